@@ -1,0 +1,128 @@
+"""The result of a calibration: values with standard deviations and verdicts, saved and loaded whole."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+Verdict = Literal["determined", "weak", "undetermined", "fixed"]
+
+
+@dataclass(frozen=True)
+class ParameterGroup:
+    """One estimated group of parameters of one sensor.
+
+    value: rotations 3x3 (R_imu_sensor), else (n,). std_formal, std: (n,) (rotations: rad about the sensor's axes);
+    std = std_formal * factor, zeros where fixed. columns: where the group stands in the covariance, None where fixed.
+    """
+
+    sensor: str  # "cam0", "imu0", "board0"
+    name: str  # "rotation", "translation", "time_offset", "intrinsics", "distortion", "bloom", "shape", ...
+    labels: tuple[str, ...]  # one per entry: ("x", "y", "z"), ("fx", "fy", "cx", "cy"), ...
+    unit: str  # SI unit of value and std: "rad", "m", "s", "px", ""
+    value: np.ndarray
+    std_formal: np.ndarray
+    std: np.ndarray
+    verdict: tuple[Verdict, ...]
+    mode: str  # free, fixed, prior
+    columns: tuple[int, ...] | None = None
+    factor: np.ndarray | None = None  # (n,) empirical factor that scales std_formal
+
+
+@dataclass(frozen=True)
+class SensorFit:
+    """How well one kind of measurement is explained: chi^2 over post-fit degrees of freedom."""
+
+    sensor: str
+    kind: str  # "corners", "gyroscope", "accelerometer", "bias walk"
+    count: int  # scalar residuals used
+    dof: float  # post-fit degrees of freedom
+    chi2: float
+    rms: float | None = None  # of the raw residual, in `unit`
+    unit: str = ""
+    rejected: int = 0  # corners set aside
+
+
+@dataclass(frozen=True)
+class CornerResiduals:
+    """Residuals (predicted - measured) of one camera's corners, in the recording's order; rejected ones stay, marked."""
+
+    sensor: str
+    seconds: np.ndarray  # (M,) image times, imu clock, s since the first IMU stamp
+    start: np.ndarray  # (M + 1,) corners of image i are start[i]:start[i+1]
+    point: np.ndarray  # (N,) index into the target's points
+    uv: np.ndarray  # (N, 2) measured, px
+    residual: np.ndarray  # (N, 2) px
+    sigma: np.ndarray  # (N,) px, standard deviation that the corner was given
+    rejected: np.ndarray  # (N,) bool
+
+
+@dataclass(frozen=True)
+class ImuResiduals:
+    """Whitened residuals of the IMU factor, one row an interval between nodes: rotation, velocity, position, gyro walk, accel walk."""
+
+    seconds: np.ndarray  # (K - 1,) start of each interval
+    whitened: np.ndarray  # (K - 1, 15)
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """The nodes: where the IMU was. seconds since the first IMU stamp; world frame, z up."""
+
+    seconds: np.ndarray  # (K,)
+    rotation: np.ndarray  # (K, 3, 3) R_world_imu
+    position: np.ndarray  # (K, 3)
+    velocity: np.ndarray  # (K, 3)
+    gyro_bias: np.ndarray  # (K, 3)
+    accel_bias: np.ndarray  # (K, 3)
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One step of the solver."""
+
+    stage: str
+    cost: float  # half the robust chi^2
+    predicted_decrease: float
+    damping: float
+    accepted: bool
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Everything a run found, and what it was made from."""
+
+    groups: tuple[ParameterGroup, ...]
+    covariance: np.ndarray  # (B, B) formal covariance of all estimated parameters, SI, right perturbation
+    covariance_names: tuple[str, ...]  # B names: "cam0.rotation.x", ...
+    undetermined: tuple[str, ...]  # sentences: combinations that the data do not determine, and the missing motion
+    fits: tuple[SensorFit, ...]
+    corner_residuals: tuple[CornerResiduals, ...]
+    imu_residuals: ImuResiduals
+    trajectory: Trajectory
+    iterations: tuple[Iteration, ...]
+    converged: bool
+    status: str  # one sentence
+    warnings: tuple[str, ...]  # what to know before trusting the numbers, one sentence each
+    notes: tuple[str, ...]  # what was assumed, dropped, repaired
+    rig: dict[str, Any] = field(default_factory=dict)  # the rig as plain data
+    inputs: dict[str, str] = field(default_factory=dict)  # file -> sha256
+    settings: dict[str, Any] = field(default_factory=dict)
+    versions: dict[str, str] = field(default_factory=dict)
+    timings: dict[str, float] = field(default_factory=dict)  # stage -> seconds
+
+    def group(self, sensor: str, name: str) -> ParameterGroup:
+        """The group `name` of `sensor`. Raises KeyError naming what there is."""
+        for g in self.groups:
+            if g.sensor == sensor and g.name == name:
+                return g
+        raise KeyError(f"no {name} of {sensor}; there are {', '.join(f'{g.sensor}.{g.name}' for g in self.groups)}")
+
+    def T_imu_sensor(self, sensor: str) -> np.ndarray:
+        """4x4 pose of `sensor` in the imu frame."""
+        T = np.eye(4)
+        T[:3, :3] = self.group(sensor, "rotation").value
+        T[:3, 3] = self.group(sensor, "translation").value
+        return T

@@ -1,0 +1,1 @@
+"""From measurements to the most probable calibration: factors, problem, solver."""

@@ -1,0 +1,264 @@
+"""Normal equations of a chain of nodes with a dense border: an arrowhead, solved in time linear in the chain.
+
+    [ T   E ] [chain ]     [g_chain ]      T: block tridiagonal, 15 x 15 blocks
+    [ E^T C ] [border] = - [g_border]      E: chain x border, C: border x border
+
+The chain is cut into pieces that share their end nodes. Each piece is accumulated and eliminated on its own, by its own
+thread, towards the node that it shares with its neighbour; shared node and border are what is left at the end.
+The number of pieces does not depend on the number of cores, so that the answer does not either.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cache
+from math import sqrt
+from typing import TypeVar
+
+import numpy as np
+from numba import njit
+
+from icalib.errors import EstimationError
+from icalib.estimation.state import NODE
+
+T = TypeVar("T")
+THREADS = 2  # pieces of the chain; more would need separators of their own
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(THREADS, thread_name_prefix="icalib")
+
+
+def in_parallel(function: Callable[..., T], items: Iterable) -> list[T]:
+    """[function(item) for item in items], on two threads; kernels release the interpreter lock."""
+    return list(_pool().map(function, items))
+
+
+@dataclass
+class Piece:
+    """J^T J and J^T r of the factors between nodes `first` and `last`, both included.
+
+    diagonal (n, 15, 15); upper (n, 15, 15), node k with node k + 1; side (n, 15, B + 1), node with border, the node's
+    gradient in the last column; border (B + 1, B + 1), the border's gradient in its last column.
+    """
+
+    first: int
+    last: int
+    diagonal: np.ndarray
+    upper: np.ndarray
+    side: np.ndarray
+    border: np.ndarray
+
+    @classmethod
+    def zeros(cls, first: int, last: int, n_border: int) -> Piece:
+        n = last - first + 1
+        return cls(
+            first,
+            last,
+            np.zeros((n, NODE, NODE)),
+            np.zeros((n, NODE, NODE)),
+            np.zeros((n, NODE, n_border + 1)),
+            np.zeros((n_border + 1, n_border + 1)),
+        )
+
+    def clear(self) -> None:
+        for a in (self.diagonal, self.upper, self.side, self.border):
+            a[:] = 0.0
+
+
+def make_pieces(n_nodes: int, n_border: int) -> tuple[Piece, ...]:
+    """Two pieces of about the same length; one where the chain is too short to share."""
+    middle = n_nodes // 2
+    if middle < 2:
+        return (Piece.zeros(0, n_nodes - 1, n_border),)
+    return Piece.zeros(0, middle, n_border), Piece.zeros(middle, n_nodes - 1, n_border)
+
+
+@njit(cache=True, nogil=True)
+def _cholesky(A):
+    """Lower Cholesky factor in place of the lower triangle; False where A is not positive definite."""
+    n = A.shape[0]
+    for j in range(n):
+        d = A[j, j]
+        for k in range(j):
+            d -= A[j, k] * A[j, k]
+        if not d > 0.0:
+            return False
+        d = sqrt(d)
+        A[j, j] = d
+        for i in range(j + 1, n):
+            s = A[i, j]
+            for k in range(j):
+                s -= A[i, k] * A[j, k]
+            A[i, j] = s / d
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _forward_solve(L, X):
+    """X <- L^-1 X."""
+    for i in range(L.shape[0]):
+        for k in range(i):
+            f = L[i, k]
+            for j in range(X.shape[1]):
+                X[i, j] -= f * X[k, j]
+        f = 1.0 / L[i, i]
+        for j in range(X.shape[1]):
+            X[i, j] *= f
+
+
+@njit(cache=True, nogil=True)
+def _subtract_product(A, B, X):
+    """X <- X - A^T B."""
+    for k in range(A.shape[0]):
+        for i in range(A.shape[1]):
+            f = A[k, i]
+            if f != 0.0:
+                for j in range(B.shape[1]):
+                    X[i, j] -= f * B[k, j]
+
+
+@njit(cache=True, nogil=True)
+def _eliminate(diagonal, upper, side, forwards, keep):
+    """Factorises in place from one end to the other; with `keep`, the last node is only updated. False: not definite.
+
+    Afterwards diagonal holds L_k, link (upper, turned when running backwards) L_k^-1 T[k, next], side L_k^-1 side.
+    """
+    n = diagonal.shape[0]
+    for step in range(n):
+        k = step if forwards else n - 1 - step
+        if step == n - 1 and keep:
+            return True
+        if not _cholesky(diagonal[k]):
+            return False
+        _forward_solve(diagonal[k], side[k])
+        if step < n - 1:
+            after = k + 1 if forwards else k - 1
+            if forwards:
+                link = upper[k]
+            else:
+                link = upper[k - 1].T.copy()
+            _forward_solve(diagonal[k], link)
+            if not forwards:
+                upper[k - 1] = link
+            _subtract_product(link, link, diagonal[after])
+            _subtract_product(link, side[k], side[after])
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _substitute(diagonal, upper, side, forwards, keep, border, chain):
+    """Back substitution: fills chain (n, 15) from the border step and, with `keep`, the last node's step in it."""
+    n = diagonal.shape[0]
+    B = side.shape[2] - 1
+    for step in range(n - 2 if keep else n - 1, -1, -1):
+        k = step if forwards else n - 1 - step
+        L = diagonal[k]
+        for i in range(L.shape[0]):
+            s = side[k, i, B]
+            for j in range(B):
+                s += side[k, i, j] * border[j]
+            chain[k, i] = -s
+        if step < n - 1:
+            after = k + 1 if forwards else k - 1
+            link = upper[k] if forwards else upper[k - 1]
+            for i in range(L.shape[0]):
+                for j in range(L.shape[0]):
+                    chain[k, i] -= link[i, j] * chain[after, j]
+        for i in range(L.shape[0] - 1, -1, -1):
+            s = chain[k, i]
+            for j in range(i + 1, L.shape[0]):
+                s -= L[j, i] * chain[k, j]
+            chain[k, i] = s / L[i, i]
+
+
+@njit(cache=True, nogil=True)
+def _damp(diagonal, damping):
+    for k in range(diagonal.shape[0]):
+        for i in range(diagonal.shape[1]):
+            diagonal[k, i, i] *= 1.0 + damping
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Step (chain (K, 15), border (B,)), `decrease` of half the chi^2 that the linear model predicts, and the
+    `information` (B, B) of the border, the chain marginalised (damping included)."""
+
+    chain: np.ndarray
+    border: np.ndarray
+    decrease: float
+    information: np.ndarray
+
+
+class NotDefinite(EstimationError):
+    """The normal equations are not positive definite: something is not determined, or damping is too small."""
+
+
+def _eliminated_part(piece: Piece, keep: bool) -> np.ndarray:
+    """(B + 1, B + 1) what eliminating a piece's chain, but for a kept end node, takes from the border."""
+    rows = piece.side
+    if keep:
+        rows = rows[:-1] if piece.first == 0 else rows[1:]
+    flat = rows.reshape(-1, rows.shape[2])
+    return flat.T @ flat
+
+
+def marginalise(piece: Piece) -> np.ndarray:
+    """Border (B + 1, B + 1) with all nodes of `piece` eliminated; overwrites the piece. Raises NotDefinite."""
+    if not _eliminate(piece.diagonal, piece.upper, piece.side, True, False):
+        raise NotDefinite("the motion between nodes is not determined.")
+    return piece.border - _eliminated_part(piece, keep=False)
+
+
+HELD_BELOW = 1e-2  # information in tolerance units: a direction known to less than ten tolerances stays where it is
+
+
+def border_step(information: np.ndarray, gradient: np.ndarray, tolerance: np.ndarray) -> tuple[np.ndarray, float]:
+    """Step (B,) of the border and the decrease of half the chi^2 it promises; undetermined directions are held.
+
+    Eigen-directions are those of the information in units of `tolerance` (B,).
+    """
+    values, vectors = np.linalg.eigh(information * tolerance[:, None] * tolerance)
+    projected = vectors.T @ (tolerance * gradient)
+    step = np.where(values > HELD_BELOW, -projected / np.maximum(values, HELD_BELOW), 0.0)
+    return tolerance * (vectors @ step), float(-0.5 * projected @ step)
+
+
+def solve(pieces: tuple[Piece, ...], n_nodes: int, tolerance: np.ndarray, damping: float = 0.0) -> Solution:
+    """Solves (H + damping diag(H)) step = -gradient; overwrites the pieces. Raises NotDefinite."""
+    keep = len(pieces) > 1
+    n_border = len(tolerance)
+    rest = sum((p.border for p in pieces), np.zeros((n_border + 1, n_border + 1)))
+    rest[np.diag_indices(n_border)] *= 1.0 + damping
+    if damping:
+        for piece in pieces:
+            _damp(piece.diagonal, damping)
+    done = in_parallel(lambda p: _eliminate(p.diagonal, p.upper, p.side, p.first == 0, keep), pieces)
+    if not all(done):
+        raise NotDefinite("the motion between nodes is not determined.")
+    for piece in pieces:
+        rest -= _eliminated_part(piece, keep)
+    shared, shared_side = np.zeros((0, 0)), np.zeros((0, n_border + 1))
+    if keep:
+        shared = pieces[0].diagonal[-1] + pieces[1].diagonal[0]
+        shared_side = pieces[0].side[-1] + pieces[1].side[0]
+        if not _cholesky(shared):
+            raise NotDefinite("the motion between nodes is not determined.")
+        _forward_solve(shared, shared_side)
+        rest -= shared_side.T @ shared_side
+    information = rest[:n_border, :n_border]
+    border, decrease = border_step(information, rest[:n_border, n_border], tolerance)
+    chain = np.zeros((n_nodes, NODE))
+    if keep:
+        rhs = -(shared_side[:, -1] + shared_side[:, :-1] @ border)
+        chain[pieces[0].last] = np.linalg.solve(np.tril(shared).T, rhs)
+    in_parallel(
+        lambda p: _substitute(
+            p.diagonal, p.upper, p.side, p.first == 0, keep, border, chain[p.first : p.last + 1]
+        ),
+        pieces,
+    )  # fmt: skip
+    return Solution(chain, border, decrease - 0.5 * float(rest[n_border, n_border]), information)

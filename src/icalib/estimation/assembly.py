@@ -1,0 +1,159 @@
+"""From rig, measurements and a state to a `Problem`: one pass of the estimate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.errors import EstimationError
+from icalib.estimation.board import SHAPE_LABELS, bloom_direction, shape_basis
+from icalib.estimation.corner_factor import CornerFactor, CornerNoise
+from icalib.estimation.imu_data import ImuData
+from icalib.estimation.imu_factor import ImuFactor
+from icalib.estimation.imu_model import N_INTRINSICS
+from icalib.estimation.nodes import place_nodes, usable
+from icalib.estimation.poses import assign_nodes, poses_at
+from icalib.estimation.prior_factor import Prior
+from icalib.estimation.problem import Problem
+from icalib.estimation.state import Kind, Layout, State, make_layout
+from icalib.estimation.tolerances import Tolerances
+from icalib.geometry.cameras import camera_model
+from icalib.measurements import CornerStream, Measurements
+from icalib.rig import Camera, Parameter, Rig
+
+BOARD = "board0"
+SHAPE_SIGMA_M = 3e-3  # prior on each bend: printed boards are flat to a few millimetres
+BLOOM_SIGMA_PX = 1.0
+CAMERA_PARAMETERS: tuple[tuple[str, Kind], ...] = (
+    ("rotation", "rotation"),
+    ("translation", "vector"),
+    ("time_offset", "vector"),
+    ("intrinsics", "vector"),
+    ("distortion", "vector"),
+    ("bloom", "vector"),
+)
+SIZES = {"rotation": 3, "translation": 3, "time_offset": 1, "intrinsics": 4, "bloom": 1}
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What does not change from pass to pass."""
+
+    rig: Rig
+    measurements: Measurements
+    imu: ImuData
+    layout: Layout
+    tolerances: Tolerances
+
+
+def layout_for(rig: Rig) -> Layout:
+    """The border: IMU intrinsics, board, then each camera's parameters."""
+    entries: list[tuple[str, str, Kind, int, bool]] = [
+        (rig.imu.name, "intrinsics", "vector", N_INTRINSICS, rig.imu.intrinsics.mode != "fixed"),
+        (BOARD, "tilt", "tilt", 2, True),
+        (BOARD, "shape", "vector", len(SHAPE_LABELS) if rig.settings.board_shape else 0, rig.settings.board_shape),
+    ]
+    for camera in rig.cameras:
+        sizes = SIZES | {"distortion": len(camera_model(camera.model).parameter_names) - 4}
+        for name, kind in CAMERA_PARAMETERS:
+            estimated = getattr(camera, name).mode != "fixed" and (name != "bloom" or rig.settings.bloom)
+            entries.append((camera.name, name, kind, sizes[name], estimated))
+    return make_layout(entries)
+
+
+def origin_difference(measurements: Measurements, stream: CornerStream) -> float:
+    """Seconds from the IMU's first stamp to the camera's, each on its own clock: what a raw time offset lacks."""
+    return (stream.origin_ns - measurements.imu.origin_ns) * 1e-9
+
+
+def _priors(inputs: Inputs) -> tuple[Prior, ...]:
+    rig, layout = inputs.rig, inputs.layout
+    priors = []
+    if rig.settings.board_shape:
+        n = len(SHAPE_LABELS)
+        priors.append(Prior(layout.block(BOARD, "shape"), np.zeros(n), np.full(n, SHAPE_SIGMA_M)))
+    owners: list[tuple[str, str, Parameter, float]] = [(rig.imu.name, "intrinsics", rig.imu.intrinsics, 0.0)]
+    for camera, stream in zip(rig.cameras, inputs.measurements.cameras, strict=True):
+        for name, _ in CAMERA_PARAMETERS:
+            shift = origin_difference(inputs.measurements, stream) if name == "time_offset" else 0.0
+            owners.append((camera.name, name, getattr(camera, name), shift))
+            if name == "bloom" and rig.settings.bloom and camera.bloom.mode == "free":
+                block = layout.block(camera.name, "bloom")
+                priors.append(Prior(block, np.zeros(1), np.full(1, BLOOM_SIGMA_PX)))
+    for sensor, name, parameter, shift in owners:
+        if parameter.mode == "prior" and parameter.value is not None and parameter.sigma is not None:
+            priors.append(Prior(layout.block(sensor, name), parameter.value + shift, parameter.sigma))
+    return tuple(priors)
+
+
+def image_times(inputs: Inputs, state: State) -> list[np.ndarray]:
+    """Instants of each camera's images, seconds on the imu clock since its first stamp."""
+    return [c.seconds + state.values[c.name, "time_offset"][0] for c in inputs.measurements.cameras]
+
+
+def resample(state: State, nodes: np.ndarray, inputs: Inputs) -> State:
+    """The same motion at other nodes, by integrating the IMU from the nearest old one."""
+    near = assign_nodes("inertial", state.seconds, nodes)
+    poses = poses_at("inertial", nodes, near, state, inputs.imu, inputs.rig.gravity, False)
+    return State(nodes, poses.rotation, poses.position, poses.velocity, state.bias[near].copy(), state.values)
+
+
+def nodes_for(inputs: Inputs, times: list[np.ndarray]) -> np.ndarray:
+    """Node times for images at `times`. Raises EstimationError where clocks do not overlap."""
+    settings = inputs.rig.settings
+    nodes = place_nodes(inputs.imu, times, settings.node_spacing_s, settings.max_gap_s)
+    if len(nodes) < 3:
+        raise EstimationError(
+            f"fewer than 3 images of {', '.join(c.name for c in inputs.rig.cameras)} fall within the recording of "
+            f"{inputs.imu.name}; check that the clocks overlap, or the time_offset in the rig file."
+        )
+    return nodes
+
+
+def assemble(inputs: Inputs, state: State, noise: list[CornerNoise], keep: list[np.ndarray]) -> Problem:
+    """The problem at the nodes of `state`, everything frozen that a pass freezes: nodes, assignment, preintegration."""
+    rig, layout = inputs.rig, inputs.layout
+    imu_columns = layout.columns(rig.imu.name, "intrinsics")
+    imu_factor = ImuFactor.build(inputs.imu, state, rig.gravity, imu_columns[imu_columns >= 0])
+    basis = shape_basis(rig.target, rig.settings.board_shape)
+    factors = []
+    for camera, stream, t, n, k in zip(
+        rig.cameras, inputs.measurements.cameras, image_times(inputs, state), noise, keep, strict=True
+    ):
+        seen = usable(inputs.imu, t, rig.settings.max_gap_s)
+        factor = CornerFactor(
+            stream, camera_model(camera.model), inputs.imu, rig.gravity, rig.settings.scheme, stream.seconds,
+            assign_nodes(rig.settings.scheme, state.seconds, t), k & np.repeat(seen, np.diff(stream.start)), n,
+            np.zeros((0, 2)), BOARD, rig.target.points, basis, layout, len(state.seconds),
+        )  # fmt: skip
+        factors.append(_with_bloom(factor, camera, state, rig) if rig.settings.bloom else factor)
+    tolerance = inputs.tolerances.of(layout, rig.imu.name)
+    return Problem(layout, imu_factor, tuple(factors), _priors(inputs), tolerance)
+
+
+def _with_bloom(factor: CornerFactor, camera: Camera, state: State, rig: Rig) -> CornerFactor:
+    """The factor with the directions in which its corners bloom, frozen at `state`."""
+    X, R_cw = factor.points_in_camera(state)
+    R_wb = state.values[BOARD, "tilt"]
+    point = factor.stream.point
+    towards = np.einsum(
+        "nij,nj->ni", R_cw[factor.stream.image], ((rig.target.tag_centers - rig.target.points) @ R_wb.T)[point]
+    )
+    params = np.concatenate([state.values[camera.name, "intrinsics"], state.values[camera.name, "distortion"]])
+    return factor.with_direction(bloom_direction(factor.model, params, X, towards))
+
+
+def start_values(inputs: Inputs, guess_values: dict[tuple[str, str], np.ndarray]) -> dict[tuple[str, str], np.ndarray]:
+    """Values of all blocks: the guess, completed by what starts from zero."""
+    values = dict(guess_values)
+    n_shape = inputs.layout.block(BOARD, "shape").size
+    values[BOARD, "shape"] = np.zeros(n_shape)
+    imu = inputs.rig.imu
+    values[imu.name, "intrinsics"] = np.zeros(N_INTRINSICS) if imu.intrinsics.value is None else imu.intrinsics.value.copy()
+    for camera in inputs.rig.cameras:
+        bloom = camera.bloom.value if inputs.rig.settings.bloom else None
+        values[camera.name, "bloom"] = np.zeros(1) if bloom is None else bloom.copy()
+    return {key: np.ascontiguousarray(v, dtype=np.float64) for key, v in values.items()}
+
+

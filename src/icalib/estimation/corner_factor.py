@@ -1,0 +1,180 @@
+"""Corners of a known target in the images of one camera (paper (20)-(22)).
+
+residual = K(X) + bloom * direction - uv,  X = R_cam_world (R_world_board P - p_world_cam),
+P the target's point, moved by the board's shape. All corners of an image share one pose: their small Gram matrix over
+(camera pose, what belongs to the camera or the board) is summed first, the pose's Jacobians are applied once an image.
+
+An error that all corners of an image share, a field of functions of the corner with sizes N(0, tau^2), is marginalised
+image by image.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from icalib.estimation.arrowhead import Piece
+from icalib.estimation.corner_kernels import accumulate, camera_points
+from icalib.estimation.imu_data import ImuData
+from icalib.estimation.poses import Poses, poses_at
+from icalib.estimation.state import NODE, Layout, State
+from icalib.geometry.cameras.base import CameraModel
+from icalib.measurements import CornerStream
+from icalib.rig import Scheme
+
+CHUNK = 64  # images at a time: what a chunk needs stays in the cache
+LOSSES = {"none": 0, "huber": 1, "cauchy": 2}
+
+
+@dataclass(frozen=True)
+class CornerNoise:
+    """What is known of corner errors: sigma (M,) px per image; tau (m,) px, sizes of the error an image shares, along
+    the functions `field` (N, m) of the corner; the robust loss and where it starts to bend, in sigma."""
+
+    sigma: np.ndarray
+    tau: np.ndarray
+    field: np.ndarray
+    loss: str = "none"
+    loss_scale: float = 2.5
+
+
+@dataclass(frozen=True)
+class CornerOutput:
+    """Per corner: residual (N, 2) px, predicted - measured, and root (N,), square root of its weight over sigma (0 where
+    left out); per image: shared (M, 2, m), the sizes of the common error."""
+
+    residual: np.ndarray
+    root: np.ndarray
+    shared: np.ndarray
+
+    @classmethod
+    def empty(cls, stream: CornerStream, m: int) -> CornerOutput:
+        n = len(stream.uv)
+        return cls(np.zeros((n, 2)), np.zeros(n), np.zeros((len(stream.stamps_ns), 2, m)))
+
+
+@dataclass(frozen=True)
+class CornerFactor:
+    """All images of one camera.
+
+    times (M,): stamps on the imu clock at zero offset beyond `stream`'s origin; node (M,), increasing: the node each
+    image hangs on; keep (N,): corners in use; direction (N, 2) image direction of the bloom, (0, 2) without it;
+    basis (n_points, s, 3): how the target's points move with its shape.
+    """
+
+    stream: CornerStream
+    model: CameraModel
+    imu: ImuData
+    gravity: float
+    scheme: Scheme
+    times: np.ndarray
+    node: np.ndarray
+    keep: np.ndarray
+    noise: CornerNoise
+    direction: np.ndarray
+    target: str
+    points: np.ndarray
+    basis: np.ndarray
+    layout: Layout
+    n_nodes: int
+
+    @property
+    def name(self) -> str:
+        return self.stream.name
+
+    def world_points(self, state: State) -> np.ndarray:
+        """(n_points, 3) the target's points, shape included, in the world frame."""
+        shape = state.values[self.target, "shape"]
+        board = self.points + np.einsum("nsk,s->nk", self.basis, shape)
+        return board @ state.values[self.target, "tilt"].T
+
+    def camera_poses(self, state: State, i0: int = 0, i1: int | None = None) -> tuple[Poses, np.ndarray, np.ndarray]:
+        """IMU poses, and R_cam_world (n, 3, 3), p_world_cam (n, 3) at the instants of images i0..i1."""
+        times = self.times[i0:i1] + state.values[self.name, "time_offset"][0]
+        imu_free = self.layout.block(self.imu.name, "intrinsics").start is not None
+        poses = poses_at(self.scheme, times, self.node[i0:i1], state, self.imu, self.gravity, imu_free)
+        R_ic, p_ic = state.values[self.name, "rotation"], state.values[self.name, "translation"]
+        R_cw = np.ascontiguousarray((poses.rotation @ R_ic).transpose(0, 2, 1))
+        return poses, R_cw, poses.position + poses.rotation @ p_ic
+
+    def points_in_camera(self, state: State) -> tuple[np.ndarray, np.ndarray]:
+        """X (N, 3), each corner's point in its camera's frame, and R_cam_world (M, 3, 3)."""
+        _, R_cw, p_wc = self.camera_poses(state)
+        X = np.empty((len(self.stream.uv), 3))
+        camera_points(
+            0, len(self.node), self.stream.start, self.stream.point, R_cw, p_wc, self.world_points(state), X
+        )  # fmt: skip
+        return X, R_cw
+
+    def with_direction(self, direction: np.ndarray) -> CornerFactor:
+        """The same factor with bloom along `direction` (N, 2)."""
+        return replace(self, direction=direction)
+
+    def _columns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Border columns of the chained and of the direct parameters, and which model parameters the latter hold."""
+        imu = self.layout.columns(self.imu.name, "intrinsics")
+        chained = [
+            self.layout.columns(self.name, "rotation", "translation", "time_offset"),
+            self.layout.columns(self.target, "tilt"),
+            imu if imu[0] >= 0 else imu[:0],
+        ]
+        model = self.layout.columns(self.name, "intrinsics", "distortion")
+        pars = np.flatnonzero(model >= 0)
+        direct = [model[pars]]
+        if len(self.direction):
+            direct.append(self.layout.columns(self.name, "bloom"))
+        direct.append(self.layout.columns(self.target, "shape"))
+        return np.concatenate(chained), np.concatenate(direct), pars
+
+    def accumulate(
+        self,
+        state: State,
+        piece: Piece,
+        out: CornerOutput,
+        sums: bool = True,
+        noise: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> float:
+        """Fills `out` for the images whose node lies in `piece`, and adds them to its sums where `sums` are wanted.
+
+        Returns half the robust chi^2. With `noise` (corners (N, 2), common errors (M, 2, m), white) in place of the
+        whitened residuals, returns the quadratic form of the common errors' rows instead.
+        """
+        i0, i1 = self._images(piece)
+        poses, R_cw, p_wc = self.camera_poses(state, i0, i1)
+        params = np.concatenate([state.values[self.name, "intrinsics"], state.values[self.name, "distortion"]])
+        world = self.world_points(state)
+        chained, direct, pars = self._columns()
+        empty = np.zeros((0, NODE, NODE))
+        targets = (piece.diagonal, piece.upper, piece.side, piece.border) if sums else (empty,) * 3 + (np.zeros((0, 0)),)
+        start, n = self.stream.start[i0 : i1 + 1], self.noise
+        white, white_shared = noise or (out.residual, out.shared)
+        settings = (
+            start, self.stream.uv, self.stream.point, self.keep, n.sigma[i0:i1], LOSSES[n.loss], n.loss_scale,
+            n.field, 1.0 / n.tau**2, state.values[self.name, "bloom"][0], self.direction,
+            self.basis @ state.values[self.target, "tilt"].T, pars,
+        )  # fmt: skip
+        common = (
+            white, white_shared[i0:i1], noise is not None,
+            np.ascontiguousarray(state.values[self.name, "rotation"]), state.values[self.name, "translation"],
+            R_cw, p_wc, poses.rate, poses.velocity, poses.by_node, poses.by_next, poses.by_imu,
+            self.node[i0:i1], piece.first, chained, direct, *targets, out.residual, out.root, out.shared[i0:i1],
+        )  # fmt: skip
+        total = 0.0
+        for a in range(0, i1 - i0, CHUNK):
+            b = min(a + CHUNK, i1 - i0)
+            X = np.empty((start[b] - start[a], 3))
+            camera_points(a, b, start, self.stream.point, R_cw, p_wc, world, X)
+            if sums:
+                predicted, valid, Jp, Jpar = self.model.project_with_jacobians(params, X)
+            else:
+                predicted, valid = self.model.project(params, X)
+                Jp, Jpar = np.zeros((0, 2, 3)), np.zeros((0, 2, 0))
+            total += accumulate(a, b, start[a], *settings, predicted, valid, X, Jp, Jpar, *common)
+        return total
+
+    def _images(self, piece: Piece) -> tuple[int, int]:
+        """The images that belong to `piece`: nodes from first to before last, the chain's very last node included."""
+        stop = piece.last + 1 if piece.last == self.n_nodes - 1 else piece.last
+        i0, i1 = np.searchsorted(self.node, [piece.first, stop])
+        return int(i0), int(i1)

@@ -1,0 +1,54 @@
+"""IMU readings made ready for integration: seconds, noise per interval, gaps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.measurements import ImuStream
+from icalib.rig import ImuNoise
+
+GAP = 3.0  # an interval longer than this many median periods is a gap
+# Within a gap the motion goes on unseen: what is not known of rate and force, their spread over the recording,
+# is taken to stay correlated for this long.
+MOTION_CORRELATION_S = 0.1
+
+
+@dataclass(frozen=True)
+class ImuData:
+    """Readings on the imu clock, seconds since its first stamp.
+
+    variance (N - 1, 2): squared noise densities of each interval, gyroscope and accelerometer; walk (2,): squared
+    densities of the bias walks. gaps: (start, end) of intervals without readings.
+    """
+
+    name: str
+    seconds: np.ndarray
+    gyro: np.ndarray
+    accel: np.ndarray
+    variance: np.ndarray
+    walk: np.ndarray
+    gaps: tuple[tuple[float, float], ...]
+
+    @classmethod
+    def build(cls, stream: ImuStream, noise: ImuNoise) -> ImuData:
+        t = stream.seconds
+        dt = np.diff(t)
+        variance = np.tile([noise.gyro**2, noise.accel**2], (len(dt), 1))
+        gap = dt > GAP * np.median(dt)
+        spread = np.array([stream.gyro.var(axis=0).sum() / 3.0, stream.accel.var(axis=0).sum() / 3.0])
+        variance[gap] += 2.0 * MOTION_CORRELATION_S * spread
+        return cls(
+            stream.name,
+            t,
+            np.ascontiguousarray(stream.gyro),
+            np.ascontiguousarray(stream.accel),
+            variance,
+            np.array([noise.gyro_walk**2, noise.accel_walk**2]),
+            tuple(zip(t[:-1][gap], t[1:][gap], strict=True)),
+        )
+
+    def interval(self, seconds: np.ndarray) -> np.ndarray:
+        """(n,) index of the reading interval that each time lies in, the first or last for times outside."""
+        return np.clip(np.searchsorted(self.seconds, seconds, side="right") - 1, 0, len(self.seconds) - 2)

@@ -1,0 +1,37 @@
+"""Where the nodes of the chain stand: at every distinct image instant, and often enough in between."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icalib.estimation.imu_data import ImuData
+
+MERGED_WITHIN_S = 2e-3  # images closer than this share a node
+
+
+def place_nodes(imu: ImuData, image_times: list[np.ndarray], spacing: float, max_gap: float) -> np.ndarray:
+    """(K,) node times, seconds on the imu clock: all image instants, none further apart than `spacing`.
+
+    IMU gaps are filled too, up to `max_gap` seconds; in longer ones there is no node.
+    """
+    times = np.sort(np.concatenate(image_times))
+    times = times[usable(imu, times, max_gap)]
+    distinct = times[np.diff(times, prepend=-np.inf) > MERGED_WITHIN_S]
+    long_gaps = [(a, b) for a, b in imu.gaps if b - a > max_gap]
+    pieces = [distinct[:1]]
+    for a, b in zip(distinct[:-1], distinct[1:], strict=True):
+        n = int(np.ceil((b - a) / spacing - 1e-9))
+        between = np.linspace(a, b, n + 1)[1:]
+        for start, end in long_gaps:
+            between = between[~((between > start) & (between < end))]
+        pieces.append(between)
+    return np.concatenate(pieces)
+
+
+def usable(imu: ImuData, times: np.ndarray, max_gap: float) -> np.ndarray:
+    """(n,) whether the IMU was running at each time, gaps up to `max_gap` seconds allowed."""
+    inside = (times >= imu.seconds[0]) & (times <= imu.seconds[-1])
+    for a, b in imu.gaps:
+        if b - a > max_gap:
+            inside &= (times <= a) | (times >= b)
+    return inside

@@ -1,0 +1,184 @@
+"""Where the IMU was at a sensor's own instant: three schemes behind one function, `poses_at`.
+
+    inertial    the IMU's readings integrated from the nearest node to t, forwards or backwards
+    kinematic   constant angular rate and velocity from the nearest node, paper (8)-(9)
+    pose        between the two bounding nodes, paper (10)-(12); position interpolated linearly
+
+A measurement keeps its node (`Assignment`) while the solver runs; only the time itself moves with the offset.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from icalib.estimation.imu_data import ImuData
+from icalib.estimation.imu_model import N_INTRINSICS, correction_matrices, intrinsics_jacobians
+from icalib.estimation.integration import integrate
+from icalib.estimation.state import NODE, State
+from icalib.geometry import so3
+from icalib.rig import Scheme
+
+
+@dataclass(frozen=True)
+class Poses:
+    """IMU poses at n instants, and how they move. Rows of the Jacobians: rotation (right), position (world).
+
+    rotation (n, 3, 3), position (n, 3); rate (n, 3) body rad/s and velocity (n, 3) world m/s, the time derivative;
+    by_node, by_next (n, 6, 15): with respect to the node and, for `pose` alone, the one after it (else of length 0);
+    by_imu (n, 6, 24 or 0): with respect to the IMU intrinsics.
+    """
+
+    rotation: np.ndarray
+    position: np.ndarray
+    rate: np.ndarray
+    velocity: np.ndarray
+    by_node: np.ndarray
+    by_next: np.ndarray
+    by_imu: np.ndarray
+
+
+def assign_nodes(scheme: Scheme, nodes: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """(n,) node of each time: the nearest one, or for `pose` the one before it."""
+    after = np.clip(np.searchsorted(nodes, times, side="right"), 1, len(nodes) - 1)
+    if scheme == "pose":
+        return after - 1
+    return after - (times - nodes[after - 1] < nodes[after] - times)
+
+
+@njit(cache=True, nogil=True)
+def _inertial(times, node, first, nodes, R, p, v, b, g, t, gyro, accel, intrinsics, out_R, out_p, rate, vel, Jn, Jx):
+    variance, walk = np.zeros(2).reshape(1, 2), np.zeros(2)
+    width = 6 + Jx.shape[2]
+    dR, dv, dp, J = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((9, width))
+    P = np.empty((0, 0))
+    for i in range(len(times)):
+        k = node[i]
+        dt = times[i] - nodes[k]
+        w, _ = integrate(
+            nodes[k], times[i], first[i], t, gyro, accel, b[k], intrinsics, variance, walk, dR, dv, dp, J, P
+        )  # fmt: skip
+        rate[i] = w
+        for a in range(3):
+            out_p[i, a] = p[k, a] + v[k, a] * dt
+            vel[i, a] = v[k, a]
+            for c in range(3):
+                out_p[i, a] += R[k, a, c] * dp[c]
+                vel[i, a] += R[k, a, c] * dv[c]
+                s = 0.0
+                for d in range(3):
+                    s += R[k, a, d] * dR[d, c]
+                out_R[i, a, c] = s
+                Jn[i, a, c] = dR[c, a]
+            Jn[i, 3 + a, 3 + a] = 1.0
+            Jn[i, 3 + a, 6 + a] = dt
+        out_p[i, 2] -= 0.5 * g * dt * dt
+        vel[i, 2] -= g * dt
+        turn = so3.hat(dp)
+        for a in range(3):
+            for c in range(3):
+                s = 0.0
+                for d in range(3):
+                    s -= R[k, a, d] * turn[d, c]
+                Jn[i, 3 + a, c] = s
+            for c in range(width):
+                s = 0.0
+                for d in range(3):
+                    s += R[k, a, d] * J[6 + d, c]
+                if c < 6:
+                    Jn[i, a, 9 + c] = J[a, c]
+                    Jn[i, 3 + a, 9 + c] = s
+                else:
+                    Jx[i, a, c - 6] = J[a, c]
+                    Jx[i, 3 + a, c - 6] = s
+
+
+@njit(cache=True, nogil=True)
+def _kinematic(times, node, first, nodes, R, p, v, b, t, gyro, accel, intrinsics, out_R, out_p, rate, vel, Jn, Jx):
+    F, G, H = correction_matrices(intrinsics)
+    n_x = Jx.shape[2]
+    by_w, by_f = np.zeros((3, n_x)), np.zeros((3, n_x))
+    w, f = np.empty(3), np.empty(3)
+    for i in range(len(times)):
+        k, j = node[i], first[i]
+        dt = times[i] - nodes[k]
+        s = (nodes[k] - t[j]) / (t[j + 1] - t[j])
+        for a in range(3):
+            w[a] = f[a] = 0.0
+            for c in range(3):
+                raw_w = gyro[j, c] + s * (gyro[j + 1, c] - gyro[j, c]) - b[k, c]
+                raw_f = accel[j, c] + s * (accel[j + 1, c] - accel[j, c]) - b[k, 3 + c]
+                w[a] += G[a, c] * raw_w + H[a, c] * raw_f
+                f[a] += F[a, c] * raw_f
+        turn = w * dt
+        E, Jr = so3.exp(turn), so3.right_jacobian(turn)
+        if n_x:
+            intrinsics_jacobians(intrinsics, F, G, f, w, by_w, by_f)
+        for a in range(3):
+            rate[i, a] = w[a]
+            vel[i, a] = v[k, a]
+            out_p[i, a] = p[k, a] + v[k, a] * dt
+            Jn[i, 3 + a, 3 + a] = 1.0
+            Jn[i, 3 + a, 6 + a] = dt
+            for c in range(3):
+                out_R[i, a, c] = R[k, a, 0] * E[0, c] + R[k, a, 1] * E[1, c] + R[k, a, 2] * E[2, c]
+                Jn[i, a, c] = E[c, a]
+                for d in range(3):
+                    Jn[i, a, 9 + c] -= dt * Jr[a, d] * G[d, c]
+                    Jn[i, a, 12 + c] -= dt * Jr[a, d] * H[d, c]
+            for c in range(n_x):
+                Jx[i, a, c] = dt * (Jr[a, 0] * by_w[0, c] + Jr[a, 1] * by_w[1, c] + Jr[a, 2] * by_w[2, c])
+
+
+@njit(cache=True, nogil=True)
+def _between(times, node, nodes, R, p, out_R, out_p, rate, vel, Jn, Jm):
+    for i in range(len(times)):
+        k = node[i]
+        span = nodes[k + 1] - nodes[k]
+        s = (times[i] - nodes[k]) / span
+        R01 = np.ascontiguousarray(R[k].T) @ R[k + 1]
+        phi = so3.log(R01)
+        E = so3.exp(s * phi)
+        slide = s * (so3.right_jacobian(s * phi) @ so3.right_jacobian_inverse(phi))
+        back = slide @ np.ascontiguousarray(R01.T)
+        out_R[i] = R[k] @ E
+        for a in range(3):
+            rate[i, a] = phi[a] / span
+            vel[i, a] = (p[k + 1, a] - p[k, a]) / span
+            out_p[i, a] = p[k, a] + s * (p[k + 1, a] - p[k, a])
+            Jn[i, 3 + a, 3 + a] = 1.0 - s
+            Jm[i, 3 + a, 3 + a] = s
+            for c in range(3):
+                Jn[i, a, c] = E[c, a] - back[a, c]
+                Jm[i, a, c] = slide[a, c]
+
+
+def poses_at(
+    scheme: Scheme, times: np.ndarray, node: np.ndarray, state: State, imu: ImuData, gravity: float, imu_free: bool
+) -> Poses:
+    """IMU poses at `times` (n,) seconds on the imu clock, each from its `node` (see `assign_nodes`)."""
+    n = len(times)
+    out = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
+    by_node, by_imu = np.zeros((n, 6, NODE)), np.zeros((n, 6, N_INTRINSICS if imu_free else 0))
+    by_next = np.zeros((n if scheme == "pose" else 0, 6, NODE))
+    intrinsics = state.values[imu.name, "intrinsics"]
+    raw = imu.seconds, imu.gyro, imu.accel, intrinsics
+    if scheme == "pose":
+        _between(times, node, state.seconds, state.rotation, state.position, *out, by_node, by_next)
+    else:
+        # Integration backwards starts in the interval that ends at the node, if the node lies on a stamp.
+        first = imu.interval(state.seconds[node])
+        if scheme == "inertial":
+            on_stamp = (times < state.seconds[node]) & (imu.seconds[first] == state.seconds[node]) & (first > 0)
+            _inertial(
+                times, node, first - on_stamp, state.seconds, state.rotation, state.position, state.velocity,
+                state.bias, gravity, *raw, *out, by_node, by_imu,
+            )  # fmt: skip
+        else:
+            _kinematic(
+                times, node, first, state.seconds, state.rotation, state.position, state.velocity, state.bias,
+                *raw, *out, by_node, by_imu,
+            )  # fmt: skip
+    return Poses(*out, by_node, by_next, by_imu)

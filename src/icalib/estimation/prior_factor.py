@@ -1,0 +1,54 @@
+"""Gaussian priors on lasting parameters, and a very broad one on the first node's biases."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.estimation.arrowhead import Piece
+from icalib.estimation.state import Block, State
+from icalib.geometry import so3
+
+# Keeps the biases defined where nothing else does (a motionless stretch); far wider than any IMU's turn-on bias.
+FIRST_BIAS_SIGMA = np.array([0.5] * 3 + [3.0] * 3)
+
+
+@dataclass(frozen=True)
+class Prior:
+    """residual = (x - value) / sigma; for rotations Log(value^T R) / sigma, Jacobian J_r^-1 / sigma."""
+
+    block: Block
+    value: np.ndarray
+    sigma: np.ndarray
+
+    def residual(self, state: State) -> tuple[np.ndarray, np.ndarray]:
+        """Whitened residual (n,) and its Jacobian (n, n)."""
+        x = state.values[self.block.key]
+        if self.block.kind == "rotation":
+            error = so3.log(np.ascontiguousarray(self.value.T @ x))
+            return error / self.sigma, so3.right_jacobian_inverse(error) / self.sigma[:, None]
+        return (x - self.value) / self.sigma, np.diag(1.0 / self.sigma)
+
+    def accumulate(self, state: State, piece: Piece, sums: bool = True, noise: np.ndarray | None = None) -> float:
+        """Adds the prior to the sums of `piece`; returns half its chi^2."""
+        r, J = self.residual(state)
+        r = r if noise is None else noise
+        columns = self.block.columns
+        if sums:
+            piece.border[np.ix_(columns, columns)] += J.T @ J
+            piece.border[columns, -1] += J.T @ r
+            piece.border[-1, columns] += J.T @ r
+        return 0.5 * float(r @ r)
+
+
+def accumulate_bias_prior(state: State, piece: Piece, sums: bool = True) -> float:
+    """The broad prior on the first node's biases, about zero; returns half its chi^2."""
+    if piece.first != 0:
+        return 0.0
+    r = state.bias[0] / FIRST_BIAS_SIGMA
+    if sums:
+        index = np.arange(9, 15)
+        piece.diagonal[0, index, index] += 1.0 / FIRST_BIAS_SIGMA**2
+        piece.side[0, 9:15, -1] += r / FIRST_BIAS_SIGMA
+    return 0.5 * float(r @ r)

@@ -1,0 +1,58 @@
+"""Where factors and solver meet: all measurements of one recording, as sums over the pieces of the chain (paper (15))."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.estimation.arrowhead import Piece, in_parallel, make_pieces
+from icalib.estimation.corner_factor import CornerFactor, CornerOutput
+from icalib.estimation.imu_factor import ROWS, ImuFactor
+from icalib.estimation.prior_factor import Prior, accumulate_bias_prior
+from icalib.estimation.state import Layout, State
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """What the factors left behind at a state: the IMU's whitened residuals (K - 1, 15), the corners' by camera."""
+
+    imu: np.ndarray
+    corners: tuple[CornerOutput, ...]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Minimise half the sum of all squared, whitened, robust residuals over a `State`."""
+
+    layout: Layout
+    imu: ImuFactor
+    cameras: tuple[CornerFactor, ...]
+    priors: tuple[Prior, ...]
+    tolerance: np.ndarray  # (B,) what a user would call the same number; scales the border
+
+    @property
+    def n_nodes(self) -> int:
+        return len(self.imu.dR) + 1
+
+    def pieces(self) -> tuple[Piece, ...]:
+        return make_pieces(self.n_nodes, self.layout.size)
+
+    def residuals(self) -> Residuals:
+        """Empty arrays for `linearise` to fill."""
+        corners = tuple(CornerOutput.empty(c.stream, len(c.noise.tau)) for c in self.cameras)
+        return Residuals(np.zeros((self.n_nodes - 1, ROWS)), corners)
+
+    def linearise(self, state: State, pieces: tuple[Piece, ...], out: Residuals, sums: bool = True) -> float:
+        """Fills `pieces` and `out` at `state`; returns half the robust chi^2."""
+        return sum(in_parallel(lambda p: self._accumulate(state, p, out, sums), pieces))
+
+    def _accumulate(self, state: State, piece: Piece, out: Residuals, sums: bool) -> float:
+        piece.clear()
+        cost = self.imu.accumulate(state, piece, out.imu, sums)
+        for camera, corners in zip(self.cameras, out.corners, strict=True):
+            cost += camera.accumulate(state, piece, corners, sums)
+        if piece.first == 0:
+            cost += accumulate_bias_prior(state, piece, sums)
+            cost += sum(p.accumulate(state, piece, sums) for p in self.priors)
+        return cost

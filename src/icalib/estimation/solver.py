@@ -1,0 +1,98 @@
+"""Levenberg-Marquardt on the manifold. It knows a problem only by its sums."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.errors import EstimationError
+from icalib.estimation.arrowhead import NotDefinite, solve
+from icalib.estimation.problem import Problem, Residuals
+from icalib.estimation.state import State
+
+MAX_ITERATIONS = 50
+# Half a chi^2 of 5e-4 is a step of 0.03 standard deviations at most, in any direction.
+CONVERGED_DECREASE = 5e-4
+FIRST_DAMPING = 1e-8
+ZERO_DAMPING = 1e-10  # below this, none: the weak information of a planar drive must not be swamped
+
+
+@dataclass(frozen=True)
+class Step:
+    """One iteration: half the robust chi^2 before it, the decrease that the linear model promises, and its fate."""
+
+    cost: float
+    predicted_decrease: float
+    damping: float
+    accepted: bool
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Where the solver ended, with a status that is a sentence."""
+
+    state: State
+    cost: float
+    residuals: Residuals
+    information: np.ndarray  # (B, B) of the border at the last linearisation, the chain marginalised, no damping
+    steps: tuple[Step, ...]
+    converged: bool
+    status: str
+
+
+def minimise(problem: Problem, state: State, on_step: Callable[[Step], None] = lambda _: None) -> Outcome:
+    """Minimises `problem` from `state`. Raises EstimationError if no step can be computed at all."""
+    pieces, residuals = problem.pieces(), problem.residuals()
+    cost = problem.linearise(state, pieces, residuals)
+    damping, growth, steps = 0.0, 10.0, []
+    for _ in range(MAX_ITERATIONS):
+        if not np.isfinite(cost):
+            raise EstimationError("the first guess predicts no finite measurement; give a better guess in the rig file.")
+        solution, damping = _solve(problem, state, pieces, residuals, damping)
+        candidate = state.retract(problem.layout, solution.chain, solution.border)
+        candidate_cost = problem.linearise(candidate, pieces, residuals)
+        gain = (cost - candidate_cost) / max(solution.decrease, 1e-300)
+        converged = damping == 0.0 and solution.decrease < CONVERGED_DECREASE
+        # At the bottom rounding decides whether the cost falls; a step this small is taken anyway.
+        accepted = bool(candidate_cost < cost) or converged
+        steps.append(Step(cost, solution.decrease, damping, accepted))
+        on_step(steps[-1])
+        if accepted:
+            state, cost = candidate, candidate_cost
+            damping = damping * (0.1 if gain > 0.25 else 1.0)
+            damping = 0.0 if damping < ZERO_DAMPING else damping
+            if converged:
+                return _finish(problem, state, cost, pieces, residuals, steps, True)
+        else:
+            damping = max(damping * growth, 1e-6)
+            if damping > 1e6:
+                break
+            cost = problem.linearise(state, pieces, residuals)
+    return _finish(problem, state, cost, pieces, residuals, steps, False)
+
+
+def _solve(problem, state, pieces, residuals, damping):
+    """Solves with the least damping, from `damping` up, that makes the sums definite."""
+    while True:
+        try:
+            return solve(pieces, problem.n_nodes, problem.tolerance, damping), damping
+        except NotDefinite:
+            damping = max(10.0 * damping, FIRST_DAMPING)
+            if damping > 1e3:
+                raise
+            problem.linearise(state, pieces, residuals)
+
+
+def _finish(problem, state, cost, pieces, residuals, steps, converged) -> Outcome:
+    problem.linearise(state, pieces, residuals)
+    information = solve(pieces, problem.n_nodes, problem.tolerance, 0.0).information
+    n = len(steps)
+    status = (
+        f"converged in {n} iterations: the next step would change no parameter by more than 3 % of its standard deviation."
+        if converged
+        else f"not converged after {n} iterations: the cost is {cost:.6g} and still {steps[-1].predicted_decrease:.3g} above "
+        "what the last step promised; give a better first guess, or check the noise in the rig file."
+    )
+    return Outcome(state, cost, residuals, information, tuple(steps), converged, status)

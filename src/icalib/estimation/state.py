@@ -1,0 +1,103 @@
+"""What is estimated: the inertial states at the nodes, and the lasting parameters of the border.
+
+A node is (R_world_imu, p, v, b_g, b_a), 15 tangent dimensions in this order (paper (2)).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from icalib.geometry import so3
+
+NODE = 15
+Key = tuple[str, str]  # sensor, parameter
+Kind = Literal["vector", "rotation", "tilt"]
+
+
+@dataclass(frozen=True)
+class Block:
+    """One lasting parameter. kind: how it is perturbed; start: its first border column, None where it is fixed.
+
+    rotation: R <- R Exp(d). tilt (2 columns): R_world_board <- Exp((d0, d1, 0)) R_world_board; the third turn, about
+    gravity, is the freedom of the world frame.
+    """
+
+    sensor: str
+    name: str
+    kind: Kind
+    size: int
+    start: int | None
+
+    @property
+    def key(self) -> Key:
+        return self.sensor, self.name
+
+    @property
+    def columns(self) -> np.ndarray:
+        """(size,) border columns, -1 where fixed."""
+        return np.full(self.size, -1) if self.start is None else np.arange(self.start, self.start + self.size)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where each lasting parameter stands in the border."""
+
+    blocks: tuple[Block, ...]
+
+    @property
+    def size(self) -> int:
+        return sum(b.size for b in self.blocks if b.start is not None)
+
+    @property
+    def free(self) -> tuple[Block, ...]:
+        return tuple(b for b in self.blocks if b.start is not None)
+
+    def block(self, sensor: str, name: str) -> Block:
+        return next(b for b in self.blocks if b.key == (sensor, name))
+
+    def columns(self, sensor: str, *names: str) -> np.ndarray:
+        return np.concatenate([self.block(sensor, n).columns for n in names])
+
+
+def make_layout(entries: list[tuple[str, str, Kind, int, bool]]) -> Layout:
+    """Layout from (sensor, name, kind, size, estimated) in order."""
+    blocks, column = [], 0
+    for sensor, name, kind, size, estimated in entries:
+        blocks.append(Block(sensor, name, kind, size, column if estimated else None))
+        column += size if estimated else 0
+    return Layout(tuple(blocks))
+
+
+@dataclass(frozen=True)
+class State:
+    """One estimate. seconds (K,) node times on the imu clock since its first stamp; world frame z up."""
+
+    seconds: np.ndarray
+    rotation: np.ndarray  # (K, 3, 3) R_world_imu
+    position: np.ndarray  # (K, 3)
+    velocity: np.ndarray  # (K, 3)
+    bias: np.ndarray  # (K, 6) gyroscope, accelerometer
+    values: dict[Key, np.ndarray]
+
+    def retract(self, layout: Layout, chain: np.ndarray, border: np.ndarray) -> State:
+        """The state moved by tangent steps chain (K, 15) and border (B,)."""
+        values = dict(self.values)
+        for b in layout.free:
+            d, old = border[b.columns], values[b.key]
+            if b.kind == "rotation":
+                values[b.key] = old @ so3.exp(d)
+            elif b.kind == "tilt":
+                values[b.key] = so3.exp(np.array([d[0], d[1], 0.0])) @ old
+            else:
+                values[b.key] = old + d
+        return replace(
+            self,
+            rotation=self.rotation @ so3.exp_many(np.ascontiguousarray(chain[:, 0:3])),
+            position=self.position + chain[:, 3:6],
+            velocity=self.velocity + chain[:, 6:9],
+            bias=self.bias + chain[:, 9:15],
+            values=values,
+        )

@@ -1,0 +1,32 @@
+"""What a user would call the same number: the scale against which a parameter is determined or not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.estimation.state import Layout
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """Standard deviations below these are `determined`. Angles rad, lengths m, times s, image quantities px."""
+
+    rotation: float = np.deg2rad(0.1)
+    translation: float = 5e-3
+    time_offset: float = 1e-3
+    intrinsics: float = 1.0  # px; IMU intrinsics have their own
+    distortion: float = 1e-2
+    bloom: float = 0.1
+    shape: float = 1e-3
+    tilt: float = np.deg2rad(0.1)
+    imu_intrinsics: float = 1e-2  # scale, misalignment [rad]; g-sensitivity rad/s per m/s^2
+
+    def of(self, layout: Layout, imu: str) -> np.ndarray:
+        """(B,) tolerance of each border column."""
+        out = np.zeros(layout.size)
+        for b in layout.free:
+            name = "imu_intrinsics" if b.sensor == imu else b.name
+            out[b.columns] = getattr(self, name)
+        return out

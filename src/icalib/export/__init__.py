@@ -1,0 +1,1 @@
+"""The calibration in the formats of other programs."""

@@ -1,0 +1,17 @@
+"""Camera models by name."""
+
+from __future__ import annotations
+
+from icalib.errors import CalibrationError
+from icalib.geometry.cameras.base import CameraModel
+from icalib.geometry.cameras.equidistant import PinholeEquidistant
+from icalib.geometry.cameras.radtan import PinholeRadtan
+
+CAMERA_MODELS: dict[str, CameraModel] = {model.name: model for model in (PinholeRadtan(), PinholeEquidistant())}
+
+
+def camera_model(name: str) -> CameraModel:
+    """The model called `name`. Raises CalibrationError with the available names if there is none."""
+    if name not in CAMERA_MODELS:
+        raise CalibrationError(f"there is no camera model {name!r}; available are {', '.join(CAMERA_MODELS)}.")
+    return CAMERA_MODELS[name]

@@ -1,0 +1,33 @@
+"""What the rest of the program knows of a camera model: this class and nothing else."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import ClassVar
+
+import numpy as np
+
+
+class CameraModel(ABC):
+    """A camera model: compiled functions over arrays of points. Parameters are (fx, fy, cx, cy, distortion ...).
+
+    `valid` marks points that the model can see (in front of the camera, inside the range where the distortion is
+    monotonic); what is computed for the others is finite but meaningless.
+    """
+
+    name: ClassVar[str]
+    parameter_names: ClassVar[tuple[str, ...]]
+
+    @abstractmethod
+    def project(self, params: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Points (N, 3) in the camera frame [m] -> uv (N, 2) [px], valid (N,) bool."""
+
+    @abstractmethod
+    def project_with_jacobians(
+        self, params: np.ndarray, points: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """uv and valid as `project`, then d uv / d point (N, 2, 3) and d uv / d params (N, 2, P)."""
+
+    @abstractmethod
+    def unproject(self, params: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """uv (N, 2) [px] -> unit rays (N, 3) in the camera frame, valid (N,) bool (inside the model's range)."""

@@ -1,0 +1,141 @@
+"""Pinhole camera with radial-tangential distortion, as in OpenCV and Kalibr ("radtan", Brown-Conrady)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from icalib.geometry.cameras import radial
+from icalib.geometry.cameras.base import CameraModel
+
+_MIN_DEPTH = 1e-6  # m
+_MAX_NEWTON_STEPS = 30
+
+
+class PinholeRadtan(CameraModel):
+    """With a = x / z, b = y / z, s = a^2 + b^2 and d = 1 + k1 s + k2 s^2 (OpenCV, calib3d, "radial" and "tangential"):
+
+        u = fx (a d + 2 p1 a b + p2 (s + 2 a^2)) + cx
+        v = fy (b d + p1 (s + 2 b^2) + 2 p2 a b) + cy
+
+    Valid: z > 1 um, and r = sqrt(s) below the first zero of 1 + 3 k1 r^2 + 5 k2 r^4. The rest is projected to (0, 0)
+    with zero Jacobians.
+    """
+
+    name = "pinhole-radtan"
+    parameter_names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+
+    def project(self, params: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        params, points = np.ascontiguousarray(params, float), np.ascontiguousarray(points, float)
+        uv, valid = np.empty((len(points), 2)), np.empty(len(points), dtype=np.bool_)
+        _project(params, points, radial.monotonic_limit(params[4:6]), uv, valid)
+        return uv, valid
+
+    def project_with_jacobians(
+        self, params: np.ndarray, points: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        params, points = np.ascontiguousarray(params, float), np.ascontiguousarray(points, float)
+        n = len(points)
+        uv, valid, j_point, j_params = np.empty((n, 2)), np.empty(n, np.bool_), np.empty((n, 2, 3)), np.empty((n, 2, 8))
+        _project_with_jacobians(params, points, radial.monotonic_limit(params[4:6]), uv, valid, j_point, j_params)
+        return uv, valid, j_point, j_params
+
+    def unproject(self, params: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        params, uv = np.ascontiguousarray(params, float), np.ascontiguousarray(uv, float)
+        rays, valid = np.empty((len(uv), 3)), np.empty(len(uv), dtype=np.bool_)
+        _unproject(params, uv, radial.monotonic_limit(params[4:6]), rays, valid)
+        return rays, valid
+
+
+@njit(cache=True, nogil=True)
+def _distort(params, a, b):
+    """Distorted (a, b), d of it / d (a, b) as (aa, ab = ba, bb): the Jacobian of this distortion is symmetric."""
+    k1, k2, p1, p2 = params[4], params[5], params[6], params[7]
+    s = a * a + b * b
+    d = 1.0 + s * (k1 + s * k2)
+    slope = 2.0 * (k1 + 2.0 * k2 * s)
+    distorted_a = a * d + 2.0 * p1 * a * b + p2 * (s + 2.0 * a * a)
+    distorted_b = b * d + p1 * (s + 2.0 * b * b) + 2.0 * p2 * a * b
+    j_aa = d + a * a * slope + 2.0 * p1 * b + 6.0 * p2 * a
+    j_ab = a * b * slope + 2.0 * p1 * a + 2.0 * p2 * b
+    j_bb = d + b * b * slope + 6.0 * p1 * b + 2.0 * p2 * a
+    return distorted_a, distorted_b, j_aa, j_ab, j_bb
+
+
+@njit(cache=True, nogil=True)
+def _project(params, points, limit, uv, valid):
+    for i in range(len(points)):
+        z = points[i, 2]
+        inverse_z = 1.0 / z if z > _MIN_DEPTH else 0.0
+        a, b = points[i, 0] * inverse_z, points[i, 1] * inverse_z
+        valid[i] = z > _MIN_DEPTH and a * a + b * b < limit * limit
+        if valid[i]:
+            distorted_a, distorted_b, _, _, _ = _distort(params, a, b)
+            uv[i, 0] = params[0] * distorted_a + params[2]
+            uv[i, 1] = params[1] * distorted_b + params[3]
+        else:
+            uv[i] = 0.0
+
+
+@njit(cache=True, nogil=True)
+def _project_with_jacobians(params, points, limit, uv, valid, j_point, j_params):
+    fx, fy = params[0], params[1]
+    for i in range(len(points)):
+        z = points[i, 2]
+        inverse_z = 1.0 / z if z > _MIN_DEPTH else 0.0
+        a, b = points[i, 0] * inverse_z, points[i, 1] * inverse_z
+        s = a * a + b * b
+        valid[i] = z > _MIN_DEPTH and s < limit * limit
+        j_params[i] = 0.0
+        if not valid[i]:
+            uv[i] = 0.0
+            j_point[i] = 0.0
+            continue
+        distorted_a, distorted_b, j_aa, j_ab, j_bb = _distort(params, a, b)
+        uv[i, 0], uv[i, 1] = fx * distorted_a + params[2], fy * distorted_b + params[3]
+        scale_u, scale_v = fx * inverse_z, fy * inverse_z
+        j_point[i, 0, 0], j_point[i, 0, 1] = scale_u * j_aa, scale_u * j_ab
+        j_point[i, 1, 0], j_point[i, 1, 1] = scale_v * j_ab, scale_v * j_bb
+        j_point[i, 0, 2] = -scale_u * (a * j_aa + b * j_ab)
+        j_point[i, 1, 2] = -scale_v * (a * j_ab + b * j_bb)
+        j_params[i, 0, 0], j_params[i, 0, 2] = distorted_a, 1.0
+        j_params[i, 0, 4], j_params[i, 0, 5] = fx * a * s, fx * a * s * s
+        j_params[i, 0, 6], j_params[i, 0, 7] = 2.0 * fx * a * b, fx * (s + 2.0 * a * a)
+        j_params[i, 1, 1], j_params[i, 1, 3] = distorted_b, 1.0
+        j_params[i, 1, 4], j_params[i, 1, 5] = fy * b * s, fy * b * s * s
+        j_params[i, 1, 6], j_params[i, 1, 7] = fy * (s + 2.0 * b * b), 2.0 * fy * a * b
+
+
+@njit(cache=True, nogil=True)
+def _undistort(params, limit, distorted_a, distorted_b):
+    """(a, b) and whether Newton converged inside the monotonic range; starts where the radial part alone would be."""
+    distorted_r = np.hypot(distorted_a, distorted_b)
+    # At the limit itself the radial slope is zero; 0.9 leaves room for tangential terms that reach slightly past it.
+    r = min(radial.invert(params[4:6], distorted_r, limit), 0.9 * limit)
+    scale = r / distorted_r if distorted_r > 0.0 else 1.0
+    a, b = scale * distorted_a, scale * distorted_b
+    for _ in range(_MAX_NEWTON_STEPS):
+        value_a, value_b, j_aa, j_ab, j_bb = _distort(params, a, b)
+        determinant = j_aa * j_bb - j_ab * j_ab
+        if not determinant > 0.0:
+            return a, b, False
+        error_a, error_b = value_a - distorted_a, value_b - distorted_b
+        step_a = (j_bb * error_a - j_ab * error_b) / determinant
+        step_b = (j_aa * error_b - j_ab * error_a) / determinant
+        a, b = a - step_a, b - step_b
+        if abs(step_a) + abs(step_b) <= 1e-14 * (1.0 + abs(a) + abs(b)):
+            return a, b, a * a + b * b < limit * limit
+    return a, b, False
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # a focal length of zero: nothing is valid
+def _unproject(params, uv, limit, rays, valid):
+    for i in range(len(uv)):
+        mx, my = (uv[i, 0] - params[2]) / params[0], (uv[i, 1] - params[3]) / params[1]
+        a, b, valid[i] = 0.0, 0.0, False
+        if np.isfinite(mx) and np.isfinite(my):
+            a, b, valid[i] = _undistort(params, limit, mx, my)
+        if not valid[i]:
+            a, b = 0.0, 0.0
+        norm = np.sqrt(1.0 + a * a + b * b)
+        rays[i, 0], rays[i, 1], rays[i, 2] = a / norm, b / norm, 1.0 / norm

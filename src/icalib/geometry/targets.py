@@ -1,0 +1,56 @@
+"""Calibration targets: where their points are, in the board frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from icalib.errors import RecordingError
+
+_CORNERS = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])  # of a unit tag, corner 0 to 3
+
+
+@dataclass(frozen=True)
+class AprilGrid:
+    """Kalibr's AprilGrid: `rows` x `cols` tags of edge `tag_size` [m], gaps of `tag_spacing` * tag_size.
+
+    Board frame: origin at corner 0 of tag 0, x along a row, y along a column, the tags in z = 0. Tag ids run row-major.
+    """
+
+    rows: int
+    cols: int
+    tag_size: float
+    tag_spacing: float
+
+    @cached_property
+    def points(self) -> np.ndarray:
+        """(4 * rows * cols, 3) corners in metres, corner c of tag i at index 4 i + c."""
+        pitch = self.tag_size * (1.0 + self.tag_spacing)
+        row, col = np.divmod(np.arange(self.rows * self.cols), self.cols)
+        origin = pitch * np.stack([col, row], axis=1)
+        xy = origin[:, None, :] + self.tag_size * _CORNERS[None]
+        return np.concatenate([xy.reshape(-1, 2), np.zeros((4 * len(origin), 1))], axis=1)
+
+    @cached_property
+    def tag_centers(self) -> np.ndarray:
+        """(4 * rows * cols, 3) for each corner, the centre of its tag in metres."""
+        centers = self.points.reshape(-1, 4, 3).mean(axis=1)
+        return np.repeat(centers, 4, axis=0)
+
+    def point_index(self, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarray:
+        """(N,) index into `points`. Raises RecordingError for a tag or corner that this target does not have."""
+        tag_id, corner = np.asarray(tag_id, dtype=np.int64), np.asarray(corner, dtype=np.int64)
+        n_tags = self.rows * self.cols
+        bad = (tag_id < 0) | (tag_id >= n_tags)
+        if bad.any():
+            raise RecordingError(
+                f"tag {tag_id[bad][0]} is not on the target ({self.rows} x {self.cols} tags, ids 0 to {n_tags - 1}); "
+                "check rows and cols in the rig file."
+            )
+        if ((corner < 0) | (corner > 3)).any():
+            raise RecordingError(
+                f"corner {corner[(corner < 0) | (corner > 3)][0]} is not one of a tag's corners 0 to 3."
+            )
+        return 4 * tag_id + corner

@@ -1,0 +1,1 @@
+"""A first guess of everything, from the measurements alone."""

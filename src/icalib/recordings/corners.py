@@ -1,0 +1,83 @@
+"""Rows of corners -> one camera's stream, grouped by image."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icalib.errors import RecordingError
+from icalib.geometry.targets import AprilGrid
+from icalib.measurements import CornerStream
+
+
+def group_corners(
+    name: str,
+    source: str,
+    stamps_ns: np.ndarray,
+    tag: np.ndarray,
+    corner: np.ndarray,
+    uv: np.ndarray,
+    target: AprilGrid,
+) -> CornerStream:
+    """Group the rows (stamps_ns, tag, corner (N,) int64; uv (N, 2) px) of one camera by image.
+
+    Raises RecordingError naming `source` and the instant: images out of order, a corner that the target does not have,
+    or one that appears twice in an image.
+    """
+    step = np.diff(stamps_ns)
+    if (step < 0).any():
+        i = int(np.argmax(step < 0))
+        raise RecordingError(
+            f"{source}: the image at {stamps_ns[i + 1]} ns comes after the one at {stamps_ns[i]} ns; sort the rows by stamp."
+        )
+    point = _point_index(source, stamps_ns, tag, corner, target)
+    first = np.flatnonzero(np.concatenate([[True], step > 0]))
+    start = np.append(first, len(stamps_ns)).astype(np.int64)
+    _refuse_repeated(source, stamps_ns, tag, corner, point, start, len(target.points))
+    return CornerStream(name, stamps_ns[first], start, point, np.ascontiguousarray(uv))
+
+
+def _point_index(
+    source: str, stamps_ns: np.ndarray, tag: np.ndarray, corner: np.ndarray, target: AprilGrid
+) -> np.ndarray:
+    try:
+        return target.point_index(tag, corner)
+    except RecordingError:
+        row = _first_unknown(tag, corner, target)
+    try:
+        return target.point_index(tag[row : row + 1], corner[row : row + 1])
+    except RecordingError as error:
+        raise RecordingError(f"{source}: in the image at {stamps_ns[row]} ns, {error}") from None
+
+
+def _first_unknown(tag: np.ndarray, corner: np.ndarray, target: AprilGrid) -> int:
+    """Bisects for the first row that `target` refuses, so that what it refuses is written in one place only."""
+    known, refused = 0, len(tag)
+    while refused - known > 1:
+        middle = (known + refused) // 2
+        try:
+            target.point_index(tag[:middle], corner[:middle])
+            known = middle
+        except RecordingError:
+            refused = middle
+    return refused - 1
+
+
+def _refuse_repeated(
+    source: str,
+    stamps_ns: np.ndarray,
+    tag: np.ndarray,
+    corner: np.ndarray,
+    point: np.ndarray,
+    start: np.ndarray,
+    n_points: int,
+) -> None:
+    image = np.repeat(np.arange(len(start) - 1), np.diff(start))
+    key = image * n_points + point
+    order = np.argsort(key, kind="stable")
+    repeated = order[1:][np.diff(key[order]) == 0]
+    if len(repeated):
+        row = int(repeated.min())
+        raise RecordingError(
+            f"{source}: the image at {stamps_ns[row]} ns has corner {corner[row]} of tag {tag[row]} twice; "
+            "remove one, or give images taken at the same instant different cameras."
+        )

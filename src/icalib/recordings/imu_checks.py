@@ -1,0 +1,114 @@
+"""Is this an IMU's stream in rad/s, m/s^2 and nanoseconds?"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icalib.errors import RecordingError
+from icalib.measurements import ImuStream
+from icalib.recordings.clocks import rate_sentence
+
+_RATE_HZ = (10.0, 20_000.0)
+_FASTEST_RAD_S = 35.0  # 2000 deg/s, the widest range of common gyroscopes
+_G_UNITS = (0.5, 2.0)  # of the median |accel|: a reading of gravity in units of g
+_GRAVITY_M_S2 = (5.0, 20.0)
+_SATURATED_RUN = 5
+# No sensor's range is narrower (125 deg/s, 2 g); below it, equal readings are coarse quantisation, not saturation.
+_NARROWEST_RANGE = {"gyroscope": 2.0, "accelerometer": 17.0}
+
+
+def checked_imu(imu: ImuStream, where: str) -> tuple[ImuStream, tuple[str, ...]]:
+    """`imu` with strictly increasing stamps, and notes on what was dropped or looks saturated.
+
+    Raises RecordingError naming `where` (the file) and the instant: too few readings, NaN, stamps out of order or
+    repeated with other values, a frozen sensor, other units of time, angular rate or acceleration.
+    """
+    what = f"{where} ({imu.name})"
+    if len(imu.stamps_ns) < 2:
+        raise RecordingError(f"{what}: only {len(imu.stamps_ns)} reading; a calibration needs the whole recording.")
+    _refuse_non_finite(imu, what)
+    _refuse_disorder(imu, what)
+    sentence = rate_sentence(what, imu.stamps_ns, *_RATE_HZ)
+    if sentence:
+        raise RecordingError(sentence)
+    imu, notes = _without_repeats(imu, what)
+    _refuse_units(imu, what)
+    return imu, notes + _saturation_notes(imu, what)
+
+
+def _refuse_non_finite(imu: ImuStream, what: str) -> None:
+    bad = ~(np.isfinite(imu.gyro).all(axis=1) & np.isfinite(imu.accel).all(axis=1))
+    if bad.any():
+        raise RecordingError(f"{what}: the reading at {imu.stamps_ns[np.argmax(bad)]} ns is not finite; remove it.")
+
+
+def _refuse_disorder(imu: ImuStream, what: str) -> None:
+    back = np.diff(imu.stamps_ns) < 0
+    if back.any():
+        i = int(np.argmax(back))
+        raise RecordingError(
+            f"{what}: the reading at {imu.stamps_ns[i + 1]} ns comes after the one at {imu.stamps_ns[i]} ns; "
+            "sort the readings by stamp, or record again if the clock was set back."
+        )
+
+
+def _without_repeats(imu: ImuStream, what: str) -> tuple[ImuStream, tuple[str, ...]]:
+    repeat = np.concatenate([[False], np.diff(imu.stamps_ns) == 0])
+    if not repeat.any():
+        return imu, ()
+    readings = np.hstack([imu.gyro, imu.accel])
+    differs = repeat.copy()
+    differs[1:] &= (np.diff(readings, axis=0) != 0).any(axis=1)
+    if differs.any():
+        instant = imu.stamps_ns[np.argmax(differs)]
+        raise RecordingError(
+            f"{what}: two different readings are both stamped {instant} ns; export the IMU's own stamps, or remove one."
+        )
+    first = imu.stamps_ns[np.argmax(repeat)]
+    note = f"{what}: {int(repeat.sum())} repeated readings were dropped, the first at {first} ns."
+    keep = ~repeat
+    return ImuStream(imu.name, imu.stamps_ns[keep], imu.gyro[keep], imu.accel[keep]), (note,)
+
+
+def _refuse_units(imu: ImuStream, what: str) -> None:
+    for kind, values in (("gyroscope", imu.gyro), ("accelerometer", imu.accel)):
+        if (values == values[0]).all():
+            raise RecordingError(f"{what}: the {kind} gives the same reading from start to end; check its driver.")
+    gravity = float(np.median(np.linalg.norm(imu.accel, axis=1)))
+    if _G_UNITS[0] <= gravity <= _G_UNITS[1]:
+        raise RecordingError(
+            f"{what}: the median |accel| is {gravity:.3g}, which looks like units of g; multiply by 9.80665 to get m/s^2."
+        )
+    if not _GRAVITY_M_S2[0] <= gravity <= _GRAVITY_M_S2[1]:
+        raise RecordingError(
+            f"{what}: the median |accel| is {gravity:.3g}, far from gravity, 9.81 m/s^2; the columns must be t [ns], "
+            "gyroscope x, y, z [rad/s], accelerometer x, y, z [m/s^2], gravity included."
+        )
+    fast = float(np.percentile(np.linalg.norm(imu.gyro, axis=1), 99))
+    if fast > _FASTEST_RAD_S:
+        raise RecordingError(
+            f"{what}: the angular rate reaches {fast:.3g}, more than any hand or robot turns in rad/s; "
+            "it looks like deg/s; multiply by pi / 180."
+        )
+
+
+def _saturation_notes(imu: ImuStream, what: str) -> tuple[str, ...]:
+    notes = []
+    for kind, values in (("gyroscope", imu.gyro), ("accelerometer", imu.accel)):
+        for axis, name in enumerate("xyz"):
+            for limit in (values[:, axis].max(), values[:, axis].min()):
+                at, count = _longest_run(values[:, axis] == limit)
+                if abs(limit) >= _NARROWEST_RANGE[kind] and count >= _SATURATED_RUN:
+                    notes.append(
+                        f"{what}: the {kind} {name} looks saturated, {count} readings in a row at {limit:.4g} "
+                        f"from {imu.stamps_ns[at]} ns on; move less quickly or set a wider range."
+                    )
+    return tuple(notes)
+
+
+def _longest_run(flag: np.ndarray) -> tuple[int, int]:
+    """Where the longest run of True in `flag` (N,) begins, and its length."""
+    edge = np.diff(np.concatenate([[0], flag.astype(np.int8), [0]]))
+    begin, end = np.flatnonzero(edge == 1), np.flatnonzero(edge == -1)
+    longest = int(np.argmax(end - begin))
+    return int(begin[longest]), int(end[longest] - begin[longest])

@@ -1,0 +1,1 @@
+"""The calibration as a page to read: `report.html`."""

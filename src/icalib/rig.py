@@ -1,0 +1,103 @@
+"""What is on the robot and what is to be calibrated: the rig, as frozen dataclasses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from icalib.geometry.targets import AprilGrid
+
+Mode = Literal["free", "fixed", "prior"]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """How one group of parameters is treated.
+
+    free: estimated, `value` (if given) is where the solver starts. fixed: held at `value`. prior: estimated, with a
+    Gaussian prior of mean `value` and standard deviation `sigma`. value None: the program finds its own start.
+    Rotations are 3x3 matrices R_imu_sensor with sigma (3,) in rad about the sensor's axes (right perturbation); all
+    else are vectors with sigma of the same shape.
+    """
+
+    mode: Mode = "free"
+    value: np.ndarray | None = None
+    sigma: np.ndarray | None = None
+
+
+def fixed(value: object) -> Parameter:
+    return Parameter("fixed", np.asarray(value, dtype=np.float64))
+
+
+@dataclass(frozen=True)
+class ImuNoise:
+    """Continuous-time noise: gyro rad/s/sqrt(Hz), gyro_walk rad/s^2/sqrt(Hz), accel m/s^2/sqrt(Hz), accel_walk m/s^3/sqrt(Hz)."""
+
+    gyro: float
+    gyro_walk: float
+    accel: float
+    accel_walk: float
+    source: str = "rig file"  # or "default for a consumer IMU", printed with the result
+
+
+@dataclass(frozen=True)
+class ImuSensor:
+    """The inertial sensor; its frame is the body frame."""
+
+    name: str
+    path: str
+    noise: ImuNoise
+    intrinsics: Parameter = field(default_factory=lambda: Parameter("fixed"))  # 24: see estimation.imu_model
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One camera. Intrinsics are (fx, fy, cx, cy) in pixels, distortion the model's coefficients."""
+
+    name: str
+    path: str
+    model: str
+    resolution: tuple[int, int]
+    corner_noise_px: float | None = None  # None: estimated from the residuals
+    rotation: Parameter = Parameter()
+    translation: Parameter = Parameter()
+    time_offset: Parameter = Parameter()
+    intrinsics: Parameter = Parameter()
+    distortion: Parameter = Parameter()
+    bloom: Parameter = Parameter()
+
+
+Scheme = Literal["inertial", "pose", "kinematic"]
+Loss = Literal["none", "huber", "cauchy"]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How the estimate is made; every field has a default that just works."""
+
+    scheme: Scheme = "inertial"  # where a sensor was between nodes
+    loss: Loss = "huber"  # robust loss on corners
+    loss_scale: float = 2.5  # in standard deviations, where the loss starts to bend
+    outliers: bool = True  # drop corners far off the rest of their image
+    bloom: bool = True  # corners pulled towards their tag's centre, one size a camera
+    board_shape: bool = True  # the target is not flat: estimate how it bends
+    blur_noise: bool = True  # corners of fast images weigh less
+    common_error: bool = True  # corners of one image share an error
+    splits: int = 8  # segments for the empirical factor, 0: none
+    max_gap_s: float = 0.5  # IMU gaps up to this are bridged; longer ones split the recording
+    node_spacing_s: float = 0.05  # no two nodes further apart
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The whole robot."""
+
+    imu: ImuSensor
+    cameras: tuple[Camera, ...]
+    target: AprilGrid
+    gravity: float = 9.81  # m/s^2
+    settings: Settings = Settings()
+    path: Path | None = None

@@ -1,0 +1,147 @@
+"""One parameter group of the rig file: free, a guess, fixed or a prior; and back to plain data."""
+
+from __future__ import annotations
+
+from math import radians
+from typing import Any
+
+import numpy as np
+
+from icalib.rig import Parameter
+from icalib.yaml_nodes import YamlValue
+
+_FORMS = "write free, {guess: VALUE}, {fixed: VALUE} or {prior: VALUE, sigma: SIGMA}"
+_ROTATION_FORMS = "a 3x3 matrix, {xyzw: [x, y, z, w]} or {rpy_deg: [roll, pitch, yaw]}"
+_ROUNDING = 1e-3  # published rotations have few digits; beyond it a value is a mistake
+_EXACT = 1e-12
+
+# Broad priors of the IMU intrinsics (order as in estimation.imu_model): scale and misalignment of the accelerometer (6)
+# and the gyroscope (6), rotation between them [rad] (3), g-sensitivity [rad/s per m/s^2] (9).
+IMU_INTRINSICS_SIGMA = np.repeat([0.05, 0.05, 0.05, 0.01], [6, 6, 3, 9])
+
+
+def vector_parameter(value: YamlValue, size: int) -> Parameter:
+    """A group of `size` numbers. Raises RigError naming line and field."""
+    mode, found = _mode(value, ("sigma",))
+    if found is None:
+        return Parameter("free")
+    mean = found[mode].vector(size)
+    if mode != "prior":
+        return Parameter("free" if mode == "guess" else "fixed", mean)
+    return Parameter("prior", mean, _sigma(found["sigma"], size))
+
+
+def rotation_parameter(value: YamlValue) -> Parameter:
+    """A rotation R_imu_sensor; sigma in rad or sigma_deg. Raises RigError naming line and field."""
+    mode, found = _mode(value, ("sigma", "sigma_deg"))
+    if found is None:
+        return Parameter("free")
+    matrix = _rotation(found[mode])
+    if mode != "prior":
+        return Parameter("free" if mode == "guess" else "fixed", matrix)
+    if "sigma_deg" in found:
+        return Parameter("prior", matrix, np.deg2rad(_sigma(found["sigma_deg"], 3)))
+    return Parameter("prior", matrix, _sigma(found["sigma"], 3))
+
+
+def imu_intrinsics_parameter(value: YamlValue) -> Parameter:
+    """24 numbers, zero for an ideal IMU; `free` and `prior: default` are broad priors about the ideal IMU."""
+    if value.is_mapping and list(value.entries()) == ["prior"]:
+        value.entries()["prior"].choice("prior without sigma", ("default",))
+        return Parameter("prior", np.zeros(24), IMU_INTRINSICS_SIGMA.copy())
+    parameter = vector_parameter(value, 24)
+    if parameter.mode == "free":
+        start = np.zeros(24) if parameter.value is None else parameter.value
+        return Parameter("prior", start, IMU_INTRINSICS_SIGMA.copy())
+    return parameter
+
+
+def parameter_to_plain(parameter: Parameter) -> Any:
+    """Lists, numbers and text that load back as `parameter`; None for a fixed group without a value (a default)."""
+    if parameter.value is None:
+        return "free" if parameter.mode == "free" else None
+    key = "guess" if parameter.mode == "free" else parameter.mode
+    plain: dict[str, Any] = {key: parameter.value.tolist()}
+    if parameter.sigma is not None:
+        plain["sigma"] = parameter.sigma.tolist()
+    return plain
+
+
+def _mode(value: YamlValue, sigmas: tuple[str, ...]) -> tuple[str, dict[str, YamlValue] | None]:
+    """guess, fixed or prior and the fields given with it; ("free", None) for plain free."""
+    if not value.is_mapping:
+        if value.is_list or value.text() != "free":
+            value.fail(f"must be free or a mapping, but is {value.shown()}; {_FORMS}.")
+        return "free", None
+    found = value.record((), ("guess", "fixed", "prior", *sigmas))
+    modes = [name for name in ("guess", "fixed", "prior") if name in found]
+    if len(modes) != 1:
+        value.fail(f"needs exactly one of guess, fixed and prior, but has {' and '.join(modes) or 'none'}; {_FORMS}.")
+    given = [name for name in sigmas if name in found]
+    if modes[0] == "prior" and len(given) != 1:
+        value.fail(f"a prior needs exactly one of {' and '.join(sigmas)}; {_FORMS}.")
+    if modes[0] != "prior" and given:
+        found[given[0]].fail(f"belongs to a prior, not to {modes[0]}; {_FORMS}.")
+    return modes[0], found
+
+
+def _sigma(value: YamlValue, size: int) -> np.ndarray:
+    """(size,) standard deviations; one number stands for all."""
+    sigma = value.vector(size) if value.is_list else np.full(size, value.number())
+    if (sigma <= 0).any():
+        value.fail(f"a standard deviation must be above 0, but is {sigma.min():g}; to hold the value, write fixed.")
+    return sigma
+
+
+def _rotation(value: YamlValue) -> np.ndarray:
+    """(3, 3) rotation, re-orthonormalised where its digits were rounded."""
+    if value.is_list:
+        return _matrix(value)
+    if not value.is_mapping:
+        value.fail(f"must be a rotation, {_ROTATION_FORMS}, but is {value.shown()}.")
+    found = value.record((), ("xyzw", "rpy_deg"))
+    if len(found) != 1:
+        value.fail(f"must be one rotation; write {_ROTATION_FORMS}.")
+    if "xyzw" in found:
+        return _from_quaternion(found["xyzw"])
+    return _from_rpy(*(radians(angle) for angle in found["rpy_deg"].vector(3)))
+
+
+def _matrix(value: YamlValue) -> np.ndarray:
+    rows = value.items()
+    if len(rows) != 3:
+        value.fail(f"a rotation matrix has 3 rows of 3 numbers, but this has {len(rows)}; write {_ROTATION_FORMS}.")
+    matrix = np.array([row.vector(3) for row in rows])
+    error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
+    if error > _ROUNDING:
+        value.fail(f"is not a rotation matrix (R R^T is off the identity by {error:.2g}); write {_ROTATION_FORMS}.")
+    if np.linalg.det(matrix) < 0:
+        value.fail("is a reflection (its determinant is -1), not a rotation; turn the sign of one axis.")
+    if error <= _EXACT:
+        return matrix
+    u, _, vt = np.linalg.svd(matrix)
+    return u @ vt
+
+
+def _from_quaternion(value: YamlValue) -> np.ndarray:
+    q = value.vector(4)
+    norm = float(np.linalg.norm(q))
+    if abs(norm - 1) > _ROUNDING:
+        value.fail(f"a unit quaternion [x, y, z, w] has norm 1, but this has {norm:.4g}; normalise it.")
+    x, y, z, w = q / norm
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _from_rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:
+    """Rz(yaw) Ry(pitch) Rx(roll), angles in rad."""
+    cr, sr, cp, sp, cy, sy = (f(a) for a in (roll, pitch, yaw) for f in (np.cos, np.sin))
+    rx = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    ry = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    rz = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    return rz @ ry @ rx

@@ -1,0 +1,110 @@
+"""What a camera reports: corners of the target, image by image, with everything that goes wrong with them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.geometry.targets import AprilGrid
+from icalib.measurements import CornerStream
+from icalib.simulation.imu import inside
+from icalib.simulation.motion import Trajectory
+from icalib.simulation.projection import image_velocity, project, visible
+from icalib.simulation.scenario import Scenario, SimCamera
+
+_MIN_CORNERS = 6
+_LEAD_S = 0.05  # images start and end this far inside the IMU's readings
+_DIFFERENCE_S = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class CornerTruth:
+    """seconds (M,): true instants of the images, IMU clock since its origin. Per corner: uv (N, 2) before noise and
+    outliers (bloom included), sigma (N,) [px] of the white noise, outlier (N,) bool."""
+
+    seconds: np.ndarray
+    uv: np.ndarray
+    sigma: np.ndarray
+    outlier: np.ndarray
+
+
+def board_surface(target: AprilGrid, bow: tuple[float, float, float], points: np.ndarray) -> np.ndarray:
+    """Points (N, 3) of the flat target moved out of its plane by z = a x^2 + b x y + c y^2 (see `Scenario`)."""
+    low, high = target.points[:, :2].min(axis=0), target.points[:, :2].max(axis=0)
+    x, y = ((points[:, :2] - 0.5 * (low + high)) / (0.5 * (high - low))).T
+    bent = points.copy()
+    bent[:, 2] += bow[0] * x**2 + bow[1] * x * y + bow[2] * y**2
+    return bent
+
+
+def image_stamps(scenario: Scenario, camera: SimCamera, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Stamps (M,) int64 ns on the camera's clock, and the instants (M,) [s] on the IMU's that these stamps mean."""
+    span = scenario.duration_s - 2.0 * _LEAD_S - camera.phase_s
+    taken = _LEAD_S + camera.phase_s + np.arange(int(span * camera.rate_hz) + 1) / camera.rate_hz
+    taken += rng.uniform(-camera.jitter_s, camera.jitter_s, len(taken))
+    since_origin = np.round((taken - camera.time_offset_s) * 1e9).astype(np.int64)
+    seconds = since_origin.astype(np.float64) * 1e-9 + camera.time_offset_s
+    kept = ~inside(camera.dropouts, seconds)
+    return since_origin[kept] + np.int64(camera.clock_origin_ns), seconds[kept]
+
+
+def see_corners(
+    scenario: Scenario, camera: SimCamera, trajectory: Trajectory, rng: np.random.Generator
+) -> tuple[CornerStream, CornerTruth]:
+    """Corners seen by one camera; images with fewer than 6 are dropped."""
+    stamps, seconds = image_stamps(scenario, camera, rng)
+    surface = board_surface(scenario.target, scenario.bow, scenario.target.points)
+    points = _in_camera(scenario, camera, trajectory, seconds, surface)
+    uv = project(camera, points)
+    seen = visible(camera, points, uv)
+    kept = seen.sum(axis=1) >= _MIN_CORNERS
+    stamps, seconds, points, uv, seen = stamps[kept], seconds[kept], points[kept], uv[kept], seen[kept]
+
+    uv = uv + camera.bloom_px * _towards_tag_center(scenario, camera, trajectory, seconds, points)
+    sigma = _corner_sigma(scenario, camera, trajectory, seconds, seen)
+    image, point = np.nonzero(seen)
+    true = uv[seen]
+    sigma = sigma[image]
+    shift = scenario.shift_px * float(scenario.corner_noise_enabled) * rng.standard_normal((len(stamps), 2))
+    measured = true + sigma[:, None] * rng.standard_normal(true.shape) + shift[image]
+    outlier = rng.random(len(true)) < scenario.outlier_fraction
+    measured[outlier] += rng.uniform(-scenario.outlier_px, scenario.outlier_px, (int(outlier.sum()), 2))
+    start = np.concatenate([[0], np.cumsum(seen.sum(axis=1))]).astype(np.int64)
+    stream = CornerStream(camera.name, stamps, start, point.astype(np.int64), measured)
+    return stream, CornerTruth(seconds, true, sigma, outlier)
+
+
+def _in_camera(
+    scenario: Scenario, camera: SimCamera, trajectory: Trajectory, seconds: np.ndarray, points: np.ndarray
+) -> np.ndarray:
+    """Points (N, 3) of the board in the camera frame at each instant, (M, N, 3)."""
+    rotation, position, _ = trajectory.pose_at(seconds)
+    world = points @ scenario.T_world_board[:3, :3].T + scenario.T_world_board[:3, 3]
+    imu = (world - position[:, None, :]) @ rotation
+    return (imu - camera.T_imu_cam[:3, 3]) @ camera.T_imu_cam[:3, :3]
+
+
+def _towards_tag_center(
+    scenario: Scenario, camera: SimCamera, trajectory: Trajectory, seconds: np.ndarray, points: np.ndarray
+) -> np.ndarray:
+    """(M, N, 2) unit image direction from each corner towards the centre of its tag, which lies on the bent board."""
+    surface = board_surface(scenario.target, scenario.bow, scenario.target.tag_centers)
+    direction = image_velocity(camera, points, _in_camera(scenario, camera, trajectory, seconds, surface) - points)
+    return direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+
+
+def _corner_sigma(
+    scenario: Scenario, camera: SimCamera, trajectory: Trajectory, seconds: np.ndarray, seen: np.ndarray
+) -> np.ndarray:
+    """(M,) standard deviation [px] of the corners of each image."""
+    if not scenario.corner_noise_enabled:
+        return np.zeros(len(seconds))
+    surface = board_surface(scenario.target, scenario.bow, scenario.target.points)
+    before, after = (
+        project(camera, _in_camera(scenario, camera, trajectory, seconds + dt, surface))
+        for dt in (-_DIFFERENCE_S, _DIFFERENCE_S)
+    )
+    velocity = np.where(seen[..., None], (after - before) / (2.0 * _DIFFERENCE_S), 0.0)
+    mean_square_speed = np.sum(velocity**2, axis=(1, 2)) / seen.sum(axis=1)
+    return np.sqrt(camera.corner_noise_px**2 + scenario.blur_s**2 * mean_square_speed)

@@ -1,0 +1,75 @@
+"""What the IMU reads: sensor model, biases that walk, white noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.simulation.motion import skew
+from icalib.simulation.scenario import Interval, Scenario
+
+_LOWER = ((0, 1, 1, 2, 2, 2), (0, 0, 1, 0, 1, 2))  # rows, columns of xx, yx, yy, zx, zy, zz
+
+
+@dataclass(frozen=True, eq=False)
+class ImuReadings:
+    """gyro, accel, and the biases in them, all (N, 3)."""
+
+    gyro: np.ndarray
+    accel: np.ndarray
+    gyro_bias: np.ndarray
+    accel_bias: np.ndarray
+
+
+def inside(intervals: tuple[Interval, ...], seconds: np.ndarray) -> np.ndarray:
+    """(N,) whether each instant lies in one of the intervals, ends included."""
+    hit = np.zeros(len(seconds), dtype=bool)
+    for start, end in intervals:
+        hit |= (seconds >= start) & (seconds <= end)
+    return hit
+
+
+def imu_stamps(scenario: Scenario, rng: np.random.Generator) -> np.ndarray:
+    """(N,) int64 ns since the IMU clock's origin; the first is 0."""
+    count = round(scenario.duration_s * scenario.imu_rate_hz) + 1
+    seconds = np.arange(count) / scenario.imu_rate_hz
+    seconds[1:] += rng.uniform(-scenario.imu_jitter_s, scenario.imu_jitter_s, count - 1)
+    return np.round(seconds * 1e9).astype(np.int64)
+
+
+def distort(intrinsics: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """True rates and forces (N, 6) through Kalibr's scale-misalignment model (see `Scenario`), without bias."""
+    M_a, M_g = np.eye(3), np.eye(3)
+    M_a[_LOWER] += intrinsics[:6]
+    M_g[_LOWER] += intrinsics[6:12]
+    C_g = rotation_from_vector(intrinsics[12:15])
+    A_g = intrinsics[15:24].reshape(3, 3)
+    rate, force = true[:, :3], true[:, 3:]
+    return np.concatenate([rate @ (M_g @ C_g).T + force @ A_g.T, force @ M_a.T], axis=1)
+
+
+def rotation_from_vector(vector: np.ndarray) -> np.ndarray:
+    """Exp of a rotation vector (3,) [rad] by Rodrigues' formula."""
+    angle = float(np.linalg.norm(vector))
+    if angle == 0.0:
+        return np.eye(3)
+    K = skew(vector / angle)
+    return np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * K @ K
+
+
+def read_imu(scenario: Scenario, seconds: np.ndarray, true: np.ndarray, rng: np.random.Generator) -> ImuReadings:
+    """Readings of true rates and forces (N, 6) at seconds (N,).
+
+    A density d gives each reading a standard deviation d sqrt(rate); a walk density w adds w sqrt(dt) N(0, 1)
+    to the bias from one reading to the next.
+    """
+    noise = scenario.imu_noise
+    white, steps = rng.standard_normal((2, len(seconds), 6)) * float(scenario.imu_noise_enabled)
+    white *= np.sqrt(scenario.imu_rate_hz) * np.repeat([noise.gyro, noise.accel], 3)
+    steps *= np.repeat([noise.gyro_walk, noise.accel_walk], 3)
+    steps[0] = 0.0
+    steps[1:] *= np.sqrt(np.diff(seconds))[:, None]
+    bias = np.concatenate([scenario.gyro_bias, scenario.accel_bias]) + np.cumsum(steps, axis=0)
+    reading = distort(scenario.imu_intrinsics, true) + bias + white
+    return ImuReadings(reading[:, :3], reading[:, 3:], bias[:, :3], bias[:, 3:])

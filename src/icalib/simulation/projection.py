@@ -1,0 +1,78 @@
+"""Pinhole projection with radial-tangential or equidistant distortion, written so that complex points pass through.
+
+A direction in the image is then Im(project(P + i h d)) / h, exact to rounding: no Jacobian to get wrong.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icalib.simulation.scenario import SimCamera
+
+_COMPLEX_STEP = 1e-30
+
+
+def project(camera: SimCamera, points: np.ndarray) -> np.ndarray:
+    """Points (..., 3) in the camera frame [m] -> (..., 2) [px]; meaningful where `visible`."""
+    distorted = _radtan if camera.model == "pinhole-radtan" else _equidistant
+    fx, fy, cx, cy = camera.intrinsics
+    x, y = distorted(camera.distortion, points[..., 0], points[..., 1], points[..., 2])
+    return np.stack([fx * x + cx, fy * y + cy], axis=-1)
+
+
+def image_velocity(camera: SimCamera, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """d/ds project(P + s d) at s = 0, (..., 2) [px per unit of s], by the complex step."""
+    return np.imag(project(camera, points + 1j * _COMPLEX_STEP * directions)) / _COMPLEX_STEP
+
+
+def visible(camera: SimCamera, points: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """(...,) bool: in front of the camera, before the distortion folds back, and inside the image."""
+    radius = np.hypot(points[..., 0], points[..., 1])
+    z = points[..., 2]
+    if camera.model == "pinhole-radtan":
+        k1, k2 = camera.distortion[:2]
+        seen = (z > 0.0) & (radius < _first_extremum((k1, k2)) * z)
+    else:
+        seen = np.arctan2(radius, z) < min(_first_extremum(camera.distortion), np.pi)
+    width, height = camera.resolution
+    u, v = uv[..., 0], uv[..., 1]
+    return seen & (u >= 0.0) & (u <= width - 1.0) & (v >= 0.0) & (v <= height - 1.0)
+
+
+def _radtan(
+    distortion: tuple[float, ...], X: np.ndarray, Y: np.ndarray, Z: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Brown's model as in OpenCV: (k1, k2, p1, p2)."""
+    k1, k2, p1, p2 = distortion
+    x, y = X / Z, Y / Z
+    r2 = x * x + y * y
+    radial = 1.0 + k1 * r2 + k2 * r2**2
+    return (
+        x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+        y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+    )
+
+
+def _equidistant(
+    distortion: tuple[float, ...], X: np.ndarray, Y: np.ndarray, Z: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Kannala and Brandt: radius = theta + k1 theta^3 + k2 theta^5 + k3 theta^7 + k4 theta^9."""
+    radius = np.sqrt(X * X + Y * Y)
+    radius = np.where(radius == 0.0, 1e-300, radius)
+    # arctan2 has no complex form; the two branches keep its argument below one.
+    steep = np.real(radius) > np.abs(np.real(Z))
+    theta = np.where(
+        steep,
+        0.5 * np.pi - np.arctan(np.where(steep, Z, 0.0) / radius),
+        np.arctan(radius / np.where(steep, 1.0, Z)) + np.where(np.real(Z) < 0.0, np.pi, 0.0),
+    )
+    bent = theta * (1.0 + sum(k * theta ** (2 * i + 2) for i, k in enumerate(distortion)))
+    return bent * X / radius, bent * Y / radius
+
+
+def _first_extremum(coefficients: tuple[float, ...]) -> float:
+    """Smallest positive r where r (1 + k1 r^2 + k2 r^4 + ...) stops growing; infinity if nowhere."""
+    slope = [(2 * i + 3) * k for i, k in enumerate(coefficients)]
+    roots = np.roots([*reversed(slope), 1.0])
+    squares = roots[(np.abs(roots.imag) < 1e-12) & (roots.real > 0.0)].real
+    return float(np.sqrt(squares.min())) if len(squares) else np.inf

@@ -1,0 +1,187 @@
+"""What to simulate: the rig's truth, the motion and every disturbance, as frozen dataclasses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from icalib.errors import RigError
+from icalib.geometry.targets import AprilGrid
+from icalib.rig import ImuNoise
+
+MotionKind = Literal["handheld", "planar", "single_axis", "motionless"]
+Interval = tuple[float, float]  # (start, end) in seconds on the IMU's clock, since its origin
+
+MODELS = ("pinhole-radtan", "pinhole-equidistant")
+ADIS16448 = ImuNoise(1.6968e-4, 1.9393e-5, 2.0e-3, 3.0e-3, source="data sheet of the ADIS16448")
+GRAVITY_WORLD = np.array([0.0, 0.0, -9.81])  # m/s^2
+
+_EUROC_T_IMU_CAM0 = (
+    (0.0148655429818, -0.999880929698, 0.00414029679422, -0.0216401454975),
+    (0.999557249008, 0.0149672133247, 0.025715529948, -0.064676986768),
+    (-0.0257744366974, 0.00375618835797, 0.999660727178, 0.00981073058949),
+    (0.0, 0.0, 0.0, 1.0),
+)
+_EUROC_T_IMU_CAM1 = (
+    (0.0125552670891, -0.999755099723, 0.0182237714554, -0.0198435579556),
+    (0.999598781151, 0.0130119051815, 0.0251588363115, 0.0453689425024),
+    (-0.0253898008918, 0.0179005838253, 0.999517347078, 0.00786212447038),
+    (0.0, 0.0, 0.0, 1.0),
+)
+
+
+def pose_from_rows(rows: object) -> np.ndarray:
+    """4x4 pose from printed numbers: the rotation is made orthonormal (nearest in the Frobenius norm, by SVD)."""
+    T = np.array(rows, dtype=np.float64)
+    left, _, right = np.linalg.svd(T[:3, :3])
+    T[:3, :3] = left @ right
+    return T
+
+
+def _standing_board() -> np.ndarray:
+    """T_world_board: y nearly up, the tags facing -y of the world, yawed, leaning and rolled by a few degrees."""
+    yaw, lean, roll = np.deg2rad([25.0, 6.0, 3.0])
+    stand = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    about_z = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
+    about_x = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(lean), -np.sin(lean)], [0.0, np.sin(lean), np.cos(lean)]])
+    in_plane = np.array([[np.cos(roll), -np.sin(roll), 0.0], [np.sin(roll), np.cos(roll), 0.0], [0.0, 0.0, 1.0]])
+    T = np.eye(4)
+    T[:3, :3] = about_z @ about_x @ stand @ in_plane
+    T[:3, 3] = [0.3, -0.2, 1.0]
+    return T
+
+
+@dataclass(frozen=True, eq=False)
+class SimCamera:
+    """One true camera.
+
+    Image i is taken at phase_s + i / rate_hz (IMU clock), and stamped by the camera's own clock so that
+    t_imu = t_cam + time_offset_s, both counted from their clock's origin; stamps are rounded to ns, and the truth is
+    evaluated at the rounded stamp. intrinsics are (fx, fy, cx, cy) [px]. bloom_px moves each corner towards its
+    tag's centre, along the image direction of that centre at the corner. No target is seen during `dropouts`.
+    Raises RigError for an unknown model.
+    """
+
+    name: str
+    model: str
+    resolution: tuple[int, int]
+    intrinsics: tuple[float, ...]
+    distortion: tuple[float, ...]
+    T_imu_cam: np.ndarray  # (4, 4)
+    time_offset_s: float = 0.0
+    rate_hz: float = 20.0
+    phase_s: float = 0.0
+    clock_origin_ns: int = 0
+    jitter_s: float = 0.0  # instants shifted by uniform +-jitter_s, below half a period
+    corner_noise_px: float = 0.2
+    bloom_px: float = 0.0
+    dropouts: tuple[Interval, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.model not in MODELS:
+            raise RigError(f"{self.name}: no camera model {self.model!r} to simulate; there are {', '.join(MODELS)}.")
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How the rig moves in front of the board: sums of sinusoids around a pose `distance_m` in front of its centre.
+
+    handheld: all axes. planar: yaw about the world's z and translation in its x and y. single_axis: rotation about
+    `axis_imu` only, translation in all axes. motionless: none. The scales multiply the amplitudes of about 1.1 rad/s
+    and 4.7 m/s^2 RMS. With `exact`, the true trajectory is the exact integral of body rates and specific forces that
+    are constant between readings, the means of the two; otherwise readings sample a trajectory in closed form.
+    """
+
+    kind: MotionKind = "handheld"
+    exact: bool = True
+    distance_m: float = 0.8
+    rotation_scale: float = 1.0
+    translation_scale: float = 1.0
+    axis_imu: tuple[float, float, float] = (0.0, 1.0, 0.0)
+    seed: int | None = None  # None: drawn anew for each seed of the simulation
+
+
+@dataclass(frozen=True, eq=False)
+class Scenario:
+    """Everything that `simulate` needs but the seed.
+
+    imu_intrinsics (24,), Kalibr's scale-misalignment model: w_m = M_g C_g w + A_g f + b_g, a_m = M_a f + b_a, with
+    M_a - I and M_g - I lower triangular (xx, yx, yy, zx, zy, zz), C_g = Exp(rotation vector), A_g row-major; in the
+    order M_a, M_g, C_g, A_g. bow (3,) [m]: the board's points lie at z = a x^2 + b x y + c y^2, with x and y from -1
+    to 1 over the board's extent. Corner noise has sigma^2 = corner_noise_px^2 + (blur_s * image speed)^2, the
+    image speed being the RMS of its corners' in px/s; shift_px is the sigma of a 2D shift that all corners of an
+    image share. Outliers are moved by up to +-outlier_px on each axis.
+    """
+
+    cameras: tuple[SimCamera, ...]
+    target: AprilGrid = AprilGrid(6, 6, 0.088, 0.3)
+    duration_s: float = 20.0
+    motion: Motion = Motion()
+    T_world_board: np.ndarray = field(default_factory=_standing_board)
+    bow: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    imu_rate_hz: float = 200.0
+    imu_noise: ImuNoise = ADIS16448
+    imu_noise_enabled: bool = True  # white noise and bias walk
+    gyro_bias: tuple[float, float, float] = (-0.002, 0.021, 0.076)  # rad/s, at the first reading
+    accel_bias: tuple[float, float, float] = (-0.03, 0.11, 0.08)  # m/s^2
+    imu_intrinsics: np.ndarray = field(default_factory=lambda: np.zeros(24))
+    imu_clock_origin_ns: int = 0
+    imu_jitter_s: float = 0.0  # readings taken at instants shifted by uniform +-imu_jitter_s, below half a period
+    imu_gaps: tuple[Interval, ...] = ()  # readings inside are lost
+    corner_noise_enabled: bool = True  # white, blur and shift
+    blur_s: float = 0.0
+    shift_px: float = 0.0
+    outlier_fraction: float = 0.0
+    outlier_px: float = 20.0
+
+
+def handheld(
+    duration_s: float = 20.0,
+    asynchronous: bool = False,
+    imu: Literal["datasheet", "noisy"] = "datasheet",
+    exact: bool = True,
+    noiseless: bool = False,
+) -> Scenario:
+    """The EuRoC sensor unit (two radtan cameras at 20 Hz, ADIS16448 at 200 Hz) waved in front of its AprilGrid.
+
+    asynchronous: cam1 takes its images half a period after cam0. imu "noisy": ten times the data sheet's densities.
+    exact: see `Motion`. noiseless: neither corners nor IMU have noise, though `rig_for` still states the sigmas.
+    """
+    scale = {"datasheet": 1.0, "noisy": 10.0}[imu]
+    noise = ImuNoise(
+        *(scale * d for d in (ADIS16448.gyro, ADIS16448.gyro_walk, ADIS16448.accel, ADIS16448.accel_walk)),
+        source="simulation",
+    )
+    epoch_ns = 1_403_715_273_262_142_976
+    cam0 = SimCamera(
+        "cam0",
+        "pinhole-radtan",
+        (752, 480),
+        (458.654, 457.296, 367.215, 248.375),
+        (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05),
+        pose_from_rows(_EUROC_T_IMU_CAM0),
+        time_offset_s=0.0042,
+        clock_origin_ns=epoch_ns,
+    )
+    cam1 = SimCamera(
+        "cam1",
+        "pinhole-radtan",
+        (752, 480),
+        (457.587, 456.134, 379.999, 255.238),
+        (-0.28368365, 0.07451284, -0.00010473, -3.555907e-05),
+        pose_from_rows(_EUROC_T_IMU_CAM1),
+        time_offset_s=-0.0073,
+        phase_s=0.025 if asynchronous else 0.0,
+        clock_origin_ns=epoch_ns,
+    )
+    return Scenario(
+        (cam0, cam1),
+        duration_s=duration_s,
+        motion=Motion(exact=exact),
+        imu_noise=noise,
+        imu_noise_enabled=not noiseless,
+        corner_noise_enabled=not noiseless,
+        imu_clock_origin_ns=epoch_ns,
+    )

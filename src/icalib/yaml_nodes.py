@@ -1,0 +1,169 @@
+"""YAML values that know their file, line and field, so that every complaint can name them."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from dataclasses import dataclass
+from math import isfinite
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+import yaml
+
+from icalib.errors import RigError
+
+_WHOLE = re.compile(r"[-+]?[0-9]{1,18}")
+
+
+@dataclass(frozen=True)
+class YamlValue:
+    """One value of a YAML file. `field` is its place, for example "sensors.cam0.model"; "" is the whole file."""
+
+    node: yaml.Node
+    file: str
+    field: str
+
+    def fail(self, sentence: str) -> NoReturn:
+        """Raises RigError: `sentence` says what is wrong and what to do."""
+        place = f"{self.file}:{self.node.start_mark.line + 1}"
+        raise RigError(f"{place}: {self.field}: {sentence}" if self.field else f"{place}: {sentence}")
+
+    @property
+    def is_mapping(self) -> bool:
+        return isinstance(self.node, yaml.MappingNode)
+
+    @property
+    def is_list(self) -> bool:
+        return isinstance(self.node, yaml.SequenceNode)
+
+    def shown(self) -> str:
+        """The value in words, for a sentence."""
+        if not isinstance(self.node, yaml.ScalarNode):
+            return "a mapping" if self.is_mapping else "a list"
+        if self.node.tag == "tag:yaml.org,2002:null":
+            return "empty"
+        text = str(self.node.value)
+        return repr(text if len(text) <= 40 else text[:40] + "...")
+
+    def entries(self) -> dict[str, YamlValue]:
+        """The mapping's values by key. Refuses anything else, and keys that are given twice."""
+        if not isinstance(self.node, yaml.MappingNode):
+            self.fail(f"must be a mapping (name: value), but is {self.shown()}.")
+        found: dict[str, YamlValue] = {}
+        for key, node in self.node.value:
+            at = YamlValue(key, self.file, self.field)
+            if not isinstance(key, yaml.ScalarNode):
+                at.fail("a name must be plain text; remove the brackets or braces.")
+            name = str(key.value)
+            if name in found:
+                at.fail(f"{name!r} is given twice, first in line {found[name].node.start_mark.line + 1}; remove one.")
+            found[name] = YamlValue(node, self.file, f"{self.field}.{name}" if self.field else name)
+        return found
+
+    def record(self, required: tuple[str, ...], optional: tuple[str, ...] = ()) -> dict[str, YamlValue]:
+        """The mapping's values by key, where only these keys may stand and the required ones must."""
+        found, valid = self.entries(), required + optional
+        for name, value in found.items():
+            if name not in valid:
+                value.fail(f"there is no such field{suggestion(name, valid)}; available are {', '.join(valid)}.")
+        missing = [name for name in required if name not in found]
+        if missing:
+            self.fail(f"{', '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing; add {missing[0]}.")
+        return found
+
+    def text(self) -> str:
+        if not isinstance(self.node, yaml.ScalarNode) or not str(self.node.value).strip():
+            self.fail(f"must be text, but is {self.shown()}.")
+        return str(self.node.value)
+
+    def choice(self, what: str, available: tuple[str, ...]) -> str:
+        """One of `available`; `what` names it in the sentence."""
+        text = self.text()
+        if text not in available:
+            self.fail(
+                f"there is no {what} {self.shown()}{suggestion(text, available)}; available are {', '.join(available)}."
+            )
+        return text
+
+    def boolean(self) -> bool:
+        if not isinstance(self.node, yaml.ScalarNode) or self.node.tag != "tag:yaml.org,2002:bool":
+            self.fail(f"must be true or false, but is {self.shown()}.")
+        return str(self.node.value).lower() in ("true", "yes", "on")
+
+    def number(self) -> float:
+        """A finite number. Read by Python, since YAML 1.1 takes 2e-5 (no decimal point) for text."""
+        plain = isinstance(self.node, yaml.ScalarNode) and self.node.style is None
+        text = str(self.node.value) if plain else ""
+        if text.lower().lstrip("+-") in (".nan", ".inf", "nan", "inf", "infinity"):
+            self.fail(f"must be a finite number, but is {self.shown()}.")
+        try:
+            value = float(text)
+        except ValueError:
+            self.fail(f"must be a number, but is {self.shown()}.")
+        if not isfinite(value):
+            self.fail(f"is too large a number ({self.shown()}).")
+        return value
+
+    def positive(self) -> float:
+        value = self.number()
+        if value <= 0:
+            self.fail(f"must be above 0, but is {value:g}.")
+        return value
+
+    def whole(self, least: int) -> int:
+        """A whole number that is at least `least`."""
+        self.number()
+        text = str(self.node.value)
+        if not _WHOLE.fullmatch(text) or int(text) < least:
+            self.fail(f"must be a whole number of at least {least}, but is {self.shown()}.")
+        return int(text)
+
+    def items(self) -> list[YamlValue]:
+        """The list's values; their field names end in [i], from 0."""
+        if not isinstance(self.node, yaml.SequenceNode):
+            self.fail(f"must be a list in brackets, but is {self.shown()}.")
+        return [YamlValue(node, self.file, f"{self.field}[{i}]") for i, node in enumerate(self.node.value)]
+
+    def vector(self, size: int) -> np.ndarray:
+        """(size,) float64. A single number will do where one is asked for."""
+        if size == 1 and not self.is_list:
+            return np.array([self.number()])
+        numbers = self.items()
+        if len(numbers) != size:
+            self.fail(f"must be a list of {size} numbers, but has {len(numbers)}.")
+        return np.array([item.number() for item in numbers])
+
+
+def read_yaml(path: Path) -> YamlValue:
+    """The YAML file at `path`, composed but never constructed: nothing in it can run.
+
+    Raises RigError where there is no such file, it cannot be read, is not YAML or is empty.
+    """
+    try:
+        root = yaml.compose(path.read_text(encoding="utf-8-sig"), Loader=yaml.SafeLoader)
+    except FileNotFoundError:
+        raise RigError(f"{path} does not exist; check the path of the rig file.") from None
+    except OSError as error:
+        raise RigError(f"{path} cannot be read ({error.strerror or error}); give the path of a rig file.") from error
+    except UnicodeDecodeError as error:
+        raise RigError(f"{path} is not a text file in UTF-8 ({error.reason}); give a YAML file.") from error
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        place = f"{path}:{mark.line + 1}" if mark else str(path)
+        raise RigError(
+            f"{place}: this is not valid YAML ({error.problem or error.context}); correct the line."
+        ) from error
+    except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
+        raise RigError(f"{path} is not valid YAML ({str(error).splitlines()[0]}); correct it.") from error
+    if root is None:
+        raise RigError(f"{path} is empty; it must hold sensors and a target.")
+    return YamlValue(root, str(path), "")
+
+
+def suggestion(name: str, valid: tuple[str, ...]) -> str:
+    """The words that point to the nearest valid name, if there is one."""
+    near = difflib.get_close_matches(name.lower(), [v.lower() for v in valid], n=1, cutoff=0.6)
+    match = next((v for v in valid if near and v.lower() == near[0]), None)
+    return f", did you mean {match!r}" if match else ""

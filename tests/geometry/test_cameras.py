@@ -1,0 +1,253 @@
+"""Every camera model through the same tests: an obvious formula, Jacobians, unprojection and what it cannot see."""
+
+from __future__ import annotations
+
+import cmath
+from collections.abc import Callable
+from math import cos, hypot, pi, sin
+
+import numpy as np
+import pytest
+
+from icalib.errors import CalibrationError
+from icalib.geometry.cameras import CAMERA_MODELS, camera_model
+from icalib.geometry.cameras.base import CameraModel
+from icalib.geometry.cameras.radial import monotonic_limit
+
+# model -> parameters whose image of `IMAGE` pixels lies inside the range of the model
+SAMPLES = {
+    "pinhole-radtan": {
+        "euroc": [458.654, 457.296, 367.215, 248.375, -0.28340811, 0.07395907, 0.00019359, 1.76187114e-05],
+        "none": [400.0, 410.0, 380.0, 230.0, 0.0, 0.0, 0.0, 0.0],
+        "folds": [700.0, 690.0, 375.0, 241.0, -0.3, 0.0, 0.003, -0.002],
+        "pincushion that folds": [600.0, 610.0, 370.0, 240.0, 0.2, -0.05, -0.001, 0.002],
+    },
+    "pinhole-equidistant": {
+        "tum-vi": [191.0, 190.9, 376.0, 239.0, 0.0034823894, 0.0007150348, -0.0020532361, 0.00020293674],
+        "none": [150.0, 151.0, 370.0, 235.0, 0.0, 0.0, 0.0, 0.0],
+        "narrow": [460.0, 458.0, 367.0, 248.0, -0.01, 0.02, -0.015, 0.004],
+        "folds": [300.0, 310.0, 375.0, 240.0, -0.04, 0.0, 0.0, 0.0],
+    },
+}
+IMAGE = (752, 480)
+CASES = [pytest.param(name, label, id=f"{name}-{label}") for name, sets in SAMPLES.items() for label in sets]
+
+
+def sample(name: str, label: str) -> tuple[CameraModel, np.ndarray]:
+    return camera_model(name), np.array(SAMPLES[name][label])
+
+
+def obvious_radtan(params: np.ndarray, point: np.ndarray) -> complex:
+    """In complex numbers: w d + 2 |w|^2 (p2 + i p1) + w^2 (p2 - i p1), w = a + i b."""
+    k1, k2, p1, p2 = params[4:]
+    w = complex(point[0], point[1]) / point[2]
+    s = abs(w) ** 2
+    return w * (1 + k1 * s + k2 * s**2) + 2 * s * complex(p2, p1) + w**2 * complex(p2, -p1)
+
+
+def obvious_equidistant(params: np.ndarray, point: np.ndarray) -> complex:
+    theta = cmath.phase(complex(point[2], hypot(point[0], point[1])))
+    theta_d = theta + sum(k * theta ** (2 * i + 3) for i, k in enumerate(params[4:]))
+    return cmath.rect(theta_d, cmath.phase(complex(point[0], point[1])))
+
+
+OBVIOUS = {"pinhole-radtan": obvious_radtan, "pinhole-equidistant": obvious_equidistant}
+
+
+def angle_limit(name: str, params: np.ndarray) -> float:
+    """Largest angle from the optical axis [rad] that the model projects; found by walking outwards."""
+    radii = np.linspace(0.0, pi if name == "pinhole-equidistant" else 50.0, 200_001)[1:]
+    factors = sum(k * radii ** (2 * i + 2) for i, k in enumerate(params[4:] if "equi" in name else params[4:6]))
+    falls = np.flatnonzero(np.diff(radii * (1.0 + factors)) <= 0.0)
+    limit = radii[falls[0]] if len(falls) else radii[-1]
+    return float(limit if name == "pinhole-equidistant" else np.arctan(limit))
+
+
+def points_in_view(name: str, params: np.ndarray) -> np.ndarray:
+    """Points on and next to the optical axis, over the field, and at its edge; at several distances."""
+    limit = 0.98 * angle_limit(name, params)
+    angles = [0.0, 1e-12, 1e-8, 1e-5, 1e-3, 0.1, 0.4, *np.linspace(0.5, 1.0, 6) * limit]
+    if name == "pinhole-equidistant":
+        angles += [a for a in (pi / 2 - 1e-9, pi / 2, pi / 2 + 1e-3) if a < limit]
+    azimuths = [0.0, pi / 2, 0.3, 2.0, -2.5, -0.01]
+    angles = [a for a in angles if a < angle_limit(name, params)]
+    unit = [[sin(a) * cos(t), sin(a) * sin(t), cos(a)] for a in angles for t in azimuths]
+    return np.concatenate([distance * np.array(unit) for distance in (0.2, 1.0, 7.0)])
+
+
+def differences(function: Callable[[np.ndarray], np.ndarray], at: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Central differences of fourth order; the derivative is the last axis."""
+    columns = []
+    for i, size in enumerate(step):
+        h = np.zeros_like(at)
+        h[..., i] = size
+        near, far = function(at + h) - function(at - h), function(at + 2 * h) - function(at - 2 * h)
+        columns.append((8.0 * near - far) / (12.0 * size))
+    return np.stack(columns, axis=-1)
+
+
+def test_every_model_has_samples_and_an_obvious_formula() -> None:
+    assert set(SAMPLES) == set(OBVIOUS) == set(CAMERA_MODELS)
+    for name, sets in SAMPLES.items():
+        assert sets and all(len(p) == len(CAMERA_MODELS[name].parameter_names) for p in sets.values())
+
+
+def test_unknown_model_lists_what_there_is() -> None:
+    with pytest.raises(CalibrationError, match=r"'pinhole-radtam'.*pinhole-radtan, pinhole-equidistant"):
+        camera_model("pinhole-radtam")
+
+
+@pytest.mark.parametrize(("name", "label"), CASES)
+def test_projection_is_the_obvious_formula(name: str, label: str) -> None:
+    model, params = sample(name, label)
+    points = points_in_view(name, params)
+    uv, valid = model.project(params, points)
+    assert valid.all()
+    expected = np.array([OBVIOUS[name](params, p) for p in points], dtype=np.complex128)
+    np.testing.assert_allclose(uv[:, 0], params[0] * expected.real + params[2], rtol=1e-13, atol=1e-10)
+    np.testing.assert_allclose(uv[:, 1], params[1] * expected.imag + params[3], rtol=1e-13, atol=1e-10)
+    uv_again, valid_again, _, _ = model.project_with_jacobians(params, points)
+    np.testing.assert_allclose(uv_again, uv, rtol=1e-14)
+    np.testing.assert_array_equal(valid_again, valid)
+
+
+@pytest.mark.parametrize(("name", "label"), CASES)
+def test_jacobian_of_the_point(name: str, label: str) -> None:
+    model, params = sample(name, label)
+    points = points_in_view(name, params)
+    _, _, j_point, _ = model.project_with_jacobians(params, points)
+    for point, j in zip(points, j_point, strict=True):
+        # Of the depth too: just under 90 degrees uv of a radtan camera changes on the scale of z.
+        scale = min(float(np.linalg.norm(point)), abs(point[2])) if name == "pinhole-radtan" else np.linalg.norm(point)
+        numeric = differences(lambda p: model.project(params, p[None])[0][0], point, np.full(3, 5e-4 * scale))
+        np.testing.assert_allclose(j, numeric, atol=1e-8 * np.abs(j).max())
+
+
+@pytest.mark.parametrize(("name", "label"), CASES)
+def test_jacobian_of_the_parameters(name: str, label: str) -> None:
+    model, params = sample(name, label)
+    points = points_in_view(name, params)
+    points = points[np.arctan2(np.hypot(points[:, 0], points[:, 1]), points[:, 2]) < 0.9 * angle_limit(name, params)]
+    _, _, _, j_params = model.project_with_jacobians(params, points)
+    assert j_params.shape == (len(points), 2, len(params))
+    # uv is linear in each, so only rounding matters; small, as k4 moves the limit of the valid range.
+    step = np.where(np.arange(len(params)) < 4, 1.0, 1e-7)
+    numeric = differences(lambda p: model.project(p, points)[0], params, step)
+    rounding = 1e-15 / 1e-7 * (1e3 + np.abs(model.project(params, points)[0]).max(axis=1)[:, None, None])
+    assert (np.abs(j_params - numeric) <= 1e-9 * np.abs(j_params) + rounding).all()
+    assert np.abs(j_params).max(axis=(0, 1)).min() > 0.0
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e-320, 1e-300, 1e-170, 1e-161, 1e-154, 1e-20, 1e-12])
+@pytest.mark.parametrize(("name", "label"), CASES)
+def test_on_the_optical_axis_it_is_a_pinhole(name: str, label: str, offset: float) -> None:
+    model, params = sample(name, label)
+    uv, valid, j_point, j_params = model.project_with_jacobians(params, np.array([[offset, -offset, 2.0]]))
+    fx, fy, cx, cy = params[:4]
+    assert valid[0]
+    np.testing.assert_allclose(uv[0], [cx, cy], atol=fx * 2 * offset)
+    np.testing.assert_allclose(j_point[0], [[fx / 2, 0, 0], [0, fy / 2, 0]], atol=1e-11 * fx)
+    np.testing.assert_allclose(j_params[0, :, 2:4], np.eye(2), atol=0)
+    np.testing.assert_allclose(j_params[0, :, [0, 1, 4, 5, 6, 7]], 0.0, atol=offset)
+
+
+@pytest.mark.parametrize(("name", "label"), CASES)
+def test_every_pixel_comes_back(name: str, label: str) -> None:
+    model, params = sample(name, label)
+    u, v = np.meshgrid(np.linspace(0, IMAGE[0] - 1, 41), np.linspace(0, IMAGE[1] - 1, 31))
+    uv = np.vstack([np.stack([u.ravel(), v.ravel()], axis=1), params[2:4], params[2:4] + 1e-9])
+    rays, valid = model.unproject(params, uv)
+    assert valid.all()
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1.0, rtol=1e-15)
+    back, seen = model.project(params, rays)
+    assert seen.all()
+    np.testing.assert_allclose(back, uv, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("name", "label"), CASES)
+def test_every_point_in_view_comes_back(name: str, label: str) -> None:
+    """The other way round: of the several solutions that a polynomial may have, it is the right one."""
+    model, params = sample(name, label)
+    points = points_in_view(name, params)
+    points = points[np.arctan2(np.hypot(points[:, 0], points[:, 1]), points[:, 2]) < 0.95 * angle_limit(name, params)]
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    rays, valid = model.unproject(params, model.project(params, points)[0])
+    assert valid.all()
+    np.testing.assert_allclose(rays, points, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(("name", "label"), CASES)
+def test_the_edge_of_the_valid_range(name: str, label: str) -> None:
+    model, params = sample(name, label)
+    limit = angle_limit(name, params)
+    if limit > (pi if name == "pinhole-equidistant" else pi / 2) - 0.03:
+        limit = pi if name == "pinhole-equidistant" else pi / 2
+    for angle, expected in ((limit - 1e-3, True), (limit + 1e-3, False)):
+        if angle < pi:  # beyond, there is no direction to test
+            points = np.array([[sin(angle), 0.0, cos(angle)], [0.0, -2 * sin(angle), 2 * cos(angle)]])
+            np.testing.assert_array_equal(model.project(params, points)[1], expected)
+
+
+@pytest.mark.parametrize("name", CAMERA_MODELS)
+@pytest.mark.parametrize("point", [[0, 0, 0], [0, 0, -1], [1e-17, 0, -1], [np.nan, 0, 1], [0, 0, np.nan], [0, 0, 1e-9]])
+def test_points_without_an_image_are_flagged_and_finite(name: str, point: list[float]) -> None:
+    model, params = sample(name, next(iter(SAMPLES[name])))
+    points = np.array([point, [0.1, 0.2, 1.0]], dtype=float)
+    uv, valid, j_point, j_params = model.project_with_jacobians(params, points)
+    np.testing.assert_array_equal(valid, [False, True])
+    np.testing.assert_array_equal(model.project(params, points)[1], valid)
+    assert all(np.isfinite(values).all() for values in (uv, j_point, j_params, model.project(params, points)[0]))
+
+
+@pytest.mark.parametrize(("name", "label"), [case for case in CASES if "folds" in str(case.values[1])])
+def test_pixels_beyond_the_fold_are_flagged(name: str, label: str) -> None:
+    model, params = sample(name, label)
+    uv = np.array([[1e4, 240.0], [370.0, -1e4], [np.nan, 1.0], [np.inf, 1.0], [370.0, 240.0]])
+    rays, valid = model.unproject(params, uv)
+    np.testing.assert_array_equal(valid, [False, False, False, False, True])
+    assert np.isfinite(rays).all()
+
+
+def test_a_fisheye_sees_behind_its_image_plane_and_a_pinhole_does_not() -> None:
+    behind = np.array([[1.0, 0.2, -0.1], [0.3, -1.0, 0.0]])
+    for name, expected in (("pinhole-equidistant", True), ("pinhole-radtan", False)):
+        model, params = sample(name, "none")
+        assert (model.project(params, behind)[1] == expected).all()
+
+
+@pytest.mark.parametrize("name", CAMERA_MODELS)
+def test_a_zero_focal_length_or_nan_parameter_is_invalid_and_no_crash(name: str) -> None:
+    model, params = sample(name, "none")
+    broken = params.copy()
+    broken[4] = np.nan
+    assert not model.project(broken, np.array([[0.1, 0.1, 1.0]]))[1].any()
+    assert not model.unproject(broken, np.array([[300.0, 200.0]]))[1].any()
+    params[0] = 0.0
+    assert not model.unproject(params, np.array([[300.0, 200.0]]))[1].any()
+
+
+@pytest.mark.parametrize("name", CAMERA_MODELS)
+def test_no_points_and_integer_or_strided_points(name: str) -> None:
+    model, params = sample(name, next(iter(SAMPLES[name])))
+    shapes = [a.shape for a in model.project_with_jacobians(params, np.empty((0, 3)))]
+    assert shapes == [(0, 2), (0,), (0, 2, 3), (0, 2, 8)]
+    assert model.unproject(params, np.empty((0, 2)))[0].shape == (0, 3)
+    uv, _ = model.project(params, np.array([[0, 0, 1], [0, 1, 2]]))
+    strided = np.array([[0.0, 0, 1], [9, 9, 9], [0, 1, 2]])[::2]
+    np.testing.assert_array_equal(model.project(params, strided)[0], uv)
+
+
+@pytest.mark.parametrize(
+    ("coefficients", "expected"),
+    [
+        ([0.0, 0.0], np.inf),
+        ([0.1, 0.02], np.inf),
+        ([-0.3, 0.0], (1 / 0.9) ** 0.5),
+        ([-0.3, 1e-320], (1 / 0.9) ** 0.5),
+        ([0.0, -0.2], 1.0),
+        ([-3.0 / 3, 2.0 / 5], (1 / 2) ** 0.5),  # 1 - 3 s + 2 s^2: the first of two roots
+        ([np.nan, 0.0], 0.0),
+    ],
+)
+def test_monotonic_limit(coefficients: list[float], expected: float) -> None:
+    assert monotonic_limit(np.array(coefficients)) == pytest.approx(expected, rel=1e-12)

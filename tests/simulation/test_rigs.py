@@ -1,0 +1,57 @@
+"""The rig of a simulated recording, the ready scenarios, and what simulation may import."""
+
+import ast
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import icalib.simulation
+from icalib.rig import Parameter, Settings
+from icalib.simulation import ADIS16448, handheld, rig_for, settings_for, simulate
+
+ALLOWED = ("icalib.errors", "icalib.measurements", "icalib.rig", "icalib.geometry.targets", "icalib.simulation")
+
+
+def test_rig_states_truth_and_noise():
+    scenario = handheld(imu="noisy", noiseless=True)
+    prior = Parameter("prior", np.zeros(3), np.full(3, 0.1))
+    rig = rig_for(scenario, translation=prior, time_offset="start", bloom="fixed")
+    cam0, truth = rig.cameras[0], scenario.cameras[0]
+    assert rig.imu.noise.gyro == 10.0 * ADIS16448.gyro and rig.imu.noise.accel_walk == 10.0 * ADIS16448.accel_walk
+    assert cam0.corner_noise_px == 0.2 and rig.gravity == 9.81 and rig.target == scenario.target
+    assert cam0.rotation == Parameter("free")
+    assert cam0.translation is prior
+    assert cam0.time_offset.mode == "free" and cam0.time_offset.value == pytest.approx([0.0042])
+    assert cam0.bloom.mode == "fixed" and cam0.bloom.value == [0.0]
+    assert cam0.intrinsics.mode == "fixed"
+    np.testing.assert_array_equal(cam0.intrinsics.value, truth.intrinsics)
+    np.testing.assert_array_equal(cam0.distortion.value, truth.distortion)
+    np.testing.assert_array_equal(rig.imu.intrinsics.value, np.zeros(24))
+
+
+def test_settings_model_what_is_simulated():
+    plain = settings_for(handheld())
+    assert (plain.bloom, plain.board_shape, plain.blur_noise, plain.common_error, plain.outliers) == (False,) * 5
+    scenario = replace(handheld(), bow=(1e-3, 0.0, 0.0), blur_s=1e-3, shift_px=0.1, outlier_fraction=0.01)
+    scenario = replace(scenario, cameras=(replace(scenario.cameras[0], bloom_px=0.3), scenario.cameras[1]))
+    full = settings_for(scenario)
+    assert (full.bloom, full.board_shape, full.blur_noise, full.common_error, full.outliers) == (True,) * 5
+    chosen = Settings(scheme="pose")
+    assert rig_for(scenario, settings=chosen).settings is chosen
+
+
+def test_asynchronous_cameras_are_half_a_period_apart():
+    for asynchronous, apart in ((False, 0.0), (True, 0.025)):
+        truth = simulate(handheld(duration_s=1.0, asynchronous=asynchronous), seed=1).truth
+        assert truth.corners["cam1"].seconds[0] - truth.corners["cam0"].seconds[0] == pytest.approx(apart, abs=2e-9)
+
+
+def test_simulation_imports_nothing_that_it_is_to_check():
+    for path in Path(icalib.simulation.__file__).parent.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            for name in names:
+                assert not name.startswith("icalib") or name.startswith(ALLOWED), f"{path.name} imports {name}"
