@@ -18,6 +18,7 @@ _SENSOR_TYPES = ("imu", "camera")
 _DENSITIES = ("gyro", "gyro_walk", "accel", "accel_walk")
 _SENSOR_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 _LARGEST_TAG_M = 2.0  # nobody prints a larger one; it is in millimetres
+_MOST_TAGS = 10_000
 
 
 def load_rig(path: str | Path) -> Rig:
@@ -129,7 +130,10 @@ def _target(value: YamlValue) -> AprilGrid:
     found["type"].choice("target type", ("aprilgrid",))
     if (size := found["tag_size"].positive()) > _LARGEST_TAG_M:
         found["tag_size"].fail(f"is in metres, and {size:g} m is no tag; write 0.088 for 88 mm.")
-    return AprilGrid(found["rows"].whole(1), found["cols"].whole(1), size, found["tag_spacing"].positive())
+    rows, cols = found["rows"].whole(1), found["cols"].whole(1)
+    if rows * cols > _MOST_TAGS:
+        value.fail(f"{rows} x {cols} tags are more than {_MOST_TAGS}; correct rows and cols.")
+    return AprilGrid(rows, cols, size, found["tag_spacing"].positive())
 
 
 def _settings(value: YamlValue) -> Settings:
@@ -138,7 +142,7 @@ def _settings(value: YamlValue) -> Settings:
     return Settings(**{name: _setting(given, kinds[name]) for name, given in found.items()})
 
 
-def _setting(value: YamlValue, kind: Any) -> bool | int | float | str:
+def _setting(value: YamlValue, kind: Any) -> Any:
     if get_origin(kind) is Literal:
         return value.choice("such choice as", get_args(kind))
     if kind is bool:

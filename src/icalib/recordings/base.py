@@ -10,7 +10,7 @@ from icalib.measurements import CornerStream, ImuStream
 
 
 class Recording(Protocol):
-    """One recording. A reader knows its format only; what the numbers must satisfy is checked in `read_measurements`."""
+    """One recording. A reader knows its format only; `read_measurements` checks what the numbers must satisfy."""
 
     def imu(self, path_hint: str, name: str) -> ImuStream:
         """All readings of the IMU `name` as they were written: stamps may still repeat or run backwards.

@@ -56,6 +56,7 @@ def _without_poor_images(corners: CornerStream, what: str) -> tuple[CornerStream
     rows = keep[corners.image]
     start = np.concatenate([[0], np.cumsum(count[keep])])
     first = corners.stamps_ns[np.argmin(keep)]
-    note = f"{what}: {int((~keep).sum())} images with fewer than {_MIN_CORNERS} corners were dropped, the first at {first} ns."
+    dropped = f"{int((~keep).sum())} images with fewer than {_MIN_CORNERS} corners were dropped"
+    note = f"{what}: {dropped}, the first at {first} ns."
     kept = CornerStream(corners.name, corners.stamps_ns[keep], start, corners.point[rows], corners.uv[rows])
     return kept, (note,)

@@ -22,7 +22,5 @@ def rate_sentence(what: str, stamps_ns: np.ndarray, slowest_hz: float, fastest_h
         return None
     unit = other_unit(step, slowest_hz, fastest_hz)
     rate = "more than one reading an instant" if step == 0 else f"{1e9 / step:.4g} readings a second"
-    advice = (
-        f"they look like {unit}; export them in nanoseconds" if unit else "check the stamps, which must be nanoseconds"
-    )
+    advice = f"they look like {unit}; export them in nanoseconds" if unit else "write the stamps in nanoseconds"
     return f"{what}: the stamps mean {rate} ({slowest_hz:g} to {fastest_hz:g} expected); {advice}."

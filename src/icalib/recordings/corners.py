@@ -27,7 +27,8 @@ def group_corners(
     if (step < 0).any():
         i = int(np.argmax(step < 0))
         raise RecordingError(
-            f"{source}: the image at {stamps_ns[i + 1]} ns comes after the one at {stamps_ns[i]} ns; sort the rows by stamp."
+            f"{source}: the image at {stamps_ns[i + 1]} ns comes after the one at {stamps_ns[i]} ns; "
+            "sort the rows by stamp."
         )
     point = _point_index(source, stamps_ns, tag, corner, target)
     first = np.flatnonzero(np.concatenate([[True], step > 0]))

@@ -66,13 +66,13 @@ class FolderRecording:
 
 
 def open_recording(path: str | Path) -> Recording:
-    """Open the recording at `path`, a folder of tables. Raises RecordingError where it is missing or of another kind."""
+    """Open the recording at `path`, a folder of tables. Raises RecordingError where it is missing or not a folder."""
     root = Path(path)
     if root.is_dir():
         return FolderRecording(root)
     if root.exists():
         raise RecordingError(
-            f"{root} is a file, but a recording is a folder of tables such as imu0/data.csv; give the folder."
+            f"{root} is a file, but a recording is a folder of tables; give the folder of imu0/data.csv."
         )
     parent = root.parent
     beside = sorted(p.name for p in parent.iterdir())[:_MAX_LISTED] if parent.is_dir() else []

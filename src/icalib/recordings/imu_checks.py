@@ -77,7 +77,8 @@ def _refuse_units(imu: ImuStream, what: str) -> None:
     gravity = float(np.median(np.linalg.norm(imu.accel, axis=1)))
     if _G_UNITS[0] <= gravity <= _G_UNITS[1]:
         raise RecordingError(
-            f"{what}: the median |accel| is {gravity:.3g}, which looks like units of g; multiply by 9.80665 to get m/s^2."
+            f"{what}: the median |accel| is {gravity:.3g}, which looks like units of g; "
+            "multiply by 9.80665 to get m/s^2."
         )
     if not _GRAVITY_M_S2[0] <= gravity <= _GRAVITY_M_S2[1]:
         raise RecordingError(

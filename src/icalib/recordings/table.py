@@ -19,12 +19,11 @@ _POWERS = np.array([float(f"1e{k}") for k in range(309)])
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of a table. integers (N, I) int64, decimals (N, D) float64, line (N,) of the file, from 1."""
+    """Rows of a table. integers (N, I) int64, decimals (N, D) float64."""
 
     path: Path
     integers: np.ndarray
     decimals: np.ndarray
-    line: np.ndarray
 
 
 def read_table(path: Path, integer_columns: tuple[str, ...], decimal_columns: tuple[str, ...]) -> Table:
@@ -40,16 +39,14 @@ def read_table(path: Path, integer_columns: tuple[str, ...], decimal_columns: tu
     capacity = content.count(b"\n", begin) + 1
     integers = np.empty((capacity, n_int), dtype=np.int64)
     decimals = np.empty((capacity, n_dec))
-    line = np.empty(capacity, dtype=np.int64)
-    rows, bad_line, bad_column = _parse(buffer, begin, first_line, _POWERS, integers, decimals, line)
+    rows, bad_line, bad_column = _parse(buffer, begin, first_line, _POWERS, integers, decimals)
     if bad_line:
         names = integer_columns + decimal_columns
         raise RecordingError(_describe(path, content, bad_line, bad_column, names, n_int))
     if rows == 0:
-        raise RecordingError(
-            f"{path} holds no rows; expected the columns {', '.join(integer_columns + decimal_columns)}."
-        )
-    return Table(path, integers[:rows], decimals[:rows], line[:rows])
+        columns = ", ".join(integer_columns + decimal_columns)
+        raise RecordingError(f"{path} holds no rows; write one line for each reading, with the columns {columns}.")
+    return Table(path, integers[:rows], decimals[:rows])
 
 
 def _read_bytes(path: Path) -> bytes:
@@ -96,7 +93,8 @@ def _describe(path: Path, content: bytes, line: int, column: int, names: tuple[s
     fields = [f.strip() for f in row.split(",")]
     place = f"{path}:{line}"
     if len(fields) != len(names):
-        return f"{place}: the line has {len(fields)} columns instead of {len(names)} ({', '.join(names)}); correct or remove it."
+        wanted = f"{len(names)} ({', '.join(names)})"
+        return f"{place}: the line has {len(fields)} columns instead of {wanted}; correct or remove it."
     name, text = names[column], fields[column]
     shown = text if len(text) <= 40 else text[:40] + "..."
     try:
@@ -119,7 +117,6 @@ def _parse(
     powers: np.ndarray,
     integers: np.ndarray,
     decimals: np.ndarray,
-    lines: np.ndarray,
 ) -> tuple[int, int, int]:
     """Fill the rows; returns their number and line and column of the first bad field (line 0: none)."""
     n, n_int = buffer.size, integers.shape[1]
@@ -144,7 +141,6 @@ def _parse(
             if not (ok and ends):
                 return row, line, column
             at += 1
-        lines[row] = line
         row += 1
         line += 1
     return row, 0, 0
@@ -165,13 +161,14 @@ def _sign(buffer: np.ndarray, at: int) -> tuple[int, bool]:
 
 
 @njit(cache=True, nogil=True)
-def _integer(buffer: np.ndarray, at: int) -> tuple[int, int, bool]:
+def _integer(buffer: np.ndarray, at: int) -> tuple[int, np.int64, bool]:
     """Position after the number, its value, and whether it is an int64."""
     at, negative = _sign(buffer, _skip_blank(buffer, at))
     value, digits, ok = np.int64(0), 0, True
     while at < buffer.size and 48 <= buffer[at] <= 57:
         digit = np.int64(buffer[at]) - 48
-        ok = ok and value <= (9223372036854775807 - digit) // 10
+        if value > (9223372036854775807 - digit) // 10:
+            ok = False
         value = value * 10 + digit
         digits += 1
         at += 1
@@ -200,7 +197,7 @@ def _decimal(buffer: np.ndarray, at: int, powers: np.ndarray) -> tuple[int, floa
     ok = digits > 0
     if ok and at < buffer.size and (buffer[at] == 101 or buffer[at] == 69):  # e, E
         at, power, ok = _integer(buffer, at + 1)
-        exponent += min(max(power, -100000), 100000)
+        exponent += int(min(max(power, -100000), 100000))
     value = _scale(float(mantissa), exponent, powers)
     return at, -value if negative else value, ok and np.isfinite(value)
 
