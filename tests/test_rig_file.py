@@ -90,7 +90,7 @@ def test_everything_is_read(tmp_path):
     )
     assert (rig.target.cols, rig.target.tag_size, rig.gravity) == (7, 0.088, 9.80665)
     s = rig.settings
-    assert (s.scheme, s.loss, s.splits, s.bloom, s.outliers) == ("pose", "cauchy", 0, False, True)
+    assert (s.scheme, s.loss, s.splits, s.bloom, s.outlier_std) == ("pose", "cauchy", 0, False, 4.0)
     assert rig.path == tmp_path / "rig.yaml"
 
 

@@ -81,7 +81,8 @@ class Settings:
     scheme: Scheme = "inertial"  # where a sensor was between nodes
     loss: Loss = "huber"  # robust loss on corners
     loss_scale: float = 2.5  # in standard deviations, where the loss starts to bend
-    outliers: bool = True  # drop corners far off the rest of their image
+    outlier_std: float = 4.0  # drop corners this many standard deviations beyond their image's mean error; 0: none
+    outlier_min_px: float = 1.0  # but never one with a smaller error
     bloom: bool = True  # corners pulled towards their tag's centre, one size a camera
     board_shape: bool = True  # the target is not flat: estimate how it bends
     blur_noise: bool = True  # corners of fast images weigh less

@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
-from math import sqrt
 from typing import TypeVar
 
 import numpy as np
@@ -22,6 +21,7 @@ from numba import njit
 
 from icalib.errors import EstimationError
 from icalib.estimation.state import NODE
+from icalib.geometry.small import cholesky
 
 T = TypeVar("T")
 THREADS = 2  # pieces of the chain; more would need separators of their own
@@ -78,26 +78,6 @@ def make_pieces(n_nodes: int, n_border: int) -> tuple[Piece, ...]:
 
 
 @njit(cache=True, nogil=True)
-def _cholesky(A):
-    """Lower Cholesky factor in place of the lower triangle; False where A is not positive definite."""
-    n = A.shape[0]
-    for j in range(n):
-        d = A[j, j]
-        for k in range(j):
-            d -= A[j, k] * A[j, k]
-        if not d > 0.0:
-            return False
-        d = sqrt(d)
-        A[j, j] = d
-        for i in range(j + 1, n):
-            s = A[i, j]
-            for k in range(j):
-                s -= A[i, k] * A[j, k]
-            A[i, j] = s / d
-    return True
-
-
-@njit(cache=True, nogil=True)
 def _forward_solve(L, X):
     """X <- L^-1 X."""
     for i in range(L.shape[0]):
@@ -132,7 +112,7 @@ def _eliminate(diagonal, upper, side, forwards, keep):
         k = step if forwards else n - 1 - step
         if step == n - 1 and keep:
             return True
-        if not _cholesky(diagonal[k]):
+        if not cholesky(diagonal[k]):
             return False
         _forward_solve(diagonal[k], side[k])
         if step < n - 1:
@@ -245,7 +225,7 @@ def solve(pieces: tuple[Piece, ...], n_nodes: int, tolerance: np.ndarray, dampin
     if keep:
         shared = pieces[0].diagonal[-1] + pieces[1].diagonal[0]
         shared_side = pieces[0].side[-1] + pieces[1].side[0]
-        if not _cholesky(shared):
+        if not cholesky(shared):
             raise NotDefinite("the motion between nodes is not determined.")
         _forward_solve(shared, shared_side)
         rest -= shared_side.T @ shared_side

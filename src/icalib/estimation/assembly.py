@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.board import SHAPE_LABELS, bloom_direction, shape_basis
+from icalib.estimation.board import SHAPE_LABELS, SHAPE_SIGMA_M, bloom_direction, shape_basis
 from icalib.estimation.corner_factor import CornerFactor, CornerNoise
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.imu_factor import ImuFactor
@@ -16,14 +16,13 @@ from icalib.estimation.nodes import place_nodes, usable
 from icalib.estimation.poses import assign_nodes, poses_at
 from icalib.estimation.prior_factor import Prior
 from icalib.estimation.problem import Problem
-from icalib.estimation.state import Kind, Layout, State, make_layout
+from icalib.estimation.state import Key, Kind, Layout, State, make_layout
 from icalib.estimation.tolerances import Tolerances
 from icalib.geometry.cameras import camera_model
 from icalib.measurements import CornerStream, Measurements
 from icalib.rig import Camera, Parameter, Rig
 
 BOARD = "board0"
-SHAPE_SIGMA_M = 3e-3  # prior on each bend: printed boards are flat to a few millimetres
 BLOOM_SIGMA_PX = 1.0
 CAMERA_PARAMETERS: tuple[tuple[str, Kind], ...] = (
     ("rotation", "rotation"),
@@ -71,8 +70,7 @@ def _priors(inputs: Inputs) -> tuple[Prior, ...]:
     rig, layout = inputs.rig, inputs.layout
     priors = []
     if rig.settings.board_shape:
-        n = len(SHAPE_LABELS)
-        priors.append(Prior(layout.block(BOARD, "shape"), np.zeros(n), np.full(n, SHAPE_SIGMA_M)))
+        priors.append(Prior(layout.block(BOARD, "shape"), np.zeros(len(SHAPE_LABELS)), SHAPE_SIGMA_M))
     owners: list[tuple[str, str, Parameter, float]] = [(rig.imu.name, "intrinsics", rig.imu.intrinsics, 0.0)]
     for camera, stream in zip(rig.cameras, inputs.measurements.cameras, strict=True):
         for name, _ in CAMERA_PARAMETERS:
@@ -87,9 +85,9 @@ def _priors(inputs: Inputs) -> tuple[Prior, ...]:
     return tuple(priors)
 
 
-def image_times(inputs: Inputs, state: State) -> list[np.ndarray]:
+def image_times(inputs: Inputs, values: dict[Key, np.ndarray]) -> list[np.ndarray]:
     """Instants of each camera's images, seconds on the imu clock since its first stamp."""
-    return [c.seconds + state.values[c.name, "time_offset"][0] for c in inputs.measurements.cameras]
+    return [c.seconds + values[c.name, "time_offset"][0] for c in inputs.measurements.cameras]
 
 
 def resample(state: State, nodes: np.ndarray, inputs: Inputs) -> State:
@@ -119,7 +117,7 @@ def assemble(inputs: Inputs, state: State, noise: list[CornerNoise], keep: list[
     basis = shape_basis(rig.target, rig.settings.board_shape)
     factors = []
     for camera, stream, t, n, k in zip(
-        rig.cameras, inputs.measurements.cameras, image_times(inputs, state), noise, keep, strict=True
+        rig.cameras, inputs.measurements.cameras, image_times(inputs, state.values), noise, keep, strict=True
     ):
         seen = usable(inputs.imu, t, rig.settings.max_gap_s)
         factor = CornerFactor(
@@ -144,7 +142,7 @@ def _with_bloom(factor: CornerFactor, camera: Camera, state: State, rig: Rig) ->
     return factor.with_direction(bloom_direction(factor.model, params, X, towards))
 
 
-def start_values(inputs: Inputs, guess_values: dict[tuple[str, str], np.ndarray]) -> dict[tuple[str, str], np.ndarray]:
+def start_values(inputs: Inputs, guess_values: dict[Key, np.ndarray]) -> dict[Key, np.ndarray]:
     """Values of all blocks: the guess, completed by what starts from zero."""
     values = dict(guess_values)
     n_shape = inputs.layout.block(BOARD, "shape").size

@@ -7,28 +7,35 @@ import numpy as np
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.targets import AprilGrid
 
-SHAPE_LABELS = ("bow_xx", "bow_xy", "bow_yy")
+BOW_LABELS = ("bow_xx", "bow_xy", "bow_yy")
+# In the plane: what printing and mounting do to second order. A turn, a shift and the scale are left out: the first two
+# belong to the board's pose, and the scale is what tag_size says.
+IN_PLANE_LABELS = ("stretch", "shear", "x_xx", "y_xx", "x_xy", "y_xy", "x_yy", "y_yy")
+SHAPE_LABELS = BOW_LABELS + IN_PLANE_LABELS
+# Priors: boards are flat to a few millimetres, and printed true to about one.
+SHAPE_SIGMA_M = np.array([3e-3] * len(BOW_LABELS) + [1e-3] * len(IN_PLANE_LABELS))
 
 
 def shape_basis(target: AprilGrid, bends: bool) -> np.ndarray:
     """(n_points, s, 3) displacement in the board frame by unit of each shape parameter [m].
 
-    The bow: z = a x^2 + b x y + c y^2, with x and y from -1 to 1 over the target.
+    With x and y from -1 to 1 over the target: the bow z = a x^2 + b x y + c y^2; stretch (x, -y) and shear (y, x); and
+    x or y moved by x^2, x y, y^2.
     """
     if not bends:
         return np.zeros((len(target.points), 0, 3))
     xy = target.points[:, :2]
     low, high = xy.min(axis=0), xy.max(axis=0)
     x, y = ((xy - 0.5 * (low + high)) / (0.5 * (high - low))).T
-    basis = np.zeros((len(xy), len(SHAPE_LABELS), 3))
-    for k, f in enumerate((x * x, x * y, y * y)):
-        basis[:, k, 2] = f
-    return basis
+    o = np.zeros_like(x)
+    squares = (x * x, x * y, y * y)
+    fields = [(o, o, q) for q in squares] + [(x, -y, o), (y, x, o)]
+    for q in squares:
+        fields += [(q, o, o), (o, q, o)]
+    return np.stack([np.stack(f, axis=1) for f in fields], axis=1)
 
 
-def bloom_direction(
-    model: CameraModel, params: np.ndarray, X: np.ndarray, towards: np.ndarray
-) -> np.ndarray:
+def bloom_direction(model: CameraModel, params: np.ndarray, X: np.ndarray, towards: np.ndarray) -> np.ndarray:
     """(N, 2) unit image direction of `towards` (N, 3, camera axes) at points X (N, 3) in the camera frame."""
     _, valid, J, _ = model.project_with_jacobians(params, X)
     d = np.einsum("nij,nj->ni", J, towards)

@@ -30,10 +30,10 @@ class Prior:
             return error / self.sigma, so3.right_jacobian_inverse(error) / self.sigma[:, None]
         return (x - self.value) / self.sigma, np.diag(1.0 / self.sigma)
 
-    def accumulate(self, state: State, piece: Piece, sums: bool = True, noise: np.ndarray | None = None) -> float:
-        """Adds the prior to the sums of `piece`; returns half its chi^2."""
+    def accumulate(self, state: State, piece: Piece, sums: bool = True, residual: np.ndarray | None = None) -> float:
+        """Adds the prior to the sums of `piece`, with `residual` in place of its own; returns half its chi^2."""
         r, J = self.residual(state)
-        r = r if noise is None else noise
+        r = r if residual is None else residual
         columns = self.block.columns
         if sums:
             piece.border[np.ix_(columns, columns)] += J.T @ J
@@ -42,11 +42,9 @@ class Prior:
         return 0.5 * float(r @ r)
 
 
-def accumulate_bias_prior(state: State, piece: Piece, sums: bool = True) -> float:
-    """The broad prior on the first node's biases, about zero; returns half its chi^2."""
-    if piece.first != 0:
-        return 0.0
-    r = state.bias[0] / FIRST_BIAS_SIGMA
+def accumulate_bias_prior(state: State, piece: Piece, sums: bool = True, met: bool = False) -> float:
+    """The broad prior on the first node's biases, about zero (`met`: as if they were zero); returns half its chi^2."""
+    r = np.zeros(6) if met else state.bias[0] / FIRST_BIAS_SIGMA
     if sums:
         index = np.arange(9, 15)
         piece.diagonal[0, index, index] += 1.0 / FIRST_BIAS_SIGMA**2

@@ -49,10 +49,24 @@ class Problem:
 
     def _accumulate(self, state: State, piece: Piece, out: Residuals, sums: bool) -> float:
         piece.clear()
+        cost = self.add_measurements(state, piece, out, sums) + self.add_bias_prior(state, piece, sums)
+        if piece.first == 0:
+            cost += sum(p.accumulate(state, piece, sums) for p in self.priors)
+        return cost
+
+    def add_measurements(self, state: State, piece: Piece, out: Residuals, sums: bool = True) -> float:
+        """Adds IMU and corners in `piece`; returns half their robust chi^2."""
         cost = self.imu.accumulate(state, piece, out.imu, sums)
         for camera, corners in zip(self.cameras, out.corners, strict=True):
             cost += camera.accumulate(state, piece, corners, sums)
-        if piece.first == 0:
-            cost += accumulate_bias_prior(state, piece, sums)
-            cost += sum(p.accumulate(state, piece, sums) for p in self.priors)
         return cost
+
+    def add_bias_prior(self, state: State, piece: Piece, sums: bool = True) -> float:
+        """Adds the broad prior on the biases of the chain's first node; returns half its chi^2."""
+        return accumulate_bias_prior(state, piece, sums) if piece.first == 0 else 0.0
+
+    def add_prior_information(self, piece: Piece, state: State) -> None:
+        """Adds the priors as if they were met exactly: their information, no gradient."""
+        for prior in self.priors:
+            prior.accumulate(state, piece, residual=np.zeros(len(prior.sigma)))
+        accumulate_bias_prior(state, piece, met=True)

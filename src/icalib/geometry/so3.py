@@ -157,3 +157,15 @@ def log_many(R):
     for i in range(len(R)):
         phi[i] = log(R[i])
     return phi
+
+
+@njit(cache=True, nogil=True)
+def chain(steps, out):
+    """out (N + 1, 3, 3): out[i + 1] = out[i] steps[i]; out[0] is given."""
+    for n in range(len(steps)):
+        for i in range(3):
+            for j in range(3):
+                s = 0.0
+                for k in range(3):
+                    s += out[n, i, k] * steps[n, k, j]
+                out[n + 1, i, j] = s

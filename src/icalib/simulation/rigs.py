@@ -17,7 +17,7 @@ def settings_for(scenario: Scenario) -> Settings:
     """Settings that model just what the scenario disturbs; no empirical factor."""
     return Settings(
         loss="huber" if scenario.outlier_fraction > 0.0 else "none",
-        outliers=scenario.outlier_fraction > 0.0,
+        outlier_std=4.0 if scenario.outlier_fraction > 0.0 else 0.0,
         bloom=any(c.bloom_px != 0.0 for c in scenario.cameras),
         board_shape=any(b != 0.0 for b in scenario.bow),
         blur_noise=scenario.blur_s > 0.0,

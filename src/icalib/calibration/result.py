@@ -1,8 +1,9 @@
-"""The result of a calibration: values with standard deviations and verdicts, saved and loaded whole."""
+"""What a run found, as frozen dataclasses."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -108,6 +109,7 @@ class Calibration:
     warnings: tuple[str, ...]  # what to know before trusting the numbers, one sentence each
     notes: tuple[str, ...]  # what was assumed, dropped, repaired
     rig: dict[str, Any] = field(default_factory=dict)  # the rig as plain data
+    rates: dict[str, float] = field(default_factory=dict)  # sensor -> Hz, as recorded
     inputs: dict[str, str] = field(default_factory=dict)  # file -> sha256
     settings: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)
@@ -126,3 +128,26 @@ class Calibration:
         T[:3, :3] = self.group(sensor, "rotation").value
         T[:3, 3] = self.group(sensor, "translation").value
         return T
+
+    @property
+    def imu(self) -> str:
+        """Name of the IMU, the body frame."""
+        return self._of_type("imu")[0]
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the cameras, in the rig's order."""
+        return self._of_type("camera")
+
+    def save(self, folder: str | Path) -> None:
+        """Writes calibration.yaml, result.json and result.npz (docs/files.md) into `folder`, as one set.
+
+        Raises CalibrationError where the folder cannot be written.
+        """
+        from icalib.calibration.saving import calibration_files
+        from icalib.result_files import write_files
+
+        write_files(Path(folder), calibration_files(self))
+
+    def _of_type(self, kind: str) -> tuple[str, ...]:
+        return tuple(name for name, sensor in self.rig["sensors"].items() if sensor["type"] == kind)

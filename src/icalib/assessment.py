@@ -1,0 +1,218 @@
+"""From an estimate to a `Calibration`: standard deviations, empirical factors, verdicts, warnings."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from icalib.calibration import (
+    Calibration,
+    CornerResiduals,
+    ImuResiduals,
+    Iteration,
+    ParameterGroup,
+    SensorFit,
+    Trajectory,
+    Verdict,
+)
+from icalib.estimation.assembly import BOARD, Inputs, origin_difference
+from icalib.estimation.board import SHAPE_LABELS
+from icalib.estimation.corner_noise import NoiseModel
+from icalib.estimation.estimate import Estimate
+from icalib.estimation.evidence import Fit, fits, split_covariance
+from icalib.estimation.imu_model import LABELS as IMU_LABELS
+from icalib.estimation.state import Block
+from icalib.geometry.cameras import camera_model
+from icalib.observability import Observability, observe
+from icalib.provenance import versions
+from icalib.rig_file import rig_to_dict
+
+UNITS = {
+    "rotation": "rad", "translation": "m", "time_offset": "s", "intrinsics": "px", "distortion": "", "bloom": "px",
+    "shape": "m", "tilt": "rad",
+}  # fmt: skip
+EXPECTED_CHI2 = (0.5, 2.0)  # chi^2 per post-fit degree of freedom outside this is worth a warning
+LARGE_FACTOR = 3.0
+MANY_REJECTED = 0.05
+
+
+def assess(inputs: Inputs, found: Estimate) -> Calibration:
+    """The result with everything that says how far to trust it."""
+    problem, outcome = found.problem, found.outcome
+    names = _column_names(inputs)
+    seen = observe(problem, outcome.state, outcome.information, names)
+    empirical = split_covariance(problem, outcome, inputs.rig.settings.splits)
+    groups = _groups(inputs, found, seen, empirical)
+    judged = [_sensor_fit(f, found) for f in fits(problem, outcome)]
+    return Calibration(
+        groups=groups,
+        covariance=seen.covariance,
+        covariance_names=names,
+        undetermined=seen.undetermined,
+        fits=tuple(judged),
+        corner_residuals=_corner_residuals(found),
+        imu_residuals=ImuResiduals(outcome.state.seconds[:-1], outcome.residuals.imu),
+        trajectory=_trajectory(found),
+        iterations=tuple(
+            Iteration(n, s.cost, s.predicted_decrease, s.damping, s.accepted) for n, s in found.steps
+        ),
+        converged=outcome.converged,
+        status=outcome.status,
+        warnings=tuple(_warnings(found, groups, judged, empirical)),
+        notes=tuple(_notes(inputs, found)),
+        rig=rig_to_dict(inputs.rig),
+        settings=dataclasses.asdict(inputs.rig.settings),
+        versions=versions(),
+    )
+
+
+def _labels(inputs: Inputs, block: Block) -> tuple[str, ...]:
+    if block.sensor == inputs.rig.imu.name:
+        return IMU_LABELS
+    if block.name in ("intrinsics", "distortion"):
+        camera = next(c for c in inputs.rig.cameras if c.name == block.sensor)
+        model = camera_model(camera.model).parameter_names
+        return model[:4] if block.name == "intrinsics" else model[4:]
+    if block.name == "shape":
+        return SHAPE_LABELS
+    return ("x", "y", "z")[: block.size] if block.size > 1 else (block.name,)
+
+
+def _column_names(inputs: Inputs) -> tuple[str, ...]:
+    return tuple(f"{b.sensor}.{b.name}.{label}" for b in inputs.layout.free for label in _labels(inputs, b))
+
+
+def _mode(inputs: Inputs, block: Block) -> str:
+    if block.start is None:
+        return "fixed"
+    if block.sensor == BOARD:
+        return "free"
+    if block.sensor == inputs.rig.imu.name:
+        return inputs.rig.imu.intrinsics.mode
+    return getattr(next(c for c in inputs.rig.cameras if c.name == block.sensor), block.name).mode
+
+
+def _raw_value(inputs: Inputs, found: Estimate, block: Block) -> np.ndarray:
+    """The value as users meet it: time offsets between raw stamps."""
+    value = found.outcome.state.values[block.key]
+    if block.name == "time_offset":
+        stream = next(c for c in inputs.measurements.cameras if c.name == block.sensor)
+        return value - origin_difference(inputs.measurements, stream)
+    return value
+
+
+def _groups(
+    inputs: Inputs, found: Estimate, seen: Observability, empirical: np.ndarray | None
+) -> tuple[ParameterGroup, ...]:
+    formal = np.sqrt(np.diag(seen.covariance))
+    ratio = np.ones(len(formal)) if empirical is None else np.sqrt(np.diag(empirical)) / formal
+    overall = float(np.sqrt(np.mean(_calibration_only(inputs, ratio) ** 2))) if len(ratio) else 1.0
+    groups = []
+    for block in inputs.layout.blocks:
+        if block.start is None and block.name in ("shape", "bloom"):
+            continue
+        labels = _labels(inputs, block)
+        if block.name == "tilt":
+            labels = ("x", "y")
+        zeros, verdict = np.zeros(block.size), tuple["Verdict", ...]()
+        if block.start is None:
+            std = factor = zeros
+            verdict = ("fixed",) * block.size
+        else:
+            k = block.columns
+            own = float(np.sqrt(np.mean(ratio[k] ** 2)))
+            factor = np.full(block.size, max(1.0, own, overall))
+            std = formal[k]
+            verdict = tuple(seen.verdicts[i] for i in k)
+        unit = "" if block.sensor == inputs.rig.imu.name else UNITS[block.name]
+        groups.append(
+            ParameterGroup(
+                block.sensor, block.name, labels, unit, _raw_value(inputs, found, block), std, std * np.maximum(factor, 1.0),
+                verdict, _mode(inputs, block), None if block.start is None else tuple(int(i) for i in block.columns), factor,
+            )
+        )  # fmt: skip
+    return tuple(groups)
+
+
+def _calibration_only(inputs: Inputs, per_column: np.ndarray) -> np.ndarray:
+    """The columns that users take away: not the board's."""
+    columns = [b.columns for b in inputs.layout.free if b.sensor != BOARD and b.name != "bloom"]
+    return per_column[np.concatenate(columns)] if columns else np.ones(1)
+
+
+def _sensor_fit(fit: Fit, found: Estimate) -> SensorFit:
+    rms, unit, rejected = None, "", 0
+    for camera, out in zip(found.problem.cameras, found.outcome.residuals.corners, strict=True):
+        if camera.name == fit.sensor:
+            used = out.root > 0.0
+            rms, unit = float(np.sqrt(np.mean(out.residual[used] ** 2))), "px"
+            rejected = int((~used).sum())
+    return SensorFit(fit.sensor, fit.kind, fit.count, fit.dof, fit.chi2, rms, unit, rejected)
+
+
+def _corner_residuals(found: Estimate) -> tuple[CornerResiduals, ...]:
+    out = []
+    for camera, corners in zip(found.problem.cameras, found.outcome.residuals.corners, strict=True):
+        stream = camera.stream
+        offset = found.outcome.state.values[camera.name, "time_offset"][0]
+        out.append(
+            CornerResiduals(
+                camera.name, stream.seconds + offset, stream.start, stream.point, stream.uv, corners.residual,
+                camera.noise.sigma[stream.image], corners.root == 0.0,
+            )
+        )  # fmt: skip
+    return tuple(out)
+
+
+def _trajectory(found: Estimate) -> Trajectory:
+    s = found.outcome.state
+    return Trajectory(s.seconds, s.rotation, s.position, s.velocity, s.bias[:, :3], s.bias[:, 3:])
+
+
+def _warnings(found: Estimate, groups: tuple[ParameterGroup, ...], judged: list[SensorFit], empirical: np.ndarray | None):
+    if not found.outcome.converged:
+        yield f"the solver did not converge: {found.outcome.status}"
+    for f in judged:
+        ratio = f.chi2 / max(f.dof, 1.0)
+        if f.kind in ("gyroscope", "accelerometer") and not EXPECTED_CHI2[0] <= ratio <= EXPECTED_CHI2[1]:
+            word = "larger" if ratio > 1.0 else "smaller"
+            yield (
+                f"the {f.kind} of {f.sensor} leaves residuals {np.sqrt(ratio):.2g} times as large as its noise in the rig "
+                f"file says; a {word} noise density would fit."
+            )
+        if f.kind == "corners" and f.rejected > MANY_REJECTED * 0.5 * f.count:
+            share = f.rejected / (f.rejected + 0.5 * f.count)
+            yield f"{share:.0%} of the corners of {f.sensor} were set aside; look at its residuals in the report."
+    factors = [g.factor.max() for g in groups if g.factor is not None and g.mode != "fixed" and g.sensor != BOARD]
+    if factors and max(factors) > LARGE_FACTOR:
+        yield (
+            f"parts of the recording disagree by up to {max(factors):.1f} times what corner and IMU noise explain; the "
+            "standard deviations here include that factor, those of other programs would not."
+        )
+    if empirical is None:
+        yield "the recording is too short to be split (or splits are off): standard deviations are formal, and too small."
+
+
+def _notes(inputs: Inputs, found: Estimate):
+    yield from inputs.measurements.notes
+    rig = inputs.rig
+    n = rig.imu.noise
+    yield (
+        f"IMU noise ({n.source}): gyro {n.gyro:.3g} rad/s/sqrt(Hz), walk {n.gyro_walk:.3g}; accelerometer {n.accel:.3g} "
+        f"m/s^2/sqrt(Hz), walk {n.accel_walk:.3g}."
+    )
+    for a, b in inputs.imu.gaps:
+        how = "bridged" if b - a <= rig.settings.max_gap_s else "left out, with the images in it"
+        yield f"{rig.imu.name} has a gap of {b - a:.3f} s at {a:.3f} s, {how}."
+    for camera, model in zip(rig.cameras, found.noise, strict=True):
+        yield f"{camera.name}: {_noise_words(model)}."
+
+
+def _noise_words(model: NoiseModel) -> str:
+    words = f"corner noise {model.base:.3f} px"
+    if model.exposure > 0.0:
+        words += f", {1e3 * model.exposure:.2f} px more (in squares) per 1000 px/s of image speed"
+    if model.tau > 0.0:
+        words += f", {model.tau:.3f} px common to an image"
+    return words

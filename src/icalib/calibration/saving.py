@@ -1,0 +1,174 @@
+"""A `Calibration` as files, and back without losing a bit. The formats: docs/files.md."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import io
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from icalib.calibration.result import (
+    Calibration,
+    CornerResiduals,
+    ImuResiduals,
+    Iteration,
+    ParameterGroup,
+    SensorFit,
+    Trajectory,
+)
+from icalib.calibration.summary import calibration_yaml
+from icalib.errors import CalibrationError
+from icalib.result_files import read_file
+
+FORMAT, FORMAT_VERSION = "icalib result", 1
+_TEXTS = ("undetermined", "warnings", "notes")
+_PLAIN = ("status", "converged", "rig", "rates", "inputs", "settings", "versions", "timings")
+_MALFORMED = (KeyError, TypeError, ValueError, AttributeError, IndexError)
+
+
+def calibration_files(calibration: Calibration) -> dict[str, bytes]:
+    """calibration.yaml, result.json and result.npz by name."""
+    arrays = _npz(calibration)
+    return {
+        "calibration.yaml": calibration_yaml(calibration).encode(),
+        "result.json": json.dumps(_plain(calibration, arrays), indent=1, ensure_ascii=False).encode(),
+        "result.npz": arrays,
+    }
+
+
+def load_calibration(folder: str | Path) -> Calibration:
+    """The calibration that was saved in `folder`, exactly.
+
+    Raises CalibrationError, one sentence, where files are absent, malformed, truncated or not of one run.
+    """
+    folder = Path(folder)
+    plain = _read_json(folder)
+    arrays = _read_npz(folder, plain)
+    try:
+        calibration = _build(plain, arrays)
+        _check(calibration)
+    except _MALFORMED as error:
+        what = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+        raise CalibrationError(f"{folder / 'result.json'} is damaged ({what}); calibrate again.") from error
+    return calibration
+
+
+def _plain(c: Calibration, arrays: bytes) -> dict[str, Any]:
+    return {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "npz_sha256": hashlib.sha256(arrays).hexdigest(),
+        "groups": [_lists(g) for g in c.groups],
+        "fits": [dataclasses.asdict(f) for f in c.fits],
+        "corner_sensors": [r.sensor for r in c.corner_residuals],
+        **{name: list(getattr(c, name)) for name in _TEXTS},
+        **{name: getattr(c, name) for name in _PLAIN},
+    }
+
+
+def _lists(group: ParameterGroup) -> dict[str, Any]:
+    plain = {f.name: getattr(group, f.name) for f in dataclasses.fields(group)}
+    return {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in plain.items()}
+
+
+def _npz(c: Calibration) -> bytes:
+    arrays = {"covariance": c.covariance, "covariance_names": np.array(c.covariance_names, dtype=np.str_)}
+    for r in c.corner_residuals:
+        arrays |= {f"corners/{r.sensor}/{name}": getattr(r, name) for name in _array_names(CornerResiduals)}
+    arrays |= {f"imu_residuals/{name}": getattr(c.imu_residuals, name) for name in _array_names(ImuResiduals)}
+    arrays |= {f"trajectory/{name}": getattr(c.trajectory, name) for name in _array_names(Trajectory)}
+    for f in dataclasses.fields(Iteration):
+        kind = {"stage": np.str_, "accepted": np.bool_}.get(f.name, np.float64)
+        arrays[f"iterations/{f.name}"] = np.array([getattr(i, f.name) for i in c.iterations], dtype=kind)
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()
+
+
+def _array_names(kind: type) -> list[str]:
+    return [f.name for f in dataclasses.fields(kind) if f.name != "sensor"]
+
+
+def _read_json(folder: Path) -> dict[str, Any]:
+    path = folder / "result.json"
+    try:
+        plain = json.loads(read_file(folder, path.name))
+    except (ValueError, RecursionError) as error:
+        raise CalibrationError(f"{path} is damaged or not a result of icalib ({error}); calibrate again.") from error
+    if not isinstance(plain, dict) or plain.get("format") != FORMAT:
+        raise CalibrationError(f"{path} is not a result of icalib; give the folder that a calibration was written to.")
+    if plain.get("format_version") != FORMAT_VERSION:
+        raise CalibrationError(
+            f"{path} has format version {plain.get('format_version')}, this icalib reads {FORMAT_VERSION}; "
+            "use the icalib that wrote it, or calibrate again."
+        )
+    return plain
+
+
+def _read_npz(folder: Path, plain: dict[str, Any]) -> dict[str, np.ndarray]:
+    path = folder / "result.npz"
+    content = read_file(folder, path.name)
+    if hashlib.sha256(content).hexdigest() != plain.get("npz_sha256"):
+        raise CalibrationError(
+            f"{path} is truncated, changed, or of another run than the result.json beside it; calibrate again."
+        )
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except (ValueError, OSError, zipfile.BadZipFile) as error:
+        raise CalibrationError(f"{path} cannot be read ({error}); calibrate again.") from error
+
+
+def _build(plain: dict[str, Any], arrays: dict[str, np.ndarray]) -> Calibration:
+    def of(kind: type, prefix: str) -> dict[str, np.ndarray]:
+        return {name: arrays[f"{prefix}/{name}"] for name in _array_names(kind)}
+
+    steps = (arrays[f"iterations/{f.name}"].tolist() for f in dataclasses.fields(Iteration))
+    return Calibration(
+        groups=tuple(_group(g) for g in plain["groups"]),
+        covariance=arrays["covariance"],
+        covariance_names=tuple(arrays["covariance_names"].tolist()),
+        fits=tuple(SensorFit(**f) for f in plain["fits"]),
+        corner_residuals=tuple(
+            CornerResiduals(sensor=s, **of(CornerResiduals, f"corners/{s}")) for s in plain["corner_sensors"]
+        ),
+        imu_residuals=ImuResiduals(**of(ImuResiduals, "imu_residuals")),
+        trajectory=Trajectory(**of(Trajectory, "trajectory")),
+        iterations=tuple(Iteration(*step) for step in zip(*steps, strict=True)),
+        **{name: tuple(plain[name]) for name in _TEXTS},
+        **{name: plain[name] for name in _PLAIN},
+    )
+
+
+def _group(plain: dict[str, Any]) -> ParameterGroup:
+    floats = {n: np.array(plain[n], dtype=np.float64) for n in ("value", "std_formal", "std")}
+    return ParameterGroup(
+        **plain
+        | floats
+        | {
+            "labels": tuple(plain["labels"]),
+            "verdict": tuple(plain["verdict"]),
+            "columns": None if plain["columns"] is None else tuple(plain["columns"]),
+            "factor": None if plain["factor"] is None else np.array(plain["factor"], dtype=np.float64),
+        }
+    )
+
+
+def _check(c: Calibration) -> None:
+    """Raises ValueError where parts do not fit together."""
+    n = len(c.covariance_names)
+    if c.covariance.shape != (n, n):
+        raise ValueError(f"the covariance has shape {c.covariance.shape}, but {n} names")
+    for g in c.groups:
+        size = len(g.labels)
+        sizes = {len(g.std), len(g.std_formal), len(g.verdict), size}
+        sizes |= {len(x) for x in (g.columns, g.factor) if x is not None}
+        if sizes != {size} or (g.columns is not None and not all(0 <= k < n for k in g.columns)):
+            raise ValueError(f"{g.sensor}.{g.name} does not have {size} entries throughout")
+    if not {"imu", "camera"} <= {sensor["type"] for sensor in c.rig["sensors"].values()}:
+        raise ValueError("the rig has no IMU or no camera")

@@ -1,0 +1,103 @@
+"""`calibration.yaml`: the result for people and for other programs, one short file."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import yaml
+
+from icalib.calibration.result import Calibration, ParameterGroup, SensorFit
+
+HEADER = """\
+# Calibration by icalib {version}. Lengths in m, times in s, angles in rad, image quantities in px.
+# T_imu_sensor takes coordinates in the sensor's frame to the imu frame: p_imu = T_imu_sensor p_sensor.
+#   (Kalibr's T_cam_imu is the inverse; see camchain-imucam.yaml.)
+# time_offset: t_imu = t_sensor + time_offset.
+# std: standard deviations, of rotation about the sensor's axes, of translation along the imu axes. They include
+#   empirical_factor, by which parts of the recording disagree more than their noise explains; formal = std / factor.
+# verdict: determined, weak or undetermined by the data, or fixed by the rig file. Undetermined values are guesses.
+# The full covariance and all residuals are in result.npz.
+"""
+_OWN_KEY = ("rotation", "translation", "time_offset")
+
+
+def calibration_yaml(calibration: Calibration) -> str:
+    """Text of calibration.yaml; the format is in docs/files.md."""
+    c = calibration
+    names = list(dict.fromkeys([*c.rig["sensors"], *(g.sensor for g in c.groups)]))
+    sensors = {n: _sensor(c, n) for n in names if n in c.rig["sensors"]}
+    targets = {n: _entry(c, n) for n in names if n not in c.rig["sensors"]}
+    data = {
+        "status": c.status,
+        "converged": bool(c.converged),
+        "sensors": sensors,
+        "targets": targets,
+        "undetermined": list(c.undetermined),
+        "warnings": list(c.warnings),
+        "notes": list(c.notes),
+        "fits": [_fit(f) for f in c.fits],
+    }
+    header = HEADER.format(version=c.versions.get("icalib", "of unknown version"))
+    return header + yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=1000, allow_unicode=True)
+
+
+def parameter_keys(groups: tuple[ParameterGroup, ...]) -> dict[tuple[str, str], str]:
+    """(group, label) -> key among the parameters of one sensor: the label, with its group where two share it."""
+    count = Counter(label for g in groups for label in g.labels)
+    return {(g.name, n): n if n and count[n] == 1 else f"{g.name}_{n}".rstrip("_") for g in groups for n in g.labels}
+
+
+def _sensor(c: Calibration, name: str) -> dict[str, Any]:
+    kind = c.rig["sensors"][name]["type"]
+    if kind != "imu":
+        return {"type": kind, "T_imu_sensor": c.T_imu_sensor(name).tolist()} | _entry(c, name)
+    entry = _entry(c, name)
+    still = {"rotation": [0.0] * 3, "translation": [0.0] * 3, "time_offset": 0.0}
+    fixed = {"rotation": ["fixed"] * 3, "translation": ["fixed"] * 3, "time_offset": "fixed"}
+    pose = {"type": kind, "T_imu_sensor": np.eye(4).tolist(), "time_offset": 0.0}
+    return pose | entry | {"std": still | entry["std"], "verdict": fixed | entry["verdict"]}
+
+
+def _entry(c: Calibration, name: str) -> dict[str, Any]:
+    """time_offset, parameters, and std, verdict and empirical_factor with the same keys."""
+    groups = tuple(g for g in c.groups if g.sensor == name)
+    own = [g for g in groups if g.name in _OWN_KEY or g.value.ndim == 2]
+    rest = tuple(g for g in groups if g.name not in _OWN_KEY and g.value.ndim == 1)
+    entry: dict[str, Any] = {g.name: _short(g, g.value) for g in own if g.name not in _OWN_KEY[:2]}
+    entry["parameters"] = _by_key(rest, {g.name: g.value for g in rest})
+    for key, of in (("std", _std), ("verdict", _verdict), ("empirical_factor", _factor)):
+        given = {g.name: _short(g, value) for g in own if (value := of(g)) is not None}
+        entry[key] = given | {"parameters": _by_key(rest, {g.name: of(g) for g in rest})}
+    return entry
+
+
+def _by_key(groups: tuple[ParameterGroup, ...], values: dict[str, np.ndarray | None]) -> dict[str, Any]:
+    keys = parameter_keys(groups)
+    found = ((g, values[g.name]) for g in groups)
+    return {keys[g.name, n]: x for g, v in found if v is not None for n, x in zip(g.labels, v.tolist(), strict=True)}
+
+
+def _short(group: ParameterGroup, value: np.ndarray) -> Any:
+    return value.tolist()[0] if group.name == "time_offset" else value.tolist()
+
+
+def _std(group: ParameterGroup) -> np.ndarray:
+    return group.std
+
+
+def _verdict(group: ParameterGroup) -> np.ndarray:
+    return np.array(group.verdict)
+
+
+def _factor(group: ParameterGroup) -> np.ndarray | None:
+    return None if group.columns is None else group.factor
+
+
+def _fit(f: SensorFit) -> dict[str, Any]:
+    fit: dict[str, Any] = {"sensor": f.sensor, "kind": f.kind, "count": int(f.count), "dof": float(f.dof)}
+    fit |= {"chi2": float(f.chi2), "chi2_per_dof": float(f.chi2 / f.dof) if f.dof > 0 else None}
+    if f.rms is not None:
+        fit |= {"rms": float(f.rms), "unit": f.unit, "rejected": int(f.rejected)}
+    return fit

@@ -1,0 +1,63 @@
+"""The command line: it parses, calls the public function, and turns known errors into one line and exit code 1."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from icalib.errors import CalibrationError
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Entry point of the `icalib` command. Returns the exit code: 0 good, 1 an error, 2 wrong usage, 130 interrupted."""
+    options = _parser().parse_args(arguments)
+    try:
+        options.run(options)
+    except CalibrationError as error:
+        print(f"icalib: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("icalib: interrupted; nothing was written.", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    from icalib import __version__
+
+    parser = argparse.ArgumentParser(prog="icalib", description="Calibrates cameras and an IMU jointly from one recording.")
+    parser.add_argument("--version", action="version", version=f"icalib {__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    c = commands.add_parser("calibrate", help="calibrate the sensors of a rig from a recording")
+    c.add_argument("rig", type=Path, help="rig file (rig.yaml)")
+    c.add_argument("recording", type=Path, help="folder with the recording")
+    c.add_argument("--output", "-o", type=Path, required=True, help="folder for the results; made if it does not exist")
+    c.add_argument("--scheme", choices=("inertial", "pose", "kinematic"), help="where sensors are between nodes")
+    c.add_argument("--loss", choices=("none", "huber", "cauchy"), help="robust loss on corners")
+    c.add_argument("--splits", type=int, metavar="N", help="segments for the empirical factor; 0: none")
+    c.add_argument("--quiet", "-q", action="store_true", help="no progress bar and no table")
+    c.set_defaults(run=_calibrate)
+    return parser
+
+
+def _calibrate(options: argparse.Namespace) -> None:
+    import dataclasses
+
+    from icalib.console import print_result, progress_bar
+    from icalib.outputs import check_folder, write_outputs
+    from icalib.pipeline import calibrate
+    from icalib.rig_file import load_rig
+
+    rig = load_rig(options.rig)
+    chosen = {k: getattr(options, k) for k in ("scheme", "loss", "splits") if getattr(options, k) is not None}
+    if chosen.get("splits", 0) < 0 or chosen.get("splits") == 1:
+        raise CalibrationError("--splits must be 0 (none) or at least 2 segments.")
+    rig = dataclasses.replace(rig, settings=dataclasses.replace(rig.settings, **chosen))
+    check_folder(options.output)
+    with progress_bar(options.quiet) as progress:
+        result = calibrate(rig, options.recording, progress)
+        progress("writing", 0.97)
+        write_outputs(result, options.output)
+    if not options.quiet:
+        print_result(result, options.output)

@@ -1,0 +1,146 @@
+"""What the data themselves say of the formal standard deviations: post-fit degrees of freedom, and splits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.errors import EstimationError
+from icalib.estimation.arrowhead import Piece, in_parallel, marginalise, solve
+from icalib.estimation.corner_factor import CornerFactor, CornerOutput
+from icalib.estimation.imu_factor import ROWS
+from icalib.estimation.problem import Problem
+from icalib.estimation.solver import Outcome
+from icalib.estimation.state import State
+
+PROBES = 2  # random right-hand sides; one already gives the dof of 1e5 residuals to 1 %
+PROBE_STEP = 1e-2  # of a posterior sample: small enough to be linear
+IMU_ROWS = {"gyroscope": slice(0, 3), "accelerometer": slice(3, 9), "bias walk": slice(9, ROWS)}
+
+
+@dataclass(frozen=True)
+class Fit:
+    """chi^2 of one kind of residual, their number, and the degrees of freedom that are left after the fit."""
+
+    sensor: str
+    kind: str
+    count: int
+    dof: float
+    chi2: float
+
+
+def fits(problem: Problem, outcome: Outcome, seed: int = 0) -> list[Fit]:
+    """chi^2 over post-fit degrees of freedom of every sensor.
+
+    A random whitened residual e gives x = H^-1 J^T e; then e_s^T J_s x has the mean tr(J_s H^-1 J_s^T), the parameters
+    that sensor s pays for. J x is taken by central differences of the residuals themselves.
+    """
+    rng = np.random.default_rng(seed)
+    spent: dict[tuple[str, str], list[float]] = {}
+    for _ in range(PROBES):
+        for key, value in _probe(problem, outcome, rng).items():
+            spent.setdefault(key, []).append(value)
+    out = []
+    imu = outcome.residuals.imu
+    for kind, rows in IMU_ROWS.items():
+        key = problem.imu.imu.name, kind
+        n = imu[:, rows].size
+        out.append(Fit(*key, n, n - float(np.mean(spent[key])), float((imu[:, rows] ** 2).sum())))
+    for camera, corners in zip(problem.cameras, outcome.residuals.corners, strict=True):
+        key = camera.name, "corners"
+        n = 2 * int((corners.root > 0.0).sum()) + corners.shared.size
+        out.append(Fit(*key, n, n - float(np.mean(spent[key])), _corner_chi2(camera, corners)))
+    return out
+
+
+def _corner_chi2(camera: CornerFactor, out: CornerOutput) -> float:
+    shift = (camera.noise.field[:, None, :] * out.shared[camera.stream.image]).sum(axis=2)
+    error = (out.residual + shift) * out.root[:, None]
+    return float((error**2).sum() + ((out.shared / camera.noise.tau) ** 2).sum())
+
+
+def _probe(problem: Problem, outcome: Outcome, rng: np.random.Generator) -> dict[tuple[str, str], float]:
+    """e_s^T J_s x of each sensor for one random e."""
+    state, base = outcome.state, outcome.residuals
+    imu_noise = rng.standard_normal(base.imu.shape)
+    noise = [(rng.standard_normal(c.residual.shape), rng.standard_normal(c.shared.shape)) for c in base.corners]
+    pieces, scratch = problem.pieces(), problem.residuals()
+
+    def add(piece: Piece) -> None:
+        piece.clear()
+        problem.imu.accumulate(state, piece, scratch.imu, noise=imu_noise)
+        for camera, corners, n in zip(problem.cameras, scratch.corners, noise, strict=True):
+            camera.accumulate(state, piece, corners, noise=n)
+        if piece.first == 0:
+            problem.add_prior_information(piece, state)
+
+    in_parallel(add, pieces)
+    solution = solve(pieces, problem.n_nodes, problem.tolerance)
+    # The sums hold J^T e where a solve expects J^T r: the step is -x.
+    up, down = (_residuals_at(problem, state, -s * solution.chain, -s * solution.border) for s in (PROBE_STEP, -PROBE_STEP))
+    slope_imu = (up.imu - down.imu) / (2.0 * PROBE_STEP)
+    spent = {(problem.imu.imu.name, k): float((imu_noise[:, r] * slope_imu[:, r]).sum()) for k, r in IMU_ROWS.items()}
+    for camera, at, u, d, n in zip(problem.cameras, base.corners, up.corners, down.corners, noise, strict=True):
+        spent[camera.name, "corners"] = _spent_by_corners(camera, at, (u.residual - d.residual) / (2.0 * PROBE_STEP), *n)
+    return spent
+
+
+def _residuals_at(problem: Problem, state: State, chain: np.ndarray, border: np.ndarray):
+    out = problem.residuals()
+    problem.linearise(state.retract(problem.layout, chain, border), problem.pieces(), out, sums=False)
+    return out
+
+
+def _spent_by_corners(
+    camera: CornerFactor, at: CornerOutput, slope: np.ndarray, e: np.ndarray, e_shared: np.ndarray
+) -> float:
+    """e^T J x of one camera, its images' common errors solved along: e and slope (N, 2), e_shared (M, 2, m)."""
+    root, image, n = at.root, camera.stream.image, len(camera.stream.stamps_ns)
+    e = np.where((root > 0.0)[:, None], e, 0.0)
+    along = slope * root[:, None]
+    total = float((e * along).sum())
+    m = len(camera.noise.tau)
+    if m == 0:
+        return total
+    f = camera.noise.field * root[:, None]
+    M = np.zeros((n, m, m))
+    rhs = np.zeros((n, 2, m))
+    np.add.at(M, image, f[:, :, None] * f[:, None, :])
+    np.add.at(rhs, image, (e - along)[:, :, None] * f[:, None, :])
+    M += np.diag(1.0 / camera.noise.tau**2)
+    rhs += e_shared / camera.noise.tau
+    shared = np.linalg.solve(M, rhs.transpose(0, 2, 1)).transpose(0, 2, 1)
+    total += float((e[:, :, None] * f[:, None, :] * shared[image]).sum())
+    return total + float((e_shared * shared / camera.noise.tau).sum())
+
+
+def split_covariance(problem: Problem, outcome: Outcome, segments: int) -> np.ndarray | None:
+    """(B, B) covariance of the border as the spread over `segments` of the recording shows it; None if it is too short.
+
+    Each segment's own gradient b_g at the joint optimum (its chain marginalised) would be zero but for noise; their
+    spread through the joint information S gives S^-1 (G / (G - 1) sum (b_g - b)(b_g - b)^T) S^-1, the block jackknife to
+    first order.
+    """
+    ends = np.linspace(0, problem.n_nodes - 1, segments + 1).astype(int)
+    if segments < 2 or np.diff(ends).min() < 3:
+        return None
+    scratch = problem.residuals()
+
+    def gradient(g: int) -> np.ndarray | None:
+        piece = Piece.zeros(int(ends[g]), int(ends[g + 1]), problem.layout.size)
+        problem.add_measurements(outcome.state, piece, scratch)
+        problem.add_bias_prior(outcome.state, piece)
+        try:
+            return marginalise(piece)[:-1, -1]
+        except EstimationError:
+            return None
+
+    found = [b for b in in_parallel(gradient, range(segments)) if b is not None]
+    if len(found) < segments:
+        return None
+    b = np.array(found)
+    b -= b.mean(axis=0)
+    t = problem.tolerance
+    half = t[:, None] * (np.linalg.pinv(outcome.information * t[:, None] * t, hermitian=True) @ (t[:, None] * b.T))
+    return segments / (segments - 1.0) * half @ half.T

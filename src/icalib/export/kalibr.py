@@ -1,0 +1,137 @@
+"""Kalibr's files, so that whatever reads Kalibr's results reads ours.
+
+Formats: `camchain-imucam.yaml` and `imu.yaml` as kalibr_calibrate_imu_camera writes them (its wiki, "yaml formats").
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import yaml
+
+from icalib.calibration import Calibration, CornerResiduals
+from icalib.errors import CalibrationError
+from icalib.geometry import so3
+
+SAME_INSTANT_S = 0.025  # images this close see the same scene
+
+
+def camchain_imucam(calibration: Calibration) -> str:
+    """Text of camchain-imucam.yaml. Cameras are renamed cam0, cam1, ... in the rig's order, as Kalibr wants them."""
+    c = calibration
+    overlaps = _overlaps(c.corner_residuals)
+    data = {f"cam{i}": _camera(c, i, overlaps) for i in range(len(c.cameras))}
+    comment = (
+        "# Kalibr's camchain by icalib. T_cam_imu takes coordinates in the imu frame to the camera frame, T_cn_cnm1 those of "
+        "the camera before to this one; t_imu = t_cam + timeshift_cam_imu [s]."
+    )
+    return _text([comment, *_renamed("cam", c.cameras)], data)
+
+
+def imu_yaml(calibration: Calibration) -> str:
+    """Text of imu.yaml. Raises CalibrationError where the rate of the IMU is unknown."""
+    c = calibration
+    if c.imu not in c.rates:
+        raise CalibrationError(f"the rate of {c.imu} is not known, and Kalibr's imu.yaml needs one; calibrate again.")
+    noise = c.rig["sensors"][c.imu]["noise"]
+    data: dict[str, Any] = {
+        "T_i_b": np.eye(4).tolist(),
+        "accelerometer_noise_density": float(noise["accel"]),
+        "accelerometer_random_walk": float(noise["accel_walk"]),
+        "gyroscope_noise_density": float(noise["gyro"]),
+        "gyroscope_random_walk": float(noise["gyro_walk"]),
+        "model": "calibrated",
+        "rostopic": f"/{c.imu}",
+        "time_offset": 0.0,
+        "update_rate": float(c.rates[c.imu]),
+    }
+    comment = (
+        "# Kalibr's imu file by icalib. T_i_b takes coordinates in the body frame to the imu frame; the imu is the body here."
+    )
+    return _text([comment, *_renamed("imu", (c.imu,))], {"imu0": data | _intrinsics(c)})
+
+
+def _camera(c: Calibration, index: int, overlaps: np.ndarray) -> dict[str, Any]:
+    name = c.cameras[index]
+    T_cam_imu = _inverse(c.T_imu_sensor(name))
+    data: dict[str, Any] = {"T_cam_imu": T_cam_imu.tolist()}
+    if index > 0:
+        data["T_cn_cnm1"] = (T_cam_imu @ c.T_imu_sensor(c.cameras[index - 1])).tolist()
+    projection, distortion = c.rig["sensors"][name]["model"].split("-")
+    return data | {
+        "cam_overlaps": np.flatnonzero(overlaps[index]).tolist(),
+        "camera_model": projection,
+        "distortion_coeffs": c.group(name, "distortion").value.tolist(),
+        "distortion_model": distortion,
+        "intrinsics": c.group(name, "intrinsics").value.tolist(),
+        "resolution": [int(side) for side in c.rig["sensors"][name]["resolution"]],
+        "rostopic": f"/{name}/image_raw",
+        "timeshift_cam_imu": float(c.group(name, "time_offset").value[0]),
+    }
+
+
+def _intrinsics(c: Calibration) -> dict[str, Any]:
+    """Kalibr's scale-misalignment model, gyro = M C_gyro_i w + A C_gyro_i f, where the IMU is not taken for ideal.
+
+    Our g-sensitivity acts on f in the accelerometer's axes (estimation.imu_model), so A = A_ours C_gyro_i^T.
+    """
+    groups = [g for g in c.groups if (g.sensor, g.name) == (c.imu, "intrinsics")]
+    if not groups or (groups[0].mode == "fixed" and not groups[0].value.any()):
+        return {}
+    x = groups[0].value
+    C = so3.exp(x[12:15])
+    return {
+        "model": "scale-misalignment",
+        "accelerometers": {"M": _lower(x[:6]).tolist()},
+        "gyroscopes": {
+            "M": _lower(x[6:12]).tolist(),
+            "A": (x[15:].reshape(3, 3) @ C.T).tolist(),
+            "C_gyro_i": C.tolist(),
+        },
+    }
+
+
+def _lower(x: np.ndarray) -> np.ndarray:
+    """(3, 3) identity plus a lower triangle given row by row."""
+    M = np.eye(3)
+    M[np.tril_indices(3)] += x
+    return M
+
+
+def _inverse(T: np.ndarray) -> np.ndarray:
+    inverse = np.eye(4)
+    inverse[:3, :3] = T[:3, :3].T
+    inverse[:3, 3] = -T[:3, :3].T @ T[:3, 3]
+    return inverse
+
+
+def _overlaps(streams: tuple[CornerResiduals, ...]) -> np.ndarray:
+    """(n, n) bool: two cameras saw the same point of the target at the same instant."""
+    n = len(streams)
+    overlaps = np.zeros((n, n), dtype=bool)
+    for i in range(n):
+        for j in range(i):
+            overlaps[i, j] = overlaps[j, i] = _overlap(streams[i], streams[j])
+    return overlaps
+
+
+def _overlap(a: CornerResiduals, b: CornerResiduals) -> bool:
+    if not len(a.seconds) or not len(b.seconds):
+        return False
+    nearest = np.abs(a.seconds[:, None] - b.seconds[None, :]).argmin(axis=1)
+    together = np.abs(a.seconds - b.seconds[nearest]) <= SAME_INSTANT_S
+    n_points = 1 + max(a.point.max(initial=0), b.point.max(initial=0))
+    seen_a = np.repeat(np.where(together, nearest, -1), np.diff(a.start)) * n_points + a.point
+    seen_b = np.repeat(np.arange(len(b.seconds)), np.diff(b.start)) * n_points + b.point
+    return bool(np.isin(seen_a[seen_a >= 0], seen_b).any())
+
+
+def _renamed(kind: str, names: tuple[str, ...]) -> list[str]:
+    """Comments that say which sensor a Kalibr name stands for, where the two differ."""
+    return [f"# {kind}{i} is {name}." for i, name in enumerate(names) if name != f"{kind}{i}"]
+
+
+def _text(comments: list[str], data: dict[str, Any]) -> str:
+    """YAML laid out as Kalibr lays it out: keys sorted, a line for each row of a matrix."""
+    return "\n".join(comments) + "\n" + yaml.safe_dump(data, default_flow_style=None, width=100_000)

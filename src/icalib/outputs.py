@@ -1,0 +1,29 @@
+"""The folder that a calibration leaves: everything derived from one result, written as one set."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from icalib.calibration import Calibration, calibration_files
+from icalib.export.kalibr import camchain_imucam, imu_yaml
+from icalib.report import report_html
+from icalib.result_files import check_writable, write_files
+
+
+def write_outputs(calibration: Calibration, folder: str | Path) -> None:
+    """Writes the result, Kalibr's two files and the report into `folder`: all or none.
+
+    Raises CalibrationError where the folder cannot be written.
+    """
+    texts = {
+        "camchain-imucam.yaml": camchain_imucam(calibration),
+        "imu.yaml": imu_yaml(calibration),
+        "report.html": report_html(calibration),
+    }
+    files = calibration_files(calibration) | {name: text.encode() for name, text in texts.items()}
+    write_files(Path(folder), files)
+
+
+def check_folder(folder: str | Path) -> None:
+    """Makes `folder` and tries to write in it, before the work starts. Raises CalibrationError."""
+    check_writable(Path(folder))

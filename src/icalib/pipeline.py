@@ -1,0 +1,94 @@
+"""From a recording to a calibration: this page is the algorithm."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from icalib.assessment import assess
+from icalib.calibration import Calibration
+from icalib.estimation.assembly import Inputs, image_times, layout_for, nodes_for, start_values
+from icalib.estimation.estimate import estimate
+from icalib.estimation.imu_data import ImuData
+from icalib.estimation.state import State
+from icalib.estimation.tolerances import Tolerances
+from icalib.initialization import Guess, initial_guess, initial_trajectory
+from icalib.measurements import Measurements
+from icalib.provenance import provenance
+from icalib.recordings import Recording, open_recording, read_measurements
+from icalib.rig import Rig
+from icalib.rig_file import load_rig
+
+Progress = Callable[[str, float], None]  # what is being done, and how much of the whole is behind, 0 to 1
+
+
+def calibrate(
+    rig: Rig | str | Path, recording: Recording | str | Path, progress: Progress = lambda *_: None
+) -> Calibration:
+    """Calibrates every sensor of `rig` from `recording`. Both may be paths. Raises CalibrationError, one sentence."""
+    rig = rig if isinstance(rig, Rig) else load_rig(rig)
+    recording = open_recording(recording) if isinstance(recording, (str, Path)) else recording
+    started = time.perf_counter()
+    progress("reading", 0.0)
+    measurements = read_measurements(recording, rig)
+    read = time.perf_counter() - started
+    result = calibrate_measurements(rig, measurements, progress)
+    inputs = provenance([*([rig.path] if rig.path else []), *recording.files()])
+    timings = {"reading": read} | result.timings | {"all": time.perf_counter() - started}
+    return dataclasses.replace(result, inputs=inputs, timings=timings)
+
+
+def calibrate_measurements(
+    rig: Rig, measurements: Measurements, progress: Progress = lambda *_: None
+) -> Calibration:
+    """As `calibrate`, from measurements in memory."""
+    clock = _Clock()
+    progress("finding a first guess", 0.1)
+    guess = initial_guess(rig, measurements)
+    clock.lap("first guess")
+    inputs = Inputs(rig, measurements, ImuData.build(measurements.imu, rig.imu.noise), layout_for(rig), Tolerances())
+    state = first_state(inputs, guess)
+    clock.lap("first state")
+    steps = _StepProgress(progress)
+    found = estimate(inputs, state, lambda name, step: steps.note(name))
+    clock.lap("solving")
+    progress("judging the result", 0.9)
+    result = assess(inputs, found)
+    clock.lap("judging")
+    return dataclasses.replace(result, timings=clock.laps)
+
+
+def first_state(inputs: Inputs, guess: Guess) -> State:
+    """The state that the first pass starts from: the guess at all nodes."""
+    values = start_values(inputs, guess.values())
+    nodes = nodes_for(inputs, image_times(inputs, values))
+    rotation, position, velocity = initial_trajectory(guess, inputs.rig, inputs.measurements, nodes)
+    return State(nodes, rotation, position, velocity, guess.biases(len(nodes)), values)
+
+
+class _Clock:
+    """Wall time by stage."""
+
+    def __init__(self) -> None:
+        self.laps: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, name: str) -> None:
+        now = time.perf_counter()
+        self.laps[name] = now - self._last
+        self._last = now
+
+
+class _StepProgress:
+    """Progress of the solver: each step goes part of the way that is left."""
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress, self._done = progress, 0.2
+
+    def note(self, name: str) -> None:
+        self._done += 0.12 * (0.9 - self._done)
+        self._progress(f"solving ({name} pass)", self._done)
+
+

@@ -1,0 +1,163 @@
+"""The arrowhead solver against dense linear algebra on random chains."""
+
+import numpy as np
+import pytest
+
+from icalib.estimation.arrowhead import HELD_BELOW, NotDefinite, border_step, make_pieces, marginalise, solve
+from icalib.estimation.state import NODE
+
+
+def random_pieces(n_nodes, n_border, seed=0, border_rank=None):
+    """Pieces filled with the sums of random factors: each on two neighbouring nodes and the border, or on one node."""
+    rng = np.random.default_rng(seed)
+    pieces = make_pieces(n_nodes, n_border)
+    mix = np.eye(n_border)
+    if border_rank is not None:
+        mix = rng.normal(size=(border_rank, n_border))
+    for piece in pieces:
+        for k in range(piece.last - piece.first + 1):
+            pair = k < piece.last - piece.first
+            own = piece.first + k != piece.first or piece.first == 0  # a shared node's own factor belongs to one piece
+            for rows, both in ((22, True), (30, False)):
+                if (both and not pair) or (not both and not own):
+                    continue
+                A, B = rng.normal(size=(2, rows, NODE))
+                C, r = rng.normal(size=(rows, len(mix))) @ mix, rng.normal(size=rows)
+                add_factor(piece, k, A, B if both else None, C, r)
+    return pieces
+
+
+def add_factor(piece, k, A, B, C, r):
+    Cr = np.concatenate([C, r[:, None]], axis=1)
+    piece.diagonal[k] += A.T @ A
+    piece.side[k] += A.T @ Cr
+    if B is not None:
+        piece.upper[k] += A.T @ B
+        piece.diagonal[k + 1] += B.T @ B
+        piece.side[k + 1] += B.T @ Cr
+    piece.border += Cr.T @ Cr
+    piece.border[-1, -1] = 0.0
+
+
+def schur(H, g, n_nodes):
+    """Border with the chain eliminated: information and gradient."""
+    o = NODE * n_nodes
+    X = np.linalg.solve(H[:o, :o], np.concatenate([H[:o, o:], g[:o, None]], axis=1))
+    return H[o:, o:] - H[o:, :o] @ X[:, :-1], g[o:] - H[o:, :o] @ X[:, -1]
+
+
+def flat(solution):
+    return np.concatenate([solution.chain.ravel(), solution.border])
+
+
+@pytest.mark.parametrize("n_border", [0, 1, 3, 8])
+@pytest.mark.parametrize("n_nodes", range(1, 13))
+def test_solution_is_the_dense_one(dense, n_nodes, n_border):
+    pieces = random_pieces(n_nodes, n_border)
+    H, g = dense(pieces, n_nodes)
+    information, _ = schur(H, g, n_nodes)
+    solution = solve(pieces, n_nodes, np.ones(n_border))
+    step = np.linalg.solve(H, -g)
+    np.testing.assert_allclose(flat(solution), step, rtol=0, atol=1e-10 * np.abs(step).max())
+    np.testing.assert_allclose(solution.information, information, rtol=0, atol=1e-9)
+    assert solution.decrease == pytest.approx(-(g @ step + 0.5 * step @ H @ step), rel=1e-10)
+
+
+@pytest.mark.parametrize("n_nodes", [1, 3, 4, 7])
+@pytest.mark.parametrize("damping", [1e-9, 1e-2, 10.0])
+def test_damping_scales_the_whole_diagonal(dense, n_nodes, damping):
+    pieces = random_pieces(n_nodes, 4, seed=1)
+    H, g = dense(pieces, n_nodes)
+    H = H + damping * np.diag(np.diag(H))
+    step = np.linalg.solve(H, -g)
+    solution = solve(pieces, n_nodes, np.ones(4), damping)
+    np.testing.assert_allclose(flat(solution), step, rtol=0, atol=1e-10 * np.abs(step).max())
+    np.testing.assert_allclose(solution.information, schur(H, g, n_nodes)[0], rtol=1e-9, atol=1e-9)
+    assert solution.decrease == pytest.approx(-(g @ step + 0.5 * step @ H @ step), rel=1e-10)
+
+
+def test_the_scale_of_the_tolerances_does_not_matter_where_all_is_determined():
+    one = solve(random_pieces(6, 3), 6, np.ones(3))
+    other = solve(random_pieces(6, 3), 6, np.array([0.3, 2.0, 7.0]))
+    np.testing.assert_allclose(flat(one), flat(other), rtol=0, atol=1e-12)
+
+
+def test_long_chain_is_cut_into_two_pieces_that_share_a_node():
+    assert [(p.first, p.last) for p in make_pieces(9, 2)] == [(0, 4), (4, 8)]
+    assert [(p.first, p.last) for p in make_pieces(4, 2)] == [(0, 2), (2, 3)]
+    assert [(p.first, p.last) for p in make_pieces(3, 2)] == [(0, 2)]
+
+
+@pytest.mark.parametrize("n_nodes", [1, 2, 3])
+def test_marginalise_is_the_schur_complement(dense, n_nodes):
+    (piece,) = random_pieces(n_nodes, 5, seed=2)
+    H, g = dense((piece,), n_nodes)
+    information, gradient = schur(H, g, n_nodes)
+    border = marginalise(piece)
+    np.testing.assert_allclose(border[:-1, :-1], information, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(border[:-1, -1], gradient, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(border[-1, :-1], gradient, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("n_nodes", [3, 8])
+def test_undetermined_directions_stay_and_the_rest_is_solved(dense, n_nodes):
+    """Factors see three combinations of five border parameters: the two others are held."""
+    pieces = random_pieces(n_nodes, 5, seed=3, border_rank=3)
+    tolerance = np.array([1.0, 0.5, 2.0, 1.0, 0.3])
+    H, g = dense(pieces, n_nodes)
+    information, gradient = schur(H, g, n_nodes)
+    values, vectors = np.linalg.eigh(information * np.outer(tolerance, tolerance))
+    assert values[1] < 1e-8 < HELD_BELOW < values[2]
+    solution = solve(pieces, n_nodes, tolerance)
+    np.testing.assert_allclose(vectors[:, :2].T @ (solution.border / tolerance), 0.0, atol=1e-12)
+    free = tolerance[:, None] * vectors[:, 2:]
+    expected = free @ np.linalg.solve(free.T @ information @ free, -free.T @ gradient)
+    np.testing.assert_allclose(solution.border, expected, rtol=0, atol=1e-10)
+    o, step = NODE * n_nodes, flat(solution)
+    np.testing.assert_allclose((H @ step + g)[:o], 0.0, atol=1e-9)  # the chain follows the held border
+    assert solution.decrease == pytest.approx(-(g @ step + 0.5 * step @ H @ step), rel=1e-8)
+
+
+@pytest.mark.parametrize("factor", [0.99, 1.01])
+def test_the_border_between_held_and_moved(factor):
+    """One parameter with a tolerance of 0.1: information HELD_BELOW / 0.1^2 is where it begins to move."""
+    information, gradient = np.array([[factor * HELD_BELOW / 0.1**2]]), np.array([3.0])
+    step, decrease = border_step(information, gradient, np.array([0.1]))
+    expected = 0.0 if factor < 1.0 else -3.0 / information[0, 0]
+    assert step[0] == pytest.approx(expected, rel=1e-12)
+    assert decrease == pytest.approx(-0.5 * 3.0 * expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("node", [0, 4, 8])
+def test_a_node_that_nothing_determines_is_an_error(node):
+    pieces = random_pieces(9, 2)
+    for piece in pieces:
+        if piece.first <= node <= piece.last:
+            k = node - piece.first
+            piece.diagonal[k], piece.upper[k], piece.side[k] = 0.0, 0.0, 0.0
+            if k > 0:
+                piece.upper[k - 1] = 0.0
+    with pytest.raises(NotDefinite):
+        solve(pieces, 9, np.ones(2))
+
+
+def test_not_a_number_is_an_error():
+    pieces = random_pieces(9, 2)
+    pieces[1].diagonal[2, 3, 3] = np.nan
+    with pytest.raises(NotDefinite):
+        solve(pieces, 9, np.ones(2))
+
+
+def test_marginalise_raises_too():
+    (piece,) = random_pieces(2, 2)
+    piece.diagonal[1] = -np.eye(NODE)
+    with pytest.raises(NotDefinite):
+        marginalise(piece)
+
+
+def test_the_same_sums_give_the_same_bits():
+    first = solve(random_pieces(12, 6), 12, np.ones(6), 1e-3)
+    for _ in range(5):
+        again = solve(random_pieces(12, 6), 12, np.ones(6), 1e-3)
+        np.testing.assert_array_equal(flat(again), flat(first))
+        np.testing.assert_array_equal(again.information, first.information)

@@ -1,0 +1,229 @@
+"""One check for every factor: its sums against numeric derivatives of its residuals, on the manifold.
+
+A sample is a factor at a state. It must add to the pieces J^T W J and J^T W r, W the weights of its residuals r with
+what it marginalises taken out, and return a cost whose derivative this is.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+import icalib.estimation
+from icalib.estimation.arrowhead import Piece, make_pieces
+from icalib.estimation.corner_factor import CornerNoise, CornerOutput
+from icalib.estimation.imu_factor import ROWS, ImuFactor
+from icalib.estimation.prior_factor import FIRST_BIAS_SIGMA, Prior, accumulate_bias_prior
+from icalib.estimation.state import NODE, State
+from icalib.geometry import so3
+
+
+@dataclass(frozen=True)
+class Sample:
+    """factor: its name in the source. accumulate(state, piece, sums) -> cost; weighted(state) -> r (n,), W (n, n)."""
+
+    factor: str
+    setup: object
+    state: State
+    accumulate: Callable[[State, Piece, bool], float]
+    weighted: Callable[[State], tuple[np.ndarray, np.ndarray]]
+    smooth: bool = True  # whether the cost is least over the weights to rounding, so that its slope can be measured
+
+
+def imu_sample(unlike, setup_of, imu_free):
+    """Preintegrated at another state, so that the corrections by bias and intrinsics are not zero."""
+    setup = setup_of(unlike, imu_free=imu_free)
+    columns = setup.layout.columns("imu0", "intrinsics")
+    factor = ImuFactor.build(setup.imu, setup.state, 9.81, columns[columns >= 0])
+    state = setup.perturbed(np.random.default_rng(0), 0.1)
+
+    def weighted(at):
+        out = np.zeros((len(at.seconds) - 1, ROWS))
+        for piece in make_pieces(len(at.seconds), setup.layout.size):
+            factor.accumulate(at, piece, out, sums=False)
+        return out.ravel(), np.eye(out.size)
+
+    def accumulate(at, piece, sums):
+        return factor.accumulate(at, piece, np.zeros((len(at.seconds) - 1, ROWS)), sums)
+
+    return Sample("ImuFactor", setup, state, accumulate, weighted)
+
+
+def corner_sample(unlike, setup_of, factor_of, camera, scheme="inertial", loss="none", field=0, imu_free=False):
+    setup = setup_of(unlike, imu_free=imu_free, shape=2, bloom=True)
+    rng = np.random.default_rng(1)
+    stream = unlike.measurements.cameras[camera]
+    n, m = len(stream.uv), len(stream.stamps_ns)
+    # Few corners of each image, and errors of some sigma, so that robust losses bend.
+    noise = CornerNoise(
+        rng.uniform(0.3, 0.6, m), np.array([0.4, 0.3, 0.2])[:field], rng.normal(size=(n, 3))[:, :field].copy(), loss, 1.5
+    )
+    factor = factor_of(setup, camera, scheme)
+    factor = replace(
+        factor,
+        stream=replace(stream, uv=stream.uv + rng.normal(size=(n, 2))),
+        keep=rng.random(n) < 0.1,
+        noise=noise,
+        direction=rng.normal(size=(n, 2)),
+        basis=rng.normal(size=(len(factor.points), 2, 3)),
+    )
+    state = setup.perturbed(rng, 0.3)
+
+    def run(at):
+        out = CornerOutput.empty(stream, field)
+        for piece in make_pieces(len(at.seconds), setup.layout.size):
+            factor.accumulate(at, piece, out, sums=False)
+        return out
+
+    def weighted(at):
+        out = run(at)
+        used = out.root > 0
+        root, f, image = out.root[used], noise.field[used], stream.image[used]
+        r = out.residual[used].T.ravel()
+        W = np.kron(np.eye(2), np.diag(root**2))
+        for i in range(m if field else 0):
+            F = root[:, None] * f * (image == i)[:, None]
+            taken = F @ np.linalg.solve(F.T @ F + np.diag(noise.tau**-2), F.T)
+            W -= np.kron(np.eye(2), root[:, None] * taken * root)
+        return r, W
+
+    def accumulate(at, piece, sums):
+        return factor.accumulate(at, piece, CornerOutput.empty(stream, field), sums)
+
+    return Sample("CornerFactor", setup, state, accumulate, weighted, loss == "none" or not field)
+
+
+def prior_sample(unlike, setup_of, sensor, name):
+    setup = setup_of(unlike, imu_free=True)
+    rng = np.random.default_rng(2)
+    block, state = setup.layout.block(sensor, name), setup.perturbed(rng)
+    value = setup.state.values[block.key]
+    value = value @ so3.exp(0.3 * rng.normal(size=3)) if block.kind == "rotation" else value + rng.normal(size=block.size)
+    prior = Prior(block, np.ascontiguousarray(value), rng.uniform(0.1, 0.5, block.size))
+
+    def weighted(at):
+        x = at.values[block.key]
+        error = so3.log(np.ascontiguousarray(value.T @ x)) if block.kind == "rotation" else x - value
+        return error / prior.sigma, np.eye(block.size)
+
+    def accumulate(at, piece, sums):
+        return prior.accumulate(at, piece, sums) if piece.first == 0 else 0.0
+
+    return Sample("Prior", setup, state, accumulate, weighted)
+
+
+def bias_prior_sample(unlike, setup_of):
+    setup = setup_of(unlike)
+    return Sample(
+        "accumulate_bias_prior",
+        setup,
+        setup.perturbed(np.random.default_rng(3)),
+        accumulate_bias_prior,
+        lambda at: (at.bias[0] / FIRST_BIAS_SIGMA, np.eye(6)),
+    )
+
+
+SAMPLES = {
+    "imu": ("ImuFactor", lambda u, s, f: imu_sample(u, s, False)),
+    "imu, intrinsics": ("ImuFactor", lambda u, s, f: imu_sample(u, s, True)),
+    "radtan, inertial": ("CornerFactor", lambda u, s, f: corner_sample(u, s, f, 0)),
+    "radtan, kinematic, intrinsics": ("CornerFactor", lambda u, s, f: corner_sample(u, s, f, 0, "kinematic", imu_free=True)),
+    "equidistant, inertial, intrinsics": ("CornerFactor", lambda u, s, f: corner_sample(u, s, f, 1, imu_free=True)),
+    "equidistant, kinematic": ("CornerFactor", lambda u, s, f: corner_sample(u, s, f, 1, "kinematic")),
+    "equidistant, pose": ("CornerFactor", lambda u, s, f: corner_sample(u, s, f, 1, "pose")),
+    "radtan, pose, intrinsics": ("CornerFactor", lambda u, s, f: corner_sample(u, s, f, 0, "pose", imu_free=True)),
+    "common shift": ("CornerFactor", lambda u, s, f: corner_sample(u, s, f, 0, field=1)),
+    "common field": ("CornerFactor", lambda u, s, f: corner_sample(u, s, f, 1, "pose", field=3)),
+    "huber": ("CornerFactor", lambda u, s, f: corner_sample(u, s, f, 0, loss="huber")),
+    "cauchy": ("CornerFactor", lambda u, s, f: corner_sample(u, s, f, 1, loss="cauchy")),
+    "huber, common field": ("CornerFactor", lambda u, s, f: corner_sample(u, s, f, 0, loss="huber", field=3)),
+    "prior on a rotation": ("Prior", lambda u, s, f: prior_sample(u, s, "cam1", "rotation")),
+    "prior on a vector": ("Prior", lambda u, s, f: prior_sample(u, s, "cam0", "intrinsics")),
+    "prior on IMU intrinsics": ("Prior", lambda u, s, f: prior_sample(u, s, "imu0", "intrinsics")),
+    "bias prior": ("accumulate_bias_prior", lambda u, s, f: bias_prior_sample(u, s)),
+}
+
+
+def factors_in_the_source():
+    """Whatever adds to the normal equations: classes with `accumulate`, functions named so, of modules *_factor."""
+    found = set()
+    for module in pkgutil.iter_modules(icalib.estimation.__path__):
+        if module.name.endswith("_factor"):
+            name = f"icalib.estimation.{module.name}"
+            for key, thing in vars(importlib.import_module(name)).items():
+                own = getattr(thing, "__module__", None) == name
+                if own and (hasattr(thing, "accumulate") or (key.startswith("accumulate") and callable(thing))):
+                    found.add(key)
+    return found
+
+
+def test_every_factor_has_a_sample():
+    assert factors_in_the_source() == {factor for factor, _ in SAMPLES.values()}
+
+
+def sums_of(sample, dense):
+    n = len(sample.state.seconds)
+    pieces = make_pieces(n, sample.setup.layout.size)
+    cost = sum(sample.accumulate(sample.state, p, True) for p in pieces)
+    return cost, *dense(pieces, n)
+
+
+def moved(sample, d):
+    o = NODE * len(sample.state.seconds)
+    return sample.state.retract(sample.setup.layout, d[:o].reshape(-1, NODE), d[o:])
+
+
+def cost_at(sample, d):
+    state = moved(sample, d)
+    return sum(sample.accumulate(state, p, False) for p in make_pieces(len(state.seconds), sample.setup.layout.size))
+
+
+def scales(sample):
+    """Steps of each column: of the size that parameters have."""
+    chain = np.tile(np.repeat([1e-2, 1e-2, 1e-2, 1e-3, 1e-2], 3), len(sample.state.seconds))
+    return np.concatenate([chain, sample.setup.columns_scale()])
+
+
+@pytest.fixture(scope="module", params=SAMPLES)
+def sample(request, unlike, setup_of, factor_of):
+    name, make = SAMPLES[request.param]
+    made = make(unlike, setup_of, factor_of)
+    assert made.factor == name
+    return made
+
+
+def test_sums_are_those_of_numeric_derivatives(sample, dense):
+    _, H, g = sums_of(sample, dense)
+    r, W = sample.weighted(sample.state)
+    scale, h = scales(sample), 1e-3
+    J = np.empty((len(r), len(g)))
+    for n in range(len(g)):
+        d = np.zeros(len(g))
+        d[n] = h * scale[n]
+        J[:, n] = (sample.weighted(moved(sample, d))[0] - sample.weighted(moved(sample, -d))[0]) / (2 * h)
+    H, g = H * np.outer(scale, scale), g * scale
+    numeric_H, numeric_g = J.T @ W @ J, J.T @ W @ r
+    size = np.sqrt(np.maximum(np.diag(numeric_H), 1e-9 * np.diag(numeric_H).max()))
+    assert np.abs(numeric_g).max() > 0
+    np.testing.assert_allclose(H / np.outer(size, size), numeric_H / np.outer(size, size), rtol=0, atol=2e-6)
+    np.testing.assert_allclose(g / size, numeric_g / size, rtol=0, atol=2e-6 * np.linalg.norm(r))
+
+
+def test_gradient_is_the_slope_of_the_cost(sample, dense):
+    cost, _, g = sums_of(sample, dense)
+    assert cost > 0
+    rng, scale, h = np.random.default_rng(9), scales(sample), 1e-4
+    tolerance = 1e-6 if sample.smooth else 1e-4
+    for _ in range(10):
+        d = rng.normal(size=len(g)) * scale
+        slope = (cost_at(sample, h * d) - cost_at(sample, -h * d)) / (2 * h)
+        assert slope == pytest.approx(g @ d, rel=tolerance, abs=tolerance * np.linalg.norm(g * scale))
+
+
+def test_cost_without_sums_is_the_cost_with_them(sample, dense):
+    assert cost_at(sample, np.zeros(len(scales(sample)))) == pytest.approx(sums_of(sample, dense)[0], rel=1e-13)

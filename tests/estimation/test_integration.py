@@ -1,0 +1,266 @@
+"""Closed-form integration of readings against the matrix exponential, Runge-Kutta, differences and sampling."""
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+from icalib.estimation.integration import integrate
+from icalib.geometry import so3
+
+BIAS = np.array([0.01, -0.02, 0.03, 0.1, -0.2, 0.15])
+INTRINSICS = np.random.default_rng(5).normal(size=24) * np.repeat([0.01, 0.01, 0.02, 2e-3], [6, 6, 3, 9])
+LOWER = ([0, 1, 1, 2, 2, 2], [0, 0, 1, 0, 1, 2])
+UNIT = np.array([0.48, -0.6, 0.64])
+# Angles of one step around the border between series and closed forms, at both extremes and in between.
+ANGLES = [0.0, 1e-12, 1e-8, 1e-4, 1e-2, 0.0999999, 0.1, 0.1000001, 0.5, 2.0, np.pi - 1e-6, 3.5]
+
+
+class Readings:
+    """Irregular stamps with random readings, smooth enough to be a motion."""
+
+    def __init__(self, n=12, rate_scale=1.0, seed=0):
+        rng = np.random.default_rng(seed)
+        self.t = np.cumsum(rng.uniform(0.002, 0.011, n)) - 0.004
+        self.gyro = rate_scale * rng.normal(size=(n, 3))
+        self.accel = rng.normal(size=(n, 3)) * 3.0 + [0.0, 0.0, 9.8]
+        self.variance = np.tile([1e-4**2, 2e-3**2], (n - 1, 1)) * rng.uniform(0.5, 2.0, (n - 1, 1))
+        self.walk = np.array([1e-3**2, 2e-2**2])
+
+    def interval(self, t):
+        return int(np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 2))
+
+
+def run(r, t0, t1, bias=BIAS, intrinsics=None, first=None, width=6, covariance=False):
+    """R, v, p, J, P, and rate and force at the end."""
+    R, v, p, J = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((9, width))
+    P = np.empty((15, 15) if covariance else (0, 0))
+    first = r.interval(t0) if first is None else first
+    x = np.zeros(24) if intrinsics is None else intrinsics
+    end = integrate(t0, t1, first, r.t, r.gyro, r.accel, bias, x, r.variance, r.walk, R, v, p, J, P)
+    return R, v, p, J, P, end
+
+
+def corrected_means(r, bias, intrinsics):
+    """Body rate and specific force (n - 1, 3) of each interval."""
+    M_a, M_g = np.eye(3), np.eye(3)
+    M_a[LOWER] += intrinsics[:6]
+    M_g[LOWER] += intrinsics[6:12]
+    C = Rotation.from_rotvec(intrinsics[12:15]).as_matrix()
+    f = np.linalg.solve(M_a, (0.5 * (r.accel[1:] + r.accel[:-1]) - bias[3:]).T).T
+    gyro = 0.5 * (r.gyro[1:] + r.gyro[:-1]) - bias[:3] - f @ intrinsics[15:].reshape(3, 3).T
+    return np.linalg.solve(M_g @ C, gyro.T).T, f
+
+
+def generator(w, f):
+    A = np.zeros((5, 5))
+    A[:3, :3], A[:3, 3], A[3, 4] = np.cross(np.eye(3), w), f, 1.0
+    return A
+
+
+def by_expm(r, t0, t1, bias=BIAS, intrinsics=None):
+    """The same increments as a product of matrix exponentials: [R v p; 0 1 t; 0 0 1]."""
+    w, f = corrected_means(r, bias, np.zeros(24) if intrinsics is None else intrinsics)
+    inner = r.t[1:-1]
+    stops = [t0, *sorted(inner[(inner > min(t0, t1)) & (inner < max(t0, t1))], reverse=bool(t1 < t0)), t1]
+    X = np.eye(5)
+    for a, b in zip(stops[:-1], stops[1:], strict=True):
+        j = r.interval(0.5 * (a + b))
+        X = X @ expm(generator(w[j], f[j]) * (b - a))
+    return X[:3, :3], X[:3, 3], X[:3, 4]
+
+
+def assert_same(got, want, atol):
+    for a, b in zip(got[:3], want, strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=atol)
+
+
+def difference(plus, minus, R, h):
+    """(9,) central difference of (rotation on the right, v, p)."""
+    turn = so3.log(R.T @ plus[0]) - so3.log(R.T @ minus[0])
+    return np.concatenate([turn, plus[1] - minus[1], plus[2] - minus[2]]) / (2.0 * h)
+
+
+R0 = Readings()
+SPANS = {
+    "between stamps": (R0.t[1] + 1e-3, R0.t[8] + 2e-3),
+    "stamp to stamp": (R0.t[2], R0.t[9]),
+    "within one interval": (R0.t[4] + 2e-4, R0.t[4] + 1.1e-3),
+    "whole": (R0.t[0], R0.t[-1]),
+    "beyond both ends": (R0.t[0] - 0.003, R0.t[-1] + 0.004),
+    "no time": (R0.t[3] + 1e-4, R0.t[3] + 1e-4),
+}
+
+
+@pytest.mark.parametrize("intrinsics", [None, INTRINSICS], ids=["ideal", "intrinsics"])
+@pytest.mark.parametrize("backwards", [False, True])
+@pytest.mark.parametrize("span", SPANS)
+def test_increments_are_products_of_matrix_exponentials(span, backwards, intrinsics):
+    t0, t1 = SPANS[span][::-1] if backwards else SPANS[span]
+    assert_same(run(R0, t0, t1, intrinsics=intrinsics), by_expm(R0, t0, t1, intrinsics=intrinsics), 1e-13)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+@pytest.mark.parametrize("backwards", [False, True])
+def test_one_step_at_every_angle_with_unit_force(angle, backwards):
+    r = Readings(2)
+    r.t, r.gyro, r.accel = np.array([0.0, 1.0]), np.tile(angle * UNIT, (2, 1)), np.tile(UNIT[[1, 2, 0]], (2, 1))
+    t0, t1 = (1.0, 0.0) if backwards else (0.0, 1.0)
+    zero = np.zeros(6)
+    assert_same(run(r, t0, t1, zero), by_expm(r, t0, t1, zero), 1e-14)
+
+
+def test_increments_are_a_fine_runge_kutta():
+    t0, t1 = SPANS["between stamps"]
+    w, f = corrected_means(R0, BIAS, np.zeros(24))
+    stops = np.concatenate([[t0], R0.t[(R0.t > t0) & (R0.t < t1)], [t1]])
+    R, v, p = np.eye(3), np.zeros(3), np.zeros(3)
+    for a, b in zip(stops[:-1], stops[1:], strict=True):
+        j, h = R0.interval(0.5 * (a + b)), (b - a) / 20
+        W = np.cross(np.eye(3), w[j])
+        for _ in range(20):
+            k = [(R @ W, R @ f[j], v)]
+            for c in (0.5, 0.5, 1.0):
+                dR, dv, _ = k[-1]
+                k.append(((R + c * h * dR) @ W, (R + c * h * dR) @ f[j], v + c * h * dv))
+            R, v, p = (
+                x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4) for x, k1, k2, k3, k4 in zip((R, v, p), *k, strict=True)
+            )
+    assert_same(run(R0, t0, t1), (R, v, p), 1e-11)
+
+
+def test_forwards_and_back_is_nothing():
+    t0, t1 = SPANS["between stamps"]
+    R, v, p, *_ = run(R0, t0, t1)
+    Rb, vb, pb, *_ = run(R0, t1, t0)
+    np.testing.assert_allclose(R @ Rb, np.eye(3), atol=1e-14)
+    np.testing.assert_allclose(v + R @ vb, 0.0, atol=1e-14)
+    np.testing.assert_allclose(p + v * (t0 - t1) + R @ pb, 0.0, atol=1e-14)
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_starting_in_either_interval_at_a_stamp_is_the_same(backwards):
+    t0, t1 = (R0.t[6], R0.t[3]) if backwards else (R0.t[3], R0.t[6])
+    i = R0.interval(t0)
+    for a, b in zip(run(R0, t0, t1, first=i)[:4], run(R0, t0, t1, first=i - 1)[:4], strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-15)
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_rate_and_force_at_the_end_are_those_of_the_last_interval(backwards):
+    t0, t1 = SPANS["between stamps"][::-1] if backwards else SPANS["between stamps"]
+    w, f = corrected_means(R0, BIAS, INTRINSICS)
+    rate, force = run(R0, t0, t1, intrinsics=INTRINSICS)[5]
+    np.testing.assert_allclose(rate, w[R0.interval(t1)], atol=1e-14)
+    np.testing.assert_allclose(force, f[R0.interval(t1)], atol=1e-13)
+
+
+@pytest.mark.parametrize("intrinsics", [np.zeros(24), INTRINSICS], ids=["ideal", "intrinsics"])
+@pytest.mark.parametrize("backwards", [False, True])
+@pytest.mark.parametrize("span", ["between stamps", "stamp to stamp", "within one interval", "beyond both ends"])
+def test_jacobians_by_central_differences(span, backwards, intrinsics):
+    t0, t1 = SPANS[span][::-1] if backwards else SPANS[span]
+    R, _, _, J, _, _ = run(R0, t0, t1, intrinsics=intrinsics, width=30)
+    h = 1e-5
+    for n in range(30):
+        d = h * np.eye(30)[n]
+        plus = run(R0, t0, t1, BIAS + d[:6], intrinsics + d[6:])
+        minus = run(R0, t0, t1, BIAS - d[:6], intrinsics - d[6:])
+        np.testing.assert_allclose(J[:, n], difference(plus, minus, R, h), rtol=1e-7, atol=1e-9, err_msg=str(n))
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_bias_jacobian_of_one_step_at_every_angle(angle):
+    r = Readings(2)
+    r.t, r.gyro, r.accel = np.array([0.0, 1.0]), np.tile(angle * UNIT, (2, 1)), np.tile(UNIT[[1, 2, 0]], (2, 1))
+    zero, h = np.zeros(6), 1e-5
+    R, _, _, J, _, _ = run(r, 0.0, 1.0, zero)
+    for n in range(6):
+        d = h * np.eye(6)[n]
+        numeric = difference(run(r, 0.0, 1.0, d), run(r, 0.0, 1.0, -d), R, h)
+        np.testing.assert_allclose(J[:, n], numeric, rtol=0, atol=1e-9, err_msg=str(n))
+
+
+def test_narrow_and_wide_jacobian_agree():
+    t0, t1 = SPANS["between stamps"]
+    narrow, wide = run(R0, t0, t1, intrinsics=INTRINSICS), run(R0, t0, t1, intrinsics=INTRINSICS, width=30)
+    np.testing.assert_array_equal(narrow[3], wide[3][:, :6])
+
+
+def test_a_larger_bias_means_less_rotation_velocity_and_position():
+    J = run(R0, R0.t[0], R0.t[-1])[3]
+    assert (np.diag(J[:3, :3]) < 0).all()
+    assert (np.diag(J[3:6, 3:6]) < 0).all()
+    assert (np.diag(J[6:9, 3:6]) < 0).all()
+
+
+def noise_columns(r, t0, t1, intrinsics):
+    """(15, m): what each unit noise does to the errors at t1: readings of each interval, then steps of the biases."""
+    R = run(r, t0, t1, intrinsics=intrinsics)[0]
+    first, last = r.interval(t0), r.interval(t1 - 1e-12)
+    h, columns = 1e-4, []
+
+    def moved(bias_of):
+        # One interval after the other, each with its own bias, composed by hand.
+        X = np.eye(5)
+        for j in range(first, last + 1):
+            a, b = max(t0, r.t[j]), min(t1, r.t[j + 1])
+            w, f = corrected_means(r, bias_of(j), intrinsics)
+            X = X @ expm(generator(w[j], f[j]) * (b - a))
+        return X[:3, :3], X[:3, 3], X[:3, 4]
+
+    for j in range(first, last + 1):
+        dt = min(t1, r.t[j + 1]) - max(t0, r.t[j])
+        for k in range(6):
+            d = h * np.eye(6)[k]
+            white = difference(moved(lambda i, j=j, d=d: BIAS - d * (i == j)), moved(lambda i, j=j, d=d: BIAS + d * (i == j)), R, h)
+            walk = difference(moved(lambda i, j=j, d=d: BIAS + d * (i > j)), moved(lambda i, j=j, d=d: BIAS - d * (i > j)), R, h)
+            columns.append(np.concatenate([white, np.zeros(6)]) * np.sqrt(r.variance[j, k // 3] / dt))
+            columns.append(np.concatenate([walk, np.eye(6)[k]]) * np.sqrt(r.walk[k // 3] * dt))
+    return np.array(columns).T
+
+
+@pytest.mark.parametrize("intrinsics", [np.zeros(24), INTRINSICS], ids=["ideal", "intrinsics"])
+def test_covariance_is_that_of_all_noises_one_by_one(intrinsics):
+    t0, t1 = SPANS["between stamps"]
+    P = run(R0, t0, t1, intrinsics=intrinsics, covariance=True)[4]
+    C = noise_columns(R0, t0, t1, intrinsics)
+    scale = np.sqrt(np.diag(P))
+    np.testing.assert_allclose(P / np.outer(scale, scale), C @ C.T / np.outer(scale, scale), atol=1e-7)
+
+
+def test_covariance_against_sampled_readings():
+    """White noise of density s on readings at rate f has standard deviation s sqrt(f); biases walk from reading to reading."""
+    rate, n, samples = 200.0, 100, 4000
+    rng = np.random.default_rng(3)
+    r = Readings(n + 1)
+    r.t = np.arange(n + 1) / rate
+    phase = 2 * np.pi * r.t[:, None] * [1.1, 0.7, 0.9]
+    r.gyro, r.accel = np.sin(phase + 1.0), 2.0 * np.cos(phase) + [0.0, 0.0, 9.8]
+    r.variance = np.tile([1e-3**2, 1e-2**2], (n, 1))
+    r.walk = np.array([2e-3**2, 2e-2**2])
+    R, v, p, _, P, _ = run(r, 0.0, r.t[-1], covariance=True)
+
+    density, walk = np.sqrt(np.repeat(r.variance[0], 3)), np.sqrt(np.repeat(r.walk, 3))
+    readings = np.concatenate([r.gyro, r.accel], axis=1) + density * np.sqrt(rate) * rng.normal(size=(samples, n + 1, 6))
+    steps = walk / np.sqrt(rate) * rng.normal(size=(samples, n + 1, 6))
+    steps[:, 0] = 0.0
+    wander = np.cumsum(steps, axis=1)
+    readings += wander
+    mean = 0.5 * (readings[:, 1:] + readings[:, :-1]) - BIAS
+    Rs, vs, ps = Rotation.identity(samples), np.zeros((samples, 3)), np.zeros((samples, 3))
+    dt = 1.0 / rate
+    for i in range(n):
+        middle = Rs * Rotation.from_rotvec(0.5 * dt * mean[:, i, :3])
+        force = middle.apply(mean[:, i, 3:])
+        ps += vs * dt + 0.5 * force * dt**2
+        vs += force * dt
+        Rs = Rs * Rotation.from_rotvec(dt * mean[:, i, :3])
+    # The error of the factor is predicted - measured: the noiseless increments are the true ones here.
+    turned = (Rs.inv() * Rotation.from_matrix(R)).as_rotvec()
+    errors = np.concatenate([turned, v - vs, p - ps, wander[:, -1]], axis=1)
+    errors -= errors.mean(axis=0)
+    nees = np.einsum("ni,ij,nj->n", errors, np.linalg.inv(P), errors).mean()
+    # 4.5 standard deviations of the mean of 4000 chi^2 of 15 degrees of freedom.
+    assert abs(nees - 15.0) < 0.4
+    np.testing.assert_allclose(errors.var(axis=0) / np.diag(P), 1.0, atol=0.1)

@@ -1,0 +1,76 @@
+"""Where nodes stand: at images, filled in between, none in long gaps."""
+
+import numpy as np
+
+from icalib.estimation.imu_data import ImuData
+from icalib.estimation.nodes import place_nodes, usable
+from icalib.measurements import ImuStream
+from icalib.rig import ImuNoise
+
+
+def imu_at(seconds):
+    n = len(seconds)
+    rng = np.random.default_rng(0)
+    stream = ImuStream(
+        "imu0", np.round(np.asarray(seconds) * 1e9).astype(np.int64), rng.normal(size=(n, 3)), rng.normal(size=(n, 3))
+    )
+    return ImuData.build(stream, ImuNoise(1e-3, 1e-5, 1e-2, 1e-4))
+
+
+STEADY = np.arange(401) / 200.0
+
+
+def without(seconds, start, end):
+    return seconds[(seconds <= start) | (seconds >= end)]
+
+
+def test_images_within_2_ms_share_the_earlier_one():
+    times = [np.array([0.1, 0.15, 0.2]), np.array([0.1019, 0.1521, 0.2])]
+    nodes = place_nodes(imu_at(STEADY), times, spacing=0.1, max_gap=0.5)
+    np.testing.assert_array_equal(nodes, [0.1, 0.15, 0.1521, 0.2])
+
+
+def test_order_of_cameras_does_not_matter():
+    a, b = np.array([0.1, 0.2, 0.3]), np.array([0.125, 0.225])
+    imu = imu_at(STEADY)
+    np.testing.assert_array_equal(place_nodes(imu, [a, b], 0.05, 0.5), place_nodes(imu, [b, a], 0.05, 0.5))
+
+
+def test_no_two_nodes_are_further_apart_than_the_spacing_and_all_images_are_nodes():
+    images = np.array([0.1, 0.15, 0.38, 0.48, 1.0])
+    nodes = place_nodes(imu_at(STEADY), [images], spacing=0.05, max_gap=0.5)
+    assert np.diff(nodes).max() <= 0.05 + 1e-9
+    assert np.isin(images, nodes).all()
+    assert np.diff(nodes).min() > 0.04  # filled evenly, no node more than needed
+    assert len(nodes) == 1 + 1 + 5 + 2 + 11
+
+
+def test_images_outside_the_recording_have_no_node():
+    nodes = place_nodes(imu_at(STEADY), [np.array([-0.1, 0.0, 0.05, 2.0, 2.01])], 3.0, 0.5)
+    np.testing.assert_array_equal(nodes, [0.0, 0.05, 2.0])
+
+
+def test_short_gaps_are_filled():
+    imu = imu_at(without(STEADY, 0.5, 0.8))
+    np.testing.assert_allclose(imu.gaps, [(0.5, 0.8)])
+    images = np.arange(0.1, 1.0, 0.1)
+    nodes = place_nodes(imu, [images], spacing=0.05, max_gap=0.5)
+    assert np.isin(images, nodes).all()
+    assert np.diff(nodes).max() <= 0.05 + 1e-9
+
+
+def test_long_gaps_hold_no_node():
+    imu = imu_at(without(STEADY, 0.5, 1.3))
+    images = np.arange(0.1, 1.6, 0.1)
+    nodes = place_nodes(imu, [images], spacing=0.05, max_gap=0.5)
+    assert not ((nodes > 0.5 + 1e-9) & (nodes < 1.3 - 1e-9)).any()
+    assert nodes[0] == images[0] and nodes[-1] == images[-1]
+    # Up to the gap and after it the spacing holds, but for the ends towards the gap.
+    assert np.sort(np.diff(nodes))[-2] <= 0.05 + 1e-9
+
+
+def test_usable_is_what_lies_inside_the_recording_and_outside_long_gaps():
+    times = np.array([-1e-3, 0.0, 0.3, 0.5, 0.6, 1.2, 1.3, 2.0, 2.1])
+    imu = imu_at(without(STEADY, 0.5, 1.3))
+    np.testing.assert_array_equal(usable(imu, times, 0.5), [False, True, True, True, False, False, True, True, False])
+    np.testing.assert_array_equal(usable(imu, times, 1.0), [False, True, True, True, True, True, True, True, False])

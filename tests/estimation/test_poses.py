@@ -1,0 +1,160 @@
+"""Where the IMU was at a sensor's instant: three schemes, their Jacobians and time derivatives."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation, Slerp
+
+from icalib.estimation.poses import assign_nodes, poses_at
+from icalib.estimation.state import NODE
+from icalib.geometry import so3
+
+SCHEMES = ("inertial", "kinematic", "pose")
+
+
+@pytest.fixture(scope="module")
+def setup(unlike, setup_of):
+    """Nodes off the stamps of the IMU as well as on them."""
+    setup = setup_of(unlike, imu_free=True)
+    seconds = np.array([0.05, 0.1013, 0.1487, 0.2, 0.2471])
+    R, p, v = setup.truth_at(seconds)
+    state = replace(setup.state, seconds=seconds, rotation=R, position=p, velocity=v, bias=setup.state.bias[:5].copy())
+    return replace(setup, state=state)
+
+
+# Between nodes, on stamps of the IMU, at nodes, before the first node and after the last.
+TIMES = np.array([0.0312, 0.05, 0.0521, 0.0913, 0.105, 0.1251, 0.1488, 0.17, 0.2, 0.2219, 0.26])
+
+
+def evaluate(setup, scheme, state=None, times=TIMES, imu_free=True):
+    node = assign_nodes(scheme, setup.state.seconds, TIMES)
+    return poses_at(scheme, times, node, state or setup.state, setup.imu, 9.81, imu_free), node
+
+
+def difference(plus, minus, at, h):
+    """(n, 6) central difference: rotation on the right, position."""
+    Rt = at.rotation.transpose(0, 2, 1)
+    turn = so3.log_many(np.ascontiguousarray(Rt @ plus.rotation)) - so3.log_many(np.ascontiguousarray(Rt @ minus.rotation))
+    return np.concatenate([turn, plus.position - minus.position], axis=1) / (2 * h)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_jacobians_of_every_node_by_central_differences(setup, scheme):
+    state = setup.perturbed(np.random.default_rng(1))
+    at, node = evaluate(setup, scheme, state)
+    h, border = 1e-6, np.zeros(setup.layout.size)
+    for k in range(len(state.seconds)):
+        for j in range(NODE):
+            chain = np.zeros((len(state.seconds), NODE))
+            chain[k, j] = h
+            plus, _ = evaluate(setup, scheme, state.retract(setup.layout, chain, border))
+            minus, _ = evaluate(setup, scheme, state.retract(setup.layout, -chain, border))
+            analytic = at.by_node[:, :, j] * (node == k)[:, None]
+            if scheme == "pose":
+                analytic = analytic + at.by_next[:, :, j] * (node + 1 == k)[:, None]
+            np.testing.assert_allclose(analytic, difference(plus, minus, at, h), rtol=0, atol=5e-9, err_msg=f"{k} {j}")
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_jacobians_of_the_imu_intrinsics_by_central_differences(setup, scheme):
+    state = setup.perturbed(np.random.default_rng(2))
+    at, _ = evaluate(setup, scheme, state)
+    h, chain = 1e-5, np.zeros((len(state.seconds), NODE))
+    assert at.by_imu.shape == (len(TIMES), 6, 24)
+    for n, column in enumerate(setup.layout.columns("imu0", "intrinsics")):
+        border = h * np.eye(setup.layout.size)[column]
+        plus, _ = evaluate(setup, scheme, state.retract(setup.layout, chain, border))
+        minus, _ = evaluate(setup, scheme, state.retract(setup.layout, chain, -border))
+        np.testing.assert_allclose(at.by_imu[:, :, n], difference(plus, minus, at, h), rtol=0, atol=5e-9, err_msg=str(n))
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_rate_and_velocity_are_the_time_derivative(setup, scheme):
+    state, h = setup.perturbed(np.random.default_rng(3)), 1e-6
+    smooth = np.abs(TIMES[:, None] - setup.imu.seconds).min(axis=1) > 2 * h  # at a stamp the rate jumps
+    at, _ = evaluate(setup, scheme, state)
+    plus, minus = (evaluate(setup, scheme, state, TIMES + d)[0] for d in (h, -h))
+    numeric = difference(plus, minus, at, h)
+    assert smooth.sum() >= 6
+    np.testing.assert_allclose(at.rate[smooth], numeric[smooth, :3], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(at.velocity[smooth], numeric[smooth, 3:], rtol=0, atol=1e-8)
+
+
+def test_shapes_without_what_is_not_wanted(setup):
+    inertial, _ = evaluate(setup, "inertial", imu_free=False)
+    assert inertial.by_imu.shape == (len(TIMES), 6, 0)
+    assert inertial.by_next.shape == (0, 6, NODE)
+
+
+def test_inertial_is_exact_on_an_exact_trajectory(setup):
+    at, _ = evaluate(setup, "inertial")
+    R, p, v = setup.truth_at(TIMES)
+    np.testing.assert_allclose(at.rotation, R, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(at.position, p, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(at.velocity, v, rtol=0, atol=1e-12)
+
+
+def test_pose_interpolates_rotation_on_the_geodesic_and_position_linearly(setup):
+    at, _ = evaluate(setup, "pose")
+    state = setup.state
+    inside = (TIMES >= state.seconds[0]) & (TIMES <= state.seconds[-1])
+    expected = Slerp(state.seconds, Rotation.from_matrix(state.rotation))(TIMES[inside]).as_matrix()
+    np.testing.assert_allclose(at.rotation[inside], expected, rtol=0, atol=1e-14)
+    position = np.array([np.interp(TIMES[inside], state.seconds, x) for x in state.position.T]).T
+    np.testing.assert_allclose(at.position[inside], position, rtol=0, atol=1e-15)
+
+
+def test_kinematic_keeps_the_rate_and_velocity_of_the_node(setup):
+    at, node = evaluate(setup, "kinematic")
+    state = setup.state
+    dt = TIMES - state.seconds[node]
+    raw = np.array([np.interp(state.seconds[node], setup.imu.seconds, x) for x in np.hstack([setup.imu.gyro, setup.imu.accel]).T]).T
+    rate = corrected_rate(state.values["imu0", "intrinsics"], raw - state.bias[node])
+    np.testing.assert_allclose(at.rate, rate, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(at.velocity, state.velocity[node], rtol=0, atol=0)
+    expected = state.rotation[node] @ Rotation.from_rotvec(rate * dt[:, None]).as_matrix()
+    np.testing.assert_allclose(at.rotation, expected, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(at.position, state.position[node] + state.velocity[node] * dt[:, None], atol=1e-15)
+
+
+def corrected_rate(intrinsics, readings):
+    M_a, M_g = np.eye(3), np.eye(3)
+    lower = ([0, 1, 1, 2, 2, 2], [0, 0, 1, 0, 1, 2])
+    M_a[lower] += intrinsics[:6]
+    M_g[lower] += intrinsics[6:12]
+    force = np.linalg.solve(M_a, readings[:, 3:].T)
+    C = Rotation.from_rotvec(intrinsics[12:15]).as_matrix()
+    return np.linalg.solve(M_g @ C, readings[:, :3].T - intrinsics[15:].reshape(3, 3) @ force).T
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_at_a_node_every_scheme_gives_the_node(setup, scheme):
+    state = setup.perturbed(np.random.default_rng(4))
+    node = assign_nodes(scheme, state.seconds, state.seconds)
+    at = poses_at(scheme, state.seconds, node, state, setup.imu, 9.81, False)
+    np.testing.assert_allclose(at.rotation, state.rotation, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(at.position, state.position, rtol=0, atol=1e-15)
+
+
+NODES = np.array([0.0, 1.0, 3.0])
+
+
+@pytest.mark.parametrize("scheme", ["inertial", "kinematic"])
+@pytest.mark.parametrize(
+    ("time", "node"),
+    [(-5.0, 0), (0.0, 0), (0.4, 0), (0.6, 1), (1.0, 1), (1.9, 1), (2.1, 2), (3.0, 2), (9.0, 2)],
+)
+def test_nearest_node(scheme, time, node):
+    assert assign_nodes(scheme, NODES, np.array([time]))[0] == node
+
+
+@pytest.mark.parametrize("time", [0.5, 2.0])
+def test_in_the_middle_the_later_node_is_taken(time):
+    nearest = assign_nodes("inertial", NODES, np.array([time]))[0]
+    assert NODES[nearest] > time
+
+
+@pytest.mark.parametrize(("time", "node"), [(-1.0, 0), (0.0, 0), (0.9, 0), (1.0, 1), (2.9, 1), (3.0, 1), (4.0, 1)])
+def test_pose_takes_the_node_before_that_has_one_after(time, node):
+    assert assign_nodes("pose", NODES, np.array([time]))[0] == node
