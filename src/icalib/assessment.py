@@ -213,6 +213,6 @@ def _noise_words(model: NoiseModel) -> str:
     words = f"corner noise {model.base:.3f} px"
     if model.exposure > 0.0:
         words += f", {1e3 * model.exposure:.2f} px more (in squares) per 1000 px/s of image speed"
-    if model.tau > 0.0:
-        words += f", {model.tau:.3f} px common to an image"
+    if model.tau:
+        words += f", {' and '.join(f'{t:.3f}' for t in model.tau)} px common to an image"
     return words

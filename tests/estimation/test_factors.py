@@ -1,7 +1,8 @@
 """One check for every factor: its sums against numeric derivatives of its residuals, on the manifold.
 
-A sample is a factor at a state. It must add to the pieces J^T W J and J^T W r, W the weights of its residuals r with
-what it marginalises taken out, and return a cost whose derivative this is.
+A sample is a factor at a state. It must add to the pieces J^T W J and J^T y, J the derivative of its residuals, y the
+slope of its cost by the residuals and W their weights, with what it marginalises taken out of both, and return a cost
+whose derivative this is.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import pytest
 import icalib.estimation
 from icalib.estimation.arrowhead import Piece, make_pieces
 from icalib.estimation.corner_factor import CornerNoise, CornerOutput
+from icalib.estimation.corner_kernels import LEAST_CURVATURE
 from icalib.estimation.imu_factor import ROWS, ImuFactor
 from icalib.estimation.prior_factor import FIRST_BIAS_SIGMA, Prior, accumulate_bias_prior
 from icalib.estimation.state import NODE, State
@@ -25,14 +27,14 @@ from icalib.geometry import so3
 
 @dataclass(frozen=True)
 class Sample:
-    """factor: its name in the source. accumulate(state, piece, sums) -> cost; weighted(state) -> r (n,), W (n, n)."""
+    """factor: its name in the source. accumulate(state, piece, sums) -> cost; weighted(state) -> r (n,), y (n,), W (n, n)."""
 
     factor: str
     setup: object
     state: State
     accumulate: Callable[[State, Piece, bool], float]
-    weighted: Callable[[State], tuple[np.ndarray, np.ndarray]]
-    smooth: bool = True  # whether the cost is least over the weights to rounding, so that its slope can be measured
+    weighted: Callable[[State], tuple[np.ndarray, np.ndarray, np.ndarray]]
+    tolerance: float = 1e-6  # of the gradient, where weights are found by iteration
 
 
 def imu_sample(unlike, setup_of, imu_free):
@@ -46,7 +48,7 @@ def imu_sample(unlike, setup_of, imu_free):
         out = np.zeros((len(at.seconds) - 1, ROWS))
         for piece in make_pieces(len(at.seconds), setup.layout.size):
             factor.accumulate(at, piece, out, sums=False)
-        return out.ravel(), np.eye(out.size)
+        return out.ravel(), out.ravel(), np.eye(out.size)
 
     def accumulate(at, piece, sums):
         return factor.accumulate(at, piece, np.zeros((len(at.seconds) - 1, ROWS)), sums)
@@ -54,48 +56,63 @@ def imu_sample(unlike, setup_of, imu_free):
     return Sample("ImuFactor", setup, state, accumulate, weighted)
 
 
-def corner_sample(unlike, setup_of, factor_of, camera, scheme="inertial", loss="none", field=0, imu_free=False):
+LOSS_SCALE = 1.5
+
+
+def slope_along(loss, t):
+    """Second derivative of the loss at t standard deviations, over its weight; kept positive as the factor does."""
+
+    def psi(t):
+        return np.where(t < LOSS_SCALE, t, LOSS_SCALE) if loss == "huber" else t / (1.0 + (t / LOSS_SCALE) ** 2)
+
+    if loss == "none":
+        return np.ones_like(t)
+    return np.maximum((psi(t + 1e-6) - psi(t - 1e-6)) / 2e-6 / (psi(t) / t), LEAST_CURVATURE)
+
+
+def corner_sample(
+    unlike, setup_of, factor_of, camera, scheme="inertial", loss="none", field=0, imu_free=False, curved=False
+):
     setup = setup_of(unlike, imu_free=imu_free, shape=2, bloom=True)
     rng = np.random.default_rng(1)
     stream = unlike.measurements.cameras[camera]
     n, m = len(stream.uv), len(stream.stamps_ns)
-    # Few corners of each image, and errors of some sigma, so that robust losses bend.
-    noise = CornerNoise(
-        rng.uniform(0.3, 0.6, m), np.array([0.4, 0.3, 0.2])[:field], rng.normal(size=(n, 3))[:, :field].copy(), loss, 1.5
-    )
+    # Few corners of each image, some of them far enough off that robust losses bend.
+    sigma = rng.uniform(0.8, 1.2, m)
+    noise = CornerNoise(sigma, np.array([0.8, 0.6, 0.4])[:field], rng.normal(size=(n, 3))[:, :field].copy(), loss, LOSS_SCALE)
     factor = factor_of(setup, camera, scheme)
     factor = replace(
         factor,
-        stream=replace(stream, uv=stream.uv + rng.normal(size=(n, 2))),
-        keep=rng.random(n) < 0.1,
+        stream=replace(stream, uv=stream.uv + rng.normal(size=(n, 2)) * rng.choice([0.8, 3.0], (n, 1), p=[0.8, 0.2])),
+        keep=rng.random(n) < 0.15,
         noise=noise,
         direction=rng.normal(size=(n, 2)),
         basis=rng.normal(size=(len(factor.points), 2, 3)),
     )
-    state = setup.perturbed(rng, 0.3)
+    state = setup.perturbed(rng, 0.02)
 
-    def run(at):
+    def weighted(at):
         out = CornerOutput.empty(stream, field)
         for piece in make_pieces(len(at.seconds), setup.layout.size):
             factor.accumulate(at, piece, out, sums=False)
-        return out
-
-    def weighted(at):
-        out = run(at)
         used = out.root > 0
-        root, f, image = out.root[used], noise.field[used], stream.image[used]
-        r = out.residual[used].T.ravel()
-        W = np.kron(np.eye(2), np.diag(root**2))
+        root, f, image, r = out.root[used], noise.field[used], stream.image[used], out.residual[used]
+        e = r + np.einsum("nk,nak->na", f, out.shared[image])
+        size = np.linalg.norm(e, axis=1)
+        bend = np.sqrt(slope_along(loss if curved else "none", size / sigma[image]))
+        B = np.eye(2) + (bend - 1.0)[:, None, None] * np.einsum("ni,nj->nij", e, e) / (size**2)[:, None, None]
+        B = np.block([[np.diag(root * B[:, i, j]) for j in range(2)] for i in range(2)])
+        W = np.eye(2 * len(r))
         for i in range(m if field else 0):
             F = root[:, None] * f * (image == i)[:, None]
-            taken = F @ np.linalg.solve(F.T @ F + np.diag(noise.tau**-2), F.T)
-            W -= np.kron(np.eye(2), root[:, None] * taken * root)
-        return r, W
+            W -= np.kron(np.eye(2), F @ np.linalg.solve(F.T @ F + np.diag(noise.tau**-2), F.T))
+        return r.T.ravel(), (root[:, None] ** 2 * e).T.ravel(), B @ W @ B
 
     def accumulate(at, piece, sums):
-        return factor.accumulate(at, piece, CornerOutput.empty(stream, field), sums)
+        return factor.accumulate(at, piece, CornerOutput.empty(stream, field), sums, curved)
 
-    return Sample("CornerFactor", setup, state, accumulate, weighted, loss == "none" or not field)
+    tolerance = 1e-3 if field and loss != "none" else 1e-6
+    return Sample("CornerFactor", setup, state, accumulate, weighted, tolerance)
 
 
 def prior_sample(unlike, setup_of, sensor, name):
@@ -109,7 +126,7 @@ def prior_sample(unlike, setup_of, sensor, name):
     def weighted(at):
         x = at.values[block.key]
         error = so3.log(np.ascontiguousarray(value.T @ x)) if block.kind == "rotation" else x - value
-        return error / prior.sigma, np.eye(block.size)
+        return error / prior.sigma, error / prior.sigma, np.eye(block.size)
 
     def accumulate(at, piece, sums):
         return prior.accumulate(at, piece, sums) if piece.first == 0 else 0.0
@@ -123,8 +140,8 @@ def bias_prior_sample(unlike, setup_of):
         "accumulate_bias_prior",
         setup,
         setup.perturbed(np.random.default_rng(3)),
-        accumulate_bias_prior,
-        lambda at: (at.bias[0] / FIRST_BIAS_SIGMA, np.eye(6)),
+        lambda at, piece, sums: accumulate_bias_prior(at, piece, sums) if piece.first == 0 else 0.0,
+        lambda at: (at.bias[0] / FIRST_BIAS_SIGMA, at.bias[0] / FIRST_BIAS_SIGMA, np.eye(6)),
     )
 
 
@@ -142,6 +159,12 @@ SAMPLES = {
     "huber": ("CornerFactor", lambda u, s, f: corner_sample(u, s, f, 0, loss="huber")),
     "cauchy": ("CornerFactor", lambda u, s, f: corner_sample(u, s, f, 1, loss="cauchy")),
     "huber, common field": ("CornerFactor", lambda u, s, f: corner_sample(u, s, f, 0, loss="huber", field=3)),
+    "huber, curved": ("CornerFactor", lambda u, s, f: corner_sample(u, s, f, 0, loss="huber", curved=True)),
+    "cauchy, curved": ("CornerFactor", lambda u, s, f: corner_sample(u, s, f, 0, "pose", loss="cauchy", curved=True)),
+    "cauchy, common shift, curved": (
+        "CornerFactor",
+        lambda u, s, f: corner_sample(u, s, f, 1, loss="cauchy", field=1, curved=True),
+    ),
     "prior on a rotation": ("Prior", lambda u, s, f: prior_sample(u, s, "cam1", "rotation")),
     "prior on a vector": ("Prior", lambda u, s, f: prior_sample(u, s, "cam0", "intrinsics")),
     "prior on IMU intrinsics": ("Prior", lambda u, s, f: prior_sample(u, s, "imu0", "intrinsics")),
@@ -199,7 +222,7 @@ def sample(request, unlike, setup_of, factor_of):
 
 def test_sums_are_those_of_numeric_derivatives(sample, dense):
     _, H, g = sums_of(sample, dense)
-    r, W = sample.weighted(sample.state)
+    r, y, W = sample.weighted(sample.state)
     scale, h = scales(sample), 1e-3
     J = np.empty((len(r), len(g)))
     for n in range(len(g)):
@@ -207,22 +230,21 @@ def test_sums_are_those_of_numeric_derivatives(sample, dense):
         d[n] = h * scale[n]
         J[:, n] = (sample.weighted(moved(sample, d))[0] - sample.weighted(moved(sample, -d))[0]) / (2 * h)
     H, g = H * np.outer(scale, scale), g * scale
-    numeric_H, numeric_g = J.T @ W @ J, J.T @ W @ r
+    numeric_H, numeric_g = J.T @ W @ J, J.T @ y
     size = np.sqrt(np.maximum(np.diag(numeric_H), 1e-9 * np.diag(numeric_H).max()))
     assert np.abs(numeric_g).max() > 0
     np.testing.assert_allclose(H / np.outer(size, size), numeric_H / np.outer(size, size), rtol=0, atol=2e-6)
-    np.testing.assert_allclose(g / size, numeric_g / size, rtol=0, atol=2e-6 * np.linalg.norm(r))
+    np.testing.assert_allclose(g / size, numeric_g / size, rtol=0, atol=2e-6 * np.sqrt(y @ r))
 
 
 def test_gradient_is_the_slope_of_the_cost(sample, dense):
     cost, _, g = sums_of(sample, dense)
     assert cost > 0
-    rng, scale, h = np.random.default_rng(9), scales(sample), 1e-4
-    tolerance = 1e-6 if sample.smooth else 1e-4
+    rng, scale, h = np.random.default_rng(9), scales(sample), 2e-5
     for _ in range(10):
         d = rng.normal(size=len(g)) * scale
         slope = (cost_at(sample, h * d) - cost_at(sample, -h * d)) / (2 * h)
-        assert slope == pytest.approx(g @ d, rel=tolerance, abs=tolerance * np.linalg.norm(g * scale))
+        assert slope == pytest.approx(g @ d, rel=sample.tolerance, abs=sample.tolerance * np.linalg.norm(g * scale))
 
 
 def test_cost_without_sums_is_the_cost_with_them(sample, dense):

@@ -1,6 +1,7 @@
 """Where nodes stand: at images, filled in between, none in long gaps."""
 
 import numpy as np
+import pytest
 
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.nodes import place_nodes, usable
@@ -36,13 +37,22 @@ def test_order_of_cameras_does_not_matter():
     np.testing.assert_array_equal(place_nodes(imu, [a, b], 0.05, 0.5), place_nodes(imu, [b, a], 0.05, 0.5))
 
 
-def test_no_two_nodes_are_further_apart_than_the_spacing_and_all_images_are_nodes():
+def test_long_stretches_are_filled_evenly_and_all_images_are_nodes():
     images = np.array([0.1, 0.15, 0.38, 0.48, 1.0])
     nodes = place_nodes(imu_at(STEADY), [images], spacing=0.05, max_gap=0.5)
-    assert np.diff(nodes).max() <= 0.05 + 1e-9
     assert np.isin(images, nodes).all()
-    assert np.diff(nodes).min() > 0.04  # filled evenly, no node more than needed
-    assert len(nodes) == 1 + 1 + 5 + 2 + 11
+    counts = np.histogram(nodes, images)[0]  # nodes from each image to before the next; the last node counts too
+    np.testing.assert_array_equal(counts, [1, 5, 2, 11])
+    for a, b in zip(images[:-1], images[1:], strict=True):
+        steps = np.diff(nodes[(nodes >= a) & (nodes <= b)])
+        np.testing.assert_allclose(steps, steps[0], rtol=1e-9)
+
+
+@pytest.mark.parametrize(("distance", "steps"), [(0.04, 1), (0.0545, 1), (0.0555, 2), (0.104, 2), (0.106, 3)])
+def test_jitter_of_a_tenth_of_the_spacing_needs_no_node(distance, steps):
+    nodes = place_nodes(imu_at(STEADY), [np.array([0.1, 0.1 + distance])], spacing=0.05, max_gap=0.5)
+    assert len(nodes) == 1 + steps
+    assert np.diff(nodes).max() <= 1.1 * 0.05
 
 
 def test_images_outside_the_recording_have_no_node():

@@ -133,11 +133,13 @@ class CornerFactor:
         piece: Piece,
         out: CornerOutput,
         sums: bool = True,
+        curved: bool = False,
         noise: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> float:
         """Fills `out` for the images whose node lies in `piece`, and adds them to its sums where `sums` are wanted.
 
-        Returns half the robust chi^2. With `noise` (corners (N, 2), common errors (M, 2, m), white) in place of the
+        Returns half the robust chi^2. `curved`: J^T J has the true curvature of the robust loss, not its weights alone.
+        With `noise` (corners (N, 2), common errors (M, 2, m), white) in place of the
         whitened residuals, returns the quadratic form of the common errors' rows instead.
         """
         i0, i1 = self._images(piece)
@@ -150,7 +152,7 @@ class CornerFactor:
         start, n = self.stream.start[i0 : i1 + 1], self.noise
         white, white_shared = noise or (out.residual, out.shared)
         settings = (
-            start, self.stream.uv, self.stream.point, self.keep, n.sigma[i0:i1], LOSSES[n.loss], n.loss_scale,
+            start, self.stream.uv, self.stream.point, self.keep, n.sigma[i0:i1], LOSSES[n.loss], n.loss_scale, curved,
             n.field, 1.0 / n.tau**2, state.values[self.name, "bloom"][0], self.direction,
             self.basis @ state.values[self.target, "tilt"].T, pars,
         )  # fmt: skip

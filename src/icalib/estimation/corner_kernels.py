@@ -7,6 +7,8 @@ from numba import njit
 
 from icalib.geometry import so3
 
+LEAST_CURVATURE = 1e-3
+
 
 @njit(cache=True, nogil=True)
 def camera_points(i0, i1, start, point, R_cw, p_wc, world_points, X):
@@ -24,16 +26,17 @@ def camera_points(i0, i1, start, point, R_cw, p_wc, world_points, X):
 
 @njit(cache=True, nogil=True)
 def _weight(loss, scale, s):
-    """Weight and robust cost (half rho) of a squared whitened norm s."""
+    """Weight rho' and robust cost (half rho) of a squared whitened norm s, and the curvature along the residual over
+    the weight, 1 + 2 s rho'' / rho' (Triggs 1999), kept positive."""
     if loss == 0:
-        return 1.0, 0.5 * s
+        return 1.0, 0.5 * s, 1.0
     if loss == 1:
         r = np.sqrt(s)
         if r <= scale:
-            return 1.0, 0.5 * s
-        return scale / r, scale * r - 0.5 * scale * scale
+            return 1.0, 0.5 * s, 1.0
+        return scale / r, scale * r - 0.5 * scale * scale, LEAST_CURVATURE
     k = scale * scale
-    return 1.0 / (1.0 + s / k), 0.5 * k * np.log1p(s / k)
+    return 1.0 / (1.0 + s / k), 0.5 * k * np.log1p(s / k), max((k - s) / (k + s), LEAST_CURVATURE)
 
 
 @njit(cache=True, nogil=True)
@@ -63,9 +66,9 @@ def _robust_weights(res, keep, f, precision, sigma, loss, scale, root, shared):
     n, m = len(keep), f.shape[1]
     shared[:] = 0.0
     M, inv, rhs = np.empty((m, m)), np.empty((m, m)), np.empty((2, m))
-    rounds = 1 if m == 0 else (2 if loss == 0 else 6)
+    rounds = 1 if m == 0 else (2 if loss == 0 else 8)
     cost = 0.0
-    for _ in range(rounds):
+    for turn in range(rounds):
         cost = 0.0
         for i in range(n):
             if not keep[i]:
@@ -75,31 +78,48 @@ def _robust_weights(res, keep, f, precision, sigma, loss, scale, root, shared):
             for k in range(m):
                 u += shared[0, k] * f[i, k]
                 v += shared[1, k] * f[i, k]
-            w, c = _weight(loss, scale, (u * u + v * v) / (sigma * sigma))
+            w, c, _ = _weight(loss, scale, (u * u + v * v) / (sigma * sigma))
             root[i] = np.sqrt(w) / sigma
             cost += c
         for k in range(m):
             cost += 0.5 * precision[k] * (shared[0, k] ** 2 + shared[1, k] ** 2)
-        if m == 0:
+        if turn == rounds - 1:
             return cost
-        rhs[:] = 0.0
-        for a in range(m):
-            for b in range(m):
-                M[a, b] = precision[a] if a == b else 0.0
-        for i in range(n):
-            w = root[i] * root[i]
-            for a in range(m):
-                for b in range(m):
-                    M[a, b] += w * f[i, a] * f[i, b]
-                rhs[0, a] += w * f[i, a] * res[i, 0]
-                rhs[1, a] += w * f[i, a] * res[i, 1]
-        _invert_small(M, inv)
-        for a in range(m):
-            shared[0, a] = shared[1, a] = 0.0
-            for b in range(m):
-                shared[0, a] -= inv[a, b] * rhs[0, b]
-                shared[1, a] -= inv[a, b] * rhs[1, b]
+        _common_error(res, root, f, precision, M, inv, rhs, shared)
     return cost
+
+
+@njit(cache=True, nogil=True)
+def _common_error(res, root, f, precision, M, inv, rhs, shared):
+    """The image's common error (2, m) at given weights: ridge regression of -res on its functions."""
+    m = f.shape[1]
+    rhs[:] = 0.0
+    for a in range(m):
+        for b in range(m):
+            M[a, b] = precision[a] if a == b else 0.0
+    for i in range(len(root)):
+        w = root[i] * root[i]
+        for a in range(m):
+            for b in range(m):
+                M[a, b] += w * f[i, a] * f[i, b]
+            rhs[0, a] += w * f[i, a] * res[i, 0]
+            rhs[1, a] += w * f[i, a] * res[i, 1]
+    _invert_small(M, inv)
+    for a in range(m):
+        shared[0, a] = shared[1, a] = 0.0
+        for b in range(m):
+            shared[0, a] -= inv[a, b] * rhs[0, b]
+            shared[1, a] -= inv[a, b] * rhs[1, b]
+
+
+@njit(cache=True, nogil=True)
+def _whole_error(res, f, shared, error):
+    """error (n, 2): residuals with the image's common error in them."""
+    for i in range(len(res)):
+        for axis in range(2):
+            error[i, axis] = res[i, axis]
+            for k in range(f.shape[1]):
+                error[i, axis] += shared[axis, k] * f[i, k]
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
@@ -115,8 +135,13 @@ def _gram(A, D, n, out):
 
 
 @njit(cache=True, nogil=True)
-def _fill_rows(o, n0, n1, res, root, X, Jp, Jpar, pars, has_bloom, direction, basis, point, R_cw, A):
-    """Weighted Jacobian of one image, transposed: A (D + 1, 2 n), u rows first; the last row the residual. Returns D."""
+def _fill_rows(
+    o, n0, n1, res, root, sigma, loss, scale, curved, X, Jp, Jpar, pars, has_bloom, direction, basis, point, R_cw, A
+):  # fmt: skip
+    """Weighted Jacobian of one image, transposed: A (D + 1, 2 n), u rows first; the last row the residual. Returns D.
+
+    With `curved`, where the loss bends the rows are scaled so that A^T A is the true curvature, A^T r the true gradient.
+    """
     n = n1 - n0
     ns = basis.shape[1]
     D = 6 + len(pars) + has_bloom + ns
@@ -145,12 +170,33 @@ def _fill_rows(o, n0, n1, res, root, X, Jp, Jpar, pars, has_bloom, direction, ba
             for s in range(ns):
                 A[d + s, c] = a0 * q0[s] + a1 * q1[s] + a2 * q2[s]
             A[D, c] = w * res[i - n0, r]
+        if curved and loss > 0 and w > 0.0:
+            square = (res[i - n0, 0] ** 2 + res[i - n0, 1] ** 2) / (sigma * sigma)
+            _, _, curvature = _weight(loss, scale, square)
+            if curvature < 1.0:
+                _bend(A, D, i - n0, n, res[i - n0], np.sqrt(curvature))
     return D
 
 
 @njit(cache=True, nogil=True)
-def _marginalise_shared(A, D, n, root, f, precision, prior_noise, G):
-    """Takes the image's common error out of the Gram matrix G (D + 1, D + 1). Returns rhs^T M^-1 rhs of its own rows."""
+def _bend(A, D, i, n, r, factor):
+    """Scales the Jacobian rows of corner i along its residual r by `factor`, and the residual by its inverse."""
+    size = np.sqrt(r[0] * r[0] + r[1] * r[1])
+    u, v = r[0] / size, r[1] / size
+    for k in range(D + 1):
+        along = u * A[k, i] + v * A[k, n + i]
+        change = along * ((factor if k < D else 1.0 / factor) - 1.0)
+        A[k, i] += change * u
+        A[k, n + i] += change * v
+
+
+@njit(cache=True, nogil=True)
+def _marginalise_shared(A, D, n, root, f, precision, own, given, G):
+    """Takes the image's common error out of the Gram matrix G (D + 1, D + 1).
+
+    Its own gradient is zero: the cost is the least over it. With `given` noise, own (2, m) stands for its whitened
+    residual; returns rhs^T M^-1 rhs of its rows then.
+    """
     m = f.shape[1]
     M, inv = np.empty((m, m)), np.empty((m, m))
     C = np.empty((m, D + 1))
@@ -160,13 +206,13 @@ def _marginalise_shared(A, D, n, root, f, precision, prior_noise, G):
             for b in range(m):
                 M[a, b] = precision[a] if a == b else 0.0
             C[a] = 0.0
-            C[a, D] = prior_noise[axis, a] * np.sqrt(precision[a])
+            C[a, D] = own[axis, a] * np.sqrt(precision[a]) if given else 0.0
         for i in range(n):
             for a in range(m):
                 wf = root[i] * f[i, a]
                 for b in range(m):
                     M[a, b] += wf * root[i] * f[i, b]
-                for k in range(D + 1):
+                for k in range(D + 1 if given else D):
                     C[a, k] += wf * A[k, axis * n + i]
         _invert_small(M, inv)
         for a in range(m):
@@ -298,7 +344,7 @@ def _add_border(G, D, Tc, cols_c, cols_d, border):
 
 @njit(cache=True, nogil=True)
 def accumulate(
-    i0, i1, o, start, uv, point, keep, sigma, loss, scale, field, precision, bloom, direction, basis, pars,
+    i0, i1, o, start, uv, point, keep, sigma, loss, scale, curved, field, precision, bloom, direction, basis, pars,
     predicted, valid, X, Jp, Jpar, noise, shared_noise, given, R_ic, p_ic, R_cw, p_wc, rate, vel, Jn, Jm, Jx,
     node, first, cols_c, cols_d, diagonal, upper, side, border, residual, root_out, shared_out,
 ):  # fmt: skip
@@ -315,6 +361,7 @@ def accumulate(
     G = np.empty((D + 1, D + 1))
     Tn, Tm, Tc = np.empty((6, 15)), np.empty((6, 15 if Jm.shape[0] else 0)), np.empty((6, 9 + Jx.shape[2]))
     m = field.shape[1]
+    error = np.empty((most, 2))
     total = 0.0
     for i in range(i0, i1):
         n0, n1 = start[i], start[i + 1]
@@ -332,14 +379,17 @@ def accumulate(
             total += cost
         if diagonal.shape[0] == 0:
             continue
-        _fill_rows(o, n0, n1, res, root, X, Jp, Jpar, pars, has_bloom, direction, basis, point, R_cw[i], A)
+        _whole_error(res, f, shared_out[i], error)
+        _fill_rows(
+            o, n0, n1, error, root, sigma[i], loss, scale, curved, X, Jp, Jpar, pars, has_bloom, direction, basis, point, R_cw[i], A
+        )  # fmt: skip
         if given:
             for k in range(n):
                 A[D, k] = noise[n0 + k, 0] if ok[k] else 0.0
                 A[D, n + k] = noise[n0 + k, 1] if ok[k] else 0.0
         _gram(A, D + 1, 2 * n, G)
         if m:
-            quad = _marginalise_shared(A, D, n, root, f, precision, shared_noise[i], G)
+            quad = _marginalise_shared(A, D, n, root, f, precision, shared_noise[i], given, G)
             if given:
                 total += quad
         if Jm.shape[0]:

@@ -1,9 +1,10 @@
 """How large the errors of corners are, judged from what a pass leaves behind.
 
     sigma_i^2 = base^2 + (exposure v_i)^2      image i, whose corners move at v_i px/s: blur
-    shared    ~ N(0, tau^2), u and v apart     a shift that all corners of an image have in common
+    shared    ~ N(0, tau_k^2), u and v apart   an error that the corners of an image have in common: a shift, a tilt
 
-Sizes come from medians, so that outliers have no say.
+Sizes of single corners come from medians, so that outliers have no say. Those of the common errors come from their
+chi^2 over post-fit degrees of freedom, pass by pass (Foerstner's variance components): the poses soak most of them up.
 """
 
 from __future__ import annotations
@@ -13,33 +14,36 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.estimation.corner_factor import CornerFactor, CornerNoise, CornerOutput
+from icalib.estimation.evidence import Fit
 from icalib.estimation.state import State
 from icalib.measurements import CornerStream
 from icalib.rig import Camera, Settings
 
 FIRST_GUESS_PX = 0.5
-SMALLEST_PX = 1e-3
+SMALLEST_PX, LARGEST_PX = 1e-3, 5.0
+FIRST_TAU_PX = 0.1
+COMMON_ERRORS = 1
 SMALLEST_BASE_PX = 0.02
 BINS = 12  # of image speed
 MEDIAN_OF_SQUARE = 2.0 * np.log(2.0)  # median of chi^2 with two degrees of freedom
-MAD_TO_SIGMA = 1.4826
 
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """One camera's corner noise: base [px], exposure [s], tau [px] (0: images share no error)."""
+    """One camera's corner noise: base [px], exposure [s], tau (m,) [px] (empty: images share no error)."""
 
     base: float
     exposure: float = 0.0
-    tau: float = 0.0
+    tau: tuple[float, ...] = ()
 
-    def noise(self, stream: CornerStream, settings: Settings, speed: np.ndarray | None = None) -> CornerNoise:
+    def noise(self, stream: CornerStream, camera: Camera, settings: Settings, speed: np.ndarray | None = None) -> CornerNoise:
         """What the corner factor needs; speed (M,) px/s of each image."""
         blur = 0.0 if speed is None else self.exposure * speed
         sigma = np.hypot(self.base, np.broadcast_to(blur, stream.stamps_ns.shape))
-        m = 1 if self.tau > 0.0 else 0
-        field = np.ones((len(stream.uv), m))
-        return CornerNoise(sigma, np.full(m, self.tau), field, settings.loss, settings.loss_scale)
+        half = 0.5 * np.array(camera.resolution)
+        x, y = ((stream.uv - half) / half[0]).T
+        field = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)[:, : len(self.tau)]
+        return CornerNoise(sigma, np.array(self.tau), np.ascontiguousarray(field), settings.loss, settings.loss_scale)
 
 
 def first_noise(camera: Camera) -> NoiseModel:
@@ -69,9 +73,9 @@ def image_mean(stream: CornerStream, x: np.ndarray, keep: np.ndarray) -> np.ndar
 
 
 def estimate_noise(
-    camera: Camera, settings: Settings, factor: CornerFactor, out: CornerOutput, speed: np.ndarray
+    camera: Camera, settings: Settings, factor: CornerFactor, out: CornerOutput, speed: np.ndarray, tau: tuple[float, ...]
 ) -> NoiseModel:
-    """The noise that the residuals of a pass show. A size given in the rig file is kept."""
+    """The noise that the residuals of a pass show, with `tau` for its common errors. A size given in the rig file is kept."""
     stream, used = factor.stream, out.root > 0.0
     error = out.residual + (factor.noise.field[:, None, :] * out.shared[stream.image]).sum(axis=2)
     square = (error**2).sum(axis=1)
@@ -83,8 +87,17 @@ def estimate_noise(
         base, exposure = _fit_blur(square[used], speed[stream.image][used])
     else:
         base, exposure = np.sqrt(np.median(square[used]) / MEDIAN_OF_SQUARE), 0.0
-    tau = _shared_size(factor, out, used, np.hypot(base, exposure * speed)) if settings.common_error else 0.0
     return NoiseModel(max(float(base), SMALLEST_BASE_PX), float(exposure), tau)
+
+
+def scale_common_errors(tau: tuple[float, ...], fits: list[Fit]) -> tuple[float, ...]:
+    """tau of the next pass: each times the square root of its chi^2 over post-fit degrees of freedom.
+
+    fits: those of one camera's common errors, in order.
+    """
+    return tuple(
+        float(np.clip(t * np.sqrt(f.chi2 / max(f.dof, 1.0)), SMALLEST_PX, LARGEST_PX)) for t, f in zip(tau, fits, strict=True)
+    )
 
 
 def _fit_blur(square: np.ndarray, speed: np.ndarray) -> tuple[float, float]:
@@ -101,14 +114,3 @@ def _fit_blur(square: np.ndarray, speed: np.ndarray) -> tuple[float, float]:
     if b <= 0.0 or a <= 0.0:
         return float(np.sqrt(np.median(square) / MEDIAN_OF_SQUARE)), 0.0
     return float(np.sqrt(a)), float(np.sqrt(b))
-
-
-def _shared_size(factor: CornerFactor, out: CornerOutput, used: np.ndarray, sigma: np.ndarray) -> float:
-    """tau [px] from the spread of the images' mean residuals beyond what independent corners leave."""
-    stream = factor.stream
-    count = np.bincount(stream.image[used], minlength=len(stream.stamps_ns))
-    seen = count > 0
-    means = np.stack([image_mean(stream, out.residual[:, k], used)[seen] for k in range(2)])
-    spread = MAD_TO_SIGMA * np.median(np.abs(means - np.median(means, axis=1, keepdims=True)))
-    own = np.median(sigma[seen] ** 2 / count[seen])
-    return float(max(np.sqrt(max(spread**2 - own, 0.0)), SMALLEST_PX))

@@ -8,12 +8,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.estimation.assembly import Inputs, assemble, image_times, nodes_for, resample
-from icalib.estimation.corner_factor import CornerFactor, CornerOutput
-from icalib.estimation.corner_noise import NoiseModel, estimate_noise, first_noise, image_speed
+from icalib.estimation.corner_factor import CornerFactor, CornerNoise, CornerOutput
+from icalib.estimation.corner_noise import (
+    COMMON_ERRORS,
+    FIRST_TAU_PX,
+    NoiseModel,
+    estimate_noise,
+    first_noise,
+    image_speed,
+    scale_common_errors,
+)
+from icalib.estimation.evidence import fits
 from icalib.estimation.problem import Problem
-from icalib.estimation.solver import Outcome, Step, minimise
+from icalib.estimation.solver import CONVERGED_DECREASE, Outcome, Step, minimise
 from icalib.estimation.state import State
 from icalib.rig import Settings
+
+EARLY_DECREASE = 0.5  # an early pass is followed by another
 
 
 @dataclass(frozen=True)
@@ -30,7 +41,7 @@ def estimate(inputs: Inputs, state: State, on_step: Callable[[str, Step], None] 
     """All passes from a first `state`. Raises EstimationError where the data do not carry an estimate."""
     rig, streams = inputs.rig, inputs.measurements.cameras
     models = [first_noise(c) for c in rig.cameras]
-    noise = [m.noise(s, rig.settings) for m, s in zip(models, streams, strict=True)]
+    noise = [m.noise(s, c, rig.settings) for m, s, c in zip(models, streams, rig.cameras, strict=True)]
     keep = [np.ones(len(s.uv), dtype=bool) for s in streams]
     history: list[tuple[str, Step]] = []
     names = pass_names(inputs)
@@ -41,19 +52,30 @@ def estimate(inputs: Inputs, state: State, on_step: Callable[[str, Step], None] 
             history.append((name, step))
             on_step(name, step)
 
-        outcome = minimise(problem, state, note)
-        if name == names[-1]:
+        last = name == names[-1]
+        outcome = minimise(problem, state, note, CONVERGED_DECREASE if last else EARLY_DECREASE)
+        if last:
             return Estimate(problem, outcome, tuple(models), tuple(history))
-        keep = [k & _inliers(f, out, rig.settings) for k, f, out in _zip(keep, problem, outcome)]
-        speeds = [image_speed(f, outcome.state) for f in problem.cameras]
+        if name == "first":
+            keep = [_inliers(f, out, rig.settings) for f, out in zip(problem.cameras, outcome.residuals.corners, strict=True)]
         if _noise_is_estimated(inputs):
-            models = [
-                estimate_noise(c, rig.settings, f, out, v)
-                for c, f, out, v in zip(rig.cameras, problem.cameras, outcome.residuals.corners, speeds, strict=True)
-            ]
-        noise = [m.noise(s, rig.settings, v) for m, s, v in zip(models, streams, speeds, strict=True)]
+            models, noise = _next_noise(inputs, problem, outcome)
         state = resample(outcome.state, nodes_for(inputs, image_times(inputs, outcome.state.values)), inputs)
     raise AssertionError("pass_names is never empty")
+
+
+def _next_noise(inputs: Inputs, problem: Problem, outcome: Outcome) -> tuple[list[NoiseModel], list[CornerNoise]]:
+    """The noise of the next pass, as the residuals of this one show it."""
+    settings, models, noise = inputs.rig.settings, [], []
+    common = [f for f in fits(problem, outcome) if f.kind.startswith("common")] if settings.common_error else []
+    for camera, factor, out in zip(inputs.rig.cameras, problem.cameras, outcome.residuals.corners, strict=True):
+        speed = image_speed(factor, outcome.state)
+        tau = (FIRST_TAU_PX,) * COMMON_ERRORS if settings.common_error else ()
+        if len(factor.noise.tau):
+            tau = scale_common_errors(tuple(factor.noise.tau), [f for f in common if f.sensor == camera.name])
+        models.append(estimate_noise(camera, settings, factor, out, speed, tau))
+        noise.append(models[-1].noise(factor.stream, camera, settings, speed))
+    return models, noise
 
 
 def _noise_is_estimated(inputs: Inputs) -> bool:
@@ -62,12 +84,10 @@ def _noise_is_estimated(inputs: Inputs) -> bool:
 
 
 def pass_names(inputs: Inputs) -> tuple[str, ...]:
-    """The passes: nodes and assignment are made anew once; noise that is estimated takes one more."""
-    return ("first", "noise", "final") if _noise_is_estimated(inputs) else ("first", "final")
-
-
-def _zip(keep: list[np.ndarray], problem: Problem, outcome: Outcome):
-    return zip(keep, problem.cameras, outcome.residuals.corners, strict=True)
+    """The passes: nodes and assignment are made anew once; noise that is estimated takes more."""
+    if not _noise_is_estimated(inputs):
+        return ("first", "final")
+    return ("first", "noise", "noise again", "final") if inputs.rig.settings.common_error else ("first", "noise", "final")
 
 
 def _inliers(factor: CornerFactor, out: CornerOutput, settings: Settings) -> np.ndarray:

@@ -21,7 +21,10 @@ IMU_ROWS = {"gyroscope": slice(0, 3), "accelerometer": slice(3, 9), "bias walk":
 
 @dataclass(frozen=True)
 class Fit:
-    """chi^2 of one kind of residual, their number, and the degrees of freedom that are left after the fit."""
+    """chi^2 of one kind of residual, their number, and the degrees of freedom that are left after the fit.
+
+    kind: "gyroscope", "accelerometer", "bias walk", "corners", or "common error 0", 1, ... for the images' own.
+    """
 
     sensor: str
     kind: str
@@ -48,16 +51,21 @@ def fits(problem: Problem, outcome: Outcome, seed: int = 0) -> list[Fit]:
         n = imu[:, rows].size
         out.append(Fit(*key, n, n - float(np.mean(spent[key])), float((imu[:, rows] ** 2).sum())))
     for camera, corners in zip(problem.cameras, outcome.residuals.corners, strict=True):
-        key = camera.name, "corners"
-        n = 2 * int((corners.root > 0.0).sum()) + corners.shared.size
-        out.append(Fit(*key, n, n - float(np.mean(spent[key])), _corner_chi2(camera, corners)))
+        for kind, (n, chi2) in _corner_chi2(camera, corners).items():
+            key = camera.name, kind
+            out.append(Fit(*key, n, n - float(np.mean(spent[key])), chi2))
     return out
 
 
-def _corner_chi2(camera: CornerFactor, out: CornerOutput) -> float:
+def _corner_chi2(camera: CornerFactor, out: CornerOutput) -> dict[str, tuple[int, float]]:
+    """Number and chi^2 of one camera's corner rows and of each kind of common error's rows."""
     shift = (camera.noise.field[:, None, :] * out.shared[camera.stream.image]).sum(axis=2)
     error = (out.residual + shift) * out.root[:, None]
-    return float((error**2).sum() + ((out.shared / camera.noise.tau) ** 2).sum())
+    found = {"corners": (2 * int((out.root > 0.0).sum()), float((error**2).sum()))}
+    for k, tau in enumerate(camera.noise.tau):
+        rows = out.shared[:, :, k] / tau
+        found[f"common error {k}"] = (rows.size, float((rows**2).sum()))
+    return found
 
 
 def _probe(problem: Problem, outcome: Outcome, rng: np.random.Generator) -> dict[tuple[str, str], float]:
@@ -82,7 +90,9 @@ def _probe(problem: Problem, outcome: Outcome, rng: np.random.Generator) -> dict
     slope_imu = (up.imu - down.imu) / (2.0 * PROBE_STEP)
     spent = {(problem.imu.imu.name, k): float((imu_noise[:, r] * slope_imu[:, r]).sum()) for k, r in IMU_ROWS.items()}
     for camera, at, u, d, n in zip(problem.cameras, base.corners, up.corners, down.corners, noise, strict=True):
-        spent[camera.name, "corners"] = _spent_by_corners(camera, at, (u.residual - d.residual) / (2.0 * PROBE_STEP), *n)
+        slope = (u.residual - d.residual) / (2.0 * PROBE_STEP)
+        for kind, value in _spent_by_corners(camera, at, slope, *n).items():
+            spent[camera.name, kind] = value
     return spent
 
 
@@ -94,7 +104,7 @@ def _residuals_at(problem: Problem, state: State, chain: np.ndarray, border: np.
 
 def _spent_by_corners(
     camera: CornerFactor, at: CornerOutput, slope: np.ndarray, e: np.ndarray, e_shared: np.ndarray
-) -> float:
+) -> dict[str, float]:
     """e^T J x of one camera, its images' common errors solved along: e and slope (N, 2), e_shared (M, 2, m)."""
     root, image, n = at.root, camera.stream.image, len(camera.stream.stamps_ns)
     e = np.where((root > 0.0)[:, None], e, 0.0)
@@ -102,7 +112,7 @@ def _spent_by_corners(
     total = float((e * along).sum())
     m = len(camera.noise.tau)
     if m == 0:
-        return total
+        return {"corners": total}
     f = camera.noise.field * root[:, None]
     M = np.zeros((n, m, m))
     rhs = np.zeros((n, 2, m))
@@ -112,7 +122,8 @@ def _spent_by_corners(
     rhs += e_shared / camera.noise.tau
     shared = np.linalg.solve(M, rhs.transpose(0, 2, 1)).transpose(0, 2, 1)
     total += float((e[:, :, None] * f[:, None, :] * shared[image]).sum())
-    return total + float((e_shared * shared / camera.noise.tau).sum())
+    own = (e_shared * shared / camera.noise.tau).sum(axis=(0, 1))
+    return {"corners": total} | {f"common error {k}": float(own[k]) for k in range(m)}
 
 
 def split_covariance(problem: Problem, outcome: Outcome, segments: int) -> np.ndarray | None:

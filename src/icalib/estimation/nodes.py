@@ -7,10 +7,11 @@ import numpy as np
 from icalib.estimation.imu_data import ImuData
 
 MERGED_WITHIN_S = 2e-3  # images closer than this share a node
+SLACK = 0.1  # of the spacing: a camera of 20 Hz whose stamps jitter needs no node in between
 
 
 def place_nodes(imu: ImuData, image_times: list[np.ndarray], spacing: float, max_gap: float) -> np.ndarray:
-    """(K,) node times, seconds on the imu clock: all image instants, none further apart than `spacing`.
+    """(K,) node times, seconds on the imu clock: all image instants, none further apart than 1.1 `spacing`.
 
     IMU gaps are filled too, up to `max_gap` seconds; in longer ones there is no node.
     """
@@ -20,7 +21,7 @@ def place_nodes(imu: ImuData, image_times: list[np.ndarray], spacing: float, max
     long_gaps = [(a, b) for a, b in imu.gaps if b - a > max_gap]
     pieces = [distinct[:1]]
     for a, b in zip(distinct[:-1], distinct[1:], strict=True):
-        n = int(np.ceil((b - a) / spacing - 1e-9))
+        n = max(int(np.ceil((b - a) / spacing - SLACK)), 1)
         between = np.linspace(a, b, n + 1)[1:]
         for start, end in long_gaps:
             between = between[~((between > start) & (between < end))]

@@ -43,22 +43,26 @@ class Problem:
         corners = tuple(CornerOutput.empty(c.stream, len(c.noise.tau)) for c in self.cameras)
         return Residuals(np.zeros((self.n_nodes - 1, ROWS)), corners)
 
-    def linearise(self, state: State, pieces: tuple[Piece, ...], out: Residuals, sums: bool = True) -> float:
-        """Fills `pieces` and `out` at `state`; returns half the robust chi^2."""
-        return sum(in_parallel(lambda p: self._accumulate(state, p, out, sums), pieces))
+    def linearise(
+        self, state: State, pieces: tuple[Piece, ...], out: Residuals, sums: bool = True, curved: bool = False
+    ) -> float:
+        """Fills `pieces` and `out` at `state`; returns half the robust chi^2. `curved`: see CornerFactor.accumulate."""
+        return sum(in_parallel(lambda p: self._accumulate(state, p, out, sums, curved), pieces))
 
-    def _accumulate(self, state: State, piece: Piece, out: Residuals, sums: bool) -> float:
+    def _accumulate(self, state: State, piece: Piece, out: Residuals, sums: bool, curved: bool) -> float:
         piece.clear()
-        cost = self.add_measurements(state, piece, out, sums) + self.add_bias_prior(state, piece, sums)
+        cost = self.add_measurements(state, piece, out, sums, curved) + self.add_bias_prior(state, piece, sums)
         if piece.first == 0:
             cost += sum(p.accumulate(state, piece, sums) for p in self.priors)
         return cost
 
-    def add_measurements(self, state: State, piece: Piece, out: Residuals, sums: bool = True) -> float:
+    def add_measurements(
+        self, state: State, piece: Piece, out: Residuals, sums: bool = True, curved: bool = False
+    ) -> float:
         """Adds IMU and corners in `piece`; returns half their robust chi^2."""
         cost = self.imu.accumulate(state, piece, out.imu, sums)
         for camera, corners in zip(self.cameras, out.corners, strict=True):
-            cost += camera.accumulate(state, piece, corners, sums)
+            cost += camera.accumulate(state, piece, corners, sums, curved)
         return cost
 
     def add_bias_prior(self, state: State, piece: Piece, sums: bool = True) -> float:

@@ -15,6 +15,8 @@ from icalib.estimation.state import State
 MAX_ITERATIONS = 50
 # Half a chi^2 of 5e-4 is a step of 0.03 standard deviations at most, in any direction.
 CONVERGED_DECREASE = 5e-4
+ROUNDING = 1e-11  # of the cost: what rounding makes of a sum of 1e6 squares
+CURVED_BELOW = 1e-2  # of the cost: steps that promise less use the true curvature of the robust loss
 FIRST_DAMPING = 1e-8
 ZERO_DAMPING = 1e-10  # below this, none: the weak information of a planar drive must not be swamped
 
@@ -42,38 +44,46 @@ class Outcome:
     status: str
 
 
-def minimise(problem: Problem, state: State, on_step: Callable[[Step], None] = lambda _: None) -> Outcome:
-    """Minimises `problem` from `state`. Raises EstimationError if no step can be computed at all."""
+def minimise(
+    problem: Problem, state: State, on_step: Callable[[Step], None] = lambda _: None, tolerance: float = CONVERGED_DECREASE
+) -> Outcome:
+    """Minimises `problem` from `state` until half the chi^2 can fall by less than `tolerance`.
+
+    Raises EstimationError if no step can be computed at all.
+    """
     pieces, residuals = problem.pieces(), problem.residuals()
     cost = problem.linearise(state, pieces, residuals)
-    damping, growth, steps = 0.0, 10.0, []
+    damping, curved, steps = 0.0, False, []
     for _ in range(MAX_ITERATIONS):
         if not np.isfinite(cost):
             raise EstimationError("the first guess predicts no finite measurement; give a better guess in the rig file.")
-        solution, damping = _solve(problem, state, pieces, residuals, damping)
+        solution, damping = _solve(problem, state, pieces, residuals, damping, curved)
         candidate = state.retract(problem.layout, solution.chain, solution.border)
-        candidate_cost = problem.linearise(candidate, pieces, residuals)
-        gain = (cost - candidate_cost) / max(solution.decrease, 1e-300)
-        converged = damping == 0.0 and solution.decrease < CONVERGED_DECREASE
+        settled = solution.decrease < CURVED_BELOW * cost
+        candidate_cost = problem.linearise(candidate, pieces, residuals, curved=settled)
+        converged = damping == 0.0 and solution.decrease < max(tolerance, ROUNDING * cost)
         # At the bottom rounding decides whether the cost falls; a step this small is taken anyway.
         accepted = bool(candidate_cost < cost) or converged
         steps.append(Step(cost, solution.decrease, damping, accepted))
         on_step(steps[-1])
         if accepted:
-            state, cost = candidate, candidate_cost
-            damping = damping * (0.1 if gain > 0.25 else 1.0)
+            good = cost - candidate_cost > 0.25 * solution.decrease
+            state, cost, curved = candidate, candidate_cost, settled
+            damping = damping * (0.1 if good else 1.0)
             damping = 0.0 if damping < ZERO_DAMPING else damping
             if converged:
                 return _finish(problem, state, cost, pieces, residuals, steps, True)
-        else:
-            damping = max(damping * growth, 1e-6)
-            if damping > 1e6:
-                break
-            cost = problem.linearise(state, pieces, residuals)
+            continue
+        # Too far out for the true curvature of the loss: weights alone, and only then more damping.
+        damping = damping if curved else max(damping * 10.0, 1e-6)
+        curved = False
+        if damping > 1e6:
+            break
+        cost = problem.linearise(state, pieces, residuals)
     return _finish(problem, state, cost, pieces, residuals, steps, False)
 
 
-def _solve(problem, state, pieces, residuals, damping):
+def _solve(problem, state, pieces, residuals, damping, curved):
     """Solves with the least damping, from `damping` up, that makes the sums definite."""
     while True:
         try:
@@ -82,11 +92,11 @@ def _solve(problem, state, pieces, residuals, damping):
             damping = max(10.0 * damping, FIRST_DAMPING)
             if damping > 1e3:
                 raise
-            problem.linearise(state, pieces, residuals)
+            problem.linearise(state, pieces, residuals, curved=curved)
 
 
 def _finish(problem, state, cost, pieces, residuals, steps, converged) -> Outcome:
-    problem.linearise(state, pieces, residuals)
+    problem.linearise(state, pieces, residuals, curved=True)
     information = solve(pieces, problem.n_nodes, problem.tolerance, 0.0).information
     n = len(steps)
     status = (

@@ -14,19 +14,21 @@ from icalib.calibration import Calibration, CornerResiduals
 from icalib.errors import CalibrationError
 from icalib.geometry import so3
 
+KALIBR_DISTORTIONS = ("radtan", "equidistant")
 SAME_INSTANT_S = 0.025  # images this close see the same scene
 
 
 def camchain_imucam(calibration: Calibration) -> str:
     """Text of camchain-imucam.yaml. Cameras are renamed cam0, cam1, ... in the rig's order, as Kalibr wants them."""
     c = calibration
-    overlaps = _overlaps(c.corner_residuals)
+    seen = {r.sensor: r for r in c.corner_residuals}
+    overlaps = _overlaps([seen[name] for name in c.cameras])
     data = {f"cam{i}": _camera(c, i, overlaps) for i in range(len(c.cameras))}
     comment = (
         "# Kalibr's camchain by icalib. T_cam_imu takes coordinates in the imu frame to the camera frame, T_cn_cnm1 those of "
         "the camera before to this one; t_imu = t_cam + timeshift_cam_imu [s]."
     )
-    return _text([comment, *_renamed("cam", c.cameras)], data)
+    return _text([comment, *_renamed("cam", c.cameras), *_foreign_models(data)], data)
 
 
 def imu_yaml(calibration: Calibration) -> str:
@@ -106,7 +108,7 @@ def _inverse(T: np.ndarray) -> np.ndarray:
     return inverse
 
 
-def _overlaps(streams: tuple[CornerResiduals, ...]) -> np.ndarray:
+def _overlaps(streams: list[CornerResiduals]) -> np.ndarray:
     """(n, n) bool: two cameras saw the same point of the target at the same instant."""
     n = len(streams)
     overlaps = np.zeros((n, n), dtype=bool)
@@ -119,7 +121,9 @@ def _overlaps(streams: tuple[CornerResiduals, ...]) -> np.ndarray:
 def _overlap(a: CornerResiduals, b: CornerResiduals) -> bool:
     if not len(a.seconds) or not len(b.seconds):
         return False
-    nearest = np.abs(a.seconds[:, None] - b.seconds[None, :]).argmin(axis=1)
+    after = np.clip(np.searchsorted(b.seconds, a.seconds), 1, max(len(b.seconds) - 1, 1)) % len(b.seconds)
+    before = np.maximum(after - 1, 0)
+    nearest = np.where(a.seconds - b.seconds[before] < b.seconds[after] - a.seconds, before, after)
     together = np.abs(a.seconds - b.seconds[nearest]) <= SAME_INSTANT_S
     n_points = 1 + max(a.point.max(initial=0), b.point.max(initial=0))
     seen_a = np.repeat(np.where(together, nearest, -1), np.diff(a.start)) * n_points + a.point
@@ -130,6 +134,12 @@ def _overlap(a: CornerResiduals, b: CornerResiduals) -> bool:
 def _renamed(kind: str, names: tuple[str, ...]) -> list[str]:
     """Comments that say which sensor a Kalibr name stands for, where the two differ."""
     return [f"# {kind}{i} is {name}." for i, name in enumerate(names) if name != f"{kind}{i}"]
+
+
+def _foreign_models(data: dict[str, Any]) -> list[str]:
+    """Comments on distortion models that Kalibr does not have; a reader refuses their name rather than misread them."""
+    models = ((cam, entry["distortion_model"]) for cam, entry in data.items())
+    return [f"# {cam}: Kalibr has no {model}; calibrate with radtan where a program must read this." for cam, model in models if model not in KALIBR_DISTORTIONS]
 
 
 def _text(comments: list[str], data: dict[str, Any]) -> str:

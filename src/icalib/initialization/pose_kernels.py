@@ -50,6 +50,16 @@ def cholesky_solve(L, b):
 
 
 @njit(cache=True, nogil=True)
+def _product(A, B):
+    """A B of two 3x3 matrices; np.dot would ask for scipy."""
+    C = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            C[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
+    return C
+
+
+@njit(cache=True, nogil=True)
 def _homography(rays, xy, size, h):
     """H (row-major in h) with f x H (x / size, y / size, 1) = 0: least eigenvector of sum (I - f f^T) (x) X X^T."""
     M = np.zeros((9, 9))
@@ -108,7 +118,7 @@ def _refine(rays, xy, scale, R, t):
     Returns the robust cost, the mean of log(1 + (|u - f| / scale)^2), before the last step.
     """
     cost = np.inf
-    J, e = np.empty((3, 6)), np.empty(3)
+    J, e, unit = np.empty((3, 6)), np.empty(3), np.eye(3)
     for _ in range(_GAUSS_NEWTON_STEPS):
         A, b = np.zeros((6, 6)), np.zeros(6)
         cost = 0.0
@@ -131,7 +141,7 @@ def _refine(rays, xy, scale, R, t):
                 elif k == 2:
                     d0, d1, d2 = (x * R[0, 1] - y * R[0, 0], x * R[1, 1] - y * R[1, 0], x * R[2, 1] - y * R[2, 0])
                 else:
-                    d0, d1, d2 = float(k == 3), float(k == 4), float(k == 5)
+                    d0, d1, d2 = unit[k - 3, 0], unit[k - 3, 1], unit[k - 3, 2]
                 along = u0 * d0 + u1 * d1 + u2 * d2
                 J[0, k] = (d0 - along * u0) * inverse
                 J[1, k] = (d1 - along * u1) * inverse
@@ -149,7 +159,7 @@ def _refine(rays, xy, scale, R, t):
         angle = sqrt(b[0] * b[0] + b[1] * b[1] + b[2] * b[2])
         if angle > 0.5:  # beyond it the linearisation says nothing
             b *= 0.5 / angle
-        R[:] = np.dot(R, so3.exp(b[:3]))
+        R[:] = _product(R, so3.exp(b[:3]))
         t += b[3:]
         if angle < _STEP_TOLERANCE and (b[3:] * b[3:]).sum() < _STEP_TOLERANCE**2 * (t * t).sum():
             break
@@ -161,7 +171,7 @@ def _mirrored(R, t):
     """The other planar solution in weak perspective (Schweighofer and Pinz 2006): depths mirrored about the centre."""
     v = t / sqrt((t * t).sum())
     S = np.eye(3) - 2.0 * np.outer(v, v)
-    other = np.dot(S, R)
+    other = _product(S, R)
     other[:, 2] *= -1.0
     return other
 
@@ -224,6 +234,7 @@ def board_poses(rays, xy, start, scale, limit, inlier_share, R_board_cam, p_boar
             continue
         ok[i] = _inlier_fraction(f, local, limit, R, t) >= inlier_share
         R_board_cam[i] = R.T
-        p_board_cam[i] = -np.dot(R.T, t)
+        for k in range(3):
+            p_board_cam[i, k] = -(R[0, k] * t[0] + R[1, k] * t[1] + R[2, k] * t[2])
         p_board_cam[i, 0] += cx
         p_board_cam[i, 1] += cy

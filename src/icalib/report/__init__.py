@@ -1,1 +1,5 @@
-"""The calibration as a page to read: `report.html`."""
+"""The calibration as a page to read, `report.html`, and as a table for the terminal."""
+
+from icalib.report.page import report_html
+
+__all__ = ["report_html"]

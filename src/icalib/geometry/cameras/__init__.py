@@ -6,8 +6,11 @@ from icalib.errors import CalibrationError
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.cameras.equidistant import PinholeEquidistant
 from icalib.geometry.cameras.radtan import PinholeRadtan
+from icalib.geometry.cameras.radtan5 import PinholeRadtan5
 
-CAMERA_MODELS: dict[str, CameraModel] = {model.name: model for model in (PinholeRadtan(), PinholeEquidistant())}
+CAMERA_MODELS: dict[str, CameraModel] = {
+    model.name: model for model in (PinholeRadtan(), PinholeRadtan5(), PinholeEquidistant())
+}
 
 
 def camera_model(name: str) -> CameraModel:

@@ -1,4 +1,4 @@
-"""Pinhole camera with radial-tangential distortion, as in OpenCV and Kalibr ("radtan", Brown-Conrady)."""
+"""Pinhole cameras with radial-tangential distortion, as in OpenCV and Kalibr ("radtan", Brown-Conrady)."""
 
 from __future__ import annotations
 
@@ -12,48 +12,65 @@ _MIN_DEPTH = 1e-6  # m
 _MAX_NEWTON_STEPS = 30
 
 
-class PinholeRadtan(CameraModel):
-    """With a = x / z, b = y / z, s = a^2 + b^2 and d = 1 + k1 s + k2 s^2 (OpenCV, calib3d, "radial" and "tangential"):
+class RadialTangential(CameraModel):
+    """With a = x / z, b = y / z, s = a^2 + b^2 and d = 1 + k1 s + k2 s^2 + k3 s^3 (OpenCV, calib3d, "radial" and
+    "tangential"; k3 = 0 in a model without it):
 
         u = fx (a d + 2 p1 a b + p2 (s + 2 a^2)) + cx
         v = fy (b d + p1 (s + 2 b^2) + 2 p2 a b) + cy
 
-    Valid: z > 1 um, and r = sqrt(s) below the first zero of 1 + 3 k1 r^2 + 5 k2 r^4. The rest is projected to (0, 0)
-    with zero Jacobians.
+    Parameters: fx, fy, cx, cy, k1, k2, p1, p2 and, where the model has it, k3. Valid: z > 1 um, and r = sqrt(s) below
+    the first zero of 1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6. The rest is projected to (0, 0) with zero Jacobians.
     """
-
-    name = "pinhole-radtan"
-    parameter_names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 
     def project(self, params: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         params, points = np.ascontiguousarray(params, float), np.ascontiguousarray(points, float)
         uv, valid = np.empty((len(points), 2)), np.empty(len(points), dtype=np.bool_)
-        _project(params, points, radial.monotonic_limit(params[4:6]), uv, valid)
+        _project(params, points, radial.monotonic_limit(_radial_coefficients(params)), uv, valid)
         return uv, valid
 
     def project_with_jacobians(
         self, params: np.ndarray, points: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         params, points = np.ascontiguousarray(params, float), np.ascontiguousarray(points, float)
-        n = len(points)
-        uv, valid, j_point, j_params = np.empty((n, 2)), np.empty(n, np.bool_), np.empty((n, 2, 3)), np.empty((n, 2, 8))
-        _project_with_jacobians(params, points, radial.monotonic_limit(params[4:6]), uv, valid, j_point, j_params)
+        n, limit = len(points), radial.monotonic_limit(_radial_coefficients(params))
+        uv, valid = np.empty((n, 2)), np.empty(n, dtype=np.bool_)
+        j_point, j_params = np.empty((n, 2, 3)), np.empty((n, 2, len(params)))
+        _project_with_jacobians(params, points, limit, uv, valid, j_point, j_params)
         return uv, valid, j_point, j_params
 
     def unproject(self, params: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         params, uv = np.ascontiguousarray(params, float), np.ascontiguousarray(uv, float)
         rays, valid = np.empty((len(uv), 3)), np.empty(len(uv), dtype=np.bool_)
-        _unproject(params, uv, radial.monotonic_limit(params[4:6]), rays, valid)
+        coefficients = _radial_coefficients(params)
+        _unproject(params, coefficients, uv, radial.monotonic_limit(coefficients), rays, valid)
         return rays, valid
 
 
+class PinholeRadtan(RadialTangential):
+    """Two radial coefficients: Kalibr's "radtan"."""
+
+    name = "pinhole-radtan"
+    parameter_names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+
+
+def _radial_coefficients(params: np.ndarray) -> np.ndarray:
+    """(k1, k2) or (k1, k2, k3): OpenCV's order puts the tangential ones in between."""
+    return np.concatenate([params[4:6], params[8:]])
+
+
 @njit(cache=True, nogil=True)
-def _distort(params, a, b):
+def _third_coefficient(params):
+    return params[8] if len(params) > 8 else 0.0
+
+
+@njit(cache=True, nogil=True)
+def _distort(params, k3, a, b):
     """Distorted (a, b), d of it / d (a, b) as (aa, ab = ba, bb): the Jacobian of this distortion is symmetric."""
     k1, k2, p1, p2 = params[4], params[5], params[6], params[7]
     s = a * a + b * b
-    d = 1.0 + s * (k1 + s * k2)
-    slope = 2.0 * (k1 + 2.0 * k2 * s)
+    d = 1.0 + s * k1 + s * s * (k2 + s * k3)
+    slope = 2.0 * k1 + s * (4.0 * k2 + s * (6.0 * k3))
     distorted_a = a * d + 2.0 * p1 * a * b + p2 * (s + 2.0 * a * a)
     distorted_b = b * d + p1 * (s + 2.0 * b * b) + 2.0 * p2 * a * b
     j_aa = d + a * a * slope + 2.0 * p1 * b + 6.0 * p2 * a
@@ -64,13 +81,14 @@ def _distort(params, a, b):
 
 @njit(cache=True, nogil=True)
 def _project(params, points, limit, uv, valid):
+    k3 = _third_coefficient(params)
     for i in range(len(points)):
         z = points[i, 2]
         inverse_z = 1.0 / z if z > _MIN_DEPTH else 0.0
         a, b = points[i, 0] * inverse_z, points[i, 1] * inverse_z
         valid[i] = z > _MIN_DEPTH and a * a + b * b < limit * limit
         if valid[i]:
-            distorted_a, distorted_b, _, _, _ = _distort(params, a, b)
+            distorted_a, distorted_b, _, _, _ = _distort(params, k3, a, b)
             uv[i, 0] = params[0] * distorted_a + params[2]
             uv[i, 1] = params[1] * distorted_b + params[3]
         else:
@@ -79,7 +97,7 @@ def _project(params, points, limit, uv, valid):
 
 @njit(cache=True, nogil=True)
 def _project_with_jacobians(params, points, limit, uv, valid, j_point, j_params):
-    fx, fy = params[0], params[1]
+    fx, fy, k3 = params[0], params[1], _third_coefficient(params)
     for i in range(len(points)):
         z = points[i, 2]
         inverse_z = 1.0 / z if z > _MIN_DEPTH else 0.0
@@ -91,7 +109,7 @@ def _project_with_jacobians(params, points, limit, uv, valid, j_point, j_params)
             uv[i] = 0.0
             j_point[i] = 0.0
             continue
-        distorted_a, distorted_b, j_aa, j_ab, j_bb = _distort(params, a, b)
+        distorted_a, distorted_b, j_aa, j_ab, j_bb = _distort(params, k3, a, b)
         uv[i, 0], uv[i, 1] = fx * distorted_a + params[2], fy * distorted_b + params[3]
         scale_u, scale_v = fx * inverse_z, fy * inverse_z
         j_point[i, 0, 0], j_point[i, 0, 1] = scale_u * j_aa, scale_u * j_ab
@@ -104,18 +122,21 @@ def _project_with_jacobians(params, points, limit, uv, valid, j_point, j_params)
         j_params[i, 1, 1], j_params[i, 1, 3] = distorted_b, 1.0
         j_params[i, 1, 4], j_params[i, 1, 5] = fy * b * s, fy * b * s * s
         j_params[i, 1, 6], j_params[i, 1, 7] = fy * (s + 2.0 * b * b), 2.0 * fy * a * b
+        if len(params) > 8:
+            j_params[i, 0, 8], j_params[i, 1, 8] = fx * a * s * s * s, fy * b * s * s * s
 
 
 @njit(cache=True, nogil=True)
-def _undistort(params, limit, distorted_a, distorted_b):
+def _undistort(params, coefficients, limit, distorted_a, distorted_b):
     """(a, b) and whether Newton converged inside the monotonic range; starts where the radial part alone would be."""
     distorted_r = np.hypot(distorted_a, distorted_b)
     # At the limit itself the radial slope is zero; 0.9 leaves room for tangential terms that reach slightly past it.
-    r = min(radial.invert(params[4:6], distorted_r, limit), 0.9 * limit)
+    r = min(radial.invert(coefficients, distorted_r, limit), 0.9 * limit)
     scale = r / distorted_r if distorted_r > 0.0 else 1.0
     a, b = scale * distorted_a, scale * distorted_b
+    k3 = _third_coefficient(params)
     for _ in range(_MAX_NEWTON_STEPS):
-        value_a, value_b, j_aa, j_ab, j_bb = _distort(params, a, b)
+        value_a, value_b, j_aa, j_ab, j_bb = _distort(params, k3, a, b)
         determinant = j_aa * j_bb - j_ab * j_ab
         if not determinant > 0.0:
             return a, b, False
@@ -129,12 +150,12 @@ def _undistort(params, limit, distorted_a, distorted_b):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # a focal length of zero: nothing is valid
-def _unproject(params, uv, limit, rays, valid):
+def _unproject(params, coefficients, uv, limit, rays, valid):
     for i in range(len(uv)):
         mx, my = (uv[i, 0] - params[2]) / params[0], (uv[i, 1] - params[3]) / params[1]
         a, b, valid[i] = 0.0, 0.0, False
         if np.isfinite(mx) and np.isfinite(my):
-            a, b, valid[i] = _undistort(params, limit, mx, my)
+            a, b, valid[i] = _undistort(params, coefficients, limit, mx, my)
         if not valid[i]:
             a, b = 0.0, 0.0
         norm = np.sqrt(1.0 + a * a + b * b)

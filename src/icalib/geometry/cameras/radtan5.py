@@ -1,0 +1,15 @@
+"""Pinhole camera with radial-tangential distortion of five coefficients, ROS's "plumb_bob" and OpenCV's default."""
+
+from __future__ import annotations
+
+from icalib.geometry.cameras.radtan import RadialTangential
+
+
+class PinholeRadtan5(RadialTangential):
+    """A third radial coefficient, for lenses that two cannot follow into the corners of the image.
+
+    k3 comes last, as in OpenCV's distCoeffs and ROS's CameraInfo.D.
+    """
+
+    name = "pinhole-radtan5"
+    parameter_names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")

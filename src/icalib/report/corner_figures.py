@@ -1,0 +1,145 @@
+"""Residuals of one camera's corners (predicted - measured), and of all cameras together."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from icalib.calibration import CornerResiduals
+from icalib.report.plot import COLORS, REJECTED, Figure, axis, dots, figure, line, numbers, thin
+
+MOST_DOTS = 2500  # of each kind in one figure
+BINS = 60
+CELL_PX = 40
+FEWEST_IN_CELL = 5
+
+
+def residual_plane(r: CornerResiduals) -> Figure:
+    """Density of the residuals (u, v), rejected corners as crosses."""
+    used = r.residual[~r.rejected]
+    reach = 1.3 * float(np.quantile(np.abs(used), 0.999)) if len(used) else 1.0
+    edges = np.linspace(-reach, reach, BINS + 1)
+    count, _, _ = np.histogram2d(used[:, 1], used[:, 0], bins=[edges, edges])
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    heat = {
+        "type": "heatmap",
+        "x": numbers(middle),
+        "y": numbers(middle),
+        "z": [[value or None for value in row] for row in count.tolist()],
+        "colorscale": "Blues",
+        "reversescale": False,
+        "colorbar": {"title": {"text": "corners"}, "thickness": 10},
+        "hovertemplate": "u %{x} px, v %{y} px: %{z}<extra></extra>",
+    }
+    far = r.residual[r.rejected]
+    far = far[thin(len(far), MOST_DOTS)]
+    cross = {"color": REJECTED, "size": 5, "symbol": "x-thin", "line": {"color": REJECTED, "width": 1}}
+    outside = int((np.abs(far) > 2.0 * reach).any(axis=1).sum())
+    name = "rejected" + (f" ({outside} beyond the frame)" if outside else "")
+    marks = dots(far[:, 0], far[:, 1], name, REJECTED, marker=cross)
+    window = {"range": [-2.0 * reach, 2.0 * reach]}
+    return figure(
+        [heat, marks] if len(far) else [heat],
+        400,
+        xaxis=axis("u residual [px]", **window),
+        yaxis=axis("v residual [px]", scaleanchor="x", constrain="domain", **window),
+    )
+
+
+def residuals_over_time(r: CornerResiduals) -> Figure:
+    """Size of each residual, and the RMS of each image."""
+    size = np.linalg.norm(r.residual, axis=1)
+    image = np.repeat(np.arange(len(r.seconds)), np.diff(r.start))
+    used, gone = np.flatnonzero(~r.rejected), np.flatnonzero(r.rejected)
+    some, few = used[thin(len(used), MOST_DOTS)], gone[thin(len(gone), MOST_DOTS)]
+    per_image = np.bincount(image[used], minlength=len(r.seconds))
+    square = np.bincount(image[used], size[used] ** 2, minlength=len(r.seconds))
+    rms = np.sqrt(square / np.where(per_image > 0, 2.0 * per_image, np.nan))
+    keep = thin(len(r.seconds), MOST_DOTS)
+    top = 1.5 * float(size[used].max(initial=1e-3))
+    seconds = r.seconds[image]
+    return figure(
+        [
+            dots(seconds[some], size[some], "corners", "#93b7dc"),
+            dots(seconds[few], np.minimum(size[few], top), "rejected (clipped to the frame)", REJECTED, 4),
+            line(r.seconds[keep], rms[keep], "RMS of an image, per coordinate", "#0f2f57"),
+        ],
+        400,
+        xaxis=axis("time [s]"),
+        yaxis=axis("residual [px]", rangemode="tozero"),
+    )
+
+
+def residuals_over_image(r: CornerResiduals, resolution: tuple[int, int], scale: float | None = None) -> Figure:
+    """RMS in cells of the image, with the mean residual of each cell as an enlarged arrow."""
+    width, height = resolution
+    nx, ny = max(1, round(width / CELL_PX)), max(1, round(height / CELL_PX))
+    x, y = np.clip(r.uv[~r.rejected], 0, [width - 1, height - 1]).T
+    cell = (y * ny / height).astype(int) * nx + (x * nx / width).astype(int)
+    error = r.residual[~r.rejected]
+    count = np.bincount(cell, minlength=nx * ny)
+    enough = np.where(count >= FEWEST_IN_CELL, count, np.nan)
+    mean = np.stack([np.bincount(cell, error[:, i], minlength=nx * ny) / enough for i in range(2)], axis=1)
+    rms = np.sqrt(np.bincount(cell, (error**2).sum(axis=1), minlength=nx * ny) / (2.0 * enough))
+    u, v = (np.arange(nx) + 0.5) * width / nx, (np.arange(ny) + 0.5) * height / ny
+    heat = {
+        "type": "heatmap",
+        "x": numbers(u),
+        "y": numbers(v),
+        "z": numbers(rms.reshape(ny, nx)),
+        "colorscale": "YlGnBu",
+        "reversescale": True,
+        "zmin": 0,
+        "colorbar": {"title": {"text": "RMS [px]"}, "thickness": 10},
+        "hovertemplate": "RMS %{z} px<extra></extra>",
+    }
+    gone = r.uv[r.rejected][thin(int(r.rejected.sum()), MOST_DOTS)]
+    traces = [heat, *_arrows(np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2), mean)]
+    if len(gone):
+        traces.append(dots(gone[:, 0], gone[:, 1], "rejected", REJECTED))
+    return figure(
+        traces,
+        400,
+        xaxis=axis("u [px]", range=[-0.5, width - 0.5], constrain="domain"),
+        yaxis=axis("v [px]", range=[height - 0.5, -0.5], scaleanchor="x", constrain="domain"),
+    )
+
+
+def _arrows(at: np.ndarray, mean: np.ndarray) -> list[dict[str, Any]]:
+    """Line pieces along the mean residual, the longest one cell long; a dot marks the foot."""
+    length = np.linalg.norm(mean, axis=1)
+    longest = float(np.nanmax(length, initial=0.0))
+    if longest == 0.0:
+        return []
+    gain = CELL_PX / longest
+    tip = at + gain * mean
+    pieces = np.stack([at, tip, np.full_like(at, np.nan)], axis=1).reshape(-1, 2)
+    foot = at[np.isfinite(length)]
+    name = f"mean residual, enlarged {gain:.0f} times (longest {longest:.3f} px)"
+    return [
+        line(pieces[:, 0], pieces[:, 1], name, "#111827", hoverinfo="skip"),
+        dots(foot[:, 0], foot[:, 1], "", "#111827", 3, showlegend=False, hoverinfo="skip"),
+    ]
+
+
+def normalised_histogram(streams: tuple[CornerResiduals, ...]) -> Figure:
+    """Residuals over their standard deviation against the normal density, logarithmic so that tails show."""
+    edges = np.linspace(-6.0, 6.0, 97)
+    x = 0.5 * (edges[1:] + edges[:-1])
+    traces = []
+    for i, r in enumerate(streams):
+        z = (r.residual[~r.rejected] / r.sigma[~r.rejected, None]).ravel()
+        count, _ = np.histogram(z, edges)
+        density = count / max(1, len(z)) / (edges[1] - edges[0])
+        density = np.where(count > 0, density, np.nan)
+        step = {"color": COLORS[i % len(COLORS)], "width": 1.6, "shape": "hvh"}
+        traces.append(line(x, density, f"{r.sensor} (u and v)", COLORS[i % len(COLORS)], line=step))
+    normal = np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
+    traces.append(line(x, normal, "standard normal", "#6b7280", line={"color": "#6b7280", "dash": "dash", "width": 1.4}))
+    return figure(
+        traces,
+        380,
+        xaxis=axis("residual / standard deviation"),
+        yaxis=axis("density", type="log", range=[-5, 0], exponentformat="power"),
+    )

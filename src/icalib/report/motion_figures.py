@@ -1,0 +1,98 @@
+"""The IMU's residuals, the motion, and how the solver got there."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icalib.calibration import Calibration
+from icalib.geometry import so3
+from icalib.report.plot import AXIS_COLORS, COLORS, Figure, axis, figure, line, numbers, path_3d, stacked_axes, thin, y_of
+
+MOST_NODES = 2000
+BLOCKS = ("rotation", "velocity", "position", "gyro walk", "accel walk")
+
+
+def imu_residuals(c: Calibration) -> Figure:
+    """Whitened residuals of the IMU factor; each should scatter like a standard normal number, or less."""
+    seconds, whitened = c.imu_residuals.seconds, c.imu_residuals.whitened
+    keep = thin(len(seconds), MOST_NODES)
+    return _panels(seconds[keep], [whitened[keep, 3 * b : 3 * b + 3] for b in range(5)], BLOCKS, 680)
+
+
+def motion(c: Calibration) -> Figure:
+    """Angular rate, speed and biases over time."""
+    path = c.trajectory
+    steps = np.diff(path.seconds)
+    between = np.einsum("kji,kjl->kil", path.rotation[:-1], path.rotation[1:])
+    rate = so3.log_many(np.ascontiguousarray(between)) / steps[:, None]
+    keep, inner = thin(len(path.seconds), MOST_NODES), thin(len(steps), MOST_NODES)
+    t = path.seconds
+    panels = [
+        (t[:-1][inner] + 0.5 * steps[inner], np.rad2deg(rate[inner])),
+        (t[keep], path.velocity[keep]),
+        (t[keep], np.rad2deg(path.gyro_bias[keep])),
+        (t[keep], path.accel_bias[keep]),
+    ]
+    titles = ("rate [deg/s]", "velocity [m/s]", "gyro bias [deg/s]", "accel bias [m/s^2]")
+    return _mixed_panels(panels, titles, 640)
+
+
+def trajectory(c: Calibration) -> Figure:
+    """Path of the IMU in the world, coloured by time, with the target at the origin."""
+    path = c.trajectory
+    keep = thin(len(path.seconds), MOST_NODES)
+    color = {"color": numbers(path.seconds[keep]), "colorscale": "Viridis", "width": 4}
+    color |= {"showscale": True, "colorbar": {"title": {"text": "time [s]"}, "thickness": 10}}
+    ends = path.position[[0, -1]]
+    traces = [
+        path_3d(path.position[keep], c.imu, "", line=color, showlegend=False),
+        path_3d(ends, "ends", "#111827", mode="markers+text", text=["start", "end"], marker={"size": 3}, showlegend=False),
+        *_board(c),
+    ]
+    scene = {name: {"title": {"text": f"world {name[0]} [m]"}, "nticks": 6} for name in ("xaxis", "yaxis", "zaxis")}
+    return figure(traces, 520, scene=scene | {"aspectmode": "data"}, margin={"l": 0, "r": 0, "t": 30, "b": 0})
+
+
+def _board(c: Calibration) -> list[dict]:
+    """Outline of the target where its attitude is known."""
+    target = c.rig.get("target", {})
+    attitude = [g for g in c.groups if g.sensor not in c.rig["sensors"] and g.value.shape == (3, 3)]
+    if not attitude or "tag_size" not in target:
+        return []
+    pitch = target["tag_size"] * (1.0 + target["tag_spacing"])
+    gap = target["tag_size"] * target["tag_spacing"]
+    x, y = target["cols"] * pitch - gap, target["rows"] * pitch - gap
+    outline = np.array([(0, 0, 0), (x, 0, 0), (x, y, 0), (0, y, 0), (0, 0, 0)]) @ attitude[0].value.T
+    return [path_3d(outline, attitude[0].sensor, "#be185d")]
+
+
+def convergence(c: Calibration) -> Figure:
+    """Cost and predicted decrease at each step of the solver, stage by stage."""
+    step = np.arange(1, len(c.iterations) + 1, dtype=float)
+    traces = []
+    for i, stage in enumerate(dict.fromkeys(s.stage for s in c.iterations)):
+        of = np.array([s.stage == stage for s in c.iterations])
+        cost = np.array([s.cost for s in c.iterations])[of]
+        kept = np.array([s.accepted for s in c.iterations])[of]
+        color = COLORS[i % len(COLORS)]
+        marker = {"size": 8, "color": color, "symbol": np.where(kept, "circle", "x").tolist()}
+        traces.append(line(step[of], cost, f"cost, {stage}", color, mode="lines+markers", marker=marker))
+    predicted = np.array([s.predicted_decrease for s in c.iterations])
+    dashed = {"color": "#6b7280", "dash": "dot"}
+    traces.append(line(step, np.where(predicted > 0.0, predicted, np.nan), "predicted decrease", "#6b7280", line=dashed))
+    log = axis("half the robust chi^2", type="log", exponentformat="power")
+    return figure(traces, 380, xaxis=axis("step (x: rejected)", dtick=max(1, len(step) // 12)), yaxis=log)
+
+
+def _panels(t: np.ndarray, values: list[np.ndarray], titles: tuple[str, ...], height: int) -> Figure:
+    return _mixed_panels([(t, v) for v in values], titles, height)
+
+
+def _mixed_panels(panels: list[tuple[np.ndarray, np.ndarray]], titles: tuple[str, ...], height: int) -> Figure:
+    """Three lines (x, y, z) in each of several panels one above the other."""
+    traces = [
+        line(t, v[:, i], "xyz"[i], AXIS_COLORS[i], yaxis=y_of(p), showlegend=p == 0, line={"color": AXIS_COLORS[i], "width": 1})
+        for p, (t, v) in enumerate(panels)
+        for i in range(3)
+    ]
+    return figure(traces, height, **stacked_axes(list(titles)))

@@ -1,0 +1,82 @@
+"""Figures as plain data that plotly.js draws; the Python side of plotly is slow to load and not needed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+Figure = dict[str, Any]
+COLORS = ("#2563a8", "#d97706", "#15803d", "#7c3aed", "#be185d", "#0e7490")
+AXIS_COLORS = ("#c0392b", "#1e8449", "#2563a8")  # x, y, z
+REJECTED = "#dc2626"
+DIGITS = 5  # significant; more would only make the page larger
+_GRID = {"gridcolor": "#e5e7eb", "zerolinecolor": "#cbd5e1", "linecolor": "#94a3b8"}
+
+
+def figure(traces: list[dict[str, Any]], height: int = 380, **layout: Any) -> Figure:
+    """Traces and a layout in the page's style; x, y: titles of the first axes."""
+    style: dict[str, Any] = {
+        "height": height,
+        "margin": {"l": 64, "r": 16, "t": 34, "b": 48},
+        "paper_bgcolor": "rgba(0,0,0,0)",
+        "plot_bgcolor": "#ffffff",
+        "font": {"family": "system-ui, sans-serif", "size": 12, "color": "#1f2937"},
+        "legend": {"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0},
+        "hovermode": "closest",
+    }
+    return {"data": traces, "layout": style | layout}
+
+
+def axis(title: str, **more: Any) -> dict[str, Any]:
+    """An axis with its title, in the page's style."""
+    return _GRID | {"title": {"text": title}} | more
+
+
+def line(x: np.ndarray, y: np.ndarray, name: str, color: str, **more: Any) -> dict[str, Any]:
+    """A scatter trace drawn as a line."""
+    style = {"type": "scatter", "mode": "lines", "line": {"color": color, "width": 1.4}}
+    return style | {"x": numbers(x), "y": numbers(y), "name": name} | more
+
+
+def dots(x: np.ndarray, y: np.ndarray, name: str, color: str, size: float = 3, **more: Any) -> dict[str, Any]:
+    """A scatter trace drawn as dots."""
+    marker = {"color": color, "size": size, "opacity": 0.6}
+    style = {"type": "scatter", "mode": "markers", "marker": marker}
+    return style | {"x": numbers(x), "y": numbers(y), "name": name} | more
+
+
+def path_3d(points: np.ndarray, name: str, color: str, **more: Any) -> dict[str, Any]:
+    """Lines in space through points (N, 3); a row of NaN lifts the pen."""
+    x, y, z = (numbers(points[:, i]) for i in range(3))
+    style = {"type": "scatter3d", "mode": "lines", "line": {"color": color, "width": 4}, "hoverinfo": "name"}
+    return style | {"x": x, "y": y, "z": z, "name": name} | more
+
+
+def stacked_axes(titles: list[str], gap: float = 0.045) -> dict[str, Any]:
+    """Layout of panels one above the other, sharing time; panel i has its traces on y-axis `y_of(i)`."""
+    n = len(titles)
+    panel = (1.0 - gap * (n - 1)) / n
+    layout: dict[str, Any] = {"xaxis": axis("time [s]", anchor=y_of(n - 1))}
+    for i, title in enumerate(titles):
+        top = 1.0 - i * (panel + gap)
+        layout[y_of(i).replace("y", "yaxis")] = axis(title, domain=[max(0.0, top - panel), top])
+    return layout
+
+
+def y_of(panel: int) -> str:
+    """Plotly's name of the y-axis of a panel."""
+    return "y" if panel == 0 else f"y{panel + 1}"
+
+
+def numbers(values: np.ndarray) -> list[Any]:
+    """Rounded to a few significant digits; None where not finite, since JSON knows no NaN."""
+    values = np.asarray(values, dtype=np.float64)
+    if values.ndim > 1:
+        return [numbers(row) for row in values]
+    return [float(f"{v:.{DIGITS}g}") if np.isfinite(v) else None for v in values.tolist()]
+
+
+def thin(count: int, most: int) -> np.ndarray:
+    """Indices of at most `most` of `count` items, evenly spread."""
+    return np.arange(count) if count <= most else np.linspace(0, count - 1, most).astype(np.int64)

@@ -1,0 +1,104 @@
+"""Parameters as people read them: degrees, millimetres, milliseconds, and no more digits than are known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import asin, atan2, floor, isfinite, log10
+
+import numpy as np
+
+from icalib.calibration import Calibration, ParameterGroup, Verdict
+
+SHOWN_UNITS = {"rad": ("deg", 180.0 / np.pi), "m": ("mm", 1e3), "s": ("ms", 1e3)}
+TURNS = ("roll", "pitch", "yaw")
+WORST_FIRST: tuple[Verdict, ...] = ("undetermined", "weak", "determined", "fixed")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One parameter, ready to be printed. std and formal are empty where the parameter is fixed."""
+
+    sensor: str
+    name: str
+    value: str
+    std: str
+    formal: str
+    factor: str
+    unit: str
+    verdict: Verdict
+
+
+def rows(calibration: Calibration) -> list[Row]:
+    """Every parameter of every sensor, in the order of the groups; an IMU taken for ideal has none."""
+    return [row for group in shown_groups(calibration) for row in _rows_of(group)]
+
+
+def shown_groups(calibration: Calibration) -> list[ParameterGroup]:
+    """The groups without those that are fixed at zero, which say nothing."""
+    return [g for g in calibration.groups if g.columns is not None or g.value.any()]
+
+
+def rpy_deg(R: np.ndarray) -> np.ndarray:
+    """(3,) roll, pitch, yaw [deg] with R = Rz(yaw) Ry(pitch) Rx(roll), as in the rig file."""
+    pitch = asin(float(np.clip(-R[2, 0], -1.0, 1.0)))
+    return np.rad2deg([atan2(R[2, 1], R[2, 2]), pitch, atan2(R[1, 0], R[0, 0])])
+
+
+def worst(verdicts: tuple[Verdict, ...]) -> Verdict:
+    """The verdict that a whole group deserves."""
+    return next((v for v in WORST_FIRST if v in verdicts), "fixed")
+
+
+def shown(value: float, digits: int = 2) -> str:
+    """A positive number with `digits` significant digits, without an exponent where that is readable."""
+    if not isfinite(value):
+        return "unknown" if np.isnan(value) else "infinite"
+    if value == 0.0 or not 1e-5 <= abs(value) < 1e6:
+        return f"{value:.{digits - 1}e}" if value else "0"
+    return f"{value:.{max(0, digits - 1 - floor(log10(abs(value))))}f}"
+
+
+def _rows_of(group: ParameterGroup) -> list[Row]:
+    unit, scale = SHOWN_UNITS.get(group.unit, (group.unit, 1.0))
+    names, values = _names(group), _values(group, scale)
+    factors = [None] * len(names) if group.columns is None or group.factor is None else group.factor.tolist()
+    return [
+        Row(
+            sensor=group.sensor,
+            name=names[i],
+            value=_value_text(values[i], scale * group.std[i]),
+            std="" if verdict == "fixed" else shown(scale * group.std[i]),
+            formal="" if verdict == "fixed" else shown(scale * group.std_formal[i]),
+            factor="" if factors[i] is None else f"{factors[i]:.1f}",
+            unit=unit,
+            verdict=verdict,
+        )
+        for i, verdict in enumerate(group.verdict)
+    ]
+
+
+def _names(group: ParameterGroup) -> list[str]:
+    if group.name == "rotation":
+        return [f"rotation {a} ({turn})" for a, turn in zip("xyz", TURNS, strict=True)]
+    if group.labels == (group.name,) or group.labels == ("",):
+        return [group.name.replace("_", " ")]
+    if group.name in ("intrinsics", "distortion"):
+        return list(group.labels)
+    return [f"{group.name} {label}".replace("_", " ") for label in group.labels]
+
+
+def _values(group: ParameterGroup, scale: float) -> list[float | None]:
+    if group.name == "rotation":
+        return rpy_deg(group.value).tolist()
+    if group.value.ndim == 2:  # the board's tilt: only how well it is known is of interest
+        return [None] * len(group.labels)
+    return (scale * group.value).tolist()
+
+
+def _value_text(value: float | None, std: float) -> str:
+    """The value down to the second significant digit of its standard deviation."""
+    if value is None:
+        return ""
+    if not isfinite(std) or std <= 0.0 or not 1e-9 < std < 1e3:
+        return f"{value:.6g}"
+    return f"{value:.{max(0, 1 - floor(log10(std)))}f}"

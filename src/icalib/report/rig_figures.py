@@ -1,0 +1,72 @@
+"""What was calibrated: the rig in space, and how its parameters correlate."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icalib.calibration import Calibration
+from icalib.report.plot import AXIS_COLORS, COLORS, Figure, axis, figure, numbers, path_3d
+
+_PEN_UP = np.full((1, 3), np.nan)
+
+
+def rig_picture(c: Calibration) -> Figure:
+    """Frames of all sensors and the cameras' fields of view, in the imu frame."""
+    positions = np.array([c.T_imu_sensor(name)[:3, 3] for name in c.cameras])
+    spread = max(np.ptp(np.vstack([positions, np.zeros(3)]), axis=0).max(), 0.02)
+    frames = {c.imu: np.eye(4)} | {name: c.T_imu_sensor(name) for name in c.cameras}
+    traces = [
+        path_3d(_axis_line(frames, i, 0.25 * spread), "xyz"[i], AXIS_COLORS[i], line={"color": AXIS_COLORS[i], "width": 6})
+        for i in range(3)
+    ]
+    traces += [
+        path_3d(_frustum(c, name, 0.45 * spread), name, COLORS[i % len(COLORS)], line={"color": COLORS[i % len(COLORS)], "width": 2})
+        for i, name in enumerate(c.cameras)
+    ]
+    origins = np.array([T[:3, 3] for T in frames.values()])
+    traces.append(
+        path_3d(origins, "sensors", "#111827", mode="markers+text", text=list(frames), marker={"size": 4}, showlegend=False)
+    )
+    scene = {name: {"title": {"text": f"{name[0]} of {c.imu} [m]"}, "nticks": 5} for name in ("xaxis", "yaxis", "zaxis")}
+    return figure(traces, 520, scene=scene | {"aspectmode": "data"}, margin={"l": 0, "r": 0, "t": 30, "b": 0})
+
+
+def _axis_line(frames: dict[str, np.ndarray], i: int, length: float) -> np.ndarray:
+    pieces = [np.stack([T[:3, 3], T[:3, 3] + length * T[:3, i]]) for T in frames.values()]
+    return np.concatenate([np.vstack([p, _PEN_UP]) for p in pieces])
+
+
+def _frustum(c: Calibration, name: str, depth: float) -> np.ndarray:
+    """Edges of the field of view to `depth`, distortion left out, kept inside 60 deg of the axis."""
+    fx, fy, cx, cy = c.group(name, "intrinsics").value
+    width, height = c.rig["sensors"][name]["resolution"]
+    u, v = np.array([0, width, width, 0]) - 0.5, np.array([0, 0, height, height]) - 0.5
+    widest = np.tan(np.deg2rad(60.0))
+    a, b = np.clip((u - cx) / fx, -widest, widest), np.clip((v - cy) / fy, -widest, widest)
+    corners = depth * np.stack([a, b, np.ones(4)], axis=1)
+    origin = np.zeros(3)
+    pen = np.vstack([corners, corners[:1], _PEN_UP, *(np.stack([origin, p, _PEN_UP[0]]) for p in corners)])
+    T = c.T_imu_sensor(name)
+    return pen @ T[:3, :3].T + T[:3, 3]
+
+
+def correlation(c: Calibration) -> Figure:
+    """Correlation coefficients of all estimated parameters, formal covariance."""
+    std = np.sqrt(np.diag(c.covariance))
+    scale = np.where(std > 0.0, std, 1.0)
+    rho = c.covariance / np.outer(scale, scale)
+    names = [name.replace("time_offset.time_offset", "time_offset") for name in c.covariance_names]
+    heat = {
+        "type": "heatmap",
+        "z": numbers(np.round(rho, 3)),
+        "x": names,
+        "y": names,
+        "zmin": -1,
+        "zmax": 1,
+        "colorscale": [[0, "#b2182b"], [0.25, "#f4a582"], [0.5, "#ffffff"], [0.75, "#92c5de"], [1, "#2166ac"]],
+        "colorbar": {"title": {"text": "correlation"}, "thickness": 12},
+        "hovertemplate": "%{y}<br>%{x}<br>%{z:.3f}<extra></extra>",
+    }
+    small = {"tickfont": {"size": 9 if len(names) < 60 else 6}, "automargin": True, "dtick": 1}
+    height = int(np.clip(14 * len(names) + 190, 380, 1100))
+    return figure([heat], height, xaxis=axis("", tickangle=-90, **small), yaxis=axis("", autorange="reversed", **small))

@@ -1,0 +1,149 @@
+"""Words and tables of the report. All text is escaped here, and only here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from html import escape
+
+import numpy as np
+
+from icalib.calibration import Calibration, ParameterGroup, SensorFit
+from icalib.report.quantities import SHOWN_UNITS, rows, shown, shown_groups, worst
+
+TRUST = {
+    "good": "Yes. The solver converged, the motion determines every parameter, and nothing calls for attention.",
+    "care": "Mostly. Read what stands below before using the numbers marked weak or warned about.",
+    "bad": "Not as a whole. Do not use what is marked undetermined: it is the guess, not a result.",
+    "failed": "No. The solver did not converge; the numbers are where it stopped.",
+}
+WORDS = {"rotation": "rotation", "translation": "position", "time_offset": "time offset"}
+
+
+class Html(str):
+    """Text that is HTML already."""
+
+
+def element(tag: str, content: object, css: str = "") -> Html:
+    """<tag class=css>content</tag>; content is escaped unless it is Html."""
+    attribute = f' class="{escape(css)}"' if css else ""
+    return Html(f"<{tag}{attribute}>{html(content)}</{tag}>")
+
+
+def html(content: object) -> Html:
+    """`content` as HTML: itself where it is Html, joined where it is a list, else escaped."""
+    if isinstance(content, Html):
+        return content
+    if isinstance(content, list):
+        return Html("".join(html(part) for part in content))
+    return Html(escape(str(content)))
+
+
+def table(headers: Sequence[str], body: Iterable[Sequence[object]], numeric: Sequence[str] = ()) -> Html:
+    """A table; the columns named in `numeric` stand to the right."""
+    css = ["number" if h in numeric else "" for h in headers]
+    head = element("tr", [element("th", h, c) for h, c in zip(headers, css, strict=True)])
+    lines = [element("tr", [element("td", x, c) for x, c in zip(row, css, strict=True)]) for row in body]
+    return element("div", element("table", [element("thead", head), element("tbody", lines)]), "scroll")
+
+
+def sentences(items: Sequence[str], css: str, nothing: str) -> Html:
+    """A list of sentences, or one that says that there is nothing."""
+    if not items:
+        return element("p", nothing, "quiet")
+    return element("ul", [element("li", item) for item in items], css)
+
+
+def badge(verdict: str) -> Html:
+    return element("span", verdict, f"badge {verdict}")
+
+
+def trust(c: Calibration) -> str:
+    """Key of TRUST: how far the whole can be trusted."""
+    verdicts = {v for g in c.groups for v in g.verdict}
+    if not c.converged:
+        return "failed"
+    if c.undetermined or "undetermined" in verdicts:
+        return "bad"
+    return "care" if c.warnings or "weak" in verdicts else "good"
+
+
+def sensor_cards(c: Calibration) -> Html:
+    """What is known of each sensor, in words."""
+    names = list(dict.fromkeys(g.sensor for g in shown_groups(c)))
+    return Html("".join(_card(c, name) for name in names))
+
+
+def _card(c: Calibration, sensor: str) -> Html:
+    groups = [g for g in shown_groups(c) if g.sensor == sensor]
+    verdict = worst(tuple(v for g in groups for v in g.verdict))
+    lines = [element("li", _group_words(g)) for g in groups]
+    kind = c.rig["sensors"].get(sensor, {}).get("type", "target")
+    head = element("h3", [html(sensor), element("small", f" {kind} "), badge(verdict)])
+    return element("article", [head, element("ul", lines)], f"card {verdict}")
+
+
+def _group_words(g: ParameterGroup) -> list[object]:
+    name = element("b", WORDS.get(g.name, g.name.replace("_", " ")))
+    if g.columns is None:
+        return [name, " fixed by the rig file"]
+    unit, scale = SHOWN_UNITS.get(g.unit, (g.unit, 1.0))
+    known = [s for s, v in zip(g.std.tolist(), g.verdict, strict=True) if v != "undetermined"]
+    size = f" to {shown(scale * max(known))} {unit}".rstrip() if known else ""
+    odd = [f"{n} {v}" for n, v in zip(g.labels, g.verdict, strict=True) if v in ("weak", "undetermined")]
+    if not odd:
+        return [name, f" determined{size} (1 sigma)"]
+    if len(set(g.verdict)) == 1:
+        return [name, f" {g.verdict[0]}{size}"]
+    return [name, f": {', '.join(odd)}; the rest determined{f', all known{size}' if size else ''}"]
+
+
+def parameters(c: Calibration) -> Html:
+    headers = ("sensor", "parameter", "value", "std", "unit", "formal std", "factor", "verdict")
+    body = [(r.sensor, r.name, r.value, r.std, r.unit, r.formal, r.factor, badge(r.verdict)) for r in rows(c)]
+    return table(headers, body, ("value", "std", "formal std", "factor"))
+
+
+def poses(c: Calibration) -> Html:
+    """T_imu_sensor of each camera, as a matrix to copy."""
+    blocks = []
+    for name in c.cameras:
+        lines = "\n".join("[" + ", ".join(f"{x: .9f}" for x in row) + "]" for row in c.T_imu_sensor(name))
+        blocks.append(element("figure", [element("figcaption", f"T_{c.imu}_{name}"), element("pre", lines)]))
+    return element("div", blocks, "grid")
+
+
+def fits(c: Calibration) -> Html:
+    headers = ("sensor", "kind", "residuals", "post-fit dof", "chi2 / dof", "RMS", "rejected")
+    body = [(f.sensor, f.kind, f.count, f"{f.dof:.0f}", _ratio(f), _rms(f), f.rejected or "") for f in c.fits]
+    return table(headers, body, headers[2:])
+
+
+def _ratio(f: SensorFit) -> str:
+    return shown(f.chi2 / f.dof, 3) if f.dof > 0.0 else "no freedom"
+
+
+def _rms(f: SensorFit) -> str:
+    return "" if f.rms is None else f"{shown(f.rms, 3)} {f.unit}".rstrip()
+
+
+def facts(c: Calibration) -> Html:
+    """Settings, versions, timings, rates and input files."""
+    names = ("setting", "value")
+    parts: list[object] = []
+    for title, found in (
+        ("Settings", c.settings),
+        ("Versions", c.versions),
+        ("Wall time [s]", {k: f"{v:.2f}" for k, v in c.timings.items()}),
+        ("Rates [Hz]", {k: f"{v:.4g}" for k, v in c.rates.items()}),
+    ):
+        parts.append(element("section", [element("h3", title), table(names, found.items())]))
+    files = table(("file", "sha256"), [(name, element("code", digest)) for name, digest in c.inputs.items()])
+    return Html(element("div", parts, "grid") + element("h3", "Input files") + files)
+
+
+def size_words(c: Calibration) -> str:
+    """How much was used, in a line."""
+    corners = sum(len(r.uv) for r in c.corner_residuals)
+    images = sum(len(r.seconds) for r in c.corner_residuals)
+    span = float(np.ptp(c.trajectory.seconds)) if len(c.trajectory.seconds) else 0.0
+    return f"{span:.1f} s, {images} images with {corners} corners, {len(c.trajectory.seconds)} nodes"

@@ -1,0 +1,169 @@
+"""A calibration survives its files bit for bit, and damaged files are refused in a sentence."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from icalib.calibration import Calibration, load_calibration
+from icalib.errors import CalibrationError
+
+
+def same(a: Any, b: Any) -> bool:
+    """Equal in type, shape and every bit."""
+    if isinstance(a, np.ndarray):
+        return isinstance(b, np.ndarray) and a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+    if dataclasses.is_dataclass(a):
+        return type(a) is type(b) and all(same(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a))
+    if isinstance(a, tuple | list):
+        return type(a) is type(b) and len(a) == len(b) and all(map(same, a, b))
+    return type(a) is type(b) and a == b
+
+
+@pytest.fixture
+def saved(calibration: Calibration, tmp_path: Path) -> Path:
+    folder = tmp_path / "made" / "for" / "it"
+    calibration.save(folder)
+    return folder
+
+
+def test_round_trip_is_exact(calibration: Calibration, saved: Path):
+    assert same(load_calibration(saved), calibration)
+
+
+def test_round_trip_of_what_is_not_finite_or_empty(calibration: Calibration, tmp_path: Path):
+    g = calibration.groups[0]
+    groups = (dataclasses.replace(g, std=np.array([np.inf, np.nan, 5e-324])), *calibration.groups[1:])
+    odd = dataclasses.replace(calibration, groups=groups, iterations=(), warnings=())
+    odd.save(tmp_path)
+    found = load_calibration(tmp_path)
+    assert same(found, odd)
+
+
+def test_arrays_need_no_pickle(saved: Path):
+    with np.load(saved / "result.npz", allow_pickle=False) as file:
+        assert all(file[name].dtype.kind in "fibU" for name in file.files)
+
+
+def test_yaml_is_what_the_design_says(calibration: Calibration, saved: Path):
+    data = yaml.safe_load((saved / "calibration.yaml").read_text())
+    cam = data["sensors"]["cam1"]
+    assert cam["type"] == "camera"
+    np.testing.assert_array_equal(cam["T_imu_sensor"], calibration.T_imu_sensor("cam1"))
+    assert cam["time_offset"] == calibration.group("cam1", "time_offset").value[0]
+    assert list(cam["parameters"]) == ["fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "bloom"]
+    assert cam["parameters"]["fy"] == 456.134
+    assert cam["std"]["rotation"] == calibration.group("cam1", "rotation").std.tolist()
+    assert cam["std"]["parameters"]["k1"] == 0.0
+    assert cam["verdict"]["translation"] == ["determined", "undetermined", "weak"]
+    assert cam["verdict"]["parameters"]["k1"] == "fixed"
+    assert cam["verdict"]["time_offset"] == "determined"
+    assert cam["empirical_factor"]["translation"] == [2.7] * 3
+    assert "k1" not in cam["empirical_factor"]["parameters"]
+    assert data["sensors"]["imu0"]["T_imu_sensor"] == np.eye(4).tolist()
+    assert np.shape(data["targets"]["board0"]["tilt"]) == (3, 3)
+    assert data["fits"][0]["chi2_per_dof"] == pytest.approx(20011.2 / 19800.5)
+    assert data["fits"][-1]["chi2_per_dof"] is None
+    assert data["warnings"] == list(calibration.warnings)
+
+
+def test_yaml_says_direction_sign_and_units_at_its_top(saved: Path):
+    head = (saved / "calibration.yaml").read_text().split("status:")[0]
+    for words in ("p_imu = T_imu_sensor p_sensor", "t_imu = t_sensor + time_offset", "angles in rad", "in m", "in s"):
+        assert words in head
+
+
+def test_parameters_that_share_a_label_keep_apart(calibration: Calibration, tmp_path: Path):
+    k = next(i for i, g in enumerate(calibration.groups) if g.name == "bloom")
+    twin = dataclasses.replace(calibration.groups[k], labels=("fx",))
+    dataclasses.replace(calibration, groups=(*calibration.groups[:k], twin, *calibration.groups[k + 1 :])).save(tmp_path)
+    found = yaml.safe_load((tmp_path / "calibration.yaml").read_text())["sensors"]["cam0"]["parameters"]
+    assert found["intrinsics_fx"] == 458.654
+    assert found["bloom_fx"] == 0.27
+
+
+def sentence_of(folder: Path) -> str:
+    with pytest.raises(CalibrationError) as caught:
+        load_calibration(folder)
+    sentence = str(caught.value)
+    assert sentence.endswith(".") and "\n" not in sentence and str(folder) in sentence
+    return sentence
+
+
+def test_absent_folder_and_absent_files(saved: Path):
+    assert "not a folder" in sentence_of(saved / "nothing")
+    (saved / "result.npz").unlink()
+    assert "result.npz" in sentence_of(saved)
+    (saved / "result.json").unlink()
+    assert "result.json" in sentence_of(saved)
+
+
+@pytest.mark.parametrize("size", [0, 1, 100, -1])
+def test_truncated_files(saved: Path, size: int):
+    for name in ("result.npz", "result.json"):
+        content = (saved / name).read_bytes()
+        (saved / name).write_bytes(content[:size])
+        assert name in sentence_of(saved)
+        (saved / name).write_bytes(content)
+
+
+@pytest.mark.parametrize("content", [b"[]", b'"text"', b"{}", b"\xff\xfe", b"[" * 100_000, b'{"format": "other"}'])
+def test_foreign_json(saved: Path, content: bytes):
+    (saved / "result.json").write_bytes(content)
+    assert "result.json" in sentence_of(saved)
+
+
+def change(folder: Path, **changes: Any) -> None:
+    file = folder / "result.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | changes))
+
+
+def test_arrays_of_another_run(calibration: Calibration, saved: Path, tmp_path: Path):
+    dataclasses.replace(calibration, covariance=2.0 * calibration.covariance).save(tmp_path / "other")
+    (saved / "result.npz").write_bytes((tmp_path / "other" / "result.npz").read_bytes())
+    assert "another run" in sentence_of(saved)
+
+
+def test_arrays_that_would_run_code(saved: Path):
+    np.savez(saved / "result.npz", covariance=np.array([print], dtype=object))
+    change(saved, npz_sha256=hashlib.sha256((saved / "result.npz").read_bytes()).hexdigest())
+    assert "cannot be read" in sentence_of(saved)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"format_version": 2},
+        {"groups": 3},
+        {"groups": [{}]},
+        {"groups": [{"sensor": "cam0"}]},
+        {"fits": [{"sensors": 1}]},
+        {"corner_sensors": ["cam7"]},
+        {"rig": {}},
+        {"rig": {"sensors": {}}},
+        {"rig": []},
+    ],
+)
+def test_changed_json(saved: Path, changes: dict[str, Any]):
+    change(saved, **changes)
+    sentence_of(saved)
+
+
+@pytest.mark.parametrize(("field", "value"), [("std", [1.0]), ("columns", [0, 1, 999]), ("value", "text"), ("labels", 1)])
+def test_changed_group(saved: Path, field: str, value: Any):
+    groups = json.loads((saved / "result.json").read_text())["groups"]
+    groups[0][field] = value
+    change(saved, groups=groups)
+    sentence_of(saved)
+
+
+def test_group_lists_what_there_is(calibration: Calibration):
+    with pytest.raises(KeyError, match="cam0.rotation"):
+        calibration.group("cam0", "focus")

@@ -1,0 +1,127 @@
+"""Kalibr's files: layout as Kalibr's own, numbers those of the calibration."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+
+from icalib.calibration import Calibration, ParameterGroup
+from icalib.errors import CalibrationError
+from icalib.estimation.imu_model import LABELS, correction_matrices
+from icalib.export.kalibr import camchain_imucam, imu_yaml
+
+
+@pytest.fixture(scope="module")
+def chain(calibration: Calibration) -> dict:
+    return yaml.safe_load(camchain_imucam(calibration))
+
+
+def with_intrinsics(calibration: Calibration, value: np.ndarray, mode: str) -> Calibration:
+    zeros = np.zeros(24)
+    group = ParameterGroup("imu0", "intrinsics", LABELS, "", value, zeros, zeros, ("fixed",) * 24, mode)
+    others = tuple(g for g in calibration.groups if g.sensor != "imu0")
+    return dataclasses.replace(calibration, groups=(*others, group))
+
+
+def test_poses_are_inverses_and_chain(calibration: Calibration, chain: dict):
+    for cam in ("cam0", "cam1"):
+        np.testing.assert_allclose(chain[cam]["T_cam_imu"] @ calibration.T_imu_sensor(cam), np.eye(4), atol=1e-15)
+    T0, T1 = (np.array(chain[cam]["T_cam_imu"]) for cam in ("cam0", "cam1"))
+    np.testing.assert_allclose(chain["cam1"]["T_cn_cnm1"], T1 @ np.linalg.inv(T0), atol=1e-15)
+    assert "T_cn_cnm1" not in chain["cam0"]
+    # cam1 sits 110 mm to the right of cam0: seen from it, cam0 lies at -x.
+    assert np.array(chain["cam1"]["T_cn_cnm1"])[0, 3] == pytest.approx(-0.110, abs=1e-3)
+
+
+def test_numbers(calibration: Calibration, chain: dict):
+    assert chain["cam1"]["timeshift_cam_imu"] == calibration.group("cam1", "time_offset").value[0]
+    assert chain["cam1"]["intrinsics"] == [457.587, 456.134, 379.999, 255.238]
+    assert chain["cam0"]["distortion_coeffs"] == calibration.group("cam0", "distortion").value.tolist()
+    assert chain["cam0"]["resolution"] == [752, 480]
+
+
+def test_models_are_kalibrs_names(calibration: Calibration, chain: dict):
+    assert (chain["cam0"]["camera_model"], chain["cam0"]["distortion_model"]) == ("pinhole", "radtan")
+    sensors = {n: s | ({"model": "pinhole-equidistant"} if n == "cam1" else {}) for n, s in calibration.rig["sensors"].items()}
+    fisheye = dataclasses.replace(calibration, rig=calibration.rig | {"sensors": sensors})
+    found = yaml.safe_load(camchain_imucam(fisheye))["cam1"]
+    assert (found["camera_model"], found["distortion_model"]) == ("pinhole", "equidistant")
+
+
+def test_layout_is_that_of_kalibr(euroc: Path, chain: dict, calibration: Calibration):
+    text = (euroc / "kalibr-camchain-imucam.yaml").read_text()
+    kalibr = yaml.safe_load(text)
+    assert {cam: list(entry) for cam, entry in chain.items()} == {cam: list(entry) for cam, entry in kalibr.items()}
+
+    def without_numbers(lines: list[str]) -> list[str]:
+        return [line.split("[")[0].split(": ")[0] for line in lines if not line.startswith("#")]
+
+    assert without_numbers(camchain_imucam(calibration).splitlines()) == without_numbers(text.splitlines())
+
+
+def test_overlaps_are_common_points_at_the_same_instant(calibration: Calibration, chain: dict):
+    assert (chain["cam0"]["cam_overlaps"], chain["cam1"]["cam_overlaps"]) == ([1], [0])
+    first, second = calibration.corner_residuals
+    left = dataclasses.replace(first, point=first.point % 72)
+    right = dataclasses.replace(second, point=72 + second.point % 72)
+    later = dataclasses.replace(second, seconds=second.seconds + 100.0)
+    for pair in ((left, right), (first, later)):
+        apart = yaml.safe_load(camchain_imucam(dataclasses.replace(calibration, corner_residuals=pair)))
+        assert (apart["cam0"]["cam_overlaps"], apart["cam1"]["cam_overlaps"]) == ([], [])
+
+
+def test_comments_say_direction_and_names(calibration: Calibration):
+    assert camchain_imucam(calibration).startswith("# Kalibr's camchain by icalib. T_cam_imu takes coordinates in the imu")
+    assert imu_yaml(calibration).startswith("# Kalibr's imu file by icalib. T_i_b takes coordinates in the body frame")
+    sensors = {{"cam1": "right"}.get(n, n): s for n, s in calibration.rig["sensors"].items()}
+    renamed = dataclasses.replace(
+        calibration,
+        rig=calibration.rig | {"sensors": sensors},
+        groups=tuple(dataclasses.replace(g, sensor=g.sensor.replace("cam1", "right")) for g in calibration.groups),
+        corner_residuals=(calibration.corner_residuals[0], dataclasses.replace(calibration.corner_residuals[1], sensor="right")),
+    )
+    text = camchain_imucam(renamed)
+    assert "# cam1 is right." in text
+    assert yaml.safe_load(text)["cam1"]["rostopic"] == "/right/image_raw"
+
+
+def test_imu_that_is_taken_for_ideal(calibration: Calibration):
+    assert yaml.safe_load(imu_yaml(calibration)) == {
+        "imu0": {
+            "T_i_b": np.eye(4).tolist(),
+            "accelerometer_noise_density": 2.8e-3,
+            "accelerometer_random_walk": 8.6e-4,
+            "gyroscope_noise_density": 1.6e-4,
+            "gyroscope_random_walk": 2.2e-5,
+            "model": "calibrated",
+            "rostopic": "/imu0",
+            "time_offset": 0.0,
+            "update_rate": 200.0,
+        }
+    }
+
+
+@pytest.mark.parametrize("mode", ["prior", "fixed"])
+def test_imu_intrinsics_give_the_readings_of_kalibrs_model(calibration: Calibration, mode: str):
+    x = np.random.default_rng(3).normal(scale=0.05, size=24)
+    imu = yaml.safe_load(imu_yaml(with_intrinsics(calibration, x, mode)))["imu0"]
+    assert imu["model"] == "scale-misalignment"
+    rate, force = np.array([0.3, -0.7, 1.1]), np.array([1.0, 2.0, -9.0])
+    gyro = imu["gyroscopes"]
+    C = np.array(gyro["C_gyro_i"])
+    reading = gyro["M"] @ C @ rate + gyro["A"] @ C @ force  # Kalibr, IccSensors.py
+    F, G, H = correction_matrices(x)
+    accel = imu["accelerometers"]["M"] @ force
+    np.testing.assert_allclose(F @ accel, force, atol=1e-12)
+    np.testing.assert_allclose(G @ reading + H @ accel, rate, atol=1e-12)
+    np.testing.assert_allclose(C, Rotation.from_rotvec(x[12:15]).as_matrix(), atol=1e-15)
+
+
+def test_unknown_rate_is_said(calibration: Calibration):
+    with pytest.raises(CalibrationError, match="rate of imu0"):
+        imu_yaml(dataclasses.replace(calibration, rates={}))
