@@ -86,7 +86,7 @@ class Settings:
     bloom: bool = True  # corners pulled towards their tag's centre, one size a camera
     board_shape: bool = True  # the target is not flat: estimate how it bends
     blur_noise: bool = True  # corners of fast images weigh less
-    common_error: bool = True  # corners of one image share an error
+    common_error: bool = False  # corners of one image share an error: a shift, its size estimated
     splits: int = 8  # segments for the empirical factor, 0: none
     max_gap_s: float = 0.5  # IMU gaps up to this are bridged; longer ones split the recording
     node_spacing_s: float = 0.05  # no two nodes further apart

@@ -27,14 +27,21 @@ from icalib.geometry import so3
 
 @dataclass(frozen=True)
 class Sample:
-    """factor: its name in the source. accumulate(state, piece, sums) -> cost; weighted(state) -> r (n,), y (n,), W (n, n)."""
+    """factor: its name in the source. accumulate(state, piece, sums) -> cost; residual(state) -> r (n,);
+    weights(state) -> y (n,), W (n, n)."""
 
     factor: str
     setup: object
     state: State
     accumulate: Callable[[State, Piece, bool], float]
-    weighted: Callable[[State], tuple[np.ndarray, np.ndarray, np.ndarray]]
+    residual: Callable[[State], np.ndarray]
+    weights: Callable[[State], tuple[np.ndarray, np.ndarray]]
     tolerance: float = 1e-6  # of the gradient, where weights are found by iteration
+
+
+def white(residual):
+    """Weights of residuals that are white already."""
+    return lambda at: (residual(at), np.eye(len(residual(at))))
 
 
 def imu_sample(unlike, setup_of, imu_free):
@@ -44,16 +51,16 @@ def imu_sample(unlike, setup_of, imu_free):
     factor = ImuFactor.build(setup.imu, setup.state, 9.81, columns[columns >= 0])
     state = setup.perturbed(np.random.default_rng(0), 0.1)
 
-    def weighted(at):
+    def residual(at):
         out = np.zeros((len(at.seconds) - 1, ROWS))
         for piece in make_pieces(len(at.seconds), setup.layout.size):
             factor.accumulate(at, piece, out, sums=False)
-        return out.ravel(), out.ravel(), np.eye(out.size)
+        return out.ravel()
 
     def accumulate(at, piece, sums):
         return factor.accumulate(at, piece, np.zeros((len(at.seconds) - 1, ROWS)), sums)
 
-    return Sample("ImuFactor", setup, state, accumulate, weighted)
+    return Sample("ImuFactor", setup, state, accumulate, residual, white(residual))
 
 
 LOSS_SCALE = 1.5
@@ -79,7 +86,9 @@ def corner_sample(
     n, m = len(stream.uv), len(stream.stamps_ns)
     # Few corners of each image, some of them far enough off that robust losses bend.
     sigma = rng.uniform(0.8, 1.2, m)
-    noise = CornerNoise(sigma, np.array([0.8, 0.6, 0.4])[:field], rng.normal(size=(n, 3))[:, :field].copy(), loss, LOSS_SCALE)
+    noise = CornerNoise(
+        sigma, np.array([0.8, 0.6, 0.4])[:field], rng.normal(size=(n, 3))[:, :field].copy(), loss, LOSS_SCALE
+    )
     factor = factor_of(setup, camera, scheme)
     factor = replace(
         factor,
@@ -91,11 +100,18 @@ def corner_sample(
     )
     state = setup.perturbed(rng, 0.02)
 
-    def weighted(at):
+    def run(at):
         out = CornerOutput.empty(stream, field)
         for piece in make_pieces(len(at.seconds), setup.layout.size):
             factor.accumulate(at, piece, out, sums=False)
-        used = out.root > 0
+        return out, out.root > 0
+
+    def residual(at):
+        out, used = run(at)
+        return out.residual[used].T.ravel()
+
+    def weights(at):
+        out, used = run(at)
         root, f, image, r = out.root[used], noise.field[used], stream.image[used], out.residual[used]
         e = r + np.einsum("nk,nak->na", f, out.shared[image])
         size = np.linalg.norm(e, axis=1)
@@ -106,13 +122,13 @@ def corner_sample(
         for i in range(m if field else 0):
             F = root[:, None] * f * (image == i)[:, None]
             W -= np.kron(np.eye(2), F @ np.linalg.solve(F.T @ F + np.diag(noise.tau**-2), F.T))
-        return r.T.ravel(), (root[:, None] ** 2 * e).T.ravel(), B @ W @ B
+        return (root[:, None] ** 2 * e).T.ravel(), B @ W @ B
 
     def accumulate(at, piece, sums):
         return factor.accumulate(at, piece, CornerOutput.empty(stream, field), sums, curved)
 
     tolerance = 1e-3 if field and loss != "none" else 1e-6
-    return Sample("CornerFactor", setup, state, accumulate, weighted, tolerance)
+    return Sample("CornerFactor", setup, state, accumulate, residual, weights, tolerance)
 
 
 def prior_sample(unlike, setup_of, sensor, name):
@@ -120,28 +136,35 @@ def prior_sample(unlike, setup_of, sensor, name):
     rng = np.random.default_rng(2)
     block, state = setup.layout.block(sensor, name), setup.perturbed(rng)
     value = setup.state.values[block.key]
-    value = value @ so3.exp(0.3 * rng.normal(size=3)) if block.kind == "rotation" else value + rng.normal(size=block.size)
+    value = (
+        value @ so3.exp(0.3 * rng.normal(size=3)) if block.kind == "rotation" else value + rng.normal(size=block.size)
+    )
     prior = Prior(block, np.ascontiguousarray(value), rng.uniform(0.1, 0.5, block.size))
 
-    def weighted(at):
+    def residual(at):
         x = at.values[block.key]
         error = so3.log(np.ascontiguousarray(value.T @ x)) if block.kind == "rotation" else x - value
-        return error / prior.sigma, error / prior.sigma, np.eye(block.size)
+        return error / prior.sigma
 
     def accumulate(at, piece, sums):
         return prior.accumulate(at, piece, sums) if piece.first == 0 else 0.0
 
-    return Sample("Prior", setup, state, accumulate, weighted)
+    return Sample("Prior", setup, state, accumulate, residual, white(residual))
 
 
 def bias_prior_sample(unlike, setup_of):
     setup = setup_of(unlike)
+
+    def residual(at):
+        return at.bias[0] / FIRST_BIAS_SIGMA
+
     return Sample(
         "accumulate_bias_prior",
         setup,
         setup.perturbed(np.random.default_rng(3)),
         lambda at, piece, sums: accumulate_bias_prior(at, piece, sums) if piece.first == 0 else 0.0,
-        lambda at: (at.bias[0] / FIRST_BIAS_SIGMA, at.bias[0] / FIRST_BIAS_SIGMA, np.eye(6)),
+        residual,
+        white(residual),
     )
 
 
@@ -149,7 +172,10 @@ SAMPLES = {
     "imu": ("ImuFactor", lambda u, s, f: imu_sample(u, s, False)),
     "imu, intrinsics": ("ImuFactor", lambda u, s, f: imu_sample(u, s, True)),
     "radtan, inertial": ("CornerFactor", lambda u, s, f: corner_sample(u, s, f, 0)),
-    "radtan, kinematic, intrinsics": ("CornerFactor", lambda u, s, f: corner_sample(u, s, f, 0, "kinematic", imu_free=True)),
+    "radtan, kinematic, intrinsics": (
+        "CornerFactor",
+        lambda u, s, f: corner_sample(u, s, f, 0, "kinematic", imu_free=True),
+    ),
     "equidistant, inertial, intrinsics": ("CornerFactor", lambda u, s, f: corner_sample(u, s, f, 1, imu_free=True)),
     "equidistant, kinematic": ("CornerFactor", lambda u, s, f: corner_sample(u, s, f, 1, "kinematic")),
     "equidistant, pose": ("CornerFactor", lambda u, s, f: corner_sample(u, s, f, 1, "pose")),
@@ -222,19 +248,21 @@ def sample(request, unlike, setup_of, factor_of):
 
 def test_sums_are_those_of_numeric_derivatives(sample, dense):
     _, H, g = sums_of(sample, dense)
-    r, y, W = sample.weighted(sample.state)
+    y, W = sample.weights(sample.state)
     scale, h = scales(sample), 1e-3
-    J = np.empty((len(r), len(g)))
+    J = np.empty((len(y), len(g)))
     for n in range(len(g)):
         d = np.zeros(len(g))
         d[n] = h * scale[n]
-        J[:, n] = (sample.weighted(moved(sample, d))[0] - sample.weighted(moved(sample, -d))[0]) / (2 * h)
+        J[:, n] = (sample.residual(moved(sample, d)) - sample.residual(moved(sample, -d))) / (2 * h)
     H, g = H * np.outer(scale, scale), g * scale
     numeric_H, numeric_g = J.T @ W @ J, J.T @ y
     size = np.sqrt(np.maximum(np.diag(numeric_H), 1e-9 * np.diag(numeric_H).max()))
     assert np.abs(numeric_g).max() > 0
     np.testing.assert_allclose(H / np.outer(size, size), numeric_H / np.outer(size, size), rtol=0, atol=2e-6)
-    np.testing.assert_allclose(g / size, numeric_g / size, rtol=0, atol=2e-6 * np.sqrt(y @ r))
+    np.testing.assert_allclose(
+        g / size, numeric_g / size, rtol=0, atol=2e-6 * np.sqrt(y @ sample.residual(sample.state))
+    )
 
 
 def test_gradient_is_the_slope_of_the_cost(sample, dense):

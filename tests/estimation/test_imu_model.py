@@ -32,8 +32,8 @@ def random_intrinsics(seed, size):
 def test_correction_undoes_the_model(size):
     intrinsics = random_intrinsics(1, size)
     rate, force = corrected(intrinsics, *model(intrinsics, RATE, FORCE))
-    np.testing.assert_allclose(rate, RATE, rtol=0, atol=1e-14 * 100)
-    np.testing.assert_allclose(force, FORCE, rtol=0, atol=1e-14 * 100)
+    np.testing.assert_allclose(rate, RATE, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(force, FORCE, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-9, 1e-2, 0.1])

@@ -123,9 +123,7 @@ def test_increments_are_a_fine_runge_kutta():
             for c in (0.5, 0.5, 1.0):
                 dR, dv, _ = k[-1]
                 k.append(((R + c * h * dR) @ W, (R + c * h * dR) @ f[j], v + c * h * dv))
-            R, v, p = (
-                x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4) for x, k1, k2, k3, k4 in zip((R, v, p), *k, strict=True)
-            )
+            R, v, p = (x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4) for x, k1, k2, k3, k4 in zip((R, v, p), *k, strict=True))
     assert_same(run(R0, t0, t1), (R, v, p), 1e-11)
 
 
@@ -213,8 +211,12 @@ def noise_columns(r, t0, t1, intrinsics):
         dt = min(t1, r.t[j + 1]) - max(t0, r.t[j])
         for k in range(6):
             d = h * np.eye(6)[k]
-            white = difference(moved(lambda i, j=j, d=d: BIAS - d * (i == j)), moved(lambda i, j=j, d=d: BIAS + d * (i == j)), R, h)
-            walk = difference(moved(lambda i, j=j, d=d: BIAS + d * (i > j)), moved(lambda i, j=j, d=d: BIAS - d * (i > j)), R, h)
+            white = difference(
+                moved(lambda i, j=j, d=d: BIAS - d * (i == j)), moved(lambda i, j=j, d=d: BIAS + d * (i == j)), R, h
+            )
+            walk = difference(
+                moved(lambda i, j=j, d=d: BIAS + d * (i > j)), moved(lambda i, j=j, d=d: BIAS - d * (i > j)), R, h
+            )
             columns.append(np.concatenate([white, np.zeros(6)]) * np.sqrt(r.variance[j, k // 3] / dt))
             columns.append(np.concatenate([walk, np.eye(6)[k]]) * np.sqrt(r.walk[k // 3] * dt))
     return np.array(columns).T
@@ -230,7 +232,7 @@ def test_covariance_is_that_of_all_noises_one_by_one(intrinsics):
 
 
 def test_covariance_against_sampled_readings():
-    """White noise of density s on readings at rate f has standard deviation s sqrt(f); biases walk from reading to reading."""
+    """Noise of density s on readings at rate f has standard deviation s sqrt(f); biases walk from reading to reading."""
     rate, n, samples = 200.0, 100, 4000
     rng = np.random.default_rng(3)
     r = Readings(n + 1)
@@ -242,7 +244,9 @@ def test_covariance_against_sampled_readings():
     R, v, p, _, P, _ = run(r, 0.0, r.t[-1], covariance=True)
 
     density, walk = np.sqrt(np.repeat(r.variance[0], 3)), np.sqrt(np.repeat(r.walk, 3))
-    readings = np.concatenate([r.gyro, r.accel], axis=1) + density * np.sqrt(rate) * rng.normal(size=(samples, n + 1, 6))
+    readings = np.concatenate([r.gyro, r.accel], axis=1) + density * np.sqrt(rate) * rng.normal(
+        size=(samples, n + 1, 6)
+    )
     steps = walk / np.sqrt(rate) * rng.normal(size=(samples, n + 1, 6))
     steps[:, 0] = 0.0
     wander = np.cumsum(steps, axis=1)

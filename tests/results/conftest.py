@@ -60,7 +60,9 @@ def calibration() -> Calibration:
         iterations=tuple(_iterations()),
         converged=True,
         status="converged after 8 iterations: the predicted decrease of chi^2 fell below 1e-3.",
-        warnings=("the accelerometer of imu0 leaves residuals 1.6 times as large as its noise says; a larger one fits.",),
+        warnings=(
+            "the accelerometer of imu0 leaves residuals 1.6 times as large as its noise says; a larger one fits.",
+        ),
         notes=("IMU noise (default for a consumer IMU): gyro 1.6e-4 rad/s/sqrt(Hz).", "3 corners <repaired> & kept."),
         rig=rig_to_dict(rig),
         rates={"imu0": 200.0, "cam0": 20.0, "cam1": 20.0},
@@ -174,4 +176,6 @@ def _iterations():
         for k in range(n):
             accepted = not (stage == "first" and k == 2)
             yield Iteration(stage, cost, 0.9 * cost * 0.1**k, damping, accepted)
-            cost, damping = (2e4 + 0.08 * (cost - 2e4), 0.0 if k > 2 else 0.1 * damping) if accepted else (cost, damping)
+            cost, damping = (
+                (2e4 + 0.08 * (cost - 2e4), 0.0 if k > 2 else 0.1 * damping) if accepted else (cost, damping)
+            )

@@ -83,7 +83,9 @@ def test_yaml_says_direction_sign_and_units_at_its_top(saved: Path):
 def test_parameters_that_share_a_label_keep_apart(calibration: Calibration, tmp_path: Path):
     k = next(i for i, g in enumerate(calibration.groups) if g.name == "bloom")
     twin = dataclasses.replace(calibration.groups[k], labels=("fx",))
-    dataclasses.replace(calibration, groups=(*calibration.groups[:k], twin, *calibration.groups[k + 1 :])).save(tmp_path)
+    dataclasses.replace(calibration, groups=(*calibration.groups[:k], twin, *calibration.groups[k + 1 :])).save(
+        tmp_path
+    )
     found = yaml.safe_load((tmp_path / "calibration.yaml").read_text())["sensors"]["cam0"]["parameters"]
     assert found["intrinsics_fx"] == 458.654
     assert found["bloom_fx"] == 0.27
@@ -156,7 +158,9 @@ def test_changed_json(saved: Path, changes: dict[str, Any]):
     sentence_of(saved)
 
 
-@pytest.mark.parametrize(("field", "value"), [("std", [1.0]), ("columns", [0, 1, 999]), ("value", "text"), ("labels", 1)])
+@pytest.mark.parametrize(
+    ("field", "value"), [("std", [1.0]), ("columns", [0, 1, 999]), ("value", "text"), ("labels", 1)]
+)
 def test_changed_group(saved: Path, field: str, value: Any):
     groups = json.loads((saved / "result.json").read_text())["groups"]
     groups[0][field] = value

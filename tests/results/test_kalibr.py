@@ -47,10 +47,19 @@ def test_numbers(calibration: Calibration, chain: dict):
 
 def test_models_are_kalibrs_names(calibration: Calibration, chain: dict):
     assert (chain["cam0"]["camera_model"], chain["cam0"]["distortion_model"]) == ("pinhole", "radtan")
-    sensors = {n: s | ({"model": "pinhole-equidistant"} if n == "cam1" else {}) for n, s in calibration.rig["sensors"].items()}
+    sensors = {
+        n: s | ({"model": "pinhole-equidistant"} if n == "cam1" else {}) for n, s in calibration.rig["sensors"].items()
+    }
     fisheye = dataclasses.replace(calibration, rig=calibration.rig | {"sensors": sensors})
     found = yaml.safe_load(camchain_imucam(fisheye))["cam1"]
     assert (found["camera_model"], found["distortion_model"]) == ("pinhole", "equidistant")
+
+
+def test_a_model_that_kalibr_lacks_is_said(calibration: Calibration):
+    sensors = {n: s | {"model": "pinhole-radtan5"} if n == "cam1" else s for n, s in calibration.rig["sensors"].items()}
+    text = camchain_imucam(dataclasses.replace(calibration, rig=calibration.rig | {"sensors": sensors}))
+    assert "# cam1: Kalibr has no radtan5;" in text and "# cam0" not in text
+    assert yaml.safe_load(text)["cam1"]["distortion_model"] == "radtan5"
 
 
 def test_layout_is_that_of_kalibr(euroc: Path, chain: dict, calibration: Calibration):
@@ -76,14 +85,19 @@ def test_overlaps_are_common_points_at_the_same_instant(calibration: Calibration
 
 
 def test_comments_say_direction_and_names(calibration: Calibration):
-    assert camchain_imucam(calibration).startswith("# Kalibr's camchain by icalib. T_cam_imu takes coordinates in the imu")
+    assert camchain_imucam(calibration).startswith(
+        "# Kalibr's camchain by icalib. T_cam_imu takes coordinates in the imu"
+    )
     assert imu_yaml(calibration).startswith("# Kalibr's imu file by icalib. T_i_b takes coordinates in the body frame")
     sensors = {{"cam1": "right"}.get(n, n): s for n, s in calibration.rig["sensors"].items()}
     renamed = dataclasses.replace(
         calibration,
         rig=calibration.rig | {"sensors": sensors},
         groups=tuple(dataclasses.replace(g, sensor=g.sensor.replace("cam1", "right")) for g in calibration.groups),
-        corner_residuals=(calibration.corner_residuals[0], dataclasses.replace(calibration.corner_residuals[1], sensor="right")),
+        corner_residuals=(
+            calibration.corner_residuals[0],
+            dataclasses.replace(calibration.corner_residuals[1], sensor="right"),
+        ),
     )
     text = camchain_imucam(renamed)
     assert "# cam1 is right." in text

@@ -48,7 +48,7 @@ class SensorFit:
 
 @dataclass(frozen=True)
 class CornerResiduals:
-    """Residuals (predicted - measured) of one camera's corners, in the recording's order; rejected ones stay, marked."""
+    """Residuals (predicted - measured) of one camera's corners, in the recording's order; rejected ones stay."""
 
     sensor: str
     seconds: np.ndarray  # (M,) image times, imu clock, s since the first IMU stamp
@@ -62,7 +62,10 @@ class CornerResiduals:
 
 @dataclass(frozen=True)
 class ImuResiduals:
-    """Whitened residuals of the IMU factor, one row an interval between nodes: rotation, velocity, position, gyro walk, accel walk."""
+    """Whitened residuals of the IMU factor, one row an interval between nodes.
+
+    Columns: rotation, velocity, position, gyroscope walk, accelerometer walk, three each.
+    """
 
     seconds: np.ndarray  # (K - 1,) start of each interval
     whitened: np.ndarray  # (K - 1, 15)

@@ -53,13 +53,13 @@ def minimise(
     """
     pieces, residuals = problem.pieces(), problem.residuals()
     cost = problem.linearise(state, pieces, residuals)
-    damping, curved, steps = 0.0, False, []
+    damping, curved, curved_below, steps = 0.0, False, CURVED_BELOW, []
     for _ in range(MAX_ITERATIONS):
         if not np.isfinite(cost):
             raise EstimationError("the first guess predicts no finite measurement; give a better guess in the rig file.")
         solution, damping = _solve(problem, state, pieces, residuals, damping, curved)
         candidate = state.retract(problem.layout, solution.chain, solution.border)
-        settled = solution.decrease < CURVED_BELOW * cost
+        settled = solution.decrease < curved_below * cost
         candidate_cost = problem.linearise(candidate, pieces, residuals, curved=settled)
         converged = damping == 0.0 and solution.decrease < max(tolerance, ROUNDING * cost)
         # At the bottom rounding decides whether the cost falls; a step this small is taken anyway.
@@ -76,6 +76,7 @@ def minimise(
             continue
         # Too far out for the true curvature of the loss: weights alone, and only then more damping.
         damping = damping if curved else max(damping * 10.0, 1e-6)
+        curved_below = curved_below * (0.1 if curved else 1.0)
         curved = False
         if damping > 1e6:
             break

@@ -25,8 +25,8 @@ def camchain_imucam(calibration: Calibration) -> str:
     overlaps = _overlaps([seen[name] for name in c.cameras])
     data = {f"cam{i}": _camera(c, i, overlaps) for i in range(len(c.cameras))}
     comment = (
-        "# Kalibr's camchain by icalib. T_cam_imu takes coordinates in the imu frame to the camera frame, T_cn_cnm1 those of "
-        "the camera before to this one; t_imu = t_cam + timeshift_cam_imu [s]."
+        "# Kalibr's camchain by icalib. T_cam_imu takes coordinates in the imu frame to the camera frame, T_cn_cnm1 "
+        "those of the camera before to this one; t_imu = t_cam + timeshift_cam_imu [s]."
     )
     return _text([comment, *_renamed("cam", c.cameras), *_foreign_models(data)], data)
 
@@ -49,7 +49,8 @@ def imu_yaml(calibration: Calibration) -> str:
         "update_rate": float(c.rates[c.imu]),
     }
     comment = (
-        "# Kalibr's imu file by icalib. T_i_b takes coordinates in the body frame to the imu frame; the imu is the body here."
+        "# Kalibr's imu file by icalib. T_i_b takes coordinates in the body frame to the imu frame; the imu is the "
+        "body here."
     )
     return _text([comment, *_renamed("imu", (c.imu,))], {"imu0": data | _intrinsics(c)})
 
@@ -139,7 +140,11 @@ def _renamed(kind: str, names: tuple[str, ...]) -> list[str]:
 def _foreign_models(data: dict[str, Any]) -> list[str]:
     """Comments on distortion models that Kalibr does not have; a reader refuses their name rather than misread them."""
     models = ((cam, entry["distortion_model"]) for cam, entry in data.items())
-    return [f"# {cam}: Kalibr has no {model}; calibrate with radtan where a program must read this." for cam, model in models if model not in KALIBR_DISTORTIONS]
+    return [
+        f"# {cam}: Kalibr has no {model}; calibrate with radtan where a program must read this."
+        for cam, model in models
+        if model not in KALIBR_DISTORTIONS
+    ]
 
 
 def _text(comments: list[str], data: dict[str, Any]) -> str:

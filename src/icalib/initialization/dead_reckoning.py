@@ -24,6 +24,7 @@ class DeadReckoning:
     force: np.ndarray  # (N, 3, 4)
     first: np.ndarray  # (N, 3, 4)
     second: np.ndarray  # (N, 3, 4)
+    gaps: tuple[tuple[float, float], ...]
 
     @classmethod
     def integrate(cls, imu: ImuData, gyro_bias: np.ndarray) -> DeadReckoning:
@@ -32,7 +33,14 @@ class DeadReckoning:
         rotation, force = np.empty((n, 3, 3)), np.empty((n, 3, 4))
         first, second = np.zeros((n, 3, 4)), np.zeros((n, 3, 4))
         _integrate(imu.seconds, gyro, imu.accel, rotation, force, first, second)
-        return cls(imu.seconds, gyro, rotation, force, first, second)
+        return cls(imu.seconds, gyro, rotation, force, first, second, imu.gaps)
+
+    def unbroken(self, t0: np.ndarray, t1: np.ndarray) -> np.ndarray:
+        """(n,) whether each (t0, t1) is free of gaps."""
+        free = np.ones(len(t0), dtype=np.bool_)
+        for start, end in self.gaps:
+            free &= (t1 <= start) | (t0 >= end)
+        return free
 
     def at(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Q (n, 3, 3), first and second integral (n, 3, 4) at t (n,) on the imu clock; outside, the ends go on."""

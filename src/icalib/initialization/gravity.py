@@ -56,15 +56,15 @@ def camera_triples(
     R_imu_cam: np.ndarray,
     lever: np.ndarray | None,
     reckoning: DeadReckoning,
-    covered: np.ndarray,
 ) -> Triples:
-    """Rows of all usable triples. seconds (M,) of the images on the imu clock; covered (M,): the IMU was running."""
-    usable = np.flatnonzero(poses.ok & covered)
+    """Rows of all triples of good images that the IMU covers without a gap. seconds (M,): images on the imu clock."""
+    usable = np.flatnonzero(poses.ok & (seconds >= 0.0) & (seconds <= reckoning.seconds[-1]))
     t = seconds[usable]
     after = np.searchsorted(t, t + _SPACING_S - 1e-3)
     before = np.searchsorted(t, t - _SPACING_S + 1e-3, side="right") - 1
     has = np.flatnonzero((after < len(t)) & (before >= 0))
     has = has[(t[after[has]] - t[has] < _LONGEST_S) & (t[has] - t[before[has]] < _LONGEST_S)]
+    has = has[reckoning.unbroken(t[before[has]], t[after[has]])]
     i, j, k = before[has], has, after[has]
     Q, _, second = reckoning.at(t)
     R_board_imu = poses.R_board_cam[usable] @ R_imu_cam.T

@@ -27,8 +27,7 @@ def residual_plane(r: CornerResiduals) -> Figure:
         "x": numbers(middle),
         "y": numbers(middle),
         "z": [[value or None for value in row] for row in count.tolist()],
-        "colorscale": "Blues",
-        "reversescale": False,
+        "colorscale": [[0, "#dbeafe"], [0.5, "#4a86c5"], [1, "#0b2545"]],
         "colorbar": {"title": {"text": "corners"}, "thickness": 10},
         "hovertemplate": "u %{x} px, v %{y} px: %{z}<extra></extra>",
     }
@@ -71,7 +70,7 @@ def residuals_over_time(r: CornerResiduals) -> Figure:
     )
 
 
-def residuals_over_image(r: CornerResiduals, resolution: tuple[int, int], scale: float | None = None) -> Figure:
+def residuals_over_image(r: CornerResiduals, resolution: tuple[int, int]) -> Figure:
     """RMS in cells of the image, with the mean residual of each cell as an enlarged arrow."""
     width, height = resolution
     nx, ny = max(1, round(width / CELL_PX)), max(1, round(height / CELL_PX))
@@ -116,7 +115,7 @@ def _arrows(at: np.ndarray, mean: np.ndarray) -> list[dict[str, Any]]:
     tip = at + gain * mean
     pieces = np.stack([at, tip, np.full_like(at, np.nan)], axis=1).reshape(-1, 2)
     foot = at[np.isfinite(length)]
-    name = f"mean residual, enlarged {gain:.0f} times (longest {longest:.3f} px)"
+    name = f"mean, x{gain:.0f} (longest {longest:.3f} px)"
     return [
         line(pieces[:, 0], pieces[:, 1], name, "#111827", hoverinfo="skip"),
         dots(foot[:, 0], foot[:, 1], "", "#111827", 3, showlegend=False, hoverinfo="skip"),
@@ -136,7 +135,9 @@ def normalised_histogram(streams: tuple[CornerResiduals, ...]) -> Figure:
         step = {"color": COLORS[i % len(COLORS)], "width": 1.6, "shape": "hvh"}
         traces.append(line(x, density, f"{r.sensor} (u and v)", COLORS[i % len(COLORS)], line=step))
     normal = np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
-    traces.append(line(x, normal, "standard normal", "#6b7280", line={"color": "#6b7280", "dash": "dash", "width": 1.4}))
+    traces.append(
+        line(x, normal, "standard normal", "#6b7280", line={"color": "#6b7280", "dash": "dash", "width": 1.4})
+    )
     return figure(
         traces,
         380,

@@ -6,7 +6,20 @@ import numpy as np
 
 from icalib.calibration import Calibration
 from icalib.geometry import so3
-from icalib.report.plot import AXIS_COLORS, COLORS, Figure, axis, figure, line, numbers, path_3d, stacked_axes, thin, y_of
+from icalib.report.plot import (
+    AXIS_COLORS,
+    COLORS,
+    VIEW,
+    Figure,
+    axis,
+    figure,
+    line,
+    numbers,
+    path_3d,
+    stacked_axes,
+    thin,
+    y_of,
+)
 
 MOST_NODES = 2000
 BLOCKS = ("rotation", "velocity", "position", "gyro walk", "accel walk")
@@ -46,11 +59,13 @@ def trajectory(c: Calibration) -> Figure:
     ends = path.position[[0, -1]]
     traces = [
         path_3d(path.position[keep], c.imu, "", line=color, showlegend=False),
-        path_3d(ends, "ends", "#111827", mode="markers+text", text=["start", "end"], marker={"size": 3}, showlegend=False),
+        path_3d(
+            ends, "ends", "#111827", mode="markers+text", text=["start", "end"], marker={"size": 3}, showlegend=False
+        ),
         *_board(c),
     ]
     scene = {name: {"title": {"text": f"world {name[0]} [m]"}, "nticks": 6} for name in ("xaxis", "yaxis", "zaxis")}
-    return figure(traces, 520, scene=scene | {"aspectmode": "data"}, margin={"l": 0, "r": 0, "t": 30, "b": 0})
+    return figure(traces, 520, scene=scene | VIEW, margin={"l": 0, "r": 0, "t": 30, "b": 0})
 
 
 def _board(c: Calibration) -> list[dict]:
@@ -79,7 +94,9 @@ def convergence(c: Calibration) -> Figure:
         traces.append(line(step[of], cost, f"cost, {stage}", color, mode="lines+markers", marker=marker))
     predicted = np.array([s.predicted_decrease for s in c.iterations])
     dashed = {"color": "#6b7280", "dash": "dot"}
-    traces.append(line(step, np.where(predicted > 0.0, predicted, np.nan), "predicted decrease", "#6b7280", line=dashed))
+    traces.append(
+        line(step, np.where(predicted > 0.0, predicted, np.nan), "predicted decrease", "#6b7280", line=dashed)
+    )
     log = axis("half the robust chi^2", type="log", exponentformat="power")
     return figure(traces, 380, xaxis=axis("step (x: rejected)", dtick=max(1, len(step) // 12)), yaxis=log)
 
@@ -91,7 +108,15 @@ def _panels(t: np.ndarray, values: list[np.ndarray], titles: tuple[str, ...], he
 def _mixed_panels(panels: list[tuple[np.ndarray, np.ndarray]], titles: tuple[str, ...], height: int) -> Figure:
     """Three lines (x, y, z) in each of several panels one above the other."""
     traces = [
-        line(t, v[:, i], "xyz"[i], AXIS_COLORS[i], yaxis=y_of(p), showlegend=p == 0, line={"color": AXIS_COLORS[i], "width": 1})
+        line(
+            t,
+            v[:, i],
+            "xyz"[i],
+            AXIS_COLORS[i],
+            yaxis=y_of(p),
+            showlegend=p == 0,
+            line={"color": AXIS_COLORS[i], "width": 1},
+        )
         for p, (t, v) in enumerate(panels)
         for i in range(3)
     ]

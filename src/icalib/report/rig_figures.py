@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from icalib.calibration import Calibration
-from icalib.report.plot import AXIS_COLORS, COLORS, Figure, axis, figure, numbers, path_3d
+from icalib.report.plot import AXIS_COLORS, COLORS, VIEW, Figure, axis, figure, numbers, path_3d
 
 _PEN_UP = np.full((1, 3), np.nan)
 
@@ -16,19 +16,30 @@ def rig_picture(c: Calibration) -> Figure:
     spread = max(np.ptp(np.vstack([positions, np.zeros(3)]), axis=0).max(), 0.02)
     frames = {c.imu: np.eye(4)} | {name: c.T_imu_sensor(name) for name in c.cameras}
     traces = [
-        path_3d(_axis_line(frames, i, 0.25 * spread), "xyz"[i], AXIS_COLORS[i], line={"color": AXIS_COLORS[i], "width": 6})
+        path_3d(
+            _axis_line(frames, i, 0.25 * spread), "xyz"[i], AXIS_COLORS[i], line={"color": AXIS_COLORS[i], "width": 6}
+        )
         for i in range(3)
     ]
     traces += [
-        path_3d(_frustum(c, name, 0.45 * spread), name, COLORS[i % len(COLORS)], line={"color": COLORS[i % len(COLORS)], "width": 2})
+        path_3d(
+            _frustum(c, name, 0.45 * spread),
+            name,
+            COLORS[i % len(COLORS)],
+            line={"color": COLORS[i % len(COLORS)], "width": 2},
+        )
         for i, name in enumerate(c.cameras)
     ]
     origins = np.array([T[:3, 3] for T in frames.values()])
     traces.append(
-        path_3d(origins, "sensors", "#111827", mode="markers+text", text=list(frames), marker={"size": 4}, showlegend=False)
+        path_3d(
+            origins, "sensors", "#111827", mode="markers+text", text=list(frames), marker={"size": 4}, showlegend=False
+        )
     )
-    scene = {name: {"title": {"text": f"{name[0]} of {c.imu} [m]"}, "nticks": 5} for name in ("xaxis", "yaxis", "zaxis")}
-    return figure(traces, 520, scene=scene | {"aspectmode": "data"}, margin={"l": 0, "r": 0, "t": 30, "b": 0})
+    scene = {
+        name: {"title": {"text": f"{name[0]} of {c.imu} [m]"}, "nticks": 5} for name in ("xaxis", "yaxis", "zaxis")
+    }
+    return figure(traces, 520, scene=scene | VIEW, margin={"l": 0, "r": 0, "t": 30, "b": 0})
 
 
 def _axis_line(frames: dict[str, np.ndarray], i: int, length: float) -> np.ndarray:

@@ -91,7 +91,7 @@ def _group_words(g: ParameterGroup) -> list[object]:
     size = f" to {shown(scale * max(known))} {unit}".rstrip() if known else ""
     odd = [f"{n} {v}" for n, v in zip(g.labels, g.verdict, strict=True) if v in ("weak", "undetermined")]
     if not odd:
-        return [name, f" determined{size} (1 sigma)"]
+        return [name, f" determined{size}"]
     if len(set(g.verdict)) == 1:
         return [name, f" {g.verdict[0]}{size}"]
     return [name, f": {', '.join(odd)}; the rest determined{f', all known{size}' if size else ''}"]

@@ -1,0 +1,223 @@
+"""The report: well formed, whole, escaped, without network, small; and drawn by a browser where there is one."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from icalib.calibration import Calibration
+from icalib.outputs import check_folder, write_outputs
+from icalib.report import corner_figures, report_html
+from icalib.report.console import table
+from icalib.report.plot import numbers, thin
+from icalib.report.quantities import rows, rpy_deg, shown
+from icalib.report.tables import trust
+
+VOID = {"meta", "link", "br", "img", "hr"}
+FIGURES = {"rig", "histogram", "imu-residuals", "trajectory", "motion", "convergence", "correlation"} | {
+    f"{kind}-{i}" for kind in ("plane", "image", "time") for i in (0, 1)
+}
+NASTY = '</script><script>alert("1 & 2")</script>'
+
+
+class Page(HTMLParser):
+    """Collects ids, attributes and text; fails where tags do not close in order."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(convert_charrefs=True)
+        self.open: list[str] = []
+        self.ids: list[str] = []
+        self.links: list[str] = []
+        self.scripts: list[str] = []
+        self.words = ""
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.ids += [v for k, v in attrs if k == "id" and v]
+        self.links += [v for k, v in attrs if k in ("src", "href") and v]
+        if tag not in VOID:
+            self.open.append(tag)
+        if tag == "script":
+            self.scripts.append("")
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] == "script":
+            self.scripts[-1] += data
+        elif self.open and self.open[-1] != "style":
+            self.words += data
+
+
+@pytest.fixture(scope="module")
+def text(calibration: Calibration) -> str:
+    return report_html(calibration)
+
+
+def test_every_figure_has_its_place_and_data(text: str):
+    page = Page(text)
+    figures = json.loads(page.scripts[0])
+    assert set(figures) == FIGURES
+    assert set(page.ids) >= FIGURES
+    assert len(page.ids) == len(set(page.ids))
+    assert all(f["data"] and f["layout"] for f in figures.values())
+
+
+def test_small_and_offline(text: str):
+    assert len(text.encode()) < 10e6
+    assert Page(text).links == ["data:,"]
+    assert "plotly.js v" in text
+
+
+def test_trust_comes_first(text: str):
+    page = Page(text)
+    assert page.ids[0] == "trust"
+    top = page.words.split("The rig")[0]
+    for words in ("y undetermined, z weak", "turn the rig about a second axis", "Warnings", "roll", "deg"):
+        assert words in top
+
+
+def test_a_long_recording_stays_small(calibration: Calibration):
+    r = calibration.corner_residuals[0]
+    n = 40
+    start = np.concatenate([[0], np.cumsum(np.tile(np.diff(r.start), n))])
+    long = {
+        name: np.concatenate([getattr(r, name)] * n)
+        for name in ("seconds", "point", "uv", "residual", "sigma", "rejected")
+    }
+    figure = corner_figures.residuals_over_time(dataclasses.replace(r, start=start, **long))
+    assert all(len(trace["x"]) <= corner_figures.MOST_DOTS for trace in figure["data"])
+    assert len(json.dumps(figure)) < 300_000
+
+
+def test_all_text_is_escaped(calibration: Calibration):
+    nasty = dataclasses.replace(
+        calibration,
+        status=NASTY,
+        undetermined=(NASTY,),
+        warnings=(NASTY,),
+        notes=(NASTY,),
+        inputs={NASTY: NASTY},
+        settings={NASTY: NASTY},
+        covariance_names=(NASTY, *calibration.covariance_names[1:]),
+    )
+    page = Page(report_html(nasty))
+    assert len(page.scripts) == 3
+    assert page.words.count(NASTY) == 8
+    assert NASTY in json.loads(page.scripts[0])["correlation"]["data"][0]["x"]
+
+
+def test_figures_show_the_numbers(calibration: Calibration, text: str):
+    figures = json.loads(Page(text).scripts[0])
+    used = ~calibration.corner_residuals[0].rejected
+    heat = figures["plane-0"]["data"][0]["z"]
+    assert 0.99 * used.sum() < sum(v or 0 for row in heat for v in row) <= used.sum()
+    rejected = figures["image-0"]["data"][-1]
+    assert (rejected["name"], len(rejected["x"])) == ("rejected", (~used).sum())
+    diagonal = np.diag(figures["correlation"]["data"][0]["z"])
+    np.testing.assert_allclose(diagonal, 1.0)
+    rate = figures["motion"]["data"][0]["y"]
+    assert np.rad2deg(0.5 * 2.1) * 0.9 < max(rate) < np.rad2deg(0.5 * 2.1 + 0.6 * 1.3)
+
+
+def test_nothing_seen_and_nothing_iterated(calibration: Calibration):
+    r = calibration.corner_residuals[0]
+    none = dataclasses.replace(
+        calibration,
+        corner_residuals=(dataclasses.replace(r, rejected=np.ones_like(r.rejected)), calibration.corner_residuals[1]),
+        iterations=(),
+        undetermined=(),
+        warnings=(),
+        groups=tuple(dataclasses.replace(g, verdict=("determined",) * len(g.verdict)) for g in calibration.groups),
+    )
+    assert "the motion determines every direction" in Page(report_html(none)).words
+
+
+def test_trust_is_the_worst_that_is_known(calibration: Calibration):
+    sound = dataclasses.replace(
+        calibration,
+        undetermined=(),
+        warnings=(),
+        groups=tuple(dataclasses.replace(g, verdict=("determined",) * len(g.verdict)) for g in calibration.groups),
+    )
+    assert trust(sound) == "good"
+    assert trust(dataclasses.replace(sound, warnings=("mind.",))) == "care"
+    assert trust(calibration) == "bad"
+    assert trust(dataclasses.replace(sound, converged=False)) == "failed"
+
+
+def test_rows_are_in_units_that_people_read(calibration: Calibration):
+    found = {(r.sensor, r.name): r for r in rows(calibration)}
+    yaw = found["cam0", "rotation z (yaw)"]
+    assert (yaw.value, yaw.std, yaw.unit, yaw.factor) == ("89.150", "0.022", "deg", "2.7")
+    y = found["cam1", "translation y"]
+    assert (y.value, y.std, y.formal, y.unit, y.verdict) == ("45.4", "1.2", "0.44", "mm", "undetermined")
+    offset = found["cam0", "time offset"]
+    assert (offset.value, offset.std, offset.unit) == ("-0.135", "0.030", "ms")
+    assert found["cam0", "k1"].std == ""
+    assert not any(sensor == "imu0" for sensor, _ in found)
+
+
+def test_rpy_is_that_of_the_rig_file(calibration: Calibration):
+    np.testing.assert_allclose(rpy_deg(calibration.group("cam0", "rotation").value), [0.35, 1.47, 89.15], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [(0.0123456, "0.012"), (123.4, "123"), (0.0, "0"), (2e-7, "2.0e-07"), (np.inf, "infinite"), (np.nan, "unknown")],
+)
+def test_shown(value: float, words: str):
+    assert shown(value) == words
+
+
+def test_numbers_and_thinning():
+    assert numbers(np.array([[1.23456789, np.nan], [np.inf, -2.0]])) == [[1.2346, None], [None, -2.0]]
+    kept = thin(1000, 10)
+    assert (len(kept), kept[0], kept[-1]) == (10, 0, 999)
+    np.testing.assert_array_equal(thin(3, 10), [0, 1, 2])
+
+
+def test_console_table(calibration: Calibration):
+    console = Console(width=120, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    with console.file:
+        console.print(table(calibration))
+        text = console.export_text()
+    line = next(line for line in text.splitlines() if "translation y" in line and "45.4" in line)
+    assert "undetermined" in line and "mm" in line
+    assert len([line for line in text.splitlines() if line.startswith("│")]) == len(rows(calibration))
+
+
+def test_outputs_are_one_set(calibration: Calibration, tmp_path: Path):
+    check_folder(tmp_path / "out")
+    write_outputs(calibration, tmp_path / "out")
+    names = {"calibration.yaml", "camchain-imucam.yaml", "imu.yaml", "report.html", "result.json", "result.npz"}
+    assert {p.name for p in (tmp_path / "out").iterdir()} == names
+
+
+def test_a_browser_draws_it(calibration: Calibration, text: str, tmp_path: Path):
+    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if chromium is None:
+        pytest.skip("no chromium is installed; install one to have the report drawn")
+    (tmp_path / "report.html").write_text(text, encoding="utf-8")
+    flags = (
+        "--headless --no-sandbox --disable-quic --no-first-run --disable-background-networking "
+        "--disable-component-update --disable-sync --use-angle=swiftshader --enable-unsafe-swiftshader --enable-logging=stderr --v=0 --dump-dom "
+        "--virtual-time-budget=8000"
+    )
+    command = [chromium, *flags.split(), f"--user-data-dir={tmp_path / 'profile'}", (tmp_path / "report.html").as_uri()]
+    found = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    assert not re.findall(r"CONSOLE.*(?:Error|error).*", found.stderr)
+    for name in FIGURES:
+        assert re.search(rf'<div class="plot [^"]*js-plotly-plot[^"]*" id="{name}"', found.stdout), name
