@@ -28,6 +28,7 @@ LEVELS = {
     "simulation": 2,
     "estimation": 3,
     "initialization": 4,
+    "first_guess": 4,
     "observability": 6,
     "calibration": 5,
     "assessment": 7,

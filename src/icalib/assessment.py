@@ -63,8 +63,15 @@ def assess(inputs: Inputs, found: Estimate) -> Calibration:
         notes=tuple(_notes(inputs, found)),
         rig=rig_to_dict(inputs.rig),
         settings=dataclasses.asdict(inputs.rig.settings),
+        rates=_rates(inputs),
         versions=versions(),
     )
+
+
+def _rates(inputs: Inputs) -> dict[str, float]:
+    """Hz of each sensor, from the median step of its stamps."""
+    streams = (inputs.measurements.imu, *inputs.measurements.cameras)
+    return {s.name: float(1.0 / np.median(np.diff(s.seconds))) for s in streams if len(s.stamps_ns) > 1}
 
 
 def _labels(inputs: Inputs, block: Block) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from icalib.estimation.estimate import estimate
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.state import State
 from icalib.estimation.tolerances import Tolerances
-from icalib.initialization import Guess, initial_guess, initial_trajectory
+from icalib.first_guess import Guess, initial_guess, initial_trajectory
 from icalib.measurements import Measurements
 from icalib.provenance import provenance
 from icalib.recordings import Recording, open_recording, read_measurements

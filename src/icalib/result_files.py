@@ -1,8 +1,8 @@
 """Writes a set of files into a folder so that, whatever happens, the folder holds one whole set, old or new.
 
 The new set is written into a hidden folder inside the target, flushed, and that folder renamed to `.icalib-commit`:
-from here on the new set counts. Then file by file moves into place. After a crash in between, readers look into the commit
-folder first, and the next writer finishes the move. Files of others in the folder are left alone.
+from here on the new set counts. Then file by file moves into place. After a crash in between, readers look into the
+commit folder first, and the next writer finishes the move. Files of others in the folder are left alone.
 """
 
 from __future__ import annotations

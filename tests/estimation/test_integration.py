@@ -232,7 +232,7 @@ def test_covariance_is_that_of_all_noises_one_by_one(intrinsics):
 
 
 def test_covariance_against_sampled_readings():
-    """Noise of density s on readings at rate f has standard deviation s sqrt(f); biases walk from reading to reading."""
+    """Readings at rate f have noise of density times sqrt(f); biases walk from reading to reading."""
     rate, n, samples = 200.0, 100, 4000
     rng = np.random.default_rng(3)
     r = Readings(n + 1)

@@ -56,15 +56,16 @@ def test_noiseless_recovery(setup_of, problem_of, asynchronous):
     setup = setup_of(simulate(scenario, seed=1))
     outcome = recover(setup, problem_of, setup.perturbed(np.random.default_rng(2), 5.0))
     assert too_large(setup, outcome.state, EXACT) == {}
-    in_board = [s.position @ s.values["board0", "tilt"] for s in (outcome.state, setup.state)]
-    assert np.abs(in_board[0] - in_board[1]).max() < EXACT
+    for name in ("position", "velocity"):
+        in_board = [getattr(s, name) @ s.values["board0", "tilt"] for s in (outcome.state, setup.state)]
+        assert np.abs(in_board[0] - in_board[1]).max() < EXACT, name
     assert np.abs(outcome.state.bias).max() < EXACT
     assert outcome.cost < 1e-9
 
 
 @pytest.mark.parametrize("asynchronous", [False, True])
 def test_noiseless_recovery_with_biases(setup_of, problem_of, asynchronous):
-    """The prior on the first biases takes a share that shrinks with the recording's length; 20 s put it below all bounds."""
+    """The prior on the first biases takes a share that shrinks with the recording's length: 20 s are enough."""
     setup = setup_of(simulate(handheld(20.0, asynchronous=asynchronous, noiseless=True), seed=1))
     outcome = recover(setup, problem_of, setup.perturbed(np.random.default_rng(2), 5.0))
     found = errors(setup, outcome.state)

@@ -213,8 +213,8 @@ def test_a_browser_draws_it(calibration: Calibration, text: str, tmp_path: Path)
     (tmp_path / "report.html").write_text(text, encoding="utf-8")
     flags = (
         "--headless --no-sandbox --disable-quic --no-first-run --disable-background-networking "
-        "--disable-component-update --disable-sync --use-angle=swiftshader --enable-unsafe-swiftshader --enable-logging=stderr --v=0 --dump-dom "
-        "--virtual-time-budget=8000"
+        "--disable-component-update --disable-sync --use-angle=swiftshader --enable-unsafe-swiftshader "
+        "--enable-logging=stderr --v=0 --dump-dom --virtual-time-budget=8000"
     )
     command = [chromium, *flags.split(), f"--user-data-dir={tmp_path / 'profile'}", (tmp_path / "report.html").as_uri()]
     found = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)

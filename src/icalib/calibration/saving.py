@@ -146,17 +146,12 @@ def _build(plain: dict[str, Any], arrays: dict[str, np.ndarray]) -> Calibration:
 
 
 def _group(plain: dict[str, Any]) -> ParameterGroup:
-    floats = {n: np.array(plain[n], dtype=np.float64) for n in ("value", "std_formal", "std")}
-    return ParameterGroup(
-        **plain
-        | floats
-        | {
-            "labels": tuple(plain["labels"]),
-            "verdict": tuple(plain["verdict"]),
-            "columns": None if plain["columns"] is None else tuple(plain["columns"]),
-            "factor": None if plain["factor"] is None else np.array(plain["factor"], dtype=np.float64),
-        }
-    )
+    fields = dict(plain)
+    for name in ("value", "std_formal", "std", "factor"):
+        fields[name] = None if plain[name] is None else np.array(plain[name], dtype=np.float64)
+    for name in ("labels", "verdict", "columns"):
+        fields[name] = None if plain[name] is None else tuple(plain[name])
+    return ParameterGroup(**fields)
 
 
 def _check(c: Calibration) -> None:

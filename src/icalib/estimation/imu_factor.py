@@ -22,7 +22,7 @@ def _preintegrate(k0, k1, nodes, first, t, gyro, accel, bias, intrinsics, varian
     P = np.empty((ROWS, ROWS))
     for k in range(k0, k1):
         integrate(
-            nodes[k], nodes[k + 1], first[k], t, gyro, accel, bias[k], intrinsics, variance, walk,
+            nodes[k], nodes[k + 1], first[k], t, gyro, accel, bias[k], intrinsics, variance, walk, False,
             dR[k], dv[k], dp[k], J[k], P,
         )  # fmt: skip
         _inverse_cholesky(P, W[k])

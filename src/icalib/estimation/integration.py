@@ -184,11 +184,26 @@ def _step_jacobians(R, phi, g1, g2, slope1, slope2, s1, s2, s3, dt):
 
 
 @njit(cache=True, nogil=True)
-def integrate(t0, t1, first, t, gyro, accel, bias, intrinsics, variance, walk, R, v, p, J, P):
+def _corrected(gyro, accel, j, s, bias, F, G, H, rate, force):
+    """Body rate and specific force from the readings a share s of the way from stamp j to stamp j + 1."""
+    for i in range(3):
+        rate[i] = force[i] = 0.0
+    for k in range(3):
+        w = gyro[j, k] + s * (gyro[j + 1, k] - gyro[j, k]) - bias[k]
+        f = accel[j, k] + s * (accel[j + 1, k] - accel[j, k]) - bias[3 + k]
+        for i in range(3):
+            rate[i] += G[i, k] * w + H[i, k] * f
+            force[i] += F[i, k] * f
+
+
+@njit(cache=True, nogil=True)
+def integrate(t0, t1, first, t, gyro, accel, bias, intrinsics, variance, walk, linear, R, v, p, J, P):
     """Integrates readings from t0 to t1 (seconds, imu clock; t1 < t0 runs backwards), starting at interval `first`.
 
     t (N,), gyro, accel (N, 3): readings; bias (6,); variance (N, 2): squared noise densities of each interval;
     walk (2,). R, v, p, J, P are overwritten. Beyond the recording the first or last interval is continued.
+    With `linear`, readings go linearly from stamp to stamp, and a part of an interval takes their mean over that part:
+    whole intervals are the same, but the pose at t1 then has a continuous derivative, the rate at t1.
     Returns the corrected rate (3,) and specific force (3,) at t1.
     """
     R[:] = np.eye(3)
@@ -206,24 +221,23 @@ def integrate(t0, t1, first, t, gyro, accel, bias, intrinsics, variance, walk, R
     backwards = t1 < t0
     j, now = first, t0
     while True:
-        for i in range(3):
-            rate[i] = force[i] = 0.0
-            for k in range(3):
-                w = 0.5 * (gyro[j, k] + gyro[j + 1, k]) - bias[k]
-                f = 0.5 * (accel[j, k] + accel[j + 1, k]) - bias[3 + k]
-                rate[i] += G[i, k] * w + H[i, k] * f
-                force[i] += F[i, k] * f
-        if n_extra > 0:
-            intrinsics_jacobians(intrinsics, F, G, force, rate, extra_w, extra_f)
         if backwards:
             last = j == 0 or t[j] <= t1
             end = t1 if last else t[j]
         else:
             last = j == len(t) - 2 or t[j + 1] >= t1
             end = t1 if last else t[j + 1]
+        span = t[j + 1] - t[j]
+        share = min(max((0.5 * (now + end) - t[j]) / span, 0.0), 1.0) if linear else 0.5
+        _corrected(gyro, accel, j, share, bias, F, G, H, rate, force)
+        if n_extra > 0:
+            intrinsics_jacobians(intrinsics, F, G, force, rate, extra_w, extra_f)
         if end != now:
             step(rate, force, end - now, dw_db, df_db, R, v, p, J, extra_w, extra_f, P, P_t, variance[j], walk)
         if last:
+            if linear:
+                share = min(max((end - t[j]) / span, 0.0), 1.0)
+                _corrected(gyro, accel, j, share, bias, F, G, H, rate, force)
             return rate, force
         now = end
         j += -1 if backwards else 1

@@ -58,7 +58,7 @@ def _inertial(times, node, first, nodes, R, p, v, b, g, t, gyro, accel, intrinsi
         k = node[i]
         dt = times[i] - nodes[k]
         w, _ = integrate(
-            nodes[k], times[i], first[i], t, gyro, accel, b[k], intrinsics, variance, walk, dR, dv, dp, J, P
+            nodes[k], times[i], first[i], t, gyro, accel, b[k], intrinsics, variance, walk, True, dR, dv, dp, J, P
         )  # fmt: skip
         rate[i] = w
         for a in range(3):

@@ -19,7 +19,7 @@ from icalib.initialization.dead_reckoning import DeadReckoning
 from icalib.initialization.guess import BoardPoses
 
 _SPACING_S = 0.15  # between the images of a triple: shorter and position noise wins, longer and integration drifts
-_LONGEST_S = 0.4
+_LONGEST_S = 0.6  # for slow cameras
 _BIAS_SIGMA = 0.2  # m/s^2, what an accelerometer's bias may be; it trades with gravity where the IMU hardly turns
 _LEVER_SIGMA = 1.0  # m
 _ROUNDS = 4
@@ -56,8 +56,12 @@ def camera_triples(
     R_imu_cam: np.ndarray,
     lever: np.ndarray | None,
     reckoning: DeadReckoning,
+    name: str,
 ) -> Triples:
-    """Rows of all triples of good images that the IMU covers without a gap. seconds (M,): images on the imu clock."""
+    """Rows of all triples of good images that the IMU covers without a gap. seconds (M,): images on the imu clock.
+
+    Raises EstimationError where there are hardly any.
+    """
     usable = np.flatnonzero(poses.ok & (seconds >= 0.0) & (seconds <= reckoning.seconds[-1]))
     t = seconds[usable]
     after = np.searchsorted(t, t + _SPACING_S - 1e-3)
@@ -65,6 +69,11 @@ def camera_triples(
     has = np.flatnonzero((after < len(t)) & (before >= 0))
     has = has[(t[after[has]] - t[has] < _LONGEST_S) & (t[has] - t[before[has]] < _LONGEST_S)]
     has = has[reckoning.unbroken(t[before[has]], t[after[has]])]
+    if len(has) < _MIN_TRIPLES:
+        raise EstimationError(
+            f"{name} hardly ever sees the target in three images within a second while the IMU is running "
+            f"({len(has)} times, {_MIN_TRIPLES} needed); record longer with the target in view."
+        )
     i, j, k = before[has], has, after[has]
     Q, _, second = reckoning.at(t)
     R_board_imu = poses.R_board_cam[usable] @ R_imu_cam.T
@@ -95,11 +104,6 @@ def check_accelerometer(all_triples: list[Triples], gravity: float, imu_name: st
     The readings get a scale of their own: scale = unit of the board / unit of the accelerometer. Both cameras and
     gravity shrink with the board, so |g| / scale shows the accelerometer's unit and |g| the board's.
     """
-    if sum(len(t.span) for t in all_triples) < _MIN_TRIPLES:
-        raise EstimationError(
-            f"there are hardly any moments in which {imu_name} was running and a camera saw the target in a row; "
-            "record longer with the target in view."
-        )
     plain = float(np.linalg.norm(fit_gravity(all_triples).gravity)) / gravity
     if abs(plain - 1.0) > _TOLERANCE:
         if abs(plain * gravity - 1.0) < _TOLERANCE:

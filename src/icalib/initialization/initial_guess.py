@@ -39,13 +39,13 @@ def initial_guess(rig: Rig, measurements: Measurements) -> Guess:
         seconds = stream.seconds + fit.offset
         rotation = fit.R_imu_cam
         if fit.axis is not None:
-            rotation = turn_about_axis(seconds, pose, fit, camera.translation.value, reckoning)
+            rotation = turn_about_axis(seconds, pose, fit, camera.translation.value, reckoning, camera.name)
             notes.append(
                 f"{camera.name} turned about one axis only, so its rotation about this axis could be guessed from "
                 "accelerations alone; turn the sensors about all axes."
             )
         rotations.append(rotation)
-        triples.append(camera_triples(seconds, pose, rotation, camera.translation.value, reckoning))
+        triples.append(camera_triples(seconds, pose, rotation, camera.translation.value, reckoning, camera.name))
     check_accelerometer(triples, rig.gravity, rig.imu.name)
     found = fit_gravity(triples)
 

@@ -1,114 +1,146 @@
-"""A camera's intrinsics from the target alone: focal length by trial, then a small bundle adjustment."""
+"""Intrinsics and distortion of a camera from the target, where the rig gives none."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.geometry import so3
-from icalib.geometry.cameras.base import CameraModel
-from icalib.initialization.target_poses import target_poses
+from icalib.geometry.cameras import CameraModel, camera_model
+from icalib.geometry.targets import AprilGrid
+from icalib.initialization.bundle import Views, adjust, reprojection_errors
+from icalib.initialization.poses import find_poses
 from icalib.measurements import CornerStream
+from icalib.rig import Camera
 
-TRIAL_IMAGES = 24
-BUNDLE_IMAGES = 48
-FOCAL_TRIALS = np.geomspace(0.2, 3.0, 28)  # of the image width: 136 to 19 degrees for a pinhole
-ROUNDS = 25
-HUBER_PX = 1.5
-GOOD_RMS_PX = 2.0
+_FOCAL_BY_WIDTH = np.geomspace(0.15, 5.0, 36)
+_SCAN_IMAGES = 40
+_POOL = 200  # images among which those to adjust are chosen
+_ADJUST_IMAGES = 40
+_WORST_PX = 30.0  # what an image without a pose counts in the scan
+_CENTRE_SIGMA = 0.1  # principal point, of the width
+_DISTORTION_SIGMA = 1.0
+_FOCAL_SIGMA = 3.0  # of the focal length itself
+_MIN_IMAGES = 4
+_MIN_SHARE = 0.5  # of all images must be explained in the end
 
 
-def guess_intrinsics(
-    stream: CornerStream, model: CameraModel, resolution: tuple[int, int], target: np.ndarray
-) -> np.ndarray:
-    """Model parameters (P,) that explain the corners. Raises EstimationError if none are found that do."""
-    trial = _spread_images(stream, TRIAL_IMAGES)
-    width, height = resolution
-    best, params = np.inf, np.zeros(len(model.parameter_names))
-    for focal in FOCAL_TRIALS * width:
-        start = np.zeros(len(model.parameter_names))
-        start[:4] = focal, focal, 0.5 * (width - 1), 0.5 * (height - 1)
-        rms = float(np.median(target_poses(trial, model, start, target).rms_px))
-        if rms < best:
-            best, params = rms, start
-    stream = _spread_images(stream, BUNDLE_IMAGES)
-    # Focal length and the strongest distortion first; the rest only once these are near.
-    params = _bundle(stream, model, params, target, np.array([0, 1, 4]))
-    params = _bundle(stream, model, params, target, np.arange(len(params)))
-    rms = float(np.median(target_poses(stream, model, params, target).rms_px))
-    if not rms < GOOD_RMS_PX:
-        raise EstimationError(
-            f"{stream.name}: no intrinsics of model {model.name} explain the corners (best median error {rms:.1f} px); "
-            "check the model, resolution and target in the rig file, or give intrinsics."
-        )
+def find_intrinsics(camera: Camera, stream: CornerStream, target: AprilGrid) -> np.ndarray:
+    """Parameters (P,) of the camera's model; intrinsics or distortion with a value in the rig keep it.
+
+    A scan over focal lengths, then a bundle adjustment over 40 different views. Raises EstimationError where the
+    target is not seen well enough, or where half of the images do not fit what was found.
+    """
+    model = camera_model(camera.model)
+    size = len(model.parameter_names)
+    intrinsics, distortion = camera.intrinsics.value, camera.distortion.value
+    start = np.zeros(size) if distortion is None else np.concatenate([np.zeros(4), distortion])
+    if intrinsics is not None:
+        start[:4] = intrinsics
+        if distortion is not None:
+            return start
+    rich = _rich_images(stream)
+    if len(rich) < _MIN_IMAGES:
+        raise EstimationError(_advice(camera, f"only {len(rich)} images show enough of the target"))
+    if intrinsics is None:
+        start[2:4] = 0.5 * (np.array(camera.resolution) - 1.0)
+        start[:2] = _scan_focal_length(camera, stream, target, start, rich)
+    sigma = np.full(size, 0.0 if distortion is not None else _DISTORTION_SIGMA)
+    sigma[:2] = 0.0 if intrinsics is not None else _FOCAL_SIGMA * start[0]
+    sigma[2:4] = 0.0 if intrinsics is not None else _CENTRE_SIGMA * camera.resolution[0]
+    params = _adjust_in_stages(camera, model, stream, target, start, sigma, rich)
+    ok = find_poses(stream, camera.model, params, target, rich).ok
+    if ok.mean() < _MIN_SHARE:
+        raise EstimationError(_advice(camera, f"only {ok.sum()} of {len(ok)} images fit what was found"))
     return params
 
 
-def _spread_images(stream: CornerStream, wanted: int) -> CornerStream:
-    """About `wanted` images with many corners, spread over the recording."""
+def _advice(camera: Camera, reason: str) -> str:
+    return (
+        f"the intrinsics of {camera.name} cannot be found from the target ({reason}); check model, resolution and target "
+        f"in the rig file, or give {camera.name} intrinsics: {{guess: [fx, fy, cx, cy]}}."
+    )
+
+
+def _rich_images(stream: CornerStream) -> np.ndarray:
+    """Images with at least half of the corners that the fuller ones show."""
     count = np.diff(stream.start)
-    rich = np.flatnonzero(count >= min(np.median(count), 40))
-    chosen = rich[np.unique(np.linspace(0, len(rich) - 1, wanted).astype(int))]
-    rows = np.concatenate([np.arange(stream.start[i], stream.start[i + 1]) for i in chosen])
-    start = np.concatenate([[0], np.cumsum(count[chosen])])
-    return CornerStream(stream.name, stream.stamps_ns[chosen], start, stream.point[rows], stream.uv[rows])
+    return np.flatnonzero(count >= max(8.0, 0.5 * np.quantile(count, 0.9)))
 
 
-def _bundle(
-    stream: CornerStream, model: CameraModel, params: np.ndarray, target: np.ndarray, free: np.ndarray
+def _evenly(images: np.ndarray, n: int) -> np.ndarray:
+    return images[np.unique(np.linspace(0, len(images) - 1, min(n, len(images))).astype(np.int64))]
+
+
+def _views(stream: CornerStream, target: AprilGrid, images: np.ndarray) -> Views:
+    index = np.concatenate([np.arange(stream.start[i], stream.start[i + 1]) for i in images])
+    start = np.concatenate([[0], np.cumsum(np.diff(stream.start)[images])])
+    return Views(target.points[stream.point[index]], stream.uv[index], start)
+
+
+def _posed(
+    camera: Camera, stream: CornerStream, target: AprilGrid, params: np.ndarray, images: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """R_cam_board, t_cam_board of the images, and which of them have any pose, well fitting or not."""
+    poses = find_poses(stream, camera.model, params, target, images, strict=False)
+    R = poses.R_board_cam.transpose(0, 2, 1)
+    return R, -np.einsum("mij,mj->mi", R, poses.p_board_cam), poses.ok
+
+
+def _scan_focal_length(
+    camera: Camera, stream: CornerStream, target: AprilGrid, start: np.ndarray, rich: np.ndarray
+) -> float:
+    """Focal length [px] at which rigid views of the plane explain the images best, by their median errors."""
+    images = _evenly(rich, _SCAN_IMAGES)
+    views, model = _views(stream, target, images), camera_model(camera.model)
+    costs = []
+    for focal in _FOCAL_BY_WIDTH * camera.resolution[0]:
+        params = np.concatenate([[focal, focal], start[2:]])
+        R, t, has = _posed(camera, stream, target, params, images)
+        error = reprojection_errors(model, params, R, t, views)
+        by_image = np.array([np.median(error[a:b]) for a, b in zip(views.start[:-1], views.start[1:], strict=True)])
+        costs.append(np.mean(np.where(has, np.minimum(by_image, _WORST_PX), _WORST_PX)))
+    return float(_FOCAL_BY_WIDTH[int(np.argmin(costs))] * camera.resolution[0])
+
+
+def _adjust_in_stages(
+    camera: Camera,
+    model: CameraModel,
+    stream: CornerStream,
+    target: AprilGrid,
+    start: np.ndarray,
+    sigma: np.ndarray,
+    rich: np.ndarray,
 ) -> np.ndarray:
-    """Levenberg-Marquardt over the `free` parameters and all poses, each image's pose eliminated."""
-    poses = target_poses(stream, model, params, target)
-    R, p, damping = poses.rotation, poses.position, 1e-3
-    used = poses.rms_px < np.maximum(4.0 * np.median(poses.rms_px), 1.0)
-    cost, S, g, parts = _sums(stream, model, params, target, free, R, p, used)
-    for _ in range(ROUNDS):
-        step = -np.linalg.solve(S + damping * np.diag(np.diag(S)), g)
-        trial = params.copy()
-        trial[free] += step
-        R1, p1 = R.copy(), p.copy()
-        for i, (H_inv, C, gp) in parts.items():
-            d = -H_inv @ (gp + C @ step)
-            R1[i], p1[i] = R[i] @ so3.exp(d[:3]), p[i] + R[i] @ d[3:]
-        cost1, S1, g1, parts1 = _sums(stream, model, trial, target, free, R1, p1, used)
-        if cost1 < cost:
-            done = cost - cost1 < 1e-6 * cost
-            params, R, p, cost, S, g, parts = trial, R1, p1, cost1, S1, g1, parts1
-            damping *= 0.2
-            if done:
-                break
-        else:
-            damping *= 10.0
-            if damping > 1e6:
-                break
+    """Bundle adjustment with the principal point held at first, then with all; poses anew in between."""
+    params = start
+    centre_held = sigma.copy()
+    centre_held[2:4] = 0.0
+    for stage in (centre_held, sigma):
+        if not stage.any():
+            continue
+        images = _different_views(camera, stream, target, params, rich)
+        R, t, has = _posed(camera, stream, target, params, images)
+        if has.sum() < _MIN_IMAGES:
+            raise EstimationError(_advice(camera, f"only {has.sum()} images have a pose"))
+        params, _, _ = adjust(model, params, R[has], t[has], _views(stream, target, images[has]), stage)
     return params
 
 
-def _sums(stream, model, params, target, free, R, p, used):
-    """Robust cost, Schur complement and gradient of the free parameters; what each image's pose step needs."""
-    n = len(free)
-    cost, S, g, parts = 0.0, np.zeros((n, n)), np.zeros(n), {}
-    points = target[stream.point]
-    for i in np.flatnonzero(used):
-        rows = slice(stream.start[i], stream.start[i + 1])
-        X = (points[rows] - p[i]) @ R[i]
-        uv, valid, Jx, Jp = model.project_with_jacobians(params, X)
-        r = np.where(valid[:, None], uv - stream.uv[rows], 0.0)
-        size = np.linalg.norm(r, axis=1)
-        w = np.where(size > HUBER_PX, HUBER_PX / np.maximum(size, 1e-12), 1.0) * valid
-        cost += float(np.where(size > HUBER_PX, HUBER_PX * (size - 0.5 * HUBER_PX), 0.5 * size**2).sum())
-        # Corners that the model cannot see cost as much as bad ones, or it would learn to look away.
-        cost += float((~valid).sum()) * HUBER_PX * 20.0
-        turn = np.cross(Jx, X[:, None, :])
-        A = np.concatenate([turn, -Jx], axis=2).reshape(-1, 6)
-        B = Jp[:, :, free].reshape(-1, n)
-        w2 = np.repeat(w, 2)[:, None]
-        H = (A * w2).T @ A + 1e-9 * np.eye(6)
-        H_inv = np.linalg.inv(H)
-        C, gp = (A * w2).T @ B, (A * w2).T @ r.ravel()
-        S += (B * w2).T @ B - C.T @ H_inv @ C
-        g += (B * w2).T @ r.ravel() - C.T @ H_inv @ gp
-        parts[i] = H_inv, C, gp
-    return cost, S, g, parts
-
-
+def _different_views(
+    camera: Camera, stream: CornerStream, target: AprilGrid, params: np.ndarray, rich: np.ndarray
+) -> np.ndarray:
+    """Up to 40 images that differ most in where the board stands, how large and how oblique: farthest point sampling."""
+    pool = _evenly(rich, _POOL)
+    R, t, has = _posed(camera, stream, target, params, pool)
+    pool, R, t = pool[has], R[has], t[has]
+    if len(pool) <= _ADJUST_IMAGES:
+        return pool
+    centre = t + R @ target.points.mean(axis=0)
+    distance = np.linalg.norm(centre, axis=1, keepdims=True)
+    feature = np.concatenate([2.0 * centre / distance, R[:, :, 2], np.log(distance)], axis=1)
+    chosen = [int(np.argmin(np.linalg.norm(feature - np.median(feature, axis=0), axis=1)))]
+    gap = np.full(len(pool), np.inf)
+    while len(chosen) < _ADJUST_IMAGES:
+        gap = np.minimum(gap, np.linalg.norm(feature - feature[chosen[-1]], axis=1))
+        chosen.append(int(np.argmax(gap)))
+    return pool[np.sort(chosen)]

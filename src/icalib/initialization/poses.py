@@ -27,12 +27,17 @@ def thin(stream: CornerStream, images: np.ndarray, limit: int) -> tuple[np.ndarr
 
 
 def find_poses(
-    stream: CornerStream, model: str, params: np.ndarray, target: AprilGrid, images: np.ndarray | None = None
+    stream: CornerStream,
+    model: str,
+    params: np.ndarray,
+    target: AprilGrid,
+    images: np.ndarray | None = None,
+    strict: bool = True,
 ) -> BoardPoses:
     """Board poses of `images` (m,), by default all, with the camera parameters params (P,).
 
     An image is ok where three quarters of its corners lie within about 3 px of a pose that has no rival, and where the
-    camera is on the side of the board that most images show.
+    camera is on the side of the board that most images show; without `strict`, where it has a pose at all.
     """
     images = np.arange(len(stream.stamps_ns)) if images is None else images
     index, start = thin(stream, images, CORNERS_PER_IMAGE)
@@ -42,7 +47,8 @@ def find_poses(
     R, p, ok = np.zeros((len(images), 3, 3)), np.zeros((len(images), 3)), np.zeros(len(images), dtype=np.bool_)
     xy = target.points[stream.point[index[valid]], :2]
     focal = 0.5 * (params[0] + params[1])
-    board_poses(rays[valid], xy, start, _SCALE_PX / focal, _LIMIT_PX / focal, _INLIER_SHARE, R, p, ok)
-    if ok.any():
+    share = _INLIER_SHARE if strict else 0.0
+    board_poses(rays[valid], xy, start, _SCALE_PX / focal, _LIMIT_PX / focal, share, R, p, ok)
+    if strict and ok.any():
         ok &= np.sign(p[:, 2]) == np.sign(np.median(p[ok, 2]))
     return BoardPoses(R, p, ok)

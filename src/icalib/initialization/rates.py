@@ -10,7 +10,9 @@ from icalib.estimation.imu_data import ImuData
 from icalib.geometry import so3
 from icalib.initialization.guess import BoardPoses
 
-_LONGEST_S = 0.2  # between two images whose turn still tells of the rate in between
+# Between two images whose turn still tells of the rate in between; slow cameras leave no choice.
+_LONGEST_S = 0.2
+_LONGEST_SLOW_S = 0.5
 
 
 @dataclass(frozen=True)
@@ -31,10 +33,12 @@ class CameraRates:
 
 
 def camera_rates(seconds: np.ndarray, poses: BoardPoses) -> CameraRates:
-    """Rates between consecutive images that are ok and at most 0.2 s apart. seconds (M,)."""
+    """Rates between consecutive good images at most 0.2 s apart (0.5 s, if the camera is slow). seconds (M,)."""
     found = np.flatnonzero(poses.ok)
     first, second = found[:-1], found[1:]
-    near = seconds[second] - seconds[first] < _LONGEST_S
+    apart = seconds[second] - seconds[first]
+    period = float(np.median(apart)) if len(apart) else 0.0
+    near = apart < min(max(_LONGEST_S, 1.5 * period), _LONGEST_SLOW_S)
     first, second = first[near], second[near]
     turn = poses.R_board_cam[first].transpose(0, 2, 1) @ poses.R_board_cam[second]
     t0, t1 = seconds[first], seconds[second]

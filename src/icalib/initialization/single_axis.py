@@ -15,7 +15,12 @@ _ZOOMS = 4  # each narrows the step to a quarter
 
 
 def turn_about_axis(
-    seconds: np.ndarray, poses: BoardPoses, fit: RateFit, lever: np.ndarray | None, reckoning: DeadReckoning
+    seconds: np.ndarray,
+    poses: BoardPoses,
+    fit: RateFit,
+    lever: np.ndarray | None,
+    reckoning: DeadReckoning,
+    name: str,
 ) -> np.ndarray:
     """R_imu_cam (3, 3), turned about `fit.axis` to where the accelerations fit best: a scan, then zooms into it."""
     assert fit.axis is not None
@@ -24,7 +29,7 @@ def turn_about_axis(
         return so3.exp(angle * fit.axis) @ fit.R_imu_cam
 
     def cost(angle: float) -> float:
-        return fit_gravity([camera_triples(seconds, poses, turned(angle), lever, reckoning)]).cost
+        return fit_gravity([camera_triples(seconds, poses, turned(angle), lever, reckoning, name)]).cost
 
     angles, step = np.arange(-np.pi, np.pi, _COARSE), _COARSE
     best = min(angles, key=cost)

@@ -97,7 +97,7 @@ def convergence(c: Calibration) -> Figure:
     traces.append(
         line(step, np.where(predicted > 0.0, predicted, np.nan), "predicted decrease", "#6b7280", line=dashed)
     )
-    log = axis("half the robust chi^2", type="log", exponentformat="power")
+    log = axis("cost (chi^2 / 2)", type="log", exponentformat="power")
     return figure(traces, 380, xaxis=axis("step (x: rejected)", dtick=max(1, len(step) // 12)), yaxis=log)
 
 

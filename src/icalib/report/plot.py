@@ -10,7 +10,10 @@ Figure = dict[str, Any]
 COLORS = ("#2563a8", "#d97706", "#15803d", "#7c3aed", "#be185d", "#0e7490")
 AXIS_COLORS = ("#c0392b", "#1e8449", "#2563a8")  # x, y, z
 REJECTED = "#dc2626"
-VIEW = {"aspectmode": "data", "camera": {"eye": {"x": 1.5, "y": 1.5, "z": 1.1}}}  # of scenes in space
+VIEW = {
+    "aspectmode": "data",
+    "camera": {"eye": {"x": 1.5, "y": 1.5, "z": 1.1}, "center": {"x": 0, "y": 0, "z": -0.15}},
+}  # of scenes in space
 DIGITS = 5  # significant; more would only make the page larger
 _GRID = {"gridcolor": "#e5e7eb", "zerolinecolor": "#cbd5e1", "linecolor": "#94a3b8"}
 

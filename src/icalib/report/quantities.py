@@ -46,7 +46,8 @@ def rpy_deg(R: np.ndarray) -> np.ndarray:
 
 def worst(verdicts: tuple[Verdict, ...]) -> Verdict:
     """The verdict that a whole group deserves."""
-    return next((v for v in WORST_FIRST if v in verdicts), "fixed")
+    order = {verdict: i for i, verdict in enumerate(WORST_FIRST)}
+    return min((*verdicts, WORST_FIRST[-1]), key=lambda verdict: order[verdict])
 
 
 def shown(value: float, digits: int = 2) -> str:

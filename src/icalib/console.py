@@ -1,0 +1,44 @@
+"""What the command line shows: a progress bar while it works, and the result."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from icalib.calibration import Calibration
+from icalib.report.console import table
+
+
+@contextmanager
+def progress_bar(quiet: bool) -> Iterator[Callable[[str, float], None]]:
+    """A bar on standard error with the time left; `quiet`: nothing is shown."""
+    if quiet:
+        yield lambda stage, done: None
+        return
+    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn()
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("starting", total=1.0)
+        yield lambda stage, done: bar.update(task, description=stage, completed=done)
+
+
+def print_result(calibration: Calibration, folder: Path) -> None:
+    """The table of parameters, what they rest on, and where the files are, on standard output."""
+    console = Console()
+    console.print(table(calibration))
+    for f in calibration.fits:
+        ratio = f.chi2 / max(f.dof, 1.0)
+        rms = f", {f.rms:.3f} {f.unit} RMS, {f.rejected} set aside" if f.rms is not None else ""
+        console.print(f"  {f.sensor} {f.kind}: chi^2 {ratio:.2f} per degree of freedom ({f.dof:.0f}){rms}", markup=False)
+    for title, sentences in (
+        ("Undetermined", calibration.undetermined),
+        ("Warning", calibration.warnings),
+        ("Note", calibration.notes),
+    ):
+        for sentence in sentences:
+            console.print(f"{title}: {sentence}", markup=False)
+    console.print(f"Status: {calibration.status}", markup=False)
+    console.print(f"Wrote {folder / 'calibration.yaml'}, camchain-imucam.yaml, imu.yaml, report.html.", markup=False)

@@ -1,0 +1,138 @@
+"""The first guess, from nothing: intrinsics, poses, clocks, rotation, gravity, lever arms. What the rig gives is used."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.estimation.imu_data import ImuData
+from icalib.geometry.cameras import camera_model
+from icalib.first_guess.clocks import Alignment, align, camera_rates
+from icalib.first_guess.gyro import GyroRotation
+from icalib.first_guess.intrinsics import guess_intrinsics
+from icalib.first_guess.lever_arm import LeverArm, check_gravity, lever_arm
+from icalib.first_guess.target_poses import TargetPoses, target_poses
+from icalib.measurements import CornerStream, Measurements
+from icalib.rig import Camera, Rig
+
+VELOCITY_STEP_S = 0.04
+
+
+@dataclass(frozen=True)
+class CameraGuess:
+    """params (P,); offset: t_imu - t_cam, each since its clock's first stamp [s]; T_imu_cam; poses in the board frame."""
+
+    params: np.ndarray
+    offset: float
+    rotation: np.ndarray
+    position: np.ndarray
+    poses: TargetPoses
+
+
+@dataclass(frozen=True)
+class Guess:
+    """Where the solver starts. R_world_board: world z is up, its origin the board's; its x axis horizontal in the board."""
+
+    cameras: dict[str, CameraGuess]
+    gyro_bias: np.ndarray
+    accel_bias: np.ndarray
+    R_world_board: np.ndarray
+
+    def values(self) -> dict[tuple[str, str], np.ndarray]:
+        """The lasting parameters by sensor and name."""
+        out: dict[tuple[str, str], np.ndarray] = {("board0", "tilt"): self.R_world_board}
+        for name, c in self.cameras.items():
+            out[name, "rotation"], out[name, "translation"] = c.rotation, c.position
+            out[name, "time_offset"] = np.array([c.offset])
+            out[name, "intrinsics"], out[name, "distortion"] = c.params[:4], c.params[4:]
+        return out
+
+    def biases(self, n: int) -> np.ndarray:
+        """(n, 6) the biases, the same at all nodes."""
+        return np.tile(np.concatenate([self.gyro_bias, self.accel_bias]), (n, 1))
+
+
+def initial_guess(rig: Rig, measurements: Measurements) -> Guess:
+    """Raises EstimationError, one sentence, where the recording does not carry a guess."""
+    imu = ImuData.build(measurements.imu, rig.imu.noise)
+    params = [_params(c, s, rig) for c, s in zip(rig.cameras, measurements.cameras, strict=True)]
+    poses = [
+        target_poses(s, camera_model(c.model), p, rig.target.points)
+        for c, s, p in zip(rig.cameras, measurements.cameras, params, strict=True)
+    ]
+    aligned = [_align(c, s, q, imu, measurements) for c, s, q in zip(rig.cameras, measurements.cameras, poses, strict=True)]
+    best = int(np.argmax([q.ok.sum() for q in poses]))
+    gyro_bias = aligned[best].gyro_bias
+    gyro = GyroRotation.integrate(imu, gyro_bias)
+    arms = [
+        lever_arm(imu, s.seconds + a.offset, q, a.rotation, gyro, c.translation.value)
+        for c, s, q, a in zip(rig.cameras, measurements.cameras, poses, aligned, strict=True)
+    ]
+    gravity = arms[best].gravity
+    check_gravity(float(np.linalg.norm(gravity)), rig.gravity, rig.imu.name)
+    cameras = {
+        c.name: CameraGuess(p, a.offset, a.rotation, m.position, q)
+        for c, p, a, m, q in zip(rig.cameras, params, aligned, arms, poses, strict=True)
+    }
+    return Guess(cameras, gyro_bias, _mean_bias(arms), _level(gravity))
+
+
+def _params(camera: Camera, stream: CornerStream, rig: Rig) -> np.ndarray:
+    """(P,) from the rig where it has them, else from the corners."""
+    given = camera.intrinsics.value, camera.distortion.value
+    if given[0] is not None and given[1] is not None:
+        return np.concatenate([given[0], given[1]])
+    found = guess_intrinsics(stream, camera_model(camera.model), camera.resolution, rig.target.points)
+    return np.concatenate([found[:4] if given[0] is None else given[0], found[4:] if given[1] is None else given[1]])
+
+
+def _align(camera: Camera, stream: CornerStream, poses: TargetPoses, imu: ImuData, measurements: Measurements) -> Alignment:
+    given = camera.time_offset.value
+    apart = (stream.origin_ns - measurements.imu.origin_ns) * 1e-9
+    found = align(imu, camera.name, camera_rates(stream, poses), None if given is None else float(given[0]) + apart)
+    if camera.rotation.value is None:
+        return found
+    return Alignment(found.offset, camera.rotation.value, found.gyro_bias)
+
+
+def _mean_bias(arms: list[LeverArm]) -> np.ndarray:
+    return np.mean([a.accel_bias for a in arms], axis=0)
+
+
+def _level(gravity_board: np.ndarray) -> np.ndarray:
+    """R_world_board with z against gravity and x along the horizontal direction nearest to the board's x (or y)."""
+    up = -gravity_board / np.linalg.norm(gravity_board)
+    reference = np.eye(3)[0] if abs(up[0]) < 0.9 else np.eye(3)[1]
+    x = reference - (reference @ up) * up
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(up, x), up])
+
+
+def initial_trajectory(
+    guess: Guess, rig: Rig, measurements: Measurements, nodes: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """R_world_imu (K, 3, 3), position and velocity (K, 3) at `nodes` [s on the imu clock since its first stamp].
+
+    From the nearest camera pose, rotation carried by the gyroscope, position interpolated.
+    """
+    imu = ImuData.build(measurements.imu, rig.imu.noise)
+    times, rotations, positions = [], [], []
+    for stream in measurements.cameras:
+        c = guess.cameras[stream.name]
+        ok = c.poses.ok
+        R_bi = c.poses.rotation[ok] @ c.rotation.T
+        times.append(stream.seconds[ok] + c.offset)
+        rotations.append(guess.R_world_board @ R_bi)
+        positions.append((c.poses.position[ok] - R_bi @ c.position) @ guess.R_world_board.T)
+    t = np.concatenate(times)
+    order = np.argsort(t, kind="stable")
+    order = order[np.diff(t[order], prepend=-np.inf) > 1e-4]
+    t, R, p = t[order], np.concatenate(rotations)[order], np.concatenate(positions)[order]
+
+    def position(s: np.ndarray) -> np.ndarray:
+        return np.stack([np.interp(s, t, p[:, k]) for k in range(3)], axis=1)
+
+    rotation = GyroRotation.integrate(imu, guess.gyro_bias).carry(t, R, nodes)
+    velocity = (position(nodes + VELOCITY_STEP_S) - position(nodes - VELOCITY_STEP_S)) / (2.0 * VELOCITY_STEP_S)
+    return np.ascontiguousarray(rotation), position(nodes), velocity

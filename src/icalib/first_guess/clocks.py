@@ -1,0 +1,172 @@
+"""Time offset and rotation between a camera and the IMU, from angular rates alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.errors import EstimationError
+from icalib.estimation.imu_data import ImuData
+from icalib.geometry import so3
+from icalib.first_guess.target_poses import TargetPoses
+from icalib.measurements import CornerStream
+
+GRID_HZ = 100.0
+LONGEST_STEP_S = 0.25  # images further apart do not give an angular rate
+SHORTEST_OVERLAP_S = 4.0
+LEAST_CORRELATION = 0.7
+STILL_RAD_S = 0.03
+ROUNDS = 12
+DEGREES = 180.0 / np.pi
+
+
+@dataclass(frozen=True)
+class CameraRates:
+    """Mean angular rates between neighbouring images: start, end (n,) camera clock [s]; rate (n, 3) camera axes [rad/s]."""
+
+    start: np.ndarray
+    end: np.ndarray
+    rate: np.ndarray
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """offset: t_imu - t_camera, both since their clock's first stamp [s]; R_imu_cam; gyro_bias (3,) rad/s."""
+
+    offset: float
+    rotation: np.ndarray
+    gyro_bias: np.ndarray
+
+
+def camera_rates(stream: CornerStream, poses: TargetPoses) -> CameraRates:
+    """Angular rates from consecutive good poses. Raises EstimationError where there are hardly any."""
+    t = stream.seconds
+    index = np.flatnonzero(poses.ok)
+    if len(index) < 2:
+        raise EstimationError(
+            f"{stream.name}: the target was located in {len(index)} of {len(t)} images; check the target, the camera model "
+            "and the intrinsics in the rig file."
+        )
+    a, b = index[:-1], index[1:]
+    near = t[b] - t[a] <= LONGEST_STEP_S
+    a, b = a[near], b[near]
+    if len(a) < 20:
+        raise EstimationError(f"{stream.name}: too few neighbouring images show the target; record for at least ten seconds.")
+    turn = so3.log_many(np.ascontiguousarray(poses.rotation[a].transpose(0, 2, 1) @ poses.rotation[b]))
+    return CameraRates(t[a], t[b], turn / (t[b] - t[a])[:, None])
+
+
+def align(imu: ImuData, name: str, rates: CameraRates, given_offset: float | None) -> Alignment:
+    """Offset, rotation and gyro bias. Raises EstimationError where the rates do not match at any shift."""
+    _check_motion(imu, name, rates)
+    offset = _correlate(imu, name, rates) if given_offset is None else given_offset
+    found = _refine(imu, rates, offset, given_offset is not None)
+    _check_scale(imu, name, rates, found)
+    return found
+
+
+def _check_motion(imu: ImuData, name: str, rates: CameraRates) -> None:
+    spread = np.sqrt(((imu.gyro - np.median(imu.gyro, axis=0)) ** 2).sum(axis=1).mean())
+    seen = np.sqrt(np.median((rates.rate**2).sum(axis=1)))
+    if spread < STILL_RAD_S and seen < 3.0 * STILL_RAD_S:
+        raise EstimationError(
+            f"the recording is motionless ({imu.name} turns at {spread:.4f} rad/s RMS, {name} at {seen:.4f}); record again "
+            "while turning the rig about all axes in front of the target."
+        )
+
+
+def _grid(t: np.ndarray, x: np.ndarray, covered: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray]:
+    """x on a regular grid from 0 to `length`, and a mask of where it is known."""
+    grid = np.arange(int(length * GRID_HZ) + 1) / GRID_HZ
+    mask = np.interp(grid, t, covered.astype(float)) > 0.99
+    return np.interp(grid, t, x), mask
+
+
+def _correlate(imu: ImuData, name: str, rates: CameraRates) -> float:
+    """Offset [s] at the peak of the masked, normalised cross-correlation of |w| over all shifts."""
+    bias = np.median(imu.gyro, axis=0)
+    a, mask_a = _grid(
+        imu.seconds, np.linalg.norm(imu.gyro - bias, axis=1), np.ones(len(imu.seconds), bool), imu.seconds[-1]
+    )  # fmt: skip
+    middle = 0.5 * (rates.start + rates.end)
+    near = np.diff(middle, append=middle[-1]) < LONGEST_STEP_S
+    b, mask_b = _grid(middle, np.linalg.norm(rates.rate, axis=1), near, middle[-1])
+    n = len(a) + len(b) - 1
+    size = 1 << (n - 1).bit_length()
+
+    def correlate(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """sum_t x(t + lag) y(t), lag from -(len(y) - 1) to len(x) - 1."""
+        product = np.fft.irfft(np.fft.rfft(x, size) * np.conj(np.fft.rfft(y, size)), size)
+        return np.concatenate([product[-(len(b) - 1) :], product[: len(a)]]) if len(b) > 1 else product[: len(a)]
+
+    ma, mb = mask_a.astype(float), mask_b.astype(float)
+    count = np.maximum(correlate(ma, mb), 1e-9)
+    sa, sb = correlate(a * ma, mb), correlate(ma, b * mb)
+    saa, sbb = correlate(a * a * ma, mb), correlate(ma, b * b * mb)
+    covariance = correlate(a * ma, b * mb) - sa * sb / count
+    variance = np.maximum(saa - sa**2 / count, 0.0) * np.maximum(sbb - sb**2 / count, 0.0)
+    whole = min(mask_a.sum(), mask_b.sum())
+    enough = count > min(SHORTEST_OVERLAP_S * GRID_HZ, 0.5 * whole)
+    # Against the shift's own overlap and a share of the whole, so that a short overlap of little motion cannot win.
+    floor = 1e-3 * (a[mask_a].var() * b[mask_b].var()) * count**2
+    r = np.where(enough, covariance / np.sqrt(variance + floor), 0.0)
+    score = np.arctanh(np.clip(r, 0.0, 0.999999)) * np.sqrt(count)
+    k = int(np.argmax(score))
+    if not r[k] > LEAST_CORRELATION:
+        raise EstimationError(
+            f"the motion of {name} does not match that of {imu.name} at any shift of their clocks (best correlation "
+            f"{max(float(r.max()), 0.0):.2f}); check that both come from the same recording, overlap in time, and are in rad/s."
+        )
+    return (k - (len(b) - 1)) / GRID_HZ
+
+
+def _kabsch(w_imu: np.ndarray, w_cam: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """R and bias with w_imu = R w_cam + bias: means removed, then an SVD."""
+    total = weight.sum()
+    mi, mc = weight @ w_imu / total, weight @ w_cam / total
+    U, _, Vt = np.linalg.svd(((w_imu - mi) * weight[:, None]).T @ (w_cam - mc))
+    D = np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
+    R = U @ D @ Vt
+    return R, mi - R @ mc
+
+
+def _refine(imu: ImuData, rates: CameraRates, offset: float, keep_offset: bool) -> Alignment:
+    """Gauss-Newton on the offset, Kabsch on rotation and bias in turn; rates are means over each image interval."""
+    angle = np.zeros((len(imu.seconds), 3))
+    angle[1:] = np.cumsum(0.5 * (imu.gyro[1:] + imu.gyro[:-1]) * np.diff(imu.seconds)[:, None], axis=0)
+
+    def at(x: np.ndarray, t: np.ndarray) -> np.ndarray:
+        return np.stack([np.interp(t, imu.seconds, x[:, k]) for k in range(3)], axis=1)
+
+    R, bias = np.eye(3), np.zeros(3)
+    for _ in range(ROUNDS):
+        start, end = rates.start + offset, rates.end + offset
+        inside = ((start >= imu.seconds[0]) & (end <= imu.seconds[-1])).astype(float)
+        span = (end - start)[:, None]
+        mean = (at(angle, end) - at(angle, start)) / span
+        slope = (at(imu.gyro, end) - at(imu.gyro, start)) / span
+        weight = inside
+        for _ in range(3):
+            R, bias = _kabsch(mean, rates.rate, weight)
+            residual = mean - rates.rate @ R.T - bias
+            size = np.linalg.norm(residual, axis=1)
+            weight = inside * (size < 5.0 * np.median(size[inside > 0.0]) + 1e-9)
+        if keep_offset:
+            break
+        step = -float((weight @ (slope * residual)).sum() / (weight @ slope**2).sum())
+        offset += float(np.clip(step, -0.02, 0.02))
+        if abs(step) < 1e-6:
+            break
+    return Alignment(offset, R, bias)
+
+
+def _check_scale(imu: ImuData, name: str, rates: CameraRates, found: Alignment) -> None:
+    """The two must turn equally fast: a ratio of 57 is degrees."""
+    middle = 0.5 * (rates.start + rates.end) + found.offset
+    gyro = np.stack([np.interp(middle, imu.seconds, imu.gyro[:, k]) for k in range(3)], axis=1) - found.gyro_bias
+    ratio = float(np.median(np.linalg.norm(gyro, axis=1)) / max(np.median(np.linalg.norm(rates.rate, axis=1)), 1e-9))
+    if 0.8 < ratio < 1.25:
+        return
+    cause = "its angular rate looks like deg/s; convert it to rad/s" if 0.8 < ratio / DEGREES < 1.25 else "check its units"
+    raise EstimationError(f"{imu.name} turns {ratio:.3g} times as fast as {name}: {cause}.")

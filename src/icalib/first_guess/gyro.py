@@ -1,0 +1,40 @@
+"""Dead reckoning of rotation by the gyroscope, to carry poses from image instants to any other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.estimation.imu_data import ImuData
+from icalib.geometry import so3
+
+
+@dataclass(frozen=True)
+class GyroRotation:
+    """R_start_imu (N, 3, 3) at every IMU stamp, integrated with a constant bias; rate (N - 1, 3) between stamps."""
+
+    imu: ImuData
+    rotation: np.ndarray
+    rate: np.ndarray
+
+    @classmethod
+    def integrate(cls, imu: ImuData, bias: np.ndarray) -> GyroRotation:
+        rate = 0.5 * (imu.gyro[1:] + imu.gyro[:-1]) - bias
+        steps = so3.exp_many(rate * np.diff(imu.seconds)[:, None])
+        rotation = np.empty((len(imu.seconds), 3, 3))
+        rotation[0] = np.eye(3)
+        so3.chain(steps, rotation)
+        return cls(imu, rotation, rate)
+
+    def at(self, t: np.ndarray) -> np.ndarray:
+        """(n, 3, 3) R_start_imu at times t; beyond the recording the last rate is continued."""
+        j = self.imu.interval(t)
+        return self.rotation[j] @ so3.exp_many(self.rate[j] * (t - self.imu.seconds[j])[:, None])
+
+    def carry(self, t: np.ndarray, rotation: np.ndarray, to: np.ndarray) -> np.ndarray:
+        """(n, 3, 3) rotations at `to`, each from the nearest of the known `rotation` at times t (in order)."""
+        after = np.clip(np.searchsorted(t, to), 1, len(t) - 1)
+        near = after - (to - t[after - 1] < t[after] - to)
+        start = self.at(t)[near]
+        return rotation[near] @ start.transpose(0, 2, 1) @ self.at(to)

@@ -1,0 +1,114 @@
+"""A camera's intrinsics from the target alone: focal length by trial, then a small bundle adjustment."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icalib.errors import EstimationError
+from icalib.geometry import so3
+from icalib.geometry.cameras.base import CameraModel
+from icalib.first_guess.target_poses import target_poses
+from icalib.measurements import CornerStream
+
+TRIAL_IMAGES = 24
+BUNDLE_IMAGES = 48
+FOCAL_TRIALS = np.geomspace(0.2, 3.0, 28)  # of the image width: 136 to 19 degrees for a pinhole
+ROUNDS = 25
+HUBER_PX = 1.5
+GOOD_RMS_PX = 2.0
+
+
+def guess_intrinsics(
+    stream: CornerStream, model: CameraModel, resolution: tuple[int, int], target: np.ndarray
+) -> np.ndarray:
+    """Model parameters (P,) that explain the corners. Raises EstimationError if none are found that do."""
+    trial = _spread_images(stream, TRIAL_IMAGES)
+    width, height = resolution
+    best, params = np.inf, np.zeros(len(model.parameter_names))
+    for focal in FOCAL_TRIALS * width:
+        start = np.zeros(len(model.parameter_names))
+        start[:4] = focal, focal, 0.5 * (width - 1), 0.5 * (height - 1)
+        rms = float(np.median(target_poses(trial, model, start, target).rms_px))
+        if rms < best:
+            best, params = rms, start
+    stream = _spread_images(stream, BUNDLE_IMAGES)
+    # Focal length and the strongest distortion first; the rest only once these are near.
+    params = _bundle(stream, model, params, target, np.array([0, 1, 4]))
+    params = _bundle(stream, model, params, target, np.arange(len(params)))
+    rms = float(np.median(target_poses(stream, model, params, target).rms_px))
+    if not rms < GOOD_RMS_PX:
+        raise EstimationError(
+            f"{stream.name}: no intrinsics of model {model.name} explain the corners (best median error {rms:.1f} px); "
+            "check the model, resolution and target in the rig file, or give intrinsics."
+        )
+    return params
+
+
+def _spread_images(stream: CornerStream, wanted: int) -> CornerStream:
+    """About `wanted` images with many corners, spread over the recording."""
+    count = np.diff(stream.start)
+    rich = np.flatnonzero(count >= min(np.median(count), 40))
+    chosen = rich[np.unique(np.linspace(0, len(rich) - 1, wanted).astype(int))]
+    rows = np.concatenate([np.arange(stream.start[i], stream.start[i + 1]) for i in chosen])
+    start = np.concatenate([[0], np.cumsum(count[chosen])])
+    return CornerStream(stream.name, stream.stamps_ns[chosen], start, stream.point[rows], stream.uv[rows])
+
+
+def _bundle(
+    stream: CornerStream, model: CameraModel, params: np.ndarray, target: np.ndarray, free: np.ndarray
+) -> np.ndarray:
+    """Levenberg-Marquardt over the `free` parameters and all poses, each image's pose eliminated."""
+    poses = target_poses(stream, model, params, target)
+    R, p, damping = poses.rotation, poses.position, 1e-3
+    used = poses.rms_px < np.maximum(4.0 * np.median(poses.rms_px), 1.0)
+    cost, S, g, parts = _sums(stream, model, params, target, free, R, p, used)
+    for _ in range(ROUNDS):
+        step = -np.linalg.solve(S + damping * np.diag(np.diag(S)), g)
+        trial = params.copy()
+        trial[free] += step
+        R1, p1 = R.copy(), p.copy()
+        for i, (H_inv, C, gp) in parts.items():
+            d = -H_inv @ (gp + C @ step)
+            R1[i], p1[i] = R[i] @ so3.exp(d[:3]), p[i] + R[i] @ d[3:]
+        cost1, S1, g1, parts1 = _sums(stream, model, trial, target, free, R1, p1, used)
+        if cost1 < cost:
+            done = cost - cost1 < 1e-6 * cost
+            params, R, p, cost, S, g, parts = trial, R1, p1, cost1, S1, g1, parts1
+            damping *= 0.2
+            if done:
+                break
+        else:
+            damping *= 10.0
+            if damping > 1e6:
+                break
+    return params
+
+
+def _sums(stream, model, params, target, free, R, p, used):
+    """Robust cost, Schur complement and gradient of the free parameters; what each image's pose step needs."""
+    n = len(free)
+    cost, S, g, parts = 0.0, np.zeros((n, n)), np.zeros(n), {}
+    points = target[stream.point]
+    for i in np.flatnonzero(used):
+        rows = slice(stream.start[i], stream.start[i + 1])
+        X = (points[rows] - p[i]) @ R[i]
+        uv, valid, Jx, Jp = model.project_with_jacobians(params, X)
+        r = np.where(valid[:, None], uv - stream.uv[rows], 0.0)
+        size = np.linalg.norm(r, axis=1)
+        w = np.where(size > HUBER_PX, HUBER_PX / np.maximum(size, 1e-12), 1.0) * valid
+        cost += float(np.where(size > HUBER_PX, HUBER_PX * (size - 0.5 * HUBER_PX), 0.5 * size**2).sum())
+        # Corners that the model cannot see cost as much as bad ones, or it would learn to look away.
+        cost += float((~valid).sum()) * HUBER_PX * 20.0
+        turn = np.cross(Jx, X[:, None, :])
+        A = np.concatenate([turn, -Jx], axis=2).reshape(-1, 6)
+        B = Jp[:, :, free].reshape(-1, n)
+        w2 = np.repeat(w, 2)[:, None]
+        H = (A * w2).T @ A + 1e-9 * np.eye(6)
+        H_inv = np.linalg.inv(H)
+        C, gp = (A * w2).T @ B, (A * w2).T @ r.ravel()
+        S += (B * w2).T @ B - C.T @ H_inv @ C
+        g += (B * w2).T @ r.ravel() - C.T @ H_inv @ gp
+        parts[i] = H_inv, C, gp
+    return cost, S, g, parts
+
+

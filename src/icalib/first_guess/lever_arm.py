@@ -1,0 +1,118 @@
+"""Gravity, lever arms and accelerometer bias: linear in the camera's positions and the accelerometer.
+
+With D'' = R_board_imu f and the operator A[x] = (x_2 - x_1) / h_2 - (x_1 - x_0) / h_1 over three images,
+
+    A[p_board_cam] = A[R_board_imu] p_imu_cam + A[D_f] - A[D_R] b_a + g (h_1 + h_2) / 2
+
+where D_R is the double integral of R_board_imu itself; velocities have dropped out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.errors import EstimationError
+from icalib.estimation.imu_data import ImuData
+from icalib.first_guess.gyro import GyroRotation
+from icalib.first_guess.target_poses import TargetPoses
+
+STEP_S = 0.12  # between the images of a triple: long against pose noise, short against the loss of sight
+BIAS_SIGMA = 0.3  # m/s^2
+ROW_SIGMA = 0.05  # m/s, of a row of the system
+G_TOLERANCE = 0.1
+
+
+@dataclass(frozen=True)
+class LeverArm:
+    """p_imu_cam (3,) m; gravity (3,) in board axes, m/s^2; accel_bias (3,) m/s^2."""
+
+    position: np.ndarray
+    gravity: np.ndarray
+    accel_bias: np.ndarray
+
+
+def lever_arm(
+    imu: ImuData, times: np.ndarray, poses: TargetPoses, R_imu_cam: np.ndarray, gyro: GyroRotation, given: np.ndarray | None
+) -> LeverArm:
+    """Solves for one camera; times (M,) of its images on the imu clock. `given` holds the lever arm where it is known.
+
+    Raises EstimationError where too few images can be used.
+    """
+    ok = poses.ok & (times >= imu.seconds[1]) & (times <= imu.seconds[-2])
+    t, R_bc, p = times[ok], poses.rotation[ok], poses.position[ok]
+    R_bi = R_bc @ R_imu_cam.T
+    D_f, D_R = _double_integrals(imu, t, R_bi, gyro)
+    i, j, k = _triples(t)
+    if len(i) < 10:
+        raise EstimationError("too few images follow one another closely enough to find gravity; record for longer.")
+    h1, h2 = (t[j] - t[i])[:, None], (t[k] - t[j])[:, None]
+
+    def second(x: np.ndarray) -> np.ndarray:
+        flat = x.reshape(len(x), -1)
+        return ((flat[k] - flat[j]) / h2 - (flat[j] - flat[i]) / h1).reshape(len(i), *x.shape[1:])
+
+    rows = np.zeros((len(i), 3, 9))
+    rows[:, :, 0:3] = second(R_bi)
+    rows[:, :, 3:6] = 0.5 * (h1 + h2)[:, :, None] * np.eye(3)
+    rows[:, :, 6:9] = -second(D_R)
+    rhs = second(p) - second(D_f)
+    if given is not None:
+        rhs = rhs - rows[:, :, 0:3] @ given
+        rows[:, :, 0:3] = 0.0
+    x = _solve(rows, rhs)
+    return LeverArm(x[0:3] if given is None else given, x[3:6], x[6:9])
+
+
+def _solve(rows: np.ndarray, rhs: np.ndarray) -> np.ndarray:
+    """Least squares with a weak prior on the bias, twice: the second time without rows that stand far off."""
+    prior = np.zeros((9, 9))
+    prior[np.arange(9), np.arange(9)] = ROW_SIGMA / np.array([10.0] * 3 + [1e3] * 3 + [BIAS_SIGMA] * 3)
+    weight, x = np.ones(len(rows)), np.zeros(9)
+    for _ in range(3):
+        A = np.concatenate([(rows * weight[:, None, None]).reshape(-1, 9), prior])
+        b = np.concatenate([(rhs * weight[:, None]).ravel(), np.zeros(9)])
+        x = np.linalg.lstsq(A, b, rcond=None)[0]
+        size = np.linalg.norm(rhs - rows @ x, axis=1)
+        weight = (size < 4.0 * np.median(size) + 1e-9).astype(float)
+    return x
+
+
+def _triples(t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Images (i, j, k) about STEP_S apart, within a factor of two."""
+    i = np.arange(len(t))
+    j = np.searchsorted(t, t + STEP_S - 1e-3)
+    k = np.searchsorted(t, t + 2 * STEP_S - 1e-3)
+    good = (k < len(t)) & (j < k) & (i < j)
+    i, j, k = i[good], j[good], k[good]
+    close = (t[j] - t[i] < 2 * STEP_S) & (t[k] - t[j] < 2 * STEP_S)
+    return i[close], j[close], k[close]
+
+
+def _double_integrals(
+    imu: ImuData, t: np.ndarray, R_bi: np.ndarray, gyro: GyroRotation
+) -> tuple[np.ndarray, np.ndarray]:
+    """Double integrals of R_board_imu f (n, 3) and of R_board_imu (n, 3, 3) at image times t, from the first IMU stamp."""
+    s = imu.seconds
+    R = gyro.carry(t, R_bi, s)
+    x = np.concatenate([(R @ imu.accel[:, :, None])[:, :, 0], R.reshape(-1, 9)], axis=1)
+    dt = np.diff(s)[:, None]
+    first, second = np.zeros_like(x), np.zeros_like(x)
+    first[1:] = np.cumsum(0.5 * (x[1:] + x[:-1]) * dt, axis=0)
+    second[1:] = np.cumsum(first[:-1] * dt + (2.0 * x[:-1] + x[1:]) * dt**2 / 6.0, axis=0)
+    j = imu.interval(t)
+    tau = (t - s[j])[:, None]
+    out = second[j] + first[j] * tau + 0.5 * x[j] * tau**2
+    return out[:, :3], out[:, 3:].reshape(-1, 3, 3)
+
+
+def check_gravity(measured: float, expected: float, imu: str) -> None:
+    """Raises EstimationError where gravity as the IMU and the target's size show it is not `expected` m/s^2."""
+    ratio = measured / expected
+    if abs(ratio - 1.0) <= G_TOLERANCE:
+        return
+    raise EstimationError(
+        f"{imu} and the target together show gravity of {measured:.3g} m/s^2 instead of {expected:.3g}: check that the "
+        "accelerometer is in m/s^2 (not in g), and tag_size in the rig file."
+    )

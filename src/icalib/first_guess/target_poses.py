@@ -1,0 +1,169 @@
+"""Where each camera stood when it took each image: the target's pose from its corners, no guess needed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from icalib.geometry import so3
+from icalib.geometry.cameras.base import CameraModel
+from icalib.geometry.small import solve_definite
+from icalib.measurements import CornerStream
+
+MOST_CORNERS = 48  # of an image; more do not make a first guess better
+FEWEST_CORNERS = 6
+SMALLEST_COSINE = 0.15  # rays closer to the image plane than this have no place in a homography
+LARGEST_RMS_PX = 3.0
+
+@dataclass(frozen=True)
+class TargetPoses:
+    """Camera poses in the board frame: R_board_cam (M, 3, 3), p_board_cam (M, 3); ok (M,) bool; rms_px (M,)."""
+
+    rotation: np.ndarray
+    position: np.ndarray
+    ok: np.ndarray
+    rms_px: np.ndarray
+
+@njit(cache=True, nogil=True)
+def _homography(points, seen, centre, h):
+    """H (9,) with seen ~ H (point - centre, 1), h33 = 1, by linear least squares. False where it is singular."""
+    A, b = np.zeros((8, 8)), np.zeros(8)
+    row = np.zeros(8)
+    for n in range(len(points)):
+        x, y = points[n, 0] - centre[0], points[n, 1] - centre[1]
+        for axis in range(2):
+            m = seen[n, axis]
+            row[:] = 0.0
+            o = 3 * axis
+            row[o], row[o + 1], row[o + 2] = x, y, 1.0
+            row[6], row[7] = -m * x, -m * y
+            for i in range(8):
+                b[i] += row[i] * m
+                for j in range(8):
+                    A[i, j] += row[i] * row[j]
+    if not solve_definite(A, b):
+        return False
+    h[:8] = b
+    h[8] = 1.0
+    return True
+
+@njit(cache=True, nogil=True)
+def _pose_from_homography(h, R, t):
+    """R_cam_board and the position of the homography's centre in the camera, from columns of equal length."""
+    n1 = np.sqrt(h[0] ** 2 + h[3] ** 2 + h[6] ** 2)
+    n2 = np.sqrt(h[1] ** 2 + h[4] ** 2 + h[7] ** 2)
+    s = 2.0 / (n1 + n2)
+    a, b = np.empty(3), np.empty(3)
+    for i in range(3):
+        a[i], b[i], t[i] = h[3 * i] / n1, h[3 * i + 1] / n2, h[3 * i + 2] * s
+    dot = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    for i in range(3):
+        u, v = a[i] - 0.5 * dot * b[i], b[i] - 0.5 * dot * a[i]
+        a[i], b[i] = u, v
+    _normalise(a)
+    dot = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    for i in range(3):
+        b[i] -= dot * a[i]
+    _normalise(b)
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        R[i, 0], R[i, 1] = a[i], b[i]
+        R[i, 2] = a[j] * b[k] - a[k] * b[j]
+
+@njit(cache=True, nogil=True)
+def _normalise(v):
+    n = np.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2)
+    for i in range(3):
+        v[i] /= n
+
+@njit(cache=True, nogil=True)
+def _move(turn, g, R, t):
+    """R <- turn R, t <- turn t - g[3:]."""
+    old, shift = R.copy(), t.copy()
+    for i in range(3):
+        t[i] = turn[i, 0] * shift[0] + turn[i, 1] * shift[1] + turn[i, 2] * shift[2] - g[3 + i]
+        for j in range(3):
+            R[i, j] = turn[i, 0] * old[0, j] + turn[i, 1] * old[1, j] + turn[i, 2] * old[2, j]
+
+
+@njit(cache=True, nogil=True)
+def _refine(points, seen, R, t, rounds, scale):
+    """Gauss-Newton on x / z, y / z with Huber weights beyond `scale`; returns the RMS error of the last round."""
+    rms = 1e9
+    for _ in range(rounds):
+        H, g = np.zeros((6, 6)), np.zeros(6)
+        J = np.zeros((2, 6))
+        total = 0.0
+        for n in range(len(points)):
+            X = np.empty(3)
+            for i in range(3):
+                X[i] = R[i, 0] * points[n, 0] + R[i, 1] * points[n, 1] + R[i, 2] * points[n, 2] + t[i]
+            if X[2] < 1e-6:
+                return 1e9
+            iz = 1.0 / X[2]
+            r0, r1 = X[0] * iz - seen[n, 0], X[1] * iz - seen[n, 1]
+            e = np.sqrt(r0 * r0 + r1 * r1)
+            total += e * e
+            w = 1.0 if e <= scale else scale / e
+            for k in range(2):
+                a = iz if k == 0 else 0.0
+                b = iz if k == 1 else 0.0
+                c = -X[k] * iz * iz
+                J[k, 0] = -b * X[2] + c * X[1]
+                J[k, 1] = a * X[2] - c * X[0]
+                J[k, 2] = -a * X[1] + b * X[0]
+                J[k, 3], J[k, 4], J[k, 5] = a, b, c
+            for i in range(6):
+                g[i] += w * (J[0, i] * r0 + J[1, i] * r1)
+                for j in range(6):
+                    H[i, j] += w * (J[0, i] * J[0, j] + J[1, i] * J[1, j])
+        rms = np.sqrt(total / (2 * len(points)))
+        if not solve_definite(H, g):
+            return 1e9
+        _move(so3.exp(-g[:3]), g, R, t)
+    return rms
+
+@njit(cache=True, nogil=True)
+def _all_poses(start, point, rays, good, target, most, rounds, focal, rotation, position, rms):
+    R, t, h, centre = np.empty((3, 3)), np.empty(3), np.empty(9), np.empty(2)
+    points, seen = np.empty((most, 3)), np.empty((most, 2))
+    for i in range(len(start) - 1):
+        rms[i] = 1e9
+        total = 0
+        for n in range(start[i], start[i + 1]):
+            total += good[n]
+        count, passed, wanted = 0, 0, min(most, total)
+        for n in range(start[i], start[i + 1]):
+            if good[n]:
+                if passed * wanted // max(total, 1) >= count and count < wanted:
+                    points[count] = target[point[n]]
+                    seen[count, 0], seen[count, 1] = rays[n, 0] / rays[n, 2], rays[n, 1] / rays[n, 2]
+                    count += 1
+                passed += 1
+        if count < 6:
+            continue
+        centre[0], centre[1] = points[:count, 0].mean(), points[:count, 1].mean()
+        if not _homography(points[:count], seen[:count], centre, h):
+            continue
+        _pose_from_homography(h, R, t)
+        for k in range(3):
+            t[k] -= R[k, 0] * centre[0] + R[k, 1] * centre[1]
+        rms[i] = focal * _refine(points[:count], seen[:count], R, t, rounds, 2.0 / focal)
+        for a in range(3):
+            position[i, a] = -(R[0, a] * t[0] + R[1, a] * t[1] + R[2, a] * t[2])
+            for b in range(3):
+                rotation[i, a, b] = R[b, a]
+
+def target_poses(stream: CornerStream, model: CameraModel, params: np.ndarray, target: np.ndarray) -> TargetPoses:
+    """Poses of the camera in the frame of the planar `target` (n, 3), image by image, from up to 48 corners each."""
+    rays, valid = model.unproject(params, stream.uv)
+    good = valid & (rays[:, 2] > SMALLEST_COSINE)
+    n = len(stream.stamps_ns)
+    rotation, position, rms = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), np.empty(n)
+    _all_poses(
+        stream.start, stream.point, rays, good, target, MOST_CORNERS, 5, float(params[0]), rotation, position, rms
+    )  # fmt: skip
+
+    return TargetPoses(rotation, position, rms < LARGEST_RMS_PX, rms)

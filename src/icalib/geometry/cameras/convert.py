@@ -1,0 +1,75 @@
+"""The same lens in another camera model, for programs that know only that one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icalib.errors import CalibrationError
+from icalib.geometry.cameras.base import CameraModel
+
+_GRID = (48, 32)  # pixels across and down, the image's borders included
+_MAX_STEPS = 50
+_MAX_HALVINGS = 20
+_SETTLED_PX = 1e-9  # a step that moves no pixel further than this is the last
+
+
+def fit_model(
+    source: CameraModel, params: np.ndarray, target: CameraModel, resolution: tuple[int, int]
+) -> tuple[np.ndarray, float, float]:
+    """Parameters of `target` that project like `source` with `params`, by least squares in pixels over the image.
+
+    A grid of pixels of the image of `resolution` (width, height) [px] is unprojected by `source` (pixels outside its
+    range have no ray and are left out) and projected by `target`, starting at the source's fx, fy, cx, cy without
+    distortion. Gauss-Newton with step halving, so that every ray stays inside the range of `target`: if the best fit
+    lies outside, the result is a worse one at its edge.
+
+    Returns the parameters (P,), and the root mean square and the maximum over the grid of the distance [px] between
+    the two projections of a ray: judge them, a model that cannot follow the lens is fitted as well as it can be.
+    Raises CalibrationError where the source sees too little of the image, or the target cannot see a ray at all.
+    """
+    uv, rays = _rays(source, np.asarray(params, float), resolution)
+    if 2 * len(uv) < len(target.parameter_names):
+        raise CalibrationError(
+            f"{source.name} with these parameters can see {len(uv)} of {_GRID[0] * _GRID[1]} pixels of the image, too "
+            f"few to fit {target.name}; check its parameters and the resolution {resolution[0]}x{resolution[1]}."
+        )
+    fitted = np.zeros(len(target.parameter_names))
+    fitted[:4] = params[:4]
+    unseen = int((~target.project(fitted, rays)[1]).sum())
+    if unseen:
+        raise CalibrationError(
+            f"{target.name} cannot see {unseen} of the {len(rays)} directions that {source.name} sees in this image, "
+            "90 degrees or more from the optical axis; choose a fisheye model."
+        )
+    fitted = _minimise(target, fitted, rays, uv)
+    distance = np.linalg.norm(target.project(fitted, rays)[0] - uv, axis=1)
+    return fitted, float(np.sqrt(np.mean(distance**2))), float(distance.max())
+
+
+def _rays(source: CameraModel, params: np.ndarray, resolution: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (N, 2) over the image and their rays (N, 3), where `source` has one."""
+    u, v = np.meshgrid(*(np.linspace(0.0, side - 1.0, count) for side, count in zip(resolution, _GRID, strict=True)))
+    uv = np.stack([u.ravel(), v.ravel()], axis=1)
+    rays, valid = source.unproject(params, uv)
+    return uv[valid], rays[valid]
+
+
+def _minimise(target: CameraModel, params: np.ndarray, rays: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Gauss-Newton from `params`, which can see all rays."""
+    for _ in range(_MAX_STEPS):
+        projected, _, _, j_params = target.project_with_jacobians(params, rays)
+        residual, J = (projected - uv).ravel(), j_params.reshape(2 * len(uv), -1)
+        scale = np.linalg.norm(J, axis=0)
+        scale[scale == 0.0] = 1.0  # a term without effect on these rays stays as it is
+        step = -np.linalg.lstsq(J / scale, residual, rcond=None)[0] / scale
+        for halvings in range(_MAX_HALVINGS):
+            trial = params + step * 0.5**halvings
+            moved, valid = target.project(trial, rays)
+            if valid.all() and np.sum((moved - uv) ** 2) < residual @ residual:
+                break
+        else:
+            return params
+        params = trial
+        if np.abs(J @ step).max() < _SETTLED_PX:
+            return params
+    return params
