@@ -20,7 +20,7 @@ from icalib.estimation.assembly import BOARD, Inputs, origin_difference
 from icalib.estimation.board import SHAPE_LABELS
 from icalib.estimation.corner_noise import NoiseModel
 from icalib.estimation.estimate import Estimate
-from icalib.estimation.evidence import Fit, fits, split_covariance
+from icalib.estimation.evidence import Fit, fits, place_covariances, split_covariance
 from icalib.estimation.imu_model import LABELS as IMU_LABELS
 from icalib.estimation.state import Block
 from icalib.geometry.cameras import camera_model
@@ -42,7 +42,7 @@ def assess(inputs: Inputs, found: Estimate) -> Calibration:
     problem, outcome = found.problem, found.outcome
     names = _column_names(inputs)
     seen = observe(problem, outcome.state, outcome.information, names)
-    empirical = split_covariance(problem, outcome, inputs.rig.settings.splits)
+    empirical = _empirical_variance(inputs, found, np.diag(seen.covariance))
     groups = _groups(inputs, found, seen, empirical)
     judged = [_sensor_fit(f, found) for f in fits(problem, outcome)]
     return Calibration(
@@ -54,9 +54,7 @@ def assess(inputs: Inputs, found: Estimate) -> Calibration:
         corner_residuals=_corner_residuals(found),
         imu_residuals=ImuResiduals(outcome.state.seconds[:-1], outcome.residuals.imu),
         trajectory=_trajectory(found),
-        iterations=tuple(
-            Iteration(n, s.cost, s.predicted_decrease, s.damping, s.accepted) for n, s in found.steps
-        ),
+        iterations=tuple(Iteration(n, s.cost, s.predicted_decrease, s.damping, s.accepted) for n, s in found.steps),
         converged=outcome.converged,
         status=outcome.status,
         warnings=tuple(_warnings(found, groups, judged, empirical)),
@@ -113,7 +111,7 @@ def _groups(
     inputs: Inputs, found: Estimate, seen: Observability, empirical: np.ndarray | None
 ) -> tuple[ParameterGroup, ...]:
     formal = np.sqrt(np.diag(seen.covariance))
-    ratio = np.ones(len(formal)) if empirical is None else np.sqrt(np.diag(empirical)) / formal
+    ratio = np.ones(len(formal)) if empirical is None else np.sqrt(empirical) / formal
     overall = float(np.sqrt(np.mean(_calibration_only(inputs, ratio) ** 2))) if len(ratio) else 1.0
     groups = []
     for block in inputs.layout.blocks:
@@ -140,6 +138,16 @@ def _groups(
             )
         )  # fmt: skip
     return tuple(groups)
+
+
+def _empirical_variance(inputs: Inputs, found: Estimate, formal: np.ndarray) -> np.ndarray | None:
+    """(B,) variances as the spread over parts of the recording shows them, plus what places in the image and on the
+    target show beyond white noise; None where the recording cannot be split."""
+    split = split_covariance(found.problem, found.outcome, inputs.rig.settings.splits)
+    if split is None:
+        return None
+    excess = [np.maximum(np.diag(V) - formal, 0.0) for V in place_covariances(found.problem, found.outcome)]
+    return np.diag(split) + sum(excess)
 
 
 def _calibration_only(inputs: Inputs, per_column: np.ndarray) -> np.ndarray:
@@ -177,7 +185,9 @@ def _trajectory(found: Estimate) -> Trajectory:
     return Trajectory(s.seconds, s.rotation, s.position, s.velocity, s.bias[:, :3], s.bias[:, 3:])
 
 
-def _warnings(found: Estimate, groups: tuple[ParameterGroup, ...], judged: list[SensorFit], empirical: np.ndarray | None):
+def _warnings(
+    found: Estimate, groups: tuple[ParameterGroup, ...], judged: list[SensorFit], empirical: np.ndarray | None
+):
     if not found.outcome.converged:
         yield f"the solver did not converge: {found.outcome.status}"
     for f in judged:

@@ -26,7 +26,9 @@ def main(arguments: list[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     from icalib import __version__
 
-    parser = argparse.ArgumentParser(prog="icalib", description="Calibrates cameras and an IMU jointly from one recording.")
+    parser = argparse.ArgumentParser(
+        prog="icalib", description="Calibrates cameras and an IMU jointly from one recording."
+    )
     parser.add_argument("--version", action="version", version=f"icalib {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     c = commands.add_parser("calibrate", help="calibrate the sensors of a rig from a recording")

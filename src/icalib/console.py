@@ -19,7 +19,13 @@ def progress_bar(quiet: bool) -> Iterator[Callable[[str, float], None]]:
     if quiet:
         yield lambda stage, done: None
         return
-    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn()
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("starting", total=1.0)
         yield lambda stage, done: bar.update(task, description=stage, completed=done)
@@ -32,7 +38,9 @@ def print_result(calibration: Calibration, folder: Path) -> None:
     for f in calibration.fits:
         ratio = f.chi2 / max(f.dof, 1.0)
         rms = f", {f.rms:.3f} {f.unit} RMS, {f.rejected} set aside" if f.rms is not None else ""
-        console.print(f"  {f.sensor} {f.kind}: chi^2 {ratio:.2f} per degree of freedom ({f.dof:.0f}){rms}", markup=False)
+        console.print(
+            f"  {f.sensor} {f.kind}: chi^2 {ratio:.2f} per degree of freedom ({f.dof:.0f}){rms}", markup=False
+        )
     for title, sentences in (
         ("Undetermined", calibration.undetermined),
         ("Warning", calibration.warnings),

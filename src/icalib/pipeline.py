@@ -40,9 +40,7 @@ def calibrate(
     return dataclasses.replace(result, inputs=inputs, timings=timings)
 
 
-def calibrate_measurements(
-    rig: Rig, measurements: Measurements, progress: Progress = lambda *_: None
-) -> Calibration:
+def calibrate_measurements(rig: Rig, measurements: Measurements, progress: Progress = lambda *_: None) -> Calibration:
     """As `calibrate`, from measurements in memory."""
     clock = _Clock()
     progress("finding a first guess", 0.1)
@@ -90,5 +88,3 @@ class _StepProgress:
     def note(self, name: str) -> None:
         self._done += 0.12 * (0.9 - self._done)
         self._progress(f"solving ({name} pass)", self._done)
-
-

@@ -69,7 +69,7 @@ def test_residuals_are_whitened_with_the_covariance_of_the_increments(factor, se
         P, J = np.empty((15, 15)), np.empty((9, 6))
         integrate(
             t[k], t[k + 1], first, imu.seconds, imu.gyro, imu.accel, setup.state.bias[k], factor.intrinsics0,
-            imu.variance, imu.walk, np.empty((3, 3)), np.empty(3), np.empty(3), J, P,
+            imu.variance, imu.walk, False, np.empty((3, 3)), np.empty(3), np.empty(3), J, P,
         )  # fmt: skip
         np.testing.assert_allclose(factor.W[k] @ P @ factor.W[k].T, np.eye(15), rtol=0, atol=1e-9)
         assert (np.triu(factor.W[k], 1) == 0).all()

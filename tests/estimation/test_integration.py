@@ -31,24 +31,35 @@ class Readings:
         return int(np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 2))
 
 
-def run(r, t0, t1, bias=BIAS, intrinsics=None, first=None, width=6, covariance=False):
+def run(r, t0, t1, bias=BIAS, intrinsics=None, first=None, width=6, covariance=False, linear=False):
     """R, v, p, J, P, and rate and force at the end."""
     R, v, p, J = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((9, width))
     P = np.empty((15, 15) if covariance else (0, 0))
     first = r.interval(t0) if first is None else first
     x = np.zeros(24) if intrinsics is None else intrinsics
-    end = integrate(t0, t1, first, r.t, r.gyro, r.accel, bias, x, r.variance, r.walk, R, v, p, J, P)
+    end = integrate(t0, t1, first, r.t, r.gyro, r.accel, bias, x, r.variance, r.walk, linear, R, v, p, J, P)
     return R, v, p, J, P, end
 
 
 def corrected_means(r, bias, intrinsics):
-    """Body rate and specific force (n - 1, 3) of each interval."""
+    """Body rate and specific force (n - 1, 3) of each interval, from the mean of its readings."""
+    return corrected(0.5 * (r.gyro[1:] + r.gyro[:-1]), 0.5 * (r.accel[1:] + r.accel[:-1]), bias, intrinsics)
+
+
+def corrected_at(r, t, bias, intrinsics):
+    """Body rate and specific force (3,) from the readings interpolated at t, those of the end beyond it."""
+    gyro, accel = (np.array([[np.interp(t, r.t, x) for x in y.T]]) for y in (r.gyro, r.accel))
+    w, f = corrected(gyro, accel, bias, intrinsics)
+    return w[0], f[0]
+
+
+def corrected(gyro, accel, bias, intrinsics):
     M_a, M_g = np.eye(3), np.eye(3)
     M_a[LOWER] += intrinsics[:6]
     M_g[LOWER] += intrinsics[6:12]
     C = Rotation.from_rotvec(intrinsics[12:15]).as_matrix()
-    f = np.linalg.solve(M_a, (0.5 * (r.accel[1:] + r.accel[:-1]) - bias[3:]).T).T
-    gyro = 0.5 * (r.gyro[1:] + r.gyro[:-1]) - bias[:3] - f @ intrinsics[15:].reshape(3, 3).T
+    f = np.linalg.solve(M_a, (accel - bias[3:]).T).T
+    gyro = gyro - bias[:3] - f @ intrinsics[15:].reshape(3, 3).T
     return np.linalg.solve(M_g @ C, gyro.T).T, f
 
 
@@ -58,15 +69,17 @@ def generator(w, f):
     return A
 
 
-def by_expm(r, t0, t1, bias=BIAS, intrinsics=None):
+def by_expm(r, t0, t1, bias=BIAS, intrinsics=None, linear=False):
     """The same increments as a product of matrix exponentials: [R v p; 0 1 t; 0 0 1]."""
-    w, f = corrected_means(r, bias, np.zeros(24) if intrinsics is None else intrinsics)
+    intrinsics = np.zeros(24) if intrinsics is None else intrinsics
+    w, f = corrected_means(r, bias, intrinsics)
     inner = r.t[1:-1]
     stops = [t0, *sorted(inner[(inner > min(t0, t1)) & (inner < max(t0, t1))], reverse=bool(t1 < t0)), t1]
     X = np.eye(5)
     for a, b in zip(stops[:-1], stops[1:], strict=True):
         j = r.interval(0.5 * (a + b))
-        X = X @ expm(generator(w[j], f[j]) * (b - a))
+        rate, force = corrected_at(r, 0.5 * (a + b), bias, intrinsics) if linear else (w[j], f[j])
+        X = X @ expm(generator(rate, force) * (b - a))
     return X[:3, :3], X[:3, 3], X[:3, 4]
 
 
@@ -94,10 +107,17 @@ SPANS = {
 
 @pytest.mark.parametrize("intrinsics", [None, INTRINSICS], ids=["ideal", "intrinsics"])
 @pytest.mark.parametrize("backwards", [False, True])
+@pytest.mark.parametrize("linear", [False, True])
 @pytest.mark.parametrize("span", SPANS)
-def test_increments_are_products_of_matrix_exponentials(span, backwards, intrinsics):
+def test_increments_are_products_of_matrix_exponentials(span, linear, backwards, intrinsics):
     t0, t1 = SPANS[span][::-1] if backwards else SPANS[span]
-    assert_same(run(R0, t0, t1, intrinsics=intrinsics), by_expm(R0, t0, t1, intrinsics=intrinsics), 1e-13)
+    options = {"intrinsics": intrinsics, "linear": linear}
+    assert_same(run(R0, t0, t1, **options), by_expm(R0, t0, t1, **options), 1e-13)
+
+
+def test_from_stamp_to_stamp_linear_readings_are_the_same_as_means():
+    t0, t1 = SPANS["stamp to stamp"]
+    assert_same(run(R0, t0, t1, linear=True), run(R0, t0, t1)[:3], 1e-15)
 
 
 @pytest.mark.parametrize("angle", ANGLES)
@@ -145,25 +165,30 @@ def test_starting_in_either_interval_at_a_stamp_is_the_same(backwards):
 
 
 @pytest.mark.parametrize("backwards", [False, True])
-def test_rate_and_force_at_the_end_are_those_of_the_last_interval(backwards):
+def test_rate_and_force_at_the_end_are_the_last_means_or_interpolated(backwards):
     t0, t1 = SPANS["between stamps"][::-1] if backwards else SPANS["between stamps"]
     w, f = corrected_means(R0, BIAS, INTRINSICS)
     rate, force = run(R0, t0, t1, intrinsics=INTRINSICS)[5]
     np.testing.assert_allclose(rate, w[R0.interval(t1)], atol=1e-14)
     np.testing.assert_allclose(force, f[R0.interval(t1)], atol=1e-13)
+    w, f = corrected_at(R0, t1, BIAS, INTRINSICS)
+    rate, force = run(R0, t0, t1, intrinsics=INTRINSICS, linear=True)[5]
+    np.testing.assert_allclose(rate, w, atol=1e-14)
+    np.testing.assert_allclose(force, f, atol=1e-13)
 
 
 @pytest.mark.parametrize("intrinsics", [np.zeros(24), INTRINSICS], ids=["ideal", "intrinsics"])
 @pytest.mark.parametrize("backwards", [False, True])
+@pytest.mark.parametrize("linear", [False, True])
 @pytest.mark.parametrize("span", ["between stamps", "stamp to stamp", "within one interval", "beyond both ends"])
-def test_jacobians_by_central_differences(span, backwards, intrinsics):
+def test_jacobians_by_central_differences(span, linear, backwards, intrinsics):
     t0, t1 = SPANS[span][::-1] if backwards else SPANS[span]
-    R, _, _, J, _, _ = run(R0, t0, t1, intrinsics=intrinsics, width=30)
+    R, _, _, J, _, _ = run(R0, t0, t1, intrinsics=intrinsics, width=30, linear=linear)
     h = 1e-5
     for n in range(30):
         d = h * np.eye(30)[n]
-        plus = run(R0, t0, t1, BIAS + d[:6], intrinsics + d[6:])
-        minus = run(R0, t0, t1, BIAS - d[:6], intrinsics - d[6:])
+        plus = run(R0, t0, t1, BIAS + d[:6], intrinsics + d[6:], linear=linear)
+        minus = run(R0, t0, t1, BIAS - d[:6], intrinsics - d[6:], linear=linear)
         np.testing.assert_allclose(J[:, n], difference(plus, minus, R, h), rtol=1e-7, atol=1e-9, err_msg=str(n))
 
 
@@ -200,11 +225,11 @@ def noise_columns(r, t0, t1, intrinsics):
 
     def moved(bias_of):
         # One interval after the other, each with its own bias, composed by hand.
-        X = np.eye(5)
+        steps = []
         for j in range(first, last + 1):
-            a, b = max(t0, r.t[j]), min(t1, r.t[j + 1])
             w, f = corrected_means(r, bias_of(j), intrinsics)
-            X = X @ expm(generator(w[j], f[j]) * (b - a))
+            steps.append(generator(w[j], f[j]) * (min(t1, r.t[j + 1]) - max(t0, r.t[j])))
+        X = np.linalg.multi_dot(expm(np.array(steps)))
         return X[:3, :3], X[:3, 3], X[:3, 4]
 
     for j in range(first, last + 1):
@@ -224,7 +249,7 @@ def noise_columns(r, t0, t1, intrinsics):
 
 @pytest.mark.parametrize("intrinsics", [np.zeros(24), INTRINSICS], ids=["ideal", "intrinsics"])
 def test_covariance_is_that_of_all_noises_one_by_one(intrinsics):
-    t0, t1 = SPANS["between stamps"]
+    t0, t1 = R0.t[1] + 1e-3, R0.t[5] + 2e-3
     P = run(R0, t0, t1, intrinsics=intrinsics, covariance=True)[4]
     C = noise_columns(R0, t0, t1, intrinsics)
     scale = np.sqrt(np.diag(P))

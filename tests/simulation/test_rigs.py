@@ -33,7 +33,9 @@ def test_rig_states_truth_and_noise():
 
 def test_settings_model_what_is_simulated():
     plain = settings_for(handheld())
-    assert (plain.bloom, plain.board_shape, plain.blur_noise, plain.common_error, plain.outlier_std > 0.0) == (False,) * 5
+    assert (plain.bloom, plain.board_shape, plain.blur_noise, plain.common_error, plain.outlier_std > 0.0) == (
+        False,
+    ) * 5
     scenario = replace(handheld(), bow=(1e-3, 0.0, 0.0), blur_s=1e-3, shift_px=0.1, outlier_fraction=0.01)
     scenario = replace(scenario, cameras=(replace(scenario.cameras[0], bloom_px=0.3), scenario.cameras[1]))
     full = settings_for(scenario)

@@ -148,10 +148,10 @@ def start_values(inputs: Inputs, guess_values: dict[Key, np.ndarray]) -> dict[Ke
     n_shape = inputs.layout.block(BOARD, "shape").size
     values[BOARD, "shape"] = np.zeros(n_shape)
     imu = inputs.rig.imu
-    values[imu.name, "intrinsics"] = np.zeros(N_INTRINSICS) if imu.intrinsics.value is None else imu.intrinsics.value.copy()
+    values[imu.name, "intrinsics"] = (
+        np.zeros(N_INTRINSICS) if imu.intrinsics.value is None else imu.intrinsics.value.copy()
+    )
     for camera in inputs.rig.cameras:
         bloom = camera.bloom.value if inputs.rig.settings.bloom else None
         values[camera.name, "bloom"] = np.zeros(1) if bloom is None else bloom.copy()
     return {key: np.ascontiguousarray(v, dtype=np.float64) for key, v in values.items()}
-
-

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from icalib.estimation.arrowhead import Piece
-from icalib.estimation.corner_kernels import accumulate, camera_points
+from icalib.estimation.corner_kernels import accumulate, accumulate_clusters, camera_points
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.poses import Poses, poses_at
 from icalib.estimation.state import NODE, Layout, State
@@ -143,12 +143,14 @@ class CornerFactor:
         whitened residuals, returns the quadratic form of the common errors' rows instead.
         """
         i0, i1 = self._images(piece)
+        chained, direct, pars = self._columns()
         poses, R_cw, p_wc = self.camera_poses(state, i0, i1)
         params = np.concatenate([state.values[self.name, "intrinsics"], state.values[self.name, "distortion"]])
         world = self.world_points(state)
-        chained, direct, pars = self._columns()
         empty = np.zeros((0, NODE, NODE))
-        targets = (piece.diagonal, piece.upper, piece.side, piece.border) if sums else (empty,) * 3 + (np.zeros((0, 0)),)
+        targets = (
+            (piece.diagonal, piece.upper, piece.side, piece.border) if sums else (empty,) * 3 + (np.zeros((0, 0)),)
+        )
         start, n = self.stream.start[i0 : i1 + 1], self.noise
         white, white_shared = noise or (out.residual, out.shared)
         settings = (
@@ -163,17 +165,40 @@ class CornerFactor:
             self.node[i0:i1], piece.first, chained, direct, *targets, out.residual, out.root, out.shared[i0:i1],
         )  # fmt: skip
         total = 0.0
-        for a in range(0, i1 - i0, CHUNK):
-            b = min(a + CHUNK, i1 - i0)
-            X = np.empty((start[b] - start[a], 3))
-            camera_points(a, b, start, self.stream.point, R_cw, p_wc, world, X)
-            if sums:
-                predicted, valid, Jp, Jpar = self.model.project_with_jacobians(params, X)
-            else:
-                predicted, valid = self.model.project(params, X)
-                Jp, Jpar = np.zeros((0, 2, 3)), np.zeros((0, 2, 0))
+        for a, b, X, predicted, valid, Jp, Jpar in self._chunks(start, R_cw, p_wc, world, params, sums):
             total += accumulate(a, b, start[a], *settings, predicted, valid, X, Jp, Jpar, *common)
         return total
+
+    def accumulate_clusters(
+        self, state: State, piece: Piece, at: CornerOutput, cluster: np.ndarray, n_clusters: int, column: int
+    ) -> None:
+        """Adds the gradient of each cluster of corners (N,), weights as in `at`, to columns of `piece` from `column` on."""
+        i0, i1 = self._images(piece)
+        chained, direct, pars = self._columns()
+        poses, R_cw, p_wc = self.camera_poses(state, i0, i1)
+        params = np.concatenate([state.values[self.name, "intrinsics"], state.values[self.name, "distortion"]])
+        start = self.stream.start[i0 : i1 + 1]
+        basis = self.basis @ state.values[self.target, "tilt"].T
+        for a, b, X, _, _, Jp, Jpar in self._chunks(start, R_cw, p_wc, self.world_points(state), params, True):
+            accumulate_clusters(
+                a, b, start[a], start, self.stream.point, cluster, n_clusters, column, at.residual, at.root, at.shared[i0:i1],
+                self.noise.field, self.direction, basis, pars, X, Jp, Jpar,
+                np.ascontiguousarray(state.values[self.name, "rotation"]), state.values[self.name, "translation"],
+                R_cw, p_wc, poses.rate, poses.velocity, poses.by_node, poses.by_next, poses.by_imu,
+                self.node[i0:i1], piece.first, chained, direct, piece.side, piece.border,
+            )  # fmt: skip
+
+    def _chunks(self, start, R_cw, p_wc, world, params, jacobians: bool):
+        """Images a..b by the chunk: their points in the camera, and what the model makes of them."""
+        n = len(start) - 1
+        for a in range(0, n, CHUNK):
+            b = min(a + CHUNK, n)
+            X = np.empty((start[b] - start[a], 3))
+            camera_points(a, b, start, self.stream.point, R_cw, p_wc, world, X)
+            if jacobians:
+                yield a, b, X, *self.model.project_with_jacobians(params, X)
+            else:
+                yield a, b, X, *self.model.project(params, X), np.zeros((0, 2, 3)), np.zeros((0, 2, 0))
 
     def _images(self, piece: Piece) -> tuple[int, int]:
         """The images that belong to `piece`: nodes from first to before last, the chain's very last node included."""

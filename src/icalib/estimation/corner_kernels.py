@@ -405,3 +405,47 @@ def accumulate(
             _add_side(Tm, G, D, Tc, cols_c, cols_d, side[k + 1])
         _add_border(G, D, Tc, cols_c, cols_d, border)
     return total
+
+
+@njit(cache=True, nogil=True)
+def accumulate_clusters(
+    i0, i1, o, start, point, cluster, n_clusters, column, residual, root_all, shared, field, direction, basis, pars,
+    X, Jp, Jpar, R_ic, p_ic, R_cw, p_wc, rate, vel, Jn, Jm, Jx, node, first, cols_c, cols_d, side, border,
+):  # fmt: skip
+    """Gradients of images i0..i1 by cluster of corners, into columns `column` and on of side and border."""
+    most = 0
+    for i in range(i0, i1):
+        most = max(most, start[i + 1] - start[i])
+    has_bloom = 1 if direction.shape[0] > 0 else 0
+    D = 6 + len(pars) + has_bloom + basis.shape[1]
+    A, error = np.empty((D + 1, 2 * most)), np.empty((most, 2))
+    Tn, Tm, Tc = np.empty((6, 15)), np.empty((6, 15 if Jm.shape[0] else 0)), np.empty((6, 9 + Jx.shape[2]))
+    G = np.empty((D, n_clusters))
+    for i in range(i0, i1):
+        n0, n1 = start[i], start[i + 1]
+        n = n1 - n0
+        _whole_error(residual[n0:n1], field[n0:n1], shared[i], error)
+        _fill_rows(
+            o, n0, n1, error, root_all[n0:n1], 1.0, 0, 1.0, False, X, Jp, Jpar, pars, has_bloom, direction, basis, point,
+            R_cw[i], A,
+        )  # fmt: skip
+        G[:] = 0.0
+        for k in range(n):
+            for d in range(D):
+                G[d, cluster[n0 + k]] += A[d, k] * A[D, k] + A[d, n + k] * A[D, n + k]
+        next_by = Jm[i] if Jm.shape[0] else Jn[i]
+        _chain(R_ic, p_ic, R_cw[i], p_wc[i], rate[i], vel[i], Jn[i], next_by, Jx[i], Tn, Tm, Tc)
+        k = node[i] - first
+        for g in range(n_clusters):
+            for d in range(6):
+                f = G[d, g]
+                for a in range(15):
+                    side[k, a, column + g] += Tn[d, a] * f
+                for a in range(Tm.shape[1]):
+                    side[k + 1, a, column + g] += Tm[d, a] * f
+                for a in range(len(cols_c)):
+                    if cols_c[a] >= 0:
+                        border[cols_c[a], column + g] += Tc[d, a] * f
+            for a in range(len(cols_d)):
+                if cols_d[a] >= 0:
+                    border[cols_d[a], column + g] += G[6 + a, g]

@@ -36,7 +36,9 @@ class NoiseModel:
     exposure: float = 0.0
     tau: tuple[float, ...] = ()
 
-    def noise(self, stream: CornerStream, camera: Camera, settings: Settings, speed: np.ndarray | None = None) -> CornerNoise:
+    def noise(
+        self, stream: CornerStream, camera: Camera, settings: Settings, speed: np.ndarray | None = None
+    ) -> CornerNoise:
         """What the corner factor needs; speed (M,) px/s of each image."""
         blur = 0.0 if speed is None else self.exposure * speed
         sigma = np.hypot(self.base, np.broadcast_to(blur, stream.stamps_ns.shape))
@@ -73,7 +75,12 @@ def image_mean(stream: CornerStream, x: np.ndarray, keep: np.ndarray) -> np.ndar
 
 
 def estimate_noise(
-    camera: Camera, settings: Settings, factor: CornerFactor, out: CornerOutput, speed: np.ndarray, tau: tuple[float, ...]
+    camera: Camera,
+    settings: Settings,
+    factor: CornerFactor,
+    out: CornerOutput,
+    speed: np.ndarray,
+    tau: tuple[float, ...],
 ) -> NoiseModel:
     """The noise that the residuals of a pass show, with `tau` for its common errors. A size given in the rig file is kept."""
     stream, used = factor.stream, out.root > 0.0
@@ -96,7 +103,8 @@ def scale_common_errors(tau: tuple[float, ...], fits: list[Fit]) -> tuple[float,
     fits: those of one camera's common errors, in order.
     """
     return tuple(
-        float(np.clip(t * np.sqrt(f.chi2 / max(f.dof, 1.0)), SMALLEST_PX, LARGEST_PX)) for t, f in zip(tau, fits, strict=True)
+        float(np.clip(t * np.sqrt(f.chi2 / max(f.dof, 1.0)), SMALLEST_PX, LARGEST_PX))
+        for t, f in zip(tau, fits, strict=True)
     )
 
 

@@ -57,7 +57,10 @@ def estimate(inputs: Inputs, state: State, on_step: Callable[[str, Step], None] 
         if last:
             return Estimate(problem, outcome, tuple(models), tuple(history))
         if name == "first":
-            keep = [_inliers(f, out, rig.settings) for f, out in zip(problem.cameras, outcome.residuals.corners, strict=True)]
+            keep = [
+                _inliers(f, out, rig.settings)
+                for f, out in zip(problem.cameras, outcome.residuals.corners, strict=True)
+            ]
         if _noise_is_estimated(inputs):
             models, noise = _next_noise(inputs, problem, outcome)
         state = resample(outcome.state, nodes_for(inputs, image_times(inputs, outcome.state.values)), inputs)
@@ -87,7 +90,9 @@ def pass_names(inputs: Inputs) -> tuple[str, ...]:
     """The passes: nodes and assignment are made anew once; noise that is estimated takes more."""
     if not _noise_is_estimated(inputs):
         return ("first", "final")
-    return ("first", "noise", "noise again", "final") if inputs.rig.settings.common_error else ("first", "noise", "final")
+    return (
+        ("first", "noise", "noise again", "final") if inputs.rig.settings.common_error else ("first", "noise", "final")
+    )
 
 
 def _inliers(factor: CornerFactor, out: CornerOutput, settings: Settings) -> np.ndarray:

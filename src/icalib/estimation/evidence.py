@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,8 @@ from icalib.estimation.solver import Outcome
 from icalib.estimation.state import State
 
 PROBES = 2  # random right-hand sides; one already gives the dof of 1e5 residuals to 1 %
+IMAGE_CELLS = (4, 3)  # columns, rows
+TARGET_PARTS = 3  # along each side
 PROBE_STEP = 1e-2  # of a posterior sample: small enough to be linear
 IMU_ROWS = {"gyroscope": slice(0, 3), "accelerometer": slice(3, 9), "bias walk": slice(9, ROWS)}
 
@@ -86,7 +89,9 @@ def _probe(problem: Problem, outcome: Outcome, rng: np.random.Generator) -> dict
     in_parallel(add, pieces)
     solution = solve(pieces, problem.n_nodes, problem.tolerance)
     # The sums hold J^T e where a solve expects J^T r: the step is -x.
-    up, down = (_residuals_at(problem, state, -s * solution.chain, -s * solution.border) for s in (PROBE_STEP, -PROBE_STEP))
+    up, down = (
+        _residuals_at(problem, state, -s * solution.chain, -s * solution.border) for s in (PROBE_STEP, -PROBE_STEP)
+    )
     slope_imu = (up.imu - down.imu) / (2.0 * PROBE_STEP)
     spent = {(problem.imu.imu.name, k): float((imu_noise[:, r] * slope_imu[:, r]).sum()) for k, r in IMU_ROWS.items()}
     for camera, at, u, d, n in zip(problem.cameras, base.corners, up.corners, down.corners, noise, strict=True):
@@ -151,7 +156,54 @@ def split_covariance(problem: Problem, outcome: Outcome, segments: int) -> np.nd
     if len(found) < segments:
         return None
     b = np.array(found)
-    b -= b.mean(axis=0)
+    return segments / (segments - 1.0) * _spread(problem, outcome, b - b.mean(axis=0))
+
+
+def place_covariances(problem: Problem, outcome: Outcome) -> list[np.ndarray]:
+    """(B, B) covariances as the spread over places shows them: cells of each image, and parts of the target.
+
+    Errors that stay with a place (a lens that the model cannot follow, a target that is not as drawn) are the same in all
+    parts of a recording, and splitting it in time does not see them. The corners of a place are a cluster, whose gradient
+    would be zero but for noise; the IMU is one more.
+    """
+    return [_cluster_spread(problem, outcome, by) for by in (_image_cells, _target_parts)]
+
+
+def _image_cells(camera: CornerFactor, index: int) -> np.ndarray:
+    """(N,) cell of the image, cameras apart."""
+    columns, rows = IMAGE_CELLS
+    uv = camera.stream.uv
+    low, high = uv.min(axis=0), uv.max(axis=0) + 1e-9
+    cell = ((uv - low) / (high - low) * IMAGE_CELLS).astype(int)
+    return (index * rows + cell[:, 1]) * columns + cell[:, 0]
+
+
+def _target_parts(camera: CornerFactor, index: int) -> np.ndarray:
+    """(N,) part of the target, the same for all cameras."""
+    del index
+    xy = camera.points[:, :2]
+    low, high = xy.min(axis=0), xy.max(axis=0) + 1e-9
+    part = ((xy - low) / (high - low) * TARGET_PARTS).astype(int)
+    return (part[:, 1] * TARGET_PARTS + part[:, 0])[camera.stream.point]
+
+
+def _cluster_spread(problem: Problem, outcome: Outcome, by: Callable[[CornerFactor, int], np.ndarray]) -> np.ndarray:
+    clusters = [by(c, k) for k, c in enumerate(problem.cameras)]
+    n, B = 1 + max(int(c.max()) for c in clusters), problem.layout.size
+    piece = Piece.zeros(0, problem.n_nodes - 1, B + n)
+    narrow = problem.narrow(piece, B)
+    problem.add_measurements(outcome.state, narrow, problem.residuals())
+    problem.add_bias_prior(outcome.state, narrow)
+    piece.side[:, :, :B] = narrow.side[:, :, :B]
+    piece.border[:B, :B] = narrow.border[:B, :B]
+    for camera, at, cluster in zip(problem.cameras, outcome.residuals.corners, clusters, strict=True):
+        camera.accumulate_clusters(outcome.state, piece, at, cluster, n, B)
+    b = marginalise(piece)[:B, B : B + n].T
+    return _spread(problem, outcome, np.vstack([b, -b.sum(axis=0)]))
+
+
+def _spread(problem: Problem, outcome: Outcome, b: np.ndarray) -> np.ndarray:
+    """S^-1 (sum b_g b_g^T) S^-1 for gradients b (G, B)."""
     t = problem.tolerance
     half = t[:, None] * (np.linalg.pinv(outcome.information * t[:, None] * t, hermitian=True) @ (t[:, None] * b.T))
-    return segments / (segments - 1.0) * half @ half.T
+    return half @ half.T

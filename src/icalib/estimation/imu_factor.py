@@ -259,7 +259,13 @@ class ImuFactor:
         """Preintegrates all intervals at the biases and intrinsics of `state`."""
         n = len(state.seconds) - 1
         width = 6 + len(columns)
-        arrays = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 9, width)), np.empty((n, ROWS, ROWS))
+        arrays = (
+            np.empty((n, 3, 3)),
+            np.empty((n, 3)),
+            np.empty((n, 3)),
+            np.empty((n, 9, width)),
+            np.empty((n, ROWS, ROWS)),
+        )
         bias0 = state.bias.copy()
         intrinsics = state.values[imu.name, "intrinsics"].copy()
         first = imu.interval(state.seconds[:-1])
@@ -281,7 +287,9 @@ class ImuFactor:
         `noise` (K - 1, 15) stands in for the whitened residuals where given. Returns half the chi^2.
         """
         empty = np.zeros((0, ROWS, ROWS))
-        targets = (piece.diagonal, piece.upper, piece.side, piece.border) if sums else (empty,) * 3 + (np.zeros((0, 0)),)
+        targets = (
+            (piece.diagonal, piece.upper, piece.side, piece.border) if sums else (empty,) * 3 + (np.zeros((0, 0)),)
+        )
         dx = state.values[self.imu.name, "intrinsics"] - self.intrinsics0 if len(self.columns) else np.zeros(0)
         return _accumulate(
             piece.first, piece.last, state.rotation, state.position, state.velocity, state.bias, state.seconds,

@@ -74,3 +74,9 @@ class Problem:
         for prior in self.priors:
             prior.accumulate(state, piece, residual=np.zeros(len(prior.sigma)))
         accumulate_bias_prior(state, piece, met=True)
+
+    @staticmethod
+    def narrow(piece: Piece, n_border: int) -> Piece:
+        """A piece over the same chain blocks with a border of its own, `n_border` wide."""
+        own = Piece.zeros(piece.first, piece.last, n_border)
+        return Piece(piece.first, piece.last, piece.diagonal, piece.upper, own.side, own.border)

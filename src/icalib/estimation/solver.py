@@ -45,7 +45,10 @@ class Outcome:
 
 
 def minimise(
-    problem: Problem, state: State, on_step: Callable[[Step], None] = lambda _: None, tolerance: float = CONVERGED_DECREASE
+    problem: Problem,
+    state: State,
+    on_step: Callable[[Step], None] = lambda _: None,
+    tolerance: float = CONVERGED_DECREASE,
 ) -> Outcome:
     """Minimises `problem` from `state` until half the chi^2 can fall by less than `tolerance`.
 
@@ -56,7 +59,9 @@ def minimise(
     damping, curved, curved_below, steps = 0.0, False, CURVED_BELOW, []
     for _ in range(MAX_ITERATIONS):
         if not np.isfinite(cost):
-            raise EstimationError("the first guess predicts no finite measurement; give a better guess in the rig file.")
+            raise EstimationError(
+                "the first guess predicts no finite measurement; give a better guess in the rig file."
+            )
         solution, damping = _solve(problem, state, pieces, residuals, damping, curved)
         candidate = state.retract(problem.layout, solution.chain, solution.border)
         settled = solution.decrease < curved_below * cost

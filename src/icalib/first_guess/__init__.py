@@ -61,7 +61,9 @@ def initial_guess(rig: Rig, measurements: Measurements) -> Guess:
         target_poses(s, camera_model(c.model), p, rig.target.points)
         for c, s, p in zip(rig.cameras, measurements.cameras, params, strict=True)
     ]
-    aligned = [_align(c, s, q, imu, measurements) for c, s, q in zip(rig.cameras, measurements.cameras, poses, strict=True)]
+    aligned = [
+        _align(c, s, q, imu, measurements) for c, s, q in zip(rig.cameras, measurements.cameras, poses, strict=True)
+    ]
     best = int(np.argmax([q.ok.sum() for q in poses]))
     gyro_bias = aligned[best].gyro_bias
     gyro = GyroRotation.integrate(imu, gyro_bias)
@@ -87,7 +89,9 @@ def _params(camera: Camera, stream: CornerStream, rig: Rig) -> np.ndarray:
     return np.concatenate([found[:4] if given[0] is None else given[0], found[4:] if given[1] is None else given[1]])
 
 
-def _align(camera: Camera, stream: CornerStream, poses: TargetPoses, imu: ImuData, measurements: Measurements) -> Alignment:
+def _align(
+    camera: Camera, stream: CornerStream, poses: TargetPoses, imu: ImuData, measurements: Measurements
+) -> Alignment:
     given = camera.time_offset.value
     apart = (stream.origin_ns - measurements.imu.origin_ns) * 1e-9
     found = align(imu, camera.name, camera_rates(stream, poses), None if given is None else float(given[0]) + apart)

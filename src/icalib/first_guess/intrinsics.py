@@ -110,5 +110,3 @@ def _sums(stream, model, params, target, free, R, p, used):
         g += (B * w2).T @ r.ravel() - C.T @ H_inv @ gp
         parts[i] = H_inv, C, gp
     return cost, S, g, parts
-
-

@@ -34,7 +34,12 @@ class LeverArm:
 
 
 def lever_arm(
-    imu: ImuData, times: np.ndarray, poses: TargetPoses, R_imu_cam: np.ndarray, gyro: GyroRotation, given: np.ndarray | None
+    imu: ImuData,
+    times: np.ndarray,
+    poses: TargetPoses,
+    R_imu_cam: np.ndarray,
+    gyro: GyroRotation,
+    given: np.ndarray | None,
 ) -> LeverArm:
     """Solves for one camera; times (M,) of its images on the imu clock. `given` holds the lever arm where it is known.
 

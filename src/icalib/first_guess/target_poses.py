@@ -17,6 +17,7 @@ FEWEST_CORNERS = 6
 SMALLEST_COSINE = 0.15  # rays closer to the image plane than this have no place in a homography
 LARGEST_RMS_PX = 3.0
 
+
 @dataclass(frozen=True)
 class TargetPoses:
     """Camera poses in the board frame: R_board_cam (M, 3, 3), p_board_cam (M, 3); ok (M,) bool; rms_px (M,)."""
@@ -25,6 +26,7 @@ class TargetPoses:
     position: np.ndarray
     ok: np.ndarray
     rms_px: np.ndarray
+
 
 @njit(cache=True, nogil=True)
 def _homography(points, seen, centre, h):
@@ -49,6 +51,7 @@ def _homography(points, seen, centre, h):
     h[8] = 1.0
     return True
 
+
 @njit(cache=True, nogil=True)
 def _pose_from_homography(h, R, t):
     """R_cam_board and the position of the homography's centre in the camera, from columns of equal length."""
@@ -72,11 +75,13 @@ def _pose_from_homography(h, R, t):
         R[i, 0], R[i, 1] = a[i], b[i]
         R[i, 2] = a[j] * b[k] - a[k] * b[j]
 
+
 @njit(cache=True, nogil=True)
 def _normalise(v):
     n = np.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2)
     for i in range(3):
         v[i] /= n
+
 
 @njit(cache=True, nogil=True)
 def _move(turn, g, R, t):
@@ -125,6 +130,7 @@ def _refine(points, seen, R, t, rounds, scale):
         _move(so3.exp(-g[:3]), g, R, t)
     return rms
 
+
 @njit(cache=True, nogil=True)
 def _all_poses(start, point, rays, good, target, most, rounds, focal, rotation, position, rms):
     R, t, h, centre = np.empty((3, 3)), np.empty(3), np.empty(9), np.empty(2)
@@ -155,6 +161,7 @@ def _all_poses(start, point, rays, good, target, most, rounds, focal, rotation, 
             position[i, a] = -(R[0, a] * t[0] + R[1, a] * t[1] + R[2, a] * t[2])
             for b in range(3):
                 rotation[i, a, b] = R[b, a]
+
 
 def target_poses(stream: CornerStream, model: CameraModel, params: np.ndarray, target: np.ndarray) -> TargetPoses:
     """Poses of the camera in the frame of the planar `target` (n, 3), image by image, from up to 48 corners each."""

@@ -52,7 +52,9 @@ def camera_rates(stream: CornerStream, poses: TargetPoses) -> CameraRates:
     near = t[b] - t[a] <= LONGEST_STEP_S
     a, b = a[near], b[near]
     if len(a) < 20:
-        raise EstimationError(f"{stream.name}: too few neighbouring images show the target; record for at least ten seconds.")
+        raise EstimationError(
+            f"{stream.name}: too few neighbouring images show the target; record for at least ten seconds."
+        )
     turn = so3.log_many(np.ascontiguousarray(poses.rotation[a].transpose(0, 2, 1) @ poses.rotation[b]))
     return CameraRates(t[a], t[b], turn / (t[b] - t[a])[:, None])
 
@@ -168,5 +170,7 @@ def _check_scale(imu: ImuData, name: str, rates: CameraRates, found: Alignment) 
     ratio = float(np.median(np.linalg.norm(gyro, axis=1)) / max(np.median(np.linalg.norm(rates.rate, axis=1)), 1e-9))
     if 0.8 < ratio < 1.25:
         return
-    cause = "its angular rate looks like deg/s; convert it to rad/s" if 0.8 < ratio / DEGREES < 1.25 else "check its units"
+    cause = (
+        "its angular rate looks like deg/s; convert it to rad/s" if 0.8 < ratio / DEGREES < 1.25 else "check its units"
+    )
     raise EstimationError(f"{imu.name} turns {ratio:.3g} times as fast as {name}: {cause}.")

@@ -47,9 +47,7 @@ class DeadReckoning:
         n = len(t)
         Q, first, second = np.empty((n, 3, 3)), np.empty((n, 3, 4)), np.empty((n, 3, 4))
         k = np.clip(np.searchsorted(self.seconds, t, side="right") - 1, 0, len(self.seconds) - 2)
-        _sample(
-            t, k, self.seconds, self.gyro, self.rotation, self.force, self.first, self.second, Q, first, second
-        )
+        _sample(t, k, self.seconds, self.gyro, self.rotation, self.force, self.first, self.second, Q, first, second)
         return Q, first, second
 
 
@@ -99,6 +97,4 @@ def _sample(t, interval, seconds, gyro, rotation, force, first, second, Q, first
             for j in range(4):
                 a, slope = force[k, i, j], (force[k + 1, i, j] - force[k, i, j]) / dt
                 first_at[n, i, j] = first[k, i, j] + into * (a + 0.5 * into * slope)
-                second_at[n, i, j] = second[k, i, j] + into * (
-                    first[k, i, j] + into * (0.5 * a + into * slope / 6.0)
-                )
+                second_at[n, i, j] = second[k, i, j] + into * (first[k, i, j] + into * (0.5 * a + into * slope / 6.0))
