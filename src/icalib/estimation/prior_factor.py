@@ -42,9 +42,14 @@ class Prior:
         return 0.5 * float(r @ r)
 
 
-def accumulate_bias_prior(state: State, piece: Piece, sums: bool = True, met: bool = False) -> float:
-    """The broad prior on the first node's biases, about zero (`met`: as if they were zero); returns half its chi^2."""
-    r = np.zeros(6) if met else state.bias[0] / FIRST_BIAS_SIGMA
+def accumulate_bias_prior(
+    state: State, piece: Piece, sums: bool = True, met: bool = False, centre: np.ndarray | None = None
+) -> float:
+    """The broad prior on the first node's biases, about `centre` (6,) or zero (`met`: as if they were there).
+
+    Returns half its chi^2.
+    """
+    r = np.zeros(6) if met else (state.bias[0] - (0.0 if centre is None else centre)) / FIRST_BIAS_SIGMA
     if sums:
         index = np.arange(9, 15)
         piece.diagonal[0, index, index] += 1.0 / FIRST_BIAS_SIGMA**2

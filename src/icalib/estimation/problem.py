@@ -66,8 +66,8 @@ class Problem:
         return cost
 
     def add_bias_prior(self, state: State, piece: Piece, sums: bool = True) -> float:
-        """Adds the broad prior on the biases of the chain's first node; returns half its chi^2."""
-        return accumulate_bias_prior(state, piece, sums) if piece.first == 0 else 0.0
+        """Adds the broad prior on the biases of the chain's first node, about those that the pass started from."""
+        return accumulate_bias_prior(state, piece, sums, centre=self.imu.bias0[0]) if piece.first == 0 else 0.0
 
     def add_prior_information(self, piece: Piece, state: State) -> None:
         """Adds the priors as if they were met exactly: their information, no gradient."""

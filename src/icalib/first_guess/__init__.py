@@ -11,7 +11,7 @@ from icalib.geometry.cameras import camera_model
 from icalib.first_guess.clocks import Alignment, align, camera_rates
 from icalib.first_guess.gyro import GyroRotation
 from icalib.first_guess.intrinsics import guess_intrinsics
-from icalib.first_guess.lever_arm import LeverArm, check_gravity, lever_arm
+from icalib.first_guess.lever_arm import LeverArm, check_gravity, check_size, lever_arm
 from icalib.first_guess.target_poses import TargetPoses, target_poses
 from icalib.measurements import CornerStream, Measurements
 from icalib.rig import Camera, Rig
@@ -73,6 +73,8 @@ def initial_guess(rig: Rig, measurements: Measurements) -> Guess:
     ]
     gravity = arms[best].gravity
     check_gravity(float(np.linalg.norm(gravity)), rig.gravity, rig.imu.name)
+    for c, m in zip(rig.cameras, arms, strict=True):
+        check_size(m, c.name)
     cameras = {
         c.name: CameraGuess(p, a.offset, a.rotation, m.position, q)
         for c, p, a, m, q in zip(rig.cameras, params, aligned, arms, poses, strict=True)

@@ -22,15 +22,19 @@ STEP_S = 0.12  # between the images of a triple: long against pose noise, short 
 BIAS_SIGMA = 0.3  # m/s^2
 ROW_SIGMA = 0.05  # m/s, of a row of the system
 G_TOLERANCE = 0.1
+SIZE_TOLERANCE = 0.15  # of the target, as the accelerometer shows it
 
 
 @dataclass(frozen=True)
 class LeverArm:
-    """p_imu_cam (3,) m; gravity (3,) in board axes, m/s^2; accel_bias (3,) m/s^2."""
+    """p_imu_cam (3,) m; gravity (3,) in board axes, m/s^2; accel_bias (3,) m/s^2; true size of the target over the one
+    given, with its standard deviation."""
 
     position: np.ndarray
     gravity: np.ndarray
     accel_bias: np.ndarray
+    size: float
+    size_std: float
 
 
 def lever_arm(
@@ -67,7 +71,7 @@ def lever_arm(
         rhs = rhs - rows[:, :, 0:3] @ given
         rows[:, :, 0:3] = 0.0
     x = _solve(rows, rhs)
-    return LeverArm(x[0:3] if given is None else given, x[3:6], x[6:9])
+    return LeverArm(x[0:3] if given is None else given, x[3:6], x[6:9], *_target_size(rows, rhs, second(p)))
 
 
 def _solve(rows: np.ndarray, rhs: np.ndarray) -> np.ndarray:
@@ -82,6 +86,16 @@ def _solve(rows: np.ndarray, rhs: np.ndarray) -> np.ndarray:
         size = np.linalg.norm(rhs - rows @ x, axis=1)
         weight = (size < 4.0 * np.median(size) + 1e-9).astype(float)
     return x
+
+
+def _target_size(rows: np.ndarray, rhs: np.ndarray, moved: np.ndarray) -> tuple[float, float]:
+    """Factor on the camera's positions that the accelerometer asks for, and its standard deviation."""
+    A = np.concatenate([rows, -moved[:, :, None]], axis=2).reshape(-1, 10)
+    b = rhs.ravel()
+    information = A.T @ A + 1e-9 * np.eye(10)
+    x = np.linalg.solve(information, A.T @ b)
+    variance = np.mean((b - A @ x) ** 2)
+    return 1.0 + float(x[9]), float(np.sqrt(variance * np.linalg.inv(information)[9, 9]))
 
 
 def _triples(t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -110,6 +124,15 @@ def _double_integrals(
     tau = (t - s[j])[:, None]
     out = second[j] + first[j] * tau + 0.5 * x[j] * tau**2
     return out[:, :3], out[:, 3:].reshape(-1, 3, 3)
+
+
+def check_size(arm: LeverArm, camera: str) -> None:
+    """Raises EstimationError where the accelerometer contradicts the size of the target."""
+    if abs(arm.size - 1.0) > max(SIZE_TOLERANCE, 5.0 * arm.size_std):
+        raise EstimationError(
+            f"{camera}: by the accelerometer the target is {arm.size:.2f} +- {arm.size_std:.2f} times the size that the rig "
+            "file says; check tag_size (in metres) and tag_spacing (gap over tag_size)."
+        )
 
 
 def check_gravity(measured: float, expected: float, imu: str) -> None:

@@ -1,0 +1,151 @@
+"""The first guess from nothing: near enough for the solver, or one sentence that says why not."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from icalib.errors import EstimationError
+from icalib.first_guess import initial_guess, initial_trajectory
+from icalib.measurements import ImuStream, Measurements
+from icalib.rig import Parameter, Rig
+from icalib.simulation import Motion, Simulation, handheld, rig_for, simulate
+
+
+def angle_deg(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.rad2deg(np.arccos(np.clip((np.trace(a.T @ b) - 1.0) / 2.0, -1.0, 1.0))))
+
+
+@pytest.fixture(scope="module")
+def simulation() -> Simulation:
+    return simulate(handheld(20.0, asynchronous=True, exact=False), 3)
+
+
+def shifted(measurements: Measurements, seconds: float) -> Measurements:
+    imu = measurements.imu
+    return dataclasses.replace(
+        measurements, imu=dataclasses.replace(imu, stamps_ns=imu.stamps_ns + np.int64(round(seconds * 1e9)))
+    )
+
+
+def raw_offset(guess, measurements: Measurements, name: str) -> float:
+    stream = next(c for c in measurements.cameras if c.name == name)
+    return guess.cameras[name].offset - (stream.origin_ns - measurements.imu.origin_ns) * 1e-9
+
+
+@pytest.mark.parametrize("free", [False, True])
+def test_everything_is_found_from_nothing(simulation: Simulation, free: bool):
+    rig = rig_for(simulation.scenario, intrinsics="free" if free else "fixed", distortion="free" if free else "fixed")
+    guess = initial_guess(rig, simulation.measurements)
+    truth = simulation.truth
+    for name, camera in guess.cameras.items():
+        T = truth.T_imu_cam[name]
+        assert angle_deg(T[:3, :3], camera.rotation) < (1.5 if free else 0.6)
+        assert np.linalg.norm(T[:3, 3] - camera.position) < (0.05 if free else 0.02)
+        assert raw_offset(guess, simulation.measurements, name) == pytest.approx(truth.time_offset[name], abs=5e-4)
+        if free:
+            assert camera.params[:4] == pytest.approx(np.array(truth.intrinsics[name]), abs=8.0)
+    up = guess.R_world_board.T @ np.array([0.0, 0.0, 1.0])
+    true_up = truth.T_world_board[:3, :3].T @ np.array([0.0, 0.0, 1.0])
+    assert np.rad2deg(np.arccos(up @ true_up)) < 1.0
+
+
+def test_intrinsics_of_a_fisheye_are_found():
+    scenario = handheld(12.0)
+    fisheye = tuple(
+        dataclasses.replace(
+            c, model="pinhole-equidistant", intrinsics=(300.0, 299.0, 371.0, 245.0), distortion=(-0.01, 0.02, -0.01, 0.002)
+        )
+        for c in scenario.cameras
+    )
+    simulation = simulate(dataclasses.replace(scenario, cameras=fisheye), 1)
+    guess = initial_guess(rig_for(simulation.scenario, intrinsics="free", distortion="free"), simulation.measurements)
+    for camera in guess.cameras.values():
+        assert camera.params[:4] == pytest.approx([300.0, 299.0, 371.0, 245.0], abs=4.0)
+
+
+@pytest.mark.parametrize("seconds", [0.037, 1000.037, -5.0])
+def test_a_shifted_clock_shifts_the_offset_alone(simulation: Simulation, seconds: float):
+    rig = rig_for(simulation.scenario)
+    plain = initial_guess(rig, simulation.measurements)
+    moved = initial_guess(rig, shifted(simulation.measurements, seconds))
+    for name in plain.cameras:
+        before = raw_offset(plain, simulation.measurements, name)
+        after = raw_offset(moved, shifted(simulation.measurements, seconds), name)
+        assert after - before == pytest.approx(seconds, abs=1e-6)
+
+
+def test_the_trajectory_follows_the_truth(simulation: Simulation):
+    rig = rig_for(simulation.scenario)
+    guess = initial_guess(rig, simulation.measurements)
+    nodes = np.linspace(1.0, 19.0, 100)
+    rotation, position, velocity = initial_trajectory(guess, rig, simulation.measurements, nodes)
+    apart = (simulation.measurements.imu.origin_ns - simulation.scenario.imu_clock_origin_ns) * 1e-9
+    R, p, v = simulation.truth.pose_at(nodes + apart)
+    # The guess's world differs from the truth's by a turn about gravity and a shift.
+    turn = R[0] @ rotation[0].T
+    assert max(angle_deg(turn @ a, b) for a, b in zip(rotation, R, strict=True)) < 2.0
+    moved = position @ turn.T
+    assert np.linalg.norm((moved - moved[0]) - (p - p[0]), axis=1).max() < 0.05
+    assert np.median(np.linalg.norm(velocity @ turn.T - v, axis=1)) < 0.1
+
+
+def test_what_the_rig_gives_is_used(simulation: Simulation):
+    rig = rig_for(simulation.scenario, rotation="start", translation="start", time_offset="start")
+    guess = initial_guess(rig, simulation.measurements)
+    for camera in rig.cameras:
+        assert np.array_equal(guess.cameras[camera.name].rotation, camera.rotation.value)
+        assert np.array_equal(guess.cameras[camera.name].position, camera.translation.value)
+        offset = raw_offset(guess, simulation.measurements, camera.name)
+        assert offset == pytest.approx(simulation.truth.time_offset[camera.name], abs=1e-9)
+
+
+def with_imu(measurements: Measurements, gyro_scale: float = 1.0, accel_scale: float = 1.0) -> Measurements:
+    imu = measurements.imu
+    return dataclasses.replace(
+        measurements, imu=ImuStream(imu.name, imu.stamps_ns, imu.gyro * gyro_scale, imu.accel * accel_scale)
+    )
+
+
+def failure(rig: Rig, measurements: Measurements) -> str:
+    with pytest.raises(EstimationError) as caught:
+        initial_guess(rig, measurements)
+    sentence = str(caught.value)
+    assert "\n" not in sentence
+    return sentence
+
+
+def test_degrees_are_recognised(simulation: Simulation):
+    assert "deg/s" in failure(rig_for(simulation.scenario), with_imu(simulation.measurements, gyro_scale=180.0 / np.pi))
+
+
+def test_g_is_recognised(simulation: Simulation):
+    assert "not in g" in failure(rig_for(simulation.scenario), with_imu(simulation.measurements, accel_scale=1.0 / 9.81))
+
+
+def test_a_wrong_tag_size_is_recognised(simulation: Simulation):
+    rig = rig_for(simulation.scenario)
+    rig = dataclasses.replace(rig, target=dataclasses.replace(rig.target, tag_size=2.0 * rig.target.tag_size))
+    assert "tag_size" in failure(rig, simulation.measurements)
+
+
+def test_a_motionless_recording_is_refused():
+    simulation = simulate(dataclasses.replace(handheld(10.0), motion=Motion("motionless")), 0)
+    assert "motionless" in failure(rig_for(simulation.scenario), simulation.measurements)
+
+
+def test_an_imu_of_another_motion_is_refused(simulation: Simulation):
+    other = simulate(dataclasses.replace(handheld(20.0), motion=Motion(seed=99)), 4)
+    mixed = dataclasses.replace(simulation.measurements, imu=other.measurements.imu)
+    assert "does not match" in failure(rig_for(simulation.scenario), mixed)
+
+
+def test_one_prior_is_enough_to_start_from(simulation: Simulation):
+    rig = rig_for(simulation.scenario)
+    c = rig.cameras[0]
+    given = Parameter("prior", np.array([0.01, 0.02, 0.03]), np.full(3, 0.01))
+    rig = dataclasses.replace(rig, cameras=(dataclasses.replace(c, translation=given), *rig.cameras[1:]))
+    guess = initial_guess(rig, simulation.measurements)
+    assert np.array_equal(guess.cameras[c.name].position, given.value)
