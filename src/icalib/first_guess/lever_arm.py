@@ -71,7 +71,7 @@ def lever_arm(
         rhs = rhs - rows[:, :, 0:3] @ given
         rows[:, :, 0:3] = 0.0
     x = _solve(rows, rhs)
-    return LeverArm(x[0:3] if given is None else given, x[3:6], x[6:9], *_target_size(rows, rhs, second(p)))
+    return LeverArm(x[0:3] if given is None else given, x[3:6], x[6:9], *_target_size(rows, rhs, second(D_f)))
 
 
 def _solve(rows: np.ndarray, rhs: np.ndarray) -> np.ndarray:
@@ -88,14 +88,16 @@ def _solve(rows: np.ndarray, rhs: np.ndarray) -> np.ndarray:
     return x
 
 
-def _target_size(rows: np.ndarray, rhs: np.ndarray, moved: np.ndarray) -> tuple[float, float]:
-    """Factor on the camera's positions that the accelerometer asks for, and its standard deviation."""
-    A = np.concatenate([rows, -moved[:, :, None]], axis=2).reshape(-1, 10)
+def _target_size(rows: np.ndarray, rhs: np.ndarray, felt: np.ndarray) -> tuple[float, float]:
+    """True size of the target over the one given, and its standard deviation: the inverse of the factor that the
+    accelerometer's part asks for. (A factor on the noisy positions instead would be pulled to zero.)"""
+    A = np.concatenate([rows, felt[:, :, None]], axis=2).reshape(-1, 10)
     b = rhs.ravel()
     information = A.T @ A + 1e-9 * np.eye(10)
     x = np.linalg.solve(information, A.T @ b)
     variance = np.mean((b - A @ x) ** 2)
-    return 1.0 + float(x[9]), float(np.sqrt(variance * np.linalg.inv(information)[9, 9]))
+    factor = max(1.0 + float(x[9]), 1e-3)
+    return 1.0 / factor, float(np.sqrt(variance * np.linalg.inv(information)[9, 9])) / factor**2
 
 
 def _triples(t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
