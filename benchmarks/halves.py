@@ -1,6 +1,6 @@
 """How far two halves of a recording, each calibrated alone, disagree: with each part of the honest model on and off.
 
-    python benchmarks/halves.py [--data DIR]      DIR holds euroc_imu_april
+python benchmarks/halves.py [--data DIR]      DIR holds euroc_imu_april
 """
 
 from __future__ import annotations
@@ -41,9 +41,7 @@ def part(measurements: Measurements, start: float, stop: float) -> Measurements:
     for c in measurements.cameras:
         k = np.flatnonzero((c.stamps_ns >= low) & (c.stamps_ns <= high))
         a, b = c.start[k[0]], c.start[k[-1] + 1]
-        cameras.append(
-            CornerStream(c.name, c.stamps_ns[k], c.start[k[0] : k[-1] + 2] - a, c.point[a:b], c.uv[a:b])
-        )
+        cameras.append(CornerStream(c.name, c.stamps_ns[k], c.start[k[0] : k[-1] + 2] - a, c.point[a:b], c.uv[a:b]))
     return Measurements(ImuStream(imu.name, imu.stamps_ns[m], imu.gyro[m], imu.accel[m]), tuple(cameras))
 
 

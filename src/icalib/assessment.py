@@ -133,8 +133,10 @@ def _groups(
         unit = "" if block.sensor == inputs.rig.imu.name else UNITS[block.name]
         groups.append(
             ParameterGroup(
-                block.sensor, block.name, labels, unit, _raw_value(inputs, found, block), std, std * np.maximum(factor, 1.0),
-                verdict, _mode(inputs, block), None if block.start is None else tuple(int(i) for i in block.columns), factor,
+                block.sensor, block.name, labels, unit, _raw_value(inputs, found, block), std,
+                std * np.maximum(factor, 1.0),
+                verdict, _mode(inputs, block),
+                None if block.start is None else tuple(int(i) for i in block.columns), factor,
             )
         )  # fmt: skip
     return tuple(groups)
@@ -195,7 +197,8 @@ def _warnings(
         if f.kind in ("gyroscope", "accelerometer") and not EXPECTED_CHI2[0] <= ratio <= EXPECTED_CHI2[1]:
             word = "larger" if ratio > 1.0 else "smaller"
             yield (
-                f"the {f.kind} of {f.sensor} leaves residuals {np.sqrt(ratio):.2g} times as large as its noise in the rig "
+                f"the {f.kind} of {f.sensor} leaves residuals {np.sqrt(ratio):.2g} times as large as its noise "
+                f"in the rig "
                 f"file says; a {word} noise density would fit."
             )
         if f.kind == "corners" and f.rejected > MANY_REJECTED * 0.5 * f.count:
@@ -208,7 +211,9 @@ def _warnings(
             "standard deviations here include that factor, those of other programs would not."
         )
     if empirical is None:
-        yield "the recording is too short to be split (or splits are off): standard deviations are formal, and too small."
+        yield (
+            "the recording is too short to be split (or splits are off): standard deviations are formal, and too small."
+        )
 
 
 def _notes(inputs: Inputs, found: Estimate):
@@ -216,7 +221,8 @@ def _notes(inputs: Inputs, found: Estimate):
     rig = inputs.rig
     n = rig.imu.noise
     yield (
-        f"IMU noise ({n.source}): gyro {n.gyro:.3g} rad/s/sqrt(Hz), walk {n.gyro_walk:.3g}; accelerometer {n.accel:.3g} "
+        f"IMU noise ({n.source}): gyro {n.gyro:.3g} rad/s/sqrt(Hz), walk {n.gyro_walk:.3g}; accelerometer "
+        f"{n.accel:.3g} "
         f"m/s^2/sqrt(Hz), walk {n.accel_walk:.3g}."
     )
     for a, b in inputs.imu.gaps:

@@ -10,7 +10,8 @@ from icalib.errors import CalibrationError
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Entry point of the `icalib` command. Returns the exit code: 0 good, 1 an error, 2 wrong usage, 130 interrupted."""
+    """Entry point of the `icalib` command. Returns the exit code: 0 good, 1 an error, 2 wrong usage, 130
+    interrupted."""
     options = _parser().parse_args(arguments)
     try:
         options.run(options)

@@ -34,7 +34,8 @@ def fixed(value: object) -> Parameter:
 
 @dataclass(frozen=True)
 class ImuNoise:
-    """Continuous-time noise: gyro rad/s/sqrt(Hz), gyro_walk rad/s^2/sqrt(Hz), accel m/s^2/sqrt(Hz), accel_walk m/s^3/sqrt(Hz)."""
+    """Continuous-time noise: gyro rad/s/sqrt(Hz), gyro_walk rad/s^2/sqrt(Hz), accel m/s^2/sqrt(Hz), accel_walk
+    m/s^3/sqrt(Hz)."""
 
     gyro: float
     gyro_walk: float

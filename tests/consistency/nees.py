@@ -60,7 +60,8 @@ def block_errors(result: Calibration, truth: Truth, block: str) -> tuple[np.ndar
 def consistency(
     scenario: Scenario, rig: Rig, seeds: range, probability: float, blocks: tuple[str, ...] = BLOCKS
 ) -> dict[str, Consistency]:
-    """Calibrates one simulated recording for each seed, from nothing. Blocks that are fixed have no place in `blocks`."""
+    """Calibrates one simulated recording for each seed, from nothing. Blocks that are fixed have no place in
+    `blocks`."""
     found = {b: [] for b in blocks}
     for seed in seeds:
         simulation = simulate(scenario, seed)

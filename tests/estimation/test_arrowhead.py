@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from icalib.estimation.arrowhead import HELD_BELOW, NotDefinite, border_step, make_pieces, marginalise, solve
+from icalib.estimation.arrowhead import HELD_BELOW, NotDefiniteError, border_step, make_pieces, marginalise, solve
 from icalib.estimation.state import NODE
 
 
@@ -137,21 +137,21 @@ def test_a_node_that_nothing_determines_is_an_error(node):
             piece.diagonal[k], piece.upper[k], piece.side[k] = 0.0, 0.0, 0.0
             if k > 0:
                 piece.upper[k - 1] = 0.0
-    with pytest.raises(NotDefinite):
+    with pytest.raises(NotDefiniteError):
         solve(pieces, 9, np.ones(2))
 
 
 def test_not_a_number_is_an_error():
     pieces = random_pieces(9, 2)
     pieces[1].diagonal[2, 3, 3] = np.nan
-    with pytest.raises(NotDefinite):
+    with pytest.raises(NotDefiniteError):
         solve(pieces, 9, np.ones(2))
 
 
 def test_marginalise_raises_too():
     (piece,) = random_pieces(2, 2)
     piece.diagonal[1] = -np.eye(NODE)
-    with pytest.raises(NotDefinite):
+    with pytest.raises(NotDefiniteError):
         marginalise(piece)
 
 

@@ -56,7 +56,10 @@ def test_intrinsics_of_a_fisheye_are_found():
     scenario = handheld(12.0)
     fisheye = tuple(
         dataclasses.replace(
-            c, model="pinhole-equidistant", intrinsics=(300.0, 299.0, 371.0, 245.0), distortion=(-0.01, 0.02, -0.01, 0.002)
+            c,
+            model="pinhole-equidistant",
+            intrinsics=(300.0, 299.0, 371.0, 245.0),
+            distortion=(-0.01, 0.02, -0.01, 0.002),
         )
         for c in scenario.cameras
     )
@@ -122,7 +125,9 @@ def test_degrees_are_recognised(simulation: Simulation):
 
 
 def test_g_is_recognised(simulation: Simulation):
-    assert "not in g" in failure(rig_for(simulation.scenario), with_imu(simulation.measurements, accel_scale=1.0 / 9.81))
+    assert "not in g" in failure(
+        rig_for(simulation.scenario), with_imu(simulation.measurements, accel_scale=1.0 / 9.81)
+    )
 
 
 def test_a_wrong_tag_size_is_recognised(simulation: Simulation):

@@ -65,8 +65,15 @@ class Piece:
         )
 
     def clear(self) -> None:
-        for a in (self.diagonal, self.upper, self.side, self.border):
+        for a in self.sums(True):
             a[:] = 0.0
+
+    def sums(self, wanted: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """diagonal, upper, side, border for a kernel to add to; empty where only residuals are wanted."""
+        if wanted:
+            return self.diagonal, self.upper, self.side, self.border
+        empty = np.zeros((0, NODE, NODE))
+        return empty, empty, empty, np.zeros((0, 0))
 
 
 def make_pieces(n_nodes: int, n_border: int) -> tuple[Piece, ...]:
@@ -117,10 +124,7 @@ def _eliminate(diagonal, upper, side, forwards, keep):
         _forward_solve(diagonal[k], side[k])
         if step < n - 1:
             after = k + 1 if forwards else k - 1
-            if forwards:
-                link = upper[k]
-            else:
-                link = upper[k - 1].T.copy()
+            link = upper[k] if forwards else upper[k - 1].T.copy()
             _forward_solve(diagonal[k], link)
             if not forwards:
                 upper[k - 1] = link
@@ -173,7 +177,7 @@ class Solution:
     information: np.ndarray
 
 
-class NotDefinite(EstimationError):
+class NotDefiniteError(EstimationError):
     """The normal equations are not positive definite: something is not determined, or damping is too small."""
 
 
@@ -187,9 +191,9 @@ def _eliminated_part(piece: Piece, keep: bool) -> np.ndarray:
 
 
 def marginalise(piece: Piece) -> np.ndarray:
-    """Border (B + 1, B + 1) with all nodes of `piece` eliminated; overwrites the piece. Raises NotDefinite."""
+    """Border (B + 1, B + 1) with all nodes of `piece` eliminated; overwrites the piece. Raises NotDefiniteError."""
     if not _eliminate(piece.diagonal, piece.upper, piece.side, True, False):
-        raise NotDefinite("the motion between nodes is not determined.")
+        raise NotDefiniteError("the motion between nodes is not determined.")
     return piece.border - _eliminated_part(piece, keep=False)
 
 
@@ -208,7 +212,7 @@ def border_step(information: np.ndarray, gradient: np.ndarray, tolerance: np.nda
 
 
 def solve(pieces: tuple[Piece, ...], n_nodes: int, tolerance: np.ndarray, damping: float = 0.0) -> Solution:
-    """Solves (H + damping diag(H)) step = -gradient; overwrites the pieces. Raises NotDefinite."""
+    """Solves (H + damping diag(H)) step = -gradient; overwrites the pieces. Raises NotDefiniteError."""
     keep = len(pieces) > 1
     n_border = len(tolerance)
     rest = sum((p.border for p in pieces), np.zeros((n_border + 1, n_border + 1)))
@@ -218,7 +222,7 @@ def solve(pieces: tuple[Piece, ...], n_nodes: int, tolerance: np.ndarray, dampin
             _damp(piece.diagonal, damping)
     done = in_parallel(lambda p: _eliminate(p.diagonal, p.upper, p.side, p.first == 0, keep), pieces)
     if not all(done):
-        raise NotDefinite("the motion between nodes is not determined.")
+        raise NotDefiniteError("the motion between nodes is not determined.")
     for piece in pieces:
         rest -= _eliminated_part(piece, keep)
     shared, shared_side = np.zeros((0, 0)), np.zeros((0, n_border + 1))
@@ -226,7 +230,7 @@ def solve(pieces: tuple[Piece, ...], n_nodes: int, tolerance: np.ndarray, dampin
         shared = pieces[0].diagonal[-1] + pieces[1].diagonal[0]
         shared_side = pieces[0].side[-1] + pieces[1].side[0]
         if not cholesky(shared):
-            raise NotDefinite("the motion between nodes is not determined.")
+            raise NotDefiniteError("the motion between nodes is not determined.")
         _forward_solve(shared, shared_side)
         rest -= shared_side.T @ shared_side
     information = rest[:n_border, :n_border]

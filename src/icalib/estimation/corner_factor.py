@@ -18,7 +18,7 @@ from icalib.estimation.arrowhead import Piece
 from icalib.estimation.corner_kernels import accumulate, accumulate_clusters, camera_points
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.poses import Poses, poses_at
-from icalib.estimation.state import NODE, Layout, State
+from icalib.estimation.state import Layout, State
 from icalib.geometry.cameras.base import CameraModel
 from icalib.measurements import CornerStream
 from icalib.rig import Scheme
@@ -41,7 +41,8 @@ class CornerNoise:
 
 @dataclass(frozen=True)
 class CornerOutput:
-    """Per corner: residual (N, 2) px, predicted - measured, and root (N,), square root of its weight over sigma (0 where
+    """Per corner: residual (N, 2) px, predicted - measured, and root (N,), square root of its weight over sigma (0
+    where
     left out); per image: shared (M, 2, m), the sizes of the common error."""
 
     residual: np.ndarray
@@ -147,10 +148,6 @@ class CornerFactor:
         poses, R_cw, p_wc = self.camera_poses(state, i0, i1)
         params = np.concatenate([state.values[self.name, "intrinsics"], state.values[self.name, "distortion"]])
         world = self.world_points(state)
-        empty = np.zeros((0, NODE, NODE))
-        targets = (
-            (piece.diagonal, piece.upper, piece.side, piece.border) if sums else (empty,) * 3 + (np.zeros((0, 0)),)
-        )
         start, n = self.stream.start[i0 : i1 + 1], self.noise
         white, white_shared = noise or (out.residual, out.shared)
         settings = (
@@ -162,7 +159,8 @@ class CornerFactor:
             white, white_shared[i0:i1], noise is not None,
             np.ascontiguousarray(state.values[self.name, "rotation"]), state.values[self.name, "translation"],
             R_cw, p_wc, poses.rate, poses.velocity, poses.by_node, poses.by_next, poses.by_imu,
-            self.node[i0:i1], piece.first, chained, direct, *targets, out.residual, out.root, out.shared[i0:i1],
+            self.node[i0:i1], piece.first, chained, direct, *piece.sums(sums),
+            out.residual, out.root, out.shared[i0:i1],
         )  # fmt: skip
         total = 0.0
         for a, b, X, predicted, valid, Jp, Jpar in self._chunks(start, R_cw, p_wc, world, params, sums):
@@ -172,7 +170,8 @@ class CornerFactor:
     def accumulate_clusters(
         self, state: State, piece: Piece, at: CornerOutput, cluster: np.ndarray, n_clusters: int, column: int
     ) -> None:
-        """Adds the gradient of each cluster of corners (N,), weights as in `at`, to columns of `piece` from `column` on."""
+        """Adds the gradient of each cluster of corners (N,), weights as in `at`, to columns of `piece` from
+        `column` on."""
         i0, i1 = self._images(piece)
         chained, direct, pars = self._columns()
         poses, R_cw, p_wc = self.camera_poses(state, i0, i1)
@@ -181,7 +180,8 @@ class CornerFactor:
         basis = self.basis @ state.values[self.target, "tilt"].T
         for a, b, X, _, _, Jp, Jpar in self._chunks(start, R_cw, p_wc, self.world_points(state), params, True):
             accumulate_clusters(
-                a, b, start[a], start, self.stream.point, cluster, n_clusters, column, at.residual, at.root, at.shared[i0:i1],
+                a, b, start[a], start, self.stream.point, cluster, n_clusters, column, at.residual, at.root,
+                at.shared[i0:i1],
                 self.noise.field, self.direction, basis, pars, X, Jp, Jpar,
                 np.ascontiguousarray(state.values[self.name, "rotation"]), state.values[self.name, "translation"],
                 R_cw, p_wc, poses.rate, poses.velocity, poses.by_node, poses.by_next, poses.by_imu,

@@ -140,7 +140,8 @@ def _fill_rows(
 ):  # fmt: skip
     """Weighted Jacobian of one image, transposed: A (D + 1, 2 n), u rows first; the last row the residual. Returns D.
 
-    With `curved`, where the loss bends the rows are scaled so that A^T A is the true curvature, A^T r the true gradient.
+    With `curved`, where the loss bends the rows are scaled so that A^T A is the true curvature, A^T r the true
+    gradient.
     """
     n = n1 - n0
     ns = basis.shape[1]
@@ -381,7 +382,8 @@ def accumulate(
             continue
         _whole_error(res, f, shared_out[i], error)
         _fill_rows(
-            o, n0, n1, error, root, sigma[i], loss, scale, curved, X, Jp, Jpar, pars, has_bloom, direction, basis, point, R_cw[i], A
+            o, n0, n1, error, root, sigma[i], loss, scale, curved, X, Jp, Jpar, pars, has_bloom, direction, basis,
+            point, R_cw[i], A
         )  # fmt: skip
         if given:
             for k in range(n):
@@ -426,7 +428,8 @@ def accumulate_clusters(
         n = n1 - n0
         _whole_error(residual[n0:n1], field[n0:n1], shared[i], error)
         _fill_rows(
-            o, n0, n1, error, root_all[n0:n1], 1.0, 0, 1.0, False, X, Jp, Jpar, pars, has_bloom, direction, basis, point,
+            o, n0, n1, error, root_all[n0:n1], 1.0, 0, 1.0, False, X, Jp, Jpar, pars, has_bloom, direction, basis,
+            point,
             R_cw[i], A,
         )  # fmt: skip
         G[:] = 0.0

@@ -82,7 +82,8 @@ def estimate_noise(
     speed: np.ndarray,
     tau: tuple[float, ...],
 ) -> NoiseModel:
-    """The noise that the residuals of a pass show, with `tau` for its common errors. A size given in the rig file is kept."""
+    """The noise that the residuals of a pass show, with `tau` for its common errors. A size given in the rig file
+    is kept."""
     stream, used = factor.stream, out.root > 0.0
     error = out.residual + (factor.noise.field[:, None, :] * out.shared[stream.image]).sum(axis=2)
     square = (error**2).sum(axis=1)

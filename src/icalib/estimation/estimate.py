@@ -98,7 +98,8 @@ def pass_names(inputs: Inputs) -> tuple[str, ...]:
 def _inliers(factor: CornerFactor, out: CornerOutput, settings: Settings) -> np.ndarray:
     """(N,) bool: corners that stand with the rest of their image.
 
-    The rule: a corner is set aside when its residual is above mean + `outlier_std` standard deviations of its image, and
+    The rule: a corner is set aside when its residual is above mean + `outlier_std` standard deviations of its
+    image, and
     above `outlier_min_px`; corners that the model cannot see go too.
     """
     if settings.outlier_std <= 0.0:

@@ -135,7 +135,8 @@ def split_covariance(problem: Problem, outcome: Outcome, segments: int) -> np.nd
     """(B, B) covariance of the border as the spread over `segments` of the recording shows it; None if it is too short.
 
     Each segment's own gradient b_g at the joint optimum (its chain marginalised) would be zero but for noise; their
-    spread through the joint information S gives S^-1 (G / (G - 1) sum (b_g - b)(b_g - b)^T) S^-1, the block jackknife to
+    spread through the joint information S gives S^-1 (G / (G - 1) sum (b_g - b)(b_g - b)^T) S^-1, the block
+    jackknife to
     first order.
     """
     ends = np.linspace(0, problem.n_nodes - 1, segments + 1).astype(int)
@@ -160,13 +161,15 @@ def split_covariance(problem: Problem, outcome: Outcome, segments: int) -> np.nd
 
 
 def place_covariances(problem: Problem, outcome: Outcome) -> list[np.ndarray]:
-    """(B, B) covariances as the spread over places shows them: cells of each image, and parts of the target.
+    """(B, B) covariances as the spread over places shows them: cells of each image, parts of the target, tag corners.
 
-    Errors that stay with a place (a lens that the model cannot follow, a target that is not as drawn) are the same in all
-    parts of a recording, and splitting it in time does not see them. The corners of a place are a cluster, whose gradient
+    Errors that stay with a place (a lens that the model cannot follow, a target that is not as drawn) are the same
+    in all
+    parts of a recording, and splitting it in time does not see them. The corners of a place are a cluster, whose
+    gradient
     would be zero but for noise; the IMU is one more.
     """
-    return [_cluster_spread(problem, outcome, by) for by in (_image_cells, _target_parts)]
+    return [_cluster_spread(problem, outcome, by) for by in (_image_cells, _target_parts, _tag_corners)]
 
 
 def _image_cells(camera: CornerFactor, index: int) -> np.ndarray:
@@ -185,6 +188,11 @@ def _target_parts(camera: CornerFactor, index: int) -> np.ndarray:
     low, high = xy.min(axis=0), xy.max(axis=0) + 1e-9
     part = ((xy - low) / (high - low) * TARGET_PARTS).astype(int)
     return (part[:, 1] * TARGET_PARTS + part[:, 0])[camera.stream.point]
+
+
+def _tag_corners(camera: CornerFactor, index: int) -> np.ndarray:
+    """(N,) which of its tag's four corners, cameras apart: what a detector does to each."""
+    return 4 * index + camera.stream.point % 4
 
 
 def _cluster_spread(problem: Problem, outcome: Outcome, by: Callable[[CornerFactor, int], np.ndarray]) -> np.ndarray:

@@ -272,7 +272,7 @@ class ImuFactor:
         half = n // 2
         in_parallel(
             lambda ks: _preintegrate(
-                *ks, state.seconds, first, imu.seconds, imu.gyro, imu.accel, bias0, intrinsics,
+                ks[0], ks[1], state.seconds, first, imu.seconds, imu.gyro, imu.accel, bias0, intrinsics,
                 imu.variance, imu.walk, *arrays,
             ),
             [(0, half), (half, n)],
@@ -286,13 +286,9 @@ class ImuFactor:
 
         `noise` (K - 1, 15) stands in for the whitened residuals where given. Returns half the chi^2.
         """
-        empty = np.zeros((0, ROWS, ROWS))
-        targets = (
-            (piece.diagonal, piece.upper, piece.side, piece.border) if sums else (empty,) * 3 + (np.zeros((0, 0)),)
-        )
         dx = state.values[self.imu.name, "intrinsics"] - self.intrinsics0 if len(self.columns) else np.zeros(0)
         return _accumulate(
             piece.first, piece.last, state.rotation, state.position, state.velocity, state.bias, state.seconds,
             self.gravity, self.dR, self.dv, self.dp, self.J, self.W, self.bias0, dx, self.columns,
-            out if noise is None else noise, noise is not None, *targets, out,
+            out if noise is None else noise, noise is not None, *piece.sums(sums), out,
         )  # fmt: skip

@@ -1,11 +1,13 @@
-"""Closed-form integration of IMU readings, forwards or backwards, with Jacobians and covariance (ACI^2, paper (16)-(18)).
+"""Closed-form integration of IMU readings, forwards or backwards, with Jacobians and covariance (ACI^2, paper
+(16)-(18)).
 
 Between two IMU stamps the body rate and the specific force are constant, the mean of the two readings. Then, with
 phi = w dt, the increments of that stretch are exact:
 
     dR = Exp(phi)    dv = G1(phi) f dt    dp = G2(phi) f dt^2     G_m(phi) = sum_n hat(phi)^n / (n + m)!
 
-Increments relative to the start of the interval: R_0^T R_1; R_0^T (v_1 - v_0 - g T); R_0^T (p_1 - p_0 - v_0 T - g T^2/2).
+Increments relative to the start of the interval: R_0^T R_1; R_0^T (v_1 - v_0 - g T); R_0^T (p_1 - p_0 - v_0 T - g
+T^2/2).
 Errors are perturbed as the states are: rotation on the right, velocity and position added, in the order
 rotation, velocity, position, gyro bias, accelerometer bias.
 """

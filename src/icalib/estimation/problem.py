@@ -1,4 +1,5 @@
-"""Where factors and solver meet: all measurements of one recording, as sums over the pieces of the chain (paper (15))."""
+"""Where factors and solver meet: all measurements of one recording, as sums over the pieces of the chain (paper
+(15))."""
 
 from __future__ import annotations
 

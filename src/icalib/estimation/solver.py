@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.arrowhead import NotDefinite, solve
+from icalib.estimation.arrowhead import NotDefiniteError, solve
 from icalib.estimation.problem import Problem, Residuals
 from icalib.estimation.state import State
 
@@ -94,7 +94,7 @@ def _solve(problem, state, pieces, residuals, damping, curved):
     while True:
         try:
             return solve(pieces, problem.n_nodes, problem.tolerance, damping), damping
-        except NotDefinite:
+        except NotDefiniteError:
             damping = max(10.0 * damping, FIRST_DAMPING)
             if damping > 1e3:
                 raise
@@ -106,9 +106,11 @@ def _finish(problem, state, cost, pieces, residuals, steps, converged) -> Outcom
     information = solve(pieces, problem.n_nodes, problem.tolerance, 0.0).information
     n = len(steps)
     status = (
-        f"converged in {n} iterations: the next step would change no parameter by more than 3 % of its standard deviation."
+        f"converged in {n} iterations: the next step would change no parameter by more than 3 % of its standard "
+        f"deviation."
         if converged
-        else f"not converged after {n} iterations: the cost is {cost:.6g} and still {steps[-1].predicted_decrease:.3g} above "
+        else f"not converged after {n} iterations: the cost is {cost:.6g} and still "
+        f"{steps[-1].predicted_decrease:.3g} above "
         "what the last step promised; give a better first guess, or check the noise in the rig file."
     )
     return Outcome(state, cost, residuals, information, tuple(steps), converged, status)

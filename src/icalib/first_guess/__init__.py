@@ -1,4 +1,5 @@
-"""The first guess, from nothing: intrinsics, poses, clocks, rotation, gravity, lever arms. What the rig gives is used."""
+"""The first guess, from nothing: intrinsics, poses, clocks, rotation, gravity, lever arms. What the rig gives is
+used."""
 
 from __future__ import annotations
 
@@ -7,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.estimation.imu_data import ImuData
-from icalib.geometry.cameras import camera_model
 from icalib.first_guess.clocks import Alignment, align, camera_rates
 from icalib.first_guess.gyro import GyroRotation
 from icalib.first_guess.intrinsics import guess_intrinsics
 from icalib.first_guess.lever_arm import LeverArm, check_gravity, check_size, lever_arm
 from icalib.first_guess.target_poses import TargetPoses, target_poses
+from icalib.geometry.cameras import camera_model
 from icalib.measurements import CornerStream, Measurements
 from icalib.rig import Camera, Rig
 
@@ -21,7 +22,8 @@ VELOCITY_STEP_S = 0.04
 
 @dataclass(frozen=True)
 class CameraGuess:
-    """params (P,); offset: t_imu - t_cam, each since its clock's first stamp [s]; T_imu_cam; poses in the board frame."""
+    """params (P,); offset: t_imu - t_cam, each since its clock's first stamp [s]; T_imu_cam; poses in the board
+    frame."""
 
     params: np.ndarray
     offset: float
@@ -32,7 +34,8 @@ class CameraGuess:
 
 @dataclass(frozen=True)
 class Guess:
-    """Where the solver starts. R_world_board: world z is up, its origin the board's; its x axis horizontal in the board."""
+    """Where the solver starts. R_world_board: world z is up, its origin the board's; its x axis horizontal in the
+    board."""
 
     cameras: dict[str, CameraGuess]
     gyro_bias: np.ndarray

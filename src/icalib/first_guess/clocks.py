@@ -8,8 +8,8 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation.imu_data import ImuData
-from icalib.geometry import so3
 from icalib.first_guess.target_poses import TargetPoses
+from icalib.geometry import so3
 from icalib.measurements import CornerStream
 
 GRID_HZ = 100.0
@@ -23,7 +23,8 @@ DEGREES = 180.0 / np.pi
 
 @dataclass(frozen=True)
 class CameraRates:
-    """Mean angular rates between neighbouring images: start, end (n,) camera clock [s]; rate (n, 3) camera axes [rad/s]."""
+    """Mean angular rates between neighbouring images: start, end (n,) camera clock [s]; rate (n, 3) camera axes
+    [rad/s]."""
 
     start: np.ndarray
     end: np.ndarray
@@ -45,7 +46,8 @@ def camera_rates(stream: CornerStream, poses: TargetPoses) -> CameraRates:
     index = np.flatnonzero(poses.ok)
     if len(index) < 2:
         raise EstimationError(
-            f"{stream.name}: the target was located in {len(index)} of {len(t)} images; check the target, the camera model "
+            f"{stream.name}: the target was located in {len(index)} of {len(t)} images; check the target, the "
+            f"camera model "
             "and the intrinsics in the rig file."
         )
     a, b = index[:-1], index[1:]
@@ -73,7 +75,8 @@ def _check_motion(imu: ImuData, name: str, rates: CameraRates) -> None:
     seen = np.sqrt(np.median((rates.rate**2).sum(axis=1)))
     if spread < STILL_RAD_S and seen < 3.0 * STILL_RAD_S:
         raise EstimationError(
-            f"the recording is motionless ({imu.name} turns at {spread:.4f} rad/s RMS, {name} at {seen:.4f}); record again "
+            f"the recording is motionless ({imu.name} turns at {spread:.4f} rad/s RMS, {name} at {seen:.4f}); "
+            f"record again "
             "while turning the rig about all axes in front of the target."
         )
 
@@ -118,7 +121,8 @@ def _correlate(imu: ImuData, name: str, rates: CameraRates) -> float:
     if not r[k] > LEAST_CORRELATION:
         raise EstimationError(
             f"the motion of {name} does not match that of {imu.name} at any shift of their clocks (best correlation "
-            f"{max(float(r.max()), 0.0):.2f}); check that both come from the same recording, overlap in time, and are in rad/s."
+            f"{max(float(r.max()), 0.0):.2f}); check that both come from the same recording, overlap in time, "
+            f"and are in rad/s."
         )
     return (k - (len(b) - 1)) / GRID_HZ
 
@@ -141,7 +145,7 @@ def _refine(imu: ImuData, rates: CameraRates, offset: float, keep_offset: bool) 
     def at(x: np.ndarray, t: np.ndarray) -> np.ndarray:
         return np.stack([np.interp(t, imu.seconds, x[:, k]) for k in range(3)], axis=1)
 
-    R, bias = np.eye(3), np.zeros(3)
+    R, bias, residual = np.eye(3), np.zeros(3), np.zeros_like(rates.rate)
     for _ in range(ROUNDS):
         start, end = rates.start + offset, rates.end + offset
         inside = ((start >= imu.seconds[0]) & (end <= imu.seconds[-1])).astype(float)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from icalib.errors import EstimationError
+from icalib.first_guess.target_poses import target_poses
 from icalib.geometry import so3
 from icalib.geometry.cameras.base import CameraModel
-from icalib.first_guess.target_poses import target_poses
 from icalib.measurements import CornerStream
 
 TRIAL_IMAGES = 24
@@ -49,7 +49,7 @@ def _spread_images(stream: CornerStream, wanted: int) -> CornerStream:
     count = np.diff(stream.start)
     rich = np.flatnonzero(count >= min(np.median(count), 40))
     chosen = rich[np.unique(np.linspace(0, len(rich) - 1, wanted).astype(int))]
-    rows = np.concatenate([np.arange(stream.start[i], stream.start[i + 1]) for i in chosen])
+    rows = np.concatenate([np.arange(int(stream.start[i]), int(stream.start[i + 1])) for i in chosen])
     start = np.concatenate([[0], np.cumsum(count[chosen])])
     return CornerStream(stream.name, stream.stamps_ns[chosen], start, stream.point[rows], stream.uv[rows])
 

@@ -114,7 +114,8 @@ def _triples(t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _double_integrals(
     imu: ImuData, t: np.ndarray, R_bi: np.ndarray, gyro: GyroRotation
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Double integrals of R_board_imu f (n, 3) and of R_board_imu (n, 3, 3) at image times t, from the first IMU stamp."""
+    """Double integrals of R_board_imu f (n, 3) and of R_board_imu (n, 3, 3) at image times t, from the first IMU
+    stamp."""
     s = imu.seconds
     R = gyro.carry(t, R_bi, s)
     x = np.concatenate([(R @ imu.accel[:, :, None])[:, :, 0], R.reshape(-1, 9)], axis=1)
@@ -132,7 +133,8 @@ def check_size(arm: LeverArm, camera: str) -> None:
     """Raises EstimationError where the accelerometer contradicts the size of the target."""
     if abs(arm.size - 1.0) > max(SIZE_TOLERANCE, 5.0 * arm.size_std):
         raise EstimationError(
-            f"{camera}: by the accelerometer the target is {arm.size:.2f} +- {arm.size_std:.2f} times the size that the rig "
+            f"{camera}: by the accelerometer the target is {arm.size:.2f} +- {arm.size_std:.2f} times the size "
+            f"that the rig "
             "file says; check tag_size (in metres) and tag_spacing (gap over tag_size)."
         )
 

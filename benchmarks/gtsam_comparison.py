@@ -1,0 +1,176 @@
+"""The same least-squares problem by icalib and by GTSAM: time, and how far apart the extrinsics come out.
+
+Both: nodes at the images of cam0, preintegrated IMU with bias walks, direction of gravity and both extrinsics estimated,
+intrinsics and time offsets fixed (offsets 0: cameras and IMU share a clock), no robust loss, nothing set aside, the same
+noise and the same first state. GTSAM's projection factor with the extrinsics as a variable, ProjectionFactorPPP of
+gtsam_unstable, wants each target point to be a variable too; a tight prior holds them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Iterator
+
+import gtsam
+import gtsam_unstable
+import numpy as np
+from gtsam.symbol_shorthand import B, L, T, V, X
+
+from icalib.estimation.assembly import Inputs, layout_for
+from icalib.estimation.estimate import Estimate, estimate
+from icalib.estimation.imu_data import ImuData
+from icalib.estimation.state import State
+from icalib.estimation.tolerances import Tolerances
+from icalib.first_guess import initial_guess
+from icalib.measurements import CornerStream, ImuStream, Measurements
+from icalib.pipeline import first_state
+from icalib.rig import Rig, fixed
+
+SECONDS = 20.0  # of the recording, from its first image on
+POINT_SIGMA_M = 1e-6
+GRAVITY_KEY = gtsam.symbol("g", 0)
+
+
+def compare(rig: Rig, measurements: Measurements) -> Iterator[tuple[str, float, str]]:
+    """(name, value, unit) of each figure; `rig` has the plain model with fixed intrinsics."""
+    rig, measurements = _like_for_like(rig), excerpt(measurements, SECONDS)
+    inputs = Inputs(rig, measurements, ImuData.build(measurements.imu, rig.imu.noise), layout_for(rig), Tolerances())
+    state = first_state(inputs, initial_guess(rig, measurements))
+    estimate(inputs, state)
+    started = time.perf_counter()
+    ours = estimate(inputs, state)
+    covariance = np.linalg.inv(ours.outcome.information)
+    seconds = time.perf_counter() - started
+
+    laps = [time.perf_counter()]
+    graph, values = build(inputs, state)
+    laps.append(time.perf_counter())
+    optimizer, theirs = _optimised(graph, values)
+    laps.append(time.perf_counter())
+    marginals = gtsam.Marginals(graph, theirs)
+    theirs_covariance = [marginals.marginalCovariance(T(c)) for c in range(len(rig.cameras))]
+    laps.append(time.perf_counter())
+    build_s, solve_s, covariance_s = np.diff(laps)
+    yield "recording", SECONDS, "s"
+    yield "corners", sum(len(c.uv) for c in measurements.cameras), "1"
+    yield "icalib_time", seconds, "s"
+    yield "icalib_iterations", len(ours.steps), "1"
+    yield "gtsam_build_time", build_s, "s"
+    yield "gtsam_solve_time", solve_s, "s"
+    yield "gtsam_covariance_time", covariance_s, "s"
+    yield "gtsam_iterations", optimizer.iterations(), "1"
+    yield "gtsam_time_over_icalib_time", (laps[-1] - laps[0]) / seconds, "1"
+    yield from _differences(inputs, ours, covariance, theirs, theirs_covariance)
+
+
+def _like_for_like(rig: Rig) -> Rig:
+    cameras = tuple(dataclasses.replace(c, time_offset=fixed([0.0])) for c in rig.cameras)
+    return dataclasses.replace(
+        rig, cameras=cameras, settings=dataclasses.replace(rig.settings, loss="none", outlier_std=0.0)
+    )
+
+
+def excerpt(measurements: Measurements, seconds: float) -> Measurements:
+    """The instants from the first image of the first camera on at which every camera has an image, and their IMU."""
+    common = measurements.cameras[0].stamps_ns
+    for camera in measurements.cameras[1:]:
+        common = np.intersect1d(common, camera.stamps_ns)
+    common = common[common <= common[0] + round(seconds * 1e9)]
+
+    def camera(s: CornerStream) -> CornerStream:
+        chosen = np.isin(s.stamps_ns, common)
+        corners = np.repeat(chosen, np.diff(s.start))
+        start = np.concatenate([[0], np.cumsum(np.diff(s.start)[chosen])])
+        return CornerStream(s.name, s.stamps_ns[chosen], start, s.point[corners], s.uv[corners])
+
+    imu = measurements.imu
+    i = np.searchsorted(imu.stamps_ns, common[0], "right") - 1
+    j = np.searchsorted(imu.stamps_ns, common[-1], "left") + 1
+    part = ImuStream(imu.name, imu.stamps_ns[i:j], imu.gyro[i:j], imu.accel[i:j])
+    return Measurements(part, tuple(camera(s) for s in measurements.cameras))
+
+
+def build(inputs: Inputs, state: State) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """The graph and its first values; GTSAM's world is the target's frame, so gravity's direction is a variable."""
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    R_wb = state.values["board0", "tilt"]
+    values.insert(GRAVITY_KEY, gtsam.Unit3(R_wb.T @ [0.0, 0.0, -1.0]))
+    for k in range(len(state.seconds)):
+        pose = gtsam.Pose3(gtsam.Rot3(R_wb.T @ state.rotation[k]), R_wb.T @ state.position[k])
+        values.insert(X(k), pose)
+        values.insert(V(k), R_wb.T @ state.velocity[k])
+        values.insert(B(k), gtsam.imuBias.ConstantBias(state.bias[k, 3:], state.bias[k, :3]))
+    _add_imu(graph, inputs, state)
+    points = inputs.rig.target.points
+    tight = gtsam.noiseModel.Isotropic.Sigma(3, POINT_SIGMA_M)
+    for j in np.unique(np.concatenate([s.point for s in inputs.measurements.cameras])).tolist():
+        values.insert(L(j), points[j])
+        graph.add(gtsam.PriorFactorPoint3(L(j), points[j], tight))
+    for c in range(len(inputs.rig.cameras)):
+        _add_camera(graph, values, inputs, state, c)
+    return graph, values
+
+
+def _add_imu(graph: gtsam.NonlinearFactorGraph, inputs: Inputs, state: State) -> None:
+    noise, gravity, imu = inputs.rig.imu.noise, inputs.rig.gravity, inputs.imu
+    params = gtsam.PreintegrationCombinedParams.MakeSharedU(gravity)
+    params.setGyroscopeCovariance(noise.gyro**2 * np.eye(3))
+    params.setAccelerometerCovariance(noise.accel**2 * np.eye(3))
+    params.setBiasOmegaCovariance(noise.gyro_walk**2 * np.eye(3))
+    params.setBiasAccCovariance(noise.accel_walk**2 * np.eye(3))
+    params.setIntegrationCovariance(1e-12 * np.eye(3))
+    bias = gtsam.imuBias.ConstantBias(state.bias[0, 3:], state.bias[0, :3])
+    for k, (a, b) in enumerate(zip(state.seconds[:-1], state.seconds[1:], strict=True)):
+        inner = imu.seconds[(imu.seconds > a + 1e-6) & (imu.seconds < b - 1e-6)]
+        edges = np.concatenate([[a], inner, [b]])
+        middle = 0.5 * (edges[:-1] + edges[1:])  # readings change linearly between stamps: their mean over each step
+        accel, gyro = (
+            np.stack([np.interp(middle, imu.seconds, u[:, i]) for i in range(3)], axis=1) for u in (imu.accel, imu.gyro)
+        )
+        increments = gtsam.PreintegratedCombinedMeasurements(params, bias)
+        for f, w, dt in zip(accel, gyro, np.diff(edges), strict=True):
+            increments.integrateMeasurement(f, w, dt)
+        keys = X(k), V(k), X(k + 1), V(k + 1), B(k), B(k + 1), GRAVITY_KEY
+        graph.add(gtsam.CombinedImuFactorWithGravityDirection(*keys, increments, gravity))
+
+
+def _add_camera(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, inputs: Inputs, state: State, c: int) -> None:
+    camera, stream = inputs.rig.cameras[c], inputs.measurements.cameras[c]
+    fx, fy, cx, cy = state.values[camera.name, "intrinsics"]
+    calibration = gtsam.Cal3DS2(fx, fy, 0.0, cx, cy, *state.values[camera.name, "distortion"])
+    values.insert(
+        T(c), gtsam.Pose3(gtsam.Rot3(state.values[camera.name, "rotation"]), state.values[camera.name, "translation"])
+    )
+    noise = gtsam.noiseModel.Isotropic.Sigma(2, camera.corner_noise_px)
+    times = stream.seconds + state.values[camera.name, "time_offset"][0]
+    node = np.searchsorted(state.seconds, times - 1e-3)[stream.image].tolist()
+    for k, j, uv in zip(node, stream.point.tolist(), stream.uv, strict=True):
+        graph.add(gtsam_unstable.ProjectionFactorPPPCal3DS2(uv, noise, X(k), T(c), L(j), calibration))
+
+
+def _optimised(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values):
+    params = gtsam.LevenbergMarquardtParams()
+    params.setRelativeErrorTol(1e-9)
+    params.setAbsoluteErrorTol(5e-4)  # as icalib: half the chi^2 falls by less
+    last = gtsam.KeyVector([T(c) for c in range(8) if values.exists(T(c))] + [GRAVITY_KEY])
+    params.setOrdering(gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(graph, last, False))
+    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
+    return optimizer, optimizer.optimize()
+
+
+def _differences(
+    inputs: Inputs, ours: Estimate, covariance: np.ndarray, theirs: gtsam.Values, theirs_covariance: list[np.ndarray]
+) -> Iterator[tuple[str, float, str]]:
+    """Angle and distance between the two extrinsics, and the ratio of their formal standard deviations."""
+    for c, camera in enumerate(inputs.rig.cameras):
+        pose = theirs.atPose3(T(c))
+        v = ours.outcome.state.values
+        turn = gtsam.Rot3.Logmap(gtsam.Rot3(v[camera.name, "rotation"].T @ pose.rotation().matrix()))
+        yield f"{camera.name}_rotation_difference", np.rad2deg(np.linalg.norm(turn)), "deg"
+        moved = v[camera.name, "translation"] - pose.translation()
+        yield f"{camera.name}_translation_difference", 1e3 * np.linalg.norm(moved), "mm"
+        columns = np.concatenate([inputs.layout.columns(camera.name, n) for n in ("rotation", "translation")])
+        ratio = np.sqrt(np.diag(covariance)[columns] / np.diag(theirs_covariance[c]))
+        yield f"{camera.name}_sigma_icalib_over_gtsam_min", ratio.min(), "1"
+        yield f"{camera.name}_sigma_icalib_over_gtsam_max", ratio.max(), "1"
