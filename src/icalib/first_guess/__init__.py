@@ -7,15 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from icalib.errors import EstimationError
 from icalib.estimation.imu_data import ImuData
 from icalib.first_guess.clocks import Alignment, align, camera_rates
 from icalib.first_guess.gyro import GyroRotation
 from icalib.first_guess.intrinsics import guess_intrinsics
-from icalib.first_guess.lever_arm import LeverArm, check_gravity, check_size, lever_arm
+from icalib.first_guess.lever_arm import LeverArm, check_gravity, check_size, is_plausible, lever_arm
 from icalib.first_guess.target_poses import TargetPoses, target_poses
 from icalib.geometry.cameras import camera_model
 from icalib.measurements import CornerStream, Measurements
-from icalib.rig import Camera, Rig
+from icalib.rig import Camera, Parameter, Rig
 
 VELOCITY_STEP_S = 0.04
 
@@ -71,7 +72,7 @@ def initial_guess(rig: Rig, measurements: Measurements) -> Guess:
     gyro_bias = aligned[best].gyro_bias
     gyro = GyroRotation.integrate(imu, gyro_bias)
     arms = [
-        lever_arm(imu, s.seconds + a.offset, q, a.rotation, gyro, c.translation.value)
+        lever_arm(imu, s.seconds + a.offset, q, a.rotation, gyro, _trusted(c.translation))
         for c, s, q, a in zip(rig.cameras, measurements.cameras, poses, aligned, strict=True)
     ]
     gravity = arms[best].gravity
@@ -79,8 +80,8 @@ def initial_guess(rig: Rig, measurements: Measurements) -> Guess:
     for c, m in zip(rig.cameras, arms, strict=True):
         check_size(m, c.name)
     cameras = {
-        c.name: CameraGuess(p, a.offset, a.rotation, m.position, q)
-        for c, p, a, m, q in zip(rig.cameras, params, aligned, arms, poses, strict=True)
+        c.name: _camera_guess(c, s, p, a, m, q, measurements)
+        for c, s, p, a, m, q in zip(rig.cameras, measurements.cameras, params, aligned, arms, poses, strict=True)
     }
     return Guess(cameras, gyro_bias, _mean_bias(arms), _level(gravity))
 
@@ -94,15 +95,51 @@ def _params(camera: Camera, stream: CornerStream, rig: Rig) -> np.ndarray:
     return np.concatenate([found[:4] if given[0] is None else given[0], found[4:] if given[1] is None else given[1]])
 
 
+def _trusted(parameter: Parameter) -> np.ndarray | None:
+    """A value that what else is guessed may rest on; one that is only a place to start from may be far off."""
+    return None if parameter.mode == "free" else parameter.value
+
+
+def _relative_offset(value: np.ndarray, stream: CornerStream, measurements: Measurements) -> float:
+    return float(value[0]) + (stream.origin_ns - measurements.imu.origin_ns) * 1e-9
+
+
 def _align(
     camera: Camera, stream: CornerStream, poses: TargetPoses, imu: ImuData, measurements: Measurements
 ) -> Alignment:
-    given = camera.time_offset.value
-    apart = (stream.origin_ns - measurements.imu.origin_ns) * 1e-9
-    found = align(imu, camera.name, camera_rates(stream, poses), None if given is None else float(given[0]) + apart)
-    if camera.rotation.value is None:
-        return found
-    return Alignment(found.offset, camera.rotation.value, found.gyro_bias)
+    rates = camera_rates(stream, poses)
+    given, trusted = camera.time_offset.value, _trusted(camera.time_offset)
+    if trusted is not None:
+        found = align(imu, camera.name, rates, _relative_offset(trusted, stream, measurements))
+    else:
+        try:
+            found = align(imu, camera.name, rates, None)
+        except EstimationError:
+            if given is None:
+                raise
+            found = align(imu, camera.name, rates, _relative_offset(given, stream, measurements))
+    rotation = _trusted(camera.rotation)
+    return found if rotation is None else Alignment(found.offset, rotation, found.gyro_bias)
+
+
+def _camera_guess(
+    camera: Camera,
+    stream: CornerStream,
+    params: np.ndarray,
+    aligned: Alignment,
+    arm: LeverArm,
+    poses: TargetPoses,
+    measurements: Measurements,
+) -> CameraGuess:
+    """What was found, and in its place what the rig gives."""
+    offset, R, p = camera.time_offset.value, camera.rotation.value, camera.translation.value
+    return CameraGuess(
+        params,
+        aligned.offset if offset is None else _relative_offset(offset, stream, measurements),
+        aligned.rotation if R is None else R,
+        arm.position if p is None else p,
+        poses,
+    )
 
 
 def _mean_bias(arms: list[LeverArm]) -> np.ndarray:

@@ -8,8 +8,8 @@ from icalib.errors import CalibrationError
 from icalib.geometry.cameras.base import CameraModel
 
 _GRID = (48, 32)  # pixels across and down, the image's borders included
-_MAX_STEPS = 50
-_MAX_HALVINGS = 20
+_MAX_STEPS = 200  # ten are plenty, unless the best fit lies beyond the range of the model
+_LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e8  # of the normal equations with unit diagonal
 _SETTLED_PX = 1e-9  # a step that moves no pixel further than this is the last
 
 
@@ -20,8 +20,8 @@ def fit_model(
 
     A grid of pixels of the image of `resolution` (width, height) [px] is unprojected by `source` (pixels outside its
     range have no ray and are left out) and projected by `target`, starting at the source's fx, fy, cx, cy without
-    distortion. Gauss-Newton with step halving, so that every ray stays inside the range of `target`: if the best fit
-    lies outside, the result is a worse one at its edge.
+    distortion. Damped Gauss-Newton, of which every step keeps all rays inside the range where the target's distortion is
+    monotonic: if the best fit lies outside, the result is the best found at its edge.
 
     Returns the parameters (P,), and the root mean square and the maximum over the grid of the distance [px] between
     the two projections of a ray: judge them, a model that cannot follow the lens is fitted as well as it can be.
@@ -55,21 +55,23 @@ def _rays(source: CameraModel, params: np.ndarray, resolution: tuple[int, int]) 
 
 
 def _minimise(target: CameraModel, params: np.ndarray, rays: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Gauss-Newton from `params`, which can see all rays."""
+    """Levenberg-Marquardt from `params`, which can see all rays."""
+    damping = _LEAST_DAMPING
     for _ in range(_MAX_STEPS):
         projected, _, _, j_params = target.project_with_jacobians(params, rays)
         residual, J = (projected - uv).ravel(), j_params.reshape(2 * len(uv), -1)
         scale = np.linalg.norm(J, axis=0)
-        scale[scale == 0.0] = 1.0  # a term without effect on these rays stays as it is
-        step = -np.linalg.lstsq(J / scale, residual, rcond=None)[0] / scale
-        for halvings in range(_MAX_HALVINGS):
-            trial = params + step * 0.5**halvings
-            moved, valid = target.project(trial, rays)
+        padded = np.append(residual, np.zeros(len(params)))
+        while True:
+            damped = np.vstack([J / scale, np.sqrt(damping) * np.eye(len(params))])
+            step = -np.linalg.lstsq(damped, padded, rcond=None)[0] / scale
+            moved, valid = target.project(params + step, rays)
             if valid.all() and np.sum((moved - uv) ** 2) < residual @ residual:
                 break
-        else:
-            return params
-        params = trial
+            damping *= 10.0
+            if damping > _MOST_DAMPING:  # the step is down to rounding: as good as it gets
+                return params
+        params, damping = params + step, max(0.1 * damping, _LEAST_DAMPING)
         if np.abs(J @ step).max() < _SETTLED_PX:
             return params
     return params
