@@ -1,7 +1,9 @@
 """The same least-squares problem by icalib and by GTSAM: time, and how far apart the extrinsics come out.
 
-Both: nodes at the images of cam0, preintegrated IMU with bias walks, direction of gravity and both extrinsics estimated,
-intrinsics and time offsets fixed (offsets 0: cameras and IMU share a clock), no robust loss, nothing set aside, the same
+Both: nodes at the images of cam0, preintegrated IMU with bias walks, direction of gravity and both extrinsics
+estimated,
+intrinsics and time offsets fixed (offsets 0: cameras and IMU share a clock), no robust loss, nothing set aside, the
+same
 noise and the same first state. GTSAM's projection factor with the extrinsics as a variable, ProjectionFactorPPP of
 gtsam_unstable, wants each target point to be a variable too; a tight prior holds them.
 """
@@ -72,10 +74,12 @@ def _like_for_like(rig: Rig) -> Rig:
 
 
 def excerpt(measurements: Measurements, seconds: float) -> Measurements:
-    """The instants from the first image of the first camera on at which every camera has an image, and their IMU."""
+    """The first `seconds`: all instants at which the IMU runs and every camera has an image, and the IMU's readings."""
     common = measurements.cameras[0].stamps_ns
     for camera in measurements.cameras[1:]:
         common = np.intersect1d(common, camera.stamps_ns)
+    imu = measurements.imu
+    common = common[(common >= imu.stamps_ns[0]) & (common <= imu.stamps_ns[-1])]
     common = common[common <= common[0] + round(seconds * 1e9)]
 
     def camera(s: CornerStream) -> CornerStream:
@@ -84,7 +88,6 @@ def excerpt(measurements: Measurements, seconds: float) -> Measurements:
         start = np.concatenate([[0], np.cumsum(np.diff(s.start)[chosen])])
         return CornerStream(s.name, s.stamps_ns[chosen], start, s.point[corners], s.uv[corners])
 
-    imu = measurements.imu
     i = np.searchsorted(imu.stamps_ns, common[0], "right") - 1
     j = np.searchsorted(imu.stamps_ns, common[-1], "left") + 1
     part = ImuStream(imu.name, imu.stamps_ns[i:j], imu.gyro[i:j], imu.accel[i:j])
@@ -163,14 +166,19 @@ def _differences(
     inputs: Inputs, ours: Estimate, covariance: np.ndarray, theirs: gtsam.Values, theirs_covariance: list[np.ndarray]
 ) -> Iterator[tuple[str, float, str]]:
     """Angle and distance between the two extrinsics, and the ratio of their formal standard deviations."""
+    v = ours.outcome.state.values
     for c, camera in enumerate(inputs.rig.cameras):
         pose = theirs.atPose3(T(c))
-        v = ours.outcome.state.values
         turn = gtsam.Rot3.Logmap(gtsam.Rot3(v[camera.name, "rotation"].T @ pose.rotation().matrix()))
+        move = pose.translation() - v[camera.name, "translation"]
         yield f"{camera.name}_rotation_difference", np.rad2deg(np.linalg.norm(turn)), "deg"
-        moved = v[camera.name, "translation"] - pose.translation()
-        yield f"{camera.name}_translation_difference", 1e3 * np.linalg.norm(moved), "mm"
+        yield f"{camera.name}_translation_difference", 1e3 * np.linalg.norm(move), "mm"
         columns = np.concatenate([inputs.layout.columns(camera.name, n) for n in ("rotation", "translation")])
-        ratio = np.sqrt(np.diag(covariance)[columns] / np.diag(theirs_covariance[c]))
-        yield f"{camera.name}_sigma_icalib_over_gtsam_min", ratio.min(), "1"
-        yield f"{camera.name}_sigma_icalib_over_gtsam_max", ratio.max(), "1"
+        sigma = np.sqrt(np.diag(covariance)[columns])
+        yield f"{camera.name}_difference_over_sigma_max", np.max(np.abs(np.concatenate([turn, move])) / sigma), "1"
+        # GTSAM perturbs the translation along the camera's axes, icalib along the IMU's.
+        A = np.eye(6)
+        A[3:, 3:] = pose.rotation().matrix()
+        ratio = sigma / np.sqrt(np.diag(A @ theirs_covariance[c] @ A.T))
+        yield f"{camera.name}_sigma_over_gtsam_sigma_min", ratio.min(), "1"
+        yield f"{camera.name}_sigma_over_gtsam_sigma_max", ratio.max(), "1"

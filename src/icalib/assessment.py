@@ -22,6 +22,7 @@ from icalib.estimation.corner_noise import NoiseModel
 from icalib.estimation.estimate import Estimate
 from icalib.estimation.evidence import Fit, fits, place_covariances, split_covariance
 from icalib.estimation.imu_model import LABELS as IMU_LABELS
+from icalib.estimation.nodes import usable
 from icalib.estimation.state import Block
 from icalib.geometry.cameras import camera_model
 from icalib.observability import Observability, observe
@@ -120,16 +121,17 @@ def _groups(
         labels = _labels(inputs, block)
         if block.name == "tilt":
             labels = ("x", "y")
-        zeros, verdict = np.zeros(block.size), tuple["Verdict", ...]()
+        zeros = np.zeros(block.size)
         if block.start is None:
             std = factor = zeros
-            verdict = ("fixed",) * block.size
+            verdict: tuple[Verdict, ...] = ("fixed",) * block.size
         else:
             k = block.columns
             own = float(np.sqrt(np.mean(ratio[k] ** 2)))
             factor = np.full(block.size, max(1.0, own, overall))
             std = formal[k]
-            verdict = tuple(seen.verdicts[i] for i in k)
+            loose = std * factor > found.problem.tolerance[k]
+            verdict = tuple(_with_factor(seen.verdicts[i], w) for i, w in zip(k, loose, strict=True))
         unit = "" if block.sensor == inputs.rig.imu.name else UNITS[block.name]
         groups.append(
             ParameterGroup(
@@ -140,6 +142,11 @@ def _groups(
             )
         )  # fmt: skip
     return tuple(groups)
+
+
+def _with_factor(formal: Verdict, loose: bool) -> Verdict:
+    """What the formal information calls determined is weak where the printed deviation exceeds the tolerance."""
+    return "weak" if formal == "determined" and loose else formal
 
 
 def _empirical_variance(inputs: Inputs, found: Estimate, formal: np.ndarray) -> np.ndarray | None:
@@ -204,7 +211,8 @@ def _warnings(
         if f.kind == "corners" and f.rejected > MANY_REJECTED * 0.5 * f.count:
             share = f.rejected / (f.rejected + 0.5 * f.count)
             yield f"{share:.0%} of the corners of {f.sensor} were set aside; look at its residuals in the report."
-    factors = [g.factor.max() for g in groups if g.factor is not None and g.mode != "fixed" and g.sensor != BOARD]
+    judged_groups = (g for g in groups if g.mode != "fixed" and g.sensor != BOARD and g.name != "bloom")
+    factors = [g.factor.max() for g in judged_groups if g.factor is not None]
     if factors and max(factors) > LARGE_FACTOR:
         yield (
             f"parts of the recording disagree by up to {max(factors):.1f} times what corner and IMU noise explain; the "
@@ -228,6 +236,11 @@ def _notes(inputs: Inputs, found: Estimate):
     for a, b in inputs.imu.gaps:
         how = "bridged" if b - a <= rig.settings.max_gap_s else "left out, with the images in it"
         yield f"{rig.imu.name} has a gap of {b - a:.3f} s at {a:.3f} s, {how}."
+    for camera in found.problem.cameras:
+        t = camera.times + found.outcome.state.values[camera.name, "time_offset"][0]
+        left_out = int((~usable(inputs.imu, t, rig.settings.max_gap_s)).sum())
+        if left_out:
+            yield f"{left_out} images of {camera.name} are left out: {rig.imu.name} was not running then."
     for camera, model in zip(rig.cameras, found.noise, strict=True):
         yield f"{camera.name}: {_noise_words(model)}."
 

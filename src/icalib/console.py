@@ -15,8 +15,9 @@ from icalib.report.console import table
 
 @contextmanager
 def progress_bar(quiet: bool) -> Iterator[Callable[[str, float], None]]:
-    """A bar on standard error with the time left; `quiet`: nothing is shown."""
-    if quiet:
+    """A bar on standard error with the time left; nothing where that is no terminal, or `quiet`."""
+    console = Console(stderr=True)
+    if quiet or not console.is_terminal:
         yield lambda stage, done: None
         return
     columns = (
@@ -26,7 +27,7 @@ def progress_bar(quiet: bool) -> Iterator[Callable[[str, float], None]]:
         TextColumn("left"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("starting", total=1.0)
         yield lambda stage, done: bar.update(task, description=stage, completed=done)
 

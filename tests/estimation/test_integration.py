@@ -24,7 +24,7 @@ class Readings:
         self.t = np.cumsum(rng.uniform(0.002, 0.011, n)) - 0.004
         self.gyro = rate_scale * rng.normal(size=(n, 3))
         self.accel = rng.normal(size=(n, 3)) * 3.0 + [0.0, 0.0, 9.8]
-        self.variance = np.tile([1e-4**2, 2e-3**2], (n - 1, 1)) * rng.uniform(0.5, 2.0, (n - 1, 1))
+        self.variance = np.tile([1e-4**2, 2e-3**2, 0.0], (n - 1, 1)) * rng.uniform(0.5, 2.0, (n - 1, 1))
         self.walk = np.array([1e-3**2, 2e-2**2])
 
     def interval(self, t):
@@ -264,11 +264,11 @@ def test_covariance_against_sampled_readings():
     r.t = np.arange(n + 1) / rate
     phase = 2 * np.pi * r.t[:, None] * [1.1, 0.7, 0.9]
     r.gyro, r.accel = np.sin(phase + 1.0), 2.0 * np.cos(phase) + [0.0, 0.0, 9.8]
-    r.variance = np.tile([1e-3**2, 1e-2**2], (n, 1))
+    r.variance = np.tile([1e-3**2, 1e-2**2, 0.0], (n, 1))
     r.walk = np.array([2e-3**2, 2e-2**2])
     R, v, p, _, P, _ = run(r, 0.0, r.t[-1], covariance=True)
 
-    density, walk = np.sqrt(np.repeat(r.variance[0], 3)), np.sqrt(np.repeat(r.walk, 3))
+    density, walk = np.sqrt(np.repeat(r.variance[0, :2], 3)), np.sqrt(np.repeat(r.walk, 3))
     readings = np.concatenate([r.gyro, r.accel], axis=1) + density * np.sqrt(rate) * rng.normal(
         size=(samples, n + 1, 6)
     )

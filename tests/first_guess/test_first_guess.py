@@ -154,3 +154,52 @@ def test_one_prior_is_enough_to_start_from(simulation: Simulation):
     rig = dataclasses.replace(rig, cameras=(dataclasses.replace(c, translation=given), *rig.cameras[1:]))
     guess = initial_guess(rig, simulation.measurements)
     assert np.array_equal(guess.cameras[c.name].position, given.value)
+
+
+@pytest.mark.parametrize("span", [(0.0, 9.0), (12.0, 20.0)])
+def test_an_imu_that_covers_a_part_is_enough(simulation: Simulation, span: tuple[float, float]):
+    imu = simulation.measurements.imu
+    t = imu.seconds
+    m = (t >= span[0]) & (t <= span[1])
+    part = dataclasses.replace(
+        simulation.measurements, imu=ImuStream(imu.name, imu.stamps_ns[m], imu.gyro[m], imu.accel[m])
+    )
+    guess = initial_guess(rig_for(simulation.scenario), part)
+    for name in guess.cameras:
+        assert raw_offset(guess, part, name) == pytest.approx(simulation.truth.time_offset[name], abs=1e-3)
+
+
+def test_a_wrong_fixed_offset_is_named(simulation: Simulation):
+    rig = rig_for(simulation.scenario)
+    c = rig.cameras[0]
+    wrong = Parameter("fixed", np.array([simulation.truth.time_offset[c.name] + 3.0]))
+    rig = dataclasses.replace(rig, cameras=(dataclasses.replace(c, time_offset=wrong), *rig.cameras[1:]))
+    assert "time_offset" in failure(rig, simulation.measurements)
+
+
+def test_corners_without_rhyme_are_refused(simulation: Simulation):
+    rng = np.random.default_rng(0)
+    cameras = tuple(dataclasses.replace(c, uv=rng.permutation(c.uv)) for c in simulation.measurements.cameras)
+    rig = rig_for(simulation.scenario, intrinsics="free", distortion="free")
+    assert "intrinsics" in failure(rig, dataclasses.replace(simulation.measurements, cameras=cameras))
+
+
+def test_a_few_gross_outliers_cost_hardly_a_pose(simulation: Simulation):
+    rng = np.random.default_rng(0)
+    cameras = []
+    for c in simulation.measurements.cameras:
+        far = rng.random(len(c.uv)) < 0.03
+        cameras.append(dataclasses.replace(c, uv=c.uv + 20.0 * far[:, None] * rng.choice([-1.0, 1.0], c.uv.shape)))
+    guess = initial_guess(
+        rig_for(simulation.scenario), dataclasses.replace(simulation.measurements, cameras=tuple(cameras))
+    )
+    for camera in guess.cameras.values():
+        assert camera.poses.ok.mean() > 0.9
+
+
+def test_one_axis_of_rotation_is_not_enough_and_said():
+    simulation = simulate(
+        dataclasses.replace(handheld(15.0, exact=False), motion=Motion("single_axis", exact=False)), 0
+    )
+    assert "one axis" in failure(rig_for(simulation.scenario), simulation.measurements)
+    initial_guess(rig_for(simulation.scenario, rotation="fixed"), simulation.measurements)

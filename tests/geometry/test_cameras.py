@@ -22,6 +22,12 @@ SAMPLES = {
         "folds": [700.0, 690.0, 375.0, 241.0, -0.3, 0.0, 0.003, -0.002],
         "pincushion that folds": [600.0, 610.0, 370.0, 240.0, 0.2, -0.05, -0.001, 0.002],
     },
+    "pinhole-radtan5": {
+        "corners": [458.1, 456.9, 367.3, 248.5, -0.29, 0.1, 0.0002, -0.0001, -0.015],
+        "none": [400.0, 410.0, 380.0, 230.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        "folds": [700.0, 690.0, 375.0, 241.0, -0.1, -0.1, 0.003, -0.002, -0.15],
+        "pincushion that folds": [600.0, 610.0, 370.0, 240.0, 0.2, 0.05, -0.001, 0.002, -0.06],
+    },
     "pinhole-equidistant": {
         "tum-vi": [191.0, 190.9, 376.0, 239.0, 0.0034823894, 0.0007150348, -0.0020532361, 0.00020293674],
         "none": [150.0, 151.0, 370.0, 235.0, 0.0, 0.0, 0.0, 0.0],
@@ -39,10 +45,10 @@ def sample(name: str, label: str) -> tuple[CameraModel, np.ndarray]:
 
 def obvious_radtan(params: np.ndarray, point: np.ndarray) -> complex:
     """In complex numbers: w d + 2 |w|^2 (p2 + i p1) + w^2 (p2 - i p1), w = a + i b."""
-    k1, k2, p1, p2 = params[4:]
+    k1, k2, p1, p2, *k3 = params[4:]
     w = complex(point[0], point[1]) / point[2]
     s = abs(w) ** 2
-    return w * (1 + k1 * s + k2 * s**2) + 2 * s * complex(p2, p1) + w**2 * complex(p2, -p1)
+    return w * (1 + k1 * s + k2 * s**2 + sum(k3) * s**3) + 2 * s * complex(p2, p1) + w**2 * complex(p2, -p1)
 
 
 def obvious_equidistant(params: np.ndarray, point: np.ndarray) -> complex:
@@ -51,13 +57,18 @@ def obvious_equidistant(params: np.ndarray, point: np.ndarray) -> complex:
     return cmath.rect(theta_d, cmath.phase(complex(point[0], point[1])))
 
 
-OBVIOUS = {"pinhole-radtan": obvious_radtan, "pinhole-equidistant": obvious_equidistant}
+OBVIOUS = {
+    "pinhole-radtan": obvious_radtan,
+    "pinhole-radtan5": obvious_radtan,
+    "pinhole-equidistant": obvious_equidistant,
+}
 
 
 def angle_limit(name: str, params: np.ndarray) -> float:
     """Largest angle from the optical axis [rad] that the model projects; found by walking outwards."""
     radii = np.linspace(0.0, pi if name == "pinhole-equidistant" else 50.0, 200_001)[1:]
-    factors = sum(k * radii ** (2 * i + 2) for i, k in enumerate(params[4:] if "equi" in name else params[4:6]))
+    coefficients = params[4:] if name == "pinhole-equidistant" else [*params[4:6], *params[8:]]
+    factors = sum(k * radii ** (2 * i + 2) for i, k in enumerate(coefficients))
     falls = np.flatnonzero(np.diff(radii * (1.0 + factors)) <= 0.0)
     limit = radii[falls[0]] if len(falls) else radii[-1]
     return float(limit if name == "pinhole-equidistant" else np.arctan(limit))
@@ -93,7 +104,9 @@ def test_every_model_has_samples_and_an_obvious_formula() -> None:
 
 
 def test_unknown_model_lists_what_there_is() -> None:
-    with pytest.raises(CalibrationError, match=r"'pinhole-radtam'.*pinhole-radtan, pinhole-equidistant"):
+    with pytest.raises(
+        CalibrationError, match=r"'pinhole-radtam'.*pinhole-radtan, pinhole-radtan5, pinhole-equidistant"
+    ):
         camera_model("pinhole-radtam")
 
 
@@ -118,7 +131,7 @@ def test_jacobian_of_the_point(name: str, label: str) -> None:
     _, _, j_point, _ = model.project_with_jacobians(params, points)
     for point, j in zip(points, j_point, strict=True):
         # Of the depth too: just under 90 degrees uv of a radtan camera changes on the scale of z.
-        scale = min(float(np.linalg.norm(point)), abs(point[2])) if name == "pinhole-radtan" else np.linalg.norm(point)
+        scale = min(float(np.linalg.norm(point)), abs(point[2])) if "radtan" in name else np.linalg.norm(point)
         numeric = differences(lambda p: model.project(params, p[None])[0][0], point, np.full(3, 5e-4 * scale))
         np.testing.assert_allclose(j, numeric, atol=1e-8 * np.abs(j).max())
 
@@ -148,7 +161,7 @@ def test_on_the_optical_axis_it_is_a_pinhole(name: str, label: str, offset: floa
     np.testing.assert_allclose(uv[0], [cx, cy], atol=fx * 2 * offset)
     np.testing.assert_allclose(j_point[0], [[fx / 2, 0, 0], [0, fy / 2, 0]], atol=1e-11 * fx)
     np.testing.assert_allclose(j_params[0, :, 2:4], np.eye(2), atol=0)
-    np.testing.assert_allclose(j_params[0, :, [0, 1, 4, 5, 6, 7]], 0.0, atol=offset)
+    np.testing.assert_allclose(np.delete(j_params[0], [2, 3], axis=1), 0.0, atol=offset)
 
 
 @pytest.mark.parametrize(("name", "label"), CASES)
@@ -210,7 +223,7 @@ def test_pixels_beyond_the_fold_are_flagged(name: str, label: str) -> None:
 
 def test_a_fisheye_sees_behind_its_image_plane_and_a_pinhole_does_not() -> None:
     behind = np.array([[1.0, 0.2, -0.1], [0.3, -1.0, 0.0]])
-    for name, expected in (("pinhole-equidistant", True), ("pinhole-radtan", False)):
+    for name, expected in (("pinhole-equidistant", True), ("pinhole-radtan", False), ("pinhole-radtan5", False)):
         model, params = sample(name, "none")
         assert (model.project(params, behind)[1] == expected).all()
 
@@ -226,11 +239,24 @@ def test_a_zero_focal_length_or_nan_parameter_is_invalid_and_no_crash(name: str)
     assert not model.unproject(params, np.array([[300.0, 200.0]]))[1].any()
 
 
+def test_the_fifth_coefficient_at_zero_changes_nothing() -> None:
+    model, params = sample("pinhole-radtan", "euroc")
+    five, extended = camera_model("pinhole-radtan5"), np.append(params, 0.0)
+    points = points_in_view("pinhole-radtan", params)
+    for before, after in zip(
+        model.project_with_jacobians(params, points), five.project_with_jacobians(extended, points), strict=True
+    ):
+        np.testing.assert_array_equal(after[..., :8] if after.ndim == 3 else after, before)
+    uv = model.project(params, points)[0]
+    for before, after in zip(model.unproject(params, uv), five.unproject(extended, uv), strict=True):
+        np.testing.assert_allclose(after, before, rtol=0, atol=1e-14)
+
+
 @pytest.mark.parametrize("name", CAMERA_MODELS)
 def test_no_points_and_integer_or_strided_points(name: str) -> None:
     model, params = sample(name, next(iter(SAMPLES[name])))
     shapes = [a.shape for a in model.project_with_jacobians(params, np.empty((0, 3)))]
-    assert shapes == [(0, 2), (0,), (0, 2, 3), (0, 2, 8)]
+    assert shapes == [(0, 2), (0,), (0, 2, 3), (0, 2, len(params))]
     assert model.unproject(params, np.empty((0, 2)))[0].shape == (0, 3)
     uv, _ = model.project(params, np.array([[0, 0, 1], [0, 1, 2]]))
     strided = np.array([[0.0, 0, 1], [9, 9, 9], [0, 1, 2]])[::2]
@@ -246,6 +272,8 @@ def test_no_points_and_integer_or_strided_points(name: str) -> None:
         ([-0.3, 1e-320], (1 / 0.9) ** 0.5),
         ([0.0, -0.2], 1.0),
         ([-3.0 / 3, 2.0 / 5], (1 / 2) ** 0.5),  # 1 - 3 s + 2 s^2: the first of two roots
+        ([-6.0 / 3, 11.0 / 5, -6.0 / 7], (1 / 3) ** 0.5),  # (1 - s) (1 - 2 s) (1 - 3 s): the first of three
+        ([-0.3, 0.0, 0.0], (1 / 0.9) ** 0.5),
         ([np.nan, 0.0], 0.0),
     ],
 )

@@ -14,6 +14,7 @@ from icalib.calibration import Calibration, ParameterGroup
 from icalib.errors import CalibrationError
 from icalib.estimation.imu_model import LABELS, correction_matrices
 from icalib.export.kalibr import camchain_imucam, imu_yaml
+from icalib.geometry.cameras import camera_model
 
 
 @pytest.fixture(scope="module")
@@ -55,11 +56,27 @@ def test_models_are_kalibrs_names(calibration: Calibration, chain: dict):
     assert (found["camera_model"], found["distortion_model"]) == ("pinhole", "equidistant")
 
 
-def test_a_model_that_kalibr_lacks_is_said(calibration: Calibration):
+def test_a_model_that_kalibr_lacks_is_fitted_and_said(calibration: Calibration):
     sensors = {n: s | {"model": "pinhole-radtan5"} if n == "cam1" else s for n, s in calibration.rig["sensors"].items()}
-    text = camchain_imucam(dataclasses.replace(calibration, rig=calibration.rig | {"sensors": sensors}))
-    assert "# cam1: Kalibr has no radtan5;" in text and "# cam0" not in text
-    assert yaml.safe_load(text)["cam1"]["distortion_model"] == "radtan5"
+    groups = tuple(
+        dataclasses.replace(g, value=np.append(g.value, -0.002)) if (g.sensor, g.name) == ("cam1", "distortion") else g
+        for g in calibration.groups
+    )
+    text = camchain_imucam(dataclasses.replace(calibration, rig=calibration.rig | {"sensors": sensors}, groups=groups))
+    assert "# cam1: Kalibr has no radtan5; this radtan follows it to" in text and "# cam0" not in text
+    fitted = yaml.safe_load(text)["cam1"]
+    assert (fitted["distortion_model"], len(fitted["distortion_coeffs"])) == ("radtan", 4)
+    rays = np.array([[0.2, -0.1, 1.0], [-0.3, 0.25, 1.0]])
+    params = np.concatenate([calibration.group("cam1", "intrinsics").value, groups_of(groups, "cam1", "distortion")])
+    ours, _ = camera_model("pinhole-radtan5").project(params, rays)
+    theirs, _ = camera_model("pinhole-radtan").project(
+        np.array(fitted["intrinsics"] + fitted["distortion_coeffs"]), rays
+    )
+    assert np.abs(ours - theirs).max() < 0.5
+
+
+def groups_of(groups: tuple, sensor: str, name: str) -> np.ndarray:
+    return next(g.value for g in groups if (g.sensor, g.name) == (sensor, name))
 
 
 def test_layout_is_that_of_kalibr(euroc: Path, chain: dict, calibration: Calibration):

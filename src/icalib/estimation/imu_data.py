@@ -13,14 +13,16 @@ GAP = 3.0  # an interval longer than this many median periods is a gap
 # Within a gap the motion goes on unseen: what is not known of rate and force, their spread over the recording,
 # is taken to stay correlated for this long.
 MOTION_CORRELATION_S = 0.1
+WITHIN = 1e-4  # keeps the covariance of a stretch without a stamp in it definite; nothing else
 
 
 @dataclass(frozen=True)
 class ImuData:
     """Readings on the imu clock, seconds since its first stamp.
 
-    variance (N - 1, 2): squared noise densities of each interval, gyroscope and accelerometer; walk (2,): squared
-    densities of the bias walks. gaps: (start, end) of intervals without readings.
+    variance (N - 1, 3): squared noise densities of each interval: gyroscope, accelerometer, and how the force departs
+    from its mean within the interval; walk (2,): squared densities of the bias walks. gaps: (start, end) of intervals
+    without readings.
     """
 
     name: str
@@ -35,10 +37,10 @@ class ImuData:
     def build(cls, stream: ImuStream, noise: ImuNoise) -> ImuData:
         t = stream.seconds
         dt = np.diff(t)
-        variance = np.tile([noise.gyro**2, noise.accel**2], (len(dt), 1))
+        variance = np.tile([noise.gyro**2, noise.accel**2, WITHIN * noise.accel**2], (len(dt), 1))
         gap = dt > GAP * np.median(dt)
-        spread = np.array([stream.gyro.var(axis=0).sum() / 3.0, stream.accel.var(axis=0).sum() / 3.0])
-        variance[gap] += 2.0 * MOTION_CORRELATION_S * spread
+        gyro, accel = stream.gyro.var(axis=0).sum() / 3.0, stream.accel.var(axis=0).sum() / 3.0
+        variance[gap] += 2.0 * MOTION_CORRELATION_S * np.array([gyro, accel, accel])
         return cls(
             stream.name,
             t,

@@ -109,6 +109,10 @@ def _add_noise(P, bias_step, variance, walk, dt):
             for k in range(6):
                 s += bias_step[i, k] * bias_step[j, k] * variance[k // 3]
             P[i, j] += s / dt
+    for i in range(3):
+        # A force that is not constant within the stretch: white, it moves the position by dt^3 / 3, its mean by
+        # dt^3 / 4. Without it position follows velocity exactly where a stretch holds no other stamp (a bridged gap).
+        P[6 + i, 6 + i] += variance[2] * dt * dt * dt / 12.0
     for k in range(6):
         P[9 + k, 9 + k] += walk[k // 3] * dt
 
@@ -118,7 +122,8 @@ def step(rate, force, dt, dw_db, df_db, R, v, p, J, extra_w, extra_f, P, P_t, va
     """Advances the increments (R, v, p) by dt (either sign) of constant body `rate` and specific `force`.
 
     dw_db, df_db (3, 6): derivatives of rate and force with respect to both biases; extra_w, extra_f (3, 24 or 0): to
-    the IMU intrinsics. variance, walk (2,): squared densities, gyro and accelerometer. All arrays change in place.
+    the IMU intrinsics. variance (3,): see ImuData; walk (2,): squared densities, gyro and accelerometer. All arrays
+    change in place.
     """
     phi = rate * dt
     x = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
@@ -202,7 +207,7 @@ def _corrected(gyro, accel, j, s, bias, F, G, H, rate, force):
 def integrate(t0, t1, first, t, gyro, accel, bias, intrinsics, variance, walk, linear, R, v, p, J, P):
     """Integrates readings from t0 to t1 (seconds, imu clock; t1 < t0 runs backwards), starting at interval `first`.
 
-    t (N,), gyro, accel (N, 3): readings; bias (6,); variance (N, 2): squared noise densities of each interval;
+    t (N,), gyro, accel (N, 3): readings; bias (6,); variance (N, 3): see ImuData;
     walk (2,). R, v, p, J, P are overwritten. Beyond the recording the first or last interval is continued.
     With `linear`, readings go linearly from stamp to stamp, and a part of an interval takes their mean over that part:
     whole intervals are the same, but the pose at t1 then has a continuous derivative, the rate at t1.

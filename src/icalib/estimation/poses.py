@@ -50,7 +50,7 @@ def assign_nodes(scheme: Scheme, nodes: np.ndarray, times: np.ndarray) -> np.nda
 
 @njit(cache=True, nogil=True)
 def _inertial(times, node, first, nodes, R, p, v, b, g, t, gyro, accel, intrinsics, out_R, out_p, rate, vel, Jn, Jx):
-    variance, walk = np.zeros(2).reshape(1, 2), np.zeros(2)
+    variance, walk = np.zeros((len(t), 3)), np.zeros(2)
     width = 6 + Jx.shape[2]
     dR, dv, dp, J = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((9, width))
     P = np.empty((0, 0))

@@ -17,6 +17,7 @@ MAX_ITERATIONS = 50
 CONVERGED_DECREASE = 5e-4
 ROUNDING = 1e-11  # of the cost: what rounding makes of a sum of 1e6 squares
 CURVED_BELOW = 1e-2  # of the cost: steps that promise less use the true curvature of the robust loss
+STALLED_DECREASE = 5e-3  # a step this small that fails is at the grain of the cost: a tenth of a standard deviation
 FIRST_DAMPING = 1e-8
 ZERO_DAMPING = 1e-10  # below this, none: the weak information of a planar drive must not be swamped
 
@@ -69,6 +70,9 @@ def minimise(
         converged = damping == 0.0 and solution.decrease < max(tolerance, ROUNDING * cost)
         # At the bottom rounding decides whether the cost falls; a step this small is taken anyway.
         accepted = bool(candidate_cost < cost) or converged
+        if not accepted and damping == 0.0 and not curved and solution.decrease < STALLED_DECREASE:
+            steps.append(Step(cost, solution.decrease, damping, False))
+            return _finish(problem, state, cost, pieces, residuals, steps, True)
         steps.append(Step(cost, solution.decrease, damping, accepted))
         on_step(steps[-1])
         if accepted:
@@ -106,7 +110,7 @@ def _finish(problem, state, cost, pieces, residuals, steps, converged) -> Outcom
     information = solve(pieces, problem.n_nodes, problem.tolerance, 0.0).information
     n = len(steps)
     status = (
-        f"converged in {n} iterations: the next step would change no parameter by more than 3 % of its standard "
+        f"converged in {n} iterations: the next step would move no parameter by more than a tenth of its standard "
         f"deviation."
         if converged
         else f"not converged after {n} iterations: the cost is {cost:.6g} and still "

@@ -13,6 +13,8 @@ import yaml
 from icalib.calibration import Calibration, CornerResiduals
 from icalib.errors import CalibrationError
 from icalib.geometry import so3
+from icalib.geometry.cameras import camera_model
+from icalib.geometry.cameras.convert import fit_model
 
 KALIBR_DISTORTIONS = ("radtan", "equidistant")
 SAME_INSTANT_S = 0.025  # images this close see the same scene
@@ -28,7 +30,8 @@ def camchain_imucam(calibration: Calibration) -> str:
         "# Kalibr's camchain by icalib. T_cam_imu takes coordinates in the imu frame to the camera frame, T_cn_cnm1 "
         "those of the camera before to this one; t_imu = t_cam + timeshift_cam_imu [s]."
     )
-    return _text([comment, *_renamed("cam", c.cameras), *_foreign_models(data)], data)
+    fits = [sentence for i in range(len(c.cameras)) if (sentence := _lens(c, i)[1])]
+    return _text([comment, *_renamed("cam", c.cameras), *fits], data)
 
 
 def imu_yaml(calibration: Calibration) -> str:
@@ -61,17 +64,36 @@ def _camera(c: Calibration, index: int, overlaps: np.ndarray) -> dict[str, Any]:
     data: dict[str, Any] = {"T_cam_imu": T_cam_imu.tolist()}
     if index > 0:
         data["T_cn_cnm1"] = (T_cam_imu @ c.T_imu_sensor(c.cameras[index - 1])).tolist()
-    projection, distortion = c.rig["sensors"][name]["model"].split("-")
+    lens, _ = _lens(c, index)
     return data | {
         "cam_overlaps": np.flatnonzero(overlaps[index]).tolist(),
-        "camera_model": projection,
-        "distortion_coeffs": c.group(name, "distortion").value.tolist(),
-        "distortion_model": distortion,
-        "intrinsics": c.group(name, "intrinsics").value.tolist(),
+        "camera_model": "pinhole",
+        "distortion_coeffs": lens[1][4:].tolist(),
+        "distortion_model": lens[0],
+        "intrinsics": lens[1][:4].tolist(),
         "resolution": [int(side) for side in c.rig["sensors"][name]["resolution"]],
         "rostopic": f"/{name}/image_raw",
         "timeshift_cam_imu": float(c.group(name, "time_offset").value[0]),
     }
+
+
+def _lens(c: Calibration, index: int) -> tuple[tuple[str, np.ndarray], str]:
+    """Kalibr's distortion model with its parameters (8,), and a sentence where they are a fit to a model of ours."""
+    name = c.cameras[index]
+    sensor = c.rig["sensors"][name]
+    params = np.concatenate([c.group(name, "intrinsics").value, c.group(name, "distortion").value])
+    distortion = sensor["model"].split("-")[1]
+    if distortion in KALIBR_DISTORTIONS:
+        return (distortion, params), ""
+    width, height = (int(side) for side in sensor["resolution"])
+    source, target = camera_model(sensor["model"]), camera_model("pinhole-radtan")
+    fitted, rms, most = fit_model(source, params, target, (width, height))
+    sentence = (
+        f"# cam{index}: Kalibr has no {distortion}; this radtan follows it to {rms:.2f} px RMS over the "
+        f"image, {most:.1f} px "
+        "at most. calibration.yaml holds what was estimated."
+    )
+    return ("radtan", fitted), sentence
 
 
 def _intrinsics(c: Calibration) -> dict[str, Any]:
@@ -135,16 +157,6 @@ def _overlap(a: CornerResiduals, b: CornerResiduals) -> bool:
 def _renamed(kind: str, names: tuple[str, ...]) -> list[str]:
     """Comments that say which sensor a Kalibr name stands for, where the two differ."""
     return [f"# {kind}{i} is {name}." for i, name in enumerate(names) if name != f"{kind}{i}"]
-
-
-def _foreign_models(data: dict[str, Any]) -> list[str]:
-    """Comments on distortion models that Kalibr does not have; a reader refuses their name rather than misread them."""
-    models = ((cam, entry["distortion_model"]) for cam, entry in data.items())
-    return [
-        f"# {cam}: Kalibr has no {model}; calibrate with radtan where a program must read this."
-        for cam, model in models
-        if model not in KALIBR_DISTORTIONS
-    ]
 
 
 def _text(comments: list[str], data: dict[str, Any]) -> str:

@@ -9,10 +9,10 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation.imu_data import ImuData
-from icalib.first_guess.clocks import Alignment, align, camera_rates
+from icalib.first_guess.clocks import Alignment, align, camera_rates, check_axes
 from icalib.first_guess.gyro import GyroRotation
 from icalib.first_guess.intrinsics import guess_intrinsics
-from icalib.first_guess.lever_arm import LeverArm, check_gravity, check_size, is_plausible, lever_arm
+from icalib.first_guess.lever_arm import LeverArm, check_gravity, check_size, lever_arm
 from icalib.first_guess.target_poses import TargetPoses, target_poses
 from icalib.geometry.cameras import camera_model
 from icalib.measurements import CornerStream, Measurements
@@ -119,6 +119,8 @@ def _align(
                 raise
             found = align(imu, camera.name, rates, _relative_offset(given, stream, measurements))
     rotation = _trusted(camera.rotation)
+    if rotation is None:
+        check_axes(rates, camera.name)
     return found if rotation is None else Alignment(found.offset, rotation, found.gyro_bias)
 
 

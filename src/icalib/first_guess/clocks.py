@@ -16,7 +16,10 @@ GRID_HZ = 100.0
 LONGEST_STEP_S = 0.25  # images further apart do not give an angular rate
 SHORTEST_OVERLAP_S = 4.0
 LEAST_CORRELATION = 0.7
+LARGEST_UNEXPLAINED = 0.6  # of the angular rate, at an offset that was given
 STILL_RAD_S = 0.03
+_SAME_RECORDING = "check that both come from the same recording, overlap in time, and are in rad/s"
+LEAST_SECOND_AXIS = 0.05  # of the spread of rates about the first
 ROUNDS = 12
 DEGREES = 180.0 / np.pi
 
@@ -65,9 +68,40 @@ def align(imu: ImuData, name: str, rates: CameraRates, given_offset: float | Non
     """Offset, rotation and gyro bias. Raises EstimationError where the rates do not match at any shift."""
     _check_motion(imu, name, rates)
     offset = _correlate(imu, name, rates) if given_offset is None else given_offset
+    if not _covered(imu, rates, offset).any():
+        raise EstimationError(
+            f"with the time_offset in the rig file no image of {name} falls within the recording of {imu.name}; "
+            "correct it, or leave it out to have it found."
+        )
     found = _refine(imu, rates, offset, given_offset is not None)
     _check_scale(imu, name, rates, found)
+    _check_offset(imu, name, rates, found, given_offset is not None)
     return found
+
+
+def _covered(imu: ImuData, rates: CameraRates, offset: float) -> np.ndarray:
+    """(n,) bool: image intervals within the IMU's recording and none of its gaps."""
+    start, end = rates.start + offset, rates.end + offset
+    inside = (start >= imu.seconds[0]) & (end <= imu.seconds[-1])
+    for a, b in imu.gaps:
+        inside &= (end <= a) | (start >= b)
+    return inside
+
+
+def _check_offset(imu: ImuData, name: str, rates: CameraRates, found: Alignment, given: bool) -> None:
+    """An offset at which the two do not turn alike is wrong, or the recordings do not belong together."""
+    inside = _covered(imu, rates, found.offset)
+    seen = rates.rate[inside] @ found.rotation.T
+    middle = (0.5 * (rates.start + rates.end) + found.offset)[inside]
+    gyro = np.stack([np.interp(middle, imu.seconds, imu.gyro[:, k]) for k in range(3)], axis=1) - found.gyro_bias
+    unexplained = float(np.median(np.linalg.norm(gyro - seen, axis=1)) / np.median(np.linalg.norm(gyro, axis=1)))
+    if unexplained > LARGEST_UNEXPLAINED:
+        where = "with the time_offset in the rig file" if given else "at any shift of their clocks"
+        advice = "correct it, or leave it out to have it found" if given else _SAME_RECORDING
+        raise EstimationError(
+            f"the motion of {name} does not match that of {imu.name} {where} ({unexplained:.0%} of the angular rate is "
+            f"unexplained); {advice}."
+        )
 
 
 def _check_motion(imu: ImuData, name: str, rates: CameraRates) -> None:
@@ -94,6 +128,9 @@ def _correlate(imu: ImuData, name: str, rates: CameraRates) -> float:
     a, mask_a = _grid(
         imu.seconds, np.linalg.norm(imu.gyro - bias, axis=1), np.ones(len(imu.seconds), bool), imu.seconds[-1]
     )  # fmt: skip
+    grid = np.arange(len(a)) / GRID_HZ
+    for start, end in imu.gaps:
+        mask_a &= (grid <= start) | (grid >= end)
     middle = 0.5 * (rates.start + rates.end)
     near = np.diff(middle, append=middle[-1]) < LONGEST_STEP_S
     b, mask_b = _grid(middle, np.linalg.norm(rates.rate, axis=1), near, middle[-1])
@@ -148,7 +185,7 @@ def _refine(imu: ImuData, rates: CameraRates, offset: float, keep_offset: bool) 
     R, bias, residual = np.eye(3), np.zeros(3), np.zeros_like(rates.rate)
     for _ in range(ROUNDS):
         start, end = rates.start + offset, rates.end + offset
-        inside = ((start >= imu.seconds[0]) & (end <= imu.seconds[-1])).astype(float)
+        inside = _covered(imu, rates, offset).astype(float)
         span = (end - start)[:, None]
         mean = (at(angle, end) - at(angle, start)) / span
         slope = (at(imu.gyro, end) - at(imu.gyro, start)) / span
@@ -167,14 +204,30 @@ def _refine(imu: ImuData, rates: CameraRates, offset: float, keep_offset: bool) 
     return Alignment(offset, R, bias)
 
 
+def check_axes(rates: CameraRates, name: str) -> None:
+    """Raises EstimationError where the camera turned about one axis only: its rotation about that axis stays open."""
+    _, spread, _ = np.linalg.svd(rates.rate - rates.rate.mean(axis=0), full_matrices=False)
+    if spread[1] < LEAST_SECOND_AXIS * spread[0]:
+        raise EstimationError(
+            f"{name} turned about one axis only, and its rotation about that axis is not determined; turn the rig "
+            "about two more axes, or give rotation (fixed or prior) in the rig file."
+        )
+
+
 def _check_scale(imu: ImuData, name: str, rates: CameraRates, found: Alignment) -> None:
     """The two must turn equally fast: a ratio of 57 is degrees."""
-    middle = 0.5 * (rates.start + rates.end) + found.offset
-    gyro = np.stack([np.interp(middle, imu.seconds, imu.gyro[:, k]) for k in range(3)], axis=1) - found.gyro_bias
-    ratio = float(np.median(np.linalg.norm(gyro, axis=1)) / max(np.median(np.linalg.norm(rates.rate, axis=1)), 1e-9))
+    inside = _covered(imu, rates, found.offset)
+    middle = (0.5 * (rates.start + rates.end) + found.offset)[inside]
+    gyro = np.stack([np.interp(middle, imu.seconds, imu.gyro[:, k]) for k in range(3)], axis=1)
+    ratio = _median_size(gyro) / max(_median_size(rates.rate[inside]), 1e-9)
     if 0.8 < ratio < 1.25:
         return
     cause = (
         "its angular rate looks like deg/s; convert it to rad/s" if 0.8 < ratio / DEGREES < 1.25 else "check its units"
     )
     raise EstimationError(f"{imu.name} turns {ratio:.3g} times as fast as {name}: {cause}.")
+
+
+def _median_size(rate: np.ndarray) -> float:
+    """Median length of rates about their own median: a bias has no say."""
+    return float(np.median(np.linalg.norm(rate - np.median(rate, axis=0), axis=1)))

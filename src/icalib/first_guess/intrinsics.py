@@ -32,9 +32,12 @@ def guess_intrinsics(
         if rms < best:
             best, params = rms, start
     stream = _spread_images(stream, BUNDLE_IMAGES)
-    # Focal length and the strongest distortion first; the rest only once these are near.
-    params = _bundle(stream, model, params, target, np.array([0, 1, 4]))
-    params = _bundle(stream, model, params, target, np.arange(len(params)))
+    try:
+        # Focal length and the strongest distortion first; the rest only once these are near.
+        params = _bundle(stream, model, params, target, np.array([0, 1, 4]))
+        params = _bundle(stream, model, params, target, np.arange(len(params)))
+    except np.linalg.LinAlgError:
+        params = np.zeros_like(params)
     rms = float(np.median(target_poses(stream, model, params, target).rms_px))
     if not rms < GOOD_RMS_PX:
         raise EstimationError(

@@ -129,22 +129,9 @@ def _double_integrals(
     return out[:, :3], out[:, 3:].reshape(-1, 3, 3)
 
 
-def is_plausible(arm: LeverArm, gravity: float) -> bool:
-    """Whether neither gravity nor the target's size contradicts what the rig says; gravity in m/s^2."""
-    return _size_fits(arm) and _gravity_fits(float(np.linalg.norm(arm.gravity)), gravity)
-
-
-def _size_fits(arm: LeverArm) -> bool:
-    return abs(arm.size - 1.0) <= max(SIZE_TOLERANCE, 5.0 * arm.size_std)
-
-
-def _gravity_fits(measured: float, expected: float) -> bool:
-    return abs(measured / expected - 1.0) <= G_TOLERANCE
-
-
 def check_size(arm: LeverArm, camera: str) -> None:
     """Raises EstimationError where the accelerometer contradicts the size of the target."""
-    if not _size_fits(arm):
+    if abs(arm.size - 1.0) > max(SIZE_TOLERANCE, 5.0 * arm.size_std):
         raise EstimationError(
             f"{camera}: by the accelerometer the target is {arm.size:.2f} +- {arm.size_std:.2f} times the size "
             f"that the rig "
@@ -154,7 +141,7 @@ def check_size(arm: LeverArm, camera: str) -> None:
 
 def check_gravity(measured: float, expected: float, imu: str) -> None:
     """Raises EstimationError where gravity as the IMU and the target's size show it is not `expected` m/s^2."""
-    if _gravity_fits(measured, expected):
+    if abs(measured / expected - 1.0) <= G_TOLERANCE:
         return
     raise EstimationError(
         f"{imu} and the target together show gravity of {measured:.3g} m/s^2 instead of {expected:.3g}: check that the "

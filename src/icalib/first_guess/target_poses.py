@@ -95,7 +95,8 @@ def _move(turn, g, R, t):
 
 @njit(cache=True, nogil=True)
 def _refine(points, seen, R, t, rounds, scale):
-    """Gauss-Newton on x / z, y / z with Huber weights beyond `scale`; returns the RMS error of the last round."""
+    """Gauss-Newton on x / z, y / z, Huber weights beyond `scale`; returns the last RMS error, errors capped at 4
+    scale."""
     rms = 1e9
     for _ in range(rounds):
         H, g = np.zeros((6, 6)), np.zeros(6)
@@ -110,7 +111,7 @@ def _refine(points, seen, R, t, rounds, scale):
             iz = 1.0 / X[2]
             r0, r1 = X[0] * iz - seen[n, 0], X[1] * iz - seen[n, 1]
             e = np.sqrt(r0 * r0 + r1 * r1)
-            total += e * e
+            total += min(e, 4.0 * scale) ** 2
             w = 1.0 if e <= scale else scale / e
             for k in range(2):
                 a = iz if k == 0 else 0.0

@@ -20,8 +20,8 @@ def fit_model(
 
     A grid of pixels of the image of `resolution` (width, height) [px] is unprojected by `source` (pixels outside its
     range have no ray and are left out) and projected by `target`, starting at the source's fx, fy, cx, cy without
-    distortion. Damped Gauss-Newton, of which every step keeps all rays inside the range where the target's distortion is
-    monotonic: if the best fit lies outside, the result is the best found at its edge.
+    distortion. Damped Gauss-Newton; every step keeps all rays inside the range where the target's distortion is
+    monotonic, so if the best fit lies outside, the result is the best found at its edge.
 
     Returns the parameters (P,), and the root mean square and the maximum over the grid of the distance [px] between
     the two projections of a ray: judge them, a model that cannot follow the lens is fitted as well as it can be.

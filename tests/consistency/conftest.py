@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -57,7 +58,7 @@ def block_errors(result: Calibration, truth: Truth, block: str) -> tuple[np.ndar
     return np.concatenate([errors(result, truth, g) for g in groups]), result.covariance[np.ix_(columns, columns)]
 
 
-def consistency(
+def mean_nees(
     scenario: Scenario, rig: Rig, seeds: range, probability: float, blocks: tuple[str, ...] = BLOCKS
 ) -> dict[str, Consistency]:
     """Calibrates one simulated recording for each seed, from nothing. Blocks that are fixed have no place in
@@ -80,3 +81,9 @@ def _summary(found: list[tuple[np.ndarray, np.ndarray]], probability: float) -> 
     return Consistency(
         sum(nees) / dof, low, high, float(np.sqrt(np.mean(errors**2))), float(np.sqrt(np.mean(variances)))
     )
+
+
+@pytest.fixture
+def consistency():
+    """The function above, for tests that cannot import from here."""
+    return mean_nees
