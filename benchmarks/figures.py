@@ -1,4 +1,5 @@
-"""What is measured: one function a group, each run in a fresh process by run.py. Times are medians of wall times."""
+"""What is measured: one function a group, each run in a fresh process by run.py. Times are medians of wall times;
+`cpu` sums all cores, and other work on the machine hardly disturbs it."""
 
 from __future__ import annotations
 
@@ -89,9 +90,15 @@ def whole(name: str, rig: Rig, measurements: Measurements, repeats: int = 5) -> 
     """From corners in memory to covariance, warm."""
     results = []
     total = median_time(lambda: results.append(calibrate_measurements(rig, measurements)), repeats)
+    fastest = min(sum(r.timings.values()) for r in results[1:])
+    cpu = time.process_time()
+    calibrate_measurements(rig, measurements)
+    cpu = time.process_time() - cpu
     stages = {s: float(np.median([r.timings[s] for r in results[1:]])) for s in results[0].timings}
     return [
         Figure(f"{name}.all", total, "s"),
+        Figure(f"{name}.fastest", fastest, "s"),
+        Figure(f"{name}.cpu", cpu, "s"),
         *(Figure(f"{name}.{stage.replace(' ', '_')}", value, "s") for stage, value in stages.items()),
         Figure(f"{name}.iterations", len(results[0].iterations), "1"),
         Figure(f"{name}.peak_memory", peak_memory(), "MB"),
@@ -156,18 +163,23 @@ def repeated(measurements: Measurements, n: int) -> Measurements:
 
 
 def duration(rig: Rig, measurements: Measurements, n: int) -> list[Figure]:
-    """The plain model on `n` repetitions: linear in duration means the same time a minute."""
+    """The plain model on `n` repetitions. Iterations differ a little with length: hence the time of one, too."""
     before = peak_memory()
     long = repeated(measurements, n)
     results = []
+    cpu = time.process_time()
     seconds = median_time(lambda: results.append(calibrate_measurements(rig, long)), 1)
+    cpu = (time.process_time() - cpu) / len(results)
     minutes = float(np.ptp(long.imu.stamps_ns)) * 1e-9 / 60.0
-    name = f"duration.{n}"
+    name, iterations = f"duration.{n}", len(results[0].iterations)
     return [
         Figure(f"{name}.minutes", minutes, "min"),
-        Figure(f"{name}.iterations", len(results[0].iterations), "1"),
+        Figure(f"{name}.iterations", iterations, "1"),
         Figure(f"{name}.time", seconds, "s"),
         Figure(f"{name}.time_per_minute", seconds / minutes, "s/min"),
+        Figure(f"{name}.cpu_per_minute", cpu / minutes, "s/min"),
+        Figure(f"{name}.iteration_per_minute", results[-1].timings["solving"] / iterations / minutes, "s/min"),
+        Figure(f"{name}.first_guess_per_minute", results[-1].timings["first guess"] / minutes, "s/min"),
         Figure(f"{name}.memory", peak_memory() - before, "MB"),
         Figure(f"{name}.memory_per_minute", (peak_memory() - before) / minutes, "MB/min"),
     ]

@@ -41,7 +41,11 @@ def main() -> int:
 
         print(json.dumps([f.as_dict() for f in measure(options.child, recording)]))
         return 0
-    figures = []
+    figures = [
+        {"name": "machine.cores", "value": os.cpu_count() or 0, "unit": "1"},
+        {"name": "machine.load_before", "value": os.getloadavg()[0], "unit": "1"},  # of others: it slows all wall times
+    ]
+    _print(figures)
     for group in options.only or GROUPS:
         found = _in_own_process(group, options.data)
         _print(found)

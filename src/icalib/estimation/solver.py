@@ -17,7 +17,8 @@ MAX_ITERATIONS = 50
 CONVERGED_DECREASE = 5e-4
 ROUNDING = 1e-11  # of the cost: what rounding makes of a sum of 1e6 squares
 CURVED_BELOW = 1e-2  # of the cost: steps that promise less use the true curvature of the robust loss
-STALLED_DECREASE = 5e-3  # a step this small that fails is at the grain of the cost: a tenth of a standard deviation
+STALLED_DECREASE = 0.05  # of half the chi^2: a third of a standard deviation, good enough where smaller steps fail
+MOST_STALLED = 4  # steps this small that fail before the solver rests
 FIRST_DAMPING = 1e-8
 ZERO_DAMPING = 1e-10  # below this, none: the weak information of a planar drive must not be swamped
 
@@ -57,7 +58,7 @@ def minimise(
     """
     pieces, residuals = problem.pieces(), problem.residuals()
     cost = problem.linearise(state, pieces, residuals)
-    damping, curved, curved_below, steps = 0.0, False, CURVED_BELOW, []
+    damping, curved, curved_below, stalled, steps = 0.0, False, CURVED_BELOW, 0, []
     for _ in range(MAX_ITERATIONS):
         if not np.isfinite(cost):
             raise EstimationError(
@@ -70,9 +71,6 @@ def minimise(
         converged = damping == 0.0 and solution.decrease < max(tolerance, ROUNDING * cost)
         # At the bottom rounding decides whether the cost falls; a step this small is taken anyway.
         accepted = bool(candidate_cost < cost) or converged
-        if not accepted and damping == 0.0 and not curved and solution.decrease < STALLED_DECREASE:
-            steps.append(Step(cost, solution.decrease, damping, False))
-            return _finish(problem, state, cost, pieces, residuals, steps, True)
         steps.append(Step(cost, solution.decrease, damping, accepted))
         on_step(steps[-1])
         if accepted:
@@ -81,8 +79,11 @@ def minimise(
             damping = damping * (0.1 if good else 1.0)
             damping = 0.0 if damping < ZERO_DAMPING else damping
             if converged:
-                return _finish(problem, state, cost, pieces, residuals, steps, True)
+                break
             continue
+        stalled += solution.decrease < STALLED_DECREASE
+        if stalled > MOST_STALLED:
+            break
         # Too far out for the true curvature of the loss: weights alone, and only then more damping.
         damping = damping if curved else max(damping * 10.0, 1e-6)
         curved_below = curved_below * (0.1 if curved else 1.0)
@@ -90,7 +91,7 @@ def minimise(
         if damping > 1e6:
             break
         cost = problem.linearise(state, pieces, residuals)
-    return _finish(problem, state, cost, pieces, residuals, steps, False)
+    return _finish(problem, state, cost, pieces, residuals, steps)
 
 
 def _solve(problem, state, pieces, residuals, damping, curved):
@@ -105,16 +106,17 @@ def _solve(problem, state, pieces, residuals, damping, curved):
             problem.linearise(state, pieces, residuals, curved=curved)
 
 
-def _finish(problem, state, cost, pieces, residuals, steps, converged) -> Outcome:
+def _finish(problem, state, cost, pieces, residuals, steps) -> Outcome:
     problem.linearise(state, pieces, residuals, curved=True)
-    information = solve(pieces, problem.n_nodes, problem.tolerance, 0.0).information
-    n = len(steps)
+    last = solve(pieces, problem.n_nodes, problem.tolerance, 0.0)
+    converged, n = last.decrease < STALLED_DECREASE, len(steps)
+    # Half a chi^2 of d is a step of sqrt(2 d) standard deviations at most.
+    share = max(100.0 * np.sqrt(2.0 * max(last.decrease, 0.0)), 1.0)
     status = (
-        f"converged in {n} iterations: the next step would move no parameter by more than a tenth of its standard "
-        f"deviation."
+        f"converged in {n} iterations: the next step would move no parameter by more than {share:.0f} % of its "
+        "standard deviation."
         if converged
-        else f"not converged after {n} iterations: the cost is {cost:.6g} and still "
-        f"{steps[-1].predicted_decrease:.3g} above "
-        "what the last step promised; give a better first guess, or check the noise in the rig file."
+        else f"not converged after {n} iterations: the next step would still lower half the chi^2 of {cost:.6g} by "
+        f"{last.decrease:.3g}; give a better first guess, or check the noise in the rig file."
     )
-    return Outcome(state, cost, residuals, information, tuple(steps), converged, status)
+    return Outcome(state, cost, residuals, last.information, tuple(steps), converged, status)

@@ -83,21 +83,31 @@ class State:
     values: dict[Key, np.ndarray]
 
     def retract(self, layout: Layout, chain: np.ndarray, border: np.ndarray) -> State:
-        """The state moved by tangent steps chain (K, 15) and border (B,)."""
-        values = dict(self.values)
+        """The state moved by tangent steps chain (K, 15) and border (B,).
+
+        A tilt of the board turns the whole trajectory with it, exactly, and the nodes' own steps are what they
+        have beyond
+        that. To first order nothing changes; but where gravity is weakly known the tilt is large against the precision
+        of positions relative to the board, and positions that move along the tangent would leave their circle by
+        tilt^2 / 2.
+        """
+        values, turn = dict(self.values), np.zeros(3)
         for b in layout.free:
             d, old = border[b.columns], values[b.key]
             if b.kind == "rotation":
                 values[b.key] = old @ so3.exp(d)
             elif b.kind == "tilt":
-                values[b.key] = so3.exp(np.array([d[0], d[1], 0.0])) @ old
+                turn[:2] = d
+                values[b.key] = so3.exp(turn) @ old
             else:
                 values[b.key] = old + d
+        R = so3.exp(turn)
+        own = np.ascontiguousarray(chain[:, 0:3] - turn @ self.rotation)
         return replace(
             self,
-            rotation=self.rotation @ so3.exp_many(np.ascontiguousarray(chain[:, 0:3])),
-            position=self.position + chain[:, 3:6],
-            velocity=self.velocity + chain[:, 6:9],
+            rotation=R @ self.rotation @ so3.exp_many(own),
+            position=self.position @ R.T + chain[:, 3:6] - np.cross(turn, self.position),
+            velocity=self.velocity @ R.T + chain[:, 6:9] - np.cross(turn, self.velocity),
             bias=self.bias + chain[:, 9:15],
             values=values,
         )

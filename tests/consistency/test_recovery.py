@@ -1,0 +1,81 @@
+"""The whole program on simulated recordings: truth recovered, noiseless to numerical precision."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from icalib.calibration import Calibration
+from icalib.pipeline import calibrate_measurements
+from icalib.rig import Parameter, Rig
+from icalib.rig_parameters import IMU_INTRINSICS_SIGMA
+from icalib.simulation import Scenario, Simulation, handheld, rig_for, simulate
+
+
+def extrinsics_error(result: Calibration, simulation: Simulation, camera: str) -> tuple[float, float, float]:
+    """rad, m, s."""
+    T = simulation.truth.T_imu_cam[camera]
+    turn = Rotation.from_matrix(T[:3, :3].T @ result.group(camera, "rotation").value).magnitude()
+    move = np.linalg.norm(result.group(camera, "translation").value - T[:3, 3])
+    offset = result.group(camera, "time_offset").value[0] - simulation.truth.time_offset[camera]
+    return turn, float(move), abs(float(offset))
+
+
+@pytest.mark.parametrize("asynchronous", [False, True])
+def test_noiseless_recordings_are_recovered_from_nothing(asynchronous: bool):
+    simulation = simulate(handheld(20.0, asynchronous=asynchronous, noiseless=True), 0)
+    rig = rig_for(simulation.scenario, intrinsics="free", distortion="free")
+    result = calibrate_measurements(rig, simulation.measurements)
+    assert result.converged, result.status
+    for camera in ("cam0", "cam1"):
+        assert max(extrinsics_error(result, simulation, camera)) < 1e-8
+        intrinsics = result.group(camera, "intrinsics").value
+        assert intrinsics == pytest.approx(np.array(simulation.truth.intrinsics[camera]), rel=1e-8)
+
+
+def real_corners() -> tuple[Scenario, Rig]:
+    scenario = handheld(20.0)
+    cameras = tuple(dataclasses.replace(c, bloom_px=b) for c, b in zip(scenario.cameras, (0.25, 0.30), strict=True))
+    scenario = dataclasses.replace(scenario, cameras=cameras, bow=(1.0e-3, -0.5e-3, 0.7e-3), blur_s=3e-4)
+    rig = rig_for(scenario)
+    unknown = tuple(dataclasses.replace(c, corner_noise_px=None) for c in rig.cameras)
+    settings = dataclasses.replace(rig.settings, bloom=True, board_shape=True, blur_noise=True)
+    return scenario, dataclasses.replace(rig, cameras=unknown, settings=settings)
+
+
+def test_bloom_bow_and_blur_are_recovered():
+    scenario, rig = real_corners()
+    simulation = simulate(scenario, 5)
+    result = calibrate_measurements(rig, simulation.measurements)
+    shape = result.group("board0", "shape")
+    assert np.abs((shape.value[:3] - np.array(scenario.bow)) / shape.std_formal[:3]).max() < 4.0
+    assert np.abs(shape.value[3:] / shape.std_formal[3:]).max() < 4.0
+    for camera in scenario.cameras:
+        bloom = result.group(camera.name, "bloom")
+        assert abs(bloom.value[0] - camera.bloom_px) < 4.0 * bloom.std_formal[0]
+        turn, move, offset = extrinsics_error(result, simulation, camera.name)
+        assert turn < 1e-3
+        assert move < 2e-3
+        assert offset < 1e-4
+    for residuals, camera in zip(result.corner_residuals, scenario.cameras, strict=True):
+        assert residuals.sigma.min() == pytest.approx(camera.corner_noise_px, rel=0.25)
+        true = simulation.truth.corners[camera.name].sigma
+        assert np.median(residuals.sigma) == pytest.approx(np.median(true), rel=0.15)
+
+
+def test_imu_intrinsics_of_one_percent_are_recovered():
+    rng = np.random.default_rng(2)
+    intrinsics = np.concatenate([rng.normal(0.0, 0.01, 15), rng.normal(0.0, 1e-3, 9)])
+    scenario = dataclasses.replace(handheld(30.0), imu_intrinsics=intrinsics)
+    simulation = simulate(scenario, 1)
+    rig = rig_for(scenario)
+    rig = dataclasses.replace(
+        rig, imu=dataclasses.replace(rig.imu, intrinsics=Parameter("prior", np.zeros(24), IMU_INTRINSICS_SIGMA))
+    )
+    result = calibrate_measurements(rig, simulation.measurements)
+    found = result.group("imu0", "intrinsics")
+    assert np.abs((found.value - intrinsics) / found.std_formal).max() < 4.0
+    assert found.std_formal.max() < 0.01
