@@ -78,7 +78,8 @@ def main() -> None:
     for title, rig, model in (
         ("fixed", fixed, None),
         ("free, pinhole-radtan", free, "pinhole-radtan"),
-        ("free, pinhole-radtan5", free, None),
+        ("free, pinhole-radtan5", free, "pinhole-radtan5"),
+        ("free, pinhole-equidistant", free, "pinhole-equidistant"),
     ):
         for name, settings in MODELS.items():
             one, two = (calibrate_measurements(with_model(rig, model, **settings), h) for h in halves)

@@ -85,11 +85,10 @@ class State:
     def retract(self, layout: Layout, chain: np.ndarray, border: np.ndarray) -> State:
         """The state moved by tangent steps chain (K, 15) and border (B,).
 
-        A tilt of the board turns the whole trajectory with it, exactly, and the nodes' own steps are what they
-        have beyond
-        that. To first order nothing changes; but where gravity is weakly known the tilt is large against the precision
-        of positions relative to the board, and positions that move along the tangent would leave their circle by
-        tilt^2 / 2.
+        A tilt of the board turns the whole trajectory with it, exactly; the nodes' own steps are what they have beyond
+        that, and turn too. To first order nothing changes. But where gravity is weakly known the tilt is large against
+        the precision of positions relative to the board: moved along the tangent they would leave their circle by
+        tilt^2 / 2, and a step that cancels against one of the lever arm would no longer do so.
         """
         values, turn = dict(self.values), np.zeros(3)
         for b in layout.free:
@@ -101,13 +100,15 @@ class State:
                 values[b.key] = so3.exp(turn) @ old
             else:
                 values[b.key] = old + d
-        R = so3.exp(turn)
-        own = np.ascontiguousarray(chain[:, 0:3] - turn @ self.rotation)
+        Q = so3.exp(turn)
+        own_rotation = np.ascontiguousarray(chain[:, 0:3] - turn @ self.rotation)
+        own_position = chain[:, 3:6] - np.cross(turn, self.position)
+        own_velocity = chain[:, 6:9] - np.cross(turn, self.velocity)
         return replace(
             self,
-            rotation=R @ self.rotation @ so3.exp_many(own),
-            position=self.position @ R.T + chain[:, 3:6] - np.cross(turn, self.position),
-            velocity=self.velocity @ R.T + chain[:, 6:9] - np.cross(turn, self.velocity),
+            rotation=Q @ self.rotation @ so3.exp_many(own_rotation),
+            position=(self.position + own_position) @ Q.T,
+            velocity=(self.velocity + own_velocity) @ Q.T,
             bias=self.bias + chain[:, 9:15],
             values=values,
         )
