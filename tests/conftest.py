@@ -8,14 +8,25 @@ from pathlib import Path
 import pytest
 
 
-@pytest.fixture(scope="session")
-def euroc() -> Path:
-    """The whole EuRoC calibration recording; ICALIB_DATA names its parent, ICALIB_REQUIRE_DATA=1 forbids to skip."""
+def _recording(name: str) -> Path:
+    """A real recording; ICALIB_DATA names its parent, ICALIB_REQUIRE_DATA=1 forbids to skip."""
     default = Path(__file__).parents[2] / "shared" / "data"
-    path = Path(os.environ.get("ICALIB_DATA", default)) / "euroc_imu_april"
+    path = Path(os.environ.get("ICALIB_DATA", default)) / name
     if path.is_dir():
         return path
-    sentence = f"the recording {path} is absent; set ICALIB_DATA to the folder that holds euroc_imu_april"
+    sentence = f"the recording {path} is absent; set ICALIB_DATA to the folder that holds {name}"
     if os.environ.get("ICALIB_REQUIRE_DATA") == "1":
         pytest.fail(sentence)
     pytest.skip(sentence)
+
+
+@pytest.fixture(scope="session")
+def euroc() -> Path:
+    """The whole EuRoC calibration recording."""
+    return _recording("euroc_imu_april")
+
+
+@pytest.fixture(scope="session")
+def aprilgrid_images() -> Path:
+    """Stereo stills of the same board by the same cameras, with another detector's corners."""
+    return _recording("aprilgrid_images")

@@ -31,6 +31,11 @@ def rig_from_nothing() -> Rig:
 
 
 @pytest.fixture(scope="session")
+def rig_equidistant() -> Rig:
+    return load_rig(EXAMPLE / "rig-equidistant.yaml")
+
+
+@pytest.fixture(scope="session")
 def whole(euroc: Path, rig: Rig) -> Measurements:
     return read_measurements(open_recording(euroc), rig)
 

@@ -85,11 +85,15 @@ def whole_free(rig_from_nothing, whole) -> Calibration:
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
-def test_from_nothing_the_published_time_offset_lies_within_three_standard_deviations(whole_free, camera):
-    # Rotation and position do not: docs/uncertainty.md says by how much, and what that means.
-    offset = whole_free.group(camera, "time_offset")
+@pytest.mark.parametrize("name", ["rotation", "translation", "time_offset", "intrinsics"])
+def test_from_nothing_the_published_values_lie_within_three_standard_deviations(whole_free, published, camera, name):
+    # Not so k1 and k2: they come with the flat board and the image parts of the recording behind the published values;
+    # test_other_images.py holds the lenses to one that agrees with this recording.
+    T, found = np.array(published[camera]["T_imu_cam"]), whole_free.group(camera, name)
+    expected = {"translation": T[:3, 3], "time_offset": 0.0, "intrinsics": published[camera]["intrinsics"]}
+    error = turn(T[:3, :3], found.value) if name == "rotation" else found.value - expected[name]
     assert whole_free.converged, whole_free.status
-    assert abs(offset.value[0]) < 3.0 * offset.std[0]
+    assert np.abs(error / found.std).max() < 3.0
 
 
 def test_from_nothing_the_published_baseline_lies_within_three_standard_deviations(whole_free):
