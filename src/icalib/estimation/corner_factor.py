@@ -180,7 +180,7 @@ class CornerFactor:
         basis = self.basis @ state.values[self.target, "tilt"].T
         for a, b, X, _, _, Jp, Jpar in self._chunks(start, R_cw, p_wc, self.world_points(state), params, True):
             accumulate_clusters(
-                a, b, start[a], start, self.stream.point, cluster, n_clusters, column, at.residual, at.root,
+                a, b, start[a], start, self.stream.point, cluster, n_clusters, column, LOSSES["none"], False, at.residual, at.root,
                 at.shared[i0:i1],
                 self.noise.field, self.direction, basis, pars, X, Jp, Jpar,
                 np.ascontiguousarray(state.values[self.name, "rotation"]), state.values[self.name, "translation"],

@@ -43,7 +43,9 @@ def _weight(loss, scale, s):
 def _invert_small(M, out):
     """Inverse of a small symmetric positive definite matrix by Gauss-Jordan."""
     n = M.shape[0]
-    out[:] = np.eye(n)
+    for i in range(n):
+        for j in range(n):
+            out[i, j] = 1.0 if i == j else 0.0
     for i in range(n):
         f = 1.0 / M[i, i]
         for j in range(n):
@@ -64,7 +66,8 @@ def _robust_weights(res, keep, f, precision, sigma, loss, scale, root, shared):
     Weights and common error depend on each other; a few rounds settle them, so that the cost is the least one over it.
     """
     n, m = len(keep), f.shape[1]
-    shared[:] = 0.0
+    for k in range(m):
+        shared[0, k], shared[1, k] = 0.0, 0.0
     M, inv, rhs = np.empty((m, m)), np.empty((m, m)), np.empty((2, m))
     rounds = 1 if m == 0 else (2 if loss == 0 else 8)
     cost = 0.0
@@ -93,8 +96,8 @@ def _robust_weights(res, keep, f, precision, sigma, loss, scale, root, shared):
 def _common_error(res, root, f, precision, M, inv, rhs, shared):
     """The image's common error (2, m) at given weights: ridge regression of -res on its functions."""
     m = f.shape[1]
-    rhs[:] = 0.0
     for a in range(m):
+        rhs[0, a], rhs[1, a] = 0.0, 0.0
         for b in range(m):
             M[a, b] = precision[a] if a == b else 0.0
     for i in range(len(root)):
@@ -106,7 +109,7 @@ def _common_error(res, root, f, precision, M, inv, rhs, shared):
             rhs[1, a] += w * f[i, a] * res[i, 1]
     _invert_small(M, inv)
     for a in range(m):
-        shared[0, a] = shared[1, a] = 0.0
+        shared[0, a], shared[1, a] = 0.0, 0.0
         for b in range(m):
             shared[0, a] -= inv[a, b] * rhs[0, b]
             shared[1, a] -= inv[a, b] * rhs[1, b]
@@ -206,7 +209,8 @@ def _marginalise_shared(A, D, n, root, f, precision, own, given, G):
         for a in range(m):
             for b in range(m):
                 M[a, b] = precision[a] if a == b else 0.0
-            C[a] = 0.0
+            for k in range(D + 1):
+                C[a, k] = 0.0
             C[a, D] = own[axis, a] * np.sqrt(precision[a]) if given else 0.0
         for i in range(n):
             for a in range(m):
@@ -411,7 +415,8 @@ def accumulate(
 
 @njit(cache=True, nogil=True)
 def accumulate_clusters(
-    i0, i1, o, start, point, cluster, n_clusters, column, residual, root_all, shared, field, direction, basis, pars,
+    i0, i1, o, start, point, cluster, n_clusters, column, loss, curved, residual, root_all, shared, field, direction,
+    basis, pars,
     X, Jp, Jpar, R_ic, p_ic, R_cw, p_wc, rate, vel, Jn, Jm, Jx, node, first, cols_c, cols_d, side, border,
 ):  # fmt: skip
     """Gradients of images i0..i1 by cluster of corners, into columns `column` and on of side and border."""
@@ -428,11 +433,13 @@ def accumulate_clusters(
         n = n1 - n0
         _whole_error(residual[n0:n1], field[n0:n1], shared[i], error)
         _fill_rows(
-            o, n0, n1, error, root_all[n0:n1], 1.0, 0, 1.0, False, X, Jp, Jpar, pars, has_bloom, direction, basis,
+            o, n0, n1, error, root_all[n0:n1], 1.0, loss, 1.0, curved, X, Jp, Jpar, pars, has_bloom, direction, basis,
             point,
             R_cw[i], A,
         )  # fmt: skip
-        G[:] = 0.0
+        for d in range(D):
+            for g in range(n_clusters):
+                G[d, g] = 0.0
         for k in range(n):
             for d in range(D):
                 G[d, cluster[n0 + k]] += A[d, k] * A[D, k] + A[d, n + k] * A[D, n + k]

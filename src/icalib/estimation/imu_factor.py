@@ -12,17 +12,18 @@ from icalib.estimation.imu_data import ImuData
 from icalib.estimation.integration import integrate
 from icalib.estimation.state import State
 from icalib.geometry import so3
+from icalib.geometry.small import mul3, tmul3
 
 ROWS = 15  # rotation, velocity, position, gyro bias, accelerometer bias
 
 
 @njit(cache=True, nogil=True)
-def _preintegrate(k0, k1, nodes, first, t, gyro, accel, bias, intrinsics, variance, walk, dR, dv, dp, J, W):
+def _preintegrate(k0, k1, nodes, first, t, gyro, accel, bias, intrinsics, variance, walk, linear, dR, dv, dp, J, W):
     """Increments, bias (and intrinsics) Jacobians and inverse Cholesky factor W of the covariance, intervals k0..k1."""
     P = np.empty((ROWS, ROWS))
     for k in range(k0, k1):
         integrate(
-            nodes[k], nodes[k + 1], first[k], t, gyro, accel, bias[k], intrinsics, variance, walk, False,
+            nodes[k], nodes[k + 1], first[k], t, gyro, accel, bias[k], intrinsics, variance, walk, linear,
             dR[k], dv[k], dp[k], J[k], P,
         )  # fmt: skip
         _inverse_cholesky(P, W[k])
@@ -67,8 +68,8 @@ def _residual(R0, p0, v0, b0, R1, p1, v1, b1, dt, g, dR, dv, dp, Jb, db, Jx, dx,
             turn[i] += Jb[i, j] * db[j]
         for j in range(len(dx)):
             turn[i] += Jx[i, j] * dx[j]
-    R01 = _tmul(R0, R1)
-    error = so3.log(_tmul(so3.exp(turn), _tmul(dR, R01)))
+    R01 = tmul3(R0, R1)
+    error = so3.log(tmul3(so3.exp(turn), tmul3(dR, R01)))
     Jr_inv = so3.right_jacobian_inverse(error)
     mv, mp = np.empty(3), np.empty(3)
     for i in range(3):
@@ -93,8 +94,8 @@ def _residual(R0, p0, v0, b0, R1, p1, v1, b1, dt, g, dR, dv, dp, Jb, db, Jx, dx,
             r[6 + i] -= Jx[6 + i, j] * dx[j]
     for i in range(6):
         r[9 + i] = b1[i] - b0[i]
-    R0t = R0.T
-    _put(J0, 0, 0, -1.0, _mul(Jr_inv, R01.T))
+    R0t = np.ascontiguousarray(R0.T)
+    _put(J0, 0, 0, -1.0, mul3(Jr_inv, tmul3(R1, R0)))
     _put(J1, 0, 0, 1.0, Jr_inv)
     _put(J0, 3, 0, 1.0, so3.hat(hv))
     _put(J0, 3, 6, -1.0, R0t)
@@ -103,7 +104,7 @@ def _residual(R0, p0, v0, b0, R1, p1, v1, b1, dt, g, dR, dv, dp, Jb, db, Jx, dx,
     _put(J0, 6, 3, -1.0, R0t)
     _put(J0, 6, 6, -dt, R0t)
     _put(J1, 6, 3, 1.0, R0t)
-    by_turn = _mul(Jr_inv, _mul(so3.exp(-error), so3.right_jacobian(turn)))
+    by_turn = mul3(Jr_inv, mul3(so3.exp(-error), so3.right_jacobian(turn)))
     for i in range(3):
         for j in range(6):
             s = 0.0
@@ -122,25 +123,6 @@ def _residual(R0, p0, v0, b0, R1, p1, v1, b1, dt, g, dR, dv, dp, Jb, db, Jx, dx,
     for i in range(6):
         J0[9 + i, 9 + i] = -1.0
         J1[9 + i, 9 + i] = 1.0
-
-
-@njit(cache=True, nogil=True)
-def _mul(a, b):
-    out = np.empty((3, 3))
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
-    return out
-
-
-@njit(cache=True, nogil=True)
-def _tmul(a, b):
-    """a^T b."""
-    out = np.empty((3, 3))
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = a[0, i] * b[0, j] + a[1, i] * b[1, j] + a[2, i] * b[2, j]
-    return out
 
 
 @njit(cache=True, nogil=True)
@@ -189,8 +171,10 @@ def _accumulate(
             R[k], p[k], v[k], b[k], R[k + 1], p[k + 1], v[k + 1], b[k + 1], dt, g,
             dR[k], dv[k], dp[k], J[k, :, :6], db, J[k, :, 6:], dx, r, J0, J1, Jc,
         )  # fmt: skip
-        Jcr[:, :n_x] = Jc
-        Jcr[:, n_x] = r
+        for i in range(ROWS):
+            for j in range(n_x):
+                Jcr[i, j] = Jc[i, j]
+            Jcr[i, n_x] = r[i]
         _whiten(W[k], Jcr, Ac)
         for i in range(ROWS):
             if given:
@@ -273,7 +257,7 @@ class ImuFactor:
         in_parallel(
             lambda ks: _preintegrate(
                 ks[0], ks[1], state.seconds, first, imu.seconds, imu.gyro, imu.accel, bias0, intrinsics,
-                imu.variance, imu.walk, *arrays,
+                imu.variance, imu.walk, False, *arrays,
             ),
             [(0, half), (half, n)],
         )  # fmt: skip

@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 
 from icalib.geometry import so3
+from icalib.geometry.small import mul3, tmul3
 
 N_INTRINSICS = 24
 LABELS = (
@@ -37,13 +38,12 @@ def _lower_inverse(m):
 
 
 @njit(cache=True, nogil=True)
-def matmul3(a, b):
-    """Product of two small matrices, (n, m) x (m, l), without BLAS."""
-    out = np.zeros((a.shape[0], b.shape[1]))
-    for i in range(a.shape[0]):
-        for k in range(a.shape[1]):
-            for j in range(b.shape[1]):
-                out[i, j] += a[i, k] * b[k, j]
+def _sensitivity(intrinsics):
+    """A_g (3, 3)."""
+    out = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = intrinsics[15 + 3 * i + j]
     return out
 
 
@@ -56,16 +56,21 @@ def correction_matrices(intrinsics):
         mg[_ROW[n], _COL[n]] += intrinsics[6 + n]
     F = _lower_inverse(ma)
     C = so3.exp(intrinsics[12:15])
-    G = matmul3(C.T, _lower_inverse(mg))
-    H = -matmul3(matmul3(G, intrinsics[15:24].copy().reshape(3, 3)), F)
+    G = tmul3(C, _lower_inverse(mg))
+    H = mul3(mul3(G, _sensitivity(intrinsics)), F)
+    for i in range(3):
+        for j in range(3):
+            H[i, j] = -H[i, j]
     return F, G, H
 
 
 @njit(cache=True, nogil=True)
 def intrinsics_jacobians(intrinsics, F, G, force, rate, d_rate, d_force):
     """Fills d rate / d intrinsics and d force / d intrinsics, both (3, 24), at corrected `force` and `rate`."""
-    u = matmul3(so3.exp(intrinsics[12:15]), rate.copy().reshape(3, 1))[:, 0]
-    GA = matmul3(G, intrinsics[15:24].copy().reshape(3, 3))
+    C, u = so3.exp(intrinsics[12:15]), np.empty(3)
+    for i in range(3):
+        u[i] = C[i, 0] * rate[0] + C[i, 1] * rate[1] + C[i, 2] * rate[2]
+    GA = mul3(G, _sensitivity(intrinsics))
     for n in range(6):
         for i in range(3):
             d_force[i, n] = -F[i, _ROW[n]] * force[_COL[n]]
@@ -73,7 +78,7 @@ def intrinsics_jacobians(intrinsics, F, G, force, rate, d_rate, d_force):
     for n in range(6):
         for i in range(3):
             d_rate[i, n] = -(GA[i, 0] * d_force[0, n] + GA[i, 1] * d_force[1, n] + GA[i, 2] * d_force[2, n])
-    turn = matmul3(so3.hat(rate), so3.right_jacobian(intrinsics[12:15]))
+    turn = mul3(so3.hat(rate), so3.right_jacobian(intrinsics[12:15]))
     for i in range(3):
         for j in range(3):
             d_rate[i, 12 + j] = turn[i, j]

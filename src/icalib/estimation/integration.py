@@ -204,6 +204,21 @@ def _corrected(gyro, accel, j, s, bias, F, G, H, rate, force):
 
 
 @njit(cache=True, nogil=True)
+def _start(R, v, p, J, P):
+    """No motion yet. In loops: array expressions take seconds to compile."""
+    for i in range(3):
+        v[i] = p[i] = 0.0
+        for k in range(3):
+            R[i, k] = 1.0 if i == k else 0.0
+    for i in range(J.shape[0]):
+        for k in range(J.shape[1]):
+            J[i, k] = 0.0
+    for i in range(P.shape[0]):
+        for k in range(P.shape[1]):
+            P[i, k] = 0.0
+
+
+@njit(cache=True, nogil=True)
 def integrate(t0, t1, first, t, gyro, accel, bias, intrinsics, variance, walk, linear, R, v, p, J, P):
     """Integrates readings from t0 to t1 (seconds, imu clock; t1 < t0 runs backwards), starting at interval `first`.
 
@@ -213,15 +228,13 @@ def integrate(t0, t1, first, t, gyro, accel, bias, intrinsics, variance, walk, l
     whole intervals are the same, but the pose at t1 then has a continuous derivative, the rate at t1.
     Returns the corrected rate (3,) and specific force (3,) at t1.
     """
-    R[:] = np.eye(3)
-    v[:] = 0.0
-    p[:] = 0.0
-    J[:] = 0.0
-    P[:] = 0.0
     P_t = np.zeros(P.shape)
     F, G, H = correction_matrices(intrinsics)
     dw_db, df_db = np.zeros((3, 6)), np.zeros((3, 6))
-    dw_db[:, :3], dw_db[:, 3:], df_db[:, 3:] = -G, -H, -F
+    _start(R, v, p, J, P)
+    for i in range(3):
+        for k in range(3):
+            dw_db[i, k], dw_db[i, 3 + k], df_db[i, 3 + k] = -G[i, k], -H[i, k], -F[i, k]
     n_extra = max(J.shape[1] - 6, 0)
     extra_w, extra_f = np.zeros((3, n_extra)), np.zeros((3, n_extra))
     rate, force = np.empty(3), np.empty(3)

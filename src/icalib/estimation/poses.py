@@ -49,7 +49,9 @@ def assign_nodes(scheme: Scheme, nodes: np.ndarray, times: np.ndarray) -> np.nda
 
 
 @njit(cache=True, nogil=True)
-def _inertial(times, node, first, nodes, R, p, v, b, g, t, gyro, accel, intrinsics, out_R, out_p, rate, vel, Jn, Jx):
+def _inertial(
+    times, node, first, nodes, R, p, v, b, g, linear, t, gyro, accel, intrinsics, out_R, out_p, rate, vel, Jn, Jx
+):  # fmt: skip
     variance, walk = np.zeros((len(t), 3)), np.zeros(2)
     width = 6 + Jx.shape[2]
     dR, dv, dp, J = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((9, width))
@@ -58,7 +60,7 @@ def _inertial(times, node, first, nodes, R, p, v, b, g, t, gyro, accel, intrinsi
         k = node[i]
         dt = times[i] - nodes[k]
         w, _ = integrate(
-            nodes[k], times[i], first[i], t, gyro, accel, b[k], intrinsics, variance, walk, True, dR, dv, dp, J, P
+            nodes[k], times[i], first[i], t, gyro, accel, b[k], intrinsics, variance, walk, linear, dR, dv, dp, J, P
         )  # fmt: skip
         rate[i] = w
         for a in range(3):
@@ -174,7 +176,7 @@ def poses_at(
             on_stamp = (times < state.seconds[node]) & (imu.seconds[first] == state.seconds[node]) & (first > 0)
             _inertial(
                 times, node, first - on_stamp, state.seconds, state.rotation, state.position, state.velocity,
-                state.bias, gravity, *raw, *out, by_node, by_imu,
+                state.bias, gravity, True, *raw, *out, by_node, by_imu,
             )  # fmt: skip
         else:
             _kinematic(

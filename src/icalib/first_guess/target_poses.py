@@ -31,14 +31,14 @@ class TargetPoses:
 @njit(cache=True, nogil=True)
 def _homography(points, seen, centre, h):
     """H (9,) with seen ~ H (point - centre, 1), h33 = 1, by linear least squares. False where it is singular."""
-    A, b = np.zeros((8, 8)), np.zeros(8)
-    row = np.zeros(8)
+    A, b, row = np.zeros((8, 8)), np.zeros(8), np.empty(8)
     for n in range(len(points)):
         x, y = points[n, 0] - centre[0], points[n, 1] - centre[1]
         for axis in range(2):
             m = seen[n, axis]
-            row[:] = 0.0
             o = 3 * axis
+            for i in range(6):
+                row[i] = 0.0
             row[o], row[o + 1], row[o + 2] = x, y, 1.0
             row[6], row[7] = -m * x, -m * y
             for i in range(8):
@@ -47,7 +47,8 @@ def _homography(points, seen, centre, h):
                     A[i, j] += row[i] * row[j]
     if not solve_definite(A, b):
         return False
-    h[:8] = b
+    for i in range(8):
+        h[i] = b[i]
     h[8] = 1.0
     return True
 
@@ -145,13 +146,17 @@ def _all_poses(start, point, rays, good, target, most, rounds, focal, rotation, 
         for n in range(start[i], start[i + 1]):
             if good[n]:
                 if passed * wanted // max(total, 1) >= count and count < wanted:
-                    points[count] = target[point[n]]
+                    for k in range(3):
+                        points[count, k] = target[point[n], k]
                     seen[count, 0], seen[count, 1] = rays[n, 0] / rays[n, 2], rays[n, 1] / rays[n, 2]
                     count += 1
                 passed += 1
         if count < 6:
             continue
-        centre[0], centre[1] = points[:count, 0].mean(), points[:count, 1].mean()
+        for k in range(2):
+            centre[k] = 0.0
+            for n in range(count):
+                centre[k] += points[n, k] / count
         if not _homography(points[:count], seen[:count], centre, h):
             continue
         _pose_from_homography(h, R, t)

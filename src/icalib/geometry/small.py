@@ -4,7 +4,30 @@ from __future__ import annotations
 
 from math import sqrt
 
+import numpy as np
 from numba import njit
+
+# Loops throughout: array expressions compile ten times as slowly, and are no faster on matrices this small.
+
+
+@njit(cache=True, nogil=True)
+def mul3(a, b):
+    """a b of 3x3 matrices."""
+    out = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
+    return out
+
+
+@njit(cache=True, nogil=True)
+def tmul3(a, b):
+    """a^T b of 3x3 matrices."""
+    out = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = a[0, i] * b[0, j] + a[1, i] * b[1, j] + a[2, i] * b[2, j]
+    return out
 
 
 @njit(cache=True, nogil=True)

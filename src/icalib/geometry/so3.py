@@ -146,7 +146,10 @@ def exp_many(phi):
     """(N, 3) -> (N, 3, 3)."""
     R = np.empty((len(phi), 3, 3))
     for i in range(len(phi)):
-        R[i] = exp(phi[i])
+        one = exp(phi[i])
+        for j in range(3):
+            for k in range(3):
+                R[i, j, k] = one[j, k]
     return R
 
 
@@ -155,7 +158,9 @@ def log_many(R):
     """(N, 3, 3) -> (N, 3)."""
     phi = np.empty((len(R), 3))
     for i in range(len(R)):
-        phi[i] = log(R[i])
+        one = log(R[i])
+        for j in range(3):
+            phi[i, j] = one[j]
     return phi
 
 
