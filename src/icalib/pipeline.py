@@ -7,6 +7,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from threadpoolctl import threadpool_limits
+
 from icalib.assessment import assess
 from icalib.calibration import Calibration
 from icalib.estimation.assembly import Inputs, image_times, layout_for, nodes_for, start_values
@@ -42,6 +44,12 @@ def calibrate(
 
 def calibrate_measurements(rig: Rig, measurements: Measurements, progress: Progress = lambda *_: None) -> Calibration:
     """As `calibrate`, from measurements in memory."""
+    # The kernels have threads of their own; those of BLAS beside them double the time.
+    with threadpool_limits(limits=1, user_api="blas"):
+        return _calibrate(rig, measurements, progress)
+
+
+def _calibrate(rig: Rig, measurements: Measurements, progress: Progress) -> Calibration:
     clock = _Clock()
     progress("finding a first guess", 0.1)
     guess = initial_guess(rig, measurements)

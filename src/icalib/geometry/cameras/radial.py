@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numba import njit
 
@@ -13,6 +15,11 @@ def monotonic_limit(coefficients: np.ndarray) -> float:
 
     Beyond it a point far outside the field of view folds back into the image. 0 if a coefficient is not finite.
     """
+    return _monotonic_limit(tuple(coefficients.tolist()))
+
+
+@lru_cache(maxsize=64)  # asked for chunk by chunk, with the same coefficients
+def _monotonic_limit(coefficients: tuple[float, ...]) -> float:
     if not np.isfinite(coefficients).all():
         return 0.0
     # In w = 1 / r^2 the polynomial is monic, so a vanishing leading coefficient needs no special case.
