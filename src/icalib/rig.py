@@ -73,6 +73,7 @@ class Camera:
 
 Scheme = Literal["inertial", "pose", "kinematic"]
 Loss = Literal["none", "huber", "cauchy"]
+Nodes = Literal["every-image", "first-camera"]
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,7 @@ class Settings:
     """How the estimate is made; every field has a default that just works."""
 
     scheme: Scheme = "inertial"  # where a sensor was between nodes
+    nodes: Nodes = "every-image"  # whose images have a node of their own; the paper's: the first camera's alone
     loss: Loss = "huber"  # robust loss on corners
     loss_scale: float = 2.5  # in standard deviations, where the loss starts to bend
     outlier_std: float = 4.0  # drop corners this many standard deviations beyond their image's mean error; 0: none

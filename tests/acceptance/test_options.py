@@ -26,6 +26,7 @@ STEP = {
 SETTINGS = {
     "scheme pose": {"scheme": "pose"},
     "scheme kinematic": {"scheme": "kinematic"},
+    "nodes at the first camera": {"nodes": "first-camera"},
     "loss none": {"loss": "none"},
     "loss cauchy": {"loss": "cauchy"},
     "tight loss": {"loss_scale": 1.5},

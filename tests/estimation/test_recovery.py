@@ -10,7 +10,8 @@ from icalib.estimation import solver
 from icalib.estimation.arrowhead import THREADS, solve
 from icalib.estimation.solver import minimise
 from icalib.geometry import so3
-from icalib.simulation import handheld, simulate
+from icalib.pipeline import calibrate_measurements
+from icalib.simulation import handheld, rig_for, simulate
 
 EXACT = 1e-8  # rad, m, s; relative for intrinsics
 
@@ -131,3 +132,38 @@ def test_a_start_that_predicts_nothing_finite_is_an_error(noisy_problem):
     bad = replace(start, position=start.position * np.nan)
     with pytest.raises(EstimationError, match="first guess"):
         minimise(problem, bad)
+
+
+def test_slow_motion_and_a_poor_imu_converge_although_gravity_is_hardly_known():
+    """The tilt of the board then moves by degrees, and with it, in one step, accelerometer bias and lever arm."""
+    scenario = handheld(20.0, imu="noisy")
+    motion = replace(scenario.motion, rotation_scale=0.25, translation_scale=0.25)
+    scenario = replace(scenario, motion=motion)
+    result = calibrate_measurements(rig_for(scenario), simulate(scenario, seed=25).measurements)
+    assert result.converged, result.status
+    assert len(result.iterations) <= 15
+
+
+@pytest.mark.parametrize("loss", ["huber", "cauchy"])
+def test_the_information_has_the_true_curvature_of_the_loss(unlike, setup_of, problem_of, loss):
+    setup = setup_of(unlike)
+    problem = problem_of(setup, setup.state)
+    rng = np.random.default_rng(4)
+    cameras = tuple(
+        replace(
+            c,
+            stream=replace(c.stream, uv=c.stream.uv + rng.normal(size=c.stream.uv.shape)),
+            noise=replace(c.noise, sigma=np.ones_like(c.noise.sigma), loss=loss, loss_scale=1.5),
+        )
+        for c in problem.cameras
+    )
+    problem = replace(problem, cameras=cameras)
+    outcome = minimise(problem, setup.state)
+
+    def information(curved):
+        pieces = problem.pieces()
+        problem.linearise(outcome.state, pieces, problem.residuals(), curved=curved)
+        return solve(pieces, problem.n_nodes, problem.tolerance).information
+
+    np.testing.assert_allclose(outcome.information, information(True), rtol=1e-9, atol=1e-3)
+    assert np.diag(information(True)).sum() < 0.95 * np.diag(information(False)).sum()

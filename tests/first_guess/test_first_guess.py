@@ -105,6 +105,23 @@ def test_what_the_rig_gives_is_used(simulation: Simulation):
         assert offset == pytest.approx(simulation.truth.time_offset[camera.name], abs=1e-9)
 
 
+@pytest.mark.parametrize("given", ["intrinsics", "distortion"])
+def test_what_is_given_of_a_lens_is_held_while_the_rest_is_found(simulation: Simulation, given: str):
+    rig = rig_for(simulation.scenario, intrinsics="free", distortion="free")
+    held = {c.name: getattr(simulation.truth, given)[c.name] * 1.01 for c in rig.cameras}
+    cameras = tuple(dataclasses.replace(c, **{given: Parameter("fixed", held[c.name])}) for c in rig.cameras)
+    guess = initial_guess(dataclasses.replace(rig, cameras=cameras), simulation.measurements)
+    for c in rig.cameras:
+        params = guess.cameras[c.name].params
+        np.testing.assert_array_equal(params[:4] if given == "intrinsics" else params[4:], held[c.name])
+        if given == "distortion":
+            # The focal length makes up for what the wrong coefficients do, which it could not after the fit.
+            np.testing.assert_allclose(params[:4], simulation.truth.intrinsics[c.name], rtol=0.01)
+        else:
+            assert params[4] != pytest.approx(simulation.truth.distortion[c.name][0], abs=1e-3)
+            assert np.median(guess.cameras[c.name].poses.rms_px) < 1.0
+
+
 def with_imu(measurements: Measurements, gyro_scale: float = 1.0, accel_scale: float = 1.0) -> Measurements:
     imu = measurements.imu
     return dataclasses.replace(

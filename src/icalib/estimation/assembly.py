@@ -100,7 +100,8 @@ def resample(state: State, nodes: np.ndarray, inputs: Inputs) -> State:
 def nodes_for(inputs: Inputs, times: list[np.ndarray]) -> np.ndarray:
     """Node times for images at `times`. Raises EstimationError where clocks do not overlap."""
     settings = inputs.rig.settings
-    nodes = place_nodes(inputs.imu, times, settings.node_spacing_s, settings.max_gap_s)
+    hosts = times[:1] if settings.nodes == "first-camera" else times
+    nodes = place_nodes(inputs.imu, hosts, settings.node_spacing_s, settings.max_gap_s)
     if len(nodes) < 3:
         raise EstimationError(
             f"fewer than 3 images of {', '.join(c.name for c in inputs.rig.cameras)} fall within the recording of "

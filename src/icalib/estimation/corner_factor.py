@@ -180,9 +180,8 @@ class CornerFactor:
         basis = self.basis @ state.values[self.target, "tilt"].T
         for a, b, X, _, _, Jp, Jpar in self._chunks(start, R_cw, p_wc, self.world_points(state), params, True):
             accumulate_clusters(
-                a, b, start[a], start, self.stream.point, cluster, n_clusters, column, LOSSES["none"], False, at.residual, at.root,
-                at.shared[i0:i1],
-                self.noise.field, self.direction, basis, pars, X, Jp, Jpar,
+                a, b, start[a], start, self.stream.point, cluster, n_clusters, column, LOSSES["none"], False,
+                at.residual, at.root, at.shared[i0:i1], self.noise.field, self.direction, basis, pars, X, Jp, Jpar,
                 np.ascontiguousarray(state.values[self.name, "rotation"]), state.values[self.name, "translation"],
                 R_cw, p_wc, poses.rate, poses.velocity, poses.by_node, poses.by_next, poses.by_imu,
                 self.node[i0:i1], piece.first, chained, direct, piece.side, piece.border,

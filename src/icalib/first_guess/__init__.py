@@ -88,11 +88,14 @@ def initial_guess(rig: Rig, measurements: Measurements) -> Guess:
 
 def _params(camera: Camera, stream: CornerStream, rig: Rig) -> np.ndarray:
     """(P,) from the rig where it has them, else from the corners."""
-    given = camera.intrinsics.value, camera.distortion.value
-    if given[0] is not None and given[1] is not None:
-        return np.concatenate([given[0], given[1]])
-    found = guess_intrinsics(stream, camera_model(camera.model), camera.resolution, rig.target.points)
-    return np.concatenate([found[:4] if given[0] is None else given[0], found[4:] if given[1] is None else given[1]])
+    model = camera_model(camera.model)
+    given = np.full(len(model.parameter_names), np.nan)
+    for part, parameter in ((slice(0, 4), camera.intrinsics), (slice(4, None), camera.distortion)):
+        if parameter.value is not None:
+            given[part] = parameter.value
+    if not np.isnan(given).any():
+        return given
+    return guess_intrinsics(stream, model, camera.resolution, rig.target.points, given)
 
 
 def _trusted(parameter: Parameter) -> np.ndarray | None:

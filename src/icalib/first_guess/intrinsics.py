@@ -19,23 +19,20 @@ GOOD_RMS_PX = 2.0
 
 
 def guess_intrinsics(
-    stream: CornerStream, model: CameraModel, resolution: tuple[int, int], target: np.ndarray
+    stream: CornerStream, model: CameraModel, resolution: tuple[int, int], target: np.ndarray, given: np.ndarray
 ) -> np.ndarray:
-    """Model parameters (P,) that explain the corners. Raises EstimationError if none are found that do."""
-    trial = _spread_images(stream, TRIAL_IMAGES)
-    width, height = resolution
-    best, params = np.inf, np.zeros(len(model.parameter_names))
-    for focal in FOCAL_TRIALS * width:
-        start = np.zeros(len(model.parameter_names))
-        start[:4] = focal, focal, 0.5 * (width - 1), 0.5 * (height - 1)
-        rms = float(np.median(target_poses(trial, model, start, target).rms_px))
-        if rms < best:
-            best, params = rms, start
+    """Model parameters (P,) that explain the corners. Raises EstimationError if none are found that do.
+
+    given (P,): values that are held, NaN for those to be found.
+    """
+    params = _best_start(_spread_images(stream, TRIAL_IMAGES), model, resolution, target, given)
     stream = _spread_images(stream, BUNDLE_IMAGES)
+    wanted = np.isnan(given)
     try:
         # Focal length and the strongest distortion first; the rest only once these are near.
-        params = _bundle(stream, model, params, target, np.array([0, 1, 4]))
-        params = _bundle(stream, model, params, target, np.arange(len(params)))
+        for stage in (np.array([0, 1, 4]), np.arange(len(params))):
+            free = stage[wanted[stage]]
+            params = _bundle(stream, model, params, target, free) if len(free) else params
     except np.linalg.LinAlgError:
         params = np.zeros_like(params)
     rms = float(np.median(target_poses(stream, model, params, target).rms_px))
@@ -44,6 +41,22 @@ def guess_intrinsics(
             f"{stream.name}: no intrinsics of model {model.name} explain the corners (best median error {rms:.1f} px); "
             "check the model, resolution and target in the rig file, or give intrinsics."
         )
+    return params
+
+
+def _best_start(
+    trial: CornerStream, model: CameraModel, resolution: tuple[int, int], target: np.ndarray, given: np.ndarray
+) -> np.ndarray:
+    """Parameters (P,) with the focal length of the trials that explains the corners best, where none is given."""
+    width, height = resolution
+    best, params = np.inf, np.zeros(len(given))
+    for focal in FOCAL_TRIALS * width if np.isnan(given[0]) else given[:1]:
+        start = np.zeros(len(given))
+        start[:4] = focal, focal, 0.5 * (width - 1), 0.5 * (height - 1)
+        start = np.where(np.isnan(given), start, given)
+        rms = float(np.median(target_poses(trial, model, start, target).rms_px))
+        if rms < best:
+            best, params = rms, start
     return params
 
 
