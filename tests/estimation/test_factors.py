@@ -18,7 +18,7 @@ import pytest
 import icalib.estimation
 from icalib.estimation.arrowhead import Piece, make_pieces
 from icalib.estimation.corner_factor import CornerNoise, CornerOutput
-from icalib.estimation.corner_kernels import LEAST_CURVATURE
+from icalib.estimation.corner_weights import LEAST_CURVATURE
 from icalib.estimation.imu_factor import ROWS, ImuFactor
 from icalib.estimation.prior_factor import FIRST_BIAS_SIGMA, Prior, accumulate_bias_prior
 from icalib.estimation.state import NODE, State

@@ -10,12 +10,25 @@ image by image.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from icalib.estimation.arrowhead import Piece
-from icalib.estimation.corner_kernels import accumulate, accumulate_clusters, camera_points
+from icalib.estimation.corner_kernels import (
+    Direct,
+    Found,
+    Given,
+    Images,
+    Motion,
+    Noise,
+    Predicted,
+    Sums,
+    accumulate,
+    accumulate_clusters,
+    camera_points,
+)
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.poses import Poses, poses_at
 from icalib.estimation.state import Layout, State
@@ -144,27 +157,13 @@ class CornerFactor:
         whitened residuals, returns the quadratic form of the common errors' rows instead.
         """
         i0, i1 = self._images(piece)
-        chained, direct, pars = self._columns()
-        poses, R_cw, p_wc = self.camera_poses(state, i0, i1)
-        params = np.concatenate([state.values[self.name, "intrinsics"], state.values[self.name, "distortion"]])
-        world = self.world_points(state)
-        start, n = self.stream.start[i0 : i1 + 1], self.noise
+        images, noise_model, direct, motion = self._arguments(state, i0, i1, curved)
         white, white_shared = noise or (out.residual, out.shared)
-        settings = (
-            start, self.stream.uv, self.stream.point, self.keep, n.sigma[i0:i1], LOSSES[n.loss], n.loss_scale, curved,
-            n.field, 1.0 / n.tau**2, state.values[self.name, "bloom"][0], self.direction,
-            self.basis @ state.values[self.target, "tilt"].T, pars,
-        )  # fmt: skip
-        common = (
-            white, white_shared[i0:i1], noise is not None,
-            np.ascontiguousarray(state.values[self.name, "rotation"]), state.values[self.name, "translation"],
-            R_cw, p_wc, poses.rate, poses.velocity, poses.by_node, poses.by_next, poses.by_imu,
-            self.node[i0:i1], piece.first, chained, direct, *piece.sums(sums),
-            out.residual, out.root, out.shared[i0:i1],
-        )  # fmt: skip
+        given = Given(noise is not None, white, white_shared[i0:i1])
+        into, found = Sums(piece.first, *piece.sums(sums)), Found(out.residual, out.root, out.shared[i0:i1])
         total = 0.0
-        for a, b, X, predicted, valid, Jp, Jpar in self._chunks(start, R_cw, p_wc, world, params, sums):
-            total += accumulate(a, b, start[a], *settings, predicted, valid, X, Jp, Jpar, *common)
+        for a, b, predicted in self._chunks(state, images, motion, sums):
+            total += accumulate(a, b, images, noise_model, direct, motion, predicted, given, into, found)
         return total
 
     def accumulate_clusters(
@@ -173,31 +172,44 @@ class CornerFactor:
         """Adds the gradient of each cluster of corners (N,), weights as in `at`, to columns of `piece` from
         `column` on."""
         i0, i1 = self._images(piece)
-        chained, direct, pars = self._columns()
-        poses, R_cw, p_wc = self.camera_poses(state, i0, i1)
-        params = np.concatenate([state.values[self.name, "intrinsics"], state.values[self.name, "distortion"]])
-        start = self.stream.start[i0 : i1 + 1]
-        basis = self.basis @ state.values[self.target, "tilt"].T
-        for a, b, X, _, _, Jp, Jpar in self._chunks(start, R_cw, p_wc, self.world_points(state), params, True):
+        images, noise, direct, motion = self._arguments(state, i0, i1, False)
+        into, found = Sums(piece.first, *piece.sums(True)), Found(at.residual, at.root, at.shared[i0:i1])
+        for a, b, predicted in self._chunks(state, images, motion, True):
             accumulate_clusters(
-                a, b, start[a], start, self.stream.point, cluster, n_clusters, column, LOSSES["none"], False,
-                at.residual, at.root, at.shared[i0:i1], self.noise.field, self.direction, basis, pars, X, Jp, Jpar,
-                np.ascontiguousarray(state.values[self.name, "rotation"]), state.values[self.name, "translation"],
-                R_cw, p_wc, poses.rate, poses.velocity, poses.by_node, poses.by_next, poses.by_imu,
-                self.node[i0:i1], piece.first, chained, direct, piece.side, piece.border,
+                a, b, cluster, n_clusters, column, images, noise, direct, motion, predicted, into, found
             )  # fmt: skip
 
-    def _chunks(self, start, R_cw, p_wc, world, params, jacobians: bool):
-        """Images a..b by the chunk: their points in the camera, and what the model makes of them."""
-        n = len(start) - 1
-        for a in range(0, n, CHUNK):
-            b = min(a + CHUNK, n)
+    def _arguments(self, state: State, i0: int, i1: int, curved: bool) -> tuple[Images, Noise, Direct, Motion]:
+        """What the kernels need to know of images i0..i1."""
+        chained, direct, pars = self._columns()
+        poses, R_cw, p_wc = self.camera_poses(state, i0, i1)
+        s, n = self.stream, self.noise
+        images = Images(s.start[i0 : i1 + 1], s.uv, s.point, self.keep, self.node[i0:i1])
+        noise = Noise(n.sigma[i0:i1], LOSSES[n.loss], n.loss_scale, curved, n.field, 1.0 / n.tau**2)
+        bloom = float(state.values[self.name, "bloom"][0])
+        basis = self.basis @ state.values[self.target, "tilt"].T
+        R_ic, p_ic = state.values[self.name, "rotation"], state.values[self.name, "translation"]
+        motion = Motion(
+            np.ascontiguousarray(R_ic), p_ic, R_cw, p_wc, poses.rate, poses.velocity,
+            poses.by_node, poses.by_next, poses.by_imu, chained,
+        )  # fmt: skip
+        return images, noise, Direct(pars, bloom, self.direction, basis, direct), motion
+
+    def _chunks(
+        self, state: State, images: Images, motion: Motion, jacobians: bool
+    ) -> Iterator[tuple[int, int, Predicted]]:
+        """Images a..b by the chunk, and what the model makes of them."""
+        params = np.concatenate([state.values[self.name, "intrinsics"], state.values[self.name, "distortion"]])
+        world, start = self.world_points(state), images.start
+        for a in range(0, len(images.node), CHUNK):
+            b = min(a + CHUNK, len(images.node))
             X = np.empty((start[b] - start[a], 3))
-            camera_points(a, b, start, self.stream.point, R_cw, p_wc, world, X)
+            camera_points(a, b, start, images.point, motion.R_cam_world, motion.p_world_cam, world, X)
             if jacobians:
-                yield a, b, X, *self.model.project_with_jacobians(params, X)
+                yield a, b, Predicted(int(start[a]), X, *self.model.project_with_jacobians(params, X))
             else:
-                yield a, b, X, *self.model.project(params, X), np.zeros((0, 2, 3)), np.zeros((0, 2, 0))
+                uv, valid = self.model.project(params, X)
+                yield a, b, Predicted(int(start[a]), X, uv, valid, np.zeros((0, 2, 3)), np.zeros((0, 2, 0)))
 
     def _images(self, piece: Piece) -> tuple[int, int]:
         """The images that belong to `piece`: nodes from first to before last, the chain's very last node included."""

@@ -1,13 +1,103 @@
-"""Compiled sums of the corner factor: from residuals and model Jacobians to the normal equations of a piece."""
+"""Compiled sums of the corner factor: from residuals and model Jacobians to the normal equations of a piece.
+
+Images are counted from the first one of the piece, corners from the first of the recording.
+"""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
+from icalib.estimation.corner_weights import bend, marginalise_shared, robust_weights, weight, whole_error
 from icalib.geometry import so3
 
-LEAST_CURVATURE = 1e-3
+
+class Images(NamedTuple):
+    """What was seen: corners of image i are start[i]:start[i+1]; uv (N, 2), point (N,), keep (N,); node (n,)."""
+
+    start: np.ndarray
+    uv: np.ndarray
+    point: np.ndarray
+    keep: np.ndarray
+    node: np.ndarray
+
+
+class Noise(NamedTuple):
+    """sigma (n,) px; the robust loss, where it bends, and whether the sums have its true curvature; the functions
+    field (N, m) and precision (m,) of the common error."""
+
+    sigma: np.ndarray
+    loss: int
+    scale: float
+    curved: bool
+    field: np.ndarray
+    precision: np.ndarray
+
+
+class Direct(NamedTuple):
+    """What shows in the image beyond the pose: model parameters `pars` that are free, bloom along direction (N, 2) or
+    (0, 2), the shape's basis (n_points, s, 3) in the world; columns: theirs in the border, -1 where fixed."""
+
+    pars: np.ndarray
+    bloom: float
+    direction: np.ndarray
+    basis: np.ndarray
+    columns: np.ndarray
+
+
+class Motion(NamedTuple):
+    """Camera in the IMU, camera poses (n, ...) in the world, and of the IMU what `Poses` holds; columns: those of the
+    border that act through the pose."""
+
+    R_imu_cam: np.ndarray
+    p_imu_cam: np.ndarray
+    R_cam_world: np.ndarray
+    p_world_cam: np.ndarray
+    rate: np.ndarray
+    velocity: np.ndarray
+    by_node: np.ndarray
+    by_next: np.ndarray
+    by_imu: np.ndarray
+    columns: np.ndarray
+
+
+class Predicted(NamedTuple):
+    """What the model makes of corners `first` and on: uv, valid, X in the camera, Jacobians by X and parameters."""
+
+    first: int
+    X: np.ndarray
+    uv: np.ndarray
+    valid: np.ndarray
+    by_point: np.ndarray
+    by_params: np.ndarray
+
+
+class Given(NamedTuple):
+    """White noise in place of the whitened residuals, where `used`: corners (N, 2), common errors (n, 2, m)."""
+
+    used: bool
+    corners: np.ndarray
+    shared: np.ndarray
+
+
+class Found(NamedTuple):
+    """What is left: residual (N, 2) and root (N,) by corner, shared (n, 2, m) by image."""
+
+    residual: np.ndarray
+    root: np.ndarray
+    shared: np.ndarray
+
+
+class Sums(NamedTuple):
+    """Normal equations of the piece that starts at node `first`; empty where only residuals are wanted."""
+
+    first: int
+    diagonal: np.ndarray
+    upper: np.ndarray
+    side: np.ndarray
+    border: np.ndarray
 
 
 @njit(cache=True, nogil=True)
@@ -24,107 +114,6 @@ def camera_points(i0, i1, start, point, R_cw, p_wc, world_points, X):
                 X[n - o, r] = R_cw[i, r, 0] * a + R_cw[i, r, 1] * b + R_cw[i, r, 2] * c
 
 
-@njit(cache=True, nogil=True)
-def _weight(loss, scale, s):
-    """Weight rho' and robust cost (half rho) of a squared whitened norm s, and the curvature along the residual over
-    the weight, 1 + 2 s rho'' / rho' (Triggs 1999), kept positive."""
-    if loss == 0:
-        return 1.0, 0.5 * s, 1.0
-    if loss == 1:
-        r = np.sqrt(s)
-        if r <= scale:
-            return 1.0, 0.5 * s, 1.0
-        return scale / r, scale * r - 0.5 * scale * scale, LEAST_CURVATURE
-    k = scale * scale
-    return 1.0 / (1.0 + s / k), 0.5 * k * np.log1p(s / k), max((k - s) / (k + s), LEAST_CURVATURE)
-
-
-@njit(cache=True, nogil=True)
-def _invert_small(M, out):
-    """Inverse of a small symmetric positive definite matrix by Gauss-Jordan."""
-    n = M.shape[0]
-    for i in range(n):
-        for j in range(n):
-            out[i, j] = 1.0 if i == j else 0.0
-    for i in range(n):
-        f = 1.0 / M[i, i]
-        for j in range(n):
-            M[i, j] *= f
-            out[i, j] *= f
-        for k in range(n):
-            if k != i:
-                f = M[k, i]
-                for j in range(n):
-                    M[k, j] -= f * M[i, j]
-                    out[k, j] -= f * out[i, j]
-
-
-@njit(cache=True, nogil=True)
-def _robust_weights(res, keep, f, precision, sigma, loss, scale, root, shared):
-    """root (n,): square roots of the weights over sigma; shared (2, m): the image's common error. Returns the cost.
-
-    Weights and common error depend on each other; a few rounds settle them, so that the cost is the least one over it.
-    """
-    n, m = len(keep), f.shape[1]
-    for k in range(m):
-        shared[0, k], shared[1, k] = 0.0, 0.0
-    M, inv, rhs = np.empty((m, m)), np.empty((m, m)), np.empty((2, m))
-    rounds = 1 if m == 0 else (2 if loss == 0 else 8)
-    cost = 0.0
-    for turn in range(rounds):
-        cost = 0.0
-        for i in range(n):
-            if not keep[i]:
-                root[i] = 0.0
-                continue
-            u, v = res[i, 0], res[i, 1]
-            for k in range(m):
-                u += shared[0, k] * f[i, k]
-                v += shared[1, k] * f[i, k]
-            w, c, _ = _weight(loss, scale, (u * u + v * v) / (sigma * sigma))
-            root[i] = np.sqrt(w) / sigma
-            cost += c
-        for k in range(m):
-            cost += 0.5 * precision[k] * (shared[0, k] ** 2 + shared[1, k] ** 2)
-        if turn == rounds - 1:
-            return cost
-        _common_error(res, root, f, precision, M, inv, rhs, shared)
-    return cost
-
-
-@njit(cache=True, nogil=True)
-def _common_error(res, root, f, precision, M, inv, rhs, shared):
-    """The image's common error (2, m) at given weights: ridge regression of -res on its functions."""
-    m = f.shape[1]
-    for a in range(m):
-        rhs[0, a], rhs[1, a] = 0.0, 0.0
-        for b in range(m):
-            M[a, b] = precision[a] if a == b else 0.0
-    for i in range(len(root)):
-        w = root[i] * root[i]
-        for a in range(m):
-            for b in range(m):
-                M[a, b] += w * f[i, a] * f[i, b]
-            rhs[0, a] += w * f[i, a] * res[i, 0]
-            rhs[1, a] += w * f[i, a] * res[i, 1]
-    _invert_small(M, inv)
-    for a in range(m):
-        shared[0, a], shared[1, a] = 0.0, 0.0
-        for b in range(m):
-            shared[0, a] -= inv[a, b] * rhs[0, b]
-            shared[1, a] -= inv[a, b] * rhs[1, b]
-
-
-@njit(cache=True, nogil=True)
-def _whole_error(res, f, shared, error):
-    """error (n, 2): residuals with the image's common error in them."""
-    for i in range(len(res)):
-        for axis in range(2):
-            error[i, axis] = res[i, axis]
-            for k in range(f.shape[1]):
-                error[i, axis] += shared[axis, k] * f[i, k]
-
-
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def _gram(A, D, n, out):
     """out (D, D) = A[:D, :n] A[:D, :n]^T, upper triangle mirrored. Sums may be reordered: they are vectorised."""
@@ -138,145 +127,122 @@ def _gram(A, D, n, out):
 
 
 @njit(cache=True, nogil=True)
-def _fill_rows(
-    o, n0, n1, res, root, sigma, loss, scale, curved, X, Jp, Jpar, pars, has_bloom, direction, basis, point, R_cw, A
-):  # fmt: skip
-    """Weighted Jacobian of one image, transposed: A (D + 1, 2 n), u rows first; the last row the residual. Returns D.
+def _predict_image(i, images, noise, direct, predicted, found):
+    """Residuals, weights and common error of image i; returns its half robust chi^2."""
+    n0, n1, o = images.start[i], images.start[i + 1], predicted.first
+    res, ok = found.residual[n0:n1], np.empty(n1 - n0, np.bool_)
+    for k in range(n1 - n0):
+        n = n0 + k
+        ok[k] = images.keep[n] and predicted.valid[n - o]
+        for r in range(2):
+            res[k, r] = predicted.uv[n - o, r] - images.uv[n, r]
+            if len(direct.direction):
+                res[k, r] += direct.bloom * direct.direction[n, r]
+    return robust_weights(
+        res, ok, noise.field[n0:n1], noise.precision, noise.sigma[i], noise.loss, noise.scale, found.root[n0:n1],
+        found.shared[i],
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def _fill_rows(i, images, noise, direct, motion, predicted, found, error, A):
+    """Weighted Jacobian of image i, transposed: A (D + 1, 2 n), u rows first; the last row the residual.
 
     With `curved`, where the loss bends the rows are scaled so that A^T A is the true curvature, A^T r the true
     gradient.
     """
-    n = n1 - n0
-    ns = basis.shape[1]
-    D = 6 + len(pars) + has_bloom + ns
-    q0, q1, q2 = np.empty(ns), np.empty(ns), np.empty(ns)
-    for i in range(n0, n1):
-        x, y, z = X[i - o, 0], X[i - o, 1], X[i - o, 2]
-        for s in range(ns):
-            b = basis[point[i], s]
-            q0[s] = R_cw[0, 0] * b[0] + R_cw[0, 1] * b[1] + R_cw[0, 2] * b[2]
-            q1[s] = R_cw[1, 0] * b[0] + R_cw[1, 1] * b[1] + R_cw[1, 2] * b[2]
-            q2[s] = R_cw[2, 0] * b[0] + R_cw[2, 1] * b[1] + R_cw[2, 2] * b[2]
-        w = root[i - n0]
+    n0, n1 = images.start[i], images.start[i + 1]
+    n, ns, n_pars = n1 - n0, direct.basis.shape[1], len(direct.pars)
+    has_bloom = len(direct.direction) > 0
+    D = 6 + n_pars + has_bloom + ns
+    moved = np.empty((3, ns))
+    for k in range(n):
+        c, root = n0 + k - predicted.first, found.root[n0 + k]
+        x, y, z = predicted.X[c, 0], predicted.X[c, 1], predicted.X[c, 2]
+        _turn(motion.R_cam_world[i], direct.basis[images.point[n0 + k]], moved)
         for r in range(2):
-            c = r * n + i - n0
-            a0, a1, a2 = w * Jp[i - o, r, 0], w * Jp[i - o, r, 1], w * Jp[i - o, r, 2]
-            A[0, c] = a1 * z - a2 * y
-            A[1, c] = a2 * x - a0 * z
-            A[2, c] = a0 * y - a1 * x
-            A[3, c], A[4, c], A[5, c] = -a0, -a1, -a2
-            for k in range(len(pars)):
-                A[6 + k, c] = w * Jpar[i - o, r, pars[k]]
-            d = 6 + len(pars)
+            at = r * n + k
+            a0, a1 = root * predicted.by_point[c, r, 0], root * predicted.by_point[c, r, 1]
+            a2 = root * predicted.by_point[c, r, 2]
+            A[0, at] = a1 * z - a2 * y
+            A[1, at] = a2 * x - a0 * z
+            A[2, at] = a0 * y - a1 * x
+            A[3, at], A[4, at], A[5, at] = -a0, -a1, -a2
+            for q in range(n_pars):
+                A[6 + q, at] = root * predicted.by_params[c, r, direct.pars[q]]
+            d = 6 + n_pars
             if has_bloom:
-                A[d, c] = w * direction[i, r]
+                A[d, at] = root * direct.direction[n0 + k, r]
                 d += 1
-            for s in range(ns):
-                A[d + s, c] = a0 * q0[s] + a1 * q1[s] + a2 * q2[s]
-            A[D, c] = w * res[i - n0, r]
-        if curved and loss > 0 and w > 0.0:
-            square = (res[i - n0, 0] ** 2 + res[i - n0, 1] ** 2) / (sigma * sigma)
-            _, _, curvature = _weight(loss, scale, square)
+            for q in range(ns):
+                A[d + q, at] = a0 * moved[0, q] + a1 * moved[1, q] + a2 * moved[2, q]
+            A[D, at] = root * error[k, r]
+        if noise.curved and noise.loss > 0 and root > 0.0:
+            square = (error[k, 0] ** 2 + error[k, 1] ** 2) / (noise.sigma[i] * noise.sigma[i])
+            _, _, curvature = weight(noise.loss, noise.scale, square)
             if curvature < 1.0:
-                _bend(A, D, i - n0, n, res[i - n0], np.sqrt(curvature))
-    return D
+                bend(A, D, k, n, error[k], np.sqrt(curvature))
 
 
 @njit(cache=True, nogil=True)
-def _bend(A, D, i, n, r, factor):
-    """Scales the Jacobian rows of corner i along its residual r by `factor`, and the residual by its inverse."""
-    size = np.sqrt(r[0] * r[0] + r[1] * r[1])
-    u, v = r[0] / size, r[1] / size
-    for k in range(D + 1):
-        along = u * A[k, i] + v * A[k, n + i]
-        change = along * ((factor if k < D else 1.0 / factor) - 1.0)
-        A[k, i] += change * u
-        A[k, n + i] += change * v
+def _turn(R, b, out):
+    """out (3, s) = R b^T for b (s, 3)."""
+    for r in range(3):
+        for s in range(len(b)):
+            out[r, s] = R[r, 0] * b[s, 0] + R[r, 1] * b[s, 1] + R[r, 2] * b[s, 2]
 
 
 @njit(cache=True, nogil=True)
-def _marginalise_shared(A, D, n, root, f, precision, own, given, G):
-    """Takes the image's common error out of the Gram matrix G (D + 1, D + 1).
-
-    Its own gradient is zero: the cost is the least over it. With `given` noise, own (2, m) stands for its whitened
-    residual; returns rhs^T M^-1 rhs of its rows then.
-    """
-    m = f.shape[1]
-    M, inv = np.empty((m, m)), np.empty((m, m))
-    C = np.empty((m, D + 1))
-    quad = 0.0
-    for axis in range(2):
-        for a in range(m):
-            for b in range(m):
-                M[a, b] = precision[a] if a == b else 0.0
-            for k in range(D + 1):
-                C[a, k] = 0.0
-            C[a, D] = own[axis, a] * np.sqrt(precision[a]) if given else 0.0
-        for i in range(n):
-            for a in range(m):
-                wf = root[i] * f[i, a]
-                for b in range(m):
-                    M[a, b] += wf * root[i] * f[i, b]
-                for k in range(D + 1 if given else D):
-                    C[a, k] += wf * A[k, axis * n + i]
-        _invert_small(M, inv)
-        for a in range(m):
-            for b in range(m):
-                for k in range(D + 1):
-                    s = inv[a, b] * C[a, k]
-                    for c in range(D + 1):
-                        G[k, c] -= s * C[b, c]
-                quad += inv[a, b] * C[a, D] * C[b, D]
-    return quad
-
-
-@njit(cache=True, nogil=True)
-def _chain(R_ic, p_ic, R_cw, p_wc, rate, vel, Jn, Jm, Jx, Tn, Tm, Tc):
-    """Camera pose (right rotation, position in camera axes) by the nodes (Tn, Tm) and the chained border (Tc).
-
-    Chained border: rotation 3, translation 3, time offset 1, tilt of the board 2, IMU intrinsics 24 or 0.
-    """
-    A = np.empty((6, 6))
+def _by_imu_pose(R_ic, p_ic, R_cw):
+    """(6, 6) camera pose (right rotation, position in camera axes) by the IMU's (right rotation, position)."""
+    A = np.zeros((6, 6))
     lever = so3.hat(p_ic)
     for i in range(3):
         for j in range(3):
             A[i, j] = R_ic[j, i]
-            A[i, 3 + j] = 0.0
             A[3 + i, 3 + j] = R_cw[i, j]
-            s = 0.0
             for k in range(3):
-                s -= R_ic[k, i] * lever[k, j]
-            A[3 + i, j] = s
+                A[3 + i, j] -= R_ic[k, i] * lever[k, j]
+    return A
+
+
+@njit(cache=True, nogil=True)
+def _product(A, J, out, column):
+    """out[:, column:] = A J for A (6, 6)."""
     for i in range(6):
-        for j in range(Jn.shape[1]):
+        for j in range(J.shape[1]):
             s = 0.0
             for k in range(6):
-                s += A[i, k] * Jn[k, j]
-            Tn[i, j] = s
-        for j in range(Tm.shape[1]):
-            s = 0.0
-            for k in range(6):
-                s += A[i, k] * Jm[k, j]
-            Tm[i, j] = s
-        s = 0.0
+                s += A[i, k] * J[k, j]
+            out[i, column + j] = s
+
+
+@njit(cache=True, nogil=True)
+def _chain(i, motion, Tn, Tm, Tc):
+    """Camera pose (right rotation, position in camera axes) by the nodes (Tn, Tm) and the chained border (Tc).
+
+    Chained border: rotation 3, translation 3, time offset 1, tilt of the board 2, IMU intrinsics 24 or 0.
+    """
+    R_ic, R_cw, p_wc = motion.R_imu_cam, motion.R_cam_world[i], motion.p_world_cam[i]
+    A = _by_imu_pose(R_ic, motion.p_imu_cam, R_cw)
+    _product(A, motion.by_node[i], Tn, 0)
+    if len(motion.by_next):
+        _product(A, motion.by_next[i], Tm, 0)
+    _product(A, motion.by_imu[i], Tc, 9)
+    for r in range(6):
+        Tc[r, 6] = 0.0
         for k in range(3):
-            s += A[i, k] * rate[k] + A[i, 3 + k] * vel[k]
-        Tc[i, 6] = s
-        for j in range(Jx.shape[1]):
-            s = 0.0
-            for k in range(6):
-                s += A[i, k] * Jx[k, j]
-            Tc[i, 9 + j] = s
-    for i in range(3):
+            Tc[r, 6] += A[r, k] * motion.rate[i, k] + A[r, 3 + k] * motion.velocity[i, k]
+    for r in range(3):
         for j in range(3):
-            Tc[i, j] = 1.0 if i == j else 0.0
-            Tc[3 + i, j] = 0.0
-            Tc[i, 3 + j] = 0.0
-            Tc[3 + i, 3 + j] = R_ic[j, i]
+            Tc[r, j] = 1.0 if r == j else 0.0
+            Tc[3 + r, j] = 0.0
+            Tc[r, 3 + j] = 0.0
+            Tc[3 + r, 3 + j] = R_ic[j, r]
         # Turning the board about world x (y) is turning the camera the other way about the board's origin.
-        Tc[i, 7], Tc[i, 8] = -R_cw[i, 0], -R_cw[i, 1]
-        Tc[3 + i, 7] = R_cw[i, 1] * p_wc[2] - R_cw[i, 2] * p_wc[1]
-        Tc[3 + i, 8] = R_cw[i, 2] * p_wc[0] - R_cw[i, 0] * p_wc[2]
+        Tc[r, 7], Tc[r, 8] = -R_cw[r, 0], -R_cw[r, 1]
+        Tc[3 + r, 7] = R_cw[r, 1] * p_wc[2] - R_cw[r, 2] * p_wc[1]
+        Tc[3 + r, 8] = R_cw[r, 2] * p_wc[0] - R_cw[r, 0] * p_wc[2]
 
 
 @njit(cache=True, nogil=True)
@@ -348,114 +314,100 @@ def _add_border(G, D, Tc, cols_c, cols_d, border):
 
 
 @njit(cache=True, nogil=True)
-def accumulate(
-    i0, i1, o, start, uv, point, keep, sigma, loss, scale, curved, field, precision, bloom, direction, basis, pars,
-    predicted, valid, X, Jp, Jpar, noise, shared_noise, given, R_ic, p_ic, R_cw, p_wc, rate, vel, Jn, Jm, Jx,
-    node, first, cols_c, cols_d, diagonal, upper, side, border, residual, root_out, shared_out,
-):  # fmt: skip
+def _work(images, direct, motion):
+    """Arrays for one image: rows A, their Gram matrix, errors (n, 2), and the chain matrices Tn, Tm, Tc."""
+    most = 0
+    for i in range(len(images.start) - 1):
+        most = max(most, images.start[i + 1] - images.start[i])
+    D = 6 + len(direct.pars) + (len(direct.direction) > 0) + direct.basis.shape[1]
+    Tm = np.empty((6, 15 if len(motion.by_next) else 0))
+    return (
+        np.empty((D + 1, 2 * most)), np.empty((D + 1, D + 1)), np.empty((most, 2)),
+        np.empty((6, 15)), Tm, np.empty((6, 9 + motion.by_imu.shape[2])),
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def accumulate(i0, i1, images, noise, direct, motion, predicted, given, sums, found):
     """Images i0..i1: residuals, weights and common errors out, and the normal equations where they are wanted.
 
     Returns half the robust chi^2, or with `given` noise the quadratic form of the common errors' own rows.
     """
-    most = 0
-    for i in range(i0, i1):
-        most = max(most, start[i + 1] - start[i])
-    has_bloom = 1 if direction.shape[0] > 0 else 0
-    D = 6 + len(pars) + has_bloom + basis.shape[1]
-    A = np.empty((D + 1, 2 * most))
-    G = np.empty((D + 1, D + 1))
-    Tn, Tm, Tc = np.empty((6, 15)), np.empty((6, 15 if Jm.shape[0] else 0)), np.empty((6, 9 + Jx.shape[2]))
-    m = field.shape[1]
-    error = np.empty((most, 2))
+    A, G, error, Tn, Tm, Tc = _work(images, direct, motion)
+    D = len(G) - 1
     total = 0.0
     for i in range(i0, i1):
-        n0, n1 = start[i], start[i + 1]
-        n = n1 - n0
-        res, ok, root = residual[n0:n1], np.empty(n, np.bool_), root_out[n0:n1]
-        for k in range(n):
-            ok[k] = keep[n0 + k] and valid[n0 + k - o]
-            for r in range(2):
-                res[k, r] = predicted[n0 + k - o, r] - uv[n0 + k, r]
-                if has_bloom:
-                    res[k, r] += bloom * direction[n0 + k, r]
-        f = field[n0:n1]
-        cost = _robust_weights(res, ok, f, precision, sigma[i], loss, scale, root, shared_out[i])
-        if not given:
+        cost = _predict_image(i, images, noise, direct, predicted, found)
+        if not given.used:
             total += cost
-        if diagonal.shape[0] == 0:
+        if len(sums.diagonal) == 0:
             continue
-        _whole_error(res, f, shared_out[i], error)
-        _fill_rows(
-            o, n0, n1, error, root, sigma[i], loss, scale, curved, X, Jp, Jpar, pars, has_bloom, direction, basis,
-            point, R_cw[i], A
-        )  # fmt: skip
-        if given:
+        n0, n1 = images.start[i], images.start[i + 1]
+        n = n1 - n0
+        whole_error(found.residual[n0:n1], noise.field[n0:n1], found.shared[i], error)
+        _fill_rows(i, images, noise, direct, motion, predicted, found, error, A)
+        if given.used:
             for k in range(n):
-                A[D, k] = noise[n0 + k, 0] if ok[k] else 0.0
-                A[D, n + k] = noise[n0 + k, 1] if ok[k] else 0.0
+                ok = found.root[n0 + k] > 0.0
+                A[D, k] = given.corners[n0 + k, 0] if ok else 0.0
+                A[D, n + k] = given.corners[n0 + k, 1] if ok else 0.0
         _gram(A, D + 1, 2 * n, G)
-        if m:
-            quad = _marginalise_shared(A, D, n, root, f, precision, shared_noise[i], given, G)
-            if given:
-                total += quad
-        if Jm.shape[0]:
-            _chain(R_ic, p_ic, R_cw[i], p_wc[i], rate[i], vel[i], Jn[i], Jm[i], Jx[i], Tn, Tm, Tc)
-        else:
-            _chain(R_ic, p_ic, R_cw[i], p_wc[i], rate[i], vel[i], Jn[i], Jn[i], Jx[i], Tn, Tm, Tc)
-        k = node[i] - first
-        _outer_add(Tn, G, Tn, diagonal[k])
-        _add_side(Tn, G, D, Tc, cols_c, cols_d, side[k])
-        if Jm.shape[0]:
-            _outer_add(Tn, G, Tm, upper[k])
-            _outer_add(Tm, G, Tm, diagonal[k + 1])
-            _add_side(Tm, G, D, Tc, cols_c, cols_d, side[k + 1])
-        _add_border(G, D, Tc, cols_c, cols_d, border)
+        if len(noise.precision):
+            rows = marginalise_shared(
+                A, D, n, found.root[n0:n1], noise.field[n0:n1], noise.precision, given.shared[i], given.used, G
+            )
+            total += rows if given.used else 0.0
+        _chain(i, motion, Tn, Tm, Tc)
+        _add_image(images.node[i] - sums.first, G, Tn, Tm, Tc, motion.columns, direct.columns, sums)
     return total
 
 
 @njit(cache=True, nogil=True)
-def accumulate_clusters(
-    i0, i1, o, start, point, cluster, n_clusters, column, loss, curved, residual, root_all, shared, field, direction,
-    basis, pars,
-    X, Jp, Jpar, R_ic, p_ic, R_cw, p_wc, rate, vel, Jn, Jm, Jx, node, first, cols_c, cols_d, side, border,
-):  # fmt: skip
+def _add_image(k, G, Tn, Tm, Tc, chained, direct, sums):
+    """One image's Gram matrix G into the sums of node k and, where its pose hangs on two, of the next."""
+    D = len(G) - 1
+    _outer_add(Tn, G, Tn, sums.diagonal[k])
+    _add_side(Tn, G, D, Tc, chained, direct, sums.side[k])
+    if Tm.shape[1]:
+        _outer_add(Tn, G, Tm, sums.upper[k])
+        _outer_add(Tm, G, Tm, sums.diagonal[k + 1])
+        _add_side(Tm, G, D, Tc, chained, direct, sums.side[k + 1])
+    _add_border(G, D, Tc, chained, direct, sums.border)
+
+
+@njit(cache=True, nogil=True)
+def accumulate_clusters(i0, i1, cluster, n_clusters, column, images, noise, direct, motion, predicted, sums, found):
     """Gradients of images i0..i1 by cluster of corners, into columns `column` and on of side and border."""
-    most = 0
-    for i in range(i0, i1):
-        most = max(most, start[i + 1] - start[i])
-    has_bloom = 1 if direction.shape[0] > 0 else 0
-    D = 6 + len(pars) + has_bloom + basis.shape[1]
-    A, error = np.empty((D + 1, 2 * most)), np.empty((most, 2))
-    Tn, Tm, Tc = np.empty((6, 15)), np.empty((6, 15 if Jm.shape[0] else 0)), np.empty((6, 9 + Jx.shape[2]))
+    A, gram, error, Tn, Tm, Tc = _work(images, direct, motion)
+    D = len(gram) - 1
     G = np.empty((D, n_clusters))
     for i in range(i0, i1):
-        n0, n1 = start[i], start[i + 1]
+        n0, n1 = images.start[i], images.start[i + 1]
         n = n1 - n0
-        _whole_error(residual[n0:n1], field[n0:n1], shared[i], error)
-        _fill_rows(
-            o, n0, n1, error, root_all[n0:n1], 1.0, loss, 1.0, curved, X, Jp, Jpar, pars, has_bloom, direction, basis,
-            point,
-            R_cw[i], A,
-        )  # fmt: skip
+        whole_error(found.residual[n0:n1], noise.field[n0:n1], found.shared[i], error)
+        _fill_rows(i, images, noise, direct, motion, predicted, found, error, A)
         for d in range(D):
             for g in range(n_clusters):
                 G[d, g] = 0.0
-        for k in range(n):
-            for d in range(D):
+            for k in range(n):
                 G[d, cluster[n0 + k]] += A[d, k] * A[D, k] + A[d, n + k] * A[D, n + k]
-        next_by = Jm[i] if Jm.shape[0] else Jn[i]
-        _chain(R_ic, p_ic, R_cw[i], p_wc[i], rate[i], vel[i], Jn[i], next_by, Jx[i], Tn, Tm, Tc)
-        k = node[i] - first
-        for g in range(n_clusters):
-            for d in range(6):
-                f = G[d, g]
-                for a in range(15):
-                    side[k, a, column + g] += Tn[d, a] * f
-                for a in range(Tm.shape[1]):
-                    side[k + 1, a, column + g] += Tm[d, a] * f
-                for a in range(len(cols_c)):
-                    if cols_c[a] >= 0:
-                        border[cols_c[a], column + g] += Tc[d, a] * f
-            for a in range(len(cols_d)):
-                if cols_d[a] >= 0:
-                    border[cols_d[a], column + g] += G[6 + a, g]
+        _chain(i, motion, Tn, Tm, Tc)
+        _add_clusters(images.node[i] - sums.first, G, column, Tn, Tm, Tc, motion.columns, direct.columns, sums)
+
+
+@njit(cache=True, nogil=True)
+def _add_clusters(k, G, column, Tn, Tm, Tc, chained, direct, sums):
+    """One image's gradients G (D, clusters) through its pose into columns of node k, the next, and the border."""
+    for g in range(G.shape[1]):
+        for d in range(6):
+            f = G[d, g]
+            for a in range(15):
+                sums.side[k, a, column + g] += Tn[d, a] * f
+            for a in range(Tm.shape[1]):
+                sums.side[k + 1, a, column + g] += Tm[d, a] * f
+            for a in range(len(chained)):
+                if chained[a] >= 0:
+                    sums.border[chained[a], column + g] += Tc[d, a] * f
+        for a in range(len(direct)):
+            if direct[a] >= 0:
+                sums.border[direct[a], column + g] += G[6 + a, g]
