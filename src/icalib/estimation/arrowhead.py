@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numba import njit
@@ -35,6 +35,17 @@ def _pool() -> ThreadPoolExecutor:
 def in_parallel(function: Callable[..., T], items: Iterable) -> list[T]:
     """[function(item) for item in items], on two threads; kernels release the interpreter lock."""
     return list(_pool().map(function, items))
+
+
+class Sums(NamedTuple):
+    """What a kernel adds to: the arrays of the `Piece` that starts at node `first`, empty where only residuals are
+    wanted."""
+
+    first: int
+    diagonal: np.ndarray
+    upper: np.ndarray
+    side: np.ndarray
+    border: np.ndarray
 
 
 @dataclass
@@ -65,15 +76,15 @@ class Piece:
         )
 
     def clear(self) -> None:
-        for a in self.sums(True):
+        for a in (self.diagonal, self.upper, self.side, self.border):
             a[:] = 0.0
 
-    def sums(self, wanted: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """diagonal, upper, side, border for a kernel to add to; empty where only residuals are wanted."""
+    def sums(self, wanted: bool) -> Sums:
+        """For a kernel to add to; empty where only residuals are wanted."""
         if wanted:
-            return self.diagonal, self.upper, self.side, self.border
+            return Sums(self.first, self.diagonal, self.upper, self.side, self.border)
         empty = np.zeros((0, NODE, NODE))
-        return empty, empty, empty, np.zeros((0, 0))
+        return Sums(self.first, empty, empty, empty, np.zeros((0, 0)))
 
 
 def make_pieces(n_nodes: int, n_border: int) -> tuple[Piece, ...]:

@@ -24,7 +24,6 @@ from icalib.estimation.corner_kernels import (
     Motion,
     Noise,
     Predicted,
-    Sums,
     accumulate,
     accumulate_clusters,
     camera_points,
@@ -160,7 +159,7 @@ class CornerFactor:
         images, noise_model, direct, motion = self._arguments(state, i0, i1, curved)
         white, white_shared = noise or (out.residual, out.shared)
         given = Given(noise is not None, white, white_shared[i0:i1])
-        into, found = Sums(piece.first, *piece.sums(sums)), Found(out.residual, out.root, out.shared[i0:i1])
+        into, found = piece.sums(sums), Found(out.residual, out.root, out.shared[i0:i1])
         total = 0.0
         for a, b, predicted in self._chunks(state, images, motion, sums):
             total += accumulate(a, b, images, noise_model, direct, motion, predicted, given, into, found)
@@ -173,7 +172,7 @@ class CornerFactor:
         `column` on."""
         i0, i1 = self._images(piece)
         images, noise, direct, motion = self._arguments(state, i0, i1, False)
-        into, found = Sums(piece.first, *piece.sums(True)), Found(at.residual, at.root, at.shared[i0:i1])
+        into, found = piece.sums(True), Found(at.residual, at.root, at.shared[i0:i1])
         for a, b, predicted in self._chunks(state, images, motion, True):
             accumulate_clusters(
                 a, b, cluster, n_clusters, column, images, noise, direct, motion, predicted, into, found

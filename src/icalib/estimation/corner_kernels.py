@@ -90,16 +90,6 @@ class Found(NamedTuple):
     shared: np.ndarray
 
 
-class Sums(NamedTuple):
-    """Normal equations of the piece that starts at node `first`; empty where only residuals are wanted."""
-
-    first: int
-    diagonal: np.ndarray
-    upper: np.ndarray
-    side: np.ndarray
-    border: np.ndarray
-
-
 @njit(cache=True, nogil=True)
 def camera_points(i0, i1, start, point, R_cw, p_wc, world_points, X):
     """X (n, 3): the points of images i0..i1 in their camera's frame."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -49,6 +50,29 @@ def _inverse_cholesky(P, W):
             W[i, j] = s / P[i, i]
 
 
+class Chain(NamedTuple):
+    """The nodes: R_world_imu (K, 3, 3), p, v (K, 3), biases (K, 6), seconds (K,); gravity m/s^2."""
+
+    R: np.ndarray
+    p: np.ndarray
+    v: np.ndarray
+    b: np.ndarray
+    seconds: np.ndarray
+    gravity: float
+
+
+class Increments(NamedTuple):
+    """Preintegrated intervals (K - 1, ...): rotation, velocity, position; their Jacobians J (9, 6 or 30) by biases and
+    intrinsics, the inverse Cholesky factor W (15, 15), the biases that they were made with."""
+
+    dR: np.ndarray
+    dv: np.ndarray
+    dp: np.ndarray
+    J: np.ndarray
+    W: np.ndarray
+    bias0: np.ndarray
+
+
 @njit(cache=True, nogil=True)
 def _put(J, row, col, sign, M):
     for i in range(3):
@@ -57,72 +81,74 @@ def _put(J, row, col, sign, M):
 
 
 @njit(cache=True, nogil=True)
-def _residual(R0, p0, v0, b0, R1, p1, v1, b1, dt, g, dR, dv, dp, Jb, db, Jx, dx, r, J0, J1, Jc):
-    """Residual (15,) = predicted - measured, and Jacobians (15, 15) of both nodes, (15, 24 or 0) of the intrinsics.
-
-    db: bias of node 0 less the one preintegrated with; dx the same of the intrinsics; Jb, Jx: increments by them.
-    """
-    turn = np.zeros(3)
-    for i in range(3):
+def _correction(k, chain, made, dx, change):
+    """change (9,): the increments' by biases and intrinsics `dx` other than those that they were made with."""
+    for i in range(9):
+        change[i] = 0.0
         for j in range(6):
-            turn[i] += Jb[i, j] * db[j]
+            change[i] += made.J[k, i, j] * (chain.b[k, j] - made.bias0[k, j])
         for j in range(len(dx)):
-            turn[i] += Jx[i, j] * dx[j]
-    R01 = tmul3(R0, R1)
-    error = so3.log(tmul3(so3.exp(turn), tmul3(dR, R01)))
-    Jr_inv = so3.right_jacobian_inverse(error)
-    mv, mp = np.empty(3), np.empty(3)
+            change[i] += made.J[k, i, 6 + j] * dx[j]
+
+
+@njit(cache=True, nogil=True)
+def _motion(k, chain):
+    """R_k^T R_k+1, and velocity and position gained without gravity, in the axes of node k."""
+    R0, dt, g = chain.R[k], chain.seconds[k + 1] - chain.seconds[k], chain.gravity
+    mv, mp, hv, hp = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(3):
-        mv[i] = v1[i] - v0[i]
-        mp[i] = p1[i] - p0[i] - v0[i] * dt
+        mv[i] = chain.v[k + 1, i] - chain.v[k, i]
+        mp[i] = chain.p[k + 1, i] - chain.p[k, i] - chain.v[k, i] * dt
     mv[2] += g * dt
     mp[2] += 0.5 * g * dt * dt
-    hv, hp = np.zeros(3), np.zeros(3)
     for i in range(3):
-        for j in range(3):
-            hv[i] += R0[j, i] * mv[j]
-            hp[i] += R0[j, i] * mp[j]
+        hv[i] = R0[0, i] * mv[0] + R0[1, i] * mv[1] + R0[2, i] * mv[2]
+        hp[i] = R0[0, i] * mp[0] + R0[1, i] * mp[1] + R0[2, i] * mp[2]
+    return tmul3(R0, chain.R[k + 1]), hv, hp
+
+
+@njit(cache=True, nogil=True)
+def _residual(k, chain, made, change, R01, hv, hp, r):
+    """r (15,) = predicted - measured of interval k, not whitened."""
+    error = so3.log(tmul3(so3.exp(change[:3]), tmul3(made.dR[k], R01)))
     for i in range(3):
         r[i] = error[i]
-        r[3 + i] = hv[i] - dv[i]
-        r[6 + i] = hp[i] - dp[i]
-        for j in range(6):
-            r[3 + i] -= Jb[3 + i, j] * db[j]
-            r[6 + i] -= Jb[6 + i, j] * db[j]
-        for j in range(len(dx)):
-            r[3 + i] -= Jx[3 + i, j] * dx[j]
-            r[6 + i] -= Jx[6 + i, j] * dx[j]
+        r[3 + i] = hv[i] - made.dv[k, i] - change[3 + i]
+        r[6 + i] = hp[i] - made.dp[k, i] - change[6 + i]
     for i in range(6):
-        r[9 + i] = b1[i] - b0[i]
-    R0t = np.ascontiguousarray(R0.T)
-    _put(J0, 0, 0, -1.0, mul3(Jr_inv, tmul3(R1, R0)))
+        r[9 + i] = chain.b[k + 1, i] - chain.b[k, i]
+
+
+@njit(cache=True, nogil=True)
+def _jacobians(k, chain, made, change, R01, hv, hp, r, J0, J1, Jc):
+    """Fills d r / d node k, d r / d node k + 1 (15, 15) and d r / d intrinsics (15, 24 or 0)."""
+    Jr_inv = so3.right_jacobian_inverse(r[:3])
+    R0t, R10 = np.ascontiguousarray(chain.R[k].T), np.ascontiguousarray(R01.T)
+    _put(J0, 0, 0, -1.0, mul3(Jr_inv, R10))
     _put(J1, 0, 0, 1.0, Jr_inv)
     _put(J0, 3, 0, 1.0, so3.hat(hv))
     _put(J0, 3, 6, -1.0, R0t)
     _put(J1, 3, 6, 1.0, R0t)
     _put(J0, 6, 0, 1.0, so3.hat(hp))
     _put(J0, 6, 3, -1.0, R0t)
-    _put(J0, 6, 6, -dt, R0t)
+    _put(J0, 6, 6, chain.seconds[k] - chain.seconds[k + 1], R0t)
     _put(J1, 6, 3, 1.0, R0t)
-    by_turn = mul3(Jr_inv, mul3(so3.exp(-error), so3.right_jacobian(turn)))
-    for i in range(3):
-        for j in range(6):
-            s = 0.0
-            for k in range(3):
-                s -= by_turn[i, k] * Jb[k, j]
-            J0[i, 9 + j] = s
-            J0[3 + i, 9 + j] = -Jb[3 + i, j]
-            J0[6 + i, 9 + j] = -Jb[6 + i, j]
-        for j in range(Jc.shape[1]):
-            s = 0.0
-            for k in range(3):
-                s -= by_turn[i, k] * Jx[k, j]
-            Jc[i, j] = s
-            Jc[3 + i, j] = -Jx[3 + i, j]
-            Jc[6 + i, j] = -Jx[6 + i, j]
     for i in range(6):
         J0[9 + i, 9 + i] = -1.0
         J1[9 + i, 9 + i] = 1.0
+    back = np.ascontiguousarray(so3.exp(r[:3]).T)
+    by_turn = mul3(Jr_inv, mul3(back, so3.right_jacobian(change[:3])))
+    for i in range(3):
+        for j in range(6 + Jc.shape[1]):
+            turn = 0.0
+            for m in range(3):
+                turn -= by_turn[i, m] * made.J[k, m, j]
+            if j < 6:
+                J0[i, 9 + j] = turn
+                J0[3 + i, 9 + j], J0[6 + i, 9 + j] = -made.J[k, 3 + i, j], -made.J[k, 6 + i, j]
+            else:
+                Jc[i, j - 6] = turn
+                Jc[3 + i, j - 6], Jc[6 + i, j - 6] = -made.J[k, 3 + i, j], -made.J[k, 6 + i, j]
 
 
 @njit(cache=True, nogil=True)
@@ -149,51 +175,53 @@ def _add_gram(A, B, out):
 
 
 @njit(cache=True, nogil=True)
-def _accumulate(
-    k0, k1, R, p, v, b, nodes, g, dR, dv, dp, J, W, bias0, dx, cols, noise, given, diagonal, upper, side, border, out
-):  # fmt: skip
-    """Adds intervals k0..k1 to the normal equations of a piece that starts at node k0; whitened residuals into out.
+def _accumulate(k1, chain, made, dx, columns, noise, given, sums, out):
+    """Adds intervals from `sums.first` to k1 to the normal equations; whitened residuals into out (K - 1, 15).
 
-    cols (24 or 0,): border columns of the intrinsics. given: use `noise` (n, 15) in place of the whitened residuals.
-    Returns half the chi^2.
+    dx, columns (24 or 0,): change and border columns of the intrinsics. given: use `noise` (K - 1, 15) in place of the
+    whitened residuals. Returns half the chi^2.
     """
-    n_x = len(cols)
-    n_b = side.shape[2] - 1
-    r, J0, J1 = np.zeros(ROWS), np.zeros((ROWS, ROWS)), np.zeros((ROWS, ROWS))
-    Jc = np.zeros((ROWS, n_x))
+    n_x = len(columns)
+    r, change = np.zeros(ROWS), np.zeros(9)
+    J0, J1, Jc = np.zeros((ROWS, ROWS)), np.zeros((ROWS, ROWS)), np.zeros((ROWS, n_x))
     A0, A1, Ac = np.empty((ROWS, ROWS)), np.empty((ROWS, ROWS)), np.empty((ROWS, n_x + 1))
     Jcr = np.zeros((ROWS, n_x + 1))
+    wanted = len(sums.diagonal) > 0
     cost = 0.0
-    for k in range(k0, k1):
-        db = b[k] - bias0[k]
-        dt = nodes[k + 1] - nodes[k]
-        _residual(
-            R[k], p[k], v[k], b[k], R[k + 1], p[k + 1], v[k + 1], b[k + 1], dt, g,
-            dR[k], dv[k], dp[k], J[k, :, :6], db, J[k, :, 6:], dx, r, J0, J1, Jc,
-        )  # fmt: skip
+    for k in range(sums.first, k1):
+        R01, hv, hp = _motion(k, chain)
+        _correction(k, chain, made, dx, change)
+        _residual(k, chain, made, change, R01, hv, hp, r)
+        if wanted:
+            _jacobians(k, chain, made, change, R01, hv, hp, r, J0, J1, Jc)
         for i in range(ROWS):
             for j in range(n_x):
                 Jcr[i, j] = Jc[i, j]
             Jcr[i, n_x] = r[i]
-        _whiten(W[k], Jcr, Ac)
+        _whiten(made.W[k], Jcr, Ac)
         for i in range(ROWS):
             if given:
                 Ac[i, n_x] = noise[k, i]
             out[k, i] = Ac[i, n_x]
             cost += 0.5 * Ac[i, n_x] * Ac[i, n_x]
-        if diagonal.shape[0] == 0:
-            continue
-        _whiten(W[k], J0, A0)
-        _whiten(W[k], J1, A1)
-        i = k - k0
-        _add_gram(A0, A0, diagonal[i])
-        _add_gram(A0, A1, upper[i])
-        _add_gram(A1, A1, diagonal[i + 1])
-        _scatter(A0, Ac, cols, n_b, side[i])
-        _scatter(A1, Ac, cols, n_b, side[i + 1])
-        if n_x:
-            _scatter_border(Ac, cols, n_b, border)
+        if wanted:
+            _whiten(made.W[k], J0, A0)
+            _whiten(made.W[k], J1, A1)
+            _add_interval(k - sums.first, A0, A1, Ac, columns, sums)
     return cost
+
+
+@njit(cache=True, nogil=True)
+def _add_interval(i, A0, A1, Ac, columns, sums):
+    """Whitened Jacobians of one interval into the sums of nodes i and i + 1 of the piece."""
+    n_b = sums.side.shape[2] - 1
+    _add_gram(A0, A0, sums.diagonal[i])
+    _add_gram(A0, A1, sums.upper[i])
+    _add_gram(A1, A1, sums.diagonal[i + 1])
+    _scatter(A0, Ac, columns, n_b, sums.side[i])
+    _scatter(A1, Ac, columns, n_b, sums.side[i + 1])
+    if len(columns):
+        _scatter_border(Ac, columns, n_b, sums.border)
 
 
 @njit(cache=True, nogil=True)
@@ -271,8 +299,9 @@ class ImuFactor:
         `noise` (K - 1, 15) stands in for the whitened residuals where given. Returns half the chi^2.
         """
         dx = state.values[self.imu.name, "intrinsics"] - self.intrinsics0 if len(self.columns) else np.zeros(0)
+        chain = Chain(state.rotation, state.position, state.velocity, state.bias, state.seconds, self.gravity)
+        made = Increments(self.dR, self.dv, self.dp, self.J, self.W, self.bias0)
         return _accumulate(
-            piece.first, piece.last, state.rotation, state.position, state.velocity, state.bias, state.seconds,
-            self.gravity, self.dR, self.dv, self.dp, self.J, self.W, self.bias0, dx, self.columns,
-            out if noise is None else noise, noise is not None, *piece.sums(sums), out,
+            piece.last, chain, made, dx, self.columns, out if noise is None else noise, noise is not None,
+            piece.sums(sums), out,
         )  # fmt: skip
