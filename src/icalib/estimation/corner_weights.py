@@ -1,0 +1,157 @@
+"""Weights of the corners of one image: robust loss, and the error that they share, marginalised."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+LEAST_CURVATURE = 1e-3
+
+
+@njit(cache=True, nogil=True)
+def weight(loss, scale, s):
+    """Weight rho' and robust cost (half rho) of a squared whitened norm s, and the curvature along the residual over
+    the weight, 1 + 2 s rho'' / rho' (Triggs 1999), kept positive."""
+    if loss == 0:
+        return 1.0, 0.5 * s, 1.0
+    if loss == 1:
+        r = np.sqrt(s)
+        if r <= scale:
+            return 1.0, 0.5 * s, 1.0
+        return scale / r, scale * r - 0.5 * scale * scale, LEAST_CURVATURE
+    k = scale * scale
+    return 1.0 / (1.0 + s / k), 0.5 * k * np.log1p(s / k), max((k - s) / (k + s), LEAST_CURVATURE)
+
+
+@njit(cache=True, nogil=True)
+def _invert_small(M, out):
+    """Inverse of a small symmetric positive definite matrix by Gauss-Jordan."""
+    n = M.shape[0]
+    for i in range(n):
+        for j in range(n):
+            out[i, j] = 1.0 if i == j else 0.0
+    for i in range(n):
+        f = 1.0 / M[i, i]
+        for j in range(n):
+            M[i, j] *= f
+            out[i, j] *= f
+        for k in range(n):
+            if k != i:
+                f = M[k, i]
+                for j in range(n):
+                    M[k, j] -= f * M[i, j]
+                    out[k, j] -= f * out[i, j]
+
+
+@njit(cache=True, nogil=True)
+def robust_weights(res, keep, f, precision, sigma, loss, scale, root, shared):
+    """root (n,): square roots of the weights over sigma; shared (2, m): the image's common error. Returns the cost.
+
+    Weights and common error depend on each other; a few rounds settle them, so that the cost is the least one over it.
+    """
+    n, m = len(keep), f.shape[1]
+    for k in range(m):
+        shared[0, k], shared[1, k] = 0.0, 0.0
+    M, inv, rhs = np.empty((m, m)), np.empty((m, m)), np.empty((2, m))
+    rounds = 1 if m == 0 else (2 if loss == 0 else 8)
+    cost = 0.0
+    for turn in range(rounds):
+        cost = 0.0
+        for i in range(n):
+            if not keep[i]:
+                root[i] = 0.0
+                continue
+            u, v = res[i, 0], res[i, 1]
+            for k in range(m):
+                u += shared[0, k] * f[i, k]
+                v += shared[1, k] * f[i, k]
+            w, c, _ = weight(loss, scale, (u * u + v * v) / (sigma * sigma))
+            root[i] = np.sqrt(w) / sigma
+            cost += c
+        for k in range(m):
+            cost += 0.5 * precision[k] * (shared[0, k] ** 2 + shared[1, k] ** 2)
+        if turn == rounds - 1:
+            return cost
+        _common_error(res, root, f, precision, M, inv, rhs, shared)
+    return cost
+
+
+@njit(cache=True, nogil=True)
+def _common_error(res, root, f, precision, M, inv, rhs, shared):
+    """The image's common error (2, m) at given weights: ridge regression of -res on its functions."""
+    m = f.shape[1]
+    for a in range(m):
+        rhs[0, a], rhs[1, a] = 0.0, 0.0
+        for b in range(m):
+            M[a, b] = precision[a] if a == b else 0.0
+    for i in range(len(root)):
+        w = root[i] * root[i]
+        for a in range(m):
+            for b in range(m):
+                M[a, b] += w * f[i, a] * f[i, b]
+            rhs[0, a] += w * f[i, a] * res[i, 0]
+            rhs[1, a] += w * f[i, a] * res[i, 1]
+    _invert_small(M, inv)
+    for a in range(m):
+        shared[0, a], shared[1, a] = 0.0, 0.0
+        for b in range(m):
+            shared[0, a] -= inv[a, b] * rhs[0, b]
+            shared[1, a] -= inv[a, b] * rhs[1, b]
+
+
+@njit(cache=True, nogil=True)
+def whole_error(res, f, shared, error):
+    """error (n, 2): residuals with the image's common error in them."""
+    for i in range(len(res)):
+        for axis in range(2):
+            error[i, axis] = res[i, axis]
+            for k in range(f.shape[1]):
+                error[i, axis] += shared[axis, k] * f[i, k]
+
+
+@njit(cache=True, nogil=True)
+def bend(A, D, i, n, r, factor):
+    """Scales the Jacobian rows of corner i along its residual r by `factor`, and the residual by its inverse."""
+    size = np.sqrt(r[0] * r[0] + r[1] * r[1])
+    u, v = r[0] / size, r[1] / size
+    for k in range(D + 1):
+        along = u * A[k, i] + v * A[k, n + i]
+        change = along * ((factor if k < D else 1.0 / factor) - 1.0)
+        A[k, i] += change * u
+        A[k, n + i] += change * v
+
+
+@njit(cache=True, nogil=True)
+def marginalise_shared(A, D, n, root, f, precision, own, given, G):
+    """Takes the image's common error out of the Gram matrix G (D + 1, D + 1).
+
+    Its own gradient is zero: the cost is the least over it. With `given` noise, own (2, m) stands for its whitened
+    residual; returns rhs^T M^-1 rhs of its rows then.
+    """
+    m = f.shape[1]
+    M, inv = np.empty((m, m)), np.empty((m, m))
+    C = np.empty((m, D + 1))
+    quad = 0.0
+    for axis in range(2):
+        for a in range(m):
+            for b in range(m):
+                M[a, b] = precision[a] if a == b else 0.0
+            for k in range(D + 1):
+                C[a, k] = 0.0
+            C[a, D] = own[axis, a] * np.sqrt(precision[a]) if given else 0.0
+        for i in range(n):
+            for a in range(m):
+                wf = root[i] * f[i, a]
+                for b in range(m):
+                    M[a, b] += wf * root[i] * f[i, b]
+                for k in range(D + 1 if given else D):
+                    C[a, k] += wf * A[k, axis * n + i]
+        _invert_small(M, inv)
+        for a in range(m):
+            for b in range(m):
+                for k in range(D + 1):
+                    s = inv[a, b] * C[a, k]
+                    for c in range(D + 1):
+                        G[k, c] -= s * C[b, c]
+                quad += inv[a, b] * C[a, D] * C[b, D]
+    return quad
