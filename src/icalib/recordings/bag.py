@@ -115,8 +115,6 @@ class BagRecording:
         for storage in self._storages:
             wanted = {k for k, c in storage.connections.items() if (c.topic, c.type) == (topic.name, topic.type)}
             for key, received_ns, content in storage.messages(wanted):
-                if content.startswith(ZSTD_MAGIC):  # ROS 2 can compress message by message
-                    content = load_zstd().decompress(content)
                 yield received_ns, storage.connections[key].encoding, content
 
     def _imu_topic(self, imu: ImuSensor) -> str:
@@ -180,9 +178,19 @@ def _stores() -> dict[str, Any]:
 
 def _deserialise(encoding: str, content: bytes, kind: str) -> Any:
     """Raises ValueError where the bytes are not such a message."""
+    if content.startswith(ZSTD_MAGIC):  # ROS 2 can compress message by message
+        content = _decompress(content)
     try:
         return _stores()[encoding](content, kind)
     except (struct.error, IndexError, *_serde_errors()) as error:
+        raise ValueError(str(error)) from error
+
+
+def _decompress(content: bytes) -> bytes:
+    zstd = load_zstd()
+    try:
+        return zstd.decompress(content)
+    except zstd.ZstdError as error:
         raise ValueError(str(error)) from error
 
 

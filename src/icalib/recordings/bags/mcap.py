@@ -12,11 +12,12 @@ from icalib.recordings.bags.spans import DamageError, Span, SpanStorage
 from icalib.recordings.bags.storage import Connection, Tally, full_type
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
-_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX, _DATA_END = 2, 3, 4, 5, 6, 7, 15
+_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX = 2, 3, 4, 5, 6, 7
 _RECORD = struct.Struct("<BQ")  # kind, length
-_MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_MESSAGE_HEAD = struct.Struct("<HIqq")  # channel, sequence, log time, publish time
 _CHUNK_HEAD = struct.Struct("<QQQI")  # first and last log time, uncompressed size, crc
 _INDEX_ENTRY = np.dtype([("log_time", "<i8"), ("offset", "<u8")])
+_LONGEST_NAME = 16  # of a compression; more is damage
 _RUN_BYTES = 1 << 20  # messages outside of chunks are read in runs of this size
 
 
@@ -34,8 +35,8 @@ class McapStorage(SpanStorage):
                 begin = file.tell()
                 if begin + length > size and kind != _CHUNK:
                     raise DamageError
-                if kind in (_DATA_END, _FOOTER):
-                    return
+                if kind == _FOOTER:
+                    return _refuse_cut_index(file)
                 self._note_record(kind, file, at, min(length, size - begin))
             except (struct.error, UnicodeDecodeError, DamageError) as error:
                 file.seek(at)
@@ -51,13 +52,15 @@ class McapStorage(SpanStorage):
         begin = file.tell()
         if kind == _CHUNK:
             _, _, _, crc = _CHUNK_HEAD.unpack(file.read(_CHUNK_HEAD.size))
-            compression = file.read(struct.unpack("<I", file.read(4))[0]).decode()
+            (letters,) = struct.unpack("<I", file.read(4))
+            compression = file.read(min(letters, _LONGEST_NAME)).decode()
             (stored,) = struct.unpack("<Q", file.read(8))
-            there = length - (file.tell() - begin)
+            there = max(0, length - (file.tell() - begin))
             self.spans.append(Span(file.tell(), min(stored, there), compression, crc if stored <= there else 0))
         elif kind == _INDEX and self.spans:
-            channel, _ = struct.unpack("<HI", file.read(6))
-            entries = np.frombuffer(file.read(length - 6), _INDEX_ENTRY)
+            channel, size = struct.unpack("<HI", file.read(6))
+            size = min(size, length - 6)
+            entries = np.frombuffer(file.read(max(0, size - size % _INDEX_ENTRY.itemsize)), _INDEX_ENTRY)
             self.spans[-1].tally.setdefault(channel, Tally()).add_stamps(entries["log_time"])
         elif kind == _MESSAGE:
             channel, _, log_time, _ = _MESSAGE_HEAD.unpack(file.read(_MESSAGE_HEAD.size))
@@ -100,6 +103,13 @@ class McapStorage(SpanStorage):
                     self._note_definition(kind, body[begin:at])
         except (struct.error, UnicodeDecodeError) as error:
             raise DamageError from error
+
+
+def _refuse_cut_index(file: BinaryIO) -> None:
+    """All messages are there, but a whole file ends as it begins."""
+    file.seek(-len(MCAP_MAGIC), 2)
+    if file.read() != MCAP_MAGIC:
+        raise DamageError
 
 
 def _text(content: memoryview, at: int) -> tuple[str, int]:

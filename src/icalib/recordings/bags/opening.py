@@ -87,6 +87,8 @@ def _open_compressed(path: Path) -> Storage:
         shutil.rmtree(folder)
         raise
     try:
+        if not copy.stat().st_size:
+            raise RecordingError(f"{path} is cut off or damaged before its first message; copy or record it again.")
         storage = open_storage(copy, path)
     except RecordingError:
         shutil.rmtree(folder)

@@ -15,6 +15,10 @@ from icalib.recordings.bags.storage import Connection, Tally, cut_note
 from icalib.recordings.extras import load_lz4, load_zstd
 
 
+class _UnknownCompressionError(Exception):
+    """A compression that the format does not have."""
+
+
 class DamageError(Exception):
     """A record that is cut off or makes no sense."""
 
@@ -27,6 +31,7 @@ class Span:
     size: int
     compression: str = ""
     crc: int = 0  # 0: none was written
+    cut: bool = False  # the last of a file that was cut off, which has its own note
     tally: dict[int, Tally] = field(default_factory=dict)
 
     def count(self, connection: int, received_ns: int) -> None:
@@ -81,9 +86,13 @@ class SpanStorage(ABC):
     def _messages_of(self, file: BinaryIO, span: Span) -> Iterator[tuple[int, int, memoryview]]:
         try:
             yield from self._walk(_body(file, span))
+        except _UnknownCompressionError as error:
+            raise RecordingError(
+                f"{self.name} is compressed by {str(error)!r}, which icalib cannot read; use zstd, lz4 or none."
+            ) from None
         except DamageError:
             note = f"{self.name}: the block at byte {span.offset} is damaged; what follows in it was left out."
-            if note not in self.notes:
+            if not span.cut and note not in self.notes:
                 self.notes.append(note)
 
     def _scan_to_the_end(self, file: BinaryIO, size: int) -> int | None:
@@ -92,6 +101,7 @@ class SpanStorage(ABC):
             self._scan(file, size)
         except DamageError:
             if self.spans:
+                self.spans[-1].cut = True
                 self.spans[-1].tally = {}  # its index may be incomplete
             return file.tell()
         return None
@@ -128,4 +138,4 @@ def _decompressor(compression: str) -> tuple[Any, tuple[type[Exception], ...]]:
     if compression == "zstd":
         zstd = load_zstd()
         return zstd.ZstdDecompressor(), (zstd.ZstdError, ValueError, EOFError)
-    raise RecordingError(f"A block is compressed by {compression!r}, which icalib cannot read; use zstd, lz4 or none.")
+    raise _UnknownCompressionError(compression)
