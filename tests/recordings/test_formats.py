@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import pickle
+import shutil
+import sqlite3
 import tracemalloc
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -118,6 +121,25 @@ def test_single_database_and_odd_names(tmp_path, truth, write):
     folder = write.small("ros2 sqlite3", tmp_path, truth)
     odd = (folder / "run.db3").rename(tmp_path / "what? 100%#1.bin")
     assert len(list(open_recording(odd).images("cam0/image_raw"))) == len(truth.images)
+
+
+def test_database_whose_recorder_crashed(tmp_path, truth, write):
+    """What was recorded last is still in the write-ahead log."""
+    folder = write.small("ros2 sqlite3", tmp_path / "closed", truth)
+    crashed = tmp_path / "crashed"
+    with closing(sqlite3.connect(folder / "run.db3")) as database:
+        database.execute("PRAGMA journal_mode=WAL")
+        database.execute("DELETE FROM messages WHERE id > 100")
+        database.commit()
+        shutil.copytree(folder, crashed)
+    assert (crashed / "run.db3-wal").stat().st_size
+    assert sum(t.count for t in open_recording(crashed).topics()) == 100
+
+
+def test_mav0_itself_may_be_given(tmp_path, truth, write):
+    recording = open_recording(write.euroc(tmp_path, truth) / "mav0")
+    assert len(list(recording.images(recording.image_topic(CAM1)))) == len(truth.images)
+    assert recording.imu(IMU).stamps_ns.tolist() == truth.imu_stamps
 
 
 def test_a_folder_of_tables_beside_its_bag_is_tables(tmp_path, truth, write):

@@ -8,7 +8,6 @@ from collections.abc import Iterator, Set
 from contextlib import closing
 from pathlib import Path
 from typing import final
-from urllib.parse import quote
 
 from icalib.errors import RecordingError
 from icalib.recordings.bags.storage import Connection, Tally, cut_note, full_type
@@ -90,7 +89,7 @@ class SqliteStorage:
         # Without a write-ahead log nothing needs to be written beside the file, and it may lie on a read-only disk.
         log = self.path.with_name(self.path.name + "-wal")
         options = "mode=ro" if log.exists() and log.stat().st_size else "mode=ro&immutable=1"
-        database = sqlite3.connect(f"file:{quote(str(self.path.absolute()))}?{options}", uri=True)
+        database = sqlite3.connect(f"{self.path.absolute().as_uri()}?{options}", uri=True)
         database.execute("PRAGMA writable_schema=ON")  # opens a file that is shorter than its header says
         return database
 
