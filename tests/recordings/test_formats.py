@@ -148,14 +148,14 @@ def test_a_folder_of_tables_beside_its_bag_is_tables(tmp_path, truth, write):
     assert not isinstance(open_recording(tmp_path), BagRecording)
 
 
-@pytest.mark.parametrize("form", ["ros1", "ros2", "mcap"])
+@pytest.mark.parametrize("form", ["ros1", "ros2", "mcap", "mcap without chunks"])
 def test_memory_is_bounded(form, tmp_path, write):
     maker = write.maker("ros1" if form == "ros1" else "ros2")
     rows = np.random.default_rng(0).integers(0, 256, (256, 512), dtype=np.uint8)
     messages = [("/cam", "sensor_msgs/msg/Image", k, maker.image(k, np.roll(rows, k))) for k in range(1, 101)]
-    recording = open_recording(
-        {"ros1": write.ros1, "ros2": write.ros2, "mcap": write.mcap}[form](tmp_path / "r", messages)
-    )
+    writer = {"ros1": write.ros1, "ros2": write.ros2}.get(form, write.mcap)
+    options = {"use_chunking": False} if "without" in form else {}
+    recording = open_recording(writer(tmp_path / "r", messages, **options))
     next(recording.images("/cam"))  # what is imported and cached on first use does not count
     tracemalloc.start()
     count = sum(1 for _ in recording.images("/cam"))
