@@ -18,7 +18,7 @@ _MESSAGE_HEAD = struct.Struct("<HIqq")  # channel, sequence, log time, publish t
 _CHUNK_HEAD = struct.Struct("<QQQI")  # first and last log time, uncompressed size, crc
 _INDEX_ENTRY = np.dtype([("log_time", "<i8"), ("offset", "<u8")])
 _LONGEST_NAME = 16  # of a compression; more is damage
-_RUN_BYTES = 1 << 19  # messages outside of chunks are read in runs of this size
+_RUN_BYTES = 1 << 20  # messages outside of chunks are read in runs of this size
 
 
 @final
