@@ -101,6 +101,15 @@ def test_defaults(tmp_path):
     assert rig.imu.noise.source == "default for a consumer IMU"
 
 
+def test_topics_of_a_bag(tmp_path):
+    text = edited("    path: right/corners.csv.gz\n", "    topic: /right/image_raw\n")
+    rig = load(tmp_path, text.replace("    type: imu\n", "    type: imu\n    topic: /imu/data\n"))
+    assert (rig.imu.topic, [c.topic for c in rig.cameras]) == ("/imu/data", [None, "/right/image_raw"])
+    assert rig.cameras[1].path == "cam1/corners.csv"
+    again = load(tmp_path, yaml.safe_dump(rig_to_dict(rig)))
+    assert (again.imu.topic, [c.topic for c in again.cameras]) == ("/imu/data", [None, "/right/image_raw"])
+
+
 @pytest.mark.parametrize("name", IMU_CLASSES)
 def test_imu_classes(tmp_path, name):
     noise = load(tmp_path, edited("{gyro: 1.7e-4, gyro_walk: 2e-5, accel: 2e-3, accel_walk: 3e-3}", name)).imu.noise

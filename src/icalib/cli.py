@@ -34,7 +34,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     c = commands.add_parser("calibrate", help="calibrate the sensors of a rig from a recording")
     c.add_argument("rig", type=Path, help="rig file (rig.yaml)")
-    c.add_argument("recording", type=Path, help="folder with the recording")
+    c.add_argument("recording", type=Path, help="folder with the recording, or bag")
     c.add_argument("--output", "-o", type=Path, required=True, help="folder for the results; made if it does not exist")
     c.add_argument("--scheme", choices=("inertial", "pose", "kinematic"), help="where sensors are between nodes")
     c.add_argument("--loss", choices=("none", "huber", "cauchy"), help="robust loss on corners")

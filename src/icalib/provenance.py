@@ -12,7 +12,12 @@ _LIBRARIES = ("numpy", "numba")
 
 def provenance(files: list[Path]) -> dict[str, str]:
     """File name -> sha256 of its bytes."""
-    return {str(f): hashlib.sha256(f.read_bytes()).hexdigest() for f in files}
+    return {str(f): _sha256(f) for f in files}
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:  # a bag may be larger than memory
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def versions() -> dict[str, str]:

@@ -52,6 +52,7 @@ class ImuSensor:
     path: str
     noise: ImuNoise
     intrinsics: Parameter = field(default_factory=lambda: Parameter("fixed"))  # 24: see estimation.imu_model
+    topic: str | None = None  # in a bag; None: the one with the sensor's name, or the only one
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,7 @@ class Camera:
     intrinsics: Parameter = Parameter()
     distortion: Parameter = Parameter()
     bloom: Parameter = Parameter()
+    topic: str | None = None  # of its images; None: the one with the camera's name, or the only one
 
 
 Scheme = Literal["inertial", "pose", "kinematic"]

@@ -71,12 +71,13 @@ def _sensors(value: YamlValue) -> tuple[list[ImuSensor], list[Camera]]:
 
 
 def _imu(name: str, value: YamlValue) -> ImuSensor:
-    found = value.record(("type",), ("path", "noise", "intrinsics"))
+    found = value.record(("type",), ("path", "topic", "noise", "intrinsics"))
     return ImuSensor(
         name=name,
         path=_path(found, f"{name}/data.csv"),
         noise=_noise(found["noise"]) if "noise" in found else class_noise(DEFAULT_CLASS),
         intrinsics=imu_intrinsics_parameter(found["intrinsics"]) if "intrinsics" in found else Parameter("fixed"),
+        topic=_topic(found),
     )
 
 
@@ -90,7 +91,7 @@ def _noise(value: YamlValue) -> ImuNoise:
 
 def _camera(name: str, value: YamlValue) -> Camera:
     groups = ("rotation", "translation", "time_offset", "intrinsics", "distortion", "bloom")
-    found = value.record(("type", "model", "resolution"), ("path", "corner_noise", *groups))
+    found = value.record(("type", "model", "resolution"), ("path", "topic", "corner_noise", *groups))
     model = found["model"].choice("camera model", tuple(CAMERA_MODELS))
     sizes = {"translation": 3, "time_offset": 1, "intrinsics": 4, "bloom": 1}
     sizes["distortion"] = len(CAMERA_MODELS[model].parameter_names) - sizes["intrinsics"]
@@ -104,6 +105,7 @@ def _camera(name: str, value: YamlValue) -> Camera:
         model=model,
         resolution=_resolution(found["resolution"]),
         corner_noise_px=found["corner_noise"].positive() if "corner_noise" in found else None,
+        topic=_topic(found),
         **parameters,
     )
 
@@ -123,6 +125,10 @@ def _resolution(value: YamlValue) -> tuple[int, int]:
 
 def _path(found: dict[str, YamlValue], default: str) -> str:
     return found["path"].text() if "path" in found else default
+
+
+def _topic(found: dict[str, YamlValue]) -> str | None:
+    return found["topic"].text() if "topic" in found else None
 
 
 def _target(value: YamlValue) -> AprilGrid:
@@ -152,6 +158,8 @@ def _setting(value: YamlValue, kind: Any) -> Any:
 
 def _imu_to_plain(imu: ImuSensor) -> dict[str, Any]:
     plain: dict[str, Any] = {"type": "imu", "path": imu.path, "noise": dataclasses.asdict(imu.noise)}
+    if imu.topic is not None:
+        plain["topic"] = imu.topic
     intrinsics = parameter_to_plain(imu.intrinsics)
     return plain if intrinsics is None else plain | {"intrinsics": intrinsics}
 
@@ -159,6 +167,8 @@ def _imu_to_plain(imu: ImuSensor) -> dict[str, Any]:
 def _camera_to_plain(camera: Camera) -> dict[str, Any]:
     plain: dict[str, Any] = {"type": "camera", "path": camera.path, "model": camera.model}
     plain["resolution"] = list(camera.resolution)
+    if camera.topic is not None:
+        plain["topic"] = camera.topic
     if camera.corner_noise_px is not None:
         plain["corner_noise"] = camera.corner_noise_px
     groups = {f.name: getattr(camera, f.name) for f in dataclasses.fields(camera)}

@@ -116,7 +116,7 @@ class TestFolder:
 
     def test_file_instead_of_folder(self, tmp_path):
         (tmp_path / "a.csv").write_text("1")
-        with pytest.raises(RecordingError, match=r"a\.csv is a file, but a recording is a folder"):
+        with pytest.raises(RecordingError, match=r"a\.csv is neither a ROS 1 bag nor .*folder of tables"):
             open_recording(tmp_path / "a.csv")
 
     def test_missing_table_lists_what_there_is(self, tmp_path):

@@ -2,35 +2,66 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Protocol
 
 from icalib.geometry.targets import AprilGrid
 from icalib.measurements import CornerStream, ImuStream
+from icalib.recordings.images import Frame, Payload
+from icalib.recordings.topics import TopicInfo
+from icalib.rig import Camera, ImuSensor
 
 
 class Recording(Protocol):
     """One recording. A reader knows its format only; `read_measurements` checks what the numbers must satisfy."""
 
-    def imu(self, path_hint: str, name: str) -> ImuStream:
-        """All readings of the IMU `name` as they were written: stamps may still repeat or run backwards.
+    def topics(self) -> tuple[TopicInfo, ...]:
+        """What there is, by name."""
+        ...
 
-        Raises RecordingError naming file and line where the data are missing or cannot be read.
+    def image_topic(self, camera: Camera) -> str:
+        """The topic of the camera's images: its `topic`, else the one with its name, else the only one.
+
+        Raises RecordingError listing what there is where that leaves none or several.
         """
         ...
 
-    def corners(self, path_hint: str, name: str, target: AprilGrid) -> CornerStream:
-        """All corners that the camera `name` saw, grouped by image, images in order.
+    def payloads(self, topic: str) -> Iterator[Payload]:
+        """The undecoded images of `topic` in order, one at a time; `images.decode` decodes one, in any process.
+
+        Stamps increase strictly and the resolution is one. Images of zeros, repeated or late ones are left out, which
+        the notes say once the last image was read. Raises RecordingError naming the topic, or the instant of an image.
+        """
+        ...
+
+    def images(self, topic: str) -> Iterator[Frame]:
+        """The decoded images of `topic`, as `payloads`; damaged ones are left out, too, with a note."""
+        ...
+
+    def imu(self, sensor: ImuSensor) -> ImuStream:
+        """All readings of the IMU as they were written: stamps may still repeat or run backwards.
+
+        Raises RecordingError naming file and line, or topic, where the data are missing or cannot be read.
+        """
+        ...
+
+    def corners(self, camera: Camera, target: AprilGrid) -> CornerStream:
+        """All corners that the camera saw, grouped by image, images in order.
 
         Raises RecordingError naming file and line or instant where the data are missing or cannot be read, where images
         are out of order, where a corner appears twice in an image, and where it is not on the target.
         """
         ...
 
-    def where(self, path_hint: str) -> str:
-        """How a sentence names the place of a sensor's data, for example the file."""
+    def where(self, sensor: ImuSensor | Camera) -> str:
+        """How a sentence names the place of the sensor's data, for example the file."""
         ...
 
     def files(self) -> list[Path]:
         """The files that have been read so far, each once, in the order of reading."""
+        ...
+
+    def notes(self) -> tuple[str, ...]:
+        """What the reader itself left out or repaired so far, one sentence each."""
         ...

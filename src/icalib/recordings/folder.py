@@ -1,47 +1,100 @@
-"""Recordings that are folders of tables: `imu0/data.csv`, `cam0/corners.csv`, gzip or not, EuRoC's `mav0/` included."""
+"""Recordings that are folders: tables `imu0/data.csv`, `cam0/corners.csv`, gzip or not, and EuRoC's images."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import final
+
+import numpy as np
 
 from icalib.errors import RecordingError
 from icalib.geometry.targets import AprilGrid
 from icalib.measurements import CornerStream, ImuStream
-from icalib.recordings.base import Recording
 from icalib.recordings.corners import group_corners
-from icalib.recordings.table import read_table
+from icalib.recordings.euroc_images import file_payloads, image_files
+from icalib.recordings.image_checks import checked_payloads, frames
+from icalib.recordings.images import Frame, Payload
+from icalib.recordings.table import columns_of, read_table
+from icalib.recordings.topics import TopicInfo, choose_topic, find_topic
+from icalib.rig import Camera, ImuSensor
 
 _IMU_DECIMALS = ("wx [rad/s]", "wy [rad/s]", "wz [rad/s]", "ax [m/s^2]", "ay [m/s^2]", "az [m/s^2]")
+_IMU_STAMP = ("t [ns]",)
+_CORNER_INTEGERS, _CORNER_DECIMALS = ("t [ns]", "tag id", "corner"), ("u [px]", "v [px]")
 _MAX_LISTED = 12
 
 
+@final
 class FolderRecording:
-    """A folder of tables.
+    """A folder of tables and images; those of EuRoC's `mav0` are found, too.
 
     IMU: t [ns], wx, wy, wz [rad/s], ax, ay, az [m/s^2], which is also EuRoC's `imu0/data.csv`. Corners: t [ns], tag id,
-    corner 0 to 3, u, v [px].
+    corner 0 to 3, u, v [px]. Images: the folder `data` beside a `data.csv` of t [ns], file name.
     """
 
     def __init__(self, root: Path) -> None:
         self.root = root
         self._read: list[Path] = []
+        self._notes: list[str] = []
 
-    def imu(self, path_hint: str, name: str) -> ImuStream:
-        table = read_table(self._locate(path_hint), ("t [ns]",), _IMU_DECIMALS)
+    def topics(self) -> tuple[TopicInfo, ...]:
+        found: list[TopicInfo] = []
+        for folder in sorted(p for base in self._bases() for p in base.iterdir() if p.is_dir()):
+            if (images := _images(folder)) is not None:
+                found.append(images)
+            elif (table := _existing(folder, "data.csv")) and columns_of(table) == len(_IMU_STAMP + _IMU_DECIMALS):
+                stamps_ns = read_table(table, _IMU_STAMP, _IMU_DECIMALS).integers[:, 0]
+                found.append(_info(f"{folder.name}/data.csv", "table of readings", "imu", stamps_ns))
+            if table := _existing(folder, "corners.csv"):
+                stamps_ns = np.unique(read_table(table, _CORNER_INTEGERS, _CORNER_DECIMALS).integers[:, 0])
+                found.append(_info(f"{folder.name}/corners.csv", "table of corners", "corners", stamps_ns))
+        return tuple(found)
+
+    def image_topic(self, camera: Camera) -> str:
+        return choose_topic(str(self.root), self._image_topics(), "image", camera.name, camera.topic).name
+
+    def payloads(self, topic: str) -> Iterator[Payload]:
+        name = find_topic(str(self.root), self._image_topics(), topic).name
+        folder = next(p for base in self._bases() if (p := base / name).is_dir())
+        if (folder / "data.csv").is_file():
+            self._remember(folder / "data.csv")
+        return checked_payloads(file_payloads(image_files(folder), str(folder), self._note), str(folder), self._note)
+
+    def images(self, topic: str) -> Iterator[Frame]:
+        return frames(self.payloads(topic), f"{self.root}/{topic}", self._note)
+
+    def imu(self, sensor: ImuSensor) -> ImuStream:
+        table = read_table(self._locate(sensor.path), _IMU_STAMP, _IMU_DECIMALS)
         self._remember(table.path)
-        return ImuStream(name, table.integers[:, 0].copy(), table.decimals[:, :3].copy(), table.decimals[:, 3:].copy())
+        stamps_ns, values = table.integers[:, 0].copy(), table.decimals
+        return ImuStream(sensor.name, stamps_ns, values[:, :3].copy(), values[:, 3:].copy())
 
-    def corners(self, path_hint: str, name: str, target: AprilGrid) -> CornerStream:
-        table = read_table(self._locate(path_hint), ("t [ns]", "tag id", "corner"), ("u [px]", "v [px]"))
+    def corners(self, camera: Camera, target: AprilGrid) -> CornerStream:
+        table = read_table(self._locate(camera.path), _CORNER_INTEGERS, _CORNER_DECIMALS)
         self._remember(table.path)
         stamps, tag, corner = (table.integers[:, k].copy() for k in range(3))
-        return group_corners(name, str(table.path), stamps, tag, corner, table.decimals, target)
+        return group_corners(camera.name, str(table.path), stamps, tag, corner, table.decimals, target)
 
-    def where(self, path_hint: str) -> str:
-        return str(self._locate(path_hint))
+    def where(self, sensor: ImuSensor | Camera) -> str:
+        return str(self._locate(sensor.path))
 
     def files(self) -> list[Path]:
         return list(self._read)
+
+    def notes(self) -> tuple[str, ...]:
+        return tuple(self._notes)
+
+    def _note(self, sentence: str) -> None:
+        if sentence not in self._notes:
+            self._notes.append(sentence)
+
+    def _bases(self) -> list[Path]:
+        return [p for p in (self.root, self.root / "mav0") if p.is_dir()]
+
+    def _image_topics(self) -> tuple[TopicInfo, ...]:
+        folders = sorted(p for base in self._bases() for p in base.iterdir() if p.is_dir())
+        return tuple(topic for p in folders if (topic := _images(p)) is not None)
 
     def _remember(self, path: Path) -> None:
         if path not in self._read:
@@ -65,16 +118,14 @@ class FolderRecording:
         return f"it holds {', '.join(found[:_MAX_LISTED])}{more}"
 
 
-def open_recording(path: str | Path) -> Recording:
-    """Open the recording at `path`, a folder of tables. Raises RecordingError where it is missing or not a folder."""
-    root = Path(path)
-    if root.is_dir():
-        return FolderRecording(root)
-    if root.exists():
-        raise RecordingError(
-            f"{root} is a file, but a recording is a folder of tables; give the folder of imu0/data.csv."
-        )
-    parent = root.parent
-    beside = sorted(p.name for p in parent.iterdir())[:_MAX_LISTED] if parent.is_dir() else []
-    listing = f"{parent} holds {', '.join(beside)}" if beside else f"{parent} is empty or missing"
-    raise RecordingError(f"{root} does not exist; {listing}; check the path of the recording.")
+def _existing(folder: Path, name: str) -> Path | None:
+    return next((p for p in (folder / name, folder / f"{name}.gz") if p.is_file()), None)
+
+
+def _images(folder: Path) -> TopicInfo | None:
+    stamps = [stamp for stamp, _ in image_files(folder)]
+    return _info(folder.name, "images", "image", np.array(stamps, np.int64)) if stamps else None
+
+
+def _info(name: str, kind_of_file: str, kind: str, stamps_ns: np.ndarray) -> TopicInfo:
+    return TopicInfo(name, kind_of_file, kind, len(stamps_ns), int(stamps_ns.min()), int(stamps_ns.max()))

@@ -15,11 +15,11 @@ def read_measurements(recording: Recording, rig: Rig) -> Measurements:
     What was dropped or looks odd stands in the notes. Raises RecordingError, one sentence naming the file and the line
     or instant, for data that are missing, unreadable, out of order, in other units, or not of this rig.
     """
-    imu, notes = checked_imu(recording.imu(rig.imu.path, rig.imu.name), recording.where(rig.imu.path))
+    imu, notes = checked_imu(recording.imu(rig.imu), recording.where(rig.imu))
     cameras: list[CornerStream] = []
     for camera in rig.cameras:
-        corners = recording.corners(camera.path, camera.name, rig.target)
-        corners, dropped = checked_corners(corners, recording.where(camera.path), camera.resolution)
+        corners = recording.corners(camera, rig.target)
+        corners, dropped = checked_corners(corners, recording.where(camera), camera.resolution)
         cameras.append(corners)
         notes = notes + dropped
-    return Measurements(imu, tuple(cameras), notes)
+    return Measurements(imu, tuple(cameras), recording.notes() + notes)

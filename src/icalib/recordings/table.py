@@ -49,6 +49,15 @@ def read_table(path: Path, integer_columns: tuple[str, ...], decimal_columns: tu
     return Table(path, integers[:rows], decimals[:rows])
 
 
+def columns_of(path: Path) -> int:
+    """How many columns the first row of a table has, 0 if there is none. Raises RecordingError as `read_table`."""
+    content = _read_bytes(path)
+    for line in content[_skip_header(content)[0] :].splitlines():
+        if line.strip() and not line.lstrip().startswith(b"#"):
+            return line.count(b",") + 1
+    return 0
+
+
 def _read_bytes(path: Path) -> bytes:
     try:
         content = path.read_bytes()

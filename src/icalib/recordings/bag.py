@@ -1,0 +1,201 @@
+"""Recordings that are bags of ROS 1 or ROS 2: one file, or a folder of them."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+
+from icalib.errors import RecordingError
+from icalib.geometry.targets import AprilGrid
+from icalib.measurements import CornerStream, ImuStream
+from icalib.recordings.bags.opening import ZSTD_MAGIC, open_storages
+from icalib.recordings.bags.storage import Tally
+from icalib.recordings.extras import load_typesys, load_zstd
+from icalib.recordings.image_checks import checked_payloads, frames
+from icalib.recordings.images import Frame, Payload, file_payload
+from icalib.recordings.topics import KINDS, TopicInfo, choose_topic
+from icalib.rig import Camera, ImuSensor
+
+_SWAPPED_NS = 1_000_000_000  # readings overtake each other on the network by less; more is a clock that was set back
+
+
+@final
+class BagRecording:
+    """A bag. Stamps are those of the messages' headers; where one is zero, when the message was received."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self._storages, self._notes = open_storages(root)
+        self._topics = self._list_topics()
+
+    def topics(self) -> tuple[TopicInfo, ...]:
+        return self._topics
+
+    def image_topic(self, camera: Camera) -> str:
+        return choose_topic(str(self.root), self._topics, "image", camera.name, camera.topic).name
+
+    def payloads(self, topic: str) -> Iterator[Payload]:
+        where = f"{self.root} {topic}"
+        found = (_payload(stamp, where, message) for stamp, message in self.messages(topic, "image"))
+        return checked_payloads(found, where, self._note)
+
+    def images(self, topic: str) -> Iterator[Frame]:
+        return frames(self.payloads(topic), f"{self.root} {topic}", self._note)
+
+    def imu(self, sensor: ImuSensor) -> ImuStream:
+        topic = self._imu_topic(sensor)
+        stamps: list[int] = []
+        rows: list[tuple[float, ...]] = []
+        for stamp, message in self.messages(topic, "imu"):
+            w, f = message.angular_velocity, message.linear_acceleration
+            stamps.append(stamp)
+            rows.append((w.x, w.y, w.z, f.x, f.y, f.z))
+        stamps_ns, values = np.array(stamps, np.int64), np.array(rows, np.float64).reshape(-1, 6)
+        order = self._order(topic, stamps_ns)
+        return ImuStream(sensor.name, stamps_ns[order], values[order, :3].copy(), values[order, 3:].copy())
+
+    def corners(self, camera: Camera, target: AprilGrid) -> CornerStream:
+        raise RecordingError(
+            f"{self.root} holds images, not corners, of {camera.name}; detect the target in "
+            f"{self.image_topic(camera)} and write {camera.path} to a folder of tables."
+        )
+
+    def where(self, sensor: ImuSensor | Camera) -> str:
+        topic = self._imu_topic(sensor) if isinstance(sensor, ImuSensor) else self.image_topic(sensor)
+        return f"{self.root} {topic}"
+
+    def files(self) -> list[Path]:
+        return [storage.name for storage in self._storages]
+
+    def notes(self) -> tuple[str, ...]:
+        damage = (note for storage in self._storages for note in storage.notes)
+        return tuple(dict.fromkeys([*self._notes, *damage]))
+
+    def messages(self, topic: str, kind: str) -> Iterator[tuple[int, Any]]:
+        """Stamp [ns] and content of each message of `topic`, in the order of the bag; the content has the fields of the
+        ROS type.
+
+        Raises RecordingError listing what there is where the topic is missing or not of `kind` (see TopicInfo), and
+        naming the instant where a message cannot be read.
+        """
+        chosen = choose_topic(str(self.root), self._topics, kind, "", topic)
+        return self._messages(chosen)
+
+    def _messages(self, topic: TopicInfo) -> Iterator[tuple[int, Any]]:
+        unstamped = 0
+        for received_ns, encoding, content in self._contents(topic):
+            if encoding not in _stores():
+                raise RecordingError(
+                    f"{self.root} {topic.name}: messages in {encoding!r} are not ROS's; convert the bag."
+                )
+            try:
+                message = _deserialise(encoding, content, topic.type)
+            except ValueError as error:
+                raise RecordingError(
+                    f"{self.root} {topic.name}: the message received at {received_ns} ns is damaged ({error}); "
+                    "copy or record the bag again."
+                ) from error
+            stamp = message.header.stamp
+            stamp_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
+            unstamped += not stamp_ns
+            yield stamp_ns or received_ns, message
+        if unstamped:
+            self._note(
+                f"{self.root} {topic.name}: {unstamped} messages have no stamp in their header; the times at which "
+                "they were received stand in, which are late and jitter; let the driver stamp them."
+            )
+
+    def _contents(self, topic: TopicInfo) -> Iterator[tuple[int, str, bytes]]:
+        """When it was received [ns], encoding and bytes of each message."""
+        for storage in self._storages:
+            wanted = {k for k, c in storage.connections.items() if (c.topic, c.type) == (topic.name, topic.type)}
+            for key, received_ns, content in storage.messages(wanted):
+                yield received_ns, storage.connections[key].encoding, content
+
+    def _imu_topic(self, imu: ImuSensor) -> str:
+        return choose_topic(str(self.root), self._topics, "imu", imu.name, imu.topic).name
+
+    def _order(self, topic: str, stamps_ns: np.ndarray) -> np.ndarray:
+        """The order by stamp; as it is where the clock was set back, which the checks refuse."""
+        back = np.diff(stamps_ns, prepend=stamps_ns[:1]) < 0
+        late_ns = int((np.maximum.accumulate(stamps_ns) - stamps_ns).max()) if back.any() else 0
+        if not 0 < late_ns <= _SWAPPED_NS:
+            return np.arange(len(stamps_ns))
+        self._note(
+            f"{self.root} {topic}: {int(back.sum())} readings came after later ones, by up to {late_ns * 1e-6:.1f} ms; "
+            "all were sorted by stamp."
+        )
+        return np.argsort(stamps_ns, kind="stable")
+
+    def _list_topics(self) -> tuple[TopicInfo, ...]:
+        tallies: dict[tuple[str, str], Tally] = {}
+        for storage in self._storages:
+            counted = storage.tally()
+            for key, connection in storage.connections.items():
+                part = counted.get(key, Tally())
+                tallies.setdefault((connection.topic, connection.type), Tally()).add(
+                    part.count, part.first_ns, part.last_ns
+                )
+        return tuple(_topic_info(*name, tally) for name, tally in sorted(tallies.items()))
+
+    def _note(self, sentence: str) -> None:
+        if sentence not in self._notes:
+            self._notes.append(sentence)
+
+
+def _topic_info(topic: str, kind: str, tally: Tally) -> TopicInfo:
+    first, last = (tally.first_ns, tally.last_ns) if tally.count else (None, None)
+    return TopicInfo(topic, kind, KINDS.get(kind, ""), tally.count, first, last)
+
+
+def _payload(stamp_ns: int, where: str, message: Any) -> Payload:
+    if hasattr(message, "format"):  # CompressedImage
+        return file_payload(stamp_ns, where, message.data.tobytes(), message.format)
+    return Payload(
+        stamp_ns,
+        where,
+        message.encoding,
+        message.data.tobytes(),
+        message.width,
+        message.height,
+        message.step,
+        bool(message.is_bigendian),
+    )
+
+
+@cache
+def _stores() -> dict[str, Any]:
+    """How the bytes of each encoding become a message. The types that icalib reads have not changed in any release."""
+    typesys = load_typesys()
+    ros1, ros2 = (typesys.get_typestore(s) for s in (typesys.Stores.ROS1_NOETIC, typesys.Stores.ROS2_HUMBLE))
+    return {"ros1": ros1.deserialize_ros1, "cdr": ros2.deserialize_cdr}
+
+
+def _deserialise(encoding: str, content: bytes, kind: str) -> Any:
+    """Raises ValueError where the bytes are not such a message."""
+    if content.startswith(ZSTD_MAGIC):  # ROS 2 can compress message by message
+        content = _decompress(content)
+    try:
+        return _stores()[encoding](content, kind)
+    except (struct.error, IndexError, *_serde_errors()) as error:
+        raise ValueError(str(error)) from error
+
+
+def _decompress(content: bytes) -> bytes:
+    zstd = load_zstd()
+    try:
+        return zstd.decompress(content)
+    except zstd.ZstdError as error:
+        raise ValueError(str(error)) from error
+
+
+@cache
+def _serde_errors() -> tuple[type[Exception], ...]:
+    from rosbags.serde import SerdeError
+
+    return (SerdeError,)

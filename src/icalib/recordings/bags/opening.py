@@ -1,0 +1,107 @@
+"""Which files make up a bag, and which reader each needs: told by what is in them, not by their names."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import tempfile
+import weakref
+from pathlib import Path
+
+import yaml
+
+from icalib.errors import RecordingError
+from icalib.recordings.bags.mcap import MCAP_MAGIC, McapStorage
+from icalib.recordings.bags.ros1 import ROS1_MAGIC, Ros1Storage
+from icalib.recordings.bags.sqlite import SQLITE_MAGIC, SqliteStorage
+from icalib.recordings.bags.storage import Storage
+from icalib.recordings.extras import load_zstd
+
+_READERS = {ROS1_MAGIC: Ros1Storage, MCAP_MAGIC: McapStorage, SQLITE_MAGIC: SqliteStorage}
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+_SUFFIXES = (".bag", ".active", ".mcap", ".db3", ".zstd")
+
+
+def bag_files(folder: Path) -> list[Path]:
+    """Bag files right in `folder`, in the order of their numbers: run_2.db3 before run_10.db3."""
+    found = [p for p in folder.iterdir() if p.is_file() and p.suffix in _SUFFIXES]
+    return sorted(found, key=lambda p: [int(t) if t.isdigit() else t for t in re.split(r"(\d+)", p.name)])
+
+
+def open_storages(path: Path) -> tuple[list[Storage], list[str]]:
+    """The bag files of `path`, a file or a folder, and notes on those that cannot be read.
+
+    Raises RecordingError where a file is no bag, or none of a folder can be read.
+    """
+    if path.is_file():
+        return [open_storage(path)], []
+    files = bag_files(path)
+    notes = [f"{path}: metadata.yaml names {name}, which is not there." for name in _absent(path)]
+    storages: list[Storage] = []
+    for file in files:
+        try:
+            storages.append(open_storage(file))
+        except RecordingError as error:
+            if len(files) == 1:
+                raise
+            notes.append(str(error))
+    if not storages:
+        raise RecordingError(f"{path}: none of its {len(files)} bag files can be read. {notes[-1]}")
+    return storages, notes
+
+
+def open_storage(path: Path, name: Path | None = None) -> Storage:
+    """The bag file `path`, called `name` in sentences. Raises RecordingError where it is empty, damaged or no bag."""
+    name = name or path
+    try:
+        with path.open("rb") as file:
+            head = file.read(16)
+        if not head:
+            raise RecordingError(f"{name} is empty; record or copy it again.")
+        for magic, reader in _READERS.items():
+            if head.startswith(magic):
+                return reader(path, name)
+        if head.startswith(ZSTD_MAGIC):
+            return _open_compressed(path)
+    except OSError as error:
+        raise RecordingError(
+            f"{name} cannot be read ({error.strerror or error}); check the file and its permissions."
+        ) from error
+    raise RecordingError(
+        f"{name} is neither a ROS 1 bag nor an MCAP file nor a ROS 2 database; "
+        "give a .bag, .mcap or .db3 file, a folder that ROS 2 recorded, or a folder of tables."
+    )
+
+
+def _open_compressed(path: Path) -> Storage:
+    """A file that ROS 2 compressed as a whole: it is read from a copy, which goes when the reader does."""
+    zstd = load_zstd()
+    folder = tempfile.mkdtemp(prefix="icalib-")
+    copy = Path(folder) / path.stem
+    try:
+        with zstd.open(path, "rb") as packed, copy.open("wb") as out:
+            shutil.copyfileobj(packed, out)
+    except (zstd.ZstdError, EOFError):
+        pass  # cut off: the reader of the copy says how much there is
+    except OSError:
+        shutil.rmtree(folder)
+        raise
+    try:
+        if not copy.stat().st_size:
+            raise RecordingError(f"{path} is cut off or damaged before its first message; copy or record it again.")
+        storage = open_storage(copy, path)
+    except RecordingError:
+        shutil.rmtree(folder)
+        raise
+    weakref.finalize(storage, shutil.rmtree, folder)
+    return storage
+
+
+def _absent(folder: Path) -> list[str]:
+    """Files that metadata.yaml names and that are missing. The rest of it is not needed, so it may be damaged."""
+    try:
+        listed = yaml.safe_load((folder / "metadata.yaml").read_text(encoding="utf-8"))
+        names = [Path(str(n)).name for n in listed["rosbag2_bagfile_information"]["relative_file_paths"]]
+    except (OSError, ValueError, yaml.YAMLError, KeyError, TypeError):
+        return []
+    return [n for n in names if not (folder / n).exists() and not (folder / (n + ".zstd")).exists()]

@@ -1,0 +1,105 @@
+"""ROS 2's sqlite databases (.db3)."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections import deque
+from collections.abc import Iterator, Set
+from contextlib import closing
+from pathlib import Path
+from typing import final
+
+from icalib.errors import RecordingError
+from icalib.recordings.bags.storage import Connection, Tally, cut_note, full_type
+
+SQLITE_MAGIC = b"SQLite format 3\x00"
+# A damaged database may hold anything anywhere.
+_TOPICS = (
+    "SELECT id, name, type, serialization_format FROM topics WHERE typeof(name) = 'text' AND typeof(type) = 'text'"
+)
+
+
+@final
+class SqliteStorage:
+    """A ROS 2 database. Rows are read in the order of their ids, which is that of writing: no index is needed."""
+
+    def __init__(self, path: Path, name: Path) -> None:
+        self.path = path
+        self.name = name
+        self.notes: list[str] = []
+        self._tally: dict[int, Tally] = {}
+        self._last_id = -1  # of the messages that are used
+        try:
+            with closing(self._connect()) as database:
+                rows = database.execute(_TOPICS).fetchall()
+        except sqlite3.OperationalError as error:
+            raise RecordingError(f"{name} is a database, but not a ROS 2 bag ({error}); check the path.") from error
+        except sqlite3.DatabaseError as error:
+            raise RecordingError(f"{name} is a damaged database ({error}); copy or record it again.") from error
+        self.connections = {key: Connection(topic, full_type(kind), form) for key, topic, kind, form in rows}
+        self._count()
+
+    def tally(self) -> dict[int, Tally]:
+        return self._tally
+
+    def messages(self, wanted: Set[int]) -> Iterator[tuple[int, int, bytes]]:
+        marks = ",".join("?" * len(wanted))
+        query = f"SELECT topic_id, timestamp, data FROM messages WHERE id <= ? AND topic_id IN ({marks}) ORDER BY id"
+        with closing(self._connect()) as database:
+            try:
+                yield from database.execute(query, (self._last_id, *wanted))
+            except sqlite3.DatabaseError as error:
+                note = f"{self.name} is damaged ({error}); the messages after the damage were left out."
+                if note not in self.notes:
+                    self.notes.append(note)
+
+    def _count(self) -> None:
+        page_bytes = _page_bytes_of_cut(self.path)
+        wrong = self._tally_rows("CASE typeof(data) WHEN 'blob' THEN x'' END", 0)
+        if wrong or page_bytes:  # the messages are read themselves: their later pages may be missing
+            wrong = self._tally_rows("data", page_bytes) or "the last pages are missing"
+            self.notes.append(cut_note(self.name, f"({wrong})", self._tally))
+
+    def _tally_rows(self, data: str, doubtful_bytes: int) -> str:
+        """Tally the messages before the first damage; returns what is wrong there, empty if nothing is.
+
+        The last of them are left out, up to `doubtful_bytes`: they may lie in a page of which only a part is there, and
+        the database takes the rest for zeros.
+        """
+        self._tally, self._last_id = {}, -1
+        doubtful: deque[tuple[int, int, int, int]] = deque()  # id, topic, when received, size
+        total = 0
+        try:
+            with closing(self._connect()) as database:
+                query = f"SELECT id, topic_id, timestamp, {data} FROM messages ORDER BY id"
+                for key, topic, received_ns, content in database.execute(query):
+                    if not (isinstance(topic, int) and isinstance(received_ns, int) and isinstance(content, bytes)):
+                        return "a row makes no sense"
+                    doubtful.append((key, topic, received_ns, len(content)))
+                    total += len(content)
+                    while doubtful and total - doubtful[0][3] >= doubtful_bytes:
+                        self._last_id, topic, received_ns, size = doubtful.popleft()
+                        self._tally.setdefault(topic, Tally()).add(1, received_ns, received_ns)
+                        total -= size
+        except sqlite3.DatabaseError as error:
+            return str(error)
+        return ""
+
+    def _connect(self) -> sqlite3.Connection:
+        # Without a write-ahead log nothing needs to be written beside the file, and it may lie on a read-only disk.
+        log = self.path.with_name(self.path.name + "-wal")
+        options = "mode=ro" if log.exists() and log.stat().st_size else "mode=ro&immutable=1"
+        database = sqlite3.connect(f"{self.path.absolute().as_uri()}?{options}", uri=True)
+        database.execute("PRAGMA writable_schema=ON")  # opens a file that is shorter than its header says
+        return database
+
+
+def _page_bytes_of_cut(path: Path) -> int:
+    """The size of a page of a database that is shorter than its header says, 0 of a whole one."""
+    with path.open("rb") as file:
+        head = file.read(100)
+    page_bytes = int.from_bytes(head[16:18]) if head[16:18] != b"\0\1" else 65536
+    pages = int.from_bytes(head[28:32]) if head[24:28] == head[92:96] else 0  # else no program kept the number
+    size = path.stat().st_size
+    cut = size < pages * page_bytes or (page_bytes and size % page_bytes)
+    return page_bytes if cut else 0

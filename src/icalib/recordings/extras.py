@@ -1,0 +1,39 @@
+"""Packages that only some recordings need: they are imported on use, and where one is missing a sentence says so."""
+
+from __future__ import annotations
+
+import importlib
+from types import ModuleType
+from typing import Any
+
+from icalib.errors import RecordingError
+
+
+def load_cv2() -> Any:
+    """OpenCV. Raises RecordingError where it is not installed."""
+    return _load("cv2", "images", "Images need OpenCV")
+
+
+def load_typesys() -> Any:
+    """The message types of rosbags. Raises RecordingError where it is not installed."""
+    return _load("rosbags.typesys", "bags", "Bags need the package rosbags")
+
+
+def load_lz4() -> Any:
+    """lz4's frame format. Raises RecordingError where it is not installed."""
+    return _load("lz4.frame", "bags", "Bags compressed by lz4 need the package lz4")
+
+
+def load_zstd() -> Any:
+    """zstd: the standard library's from Python 3.14 on. Raises RecordingError where it is not installed."""
+    try:
+        return importlib.import_module("compression.zstd")
+    except ImportError:
+        return _load("backports.zstd", "bags", "Bags compressed by zstd need the package backports.zstd")
+
+
+def _load(module: str, extra: str, need: str) -> ModuleType:
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        raise RecordingError(f"{need}, which is not installed; run: pip install icalib[{extra}].") from None

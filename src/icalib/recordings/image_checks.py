@@ -1,0 +1,105 @@
+"""Is this stream of images one camera's, in order, and alive? What is left out is counted and noted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+
+import numpy as np
+
+from icalib.errors import RecordingError
+from icalib.recordings.images import DamagedImageError, Frame, Payload, decode, is_known, unknown_encoding
+
+Note = Callable[[str], None]
+_LATE_NS = 1_000_000_000  # beyond, images did not overtake each other: the clock was set back
+
+
+def checked_payloads(payloads: Iterable[Payload], where: str, note: Note) -> Iterator[Payload]:
+    """`payloads` with strictly increasing stamps and one resolution; a note on what was left out, at the end.
+
+    Left out: images of zeros, exact repetitions of the image before (the camera froze), images that come after a later
+    one. Raises RecordingError naming `where` and the instant: an unknown encoding, two resolutions, a clock that was
+    set back, no usable image.
+    """
+    dropped = _Dropped()
+    kept = 0
+    last: Payload | None = None
+    for payload in payloads:
+        if not np.frombuffer(payload.data, np.uint8).any():
+            dropped.add("consist of zeros", payload)
+            continue
+        if not is_known(payload.encoding):
+            raise RecordingError(unknown_encoding(payload))
+        if last is not None:
+            _refuse_other_camera(last, payload, where)
+            if payload.stamp_ns <= last.stamp_ns:
+                dropped.add("are not later than the one before", payload)
+                continue
+            if payload.data == last.data:
+                dropped.add("repeat the one before exactly (the camera froze)", payload)
+                continue
+        last = payload
+        kept += 1
+        yield payload
+    _refuse_too_few(kept, dropped, where)
+    dropped.note(where, note)
+
+
+def frames(payloads: Iterable[Payload], where: str, note: Note) -> Iterator[Frame]:
+    """The decoded images; those that are damaged are left out, with a note at the end.
+
+    Raises RecordingError if all are damaged.
+    """
+    dropped = _Dropped()
+    kept = 0
+    for payload in payloads:
+        try:
+            image = decode(payload)
+        except DamagedImageError as error:
+            dropped.add("are damaged", payload, str(error))
+            continue
+        kept += 1
+        yield Frame(payload.stamp_ns, image)
+    if not kept and dropped.first_error:
+        raise RecordingError(dropped.first_error)
+    dropped.note(where, note)
+
+
+class _Dropped:
+    """What was left out: how many, for which reason, the first of them."""
+
+    def __init__(self) -> None:
+        self.count: dict[str, int] = {}
+        self._first_ns: dict[str, int] = {}
+        self.first_error = ""
+
+    def add(self, reason: str, payload: Payload, error: str = "") -> None:
+        self.count[reason] = self.count.get(reason, 0) + 1
+        self._first_ns.setdefault(reason, payload.stamp_ns)
+        self.first_error = self.first_error or error
+
+    def note(self, where: str, note: Note) -> None:
+        for reason, count in self.count.items():
+            note(f"{where}: {count} images that {reason} were left out, the first at {self._first_ns[reason]} ns.")
+
+
+def _refuse_other_camera(last: Payload, payload: Payload, where: str) -> None:
+    if (payload.width, payload.height) != (last.width, last.height) and payload.width and last.width:
+        raise RecordingError(
+            f"{where}: the image at {payload.stamp_ns} ns has {payload.width} x {payload.height} px, the one at "
+            f"{last.stamp_ns} ns {last.width} x {last.height} px; record each resolution under its own name."
+        )
+    if payload.stamp_ns < last.stamp_ns - _LATE_NS:
+        raise RecordingError(
+            f"{where}: the image at {payload.stamp_ns} ns comes after the one at {last.stamp_ns} ns; "
+            "the camera's clock was set back: record again, or cut the recording there."
+        )
+
+
+def _refuse_too_few(kept: int, dropped: _Dropped, where: str) -> None:
+    total = kept + sum(dropped.count.values())
+    if not total:
+        raise RecordingError(f"{where}: there are no images; check that the camera was running.")
+    if kept > 1 or not dropped.count:
+        return
+    reasons = ", ".join(f"{count} {reason}" for reason, count in dropped.count.items())
+    raise RecordingError(f"{where}: of {total} images, {reasons}; check the camera and record again.")

@@ -1,0 +1,191 @@
+"""Images as they were recorded, and their decoding to grey: a pure function, so that other processes can do it."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from icalib.errors import RecordingError
+from icalib.recordings.extras import load_cv2
+
+Convert = Callable[[np.ndarray, Any], np.ndarray]
+
+
+class DamagedImageError(RecordingError):
+    """One image cannot be decoded; the others may be good."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image: stamp_ns on the camera's clock, image (height, width) uint8 grey."""
+
+    stamp_ns: int
+    image: np.ndarray
+
+
+@dataclass(frozen=True)
+class Payload:
+    """One image as it was recorded, undecoded; it can be sent to another process.
+
+    source names the stream in sentences. encoding: that of sensor_msgs/Image, or of a file, jpeg or png, then after
+    a blank the pixels' if these are a Bayer mosaic. width, height [px]: 0 where the file does not tell. step: bytes
+    in a row, 0 for files.
+    """
+
+    stamp_ns: int
+    source: str
+    encoding: str
+    data: bytes
+    width: int
+    height: int
+    step: int = 0
+    big_endian: bool = False
+
+
+def decode(payload: Payload) -> np.ndarray:
+    """The image (height, width) uint8, grey. 16 bits are shifted so that the brightest pixel fits 8.
+
+    Raises RecordingError naming the stream and the instant for an unknown encoding, DamagedImageError for data that are
+    too short or damaged.
+    """
+    if is_file(payload.encoding):
+        return _decode_file(payload)
+    if payload.encoding not in _ENCODINGS:
+        raise RecordingError(unknown_encoding(payload))
+    pixel_bytes, convert = _ENCODINGS[payload.encoding]
+    rows = _rows(payload, pixel_bytes)
+    return np.require(convert(rows, payload), requirements=("C", "W"))
+
+
+def is_known(encoding: str) -> bool:
+    """Whether `decode` knows the encoding."""
+    return encoding in _ENCODINGS or is_file(encoding)
+
+
+def is_file(encoding: str) -> bool:
+    """Whether the data are those of an image file."""
+    return encoding.split(" ")[0] in ("jpeg", "png")
+
+
+def unknown_encoding(payload: Payload) -> str:
+    """The sentence for an encoding that `decode` does not know."""
+    known = ", ".join(sorted(_ENCODINGS))
+    return (
+        f"{payload.source}: the image at {payload.stamp_ns} ns has the encoding {payload.encoding!r}, which icalib "
+        f"does not read; record jpeg, png, or one of {known}."
+    )
+
+
+def file_payload(stamp_ns: int, source: str, data: bytes, described: str = "") -> Payload:
+    """The payload of an image file; its format is told by its content, or else as `described` by the recorder."""
+    words = described.replace(";", " ").lower().split()
+    encoding = _file_format(data, words)
+    if encoding in ("jpeg", "png") and words and words[-1] in _BAYER:
+        encoding = f"{encoding} {words[-1]}"
+    width, height = file_size(data)
+    return Payload(stamp_ns, source, encoding, data, width, height)
+
+
+def file_size(data: bytes) -> tuple[int, int]:
+    """Width and height [px] by the header of a JPEG or PNG file, (0, 0) where it does not tell."""
+    if data.startswith(_PNG) and len(data) >= 24:
+        return struct.unpack_from(">II", data, 16)
+    at = 2 if data.startswith(_JPEG) else len(data)
+    while at + 9 <= len(data) and data[at] == 0xFF:
+        marker, length = data[at + 1], int.from_bytes(data[at + 2 : at + 4])
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of frame
+            height, width = struct.unpack_from(">HH", data, at + 5)
+            return width, height
+        at += 1 if marker == 0xFF else 2 + length
+    return 0, 0
+
+
+_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
+
+
+def _file_format(data: bytes, words: list[str]) -> str:
+    if data.startswith(_JPEG):
+        return "jpeg"
+    if data.startswith(_PNG):
+        return "png"
+    for name in ("jpeg", "png"):
+        if name in words or (name == "jpeg" and "jpg" in words):
+            return name
+    return " ".join(words) or "unknown"
+
+
+def _decode_file(payload: Payload) -> np.ndarray:
+    cv2 = load_cv2()
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        image = cv2.imdecode(np.frombuffer(payload.data, np.uint8), flags)
+    except cv2.error:
+        image = None
+    if image is None:
+        raise DamagedImageError(f"{payload.source}: the image at {payload.stamp_ns} ns is damaged; leave it out.")
+    image = _to_8_bits(image)
+    mosaic = payload.encoding.partition(" ")[2]
+    return _demosaic(mosaic)(image, payload) if mosaic else image
+
+
+def _rows(payload: Payload, pixel_bytes: int) -> np.ndarray:
+    """(height, width * pixel_bytes) uint8: the rows without their padding."""
+    wanted = payload.width * pixel_bytes
+    step = payload.step or wanted
+    if step < wanted or len(payload.data) < step * payload.height or not wanted * payload.height:
+        raise DamagedImageError(
+            f"{payload.source}: the image at {payload.stamp_ns} ns has {len(payload.data)} bytes, too few for "
+            f"{payload.width} x {payload.height} px of {payload.encoding} in rows of {step} bytes; leave it out."
+        )
+    rows = np.frombuffer(payload.data, np.uint8, step * payload.height).reshape(payload.height, step)
+    return np.ascontiguousarray(rows[:, :wanted])
+
+
+def _to_8_bits(image: np.ndarray) -> np.ndarray:
+    """Cameras of 10 or 12 bits fill only part of 16: the brightest pixel tells how far to shift."""
+    if image.dtype == np.uint8:
+        return image
+    return (image >> max(0, int(image.max()).bit_length() - 8)).astype(np.uint8)
+
+
+def _sixteen_bits(rows: np.ndarray, payload: Payload) -> np.ndarray:
+    return _to_8_bits(rows.view(">u2" if payload.big_endian else "<u2"))
+
+
+def _colour(code: str, channels: int) -> Convert:
+    def convert(rows: np.ndarray, payload: Payload) -> np.ndarray:
+        cv2 = load_cv2()
+        return cv2.cvtColor(rows.reshape(payload.height, payload.width, channels), getattr(cv2, f"COLOR_{code}2GRAY"))
+
+    return convert
+
+
+def _demosaic(encoding: str) -> Convert:
+    def convert(rows: np.ndarray, _: Payload) -> np.ndarray:
+        cv2 = load_cv2()
+        return cv2.cvtColor(rows, getattr(cv2, f"COLOR_Bayer{_BAYER[encoding]}2GRAY"))
+
+    return convert
+
+
+def _luma(first: int) -> Convert:
+    return lambda rows, _: rows[:, first::2]
+
+
+# OpenCV names a mosaic by the pixels (1, 1) and (1, 2), ROS by its first row and second.
+_BAYER = {"bayer_rggb8": "BG", "bayer_bggr8": "RG", "bayer_gbrg8": "GR", "bayer_grbg8": "GB"}
+_ENCODINGS: dict[str, tuple[int, Convert]] = {  # bytes per pixel, and how the rows become grey
+    **{name: (1, lambda rows, _: rows) for name in ("mono8", "8UC1")},
+    **{name: (2, _sixteen_bits) for name in ("mono16", "16UC1")},
+    **{name: (3, _colour("BGR", 3)) for name in ("bgr8", "8UC3")},
+    "rgb8": (3, _colour("RGB", 3)),
+    "bgra8": (4, _colour("BGRA", 4)),
+    "rgba8": (4, _colour("RGBA", 4)),
+    **{name: (1, _demosaic(name)) for name in _BAYER},
+    **{name: (2, _luma(1)) for name in ("yuv422", "uyvy")},
+    **{name: (2, _luma(0)) for name in ("yuv422_yuy2", "yuyv")},
+}

@@ -1,0 +1,35 @@
+"""A path -> the reader of what lies there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from icalib.errors import RecordingError
+from icalib.recordings.bag import BagRecording
+from icalib.recordings.bags.opening import bag_files
+from icalib.recordings.base import Recording
+from icalib.recordings.folder import FolderRecording
+
+_MAX_LISTED = 12
+
+
+def open_recording(path: str | Path) -> Recording:
+    """Open the recording at `path`: a folder of tables or EuRoC's, a bag, or a folder of bags.
+
+    It is told by what is there, not by names. Raises RecordingError where it is missing, empty or none of these.
+    """
+    root = Path(path)
+    if root.is_dir():
+        return BagRecording(root) if _holds_bags(root) else FolderRecording(root)
+    if root.exists():
+        return BagRecording(root)
+    parent = root.parent
+    beside = sorted(p.name for p in parent.iterdir())[:_MAX_LISTED] if parent.is_dir() else []
+    listing = f"{parent} holds {', '.join(beside)}" if beside else f"{parent} is empty or missing"
+    raise RecordingError(f"{root} does not exist; {listing}; check the path of the recording.")
+
+
+def _holds_bags(folder: Path) -> bool:
+    """Bags, and no tables: these may have been made from a bag that was left beside them."""
+    tables = [p for pattern in ("*/*.csv", "*/*.csv.gz", "mav0") for p in folder.glob(pattern)]
+    return bool(bag_files(folder)) and not tables
