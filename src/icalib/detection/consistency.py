@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from math import hypot
+
 import numpy as np
+from numba import njit
 
 from icalib.detection.decoding import mapped, unit_homography
 from icalib.detection.growth import distance_from_neighbours
@@ -19,12 +22,7 @@ def largest_group(known: np.ndarray, quads: np.ndarray, board: np.ndarray) -> np
     tag sizes.
     """
     tags = np.flatnonzero(known)
-    links = np.zeros((len(tags), len(tags)), dtype=bool)
-    for i, tag in enumerate(tags):
-        off = _off(tag, tags, quads, board)
-        distance = np.linalg.norm(board[tags].mean(axis=1) - board[tag].mean(axis=0), axis=1)
-        links[i] = off < _LINK_OFF * np.maximum(distance, 1.0)
-    links &= links.T
+    links = _links(quads[tags], board[tags])
     groups: list[np.ndarray] = []
     left = np.ones(len(tags), dtype=bool)
     while left.any():
@@ -40,17 +38,24 @@ def largest_group(known: np.ndarray, quads: np.ndarray, board: np.ndarray) -> np
     return out
 
 
-def _off(tag: int, others: np.ndarray, quads: np.ndarray, board: np.ndarray) -> np.ndarray:
-    """(m,) how far, in its own sides, the centre of each other tag lies from where this one predicts it."""
-    H = unit_homography(quads[tag])
-    origin, a, b = board[tag, 0], board[tag, 1] - board[tag, 0], board[tag, 3] - board[tag, 0]
-    off = np.empty(len(others))
-    for i, other in enumerate(others):
-        local = board[other].mean(axis=0) - origin
-        predicted = mapped(H, float(local @ a), float(local @ b))
-        side = np.linalg.norm(np.roll(quads[other], 1, axis=0) - quads[other], axis=1).mean()
-        off[i] = np.linalg.norm(quads[other].mean(axis=0) - predicted) / side
-    return off
+@njit(cache=True, nogil=True)
+def _links(quads, board):
+    """(m, m) bool: which tags predict each other's centre. quads (m, 4, 2) px, board (m, 4, 2) in tag sizes."""
+    m = len(quads)
+    seen_from = np.zeros((m, m), dtype=np.bool_)
+    for i in range(m):
+        H = unit_homography(quads[i])
+        ax, ay = board[i, 1, 0] - board[i, 0, 0], board[i, 1, 1] - board[i, 0, 1]
+        bx, by = board[i, 3, 0] - board[i, 0, 0], board[i, 3, 1] - board[i, 0, 1]
+        for j in range(m):
+            x, y = board[j, :, 0].mean() - board[i, 0, 0], board[j, :, 1].mean() - board[i, 0, 1]
+            s, t = x * ax + y * ay, x * bx + y * by
+            u, v = mapped(H, s, t)
+            side = hypot(quads[j, 1, 0] - quads[j, 0, 0], quads[j, 1, 1] - quads[j, 0, 1])
+            side = max(side, hypot(quads[j, 3, 0] - quads[j, 0, 0], quads[j, 3, 1] - quads[j, 0, 1]))
+            off = hypot(quads[j, :, 0].mean() - u, quads[j, :, 1].mean() - v)
+            seen_from[i, j] = off < _LINK_OFF * side * max(hypot(s - 0.5, t - 0.5), 1.0)
+    return seen_from & seen_from.T
 
 
 def consistent_corners(uv: np.ndarray, board: np.ndarray, found: np.ndarray, side: np.ndarray) -> np.ndarray:

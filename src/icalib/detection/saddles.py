@@ -37,13 +37,20 @@ def window_frame(ea, eb, clear):
 
 
 @njit(cache=True, nogil=True)
-def _bounds(image, u, v, ea, eb, sa, sb):
-    """(u0, u1, v0, v1, inside) of the pixels that the window may touch, and whether their gradients exist."""
+def _room(image, u, v, ea, eb, sa, sb):
+    """By what factor, at most 1, a window must be scaled so that all its pixels have neighbours in the image."""
     ru = abs(ea[0]) * sa + abs(eb[0]) * sb
     rv = abs(ea[1]) * sa + abs(eb[1]) * sb
-    u0, u1, v0, v1 = int(np.ceil(u - ru)), int(np.floor(u + ru)), int(np.ceil(v - rv)), int(np.floor(v + rv))
-    inside = u0 >= 1 and v0 >= 1 and u1 <= image.shape[1] - 2 and v1 <= image.shape[0] - 2
-    return u0, u1, v0, v1, inside
+    room_u, room_v = min(u, image.shape[1] - 1.0 - u) - 1.0, min(v, image.shape[0] - 1.0 - v) - 1.0
+    return max(min(1.0, min(room_u / ru, room_v / rv)), 0.0)
+
+
+@njit(cache=True, nogil=True)
+def _bounds(u, v, ea, eb, sa, sb):
+    """(u0, u1, v0, v1) of the pixels that the window may touch."""
+    ru = abs(ea[0]) * sa + abs(eb[0]) * sb
+    rv = abs(ea[1]) * sa + abs(eb[1]) * sb
+    return int(np.ceil(u - ru)), int(np.floor(u + ru)), int(np.ceil(v - rv)), int(np.floor(v + rv))
 
 
 @njit(cache=True, nogil=True)
@@ -74,14 +81,16 @@ def refine_saddle(image, u, v, ea, eb, clear, max_move):
     u_start, v_start = u, v
     if sine < _LEAST_SINE:
         return u, v, np.nan
+    a, b, c, room = 0.0, 0.0, 0.0, 1.0
     for _ in range(_ITERATIONS):
-        u0, u1, v0, v1, inside = _bounds(image, u, v, ea, eb, sa, sb)
-        if not inside:
+        room = _room(image, u, v, ea, eb, sa, sb)
+        if room * min(sa * hypot(ea[0], ea[1]), sb * hypot(eb[0], eb[1])) * sine < 0.99 * LEAST_HALF_PX:
             return u, v, np.nan
+        u0, u1, v0, v1 = _bounds(u, v, ea, eb, room * sa, room * sb)
         a, b, c, p, q = 0.0, 0.0, 0.0, 0.0, 0.0
         for y in range(v0, v1 + 1):
             for x in range(u0, u1 + 1):
-                w = _weight(x - u, y - v, ea, eb, det, sa, sb)
+                w = _weight(x - u, y - v, ea, eb, det, room * sa, room * sb)
                 if w > 0.0:
                     gu, gv = _gradient(image, x, y)
                     along = gu * (x - u) + gv * (y - v)
@@ -99,7 +108,7 @@ def refine_saddle(image, u, v, ea, eb, clear, max_move):
             return u, v, np.nan
         if hypot(du, dv) < _CONVERGED_PX:
             break
-    return u, v, _sigma(image, u, v, ea, eb, sa, sb, a, b, c)
+    return u, v, _sigma(image, u, v, ea, eb, room * sa, room * sb, a, b, c)
 
 
 @njit(cache=True, nogil=True)
@@ -108,9 +117,9 @@ def _sigma(image, u, v, ea, eb, sa, sb, a, b, c):
 
     There, noise n enters as sum w g (grad n . d); summed by parts, a pixel's share is the divergence of w g d.
     """
-    u0, u1, v0, v1, inside = _bounds(image, u, v, ea, eb, sa, sb)
-    if not inside:
-        return np.nan
+    room = _room(image, u, v, ea, eb, sa, sb)
+    sa, sb = room * sa, room * sb
+    u0, u1, v0, v1 = _bounds(u, v, ea, eb, sa, sb)
     det = ea[0] * eb[1] - ea[1] * eb[0]
     share = np.zeros((v1 - v0 + 3, u1 - u0 + 3, 2))
     for y in range(v0, v1 + 1):
@@ -137,14 +146,15 @@ def _sigma(image, u, v, ea, eb, sa, sb, a, b, c):
 def crossing_contrast(image, u, v, ea, eb, clear):
     """Least white minus most black grey of the four fields about an X-corner; the dark one lies between ea and eb."""
     sa, sb, _ = window_frame(ea, eb, clear)
-    sa, sb = 0.6 * sa, 0.6 * sb
+    room = 0.6 * _room(image, u, v, ea, eb, sa, sb)
+    sa, sb = room * sa, room * sb
     black, white = 0.0, 255.0
+    if room == 0.0:
+        return 0.0
     for i in range(2):
         for j in range(2):
             s, t = sa * (1 - 2 * i), sb * (1 - 2 * j)
             x, y = u + s * ea[0] + t * eb[0], v + s * ea[1] + t * eb[1]
-            if not (0.0 <= x <= image.shape[1] - 1.0 and 0.0 <= y <= image.shape[0] - 1.0):
-                return 0.0
             value = bilinear(image, x, y)
             if i == j:
                 black = max(black, value)
