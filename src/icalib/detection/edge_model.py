@@ -65,11 +65,11 @@ def fit_step(image, u0, v0, u1, v1, half):
     cu, cv = 0.5 * (u0 + u1), 0.5 * (v0 + v1)
     reach = 0.5 * length - end
     ru, rv = abs(tu) * reach + abs(tv) * half, abs(tv) * reach + abs(tu) * half
-    x0, x1 = max(int(np.ceil(cu - ru)), 0), min(int(np.floor(cu + ru)), image.shape[1] - 1)
-    y0, y1 = max(int(np.ceil(cv - rv)), 0), min(int(np.floor(cv + rv)), image.shape[0] - 1)
+    x0, x1 = int(np.ceil(cu - ru)), int(np.floor(cu + ru))
+    y0, y1 = int(np.ceil(cv - rv)), int(np.floor(cv + rv))
     blur, low, high = 1.0, 0.0, 0.0
     n_low, n_high, m = 0, 0, (x1 - x0 + 1) * (y1 - y0 + 1)
-    if m <= 0:
+    if min(x0, y0) < 0 or x1 > image.shape[1] - 1 or y1 > image.shape[0] - 1 or m <= 0:
         return place, blur, 0.0, variance
     way, off, grey = np.empty(m), np.empty(m), np.empty(m)
     n = 0

@@ -18,7 +18,7 @@ _LEAST_SEEN = 12  # data cells of a tag that the image cuts
 _WRONG_CELLS = 0.15  # of the cells seen: the pattern is known, so many may be wrong
 _LEAST_RISE = 4.0  # grey levels over 2 px at an edge
 _MOST_MOVE = 0.12  # of a side: how far a corner may lie from where it is predicted
-CONTRAST_SHARE = 0.35  # of the tag's contrast that an X-corner must show
+_USUAL_BLUR = 0.7  # px, before it is measured
 LEAST_SIDE_PX = 6.0
 
 
@@ -88,12 +88,12 @@ def side_vectors(quad, k):
 
 
 @njit(cache=True, nogil=True)
-def refine_crossings(image, quad, clear, most_move):
+def refine_crossings(image, quad, clear, blur, most_move):
     """(corners (4, 2), sigma (4,)) of a tag whose corners touch other dark squares; sigma NaN where not found."""
     corners, sigma = quad.copy(), np.full(4, np.nan)
     for k in range(4):
         ea, eb = side_vectors(quad, k)
-        u, v, s = refine_saddle(image, quad[k, 0], quad[k, 1], ea, eb, clear, most_move)
+        u, v, s = refine_saddle(image, quad[k, 0], quad[k, 1], ea, eb, clear, blur, most_move)
         if not np.isnan(s):
             corners[k, 0], corners[k, 1], sigma[k] = u, v, s
     return corners, sigma
@@ -105,12 +105,12 @@ def _fitted(image, quad, clear, crossing):
     side = shortest_side(quad)
     if crossing:
         most = _MOST_MOVE * side + 1.0
-        corners, sigma = refine_crossings(image, quad, clear, most)
+        corners, sigma = refine_crossings(image, quad, clear, _USUAL_BLUR, most)
         found = 0
         for k in range(4):
             ea, eb = side_vectors(corners, k)
             if not np.isnan(sigma[k]):
-                if crossing_contrast(image, corners[k, 0], corners[k, 1], ea, eb, clear) >= LEAST_CONTRAST:
+                if crossing_contrast(image, corners[k, 0], corners[k, 1], ea, eb, clear, _USUAL_BLUR) >= LEAST_CONTRAST:
                     found += 1
                 else:
                     corners[k] = quad[k]

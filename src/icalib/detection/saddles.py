@@ -13,26 +13,26 @@ from numba import njit
 
 from icalib.detection.decoding import bilinear
 
-LEAST_HALF_PX = 2.0  # half a window's width; fewer pixels than that hold no corner
+LEAST_HALF_PX = 1.5  # half a window's width; fewer pixels than that hold no corner
 MOST_HALF_PX = 6.0  # more average the bend of a distorted edge into the corner
-_BLUR_MARGIN_PX = 1.0  # how far a neighbouring feature is blurred into the window
+MARGIN_BLURS = 1.5  # how far, in blurs, a neighbouring feature reaches into the window
 _ITERATIONS = 12
 _CONVERGED_PX = 1e-3
 _LEAST_SINE = 0.17  # of the angle between the edges: 10 degrees
 
 
 @njit(cache=True, nogil=True)
-def window_frame(ea, eb, clear):
+def window_frame(ea, eb, clear, blur):
     """(sa, sb, sine): half a window's width in units of the sides ea, eb (2,) px that meet in the corner.
 
-    `clear` is the distance of the nearest other feature in the same units. The window keeps away from it by the usual
-    blur, and is 2 to 6 px wide across the edges.
+    `clear` is the distance of the nearest other feature in the same units. The window keeps away from it by 1.5 times the
+    blur [px], and is 1.5 to 6 px wide across the edges.
     """
     la, lb = hypot(ea[0], ea[1]), hypot(eb[0], eb[1])
     sine = abs(ea[0] * eb[1] - ea[1] * eb[0]) / max(la * lb, 1e-12)
-    across = max(sine, _LEAST_SINE)
-    sa = min(max(clear - _BLUR_MARGIN_PX / (la * across), LEAST_HALF_PX / (la * across)), MOST_HALF_PX / la)
-    sb = min(max(clear - _BLUR_MARGIN_PX / (lb * across), LEAST_HALF_PX / (lb * across)), MOST_HALF_PX / lb)
+    across, margin = max(sine, _LEAST_SINE), MARGIN_BLURS * blur
+    sa = min(max(clear - margin / (la * across), LEAST_HALF_PX / (la * across)), MOST_HALF_PX / la)
+    sb = min(max(clear - margin / (lb * across), LEAST_HALF_PX / (lb * across)), MOST_HALF_PX / lb)
     return max(sa, LEAST_HALF_PX / la), max(sb, LEAST_HALF_PX / lb), sine
 
 
@@ -70,13 +70,13 @@ def _gradient(image, x, y):
 
 
 @njit(cache=True, nogil=True)
-def refine_saddle(image, u, v, ea, eb, clear, max_move):
+def refine_saddle(image, u, v, ea, eb, clear, blur, max_move):
     """(u, v, sigma) of the X-corner near (u, v); sigma is NaN where there is none within `max_move` px.
 
     ea, eb (2,) px are the sides of the dark square that meet in the corner, `clear` is how far, in units of them, the
-    nearest other feature is. sigma is the standard deviation [px] per axis for an image noise of one grey level.
+    nearest other feature is, blur [px] that of the image. sigma is the standard deviation [px] per axis for an image noise of one grey level.
     """
-    sa, sb, sine = window_frame(ea, eb, clear)
+    sa, sb, sine = window_frame(ea, eb, clear, blur)
     det = ea[0] * eb[1] - ea[1] * eb[0]
     u_start, v_start = u, v
     if sine < _LEAST_SINE:
@@ -143,9 +143,9 @@ def _sigma(image, u, v, ea, eb, sa, sb, a, b, c):
 
 
 @njit(cache=True, nogil=True)
-def crossing_contrast(image, u, v, ea, eb, clear):
+def crossing_contrast(image, u, v, ea, eb, clear, blur):
     """Least white minus most black grey of the four fields about an X-corner; the dark one lies between ea and eb."""
-    sa, sb, _ = window_frame(ea, eb, clear)
+    sa, sb, _ = window_frame(ea, eb, clear, blur)
     room = 0.6 * _room(image, u, v, ea, eb, sa, sb)
     sa, sb = room * sa, room * sb
     black, white = 0.0, 255.0
