@@ -10,7 +10,7 @@ from numba import njit
 from icalib.detection.decoding import cell_greys, levels, mapped, popcount, read_cells, seen_cells, unit_homography
 from icalib.detection.edge_model import solve_small
 from icalib.detection.edges import fit_quad
-from icalib.detection.saddles import crossing_contrast, refine_saddle
+from icalib.detection.saddles import crossing_contrast, find_saddle
 from icalib.detection.tags import LEAST_CONTRAST, shortest_side
 
 _NEIGHBOURS = 3  # tags that predict another, none further than two tags away
@@ -88,33 +88,18 @@ def side_vectors(quad, k):
 
 
 @njit(cache=True, nogil=True)
-def refine_crossings(image, quad, clear, blur, most_move):
-    """(corners (4, 2), sigma (4,)) of a tag whose corners touch other dark squares; sigma NaN where not found."""
-    corners, sigma = quad.copy(), np.full(4, np.nan)
-    for k in range(4):
-        ea, eb = side_vectors(quad, k)
-        u, v, s = refine_saddle(image, quad[k, 0], quad[k, 1], ea, eb, clear, blur, most_move)
-        if not np.isnan(s):
-            corners[k, 0], corners[k, 1], sigma[k] = u, v, s
-    return corners, sigma
-
-
-@njit(cache=True, nogil=True)
 def _fitted(image, quad, clear, crossing):
     """(number of corners found, quad) near a predicted quad."""
     side = shortest_side(quad)
     if crossing:
-        most = _MOST_MOVE * side + 1.0
-        corners, sigma = refine_crossings(image, quad, clear, _USUAL_BLUR, most)
-        found = 0
+        most, corners, n_found = _MOST_MOVE * side + 1.0, quad.copy(), 0
         for k in range(4):
-            ea, eb = side_vectors(corners, k)
-            if not np.isnan(sigma[k]):
-                if crossing_contrast(image, corners[k, 0], corners[k, 1], ea, eb, clear, _USUAL_BLUR) >= LEAST_CONTRAST:
-                    found += 1
-                else:
-                    corners[k] = quad[k]
-        return found, corners
+            ea, eb = side_vectors(quad, k)
+            found, u, v = find_saddle(image, quad[k, 0], quad[k, 1], ea, eb, clear, _USUAL_BLUR, most)
+            if found and crossing_contrast(image, u, v, ea, eb, clear, _USUAL_BLUR) >= LEAST_CONTRAST:
+                corners[k, 0], corners[k, 1] = u, v
+                n_found += 1
+        return n_found, corners
     fits, corners = fit_quad(image, quad, min(max(1.5, 0.1 * side), 6.0), _LEAST_RISE)
     return 4 if fits else 0, corners
 

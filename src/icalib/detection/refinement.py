@@ -7,9 +7,10 @@ from math import hypot
 import numpy as np
 from numba import njit
 
+from icalib.detection.crossing_model import fit_crossing
 from icalib.detection.edge_model import fit_corners, fit_step
-from icalib.detection.growth import refine_crossings, side_vectors
-from icalib.detection.saddles import MARGIN_BLURS, crossing_contrast
+from icalib.detection.growth import side_vectors
+from icalib.detection.saddles import MARGIN_BLURS
 from icalib.detection.tags import LEAST_CONTRAST
 
 _MOST_MOVE_PX = 2.0
@@ -35,15 +36,14 @@ def _strip(least, blur, most):
 
 
 @njit(cache=True, nogil=True)
-def _measured_blur(image, quad, least):
-    """Blur [px] of the blurrier of two sides of the quad that meet; NaN where neither has an edge."""
-    worst = np.nan
-    for k in range(2):
-        u0, v0, u1, v1 = quad[k, 0], quad[k, 1], quad[k + 1, 0], quad[k + 1, 1]
+def _measured_blur(image, quad, k, least):
+    """Blur [px] across the sides k and k + 2 of the quad, NaN where neither has an edge."""
+    for m in (k, k + 2):
+        u0, v0, u1, v1 = quad[m, 0], quad[m, 1], quad[(m + 1) % 4, 0], quad[(m + 1) % 4, 1]
         _, blur, contrast, _ = fit_step(image, u0, v0, u1, v1, _strip(least, _USUAL_BLUR, _BLUR_STRIP_PX))
-        if contrast > 0.0 and not blur < worst:
-            worst = blur
-    return worst
+        if contrast > 0.0:
+            return blur
+    return np.nan
 
 
 @njit(cache=True, nogil=True)
@@ -58,14 +58,20 @@ def refined_crossings(image, quads, clear):
     for i in range(len(quads)):
         for k in range(4):
             quality[2, i, k], quality[3, i, k], quality[4, i, k] = _shape(quads[i], k, clear)
-        blur = _measured_blur(image, quads[i], quality[3, i].min())
-        quality[1, i] = blur
-        known_blur = _USUAL_BLUR if np.isnan(blur) else blur
-        uv[i], quality[0, i] = refine_crossings(image, quads[i], clear, known_blur, _MOST_MOVE_PX)
+        least, blur = quality[3, i].min(), np.empty(2)
+        for k in range(2):
+            blur[k] = _measured_blur(image, quads[i], k, least)
+        quality[1, i] = blur.max()  # NaN if either is: the corners are then not kept
+        if np.isnan(blur).any():
+            blur[:] = _USUAL_BLUR
         for k in range(4):
             ea, eb = side_vectors(quads[i], k)
-            if crossing_contrast(image, uv[i, k, 0], uv[i, k, 1], ea, eb, clear, known_blur) < LEAST_CONTRAST:
-                quality[0, i, k] = np.nan
+            blur_a, blur_b = blur[k % 2], blur[(k + 1) % 2]
+            u, v, sigma, contrast = fit_crossing(
+                image, quads[i, k, 0], quads[i, k, 1], ea, eb, clear, blur_a, blur_b, _MOST_MOVE_PX
+            )
+            uv[i, k, 0], uv[i, k, 1] = u, v
+            quality[0, i, k] = sigma if contrast >= LEAST_CONTRAST else np.nan
     return uv, quality
 
 
