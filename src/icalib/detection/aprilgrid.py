@@ -89,7 +89,7 @@ class AprilGridDetector:
         tags = np.flatnonzero(known)
         refine = refined_crossings if self.squares else refined_corners
         uv, quality = refine(image, quads[tags], self._clear)
-        uv, (sigma, blur, sine, clear_px, side) = uv.reshape(-1, 2), quality.reshape(5, -1)
+        uv, (sigma, blur, sine, room_px, side) = uv.reshape(-1, 2), quality.reshape(5, -1)
         point = (4 * tags[:, None] + APRILTAG_CORNER).ravel()
         consistent = consistent_corners(uv, self._board[tags].reshape(-1, 2), np.isfinite(sigma), side)
-        return judged(point, uv, sigma, blur, sine, clear_px, consistent)
+        return judged(point, uv, sigma, blur, sine, room_px, consistent)

@@ -12,7 +12,7 @@ from icalib.detection.growth import distance_from_neighbours
 
 _NEAREST = 12
 _MOST_OFF = (1.0, 0.05)  # px, and of a side: how far a corner may lie from where its neighbours place it
-_OFF = (0.3, 0.005, 6.0)  # px, of a side, and times the median: the same, as far as the other corners agree
+_OFF = (0.3, 0.01, 6.0)  # px, of a side, and times the median: the same, as far as the other corners agree
 _LINK_OFF = 0.3  # of a tag: how far its centre may lie from where another tag predicts it, per tag of distance
 
 
@@ -62,7 +62,7 @@ def _links(quads, board):
 def consistent_corners(uv: np.ndarray, board: np.ndarray, found: np.ndarray, side: np.ndarray) -> np.ndarray:
     """(N,) bool: which corners lie where the 12 nearest others place them.
 
-    The bound is 6 times the median distance, at least 0.3 px + 0.005 sides and at most 1 px + 0.05 sides. The worst corner is left
+    The bound is 6 times the median distance, at least 0.3 px + 0.01 sides and at most 1 px + 0.05 sides. The worst corner is left
     out first, as long as there is one. uv (N, 2) px, board (N, 2), found (N,) bool, side (N,) px.
     """
     used = found.copy()
@@ -70,7 +70,8 @@ def consistent_corners(uv: np.ndarray, board: np.ndarray, found: np.ndarray, sid
     while True:
         off = distance_from_neighbours(uv, board, used, _NEAREST)
         placed = used & np.isfinite(off)
-        bound = np.minimum(most, np.maximum(_OFF[0] + _OFF[1] * side, _OFF[2] * np.median(off[placed]))) if placed.any() else most
+        usual = float(np.median(off[placed])) if placed.any() else np.inf
+        bound = np.minimum(most, np.maximum(_OFF[0] + _OFF[1] * side, _OFF[2] * usual))
         excess = np.where(placed, off / bound, 0.0)
         if not len(excess) or excess.max() <= 1.0:
             return used | ~found

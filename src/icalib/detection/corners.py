@@ -14,7 +14,6 @@ IMAGE_NOISE = 2.0  # grey levels, assumed of every image: the sigmas are right u
 MODEL_SIGMA_PX = 0.02  # what sampling, printing and the lens add to the noise's share
 MOST_SIGMA_PX = 0.25
 LEAST_ANGLE_DEG = 15.0  # between the edges that meet in a corner
-CLEAR_PX, CLEAR_BLURS = 1.5, 1.5  # the nearest other feature is at least 1.5 px + 1.5 blurs away
 
 VERDICTS = ("kept", "faint", "blurred", "oblique", "inconsistent")
 KEPT, FAINT, BLURRED, OBLIQUE, INCONSISTENT = range(5)
@@ -59,22 +58,23 @@ def judged(
     unit_sigma: np.ndarray,
     blur: np.ndarray,
     sine: np.ndarray,
-    clear_px: np.ndarray,
+    room_px: np.ndarray,
     consistent: np.ndarray,
 ) -> ImageCorners:
     """Corners with sigma and verdict, by this rule; what is named first wins.
 
     inconsistent: not where the neighbours place it. oblique: its edges meet at less than 15 degrees. blurred: the
-    nearest other feature is less than 1.5 px + 1.5 blurs away, or there is no edge to measure the blur on. faint: sigma is above 0.25 px. All arguments (N,), but
+    nearest other feature is less than 1.5 px + 1.5 blurs away, for L-corners 1.5 px + 2.25 blurs. faint: sigma is above 0.25 px. All arguments (N,), but
     uv (N, 2): unit_sigma [px] is the standard deviation for a noise of one grey level, NaN where nothing was found;
-    sine is that of the angle between the edges; clear_px the distance to the nearest other feature.
+    sine is that of the angle between the edges; room_px by how much the distance to the nearest
+    other feature exceeds that bound.
     """
     rows = np.flatnonzero(np.isfinite(unit_sigma))
     rows = rows[np.argsort(point[rows], kind="stable")]
     sigma = np.hypot(IMAGE_NOISE * unit_sigma[rows], MODEL_SIGMA_PX)
     verdict = np.full(len(rows), KEPT, dtype=np.int8)
     verdict[sigma > MOST_SIGMA_PX] = FAINT
-    verdict[~(clear_px[rows] >= CLEAR_PX + CLEAR_BLURS * blur[rows])] = BLURRED
+    verdict[~(room_px[rows] >= 0.0)] = BLURRED
     verdict[sine[rows] < np.sin(np.radians(LEAST_ANGLE_DEG))] = OBLIQUE
     verdict[~consistent[rows]] = INCONSISTENT
     return ImageCorners(point[rows].astype(np.int64), uv[rows], sigma, blur[rows], verdict)

@@ -19,6 +19,7 @@ _WRONG_CELLS = 0.15  # of the cells seen: the pattern is known, so many may be w
 _LEAST_RISE = 4.0  # grey levels over 2 px at an edge
 _MOST_MOVE = 0.12  # of a side: how far a corner may lie from where it is predicted
 _USUAL_BLUR = 0.7  # px, before it is measured
+_GROWTH_BESIDE = 1.5  # of errors with the square of the distance from the neighbours, in units of their spread
 LEAST_SIDE_PX = 6.0
 
 
@@ -147,7 +148,8 @@ def grow(image, known, quads, board, cols, patterns, bits, border, clear, crossi
 def distance_from_neighbours(uv, xy, used, n_near):
     """(n,) px from each corner uv (n, 2) to where the nearest others on the board xy (n, 2) place it.
 
-    Others are the n_near nearest that are `used` (n,) bool; inf where there are fewer than 6.
+    Others are the n_near nearest that are `used` (n,) bool; inf where there are fewer than 6. The distance of a corner
+    that lies beside its neighbours, not among them, is divided by how much errors grow on the way there.
     """
     out = np.full(len(uv), np.inf)
     near = np.empty(len(uv))
@@ -162,5 +164,8 @@ def distance_from_neighbours(uv, xy, used, n_near):
                 n += 1
         if n >= 6:
             u, v = mapped(fit_homography(px, pu, n), xy[i, 0], xy[i, 1])
-            out[i] = hypot(u - uv[i, 0], v - uv[i, 1])
+            x, y = px[:n, 0].mean(), px[:n, 1].mean()
+            spread = ((px[:n, 0] - x) ** 2 + (px[:n, 1] - y) ** 2).mean()
+            beside = ((xy[i, 0] - x) ** 2 + (xy[i, 1] - y) ** 2) / max(spread, 1e-12)
+            out[i] = hypot(u - uv[i, 0], v - uv[i, 1]) / (1.0 + _GROWTH_BESIDE * beside)
     return out
