@@ -30,12 +30,14 @@ class Pattern:
     centers: np.ndarray  # (n, 2) of the dark square to which each point belongs
 
 
-def homography(pattern: Pattern, distance: float, tilt_deg: float, turn_deg: float, roll_deg: float, offset) -> np.ndarray:
-    """Board -> pixels: the board's middle at `distance`, `offset` px from the image's, tilted about an axis at `turn`."""
+def homography(
+    pattern: Pattern, distance: float, tilt_deg: float, turn_deg: float, roll_deg: float, offset, y_up: bool = True
+) -> np.ndarray:
+    """Board -> pixels: its middle `distance` away and `offset` px from the image's, tilted about an axis at `turn`."""
     tilt, turn, roll = np.radians([tilt_deg, turn_deg, roll_deg])
     about_z = lambda a: np.array([[np.cos(a), -np.sin(a), 0.0], [np.sin(a), np.cos(a), 0.0], [0.0, 0.0, 1.0]])  # noqa: E731
     about_x = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(tilt), -np.sin(tilt)], [0.0, np.sin(tilt), np.cos(tilt)]])
-    facing = np.diag([1.0, -1.0, -1.0])  # y of the board up in the image, z towards the camera
+    facing = np.diag([1.0, -1.0, -1.0]) if y_up else np.eye(3)
     R = about_z(turn) @ about_x @ about_z(-turn) @ about_z(roll) @ facing
     t = distance * np.array([offset[0] / K[0, 0], offset[1] / K[1, 1], 1.0])
     middle = 0.5 * pattern.cell * np.array(pattern.white.shape[::-1])
@@ -89,7 +91,9 @@ def marker_cells(family: str, tag: int, border: int) -> np.ndarray:
     return source.generateImageMarker(tag, n, None, border) > 127
 
 
-def aprilgrid(rows: int, cols: int, border: int = 2, gap: int = 3, squares: bool = True, size: float = 0.088) -> Pattern:
+def aprilgrid(
+    rows: int, cols: int, border: int = 2, gap: int = 3, squares: bool = True, size: float = 0.088
+) -> Pattern:
     """Kalibr's grid: tag 0 at the origin, x to the right, y up; `gap` in cells."""
     n = 6 + 2 * border
     pitch = n + gap
@@ -108,6 +112,40 @@ def aprilgrid(rows: int, cols: int, border: int = 2, gap: int = 3, squares: bool
         for row in range(rows + 1):
             for col in range(cols + 1):
                 white[row * pitch : row * pitch + gap, col * pitch : col * pitch + gap] = False
+    return Pattern(white, cell, cell * np.array(points, dtype=float), cell * np.array(centers))
+
+
+def charuco(rows: int, cols: int, family: str = "4X4_50", square: float = 0.06) -> Pattern:
+    """OpenCV's board as OpenCV draws it, markers two cells smaller than squares; x to the right, y down."""
+    cv2 = pytest.importorskip("cv2")
+    source = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{family}"))
+    n = source.markerSize + 4
+    board = cv2.aruco.CharucoBoard((cols, rows), float(n), float(n - 2), source)
+    white = board.generateImage((n * cols, n * rows), None, 0, 1) > 127
+    points = np.asarray(board.getChessboardCorners())[:, :2].astype(float) * square / n
+    return Pattern(white, square / n, points, points + 0.5 * square)
+
+
+def checkerboard(rows: int, cols: int, square: float = 0.06) -> Pattern:
+    """`rows` x `cols` inner corners; the square between the first four of them is dark; x to the right, y down."""
+    row, col = np.indices((rows + 1, cols + 1))
+    y, x = np.indices((rows, cols)).reshape(2, -1) + 1
+    points = square * np.stack([x, y], axis=1).astype(float)
+    return Pattern((row + col) % 2 == 1, square, points, points + 0.5 * square)
+
+
+def markers(family: str, ids: list[int], border: int, size: float = 0.15) -> Pattern:
+    """Tags in a row with gaps of their own size, as icalib numbers their corners: x to the right, y up."""
+    bits = [marker_cells(family, tag, border) for tag in ids]
+    n = len(bits[0])
+    white = np.ones((3 * n, (2 * len(ids) + 1) * n), dtype=bool)
+    points, centers = [], []
+    for i, cells in enumerate(bits):
+        x = (2 * i + 1) * n
+        white[n : 2 * n, x : x + n] = (np.rot90(cells, 2) if family.startswith("APRILTAG") else cells)[::-1]
+        points += [(x, n), (x + n, n), (x + n, 2 * n), (x, 2 * n)]
+        centers += 4 * [(x + n / 2, 1.5 * n)]
+    cell = size / n
     return Pattern(white, cell, cell * np.array(points, dtype=float), cell * np.array(centers))
 
 
@@ -133,6 +171,13 @@ def errors(pattern: Pattern, H: np.ndarray, point: np.ndarray, uv: np.ndarray) -
 def rendering() -> SimpleNamespace:
     """The functions of this file, for tests are not a package."""
     functions: dict[str, Callable] = dict(
-        homography=homography, render=render, aprilgrid=aprilgrid, errors=errors, applied=applied, marker=marker_cells
+        homography=homography,
+        render=render,
+        errors=errors,
+        applied=applied,
+        aprilgrid=aprilgrid,
+        charuco=charuco,
+        checkerboard=checkerboard,
+        markers=markers,
     )
     return SimpleNamespace(Pattern=Pattern, size=SIZE, **functions)

@@ -11,13 +11,13 @@ from icalib.detection.consistency import consistent_corners, largest_group
 from icalib.detection.corners import ImageCorners, checked_image, judged, no_corners
 from icalib.detection.families import Family, tag_family
 from icalib.detection.growth import grow
+from icalib.detection.markers import APRILTAG_CORNER
 from icalib.detection.quads import threshold_windows
 from icalib.detection.refinement import refined_corners, refined_crossings
 from icalib.detection.tags import Tags, find_tags
 from icalib.errors import RecordingError
 
 _ON_BOARD = np.array([(1.0, 0.0), (0.0, 0.0), (0.0, 1.0), (1.0, 1.0)])  # corners in OpenCV's order, tag sizes
-APRILTAG_CORNER = np.array([1, 0, 3, 2])  # icalib's number of each of OpenCV's corners of an AprilTag
 
 
 @dataclass(frozen=True)

@@ -62,8 +62,8 @@ def _links(quads, board):
 def consistent_corners(uv: np.ndarray, board: np.ndarray, found: np.ndarray, side: np.ndarray) -> np.ndarray:
     """(N,) bool: which corners lie where the 12 nearest others place them.
 
-    The bound is 6 times the median distance, at least 0.3 px + 0.01 sides and at most 1 px + 0.05 sides. The worst corner is left
-    out first, as long as there is one. uv (N, 2) px, board (N, 2), found (N,) bool, side (N,) px.
+    The bound is 6 times the median distance, at least 0.3 px + 0.01 sides and at most 1 px + 0.05 sides. The worst
+    corner is left out first, as long as there is one. uv (N, 2) px, board (N, 2), found (N,) bool, side (N,) px.
     """
     used = found.copy()
     most = _MOST_OFF[0] + _MOST_OFF[1] * side

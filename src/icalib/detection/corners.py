@@ -64,10 +64,12 @@ def judged(
     """Corners with sigma and verdict, by this rule; what is named first wins.
 
     inconsistent: not where the neighbours place it. oblique: its edges meet at less than 15 degrees. blurred: the
-    nearest other feature is less than 1.5 px + 1.5 blurs away, for L-corners 1.5 px + 2.25 blurs. faint: sigma is above 0.25 px. All arguments (N,), but
-    uv (N, 2): unit_sigma [px] is the standard deviation for a noise of one grey level, NaN where nothing was found;
-    sine is that of the angle between the edges; room_px by how much the distance to the nearest
-    other feature exceeds that bound.
+    nearest other feature is less than 1.5 px + 1.5 blurs away, for L-corners 1.5 px + 2.25 blurs. faint: sigma is
+    above 0.25 px.
+
+    All arguments (N,), but uv (N, 2): unit_sigma [px] is the standard deviation for a noise of one grey level, NaN
+    where nothing was found; sine is that of the angle between the edges; room_px by how much the distance to the
+    nearest other feature exceeds the bound above.
     """
     rows = np.flatnonzero(np.isfinite(unit_sigma))
     rows = rows[np.argsort(point[rows], kind="stable")]
@@ -104,6 +106,6 @@ def checked_image(image: np.ndarray) -> np.ndarray:
     """The image as contiguous (h, w) uint8. Raises RecordingError for anything else than a grey image of 8 bits."""
     if image.ndim != 2 or image.dtype != np.uint8:
         raise RecordingError(
-            f"an image has shape {image.shape} and type {image.dtype}; convert it to grey levels of 8 bits, (h, w) uint8."
+            f"an image has shape {image.shape} and type {image.dtype}; convert it to grey levels, (h, w) uint8."
         )
     return np.ascontiguousarray(image)

@@ -156,9 +156,7 @@ def fit_corners(image, quad, half):
     place, variance, side_blur = np.empty((4, 3)), np.empty((4, 2)), np.empty(4)
     for k in range(4):
         m = (k + 1) % 4
-        place[k], side_blur[k], _, variance[k] = fit_step(
-            image, quad[k, 0], quad[k, 1], quad[m, 0], quad[m, 1], half
-        )
+        place[k], side_blur[k], _, variance[k] = fit_step(image, quad[k, 0], quad[k, 1], quad[m, 0], quad[m, 1], half)
     corners, sigma, blur = quad.copy(), np.full(4, np.nan), np.empty(4)
     for k in range(4):
         before = (k + 3) % 4

@@ -22,8 +22,8 @@ LEAST_SINE = 0.17  # of the angle between the edges: 10 degrees
 def window_frame(ea, eb, clear, blur, least):
     """(sa, sb, sine): half a window's width in units of the sides ea, eb (2,) px that meet in the corner.
 
-    `clear` is the distance of the nearest other feature in the same units. The window keeps away from it by 1.5 times the
-    blur [px], but half of it is at least `least` px wide across the edges, and at most 6 px.
+    `clear` is the distance of the nearest other feature in the same units. The window keeps away from it by 1.5 times
+    the blur [px], but half of it is at least `least` px wide across the edges, and at most 6 px.
     """
     la, lb = hypot(ea[0], ea[1]), hypot(eb[0], eb[1])
     sine = abs(ea[0] * eb[1] - ea[1] * eb[0]) / max(la * lb, 1e-12)
