@@ -55,9 +55,14 @@ class AprilGridDetector:
         return (1.0 + self.tag_spacing) * np.stack([col, row], axis=1)[:, None, :] + _ON_BOARD
 
     @property
+    def _border(self) -> float:
+        """Width of the border in tag sizes."""
+        return self.border_bits / (self._family.bits + 2 * self.border_bits)
+
+    @property
     def _clear(self) -> float:
         """Distance from a corner to the nearest other feature, in tag sizes."""
-        return min(self.border_bits / (self._family.bits + 2 * self.border_bits), self.tag_spacing)
+        return min(self._border, self.tag_spacing)
 
     def detect(self, image: np.ndarray) -> ImageCorners:
         """The grid's corners in the image (h, w) uint8, corner c of tag i as point 4 i + c.
@@ -87,8 +92,10 @@ class AprilGridDetector:
         cells = (patterns, self._family.bits, self.border_bits)
         grow(image, known, quads, self._board, self.cols, *cells, self._clear, self.squares)
         tags = np.flatnonzero(known)
-        refine = refined_crossings if self.squares else refined_corners
-        uv, quality = refine(image, quads[tags], self._clear)
+        if self.squares:
+            uv, quality = refined_crossings(image, quads[tags], np.array([self.tag_spacing, self._border, np.inf]))
+        else:
+            uv, quality = refined_corners(image, quads[tags], self._clear)
         uv, (sigma, blur, sine, room_px, side) = uv.reshape(-1, 2), quality.reshape(5, -1)
         point = (4 * tags[:, None] + APRILTAG_CORNER).ravel()
         consistent = consistent_corners(uv, self._board[tags].reshape(-1, 2), np.isfinite(sigma), side)

@@ -17,6 +17,7 @@ from icalib.detection.squares import square_corners
 from icalib.errors import RecordingError
 
 _NEAREST = 4  # markers that predict a corner
+_LEAST_MARKERS = 2  # that agree: small dictionaries are sometimes read where there is nothing
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ class CharucoDetector:
         for tag in ids[(count == 1) & (ids < n)]:
             known[tag], quads[tag] = True, tags.quads[tags.ids == tag][0]
         known = largest_group(known, quads, self._markers / self.marker_ratio)
-        if not known.any():
+        if known.sum() < _LEAST_MARKERS:
             return no_corners()
         expected = self._expected(self._markers[known], quads[known])
         return square_corners(image, expected, self._dark, 0.5 * (1.0 - self.marker_ratio))

@@ -11,8 +11,6 @@ from icalib.detection.opencv import opencv
 from icalib.detection.squares import square_corners
 from icalib.errors import RecordingError
 
-_CLEAR = 0.5  # squares, from a corner to the nearest other feature: the next corner's window is as large
-
 
 @dataclass(frozen=True)
 class CheckerboardDetector:
@@ -51,7 +49,7 @@ class CheckerboardDetector:
             return no_corners()
         grid = self._ordered(image, np.asarray(corners, dtype=np.float64).reshape(self.rows, self.cols, 2))
         dark = (np.indices((self.rows + 1, self.cols + 1)).sum(axis=0) % 2 == 0) == _is_dark(image, grid, 0, 0)
-        return square_corners(image, _framed(grid), dark, _CLEAR)
+        return square_corners(image, _framed(grid), dark, np.inf)
 
     def _ordered(self, image: np.ndarray, grid: np.ndarray) -> np.ndarray:
         """The corners (rows, cols, 2) px with rows and columns reversed where they must be."""

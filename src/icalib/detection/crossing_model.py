@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from icalib.detection.edge_model import solve_small
-from icalib.detection.saddles import LEAST_SINE, room_for, window_bounds, window_frame
+from icalib.detection.saddles import LEAST_SINE, MARGIN_BLURS, room_for, window_bounds, window_frame
 
 _ITERATIONS = 12
 _CONVERGED_PX = 2e-3
@@ -23,14 +23,16 @@ _SIZE = 6  # u, v, two angles, mean, contrast
 
 
 @njit(cache=True, nogil=True)
-def fit_crossing(image, u, v, ea, eb, clear, blur_a, blur_b, most_move):
+def fit_crossing(image, u, v, ea, eb, surroundings, blur_a, blur_b, most_move):
     """(u, v, sigma, contrast) of the X-corner near (u, v); sigma is NaN where there is none within `most_move` px.
 
-    ea, eb (2,) px are the sides of the dark square that meet in the corner, blur_a, blur_b [px] the blur across them;
-    `clear` is how far, in units of the sides, the nearest other feature is. sigma [px] is the standard deviation per
-    axis for a noise of one grey level, contrast the grey levels between dark and light.
+    ea, eb (2,) px are the sides of the dark square that meet in the corner, blur_a, blur_b [px] the blur across them.
+    `surroundings` (3,), in units of the sides: how far the nearest other feature is across either edge, and how far
+    from both edges at once features begin in the dark fields and in the white ones, inf if there are none. sigma [px]
+    is the standard deviation per axis for a noise of one grey level, contrast the grey levels between dark and light.
     """
-    sa, sb, sine = window_frame(ea, eb, clear, max(blur_a, blur_b), LEAST_WINDOW_PX)
+    blur = max(blur_a, blur_b)
+    sa, sb, sine = window_frame(ea, eb, surroundings[0], blur, LEAST_WINDOW_PX)
     room = room_for(image, u, v, ea, eb, sa, sb)
     narrow = min(sa * hypot(ea[0], ea[1]), sb * hypot(eb[0], eb[1])) * sine
     p, start_u, start_v = np.zeros(_SIZE), u, v
@@ -38,7 +40,10 @@ def fit_crossing(image, u, v, ea, eb, clear, blur_a, blur_b, most_move):
         return u, v, np.nan, 0.0
     sa, sb = room * sa, room * sb
     p[0], p[1], p[2], p[3] = u, v, atan2(ea[1], ea[0]), atan2(eb[1], eb[0])
-    xs, ys, grey = _window(image, u, v, ea, eb, sa, sb)
+    margin = MARGIN_BLURS * blur / (sine * hypot(ea[0], ea[1])), MARGIN_BLURS * blur / (sine * hypot(eb[0], eb[1]))
+    xs, ys, grey = _window(image, u, v, ea, eb, sa, sb, surroundings, margin)
+    if len(grey) < 2 * _SIZE:
+        return u, v, np.nan, 0.0
     p[4] = grey.mean()
     p[5] = 0.5 * (grey.max() - grey.min())
     turn = 1.0 if ea[0] * eb[1] - ea[1] * eb[0] > 0.0 else -1.0
@@ -58,8 +63,8 @@ def fit_crossing(image, u, v, ea, eb, clear, blur_a, blur_b, most_move):
 
 
 @njit(cache=True, nogil=True)
-def _window(image, u, v, ea, eb, sa, sb):
-    """(x (n,), y (n,), grey (n,)) of the pixels in the window."""
+def _window(image, u, v, ea, eb, sa, sb, surroundings, margin):
+    """(x (n,), y (n,), grey (n,)) of the pixels in the window, `margin` away from what lies in its fields."""
     u0, u1, v0, v1 = window_bounds(u, v, ea, eb, sa, sb)
     det = ea[0] * eb[1] - ea[1] * eb[0]
     m = (u1 - u0 + 1) * (v1 - v0 + 1)
@@ -68,7 +73,8 @@ def _window(image, u, v, ea, eb, sa, sb):
         for x in range(u0, u1 + 1):
             s = ((x - u) * eb[1] - (y - v) * eb[0]) / det
             t = (ea[0] * (y - v) - ea[1] * (x - u)) / det
-            if abs(s) <= sa and abs(t) <= sb:
+            inset = surroundings[1] if s * t > 0.0 else surroundings[2]
+            if abs(s) <= sa and abs(t) <= sb and (abs(s) <= inset - margin[0] or abs(t) <= inset - margin[1]):
                 xs[n], ys[n], grey[n] = x, y, image[y, x]
                 n += 1
     return xs[:n], ys[:n], grey[:n]

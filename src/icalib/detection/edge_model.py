@@ -13,7 +13,7 @@ from numba import njit
 
 _ITERATIONS = 10
 _CONVERGED_PX = 1e-3
-_END_PX = 3.0  # left out at both ends of a side, where the corner's blur bends the edge
+END_PX = 3.0  # left out at both ends of a side, where the corner's blur bends the edge
 _MOST_END = 0.25  # of the side
 _CURVED_FROM_PX = 40.0  # sides as long as that may be bent by the lens
 _BLUR_RANGE = (0.35, 6.0)
@@ -50,16 +50,17 @@ def solve_small(A, b):
 
 
 @njit(cache=True, nogil=True)
-def fit_step(image, u0, v0, u1, v1, half):
+def fit_step(image, u0, v0, u1, v1, end, half):
     """(place (3,), blur, contrast, variance (2,)) of the edge from (u0, v0) to (u1, v1), bright on its left.
 
     place are the coefficients of the offset [px] along the outward normal as a polynomial in the way along the side,
     -1 to 1; the last is zero for short sides. blur [px] is the Gaussian's. Pixels within `half` px of the side are
-    used. variance [px^2] is that of the offset at both ends for a noise of one grey level, NaN where there is no edge.
+    used, but not the last `end` px at both ends. variance [px^2] is that of the offset at both ends for a noise of one
+    grey level, NaN where there is no edge.
     """
     place, variance = np.zeros(3), np.full(2, np.nan)
     length = hypot(u1 - u0, v1 - v0)
-    end = min(_END_PX, _MOST_END * length)
+    end = min(end, _MOST_END * length)
     n_place = 3 if length >= _CURVED_FROM_PX else 2
     tu, tv = (u1 - u0) / length, (v1 - v0) / length
     cu, cv = 0.5 * (u0 + u1), 0.5 * (v0 + v1)
@@ -146,6 +147,13 @@ def _tangent(quad, k, place, u, v):
 
 
 @njit(cache=True, nogil=True)
+def _sine(quad, k):
+    """Of the angle between the sides that meet in corner k of the quad."""
+    a, b = quad[(k + 1) % 4] - quad[k], quad[(k + 3) % 4] - quad[k]
+    return abs(a[0] * b[1] - a[1] * b[0]) / max(hypot(a[0], a[1]) * hypot(b[0], b[1]), 1e-12)
+
+
+@njit(cache=True, nogil=True)
 def fit_corners(image, quad, half):
     """(corners (4, 2), sigma (4,), blur (4,)): the quad's corners where its fitted sides meet.
 
@@ -156,7 +164,10 @@ def fit_corners(image, quad, half):
     place, variance, side_blur = np.empty((4, 3)), np.empty((4, 2)), np.empty(4)
     for k in range(4):
         m = (k + 1) % 4
-        place[k], side_blur[k], _, variance[k] = fit_step(image, quad[k, 0], quad[k, 1], quad[m, 0], quad[m, 1], half)
+        end = END_PX / max(min(_sine(quad, k), _sine(quad, m)), _LEAST_SINE)
+        place[k], side_blur[k], _, variance[k] = fit_step(
+            image, quad[k, 0], quad[k, 1], quad[m, 0], quad[m, 1], end, half
+        )
     corners, sigma, blur = quad.copy(), np.full(4, np.nan), np.empty(4)
     for k in range(4):
         before = (k + 3) % 4

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from math import comb
 
 import numpy as np
 
 from icalib.detection.decoding import least_distance
 from icalib.detection.opencv import dictionary
 
-_BITS_PER_ERROR = 12  # one wrong bit is allowed for so many, where the family's distance allows it too
+_FALSE_ALARMS = 1e-3  # most of all random patterns that may be taken for a tag
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,15 @@ def tag_family(name: str) -> Family:
         for turn in range(4):
             codes[i, turn] = _packed(np.rot90(pattern, turn))
     correctable = (least_distance(codes) - 1) // 2
-    return Family(name, bits, codes, max(0, min(correctable, bits * bits // _BITS_PER_ERROR)))
+    return Family(name, bits, codes, min(correctable, _errors_allowed(4 * n, bits * bits)))
+
+
+def _errors_allowed(n_codes: int, n_cells: int) -> int:
+    """Most wrong cells with which at most `_FALSE_ALARMS` of all random patterns are taken for one of the codes."""
+    errors, accepted = 0, n_codes
+    while (accepted := accepted + n_codes * comb(n_cells, errors + 1)) <= _FALSE_ALARMS * 2.0**n_cells:
+        errors += 1
+    return errors
 
 
 def _packed(pattern: np.ndarray) -> np.uint64:

@@ -15,15 +15,16 @@ from icalib.detection.saddles import crossing_contrast, find_saddle
 from icalib.detection.tags import LEAST_CONTRAST, shortest_side
 
 _MOST_MOVE = 0.15  # of a side: how far a corner may lie from where it is expected
+_CLEAR = 0.5  # squares, from a corner to the nearest other feature: the next corner is as far from the same place
 _USUAL_BLUR = 0.7  # px, before it is measured
 
 
-def square_corners(image: np.ndarray, expected: np.ndarray, dark: np.ndarray, clear: float) -> ImageCorners:
+def square_corners(image: np.ndarray, expected: np.ndarray, dark: np.ndarray, inset: float) -> ImageCorners:
     """Inner corners of a board of `rows` x `cols` squares, numbered row by row, each refined and judged.
 
     image (h, w) uint8. expected (rows + 1, cols + 1, 2) px, all corners of the squares, right to some 0.15 squares; its
-    columns and rows turn with the clock in the image. dark (rows, cols) bool. `clear` is the distance of the nearest
-    other feature from a corner, in squares.
+    columns and rows turn with the clock in the image. dark (rows, cols) bool. `inset` is how far from
+    the edges of the white squares markers begin, in squares, inf without markers.
     """
     rows, cols = dark.shape
     uv, sigma, quality = np.zeros((rows + 1, cols + 1, 2)), np.full((rows + 1, cols + 1), np.nan), {}
@@ -33,8 +34,8 @@ def square_corners(image: np.ndarray, expected: np.ndarray, dark: np.ndarray, cl
     usable = np.array([shortest_side(quad) >= LEAST_SIDE_PX for quad in quads], dtype=bool)
     at, quads = at[usable], quads[usable]
     inner = ((at >= 1) & (at < [rows, cols])).all(axis=2)
-    quads, found = _roughly(image, quads, inner, clear)
-    fine, measures = refined_crossings(image, quads, clear)
+    quads, found = _roughly(image, quads, inner, min(inset, _CLEAR))
+    fine, measures = refined_crossings(image, quads, np.array([_CLEAR, np.inf, inset]))
     for i, k in zip(*np.nonzero(found & np.isfinite(measures[0])), strict=True):
         where = tuple(at[i, k])
         if not measures[0, i, k] >= sigma[where]:
