@@ -55,10 +55,7 @@ def no_corners() -> ImageCorners:
 def judged(
     point: np.ndarray,
     uv: np.ndarray,
-    unit_sigma: np.ndarray,
-    blur: np.ndarray,
-    sine: np.ndarray,
-    room_px: np.ndarray,
+    quality: np.ndarray,
     consistent: np.ndarray,
 ) -> ImageCorners:
     """Corners with sigma and verdict, by this rule; what is named first wins.
@@ -67,10 +64,9 @@ def judged(
     nearest other feature is less than 1.5 px + 1.5 blurs away, for L-corners 1.5 px + 2.25 blurs. faint: sigma is
     above 0.25 px.
 
-    All arguments (N,), but uv (N, 2): unit_sigma [px] is the standard deviation for a noise of one grey level, NaN
-    where nothing was found; sine is that of the angle between the edges; room_px by how much the distance to the
-    nearest other feature exceeds the bound above.
+    point (N,) int64; uv (N, 2) px; quality (5, N) as `refined_crossings` gives it; consistent (N,) bool.
     """
+    unit_sigma, blur, sine, room_px, _ = quality
     rows = np.flatnonzero(np.isfinite(unit_sigma))
     rows = rows[np.argsort(point[rows], kind="stable")]
     sigma = np.hypot(IMAGE_NOISE * unit_sigma[rows], MODEL_SIGMA_PX)

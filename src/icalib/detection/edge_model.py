@@ -6,7 +6,7 @@ ends is symmetric under blur, so its place is not biased, and neither is the poi
 
 from __future__ import annotations
 
-from math import erf, exp, hypot, sqrt
+from math import erf, exp, hypot, pi, sqrt
 
 import numpy as np
 from numba import njit
@@ -56,79 +56,81 @@ def fit_step(image, u0, v0, u1, v1, end, half):
     place are the coefficients of the offset [px] along the outward normal as a polynomial in the way along the side,
     -1 to 1; the last is zero for short sides. blur [px] is the Gaussian's. Pixels within `half` px of the side are
     used, but not the last `end` px at both ends. variance [px^2] is that of the offset at both ends for a noise of one
-    grey level, NaN where there is no edge.
+    grey level, NaN where there is no edge; contrast [grey levels] is zero there.
     """
-    place, variance = np.zeros(3), np.full(2, np.nan)
+    # Parameters: offset, slope, blur, low, high and, for a long side, bend.
+    p, variance = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), np.full(2, np.nan)
     length = hypot(u1 - u0, v1 - v0)
-    end = min(end, _MOST_END * length)
-    n_place = 3 if length >= _CURVED_FROM_PX else 2
+    size = 6 if length >= _CURVED_FROM_PX else 5
+    way, off, grey = _strip(image, u0, v0, u1, v1, 0.5 * length - min(end, _MOST_END * length), half)
+    dark, bright = off < -0.5 * half, off > 0.5 * half
+    if len(grey) < 2 * size or not dark.any() or not bright.any():
+        return np.zeros(3), p[2], 0.0, variance
+    p[3], p[4] = grey[dark].mean(), grey[bright].mean()
+    A = np.zeros((size, size))
+    for _ in range(_ITERATIONS):
+        step = solve_small(A, _accumulate(A, p, way, off, grey))
+        largest = max(abs(step[0]), abs(step[1]))
+        scale = min(1.0, 1.0 / max(largest, 1e-12))
+        blur = p[2] + scale * min(max(step[2], -0.5 * p[2]), p[2])
+        for k in range(size):
+            p[k] += step[k] if k == 3 or k == 4 else scale * step[k]
+        p[2] = min(max(blur, _BLUR_RANGE[0]), _BLUR_RANGE[1])
+        if abs(p[0]) + abs(p[1]) + abs(p[5]) > half + 1.0 or p[4] <= p[3]:
+            return np.zeros(3), p[2], 0.0, variance
+        if largest < _CONVERGED_PX and abs(step[2]) < 0.01:
+            break
+    for k in range(2):
+        at_end = np.zeros(6)
+        at_end[0], at_end[1], at_end[5] = 1.0, 2.0 * k - 1.0, 1.0
+        variance[k] = (at_end[:size] * solve_small(A, at_end[:size])).sum()
+    return np.array([p[0], p[1], p[5]]), p[2], p[4] - p[3], variance
+
+
+@njit(cache=True, nogil=True)
+def _strip(image, u0, v0, u1, v1, reach, half):
+    """(way, off, grey), each (n,), of the pixels within `reach` px along and `half` px across the side's middle.
+
+    way is -1 to 1 from end to end, off [px] is positive on the left. None where the strip leaves the image.
+    """
+    length = hypot(u1 - u0, v1 - v0)
     tu, tv = (u1 - u0) / length, (v1 - v0) / length
     cu, cv = 0.5 * (u0 + u1), 0.5 * (v0 + v1)
-    reach = 0.5 * length - end
     ru, rv = abs(tu) * reach + abs(tv) * half, abs(tv) * reach + abs(tu) * half
-    x0, x1 = int(np.ceil(cu - ru)), int(np.floor(cu + ru))
-    y0, y1 = int(np.ceil(cv - rv)), int(np.floor(cv + rv))
-    blur, low, high = 1.0, 0.0, 0.0
-    n_low, n_high, m = 0, 0, (x1 - x0 + 1) * (y1 - y0 + 1)
-    if min(x0, y0) < 0 or x1 > image.shape[1] - 1 or y1 > image.shape[0] - 1 or m <= 0:
-        return place, blur, 0.0, variance
-    way, off, grey = np.empty(m), np.empty(m), np.empty(m)
-    n = 0
+    if not (cu - ru > 0.0 and cv - rv > 0.0 and cu + ru < image.shape[1] - 1.0 and cv + rv < image.shape[0] - 1.0):
+        return np.empty(0), np.empty(0), np.empty(0)
+    x0, x1, y0, y1 = int(np.ceil(cu - ru)), int(cu + ru), int(np.ceil(cv - rv)), int(cv + rv)
+    m = (x1 - x0 + 1) * (y1 - y0 + 1)
+    way, off, grey, n = np.empty(m), np.empty(m), np.empty(m), 0
     for y in range(y0, y1 + 1):
         for x in range(x0, x1 + 1):
             t, d = (x - cu) * tu + (y - cv) * tv, (x - cu) * tv - (y - cv) * tu
             if abs(t) <= reach and abs(d) <= half:
                 way[n], off[n], grey[n] = t / (0.5 * length), d, image[y, x]
-                if d < -0.5 * half:
-                    low, n_low = low + grey[n], n_low + 1
-                elif d > 0.5 * half:
-                    high, n_high = high + grey[n], n_high + 1
                 n += 1
-    if n_low == 0 or n_high == 0 or n < 12:
-        return place, blur, 0.0, variance
-    low, high = low / n_low, high / n_high
-    size = 3 + n_place
-    A, b, J = np.zeros((size, size)), np.zeros(size), np.zeros(size)
-    for _ in range(_ITERATIONS):
-        A[:], b[:] = 0.0, 0.0
-        for i in range(n):
-            d = off[i] - place[0] - way[i] * (place[1] + way[i] * place[2])
-            z = d / blur
-            share = 0.5 * (1.0 + erf(z / sqrt(2.0)))
-            slope = (high - low) * exp(-0.5 * z * z) / (sqrt(2.0 * np.pi) * blur)
-            J[0], J[1], J[2] = -slope, -slope * way[i], -slope * z
-            J[3], J[4] = 1.0 - share, share
-            if n_place == 3:
-                J[5] = -slope * way[i] * way[i]
-            error = grey[i] - low - (high - low) * share
-            for p in range(size):
-                b[p] += J[p] * error
-                for q in range(p + 1):
-                    A[p, q] += J[p] * J[q]
-        for p in range(size):
-            A[p, p] *= 1.0 + 1e-9
-            for q in range(p):
-                A[q, p] = A[p, q]
-        step = solve_small(A, b)
-        largest = max(abs(step[0]), abs(step[1]))
-        scale = min(1.0, 1.0 / max(largest, 1e-12))
-        place[0] += scale * step[0]
-        place[1] += scale * step[1]
-        blur = min(max(blur + scale * min(max(step[2], -0.5 * blur), blur), _BLUR_RANGE[0]), _BLUR_RANGE[1])
-        low, high = low + step[3], high + step[4]
-        if n_place == 3:
-            place[2] += scale * step[5]
-        if abs(place[0]) + abs(place[1]) + abs(place[2]) > half + 1.0 or high <= low:
-            return place, blur, 0.0, variance
-        if largest < _CONVERGED_PX and abs(step[2]) < 0.01:
-            break
-    for k in range(2):
-        at_end = np.zeros(size)
-        at_end[0], at_end[1] = 1.0, 2.0 * k - 1.0
-        if n_place == 3:
-            at_end[5] = 1.0
-        variance[k] = (at_end * solve_small(A, at_end)).sum()
-    return place, blur, high - low, variance
+    return way[:n], off[:n], grey[:n]
+
+
+@njit(cache=True, nogil=True)
+def _accumulate(A, p, way, off, grey):
+    """Normal equations of the step at its parameters p (6,): A (5, 5) or (6, 6) is filled, the right side returned."""
+    size, contrast, blur = len(A), p[4] - p[3], p[2]
+    b, J = np.zeros(size), np.empty(6)
+    A[:] = 0.0
+    for i in range(len(grey)):
+        z = (off[i] - p[0] - way[i] * (p[1] + way[i] * p[5])) / blur
+        share = 0.5 * (1.0 + erf(z / sqrt(2.0)))
+        slope = contrast * exp(-0.5 * z * z) / (sqrt(2.0 * pi) * blur)
+        J[0], J[1], J[2] = -slope, -slope * way[i], -slope * z
+        J[3], J[4], J[5] = 1.0 - share, share, -slope * way[i] * way[i]
+        error = grey[i] - p[3] - contrast * share
+        for j in range(size):
+            b[j] += J[j] * error
+            for k in range(j + 1):
+                A[j, k] += J[j] * J[k]
+    for j in range(size):
+        A[j, j] *= 1.0 + 1e-9
+    return b
 
 
 @njit(cache=True, nogil=True)

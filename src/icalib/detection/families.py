@@ -42,7 +42,7 @@ def tag_family(name: str) -> Family:
         pattern = source.generateImageMarker(i, bits + 2, None, 1)[1:-1, 1:-1] > 127
         for turn in range(4):
             codes[i, turn] = _packed(np.rot90(pattern, turn))
-    correctable = (least_distance(codes) - 1) // 2
+    correctable = (int(least_distance(codes)) - 1) // 2
     return Family(name, bits, codes, min(correctable, _errors_allowed(4 * n, bits * bits)))
 
 

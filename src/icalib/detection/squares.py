@@ -50,7 +50,7 @@ def _judged(uv: np.ndarray, quality: dict, shape: tuple[int, int]) -> ImageCorne
     board = where[:, ::-1].astype(np.float64)
     consistent = consistent_corners(found, board, np.ones(len(where), dtype=bool), measures[4])
     point = (where[:, 0] - 1) * (shape[1] - 1) + where[:, 1] - 1
-    return judged(point, found, *measures[:4], consistent)
+    return judged(point, found, measures, consistent)
 
 
 @njit(cache=True, nogil=True)
