@@ -24,7 +24,7 @@ LEVELS = {
     "rig_parameters": 2,
     "rig_file": 3,
     "recordings": 2,
-    "detection": 2,
+    "detection": 3,
     "simulation": 2,
     "estimation": 3,
     "first_guess": 4,

@@ -1,0 +1,102 @@
+"""AprilGrid: tags found, grown over the grid, corners refined and compared with their neighbours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from icalib.detection.consistency import consistent_corners, largest_group
+from icalib.detection.corners import ImageCorners, checked_image, judged, no_corners
+from icalib.detection.families import Family, tag_family
+from icalib.detection.growth import grow
+from icalib.detection.markers import APRILTAG_CORNER
+from icalib.detection.quads import threshold_windows
+from icalib.detection.refinement import refined_corners, refined_crossings
+from icalib.detection.tags import Tags, find_tags
+from icalib.errors import RecordingError
+
+_ON_BOARD = np.array([(1.0, 0.0), (0.0, 0.0), (0.0, 1.0), (1.0, 1.0)])  # corners in OpenCV's order, tag sizes
+
+
+@dataclass(frozen=True)
+class AprilGridDetector:
+    """Finds the corners of an AprilGrid of `rows` x `cols` tags with gaps of `tag_spacing` tag sizes.
+
+    `border_bits` is the width of the tags' black border in cells: 2 for Kalibr's grids, 1 for plain tags. `squares`
+    says whether black squares fill the gaps between the tags' corners, as on Kalibr's grids. Raises RecordingError for
+    a family that is not known or has too few ids.
+    """
+
+    rows: int
+    cols: int
+    tag_spacing: float
+    family: str = "tag36h11"
+    border_bits: int = 2
+    squares: bool = True
+
+    def __post_init__(self) -> None:
+        n = len(self._family.codes)
+        if self.rows * self.cols > n:
+            raise RecordingError(
+                f"an AprilGrid of {self.rows} x {self.cols} tags needs more ids than {self.family} has ({n}); "
+                "check rows, cols and family."
+            )
+
+    @cached_property
+    def _family(self) -> Family:
+        return tag_family(self.family)
+
+    @cached_property
+    def _board(self) -> np.ndarray:
+        """(n, 4, 2) corners in OpenCV's order, in tag sizes."""
+        row, col = np.divmod(np.arange(self.rows * self.cols), self.cols)
+        return (1.0 + self.tag_spacing) * np.stack([col, row], axis=1)[:, None, :] + _ON_BOARD
+
+    @property
+    def _border(self) -> float:
+        """Width of the border in tag sizes."""
+        return self.border_bits / (self._family.bits + 2 * self.border_bits)
+
+    @property
+    def _clear(self) -> float:
+        """Distance from a corner to the nearest other feature, in tag sizes."""
+        return min(self._border, self.tag_spacing)
+
+    def detect(self, image: np.ndarray) -> ImageCorners:
+        """The grid's corners in the image (h, w) uint8, corner c of tag i as point 4 i + c.
+
+        Raises RecordingError for an image that is not grey with 8 bits.
+        """
+        image = checked_image(image)
+        for window in threshold_windows(image.shape[1]):
+            for separate in (True, False):
+                tags = find_tags(image, self._family, self.border_bits, window, separate)
+                known, quads = self._seeds(tags)
+                if known.any():
+                    return self._corners(image, known, quads)
+        return no_corners()
+
+    def _seeds(self, tags: Tags) -> tuple[np.ndarray, np.ndarray]:
+        """(known (n,) bool, quads (n, 4, 2)) of the tags on the board that agree on where it is."""
+        n = self.rows * self.cols
+        known, quads = np.zeros(n, dtype=bool), np.zeros((n, 4, 2))
+        ids, count = np.unique(tags.ids, return_counts=True)
+        for tag in ids[(count == 1) & (ids < n)]:
+            known[tag], quads[tag] = True, tags.quads[tags.ids == tag][0]
+        return largest_group(known, quads, self._board), quads
+
+    def _corners(self, image: np.ndarray, known: np.ndarray, quads: np.ndarray) -> ImageCorners:
+        patterns = np.ascontiguousarray(self._family.codes[: len(known), 0])
+        cells = (patterns, self._family.bits, self.border_bits)
+        grow(image, known, quads, self._board, self.cols, *cells, self._clear, self.squares)
+        tags = np.flatnonzero(known)
+        if self.squares:
+            uv, quality = refined_crossings(image, quads[tags], np.array([self.tag_spacing, self._border, np.inf]))
+        else:
+            uv, quality = refined_corners(image, quads[tags], self._clear)
+        uv, quality = uv.reshape(-1, 2), quality.reshape(5, -1)
+        point = (4 * tags[:, None] + APRILTAG_CORNER).ravel()
+        consistent = consistent_corners(uv, self._board[tags].reshape(-1, 2), np.isfinite(quality[0]), quality[4])
+        return judged(point, uv, quality, consistent)

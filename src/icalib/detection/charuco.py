@@ -1,0 +1,98 @@
+"""ChArUco boards: markers say which corner is which, the squares' corners are measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from icalib.detection.consistency import largest_group
+from icalib.detection.corners import ImageCorners, checked_image, no_corners
+from icalib.detection.decoding import mapped
+from icalib.detection.families import Family, tag_family
+from icalib.detection.growth import fit_homography
+from icalib.detection.markers import all_tags
+from icalib.detection.squares import square_corners
+from icalib.errors import RecordingError
+
+_NEAREST = 4  # markers that predict a corner
+_LEAST_MARKERS = 2  # that agree: small dictionaries are sometimes read where there is nothing
+
+
+@dataclass(frozen=True)
+class CharucoDetector:
+    """Finds the inner corners of a ChArUco board of `rows` x `cols` squares, the white ones with markers.
+
+    The markers' edges are `marker_ratio` squares long; `family` is their dictionary, with ids from 0 row by row, as
+    OpenCV numbers them. `legacy` is OpenCV's pattern before 4.6, which differs where the number of rows is even. Raises
+    RecordingError for a board that cannot be.
+    """
+
+    rows: int
+    cols: int
+    marker_ratio: float
+    family: str
+    legacy: bool = False
+
+    def __post_init__(self) -> None:
+        n, has = len(self._markers), len(self._family.codes)
+        if n > has:
+            raise RecordingError(
+                f"a ChArUco board of {self.rows} x {self.cols} squares needs {n} markers and {self.family} has {has}; "
+                "check rows, cols and family."
+            )
+        if not 0.0 < self.marker_ratio < 1.0:
+            raise RecordingError(
+                f"marker_ratio is {self.marker_ratio:g}; give the marker's edge divided by the square's, 0 to 1."
+            )
+
+    @cached_property
+    def _family(self) -> Family:
+        return tag_family(self.family)
+
+    @cached_property
+    def _dark(self) -> np.ndarray:
+        """(rows, cols) bool."""
+        row, col = np.indices((self.rows, self.cols))
+        return (row + col + int(self.legacy and self.rows % 2 == 0)) % 2 == 0
+
+    @cached_property
+    def _markers(self) -> np.ndarray:
+        """(n, 4, 2) corners of the markers in squares, clockwise from the top left; x to the right, y down."""
+        row, col = np.nonzero(~self._dark)
+        margin = 0.5 * (1.0 - self.marker_ratio)
+        unit = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
+        return np.stack([col, row], axis=1)[:, None, :] + margin + self.marker_ratio * unit
+
+    def detect(self, image: np.ndarray) -> ImageCorners:
+        """The board's inner corners in the image (h, w) uint8, numbered row by row from the top left, as OpenCV does.
+
+        Raises RecordingError for an image that is not grey with 8 bits.
+        """
+        image = checked_image(image)
+        n = len(self._markers)
+        known, quads = np.zeros(n, dtype=bool), np.zeros((n, 4, 2))
+        tags = all_tags(image, self._family, 1)
+        ids, count = np.unique(tags.ids, return_counts=True)
+        for tag in ids[(count == 1) & (ids < n)]:
+            known[tag], quads[tag] = True, tags.quads[tags.ids == tag][0]
+        known = largest_group(known, quads, self._markers / self.marker_ratio)
+        if known.sum() < _LEAST_MARKERS:
+            return no_corners()
+        expected = self._expected(self._markers[known], quads[known])
+        return square_corners(image, expected, self._dark, 0.5 * (1.0 - self.marker_ratio))
+
+    def _expected(self, markers: np.ndarray, quads: np.ndarray) -> np.ndarray:
+        """(rows + 1, cols + 1, 2) px, the squares' corners where the nearest markers found place them.
+
+        markers (m, 4, 2) in squares, quads (m, 4, 2) px.
+        """
+        out = np.empty((self.rows + 1, self.cols + 1, 2))
+        centers = markers.mean(axis=1)
+        for row in range(self.rows + 1):
+            for col in range(self.cols + 1):
+                near = np.argsort(((centers - (col, row)) ** 2).sum(axis=1), kind="stable")[:_NEAREST]
+                xy, uv = markers[near].reshape(-1, 2), quads[near].reshape(-1, 2)
+                out[row, col] = mapped(fit_homography(xy, uv, len(xy)), float(col), float(row))
+        return out

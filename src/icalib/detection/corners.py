@@ -1,0 +1,107 @@
+"""What a detector gives for one image, and the rule by which corners are dropped."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.errors import RecordingError
+from icalib.measurements import CornerStream
+
+IMAGE_NOISE = 2.0  # grey levels, assumed of every image: the sigmas are right up to this common factor
+MODEL_SIGMA_PX = 0.02  # what sampling, printing and the lens add to the noise's share
+MOST_SIGMA_PX = 0.25
+LEAST_ANGLE_DEG = 15.0  # between the edges that meet in a corner
+
+VERDICTS = ("kept", "faint", "blurred", "oblique", "inconsistent")
+KEPT, FAINT, BLURRED, OBLIQUE, INCONSISTENT = range(5)
+
+
+@dataclass(frozen=True)
+class ImageCorners:
+    """Corners of the target in one image, those that were dropped among them, in the order of `point`.
+
+    point (N,) int64, index into the target's points, each at most once; uv (N, 2) px, (0, 0) is the centre of the
+    top-left pixel; sigma (N,) px, the expected standard deviation per axis; blur (N,) px, of a Gaussian;
+    verdict (N,) int8, index into `VERDICTS`.
+    """
+
+    point: np.ndarray
+    uv: np.ndarray
+    sigma: np.ndarray
+    blur: np.ndarray
+    verdict: np.ndarray
+
+    @property
+    def kept(self) -> np.ndarray:
+        """(N,) bool."""
+        return self.verdict == KEPT
+
+    def counts(self) -> dict[str, int]:
+        """How many corners have each verdict of `VERDICTS`."""
+        return {name: int((self.verdict == k).sum()) for k, name in enumerate(VERDICTS)}
+
+
+def no_corners() -> ImageCorners:
+    """An image in which nothing was found."""
+    nothing = np.zeros(0)
+    return ImageCorners(
+        nothing.astype(np.int64), np.zeros((0, 2)), nothing.copy(), nothing.copy(), nothing.astype(np.int8)
+    )
+
+
+def judged(
+    point: np.ndarray,
+    uv: np.ndarray,
+    quality: np.ndarray,
+    consistent: np.ndarray,
+) -> ImageCorners:
+    """Corners with sigma and verdict, by this rule; what is named first wins.
+
+    inconsistent: not where the neighbours place it. oblique: its edges meet at less than 15 degrees. blurred: the
+    nearest other feature is less than 1.5 px + 1.5 blurs away, for L-corners 1.5 px + 2.25 blurs. faint: sigma is
+    above 0.25 px.
+
+    point (N,) int64; uv (N, 2) px; quality (5, N) as `refined_crossings` gives it; consistent (N,) bool.
+    """
+    unit_sigma, blur, sine, room_px, _ = quality
+    rows = np.flatnonzero(np.isfinite(unit_sigma))
+    rows = rows[np.argsort(point[rows], kind="stable")]
+    sigma = np.hypot(IMAGE_NOISE * unit_sigma[rows], MODEL_SIGMA_PX)
+    verdict = np.full(len(rows), KEPT, dtype=np.int8)
+    verdict[sigma > MOST_SIGMA_PX] = FAINT
+    verdict[~(room_px[rows] >= 0.0)] = BLURRED
+    verdict[sine[rows] < np.sin(np.radians(LEAST_ANGLE_DEG))] = OBLIQUE
+    verdict[~consistent[rows]] = INCONSISTENT
+    return ImageCorners(point[rows].astype(np.int64), uv[rows], sigma, blur[rows], verdict)
+
+
+def corner_stream(name: str, stamps_ns: np.ndarray, images: Sequence[ImageCorners]) -> CornerStream:
+    """The corners that were kept, of the images of camera `name` taken at stamps_ns (M,) int64, strictly increasing.
+
+    Raises RecordingError where the stamps do not increase, or their number is not that of the images.
+    """
+    stamps_ns = np.asarray(stamps_ns, dtype=np.int64)
+    if len(stamps_ns) != len(images):
+        raise RecordingError(f"{name}: {len(images)} images have {len(stamps_ns)} stamps; give one for each.")
+    if (np.diff(stamps_ns) <= 0).any():
+        row = int(np.argmax(np.diff(stamps_ns) <= 0)) + 1
+        raise RecordingError(
+            f"{name}: the image at {stamps_ns[row]} ns does not come after the one at {stamps_ns[row - 1]} ns; "
+            "sort the images by stamp and remove repeated ones."
+        )
+    start = np.concatenate([[0], np.cumsum([int(image.kept.sum()) for image in images])]).astype(np.int64)
+    point = np.concatenate([np.zeros(0, dtype=np.int64)] + [image.point[image.kept] for image in images])
+    uv = np.concatenate([np.zeros((0, 2))] + [image.uv[image.kept] for image in images])
+    return CornerStream(name, stamps_ns, start, point, uv)
+
+
+def checked_image(image: np.ndarray) -> np.ndarray:
+    """The image as contiguous (h, w) uint8. Raises RecordingError for anything else than a grey image of 8 bits."""
+    if image.ndim != 2 or image.dtype != np.uint8:
+        raise RecordingError(
+            f"an image has shape {image.shape} and type {image.dtype}; convert it to grey levels, (h, w) uint8."
+        )
+    return np.ascontiguousarray(image)

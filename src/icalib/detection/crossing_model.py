@@ -1,0 +1,120 @@
+"""Kernel that places an X-corner, where two dark squares touch: two crossing blurred steps are fitted to its pixels.
+
+An X-corner is point symmetric, however blurred, however oblique and whatever the camera's response to light, and so is
+the model: what the model lacks cannot bias the point, as long as nothing else reaches into the window. The gradients
+alone would not do: where the window is not much wider than the blur, they point away from the corner.
+"""
+
+from __future__ import annotations
+
+from math import atan2, cos, erf, exp, hypot, pi, sin, sqrt
+
+import numpy as np
+from numba import njit
+
+from icalib.detection.edge_model import solve_small
+from icalib.detection.saddles import LEAST_SINE, MARGIN_BLURS, room_for, window_bounds, window_frame
+
+_ITERATIONS = 12
+_CONVERGED_PX = 2e-3
+_MOST_STEP_PX = 0.7
+LEAST_WINDOW_PX = 1.5  # half a window's width across the edges
+_SIZE = 6  # u, v, two angles, mean, contrast
+
+
+@njit(cache=True, nogil=True)
+def fit_crossing(image, u, v, ea, eb, surroundings, blur_a, blur_b, most_move):
+    """(u, v, sigma, contrast) of the X-corner near (u, v); sigma is NaN where there is none within `most_move` px.
+
+    ea, eb (2,) px are the sides of the dark square that meet in the corner, blur_a, blur_b [px] the blur across them.
+    `surroundings` (3,), in units of the sides: how far the nearest other feature is across either edge, and how far
+    from both edges at once features begin in the dark fields and in the white ones, inf if there are none. sigma [px]
+    is the standard deviation per axis for a noise of one grey level, contrast the grey levels between dark and light.
+    """
+    blur = max(blur_a, blur_b)
+    sa, sb, sine = window_frame(ea, eb, surroundings[0], blur, LEAST_WINDOW_PX)
+    room = room_for(image, u, v, ea, eb, sa, sb)
+    narrow = min(sa * hypot(ea[0], ea[1]), sb * hypot(eb[0], eb[1])) * sine
+    p, start_u, start_v = np.zeros(_SIZE), u, v
+    if sine < LEAST_SINE or room * narrow < 0.99 * LEAST_WINDOW_PX:
+        return u, v, np.nan, 0.0
+    sa, sb = room * sa, room * sb
+    p[0], p[1], p[2], p[3] = u, v, atan2(ea[1], ea[0]), atan2(eb[1], eb[0])
+    margin = MARGIN_BLURS * blur / (sine * hypot(ea[0], ea[1])), MARGIN_BLURS * blur / (sine * hypot(eb[0], eb[1]))
+    xs, ys, grey = _window(image, u, v, ea, eb, sa, sb, surroundings, margin)
+    if len(grey) < 2 * _SIZE:
+        return u, v, np.nan, 0.0
+    p[4] = grey.mean()
+    p[5] = 0.5 * (grey.max() - grey.min())
+    turn = 1.0 if ea[0] * eb[1] - ea[1] * eb[0] > 0.0 else -1.0
+    A = np.zeros((_SIZE, _SIZE))
+    for _ in range(_ITERATIONS):
+        b = _accumulate(A, p, xs, ys, grey, turn, blur_a, blur_b)
+        step = solve_small(A, b)
+        largest = hypot(step[0], step[1])
+        scale = min(1.0, _MOST_STEP_PX / max(largest, 1e-12))
+        for k in range(_SIZE):
+            p[k] += scale * step[k]
+        if hypot(p[0] - start_u, p[1] - start_v) > most_move or p[5] <= 0.0:
+            return u, v, np.nan, 0.0
+        if largest < _CONVERGED_PX:
+            return p[0], p[1], _sigma(A), 2.0 * p[5]
+    return u, v, np.nan, 0.0
+
+
+@njit(cache=True, nogil=True)
+def _window(image, u, v, ea, eb, sa, sb, surroundings, margin):
+    """(x (n,), y (n,), grey (n,)) of the pixels in the window, `margin` away from what lies in its fields."""
+    u0, u1, v0, v1 = window_bounds(u, v, ea, eb, sa, sb)
+    det = ea[0] * eb[1] - ea[1] * eb[0]
+    m = (u1 - u0 + 1) * (v1 - v0 + 1)
+    xs, ys, grey, n = np.empty(m), np.empty(m), np.empty(m), 0
+    for y in range(v0, v1 + 1):
+        for x in range(u0, u1 + 1):
+            s = ((x - u) * eb[1] - (y - v) * eb[0]) / det
+            t = (ea[0] * (y - v) - ea[1] * (x - u)) / det
+            inset = surroundings[1] if s * t > 0.0 else surroundings[2]
+            if abs(s) <= sa and abs(t) <= sb and (abs(s) <= inset - margin[0] or abs(t) <= inset - margin[1]):
+                xs[n], ys[n], grey[n] = x, y, image[y, x]
+                n += 1
+    return xs[:n], ys[:n], grey[:n]
+
+
+@njit(cache=True, nogil=True)
+def _accumulate(A, p, xs, ys, grey, turn, blur_a, blur_b):
+    """Normal equations of the model at p: A is filled, the right side is returned."""
+    A[:] = 0.0
+    b, J = np.zeros(_SIZE), np.empty(_SIZE)
+    cos_a, sin_a, cos_b, sin_b = cos(p[2]), sin(p[2]), cos(p[3]), sin(p[3])
+    for i in range(len(xs)):
+        x, y = xs[i] - p[0], ys[i] - p[1]
+        # Distance from the edge along ea towards eb, and from the one along eb towards ea.
+        la, lb = turn * (cos_a * y - sin_a * x), turn * (sin_b * x - cos_b * y)
+        za, zb = la / (sqrt(2.0) * blur_a), lb / (sqrt(2.0) * blur_b)
+        Ea, Eb = erf(za), erf(zb)
+        da = -p[5] * Eb * 2.0 / sqrt(pi) * exp(-za * za) / (sqrt(2.0) * blur_a)
+        db = -p[5] * Ea * 2.0 / sqrt(pi) * exp(-zb * zb) / (sqrt(2.0) * blur_b)
+        J[0] = turn * (da * sin_a - db * sin_b)
+        J[1] = turn * (db * cos_b - da * cos_a)
+        J[2] = -turn * da * (sin_a * y + cos_a * x)
+        J[3] = turn * db * (cos_b * x + sin_b * y)
+        J[4], J[5] = 1.0, -Ea * Eb
+        error = grey[i] - p[4] + p[5] * Ea * Eb
+        for j in range(_SIZE):
+            b[j] += J[j] * error
+            for k in range(j + 1):
+                A[j, k] += J[j] * J[k]
+    for j in range(_SIZE):
+        A[j, j] *= 1.0 + 1e-9
+    return b
+
+
+@njit(cache=True, nogil=True)
+def _sigma(A):
+    """Standard deviation per axis of the point: the root of half the trace of its 2 x 2 block of A^-1."""
+    variance = 0.0
+    for k in range(2):
+        unit = np.zeros(_SIZE)
+        unit[k] = 1.0
+        variance += 0.5 * solve_small(A, unit)[k]
+    return sqrt(variance) if variance > 0.0 else np.nan

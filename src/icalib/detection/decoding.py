@@ -1,0 +1,165 @@
+"""Kernels that read the cells of a tag through a homography and look its pattern up."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+_M1, _M2, _M4 = np.uint64(0x5555555555555555), np.uint64(0x3333333333333333), np.uint64(0x0F0F0F0F0F0F0F0F)
+_SUM, _ONE, _TWO, _FOUR, _TOP = np.uint64(0x0101010101010101), np.uint64(1), np.uint64(2), np.uint64(4), np.uint64(56)
+_SPREAD = 0.2  # of a cell, between its centre and the other places where it is sampled
+_SHARPEN = 0.25  # times the Laplacian over cells, against the blur of small tags
+
+
+@njit(cache=True, nogil=True)
+def popcount(x):
+    """Number of ones in a uint64."""
+    x = x - ((x >> _ONE) & _M1)
+    x = (x & _M2) + ((x >> _TWO) & _M2)
+    x = (x + (x >> _FOUR)) & _M4
+    return np.int64((x * _SUM) >> _TOP)
+
+
+@njit(cache=True, nogil=True)
+def least_distance(codes):
+    """Least number of cells by which two of the patterns (n, 4) uint64 differ, a pattern and its own turns included."""
+    least = 64
+    for i in range(len(codes)):
+        for j in range(i, len(codes)):
+            for turn in range(4):
+                if (i != j or turn > 0) and codes[i, 0] != codes[j, turn]:
+                    least = min(least, popcount(codes[i, 0] ^ codes[j, turn]))
+    return least
+
+
+@njit(cache=True, nogil=True)
+def lookup(code, codes):
+    """(id, turn, wrong cells) of the pattern nearest to `code` (uint64)."""
+    best, best_id, best_turn = 65, -1, 0
+    for i in range(len(codes)):
+        for turn in range(4):
+            distance = popcount(code ^ codes[i, turn])
+            if distance < best:
+                best, best_id, best_turn = distance, i, turn
+    return best_id, best_turn, best
+
+
+@njit(cache=True, nogil=True)
+def bilinear(image, u, v):
+    """Grey at (u, v), which must lie at least within the outermost pixel centres."""
+    x, y = int(u), int(v)
+    x, y = min(x, image.shape[1] - 2), min(y, image.shape[0] - 2)
+    a, b = u - x, v - y
+    top = (1.0 - a) * image[y, x] + a * image[y, x + 1]
+    low = (1.0 - a) * image[y + 1, x] + a * image[y + 1, x + 1]
+    return (1.0 - b) * top + b * low
+
+
+@njit(cache=True, nogil=True)
+def unit_homography(quad):
+    """(3, 3) H from the unit square (0,0), (1,0), (1,1), (0,1) to the quad (4, 2)."""
+    x0, y0, x1, y1 = quad[0, 0], quad[0, 1], quad[1, 0], quad[1, 1]
+    x2, y2, x3, y3 = quad[2, 0], quad[2, 1], quad[3, 0], quad[3, 1]
+    dx1, dx2, sx = x1 - x2, x3 - x2, x0 - x1 + x2 - x3
+    dy1, dy2, sy = y1 - y2, y3 - y2, y0 - y1 + y2 - y3
+    det = dx1 * dy2 - dx2 * dy1
+    H = np.zeros((3, 3))
+    if det == 0.0:
+        return H
+    g, h = (sx * dy2 - dx2 * sy) / det, (dx1 * sy - sx * dy1) / det
+    H[0, 0], H[0, 1], H[0, 2] = x1 - x0 + g * x1, x3 - x0 + h * x3, x0
+    H[1, 0], H[1, 1], H[1, 2] = y1 - y0 + g * y1, y3 - y0 + h * y3, y0
+    H[2, 0], H[2, 1], H[2, 2] = g, h, 1.0
+    return H
+
+
+@njit(cache=True, nogil=True)
+def mapped(H, x, y):
+    """(u, v) of the point (x, y) under H; far outside every image where the point has no picture."""
+    w = H[2, 0] * x + H[2, 1] * y + H[2, 2]
+    if w <= 1e-9:
+        return -1e9, -1e9
+    return (H[0, 0] * x + H[0, 1] * y + H[0, 2]) / w, (H[1, 0] * x + H[1, 1] * y + H[1, 2]) / w
+
+
+@njit(cache=True, nogil=True)
+def _sample(image, H, x, y, spread):
+    """Mean grey of five places about (x, y), NaN where one is outside the image."""
+    total = 0.0
+    for k in range(5):
+        dx = spread * ((k == 1) - (k == 2))
+        dy = spread * ((k == 3) - (k == 4))
+        u, v = mapped(H, x + dx, y + dy)
+        if not (0.0 <= u <= image.shape[1] - 1.0 and 0.0 <= v <= image.shape[0] - 1.0):
+            return np.nan
+        total += bilinear(image, u, v)
+    return total / 5.0
+
+
+@njit(cache=True, nogil=True)
+def cell_greys(image, H, n):
+    """(n + 2, n + 2) greys of the n x n cells of a tag and of the ring around it; NaN outside the image.
+
+    H takes the unit square to the tag. The ring is sampled half a cell outside the tag's edge.
+    """
+    grey = np.empty((n + 2, n + 2))
+    for row in range(n + 2):
+        for col in range(n + 2):
+            grey[row, col] = _sample(image, H, (col - 0.5) / n, (row - 0.5) / n, _SPREAD / n)
+    return grey
+
+
+@njit(cache=True, nogil=True)
+def levels(grey, border):
+    """(black, white): mean of the cells of the border, `border` cells wide, and of the ring without its corners."""
+    n = len(grey) - 2
+    black, n_black, white, n_white = 0.0, 0, 0.0, 0
+    for row in range(n + 2):
+        for col in range(n + 2):
+            value = grey[row, col]
+            depth = min(min(row, col), min(n + 1 - row, n + 1 - col))
+            if np.isnan(value):
+                continue
+            if depth == 0 and 1 < row + col < 2 * n + 1 and abs(row - col) < n:
+                white += value
+                n_white += 1
+            elif 1 <= depth <= border:
+                black += value
+                n_black += 1
+    if n_black == 0 or n_white == 0:
+        return 0.0, 0.0
+    return black / n_black, white / n_white
+
+
+@njit(cache=True, nogil=True)
+def _sharpened(grey, row, col):
+    value, total = grey[row, col], 0.0
+    total = grey[row - 1, col] + grey[row + 1, col] + grey[row, col - 1] + grey[row, col + 1]
+    return value if np.isnan(total) else value + _SHARPEN * (4.0 * value - total)
+
+
+@njit(cache=True, nogil=True)
+def read_cells(grey, border, threshold):
+    """(code, cells of the border that are not black): the data cells as uint64, an unseen cell counted as black."""
+    n = len(grey) - 2
+    code, wrong = np.uint64(0), 0
+    for row in range(1, n + 1):
+        for col in range(1, n + 1):
+            white = _sharpened(grey, row, col) > threshold
+            depth = min(min(row, col), min(n + 1 - row, n + 1 - col))
+            if depth > border:
+                code = (code << _ONE) | (_ONE if white else np.uint64(0))
+            elif white:
+                wrong += 1
+    return code, wrong
+
+
+@njit(cache=True, nogil=True)
+def seen_cells(grey, border):
+    """uint64 with a one for each data cell that lies inside the image, packed as `read_cells` packs them."""
+    n = len(grey) - 2
+    seen = np.uint64(0)
+    for row in range(border + 1, n + 1 - border):
+        for col in range(border + 1, n + 1 - border):
+            seen = (seen << _ONE) | (np.uint64(0) if np.isnan(grey[row, col]) else _ONE)
+    return seen

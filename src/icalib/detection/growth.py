@@ -1,0 +1,171 @@
+"""Kernels that find the tags of a grid from those already found: each is looked for where its neighbours predict it."""
+
+from __future__ import annotations
+
+from math import hypot
+
+import numpy as np
+from numba import njit
+
+from icalib.detection.decoding import cell_greys, levels, mapped, popcount, read_cells, seen_cells, unit_homography
+from icalib.detection.edge_model import solve_small
+from icalib.detection.edges import fit_quad
+from icalib.detection.saddles import crossing_contrast, find_saddle
+from icalib.detection.tags import LEAST_CONTRAST, shortest_side
+
+_NEIGHBOURS = 3  # tags that predict another, none further than two tags away
+_LEAST_SEEN = 12  # data cells of a tag that the image cuts
+_WRONG_CELLS = 0.15  # of the cells seen: the pattern is known, so many may be wrong
+_LEAST_RISE = 4.0  # grey levels over 2 px at an edge
+_MOST_MOVE = 0.12  # of a side: how far a corner may lie from where it is predicted
+_USUAL_BLUR = 0.7  # px, before it is measured
+_GROWTH_BESIDE = 1.5  # of errors with the square of the distance from the neighbours, in units of their spread
+LEAST_SIDE_PX = 6.0
+
+
+@njit(cache=True, nogil=True)
+def fit_homography(xy, uv, n):
+    """(3, 3) H from the first n >= 4 points xy (., 2) to uv (., 2), least squares after centring and scaling."""
+    mx, my, mu, mv = xy[:n, 0].mean(), xy[:n, 1].mean(), uv[:n, 0].mean(), uv[:n, 1].mean()
+    sx = 1.0 / max(np.abs(xy[:n, 0] - mx).max() + np.abs(xy[:n, 1] - my).max(), 1e-12)
+    su = 1.0 / max(np.abs(uv[:n, 0] - mu).max() + np.abs(uv[:n, 1] - mv).max(), 1e-12)
+    A, b, J = np.zeros((8, 8)), np.zeros(8), np.zeros(8)
+    for i in range(n):
+        x, y, u, v = sx * (xy[i, 0] - mx), sx * (xy[i, 1] - my), su * (uv[i, 0] - mu), su * (uv[i, 1] - mv)
+        for axis in range(2):
+            value = u if axis == 0 else v
+            J[:] = 0.0
+            J[3 * axis], J[3 * axis + 1], J[3 * axis + 2] = x, y, 1.0
+            J[6], J[7] = -x * value, -y * value
+            for p in range(8):
+                b[p] += J[p] * value
+                for q in range(8):
+                    A[p, q] += J[p] * J[q]
+    h = solve_small(A, b)
+    H = np.array([[h[0], h[1], h[2]], [h[3], h[4], h[5]], [h[6], h[7], 1.0]])
+    to_xy = np.array([[sx, 0.0, -sx * mx], [0.0, sx, -sx * my], [0.0, 0.0, 1.0]])
+    from_uv = np.array([[1.0 / su, 0.0, mu], [0.0, 1.0 / su, mv], [0.0, 0.0, 1.0]])
+    return _product(from_uv, _product(H, to_xy))
+
+
+@njit(cache=True, nogil=True)
+def _product(A, B):
+    C = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                C[i, j] += A[i, k] * B[k, j]
+    return C
+
+
+@njit(cache=True, nogil=True)
+def predict(tag, known, quads, board, cols):
+    """(number of neighbours, quad (4, 2)) that the nearest known tags predict for a tag; 0 without neighbours.
+
+    board (n, 4, 2) are the corners on the board, quads those in the image, known (n,) bool.
+    """
+    xy, uv, n = np.empty((4 * _NEIGHBOURS, 2)), np.empty((4 * _NEIGHBOURS, 2)), 0
+    row, col = tag // cols, tag % cols
+    for distance in (1, 2, 4, 5, 8):
+        for other in range(len(known)):
+            dr, dc = other // cols - row, other % cols - col
+            if known[other] and dr * dr + dc * dc == distance and n < 4 * _NEIGHBOURS:
+                for k in range(4):
+                    xy[n], uv[n] = board[other, k], quads[other, k]
+                    n += 1
+    quad = np.empty((4, 2))
+    if n == 0:
+        return 0, quad
+    H = fit_homography(xy, uv, n)
+    for k in range(4):
+        quad[k, 0], quad[k, 1] = mapped(H, board[tag, k, 0], board[tag, k, 1])
+    return n // 4, quad
+
+
+@njit(cache=True, nogil=True)
+def side_vectors(quad, k):
+    """The two sides (2,) px of the quad that leave its corner k."""
+    return quad[(k + 1) % 4] - quad[k], quad[(k + 3) % 4] - quad[k]
+
+
+@njit(cache=True, nogil=True)
+def _fitted(image, quad, clear, crossing):
+    """(number of corners found, quad) near a predicted quad."""
+    side = shortest_side(quad)
+    if crossing:
+        most, corners, n_found = _MOST_MOVE * side + 1.0, quad.copy(), 0
+        for k in range(4):
+            ea, eb = side_vectors(quad, k)
+            found, u, v = find_saddle(image, quad[k, 0], quad[k, 1], ea, eb, clear, _USUAL_BLUR, most)
+            if found and crossing_contrast(image, u, v, ea, eb, clear, _USUAL_BLUR) >= LEAST_CONTRAST:
+                corners[k, 0], corners[k, 1] = u, v
+                n_found += 1
+        return n_found, corners
+    fits, corners = fit_quad(image, quad, min(max(1.5, 0.1 * side), 6.0), _LEAST_RISE)
+    return 4 if fits else 0, corners
+
+
+@njit(cache=True, nogil=True)
+def _is_tag(image, quad, pattern, bits, border):
+    """Whether the cells inside the quad that the image shows are those of the pattern (uint64)."""
+    n = bits + 2 * border
+    grey = cell_greys(image, unit_homography(quad), n)
+    black, white = levels(grey, border)
+    if white - black < LEAST_CONTRAST:
+        return False
+    code, wrong = read_cells(grey, border, 0.5 * (black + white))
+    seen = seen_cells(grey, border)
+    n_seen = popcount(seen)
+    return n_seen >= _LEAST_SEEN and wrong + popcount((code ^ pattern) & seen) <= _WRONG_CELLS * n_seen
+
+
+@njit(cache=True, nogil=True)
+def grow(image, known, quads, board, cols, patterns, bits, border, clear, crossing):
+    """Adds to known (n,) bool and quads (n, 4, 2) px the tags that are found where their neighbours predict them.
+
+    patterns (n,) uint64 are those of the tags of the board. With `crossing` the tags' corners touch other dark squares,
+    and a tag that the image cuts is found by two of its corners.
+    """
+    tried = np.zeros(len(known), dtype=np.int64)  # with how many neighbours
+    changed = True
+    while changed:
+        changed = False
+        for tag in range(len(known)):
+            if known[tag]:
+                continue
+            neighbours, quad = predict(tag, known, quads, board, cols)
+            if neighbours <= tried[tag]:
+                continue
+            tried[tag] = neighbours
+            if not np.abs(quad).max() < 1e5 or shortest_side(quad) < LEAST_SIDE_PX:
+                continue
+            found, quad = _fitted(image, quad, clear, crossing)
+            if found >= 2 and _is_tag(image, quad, patterns[tag], bits, border):
+                known[tag], quads[tag], changed = True, quad, True
+
+
+@njit(cache=True, nogil=True)
+def distance_from_neighbours(uv, xy, used, n_near):
+    """(n,) px from each corner uv (n, 2) to where the nearest others on the board xy (n, 2) place it.
+
+    Others are the n_near nearest that are `used` (n,) bool; inf where there are fewer than 6. The distance of a corner
+    that lies beside its neighbours, not among them, is divided by how much errors grow on the way there.
+    """
+    out = np.full(len(uv), np.inf)
+    near = np.empty(len(uv))
+    px, pu = np.empty((n_near, 2)), np.empty((n_near, 2))
+    for i in range(len(uv)):
+        for j in range(len(uv)):
+            near[j] = hypot(xy[j, 0] - xy[i, 0], xy[j, 1] - xy[i, 1]) if used[j] and j != i else np.inf
+        order, n = np.argsort(near), 0
+        for j in order[:n_near]:
+            if np.isfinite(near[j]):
+                px[n], pu[n] = xy[j], uv[j]
+                n += 1
+        if n >= 6:
+            u, v = mapped(fit_homography(px, pu, n), xy[i, 0], xy[i, 1])
+            x, y = px[:n, 0].mean(), px[:n, 1].mean()
+            spread = ((px[:n, 0] - x) ** 2 + (px[:n, 1] - y) ** 2).mean()
+            beside = ((xy[i, 0] - x) ** 2 + (xy[i, 1] - y) ** 2) / max(spread, 1e-12)
+            out[i] = hypot(u - uv[i, 0], v - uv[i, 1]) / (1.0 + _GROWTH_BESIDE * beside)
+    return out

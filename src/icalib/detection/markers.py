@@ -1,0 +1,70 @@
+"""Free markers: tags of a family that stand alone on white, four L-corners each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from icalib.detection.corners import ImageCorners, checked_image, judged, no_corners
+from icalib.detection.families import Family, tag_family
+from icalib.detection.quads import dark_quads, threshold_windows
+from icalib.detection.refinement import refined_corners
+from icalib.detection.tags import Tags, tags_at
+from icalib.errors import RecordingError
+
+# icalib's number of each of OpenCV's corners: from the lower left of the tag's own picture, against the clock. OpenCV's
+# pictures of AprilTags stand on their heads.
+APRILTAG_CORNER = np.array([1, 0, 3, 2])
+ARUCO_CORNER = np.array([3, 2, 1, 0])
+
+
+def all_tags(image: np.ndarray, family: Family, border_bits: int) -> Tags:
+    """The tags that stand alone in the image (h, w) uint8, large ones and small ones."""
+    windows = threshold_windows(image.shape[1])
+    quads = np.concatenate([dark_quads(image, window, False) for window in windows])
+    return tags_at(image, quads, family, border_bits)
+
+
+@dataclass(frozen=True)
+class MarkerDetector:
+    """Finds tags of `family` that stand alone on white, with a black border of `border_bits` cells.
+
+    `ids` are those to look for; corner c of ids[i] is point 4 i + c. Corners count from the lower left of the tag's own
+    picture against the clock, as on an AprilGrid. Raises RecordingError for a family or id that is not known.
+    """
+
+    family: str
+    ids: tuple[int, ...]
+    border_bits: int = 1
+
+    def __post_init__(self) -> None:
+        n = len(self._family.codes)
+        for tag in self.ids:
+            if not 0 <= tag < n or self.ids.count(tag) > 1:
+                raise RecordingError(
+                    f"id {tag} is not one of {self.family} (0 to {n - 1}) or is listed twice; correct the list of ids."
+                )
+
+    @cached_property
+    def _family(self) -> Family:
+        return tag_family(self.family)
+
+    def detect(self, image: np.ndarray) -> ImageCorners:
+        """The markers' corners in the image (h, w) uint8; a marker that is seen twice is left out.
+
+        Raises RecordingError for an image that is not grey with 8 bits.
+        """
+        image = checked_image(image)
+        tags = all_tags(image, self._family, self.border_bits)
+        ids, count = np.unique(tags.ids, return_counts=True)
+        rows = np.flatnonzero(np.isin(tags.ids, ids[count == 1]) & np.isin(tags.ids, self.ids))
+        if not len(rows):
+            return no_corners()
+        clear = self.border_bits / (self._family.bits + 2 * self.border_bits)
+        uv, quality = refined_corners(image, tags.quads[rows], clear)
+        order = APRILTAG_CORNER if self._family.is_apriltag else ARUCO_CORNER
+        place = np.array([self.ids.index(int(tag)) for tag in tags.ids[rows]])
+        point = (4 * place[:, None] + order).ravel()
+        return judged(point, uv.reshape(-1, 2), quality.reshape(5, -1), np.ones(len(point), dtype=bool))

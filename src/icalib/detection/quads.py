@@ -1,0 +1,63 @@
+"""Dark quads in an image: candidates for tags."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icalib.detection.opencv import opencv
+
+_CONTRAST = 7  # grey levels below the local mean
+_LEAST_SIDE_PX = 7.0
+_LEAST_FILL = 0.75  # of the area of its quad that a contour covers
+_STRAIGHT = 0.05  # of the perimeter: how far a contour may leave its polygon
+_WINDOW_SHARES = (0.08, 0.03, 0.2)  # of the width of the image
+
+
+def dark_quads(image: np.ndarray, window: int, separate: bool) -> np.ndarray:
+    """(n, 4, 2) corners, clockwise in the image, of dark regions with about four straight sides, to about 2 px.
+
+    image (h, w) uint8; dark is what is darker than the mean of `window` x `window` px (odd). `separate` takes the
+    outermost pixel off all dark regions first, so that tags whose corners touch other dark squares come apart.
+    """
+    cv2 = opencv()
+    dark = cv2.adaptiveThreshold(
+        image, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, window, float(_CONTRAST)
+    )
+    if separate:
+        dark = cv2.erode(dark, np.ones((3, 3), dtype=np.uint8))
+    contours, hierarchy = cv2.findContours(dark, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+    if hierarchy is None:
+        return np.zeros((0, 4, 2))
+    found = []
+    for contour, parent in zip(contours, hierarchy[0, :, 3], strict=True):
+        if parent < 0 and len(contour) >= 4:
+            quad = _quad(cv2, contour)
+            if quad is not None:
+                found.append(_grown(quad) if separate else quad)
+    return np.array(found).reshape(-1, 4, 2)
+
+
+def _quad(cv2, contour: np.ndarray) -> np.ndarray | None:
+    _, _, width, height = cv2.boundingRect(contour)
+    if max(width, height) < _LEAST_SIDE_PX or min(width, height) < 0.25 * _LEAST_SIDE_PX:
+        return None
+    hull = cv2.convexHull(contour)
+    corners = cv2.approxPolyDP(hull, _STRAIGHT * cv2.arcLength(hull, True), True)
+    if len(corners) != 4:
+        return None
+    quad = corners[:, 0, :].astype(np.float64)
+    area = cv2.contourArea(corners, True)
+    if cv2.contourArea(contour) < _LEAST_FILL * abs(area):
+        return None
+    return quad if area > 0 else quad[::-1]
+
+
+def _grown(quad: np.ndarray) -> np.ndarray:
+    """The quad with its corners one diagonal pixel further from its centre."""
+    out = quad - quad.mean(axis=0)
+    return quad + np.sqrt(2.0) * out / np.linalg.norm(out, axis=1, keepdims=True)
+
+
+def threshold_windows(width: int) -> tuple[int, ...]:
+    """Windows [px] for `dark_quads` in images of this width, the one that finds most tags first."""
+    return tuple(max(2 * int(0.5 * share * width) + 1, 11) for share in _WINDOW_SHARES)

@@ -1,0 +1,119 @@
+"""Kernels that refine the corners of many tags at once and measure what their quality follows from."""
+
+from __future__ import annotations
+
+from math import hypot
+
+import numpy as np
+from numba import njit
+
+from icalib.detection.crossing_model import LEAST_WINDOW_PX, fit_crossing
+from icalib.detection.edge_model import END_PX, fit_corners, fit_step
+from icalib.detection.growth import side_vectors
+from icalib.detection.saddles import MARGIN_BLURS
+from icalib.detection.tags import LEAST_CONTRAST
+
+_MOST_MOVE_PX = 2.0
+_LEAST_STRIP_PX, _MOST_STRIP_PX = 1.5, 4.0  # fitted on each side of an edge
+_STRIP_BLURS = 2.25  # how far, in blurs, the strip along an edge keeps away from other features
+_BLUR_STRIP_PX = 2.5  # fitted on each side of an edge where only the blur is wanted
+_LEAST_INSET_PX = 0.75  # as LEAST_WINDOW_PX, for features that lie in the fields of an X-corner
+_USUAL_BLUR = 0.7  # px, before it is measured
+
+
+@njit(cache=True, nogil=True)
+def _shape(quad, k):
+    """(sine of the angle at corner k, height [px] of the quad over its longer side there, shorter side [px])."""
+    ea, eb = side_vectors(quad, k)
+    la, lb = hypot(ea[0], ea[1]), hypot(eb[0], eb[1])
+    sine = abs(ea[0] * eb[1] - ea[1] * eb[0]) / max(la * lb, 1e-12)
+    return sine, min(la, lb) * sine, min(la, lb)
+
+
+@njit(cache=True, nogil=True)
+def _strip(least, blur, most):
+    """Half the width [px] of the strip along an edge, the nearest other feature being `least` px away."""
+    return min(max(least - _STRIP_BLURS * blur, _LEAST_STRIP_PX), most)
+
+
+@njit(cache=True, nogil=True)
+def _measured_blur(image, quad, k, least):
+    """Blur [px] across the sides k and k + 2 of the quad, NaN where neither has an edge."""
+    for m in (k, k + 2):
+        u0, v0, u1, v1 = quad[m, 0], quad[m, 1], quad[(m + 1) % 4, 0], quad[(m + 1) % 4, 1]
+        _, blur, contrast, _ = fit_step(image, u0, v0, u1, v1, END_PX, _strip(least, _USUAL_BLUR, _BLUR_STRIP_PX))
+        if contrast > 0.0:
+            return blur
+    return np.nan
+
+
+@njit(cache=True, nogil=True)
+def _measured_blurs(image, quads, least):
+    """(n, 2) blur [px] across each quad's sides 0 and 1; where they have no edge, what is usual in this image."""
+    blur = np.empty((len(quads), 2))
+    for i in range(len(quads)):
+        for k in range(2):
+            blur[i, k] = _measured_blur(image, quads[i], k, least[i])
+    known = blur.ravel()[~np.isnan(blur.ravel())]
+    usual = np.median(known) if len(known) else _USUAL_BLUR
+    for i in range(len(quads)):
+        for k in range(2):
+            if np.isnan(blur[i, k]):
+                blur[i, k] = usual
+    return blur
+
+
+@njit(cache=True, nogil=True)
+def _shapes(quads, quality):
+    """Fills sine, height and side of `quality`; (n,) the least height [px] of each quad is returned."""
+    least = np.empty(len(quads))
+    for i in range(len(quads)):
+        for k in range(4):
+            quality[2, i, k], quality[3, i, k], quality[4, i, k] = _shape(quads[i], k)
+        least[i] = quality[3, i].min()
+    return least
+
+
+@njit(cache=True, nogil=True)
+def refined_crossings(image, quads, surroundings):
+    """(uv (n, 4, 2), quality (5, n, 4)) of the X-corners of the quads (n, 4, 2), `surroundings` as in `fit_crossing`.
+
+    quality: sigma [px] per axis for a noise of one grey level, NaN where there is no corner; blur [px]; sine of the
+    angle between the edges; by how much the distance to the nearest other feature exceeds what the smallest window
+    needs [px]; shorter side [px].
+    """
+    uv, quality = np.empty(quads.shape), np.empty((5, len(quads), 4))
+    inset = min(surroundings[1], surroundings[2])
+    blur = _measured_blurs(image, quads, min(surroundings[0], inset) * _shapes(quads, quality))
+    for i in range(len(quads)):
+        quality[1, i] = blur[i].max()
+        for k in range(4):
+            ea, eb = side_vectors(quads[i], k)
+            blur_a, blur_b = blur[i, k % 2], blur[i, (k + 1) % 2]
+            u, v, sigma, contrast = fit_crossing(
+                image, quads[i, k, 0], quads[i, k, 1], ea, eb, surroundings, blur_a, blur_b, _MOST_MOVE_PX
+            )
+            uv[i, k, 0], uv[i, k, 1] = u, v
+            quality[0, i, k] = sigma if contrast >= LEAST_CONTRAST else np.nan
+    room = np.minimum(surroundings[0] * quality[3] - LEAST_WINDOW_PX, inset * quality[3] - _LEAST_INSET_PX)
+    quality[3] = room - MARGIN_BLURS * quality[1]
+    return uv, quality
+
+
+@njit(cache=True, nogil=True)
+def refined_corners(image, quads, clear):
+    """As `refined_crossings`, of the L-corners of dark quads whose corners run clockwise in the image.
+
+    `clear` is the distance of the nearest other feature in units of the quad's sides.
+    """
+    uv, quality = np.empty(quads.shape), np.empty((5, len(quads), 4))
+    least = clear * _shapes(quads, quality)
+    for i in range(len(quads)):
+        first, _, blur = fit_corners(image, quads[i], _strip(least[i], _USUAL_BLUR, _MOST_STRIP_PX))
+        half = _strip(least[i], blur.max(), _MOST_STRIP_PX)
+        uv[i], quality[0, i], quality[1, i] = fit_corners(image, first, half)
+        for k in range(4):
+            if hypot(uv[i, k, 0] - quads[i, k, 0], uv[i, k, 1] - quads[i, k, 1]) > _MOST_MOVE_PX:
+                quality[0, i, k] = np.nan
+    quality[3] = clear * quality[3] - _LEAST_STRIP_PX - _STRIP_BLURS * quality[1]
+    return uv, quality

@@ -1,0 +1,134 @@
+"""Kernels about corners where two dark squares touch, X-corners: their windows, and where they roughly are."""
+
+from __future__ import annotations
+
+from math import hypot
+
+import numpy as np
+from numba import njit
+
+from icalib.detection.decoding import bilinear
+
+_LEAST_HALF_PX = 2.0  # half the width of the window of `find_saddle`
+MOST_HALF_PX = 6.0  # more average the bend of a distorted edge into the corner
+MARGIN_BLURS = 1.5  # how far, in blurs, a neighbouring feature reaches into the window
+_ITERATIONS = 12
+_CONVERGED_PX = 0.02
+_LEAST_ROOM_PX = 1.5  # half a window's width beside the image's border
+LEAST_SINE = 0.17  # of the angle between the edges: 10 degrees
+
+
+@njit(cache=True, nogil=True)
+def window_frame(ea, eb, clear, blur, least):
+    """(sa, sb, sine): half a window's width in units of the sides ea, eb (2,) px that meet in the corner.
+
+    `clear` is the distance of the nearest other feature in the same units. The window keeps away from it by 1.5 times
+    the blur [px], but half of it is at least `least` px wide across the edges, and at most 6 px.
+    """
+    la, lb = hypot(ea[0], ea[1]), hypot(eb[0], eb[1])
+    sine = abs(ea[0] * eb[1] - ea[1] * eb[0]) / max(la * lb, 1e-12)
+    across, margin = max(sine, LEAST_SINE), MARGIN_BLURS * blur
+    sa = min(max(clear - margin / (la * across), least / (la * across)), MOST_HALF_PX / la)
+    sb = min(max(clear - margin / (lb * across), least / (lb * across)), MOST_HALF_PX / lb)
+    return max(sa, least / la), max(sb, least / lb), sine
+
+
+@njit(cache=True, nogil=True)
+def room_for(image, u, v, ea, eb, sa, sb):
+    """By what factor, at most 1, a window must be scaled so that all its pixels have neighbours in the image."""
+    ru = abs(ea[0]) * sa + abs(eb[0]) * sb
+    rv = abs(ea[1]) * sa + abs(eb[1]) * sb
+    room_u, room_v = min(u, image.shape[1] - 1.0 - u) - 1.0, min(v, image.shape[0] - 1.0 - v) - 1.0
+    return max(min(1.0, min(room_u / ru, room_v / rv)), 0.0)
+
+
+@njit(cache=True, nogil=True)
+def window_bounds(u, v, ea, eb, sa, sb):
+    """(u0, u1, v0, v1) of the pixels that the window may touch."""
+    ru = abs(ea[0]) * sa + abs(eb[0]) * sb
+    rv = abs(ea[1]) * sa + abs(eb[1]) * sb
+    return int(np.ceil(u - ru)), int(np.floor(u + ru)), int(np.ceil(v - rv)), int(np.floor(v + rv))
+
+
+@njit(cache=True, nogil=True)
+def _weight(du, dv, ea, eb, det, sa, sb):
+    s = (du * eb[1] - dv * eb[0]) / det / sa
+    t = (ea[0] * dv - ea[1] * du) / det / sb
+    s, t = 1.0 - s * s, 1.0 - t * t
+    return s * t if s > 0.0 and t > 0.0 else 0.0
+
+
+@njit(cache=True, nogil=True)
+def _gradient(image, x, y):
+    """Central differences; float before the difference, for grey levels are unsigned."""
+    gu = 0.5 * (float(image[y, x + 1]) - float(image[y, x - 1]))
+    gv = 0.5 * (float(image[y + 1, x]) - float(image[y - 1, x]))
+    return gu, gv
+
+
+@njit(cache=True, nogil=True)
+def find_saddle(image, u, v, ea, eb, clear, blur, max_move):
+    """(found, u, v): the point within `max_move` px of (u, v) towards which all gradients are perpendicular.
+
+    ea, eb (2,) px are the sides of the dark square that meet in the corner, `clear` is how far, in units of them, the
+    nearest other feature is, blur [px] that of the image. Right to some tenths of a pixel, from some pixels away.
+    """
+    sa, sb, sine = window_frame(ea, eb, clear, blur, _LEAST_HALF_PX)
+    det = ea[0] * eb[1] - ea[1] * eb[0]
+    start_u, start_v = u, v
+    if sine < LEAST_SINE:
+        return False, u, v
+    for _ in range(_ITERATIONS):
+        room = room_for(image, u, v, ea, eb, sa, sb)
+        if room * min(sa * hypot(ea[0], ea[1]), sb * hypot(eb[0], eb[1])) * sine < _LEAST_ROOM_PX:
+            return False, u, v
+        du, dv = _step(image, u, v, ea, eb, det, room * sa, room * sb)
+        u, v = u + du, v + dv
+        if not hypot(u - start_u, v - start_v) <= max_move:
+            return False, u, v
+        if hypot(du, dv) < _CONVERGED_PX:
+            break
+    return True, u, v
+
+
+@njit(cache=True, nogil=True)
+def _step(image, u, v, ea, eb, det, sa, sb):
+    """From (u, v) to the point that the gradients of the window about it are perpendicular to; NaN if there is none."""
+    u0, u1, v0, v1 = window_bounds(u, v, ea, eb, sa, sb)
+    a, b, c, p, q = 0.0, 0.0, 0.0, 0.0, 0.0
+    for y in range(v0, v1 + 1):
+        for x in range(u0, u1 + 1):
+            w = _weight(x - u, y - v, ea, eb, det, sa, sb)
+            if w > 0.0:
+                gu, gv = _gradient(image, x, y)
+                along = gu * (x - u) + gv * (y - v)
+                a += w * gu * gu
+                b += w * gu * gv
+                c += w * gv * gv
+                p += w * gu * along
+                q += w * gv * along
+    full = a * c - b * b
+    if full <= 1e-6 * (a + c) * (a + c):
+        return np.nan, np.nan
+    return (c * p - b * q) / full, (a * q - b * p) / full
+
+
+@njit(cache=True, nogil=True)
+def crossing_contrast(image, u, v, ea, eb, clear, blur):
+    """Least white minus most black grey of the four fields about an X-corner; the dark one lies between ea and eb."""
+    sa, sb, _ = window_frame(ea, eb, clear, blur, _LEAST_HALF_PX)
+    room = 0.6 * room_for(image, u, v, ea, eb, sa, sb)
+    sa, sb = room * sa, room * sb
+    black, white = 0.0, 255.0
+    if room == 0.0:
+        return 0.0
+    for i in range(2):
+        for j in range(2):
+            s, t = sa * (1 - 2 * i), sb * (1 - 2 * j)
+            x, y = u + s * ea[0] + t * eb[0], v + s * ea[1] + t * eb[1]
+            value = bilinear(image, x, y)
+            if i == j:
+                black = max(black, value)
+            else:
+                white = min(white, value)
+    return white - black

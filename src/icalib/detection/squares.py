@@ -1,0 +1,70 @@
+"""Boards of black and white squares: their inner corners, each where two dark squares touch."""
+
+from __future__ import annotations
+
+from math import hypot
+
+import numpy as np
+from numba import njit
+
+from icalib.detection.consistency import consistent_corners
+from icalib.detection.corners import ImageCorners, judged
+from icalib.detection.growth import LEAST_SIDE_PX, side_vectors
+from icalib.detection.refinement import refined_crossings
+from icalib.detection.saddles import crossing_contrast, find_saddle
+from icalib.detection.tags import LEAST_CONTRAST, shortest_side
+
+_MOST_MOVE = 0.15  # of a side: how far a corner may lie from where it is expected
+_CLEAR = 0.5  # squares, from a corner to the nearest other feature: the next corner is as far from the same place
+_USUAL_BLUR = 0.7  # px, before it is measured
+
+
+def square_corners(image: np.ndarray, expected: np.ndarray, dark: np.ndarray, inset: float) -> ImageCorners:
+    """Inner corners of a board of `rows` x `cols` squares, numbered row by row, each refined and judged.
+
+    image (h, w) uint8. expected (rows + 1, cols + 1, 2) px, all corners of the squares, right to some 0.15 squares; its
+    columns and rows turn with the clock in the image. dark (rows, cols) bool. `inset` is how far from
+    the edges of the white squares markers begin, in squares, inf without markers.
+    """
+    rows, cols = dark.shape
+    uv, sigma, quality = np.zeros((rows + 1, cols + 1, 2)), np.full((rows + 1, cols + 1), np.nan), {}
+    row, col = np.nonzero(dark)
+    at = np.stack([[row, col], [row, col + 1], [row + 1, col + 1], [row + 1, col]], axis=0).transpose(2, 0, 1)
+    quads = expected[at[:, :, 0], at[:, :, 1]]
+    usable = np.array([shortest_side(quad) >= LEAST_SIDE_PX for quad in quads], dtype=bool)
+    at, quads = at[usable], quads[usable]
+    inner = ((at >= 1) & (at < [rows, cols])).all(axis=2)
+    quads, found = _roughly(image, quads, inner, min(inset, _CLEAR))
+    fine, measures = refined_crossings(image, quads, np.array([_CLEAR, np.inf, inset]))
+    for i, k in zip(*np.nonzero(found & np.isfinite(measures[0])), strict=True):
+        where = tuple(at[i, k])
+        if not measures[0, i, k] >= sigma[where]:
+            uv[where], sigma[where], quality[where] = fine[i, k], measures[0, i, k], measures[:, i, k]
+    return _judged(uv, quality, (rows, cols))
+
+
+def _judged(uv: np.ndarray, quality: dict, shape: tuple[int, int]) -> ImageCorners:
+    where = np.array(sorted(quality), dtype=np.int64).reshape(-1, 2)
+    measures = np.array([quality[tuple(w)] for w in where]).reshape(-1, 5).T
+    found = uv[where[:, 0], where[:, 1]]
+    board = where[:, ::-1].astype(np.float64)
+    consistent = consistent_corners(found, board, np.ones(len(where), dtype=bool), measures[4])
+    point = (where[:, 0] - 1) * (shape[1] - 1) + where[:, 1] - 1
+    return judged(point, found, measures, consistent)
+
+
+@njit(cache=True, nogil=True)
+def _roughly(image, quads, inner, clear):
+    """(quads (n, 4, 2), found (n, 4)): dark squares, those of their corners that are `inner` moved to the saddles."""
+    out, found = quads.copy(), np.zeros(inner.shape, dtype=np.bool_)
+    for i in range(len(quads)):
+        for k in range(4):
+            if not inner[i, k]:
+                continue
+            ea, eb = side_vectors(quads[i], k)
+            most = _MOST_MOVE * min(hypot(ea[0], ea[1]), hypot(eb[0], eb[1])) + 1.0
+            u, v = quads[i, k]
+            is_there, u, v = find_saddle(image, u, v, ea, eb, clear, _USUAL_BLUR, most)
+            if is_there and crossing_contrast(image, u, v, ea, eb, clear, _USUAL_BLUR) >= LEAST_CONTRAST:
+                out[i, k, 0], out[i, k, 1], found[i, k] = u, v, True
+    return out, found

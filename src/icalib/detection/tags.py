@@ -1,0 +1,104 @@
+"""Tags of one family in an image: dark quads whose cells are a pattern of the family."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from icalib.detection.decoding import cell_greys, levels, lookup, read_cells, unit_homography
+from icalib.detection.edges import fit_quad
+from icalib.detection.families import Family
+from icalib.detection.quads import dark_quads
+
+LEAST_CONTRAST = 16.0  # grey levels between black and white of a tag
+_LEAST_RISE = 4.0  # grey levels over 2 px at an edge
+_WRONG_BORDER = 0.15  # of the cells of the border
+
+
+@dataclass(frozen=True)
+class Tags:
+    """Tags in one image: ids (n,) int64; quads (n, 4, 2) px, to about 0.2 px; contrast (n,) grey levels.
+
+    The corners run clockwise in the image of a tag that is not mirrored, from the top left of OpenCV's picture of it.
+    """
+
+    ids: np.ndarray
+    quads: np.ndarray
+    contrast: np.ndarray
+
+
+def find_tags(image: np.ndarray, family: Family, border_bits: int, window: int, separate: bool) -> Tags:
+    """All tags of `family` with a black border of `border_bits` cells in the image (h, w) uint8.
+
+    An id may appear more than once, and a tag that was found as two quads appears once. `window` and `separate` are
+    those of `dark_quads`.
+    """
+    quads = dark_quads(image, window, separate)
+    return tags_at(image, quads, family, border_bits)
+
+
+def tags_at(image: np.ndarray, quads: np.ndarray, family: Family, border_bits: int) -> Tags:
+    """The tags of `family` among the quads (n, 4, 2) px, clockwise in the image."""
+    ids, fitted, contrast = _decode_all(image, quads, family.bits, border_bits, family.codes, family.max_errors)
+    keep = _first_of_each(ids, fitted)
+    return Tags(ids[keep], fitted[keep], contrast[keep])
+
+
+def _first_of_each(ids: np.ndarray, quads: np.ndarray) -> np.ndarray:
+    """Rows of the tags that were read, without those that repeat one with the same id at the same place."""
+    keep: list[int] = []
+    for row in np.flatnonzero(ids >= 0):
+        center = quads[row].mean(axis=0)
+        size = np.ptp(quads[row], axis=0).max()
+        same = [k for k in keep if ids[k] == ids[row]]
+        if all(np.abs(quads[k].mean(axis=0) - center).max() > 0.5 * size for k in same):
+            keep.append(int(row))
+    return np.array(keep, dtype=np.int64)
+
+
+@njit(cache=True, nogil=True)
+def _decode_all(image, quads, bits, border, codes, max_errors):
+    n = len(quads)
+    ids, contrast = np.full(n, -1, dtype=np.int64), np.zeros(n)
+    fitted = np.empty((n, 4, 2))
+    for i in range(n):
+        side = shortest_side(quads[i])
+        reach = min(max(2.0, 0.1 * side), 12.0)
+        fits, quad = fit_quad(image, quads[i], reach, _LEAST_RISE)
+        if fits:
+            fits, quad = fit_quad(image, quad, min(2.0, 0.1 * side + 0.5), _LEAST_RISE)
+        if fits:
+            ids[i], turn, contrast[i] = decode(image, quad, bits, border, codes, max_errors)
+            for k in range(4):
+                fitted[i, k] = quad[(k + 4 - turn) % 4]
+    return ids, fitted, contrast
+
+
+@njit(cache=True, nogil=True)
+def shortest_side(quad):
+    """Length of the shortest side of the quad (4, 2)."""
+    least = 1e300
+    for k in range(4):
+        du, dv = quad[(k + 1) % 4, 0] - quad[k, 0], quad[(k + 1) % 4, 1] - quad[k, 1]
+        least = min(least, np.sqrt(du * du + dv * dv))
+    return least
+
+
+@njit(cache=True, nogil=True)
+def decode(image, quad, bits, border, codes, max_errors):
+    """(id, turn, contrast): the pattern inside the quad, id -1 if it is none; corner k of the tag is quad[k - turn]."""
+    n = bits + 2 * border
+    grey = cell_greys(image, unit_homography(quad), n)
+    black, white = levels(grey, border)
+    contrast = white - black
+    if contrast < LEAST_CONTRAST or np.isnan(grey).any():
+        return -1, 0, contrast
+    code, wrong = read_cells(grey, border, 0.5 * (black + white))
+    if wrong > _WRONG_BORDER * (n * n - bits * bits):
+        return -1, 0, contrast
+    tag, turn, errors = lookup(code, codes)
+    if errors > max_errors:
+        return -1, 0, contrast
+    return tag, turn, contrast
