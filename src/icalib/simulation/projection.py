@@ -87,9 +87,7 @@ def _equidistant(
     return bent * X / radius, bent * Y / radius
 
 
-def _eucm(
-    distortion: tuple[float, ...], X: np.ndarray, Y: np.ndarray, Z: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _eucm(distortion: tuple[float, ...], X: np.ndarray, Y: np.ndarray, Z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Khomutenko: (alpha, beta), the depth a mean of z and of the distance in a space stretched across the axis."""
     alpha, beta = distortion
     depth = alpha * np.sqrt(beta * (X * X + Y * Y) + Z * Z) + (1.0 - alpha) * Z
@@ -104,9 +102,7 @@ def _double_sphere(
     return _eucm((alpha, 1.0), X, Y, Z + xi * np.sqrt(X * X + Y * Y + Z * Z))
 
 
-def _omni(
-    distortion: tuple[float, ...], X: np.ndarray, Y: np.ndarray, Z: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _omni(distortion: tuple[float, ...], X: np.ndarray, Y: np.ndarray, Z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mei: (xi, k1, k2, p1, p2), Brown's model after the points moved by xi times their distance."""
     return _radtan(distortion[1:], X, Y, Z + distortion[0] * np.sqrt(X * X + Y * Y + Z * Z))
 

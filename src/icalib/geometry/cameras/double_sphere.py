@@ -25,7 +25,8 @@ class DoubleSphere(ClosedForm):
 
     name = "double-sphere"
     parameter_names = ("fx", "fy", "cx", "cy", "xi", "alpha")
-    start_distortions = ((0.0, 0.1), (0.0, 0.5), (0.0, 0.7))
+    # For any lens there is a second, wrong valley with xi of the other sign; a start in each finds the right one.
+    start_distortions = ((-0.2, 0.5), (0.0, 0.5), (0.3, 0.7))
 
     def _fill_image(self, params, points, uv, valid) -> None:
         _project(params, points, uv, valid)
