@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from icalib.calibration import Calibration
+from icalib.geometry.targets import Charuco, Checkerboard, Target
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter, Rig
 from icalib.rig_parameters import IMU_INTRINSICS_SIGMA
@@ -64,6 +65,20 @@ def test_wide_lenses_are_recovered_from_nothing(model: str, intrinsics: tuple, d
         assert max(extrinsics_error(result, simulation, camera)) < 1e-7
         assert result.group(camera, "intrinsics").value == pytest.approx(np.array(intrinsics), rel=1e-6)
         assert result.group(camera, "distortion").value == pytest.approx(np.array(distortion), rel=1e-6, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "target", [Charuco(8, 7, 0.08, 0.06, "5x5_100"), Checkerboard(6, 7, 0.08)], ids=lambda target: target.type
+)
+def test_boards_without_bloom_are_recovered(target: Target):
+    simulation = simulate(dataclasses.replace(handheld(12.0, noiseless=True), target=target), 1)
+    rig = rig_for(simulation.scenario)
+    rig = dataclasses.replace(rig, settings=dataclasses.replace(rig.settings, bloom=True))
+    result = calibrate_measurements(rig, simulation.measurements)
+    assert result.converged, result.status
+    for camera in ("cam0", "cam1"):
+        assert max(extrinsics_error(result, simulation, camera)) < 1e-8
+    assert not any(group.name == "bloom" for group in result.groups)
 
 
 def real_corners() -> tuple[Scenario, Rig]:

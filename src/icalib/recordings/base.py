@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Protocol
 
-from icalib.geometry.targets import AprilGrid
+from icalib.geometry.targets import Target
 from icalib.measurements import CornerStream, ImuStream
 
 
@@ -19,7 +19,7 @@ class Recording(Protocol):
         """
         ...
 
-    def corners(self, path_hint: str, name: str, target: AprilGrid) -> CornerStream:
+    def corners(self, path_hint: str, name: str, target: Target) -> CornerStream:
         """All corners that the camera `name` saw, grouped by image, images in order.
 
         Raises RecordingError naming file and line or instant where the data are missing or cannot be read, where images

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from icalib.errors import RecordingError
-from icalib.geometry.targets import AprilGrid
+from icalib.geometry.targets import Target
 from icalib.measurements import CornerStream, ImuStream
 from icalib.recordings.base import Recording
 from icalib.recordings.corners import group_corners
@@ -19,7 +19,7 @@ class FolderRecording:
     """A folder of tables.
 
     IMU: t [ns], wx, wy, wz [rad/s], ax, ay, az [m/s^2], which is also EuRoC's `imu0/data.csv`. Corners: t [ns], tag id,
-    corner 0 to 3, u, v [px].
+    corner (as the target names its points), u, v [px].
     """
 
     def __init__(self, root: Path) -> None:
@@ -31,7 +31,7 @@ class FolderRecording:
         self._remember(table.path)
         return ImuStream(name, table.integers[:, 0].copy(), table.decimals[:, :3].copy(), table.decimals[:, 3:].copy())
 
-    def corners(self, path_hint: str, name: str, target: AprilGrid) -> CornerStream:
+    def corners(self, path_hint: str, name: str, target: Target) -> CornerStream:
         table = read_table(self._locate(path_hint), ("t [ns]", "tag id", "corner"), ("u [px]", "v [px]"))
         self._remember(table.path)
         stamps, tag, corner = (table.integers[:, k].copy() for k in range(3))

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from icalib.errors import RigError
-from icalib.geometry.targets import AprilGrid
+from icalib.geometry.targets import AprilGrid, Target
 from icalib.rig import ImuNoise
 
 MotionKind = Literal["handheld", "planar", "single_axis", "motionless"]
@@ -116,7 +116,7 @@ class Scenario:
     """
 
     cameras: tuple[SimCamera, ...]
-    target: AprilGrid = AprilGrid(6, 6, 0.088, 0.3)
+    target: Target = AprilGrid(6, 6, 0.088, 0.3)
     duration_s: float = 20.0
     motion: Motion = Motion()
     T_world_board: np.ndarray = field(default_factory=_standing_board)
