@@ -14,7 +14,7 @@ from icalib.rig import ImuNoise
 MotionKind = Literal["handheld", "planar", "single_axis", "motionless"]
 Interval = tuple[float, float]  # (start, end) in seconds on the IMU's clock, since its origin
 
-MODELS = ("pinhole-radtan", "pinhole-equidistant", "eucm", "double-sphere", "omni-radtan")
+MODELS: tuple[str, ...] = ("pinhole-radtan", "pinhole-equidistant", "eucm", "double-sphere", "omni-radtan")
 ADIS16448 = ImuNoise(1.6968e-4, 1.9393e-5, 2.0e-3, 3.0e-3, source="data sheet of the ADIS16448")
 GRAVITY_WORLD = np.array([0.0, 0.0, -9.81])  # m/s^2
 
