@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from icalib.errors import CalibrationError, RigError
+from icalib.geometry.targets import Charuco, Checkerboard
 from icalib.imu_classes import IMU_CLASSES, class_noise
 from icalib.rig import Rig, Settings
 from icalib.rig_file import load_rig, rig_to_dict
@@ -187,6 +188,7 @@ NOISE = "{gyro: 1.7e-4, gyro_walk: 2e-5, accel: 2e-3, accel_walk: 3e-3}"
 INTRINSICS = "{fixed: [458.654, 457.296, 367.215, 248.375]}"
 PRIOR = "{prior: [-0.02, -0.06, 0.01], sigma: 0.05}"
 TARGET = "{type: aprilgrid, rows: 6, cols: 7, tag_size: 0.088, tag_spacing: 0.3}"
+CHARUCO = "{type: charuco, squares_x: 7, squares_y: 5, square_size: 0.04, marker_size: 0.03, dictionary: 5x5_100}"
 
 
 @pytest.mark.parametrize(
@@ -269,8 +271,18 @@ TARGET = "{type: aprilgrid, rows: 6, cols: 7, tag_size: 0.088, tag_spacing: 0.3}
         (
             "type: aprilgrid",
             "type: chessboard",
-            "target.type: there is no target type 'chessboard'; available are aprilgrid",
+            "target.type: there is no target type 'chessboard', did you mean 'checkerboard'; available are aprilgrid, "
+            "charuco, checkerboard",
         ),
+        ("type: aprilgrid, ", "", "target: type is missing; add type: aprilgrid"),
+        (TARGET, "{type: charuco, rows: 5}", "target.rows: there is no such field; available are type, squares_x"),
+        (TARGET, CHARUCO.replace("0.03", "0.05"), "target: marker_size 0.05 does not fit a square of 0.04"),
+        (TARGET, CHARUCO.replace("5x5_100", "5x5_101"), "target.dictionary: there is no dictionary '5x5_101', did you"),
+        (TARGET, CHARUCO.replace("7", "70"), "target: needs 175 tags, but 5x5_100 has 100"),
+        (TARGET, CHARUCO.replace("7", "7.5"), "target.squares_x: must be a whole number of at least 1"),
+        (TARGET, CHARUCO.replace("0.04", "40"), "target.square_size: is in metres, and 40 m is no square"),
+        (TARGET, "{type: checkerboard, rows: 1, cols: 8, square_size: 0.03}", "target: a checkerboard of 1 x 8 inner"),
+        (TARGET, "{type: checkerboard, rows: 600, cols: 800, square_size: 0.03}", "target: 600 x 800 corners are more"),
         ("rows: 6", "rows: six", "target.rows: must be a number, but is 'six'"),
         ("rows: 6", "rows: 6.0", "target.rows: must be a whole number of at least 1"),
         ("rows: 6", "rows: 100000000000", "target: 100000000000 x 7 tags are more than 10000"),
@@ -295,6 +307,22 @@ TARGET = "{type: aprilgrid, rows: 6, cols: 7, tag_size: 0.088, tag_spacing: 0.3}
 )
 def test_what_is_wrong_is_named(tmp_path, old, new, words):
     assert words in complaint(tmp_path, edited(old, new))
+
+
+@pytest.mark.parametrize(
+    ("text", "target"),
+    [
+        (CHARUCO, Charuco(7, 5, 0.04, 0.03, "5x5_100")),
+        ("{type: checkerboard, rows: 6, cols: 8, square_size: 0.03}", Checkerboard(6, 8, 0.03)),
+    ],
+)
+def test_other_targets_are_read_and_written(tmp_path, text, target):
+    path = tmp_path / "rig.yaml"
+    path.write_text(edited(TARGET, text))
+    rig = load_rig(path)
+    assert rig.target == target and not rig.blooms
+    path.write_text(yaml.safe_dump(rig_to_dict(rig)))
+    assert load_rig(path).target == target
 
 
 def test_no_imu_two_imus_no_camera(tmp_path):

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from icalib.geometry.targets import AprilGrid
+from icalib.geometry.targets import Target
 
 Mode = Literal["free", "fixed", "prior"]
 
@@ -103,7 +103,12 @@ class Rig:
 
     imu: ImuSensor
     cameras: tuple[Camera, ...]
-    target: AprilGrid
+    target: Target
     gravity: float = 9.81  # m/s^2
     settings: Settings = Settings()
     path: Path | None = None
+
+    @property
+    def blooms(self) -> bool:
+        """Whether bloom is estimated: it is asked for, and the target's corners can be pulled."""
+        return self.settings.bloom and self.target.blooms

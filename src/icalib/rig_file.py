@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
+from icalib.errors import RigError
 from icalib.geometry.cameras import CAMERA_MODELS
-from icalib.geometry.targets import AprilGrid
+from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Target
+from icalib.geometry.targets.families import FAMILIES
 from icalib.imu_classes import DEFAULT_CLASS, IMU_CLASSES, class_noise
 from icalib.rig import Camera, ImuNoise, ImuSensor, Parameter, Rig, Settings
 from icalib.rig_parameters import imu_intrinsics_parameter, parameter_to_plain, rotation_parameter, vector_parameter
@@ -17,6 +20,11 @@ from icalib.yaml_nodes import YamlValue, read_yaml
 _SENSOR_TYPES = ("imu", "camera")
 _DENSITIES = ("gyro", "gyro_walk", "accel", "accel_walk")
 _SENSOR_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
+_TARGET_FIELDS = {
+    "aprilgrid": ("rows", "cols", "tag_size", "tag_spacing"),
+    "charuco": ("squares_x", "squares_y", "square_size", "marker_size", "dictionary"),
+    "checkerboard": ("rows", "cols", "square_size"),
+}
 _LARGEST_TAG_M = 2.0  # nobody prints a larger one; it is in millimetres
 _MOST_TAGS = 10_000
 
@@ -42,7 +50,7 @@ def rig_to_dict(rig: Rig) -> dict[str, Any]:
     sensors = {rig.imu.name: _imu_to_plain(rig.imu)} | {c.name: _camera_to_plain(c) for c in rig.cameras}
     return {
         "sensors": sensors,
-        "target": {"type": "aprilgrid"} | dataclasses.asdict(rig.target),
+        "target": {"type": rig.target.type} | dataclasses.asdict(rig.target),
         "gravity": rig.gravity,
         "settings": dataclasses.asdict(rig.settings),
     }
@@ -131,15 +139,43 @@ def _topic(found: dict[str, YamlValue]) -> str | None:
     return found["topic"].text() if "topic" in found else None
 
 
-def _target(value: YamlValue) -> AprilGrid:
-    found = value.record(("type", "rows", "cols", "tag_size", "tag_spacing"))
-    found["type"].choice("target type", ("aprilgrid",))
-    if (size := found["tag_size"].positive()) > _LARGEST_TAG_M:
-        found["tag_size"].fail(f"is in metres, and {size:g} m is no tag; write 0.088 for 88 mm.")
-    rows, cols = found["rows"].whole(1), found["cols"].whole(1)
-    if rows * cols > _MOST_TAGS:
-        value.fail(f"{rows} x {cols} tags are more than {_MOST_TAGS}; correct rows and cols.")
-    return AprilGrid(rows, cols, size, found["tag_spacing"].positive())
+def _target(value: YamlValue) -> Target:
+    fields = value.entries()
+    if "type" not in fields:
+        value.fail(f"type is missing; add type: {', type: '.join(_TARGET_FIELDS)}.")
+    kind = fields["type"].choice("target type", tuple(_TARGET_FIELDS))
+    found = value.record(("type", *_TARGET_FIELDS[kind]))
+    if kind == "aprilgrid":
+        size = _edge(found["tag_size"], "tag")
+        rows, cols = _counts(value, found, "rows", "cols", "tags")
+        return AprilGrid(rows, cols, size, found["tag_spacing"].positive())
+    size = _edge(found["square_size"], "square")
+    if kind == "checkerboard":
+        rows, cols = _counts(value, found, "rows", "cols", "corners")
+        return _made(value, lambda: Checkerboard(rows, cols, size))
+    squares = _counts(value, found, "squares_x", "squares_y", "squares")
+    marker, dictionary = _edge(found["marker_size"], "tag"), found["dictionary"].choice("dictionary", tuple(FAMILIES))
+    return _made(value, lambda: Charuco(*squares, size, marker, dictionary))
+
+
+def _edge(value: YamlValue, what: str) -> float:
+    if (size := value.positive()) > _LARGEST_TAG_M:
+        value.fail(f"is in metres, and {size:g} m is no {what}; write 0.088 for 88 mm.")
+    return size
+
+
+def _counts(value: YamlValue, found: dict[str, YamlValue], first: str, second: str, what: str) -> tuple[int, int]:
+    a, b = found[first].whole(1), found[second].whole(1)
+    if a * b > _MOST_TAGS:
+        value.fail(f"{a} x {b} {what} are more than {_MOST_TAGS}; correct {first} and {second}.")
+    return a, b
+
+
+def _made(value: YamlValue, make: Callable[[], Target]) -> Target:
+    try:
+        return make()
+    except RigError as error:
+        value.fail(str(error))
 
 
 def _settings(value: YamlValue) -> Settings:

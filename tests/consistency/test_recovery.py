@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from icalib.calibration import Calibration
+from icalib.geometry.targets import Charuco, Checkerboard, Target
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter, Rig
 from icalib.rig_parameters import IMU_INTRINSICS_SIGMA
@@ -34,6 +35,50 @@ def test_noiseless_recordings_are_recovered_from_nothing(asynchronous: bool):
         assert max(extrinsics_error(result, simulation, camera)) < 1e-8
         intrinsics = result.group(camera, "intrinsics").value
         assert intrinsics == pytest.approx(np.array(simulation.truth.intrinsics[camera]), rel=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("model", "intrinsics", "distortion", "turn_deg"),
+    [
+        ("eucm", (250.0, 249.0, 371.0, 245.0), (0.62, 1.09), 0.0),
+        ("eucm", (110.0, 109.0, 371.0, 245.0), (0.6, 1.1), 70.0),  # corners up to 101 degrees off the axis
+        ("double-sphere", (150.0, 151.0, 371.0, 245.0), (-0.2, 0.59), 0.0),
+        ("double-sphere", (220.0, 221.0, 371.0, 245.0), (0.3, 0.7), 40.0),
+        ("omni-radtan", (300.0, 298.0, 371.0, 245.0), (1.2, -0.1, 0.03, 3e-4, -2e-4), 40.0),
+    ],
+)
+def test_wide_lenses_are_recovered_from_nothing(model: str, intrinsics: tuple, distortion: tuple, turn_deg: float):
+    """Seen from 0.35 m, by cameras turned away from the target."""
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("y", turn_deg, degrees=True).as_matrix()
+    scenario = handheld(12.0, noiseless=True)
+    cameras = tuple(
+        dataclasses.replace(c, model=model, intrinsics=intrinsics, distortion=distortion, T_imu_cam=c.T_imu_cam @ turn)
+        for c in scenario.cameras
+    )
+    motion = dataclasses.replace(scenario.motion, distance_m=0.35)
+    simulation = simulate(dataclasses.replace(scenario, cameras=cameras, motion=motion), 1)
+    rig = rig_for(simulation.scenario, intrinsics="free", distortion="free")
+    result = calibrate_measurements(rig, simulation.measurements)
+    assert result.converged, result.status
+    for camera in ("cam0", "cam1"):
+        assert max(extrinsics_error(result, simulation, camera)) < 1e-7
+        assert result.group(camera, "intrinsics").value == pytest.approx(np.array(intrinsics), rel=1e-6)
+        assert result.group(camera, "distortion").value == pytest.approx(np.array(distortion), rel=1e-6, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "target", [Charuco(8, 7, 0.08, 0.06, "5x5_100"), Checkerboard(6, 7, 0.08)], ids=lambda target: target.type
+)
+def test_boards_without_bloom_are_recovered(target: Target):
+    simulation = simulate(dataclasses.replace(handheld(12.0, noiseless=True), target=target), 1)
+    rig = rig_for(simulation.scenario)
+    rig = dataclasses.replace(rig, settings=dataclasses.replace(rig.settings, bloom=True))
+    result = calibrate_measurements(rig, simulation.measurements)
+    assert result.converged, result.status
+    for camera in ("cam0", "cam1"):
+        assert max(extrinsics_error(result, simulation, camera)) < 1e-8
+    assert not any(group.name == "bloom" for group in result.groups)
 
 
 def real_corners() -> tuple[Scenario, Rig]:

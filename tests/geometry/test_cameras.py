@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import cmath
 from collections.abc import Callable
-from math import cos, hypot, pi, sin
+from math import cos, hypot, pi, sin, sqrt
 
 import numpy as np
 import pytest
@@ -34,6 +34,29 @@ SAMPLES = {
         "narrow": [460.0, 458.0, 367.0, 248.0, -0.01, 0.02, -0.015, 0.004],
         "folds": [300.0, 310.0, 375.0, 240.0, -0.04, 0.0, 0.0, 0.0],
     },
+    "eucm": {
+        "wide, folds": [250.0, 249.0, 376.0, 239.0, 0.62, 1.09],
+        "none": [400.0, 410.0, 380.0, 230.0, 0.0, 1.0],
+        "narrow": [458.0, 457.0, 367.0, 248.0, 0.3, 0.9],
+        "half": [190.0, 191.0, 367.0, 248.0, 0.5, 1.2],
+        "alpha below 0": [458.0, 457.0, 367.0, 248.0, -0.2, 0.8],
+        "alpha above 1, folds": [480.0, 481.0, 376.0, 239.0, 1.1, 0.7],
+        "beta below 0": [300.0, 301.0, 376.0, 239.0, 0.4, -0.1],
+    },
+    "double-sphere": {
+        "wide, folds": [313.0, 312.0, 376.0, 239.0, -0.18, 0.59],
+        "none": [400.0, 410.0, 380.0, 230.0, 0.0, 0.0],
+        "narrow": [458.0, 457.0, 367.0, 248.0, 0.2, 0.3],
+        "alpha below 0": [300.0, 301.0, 376.0, 239.0, -0.2, -0.1],
+        "xi above 1, folds": [900.0, 901.0, 376.0, 239.0, 1.2, 0.3],
+    },
+    "omni-radtan": {
+        "mirror": [600.0, 598.0, 376.0, 239.0, 0.98, -0.1, 0.08, 0.0003, -0.0002],
+        "none": [400.0, 410.0, 380.0, 230.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        "parabola": [500.0, 501.0, 376.0, 239.0, 1.0, 0.0, 0.0, 0.0, 0.0],
+        "folds": [700.0, 690.0, 375.0, 241.0, 1.2, -0.3, 0.0, 0.003, -0.002],
+        "xi far above 1, folds": [1000.0, 1001.0, 376.0, 239.0, 2.0, 0.02, 0.0, 0.0, 0.0],
+    },
 }
 IMAGE = (752, 480)
 CASES = [pytest.param(name, label, id=f"{name}-{label}") for name, sets in SAMPLES.items() for label in sets]
@@ -57,31 +80,76 @@ def obvious_equidistant(params: np.ndarray, point: np.ndarray) -> complex:
     return cmath.rect(theta_d, cmath.phase(complex(point[0], point[1])))
 
 
+def obvious_eucm(params: np.ndarray, point: np.ndarray) -> complex:
+    """Onto the ellipsoid, then seen from behind it: P / d lies on beta (x^2 + y^2) + z^2 = 1."""
+    alpha, beta = params[4:]
+    x, y, z = point / sqrt(beta * (point[0] ** 2 + point[1] ** 2) + point[2] ** 2)
+    return complex(x, y) / (alpha + (1 - alpha) * z)
+
+
+def obvious_double_sphere(params: np.ndarray, point: np.ndarray) -> complex:
+    """Onto the first unit sphere, its centre moved by xi, onto the second, its centre moved by alpha / (1 - alpha)."""
+    xi, alpha = params[4:]
+    second = point / np.linalg.norm(point) + [0.0, 0.0, xi]
+    second = second / np.linalg.norm(second) + [0.0, 0.0, alpha / (1 - alpha)]
+    return complex(second[0], second[1]) / second[2] / (1 - alpha)
+
+
+def obvious_omni(params: np.ndarray, point: np.ndarray) -> complex:
+    shifted = point / np.linalg.norm(point) + [0.0, 0.0, params[4]]
+    return obvious_radtan(np.delete(params, 4), shifted)
+
+
 OBVIOUS = {
     "pinhole-radtan": obvious_radtan,
     "pinhole-radtan5": obvious_radtan,
     "pinhole-equidistant": obvious_equidistant,
+    "eucm": obvious_eucm,
+    "double-sphere": obvious_double_sphere,
+    "omni-radtan": obvious_omni,
 }
+
+
+def radius_without_tangential_terms(name: str, params: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    """Of the image of rays at `angles` from the axis, before fx and fy; NaN where the formula has no positive depth."""
+    s, c = np.sin(angles), np.cos(angles)
+    if name == "eucm":
+        alpha, beta = params[4:]
+        depth, coefficients = alpha * np.sqrt(beta * s**2 + c**2) + (1 - alpha) * c, []
+        depth[beta * s**2 + c**2 <= np.where(c > 0.0, 0.0, max(-beta, 0.0))] = np.nan
+    elif name == "double-sphere":
+        (xi, alpha), coefficients = params[4:], []
+        depth = alpha * np.sqrt(s**2 + (c + xi) ** 2) + (1 - alpha) * (c + xi)
+    elif name == "omni-radtan":
+        depth, coefficients = c + params[4], params[5:7]
+    else:
+        depth, coefficients = c, [*params[4:6], *params[8:]]
+    radii = s / np.where(depth > 0.0, depth, np.nan)
+    if name == "pinhole-equidistant":
+        radii, coefficients = angles, params[4:]
+    return radii * (1.0 + sum(k * radii ** (2 * i + 2) for i, k in enumerate(coefficients)))
 
 
 def angle_limit(name: str, params: np.ndarray) -> float:
     """Largest angle from the optical axis [rad] that the model projects; found by walking outwards."""
-    radii = np.linspace(0.0, pi if name == "pinhole-equidistant" else 50.0, 200_001)[1:]
-    coefficients = params[4:] if name == "pinhole-equidistant" else [*params[4:6], *params[8:]]
-    factors = sum(k * radii ** (2 * i + 2) for i, k in enumerate(coefficients))
-    falls = np.flatnonzero(np.diff(radii * (1.0 + factors)) <= 0.0)
-    limit = radii[falls[0]] if len(falls) else radii[-1]
-    return float(limit if name == "pinhole-equidistant" else np.arctan(limit))
+    angles = np.linspace(0.0, pi, 400_001)[1:-1]
+    with np.errstate(invalid="ignore"):
+        stops = np.flatnonzero(~(np.diff(radius_without_tangential_terms(name, params, angles)) > 0.0))
+    return float(angles[stops[0]]) if len(stops) else pi
+
+
+def magnification(name: str, params: np.ndarray) -> float:
+    """In the image's centre, over the focal length."""
+    return 1.0 / (1.0 + params[4]) if name in ("double-sphere", "omni-radtan") else 1.0
 
 
 def points_in_view(name: str, params: np.ndarray) -> np.ndarray:
     """Points on and next to the optical axis, over the field, and at its edge; at several distances."""
     limit = 0.98 * angle_limit(name, params)
     angles = [0.0, 1e-12, 1e-8, 1e-5, 1e-3, 0.1, 0.4, *np.linspace(0.5, 1.0, 6) * limit]
-    if name == "pinhole-equidistant":
-        angles += [a for a in (pi / 2 - 1e-9, pi / 2, pi / 2 + 1e-3) if a < limit]
+    angles += [a for a in (pi / 2 - 1e-9, pi / 2, pi / 2 + 1e-3) if a < limit]
     azimuths = [0.0, pi / 2, 0.3, 2.0, -2.5, -0.01]
-    angles = [a for a in angles if a < angle_limit(name, params)]
+    angles = [a for a in angles if a < limit / 0.98]
     unit = [[sin(a) * cos(t), sin(a) * sin(t), cos(a)] for a in angles for t in azimuths]
     return np.concatenate([distance * np.array(unit) for distance in (0.2, 1.0, 7.0)])
 
@@ -105,7 +173,7 @@ def test_every_model_has_samples_and_an_obvious_formula() -> None:
 
 def test_unknown_model_lists_what_there_is() -> None:
     with pytest.raises(
-        CalibrationError, match=r"'pinhole-radtam'.*pinhole-radtan, pinhole-radtan5, pinhole-equidistant"
+        CalibrationError, match=r"'pinhole-radtam'.*pinhole-radtan, pinhole-radtan5, pinhole-equidistant, eucm, double"
     ):
         camera_model("pinhole-radtam")
 
@@ -129,9 +197,11 @@ def test_jacobian_of_the_point(name: str, label: str) -> None:
     model, params = sample(name, label)
     points = points_in_view(name, params)
     _, _, j_point, _ = model.project_with_jacobians(params, points)
+    limit = angle_limit(name, params)
     for point, j in zip(points, j_point, strict=True):
-        # Of the depth too: just under 90 degrees uv of a radtan camera changes on the scale of z.
-        scale = min(float(np.linalg.norm(point)), abs(point[2])) if "radtan" in name else np.linalg.norm(point)
+        # Close to the edge of the range uv changes on the scale of what is left to it.
+        left = limit - np.arctan2(hypot(point[0], point[1]), point[2])
+        scale = float(np.linalg.norm(point)) * min(1.0, left)
         numeric = differences(lambda p: model.project(params, p[None])[0][0], point, np.full(3, 5e-4 * scale))
         np.testing.assert_allclose(j, numeric, atol=1e-8 * np.abs(j).max())
 
@@ -148,7 +218,8 @@ def test_jacobian_of_the_parameters(name: str, label: str) -> None:
     numeric = differences(lambda p: model.project(p, points)[0], params, step)
     rounding = 1e-15 / 1e-7 * (1e3 + np.abs(model.project(params, points)[0]).max(axis=1)[:, None, None])
     assert (np.abs(j_params - numeric) <= 1e-9 * np.abs(j_params) + rounding).all()
-    assert np.abs(j_params).max(axis=(0, 1)).min() > 0.0
+    moves = np.abs(j_params).max(axis=(0, 1)) > 0.0
+    assert moves.all() or (name, label) == ("eucm", "none") and moves[:5].all()  # alpha = 0 leaves nothing to beta
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e-320, 1e-300, 1e-170, 1e-161, 1e-154, 1e-20, 1e-12])
@@ -159,9 +230,11 @@ def test_on_the_optical_axis_it_is_a_pinhole(name: str, label: str, offset: floa
     fx, fy, cx, cy = params[:4]
     assert valid[0]
     np.testing.assert_allclose(uv[0], [cx, cy], atol=fx * 2 * offset)
-    np.testing.assert_allclose(j_point[0], [[fx / 2, 0, 0], [0, fy / 2, 0]], atol=1e-11 * fx)
+    scale = 0.5 * magnification(name, params)
+    np.testing.assert_allclose(j_point[0], [[fx * scale, 0, 0], [0, fy * scale, 0]], atol=1e-11 * fx)
     np.testing.assert_allclose(j_params[0, :, 2:4], np.eye(2), atol=0)
-    np.testing.assert_allclose(np.delete(j_params[0], [2, 3], axis=1), 0.0, atol=offset)
+    np.testing.assert_allclose(j_params[0, :, :2], 0.0, atol=offset)
+    np.testing.assert_allclose(j_params[0, :, 4:], 0.0, atol=offset * (1.0 if "pinhole" in name else fx))
 
 
 @pytest.mark.parametrize(("name", "label"), CASES)
@@ -193,8 +266,6 @@ def test_every_point_in_view_comes_back(name: str, label: str) -> None:
 def test_the_edge_of_the_valid_range(name: str, label: str) -> None:
     model, params = sample(name, label)
     limit = angle_limit(name, params)
-    if limit > (pi if name == "pinhole-equidistant" else pi / 2) - 0.03:
-        limit = pi if name == "pinhole-equidistant" else pi / 2
     for angle, expected in ((limit - 1e-3, True), (limit + 1e-3, False)):
         if angle < pi:  # beyond, there is no direction to test
             points = np.array([[sin(angle), 0.0, cos(angle)], [0.0, -2 * sin(angle), 2 * cos(angle)]])
@@ -212,6 +283,83 @@ def test_points_without_an_image_are_flagged_and_finite(name: str, point: list[f
     assert all(np.isfinite(values).all() for values in (uv, j_point, j_params, model.project(params, points)[0]))
 
 
+def relative_to_pinhole(name: str, distortion: list[float], label: str = "none") -> None:
+    """The model at this distortion is the pinhole-radtan of the sample `label`, values and Jacobians."""
+    pinhole, params = sample("pinhole-radtan", label)
+    model, both = camera_model(name), np.append(params[:4], distortion)
+    points = points_in_view("pinhole-radtan", params)
+    expected, got = pinhole.project_with_jacobians(params, points), model.project_with_jacobians(both, points)
+    np.testing.assert_array_equal(got[1], expected[1])
+    np.testing.assert_allclose(got[0], expected[0], rtol=1e-12)
+    np.testing.assert_allclose(got[2], expected[2], rtol=1e-12, atol=1e-11 * np.abs(expected[2]).max())
+    np.testing.assert_allclose(got[3][:, :, :4], expected[3][:, :, :4], rtol=1e-12)
+
+
+def test_limits_are_the_pinhole() -> None:
+    relative_to_pinhole("eucm", [0.0, 1.7])
+    relative_to_pinhole("double-sphere", [0.0, 0.0])
+    for label in ("euroc", "none", "folds"):
+        relative_to_pinhole("omni-radtan", [0.0, *SAMPLES["pinhole-radtan"][label][4:]], label)
+
+
+@pytest.mark.parametrize("xi", [0.2, 1.0, 2.5])
+def test_three_models_share_the_unified_one(xi: float) -> None:
+    """Geyer's model: Mei without distortion, EUCM with beta = 1 and double sphere with xi = 0."""
+    alpha = xi / (1.0 + xi)
+    scaled = [400.0, 410.0, 380.0, 230.0]
+    mei = np.array([scaled[0] * (1.0 + xi), scaled[1] * (1.0 + xi), *scaled[2:], xi, 0.0, 0.0, 0.0, 0.0])
+    points = np.random.default_rng(0).normal(size=(500, 3))
+    uv, valid = camera_model("omni-radtan").project(mei, points)
+    assert valid.any()
+    for name, distortion in (("eucm", [alpha, 1.0]), ("double-sphere", [0.0, alpha])):
+        again, seen = camera_model(name).project(np.array(scaled + distortion), points)
+        np.testing.assert_array_equal(seen, valid)
+        np.testing.assert_allclose(again, uv, rtol=1e-10)
+
+
+def test_the_ranges_are_those_of_the_papers() -> None:
+    """Khomutenko et al. as Usenko et al. 2018 give it in section 2.3; Mei's with xi or 1 / xi.
+
+    The double sphere's w2 is not the paper's (eq. 45), which takes the two shifts in the wrong order and is exact for
+    xi = 0 only: at xi = -0.5, alpha = 1 / 11 it admits points whose depth is negative.
+    """
+    rng = np.random.default_rng(1)
+    points = rng.normal(size=(400, 3))
+    d = np.linalg.norm(points, axis=1)
+    for xi, alpha in rng.uniform([-0.95, 0.0], [0.95, 1.0], (50, 2)):
+        w1 = alpha / (1 - alpha) if alpha <= 0.5 else (1 - alpha) / alpha
+        w2 = xi * (1.0 - w1**2) + w1 * sqrt(1.0 - xi**2 * (1.0 - w1**2))
+        found = camera_model("double-sphere").project(np.array([1.0, 1.0, 0.0, 0.0, xi, alpha]), points)[1]
+        np.testing.assert_array_equal(found, points[:, 2] > -w2 * d)
+        beta = 0.5 + abs(xi)
+        stretched = np.sqrt(beta * (d**2 - points[:, 2] ** 2) + points[:, 2] ** 2)
+        found = camera_model("eucm").project(np.array([1.0, 1.0, 0.0, 0.0, alpha, beta]), points)[1]
+        np.testing.assert_array_equal(found, points[:, 2] > -w1 * stretched)
+        mirror = 3.0 * alpha
+        found = camera_model("omni-radtan").project(np.array([1.0, 1.0, 0, 0, mirror, 0, 0, 0, 0]), points)[1]
+        np.testing.assert_array_equal(found, points[:, 2] > -min(mirror, 1.0 / mirror) * d)
+
+
+@pytest.mark.parametrize("name", CAMERA_MODELS)
+def test_any_parameters_are_finite_and_no_crash(name: str) -> None:
+    """Far outside the domain too: what an estimate may try on its way."""
+    model, rng = camera_model(name), np.random.default_rng(2)
+    points, uv = rng.normal(size=(50, 3)), rng.uniform(0.0, 700.0, (50, 2))
+    points[0], uv[0] = [0.0, 0.0, 1.0], [370.0, 240.0]
+    special = [-1.0, -0.5, 0.0, 0.5, 1.0, 2.0, 1e8, -1e8, np.inf, np.nan]
+    for _ in range(300):
+        rest = np.where(
+            rng.random(len(model.parameter_names) - 4) < 0.5,
+            rng.choice(special, len(model.parameter_names) - 4),
+            rng.normal(scale=2.0, size=len(model.parameter_names) - 4),
+        )
+        params = np.array([400.0, 410.0, 370.0, 240.0, *rest])
+        found = model.project_with_jacobians(params, points)
+        for values in (*found, *model.unproject(params, uv)):
+            if np.isfinite(rest).all():
+                assert np.isfinite(values).all()
+
+
 @pytest.mark.parametrize(("name", "label"), [case for case in CASES if "folds" in str(case.values[1])])
 def test_pixels_beyond_the_fold_are_flagged(name: str, label: str) -> None:
     model, params = sample(name, label)
@@ -223,8 +371,15 @@ def test_pixels_beyond_the_fold_are_flagged(name: str, label: str) -> None:
 
 def test_a_fisheye_sees_behind_its_image_plane_and_a_pinhole_does_not() -> None:
     behind = np.array([[1.0, 0.2, -0.1], [0.3, -1.0, 0.0]])
-    for name, expected in (("pinhole-equidistant", True), ("pinhole-radtan", False), ("pinhole-radtan5", False)):
-        model, params = sample(name, "none")
+    seeing = (
+        ("pinhole-equidistant", "none"),
+        ("eucm", "half"),
+        ("double-sphere", "wide, folds"),
+        ("omni-radtan", "mirror"),
+    )
+    blind = [(name, "none") for name in CAMERA_MODELS if name != "pinhole-equidistant"]
+    for (name, label), expected in [(case, True) for case in seeing] + [(case, False) for case in blind]:
+        model, params = sample(name, label)
         assert (model.project(params, behind)[1] == expected).all()
 
 

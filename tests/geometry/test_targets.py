@@ -1,12 +1,15 @@
-"""Layout of the AprilGrid, as the data's README states it."""
+"""Layout of the targets: the AprilGrid as the data's README states it, ChArUco boards as OpenCV does."""
 
 from __future__ import annotations
+
+import sys
 
 import numpy as np
 import pytest
 
-from icalib.errors import RecordingError
-from icalib.geometry.targets import AprilGrid
+from icalib.errors import CalibrationError, RecordingError, RigError
+from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Tag, Target
+from icalib.geometry.targets.families import FAMILIES, tag_bits
 
 GRID = AprilGrid(rows=6, cols=7, tag_size=0.088, tag_spacing=0.3)  # not square, so that rows and columns differ
 
@@ -42,3 +45,102 @@ def test_unknown_tag(tag: int) -> None:
 def test_unknown_corner(corner: int) -> None:
     with pytest.raises(RecordingError, match=f"corner {corner} is not one of"):
         GRID.point_index(np.array([0, 1]), np.array([0, corner]))
+
+
+CHARUCO = Charuco(squares_x=7, squares_y=5, square_size=0.04, marker_size=0.03, dictionary="5x5_100")
+BOARD = Checkerboard(rows=6, cols=9, square_size=0.03)
+TAG = Tag("apriltag_36h11", 12, 0.2)
+
+
+@pytest.mark.parametrize("target", [GRID, CHARUCO, BOARD, TAG], ids=lambda t: t.type)
+def test_identities_and_indices_are_inverse_and_the_origin_is_point_0(target: Target):
+    index = np.arange(len(target.points))
+    np.testing.assert_array_equal(target.point_index(*target.point_identity(index)), index)
+    np.testing.assert_array_equal(target.points[0], 0.0)
+    np.testing.assert_array_equal(target.points[:, 2], 0.0)
+    assert target.tag_centers.shape == target.points.shape
+    assert (target.tag_centers != target.points).any() == target.blooms
+
+
+def test_charuco_corners_are_opencvs():
+    """Its corners run from the top left downwards, in a frame with y down whose origin is the board's own corner."""
+    aruco = pytest.importorskip("cv2").aruco
+    board = aruco.CharucoBoard((7, 5), 0.04, 0.03, aruco.getPredefinedDictionary(aruco.DICT_5X5_100))
+    theirs = np.asarray(board.getChessboardCorners()) * [1.0, -1.0, 1.0]
+    np.testing.assert_allclose(CHARUCO.points, theirs - theirs[0], atol=1e-7)
+
+
+def test_checkerboard_runs_row_by_row_from_the_bottom_left():
+    np.testing.assert_allclose(BOARD.points[[1, 9, 53]], [[0.03, 0, 0], [0, 0.03, 0], [0.24, 0.15, 0]])
+
+
+@pytest.mark.parametrize(("rows", "cols", "symmetric"), [(6, 9, False), (6, 8, True), (7, 9, True), (6, 6, True)])
+def test_symmetry_of_a_checkerboard(rows: int, cols: int, symmetric: bool):
+    """Colours of the squares, the board turned by half a turn."""
+    black = np.indices((rows + 1, cols + 1)).sum(axis=0) % 2 == 0
+    board = Checkerboard(rows, cols, 0.03)
+    assert board.symmetric == symmetric == np.array_equal(black, black[::-1, ::-1])
+    if symmetric:
+        turned = board.points.max(axis=0) - board.points
+        np.testing.assert_allclose(turned, board.points[::-1], atol=1e-15)
+    assert not CHARUCO.symmetric and not GRID.symmetric
+
+
+def test_tag_corners_run_counterclockwise_from_the_bottom_left():
+    np.testing.assert_allclose(TAG.points[:, :2], [[0, 0], [0.2, 0], [0.2, 0.2], [0, 0.2]])
+    np.testing.assert_allclose(TAG.tag_centers, [[0.1, 0.1, 0.0]] * 4)
+
+
+@pytest.mark.parametrize(
+    ("target", "tag_id", "corner", "words"),
+    [
+        (CHARUCO, 0, 24, "corner 24 is not on the target (corners 0 to 23); check squares_x and squares_y"),
+        (CHARUCO, 3, 0, "tag 3 is not on the target, whose corners have tag 0"),
+        (BOARD, 0, -1, "corner -1 is not on the target (corners 0 to 53); check rows and cols"),
+        (TAG, 11, 0, "tag 11 is not tag 12"),
+        (TAG, 12, 4, "corner 4 is not one of a tag's corners"),
+    ],
+)
+def test_points_that_a_target_lacks(target: Target, tag_id: int, corner: int, words: str):
+    with pytest.raises(RecordingError) as caught:
+        target.point_index(np.array([tag_id]), np.array([corner]))
+    assert words in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Charuco(7, 5, 0.04, 0.04, "5x5_100"), "marker_size 0.04 does not fit a square of 0.04"),
+        (lambda: Charuco(2, 5, 0.04, 0.03, "5x5_100"), "2 x 5 squares has too few inner corners"),
+        (lambda: Charuco(20, 20, 0.04, 0.03, "5x5_100"), "needs 200 tags, but 5x5_100 has 100"),
+        (lambda: Charuco(7, 5, 0.04, 0.03, "5x5"), "no family of tags '5x5'; available are 4x4_50"),
+        (lambda: Checkerboard(1, 5, 0.04), "1 x 5 inner corners cannot tell x from y"),
+        (lambda: Tag("apriltag_36h11", 587, 0.1), "needs 588 tags, but apriltag_36h11 has 587"),
+    ],
+)
+def test_targets_that_cannot_be(make, words: str):
+    with pytest.raises(RigError) as caught:
+        make()
+    assert words in str(caught.value)
+
+
+def test_families_are_opencvs():
+    aruco = pytest.importorskip("cv2").aruco
+    for family, (bits, count) in FAMILIES.items():
+        name = next(n for n in dir(aruco) if n.lower() == f"dict_{family}")
+        dictionary = aruco.getPredefinedDictionary(getattr(aruco, name))
+        assert (dictionary.markerSize, len(dictionary.bytesList)) == (bits, count)
+        assert tag_bits(family, count - 1).shape == (bits, bits)
+
+
+def test_apriltags_stand_as_their_authors_draw_them():
+    """36h11's code of id 0 is 0xd5d628584, its highest bit at the top left (Olson 2011; Kalibr draws it so too)."""
+    pytest.importorskip("cv2")
+    code = f"{0xD5D628584:036b}"
+    np.testing.assert_array_equal(tag_bits("apriltag_36h11", 0).ravel(), [c == "1" for c in code])
+
+
+def test_without_opencv_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with pytest.raises(CalibrationError, match=r"install icalib\[images\]"):
+        tag_bits("4x4_50", 0)

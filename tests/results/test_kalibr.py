@@ -75,6 +75,27 @@ def test_a_model_that_kalibr_lacks_is_fitted_and_said(calibration: Calibration):
     assert np.abs(ours - theirs).max() < 0.5
 
 
+@pytest.mark.parametrize(
+    ("model", "distortion", "expected"),
+    [
+        ("eucm", [0.6, 1.1], ("eucm", [0.6, 1.1], "none", [])),
+        ("double-sphere", [-0.2, 0.6], ("ds", [-0.2, 0.6], "none", [])),
+        ("omni-radtan", [0.9, -0.1, 0.02, 1e-3, 2e-3], ("omni", [0.9], "radtan", [-0.1, 0.02, 1e-3, 2e-3])),
+    ],
+)
+def test_models_of_wide_lenses_are_kalibrs(calibration: Calibration, model: str, distortion: list, expected: tuple):
+    """Kalibr's wiki, "supported models": xi, alpha and beta stand before the focal lengths."""
+    sensors = {n: s | ({"model": model} if n == "cam1" else {}) for n, s in calibration.rig["sensors"].items()}
+    groups = tuple(
+        dataclasses.replace(g, value=np.array(distortion)) if (g.sensor, g.name) == ("cam1", "distortion") else g
+        for g in calibration.groups
+    )
+    text = camchain_imucam(dataclasses.replace(calibration, rig=calibration.rig | {"sensors": sensors}, groups=groups))
+    found, pinhole = yaml.safe_load(text)["cam1"], [457.587, 456.134, 379.999, 255.238]
+    assert (found["camera_model"], found["intrinsics"]) == (expected[0], expected[1] + pinhole)
+    assert (found["distortion_model"], found["distortion_coeffs"]) == expected[2:]
+
+
 def groups_of(groups: tuple, sensor: str, name: str) -> np.ndarray:
     return next(g.value for g in groups if (g.sensor, g.name) == (sensor, name))
 

@@ -13,6 +13,10 @@ from icalib.simulation.projection import image_velocity, project, visible
 FISHEYE = SimCamera(
     "cam0", "pinhole-equidistant", (752, 480), (190.0, 191.0, 375.0, 240.0), (0.03, -0.01, 0.004, -0.001), np.eye(4)
 )
+EUCM = replace(FISHEYE, model="eucm", intrinsics=(210.0, 211.0, 375.0, 240.0), distortion=(0.62, 1.1))
+SPHERES = replace(EUCM, model="double-sphere", distortion=(-0.2, 0.59))
+MIRROR = replace(EUCM, model="omni-radtan", distortion=(1.2, -0.1, 0.03, 3e-4, -2e-4))
+WIDE = (FISHEYE, EUCM, SPHERES, MIRROR)
 
 
 def with_camera(scenario, index=0, **changes):
@@ -23,9 +27,19 @@ def with_camera(scenario, index=0, **changes):
 
 def project_one(camera, P):
     """One point with the standard library only."""
-    x, y, d = P[0] / P[2], P[1] / P[2], camera.distortion
+    d, length = camera.distortion, math.hypot(*P[:3])
+    if camera.model == "omni-radtan":
+        d, P = d[1:], (P[0] / length, P[1] / length, P[2] / length + d[0])
+    x, y = P[0] / P[2], P[1] / P[2]
     r = math.sqrt(x * x + y * y)
-    if camera.model == "pinhole-radtan":
+    if camera.model == "eucm":
+        depth = d[0] * math.hypot(math.sqrt(d[1]) * P[0], math.sqrt(d[1]) * P[1], P[2]) + (1.0 - d[0]) * P[2]
+        xd, yd = P[0] / depth, P[1] / depth
+    elif camera.model == "double-sphere":
+        z = P[2] + d[0] * length
+        depth = d[1] * math.hypot(P[0], P[1], z) + (1.0 - d[1]) * z
+        xd, yd = P[0] / depth, P[1] / depth
+    elif "radtan" in camera.model:
         L = 1.0 + d[0] * r**2 + d[1] * r**4
         xd = x * L + 2.0 * d[2] * x * y + d[3] * (r * r + 2.0 * x * x)
         yd = y * L + d[2] * (r * r + 2.0 * y * y) + 2.0 * d[3] * x * y
@@ -66,23 +80,24 @@ def test_corners_are_projections_at_sensor_time_plus_offset(index, exact):
     assert np.abs(measured - wrong_sign).max() > 1.0
 
 
-def test_fisheye_recording_is_exact_too():
+@pytest.mark.parametrize("lens", WIDE, ids=lambda c: c.model)
+def test_recordings_of_wide_lenses_are_exact_too(lens):
     scenario = with_camera(
         handheld(duration_s=1.0, noiseless=True),
-        model=FISHEYE.model,
-        intrinsics=FISHEYE.intrinsics,
-        distortion=FISHEYE.distortion,
+        model=lens.model,
+        intrinsics=lens.intrinsics,
+        distortion=lens.distortion,
     )
     sim = simulate(scenario, seed=2)
     expected = expected_corners(sim, 0, sim.truth.time_offset["cam0"])
     np.testing.assert_allclose(sim.measurements.cameras[0].uv, expected, atol=1e-9)
 
 
-@pytest.mark.parametrize("camera", [handheld().cameras[0], FISHEYE], ids=lambda c: c.model)
+@pytest.mark.parametrize("camera", [handheld().cameras[0], *WIDE], ids=lambda c: c.model)
 def test_projection_and_its_directional_derivative(camera):
     rng = np.random.default_rng(3)
     points = np.concatenate([rng.uniform(-1.0, 1.0, (50, 2)), rng.uniform(0.4, 2.0, (50, 1))], axis=1)
-    if camera is FISHEYE:
+    if camera in WIDE:
         points = np.concatenate([points, [[1.0, 0.3, -0.2], [1.0, 1.0, 1e-9], [1e-9, -1e-9, 1.0]]])
     uv = np.array([project_one(camera, P) for P in points])
     np.testing.assert_allclose(project(camera, points), uv, rtol=1e-13)
@@ -107,6 +122,18 @@ def test_points_behind_outside_or_beyond_the_fold_are_not_seen():
     theta = np.sqrt(1.0 / 0.3) + np.array([-0.01, 0.01])
     points = np.stack([np.sin(theta), 0.0 * theta, np.cos(theta)], axis=1)
     np.testing.assert_array_equal(visible(fisheye, points, project(fisheye, points)), [True, False])
+
+
+@pytest.mark.parametrize("camera", [EUCM, SPHERES, MIRROR], ids=lambda c: c.model)
+def test_wide_lenses_see_just_as_far_as_their_image_moves_outwards(camera):
+    camera = replace(camera, resolution=(100_000, 100_000), intrinsics=(*camera.intrinsics[:2], 5e4, 5e4))
+    angles = np.linspace(1e-3, math.pi - 1e-3, 5000)
+    points = np.stack([np.sin(angles), 0.0 * angles, np.cos(angles)], axis=1)
+    uv = project(camera, points)
+    seen = visible(camera, points, uv)
+    limit = int(seen.argmin())
+    assert not seen[limit:].any() and angles[limit] > 0.55 * math.pi
+    assert (np.diff(uv[:limit, 0]) > 0.0).all() and not np.diff(uv[limit - 1 : limit + 2, 0]).min() > 0.0
 
 
 def test_unknown_model_is_refused():

@@ -56,7 +56,7 @@ def layout_for(rig: Rig) -> Layout:
     for camera in rig.cameras:
         sizes = SIZES | {"distortion": len(camera_model(camera.model).parameter_names) - 4}
         for name, kind in CAMERA_PARAMETERS:
-            estimated = getattr(camera, name).mode != "fixed" and (name != "bloom" or rig.settings.bloom)
+            estimated = getattr(camera, name).mode != "fixed" and (name != "bloom" or rig.blooms)
             entries.append((camera.name, name, kind, sizes[name], estimated))
     return make_layout(entries)
 
@@ -76,7 +76,7 @@ def _priors(inputs: Inputs) -> tuple[Prior, ...]:
         for name, _ in CAMERA_PARAMETERS:
             shift = origin_difference(inputs.measurements, stream) if name == "time_offset" else 0.0
             owners.append((camera.name, name, getattr(camera, name), shift))
-            if name == "bloom" and rig.settings.bloom and camera.bloom.mode == "free":
+            if name == "bloom" and rig.blooms and camera.bloom.mode == "free":
                 block = layout.block(camera.name, "bloom")
                 priors.append(Prior(block, np.zeros(1), np.full(1, BLOOM_SIGMA_PX)))
     for sensor, name, parameter, shift in owners:
@@ -126,7 +126,7 @@ def assemble(inputs: Inputs, state: State, noise: list[CornerNoise], keep: list[
             assign_nodes(rig.settings.scheme, state.seconds, t), k & np.repeat(seen, np.diff(stream.start)), n,
             np.zeros((0, 2)), BOARD, rig.target.points, basis, layout, len(state.seconds),
         )  # fmt: skip
-        factors.append(_with_bloom(factor, camera, state, rig) if rig.settings.bloom else factor)
+        factors.append(_with_bloom(factor, camera, state, rig) if rig.blooms else factor)
     tolerance = inputs.tolerances.of(layout, rig.imu.name)
     return Problem(layout, imu_factor, tuple(factors), _priors(inputs), tolerance)
 
@@ -153,6 +153,6 @@ def start_values(inputs: Inputs, guess_values: dict[Key, np.ndarray]) -> dict[Ke
         np.zeros(N_INTRINSICS) if imu.intrinsics.value is None else imu.intrinsics.value.copy()
     )
     for camera in inputs.rig.cameras:
-        bloom = camera.bloom.value if inputs.rig.settings.bloom else None
+        bloom = camera.bloom.value if inputs.rig.blooms else None
         values[camera.name, "bloom"] = np.zeros(1) if bloom is None else bloom.copy()
     return {key: np.ascontiguousarray(v, dtype=np.float64) for key, v in values.items()}

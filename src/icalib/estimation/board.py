@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from icalib.geometry.cameras.base import CameraModel
-from icalib.geometry.targets import AprilGrid
+from icalib.geometry.targets import Target
 
 BOW_LABELS = ("bow_xx", "bow_xy", "bow_yy")
 # In the plane: what printing and mounting do to second order. A turn, a shift and the scale are left out: the first two
@@ -16,7 +16,7 @@ SHAPE_LABELS = BOW_LABELS + IN_PLANE_LABELS
 SHAPE_SIGMA_M = np.array([3e-3] * len(BOW_LABELS) + [1e-3] * len(IN_PLANE_LABELS))
 
 
-def shape_basis(target: AprilGrid, bends: bool) -> np.ndarray:
+def shape_basis(target: Target, bends: bool) -> np.ndarray:
     """(n_points, s, 3) displacement in the board frame by unit of each shape parameter [m].
 
     With x and y from -1 to 1 over the target: the bow z = a x^2 + b x y + c y^2; stretch (x, -y) and shear (y, x); and

@@ -16,7 +16,14 @@ from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.cameras.convert import fit_model
 
-KALIBR_DISTORTIONS = ("radtan", "equidistant")
+# Our model -> Kalibr's camera and distortion model, and which of our distortion stand before its focal lengths.
+KALIBR_MODELS = {
+    "pinhole-radtan": ("pinhole", "radtan", 0),
+    "pinhole-equidistant": ("pinhole", "equidistant", 0),
+    "eucm": ("eucm", "none", 2),
+    "double-sphere": ("ds", "none", 2),
+    "omni-radtan": ("omni", "radtan", 1),
+}
 SAME_INSTANT_S = 0.025  # images this close see the same scene
 
 
@@ -67,33 +74,40 @@ def _camera(c: Calibration, index: int, overlaps: np.ndarray) -> dict[str, Any]:
     lens, _ = _lens(c, index)
     return data | {
         "cam_overlaps": np.flatnonzero(overlaps[index]).tolist(),
-        "camera_model": "pinhole",
-        "distortion_coeffs": lens[1][4:].tolist(),
-        "distortion_model": lens[0],
-        "intrinsics": lens[1][:4].tolist(),
+        **lens,
         "resolution": [int(side) for side in c.rig["sensors"][name]["resolution"]],
         "rostopic": f"/{name}/image_raw",
         "timeshift_cam_imu": float(c.group(name, "time_offset").value[0]),
     }
 
 
-def _lens(c: Calibration, index: int) -> tuple[tuple[str, np.ndarray], str]:
-    """Kalibr's distortion model with its parameters (8,), and a sentence where they are a fit to a model of ours."""
+def _lens(c: Calibration, index: int) -> tuple[dict[str, Any], str]:
+    """Kalibr's fields of the lens, and a sentence where they are a fit to a model of ours."""
     name = c.cameras[index]
     sensor = c.rig["sensors"][name]
+    model = sensor["model"]
     params = np.concatenate([c.group(name, "intrinsics").value, c.group(name, "distortion").value])
-    distortion = sensor["model"].split("-")[1]
-    if distortion in KALIBR_DISTORTIONS:
-        return (distortion, params), ""
+    if model in KALIBR_MODELS:
+        return _lens_fields(model, params), ""
     width, height = (int(side) for side in sensor["resolution"])
-    source, target = camera_model(sensor["model"]), camera_model("pinhole-radtan")
+    source, target = camera_model(model), camera_model("pinhole-radtan")
     fitted, rms, most = fit_model(source, params, target, (width, height))
     sentence = (
-        f"# cam{index}: Kalibr has no {distortion}; this radtan follows it to {rms:.2f} px RMS over the "
+        f"# cam{index}: Kalibr has no {model.split('-')[1]}; this radtan follows it to {rms:.2f} px RMS over the "
         f"image, {most:.1f} px "
         "at most. calibration.yaml holds what was estimated."
     )
-    return ("radtan", fitted), sentence
+    return _lens_fields(target.name, fitted), sentence
+
+
+def _lens_fields(model: str, params: np.ndarray) -> dict[str, Any]:
+    camera, distortion, before = KALIBR_MODELS[model]
+    return {
+        "camera_model": camera,
+        "distortion_coeffs": params[4 + before :].tolist(),
+        "distortion_model": distortion,
+        "intrinsics": [*params[4 : 4 + before].tolist(), *params[:4].tolist()],
+    }
 
 
 def _intrinsics(c: Calibration) -> dict[str, Any]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from icalib.errors import EstimationError
@@ -12,7 +14,7 @@ from icalib.measurements import CornerStream
 
 TRIAL_IMAGES = 24
 BUNDLE_IMAGES = 48
-FOCAL_TRIALS = np.geomspace(0.2, 3.0, 28)  # of the image width: 136 to 19 degrees for a pinhole
+FOCAL_TRIALS = np.geomspace(0.1, 3.0, 35)  # of the image width: 19 degrees for a pinhole, all round for a fisheye
 ROUNDS = 25
 HUBER_PX = 1.5
 GOOD_RMS_PX = 2.0
@@ -25,17 +27,18 @@ def guess_intrinsics(
 
     given (P,): values that are held, NaN for those to be found.
     """
-    params = _best_start(_spread_images(stream, TRIAL_IMAGES), model, resolution, target, given)
-    stream = _spread_images(stream, BUNDLE_IMAGES)
-    wanted = np.isnan(given)
-    try:
-        # Focal length and the strongest distortion first; the rest only once these are near.
-        for stage in (np.array([0, 1, 4]), np.arange(len(params))):
-            free = stage[wanted[stage]]
-            params = _bundle(stream, model, params, target, free) if len(free) else params
-    except np.linalg.LinAlgError:
-        params = np.zeros_like(params)
-    rms = float(np.median(target_poses(stream, model, params, target).rms_px))
+    trial, bundle = _spread_images(stream, TRIAL_IMAGES), _spread_images(stream, BUNDLE_IMAGES)
+    least, params = np.inf, np.where(np.isnan(given), 0.0, given)
+    # A model of two shape parameters can settle in the wrong valley; the right one costs less.
+    for starts in _starts(model, resolution, given):
+        medians = [np.median(target_poses(trial, model, start, target).rms_px) for start in starts]
+        try:
+            found, cost = _fit(bundle, model, starts[int(np.argmin(medians))], target, np.isnan(given))
+        except np.linalg.LinAlgError:
+            continue
+        if cost < least:
+            least, params = cost, found
+    rms = float(np.median(target_poses(bundle, model, params, target).rms_px))
     if not rms < GOOD_RMS_PX:
         raise EstimationError(
             f"{stream.name}: no intrinsics of model {model.name} explain the corners (best median error {rms:.1f} px); "
@@ -44,20 +47,33 @@ def guess_intrinsics(
     return params
 
 
-def _best_start(
-    trial: CornerStream, model: CameraModel, resolution: tuple[int, int], target: np.ndarray, given: np.ndarray
-) -> np.ndarray:
-    """Parameters (P,) with the focal length of the trials that explains the corners best, where none is given."""
+def _starts(model: CameraModel, resolution: tuple[int, int], given: np.ndarray) -> Iterator[np.ndarray]:
+    """For each kind of lens that the model starts from, parameters (F, P) with every focal length to try.
+
+    The trials are of the scale in the image's centre, which is not fx in every model. What is `given` is kept.
+    """
     width, height = resolution
-    best, params = np.inf, np.zeros(len(given))
-    for focal in FOCAL_TRIALS * width if np.isnan(given[0]) else given[:1]:
-        start = np.zeros(len(given))
-        start[:4] = focal, focal, 0.5 * (width - 1), 0.5 * (height - 1)
-        start = np.where(np.isnan(given), start, given)
-        rms = float(np.median(target_poses(trial, model, start, target).rms_px))
-        if rms < best:
-            best, params = rms, start
-    return params
+    for distortion in model.start_distortions:
+        params = np.array([1.0, 1.0, 0.5 * (width - 1), 0.5 * (height - 1), *distortion])
+        _, _, j_point, _ = model.project_with_jacobians(params, np.array([[0.0, 0.0, 1.0]]))
+        starts = np.tile(params, (len(FOCAL_TRIALS), 1))
+        starts[:, :2] = FOCAL_TRIALS[:, None] * width / j_point[0, 0, 0]
+        starts = np.where(np.isnan(given), starts, given)
+        yield starts[:1] if not np.isnan(given[:2]).any() else starts
+        if not np.isnan(given[4:]).any():
+            return
+
+
+def _fit(
+    bundle: CornerStream, model: CameraModel, params: np.ndarray, target: np.ndarray, wanted: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Parameters and cost after fitting those `wanted` (P,): focal length and the strongest distortion first, the rest
+    only once these are near."""
+    cost = np.inf
+    for stage in (np.array([0, 1, 4]), np.arange(len(params))):
+        if wanted[stage].any():
+            params, cost = _bundle(bundle, model, params, target, stage[wanted[stage]])
+    return params, cost
 
 
 def _spread_images(stream: CornerStream, wanted: int) -> CornerStream:
@@ -72,8 +88,11 @@ def _spread_images(stream: CornerStream, wanted: int) -> CornerStream:
 
 def _bundle(
     stream: CornerStream, model: CameraModel, params: np.ndarray, target: np.ndarray, free: np.ndarray
-) -> np.ndarray:
-    """Levenberg-Marquardt over the `free` parameters and all poses, each image's pose eliminated."""
+) -> tuple[np.ndarray, float]:
+    """Levenberg-Marquardt over the `free` parameters and all poses, each image's pose eliminated.
+
+    Returns the parameters (P,) and the robust cost of an image in the mean.
+    """
     poses = target_poses(stream, model, params, target)
     R, p, damping = poses.rotation, poses.position, 1e-3
     used = poses.rms_px < np.maximum(4.0 * np.median(poses.rms_px), 1.0)
@@ -97,7 +116,7 @@ def _bundle(
             damping *= 10.0
             if damping > 1e6:
                 break
-    return params
+    return params, cost / max(int(used.sum()), 1)
 
 
 def _sums(stream, model, params, target, free, R, p, used):

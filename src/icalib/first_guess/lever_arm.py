@@ -133,9 +133,8 @@ def check_size(arm: LeverArm, camera: str) -> None:
     """Raises EstimationError where the accelerometer contradicts the size of the target."""
     if abs(arm.size - 1.0) > max(SIZE_TOLERANCE, 5.0 * arm.size_std):
         raise EstimationError(
-            f"{camera}: by the accelerometer the target is {arm.size:.2f} +- {arm.size_std:.2f} times the size "
-            f"that the rig "
-            "file says; check tag_size (in metres) and tag_spacing (gap over tag_size)."
+            f"{camera}: by the accelerometer the target is {arm.size:.2f} +- {arm.size_std:.2f} times the size that "
+            "the rig file says; check its tag_size or square_size (in metres) and tag_spacing (gap over tag_size)."
         )
 
 
@@ -145,5 +144,5 @@ def check_gravity(measured: float, expected: float, imu: str) -> None:
         return
     raise EstimationError(
         f"{imu} and the target together show gravity of {measured:.3g} m/s^2 instead of {expected:.3g}: check that the "
-        "accelerometer is in m/s^2 (not in g), and tag_size in the rig file."
+        "accelerometer is in m/s^2 (not in g), and tag_size or square_size in the rig file."
     )

@@ -11,7 +11,7 @@ from typing import Any, final
 import numpy as np
 
 from icalib.errors import RecordingError
-from icalib.geometry.targets import AprilGrid
+from icalib.geometry.targets import Target
 from icalib.measurements import CornerStream, ImuStream
 from icalib.recordings.bags.opening import ZSTD_MAGIC, open_storages
 from icalib.recordings.bags.storage import Tally
@@ -59,7 +59,7 @@ class BagRecording:
         order = self._order(topic, stamps_ns)
         return ImuStream(sensor.name, stamps_ns[order], values[order, :3].copy(), values[order, 3:].copy())
 
-    def corners(self, camera: Camera, target: AprilGrid) -> CornerStream:
+    def corners(self, camera: Camera, target: Target) -> CornerStream:
         raise RecordingError(
             f"{self.root} holds images, not corners, of {camera.name}; detect the target in "
             f"{self.image_topic(camera)} and write {camera.path} to a folder of tables."

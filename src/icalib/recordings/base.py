@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Protocol
 
-from icalib.geometry.targets import AprilGrid
+from icalib.geometry.targets import Target
 from icalib.measurements import CornerStream, ImuStream
 from icalib.recordings.images import Frame, Payload
 from icalib.recordings.topics import TopicInfo
@@ -46,7 +46,7 @@ class Recording(Protocol):
         """
         ...
 
-    def corners(self, camera: Camera, target: AprilGrid) -> CornerStream:
+    def corners(self, camera: Camera, target: Target) -> CornerStream:
         """All corners that the camera saw, grouped by image, images in order.
 
         Raises RecordingError naming file and line or instant where the data are missing or cannot be read, where images

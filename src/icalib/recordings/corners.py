@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from icalib.errors import RecordingError
-from icalib.geometry.targets import AprilGrid
+from icalib.geometry.targets import Target
 from icalib.measurements import CornerStream
 
 
@@ -16,7 +16,7 @@ def group_corners(
     tag: np.ndarray,
     corner: np.ndarray,
     uv: np.ndarray,
-    target: AprilGrid,
+    target: Target,
 ) -> CornerStream:
     """Group the rows (stamps_ns, tag, corner (N,) int64; uv (N, 2) px) of one camera by image.
 
@@ -37,9 +37,7 @@ def group_corners(
     return CornerStream(name, stamps_ns[first], start, point, np.ascontiguousarray(uv))
 
 
-def _point_index(
-    source: str, stamps_ns: np.ndarray, tag: np.ndarray, corner: np.ndarray, target: AprilGrid
-) -> np.ndarray:
+def _point_index(source: str, stamps_ns: np.ndarray, tag: np.ndarray, corner: np.ndarray, target: Target) -> np.ndarray:
     try:
         return target.point_index(tag, corner)
     except RecordingError:
@@ -50,7 +48,7 @@ def _point_index(
         raise RecordingError(f"{source}: in the image at {stamps_ns[row]} ns, {error}") from None
 
 
-def _first_unknown(tag: np.ndarray, corner: np.ndarray, target: AprilGrid) -> int:
+def _first_unknown(tag: np.ndarray, corner: np.ndarray, target: Target) -> int:
     """Bisects for the first row that `target` refuses, so that what it refuses is written in one place only."""
     known, refused = 0, len(tag)
     while refused - known > 1:

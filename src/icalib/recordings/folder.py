@@ -9,7 +9,7 @@ from typing import final
 import numpy as np
 
 from icalib.errors import RecordingError
-from icalib.geometry.targets import AprilGrid
+from icalib.geometry.targets import Target
 from icalib.measurements import CornerStream, ImuStream
 from icalib.recordings.corners import group_corners
 from icalib.recordings.euroc_images import file_payloads, image_files
@@ -30,7 +30,8 @@ class FolderRecording:
     """A folder of tables and images; those of EuRoC's `mav0` are found, too.
 
     IMU: t [ns], wx, wy, wz [rad/s], ax, ay, az [m/s^2], which is also EuRoC's `imu0/data.csv`. Corners: t [ns], tag id,
-    corner 0 to 3, u, v [px]. Images: the folder `data` beside a `data.csv` of t [ns], file name.
+    corner (as the target names its points), u, v [px]. Images: the folder `data` beside a `data.csv` of t [ns], file
+    name.
     """
 
     def __init__(self, root: Path) -> None:
@@ -70,7 +71,7 @@ class FolderRecording:
         stamps_ns, values = table.integers[:, 0].copy(), table.decimals
         return ImuStream(sensor.name, stamps_ns, values[:, :3].copy(), values[:, 3:].copy())
 
-    def corners(self, camera: Camera, target: AprilGrid) -> CornerStream:
+    def corners(self, camera: Camera, target: Target) -> CornerStream:
         table = read_table(self._locate(camera.path), _CORNER_INTEGERS, _CORNER_DECIMALS)
         self._remember(table.path)
         stamps, tag, corner = (table.integers[:, k].copy() for k in range(3))

@@ -2,6 +2,7 @@
 
 from icalib.simulation.corners import CornerTruth
 from icalib.simulation.motion import Trajectory
+from icalib.simulation.rendering import Imaging, Picture, Renderer, Sheet, SheetTruth, exposure_poses
 from icalib.simulation.rigs import rig_for, settings_for
 from icalib.simulation.scenario import ADIS16448, Motion, Scenario, SimCamera, handheld
 from icalib.simulation.simulate import Simulation, Truth, simulate
@@ -9,12 +10,18 @@ from icalib.simulation.simulate import Simulation, Truth, simulate
 __all__ = [
     "ADIS16448",
     "CornerTruth",
+    "Imaging",
     "Motion",
+    "Picture",
+    "Renderer",
     "Scenario",
+    "Sheet",
+    "SheetTruth",
     "SimCamera",
     "Simulation",
     "Trajectory",
     "Truth",
+    "exposure_poses",
     "handheld",
     "rig_for",
     "settings_for",

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.geometry.targets import AprilGrid
+from icalib.geometry.targets import Target
 from icalib.measurements import CornerStream
 from icalib.simulation.imu import inside
 from icalib.simulation.motion import Trajectory
@@ -29,7 +29,7 @@ class CornerTruth:
     outlier: np.ndarray
 
 
-def board_surface(target: AprilGrid, bow: tuple[float, float, float], points: np.ndarray) -> np.ndarray:
+def board_surface(target: Target, bow: tuple[float, float, float], points: np.ndarray) -> np.ndarray:
     """Points (N, 3) of the flat target moved out of its plane by z = a x^2 + b x y + c y^2 (see `Scenario`)."""
     low, high = target.points[:, :2].min(axis=0), target.points[:, :2].max(axis=0)
     x, y = ((points[:, :2] - 0.5 * (low + high)) / (0.5 * (high - low))).T
@@ -88,7 +88,12 @@ def _in_camera(
 def _towards_tag_center(
     scenario: Scenario, camera: SimCamera, trajectory: Trajectory, seconds: np.ndarray, points: np.ndarray
 ) -> np.ndarray:
-    """(M, N, 2) unit image direction from each corner towards the centre of its tag, which lies on the bent board."""
+    """(M, N, 2) unit image direction from each corner towards the centre of its tag, which lies on the bent board.
+
+    Zero on targets that do not bloom.
+    """
+    if not scenario.target.blooms:
+        return np.zeros((*points.shape[:2], 2))
     surface = board_surface(scenario.target, scenario.bow, scenario.target.tag_centers)
     direction = image_velocity(camera, points, _in_camera(scenario, camera, trajectory, seconds, surface) - points)
     return direction / np.linalg.norm(direction, axis=-1, keepdims=True)

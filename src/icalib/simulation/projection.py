@@ -1,4 +1,4 @@
-"""Pinhole projection with radial-tangential or equidistant distortion, written so that complex points pass through.
+"""Projection by each camera model that can be simulated, written so that complex points pass through.
 
 A direction in the image is then Im(project(P + i h d)) / h, exact to rounding: no Jacobian to get wrong.
 """
@@ -14,9 +14,8 @@ _COMPLEX_STEP = 1e-30
 
 def project(camera: SimCamera, points: np.ndarray) -> np.ndarray:
     """Points (..., 3) in the camera frame [m] -> (..., 2) [px]; meaningful where `visible`."""
-    distorted = _radtan if camera.model == "pinhole-radtan" else _equidistant
     fx, fy, cx, cy = camera.intrinsics
-    x, y = distorted(camera.distortion, points[..., 0], points[..., 1], points[..., 2])
+    x, y = _PROJECTIONS[camera.model](camera.distortion, points[..., 0], points[..., 1], points[..., 2])
     return np.stack([fx * x + cx, fy * y + cy], axis=-1)
 
 
@@ -26,17 +25,35 @@ def image_velocity(camera: SimCamera, points: np.ndarray, directions: np.ndarray
 
 
 def visible(camera: SimCamera, points: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """(...,) bool: in front of the camera, before the distortion folds back, and inside the image."""
-    radius = np.hypot(points[..., 0], points[..., 1])
-    z = points[..., 2]
-    if camera.model == "pinhole-radtan":
-        k1, k2 = camera.distortion[:2]
-        seen = (z > 0.0) & (radius < _first_extremum((k1, k2)) * z)
-    else:
-        seen = np.arctan2(radius, z) < min(_first_extremum(camera.distortion), np.pi)
+    """(...,) bool: where the model has an image, before it folds back, and inside the picture."""
+    seen = in_range(camera, np.hypot(points[..., 0], points[..., 1]), points[..., 2])
     width, height = camera.resolution
     u, v = uv[..., 0], uv[..., 1]
     return seen & (u >= 0.0) & (u <= width - 1.0) & (v >= 0.0) & (v <= height - 1.0)
+
+
+def in_range(camera: SimCamera, radius: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """(...,) bool: whether the model has an image, not folded back, of points at `radius` from the axis and depth z."""
+    d = camera.distortion
+    if camera.model == "pinhole-radtan":
+        return (z > 0.0) & (radius < _first_extremum(d[:2]) * z)
+    if camera.model == "pinhole-equidistant":
+        return np.arctan2(radius, z) < min(_first_extremum(d), np.pi)
+    if camera.model == "eucm":
+        alpha, beta = d
+        return z > -_shift_limit(alpha / (1.0 - alpha)) * np.sqrt(beta * radius**2 + z**2)
+    if camera.model == "double-sphere":
+        xi, alpha = d
+        shifted = z + xi * np.hypot(radius, z)
+        return shifted > -_shift_limit(alpha / (1.0 - alpha)) * np.hypot(radius, shifted)
+    depth = z + d[0] * np.hypot(radius, z)
+    on_sphere = z > -_shift_limit(d[0]) * np.hypot(radius, z)
+    return on_sphere & (radius < _first_extremum(d[1:3]) * depth)
+
+
+def _shift_limit(shift: float) -> float:
+    """Cosine of the ray furthest behind a unit sphere that is seen from `shift` behind its centre, sign changed."""
+    return min(shift, 1.0 / shift) if shift > 0.0 else 0.0
 
 
 def _radtan(
@@ -68,6 +85,35 @@ def _equidistant(
     )
     bent = theta * (1.0 + sum(k * theta ** (2 * i + 2) for i, k in enumerate(distortion)))
     return bent * X / radius, bent * Y / radius
+
+
+def _eucm(distortion: tuple[float, ...], X: np.ndarray, Y: np.ndarray, Z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Khomutenko: (alpha, beta), the depth a mean of z and of the distance in a space stretched across the axis."""
+    alpha, beta = distortion
+    depth = alpha * np.sqrt(beta * (X * X + Y * Y) + Z * Z) + (1.0 - alpha) * Z
+    return X / depth, Y / depth
+
+
+def _double_sphere(
+    distortion: tuple[float, ...], X: np.ndarray, Y: np.ndarray, Z: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Usenko: (xi, alpha), the unified model (EUCM with beta = 1) after the points moved by xi times their distance."""
+    xi, alpha = distortion
+    return _eucm((alpha, 1.0), X, Y, Z + xi * np.sqrt(X * X + Y * Y + Z * Z))
+
+
+def _omni(distortion: tuple[float, ...], X: np.ndarray, Y: np.ndarray, Z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mei: (xi, k1, k2, p1, p2), Brown's model after the points moved by xi times their distance."""
+    return _radtan(distortion[1:], X, Y, Z + distortion[0] * np.sqrt(X * X + Y * Y + Z * Z))
+
+
+_PROJECTIONS = {
+    "pinhole-radtan": _radtan,
+    "pinhole-equidistant": _equidistant,
+    "eucm": _eucm,
+    "double-sphere": _double_sphere,
+    "omni-radtan": _omni,
+}
 
 
 def _first_extremum(coefficients: tuple[float, ...]) -> float:

@@ -8,13 +8,13 @@ from typing import Literal
 import numpy as np
 
 from icalib.errors import RigError
-from icalib.geometry.targets import AprilGrid
+from icalib.geometry.targets import AprilGrid, Target
 from icalib.rig import ImuNoise
 
 MotionKind = Literal["handheld", "planar", "single_axis", "motionless"]
 Interval = tuple[float, float]  # (start, end) in seconds on the IMU's clock, since its origin
 
-MODELS = ("pinhole-radtan", "pinhole-equidistant")
+MODELS: tuple[str, ...] = ("pinhole-radtan", "pinhole-equidistant", "eucm", "double-sphere", "omni-radtan")
 ADIS16448 = ImuNoise(1.6968e-4, 1.9393e-5, 2.0e-3, 3.0e-3, source="data sheet of the ADIS16448")
 GRAVITY_WORLD = np.array([0.0, 0.0, -9.81])  # m/s^2
 
@@ -116,7 +116,7 @@ class Scenario:
     """
 
     cameras: tuple[SimCamera, ...]
-    target: AprilGrid = AprilGrid(6, 6, 0.088, 0.3)
+    target: Target = AprilGrid(6, 6, 0.088, 0.3)
     duration_s: float = 20.0
     motion: Motion = Motion()
     T_world_board: np.ndarray = field(default_factory=_standing_board)

@@ -4,12 +4,23 @@ from __future__ import annotations
 
 from icalib.errors import CalibrationError
 from icalib.geometry.cameras.base import CameraModel
+from icalib.geometry.cameras.double_sphere import DoubleSphere
 from icalib.geometry.cameras.equidistant import PinholeEquidistant
+from icalib.geometry.cameras.eucm import ExtendedUnified
+from icalib.geometry.cameras.omni import OmniRadtan
 from icalib.geometry.cameras.radtan import PinholeRadtan
 from icalib.geometry.cameras.radtan5 import PinholeRadtan5
 
 CAMERA_MODELS: dict[str, CameraModel] = {
-    model.name: model for model in (PinholeRadtan(), PinholeRadtan5(), PinholeEquidistant())
+    model.name: model
+    for model in (
+        PinholeRadtan(),
+        PinholeRadtan5(),
+        PinholeEquidistant(),
+        ExtendedUnified(),
+        DoubleSphere(),
+        OmniRadtan(),
+    )
 }
 
 

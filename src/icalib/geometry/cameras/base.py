@@ -11,12 +11,16 @@ import numpy as np
 class CameraModel(ABC):
     """A camera model: compiled functions over arrays of points. Parameters are (fx, fy, cx, cy, distortion ...).
 
-    `valid` marks points that the model can see (in front of the camera, inside the range where the distortion is
-    monotonic); what is computed for the others is finite but meaningless.
+    `valid` marks points that the model can see (in front of the camera, where the model asks for it, and inside the
+    range where the image moves outwards as the ray turns away from the axis); what is computed for the others is finite
+    but meaningless. Parameters outside the model's domain see less, or nothing, but raise no error.
+
+    start_distortions: where to start when nothing is known of the lens; each is all that follows fx, fy, cx, cy.
     """
 
     name: ClassVar[str]
     parameter_names: ClassVar[tuple[str, ...]]
+    start_distortions: ClassVar[tuple[tuple[float, ...], ...]]
 
     @abstractmethod
     def project(self, params: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

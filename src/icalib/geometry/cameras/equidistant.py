@@ -23,6 +23,7 @@ class PinholeEquidistant(CameraModel):
 
     name = "pinhole-equidistant"
     parameter_names = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
+    start_distortions = ((0.0, 0.0, 0.0, 0.0),)
 
     def project(self, params: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         params, points = np.ascontiguousarray(params, float), np.ascontiguousarray(points, float)

@@ -52,6 +52,7 @@ class PinholeRadtan(RadialTangential):
 
     name = "pinhole-radtan"
     parameter_names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+    start_distortions = ((0.0, 0.0, 0.0, 0.0),)
 
 
 def _radial_coefficients(params: np.ndarray) -> np.ndarray:
@@ -65,7 +66,7 @@ def _third_coefficient(params):
 
 
 @njit(cache=True, nogil=True)
-def _distort(params, k3, a, b):
+def distort(params, k3, a, b):
     """Distorted (a, b), d of it / d (a, b) as (aa, ab = ba, bb): the Jacobian of this distortion is symmetric."""
     k1, k2, p1, p2 = params[4], params[5], params[6], params[7]
     s = a * a + b * b
@@ -89,7 +90,7 @@ def _project(params, points, limit, uv, valid):
         a, b = points[i, 0] * inverse_z, points[i, 1] * inverse_z
         valid[i] = z > _MIN_DEPTH and a * a + b * b < limit * limit
         if valid[i]:
-            distorted_a, distorted_b, _, _, _ = _distort(params, k3, a, b)
+            distorted_a, distorted_b, _, _, _ = distort(params, k3, a, b)
             uv[i, 0] = params[0] * distorted_a + params[2]
             uv[i, 1] = params[1] * distorted_b + params[3]
         else:
@@ -110,7 +111,7 @@ def _project_with_jacobians(params, points, limit, uv, valid, j_point, j_params)
             uv[i] = 0.0
             j_point[i] = 0.0
             continue
-        distorted_a, distorted_b, j_aa, j_ab, j_bb = _distort(params, k3, a, b)
+        distorted_a, distorted_b, j_aa, j_ab, j_bb = distort(params, k3, a, b)
         uv[i, 0], uv[i, 1] = fx * distorted_a + params[2], fy * distorted_b + params[3]
         scale_u, scale_v = fx * inverse_z, fy * inverse_z
         j_point[i, 0, 0], j_point[i, 0, 1] = scale_u * j_aa, scale_u * j_ab
@@ -128,7 +129,7 @@ def _project_with_jacobians(params, points, limit, uv, valid, j_point, j_params)
 
 
 @njit(cache=True, nogil=True)
-def _undistort(params, coefficients, limit, distorted_a, distorted_b):
+def undistort(params, coefficients, limit, distorted_a, distorted_b):
     """(a, b) and whether Newton converged inside the monotonic range; starts where the radial part alone would be."""
     distorted_r = np.hypot(distorted_a, distorted_b)
     # At the limit itself the radial slope is zero; 0.9 leaves room for tangential terms that reach slightly past it.
@@ -137,7 +138,7 @@ def _undistort(params, coefficients, limit, distorted_a, distorted_b):
     a, b = scale * distorted_a, scale * distorted_b
     k3 = _third_coefficient(params)
     for _ in range(_MAX_NEWTON_STEPS):
-        value_a, value_b, j_aa, j_ab, j_bb = _distort(params, k3, a, b)
+        value_a, value_b, j_aa, j_ab, j_bb = distort(params, k3, a, b)
         determinant = j_aa * j_bb - j_ab * j_ab
         if not determinant > 0.0:
             return a, b, False
@@ -156,7 +157,7 @@ def _unproject(params, coefficients, uv, limit, rays, valid):
         mx, my = (uv[i, 0] - params[2]) / params[0], (uv[i, 1] - params[3]) / params[1]
         a, b, valid[i] = 0.0, 0.0, False
         if np.isfinite(mx) and np.isfinite(my):
-            a, b, valid[i] = _undistort(params, coefficients, limit, mx, my)
+            a, b, valid[i] = undistort(params, coefficients, limit, mx, my)
         if not valid[i]:
             a, b = 0.0, 0.0
         norm = np.sqrt(1.0 + a * a + b * b)

@@ -13,3 +13,4 @@ class PinholeRadtan5(RadialTangential):
 
     name = "pinhole-radtan5"
     parameter_names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+    start_distortions = ((0.0, 0.0, 0.0, 0.0, 0.0),)

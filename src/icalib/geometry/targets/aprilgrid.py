@@ -1,23 +1,29 @@
-"""Calibration targets: where their points are, in the board frame."""
+"""Kalibr's AprilGrid."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
 from icalib.errors import RecordingError
+from icalib.geometry.targets.base import Target
 
-_CORNERS = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])  # of a unit tag, corner 0 to 3
+UNIT_TAG = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])  # corner 0 to 3
 
 
 @dataclass(frozen=True)
-class AprilGrid:
+class AprilGrid(Target):
     """Kalibr's AprilGrid: `rows` x `cols` tags of edge `tag_size` [m], gaps of `tag_spacing` * tag_size.
 
-    Board frame: origin at corner 0 of tag 0, x along a row, y along a column, the tags in z = 0. Tag ids run row-major.
+    Board frame: origin at corner 0 of tag 0, x along a row, y along a column, the tags in z = 0. Tag ids run row-major
+    from the bottom left; corner 0 of a tag is at its bottom left, then counterclockwise.
     """
+
+    type: ClassVar[str] = "aprilgrid"
+    blooms: ClassVar[bool] = True
 
     rows: int
     cols: int
@@ -30,7 +36,7 @@ class AprilGrid:
         pitch = self.tag_size * (1.0 + self.tag_spacing)
         row, col = np.divmod(np.arange(self.rows * self.cols), self.cols)
         origin = pitch * np.stack([col, row], axis=1)
-        xy = origin[:, None, :] + self.tag_size * _CORNERS[None]
+        xy = origin[:, None, :] + self.tag_size * UNIT_TAG[None]
         return np.concatenate([xy.reshape(-1, 2), np.zeros((4 * len(origin), 1))], axis=1)
 
     @cached_property
@@ -54,3 +60,7 @@ class AprilGrid:
                 f"corner {corner[(corner < 0) | (corner > 3)][0]} is not one of a tag's corners 0 to 3."
             )
         return 4 * tag_id + corner
+
+    def point_identity(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(N,) tag ids and corners of points."""
+        return index // 4, index % 4

@@ -1,0 +1,11 @@
+"""Calibration targets: where their points are, in the board frame, and what identifies a point."""
+
+from __future__ import annotations
+
+from icalib.geometry.targets.aprilgrid import AprilGrid
+from icalib.geometry.targets.base import Target
+from icalib.geometry.targets.charuco import Charuco
+from icalib.geometry.targets.checkerboard import Checkerboard
+from icalib.geometry.targets.tag import Tag
+
+__all__ = ["AprilGrid", "Charuco", "Checkerboard", "Tag", "Target"]

@@ -1,0 +1,65 @@
+"""What the rest of the program knows of a target: this class and nothing else."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+
+from icalib.errors import RecordingError
+
+
+@dataclass(frozen=True)
+class Target(ABC):
+    """A flat target. Its frame: origin at point 0, x to the right and y upwards on the sheet, so that z points out of
+    the print towards whoever looks at it; all points have z = 0.
+
+    A point is identified by the id of a tag and its corner, or by tag 0 and the number of the corner on targets whose
+    points belong to no tag. type: the name in rig files. blooms: the points are corners of tags, which bloom pulls
+    towards the tag's centre; where squares touch corner to corner it moves nothing.
+    """
+
+    type: ClassVar[str]
+    blooms: ClassVar[bool]
+
+    @cached_property
+    @abstractmethod
+    def points(self) -> np.ndarray:
+        """(n, 3) in metres, board frame."""
+
+    @cached_property
+    def tag_centers(self) -> np.ndarray:
+        """(n, 3) in metres: for each point the centre of its tag; the point itself where nothing blooms."""
+        return self.points
+
+    @property
+    def symmetric(self) -> bool:
+        """A half turn maps the target on itself, so that no image can tell point i from point n - 1 - i."""
+        return False
+
+    @abstractmethod
+    def point_index(self, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarray:
+        """(N,) index into `points` of (N,) tags and corners. Raises RecordingError for one that the target lacks."""
+
+    @abstractmethod
+    def point_identity(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(N,) tag ids and (N,) corners of (N,) indices into `points`."""
+
+
+def untagged_index(tag_id: np.ndarray, corner: np.ndarray, n_points: int, sizes: str) -> np.ndarray:
+    """`point_index` of a target whose points belong to no tag; `sizes` are the fields to check in the rig file."""
+    tag_id, corner = np.asarray(tag_id, dtype=np.int64), np.asarray(corner, dtype=np.int64)
+    if (tag_id != 0).any():
+        raise RecordingError(
+            f"tag {tag_id[tag_id != 0][0]} is not on the target, whose corners have tag 0; correct the tag."
+        )
+    bad = (corner < 0) | (corner >= n_points)
+    if bad.any():
+        raise RecordingError(
+            f"corner {corner[bad][0]} is not on the target (corners 0 to {n_points - 1}); "
+            f"check {sizes} in the rig file."
+        )
+    return corner

@@ -1,0 +1,58 @@
+"""ChArUco boards: a checkerboard with a small tag in each white square."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+
+from icalib.errors import RigError
+from icalib.geometry.targets.base import Target, untagged_index
+from icalib.geometry.targets.families import check_family
+
+
+@dataclass(frozen=True)
+class Charuco(Target):
+    """OpenCV's ChArUco board of `squares_x` x `squares_y` squares of edge `square_size` [m], the one in the top left
+    corner black (OpenCV 4.6 and later), with tags of edge `marker_size` [m] of `dictionary` in the white ones, ids row
+    by row from the top.
+
+    Points are the inner corners, numbered as OpenCV does: row by row from the top left; point 0 is the origin, so y of
+    later rows is negative. Raises RigError where the sizes or the dictionary do not fit.
+    """
+
+    type: ClassVar[str] = "charuco"
+    blooms: ClassVar[bool] = False
+
+    squares_x: int
+    squares_y: int
+    square_size: float
+    marker_size: float
+    dictionary: str
+
+    def __post_init__(self) -> None:
+        if min(self.squares_x, self.squares_y) < 3:
+            raise RigError(
+                f"a ChArUco board of {self.squares_x} x {self.squares_y} squares has too few inner corners; "
+                "it needs 3 squares each way."
+            )
+        if not self.marker_size < self.square_size:
+            raise RigError(
+                f"marker_size {self.marker_size:g} does not fit a square of {self.square_size:g}; "
+                "correct marker_size or square_size."
+            )
+        check_family(self.dictionary, self.squares_x * self.squares_y // 2)
+
+    @cached_property
+    def points(self) -> np.ndarray:
+        """((squares_x - 1) (squares_y - 1), 3) inner corners in metres."""
+        row, col = np.divmod(np.arange((self.squares_x - 1) * (self.squares_y - 1)), self.squares_x - 1)
+        return self.square_size * np.stack([col, -row, 0 * row], axis=1)
+
+    def point_index(self, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarray:
+        return untagged_index(tag_id, corner, len(self.points), "squares_x and squares_y")
+
+    def point_identity(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros_like(index), index

@@ -1,0 +1,179 @@
+"""Images of printed targets as a simulated camera takes them, with the true places of their points.
+
+Every pixel is the light of its square, (0, 0) being the CENTRE of the top left one, seen through the lens itself: no
+picture is resampled. Nothing here knows how corners are found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from icalib.errors import RigError
+from icalib.geometry.targets import Target
+from icalib.geometry.targets.pattern import Pattern, pattern_of
+from icalib.simulation.lenses import lens_of, unproject
+from icalib.simulation.motion import Trajectory
+from icalib.simulation.projection import project, visible
+from icalib.simulation.raster import paint, pixel_kernel, shrink
+from icalib.simulation.scenario import SimCamera
+
+_CELLS = 4  # a pixel, along each axis
+_REACH = 4.0  # of the blur, in standard deviations
+
+
+@dataclass(frozen=True, eq=False)
+class Sheet:
+    """A printed target somewhere in the world, on white paper that ends `margin` [m] beyond the print.
+
+    border_bits: see `pattern_of`. Where sheets overlap in the image, the one whose middle is nearer covers the other.
+    """
+
+    target: Target
+    T_world_target: np.ndarray = field(default_factory=lambda: np.eye(4))  # (4, 4)
+    margin: float = 0.02
+    border_bits: int | None = None
+
+    @cached_property
+    def pattern(self) -> Pattern:
+        return pattern_of(self.target, self.border_bits).with_margin(self.margin)
+
+
+@dataclass(frozen=True)
+class Imaging:
+    """How light becomes grey. Greys 0 to 255: `white` and `black` of the print, `background` of everything else.
+
+    blur_px: standard deviation of the lens's Gaussian blur. vignetting: share of the light lost in the image's corners,
+    growing with the square of the distance from its centre. gain: times all of it. noise: standard deviation of each
+    pixel's grey, white and Gaussian.
+    """
+
+    white: float = 210.0
+    black: float = 25.0
+    background: float = 110.0
+    blur_px: float = 0.5
+    vignetting: float = 0.0
+    gain: float = 1.0
+    noise: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class SheetTruth:
+    """One sheet in a picture: uv (n, 2) [px] of its points, the mean over the exposure, and seen (n,) bool: in the
+    image and from the front all that time."""
+
+    uv: np.ndarray
+    seen: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """grey (H, W) float64, neither rounded nor clipped, and the truth of each sheet in the order they were given."""
+
+    grey: np.ndarray
+    sheets: tuple[SheetTruth, ...]
+
+    @property
+    def pixels(self) -> np.ndarray:
+        """(H, W) uint8."""
+        return np.clip(np.rint(self.grey), 0.0, 255.0).astype(np.uint8)
+
+
+@dataclass(frozen=True, eq=False)
+class Renderer:
+    """Takes pictures with one camera. What the lens does to the rays is worked out once, at the first picture."""
+
+    camera: SimCamera
+    imaging: Imaging = Imaging()
+
+    def picture(
+        self, sheets: Sequence[Sheet], T_world_cam: np.ndarray, rng: np.random.Generator | None = None
+    ) -> Picture:
+        """One image of `sheets` from T_world_cam (4, 4), or the mean over the poses (K, 4, 4) of an exposure.
+
+        rng: where noise is wanted. Raises RigError where noise is wanted without one.
+        """
+        poses = np.asarray(T_world_cam, dtype=np.float64).reshape(-1, 4, 4)
+        fine = np.zeros(self._fine_shape, dtype=np.float32)
+        for pose in poses:
+            fine += self._instant(sheets, pose)
+        width, height = self.camera.resolution
+        grey = np.empty((height, width))
+        shrink(fine, pixel_kernel(self.imaging.blur_px, _CELLS, self._pad), _CELLS, grey)
+        grey *= self.imaging.gain * self._falloff / len(poses)
+        if self.imaging.noise > 0.0:
+            if rng is None:
+                raise RigError("a noisy picture needs a generator of random numbers; give rng.")
+            grey += self.imaging.noise * rng.standard_normal(grey.shape)
+        return Picture(grey, tuple(self._truth(sheet, poses) for sheet in sheets))
+
+    @property
+    def _pad(self) -> int:
+        """Pixels around the image whose light the blur brings in."""
+        return int(np.ceil(_REACH * self.imaging.blur_px))
+
+    @property
+    def _fine_shape(self) -> tuple[int, int]:
+        width, height = self.camera.resolution
+        return (height + 2 * self._pad) * _CELLS, (width + 2 * self._pad) * _CELLS
+
+    @cached_property
+    def _rays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rays through the centres of the pixels and of those around the image, and their derivatives by u and v."""
+        width, height = self.camera.resolution
+        u, v = np.meshgrid(
+            np.arange(-self._pad - 1.0, width + self._pad + 1.0), np.arange(-self._pad - 1.0, height + self._pad + 1.0)
+        )
+        rays = unproject(self.camera, np.stack([u, v], axis=-1))
+        by_u, by_v = 0.5 * (rays[1:-1, 2:] - rays[1:-1, :-2]), 0.5 * (rays[2:, 1:-1] - rays[:-2, 1:-1])
+        return np.ascontiguousarray(rays[1:-1, 1:-1]), by_u, by_v
+
+    @cached_property
+    def _falloff(self) -> np.ndarray:
+        """(H, W) share of the light that arrives."""
+        width, height = self.camera.resolution
+        u, v = np.arange(width) - 0.5 * (width - 1), np.arange(height) - 0.5 * (height - 1)
+        square = u[None] ** 2 + v[:, None] ** 2
+        return 1.0 - self.imaging.vignetting * square / square.max()
+
+    def _instant(self, sheets: Sequence[Sheet], T_world_cam: np.ndarray) -> np.ndarray:
+        """(H s, W s) greys from one pose, before blur, the border included."""
+        fine = np.full(self._fine_shape, self.imaging.background, dtype=np.float32)
+        code, lens = lens_of(self.camera)
+        seen_from = [(sheet, np.linalg.inv(sheet.T_world_target) @ T_world_cam) for sheet in sheets]
+        for sheet, T_sheet_cam in sorted(seen_from, key=lambda s: -_distance(*s)):
+            pattern, R, C = sheet.pattern, T_sheet_cam[:3, :3], T_sheet_cam[:3, 3]
+            front = C[2] > 0.0  # the back of the paper is white
+            grey_of = np.where(pattern.white | (not front), self.imaging.white, self.imaging.black)
+            paint(code, lens, *self._rays, self._pad, _CELLS, R, C, pattern.x, pattern.y, grey_of, fine)
+        return fine
+
+    def _truth(self, sheet: Sheet, poses: np.ndarray) -> SheetTruth:
+        """By the simulator's own projection, at each pose."""
+        R_world_target, p_world_target = sheet.T_world_target[:3, :3], sheet.T_world_target[:3, 3]
+        world = sheet.target.points @ R_world_target.T + p_world_target
+        points = (world - poses[:, None, :3, 3]) @ poses[:, :3, :3]
+        uv = project(self.camera, points)
+        front = (poses[:, :3, 3] - p_world_target) @ R_world_target[:, 2] > 0.0
+        seen = visible(self.camera, points, uv) & front[:, None]
+        return SheetTruth(uv.mean(axis=0), np.all(seen, axis=0, keepdims=True)[0])
+
+
+def _distance(sheet: Sheet, T_sheet_cam: np.ndarray) -> float:
+    x, y = sheet.pattern.x, sheet.pattern.y
+    middle = np.array([0.5 * (x[0] + x[-1]), 0.5 * (y[0] + y[-1]), 0.0])
+    return float(np.linalg.norm(T_sheet_cam[:3, 3] - middle))
+
+
+def exposure_poses(
+    camera: SimCamera, trajectory: Trajectory, seconds: float, exposure_s: float, count: int = 5
+) -> np.ndarray:
+    """(count, 4, 4) T_world_cam at the middles of equal parts of an exposure about `seconds` of the IMU's clock."""
+    at = seconds + exposure_s * ((np.arange(count) + 0.5) / count - 0.5)
+    rotation, position, _ = trajectory.pose_at(at)
+    T_world_imu = np.tile(np.eye(4), (count, 1, 1))
+    T_world_imu[:, :3, :3], T_world_imu[:, :3, 3] = rotation, position
+    return T_world_imu @ camera.T_imu_cam
