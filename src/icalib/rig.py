@@ -92,6 +92,7 @@ class Settings:
     board_shape: bool = True  # the target is not flat: estimate how it bends
     blur_noise: bool = True  # corners of fast images weigh less
     common_error: bool = False  # corners of one image share an error: a shift, its size estimated
+    keep_corners: bool = True  # corners found in images are kept in the user's cache folder for the next run
     splits: int = 8  # segments for the empirical factor, 0: none
     max_gap_s: float = 0.5  # IMU gaps up to this are bridged; longer ones split the recording
     node_spacing_s: float = 0.05  # no two nodes further apart

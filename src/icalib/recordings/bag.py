@@ -59,11 +59,11 @@ class BagRecording:
         order = self._order(topic, stamps_ns)
         return ImuStream(sensor.name, stamps_ns[order], values[order, :3].copy(), values[order, 3:].copy())
 
+    def has_corners(self, camera: Camera) -> bool:
+        return False
+
     def corners(self, camera: Camera, target: Target) -> CornerStream:
-        raise RecordingError(
-            f"{self.root} holds images, not corners, of {camera.name}; detect the target in "
-            f"{self.image_topic(camera)} and write {camera.path} to a folder of tables."
-        )
+        raise RecordingError(f"{self.root} holds images of {camera.name}, not corners; find them in its images.")
 
     def where(self, sensor: ImuSensor | Camera) -> str:
         topic = self._imu_topic(sensor) if isinstance(sensor, ImuSensor) else self.image_topic(sensor)

@@ -46,6 +46,10 @@ class Recording(Protocol):
         """
         ...
 
+    def has_corners(self, camera: Camera) -> bool:
+        """Whether the camera's corners are there as a table; else they are to be found in its images."""
+        ...
+
     def corners(self, camera: Camera, target: Target) -> CornerStream:
         """All corners that the camera saw, grouped by image, images in order.
 

@@ -71,6 +71,10 @@ class FolderRecording:
         stamps_ns, values = table.integers[:, 0].copy(), table.decimals
         return ImuStream(sensor.name, stamps_ns, values[:, :3].copy(), values[:, 3:].copy())
 
+    def has_corners(self, camera: Camera) -> bool:
+        # Where there are neither corners nor images, the sentence on the missing table is the better one.
+        return self._find(camera.path) is not None or not self._image_topics()
+
     def corners(self, camera: Camera, target: Target) -> CornerStream:
         table = read_table(self._locate(camera.path), _CORNER_INTEGERS, _CORNER_DECIMALS)
         self._remember(table.path)
@@ -78,6 +82,8 @@ class FolderRecording:
         return group_corners(camera.name, str(table.path), stamps, tag, corner, table.decimals, target)
 
     def where(self, sensor: ImuSensor | Camera) -> str:
+        if isinstance(sensor, Camera) and not self.has_corners(sensor):
+            return f"{self.root / self.image_topic(sensor)}"
         return str(self._locate(sensor.path))
 
     def files(self) -> list[Path]:
@@ -101,12 +107,17 @@ class FolderRecording:
         if path not in self._read:
             self._read.append(path)
 
-    def _locate(self, path_hint: str) -> Path:
+    def _find(self, path_hint: str) -> Path | None:
         plain = path_hint.removesuffix(".gz")
-        for folder in (self.root, self.root / "mav0"):
-            for name in (path_hint, plain, plain + ".gz"):
-                if (folder / name).is_file():
-                    return folder / name
+        names = (path_hint, plain, plain + ".gz")
+        return next(
+            (p for folder in (self.root, self.root / "mav0") for n in names if (p := folder / n).is_file()), None
+        )
+
+    def _locate(self, path_hint: str) -> Path:
+        if found := self._find(path_hint):
+            return found
+        plain = path_hint.removesuffix(".gz")
         raise RecordingError(
             f"{self.root} has no {plain} (nor {plain}.gz); {self._listing()}; set `path` of the sensor in the rig file."
         )

@@ -2,24 +2,40 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+from icalib.errors import RecordingError
 from icalib.measurements import CornerStream, Measurements
 from icalib.recordings.base import Recording
 from icalib.recordings.camera_checks import checked_corners
 from icalib.recordings.imu_checks import checked_imu
-from icalib.rig import Rig
+from icalib.recordings.topics import image_topics
+from icalib.rig import Camera, Rig
+
+FindCorners = Callable[[Recording, Camera], tuple[CornerStream, tuple[str, ...]]]
 
 
-def read_measurements(recording: Recording, rig: Rig) -> Measurements:
-    """Read what `rig` asks for from `recording`, and check it.
+def tables_only(recording: Recording, camera: Camera) -> tuple[CornerStream, tuple[str, ...]]:
+    """For recordings without images. Raises RecordingError."""
+    raise RecordingError(f"{recording.where(camera)} holds images, not corners; nothing here looks for the target.")
+
+
+def read_measurements(recording: Recording, rig: Rig, find: FindCorners = tables_only) -> Measurements:
+    """Read what `rig` asks for from `recording`, and check it; `find` finds corners where there are images.
 
     What was dropped or looks odd stands in the notes. Raises RecordingError, one sentence naming the file and the line
     or instant, for data that are missing, unreadable, out of order, in other units, or not of this rig.
     """
     imu, notes = checked_imu(recording.imu(rig.imu), recording.where(rig.imu))
+    pictured = [c for c in rig.cameras if not recording.has_corners(c)]
+    image_topics(recording, pictured)
     cameras: list[CornerStream] = []
     for camera in rig.cameras:
-        corners = recording.corners(camera, rig.target)
+        if camera in pictured:
+            corners, found = find(recording, camera)
+        else:
+            corners, found = recording.corners(camera, rig.target), ()
         corners, dropped = checked_corners(corners, recording.where(camera), camera.resolution)
         cameras.append(corners)
-        notes = notes + dropped
+        notes = notes + found + dropped
     return Measurements(imu, tuple(cameras), recording.notes() + notes)

@@ -1,0 +1,68 @@
+"""Corners that were found once are kept: a file for each stream of images, named by its content and the settings.
+
+The folder is the user's cache folder, or $ICALIB_CACHE. A file that is damaged or of another format is no file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+import zipfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from icalib.detection.corners import ImageCorners
+from icalib.recordings import Payload
+
+VERSION = 1  # of the detectors and of the format: whatever changes corners changes this
+_FIELDS = ("point", "uv", "sigma", "blur", "verdict")
+
+
+def cache_folder() -> Path:
+    """Where found corners are kept."""
+    if given := os.environ.get("ICALIB_CACHE"):
+        return Path(given)
+    from platformdirs import user_cache_path
+
+    return user_cache_path("icalib", appauthor=False) / "corners"
+
+
+def stream_key(payloads: Iterable[Payload], settings: str) -> str:
+    """Name of a stream of images, from every byte of it and what is looked for."""
+    digest = hashlib.blake2b(f"{VERSION} {settings}".encode(), digest_size=20)
+    for p in payloads:
+        digest.update(f"{p.stamp_ns} {p.encoding} {p.width} {p.height} {p.step} {p.big_endian} {len(p.data)} ".encode())
+        digest.update(p.data)
+    return digest.hexdigest()
+
+
+def load_corners(key: str) -> tuple[np.ndarray, list[ImageCorners]] | None:
+    """Stamps (M,) and corners of the images under `key`, or None."""
+    try:
+        with np.load(cache_folder() / f"{key}.npz", allow_pickle=False) as file:
+            arrays = {name: file[name] for name in ("stamps_ns", "start", *_FIELDS)}
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
+    start = arrays["start"]
+    images = [
+        ImageCorners(*(arrays[name][a:b] for name in _FIELDS)) for a, b in zip(start[:-1], start[1:], strict=True)
+    ]
+    return arrays["stamps_ns"], images
+
+
+def keep_corners(key: str, stamps_ns: np.ndarray, images: list[ImageCorners]) -> None:
+    """Keeps what was found under `key`. A folder that cannot be written keeps nothing: the next run looks again."""
+    arrays: dict[str, Any] = {name: np.concatenate([getattr(i, name) for i in images]) for name in _FIELDS}
+    arrays |= {"stamps_ns": stamps_ns, "start": np.concatenate([[0], np.cumsum([len(i.point) for i in images])])}
+    folder = cache_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=folder, suffix=".part", delete=False) as file:
+            np.savez_compressed(file, **arrays)
+        Path(file.name).replace(folder / f"{key}.npz")
+    except OSError:
+        return

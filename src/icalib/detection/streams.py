@@ -1,0 +1,136 @@
+"""From a recording's images to the corners of the target: decoded and searched on all cores, and kept for the next run.
+
+The images are read twice: once for the name under which their corners are kept, which is cheap, and once more where
+nothing is kept under it. Only a few are in memory at a time.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+
+import numpy as np
+
+from icalib.detection.cache import keep_corners, load_corners, stream_key
+from icalib.detection.corners import KEPT, VERDICTS, ImageCorners, corner_stream
+from icalib.detection.detectors import Detector, detector_of
+from icalib.errors import RecordingError
+from icalib.geometry.targets import Target
+from icalib.measurements import CornerStream
+from icalib.recordings import DamagedImageError, Payload, Recording, decode
+from icalib.recordings.extras import load_cv2
+from icalib.rig import Camera
+
+PER_WORKER = 4  # images in memory for each thread
+Progress = Callable[[float], None]  # the share of the images that is done, 0 to 1
+
+
+def find_corners(
+    recording: Recording, camera: Camera, target: Target, keep: bool = True, progress: Progress = lambda _: None
+) -> tuple[CornerStream, tuple[str, ...]]:
+    """The target's corners in all images of `camera`, and sentences on those left out.
+
+    With `keep`, what an earlier run found is used, and what is found is kept. Raises RecordingError, one sentence,
+    where there are no images of the camera, they are not of its resolution, cannot be read, or the target is in none.
+    """
+    topic, where = recording.image_topic(camera), recording.where(camera)
+    key = stream_key(_of_resolution(recording.payloads(topic), camera, where), repr(target)) if keep else ""
+    found = load_corners(key) if keep else None
+    if found is None:
+        count = next(t.count for t in recording.topics() if t.name == topic)
+        payloads = _of_resolution(recording.payloads(topic), camera, where)
+        found = _search(payloads, detector_of(target), where, lambda n: progress(min(n / count, 1.0)))
+        if keep:
+            keep_corners(key, *found)
+    stamps_ns, images = found
+    if not any(i.kept.any() for i in images):
+        raise RecordingError(
+            f"{where}: the target of the rig file is in none of {len(images)} images of {camera.name}; "
+            "check the target's type and sizes, and that the camera saw it."
+        )
+    return corner_stream(camera.name, stamps_ns, images), _notes(where, images)
+
+
+def _of_resolution(payloads: Iterable[Payload], camera: Camera, where: str) -> Iterator[Payload]:
+    for p in payloads:
+        if p.width and (p.width, p.height) != camera.resolution:
+            raise RecordingError(
+                f"{where}: images have {p.width} x {p.height} px, but {camera.name} {camera.resolution[0]} x "
+                f"{camera.resolution[1]}; correct its resolution in the rig file."
+            )
+        yield p
+
+
+def _search(
+    payloads: Iterable[Payload], detector: Detector, where: str, done: Callable[[int], None]
+) -> tuple[np.ndarray, list[ImageCorners]]:
+    """Stamps (M,) and corners of all images that can be decoded. Raises RecordingError where none can."""
+    stamps: list[int] = []
+    images: list[ImageCorners] = []
+    damaged = ""
+    with _one_thread_in_opencv(), _pool() as pool:
+        waiting: deque[tuple[int, Future[ImageCorners]]] = deque()
+
+        def take() -> str:
+            stamp, future = waiting.popleft()
+            try:
+                found = future.result()
+            except DamagedImageError as error:
+                return str(error)
+            stamps.append(stamp)
+            images.append(found)
+            done(len(images))
+            return ""
+
+        for p in payloads:
+            waiting.append((p.stamp_ns, pool.submit(_one, p, detector)))
+            if len(waiting) > PER_WORKER * _workers():
+                damaged = take() or damaged
+        while waiting:
+            damaged = take() or damaged
+    if not images:
+        raise RecordingError(damaged or f"{where}: there are no images; check that the camera was running.")
+    return np.array(stamps, dtype=np.int64), images
+
+
+def _one(payload: Payload, detector: Detector) -> ImageCorners:
+    return detector.detect(decode(payload))
+
+
+def _workers() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def _pool() -> Iterator[ThreadPoolExecutor]:
+    """Threads: OpenCV and compiled code let each other run. When interrupted, what has not begun is dropped."""
+    pool = ThreadPoolExecutor(_workers(), thread_name_prefix="icalib-images")
+    try:
+        yield pool
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+@contextmanager
+def _one_thread_in_opencv() -> Iterator[None]:
+    """Threads of OpenCV's own beside ours get into each other's way."""
+    cv2 = load_cv2()
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
+
+
+def _notes(where: str, images: list[ImageCorners]) -> tuple[str, ...]:
+    """How many images have the target, and how many corners were dropped, for which reasons."""
+    seen = sum(bool(i.kept.any()) for i in images)
+    kept = sum(int(i.kept.sum()) for i in images)
+    dropped = {name: sum(i.counts()[name] for i in images) for k, name in enumerate(VERDICTS) if k != KEPT}
+    reasons = ", ".join(f"{n} {name}" for name, n in dropped.items() if n)
+    tail = f"; corners left out: {reasons}" if reasons else ""
+    return (f"{where}: the target is in {seen} of {len(images)} images, {kept} corners{tail}.",)
