@@ -21,6 +21,7 @@ from icalib.estimation.board import SHAPE_LABELS
 from icalib.estimation.corner_noise import NoiseModel
 from icalib.estimation.estimate import Estimate
 from icalib.estimation.evidence import Fit, fits, place_covariances, split_covariance
+from icalib.estimation.imu_data import ImuData
 from icalib.estimation.imu_model import LABELS as IMU_LABELS
 from icalib.estimation.nodes import usable
 from icalib.estimation.state import Block
@@ -69,12 +70,13 @@ def assess(inputs: Inputs, found: Estimate) -> Calibration:
 
 def _rates(inputs: Inputs) -> dict[str, float]:
     """Hz of each sensor, from the median step of its stamps."""
-    streams = (inputs.measurements.imu, *inputs.measurements.cameras)
+    imu = inputs.measurements.imu
+    streams = (*(() if imu is None else (imu,)), *inputs.measurements.cameras)
     return {s.name: float(1.0 / np.median(np.diff(s.seconds))) for s in streams if len(s.stamps_ns) > 1}
 
 
 def _labels(inputs: Inputs, block: Block) -> tuple[str, ...]:
-    if block.sensor == inputs.rig.imu.name:
+    if inputs.imu is not None and block.sensor == inputs.imu.name:
         return IMU_LABELS
     if block.name in ("intrinsics", "distortion"):
         camera = next(c for c in inputs.rig.cameras if c.name == block.sensor)
@@ -94,7 +96,7 @@ def _mode(inputs: Inputs, block: Block) -> str:
         return "fixed"
     if block.sensor == BOARD:
         return "free"
-    if block.sensor == inputs.rig.imu.name:
+    if inputs.rig.imu is not None and block.sensor == inputs.rig.imu.name:
         return inputs.rig.imu.intrinsics.mode
     return getattr(next(c for c in inputs.rig.cameras if c.name == block.sensor), block.name).mode
 
@@ -132,7 +134,7 @@ def _groups(
             std = formal[k]
             loose = std * factor > found.problem.tolerance[k]
             verdict = tuple(_with_factor(seen.verdicts[i], w) for i, w in zip(k, loose, strict=True))
-        unit = "" if block.sensor == inputs.rig.imu.name else UNITS[block.name]
+        unit = "" if labels == IMU_LABELS else UNITS[block.name]
         groups.append(
             ParameterGroup(
                 block.sensor, block.name, labels, unit, _raw_value(inputs, found, block), std,
@@ -226,23 +228,27 @@ def _warnings(
 
 def _notes(inputs: Inputs, found: Estimate):
     yield from inputs.measurements.notes
-    rig = inputs.rig
-    n = rig.imu.noise
+    if inputs.imu is not None:
+        yield from _imu_notes(inputs, inputs.imu, found)
+    for camera, model in zip(inputs.rig.cameras, found.noise, strict=True):
+        yield f"{camera.name}: {_noise_words(model)}."
+
+
+def _imu_notes(inputs: Inputs, imu: ImuData, found: Estimate):
+    assert inputs.rig.imu is not None
+    n, most = inputs.rig.imu.noise, inputs.rig.settings.max_gap_s
     yield (
         f"IMU noise ({n.source}): gyro {n.gyro:.3g} rad/s/sqrt(Hz), walk {n.gyro_walk:.3g}; accelerometer "
-        f"{n.accel:.3g} "
-        f"m/s^2/sqrt(Hz), walk {n.accel_walk:.3g}."
+        f"{n.accel:.3g} m/s^2/sqrt(Hz), walk {n.accel_walk:.3g}."
     )
-    for a, b in inputs.imu.gaps:
-        how = "bridged" if b - a <= rig.settings.max_gap_s else "left out, with the images in it"
-        yield f"{rig.imu.name} has a gap of {b - a:.3f} s at {a:.3f} s, {how}."
+    for a, b in imu.gaps:
+        how = "bridged" if b - a <= most else "left out, with the images in it"
+        yield f"{imu.name} has a gap of {b - a:.3f} s at {a:.3f} s, {how}."
     for camera in found.problem.cameras:
         t = camera.times + found.outcome.state.values[camera.name, "time_offset"][0]
-        left_out = int((~usable(inputs.imu, t, rig.settings.max_gap_s)).sum())
+        left_out = int((~usable(imu, t, most)).sum())
         if left_out:
-            yield f"{left_out} images of {camera.name} are left out: {rig.imu.name} was not running then."
-    for camera, model in zip(rig.cameras, found.noise, strict=True):
-        yield f"{camera.name}: {_noise_words(model)}."
+            yield f"{left_out} images of {camera.name} are left out: {imu.name} was not running then."
 
 
 def _noise_words(model: NoiseModel) -> str:

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from icalib.calibration import Calibration
+from icalib.export.kalibr import camchain_name
 from icalib.report.console import table
 
 
@@ -50,4 +51,5 @@ def print_result(calibration: Calibration, folder: Path) -> None:
         for sentence in sentences:
             console.print(f"{title}: {sentence}", markup=False)
     console.print(f"Status: {calibration.status}", markup=False)
-    console.print(f"Wrote {folder / 'calibration.yaml'}, camchain-imucam.yaml, imu.yaml, report.html.", markup=False)
+    written = [camchain_name(calibration), *(["imu.yaml"] if calibration.imu else []), "report.html"]
+    console.print(f"Wrote {folder / 'calibration.yaml'}, {', '.join(written)}.", markup=False)

@@ -89,6 +89,11 @@ class CornerStream:
 class Measurements:
     """Everything one recording holds that the rig asks for."""
 
-    imu: ImuStream
+    imu: ImuStream | None
     cameras: tuple[CornerStream, ...]
     notes: tuple[str, ...] = ()  # what was dropped or repaired while reading, one sentence each
+
+    @property
+    def origin_ns(self) -> int:
+        """The first stamp of the body's clock: the IMU's, or without one the first camera's."""
+        return self.cameras[0].origin_ns if self.imu is None else self.imu.origin_ns

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from icalib.calibration import Calibration, calibration_files
-from icalib.export.kalibr import camchain_imucam, imu_yaml
+from icalib.export.kalibr import camchain, camchain_name, imu_yaml
 from icalib.report import report_html
 from icalib.result_files import check_writable, write_files
 
@@ -15,11 +15,9 @@ def write_outputs(calibration: Calibration, folder: str | Path) -> None:
 
     Raises CalibrationError where the folder cannot be written.
     """
-    texts = {
-        "camchain-imucam.yaml": camchain_imucam(calibration),
-        "imu.yaml": imu_yaml(calibration),
-        "report.html": report_html(calibration),
-    }
+    texts = {camchain_name(calibration): camchain(calibration), "report.html": report_html(calibration)}
+    if calibration.imu is not None:
+        texts["imu.yaml"] = imu_yaml(calibration)
     files = calibration_files(calibration) | {name: text.encode() for name, text in texts.items()}
     write_files(Path(folder), files)
 

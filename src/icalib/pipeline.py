@@ -14,7 +14,7 @@ from icalib.calibration import Calibration
 from icalib.detection.streams import find_corners
 from icalib.estimation.assembly import Inputs, image_times, layout_for, nodes_for, start_values
 from icalib.estimation.estimate import estimate
-from icalib.estimation.imu_data import ImuData
+from icalib.estimation.imu_data import imu_data
 from icalib.estimation.state import State
 from icalib.estimation.tolerances import Tolerances
 from icalib.first_guess import Guess, initial_guess, initial_trajectory
@@ -74,7 +74,7 @@ def _calibrate(rig: Rig, measurements: Measurements, progress: Progress) -> Cali
     progress("finding a first guess", 0.0)
     guess = initial_guess(rig, measurements)
     clock.lap("first guess")
-    inputs = Inputs(rig, measurements, ImuData.build(measurements.imu, rig.imu.noise), layout_for(rig), Tolerances())
+    inputs = Inputs(rig, measurements, imu_data(rig, measurements), layout_for(rig), Tolerances())
     state = first_state(inputs, guess)
     clock.lap("first state")
     steps = _StepProgress(progress)

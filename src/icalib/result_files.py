@@ -18,7 +18,9 @@ from icalib.errors import CalibrationError
 
 COMMIT = ".icalib-commit"
 # Every name that icalib writes: a leftover of an earlier result beside a new one would be a silently wrong number.
-OWN_FILES = ("calibration.yaml", "camchain-imucam.yaml", "imu.yaml", "report.html", "result.json", "result.npz")
+OWN_FILES = (
+    "calibration.yaml", "camchain-imucam.yaml", "camchain.yaml", "imu.yaml", "report.html", "result.json", "result.npz",
+)  # fmt: skip
 
 
 def write_files(folder: Path, files: Mapping[str, bytes]) -> None:

@@ -100,9 +100,10 @@ class Settings:
 
 @dataclass(frozen=True)
 class Rig:
-    """The whole robot."""
+    """The whole robot. Without an IMU the first camera's frame is the body frame, and time stands still: images taken
+    at the same stamp are taken together, nothing ties one instant to the next."""
 
-    imu: ImuSensor
+    imu: ImuSensor | None
     cameras: tuple[Camera, ...]
     target: Target
     gravity: float = 9.81  # m/s^2
@@ -113,3 +114,8 @@ class Rig:
     def blooms(self) -> bool:
         """Whether bloom is estimated: it is asked for, and the target's corners can be pulled."""
         return self.settings.bloom and self.target.blooms
+
+    @property
+    def body(self) -> str:
+        """Name of the sensor whose frame is the body frame."""
+        return self.cameras[0].name if self.imu is None else self.imu.name

@@ -36,7 +36,7 @@ def load_rig(path: str | Path) -> Rig:
     found = root.record(("sensors", "target"), ("gravity", "settings"))
     imus, cameras = _sensors(found["sensors"])
     return Rig(
-        imu=imus[0],
+        imu=imus[0] if imus else None,
         cameras=tuple(cameras),
         target=_target(found["target"]),
         gravity=found["gravity"].positive() if "gravity" in found else Rig.gravity,
@@ -47,7 +47,8 @@ def load_rig(path: str | Path) -> Rig:
 
 def rig_to_dict(rig: Rig) -> dict[str, Any]:
     """`rig` as lists, numbers and text; written as YAML or JSON, it loads back as the same rig."""
-    sensors = {rig.imu.name: _imu_to_plain(rig.imu)} | {c.name: _camera_to_plain(c) for c in rig.cameras}
+    imus = {} if rig.imu is None else {rig.imu.name: _imu_to_plain(rig.imu)}
+    sensors = imus | {c.name: _camera_to_plain(c) for c in rig.cameras}
     return {
         "sensors": sensors,
         "target": {"type": rig.target.type} | dataclasses.asdict(rig.target),
@@ -71,8 +72,6 @@ def _sensors(value: YamlValue) -> tuple[list[ImuSensor], list[Camera]]:
             sensor.fail(f"is a second IMU beside {imus[0].name}; keep the one that is the body frame.")
         else:
             imus.append(_imu(name, sensor))
-    if not imus:
-        value.fail("there is no IMU; add a sensor of type: imu.")
     if not cameras:
         value.fail("there is no camera; add a sensor of type: camera.")
     return imus, cameras

@@ -13,13 +13,13 @@ from scipy.spatial.transform import Rotation
 from icalib.calibration import Calibration, ParameterGroup
 from icalib.errors import CalibrationError
 from icalib.estimation.imu_model import LABELS, correction_matrices
-from icalib.export.kalibr import camchain_imucam, imu_yaml
+from icalib.export.kalibr import camchain, imu_yaml
 from icalib.geometry.cameras import camera_model
 
 
 @pytest.fixture(scope="module")
 def chain(calibration: Calibration) -> dict:
-    return yaml.safe_load(camchain_imucam(calibration))
+    return yaml.safe_load(camchain(calibration))
 
 
 def with_intrinsics(calibration: Calibration, value: np.ndarray, mode: str) -> Calibration:
@@ -52,7 +52,7 @@ def test_models_are_kalibrs_names(calibration: Calibration, chain: dict):
         n: s | ({"model": "pinhole-equidistant"} if n == "cam1" else {}) for n, s in calibration.rig["sensors"].items()
     }
     fisheye = dataclasses.replace(calibration, rig=calibration.rig | {"sensors": sensors})
-    found = yaml.safe_load(camchain_imucam(fisheye))["cam1"]
+    found = yaml.safe_load(camchain(fisheye))["cam1"]
     assert (found["camera_model"], found["distortion_model"]) == ("pinhole", "equidistant")
 
 
@@ -62,7 +62,7 @@ def test_a_model_that_kalibr_lacks_is_fitted_and_said(calibration: Calibration):
         dataclasses.replace(g, value=np.append(g.value, -0.002)) if (g.sensor, g.name) == ("cam1", "distortion") else g
         for g in calibration.groups
     )
-    text = camchain_imucam(dataclasses.replace(calibration, rig=calibration.rig | {"sensors": sensors}, groups=groups))
+    text = camchain(dataclasses.replace(calibration, rig=calibration.rig | {"sensors": sensors}, groups=groups))
     assert "# cam1: Kalibr has no radtan5; this radtan follows it to" in text and "# cam0" not in text
     fitted = yaml.safe_load(text)["cam1"]
     assert (fitted["distortion_model"], len(fitted["distortion_coeffs"])) == ("radtan", 4)
@@ -90,7 +90,7 @@ def test_models_of_wide_lenses_are_kalibrs(calibration: Calibration, model: str,
         dataclasses.replace(g, value=np.array(distortion)) if (g.sensor, g.name) == ("cam1", "distortion") else g
         for g in calibration.groups
     )
-    text = camchain_imucam(dataclasses.replace(calibration, rig=calibration.rig | {"sensors": sensors}, groups=groups))
+    text = camchain(dataclasses.replace(calibration, rig=calibration.rig | {"sensors": sensors}, groups=groups))
     found, pinhole = yaml.safe_load(text)["cam1"], [457.587, 456.134, 379.999, 255.238]
     assert (found["camera_model"], found["intrinsics"]) == (expected[0], expected[1] + pinhole)
     assert (found["distortion_model"], found["distortion_coeffs"]) == expected[2:]
@@ -108,7 +108,7 @@ def test_layout_is_that_of_kalibr(euroc: Path, chain: dict, calibration: Calibra
     def without_numbers(lines: list[str]) -> list[str]:
         return [line.split("[")[0].split(": ")[0] for line in lines if not line.startswith("#")]
 
-    assert without_numbers(camchain_imucam(calibration).splitlines()) == without_numbers(text.splitlines())
+    assert without_numbers(camchain(calibration).splitlines()) == without_numbers(text.splitlines())
 
 
 def test_overlaps_are_common_points_at_the_same_instant(calibration: Calibration, chain: dict):
@@ -118,14 +118,12 @@ def test_overlaps_are_common_points_at_the_same_instant(calibration: Calibration
     right = dataclasses.replace(second, point=72 + second.point % 72)
     later = dataclasses.replace(second, seconds=second.seconds + 100.0)
     for pair in ((left, right), (first, later)):
-        apart = yaml.safe_load(camchain_imucam(dataclasses.replace(calibration, corner_residuals=pair)))
+        apart = yaml.safe_load(camchain(dataclasses.replace(calibration, corner_residuals=pair)))
         assert (apart["cam0"]["cam_overlaps"], apart["cam1"]["cam_overlaps"]) == ([], [])
 
 
 def test_comments_say_direction_and_names(calibration: Calibration):
-    assert camchain_imucam(calibration).startswith(
-        "# Kalibr's camchain by icalib. T_cam_imu takes coordinates in the imu"
-    )
+    assert camchain(calibration).startswith("# Kalibr's camchain by icalib. T_cam_imu takes coordinates in the imu")
     assert imu_yaml(calibration).startswith("# Kalibr's imu file by icalib. T_i_b takes coordinates in the body frame")
     sensors = {{"cam1": "right"}.get(n, n): s for n, s in calibration.rig["sensors"].items()}
     renamed = dataclasses.replace(
@@ -137,7 +135,7 @@ def test_comments_say_direction_and_names(calibration: Calibration):
             dataclasses.replace(calibration.corner_residuals[1], sensor="right"),
         ),
     )
-    text = camchain_imucam(renamed)
+    text = camchain(renamed)
     assert "# cam1 is right." in text
     assert yaml.safe_load(text)["cam1"]["rostopic"] == "/right/image_raw"
 

@@ -126,16 +126,21 @@ class Calibration:
         raise KeyError(f"no {name} of {sensor}; there are {', '.join(f'{g.sensor}.{g.name}' for g in self.groups)}")
 
     def T_imu_sensor(self, sensor: str) -> np.ndarray:
-        """4x4 pose of `sensor` in the imu frame."""
+        """4x4 pose of `sensor` in the imu frame; without an IMU in that of the first camera, the body's."""
         T = np.eye(4)
         T[:3, :3] = self.group(sensor, "rotation").value
         T[:3, 3] = self.group(sensor, "translation").value
         return T
 
     @property
-    def imu(self) -> str:
-        """Name of the IMU, the body frame."""
-        return self._of_type("imu")[0]
+    def imu(self) -> str | None:
+        """Name of the IMU, if there is one."""
+        return next(iter(self._of_type("imu")), None)
+
+    @property
+    def body(self) -> str:
+        """Name of the sensor whose frame is the body frame: the IMU, or without one the first camera."""
+        return self.imu or self.cameras[0]
 
     @property
     def cameras(self) -> tuple[str, ...]:

@@ -12,10 +12,10 @@ from icalib.calibration.result import Calibration, ParameterGroup, SensorFit
 
 HEADER = """\
 # Calibration by icalib {version}. Lengths in m, times in s, angles in rad, image quantities in px.
-# T_imu_sensor takes coordinates in the sensor's frame to the imu frame: p_imu = T_imu_sensor p_sensor.
+# {key} takes coordinates in the sensor's frame to the {body} frame: p_{body} = {key} p_sensor.
 #   (Kalibr's T_cam_imu is the inverse; see camchain-imucam.yaml.)
-# time_offset: t_imu = t_sensor + time_offset.
-# std: standard deviations, of rotation about the sensor's axes, of translation along the imu axes. They include
+# time_offset: t_{body} = t_sensor + time_offset.
+# std: standard deviations, of rotation about the sensor's axes, of translation along the {body} axes. They include
 #   empirical_factor, by which parts of the recording disagree more than their noise explains; formal = std / factor.
 # verdict: determined, weak or undetermined by the data, or fixed by the rig file. Undetermined values are guesses.
 # The full covariance and all residuals are in result.npz.
@@ -39,7 +39,8 @@ def calibration_yaml(calibration: Calibration) -> str:
         "notes": list(c.notes),
         "fits": [_fit(f) for f in c.fits],
     }
-    header = HEADER.format(version=c.versions.get("icalib", "of unknown version"))
+    body = c.body if c.imu is None else "imu"
+    header = HEADER.format(version=c.versions.get("icalib", "of unknown version"), key=pose_key(c), body=body)
     return header + yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=1000, allow_unicode=True)
 
 
@@ -49,10 +50,15 @@ def parameter_keys(groups: tuple[ParameterGroup, ...]) -> dict[tuple[str, str], 
     return {(g.name, n): n if n and count[n] == 1 else f"{g.name}_{n}".rstrip("_") for g in groups for n in g.labels}
 
 
+def pose_key(c: Calibration) -> str:
+    """T_imu_sensor, or without an IMU T_cam0_sensor, after the camera whose frame is the body's."""
+    return f"T_{'imu' if c.imu else c.body}_sensor"
+
+
 def _sensor(c: Calibration, name: str) -> dict[str, Any]:
     kind = c.rig["sensors"][name]["type"]
     if kind != "imu":
-        return {"type": kind, "T_imu_sensor": c.T_imu_sensor(name).tolist()} | _entry(c, name)
+        return {"type": kind, pose_key(c): c.T_imu_sensor(name).tolist()} | _entry(c, name)
     entry = _entry(c, name)
     still = {"rotation": [0.0] * 3, "translation": [0.0] * 3, "time_offset": 0.0}
     fixed = {"rotation": ["fixed"] * 3, "translation": ["fixed"] * 3, "time_offset": "fixed"}

@@ -9,13 +9,14 @@ import numpy as np
 from icalib.errors import EstimationError
 from icalib.estimation.board import SHAPE_LABELS, SHAPE_SIGMA_M, bloom_direction, shape_basis
 from icalib.estimation.corner_factor import CornerFactor, CornerNoise
+from icalib.estimation.free_nodes import FreeNodes
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.imu_factor import ImuFactor
 from icalib.estimation.imu_model import N_INTRINSICS
-from icalib.estimation.nodes import place_nodes, usable
+from icalib.estimation.nodes import MERGED_WITHIN_S, distinct, place_nodes, usable
 from icalib.estimation.poses import assign_nodes, poses_at
 from icalib.estimation.prior_factor import Prior
-from icalib.estimation.problem import Problem
+from icalib.estimation.problem import ChainFactor, Problem
 from icalib.estimation.state import Key, Kind, Layout, State, make_layout
 from icalib.estimation.tolerances import Tolerances
 from icalib.geometry.cameras import camera_model
@@ -41,29 +42,36 @@ class Inputs:
 
     rig: Rig
     measurements: Measurements
-    imu: ImuData
+    imu: ImuData | None
     layout: Layout
     tolerances: Tolerances
 
 
 def layout_for(rig: Rig) -> Layout:
     """The border: IMU intrinsics, board, then each camera's parameters."""
-    entries: list[tuple[str, str, Kind, int, bool]] = [
-        (rig.imu.name, "intrinsics", "vector", N_INTRINSICS, rig.imu.intrinsics.mode != "fixed"),
-        (BOARD, "tilt", "tilt", 2, True),
-        (BOARD, "shape", "vector", len(SHAPE_LABELS) if rig.settings.board_shape else 0, rig.settings.board_shape),
-    ]
+    imu = rig.imu
+    entries: list[tuple[str, str, Kind, int, bool]] = []
+    if imu is not None:
+        entries.append((imu.name, "intrinsics", "vector", N_INTRINSICS, imu.intrinsics.mode != "fixed"))
+    bends = rig.settings.board_shape
+    entries.append((BOARD, "tilt", "tilt", 2, imu is not None))  # without an IMU the board's frame is the world's
+    entries.append((BOARD, "shape", "vector", len(SHAPE_LABELS) if bends else 0, bends))
     for camera in rig.cameras:
         sizes = SIZES | {"distortion": len(camera_model(camera.model).parameter_names) - 4}
         for name, kind in CAMERA_PARAMETERS:
-            estimated = getattr(camera, name).mode != "fixed" and (name != "bloom" or rig.blooms)
-            entries.append((camera.name, name, kind, sizes[name], estimated))
+            entries.append((camera.name, name, kind, sizes[name], _is_estimated(rig, camera, name)))
     return make_layout(entries)
 
 
+def _is_estimated(rig: Rig, camera: Camera, name: str) -> bool:
+    if rig.imu is None and (name == "time_offset" or (camera.name == rig.body and name in ("rotation", "translation"))):
+        return False
+    return getattr(camera, name).mode != "fixed" and (name != "bloom" or rig.blooms)
+
+
 def origin_difference(measurements: Measurements, stream: CornerStream) -> float:
-    """Seconds from the IMU's first stamp to the camera's, each on its own clock: what a raw time offset lacks."""
-    return (stream.origin_ns - measurements.imu.origin_ns) * 1e-9
+    """Seconds from the body's first stamp to the camera's, each on its own clock: what a raw time offset lacks."""
+    return (stream.origin_ns - measurements.origin_ns) * 1e-9
 
 
 def _priors(inputs: Inputs) -> tuple[Prior, ...]:
@@ -71,7 +79,9 @@ def _priors(inputs: Inputs) -> tuple[Prior, ...]:
     priors = []
     if rig.settings.board_shape:
         priors.append(Prior(layout.block(BOARD, "shape"), np.zeros(len(SHAPE_LABELS)), SHAPE_SIGMA_M))
-    owners: list[tuple[str, str, Parameter, float]] = [(rig.imu.name, "intrinsics", rig.imu.intrinsics, 0.0)]
+    owners: list[tuple[str, str, Parameter, float]] = []
+    if rig.imu is not None:
+        owners.append((rig.imu.name, "intrinsics", rig.imu.intrinsics, 0.0))
     for camera, stream in zip(rig.cameras, inputs.measurements.cameras, strict=True):
         for name, _ in CAMERA_PARAMETERS:
             shift = origin_difference(inputs.measurements, stream) if name == "time_offset" else 0.0
@@ -80,18 +90,21 @@ def _priors(inputs: Inputs) -> tuple[Prior, ...]:
                 block = layout.block(camera.name, "bloom")
                 priors.append(Prior(block, np.zeros(1), np.full(1, BLOOM_SIGMA_PX)))
     for sensor, name, parameter, shift in owners:
-        if parameter.mode == "prior" and parameter.value is not None and parameter.sigma is not None:
+        estimated = layout.block(sensor, name).start is not None
+        if estimated and parameter.mode == "prior" and parameter.value is not None and parameter.sigma is not None:
             priors.append(Prior(layout.block(sensor, name), parameter.value + shift, parameter.sigma))
     return tuple(priors)
 
 
 def image_times(inputs: Inputs, values: dict[Key, np.ndarray]) -> list[np.ndarray]:
-    """Instants of each camera's images, seconds on the imu clock since its first stamp."""
+    """Instants of each camera's images, seconds on the body's clock since its first stamp."""
     return [c.seconds + values[c.name, "time_offset"][0] for c in inputs.measurements.cameras]
 
 
 def resample(state: State, nodes: np.ndarray, inputs: Inputs) -> State:
-    """The same motion at other nodes, by integrating the IMU from the nearest old one."""
+    """The same motion at other nodes, by integrating the IMU from the nearest old one; without an IMU nodes stay."""
+    if inputs.imu is None:
+        return state
     near = assign_nodes("inertial", state.seconds, nodes)
     poses = poses_at("inertial", nodes, near, state, inputs.imu, inputs.rig.gravity, False)
     return State(nodes, poses.rotation, poses.position, poses.velocity, state.bias[near].copy(), state.values)
@@ -100,6 +113,8 @@ def resample(state: State, nodes: np.ndarray, inputs: Inputs) -> State:
 def nodes_for(inputs: Inputs, times: list[np.ndarray]) -> np.ndarray:
     """Node times for images at `times`. Raises EstimationError where clocks do not overlap."""
     settings = inputs.rig.settings
+    if inputs.imu is None:
+        return distinct(np.sort(np.concatenate(times)))
     hosts = times[:1] if settings.nodes == "first-camera" else times
     nodes = place_nodes(inputs.imu, hosts, settings.node_spacing_s, settings.max_gap_s)
     if len(nodes) < 3:
@@ -113,22 +128,37 @@ def nodes_for(inputs: Inputs, times: list[np.ndarray]) -> np.ndarray:
 def assemble(inputs: Inputs, state: State, noise: list[CornerNoise], keep: list[np.ndarray]) -> Problem:
     """The problem at the nodes of `state`, everything frozen that a pass freezes: nodes, assignment, preintegration."""
     rig, layout = inputs.rig, inputs.layout
-    imu_columns = layout.columns(rig.imu.name, "intrinsics")
-    imu_factor = ImuFactor.build(inputs.imu, state, rig.gravity, imu_columns[imu_columns >= 0])
     basis = shape_basis(rig.target, rig.settings.board_shape)
     factors = []
     for camera, stream, t, n, k in zip(
         rig.cameras, inputs.measurements.cameras, image_times(inputs, state.values), noise, keep, strict=True
     ):
-        seen = usable(inputs.imu, t, rig.settings.max_gap_s)
+        scheme = rig.settings.scheme if inputs.imu is not None else "inertial"
+        node = assign_nodes(scheme, state.seconds, t)
+        seen = is_seen(inputs, t, state.seconds[node])
         factor = CornerFactor(
-            stream, camera_model(camera.model), inputs.imu, rig.gravity, rig.settings.scheme, stream.seconds,
-            assign_nodes(rig.settings.scheme, state.seconds, t), k & np.repeat(seen, np.diff(stream.start)), n,
-            np.zeros((0, 2)), BOARD, rig.target.points, basis, layout, len(state.seconds),
+            stream, camera_model(camera.model), inputs.imu, rig.gravity, scheme, stream.seconds, node,
+            k & np.repeat(seen, np.diff(stream.start)), n, np.zeros((0, 2)), BOARD, rig.target.points, basis, layout,
+            len(state.seconds),
         )  # fmt: skip
         factors.append(_with_bloom(factor, camera, state, rig) if rig.blooms else factor)
-    tolerance = inputs.tolerances.of(layout, rig.imu.name)
-    return Problem(layout, imu_factor, tuple(factors), _priors(inputs), tolerance)
+    tolerance = inputs.tolerances.of(layout, None if rig.imu is None else rig.imu.name)
+    return Problem(layout, _chain(inputs, state), tuple(factors), _priors(inputs), tolerance)
+
+
+def _chain(inputs: Inputs, state: State) -> ChainFactor:
+    if inputs.imu is None:
+        return FreeNodes(inputs.rig.body, len(state.seconds))
+    columns = inputs.layout.columns(inputs.imu.name, "intrinsics")
+    return ImuFactor.build(inputs.imu, state, inputs.rig.gravity, columns[columns >= 0])
+
+
+def is_seen(inputs: Inputs, times: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    """(n,) whether images at `times` can be used, each at its node's instant: the IMU was running, or without one they
+    were taken there."""
+    if inputs.imu is None:
+        return np.abs(times - nodes) <= MERGED_WITHIN_S
+    return usable(inputs.imu, times, inputs.rig.settings.max_gap_s)
 
 
 def _with_bloom(factor: CornerFactor, camera: Camera, state: State, rig: Rig) -> CornerFactor:
@@ -148,10 +178,9 @@ def start_values(inputs: Inputs, guess_values: dict[Key, np.ndarray]) -> dict[Ke
     values = dict(guess_values)
     n_shape = inputs.layout.block(BOARD, "shape").size
     values[BOARD, "shape"] = np.zeros(n_shape)
-    imu = inputs.rig.imu
-    values[imu.name, "intrinsics"] = (
-        np.zeros(N_INTRINSICS) if imu.intrinsics.value is None else imu.intrinsics.value.copy()
-    )
+    if (imu := inputs.rig.imu) is not None:
+        given = imu.intrinsics.value
+        values[imu.name, "intrinsics"] = np.zeros(N_INTRINSICS) if given is None else given.copy()
     for camera in inputs.rig.cameras:
         bloom = camera.bloom.value if inputs.rig.blooms else None
         values[camera.name, "bloom"] = np.zeros(1) if bloom is None else bloom.copy()

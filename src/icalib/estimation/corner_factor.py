@@ -29,7 +29,7 @@ from icalib.estimation.corner_kernels import (
     camera_points,
 )
 from icalib.estimation.imu_data import ImuData
-from icalib.estimation.poses import Poses, poses_at
+from icalib.estimation.poses import Poses, poses_at, poses_of_nodes
 from icalib.estimation.state import Layout, State
 from icalib.geometry.cameras.base import CameraModel
 from icalib.measurements import CornerStream
@@ -78,7 +78,7 @@ class CornerFactor:
 
     stream: CornerStream
     model: CameraModel
-    imu: ImuData
+    imu: ImuData | None
     gravity: float
     scheme: Scheme
     times: np.ndarray
@@ -104,9 +104,12 @@ class CornerFactor:
 
     def camera_poses(self, state: State, i0: int = 0, i1: int | None = None) -> tuple[Poses, np.ndarray, np.ndarray]:
         """IMU poses, and R_cam_world (n, 3, 3), p_world_cam (n, 3) at the instants of images i0..i1."""
-        times = self.times[i0:i1] + state.values[self.name, "time_offset"][0]
-        imu_free = self.layout.block(self.imu.name, "intrinsics").start is not None
-        poses = poses_at(self.scheme, times, self.node[i0:i1], state, self.imu, self.gravity, imu_free)
+        if self.imu is None:
+            poses = poses_of_nodes(self.node[i0:i1], state)
+        else:
+            times = self.times[i0:i1] + state.values[self.name, "time_offset"][0]
+            imu_free = self.layout.block(self.imu.name, "intrinsics").start is not None
+            poses = poses_at(self.scheme, times, self.node[i0:i1], state, self.imu, self.gravity, imu_free)
         R_ic, p_ic = state.values[self.name, "rotation"], state.values[self.name, "translation"]
         R_cw = np.ascontiguousarray((poses.rotation @ R_ic).transpose(0, 2, 1))
         return poses, R_cw, poses.position + poses.rotation @ p_ic
@@ -126,11 +129,12 @@ class CornerFactor:
 
     def _columns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Border columns of the chained and of the direct parameters, and which model parameters the latter hold."""
-        imu = self.layout.columns(self.imu.name, "intrinsics")
+        nothing = np.zeros(0, dtype=np.int64)
+        imu = nothing if self.imu is None else self.layout.columns(self.imu.name, "intrinsics")
         chained = [
             self.layout.columns(self.name, "rotation", "translation", "time_offset"),
             self.layout.columns(self.target, "tilt"),
-            imu if imu[0] >= 0 else imu[:0],
+            imu[imu >= 0],
         ]
         model = self.layout.columns(self.name, "intrinsics", "distortion")
         pars = np.flatnonzero(model >= 0)

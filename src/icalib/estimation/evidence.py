@@ -10,7 +10,6 @@ import numpy as np
 from icalib.errors import EstimationError
 from icalib.estimation.arrowhead import Piece, in_parallel, marginalise, solve
 from icalib.estimation.corner_factor import CornerFactor, CornerOutput
-from icalib.estimation.imu_factor import ROWS
 from icalib.estimation.problem import Problem
 from icalib.estimation.solver import Outcome
 from icalib.estimation.state import State
@@ -19,7 +18,6 @@ PROBES = 2  # random right-hand sides; one already gives the dof of 1e5 residual
 IMAGE_CELLS = (4, 3)  # columns, rows
 TARGET_PARTS = 3  # along each side
 PROBE_STEP = 1e-2  # of a posterior sample: small enough to be linear
-IMU_ROWS = {"gyroscope": slice(0, 3), "accelerometer": slice(3, 9), "bias walk": slice(9, ROWS)}
 
 
 @dataclass(frozen=True)
@@ -49,8 +47,8 @@ def fits(problem: Problem, outcome: Outcome, seed: int = 0) -> list[Fit]:
             spent.setdefault(key, []).append(value)
     out = []
     imu = outcome.residuals.imu
-    for kind, rows in IMU_ROWS.items():
-        key = problem.imu.imu.name, kind
+    for kind, rows in problem.chain.kinds.items():
+        key = problem.chain.name, kind
         n = imu[:, rows].size
         out.append(Fit(*key, n, n - float(np.mean(spent[key])), float((imu[:, rows] ** 2).sum())))
     for camera, corners in zip(problem.cameras, outcome.residuals.corners, strict=True):
@@ -80,7 +78,7 @@ def _probe(problem: Problem, outcome: Outcome, rng: np.random.Generator) -> dict
 
     def add(piece: Piece) -> None:
         piece.clear()
-        problem.imu.accumulate(state, piece, scratch.imu, noise=imu_noise)
+        problem.chain.accumulate(state, piece, scratch.imu, noise=imu_noise)
         for camera, corners, n in zip(problem.cameras, scratch.corners, noise, strict=True):
             camera.accumulate(state, piece, corners, noise=n)
         if piece.first == 0:
@@ -93,7 +91,8 @@ def _probe(problem: Problem, outcome: Outcome, rng: np.random.Generator) -> dict
         _residuals_at(problem, state, -s * solution.chain, -s * solution.border) for s in (PROBE_STEP, -PROBE_STEP)
     )
     slope_imu = (up.imu - down.imu) / (2.0 * PROBE_STEP)
-    spent = {(problem.imu.imu.name, k): float((imu_noise[:, r] * slope_imu[:, r]).sum()) for k, r in IMU_ROWS.items()}
+    kinds = problem.chain.kinds.items()
+    spent = {(problem.chain.name, k): float((imu_noise[:, r] * slope_imu[:, r]).sum()) for k, r in kinds}
     for camera, at, u, d, n in zip(problem.cameras, base.corners, up.corners, down.corners, noise, strict=True):
         slope = (u.residual - d.residual) / (2.0 * PROBE_STEP)
         for kind, value in _spent_by_corners(camera, at, slope, *n).items():

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.measurements import ImuStream
-from icalib.rig import ImuNoise
+from icalib.measurements import ImuStream, Measurements
+from icalib.rig import ImuNoise, Rig
 
 GAP = 3.0  # an interval longer than this many median periods is a gap
 # Within a gap the motion goes on unseen: what is not known of rate and force, their spread over the recording,
@@ -54,3 +54,10 @@ class ImuData:
     def interval(self, seconds: np.ndarray) -> np.ndarray:
         """(n,) index of the reading interval that each time lies in, the first or last for times outside."""
         return np.clip(np.searchsorted(self.seconds, seconds, side="right") - 1, 0, len(self.seconds) - 2)
+
+
+def imu_data(rig: Rig, measurements: Measurements) -> ImuData | None:
+    """The rig's IMU, or None where it has none."""
+    if rig.imu is None or measurements.imu is None:
+        return None
+    return ImuData.build(measurements.imu, rig.imu.noise)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -11,6 +11,7 @@ from numba import njit
 from icalib.estimation.arrowhead import Piece, in_parallel
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.integration import integrate
+from icalib.estimation.prior_factor import accumulate_bias_prior
 from icalib.estimation.state import State
 from icalib.geometry import so3
 from icalib.geometry.small import mul3, tmul3
@@ -255,6 +256,10 @@ class ImuFactor:
     R_k^T (p_k+1 - p_k - v_k dt - g dt^2 / 2) - dp - J_p db; b_k+1 - b_k, whitened jointly.
     """
 
+    kinds: ClassVar[dict[str, slice]] = {
+        "gyroscope": slice(0, 3), "accelerometer": slice(3, 9), "bias walk": slice(9, ROWS),
+    }  # fmt: skip
+
     imu: ImuData
     gravity: float
     columns: np.ndarray  # (24,) border columns of the intrinsics, or (0,) where they are fixed
@@ -265,6 +270,18 @@ class ImuFactor:
     W: np.ndarray
     bias0: np.ndarray
     intrinsics0: np.ndarray
+
+    @property
+    def name(self) -> str:
+        return self.imu.name
+
+    @property
+    def n_nodes(self) -> int:
+        return len(self.dR) + 1
+
+    def accumulate_bias_prior(self, state: State, piece: Piece, sums: bool = True, met: bool = False) -> float:
+        """The broad prior on the first node's biases, about those of the pass's start. Returns half its chi^2."""
+        return accumulate_bias_prior(state, piece, sums, met, self.bias0[0])
 
     @classmethod
     def build(cls, imu: ImuData, state: State, gravity: float, columns: np.ndarray) -> ImuFactor:

@@ -16,17 +16,21 @@ def place_nodes(imu: ImuData, image_times: list[np.ndarray], spacing: float, max
     IMU gaps are filled too, up to `max_gap` seconds; in longer ones there is no node.
     """
     times = np.sort(np.concatenate(image_times))
-    times = times[usable(imu, times, max_gap)]
-    distinct = times[np.diff(times, prepend=-np.inf) > MERGED_WITHIN_S]
+    own = distinct(times[usable(imu, times, max_gap)])
     long_gaps = [(a, b) for a, b in imu.gaps if b - a > max_gap]
-    pieces = [distinct[:1]]
-    for a, b in zip(distinct[:-1], distinct[1:], strict=True):
+    pieces = [own[:1]]
+    for a, b in zip(own[:-1], own[1:], strict=True):
         n = max(int(np.ceil((b - a) / spacing - SLACK)), 1)
         between = np.linspace(a, b, n + 1)[1:]
         for start, end in long_gaps:
             between = between[~((between > start) & (between < end))]
         pieces.append(between)
     return np.concatenate(pieces)
+
+
+def distinct(times: np.ndarray) -> np.ndarray:
+    """The first of each group of sorted `times` that lie close together."""
+    return times[np.diff(times, prepend=-np.inf) > MERGED_WITHIN_S]
 
 
 def usable(imu: ImuData, times: np.ndarray, max_gap: float) -> np.ndarray:

@@ -157,6 +157,15 @@ def _between(times, node, nodes, R, p, out_R, out_p, rate, vel, Jn, Jm):
                 Jm[i, a, c] = slide[a, c]
 
 
+def poses_of_nodes(node: np.ndarray, state: State) -> Poses:
+    """IMU poses at the nodes themselves, which stand still: where there is no IMU, images are taken at nodes."""
+    n = len(node)
+    by_node, still = np.zeros((n, 6, NODE)), np.zeros((n, 3))
+    by_node[:, range(6), range(6)] = 1.0
+    nothing = np.zeros((0, 6, NODE))
+    return Poses(state.rotation[node], state.position[node], still, still, by_node, nothing, np.zeros((n, 6, 0)))
+
+
 def poses_at(
     scheme: Scheme, times: np.ndarray, node: np.ndarray, state: State, imu: ImuData, gravity: float, imu_free: bool
 ) -> Poses:

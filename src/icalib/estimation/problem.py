@@ -4,19 +4,42 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar, Protocol
 
 import numpy as np
 
 from icalib.estimation.arrowhead import Piece, in_parallel, make_pieces
 from icalib.estimation.corner_factor import CornerFactor, CornerOutput
-from icalib.estimation.imu_factor import ROWS, ImuFactor
-from icalib.estimation.prior_factor import Prior, accumulate_bias_prior
+from icalib.estimation.imu_factor import ROWS
+from icalib.estimation.prior_factor import Prior
 from icalib.estimation.state import Layout, State
+
+
+class ChainFactor(Protocol):
+    """What ties the nodes together: an `ImuFactor`, or `FreeNodes`. kinds: rows of its residuals by name."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def n_nodes(self) -> int: ...
+
+    kinds: ClassVar[dict[str, slice]]
+
+    def accumulate(
+        self, state: State, piece: Piece, out: np.ndarray, sums: bool = True, noise: np.ndarray | None = None
+    ) -> float:
+        """Fills whitened residuals `out` (K - 1, 15) of `piece`, adds them to its sums; returns half the chi^2."""
+        ...
+
+    def accumulate_bias_prior(self, state: State, piece: Piece, sums: bool = True, met: bool = False) -> float:
+        """Adds what keeps the first node's biases defined (`met`: as if they were met); returns half its chi^2."""
+        ...
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """What the factors left behind at a state: the IMU's whitened residuals (K - 1, 15), the corners' by camera."""
+    """What the factors left behind at a state: the chain's whitened residuals (K - 1, 15), the corners' by camera."""
 
     imu: np.ndarray
     corners: tuple[CornerOutput, ...]
@@ -27,14 +50,14 @@ class Problem:
     """Minimise half the sum of all squared, whitened, robust residuals over a `State`."""
 
     layout: Layout
-    imu: ImuFactor
+    chain: ChainFactor
     cameras: tuple[CornerFactor, ...]
     priors: tuple[Prior, ...]
     tolerance: np.ndarray  # (B,) what a user would call the same number; scales the border
 
     @property
     def n_nodes(self) -> int:
-        return len(self.imu.dR) + 1
+        return self.chain.n_nodes
 
     def pieces(self) -> tuple[Piece, ...]:
         return make_pieces(self.n_nodes, self.layout.size)
@@ -61,20 +84,20 @@ class Problem:
         self, state: State, piece: Piece, out: Residuals, sums: bool = True, curved: bool = False
     ) -> float:
         """Adds IMU and corners in `piece`; returns half their robust chi^2."""
-        cost = self.imu.accumulate(state, piece, out.imu, sums)
+        cost = self.chain.accumulate(state, piece, out.imu, sums)
         for camera, corners in zip(self.cameras, out.corners, strict=True):
             cost += camera.accumulate(state, piece, corners, sums, curved)
         return cost
 
     def add_bias_prior(self, state: State, piece: Piece, sums: bool = True) -> float:
         """Adds the broad prior on the biases of the chain's first node, about those that the pass started from."""
-        return accumulate_bias_prior(state, piece, sums, centre=self.imu.bias0[0]) if piece.first == 0 else 0.0
+        return self.chain.accumulate_bias_prior(state, piece, sums) if piece.first == 0 else 0.0
 
     def add_prior_information(self, piece: Piece, state: State) -> None:
         """Adds the priors as if they were met exactly: their information, no gradient."""
         for prior in self.priors:
             prior.accumulate(state, piece, residual=np.zeros(len(prior.sigma)))
-        accumulate_bias_prior(state, piece, met=True)
+        self.chain.accumulate_bias_prior(state, piece, met=True)
 
     @staticmethod
     def narrow(piece: Piece, n_border: int) -> Piece:

@@ -23,7 +23,7 @@ class Tolerances:
     tilt: float = np.deg2rad(0.1)
     imu_intrinsics: float = 1e-2  # scale, misalignment [rad]; g-sensitivity rad/s per m/s^2
 
-    def of(self, layout: Layout, imu: str) -> np.ndarray:
+    def of(self, layout: Layout, imu: str | None) -> np.ndarray:
         """(B,) tolerance of each border column."""
         out = np.zeros(layout.size)
         for b in layout.free:

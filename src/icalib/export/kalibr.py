@@ -27,23 +27,33 @@ KALIBR_MODELS = {
 SAME_INSTANT_S = 0.025  # images this close see the same scene
 
 
-def camchain_imucam(calibration: Calibration) -> str:
-    """Text of camchain-imucam.yaml. Cameras are renamed cam0, cam1, ... in the rig's order, as Kalibr wants them."""
+def camchain_name(calibration: Calibration) -> str:
+    """What Kalibr calls the file of `camchain`."""
+    return "camchain.yaml" if calibration.imu is None else "camchain-imucam.yaml"
+
+
+def camchain(calibration: Calibration) -> str:
+    """Text of camchain-imucam.yaml, or of camchain.yaml without an IMU. Cameras are renamed cam0, cam1, ... in the
+    rig's order, as Kalibr wants them."""
     c = calibration
     seen = {r.sensor: r for r in c.corner_residuals}
     overlaps = _overlaps([seen[name] for name in c.cameras])
     data = {f"cam{i}": _camera(c, i, overlaps) for i in range(len(c.cameras))}
     comment = (
-        "# Kalibr's camchain by icalib. T_cam_imu takes coordinates in the imu frame to the camera frame, T_cn_cnm1 "
-        "those of the camera before to this one; t_imu = t_cam + timeshift_cam_imu [s]."
+        "# Kalibr's camchain by icalib. T_cn_cnm1 takes coordinates in the frame of the camera before to this one's"
     )
+    if c.imu is not None:
+        comment += ", T_cam_imu those in the imu frame; t_imu = t_cam + timeshift_cam_imu [s]"
+    comment += "."
     fits = [sentence for i in range(len(c.cameras)) if (sentence := _lens(c, i)[1])]
     return _text([comment, *_renamed("cam", c.cameras), *fits], data)
 
 
 def imu_yaml(calibration: Calibration) -> str:
-    """Text of imu.yaml. Raises CalibrationError where the rate of the IMU is unknown."""
+    """Text of imu.yaml. Raises CalibrationError where there is no IMU or its rate is unknown."""
     c = calibration
+    if c.imu is None:
+        raise CalibrationError("the rig has no IMU, so there is no imu.yaml to write.")
     if c.imu not in c.rates:
         raise CalibrationError(f"the rate of {c.imu} is not known, and Kalibr's imu.yaml needs one; calibrate again.")
     noise = c.rig["sensors"][c.imu]["noise"]
@@ -68,7 +78,7 @@ def imu_yaml(calibration: Calibration) -> str:
 def _camera(c: Calibration, index: int, overlaps: np.ndarray) -> dict[str, Any]:
     name = c.cameras[index]
     T_cam_imu = _inverse(c.T_imu_sensor(name))
-    data: dict[str, Any] = {"T_cam_imu": T_cam_imu.tolist()}
+    data: dict[str, Any] = {} if c.imu is None else {"T_cam_imu": T_cam_imu.tolist()}
     if index > 0:
         data["T_cn_cnm1"] = (T_cam_imu @ c.T_imu_sensor(c.cameras[index - 1])).tolist()
     lens, _ = _lens(c, index)
@@ -77,7 +87,7 @@ def _camera(c: Calibration, index: int, overlaps: np.ndarray) -> dict[str, Any]:
         **lens,
         "resolution": [int(side) for side in c.rig["sensors"][name]["resolution"]],
         "rostopic": f"/{name}/image_raw",
-        "timeshift_cam_imu": float(c.group(name, "time_offset").value[0]),
+        **({} if c.imu is None else {"timeshift_cam_imu": float(c.group(name, "time_offset").value[0])}),
     }
 
 

@@ -3,68 +3,36 @@ used."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.imu_data import ImuData
+from icalib.estimation.imu_data import ImuData, imu_data
 from icalib.first_guess.clocks import Alignment, align, camera_rates, check_axes
+from icalib.first_guess.guess import CameraGuess, Guess, relative_offset
 from icalib.first_guess.gyro import GyroRotation
 from icalib.first_guess.intrinsics import guess_intrinsics
 from icalib.first_guess.lever_arm import LeverArm, check_gravity, check_size, lever_arm
 from icalib.first_guess.target_poses import TargetPoses, target_poses
+from icalib.first_guess.without_imu import guess_without_imu, trajectory_without_imu
 from icalib.geometry.cameras import camera_model
 from icalib.measurements import CornerStream, Measurements
 from icalib.rig import Camera, Parameter, Rig
 
+__all__ = ["CameraGuess", "Guess", "initial_guess", "initial_trajectory"]
+
 VELOCITY_STEP_S = 0.04
-
-
-@dataclass(frozen=True)
-class CameraGuess:
-    """params (P,); offset: t_imu - t_cam, each since its clock's first stamp [s]; T_imu_cam; poses in the board
-    frame."""
-
-    params: np.ndarray
-    offset: float
-    rotation: np.ndarray
-    position: np.ndarray
-    poses: TargetPoses
-
-
-@dataclass(frozen=True)
-class Guess:
-    """Where the solver starts. R_world_board: world z is up, its origin the board's; its x axis horizontal in the
-    board."""
-
-    cameras: dict[str, CameraGuess]
-    gyro_bias: np.ndarray
-    accel_bias: np.ndarray
-    R_world_board: np.ndarray
-
-    def values(self) -> dict[tuple[str, str], np.ndarray]:
-        """The lasting parameters by sensor and name."""
-        out: dict[tuple[str, str], np.ndarray] = {("board0", "tilt"): self.R_world_board}
-        for name, c in self.cameras.items():
-            out[name, "rotation"], out[name, "translation"] = c.rotation, c.position
-            out[name, "time_offset"] = np.array([c.offset])
-            out[name, "intrinsics"], out[name, "distortion"] = c.params[:4], c.params[4:]
-        return out
-
-    def biases(self, n: int) -> np.ndarray:
-        """(n, 6) the biases, the same at all nodes."""
-        return np.tile(np.concatenate([self.gyro_bias, self.accel_bias]), (n, 1))
 
 
 def initial_guess(rig: Rig, measurements: Measurements) -> Guess:
     """Raises EstimationError, one sentence, where the recording does not carry a guess."""
-    imu = ImuData.build(measurements.imu, rig.imu.noise)
     params = [_params(c, s, rig) for c, s in zip(rig.cameras, measurements.cameras, strict=True)]
     poses = [
         target_poses(s, camera_model(c.model), p, rig.target.points)
         for c, s, p in zip(rig.cameras, measurements.cameras, params, strict=True)
     ]
+    imu = imu_data(rig, measurements)
+    if imu is None:
+        return guess_without_imu(rig, measurements, params, poses)
     aligned = [
         _align(c, s, q, imu, measurements) for c, s, q in zip(rig.cameras, measurements.cameras, poses, strict=True)
     ]
@@ -76,7 +44,7 @@ def initial_guess(rig: Rig, measurements: Measurements) -> Guess:
         for c, s, q, a in zip(rig.cameras, measurements.cameras, poses, aligned, strict=True)
     ]
     gravity = arms[best].gravity
-    check_gravity(float(np.linalg.norm(gravity)), rig.gravity, rig.imu.name)
+    check_gravity(float(np.linalg.norm(gravity)), rig.gravity, imu.name)
     for c, m in zip(rig.cameras, arms, strict=True):
         check_size(m, c.name)
     cameras = {
@@ -103,24 +71,20 @@ def _trusted(parameter: Parameter) -> np.ndarray | None:
     return None if parameter.mode == "free" else parameter.value
 
 
-def _relative_offset(value: np.ndarray, stream: CornerStream, measurements: Measurements) -> float:
-    return float(value[0]) + (stream.origin_ns - measurements.imu.origin_ns) * 1e-9
-
-
 def _align(
     camera: Camera, stream: CornerStream, poses: TargetPoses, imu: ImuData, measurements: Measurements
 ) -> Alignment:
     rates = camera_rates(stream, poses)
     given, trusted = camera.time_offset.value, _trusted(camera.time_offset)
     if trusted is not None:
-        found = align(imu, camera.name, rates, _relative_offset(trusted, stream, measurements))
+        found = align(imu, camera.name, rates, relative_offset(trusted, stream, measurements))
     else:
         try:
             found = align(imu, camera.name, rates, None)
         except EstimationError:
             if given is None:
                 raise
-            found = align(imu, camera.name, rates, _relative_offset(given, stream, measurements))
+            found = align(imu, camera.name, rates, relative_offset(given, stream, measurements))
     rotation = _trusted(camera.rotation)
     if rotation is None:
         check_axes(rates, camera.name)
@@ -140,7 +104,7 @@ def _camera_guess(
     offset, R, p = camera.time_offset.value, camera.rotation.value, camera.translation.value
     return CameraGuess(
         params,
-        aligned.offset if offset is None else _relative_offset(offset, stream, measurements),
+        aligned.offset if offset is None else relative_offset(offset, stream, measurements),
         aligned.rotation if R is None else R,
         arm.position if p is None else p,
         poses,
@@ -167,19 +131,10 @@ def initial_trajectory(
 
     From the nearest camera pose, rotation carried by the gyroscope, position interpolated.
     """
-    imu = ImuData.build(measurements.imu, rig.imu.noise)
-    times, rotations, positions = [], [], []
-    for stream in measurements.cameras:
-        c = guess.cameras[stream.name]
-        ok = c.poses.ok
-        R_bi = c.poses.rotation[ok] @ c.rotation.T
-        times.append(stream.seconds[ok] + c.offset)
-        rotations.append(guess.R_world_board @ R_bi)
-        positions.append((c.poses.position[ok] - R_bi @ c.position) @ guess.R_world_board.T)
-    t = np.concatenate(times)
-    order = np.argsort(t, kind="stable")
-    order = order[np.diff(t[order], prepend=-np.inf) > 1e-4]
-    t, R, p = t[order], np.concatenate(rotations)[order], np.concatenate(positions)[order]
+    imu = imu_data(rig, measurements)
+    if imu is None:
+        return trajectory_without_imu(guess, measurements, nodes)
+    t, R, p = guess.body_poses(measurements)
 
     def position(s: np.ndarray) -> np.ndarray:
         return np.stack([np.interp(s, t, p[:, k]) for k in range(3)], axis=1)

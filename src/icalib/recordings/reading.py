@@ -26,7 +26,9 @@ def read_measurements(recording: Recording, rig: Rig, find: FindCorners = tables
     What was dropped or looks odd stands in the notes. Raises RecordingError, one sentence naming the file and the line
     or instant, for data that are missing, unreadable, out of order, in other units, or not of this rig.
     """
-    imu, notes = checked_imu(recording.imu(rig.imu), recording.where(rig.imu))
+    imu, notes = None, ()
+    if rig.imu is not None:
+        imu, notes = checked_imu(recording.imu(rig.imu), recording.where(rig.imu))
     pictured = [c for c in rig.cameras if not recording.has_corners(c)]
     image_topics(recording, pictured)
     cameras: list[CornerStream] = []

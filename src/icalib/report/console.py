@@ -27,6 +27,7 @@ def table(calibration: Calibration) -> Table:
 
 
 def _caption(calibration: Calibration) -> str:
-    text = "T_imu_sensor; rotation: std about the sensor's axes; t_imu = t_sensor + time offset."
+    body = "imu" if calibration.imu else calibration.body
+    text = f"T_{body}_sensor; rotation: std about the sensor's axes; t_{body} = t_sensor + time offset."
     scaled = any(g.columns is not None and g.factor is not None for g in calibration.groups)
     return text + (" std includes the empirical factor." if scaled else " std is formal: the recording was not split.")

@@ -21,8 +21,9 @@ def report_html(calibration: Calibration) -> str:
     figures = _figures(c)
     trust = tables.trust(c)
     words = {
-        "sensors": " + ".join((c.imu, *c.cameras)),
+        "sensors": " + ".join((*(() if c.imu is None else (c.imu,)), *c.cameras)),
         "size": tables.size_words(c),
+        "body": "imu" if c.imu else c.body,
         "status": c.status,
         "answer": tables.TRUST[trust],
         "most_dots": corner_figures.MOST_DOTS,
@@ -41,6 +42,7 @@ def report_html(calibration: Calibration) -> str:
         "facts": tables.facts(c),
         "figures": _script_json(figures),
         "css": _resource("icalib.report", "page.css"),
+        "without_imu": "" if c.imu else " hidden",
         "plotly": _resource("plotly", "package_data/plotly.min.js"),
     }
     escaped = {name: tables.html(value) for name, value in words.items()}
@@ -58,6 +60,8 @@ def _figures(c: Calibration) -> dict[str, Figure]:
         "convergence": motion_figures.convergence(c),
         "correlation": rig_figures.correlation(c),
     }
+    if c.imu is None:
+        del found["imu-residuals"], found["motion"]
     for i, r in enumerate(c.corner_residuals):
         width, height = c.rig["sensors"][r.sensor]["resolution"]
         found[f"plane-{i}"] = corner_figures.residual_plane(r)

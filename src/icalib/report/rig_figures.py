@@ -14,7 +14,7 @@ def rig_picture(c: Calibration) -> Figure:
     """Frames of all sensors and the cameras' fields of view, in the imu frame."""
     positions = np.array([c.T_imu_sensor(name)[:3, 3] for name in c.cameras])
     spread = max(np.ptp(np.vstack([positions, np.zeros(3)]), axis=0).max(), 0.02)
-    frames = {c.imu: np.eye(4)} | {name: c.T_imu_sensor(name) for name in c.cameras}
+    frames = {c.body: np.eye(4)} | {name: c.T_imu_sensor(name) for name in c.cameras}
     traces = [
         path_3d(
             _axis_line(frames, i, 0.25 * spread), "xyz"[i], AXIS_COLORS[i], line={"color": AXIS_COLORS[i], "width": 6}
@@ -37,7 +37,7 @@ def rig_picture(c: Calibration) -> Figure:
         )
     )
     scene = {
-        name: {"title": {"text": f"{name[0]} of {c.imu} [m]"}, "nticks": 5} for name in ("xaxis", "yaxis", "zaxis")
+        name: {"title": {"text": f"{name[0]} of {c.body} [m]"}, "nticks": 5} for name in ("xaxis", "yaxis", "zaxis")
     }
     return figure(traces, 520, scene=scene | VIEW, margin={"l": 0, "r": 0, "t": 30, "b": 0})
 

@@ -108,7 +108,7 @@ def poses(c: Calibration) -> Html:
     blocks = []
     for name in c.cameras:
         lines = "\n".join("[" + ", ".join(f"{x: .9f}" for x in row) + "]" for row in c.T_imu_sensor(name))
-        blocks.append(element("figure", [element("figcaption", f"T_{c.imu}_{name}"), element("pre", lines)]))
+        blocks.append(element("figure", [element("figcaption", f"T_{c.body}_{name}"), element("pre", lines)]))
     return element("div", blocks, "grid")
 
 
