@@ -99,11 +99,10 @@ def _metres(text: str) -> float:
 
 
 def _print_target(options: argparse.Namespace) -> None:
-    from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Tag
+    from icalib.geometry.targets import TARGETS
     from icalib.printing import write_target
 
-    kinds = {kind.type: kind for kind in (AprilGrid, Charuco, Checkerboard, Tag)}
-    target = kinds[options.type](**{field: getattr(options, field) for field in options.fields})
+    target = TARGETS[options.type](**{field: getattr(options, field) for field in options.fields})
     write_target(options.output, target, options.paper, getattr(options, "border_bits", None))
     print(f"{options.output}: print at 100 %, and measure the ruler.")
 

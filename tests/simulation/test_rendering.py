@@ -203,6 +203,7 @@ def test_motion_blur_is_the_mean_over_the_poses():
 
 
 def test_points_are_where_the_simulated_corners_are():
+    pytest.importorskip("cv2")
     scenario = handheld(0.5, noiseless=True)
     simulation = simulate(scenario, 0)
     camera, stream = scenario.cameras[0], simulation.measurements.cameras[0]
