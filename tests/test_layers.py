@@ -26,6 +26,7 @@ LEVELS = {
     "recordings": 2,
     "detection": 3,
     "simulation": 2,
+    "printing": 2,
     "estimation": 3,
     "first_guess": 4,
     "observability": 6,

@@ -41,7 +41,70 @@ def _parser() -> argparse.ArgumentParser:
     c.add_argument("--splits", type=int, metavar="N", help="segments for the empirical factor; 0: none")
     c.add_argument("--quiet", "-q", action="store_true", help="no progress bar and no table")
     c.set_defaults(run=_calibrate)
+    _add_target(commands)
     return parser
+
+
+def _add_target(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """`icalib target TYPE`: its options are the fields of the rig file's target."""
+    from icalib.printing import PAPERS
+
+    t = commands.add_parser("target", help="print a target to PDF, at true scale")
+    types = t.add_subparsers(required=True, metavar="TYPE", dest="type")
+    fields = {
+        "aprilgrid": {"rows": _count, "cols": _count, "tag_size": _metres, "tag_spacing": _metres},
+        "charuco": {
+            "squares_x": _count, "squares_y": _count, "square_size": _metres, "marker_size": _metres, "dictionary": str
+        },
+        "checkerboard": {"rows": _count, "cols": _count, "square_size": _metres},
+        "tag": {"family": str, "id": _whole, "size": _metres},
+    }  # fmt: skip
+    for name, options in fields.items():
+        one = types.add_parser(name, help=f"{name}, with the fields of the rig file")
+        for field, kind in options.items():
+            unit = {_metres: "METRES", _count: "N", _whole: "N"}.get(kind, "NAME")
+            one.add_argument(
+                f"--{field.replace('_', '-')}",
+                type=kind,
+                required=True,
+                metavar="RATIO" if "spacing" in field else unit,
+            )
+        if name != "checkerboard":
+            one.add_argument("--border-bits", type=_count, metavar="N", help="width of the tags' black border")
+        one.add_argument("--paper", choices=tuple(PAPERS), default="a4")
+        one.add_argument("--output", "-o", type=Path, required=True, metavar="FILE.pdf")
+        one.set_defaults(run=_print_target, fields=tuple(options))
+
+
+def _whole(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"must be a whole number, but is {text!r}")
+    return int(text)
+
+
+def _count(text: str) -> int:
+    if _whole(text) == 0:
+        raise argparse.ArgumentTypeError("must be at least 1, but is 0")
+    return int(text)
+
+
+def _metres(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"must be a number above 0, but is {text!r}")
+    return value
+
+
+def _print_target(options: argparse.Namespace) -> None:
+    from icalib.geometry.targets import TARGETS
+    from icalib.printing import write_target
+
+    target = TARGETS[options.type](**{field: getattr(options, field) for field in options.fields})
+    write_target(options.output, target, options.paper, getattr(options, "border_bits", None))
+    print(f"{options.output}: print at 100 %, and measure the ruler.")
 
 
 def _calibrate(options: argparse.Namespace) -> None:

@@ -114,7 +114,7 @@ def test_edges_are_where_they_truly_are(camera: SimCamera, blur: float, shift: f
     grey = Renderer(camera, replace(SHARP, blur_px=blur)).picture([half()], pose).grey
     rows = slice(8, 112)  # beyond them the blur brings in what the edge does outside
     black = (1.0 - grey[rows]).sum(axis=1) - 0.5
-    np.testing.assert_allclose(black, edge_by_rows(camera, pose)[rows], atol=2e-3 if blur else 5e-4)
+    np.testing.assert_allclose(black, edge_by_rows(camera, pose)[rows], atol=5e-4)
 
 
 @pytest.mark.parametrize("phase", [0.0, 0.2, 0.5, 0.77])
@@ -203,6 +203,7 @@ def test_motion_blur_is_the_mean_over_the_poses():
 
 
 def test_points_are_where_the_simulated_corners_are():
+    pytest.importorskip("cv2")
     scenario = handheld(0.5, noiseless=True)
     simulation = simulate(scenario, 0)
     camera, stream = scenario.cameras[0], simulation.measurements.cameras[0]

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.first_guess.target_poses import target_poses
+from icalib.first_guess.target_poses import TargetPoses, target_poses
 from icalib.geometry import so3
 from icalib.geometry.cameras.base import CameraModel
 from icalib.measurements import CornerStream
 
 TRIAL_IMAGES = 24
 BUNDLE_IMAGES = 48
+JUDGE_IMAGES = 300  # to tell valleys apart that differ by far less than the noise
 FOCAL_TRIALS = np.geomspace(0.1, 3.0, 35)  # of the image width: 19 degrees for a pinhole, all round for a fisheye
 ROUNDS = 25
 HUBER_PX = 1.5
@@ -27,17 +29,9 @@ def guess_intrinsics(
 
     given (P,): values that are held, NaN for those to be found.
     """
-    trial, bundle = _spread_images(stream, TRIAL_IMAGES), _spread_images(stream, BUNDLE_IMAGES)
-    least, params = np.inf, np.where(np.isnan(given), 0.0, given)
-    # A model of two shape parameters can settle in the wrong valley; the right one costs less.
-    for starts in _starts(model, resolution, given):
-        medians = [np.median(target_poses(trial, model, start, target).rms_px) for start in starts]
-        try:
-            found, cost = _fit(bundle, model, starts[int(np.argmin(medians))], target, np.isnan(given))
-        except np.linalg.LinAlgError:
-            continue
-        if cost < least:
-            least, params = cost, found
+    bundle = _spread_images(stream, BUNDLE_IMAGES)
+    candidates = _candidates(stream, bundle, model, _starts(model, resolution, given), target, np.isnan(given))
+    params = _cheapest(_spread_images(stream, JUDGE_IMAGES), model, candidates, target, np.flatnonzero(np.isnan(given)))
     rms = float(np.median(target_poses(bundle, model, params, target).rms_px))
     if not rms < GOOD_RMS_PX:
         raise EstimationError(
@@ -45,6 +39,54 @@ def guess_intrinsics(
             "check the model, resolution and target in the rig file, or give intrinsics."
         )
     return params
+
+
+def _candidates(
+    stream: CornerStream,
+    bundle: CornerStream,
+    model: CameraModel,
+    kinds: Iterator[np.ndarray],
+    target: np.ndarray,
+    wanted: np.ndarray,
+) -> list[np.ndarray]:
+    """Parameters (P,) that a bundle adjustment of those `wanted` (P,) finds from each kind of lens, started at its best
+    focal length; those that are nearly the same, once."""
+    trial, found = _spread_images(stream, TRIAL_IMAGES), []
+    for starts in kinds:
+        medians = [np.median(target_poses(trial, model, start, target).rms_px) for start in starts]
+        with suppress(np.linalg.LinAlgError):
+            # Focal length and the strongest distortion first; the rest only once these are near.
+            params = starts[int(np.argmin(medians))]
+            for stage in (np.array([0, 1, 4]), np.arange(len(params))):
+                if wanted[stage].any():
+                    params, _ = _bundle(bundle, model, params, target, stage[wanted[stage]])
+            if not any(np.allclose(params, other, rtol=1e-2, atol=1e-3) for other in found):
+                found.append(params)
+    return found
+
+
+def _cheapest(
+    stream: CornerStream, model: CameraModel, found: list[np.ndarray], target: np.ndarray, free: np.ndarray
+) -> np.ndarray:
+    """The candidate that costs least: a model of two shape parameters can settle in the wrong valley.
+
+    The difference is small against the noise, so all are judged on the same images. Zeros where there is none.
+    """
+    if len(found) <= 1:
+        return found[0] if found else np.zeros(len(model.parameter_names))
+    used = np.all([_used(target_poses(stream, model, p, target)) for p in found], axis=0)
+    least, best = np.inf, found[0]
+    for params in found:
+        with suppress(np.linalg.LinAlgError):
+            params, cost = _bundle(stream, model, params, target, free, used)
+            if cost < least:
+                least, best = cost, params
+    return best
+
+
+def _used(poses: TargetPoses) -> np.ndarray:
+    """(M,) bool: images whose pose is worth starting from."""
+    return poses.rms_px < np.maximum(4.0 * np.median(poses.rms_px), 1.0)
 
 
 def _starts(model: CameraModel, resolution: tuple[int, int], given: np.ndarray) -> Iterator[np.ndarray]:
@@ -59,21 +101,9 @@ def _starts(model: CameraModel, resolution: tuple[int, int], given: np.ndarray) 
         starts = np.tile(params, (len(FOCAL_TRIALS), 1))
         starts[:, :2] = FOCAL_TRIALS[:, None] * width / j_point[0, 0, 0]
         starts = np.where(np.isnan(given), starts, given)
-        yield starts[:1] if not np.isnan(given[:2]).any() else starts
+        yield starts if np.isnan(given[:2]).any() else starts[:1]
         if not np.isnan(given[4:]).any():
             return
-
-
-def _fit(
-    bundle: CornerStream, model: CameraModel, params: np.ndarray, target: np.ndarray, wanted: np.ndarray
-) -> tuple[np.ndarray, float]:
-    """Parameters and cost after fitting those `wanted` (P,): focal length and the strongest distortion first, the rest
-    only once these are near."""
-    cost = np.inf
-    for stage in (np.array([0, 1, 4]), np.arange(len(params))):
-        if wanted[stage].any():
-            params, cost = _bundle(bundle, model, params, target, stage[wanted[stage]])
-    return params, cost
 
 
 def _spread_images(stream: CornerStream, wanted: int) -> CornerStream:
@@ -87,15 +117,21 @@ def _spread_images(stream: CornerStream, wanted: int) -> CornerStream:
 
 
 def _bundle(
-    stream: CornerStream, model: CameraModel, params: np.ndarray, target: np.ndarray, free: np.ndarray
+    stream: CornerStream,
+    model: CameraModel,
+    params: np.ndarray,
+    target: np.ndarray,
+    free: np.ndarray,
+    used: np.ndarray | None = None,
 ) -> tuple[np.ndarray, float]:
     """Levenberg-Marquardt over the `free` parameters and all poses, each image's pose eliminated.
 
-    Returns the parameters (P,) and the robust cost of an image in the mean.
+    used (M,) bool: the images, by default those whose pose is worth starting from. Returns the parameters (P,) and the
+    robust cost.
     """
     poses = target_poses(stream, model, params, target)
     R, p, damping = poses.rotation, poses.position, 1e-3
-    used = poses.rms_px < np.maximum(4.0 * np.median(poses.rms_px), 1.0)
+    used = _used(poses) if used is None else used
     cost, S, g, parts = _sums(stream, model, params, target, free, R, p, used)
     for _ in range(ROUNDS):
         step = -np.linalg.solve(S + damping * np.diag(np.diag(S)), g)
@@ -116,7 +152,7 @@ def _bundle(
             damping *= 10.0
             if damping > 1e6:
                 break
-    return params, cost / max(int(used.sum()), 1)
+    return params, cost
 
 
 def _sums(stream, model, params, target, free, R, p, used):

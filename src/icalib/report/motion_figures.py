@@ -6,6 +6,7 @@ import numpy as np
 
 from icalib.calibration import Calibration
 from icalib.geometry import so3
+from icalib.geometry.targets import TARGETS
 from icalib.report.plot import (
     AXIS_COLORS,
     COLORS,
@@ -70,14 +71,15 @@ def trajectory(c: Calibration) -> Figure:
 
 def _board(c: Calibration) -> list[dict]:
     """Outline of the target where its attitude is known."""
-    target = c.rig.get("target", {})
+    fields = dict(c.rig.get("target", {}))
     attitude = [g for g in c.groups if g.sensor not in c.rig["sensors"] and g.value.shape == (3, 3)]
-    if not attitude or "tag_size" not in target:
+    kind = TARGETS.get(fields.pop("type", ""))
+    if not attitude or kind is None:
         return []
-    pitch = target["tag_size"] * (1.0 + target["tag_spacing"])
-    gap = target["tag_size"] * target["tag_spacing"]
-    x, y = target["cols"] * pitch - gap, target["rows"] * pitch - gap
-    outline = np.array([(0, 0, 0), (x, 0, 0), (x, y, 0), (0, y, 0), (0, 0, 0)]) @ attitude[0].value.T
+    points = kind(**fields).points
+    (x0, y0, _), (x, y, _) = points.min(axis=0), points.max(axis=0)
+    corners = [(x0, y0, 0.0), (x, y0, 0.0), (x, y, 0.0), (x0, y, 0.0), (x0, y0, 0.0)]
+    outline = np.array(corners) @ attitude[0].value.T
     return [path_3d(outline, attitude[0].sensor, "#be185d")]
 
 

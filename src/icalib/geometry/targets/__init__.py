@@ -8,4 +8,6 @@ from icalib.geometry.targets.charuco import Charuco
 from icalib.geometry.targets.checkerboard import Checkerboard
 from icalib.geometry.targets.tag import Tag
 
-__all__ = ["AprilGrid", "Charuco", "Checkerboard", "Tag", "Target"]
+__all__ = ["TARGETS", "AprilGrid", "Charuco", "Checkerboard", "Tag", "Target"]
+
+TARGETS: dict[str, type[Target]] = {kind.type: kind for kind in (AprilGrid, Charuco, Checkerboard, Tag)}

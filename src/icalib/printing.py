@@ -1,0 +1,115 @@
+"""Targets on paper: PDF at true scale, in vectors, with the rig file's line for it and a ruler to check the print."""
+
+from __future__ import annotations
+
+import dataclasses
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+from icalib.errors import CalibrationError, RigError
+from icalib.geometry.targets import Tag, Target
+from icalib.geometry.targets.pattern import Pattern, pattern_of
+
+# Width and height [mm], upright; smallest first.
+PAPERS = {
+    "a4": (210.0, 297.0),
+    "letter": (215.9, 279.4),
+    "a3": (297.0, 420.0),
+    "a2": (420.0, 594.0),
+    "a1": (594.0, 841.0),
+    "a0": (841.0, 1189.0),
+}
+EDGE_MM = 8.0  # that printers leave white
+FOOT_MM = 16.0  # for text and ruler, below the target
+RULER_MM = 100.0
+_POINTS = 72.0 / 25.4  # a millimetre
+_FONT, _FONT_POINTS = "Helvetica", 7.5
+
+
+def write_target(path: str | Path, target: Target, paper: str = "a4", border_bits: int | None = None) -> None:
+    """Writes `target_pdf` to `path`. Raises as it does, and CalibrationError where the file cannot be written."""
+    data = target_pdf(target, paper, border_bits)
+    try:
+        Path(path).write_bytes(data)
+    except OSError as error:
+        raise CalibrationError(
+            f"{path} cannot be written ({error.strerror or error}); give the path of a file in a folder that exists."
+        ) from error
+
+
+def target_pdf(target: Target, paper: str = "a4", border_bits: int | None = None) -> bytes:
+    """A page with `target`, upright or on its side as it fits; border_bits as in `pattern_of`.
+
+    Raises RigError where the paper is unknown or too small, CalibrationError where reportlab, or OpenCV for tags, is
+    not installed.
+    """
+    if paper not in PAPERS:
+        raise RigError(f"there is no paper {paper!r}; available are {', '.join(PAPERS)}.")
+    pattern = pattern_of(target, border_bits)
+    width, height = page_mm(pattern, paper)
+    page = _canvas(width, height)
+    page.setTitle(f"{target.type} target, print at 100 %")
+    size_x, size_y = _size_mm(pattern)
+    left, bottom = 0.5 * (width - size_x), EDGE_MM + FOOT_MM + 0.5 * (height - 2.0 * EDGE_MM - FOOT_MM - size_y)
+    # One path: edges that boxes share would show as hairlines between several.
+    path = page.beginPath()
+    for x0, y0, x1, y1 in 1e3 * pattern.black_boxes():
+        x, y = left + x0 - 1e3 * pattern.x[0], bottom + y0 - 1e3 * pattern.y[0]
+        path.rect(*(_POINTS * side for side in (x, y, x1 - x0, y1 - y0)))
+    page.drawPath(path, stroke=0, fill=1, fillMode=1)  # non-zero: rounded edges that overlap stay black
+    _foot(page, target, border_bits)
+    page.showPage()
+    return page.getpdfdata()
+
+
+def page_mm(pattern: Pattern, paper: str) -> tuple[float, float]:
+    """Width and height of the page [mm], turned so that the pattern fits. Raises RigError where it does not."""
+    size = _size_mm(pattern)
+    for width, height in (PAPERS[paper], PAPERS[paper][::-1]):
+        if _fits(size, width, height):
+            return width, height
+    larger = [p for p, (w, h) in PAPERS.items() if _fits(size, w, h) or _fits(size, h, w)]
+    rooms = [(w - 2.0 * EDGE_MM, h - 2.0 * EDGE_MM - FOOT_MM) for w, h in (PAPERS[paper], PAPERS[paper][::-1])]
+    raise RigError(
+        f"the target is {size[0]:.0f} x {size[1]:.0f} mm, and {paper} has room for {rooms[0][0]:.0f} x "
+        f"{rooms[0][1]:.0f} mm, on its side for {rooms[1][0]:.0f} x {rooms[1][1]:.0f} mm; "
+        + (f"choose {larger[0]}, or make the target smaller." if larger else "make the target smaller.")
+    )
+
+
+def _size_mm(pattern: Pattern) -> tuple[float, float]:
+    return 1e3 * float(pattern.x[-1] - pattern.x[0]), 1e3 * float(pattern.y[-1] - pattern.y[0])
+
+
+def _fits(size: tuple[float, float], width: float, height: float) -> bool:
+    return size[0] <= width - 2.0 * EDGE_MM and size[1] <= height - 2.0 * EDGE_MM - FOOT_MM
+
+
+def _canvas(width: float, height: float) -> Any:
+    try:
+        from reportlab.pdfgen.canvas import Canvas
+    except ImportError:
+        raise CalibrationError("PDF is made by reportlab, which is not installed; install icalib[print].") from None
+    # invariant: no date inside, so that the same target gives the same file.
+    return Canvas(BytesIO(), pagesize=(_POINTS * width, _POINTS * height), pageCompression=0, invariant=1)
+
+
+def _foot(page: Any, target: Target, border_bits: int | None) -> None:
+    """What the rig file must say, how to print, and the ruler; from the top down, at the left."""
+    fields = {"type": target.type} | dataclasses.asdict(target)
+    head = "" if isinstance(target, Tag) else "target: "  # a tag alone is no target of a rig file
+    border = "" if border_bits is None else f", tags with a border of {border_bits} bits"
+    page.setFont(_FONT, _FONT_POINTS)
+    lines = (
+        f"{head}{{{', '.join(f'{name}: {value}' for name, value in fields.items())}}}",
+        f"icalib, sizes in metres{border}. Print at 100 %, unscaled; the ruler must measure {RULER_MM:.0f} mm.",
+    )
+    for i, text in enumerate(lines):
+        page.drawString(_POINTS * EDGE_MM, _POINTS * (EDGE_MM + FOOT_MM - 6.0 - 3.5 * i), text)
+    page.setLineWidth(0.15 * _POINTS)
+    page.line(*(_POINTS * side for side in (EDGE_MM, EDGE_MM, EDGE_MM + RULER_MM, EDGE_MM)))
+    for tick in range(11):
+        x = EDGE_MM + 0.1 * RULER_MM * tick
+        page.line(*(_POINTS * side for side in (x, EDGE_MM, x, EDGE_MM + (3.0 if tick % 5 == 0 else 1.8))))
+    page.drawString(_POINTS * (EDGE_MM + RULER_MM + 1.5), _POINTS * EDGE_MM, f"{RULER_MM:.0f} mm")
