@@ -17,7 +17,7 @@ _MOST_MOVE_PX = 2.0
 _LEAST_STRIP_PX, _MOST_STRIP_PX = 1.5, 4.0  # fitted on each side of an edge
 _STRIP_BLURS = 2.25  # how far, in blurs, the strip along an edge keeps away from other features
 _BLUR_STRIP_PX = 2.5  # fitted on each side of an edge where only the blur is wanted
-_LEAST_INSET_PX = 0.75  # as LEAST_WINDOW_PX, for features that lie in the fields of an X-corner
+_LEAST_INSET_PX = (1.0, 0.5)  # as LEAST_WINDOW_PX, for features that lie in the dark and in the white fields
 _USUAL_BLUR = 0.7  # px, before it is measured
 
 
@@ -83,8 +83,7 @@ def refined_crossings(image, quads, surroundings):
     needs [px]; shorter side [px].
     """
     uv, quality = np.empty(quads.shape), np.empty((5, len(quads), 4))
-    inset = min(surroundings[1], surroundings[2])
-    blur = _measured_blurs(image, quads, min(surroundings[0], inset) * _shapes(quads, quality))
+    blur = _measured_blurs(image, quads, surroundings.min() * _shapes(quads, quality))
     for i in range(len(quads)):
         quality[1, i] = blur[i].max()
         for k in range(4):
@@ -95,7 +94,9 @@ def refined_crossings(image, quads, surroundings):
             )
             uv[i, k, 0], uv[i, k, 1] = u, v
             quality[0, i, k] = sigma if contrast >= LEAST_CONTRAST else np.nan
-    room = np.minimum(surroundings[0] * quality[3] - LEAST_WINDOW_PX, inset * quality[3] - _LEAST_INSET_PX)
+    room = surroundings[0] * quality[3] - LEAST_WINDOW_PX
+    for k in range(2):
+        room = np.minimum(room, surroundings[1 + k] * quality[3] - _LEAST_INSET_PX[k])
     quality[3] = room - MARGIN_BLURS * quality[1]
     return uv, quality
 
