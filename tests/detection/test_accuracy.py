@@ -58,7 +58,7 @@ TARGETS = {
         ALL | {"cut": 0.5},
     ),
 }
-IMAGES = 3
+IMAGES = 2
 
 
 @pytest.mark.parametrize("pose", POSES)
