@@ -109,7 +109,7 @@ def test_sides_of_a_bent_quad_meet_in_its_corners():
         grey = grey * 0.5 * (1.0 + erf(d / np.sqrt(2.0)))
     image = 200.0 - 160.0 * grey
     quad = np.array([(20.4, 19.7), (80.3, 20.2), (79.8, 80.4), (19.6, 79.9)])
-    corners, sigma, blur = fit_corners(image, quad, 4.0)
+    corners, sigma, blur = fit_corners(image, quad, 3.0, 4.0)
     np.testing.assert_allclose(corners, [(20, 20), (80, 20), (80, 80), (20, 80)], atol=0.01)
     np.testing.assert_allclose(blur, 1.0, rtol=0.02)
     assert (sigma > 0.0).all()
