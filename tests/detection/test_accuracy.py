@@ -113,3 +113,15 @@ def test_more_blur_means_larger_sigma_and_blur(rendering):
     # A pixel adds the blur of its own width, 1 / sqrt(12).
     expected = np.sqrt(np.array([0.7, 1.2, 2.0]) ** 2 + 1.0 / 12.0)
     np.testing.assert_allclose([np.median(one.blur) for one in found], expected, rtol=0.05)
+
+
+@pytest.mark.parametrize("gamma", [0.45, 2.2])
+def test_x_corners_stay_whatever_the_response_to_light(rendering, gamma):
+    pattern = rendering.aprilgrid(6, 6)
+    H = rendering.homography(pattern, *POSES["tilted"])
+    image = 255.0 * (rendering.render(pattern, H, 0.9, noise=0.0) / 255.0) ** gamma
+    found = AprilGridDetector(6, 6, 0.3).detect(np.round(image).astype(np.uint8))
+    errors = rendering.errors(pattern, H, found.point[found.kept], found.uv[found.kept])
+    assert len(errors.uv) > 135
+    assert abs(errors.inward.mean()) < 0.03
+    assert errors.rms < 0.04

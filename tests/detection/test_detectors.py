@@ -18,7 +18,7 @@ from icalib.detection import (
 )
 from icalib.detection.corners import judged
 from icalib.detection.families import tag_family
-from icalib.detection.opencv import FAMILIES, opencv
+from icalib.detection.opencv import FAMILIES, dictionary, opencv
 from icalib.errors import RecordingError
 
 cv2 = pytest.importorskip("cv2")
@@ -151,6 +151,12 @@ def test_without_opencv_the_extra_is_named(monkeypatch):
     monkeypatch.setattr(importlib, "import_module", absent)
     with pytest.raises(RecordingError, match=r"not installed; run `pip install icalib\[images\]`\."):
         opencv()
+
+
+def test_a_family_that_an_old_opencv_lacks_is_refused(monkeypatch):
+    monkeypatch.delattr(cv2.aruco, "DICT_ARUCO_MIP_36h12")
+    with pytest.raises(RecordingError, match="has no tags of aruco_mip_36h12; update opencv-python-headless"):
+        dictionary("aruco_mip_36h12")
 
 
 @pytest.mark.parametrize("name", FAMILIES)

@@ -10,7 +10,7 @@ import numpy as np
 
 from icalib.detection.corners import checked_image
 from icalib.detection.families import tag_family
-from icalib.detection.opencv import FAMILIES
+from icalib.detection.opencv import FAMILIES, is_available
 from icalib.detection.quads import dark_quads, threshold_windows
 from icalib.detection.tags import tags_at
 
@@ -51,14 +51,15 @@ def what_is_seen(images: Iterable[np.ndarray], family: str, border_bits: int, id
 def _candidates(images: list[np.ndarray]) -> list[_Seen]:
     """What each family and border finds, where it is more than chance."""
     found: dict[tuple[str, int, bool], list[np.ndarray]] = {}
+    tried = [name for name in _TRIED if is_available(name)]
     for image, mirrored in product(images, (False, True)):
         view = np.ascontiguousarray(image[:, ::-1]) if mirrored else image
         windows = threshold_windows(view.shape[1])
         quads = np.concatenate([dark_quads(view, window, apart) for window in windows for apart in (True, False)])
-        for name, border in product(_TRIED, _BORDERS):
+        for name, border in product(tried, _BORDERS):
             found.setdefault((name, border, mirrored), []).append(tags_at(view, quads, tag_family(name), border).ids)
     seen = [_Seen(*key, np.concatenate(ids)) for key, ids in found.items()]
-    least = {name: _LEAST_TAGS.get(tag_family(name).bits, _LEAST_TAGS_USUALLY) for name in _TRIED}
+    least = {name: _LEAST_TAGS.get(tag_family(name).bits, _LEAST_TAGS_USUALLY) for name in tried}
     return [one for one in seen if len(one.ids) >= least[one.family]]
 
 
