@@ -50,7 +50,7 @@ def applied(H: np.ndarray, points: np.ndarray) -> np.ndarray:
     return p[:, :2] / p[:, 2:]
 
 
-@njit(cache=True)
+@njit
 def _painted(white, inverse, cell, width, height, margin, black_level, white_level, background):
     image = np.empty((height, width))
     for v in range(height):

@@ -61,8 +61,8 @@ def judged(
     """Corners with sigma and verdict, by this rule; what is named first wins.
 
     inconsistent: not where the neighbours place it. oblique: its edges meet at less than 15 degrees. blurred: the
-    nearest other feature is less than 1.5 px + 1.5 blurs away, for L-corners 1.5 px + 2.25 blurs. faint: sigma is
-    above 0.25 px.
+    nearest other feature is less than 1.5 px + 1.5 blurs away (L-corners: 1.5 px + 2.25 blurs; cells of a tag in the
+    dark field: 1 px + 1.5 blurs; markers in the white one: 0.5 px + 1.5 blurs). faint: sigma is above 0.25 px.
 
     point (N,) int64; uv (N, 2) px; quality (5, N) as `refined_crossings` gives it; consistent (N,) bool.
     """

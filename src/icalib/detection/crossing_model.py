@@ -18,6 +18,7 @@ from icalib.detection.saddles import LEAST_SINE, MARGIN_BLURS, room_for, window_
 _ITERATIONS = 12
 _CONVERGED_PX = 2e-3
 _MOST_STEP_PX = 0.7
+_MOST_WINDOW = (6.0, 4.0)  # px, and blurs: more would average the bend of a distorted edge into the corner
 LEAST_WINDOW_PX = 1.5  # half a window's width across the edges
 _SIZE = 6  # u, v, two angles, mean, contrast
 
@@ -32,20 +33,19 @@ def fit_crossing(image, u, v, ea, eb, surroundings, blur_a, blur_b, most_move):
     is the standard deviation per axis for a noise of one grey level, contrast the grey levels between dark and light.
     """
     blur = max(blur_a, blur_b)
-    sa, sb, sine = window_frame(ea, eb, surroundings[0], blur, LEAST_WINDOW_PX)
+    most = max(_MOST_WINDOW[0], _MOST_WINDOW[1] * blur)
+    sa, sb, sine = window_frame(ea, eb, surroundings[0], blur, LEAST_WINDOW_PX, most)
     room = room_for(image, u, v, ea, eb, sa, sb)
     narrow = min(sa * hypot(ea[0], ea[1]), sb * hypot(eb[0], eb[1])) * sine
-    p, start_u, start_v = np.zeros(_SIZE), u, v
     if sine < LEAST_SINE or room * narrow < 0.99 * LEAST_WINDOW_PX:
         return u, v, np.nan, 0.0
     sa, sb = room * sa, room * sb
-    p[0], p[1], p[2], p[3] = u, v, atan2(ea[1], ea[0]), atan2(eb[1], eb[0])
     margin = MARGIN_BLURS * blur / (sine * hypot(ea[0], ea[1])), MARGIN_BLURS * blur / (sine * hypot(eb[0], eb[1]))
     xs, ys, grey = _window(image, u, v, ea, eb, sa, sb, surroundings, margin)
     if len(grey) < 2 * _SIZE:
         return u, v, np.nan, 0.0
-    p[4] = grey.mean()
-    p[5] = 0.5 * (grey.max() - grey.min())
+    contrast = 0.5 * (grey.max() - grey.min())
+    p = np.array([u, v, atan2(ea[1], ea[0]), atan2(eb[1], eb[0]), grey.mean(), contrast])
     turn = 1.0 if ea[0] * eb[1] - ea[1] * eb[0] > 0.0 else -1.0
     A = np.zeros((_SIZE, _SIZE))
     for _ in range(_ITERATIONS):
@@ -53,9 +53,8 @@ def fit_crossing(image, u, v, ea, eb, surroundings, blur_a, blur_b, most_move):
         step = solve_small(A, b)
         largest = hypot(step[0], step[1])
         scale = min(1.0, _MOST_STEP_PX / max(largest, 1e-12))
-        for k in range(_SIZE):
-            p[k] += scale * step[k]
-        if hypot(p[0] - start_u, p[1] - start_v) > most_move or p[5] <= 0.0:
+        p += scale * step
+        if hypot(p[0] - u, p[1] - v) > most_move or p[5] <= 0.0:
             return u, v, np.nan, 0.0
         if largest < _CONVERGED_PX:
             return p[0], p[1], _sigma(A), 2.0 * p[5]

@@ -132,6 +132,16 @@ def levels(grey, border):
 
 
 @njit(cache=True, nogil=True)
+def dark_in_ring(grey, threshold):
+    """How many places of the ring around the tag, without its corners, are not brighter than the threshold."""
+    m, dark = len(grey) - 1, 0
+    for k in range(1, m):
+        dark += (not grey[0, k] > threshold) + (not grey[m, k] > threshold)
+        dark += (not grey[k, 0] > threshold) + (not grey[k, m] > threshold)
+    return dark
+
+
+@njit(cache=True, nogil=True)
 def _sharpened(grey, row, col):
     value, total = grey[row, col], 0.0
     total = grey[row - 1, col] + grey[row + 1, col] + grey[row, col - 1] + grey[row, col + 1]

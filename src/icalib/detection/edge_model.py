@@ -156,19 +156,19 @@ def _sine(quad, k):
 
 
 @njit(cache=True, nogil=True)
-def fit_corners(image, quad, half):
+def fit_corners(image, quad, end, half):
     """(corners (4, 2), sigma (4,), blur (4,)): the quad's corners where its fitted sides meet.
 
-    The dark quad's corners run clockwise in the image and are right to about 1 px; pixels within `half` px of its sides
-    are used. sigma is the standard deviation [px] per axis for a noise of one grey level, NaN for a corner that was
-    not found; blur [px] is the larger of the two sides'.
+    The dark quad's corners run clockwise in the image and are right to about 1 px. Pixels within `half` px of a side
+    are used, but those less than `end` px from another side. sigma is the standard deviation [px] per axis for a noise
+    of one grey level, NaN for a corner that was not found; blur [px] is the larger of the two sides'.
     """
     place, variance, side_blur = np.empty((4, 3)), np.empty((4, 2)), np.empty(4)
     for k in range(4):
         m = (k + 1) % 4
-        end = END_PX / max(min(_sine(quad, k), _sine(quad, m)), _LEAST_SINE)
+        ends = end / max(min(_sine(quad, k), _sine(quad, m)), _LEAST_SINE)
         place[k], side_blur[k], _, variance[k] = fit_step(
-            image, quad[k, 0], quad[k, 1], quad[m, 0], quad[m, 1], end, half
+            image, quad[k, 0], quad[k, 1], quad[m, 0], quad[m, 1], ends, half
         )
     corners, sigma, blur = quad.copy(), np.full(4, np.nan), np.empty(4)
     for k in range(4):

@@ -37,6 +37,27 @@ def _edge_point(image, u, v, nu, nv, reach, least):
 
 
 @njit(cache=True, nogil=True)
+def _robust_line(t, d, used, bound):
+    """(offset, slope, fits) of d = offset + slope t over the points `used`; outliers are those further than `bound`."""
+    offset, slope = np.median(d[used]), 0.0
+    for _ in range(3):
+        s, st, stt, sd, std = 0.0, 0.0, 0.0, 0.0, 0.0
+        for k in range(len(t)):
+            if used[k] and abs(d[k] - offset - slope * t[k]) < bound:
+                s += 1.0
+                st += t[k]
+                stt += t[k] * t[k]
+                sd += d[k]
+                std += t[k] * d[k]
+        det = s * stt - st * st
+        if s < 3.0 or 2.0 * s < len(t) or det <= 0.0:
+            return offset, slope, False
+        offset, slope = (stt * sd - st * std) / det, (s * std - st * sd) / det
+        bound = _OUTLIER_PX
+    return offset, slope, True
+
+
+@njit(cache=True, nogil=True)
 def fit_side(image, u0, v0, u1, v1, reach, least):
     """Line (a, b, c), a u + b v = c with (a, b) the outward normal, of the side from (u0, v0) to (u1, v1).
 
@@ -56,22 +77,9 @@ def fit_side(image, u0, v0, u1, v1, reach, least):
     used = ~np.isnan(d)
     if 2 * used.sum() < n:
         return np.nan, np.nan, np.nan
-    offset, slope = np.median(d[used]), 0.0
-    bound = max(_OUTLIER_PX, 0.5 * reach)
-    for _ in range(3):
-        s, st, stt, sd, std = 0.0, 0.0, 0.0, 0.0, 0.0
-        for k in range(n):
-            if used[k] and abs(d[k] - offset - slope * t[k]) < bound:
-                s += 1.0
-                st += t[k]
-                stt += t[k] * t[k]
-                sd += d[k]
-                std += t[k] * d[k]
-        det = s * stt - st * st
-        if s < 3.0 or 2.0 * s < n or det <= 0.0:
-            return np.nan, np.nan, np.nan
-        offset, slope = (stt * sd - st * std) / det, (s * std - st * sd) / det
-        bound = _OUTLIER_PX
+    offset, slope, fits = _robust_line(t, d, used, max(_OUTLIER_PX, 0.5 * reach))
+    if not fits:
+        return np.nan, np.nan, np.nan
     a, b = nu - slope * tu, nv - slope * tv
     norm = hypot(a, b)
     a, b = a / norm, b / norm

@@ -34,4 +34,11 @@ def dictionary(family: str) -> Any:
     if family not in _DICTIONARIES:
         raise RecordingError(f"tag family {family!r} is not known; choose one of {', '.join(FAMILIES)}.")
     aruco = opencv().aruco
+    if not is_available(family):
+        raise RecordingError(f"the installed OpenCV has no tags of {family}; update opencv-python-headless.")
     return aruco.getPredefinedDictionary(getattr(aruco, _DICTIONARIES[family]))
+
+
+def is_available(family: str) -> bool:
+    """Whether the installed OpenCV has this family of `FAMILIES`; older ones lack some."""
+    return hasattr(opencv().aruco, _DICTIONARIES[family])

@@ -11,13 +11,15 @@ from icalib.detection.crossing_model import LEAST_WINDOW_PX, fit_crossing
 from icalib.detection.edge_model import END_PX, fit_corners, fit_step
 from icalib.detection.growth import side_vectors
 from icalib.detection.saddles import MARGIN_BLURS
-from icalib.detection.tags import LEAST_CONTRAST
+from icalib.detection.tags import LEAST_CONTRAST, shortest_side
 
-_MOST_MOVE_PX = 2.0
-_LEAST_STRIP_PX, _MOST_STRIP_PX = 1.5, 4.0  # fitted on each side of an edge
+_MOST_MOVE = (2.0, 0.03)  # px, and of a side: how far a corner may lie from where it was found roughly
+_LEAST_STRIP_PX = 1.5  # fitted on each side of an edge
+_MOST_STRIP = (4.0, 3.0)  # px, and blurs: the same
 _STRIP_BLURS = 2.25  # how far, in blurs, the strip along an edge keeps away from other features
-_BLUR_STRIP_PX = 2.5  # fitted on each side of an edge where only the blur is wanted
-_LEAST_INSET_PX = 0.75  # as LEAST_WINDOW_PX, for features that lie in the fields of an X-corner
+_BLUR_STRIP = (2.5, 0.06)  # px, and of a side: fitted on each side of an edge where only the blur is wanted
+_LEAST_INSET_PX = (1.0, 0.5)  # as LEAST_WINDOW_PX, for features that lie in the dark and in the white fields
+_END_BLURS = 2.4  # left out at the ends of a side
 _USUAL_BLUR = 0.7  # px, before it is measured
 
 
@@ -39,9 +41,10 @@ def _strip(least, blur, most):
 @njit(cache=True, nogil=True)
 def _measured_blur(image, quad, k, least):
     """Blur [px] across the sides k and k + 2 of the quad, NaN where neither has an edge."""
+    most = max(_BLUR_STRIP[0], _BLUR_STRIP[1] * shortest_side(quad))
     for m in (k, k + 2):
         u0, v0, u1, v1 = quad[m, 0], quad[m, 1], quad[(m + 1) % 4, 0], quad[(m + 1) % 4, 1]
-        _, blur, contrast, _ = fit_step(image, u0, v0, u1, v1, END_PX, _strip(least, _USUAL_BLUR, _BLUR_STRIP_PX))
+        _, blur, contrast, _ = fit_step(image, u0, v0, u1, v1, END_PX, _strip(least, _USUAL_BLUR, most))
         if contrast > 0.0:
             return blur
     return np.nan
@@ -83,19 +86,21 @@ def refined_crossings(image, quads, surroundings):
     needs [px]; shorter side [px].
     """
     uv, quality = np.empty(quads.shape), np.empty((5, len(quads), 4))
-    inset = min(surroundings[1], surroundings[2])
-    blur = _measured_blurs(image, quads, min(surroundings[0], inset) * _shapes(quads, quality))
+    blur = _measured_blurs(image, quads, surroundings.min() * _shapes(quads, quality))
     for i in range(len(quads)):
         quality[1, i] = blur[i].max()
         for k in range(4):
             ea, eb = side_vectors(quads[i], k)
+            most_move = max(_MOST_MOVE[0], _MOST_MOVE[1] * quality[4, i, k])
             blur_a, blur_b = blur[i, k % 2], blur[i, (k + 1) % 2]
             u, v, sigma, contrast = fit_crossing(
-                image, quads[i, k, 0], quads[i, k, 1], ea, eb, surroundings, blur_a, blur_b, _MOST_MOVE_PX
+                image, quads[i, k, 0], quads[i, k, 1], ea, eb, surroundings, blur_a, blur_b, most_move
             )
             uv[i, k, 0], uv[i, k, 1] = u, v
             quality[0, i, k] = sigma if contrast >= LEAST_CONTRAST else np.nan
-    room = np.minimum(surroundings[0] * quality[3] - LEAST_WINDOW_PX, inset * quality[3] - _LEAST_INSET_PX)
+    room = surroundings[0] * quality[3] - LEAST_WINDOW_PX
+    for k in range(2):
+        room = np.minimum(room, surroundings[1 + k] * quality[3] - _LEAST_INSET_PX[k])
     quality[3] = room - MARGIN_BLURS * quality[1]
     return uv, quality
 
@@ -109,11 +114,14 @@ def refined_corners(image, quads, clear):
     uv, quality = np.empty(quads.shape), np.empty((5, len(quads), 4))
     least = clear * _shapes(quads, quality)
     for i in range(len(quads)):
-        first, _, blur = fit_corners(image, quads[i], _strip(least[i], _USUAL_BLUR, _MOST_STRIP_PX))
-        half = _strip(least[i], blur.max(), _MOST_STRIP_PX)
-        uv[i], quality[0, i], quality[1, i] = fit_corners(image, first, half)
+        most = max(_MOST_STRIP[0], _BLUR_STRIP[1] * shortest_side(quads[i]))
+        first, _, blur = fit_corners(image, quads[i], END_PX, _strip(least[i], _USUAL_BLUR, most))
+        half = _strip(least[i], blur.max(), max(_MOST_STRIP[0], _MOST_STRIP[1] * blur.max()))
+        end = max(END_PX, _END_BLURS * blur.max())
+        uv[i], quality[0, i], quality[1, i] = fit_corners(image, first, end, half)
         for k in range(4):
-            if hypot(uv[i, k, 0] - quads[i, k, 0], uv[i, k, 1] - quads[i, k, 1]) > _MOST_MOVE_PX:
+            most_move = max(_MOST_MOVE[0], _MOST_MOVE[1] * quality[4, i, k])
+            if hypot(uv[i, k, 0] - quads[i, k, 0], uv[i, k, 1] - quads[i, k, 1]) > most_move:
                 quality[0, i, k] = np.nan
     quality[3] = clear * quality[3] - _LEAST_STRIP_PX - _STRIP_BLURS * quality[1]
     return uv, quality

@@ -10,7 +10,7 @@ from numba import njit
 from icalib.detection.decoding import bilinear
 
 _LEAST_HALF_PX = 2.0  # half the width of the window of `find_saddle`
-MOST_HALF_PX = 6.0  # more average the bend of a distorted edge into the corner
+_MOST_HALF = (6.0, 0.1)  # px, and of a side: half the width of the same window
 MARGIN_BLURS = 1.5  # how far, in blurs, a neighbouring feature reaches into the window
 _ITERATIONS = 12
 _CONVERGED_PX = 0.02
@@ -19,17 +19,17 @@ LEAST_SINE = 0.17  # of the angle between the edges: 10 degrees
 
 
 @njit(cache=True, nogil=True)
-def window_frame(ea, eb, clear, blur, least):
+def window_frame(ea, eb, clear, blur, least, most):
     """(sa, sb, sine): half a window's width in units of the sides ea, eb (2,) px that meet in the corner.
 
     `clear` is the distance of the nearest other feature in the same units. The window keeps away from it by 1.5 times
-    the blur [px], but half of it is at least `least` px wide across the edges, and at most 6 px.
+    the blur [px], but half of it is at least `least` px wide across the edges, and at most `most` px.
     """
     la, lb = hypot(ea[0], ea[1]), hypot(eb[0], eb[1])
     sine = abs(ea[0] * eb[1] - ea[1] * eb[0]) / max(la * lb, 1e-12)
     across, margin = max(sine, LEAST_SINE), MARGIN_BLURS * blur
-    sa = min(max(clear - margin / (la * across), least / (la * across)), MOST_HALF_PX / la)
-    sb = min(max(clear - margin / (lb * across), least / (lb * across)), MOST_HALF_PX / lb)
+    sa = min(max(clear - margin / (la * across), least / (la * across)), most / la)
+    sb = min(max(clear - margin / (lb * across), least / (lb * across)), most / lb)
     return max(sa, least / la), max(sb, least / lb), sine
 
 
@@ -67,13 +67,19 @@ def _gradient(image, x, y):
 
 
 @njit(cache=True, nogil=True)
+def _coarse_frame(ea, eb, clear, blur):
+    most = max(_MOST_HALF[0], _MOST_HALF[1] * min(hypot(ea[0], ea[1]), hypot(eb[0], eb[1])))
+    return window_frame(ea, eb, clear, blur, _LEAST_HALF_PX, most)
+
+
+@njit(cache=True, nogil=True)
 def find_saddle(image, u, v, ea, eb, clear, blur, max_move):
     """(found, u, v): the point within `max_move` px of (u, v) towards which all gradients are perpendicular.
 
     ea, eb (2,) px are the sides of the dark square that meet in the corner, `clear` is how far, in units of them, the
     nearest other feature is, blur [px] that of the image. Right to some tenths of a pixel, from some pixels away.
     """
-    sa, sb, sine = window_frame(ea, eb, clear, blur, _LEAST_HALF_PX)
+    sa, sb, sine = _coarse_frame(ea, eb, clear, blur)
     det = ea[0] * eb[1] - ea[1] * eb[0]
     start_u, start_v = u, v
     if sine < LEAST_SINE:
@@ -116,7 +122,7 @@ def _step(image, u, v, ea, eb, det, sa, sb):
 @njit(cache=True, nogil=True)
 def crossing_contrast(image, u, v, ea, eb, clear, blur):
     """Least white minus most black grey of the four fields about an X-corner; the dark one lies between ea and eb."""
-    sa, sb, _ = window_frame(ea, eb, clear, blur, _LEAST_HALF_PX)
+    sa, sb, _ = _coarse_frame(ea, eb, clear, blur)
     room = 0.6 * room_for(image, u, v, ea, eb, sa, sb)
     sa, sb = room * sa, room * sb
     black, white = 0.0, 255.0

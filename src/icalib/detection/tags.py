@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from icalib.detection.decoding import cell_greys, levels, lookup, read_cells, unit_homography
+from icalib.detection.decoding import cell_greys, dark_in_ring, levels, lookup, read_cells, unit_homography
 from icalib.detection.edges import fit_quad
 from icalib.detection.families import Family
 from icalib.detection.quads import dark_quads
@@ -15,6 +15,7 @@ from icalib.detection.quads import dark_quads
 LEAST_CONTRAST = 16.0  # grey levels between black and white of a tag
 _LEAST_RISE = 4.0  # grey levels over 2 px at an edge
 _WRONG_BORDER = 0.15  # of the cells of the border
+_WRONG_RING = 0.15  # of the places in the white around the tag
 
 
 @dataclass(frozen=True)
@@ -95,8 +96,9 @@ def decode(image, quad, bits, border, codes, max_errors):
     contrast = white - black
     if contrast < LEAST_CONTRAST or np.isnan(grey).any():
         return -1, 0, contrast
-    code, wrong = read_cells(grey, border, 0.5 * (black + white))
-    if wrong > _WRONG_BORDER * (n * n - bits * bits):
+    threshold = 0.5 * (black + white)
+    code, wrong = read_cells(grey, border, threshold)
+    if wrong > _WRONG_BORDER * (n * n - bits * bits) or dark_in_ring(grey, threshold) > _WRONG_RING * 4 * n:
         return -1, 0, contrast
     tag, turn, errors = lookup(code, codes)
     if errors > max_errors:

@@ -1,0 +1,88 @@
+"""Why is nothing of the target seen? Tries the other families, borders and ids, and says what is there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import islice, product
+
+import numpy as np
+
+from icalib.detection.corners import checked_image
+from icalib.detection.families import tag_family
+from icalib.detection.opencv import FAMILIES, is_available
+from icalib.detection.quads import dark_quads, threshold_windows
+from icalib.detection.tags import tags_at
+
+_MOST_IMAGES = 5
+_SIZES = (50, 100, 250, 1000)  # of OpenCV's families; each starts with the smaller ones
+_TRIED = ("tag36h11", "tag25h9", "tag16h5", "tag36h10", "aruco_original", "aruco_mip_36h12") + tuple(
+    f"{n}x{n}_{size}" for n, size in ((4, 250), (5, 1000), (6, 1000), (7, 1000))
+)
+_BORDERS = (1, 2)
+_LEAST_TAGS = {4: 4}  # fewer tags of 4 x 4 cells may be chance
+_LEAST_TAGS_USUALLY = 2
+
+
+@dataclass(frozen=True)
+class _Seen:
+    family: str
+    border_bits: int
+    mirrored: bool
+    ids: np.ndarray  # all that were read, repeated ones too
+
+
+def what_is_seen(images: Iterable[np.ndarray], family: str, border_bits: int, ids: Sequence[int]) -> str:
+    """A sentence on the tags in the first images (h, w) uint8 of a recording, in which no target was found.
+
+    `family`, `border_bits` and `ids` are those of the target. Raises RecordingError for an image that is not grey.
+    """
+    candidates = _candidates([checked_image(image) for image in islice(images, _MOST_IMAGES)])
+    own_name = _largest(family)
+    candidates.sort(key=lambda seen: (len(seen.ids), seen.family == own_name), reverse=True)
+    if not candidates:
+        return (
+            "the images show no tags of any known family; check that the target is in view, sharp, well lit and larger "
+            "than some 20 pixels a tag."
+        )
+    return _sentence(candidates[0], family, border_bits, ids)
+
+
+def _candidates(images: list[np.ndarray]) -> list[_Seen]:
+    """What each family and border finds, where it is more than chance."""
+    found: dict[tuple[str, int, bool], list[np.ndarray]] = {}
+    tried = [name for name in _TRIED if is_available(name)]
+    for image, mirrored in product(images, (False, True)):
+        view = np.ascontiguousarray(image[:, ::-1]) if mirrored else image
+        windows = threshold_windows(view.shape[1])
+        quads = np.concatenate([dark_quads(view, window, apart) for window in windows for apart in (True, False)])
+        for name, border in product(tried, _BORDERS):
+            found.setdefault((name, border, mirrored), []).append(tags_at(view, quads, tag_family(name), border).ids)
+    seen = [_Seen(*key, np.concatenate(ids)) for key, ids in found.items()]
+    least = {name: _LEAST_TAGS.get(tag_family(name).bits, _LEAST_TAGS_USUALLY) for name in tried}
+    return [one for one in seen if len(one.ids) >= least[one.family]]
+
+
+def _sentence(seen: _Seen, family: str, border_bits: int, ids: Sequence[int]) -> str:
+    what = f"{len(seen.ids)} tags of {_smallest(seen)} (ids {seen.ids.min()} to {seen.ids.max()})"
+    if seen.mirrored:
+        return f"the images are mirrored, they show {what} that way; switch mirroring off in the camera's driver."
+    if seen.family != _largest(family):
+        return f"the images show {what}, none of {family}; correct the target's family."
+    if seen.border_bits != border_bits:
+        return f"the images show {what} with border_bits {seen.border_bits}, not {border_bits}; correct border_bits."
+    if not np.isin(seen.ids, ids).any():
+        return f"the images show {what}, none of those of the target; correct the target's ids, rows and cols."
+    return f"the images show {what}; check that rows, cols and spacing are those of the target."
+
+
+def _largest(family: str) -> str:
+    """The family among those tried that holds all patterns of `family`."""
+    return next((name for name in _TRIED if name.split("_")[0] == family.split("_")[0] and "x" in family), family)
+
+
+def _smallest(seen: _Seen) -> str:
+    """The smallest of OpenCV's families with the ids that were seen."""
+    start = seen.family.split("_")[0]
+    fitting = (f"{start}_{size}" for size in _SIZES if size > seen.ids.max() and f"{start}_{size}" in FAMILIES)
+    return next(fitting, seen.family) if "x" in start else seen.family

@@ -1,0 +1,182 @@
+"""Kernels against slow, obvious formulas."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.special import erf
+
+from icalib.detection.consistency import consistent_corners, largest_group
+from icalib.detection.crossing_model import fit_crossing
+from icalib.detection.decoding import bilinear, lookup, mapped, popcount, read_cells, seen_cells, unit_homography
+from icalib.detection.edge_model import fit_corners, fit_step, solve_small
+from icalib.detection.growth import fit_homography
+
+H_TRUE = np.array([[30.0, 4.0, 100.0], [-3.0, 28.0, 80.0], [0.02, -0.03, 1.0]])
+
+
+def step_image(normal, offset, blur, low=40.0, high=200.0, size=60, noise=0.0):
+    v, u = np.indices((size, size)).astype(float)
+    d = (normal[0] * u + normal[1] * v - offset) / (np.sqrt(2.0) * blur)
+    image = low + (high - low) * 0.5 * (1.0 + erf(d))
+    return image + noise * np.random.default_rng(0).standard_normal(image.shape)
+
+
+def test_popcount_and_lookup():
+    rng = np.random.default_rng(1)
+    values = rng.integers(0, 2**63, 50, dtype=np.uint64)
+    assert [popcount(v) for v in values] == [bin(int(v)).count("1") for v in values]
+    codes = values[:40].reshape(10, 4)
+    assert lookup(codes[6, 3] ^ np.uint64(0b1010), codes) == (6, 3, 2)
+
+
+def test_bilinear_is_linear_between_pixel_centres():
+    image = np.add.outer(10.0 * np.arange(5), 3.0 * np.arange(6))
+    assert bilinear(image, 2.25, 3.5) == pytest.approx(3.0 * 2.25 + 35.0)
+    assert bilinear(image, 5.0, 4.0) == image[4, 5]
+
+
+def test_homographies():
+    square = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
+    quad = np.array([mapped(H_TRUE, *p) for p in square])
+    np.testing.assert_allclose(unit_homography(quad), H_TRUE, rtol=1e-10, atol=1e-12)
+    xy = np.random.default_rng(2).uniform(-1.0, 3.0, (12, 2))
+    uv = np.array([mapped(H_TRUE, *p) for p in xy])
+    H = fit_homography(xy, uv, 12)
+    np.testing.assert_allclose(H / H[2, 2], H_TRUE, rtol=1e-7, atol=1e-9)
+    assert mapped(np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, -1]]), 0.0, 0.0) == (-1e9, -1e9)
+
+
+def test_solve_small():
+    M = np.random.default_rng(3).standard_normal((6, 6))
+    A, b = M @ M.T + np.eye(6), np.arange(6.0)
+    np.testing.assert_allclose(solve_small(A, b), np.linalg.solve(A, b), rtol=1e-10)
+    np.testing.assert_array_equal(solve_small(np.zeros((2, 2)), np.ones(2)), 0.0)
+
+
+def test_read_cells_packs_row_by_row_and_counts_a_white_border():
+    grey = np.zeros((6, 6))
+    grey[2, 3] = grey[3, 2] = 100.0  # data cells (0, 1) and (1, 0) of 2 x 2
+    assert read_cells(grey, 1, 50.0) == (0b0110, 0)
+    grey[1, 1] = 100.0
+    assert read_cells(grey, 1, 50.0) == (0b0110, 1)
+    grey[2, 2] = np.nan
+    assert seen_cells(grey, 1) == 0b0111
+
+
+@pytest.mark.parametrize("side", [30.0, 50.0])
+def test_fit_step_is_the_least_squares_fit(side):
+    normal = np.array([np.sin(0.3), -np.cos(0.3)])  # outward, for a side that runs along (cos, sin)
+    along = np.array([np.cos(0.3), np.sin(0.3)])
+    middle = np.array([30.0, 31.0])
+    image = step_image(normal, normal @ middle, 1.1, size=62, noise=3.0)
+    p0, p1 = middle - 0.5 * side * along, middle + 0.5 * side * along
+    place, blur, contrast, variance = fit_step(image, *p0, *p1, 3.0, 3.5)
+
+    v, u = np.indices(image.shape)
+    t = ((u - middle[0]) * along[0] + (v - middle[1]) * along[1]) / (0.5 * side)
+    d = (u - middle[0]) * normal[0] + (v - middle[1]) * normal[1]
+    used = (np.abs(t) * 0.5 * side <= 0.5 * side - 3.0) & (np.abs(d) <= 3.5)
+    bend = side >= 40.0
+
+    def residual(p):
+        z = (d[used] - p[0] - p[1] * t[used] - bend * p[5] * t[used] ** 2) / (np.sqrt(2.0) * p[2])
+        return p[3] + (p[4] - p[3]) * 0.5 * (1.0 + erf(z)) - image[used]
+
+    fit = least_squares(residual, [0.0, 0.0, 1.0, 40.0, 200.0, 0.0], xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    np.testing.assert_allclose(place, fit.x[[0, 1, 5]] * [1, 1, bend], atol=1e-4)
+    assert (blur, contrast) == pytest.approx((fit.x[2], fit.x[4] - fit.x[3]), rel=1e-4)
+    J = fit.jac if bend else fit.jac[:, :5]
+    ends = np.array([[1.0, s, 0, 0, 0, 1.0][: J.shape[1]] for s in (-1.0, 1.0)])
+    np.testing.assert_allclose(variance, np.diag(ends @ np.linalg.inv(J.T @ J) @ ends.T), rtol=1e-3)
+
+
+def test_no_step_where_there_is_none_or_the_image_ends():
+    flat = np.full((60, 60), 100, dtype=np.uint8)
+    assert np.isnan(fit_step(flat, 10.0, 30.0, 40.0, 30.0, 3.0, 3.0)[3]).all()
+    image = step_image(np.array([0.0, -1.0]), -2.0, 1.0)
+    assert np.isnan(fit_step(image, 10.0, 2.0, 40.0, 2.0, 3.0, 3.0)[3]).all()
+
+
+def test_sides_of_a_bent_quad_meet_in_its_corners():
+    # A dark quad whose upper edge is bent by 0.3 px, as a lens does: its corners are where the arcs meet.
+    v, u = np.indices((100, 100)).astype(float)
+    bend = 0.3 * (1.0 - ((u - 50.0) / 30.0) ** 2)
+    inside = [(u - 20.0), (80.0 - u), (v - 20.0 + bend), (80.0 - v)]
+    grey = np.ones_like(u)
+    for d in inside:
+        grey = grey * 0.5 * (1.0 + erf(d / np.sqrt(2.0)))
+    image = 200.0 - 160.0 * grey
+    quad = np.array([(20.4, 19.7), (80.3, 20.2), (79.8, 80.4), (19.6, 79.9)])
+    corners, sigma, blur = fit_corners(image, quad, 3.0, 4.0)
+    np.testing.assert_allclose(corners, [(20, 20), (80, 20), (80, 80), (20, 80)], atol=0.01)
+    np.testing.assert_allclose(blur, 1.0, rtol=0.02)
+    assert (sigma > 0.0).all()
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_fit_crossing_is_the_least_squares_fit(turned):
+    ea, eb = np.array([30.0, 6.0]), np.array([-4.0, 28.0])
+    truth, blur = np.array([30.3, 29.6]), (0.9, 1.1)
+    v, u = np.indices((60, 60)).astype(float)
+
+    def model(p):
+        a, b = p[2], p[3]
+        la = np.cos(a) * (v - p[1]) - np.sin(a) * (u - p[0])
+        lb = np.sin(b) * (u - p[0]) - np.cos(b) * (v - p[1])
+        return p[4] - p[5] * erf(la / (np.sqrt(2.0) * blur[0])) * erf(lb / (np.sqrt(2.0) * blur[1]))
+
+    p_true = np.array([*truth, np.arctan2(ea[1], ea[0]), np.arctan2(eb[1], eb[0]), 120.0, 80.0])
+    image = model(p_true) + 3.0 * np.random.default_rng(4).standard_normal(u.shape)
+    surroundings = np.array([0.5, np.inf, 0.15])
+    sides = (eb, ea, blur[1], blur[0]) if turned else (ea, eb, *blur)
+    found = fit_crossing(image, 30.0, 30.0, *sides[:2], surroundings, *sides[2:], 2.0)
+
+    s, t = np.linalg.solve(np.stack([ea, eb], axis=1), np.stack([u - 30.0, v - 30.0]).reshape(2, -1)).reshape(2, 60, 60)
+    la, lb = np.linalg.norm(ea), np.linalg.norm(eb)
+    margin = 1.5 * max(blur) * la * lb / abs(ea[0] * eb[1] - ea[1] * eb[0])
+    white_cells = (s * t < 0.0) & (np.abs(s) > 0.15 - margin / la) & (np.abs(t) > 0.15 - margin / lb)
+    used = (np.abs(s) <= 6.0 / la) & (np.abs(t) <= 6.0 / lb) & ~white_cells
+    fit = least_squares(lambda p: (model(p) - image)[used], p_true, xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    np.testing.assert_allclose(found[:2], fit.x[:2], atol=1e-3)
+    sigma = np.sqrt(0.5 * np.trace(np.linalg.inv(fit.jac.T @ fit.jac)[:2, :2]))
+    assert found[2:] == pytest.approx((sigma, 2.0 * fit.x[5]), rel=1e-2)
+
+
+def test_no_crossing_where_there_is_none_or_it_is_too_oblique_or_too_near_the_border():
+    flat, surroundings = np.full((60, 60), 100, dtype=np.uint8), np.array([0.5, np.inf, np.inf])
+    ea, eb = np.array([30.0, 0.0]), np.array([0.0, 30.0])
+    assert np.isnan(fit_crossing(flat, 30.0, 30.0, ea, eb, surroundings, 1.0, 1.0, 2.0)[2])
+    v, u = np.indices((60, 60)).astype(float)
+    for at, sides, is_there in [(30.0, (ea, eb), True), (1.5, (ea, eb), False), (30.0, (ea, ea + 0.1 * eb), False)]:
+        image = 120.0 - 80.0 * erf(u - at) * erf(v - 30.0)
+        assert np.isfinite(fit_crossing(image, at, 30.0, *sides, surroundings, 0.7, 0.7, 2.0)[2]) == is_there
+
+
+def grid(noise=0.05):
+    xy = np.stack(np.meshgrid(np.arange(6.0), np.arange(6.0)), axis=-1).reshape(-1, 2)
+    uv = np.array([mapped(H_TRUE, *p) for p in xy])
+    return xy, uv + noise * np.random.default_rng(5).standard_normal(uv.shape)
+
+
+@pytest.mark.parametrize("row", [0, 14, 35])
+def test_a_corner_that_is_off_is_inconsistent_and_no_other(row):
+    xy, uv = grid()
+    found, side = np.ones(36, dtype=bool), np.full(36, 30.0)
+    assert consistent_corners(uv, xy, found, side).all()
+    uv[row] += (4.0, -4.0)
+    np.testing.assert_array_equal(np.flatnonzero(~consistent_corners(uv, xy, found, side)), [row])
+
+
+def test_the_largest_group_of_tags_that_agree_is_kept():
+    row, col = np.divmod(np.arange(9), 3)
+    board = 1.3 * np.stack([col, row], axis=1)[:, None, :] + np.array([(0.0, 0), (1, 0), (1, 1), (0, 1)])
+    quads = np.array([[mapped(H_TRUE, *p) for p in tag] for tag in board])
+    quads[4] += 60.0  # read where it is not
+    known = np.ones(9, dtype=bool)
+    known[7] = False
+    expected = known.copy()
+    expected[4] = False
+    np.testing.assert_array_equal(largest_group(known, quads, board), expected)
+    assert not largest_group(np.zeros(9, dtype=bool), quads, board).any()
