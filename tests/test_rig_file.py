@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from icalib.errors import CalibrationError, RigError
-from icalib.geometry.targets import Charuco, Checkerboard
+from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard
 from icalib.imu_classes import IMU_CLASSES, class_noise
 from icalib.rig import Rig, Settings
 from icalib.rig_file import load_rig, rig_to_dict
@@ -325,13 +325,35 @@ def test_other_targets_are_read_and_written(tmp_path, text, target):
     assert load_rig(path).target == target
 
 
-def test_no_imu_two_imus_no_camera(tmp_path):
+def test_two_imus_no_camera(tmp_path):
     imu, rest = "  imu0: {type: imu}\n", f"target: {TARGET}\n"
     camera = "  cam0: {type: camera, model: pinhole-radtan, resolution: [752, 480]}\n"
-    assert "rig.yaml:2: sensors: there is no IMU" in complaint(tmp_path, "sensors:\n" + camera + rest)
     assert "there is no camera" in complaint(tmp_path, "sensors:\n" + imu + rest)
     second = complaint(tmp_path, "sensors:\n" + imu + "  imu1: {type: imu}\n" + camera + rest)
     assert "rig.yaml:3: sensors.imu1: is a second IMU beside imu0" in second
+
+
+def test_without_an_imu_the_first_camera_is_the_body(tmp_path):
+    path = tmp_path / "rig.yaml"
+    cameras = "".join(f"  {n}: {{type: camera, model: eucm, resolution: [752, 480]}}\n" for n in ("left", "right"))
+    path.write_text("sensors:\n" + cameras + f"target: {TARGET}\n")
+    rig = load_rig(path)
+    assert rig.imu is None and rig.body == "left"
+    again = tmp_path / "again.yaml"
+    again.write_text(yaml.safe_dump(rig_to_dict(rig)))
+    assert dataclasses.replace(load_rig(again), path=path) == rig
+
+
+@pytest.mark.parametrize("border", [1, 2])
+def test_an_aprilgrid_of_plain_tags(tmp_path, border):
+    path = tmp_path / "rig.yaml"
+    camera = "  cam0: {type: camera, model: eucm, resolution: [752, 480]}\n"
+    target = TARGET.replace("}", f", border_bits: {border}, squares: false}}")
+    path.write_text("sensors:\n" + camera + f"target: {target}\n")
+    assert load_rig(path).target == AprilGrid(6, 7, 0.088, 0.3, border, squares=False)
+    path.write_text(path.read_text().replace(f"border_bits: {border}", "border_bits: 3"))
+    with pytest.raises(RigError, match="target.border_bits"):
+        load_rig(path)
 
 
 @pytest.mark.parametrize("text", ["", "# nothing\n", "---\n"])

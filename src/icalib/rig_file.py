@@ -25,6 +25,7 @@ _TARGET_FIELDS = {
     "charuco": ("squares_x", "squares_y", "square_size", "marker_size", "dictionary"),
     "checkerboard": ("rows", "cols", "square_size"),
 }
+_APRILGRID_OPTIONS = ("border_bits", "squares")
 _LARGEST_TAG_M = 2.0  # nobody prints a larger one; it is in millimetres
 _MOST_TAGS = 10_000
 
@@ -143,11 +144,9 @@ def _target(value: YamlValue) -> Target:
     if "type" not in fields:
         value.fail(f"type is missing; add type: {', type: '.join(_TARGET_FIELDS)}.")
     kind = fields["type"].choice("target type", tuple(_TARGET_FIELDS))
-    found = value.record(("type", *_TARGET_FIELDS[kind]))
+    found = value.record(("type", *_TARGET_FIELDS[kind]), _APRILGRID_OPTIONS if kind == "aprilgrid" else ())
     if kind == "aprilgrid":
-        size = _edge(found["tag_size"], "tag")
-        rows, cols = _counts(value, found, "rows", "cols", "tags")
-        return AprilGrid(rows, cols, size, found["tag_spacing"].positive())
+        return _aprilgrid(value, found)
     size = _edge(found["square_size"], "square")
     if kind == "checkerboard":
         rows, cols = _counts(value, found, "rows", "cols", "corners")
@@ -155,6 +154,14 @@ def _target(value: YamlValue) -> Target:
     squares = _counts(value, found, "squares_x", "squares_y", "squares")
     marker, dictionary = _edge(found["marker_size"], "tag"), found["dictionary"].choice("dictionary", tuple(FAMILIES))
     return _made(value, lambda: Charuco(*squares, size, marker, dictionary))
+
+
+def _aprilgrid(value: YamlValue, found: dict[str, YamlValue]) -> AprilGrid:
+    size = _edge(found["tag_size"], "tag")
+    rows, cols = _counts(value, found, "rows", "cols", "tags")
+    border = int(found["border_bits"].choice("width of border", ("1", "2"))) if "border_bits" in found else 2
+    squares = found["squares"].boolean() if "squares" in found else True
+    return AprilGrid(rows, cols, size, found["tag_spacing"].positive(), border, squares)
 
 
 def _edge(value: YamlValue, what: str) -> float:

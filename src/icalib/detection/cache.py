@@ -6,6 +6,7 @@ The folder is the user's cache folder, or $ICALIB_CACHE. A file that is damaged 
 from __future__ import annotations
 
 import hashlib
+import io
 import os
 import tempfile
 import zipfile
@@ -43,7 +44,8 @@ def stream_key(payloads: Iterable[Payload], settings: str) -> str:
 def load_corners(key: str) -> tuple[np.ndarray, list[ImageCorners]] | None:
     """Stamps (M,) and corners of the images under `key`, or None."""
     try:
-        with np.load(cache_folder() / f"{key}.npz", allow_pickle=False) as file:
+        content = (cache_folder() / f"{key}.npz").read_bytes()
+        with np.load(io.BytesIO(content), allow_pickle=False) as file:
             arrays = {name: file[name] for name in ("stamps_ns", "start", *_FIELDS)}
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None

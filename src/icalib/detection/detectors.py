@@ -25,7 +25,9 @@ class Detector(Protocol):
 def detector_of(target: Target) -> Detector:
     """The detector that finds `target`. Raises RigError for one that none finds in images."""
     if isinstance(target, AprilGrid):
-        return AprilGridDetector(target.rows, target.cols, target.tag_spacing)
+        return AprilGridDetector(
+            target.rows, target.cols, target.tag_spacing, border_bits=target.border_bits, squares=target.squares
+        )
     if isinstance(target, Charuco):
         ratio = target.marker_size / target.square_size
         return CharucoDetector(target.squares_y, target.squares_x, ratio, target.dictionary)

@@ -11,19 +11,22 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from itertools import islice
 
 import numpy as np
 
 from icalib.detection.cache import keep_corners, load_corners, stream_key
 from icalib.detection.corners import KEPT, VERDICTS, ImageCorners, corner_stream
 from icalib.detection.detectors import Detector, detector_of
+from icalib.detection.diagnosis import what_is_seen
 from icalib.errors import RecordingError
-from icalib.geometry.targets import Target
+from icalib.geometry.targets import AprilGrid, Charuco, Target
 from icalib.measurements import CornerStream
 from icalib.recordings import DamagedImageError, Payload, Recording, decode
 from icalib.recordings.extras import load_cv2
 from icalib.rig import Camera
 
+DIAGNOSED = 10  # images in which tags are looked for that are not the target's
 PER_WORKER = 4  # images in memory for each thread
 Progress = Callable[[float], None]  # the share of the images that is done, 0 to 1
 
@@ -49,9 +52,23 @@ def find_corners(
     if not any(i.kept.any() for i in images):
         raise RecordingError(
             f"{where}: the target of the rig file is in none of {len(images)} images of {camera.name}; "
-            "check the target's type and sizes, and that the camera saw it."
+            + _seen_instead(recording, topic, target)
         )
     return corner_stream(camera.name, stamps_ns, images), _notes(where, images)
+
+
+def _seen_instead(recording: Recording, topic: str, target: Target) -> str:
+    """What to do about a target that is never found: by what the images show instead, where it has tags."""
+    if isinstance(target, AprilGrid):
+        family, border, ids = "tag36h11", target.border_bits, range(target.rows * target.cols)
+    elif isinstance(target, Charuco):
+        family, border, ids = target.dictionary, 1, range(target.squares_x * target.squares_y // 2)
+    else:
+        return "check the target's type and sizes, and that the camera saw it."
+    count = next(t.count for t in recording.topics() if t.name == topic)
+    every = max(count // DIAGNOSED, 1)
+    images = (frame.image for frame in islice(recording.images(topic), 0, None, every))
+    return what_is_seen(images, family, border, ids)
 
 
 def _of_resolution(payloads: Iterable[Payload], camera: Camera, where: str) -> Iterator[Payload]:

@@ -74,7 +74,7 @@ def _good_starts(trial: CornerStream, model: CameraModel, starts: np.ndarray, ta
 def _fit(
     bundle: CornerStream, model: CameraModel, params: np.ndarray, target: np.ndarray, wanted: np.ndarray
 ) -> np.ndarray:
-    """Those `wanted` (P,) of `params`: focal length and the strongest distortion first, the rest once these are near."""
+    """The `wanted` (P,) of `params`: focal length and the strongest distortion first, the rest once these are near."""
     for stage in (np.array([0, 1, 4]), np.arange(len(params))):
         if wanted[stage].any():
             params, _ = _bundle(bundle, model, params, target, stage[wanted[stage]])

@@ -19,7 +19,8 @@ class AprilGrid(Target):
     """Kalibr's AprilGrid: `rows` x `cols` tags of edge `tag_size` [m], gaps of `tag_spacing` * tag_size.
 
     Board frame: origin at corner 0 of tag 0, x along a row, y along a column, the tags in z = 0. Tag ids run row-major
-    from the bottom left; corner 0 of a tag is at its bottom left, then counterclockwise.
+    from the bottom left; corner 0 of a tag is at its bottom left, then counterclockwise. border_bits: width of the
+    tags' black border, 2 as Kalibr prints them, or 1; squares: black squares fill the gaps between the tags' corners.
     """
 
     type: ClassVar[str] = "aprilgrid"
@@ -29,6 +30,8 @@ class AprilGrid(Target):
     cols: int
     tag_size: float
     tag_spacing: float
+    border_bits: int = 2
+    squares: bool = True
 
     @cached_property
     def points(self) -> np.ndarray:

@@ -16,7 +16,6 @@ from icalib.geometry.targets.tag import Tag
 
 _SAME_M = 1e-9  # edges this close are one
 _APRILGRID_FAMILY = "apriltag_36h11"
-_APRILGRID_BORDER = 2  # Kalibr's; the authors of AprilTag and OpenCV use 1
 _Box = tuple[float, float, float, float, bool]  # left, bottom, right, top [m]; white
 
 
@@ -49,8 +48,8 @@ class Pattern:
 
 
 def pattern_of(target: Target, border_bits: int | None = None) -> Pattern:
-    """The print of `target`. border_bits: width of the tags' black border in bits; by default 2 on an AprilGrid, as
-    Kalibr prints it, and 1 elsewhere.
+    """The print of `target`. border_bits: width of the tags' black border in bits; by default an AprilGrid's
+    own, and 1 elsewhere.
 
     Raises CalibrationError where the bits of tags are needed and OpenCV is not installed, RigError where there is no
     such print.
@@ -58,7 +57,7 @@ def pattern_of(target: Target, border_bits: int | None = None) -> Pattern:
     if border_bits is not None and border_bits < 1:
         raise RigError(f"a border of {border_bits} bits leaves no edge to see; give 1 or 2.")
     if isinstance(target, AprilGrid):
-        return _rasterised(_aprilgrid(target, border_bits or _APRILGRID_BORDER))
+        return _rasterised(_aprilgrid(target, border_bits or target.border_bits))
     if isinstance(target, Charuco):
         return _rasterised(_charuco(target, border_bits or 1))
     if isinstance(target, Checkerboard):
@@ -76,10 +75,10 @@ def _aprilgrid(grid: AprilGrid, border_bits: int) -> list[_Box]:
     for i in range(grid.rows * grid.cols):
         row, col = divmod(i, grid.cols)
         boxes += _tag(_APRILGRID_FAMILY, i, size, (col * pitch, row * pitch), border_bits)
-    for row in range(grid.rows + 1):
-        for col in range(grid.cols + 1):
-            left, bottom = col * pitch - gap, row * pitch - gap
-            boxes.append((left, bottom, left + gap, bottom + gap, False))
+    corners = [(row, col) for row in range(grid.rows + 1) for col in range(grid.cols + 1)] if grid.squares else []
+    for row, col in corners:
+        left, bottom = col * pitch - gap, row * pitch - gap
+        boxes.append((left, bottom, left + gap, bottom + gap, False))
     return boxes
 
 

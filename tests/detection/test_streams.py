@@ -1,0 +1,159 @@
+"""From the images of a recording to its corners: every image once, in order, kept for the next run."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from icalib.detection import streams
+from icalib.detection.corners import ImageCorners, no_corners
+from icalib.errors import RecordingError
+from icalib.geometry.targets import AprilGrid
+from icalib.recordings import Payload, TopicInfo
+from icalib.rig import Camera
+
+GRID = AprilGrid(6, 6, 0.088, 0.3)
+CAMERA = Camera("cam0", "cam0/corners.csv", "pinhole-radtan", (8, 6))
+
+
+class FakeRecording:
+    """Images of 6 x 8 px; the first pixel counts them."""
+
+    def __init__(self, n: int = 20, width: int = 8, size: int = 48) -> None:
+        self.n, self.width, self.size = n, width, size
+        self.read = 0
+
+    def image_topic(self, camera: Camera) -> str:
+        return "/cam0"
+
+    def where(self, sensor: object) -> str:
+        return "fake.bag /cam0"
+
+    def topics(self) -> tuple[TopicInfo, ...]:
+        return (TopicInfo("/cam0", "sensor_msgs/msg/Image", "image", self.n, 0, self.n),)
+
+    def payloads(self, topic: str) -> Iterator[Payload]:
+        for i in range(self.n):
+            self.read += 1
+            data = bytes([i]) + bytes([100]) * (self.size - 1)
+            yield Payload(1000 + i, "fake.bag /cam0", "mono8", data, self.width, 6, self.width)
+
+
+class FakeDetector:
+    """One corner at (first pixel, 1); counts what it was shown, and by which threads."""
+
+    def __init__(self) -> None:
+        self.seen: list[int] = []
+        self.fail_at = -1
+
+    def detect(self, image: np.ndarray) -> ImageCorners:
+        i = int(image[0, 0])
+        if i == self.fail_at:
+            raise KeyboardInterrupt
+        self.seen.append(i)
+        if i % 5 == 4:
+            return no_corners()
+        one = np.ones(1)
+        return ImageCorners(np.array([i % 3]), np.array([[float(i), 1.0]]), 0.1 * one, one, np.zeros(1, np.int8))
+
+
+@pytest.fixture
+def detector(monkeypatch, tmp_path) -> FakeDetector:
+    fake = FakeDetector()
+    monkeypatch.setattr(streams, "detector_of", lambda target: fake)
+    monkeypatch.setenv("ICALIB_CACHE", str(tmp_path / "cache"))
+    return fake
+
+
+def test_every_image_is_searched_once_and_stands_in_order(detector):
+    done = []
+    found, notes = streams.find_corners(FakeRecording(), CAMERA, GRID, True, done.append)
+    assert sorted(detector.seen) == list(range(20))
+    np.testing.assert_array_equal(found.stamps_ns, 1000 + np.arange(20))
+    seen = [i for i in range(20) if i % 5 != 4]
+    np.testing.assert_array_equal(found.uv[:, 0], seen)
+    np.testing.assert_array_equal(found.point, [i % 3 for i in seen])
+    assert done == sorted(done) and done[-1] == 1.0
+    assert notes == ("fake.bag /cam0: the target is in 16 of 20 images, 16 corners.",)
+
+
+def test_a_second_run_looks_at_nothing(detector):
+    first = streams.find_corners(FakeRecording(), CAMERA, GRID)
+    detector.seen.clear()
+    second = streams.find_corners(FakeRecording(), CAMERA, GRID)
+    assert detector.seen == []
+    for a, b in zip(vars(first[0]).values(), vars(second[0]).values(), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert first[1] == second[1]
+
+
+@pytest.mark.parametrize("other", [FakeRecording(19), FakeRecording(21)])
+def test_other_images_are_searched(detector, other):
+    streams.find_corners(FakeRecording(), CAMERA, GRID)
+    detector.seen.clear()
+    streams.find_corners(other, CAMERA, GRID)
+    assert len(detector.seen) == other.n
+
+
+def test_another_target_is_searched_for(detector):
+    streams.find_corners(FakeRecording(), CAMERA, GRID)
+    detector.seen.clear()
+    streams.find_corners(FakeRecording(), CAMERA, AprilGrid(6, 6, 0.088, 0.25))
+    assert len(detector.seen) == 20
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 truncated", b"no zip at all" * 50])
+def test_a_damaged_file_in_the_cache_is_no_file(detector, tmp_path, content):
+    streams.find_corners(FakeRecording(), CAMERA, GRID)
+    (kept,) = (tmp_path / "cache").iterdir()
+    kept.write_bytes(content)
+    detector.seen.clear()
+    found, _ = streams.find_corners(FakeRecording(), CAMERA, GRID)
+    assert len(detector.seen) == 20 and len(found.uv) == 16
+
+
+def test_nothing_is_kept_where_that_is_switched_off_or_cannot_be(detector, tmp_path, monkeypatch):
+    streams.find_corners(FakeRecording(), CAMERA, GRID, keep=False)
+    assert not (tmp_path / "cache").exists()
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv("ICALIB_CACHE", str(tmp_path / "file"))
+    found, _ = streams.find_corners(FakeRecording(), CAMERA, GRID)
+    assert len(found.uv) == 16
+
+
+def test_few_images_wait_in_memory(detector, monkeypatch):
+    """The reader never runs ahead of the detectors by more than the bound."""
+    monkeypatch.setattr(streams, "_workers", lambda: 2)
+    recording, ahead = FakeRecording(60), []
+    plain = detector.detect
+    gate = threading.Semaphore(0)
+
+    def slow(image: np.ndarray) -> ImageCorners:
+        ahead.append(recording.read - len(detector.seen))
+        gate.acquire(timeout=0.01)
+        return plain(image)
+
+    monkeypatch.setattr(detector, "detect", slow)
+    streams.find_corners(recording, CAMERA, GRID, keep=False)
+    assert max(ahead) <= 2 * streams.PER_WORKER + 2 + 2
+
+
+def test_an_interrupted_search_keeps_nothing(detector, tmp_path):
+    detector.fail_at = 11
+    with pytest.raises(KeyboardInterrupt):
+        streams.find_corners(FakeRecording(), CAMERA, GRID)
+    assert not list(Path(tmp_path).rglob("*.npz"))
+
+
+def test_images_of_another_size_are_refused(detector):
+    with pytest.raises(RecordingError, match="images have 6 x 6 px, but cam0 8 x 6; correct its resolution"):
+        streams.find_corners(FakeRecording(width=6), CAMERA, GRID)
+
+
+def test_damaged_images_are_left_out_and_all_damaged_are_refused(detector):
+    with pytest.raises(RecordingError, match="fake.bag /cam0"):
+        streams.find_corners(FakeRecording(size=20), CAMERA, GRID)
