@@ -118,7 +118,7 @@ def _groups(
     overall = float(np.sqrt(np.mean(_calibration_only(inputs, ratio) ** 2))) if len(ratio) else 1.0
     groups = []
     for block in inputs.layout.blocks:
-        if block.start is None and block.name in ("shape", "bloom"):
+        if block.start is None and block.name in ("shape", "bloom", "tilt"):
             continue
         labels = _labels(inputs, block)
         if block.name == "tilt":

@@ -229,10 +229,7 @@ class TestChoice:
         bag = open_recording(write.mcap(tmp_path / "run.mcap", messages))
         rig = Rig(IMU, (CAM0,), AprilGrid(6, 6, 0.088, 0.3))
         sentence = complaint(lambda: read_measurements(bag, rig))
-        assert (
-            "holds images, not corners, of cam0; detect the target in /cam0/image and write cam0/corners.csv"
-            in sentence
-        )
+        assert "run.mcap /cam0/image holds images, not corners" in sentence
 
 
 def test_numbers_in_names_are_numbers(tmp_path):

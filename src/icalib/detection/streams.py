@@ -43,9 +43,9 @@ def find_corners(
     key = stream_key(_of_resolution(recording.payloads(topic), camera, where), repr(target)) if keep else ""
     found = load_corners(key) if keep else None
     if found is None:
-        count = next(t.count for t in recording.topics() if t.name == topic)
+        count = _count(recording, topic)
         payloads = _of_resolution(recording.payloads(topic), camera, where)
-        found = _search(payloads, detector_of(target), where, lambda n: progress(min(n / count, 1.0)))
+        found = _search(payloads, detector_of(target), where, lambda n: progress(n / max(count, n)))
         if keep:
             keep_corners(key, *found)
     stamps_ns, images = found
@@ -65,10 +65,14 @@ def _seen_instead(recording: Recording, topic: str, target: Target) -> str:
         family, border, ids = target.dictionary, 1, range(target.squares_x * target.squares_y // 2)
     else:
         return "check the target's type and sizes, and that the camera saw it."
-    count = next(t.count for t in recording.topics() if t.name == topic)
-    every = max(count // DIAGNOSED, 1)
+    every = max(_count(recording, topic) // DIAGNOSED, 1)
     images = (frame.image for frame in islice(recording.images(topic), 0, None, every))
     return what_is_seen(images, family, border, ids)
+
+
+def _count(recording: Recording, topic: str) -> int:
+    """How many images there are about; 0 where that is not known."""
+    return next((t.count for t in recording.topics() if t.name == topic), 0)
 
 
 def _of_resolution(payloads: Iterable[Payload], camera: Camera, where: str) -> Iterator[Payload]:

@@ -39,12 +39,14 @@ def camchain(calibration: Calibration) -> str:
     seen = {r.sensor: r for r in c.corner_residuals}
     overlaps = _overlaps([seen[name] for name in c.cameras])
     data = {f"cam{i}": _camera(c, i, overlaps) for i in range(len(c.cameras))}
-    comment = (
-        "# Kalibr's camchain by icalib. T_cn_cnm1 takes coordinates in the frame of the camera before to this one's"
-    )
-    if c.imu is not None:
-        comment += ", T_cam_imu those in the imu frame; t_imu = t_cam + timeshift_cam_imu [s]"
-    comment += "."
+    comment = "# Kalibr's camchain by icalib. "
+    if c.imu is None:
+        comment += "T_cn_cnm1 takes coordinates in the frame of the camera before to this one's."
+    else:
+        comment += (
+            "T_cam_imu takes coordinates in the imu frame to the camera frame, T_cn_cnm1 those of the camera before to "
+            "this one; t_imu = t_cam + timeshift_cam_imu [s]."
+        )
     fits = [sentence for i in range(len(c.cameras)) if (sentence := _lens(c, i)[1])]
     return _text([comment, *_renamed("cam", c.cameras), *fits], data)
 

@@ -19,6 +19,7 @@ JUDGE_IMAGES = 300  # to tell valleys apart that differ by far less than the noi
 FOCAL_TRIALS = np.geomspace(0.1, 3.0, 35)  # of the image width: 19 degrees for a pinhole, all round for a fisheye
 ROUNDS = 25
 TIED = 1.05  # trials this much worse than the best are as good
+ALIKE = 1.002  # costs that the noise cannot tell apart: the plainer lens is taken
 MOST_TIED = 5  # neighbours of the best, which lead to the same place
 HUBER_PX = 1.5
 GOOD_RMS_PX = 2.0
@@ -91,13 +92,16 @@ def _cheapest(
     if len(found) <= 1:
         return found[0] if found else np.zeros(len(model.parameter_names))
     used = np.all([_used(target_poses(stream, model, p, target)) for p in found], axis=0)
-    least, best = np.inf, found[0]
+    judged: list[tuple[float, np.ndarray]] = []
     for params in found:
         with suppress(np.linalg.LinAlgError):
             params, cost = _bundle(stream, model, params, target, free, used)
-            if cost < least:
-                least, best = cost, params
-    return best
+            judged.append((cost, params))
+    if not judged:
+        return found[0]
+    least = min(cost for cost, _ in judged)
+    alike = [params for cost, params in judged if cost <= ALIKE * least]
+    return min(alike, key=lambda params: float(np.linalg.norm(params[4:])))
 
 
 def _used(poses: TargetPoses) -> np.ndarray:

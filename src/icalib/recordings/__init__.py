@@ -5,6 +5,7 @@ from icalib.recordings.base import Recording
 from icalib.recordings.folder import FolderRecording
 from icalib.recordings.images import DamagedImageError, Frame, Payload, decode
 from icalib.recordings.opening import open_recording
+from icalib.recordings.pictures import PictureFolder
 from icalib.recordings.reading import read_measurements
 from icalib.recordings.topics import TopicInfo, image_topics
 
@@ -14,6 +15,7 @@ __all__ = [
     "FolderRecording",
     "Frame",
     "Payload",
+    "PictureFolder",
     "Recording",
     "TopicInfo",
     "decode",

@@ -9,7 +9,7 @@ from icalib.errors import RecordingError
 from icalib.recordings.image_checks import Note
 from icalib.recordings.images import Payload, file_payload
 
-_SUFFIXES = (".png", ".jpg", ".jpeg")
+SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
 def image_files(folder: Path) -> list[tuple[int, Path]]:
@@ -18,7 +18,7 @@ def image_files(folder: Path) -> list[tuple[int, Path]]:
     Empty where there is no folder `data` of images. Raises RecordingError naming the line that cannot be read.
     """
     data = folder / "data"
-    there = sorted(p for p in data.iterdir() if p.suffix.lower() in _SUFFIXES) if data.is_dir() else []
+    there = sorted(p for p in data.iterdir() if p.suffix.lower() in SUFFIXES) if data.is_dir() else []
     if not there:
         return []
     table = folder / "data.csv"

@@ -9,18 +9,21 @@ from icalib.recordings.bag import BagRecording
 from icalib.recordings.bags.opening import bag_files
 from icalib.recordings.base import Recording
 from icalib.recordings.folder import FolderRecording
+from icalib.recordings.pictures import PictureFolder, has_pictures
 
 _MAX_LISTED = 12
 
 
 def open_recording(path: str | Path) -> Recording:
-    """Open the recording at `path`: a folder of tables or EuRoC's, a bag, or a folder of bags.
+    """Open the recording at `path`: a folder of tables or EuRoC's, a bag, a folder of bags, or of pictures.
 
     It is told by what is there, not by names. Raises RecordingError where it is missing, empty or none of these.
     """
     root = Path(path)
     if root.is_dir():
-        return BagRecording(root) if _holds_bags(root) else FolderRecording(root)
+        if _holds_bags(root):
+            return BagRecording(root)
+        return PictureFolder(root) if has_pictures(root) and not _holds_tables(root) else FolderRecording(root)
     if root.exists():
         return BagRecording(root)
     parent = root.parent
@@ -31,5 +34,8 @@ def open_recording(path: str | Path) -> Recording:
 
 def _holds_bags(folder: Path) -> bool:
     """Bags, and no tables: these may have been made from a bag that was left beside them."""
-    tables = [p for pattern in ("*/*.csv", "*/*.csv.gz", "mav0") for p in folder.glob(pattern)]
-    return bool(bag_files(folder)) and not tables
+    return bool(bag_files(folder)) and not _holds_tables(folder)
+
+
+def _holds_tables(folder: Path) -> bool:
+    return any(p for pattern in ("*/*.csv", "*/*.csv.gz", "mav0", "*/data") for p in folder.glob(pattern))

@@ -70,17 +70,17 @@ def trajectory(c: Calibration) -> Figure:
 
 
 def _board(c: Calibration) -> list[dict]:
-    """Outline of the target where its attitude is known."""
+    """Outline of the target where its attitude is known; without an IMU its frame is the world's."""
     fields = dict(c.rig.get("target", {}))
     attitude = [g for g in c.groups if g.sensor not in c.rig["sensors"] and g.value.shape == (3, 3)]
     kind = TARGETS.get(fields.pop("type", ""))
-    if not attitude or kind is None:
+    if kind is None or not (attitude or c.imu is None):
         return []
+    R, name = (attitude[0].value, attitude[0].sensor) if attitude else (np.eye(3), "board0")
     points = kind(**fields).points
     (x0, y0, _), (x, y, _) = points.min(axis=0), points.max(axis=0)
     corners = [(x0, y0, 0.0), (x, y0, 0.0), (x, y, 0.0), (x0, y, 0.0), (x0, y0, 0.0)]
-    outline = np.array(corners) @ attitude[0].value.T
-    return [path_3d(outline, attitude[0].sensor, "#be185d")]
+    return [path_3d(np.array(corners) @ R.T, name, "#be185d")]
 
 
 def convergence(c: Calibration) -> Figure:

@@ -1,0 +1,128 @@
+"""Recordings that are folders of pictures without clocks: a phone's, or those of cameras that were triggered by hand.
+
+A picture's number, the last one in its name, says when it was taken: pictures of the same number were taken together.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import final
+
+from icalib.errors import RecordingError
+from icalib.geometry.targets import Target
+from icalib.measurements import CornerStream, ImuStream
+from icalib.recordings.euroc_images import SUFFIXES, file_payloads
+from icalib.recordings.image_checks import checked_payloads, frames
+from icalib.recordings.images import Frame, Payload
+from icalib.recordings.topics import TopicInfo, choose_topic
+from icalib.rig import Camera, ImuSensor
+
+APART_NS = 1_000_000_000  # from one number to the next
+MOST = 9_000_000_000  # beyond, nanoseconds do not fit
+
+
+def has_pictures(root: Path) -> bool:
+    """Whether `root` or a folder in it holds pictures."""
+    return bool(_topics(root))
+
+
+@final
+class PictureFolder:
+    """A folder of pictures, or of one folder of pictures for each camera.
+
+    A topic is the name of such a folder, `.` for the root itself, or a pattern of files as `images/*_0.jpg`, in which
+    the star is the picture's number.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self._read: list[Path] = []
+        self._notes: list[str] = []
+
+    def topics(self) -> tuple[TopicInfo, ...]:
+        return tuple(self._info(name) for name in _topics(self.root))
+
+    def image_topic(self, camera: Camera) -> str:
+        if camera.topic is not None and "*" in camera.topic:
+            return camera.topic
+        return choose_topic(str(self.root), self.topics(), "image", camera.name, camera.topic).name
+
+    def payloads(self, topic: str) -> Iterator[Payload]:
+        files, where = self._files(topic), f"{self.root}/{topic}"
+        self._read += [path for _, path in files if path not in self._read]
+        return checked_payloads(file_payloads(files, where, self._note), where, self._note)
+
+    def images(self, topic: str) -> Iterator[Frame]:
+        return frames(self.payloads(topic), f"{self.root}/{topic}", self._note)
+
+    def imu(self, sensor: ImuSensor) -> ImuStream:
+        raise RecordingError(
+            f"{self.root} holds pictures without a clock, and {sensor.name} needs one; take the IMU out of the "
+            "rig file to calibrate the cameras alone, or give data.csv with the stamps of the images."
+        )
+
+    def has_corners(self, camera: Camera) -> bool:
+        return False
+
+    def corners(self, camera: Camera, target: Target) -> CornerStream:
+        raise RecordingError(f"{self.root} holds images of {camera.name}, not corners; find them in its images.")
+
+    def where(self, sensor: ImuSensor | Camera) -> str:
+        return str(self.root) if isinstance(sensor, ImuSensor) else f"{self.root}/{self.image_topic(sensor)}"
+
+    def files(self) -> list[Path]:
+        return list(self._read)
+
+    def notes(self) -> tuple[str, ...]:
+        return tuple(self._notes)
+
+    def _note(self, sentence: str) -> None:
+        if sentence not in self._notes:
+            self._notes.append(sentence)
+
+    def _info(self, name: str) -> TopicInfo:
+        try:
+            stamps = [stamp for stamp, _ in self._files(name)]
+        except RecordingError:  # a pattern may tell apart what one folder mixes
+            return TopicInfo(name, "pictures", "image", len(_pictures(self.root / name)), None, None)
+        return TopicInfo(name, "pictures", "image", len(stamps), stamps[0], stamps[-1])
+
+    def _files(self, topic: str) -> list[tuple[int, Path]]:
+        """Stamp and file of each picture, by number. Raises RecordingError where numbers are missing or repeat."""
+        if "*" in topic:
+            before, _, after = topic.partition("*")
+            paths = [p for p in self.root.glob(topic) if p.suffix.lower() in SUFFIXES]
+            keys = [str(p.relative_to(self.root))[len(before) : -len(after) or None] for p in paths]
+        else:
+            paths = _pictures(self.root / topic)
+            keys = [p.stem for p in paths]
+        if not paths:
+            raise RecordingError(f"{self.root} has no pictures {topic}; correct `topic` of the camera in the rig file.")
+        found = sorted((_number(key, p), p) for key, p in zip(keys, paths, strict=True))
+        for (a, first), (b, second) in zip(found, found[1:], strict=False):
+            if a == b:
+                raise RecordingError(
+                    f"{first} and {second.name} have the same number, {a}; give each picture of a camera its own."
+                )
+        return [(number * APART_NS, path) for number, path in found]
+
+
+def _topics(root: Path) -> list[str]:
+    folders = sorted(p.name for p in root.iterdir() if p.is_dir() and _pictures(p)) if root.is_dir() else []
+    return [*(["."] if _pictures(root) else []), *folders]
+
+
+def _pictures(folder: Path) -> list[Path]:
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES) if folder.is_dir() else []
+
+
+def _number(key: str, path: Path) -> int:
+    groups = re.findall(r"\d+", key)
+    if not groups or int(groups[-1]) > MOST:
+        raise RecordingError(
+            f"{path} has no number in its name that says which picture it is; call pictures 0001.jpg, 0002.jpg, ..., "
+            "the same number for those taken together."
+        )
+    return int(groups[-1])
