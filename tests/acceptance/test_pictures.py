@@ -1,4 +1,4 @@
-"""The stills of `aprilgrid_images`, from pictures to lenses, by the public function: no IMU, no clock, no first guess."""
+"""The stills of `aprilgrid_images`, from pictures to lenses: no IMU, no clock, no first guess."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_lenses_that_fit_leave_less_than_the_shipped_solutions(folder, aprilgrid
 
 
 def test_the_corners_in_the_image_are_more_than_two_radial_coefficients_follow(folder, aprilgrid_images):
-    """The pictures reach further into the corners of the image than the shipped detections; pinhole-radtan says so by its
+    """The pictures reach further into the corners of the image than the shipped detections; the model says so by its
     standard deviations."""
     result = calibrated("pinhole-radtan", folder, aprilgrid_images)
     T, std = result.T_imu_sensor("cam1"), result.group("cam1", "translation").std
