@@ -3,9 +3,18 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _own_cache(tmp_path_factory) -> Iterator[None]:
+    """Corners that tests find are not kept among the user's."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ICALIB_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
 
 
 def _recording(name: str) -> Path:

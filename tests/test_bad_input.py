@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gzip
 import re
 from collections.abc import Callable
@@ -16,6 +17,9 @@ from icalib.calibration import Calibration
 from icalib.cli import main
 from icalib.errors import CalibrationError
 from icalib.geometry import so3
+from icalib.pipeline import calibrate_measurements
+from icalib.rig import Settings
+from icalib.simulation import handheld, rig_for, simulate
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "euroc"
 SECONDS = 10
@@ -387,3 +391,11 @@ def test_the_error_class_of_all_these_is_one(tables, tmp_path):
     no_corners(tables)
     with pytest.raises(CalibrationError):
         calibrated(tables, tmp_path)
+
+
+def test_a_wrong_tag_spacing_is_warned_about():
+    simulation = simulate(handheld(8.0), 1)
+    rig = rig_for(simulation.scenario, settings=Settings(splits=0))
+    target = dataclasses.replace(rig.target, tag_spacing=0.25, tag_size=rig.target.tag_size * 1.3 / 1.25)
+    found = calibrate_measurements(dataclasses.replace(rig, target=target), simulation.measurements)
+    assert [w for w in found.warnings if "check tag_size and tag_spacing" in w]

@@ -36,6 +36,7 @@ UNITS = {
 }  # fmt: skip
 EXPECTED_CHI2 = (0.5, 2.0)  # chi^2 per post-fit degree of freedom outside this is worth a warning
 LARGE_FACTOR = 3.0
+LARGE_BLOOM_PX = 0.8  # ink and overexposure move edges by a third of that
 MANY_REJECTED = 0.05
 
 
@@ -213,6 +214,13 @@ def _warnings(
         if f.kind == "corners" and f.rejected > MANY_REJECTED * 0.5 * f.count:
             share = f.rejected / (f.rejected + 0.5 * f.count)
             yield f"{share:.0%} of the corners of {f.sensor} were set aside; look at its residuals in the report."
+    for g in groups:
+        if g.name == "bloom" and abs(g.value[0]) > LARGE_BLOOM_PX:
+            where = "in" if g.value[0] > 0.0 else "out"
+            yield (
+                f"the corners of {g.sensor} lie {abs(g.value[0]):.1f} px too far {where} on their tags, more than light "
+                "and ink do; check tag_size and tag_spacing (the gap over tag_size) of the target."
+            )
     judged_groups = (g for g in groups if g.mode != "fixed" and g.sensor != BOARD and g.name != "bloom")
     factors = [g.factor.max() for g in judged_groups if g.factor is not None]
     if factors and max(factors) > LARGE_FACTOR:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -24,14 +22,8 @@ target: {{type: aprilgrid, rows: 6, cols: 6, tag_size: 0.088, tag_spacing: 0.3}}
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Iterator[Path]:
-    """Where rigs are written and found corners are kept: four models look at the pictures once."""
-    path, before = tmp_path_factory.mktemp("pictures"), os.environ.get("ICALIB_CACHE")
-    os.environ["ICALIB_CACHE"] = str(path / "cache")
-    yield path
-    os.environ.pop("ICALIB_CACHE")
-    if before is not None:
-        os.environ["ICALIB_CACHE"] = before
+def folder(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("pictures")
 
 
 def calibrated(model: str, folder: Path, pictures: Path) -> Calibration:

@@ -28,7 +28,7 @@ class TargetPoses:
     rms_px: np.ndarray
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _homography(points, seen, centre, h):
     """H (9,) with seen ~ H (point - centre, 1), h33 = 1, by linear least squares. False where it is singular."""
     A, b, row = np.zeros((8, 8)), np.zeros(8), np.empty(8)
@@ -53,7 +53,7 @@ def _homography(points, seen, centre, h):
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _pose_from_homography(h, R, t):
     """R_cam_board and the position of the homography's centre in the camera, from columns of equal length."""
     n1 = np.sqrt(h[0] ** 2 + h[3] ** 2 + h[6] ** 2)
@@ -77,14 +77,14 @@ def _pose_from_homography(h, R, t):
         R[i, 2] = a[j] * b[k] - a[k] * b[j]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _normalise(v):
     n = np.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2)
     for i in range(3):
         v[i] /= n
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _move(turn, g, R, t):
     """R <- turn R, t <- turn t - g[3:]."""
     old, shift = R.copy(), t.copy()
@@ -94,7 +94,7 @@ def _move(turn, g, R, t):
             R[i, j] = turn[i, 0] * old[0, j] + turn[i, 1] * old[1, j] + turn[i, 2] * old[2, j]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _refine(points, seen, R, t, rounds, scale):
     """Gauss-Newton on x / z, y / z, Huber weights beyond `scale`; returns the last RMS error, errors capped at 4
     scale."""
@@ -133,7 +133,7 @@ def _refine(points, seen, R, t, rounds, scale):
     return rms
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _all_poses(start, point, rays, good, target, most, rounds, focal, rotation, position, rms):
     R, t, h, centre = np.empty((3, 3)), np.empty(3), np.empty(9), np.empty(2)
     points, seen = np.empty((most, 3)), np.empty((most, 2))
@@ -163,6 +163,9 @@ def _all_poses(start, point, rays, good, target, most, rounds, focal, rotation, 
         for k in range(3):
             t[k] -= R[k, 0] * centre[0] + R[k, 1] * centre[1]
         rms[i] = focal * _refine(points[:count], seen[:count], R, t, rounds, 2.0 / focal)
+        if not rms[i] < 1e9:  # corners on a line, or in one point
+            rms[i] = 1e9
+            continue
         for a in range(3):
             position[i, a] = -(R[0, a] * t[0] + R[1, a] * t[1] + R[2, a] * t[2])
             for b in range(3):
