@@ -218,8 +218,8 @@ def _warnings(
         if g.name == "bloom" and abs(g.value[0]) > LARGE_BLOOM_PX:
             where = "in" if g.value[0] > 0.0 else "out"
             yield (
-                f"the corners of {g.sensor} lie {abs(g.value[0]):.1f} px too far {where} on their tags, more than light "
-                "and ink do; check tag_size and tag_spacing (the gap over tag_size) of the target."
+                f"the corners of {g.sensor} lie {abs(g.value[0]):.1f} px too far {where} on their tags, more than "
+                "light and ink do; check tag_size and tag_spacing (the gap over tag_size) of the target."
             )
     judged_groups = (g for g in groups if g.mode != "fixed" and g.sensor != BOARD and g.name != "bloom")
     factors = [g.factor.max() for g in judged_groups if g.factor is not None]
