@@ -41,6 +41,13 @@ def _parser() -> argparse.ArgumentParser:
     c.add_argument("--splits", type=int, metavar="N", help="segments for the empirical factor; 0: none")
     c.add_argument("--quiet", "-q", action="store_true", help="no progress bar and no table")
     c.set_defaults(run=_calibrate)
+    c = commands.add_parser("inspect", help="say what is in a recording, and whether it can be calibrated")
+    c.add_argument("recording", type=Path, help="folder with the recording, or bag")
+    c.add_argument("--rig", type=Path, metavar="FILE", help="write a draft of the rig file; never over another file")
+    c.add_argument("--target", type=Path, metavar="FILE", help="YAML of the target, or a rig file: look for it")
+    c.add_argument("--json", type=Path, metavar="FILE", help="write the figures as JSON")
+    c.add_argument("--quiet", "-q", action="store_true", help="no progress bar and no table")
+    c.set_defaults(run=_inspect)
     return parser
 
 
@@ -64,3 +71,24 @@ def _calibrate(options: argparse.Namespace) -> None:
         write_outputs(result, options.output)
     if not options.quiet:
         print_result(result, options.output)
+
+
+def _inspect(options: argparse.Namespace) -> None:
+    from icalib.console import progress_bar
+    from icalib.inspection import draft_rig, inspect_recording, read_target, write_draft
+    from icalib.inspection.console import print_inspection
+    from icalib.inspection.draft import check_draft, write_whole
+    from icalib.inspection.figures import figures_json
+
+    if options.rig:
+        check_draft(options.rig)
+    target = read_target(options.target) if options.target else None
+    with progress_bar(options.quiet) as progress:
+        found = inspect_recording(options.recording, target, progress)
+    if not options.quiet:
+        print_inspection(found)
+    if options.json:
+        write_whole(options.json, figures_json(found))
+    if options.rig:
+        write_draft(draft_rig(found), options.rig)
+        print(f"Wrote {options.rig}, a draft: check it, then run icalib calibrate {options.rig} {options.recording}.")
