@@ -91,4 +91,7 @@ def _inspect(options: argparse.Namespace) -> None:
         write_whole(options.json, figures_json(found))
     if options.rig:
         write_draft(draft_rig(found), options.rig)
-        print(f"Wrote {options.rig}, a draft: check it, then run icalib calibrate {options.rig} {options.recording}.")
+        if not options.quiet:
+            print(
+                f"Wrote {options.rig}, a draft: check it, then icalib calibrate {options.rig} {options.recording} -o out"
+            )

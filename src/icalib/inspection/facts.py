@@ -76,7 +76,7 @@ class ImuFacts:
 
     mean_accel: mean of |accel|. gyro_rms: RMS of each axis; accel_std: RMS about the mean. principal_rms: RMS rate
     about the directions `principal` (unit vectors), from the strongest to the weakest. gravity_spread: see
-    `imu.gravity_spread`, for rates in rad/s and in deg/s.
+    `imu.gravity_spread`, for rates in rad/s, in deg/s, and for none.
     """
 
     frame: str
@@ -89,7 +89,7 @@ class ImuFacts:
     accel_std: Vector
     principal_rms: Vector
     principal: tuple[Vector, Vector, Vector]
-    gravity_spread: tuple[float, float] | None
+    gravity_spread: Vector | None
     saturated: tuple[Saturation, ...]
     notes: tuple[str, ...]
     problem: str = ""

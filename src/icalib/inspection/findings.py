@@ -16,7 +16,9 @@ SECOND_AXIS = 0.05  # of the strongest rotation; `calibrate` refuses less
 WEAK_M_S2 = 0.3  # RMS of the specific force about its mean
 FASTEST_RAD_S = 12.0  # a hand turns more slowly
 DEGREE = np.pi / 180.0
-LIKELIER = 0.7  # times less spread of gravity in deg/s: then they are
+LIKELIER = 0.7  # as much spread of gravity: then this unit it is
+EXPLAINED = 0.95  # as much spread as without any rotation: then it explains something
+CONTRARY = 1.2  # times the spread without any rotation: then the rates are those of another motion
 SHORT_S, FEWEST_IMAGES, FEWEST_SEEN = 20.0, 20, 0.3
 SLOWEST_IMAGES_HZ = 4.0  # images further apart than 0.25 s give no angular rate
 FLAT_DEG = 15.0
@@ -67,13 +69,20 @@ def _imu(found: Inspection) -> Iterator[Finding]:
     facts, name = found.imus[found.imu], found.imu
     yield from (Finding("warning", _capital(note)) for note in facts.notes)
     fast = max(*map(abs, facts.gyro_min), *map(abs, facts.gyro_max))
-    if facts.gravity_spread and facts.gravity_spread[1] < LIKELIER * facts.gravity_spread[0]:
+    radians, degrees, none = facts.gravity_spread or (0.0, 0.0, 0.0)
+    if degrees < LIKELIER * radians and degrees < EXPLAINED * none:
         yield Finding(
             "problem",
             f"{name}: the angular rates look like deg/s, for so they turn as gravity does in the accelerometer; "
             "multiply them by pi / 180.",
         )
         return
+    if radians > CONTRARY * none:
+        yield Finding(
+            "warning",
+            f"{name}: gravity does not turn in the accelerometer as the angular rates say; check that they are in rad/s "
+            "and that the driver gives both sensors in the same axes.",
+        )
     if fast > FASTEST_RAD_S:
         yield Finding(
             "warning",

@@ -79,9 +79,9 @@ def gravity_spread(imu: ImuStream, unit: float) -> float | None:
     return float(np.sqrt(((level - level.mean(axis=1, keepdims=True)) ** 2).sum(axis=2).mean()))
 
 
-def _spreads(imu: ImuStream) -> tuple[float, float] | None:
-    radians, degrees = gravity_spread(imu, 1.0), gravity_spread(imu, _DEGREE)
-    return None if radians is None or degrees is None else (radians, degrees)
+def _spreads(imu: ImuStream) -> Vector | None:
+    radians, degrees, none = (gravity_spread(imu, unit) for unit in (1.0, _DEGREE, 0.0))
+    return None if radians is None or degrees is None or none is None else (radians, degrees, none)
 
 
 def _vector(x: np.ndarray) -> Vector:
