@@ -92,6 +92,4 @@ def _inspect(options: argparse.Namespace) -> None:
     if options.rig:
         write_draft(draft_rig(found), options.rig)
         if not options.quiet:
-            print(
-                f"Wrote {options.rig}, a draft: check it, then icalib calibrate {options.rig} {options.recording} -o out"
-            )
+            print(f"Wrote {options.rig}, a draft: check it, and fill in what is missing.")

@@ -74,7 +74,7 @@ def test_a_draft_loads_once_the_target_is_filled_in(draft, bags):
     assert all(c.intrinsics.value is None for c in rig.cameras)
     assert (rig.imu.name, rig.imu.topic, rig.imu.noise.source) == ("imu0", "/imu0", "default for a consumer IMU")
     assert 'frame "left: eye"' in text and 'frame "imu_link"' in text
-    assert "ruler" in text and "default class" in text
+    assert "ruler" in text and "The default class" in text
 
 
 @pytest.mark.parametrize(

@@ -14,12 +14,14 @@ _ANSWERS = {
     "yes, but": Text("Yes, but not as well as it could be.", style="bold yellow"),
     "no": Text("No.", style="bold red"),
 }
+_UNSEEN = Text("Yes, as far as can be told without looking for the target.", style="bold green")
 
 
 def print_inspection(found: Inspection, console: Console | None = None) -> None:
     """On standard output."""
     out = console or Console()
-    out.print(Text("Can this be calibrated? ", style="bold") + _ANSWERS[found.verdict])
+    answer = _UNSEEN if found.verdict == "yes" and found.target is None else _ANSWERS[found.verdict]
+    out.print(Text("Can this be calibrated? ", style="bold") + answer)
     for f in found.findings:
         out.print(Text(f"  {f.severity}: ", style=STYLES[f.severity]) + Text(f.sentence))
     out.print()
@@ -43,7 +45,7 @@ def streams_table(found: Inspection) -> Table:
     names |= {t.name: name for name, t in found.sources.imus.items()}
     table = _table(
         f"Topics of {found.recording}",
-        ("topic", "type", "sensor", "count", "rate [Hz]", "jitter [ms]", "gaps", "longest [s]", "begin [s]", "end [s]"),
+        ("topic", "type", "sensor", "count", "rate [Hz]", "jitter [ms]", "gaps (longest)", "from to [s]"),
         right=3,
         caption=_caption(found),
     )
@@ -120,7 +122,8 @@ def _digit(count: int, most: int) -> str:
 def _table(title: str, headers: tuple[str, ...], right: int, caption: str) -> Table:
     table = Table(title=title, caption=caption, caption_justify="left", title_justify="left")
     for k, header in enumerate(headers):
-        table.add_column(Text(header), justify="right" if k >= right else "left", overflow="fold")
+        # What is looked up by its name, the first column, stays in one piece.
+        table.add_column(Text(header), justify="right" if k >= right else "left", overflow="fold", no_wrap=k == 0)
     return table
 
 
@@ -134,7 +137,7 @@ def _origin(found: Inspection) -> int | None:
 def _caption(found: Inspection) -> str:
     origin = _origin(found)
     text = "rate: of the median interval; gaps: intervals longer than 1.5 medians"
-    return text if origin is None else f"{text}; begin and end: by the stamps, after {origin} ns."
+    return text if origin is None else f"{text}; from, to: stamps after {origin} ns."
 
 
 def _type(found: Inspection, s: StreamFacts) -> str:
@@ -150,15 +153,14 @@ def _type(found: Inspection, s: StreamFacts) -> str:
 def _timing(s: StreamFacts, origin: int | None) -> tuple[str, ...]:
     t = s.timing
     if t is None:
-        return (str(s.topic.count), *[""] * 6)
-    after = [] if origin is None else [f"{(ns - origin) * 1e-9:.3f}" for ns in (t.first_ns, t.last_ns)]
+        return (str(s.topic.count), *[""] * 4)
+    ends = () if origin is None else (f"{(ns - origin) * 1e-9:.2f}" for ns in (t.first_ns, t.last_ns))
     return (
         str(s.topic.count),
         f"{t.rate_hz:.2f}" if t.rate_hz else "",
         f"{t.jitter_s * 1e3:.3f}" if t.jitter_s is not None else "",
-        str(t.gaps),
-        f"{t.longest_gap_s:.3f}" if t.longest_gap_s else "",
-        *after,
+        f"{t.gaps} ({t.longest_gap_s:.3f} s)" if t.longest_gap_s else "0",
+        " to ".join(ends),
     )
 
 

@@ -111,10 +111,12 @@ def _imu(found: Inspection) -> list[str]:
     kalibr = _kalibr_imu(found, topic.name)
     if kalibr is None:
         classes = ", ".join(IMU_CLASSES)
-        lines.append(
-            f"    noise: {DEFAULT_CLASS}  # the default class, a guess ({classes}); better: the densities of its data "
-            "sheet or Allan variance, {gyro: , gyro_walk: , accel: , accel_walk: }"
-        )
+        lines += [
+            f"    # The default class of {classes}. Better: the densities of the data sheet or of an Allan variance,",
+            "    # {gyro: , gyro_walk: , accel: , accel_walk: }, in rad/s/sqrt(Hz), rad/s^2/sqrt(Hz), m/s^2/sqrt(Hz),",
+            "    # m/s^3/sqrt(Hz).",
+            f"    noise: {DEFAULT_CLASS}",
+        ]
     else:
         noise = dataclasses.asdict(kalibr.noise)
         values = ", ".join(f"{k}: {_number(v)}" for k, v in noise.items() if k != "source")

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from icalib.inspection.facts import Inspection
+from icalib.inspection.facts import CameraSource, Inspection, StreamFacts
+from icalib.inspection.timing import overlap_s
 from icalib.inspection.views import GRID
 
 
@@ -33,7 +34,7 @@ def figures_json(found: Inspection) -> str:
     return json.dumps(figures(found), indent=1, allow_nan=False) + "\n"
 
 
-def _stream(stream: Any) -> dict[str, Any]:
+def _stream(stream: StreamFacts) -> dict[str, Any]:
     """One topic: what the index says of it, and its stamps."""
     topic = dataclasses.asdict(stream.topic)
     return topic | {"timing": _plain(stream.timing) or None, "problem": stream.problem}
@@ -48,9 +49,17 @@ def _camera(found: Inspection, name: str) -> dict[str, Any]:
         "corners": source.corners.name if source.corners else None,
         "others": list(source.others),
         **_plain(found.images.get(name)),
+        "overlap_with_imu_s": _overlap(found, source),
         "camera_info": _plain(info) or None,
         "target": (_plain(view) | {"grid": list(GRID)}) if view else None,
     }
+
+
+def _overlap(found: Inspection, source: CameraSource) -> float | None:
+    """How long the camera and the IMU both ran, by their stamps [s]; negative: how far they are apart."""
+    camera = found.stream(source.topic).timing
+    imu = found.stream(found.sources.imus[found.imu]).timing if found.imu else None
+    return overlap_s(camera, imu) if camera and imu else None
 
 
 def _target(found: Inspection) -> dict[str, Any] | None:

@@ -80,8 +80,8 @@ def _imu(found: Inspection) -> Iterator[Finding]:
     if radians > CONTRARY * none:
         yield Finding(
             "warning",
-            f"{name}: gravity does not turn in the accelerometer as the angular rates say; check that they are in rad/s "
-            "and that the driver gives both sensors in the same axes.",
+            f"{name}: gravity does not turn in the accelerometer as the angular rates say; check that they are in "
+            "rad/s and that the driver gives both sensors in the same axes.",
         )
     if fast > FASTEST_RAD_S:
         yield Finding(
