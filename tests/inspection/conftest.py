@@ -62,6 +62,16 @@ def imu_messages(topic: str, imu: ImuStream) -> list[Message]:
     return found
 
 
+def pose(topic: str, stamp_ns: int) -> Message:
+    origin = make("geometry_msgs/msg/Point", 0.0, 0.0, 0.0), make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
+    message = make("geometry_msgs/msg/PoseStamped", header(stamp_ns, "map"), make("geometry_msgs/msg/Pose", *origin))
+    return topic, "geometry_msgs/msg/PoseStamped", stamp_ns + DELAY, message
+
+
+def text(topic: str, received_ns: int) -> Message:
+    return topic, "std_msgs/msg/String", received_ns, make("std_msgs/msg/String", "hello")
+
+
 def noise_images(topic: str, size: tuple[int, int] = (32, 24), count: int = 50, frame: str = "lens") -> list[Message]:
     rng = np.random.default_rng(len(topic))
     return [
@@ -89,6 +99,8 @@ class Bags:
     camera_info: Callable[..., Message] = camera_info
     imu: Callable[[str, ImuStream], list[Message]] = imu_messages
     noise: Callable[..., list[Message]] = noise_images
+    pose: Callable[[str, int], Message] = pose
+    text: Callable[[str, int], Message] = text
     write: Callable[[Path, list[Message]], Path] = write_bag
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 from dataclasses import replace
@@ -10,10 +11,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from rich.console import Console
 
 from icalib.cli import main
 from icalib.geometry.targets import AprilGrid
 from icalib.inspection import Inspection, inspect_recording
+from icalib.inspection.console import print_inspection
 from icalib.inspection.facts import CameraSource
 from icalib.inspection.findings import empty_borders
 from icalib.inspection.views import coverage, target_view
@@ -157,7 +160,7 @@ def test_tilts_and_distances():
             return stream
 
     topic = TopicInfo("cam0/corners.csv", "table", "corners", 41, 0, 1)
-    view = target_view(Tables(), CameraSource("cam0", None, topic, None), TARGET, None, lambda _: None)
+    view = target_view(Tables(), CameraSource("cam0", topic, None, topic, None), TARGET, None, lambda _: None)
     assert view.tilt_deg == pytest.approx((4.0, 20.0, 36.0), abs=2.0)
     assert view.distance_ratio == pytest.approx(9.5 / 5.5, rel=0.05)
     assert view.images is None and view.cells is None
@@ -195,6 +198,18 @@ class TestStreams:
         assert any("The IMU ran for 3.0 s: record for 30 to 90 s." in s for s in sentences(found, "warning")), (
             found.findings
         )
+
+    def test_topics_of_no_sensor(self, bags, brief, tmp_path):
+        others = [bags.pose("/[bold]", bags.origin_ns + k * STEP) for k in range(5)]
+        others += [bags.text("/chatter", bags.origin_ns + k * STEP) for k in range(7)]
+        found = self.inspected(bags, tmp_path, others + bags.noise("/cam0/image_raw") + bags.imu("/imu0", brief))
+        by_name = {s.topic.name: s for s in found.streams}
+        timing = by_name["/[bold]"].timing
+        assert timing and timing.rate_hz == pytest.approx(20.0) and timing.first_ns == bags.origin_ns
+        assert (by_name["/chatter"].timing, by_name["/chatter"].topic.count) == (None, 7)
+        shown = io.StringIO()
+        print_inspection(found, Console(file=shown, width=80))
+        assert "/[bold]" in shown.getvalue() and max(map(len, shown.getvalue().splitlines())) <= 80
 
     def test_gaps(self, bags, brief, tmp_path):
         cut = np.delete(np.arange(600), np.s_[201:241])

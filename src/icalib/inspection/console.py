@@ -6,7 +6,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from icalib.inspection.facts import Inspection, StreamFacts, TargetView, Vector
+from icalib.inspection.facts import Inspection, StreamFacts, Vector
 
 STYLES = {"problem": "bold red", "warning": "yellow", "hint": "dim"}
 _ANSWERS = {
@@ -33,7 +33,7 @@ def print_inspection(found: Inspection, console: Console | None = None) -> None:
         for name, view in found.views.items():
             if view.cells:
                 out.print(Text(f"Corners over the image of {name} (. none, 1 to 9 the share of the fullest cell):"))
-                out.print(Text(coverage_map(view)))
+                out.print(Text(coverage_map(view.cells)))
     for note in found.notes + tuple(n for v in found.views.values() for n in v.notes):
         out.print(Text(f"Note: {note}"))
 
@@ -81,9 +81,8 @@ def imu_table(found: Inspection) -> Table:
 
 def target_table(found: Inspection) -> Table:
     """One row for each camera: where it saw the target."""
-    assert found.target is not None  # or there would be no views
     table = _table(
-        f"Target ({found.target.target.type} of {found.target.file})",
+        f"Target ({found.target.target.type} of {found.target.file})" if found.target else "",
         ("camera", "images", "with target", "corners", "cells covered", "tilt [deg]", "farthest / nearest"),
         right=1,
         caption="tilt: 10 to 90 % of the images, and distances: without intrinsics, so roughly.",
@@ -108,11 +107,10 @@ def target_table(found: Inspection) -> Table:
     return table
 
 
-def coverage_map(view: TargetView) -> str:
+def coverage_map(cells: tuple[tuple[int, ...], ...]) -> str:
     """The grid of cells as lines of text."""
-    assert view.cells is not None
-    most = max(max(row) for row in view.cells) or 1
-    return "\n".join("  " + " ".join(_digit(n, most) for n in row) for row in view.cells)
+    most = max(max(row) for row in cells) or 1
+    return "\n".join("  " + " ".join(_digit(n, most) for n in row) for row in cells)
 
 
 def _digit(count: int, most: int) -> str:

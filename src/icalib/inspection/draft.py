@@ -14,7 +14,6 @@ from typing import Any
 
 from icalib.errors import CalibrationError, RecordingError
 from icalib.geometry.cameras import CAMERA_MODELS
-from icalib.geometry.targets import Target
 from icalib.imu_classes import DEFAULT_CLASS, IMU_CLASSES
 from icalib.inspection.facts import CameraSource, Inspection
 from icalib.inspection.inspect import resolution_of
@@ -177,13 +176,9 @@ def _place(name: str, kind: str, frame: str) -> str:
 def _target(found: Inspection) -> str:
     if found.target is None:
         return _TEMPLATE
-    fields = ", ".join(f"{k}: {_field(v)}" for k, v in _fields(found.target.target).items())
+    target = found.target.target
+    fields = ", ".join(f"{k}: {_field(v)}" for k, v in ({"type": target.type} | dataclasses.asdict(target)).items())
     return f"# The target is from {_comment(found.target.file)}; check its sizes with a ruler.\ntarget: {{{fields}}}\n"
-
-
-def _fields(target: Target) -> dict[str, Any]:
-    assert dataclasses.is_dataclass(target)  # all targets are
-    return {"type": target.type} | dataclasses.asdict(target)
 
 
 def _field(value: Any) -> str:

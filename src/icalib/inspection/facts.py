@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from icalib.geometry.targets import Target
@@ -119,20 +119,14 @@ class TargetView:
 @dataclass(frozen=True)
 class CameraSource:
     """One camera: the topics of its images, of its corners (a table) and of its CameraInfo; others: more topics of the
-    same images."""
+    same images. topic: the corners where they were recorded, else the images, as `calibrate` takes them."""
 
     name: str
+    topic: TopicInfo
     images: TopicInfo | None
     corners: TopicInfo | None
     info: TopicInfo | None
     others: tuple[str, ...] = ()
-
-    @property
-    def topic(self) -> TopicInfo:
-        """Where its measurements come from."""
-        found = self.corners or self.images
-        assert found is not None  # a camera is made from one of them
-        return found
 
 
 @dataclass(frozen=True)
@@ -165,9 +159,9 @@ class Inspection:
     imus: Mapping[str, ImuFacts]
     imu: str | None
     target: GivenTarget | None
-    views: Mapping[str, TargetView]
     kalibr: KalibrFiles
-    notes: tuple[str, ...]
+    views: Mapping[str, TargetView] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
 
     @property

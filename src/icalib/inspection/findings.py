@@ -8,6 +8,7 @@ import numpy as np
 
 from icalib.inspection.facts import CameraSource, Finding, ImuFacts, Inspection, TargetView, Timing
 from icalib.inspection.timing import overlap_s
+from icalib.recordings import TopicInfo
 from icalib.recordings.topics import listing
 
 STILL_RAD_S = 0.03  # RMS: below it, nothing moved
@@ -141,7 +142,7 @@ def _clocks(found: Inspection) -> Iterator[Finding]:
         common = overlap_s(stream.timing, imu)
         whole = stream.timing.duration_s
         if common <= 0.0:
-            yield _apart(found, c, -common)
+            yield _apart(c, found.imu, found.sources.imus[found.imu], -common)
         elif common < 0.8 * whole:
             yield Finding(
                 "warning",
@@ -150,13 +151,11 @@ def _clocks(found: Inspection) -> Iterator[Finding]:
             )
 
 
-def _apart(found: Inspection, camera: CameraSource, apart_s: float) -> Finding:
+def _apart(camera: CameraSource, imu: str, topic: TopicInfo, apart_s: float) -> Finding:
     """A bag says when messages were received, by one clock, and so whether the two ran together."""
-    assert found.imu is not None
-    a, b = camera.topic, found.sources.imus[found.imu]
-    assert a.first_ns is not None and a.last_ns is not None and b.first_ns is not None and b.last_ns is not None
-    together = min(a.last_ns, b.last_ns) > max(a.first_ns, b.first_ns)
-    says = f"The clocks of {camera.name} and {found.imu} do not overlap, they are {_span(apart_s)} apart"
+    spans = [(t.first_ns or 0, t.last_ns or 0) for t in (camera.topic, topic)]
+    together = min(last for _, last in spans) > max(first for first, _ in spans)
+    says = f"The clocks of {camera.name} and {imu} do not overlap, they are {_span(apart_s)} apart"
     if together:
         return Finding(
             "warning",

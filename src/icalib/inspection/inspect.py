@@ -49,26 +49,19 @@ def inspect_recording(
             f"{path} holds no messages, images or tables; give a bag, or a folder with imu0/data.csv and cam0/data."
         )
     sources, kalibr = find_sources(topics), find_kalibr_files(Path(path))
-    if target is None and kalibr.target is not None:
-        target = GivenTarget(kalibr.target, kalibr.target_file, {})
+    target = target or _beside(kalibr)
     share = READING_SHARE if target else 1.0
     streams, images, imus = _read(recording, topics, sources, lambda what, done: progress(what, share * done))
-    found = Inspection(
-        recording=str(path),
-        sources=sources,
-        streams=streams,
-        images=images,
-        infos=_infos(recording, sources),
-        imus=imus,
-        imu=_choose(imus, sources, kalibr),
-        target=target,
-        views={},
-        kalibr=kalibr,
-        notes=(),
-    )
+    infos, imu = _infos(recording, sources), _choose(imus, sources, kalibr)
+    found = Inspection(str(path), sources, streams, images, infos, imus, imu, target, kalibr)
     views = _views(recording, found, lambda what, done: progress(what, share + (1.0 - share) * done))
     found = dataclasses.replace(found, views=views, notes=recording.notes() + kalibr.notes)
     return dataclasses.replace(found, findings=findings(found))
+
+
+def _beside(kalibr: KalibrFiles) -> GivenTarget | None:
+    """The target of Kalibr's file beside the recording."""
+    return GivenTarget(kalibr.target, kalibr.target_file, {}) if kalibr.target else None
 
 
 def resolution_of(found: Inspection, camera: CameraSource) -> tuple[int, int] | None:

@@ -78,7 +78,7 @@ def find_kalibr_files(recording: Path) -> KalibrFiles:
         data = yaml_mapping(path)
         try:
             if "target_type" in data:
-                targets[path.name] = kalibr_target(data, str(path))
+                targets[str(path)] = kalibr_target(data, str(path))
             else:
                 cameras += _read(path, data, "camera_model", _camera)
                 imus += _read(path, data, "gyroscope_noise_density", _imu)
@@ -88,7 +88,7 @@ def find_kalibr_files(recording: Path) -> KalibrFiles:
         notes.append(f"the targets {', '.join(targets)} beside the recording differ; give the right one as --target.")
         targets = {}
     file = next(iter(targets), "")
-    return KalibrFiles(tuple(cameras), tuple(imus), targets.get(file), file, tuple(notes))
+    return KalibrFiles(tuple(cameras), tuple(imus), targets.get(file), Path(file).name, tuple(notes))
 
 
 def kalibr_target(data: dict[str, Any], file: str) -> Target:
@@ -107,9 +107,18 @@ def kalibr_target(data: dict[str, Any], file: str) -> Target:
 
 
 def _yaml_files(recording: Path) -> list[Path]:
-    folders = [recording, recording.parent] if recording.is_dir() else [recording.parent]
-    found = [p for f in folders for p in sorted(f.iterdir()) if p.suffix in (".yaml", ".yml") and p.is_file()]
+    above = recording.resolve().parent
+    folders = [recording, above] if recording.is_dir() else [above]
+    found = [p for f in folders for p in _entries(f) if p.suffix in (".yaml", ".yml") and p.is_file()]
     return [p for p in found if p.stat().st_size <= _LARGEST_BYTES]
+
+
+def _entries(folder: Path) -> list[Path]:
+    """What lies in `folder`; nothing where that may not be seen."""
+    try:
+        return sorted(folder.iterdir())
+    except OSError:
+        return []
 
 
 def yaml_mapping(path: Path) -> dict[str, Any]:

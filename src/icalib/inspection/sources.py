@@ -43,7 +43,8 @@ def _camera(
     """Of several topics of the same images: the one that is not rectified, has most messages, is not compressed."""
     same = sorted(images.get(key, []), key=lambda t: ("rect" in t.name, -t.count, len(t.name)))
     table, info = corners.get(key, [None])[0], infos.get(key, [None])[0]
-    return CameraSource(name, same[0] if same else None, table, info, tuple(t.name for t in same[1:]))
+    others = tuple(t.name for t in same[1:])
+    return CameraSource(name, table or same[0], same[0] if same else None, table, info, others)
 
 
 def _by_key(topics: list[TopicInfo]) -> dict[Key, list[TopicInfo]]:
