@@ -158,6 +158,15 @@ def test_depth_images_and_odd_topics(draft, bags):
     assert "# Not used: /depth/image (depth images)" in text
 
 
+def test_a_camera_that_cannot_be_read_is_left_out(draft, bags):
+    pixels = np.ones((4, 4), np.uint8)
+    odd = [bags.image("/odd/image", bags.origin_ns + k, pixels, "32FC9") for k in range(3)]
+    text, path = draft(odd + bags.noise("/cam0/image_raw", SIZE))
+    fill(path)
+    assert [c.name for c in load_rig(path).cameras] == ["cam0"]
+    assert "# Not used: odd (" in text and "32FC9" in text
+
+
 def test_a_folder_of_tables_needs_its_resolution(tmp_path, capsys):
     example = Path(__file__).parents[2] / "examples" / "euroc" / "recording"
     path = tmp_path / "rig.yaml"
@@ -205,9 +214,9 @@ def test_a_folder_that_is_not_there(tmp_path):
         write_draft("draft", tmp_path / "away" / "rig.yaml")
 
 
-@pytest.mark.parametrize("kind", ["camera", "IMU"])
+@pytest.mark.parametrize("kind", ["camera that can be read", "IMU"])
 def test_no_draft_without_camera_or_imu(kind, bags, brief, tmp_path, capsys):
-    messages = bags.imu("/imu0", brief) if kind == "camera" else bags.noise("/cam0/image_raw", SIZE)
+    messages = bags.imu("/imu0", brief) if kind == "camera that can be read" else bags.noise("/cam0/image_raw", SIZE)
     bag = bags.write(tmp_path / "run", messages)
     assert main(["inspect", str(bag), "--rig", str(tmp_path / "rig.yaml"), "-q"]) == 1
     assert f"holds no {kind}, so there is no rig to draft" in capsys.readouterr().err

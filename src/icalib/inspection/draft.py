@@ -38,7 +38,9 @@ target:
 
 def draft_rig(found: Inspection) -> str:
     """The text of a rig file. Raises RecordingError where there is no camera or no IMU to write down."""
-    missing = "camera" if not found.sources.cameras else "IMU" if not found.sources.imus else ""
+    broken = {c.name: problem for c in found.sources.cameras if (problem := found.stream(c.topic).problem)}
+    cameras = [c for c in found.sources.cameras if c.name not in broken]
+    missing = "camera that can be read" if not cameras else "IMU" if not found.sources.imus else ""
     if missing:
         raise RecordingError(f"{found.recording} holds no {missing}, so there is no rig to draft; record it, too.")
     lines = [
@@ -47,9 +49,10 @@ def draft_rig(found: Inspection) -> str:
         "sensors:",
         *_imu(found),
     ]
-    for camera in found.sources.cameras:
+    for camera in cameras:
         lines += _camera(found, camera)
-    lines += [f"  # Not used: {topic} ({_comment(why)})" for topic, why in found.sources.left_out.items()]
+    left_out = {**broken, **found.sources.left_out}
+    lines += [f"  # Not used: {_comment(topic)} ({_comment(why)})" for topic, why in left_out.items()]
     return "\n".join([*lines, _target(found)])
 
 

@@ -20,8 +20,8 @@ DEGREE = np.pi / 180.0
 LIKELIER = 0.7  # as much spread of gravity: then this unit it is
 EXPLAINED = 0.95  # as much spread as without any rotation: then it explains something
 CONTRARY = 1.2  # times the spread without any rotation: then the rates are those of another motion
-SHORT_S, FEWEST_IMAGES, FEWEST_SEEN = 20.0, 20, 0.3
-SLOWEST_IMAGES_HZ = 4.0  # images further apart than 0.25 s give no angular rate
+SHORT_S, LEAST_SEEN = 20.0, 0.3
+FEWEST_IMAGES, SLOWEST_IMAGES_HZ = 21, 4.0  # `calibrate` needs 20 pairs of images no more than 0.25 s apart
 FLAT_DEG = 15.0
 EMPTY_EDGE = 0.5  # share of empty cells along an edge of the image from which on it counts as empty
 _ORDER = ("problem", "warning", "hint")
@@ -45,11 +45,10 @@ def _missing(found: Inspection) -> Iterator[Finding]:
 
 
 def _broken(found: Inspection) -> Iterator[Finding]:
-    """Sensors that cannot be read are a problem where no other can take their place."""
-    good = [c for c in found.sources.cameras if c.corners or not found.stream(c.topic).problem]
-    for c in found.sources.cameras:
-        if c not in good:
-            yield Finding("warning" if good else "problem", found.stream(c.topic).problem)
+    """Sensors that cannot be used are a problem where no other can take their place."""
+    reasons = [reason for c in found.sources.cameras if (reason := _unfit(found, c))]
+    alone = len(reasons) == len(found.sources.cameras)
+    yield from (Finding("problem" if alone else "warning", reason) for reason in reasons)
     for name, topic in found.sources.imus.items():
         stream = found.stream(topic)
         if stream.problem:
@@ -62,6 +61,23 @@ def _broken(found: Inspection) -> Iterator[Finding]:
                 f"{name}: {images.damaged} of {images.decoded} images that were looked at cannot be decoded; they are "
                 "left out: check the disk and the network of the recorder.",
             )
+
+
+def _unfit(found: Inspection, camera: CameraSource) -> str:
+    """Why `calibrate` would refuse the camera; empty where it would not."""
+    stream, view, name = found.stream(camera.topic), found.views.get(camera.name), camera.name
+    timing = stream.timing
+    if stream.problem or timing is None:
+        return stream.problem
+    if view is not None and view.problem:
+        return view.problem
+    if timing.count < FEWEST_IMAGES:
+        return f"{name} has {timing.count} images, too few: record for 30 to 90 s, with 10 to 30 images a second."
+    if timing.rate_hz and timing.rate_hz < SLOWEST_IMAGES_HZ:
+        return f"{name} takes {timing.rate_hz:.2g} images a second, too few to follow its motion: record 10 to 30."
+    if view is not None and view.seen < FEWEST_IMAGES:
+        return f"{name} sees the target in {view.seen} images, too few: keep it in view for 30 to 90 s."
+    return ""
 
 
 def _imu(found: Inspection) -> Iterator[Finding]:
@@ -181,19 +197,8 @@ def _streams(found: Inspection) -> Iterator[Finding]:
         yield Finding("warning", f"{found.imu} has {_gaps(imu)}: check the load of the recorder and the bus.")
     for c in found.sources.cameras:
         timing = found.stream(c.topic).timing
-        if timing is None or found.stream(c.topic).problem:
-            continue
-        if timing.count < FEWEST_IMAGES:
-            yield Finding(
-                "warning", f"{c.name} has {timing.count} images: record for 30 to 90 s, with 10 to 30 images a second."
-            )
-        elif timing.rate_hz and timing.rate_hz < SLOWEST_IMAGES_HZ:
-            yield Finding(
-                "problem",
-                f"{c.name} takes {timing.rate_hz:.2g} images a second, too few to follow its motion: record 10 to 30.",
-            )
         # Images without the target are no gaps in the camera's work, so tables of corners are not judged.
-        if timing.gaps and not c.corners:
+        if timing is not None and timing.gaps and not c.corners:
             yield Finding("hint", f"{c.name} has {_gaps(timing)}.")
 
 
@@ -212,16 +217,13 @@ def _target(found: Inspection) -> Iterator[Finding]:
     if found.target is None:
         yield Finding("hint", "No target is known, so the images were not searched for it: give --target FILE.")
         return
-    blind = [v for v in found.views.values() if v.problem]
-    for v in blind:
-        yield Finding("problem" if len(blind) == len(found.views) else "warning", v.problem)
     for v in found.views.values():
         if not v.problem:
             yield from _view(v)
 
 
 def _view(v: TargetView) -> Iterator[Finding]:
-    if v.images and v.seen < FEWEST_SEEN * v.images:
+    if v.images and v.seen < LEAST_SEEN * v.images:
         yield Finding(
             "warning",
             f"{v.camera} sees the target in {v.seen} of {v.images} images ({v.seen / v.images:.0%}): keep it in view.",
