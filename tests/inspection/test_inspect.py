@@ -15,10 +15,10 @@ from rich.console import Console
 
 from icalib.cli import main
 from icalib.geometry.targets import AprilGrid
-from icalib.inspection import Inspection, inspect_recording
+from icalib.inspection import Inspection, inspect_recording, read_target
 from icalib.inspection.console import print_inspection
 from icalib.inspection.facts import CameraSource
-from icalib.inspection.findings import empty_borders
+from icalib.inspection.findings import empty_borders, findings
 from icalib.inspection.views import coverage, target_view
 from icalib.measurements import CornerStream
 from icalib.recordings import TopicInfo
@@ -107,7 +107,7 @@ class TestTarget:
         )
         found = inspect_recording(bag)
         assert found.verdict == "no"
-        assert any("the target of the rig file is in none of 4 images of cam0; check" in s for s in sentences(found))
+        assert any("the target is in none of 4 images of cam0; check" in s for s in sentences(found))
 
     @pytest.mark.parametrize(
         ("text", "words"),
@@ -178,6 +178,31 @@ def test_the_example_that_comes_with_icalib(tmp_path, capsys):
     assert [t["timing"]["rate_hz"] for t in figures["topics"]] == pytest.approx([20.0, 20.0, 200.0], rel=1e-3)
     assert figures["imus"]["imu0"]["mean_accel"] == pytest.approx(9.9, abs=0.3)
     assert figures["cameras"]["cam1"]["target"]["seen"] == 720
+
+
+@pytest.fixture(scope="module")
+def example() -> Inspection:
+    return inspect_recording(EXAMPLE / "recording", read_target(EXAMPLE / "rig.yaml"))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"seen": 20}, "cam1 sees the target in 20 images, too few"),
+        ({"images": 2900}, r"cam1 sees the target in 720 of 2900 images \(25%\): keep it in view"),
+        ({"tilt_deg": (1.0, 2.0, 3.0)}, r"cam1 sees the target nearly from the front only \(tilts up to about 3 deg\)"),
+        ({"cells": ((0,) * 8, *((1,) * 8,) * 4)}, "cam1 never sees the target at the top edge of the image"),
+        ({"problem": "cam1 is broken."}, "cam1 is broken"),
+    ],
+)
+def test_a_camera_that_hardly_sees_the_target(change, words, example):
+    """One of two, so a warning; both, so no calibration can be made where one would be refused."""
+    one = replace(example, views=dict(example.views, cam1=replace(example.views["cam1"], **change)))
+    (finding,) = findings(one)
+    assert finding.severity == "warning" and re.search(words, finding.sentence)
+    both = replace(example, views={n: replace(v, **change) for n, v in one.views.items()})
+    refused = "seen" in change or "problem" in change
+    assert {f.severity for f in findings(both)} == {"problem" if refused else "warning"}
 
 
 class TestStreams:
