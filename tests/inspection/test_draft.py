@@ -199,6 +199,22 @@ def test_a_file_that_appears_meanwhile_is_kept(tmp_path):
     assert [p.read_text() for p in tmp_path.iterdir()] == ["mine"]
 
 
+@pytest.mark.parametrize("there", [False, True])
+def test_a_file_system_without_links(there, tmp_path, monkeypatch):
+    def no_link(*_):
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", no_link)
+    path = tmp_path / "rig.yaml"
+    if there:
+        path.write_text("mine")
+        with pytest.raises(CalibrationError, match=r"rig\.yaml exists"):
+            write_draft("draft", path)
+    else:
+        write_draft("draft", path)
+    assert [p.read_text() for p in tmp_path.iterdir()] == ["mine" if there else "draft"]
+
+
 def test_the_file_is_whole_and_readable_by_others(tmp_path):
     before = os.umask(0o022)
     try:

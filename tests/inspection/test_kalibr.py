@@ -116,6 +116,11 @@ def test_checkerboard(tmp_path):
         ("imu", IMU.replace("1.87e-04", "'none'"), r"imu\.yaml: gyroscope_noise_density must be a number above 0"),
         ("grid", APRILGRID.replace("0.088", "-1"), r"grid\.yaml: tagSize must be a number above 0"),
         ("grid", APRILGRID.replace("6  ", "6.5"), r"grid\.yaml: tagCols must be a whole number"),
+        (
+            "board",
+            "{target_type: checkerboard, targetRows: 6, targetCols: 7, rowSpacingMeters: 0.06, colSpacingMeters: 0.05}",
+            r"board\.yaml: rowSpacingMeters and colSpacingMeters differ",
+        ),
         ("grid", APRILGRID.replace("aprilgrid'", "circlegrid'"), r"does not know the target_type 'circlegrid'"),
     ],
 )

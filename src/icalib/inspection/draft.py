@@ -86,7 +86,7 @@ def write_whole(path: Path, text: str, replace: bool = True) -> None:
         if replace:
             part.replace(path)
         else:
-            os.link(part, path)  # unlike a rename, fails where the name is taken
+            _link(part, path, text)
     except FileExistsError:
         raise
     except OSError as error:
@@ -97,6 +97,17 @@ def write_whole(path: Path, text: str, replace: bool = True) -> None:
         if part is not None:
             with contextlib.suppress(OSError):
                 part.unlink()
+
+
+def _link(part: Path, path: Path, text: str) -> None:
+    """Gives `part` the name `path`; unlike a rename, this fails where the name is taken."""
+    try:
+        os.link(part, path)
+    except FileExistsError:
+        raise
+    except OSError:  # a file system without links
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
 
 
 def _umask() -> int:
