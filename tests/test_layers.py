@@ -25,6 +25,7 @@ LEVELS = {
     "rig_file": 3,
     "recordings": 2,
     "detection": 3,
+    "inspection": 4,
     "simulation": 2,
     "printing": 2,
     "estimation": 3,

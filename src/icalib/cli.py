@@ -34,15 +34,26 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     c = commands.add_parser("calibrate", help="calibrate the sensors of a rig from a recording")
     c.add_argument("rig", type=Path, help="rig file (rig.yaml)")
-    c.add_argument("recording", type=Path, help="folder with the recording, or bag")
+    c.add_argument("recording", type=Path, help="folder of the recording, or bag")
     c.add_argument("--output", "-o", type=Path, required=True, help="folder for the results; made if it does not exist")
     c.add_argument("--scheme", choices=("inertial", "pose", "kinematic"), help="where sensors are between nodes")
     c.add_argument("--loss", choices=("none", "huber", "cauchy"), help="robust loss on corners")
     c.add_argument("--splits", type=int, metavar="N", help="segments for the empirical factor; 0: none")
     c.add_argument("--quiet", "-q", action="store_true", help="no progress bar and no table")
     c.set_defaults(run=_calibrate)
+    _add_inspect(commands)
     _add_target(commands)
     return parser
+
+
+def _add_inspect(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    c = commands.add_parser("inspect", help="say what is in a recording, and whether it can be calibrated")
+    c.add_argument("recording", type=Path, help="folder of the recording, or bag")
+    c.add_argument("--rig", type=Path, metavar="FILE", help="write a draft of the rig file; never over another file")
+    c.add_argument("--target", type=Path, metavar="FILE", help="YAML of the target, or a rig file: look for it")
+    c.add_argument("--json", type=Path, metavar="FILE", help="write the figures as JSON")
+    c.add_argument("--quiet", "-q", action="store_true", help="no progress bar and no table")
+    c.set_defaults(run=_inspect)
 
 
 def _add_target(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -127,3 +138,25 @@ def _calibrate(options: argparse.Namespace) -> None:
         write_outputs(result, options.output)
     if not options.quiet:
         print_result(result, options.output)
+
+
+def _inspect(options: argparse.Namespace) -> None:
+    from icalib.console import progress_bar
+    from icalib.inspection import draft_rig, inspect_recording, read_target, write_draft
+    from icalib.inspection.console import print_inspection
+    from icalib.inspection.draft import check_draft, write_whole
+    from icalib.inspection.figures import figures_json
+
+    if options.rig:
+        check_draft(options.rig)
+    target = read_target(options.target) if options.target else None
+    with progress_bar(options.quiet) as progress:
+        found = inspect_recording(options.recording, target, progress)
+    if not options.quiet:
+        print_inspection(found)
+    if options.json:
+        write_whole(options.json, figures_json(found))
+    if options.rig:
+        write_draft(draft_rig(found), options.rig)
+        if not options.quiet:
+            print(f"Wrote {options.rig}, a draft: check it, and fill in what is missing.")

@@ -46,6 +46,15 @@ def load_rig(path: str | Path) -> Rig:
     )
 
 
+def load_target(path: str | Path) -> Target:
+    """Read a target: a YAML file with the fields of the rig file's `target`, or one that has a `target`.
+
+    Raises RigError, one sentence naming file, line, field, what is wrong and what to do.
+    """
+    root = read_yaml(Path(path))
+    return _target(root.entries().get("target", root))
+
+
 def rig_to_dict(rig: Rig) -> dict[str, Any]:
     """`rig` as lists, numbers and text; written as YAML or JSON, it loads back as the same rig."""
     imus = {} if rig.imu is None else {rig.imu.name: _imu_to_plain(rig.imu)}

@@ -51,7 +51,7 @@ def find_corners(
     stamps_ns, images = found
     if not any(i.kept.any() for i in images):
         raise RecordingError(
-            f"{where}: the target of the rig file is in none of {len(images)} images of {camera.name}; "
+            f"{where}: the target is in none of {len(images)} images of {camera.name}; "
             + _seen_instead(recording, topic, target)
         )
     return corner_stream(camera.name, stamps_ns, images), _notes(where, images)

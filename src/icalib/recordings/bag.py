@@ -18,7 +18,7 @@ from icalib.recordings.bags.storage import Tally
 from icalib.recordings.extras import load_typesys, load_zstd
 from icalib.recordings.image_checks import checked_payloads, frames
 from icalib.recordings.images import Frame, Payload, file_payload
-from icalib.recordings.topics import KINDS, TopicInfo, choose_topic
+from icalib.recordings.topics import KINDS, TopicInfo, choose_topic, find_topic
 from icalib.rig import Camera, ImuSensor
 
 _SWAPPED_NS = 1_000_000_000  # readings overtake each other on the network by less; more is a clock that was set back
@@ -35,6 +35,12 @@ class BagRecording:
 
     def topics(self) -> tuple[TopicInfo, ...]:
         return self._topics
+
+    def stamps(self, topic: str) -> np.ndarray:
+        chosen = find_topic(str(self.root), self._topics, topic)
+        if not chosen.kind:
+            raise RecordingError(f"{self.root}: icalib does not read {chosen.type}; choose another topic than {topic}.")
+        return np.array([stamp_ns for stamp_ns, _ in self._messages(chosen)], np.int64)
 
     def image_topic(self, camera: Camera) -> str:
         return choose_topic(str(self.root), self._topics, "image", camera.name, camera.topic).name

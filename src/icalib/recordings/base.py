@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Protocol
 
+import numpy as np
+
 from icalib.geometry.targets import Target
 from icalib.measurements import CornerStream, ImuStream
 from icalib.recordings.images import Frame, Payload
@@ -18,6 +20,13 @@ class Recording(Protocol):
 
     def topics(self) -> tuple[TopicInfo, ...]:
         """What there is, by name."""
+        ...
+
+    def stamps(self, topic: str) -> np.ndarray:
+        """(N,) int64: the stamps of all messages of `topic`, as they were written; of corners, one for each image.
+
+        Raises RecordingError where there is no such topic, icalib does not read its kind, or a message is damaged.
+        """
         ...
 
     def image_topic(self, camera: Camera) -> str:

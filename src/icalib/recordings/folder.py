@@ -52,6 +52,15 @@ class FolderRecording:
                 found.append(_info(f"{folder.name}/corners.csv", "table of corners", "corners", stamps_ns))
         return tuple(found)
 
+    def stamps(self, topic: str) -> np.ndarray:
+        chosen = find_topic(str(self.root), self.topics(), topic)
+        if chosen.kind == "image":
+            folder = next(p for base in self._bases() if (p := base / chosen.name).is_dir())
+            return np.array([stamp_ns for stamp_ns, _ in image_files(folder)], np.int64)
+        if chosen.kind == "imu":
+            return read_table(self._locate(chosen.name), _IMU_STAMP, _IMU_DECIMALS).integers[:, 0].copy()
+        return np.unique(read_table(self._locate(chosen.name), _CORNER_INTEGERS, _CORNER_DECIMALS).integers[:, 0])
+
     def image_topic(self, camera: Camera) -> str:
         return choose_topic(str(self.root), self._image_topics(), "image", camera.name, camera.topic).name
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from icalib.errors import RecordingError
@@ -15,6 +17,17 @@ _GRAVITY_M_S2 = (5.0, 20.0)
 _SATURATED_RUN = 5
 # No sensor's range is narrower (125 deg/s, 2 g); below it, equal readings are coarse quantisation, not saturation.
 _NARROWEST_RANGE = {"gyroscope": 2.0, "accelerometer": 17.0}
+
+
+@dataclass(frozen=True)
+class Saturation:
+    """count readings in a row at `limit` [rad/s or m/s^2] from stamp_ns on; kind: gyroscope or accelerometer."""
+
+    kind: str
+    axis: str  # x, y or z
+    limit: float
+    count: int
+    stamp_ns: int
 
 
 def checked_imu(imu: ImuStream, where: str) -> tuple[ImuStream, tuple[str, ...]]:
@@ -94,17 +107,23 @@ def _refuse_units(imu: ImuStream, what: str) -> None:
 
 
 def _saturation_notes(imu: ImuStream, what: str) -> tuple[str, ...]:
-    notes = []
+    return tuple(
+        f"{what}: the {s.kind} {s.axis} looks saturated, {s.count} readings in a row at {s.limit:.4g} "
+        f"from {s.stamp_ns} ns on; move less quickly or set a wider range."
+        for s in saturations(imu)
+    )
+
+
+def saturations(imu: ImuStream) -> tuple[Saturation, ...]:
+    """Where readings sit at the largest or smallest value of their axis, the longest run of each."""
+    found: list[Saturation] = []
     for kind, values in (("gyroscope", imu.gyro), ("accelerometer", imu.accel)):
         for axis, name in enumerate("xyz"):
             for limit in (values[:, axis].max(), values[:, axis].min()):
                 at, count = _longest_run(values[:, axis] == limit)
                 if abs(limit) >= _NARROWEST_RANGE[kind] and count >= _SATURATED_RUN:
-                    notes.append(
-                        f"{what}: the {kind} {name} looks saturated, {count} readings in a row at {limit:.4g} "
-                        f"from {imu.stamps_ns[at]} ns on; move less quickly or set a wider range."
-                    )
-    return tuple(notes)
+                    found.append(Saturation(kind, name, float(limit), count, int(imu.stamps_ns[at])))
+    return tuple(found)
 
 
 def _longest_run(flag: np.ndarray) -> tuple[int, int]:

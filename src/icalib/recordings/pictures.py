@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import final
 
+import numpy as np
+
 from icalib.errors import RecordingError
 from icalib.geometry.targets import Target
 from icalib.measurements import CornerStream, ImuStream
@@ -43,6 +45,9 @@ class PictureFolder:
 
     def topics(self) -> tuple[TopicInfo, ...]:
         return tuple(self._info(name) for name in _topics(self.root))
+
+    def stamps(self, topic: str) -> np.ndarray:
+        return np.array([stamp for stamp, _ in self._files(topic)], np.int64)
 
     def image_topic(self, camera: Camera) -> str:
         if camera.topic is not None and "*" in camera.topic:

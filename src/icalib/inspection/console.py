@@ -1,0 +1,166 @@
+"""An inspection on the terminal: first whether it can be calibrated, then the figures."""
+
+from __future__ import annotations
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from icalib.inspection.facts import Inspection, StreamFacts, Vector
+
+STYLES = {"problem": "bold red", "warning": "yellow", "hint": "dim"}
+_ANSWERS = {
+    "yes": Text("Yes.", style="bold green"),
+    "yes, but": Text("Yes, but not as well as it could be.", style="bold yellow"),
+    "no": Text("No.", style="bold red"),
+}
+_UNSEEN = Text("Yes, as far as can be told without looking for the target.", style="bold green")
+
+
+def print_inspection(found: Inspection, console: Console | None = None) -> None:
+    """On standard output."""
+    out = console or Console()
+    answer = _UNSEEN if found.verdict == "yes" and found.target is None else _ANSWERS[found.verdict]
+    out.print(Text("Can this be calibrated? ", style="bold") + answer)
+    for f in found.findings:
+        out.print(Text(f"  {f.severity}: ", style=STYLES[f.severity]) + Text(f.sentence))
+    out.print()
+    out.print(streams_table(found))
+    if found.imus:
+        out.print(imu_table(found))
+    if found.views:
+        out.print(target_table(found))
+        for name, view in found.views.items():
+            if view.cells:
+                out.print(Text(f"Corners over the image of {name} (. none, 1 to 9 the share of the fullest cell):"))
+                out.print(Text(coverage_map(view.cells)))
+    for note in found.notes + tuple(n for v in found.views.values() for n in v.notes):
+        out.print(Text(f"Note: {note}"))
+
+
+def streams_table(found: Inspection) -> Table:
+    """One row for each topic."""
+    names = {c.images.name: c.name for c in found.sources.cameras if c.images}
+    names |= {c.corners.name: c.name for c in found.sources.cameras if c.corners}
+    names |= {t.name: name for name, t in found.sources.imus.items()}
+    table = _table(
+        f"Topics of {found.recording}",
+        ("topic", "type", "sensor", "count", "rate [Hz]", "jitter [ms]", "gaps (longest)", "from to [s]"),
+        right=3,
+        caption=_caption(found),
+    )
+    origin = _origin(found)
+    for s in found.streams:
+        table.add_row(*map(Text, (s.topic.name, _type(found, s), names.get(s.topic.name, ""), *_timing(s, origin))))
+    return table
+
+
+def imu_table(found: Inspection) -> Table:
+    """One row for each axis of each IMU."""
+    table = _table(
+        "IMU",
+        ("sensor", "axis", "gyro [rad/s]", "RMS", "accel [m/s^2]", "RMS about mean", "saturated"),
+        right=2,
+        caption="; ".join(f"{n}: mean |accel| {f.mean_accel:.2f} m/s^2" for n, f in found.imus.items()),
+    )
+    for name, f in found.imus.items():
+        for k, axis in enumerate("xyz"):
+            saturated = ", ".join(f"{s.kind} at {s.limit:.4g}" for s in f.saturated if s.axis == axis)
+            cells = (
+                name if k == 0 else "",
+                axis,
+                _range(f.gyro_min, f.gyro_max, k),
+                f"{f.gyro_rms[k]:.3f}",
+                _range(f.accel_min, f.accel_max, k),
+                f"{f.accel_std[k]:.2f}",
+                saturated or "no",
+            )
+            table.add_row(*map(Text, cells), end_section=k == 2)
+    return table
+
+
+def target_table(found: Inspection) -> Table:
+    """One row for each camera: where it saw the target."""
+    table = _table(
+        f"Target ({found.target.target.type} of {found.target.file})" if found.target else "",
+        ("camera", "images", "with target", "corners", "cells covered", "tilt [deg]", "farthest / nearest"),
+        right=1,
+        caption="tilt: 10 to 90 % of the images, and distances: without intrinsics, so roughly.",
+    )
+    for name, v in found.views.items():
+        share = f" ({v.seen / v.images:.0%})" if v.images else ""
+        filled = sum(n > 0 for row in v.cells for n in row) if v.cells else None
+        table.add_row(
+            *map(
+                Text,
+                (
+                    name,
+                    "" if v.images is None else str(v.images),
+                    f"{v.seen}{share}",
+                    str(v.corners),
+                    f"{filled} of {len(v.cells) * len(v.cells[0])}" if v.cells else "",
+                    f"{v.tilt_deg[0]:.0f} to {v.tilt_deg[2]:.0f}" if v.tilt_deg else "",
+                    f"{v.distance_ratio:.1f}" if v.distance_ratio else "",
+                ),
+            )
+        )
+    return table
+
+
+def coverage_map(cells: tuple[tuple[int, ...], ...]) -> str:
+    """The grid of cells as lines of text."""
+    most = max(max(row) for row in cells) or 1
+    return "\n".join("  " + " ".join(_digit(n, most) for n in row) for row in cells)
+
+
+def _digit(count: int, most: int) -> str:
+    return str(max(1, round(9 * count / most))) if count else "."
+
+
+def _table(title: str, headers: tuple[str, ...], right: int, caption: str) -> Table:
+    table = Table(title=title, caption=caption, caption_justify="left", title_justify="left")
+    for k, header in enumerate(headers):
+        # What is looked up by its name, the first column, stays in one piece.
+        table.add_column(Text(header), justify="right" if k >= right else "left", overflow="fold", no_wrap=k == 0)
+    return table
+
+
+def _origin(found: Inspection) -> int | None:
+    """The first stamp of all cameras and IMUs."""
+    sensors = {t.name for t in found.sources.imus.values()} | {c.topic.name for c in found.sources.cameras}
+    stamps = [s.timing.first_ns for s in found.streams if s.timing and s.topic.name in sensors]
+    return min(stamps, default=None)
+
+
+def _caption(found: Inspection) -> str:
+    origin = _origin(found)
+    text = "rate: of the median interval; gaps: intervals longer than 1.5 medians"
+    return text if origin is None else f"{text}; from, to: stamps after {origin} ns."
+
+
+def _type(found: Inspection, s: StreamFacts) -> str:
+    """The type, and of images resolution and encoding."""
+    name = next((c.name for c in found.sources.cameras if c.images and c.images.name == s.topic.name), "")
+    facts = found.images.get(name)
+    kind = s.topic.type.removeprefix("sensor_msgs/msg/")
+    if facts is None or facts.resolution is None:
+        return kind
+    return f"{kind}, {facts.resolution[0]} x {facts.resolution[1]} {facts.encoding}"
+
+
+def _timing(s: StreamFacts, origin: int | None) -> tuple[str, ...]:
+    t = s.timing
+    if t is None:
+        return (str(s.topic.count), *[""] * 4)
+    ends = () if origin is None else (f"{(ns - origin) * 1e-9:.2f}" for ns in (t.first_ns, t.last_ns))
+    return (
+        str(s.topic.count),
+        f"{t.rate_hz:.2f}" if t.rate_hz else "",
+        f"{t.jitter_s * 1e3:.3f}" if t.jitter_s is not None else "",
+        f"{t.gaps} ({t.longest_gap_s:.3f} s)" if t.longest_gap_s else "0",
+        " to ".join(ends),
+    )
+
+
+def _range(low: Vector, high: Vector, k: int) -> str:
+    return f"{low[k]:.2f} to {high[k]:.2f}"

@@ -1,0 +1,215 @@
+"""A first rig file for a recording: what is known is filled in and says where it is from, the rest is left to fill."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import re
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from icalib.errors import CalibrationError, RecordingError
+from icalib.geometry.cameras import CAMERA_MODELS
+from icalib.imu_classes import DEFAULT_CLASS, IMU_CLASSES
+from icalib.inspection.facts import CameraSource, Inspection
+from icalib.inspection.inspect import resolution_of
+from icalib.inspection.kalibr import KalibrImu
+from icalib.inspection.lens import LensStart, lens_start
+
+_PLAIN = re.compile(r"[A-Za-z0-9_./][A-Za-z0-9_./-]*")
+_TEMPLATE = """\
+# FILL IN the target: count, and measure the print itself with a ruler or a caliper, over as many tags or squares as you
+# can and divided by their number. Printers scale, and an error of 1 % in the target is one of 1 % in every translation.
+target:
+  type: aprilgrid
+  rows:         # tags in a column
+  cols:         # tags in a row
+  tag_size:     # edge of a tag, from black border to black border, m: 0.088 is 88 mm
+  tag_spacing:  # gap between two tags, divided by tag_size
+# Other targets, in place of the lines above:
+#   target: {type: charuco, squares_x: , squares_y: , square_size: , marker_size: , dictionary: 5x5_100}
+#   target: {type: checkerboard, rows: , cols: , square_size: }  # rows and cols of INNER corners
+"""
+
+
+def draft_rig(found: Inspection) -> str:
+    """The text of a rig file. Raises RecordingError where there is no camera to write down."""
+    broken = {c.name: problem for c in found.sources.cameras if (problem := found.stream(c.topic).problem)}
+    cameras = [c for c in found.sources.cameras if c.name not in broken]
+    if not cameras:
+        raise RecordingError(
+            f"{found.recording} holds no camera that can be read, so there is no rig to draft; record one, too."
+        )
+    lines = [
+        f"# Draft by icalib inspect from {json.dumps(found.recording)}. Check every line (docs/rig-file.md).",
+        "# Start values ({guess: ...}) have no weight; delete such a line to have its value found from nothing.",
+        "sensors:",
+        *_imu(found),
+    ]
+    for camera in cameras:
+        lines += _camera(found, camera)
+    left_out = {**broken, **found.sources.left_out}
+    lines += [f"  # Not used: {_comment(topic)} ({_comment(why)})" for topic, why in left_out.items()]
+    return "\n".join([*lines, _target(found)])
+
+
+def check_draft(path: Path) -> None:
+    """Raises CalibrationError where there is something at `path` already."""
+    if os.path.lexists(path):
+        raise CalibrationError(
+            f"{path} exists and is left as it is; give another name for the draft, or give it as --target to use the "
+            "target in it."
+        )
+
+
+def write_draft(text: str, path: Path) -> None:
+    """Writes `text` to `path`, wholly or not at all, and never over another file. Raises CalibrationError."""
+    try:
+        write_whole(path, text, replace=False)
+    except FileExistsError:
+        check_draft(path)
+        raise CalibrationError(f"{path} exists; give another name for the draft.") from None
+
+
+def write_whole(path: Path, text: str, replace: bool = True) -> None:
+    """Writes the file so that nobody sees half of it. Raises CalibrationError where that is not possible, and
+    FileExistsError where the file is there and `replace` is False."""
+    part: Path | None = None
+    try:
+        with tempfile.NamedTemporaryFile("w", encoding="utf-8", dir=path.parent, suffix=".part", delete=False) as file:
+            part = Path(file.name)
+            file.write(text)
+        part.chmod(0o666 & ~_umask())
+        if replace:
+            part.replace(path)
+        else:
+            _link(part, path, text)
+    except FileExistsError:
+        raise
+    except OSError as error:
+        raise CalibrationError(
+            f"{path} cannot be written ({error.strerror or error}); choose another place."
+        ) from error
+    finally:
+        if part is not None:
+            with contextlib.suppress(OSError):
+                part.unlink()
+
+
+def _link(part: Path, path: Path, text: str) -> None:
+    """Gives `part` the name `path`; unlike a rename, this fails where the name is taken."""
+    try:
+        os.link(part, path)
+    except FileExistsError:
+        raise
+    except OSError:  # a file system without links
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def _imu(found: Inspection) -> list[str]:
+    if not found.sources.imus:
+        return ["  # No IMU: cameras are calibrated alone, the first one's frame is the body's."]
+    name = found.imu or next(iter(found.sources.imus))
+    topic = found.sources.imus[name]
+    facts = found.imus.get(name)
+    lines = [f"  {name}:", "    type: imu", _place(topic.name, topic.type, facts.frame if facts else "")]
+    kalibr = _kalibr_imu(found, topic.name)
+    if kalibr is None:
+        classes = ", ".join(IMU_CLASSES)
+        lines += [
+            f"    # The default class of {classes}. Better: the densities of the data sheet or of an Allan variance,",
+            "    # {gyro: , gyro_walk: , accel: , accel_walk: }, in rad/s/sqrt(Hz), rad/s^2/sqrt(Hz), m/s^2/sqrt(Hz),",
+            "    # m/s^3/sqrt(Hz).",
+            f"    noise: {DEFAULT_CLASS}",
+        ]
+    else:
+        noise = dataclasses.asdict(kalibr.noise)
+        values = ", ".join(f"{k}: {_number(v)}" for k, v in noise.items() if k != "source")
+        lines.append(
+            f"    noise: {{{values}, source: {json.dumps(kalibr.noise.source)}}}  # from {_comment(kalibr.file)}"
+        )
+    others = [f"{n} ({t.name})" for n, t in found.sources.imus.items() if n != name]
+    if others:
+        lines.append(f"  # Also recorded: {_comment(', '.join(others))}; a rig has one IMU, choose the best.")
+    return lines
+
+
+def _kalibr_imu(found: Inspection, topic: str) -> KalibrImu | None:
+    """The entry with the IMU's topic; else the only one, where it names no topic of this recording."""
+    entries = found.kalibr.imus
+    topics = {s.topic.name.strip("/") for s in found.streams}
+    mine = [k for k in entries if k.topic.strip("/") == topic.strip("/")]
+    if not mine and len(entries) == 1 and entries[0].topic.strip("/") not in topics:
+        mine = list(entries)
+    return mine[0] if mine else None
+
+
+def _camera(found: Inspection, camera: CameraSource) -> list[str]:
+    resolution = resolution_of(found, camera)
+    lens = lens_start(found, camera, resolution)
+    frame = found.images[camera.name].frame if camera.images else ""
+    lines = [f"  {camera.name}:", "    type: camera"]
+    if camera.corners:
+        lines.append(_place(camera.corners.name, camera.corners.type, ""))
+    if camera.images:
+        lines.append(_place(camera.images.name, camera.images.type if camera.corners is None else "images", frame))
+    lines.append(f"    model: {lens.model}  # {_comment(lens.why)}")
+    lines.append(
+        f"    resolution: [{resolution[0]}, {resolution[1]}]"
+        if resolution
+        else "    resolution:  # FILL IN: [width, height] of the images, px"
+    )
+    lines += _starts(lens)
+    lines += [f"    # {_comment(note)}" for note in lens.notes]
+    return lines
+
+
+def _starts(lens: LensStart) -> Iterable[str]:
+    if lens.intrinsics is not None:
+        yield f"    intrinsics: {{guess: {_numbers(lens.intrinsics)}}}  # fx, fy, cx, cy from {_comment(lens.source)}"
+    if lens.distortion is not None:
+        names = ", ".join(CAMERA_MODELS[lens.model].parameter_names[4:])
+        yield f"    distortion: {{guess: {_numbers(lens.distortion)}}}  # {names} from {_comment(lens.source)}"
+
+
+def _place(name: str, kind: str, frame: str) -> str:
+    """`topic` of a bag or a folder of images; `path` of a table."""
+    field = "path" if name.endswith((".csv", ".csv.gz")) else "topic"
+    shown = name if _PLAIN.fullmatch(name) else json.dumps(name)
+    return f"    {field}: {shown}  # {_comment(kind)}" + (f", frame {json.dumps(frame)}" if frame else "")
+
+
+def _target(found: Inspection) -> str:
+    if found.target is None:
+        return _TEMPLATE
+    target = found.target.target
+    fields = ", ".join(f"{k}: {_field(v)}" for k, v in ({"type": target.type} | dataclasses.asdict(target)).items())
+    return f"# The target is from {_comment(found.target.file)}; check its sizes with a ruler.\ntarget: {{{fields}}}\n"
+
+
+def _field(value: Any) -> str:
+    return _number(value) if isinstance(value, float) else str(value)
+
+
+def _numbers(values: Iterable[float]) -> str:
+    return f"[{', '.join(map(_number, values))}]"
+
+
+def _number(value: float) -> str:
+    return repr(float(value))
+
+
+def _comment(text: str) -> str:
+    """`text` on one line."""
+    return " ".join(text.split())

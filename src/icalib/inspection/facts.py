@@ -1,0 +1,174 @@
+"""What was found in a recording, as plain data; figures are None where they could not be had."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+from icalib.geometry.targets import Target
+from icalib.inspection.kalibr import KalibrFiles
+from icalib.recordings import TopicInfo
+from icalib.recordings.imu_checks import Saturation
+from icalib.recordings.streams import CameraInfo
+
+Severity = Literal["problem", "warning", "hint"]
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One sentence that says what is wrong or missing, and what to do.
+
+    problem: no calibration can be made; warning: it will be worse than it could be; hint: good to know.
+    """
+
+    severity: Severity
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Timing:
+    """The stamps of one stream, on its own clock.
+
+    rate_hz: of the median interval; jitter_s: RMS of the intervals about their median, gaps left out. A gap is an
+    interval longer than 1.5 medians; longest_gap_at_s is seconds after the first stamp. backwards, repeated: how many
+    stamps are before, or the same as, the one in front of them.
+    """
+
+    count: int
+    first_ns: int
+    last_ns: int
+    duration_s: float
+    rate_hz: float | None
+    jitter_s: float | None
+    gaps: int
+    longest_gap_s: float | None
+    longest_gap_at_s: float | None
+    backwards: int
+    repeated: int
+
+
+@dataclass(frozen=True)
+class StreamFacts:
+    """One topic. timing: of the stamps of kinds that icalib reads. problem: the sentence where it cannot be read."""
+
+    topic: TopicInfo
+    timing: Timing | None
+    problem: str = ""
+
+
+@dataclass(frozen=True)
+class ImageFacts:
+    """The images of one topic: resolution (width, height) px, encoding and frame id of the first. Of a sample of
+    `decoded` images, `damaged` cannot be decoded."""
+
+    resolution: tuple[int, int] | None
+    encoding: str
+    frame: str
+    decoded: int
+    damaged: int
+
+
+@dataclass(frozen=True)
+class ImuFacts:
+    """One IMU, x y z in its own axes: gyro [rad/s], accel [m/s^2], as they were written.
+
+    mean_accel: mean of |accel|. gyro_rms: RMS of each axis; accel_std: RMS about the mean. principal_rms: RMS rate
+    about the directions `principal` (unit vectors), from the strongest to the weakest. gravity_spread: see
+    `imu.gravity_spread`, for rates in rad/s, in deg/s, and for none.
+    """
+
+    frame: str
+    gyro_min: Vector
+    gyro_max: Vector
+    accel_min: Vector
+    accel_max: Vector
+    mean_accel: float
+    gyro_rms: Vector
+    accel_std: Vector
+    principal_rms: Vector
+    principal: tuple[Vector, Vector, Vector]
+    gravity_spread: Vector | None
+    saturated: tuple[Saturation, ...]
+    notes: tuple[str, ...]
+    problem: str = ""
+
+
+@dataclass(frozen=True)
+class TargetView:
+    """The target in the images of one camera.
+
+    images, seen: how many there are (None: only the corners were recorded), and how many show the target. cells: number
+    of corners in each cell of a grid over the image, row by row; None where the resolution is unknown. tilt_deg: 10th,
+    50th and 90th percentile of the angle between the optical axis and the target's normal; distance_ratio: the farthest
+    over the nearest, 90th over 10th percentile. Both without intrinsics, so roughly.
+    """
+
+    camera: str
+    images: int | None
+    seen: int
+    corners: int
+    cells: tuple[tuple[int, ...], ...] | None
+    tilt_deg: Vector | None
+    distance_ratio: float | None
+    notes: tuple[str, ...] = ()
+    problem: str = ""
+
+
+@dataclass(frozen=True)
+class CameraSource:
+    """One camera: the topics of its images, of its corners (a table) and of its CameraInfo; others: more topics of the
+    same images. topic: the corners where they were recorded, else the images, as `calibrate` takes them."""
+
+    name: str
+    topic: TopicInfo
+    images: TopicInfo | None
+    corners: TopicInfo | None
+    info: TopicInfo | None
+    others: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Sources:
+    """The sensors of a recording by name; left_out: topics of images that are no camera's to calibrate, and why."""
+
+    cameras: tuple[CameraSource, ...]
+    imus: Mapping[str, TopicInfo]
+    left_out: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class GivenTarget:
+    """A target and the file that it is from; resolutions: of cameras by name, where the file is a rig file."""
+
+    target: Target
+    file: str
+    resolutions: Mapping[str, tuple[int, int]]
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """All that was found. images, infos and views are by camera, imus by IMU; imu: the one to calibrate with."""
+
+    recording: str
+    sources: Sources
+    streams: tuple[StreamFacts, ...]
+    images: Mapping[str, ImageFacts]
+    infos: Mapping[str, CameraInfo]
+    imus: Mapping[str, ImuFacts]
+    imu: str | None
+    target: GivenTarget | None
+    kalibr: KalibrFiles
+    views: Mapping[str, TargetView] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
+
+    @property
+    def verdict(self) -> Literal["yes", "yes, but", "no"]:
+        """Can this be calibrated?"""
+        found = {f.severity for f in self.findings}
+        return "no" if "problem" in found else "yes, but" if "warning" in found else "yes"
+
+    def stream(self, topic: TopicInfo) -> StreamFacts:
+        return next(s for s in self.streams if s.topic == topic)

@@ -1,0 +1,75 @@
+"""An inspection as plain data, for JSON: the figures that the terminal shows, in SI units."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from typing import Any
+
+import numpy as np
+
+from icalib.inspection.facts import CameraSource, Inspection, StreamFacts
+from icalib.inspection.timing import overlap_s
+from icalib.inspection.views import GRID
+
+
+def figures(found: Inspection) -> dict[str, Any]:
+    """Lists, numbers and text. Units stand in the names where they are not SI."""
+    return {
+        "recording": found.recording,
+        "verdict": found.verdict,
+        "findings": [dataclasses.asdict(f) for f in found.findings],
+        "topics": [_stream(s) for s in found.streams],
+        "cameras": {c.name: _camera(found, c.name) for c in found.sources.cameras},
+        "imus": {n: {"topic": t.name} | _plain(found.imus.get(n)) for n, t in found.sources.imus.items()},
+        "imu": found.imu,
+        "left_out": dict(found.sources.left_out),
+        "target": _target(found),
+        "notes": list(found.notes),
+    }
+
+
+def figures_json(found: Inspection) -> str:
+    """`figures` as the text of a JSON file."""
+    return json.dumps(figures(found), indent=1, allow_nan=False) + "\n"
+
+
+def _stream(stream: StreamFacts) -> dict[str, Any]:
+    """One topic: what the index says of it, and its stamps."""
+    topic = dataclasses.asdict(stream.topic)
+    return topic | {"timing": _plain(stream.timing) or None, "problem": stream.problem}
+
+
+def _camera(found: Inspection, name: str) -> dict[str, Any]:
+    source = next(c for c in found.sources.cameras if c.name == name)
+    info = found.infos.get(name)
+    view = found.views.get(name)
+    return {
+        "images": source.images.name if source.images else None,
+        "corners": source.corners.name if source.corners else None,
+        "others": list(source.others),
+        **_plain(found.images.get(name)),
+        "overlap_with_imu_s": _overlap(found, source),
+        "camera_info": _plain(info) or None,
+        "target": (_plain(view) | {"grid": list(GRID)}) if view else None,
+    }
+
+
+def _overlap(found: Inspection, source: CameraSource) -> float | None:
+    """How long the camera and the IMU both ran, by their stamps [s]; negative: how far they are apart."""
+    camera = found.stream(source.topic).timing
+    imu = found.stream(found.sources.imus[found.imu]).timing if found.imu else None
+    return overlap_s(camera, imu) if camera and imu else None
+
+
+def _target(found: Inspection) -> dict[str, Any] | None:
+    if found.target is None:
+        return None
+    return {"type": found.target.target.type, **_plain(found.target.target), "file": found.target.file}
+
+
+def _plain(value: Any) -> dict[str, Any]:
+    """The fields of a dataclass; {} of None."""
+    if value is None:
+        return {}
+    return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in dataclasses.asdict(value).items()}

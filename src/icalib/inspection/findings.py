@@ -1,0 +1,265 @@
+"""Can it be calibrated? Sentences that say what is wrong or missing, and what to do; the worst first."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from icalib.inspection.facts import CameraSource, Finding, ImuFacts, Inspection, TargetView, Timing
+from icalib.inspection.timing import overlap_s
+from icalib.recordings import TopicInfo
+from icalib.recordings.topics import listing
+
+STILL_RAD_S = 0.03  # RMS: below it, nothing moved
+WEAK_RAD_S = 0.1  # RMS about one axis: below it, this axis is hardly determined
+SECOND_AXIS = 0.05  # of the strongest rotation; `calibrate` refuses less
+WEAK_M_S2 = 0.3  # RMS of the specific force about its mean
+FASTEST_RAD_S = 12.0  # a hand turns more slowly
+DEGREE = np.pi / 180.0
+LIKELIER = 0.7  # as much spread of gravity: then this unit it is
+EXPLAINED = 0.95  # as much spread as without any rotation: then it explains something
+CONTRARY = 1.2  # times the spread without any rotation: then the rates are those of another motion
+SHORT_S, LEAST_SEEN = 20.0, 0.3
+FEWEST_IMAGES, SLOWEST_IMAGES_HZ = 21, 4.0  # `calibrate` needs 20 pairs of images no more than 0.25 s apart
+FLAT_DEG = 15.0
+EMPTY_EDGE = 0.5  # share of empty cells along an edge of the image from which on it counts as empty
+_ORDER = ("problem", "warning", "hint")
+
+
+def findings(found: Inspection) -> tuple[Finding, ...]:
+    """Problems, then warnings, then hints."""
+    every = [*_missing(found), *_broken(found), *_imu(found), *_clocks(found), *_streams(found), *_target(found)]
+    return tuple(sorted(every, key=lambda f: _ORDER.index(f.severity)))
+
+
+def _missing(found: Inspection) -> Iterator[Finding]:
+    topics = [s.topic for s in found.streams]
+    if not found.sources.cameras:
+        yield Finding("problem", f"There are no images: {listing(topics)}; record the images of at least one camera.")
+    if not found.sources.imus:
+        yield Finding(
+            "warning",
+            f"There is no IMU: {listing(topics)}; cameras alone give intrinsics, and extrinsics of those that see the "
+            "target together. For more, record sensor_msgs/Imu, or write imu0/data.csv.",
+        )
+    for topic in topics:
+        if topic.kind in ("image", "imu") and not topic.count:
+            yield Finding("warning", f"{topic.name} holds no messages: check that this sensor was running.")
+
+
+def _broken(found: Inspection) -> Iterator[Finding]:
+    """Sensors that cannot be used are a problem where no other can take their place."""
+    reasons = [reason for c in found.sources.cameras if (reason := _unfit(found, c))]
+    alone = len(reasons) == len(found.sources.cameras)
+    yield from (Finding("problem" if alone else "warning", reason) for reason in reasons)
+    for name, topic in found.sources.imus.items():
+        stream = found.stream(topic)
+        if stream.problem:
+            alone = found.imu is None or found.imu == name
+            yield Finding("problem" if alone else "warning", stream.problem)
+    for name, images in found.images.items():
+        if 0 < images.damaged < images.decoded:
+            yield Finding(
+                "warning",
+                f"{name}: {images.damaged} of {images.decoded} images that were looked at cannot be decoded; they are "
+                "left out: check the disk and the network of the recorder.",
+            )
+
+
+def _unfit(found: Inspection, camera: CameraSource) -> str:
+    """Why `calibrate` would refuse the camera; empty where it would not."""
+    stream, view, name = found.stream(camera.topic), found.views.get(camera.name), camera.name
+    timing = stream.timing
+    if stream.problem or timing is None:
+        return stream.problem
+    if view is not None and view.problem:
+        return view.problem
+    if timing.count < FEWEST_IMAGES:
+        return f"{name} has {timing.count} images, too few: record for 30 to 90 s, with 10 to 30 images a second."
+    if found.sources.imus and timing.rate_hz and timing.rate_hz < SLOWEST_IMAGES_HZ:
+        return f"{name} takes {timing.rate_hz:.2g} images a second, too few to follow its motion: record 10 to 30."
+    if view is not None and view.seen < FEWEST_IMAGES:
+        return f"{name} sees the target in {view.seen} images, too few: keep it in view for 30 to 90 s."
+    return ""
+
+
+def _imu(found: Inspection) -> Iterator[Finding]:
+    if found.imu is None or found.imus[found.imu].problem:
+        return
+    facts, name = found.imus[found.imu], found.imu
+    yield from (Finding("warning", _capital(note)) for note in facts.notes)
+    fast = max(*map(abs, facts.gyro_min), *map(abs, facts.gyro_max))
+    radians, degrees, none = facts.gravity_spread or (0.0, 0.0, 0.0)
+    if degrees < LIKELIER * radians and degrees < EXPLAINED * none:
+        yield Finding(
+            "problem",
+            f"{name}: the angular rates look like deg/s, for so they turn as gravity does in the accelerometer; "
+            "multiply them by pi / 180.",
+        )
+        return
+    if radians > CONTRARY * none:
+        yield Finding(
+            "warning",
+            f"{name}: gravity does not turn in the accelerometer as the angular rates say; check that they are in "
+            "rad/s and that the driver gives both sensors in the same axes.",
+        )
+    if fast > FASTEST_RAD_S:
+        yield Finding(
+            "warning",
+            f"{name} turns at up to {fast:.1f} rad/s ({fast / DEGREE:.0f} deg/s); images blur at such rates: turn the "
+            "rig more slowly, or check that the driver sends rad/s.",
+        )
+    yield from _motion(name, facts)
+
+
+def _motion(name: str, facts: ImuFacts) -> Iterator[Finding]:
+    strongest, second, weakest = facts.principal_rms
+    if strongest < STILL_RAD_S:
+        yield Finding(
+            "problem",
+            f"{name} hardly moves ({strongest:.3f} rad/s RMS): record again while turning the rig about all three axes "
+            "in front of the target.",
+        )
+    elif second < SECOND_AXIS * strongest or second < STILL_RAD_S:
+        yield Finding(
+            "problem",
+            f"{name} turns about {_axis(name, facts.principal[0])} only ({strongest:.2f} rad/s RMS; {second:.2f} and "
+            f"{weakest:.2f} about the directions across it): turn the rig about two more axes.",
+        )
+    else:
+        for rms, direction in zip(facts.principal_rms, facts.principal, strict=True):
+            if rms < WEAK_RAD_S:
+                yield Finding(
+                    "warning",
+                    f"Hardly any rotation about {_axis(name, direction)} ({rms:.2f} rad/s RMS): turn the rig about it "
+                    "too.",
+                )
+    if strongest >= STILL_RAD_S and max(facts.accel_std) < WEAK_M_S2:
+        yield Finding(
+            "warning",
+            f"Hardly any acceleration of {name} ({max(facts.accel_std):.2f} m/s^2 RMS about the mean): shake the rig "
+            "briskly to and fro, along all three axes.",
+        )
+
+
+def _axis(name: str, direction: tuple[float, float, float]) -> str:
+    k = int(np.argmax(np.abs(direction)))
+    if abs(direction[k]) > 0.9:
+        return f"the {'xyz'[k]} axis of {name}"
+    return f"the direction ({', '.join(f'{x:.2f}' for x in direction)}) in the axes of {name}"
+
+
+def _clocks(found: Inspection) -> Iterator[Finding]:
+    """Do the images and the IMU have a time in common?"""
+    imu = _imu_timing(found)
+    if imu is None or found.imu is None:
+        return
+    for c in found.sources.cameras:
+        stream = found.stream(c.topic)
+        if stream.timing is None:
+            continue
+        common = overlap_s(stream.timing, imu)
+        whole = stream.timing.duration_s
+        if common <= 0.0:
+            yield _apart(c, found.imu, found.sources.imus[found.imu], -common)
+        elif common < 0.8 * whole:
+            yield Finding(
+                "warning",
+                f"{found.imu} was running during {common:.1f} s of the {whole:.1f} s of {c.name}; images without "
+                "readings are left out: start and stop both together.",
+            )
+
+
+def _apart(camera: CameraSource, imu: str, topic: TopicInfo, apart_s: float) -> Finding:
+    """A bag says when messages were received, by one clock, and so whether the two ran together."""
+    spans = [(t.first_ns or 0, t.last_ns or 0) for t in (camera.topic, topic)]
+    together = min(last for _, last in spans) > max(first for first, _ in spans)
+    says = f"The clocks of {camera.name} and {imu} do not overlap, they are {_span(apart_s)} apart"
+    if together:
+        return Finding(
+            "warning",
+            f"{says}, but the messages were received together: leave time_offset free and it is found, and have both "
+            "drivers stamp with one clock if the stamps are used elsewhere.",
+        )
+    return Finding(
+        "warning",
+        f"{says}: if both recorded the same motion, leave time_offset free and it is found; else record both at "
+        "the same time.",
+    )
+
+
+def _span(seconds: float) -> str:
+    return f"{seconds:.1f} s" if seconds < 1e4 else f"{seconds / 86400.0:.1f} days"
+
+
+def _streams(found: Inspection) -> Iterator[Finding]:
+    imu = _imu_timing(found)
+    if imu is not None and imu.rate_hz and imu.duration_s < SHORT_S:
+        yield Finding("warning", f"The IMU ran for {imu.duration_s:.1f} s: record for 30 to 90 s.")
+    if imu is not None and imu.gaps:
+        yield Finding("warning", f"{found.imu} has {_gaps(imu)}: check the load of the recorder and the bus.")
+    for c in found.sources.cameras:
+        timing = found.stream(c.topic).timing
+        # Images without the target are no gaps in the camera's work, so tables of corners are not judged.
+        if timing is not None and timing.gaps and not c.corners:
+            yield Finding("hint", f"{c.name} has {_gaps(timing)}.")
+
+
+def _gaps(t: Timing) -> str:
+    return (
+        f"{t.gaps} gap{'s' * (t.gaps > 1)}, the longest of {t.longest_gap_s or 0.0:.3f} s at "
+        f"{t.longest_gap_at_s or 0.0:.2f} s"
+    )
+
+
+def _imu_timing(found: Inspection) -> Timing | None:
+    return found.stream(found.sources.imus[found.imu]).timing if found.imu else None
+
+
+def _target(found: Inspection) -> Iterator[Finding]:
+    if found.target is None:
+        yield Finding("hint", "No target is known, so the images were not searched for it: give --target FILE.")
+        return
+    for v in found.views.values():
+        if not v.problem:
+            yield from _view(v)
+
+
+def _view(v: TargetView) -> Iterator[Finding]:
+    if v.images and v.seen < LEAST_SEEN * v.images:
+        yield Finding(
+            "warning",
+            f"{v.camera} sees the target in {v.seen} of {v.images} images ({v.seen / v.images:.0%}): keep it in view.",
+        )
+    empty = empty_borders(v.cells) if v.cells else ()
+    if empty:
+        yield Finding(
+            "warning",
+            f"{v.camera} never sees the target at the {', '.join(empty)} of the image, and the lens is not determined "
+            "there: move the target there, too.",
+        )
+    if v.tilt_deg and v.tilt_deg[2] < FLAT_DEG:
+        yield Finding(
+            "warning",
+            f"{v.camera} sees the target nearly from the front only (tilts up to about {v.tilt_deg[2]:.0f} deg): tilt "
+            "it by up to 45 deg, or the focal length is weakly determined.",
+        )
+
+
+def empty_borders(cells: tuple[tuple[int, ...], ...]) -> tuple[str, ...]:
+    """Edges of the image along which most cells are empty, and empty corners of the image on other edges, in words."""
+    grid = np.array(cells)
+    edges = {"top": grid[0], "bottom": grid[-1], "left": grid[:, 0], "right": grid[:, -1]}
+    empty = [name for name, line in edges.items() if (line == 0).mean() > EMPTY_EDGE]
+    corners = [
+        f"{rows} {cols} corner"
+        for rows, i in (("top", 0), ("bottom", -1))
+        for cols, j in (("left", 0), ("right", -1))
+        if grid[i, j] == 0 and rows not in empty and cols not in empty
+    ]
+    return (*(f"{name} edge" for name in empty), *corners)
+
+
+def _capital(sentence: str) -> str:
+    return sentence[:1].upper() + sentence[1:] if sentence[:1].isalpha() else sentence

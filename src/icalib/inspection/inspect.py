@@ -1,0 +1,209 @@
+"""From a recording to what is in it: this page reads, `findings` judges."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from icalib.errors import RecordingError
+from icalib.inspection.facts import (
+    CameraSource,
+    GivenTarget,
+    ImageFacts,
+    ImuFacts,
+    Inspection,
+    Sources,
+    StreamFacts,
+    TargetView,
+)
+from icalib.inspection.findings import findings
+from icalib.inspection.imu import imu_facts, read_imu
+from icalib.inspection.kalibr import KalibrFiles, find_kalibr_files
+from icalib.inspection.sources import find_sources
+from icalib.inspection.timing import timing_of
+from icalib.inspection.views import target_view
+from icalib.recordings import BagRecording, DamagedImageError, Payload, Recording, TopicInfo, decode, open_recording
+from icalib.recordings.streams import CameraInfo, read_camera_info
+
+SAMPLE = 16  # images that are decoded, spread over the recording
+READING_SHARE = 0.3  # of the time, where the target is looked for
+Progress = Callable[[str, float], None]  # what is being done, and how much of the whole is behind, 0 to 1
+
+
+def inspect_recording(
+    path: str | Path, target: GivenTarget | None = None, progress: Progress = lambda *_: None
+) -> Inspection:
+    """Reads the recording at `path` once, and says what is in it and whether it can be calibrated.
+
+    The `target`, or one of Kalibr's beside the recording, is looked for in all images; the corners are kept for
+    `calibrate`. Raises RecordingError, one sentence, where there is no recording, or nothing in it; what is wrong with
+    a single topic stands in the findings.
+    """
+    recording = open_recording(path)
+    topics = recording.topics()
+    if not any(t.count for t in topics):
+        raise RecordingError(
+            f"{path} holds no messages, images or tables; give a bag, or a folder with imu0/data.csv and cam0/data."
+        )
+    sources, kalibr = find_sources(topics), find_kalibr_files(Path(path))
+    target = target or _beside(kalibr)
+    share = READING_SHARE if target else 1.0
+    streams, images, imus = _read(recording, topics, sources, lambda what, done: progress(what, share * done))
+    infos, imu = _infos(recording, sources), _choose(imus, sources, kalibr)
+    found = Inspection(str(path), sources, streams, images, infos, imus, imu, target, kalibr)
+    views = _views(recording, found, lambda what, done: progress(what, share + (1.0 - share) * done))
+    found = dataclasses.replace(found, views=views, notes=recording.notes() + kalibr.notes)
+    return dataclasses.replace(found, findings=findings(found))
+
+
+def _beside(kalibr: KalibrFiles) -> GivenTarget | None:
+    """The target of Kalibr's file beside the recording."""
+    return GivenTarget(kalibr.target, kalibr.target_file, {}) if kalibr.target else None
+
+
+def resolution_of(found: Inspection, camera: CameraSource) -> tuple[int, int] | None:
+    """That of the camera's images; without images, the one that a rig file or Kalibr's camchain gives."""
+    if camera.images:
+        return found.images[camera.name].resolution
+    given = found.target.resolutions.get(camera.name) if found.target else None
+    return given or next((c.resolution for c in found.kalibr.cameras if c.name == camera.name), None)
+
+
+def _read(
+    recording: Recording, topics: tuple[TopicInfo, ...], sources: Sources, progress: Progress
+) -> tuple[tuple[StreamFacts, ...], dict[str, ImageFacts], dict[str, ImuFacts]]:
+    """Every topic once: images and readings in full, of the others the stamps."""
+    cameras = {c.images.name: c.name for c in sources.cameras if c.images}
+    names = {t.name: name for name, t in sources.imus.items()}
+    images: dict[str, ImageFacts] = {}
+    imus: dict[str, ImuFacts] = {}
+    streams: list[StreamFacts] = []
+    for k, topic in enumerate(topics):
+        progress(f"reading {topic.name}", k / len(topics))
+        if topic.name in cameras:
+            stream, images[cameras[topic.name]] = _read_images(recording, topic)
+        elif topic.name in names and topic.count:
+            stream, facts = _read_imu(recording, topic, names[topic.name])
+            if facts is not None:
+                imus[names[topic.name]] = facts
+        else:
+            stream = _read_stamps(recording, topic, topic.name in sources.left_out)
+        streams.append(stream)
+    return tuple(streams), images, imus
+
+
+def _read_images(recording: Recording, topic: TopicInfo) -> tuple[StreamFacts, ImageFacts]:
+    sample = _Sample(max(topic.count // SAMPLE, 1))
+    stamps: list[int] = []
+    problem = ""
+    try:
+        for payload in recording.payloads(topic.name):
+            stamps.append(payload.stamp_ns)
+            sample.look(payload)
+    except RecordingError as error:
+        problem = str(error)
+    if sample.decoded and sample.damaged == sample.decoded:
+        problem = problem or (
+            f"{topic.name}: none of {sample.decoded} images that were looked at can be decoded "
+            f"({sample.error.rstrip('.')}); check the driver, and record again."
+        )
+    frame = _frame(recording, topic)
+    facts = ImageFacts(sample.resolution, sample.encoding, frame, sample.decoded, sample.damaged)
+    return StreamFacts(topic, timing_of(np.array(stamps, np.int64)), problem), facts
+
+
+class _Sample:
+    """Decodes every n-th image."""
+
+    def __init__(self, every: int) -> None:
+        self._every, self._seen = every, 0
+        self.decoded = self.damaged = 0
+        self.encoding = self.error = ""
+        self.resolution: tuple[int, int] | None = None
+
+    def look(self, payload: Payload) -> None:
+        self._seen += 1
+        if self._seen == 1:
+            self.encoding = payload.encoding
+        if self.resolution is None and payload.width:
+            self.resolution = payload.width, payload.height
+        if (self._seen - 1) % self._every:
+            return
+        self.decoded += 1
+        try:
+            height, width = decode(payload).shape
+        except DamagedImageError as error:
+            self.damaged += 1
+            self.error = self.error or str(error)
+            return
+        self.resolution = self.resolution or (width, height)
+
+
+def _read_imu(recording: Recording, topic: TopicInfo, name: str) -> tuple[StreamFacts, ImuFacts | None]:
+    try:
+        imu, where = read_imu(recording, name, topic)
+    except RecordingError as error:
+        return StreamFacts(topic, None, str(error)), None
+    facts = imu_facts(imu, where, _frame(recording, topic))
+    return StreamFacts(topic, timing_of(imu.stamps_ns), facts.problem), facts
+
+
+def _read_stamps(recording: Recording, topic: TopicInfo, left_out: bool) -> StreamFacts:
+    """Of messages that icalib does not read, of CameraInfo and of images left out, only what the index says."""
+    if left_out or not topic.count or topic.kind in ("", "camera info"):
+        return StreamFacts(topic, None)
+    try:
+        return StreamFacts(topic, timing_of(recording.stamps(topic.name)))
+    except RecordingError as error:
+        return StreamFacts(topic, None, str(error))
+
+
+def _frame(recording: Recording, topic: TopicInfo) -> str:
+    """The frame id of the first message; empty in folders."""
+    if not isinstance(recording, BagRecording):
+        return ""
+    first: Iterator = recording.messages(topic.name, topic.kind)
+    try:
+        _, message = next(first)
+    except (RecordingError, StopIteration):
+        return ""
+    return str(message.header.frame_id)
+
+
+def _infos(recording: Recording, sources: Sources) -> dict[str, CameraInfo]:
+    """What the drivers say of the cameras; nothing of those whose messages cannot be read."""
+    found: dict[str, CameraInfo] = {}
+    for c in sources.cameras:
+        if c.info and isinstance(recording, BagRecording):
+            try:
+                found[c.name] = read_camera_info(recording, c.info.name)
+            except (RecordingError, ValueError):
+                continue
+    return found
+
+
+def _choose(imus: dict[str, ImuFacts], sources: Sources, kalibr: KalibrFiles) -> str | None:
+    """The IMU to calibrate with: one that is not refused; the one that Kalibr's file names; the first."""
+    named = {k.topic.strip("/") for k in kalibr.imus}
+    order = sorted(imus, key=lambda n: (bool(imus[n].problem), sources.imus[n].name.strip("/") not in named))
+    return order[0] if order else None
+
+
+def _views(recording: Recording, found: Inspection, progress: Progress) -> dict[str, TargetView]:
+    """The target in each camera whose images can be read."""
+    if found.target is None:
+        return {}
+    views: dict[str, TargetView] = {}
+    cameras = [c for c in found.sources.cameras if c.corners or not found.stream(c.topic).problem]
+    for k, camera in enumerate(cameras):
+        what = f"finding the target in the images of {camera.name}"
+
+        def show(done: float, k: int = k, what: str = what) -> None:
+            progress(what, (k + done) / len(cameras))
+
+        show(0.0)
+        views[camera.name] = target_view(recording, camera, found.target.target, resolution_of(found, camera), show)
+    return views

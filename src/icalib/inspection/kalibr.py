@@ -1,0 +1,189 @@
+"""Kalibr's own files beside a recording: camchain, imu and target, told by what is in them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import yaml
+
+from icalib.errors import RigError
+from icalib.geometry.targets import AprilGrid, Checkerboard, Target
+from icalib.rig import ImuNoise
+
+_LARGEST_BYTES = 100_000  # of a file that people write by hand
+_DENSITIES = (
+    "gyroscope_noise_density",
+    "gyroscope_random_walk",
+    "accelerometer_noise_density",
+    "accelerometer_random_walk",
+)
+# Kalibr's camera and distortion model -> ours, and how many of our coefficients stand before its focal lengths.
+MODELS = {
+    ("pinhole", "radtan"): ("pinhole-radtan", 0),
+    ("pinhole", "equidistant"): ("pinhole-equidistant", 0),
+    ("eucm", "none"): ("eucm", 2),
+    ("ds", "none"): ("double-sphere", 2),
+    ("omni", "radtan"): ("omni-radtan", 1),
+}
+Found = TypeVar("Found")
+
+
+@dataclass(frozen=True)
+class KalibrCamera:
+    """One camera of a camchain: name there, topic, our model and its values; intrinsics fx, fy, cx, cy [px]."""
+
+    file: str
+    name: str
+    topic: str
+    model: str
+    resolution: tuple[int, int]
+    intrinsics: tuple[float, ...]
+    distortion: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class KalibrImu:
+    """The noise in an imu file, and the topic that it is for."""
+
+    file: str
+    topic: str
+    noise: ImuNoise
+
+
+@dataclass(frozen=True)
+class KalibrFiles:
+    """What lies beside a recording. notes: files that could not be used, and why."""
+
+    cameras: tuple[KalibrCamera, ...] = ()
+    imus: tuple[KalibrImu, ...] = ()
+    target: Target | None = None
+    target_file: str = ""
+    notes: tuple[str, ...] = ()
+
+
+def find_kalibr_files(recording: Path) -> KalibrFiles:
+    """Kalibr's files in the folder of the recording and in the one above; what is wrong with one stands in the notes.
+
+    Targets that differ are not used: nobody knows which it was.
+    """
+    cameras: list[KalibrCamera] = []
+    imus: list[KalibrImu] = []
+    targets: dict[str, Target] = {}
+    notes: list[str] = []
+    for path in _yaml_files(recording):
+        data = yaml_mapping(path)
+        try:
+            if "target_type" in data:
+                targets[str(path)] = kalibr_target(data, str(path))
+            else:
+                cameras += _read(path, data, "camera_model", _camera)
+                imus += _read(path, data, "gyroscope_noise_density", _imu)
+        except RigError as error:
+            notes.append(str(error))
+    if len(set(map(repr, targets.values()))) > 1:
+        notes.append(f"the targets {', '.join(targets)} beside the recording differ; give the right one as --target.")
+        targets = {}
+    file = next(iter(targets), "")
+    return KalibrFiles(tuple(cameras), tuple(imus), targets.get(file), Path(file).name, tuple(notes))
+
+
+def kalibr_target(data: dict[str, Any], file: str) -> Target:
+    """The target of Kalibr's target file. Raises RigError naming file and field."""
+    kind = data["target_type"]
+    if kind == "aprilgrid":
+        rows, cols = (_whole(data, name, file) for name in ("tagRows", "tagCols"))
+        return AprilGrid(rows, cols, _positive(data, "tagSize", file), _positive(data, "tagSpacing", file))
+    if kind == "checkerboard":
+        rows, cols = (_whole(data, name, file) for name in ("targetRows", "targetCols"))
+        size, other = (_positive(data, name, file) for name in ("rowSpacingMeters", "colSpacingMeters"))
+        if size != other:
+            raise RigError(f"{file}: rowSpacingMeters and colSpacingMeters differ; icalib needs square squares.")
+        return Checkerboard(rows, cols, size)
+    raise RigError(f"{file}: icalib does not know the target_type {kind!r}; use an aprilgrid or a checkerboard.")
+
+
+def _yaml_files(recording: Path) -> list[Path]:
+    above = recording.resolve().parent
+    folders = [recording, above] if recording.is_dir() else [above]
+    found = [p for f in folders for p in _entries(f) if p.suffix in (".yaml", ".yml") and p.is_file()]
+    return [p for p in found if p.stat().st_size <= _LARGEST_BYTES]
+
+
+def _entries(folder: Path) -> list[Path]:
+    """What lies in `folder`; nothing where that may not be seen."""
+    try:
+        return sorted(folder.iterdir())
+    except OSError:
+        return []
+
+
+def yaml_mapping(path: Path) -> dict[str, Any]:
+    """The file's mapping; an empty one for files of others, whatever they are."""
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, yaml.YAMLError, RecursionError):
+        return {}
+    return data if isinstance(data, dict) else {}
+
+
+def _read(
+    path: Path, data: dict[str, Any], mark: str, make: Callable[[str, str, dict[str, Any]], Found]
+) -> list[Found]:
+    """What `make` reads from the mappings that have `mark`: the whole file, or its entries (cam0, imu0)."""
+    entries = {"": data} if mark in data else {k: v for k, v in data.items() if isinstance(v, dict) and mark in v}
+    return [make(str(path), str(name), entry) for name, entry in entries.items()]
+
+
+def _camera(file: str, name: str, data: dict[str, Any]) -> KalibrCamera:
+    kind = (str(data["camera_model"]), str(data.get("distortion_model")))
+    if kind not in MODELS:
+        raise RigError(f"{file}: {name}: icalib has no {kind[0]}-{kind[1]}; its intrinsics are not used.")
+    model, before = MODELS[kind]
+    values = _numbers(data, "intrinsics", before + 4, file)
+    coefficients = _numbers(data, "distortion_coeffs", 4 if kind[1] != "none" else None, file)
+    width, height = (int(side) for side in _numbers(data, "resolution", 2, file))
+    return KalibrCamera(
+        file,
+        name,
+        str(data.get("rostopic", "")),
+        model,
+        (width, height),
+        values[before:],
+        (*values[:before], *(coefficients if kind[1] != "none" else ())),
+    )
+
+
+def _imu(file: str, _: str, data: dict[str, Any]) -> KalibrImu:
+    densities = [_positive(data, name, file) for name in _DENSITIES]
+    return KalibrImu(file, str(data.get("rostopic", "")), ImuNoise(*densities, source=f"{Path(file).name} (Kalibr)"))
+
+
+def _numbers(data: dict[str, Any], name: str, size: int | None, file: str) -> tuple[float, ...]:
+    try:
+        values = tuple(float(x) for x in data.get(name, ()))
+    except (TypeError, ValueError):
+        values = ()
+    if (size is not None and len(values) != size) or not np.isfinite(values).all():
+        raise RigError(f"{file}: {name} must be {size} finite numbers; correct the file.")
+    return values
+
+
+def _positive(data: dict[str, Any], name: str, file: str) -> float:
+    try:
+        value = float(data[name])
+    except (KeyError, TypeError, ValueError):
+        value = -1.0
+    if not 0.0 < value < np.inf:
+        raise RigError(f"{file}: {name} must be a number above 0; correct the file.")
+    return value
+
+
+def _whole(data: dict[str, Any], name: str, file: str) -> int:
+    value = _positive(data, name, file)
+    if value != int(value):
+        raise RigError(f"{file}: {name} must be a whole number; correct the file.")
+    return int(value)

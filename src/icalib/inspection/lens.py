@@ -1,0 +1,95 @@
+"""Which camera model a draft starts with, and from which values: Kalibr's camchain, else CameraInfo, else none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from icalib.inspection.facts import CameraSource, Inspection
+from icalib.inspection.kalibr import KalibrCamera
+from icalib.recordings.streams import CameraInfo
+
+DEFAULT_MODEL = "pinhole-radtan"
+_FISHEYES = ("equidistant", "fisheye", "kannala_brandt4")
+Values = tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class LensStart:
+    """model, and why; intrinsics and distortion (None: found from nothing), and where they are from; notes."""
+
+    model: str
+    why: str
+    intrinsics: Values | None = None
+    distortion: Values | None = None
+    source: str = ""
+    notes: tuple[str, ...] = ()
+
+
+def lens_start(found: Inspection, camera: CameraSource, resolution: tuple[int, int] | None) -> LensStart:
+    """What is known of the lens of `camera`, whose images have `resolution` px."""
+    notes: list[str] = []
+    kalibr = _kalibr(found, camera)
+    if kalibr is not None and kalibr.resolution != resolution:
+        notes.append(f"{Path(kalibr.file).name} is for {_size(kalibr.resolution)} px and is not used")
+    elif kalibr is not None:
+        source = f"{Path(kalibr.file).name} (Kalibr, {kalibr.name})"
+        return LensStart(kalibr.model, f"from {source}", kalibr.intrinsics, kalibr.distortion or None, source)
+    info = found.infos.get(camera.name)
+    if info is None or camera.info is None:
+        why = "for lenses of up to about 100 deg; for a fisheye: pinhole-equidistant"
+        return LensStart(DEFAULT_MODEL, why, notes=tuple(notes))
+    return _from_info(info, camera, camera.info.name, resolution, notes)
+
+
+def _from_info(
+    info: CameraInfo, camera: CameraSource, topic: str, resolution: tuple[int, int] | None, notes: list[str]
+) -> LensStart:
+    model = _model(info)
+    why = f"from {topic} ({info.model or 'no distortion_model'})"
+    K = info.K
+    intrinsics = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+    if camera.images is not None and "rect" in camera.images.name.lower():
+        notes.append(f"{topic} is of the images before they were rectified and is not used; prefer the raw images")
+    elif not (np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0):
+        notes.append(f"{topic} holds no intrinsics")
+    elif info.resolution != resolution:
+        notes.append(f"{topic} is for {_size(info.resolution)} px and is not used")
+    else:
+        distortion = _distortion(info, model)
+        if distortion is None:
+            notes.append(f"the distortion in {topic} is of another model and is not used")
+        return LensStart(model, why, tuple(map(float, intrinsics)), distortion, topic, tuple(notes))
+    return LensStart(model, why, notes=tuple(notes))
+
+
+def _model(info: CameraInfo) -> str:
+    if info.model in _FISHEYES:
+        return "pinhole-equidistant"
+    return "pinhole-radtan5" if info.model == "plumb_bob" and len(info.distortion) == 5 else DEFAULT_MODEL
+
+
+def _distortion(info: CameraInfo, model: str) -> Values | None:
+    sizes = {"pinhole-equidistant": 4, "pinhole-radtan5": 5, DEFAULT_MODEL: 4}
+    known = info.model in ("plumb_bob", *_FISHEYES)
+    if not known or len(info.distortion) != sizes[model] or not np.isfinite(info.distortion).all():
+        return None
+    return tuple(float(x) for x in info.distortion)
+
+
+def _kalibr(found: Inspection, camera: CameraSource) -> KalibrCamera | None:
+    """The entry with the camera's topic; else with its name, where no entry names a topic of this recording."""
+    topics = {s.topic.name.strip("/") for s in found.streams}
+    named = any(k.topic.strip("/") in topics for k in found.kalibr.cameras)
+    mine = camera.images.name.strip("/") if camera.images else None
+    is_mine: Callable[[KalibrCamera], bool] = (
+        (lambda k: k.topic.strip("/") == mine) if named else (lambda k: k.name == camera.name)
+    )
+    return next((k for k in found.kalibr.cameras if is_mine(k)), None)
+
+
+def _size(resolution: tuple[int, int]) -> str:
+    return f"{resolution[0]} x {resolution[1]}"

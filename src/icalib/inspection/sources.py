@@ -1,0 +1,76 @@
+"""Which topics are sensors, and what to call them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+from icalib.inspection.facts import CameraSource, Sources
+from icalib.recordings import TopicInfo
+
+# Parts of a topic's name that say what it carries, not whose it is.
+_WHAT = re.compile(
+    r"(image(_(raw|color|mono|rect|rect_raw|rect_color))?|compressed|raw|camera_info|data(_raw)?|sample"
+    r"|(data|corners)\.csv)"
+)
+_UNNAMEABLE = re.compile(r"[^A-Za-z0-9_-]+")
+Key = tuple[str, ...]
+
+
+def find_sources(topics: Sequence[TopicInfo]) -> Sources:
+    """The sensors among `topics` that hold messages, each under a unique name made of its topic."""
+    filled = [t for t in topics if t.count]
+    depth = [t for t in filled if t.kind == "image" and "depth" in t.name.lower()]
+    images = _by_key([t for t in filled if t.kind == "image" and t not in depth])
+    corners = _by_key([t for t in filled if t.kind == "corners"])
+    infos = _by_key([t for t in filled if t.kind == "camera info"])
+    imus = [t for t in filled if t.kind == "imu"]
+    keys = sorted({*images, *corners})
+    names = _names([(k, "cam") for k in keys] + [(_key(t), "imu") for t in imus])
+    cameras = tuple(_camera(n, k, images, corners, infos) for n, k in zip(names, keys, strict=False))
+    left_out = {t.name: "depth images" for t in depth}
+    left_out |= {other: f"the images of {c.name} once more" for c in cameras for other in c.others}
+    return Sources(cameras, dict(zip(names[len(keys) :], imus, strict=True)), left_out)
+
+
+def _camera(
+    name: str,
+    key: Key,
+    images: dict[Key, list[TopicInfo]],
+    corners: dict[Key, list[TopicInfo]],
+    infos: dict[Key, list[TopicInfo]],
+) -> CameraSource:
+    """Of several topics of the same images: the one that is not rectified, has most messages, is not compressed."""
+    same = sorted(images.get(key, []), key=lambda t: ("rect" in t.name, -t.count, len(t.name)))
+    table, info = corners.get(key, [None])[0], infos.get(key, [None])[0]
+    others = tuple(t.name for t in same[1:])
+    return CameraSource(name, table or same[0], same[0] if same else None, table, info, others)
+
+
+def _by_key(topics: list[TopicInfo]) -> dict[Key, list[TopicInfo]]:
+    found: dict[Key, list[TopicInfo]] = {}
+    for topic in topics:
+        found.setdefault(_key(topic), []).append(topic)
+    return found
+
+
+def _key(topic: TopicInfo) -> Key:
+    return tuple(p for p in topic.name.split("/") if p and not _WHAT.fullmatch(p))
+
+
+def _names(sensors: list[tuple[Key, str]]) -> list[str]:
+    """For each sensor the last parts of its key, as few as tell all of them apart."""
+    longest = max((len(key) for key, _ in sensors), default=1)
+    names: list[str] = []
+    for length in range(1, longest + 1):
+        names = [_name(key[-length:], kind) for key, kind in sensors]
+        if len(set(names)) == len(names):
+            return names
+    return [f"{name}_{k}" if name in names[:k] else name for k, name in enumerate(names)]
+
+
+def _name(parts: Key, kind: str) -> str:
+    name = _UNNAMEABLE.sub("_", "_".join(parts)).strip("_-")
+    if not name:
+        return f"{kind}0"
+    return name if name[0].isalpha() else f"{kind}_{name}"

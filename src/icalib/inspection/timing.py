@@ -1,0 +1,40 @@
+"""Rates, gaps and jitter of stamps."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icalib.inspection.facts import Timing
+
+GAP = 1.5  # medians: halfway between an interval and the one that a lost message leaves
+
+
+def timing_of(stamps_ns: np.ndarray) -> Timing | None:
+    """Figures of the stamps (N,) int64, in the order in which they were recorded; None where there are none."""
+    if not len(stamps_ns):
+        return None
+    first, last = int(stamps_ns.min()), int(stamps_ns.max())
+    steps = np.diff(stamps_ns)
+    forward = steps[steps > 0]
+    median = float(np.median(forward)) if len(forward) else None
+    wide = steps > GAP * median if median else np.zeros(len(steps), bool)
+    longest = int(np.argmax(steps)) if wide.any() else None
+    even = forward[forward <= GAP * median] if median else forward
+    return Timing(
+        count=len(stamps_ns),
+        first_ns=first,
+        last_ns=last,
+        duration_s=(last - first) * 1e-9,
+        rate_hz=1e9 / median if median else None,
+        jitter_s=1e-9 * float(np.sqrt(np.mean((even - median) ** 2))) if median else None,
+        gaps=int(wide.sum()),
+        longest_gap_s=None if longest is None else float(steps[longest]) * 1e-9,
+        longest_gap_at_s=None if longest is None else int(stamps_ns[longest] - first) * 1e-9,
+        backwards=int((steps < 0).sum()),
+        repeated=int((steps == 0).sum()),
+    )
+
+
+def overlap_s(a: Timing, b: Timing) -> float:
+    """How long both ran, by their stamps [s]; negative: how far they are apart."""
+    return (min(a.last_ns, b.last_ns) - max(a.first_ns, b.first_ns)) * 1e-9

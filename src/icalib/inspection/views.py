@@ -1,0 +1,85 @@
+"""The target in the images: in how many, where in them, from how far and how tilted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from icalib.detection.streams import find_corners
+from icalib.errors import RecordingError
+from icalib.geometry.targets import Target
+from icalib.inspection.facts import CameraSource, TargetView
+from icalib.measurements import CornerStream
+from icalib.recordings import Recording
+from icalib.rig import Camera
+
+GRID = (8, 5)  # columns and rows of cells over the image
+_LEAST_CORNERS = 8  # for the pose of the target in one image
+
+
+def target_view(
+    recording: Recording,
+    source: CameraSource,
+    target: Target,
+    resolution: tuple[int, int] | None,
+    progress: Callable[[float], None],
+) -> TargetView:
+    """Finds the target in all images of the camera, or reads the corners that were recorded. What goes wrong stands in
+    `problem`."""
+    images = source.images.name if source.images else None
+    path = source.corners.name if source.corners else f"{source.name}/corners.csv"
+    # The model plays no part in finding corners.
+    camera = Camera(source.name, path, "pinhole-radtan", resolution or (1, 1), topic=images)
+    tabled = source.corners is not None
+    try:
+        if tabled:
+            corners, notes = recording.corners(camera, target), ()
+        else:
+            corners, notes = find_corners(recording, camera, target, progress=progress)
+    except RecordingError as error:
+        return TargetView(source.name, None, 0, 0, None, None, None, problem=str(error))
+    count = np.diff(corners.start)
+    tilt, ratio = _poses(corners, target)
+    return TargetView(
+        source.name,
+        images=None if tabled else len(count),
+        seen=int((count > 0).sum()),
+        corners=len(corners.uv),
+        cells=coverage(corners.uv, resolution) if resolution else None,
+        tilt_deg=tilt,
+        distance_ratio=ratio,
+        notes=notes,
+    )
+
+
+def coverage(uv: np.ndarray, resolution: tuple[int, int]) -> tuple[tuple[int, ...], ...]:
+    """How many of the corners uv (N, 2) [px] lie in each cell of the image of `resolution` (width, height): GRID[1]
+    rows of GRID[0]."""
+    cell = np.floor((uv + 0.5) / resolution * GRID).astype(np.int64)
+    col, row = np.clip(cell, 0, np.array(GRID) - 1).T
+    counts = np.bincount(row * GRID[0] + col, minlength=GRID[0] * GRID[1]).reshape(GRID[1], GRID[0])
+    return tuple(tuple(int(n) for n in line) for line in counts)
+
+
+def _poses(corners: CornerStream, target: Target) -> tuple[tuple[float, float, float] | None, float | None]:
+    """Percentiles of the tilt [deg], and farthest over nearest, from how the target's plane is stretched in each image.
+
+    Seen from far, a plane tilted by a keeps its scale f / distance along the axis of the tilt, and has cos(a) times it
+    across.
+    """
+    scales: list[np.ndarray] = []
+    for a, b in zip(corners.start[:-1], corners.start[1:], strict=True):
+        if b - a < _LEAST_CORNERS:
+            continue
+        xy = target.points[corners.point[a:b], :2]
+        design = np.column_stack([xy - xy.mean(axis=0), np.ones(len(xy))])
+        affine, _, rank, _ = np.linalg.lstsq(design, corners.uv[a:b], rcond=None)
+        if rank == 3:
+            scales.append(np.linalg.svd(affine[:2], compute_uv=False))
+    if not scales:
+        return None, None
+    large, small = np.array(scales).T
+    low, middle, high = np.percentile(np.degrees(np.arccos(np.clip(small / large, 0.0, 1.0))), (10, 50, 90))
+    near, far = np.percentile(large, (90, 10))
+    return (float(low), float(middle), float(high)), float(near / far)

@@ -1,0 +1,248 @@
+"""The draft of a rig file: it loads, it says where each number is from, and it replaces nothing."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from icalib.cli import main
+from icalib.errors import CalibrationError, RigError
+from icalib.geometry.targets import AprilGrid
+from icalib.inspection.draft import write_draft
+from icalib.rig_file import load_rig
+
+SIZE = (32, 24)
+K = (40.5, 41.5, 15.25, 11.75)
+KALIBR = """\
+cam0:
+  camera_model: pinhole
+  distortion_coeffs: [-0.28, 0.07, 0.0002, 1.8e-05]
+  distortion_model: equidistant
+  intrinsics: [30.0, 31.0, 16.0, 12.0]
+  resolution: [32, 24]
+  rostopic: /cam0/image_raw
+"""
+NOISE = """\
+accelerometer_noise_density: 1.86e-03
+accelerometer_random_walk: 4.33e-04
+gyroscope_noise_density: 1.87e-04
+gyroscope_random_walk: 2.66e-05
+rostopic: /imu0
+"""
+GRID = "{target_type: aprilgrid, tagCols: 6, tagRows: 7, tagSize: 0.088, tagSpacing: 0.3}"
+
+
+@pytest.fixture
+def draft(bags, brief, tmp_path, capsys):
+    """A function: messages beside those of /imu0 -> the draft made for them, and its path."""
+
+    def build(messages, imu_topics=("/imu0",), quiet=True) -> tuple[str, Path]:
+        for topic in imu_topics:
+            messages = messages + bags.imu(topic, brief)
+        bag = bags.write(tmp_path / "run", messages)
+        path = tmp_path / "rig.yaml"
+        assert main(["inspect", str(bag), "--rig", str(path), *(["-q"] if quiet else [])]) == 0, capsys.readouterr()
+        return path.read_text(), path
+
+    return build
+
+
+def fill(path: Path) -> None:
+    """What a user does to the template."""
+    text = path.read_text()
+    for name, value in (("rows", "7"), ("cols", "6"), ("tag_size", "0.088"), ("tag_spacing", "0.3")):
+        text = text.replace(f"  {name}: ", f"  {name}: {value} ", 1)
+    path.write_text(text)
+
+
+def test_a_draft_loads_once_the_target_is_filled_in(draft, bags):
+    messages = bags.noise("/cam0/image_raw", SIZE, frame="left: eye") + bags.noise("/cam1/image_raw", (40, 30))
+    text, path = draft(messages)
+    with pytest.raises(RigError, match=r"rig\.yaml:\d+: target\.tag_size: must be a number, but is empty"):
+        load_rig(path)
+    fill(path)
+    rig = load_rig(path)
+    assert rig.target == AprilGrid(7, 6, 0.088, 0.3)
+    assert [(c.name, c.topic, c.model, c.resolution) for c in rig.cameras] == [
+        ("cam0", "/cam0/image_raw", "pinhole-radtan", SIZE),
+        ("cam1", "/cam1/image_raw", "pinhole-radtan", (40, 30)),
+    ]
+    assert all(c.intrinsics.value is None for c in rig.cameras)
+    assert (rig.imu.name, rig.imu.topic, rig.imu.noise.source) == ("imu0", "/imu0", "default for a consumer IMU")
+    assert 'frame "left: eye"' in text and 'frame "imu_link"' in text
+    assert "ruler" in text and "The default class" in text
+
+
+@pytest.mark.parametrize(
+    ("model", "D", "expected", "guess"),
+    [
+        ("plumb_bob", [-0.1, 0.01, 1e-3, 2e-3, 1e-4], "pinhole-radtan5", True),
+        ("plumb_bob", [-0.1, 0.01, 1e-3, 2e-3], "pinhole-radtan", True),
+        ("equidistant", [0.1, 0.01, 1e-3, 2e-3], "pinhole-equidistant", True),
+        ("fisheye", [0.1, 0.01, 1e-3, 2e-3], "pinhole-equidistant", True),
+        ("rational_polynomial", [0.1] * 8, "pinhole-radtan", False),
+        ("", [], "pinhole-radtan", False),
+    ],
+)
+def test_values_of_camera_info(draft, bags, model, D, expected, guess):
+    info = bags.camera_info("/cam0/camera_info", SIZE, model, D, K)
+    text, path = draft([*bags.noise("/cam0/image_raw", SIZE), info])
+    fill(path)
+    (camera,) = load_rig(path).cameras
+    assert camera.model == expected
+    assert camera.intrinsics.mode == "free"
+    np.testing.assert_array_equal(camera.intrinsics.value, K)
+    assert (camera.distortion.value is not None) == guess
+    if guess:
+        np.testing.assert_array_equal(camera.distortion.value, D)
+    assert text.count("from /cam0/camera_info") == 2 + guess
+
+
+@pytest.mark.parametrize(
+    ("topic", "size", "values", "words"),
+    [
+        ("/cam0/image_raw", SIZE, (0.0, 0.0, 0.0, 0.0), "/cam0/camera_info holds no intrinsics"),
+        ("/cam0/image_raw", (64, 48), K, "/cam0/camera_info is for 64 x 48 px and is not used"),
+        ("/cam0/image_rect", SIZE, K, "is of the images before they were rectified"),
+    ],
+)
+def test_camera_info_that_is_not_used(draft, bags, topic, size, values, words):
+    info = bags.camera_info("/cam0/camera_info", size, "plumb_bob", [0.0] * 5, values)
+    text, path = draft([*bags.noise(topic, SIZE), info])
+    fill(path)
+    assert words in text
+    assert load_rig(path).cameras[0].intrinsics.value is None
+
+
+def test_a_draft_with_kalibrs_files_loads_as_it_is(draft, bags, tmp_path):
+    for name, text in (("camchain-imucam", KALIBR), ("imu", NOISE), ("grid", GRID)):
+        (tmp_path / f"{name}.yaml").write_text(text)
+    info = bags.camera_info("/cam0/camera_info", SIZE, "plumb_bob", [0.0] * 5, K)
+    text, path = draft([*bags.noise("/cam0/image_raw", SIZE), info])
+    rig = load_rig(path)
+    assert rig.target == AprilGrid(7, 6, 0.088, 0.3)
+    assert rig.cameras[0].model == "pinhole-equidistant"
+    np.testing.assert_array_equal(rig.cameras[0].intrinsics.value, [30.0, 31.0, 16.0, 12.0])
+    np.testing.assert_array_equal(rig.cameras[0].distortion.value, [-0.28, 0.07, 0.0002, 1.8e-05])
+    assert (rig.imu.noise.gyro, rig.imu.noise.source) == (1.87e-4, "imu.yaml (Kalibr)")
+    assert "from camchain-imucam.yaml (Kalibr, cam0)" in text and "The target is from grid.yaml" in text
+
+
+def test_kalibrs_camera_of_another_resolution(draft, bags, tmp_path):
+    (tmp_path / "camchain.yaml").write_text(KALIBR.replace("[32, 24]", "[64, 48]"))
+    text, path = draft(bags.noise("/cam0/image_raw", SIZE))
+    fill(path)
+    assert load_rig(path).cameras[0].intrinsics.value is None
+    assert "camchain.yaml is for 64 x 48 px and is not used" in text
+
+
+def test_kalibrs_noise_of_another_imu(draft, bags, tmp_path):
+    (tmp_path / "imu.yaml").write_text(NOISE.replace("/imu0", "/imu1"))
+    text, path = draft(bags.noise("/cam0/image_raw", SIZE), ("/imu0", "/imu1"))
+    fill(path)
+    rig = load_rig(path)
+    assert (rig.imu.name, rig.imu.noise.gyro) == ("imu1", 1.87e-4)
+    assert "Also recorded: imu0 (/imu0); a rig has one IMU" in text
+
+
+def test_depth_images_and_odd_topics(draft, bags):
+    names = ("/depth/image", "/rig: #1/image_raw", "/rig: #1/image_raw/compressed")
+    text, path = draft([m for n in names[:2] for m in bags.noise(n, SIZE)])
+    fill(path)
+    (camera,) = load_rig(path).cameras
+    assert (camera.name, camera.topic) == ("rig_1", names[1])
+    assert "# Not used: /depth/image (depth images)" in text
+
+
+def test_a_camera_that_cannot_be_read_is_left_out(draft, bags):
+    pixels = np.ones((4, 4), np.uint8)
+    odd = [bags.image("/odd/image", bags.origin_ns + k, pixels, "32FC9") for k in range(3)]
+    text, path = draft(odd + bags.noise("/cam0/image_raw", SIZE))
+    fill(path)
+    assert [c.name for c in load_rig(path).cameras] == ["cam0"]
+    assert "# Not used: odd (" in text and "32FC9" in text
+
+
+def test_a_folder_of_tables_needs_its_resolution(tmp_path, capsys):
+    example = Path(__file__).parents[2] / "examples" / "euroc" / "recording"
+    path = tmp_path / "rig.yaml"
+    assert main(["inspect", str(example), "--rig", str(path), "-q"]) == 0
+    fill(path)
+    with pytest.raises(RigError, match=r"cam0\.resolution"):
+        load_rig(path)
+    path.write_text(path.read_text().replace("resolution:", "resolution: [752, 480]"))
+    rig = load_rig(path)
+    assert [c.path for c in rig.cameras] == ["cam0/corners.csv", "cam1/corners.csv"]
+    assert rig.imu.path == "imu0/data.csv"
+
+
+@pytest.mark.parametrize("made", ["file", "link"])
+def test_nothing_is_overwritten(made, bags, brief, tmp_path, capsys):
+    bag = bags.write(tmp_path / "run", bags.noise("/cam0/image_raw", SIZE) + bags.imu("/imu0", brief))
+    path = tmp_path / "rig.yaml"
+    path.write_text("mine") if made == "file" else path.symlink_to(tmp_path / "nowhere")
+    assert main(["inspect", str(bag), "--rig", str(path)]) == 1
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1 and "rig.yaml exists and is left as it is; give another name" in captured.err
+    assert not (tmp_path / "nowhere").exists() and (made == "link" or path.read_text() == "mine")
+
+
+def test_a_file_that_appears_meanwhile_is_kept(tmp_path):
+    (tmp_path / "rig.yaml").write_text("mine")
+    with pytest.raises(CalibrationError, match=r"rig\.yaml exists"):
+        write_draft("draft", tmp_path / "rig.yaml")
+    assert [p.read_text() for p in tmp_path.iterdir()] == ["mine"]
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_a_file_system_without_links(there, tmp_path, monkeypatch):
+    def no_link(*_):
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", no_link)
+    path = tmp_path / "rig.yaml"
+    if there:
+        path.write_text("mine")
+        with pytest.raises(CalibrationError, match=r"rig\.yaml exists"):
+            write_draft("draft", path)
+    else:
+        write_draft("draft", path)
+    assert [p.read_text() for p in tmp_path.iterdir()] == ["mine" if there else "draft"]
+
+
+def test_the_file_is_whole_and_readable_by_others(tmp_path):
+    before = os.umask(0o022)
+    try:
+        write_draft("draft", tmp_path / "rig.yaml")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "rig.yaml").stat().st_mode) == 0o644
+    assert [p.name for p in tmp_path.iterdir()] == ["rig.yaml"]
+
+
+def test_a_folder_that_is_not_there(tmp_path):
+    with pytest.raises(CalibrationError, match=r"rig\.yaml cannot be written .*choose another place"):
+        write_draft("draft", tmp_path / "away" / "rig.yaml")
+
+
+def test_no_draft_without_camera(bags, brief, tmp_path, capsys):
+    bag = bags.write(tmp_path / "run", bags.imu("/imu0", brief))
+    assert main(["inspect", str(bag), "--rig", str(tmp_path / "rig.yaml"), "-q"]) == 1
+    assert "holds no camera that can be read, so there is no rig to draft" in capsys.readouterr().err
+    assert not (tmp_path / "rig.yaml").exists()
+
+
+def test_a_draft_of_cameras_alone_loads(bags, tmp_path):
+    bag = bags.write(tmp_path / "run", bags.noise("/cam0/image_raw", SIZE))
+    assert main(["inspect", str(bag), "--rig", str(tmp_path / "rig.yaml"), "-q"]) == 0
+    text = (tmp_path / "rig.yaml").read_text()
+    for field, value in (("rows:", 6), ("cols:", 6), ("tag_size:", 0.088), ("tag_spacing:", 0.3)):
+        text = text.replace(f"\n  {field}", f"\n  {field} {value}", 1)
+    (tmp_path / "rig.yaml").write_text(text)
+    rig = load_rig(tmp_path / "rig.yaml")
+    assert rig.imu is None and rig.body == rig.cameras[0].name

@@ -1,0 +1,70 @@
+"""Topics become sensors with names that tell them apart."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from icalib.inspection.sources import find_sources
+from icalib.recordings import TopicInfo
+from icalib.recordings.topics import KINDS
+
+
+def topics(*names: str) -> list[TopicInfo]:
+    """By their names: ...info are CameraInfo, ...imu... IMUs, tables by their endings, all else images."""
+
+    def kind(name: str) -> str:
+        if name.endswith("corners.csv"):
+            return "corners"
+        if name.endswith("info"):
+            return "camera info"
+        return "imu" if re.search("imu|mavros", name) else "image"
+
+    types = {k: t for t, k in KINDS.items()}
+    return [TopicInfo(n, types.get(kind(n), "table"), kind(n), 10, 0, 1) for n in names]
+
+
+@pytest.mark.parametrize(
+    ("given", "cameras", "imus"),
+    [
+        (["/cam0/image_raw", "/cam1/image_raw", "/imu0"], ["cam0", "cam1"], ["imu0"]),
+        (["/stereo/left/image_raw", "/stereo/right/image_raw", "/imu/data"], ["left", "right"], ["imu"]),
+        (["/left/camera/image_raw", "/right/camera/image_raw", "/imu"], ["left_camera", "right_camera"], ["imu"]),
+        (["/image_raw", "/imu/data_raw"], ["cam0"], ["imu"]),
+        (["/cam0/image_raw", "/imu", "/mavros/imu/data"], ["cam0"], ["imu", "mavros_imu"]),
+        (["cam0", "cam1/corners.csv", "imu0/data.csv"], ["cam0", "cam1"], ["imu0"]),
+        (["/7/image_raw", "/a b/image_raw", "/imu"], ["cam_7", "a_b"], ["imu"]),
+    ],
+)
+def test_names(given, cameras, imus):
+    found = find_sources(topics(*given))
+    assert [c.name for c in found.cameras] == cameras
+    assert list(found.imus) == imus
+    assert all(re.fullmatch("[A-Za-z][A-Za-z0-9_-]*", n) for n in (*cameras, *imus))
+
+
+def test_the_same_images_twice_are_one_camera():
+    given = ["/c/image_rect", "/c/image_raw/compressed", "/c/image_raw", "/c/camera_info", "/d/image_raw"]
+    found = find_sources(topics(*given))
+    camera = found.cameras[0]
+    assert camera.images and camera.info
+    assert (camera.name, camera.images.name, camera.info.name) == ("c", "/c/image_raw", "/c/camera_info")
+    assert found.cameras[1].info is None
+    assert found.left_out == {k: "the images of c once more" for k in ("/c/image_raw/compressed", "/c/image_rect")}
+
+
+def test_depth_images_are_no_camera():
+    found = find_sources(topics("/d455/depth/image_rect_raw", "/d455/color/image_raw"))
+    assert [c.name for c in found.cameras] == ["color"]
+    assert found.left_out == {"/d455/depth/image_rect_raw": "depth images"}
+
+
+def test_images_and_corners_of_one_camera():
+    (camera,) = find_sources(topics("cam0", "cam0/corners.csv")).cameras
+    assert camera.images and camera.corners and camera.topic is camera.corners
+
+
+def test_names_that_no_part_tells_apart():
+    found = find_sources(topics("/a-/image_raw", "/a_/image_raw"))
+    assert len({c.name for c in found.cameras}) == 2
