@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -117,3 +118,10 @@ def test_module_imports_only_from_lower_levels(module: str, package: str, file: 
 def test_the_check_finds_what_is_forbidden(source: str, module: str, forbidden: list[str]):
     found = violations(source, module, module.rpartition(".")[0])
     assert [sentence.split(" imports ")[1].split(" ")[0] for sentence in found] == forbidden
+
+
+def test_the_page_about_the_architecture_has_every_unit_at_its_level():
+    page = (Path(__file__).parents[1] / "docs" / "architecture.md").read_text(encoding="utf-8")
+    rows = [line.split("|") for line in page.splitlines() if re.match(r"\| \d ", line)]
+    listed = {unit: int(row[1]) for row in rows for unit in re.findall(r"`(\w+)`", row[2])}
+    assert listed == {unit: level for unit, level in LEVELS.items() if not unit.startswith("__")}
