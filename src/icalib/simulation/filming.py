@@ -73,9 +73,7 @@ class Film:
             due += [(s, i, k, t) for k, (s, t) in enumerate(zip(seconds.tolist(), stamps.tolist(), strict=True))]
         return sorted(due)
 
-    def _shot(
-        self, renderer: Renderer, sheet: Sheet, number: tuple[int, int], stamp_ns: int, seconds: float
-    ) -> Shot:
+    def _shot(self, renderer: Renderer, sheet: Sheet, number: tuple[int, int], stamp_ns: int, seconds: float) -> Shot:
         camera, image = number
         count = 5 if self.exposure_s > 0.0 else 1
         poses = exposure_poses(renderer.camera, self.truth.trajectory, seconds, self.exposure_s, count)

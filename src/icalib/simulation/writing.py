@@ -124,7 +124,7 @@ class _Bag:
 
 
 class _Folder:
-    """EuRoC's layout; numbers are written so that they are read back to the last bit."""
+    """EuRoC's layout; every digit of the readings is written."""
 
     def __init__(self, path: Path, cameras: list[str]) -> None:
         self._cv2 = _package("cv2", "images")
