@@ -92,8 +92,10 @@ def film(scenario: Scenario, seed: int, imaging: Imaging | None = None, exposure
     if any(scenario.bow):
         raise RigError("boards are rendered flat; set the scenario's bow to zero.")
     simulation = simulate(scenario, seed)
+    imu = simulation.measurements.imu
+    assert imu is not None  # of every scenario
     imaging = Imaging(blur_px=0.8, noise=2.0) if imaging is None else imaging
-    return Film(scenario, seed, imaging, exposure_s, simulation.measurements.imu, simulation.truth)
+    return Film(scenario, seed, imaging, exposure_s, imu, simulation.truth)
 
 
 def _cores() -> int:
