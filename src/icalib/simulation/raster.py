@@ -1,9 +1,10 @@
 """Compiled: a flat black and white pattern averaged over the cells of a grid finer than the pixels, and its blur.
 
-A pixel whose footprint on the sheet lies in one cell of the pattern has that cell's grey. Every other pixel is cut into
-s x s cells, each with a ray of its own, by the rays around the pixel to second order. To first order the place on the sheet that a cell sees spreads
-like the sum of two uniform variables, so what lies between two edges of the pattern is a difference of trapezoids'
-integrals: an edge is exact wherever it falls in the cell, not rounded to samples.
+A pixel whose footprint on the sheet lies in one cell of the pattern has that cell's grey. Every other pixel is cut
+into s x s cells, each with a ray of its own, by the rays around the pixel to second order. To first order the place
+on the sheet that a cell sees spreads like the sum of two uniform variables, so what lies between two edges of the
+pattern is a difference of trapezoids' integrals: an edge is exact wherever it falls in the cell, not rounded to
+samples.
 """
 
 from __future__ import annotations
