@@ -18,6 +18,9 @@ BUNDLE_IMAGES = 48
 JUDGE_IMAGES = 300  # to tell valleys apart that differ by far less than the noise
 FOCAL_TRIALS = np.geomspace(0.1, 3.0, 35)  # of the image width: 19 degrees for a pinhole, all round for a fisheye
 ROUNDS = 25
+TIED = 1.05  # trials this much worse than the best are as good
+ALIKE = 1.002  # costs that the noise cannot tell apart: the plainer lens is taken
+MOST_TIED = 5  # neighbours of the best, which lead to the same place
 HUBER_PX = 1.5
 GOOD_RMS_PX = 2.0
 
@@ -53,16 +56,30 @@ def _candidates(
     focal length; those that are nearly the same, once."""
     trial, found = _spread_images(stream, TRIAL_IMAGES), []
     for starts in kinds:
-        medians = [np.median(target_poses(trial, model, start, target).rms_px) for start in starts]
-        with suppress(np.linalg.LinAlgError):
-            # Focal length and the strongest distortion first; the rest only once these are near.
-            params = starts[int(np.argmin(medians))]
-            for stage in (np.array([0, 1, 4]), np.arange(len(params))):
-                if wanted[stage].any():
-                    params, _ = _bundle(bundle, model, params, target, stage[wanted[stage]])
-            if not any(np.allclose(params, other, rtol=1e-2, atol=1e-3) for other in found):
-                found.append(params)
+        for start in _good_starts(trial, model, starts, target):
+            with suppress(np.linalg.LinAlgError):
+                params = _fit(bundle, model, start, target, wanted)
+                if not any(np.allclose(params, other, rtol=1e-2, atol=1e-3) for other in found):
+                    found.append(params)
     return found
+
+
+def _good_starts(trial: CornerStream, model: CameraModel, starts: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """The rows of `starts` (F, P) that explain the corners best; several, far apart, where they are about as good: a
+    target that is always seen from straight ahead looks the same through every focal length."""
+    medians = np.array([np.median(target_poses(trial, model, start, target).rms_px) for start in starts])
+    good = np.flatnonzero(medians <= TIED * medians.min())
+    return starts[np.unique(good[[0, len(good) // 2, -1]])] if len(good) > MOST_TIED else starts[[np.argmin(medians)]]
+
+
+def _fit(
+    bundle: CornerStream, model: CameraModel, params: np.ndarray, target: np.ndarray, wanted: np.ndarray
+) -> np.ndarray:
+    """The `wanted` (P,) of `params`: focal length and the strongest distortion first, the rest once these are near."""
+    for stage in (np.array([0, 1, 4]), np.arange(len(params))):
+        if wanted[stage].any():
+            params, _ = _bundle(bundle, model, params, target, stage[wanted[stage]])
+    return params
 
 
 def _cheapest(
@@ -75,13 +92,16 @@ def _cheapest(
     if len(found) <= 1:
         return found[0] if found else np.zeros(len(model.parameter_names))
     used = np.all([_used(target_poses(stream, model, p, target)) for p in found], axis=0)
-    least, best = np.inf, found[0]
+    judged: list[tuple[float, np.ndarray]] = []
     for params in found:
         with suppress(np.linalg.LinAlgError):
             params, cost = _bundle(stream, model, params, target, free, used)
-            if cost < least:
-                least, best = cost, params
-    return best
+            judged.append((cost, params))
+    if not judged:
+        return found[0]
+    least = min(cost for cost, _ in judged)
+    alike = [params for cost, params in judged if cost <= ALIKE * least]
+    return min(alike, key=lambda params: float(np.linalg.norm(params[4:])))
 
 
 def _used(poses: TargetPoses) -> np.ndarray:
