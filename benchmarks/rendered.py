@@ -131,9 +131,9 @@ def _line(row: np.ndarray) -> str:
 
 
 def _end_to_end(options: argparse.Namespace) -> None:
-    import resource
-
-    for _ in range(2):  # the second time nothing is compiled
+    """In a process of its own, twice: the second time nothing is compiled."""
+    print(f"one bag, {os.cpu_count()} cores, load of all {os.getloadavg()[0]:.1f}; in a process of its own:")
+    for kernels in ("perhaps compiling", "compiled"):
         with tempfile.TemporaryDirectory() as empty:
             started = time.perf_counter()
             command = [sys.executable, __file__, *sys.argv[1:], "--child"]
@@ -141,16 +141,19 @@ def _end_to_end(options: argparse.Namespace) -> None:
                 command, env=os.environ | {"ICALIB_CACHE": empty}, stdout=subprocess.PIPE, text=True, check=True
             )
             seconds = time.perf_counter() - started
-    unit = 1 if sys.platform == "darwin" else 1024
-    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * unit * 1e-6
-    note = "" if options.kind != "pinhole" else f", at most {TARGET_S:g} s"
-    print(f"one bag, in a process of its own: {seconds:.2f} s{note}, peak {peak:.0f} MB; {done.stdout.strip()}")
+        print(f"  {kernels:<18} {seconds:6.2f} s; {done.stdout.strip()}")
+    print(f"  at most            {TARGET_S:6.2f} s")
 
 
 def _child(options: argparse.Namespace) -> int:
+    import resource
+
     scenario = scenario_of(options.kind, options.duration)
     result = icalib.calibrate(rig_of(scenario), _path(options, options.first))
-    print(", ".join(f"{stage} {seconds:.2f} s" for stage, seconds in result.timings.items()))
+    unit = 1 if sys.platform == "darwin" else 1024
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit * 1e-6
+    stages = ", ".join(f"{stage} {seconds:.2f} s" for stage, seconds in result.timings.items())
+    print(f"of all processors {time.process_time():.2f} s, peak {peak:.0f} MB; {stages}")
     return 0
 
 
