@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -32,5 +34,30 @@ def detector_of(target: Target) -> Detector:
         ratio = target.marker_size / target.square_size
         return CharucoDetector(target.squares_y, target.squares_x, ratio, target.dictionary)
     if isinstance(target, Checkerboard):
-        return CheckerboardDetector(target.rows, target.cols)
+        return _Renumbered(CheckerboardDetector(target.rows, target.cols), _from_the_bottom(target.rows, target.cols))
     raise RigError(f"targets of type {target.type} are not found in images; use corners as a table.")
+
+
+@dataclass(frozen=True, eq=False)
+class _Renumbered:
+    """What `detector` calls k is the target's point number[k]."""
+
+    detector: Detector
+    number: np.ndarray
+
+    def detect(self, image: np.ndarray) -> ImageCorners:
+        found = self.detector.detect(image)
+        point = self.number[found.point]
+        order = np.argsort(point)
+        fields = {f.name: getattr(found, f.name)[order] for f in dataclasses.fields(found)}
+        return ImageCorners(**fields | {"point": point[order]})
+
+
+def _from_the_bottom(rows: int, cols: int) -> np.ndarray:
+    """(rows cols,) the target's point of each of the detector's corners. One of rows, cols is odd.
+
+    Both begin where the corner's square is dark; the target's y goes up the sheet, the detector's down. Backwards along
+    the even one, the first square is dark again.
+    """
+    number = np.arange(rows * cols).reshape(rows, cols)
+    return (number[::-1] if rows % 2 == 0 else number[:, ::-1]).ravel()

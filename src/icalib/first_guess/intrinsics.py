@@ -19,6 +19,7 @@ JUDGE_IMAGES = 300  # to tell valleys apart that differ by far less than the noi
 FOCAL_TRIALS = np.geomspace(0.1, 3.0, 35)  # of the image width: 19 degrees for a pinhole, all round for a fisheye
 ROUNDS = 25
 TIED = 1.05  # trials this much worse than the best are as good
+NEAR = 1.5  # candidates with so many times the error of the best are in another valley: no closer look is needed
 ALIKE = 1.002  # costs that the noise cannot tell apart: the plainer lens is taken
 MOST_TIED = 5  # neighbours of the best, which lead to the same place
 HUBER_PX = 1.5
@@ -34,8 +35,9 @@ def guess_intrinsics(
     """
     bundle = _spread_images(stream, BUNDLE_IMAGES)
     candidates = _candidates(stream, bundle, model, _starts(model, resolution, given), target, np.isnan(given))
+    candidates = _near_the_best(bundle, model, candidates, target)
     params = _cheapest(_spread_images(stream, JUDGE_IMAGES), model, candidates, target, np.flatnonzero(np.isnan(given)))
-    rms = float(np.median(target_poses(bundle, model, params, target).rms_px))
+    rms = _median_rms(bundle, model, params, target)
     if not rms < GOOD_RMS_PX:
         raise EstimationError(
             f"{stream.name}: no intrinsics of model {model.name} explain the corners (best median error {rms:.1f} px); "
@@ -67,7 +69,7 @@ def _candidates(
 def _good_starts(trial: CornerStream, model: CameraModel, starts: np.ndarray, target: np.ndarray) -> np.ndarray:
     """The rows of `starts` (F, P) that explain the corners best; several, far apart, where they are about as good: a
     target that is always seen from straight ahead looks the same through every focal length."""
-    medians = np.array([np.median(target_poses(trial, model, start, target).rms_px) for start in starts])
+    medians = np.array([_median_rms(trial, model, start, target) for start in starts])
     good = np.flatnonzero(medians <= TIED * medians.min())
     return starts[np.unique(good[[0, len(good) // 2, -1]])] if len(good) > MOST_TIED else starts[[np.argmin(medians)]]
 
@@ -80,6 +82,19 @@ def _fit(
         if wanted[stage].any():
             params, _ = _bundle(bundle, model, params, target, stage[wanted[stage]])
     return params
+
+
+def _near_the_best(
+    stream: CornerStream, model: CameraModel, found: list[np.ndarray], target: np.ndarray
+) -> list[np.ndarray]:
+    """Those of `found` whose error is near the least. To judge all of them on many images takes seconds."""
+    rms = [_median_rms(stream, model, params, target) for params in found]
+    return [params for params, error in zip(found, rms, strict=True) if error <= NEAR * min(rms)]
+
+
+def _median_rms(stream: CornerStream, model: CameraModel, params: np.ndarray, target: np.ndarray) -> float:
+    """Over the images [px]."""
+    return float(np.median(target_poses(stream, model, params, target).rms_px))
 
 
 def _cheapest(

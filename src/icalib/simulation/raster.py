@@ -1,9 +1,10 @@
 """Compiled: a flat black and white pattern averaged over the cells of a grid finer than the pixels, and its blur.
 
-A pixel whose footprint on the sheet lies in one cell of the pattern has that cell's grey. Every other pixel is cut into
-s x s cells, each with a ray of its own through the lens. To first order the place on the sheet that a cell sees spreads
-like the sum of two uniform variables, so what lies between two edges of the pattern is a difference of trapezoids'
-integrals: an edge is exact wherever it falls in the cell, not rounded to samples.
+A pixel whose footprint on the sheet lies in one cell of the pattern has that cell's grey. Every other pixel is cut
+into s x s cells, each with a ray of its own, by the rays around the pixel to second order. To first order the place
+on the sheet that a cell sees spreads like the sum of two uniform variables, so what lies between two edges of the
+pattern is a difference of trapezoids' integrals: an edge is exact wherever it falls in the cell, not rounded to
+samples.
 """
 
 from __future__ import annotations
@@ -13,18 +14,16 @@ from math import erf
 import numpy as np
 from numba import njit
 
-from icalib.simulation.lenses import ray
-
 _SLACK = 1.3  # of a pixel's linear footprint, for what the lens bends it
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def paint(code, lens, rays, by_u, by_v, pad, s, R, C, x_edges, y_edges, grey_of, fine):
+def paint(rays, by_u, by_v, bends, s, R, C, x_edges, y_edges, grey_of, fine):
     """Paints the sheet over the greys in `fine` (H s, W s), s x s cells a pixel.
 
-    rays (H, W, 3) through the pixels' centres and their derivatives, NaN where there are none; pixel (0, 0) of the grid
-    is (-pad, -pad) of the image; R, C: rotation from the camera to the sheet, the camera's place on the sheet's frame;
-    grey_of (ny, nx): grey of each cell.
+    rays (H, W, 3) through the pixels' centres, their derivatives, and bends (3, H, W, 3), those by uu, uv and vv; NaN
+    where there are none. R, C: rotation from the camera to the sheet, the camera's place on the sheet's frame; grey_of
+    (ny, nx): grey of each cell.
     """
     for row in range(rays.shape[0]):
         for col in range(rays.shape[1]):
@@ -49,13 +48,23 @@ def paint(code, lens, rays, by_u, by_v, pad, s, R, C, x_edges, y_edges, grey_of,
                 continue
             for a in range(s):
                 for b in range(s):
-                    u, v = col - pad + (b + 0.5) / s - 0.5, row - pad + (a + 0.5) / s - 0.5
-                    x, y, z = ray(code, lens, u, v)
+                    du, dv = (b + 0.5) / s - 0.5, (a + 0.5) / s - 0.5
+                    x, y, z = _ray(rays[row, col], by_u[row, col], by_v[row, col], bends[:, row, col], du, dv)
                     grey, covered = _average(
                         x, y, z, R, C, Xu / s, Yu / s, Xv / s, Yv / s, x_edges, y_edges, grey_of
                     )  # fmt: skip
                     old = fine[row * s + a, col * s + b]
                     fine[row * s + a, col * s + b] = old * (1.0 - covered) + grey
+
+
+@njit(cache=True, nogil=True)
+def _ray(d, d_u, d_v, bend, du, dv):
+    """The ray du, dv pixels beside the one that is d."""
+    uu, uv, vv = 0.5 * du * du, du * dv, 0.5 * dv * dv
+    x = d[0] + du * d_u[0] + dv * d_v[0] + uu * bend[0, 0] + uv * bend[1, 0] + vv * bend[2, 0]
+    y = d[1] + du * d_u[1] + dv * d_v[1] + uu * bend[0, 1] + uv * bend[1, 1] + vv * bend[2, 1]
+    z = d[2] + du * d_u[2] + dv * d_v[2] + uu * bend[0, 2] + uv * bend[1, 2] + vv * bend[2, 2]
+    return x, y, z
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

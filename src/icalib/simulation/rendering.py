@@ -15,7 +15,7 @@ import numpy as np
 from icalib.errors import RigError
 from icalib.geometry.targets import Target
 from icalib.geometry.targets.pattern import Pattern, pattern_of
-from icalib.simulation.lenses import lens_of, unproject
+from icalib.simulation.lenses import unproject
 from icalib.simulation.motion import Trajectory
 from icalib.simulation.projection import project, visible
 from icalib.simulation.raster import paint, pixel_kernel, shrink
@@ -121,15 +121,21 @@ class Renderer:
         return (height + 2 * self._pad) * _CELLS, (width + 2 * self._pad) * _CELLS
 
     @cached_property
-    def _rays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Rays through the centres of the pixels and of those around the image, and their derivatives by u and v."""
+    def _rays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Rays (h, w, 3) through the centres of the pixels and of those around the image, their derivatives by u and
+        by v, and (3, h, w, 3) the second ones, by uu, uv and vv."""
         width, height = self.camera.resolution
         u, v = np.meshgrid(
             np.arange(-self._pad - 1.0, width + self._pad + 1.0), np.arange(-self._pad - 1.0, height + self._pad + 1.0)
         )
         rays = unproject(self.camera, np.stack([u, v], axis=-1))
         by_u, by_v = 0.5 * (rays[1:-1, 2:] - rays[1:-1, :-2]), 0.5 * (rays[2:, 1:-1] - rays[:-2, 1:-1])
-        return np.ascontiguousarray(rays[1:-1, 1:-1]), by_u, by_v
+        middle = np.ascontiguousarray(rays[1:-1, 1:-1])
+        by_uu, by_vv = (
+            a + b - 2.0 * middle for a, b in ((rays[1:-1, 2:], rays[1:-1, :-2]), (rays[2:, 1:-1], rays[:-2, 1:-1]))
+        )
+        by_uv = 0.25 * (rays[2:, 2:] + rays[:-2, :-2] - rays[2:, :-2] - rays[:-2, 2:])
+        return middle, by_u, by_v, np.stack([by_uu, by_uv, by_vv])
 
     @cached_property
     def _falloff(self) -> np.ndarray:
@@ -142,13 +148,12 @@ class Renderer:
     def _instant(self, sheets: Sequence[Sheet], T_world_cam: np.ndarray) -> np.ndarray:
         """(H s, W s) greys from one pose, before blur, the border included."""
         fine = np.full(self._fine_shape, self.imaging.background, dtype=np.float32)
-        code, lens = lens_of(self.camera)
         seen_from = [(sheet, np.linalg.inv(sheet.T_world_target) @ T_world_cam) for sheet in sheets]
         for sheet, T_sheet_cam in sorted(seen_from, key=lambda s: -_distance(*s)):
             pattern, R, C = sheet.pattern, T_sheet_cam[:3, :3], T_sheet_cam[:3, 3]
             front = C[2] > 0.0  # the back of the paper is white
             grey_of = np.where(pattern.white | (not front), self.imaging.white, self.imaging.black)
-            paint(code, lens, *self._rays, self._pad, _CELLS, R, C, pattern.x, pattern.y, grey_of, fine)
+            paint(*self._rays, _CELLS, R, C, pattern.x, pattern.y, grey_of, fine)
         return fine
 
     def _truth(self, sheet: Sheet, poses: np.ndarray) -> SheetTruth:

@@ -1,0 +1,172 @@
+"""Films as files: bags of ROS 1 and ROS 2, written by rosbags, and EuRoC's folder (`icalib[bags,images]`)."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, Protocol
+
+import numpy as np
+
+from icalib.errors import CalibrationError, RecordingError
+from icalib.simulation.filming import Film, Shot
+
+Form = Literal["ros1", "mcap", "sqlite3", "euroc"]
+FORMS: tuple[Form, ...] = ("ros1", "mcap", "sqlite3", "euroc")
+_IMU_TOPIC = "/imu0"
+_IMAGE, _IMU = "sensor_msgs/msg/Image", "sensor_msgs/msg/Imu"
+Reading = tuple[int, list[float]]  # stamp [ns]; gyro, accel
+
+
+class _Sink(AbstractContextManager["_Sink"], Protocol):
+    """One recording that is being written. received_ns: when the recorder received it, on the IMU's clock."""
+
+    def image(self, shot: Shot, received_ns: int) -> None: ...
+
+    def reading(self, reading: Reading) -> None: ...
+
+
+def write_film(film: Film, paths: Mapping[Form, Path], workers: int | None = None) -> None:
+    """Writes `film` once in each form of `paths`; each image is rendered once, and only a few are in memory.
+
+    ros1: a file; mcap and sqlite3: folders of ROS 2; euroc: a folder that holds `mav0`, images as PNG. Images of cam0
+    are topic `/cam0/image_raw`, mono8. Raises RecordingError where a path exists, CalibrationError where a package is
+    missing.
+    """
+    for path in paths.values():
+        if path.exists():
+            raise RecordingError(f"{path} exists already; remove it, or write elsewhere.")
+    cameras = [camera.name for camera in film.scenario.cameras]
+    with ExitStack() as stack:
+        sinks = [stack.enter_context(_sink(form, path, cameras)) for form, path in paths.items()]
+        for received_ns, event in _in_time(film, workers):
+            for sink in sinks:
+                if isinstance(event, Shot):
+                    sink.image(event, received_ns)
+                else:
+                    sink.reading(event)
+
+
+def _in_time(film: Film, workers: int | None) -> Iterator[tuple[int, Shot | Reading]]:
+    """Images and readings as they are taken, with that instant on the IMU's clock [ns]."""
+    values = np.concatenate([film.imu.gyro, film.imu.accel], axis=1)
+    readings = zip(film.imu.stamps_ns.tolist(), values.tolist(), strict=True)
+    next_reading = next(readings, None)
+    for shot in film.shots(workers):
+        taken_ns = film.truth.imu_clock_origin_ns + round(shot.seconds * 1e9)
+        while next_reading is not None and next_reading[0] <= taken_ns:
+            yield next_reading[0], next_reading
+            next_reading = next(readings, None)
+        yield taken_ns, shot
+    while next_reading is not None:
+        yield next_reading[0], next_reading
+        next_reading = next(readings, None)
+
+
+def _sink(form: Form, path: Path, cameras: list[str]) -> _Sink:
+    return _Folder(path, cameras) if form == "euroc" else _Bag(form, path, cameras)
+
+
+class _Bag:
+    """A bag, by rosbags' writers."""
+
+    def __init__(self, form: Form, path: Path, cameras: list[str]) -> None:
+        typesys = _package("rosbags.typesys", "bags")
+        self._ros1 = form == "ros1"
+        stores = typesys.Stores
+        self._store: Any = typesys.get_typestore(stores.ROS1_NOETIC if self._ros1 else stores.ROS2_HUMBLE)
+        if self._ros1:
+            self._writer = _package("rosbags.rosbag1", "bags").Writer(path)
+        else:
+            rosbag2 = _package("rosbags.rosbag2", "bags")
+            plugin = rosbag2.StoragePlugin[form.upper()]
+            self._writer = rosbag2.Writer(path, version=9, storage_plugin=plugin)
+        self._topics = {_IMU_TOPIC: _IMU} | {_image_topic(name): _IMAGE for name in cameras}
+        self._connections: dict[str, Any] = {}
+
+    def __enter__(self) -> _Bag:
+        self._writer.__enter__()
+        for topic, kind in self._topics.items():
+            self._connections[topic] = self._writer.add_connection(topic, kind, typestore=self._store)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._writer.__exit__(kind, error, trace)
+
+    def image(self, shot: Shot, received_ns: int) -> None:
+        height, width = shot.pixels.shape
+        header = self._header(shot.stamp_ns, shot.camera)
+        message = self._make(_IMAGE, header, height, width, "mono8", 0, width, shot.pixels.ravel())
+        self._write(_image_topic(shot.camera), message, received_ns)
+
+    def reading(self, reading: Reading) -> None:
+        stamp_ns, values = reading
+        unknown, turn = np.zeros(9), self._make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
+        w, f = (self._make("geometry_msgs/msg/Vector3", *v) for v in (values[:3], values[3:]))
+        message = self._make(_IMU, self._header(stamp_ns, "imu0"), turn, unknown, w, unknown, f, unknown)
+        self._write(_IMU_TOPIC, message, stamp_ns)
+
+    def _header(self, stamp_ns: int, frame: str) -> Any:
+        stamp = self._make("builtin_interfaces/msg/Time", *divmod(stamp_ns, 1_000_000_000))
+        return self._make("std_msgs/msg/Header", *([0] if self._ros1 else []), stamp, frame)
+
+    def _make(self, kind: str, *values: Any) -> Any:
+        return self._store.types[kind](*values)
+
+    def _write(self, topic: str, message: Any, received_ns: int) -> None:
+        serialise = self._store.serialize_ros1 if self._ros1 else self._store.serialize_cdr
+        self._writer.write(self._connections[topic], received_ns, serialise(message, self._topics[topic]))
+
+
+class _Folder:
+    """EuRoC's layout; every digit of the readings is written."""
+
+    def __init__(self, path: Path, cameras: list[str]) -> None:
+        self._cv2 = _package("cv2", "images")
+        self._root = path / "mav0"
+        self._stack = ExitStack()
+        self._headers = {"imu0": "#timestamp [ns],w_x [rad s^-1],w_y,w_z,a_x [m s^-2],a_y,a_z"}
+        self._headers |= {name: "#timestamp [ns],filename" for name in cameras}
+        self._tables: dict[str, Any] = {}
+
+    def __enter__(self) -> _Folder:
+        for name, header in self._headers.items():
+            (self._root / name / ("" if name == "imu0" else "data")).mkdir(parents=True)
+            table = (self._root / name / "data.csv").open("w", encoding="utf-8")
+            self._tables[name] = self._stack.enter_context(table)
+            table.write(header + "\n")
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.__exit__(kind, error, trace)
+
+    def image(self, shot: Shot, received_ns: int) -> None:
+        name = f"{shot.stamp_ns}.png"
+        done, data = self._cv2.imencode(".png", shot.pixels)
+        assert done
+        (self._root / shot.camera / "data" / name).write_bytes(data.tobytes())
+        self._tables[shot.camera].write(f"{shot.stamp_ns},{name}\n")
+
+    def reading(self, reading: Reading) -> None:
+        stamp_ns, values = reading
+        self._tables["imu0"].write(",".join([str(stamp_ns), *(repr(v) for v in values)]) + "\n")
+
+
+def _image_topic(camera: str) -> str:
+    return f"/{camera}/image_raw"
+
+
+def _package(name: str, extra: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise CalibrationError(
+            f"writing recordings needs {name}, which is not installed; run: pip install icalib[{extra}]."
+        ) from None

@@ -1,0 +1,106 @@
+"""The whole way, from a bag of rendered images to a calibration, from nothing and against the truth."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import icalib
+from icalib.calibration import Calibration
+from icalib.rig import Rig, Settings
+from icalib.simulation import Film, Scenario, film, handheld, rig_for, write_film
+from icalib.simulation.projection import project
+from icalib.simulation.writing import FORMS, Form
+
+pytest.importorskip("cv2")
+pytest.importorskip("rosbags")
+
+BLOCKS = ("rotation", "translation", "time_offset", "intrinsics")
+
+
+@pytest.fixture(scope="module")
+def scenario() -> Scenario:
+    """Six seconds of EuRoC's cam0 at half its resolution."""
+    base = handheld(6.0)
+    fx, fy, cx, cy = 0.5 * np.array(base.cameras[0].intrinsics)
+    # The centre of the top left pixel stays (0, 0).
+    intrinsics = (fx, fy, cx - 0.25, cy - 0.25)
+    camera = dataclasses.replace(base.cameras[0], resolution=(376, 240), intrinsics=intrinsics)
+    return dataclasses.replace(base, cameras=(camera,))
+
+
+@pytest.fixture(scope="module")
+def filmed(scenario: Scenario) -> Film:
+    return film(scenario, seed=0)
+
+
+@pytest.fixture(scope="module")
+def recordings(filmed: Film, tmp_path_factory: pytest.TempPathFactory) -> dict[Form, Path]:
+    folder = tmp_path_factory.mktemp("filmed")
+    paths = {form: folder / form for form in FORMS}
+    write_film(filmed, paths)
+    return paths
+
+
+@pytest.fixture(scope="module")
+def rig(scenario: Scenario) -> Rig:
+    """As a user would write it: nothing known of the camera but its model and resolution."""
+    settings = Settings(keep_corners=False)
+    rig = rig_for(scenario, intrinsics="free", distortion="free", settings=settings)
+    return dataclasses.replace(rig, cameras=(dataclasses.replace(rig.cameras[0], corner_noise_px=None),))
+
+
+@pytest.fixture(scope="module")
+def result(rig: Rig, recordings: dict[Form, Path]) -> Calibration:
+    return icalib.calibrate(rig, recordings["ros1"])
+
+
+def test_a_bag_of_images_gives_the_truth(result: Calibration, filmed: Film):
+    truth = filmed.truth
+    true = {
+        "translation": truth.T_imu_cam["cam0"][:3, 3],
+        "time_offset": [truth.time_offset["cam0"]],
+        "intrinsics": truth.intrinsics["cam0"],
+    }
+    assert result.converged
+    for block in BLOCKS:
+        group = result.group("cam0", block)
+        if block == "rotation":
+            error = Rotation.from_matrix(truth.T_imu_cam["cam0"][:3, :3].T @ group.value).as_rotvec()
+        else:
+            error = group.value - true[block]
+        assert np.abs(error / group.std_formal).max() < 3.0, block
+        assert group.verdict == ("determined",) * len(group.labels), block
+
+
+def test_what_the_lens_bends_within_a_window_is_all_that_distortion_is_off(
+    result: Calibration, filmed: Film, scenario: Scenario
+):
+    """Edges are taken for straight as far as a corner's window reaches: some thousandths of a pixel, several formal
+    standard deviations of the distortion's coefficients."""
+    camera = scenario.cameras[0]
+    found = dataclasses.replace(
+        camera,
+        intrinsics=tuple(result.group("cam0", "intrinsics").value),
+        distortion=tuple(result.group("cam0", "distortion").value),
+    )
+    x, y = np.meshgrid(np.linspace(-0.75, 0.75, 31), np.linspace(-0.5, 0.5, 21))
+    points = np.stack([x, y, np.ones_like(x)], axis=-1)
+    moved = project(found, points) - project(camera, points)
+    turn = result.group("cam0", "intrinsics").value[:2] / 1e3  # a turn of 1 mrad moves a point by so much
+    assert np.abs(moved - moved.mean(axis=(0, 1))).max() < 0.02 < 0.1 * turn.min()
+    assert abs(result.group("cam0", "bloom").value[0]) < 0.005
+
+
+@pytest.mark.parametrize("form", [f for f in FORMS if f != "ros1"])
+def test_every_format_gives_the_same(form: Form, rig: Rig, recordings: dict[Form, Path], result: Calibration):
+    other = icalib.calibrate(rig, recordings[form])
+    for ours, theirs in zip(result.groups, other.groups, strict=True):
+        np.testing.assert_allclose(theirs.value, ours.value, rtol=0.0, atol=1e-9, err_msg=f"{ours.sensor} {ours.name}")
+    for ours, theirs in zip(result.corner_residuals, other.corner_residuals, strict=True):
+        np.testing.assert_array_equal(theirs.uv, ours.uv)
+        np.testing.assert_array_equal(theirs.point, ours.point)
