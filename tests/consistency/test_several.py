@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from icalib.calibration import Calibration, load_calibration
-from icalib.errors import EstimationError
-from icalib.measurements import ImuStream, Measurements
+from icalib.errors import EstimationError, RecordingError
+from icalib.measurements import CornerStream, ImuStream
 from icalib.outputs import write_outputs
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Rig
@@ -200,7 +200,7 @@ def test_gaps_and_other_schemes(noisy):
     """A gap is told with its recording, and images between two nodes never reach into another recording."""
     first, other = (s.measurements for s in noisy)
     t = other.imu.seconds
-    kept = (t < 4.0) | (t > 4.8)
+    kept = (t < 4.0) | (t > 4.1)
     imu = ImuStream(other.imu.name, other.imu.stamps_ns[kept], other.imu.gyro[kept], other.imu.accel[kept])
     rig = rig_of(noisy[0])
     for scheme in ("pose", "kinematic"):
@@ -210,7 +210,7 @@ def test_gaps_and_other_schemes(noisy):
         )
         error, _ = errors(result, noisy[0].truth)
         assert np.abs(error[:6]).max() < 5e-3
-        assert any("has a gap of 0.8" in n and "of recording 2, left out" in n for n in result.notes)
+        assert any("has a gap of 0.1" in n and "s of recording 2, bridged" in n for n in result.notes)
 
 
 def test_without_an_imu_recordings_are_more_images():
@@ -225,18 +225,27 @@ def test_without_an_imu_recordings_are_more_images():
     both, alone = calibrate_measurements(rig, recordings), calibrate_measurements(rig, recordings[:1])
     assert both.converged, both.status
     assert len(both.trajectory.seconds) == sum(len(m.cameras[0].stamps_ns) for m in recordings)
-    assert np.bincount(both.recording_of(both.trajectory.seconds)).tolist() == [33, 33] or True
+    counts = np.bincount(both.recording_of(both.trajectory.seconds))
+    assert counts.tolist() == [len(m.cameras[0].stamps_ns) for m in recordings]
     g, truth = both.group("cam0", "intrinsics"), simulations[0].truth.intrinsics["cam0"]
     assert np.abs((g.value - truth) / g.std_formal).max() < 4.0
     assert (g.std_formal < 0.9 * alone.group("cam0", "intrinsics").std_formal).all()
 
 
-def test_nothing_is_refused(noisy):
-    with pytest.raises(Exception, match="no recording was given"):
+def test_a_recording_that_shows_too_little_is_named(noisy):
+    """The first guess needs motion, and a chain needs three images within the recording of the IMU."""
+    first, other = (s.measurements for s in noisy)
+    short = dataclasses.replace(other, cameras=tuple(only(c, 0, 15) for c in other.cameras), name="short")
+    with pytest.raises(EstimationError, match=r"^short: cam0: too few neighbouring images show the target"):
+        calibrate_measurements(rig_of(noisy[0]), [first, short])
+
+
+def only(c: CornerStream, first: int, end: int) -> CornerStream:
+    """Images first..end."""
+    own = slice(c.start[first], c.start[end])
+    return CornerStream(c.name, c.stamps_ns[first:end], c.start[first : end + 1] - own.start, c.point[own], c.uv[own])
+
+
+def test_no_recording_is_refused(noisy):
+    with pytest.raises(RecordingError, match="no recording was given"):
         calibrate_measurements(rig_of(noisy[0]), [])
-
-
-def test_measurements_stay_as_they_were(noisy):
-    names = [m.name for m in (s.measurements for s in noisy)]
-    assert names == ["", ""]
-    assert isinstance(noisy[0].measurements, Measurements)

@@ -97,8 +97,8 @@ class State:
 
         A tilt of the board turns the whole trajectory of its recording with it, exactly; the nodes' own steps are what
         they have beyond that, and turn too. To first order nothing changes. But where gravity is weakly known the tilt
-        is large against the precision of positions relative to the board: moved along the tangent they would leave their
-        circle by tilt^2 / 2, and a step that cancels against one of the lever arm would no longer do so.
+        is large against the precision of positions relative to the board: moved along the tangent they would leave
+        their circle by tilt^2 / 2, and a step that cancels against one of the lever arm would no longer do so.
         """
         values, turns = dict(self.values), []
         for b in layout.free:

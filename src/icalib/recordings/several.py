@@ -16,7 +16,10 @@ Source = Recording | str | Path
 
 def open_all(given: Source | Sequence[Source]) -> dict[str, Recording]:
     """One recording or several by name: that of the file or folder, the whole path where two share it, or a number
-    for those that are open already. Raises RecordingError for none, for one that cannot be opened, and for one that is given twice."""
+    for those that are open already.
+
+    Raises RecordingError for none, for one that cannot be opened, and for one that is given twice.
+    """
     sources: Sequence[Source] = given if isinstance(given, Sequence) and not isinstance(given, str) else [given]
     if not sources:
         raise RecordingError("no recording was given; give at least one.")
