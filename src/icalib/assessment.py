@@ -48,7 +48,7 @@ def assess(inputs: Inputs, found: Estimate) -> Calibration:
     empirical = _empirical_variance(inputs, found, np.diag(seen.covariance))
     groups = _groups(inputs, found, seen, empirical)
     judged = [_sensor_fit(f, found) for f in fits(problem, outcome)]
-    timeline = Timeline.of(inputs.parts)
+    timeline = Timeline.of(inputs.parts, image_times(inputs, outcome.state.values))
     trajectory = _trajectory(inputs, outcome.state, timeline)
     return Calibration(
         groups=groups,

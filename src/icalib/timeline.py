@@ -8,31 +8,33 @@ import numpy as np
 
 from icalib.calibration import RecordingSpan
 from icalib.joining import Part
-from icalib.measurements import Measurements
 
 PAUSE_S = 1.0
 
 
 @dataclass(frozen=True)
 class Timeline:
-    """Where recordings stand on the joined clock that was estimated on, and in the result."""
+    """Where recordings stand on the joined clock that was estimated on, and in the result. moved (n,): from the one to
+    the other [s], by recording."""
 
     parts: tuple[Part, ...]
     spans: tuple[RecordingSpan, ...]
+    moved: np.ndarray
 
     @classmethod
-    def of(cls, parts: tuple[Part, ...]) -> Timeline:
-        spans, start = [], 0.0
-        for part in parts:
-            end = start + _length(part.measurements)
-            spans.append(RecordingSpan(part.name, start, end, part.measurements.origin_ns))
-            start = end + PAUSE_S
-        return cls(parts, tuple(spans))
+    def of(cls, parts: tuple[Part, ...], image_times: list[np.ndarray]) -> Timeline:
+        """image_times: of each camera's images, on the joined clock."""
+        spans, moved = [], np.zeros(len(parts))
+        for k, part in enumerate(parts):
+            first, last = _extent(part, image_times)
+            moved[k] = spans[-1].end + PAUSE_S - first if spans else 0.0
+            origin_ns = part.measurements.origin_ns + round(1e9 * (first - part.begin))
+            spans.append(RecordingSpan(part.name, first + moved[k], last + moved[k], origin_ns))
+        return cls(parts, tuple(spans), moved)
 
     def shown(self, seconds: np.ndarray, recording: np.ndarray) -> np.ndarray:
         """(n,) seconds of the result from joined ones, each of a recording (n,)."""
-        moved = np.array([s.start - p.begin for s, p in zip(self.spans, self.parts, strict=True)])
-        return seconds + moved[recording]
+        return seconds + self.moved[recording]
 
     def of_images(self, camera: int) -> np.ndarray:
         """(M,) the recording of each image of a camera, given by its number."""
@@ -46,8 +48,8 @@ class Timeline:
         return own if len(self.parts) == 1 else f"{own} of {self.parts[k].name}"
 
 
-def _length(measurements: Measurements) -> float:
-    """Seconds from the first stamp of the body's clock to its last; without an IMU to the last image of any camera."""
-    if measurements.imu is not None:
-        return float(measurements.imu.seconds[-1])
-    return max(float(c.seconds[-1]) for c in measurements.cameras)
+def _extent(part: Part, image_times: list[np.ndarray]) -> tuple[float, float]:
+    """The first and the last instant of a recording at which anything was measured, on the joined clock."""
+    images = [t[own] for t, own in zip(image_times, part.images, strict=True)]
+    times = np.concatenate([*images, *([part.begin + imu.seconds] if (imu := part.measurements.imu) else [])])
+    return float(times.min()), float(times.max())

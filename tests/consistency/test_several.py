@@ -151,13 +151,16 @@ def test_splits_keep_recordings_apart(noisy_joint):
 def test_times_and_notes_name_the_recording(noisy, noisy_joint):
     spans = noisy_joint.recordings
     assert [s.name for s in spans] == ["recording 1", "recording 2"]
-    assert [s.origin_ns for s in spans] == [s.measurements.imu.origin_ns for s in noisy]
     assert spans[1].start == pytest.approx(spans[0].end + 1.0)
     path = noisy_joint.trajectory
     recording = noisy_joint.recording_of(path.seconds)
     for k, (span, simulation) in enumerate(zip(spans, noisy, strict=True)):
-        own = path.seconds[recording == k] - span.start
-        assert own.min() >= 0.0 and own.max() <= simulation.measurements.imu.seconds[-1]
+        own = path.seconds[recording == k]
+        stamps = simulation.measurements.imu.stamps_ns
+        shown = span.origin_ns + np.round(1e9 * (own - span.start)).astype(np.int64)
+        assert stamps[0] <= shown[0] < stamps[0] + 10**8
+        assert stamps[-1] - 10**8 < shown[-1] <= stamps[-1]
+        assert span.start <= own[0] and own[-1] <= span.end
     for residuals in noisy_joint.corner_residuals:
         assert (np.diff(residuals.seconds) > 0.0).all()
         count = np.bincount(noisy_joint.recording_of(residuals.seconds))
@@ -249,3 +252,38 @@ def only(c: CornerStream, first: int, end: int) -> CornerStream:
 def test_no_recording_is_refused(noisy):
     with pytest.raises(RecordingError, match="no recording was given"):
         calibrate_measurements(rig_of(noisy[0]), [])
+
+
+def test_a_recording_on_wheels_needs_another():
+    """Turning about one axis alone gives no guess, even where it shows most; beside a recording in hand it counts."""
+    still = handheld(20.0, noiseless=True)
+    wheels = simulate(dataclasses.replace(still, motion=dataclasses.replace(still.motion, kind="single_axis")), 3)
+    hand = simulate(second(handheld(9.0, noiseless=True)), 4)
+    rig = rig_for(hand.scenario)
+    with pytest.raises(EstimationError, match="turned about one axis only"):
+        calibrate_measurements(rig, wheels.measurements)
+    result = calibrate_measurements(rig, [wheels.measurements, hand.measurements])
+    assert result.converged, result.status
+    for camera, T in hand.truth.T_imu_cam.items():
+        np.testing.assert_allclose(result.T_imu_sensor(camera), T, atol=1e-8)
+
+
+def test_images_that_outlast_the_imu_are_left_out(noisy):
+    """Cameras of the first recording ran on for seconds, those of the second began earlier; none goes astray."""
+    first, other = (s.measurements for s in noisy)
+    early, late = first.imu.stamps_ns < first.imu.stamps_ns[0] + 9 * 10**9, other.imu.seconds > 2.0
+    cut = [
+        dataclasses.replace(m, imu=ImuStream("imu0", m.imu.stamps_ns[k], m.imu.gyro[k], m.imu.accel[k]))
+        for m, k in ((first, early), (other, late))
+    ]
+    result = calibrate_measurements(rig_of(noisy[0]), cut)
+    error, _ = errors(result, noisy[0].truth)
+    assert np.abs(error[:6]).max() < 5e-3
+    for residuals in result.corner_residuals:
+        assert (np.diff(residuals.seconds) > 0.0).all()
+        recording = result.recording_of(residuals.seconds)
+        camera = int(residuals.sensor[-1])
+        assert np.bincount(recording).tolist() == [len(m.cameras[camera].stamps_ns) for m in cut]
+        unseen = np.add.reduceat(residuals.rejected, residuals.start[:-1]) == np.diff(residuals.start)
+        assert 90 < unseen.sum() < 110
+    assert sum("images of cam" in n and "left out" in n for n in result.notes) == 2

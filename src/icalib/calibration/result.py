@@ -88,7 +88,8 @@ class Trajectory:
 class RecordingSpan:
     """One of the recordings: when it was, on the clock of this result, on which recordings follow one another.
 
-    start: its first stamp on the body's clock, end: its last, [s]; origin_ns: that first stamp as it was recorded.
+    start, end: its first and its last measurement [s]; origin_ns: `start` as a raw stamp of the body's clock, which at
+    t seconds showed origin_ns + 1e9 (t - start).
     """
 
     name: str
