@@ -61,7 +61,7 @@ def run(folder: Path, *names: str) -> int:
 def test_two_recordings_on_the_command_line(folder: Path, capsys):
     assert run(folder, *PARTS) == 0
     printed = capsys.readouterr().out
-    assert "Note: recording 2 is evening, 9.0 s from " in printed
+    assert "Note: recording 2, evening: 9.0 s from " in printed
     found = load_calibration(folder / "out")
     assert [r.name for r in found.recordings] == ["morning", "evening"]
     assert {Path(name).parents[1].name for name in found.inputs if name.endswith(".csv")} == set(PARTS)

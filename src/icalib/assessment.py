@@ -250,7 +250,9 @@ def _warnings(
 
 def _notes(inputs: Inputs, found: Estimate, timeline: Timeline):
     for k, span in enumerate(timeline.spans if len(timeline.spans) > 1 else (), 1):
-        yield f"recording {k} is {span.name}, {span.end - span.start:.1f} s from {span.origin_ns} ns on."
+        number = f"recording {k}"
+        name = number if span.name == number else f"{number}, {span.name}"
+        yield f"{name}: {span.end - span.start:.1f} s from {span.origin_ns} ns on."
     yield from inputs.measurements.notes
     if inputs.imu is not None:
         yield from _imu_notes(inputs, inputs.imu, found, timeline)

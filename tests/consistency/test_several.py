@@ -168,7 +168,7 @@ def test_times_and_notes_name_the_recording(noisy, noisy_joint):
         assert count.tolist() == [len(s.measurements.cameras[camera].stamps_ns) for s in noisy]
     assert len(noisy_joint.imu_residuals.seconds) == len(path.seconds) - 2
     assert noisy_joint.imu_residuals.whitened.any(axis=1).all()
-    assert any(note.startswith("recording 2 is recording 2, 9.0 s from ") for note in noisy_joint.notes)
+    assert any(note.startswith("recording 2: 9.0 s from ") for note in noisy_joint.notes)
 
 
 def test_outputs(noisy_joint, tmp_path):
