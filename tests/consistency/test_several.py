@@ -287,3 +287,31 @@ def test_images_that_outlast_the_imu_are_left_out(noisy):
         unseen = np.add.reduceat(residuals.rejected, residuals.start[:-1]) == np.diff(residuals.start)
         assert 90 < unseen.sum() < 110
     assert sum("images of cam" in n and "left out" in n for n in result.notes) == 2
+
+
+def test_three_recordings_share_bloom_and_bow():
+    """What is of the target or of its image is the same in all, whichever way the target leans."""
+    seconds = (9.0, 8.0, 7.0)
+    scenarios = [handheld(s) if k == 0 else second(handheld(s)) for k, s in enumerate(seconds)]
+    bow, blooms = (1.0e-3, -0.5e-3, 0.7e-3), (0.25, 0.30)
+    simulations = []
+    for k, scenario in enumerate(scenarios):
+        cameras = tuple(dataclasses.replace(c, bloom_px=b) for c, b in zip(scenario.cameras, blooms, strict=True))
+        simulations.append(simulate(dataclasses.replace(scenario, cameras=cameras, bow=bow, blur_s=3e-4), 20 + k))
+    rig = rig_of(simulations[0])
+    cameras = tuple(dataclasses.replace(c, corner_noise_px=None) for c in rig.cameras)
+    settings = dataclasses.replace(rig.settings, splits=6, common_error=True)
+    result = joint(tuple(simulations), dataclasses.replace(rig, cameras=cameras, settings=settings))
+    assert result.converged, result.status
+    shape = result.group("board0", "shape")
+    assert np.abs((shape.value[:3] - np.array(bow)) / shape.std_formal[:3]).max() < 4.0
+    for camera, bloom in zip(("cam0", "cam1"), blooms, strict=True):
+        found = result.group(camera, "bloom")
+        assert abs(found.value[0] - bloom) < 4.0 * found.std_formal[0]
+    error, columns = errors(result, simulations[0].truth)
+    low, high = chi2.ppf([0.0005, 0.9995], len(error))
+    assert low < error @ np.linalg.solve(result.covariance[np.ix_(columns, columns)], error) < high
+    assert not any("too short" in w for w in result.warnings)
+    assert [g.sensor for g in result.groups if g.name == "tilt"] == [
+        "board0", "board0 in recording 2", "board0 in recording 3"
+    ]  # fmt: skip

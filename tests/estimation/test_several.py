@@ -9,7 +9,7 @@ import pytest
 
 from icalib.errors import RecordingError
 from icalib.estimation.assembly import assemble, inputs_for
-from icalib.estimation.corner_factor import CornerNoise
+from icalib.estimation.corner_noise import NoiseModel
 from icalib.estimation.evidence import segment_ends
 from icalib.estimation.imu_factor import ImuFactor
 from icalib.estimation.nodes import first_nodes, place_nodes, usable
@@ -99,12 +99,18 @@ def test_nodes_and_images_stay_off_the_seam(rig, recordings):
     assert k == 3
 
 
-@pytest.fixture(scope="module")
-def problem(rig, recordings):
-    inputs = inputs_for(rig, recordings)
+@pytest.fixture(scope="module", params=["plain", "real corners"])
+def problem(rig, recordings, request):
+    """Two recordings at their first guess; with bloom, a bent board and a common error of each image, or without."""
+    real = request.param != "plain"
+    settings = dataclasses.replace(rig.settings, bloom=real, board_shape=real, common_error=real, blur_noise=real)
+    inputs = inputs_for(dataclasses.replace(rig, settings=settings), recordings)
     state = first_state(inputs, *initial_guesses(rig, recordings))
+    if real:
+        state.values["board0", "shape"][:] = 1e-3
+    models = [NoiseModel(0.2, tau=(0.1,) if real else ()) for _ in rig.cameras]
     streams = inputs.measurements.cameras
-    noise = [CornerNoise(np.full(len(s.stamps_ns), 0.2), np.zeros(0), np.zeros((len(s.uv), 0))) for s in streams]
+    noise = [m.noise(s, c, settings) for m, s, c in zip(models, streams, rig.cameras, strict=True)]
     return assemble(inputs, state, noise, [np.ones(len(s.uv), dtype=bool) for s in streams]), state
 
 
