@@ -17,10 +17,8 @@ from pathlib import Path
 import numpy as np
 
 import icalib
-from icalib.estimation.assembly import Inputs, assemble, layout_for
+from icalib.estimation.assembly import assemble, inputs_for
 from icalib.estimation.corner_noise import first_noise
-from icalib.estimation.imu_data import ImuData
-from icalib.estimation.tolerances import Tolerances
 from icalib.first_guess import initial_guess
 from icalib.measurements import CornerStream, ImuStream, Measurements
 from icalib.pipeline import calibrate_measurements, first_state
@@ -107,7 +105,7 @@ def whole(name: str, rig: Rig, measurements: Measurements, repeats: int = 5) -> 
 
 def sums(name: str, rig: Rig, measurements: Measurements) -> list[Figure]:
     """Residuals, Jacobians and sums of the normal equations at the first state."""
-    inputs = Inputs(rig, measurements, ImuData.build(measurements.imu, rig.imu.noise), layout_for(rig), Tolerances())
+    inputs = inputs_for(rig, [measurements])
     state = first_state(inputs, initial_guess(rig, measurements))
     pairs = list(zip(rig.cameras, measurements.cameras, strict=True))
     noise = [first_noise(c).noise(s, c, rig.settings) for c, s in pairs]

@@ -22,11 +22,9 @@ import gtsam_unstable
 import numpy as np
 from gtsam.symbol_shorthand import B, L, T, V, X
 
-from icalib.estimation.assembly import Inputs, layout_for
+from icalib.estimation.assembly import Inputs, inputs_for
 from icalib.estimation.estimate import Estimate, estimate
-from icalib.estimation.imu_data import ImuData
 from icalib.estimation.state import State
-from icalib.estimation.tolerances import Tolerances
 from icalib.first_guess import initial_guess
 from icalib.measurements import CornerStream, ImuStream, Measurements
 from icalib.pipeline import first_state
@@ -40,7 +38,7 @@ GRAVITY_KEY = gtsam.symbol("g", 0)
 def compare(rig: Rig, measurements: Measurements) -> Iterator[tuple[str, float, str]]:
     """(name, value, unit) of each figure; `rig` has the plain model with fixed intrinsics."""
     rig, measurements = _like_for_like(rig), excerpt(measurements, SECONDS)
-    inputs = Inputs(rig, measurements, ImuData.build(measurements.imu, rig.imu.noise), layout_for(rig), Tolerances())
+    inputs = inputs_for(rig, [measurements])
     state = first_state(inputs, initial_guess(rig, measurements))
     estimate(inputs, state)
     started = time.perf_counter()

@@ -1,4 +1,4 @@
-"""Calibrates cameras and an IMU jointly, in space and in time, from one recording."""
+"""Calibrates cameras and an IMU jointly, in space and in time, from recordings of a target."""
 
 from __future__ import annotations
 

@@ -16,19 +16,20 @@ from icalib.calibration import (
     Trajectory,
     Verdict,
 )
-from icalib.estimation.assembly import BOARD, Inputs, origin_difference
-from icalib.estimation.board import SHAPE_LABELS
+from icalib.estimation.assembly import BOARD, Inputs, image_times, origin_difference
+from icalib.estimation.board import SHAPE_LABELS, is_board
 from icalib.estimation.corner_noise import NoiseModel
 from icalib.estimation.estimate import Estimate
 from icalib.estimation.evidence import Fit, fits, place_covariances, split_covariance
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.imu_model import LABELS as IMU_LABELS
 from icalib.estimation.nodes import usable
-from icalib.estimation.state import Block
+from icalib.estimation.state import Block, State
 from icalib.geometry.cameras import camera_model
 from icalib.observability import Observability, observe
 from icalib.provenance import versions
 from icalib.rig_file import rig_to_dict
+from icalib.timeline import Timeline
 
 UNITS = {
     "rotation": "rad", "translation": "m", "time_offset": "s", "intrinsics": "px", "distortion": "", "bloom": "px",
@@ -48,24 +49,27 @@ def assess(inputs: Inputs, found: Estimate) -> Calibration:
     empirical = _empirical_variance(inputs, found, np.diag(seen.covariance))
     groups = _groups(inputs, found, seen, empirical)
     judged = [_sensor_fit(f, found) for f in fits(problem, outcome)]
+    timeline = Timeline.of(inputs.parts, image_times(inputs, outcome.state.values))
+    trajectory = _trajectory(inputs, outcome.state, timeline)
     return Calibration(
         groups=groups,
         covariance=seen.covariance,
         covariance_names=names,
         undetermined=seen.undetermined,
         fits=tuple(judged),
-        corner_residuals=_corner_residuals(found),
-        imu_residuals=ImuResiduals(outcome.state.seconds[:-1], outcome.residuals.imu),
-        trajectory=_trajectory(found),
+        corner_residuals=_corner_residuals(found, timeline),
+        imu_residuals=_imu_residuals(found, trajectory),
+        trajectory=trajectory,
         iterations=tuple(Iteration(n, s.cost, s.predicted_decrease, s.damping, s.accepted) for n, s in found.steps),
         converged=outcome.converged,
         status=outcome.status,
         warnings=tuple(_warnings(found, groups, judged, empirical)),
-        notes=tuple(_notes(inputs, found)),
+        notes=tuple(_notes(inputs, found, timeline)),
         rig=rig_to_dict(inputs.rig),
         settings=dataclasses.asdict(inputs.rig.settings),
         rates=_rates(inputs),
         versions=versions(),
+        recordings=timeline.spans,
     )
 
 
@@ -95,7 +99,7 @@ def _column_names(inputs: Inputs) -> tuple[str, ...]:
 def _mode(inputs: Inputs, block: Block) -> str:
     if block.start is None:
         return "fixed"
-    if block.sensor == BOARD:
+    if is_board(block.sensor, BOARD):
         return "free"
     if inputs.rig.imu is not None and block.sensor == inputs.rig.imu.name:
         return inputs.rig.imu.intrinsics.mode
@@ -164,7 +168,7 @@ def _empirical_variance(inputs: Inputs, found: Estimate, formal: np.ndarray) -> 
 
 def _calibration_only(inputs: Inputs, per_column: np.ndarray) -> np.ndarray:
     """The columns that users take away: not the board's."""
-    columns = [b.columns for b in inputs.layout.free if b.sensor != BOARD and b.name != "bloom"]
+    columns = [b.columns for b in inputs.layout.free if not is_board(b.sensor, BOARD) and b.name != "bloom"]
     return per_column[np.concatenate(columns)] if columns else np.ones(1)
 
 
@@ -178,23 +182,41 @@ def _sensor_fit(fit: Fit, found: Estimate) -> SensorFit:
     return SensorFit(fit.sensor, fit.kind, fit.count, fit.dof, fit.chi2, rms, unit, rejected)
 
 
-def _corner_residuals(found: Estimate) -> tuple[CornerResiduals, ...]:
+def _corner_residuals(found: Estimate, timeline: Timeline) -> tuple[CornerResiduals, ...]:
     out = []
-    for camera, corners in zip(found.problem.cameras, found.outcome.residuals.corners, strict=True):
+    for i, (camera, corners) in enumerate(zip(found.problem.cameras, found.outcome.residuals.corners, strict=True)):
         stream = camera.stream
-        offset = found.outcome.state.values[camera.name, "time_offset"][0]
+        times = stream.seconds + found.outcome.state.values[camera.name, "time_offset"][0]
         out.append(
             CornerResiduals(
-                camera.name, stream.seconds + offset, stream.start, stream.point, stream.uv, corners.residual,
-                camera.noise.sigma[stream.image], corners.root == 0.0,
+                camera.name, timeline.shown(times, timeline.of_images(i)), stream.start, stream.point, stream.uv,
+                corners.residual, camera.noise.sigma[stream.image], corners.root == 0.0,
             )
         )  # fmt: skip
     return tuple(out)
 
 
-def _trajectory(found: Estimate) -> Trajectory:
-    s = found.outcome.state
-    return Trajectory(s.seconds, s.rotation, s.position, s.velocity, s.bias[:, :3], s.bias[:, 3:])
+def _trajectory(inputs: Inputs, s: State, timeline: Timeline) -> Trajectory:
+    seconds = timeline.shown(s.seconds, _node_recordings(inputs, s, timeline))
+    return Trajectory(seconds, s.rotation, s.position, s.velocity, s.bias[:, :3], s.bias[:, 3:])
+
+
+def _node_recordings(inputs: Inputs, state: State, timeline: Timeline) -> np.ndarray:
+    """(K,) the recording of each node; without an IMU, that of the image which is taken there."""
+    if inputs.imu is not None:
+        return np.repeat(np.arange(len(state.starts)), np.diff((*state.starts, len(state.seconds))))
+    times = np.concatenate(image_times(inputs, state.values))
+    recording = np.concatenate([timeline.of_images(i) for i in range(len(inputs.measurements.cameras))])
+    order = np.argsort(times, kind="stable")
+    return recording[order][np.searchsorted(times[order], state.seconds)]
+
+
+def _imu_residuals(found: Estimate, trajectory: Trajectory) -> ImuResiduals:
+    """Of all intervals but those between recordings, which hold nothing."""
+    seams = np.array(found.problem.chain.starts[1:], dtype=np.int64) - 1
+    return ImuResiduals(
+        np.delete(trajectory.seconds[:-1], seams), np.delete(found.outcome.residuals.imu, seams, axis=0)
+    )
 
 
 def _warnings(
@@ -221,7 +243,7 @@ def _warnings(
                 f"the corners of {g.sensor} lie {abs(g.value[0]):.1f} px too far {where} on their tags, more than "
                 "light and ink do; check tag_size and tag_spacing (the gap over tag_size) of the target."
             )
-    judged_groups = (g for g in groups if g.mode != "fixed" and g.sensor != BOARD and g.name != "bloom")
+    judged_groups = (g for g in groups if g.mode != "fixed" and not is_board(g.sensor, BOARD) and g.name != "bloom")
     factors = [g.factor.max() for g in judged_groups if g.factor is not None]
     if factors and max(factors) > LARGE_FACTOR:
         yield (
@@ -234,15 +256,19 @@ def _warnings(
         )
 
 
-def _notes(inputs: Inputs, found: Estimate):
+def _notes(inputs: Inputs, found: Estimate, timeline: Timeline):
+    for k, span in enumerate(timeline.spans if len(timeline.spans) > 1 else (), 1):
+        number = f"recording {k}"
+        name = number if span.name == number else f"{number}, {span.name}"
+        yield f"{name}: {span.end - span.start:.1f} s from {span.origin_ns} ns on."
     yield from inputs.measurements.notes
     if inputs.imu is not None:
-        yield from _imu_notes(inputs, inputs.imu, found)
+        yield from _imu_notes(inputs, inputs.imu, found, timeline)
     for camera, model in zip(inputs.rig.cameras, found.noise, strict=True):
         yield f"{camera.name}: {_noise_words(model)}."
 
 
-def _imu_notes(inputs: Inputs, imu: ImuData, found: Estimate):
+def _imu_notes(inputs: Inputs, imu: ImuData, found: Estimate, timeline: Timeline):
     assert inputs.rig.imu is not None
     n, most = inputs.rig.imu.noise, inputs.rig.settings.max_gap_s
     yield (
@@ -251,7 +277,7 @@ def _imu_notes(inputs: Inputs, imu: ImuData, found: Estimate):
     )
     for a, b in imu.gaps:
         how = "bridged" if b - a <= most else "left out, with the images in it"
-        yield f"{imu.name} has a gap of {b - a:.3f} s at {a:.3f} s, {how}."
+        yield f"{imu.name} has a gap of {b - a:.3f} s at {timeline.words(a)}, {how}."
     for camera in found.problem.cameras:
         t = camera.times + found.outcome.state.values[camera.name, "time_offset"][0]
         left_out = int((~usable(imu, t, most)).sum())

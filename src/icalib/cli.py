@@ -28,13 +28,14 @@ def _parser() -> argparse.ArgumentParser:
     from icalib import __version__
 
     parser = argparse.ArgumentParser(
-        prog="icalib", description="Calibrates cameras and an IMU jointly from one recording."
+        prog="icalib", description="Calibrates cameras and an IMU jointly from recordings of a target."
     )
     parser.add_argument("--version", action="version", version=f"icalib {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    c = commands.add_parser("calibrate", help="calibrate the sensors of a rig from a recording")
+    c = commands.add_parser("calibrate", help="calibrate the sensors of a rig from one recording or several")
     c.add_argument("rig", type=Path, help="rig file (rig.yaml)")
-    c.add_argument("recording", type=Path, help="folder of the recording, or bag")
+    several = "folder of the recording, or bag; several of one rig are solved jointly"
+    c.add_argument("recording", type=Path, nargs="+", help=several)
     c.add_argument("--output", "-o", type=Path, required=True, help="folder for the results; made if it does not exist")
     c.add_argument("--scheme", choices=("inertial", "pose", "kinematic"), help="where sensors are between nodes")
     c.add_argument("--loss", choices=("none", "huber", "cauchy"), help="robust loss on corners")

@@ -92,6 +92,7 @@ class Measurements:
     imu: ImuStream | None
     cameras: tuple[CornerStream, ...]
     notes: tuple[str, ...] = ()  # what was dropped or repaired while reading, one sentence each
+    name: str = ""  # of the recording, for sentences about one of several
 
     @property
     def origin_ns(self) -> int:

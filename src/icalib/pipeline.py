@@ -1,26 +1,30 @@
-"""From a recording to a calibration: this page is the algorithm."""
+"""From recordings to a calibration: this page is the algorithm."""
 
 from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import numpy as np
 from threadpoolctl import threadpool_limits
 
 from icalib.assessment import assess
 from icalib.calibration import Calibration
 from icalib.detection.streams import find_corners
-from icalib.estimation.assembly import Inputs, image_times, layout_for, nodes_for, start_values
+from icalib.errors import RecordingError
+from icalib.estimation.assembly import BOARD, Inputs, image_times, inputs_for, nodes_for, start_values
+from icalib.estimation.board import board_in
 from icalib.estimation.estimate import estimate
-from icalib.estimation.imu_data import imu_data
+from icalib.estimation.nodes import first_nodes
 from icalib.estimation.state import State
-from icalib.estimation.tolerances import Tolerances
-from icalib.first_guess import Guess, initial_guess, initial_trajectory
+from icalib.first_guess import Guess, initial_trajectory
+from icalib.first_guess.several import initial_guesses
 from icalib.measurements import CornerStream, Measurements
 from icalib.provenance import provenance
-from icalib.recordings import Recording, open_recording, read_measurements
+from icalib.recordings import Recording, read_measurements
+from icalib.recordings.several import Source, naming, open_all
 from icalib.rig import Camera, Rig
 from icalib.rig_file import load_rig
 
@@ -29,20 +33,31 @@ Progress = Callable[[str, float], None]  # what is being done, and how much of t
 
 
 def calibrate(
-    rig: Rig | str | Path, recording: Recording | str | Path, progress: Progress = lambda *_: None
+    rig: Rig | str | Path, recording: Source | Sequence[Source], progress: Progress = lambda *_: None
 ) -> Calibration:
-    """Calibrates every sensor of `rig` from `recording`. Both may be paths. Raises CalibrationError, one sentence."""
+    """Calibrates every sensor of `rig` from `recording`, or jointly from several of the same rig.
+
+    All may be paths. Raises CalibrationError, one sentence; where there are several recordings it names the one meant.
+    """
     rig = rig if isinstance(rig, Rig) else load_rig(rig)
-    recording = open_recording(recording) if isinstance(recording, (str, Path)) else recording
+    opened = open_all(recording)
     started = time.perf_counter()
-    pictured = any(not recording.has_corners(c) for c in rig.cameras)
+    pictured = any(not r.has_corners(c) for r in opened.values() for c in rig.cameras)
     share = IMAGES_SHARE if pictured else READING_SHARE
-    measurements = _measure(rig, recording, lambda stage, done: progress(stage, share * done))
+    measurements = []
+    for k, (name, one) in enumerate(opened.items()):
+
+        def show(stage: str, done: float, k: int = k) -> None:
+            progress(stage, share * (k + done) / len(opened))
+
+        with naming(name if len(opened) > 1 else ""):
+            measurements.append(dataclasses.replace(_measure(rig, one, show), name=name))
     read = time.perf_counter() - started
     result = calibrate_measurements(
         rig, measurements, lambda stage, done: progress(stage, share + (1.0 - share) * done)
     )
-    inputs = provenance([*([rig.path] if rig.path else []), *recording.files()])
+    files = [file for r in opened.values() for file in r.files()]
+    inputs = provenance([*([rig.path] if rig.path else []), *files])
     timings = {"reading": read} | result.timings | {"all": time.perf_counter() - started}
     return dataclasses.replace(result, inputs=inputs, timings=timings)
 
@@ -62,20 +77,26 @@ def _measure(rig: Rig, recording: Recording, progress: Progress) -> Measurements
     return read_measurements(recording, rig, find)
 
 
-def calibrate_measurements(rig: Rig, measurements: Measurements, progress: Progress = lambda *_: None) -> Calibration:
-    """As `calibrate`, from measurements in memory."""
+def calibrate_measurements(
+    rig: Rig, measurements: Measurements | Sequence[Measurements], progress: Progress = lambda *_: None
+) -> Calibration:
+    """As `calibrate`, from measurements in memory. Those without a name are called by their number."""
+    given = [measurements] if isinstance(measurements, Measurements) else measurements
+    if not given:
+        raise RecordingError("no recording was given; give at least one.")
+    recordings = [m if m.name else dataclasses.replace(m, name=f"recording {k}") for k, m in enumerate(given, 1)]
     # The kernels have threads of their own; those of BLAS beside them double the time.
     with threadpool_limits(limits=1, user_api="blas"):
-        return _calibrate(rig, measurements, progress)
+        return _calibrate(rig, recordings, progress)
 
 
-def _calibrate(rig: Rig, measurements: Measurements, progress: Progress) -> Calibration:
+def _calibrate(rig: Rig, recordings: Sequence[Measurements], progress: Progress) -> Calibration:
     clock = _Clock()
     progress("finding a first guess", 0.0)
-    guess = initial_guess(rig, measurements)
+    inputs = inputs_for(rig, recordings)
+    guesses = initial_guesses(rig, [m.measurements for m in inputs.motions])
     clock.lap("first guess")
-    inputs = Inputs(rig, measurements, imu_data(rig, measurements), layout_for(rig), Tolerances())
-    state = first_state(inputs, guess)
+    state = first_state(inputs, *guesses)
     clock.lap("first state")
     steps = _StepProgress(progress)
     found = estimate(inputs, state, lambda name, step: steps.note(name))
@@ -86,12 +107,19 @@ def _calibrate(rig: Rig, measurements: Measurements, progress: Progress) -> Cali
     return dataclasses.replace(result, timings=clock.laps)
 
 
-def first_state(inputs: Inputs, guess: Guess) -> State:
-    """The state that the first pass starts from: the guess at all nodes."""
-    values = start_values(inputs, guess.values())
+def first_state(inputs: Inputs, *guesses: Guess) -> State:
+    """The state that the first pass starts from: the guess of each of `inputs.motions` at all its nodes."""
+    values = guesses[0].values()
+    for k, guess in enumerate(guesses):
+        values[board_in(BOARD, k), "tilt"] = guess.R_world_board
+    values = start_values(inputs, values)
     nodes = nodes_for(inputs, image_times(inputs, values))
-    rotation, position, velocity = initial_trajectory(guess, inputs.rig, inputs.measurements, nodes)
-    return State(nodes, rotation, position, velocity, guess.biases(len(nodes)), values)
+    starts = first_nodes(inputs.imu, nodes)
+    own = [(g, m, t - m.begin) for g, m, t in zip(guesses, inputs.motions, np.split(nodes, starts[1:]), strict=True)]
+    paths = [initial_trajectory(guess, inputs.rig, motion.measurements, t) for guess, motion, t in own]
+    rotation, position, velocity = (np.concatenate(x) for x in zip(*paths, strict=True))
+    bias = np.concatenate([guess.biases(len(t)) for guess, _, t in own])
+    return State(nodes, rotation, position, velocity, bias, values, starts)
 
 
 class _Clock:

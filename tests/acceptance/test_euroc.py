@@ -128,6 +128,21 @@ def test_the_halves_differ_by_what_their_standard_deviations_say(halves):
     assert np.sqrt(np.mean(np.square(z))) <= 2.0
 
 
+def test_the_halves_as_two_recordings_give_the_whole(rig, whole, whole_fixed, cut):
+    """Only the images at the cut are missing, and what the IMU says of the instant between."""
+    joint = calibrate_measurements(rig, [cut(whole, 0.0, 0.5), cut(whole, 0.5, 1.0)])
+    assert joint.converged, joint.status
+    for camera in CAMERAS:
+        for name in ("rotation", "translation", "time_offset"):
+            a, b = whole_fixed.group(camera, name), joint.group(camera, name)
+            difference = turn(a.value, b.value) if name == "rotation" else b.value - a.value
+            assert np.abs(difference / a.std_formal).max() < 1.0
+            np.testing.assert_allclose(b.std_formal, a.std_formal, rtol=0.05)
+            np.testing.assert_allclose(b.std, a.std, rtol=0.5)
+    tilts = [joint.group(name, "tilt").value[2] for name in ("board0", "board0 in recording 2")]
+    assert np.linalg.norm(tilts[0] - tilts[1]) < 2e-3  # the board stood still
+
+
 @pytest.fixture(scope="module")
 def unshifted(rig, whole) -> Calibration:
     return calibrate_measurements(with_settings(rig, splits=0), whole)

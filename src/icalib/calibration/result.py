@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -51,7 +52,7 @@ class CornerResiduals:
     """Residuals (predicted - measured) of one camera's corners, in the recording's order; rejected ones stay."""
 
     sensor: str
-    seconds: np.ndarray  # (M,) image times, imu clock, s since the first IMU stamp
+    seconds: np.ndarray  # (M,) image times, imu clock, s since the first IMU stamp; see RecordingSpan for several
     start: np.ndarray  # (M + 1,) corners of image i are start[i]:start[i+1]
     point: np.ndarray  # (N,) index into the target's points
     uv: np.ndarray  # (N, 2) measured, px
@@ -73,7 +74,7 @@ class ImuResiduals:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """The nodes: where the IMU was. seconds since the first IMU stamp; world frame, z up."""
+    """The nodes: where the IMU was. seconds since the first IMU stamp; world frame, z up, one for each recording."""
 
     seconds: np.ndarray  # (K,)
     rotation: np.ndarray  # (K, 3, 3) R_world_imu
@@ -81,6 +82,20 @@ class Trajectory:
     velocity: np.ndarray  # (K, 3)
     gyro_bias: np.ndarray  # (K, 3)
     accel_bias: np.ndarray  # (K, 3)
+
+
+@dataclass(frozen=True)
+class RecordingSpan:
+    """One of the recordings: when it was, on the clock of this result, on which recordings follow one another.
+
+    start, end: its first and its last measurement [s]; origin_ns: `start` as a raw stamp of the body's clock, which at
+    t seconds showed origin_ns + 1e9 (t - start).
+    """
+
+    name: str
+    start: float
+    end: float
+    origin_ns: int
 
 
 @dataclass(frozen=True)
@@ -117,6 +132,12 @@ class Calibration:
     settings: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)
     timings: dict[str, float] = field(default_factory=dict)  # stage -> seconds
+    recordings: tuple[RecordingSpan, ...] = ()  # in order; arrays of seconds run through all of them
+
+    def recording_of(self, seconds: np.ndarray) -> np.ndarray:
+        """(n,) which of `recordings` each instant of this result lies in."""
+        middles = [0.5 * (a.end + b.start) for a, b in pairwise(self.recordings)]
+        return np.searchsorted(middles, seconds)
 
     def group(self, sensor: str, name: str) -> ParameterGroup:
         """The group `name` of `sensor`. Raises KeyError naming what there is."""

@@ -18,6 +18,7 @@ from icalib.calibration.result import (
     ImuResiduals,
     Iteration,
     ParameterGroup,
+    RecordingSpan,
     SensorFit,
     Trajectory,
 )
@@ -65,6 +66,7 @@ def _plain(c: Calibration, arrays: bytes) -> dict[str, Any]:
         "npz_sha256": hashlib.sha256(arrays).hexdigest(),
         "groups": [_lists(g) for g in c.groups],
         "fits": [dataclasses.asdict(f) for f in c.fits],
+        "recordings": [dataclasses.asdict(r) for r in c.recordings],
         "corner_sensors": [r.sensor for r in c.corner_residuals],
         **{name: list(getattr(c, name)) for name in _TEXTS},
         **{name: getattr(c, name) for name in _PLAIN},
@@ -139,6 +141,7 @@ def _build(plain: dict[str, Any], arrays: dict[str, np.ndarray]) -> Calibration:
         ),
         imu_residuals=ImuResiduals(**of(ImuResiduals, "imu_residuals")),
         trajectory=Trajectory(**of(Trajectory, "trajectory")),
+        recordings=tuple(RecordingSpan(**r) for r in plain.get("recordings", [])),
         iterations=tuple(Iteration(*step) for step in zip(*steps, strict=True)),
         **{name: tuple(plain[name]) for name in _TEXTS},
         **{name: plain[name] for name in _PLAIN},

@@ -79,6 +79,10 @@ class Piece:
         for a in (self.diagonal, self.upper, self.side, self.border):
             a[:] = 0.0
 
+    def without_last(self) -> Piece:
+        """The same sums without node `last`, of which they must say nothing."""
+        return Piece(self.first, self.last - 1, self.diagonal[:-1], self.upper[:-1], self.side[:-1], self.border)
+
     def sums(self, wanted: bool) -> Sums:
         """For a kernel to add to; empty where only residuals are wanted."""
         if wanted:

@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.board import SHAPE_LABELS, SHAPE_SIGMA_M, bloom_direction, shape_basis
+from icalib.estimation.board import SHAPE_LABELS, SHAPE_SIGMA_M, bloom_direction, board_in, shape_basis
 from icalib.estimation.corner_factor import CornerFactor, CornerNoise
 from icalib.estimation.free_nodes import FreeNodes
-from icalib.estimation.imu_data import ImuData
+from icalib.estimation.imu_data import ImuData, joined_imu_data
 from icalib.estimation.imu_factor import ImuFactor
 from icalib.estimation.imu_model import N_INTRINSICS
-from icalib.estimation.nodes import MERGED_WITHIN_S, distinct, place_nodes, usable
+from icalib.estimation.nodes import MERGED_WITHIN_S, distinct, first_nodes, place_nodes, usable
 from icalib.estimation.poses import assign_nodes, poses_at
 from icalib.estimation.prior_factor import Prior
 from icalib.estimation.problem import ChainFactor, Problem
 from icalib.estimation.state import Key, Kind, Layout, State, make_layout
 from icalib.estimation.tolerances import Tolerances
 from icalib.geometry.cameras import camera_model
+from icalib.joining import Part, join
 from icalib.measurements import CornerStream, Measurements
-from icalib.rig import Camera, Parameter, Rig
+from icalib.rig import Camera, Parameter, Rig, Scheme
 
 BOARD = "board0"
 BLOOM_SIGMA_PX = 1.0
@@ -38,23 +40,43 @@ SIZES = {"rotation": 3, "translation": 3, "time_offset": 1, "intrinsics": 4, "bl
 
 @dataclass(frozen=True)
 class Inputs:
-    """What does not change from pass to pass."""
+    """What does not change from pass to pass. parts: the recordings that `measurements` were joined from."""
 
     rig: Rig
     measurements: Measurements
     imu: ImuData | None
     layout: Layout
     tolerances: Tolerances
+    parts: tuple[Part, ...]
+
+    @property
+    def motions(self) -> tuple[Part, ...]:
+        """The recordings, each with a chain and a board of its own; without an IMU all together, since then nothing
+        ties the instants of even one."""
+        if self.imu is not None:
+            return self.parts
+        everything = tuple(slice(0, len(c.stamps_ns)) for c in self.measurements.cameras)
+        return (Part(self.measurements, 0, everything, 0.0),)
 
 
-def layout_for(rig: Rig) -> Layout:
+def inputs_for(rig: Rig, recordings: Sequence[Measurements]) -> Inputs:
+    """Of one recording or several, joined."""
+    joined, parts = join(rig, recordings)
+    return Inputs(
+        rig, joined, joined_imu_data(rig, parts, joined), layout_for(rig, len(parts)), Tolerances(), parts
+    )  # fmt: skip
+
+
+def layout_for(rig: Rig, n_recordings: int = 1) -> Layout:
     """The border: IMU intrinsics, board, then each camera's parameters."""
     imu = rig.imu
     entries: list[tuple[str, str, Kind, int, bool]] = []
     if imu is not None:
         entries.append((imu.name, "intrinsics", "vector", N_INTRINSICS, imu.intrinsics.mode != "fixed"))
     bends = rig.settings.board_shape
-    entries.append((BOARD, "tilt", "tilt", 2, imu is not None))  # without an IMU the board's frame is the world's
+    # Without an IMU the board's frame is the world's, in all recordings.
+    for k in range(1 if imu is None else n_recordings):
+        entries.append((board_in(BOARD, k), "tilt", "tilt", 2, imu is not None))
     entries.append((BOARD, "shape", "vector", len(SHAPE_LABELS) if bends else 0, bends))
     for camera in rig.cameras:
         sizes = SIZES | {"distortion": len(camera_model(camera.model).parameter_names) - 4}
@@ -107,7 +129,8 @@ def resample(state: State, nodes: np.ndarray, inputs: Inputs) -> State:
         return state
     near = assign_nodes("inertial", state.seconds, nodes)
     poses = poses_at("inertial", nodes, near, state, inputs.imu, inputs.rig.gravity, False)
-    return State(nodes, poses.rotation, poses.position, poses.velocity, state.bias[near].copy(), state.values)
+    starts = first_nodes(inputs.imu, nodes)
+    return State(nodes, poses.rotation, poses.position, poses.velocity, state.bias[near].copy(), state.values, starts)
 
 
 def nodes_for(inputs: Inputs, times: list[np.ndarray]) -> np.ndarray:
@@ -117,10 +140,12 @@ def nodes_for(inputs: Inputs, times: list[np.ndarray]) -> np.ndarray:
         return distinct(np.sort(np.concatenate(times)))
     hosts = times[:1] if settings.nodes == "first-camera" else times
     nodes = place_nodes(inputs.imu, hosts, settings.node_spacing_s, settings.max_gap_s)
-    if len(nodes) < 3:
+    counts = np.diff((*first_nodes(inputs.imu, nodes), len(nodes)))
+    if counts.min() < 3:
+        where = f"{inputs.parts[int(np.argmin(counts))].name}: " if len(inputs.parts) > 1 else ""
         raise EstimationError(
-            f"fewer than 3 images of {', '.join(c.name for c in inputs.rig.cameras)} fall within the recording of "
-            f"{inputs.imu.name}; check that the clocks overlap, or the time_offset in the rig file."
+            f"{where}fewer than 3 images of {', '.join(c.name for c in inputs.rig.cameras)} fall within the recording "
+            f"of {inputs.imu.name}; check that the clocks overlap, or the time_offset in the rig file."
         )
     return nodes
 
@@ -130,20 +155,28 @@ def assemble(inputs: Inputs, state: State, noise: list[CornerNoise], keep: list[
     rig, layout = inputs.rig, inputs.layout
     basis = shape_basis(rig.target, rig.settings.board_shape)
     factors = []
-    for camera, stream, t, n, k in zip(
-        rig.cameras, inputs.measurements.cameras, image_times(inputs, state.values), noise, keep, strict=True
+    scheme = rig.settings.scheme if inputs.imu is not None else "inertial"
+    times = image_times(inputs, state.values)
+    for i, (camera, stream, t, n, k) in enumerate(
+        zip(rig.cameras, inputs.measurements.cameras, times, noise, keep, strict=True)
     ):
-        scheme = rig.settings.scheme if inputs.imu is not None else "inertial"
-        node = assign_nodes(scheme, state.seconds, t)
+        own = [m.images[i] for m in inputs.motions]
+        node = _nodes_of(scheme, state, t, own)
         seen = is_seen(inputs, t, state.seconds[node])
         factor = CornerFactor(
             stream, camera_model(camera.model), inputs.imu, rig.gravity, scheme, stream.seconds, node,
             k & np.repeat(seen, np.diff(stream.start)), n, np.zeros((0, 2)), BOARD, rig.target.points, basis, layout,
-            len(state.seconds),
+            len(state.seconds), tuple(images.start for images in own[1:]),
         )  # fmt: skip
         factors.append(_with_bloom(factor, camera, state, rig) if rig.blooms else factor)
     tolerance = inputs.tolerances.of(layout, None if rig.imu is None else rig.imu.name)
     return Problem(layout, _chain(inputs, state), tuple(factors), _priors(inputs), tolerance)
+
+
+def _nodes_of(scheme: Scheme, state: State, times: np.ndarray, images: list[slice]) -> np.ndarray:
+    """(n,) node of each image at `times`, one of its own recording; `images` of each recording."""
+    pairs = zip(images, state.recordings, strict=True)
+    return np.concatenate([assign_nodes(scheme, state.seconds[k], times[i]) + k.start for i, k in pairs])
 
 
 def _chain(inputs: Inputs, state: State) -> ChainFactor:
@@ -163,12 +196,9 @@ def is_seen(inputs: Inputs, times: np.ndarray, nodes: np.ndarray) -> np.ndarray:
 
 def _with_bloom(factor: CornerFactor, camera: Camera, state: State, rig: Rig) -> CornerFactor:
     """The factor with the directions in which its corners bloom, frozen at `state`."""
-    X, R_cw = factor.points_in_camera(state)
-    R_wb = state.values[BOARD, "tilt"]
-    point = factor.stream.point
-    towards = np.einsum(
-        "nij,nj->ni", R_cw[factor.stream.image], ((rig.target.tag_centers - rig.target.points) @ R_wb.T)[point]
-    )
+    X, R_cb = factor.points_in_camera(state)
+    inwards = (rig.target.tag_centers - rig.target.points)[factor.stream.point]
+    towards = np.einsum("nij,nj->ni", R_cb[factor.stream.image], inwards)
     params = np.concatenate([state.values[camera.name, "intrinsics"], state.values[camera.name, "distortion"]])
     return factor.with_direction(bloom_direction(factor.model, params, X, towards))
 

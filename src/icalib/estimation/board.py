@@ -16,6 +16,20 @@ SHAPE_LABELS = BOW_LABELS + IN_PLANE_LABELS
 SHAPE_SIGMA_M = np.array([3e-3] * len(BOW_LABELS) + [1e-3] * len(IN_PLANE_LABELS))
 
 
+_RECORDING = " in recording "
+
+
+def is_board(sensor: str, target: str) -> bool:
+    """Whether `sensor` is `target`, in whichever recording."""
+    return sensor.partition(_RECORDING)[0] == target
+
+
+def board_in(target: str, recording: int) -> str:
+    """Name of the target as it stands in one of several recordings, counted from 0: its shape is the same in all, its
+    attitude is not."""
+    return target if recording == 0 else f"{target}{_RECORDING}{recording + 1}"
+
+
 def shape_basis(target: Target, bends: bool) -> np.ndarray:
     """(n_points, s, 3) displacement in the board frame by unit of each shape parameter [m].
 

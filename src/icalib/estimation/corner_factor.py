@@ -12,10 +12,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
 from icalib.estimation.arrowhead import Piece
+from icalib.estimation.board import board_in
 from icalib.estimation.corner_kernels import (
     Direct,
     Found,
@@ -73,7 +75,8 @@ class CornerFactor:
 
     times (M,): stamps on the imu clock at zero offset beyond `stream`'s origin; node (M,), increasing: the node each
     image hangs on; keep (N,): corners in use; direction (N, 2) image direction of the bloom, (0, 2) without it;
-    basis (n_points, s, 3): how the target's points move with its shape.
+    basis (n_points, s, 3): how the target's points move with its shape; seams: the images that begin further
+    recordings, in which the target stands elsewhere.
     """
 
     stream: CornerStream
@@ -91,16 +94,24 @@ class CornerFactor:
     basis: np.ndarray
     layout: Layout
     n_nodes: int
+    seams: tuple[int, ...] = ()
 
     @property
     def name(self) -> str:
         return self.stream.name
 
-    def world_points(self, state: State) -> np.ndarray:
-        """(n_points, 3) the target's points, shape included, in the world frame."""
+    def boards(self, i0: int, i1: int) -> Iterator[tuple[int, int, str]]:
+        """Images i0..i1 recording by recording, each with the name of the target there."""
+        for k, (first, end) in enumerate(pairwise((0, *self.seams, len(self.node)))):
+            a, b = max(i0, first), min(i1, end)
+            if a < b:
+                yield a, b, board_in(self.target, k)
+
+    def world_points(self, state: State, board: str) -> np.ndarray:
+        """(n_points, 3) the target's points, shape included, in the world frame of `board`'s recording."""
         shape = state.values[self.target, "shape"]
-        board = self.points + np.einsum("nsk,s->nk", self.basis, shape)
-        return board @ state.values[self.target, "tilt"].T
+        points = self.points + np.einsum("nsk,s->nk", self.basis, shape)
+        return points @ state.values[board, "tilt"].T
 
     def camera_poses(self, state: State, i0: int = 0, i1: int | None = None) -> tuple[Poses, np.ndarray, np.ndarray]:
         """IMU poses, and R_cam_world (n, 3, 3), p_world_cam (n, 3) at the instants of images i0..i1."""
@@ -115,25 +126,26 @@ class CornerFactor:
         return poses, R_cw, poses.position + poses.rotation @ p_ic
 
     def points_in_camera(self, state: State) -> tuple[np.ndarray, np.ndarray]:
-        """X (N, 3), each corner's point in its camera's frame, and R_cam_world (M, 3, 3)."""
+        """X (N, 3), each corner's point in its camera's frame, and R_cam_board (M, 3, 3)."""
         _, R_cw, p_wc = self.camera_poses(state)
-        X = np.empty((len(self.stream.uv), 3))
-        camera_points(
-            0, len(self.node), self.stream.start, self.stream.point, R_cw, p_wc, self.world_points(state), X
-        )  # fmt: skip
-        return X, R_cw
+        X, R_cb, start = np.empty((len(self.stream.uv), 3)), np.empty_like(R_cw), self.stream.start
+        for a, b, board in self.boards(0, len(self.node)):
+            world = self.world_points(state, board)
+            camera_points(a, b, start, self.stream.point, R_cw, p_wc, world, X[start[a] : start[b]])
+            R_cb[a:b] = R_cw[a:b] @ state.values[board, "tilt"]
+        return X, R_cb
 
     def with_direction(self, direction: np.ndarray) -> CornerFactor:
         """The same factor with bloom along `direction` (N, 2)."""
         return replace(self, direction=direction)
 
-    def _columns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _columns(self, board: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Border columns of the chained and of the direct parameters, and which model parameters the latter hold."""
         nothing = np.zeros(0, dtype=np.int64)
         imu = nothing if self.imu is None else self.layout.columns(self.imu.name, "intrinsics")
         chained = [
             self.layout.columns(self.name, "rotation", "translation", "time_offset"),
-            self.layout.columns(self.target, "tilt"),
+            self.layout.columns(board, "tilt"),
             imu[imu >= 0],
         ]
         model = self.layout.columns(self.name, "intrinsics", "distortion")
@@ -159,14 +171,14 @@ class CornerFactor:
         With `noise` (corners (N, 2), common errors (M, 2, m), white) in place of the
         whitened residuals, returns the quadratic form of the common errors' rows instead.
         """
-        i0, i1 = self._images(piece)
-        images, noise_model, direct, motion = self._arguments(state, i0, i1, curved)
         white, white_shared = noise or (out.residual, out.shared)
-        given = Given(noise is not None, white, white_shared[i0:i1])
-        into, found = piece.sums(sums), Found(out.residual, out.root, out.shared[i0:i1])
-        total = 0.0
-        for a, b, predicted in self._chunks(state, images, motion, sums):
-            total += accumulate(a, b, images, noise_model, direct, motion, predicted, given, into, found)
+        into, total = piece.sums(sums), 0.0
+        for i0, i1, board in self.boards(*self._images(piece)):
+            images, noise_model, direct, motion = self._arguments(state, i0, i1, board, curved)
+            given = Given(noise is not None, white, white_shared[i0:i1])
+            found = Found(out.residual, out.root, out.shared[i0:i1])
+            for a, b, predicted in self._chunks(state, images, motion, board, sums):
+                total += accumulate(a, b, images, noise_model, direct, motion, predicted, given, into, found)
         return total
 
     def accumulate_clusters(
@@ -174,23 +186,26 @@ class CornerFactor:
     ) -> None:
         """Adds the gradient of each cluster of corners (N,), weights as in `at`, to columns of `piece` from
         `column` on."""
-        i0, i1 = self._images(piece)
-        images, noise, direct, motion = self._arguments(state, i0, i1, False)
-        into, found = piece.sums(True), Found(at.residual, at.root, at.shared[i0:i1])
-        for a, b, predicted in self._chunks(state, images, motion, True):
-            accumulate_clusters(
-                a, b, cluster, n_clusters, column, images, noise, direct, motion, predicted, into, found
-            )  # fmt: skip
+        into = piece.sums(True)
+        for i0, i1, board in self.boards(*self._images(piece)):
+            images, noise, direct, motion = self._arguments(state, i0, i1, board, False)
+            found = Found(at.residual, at.root, at.shared[i0:i1])
+            for a, b, predicted in self._chunks(state, images, motion, board, True):
+                accumulate_clusters(
+                    a, b, cluster, n_clusters, column, images, noise, direct, motion, predicted, into, found
+                )  # fmt: skip
 
-    def _arguments(self, state: State, i0: int, i1: int, curved: bool) -> tuple[Images, Noise, Direct, Motion]:
-        """What the kernels need to know of images i0..i1."""
-        chained, direct, pars = self._columns()
+    def _arguments(
+        self, state: State, i0: int, i1: int, board: str, curved: bool
+    ) -> tuple[Images, Noise, Direct, Motion]:
+        """What the kernels need to know of images i0..i1, of one recording."""
+        chained, direct, pars = self._columns(board)
         poses, R_cw, p_wc = self.camera_poses(state, i0, i1)
         s, n = self.stream, self.noise
         images = Images(s.start[i0 : i1 + 1], s.uv, s.point, self.keep, self.node[i0:i1])
         noise = Noise(n.sigma[i0:i1], LOSSES[n.loss], n.loss_scale, curved, n.field, 1.0 / n.tau**2)
         bloom = float(state.values[self.name, "bloom"][0])
-        basis = self.basis @ state.values[self.target, "tilt"].T
+        basis = self.basis @ state.values[board, "tilt"].T
         R_ic, p_ic = state.values[self.name, "rotation"], state.values[self.name, "translation"]
         motion = Motion(
             np.ascontiguousarray(R_ic), p_ic, R_cw, p_wc, poses.rate, poses.velocity,
@@ -199,11 +214,11 @@ class CornerFactor:
         return images, noise, Direct(pars, bloom, self.direction, basis, direct), motion
 
     def _chunks(
-        self, state: State, images: Images, motion: Motion, jacobians: bool
+        self, state: State, images: Images, motion: Motion, board: str, jacobians: bool
     ) -> Iterator[tuple[int, int, Predicted]]:
         """Images a..b by the chunk, and what the model makes of them."""
         params = np.concatenate([state.values[self.name, "intrinsics"], state.values[self.name, "distortion"]])
-        world, start = self.world_points(state), images.start
+        world, start = self.world_points(state, board), images.start
         for a in range(0, len(images.node), CHUNK):
             b = min(a + CHUNK, len(images.node))
             X = np.empty((start[b] - start[a], 3))

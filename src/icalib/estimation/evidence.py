@@ -49,7 +49,7 @@ def fits(problem: Problem, outcome: Outcome, seed: int = 0) -> list[Fit]:
     imu = outcome.residuals.imu
     for kind, rows in problem.chain.kinds.items():
         key = problem.chain.name, kind
-        n = imu[:, rows].size
+        n = imu[:, rows].size - (len(problem.chain.starts) - 1) * imu[0, rows].size
         out.append(Fit(*key, n, n - float(np.mean(spent[key])), float((imu[:, rows] ** 2).sum())))
     for camera, corners in zip(problem.cameras, outcome.residuals.corners, strict=True):
         for kind, (n, chi2) in _corner_chi2(camera, corners).items():
@@ -81,8 +81,7 @@ def _probe(problem: Problem, outcome: Outcome, rng: np.random.Generator) -> dict
         problem.chain.accumulate(state, piece, scratch.imu, noise=imu_noise)
         for camera, corners, n in zip(problem.cameras, scratch.corners, noise, strict=True):
             camera.accumulate(state, piece, corners, noise=n)
-        if piece.first == 0:
-            problem.add_prior_information(piece, state)
+        problem.add_prior_information(piece, state)
 
     in_parallel(add, pieces)
     solution = solve(pieces, problem.n_nodes, problem.tolerance)
@@ -132,14 +131,18 @@ def _spent_by_corners(
 
 def split_covariance(problem: Problem, outcome: Outcome, segments: int) -> np.ndarray | None:
     """(B, B) covariance of the border as the spread over `segments` of the recording shows it; None if it is too short.
+    Several recordings share them by length, at least one each.
 
     Each segment's own gradient b_g at the joint optimum (its chain marginalised) would be zero but for noise; their
     spread through the joint information S gives S^-1 (G / (G - 1) sum (b_g - b)(b_g - b)^T) S^-1, the block
     jackknife to
     first order.
     """
-    ends = np.linspace(0, problem.n_nodes - 1, segments + 1).astype(int)
-    if segments < 2 or np.diff(ends).min() < 3:
+    if segments < 2:
+        return None
+    ends = segment_ends(problem.chain.starts, problem.n_nodes, segments)
+    segments = len(ends) - 1
+    if np.diff(ends).min() < 3:
         return None
     scratch = problem.residuals()
 
@@ -147,6 +150,9 @@ def split_covariance(problem: Problem, outcome: Outcome, segments: int) -> np.nd
         piece = Piece.zeros(int(ends[g]), int(ends[g + 1]), problem.layout.size)
         problem.add_measurements(outcome.state, piece, scratch)
         problem.add_bias_prior(outcome.state, piece)
+        if piece.last in problem.chain.starts:
+            # The seam says nothing of the node behind it, and that node's own images are in the next segment.
+            piece = piece.without_last()
         try:
             return marginalise(piece)[:-1, -1]
         except EstimationError:
@@ -157,6 +163,15 @@ def split_covariance(problem: Problem, outcome: Outcome, segments: int) -> np.nd
         return None
     b = np.array(found)
     return segments / (segments - 1.0) * _spread(problem, outcome, b - b.mean(axis=0))
+
+
+def segment_ends(starts: tuple[int, ...], n_nodes: int, segments: int) -> np.ndarray:
+    """(segments + 1,) nodes between which segments lie; each start of a recording is one. More segments where there are
+    more recordings."""
+    edges = np.array([*starts, n_nodes - 1])
+    counts = np.maximum(np.round(segments * np.diff(edges) / edges[-1]).astype(int), 1)
+    pieces = [np.linspace(a, b, n + 1)[:-1] for a, b, n in zip(edges[:-1], edges[1:], counts, strict=True)]
+    return np.concatenate([*pieces, edges[-1:]]).astype(int)
 
 
 def place_covariances(problem: Problem, outcome: Outcome) -> list[np.ndarray]:

@@ -23,6 +23,11 @@ class FreeNodes:
     name: str  # of the body's sensor
     n_nodes: int
 
+    @property
+    def starts(self) -> tuple[int, ...]:
+        """One chain: where nothing ties neighbours, recordings make no difference."""
+        return (0,)
+
     def accumulate(
         self, state: State, piece: Piece, out: np.ndarray, sums: bool = True, noise: np.ndarray | None = None
     ) -> float:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from icalib.joining import Part
 from icalib.measurements import ImuStream, Measurements
 from icalib.rig import ImuNoise, Rig
 
@@ -22,7 +24,7 @@ class ImuData:
 
     variance (N - 1, 3): squared noise densities of each interval: gyroscope, accelerometer, and how the force departs
     from its mean within the interval; walk (2,): squared densities of the bias walks. gaps: (start, end) of intervals
-    without readings.
+    without readings. seams: (end, begin) of recordings that were joined; nothing is known of what lies between.
     """
 
     name: str
@@ -32,6 +34,7 @@ class ImuData:
     variance: np.ndarray
     walk: np.ndarray
     gaps: tuple[tuple[float, float], ...]
+    seams: tuple[tuple[float, float], ...] = ()
 
     @classmethod
     def build(cls, stream: ImuStream, noise: ImuNoise) -> ImuData:
@@ -61,3 +64,18 @@ def imu_data(rig: Rig, measurements: Measurements) -> ImuData | None:
     if rig.imu is None or measurements.imu is None:
         return None
     return ImuData.build(measurements.imu, rig.imu.noise)
+
+
+def joined_imu_data(rig: Rig, parts: Sequence[Part], joined: Measurements) -> ImuData | None:
+    """The same of recordings joined: each with the noise in its gaps that its own motion gives them."""
+    found = [(p, imu) for p in parts if (imu := imu_data(rig, p.measurements)) is not None]
+    if len(found) < 2 or joined.imu is None:
+        return found[0][1] if found else None
+    seconds = joined.imu.seconds
+    # The interval of a seam is an interval like any other; no factor asks for it.
+    variance = np.concatenate([np.vstack([imu.variance, imu.variance[-1:]]) for _, imu in found])[:-1]
+    gaps = tuple((a + p.begin, b + p.begin) for p, imu in found for a, b in imu.gaps)
+    last = np.cumsum([len(imu.seconds) for _, imu in found])[:-1] - 1
+    seams = tuple((float(seconds[i]), float(seconds[i + 1])) for i in last)
+    gyro, accel = np.ascontiguousarray(joined.imu.gyro), np.ascontiguousarray(joined.imu.accel)
+    return ImuData(joined.imu.name, seconds, gyro, accel, variance, found[0][1].walk, gaps, seams)

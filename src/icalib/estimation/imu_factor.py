@@ -253,7 +253,8 @@ class ImuFactor:
     """All intervals of one IMU between neighbouring nodes.
 
     residual (15,) of interval k: Log((dR Exp(J_R db))^T R_k^T R_k+1); R_k^T (v_k+1 - v_k - g dt) - dv - J_v db;
-    R_k^T (p_k+1 - p_k - v_k dt - g dt^2 / 2) - dp - J_p db; b_k+1 - b_k, whitened jointly.
+    R_k^T (p_k+1 - p_k - v_k dt - g dt^2 / 2) - dp - J_p db; b_k+1 - b_k, whitened jointly. The interval before each of
+    `starts`, recordings' first nodes, carries no information.
     """
 
     kinds: ClassVar[dict[str, slice]] = {
@@ -270,6 +271,7 @@ class ImuFactor:
     W: np.ndarray
     bias0: np.ndarray
     intrinsics0: np.ndarray
+    starts: tuple[int, ...] = (0,)
 
     @property
     def name(self) -> str:
@@ -280,8 +282,10 @@ class ImuFactor:
         return len(self.dR) + 1
 
     def accumulate_bias_prior(self, state: State, piece: Piece, sums: bool = True, met: bool = False) -> float:
-        """The broad prior on the first node's biases, about those of the pass's start. Returns half its chi^2."""
-        return accumulate_bias_prior(state, piece, sums, met, self.bias0[0])
+        """The broad prior on the biases of the recordings' first nodes in `piece`, about those of the pass's start.
+        Returns half its chi^2."""
+        own = [k for k in self.starts if piece.first <= k < piece.last]
+        return sum(accumulate_bias_prior(state, piece, sums, met, self.bias0[k], k) for k in own)
 
     @classmethod
     def build(cls, imu: ImuData, state: State, gravity: float, columns: np.ndarray) -> ImuFactor:
@@ -306,7 +310,12 @@ class ImuFactor:
             ),
             [(0, half), (half, n)],
         )  # fmt: skip
-        return cls(imu, gravity, columns, *arrays, bias0, intrinsics)
+        seams = np.array(state.starts[1:], dtype=np.int64) - 1
+        dR, _, _, _, W = arrays
+        W[seams] = 0.0
+        # As if met: the logarithm of a rotation that means nothing could lie where it has no derivative.
+        dR[seams] = state.rotation[seams].transpose(0, 2, 1) @ state.rotation[seams + 1]
+        return cls(imu, gravity, columns, *arrays, bias0, intrinsics, state.starts)
 
     def accumulate(
         self, state: State, piece: Piece, out: np.ndarray, sums: bool = True, noise: np.ndarray | None = None

@@ -1,4 +1,4 @@
-"""Gaussian priors on lasting parameters, and a very broad one on the first node's biases."""
+"""Gaussian priors on lasting parameters, and a very broad one on the biases of each recording's first node."""
 
 from __future__ import annotations
 
@@ -43,15 +43,16 @@ class Prior:
 
 
 def accumulate_bias_prior(
-    state: State, piece: Piece, sums: bool = True, met: bool = False, centre: np.ndarray | None = None
+    state: State, piece: Piece, sums: bool = True, met: bool = False, centre: np.ndarray | None = None, node: int = 0
 ) -> float:
-    """The broad prior on the first node's biases, about `centre` (6,) or zero (`met`: as if they were there).
+    """The broad prior on the biases of `node`, a recording's first, about `centre` (6,) or zero (`met`: as if they
+    were there).
 
     Returns half its chi^2.
     """
-    r = np.zeros(6) if met else (state.bias[0] - (0.0 if centre is None else centre)) / FIRST_BIAS_SIGMA
+    r = np.zeros(6) if met else (state.bias[node] - (0.0 if centre is None else centre)) / FIRST_BIAS_SIGMA
     if sums:
-        index = np.arange(9, 15)
-        piece.diagonal[0, index, index] += 1.0 / FIRST_BIAS_SIGMA**2
-        piece.side[0, 9:15, -1] += r / FIRST_BIAS_SIGMA
+        index, k = np.arange(9, 15), node - piece.first
+        piece.diagonal[k, index, index] += 1.0 / FIRST_BIAS_SIGMA**2
+        piece.side[k, 9:15, -1] += r / FIRST_BIAS_SIGMA
     return 0.5 * float(r @ r)

@@ -1,5 +1,4 @@
-"""Where factors and solver meet: all measurements of one recording, as sums over the pieces of the chain (paper
-(15))."""
+"""Where factors and solver meet: all measurements, as sums over the pieces of the chain (paper (15))."""
 
 from __future__ import annotations
 
@@ -16,13 +15,17 @@ from icalib.estimation.state import Layout, State
 
 
 class ChainFactor(Protocol):
-    """What ties the nodes together: an `ImuFactor`, or `FreeNodes`. kinds: rows of its residuals by name."""
+    """What ties the nodes together: an `ImuFactor`, or `FreeNodes`. kinds: rows of its residuals by name; starts: the
+    first node of each recording, which nothing ties to the one before."""
 
     @property
     def name(self) -> str: ...
 
     @property
     def n_nodes(self) -> int: ...
+
+    @property
+    def starts(self) -> tuple[int, ...]: ...
 
     kinds: ClassVar[dict[str, slice]]
 
@@ -33,7 +36,8 @@ class ChainFactor(Protocol):
         ...
 
     def accumulate_bias_prior(self, state: State, piece: Piece, sums: bool = True, met: bool = False) -> float:
-        """Adds what keeps the first node's biases defined (`met`: as if they were met); returns half its chi^2."""
+        """Adds what keeps the biases of those `starts` defined that lie in `piece`, its last node aside (`met`: as if
+        they were met); returns half its chi^2."""
         ...
 
 
@@ -90,12 +94,12 @@ class Problem:
         return cost
 
     def add_bias_prior(self, state: State, piece: Piece, sums: bool = True) -> float:
-        """Adds the broad prior on the biases of the chain's first node, about those that the pass started from."""
-        return self.chain.accumulate_bias_prior(state, piece, sums) if piece.first == 0 else 0.0
+        """Adds the broad prior on the biases of recordings' first nodes, about those that the pass started from."""
+        return self.chain.accumulate_bias_prior(state, piece, sums)
 
     def add_prior_information(self, piece: Piece, state: State) -> None:
         """Adds the priors as if they were met exactly: their information, no gradient."""
-        for prior in self.priors:
+        for prior in self.priors if piece.first == 0 else ():
             prior.accumulate(state, piece, residual=np.zeros(len(prior.sigma)))
         self.chain.accumulate_bias_prior(state, piece, met=True)
 

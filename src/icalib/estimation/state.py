@@ -6,6 +6,7 @@ A node is (R_world_imu, p, v, b_g, b_a), 15 tangent dimensions in this order (pa
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -73,7 +74,10 @@ def make_layout(entries: list[tuple[str, str, Kind, int, bool]]) -> Layout:
 
 @dataclass(frozen=True)
 class State:
-    """One estimate. seconds (K,) node times on the imu clock since its first stamp; world frame z up."""
+    """One estimate. seconds (K,) node times on the imu clock since its first stamp; world frame z up.
+
+    starts: the first node of each recording; each has a world of its own, whose origin is the board's.
+    """
 
     seconds: np.ndarray
     rotation: np.ndarray  # (K, 3, 3) R_world_imu
@@ -81,34 +85,38 @@ class State:
     velocity: np.ndarray  # (K, 3)
     bias: np.ndarray  # (K, 6) gyroscope, accelerometer
     values: dict[Key, np.ndarray]
+    starts: tuple[int, ...] = (0,)
+
+    @property
+    def recordings(self) -> list[slice]:
+        """The nodes of each recording."""
+        return [slice(a, b) for a, b in pairwise((*self.starts, len(self.seconds)))]
 
     def retract(self, layout: Layout, chain: np.ndarray, border: np.ndarray) -> State:
         """The state moved by tangent steps chain (K, 15) and border (B,).
 
-        A tilt of the board turns the whole trajectory with it, exactly; the nodes' own steps are what they have beyond
-        that, and turn too. To first order nothing changes. But where gravity is weakly known the tilt is large against
-        the precision of positions relative to the board: moved along the tangent they would leave their circle by
-        tilt^2 / 2, and a step that cancels against one of the lever arm would no longer do so.
+        A tilt of the board turns the whole trajectory of its recording with it, exactly; the nodes' own steps are what
+        they have beyond that, and turn too. To first order nothing changes. But where gravity is weakly known the tilt
+        is large against the precision of positions relative to the board: moved along the tangent they would leave
+        their circle by tilt^2 / 2, and a step that cancels against one of the lever arm would no longer do so.
         """
-        values, turn = dict(self.values), np.zeros(3)
+        values, turns = dict(self.values), []
         for b in layout.free:
             d, old = border[b.columns], values[b.key]
             if b.kind == "rotation":
                 values[b.key] = old @ so3.exp(d)
             elif b.kind == "tilt":
-                turn[:2] = d
-                values[b.key] = so3.exp(turn) @ old
+                turns.append(np.array([d[0], d[1], 0.0]))
+                values[b.key] = so3.exp(turns[-1]) @ old
             else:
                 values[b.key] = old + d
-        Q = so3.exp(turn)
-        own_rotation = np.ascontiguousarray(chain[:, 0:3] - turn @ self.rotation)
-        own_position = chain[:, 3:6] - np.cross(turn, self.position)
-        own_velocity = chain[:, 6:9] - np.cross(turn, self.velocity)
-        return replace(
-            self,
-            rotation=Q @ self.rotation @ so3.exp_many(own_rotation),
-            position=(self.position + own_position) @ Q.T,
-            velocity=(self.velocity + own_velocity) @ Q.T,
-            bias=self.bias + chain[:, 9:15],
-            values=values,
-        )
+        R, p, v = np.empty_like(self.rotation), np.empty_like(self.position), np.empty_like(self.velocity)
+        for turn, k in zip(turns or [np.zeros(3)] * len(self.starts), self.recordings, strict=True):
+            Q = so3.exp(turn)
+            own_rotation = np.ascontiguousarray(chain[k, 0:3] - turn @ self.rotation[k])
+            own_position = chain[k, 3:6] - np.cross(turn, self.position[k])
+            own_velocity = chain[k, 6:9] - np.cross(turn, self.velocity[k])
+            R[k] = Q @ self.rotation[k] @ so3.exp_many(own_rotation)
+            p[k] = (self.position[k] + own_position) @ Q.T
+            v[k] = (self.velocity[k] + own_velocity) @ Q.T
+        return replace(self, rotation=R, position=p, velocity=v, bias=self.bias + chain[:, 9:15], values=values)

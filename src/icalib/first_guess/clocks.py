@@ -17,6 +17,8 @@ LONGEST_STEP_S = 0.25  # images further apart do not give an angular rate
 SHORTEST_OVERLAP_S = 4.0
 LEAST_CORRELATION = 0.7
 LARGEST_UNEXPLAINED = 0.6  # of the angular rate, at an offset that was given
+CLOCKS_AGREE_S = 0.01  # of the time offsets that two recordings show
+CLEARLY_BETTER = 0.5  # of what another offset leaves unexplained
 STILL_RAD_S = 0.03
 _SAME_RECORDING = "check that both come from the same recording, overlap in time, and are in rad/s"
 LEAST_SECOND_AXIS = 0.05  # of the spread of rates about the first
@@ -90,11 +92,7 @@ def _covered(imu: ImuData, rates: CameraRates, offset: float) -> np.ndarray:
 
 def _check_offset(imu: ImuData, name: str, rates: CameraRates, found: Alignment, given: bool) -> None:
     """An offset at which the two do not turn alike is wrong, or the recordings do not belong together."""
-    inside = _covered(imu, rates, found.offset)
-    seen = rates.rate[inside] @ found.rotation.T
-    middle = (0.5 * (rates.start + rates.end) + found.offset)[inside]
-    gyro = np.stack([np.interp(middle, imu.seconds, imu.gyro[:, k]) for k in range(3)], axis=1) - found.gyro_bias
-    unexplained = float(np.median(np.linalg.norm(gyro - seen, axis=1)) / np.median(np.linalg.norm(gyro, axis=1)))
+    unexplained = _unexplained(imu, rates, found)
     if unexplained > LARGEST_UNEXPLAINED:
         where = "with the time_offset in the rig file" if given else "at any shift of their clocks"
         advice = "correct it, or leave it out to have it found" if given else _SAME_RECORDING
@@ -102,6 +100,29 @@ def _check_offset(imu: ImuData, name: str, rates: CameraRates, found: Alignment,
             f"the motion of {name} does not match that of {imu.name} {where} ({unexplained:.0%} of the angular rate is "
             f"unexplained); {advice}."
         )
+
+
+def _unexplained(imu: ImuData, rates: CameraRates, found: Alignment) -> float:
+    """Share of the angular rate that the camera did not see."""
+    inside = _covered(imu, rates, found.offset)
+    seen = rates.rate[inside] @ found.rotation.T
+    middle = (0.5 * (rates.start + rates.end) + found.offset)[inside]
+    gyro = np.stack([np.interp(middle, imu.seconds, imu.gyro[:, k]) for k in range(3)], axis=1) - found.gyro_bias
+    return float(np.median(np.linalg.norm(gyro - seen, axis=1)) / np.median(np.linalg.norm(gyro, axis=1)))
+
+
+def better_offset(imu: ImuData, name: str, rates: CameraRates, expected: float) -> float | None:
+    """The offset at which the two turn alike, where it is clearly another than the `expected` one; else None."""
+    try:
+        own = align(imu, name, rates, None)
+    except EstimationError:
+        return None  # the motion does not show it
+    if abs(own.offset - expected) < CLOCKS_AGREE_S:
+        return None
+    if not _covered(imu, rates, expected).any():
+        return own.offset
+    there = _unexplained(imu, rates, _refine(imu, rates, expected, True))
+    return own.offset if _unexplained(imu, rates, own) < CLEARLY_BETTER * there else None
 
 
 def _check_motion(imu: ImuData, name: str, rates: CameraRates) -> None:

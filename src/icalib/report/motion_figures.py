@@ -39,13 +39,14 @@ def motion(c: Calibration) -> Figure:
     steps = np.diff(path.seconds)
     between = np.einsum("kji,kjl->kil", path.rotation[:-1], path.rotation[1:])
     rate = so3.log_many(np.ascontiguousarray(between)) / steps[:, None]
+    rate[_seams(c)] = np.nan
     keep, inner = thin(len(path.seconds), MOST_NODES), thin(len(steps), MOST_NODES)
     t = path.seconds
     panels = [
         (t[:-1][inner] + 0.5 * steps[inner], np.rad2deg(rate[inner])),
-        (t[keep], path.velocity[keep]),
-        (t[keep], np.rad2deg(path.gyro_bias[keep])),
-        (t[keep], path.accel_bias[keep]),
+        (t[keep], _lifted(c, path.velocity)[keep]),
+        (t[keep], np.rad2deg(_lifted(c, path.gyro_bias)[keep])),
+        (t[keep], _lifted(c, path.accel_bias)[keep]),
     ]
     titles = ("rate [deg/s]", "velocity [m/s]", "gyro bias [deg/s]", "accel bias [m/s^2]")
     return _mixed_panels(panels, titles, 640)
@@ -59,7 +60,7 @@ def trajectory(c: Calibration) -> Figure:
     color |= {"showscale": True, "colorbar": {"title": {"text": "time [s]"}, "thickness": 10}}
     ends = path.position[[0, -1]]
     traces = [
-        path_3d(path.position[keep], c.body, "", line=color, showlegend=False),
+        path_3d(_lifted(c, path.position)[keep], c.body, "", line=color, showlegend=False),
         path_3d(
             ends, "ends", "#111827", mode="markers+text", text=["start", "end"], marker={"size": 3}, showlegend=False
         ),
@@ -70,17 +71,29 @@ def trajectory(c: Calibration) -> Figure:
 
 
 def _board(c: Calibration) -> list[dict]:
-    """Outline of the target where its attitude is known; without an IMU its frame is the world's."""
+    """Outline of the target as it stands in each recording; without an IMU its frame is the world's."""
     fields = dict(c.rig.get("target", {}))
     attitude = [g for g in c.groups if g.sensor not in c.rig["sensors"] and g.value.shape == (3, 3)]
     kind = TARGETS.get(fields.pop("type", ""))
     if kind is None or not (attitude or c.imu is None):
         return []
-    R, name = (attitude[0].value, attitude[0].sensor) if attitude else (np.eye(3), "board0")
     points = kind(**fields).points
     (x0, y0, _), (x, y, _) = points.min(axis=0), points.max(axis=0)
     corners = [(x0, y0, 0.0), (x, y0, 0.0), (x, y, 0.0), (x0, y, 0.0), (x0, y0, 0.0)]
-    return [path_3d(np.array(corners) @ R.T, name, "#be185d")]
+    stands = [(a.value, a.sensor) for a in attitude] or [(np.eye(3), "board0")]
+    return [path_3d(np.array(corners) @ R.T, name, "#be185d") for R, name in stands]
+
+
+def _seams(c: Calibration) -> np.ndarray:
+    """Nodes that are the last of a recording that others follow."""
+    return np.flatnonzero(np.diff(c.recording_of(c.trajectory.seconds)))
+
+
+def _lifted(c: Calibration, values: np.ndarray) -> np.ndarray:
+    """Values (K, 3) at the nodes, NaN at the last of each recording that others follow, so that no line runs on."""
+    out = values.copy()
+    out[_seams(c)] = np.nan
+    return out
 
 
 def convergence(c: Calibration) -> Figure:

@@ -145,5 +145,7 @@ def size_words(c: Calibration) -> str:
     """How much was used, in a line."""
     corners = sum(len(r.uv) for r in c.corner_residuals)
     images = sum(len(r.seconds) for r in c.corner_residuals)
-    span = float(np.ptp(c.trajectory.seconds)) if len(c.trajectory.seconds) else 0.0
-    return f"{span:.1f} s, {images} images with {corners} corners, {len(c.trajectory.seconds)} nodes"
+    whole = float(np.ptp(c.trajectory.seconds)) if len(c.trajectory.seconds) else 0.0
+    several = f"{len(c.recordings)} recordings, " if len(c.recordings) > 1 else ""
+    span = sum(r.end - r.start for r in c.recordings) if several else whole
+    return f"{several}{span:.1f} s, {images} images with {corners} corners, {len(c.trajectory.seconds)} nodes"

@@ -1,0 +1,99 @@
+"""First guesses of several recordings: the calibration from the one that shows most, and held for the others."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from icalib.errors import CalibrationError, EstimationError
+from icalib.estimation.imu_data import imu_data
+from icalib.first_guess import initial_guess
+from icalib.first_guess.clocks import better_offset, camera_rates
+from icalib.first_guess.guess import CameraGuess, Guess
+from icalib.first_guess.target_poses import target_poses
+from icalib.geometry.cameras import camera_model
+from icalib.measurements import Measurements
+from icalib.rig import Camera, Rig, fixed
+
+
+def initial_guesses(rig: Rig, recordings: Sequence[Measurements]) -> tuple[Guess, ...]:
+    """A guess for each recording, all with the same calibration.
+
+    Raises EstimationError, one sentence; where there are several recordings it names the one that carries no guess, or
+    whose clocks stand elsewhere.
+    """
+    if len(recordings) == 1:
+        return (initial_guess(rig, recordings[0]),)
+    order = sorted(range(len(recordings)), key=lambda k: -sum(len(c.stamps_ns) for c in recordings[k].cameras))
+    best, guess = _first_that_works(rig, [(k, recordings[k]) for k in order])
+    held = _held(rig, guess, recordings[best])
+    guesses = []
+    for k, recording in enumerate(recordings):
+        if k == best:
+            guesses.append(guess)
+            continue
+        _check_clocks(rig, guess, recordings[best], recording)
+        guesses.append(_named(held, recording))
+    return tuple(guesses)
+
+
+def _first_that_works(rig: Rig, recordings: list[tuple[int, Measurements]]) -> tuple[int, Guess]:
+    """The calibration needs one recording that shows all of it; the error is that of the one that showed most."""
+    failed: list[EstimationError] = []
+    for k, recording in recordings:
+        try:
+            return k, _named(rig, recording)
+        except EstimationError as error:
+            failed.append(error)
+    raise failed[0]
+
+
+def _named(rig: Rig, recording: Measurements) -> Guess:
+    try:
+        return initial_guess(rig, recording)
+    except CalibrationError as error:
+        raise EstimationError(f"{recording.name}: {error}") from error
+
+
+def _held(rig: Rig, guess: Guess, recording: Measurements) -> Rig:
+    """The rig with the calibration of `guess`, made from `recording`, fixed."""
+
+    def camera(c: Camera, found: CameraGuess, origin_ns: int) -> Camera:
+        offset = found.offset - (origin_ns - recording.origin_ns) * 1e-9
+        return dataclasses.replace(
+            c,
+            rotation=fixed(found.rotation),
+            translation=fixed(found.position),
+            time_offset=fixed(np.array([offset])),
+            intrinsics=fixed(found.params[:4]),
+            distortion=fixed(found.params[4:]),
+        )
+
+    pairs = zip(rig.cameras, recording.cameras, strict=True)
+    return dataclasses.replace(rig, cameras=tuple(camera(c, guess.cameras[c.name], s.origin_ns) for c, s in pairs))
+
+
+def _check_clocks(rig: Rig, guess: Guess, reference: Measurements, recording: Measurements) -> None:
+    """Raises EstimationError where a camera and the IMU turn alike at another time offset than in `reference`, which
+    `guess` was made from."""
+    imu = imu_data(rig, recording)
+    if imu is None:
+        return
+    for camera, stream, before in zip(rig.cameras, recording.cameras, reference.cameras, strict=True):
+        known = guess.cameras[camera.name]
+        origins_ns = (stream.origin_ns - recording.origin_ns) - (before.origin_ns - reference.origin_ns)
+        expected = known.offset + origins_ns * 1e-9
+        poses = target_poses(stream, camera_model(camera.model), known.params, rig.target.points)
+        try:
+            rates = camera_rates(stream, poses)
+        except EstimationError as error:
+            raise EstimationError(f"{recording.name}: {error}") from error
+        found = better_offset(imu, camera.name, rates, expected)
+        if found is not None:
+            raise EstimationError(
+                f"{recording.name}: the time offset of {camera.name} is {found - expected:+.3f} s from that in "
+                f"{reference.name}; recordings share one calibration only while no clock is set or "
+                "restarted between them, so calibrate this one alone."
+            )

@@ -1,0 +1,95 @@
+"""Several recordings of one rig as one: their clocks are shifted so that they follow one another after a pause."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from icalib.measurements import CornerStream, ImuStream, Measurements
+from icalib.rig import Rig
+
+PAUSE_NS = 10_000_000_000
+
+
+@dataclass(frozen=True)
+class Part:
+    """One recording among those that were joined, as it was measured.
+
+    shift_ns: what was added to all its stamps; images: which of each camera's joined images are its own; begin: its
+    first stamp on the joined clock of the body [s].
+    """
+
+    measurements: Measurements
+    shift_ns: int
+    images: tuple[slice, ...]
+    begin: float
+
+    @property
+    def name(self) -> str:
+        return self.measurements.name
+
+
+def join(rig: Rig, recordings: Sequence[Measurements]) -> tuple[Measurements, tuple[Part, ...]]:
+    """All recordings as one, and where each stands in it; a single one stays as it is.
+
+    All clocks of a recording are shifted alike, so that time offsets between raw clocks stay. Whatever these are, two
+    recordings stay apart as long as the streams of each overlap: the pause between them is longer than both.
+    """
+    shifts = _shifts(rig, recordings)
+    ends = np.cumsum([[0] * len(rig.cameras), *([len(c.stamps_ns) for c in m.cameras] for m in recordings)], axis=0)
+    own = [tuple(slice(int(a), int(b)) for a, b in zip(*pair, strict=True)) for pair in pairwise(ends)]
+    first = recordings[0].origin_ns
+    parts = tuple(
+        Part(m, shift, images, (m.origin_ns + shift - first) * 1e-9)
+        for m, shift, images in zip(recordings, shifts, own, strict=True)
+    )
+    return (_joined(recordings, shifts) if len(recordings) > 1 else recordings[0]), parts
+
+
+def _streams(measurements: Measurements) -> list[ImuStream | CornerStream]:
+    return [*([] if measurements.imu is None else [measurements.imu]), *measurements.cameras]
+
+
+def _shifts(rig: Rig, recordings: Sequence[Measurements]) -> list[int]:
+    """What to add to the stamps of each recording [ns]."""
+    shifts = [0]
+    for before, after in pairwise(recordings):
+        pairs = zip(_streams(before), _streams(after), strict=True)
+        follows = max(int(a.stamps_ns[-1]) - int(b.stamps_ns[0]) for a, b in pairs)
+        shifts.append(shifts[-1] + follows + _length_ns(rig, before) + _length_ns(rig, after) + PAUSE_NS)
+    return shifts
+
+
+def _length_ns(rig: Rig, measurements: Measurements) -> int:
+    """Of the longest stream; without an IMU from the first image of any camera to the last: offsets are known then."""
+    spans = [(int(s.stamps_ns[0]), int(s.stamps_ns[-1])) for s in _streams(measurements)]
+    if measurements.imu is not None:
+        return max(b - a for a, b in spans)
+    given = [c.time_offset.value for c in rig.cameras]
+    offsets = [0 if v is None else round(1e9 * float(v[0])) for v in given]
+    begins, ends = zip(*((a + d, b + d) for (a, b), d in zip(spans, offsets, strict=True)), strict=True)
+    return max(ends) - min(begins)
+
+
+def _joined(recordings: Sequence[Measurements], shifts: list[int]) -> Measurements:
+    shifted = list(zip(recordings, shifts, strict=True))
+    imus = [(m.imu, shift) for m, shift in shifted if m.imu is not None]
+    imu = None
+    if imus:
+        stamps = np.concatenate([i.stamps_ns + np.int64(shift) for i, shift in imus])
+        gyro, accel = np.concatenate([i.gyro for i, _ in imus]), np.concatenate([i.accel for i, _ in imus])
+        imu = ImuStream(imus[0][0].name, stamps, gyro, accel)
+    cameras = (_corners([(m.cameras[k], shift) for m, shift in shifted]) for k in range(len(recordings[0].cameras)))
+    notes = tuple(f"{m.name}: {note}" for m in recordings for note in m.notes)
+    return Measurements(imu, tuple(cameras), notes)
+
+
+def _corners(streams: list[tuple[CornerStream, int]]) -> CornerStream:
+    """One camera's images of all recordings."""
+    stamps = np.concatenate([s.stamps_ns + np.int64(shift) for s, shift in streams])
+    start = np.concatenate([[0], np.cumsum(np.concatenate([np.diff(s.start) for s, _ in streams]))])
+    point, uv = np.concatenate([s.point for s, _ in streams]), np.concatenate([s.uv for s, _ in streams])
+    return CornerStream(streams[0][0].name, stamps, start.astype(np.int64), point, uv)

@@ -1,0 +1,49 @@
+"""Several recordings of one rig: opened, each with a name that tells it from the others."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from icalib.errors import CalibrationError, RecordingError
+from icalib.recordings.base import Recording
+from icalib.recordings.opening import open_recording
+
+Source = Recording | str | Path
+
+
+def open_all(given: Source | Sequence[Source]) -> dict[str, Recording]:
+    """One recording or several by name: that of the file or folder, the whole path where two share it, or a number
+    for those that are open already.
+
+    Raises RecordingError for none, for one that cannot be opened, and for one that is given twice.
+    """
+    sources: Sequence[Source] = given if isinstance(given, Sequence) and not isinstance(given, str) else [given]
+    if not sources:
+        raise RecordingError("no recording was given; give at least one.")
+    paths = [Path(s).resolve() for s in sources if isinstance(s, (str, Path))]
+    twice = [path for path, count in Counter(paths).items() if count > 1]
+    if twice:
+        raise RecordingError(f"the recording {twice[0]} is given twice; give each recording once.")
+    names = Counter(path.name for path in paths)
+    found: dict[str, Recording] = {}
+    for k, source in enumerate(sources, 1):
+        if isinstance(source, (str, Path)):
+            path = Path(source).resolve()
+            found[path.name if names[path.name] == 1 else str(path)] = open_recording(source)
+        else:
+            found[f"recording {k}"] = source
+    return found
+
+
+@contextmanager
+def naming(name: str) -> Iterator[None]:
+    """Errors raised within begin with `name`, unless they say it already, or it is empty."""
+    try:
+        yield
+    except CalibrationError as error:
+        if name in str(error):
+            raise
+        raise type(error)(f"{name}: {error}") from error

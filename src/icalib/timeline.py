@@ -1,0 +1,55 @@
+"""The clock of a result: recordings one after another with a second between them, whatever their own clocks say."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.calibration import RecordingSpan
+from icalib.joining import Part
+
+PAUSE_S = 1.0
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """Where recordings stand on the joined clock that was estimated on, and in the result. moved (n,): from the one to
+    the other [s], by recording."""
+
+    parts: tuple[Part, ...]
+    spans: tuple[RecordingSpan, ...]
+    moved: np.ndarray
+
+    @classmethod
+    def of(cls, parts: tuple[Part, ...], image_times: list[np.ndarray]) -> Timeline:
+        """image_times: of each camera's images, on the joined clock."""
+        spans, moved = [], np.zeros(len(parts))
+        for k, part in enumerate(parts):
+            first, last = _extent(part, image_times)
+            moved[k] = spans[-1].end + PAUSE_S - first if spans else 0.0
+            origin_ns = part.measurements.origin_ns + round(1e9 * (first - part.begin))
+            spans.append(RecordingSpan(part.name, first + moved[k], last + moved[k], origin_ns))
+        return cls(parts, tuple(spans), moved)
+
+    def shown(self, seconds: np.ndarray, recording: np.ndarray) -> np.ndarray:
+        """(n,) seconds of the result from joined ones, each of a recording (n,)."""
+        return seconds + self.moved[recording]
+
+    def of_images(self, camera: int) -> np.ndarray:
+        """(M,) the recording of each image of a camera, given by its number."""
+        counts = [p.images[camera].stop - p.images[camera].start for p in self.parts]
+        return np.repeat(np.arange(len(counts)), counts)
+
+    def words(self, second: float) -> str:
+        """How a sentence names an instant of the joined clock at which the IMU was running."""
+        k = int(np.searchsorted([p.begin for p in self.parts[1:]], second, side="right"))
+        own = f"{second - self.parts[k].begin:.3f} s"
+        return own if len(self.parts) == 1 else f"{own} of {self.parts[k].name}"
+
+
+def _extent(part: Part, image_times: list[np.ndarray]) -> tuple[float, float]:
+    """The first and the last instant of a recording at which anything was measured, on the joined clock."""
+    images = [t[own] for t, own in zip(image_times, part.images, strict=True)]
+    times = np.concatenate([*images, *([part.begin + imu.seconds] if (imu := part.measurements.imu) else [])])
+    return float(times.min()), float(times.max())
