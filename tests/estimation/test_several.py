@@ -211,3 +211,7 @@ def test_errors_begin_with_the_recording():
         raise RecordingError("no corners.")
     with pytest.raises(RecordingError, match=r"^evening/cam0: no corners\.$"), naming("evening"):
         raise RecordingError("evening/cam0: no corners.")
+    with pytest.raises(RecordingError, match=r"^a: at 3 ns a corner is missing\.$"), naming("a"):
+        raise RecordingError("at 3 ns a corner is missing.")
+    with pytest.raises(RecordingError, match=r"^no corners\.$"), naming(""):
+        raise RecordingError("no corners.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -40,10 +41,10 @@ def open_all(given: Source | Sequence[Source]) -> dict[str, Recording]:
 
 @contextmanager
 def naming(name: str) -> Iterator[None]:
-    """Errors raised within begin with `name`, unless they say it already, or it is empty."""
+    """Errors raised within begin with `name`, unless a path in them does or has it, or it is empty."""
     try:
         yield
     except CalibrationError as error:
-        if name in str(error):
+        if not name or re.search(rf"(^|[/\\]){re.escape(name)}\b", str(error)):
             raise
         raise type(error)(f"{name}: {error}") from error
