@@ -242,3 +242,12 @@ def test_a_focal_length_is_found_where_all_trials_explain_the_corners_alike():
     guess = initial_guess(rig_for(scenario, intrinsics="free", distortion="free"), simulation.measurements)
     found = guess.values()["cam0", "intrinsics"]
     np.testing.assert_allclose(found, scenario.cameras[0].intrinsics, atol=1.0)
+
+
+@pytest.mark.parametrize("length", [0.3, 0.8, 3.0])
+def test_a_gap_in_the_imu_spoils_no_guess(length: float):
+    scenario = dataclasses.replace(handheld(12.0), imu_gaps=((5.0, 5.0 + length),))
+    simulation = simulate(scenario, 2)
+    guess = initial_guess(rig_for(scenario), simulation.measurements)
+    for name, c in guess.cameras.items():
+        assert np.linalg.norm(c.position - simulation.truth.T_imu_cam[name][:3, 3]) < 0.03

@@ -53,7 +53,7 @@ def lever_arm(
     t, R_bc, p = times[ok], poses.rotation[ok], poses.position[ok]
     R_bi = R_bc @ R_imu_cam.T
     D_f, D_R = _double_integrals(imu, t, R_bi, gyro)
-    i, j, k = _triples(t)
+    i, j, k = _triples(t, imu.gaps)
     if len(i) < 10:
         raise EstimationError("too few images follow one another closely enough to find gravity; record for longer.")
     h1, h2 = (t[j] - t[i])[:, None], (t[k] - t[j])[:, None]
@@ -100,14 +100,16 @@ def _target_size(rows: np.ndarray, rhs: np.ndarray, felt: np.ndarray) -> tuple[f
     return 1.0 / factor, float(np.sqrt(variance * np.linalg.inv(information)[9, 9])) / factor**2
 
 
-def _triples(t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Images (i, j, k) about STEP_S apart, within a factor of two."""
+def _triples(t: np.ndarray, gaps: tuple[tuple[float, float], ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Images (i, j, k) about STEP_S apart, within a factor of two, and no part of them in a gap of the IMU."""
     i = np.arange(len(t))
     j = np.searchsorted(t, t + STEP_S - 1e-3)
     k = np.searchsorted(t, t + 2 * STEP_S - 1e-3)
     good = (k < len(t)) & (j < k) & (i < j)
     i, j, k = i[good], j[good], k[good]
     close = (t[j] - t[i] < 2 * STEP_S) & (t[k] - t[j] < 2 * STEP_S)
+    for start, end in gaps:
+        close &= (t[k] <= start) | (t[i] >= end)
     return i[close], j[close], k[close]
 
 
