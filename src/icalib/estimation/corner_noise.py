@@ -23,7 +23,7 @@ FIRST_GUESS_PX = 0.5
 SMALLEST_PX, LARGEST_PX = 1e-3, 5.0
 FIRST_TAU_PX = 0.1
 COMMON_ERRORS = 1
-SMALLEST_BASE_PX = 0.02
+SMALLEST_BASE_PX = 0.005  # no detector does better; keeps weights finite where corners are exact
 BINS = 12  # of image speed
 MEDIAN_OF_SQUARE = 2.0 * np.log(2.0)  # median of chi^2 with two degrees of freedom
 
@@ -95,7 +95,9 @@ def estimate_noise(
         base, exposure = _fit_blur(square[used], speed[stream.image][used])
     else:
         base, exposure = np.sqrt(np.median(square[used]) / MEDIAN_OF_SQUARE), 0.0
-    return NoiseModel(max(float(base), SMALLEST_BASE_PX), float(exposure), tau)
+    if camera.corner_noise_px is None:
+        base = max(base, SMALLEST_BASE_PX)
+    return NoiseModel(float(base), float(exposure), tau)
 
 
 def scale_common_errors(tau: tuple[float, ...], fits: list[Fit]) -> tuple[float, ...]:
