@@ -18,6 +18,7 @@ BUNDLE_IMAGES = 48
 JUDGE_IMAGES = 300  # to tell valleys apart that differ by far less than the noise
 FOCAL_TRIALS = np.geomspace(0.1, 3.0, 35)  # of the image width: 19 degrees for a pinhole, all round for a fisheye
 ROUNDS = 25
+FIRST = np.array([0, 1, 4])  # fx, fy and the strongest distortion
 TIED = 1.05  # trials this much worse than the best are as good
 NEAR = 1.5  # candidates with so many times the error of the best are in another valley: no closer look is needed
 ALIKE = 1.002  # costs that the noise cannot tell apart: the plainer lens is taken
@@ -58,7 +59,10 @@ def _candidates(
     focal length; those that are nearly the same, once."""
     trial, found = _spread_images(stream, TRIAL_IMAGES), []
     for starts in kinds:
-        for start in _good_starts(trial, model, starts, target):
+        good = _good_starts(trial, model, starts, target)
+        if len(model.start_distortions) == 1:  # one valley: the best after a rough fit leads into it
+            good = [_roughly_fitted(trial, model, good, target, wanted)]
+        for start in good:
             with suppress(np.linalg.LinAlgError):
                 params = _fit(bundle, model, start, target, wanted)
                 if not any(np.allclose(params, other, rtol=1e-2, atol=1e-3) for other in found):
@@ -78,10 +82,23 @@ def _fit(
     bundle: CornerStream, model: CameraModel, params: np.ndarray, target: np.ndarray, wanted: np.ndarray
 ) -> np.ndarray:
     """The `wanted` (P,) of `params`: focal length and the strongest distortion first, the rest once these are near."""
-    for stage in (np.array([0, 1, 4]), np.arange(len(params))):
+    for stage in (FIRST, np.arange(len(params))):
         if wanted[stage].any():
             params, _ = _bundle(bundle, model, params, target, stage[wanted[stage]])
     return params
+
+
+def _roughly_fitted(
+    trial: CornerStream, model: CameraModel, starts: np.ndarray, target: np.ndarray, wanted: np.ndarray
+) -> np.ndarray:
+    """(P,) the best of `starts` after focal length and the strongest distortion were fitted, where `wanted` (P,)."""
+    if len(starts) == 1 or not wanted[FIRST].any():
+        return starts[0]
+    fitted = []
+    for start in starts:
+        with suppress(np.linalg.LinAlgError):
+            fitted.append(_bundle(trial, model, start, target, FIRST[wanted[FIRST]]))
+    return min(fitted, key=lambda pair: pair[1])[0] if fitted else starts[0]
 
 
 def _near_the_best(
