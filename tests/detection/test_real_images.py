@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 
 import numpy as np
@@ -15,15 +14,8 @@ cv2 = pytest.importorskip("cv2")
 
 
 @pytest.fixture(scope="module")
-def images() -> Path:
-    default = Path(__file__).parents[3] / "shared" / "data"
-    path = Path(os.environ.get("ICALIB_DATA", default)) / "aprilgrid_images" / "images"
-    if path.is_dir():
-        return path
-    sentence = f"the images {path} are absent; set ICALIB_DATA to the folder that holds aprilgrid_images"
-    if os.environ.get("ICALIB_REQUIRE_DATA") == "1":
-        pytest.fail(sentence)
-    pytest.skip(sentence)
+def images(aprilgrid_images) -> Path:
+    return aprilgrid_images / "images"
 
 
 @pytest.fixture(scope="module")
