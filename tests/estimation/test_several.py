@@ -119,7 +119,8 @@ def test_nothing_is_known_across_the_seam(problem):
     chain = built.chain
     assert isinstance(chain, ImuFactor)
     k = state.starts[1]
-    assert not chain.W[k - 1].any() and chain.W[k - 2].any() and chain.W[k].any()
+    W = chain.made.W
+    assert not W[k - 1].any() and W[k - 2].any() and W[k].any()
     pieces, out = built.pieces(), built.residuals()
     built.linearise(state, pieces, out)
     piece = next(p for p in pieces if p.first < k <= p.last)

@@ -264,12 +264,7 @@ class ImuFactor:
     imu: ImuData
     gravity: float
     columns: np.ndarray  # (24,) border columns of the intrinsics, or (0,) where they are fixed
-    dR: np.ndarray
-    dv: np.ndarray
-    dp: np.ndarray
-    J: np.ndarray
-    W: np.ndarray
-    bias0: np.ndarray
+    made: Increments
     intrinsics0: np.ndarray
     starts: tuple[int, ...] = (0,)
 
@@ -279,13 +274,13 @@ class ImuFactor:
 
     @property
     def n_nodes(self) -> int:
-        return len(self.dR) + 1
+        return len(self.made.dR) + 1
 
     def accumulate_bias_prior(self, state: State, piece: Piece, sums: bool = True, met: bool = False) -> float:
         """The broad prior on the biases of the recordings' first nodes in `piece`, about those of the pass's start.
         Returns half its chi^2."""
         own = [k for k in self.starts if piece.first <= k < piece.last]
-        return sum(accumulate_bias_prior(state, piece, sums, met, self.bias0[k], k) for k in own)
+        return sum(accumulate_bias_prior(state, piece, sums, met, self.made.bias0[k], k) for k in own)
 
     @classmethod
     def build(cls, imu: ImuData, state: State, gravity: float, columns: np.ndarray) -> ImuFactor:
@@ -315,7 +310,7 @@ class ImuFactor:
         W[seams] = 0.0
         # As if met: the logarithm of a rotation that means nothing could lie where it has no derivative.
         dR[seams] = state.rotation[seams].transpose(0, 2, 1) @ state.rotation[seams + 1]
-        return cls(imu, gravity, columns, *arrays, bias0, intrinsics, state.starts)
+        return cls(imu, gravity, columns, Increments(*arrays, bias0), intrinsics, state.starts)
 
     def accumulate(
         self, state: State, piece: Piece, out: np.ndarray, sums: bool = True, noise: np.ndarray | None = None
@@ -326,8 +321,7 @@ class ImuFactor:
         """
         dx = state.values[self.imu.name, "intrinsics"] - self.intrinsics0 if len(self.columns) else np.zeros(0)
         chain = Chain(state.rotation, state.position, state.velocity, state.bias, state.seconds, self.gravity)
-        made = Increments(self.dR, self.dv, self.dp, self.J, self.W, self.bias0)
         return _accumulate(
-            piece.last, chain, made, dx, self.columns, out if noise is None else noise, noise is not None,
+            piece.last, chain, self.made, dx, self.columns, out if noise is None else noise, noise is not None,
             piece.sums(sums), out,
         )  # fmt: skip
