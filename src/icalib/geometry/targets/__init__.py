@@ -6,8 +6,10 @@ from icalib.geometry.targets.aprilgrid import AprilGrid
 from icalib.geometry.targets.base import Target
 from icalib.geometry.targets.charuco import Charuco
 from icalib.geometry.targets.checkerboard import Checkerboard
+from icalib.geometry.targets.markers import Markers
+from icalib.geometry.targets.scene import Scene
 from icalib.geometry.targets.tag import Tag
 
-__all__ = ["TARGETS", "AprilGrid", "Charuco", "Checkerboard", "Tag", "Target"]
+__all__ = ["TARGETS", "AprilGrid", "Charuco", "Checkerboard", "Markers", "Scene", "Tag", "Target"]
 
 TARGETS: dict[str, type[Target]] = {kind.type: kind for kind in (AprilGrid, Charuco, Checkerboard, Tag)}

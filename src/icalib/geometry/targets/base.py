@@ -12,10 +12,14 @@ import numpy as np
 from icalib.errors import RecordingError
 
 
+BOARD = "board0"
+
+
 @dataclass(frozen=True)
 class Target(ABC):
-    """A flat target. Its frame: origin at point 0, x to the right and y upwards on the sheet, so that z points out of
-    the print towards whoever looks at it; all points have z = 0.
+    """Points on flat, rigid bodies: one, unless said otherwise. The frame of a body: origin at its first point, x to
+    the right and y upwards on the sheet, so that z points out of the print towards whoever looks at it; all points
+    have z = 0.
 
     A point is identified by the id of a tag and its corner, or by tag 0 and the number of the corner on targets whose
     points belong to no tag. type: the name in rig files. blooms: the points are corners of tags, which bloom pulls
@@ -28,12 +32,27 @@ class Target(ABC):
     @cached_property
     @abstractmethod
     def points(self) -> np.ndarray:
-        """(n, 3) in metres, board frame."""
+        """(n, 3) in metres, in the frame of the body that each belongs to."""
 
     @cached_property
     def tag_centers(self) -> np.ndarray:
         """(n, 3) in metres: for each point the centre of its tag; the point itself where nothing blooms."""
         return self.points
+
+    @cached_property
+    def bodies(self) -> tuple[str, ...]:
+        """Name of each rigid body. How several stand to each other is unknown, and estimated."""
+        return (BOARD,)
+
+    @cached_property
+    def body(self) -> np.ndarray:
+        """(n,) int64: the body that each point belongs to."""
+        return np.zeros(len(self.points), dtype=np.int64)
+
+    @cached_property
+    def bends(self) -> np.ndarray:
+        """(bodies,) bool: whether a body is large enough to bend."""
+        return np.ones(len(self.bodies), dtype=bool)
 
     @property
     def symmetric(self) -> bool:

@@ -1,0 +1,78 @@
+"""Free tags of one family and size, stuck anywhere: each stands where it stands."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+
+from icalib.errors import RecordingError, RigError
+from icalib.geometry.targets.aprilgrid import UNIT_TAG
+from icalib.geometry.targets.base import Target
+from icalib.geometry.targets.families import FAMILIES, check_family
+
+
+@dataclass(frozen=True)
+class Markers(Target):
+    """Tags of `family`, their black borders of edge `size` [m], with these `ids`, or any of the family if there are
+    none.
+
+    Every tag is a body of its own. Corners as on an AprilGrid: 0 at the bottom left, then counterclockwise. Raises
+    RigError where the family lacks such a tag or an id is listed twice.
+    """
+
+    type: ClassVar[str] = "markers"
+    blooms: ClassVar[bool] = True
+
+    family: str
+    size: float
+    ids: tuple[int, ...] = ()
+    border_bits: int = 1
+
+    def __post_init__(self) -> None:
+        check_family(self.family, 1 + max(self.ids, default=0))
+        if repeated := [i for i in self.ids if self.ids.count(i) > 1]:
+            raise RigError(f"tag {repeated[0]} is listed twice; each id may stand in one place only.")
+
+    @cached_property
+    def known(self) -> np.ndarray:
+        """(tags,) int64 ids, increasing."""
+        return np.array(sorted(self.ids) or range(FAMILIES[self.family][1]), dtype=np.int64)
+
+    @cached_property
+    def points(self) -> np.ndarray:
+        """(4 tags, 3) corners in metres, each in its tag's frame; corner c of known[i] at index 4 i + c."""
+        corners = np.concatenate([self.size * UNIT_TAG, np.zeros((4, 1))], axis=1)
+        return np.tile(corners, (len(self.known), 1))
+
+    @cached_property
+    def tag_centers(self) -> np.ndarray:
+        return np.tile([0.5 * self.size, 0.5 * self.size, 0.0], (len(self.points), 1))
+
+    @cached_property
+    def bodies(self) -> tuple[str, ...]:
+        return tuple(f"tag {i}" for i in self.known)
+
+    @cached_property
+    def body(self) -> np.ndarray:
+        return np.repeat(np.arange(len(self.known)), 4)
+
+    @cached_property
+    def bends(self) -> np.ndarray:
+        return np.zeros(len(self.known), dtype=bool)
+
+    def point_index(self, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarray:
+        tag_id, corner = np.asarray(tag_id, dtype=np.int64), np.asarray(corner, dtype=np.int64)
+        place = np.minimum(np.searchsorted(self.known, tag_id), len(self.known) - 1)
+        if (strange := self.known[place] != tag_id).any():
+            raise RecordingError(f"tag {tag_id[strange][0]} is not one of the target's ids; add it, or leave it out.")
+        if ((corner < 0) | (corner > 3)).any():
+            raise RecordingError(
+                f"corner {corner[(corner < 0) | (corner > 3)][0]} is not one of a tag's corners 0 to 3."
+            )
+        return 4 * place + corner
+
+    def point_identity(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return self.known[index // 4], index % 4

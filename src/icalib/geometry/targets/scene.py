@@ -1,0 +1,96 @@
+"""Several targets in one scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+
+from icalib.errors import RecordingError
+from icalib.geometry.targets.base import Target
+
+
+@dataclass(frozen=True)
+class Scene(Target):
+    """Targets that stand still to each other, by name. How they stand is unknown, and estimated.
+
+    Points are those of the first, then those of the second, and so on; bodies are called as their target, or as the
+    target and its body where it has several.
+    """
+
+    type: ClassVar[str] = "scene"
+    blooms: ClassVar[bool] = True
+
+    names: tuple[str, ...]
+    targets: tuple[Target, ...]
+
+    @cached_property
+    def first_points(self) -> np.ndarray:
+        """(targets + 1,) index of each target's first point, and the number of points."""
+        return np.concatenate([[0], np.cumsum([len(t.points) for t in self.targets])]).astype(np.int64)
+
+    @cached_property
+    def points(self) -> np.ndarray:
+        """(n, 3) in metres, in the frame of the body that each belongs to."""
+        return np.concatenate([t.points for t in self.targets])
+
+    @cached_property
+    def tag_centers(self) -> np.ndarray:
+        return np.concatenate([t.tag_centers for t in self.targets])
+
+    @cached_property
+    def bodies(self) -> tuple[str, ...]:
+        pairs = zip(self.names, self.targets, strict=True)
+        return tuple(name if len(t.bodies) == 1 else f"{name} {body}" for name, t in pairs for body in t.bodies)
+
+    @cached_property
+    def body(self) -> np.ndarray:
+        first = np.concatenate([[0], np.cumsum([len(t.bodies) for t in self.targets])])
+        return np.concatenate([t.body + k for t, k in zip(self.targets, first[:-1], strict=True)])
+
+    @cached_property
+    def bends(self) -> np.ndarray:
+        return np.concatenate([t.bends for t in self.targets])
+
+    @property
+    def symmetric(self) -> bool:
+        return any(t.symmetric for t in self.targets)
+
+    def point_index(self, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarray:
+        """Raises RecordingError also where two targets have such a corner: a table cannot tell which one is meant."""
+        tag_id, corner = np.asarray(tag_id, dtype=np.int64), np.asarray(corner, dtype=np.int64)
+        index = np.full(len(tag_id), -1)
+        owner = np.full(len(tag_id), -1)
+        for k, (target, first) in enumerate(zip(self.targets, self.first_points[:-1], strict=True)):
+            own = _rows_of(target, tag_id, corner)
+            if (both := own & (owner >= 0)).any():
+                names = f"{self.names[owner[both][0]]} and {self.names[k]}"
+                raise RecordingError(
+                    f"corner {corner[both][0]} of tag {tag_id[both][0]} is on {names}; give them other ids, or images."
+                )
+            owner[own] = k
+            index[own] = first + target.point_index(tag_id[own], corner[own])
+        if (lost := owner < 0).any():
+            raise RecordingError(
+                f"corner {corner[lost][0]} of tag {tag_id[lost][0]} is on none of {', '.join(self.names)}; "
+                "check the targets in the rig file."
+            )
+        return index
+
+    def point_identity(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        index = np.asarray(index, dtype=np.int64)
+        tag_id, corner = np.empty_like(index), np.empty_like(index)
+        owner = np.searchsorted(self.first_points, index, side="right") - 1
+        for k, target in enumerate(self.targets):
+            own = owner == k
+            tag_id[own], corner[own] = target.point_identity(index[own] - self.first_points[k])
+        return tag_id, corner
+
+
+def _rows_of(target: Target, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarray:
+    """(N,) bool: the rows that are points of `target`."""
+    known = np.stack(target.point_identity(np.arange(len(target.points))), axis=1)
+    base = 1 + int(max(known.max(), tag_id.max(initial=0), corner.max(initial=0)))
+    return np.isin(tag_id * base + corner, known[:, 0] * base + known[:, 1]) & (tag_id >= 0) & (corner >= 0)
