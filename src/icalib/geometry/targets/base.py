@@ -11,7 +11,6 @@ import numpy as np
 
 from icalib.errors import RecordingError
 
-
 BOARD = "board0"
 
 
