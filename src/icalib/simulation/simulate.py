@@ -30,7 +30,7 @@ class Truth:
     accel_bias: np.ndarray  # (N, 3) m/s^2
     imu_intrinsics: np.ndarray  # (24,)
     gravity: np.ndarray  # (3,) m/s^2, world
-    T_world_board: np.ndarray  # (4, 4)
+    T_world_bodies: np.ndarray  # (bodies, 4, 4), in the order of the target's bodies
     bow: np.ndarray  # (3,) m
     T_imu_cam: dict[str, np.ndarray]
     time_offset: dict[str, float]  # s, between raw stamps: t_imu = t_cam + time_offset
@@ -39,6 +39,11 @@ class Truth:
     bloom_px: dict[str, float]
     corners: dict[str, CornerTruth]
     trajectory: Trajectory
+
+    @property
+    def T_world_board(self) -> np.ndarray:
+        """(4, 4): of the first body."""
+        return self.T_world_bodies[0]
 
     def pose_at(self, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Exact R_world_imu (N, 3, 3), position and velocity (N, 3) in world at seconds (N,)."""
@@ -97,7 +102,7 @@ def simulate(scenario: Scenario, seed: int) -> Simulation:
         readings.accel_bias[kept],
         scenario.imu_intrinsics,
         GRAVITY_WORLD,
-        scenario.T_world_board,
+        scenario.body_poses,
         np.array(scenario.bow),
         {c.name: c.T_imu_cam for c in scenario.cameras},
         {c.name: raw_time_offset(scenario, c) for c in scenario.cameras},
