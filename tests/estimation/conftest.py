@@ -119,13 +119,13 @@ def make_setup(
     entries = [("imu0", "intrinsics", "vector", 24, imu_free), ("board0", "tilt", "tilt", 2, True)]
     target = SplitGrid(*dataclasses.astuple(sim.scenario.target)) if split else sim.scenario.target
     bodies = Bodies(target, (1, 0, 2) if split else (0,), (), shape)
-    entries += bodies.entries()
+    entries += bodies.shape_entries() + bodies.pose_entries()
     values = {(name, "shape"): np.zeros(len(SHAPE_LABELS)) for name in bodies.bending}
     values["imu0", "intrinsics"] = truth.imu_intrinsics.copy()
     R_world_grid, origin = truth.T_world_board[:3, :3], truth.T_world_board[:3, 3]
     R_grid_scene, p_grid_scene = target.frame(1) if split else (np.eye(3), np.zeros(3))
     values["board0", "tilt"] = R_world_grid @ R_grid_scene
-    for k in bodies.used[1:]:
+    for k in bodies.used:
         values[target.bodies[k], "rotation"], values[target.bodies[k], "translation"] = target.place(k, bodies.used[0])
     times = []
     for c in measurements.cameras:

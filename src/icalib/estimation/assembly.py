@@ -19,7 +19,7 @@ from icalib.estimation.nodes import MERGED_WITHIN_S, distinct, first_nodes, plac
 from icalib.estimation.poses import assign_nodes, poses_at
 from icalib.estimation.prior_factor import Prior
 from icalib.estimation.problem import ChainFactor, Problem
-from icalib.estimation.state import Key, Kind, Layout, State, make_layout
+from icalib.estimation.state import Entry, Key, Kind, Layout, State, make_layout
 from icalib.estimation.tolerances import Tolerances
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets.base import BOARD
@@ -77,18 +77,18 @@ def inputs_for(rig: Rig, recordings: Sequence[Measurements]) -> Inputs:
 def layout_for(rig: Rig, bodies: Bodies, n_recordings: int = 1) -> Layout:
     """The border: IMU intrinsics, the scene and its bodies, then each camera's parameters."""
     imu = rig.imu
-    entries: list[tuple[str, str, Kind, int, bool]] = []
+    entries: list[Entry] = []
     if imu is not None:
         entries.append((imu.name, "intrinsics", "vector", N_INTRINSICS, imu.intrinsics.mode != "fixed"))
     # Without an IMU the scene's frame is the world's, in all recordings.
     for k in range(1 if imu is None else n_recordings):
         entries.append((board_in(BOARD, k), "tilt", "tilt", 2, imu is not None))
-    entries += bodies.entries()
+    entries += bodies.shape_entries()
     for camera in rig.cameras:
         sizes = SIZES | {"distortion": len(camera_model(camera.model).parameter_names) - 4}
         for name, kind in CAMERA_PARAMETERS:
             entries.append((camera.name, name, kind, sizes[name], _is_estimated(rig, camera, name)))
-    return make_layout(entries)
+    return make_layout(entries + bodies.pose_entries())
 
 
 def _is_estimated(rig: Rig, camera: Camera, name: str) -> bool:
@@ -213,6 +213,8 @@ def start_values(inputs: Inputs, guess_values: dict[Key, np.ndarray]) -> dict[Ke
     values = dict(guess_values)
     for name in inputs.bodies.bending:
         values[name, "shape"] = np.zeros(len(SHAPE_LABELS))
+    reference = inputs.bodies.names[0]
+    values[reference, "rotation"], values[reference, "translation"] = np.eye(3), np.zeros(3)
     if (imu := inputs.rig.imu) is not None:
         given = imu.intrinsics.value
         values[imu.name, "intrinsics"] = np.zeros(N_INTRINSICS) if given is None else given.copy()

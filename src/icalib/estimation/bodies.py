@@ -13,7 +13,7 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation.board import SHAPE_LABELS, shape_basis
-from icalib.estimation.state import Key, Kind, Layout
+from icalib.estimation.state import Entry, Key, Layout
 from icalib.geometry.targets import Target
 from icalib.measurements import CornerStream, Measurements
 
@@ -41,11 +41,6 @@ class Bodies:
         return tuple(self.target.bodies[k] for k in self.used)
 
     @property
-    def placed(self) -> tuple[str, ...]:
-        """Names of those whose pose in the scene is estimated: all in use but the reference."""
-        return self.names[1:]
-
-    @property
     def bending(self) -> tuple[str, ...]:
         """Names of those whose shape is estimated."""
         return tuple(self.target.bodies[k] for k in self.used if self.bent and self.target.bends[k])
@@ -55,22 +50,24 @@ class Bodies:
         """(n_points, s, 3) displacement of each point by unit of its body's shape parameters, in the body's frame."""
         return shape_basis(self.target, self.bent)
 
-    def entries(self) -> list[tuple[str, str, Kind, int, bool]]:
-        """Blocks of a layout: shapes, then poses in the scene."""
-        found: list[tuple[str, str, Kind, int, bool]] = []
-        for name in self.bending:
-            found.append((name, "shape", "vector", len(SHAPE_LABELS), True))
-        for name in self.placed:
-            found.append((name, "rotation", "rotation", 3, True))
-            found.append((name, "translation", "vector", 3, True))
-        return found
+    def shape_entries(self) -> list[Entry]:
+        """Blocks of a layout for how bodies bend."""
+        return [(name, "shape", "vector", len(SHAPE_LABELS), True) for name in self.bending]
+
+    def pose_entries(self) -> list[Entry]:
+        """Blocks of a layout for poses in the scene, the reference's fixed; none where there is one body only."""
+        entries: list[Entry] = []
+        for name in self.names if self.several else ():
+            entries.append((name, "rotation", "rotation", 3, name != self.names[0]))
+            entries.append((name, "translation", "vector", 3, name != self.names[0]))
+        return entries
 
     def columns(self, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
         """Border columns of each of the target's bodies: pose (n, 6, or 0 where only one is in use) and shape (n, s),
         -1 where there are none."""
         names, n = self.target.bodies, len(self.target.bodies)
         pose, shape = np.full((n, 6 if self.several else 0), -1), np.full((n, self.basis.shape[1]), -1)
-        for k in self.used[1:]:
+        for k in self.used if self.several else ():
             pose[k] = layout.columns(names[k], "rotation", "translation")
         for k in self.used:
             if names[k] in self.bending:
@@ -78,7 +75,7 @@ class Bodies:
         return pose, shape
 
     def poses(self, values: dict[Key, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """R_scene_body (n, 3, 3) and p_scene_body (n, 3) of all the target's bodies; the identity where there is
+        """R_scene_body (n, 3, 3) and p_scene_body (n, 3) of all the target's bodies; the identity where one has
         none."""
         n = len(self.target.bodies)
         R, p = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3))
