@@ -93,6 +93,18 @@ def test_recordings_that_show_different_tags_share_one_scene():
     assert max(camera_errors(result, simulations[0], "cam0")) < 1e-7
 
 
+def test_a_scene_that_was_changed_between_recordings_is_named():
+    simulations = [simulate(tag_map(12.0, noiseless=True), seed) for seed in (0, 1)]
+    moved = simulations[1].scenario.T_world_bodies.copy()
+    moved[::2, :3, 3] += [0.02, -0.05, 0.1]
+    other = simulate(dataclasses.replace(simulations[1].scenario, T_world_bodies=moved), 1)
+    recordings = [
+        dataclasses.replace(s.measurements, name=name) for s, name in ((simulations[0], "old"), (other, "new"))
+    ]
+    with pytest.raises(EstimationError, match="^(new|old): the targets do not stand to each other as in the other"):
+        calibrate_measurements(rig_for(simulations[0].scenario), recordings)
+
+
 def test_tags_that_no_image_ties_to_the_others_are_left_out_and_named():
     simulation = simulate(tag_map(12.0, noiseless=True), 0)
     tags = simulation.scenario.target.body

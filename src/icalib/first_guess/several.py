@@ -19,6 +19,8 @@ from icalib.geometry.cameras import camera_model
 from icalib.measurements import Measurements
 from icalib.rig import Camera, Rig, fixed
 
+LEAST_FIT = 0.5  # of the images must fit the scene
+
 
 def initial_guesses(rig: Rig, bodies: Bodies, recordings: Sequence[Measurements]) -> tuple[Guess, ...]:
     """A guess for each recording, all with the same calibration and the same scene.
@@ -29,6 +31,7 @@ def initial_guesses(rig: Rig, bodies: Bodies, recordings: Sequence[Measurements]
     scene = find_scene(rig, bodies, recordings)
     if len(recordings) == 1:
         return (initial_guess(rig, recordings[0], scene),)
+    _check_scene(rig, scene, recordings)
     order = sorted(range(len(recordings)), key=lambda k: -sum(len(c.stamps_ns) for c in recordings[k].cameras))
     best, guess = _first_that_works(rig, scene, [(k, recordings[k]) for k in order])
     held = _held(rig, guess, recordings[best])
@@ -40,6 +43,18 @@ def initial_guesses(rig: Rig, bodies: Bodies, recordings: Sequence[Measurements]
         _check_clocks(rig, scene, guess, recordings[best], recording)
         guesses.append(_named(held, scene, recording))
     return tuple(guesses)
+
+
+def _check_scene(rig: Rig, scene: Placed, recordings: Sequence[Measurements]) -> None:
+    """Raises EstimationError naming a recording in which the bodies stand to each other otherwise."""
+    for recording in recordings if scene.bodies.several else ():
+        pairs = list(zip(rig.cameras, recording.cameras, strict=True))
+        fits = [scene_poses(s, camera_model(c.model), scene.params[c.name], scene).ok.mean() for c, s in pairs]
+        if max(fits) < LEAST_FIT:
+            raise EstimationError(
+                f"{recording.name}: the targets do not stand to each other as in the other recordings; calibrate it "
+                "alone, or leave out the targets that were moved."
+            )
 
 
 def _first_that_works(rig: Rig, scene: Placed, recordings: list[tuple[int, Measurements]]) -> tuple[int, Guess]:
