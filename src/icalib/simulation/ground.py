@@ -76,9 +76,11 @@ def _floor(hills: Hills | None, x: Jet, y: Jet) -> tuple[Jet, Jet, Jet]:
     return z, slope_x, slope_y
 
 
-def ground_motion(drive: Drive, room: Room, T_imu_wheel: np.ndarray, rng: np.random.Generator) -> GroundMotion:
+def ground_motion(
+    drive: Drive, room: Room, T_imu_wheel: np.ndarray, duration_s: float, rng: np.random.Generator
+) -> GroundMotion:
     """The drive's motion in the middle of the room, its phases and directions drawn from `rng`."""
-    path = _PATHS[drive.kind](room, rng)
+    path = _steady(room, duration_s, rng) if drive.kind == "constant-velocity" else _PATHS[drive.kind](room, rng)
     slip = np.deg2rad(drive.sideslip_deg) * np.array([0.6, 0.4])
     sideslip = _wave(slip, _SLIP_HZ, rng) if drive.sideslip_deg else None
     hills = room.hills if drive.kind == "ramps" else None
@@ -100,20 +102,21 @@ def _wave(amplitude: np.ndarray, band_hz: np.ndarray, rng: np.random.Generator) 
 
 
 def _curves(room: Room, rng: np.random.Generator) -> Path:
-    """Laps around the room's middle that wander; the frame points along its path."""
+    """Figures of eight about the room's middle that wander; the frame points along its path."""
     half_x, half_y = _LAP_SHARE * room.size[0], _LAP_SHARE * room.size[1]
     turn, start = rng.choice([-1.0, 1.0]) * 2.0 * np.pi / _LAP_S, rng.uniform(0.0, 2.0 * np.pi)
     wander_x, wander_y = (_wave(_WANDER_M, _WANDER_HZ, rng) for _ in range(2))
 
     def at(time: Jet) -> tuple[Jet, Jet, Jet, Jet]:
-        sine, cosine = (turn * time + start).sine_cosine()
-        x, y = half_x * cosine + wander_x(time), half_y * sine + wander_y(time)
+        angle = turn * time + start
+        x = half_x * angle.sine_cosine()[0] + wander_x(time)
+        y = half_y * (2.0 * angle).sine_cosine()[0] + wander_y(time)
         return x, y, x.derivative(), y.derivative()
 
     return at
 
 
-def _line(room: Room, rng: np.random.Generator, way: Callable[[Jet], Jet]) -> Path:
+def _line(rng: np.random.Generator, way: Callable[[Jet], Jet]) -> Path:
     """Without turning: `way` [m] along a line through the room's middle."""
     heading = rng.uniform(-0.3, 0.3)
     c, s = float(np.cos(heading)), float(np.sin(heading))
@@ -126,17 +129,17 @@ def _line(room: Room, rng: np.random.Generator, way: Callable[[Jet], Jet]) -> Pa
 
 
 def _to_and_fro(room: Room, rng: np.random.Generator) -> Path:
-    return _line(room, rng, _wave(np.array([0.25 * room.size[0], 0.15]), np.array([[0.05, 0.08], [0.3, 0.5]]), rng))
+    return _line(rng, _wave(np.array([0.25 * room.size[0], 0.15]), np.array([[0.05, 0.08], [0.3, 0.5]]), rng))
 
 
-def _steady(room: Room, rng: np.random.Generator) -> Path:
-    """From one end of the room on; slow enough for a minute."""
-    start, speed = -0.4 * room.size[0], 0.8 * room.size[0] / 60.0
-    return _line(room, rng, lambda time: speed * time + start)
+def _steady(room: Room, duration_s: float, rng: np.random.Generator) -> Path:
+    """From one end of the room to the other at most, within the duration."""
+    speed = min(_SPEED, 0.8 * room.size[0] / duration_s)
+    return _line(rng, lambda time: speed * time - 0.5 * speed * duration_s)
 
 
 def _still(room: Room, rng: np.random.Generator) -> Path:
-    return _line(room, rng, lambda time: time.constant(0.0))
+    return _line(rng, lambda time: time.constant(0.0))
 
 
 def _arc(room: Room, rng: np.random.Generator) -> Path:
@@ -163,7 +166,6 @@ def _spin(room: Room, rng: np.random.Generator) -> Path:
 _PATHS: dict[str, Callable[[Room, np.random.Generator], Path]] = {
     "planar": _curves,
     "ramps": _curves,
-    "constant-velocity": _steady,
     "straight-line": _to_and_fro,
     "standing": _still,
     "arc": _arc,
