@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -85,6 +86,147 @@ class CornerStream:
         return np.repeat(np.arange(len(self.stamps_ns)), np.diff(self.start))
 
 
+def _check_groups(name: str, stamps_ns: np.ndarray, start: np.ndarray, what: str, counts: dict[str, int]) -> None:
+    """Stamps (M,) int64, start (M + 1,) from 0 upwards to the length of every column."""
+    _check(stamps_ns.dtype == np.int64, f"{name}: stamps must be int64 nanoseconds.")
+    m = len(stamps_ns)
+    _check(start.shape == (m + 1,), f"{name}: start must have shape ({m + 1},), not {start.shape}.")
+    n = int(start[-1])
+    _check(int(start[0]) == 0 and bool((np.diff(start) >= 0).all()), f"{name}: start must run upwards from 0.")
+    for column, count in counts.items():
+        _check(count == n, f"{name}: {column} must have a row for each of the {n} {what}, not {count}.")
+
+
+@dataclass(frozen=True)
+class TrackStream:
+    """Points of the scene that one camera followed, image by image, as a front end reports them.
+
+    stamps_ns (M,) int64, one per image, strictly increasing; start (M + 1,) int64, observations of image i are
+    start[i]:start[i+1]; feature (N,) int64, the same number is the same point of the scene, in all cameras; uv (N, 2)
+    pixels, (0, 0) is the centre of the top-left pixel.
+    """
+
+    name: str
+    stamps_ns: np.ndarray
+    start: np.ndarray
+    feature: np.ndarray
+    uv: np.ndarray
+
+    def __post_init__(self) -> None:
+        counts = {"feature": len(self.feature), "uv": len(self.uv)}
+        _check_groups(self.name, self.stamps_ns, self.start, "observations", counts)
+        _check(self.feature.dtype == np.int64, f"{self.name}: feature must be int64.")
+        _check(self.uv.shape[1:] == (2,), f"{self.name}: uv must have shape (N, 2), not {self.uv.shape}.")
+
+    @property
+    def origin_ns(self) -> int:
+        return int(self.stamps_ns[0])
+
+    @property
+    def seconds(self) -> np.ndarray:
+        """(M,) seconds since this clock's own first stamp."""
+        return seconds_since(self.stamps_ns, self.origin_ns)
+
+    @property
+    def image(self) -> np.ndarray:
+        """(N,) the image that each observation belongs to."""
+        return np.repeat(np.arange(len(self.stamps_ns)), np.diff(self.start))
+
+
+@dataclass(frozen=True)
+class LidarStream:
+    """Points of one LiDAR, scan by scan.
+
+    stamps_ns (S,) int64, one per scan, strictly increasing; start (S + 1,) int64, points of scan i are
+    start[i]:start[i+1]; offset_s (N,) float32, instant of each point from its scan's stamp; xyz (N, 3) float32 [m] in
+    the sensor's frame at the point's own instant; plane (N,) int32, the plane that it is known to lie on, -1: unknown.
+    """
+
+    name: str
+    stamps_ns: np.ndarray
+    start: np.ndarray
+    offset_s: np.ndarray
+    xyz: np.ndarray
+    plane: np.ndarray
+
+    def __post_init__(self) -> None:
+        counts = {"offset_s": len(self.offset_s), "xyz": len(self.xyz), "plane": len(self.plane)}
+        _check_groups(self.name, self.stamps_ns, self.start, "points", counts)
+        _check(self.xyz.shape[1:] == (3,), f"{self.name}: xyz must have shape (N, 3), not {self.xyz.shape}.")
+        for column, array in (("offset_s", self.offset_s), ("xyz", self.xyz)):
+            _check(array.dtype == np.float32, f"{self.name}: {column} must be float32.")
+        _check(self.plane.dtype == np.int32, f"{self.name}: plane must be int32.")
+
+    @property
+    def origin_ns(self) -> int:
+        return int(self.stamps_ns[0])
+
+    @property
+    def seconds(self) -> np.ndarray:
+        """(S,) seconds since this clock's own first stamp."""
+        return seconds_since(self.stamps_ns, self.origin_ns)
+
+
+@dataclass(frozen=True)
+class WheelStream:
+    """Turning rates of a left and a right wheel.
+
+    stamps_ns (N,) int64, strictly increasing; rate (N, 2) rad/s, left and right, positive forwards. meaning "mean":
+    reading i is the mean over the period from stamp i-1 to stamp i, so rate x period is the angle turned (what a
+    difference of encoder counts gives; the first reading's period began one unknown stamp earlier). "instant": the
+    rate at the stamp.
+    """
+
+    name: str
+    stamps_ns: np.ndarray
+    rate: np.ndarray
+    meaning: Literal["mean", "instant"] = "mean"
+
+    def __post_init__(self) -> None:
+        n = len(self.stamps_ns)
+        _check(self.stamps_ns.dtype == np.int64, f"{self.name}: stamps must be int64 nanoseconds.")
+        _check(self.rate.shape == (n, 2), f"{self.name}: rate must have shape ({n}, 2), not {self.rate.shape}.")
+
+    @property
+    def origin_ns(self) -> int:
+        return int(self.stamps_ns[0])
+
+    @property
+    def seconds(self) -> np.ndarray:
+        """(N,) seconds since this clock's own first stamp."""
+        return seconds_since(self.stamps_ns, self.origin_ns)
+
+
+@dataclass(frozen=True)
+class WheelPoses:
+    """Relative planar poses of a wheel frame between consecutive instants, the paper's z_W of (27).
+
+    stamps_ns (K + 1,) int64, strictly increasing; pose (K, 3) yaw [rad], x, y [m] of the wheel frame at stamp k+1 in
+    the wheel frame at stamp k; covariance (K, 3, 3) of the same.
+    """
+
+    name: str
+    stamps_ns: np.ndarray
+    pose: np.ndarray
+    covariance: np.ndarray
+
+    def __post_init__(self) -> None:
+        k = len(self.stamps_ns) - 1
+        _check(self.stamps_ns.dtype == np.int64, f"{self.name}: stamps must be int64 nanoseconds.")
+        _check(self.pose.shape == (k, 3), f"{self.name}: pose must have shape ({k}, 3), not {self.pose.shape}.")
+        shape = self.covariance.shape
+        _check(shape == (k, 3, 3), f"{self.name}: covariance must have shape ({k}, 3, 3), not {shape}.")
+
+    @property
+    def origin_ns(self) -> int:
+        return int(self.stamps_ns[0])
+
+    @property
+    def seconds(self) -> np.ndarray:
+        """(K + 1,) seconds since this clock's own first stamp."""
+        return seconds_since(self.stamps_ns, self.origin_ns)
+
+
 @dataclass(frozen=True)
 class Measurements:
     """Everything one recording holds that the rig asks for."""
@@ -93,6 +235,9 @@ class Measurements:
     cameras: tuple[CornerStream, ...]
     notes: tuple[str, ...] = ()  # what was dropped or repaired while reading, one sentence each
     name: str = ""  # of the recording, for sentences about one of several
+    tracks: tuple[TrackStream, ...] = ()
+    lidars: tuple[LidarStream, ...] = ()
+    wheels: tuple[WheelStream | WheelPoses, ...] = ()
 
     @property
     def origin_ns(self) -> int:

@@ -136,17 +136,17 @@ class YamlValue:
         return np.array([item.number() for item in numbers])
 
 
-def read_yaml(path: Path) -> YamlValue:
-    """The YAML file at `path`, composed but never constructed: nothing in it can run.
+def read_yaml(path: Path, kind: str = "rig file") -> YamlValue:
+    """The YAML file at `path`, composed but never constructed: nothing in it can run. kind: for sentences.
 
     Raises RigError where there is no such file, it cannot be read, is not YAML or is empty.
     """
     try:
         root = yaml.compose(path.read_text(encoding="utf-8-sig"), Loader=yaml.SafeLoader)
     except FileNotFoundError:
-        raise RigError(f"{path} does not exist; check the path of the rig file.") from None
+        raise RigError(f"{path} does not exist; check the path of the {kind}.") from None
     except OSError as error:
-        raise RigError(f"{path} cannot be read ({error.strerror or error}); give the path of a rig file.") from error
+        raise RigError(f"{path} cannot be read ({error.strerror or error}); give the path of a {kind}.") from error
     except UnicodeDecodeError as error:
         raise RigError(f"{path} is not a text file in UTF-8 ({error.reason}); give a YAML file.") from error
     except yaml.MarkedYAMLError as error:
@@ -158,7 +158,7 @@ def read_yaml(path: Path) -> YamlValue:
     except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
         raise RigError(f"{path} is not valid YAML ({str(error).splitlines()[0]}); correct it.") from error
     if root is None:
-        raise RigError(f"{path} is empty; it must hold sensors and a target.")
+        raise RigError(f"{path} is empty; give a {kind}.")
     return YamlValue(root, str(path), "")
 
 

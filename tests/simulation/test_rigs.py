@@ -11,7 +11,14 @@ import icalib.simulation
 from icalib.rig import Parameter, Settings
 from icalib.simulation import ADIS16448, handheld, rig_for, settings_for, simulate
 
-ALLOWED = ("icalib.errors", "icalib.measurements", "icalib.rig", "icalib.geometry.targets", "icalib.simulation")
+ALLOWED = (
+    "icalib.errors",
+    "icalib.measurements",
+    "icalib.rig",
+    "icalib.geometry.targets",
+    "icalib.simulation",
+    "icalib.yaml_nodes",
+)
 
 
 def test_rig_states_truth_and_noise():

@@ -5,30 +5,46 @@ from icalib.simulation.filming import Film, Shot, film, sheets_of
 from icalib.simulation.motion import Trajectory
 from icalib.simulation.rendering import Imaging, Picture, Renderer, Sheet, SheetTruth, exposure_poses
 from icalib.simulation.rigs import rig_for, settings_for
+from icalib.simulation.robot import Drive, Features, SimLidar, SimWheels
+from icalib.simulation.room import Block, Hills, Room, hills_of_slope
 from icalib.simulation.scenario import ADIS16448, Motion, Scenario, SimCamera, handheld
+from icalib.simulation.scenario_file import load_scenario
 from icalib.simulation.simulate import Simulation, Truth, simulate
 from icalib.simulation.tag_map import tag_map
+from icalib.simulation.tracks import TrackTruth
+from icalib.simulation.wheels import WheelTruth
 from icalib.simulation.writing import write_film
 
 __all__ = [
     "ADIS16448",
+    "Block",
     "CornerTruth",
+    "Drive",
+    "Features",
     "Film",
+    "Hills",
     "Imaging",
     "Motion",
     "Picture",
     "Renderer",
+    "Room",
     "Scenario",
     "Sheet",
     "SheetTruth",
     "Shot",
     "SimCamera",
+    "SimLidar",
+    "SimWheels",
     "Simulation",
+    "TrackTruth",
     "Trajectory",
     "Truth",
+    "WheelTruth",
     "exposure_poses",
     "film",
     "handheld",
+    "hills_of_slope",
+    "load_scenario",
     "rig_for",
     "settings_for",
     "sheets_of",

@@ -50,17 +50,37 @@ class Trajectory(Protocol):
         """seconds (N,) since the IMU clock's origin -> R_world_imu (N, 3, 3), position, velocity (N, 3) in world."""
         ...
 
+    def rate_at(self, seconds: np.ndarray) -> np.ndarray:
+        """seconds (N,) -> angular rate (N, 3) [rad/s] in the imu frame."""
+        ...
+
+
+class ClosedForm(Trajectory, Protocol):
+    """A trajectory that an IMU can sample."""
+
+    def readings_at(self, seconds: np.ndarray) -> np.ndarray:
+        """(N, 6) true angular rate [rad/s] and specific force [m/s^2] in the imu frame."""
+        ...
+
+
+def readings_of(rotation: np.ndarray, rotation_rate: np.ndarray, acceleration: np.ndarray) -> np.ndarray:
+    """(N, 6) angular rate and specific force in the imu frame, of R_world_imu and its time derivative (N, 3, 3), and
+    of the acceleration (N, 3) in world."""
+    spin = np.swapaxes(rotation, 1, 2) @ rotation_rate
+    rate = 0.5 * np.stack([spin[:, i, j] - spin[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], axis=1)
+    return np.concatenate([rate, np.einsum("nji,nj->ni", rotation, acceleration - GRAVITY_WORLD)], axis=1)
+
 
 @dataclass(frozen=True, eq=False)
 class Waves:
-    """Three channels, each the sum of two sinusoids: amplitude, frequency [Hz], phase [rad], all (2, 3)."""
+    """Channels, each a sum of sinusoids: amplitude, frequency [Hz], phase [rad], all (sinusoids, channels)."""
 
     amplitude: np.ndarray
     frequency: np.ndarray
     phase: np.ndarray
 
     def derivative(self, order: int, seconds: np.ndarray) -> np.ndarray:
-        """(N, 3) `order`-th time derivative at seconds (N,)."""
+        """(N, channels) `order`-th time derivative at seconds (N,)."""
         omega = 2.0 * np.pi * self.frequency
         angle = omega * seconds[:, None, None] + self.phase + 0.5 * np.pi * order
         return np.sum(self.amplitude * omega**order * np.sin(angle), axis=1)
@@ -95,6 +115,10 @@ class Reference:
         force = np.einsum("nji,nj->ni", rotation, acceleration - GRAVITY_WORLD)
         return np.concatenate([rate @ self.right, force], axis=1)
 
+    def rate_at(self, seconds: np.ndarray) -> np.ndarray:
+        """See `Trajectory.rate_at`."""
+        return self.readings_at(seconds)[:, :3]
+
     def _factors(self, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         angles = self.angles.derivative(0, seconds)
         return _turn(2, angles[:, 0]), _turn(1, angles[:, 1]), _turn(0, angles[:, 2])
@@ -116,7 +140,7 @@ def _waves(amplitude: np.ndarray, rng: np.random.Generator) -> Waves:
     return Waves(amplitude, frequency, rng.uniform(0.0, 2.0 * np.pi, (2, 3)))
 
 
-def _basis_with_z(axis: np.ndarray) -> np.ndarray:
+def basis_with_z(axis: np.ndarray) -> np.ndarray:
     """A rotation whose third column is the unit vector along `axis`."""
     z = axis / np.linalg.norm(axis)
     x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
@@ -127,7 +151,8 @@ def _basis_with_z(axis: np.ndarray) -> np.ndarray:
 def reference_motion(scenario: Scenario, rng: np.random.Generator) -> Reference:
     """The scenario's motion in closed form, around where the first camera looks at the board's centre, or at the
     origin of T_world_board where there are several bodies."""
-    motion: Motion = scenario.motion
+    motion = scenario.motion
+    assert isinstance(motion, Motion)
     T_imu_cam = scenario.cameras[0].T_imu_cam
     R_world_board, origin = scenario.T_world_board[:3, :3], scenario.T_world_board[:3, 3]
     corners = scenario.target.points if scenario.T_world_bodies is None else np.zeros((1, 3))
@@ -143,7 +168,7 @@ def reference_motion(scenario: Scenario, rng: np.random.Generator) -> Reference:
         left, right, axes = np.eye(3), R_world_imu, np.eye(3)
         angles, shifts = _YAW_RAD, _SHIFT_M * [1.0, 1.0, 0.0]
     elif motion.kind == "single_axis":
-        basis = _basis_with_z(np.array(motion.axis_imu))
+        basis = basis_with_z(np.array(motion.axis_imu))
         left, right, angles = R_world_imu @ basis, basis.T, _YAW_RAD
     elif motion.kind == "motionless":
         angles, shifts = 0.0 * angles, 0.0 * shifts
@@ -169,10 +194,18 @@ class ExactTrajectory:
 
     def pose_at(self, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See `Trajectory.pose_at`; beyond the ends the outermost interval's rates go on."""
-        i = np.clip(np.searchsorted(self.seconds, seconds, side="right") - 1, 0, len(self.seconds) - 2)
-        mean = 0.5 * (self.readings[i] + self.readings[i + 1])
+        i, mean = self._interval(seconds)
         dt = seconds - self.seconds[i]
         return _advance((self.rotation[i], self.position[i], self.velocity[i]), mean, dt)
+
+    def rate_at(self, seconds: np.ndarray) -> np.ndarray:
+        """See `Trajectory.rate_at`; at a reading, that of the interval which it begins."""
+        return self._interval(seconds)[1][:, :3]
+
+    def _interval(self, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(N,) the interval between readings that each instant lies in, and (N, 6) its rates and forces."""
+        i = np.clip(np.searchsorted(self.seconds, seconds, side="right") - 1, 0, len(self.seconds) - 2)
+        return i, 0.5 * (self.readings[i] + self.readings[i + 1])
 
 
 def _advance(
@@ -189,7 +222,7 @@ def _advance(
     )
 
 
-def exact_motion(reference: Reference, seconds: np.ndarray) -> ExactTrajectory:
+def exact_motion(reference: ClosedForm, seconds: np.ndarray) -> ExactTrajectory:
     """Readings near the reference's, and their exact integral.
 
     The integral of means drifts from the reference by the trapezoid's error, so each reading is steered softly by

@@ -9,6 +9,7 @@ import numpy as np
 
 from icalib.simulation.scenario import SimCamera
 
+PARAMETER_COUNTS = {"pinhole-radtan": 4, "pinhole-equidistant": 4, "eucm": 2, "double-sphere": 2, "omni-radtan": 5}
 _COMPLEX_STEP = 1e-30
 
 

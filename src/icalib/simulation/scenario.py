@@ -10,6 +10,8 @@ import numpy as np
 from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Target
 from icalib.rig import ImuNoise
+from icalib.simulation.robot import Drive, Features, SimLidar, SimWheels
+from icalib.simulation.room import Room
 
 MotionKind = Literal["handheld", "planar", "single_axis", "motionless"]
 Interval = tuple[float, float]  # (start, end) in seconds on the IMU's clock, since its origin
@@ -117,13 +119,13 @@ class Scenario:
     image speed being the RMS of its corners' in px/s; shift_px is the sigma of a 2D shift that all corners of an
     image share. Outliers are moved by up to +-outlier_px on each axis.
 
-    Raises RigError where bodies have no pose.
+    Raises RigError where bodies have no pose, or its parts do not go together.
     """
 
     cameras: tuple[SimCamera, ...]
     target: Target = AprilGrid(6, 6, 0.088, 0.3)
     duration_s: float = 20.0
-    motion: Motion = Motion()
+    motion: Motion | Drive = Motion()
     T_world_board: np.ndarray = field(default_factory=_standing_board)
     T_world_bodies: np.ndarray | None = None
     bow: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -141,8 +143,16 @@ class Scenario:
     shift_px: float = 0.0
     outlier_fraction: float = 0.0
     outlier_px: float = 20.0
+    board: bool = True  # whether the target stands in the scene
+    room: Room | None = None
+    features: Features | None = None  # on the room's surfaces; None: no tracks
+    lidars: tuple[SimLidar, ...] = ()
+    wheels: tuple[SimWheels, ...] = ()
+    robot_noise_enabled: bool = True  # of tracks, LiDARs and wheels
+    seed: int = 0  # where none is asked for
 
     def __post_init__(self) -> None:
+        _check_robot(self)
         needed = (len(self.target.bodies), 4, 4)
         if (given := self.body_poses.shape) != needed:
             raise RigError(
@@ -153,6 +163,24 @@ class Scenario:
     def body_poses(self) -> np.ndarray:
         """(bodies, 4, 4) T_world_body."""
         return self.T_world_board[None] if self.T_world_bodies is None else self.T_world_bodies
+
+
+def _check_robot(scenario: Scenario) -> None:
+    """Raises RigError where the parts of a scenario do not go together."""
+    drive = scenario.motion if isinstance(scenario.motion, Drive) else None
+    needs_room = drive or scenario.features or scenario.lidars
+    if needs_room and scenario.room is None:
+        raise RigError("drives, features and LiDARs need a room; give the scenario one.")
+    if drive is not None and drive.kind == "ramps" and (scenario.room is None or scenario.room.hills is None):
+        raise RigError("the motion ramps needs hills; give the room a slope.")
+    if scenario.room and scenario.room.hills and drive is not None and drive.on_ground and drive.kind != "ramps":
+        raise RigError(f"the motion {drive.kind} is on a flat floor; take the slope out of the room.")
+    for wheels in scenario.wheels:
+        if wheels.reports == "rates" and not (drive is not None and drive.on_ground):
+            raise RigError(
+                f"{wheels.name} cannot roll: the motion is not that of wheels on a floor; let it report poses, or "
+                "choose a motion on the ground."
+            )
 
 
 def handheld(

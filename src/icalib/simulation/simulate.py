@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
-from icalib.measurements import ImuStream, Measurements
+from icalib.measurements import CornerStream, ImuStream, LidarStream, Measurements, WheelPoses, WheelStream
 from icalib.simulation.corners import CornerTruth, see_corners
+from icalib.simulation.drives import drive_motion
 from icalib.simulation.imu import imu_stamps, inside, read_imu
-from icalib.simulation.motion import Trajectory, exact_motion, reference_motion
-from icalib.simulation.scenario import GRAVITY_WORLD, Scenario, SimCamera
+from icalib.simulation.lidar import scan_room
+from icalib.simulation.motion import ClosedForm, Trajectory, exact_motion, reference_motion
+from icalib.simulation.robot import SimLidar, SimWheels
+from icalib.simulation.scenario import GRAVITY_WORLD, Motion, Scenario, SimCamera
+from icalib.simulation.tracks import Followed, TrackTruth, follow
+from icalib.simulation.wheels import WheelTruth, read_wheels
+
+Progress = Callable[[str, float], None]  # what is being done, and the share of all that is done
+_LIDAR_STREAM, _WHEEL_STREAM = 1000, 2000  # of random numbers; those of cameras count from 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,7 +28,7 @@ class Truth:
     """What the measurements were made from.
 
     All instants are seconds on the IMU's clock since `imu_clock_origin_ns`. Arrays over the readings have one row per
-    reading in the measurements (readings lost in gaps have none). Dictionaries are by camera name.
+    reading in the measurements (readings lost in gaps have none). Dictionaries are by the sensor's name.
     """
 
     imu_clock_origin_ns: int
@@ -33,12 +43,20 @@ class Truth:
     T_world_bodies: np.ndarray  # (bodies, 4, 4), in the order of the target's bodies
     bow: np.ndarray  # (3,) m
     T_imu_cam: dict[str, np.ndarray]
-    time_offset: dict[str, float]  # s, between raw stamps: t_imu = t_cam + time_offset
+    time_offset: dict[str, float]  # s, between raw stamps: t_imu = t_sensor + time_offset
     intrinsics: dict[str, np.ndarray]
     distortion: dict[str, np.ndarray]
     bloom_px: dict[str, float]
     corners: dict[str, CornerTruth]
     trajectory: Trajectory
+    tracks: dict[str, TrackTruth] = field(default_factory=dict)
+    wheels: dict[str, WheelTruth] = field(default_factory=dict)
+    points: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))  # (F, 3) m, world, by number of the feature
+    planes: np.ndarray = field(default_factory=lambda: np.empty((0, 4)))  # (P, 4) n, d: n . p = d, world
+    T_imu_lidar: dict[str, np.ndarray] = field(default_factory=dict)
+    T_imu_wheel: dict[str, np.ndarray] = field(default_factory=dict)
+    radii: dict[str, np.ndarray] = field(default_factory=dict)  # (2,) m, left and right
+    baseline: dict[str, float] = field(default_factory=dict)  # m
 
     @property
     def T_world_board(self) -> np.ndarray:
@@ -59,39 +77,32 @@ class Simulation:
     truth: Truth
 
 
-def raw_time_offset(scenario: Scenario, camera: SimCamera) -> float:
-    """Seconds to add to the camera's raw stamps to get the IMU's: the offset and the distance of the clock origins."""
-    return camera.time_offset_s + (scenario.imu_clock_origin_ns - camera.clock_origin_ns) * 1e-9
+def raw_time_offset(scenario: Scenario, sensor: SimCamera | SimLidar | SimWheels) -> float:
+    """Seconds to add to the sensor's raw stamps to get the IMU's: the offset and the distance of the clock origins."""
+    return sensor.time_offset_s + (scenario.imu_clock_origin_ns - sensor.clock_origin_ns) * 1e-9
 
 
-def simulate(scenario: Scenario, seed: int) -> Simulation:
+def simulate(scenario: Scenario, seed: int, progress: Progress = lambda stage, done: None) -> Simulation:
     """Simulate one recording; the same scenario and seed give the same numbers.
 
-    Motion, IMU noise and each camera draw from streams of their own: changing one leaves the others as they are.
+    Motion, IMU noise and each sensor draw from streams of their own: changing one leaves the others as they are.
     """
-    motion_seed = seed if scenario.motion.seed is None else scenario.motion.seed
+    progress("motion", 0.0)
     imu_rng = np.random.default_rng([seed, 1])
     stamps = imu_stamps(scenario, imu_rng)
     seconds = stamps.astype(np.float64) * 1e-9
-    reference = reference_motion(scenario, np.random.default_rng([motion_seed, 0]))
-    if scenario.motion.exact:
-        trajectory = exact_motion(reference, seconds)
-        ideal = trajectory.readings
-    else:
-        trajectory = reference
-        ideal = reference.readings_at(seconds)
+    trajectory, ideal = _motion(scenario, seed, seconds)
     readings = read_imu(scenario, seconds, ideal, imu_rng)
     kept = ~inside(scenario.imu_gaps, seconds)
-    streams, corners = zip(
-        *(
-            see_corners(scenario, camera, trajectory, np.random.default_rng([seed, 2 + i]))
-            for i, camera in enumerate(scenario.cameras)
-        ),
-        strict=True,
-    )
     stamps_ns = stamps[kept] + np.int64(scenario.imu_clock_origin_ns)
     imu = ImuStream("imu0", stamps_ns, readings.gyro[kept], readings.accel[kept])
     rotation, position, velocity = trajectory.pose_at(seconds[kept])
+    progress("images", 0.1)
+    corners, corner_truth = _corners(scenario, trajectory, seed)
+    followed = _tracks(scenario, trajectory, seed)
+    lidars = _scans(scenario, trajectory, seed, progress)
+    progress("wheels", 0.95)
+    wheels, wheel_truth = _wheels(scenario, trajectory, seconds, seed)
     truth = Truth(
         scenario.imu_clock_origin_ns,
         seconds[kept],
@@ -104,12 +115,88 @@ def simulate(scenario: Scenario, seed: int) -> Simulation:
         GRAVITY_WORLD,
         scenario.body_poses,
         np.array(scenario.bow),
-        {c.name: c.T_imu_cam for c in scenario.cameras},
-        {c.name: raw_time_offset(scenario, c) for c in scenario.cameras},
-        {c.name: np.array(c.intrinsics) for c in scenario.cameras},
-        {c.name: np.array(c.distortion) for c in scenario.cameras},
-        {c.name: c.bloom_px for c in scenario.cameras},
-        {c.name: t for c, t in zip(scenario.cameras, corners, strict=True)},
-        trajectory,
+        **_rig_truth(scenario),
+        corners=corner_truth,
+        trajectory=trajectory,
+        tracks={s.name: t for s, t in zip(followed.streams, followed.truths, strict=True)},
+        wheels=wheel_truth,
+        points=followed.points,
+        planes=np.empty((0, 4)) if scenario.room is None else scenario.room.planes,
     )
-    return Simulation(scenario, Measurements(imu, tuple(streams)), truth)
+    measured = Measurements(imu, corners, tracks=followed.streams, lidars=lidars, wheels=wheels)
+    return Simulation(scenario, measured, truth)
+
+
+def _motion(scenario: Scenario, seed: int, seconds: np.ndarray) -> tuple[Trajectory, np.ndarray]:
+    """The trajectory, and the rates and forces (N, 6) that an IMU without errors reads on it."""
+    motion = scenario.motion
+    rng = np.random.default_rng([seed if motion.seed is None else motion.seed, 0])
+    reference: ClosedForm
+    if isinstance(motion, Motion):
+        reference = reference_motion(scenario, rng)
+    else:
+        assert scenario.room is not None  # `Scenario` sees to it
+        T_imu_wheel = scenario.wheels[0].T_imu_wheel if scenario.wheels else None
+        reference = drive_motion(motion, scenario.room, T_imu_wheel, scenario.duration_s, rng)
+    if motion.exact:
+        trajectory = exact_motion(reference, seconds)
+        return trajectory, trajectory.readings
+    return reference, reference.readings_at(seconds)
+
+
+def _corners(
+    scenario: Scenario, trajectory: Trajectory, seed: int
+) -> tuple[tuple[CornerStream, ...], dict[str, CornerTruth]]:
+    if not scenario.board:
+        return (), {}
+    seen = [
+        see_corners(scenario, camera, trajectory, np.random.default_rng([seed, 2 + i]))
+        for i, camera in enumerate(scenario.cameras)
+    ]
+    return tuple(stream for stream, _ in seen), {stream.name: truth for stream, truth in seen}
+
+
+def _tracks(scenario: Scenario, trajectory: Trajectory, seed: int) -> Followed:
+    if scenario.room is None or scenario.features is None:
+        return Followed((), (), np.empty((0, 3)))
+    return follow(scenario, scenario.room, scenario.features, trajectory, seed)
+
+
+def _scans(scenario: Scenario, trajectory: Trajectory, seed: int, progress: Progress) -> tuple[LidarStream, ...]:
+    scans = []
+    for i, lidar in enumerate(scenario.lidars):
+        assert scenario.room is not None  # `Scenario` sees to it
+        share = (0.3 + 0.65 * i / len(scenario.lidars), 0.65 / len(scenario.lidars))
+        done = _shared(progress, lidar.name, *share)
+        scans.append(scan_room(scenario.room, lidar, trajectory, scenario, [seed, _LIDAR_STREAM + i], done))
+    return tuple(scans)
+
+
+def _shared(progress: Progress, stage: str, before: float, share: float) -> Callable[[float], None]:
+    return lambda done: progress(stage, before + share * done)
+
+
+def _wheels(
+    scenario: Scenario, trajectory: Trajectory, seconds: np.ndarray, seed: int
+) -> tuple[tuple[WheelStream | WheelPoses, ...], dict[str, WheelTruth]]:
+    read = []
+    for i, wheels in enumerate(scenario.wheels):
+        rng = np.random.default_rng([seed, _WHEEL_STREAM + i])
+        read.append(read_wheels(wheels, trajectory, seconds, scenario.robot_noise_enabled, rng))
+    return tuple(stream for stream, _ in read), {stream.name: truth for stream, truth in read}
+
+
+def _rig_truth(scenario: Scenario) -> dict[str, Any]:
+    """The fields of `Truth` that the scenario states."""
+    cameras, lidars, wheels = scenario.cameras, scenario.lidars, scenario.wheels
+    return {
+        "T_imu_cam": {c.name: c.T_imu_cam for c in cameras},
+        "time_offset": {s.name: raw_time_offset(scenario, s) for s in (*cameras, *lidars, *wheels)},
+        "intrinsics": {c.name: np.array(c.intrinsics) for c in cameras},
+        "distortion": {c.name: np.array(c.distortion) for c in cameras},
+        "bloom_px": {c.name: c.bloom_px for c in cameras},
+        "T_imu_lidar": {s.name: s.T_imu_lidar for s in lidars},
+        "T_imu_wheel": {s.name: s.T_imu_wheel for s in wheels},
+        "radii": {s.name: np.array(s.radii) for s in wheels},
+        "baseline": {s.name: s.baseline for s in wheels},
+    }

@@ -1,0 +1,32 @@
+"""When a sensor measures, and what its own clock shows then."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+LEAD_S = 0.05  # sensors start and end this far inside the IMU's readings
+
+
+class Clocked(Protocol):
+    """A simulated sensor with a clock of its own; see `SimCamera`."""
+
+    @property
+    def time_offset_s(self) -> float: ...
+    @property
+    def rate_hz(self) -> float: ...
+    @property
+    def phase_s(self) -> float: ...
+    @property
+    def clock_origin_ns(self) -> int: ...
+
+
+def stamped(sensor: Clocked, end_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Stamps (M,) int64 ns on the sensor's clock up to end_s, and the instants (M,) [s] on the IMU's that these stamps
+    mean."""
+    begin = LEAD_S + sensor.phase_s
+    nominal = begin + np.arange(int((end_s - begin) * sensor.rate_hz + 1e-9) + 1) / sensor.rate_hz
+    since_origin = np.round((nominal - sensor.time_offset_s) * 1e9).astype(np.int64)
+    seconds = since_origin.astype(np.float64) * 1e-9 + sensor.time_offset_s
+    return since_origin + np.int64(sensor.clock_origin_ns), seconds

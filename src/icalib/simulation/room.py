@@ -1,0 +1,239 @@
+"""The room that a robot moves through: walls, floor and ceiling, boxes, ramps, hills, and where a ray meets them.
+
+World frame: z up, the origin in the middle of the floor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from icalib.errors import RigError
+
+_STEPS = 200  # of a ray's march over hills
+_CLOSE_M = 1e-9  # to the ground, where the march ends
+
+
+@dataclass(frozen=True)
+class Block:
+    """A box, or with `ramp` a wedge that rises from nothing to size z along its own x. center (x, y) [m] of its base,
+    size (x, y, z) [m], turned by yaw_rad about the vertical."""
+
+    center: tuple[float, float]
+    size: tuple[float, float, float]
+    yaw_rad: float = 0.0
+    ramp: bool = False
+
+
+@dataclass(frozen=True)
+class Hills:
+    """A floor z(x, y) = sum a_i sin(k_i . (x, y) + phase_i): amplitude (W,) [m], wave (W, 2) [rad/m], phase (W,)."""
+
+    amplitude: tuple[float, ...]
+    wave: tuple[tuple[float, float], ...]
+    phase: tuple[float, ...]
+
+    @property
+    def depth(self) -> float:
+        """The floor stays within +-depth [m]."""
+        return float(np.abs(self.amplitude).sum())
+
+    @property
+    def steepest(self) -> float:
+        """No slope is above this (a tangent)."""
+        return float((np.abs(self.amplitude) * np.linalg.norm(self.wave, axis=1)).sum())
+
+    def height(self, xy: np.ndarray) -> np.ndarray:
+        """(N,) z at xy (N, 2)."""
+        return np.sin(xy @ np.array(self.wave).T + self.phase) @ np.array(self.amplitude)
+
+
+def hills_of_slope(slope_deg: float) -> Hills:
+    """Three waves of 6.3, 4.2 and 2.9 m in different directions, whose slopes add up to `slope_deg` at most."""
+    wave = np.array([[0.97, 0.24], [-0.45, 1.43], [1.6, -1.45]])
+    amplitude = np.array([0.5, 0.35, 0.15]) * np.tan(np.deg2rad(slope_deg)) / np.linalg.norm(wave, axis=1)
+    return Hills(tuple(amplitude.tolist()), ((0.97, 0.24), (-0.45, 1.43), (1.6, -1.45)), (0.3, 1.9, 4.0))
+
+
+class Surfaces(NamedTuple):
+    """What rays meet. Faces are parallelograms origin + s u + t v, 0 <= s, t <= 1, or triangles (s + t <= 1), seen
+    from the side that `normal` points to; s = s_of . q, t = t_of . q of q from the origin. The rest: see `Hills`."""
+
+    origin: np.ndarray  # (F, 3)
+    normal: np.ndarray  # (F, 3)
+    s_of: np.ndarray  # (F, 3)
+    t_of: np.ndarray  # (F, 3)
+    triangle: np.ndarray  # (F,) bool
+    amplitude: np.ndarray  # (W,), W = 0: no hills
+    wave: np.ndarray  # (W, 2)
+    phase: np.ndarray  # (W,)
+    steepest: float
+
+
+@dataclass(frozen=True)
+class Room:
+    """size (x, y, z) [m]. With hills there is no flat floor, and all else reaches down below them."""
+
+    size: tuple[float, float, float] = (12.0, 10.0, 3.2)
+    blocks: tuple[Block, ...] = ()
+    hills: Hills | None = None
+
+    def __post_init__(self) -> None:
+        half = np.array(self.size[:2]) / 2.0
+        for i, block in enumerate(self.blocks):
+            c, s = abs(np.cos(block.yaw_rad)), abs(np.sin(block.yaw_rad))
+            reach = np.array([[c, s], [s, c]]) @ block.size[:2] / 2.0
+            if (np.abs(block.center) + reach > half).any() or block.size[2] > self.size[2]:
+                raise RigError(f"block {i} does not fit into the room; make it smaller, or move it inwards.")
+
+    @property
+    def base(self) -> float:
+        """Where walls and blocks begin [m]."""
+        return -self.hills.depth if self.hills else 0.0
+
+    @cached_property
+    def faces(self) -> np.ndarray:
+        """(F, 4, 3): origin, u, v and (1, 0, 0) of a triangle or zeros; u x v points into the open."""
+        x, y, z = self.size
+        low = np.array([-0.5 * x, -0.5 * y, self.base])
+        ex, ey, ez = np.diag([x, y, z - self.base])
+        flat = [] if self.hills else [(low, ex, ey)]
+        shell = [(low + ez, ey, ex), (low, ey, ez), (low + ex, ez, ey), (low, ez, ex), (low + ey, ex, ez)]
+        found = [(*face, np.zeros(3)) for face in flat + shell]
+        for block in self.blocks:
+            found += _ramp(block, self.base) if block.ramp else _box(block, self.base)
+        return np.array(found)
+
+    @property
+    def planes(self) -> np.ndarray:
+        """(F, 4): normal, into the open, and d [m] of each face; n . p = d on it."""
+        normal = _normals(self.faces)
+        return np.column_stack([normal, np.sum(normal * self.faces[:, 0], axis=1)])
+
+    @cached_property
+    def surfaces(self) -> Surfaces:
+        origin, u, v, mark = np.moveaxis(self.faces, 1, 0).copy()
+        normal = _normals(self.faces)
+        area = np.sum(normal * np.cross(u, v), axis=1)[:, None]
+        hills = self.hills or Hills((), (), ())
+        wave = np.array(hills.wave, dtype=np.float64).reshape(-1, 2)
+        steepest = hills.steepest if self.hills else 0.0
+        return Surfaces(
+            origin,
+            normal,
+            np.cross(v, normal) / area,
+            np.cross(normal, u) / area,
+            mark[:, 0] > 0.0,
+            np.array(hills.amplitude, dtype=np.float64),
+            wave,
+            np.array(hills.phase, dtype=np.float64),
+            steepest,
+        )
+
+    def points(self, count: int, rng: np.random.Generator) -> np.ndarray:
+        """(count, 3) points spread over all surfaces by area, hills as if they were flat."""
+        u, v, triangle = self.faces[:, 1], self.faces[:, 2], self.faces[:, 3, 0] > 0.0
+        area = np.linalg.norm(np.cross(u, v), axis=1) * np.where(triangle, 0.5, 1.0)
+        ground = self.size[0] * self.size[1] if self.hills else 0.0
+        share = np.append(area, ground) / (area.sum() + ground)
+        face = rng.choice(len(share), count, p=share)
+        st = rng.random((count, 2))
+        on_ground = face == len(area)
+        face[on_ground] = 0
+        st = np.where((triangle[face] & (st.sum(axis=1) > 1.0))[:, None], 1.0 - st, st)
+        found = self.faces[face, 0] + st[:, :1] * u[face] + st[:, 1:] * v[face]
+        if self.hills:
+            xy = (rng.random((count, 2)) - 0.5) * self.size[:2]
+            found[on_ground] = np.column_stack([xy, self.hills.height(xy)])[on_ground]
+        return found
+
+
+def _normals(faces: np.ndarray) -> np.ndarray:
+    normal = np.cross(faces[:, 1], faces[:, 2])
+    return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+
+Face = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+def _placed(block: Block, base: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The lowest corner of a block, and its edges along its own x, y and z."""
+    c, s = np.cos(block.yaw_rad), np.sin(block.yaw_rad)
+    ex, ey = block.size[0] * np.array([c, s, 0.0]), block.size[1] * np.array([-s, c, 0.0])
+    ez = np.array([0.0, 0.0, block.size[2] - base])
+    return np.array([*block.center, base]) - 0.5 * (ex + ey), ex, ey, ez
+
+
+def _box(block: Block, base: float) -> list[Face]:
+    low, ex, ey, ez = _placed(block, base)
+    sides = [(low + ez, ex, ey), (low, ex, ez), (low + ey, ez, ex), (low, ez, ey), (low + ex, ey, ez)]
+    return [(*side, np.zeros(3)) for side in sides]
+
+
+def _ramp(block: Block, base: float) -> list[Face]:
+    low, ex, ey, ez = _placed(block, base)
+    whole, half = np.zeros(3), np.array([1.0, 0.0, 0.0])
+    return [
+        (low, ex + ez, ey, whole),
+        (low + ex, ey, ez, whole),
+        (low + ex, ez, -ex, half),
+        (low + ex + ey, -ex, ez, half),
+    ]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def nearest(surfaces, px, py, pz, dx, dy, dz):
+    """Distance in units of d and the face that the ray p + t d meets first; -1: the hills; t = inf: nothing."""
+    best, hit = np.inf, -1
+    for f in range(len(surfaces.origin)):
+        n, o = surfaces.normal[f], surfaces.origin[f]
+        towards = n[0] * dx + n[1] * dy + n[2] * dz
+        if towards >= 0.0:
+            continue
+        t = (n[0] * (o[0] - px) + n[1] * (o[1] - py) + n[2] * (o[2] - pz)) / towards
+        if t <= 0.0 or t >= best:
+            continue
+        qx, qy, qz = px + t * dx - o[0], py + t * dy - o[1], pz + t * dz - o[2]
+        a, b = surfaces.s_of[f], surfaces.t_of[f]
+        along, across = a[0] * qx + a[1] * qy + a[2] * qz, b[0] * qx + b[1] * qy + b[2] * qz
+        inside = along >= 0.0 and across >= 0.0 and along <= 1.0 and across <= 1.0
+        if inside and not (surfaces.triangle[f] and along + across > 1.0):
+            best, hit = t, f
+    if len(surfaces.amplitude):
+        t = _ground(surfaces, px, py, pz, dx, dy, dz, best)
+        if t < best:
+            return t, -1
+    return best, hit
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _ground(surfaces, px, py, pz, dx, dy, dz, limit):
+    """Where the ray meets the hills before `limit`, else inf: steps that can never pass through the ground."""
+    t = 0.0
+    closing = surfaces.steepest * np.sqrt(dx * dx + dy * dy) - dz  # how fast the ray can near the ground at most
+    if closing <= 0.0:
+        return np.inf
+    for _ in range(_STEPS):
+        gap = pz + t * dz
+        for w in range(len(surfaces.amplitude)):
+            k = surfaces.wave[w]
+            angle = k[0] * (px + t * dx) + k[1] * (py + t * dy) + surfaces.phase[w]
+            gap -= surfaces.amplitude[w] * np.sin(angle)
+        if gap < _CLOSE_M:
+            return t
+        t += gap / closing
+        if t >= limit:
+            return np.inf
+    return t
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def distances(surfaces, origins, directions, found):
+    """found (N,): distance, in units of each direction (N, 3), to what is met first from origins (N, 3)."""
+    for i in range(len(origins)):
+        p, d = origins[i], directions[i]
+        found[i], _ = nearest(surfaces, p[0], p[1], p[2], d[0], d[1], d[2])

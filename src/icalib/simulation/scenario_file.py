@@ -1,0 +1,237 @@
+"""scenario.yaml -> Scenario. The format: docs/simulation.md."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar, get_args
+
+import numpy as np
+
+from icalib.errors import RigError
+from icalib.rig import ImuNoise
+from icalib.simulation.projection import PARAMETER_COUNTS
+from icalib.simulation.robot import Drive, DriveKind, Features, SimLidar, SimWheels
+from icalib.simulation.room import Block, Room, hills_of_slope
+from icalib.simulation.scenario import MODELS, Scenario, SimCamera, pose_from_rows
+from icalib.yaml_nodes import YamlValue, read_yaml
+
+_SENSOR_TYPES = ("imu", "camera", "lidar", "wheels")
+_DENSITIES = ("gyro", "gyro_walk", "accel", "accel_walk")
+_CLOCK = ("T_imu_sensor", "rate")
+_CLOCK_OPTIONS = ("time_offset", "phase")
+_START_NS = 1_700_000_000_000_000_000  # of all clocks, where the file gives none
+_STEEPEST_DEG = 45.0
+
+Made = TypeVar("Made")
+
+
+def load_scenario(path: str | Path) -> Scenario:
+    """Read a scenario file. Raises RigError, one sentence naming file, line, field, what is wrong and what to do."""
+    root = read_yaml(Path(path), "scenario file")
+    found = root.record(("duration", "sensors", "room", "motion"), ("features", "seed", "start_ns"))
+    start_ns = found["start_ns"].whole(0) if "start_ns" in found else _START_NS
+    sensors = _sensors(found["sensors"], start_ns)
+    room, motion = _room(found["room"]), _motion(found["motion"], Path(path).parent)
+    features = _features(found["features"]) if "features" in found else None
+    return _made(
+        root,
+        lambda: Scenario(
+            duration_s=found["duration"].positive(),
+            motion=motion,
+            imu_clock_origin_ns=start_ns,
+            board=False,
+            room=room,
+            features=features,
+            seed=found["seed"].whole(0) if "seed" in found else 0,
+            **sensors,
+        ),
+    )
+
+
+def _made(value: YamlValue, make: Callable[[], Made]) -> Made:
+    """What `make` makes; a RigError is told as one of `value`."""
+    try:
+        return make()
+    except RigError as error:
+        value.fail(str(error))
+
+
+def _sensors(value: YamlValue, start_ns: int) -> dict[str, Any]:
+    """The fields of `Scenario` that the sensors fill."""
+    imus: list[dict[str, Any]] = []
+    cameras: list[SimCamera] = []
+    lidars: list[SimLidar] = []
+    wheels: list[SimWheels] = []
+    for name, sensor in value.entries().items():
+        fields = sensor.entries()
+        if "type" not in fields:
+            sensor.fail(f"type is missing; add type: {' or type: '.join(_SENSOR_TYPES)}.")
+        kind = fields["type"].choice("sensor type", _SENSOR_TYPES)
+        if kind == "imu":
+            imus.append(_imu(name, sensor))
+        elif kind == "camera":
+            cameras.append(_camera(name, sensor, start_ns))
+        elif kind == "lidar":
+            lidars.append(_lidar(name, sensor, start_ns))
+        else:
+            wheels.append(_wheels(name, sensor, start_ns))
+    if len(imus) != 1:
+        value.fail(f"there must be one sensor of type: imu, not {len(imus)}; its frame is the robot's.")
+    return imus[0] | {"cameras": tuple(cameras), "lidars": tuple(lidars), "wheels": tuple(wheels)}
+
+
+def _imu(name: str, value: YamlValue) -> dict[str, Any]:
+    if name != "imu0":
+        value.fail("the IMU must be called imu0; rename it.")
+    found = value.record(("type", "rate", "noise"), ("gyro_bias", "accel_bias"))
+    densities = found["noise"].record(_DENSITIES)
+    noise = ImuNoise(**{name: densities[name].positive() for name in _DENSITIES}, source="scenario")
+    biases = {key: tuple(found[key].vector(3).tolist()) for key in ("gyro_bias", "accel_bias") if key in found}
+    return {"imu_rate_hz": found["rate"].positive(), "imu_noise": noise} | biases
+
+
+def _clock(found: dict[str, YamlValue], start_ns: int) -> dict[str, Any]:
+    """What all sensors but the IMU have, by the names of their fields."""
+    return {
+        "time_offset_s": found["time_offset"].number() if "time_offset" in found else 0.0,
+        "rate_hz": found["rate"].positive(),
+        "phase_s": _least(found["phase"], 0.0) if "phase" in found else 0.0,
+        "clock_origin_ns": start_ns,
+    }
+
+
+def _camera(name: str, value: YamlValue, start_ns: int) -> SimCamera:
+    required = ("type", *_CLOCK, "model", "resolution", "intrinsics", "distortion", "noise_px")
+    found = value.record(required, _CLOCK_OPTIONS)
+    model = found["model"].choice("camera model", MODELS)
+    sides = found["resolution"].items()
+    if len(sides) != 2:
+        found["resolution"].fail(f"must be [width, height] in pixels, but has {len(sides)} entries.")
+    return SimCamera(
+        name,
+        model,
+        (sides[0].whole(1), sides[1].whole(1)),
+        tuple(found["intrinsics"].vector(4).tolist()),
+        tuple(found["distortion"].vector(PARAMETER_COUNTS[model]).tolist()),
+        _pose(found["T_imu_sensor"]),
+        corner_noise_px=_least(found["noise_px"], 0.0),
+        **_clock(found, start_ns),
+    )
+
+
+def _lidar(name: str, value: YamlValue, start_ns: int) -> SimLidar:
+    options = ("rings", "azimuth_steps", "elevation_deg", "range", "noise")
+    found = value.record(("type", *_CLOCK), _CLOCK_OPTIONS + options)
+    chosen: dict[str, Any] = {key: found[key].whole(1) for key in ("rings", "azimuth_steps") if key in found}
+    if "elevation_deg" in found:
+        chosen["elevation_deg"] = _interval(found["elevation_deg"])
+    if "range" in found:
+        chosen["range_m"] = _interval(found["range"])
+    if "noise" in found:
+        chosen["range_noise_m"] = _least(found["noise"], 0.0)
+    return SimLidar(name, _pose(found["T_imu_sensor"]), **chosen, **_clock(found, start_ns))
+
+
+def _wheels(name: str, value: YamlValue, start_ns: int) -> SimWheels:
+    options = ("noise", "slip", "reports", "meaning", "poses_every")
+    found = value.record(("type", *_CLOCK, "radii", "baseline"), _CLOCK_OPTIONS + options)
+    radii = found["radii"].items()
+    if len(radii) != 2:
+        found["radii"].fail(f"must be [left, right] in metres, but has {len(radii)} entries.")
+    chosen: dict[str, Any] = {key: _least(found[key], 0.0) for key in ("noise", "slip") if key in found}
+    choices = {"reports": ("rates", "poses"), "meaning": ("mean", "instant")}
+    chosen |= {key: found[key].choice(key, available) for key, available in choices.items() if key in found}
+    if "poses_every" in found:
+        chosen["poses_every"] = found["poses_every"].whole(1)
+    return SimWheels(
+        name,
+        _pose(found["T_imu_sensor"]),
+        (radii[0].positive(), radii[1].positive()),
+        found["baseline"].positive(),
+        **chosen,
+        **_clock(found, start_ns),
+    )
+
+
+def _room(value: YamlValue) -> Room:
+    found = value.record(("size",), ("blocks", "slope_deg"))
+    blocks = tuple(_block(block) for block in found["blocks"].items()) if "blocks" in found else ()
+    hills = None
+    if "slope_deg" in found:
+        slope = found["slope_deg"].positive()
+        if slope > _STEEPEST_DEG:
+            found["slope_deg"].fail(f"must be at most {_STEEPEST_DEG:g} degrees, but is {slope:g}.")
+        hills = hills_of_slope(slope)
+    return _made(value, lambda: Room(_triple(found["size"]), blocks, hills))
+
+
+def _block(value: YamlValue) -> Block:
+    found = value.record(("center", "size"), ("yaw_deg", "ramp"))
+    x, y = found["center"].vector(2).tolist()
+    yaw = np.deg2rad(found["yaw_deg"].number()) if "yaw_deg" in found else 0.0
+    return Block((x, y), _triple(found["size"]), float(yaw), found["ramp"].boolean() if "ramp" in found else False)
+
+
+def _motion(value: YamlValue, folder: Path) -> Drive:
+    found = value.record(("kind",), ("exact", "axis_imu", "path", "sideslip_deg", "seed"))
+    chosen: dict[str, Any] = {"kind": found["kind"].choice("motion", get_args(DriveKind))}
+    if "exact" in found:
+        chosen["exact"] = found["exact"].boolean()
+    if "axis_imu" in found:
+        chosen["axis_imu"] = tuple(found["axis_imu"].vector(3).tolist())
+        if not any(chosen["axis_imu"]):
+            found["axis_imu"].fail("must not be zero; give the direction of the axis.")
+    if "path" in found:
+        chosen["path"] = folder / found["path"].text()
+    if "sideslip_deg" in found:
+        chosen["sideslip_deg"] = _least(found["sideslip_deg"], 0.0)
+    if "seed" in found:
+        chosen["seed"] = found["seed"].whole(0)
+    return _made(value, lambda: Drive(**chosen))
+
+
+def _features(value: YamlValue) -> Features:
+    found = value.record((), ("count", "lasting", "longest_track", "per_image", "range", "seed"))
+    least = {"count": 1, "lasting": 0, "per_image": 1, "seed": 0}
+    chosen: dict[str, Any] = {key: found[key].whole(n) for key, n in least.items() if key in found}
+    named = {"longest_track": "longest_track_s", "range": "range_m"}
+    chosen |= {field: found[key].positive() for key, field in named.items() if key in found}
+    features = Features(**chosen)
+    if features.lasting > features.count:
+        value.fail(f"{features.lasting} lasting points are more than all {features.count}; lower lasting.")
+    return features
+
+
+def _least(value: YamlValue, least: float) -> float:
+    number = value.number()
+    if number < least:
+        value.fail(f"must be at least {least:g}, but is {number:g}.")
+    return number
+
+
+def _interval(value: YamlValue) -> tuple[float, float]:
+    low, high = value.vector(2).tolist()
+    if low > high:
+        value.fail(f"must be [lowest, highest], but is [{low:g}, {high:g}].")
+    return low, high
+
+
+def _triple(value: YamlValue) -> tuple[float, float, float]:
+    """Three positive lengths."""
+    sides = value.items()
+    if len(sides) != 3:
+        value.fail(f"must be a list of 3 numbers, but has {len(sides)}.")
+    return sides[0].positive(), sides[1].positive(), sides[2].positive()
+
+
+def _pose(value: YamlValue) -> np.ndarray:
+    """4 x 4, its rotation made orthonormal."""
+    rows = value.items()
+    if len(rows) != 4:
+        value.fail(f"must be 4 rows of 4 numbers, but has {len(rows)}.")
+    T = np.array([row.vector(4) for row in rows])
+    R = T[:3, :3]
+    if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0.0 or (T[3] != [0, 0, 0, 1]).any():
+        value.fail("is no pose: its first three columns must be a rotation, its last row 0, 0, 0, 1; correct it.")
+    return pose_from_rows(T)

@@ -1,0 +1,132 @@
+"""What a front end makes of the images: points of the room, followed from image to image and numbered."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.measurements import TrackStream
+from icalib.simulation.corners import image_stamps
+from icalib.simulation.motion import Trajectory
+from icalib.simulation.projection import project, visible
+from icalib.simulation.robot import Features
+from icalib.simulation.room import Room, distances
+from icalib.simulation.scenario import Scenario, SimCamera
+
+_NEAREST_M = 0.3
+_LOST_PERIODS = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class TrackTruth:
+    """seconds (M,): true instants of the images, IMU clock since its origin; uv (N, 2) before noise."""
+
+    seconds: np.ndarray
+    uv: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """What all cameras followed. points (F, 3): where feature i truly is, in world."""
+
+    streams: tuple[TrackStream, ...]
+    truths: tuple[TrackTruth, ...]
+    points: np.ndarray
+
+
+def follow(scenario: Scenario, room: Room, features: Features, trajectory: Trajectory, seed: int) -> Followed:
+    """Tracks of all cameras. Images are those of the corners; noise is each camera's `corner_noise_px`."""
+    points = room.points(features.count, np.random.default_rng(features.seed))
+    front_end = _FrontEnd(features, min(c.rate_hz for c in scenario.cameras), np.random.default_rng([seed, 2, 0, 1]))
+    images = [image_stamps(scenario, c, np.random.default_rng([seed, 2 + i])) for i, c in enumerate(scenario.cameras)]
+    due = sorted((s, i, k) for i, (_, seconds) in enumerate(images) for k, s in enumerate(seconds.tolist()))
+    taken: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in scenario.cameras]
+    poses = [trajectory.pose_at(seconds)[:2] for _, seconds in images]
+    for seconds, i, k in due:
+        camera, (rotation, position) = scenario.cameras[i], poses[i]
+        seen, uv = _view(camera, room, features, points, rotation[k], position[k])
+        chosen, number = front_end.choose(i, seconds, seen)
+        taken[i].append((number, uv[chosen]))
+    noise = float(scenario.robot_noise_enabled)
+    streams, truths = zip(
+        *(
+            _stream(c, images[i], taken[i], noise, np.random.default_rng([seed, 2 + i, 0, 2]))
+            for i, c in enumerate(scenario.cameras)
+        ),
+        strict=True,
+    )
+    return Followed(streams, truths, points[front_end.point_of()])
+
+
+def _view(
+    camera: SimCamera, room: Room, features: Features, points: np.ndarray, rotation: np.ndarray, position: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of the points that are in the picture and not hidden, and the pixels (N, 2) of all points."""
+    eye = position + rotation @ camera.T_imu_cam[:3, 3]
+    rays = points - eye
+    local = rays @ (rotation @ camera.T_imu_cam[:3, :3])
+    far = np.linalg.norm(rays, axis=1)
+    near = (far > _NEAREST_M) & (far < features.range_m) & (local[:, 2] > 0.0)
+    uv = np.full((len(points), 2), np.nan)
+    uv[near] = project(camera, local[near])
+    seen = np.flatnonzero(near)
+    seen = seen[visible(camera, local[seen], uv[seen])]
+    met = np.empty(len(seen))
+    distances(room.surfaces, np.broadcast_to(eye, (len(seen), 3)), rays[seen], met)
+    return seen[met * far[seen] > far[seen] - 1e-4], uv
+
+
+class _FrontEnd:
+    """Which points each camera follows, and under which number."""
+
+    def __init__(self, features: Features, slowest_hz: float, rng: np.random.Generator) -> None:
+        self._features, self._rng = features, rng
+        self._lost_after = _LOST_PERIODS / slowest_hz
+        self._number = np.full(features.count, -1)
+        self._number[: features.lasting] = np.arange(features.lasting)
+        self._born = np.full(features.count, -np.inf)
+        self._last = np.full(features.count, -np.inf)
+        self._points = list(range(features.lasting))
+        self._tracked: dict[int, np.ndarray] = {}
+
+    def choose(self, camera: int, seconds: float, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of the points `seen` at an instant, those that the camera follows, and their numbers.
+
+        First those that it followed before, then those that another camera follows, then others.
+        """
+        alive = self._alive(seconds, seen)
+        before = np.isin(seen, self._tracked.get(camera, np.empty(0, dtype=np.int64)))
+        order = np.lexsort((self._rng.random(len(seen)), ~alive, ~before))[: self._features.per_image]
+        chosen = np.sort(seen[order])
+        new = chosen[~self._alive(seconds, chosen)]
+        self._number[new] = len(self._points) + np.arange(len(new))
+        self._points += new.tolist()
+        self._born[new] = seconds
+        self._last[chosen] = seconds
+        self._tracked[camera] = chosen
+        return chosen, self._number[chosen].copy()
+
+    def _alive(self, seconds: float, points: np.ndarray) -> np.ndarray:
+        """Whether each point's number still holds."""
+        held = seconds - self._last[points] <= self._lost_after
+        young = seconds - self._born[points] <= self._features.longest_track_s
+        return (points < self._features.lasting) | (held & young)
+
+    def point_of(self) -> np.ndarray:
+        """(F,) the point behind each number."""
+        return np.array(self._points, dtype=np.int64)
+
+
+def _stream(
+    camera: SimCamera,
+    images: tuple[np.ndarray, np.ndarray],
+    taken: list[tuple[np.ndarray, np.ndarray]],
+    noise: float,
+    rng: np.random.Generator,
+) -> tuple[TrackStream, TrackTruth]:
+    number = np.concatenate([n for n, _ in taken])
+    true = np.concatenate([uv for _, uv in taken])
+    start = np.concatenate([[0], np.cumsum([len(n) for n, _ in taken])]).astype(np.int64)
+    measured = true + noise * camera.corner_noise_px * rng.standard_normal(true.shape)
+    return TrackStream(camera.name, images[0], start, number, measured), TrackTruth(images[1], true)
