@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.arrowhead import Piece, in_parallel, marginalise, solve
+from icalib.estimation.arrowhead import Piece, in_parallel, marginalise, restricted_inverse, solve
 from icalib.estimation.corner_factor import CornerFactor, CornerOutput
 from icalib.estimation.problem import Problem
 from icalib.estimation.solver import Outcome
@@ -84,7 +84,7 @@ def _probe(problem: Problem, outcome: Outcome, rng: np.random.Generator) -> dict
         problem.add_prior_information(piece, state)
 
     in_parallel(add, pieces)
-    solution = solve(pieces, problem.n_nodes, problem.tolerance)
+    solution = solve(pieces, problem.n_nodes, problem.tolerance, held=problem.held)
     # The sums hold J^T e where a solve expects J^T r: the step is -x.
     up, down = (
         _residuals_at(problem, state, -s * solution.chain, -s * solution.border) for s in (PROBE_STEP, -PROBE_STEP)
@@ -234,5 +234,6 @@ def _cluster_spread(problem: Problem, outcome: Outcome, by: Callable[[CornerFact
 def _spread(problem: Problem, outcome: Outcome, b: np.ndarray) -> np.ndarray:
     """S^-1 (sum b_g b_g^T) S^-1 for gradients b (G, B)."""
     t = problem.tolerance
-    half = t[:, None] * (np.linalg.pinv(outcome.information * t[:, None] * t, hermitian=True) @ (t[:, None] * b.T))
+    inverse = restricted_inverse(outcome.information * t[:, None] * t, problem.held)
+    half = t[:, None] * (inverse @ (t[:, None] * b.T))
     return half @ half.T

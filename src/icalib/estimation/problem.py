@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar, Protocol
 
 import numpy as np
 
-from icalib.estimation.arrowhead import Piece, in_parallel, make_pieces
+from icalib.estimation.arrowhead import NOTHING, Piece, in_parallel, make_pieces
 from icalib.estimation.corner_factor import CornerFactor, CornerOutput
 from icalib.estimation.imu_factor import ROWS
 from icalib.estimation.prior_factor import Prior
@@ -58,6 +58,9 @@ class Problem:
     cameras: tuple[CornerFactor, ...]
     priors: tuple[Prior, ...]
     tolerance: np.ndarray  # (B,) what a user would call the same number; scales the border
+    held: np.ndarray = field(
+        default_factory=lambda: NOTHING
+    )  # (B, m) orthonormal directions of the border, in tolerance units, that stay
 
     @property
     def n_nodes(self) -> int:
