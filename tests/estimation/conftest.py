@@ -125,7 +125,7 @@ def make_setup(
     R_world_grid, origin = truth.T_world_board[:3, :3], truth.T_world_board[:3, 3]
     R_grid_scene, p_grid_scene = target.frame(1) if split else (np.eye(3), np.zeros(3))
     values["board0", "tilt"] = R_world_grid @ R_grid_scene
-    for k in bodies.used:
+    for k in bodies.used if split else ():
         values[target.bodies[k], "rotation"], values[target.bodies[k], "translation"] = target.place(k, bodies.used[0])
     times = []
     for c in measurements.cameras:

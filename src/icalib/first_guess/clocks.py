@@ -43,6 +43,7 @@ class Alignment:
     offset: float
     rotation: np.ndarray
     gyro_bias: np.ndarray
+    given: bool = False  # offset and rotation are the rig file's, and as good as these
 
 
 def camera_rates(stream: CornerStream, poses: TargetPoses) -> CameraRates:
@@ -245,7 +246,7 @@ def as_given(imu: ImuData, name: str, rates: CameraRates, offset: float, rotatio
         raise _no_overlap(imu, name)
     middle = (0.5 * (rates.start + rates.end) + offset)[inside]
     gyro = np.stack([np.interp(middle, imu.seconds, imu.gyro[:, k]) for k in range(3)], axis=1)
-    return Alignment(offset, rotation, np.median(gyro - rates.rate[inside] @ rotation.T, axis=0))
+    return Alignment(offset, rotation, np.median(gyro - rates.rate[inside] @ rotation.T, axis=0), given=True)
 
 
 def _no_overlap(imu: ImuData, name: str) -> EstimationError:
