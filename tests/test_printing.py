@@ -26,7 +26,7 @@ TARGETS = {
     "large aprilgrid": (AprilGrid(6, 6, 0.088, 0.3), "a0"),
     "charuco": (Charuco(8, 5, 0.03, 0.022, "5x5_100"), "letter"),
     "checkerboard": (Checkerboard(6, 9, 0.035), "a3"),
-    "tag": (Tag("apriltag_36h11", 3, 0.15), "a4"),
+    "tag": (Tag("tag36h11", 3, 0.15), "a4"),
 }
 
 
@@ -165,7 +165,7 @@ COMMANDS = {
         TARGETS["charuco"]
     ),
     "checkerboard --rows 6 --cols 9 --square-size 0.035 --paper a3": TARGETS["checkerboard"],
-    "tag --family apriltag_36h11 --id 3 --size 0.15": TARGETS["tag"],
+    "tag --family tag36h11 --id 3 --size 0.15": TARGETS["tag"],
 }
 
 

@@ -11,7 +11,6 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 from icalib.errors import RigError
 from icalib.geometry.cameras import CAMERA_MODELS
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Target
-from icalib.geometry.targets.families import FAMILIES
 from icalib.imu_classes import DEFAULT_CLASS, IMU_CLASSES, class_noise
 from icalib.rig import Camera, ImuNoise, ImuSensor, Parameter, Rig, Settings
 from icalib.rig_parameters import imu_intrinsics_parameter, parameter_to_plain, rotation_parameter, vector_parameter
@@ -161,7 +160,7 @@ def _target(value: YamlValue) -> Target:
         rows, cols = _counts(value, found, "rows", "cols", "corners")
         return _made(value, lambda: Checkerboard(rows, cols, size))
     squares = _counts(value, found, "squares_x", "squares_y", "squares")
-    marker, dictionary = _edge(found["marker_size"], "tag"), found["dictionary"].choice("dictionary", tuple(FAMILIES))
+    marker, dictionary = _edge(found["marker_size"], "tag"), found["dictionary"].text()
     return _made(value, lambda: Charuco(*squares, size, marker, dictionary))
 
 

@@ -16,6 +16,7 @@ from icalib.detection.quads import threshold_windows
 from icalib.detection.refinement import refined_corners, refined_crossings
 from icalib.detection.tags import Tags, find_tags
 from icalib.errors import RecordingError
+from icalib.geometry.targets.families import APRILGRID_FAMILY
 
 _ON_BOARD = np.array([(1.0, 0.0), (0.0, 0.0), (0.0, 1.0), (1.0, 1.0)])  # corners in OpenCV's order, tag sizes
 
@@ -32,7 +33,7 @@ class AprilGridDetector:
     rows: int
     cols: int
     tag_spacing: float
-    family: str = "tag36h11"
+    family: str = APRILGRID_FAMILY
     border_bits: int = 2
     squares: bool = True
 

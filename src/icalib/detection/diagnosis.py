@@ -10,9 +10,9 @@ import numpy as np
 
 from icalib.detection.corners import checked_image
 from icalib.detection.families import tag_family
-from icalib.detection.opencv import FAMILIES, is_available
 from icalib.detection.quads import dark_quads, threshold_windows
 from icalib.detection.tags import tags_at
+from icalib.geometry.targets.families import FAMILIES, is_available
 
 _MOST_IMAGES = 5
 _SIZES = (50, 100, 250, 1000)  # of OpenCV's families; each starts with the smaller ones

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.detection.opencv import opencv
+from icalib.extras import load_cv2
 
 _CONTRAST = 7  # grey levels below the local mean
 _LEAST_SIDE_PX = 7.0
@@ -19,7 +19,7 @@ def dark_quads(image: np.ndarray, window: int, separate: bool) -> np.ndarray:
     image (h, w) uint8; dark is what is darker than the mean of `window` x `window` px (odd). `separate` takes the
     outermost pixel off all dark regions first, so that tags whose corners touch other dark squares come apart.
     """
-    cv2 = opencv()
+    cv2 = load_cv2()
     dark = cv2.adaptiveThreshold(
         image, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, window, float(_CONTRAST)
     )

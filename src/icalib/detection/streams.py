@@ -20,10 +20,11 @@ from icalib.detection.corners import KEPT, VERDICTS, ImageCorners, corner_stream
 from icalib.detection.detectors import Detector, detector_of
 from icalib.detection.diagnosis import what_is_seen
 from icalib.errors import RecordingError
+from icalib.extras import load_cv2
 from icalib.geometry.targets import AprilGrid, Charuco, Target
+from icalib.geometry.targets.families import APRILGRID_FAMILY
 from icalib.measurements import CornerStream
 from icalib.recordings import DamagedImageError, Payload, Recording, decode
-from icalib.recordings.extras import load_cv2
 from icalib.rig import Camera
 
 DIAGNOSED = 10  # images in which tags are looked for that are not the target's
@@ -60,7 +61,7 @@ def find_corners(
 def _seen_instead(recording: Recording, topic: str, target: Target) -> str:
     """What to do about a target that is never found: by what the images show instead, where it has tags."""
     if isinstance(target, AprilGrid):
-        family, border, ids = "tag36h11", target.border_bits, range(target.rows * target.cols)
+        family, border, ids = APRILGRID_FAMILY, target.border_bits, range(target.rows * target.cols)
     elif isinstance(target, Charuco):
         family, border, ids = target.dictionary, 1, range(target.squares_x * target.squares_y // 2)
     else:

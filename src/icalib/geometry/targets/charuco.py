@@ -10,7 +10,7 @@ import numpy as np
 
 from icalib.errors import RigError
 from icalib.geometry.targets.base import Target, untagged_index
-from icalib.geometry.targets.families import check_family
+from icalib.geometry.targets.families import checked_family
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Charuco(Target):
                 f"marker_size {self.marker_size:g} does not fit a square of {self.square_size:g}; "
                 "correct marker_size or square_size."
             )
-        check_family(self.dictionary, self.squares_x * self.squares_y // 2)
+        object.__setattr__(self, "dictionary", checked_family(self.dictionary, self.squares_x * self.squares_y // 2))
 
     @cached_property
     def points(self) -> np.ndarray:
