@@ -25,6 +25,7 @@ LEVELS = {
     "provenance": 2,
     "imu_classes": 2,
     "rig_parameters": 2,
+    "rig_targets": 2,
     "rig_file": 3,
     "recordings": 2,
     "detection": 3,

@@ -5,7 +5,9 @@ AprilTags are called as their authors do (tag36h11), others as OpenCV does, with
 
 from __future__ import annotations
 
+import difflib
 import re
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -29,6 +31,22 @@ _APRILTAG = re.compile(r"(?:april)?(?:tag)?_?([0-9]+h[0-9]+)")
 _OPENCVS = {"aruco_original": "DICT_ARUCO_ORIGINAL", "aruco_mip_36h12": "DICT_ARUCO_MIP_36h12"}
 
 
+@dataclass(frozen=True)
+class TagSet:
+    """Tags that are on a target: `ids` of `family`, with black borders of `border_bits` cells."""
+
+    family: str
+    border_bits: int
+    ids: tuple[int, ...]
+
+    def shared_with(self, other: TagSet) -> list[int]:
+        """Ids under which either set has the same tag as the other."""
+        # Of OpenCV's families with the same number of bits, the larger ones begin with the smaller ones.
+        kinds = [t.family.split("_")[0] if "x" in t.family else t.family for t in (self, other)]
+        same = kinds[0] == kinds[1] and self.border_bits == other.border_bits
+        return sorted(set(self.ids) & set(other.ids)) if same else []
+
+
 def family_name(text: str) -> str:
     """The name in `FAMILIES` of a family that is called so by its authors, by ROS or by OpenCV, with DICT_ or without.
 
@@ -38,7 +56,9 @@ def family_name(text: str) -> str:
     if april := _APRILTAG.fullmatch(name):
         name = f"tag{april[1]}"
     if name not in FAMILIES:
-        raise RigError(f"there is no family of tags {text!r}; available are {', '.join(FAMILIES)}.")
+        near = difflib.get_close_matches(name, FAMILIES, n=1)
+        hint = f", did you mean {near[0]!r}" if near else ""
+        raise RigError(f"there is no family of tags {text!r}{hint}; available are {', '.join(FAMILIES)}.")
     return name
 
 
