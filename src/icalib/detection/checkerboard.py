@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.detection.corners import ImageCorners, checked_image, no_corners
+from icalib.detection.corners import ImageCorners, no_corners
+from icalib.detection.quads import View
 from icalib.detection.squares import square_corners
 from icalib.errors import RecordingError
 from icalib.extras import load_cv2
@@ -42,7 +43,11 @@ class CheckerboardDetector:
 
         Raises RecordingError for an image that is not grey with 8 bits.
         """
-        image = checked_image(image)
+        return self.find(View(image))
+
+    def find(self, view: View) -> ImageCorners:
+        """As `detect`."""
+        image = view.image
         cv2 = load_cv2()
         found, corners = cv2.findChessboardCornersSB(image, (self.cols, self.rows), flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
         if not found:
