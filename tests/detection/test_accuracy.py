@@ -52,7 +52,7 @@ TARGETS = {
         ("charuco", 5, 8, "APRILTAG_36h11"),
         CharucoDetector(5, 8, 0.8, "tag36h11"),
         False,
-        ALL | {"oblique": 0.9, "small": 0.4},
+        ALL | {"oblique": 0.85, "small": 0.4},
     ),
     "checkerboard": (("checkerboard", 6, 9), CheckerboardDetector(6, 9), False, ALL | {"cut": 0.0}),
     "checkerboard 7 x 6": (("checkerboard", 7, 6), CheckerboardDetector(7, 6), False, ALL | {"cut": 0.0}),

@@ -80,11 +80,11 @@ def test_corners_of_a_tag_map_with_a_grid_are_where_they_are(shots: list[Shot]):
         assert abs(inside[rows].mean()) < 0.02 and np.abs(uv[rows].mean(axis=0)).max() < 0.02
 
 
-@pytest.mark.parametrize("size", [0.06, 0.12])
-def test_small_and_oblique_tags(size: float):
-    """Tags of 20 and 40 px in a row, turned about the vertical by up to 70 degrees."""
+@pytest.mark.parametrize(("family", "size"), [("tag36h11", 0.1), ("tag36h11", 0.15), ("4x4_50", 0.08)])
+def test_small_and_oblique_tags(family: str, size: float):
+    """Tags of 26 to 50 px in a row, turned about the vertical by up to 70 degrees; the lens bends their sides."""
     angles = np.radians([0.0, 30.0, 50.0, 60.0, 70.0])
-    target = Markers("tag36h11", size, tuple(range(len(angles))))
+    target = Markers(family, size, tuple(range(len(angles))))
     T = np.tile(np.eye(4), (len(angles), 1, 1))
     for k, (angle, pose) in enumerate(zip(angles, T, strict=True)):
         c, s = np.cos(angle), np.sin(angle)
@@ -103,9 +103,7 @@ def test_small_and_oblique_tags(size: float):
         kept += np.bincount(found.point[found.kept] // 4, minlength=len(angles))
     uv = np.concatenate(errors)
     assert np.sqrt((uv**2).mean()) < 0.1 and np.hypot(*uv.T).max() < 0.4
-    assert np.abs(uv.mean(axis=0)).max() < 0.02 or len(uv) < 30
-    if size == 0.12:
-        assert (kept[:3] >= 30).all()
+    assert np.abs(uv.mean(axis=0)).max() < 0.02 and (kept[:2] == 40).all()
 
 
 def test_each_target_of_a_scene_is_found_as_if_it_were_alone(shots: list[Shot]):
@@ -117,6 +115,13 @@ def test_each_target_of_a_scene_is_found_as_if_it_were_alone(shots: list[Shot]):
         np.testing.assert_array_equal(whole.point, np.concatenate([parts[0].point, parts[1].point + 48]))
         np.testing.assert_array_equal(whole.uv, np.concatenate([p.uv for p in parts]))
         assert (np.diff(whole.point) > 0).all()
+
+
+def test_a_checkerboard_is_not_seen_in_the_squares_of_a_grid(shots: list[Shot]):
+    grid, board = AprilGrid(3, 3, 0.1, 0.3), Checkerboard(3, 4, 0.1)
+    detectors = [detector_of(t) for t in (board, Scene(("board", "grid"), (board, grid)))]
+    alone, beside = ([d.detect(shot.pixels).point for shot in shots[:4]] for d in detectors)
+    assert all((a < 12).any() for a in alone) and all((b >= 12).all() and len(b) for b in beside)
 
 
 def test_an_image_is_thresholded_once_for_all_targets(shots: list[Shot], monkeypatch: pytest.MonkeyPatch):
@@ -132,7 +137,7 @@ def test_sentences_on_a_scene(shots: list[Shot]):
     found, notes = found_in(images, Scene(("wall", "grid"), (TAGS, AprilGrid(3, 3, 0.1, 0.3))))
     assert notes[0].startswith(f"shown.bag /cam0: wall is in 8, grid is in 8 of 8 images, {len(found.uv)} corners;")
     assert len(notes) == 1 and (np.diff(found.start) > 20).all()
-    board = Checkerboard(3, 4, 0.1)
+    board = Checkerboard(5, 6, 0.1)
     _, notes = found_in(images, Scene(("wall", "board"), (TAGS, board)))
     assert notes[1:] == ("shown.bag /cam0: board is never seen; check its type, family, ids and sizes.",)
     none = Scene(("board", "charuco"), (board, Charuco(5, 4, 0.05, 0.04, "4x4_50")))

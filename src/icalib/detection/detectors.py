@@ -11,11 +11,13 @@ import numpy as np
 from icalib.detection.aprilgrid import AprilGridDetector
 from icalib.detection.charuco import CharucoDetector
 from icalib.detection.checkerboard import CheckerboardDetector
-from icalib.detection.corners import ImageCorners
+from icalib.detection.corners import ImageCorners, no_corners
 from icalib.detection.markers import MarkerDetector
 from icalib.detection.quads import View
 from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Markers, Scene, Target
+
+_SAME_PX = 3.0  # corners this close are one
 
 
 class Detector(Protocol):
@@ -39,7 +41,11 @@ def detector_of(target: Target) -> Detector:
 
 def _finder_of(target: Target) -> _Finder:
     if isinstance(target, Scene):
-        return _SceneDetector(tuple(_finder_of(t) for t in target.targets), target.first_points[:-1])
+        members, tagged = (
+            tuple(_finder_of(t) for t in target.targets),
+            tuple(t.tags is not None for t in target.targets),
+        )
+        return _SceneDetector(members, target.first_points[:-1], tagged)
     if isinstance(target, Markers):
         return MarkerDetector(target.family, tuple(target.known.tolist()), target.border_bits)
     if isinstance(target, AprilGrid):
@@ -60,12 +66,15 @@ class _SceneDetector:
 
     members: tuple[_Finder, ...]
     first: np.ndarray
+    tagged: tuple[bool, ...]  # whether tags tell a member from others
 
     def detect(self, image: np.ndarray) -> ImageCorners:
         return self.find(View(image))
 
     def find(self, view: View) -> ImageCorners:
         found = [member.find(view) for member in self.members]
+        of_tags = np.concatenate([np.zeros((0, 2))] + [f.uv for f, t in zip(found, self.tagged, strict=True) if t])
+        found = [f if t or _apart(f.uv, of_tags) else no_corners() for f, t in zip(found, self.tagged, strict=True)]
         fields = {f.name: np.concatenate([getattr(one, f.name) for one in found]) for f in dataclasses.fields(found[0])}
         point = np.concatenate([one.point + first for one, first in zip(found, self.first, strict=True)])
         return ImageCorners(**fields | {"point": point})
@@ -87,6 +96,11 @@ class _Renumbered:
         order = np.argsort(point)
         fields = {f.name: getattr(found, f.name)[order] for f in dataclasses.fields(found)}
         return ImageCorners(**fields | {"point": point[order]})
+
+
+def _apart(uv: np.ndarray, others: np.ndarray) -> bool:
+    """Whether no corner of a board lies on another target's, whose squares may look like a small checkerboard."""
+    return not len(others) or bool((np.linalg.norm(uv[:, None] - others, axis=2) > _SAME_PX).all())
 
 
 def _from_the_bottom(rows: int, cols: int) -> np.ndarray:
