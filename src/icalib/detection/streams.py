@@ -27,7 +27,7 @@ from icalib.measurements import CornerStream
 from icalib.recordings import DamagedImageError, Payload, Recording, decode
 from icalib.rig import Camera
 
-DIAGNOSED = 10  # images in which tags are looked for that are not the target's
+DIAGNOSED = 5  # images in which tags are looked for that are not the target's
 # Of a target's points, and of free tags' corners, an image on average: with fewer the border may be another one.
 POOR_SHARE, POOR_CORNERS = 0.5, 8
 PER_WORKER = 4  # images in memory for each thread
