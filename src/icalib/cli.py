@@ -8,6 +8,8 @@ from pathlib import Path
 
 from icalib.errors import CalibrationError
 
+_MOST_IDS = 10_000  # more than any family has
+
 
 def main(arguments: list[str] | None = None) -> int:
     """Entry point of the `icalib` command. Returns the exit code: 0 good, 1 an error, 2 wrong usage, 130
@@ -69,12 +71,13 @@ def _add_target(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
             "squares_x": _count, "squares_y": _count, "square_size": _metres, "marker_size": _metres, "dictionary": str
         },
         "checkerboard": {"rows": _count, "cols": _count, "square_size": _metres},
+        "markers": {"family": str, "size": _metres, "ids": _ids},
         "tag": {"family": str, "id": _whole, "size": _metres},
     }  # fmt: skip
     for name, options in fields.items():
         one = types.add_parser(name, help=f"{name}, with the fields of the rig file")
         for field, kind in options.items():
-            unit = {_metres: "METRES", _count: "N", _whole: "N"}.get(kind, "NAME")
+            unit = {_metres: "METRES", _count: "N", _whole: "N", _ids: "0-11 or 0,3,7"}.get(kind, "NAME")
             one.add_argument(
                 f"--{field.replace('_', '-')}",
                 type=kind,
@@ -98,6 +101,17 @@ def _count(text: str) -> int:
     if _whole(text) == 0:
         raise argparse.ArgumentTypeError("must be at least 1, but is 0")
     return int(text)
+
+
+def _ids(text: str) -> tuple[int, ...]:
+    """Ids and ranges of ids, separated by commas."""
+    ids: list[int] = []
+    for part in text.split(","):
+        first, _, last = part.partition("-")
+        ids += range(_whole(first), _whole(last or first) + 1)
+    if not ids or len(ids) > _MOST_IDS:
+        raise argparse.ArgumentTypeError(f"must be 1 to {_MOST_IDS} ids, as in 0-11 or 0,3,7, but is {text!r}")
+    return tuple(ids)
 
 
 def _metres(text: str) -> float:

@@ -12,4 +12,4 @@ from icalib.geometry.targets.tag import Tag
 
 __all__ = ["TARGETS", "AprilGrid", "Charuco", "Checkerboard", "Markers", "Scene", "Tag", "Target"]
 
-TARGETS: dict[str, type[Target]] = {kind.type: kind for kind in (AprilGrid, Charuco, Checkerboard, Tag)}
+TARGETS: dict[str, type[Target]] = {kind.type: kind for kind in (AprilGrid, Charuco, Checkerboard, Markers, Tag)}
