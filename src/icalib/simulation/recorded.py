@@ -97,7 +97,9 @@ def recorded_motion(path: Path, duration_s: float, middle: np.ndarray) -> Record
     if seconds[-1] < duration_s:
         raise RecordingError(f"{path} is {seconds[-1]:.3g} s long; lower the duration of {duration_s:g} s.")
     if (gap := float(np.diff(seconds).max())) > _LARGEST_GAP_S:
-        raise RecordingError(f"{path} has a gap of {gap:.3g} s; give a trajectory without gaps above {_LARGEST_GAP_S} s.")
+        raise RecordingError(
+            f"{path} has a gap of {gap:.3g} s; give a trajectory without gaps above {_LARGEST_GAP_S} s."
+        )
     used = seconds <= duration_s + _KNOT_S
     seconds, poses = seconds[used], poses[used]
     poses[:, :3] += middle - 0.5 * (poses[:, :3].min(axis=0) + poses[:, :3].max(axis=0))
