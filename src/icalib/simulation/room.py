@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from numba import njit
 
 from icalib.errors import RigError
 
-_STEPS = 200  # of a ray's march over hills
+_STEPS = 1000  # of a ray's march over hills; one that grazes them for longer meets nothing
 _CLOSE_M = 1e-9  # to the ground, where the march ends
 
 
@@ -44,8 +45,10 @@ class Hills:
 
     @property
     def steepest(self) -> float:
-        """No slope is above this (a tangent)."""
-        return float((np.abs(self.amplitude) * np.linalg.norm(self.wave, axis=1)).sum())
+        """No slope is above this (a tangent): that of all waves together, at the worst of their phases."""
+        slopes = np.array(self.amplitude)[:, None] * np.array(self.wave)
+        signs = np.array(list(product((-1.0, 1.0), repeat=len(slopes))))
+        return float(np.linalg.norm(signs @ slopes, axis=1).max())
 
     def height(self, xy: np.ndarray) -> np.ndarray:
         """(N,) z at xy (N, 2)."""
@@ -53,10 +56,11 @@ class Hills:
 
 
 def hills_of_slope(slope_deg: float) -> Hills:
-    """Three waves of 6.3, 4.2 and 2.9 m in different directions, whose slopes add up to `slope_deg` at most."""
-    wave = np.array([[0.97, 0.24], [-0.45, 1.43], [1.6, -1.45]])
-    amplitude = np.array([0.5, 0.35, 0.15]) * np.tan(np.deg2rad(slope_deg)) / np.linalg.norm(wave, axis=1)
-    return Hills(tuple(amplitude.tolist()), ((0.97, 0.24), (-0.45, 1.43), (1.6, -1.45)), (0.3, 1.9, 4.0))
+    """Three waves of 6.3, 4.2 and 2.9 m in different directions, of which no slope is above `slope_deg`."""
+    waves, phases = ((0.97, 0.24), (-0.45, 1.43), (1.6, -1.45)), (0.3, 1.9, 4.0)
+    shares = np.array([0.5, 0.35, 0.15]) / np.linalg.norm(waves, axis=1)
+    scale = np.tan(np.deg2rad(slope_deg)) / Hills(tuple(shares), waves, phases).steepest
+    return Hills(tuple((scale * shares).tolist()), waves, phases)
 
 
 class Surfaces(NamedTuple):
@@ -187,7 +191,7 @@ def _ramp(block: Block, base: float) -> list[Face]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def nearest(surfaces, px, py, pz, dx, dy, dz):
-    """Distance in units of d and the face that the ray p + t d meets first; -1: the hills; t = inf: nothing."""
+    """Distance t in units of d and the face that the ray p + t d meets first; -1: the hills; t = inf or NaN: nothing."""
     best, hit = np.inf, -1
     for f in range(len(surfaces.origin)):
         n, o = surfaces.normal[f], surfaces.origin[f]
@@ -205,14 +209,15 @@ def nearest(surfaces, px, py, pz, dx, dy, dz):
             best, hit = t, f
     if len(surfaces.amplitude):
         t = _ground(surfaces, px, py, pz, dx, dy, dz, best)
-        if t < best:
+        if not t >= best:
             return t, -1
     return best, hit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _ground(surfaces, px, py, pz, dx, dy, dz, limit):
-    """Where the ray meets the hills before `limit`, else inf: steps that can never pass through the ground."""
+    """Where the ray meets the hills before `limit`, else inf: steps that can never pass through the ground.
+    NaN where they are too many."""
     t = 0.0
     closing = surfaces.steepest * np.sqrt(dx * dx + dy * dy) - dz  # how fast the ray can near the ground at most
     if closing <= 0.0:
@@ -228,7 +233,7 @@ def _ground(surfaces, px, py, pz, dx, dy, dz, limit):
         t += gap / closing
         if t >= limit:
             return np.inf
-    return t
+    return np.nan
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
