@@ -65,12 +65,11 @@ def hills_of_slope(slope_deg: float) -> Hills:
 
 class Surfaces(NamedTuple):
     """What rays meet. Faces are parallelograms origin + s u + t v, 0 <= s, t <= 1, or triangles (s + t <= 1), seen
-    from the side that `normal` points to; s = s_of . q, t = t_of . q of q from the origin. The rest: see `Hills`."""
+    from the side that the normal points to. Of the hills: see `Hills`."""
 
-    origin: np.ndarray  # (F, 3)
-    normal: np.ndarray  # (F, 3)
-    s_of: np.ndarray  # (F, 3)
-    t_of: np.ndarray  # (F, 3)
+    plane: np.ndarray  # (F, 4) n, d: n . p = d
+    along: np.ndarray  # (F, 4) a, a0: s = a . p - a0
+    across: np.ndarray  # (F, 4) b, b0: t = b . p - b0
     triangle: np.ndarray  # (F,) bool
     amplitude: np.ndarray  # (W,), W = 0: no hills
     wave: np.ndarray  # (W, 2)
@@ -115,27 +114,23 @@ class Room:
     @property
     def planes(self) -> np.ndarray:
         """(F, 4): normal, into the open, and d [m] of each face; n . p = d on it."""
-        normal = _normals(self.faces)
-        return np.column_stack([normal, np.sum(normal * self.faces[:, 0], axis=1)])
+        return _with_offset(_normals(self.faces), self.faces[:, 0])
 
     @cached_property
     def surfaces(self) -> Surfaces:
-        origin, u, v, mark = np.moveaxis(self.faces, 1, 0).copy()
+        origin, u, v, mark = np.moveaxis(self.faces, 1, 0)
         normal = _normals(self.faces)
         area = np.sum(normal * np.cross(u, v), axis=1)[:, None]
         hills = self.hills or Hills((), (), ())
-        wave = np.array(hills.wave, dtype=np.float64).reshape(-1, 2)
-        steepest = hills.steepest if self.hills else 0.0
         return Surfaces(
-            origin,
-            normal,
-            np.cross(v, normal) / area,
-            np.cross(normal, u) / area,
+            self.planes,
+            _with_offset(np.cross(v, normal) / area, origin),
+            _with_offset(np.cross(normal, u) / area, origin),
             mark[:, 0] > 0.0,
             np.array(hills.amplitude, dtype=np.float64),
-            wave,
+            np.array(hills.wave, dtype=np.float64).reshape(-1, 2),
             np.array(hills.phase, dtype=np.float64),
-            steepest,
+            hills.steepest if self.hills else 0.0,
         )
 
     def points(self, count: int, rng: np.random.Generator) -> np.ndarray:
@@ -159,6 +154,11 @@ class Room:
 def _normals(faces: np.ndarray) -> np.ndarray:
     normal = np.cross(faces[:, 1], faces[:, 2])
     return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+
+def _with_offset(directions: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """(F, 4): each direction (F, 3) with its product with the origin (F, 3)."""
+    return np.column_stack([directions, np.sum(directions * origin, axis=1)])
 
 
 Face = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -191,21 +191,20 @@ def _ramp(block: Block, base: float) -> list[Face]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def nearest(surfaces, px, py, pz, dx, dy, dz):
-    """Distance t in units of d and the face that the ray p + t d meets first; -1: the hills; t = inf or NaN: nothing."""
+    """Distance t in units of d, and the face that p + t d meets first, -1: the hills. t = inf or NaN: nothing."""
     best, hit = np.inf, -1
-    for f in range(len(surfaces.origin)):
-        n, o = surfaces.normal[f], surfaces.origin[f]
-        towards = n[0] * dx + n[1] * dy + n[2] * dz
+    plane, along, across = surfaces.plane, surfaces.along, surfaces.across
+    for f in range(len(plane)):
+        towards = plane[f, 0] * dx + plane[f, 1] * dy + plane[f, 2] * dz
         if towards >= 0.0:
             continue
-        t = (n[0] * (o[0] - px) + n[1] * (o[1] - py) + n[2] * (o[2] - pz)) / towards
+        t = (plane[f, 3] - plane[f, 0] * px - plane[f, 1] * py - plane[f, 2] * pz) / towards
         if t <= 0.0 or t >= best:
             continue
-        qx, qy, qz = px + t * dx - o[0], py + t * dy - o[1], pz + t * dz - o[2]
-        a, b = surfaces.s_of[f], surfaces.t_of[f]
-        along, across = a[0] * qx + a[1] * qy + a[2] * qz, b[0] * qx + b[1] * qy + b[2] * qz
-        inside = along >= 0.0 and across >= 0.0 and along <= 1.0 and across <= 1.0
-        if inside and not (surfaces.triangle[f] and along + across > 1.0):
+        x, y, z = px + t * dx, py + t * dy, pz + t * dz
+        u = along[f, 0] * x + along[f, 1] * y + along[f, 2] * z - along[f, 3]
+        v = across[f, 0] * x + across[f, 1] * y + across[f, 2] * z - across[f, 3]
+        if u >= 0.0 and v >= 0.0 and u <= 1.0 and v <= 1.0 and not (surfaces.triangle[f] and u + v > 1.0):
             best, hit = t, f
     if len(surfaces.amplitude):
         t = _ground(surfaces, px, py, pz, dx, dy, dz, best)
