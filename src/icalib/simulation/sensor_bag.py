@@ -9,27 +9,34 @@ from typing import Any
 
 import numpy as np
 
+from icalib.errors import RigError
 from icalib.measurements import ImuStream, LidarStream, WheelPoses, WheelStream
-from icalib.simulation.bag_writer import IMU, IMU_TOPIC, JOINTS, POINTS, BagWriter
+from icalib.simulation.bag_writer import IMAGE, IMU, IMU_TOPIC, JOINTS, POINTS, BagWriter
+from icalib.simulation.filming import Film
+from icalib.simulation.rendering import Imaging
 from icalib.simulation.simulate import Simulation
 from icalib.simulation.tables import whole, write_truth
 
 Event = tuple[int, str, Callable[[BagWriter], Any]]  # when on the IMU's clock [ns], topic, what makes the message
+_EXPOSURE_S = 0.004
 _WHEELS = ["left_wheel", "right_wheel"]
 
 
 def write_sensors(
     simulation: Simulation, seed: int, path: Path, progress: Callable[[float], None] = lambda done: None
 ) -> tuple[str, ...]:
-    """Writes IMU readings, clouds and joints as a bag, and the truth beside it, in the new folder `path`; a `path` that
-    ends in .bag is a bag of ROS 1 alone. All or nothing.
+    """Writes a bag and the truth beside it into the new folder `path`, all or nothing; a `path` that ends in .bag is a
+    bag of ROS 1, and has no truth.
 
-    Topics are /imu0 (Imu), /NAME/points (PointCloud2: x, y, z and `time` [s] from the stamp) and /NAME/joint_states
-    (JointState). Returns sentences on what was left out. Raises RecordingError where `path` exists or cannot be
-    written, CalibrationError where a package is missing.
+    Topics are /imu0 (Imu), /NAME/points (PointCloud2: x, y, z and `time` [s] from the stamp), /NAME/joint_states
+    (JointState) and, where a target stands in the scene, /NAME/image_raw (Image, mono8). Returns sentences on what was
+    left out. Raises RecordingError where `path` exists or cannot be written, CalibrationError where a package is
+    missing, RigError for a board that is not flat.
     """
+    if any(simulation.scenario.bow):
+        raise RigError("boards are rendered flat; set the scenario's bow to zero.")
     ros1 = path.suffix == ".bag"
-    topics, streams, notes = _streams(simulation)
+    topics, streams, notes = _streams(simulation, seed)
     last_ns = simulation.truth.imu_clock_origin_ns + int(simulation.truth.seconds[-1] * 1e9)
     span_ns = max(last_ns - simulation.truth.imu_clock_origin_ns, 1)
     with whole(path) as place:
@@ -42,7 +49,7 @@ def write_sensors(
     return notes
 
 
-def _streams(simulation: Simulation) -> tuple[dict[str, str], list[Iterator[Event]], tuple[str, ...]]:
+def _streams(simulation: Simulation, seed: int) -> tuple[dict[str, str], list[Iterator[Event]], tuple[str, ...]]:
     """The type of each topic, the events of each stream, and sentences on what has none."""
     measured, truth = simulation.measurements, simulation.truth
     assert measured.imu is not None  # of every scenario
@@ -56,8 +63,11 @@ def _streams(simulation: Simulation) -> tuple[dict[str, str], list[Iterator[Even
             continue
         topics[f"/{wheels.name}/joint_states"] = JOINTS
         streams.append(_joints(wheels, round(truth.time_offset[wheels.name] * 1e9)))
-    if measured.tracks:
-        notes.append("tracks are no sensor's; they are left out, and there are no images.")
+    if simulation.scenario.board:
+        topics |= {f"/{camera.name}/image_raw": IMAGE for camera in simulation.scenario.cameras}
+        streams.append(_images(simulation, seed))
+    elif simulation.scenario.cameras:
+        notes.append("images show nothing but targets; the scenario has none, and so there are no images.")
     return topics, streams, tuple(notes)
 
 
@@ -65,6 +75,18 @@ def _readings(imu: ImuStream) -> Iterator[Event]:
     values = np.concatenate([imu.gyro, imu.accel], axis=1).tolist()
     for stamp_ns, row in zip(imu.stamps_ns.tolist(), values, strict=True):
         yield stamp_ns, IMU_TOPIC, lambda bag, stamp_ns=stamp_ns, row=row: bag.imu(stamp_ns, row)
+
+
+def _images(simulation: Simulation, seed: int) -> Iterator[Event]:
+    """Rendered a few ahead, on all cores."""
+    imu, truth = simulation.measurements.imu, simulation.truth
+    assert imu is not None  # of every scenario
+    for shot in Film(simulation.scenario, seed, Imaging(blur_px=0.8, noise=2.0), _EXPOSURE_S, imu, truth).shots():
+        yield (
+            truth.imu_clock_origin_ns + round(shot.seconds * 1e9),
+            f"/{shot.camera}/image_raw",
+            lambda bag, shot=shot: bag.image(shot.stamp_ns, shot.camera, shot.pixels),
+        )
 
 
 def _clouds(lidar: LidarStream, offset_ns: int) -> Iterator[Event]:
