@@ -126,7 +126,7 @@ def test_bags_hold_what_the_drivers_send(simulation, tmp_path, name):
     np.testing.assert_allclose(turned, wheels.rate[1:], atol=1e-9)
     images = list(bag.images("/cam0/image_raw"))
     assert len(images) == len(measured.tracks[0].stamps_ns) and images[0].image.shape == (150, 200)
-    assert images[0].image.std() > 20  # the board is in view
+    assert images[0].image.std() > 10  # the board is in view; without it there is the noise of 2 grey levels
     assert (tmp_path / name / "truth.yaml").exists() == (name == "run")
 
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from icalib.errors import RigError
 from icalib.simulation import Features, simulate
 
 from .conftest import alone
@@ -117,3 +118,15 @@ def test_the_same_seed_gives_the_same_recording(robot):
     without = simulate(replace(robot, lidars=(), features=None), 1).measurements
     np.testing.assert_array_equal(without.wheels[0].pose, one.wheels[0].pose)
     np.testing.assert_array_equal(without.imu.gyro, one.imu.gyro)
+
+
+def test_a_sensor_without_time_to_measure_is_named(robot):
+    for change, name in (
+        ({"cameras": (replace(robot.cameras[1], rate_hz=0.1),), "lidars": ()}, "cam1"),
+        ({"lidars": (replace(robot.lidars[0], rate_hz=0.5),)}, "lidar0"),
+        ({"wheels": (replace(robot.wheels[0], rate_hz=0.2),)}, "wheel0"),
+        ({"wheels": (replace(robot.wheels[0], poses_every=300),)}, "wheel0"),
+    ):
+        with pytest.raises(RigError, match=f"{name} measures less than twice"):
+            simulate(replace(robot, **change), 1)
+    assert simulate(replace(robot, cameras=(), lidars=()), 1).measurements.tracks == ()

@@ -81,6 +81,8 @@ def simulate(scenario: Scenario, seed: int, progress: Progress = lambda stage, d
     """Simulate one recording; the same scenario and seed give the same numbers.
 
     Motion, IMU noise and each sensor draw from streams of their own: changing one leaves the others as they are.
+    Raises RigError where a robot's sensor measures less than twice, RecordingError where a recorded motion cannot be
+    used.
     """
     progress("motion", 0.0)
     imu_rng = np.random.default_rng([seed, 1])
@@ -152,7 +154,7 @@ def _corners(
 
 
 def _tracks(scenario: Scenario, trajectory: Trajectory, seed: int) -> Followed:
-    if scenario.room is None or scenario.features is None:
+    if scenario.room is None or scenario.features is None or not scenario.cameras:
         return Followed((), (), np.empty((0, 3)))
     return follow(scenario, scenario.room, scenario.features, trajectory, seed)
 
