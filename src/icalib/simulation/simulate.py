@@ -93,7 +93,6 @@ def simulate(scenario: Scenario, seed: int, progress: Progress = lambda stage, d
     kept = ~inside(scenario.imu_gaps, seconds)
     stamps_ns = stamps[kept] + np.int64(scenario.imu_clock_origin_ns)
     imu = ImuStream("imu0", stamps_ns, readings.gyro[kept], readings.accel[kept])
-    rotation, position, velocity = trajectory.pose_at(seconds[kept])
     progress("images", 0.1)
     corners, corner_truth = _corners(scenario, trajectory, seed)
     followed = _tracks(scenario, trajectory, seed)
@@ -101,24 +100,14 @@ def simulate(scenario: Scenario, seed: int, progress: Progress = lambda stage, d
     progress("wheels", 0.95)
     wheels, wheel_truth = _wheels(scenario, trajectory, seconds, seed)
     truth = Truth(
-        scenario.imu_clock_origin_ns,
-        seconds[kept],
-        rotation,
-        position,
-        velocity,
-        readings.gyro_bias[kept],
-        readings.accel_bias[kept],
-        scenario.imu_intrinsics,
-        GRAVITY_WORLD,
-        scenario.T_world_board,
-        np.array(scenario.bow),
+        **_motion_truth(scenario, trajectory, seconds[kept]),
         **_rig_truth(scenario),
+        gyro_bias=readings.gyro_bias[kept],
+        accel_bias=readings.accel_bias[kept],
         corners=corner_truth,
-        trajectory=trajectory,
         tracks={s.name: t for s, t in zip(followed.streams, followed.truths, strict=True)},
         wheels=wheel_truth,
         points=followed.points,
-        planes=np.empty((0, 4)) if scenario.room is None else scenario.room.planes,
     )
     measured = Measurements(imu, corners, tracks=followed.streams, lidars=lidars, wheels=wheels)
     return Simulation(scenario, measured, truth)
@@ -183,10 +172,28 @@ def _wheels(
     return tuple(stream for stream, _ in read), {stream.name: truth for stream, truth in read}
 
 
+def _motion_truth(scenario: Scenario, trajectory: Trajectory, seconds: np.ndarray) -> dict[str, Any]:
+    """The fields of `Truth` on where the IMU was at its readings."""
+    rotation, position, velocity = trajectory.pose_at(seconds)
+    return {
+        "imu_clock_origin_ns": scenario.imu_clock_origin_ns,
+        "seconds": seconds,
+        "R_world_imu": rotation,
+        "position": position,
+        "velocity": velocity,
+        "trajectory": trajectory,
+    }
+
+
 def _rig_truth(scenario: Scenario) -> dict[str, Any]:
     """The fields of `Truth` that the scenario states."""
     cameras, lidars, wheels = scenario.cameras, scenario.lidars, scenario.wheels
     return {
+        "imu_intrinsics": scenario.imu_intrinsics,
+        "gravity": GRAVITY_WORLD,
+        "T_world_board": scenario.T_world_board,
+        "bow": np.array(scenario.bow),
+        "planes": np.empty((0, 4)) if scenario.room is None else scenario.room.planes,
         "T_imu_cam": {c.name: c.T_imu_cam for c in cameras},
         "time_offset": {s.name: raw_time_offset(scenario, s) for s in (*cameras, *lidars, *wheels)},
         "intrinsics": {c.name: np.array(c.intrinsics) for c in cameras},
