@@ -16,8 +16,9 @@ from icalib.calibration import (
     Trajectory,
     Verdict,
 )
-from icalib.estimation.assembly import BOARD, Inputs, image_times, origin_difference
-from icalib.estimation.board import SHAPE_LABELS, is_board
+from icalib.estimation.assembly import Inputs, image_times, origin_difference
+from icalib.estimation.board import SHAPE_LABELS
+from icalib.estimation.bodies import words_on_left_out
 from icalib.estimation.corner_noise import NoiseModel
 from icalib.estimation.estimate import Estimate
 from icalib.estimation.evidence import Fit, fits, place_covariances, split_covariance
@@ -63,7 +64,7 @@ def assess(inputs: Inputs, found: Estimate) -> Calibration:
         iterations=tuple(Iteration(n, s.cost, s.predicted_decrease, s.damping, s.accepted) for n, s in found.steps),
         converged=outcome.converged,
         status=outcome.status,
-        warnings=tuple(_warnings(found, groups, judged, empirical)),
+        warnings=tuple(_warnings(inputs, found, groups, judged, empirical)),
         notes=tuple(_notes(inputs, found, timeline)),
         rig=rig_to_dict(inputs.rig),
         settings=dataclasses.asdict(inputs.rig.settings),
@@ -99,7 +100,7 @@ def _column_names(inputs: Inputs) -> tuple[str, ...]:
 def _mode(inputs: Inputs, block: Block) -> str:
     if block.start is None:
         return "fixed"
-    if is_board(block.sensor, BOARD):
+    if not inputs.is_sensor(block.sensor):
         return "free"
     if inputs.rig.imu is not None and block.sensor == inputs.rig.imu.name:
         return inputs.rig.imu.intrinsics.mode
@@ -168,7 +169,7 @@ def _empirical_variance(inputs: Inputs, found: Estimate, formal: np.ndarray) -> 
 
 def _calibration_only(inputs: Inputs, per_column: np.ndarray) -> np.ndarray:
     """The columns that users take away: not the board's."""
-    columns = [b.columns for b in inputs.layout.free if not is_board(b.sensor, BOARD) and b.name != "bloom"]
+    columns = [b.columns for b in inputs.layout.free if inputs.is_sensor(b.sensor) and b.name != "bloom"]
     return per_column[np.concatenate(columns)] if columns else np.ones(1)
 
 
@@ -220,7 +221,11 @@ def _imu_residuals(found: Estimate, trajectory: Trajectory) -> ImuResiduals:
 
 
 def _warnings(
-    found: Estimate, groups: tuple[ParameterGroup, ...], judged: list[SensorFit], empirical: np.ndarray | None
+    inputs: Inputs,
+    found: Estimate,
+    groups: tuple[ParameterGroup, ...],
+    judged: list[SensorFit],
+    empirical: np.ndarray | None,
 ):
     if not found.outcome.converged:
         yield f"the solver did not converge: {found.outcome.status}"
@@ -243,7 +248,7 @@ def _warnings(
                 f"the corners of {g.sensor} lie {abs(g.value[0]):.1f} px too far {where} on their tags, more than "
                 "light and ink do; check tag_size and tag_spacing (the gap over tag_size) of the target."
             )
-    judged_groups = (g for g in groups if g.mode != "fixed" and not is_board(g.sensor, BOARD) and g.name != "bloom")
+    judged_groups = (g for g in groups if g.mode != "fixed" and inputs.is_sensor(g.sensor) and g.name != "bloom")
     factors = [g.factor.max() for g in judged_groups if g.factor is not None]
     if factors and max(factors) > LARGE_FACTOR:
         yield (
@@ -262,6 +267,8 @@ def _notes(inputs: Inputs, found: Estimate, timeline: Timeline):
         name = number if span.name == number else f"{number}, {span.name}"
         yield f"{name}: {span.end - span.start:.1f} s from {span.origin_ns} ns on."
     yield from inputs.measurements.notes
+    if words := words_on_left_out(inputs.bodies):
+        yield words
     if inputs.imu is not None:
         yield from _imu_notes(inputs, inputs.imu, found, timeline)
     for camera, model in zip(inputs.rig.cameras, found.noise, strict=True):

@@ -11,7 +11,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from icalib.calibration import Calibration
 from icalib.export.kalibr import camchain_name
-from icalib.report.console import table
+from icalib.report.console import bodies_words, table
 
 
 @contextmanager
@@ -37,6 +37,8 @@ def print_result(calibration: Calibration, folder: Path) -> None:
     """The table of parameters, what they rest on, and where the files are, on standard output."""
     console = Console()
     console.print(table(calibration))
+    if placed := bodies_words(calibration):
+        console.print(f"  target: {placed}", markup=False)
     for f in calibration.fits:
         ratio = f.chi2 / max(f.dof, 1.0)
         rms = f", {f.rms:.3f} {f.unit} RMS, {f.rejected} set aside" if f.rms is not None else ""

@@ -82,13 +82,13 @@ def _joined(recordings: Sequence[Measurements], shifts: list[int]) -> Measuremen
         stamps = np.concatenate([i.stamps_ns + np.int64(shift) for i, shift in imus])
         gyro, accel = np.concatenate([i.gyro for i, _ in imus]), np.concatenate([i.accel for i, _ in imus])
         imu = ImuStream(imus[0][0].name, stamps, gyro, accel)
-    cameras = (_corners([(m.cameras[k], shift) for m, shift in shifted]) for k in range(len(recordings[0].cameras)))
+    cameras = (join_corners([(m.cameras[k], shift) for m, shift in shifted]) for k in range(len(recordings[0].cameras)))
     notes = tuple(f"{m.name}: {note}" for m in recordings for note in m.notes)
     return Measurements(imu, tuple(cameras), notes)
 
 
-def _corners(streams: list[tuple[CornerStream, int]]) -> CornerStream:
-    """One camera's images of all recordings."""
+def join_corners(streams: list[tuple[CornerStream, int]]) -> CornerStream:
+    """One camera's images of all recordings, each with what to add to its stamps [ns]."""
     stamps = np.concatenate([s.stamps_ns + np.int64(shift) for s, shift in streams])
     start = np.concatenate([[0], np.cumsum(np.concatenate([np.diff(s.start) for s, _ in streams]))])
     point, uv = np.concatenate([s.point for s, _ in streams]), np.concatenate([s.uv for s, _ in streams])

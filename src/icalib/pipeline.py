@@ -14,13 +14,14 @@ from icalib.assessment import assess
 from icalib.calibration import Calibration
 from icalib.detection.streams import find_corners
 from icalib.errors import RecordingError
-from icalib.estimation.assembly import BOARD, Inputs, image_times, inputs_for, nodes_for, start_values
+from icalib.estimation.assembly import Inputs, image_times, inputs_for, nodes_for, start_values
 from icalib.estimation.board import board_in
 from icalib.estimation.estimate import estimate
 from icalib.estimation.nodes import first_nodes
 from icalib.estimation.state import State
 from icalib.first_guess import Guess, initial_trajectory
 from icalib.first_guess.several import initial_guesses
+from icalib.geometry.targets.base import BOARD
 from icalib.measurements import CornerStream, Measurements
 from icalib.provenance import provenance
 from icalib.recordings import Recording, read_measurements
@@ -94,7 +95,7 @@ def _calibrate(rig: Rig, recordings: Sequence[Measurements], progress: Progress)
     clock = _Clock()
     progress("finding a first guess", 0.0)
     inputs = inputs_for(rig, recordings)
-    guesses = initial_guesses(rig, [m.measurements for m in inputs.motions])
+    guesses = initial_guesses(rig, inputs.bodies, [m.measurements for m in inputs.motions])
     clock.lap("first guess")
     state = first_state(inputs, *guesses)
     clock.lap("first state")

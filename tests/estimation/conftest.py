@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from icalib.estimation.arrowhead import Piece
+from icalib.estimation.board import SHAPE_LABELS
+from icalib.estimation.bodies import Bodies, restrict
 from icalib.estimation.corner_factor import CornerFactor, CornerNoise
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.imu_factor import ImuFactor
@@ -17,6 +22,8 @@ from icalib.estimation.poses import assign_nodes
 from icalib.estimation.problem import Problem
 from icalib.estimation.state import NODE, Layout, State, make_layout
 from icalib.geometry.cameras import camera_model
+from icalib.geometry.targets import AprilGrid
+from icalib.measurements import CornerStream
 from icalib.simulation import Scenario, Simulation, handheld, simulate
 
 TOLERANCE = {
@@ -32,18 +39,56 @@ TOLERANCE = {
 
 
 @dataclass(frozen=True)
+class SplitGrid(AprilGrid):
+    """An AprilGrid whose tags are in turn those of three bodies, each with a frame of its own, anywhere."""
+
+    @cached_property
+    def bodies(self) -> tuple[str, ...]:
+        return ("left", "middle", "right")
+
+    @cached_property
+    def body(self) -> np.ndarray:
+        return np.arange(len(self.points)) // 4 % 3
+
+    @cached_property
+    def points(self) -> np.ndarray:
+        on_grid = AprilGrid(*dataclasses.astuple(self)).points
+        own = np.empty_like(on_grid)
+        for k in range(3):
+            R, p = self.frame(k)
+            rows = np.arange(len(on_grid)) // 4 % 3 == k
+            own[rows] = (on_grid[rows] - p) @ R
+        return own
+
+    @staticmethod
+    def frame(k: int) -> tuple[np.ndarray, np.ndarray]:
+        """R_grid_body, p_grid_body."""
+        rng = np.random.default_rng(k)
+        return Rotation.from_rotvec(rng.normal(size=3)).as_matrix(), rng.normal(size=3)
+
+    def place(self, k: int, reference: int) -> tuple[np.ndarray, np.ndarray]:
+        """R_reference_k, p_reference_k."""
+        (Rk, pk), (R, p) = self.frame(k), self.frame(reference)
+        return R.T @ Rk, R.T @ (pk - p)
+
+
+@dataclass(frozen=True)
 class Setup:
-    """A simulated recording seen by the estimator: the board's origin is the origin of the world. state: the truth."""
+    """A simulated recording seen by the estimator: the scene's origin is the origin of the world, `origin` in the
+    simulation's. state: the truth."""
 
     sim: Simulation
     imu: ImuData
     layout: Layout
+    bodies: Bodies
+    streams: tuple[CornerStream, ...]
+    origin: np.ndarray
     state: State
 
     def truth_at(self, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Rotation, position, velocity of the IMU at seconds since its first stamp."""
         R, p, v = self.sim.truth.pose_at(seconds + self.sim.truth.seconds[0])
-        return R, p - self.sim.truth.T_world_board[:3, 3], v
+        return R, p - self.origin, v
 
     def columns_scale(self) -> np.ndarray:
         """(B,) a reasonable step of each border column."""
@@ -60,14 +105,28 @@ class Setup:
 
 
 def make_setup(
-    sim: Simulation, *, imu_free: bool = False, shape: int = 0, bloom: bool = False, spacing: float = 0.05
+    sim: Simulation,
+    *,
+    imu_free: bool = False,
+    shape: bool = False,
+    bloom: bool = False,
+    spacing: float = 0.05,
+    split: bool = False,
 ) -> Setup:
+    """split: the target is taken as three bodies that stand where they would on the target."""
     truth, measurements = sim.truth, sim.measurements
     imu = ImuData.build(measurements.imu, sim.scenario.imu_noise)
     entries = [("imu0", "intrinsics", "vector", 24, imu_free), ("board0", "tilt", "tilt", 2, True)]
-    entries.append(("board0", "shape", "vector", shape, shape > 0))
-    values = {("imu0", "intrinsics"): truth.imu_intrinsics.copy(), ("board0", "shape"): np.zeros(shape)}
-    values["board0", "tilt"] = truth.T_world_board[:3, :3].copy()
+    target = SplitGrid(*dataclasses.astuple(sim.scenario.target)) if split else sim.scenario.target
+    bodies = Bodies(target, (1, 0, 2) if split else (0,), (), shape)
+    entries += bodies.shape_entries() + bodies.pose_entries()
+    values = {(name, "shape"): np.zeros(len(SHAPE_LABELS)) for name in bodies.bending}
+    values["imu0", "intrinsics"] = truth.imu_intrinsics.copy()
+    R_world_grid, origin = truth.T_world_board[:3, :3], truth.T_world_board[:3, 3]
+    R_grid_scene, p_grid_scene = target.frame(1) if split else (np.eye(3), np.zeros(3))
+    values["board0", "tilt"] = R_world_grid @ R_grid_scene
+    for k in bodies.used:
+        values[target.bodies[k], "rotation"], values[target.bodies[k], "translation"] = target.place(k, bodies.used[0])
     times = []
     for c in measurements.cameras:
         T = truth.T_imu_cam[c.name]
@@ -87,17 +146,20 @@ def make_setup(
         times.append(c.seconds + offset)
     seconds = place_nodes(imu, times, spacing, 0.5)
     bias = np.concatenate([truth.gyro_bias[0], truth.accel_bias[0]])
-    pending = Setup(sim, imu, make_layout(entries), State(seconds, *(np.empty(0),) * 4, values))
+    streams = restrict(bodies, measurements).cameras
+    pending = Setup(
+        sim, imu, make_layout(entries), bodies, streams, origin + R_world_grid @ p_grid_scene,
+        State(seconds, *(np.empty(0),) * 4, values),
+    )  # fmt: skip
     R, p, v = pending.truth_at(seconds)
     return replace(pending, state=State(seconds, R, p, v, np.tile(bias, (len(seconds), 1)), values))
 
 
 def make_factor(setup: Setup, camera: int, scheme: str = "inertial", **changes) -> CornerFactor:
     """The factor of one camera, everything kept, sigma 0.2 px, no loss and no common error unless `changes` say so."""
-    stream = setup.sim.measurements.cameras[camera]
+    stream = setup.streams[camera]
     n, state = len(stream.uv), setup.state
     node = assign_nodes(scheme, state.seconds, stream.seconds + state.values[stream.name, "time_offset"][0])
-    target = setup.sim.scenario.target
     factor = CornerFactor(
         stream=stream,
         model=camera_model(setup.sim.scenario.cameras[camera].model),
@@ -109,9 +171,7 @@ def make_factor(setup: Setup, camera: int, scheme: str = "inertial", **changes) 
         keep=np.ones(n, dtype=bool),
         noise=CornerNoise(np.full(len(node), 0.2), np.zeros(0), np.zeros((n, 0))),
         direction=np.zeros((0, 2)),
-        target="board0",
-        points=target.points,
-        basis=np.zeros((len(target.points), setup.layout.block("board0", "shape").size, 3)),
+        bodies=setup.bodies,
         layout=setup.layout,
         n_nodes=len(state.seconds),
     )

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import minimize
 
 from icalib.estimation.arrowhead import Piece, make_pieces
-from icalib.estimation.corner_factor import CornerNoise, CornerOutput
+from icalib.estimation.corner_factor import CornerNoise
 from icalib.simulation.projection import project
 
 
@@ -24,7 +24,7 @@ def near(setup):
 
 def run(factor, state, sums=False, **options):
     """Cost, output and pieces."""
-    out = CornerOutput.empty(factor.stream, len(factor.noise.tau))
+    out = factor.output()
     pieces = make_pieces(factor.n_nodes, factor.layout.size)
     return sum(factor.accumulate(state, p, out, sums, **options) for p in pieces), out, pieces
 
@@ -34,27 +34,35 @@ def noisy(factor, seed=0, size=1.0):
     return replace(factor, stream=replace(factor.stream, uv=uv))
 
 
+@pytest.mark.parametrize("split", [False, True], ids=["one body", "three bodies"])
 @pytest.mark.parametrize("camera", [0, 1], ids=["radtan", "equidistant"])
-def test_residual_is_the_obvious_formula_at_the_true_motion(setup, factor_of, camera):
+def test_residual_is_the_obvious_formula_at_the_true_motion(unlike, setup_of, factor_of, camera, split):
     """Board, bloom and camera other than the truth; the IMU where it truly was, 5 ms later, on a stamp of the IMU."""
+    setup = setup_of(unlike, split=split, shape=True)
     factor, rng = factor_of(setup, camera), np.random.default_rng(1)
     name, sim_camera = factor.name, setup.sim.scenario.cameras[camera]
-    factor = replace(
-        factor, direction=rng.normal(size=factor.stream.uv.shape), basis=rng.normal(size=(len(factor.points), 2, 3))
+    factor = replace(factor, direction=rng.normal(size=factor.stream.uv.shape))
+    bodies, target = setup.bodies, setup.bodies.target
+    shapes = {(body, "shape"): 2e-3 * rng.normal(size=11) for body in bodies.names}
+    values = (
+        setup.state.values
+        | shapes
+        | {
+            (name, "bloom"): np.array([0.3]),
+            (name, "time_offset"): setup.state.values[name, "time_offset"] + 5e-3,
+            (name, "translation"): setup.state.values[name, "translation"] + [0.02, -0.05, 0.03],
+        }
     )
-    values = setup.state.values | {
-        ("board0", "shape"): np.array([2e-3, -1e-3]),
-        (name, "bloom"): np.array([0.3]),
-        (name, "time_offset"): setup.state.values[name, "time_offset"] + 5e-3,
-        (name, "translation"): setup.state.values[name, "translation"] + [0.02, -0.05, 0.03],
-    }
     _, out, _ = run(factor, replace(setup.state, values=values))
     R, p, _ = setup.truth_at(factor.stream.seconds + values[name, "time_offset"][0])
     R_imu_cam, p_imu_cam = values[name, "rotation"], values[name, "translation"]
     predicted = np.empty_like(factor.stream.uv)
     for n, (i, q) in enumerate(zip(factor.stream.image, factor.stream.point, strict=True)):
-        board = factor.points[q] + 2e-3 * factor.basis[q, 0] - 1e-3 * factor.basis[q, 1]
-        world = values["board0", "tilt"] @ board
+        body = target.bodies[target.body[q]]
+        point = target.points[q] + shapes[body, "shape"] @ bodies.basis[q]
+        if body != bodies.names[0]:
+            point = values[body, "rotation"] @ point + values[body, "translation"]
+        world = values["board0", "tilt"] @ point
         X = R_imu_cam.T @ (R[i].T @ (world - p[i]) - p_imu_cam)
         predicted[n] = project(sim_camera, X) + 0.3 * factor.direction[n]
     np.testing.assert_allclose(out.residual, predicted - factor.stream.uv, rtol=0, atol=1e-8)
@@ -245,6 +253,6 @@ def test_two_pieces_hold_what_one_holds(setup, near, factor_of, dense, scheme):
     cost, _, pieces = run(factor, near, sums=True)
     assert len(pieces) == 2
     whole = Piece.zeros(0, factor.n_nodes - 1, factor.layout.size)
-    assert factor.accumulate(near, whole, CornerOutput.empty(factor.stream, 0)) == pytest.approx(cost, rel=1e-12)
+    assert factor.accumulate(near, whole, factor.output()) == pytest.approx(cost, rel=1e-12)
     for a, b in zip(dense(pieces, factor.n_nodes), dense((whole,), factor.n_nodes), strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-12 * np.abs(b).max())

@@ -17,7 +17,7 @@ import pytest
 
 import icalib.estimation
 from icalib.estimation.arrowhead import Piece, make_pieces
-from icalib.estimation.corner_factor import CornerNoise, CornerOutput
+from icalib.estimation.corner_factor import CornerNoise
 from icalib.estimation.corner_weights import LEAST_CURVATURE
 from icalib.estimation.imu_factor import ROWS, ImuFactor
 from icalib.estimation.prior_factor import FIRST_BIAS_SIGMA, Prior, accumulate_bias_prior
@@ -78,11 +78,20 @@ def slope_along(loss, t):
 
 
 def corner_sample(
-    unlike, setup_of, factor_of, camera, scheme="inertial", loss="none", field=0, imu_free=False, curved=False
+    unlike,
+    setup_of,
+    factor_of,
+    camera,
+    scheme="inertial",
+    loss="none",
+    field=0,
+    imu_free=False,
+    curved=False,
+    split=False,
 ):
-    setup = setup_of(unlike, imu_free=imu_free, shape=2, bloom=True)
+    setup = setup_of(unlike, imu_free=imu_free, shape=True, bloom=True, split=split)
     rng = np.random.default_rng(1)
-    stream = unlike.measurements.cameras[camera]
+    stream = setup.streams[camera]
     n, m = len(stream.uv), len(stream.stamps_ns)
     # Few corners of each image, some of them far enough off that robust losses bend.
     sigma = rng.uniform(0.8, 1.2, m)
@@ -96,12 +105,11 @@ def corner_sample(
         keep=rng.random(n) < 0.15,
         noise=noise,
         direction=rng.normal(size=(n, 2)),
-        basis=rng.normal(size=(len(factor.points), 2, 3)),
     )
     state = setup.perturbed(rng, 0.02)
 
     def run(at):
-        out = CornerOutput.empty(stream, field)
+        out = factor.output()
         for piece in make_pieces(len(at.seconds), setup.layout.size):
             factor.accumulate(at, piece, out, sums=False)
         return out, out.root > 0
@@ -113,19 +121,20 @@ def corner_sample(
     def weights(at):
         out, used = run(at)
         root, f, image, r = out.root[used], noise.field[used], stream.image[used], out.residual[used]
-        e = r + np.einsum("nk,nak->na", f, out.shared[image])
+        view = factor.views.of_corner[used]
+        e = r + np.einsum("nk,nak->na", f, out.shared[view])
         size = np.linalg.norm(e, axis=1)
         bend = np.sqrt(slope_along(loss if curved else "none", size / sigma[image]))
         B = np.eye(2) + (bend - 1.0)[:, None, None] * np.einsum("ni,nj->nij", e, e) / (size**2)[:, None, None]
         B = np.block([[np.diag(root * B[:, i, j]) for j in range(2)] for i in range(2)])
         W = np.eye(2 * len(r))
-        for i in range(m if field else 0):
-            F = root[:, None] * f * (image == i)[:, None]
+        for i in range(len(factor.views.image) if field else 0):
+            F = root[:, None] * f * (view == i)[:, None]
             W -= np.kron(np.eye(2), F @ np.linalg.solve(F.T @ F + np.diag(noise.tau**-2), F.T))
         return (root[:, None] ** 2 * e).T.ravel(), B @ W @ B
 
     def accumulate(at, piece, sums):
-        return factor.accumulate(at, piece, CornerOutput.empty(stream, field), sums, curved)
+        return factor.accumulate(at, piece, factor.output(), sums, curved)
 
     tolerance = 1e-3 if field and loss != "none" else 1e-6
     return Sample("CornerFactor", setup, state, accumulate, residual, weights, tolerance)
@@ -190,6 +199,11 @@ SAMPLES = {
     "cauchy, common shift, curved": (
         "CornerFactor",
         lambda u, s, f: corner_sample(u, s, f, 1, loss="cauchy", field=1, curved=True),
+    ),
+    "three bodies": ("CornerFactor", lambda u, s, f: corner_sample(u, s, f, 0, imu_free=True, split=True)),
+    "three bodies, huber, common shift, pose": (
+        "CornerFactor",
+        lambda u, s, f: corner_sample(u, s, f, 1, "pose", loss="huber", field=1, curved=True, split=True),
     ),
     "prior on a rotation": ("Prior", lambda u, s, f: prior_sample(u, s, "cam1", "rotation")),
     "prior on a vector": ("Prior", lambda u, s, f: prior_sample(u, s, "cam0", "intrinsics")),

@@ -105,7 +105,7 @@ def problem(rig, recordings, request):
     real = request.param != "plain"
     settings = dataclasses.replace(rig.settings, bloom=real, board_shape=real, common_error=real, blur_noise=real)
     inputs = inputs_for(dataclasses.replace(rig, settings=settings), recordings)
-    state = first_state(inputs, *initial_guesses(rig, recordings))
+    state = first_state(inputs, *initial_guesses(rig, inputs.bodies, recordings))
     if real:
         state.values["board0", "shape"][:] = 1e-3
     models = [NoiseModel(0.2, tau=(0.1,) if real else ()) for _ in rig.cameras]

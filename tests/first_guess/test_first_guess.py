@@ -9,7 +9,7 @@ import pytest
 
 from icalib.errors import EstimationError
 from icalib.first_guess import initial_guess, initial_trajectory
-from icalib.first_guess.target_poses import target_poses
+from icalib.first_guess.target_poses import Flat, target_poses
 from icalib.geometry.cameras import camera_model
 from icalib.measurements import ImuStream, Measurements
 from icalib.rig import Parameter, Rig
@@ -229,7 +229,7 @@ def test_corners_on_a_line_have_no_pose_and_stop_nothing(simulation: Simulation)
     on_a_line = dataclasses.replace(stream, uv=np.column_stack([stream.uv[:, 0], np.full(len(stream.uv), 240.0)]))
     camera = rig_for(simulation.scenario).cameras[0]
     params = np.concatenate([simulation.truth.intrinsics["cam0"], simulation.truth.distortion["cam0"]])
-    poses = target_poses(on_a_line, camera_model(camera.model), params, simulation.scenario.target.points)
+    poses = target_poses(on_a_line, camera_model(camera.model), params, Flat(simulation.scenario.target.points))
     assert not poses.ok.any()
 
 

@@ -92,7 +92,7 @@ def test_the_truth_is_beside_the_tables(simulation, folder):
     truth = yaml.safe_load((folder / "truth.yaml").read_text())
     assert truth["seed"] == 3 and set(truth["sensors"]) == {"imu0", "cam0", "cam1", "cam2", "lidar0", "wheel0"}
     np.testing.assert_array_equal(truth["planes"], simulation.truth.planes)
-    np.testing.assert_array_equal(truth["T_world_board"], simulation.truth.T_world_board)
+    np.testing.assert_array_equal(truth["T_world_bodies"], simulation.truth.T_world_bodies)
     for name, sensor in truth["sensors"].items():
         if name != "imu0":
             assert sensor["time_offset"] == simulation.truth.time_offset[name]

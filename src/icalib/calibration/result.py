@@ -154,6 +154,15 @@ class Calibration:
         return T
 
     @property
+    def bodies(self) -> tuple[str, ...]:
+        """Names of the target's bodies where it has several, the one whose frame is the scene's first."""
+        return tuple(g.sensor for g in self.groups if g.name == "rotation" and g.sensor not in self.rig["sensors"])
+
+    def T_scene_body(self, body: str) -> np.ndarray:
+        """4x4 pose of a body of the target in the scene, the frame of the first of `bodies`."""
+        return self.T_imu_sensor(body)
+
+    @property
     def imu(self) -> str | None:
         """Name of the IMU, if there is one."""
         return next(iter(self._of_type("imu")), None)

@@ -17,6 +17,7 @@ HEADER = """\
 # time_offset: t_{body} = t_sensor + time_offset.
 # std: standard deviations, of rotation about the sensor's axes, of translation along the {body} axes. They include
 #   empirical_factor, by which parts of the recording disagree more than their noise explains; formal = std / factor.
+# T_scene_body: poses of a target's bodies, in the frame of that body whose pose is the identity.
 # verdict: determined, weak or undetermined by the data, or fixed by the rig file. Undetermined values are guesses.
 # The full covariance and all residuals are in result.npz.
 """
@@ -28,7 +29,7 @@ def calibration_yaml(calibration: Calibration) -> str:
     c = calibration
     names = list(dict.fromkeys([*c.rig["sensors"], *(g.sensor for g in c.groups)]))
     sensors = {n: _sensor(c, n) for n in names if n in c.rig["sensors"]}
-    targets = {n: _entry(c, n) for n in names if n not in c.rig["sensors"]}
+    targets = {n: _target(c, n) for n in names if n not in c.rig["sensors"]}
     data = {
         "status": c.status,
         "converged": bool(c.converged),
@@ -64,6 +65,11 @@ def _sensor(c: Calibration, name: str) -> dict[str, Any]:
     fixed = {"rotation": ["fixed"] * 3, "translation": ["fixed"] * 3, "time_offset": "fixed"}
     pose = {"type": kind, "T_imu_sensor": np.eye(4).tolist(), "time_offset": 0.0}
     return pose | entry | {"std": still | entry["std"], "verdict": fixed | entry["verdict"]}
+
+
+def _target(c: Calibration, name: str) -> dict[str, Any]:
+    pose = {"T_scene_body": c.T_scene_body(name).tolist()} if name in c.bodies else {}
+    return pose | _entry(c, name)
 
 
 def _entry(c: Calibration, name: str) -> dict[str, Any]:

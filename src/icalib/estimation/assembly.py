@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.board import SHAPE_LABELS, SHAPE_SIGMA_M, bloom_direction, board_in, shape_basis
+from icalib.estimation.board import SHAPE_LABELS, SHAPE_SIGMA_M, bloom_direction, board_in
+from icalib.estimation.bodies import Bodies, choose_bodies, restrict
 from icalib.estimation.corner_factor import CornerFactor, CornerNoise
 from icalib.estimation.free_nodes import FreeNodes
 from icalib.estimation.imu_data import ImuData, joined_imu_data
@@ -18,14 +19,14 @@ from icalib.estimation.nodes import MERGED_WITHIN_S, distinct, first_nodes, plac
 from icalib.estimation.poses import assign_nodes, poses_at
 from icalib.estimation.prior_factor import Prior
 from icalib.estimation.problem import ChainFactor, Problem
-from icalib.estimation.state import Key, Kind, Layout, State, make_layout
+from icalib.estimation.state import Entry, Key, Kind, Layout, State, make_layout
 from icalib.estimation.tolerances import Tolerances
 from icalib.geometry.cameras import camera_model
+from icalib.geometry.targets.base import BOARD
 from icalib.joining import Part, join
 from icalib.measurements import CornerStream, Measurements
 from icalib.rig import Camera, Parameter, Rig, Scheme
 
-BOARD = "board0"
 BLOOM_SIGMA_PX = 1.0
 CAMERA_PARAMETERS: tuple[tuple[str, Kind], ...] = (
     ("rotation", "rotation"),
@@ -40,14 +41,20 @@ SIZES = {"rotation": 3, "translation": 3, "time_offset": 1, "intrinsics": 4, "bl
 
 @dataclass(frozen=True)
 class Inputs:
-    """What does not change from pass to pass. parts: the recordings that `measurements` were joined from."""
+    """What does not change from pass to pass. bodies: what of the target is used; parts: the recordings that
+    `measurements` were joined from."""
 
     rig: Rig
     measurements: Measurements
+    bodies: Bodies
     imu: ImuData | None
     layout: Layout
     tolerances: Tolerances
     parts: tuple[Part, ...]
+
+    def is_sensor(self, name: str) -> bool:
+        """Whether `name` is a sensor's, not a body's of the target."""
+        return name == self.rig.body or name in [c.name for c in self.rig.cameras]
 
     @property
     def motions(self) -> tuple[Part, ...]:
@@ -61,28 +68,27 @@ class Inputs:
 
 def inputs_for(rig: Rig, recordings: Sequence[Measurements]) -> Inputs:
     """Of one recording or several, joined."""
-    joined, parts = join(rig, recordings)
-    return Inputs(
-        rig, joined, joined_imu_data(rig, parts, joined), layout_for(rig, len(parts)), Tolerances(), parts
-    )  # fmt: skip
+    bodies = choose_bodies(rig.target, recordings, rig.settings.board_shape)
+    joined, parts = join(rig, [restrict(bodies, r) for r in recordings])
+    layout = layout_for(rig, bodies, len(parts))
+    return Inputs(rig, joined, bodies, joined_imu_data(rig, parts, joined), layout, Tolerances(), parts)
 
 
-def layout_for(rig: Rig, n_recordings: int = 1) -> Layout:
-    """The border: IMU intrinsics, board, then each camera's parameters."""
+def layout_for(rig: Rig, bodies: Bodies, n_recordings: int = 1) -> Layout:
+    """The border: IMU intrinsics, the scene and its bodies, then each camera's parameters."""
     imu = rig.imu
-    entries: list[tuple[str, str, Kind, int, bool]] = []
+    entries: list[Entry] = []
     if imu is not None:
         entries.append((imu.name, "intrinsics", "vector", N_INTRINSICS, imu.intrinsics.mode != "fixed"))
-    bends = rig.settings.board_shape
-    # Without an IMU the board's frame is the world's, in all recordings.
+    # Without an IMU the scene's frame is the world's, in all recordings.
     for k in range(1 if imu is None else n_recordings):
         entries.append((board_in(BOARD, k), "tilt", "tilt", 2, imu is not None))
-    entries.append((BOARD, "shape", "vector", len(SHAPE_LABELS) if bends else 0, bends))
+    entries += bodies.shape_entries()
     for camera in rig.cameras:
         sizes = SIZES | {"distortion": len(camera_model(camera.model).parameter_names) - 4}
         for name, kind in CAMERA_PARAMETERS:
             entries.append((camera.name, name, kind, sizes[name], _is_estimated(rig, camera, name)))
-    return make_layout(entries)
+    return make_layout(entries + bodies.pose_entries())
 
 
 def _is_estimated(rig: Rig, camera: Camera, name: str) -> bool:
@@ -99,8 +105,8 @@ def origin_difference(measurements: Measurements, stream: CornerStream) -> float
 def _priors(inputs: Inputs) -> tuple[Prior, ...]:
     rig, layout = inputs.rig, inputs.layout
     priors = []
-    if rig.settings.board_shape:
-        priors.append(Prior(layout.block(BOARD, "shape"), np.zeros(len(SHAPE_LABELS)), SHAPE_SIGMA_M))
+    for name in inputs.bodies.bending:
+        priors.append(Prior(layout.block(name, "shape"), np.zeros(len(SHAPE_LABELS)), SHAPE_SIGMA_M))
     owners: list[tuple[str, str, Parameter, float]] = []
     if rig.imu is not None:
         owners.append((rig.imu.name, "intrinsics", rig.imu.intrinsics, 0.0))
@@ -153,7 +159,6 @@ def nodes_for(inputs: Inputs, times: list[np.ndarray]) -> np.ndarray:
 def assemble(inputs: Inputs, state: State, noise: list[CornerNoise], keep: list[np.ndarray]) -> Problem:
     """The problem at the nodes of `state`, everything frozen that a pass freezes: nodes, assignment, preintegration."""
     rig, layout = inputs.rig, inputs.layout
-    basis = shape_basis(rig.target, rig.settings.board_shape)
     factors = []
     scheme = rig.settings.scheme if inputs.imu is not None else "inertial"
     times = image_times(inputs, state.values)
@@ -165,7 +170,7 @@ def assemble(inputs: Inputs, state: State, noise: list[CornerNoise], keep: list[
         seen = is_seen(inputs, t, state.seconds[node])
         factor = CornerFactor(
             stream, camera_model(camera.model), inputs.imu, rig.gravity, scheme, stream.seconds, node,
-            k & np.repeat(seen, np.diff(stream.start)), n, np.zeros((0, 2)), BOARD, rig.target.points, basis, layout,
+            k & np.repeat(seen, np.diff(stream.start)), n, np.zeros((0, 2)), inputs.bodies, layout,
             len(state.seconds), tuple(images.start for images in own[1:]),
         )  # fmt: skip
         factors.append(_with_bloom(factor, camera, state, rig) if rig.blooms else factor)
@@ -198,7 +203,7 @@ def _with_bloom(factor: CornerFactor, camera: Camera, state: State, rig: Rig) ->
     """The factor with the directions in which its corners bloom, frozen at `state`."""
     X, R_cb = factor.points_in_camera(state)
     inwards = (rig.target.tag_centers - rig.target.points)[factor.stream.point]
-    towards = np.einsum("nij,nj->ni", R_cb[factor.stream.image], inwards)
+    towards = np.einsum("nij,nj->ni", R_cb[factor.views.of_corner], inwards)
     params = np.concatenate([state.values[camera.name, "intrinsics"], state.values[camera.name, "distortion"]])
     return factor.with_direction(bloom_direction(factor.model, params, X, towards))
 
@@ -206,8 +211,10 @@ def _with_bloom(factor: CornerFactor, camera: Camera, state: State, rig: Rig) ->
 def start_values(inputs: Inputs, guess_values: dict[Key, np.ndarray]) -> dict[Key, np.ndarray]:
     """Values of all blocks: the guess, completed by what starts from zero."""
     values = dict(guess_values)
-    n_shape = inputs.layout.block(BOARD, "shape").size
-    values[BOARD, "shape"] = np.zeros(n_shape)
+    for name in inputs.bodies.bending:
+        values[name, "shape"] = np.zeros(len(SHAPE_LABELS))
+    reference = inputs.bodies.names[0]
+    values[reference, "rotation"], values[reference, "translation"] = np.eye(3), np.zeros(3)
     if (imu := inputs.rig.imu) is not None:
         given = imu.intrinsics.value
         values[imu.name, "intrinsics"] = np.zeros(N_INTRINSICS) if given is None else given.copy()

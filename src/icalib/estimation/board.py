@@ -19,26 +19,30 @@ SHAPE_SIGMA_M = np.array([3e-3] * len(BOW_LABELS) + [1e-3] * len(IN_PLANE_LABELS
 _RECORDING = " in recording "
 
 
-def is_board(sensor: str, target: str) -> bool:
-    """Whether `sensor` is `target`, in whichever recording."""
-    return sensor.partition(_RECORDING)[0] == target
-
-
 def board_in(target: str, recording: int) -> str:
-    """Name of the target as it stands in one of several recordings, counted from 0: its shape is the same in all, its
-    attitude is not."""
+    """Name of the scene as it stands in one of several recordings, counted from 0: its bodies stand to each other alike
+    in all, its attitude is not the same."""
     return target if recording == 0 else f"{target}{_RECORDING}{recording + 1}"
 
 
-def shape_basis(target: Target, bends: bool) -> np.ndarray:
-    """(n_points, s, 3) displacement in the board frame by unit of each shape parameter [m].
-
-    With x and y from -1 to 1 over the target: the bow z = a x^2 + b x y + c y^2; stretch (x, -y) and shear (y, x); and
-    x or y moved by x^2, x y, y^2.
-    """
-    if not bends:
+def shape_basis(target: Target, bent: bool) -> np.ndarray:
+    """(n_points, s, 3) displacement in the frame of each point's body by unit of the body's shape parameters [m]; zeros
+    for bodies that do not bend, s = 0 where none may."""
+    if not (bent and target.bends.any()):
         return np.zeros((len(target.points), 0, 3))
-    xy = target.points[:, :2]
+    basis = np.zeros((len(target.points), len(SHAPE_LABELS), 3))
+    for k in np.flatnonzero(target.bends):
+        own = target.body == k
+        basis[own] = _basis_of_one(target.points[own, :2])
+    return basis
+
+
+def _basis_of_one(xy: np.ndarray) -> np.ndarray:
+    """(n, s, 3) of the body with points xy (n, 2).
+
+    With x and y from -1 to 1 over it: the bow z = a x^2 + b x y + c y^2; stretch (x, -y) and shear (y, x); and x or y
+    moved by x^2, x y, y^2.
+    """
     low, high = xy.min(axis=0), xy.max(axis=0)
     x, y = ((xy - 0.5 * (low + high)) / (0.5 * (high - low))).T
     o = np.zeros_like(x)

@@ -1,23 +1,26 @@
 """Corners of a known target in the images of one camera (paper (20)-(22)).
 
-residual = K(X) + bloom * direction - uv,  X = R_cam_world (R_world_board P - p_world_cam),
-P the target's point, moved by the board's shape. All corners of an image share one pose: their small Gram matrix over
-(camera pose, what belongs to the camera or the board) is summed first, the pose's Jacobians are applied once an image.
+residual = K(X) + bloom * direction - uv,  X = R_cam_world (R_world_scene (R_scene_body P + p_scene_body) - p_world_cam)
+with P the target's point, moved by its body's shape. All corners of one body in an image, a view, share one pose: their
+small Gram matrix over (pose, what belongs to the camera or the body) is summed first, the pose's Jacobians are applied
+once a view.
 
-An error that all corners of an image share, a field of functions of the corner with sizes N(0, tau^2), is marginalised
-image by image.
+An error that all corners of a view share, a field of functions of the corner with sizes N(0, tau^2), is marginalised
+view by view.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 
 from icalib.estimation.arrowhead import Piece
 from icalib.estimation.board import board_in
+from icalib.estimation.bodies import Bodies
 from icalib.estimation.corner_kernels import (
     Direct,
     Found,
@@ -34,10 +37,11 @@ from icalib.estimation.imu_data import ImuData
 from icalib.estimation.poses import Poses, poses_at, poses_of_nodes
 from icalib.estimation.state import Layout, State
 from icalib.geometry.cameras.base import CameraModel
+from icalib.geometry.targets.base import BOARD
 from icalib.measurements import CornerStream
 from icalib.rig import Scheme
 
-CHUNK = 64  # images at a time: what a chunk needs stays in the cache
+CHUNK = 64  # views at a time: what a chunk needs stays in the cache
 LOSSES = {"none": 0, "huber": 1, "cauchy": 2}
 
 
@@ -56,17 +60,39 @@ class CornerNoise:
 @dataclass(frozen=True)
 class CornerOutput:
     """Per corner: residual (N, 2) px, predicted - measured, and root (N,), square root of its weight over sigma (0
-    where
-    left out); per image: shared (M, 2, m), the sizes of the common error."""
+    where left out); per view: shared (V, 2, m), the sizes of the common error."""
 
     residual: np.ndarray
     root: np.ndarray
     shared: np.ndarray
 
     @classmethod
-    def empty(cls, stream: CornerStream, m: int) -> CornerOutput:
-        n = len(stream.uv)
-        return cls(np.zeros((n, 2)), np.zeros(n), np.zeros((len(stream.stamps_ns), 2, m)))
+    def empty(cls, n: int, n_views: int, m: int) -> CornerOutput:
+        """For n corners in `n_views` views with m sizes of a common error."""
+        return cls(np.zeros((n, 2)), np.zeros(n), np.zeros((n_views, 2, m)))
+
+
+@dataclass(frozen=True)
+class Views:
+    """One body of the target in one image each: corners of view j are start[j]:start[j + 1]; image and body (V,)."""
+
+    start: np.ndarray
+    image: np.ndarray
+    body: np.ndarray
+
+    @classmethod
+    def of(cls, stream: CornerStream, body: np.ndarray) -> Views:
+        """Of a stream whose corners stand body by body in each image; body (n_points,) of each point."""
+        own, image = body[stream.point], stream.image
+        fresh = np.ones(len(own), dtype=bool)
+        fresh[1:] = (np.diff(image) != 0) | (np.diff(own) != 0)
+        first = np.flatnonzero(fresh)
+        return cls(np.append(first, len(own)).astype(np.int64), image[first], own[first])
+
+    @cached_property
+    def of_corner(self) -> np.ndarray:
+        """(N,) the view that each corner belongs to."""
+        return np.repeat(np.arange(len(self.image)), np.diff(self.start))
 
 
 @dataclass(frozen=True)
@@ -75,8 +101,7 @@ class CornerFactor:
 
     times (M,): stamps on the imu clock at zero offset beyond `stream`'s origin; node (M,), increasing: the node each
     image hangs on; keep (N,): corners in use; direction (N, 2) image direction of the bloom, (0, 2) without it;
-    basis (n_points, s, 3): how the target's points move with its shape; seams: the images that begin further
-    recordings, in which the target stands elsewhere.
+    seams: the images that begin further recordings, in which the scene stands elsewhere.
     """
 
     stream: CornerStream
@@ -89,9 +114,7 @@ class CornerFactor:
     keep: np.ndarray
     noise: CornerNoise
     direction: np.ndarray
-    target: str
-    points: np.ndarray
-    basis: np.ndarray
+    bodies: Bodies
     layout: Layout
     n_nodes: int
     seams: tuple[int, ...] = ()
@@ -100,18 +123,21 @@ class CornerFactor:
     def name(self) -> str:
         return self.stream.name
 
-    def boards(self, i0: int, i1: int) -> Iterator[tuple[int, int, str]]:
-        """Images i0..i1 recording by recording, each with the name of the target there."""
-        for k, (first, end) in enumerate(pairwise((0, *self.seams, len(self.node)))):
-            a, b = max(i0, first), min(i1, end)
-            if a < b:
-                yield a, b, board_in(self.target, k)
+    @cached_property
+    def views(self) -> Views:
+        return Views.of(self.stream, self.bodies.target.body)
 
-    def world_points(self, state: State, board: str) -> np.ndarray:
-        """(n_points, 3) the target's points, shape included, in the world frame of `board`'s recording."""
-        shape = state.values[self.target, "shape"]
-        points = self.points + np.einsum("nsk,s->nk", self.basis, shape)
-        return points @ state.values[board, "tilt"].T
+    def parts(self, v0: int, v1: int) -> Iterator[tuple[int, int, str]]:
+        """Views v0..v1 recording by recording, each with the name of the scene there."""
+        seams = np.searchsorted(self.views.image, (0, *self.seams, len(self.node)))
+        for k, (first, end) in enumerate(pairwise(seams)):
+            a, b = max(v0, int(first)), min(v1, int(end))
+            if a < b:
+                yield a, b, board_in(BOARD, k)
+
+    def world_points(self, state: State, scene: str) -> np.ndarray:
+        """(n_points, 3) the target's points, shapes included, in the world frame of `scene`'s recording."""
+        return self.bodies.points(state.values) @ state.values[scene, "tilt"].T
 
     def camera_poses(self, state: State, i0: int = 0, i1: int | None = None) -> tuple[Poses, np.ndarray, np.ndarray]:
         """IMU poses, and R_cam_world (n, 3, 3), p_world_cam (n, 3) at the instants of images i0..i1."""
@@ -126,26 +152,34 @@ class CornerFactor:
         return poses, R_cw, poses.position + poses.rotation @ p_ic
 
     def points_in_camera(self, state: State) -> tuple[np.ndarray, np.ndarray]:
-        """X (N, 3), each corner's point in its camera's frame, and R_cam_board (M, 3, 3)."""
+        """X (N, 3), each corner's point in its camera's frame, and R_cam_body (V, 3, 3) of each view."""
         _, R_cw, p_wc = self.camera_poses(state)
-        X, R_cb, start = np.empty((len(self.stream.uv), 3)), np.empty_like(R_cw), self.stream.start
-        for a, b, board in self.boards(0, len(self.node)):
-            world = self.world_points(state, board)
+        views, R_sb = self.views, self.bodies.poses(state.values)[0]
+        R_cw, p_wc = R_cw[views.image], p_wc[views.image]
+        X, R_cb, start = np.empty((len(self.stream.uv), 3)), np.empty_like(R_cw), views.start
+        for a, b, scene in self.parts(0, len(views.image)):
+            world = self.world_points(state, scene)
             camera_points(a, b, start, self.stream.point, R_cw, p_wc, world, X[start[a] : start[b]])
-            R_cb[a:b] = R_cw[a:b] @ state.values[board, "tilt"]
+            R_cb[a:b] = R_cw[a:b] @ state.values[scene, "tilt"] @ R_sb[views.body[a:b]]
         return X, R_cb
+
+    def output(self) -> CornerOutput:
+        """Empty arrays for `accumulate` to fill."""
+        return CornerOutput.empty(len(self.stream.uv), len(self.views.image), len(self.noise.tau))
 
     def with_direction(self, direction: np.ndarray) -> CornerFactor:
         """The same factor with bloom along `direction` (N, 2)."""
         return replace(self, direction=direction)
 
-    def _columns(self, board: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Border columns of the chained and of the direct parameters, and which model parameters the latter hold."""
+    def _columns(self, scene: str, body: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Border columns of the chained (n, c) and of the direct parameters (n, d) of views of `body` (n,), and which
+        model parameters the latter hold."""
         nothing = np.zeros(0, dtype=np.int64)
         imu = nothing if self.imu is None else self.layout.columns(self.imu.name, "intrinsics")
+        pose, shape = (columns[body] for columns in self.bodies.columns(self.layout))
         chained = [
             self.layout.columns(self.name, "rotation", "translation", "time_offset"),
-            self.layout.columns(board, "tilt"),
+            self.layout.columns(scene, "tilt"),
             imu[imu >= 0],
         ]
         model = self.layout.columns(self.name, "intrinsics", "distortion")
@@ -153,8 +187,8 @@ class CornerFactor:
         direct = [model[pars]]
         if len(self.direction):
             direct.append(self.layout.columns(self.name, "bloom"))
-        direct.append(self.layout.columns(self.target, "shape"))
-        return np.concatenate(chained), np.concatenate(direct), pars
+        chained_of_all, direct_of_all = (np.tile(np.concatenate(own), (len(body), 1)) for own in (chained, direct))
+        return np.concatenate([chained_of_all, pose], axis=1), np.concatenate([direct_of_all, shape], axis=1), pars
 
     def accumulate(
         self,
@@ -168,16 +202,16 @@ class CornerFactor:
         """Fills `out` for the images whose node lies in `piece`, and adds them to its sums where `sums` are wanted.
 
         Returns half the robust chi^2. `curved`: J^T J has the true curvature of the robust loss, not its weights alone.
-        With `noise` (corners (N, 2), common errors (M, 2, m), white) in place of the
-        whitened residuals, returns the quadratic form of the common errors' rows instead.
+        With `noise` (corners (N, 2), common errors (V, 2, m), white) in place of the whitened residuals, returns the
+        quadratic form of the common errors' rows instead.
         """
         white, white_shared = noise or (out.residual, out.shared)
         into, total = piece.sums(sums), 0.0
-        for i0, i1, board in self.boards(*self._images(piece)):
-            images, noise_model, direct, motion = self._arguments(state, i0, i1, board, curved)
-            given = Given(noise is not None, white, white_shared[i0:i1])
-            found = Found(out.residual, out.root, out.shared[i0:i1])
-            for a, b, predicted in self._chunks(state, images, motion, board, sums):
+        for v0, v1, scene in self.parts(*self._views_of(piece)):
+            images, noise_model, direct, motion = self._arguments(state, v0, v1, scene, curved)
+            given = Given(noise is not None, white, white_shared[v0:v1])
+            found = Found(out.residual, out.root, out.shared[v0:v1])
+            for a, b, predicted in self._chunks(state, images, motion, scene, sums):
                 total += accumulate(a, b, images, noise_model, direct, motion, predicted, given, into, found)
         return total
 
@@ -187,38 +221,50 @@ class CornerFactor:
         """Adds the gradient of each cluster of corners (N,), weights as in `at`, to columns of `piece` from
         `column` on."""
         into = piece.sums(True)
-        for i0, i1, board in self.boards(*self._images(piece)):
-            images, noise, direct, motion = self._arguments(state, i0, i1, board, False)
-            found = Found(at.residual, at.root, at.shared[i0:i1])
-            for a, b, predicted in self._chunks(state, images, motion, board, True):
+        for v0, v1, scene in self.parts(*self._views_of(piece)):
+            images, noise, direct, motion = self._arguments(state, v0, v1, scene, False)
+            found = Found(at.residual, at.root, at.shared[v0:v1])
+            for a, b, predicted in self._chunks(state, images, motion, scene, True):
                 accumulate_clusters(
                     a, b, cluster, n_clusters, column, images, noise, direct, motion, predicted, into, found
                 )  # fmt: skip
 
     def _arguments(
-        self, state: State, i0: int, i1: int, board: str, curved: bool
+        self, state: State, v0: int, v1: int, scene: str, curved: bool
     ) -> tuple[Images, Noise, Direct, Motion]:
-        """What the kernels need to know of images i0..i1, of one recording."""
-        chained, direct, pars = self._columns(board)
-        poses, R_cw, p_wc = self.camera_poses(state, i0, i1)
+        """What the kernels need to know of views v0..v1, of one recording."""
+        image, body = self.views.image[v0:v1], self.views.body[v0:v1]
+        chained, direct, pars = self._columns(scene, body)
         s, n = self.stream, self.noise
-        images = Images(s.start[i0 : i1 + 1], s.uv, s.point, self.keep, self.node[i0:i1])
-        noise = Noise(n.sigma[i0:i1], LOSSES[n.loss], n.loss_scale, curved, n.field, 1.0 / n.tau**2)
+        images = Images(self.views.start[v0 : v1 + 1], s.uv, s.point, self.keep, self.node[image])
+        noise = Noise(n.sigma[image], LOSSES[n.loss], n.loss_scale, curved, n.field, 1.0 / n.tau**2)
         bloom = float(state.values[self.name, "bloom"][0])
-        basis = self.basis @ state.values[board, "tilt"].T
-        R_ic, p_ic = state.values[self.name, "rotation"], state.values[self.name, "translation"]
-        motion = Motion(
-            np.ascontiguousarray(R_ic), p_ic, R_cw, p_wc, poses.rate, poses.velocity,
-            poses.by_node, poses.by_next, poses.by_imu, chained,
-        )  # fmt: skip
+        R_ws, R_sb = state.values[scene, "tilt"], self.bodies.poses(state.values)[0]
+        basis = np.ascontiguousarray(self.bodies.basis @ (R_ws @ R_sb)[self.bodies.target.body].transpose(0, 2, 1))
+        motion = self._motion(state, image, body, R_ws, chained)
         return images, noise, Direct(pars, bloom, self.direction, basis, direct), motion
 
+    def _motion(
+        self, state: State, image: np.ndarray, body: np.ndarray, R_ws: np.ndarray, chained: np.ndarray
+    ) -> Motion:
+        """What moves views of `body` (n,) in images (n,), one behind the other."""
+        i0 = int(image[0])
+        poses, R_cw, p_wc = self.camera_poses(state, i0, int(image[-1]) + 1)
+        own = slice(None) if np.array_equal(image, np.arange(i0, i0 + len(R_cw))) else image - i0
+        R_sb, p_sb = (x[body if self.bodies.several else body[:0]] for x in self.bodies.poses(state.values))
+        R_ic, p_ic = state.values[self.name, "rotation"], state.values[self.name, "translation"]
+        return Motion(
+            np.ascontiguousarray(R_ic), p_ic, R_cw[own], p_wc[own], poses.rate[own], poses.velocity[own],
+            poses.by_node[own], poses.by_next[own] if len(poses.by_next) else poses.by_next, poses.by_imu[own],
+            np.ascontiguousarray(R_ws), R_ws @ R_sb, p_sb @ R_ws.T, chained,
+        )  # fmt: skip
+
     def _chunks(
-        self, state: State, images: Images, motion: Motion, board: str, jacobians: bool
+        self, state: State, images: Images, motion: Motion, scene: str, jacobians: bool
     ) -> Iterator[tuple[int, int, Predicted]]:
-        """Images a..b by the chunk, and what the model makes of them."""
+        """Views a..b by the chunk, and what the model makes of them."""
         params = np.concatenate([state.values[self.name, "intrinsics"], state.values[self.name, "distortion"]])
-        world, start = self.world_points(state, board), images.start
+        world, start = self.world_points(state, scene), images.start
         for a in range(0, len(images.node), CHUNK):
             b = min(a + CHUNK, len(images.node))
             X = np.empty((start[b] - start[a], 3))
@@ -229,8 +275,9 @@ class CornerFactor:
                 uv, valid = self.model.project(params, X)
                 yield a, b, Predicted(int(start[a]), X, uv, valid, np.zeros((0, 2, 3)), np.zeros((0, 2, 0)))
 
-    def _images(self, piece: Piece) -> tuple[int, int]:
-        """The images that belong to `piece`: nodes from first to before last, the chain's very last node included."""
+    def _views_of(self, piece: Piece) -> tuple[int, int]:
+        """The views that belong to `piece`: nodes from first to before last, the chain's very last node included."""
         stop = piece.last + 1 if piece.last == self.n_nodes - 1 else piece.last
-        i0, i1 = np.searchsorted(self.node, [piece.first, stop])
-        return int(i0), int(i1)
+        images = np.searchsorted(self.node, [piece.first, stop])
+        v0, v1 = np.searchsorted(self.views.image, images)
+        return int(v0), int(v1)

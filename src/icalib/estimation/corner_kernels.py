@@ -10,12 +10,13 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from icalib.estimation.corner_chain import add_clusters, add_image, pose_chain
 from icalib.estimation.corner_weights import bend, marginalise_shared, robust_weights, weight, whole_error
-from icalib.geometry import so3
 
 
 class Images(NamedTuple):
-    """What was seen: corners of image i are start[i]:start[i+1]; uv (N, 2), point (N,), keep (N,); node (n,)."""
+    """What was seen, each body of the target in an image taken as an image of its own: corners of image i are
+    start[i]:start[i+1]; uv (N, 2), point (N,), keep (N,); node (n,)."""
 
     start: np.ndarray
     uv: np.ndarray
@@ -38,7 +39,7 @@ class Noise(NamedTuple):
 
 class Direct(NamedTuple):
     """What shows in the image beyond the pose: model parameters `pars` that are free, bloom along direction (N, 2) or
-    (0, 2), the shape's basis (n_points, s, 3) in the world; columns: theirs in the border, -1 where fixed."""
+    (0, 2), the shape's basis (n_points, s, 3) in the world; columns (n, d): theirs in the border, -1 where fixed."""
 
     pars: np.ndarray
     bloom: float
@@ -48,8 +49,9 @@ class Direct(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Camera in the IMU, camera poses (n, ...) in the world, and of the IMU what `Poses` holds; columns: those of the
-    border that act through the pose."""
+    """Camera in the IMU, camera poses (n, ...) in the world, of the IMU what `Poses` holds, and where there are several
+    bodies the scene's rotation and each image's body (n, ...) in the world; columns (n, c): those of the border that
+    act through the pose."""
 
     R_imu_cam: np.ndarray
     p_imu_cam: np.ndarray
@@ -60,6 +62,9 @@ class Motion(NamedTuple):
     by_node: np.ndarray
     by_next: np.ndarray
     by_imu: np.ndarray
+    R_world_scene: np.ndarray
+    R_world_body: np.ndarray
+    p_world_body: np.ndarray
     columns: np.ndarray
 
 
@@ -183,127 +188,6 @@ def _turn(R, b, out):
 
 
 @njit(cache=True, nogil=True)
-def _by_imu_pose(R_ic, p_ic, R_cw):
-    """(6, 6) camera pose (right rotation, position in camera axes) by the IMU's (right rotation, position)."""
-    A = np.zeros((6, 6))
-    lever = so3.hat(p_ic)
-    for i in range(3):
-        for j in range(3):
-            A[i, j] = R_ic[j, i]
-            A[3 + i, 3 + j] = R_cw[i, j]
-            for k in range(3):
-                A[3 + i, j] -= R_ic[k, i] * lever[k, j]
-    return A
-
-
-@njit(cache=True, nogil=True)
-def _product(A, J, out, column):
-    """out[:, column:] = A J for A (6, 6)."""
-    for i in range(6):
-        for j in range(J.shape[1]):
-            s = 0.0
-            for k in range(6):
-                s += A[i, k] * J[k, j]
-            out[i, column + j] = s
-
-
-@njit(cache=True, nogil=True)
-def _chain(i, motion, Tn, Tm, Tc):
-    """Camera pose (right rotation, position in camera axes) by the nodes (Tn, Tm) and the chained border (Tc).
-
-    Chained border: rotation 3, translation 3, time offset 1, tilt of the board 2, IMU intrinsics 24 or 0.
-    """
-    R_ic, R_cw, p_wc = motion.R_imu_cam, motion.R_cam_world[i], motion.p_world_cam[i]
-    A = _by_imu_pose(R_ic, motion.p_imu_cam, R_cw)
-    _product(A, motion.by_node[i], Tn, 0)
-    if len(motion.by_next):
-        _product(A, motion.by_next[i], Tm, 0)
-    _product(A, motion.by_imu[i], Tc, 9)
-    for r in range(6):
-        Tc[r, 6] = 0.0
-        for k in range(3):
-            Tc[r, 6] += A[r, k] * motion.rate[i, k] + A[r, 3 + k] * motion.velocity[i, k]
-    for r in range(3):
-        for j in range(3):
-            Tc[r, j] = 1.0 if r == j else 0.0
-            Tc[3 + r, j] = 0.0
-            Tc[r, 3 + j] = 0.0
-            Tc[3 + r, 3 + j] = R_ic[j, r]
-        # Turning the board about world x (y) is turning the camera the other way about the board's origin.
-        Tc[r, 7], Tc[r, 8] = -R_cw[r, 0], -R_cw[r, 1]
-        Tc[3 + r, 7] = R_cw[r, 1] * p_wc[2] - R_cw[r, 2] * p_wc[1]
-        Tc[3 + r, 8] = R_cw[r, 2] * p_wc[0] - R_cw[r, 0] * p_wc[2]
-
-
-@njit(cache=True, nogil=True)
-def _outer_add(Ti, G, Tj, out):
-    """out += Ti^T G[:6, :6] Tj."""
-    W = np.zeros((6, Tj.shape[1]))
-    for i in range(6):
-        for k in range(6):
-            f = G[i, k]
-            for j in range(Tj.shape[1]):
-                W[i, j] += f * Tj[k, j]
-    for k in range(6):
-        for i in range(Ti.shape[1]):
-            f = Ti[k, i]
-            if f != 0.0:
-                for j in range(Tj.shape[1]):
-                    out[i, j] += f * W[k, j]
-
-
-@njit(cache=True, nogil=True)
-def _add_side(T, G, D, Tc, cols_c, cols_d, side):
-    """Node (through T) with the border and the gradient: side (15, B + 1)."""
-    n_b = side.shape[1] - 1
-    full = np.zeros((T.shape[1], Tc.shape[1]))
-    _outer_add(T, G, Tc, full)
-    for i in range(T.shape[1]):
-        for j in range(len(cols_c)):
-            if cols_c[j] >= 0:
-                side[i, cols_c[j]] += full[i, j]
-        for k in range(6):
-            f = T[k, i]
-            if f != 0.0:
-                for j in range(len(cols_d)):
-                    if cols_d[j] >= 0:
-                        side[i, cols_d[j]] += f * G[k, 6 + j]
-                side[i, n_b] += f * G[k, D]
-
-
-@njit(cache=True, nogil=True)
-def _add_border(G, D, Tc, cols_c, cols_d, border):
-    n_b = border.shape[0] - 1
-    nc, nd = len(cols_c), len(cols_d)
-    full = np.zeros((nc, nc))
-    _outer_add(Tc, G, Tc, full)
-    for i in range(nc):
-        a = cols_c[i]
-        if a < 0:
-            continue
-        for j in range(nc):
-            if cols_c[j] >= 0:
-                border[a, cols_c[j]] += full[i, j]
-        for j in range(nd + 1):
-            b = n_b if j == nd else cols_d[j]
-            if b >= 0:
-                s = 0.0
-                for k in range(6):
-                    s += Tc[k, i] * G[k, 6 + j]
-                border[a, b] += s
-                border[b, a] += s
-    for i in range(nd):
-        a = cols_d[i]
-        if a < 0:
-            continue
-        for j in range(nd):
-            if cols_d[j] >= 0:
-                border[a, cols_d[j]] += G[6 + i, 6 + j]
-        border[a, n_b] += G[6 + i, D]
-        border[n_b, a] += G[6 + i, D]
-
-
-@njit(cache=True, nogil=True)
 def _work(images, direct, motion):
     """Arrays for one image: rows A, their Gram matrix, errors (n, 2), and the chain matrices Tn, Tm, Tc."""
     most = 0
@@ -313,7 +197,7 @@ def _work(images, direct, motion):
     Tm = np.empty((6, 15 if len(motion.by_next) else 0))
     return (
         np.empty((D + 1, 2 * most)), np.empty((D + 1, D + 1)), np.empty((most, 2)),
-        np.empty((6, 15)), Tm, np.empty((6, 9 + motion.by_imu.shape[2])),
+        np.empty((6, 15)), Tm, np.empty((6, motion.columns.shape[1])),
     )  # fmt: skip
 
 
@@ -347,22 +231,9 @@ def accumulate(i0, i1, images, noise, direct, motion, predicted, given, sums, fo
                 A, D, n, found.root[n0:n1], noise.field[n0:n1], noise.precision, given.shared[i], given.used, G
             )
             total += rows if given.used else 0.0
-        _chain(i, motion, Tn, Tm, Tc)
-        _add_image(images.node[i] - sums.first, G, Tn, Tm, Tc, motion.columns, direct.columns, sums)
+        pose_chain(i, motion, Tn, Tm, Tc)
+        add_image(images.node[i] - sums.first, G, Tn, Tm, Tc, motion.columns[i], direct.columns[i], sums)
     return total
-
-
-@njit(cache=True, nogil=True)
-def _add_image(k, G, Tn, Tm, Tc, chained, direct, sums):
-    """One image's Gram matrix G into the sums of node k and, where its pose hangs on two, of the next."""
-    D = len(G) - 1
-    _outer_add(Tn, G, Tn, sums.diagonal[k])
-    _add_side(Tn, G, D, Tc, chained, direct, sums.side[k])
-    if Tm.shape[1]:
-        _outer_add(Tn, G, Tm, sums.upper[k])
-        _outer_add(Tm, G, Tm, sums.diagonal[k + 1])
-        _add_side(Tm, G, D, Tc, chained, direct, sums.side[k + 1])
-    _add_border(G, D, Tc, chained, direct, sums.border)
 
 
 @njit(cache=True, nogil=True)
@@ -381,23 +252,7 @@ def accumulate_clusters(i0, i1, cluster, n_clusters, column, images, noise, dire
                 G[d, g] = 0.0
             for k in range(n):
                 G[d, cluster[n0 + k]] += A[d, k] * A[D, k] + A[d, n + k] * A[D, n + k]
-        _chain(i, motion, Tn, Tm, Tc)
-        _add_clusters(images.node[i] - sums.first, G, column, Tn, Tm, Tc, motion.columns, direct.columns, sums)
-
-
-@njit(cache=True, nogil=True)
-def _add_clusters(k, G, column, Tn, Tm, Tc, chained, direct, sums):
-    """One image's gradients G (D, clusters) through its pose into columns of node k, the next, and the border."""
-    for g in range(G.shape[1]):
-        for d in range(6):
-            f = G[d, g]
-            for a in range(15):
-                sums.side[k, a, column + g] += Tn[d, a] * f
-            for a in range(Tm.shape[1]):
-                sums.side[k + 1, a, column + g] += Tm[d, a] * f
-            for a in range(len(chained)):
-                if chained[a] >= 0:
-                    sums.border[chained[a], column + g] += Tc[d, a] * f
-        for a in range(len(direct)):
-            if direct[a] >= 0:
-                sums.border[direct[a], column + g] += G[6 + a, g]
+        pose_chain(i, motion, Tn, Tm, Tc)
+        add_clusters(
+            images.node[i] - sums.first, G, column, Tn, Tm, Tc, motion.columns[i], direct.columns[i], sums
+        )  # fmt: skip

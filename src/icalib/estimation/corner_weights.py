@@ -53,7 +53,7 @@ def robust_weights(res, keep, f, precision, sigma, loss, scale, root, shared):
     for k in range(m):
         shared[0, k], shared[1, k] = 0.0, 0.0
     M, inv, rhs = np.empty((m, m)), np.empty((m, m)), np.empty((2, m))
-    rounds = 1 if m == 0 else (2 if loss == 0 else 8)
+    rounds = 1 if m == 0 else (2, 8, 24)[loss]
     cost = 0.0
     for turn in range(rounds):
         cost = 0.0

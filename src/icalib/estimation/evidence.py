@@ -60,7 +60,7 @@ def fits(problem: Problem, outcome: Outcome, seed: int = 0) -> list[Fit]:
 
 def _corner_chi2(camera: CornerFactor, out: CornerOutput) -> dict[str, tuple[int, float]]:
     """Number and chi^2 of one camera's corner rows and of each kind of common error's rows."""
-    shift = (camera.noise.field[:, None, :] * out.shared[camera.stream.image]).sum(axis=2)
+    shift = (camera.noise.field[:, None, :] * out.shared[camera.views.of_corner]).sum(axis=2)
     error = (out.residual + shift) * out.root[:, None]
     found = {"corners": (2 * int((out.root > 0.0).sum()), float((error**2).sum()))}
     for k, tau in enumerate(camera.noise.tau):
@@ -109,7 +109,7 @@ def _spent_by_corners(
     camera: CornerFactor, at: CornerOutput, slope: np.ndarray, e: np.ndarray, e_shared: np.ndarray
 ) -> dict[str, float]:
     """e^T J x of one camera, its images' common errors solved along: e and slope (N, 2), e_shared (M, 2, m)."""
-    root, image, n = at.root, camera.stream.image, len(camera.stream.stamps_ns)
+    root, view, n = at.root, camera.views.of_corner, len(camera.views.image)
     e = np.where((root > 0.0)[:, None], e, 0.0)
     along = slope * root[:, None]
     total = float((e * along).sum())
@@ -119,12 +119,12 @@ def _spent_by_corners(
     f = camera.noise.field * root[:, None]
     M = np.zeros((n, m, m))
     rhs = np.zeros((n, 2, m))
-    np.add.at(M, image, f[:, :, None] * f[:, None, :])
-    np.add.at(rhs, image, (e - along)[:, :, None] * f[:, None, :])
+    np.add.at(M, view, f[:, :, None] * f[:, None, :])
+    np.add.at(rhs, view, (e - along)[:, :, None] * f[:, None, :])
     M += np.diag(1.0 / camera.noise.tau**2)
     rhs += e_shared / camera.noise.tau
     shared = np.linalg.solve(M, rhs.transpose(0, 2, 1)).transpose(0, 2, 1)
-    total += float((e[:, :, None] * f[:, None, :] * shared[image]).sum())
+    total += float((e[:, :, None] * f[:, None, :] * shared[view]).sum())
     own = (e_shared * shared / camera.noise.tau).sum(axis=(0, 1))
     return {"corners": total} | {f"common error {k}": float(own[k]) for k in range(m)}
 
@@ -196,12 +196,19 @@ def _image_cells(camera: CornerFactor, index: int) -> np.ndarray:
 
 
 def _target_parts(camera: CornerFactor, index: int) -> np.ndarray:
-    """(N,) part of the target, the same for all cameras."""
+    """(N,) part of a body of the target, the same for all cameras; single tags are not divided."""
     del index
-    xy = camera.points[:, :2]
-    low, high = xy.min(axis=0), xy.max(axis=0) + 1e-9
-    part = ((xy - low) / (high - low) * TARGET_PARTS).astype(int)
-    return (part[:, 1] * TARGET_PARTS + part[:, 0])[camera.stream.point]
+    target = camera.bodies.target
+    part, parts = np.zeros(len(target.points), dtype=int), 0
+    for k in camera.bodies.used:
+        own = target.body == k
+        xy = target.points[own, :2]
+        low, high = xy.min(axis=0), xy.max(axis=0) + 1e-9
+        sides = TARGET_PARTS if target.bends[k] else 1
+        cell = ((xy - low) / (high - low) * sides).astype(int)
+        part[own] = parts + cell[:, 1] * sides + cell[:, 0]
+        parts += sides**2
+    return part[camera.stream.point]
 
 
 def _tag_corners(camera: CornerFactor, index: int) -> np.ndarray:

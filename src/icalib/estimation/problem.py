@@ -68,7 +68,7 @@ class Problem:
 
     def residuals(self) -> Residuals:
         """Empty arrays for `linearise` to fill."""
-        corners = tuple(CornerOutput.empty(c.stream, len(c.noise.tau)) for c in self.cameras)
+        corners = tuple(c.output() for c in self.cameras)
         return Residuals(np.zeros((self.n_nodes - 1, ROWS)), corners)
 
     def linearise(

@@ -16,6 +16,7 @@ from icalib.geometry import so3
 NODE = 15
 Key = tuple[str, str]  # sensor, parameter
 Kind = Literal["vector", "rotation", "tilt"]
+Entry = tuple[str, str, Kind, int, bool]  # sensor, name, kind, size, whether it is estimated
 
 
 @dataclass(frozen=True)
@@ -63,8 +64,8 @@ class Layout:
         return np.concatenate([self.block(sensor, n).columns for n in names])
 
 
-def make_layout(entries: list[tuple[str, str, Kind, int, bool]]) -> Layout:
-    """Layout from (sensor, name, kind, size, estimated) in order."""
+def make_layout(entries: list[Entry]) -> Layout:
+    """Layout from its entries in order."""
     blocks, column = [], 0
     for sensor, name, kind, size, estimated in entries:
         blocks.append(Block(sensor, name, kind, size, column if estimated else None))

@@ -6,13 +6,16 @@ from __future__ import annotations
 import numpy as np
 
 from icalib.errors import EstimationError
+from icalib.estimation.bodies import choose_bodies, restrict
 from icalib.estimation.imu_data import ImuData, imu_data
 from icalib.first_guess.clocks import Alignment, align, camera_rates, check_axes
 from icalib.first_guess.guess import CameraGuess, Guess, relative_offset
 from icalib.first_guess.gyro import GyroRotation
-from icalib.first_guess.intrinsics import guess_intrinsics
+from icalib.first_guess.intrinsics import camera_params
 from icalib.first_guess.lever_arm import LeverArm, check_gravity, check_size, lever_arm
-from icalib.first_guess.target_poses import TargetPoses, target_poses
+from icalib.first_guess.scene import Placed, scene_poses
+from icalib.first_guess.scene_lens import find_scene
+from icalib.first_guess.target_poses import TargetPoses
 from icalib.first_guess.without_imu import guess_without_imu, trajectory_without_imu
 from icalib.geometry.cameras import camera_model
 from icalib.measurements import CornerStream, Measurements
@@ -23,16 +26,26 @@ __all__ = ["CameraGuess", "Guess", "initial_guess", "initial_trajectory"]
 VELOCITY_STEP_S = 0.04
 
 
-def initial_guess(rig: Rig, measurements: Measurements) -> Guess:
-    """Raises EstimationError, one sentence, where the recording does not carry a guess."""
-    params = [_params(c, s, rig) for c, s in zip(rig.cameras, measurements.cameras, strict=True)]
+def initial_guess(rig: Rig, measurements: Measurements, scene: Placed | None = None) -> Guess:
+    """`scene`: where the bodies of the target stand, if that is known already, and all streams hold only theirs.
+
+    Raises EstimationError, one sentence, where the recording does not carry a guess.
+    """
+    if scene is None:
+        bodies = choose_bodies(rig.target, [measurements], bent=False)
+        measurements = restrict(bodies, measurements)
+        scene = find_scene(rig, bodies, [measurements])
+    params = [
+        scene.params[c.name] if c.name in scene.params else camera_params(c, s, rig.target)
+        for c, s in zip(rig.cameras, measurements.cameras, strict=True)
+    ]
     poses = [
-        target_poses(s, camera_model(c.model), p, rig.target.points)
+        scene_poses(s, camera_model(c.model), p, scene)
         for c, s, p in zip(rig.cameras, measurements.cameras, params, strict=True)
     ]
     imu = imu_data(rig, measurements)
     if imu is None:
-        return guess_without_imu(rig, measurements, params, poses)
+        return guess_without_imu(rig, measurements, params, poses, scene.values)
     aligned = [
         _align(c, s, q, imu, measurements) for c, s, q in zip(rig.cameras, measurements.cameras, poses, strict=True)
     ]
@@ -51,19 +64,7 @@ def initial_guess(rig: Rig, measurements: Measurements) -> Guess:
         c.name: _camera_guess(c, s, p, a, m, q, measurements)
         for c, s, p, a, m, q in zip(rig.cameras, measurements.cameras, params, aligned, arms, poses, strict=True)
     }
-    return Guess(cameras, gyro_bias, _mean_bias(arms), _level(gravity))
-
-
-def _params(camera: Camera, stream: CornerStream, rig: Rig) -> np.ndarray:
-    """(P,) from the rig where it has them, else from the corners."""
-    model = camera_model(camera.model)
-    given = np.full(len(model.parameter_names), np.nan)
-    for part, parameter in ((slice(0, 4), camera.intrinsics), (slice(4, None), camera.distortion)):
-        if parameter.value is not None:
-            given[part] = parameter.value
-    if not np.isnan(given).any():
-        return given
-    return guess_intrinsics(stream, model, camera.resolution, rig.target.points, given)
+    return Guess(cameras, gyro_bias, _mean_bias(arms), _level(gravity), scene.values)
 
 
 def _trusted(parameter: Parameter) -> np.ndarray | None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from icalib.estimation.state import Key
 from icalib.first_guess.target_poses import TargetPoses
+from icalib.geometry.targets.base import BOARD
 from icalib.measurements import CornerStream, Measurements
 
 
@@ -24,17 +26,18 @@ class CameraGuess:
 
 @dataclass(frozen=True)
 class Guess:
-    """Where the solver starts. R_world_board: world z is up, its origin the board's; its x axis horizontal in the
-    board. Without an IMU the world is the board."""
+    """Where the solver starts. R_world_board: world z is up, its origin the scene's; its x axis horizontal in the
+    scene. Without an IMU the world is the scene. scene: poses of the target's bodies in it, where there are several."""
 
     cameras: dict[str, CameraGuess]
     gyro_bias: np.ndarray
     accel_bias: np.ndarray
     R_world_board: np.ndarray
+    scene: dict[Key, np.ndarray] = field(default_factory=dict)
 
-    def values(self) -> dict[tuple[str, str], np.ndarray]:
+    def values(self) -> dict[Key, np.ndarray]:
         """The lasting parameters by sensor and name."""
-        out: dict[tuple[str, str], np.ndarray] = {("board0", "tilt"): self.R_world_board}
+        out: dict[Key, np.ndarray] = self.scene | {(BOARD, "tilt"): self.R_world_board}
         for name, c in self.cameras.items():
             out[name, "rotation"], out[name, "translation"] = c.rotation, c.position
             out[name, "time_offset"] = np.array([c.offset])

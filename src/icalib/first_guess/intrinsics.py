@@ -8,10 +8,14 @@ from contextlib import suppress
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.first_guess.target_poses import TargetPoses, target_poses
+from icalib.estimation.corner_factor import Views
+from icalib.first_guess.target_poses import FEWEST_CORNERS, Flat, TargetPoses, target_poses
 from icalib.geometry import so3
+from icalib.geometry.cameras import camera_model
 from icalib.geometry.cameras.base import CameraModel
+from icalib.geometry.targets import Target
 from icalib.measurements import CornerStream
+from icalib.rig import Camera
 
 TRIAL_IMAGES = 24
 BUNDLE_IMAGES = 48
@@ -27,8 +31,34 @@ HUBER_PX = 1.5
 GOOD_RMS_PX = 2.0
 
 
+def camera_params(camera: Camera, stream: CornerStream, target: Target) -> np.ndarray:
+    """(P,) what the rig gives, else from the corners. Raises EstimationError if none are found that explain them."""
+    model = camera_model(camera.model)
+    given = np.full(len(model.parameter_names), np.nan)
+    for part, parameter in ((slice(0, 4), camera.intrinsics), (slice(4, None), camera.distortion)):
+        if parameter.value is not None:
+            given[part] = parameter.value
+    if not np.isnan(given).any():
+        return given
+    return guess_intrinsics(*_one_body_each(stream, target), model, camera.resolution, given)
+
+
+def _one_body_each(stream: CornerStream, target: Target) -> tuple[CornerStream, Flat]:
+    """Each body in each image as an image of its own; of boards alone where there are any: a tag says little."""
+    if len(target.bodies) == 1:
+        return stream, Flat(target.points)
+    views = Views.of(stream, target.body)
+    size = np.bincount(target.body)
+    boards = size[views.body] >= FEWEST_CORNERS
+    used = np.flatnonzero(boards if boards.any() else ~boards)
+    rows = np.isin(views.of_corner, used)
+    start = np.concatenate([[0], np.cumsum(np.diff(views.start)[used])])
+    alone = CornerStream(stream.name, stream.stamps_ns[views.image[used]], start, stream.point[rows], stream.uv[rows])
+    return alone, Flat(target.points, FEWEST_CORNERS if boards.any() else int(size.min()))
+
+
 def guess_intrinsics(
-    stream: CornerStream, model: CameraModel, resolution: tuple[int, int], target: np.ndarray, given: np.ndarray
+    stream: CornerStream, target: Flat, model: CameraModel, resolution: tuple[int, int], given: np.ndarray
 ) -> np.ndarray:
     """Model parameters (P,) that explain the corners. Raises EstimationError if none are found that do.
 
@@ -52,7 +82,7 @@ def _candidates(
     bundle: CornerStream,
     model: CameraModel,
     kinds: Iterator[np.ndarray],
-    target: np.ndarray,
+    target: Flat,
     wanted: np.ndarray,
 ) -> list[np.ndarray]:
     """Parameters (P,) that a bundle adjustment of those `wanted` (P,) finds from each kind of lens, started at its best
@@ -70,7 +100,7 @@ def _candidates(
     return found
 
 
-def _good_starts(trial: CornerStream, model: CameraModel, starts: np.ndarray, target: np.ndarray) -> np.ndarray:
+def _good_starts(trial: CornerStream, model: CameraModel, starts: np.ndarray, target: Flat) -> np.ndarray:
     """The rows of `starts` (F, P) that explain the corners best; several, far apart, where they are about as good: a
     target that is always seen from straight ahead looks the same through every focal length."""
     medians = np.array([_median_rms(trial, model, start, target) for start in starts])
@@ -78,9 +108,7 @@ def _good_starts(trial: CornerStream, model: CameraModel, starts: np.ndarray, ta
     return starts[np.unique(good[[0, len(good) // 2, -1]])] if len(good) > MOST_TIED else starts[[np.argmin(medians)]]
 
 
-def _fit(
-    bundle: CornerStream, model: CameraModel, params: np.ndarray, target: np.ndarray, wanted: np.ndarray
-) -> np.ndarray:
+def _fit(bundle: CornerStream, model: CameraModel, params: np.ndarray, target: Flat, wanted: np.ndarray) -> np.ndarray:
     """The `wanted` (P,) of `params`: focal length and the strongest distortion first, the rest once these are near."""
     for stage in (FIRST, np.arange(len(params))):
         if wanted[stage].any():
@@ -89,7 +117,7 @@ def _fit(
 
 
 def _roughly_fitted(
-    trial: CornerStream, model: CameraModel, starts: np.ndarray, target: np.ndarray, wanted: np.ndarray
+    trial: CornerStream, model: CameraModel, starts: np.ndarray, target: Flat, wanted: np.ndarray
 ) -> np.ndarray:
     """(P,) the best of `starts` after focal length and the strongest distortion were fitted, where `wanted` (P,)."""
     if len(starts) == 1 or not wanted[FIRST].any():
@@ -101,21 +129,19 @@ def _roughly_fitted(
     return min(fitted, key=lambda pair: pair[1])[0] if fitted else starts[0]
 
 
-def _near_the_best(
-    stream: CornerStream, model: CameraModel, found: list[np.ndarray], target: np.ndarray
-) -> list[np.ndarray]:
+def _near_the_best(stream: CornerStream, model: CameraModel, found: list[np.ndarray], target: Flat) -> list[np.ndarray]:
     """Those of `found` whose error is near the least. To judge all of them on many images takes seconds."""
     rms = [_median_rms(stream, model, params, target) for params in found]
     return [params for params, error in zip(found, rms, strict=True) if error <= NEAR * min(rms)]
 
 
-def _median_rms(stream: CornerStream, model: CameraModel, params: np.ndarray, target: np.ndarray) -> float:
+def _median_rms(stream: CornerStream, model: CameraModel, params: np.ndarray, target: Flat) -> float:
     """Over the images [px]."""
     return float(np.median(target_poses(stream, model, params, target).rms_px))
 
 
 def _cheapest(
-    stream: CornerStream, model: CameraModel, found: list[np.ndarray], target: np.ndarray, free: np.ndarray
+    stream: CornerStream, model: CameraModel, found: list[np.ndarray], target: Flat, free: np.ndarray
 ) -> np.ndarray:
     """The candidate that costs least: a model of two shape parameters can settle in the wrong valley.
 
@@ -172,7 +198,7 @@ def _bundle(
     stream: CornerStream,
     model: CameraModel,
     params: np.ndarray,
-    target: np.ndarray,
+    target: Flat,
     free: np.ndarray,
     used: np.ndarray | None = None,
 ) -> tuple[np.ndarray, float]:
@@ -211,7 +237,7 @@ def _sums(stream, model, params, target, free, R, p, used):
     """Robust cost, Schur complement and gradient of the free parameters; what each image's pose step needs."""
     n = len(free)
     cost, S, g, parts = 0.0, np.zeros((n, n)), np.zeros(n), {}
-    points = target[stream.point]
+    points = target.points[stream.point]
     for i in np.flatnonzero(used):
         rows = slice(stream.start[i], stream.start[i + 1])
         X = (points[rows] - p[i]) @ R[i]

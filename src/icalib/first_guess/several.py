@@ -8,51 +8,69 @@ from collections.abc import Sequence
 import numpy as np
 
 from icalib.errors import CalibrationError, EstimationError
+from icalib.estimation.bodies import Bodies
 from icalib.estimation.imu_data import imu_data
 from icalib.first_guess import initial_guess
 from icalib.first_guess.clocks import better_offset, camera_rates
 from icalib.first_guess.guess import CameraGuess, Guess
-from icalib.first_guess.target_poses import target_poses
+from icalib.first_guess.scene import Placed, scene_poses
+from icalib.first_guess.scene_lens import find_scene
 from icalib.geometry.cameras import camera_model
 from icalib.measurements import Measurements
 from icalib.rig import Camera, Rig, fixed
 
+LEAST_FIT = 0.5  # of the images must fit the scene
 
-def initial_guesses(rig: Rig, recordings: Sequence[Measurements]) -> tuple[Guess, ...]:
-    """A guess for each recording, all with the same calibration.
+
+def initial_guesses(rig: Rig, bodies: Bodies, recordings: Sequence[Measurements]) -> tuple[Guess, ...]:
+    """A guess for each recording, all with the same calibration and the same scene.
 
     Raises EstimationError, one sentence; where there are several recordings it names the one that carries no guess, or
     whose clocks stand elsewhere.
     """
+    scene = find_scene(rig, bodies, recordings)
     if len(recordings) == 1:
-        return (initial_guess(rig, recordings[0]),)
+        return (initial_guess(rig, recordings[0], scene),)
+    _check_scene(rig, scene, recordings)
     order = sorted(range(len(recordings)), key=lambda k: -sum(len(c.stamps_ns) for c in recordings[k].cameras))
-    best, guess = _first_that_works(rig, [(k, recordings[k]) for k in order])
+    best, guess = _first_that_works(rig, scene, [(k, recordings[k]) for k in order])
     held = _held(rig, guess, recordings[best])
     guesses = []
     for k, recording in enumerate(recordings):
         if k == best:
             guesses.append(guess)
             continue
-        _check_clocks(rig, guess, recordings[best], recording)
-        guesses.append(_named(held, recording))
+        _check_clocks(rig, scene, guess, recordings[best], recording)
+        guesses.append(_named(held, scene, recording))
     return tuple(guesses)
 
 
-def _first_that_works(rig: Rig, recordings: list[tuple[int, Measurements]]) -> tuple[int, Guess]:
+def _check_scene(rig: Rig, scene: Placed, recordings: Sequence[Measurements]) -> None:
+    """Raises EstimationError naming a recording in which the bodies stand to each other otherwise."""
+    for recording in recordings if scene.bodies.several else ():
+        pairs = list(zip(rig.cameras, recording.cameras, strict=True))
+        fits = [scene_poses(s, camera_model(c.model), scene.params[c.name], scene).ok.mean() for c, s in pairs]
+        if max(fits) < LEAST_FIT:
+            raise EstimationError(
+                f"{recording.name}: the targets do not stand to each other as in the other recordings; calibrate it "
+                "alone, or leave out the targets that were moved."
+            )
+
+
+def _first_that_works(rig: Rig, scene: Placed, recordings: list[tuple[int, Measurements]]) -> tuple[int, Guess]:
     """The calibration needs one recording that shows all of it; the error is that of the one that showed most."""
     failed: list[EstimationError] = []
     for k, recording in recordings:
         try:
-            return k, _named(rig, recording)
+            return k, _named(rig, scene, recording)
         except EstimationError as error:
             failed.append(error)
     raise failed[0]
 
 
-def _named(rig: Rig, recording: Measurements) -> Guess:
+def _named(rig: Rig, scene: Placed, recording: Measurements) -> Guess:
     try:
-        return initial_guess(rig, recording)
+        return initial_guess(rig, recording, scene)
     except CalibrationError as error:
         raise EstimationError(f"{recording.name}: {error}") from error
 
@@ -75,7 +93,7 @@ def _held(rig: Rig, guess: Guess, recording: Measurements) -> Rig:
     return dataclasses.replace(rig, cameras=tuple(camera(c, guess.cameras[c.name], s.origin_ns) for c, s in pairs))
 
 
-def _check_clocks(rig: Rig, guess: Guess, reference: Measurements, recording: Measurements) -> None:
+def _check_clocks(rig: Rig, scene: Placed, guess: Guess, reference: Measurements, recording: Measurements) -> None:
     """Raises EstimationError where a camera and the IMU turn alike at another time offset than in `reference`, which
     `guess` was made from."""
     imu = imu_data(rig, recording)
@@ -85,7 +103,7 @@ def _check_clocks(rig: Rig, guess: Guess, reference: Measurements, recording: Me
         known = guess.cameras[camera.name]
         origins_ns = (stream.origin_ns - recording.origin_ns) - (before.origin_ns - reference.origin_ns)
         expected = known.offset + origins_ns * 1e-9
-        poses = target_poses(stream, camera_model(camera.model), known.params, rig.target.points)
+        poses = scene_poses(stream, camera_model(camera.model), known.params, scene)
         try:
             rates = camera_rates(stream, poses)
         except EstimationError as error:

@@ -13,9 +13,10 @@ from icalib.geometry.small import solve_definite
 from icalib.measurements import CornerStream
 
 MOST_CORNERS = 48  # of an image; more do not make a first guess better
-FEWEST_CORNERS = 6
+FEWEST_CORNERS = 6  # of a board; fewer lie on a line too easily
 SMALLEST_COSINE = 0.15  # rays closer to the image plane than this have no place in a homography
 LARGEST_RMS_PX = 3.0
+ROUNDS = 5
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ def _move(turn, g, R, t):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _refine(points, seen, R, t, rounds, scale):
+def refine(points, seen, R, t, rounds, scale):
     """Gauss-Newton on x / z, y / z, Huber weights beyond `scale`; returns the last RMS error, errors capped at 4
     scale."""
     rms = 1e9
@@ -134,24 +135,61 @@ def _refine(points, seen, R, t, rounds, scale):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _all_poses(start, point, rays, good, target, most, rounds, focal, rotation, position, rms):
+def chosen_corners(a, b, point, rays, good, target, points, seen):
+    """Fills points (n, 3) and seen (n, 2), x / z and y / z, with corners a..b that are good, as many as have room,
+    spread; returns their number."""
+    most, total = len(points), 0
+    for n in range(a, b):
+        total += good[n]
+    count, passed, wanted = 0, 0, min(most, total)
+    for n in range(a, b):
+        if good[n]:
+            if passed * wanted // max(total, 1) >= count and count < wanted:
+                for k in range(3):
+                    points[count, k] = target[point[n], k]
+                seen[count, 0], seen[count, 1] = rays[n, 0] / rays[n, 2], rays[n, 1] / rays[n, 2]
+                count += 1
+            passed += 1
+    return count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def camera_in_target(R, t, rotation, position):
+    """From R_cam_target, p_cam_target to R_target_cam, p_target_cam."""
+    for a in range(3):
+        position[a] = -(R[0, a] * t[0] + R[1, a] * t[1] + R[2, a] * t[2])
+        for b in range(3):
+            rotation[a, b] = R[b, a]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _mirror(centre, R, t):
+    """The other pose from which a flat target looks nearly alike: its depths mirrored about its middle (Schweighofer
+    and Pinz 2006)."""
+    c, d = np.empty(3), np.empty(3)
+    for i in range(3):
+        c[i] = t[i] + R[i, 0] * centre[0] + R[i, 1] * centre[1]
+        d[i] = c[i]
+    _normalise(d)
+    for j in range(2):
+        along = 2.0 * (d[0] * R[0, j] + d[1] * R[1, j] + d[2] * R[2, j])
+        for i in range(3):
+            R[i, j] -= along * d[i]
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        R[i, 2] = R[j, 0] * R[k, 1] - R[k, 0] * R[j, 1]
+        t[i] = c[i] - R[i, 0] * centre[0] - R[i, 1] * centre[1]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _all_poses(start, point, rays, good, target, fewest, rounds, focal, rotation, position, rms):
+    """Poses (n, 1 or 2, ...): with two, the mirrored one second."""
     R, t, h, centre = np.empty((3, 3)), np.empty(3), np.empty(9), np.empty(2)
-    points, seen = np.empty((most, 3)), np.empty((most, 2))
+    points, seen = np.empty((MOST_CORNERS, 3)), np.empty((MOST_CORNERS, 2))
     for i in range(len(start) - 1):
         rms[i] = 1e9
-        total = 0
-        for n in range(start[i], start[i + 1]):
-            total += good[n]
-        count, passed, wanted = 0, 0, min(most, total)
-        for n in range(start[i], start[i + 1]):
-            if good[n]:
-                if passed * wanted // max(total, 1) >= count and count < wanted:
-                    for k in range(3):
-                        points[count, k] = target[point[n], k]
-                    seen[count, 0], seen[count, 1] = rays[n, 0] / rays[n, 2], rays[n, 1] / rays[n, 2]
-                    count += 1
-                passed += 1
-        if count < 6:
+        count = chosen_corners(start[i], start[i + 1], point, rays, good, target, points, seen)
+        if count < fewest[i]:
             continue
         for k in range(2):
             centre[k] = 0.0
@@ -162,24 +200,52 @@ def _all_poses(start, point, rays, good, target, most, rounds, focal, rotation, 
         _pose_from_homography(h, R, t)
         for k in range(3):
             t[k] -= R[k, 0] * centre[0] + R[k, 1] * centre[1]
-        rms[i] = focal * _refine(points[:count], seen[:count], R, t, rounds, 2.0 / focal)
-        if not rms[i] < 1e9:  # corners on a line, or in one point
-            rms[i] = 1e9
-            continue
-        for a in range(3):
-            position[i, a] = -(R[0, a] * t[0] + R[1, a] * t[1] + R[2, a] * t[2])
-            for b in range(3):
-                rotation[i, a, b] = R[b, a]
+        for turn in range(rms.shape[1]):
+            if turn == 1:
+                _mirror(centre, R, t)
+            rms[i, turn] = focal * refine(points[:count], seen[:count], R, t, rounds, 2.0 / focal)
+            if not rms[i, turn] < 1e9:  # corners on a line, or in one point
+                rms[i, turn] = 1e9
+                break
+            camera_in_target(R, t, rotation[i, turn], position[i, turn])
 
 
-def target_poses(stream: CornerStream, model: CameraModel, params: np.ndarray, target: np.ndarray) -> TargetPoses:
-    """Poses of the camera in the frame of the planar `target` (n, 3), image by image, from up to 48 corners each."""
-    rays, valid = model.unproject(params, stream.uv)
-    good = valid & (rays[:, 2] > SMALLEST_COSINE)
-    n = len(stream.stamps_ns)
-    rotation, position, rms = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), np.empty(n)
-    _all_poses(
-        stream.start, stream.point, rays, good, target, MOST_CORNERS, 5, float(params[0]), rotation, position, rms
-    )  # fmt: skip
+@dataclass(frozen=True)
+class Flat:
+    """Points (n, 3) of flat bodies, each in its body's frame, and how many make a pose."""
 
+    points: np.ndarray
+    fewest: int = FEWEST_CORNERS
+
+
+def target_poses(stream: CornerStream, model: CameraModel, params: np.ndarray, target: Flat) -> TargetPoses:
+    """Poses of the camera in the frame of the one body that each image shows, from up to 48 corners each."""
+    fewest = np.full(len(stream.stamps_ns), target.fewest)
+    found = flat_poses(stream, stream.start, fewest, model, params, target.points, 1)
+    return TargetPoses(found.rotation[:, 0], found.position[:, 0], found.ok[:, 0], found.rms_px[:, 0])
+
+
+def flat_poses(
+    stream: CornerStream,
+    start: np.ndarray,
+    fewest: np.ndarray,
+    model: CameraModel,
+    params: np.ndarray,
+    target: np.ndarray,
+    sides: int,
+) -> TargetPoses:
+    """Poses (n, sides, ...) of the camera in the frames of flat bodies: the corners start[i]:start[i + 1] are of one,
+    and make a pose where there are `fewest` (n,) of them. With two sides, the pose with mirrored depths comes second:
+    a small body far away looks alike from both."""
+    rays, good = usable_rays(stream, model, params)
+    n = len(start) - 1
+    rotation, position = np.tile(np.eye(3), (n, sides, 1, 1)), np.zeros((n, sides, 3))
+    rms = np.empty((n, sides))
+    _all_poses(start, stream.point, rays, good, target, fewest, ROUNDS, float(params[0]), rotation, position, rms)
     return TargetPoses(rotation, position, rms < LARGEST_RMS_PX, rms)
+
+
+def usable_rays(stream: CornerStream, model: CameraModel, params: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 3) unit rays of all corners, and (N,) whether one is far enough from the image plane."""
+    rays, valid = model.unproject(params, stream.uv)
+    return rays, valid & (rays[:, 2] > SMALLEST_COSINE)

@@ -6,6 +6,7 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation.nodes import MERGED_WITHIN_S
+from icalib.estimation.state import Key
 from icalib.first_guess.guess import CameraGuess, Guess, relative_offset
 from icalib.first_guess.target_poses import TargetPoses
 from icalib.geometry import so3
@@ -13,11 +14,12 @@ from icalib.measurements import Measurements
 from icalib.rig import Rig
 
 MOST_PAIRS = 200  # of images taken together; more do not make a first guess better
+Scene = dict[Key, np.ndarray]
 Pose = tuple[np.ndarray, np.ndarray]  # R (3, 3), p (3,)
 
 
 def guess_without_imu(
-    rig: Rig, measurements: Measurements, params: list[np.ndarray], poses: list[TargetPoses]
+    rig: Rig, measurements: Measurements, params: list[np.ndarray], poses: list[TargetPoses], scene: Scene
 ) -> Guess:
     """Raises EstimationError naming a camera that no images taken together tie to the first one."""
     offsets = [
@@ -27,7 +29,7 @@ def guess_without_imu(
     times = [s.seconds + o for s, o in zip(measurements.cameras, offsets, strict=True)]
     places = _places(rig, times, poses)
     cameras = {c.name: CameraGuess(params[i], offsets[i], *places[i], poses[i]) for i, c in enumerate(rig.cameras)}
-    return Guess(cameras, np.zeros(3), np.zeros(3), np.eye(3))
+    return Guess(cameras, np.zeros(3), np.zeros(3), np.eye(3), scene)
 
 
 def trajectory_without_imu(

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
 from rich.table import Table
 from rich.text import Text
 
 from icalib.calibration import Calibration
-from icalib.report.quantities import rows
+from icalib.report.quantities import rows, shown
 
 STYLES = {"determined": "green", "weak": "yellow", "undetermined": "bold red", "fixed": "dim"}
 
@@ -16,7 +17,7 @@ def table(calibration: Calibration) -> Table:
     out = Table(title="Calibration", caption=_caption(calibration), caption_justify="left", title_justify="left")
     for header in ("sensor", "parameter", "value", "std", "unit", "verdict"):
         out.add_column(header, justify="right" if header in ("value", "std") else "left", no_wrap=True)
-    found = rows(calibration)
+    found = [row for row in rows(calibration) if row.sensor not in calibration.bodies]
     for i, row in enumerate(found):
         first = i == 0 or found[i - 1].sensor != row.sensor
         last = i + 1 == len(found) or found[i + 1].sensor != row.sensor
@@ -24,6 +25,19 @@ def table(calibration: Calibration) -> Table:
         verdict = Text(row.verdict, style=STYLES[row.verdict])
         out.add_row(*map(Text, cells), verdict, end_section=last)
     return out
+
+
+def bodies_words(calibration: Calibration) -> str:
+    """How well the target's bodies are placed, in a line; empty where there is one only."""
+    placed = calibration.bodies[1:]
+    if not placed:
+        return ""
+    turn = max(float(calibration.group(b, "rotation").std.max()) for b in placed)
+    shift = max(float(calibration.group(b, "translation").std.max()) for b in placed)
+    return (
+        f"{len(placed)} bodies placed in the frame of {calibration.bodies[0]}, std up to {shown(np.rad2deg(turn))} "
+        f"deg, {shown(1e3 * shift)} mm; poses are in calibration.yaml."
+    )
 
 
 def _caption(calibration: Calibration) -> str:

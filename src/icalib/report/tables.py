@@ -69,7 +69,7 @@ def trust(c: Calibration) -> str:
 
 def sensor_cards(c: Calibration) -> Html:
     """What is known of each sensor, in words."""
-    names = list(dict.fromkeys(g.sensor for g in shown_groups(c)))
+    names = [n for n in dict.fromkeys(g.sensor for g in shown_groups(c)) if n not in c.bodies]
     return Html("".join(_card(c, name) for name in names))
 
 

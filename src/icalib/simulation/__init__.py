@@ -1,7 +1,7 @@
 """Simulated recordings with their truth, made with formulas of their own so that no sign can cancel."""
 
 from icalib.simulation.corners import CornerTruth
-from icalib.simulation.filming import Film, Shot, film
+from icalib.simulation.filming import Film, Shot, film, sheets_of
 from icalib.simulation.motion import Trajectory
 from icalib.simulation.rendering import Imaging, Picture, Renderer, Sheet, SheetTruth, exposure_poses
 from icalib.simulation.rigs import rig_for, settings_for
@@ -12,6 +12,7 @@ from icalib.simulation.scenario_file import load_scenario
 from icalib.simulation.sensor_bag import write_sensors
 from icalib.simulation.simulate import Simulation, Truth, simulate
 from icalib.simulation.tables import write_tables
+from icalib.simulation.tag_map import tag_map
 from icalib.simulation.tracks import TrackTruth
 from icalib.simulation.wheels import WheelTruth
 from icalib.simulation.writing import write_film
@@ -48,7 +49,9 @@ __all__ = [
     "load_scenario",
     "rig_for",
     "settings_for",
+    "sheets_of",
     "simulate",
+    "tag_map",
     "write_film",
     "write_sensors",
     "write_tables",

@@ -30,11 +30,14 @@ class CornerTruth:
 
 
 def board_surface(target: Target, bow: tuple[float, float, float], points: np.ndarray) -> np.ndarray:
-    """Points (N, 3) of the flat target moved out of its plane by z = a x^2 + b x y + c y^2 (see `Scenario`)."""
-    low, high = target.points[:, :2].min(axis=0), target.points[:, :2].max(axis=0)
-    x, y = ((points[:, :2] - 0.5 * (low + high)) / (0.5 * (high - low))).T
+    """Points (n, 3), one for each of the flat target's, moved out of their bodies' planes by z = a x^2 + b x y + c y^2
+    (see `Scenario`) where these bend."""
     bent = points.copy()
-    bent[:, 2] += bow[0] * x**2 + bow[1] * x * y + bow[2] * y**2
+    for body in np.flatnonzero(target.bends):
+        own = target.body == body
+        low, high = target.points[own, :2].min(axis=0), target.points[own, :2].max(axis=0)
+        x, y = ((points[own, :2] - 0.5 * (low + high)) / (0.5 * (high - low))).T
+        bent[own, 2] += bow[0] * x**2 + bow[1] * x * y + bow[2] * y**2
     return bent
 
 
@@ -57,7 +60,8 @@ def see_corners(
     surface = board_surface(scenario.target, scenario.bow, scenario.target.points)
     points = _in_camera(scenario, camera, trajectory, seconds, surface)
     uv = project(camera, points)
-    seen = visible(camera, points, uv)
+    seen = visible(camera, points, uv) & _from_the_front(scenario, camera, trajectory, seconds)
+    seen &= _whole_tags(scenario.target, seen)
     kept = seen.sum(axis=1) >= _MIN_CORNERS
     stamps, seconds, points, uv, seen = stamps[kept], seconds[kept], points[kept], uv[kept], seen[kept]
 
@@ -78,11 +82,29 @@ def see_corners(
 def _in_camera(
     scenario: Scenario, camera: SimCamera, trajectory: Trajectory, seconds: np.ndarray, points: np.ndarray
 ) -> np.ndarray:
-    """Points (N, 3) of the board in the camera frame at each instant, (M, N, 3)."""
+    """Points (n, 3), one for each of the target's, in the camera frame at each instant, (M, n, 3)."""
     rotation, position, _ = trajectory.pose_at(seconds)
-    world = points @ scenario.T_world_board[:3, :3].T + scenario.T_world_board[:3, 3]
+    T_world_body = scenario.body_poses[scenario.target.body]
+    world = np.einsum("nij,nj->ni", T_world_body[:, :3, :3], points) + T_world_body[:, :3, 3]
     imu = (world - position[:, None, :]) @ rotation
     return (imu - camera.T_imu_cam[:3, 3]) @ camera.T_imu_cam[:3, :3]
+
+
+def _from_the_front(scenario: Scenario, camera: SimCamera, trajectory: Trajectory, seconds: np.ndarray) -> np.ndarray:
+    """(M, n) bool: whether the camera is on the printed side of each point's body. Bodies do not hide each other."""
+    rotation, position, _ = trajectory.pose_at(seconds)
+    lens = position + rotation @ camera.T_imu_cam[:3, 3]
+    origin, normal = scenario.body_poses[:, :3, 3], scenario.body_poses[:, :3, 2]
+    return (np.sum((lens[:, None] - origin) * normal, axis=-1) > 0.0)[:, scenario.target.body]
+
+
+def _whole_tags(target: Target, seen: np.ndarray) -> np.ndarray:
+    """(M, n) bool: all of a free tag is seen, or none of it, for nothing beside it tells which tag it is."""
+    whole = np.ones_like(seen)
+    for body in np.flatnonzero(~target.bends):
+        own = target.body == body
+        whole[:, own] = seen[:, own].all(axis=1, keepdims=True)
+    return whole
 
 
 def _towards_tag_center(

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.errors import RigError
+from icalib.geometry.targets import Markers, Scene, Tag, Target
 from icalib.measurements import ImuStream
 from icalib.simulation.corners import image_stamps
 from icalib.simulation.rendering import Imaging, Renderer, Sheet, SheetTruth, exposure_poses
@@ -50,12 +51,12 @@ class Film:
     def shots(self, workers: int | None = None) -> Iterator[Shot]:
         """All images of all cameras in the order in which they are taken. workers: threads; None: all cores."""
         renderers = [Renderer(camera, self.imaging) for camera in self.scenario.cameras]
-        sheet = Sheet(self.scenario.target, self.scenario.T_world_board)
+        sheets = sheets_of(self.scenario.target, self.scenario.body_poses)
         workers = workers or _cores()
         waiting: deque[Future[Shot]] = deque()
         with ThreadPoolExecutor(workers, thread_name_prefix="icalib-render") as pool:
             for seconds, camera, image, stamp_ns in self._schedule():
-                waiting.append(pool.submit(self._shot, renderers[camera], sheet, (camera, image), stamp_ns, seconds))
+                waiting.append(pool.submit(self._shot, renderers[camera], sheets, (camera, image), stamp_ns, seconds))
                 if len(waiting) > _AHEAD * workers:
                     yield waiting.popleft().result()
             while waiting:
@@ -73,13 +74,29 @@ class Film:
             due += [(s, i, k, t) for k, (s, t) in enumerate(zip(seconds.tolist(), stamps.tolist(), strict=True))]
         return sorted(due)
 
-    def _shot(self, renderer: Renderer, sheet: Sheet, number: tuple[int, int], stamp_ns: int, seconds: float) -> Shot:
+    def _shot(
+        self, renderer: Renderer, sheets: list[Sheet], number: tuple[int, int], stamp_ns: int, seconds: float
+    ) -> Shot:
         camera, image = number
         count = 5 if self.exposure_s > 0.0 else 1
         poses = exposure_poses(renderer.camera, self.truth.trajectory, seconds, self.exposure_s, count)
         rng = np.random.default_rng([self.seed, 2 + camera, 1 + image])
-        picture = renderer.picture([sheet], poses, rng)
-        return Shot(renderer.camera.name, stamp_ns, seconds, picture.pixels, picture.sheets[0])
+        picture = renderer.picture(sheets, poses, rng)
+        uv, seen = (np.concatenate([getattr(sheet, name) for sheet in picture.sheets]) for name in ("uv", "seen"))
+        return Shot(renderer.camera.name, stamp_ns, seconds, picture.pixels, SheetTruth(uv, seen))
+
+
+def sheets_of(target: Target, T_world_bodies: np.ndarray) -> list[Sheet]:
+    """Every body of `target` on paper of its own, at its pose (bodies, 4, 4); their points in turn are the target's."""
+    if isinstance(target, Scene):
+        first = np.cumsum([0] + [len(t.bodies) for t in target.targets])
+        groups = zip(target.targets, first[:-1], first[1:], strict=True)
+        return [sheet for t, a, b in groups for sheet in sheets_of(t, T_world_bodies[a:b])]
+    if isinstance(target, Markers):
+        tags = [Tag(target.family, int(i), target.size) for i in target.known]
+        pairs = zip(tags, T_world_bodies, strict=True)
+        return [Sheet(tag, T, border_bits=target.border_bits) for tag, T in pairs]
+    return [Sheet(target, T_world_bodies[0])]
 
 
 def film(scenario: Scenario, seed: int, imaging: Imaging | None = None, exposure_s: float = 0.0) -> Film:

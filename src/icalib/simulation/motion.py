@@ -149,12 +149,13 @@ def basis_with_z(axis: np.ndarray) -> np.ndarray:
 
 
 def reference_motion(scenario: Scenario, rng: np.random.Generator) -> Reference:
-    """The scenario's motion in closed form, around where the first camera looks at the board's centre."""
+    """The scenario's motion in closed form, around where the first camera looks at the board's centre, or at the
+    origin of T_world_board where there are several bodies."""
     motion = scenario.motion
     assert isinstance(motion, Motion)
     T_imu_cam = scenario.cameras[0].T_imu_cam
     R_world_board, origin = scenario.T_world_board[:3, :3], scenario.T_world_board[:3, 3]
-    corners = scenario.target.points
+    corners = scenario.target.points if scenario.T_world_bodies is None else np.zeros((1, 3))
     middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0)) + [0.0, 0.0, motion.distance_m]
     # The board's tags face its +z, so the camera looks along -z, with its y down where the board's is up.
     R_world_cam = R_world_board @ np.diag([1.0, -1.0, -1.0])

@@ -109,14 +109,17 @@ class Motion:
 class Scenario:
     """Everything that `simulate` needs but the seed.
 
+    T_world_bodies (bodies, 4, 4): where the bodies of a target of several stand; T_world_board is then what the motion
+    faces, and no board. None: the target is one body, at T_world_board. Bodies do not hide each other.
+
     imu_intrinsics (24,), Kalibr's scale-misalignment model: w_m = M_g C_g w + A_g f + b_g, a_m = M_a f + b_a, with
     M_a - I and M_g - I lower triangular (xx, yx, yy, zx, zy, zz), C_g = Exp(rotation vector), A_g row-major; in the
-    order M_a, M_g, C_g, A_g. bow (3,) [m]: the board's points lie at z = a x^2 + b x y + c y^2, with x and y from -1
-    to 1 over the board's extent. Corner noise has sigma^2 = corner_noise_px^2 + (blur_s * image speed)^2, the
+    order M_a, M_g, C_g, A_g. bow (3,) [m]: the points of a body that bends lie at z = a x^2 + b x y + c y^2, with x
+    and y from -1 to 1 over its extent. Corner noise has sigma^2 = corner_noise_px^2 + (blur_s * image speed)^2, the
     image speed being the RMS of its corners' in px/s; shift_px is the sigma of a 2D shift that all corners of an
     image share. Outliers are moved by up to +-outlier_px on each axis.
 
-    Raises RigError where its parts do not go together.
+    Raises RigError where bodies have no pose, or its parts do not go together.
     """
 
     cameras: tuple[SimCamera, ...]
@@ -124,6 +127,7 @@ class Scenario:
     duration_s: float = 20.0
     motion: Motion | Drive = Motion()
     T_world_board: np.ndarray = field(default_factory=_standing_board)
+    T_world_bodies: np.ndarray | None = None
     bow: tuple[float, float, float] = (0.0, 0.0, 0.0)
     imu_rate_hz: float = 200.0
     imu_noise: ImuNoise = ADIS16448
@@ -149,6 +153,16 @@ class Scenario:
 
     def __post_init__(self) -> None:
         _check_robot(self)
+        needed = (len(self.target.bodies), 4, 4)
+        if (given := self.body_poses.shape) != needed:
+            raise RigError(
+                f"T_world_bodies has shape {given}, but the target's bodies need {needed}; give a pose of each."
+            )
+
+    @property
+    def body_poses(self) -> np.ndarray:
+        """(bodies, 4, 4) T_world_body."""
+        return self.T_world_board[None] if self.T_world_bodies is None else self.T_world_bodies
 
 
 def _check_robot(scenario: Scenario) -> None:

@@ -40,7 +40,7 @@ class Truth:
     accel_bias: np.ndarray  # (N, 3) m/s^2
     imu_intrinsics: np.ndarray  # (24,)
     gravity: np.ndarray  # (3,) m/s^2, world
-    T_world_board: np.ndarray  # (4, 4)
+    T_world_bodies: np.ndarray  # (bodies, 4, 4), in the order of the target's bodies
     bow: np.ndarray  # (3,) m
     T_imu_cam: dict[str, np.ndarray]
     time_offset: dict[str, float]  # s, between raw stamps: t_imu = t_sensor + time_offset
@@ -57,6 +57,11 @@ class Truth:
     T_imu_wheel: dict[str, np.ndarray] = field(default_factory=dict)
     radii: dict[str, np.ndarray] = field(default_factory=dict)  # (2,) m, left and right
     baseline: dict[str, float] = field(default_factory=dict)  # m
+
+    @property
+    def T_world_board(self) -> np.ndarray:
+        """(4, 4): of the first body."""
+        return self.T_world_bodies[0]
 
     def pose_at(self, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Exact R_world_imu (N, 3, 3), position and velocity (N, 3) in world at seconds (N,)."""
@@ -191,7 +196,7 @@ def _rig_truth(scenario: Scenario) -> dict[str, Any]:
     return {
         "imu_intrinsics": scenario.imu_intrinsics,
         "gravity": GRAVITY_WORLD,
-        "T_world_board": scenario.T_world_board,
+        "T_world_bodies": scenario.body_poses,
         "bow": np.array(scenario.bow),
         "planes": np.empty((0, 4)) if scenario.room is None else scenario.room.planes,
         "T_imu_cam": {c.name: c.T_imu_cam for c in cameras},

@@ -104,7 +104,7 @@ def _plain_truth(scenario: Scenario, truth: Truth, seed: int) -> dict[str, Any]:
         sensors[w.name] = _mounted(truth, w.name, "wheels", w.T_imu_wheel) | sizes
     plain: dict[str, Any] = {"seed": seed, "gravity": truth.gravity.tolist(), "sensors": sensors}
     if scenario.board:
-        plain["T_world_board"] = truth.T_world_board.tolist()
+        plain["T_world_bodies"] = truth.T_world_bodies.tolist()
     return plain | {"planes": truth.planes.tolist()}
 
 

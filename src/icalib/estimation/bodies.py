@@ -1,0 +1,156 @@
+"""The rigid bodies that a target consists of: which of them are estimated, and where their points are.
+
+The first body in use is the reference: its frame is the scene's, in which the others have poses that are estimated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from icalib.errors import EstimationError
+from icalib.estimation.board import SHAPE_LABELS, shape_basis
+from icalib.estimation.state import Entry, Key, Layout
+from icalib.geometry.targets import Target
+from icalib.measurements import CornerStream, Measurements
+
+FEWEST_TOGETHER = 3  # images with both of two bodies that tie them to each other
+MOST_NAMED = 8  # bodies in a sentence
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """used: indices of the target's bodies that are estimated, the reference first; left_out: those that were seen, but
+    too seldom with others; bent: whether bodies may bend."""
+
+    target: Target
+    used: tuple[int, ...]
+    left_out: tuple[int, ...] = ()
+    bent: bool = False
+
+    @property
+    def several(self) -> bool:
+        return len(self.used) > 1
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of those in use."""
+        return tuple(self.target.bodies[k] for k in self.used)
+
+    @property
+    def bending(self) -> tuple[str, ...]:
+        """Names of those whose shape is estimated."""
+        return tuple(self.target.bodies[k] for k in self.used if self.bent and self.target.bends[k])
+
+    @cached_property
+    def basis(self) -> np.ndarray:
+        """(n_points, s, 3) displacement of each point by unit of its body's shape parameters, in the body's frame."""
+        return shape_basis(self.target, self.bent)
+
+    def shape_entries(self) -> list[Entry]:
+        """Blocks of a layout for how bodies bend."""
+        return [(name, "shape", "vector", len(SHAPE_LABELS), True) for name in self.bending]
+
+    def pose_entries(self) -> list[Entry]:
+        """Blocks of a layout for poses in the scene, the reference's fixed; none where there is one body only."""
+        entries: list[Entry] = []
+        for name in self.names if self.several else ():
+            entries.append((name, "rotation", "rotation", 3, name != self.names[0]))
+            entries.append((name, "translation", "vector", 3, name != self.names[0]))
+        return entries
+
+    def columns(self, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+        """Border columns of each of the target's bodies: pose (n, 6, or 0 where only one is in use) and shape (n, s),
+        -1 where there are none."""
+        names, n = self.target.bodies, len(self.target.bodies)
+        pose, shape = np.full((n, 6 if self.several else 0), -1), np.full((n, self.basis.shape[1]), -1)
+        for k in self.used if self.several else ():
+            pose[k] = layout.columns(names[k], "rotation", "translation")
+        for k in self.used:
+            if names[k] in self.bending:
+                shape[k] = layout.columns(names[k], "shape")
+        return pose, shape
+
+    def poses(self, values: dict[Key, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """R_scene_body (n, 3, 3) and p_scene_body (n, 3) of all the target's bodies; the identity where one has
+        none."""
+        n = len(self.target.bodies)
+        R, p = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3))
+        for k in self.used[1:]:
+            name = self.target.bodies[k]
+            R[k], p[k] = values[name, "rotation"], values[name, "translation"]
+        return R, p
+
+    def points(self, values: dict[Key, np.ndarray]) -> np.ndarray:
+        """(n_points, 3) the target's points in the scene, shapes included."""
+        points, body = self.target.points, self.target.body
+        if self.bending:
+            sizes = np.zeros((len(self.target.bodies), self.basis.shape[1]))
+            for k in self.used:
+                if self.target.bodies[k] in self.bending:
+                    sizes[k] = values[self.target.bodies[k], "shape"]
+            points = points + np.einsum("nsk,ns->nk", self.basis, sizes[body])
+        if not self.several:
+            return points
+        R, p = self.poses(values)
+        return np.einsum("nij,nj->ni", R[body], points) + p[body]
+
+
+def choose_bodies(target: Target, recordings: Sequence[Measurements], bent: bool) -> Bodies:
+    """The bodies that images tie to each other, directly or through others, in whichever recording; the one with most
+    corners is the reference.
+
+    Raises EstimationError where no corner was seen.
+    """
+    streams = [c for m in recordings for c in m.cameras]
+    n = len(target.bodies)
+    count = sum((np.bincount(target.body[s.point], minlength=n) for s in streams), np.zeros(n, dtype=np.int64))
+    if not count.any():
+        raise EstimationError("no camera saw the target; check the target in the rig file.")
+    reached = [int(np.argmax(count))]
+    if n > 1:
+        together = sum((_together(target.body, s, n) for s in streams), np.zeros((n, n), dtype=np.int64))
+        for k in reached:
+            reached += [int(j) for j in np.flatnonzero(together[k] >= FEWEST_TOGETHER) if j not in reached]
+    lost = tuple(int(k) for k in np.flatnonzero(count) if k not in reached)
+    return Bodies(target, (reached[0], *sorted(reached[1:])), lost, bent)
+
+
+def _together(body: np.ndarray, stream: CornerStream, n: int) -> np.ndarray:
+    """(n, n) number of images that show two bodies."""
+    pairs = np.unique(stream.image * n + body[stream.point])
+    image, which = np.divmod(pairs, n)
+    seen = np.zeros((len(stream.stamps_ns), n), dtype=np.float32)
+    seen[image, which] = 1.0
+    return np.rint(seen.T @ seen).astype(np.int64)
+
+
+def restrict(bodies: Bodies, recording: Measurements) -> Measurements:
+    """The recording without corners of bodies that are not in use, corners of an image body by body."""
+    if len(bodies.target.bodies) == 1:
+        return recording
+    return replace(recording, cameras=tuple(_restricted(bodies, c) for c in recording.cameras))
+
+
+def _restricted(bodies: Bodies, stream: CornerStream) -> CornerStream:
+    body = bodies.target.body[stream.point]
+    order = np.lexsort((body, stream.image))
+    order = order[np.isin(body[order], bodies.used)]
+    count = np.bincount(stream.image[order], minlength=len(stream.stamps_ns))
+    start = np.concatenate([[0], np.cumsum(count[count > 0])])
+    return CornerStream(stream.name, stream.stamps_ns[count > 0], start, stream.point[order], stream.uv[order])
+
+
+def words_on_left_out(bodies: Bodies) -> str:
+    """A sentence on the bodies that were seen but not used; empty where there are none."""
+    if not bodies.left_out:
+        return ""
+    names = [bodies.target.bodies[k] for k in bodies.left_out]
+    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    return (
+        f"left out, because fewer than {FEWEST_TOGETHER} images show them together with the others: "
+        f"{', '.join(names[:MOST_NAMED])}{more}."
+    )
