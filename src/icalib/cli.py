@@ -46,6 +46,7 @@ def _parser() -> argparse.ArgumentParser:
     c.set_defaults(run=_calibrate)
     _add_inspect(commands)
     _add_target(commands)
+    _add_simulate(commands)
     return parser
 
 
@@ -57,6 +58,17 @@ def _add_inspect(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     c.add_argument("--json", type=Path, metavar="FILE", help="write the figures as JSON")
     c.add_argument("--quiet", "-q", action="store_true", help="no progress bar and no table")
     c.set_defaults(run=_inspect)
+
+
+def _add_simulate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    c = commands.add_parser("simulate", help="make a recording whose truth is known")
+    c.add_argument("scenario", type=Path, help="scenario file (scenario.yaml)")
+    c.add_argument("--output", "-o", type=Path, required=True, help="where the recording goes; must not exist yet")
+    c.add_argument("--seed", type=_whole, metavar="N", help="of motion and noise; by default the scenario's")
+    levels = "data: tables of what is estimated from; sensor: a bag of what drivers send (.bag: ROS 1, else ROS 2)"
+    c.add_argument("--level", choices=("data", "sensor"), default="data", help=levels)
+    c.add_argument("--quiet", "-q", action="store_true", help="no progress bar and no last line")
+    c.set_defaults(run=_simulate)
 
 
 def _add_target(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -153,6 +165,24 @@ def _calibrate(options: argparse.Namespace) -> None:
         write_outputs(result, options.output)
     if not options.quiet:
         print_result(result, options.output)
+
+
+def _simulate(options: argparse.Namespace) -> None:
+    from icalib.console import progress_bar
+    from icalib.simulation import load_scenario, simulate, write_sensors, write_tables
+    from icalib.simulation.tables import check_absent
+
+    scenario = load_scenario(options.scenario)
+    seed = scenario.seed if options.seed is None else options.seed
+    check_absent(options.output)
+    with progress_bar(options.quiet) as progress:
+        simulation = simulate(scenario, seed, lambda stage, done: progress(stage, 0.6 * done))
+        write = write_tables if options.level == "data" else write_sensors
+        notes = write(simulation, seed, options.output, lambda done: progress("writing", 0.6 + 0.4 * done))
+    if not options.quiet:
+        for sentence in notes:
+            print(f"Note: {sentence}")
+        print(f"Wrote {options.output}, seed {seed}.")
 
 
 def _inspect(options: argparse.Namespace) -> None:
