@@ -1,13 +1,14 @@
 """Wheels of a differential drive against the motion between neighbouring nodes: two factors.
 
-`IncrementFactor`, the default: what each wheel has turned, and that the vehicle moves neither sideways nor off the ground
-beyond a slip density. `RelativePoseFactor`: paper (27)-(28), a planar pose integrated from the wheels.
+`IncrementFactor`, the default: what each wheel has turned, and that the vehicle moves neither sideways nor off the
+ground beyond a slip density. `RelativePoseFactor`: paper (27)-(28), a planar pose integrated from the wheels.
 
 Both look at stretches between two fixed instants of the wheels' clock (`wheel_intervals`). Only where these lie on the
 clock of the IMU, and so the states' poses there, moves with the time offset.
 
-The frame of the wheels has x forward, y to the left, z up, its origin midway between them. Their parameters are the blocks
-rotation, translation (R_imu_wheel, p_imu_wheel), time_offset, radii (left, right) and baseline, the wheels' distance.
+The frame of the wheels has x forward, y to the left, z up, its origin midway between them. Their parameters are the
+blocks rotation, translation (R_imu_wheel, p_imu_wheel), time_offset, radii (left, right) and baseline, the distance
+between the wheels.
 """
 
 from __future__ import annotations
@@ -60,15 +61,15 @@ class WheelOutput:
 
 @dataclass(frozen=True)
 class IncrementFactor:
-    """Both wheels' increments over n intervals. With Theta = Log(R(s_0)^T R(s_1)), D the integral of R(t)^T v(t) along the
-    `inertial` scheme, X = R_wheel_imu (D + Theta x p_imu_wheel) and T = R_wheel_imu Theta, the rows of an interval of
-    length dt are
+    """Both wheels' increments over n intervals. With Theta = Log(R(s_0)^T R(s_1)), D the integral of R(t)^T v(t) along
+    the `inertial` scheme, X = R_wheel_imu (D + Theta x p_imu_wheel) and T = R_wheel_imu Theta, the rows of an interval
+    of length dt are
 
         (e_1 X -+ b/2 e_3 T) / r - turned, over wheel sqrt(dt)     left, right
         e_2 X, e_3 X, over sideways sqrt(dt), upwards sqrt(dt)
 
-    seconds (N,): stamps since the first on the wheels' clock; angles (N, 2) rad that the wheels have turned, left and
-    right.
+    X and T stand for integrals of rates; Theta differs from that of the angular rate w by dt^3 / 12 |w x w'|: 1e-5 rad
+    where a vehicle on a ramp turns at 1 rad/s and pitches at 1 rad/s^2, over 50 ms.
     """
 
     kinds: ClassVar[dict[str, slice]] = {
@@ -97,7 +98,8 @@ class IncrementFactor:
         layout: Layout,
         state: State,
     ) -> IncrementFactor:
-        """Chooses the intervals at the time offset and the nodes of `state`."""
+        """From angles (N, 2) rad that the wheels, left and right, have turned at stamps seconds (N,) since the first on
+        the wheels' clock. Chooses the intervals at the time offset and the nodes of `state`."""
         found = wheel_intervals(name, seconds, imu, state)
         scale = np.array([noise.wheel, noise.wheel, noise.sideways, noise.upwards])
         root_dt = np.sqrt(seconds[found.last] - seconds[found.first])
@@ -145,8 +147,8 @@ class RelativePoseFactor:
         e_3 Log(R_wheel(k)_wheel(k+1)) - yaw
         Lambda [R_wheel_imu R_imu(k)_world (p(k+1) + R_world_imu(k+1) p_imu_wheel - p(k)) + p_wheel_imu] - (x, y)
 
-    whitened jointly. The measured pose follows radii and baseline to first order; build it anew from pass to pass. It is
-    that of planar motion: on ramps consistent for intervals up to 0.05 s only.
+    whitened jointly. The measured pose follows radii and baseline to first order; build it anew from pass to pass. It
+    is that of planar motion: on ramps consistent for intervals up to 0.05 s only.
     """
 
     kinds: ClassVar[dict[str, slice]] = {"wheels": slice(0, 3)}

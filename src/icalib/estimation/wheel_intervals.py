@@ -16,8 +16,8 @@ PANEL_S = 0.025
 
 @dataclass(frozen=True)
 class WheelIntervals:
-    """n stretches between wheel stamps `first` and `last` (n,). The first end hangs on `node` (n,), strictly increasing,
-    the last one on the node after it."""
+    """n stretches between wheel stamps `first` and `last` (n,). The first end hangs on `node` (n,), strictly
+    increasing, the last one on the node after it."""
 
     first: np.ndarray
     last: np.ndarray
@@ -27,8 +27,8 @@ class WheelIntervals:
 def choose_intervals(imu: ImuData, nodes: np.ndarray, starts: tuple[int, ...], times: np.ndarray) -> WheelIntervals:
     """Stretches from the stamp nearest to a node to the one nearest to the next; `times` (N,): stamps on the imu clock.
 
-    Where nodes are denser than stamps, neighbours may share a stamp; the stretch to the next stamp then hangs on the two
-    nodes about its middle. None leaves the IMU's recording, touches a gap in it, or goes from one of the recordings
+    Where nodes are denser than stamps, neighbours may share a stamp; the stretch to the next stamp then hangs on the
+    two nodes about its middle. None leaves the IMU's recording, touches a gap in it, or goes from one of the recordings
     that begin at the nodes `starts` to another.
     """
     after = np.clip(np.searchsorted(times, nodes), 1, len(times) - 1)
@@ -43,8 +43,8 @@ def choose_intervals(imu: ImuData, nodes: np.ndarray, starts: tuple[int, ...], t
 
 
 class Instants(NamedTuple):
-    """Where motion is looked at. Those of interval i are start[i]:start[i+1]: its first end, points of a quadrature, its
-    last end. times (m,) s on the wheels' clock; node (m,); weight (m,) s of the quadrature, zero at the ends."""
+    """Where motion is looked at. Those of interval i are start[i]:start[i+1]: its first end, points of a quadrature,
+    its last end. times (m,) s on the wheels' clock; node (m,); weight (m,) s of the quadrature, zero at the ends."""
 
     start: np.ndarray
     times: np.ndarray

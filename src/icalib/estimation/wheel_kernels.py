@@ -219,8 +219,8 @@ def increment_rows(start, weights, track, moving, wheels, measured, rows):
 
 @njit(cache=True, nogil=True)
 def relative_rows(track, wheels, z, J, drive0, rows):
-    """Rows of n relative poses, not whitened: yaw, x, y (paper (27); as printed its yaw has the other sign, and R_k+1 of the
-    lever arm is missing).
+    """Rows of n relative poses, not whitened: yaw, x, y (paper (27); as printed, its yaw has the other sign
+    and its lever arm at k + 1 is turned by the wrong rotation).
 
     track: motion at 2 n instants, first all begins, then all ends; z, J, drive0: see RelativePoses.
     """
@@ -255,8 +255,8 @@ def relative_rows(track, wheels, z, J, drive0, rows):
 
 @njit(cache=True, nogil=True)
 def _weigh(r, loss, scaled, root):
-    """root (m,): square roots of the weights of whitened residuals r (m,); scaled (2, m): what Jacobian and residual are
-    multiplied by, so that J^T J, J^T r are those of the weights or, curved, of the loss. Returns half the robust
+    """root (m,): square roots of the weights of whitened residuals r (m,); scaled (2, m): what Jacobian and residual
+    are multiplied by, so that J^T J, J^T r are those of the weights or, curved, of the loss. Returns half the robust
     chi^2."""
     cost = 0.0
     for q in range(len(r)):

@@ -2,7 +2,8 @@
 
 In the frame of the wheels at the first stamp, with both rates constant from stamp to stamp, each step is an arc:
 
-    dpsi = (r_r d_r - r_l d_l) / b     ds = (r_r d_r + r_l d_l) / 2     (dx, dy) = ds sinc(dpsi / 2) (cos, sin)(psi + dpsi/2)
+    dpsi = (r_r d_r - r_l d_l) / b    ds = (r_r d_r + r_l d_l) / 2
+    (dx, dy) = ds sinc(dpsi / 2) (cos, sin)(psi + dpsi / 2)
 """
 
 from __future__ import annotations
