@@ -148,7 +148,9 @@ class RelativePoseFactor:
         Lambda [R_wheel_imu R_imu(k)_world (p(k+1) + R_world_imu(k+1) p_imu_wheel - p(k)) + p_wheel_imu] - (x, y)
 
     whitened jointly. The measured pose follows radii and baseline to first order; build it anew from pass to pass. It
-    is that of planar motion: on ramps consistent for intervals up to 0.05 s only.
+    is that of planar motion: on ramps consistent for intervals up to 0.05 s only. And since the measured yaw, noise and
+    all, is what the baseline scales, the baseline comes out too long, by the share of that noise in yaw^2 (errors in
+    variables): the shorter the intervals, the more.
     """
 
     kinds: ClassVar[dict[str, slice]] = {"wheels": slice(0, 3)}
