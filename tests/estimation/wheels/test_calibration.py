@@ -59,7 +59,7 @@ def away(world, planar):
 
 @dataclass
 class Slipping:
-    """Increments of wheels with noise, their slip as an error of the zero that it is taken for; the same in each pass."""
+    """Increments of wheels with noise; slip is an error of the zero that it is taken for. The same in each pass."""
 
     world: object
     angles: np.ndarray
