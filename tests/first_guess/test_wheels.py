@@ -63,7 +63,7 @@ def guess(p, velocity_noise=0.0, wheel_noise=0.0, seed=0):
         (0.5 * (x[1:] + x[:-1]))[: n * step].reshape(n, step, 3).mean(axis=1) for x in (p.rate, p.velocity)
     )
     velocity = velocity + velocity_noise * rng.normal(size=(n, 3))
-    return drive_guess("wheels0", wheel + wheel_noise * rng.normal(size=(n, 2)), rate, velocity, 9.81 * UP)
+    return drive_guess("wheel0", wheel + wheel_noise * rng.normal(size=(n, 2)), rate, velocity, 9.81 * UP)
 
 
 def differences(found):
@@ -103,7 +103,7 @@ def test_wheels_that_slipped_for_a_while_are_left_out():
     wheel[100:115] *= [1.5, 1.2]
     n = len(wheel)
     means = [(0.5 * (x[1:] + x[:-1]))[: n * step].reshape(n, step, 3).mean(axis=1) for x in (p.rate, p.velocity)]
-    turn, lever, radii, baseline = differences(drive_guess("wheels0", wheel, *means, UP))
+    turn, lever, radii, baseline = differences(drive_guess("wheel0", wheel, *means, UP))
     assert np.abs(turn).max() < 1e-6 and np.abs(lever[:2]).max() < 1e-6
     assert np.abs(radii).max() < 1e-6 and abs(baseline) < 1e-6
 
@@ -125,8 +125,8 @@ def rates_of(p):
 def test_wheels_mixed_up_are_named(change, sentence):
     wheel, rate, velocity = rates_of(path())
     with pytest.raises(EstimationError, match=sentence) as raised:
-        drive_guess("wheels0", change(wheel), rate, velocity, UP)
-    assert str(raised.value).startswith("wheels0: ")
+        drive_guess("wheel0", change(wheel), rate, velocity, UP)
+    assert str(raised.value).startswith("wheel0: ")
 
 
 @pytest.mark.parametrize(
@@ -139,14 +139,14 @@ def test_wheels_mixed_up_are_named(change, sentence):
 )
 def test_motion_that_shows_too_little_is_named(changes, sentence):
     with pytest.raises(EstimationError, match=sentence):
-        drive_guess("wheels0", *rates_of(path(**changes)), UP)
+        drive_guess("wheel0", *rates_of(path(**changes)), UP)
 
 
 def test_a_single_arc_is_named():
     t = path().t
     arc = Path(t, 0.5 * np.ones_like(t), 0.8 * np.ones_like(t))
     with pytest.raises(EstimationError, match="one and the same arc"):
-        drive_guess("wheels0", *rates_of(arc), UP)
+        drive_guess("wheel0", *rates_of(arc), UP)
 
 
 def imu_of(p, bias=0.02, noise=0.0):
@@ -167,8 +167,8 @@ def stamped(p, offset, hz=50.0, first=3.0, last=37.0):
 def test_the_offset_is_found_whatever_the_clocks_origins(offset):
     p = path()
     seconds, angles = stamped(p, offset)
-    rates = wheel_rates("wheels0", seconds, angles)
-    assert wheel_offset(imu_of(p), UP, "wheels0", rates) == pytest.approx(offset, abs=1e-4)
+    rates = wheel_rates("wheel0", seconds, angles)
+    assert wheel_offset(imu_of(p), UP, "wheel0", rates) == pytest.approx(offset, abs=1e-4)
 
 
 def test_the_offset_with_noise_and_an_axis_that_is_five_degrees_off():
@@ -176,33 +176,33 @@ def test_the_offset_with_noise_and_an_axis_that_is_five_degrees_off():
     seconds, angles = stamped(p, 1.234)
     angles += np.cumsum(0.03 * np.sqrt(1 / 50) * np.random.default_rng(1).normal(size=angles.shape), axis=0)
     up = Rotation.from_euler("x", 5.0, degrees=True).apply(UP)
-    found = wheel_offset(imu_of(p, noise=0.01), up, "wheels0", wheel_rates("wheels0", seconds, angles))
+    found = wheel_offset(imu_of(p, noise=0.01), up, "wheel0", wheel_rates("wheel0", seconds, angles))
     assert found == pytest.approx(1.234, abs=3e-3)
 
 
 def test_swapped_wheels_turn_the_other_way_round():
     p = path()
     seconds, angles = stamped(p, 1.0)
-    with pytest.raises(EstimationError, match="wheels0 turns the other way round than imu0"):
-        wheel_offset(imu_of(p), UP, "wheels0", wheel_rates("wheels0", seconds, angles[:, ::-1]))
+    with pytest.raises(EstimationError, match="wheel0 turns the other way round than imu0"):
+        wheel_offset(imu_of(p), UP, "wheel0", wheel_rates("wheel0", seconds, angles[:, ::-1]))
 
 
 def test_wheels_of_another_drive_match_at_no_shift():
     p = path()
     other = np.cumsum(np.random.default_rng(2).normal(size=(1700, 2)), axis=0) * 0.05
-    with pytest.raises(EstimationError, match="the turning of wheels0 does not match that of imu0"):
-        wheel_offset(imu_of(p), UP, "wheels0", wheel_rates("wheels0", 0.02 * np.arange(1700), other))
+    with pytest.raises(EstimationError, match="the turning of wheel0 does not match that of imu0"):
+        wheel_offset(imu_of(p), UP, "wheel0", wheel_rates("wheel0", 0.02 * np.arange(1700), other))
 
 
 def test_too_few_readings_are_named():
-    with pytest.raises(EstimationError, match="wheels0: hardly any of its 12 readings"):
-        wheel_rates("wheels0", 0.3 * np.arange(12), np.zeros((12, 2)))
+    with pytest.raises(EstimationError, match="wheel0: hardly any of its 12 readings"):
+        wheel_rates("wheel0", 0.3 * np.arange(12), np.zeros((12, 2)))
 
 
 def test_rates_are_means_over_windows():
     p = path()
     seconds, angles = stamped(p, 0.0)
-    rates = wheel_rates("wheels0", seconds, angles)
+    rates = wheel_rates("wheel0", seconds, angles)
     assert rates.end - rates.start == pytest.approx(0.1)
     want = [(np.interp(rates.end, seconds, x) - np.interp(rates.start, seconds, x)) / 0.1 for x in angles.T]
     np.testing.assert_allclose(rates.rate.T, want, rtol=0, atol=1e-9)

@@ -33,7 +33,7 @@ from icalib.estimation.wheel_kernels import (
     increment_rows,
     relative_rows,
 )
-from icalib.estimation.wheel_poses import RelativePoses
+from icalib.estimation.wheel_poses import RelativePoses, preintegrated
 
 OWN = ("rotation", "translation", "time_offset", "radii", "baseline")
 
@@ -163,6 +163,24 @@ class RelativePoseFactor:
     gravity: float
     noise: WheelNoise
     layout: Layout
+
+    @classmethod
+    def build(
+        cls,
+        name: str,
+        seconds: np.ndarray,
+        angles: np.ndarray,
+        imu: ImuData,
+        gravity: float,
+        noise: WheelNoise,
+        layout: Layout,
+        state: State,
+    ) -> RelativePoseFactor:
+        """See IncrementFactor.build; integrated at the radii and the baseline of `state`. Of the slip densities it uses
+        `sideways`."""
+        found = wheel_intervals(name, seconds, imu, state)
+        poses = preintegrated(seconds, angles, found, drive_of(name, state), noise.wheel, noise.sideways)
+        return cls(name, seconds, found, poses, imu, gravity, noise, layout)
 
     def empty_output(self) -> WheelOutput:
         """Empty arrays for `accumulate` to fill."""

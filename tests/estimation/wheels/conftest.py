@@ -164,11 +164,11 @@ class World:
     state: State
 
     def moved(self, **values) -> State:
-        """The truth with other values of blocks of wheels0; rotations are turned by what is given."""
+        """The truth with other values of blocks of wheel0; rotations are turned by what is given."""
         changed = dict(self.state.values)
         for name, d in values.items():
-            old = changed["wheels0", name]
-            changed["wheels0", name] = old @ so3.exp(np.array(d)) if name == "rotation" else old + d
+            old = changed["wheel0", name]
+            changed["wheel0", name] = old @ so3.exp(np.array(d)) if name == "rotation" else old + d
         return replace(self.state, values=changed)
 
 
@@ -191,11 +191,11 @@ def make_world(
     R, p, v = drive.pose(nodes)
     values = {
         ("imu0", "intrinsics"): np.zeros(24),
-        ("wheels0", "rotation"): drive.R_imu_wheel,
-        ("wheels0", "translation"): drive.p_imu_wheel,
-        ("wheels0", "time_offset"): np.array([offset]),
-        ("wheels0", "radii"): drive.radii,
-        ("wheels0", "baseline"): np.array([drive.baseline]),
+        ("wheel0", "rotation"): drive.R_imu_wheel,
+        ("wheel0", "translation"): drive.p_imu_wheel,
+        ("wheel0", "time_offset"): np.array([offset]),
+        ("wheel0", "radii"): drive.radii,
+        ("wheel0", "baseline"): np.array([drive.baseline]),
     }
     layout = make_layout(
         [(s, n, "rotation" if n == "rotation" else "vector", v.size if n != "rotation" else 3, s != "imu0")

@@ -14,7 +14,7 @@ UNIT = WheelNoise(1.0, 1.0, 1.0)
 
 def factor_on(world, noise=UNIT):
     return IncrementFactor.build(
-        "wheels0", world.seconds, world.angles, world.imu, 9.81, noise, world.layout, world.state
+        "wheel0", world.seconds, world.angles, world.imu, 9.81, noise, world.layout, world.state
     )  # fmt: skip
 
 

@@ -1,5 +1,7 @@
 """Planar poses integrated from the wheels, and the factor of paper (27)-(28) on them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -104,13 +106,9 @@ def test_given_poses_are_differenced_in_the_frame_of_the_first():
     assert not made.J.any()
 
 
-def factor_on(world, poses=None):
-    chosen = wheel_intervals("wheels0", world.seconds, world.imu, world.state)
-    made = poses or preintegrated(
-        world.seconds, world.angles, chosen, drive_of("wheels0", world.state), 0.01, 5e-3
-    )  # fmt: skip
-    return RelativePoseFactor(
-        "wheels0", world.seconds, chosen, made, world.imu, 9.81, WheelNoise(0.01), world.layout
+def factor_on(world):
+    return RelativePoseFactor.build(
+        "wheel0", world.seconds, world.angles, world.imu, 9.81, WheelNoise(0.01), world.layout, world.state
     )  # fmt: skip
 
 
@@ -133,10 +131,10 @@ def test_given_poses_of_the_wheels_frame_leave_no_residual(drive_of_kind, world_
     drive = drive_of_kind("planar", 1)
     world = world_of(drive)
     t = world.seconds + 0.0123
-    chosen = wheel_intervals("wheels0", world.seconds, world.imu, world.state)
+    chosen = wheel_intervals("wheel0", world.seconds, world.imu, world.state)
     poses = np.column_stack([drive.yaw(t), drive.integral(drive.forwards, t)[:, :2]])
     made = between_given(poses, chosen, np.tile(1e-4 * np.eye(3), (len(chosen.node), 1, 1)))
-    assert np.abs(residuals(factor_on(world, made), world.state)).max() < 1e-7
+    assert np.abs(residuals(replace(factor_on(world), poses=made), world.state)).max() < 1e-7
 
 
 def test_signs_of_the_rows(drive_of_kind, world_of):
@@ -144,9 +142,7 @@ def test_signs_of_the_rows(drive_of_kind, world_of):
     world = world_of(drive_of_kind("planar", 1))
     angles = world.angles.copy()
     angles[100:, 1] += 0.01
-    chosen = wheel_intervals("wheels0", world.seconds, world.imu, world.state)
-    made = preintegrated(world.seconds, angles, chosen, drive_of("wheels0", world.state), 0.01, 5e-3)
-    r = residuals(factor_on(world, made), world.state)
+    r = residuals(factor_on(replace(world, angles=angles)), world.state)
     i = np.argmax(np.abs(r[:, 0]))
     assert r[i, 0] == pytest.approx(-0.01 * 0.11 / 0.5, rel=1e-4)
     assert r[i, 1] == pytest.approx(-0.5 * 0.01 * 0.11, rel=0.05)
@@ -157,7 +153,7 @@ def test_the_measured_pose_follows_radii_and_baseline_to_first_order(drive_of_ki
     factor = factor_on(world)
     d = np.array([1e-4, -1e-4, 5e-4])
     moved = world.moved(radii=d[:2], baseline=d[2:])
-    anew = preintegrated(world.seconds, world.angles, factor.intervals, drive_of("wheels0", moved), 0.01, 5e-3)
+    anew = preintegrated(world.seconds, world.angles, factor.intervals, drive_of("wheel0", moved), 0.01, 5e-3)
     change = residuals(factor, moved) - residuals(factor, world.state)
     exact = factor.poses.z - anew.z
     assert np.abs(exact).max() > 5e-5
