@@ -1,4 +1,4 @@
-"""A differential drive that neither slips nor leaves the ground, in closed form, and the estimator's view of it.
+"""A differential drive in closed form that neither slips, unless told to, nor leaves the ground; the estimator's view.
 
 The wheels' frame turns by three angles that are sums of waves, and its origin moves along its own x: the obvious path.
 The IMU rides along on a lever arm. None of it uses the estimator's formulas.
@@ -47,7 +47,8 @@ class Waves:
 
 @dataclass(frozen=True)
 class Drive:
-    """yaw, pitch, roll [rad] and speed [m/s] of the wheels' frame; where it is in the IMU; the wheels themselves."""
+    """yaw, pitch, roll [rad] and speed [m/s] of the wheels' frame; where it is in the IMU; the wheels themselves; how
+    fast it slips to its left [m/s]."""
 
     yaw: Waves
     pitch: Waves
@@ -58,6 +59,7 @@ class Drive:
     p_imu_wheel: np.ndarray = field(default_factory=lambda: np.array([-0.25, 0.1, -0.15]))
     radii: np.ndarray = field(default_factory=lambda: np.array([0.1, 0.11]))
     baseline: float = 0.5
+    slip: Waves = Waves(0.0, (), (), ())
 
     def rotation(self, t):
         """R_world_wheel (n, 3, 3)."""
@@ -92,9 +94,13 @@ class Drive:
         last = f((edges[j][:, None] + rest[:, None] * x).ravel()).reshape(len(t), 4, -1)
         return whole[j] + rest[:, None] * (w[:, None] * last).sum(1)
 
-    def forwards(self, t):
-        """(n, 3) velocity of the wheels' origin in the world."""
-        return self.rotation(t)[:, :, 0] * self.speed(t)[:, None]
+    def along(self, t, order=0):
+        """(n, 3) velocity of the wheels' origin in the wheels' axes, or its derivative in these."""
+        return np.stack([self.speed(t, order), self.slip(t, order), np.zeros(len(t))], axis=1)
+
+    def travel(self, t):
+        """(n, 3) the same in the world."""
+        return np.einsum("nij,nj->ni", self.rotation(t), self.along(t))
 
     @property
     def lever(self):
@@ -104,18 +110,15 @@ class Drive:
     def pose(self, t):
         """R_world_imu, p_world_imu, velocity at t (n,)."""
         R = self.rotation(t)
-        p = self.integral(self.forwards, t) + R @ self.lever
-        v = self.forwards(t) + np.einsum("nij,nj->ni", R, np.cross(self.rate(t), self.lever))
+        p = self.integral(self.travel, t) + R @ self.lever
+        v = self.travel(t) + np.einsum("nij,nj->ni", R, np.cross(self.rate(t), self.lever))
         return R @ self.R_imu_wheel.T, p, v
 
     def readings(self, t):
         """Angular rate and specific force (n, 3) in the IMU's axes."""
         w, dw = self.rate(t), self.rate_slope(t)
-        ahead = np.zeros((len(t), 3))
-        ahead[:, 0] = self.speed(t)
-        slope = np.zeros((len(t), 3))
-        slope[:, 0] = self.speed(t, 1)
-        a = slope + np.cross(w, ahead) + np.cross(dw, self.lever) + np.cross(w, np.cross(w, self.lever))
+        a = self.along(t, 1) + np.cross(w, self.along(t)) + np.cross(dw, self.lever)
+        a = a + np.cross(w, np.cross(w, self.lever))
         f = a - np.einsum("nji,j->ni", self.rotation(t), GRAVITY)
         return w @ self.R_imu_wheel.T, f @ self.R_imu_wheel.T
 

@@ -139,6 +139,38 @@ def test_errors_are_as_large_as_the_covariance_says(drive_of_kind, world_of, pro
     np.testing.assert_allclose(np.mean(square, axis=0), 1.0, rtol=0, atol=0.08)
 
 
+def slipping_waves(waves, rng, density):
+    """White to 10 Hz: a line every 0.1 Hz, so that the drift over a time t has the variance density^2 t."""
+    f = np.arange(0.05, 10.0, 0.1)
+    amplitude = np.full(len(f), 2.0 * density * np.sqrt(0.1))
+    return waves(
+        0.0, tuple(amplitude), tuple(f + rng.uniform(-0.04, 0.04, len(f))), tuple(rng.uniform(0, 6.28, len(f)))
+    )
+
+
+@pytest.mark.parametrize(("density", "chi2_of_rows"), [(5e-3, (0.6, 1.0)), (1e-2, (2.3, 4.0))])
+def test_a_vehicle_that_drifts_sideways_is_within_its_slip_density_or_shows_in_its_rows(
+    drive_of_kind, world_of, problem_of, waves, density, chi2_of_rows
+):
+    """It moves sideways in truth, and nothing is measured of it; rows of 5 mm/sqrt(s)."""
+    seeds, kept, nees, square = 8, PLANAR[1:], [], []
+    for seed in range(seeds):
+        slip = slipping_waves(waves, np.random.default_rng(seed + 500), density)
+        world = world_of(level_drive(drive_of_kind, seed, duration=10.0, slip=slip), imu_hz=400.0, noise_seed=seed)
+        angles, _, R, p = noisy(world, np.random.default_rng(seed + 100), NOISE, POSE_SIGMA)
+        factor = Slipping(world, angles, np.zeros((1000, 2)), NOISE)
+        priors = pinned(world, [PINNED, FREE, FREE], PINNED)
+        outcome = solve(problem_of, world, factor, (R, p), POSE_SIGMA, priors, away(world, True))
+        e, P = errors(world, outcome.state)[kept], np.linalg.inv(outcome.information)[np.ix_(kept, kept)]
+        nees.append(e @ np.linalg.solve(P, e))
+        square.append((outcome.residuals[1].residual[:, 2] ** 2).mean())
+    low, high = chi2_of_rows
+    assert low < np.mean(square) < high
+    dof = seeds * len(kept)
+    if density == NOISE.sideways:
+        assert chi2.ppf(5e-4, dof) < sum(nees) < chi2.ppf(1.0 - 5e-4, dof)
+
+
 def test_a_robust_loss_forgives_wheels_that_spun(drive_of_kind, world_of, problem_of):
     """The left wheel spins by 3 cm, seven times: 100 standard deviations."""
     world = world_of(level_drive(drive_of_kind, 3, duration=10.0), noise_seed=3)
