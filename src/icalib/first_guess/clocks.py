@@ -8,6 +8,7 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation.imu_data import ImuData
+from icalib.first_guess.correlation import best_shift
 from icalib.first_guess.target_poses import TargetPoses
 from icalib.geometry import so3
 from icalib.measurements import CornerStream
@@ -153,34 +154,14 @@ def _correlate(imu: ImuData, name: str, rates: CameraRates) -> float:
     middle = 0.5 * (rates.start + rates.end)
     near = np.diff(middle, append=middle[-1]) < LONGEST_STEP_S
     b, mask_b = _grid(middle, np.linalg.norm(rates.rate, axis=1), near, middle[-1])
-    n = len(a) + len(b) - 1
-    size = 1 << (n - 1).bit_length()
-
-    def correlate(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """sum_t x(t + lag) y(t), lag from -(len(y) - 1) to len(x) - 1."""
-        product = np.fft.irfft(np.fft.rfft(x, size) * np.conj(np.fft.rfft(y, size)), size)
-        return np.concatenate([product[-(len(b) - 1) :], product[: len(a)]]) if len(b) > 1 else product[: len(a)]
-
-    ma, mb = mask_a.astype(float), mask_b.astype(float)
-    count = np.maximum(correlate(ma, mb), 1e-9)
-    sa, sb = correlate(a * ma, mb), correlate(ma, b * mb)
-    saa, sbb = correlate(a * a * ma, mb), correlate(ma, b * b * mb)
-    covariance = correlate(a * ma, b * mb) - sa * sb / count
-    variance = np.maximum(saa - sa**2 / count, 0.0) * np.maximum(sbb - sb**2 / count, 0.0)
-    whole = min(mask_a.sum(), mask_b.sum())
-    enough = count > min(SHORTEST_OVERLAP_S * GRID_HZ, 0.5 * whole)
-    # Against the shift's own overlap and a share of the whole, so that a short overlap of little motion cannot win.
-    floor = 1e-3 * (a[mask_a].var() * b[mask_b].var()) * count**2
-    r = np.where(enough, covariance / np.sqrt(variance + floor), 0.0)
-    score = np.arctanh(np.clip(r, 0.0, 0.999999)) * np.sqrt(count)
-    k = int(np.argmax(score))
-    if not r[k] > LEAST_CORRELATION:
+    found = best_shift(a, mask_a, b, mask_b, SHORTEST_OVERLAP_S * GRID_HZ)
+    if not found.correlation > LEAST_CORRELATION:
         raise EstimationError(
             f"the motion of {name} does not match that of {imu.name} at any shift of their clocks (best correlation "
-            f"{max(float(r.max()), 0.0):.2f}); check that both come from the same recording, overlap in time, "
+            f"{max(found.largest, 0.0):.2f}); check that both come from the same recording, overlap in time, "
             f"and are in rad/s."
         )
-    return (k - (len(b) - 1)) / GRID_HZ
+    return found.samples / GRID_HZ
 
 
 def _kabsch(w_imu: np.ndarray, w_cam: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
