@@ -124,9 +124,14 @@ def better_offset(imu: ImuData, name: str, rates: CameraRates, expected: float) 
     return own.offset if _unexplained(imu, rates, own) < CLEARLY_BETTER * there else None
 
 
-def _check_motion(imu: ImuData, name: str, rates: CameraRates) -> None:
+def _motion(imu: ImuData, rates: CameraRates) -> tuple[float, float]:
+    """RMS rate of the IMU about its median, and the median rate of the camera, rad/s."""
     spread = np.sqrt(((imu.gyro - np.median(imu.gyro, axis=0)) ** 2).sum(axis=1).mean())
-    seen = np.sqrt(np.median((rates.rate**2).sum(axis=1)))
+    return float(spread), float(np.sqrt(np.median((rates.rate**2).sum(axis=1))))
+
+
+def _check_motion(imu: ImuData, name: str, rates: CameraRates) -> None:
+    spread, seen = _motion(imu, rates)
     if spread < STILL_RAD_S and seen < 3.0 * STILL_RAD_S:
         raise EstimationError(
             f"the recording is motionless ({imu.name} turns at {spread:.4f} rad/s RMS, {name} at {seen:.4f}); "
@@ -228,6 +233,12 @@ def as_given(imu: ImuData, name: str, rates: CameraRates, offset: float, rotatio
     middle = (0.5 * (rates.start + rates.end) + offset)[inside]
     gyro = np.stack([np.interp(middle, imu.seconds, imu.gyro[:, k]) for k in range(3)], axis=1)
     return Alignment(offset, rotation, np.median(gyro - rates.rate[inside] @ rotation.T, axis=0), given=True)
+
+
+def contradicts(imu: ImuData, rates: CameraRates, given: Alignment) -> bool:
+    """Whether the two turn, but not alike, even allowing for what a guess is off."""
+    spread, seen = _motion(imu, rates)
+    return (spread >= STILL_RAD_S or seen >= 3.0 * STILL_RAD_S) and _unexplained(imu, rates, given) > LARGEST_UNEXPLAINED
 
 
 def _no_overlap(imu: ImuData, name: str) -> EstimationError:
