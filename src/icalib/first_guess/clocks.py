@@ -238,7 +238,9 @@ def as_given(imu: ImuData, name: str, rates: CameraRates, offset: float, rotatio
 def contradicts(imu: ImuData, rates: CameraRates, given: Alignment) -> bool:
     """Whether the two turn, but not alike, even allowing for what a guess is off."""
     spread, seen = _motion(imu, rates)
-    return (spread >= STILL_RAD_S or seen >= 3.0 * STILL_RAD_S) and _unexplained(imu, rates, given) > LARGEST_UNEXPLAINED
+    return (spread >= STILL_RAD_S or seen >= 3.0 * STILL_RAD_S) and _unexplained(
+        imu, rates, given
+    ) > LARGEST_UNEXPLAINED
 
 
 def _no_overlap(imu: ImuData, name: str) -> EstimationError:
