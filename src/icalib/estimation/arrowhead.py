@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -75,6 +76,12 @@ class Piece:
             np.zeros((n_border + 1, n_border + 1)),
         )
 
+    @classmethod
+    def bare(cls, first: int, last: int) -> Piece:
+        """For residuals alone: nothing to add to."""
+        nothing = np.zeros((0, NODE, NODE))
+        return cls(first, last, nothing, nothing, nothing, np.zeros((0, 0)))
+
     def clear(self) -> None:
         for a in (self.diagonal, self.upper, self.side, self.border):
             a[:] = 0.0
@@ -85,18 +92,17 @@ class Piece:
 
     def sums(self, wanted: bool) -> Sums:
         """For a kernel to add to; empty where only residuals are wanted."""
-        if wanted:
-            return Sums(self.first, self.diagonal, self.upper, self.side, self.border)
-        empty = np.zeros((0, NODE, NODE))
-        return Sums(self.first, empty, empty, empty, np.zeros((0, 0)))
+        piece = self if wanted else Piece.bare(self.first, self.last)
+        return Sums(piece.first, piece.diagonal, piece.upper, piece.side, piece.border)
 
 
-def make_pieces(n_nodes: int, n_border: int) -> tuple[Piece, ...]:
-    """Two pieces of about the same length; one where the chain is too short to share."""
+def make_pieces(n_nodes: int, n_border: int | None) -> tuple[Piece, ...]:
+    """Two pieces of about the same length; one where the chain is too short to share. Without a border, bare ones."""
     middle = n_nodes // 2
-    if middle < 2:
-        return (Piece.zeros(0, n_nodes - 1, n_border),)
-    return Piece.zeros(0, middle, n_border), Piece.zeros(middle, n_nodes - 1, n_border)
+    cuts = (0, n_nodes - 1) if middle < 2 else (0, middle, n_nodes - 1)
+    return tuple(
+        Piece.bare(a, b) if n_border is None else Piece.zeros(a, b, n_border) for a, b in pairwise(cuts)
+    )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)
@@ -210,6 +216,32 @@ def marginalise(piece: Piece) -> np.ndarray:
     if not _eliminate(piece.diagonal, piece.upper, piece.side, True, False):
         raise NotDefiniteError("the motion between nodes is not determined.")
     return piece.border - _eliminated_part(piece, keep=False)
+
+
+def marginalise_in_turn(pieces: Iterable[Piece]) -> np.ndarray:
+    """As `marginalise`, of a whole chain: of pieces that follow one another, of which only one need be in memory.
+    Overwrites them."""
+    rest = None
+    for piece in pieces:
+        if rest is not None:
+            piece.diagonal[0] += rest.diagonal[0]
+            piece.side[0] += rest.side[0]
+            piece.border += rest.border
+        rest = _onto_last(piece)
+    if rest is None:
+        raise ValueError("there is no piece to marginalise.")
+    return marginalise(rest)
+
+
+def _onto_last(piece: Piece) -> Piece:
+    """The last node and the border, all other nodes eliminated. Raises NotDefiniteError."""
+    if not _eliminate(piece.diagonal, piece.upper, piece.side, True, True):
+        raise NotDefiniteError("the motion between nodes is not determined.")
+    last = Piece.zeros(piece.last, piece.last, piece.side.shape[2] - 1)
+    last.diagonal[0], last.side[0] = piece.diagonal[-1], piece.side[-1]
+    flat = piece.side[:-1].reshape(-1, piece.side.shape[2])
+    last.border[:] = piece.border - flat.T @ flat
+    return last
 
 
 HELD_BELOW = 1e-2  # information in tolerance units: a direction known to less than ten tolerances stays where it is

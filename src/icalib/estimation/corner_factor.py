@@ -186,6 +186,15 @@ class CornerFactor:
         """Empty arrays for `accumulate` to fill."""
         return CornerOutput.empty(len(self.stream.uv), len(self.views.image), len(self.noise.tau))
 
+    def squared_errors(self, out: CornerOutput) -> np.ndarray:
+        """(N,) px^2, of the residuals with their images' common errors in them."""
+        square = np.empty(len(out.root))
+        for v0, v1 in self.blocks():
+            own = self.corners_of(v0, v1)
+            shared = self.noise.field[own, None, :] * out.shared[self.views.of_corner[own]]
+            square[own] = ((out.residual[own] + shared.sum(axis=2)) ** 2).sum(axis=1)
+        return square
+
     def with_direction(self, direction: np.ndarray) -> CornerFactor:
         """The same factor with bloom along `direction` (N, 2)."""
         return replace(self, direction=direction)

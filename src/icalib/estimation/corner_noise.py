@@ -95,8 +95,7 @@ def estimate_noise(
     """The noise that the residuals of a pass show, with `tau` for its common errors. A size given in the rig file
     is kept."""
     stream, used = factor.stream, out.root > 0.0
-    error = out.residual + (factor.noise.field[:, None, :] * out.shared[factor.views.of_corner]).sum(axis=2)
-    square = (error**2).sum(axis=1)
+    square = factor.squared_errors(out)
     if camera.corner_noise_px is not None:
         base, exposure = camera.corner_noise_px, 0.0
         if settings.blur_noise:

@@ -34,7 +34,7 @@ def spurious_information(problem: Problem, outcome: Outcome, seed: int = 0) -> n
     clear = np.linalg.eigvalsh(outcome.information * t[:, None] * t).min(initial=np.inf) > CLEAR
     found = []
     for _ in range(1 if clear else PAIRS):
-        sample, imu = _chain_sample(problem, outcome.state, rng), _reading_noise(problem.chain.imu, rng)
+        sample, imu = _chain_sample(problem, outcome, rng), _reading_noise(problem.chain.imu, rng)
         found += [_information(*_moved(problem, outcome.state, s * sample, s * imu)) for s in (1.0, -1.0)]
     return np.mean(found, axis=0) - outcome.information
 
@@ -45,16 +45,16 @@ def _information(problem: Problem, state: State) -> np.ndarray:
     return solve(pieces, problem.n_nodes, problem.tolerance).information
 
 
-def _chain_sample(problem: Problem, state: State, rng: np.random.Generator) -> np.ndarray:
+def _chain_sample(problem: Problem, outcome: Outcome, rng: np.random.Generator) -> np.ndarray:
     """(K, 15) a draw from the posterior of the chain, the border held: T^-1 J^T e for white e."""
-    scratch, pieces = problem.residuals(), problem.pieces()
-    imu_noise = rng.standard_normal(scratch.imu.shape)
-    noise = [(rng.standard_normal(c.residual.shape), rng.standard_normal(c.shared.shape)) for c in scratch.corners]
+    state, base, pieces = outcome.state, outcome.residuals, problem.pieces()
+    imu_noise = rng.standard_normal(base.imu.shape)
+    noise = [(rng.standard_normal(c.residual.shape), rng.standard_normal(c.shared.shape)) for c in base.corners]
 
-    def add(piece: Piece) -> None:
+    def add(piece: Piece) -> None:  # the residuals of `base` are filled once more, with what they are
         piece.clear()
-        problem.chain.accumulate(state, piece, scratch.imu, noise=imu_noise)
-        for camera, corners, own in zip(problem.cameras, scratch.corners, noise, strict=True):
+        problem.chain.accumulate(state, piece, imu_noise, noise=imu_noise)
+        for camera, corners, own in zip(problem.cameras, base.corners, noise, strict=True):
             camera.accumulate(state, piece, corners, noise=own)
         problem.add_prior_information(piece, state)
 

@@ -74,6 +74,7 @@ def determine(inputs: Inputs, start: State, on_step: Callable[[str, Step], None]
     for _ in range(MOST_ROUNDS):
         if undetermined.shape == found.problem.held.shape or not (undetermined.size or found.problem.held.size):
             break
+        del found  # before the next one takes as much memory
         found = estimate(inputs, start, on_step, undetermined)
         data, undetermined = _judge(inputs, found)
     held = found.problem.held if found.problem.held.size else np.zeros((inputs.layout.size, 0))

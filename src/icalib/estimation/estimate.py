@@ -73,6 +73,7 @@ def estimate(
         if _noise_is_estimated(inputs):
             models, noise = _next_noise(inputs, problem, outcome)
         state = resample(outcome.state, nodes_for(inputs, image_times(inputs, outcome.state.values)), inputs)
+        del problem, outcome  # before the next ones take as much memory
     raise AssertionError("pass_names is never empty")
 
 

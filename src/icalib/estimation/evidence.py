@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.arrowhead import Piece, in_parallel, marginalise, restricted_inverse, solve
+from icalib.estimation.arrowhead import Piece, in_parallel, marginalise, marginalise_in_turn, restricted_inverse, solve
 from icalib.estimation.corner_factor import CornerFactor, CornerOutput
-from icalib.estimation.problem import Problem
+from icalib.estimation.problem import Problem, Residuals
 from icalib.estimation.solver import Outcome
 from icalib.estimation.state import State
 
 PROBES = 2  # random right-hand sides; one already gives the dof of 1e5 residuals to 1 %
 IMAGE_CELLS = (4, 3)  # columns, rows
 TARGET_PARTS = 3  # along each side
+SEGMENT = 512  # nodes at a time, where the whole chain would be wide
 PROBE_STEP = 1e-2  # of a posterior sample: small enough to be linear
 
 
@@ -60,9 +61,8 @@ def fits(problem: Problem, outcome: Outcome, seed: int = 0) -> list[Fit]:
 
 def _corner_chi2(camera: CornerFactor, out: CornerOutput) -> dict[str, tuple[int, float]]:
     """Number and chi^2 of one camera's corner rows and of each kind of common error's rows."""
-    shift = (camera.noise.field[:, None, :] * out.shared[camera.views.of_corner]).sum(axis=2)
-    error = (out.residual + shift) * out.root[:, None]
-    found = {"corners": (2 * int((out.root > 0.0).sum()), float((error**2).sum()))}
+    chi2 = np.einsum("i,i,i->", camera.squared_errors(out), out.root, out.root)
+    found = {"corners": (2 * int(np.count_nonzero(out.root)), float(chi2))}
     for k, tau in enumerate(camera.noise.tau):
         rows = out.shared[:, :, k] / tau
         found[f"common error {k}"] = (rows.size, float((rows**2).sum()))
@@ -74,36 +74,42 @@ def _probe(problem: Problem, outcome: Outcome, rng: np.random.Generator) -> dict
     state, base = outcome.state, outcome.residuals
     imu_noise = rng.standard_normal(base.imu.shape)
     noise = [(rng.standard_normal(c.residual.shape), rng.standard_normal(c.shared.shape)) for c in base.corners]
-    pieces, scratch = problem.pieces(), problem.residuals()
+    pieces = problem.pieces()
 
-    def add(piece: Piece) -> None:
+    def add(piece: Piece) -> None:  # the residuals of `base` are filled once more, with what they are
         piece.clear()
-        problem.chain.accumulate(state, piece, scratch.imu, noise=imu_noise)
-        for camera, corners, n in zip(problem.cameras, scratch.corners, noise, strict=True):
+        problem.chain.accumulate(state, piece, imu_noise, noise=imu_noise)
+        for camera, corners, n in zip(problem.cameras, base.corners, noise, strict=True):
             camera.accumulate(state, piece, corners, noise=n)
         problem.add_prior_information(piece, state)
 
     in_parallel(add, pieces)
     solution = solve(pieces, problem.n_nodes, problem.tolerance, held=problem.held)
-    del pieces, scratch
+    del pieces
     # The sums hold J^T e where a solve expects J^T r: the step is -x.
-    up, down = (
-        _residuals_at(problem, state, -s * solution.chain, -s * solution.border) for s in (PROBE_STEP, -PROBE_STEP)
-    )
-    slope_imu = (up.imu - down.imu) / (2.0 * PROBE_STEP)
+    slopes = _slopes(problem, state, -solution.chain, -solution.border)
     kinds = problem.chain.kinds.items()
-    spent = {(problem.chain.name, k): float((imu_noise[:, r] * slope_imu[:, r]).sum()) for k, r in kinds}
-    for camera, at, u, d, n in zip(problem.cameras, base.corners, up.corners, down.corners, noise, strict=True):
-        slope = (u.residual - d.residual) / (2.0 * PROBE_STEP)
-        for kind, value in _spent_by_corners(camera, at, slope, *n).items():
+    spent = {(problem.chain.name, k): float((imu_noise[:, r] * slopes.imu[:, r]).sum()) for k, r in kinds}
+    for camera, at, s, n in zip(problem.cameras, base.corners, slopes.corners, noise, strict=True):
+        for kind, value in _spent_by_corners(camera, at, s.residual, *n).items():
             spent[camera.name, kind] = value
     return spent
 
 
-def _residuals_at(problem: Problem, state: State, chain: np.ndarray, border: np.ndarray):
-    out = problem.residuals()
-    problem.linearise(state.retract(problem.layout, chain, border), problem.pieces(), out, sums=False)
-    return out
+def _slopes(problem: Problem, state: State, chain: np.ndarray, border: np.ndarray) -> Residuals:
+    """Derivatives of the residuals along a step; roots and common errors are not."""
+    up = problem.residuals()
+    # Of the other side only what is subtracted has arrays of its own.
+    corners = tuple(replace(c, residual=np.zeros_like(c.residual)) for c in up.corners)
+    down = Residuals(np.zeros_like(up.imu), corners)
+    for s, out in ((PROBE_STEP, up), (-PROBE_STEP, down)):
+        moved = state.retract(problem.layout, s * chain, s * border)
+        problem.linearise(moved, problem.pieces(sums=False), out, sums=False)
+    pairs = [(up.imu, down.imu), *((u.residual, d.residual) for u, d in zip(up.corners, down.corners, strict=True))]
+    for u, d in pairs:
+        u -= d
+        u /= 2.0 * PROBE_STEP
+    return up
 
 
 def _spent_by_corners(
@@ -111,12 +117,11 @@ def _spent_by_corners(
 ) -> dict[str, float]:
     """e^T J x of one camera, its images' common errors solved along: e and slope (N, 2), e_shared (M, 2, m)."""
     root, view, n = at.root, camera.views.of_corner, len(camera.views.image)
-    e = np.where((root > 0.0)[:, None], e, 0.0)
-    along = slope * root[:, None]
-    total = float((e * along).sum())
+    total = float(np.einsum("ij,ij,i->", e, slope, root))
     m = len(camera.noise.tau)
     if m == 0:
         return {"corners": total}
+    e, along = np.where((root > 0.0)[:, None], e, 0.0), slope * root[:, None]
     f = camera.noise.field * root[:, None]
     M = np.zeros((n, m, m))
     rhs = np.zeros((n, 2, m))
@@ -145,11 +150,10 @@ def split_covariance(problem: Problem, outcome: Outcome, segments: int) -> np.nd
     segments = len(ends) - 1
     if np.diff(ends).min() < 3:
         return None
-    scratch = problem.residuals()
 
     def gradient(g: int) -> np.ndarray | None:
         piece = Piece.zeros(int(ends[g]), int(ends[g + 1]), problem.layout.size)
-        problem.add_measurements(outcome.state, piece, scratch)
+        problem.add_measurements(outcome.state, piece, outcome.residuals)
         problem.add_bias_prior(outcome.state, piece)
         if piece.last in problem.chain.starts:
             # The seam says nothing of the node behind it, and that node's own images are in the next segment.
@@ -184,7 +188,9 @@ def place_covariances(problem: Problem, outcome: Outcome) -> list[np.ndarray]:
     gradient
     would be zero but for noise; the IMU is one more.
     """
-    return [_cluster_spread(problem, outcome, by) for by in (_image_cells, _target_parts, _tag_corners)]
+    kinds = [[by(c, k) for k, c in enumerate(problem.cameras)] for by in (_image_cells, _target_parts, _tag_corners)]
+    gradients = _cluster_gradients(problem, outcome, kinds)
+    return [_spread(problem, outcome, np.vstack([b, -b.sum(axis=0)])) for b in gradients]
 
 
 def _image_cells(camera: CornerFactor, index: int) -> np.ndarray:
@@ -192,15 +198,15 @@ def _image_cells(camera: CornerFactor, index: int) -> np.ndarray:
     columns, rows = IMAGE_CELLS
     uv = camera.stream.uv
     low, high = uv.min(axis=0), uv.max(axis=0) + 1e-9
-    cell = ((uv - low) / (high - low) * IMAGE_CELLS).astype(int)
-    return (index * rows + cell[:, 1]) * columns + cell[:, 0]
+    x, y = (((uv[:, k] - low[k]) / (high - low)[k] * IMAGE_CELLS[k]).astype(np.int32) for k in range(2))
+    return (index * rows + y) * columns + x
 
 
 def _target_parts(camera: CornerFactor, index: int) -> np.ndarray:
     """(N,) part of a body of the target, the same for all cameras; single tags are not divided."""
     del index
     target = camera.bodies.target
-    part, parts = np.zeros(len(target.points), dtype=int), 0
+    part, parts = np.zeros(len(target.points), dtype=np.int32), 0
     for k in camera.bodies.used:
         own = target.body == k
         xy = target.points[own, :2]
@@ -214,22 +220,31 @@ def _target_parts(camera: CornerFactor, index: int) -> np.ndarray:
 
 def _tag_corners(camera: CornerFactor, index: int) -> np.ndarray:
     """(N,) which of its tag's four corners, cameras apart: what a detector does to each."""
-    return 4 * index + camera.stream.point % 4
+    return 4 * index + (camera.stream.point % 4).astype(np.int32)
 
 
-def _cluster_spread(problem: Problem, outcome: Outcome, by: Callable[[CornerFactor, int], np.ndarray]) -> np.ndarray:
-    clusters = [by(c, k) for k, c in enumerate(problem.cameras)]
-    n, B = 1 + max(int(c.max()) for c in clusters), problem.layout.size
-    piece = Piece.zeros(0, problem.n_nodes - 1, B + n)
-    narrow = problem.narrow(piece, B)
-    problem.add_measurements(outcome.state, narrow, problem.residuals())
-    problem.add_bias_prior(outcome.state, narrow)
-    piece.side[:, :, :B] = narrow.side[:, :, :B]
-    piece.border[:B, :B] = narrow.border[:B, :B]
-    for camera, at, cluster in zip(problem.cameras, outcome.residuals.corners, clusters, strict=True):
-        camera.accumulate_clusters(outcome.state, piece, at, cluster, n, B)
-    b = marginalise(piece)[:B, B : B + n].T
-    return _spread(problem, outcome, np.vstack([b, -b.sum(axis=0)]))
+def _cluster_gradients(problem: Problem, outcome: Outcome, kinds: list[list[np.ndarray]]) -> list[np.ndarray]:
+    """Of each of `kinds` of clusters, which name the cluster of every corner camera by camera: (clusters, B), the
+    gradient of each cluster, the chain marginalised a segment at a time."""
+    counts = [1 + max(int(c.max()) for c in clusters) for clusters in kinds]
+    B, state, at = problem.layout.size, outcome.state, outcome.residuals
+    starts = B + np.cumsum([0, *counts])
+
+    def segment(first: int, last: int) -> Piece:
+        piece = Piece.zeros(first, last, int(starts[-1]))
+        narrow = problem.narrow(piece, B)
+        problem.add_measurements(state, narrow, at)
+        problem.add_bias_prior(state, narrow)
+        piece.side[:, :, :B] = narrow.side[:, :, :B]
+        piece.border[:B, :B] = narrow.border[:B, :B]
+        for clusters, n, column in zip(kinds, counts, starts, strict=False):
+            for camera, corners, cluster in zip(problem.cameras, at.corners, clusters, strict=True):
+                camera.accumulate_clusters(state, piece, corners, cluster, n, int(column))
+        return piece
+
+    ends = (*range(0, problem.n_nodes - 1, SEGMENT), problem.n_nodes - 1)
+    rest = marginalise_in_turn(segment(a, b) for a, b in pairwise(ends))
+    return [rest[:B, a:b].T for a, b in pairwise(starts)]
 
 
 def _spread(problem: Problem, outcome: Outcome, b: np.ndarray) -> np.ndarray:

@@ -66,8 +66,8 @@ class Problem:
     def n_nodes(self) -> int:
         return self.chain.n_nodes
 
-    def pieces(self) -> tuple[Piece, ...]:
-        return make_pieces(self.n_nodes, self.layout.size)
+    def pieces(self, sums: bool = True) -> tuple[Piece, ...]:
+        return make_pieces(self.n_nodes, self.layout.size if sums else None)
 
     def residuals(self) -> Residuals:
         """Empty arrays for `linearise` to fill."""
