@@ -122,7 +122,7 @@ def corner_sample(
     def weights(at):
         out, used = run(at)
         root, f, image, r = out.root[used], noise.field[used], stream.image[used], out.residual[used]
-        view = factor.views.of_corner[used]
+        view = factor.views.of_corners(0, len(factor.views.image))[used]
         e = r + np.einsum("nk,nak->na", f, out.shared[view])
         size = np.linalg.norm(e, axis=1)
         bend = np.sqrt(slope_along(loss if curved else "none", size / sigma[image]))

@@ -26,6 +26,7 @@ from icalib.geometry.small import cholesky
 
 T = TypeVar("T")
 THREADS = 2  # pieces of the chain; more would need separators of their own
+SEGMENT = 512  # nodes at a time, where nothing is asked of the chain itself
 
 
 @cache
@@ -218,19 +219,19 @@ def marginalise(piece: Piece) -> np.ndarray:
     return piece.border - _eliminated_part(piece, keep=False)
 
 
-def marginalise_in_turn(pieces: Iterable[Piece]) -> np.ndarray:
-    """As `marginalise`, of a whole chain: of pieces that follow one another, of which only one need be in memory.
-    Overwrites them."""
-    rest = None
-    for piece in pieces:
-        if rest is not None:
-            piece.diagonal[0] += rest.diagonal[0]
-            piece.side[0] += rest.side[0]
-            piece.border += rest.border
-        rest = _onto_last(piece)
-    if rest is None:
-        raise ValueError("there is no piece to marginalise.")
-    return marginalise(rest)
+def marginalise_in_segments(piece: Callable[[int, int], Piece], n_nodes: int) -> np.ndarray:
+    """As `marginalise`, of a whole chain whose `piece` from one node to another is made when it is its turn, so that
+    the chain never lies in memory as a whole."""
+    ends = [*range(0, n_nodes - 1, SEGMENT), n_nodes - 1]
+    spans, rest = list(pairwise(ends)), None
+    for k in range(0, len(spans), THREADS):
+        for own in in_parallel(lambda span: piece(*span), spans[k : k + THREADS]):
+            if rest is not None:
+                own.diagonal[0] += rest.diagonal[0]
+                own.side[0] += rest.side[0]
+                own.border += rest.border
+            rest = _onto_last(own)
+    return marginalise(piece(0, 0) if rest is None else rest)
 
 
 def _onto_last(piece: Piece) -> Piece:

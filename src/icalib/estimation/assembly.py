@@ -29,6 +29,7 @@ from icalib.measurements import CornerStream, Measurements
 from icalib.rig import Camera, Parameter, Rig, Scheme
 
 BLOOM_SIGMA_PX = 1.0
+NO_BLOOM = np.zeros((0, 2), dtype=np.float32)  # single precision: directions as such are near enough
 CAMERA_PARAMETERS: tuple[tuple[str, Kind], ...] = (
     ("rotation", "rotation"),
     ("translation", "vector"),
@@ -183,7 +184,7 @@ def assemble(
         seen = is_seen(inputs, t, state.seconds[node])
         factor = CornerFactor(
             stream, camera_model(camera.model), inputs.imu, rig.gravity, scheme, stream.seconds, node,
-            k & np.repeat(seen, np.diff(stream.start)), n, np.zeros((0, 2)), inputs.bodies, layout,
+            k & np.repeat(seen, np.diff(stream.start)), n, NO_BLOOM, inputs.bodies, layout,
             len(state.seconds), tuple(images.start for images in own[1:]),
         )  # fmt: skip
         factors.append(_with_bloom(factor, camera, state, rig) if rig.blooms else factor)
@@ -216,10 +217,10 @@ def _with_bloom(factor: CornerFactor, camera: Camera, state: State, rig: Rig) ->
     """The factor with the directions in which its corners bloom, frozen at `state`."""
     inwards = rig.target.tag_centers - rig.target.points
     params = np.concatenate([state.values[camera.name, "intrinsics"], state.values[camera.name, "distortion"]])
-    direction = np.empty_like(factor.stream.uv)
+    direction = np.empty(factor.stream.uv.shape, dtype=np.float32)
     for v0, v1 in factor.blocks():
         own, (X, R_cb) = factor.corners_of(v0, v1), factor.points_in_camera(state, v0, v1)
-        view = factor.views.of_corner[own] - v0
+        view = factor.views.of_corners(v0, v1) - v0
         towards = np.einsum("nij,nj->ni", R_cb[view], inwards[factor.stream.point[own]])
         direction[own] = bloom_direction(factor.model, params, X, towards)
     return factor.with_direction(direction)

@@ -42,6 +42,8 @@ from icalib.measurements import CornerStream
 from icalib.rig import Scheme
 
 BLOCK = 256  # images at a time, where nothing is summed
+DRAWN = 65536  # corners at a time, for which noise is drawn
+POSES = 1024  # views at a time, whose poses and how these move are made together
 CHUNK = 64  # views at a time: what a chunk needs stays in the cache
 LOSSES = {"none": 0, "huber": 1, "cauchy": 2}
 
@@ -94,10 +96,9 @@ class Views:
         first = np.flatnonzero(fresh)
         return cls(np.append(first, len(own)).astype(np.int64), image[first], own[first])
 
-    @cached_property
-    def of_corner(self) -> np.ndarray:
-        """(N,) the view that each corner belongs to."""
-        return np.repeat(np.arange(len(self.image), dtype=np.int32), np.diff(self.start))
+    def of_corners(self, v0: int, v1: int) -> np.ndarray:
+        """(n,) the view that each corner of views v0..v1 belongs to."""
+        return np.repeat(np.arange(v0, v1), np.diff(self.start[v0 : v1 + 1]))
 
 
 @dataclass(frozen=True)
@@ -182,6 +183,22 @@ class CornerFactor:
             R_cb[a:b] = R_cw[a:b] @ state.values[scene, "tilt"] @ R_sb[body[a:b]]
         return X, R_cb
 
+    def residual(self, state: State, v0: int, v1: int) -> np.ndarray:
+        """(n, 2) px, predicted - measured, of the corners of views v0..v1."""
+        own, (X, _) = self.corners_of(v0, v1), self.points_in_camera(state, v0, v1)
+        params = np.concatenate([state.values[self.name, "intrinsics"], state.values[self.name, "distortion"]])
+        uv = self.model.project(params, X)[0] - self.stream.uv[own]
+        return uv + state.values[self.name, "bloom"] * self.direction[own] if len(self.direction) else uv
+
+    def white_noise(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """In place of whitened residuals: corners (N, 2), float32 because there are many, common errors (V, 2, m)."""
+        n = len(self.stream.uv)
+        corners = np.empty((n, 2), dtype=np.float32)
+        for a in range(0, n, DRAWN):
+            b = min(a + DRAWN, n)
+            corners[a:b] = rng.standard_normal((b - a, 2))
+        return corners, rng.standard_normal((len(self.views.image), 2, len(self.noise.tau)))
+
     def output(self) -> CornerOutput:
         """Empty arrays for `accumulate` to fill."""
         return CornerOutput.empty(len(self.stream.uv), len(self.views.image), len(self.noise.tau))
@@ -191,7 +208,7 @@ class CornerFactor:
         square = np.empty(len(out.root))
         for v0, v1 in self.blocks():
             own = self.corners_of(v0, v1)
-            shared = self.noise.field[own, None, :] * out.shared[self.views.of_corner[own]]
+            shared = self.noise.field[own, None, :] * out.shared[self.views.of_corners(v0, v1)]
             square[own] = ((out.residual[own] + shared.sum(axis=2)) ** 2).sum(axis=1)
         return square
 
@@ -222,23 +239,29 @@ class CornerFactor:
         self,
         state: State,
         piece: Piece,
-        out: CornerOutput,
+        out: CornerOutput | None,
         sums: bool = True,
         curved: bool = False,
         noise: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> float:
-        """Fills `out` for the images whose node lies in `piece`, and adds them to its sums where `sums` are wanted.
+        """Fills `out`, if given, for the images whose node lies in `piece`, and adds them to its sums where `sums`
+        are wanted.
 
         Returns half the robust chi^2. `curved`: J^T J has the true curvature of the robust loss, not its weights alone.
         With `noise` (corners (N, 2), common errors (V, 2, m), white) in place of the whitened residuals, returns the
         quadratic form of the common errors' rows instead.
         """
-        white, white_shared = noise or (out.residual, out.shared)
+        m = len(self.noise.tau)
+        white, white_shared = noise or (np.zeros((0, 2), dtype=np.float32), np.zeros((0, 2, m)))
         into, total = piece.sums(sums), 0.0
-        for v0, v1, scene in self.parts(*self._views_of(piece)):
+        for v0, v1, scene in self._blocks_of(piece):
             images, noise_model, direct, motion = self._arguments(state, v0, v1, scene, curved)
             given = Given(noise is not None, white, white_shared[v0:v1])
-            found = Found(out.residual, out.root, out.shared[v0:v1])
+            if out is None:
+                own = CornerOutput.empty(int(images.start[-1] - images.start[0]), v1 - v0, m)
+                found = Found(int(images.start[0]), own.residual, own.root, own.shared)
+            else:
+                found = Found(0, out.residual, out.root, out.shared[v0:v1])
             for a, b, predicted in self._chunks(state, images, motion, scene, sums):
                 total += accumulate(a, b, images, noise_model, direct, motion, predicted, given, into, found)
         return total
@@ -249,9 +272,9 @@ class CornerFactor:
         """Adds the gradient of each cluster of corners (N,), weights as in `at`, to columns of `piece` from
         `column` on."""
         into = piece.sums(True)
-        for v0, v1, scene in self.parts(*self._views_of(piece)):
+        for v0, v1, scene in self._blocks_of(piece):
             images, noise, direct, motion = self._arguments(state, v0, v1, scene, False)
-            found = Found(at.residual, at.root, at.shared[v0:v1])
+            found = Found(0, at.residual, at.root, at.shared[v0:v1])
             for a, b, predicted in self._chunks(state, images, motion, scene, True):
                 accumulate_clusters(
                     a, b, cluster, n_clusters, column, images, noise, direct, motion, predicted, into, found
@@ -303,9 +326,11 @@ class CornerFactor:
                 uv, valid = self.model.project(params, X)
                 yield a, b, Predicted(int(start[a]), X, uv, valid, np.zeros((0, 2, 3)), np.zeros((0, 2, 0)))
 
-    def _views_of(self, piece: Piece) -> tuple[int, int]:
-        """The views that belong to `piece`: nodes from first to before last, the chain's very last node included."""
+    def _blocks_of(self, piece: Piece) -> Iterator[tuple[int, int, str]]:
+        """The views that belong to `piece`, nodes from first to before last, the chain's very last node included; some
+        at a time, as `parts` has them."""
         stop = piece.last + 1 if piece.last == self.n_nodes - 1 else piece.last
         images = np.searchsorted(self.node, [piece.first, stop])
-        v0, v1 = np.searchsorted(self.views.image, images)
-        return int(v0), int(v1)
+        v0, v1 = (int(v) for v in np.searchsorted(self.views.image, images))
+        for first in range(v0, v1, POSES):
+            yield from self.parts(first, min(first + POSES, v1))

@@ -88,8 +88,9 @@ class Given(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What is left: residual (N, 2) and root (N,) by corner, shared (n, 2, m) by image."""
+    """What is left: residual (n, 2) and root (n,) of corners `first` and on, shared (n, 2, m) by image."""
 
+    first: int
     residual: np.ndarray
     root: np.ndarray
     shared: np.ndarray
@@ -125,7 +126,8 @@ def _gram(A, D, n, out):
 def _predict_image(i, images, noise, direct, predicted, found):
     """Residuals, weights and common error of image i; returns its half robust chi^2."""
     n0, n1, o = images.start[i], images.start[i + 1], predicted.first
-    res, ok = found.residual[n0:n1], np.empty(n1 - n0, np.bool_)
+    f0, f1 = n0 - found.first, n1 - found.first
+    res, ok = found.residual[f0:f1], np.empty(n1 - n0, np.bool_)
     for k in range(n1 - n0):
         n = n0 + k
         ok[k] = images.keep[n] and predicted.valid[n - o]
@@ -134,7 +136,7 @@ def _predict_image(i, images, noise, direct, predicted, found):
             if len(direct.direction):
                 res[k, r] += direct.bloom * direct.direction[n, r]
     return robust_weights(
-        res, ok, noise.field[n0:n1], noise.precision, noise.sigma[i], noise.loss, noise.scale, found.root[n0:n1],
+        res, ok, noise.field[n0:n1], noise.precision, noise.sigma[i], noise.loss, noise.scale, found.root[f0:f1],
         found.shared[i],
     )  # fmt: skip
 
@@ -152,7 +154,7 @@ def _fill_rows(i, images, noise, direct, motion, predicted, found, error, A):
     D = 6 + n_pars + has_bloom + ns
     moved = np.empty((3, ns))
     for k in range(n):
-        c, root = n0 + k - predicted.first, found.root[n0 + k]
+        c, root = n0 + k - predicted.first, found.root[n0 + k - found.first]
         x, y, z = predicted.X[c, 0], predicted.X[c, 1], predicted.X[c, 2]
         _turn(motion.R_cam_world[i], direct.basis[images.point[n0 + k]], moved)
         for r in range(2):
@@ -217,18 +219,18 @@ def accumulate(i0, i1, images, noise, direct, motion, predicted, given, sums, fo
         if len(sums.diagonal) == 0:
             continue
         n0, n1 = images.start[i], images.start[i + 1]
-        n = n1 - n0
-        whole_error(found.residual[n0:n1], noise.field[n0:n1], found.shared[i], error)
+        n, f0, f1 = n1 - n0, n0 - found.first, n1 - found.first
+        whole_error(found.residual[f0:f1], noise.field[n0:n1], found.shared[i], error)
         _fill_rows(i, images, noise, direct, motion, predicted, found, error, A)
         if given.used:
             for k in range(n):
-                ok = found.root[n0 + k] > 0.0
+                ok = found.root[f0 + k] > 0.0
                 A[D, k] = given.corners[n0 + k, 0] if ok else 0.0
                 A[D, n + k] = given.corners[n0 + k, 1] if ok else 0.0
         _gram(A, D + 1, 2 * n, G)
         if len(noise.precision):
             rows = marginalise_shared(
-                A, D, n, found.root[n0:n1], noise.field[n0:n1], noise.precision, given.shared[i], given.used, G
+                A, D, n, found.root[f0:f1], noise.field[n0:n1], noise.precision, given.shared[i], given.used, G
             )
             total += rows if given.used else 0.0
         pose_chain(i, motion, Tn, Tm, Tc)
@@ -244,8 +246,8 @@ def accumulate_clusters(i0, i1, cluster, n_clusters, column, images, noise, dire
     G = np.empty((D, n_clusters))
     for i in range(i0, i1):
         n0, n1 = images.start[i], images.start[i + 1]
-        n = n1 - n0
-        whole_error(found.residual[n0:n1], noise.field[n0:n1], found.shared[i], error)
+        n, f0, f1 = n1 - n0, n0 - found.first, n1 - found.first
+        whole_error(found.residual[f0:f1], noise.field[n0:n1], found.shared[i], error)
         _fill_rows(i, images, noise, direct, motion, predicted, found, error, A)
         for d in range(D):
             for g in range(n_clusters):

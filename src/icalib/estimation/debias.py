@@ -8,10 +8,11 @@ it once more: S(x + d) - S(x), its mean over draws +-d of the trajectory's own p
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
-from icalib.estimation.arrowhead import Piece, in_parallel, solve
+from icalib.estimation.arrowhead import in_parallel, marginalise_in_segments, solve
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.imu_factor import ImuFactor
 from icalib.estimation.problem import Problem
@@ -34,31 +35,20 @@ def spurious_information(problem: Problem, outcome: Outcome, seed: int = 0) -> n
     clear = np.linalg.eigvalsh(outcome.information * t[:, None] * t).min(initial=np.inf) > CLEAR
     found = []
     for _ in range(1 if clear else PAIRS):
-        sample, imu = _chain_sample(problem, outcome, rng), _reading_noise(problem.chain.imu, rng)
+        sample, imu = _chain_sample(problem, outcome.state, rng), _reading_noise(problem.chain.imu, rng)
         found += [_information(*_moved(problem, outcome.state, s * sample, s * imu)) for s in (1.0, -1.0)]
     return np.mean(found, axis=0) - outcome.information
 
 
 def _information(problem: Problem, state: State) -> np.ndarray:
-    pieces = problem.pieces()
-    problem.linearise(state, pieces, problem.residuals(), curved=True)
-    return solve(pieces, problem.n_nodes, problem.tolerance).information
+    n = problem.layout.size
+    return marginalise_in_segments(partial(problem.sums_of, state), problem.n_nodes)[:n, :n]
 
 
-def _chain_sample(problem: Problem, outcome: Outcome, rng: np.random.Generator) -> np.ndarray:
+def _chain_sample(problem: Problem, state: State, rng: np.random.Generator) -> np.ndarray:
     """(K, 15) a draw from the posterior of the chain, the border held: T^-1 J^T e for white e."""
-    state, base, pieces = outcome.state, outcome.residuals, problem.pieces()
-    imu_noise = rng.standard_normal(base.imu.shape)
-    noise = [(rng.standard_normal(c.residual.shape), rng.standard_normal(c.shared.shape)) for c in base.corners]
-
-    def add(piece: Piece) -> None:  # the residuals of `base` are filled once more, with what they are
-        piece.clear()
-        problem.chain.accumulate(state, piece, imu_noise, noise=imu_noise)
-        for camera, corners, own in zip(problem.cameras, base.corners, noise, strict=True):
-            camera.accumulate(state, piece, corners, noise=own)
-        problem.add_prior_information(piece, state)
-
-    in_parallel(add, pieces)
+    noise, pieces = problem.white_noise(rng), problem.pieces()
+    in_parallel(lambda piece: problem.add_noise(state, piece, noise), pieces)
     return solve(pieces, problem.n_nodes, problem.tolerance, held=np.eye(problem.layout.size)).chain
 
 

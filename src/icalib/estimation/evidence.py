@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.arrowhead import Piece, in_parallel, marginalise, marginalise_in_turn, restricted_inverse, solve
+from icalib.estimation.arrowhead import (
+    Piece,
+    in_parallel,
+    marginalise,
+    marginalise_in_segments,
+    restricted_inverse,
+    solve,
+)
 from icalib.estimation.corner_factor import CornerFactor, CornerOutput
-from icalib.estimation.problem import Problem, Residuals
+from icalib.estimation.imu_factor import ROWS
+from icalib.estimation.problem import Problem
 from icalib.estimation.solver import Outcome
 from icalib.estimation.state import State
 
 PROBES = 2  # random right-hand sides; one already gives the dof of 1e5 residuals to 1 %
 IMAGE_CELLS = (4, 3)  # columns, rows
 TARGET_PARTS = 3  # along each side
-SEGMENT = 512  # nodes at a time, where the whole chain would be wide
 PROBE_STEP = 1e-2  # of a posterior sample: small enough to be linear
 
 
@@ -71,58 +79,47 @@ def _corner_chi2(camera: CornerFactor, out: CornerOutput) -> dict[str, tuple[int
 
 def _probe(problem: Problem, outcome: Outcome, rng: np.random.Generator) -> dict[tuple[str, str], float]:
     """e_s^T J_s x of each sensor for one random e."""
-    state, base = outcome.state, outcome.residuals
-    imu_noise = rng.standard_normal(base.imu.shape)
-    noise = [(rng.standard_normal(c.residual.shape), rng.standard_normal(c.shared.shape)) for c in base.corners]
-    pieces = problem.pieces()
-
-    def add(piece: Piece) -> None:  # the residuals of `base` are filled once more, with what they are
-        piece.clear()
-        problem.chain.accumulate(state, piece, imu_noise, noise=imu_noise)
-        for camera, corners, n in zip(problem.cameras, base.corners, noise, strict=True):
-            camera.accumulate(state, piece, corners, noise=n)
-        problem.add_prior_information(piece, state)
-
-    in_parallel(add, pieces)
+    state, at = outcome.state, outcome.residuals.corners
+    noise, pieces = problem.white_noise(rng), problem.pieces()
+    in_parallel(lambda piece: problem.add_noise(state, piece, noise), pieces)
     solution = solve(pieces, problem.n_nodes, problem.tolerance, held=problem.held)
     del pieces
     # The sums hold J^T e where a solve expects J^T r: the step is -x.
-    slopes = _slopes(problem, state, -solution.chain, -solution.border)
-    kinds = problem.chain.kinds.items()
-    spent = {(problem.chain.name, k): float((imu_noise[:, r] * slopes.imu[:, r]).sum()) for k, r in kinds}
-    for camera, at, s, n in zip(problem.cameras, base.corners, slopes.corners, noise, strict=True):
-        for kind, value in _spent_by_corners(camera, at, s.residual, *n).items():
-            spent[camera.name, kind] = value
+    ends = [state.retract(problem.layout, -s * solution.chain, -s * solution.border) for s in (PROBE_STEP, -PROBE_STEP)]
+    up, down = (_imu_residuals(problem, end) for end in ends)
+    along = noise.imu * (up - down) / (2.0 * PROBE_STEP)
+    spent = {(problem.chain.name, k): float(along[:, r].sum()) for k, r in problem.chain.kinds.items()}
+    for camera, out, own in zip(problem.cameras, at, noise.corners, strict=True):
+        found = in_parallel(partial(_spent_by_views, camera, out, ends, own), camera.blocks())
+        for kind in found[0]:
+            spent[camera.name, kind] = sum(one[kind] for one in found)
     return spent
 
 
-def _slopes(problem: Problem, state: State, chain: np.ndarray, border: np.ndarray) -> Residuals:
-    """Derivatives of the residuals along a step; roots and common errors are not."""
-    up = problem.residuals()
-    # Of the other side only what is subtracted has arrays of its own.
-    corners = tuple(replace(c, residual=np.zeros_like(c.residual)) for c in up.corners)
-    down = Residuals(np.zeros_like(up.imu), corners)
-    for s, out in ((PROBE_STEP, up), (-PROBE_STEP, down)):
-        moved = state.retract(problem.layout, s * chain, s * border)
-        problem.linearise(moved, problem.pieces(sums=False), out, sums=False)
-    pairs = [(up.imu, down.imu), *((u.residual, d.residual) for u, d in zip(up.corners, down.corners, strict=True))]
-    for u, d in pairs:
-        u -= d
-        u /= 2.0 * PROBE_STEP
-    return up
+def _imu_residuals(problem: Problem, state: State) -> np.ndarray:
+    out = np.zeros((problem.n_nodes - 1, ROWS))
+    for piece in problem.pieces(sums=False):
+        problem.chain.accumulate(state, piece, out, sums=False)
+    return out
 
 
-def _spent_by_corners(
-    camera: CornerFactor, at: CornerOutput, slope: np.ndarray, e: np.ndarray, e_shared: np.ndarray
+def _spent_by_views(
+    camera: CornerFactor,
+    at: CornerOutput,
+    ends: list[State],
+    noise: tuple[np.ndarray, np.ndarray],
+    views: tuple[int, int],
 ) -> dict[str, float]:
-    """e^T J x of one camera, its images' common errors solved along: e and slope (N, 2), e_shared (M, 2, m)."""
-    root, view, n = at.root, camera.views.of_corner, len(camera.views.image)
-    total = float(np.einsum("ij,ij,i->", e, slope, root))
-    m = len(camera.noise.tau)
+    """e^T J x of some views of one camera, their images' common errors solved along."""
+    own, n, m = camera.corners_of(*views), views[1] - views[0], len(camera.noise.tau)
+    up, down = (camera.residual(state, *views) for state in ends)
+    root, view = at.root[own], camera.views.of_corners(*views) - views[0]
+    along = (up - down) / (2.0 * PROBE_STEP) * root[:, None]
+    e, e_shared = np.where((root > 0.0)[:, None], noise[0][own], 0.0), noise[1][slice(*views)]
+    total = float((e * along).sum())
     if m == 0:
         return {"corners": total}
-    e, along = np.where((root > 0.0)[:, None], e, 0.0), slope * root[:, None]
-    f = camera.noise.field * root[:, None]
+    f = camera.noise.field[own] * root[:, None]
     M = np.zeros((n, m, m))
     rhs = np.zeros((n, 2, m))
     np.add.at(M, view, f[:, :, None] * f[:, None, :])
@@ -131,8 +128,8 @@ def _spent_by_corners(
     rhs += e_shared / camera.noise.tau
     shared = np.linalg.solve(M, rhs.transpose(0, 2, 1)).transpose(0, 2, 1)
     total += float((e[:, :, None] * f[:, None, :] * shared[view]).sum())
-    own = (e_shared * shared / camera.noise.tau).sum(axis=(0, 1))
-    return {"corners": total} | {f"common error {k}": float(own[k]) for k in range(m)}
+    spent = (e_shared * shared / camera.noise.tau).sum(axis=(0, 1))
+    return {"corners": total} | {f"common error {k}": float(spent[k]) for k in range(m)}
 
 
 def split_covariance(problem: Problem, outcome: Outcome, segments: int) -> np.ndarray | None:
@@ -242,8 +239,7 @@ def _cluster_gradients(problem: Problem, outcome: Outcome, kinds: list[list[np.n
                 camera.accumulate_clusters(state, piece, corners, cluster, n, int(column))
         return piece
 
-    ends = (*range(0, problem.n_nodes - 1, SEGMENT), problem.n_nodes - 1)
-    rest = marginalise_in_turn(segment(a, b) for a, b in pairwise(ends))
+    rest = marginalise_in_segments(segment, problem.n_nodes)
     return [rest[:B, a:b].T for a, b in pairwise(starts)]
 
 

@@ -50,6 +50,14 @@ class Residuals:
 
 
 @dataclass(frozen=True)
+class Noise:
+    """White noise: imu (K - 1, 15); by camera the corners' (N, 2) and the common errors' (V, 2, m)."""
+
+    imu: np.ndarray
+    corners: tuple[tuple[np.ndarray, np.ndarray], ...]
+
+
+@dataclass(frozen=True)
 class Problem:
     """Minimise half the sum of all squared, whitened, robust residuals over a `State`."""
 
@@ -68,6 +76,29 @@ class Problem:
 
     def pieces(self, sums: bool = True) -> tuple[Piece, ...]:
         return make_pieces(self.n_nodes, self.layout.size if sums else None)
+
+    def sums_of(self, state: State, first: int, last: int) -> Piece:
+        """The sums between two nodes alone, with the true curvature of robust losses; residuals are not kept."""
+        piece = Piece.zeros(first, last, self.layout.size)
+        self.chain.accumulate(state, piece, np.zeros((self.n_nodes - 1, ROWS)))
+        for camera in self.cameras:
+            camera.accumulate(state, piece, None, curved=True)
+        self.add_bias_prior(state, piece)
+        for prior in self.priors if first == 0 else ():
+            prior.accumulate(state, piece)
+        return piece
+
+    def white_noise(self, rng: np.random.Generator) -> Noise:
+        """White noise in place of all whitened residuals."""
+        imu = rng.standard_normal((self.n_nodes - 1, ROWS))
+        return Noise(imu, tuple(c.white_noise(rng) for c in self.cameras))
+
+    def add_noise(self, state: State, piece: Piece, noise: Noise) -> None:
+        """Adds to `piece` what `noise` gives in place of the residuals: J^T J and J^T e, priors as if they were met."""
+        self.chain.accumulate(state, piece, noise.imu, noise=noise.imu)
+        for camera, own in zip(self.cameras, noise.corners, strict=True):
+            camera.accumulate(state, piece, None, noise=own)
+        self.add_prior_information(piece, state)
 
     def residuals(self) -> Residuals:
         """Empty arrays for `linearise` to fill."""

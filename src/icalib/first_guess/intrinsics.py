@@ -51,7 +51,7 @@ def _one_body_each(stream: CornerStream, target: Target) -> tuple[CornerStream, 
     size = np.bincount(target.body)
     boards = size[views.body] >= FEWEST_CORNERS
     used = np.flatnonzero(boards if boards.any() else ~boards)
-    rows = np.isin(views.of_corner, used)
+    rows = np.isin(views.of_corners(0, len(views.image)), used)
     start = np.concatenate([[0], np.cumsum(np.diff(views.start)[used])])
     alone = CornerStream(stream.name, stream.stamps_ns[views.image[used]], start, stream.point[rows], stream.uv[rows])
     return alone, Flat(target.points, FEWEST_CORNERS if boards.any() else int(size.min()))
