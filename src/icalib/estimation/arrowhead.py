@@ -21,6 +21,7 @@ import numpy as np
 from numba import njit
 
 from icalib.errors import EstimationError
+from icalib.estimation import pages
 from icalib.estimation.state import NODE
 from icalib.geometry.small import cholesky
 
@@ -71,9 +72,9 @@ class Piece:
         return cls(
             first,
             last,
-            np.zeros((n, NODE, NODE)),
-            np.zeros((n, NODE, NODE)),
-            np.zeros((n, NODE, n_border + 1)),
+            pages.zeros((n, NODE, NODE)),
+            pages.zeros((n, NODE, NODE)),
+            pages.zeros((n, NODE, n_border + 1)),
             np.zeros((n_border + 1, n_border + 1)),
         )
 

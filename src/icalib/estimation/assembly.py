@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.errors import EstimationError
+from icalib.estimation import pages
 from icalib.estimation.arrowhead import NOTHING
 from icalib.estimation.board import SHAPE_LABELS, SHAPE_SIGMA_M, bloom_direction, board_in
 from icalib.estimation.bodies import Bodies, choose_bodies, restrict
@@ -217,7 +218,7 @@ def _with_bloom(factor: CornerFactor, camera: Camera, state: State, rig: Rig) ->
     """The factor with the directions in which its corners bloom, frozen at `state`."""
     inwards = rig.target.tag_centers - rig.target.points
     params = np.concatenate([state.values[camera.name, "intrinsics"], state.values[camera.name, "distortion"]])
-    direction = np.empty(factor.stream.uv.shape, dtype=np.float32)
+    direction = pages.zeros(factor.stream.uv.shape, np.float32)
     for v0, v1 in factor.blocks():
         own, (X, R_cb) = factor.corners_of(v0, v1), factor.points_in_camera(state, v0, v1)
         view = factor.views.of_corners(v0, v1) - v0

@@ -18,6 +18,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from icalib.estimation import pages
 from icalib.estimation.arrowhead import Piece
 from icalib.estimation.board import board_in
 from icalib.estimation.bodies import Bodies
@@ -72,7 +73,7 @@ class CornerOutput:
     @classmethod
     def empty(cls, n: int, n_views: int, m: int) -> CornerOutput:
         """For n corners in `n_views` views with m sizes of a common error."""
-        return cls(np.zeros((n, 2)), np.zeros(n), np.zeros((n_views, 2, m)))
+        return cls(pages.zeros((n, 2)), pages.zeros((n,)), np.zeros((n_views, 2, m)))
 
 
 @dataclass(frozen=True)
@@ -193,7 +194,7 @@ class CornerFactor:
     def white_noise(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """In place of whitened residuals: corners (N, 2), float32 because there are many, common errors (V, 2, m)."""
         n = len(self.stream.uv)
-        corners = np.empty((n, 2), dtype=np.float32)
+        corners = pages.zeros((n, 2), np.float32)
         for a in range(0, n, DRAWN):
             b = min(a + DRAWN, n)
             corners[a:b] = rng.standard_normal((b - a, 2))

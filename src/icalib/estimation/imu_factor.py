@@ -8,6 +8,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numba import njit
 
+from icalib.estimation import pages
 from icalib.estimation.arrowhead import Piece, in_parallel
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.integration import integrate
@@ -225,8 +226,8 @@ class ImuFactor:
             np.empty((n, 3, 3)),
             np.empty((n, 3)),
             np.empty((n, 3)),
-            np.empty((n, 9, width)),
-            np.empty((n, ROWS, ROWS)),
+            pages.zeros((n, 9, width)),
+            pages.zeros((n, ROWS, ROWS)),
         )
         bias0 = state.bias.copy()
         intrinsics = state.values[imu.name, "intrinsics"].copy()
