@@ -1,27 +1,36 @@
 """Peak memory of the command line on a long recording with images: `python benchmarks/memory.py FOLDER --minutes 10`.
 
-A camera at 20 Hz beside an IMU, filmed while being moved by hand; its images are half of EuRoC's in width and
-height, so that rendering takes minutes, and memory hardly depends on them: only a few are held at a time. The bag is
-kept in FOLDER (1.1 GB for 10 minutes). `icalib calibrate` then runs in a process of its own whose corners nobody has
-kept, twice, because kernels may have to be compiled the first time. Needs icalib[bags,images], and Linux or macOS.
+A camera at 20 Hz beside an IMU. Its motion repeats every 20 s, so that only 400 pictures are rendered, of half EuRoC's
+width and height; the IMU goes on measuring that motion with noise of its own. The bag is kept in FOLDER (1.1 GB for 10
+minutes). `icalib calibrate` then runs in a process of its own whose corners nobody has kept, twice, because kernels may
+have to be compiled the first time. Needs icalib[bags,images], and Linux or macOS.
 """
 
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import os
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import yaml
 
+from icalib.measurements import ImuStream
 from icalib.rig import Settings
 from icalib.rig_file import rig_to_dict
-from icalib.simulation import Scenario, film, handheld, rig_for, write_film
+from icalib.simulation import Scenario, handheld, rig_for, simulate, write_film
+from icalib.simulation.corners import image_stamps
+from icalib.simulation.filming import Film, Shot
+from icalib.simulation.imu import imu_stamps, read_imu
+from icalib.simulation.motion import Waves, reference_motion
+from icalib.simulation.rendering import Imaging
 
+PERIOD_S = 20.0
 TARGET_MB = 500.0
 
 
@@ -59,20 +68,51 @@ def scenario_of(duration_s: float) -> Scenario:
     base = handheld(duration_s)
     cam0 = base.cameras[0]
     fx, fy, cx, cy = cam0.intrinsics
-    half = dataclasses.replace(
+    half = replace(
         cam0,
+        jitter_s=0.0,
         resolution=(cam0.resolution[0] // 2, cam0.resolution[1] // 2),
         intrinsics=(0.5 * fx, 0.5 * fy, 0.5 * (cx - 0.5), 0.5 * (cy - 0.5)),
     )
-    return dataclasses.replace(base, cameras=(half,))
+    return replace(base, cameras=(half,))
 
 
 def _render(scenario: Scenario, bag: Path) -> int:
     part = bag.with_suffix(".part")
     part.unlink(missing_ok=True)  # of a run that was interrupted
-    write_film(film(scenario, 0), {"ros1": part})
+    write_film(repeating_film(scenario), {"ros1": part})
     part.rename(bag)
     return 0
+
+
+class RepeatingFilm(Film):
+    """A film of a motion that repeats, whose pictures of the first period are shown again in each."""
+
+    def shots(self, workers: int | None = None) -> Iterator[Shot]:
+        first = replace(self.scenario, duration_s=PERIOD_S + 1.0)
+        pictures = list(Film(first, self.seed, self.imaging, 0.0, self.imu, self.truth).shots(workers))
+        camera = self.scenario.cameras[0]
+        period = round(PERIOD_S * camera.rate_hz)
+        stamps, seconds = image_stamps(self.scenario, camera, np.random.default_rng(0))
+        for k, (stamp, t) in enumerate(zip(stamps.tolist(), seconds.tolist(), strict=True)):
+            yield replace(pictures[k % period], stamp_ns=stamp, seconds=t)
+
+
+def repeating_film(scenario: Scenario) -> Film:
+    """Readings over the whole of `scenario`, of its motion with the nearest frequencies that fit into the period."""
+    rng = np.random.default_rng(0)
+    motion = reference_motion(scenario, rng)
+    motion = replace(motion, angles=_repeating(motion.angles), shifts=_repeating(motion.shifts))
+    stamps = imu_stamps(scenario, rng)
+    seconds = 1e-9 * stamps
+    readings = read_imu(scenario, seconds, motion.readings_at(seconds), rng)
+    imu = ImuStream("imu0", stamps + np.int64(scenario.imu_clock_origin_ns), readings.gyro, readings.accel)
+    short = simulate(replace(scenario, duration_s=2.0), 0).truth
+    return RepeatingFilm(scenario, 0, Imaging(blur_px=0.8, noise=2.0), 0.0, imu, replace(short, trajectory=motion))
+
+
+def _repeating(waves: Waves) -> Waves:
+    return replace(waves, frequency=np.round(waves.frequency * PERIOD_S) / PERIOD_S)
 
 
 def calibrated(rig: Path, bag: Path) -> tuple[float, float, int]:

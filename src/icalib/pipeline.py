@@ -18,6 +18,7 @@ from icalib.estimation.assembly import Inputs, image_times, inputs_for, nodes_fo
 from icalib.estimation.board import board_in
 from icalib.estimation.determination import determine
 from icalib.estimation.nodes import first_nodes
+from icalib.estimation.pages import give_back
 from icalib.estimation.state import State
 from icalib.first_guess import Guess, initial_trajectory
 from icalib.first_guess.several import initial_guesses
@@ -94,10 +95,12 @@ def calibrate_measurements(
 def _calibrate(rig: Rig, recordings: Sequence[Measurements], progress: Progress) -> Calibration:
     clock = _Clock()
     progress("finding a first guess", 0.0)
+    give_back()
     inputs = inputs_for(rig, recordings)
     guesses = initial_guesses(rig, inputs.bodies, [m.measurements for m in inputs.motions])
     clock.lap("first guess")
     state = first_state(inputs, *guesses)
+    give_back()
     clock.lap("first state")
     steps = _StepProgress(progress)
     found = determine(inputs, state, lambda name, step: steps.note(name))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from icalib.estimation import pages
 from icalib.estimation.arrowhead import NOTHING
 from icalib.estimation.assembly import Inputs, assemble, image_times, nodes_for, resample
 from icalib.estimation.corner_factor import CornerFactor, CornerNoise, CornerOutput
@@ -74,6 +75,7 @@ def estimate(
             models, noise = _next_noise(inputs, problem, outcome)
         state = resample(outcome.state, nodes_for(inputs, image_times(inputs, outcome.state.values)), inputs)
         del problem, outcome  # before the next ones take as much memory
+        pages.give_back()
     raise AssertionError("pass_names is never empty")
 
 

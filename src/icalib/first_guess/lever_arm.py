@@ -19,6 +19,7 @@ from icalib.first_guess.gyro import GyroRotation
 from icalib.first_guess.target_poses import TargetPoses
 
 STEP_S = 0.12  # between the images of a triple: long against pose noise, short against the loss of sight
+READINGS = 8192  # of the IMU at a time, whose rotations are made together
 BIAS_SIGMA = 0.3  # m/s^2
 ROW_SIGMA = 0.05  # m/s, of a row of the system
 G_TOLERANCE = 0.1
@@ -119,17 +120,25 @@ def _double_integrals(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Double integrals of R_board_imu f (n, 3) and of R_board_imu (n, 3, 3) at image times t, from the first IMU
     stamp."""
-    s = imu.seconds
-    R = gyro.carry(t, R_bi, s)
-    x = np.concatenate([(R @ imu.accel[:, :, None])[:, :, 0], R.reshape(-1, 9)], axis=1)
-    dt = np.diff(s)[:, None]
-    first, second = np.zeros_like(x), np.zeros_like(x)
-    first[1:] = np.cumsum(0.5 * (x[1:] + x[:-1]) * dt, axis=0)
-    second[1:] = np.cumsum(first[:-1] * dt + (2.0 * x[:-1] + x[1:]) * dt**2 / 6.0, axis=0)
+    s, x = imu.seconds, np.empty((12, len(imu.seconds)))
+    for a in range(0, len(s), READINGS):
+        own = slice(a, min(a + READINGS, len(s)))
+        R = gyro.carry(t, R_bi, s[own])
+        x[:3, own] = (R @ imu.accel[own, :, None])[:, :, 0].T
+        x[3:, own] = R.reshape(-1, 9).T
     j = imu.interval(t)
-    tau = (t - s[j])[:, None]
-    out = second[j] + first[j] * tau + 0.5 * x[j] * tau**2
+    out = np.stack([_double_integral(s, row, t, j) for row in x], axis=1)
     return out[:, :3], out[:, 3:].reshape(-1, 3, 3)
+
+
+def _double_integral(s: np.ndarray, x: np.ndarray, t: np.ndarray, j: np.ndarray) -> np.ndarray:
+    """(n,) at times t, in intervals j, of x (N,), linear between times s (N,)."""
+    dt = np.diff(s)
+    first, second = np.zeros_like(x), np.zeros_like(x)
+    first[1:] = np.cumsum(0.5 * (x[1:] + x[:-1]) * dt)
+    second[1:] = np.cumsum(first[:-1] * dt + (2.0 * x[:-1] + x[1:]) * dt**2 / 6.0)
+    tau = t - s[j]
+    return second[j] + first[j] * tau + 0.5 * x[j] * tau**2
 
 
 def check_size(arm: LeverArm, camera: str, given: bool) -> None:

@@ -78,7 +78,7 @@ def scene_poses(stream: CornerStream, model: CameraModel, params: np.ndarray, sc
     views = Views.of(stream, scene.bodies.target.body)
     seen = body_poses(stream, views, scene.bodies, model, params)
     R_sb, p_sb = scene.bodies.poses(scene.values)
-    rays, good = usable_rays(stream, model, params)
+    rays, good = usable_rays(stream.uv, model, params)
     n, focal = len(stream.stamps_ns), float(params[0])
     rotation, position, rms = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), np.full(n, 1e9)
     first = np.searchsorted(views.image, np.arange(n + 1))

@@ -17,6 +17,7 @@ FEWEST_CORNERS = 6  # of a board; fewer lie on a line too easily
 SMALLEST_COSINE = 0.15  # rays closer to the image plane than this have no place in a homography
 LARGEST_RMS_PX = 3.0
 ROUNDS = 5
+BLOCK = 512  # poses at a time: what all corners need at once fills the memory
 
 
 @dataclass(frozen=True)
@@ -237,15 +238,21 @@ def flat_poses(
     """Poses (n, sides, ...) of the camera in the frames of flat bodies: the corners start[i]:start[i + 1] are of one,
     and make a pose where there are `fewest` (n,) of them. With two sides, the pose with mirrored depths comes second:
     a small body far away looks alike from both."""
-    rays, good = usable_rays(stream, model, params)
     n = len(start) - 1
     rotation, position = np.tile(np.eye(3), (n, sides, 1, 1)), np.zeros((n, sides, 3))
     rms = np.empty((n, sides))
-    _all_poses(start, stream.point, rays, good, target, fewest, ROUNDS, float(params[0]), rotation, position, rms)
+    for a in range(0, n, BLOCK):
+        i = slice(a, min(a + BLOCK, n))
+        own = slice(int(start[i.start]), int(start[i.stop]))
+        rays, good = usable_rays(stream.uv[own], model, params)
+        _all_poses(
+            start[i.start : i.stop + 1] - own.start, stream.point[own], rays, good, target, fewest[i], ROUNDS,
+            float(params[0]), rotation[i], position[i], rms[i],
+        )  # fmt: skip
     return TargetPoses(rotation, position, rms < LARGEST_RMS_PX, rms)
 
 
-def usable_rays(stream: CornerStream, model: CameraModel, params: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 3) unit rays of all corners, and (N,) whether one is far enough from the image plane."""
-    rays, valid = model.unproject(params, stream.uv)
+def usable_rays(uv: np.ndarray, model: CameraModel, params: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 3) unit rays of corners at uv (N, 2), and (N,) whether one is far enough from the image plane."""
+    rays, valid = model.unproject(params, uv)
     return rays, valid & (rays[:, 2] > SMALLEST_COSINE)
