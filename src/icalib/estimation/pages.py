@@ -18,7 +18,9 @@ LEAST = 1 << 20  # bytes, below which the allocator does better
 def zeros(shape: tuple[int, ...], dtype: type = np.float64) -> np.ndarray:
     """As np.zeros, with pages of its own where it is large."""
     size = math.prod(shape) * np.dtype(dtype).itemsize
-    return np.zeros(shape, dtype) if size < LEAST else np.ndarray(shape, dtype, buffer=mmap.mmap(-1, size))
+    if size < LEAST or sys.platform == "win32":
+        return np.zeros(shape, dtype)
+    return np.ndarray(shape, dtype, buffer=mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS))
 
 
 def give_back() -> None:
