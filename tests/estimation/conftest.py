@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.estimation.arrowhead import Piece
+from icalib.estimation.arrowhead import Piece, make_pieces
 from icalib.estimation.board import SHAPE_LABELS
 from icalib.estimation.bodies import Bodies, restrict
 from icalib.estimation.corner_factor import CornerFactor, CornerNoise
+from icalib.estimation.feature_factor import FeatureFactor
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.imu_factor import ImuFactor
 from icalib.estimation.nodes import place_nodes
@@ -23,7 +24,7 @@ from icalib.estimation.problem import Problem
 from icalib.estimation.state import NODE, Layout, State, make_layout
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets import AprilGrid
-from icalib.measurements import CornerStream
+from icalib.measurements import CornerStream, TrackStream
 from icalib.simulation import Scenario, Simulation, handheld, simulate
 
 TOLERANCE = {
@@ -125,7 +126,7 @@ def make_setup(
     R_world_grid, origin = truth.T_world_board[:3, :3], truth.T_world_board[:3, 3]
     R_grid_scene, p_grid_scene = target.frame(1) if split else (np.eye(3), np.zeros(3))
     values["board0", "tilt"] = R_world_grid @ R_grid_scene
-    for k in bodies.used:
+    for k in bodies.used if split else ():
         values[target.bodies[k], "rotation"], values[target.bodies[k], "translation"] = target.place(k, bodies.used[0])
     times = []
     for c in measurements.cameras:
@@ -178,6 +179,22 @@ def make_factor(setup: Setup, camera: int, scheme: str = "inertial", **changes) 
     return replace(factor, **changes)
 
 
+def make_features(
+    setup: Setup, scheme: str = "inertial", loss: tuple[str, float] = ("none", 2.5), noise_px: float = 0.0
+) -> FeatureFactor:
+    """The corners of both cameras as features of unknown position, sigma 0.8 and 1.1 px; of every third image of the
+    first camera some are not in use."""
+    rng = np.random.default_rng(11)
+    streams = tuple(
+        TrackStream(s.name, s.stamps_ns, s.start, s.point, s.uv + noise_px * rng.normal(size=s.uv.shape))
+        for s in setup.streams
+    )
+    cameras = tuple(make_factor(setup, i, scheme) for i in range(len(streams)))
+    keep = [rng.random(len(s.uv)) < 0.9 for s in streams]
+    cuts = tuple(p.first for p in make_pieces(len(setup.state.seconds), 0)[1:])
+    return FeatureFactor.build(cameras, streams, (0.8, 1.1), tuple(keep), loss, setup.state, cuts)
+
+
 def make_problem(setup: Setup, start: State | None = None, scheme: str = "inertial") -> Problem:
     columns = setup.layout.columns("imu0", "intrinsics")
     imu = ImuFactor.build(setup.imu, start or setup.state, 9.81, columns[columns >= 0])
@@ -200,7 +217,23 @@ def make_dense(pieces: tuple[Piece, ...], n_nodes: int) -> tuple[np.ndarray, np.
                 H[a, NODE * k + NODE : NODE * k + 2 * NODE] += piece.upper[i]
         H[o:, o:] += piece.border[:-1, :-1]
         g[o:] += piece.border[:-1, -1]
+        for H_part, g_part in schur_of_features(piece, n_nodes) if piece.features else ():
+            H -= H_part
+            g -= g_part
     return np.triu(H) + np.triu(H, 1).T, g
+
+
+def schur_of_features(piece: Piece, n_nodes: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """What eliminating each feature of a piece takes from the dense normal matrix and its gradient."""
+    sums, o = piece.features.sums, NODE * n_nodes
+    for f in range(len(sums.own)):
+        K = np.zeros((3, o + sums.side.shape[2]))
+        K[:, o:] = sums.side[f]
+        for e in np.flatnonzero(sums.track == f):
+            a = NODE * (piece.first + sums.node[e])
+            K[:, a : a + NODE] += sums.block[e]
+        M = K[:, :-1].T @ np.linalg.solve(sums.own[f], K)
+        yield M[:, :-1], M[:, -1]
 
 
 def unlike_cameras(duration_s: float, asynchronous: bool = True) -> Scenario:
@@ -225,6 +258,11 @@ def setup_of() -> Callable[..., Setup]:
 @pytest.fixture(scope="session")
 def factor_of() -> Callable[..., CornerFactor]:
     return make_factor
+
+
+@pytest.fixture(scope="session")
+def features_of() -> Callable[..., FeatureFactor]:
+    return make_features
 
 
 @pytest.fixture(scope="session")

@@ -140,6 +140,59 @@ def corner_sample(
     return Sample("CornerFactor", setup, state, accumulate, residual, weights, tolerance)
 
 
+def feature_sample(unlike, setup_of, features_of, scheme="inertial", loss="none", imu_free=False, curved=False):
+    """Points are held where the cost is least at the sample's state; the weights take them out."""
+    setup = setup_of(unlike, imu_free=imu_free)
+    rng = np.random.default_rng(4)
+    factor = features_of(setup, scheme, (loss, LOSS_SCALE), 1.0)
+    state = setup.perturbed(rng, 0.02)
+    at_optimum = factor.output()
+    for piece in make_pieces(len(state.seconds), setup.layout.size):
+        factor.accumulate(state, piece, at_optimum, sums=False)
+    used = [root > 0 for root in at_optimum.root]
+    track = np.concatenate([t[u] for t, u in zip(factor.tracks.track, used, strict=True)])
+
+    def errors(at, points):
+        found = []
+        for i, (camera, stream, u) in enumerate(zip(factor.cameras, factor.streams, used, strict=True)):
+            _, R_cw, p_wc = camera.camera_poses(at)
+            image = stream.image[u]
+            X = np.einsum("nij,nj->ni", R_cw[image], points[factor.tracks.track[i][u]] - p_wc[image])
+            params = np.concatenate([at.values[camera.name, "intrinsics"], at.values[camera.name, "distortion"]])
+            found.append(camera.model.project(params, X)[0] - stream.uv[u])
+        return np.concatenate(found)
+
+    def residual(at):
+        return errors(at, at_optimum.points).ravel()
+
+    def weights(at):
+        e = errors(at, at_optimum.points)
+        root = np.concatenate([r[u] for r, u in zip(at_optimum.root, used, strict=True)])
+        sigma = np.repeat(factor.sigma, [u.sum() for u in used])
+        size = np.linalg.norm(e, axis=1)
+        bend = slope_along(loss if curved else "none", size / sigma)
+        W = np.zeros((len(e), 2, len(e), 2))
+        along = np.einsum("ni,nj->nij", e, e) / (size**2)[:, None, None]
+        blocks = (root**2)[:, None, None] * (np.eye(2) + (bend - 1.0)[:, None, None] * along)
+        W[np.arange(len(e)), :, np.arange(len(e))] = blocks
+        W = W.reshape(2 * len(e), 2 * len(e))
+        F, h = np.zeros((2 * len(e), 3 * factor.tracks.count)), 1e-5
+        for k in range(3):
+            step = h * np.eye(3)[k]
+            slope = (errors(at, at_optimum.points + step) - errors(at, at_optimum.points - step)) / (2 * h)
+            for r in range(2):
+                F[2 * np.arange(len(e)) + r, 3 * track + k] = slope[:, r]
+        y = (root[:, None] ** 2 * e).ravel()
+        return y, W - W @ F @ np.linalg.solve(F.T @ W @ F, F.T @ W)
+
+    def accumulate(at, piece, sums):
+        if sums:
+            piece.features = factor.attach(piece, keep=True).features
+        return factor.accumulate(at, piece, factor.output(), sums, curved)
+
+    return Sample("FeatureFactor", setup, state, accumulate, residual, weights)
+
+
 def prior_sample(unlike, setup_of, sensor, name):
     setup = setup_of(unlike, imu_free=True)
     rng = np.random.default_rng(2)
@@ -205,6 +258,17 @@ SAMPLES = {
         "CornerFactor",
         lambda u, s, f: corner_sample(u, s, f, 1, "pose", loss="huber", field=1, curved=True, split=True),
     ),
+    "features": ("FeatureFactor", lambda u, s, f: feature_sample(u, s, f)),
+    "features, intrinsics, kinematic": (
+        "FeatureFactor",
+        lambda u, s, f: feature_sample(u, s, f, "kinematic", imu_free=True),
+    ),
+    "features, pose": ("FeatureFactor", lambda u, s, f: feature_sample(u, s, f, "pose")),
+    "features, huber": ("FeatureFactor", lambda u, s, f: feature_sample(u, s, f, loss="huber")),
+    "features, cauchy, curved, pose": (
+        "FeatureFactor",
+        lambda u, s, f: feature_sample(u, s, f, "pose", "cauchy", curved=True),
+    ),
     "prior on a rotation": ("Prior", lambda u, s, f: prior_sample(u, s, "cam1", "rotation")),
     "prior on a vector": ("Prior", lambda u, s, f: prior_sample(u, s, "cam0", "intrinsics")),
     "prior on IMU intrinsics": ("Prior", lambda u, s, f: prior_sample(u, s, "imu0", "intrinsics")),
@@ -253,9 +317,9 @@ def scales(sample):
 
 
 @pytest.fixture(scope="module", params=SAMPLES)
-def sample(request, unlike, setup_of, factor_of):
+def sample(request, unlike, setup_of, factor_of, features_of):
     name, make = SAMPLES[request.param]
-    made = make(unlike, setup_of, factor_of)
+    made = make(unlike, setup_of, features_of if name == "FeatureFactor" else factor_of)
     assert made.factor == name
     return made
 

@@ -1,8 +1,8 @@
 """Elimination of a chain whose nodes are tied together by features, each seen from many nodes (paper (15), Schur).
 
-Nodes are eliminated in groups, from one end of the piece to the other. A feature joins the front at the first group that
-sees it, and is eliminated with the last one: the answer is exact however long it lives. The cost per group grows with
-the square of the number of features that are alive there.
+Nodes are eliminated in groups, from one end of the piece to the other. A feature joins the front at the first group
+that sees it, and is eliminated with the last one: the answer is exact however long it lives. The cost per group grows
+with the square of the number of features that are alive there.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ PANEL = 48  # rows of a triangular solve at a time
 
 
 class FeatureSums(NamedTuple):
-    """What features add to the normal equations of a `Piece`: own (T, 3, 3); side (T, 3, B + 1), feature with border, its
-    gradient in the last column; block (E, 3, 15), feature with node, of each pair that meets. track (E,) and node (E,)
-    of these pairs, tracks and nodes counted from the first of the piece."""
+    """What features add to the normal equations of a `Piece`: own (T, 3, 3); side (T, 3, B + 1), feature with border,
+    its gradient in the last column; block (E, 3, 15), feature with node, of each pair that meets. track (E,) and node
+    (E,) of these pairs, tracks and nodes counted from the first of the piece."""
 
     own: np.ndarray
     side: np.ndarray
@@ -43,8 +43,8 @@ class FeatureSums(NamedTuple):
 
 
 class Group(NamedTuple):
-    """One step of the elimination: `nodes`, in order, and features `dying` (d,) are its pivots; what is left is the node
-    `after` them (-1: none), `surviving` features (s,), and the border.
+    """One step of the elimination: `nodes`, in order, and features `dying` (d,) are its pivots; what is left is the
+    node `after` them (-1: none), `surviving` features (s,), and the border.
 
     Positions are counted in that order. carried (c,): where what the step before left stands now; born (b,): features
     that join, and their positions born_at; pair (e,): pairs of feature and node, their positions row (node), column.
@@ -195,8 +195,8 @@ class Features:
 
 @dataclass(frozen=True)
 class Eliminated:
-    """factor (p, p) and rest (p, N - p) of each step, and what is `left` (15 or 0 + B + 1): the kept node and the border,
-    upper triangle."""
+    """factor (p, p) and rest (p, N - p) of each step, and what is `left` (15 or 0 + B + 1): the kept node and the
+    border, upper triangle."""
 
     steps: list[Group]
     factors: list[np.ndarray]
