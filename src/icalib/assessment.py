@@ -20,6 +20,7 @@ from icalib.estimation.assembly import Inputs, image_times, origin_difference
 from icalib.estimation.board import SHAPE_LABELS
 from icalib.estimation.bodies import words_on_left_out
 from icalib.estimation.corner_noise import NoiseModel
+from icalib.estimation.determination import Determined
 from icalib.estimation.estimate import Estimate
 from icalib.estimation.evidence import Fit, fits, place_covariances, split_covariance
 from icalib.estimation.imu_data import ImuData
@@ -42,11 +43,12 @@ LARGE_BLOOM_PX = 0.8  # ink and overexposure move edges by a third of that
 MANY_REJECTED = 0.05
 
 
-def assess(inputs: Inputs, found: Estimate) -> Calibration:
+def assess(inputs: Inputs, determined: Determined) -> Calibration:
     """The result with everything that says how far to trust it."""
+    found = determined.estimate
     problem, outcome = found.problem, found.outcome
     names = _column_names(inputs)
-    seen = observe(problem, outcome.state, outcome.information, names)
+    seen = observe(determined, names)
     empirical = _empirical_variance(inputs, found, np.diag(seen.covariance))
     groups = _groups(inputs, found, seen, empirical)
     judged = [_sensor_fit(f, found) for f in fits(problem, outcome)]

@@ -1,4 +1,4 @@
-"""What the data determine: verdicts on parameters and on combinations of them."""
+"""What the data determine, in words: verdicts on parameters and on combinations of them."""
 
 from __future__ import annotations
 
@@ -7,11 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.calibration import Verdict
-from icalib.estimation.arrowhead import HELD_BELOW
-from icalib.estimation.problem import Problem
-from icalib.estimation.state import State
+from icalib.estimation.determination import Determined
 
-WEAK_BELOW = 1.0  # information in tolerance units: one tolerance of standard deviation
 SHARE = 0.25  # a parameter that makes up this much of an undetermined direction is undetermined itself
 NAMED = 0.2  # parts of a direction smaller than this are not named
 
@@ -30,38 +27,35 @@ MISSING_MOTION = {
 
 @dataclass(frozen=True)
 class Observability:
-    """std (B,) formal standard deviations; verdicts by border column; undetermined combinations as sentences."""
+    """Covariance (B, B) formal; verdicts by border column; undetermined combinations as sentences."""
 
     covariance: np.ndarray
     verdicts: tuple[Verdict, ...]
     undetermined: tuple[str, ...]
 
 
-def observe(problem: Problem, state: State, information: np.ndarray, names: tuple[str, ...]) -> Observability:
-    """Classifies the border by its marginal `information` (B, B), priors left out of the verdict.
-
-    Eigen-directions are taken in tolerance units: undetermined below 1/100, weak below 1. `names` (B,) as in
-    "cam0.translation.x".
-    """
-    t = problem.tolerance
-    bare = information.copy()
-    for prior in problem.priors:
-        _, J = prior.residual(state)
-        columns = prior.block.columns
-        bare[np.ix_(columns, columns)] -= J.T @ J
-    values, vectors = np.linalg.eigh(bare * t[:, None] * t)
-    held = vectors[:, values < HELD_BELOW]
-    own, own_vectors = np.linalg.eigh(information * t[:, None] * t)
-    covariance = t[:, None] * ((own_vectors / np.maximum(own, 0.1 * HELD_BELOW)) @ own_vectors.T) * t
-    spread = np.sqrt(np.einsum("ik,k,ik->i", vectors, 1.0 / np.maximum(values, 0.1 * HELD_BELOW), vectors))
+def observe(found: Determined, names: tuple[str, ...]) -> Observability:
+    """Verdicts by what the data alone say: determined where they know a parameter to a tolerance. `names` (B,) as in
+    "cam0.translation.x"."""
+    directions = sparse_basis(found.held)
+    share = (directions**2).sum(axis=1)
     verdicts: list[Verdict] = []
-    for i in range(len(t)):
-        if (held[i] ** 2).sum() > SHARE:
-            verdicts.append("undetermined")
-        else:
-            verdicts.append("determined" if spread[i] ** 2 <= 1.0 / WEAK_BELOW else "weak")
-    sentences = tuple(_sentence(held[:, k], names) for k in range(held.shape[1]))
-    return Observability(covariance, tuple(verdicts), sentences)
+    for part, spread in zip(share, found.spread, strict=True):
+        verdicts.append("undetermined" if part > SHARE else "determined" if spread <= 1.0 else "weak")
+    sentences = tuple(_sentence(u, names) for u in directions.T)
+    return Observability(found.covariance, tuple(verdicts), sentences)
+
+
+def sparse_basis(directions: np.ndarray, rounds: int = 50) -> np.ndarray:
+    """The same span as the orthonormal columns (B, m), turned so that each has few large entries (varimax, Kaiser
+    1958)."""
+    n, m = directions.shape if directions.size else (len(directions), 0)
+    turn = np.eye(m)
+    for _ in range(rounds if m > 1 else 0):
+        L = directions @ turn
+        U, _, Vt = np.linalg.svd(directions.T @ (L**3 - L * (L**2).mean(axis=0)))
+        turn = U @ Vt
+    return directions @ turn if m else np.zeros((n, 0))
 
 
 def _sentence(direction: np.ndarray, names: tuple[str, ...]) -> str:

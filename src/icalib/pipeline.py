@@ -16,7 +16,7 @@ from icalib.detection.streams import find_corners
 from icalib.errors import RecordingError
 from icalib.estimation.assembly import Inputs, image_times, inputs_for, nodes_for, start_values
 from icalib.estimation.board import board_in
-from icalib.estimation.estimate import estimate
+from icalib.estimation.determination import determine
 from icalib.estimation.nodes import first_nodes
 from icalib.estimation.state import State
 from icalib.first_guess import Guess, initial_trajectory
@@ -100,7 +100,7 @@ def _calibrate(rig: Rig, recordings: Sequence[Measurements], progress: Progress)
     state = first_state(inputs, *guesses)
     clock.lap("first state")
     steps = _StepProgress(progress)
-    found = estimate(inputs, state, lambda name, step: steps.note(name))
+    found = determine(inputs, state, lambda name, step: steps.note(name))
     clock.lap("solving")
     progress("judging the result", 0.9)
     result = assess(inputs, found)

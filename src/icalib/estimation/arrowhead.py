@@ -20,7 +20,7 @@ import numpy as np
 from numba import njit
 
 from icalib.errors import EstimationError
-from icalib.estimation.front import Eliminated, Features, eliminate
+from icalib.estimation.front import Eliminated, Features, eliminate, plan
 from icalib.estimation.state import NODE
 from icalib.geometry.small import cholesky
 
@@ -86,7 +86,11 @@ class Piece:
 
     def without_last(self) -> Piece:
         """The same sums without node `last`, of which they must say nothing."""
-        return Piece(self.first, self.last - 1, self.diagonal[:-1], self.upper[:-1], self.side[:-1], self.border)
+        features = self.features
+        if features is not None:
+            features = Features(features.sums, plan(features.sums, len(self.diagonal) - 1, True, False))
+        own = self.diagonal[:-1], self.upper[:-1], self.side[:-1]
+        return Piece(self.first, self.last - 1, *own, self.border, features)
 
     def sums(self, wanted: bool) -> Sums:
         """For a kernel to add to; empty where only residuals are wanted."""
@@ -243,15 +247,40 @@ def marginalise(piece: Piece) -> np.ndarray:
 HELD_BELOW = 1e-2  # information in tolerance units: a direction known to less than ten tolerances stays where it is
 
 
-def border_step(information: np.ndarray, gradient: np.ndarray, tolerance: np.ndarray) -> tuple[np.ndarray, float]:
-    """Step (B,) of the border and the decrease of half the chi^2 it promises; undetermined directions are held.
+LEAST = 1e-4  # of information in tolerance units; keeps variances finite
+NOTHING = np.zeros((0, 0))
 
-    Eigen-directions are those of the information in units of `tolerance` (B,).
+
+def border_step(
+    information: np.ndarray, gradient: np.ndarray, tolerance: np.ndarray, held: np.ndarray = NOTHING
+) -> tuple[np.ndarray, float]:
+    """Step (B,) of the border and the decrease of half the chi^2 it promises; undetermined directions are held, and
+    those in the columns of `held` (B, m), orthonormal.
+
+    Directions are those of the information in units of `tolerance` (B,).
     """
-    values, vectors = np.linalg.eigh(information * tolerance[:, None] * tolerance)
-    projected = vectors.T @ (tolerance * gradient)
+    scaled, g = information * tolerance[:, None] * tolerance, tolerance * gradient
+    free = complement(held, len(tolerance))
+    values, vectors = np.linalg.eigh(free.T @ scaled @ free)
+    projected = vectors.T @ (free.T @ g)
     step = np.where(values > HELD_BELOW, -projected / np.maximum(values, HELD_BELOW), 0.0)
-    return tolerance * (vectors @ step), float(-0.5 * projected @ step)
+    return tolerance * (free @ (vectors @ step)), float(-0.5 * projected @ step)
+
+
+def complement(held: np.ndarray, n: int) -> np.ndarray:
+    """(n, n - m) orthonormal columns, all at right angles to those of `held` (n, m)."""
+    if not held.size:
+        return np.eye(n)
+    full, _, _ = np.linalg.svd(held, full_matrices=True)
+    return full[:, held.shape[1] :]
+
+
+def restricted_inverse(information: np.ndarray, held: np.ndarray) -> np.ndarray:
+    """(B, B) inverse of the information within the directions that are not held, both in tolerance units."""
+    free = complement(held, len(information))
+    values, vectors = np.linalg.eigh(free.T @ information @ free)
+    basis = free @ vectors
+    return (basis / np.maximum(values, LEAST)) @ basis.T
 
 
 def _back(piece: Piece, done: Eliminated | bool, keep: bool, border: np.ndarray, chain: np.ndarray) -> None:
@@ -263,8 +292,11 @@ def _back(piece: Piece, done: Eliminated | bool, keep: bool, border: np.ndarray,
         _substitute(piece.diagonal, piece.upper, piece.side, piece.first == 0, keep, border, own)
 
 
-def solve(pieces: tuple[Piece, ...], n_nodes: int, tolerance: np.ndarray, damping: float = 0.0) -> Solution:
-    """Solves (H + damping diag(H)) step = -gradient; overwrites the pieces. Raises NotDefiniteError."""
+def solve(
+    pieces: tuple[Piece, ...], n_nodes: int, tolerance: np.ndarray, damping: float = 0.0, held: np.ndarray = NOTHING
+) -> Solution:
+    """Solves (H + damping diag(H)) step = -gradient, directions of the border in `held` left alone (see border_step);
+    overwrites the pieces. Raises NotDefiniteError."""
     keep = len(pieces) > 1
     n_border = len(tolerance)
     scale = np.append(np.full(n_border, damping), 0.0)
@@ -285,7 +317,7 @@ def solve(pieces: tuple[Piece, ...], n_nodes: int, tolerance: np.ndarray, dampin
         _forward_solve(shared, shared_side)
         rest -= shared_side.T @ shared_side
     information = rest[:n_border, :n_border]
-    border, decrease = border_step(information, rest[:n_border, n_border], tolerance)
+    border, decrease = border_step(information, rest[:n_border, n_border], tolerance, held)
     chain = np.zeros((n_nodes, NODE))
     if keep:
         rhs = -(shared_side[:, -1] + shared_side[:, :-1] @ border)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.errors import EstimationError
+from icalib.estimation.arrowhead import NOTHING
 from icalib.estimation.board import SHAPE_LABELS, SHAPE_SIGMA_M, bloom_direction, board_in
 from icalib.estimation.bodies import Bodies, choose_bodies, restrict
 from icalib.estimation.corner_factor import CornerFactor, CornerNoise
@@ -103,25 +104,34 @@ def origin_difference(measurements: Measurements, stream: CornerStream) -> float
 
 
 def _priors(inputs: Inputs) -> tuple[Prior, ...]:
+    """All priors: those that belong to the model, and those that were given."""
     rig, layout = inputs.rig, inputs.layout
-    priors = []
-    for name in inputs.bodies.bending:
-        priors.append(Prior(layout.block(name, "shape"), np.zeros(len(SHAPE_LABELS)), SHAPE_SIGMA_M))
-    owners: list[tuple[str, str, Parameter, float]] = []
+    priors = [
+        Prior(layout.block(b, "shape"), np.zeros(len(SHAPE_LABELS)), SHAPE_SIGMA_M) for b in inputs.bodies.bending
+    ]
+    for camera in rig.cameras if rig.blooms else ():
+        if camera.bloom.mode == "free":
+            priors.append(Prior(layout.block(camera.name, "bloom"), np.zeros(1), np.full(1, BLOOM_SIGMA_PX)))
     if rig.imu is not None:
-        owners.append((rig.imu.name, "intrinsics", rig.imu.intrinsics, 0.0))
-    for camera, stream in zip(rig.cameras, inputs.measurements.cameras, strict=True):
+        priors += _given(layout, rig.imu.name, "intrinsics", rig.imu.intrinsics)
+    return (*priors, *given_priors(inputs))
+
+
+def given_priors(inputs: Inputs) -> tuple[Prior, ...]:
+    """The priors that the rig file gives on what is calibrated."""
+    priors = []
+    for camera, stream in zip(inputs.rig.cameras, inputs.measurements.cameras, strict=True):
         for name, _ in CAMERA_PARAMETERS:
             shift = origin_difference(inputs.measurements, stream) if name == "time_offset" else 0.0
-            owners.append((camera.name, name, getattr(camera, name), shift))
-            if name == "bloom" and rig.blooms and camera.bloom.mode == "free":
-                block = layout.block(camera.name, "bloom")
-                priors.append(Prior(block, np.zeros(1), np.full(1, BLOOM_SIGMA_PX)))
-    for sensor, name, parameter, shift in owners:
-        estimated = layout.block(sensor, name).start is not None
-        if estimated and parameter.mode == "prior" and parameter.value is not None and parameter.sigma is not None:
-            priors.append(Prior(layout.block(sensor, name), parameter.value + shift, parameter.sigma))
+            priors += _given(inputs.layout, camera.name, name, getattr(camera, name), shift)
     return tuple(priors)
+
+
+def _given(layout: Layout, sensor: str, name: str, parameter: Parameter, shift: float = 0.0) -> list[Prior]:
+    block = layout.block(sensor, name)
+    if block.start is None or parameter.mode != "prior" or parameter.value is None or parameter.sigma is None:
+        return []
+    return [Prior(block, parameter.value + shift, parameter.sigma)]
 
 
 def image_times(inputs: Inputs, values: dict[Key, np.ndarray]) -> list[np.ndarray]:
@@ -156,8 +166,11 @@ def nodes_for(inputs: Inputs, times: list[np.ndarray]) -> np.ndarray:
     return nodes
 
 
-def assemble(inputs: Inputs, state: State, noise: list[CornerNoise], keep: list[np.ndarray]) -> Problem:
-    """The problem at the nodes of `state`, everything frozen that a pass freezes: nodes, assignment, preintegration."""
+def assemble(
+    inputs: Inputs, state: State, noise: list[CornerNoise], keep: list[np.ndarray], held: np.ndarray = NOTHING
+) -> Problem:
+    """The problem at the nodes of `state`, everything frozen that a pass freezes: nodes, assignment, preintegration.
+    held: directions of the border that stay, see Problem."""
     rig, layout = inputs.rig, inputs.layout
     factors = []
     scheme = rig.settings.scheme if inputs.imu is not None else "inertial"
@@ -175,7 +188,7 @@ def assemble(inputs: Inputs, state: State, noise: list[CornerNoise], keep: list[
         )  # fmt: skip
         factors.append(_with_bloom(factor, camera, state, rig) if rig.blooms else factor)
     tolerance = inputs.tolerances.of(layout, None if rig.imu is None else rig.imu.name)
-    return Problem(layout, _chain(inputs, state), tuple(factors), _priors(inputs), tolerance)
+    return Problem(layout, _chain(inputs, state), tuple(factors), _priors(inputs), tolerance, held)
 
 
 def _nodes_of(scheme: Scheme, state: State, times: np.ndarray, images: list[slice]) -> np.ndarray:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from icalib.estimation.arrowhead import NOTHING
 from icalib.estimation.assembly import Inputs, assemble, image_times, nodes_for, resample
 from icalib.estimation.corner_factor import CornerFactor, CornerNoise, CornerOutput
 from icalib.estimation.corner_noise import (
@@ -37,8 +38,16 @@ class Estimate:
     steps: tuple[tuple[str, Step], ...]  # of all passes, with the pass's name
 
 
-def estimate(inputs: Inputs, state: State, on_step: Callable[[str, Step], None] = lambda *_: None) -> Estimate:
-    """All passes from a first `state`. Raises EstimationError where the data do not carry an estimate."""
+def estimate(
+    inputs: Inputs,
+    state: State,
+    on_step: Callable[[str, Step], None] = lambda *_: None,
+    held: np.ndarray = NOTHING,
+) -> Estimate:
+    """All passes from a first `state`, directions of the border in `held` (see Problem) left alone.
+
+    Raises EstimationError where the data do not carry an estimate.
+    """
     rig, streams = inputs.rig, inputs.measurements.cameras
     models = [first_noise(c) for c in rig.cameras]
     noise = [m.noise(s, c, rig.settings) for m, s, c in zip(models, streams, rig.cameras, strict=True)]
@@ -46,7 +55,7 @@ def estimate(inputs: Inputs, state: State, on_step: Callable[[str, Step], None] 
     history: list[tuple[str, Step]] = []
     names = pass_names(inputs)
     for name in names:
-        problem = assemble(inputs, state, noise, keep)
+        problem = assemble(inputs, state, noise, keep, held)
 
         def note(step: Step, name: str = name) -> None:
             history.append((name, step))

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.arrowhead import Piece, in_parallel, marginalise, solve
+from icalib.estimation.arrowhead import Piece, in_parallel, marginalise, restricted_inverse, solve
 from icalib.estimation.corner_factor import CornerFactor, CornerOutput
-from icalib.estimation.problem import Problem
+from icalib.estimation.feature_factor import FeatureFactor, hold_frame
+from icalib.estimation.problem import Problem, Residuals, WhiteNoise
 from icalib.estimation.solver import Outcome
 from icalib.estimation.state import State
 
@@ -24,7 +25,8 @@ PROBE_STEP = 1e-2  # of a posterior sample: small enough to be linear
 class Fit:
     """chi^2 of one kind of residual, their number, and the degrees of freedom that are left after the fit.
 
-    kind: "gyroscope", "accelerometer", "bias walk", "corners", or "common error 0", 1, ... for the images' own.
+    kind: "gyroscope", "accelerometer", "bias walk", "corners", "features", or "common error 0", 1, ... for the images'
+    own.
     """
 
     sensor: str
@@ -55,6 +57,12 @@ def fits(problem: Problem, outcome: Outcome, seed: int = 0) -> list[Fit]:
         for kind, (n, chi2) in _corner_chi2(camera, corners).items():
             key = camera.name, kind
             out.append(Fit(*key, n, n - float(np.mean(spent[key])), chi2))
+    if problem.features is not None and outcome.residuals.features is not None:
+        left = outcome.residuals.features
+        for camera, residual, root in zip(problem.features.cameras, left.residual, left.root, strict=True):
+            key, n = (camera.name, "features"), 2 * int((root > 0.0).sum())
+            chi2 = float(((residual * root[:, None]) ** 2).sum())
+            out.append(Fit(*key, n, n - float(np.mean(spent[key])), chi2))
     return out
 
 
@@ -72,30 +80,41 @@ def _corner_chi2(camera: CornerFactor, out: CornerOutput) -> dict[str, tuple[int
 def _probe(problem: Problem, outcome: Outcome, rng: np.random.Generator) -> dict[tuple[str, str], float]:
     """e_s^T J_s x of each sensor for one random e."""
     state, base = outcome.state, outcome.residuals
-    imu_noise = rng.standard_normal(base.imu.shape)
-    noise = [(rng.standard_normal(c.residual.shape), rng.standard_normal(c.shared.shape)) for c in base.corners]
-    pieces, scratch = problem.pieces(), problem.residuals()
-
-    def add(piece: Piece) -> None:
-        piece.clear()
-        problem.chain.accumulate(state, piece, scratch.imu, noise=imu_noise)
-        for camera, corners, n in zip(problem.cameras, scratch.corners, noise, strict=True):
-            camera.accumulate(state, piece, corners, noise=n)
-        problem.add_prior_information(piece, state)
-
-    in_parallel(add, pieces)
-    solution = solve(pieces, problem.n_nodes, problem.tolerance)
+    noise, pieces, scratch = problem.white_noise(rng), problem.pieces(), problem.residuals()
+    in_parallel(lambda piece: problem.add_noise(state, piece, noise, scratch), pieces)
+    solution = solve(pieces, problem.n_nodes, problem.tolerance, held=problem.held)
     # The sums hold J^T e where a solve expects J^T r: the step is -x.
     up, down = (
         _residuals_at(problem, state, -s * solution.chain, -s * solution.border) for s in (PROBE_STEP, -PROBE_STEP)
     )
     slope_imu = (up.imu - down.imu) / (2.0 * PROBE_STEP)
     kinds = problem.chain.kinds.items()
-    spent = {(problem.chain.name, k): float((imu_noise[:, r] * slope_imu[:, r]).sum()) for k, r in kinds}
-    for camera, at, u, d, n in zip(problem.cameras, base.corners, up.corners, down.corners, noise, strict=True):
+    spent = {(problem.chain.name, k): float((noise.imu[:, r] * slope_imu[:, r]).sum()) for k, r in kinds}
+    for camera, at, u, d, n in zip(problem.cameras, base.corners, up.corners, down.corners, noise.corners, strict=True):
         slope = (u.residual - d.residual) / (2.0 * PROBE_STEP)
         for kind, value in _spent_by_corners(camera, at, slope, *n).items():
             spent[camera.name, kind] = value
+    if problem.features is not None:
+        spent |= _spent_by_features(problem.features, base, up, down, noise)
+    return spent
+
+
+def _spent_by_features(
+    factor: FeatureFactor, at: Residuals, up: Residuals, down: Residuals, noise: WhiteNoise
+) -> dict[tuple[str, str], float]:
+    """e^T J x of each camera's features. Their points follow x, and three degrees of freedom a point are its own, the
+    cameras' shares by the number of observations."""
+    assert at.features is not None and up.features is not None and down.features is not None
+    count = np.zeros(factor.tracks.count)
+    used = [root > 0.0 for root in at.features.root]
+    for track, u in zip(factor.tracks.track, used, strict=True):
+        count += np.bincount(track[u], minlength=len(count))
+    spent = {}
+    for i, camera in enumerate(factor.cameras):
+        root, u = at.features.root[i], used[i]
+        slope = (up.features.residual[i] - down.features.residual[i]) / (2.0 * PROBE_STEP)
+        own = float((3.0 / count[factor.tracks.track[i][u]]).sum())
+        spent[camera.name, "features"] = own + float((noise.features[i] * slope * root[:, None])[u].sum())
     return spent
 
 
@@ -144,12 +163,15 @@ def split_covariance(problem: Problem, outcome: Outcome, segments: int) -> np.nd
     segments = len(ends) - 1
     if np.diff(ends).min() < 3:
         return None
-    scratch = problem.residuals()
+    apart = problem.cut(outcome.state, ends[:-1])
+    scratch = apart.residuals()
 
     def gradient(g: int) -> np.ndarray | None:
-        piece = Piece.zeros(int(ends[g]), int(ends[g + 1]), problem.layout.size)
-        problem.add_measurements(outcome.state, piece, scratch)
-        problem.add_bias_prior(outcome.state, piece)
+        piece = apart.with_features(Piece.zeros(int(ends[g]), int(ends[g + 1]), problem.layout.size))
+        apart.add_measurements(outcome.state, piece, scratch)
+        apart.add_bias_prior(outcome.state, piece)
+        if not problem.framed:
+            hold_frame(outcome.state, piece, piece.first)
         if piece.last in problem.chain.starts:
             # The seam says nothing of the node behind it, and that node's own images are in the next segment.
             piece = piece.without_last()
@@ -181,8 +203,10 @@ def place_covariances(problem: Problem, outcome: Outcome) -> list[np.ndarray]:
     in all
     parts of a recording, and splitting it in time does not see them. The corners of a place are a cluster, whose
     gradient
-    would be zero but for noise; the IMU is one more.
+    would be zero but for noise; the IMU and all features are one more.
     """
+    if not any(len(c.stream.uv) for c in problem.cameras):
+        return []
     return [_cluster_spread(problem, outcome, by) for by in (_image_cells, _target_parts, _tag_corners)]
 
 
@@ -218,13 +242,14 @@ def _tag_corners(camera: CornerFactor, index: int) -> np.ndarray:
 
 def _cluster_spread(problem: Problem, outcome: Outcome, by: Callable[[CornerFactor, int], np.ndarray]) -> np.ndarray:
     clusters = [by(c, k) for k, c in enumerate(problem.cameras)]
-    n, B = 1 + max(int(c.max()) for c in clusters), problem.layout.size
+    n, B = 1 + max(int(c.max(initial=-1)) for c in clusters), problem.layout.size
     piece = Piece.zeros(0, problem.n_nodes - 1, B + n)
-    narrow = problem.narrow(piece, B)
+    narrow = problem.with_features(problem.narrow(piece, B))
     problem.add_measurements(outcome.state, narrow, problem.residuals())
     problem.add_bias_prior(outcome.state, narrow)
     piece.side[:, :, :B] = narrow.side[:, :, :B]
     piece.border[:B, :B] = narrow.border[:B, :B]
+    piece.features = None if narrow.features is None else narrow.features.widened(B + n)
     for camera, at, cluster in zip(problem.cameras, outcome.residuals.corners, clusters, strict=True):
         camera.accumulate_clusters(outcome.state, piece, at, cluster, n, B)
     b = marginalise(piece)[:B, B : B + n].T
@@ -234,5 +259,6 @@ def _cluster_spread(problem: Problem, outcome: Outcome, by: Callable[[CornerFact
 def _spread(problem: Problem, outcome: Outcome, b: np.ndarray) -> np.ndarray:
     """S^-1 (sum b_g b_g^T) S^-1 for gradients b (G, B)."""
     t = problem.tolerance
-    half = t[:, None] * (np.linalg.pinv(outcome.information * t[:, None] * t, hermitian=True) @ (t[:, None] * b.T))
+    inverse = restricted_inverse(outcome.information * t[:, None] * t, problem.held)
+    half = t[:, None] * (inverse @ (t[:, None] * b.T))
     return half @ half.T

@@ -192,6 +192,13 @@ class Features:
     sums: FeatureSums
     steps: list[Group]
 
+    def widened(self, n_border: int) -> Features:
+        """The same with further columns of the border, between those there are and the gradient; zero, this too."""
+        side = self.sums.side
+        wide = np.zeros((*side.shape[:2], n_border + 1))
+        wide[:, :, : side.shape[2] - 1] = side[:, :, :-1]
+        return Features(self.sums._replace(side=wide), self.steps)
+
 
 @dataclass(frozen=True)
 class Eliminated:

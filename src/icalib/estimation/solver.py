@@ -98,7 +98,7 @@ def _solve(problem, state, pieces, residuals, damping, curved):
     """Solves with the least damping, from `damping` up, that makes the sums definite."""
     while True:
         try:
-            return solve(pieces, problem.n_nodes, problem.tolerance, damping), damping
+            return solve(pieces, problem.n_nodes, problem.tolerance, damping, problem.held), damping
         except NotDefiniteError:
             damping = max(10.0 * damping, FIRST_DAMPING)
             if damping > 1e3:
@@ -108,7 +108,7 @@ def _solve(problem, state, pieces, residuals, damping, curved):
 
 def _finish(problem, state, cost, pieces, residuals, steps) -> Outcome:
     problem.linearise(state, pieces, residuals, curved=True)
-    last = solve(pieces, problem.n_nodes, problem.tolerance, 0.0)
+    last = solve(pieces, problem.n_nodes, problem.tolerance, 0.0, problem.held)
     converged, n = last.decrease < STALLED_DECREASE, len(steps)
     # Half a chi^2 of d is a step of sqrt(2 d) standard deviations at most.
     share = max(100.0 * np.sqrt(2.0 * max(last.decrease, 0.0)), 1.0)

@@ -48,8 +48,8 @@ class Tracks:
 
 @dataclass(frozen=True)
 class Sightings:
-    """All observations, camera after camera: feature, image of the camera, and node (N,); used (N,): whether they count;
-    counts: how many of them each camera has."""
+    """All observations, camera after camera: feature, image of the camera, and node (N,); used (N,): whether they
+    count; counts: how many of them each camera has."""
 
     feature: np.ndarray
     image: np.ndarray
@@ -100,8 +100,8 @@ class Sightings:
         camera = np.repeat(np.arange(len(self.counts)), self.counts)[middle]
         own_track, own_pair, own_next = (tuple(np.split(a, ends)) for a in (label, pair, next_pair))
         return Tracks(
-            own_track, own_pair, own_next, pair_track, pair_node, edges, tracks_from, np.searchsorted(pair_track, tracks_from),
-            camera, self.image[middle], np.zeros((n, 3)),
+            own_track, own_pair, own_next, pair_track, pair_node, edges, tracks_from,
+            np.searchsorted(pair_track, tracks_from), camera, self.image[middle], np.zeros((n, 3)),
         )  # fmt: skip
 
 

@@ -8,7 +8,14 @@ import numpy as np
 from icalib.errors import EstimationError
 from icalib.estimation.bodies import choose_bodies, restrict
 from icalib.estimation.imu_data import ImuData, imu_data
-from icalib.first_guess.clocks import Alignment, align, camera_rates, check_axes
+from icalib.first_guess.clocks import (
+    Alignment,
+    align,
+    as_given,
+    camera_rates,
+    check_axes,
+    turns_about_two_axes,
+)
 from icalib.first_guess.guess import CameraGuess, Guess, relative_offset
 from icalib.first_guess.gyro import GyroRotation
 from icalib.first_guess.intrinsics import camera_params
@@ -75,21 +82,27 @@ def _trusted(parameter: Parameter) -> np.ndarray | None:
 def _align(
     camera: Camera, stream: CornerStream, poses: TargetPoses, imu: ImuData, measurements: Measurements
 ) -> Alignment:
+    """What the motion shows; in its place what the rig trusts, and where it shows nothing what the rig guesses."""
     rates = camera_rates(stream, poses)
     given, trusted = camera.time_offset.value, _trusted(camera.time_offset)
-    if trusted is not None:
-        found = align(imu, camera.name, rates, relative_offset(trusted, stream, measurements))
-    else:
-        try:
-            found = align(imu, camera.name, rates, None)
-        except EstimationError:
-            if given is None:
-                raise
-            found = align(imu, camera.name, rates, relative_offset(given, stream, measurements))
-    rotation = _trusted(camera.rotation)
-    if rotation is None:
-        check_axes(rates, camera.name)
-    return found if rotation is None else Alignment(found.offset, rotation, found.gyro_bias)
+    rotation = camera.rotation.value
+    try:
+        found = align(
+            imu, camera.name, rates, None if trusted is None else relative_offset(trusted, stream, measurements)
+        )
+        if rotation is None:
+            check_axes(rates, camera.name)
+    except EstimationError:
+        if given is None:
+            raise
+        at = relative_offset(given, stream, measurements)
+        if rotation is None:
+            found = align(imu, camera.name, rates, at)
+            check_axes(rates, camera.name)
+        else:
+            found = as_given(imu, camera.name, rates, at, rotation)
+    keep_guess = _trusted(camera.rotation) is None and turns_about_two_axes(rates)
+    return found if rotation is None or keep_guess else as_given(imu, camera.name, rates, found.offset, rotation)
 
 
 def _camera_guess(

@@ -71,10 +71,7 @@ def align(imu: ImuData, name: str, rates: CameraRates, given_offset: float | Non
     _check_motion(imu, name, rates)
     offset = _correlate(imu, name, rates) if given_offset is None else given_offset
     if not _covered(imu, rates, offset).any():
-        raise EstimationError(
-            f"with the time_offset in the rig file no image of {name} falls within the recording of {imu.name}; "
-            "correct it, or leave it out to have it found."
-        )
+        raise _no_overlap(imu, name)
     found = _refine(imu, rates, offset, given_offset is not None)
     _check_scale(imu, name, rates, found)
     _check_offset(imu, name, rates, found, given_offset is not None)
@@ -225,14 +222,37 @@ def _refine(imu: ImuData, rates: CameraRates, offset: float, keep_offset: bool) 
     return Alignment(offset, R, bias)
 
 
-def check_axes(rates: CameraRates, name: str) -> None:
-    """Raises EstimationError where the camera turned about one axis only: its rotation about that axis stays open."""
+def turns_about_two_axes(rates: CameraRates) -> bool:
+    """Whether the camera turned about more than one axis; else its rotation about that axis stays open."""
     _, spread, _ = np.linalg.svd(rates.rate - rates.rate.mean(axis=0), full_matrices=False)
-    if spread[1] < LEAST_SECOND_AXIS * spread[0]:
+    return bool(spread[1] >= LEAST_SECOND_AXIS * spread[0])
+
+
+def check_axes(rates: CameraRates, name: str) -> None:
+    """Raises EstimationError where the camera turned about one axis only."""
+    if not turns_about_two_axes(rates):
         raise EstimationError(
             f"{name} turned about one axis only, and its rotation about that axis is not determined; turn the rig "
-            "about two more axes, or give rotation (fixed or prior) in the rig file."
+            "about two more axes, or give rotation in the rig file."
         )
+
+
+def as_given(imu: ImuData, name: str, rates: CameraRates, offset: float, rotation: np.ndarray) -> Alignment:
+    """An alignment with this offset and rotation, whatever the motion: only the gyro bias is found. Raises
+    EstimationError where clocks do not overlap."""
+    inside = _covered(imu, rates, offset)
+    if not inside.any():
+        raise _no_overlap(imu, name)
+    middle = (0.5 * (rates.start + rates.end) + offset)[inside]
+    gyro = np.stack([np.interp(middle, imu.seconds, imu.gyro[:, k]) for k in range(3)], axis=1)
+    return Alignment(offset, rotation, np.median(gyro - rates.rate[inside] @ rotation.T, axis=0))
+
+
+def _no_overlap(imu: ImuData, name: str) -> EstimationError:
+    return EstimationError(
+        f"with the time_offset in the rig file no image of {name} falls within the recording of {imu.name}; correct "
+        "it, or leave it out to have it found."
+    )
 
 
 def _check_scale(imu: ImuData, name: str, rates: CameraRates, found: Alignment) -> None:

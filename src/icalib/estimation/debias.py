@@ -1,0 +1,71 @@
+"""How much of the information on lasting parameters is only noise in the Jacobians.
+
+A Jacobian that is taken at a noisy trajectory and noisy readings shows motion that was not there: where the truth is no
+information at all, J^T J shows some, which grows with the square of the noise. What noise adds is measured by adding
+it once more: S(x + d) - S(x), its mean over draws +-d of the trajectory's own posterior and of the IMU's noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from icalib.estimation.arrowhead import in_parallel, solve
+from icalib.estimation.imu_data import ImuData
+from icalib.estimation.imu_factor import ImuFactor
+from icalib.estimation.problem import Problem
+from icalib.estimation.solver import Outcome
+from icalib.estimation.state import State
+
+PAIRS = 3
+CLEAR = 10.0  # information in tolerance units: where all is known to a third of a tolerance, one pair will do
+
+
+def spurious_information(problem: Problem, outcome: Outcome, seed: int = 0) -> np.ndarray:
+    """(B, B) what noise adds to the border's marginal information, on average; zeros where there is no IMU.
+
+    Raises arrowhead.NotDefiniteError where the chain is not determined.
+    """
+    if not isinstance(problem.chain, ImuFactor):
+        return np.zeros_like(outcome.information)
+    rng = np.random.default_rng(seed)
+    t = problem.tolerance
+    clear = np.linalg.eigvalsh(outcome.information * t[:, None] * t).min(initial=np.inf) > CLEAR
+    found = []
+    for _ in range(1 if clear else PAIRS):
+        sample, imu = _chain_sample(problem, outcome.state, rng), _reading_noise(problem.chain.imu, rng)
+        found += [_information(*_moved(problem, outcome.state, s * sample, s * imu)) for s in (1.0, -1.0)]
+    return np.mean(found, axis=0) - outcome.information
+
+
+def _information(problem: Problem, state: State) -> np.ndarray:
+    pieces = problem.pieces()
+    problem.linearise(state, pieces, problem.residuals(), curved=True)
+    return solve(pieces, problem.n_nodes, problem.tolerance).information
+
+
+def _chain_sample(problem: Problem, state: State, rng: np.random.Generator) -> np.ndarray:
+    """(K, 15) a draw from the posterior of the chain, the border held: T^-1 J^T e for white e."""
+    scratch, pieces, noise = problem.residuals(), problem.pieces(), problem.white_noise(rng)
+    in_parallel(lambda piece: problem.add_noise(state, piece, noise, scratch), pieces)
+    return solve(pieces, problem.n_nodes, problem.tolerance, held=np.eye(problem.layout.size)).chain
+
+
+def _reading_noise(imu: ImuData, rng: np.random.Generator) -> np.ndarray:
+    """(N, 6) noise of the readings, rate and force, as their densities say; none more beside gaps."""
+    dt = np.median(np.diff(imu.seconds))
+    density = np.repeat(np.sqrt(np.median(imu.variance[:, :2], axis=0)), 3)
+    return density / np.sqrt(dt) * rng.standard_normal((len(imu.seconds), 6))
+
+
+def _moved(problem: Problem, state: State, chain: np.ndarray, readings: np.ndarray) -> tuple[Problem, State]:
+    """The problem with noisier readings, and the state with its chain moved."""
+    assert isinstance(problem.chain, ImuFactor)
+    state = state.retract(problem.layout, chain, np.zeros(problem.layout.size))
+    old = problem.chain.imu
+    imu = replace(old, gyro=old.gyro + readings[:, :3], accel=old.accel + readings[:, 3:])
+    factor = ImuFactor.build(imu, state, problem.chain.gravity, problem.chain.columns)
+    cameras = tuple(replace(c, imu=imu) for c in problem.cameras)
+    features = None if problem.features is None else replace(problem.features, cameras=cameras)
+    return replace(problem, chain=factor, cameras=cameras, features=features), state

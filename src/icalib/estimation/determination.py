@@ -1,0 +1,140 @@
+"""What the data determine: estimates in which undetermined directions of the border are held where the guess has them.
+
+Broad priors do not make an undetermined direction harmless: the solver wanders along it, and what couples with it at
+second order comes out wrong with a small standard deviation. So the information of the data alone, without what noise
+makes of it, says which directions are open; from the guess all is estimated anew with these held, until their number
+stays. How much the rest depends on where they are held is tried out, and is part of the covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.estimation.arrowhead import restricted_inverse
+from icalib.estimation.assembly import Inputs, given_priors
+from icalib.estimation.debias import spurious_information
+from icalib.estimation.estimate import EARLY_DECREASE, Estimate, estimate
+from icalib.estimation.imu_model import N_INTRINSICS
+from icalib.estimation.prior_factor import Prior
+from icalib.estimation.problem import Problem
+from icalib.estimation.solver import Step, minimise
+from icalib.estimation.state import State
+from icalib.geometry import so3
+
+UNDETERMINED_BELOW = 1e-2  # information in tolerance units: known to less than ten tolerances
+SPURIOUS_SHARE = 0.5  # a direction most of whose information is noise is not determined either
+MOST_ROUNDS = 4
+# What a guess without a standard deviation is taken to be worth: rad, m, s, px, 1.
+GUESS_SIGMA = {
+    "rotation": 0.1, "translation": 0.1, "time_offset": 0.01, "intrinsics": 15.0, "distortion": 0.1, "bloom": 1.0,
+    "shape": 1e-3, "tilt": 0.1,
+}  # fmt: skip
+OTHER_SIGMA = 0.1  # of IMU intrinsics
+
+
+@dataclass(frozen=True)
+class Determined:
+    """An estimate and what is known of its border.
+
+    data (B, B): information of the data alone in tolerance units, without priors and without what noise makes of it;
+    held (B, m): orthonormal directions in tolerance units, those that are undetermined; shifts (m, B): how all moves
+    when one of them moves by what its guess is worth.
+    """
+
+    estimate: Estimate
+    data: np.ndarray
+    held: np.ndarray
+    shifts: np.ndarray
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """(B, B), priors included: of what is determined, and how it moves with what is held."""
+        t = self.estimate.problem.tolerance
+        return t[:, None] * restricted_inverse(self.estimate.outcome.information * t[:, None] * t, self.held) * t + (
+            self.shifts.T @ self.shifts
+        )
+
+    @property
+    def spread(self) -> np.ndarray:
+        """(B,) standard deviations in tolerances that the data alone give."""
+        t = self.estimate.problem.tolerance
+        return np.sqrt(np.diag(restricted_inverse(self.data, self.held)) + ((self.shifts / t) ** 2).sum(axis=0))
+
+
+def determine(inputs: Inputs, start: State, on_step: Callable[[str, Step], None] = lambda *_: None) -> Determined:
+    """Estimates from `start`, again and again until what is undetermined stays so.
+
+    Raises EstimationError where the data do not carry an estimate.
+    """
+    found = estimate(inputs, start, on_step)
+    data, undetermined = _judge(inputs, found)
+    for _ in range(MOST_ROUNDS):
+        if undetermined.shape == found.problem.held.shape or not (undetermined.size or found.problem.held.size):
+            break
+        found = estimate(inputs, start, on_step, undetermined)
+        data, undetermined = _judge(inputs, found)
+    held = found.problem.held if found.problem.held.size else np.zeros((inputs.layout.size, 0))
+    shifts = np.array([_profile(inputs, found, u) for u in held.T]).reshape(-1, inputs.layout.size)
+    return Determined(found, data, held, shifts)
+
+
+def _judge(inputs: Inputs, found: Estimate) -> tuple[np.ndarray, np.ndarray]:
+    """Information (B, B) of the data alone, and the directions (B, m) that it leaves open, both in tolerance units.
+
+    Nuisances whose priors belong to the model (a target's shape, bloom) are open only where these priors are, too.
+    """
+    problem, outcome = found.problem, found.outcome
+    t = problem.tolerance
+    noise = spurious_information(problem, outcome)
+    asked = _without(outcome.information, given_priors(inputs), outcome.state)
+    scaled = t[:, None] * asked * t
+    values, vectors = np.linalg.eigh(scaled - t[:, None] * noise * t)
+    raw = np.einsum("ik,ij,jk->k", vectors, scaled, vectors)
+    open_ones = (values < UNDETERMINED_BELOW) | (values < SPURIOUS_SHARE * raw)
+    data = _without(outcome.information - noise, problem.priors, outcome.state)
+    return t[:, None] * data * t, vectors[:, open_ones]
+
+
+def _without(information: np.ndarray, priors: Sequence[Prior], state: State) -> np.ndarray:
+    bare = information.copy()
+    for prior in priors:
+        _, J = prior.residual(state)
+        columns = prior.block.columns
+        bare[np.ix_(columns, columns)] -= J.T @ J
+    return bare
+
+
+def _profile(inputs: Inputs, found: Estimate, direction: np.ndarray) -> np.ndarray:
+    """(B,) how the border moves when the guess moves along `direction` (B,), which is held, by what it is worth."""
+    problem, state = found.problem, found.outcome.state
+    step = problem.tolerance * direction
+    step = step / np.linalg.norm(step / _guess_sigma(inputs))
+    moved = state.retract(problem.layout, np.zeros((len(state.seconds), 15)), step)
+    return border_difference(problem, minimise(problem, moved, tolerance=EARLY_DECREASE).state, state)
+
+
+def _guess_sigma(inputs: Inputs) -> np.ndarray:
+    """(B,) standard deviations of the guess: given ones, or what one without is worth."""
+    sigma = np.zeros(inputs.layout.size)
+    for b in inputs.layout.free:
+        sigma[b.columns] = OTHER_SIGMA if b.size == N_INTRINSICS else GUESS_SIGMA[b.name]
+    for prior in given_priors(inputs):
+        sigma[prior.block.columns] = prior.sigma
+    return sigma
+
+
+def border_difference(problem: Problem, a: State, b: State) -> np.ndarray:
+    """(B,) the step of the border from `b` to `a`."""
+    out = np.zeros(problem.layout.size)
+    for block in problem.layout.free:
+        x, y = a.values[block.key], b.values[block.key]
+        if block.kind == "rotation":
+            out[block.columns] = so3.log(np.ascontiguousarray(y.T @ x))
+        elif block.kind == "tilt":
+            out[block.columns] = so3.log(np.ascontiguousarray(x @ y.T))[:2]
+        else:
+            out[block.columns] = x - y
+    return out
