@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from icalib.geometry.targets import Target
+from icalib.geometry.targets import NoTarget, Target
 
 Mode = Literal["free", "fixed", "prior"]
 
@@ -71,6 +71,8 @@ class Camera:
     distortion: Parameter = Parameter()
     bloom: Parameter = Parameter()
     topic: str | None = None  # of its images; None: the one with the camera's name, or the only one
+    tracks: str | None = None  # path of the table of tracks, where it has one
+    track_noise_px: float | None = None  # None: estimated from the residuals
 
 
 Scheme = Literal["inertial", "pose", "kinematic"]
@@ -105,10 +107,15 @@ class Rig:
 
     imu: ImuSensor | None
     cameras: tuple[Camera, ...]
-    target: Target
+    target: Target = NoTarget()
     gravity: float = 9.81  # m/s^2
     settings: Settings = Settings()
     path: Path | None = None
+
+    @property
+    def has_target(self) -> bool:
+        """Whether there is a target; else all cameras follow points of the scene."""
+        return len(self.target.bodies) > 0
 
     @property
     def blooms(self) -> bool:

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -100,12 +101,16 @@ class Piece:
         return Sums(self.first, empty, empty, empty, np.zeros((0, 0)))
 
 
+def chain_cuts(n_nodes: int) -> tuple[int, ...]:
+    """The nodes that two pieces share: the middle one; none where the chain is too short."""
+    middle = n_nodes // 2
+    return () if middle < 2 else (middle,)
+
+
 def make_pieces(n_nodes: int, n_border: int) -> tuple[Piece, ...]:
     """Two pieces of about the same length; one where the chain is too short to share."""
-    middle = n_nodes // 2
-    if middle < 2:
-        return (Piece.zeros(0, n_nodes - 1, n_border),)
-    return Piece.zeros(0, middle, n_border), Piece.zeros(middle, n_nodes - 1, n_border)
+    ends = (0, *chain_cuts(n_nodes), n_nodes - 1)
+    return tuple(Piece.zeros(a, b, n_border) for a, b in pairwise(ends))
 
 
 @njit(cache=True, nogil=True)

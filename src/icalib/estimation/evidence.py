@@ -214,7 +214,7 @@ def _image_cells(camera: CornerFactor, index: int) -> np.ndarray:
     """(N,) cell of the image, cameras apart."""
     columns, rows = IMAGE_CELLS
     uv = camera.stream.uv
-    low, high = uv.min(axis=0), uv.max(axis=0) + 1e-9
+    low, high = uv.min(axis=0, initial=np.inf), uv.max(axis=0, initial=-np.inf) + 1e-9
     cell = ((uv - low) / (high - low) * IMAGE_CELLS).astype(int)
     return (index * rows + cell[:, 1]) * columns + cell[:, 0]
 

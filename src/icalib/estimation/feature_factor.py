@@ -50,7 +50,8 @@ class FeatureOutput:
     points: np.ndarray
 
 
-class View(NamedTuple):
+@dataclass(frozen=True)
+class View:
     """One camera in a piece: what it saw, and how it moved."""
 
     camera: CornerFactor
@@ -89,7 +90,7 @@ class FeatureFactor:
         seams: tuple[int, ...] = (),
     ) -> FeatureFactor:
         """Tracks chosen, and points first looked for, with the poses of `state`; the chain is cut at nodes `cuts`."""
-        factor = cls(cameras, streams, sigma, keep, *loss, NO_TRACKS, cameras[0].layout, seams)
+        factor = cls(cameras, streams, sigma, keep, loss[0], loss[1], NO_TRACKS, cameras[0].layout, seams)
         return factor.cut(state, cuts)
 
     @property
@@ -159,7 +160,7 @@ class FeatureFactor:
         points = self._descend(views, self._from_anchors(views, tracks), tracks)
         out.points[tracks] = points.xyz
         into = piece.sums(sums)
-        features = FeatureSums.zeros(0, *(np.zeros(0, dtype=np.int64),) * 2, 0)
+        features = FeatureSums.zeros(0, np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), 0)
         if sums and piece.features is not None:
             features = piece.features.sums
             features.own[:, range(3), range(3)] += WEAK

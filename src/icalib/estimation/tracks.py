@@ -105,9 +105,8 @@ class Sightings:
         )  # fmt: skip
 
 
-
 _NO_NUMBERS = np.zeros(0, dtype=np.int64)
+_NO_EDGES = np.zeros(2, dtype=np.int64)
 NO_TRACKS = Tracks(
-    (), (), (), *(_NO_NUMBERS,) * 2, np.zeros(2, dtype=np.int64), *(np.zeros(2, dtype=np.int64),) * 2,
-    *(_NO_NUMBERS,) * 2, np.zeros((0, 3)),
-)  # fmt: skip
+    (), (), (), _NO_NUMBERS, _NO_NUMBERS, _NO_EDGES, _NO_EDGES, _NO_EDGES, _NO_NUMBERS, _NO_NUMBERS, np.zeros((0, 3))
+)
