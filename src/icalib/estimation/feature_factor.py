@@ -38,6 +38,7 @@ MOST_STEPS = 20  # of a point; most settle in three
 WEAK = 1e-6  # information [1/m^2]: keeps a point defined that no image shows any more; steers nothing else
 LONGEST_GAP_S = 1.0  # a feature that was out of sight for longer is a new track
 MOST_UNCERTAIN = 0.1  # of its distance: a point that is less certain is left out
+MOST_UNLIKE = 10.0  # times the residuals of most points: a point that fits worse is left out
 
 
 @dataclass(frozen=True)
@@ -99,7 +100,8 @@ class FeatureFactor:
 
     def cut(self, state: State, cuts: tuple[int, ...]) -> FeatureFactor:
         """The same features as tracks that end at nodes `cuts`. A track is left out whose point the poses of `state` do
-        not find in front of its cameras, or whose distance they leave uncertain."""
+        not find where all its images can show it, whose distance they leave uncertain, or that fits far worse than
+        most."""
         edges = np.unique([0, *cuts, *self.seams, self.n_nodes])
         sightings = self._sightings()
         label = sightings.in_order(sightings.labels(state.seconds, edges, LONGEST_GAP_S))
@@ -123,8 +125,14 @@ class FeatureFactor:
         anchors = replace(self, tracks=replace(self.tracks, start=np.zeros((n, 3))))._from_anchors(views, slice(0, n))
         distance = np.linalg.norm(found.xyz - anchors, axis=1)
         information = np.linalg.eigvalsh(found.A)[:, 0]
-        good = np.isfinite(found.xyz).all(axis=1) & (information * (MOST_UNCERTAIN * distance) ** 2 > 1.0)
-        return found.xyz, good
+        seen = sum(
+            (np.bincount(t[(t >= 0) & k], minlength=n) for t, k in zip(self.tracks.track, self.keep, strict=True)),
+            np.zeros(n, dtype=np.int64),
+        )
+        square = found.cost / np.maximum(seen, 1)
+        fits = square <= MOST_UNLIKE**2 * np.median(square[found.shown == seen] if n else 0.0) + MOST_UNLIKE
+        certain = information * (MOST_UNCERTAIN * distance) ** 2 > 1.0
+        return found.xyz, np.isfinite(found.xyz).all(axis=1) & (found.shown == seen) & fits & certain
 
     def output(self) -> FeatureOutput:
         """Empty arrays for `accumulate` to fill."""
@@ -236,7 +244,8 @@ class FeatureFactor:
         n = len(xyz)
         points = Points(
             xyz, xyz.copy(), np.zeros(n), np.zeros(n), np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3, 3)),
-            np.zeros((n, 3)), np.zeros(n), np.ones(n, dtype=bool),
+            np.zeros((n, 3)), np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64), np.zeros(n),
+            np.ones(n, dtype=bool),
         )  # fmt: skip
         for step in range(MOST_STEPS):
             for view in views:

@@ -63,7 +63,7 @@ class Seeing(NamedTuple):
 
 class Points(NamedTuple):
     """Points (T, 3) in the world on their way down: xyz and trial, half the chi^2 of both, the sums A (T, 3, 3) and
-    b (T, 3) of both, damping (T,), and which still move."""
+    b (T, 3) of both, how many images show them of both, damping (T,), and which still move."""
 
     xyz: np.ndarray
     trial: np.ndarray
@@ -73,6 +73,8 @@ class Points(NamedTuple):
     b: np.ndarray
     trial_A: np.ndarray
     trial_b: np.ndarray
+    shown: np.ndarray
+    trial_shown: np.ndarray
     damping: np.ndarray
     moves: np.ndarray
 
@@ -135,6 +137,7 @@ def add_to_points(seen, t0, R_cw, seeing, weighing, points):
             w /= weighing.sigma * weighing.sigma
             less = (1.0 - curvature) / (e[0] * e[0] + e[1] * e[1]) if curvature < 1.0 else 0.0
             points.trial_cost[t] += cost
+            points.trial_shown[t] += 1
             for a in range(3):
                 slope = J[0, a] * e[0] + J[1, a] * e[1]
                 points.trial_b[t, a] += w * slope
@@ -146,12 +149,14 @@ def add_to_points(seen, t0, R_cw, seeing, weighing, points):
 @njit(cache=True, nogil=True)
 def take_trials(points, start):
     """Takes trials that lowered the cost (all, at the `start`), then sets new ones; returns how many points still
-    move."""
+    move. A point must not lower its cost by leaving an image."""
     M, d, moving = np.empty((3, 3)), np.empty(3), 0
     for t in range(len(points.xyz)):
         if not points.moves[t]:
             continue
-        if start or points.trial_cost[t] <= points.cost[t]:
+        stays = points.trial_shown[t] >= points.shown[t]
+        if start or (stays and points.trial_cost[t] <= points.cost[t]):
+            points.shown[t] = points.trial_shown[t]
             points.xyz[t], points.cost[t] = points.trial[t], points.trial_cost[t]
             points.A[t], points.b[t] = points.trial_A[t], points.trial_b[t]
             points.damping[t] *= 0.1
@@ -178,7 +183,7 @@ def take_trials(points, start):
             points.trial_b[t, a] = 0.0
             for k in range(3):
                 points.trial_A[t, a, k] = 0.0
-        points.trial_cost[t] = 0.0
+        points.trial_cost[t], points.trial_shown[t] = 0.0, 0
     return moving
 
 
