@@ -54,7 +54,7 @@ def fits(problem: Problem, outcome: Outcome, seed: int = 0) -> list[Fit]:
         n = imu[:, rows].size - (len(problem.chain.starts) - 1) * imu[0, rows].size
         out.append(Fit(*key, n, n - float(np.mean(spent[key])), float((imu[:, rows] ** 2).sum())))
     for camera, corners in zip(problem.cameras, outcome.residuals.corners, strict=True):
-        for kind, (n, chi2) in (_corner_chi2(camera, corners).items() if len(camera.stream.uv) else ()):
+        for kind, (n, chi2) in _corner_chi2(camera, corners).items() if len(camera.stream.uv) else ():
             key = camera.name, kind
             out.append(Fit(*key, n, n - float(np.mean(spent[key])), chi2))
     if problem.features is not None and outcome.residuals.features is not None:

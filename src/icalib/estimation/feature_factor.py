@@ -10,7 +10,6 @@ saw them (`front.py`).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
