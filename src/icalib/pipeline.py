@@ -43,7 +43,8 @@ def calibrate(
     rig = rig if isinstance(rig, Rig) else load_rig(rig)
     opened = open_all(recording)
     started = time.perf_counter()
-    pictured = any(not r.has_corners(c) for r in opened.values() for c in rig.cameras)
+    seeing = rig.cameras if rig.has_target else ()
+    pictured = any(not r.has_corners(c) for r in opened.values() for c in seeing)
     share = IMAGES_SHARE if pictured else READING_SHARE
     measurements = []
     for k, (name, one) in enumerate(opened.items()):

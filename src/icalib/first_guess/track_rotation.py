@@ -104,19 +104,26 @@ def turn_between(f, h, R, t):
 
 
 @njit(cache=True, nogil=True)
+def _direction_step(A, x, y):
+    """Solves the part of A (5, 5) that belongs to the direction for (x, y)."""
+    mean = DAMPING * (A[0, 0] + A[1, 1] + A[2, 2])
+    p, q, r = A[3, 3] + mean, A[3, 4], A[4, 4] + mean
+    inverse = 1.0 / (p * r - q * q)
+    return inverse * (r * x - q * y), inverse * (p * y - q * x)
+
+
+@njit(cache=True, nogil=True)
 def turn_information(f, h, R, t, H, g):
     """H (3, 3) and g (3,): what two images say of a left turn of R, and what step they ask for, H step = g; the
     direction of motion t is found on the way."""
     a, b, A, x = np.empty(3), np.empty(3), np.empty((5, 5)), np.empty(5)
-    for turn in range(DIRECTION_ROUNDS + 1):
+    for _ in range(DIRECTION_ROUNDS):
         _epipolar_sums(f, h, R, t, a, b, A, x)
-        mean = DAMPING * (A[0, 0] + A[1, 1] + A[2, 2])
-        p, q, r = A[3, 3] + mean, A[3, 4], A[4, 4] + mean
-        inverse = 1.0 / (p * r - q * q)
-        if turn < DIRECTION_ROUNDS:
-            _move_direction(t, a, b, inverse * (r * x[3] - q * x[4]), inverse * (p * x[4] - q * x[3]))
+        u, v = _direction_step(A, x[3], x[4])
+        _move_direction(t, a, b, u, v)
+    _epipolar_sums(f, h, R, t, a, b, A, x)
     for i in range(3):
-        u, v = inverse * (r * A[3, i] - q * A[4, i]), inverse * (p * A[4, i] - q * A[3, i])
+        u, v = _direction_step(A, A[3, i], A[4, i])
         g[i] = x[i] - u * x[3] - v * x[4]
         for k in range(3):
             H[i, k] = A[i, k] - u * A[3, k] - v * A[4, k]
