@@ -85,7 +85,7 @@ def _probe(problem: Problem, outcome: Outcome, rng: np.random.Generator) -> dict
 
     in_parallel(add, pieces)
     solution = solve(pieces, problem.n_nodes, problem.tolerance, held=problem.held)
-    del pieces, scratch
+    del pieces
     # The sums hold J^T e where a solve expects J^T r: the step is -x.
     up, down = (
         _residuals_at(problem, state, -s * solution.chain, -s * solution.border) for s in (PROBE_STEP, -PROBE_STEP)
