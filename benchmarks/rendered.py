@@ -22,9 +22,9 @@ import icalib
 from icalib.calibration import Calibration
 from icalib.rig import Parameter, Rig, Settings
 from icalib.rig_parameters import IMU_INTRINSICS_SIGMA
-from icalib.simulation import Scenario, SimCamera, Truth, film, handheld, rig_for, simulate, write_film
+from icalib.simulation import Scenario, SimCamera, Truth, film, handheld, rig_for, simulate, tag_map, write_film
 
-KINDS = ("pinhole", "fisheye", "stereo")
+KINDS = ("pinhole", "fisheye", "stereo", "tags")
 UNITS = ("deg", "mm", "us")
 TARGETS = (0.010, 0.35, 7.0)  # RMS over the seeds at most, of the pinhole camera
 TARGET_S = 10.0
@@ -56,7 +56,9 @@ def main() -> int:
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="where the bags are kept")
-    parser.add_argument("--kind", choices=KINDS, default="pinhole", help="the camera, or two of an imperfect IMU")
+    parser.add_argument(
+        "--kind", choices=KINDS, default="pinhole", help="the camera, two of an imperfect IMU, or a map of tags"
+    )
     parser.add_argument("--seeds", type=int, default=8, metavar="N", help="recordings (8)")
     parser.add_argument("--first", type=int, default=0, metavar="SEED", help="the first of the seeds (0)")
     parser.add_argument("--duration", type=float, default=40.0, metavar="S", help="length of each recording (40)")
@@ -66,9 +68,13 @@ def _options() -> argparse.Namespace:
 
 
 def scenario_of(kind: str, duration_s: float) -> Scenario:
-    """EuRoC's cam0 and IMU; a fisheye in its place, nearer to the board; or both cameras, the IMU 1 % wrong."""
+    """EuRoC's cam0 and IMU; a fisheye in its place, nearer to the board; both cameras, the IMU 1 % wrong; or cam0 in a
+    room with tags and a small grid, none of whose poses is known."""
     base = handheld(duration_s)
     cam0 = base.cameras[0]
+    if kind == "tags":
+        room = tag_map(duration_s, with_grid=True)
+        return dataclasses.replace(room, cameras=(room.cameras[0],))
     if kind == "stereo":
         return dataclasses.replace(base, imu_intrinsics=imperfect_imu())
     if kind == "pinhole":

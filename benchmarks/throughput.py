@@ -15,13 +15,15 @@ import cv2
 import numpy as np
 
 from icalib.detection.detectors import detector_of
-from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Target
-from icalib.simulation import Motion, film, handheld
+from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Scene, Target
+from icalib.simulation import Motion, film, handheld, tag_map
 
 TARGETS: tuple[Target, ...] = (
     AprilGrid(6, 6, 0.088, 0.3),
     Charuco(8, 6, 0.08, 0.06, "5x5_100"),
     Checkerboard(6, 9, 0.06),
+    tag_map().target,
+    tag_map(with_grid=True).target,
 )
 LESS_MOTION = 0.5  # than `handheld`, whose checkerboard is seldom wholly in sight
 
@@ -45,10 +47,16 @@ def main() -> None:
 
 def rendered(target: Target, count: int) -> list[np.ndarray]:
     """Images of the scenario's cam0, four a second."""
-    base = handheld(count / 4.0 + 0.2)
-    camera = dataclasses.replace(base.cameras[0], rate_hz=4.0)
+    duration_s = count / 4.0 + 0.2
+    base = handheld(duration_s)
     motion = Motion(rotation_scale=LESS_MOTION, translation_scale=LESS_MOTION, seed=0)
-    scenario = dataclasses.replace(base, cameras=(camera,), target=target, motion=motion)
+    scenario = (
+        dataclasses.replace(base, target=target, motion=motion)
+        if len(target.bodies) == 1
+        else tag_map(duration_s, with_grid=isinstance(target, Scene))
+    )
+    camera = dataclasses.replace(base.cameras[0], rate_hz=4.0)
+    scenario = dataclasses.replace(scenario, cameras=(camera,))
     return [shot.pixels for shot in film(scenario, 0).shots()][:count]
 
 

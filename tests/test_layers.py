@@ -15,6 +15,7 @@ SOURCE = Path(icalib.__file__).parent
 # Units are the modules and packages right below icalib; inside a package imports are free.
 LEVELS = {
     "errors": 0,
+    "extras": 0,
     "geometry": 0,
     "measurements": 1,
     "rig": 1,
@@ -24,6 +25,7 @@ LEVELS = {
     "provenance": 2,
     "imu_classes": 2,
     "rig_parameters": 2,
+    "rig_targets": 2,
     "rig_file": 3,
     "recordings": 2,
     "detection": 3,
@@ -45,7 +47,7 @@ LEVELS = {
     "__main__": 10,
     "__init__": 10,
 }
-EVERYWHERE = {"errors"}  # so geometry, on the same level, may raise them
+EVERYWHERE = {"errors", "extras"}  # so geometry, on the same level, may raise errors, and ask OpenCV for tags
 NEVER = {("estimation", "simulation")}  # a lower level, but a wrong sign must not cancel against itself
 ROOT_NAMES = {"__version__"}  # of icalib/__init__.py, which any module may ask for
 

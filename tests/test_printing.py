@@ -12,7 +12,7 @@ import yaml
 
 from icalib.cli import main
 from icalib.errors import CalibrationError, RigError
-from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Tag, Target
+from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Markers, Tag, Target
 from icalib.geometry.targets.pattern import pattern_of
 from icalib.printing import PAPERS, target_pdf, write_target
 
@@ -26,7 +26,7 @@ TARGETS = {
     "large aprilgrid": (AprilGrid(6, 6, 0.088, 0.3), "a0"),
     "charuco": (Charuco(8, 5, 0.03, 0.022, "5x5_100"), "letter"),
     "checkerboard": (Checkerboard(6, 9, 0.035), "a3"),
-    "tag": (Tag("apriltag_36h11", 3, 0.15), "a4"),
+    "tag": (Tag("tag36h11", 3, 0.15), "a4"),
 }
 
 
@@ -108,6 +108,21 @@ def test_the_sheet_says_what_the_rig_file_must_say():
     assert yaml.safe_load(texts(target_pdf(*TARGETS["tag"]))[0])["id"] == 3
 
 
+def pages(pdf: bytes) -> list[bytes]:
+    return re.findall(rb"stream\r?\n.*?endstream", pdf, re.DOTALL)
+
+
+def test_free_tags_have_a_page_each_with_its_id_and_the_line_for_all():
+    printed = pages(target_pdf(Markers("tag36h11", 0.15, (9, 3)), "a4"))
+    assert len(printed) == 2
+    for tag_id, one in zip((3, 9), printed, strict=True):
+        alone = target_pdf(Tag("tag36h11", tag_id, 0.15), "a4")
+        np.testing.assert_array_equal(boxes(one), boxes(alone))
+        line, how, _ = texts(one)
+        fields = {"type": "markers", "family": "tag36h11", "size": 0.15, "ids": [9, 3], "border_bits": 1}
+        assert yaml.safe_load(line) == {"target": fields} and how.startswith(f"Tag {tag_id}. icalib, sizes in metres.")
+
+
 def test_border_bits_are_printed_and_said():
     grid = AprilGrid(2, 2, 0.05, 0.3)
     two, one = target_pdf(grid, "a4"), target_pdf(grid, "a4", border_bits=1)
@@ -116,7 +131,9 @@ def test_border_bits_are_printed_and_said():
         black = boxes(pdf)
         lowest = black[(black[:, 2] - black[:, 0]) > 0.9 * 0.05 * POINTS][:, [1, 3]].min(axis=0)
         assert lowest[1] - lowest[0] == pytest.approx(0.05 * POINTS * bits / (6 + 2 * bits), abs=2e-3)
-    assert "a border of 1 bits" in texts(one)[1] and "border" not in texts(two)[1]
+    assert "border_bits: 1" in texts(one)[0] and "border_bits: 2" in texts(two)[0]
+    said = texts(target_pdf(*TARGETS["tag"], border_bits=2))[1]  # a tag's line has no place for it
+    assert "a border of 2 bits" in said and "border" not in texts(one)[1]
 
 
 def test_the_same_target_gives_the_same_file():
@@ -165,7 +182,10 @@ COMMANDS = {
         TARGETS["charuco"]
     ),
     "checkerboard --rows 6 --cols 9 --square-size 0.035 --paper a3": TARGETS["checkerboard"],
+    "tag --family tag36h11 --id 3 --size 0.15": TARGETS["tag"],
     "tag --family apriltag_36h11 --id 3 --size 0.15": TARGETS["tag"],
+    "markers --family tag36h11 --size 0.15 --ids 0-2,9": (Markers("tag36h11", 0.15, (0, 1, 2, 9)), "a4"),
+    "markers --family 4x4_50 --size 0.1 --ids 7 --border-bits 2": (Markers("4x4_50", 0.1, (7,), 2), "a4"),
 }
 
 
@@ -200,6 +220,9 @@ def test_the_command_refuses_in_one_line_and_writes_nothing(tmp_path: Path, caps
         ("checkerboard --rows 6 --cols 9 --square-size -1 -o x.pdf", "must be a number above 0, but is '-1'"),
         ("checkerboard --rows 6 --cols 9 --square-size x -o x.pdf", "must be a number above 0, but is 'x'"),
         ("checkerboard --rows 6 --cols 9 -o x.pdf", "--square-size"),
+        ("markers --family tag36h11 --size 0.1 --ids x -o x.pdf", "must be a whole number, but is 'x'"),
+        ("markers --family tag36h11 --size 0.1 --ids 5-3 -o x.pdf", "as in 0-11 or 0,3,7, but is '5-3'"),
+        ("markers --family tag36h11 --size 0.1 -o x.pdf", "--ids"),
         ("board", "invalid choice"),
     ],
 )

@@ -8,6 +8,8 @@ from pathlib import Path
 
 from icalib.errors import CalibrationError
 
+_MOST_IDS = 10_000  # more than any family has
+
 
 def main(arguments: list[str] | None = None) -> int:
     """Entry point of the `icalib` command. Returns the exit code: 0 good, 1 an error, 2 wrong usage, 130
@@ -44,6 +46,7 @@ def _parser() -> argparse.ArgumentParser:
     c.set_defaults(run=_calibrate)
     _add_inspect(commands)
     _add_target(commands)
+    _add_simulate(commands)
     return parser
 
 
@@ -55,6 +58,17 @@ def _add_inspect(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     c.add_argument("--json", type=Path, metavar="FILE", help="write the figures as JSON")
     c.add_argument("--quiet", "-q", action="store_true", help="no progress bar and no table")
     c.set_defaults(run=_inspect)
+
+
+def _add_simulate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    c = commands.add_parser("simulate", help="make a recording whose truth is known")
+    c.add_argument("scenario", type=Path, help="scenario file (scenario.yaml)")
+    c.add_argument("--output", "-o", type=Path, required=True, help="where the recording goes; must not exist yet")
+    c.add_argument("--seed", type=_whole, metavar="N", help="of motion and noise; by default the scenario's")
+    levels = "data: tables of what is estimated from; sensor: a bag of what drivers send (.bag: ROS 1, else ROS 2)"
+    c.add_argument("--level", choices=("data", "sensor"), default="data", help=levels)
+    c.add_argument("--quiet", "-q", action="store_true", help="no progress bar and no last line")
+    c.set_defaults(run=_simulate)
 
 
 def _add_target(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -69,12 +83,13 @@ def _add_target(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
             "squares_x": _count, "squares_y": _count, "square_size": _metres, "marker_size": _metres, "dictionary": str
         },
         "checkerboard": {"rows": _count, "cols": _count, "square_size": _metres},
+        "markers": {"family": str, "size": _metres, "ids": _ids},
         "tag": {"family": str, "id": _whole, "size": _metres},
     }  # fmt: skip
     for name, options in fields.items():
         one = types.add_parser(name, help=f"{name}, with the fields of the rig file")
         for field, kind in options.items():
-            unit = {_metres: "METRES", _count: "N", _whole: "N"}.get(kind, "NAME")
+            unit = {_metres: "METRES", _count: "N", _whole: "N", _ids: "0-11 or 0,3,7"}.get(kind, "NAME")
             one.add_argument(
                 f"--{field.replace('_', '-')}",
                 type=kind,
@@ -98,6 +113,17 @@ def _count(text: str) -> int:
     if _whole(text) == 0:
         raise argparse.ArgumentTypeError("must be at least 1, but is 0")
     return int(text)
+
+
+def _ids(text: str) -> tuple[int, ...]:
+    """Ids and ranges of ids, separated by commas."""
+    ids: list[int] = []
+    for part in text.split(","):
+        first, _, last = part.partition("-")
+        ids += range(_whole(first), _whole(last or first) + 1)
+    if not ids or len(ids) > _MOST_IDS:
+        raise argparse.ArgumentTypeError(f"must be 1 to {_MOST_IDS} ids, as in 0-11 or 0,3,7, but is {text!r}")
+    return tuple(ids)
 
 
 def _metres(text: str) -> float:
@@ -139,6 +165,24 @@ def _calibrate(options: argparse.Namespace) -> None:
         write_outputs(result, options.output)
     if not options.quiet:
         print_result(result, options.output)
+
+
+def _simulate(options: argparse.Namespace) -> None:
+    from icalib.console import progress_bar
+    from icalib.simulation import load_scenario, simulate, write_sensors, write_tables
+    from icalib.simulation.tables import check_absent
+
+    scenario = load_scenario(options.scenario)
+    seed = scenario.seed if options.seed is None else options.seed
+    check_absent(options.output)
+    with progress_bar(options.quiet) as progress:
+        simulation = simulate(scenario, seed, lambda stage, done: progress(stage, 0.6 * done))
+        write = write_tables if options.level == "data" else write_sensors
+        notes = write(simulation, seed, options.output, lambda done: progress("writing", 0.6 + 0.4 * done))
+    if not options.quiet:
+        for sentence in notes:
+            print(f"Note: {sentence}")
+        print(f"Wrote {options.output}, seed {seed}.")
 
 
 def _inspect(options: argparse.Namespace) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from icalib.errors import CalibrationError, RigError
-from icalib.geometry.targets import Tag, Target
+from icalib.geometry.targets import AprilGrid, Markers, Tag, Target
 from icalib.geometry.targets.pattern import Pattern, pattern_of
 
 # Width and height [mm], upright; smallest first.
@@ -39,17 +39,37 @@ def write_target(path: str | Path, target: Target, paper: str = "a4", border_bit
 
 
 def target_pdf(target: Target, paper: str = "a4", border_bits: int | None = None) -> bytes:
-    """A page with `target`, upright or on its side as it fits; border_bits as in `pattern_of`.
+    """A page with `target`, upright or on its side as it fits, or one for each of several free tags; border_bits as in
+    `pattern_of`.
 
     Raises RigError where the paper is unknown or too small, CalibrationError where reportlab, or OpenCV for tags, is
     not installed.
     """
     if paper not in PAPERS:
         raise RigError(f"there is no paper {paper!r}; available are {', '.join(PAPERS)}.")
-    pattern = pattern_of(target, border_bits)
-    width, height = page_mm(pattern, paper)
+    if border_bits is not None and isinstance(target, AprilGrid | Markers):
+        target = dataclasses.replace(target, border_bits=border_bits)
+    patterns = _patterns(target, border_bits)
+    width, height = page_mm(next(iter(patterns.values())), paper)
     page = _canvas(width, height)
     page.setTitle(f"{target.type} target, print at 100 %")
+    for name, pattern in patterns.items():
+        _draw(page, pattern, width, height)
+        _foot(page, target, name, border_bits)
+        page.showPage()
+    return page.getpdfdata()
+
+
+def _patterns(target: Target, border_bits: int | None) -> dict[str, Pattern]:
+    """What is on each page, by name."""
+    if not isinstance(target, Markers):
+        return {"": pattern_of(target, border_bits)}
+    tags = [Tag(target.family, int(i), target.size) for i in target.known]
+    return {f"Tag {tag.id}. ": pattern_of(tag, target.border_bits) for tag in tags}
+
+
+def _draw(page: Any, pattern: Pattern, width: float, height: float) -> None:
+    """The pattern in the middle of the page [mm], above its foot."""
     size_x, size_y = _size_mm(pattern)
     left, bottom = 0.5 * (width - size_x), EDGE_MM + FOOT_MM + 0.5 * (height - 2.0 * EDGE_MM - FOOT_MM - size_y)
     # One path: edges that boxes share would show as hairlines between several.
@@ -58,9 +78,6 @@ def target_pdf(target: Target, paper: str = "a4", border_bits: int | None = None
         x, y = left + x0 - 1e3 * pattern.x[0], bottom + y0 - 1e3 * pattern.y[0]
         path.rect(*(_POINTS * side for side in (x, y, x1 - x0, y1 - y0)))
     page.drawPath(path, stroke=0, fill=1, fillMode=1)  # non-zero: rounded edges that overlap stay black
-    _foot(page, target, border_bits)
-    page.showPage()
-    return page.getpdfdata()
 
 
 def page_mm(pattern: Pattern, paper: str) -> tuple[float, float]:
@@ -95,15 +112,15 @@ def _canvas(width: float, height: float) -> Any:
     return Canvas(BytesIO(), pagesize=(_POINTS * width, _POINTS * height), pageCompression=0, invariant=1)
 
 
-def _foot(page: Any, target: Target, border_bits: int | None) -> None:
-    """What the rig file must say, how to print, and the ruler; from the top down, at the left."""
-    fields = {"type": target.type} | dataclasses.asdict(target)
+def _foot(page: Any, target: Target, name: str, border_bits: int | None) -> None:
+    """What the rig file must say, which page it is, how to print, and the ruler; from the top down, at the left."""
+    fields = target.plain()
     head = "" if isinstance(target, Tag) else "target: "  # a tag alone is no target of a rig file
-    border = "" if border_bits is None else f", tags with a border of {border_bits} bits"
+    border = "" if border_bits is None or "border_bits" in fields else f", tags with a border of {border_bits} bits"
     page.setFont(_FONT, _FONT_POINTS)
     lines = (
         f"{head}{{{', '.join(f'{name}: {value}' for name, value in fields.items())}}}",
-        f"icalib, sizes in metres{border}. Print at 100 %, unscaled; the ruler must measure {RULER_MM:.0f} mm.",
+        f"{name}icalib, sizes in metres{border}. Print at 100 %, unscaled; the ruler must measure {RULER_MM:.0f} mm.",
     )
     for i, text in enumerate(lines):
         page.drawString(_POINTS * EDGE_MM, _POINTS * (EDGE_MM + FOOT_MM - 6.0 - 3.5 * i), text)

@@ -3,46 +3,35 @@
 from __future__ import annotations
 
 import dataclasses
-import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from icalib.errors import RigError
 from icalib.geometry.cameras import CAMERA_MODELS
-from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, NoTarget, Target
-from icalib.geometry.targets.families import FAMILIES
+from icalib.geometry.targets import NoTarget, Scene, Target
 from icalib.imu_classes import DEFAULT_CLASS, IMU_CLASSES, class_noise
 from icalib.rig import Camera, ImuNoise, ImuSensor, Parameter, Rig, Settings
 from icalib.rig_parameters import imu_intrinsics_parameter, parameter_to_plain, rotation_parameter, vector_parameter
+from icalib.rig_targets import NAME, target_of, target_or_targets
 from icalib.yaml_nodes import YamlValue, read_yaml
 
 _SENSOR_TYPES = ("imu", "camera")
 _DENSITIES = ("gyro", "gyro_walk", "accel", "accel_walk")
-_SENSOR_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
-_TARGET_FIELDS = {
-    "aprilgrid": ("rows", "cols", "tag_size", "tag_spacing"),
-    "charuco": ("squares_x", "squares_y", "square_size", "marker_size", "dictionary"),
-    "checkerboard": ("rows", "cols", "square_size"),
-}
-_APRILGRID_OPTIONS = ("border_bits", "squares")
-_LARGEST_TAG_M = 2.0  # nobody prints a larger one; it is in millimetres
-_MOST_TAGS = 10_000
 
 
 def load_rig(path: str | Path) -> Rig:
     """Read a rig file. Raises RigError, one sentence naming file, line, field, what is wrong and what to do."""
     file = Path(path)
     root = read_yaml(file)
-    found = root.record(("sensors",), ("target", "gravity", "settings"))
+    found = root.record(("sensors",), ("target", "targets", "gravity", "settings"))
     imus, cameras = _sensors(found["sensors"])
     blind = [c.name for c in cameras if c.tracks is None]
-    if "target" not in found and blind:
+    targeted = "target" in found or "targets" in found
+    if blind and not targeted:
         root.fail(f"target is missing; add target, or tracks (a table of followed points) to {' and '.join(blind)}.")
     return Rig(
         imu=imus[0] if imus else None,
         cameras=tuple(cameras),
-        target=_target(found["target"]) if "target" in found else NoTarget(),
+        target=target_or_targets(root) if targeted else NoTarget(),
         gravity=found["gravity"].positive() if "gravity" in found else Rig.gravity,
         settings=_settings(found["settings"]) if "settings" in found else Settings(),
         path=file,
@@ -50,19 +39,21 @@ def load_rig(path: str | Path) -> Rig:
 
 
 def load_target(path: str | Path) -> Target:
-    """Read a target: a YAML file with the fields of the rig file's `target`, or one that has a `target`.
+    """Read a target: a YAML file with the fields of the rig file's `target`, or one that has a `target` or `targets`.
 
     Raises RigError, one sentence naming file, line, field, what is wrong and what to do.
     """
     root = read_yaml(Path(path))
-    return _target(root.entries().get("target", root))
+    has_its_own_field = {"target", "targets"} & set(root.entries())
+    return target_or_targets(root) if has_its_own_field else target_of(root)
 
 
 def rig_to_dict(rig: Rig) -> dict[str, Any]:
     """`rig` as lists, numbers and text; written as YAML or JSON, it loads back as the same rig."""
     imus = {} if rig.imu is None else {rig.imu.name: _imu_to_plain(rig.imu)}
     sensors = imus | {c.name: _camera_to_plain(c) for c in rig.cameras}
-    target = {"target": {"type": rig.target.type} | dataclasses.asdict(rig.target)} if rig.has_target else {}
+    key = "targets" if isinstance(rig.target, Scene) else "target"
+    target = {key: rig.target.plain()} if rig.has_target else {}
     return {
         "sensors": sensors,
         **target,
@@ -75,7 +66,7 @@ def _sensors(value: YamlValue) -> tuple[list[ImuSensor], list[Camera]]:
     imus: list[ImuSensor] = []
     cameras: list[Camera] = []
     for name, sensor in value.entries().items():
-        if not _SENSOR_NAME.fullmatch(name):
+        if not NAME.fullmatch(name):
             sensor.fail("a sensor's name is a letter, then letters, digits, _ or -, as in cam0; rename it.")
         fields = sensor.entries()
         if "type" not in fields:
@@ -154,51 +145,6 @@ def _path(found: dict[str, YamlValue], default: str) -> str:
 
 def _topic(found: dict[str, YamlValue]) -> str | None:
     return found["topic"].text() if "topic" in found else None
-
-
-def _target(value: YamlValue) -> Target:
-    fields = value.entries()
-    if "type" not in fields:
-        value.fail(f"type is missing; add type: {', type: '.join(_TARGET_FIELDS)}.")
-    kind = fields["type"].choice("target type", tuple(_TARGET_FIELDS))
-    found = value.record(("type", *_TARGET_FIELDS[kind]), _APRILGRID_OPTIONS if kind == "aprilgrid" else ())
-    if kind == "aprilgrid":
-        return _aprilgrid(value, found)
-    size = _edge(found["square_size"], "square")
-    if kind == "checkerboard":
-        rows, cols = _counts(value, found, "rows", "cols", "corners")
-        return _made(value, lambda: Checkerboard(rows, cols, size))
-    squares = _counts(value, found, "squares_x", "squares_y", "squares")
-    marker, dictionary = _edge(found["marker_size"], "tag"), found["dictionary"].choice("dictionary", tuple(FAMILIES))
-    return _made(value, lambda: Charuco(*squares, size, marker, dictionary))
-
-
-def _aprilgrid(value: YamlValue, found: dict[str, YamlValue]) -> AprilGrid:
-    size = _edge(found["tag_size"], "tag")
-    rows, cols = _counts(value, found, "rows", "cols", "tags")
-    border = int(found["border_bits"].choice("width of border", ("1", "2"))) if "border_bits" in found else 2
-    squares = found["squares"].boolean() if "squares" in found else True
-    return AprilGrid(rows, cols, size, found["tag_spacing"].positive(), border, squares)
-
-
-def _edge(value: YamlValue, what: str) -> float:
-    if (size := value.positive()) > _LARGEST_TAG_M:
-        value.fail(f"is in metres, and {size:g} m is no {what}; write 0.088 for 88 mm.")
-    return size
-
-
-def _counts(value: YamlValue, found: dict[str, YamlValue], first: str, second: str, what: str) -> tuple[int, int]:
-    a, b = found[first].whole(1), found[second].whole(1)
-    if a * b > _MOST_TAGS:
-        value.fail(f"{a} x {b} {what} are more than {_MOST_TAGS}; correct {first} and {second}.")
-    return a, b
-
-
-def _made(value: YamlValue, make: Callable[[], Target]) -> Target:
-    try:
-        return make()
-    except RigError as error:
-        value.fail(str(error))
 
 
 def _settings(value: YamlValue) -> Settings:

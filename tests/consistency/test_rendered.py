@@ -13,7 +13,7 @@ import icalib
 from icalib.calibration import Calibration
 from icalib.geometry.targets import Charuco, Checkerboard, Target
 from icalib.rig import Rig, Settings
-from icalib.simulation import Film, Scenario, Truth, film, handheld, rig_for, write_film
+from icalib.simulation import Film, Scenario, Truth, film, handheld, rig_for, tag_map, write_film
 from icalib.simulation.projection import project
 from icalib.simulation.writing import FORMS, Form
 
@@ -129,3 +129,25 @@ def test_other_targets_and_an_exposure(target: Target, scenario: Scenario, tmp_p
         assert np.abs(standardised(result, filmed.truth, block)).max() < 3.0, block
     fit = next(f for f in result.fits if f.kind == "corners")
     assert fit.rms is not None and fit.rms < 0.05
+
+
+def test_a_room_with_tags_and_a_grid(tmp_path: Path):
+    """From images to the calibration and where everything stands; only the lens is given."""
+    room = tag_map(8.0, with_grid=True)
+    camera = dataclasses.replace(room.cameras[0], rate_hz=10.0)
+    room = dataclasses.replace(room, cameras=(camera,))
+    filmed = film(room, seed=0)
+    write_film(filmed, {"mcap": tmp_path / "room"})
+    rig = rig_for(room, settings=Settings(keep_corners=False))
+    result = icalib.calibrate(rig, tmp_path / "room")
+    assert result.converged
+    # One tag on a wall is small and oblique in all images: its corners are too near to its cells to be used.
+    assert set(result.bodies) == set(room.target.bodies) - {"tags tag 64"}
+    for block in ("rotation", "translation", "time_offset"):
+        assert np.abs(standardised(result, filmed.truth, block)).max() < 4.0
+    true = dict(zip(room.target.bodies, filmed.truth.T_world_bodies, strict=True))
+    for body in result.bodies[1:]:
+        T = np.linalg.inv(true[result.bodies[0]]) @ true[body]
+        found = result.T_scene_body(body)
+        assert np.linalg.norm(found[:3, 3] - T[:3, 3]) < 4.0 * np.linalg.norm(result.group(body, "translation").std)
+        assert np.linalg.norm(found[:3, 3] - T[:3, 3]) < 2e-3

@@ -48,6 +48,12 @@ TARGETS = {
         False,
         ALL | {"small": 0.5},
     ),
+    "charuco of apriltags": (
+        ("charuco", 5, 8, "APRILTAG_36h11"),
+        CharucoDetector(5, 8, 0.8, "tag36h11"),
+        False,
+        ALL | {"oblique": 0.85, "small": 0.4},
+    ),
     "checkerboard": (("checkerboard", 6, 9), CheckerboardDetector(6, 9), False, ALL | {"cut": 0.0}),
     "checkerboard 7 x 6": (("checkerboard", 7, 6), CheckerboardDetector(7, 6), False, ALL | {"cut": 0.0}),
     "aruco": (("markers", "4X4_50", (3, 7), 1), MarkerDetector("4x4_50", (3, 7)), True, ALL | {"cut": 0.5}),

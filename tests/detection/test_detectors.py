@@ -17,9 +17,13 @@ from icalib.detection import (
     corner_stream,
 )
 from icalib.detection.corners import judged
+from icalib.detection.detectors import detector_of
 from icalib.detection.families import tag_family
-from icalib.detection.opencv import FAMILIES, dictionary, opencv
-from icalib.errors import RecordingError
+from icalib.errors import CalibrationError, RecordingError
+from icalib.extras import load_cv2
+from icalib.geometry.targets import Charuco
+from icalib.geometry.targets.families import FAMILIES, opencv_bits
+from icalib.geometry.targets.pattern import pattern_of
 
 cv2 = pytest.importorskip("cv2")
 
@@ -114,6 +118,25 @@ def test_legacy_charuco_boards_are_opencvs(rows):
     np.testing.assert_allclose(found.uv, expected, atol=1.0)  # OpenCV rounds the squares' places to pixels
 
 
+@pytest.mark.parametrize("family", ["5x5_100", "DICT_APRILTAG_36h11"])
+def test_a_charuco_board_is_read_alike_from_opencvs_print_and_ours(family):
+    """OpenCV's picture of the board, and ours, of the same size at the same place."""
+    target, cell = Charuco(7, 5, 0.07, 0.05, family), 80
+    name = next(n for n in dir(cv2.aruco) if n.lower() == f"dict_{family.lower().removeprefix('dict_')}")
+    source = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+    theirs = cv2.aruco.CharucoBoard((7, 5), 0.07, 0.05, source).generateImage((7 * cell, 5 * cell), None, 0, 1)
+    pattern = pattern_of(target)
+    x, y = ((np.arange(n * cell) + 0.5) * 0.07 / cell for n in (7, 5))
+    rows, cols = np.searchsorted(pattern.y, 0.07 - y) - 1, np.searchsorted(pattern.x, x - 0.07) - 1
+    ours = np.where(pattern.white[rows[:, None], cols], 255, 0).astype(np.uint8)
+    for board in (theirs, ours):
+        image = cv2.GaussianBlur(np.pad(board, 30, constant_values=255), (0, 0), 0.8)
+        found = detector_of(target).detect(image)
+        assert found.kept.all() and found.point.tolist() == list(range(24))
+        expected = target.points[:, :2] * [1.0, -1.0] / 0.07 * cell + 30 + cell - 0.5
+        np.testing.assert_allclose(found.uv, expected, atol=0.02)
+
+
 def test_a_symmetric_checkerboard_needs_a_promise(rendering):
     with pytest.raises(RecordingError, match="5 x 7 inner corners looks the same upside down; use one with an odd"):
         CheckerboardDetector(5, 7)
@@ -129,7 +152,10 @@ def test_a_symmetric_checkerboard_needs_a_promise(rendering):
     ("make", "sentence"),
     [
         (lambda: AprilGridDetector(30, 30, 0.3), r"30 x 30 tags needs more ids than tag36h11 has \(587\); check rows"),
-        (lambda: AprilGridDetector(6, 6, 0.3, family="tag37"), "family 'tag37' is not known; choose one of tag16h5"),
+        (
+            lambda: AprilGridDetector(6, 6, 0.3, family="tag37"),
+            "no family of tags 'tag37', did you mean 'tag36h11'",
+        ),
         (lambda: CharucoDetector(20, 20, 0.7, "4x4_50"), "needs 200 markers and 4x4_50 has 50; check rows"),
         (lambda: CharucoDetector(5, 5, 1.2, "4x4_50"), "marker_ratio is 1.2; give the marker's edge divided"),
         (lambda: CheckerboardDetector(2, 9), "2 x 9 inner corners is too small; use one of 3 x 4 or more"),
@@ -140,7 +166,7 @@ def test_a_symmetric_checkerboard_needs_a_promise(rendering):
     ],
 )
 def test_errors_say_what_to_do(make, sentence):
-    with pytest.raises(RecordingError, match=sentence):
+    with pytest.raises(CalibrationError, match=sentence):
         make()
 
 
@@ -149,14 +175,15 @@ def test_without_opencv_the_extra_is_named(monkeypatch):
         raise ImportError(name)
 
     monkeypatch.setattr(importlib, "import_module", absent)
-    with pytest.raises(RecordingError, match=r"not installed; run `pip install icalib\[images\]`\."):
-        opencv()
+    with pytest.raises(RecordingError, match=r"not installed; run: pip install icalib\[images\]\."):
+        load_cv2()
 
 
 def test_a_family_that_an_old_opencv_lacks_is_refused(monkeypatch):
     monkeypatch.delattr(cv2.aruco, "DICT_ARUCO_MIP_36h12")
+    opencv_bits.cache_clear()
     with pytest.raises(RecordingError, match="has no tags of aruco_mip_36h12; update opencv-python-headless"):
-        dictionary("aruco_mip_36h12")
+        opencv_bits("aruco_mip_36h12")
 
 
 @pytest.mark.parametrize("name", FAMILIES)

@@ -65,7 +65,7 @@ def test_read_cells_packs_row_by_row_and_counts_a_white_border():
     assert seen_cells(grey, 1) == 0b0111
 
 
-@pytest.mark.parametrize("side", [30.0, 50.0])
+@pytest.mark.parametrize("side", [20.0, 30.0, 50.0])
 def test_fit_step_is_the_least_squares_fit(side):
     normal = np.array([np.sin(0.3), -np.cos(0.3)])  # outward, for a side that runs along (cos, sin)
     along = np.array([np.cos(0.3), np.sin(0.3)])
@@ -78,7 +78,7 @@ def test_fit_step_is_the_least_squares_fit(side):
     t = ((u - middle[0]) * along[0] + (v - middle[1]) * along[1]) / (0.5 * side)
     d = (u - middle[0]) * normal[0] + (v - middle[1]) * normal[1]
     used = (np.abs(t) * 0.5 * side <= 0.5 * side - 3.0) & (np.abs(d) <= 3.5)
-    bend = side >= 40.0
+    bend = side >= 24.0
 
     def residual(p):
         z = (d[used] - p[0] - p[1] * t[used] - bend * p[5] * t[used] ** 2) / (np.sqrt(2.0) * p[2])

@@ -36,6 +36,8 @@ TOLERANCE = {
     "tilt": 2e-3,
     "shape": 1e-3,
     "bloom": 0.1,
+    "radii": 1e-3,
+    "baseline": 5e-3,
 }
 
 

@@ -237,7 +237,7 @@ def test_corners_beyond_the_range_of_the_model_are_left_out(setup, factor_of):
     turned = setup.state.values["cam0", "rotation"] @ np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
     state = replace(setup.state, values=setup.state.values | {("cam0", "rotation"): turned})
     params = np.concatenate([state.values["cam0", "intrinsics"], state.values["cam0", "distortion"]])
-    _, valid = factor.model.project(params, factor.points_in_camera(state)[0])
+    _, valid = factor.model.project(params, factor.points_in_camera(state, 0, len(factor.views.image))[0])
     assert valid.any() and not valid.all()
     cost, out, pieces = run(factor, state, sums=True)
     np.testing.assert_array_equal(out.root > 0, valid)

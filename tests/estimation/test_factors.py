@@ -21,7 +21,8 @@ from icalib.estimation.corner_factor import CornerNoise
 from icalib.estimation.corner_weights import LEAST_CURVATURE
 from icalib.estimation.imu_factor import ROWS, ImuFactor
 from icalib.estimation.prior_factor import FIRST_BIAS_SIGMA, Prior, accumulate_bias_prior
-from icalib.estimation.state import NODE, State
+from icalib.estimation.state import NODE, State, make_layout
+from icalib.estimation.wheel_factor import IncrementFactor, RelativePoseFactor, WheelNoise
 from icalib.geometry import so3
 
 
@@ -230,6 +231,54 @@ def bias_prior_sample(unlike, setup_of):
     )
 
 
+def with_wheels(setup):
+    """The setup with wheel0 in its state and border; no motion that wheels could follow, which its Jacobians need not.
+
+    Readings are constant: where they are not, the time derivative of a pose between stamps is exact to the part of the
+    interval squared only (test_poses), and this check asks for more.
+    """
+    wheels = {
+        "rotation": so3.exp(np.array([0.03, -0.05, 0.4])),
+        "translation": np.array([-0.2, 0.1, -0.15]),
+        "time_offset": np.array([0.013]),
+        "radii": np.array([0.1, 0.11]),
+        "baseline": np.array([0.45]),
+    }
+    entries = [(b.sensor, b.name, b.kind, b.size, b.start is not None) for b in setup.layout.blocks]
+    entries += [("wheel0", k, "rotation" if k == "rotation" else "vector", len(v), True) for k, v in wheels.items()]
+    values = setup.state.values | {("wheel0", k): v for k, v in wheels.items()}
+    gyro, accel = (np.ones((len(x), 1)) * x[5] for x in (setup.imu.gyro, setup.imu.accel))
+    imu, state = replace(setup.imu, gyro=gyro, accel=accel), replace(setup.state, values=values)
+    return replace(setup, layout=make_layout(entries), state=state, imu=imu)
+
+
+def wheel_sample(unlike, setup_of, factor, imu_free=False, rate_hz=70.0, loss="none", curved=False):
+    setup = with_wheels(setup_of(unlike, imu_free=imu_free))
+    rng = np.random.default_rng(4)
+    # The last stamps lie beyond the IMU's recording.
+    seconds = np.arange(0.0, setup.imu.seconds[-1], 1.0 / rate_hz)
+    angles = 0.2 * np.cumsum(rng.normal(size=(len(seconds), 2)), axis=0)
+    noise = WheelNoise(1.0, 0.5, 0.3, loss, LOSS_SCALE)
+    made = factor.build("wheel0", seconds, angles, setup.imu, 9.81, noise, setup.layout, setup.state)
+    state = setup.perturbed(rng, 0.3)
+
+    def run(at):
+        out = made.empty_output()
+        for piece in make_pieces(len(at.seconds), setup.layout.size):
+            made.accumulate(at, piece, out, sums=False)
+        return out.residual.ravel(), out.root.ravel()
+
+    def weights(at):
+        r, root = run(at)
+        slope = slope_along(loss if curved else "none", np.abs(r))
+        return root**2 * r, np.diag(root**2 * slope)
+
+    def accumulate(at, piece, sums):
+        return made.accumulate(at, piece, made.empty_output(), sums, curved)
+
+    return Sample(factor.__name__, setup, state, accumulate, lambda at: run(at)[0], weights)
+
+
 SAMPLES = {
     "imu": ("ImuFactor", lambda u, s, f: imu_sample(u, s, False)),
     "imu, intrinsics": ("ImuFactor", lambda u, s, f: imu_sample(u, s, True)),
@@ -272,6 +321,23 @@ SAMPLES = {
     "prior on a rotation": ("Prior", lambda u, s, f: prior_sample(u, s, "cam1", "rotation")),
     "prior on a vector": ("Prior", lambda u, s, f: prior_sample(u, s, "cam0", "intrinsics")),
     "prior on IMU intrinsics": ("Prior", lambda u, s, f: prior_sample(u, s, "imu0", "intrinsics")),
+    "wheels": ("IncrementFactor", lambda u, s, f: wheel_sample(u, s, IncrementFactor)),
+    "wheels, intrinsics": ("IncrementFactor", lambda u, s, f: wheel_sample(u, s, IncrementFactor, True)),
+    "wheels with fewer stamps than nodes": (
+        "IncrementFactor",
+        lambda u, s, f: wheel_sample(u, s, IncrementFactor, rate_hz=9.0),
+    ),
+    "wheels, huber": ("IncrementFactor", lambda u, s, f: wheel_sample(u, s, IncrementFactor, loss="huber")),
+    "wheels, cauchy, curved": (
+        "IncrementFactor",
+        lambda u, s, f: wheel_sample(u, s, IncrementFactor, loss="cauchy", curved=True),
+    ),
+    "planar poses": ("RelativePoseFactor", lambda u, s, f: wheel_sample(u, s, RelativePoseFactor)),
+    "planar poses, intrinsics": ("RelativePoseFactor", lambda u, s, f: wheel_sample(u, s, RelativePoseFactor, True)),
+    "planar poses, huber, curved": (
+        "RelativePoseFactor",
+        lambda u, s, f: wheel_sample(u, s, RelativePoseFactor, loss="huber", curved=True),
+    ),
     "bias prior": ("accumulate_bias_prior", lambda u, s, f: bias_prior_sample(u, s)),
 }
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from icalib.estimation.poses import assign_nodes, poses_at
+from icalib.estimation.poses import assign_nodes, motion_at, poses_at
 from icalib.estimation.state import NODE
 from icalib.geometry import so3
 
@@ -71,6 +71,46 @@ def test_jacobians_of_the_imu_intrinsics_by_central_differences(setup, scheme):
         np.testing.assert_allclose(
             at.by_imu[:, :, n], difference(plus, minus, at, h), rtol=0, atol=5e-9, err_msg=str(n)
         )
+
+
+def motion(setup, state=None, times=TIMES, imu_free=True):
+    node = assign_nodes("inertial", setup.state.seconds, TIMES)
+    return *motion_at(times, node, state or setup.state, setup.imu, 9.81, imu_free), node
+
+
+def test_motion_has_the_inertial_poses(setup):
+    at, _ = evaluate(setup, "inertial")
+    poses, _, _ = motion(setup)
+    for name in ("rotation", "position", "rate", "velocity", "by_node", "by_next", "by_imu"):
+        np.testing.assert_array_equal(getattr(poses, name), getattr(at, name))
+
+
+def test_jacobians_of_the_velocity_by_central_differences(setup):
+    state = setup.perturbed(np.random.default_rng(5))
+    _, moving, node = motion(setup, state)
+    n, h = len(state.seconds), 1e-6
+    for column in range(n * NODE + setup.layout.size):
+        d = h * np.eye(1, n * NODE + setup.layout.size, column)[0]
+        chain, border = d[: n * NODE].reshape(n, NODE), d[n * NODE :]
+        plus, minus = (motion(setup, state.retract(setup.layout, s * chain, s * border))[0] for s in (1.0, -1.0))
+        numeric = (plus.velocity - minus.velocity) / (2.0 * h)
+        if column < n * NODE:
+            analytic = moving.by_node[:, :, column % NODE] * (node == column // NODE)[:, None]
+        elif (k := column - n * NODE) in (own := list(setup.layout.columns("imu0", "intrinsics"))):
+            analytic = moving.by_imu[:, :, own.index(k)]
+        elif k in setup.layout.columns("board0", "tilt"):
+            continue  # turns the whole state with it
+        else:
+            analytic = np.zeros((len(TIMES), 3))
+        np.testing.assert_allclose(analytic, numeric, rtol=0, atol=5e-9, err_msg=str(column))
+
+
+def test_acceleration_is_the_time_derivative_of_the_velocity(setup):
+    """To within the part of an interval (2.5 ms at most) times how fast the force changes: see below."""
+    state, h = setup.perturbed(np.random.default_rng(6)), 1e-6
+    _, moving, _ = motion(setup, state)
+    plus, minus = (motion(setup, state, TIMES + d)[0] for d in (h, -h))
+    np.testing.assert_allclose(moving.acceleration, (plus.velocity - minus.velocity) / (2 * h), rtol=0, atol=2e-3)
 
 
 # `inertial` integrates the mean of the readings over a part of an interval, while its rate and velocity are

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from icalib.errors import CalibrationError, RecordingError, RigError
-from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Tag, Target
-from icalib.geometry.targets.families import FAMILIES, tag_bits
+from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Markers, Scene, Tag, Target
+from icalib.geometry.targets.families import FAMILIES, family_name, opencv_bits, tag_bits
 
 GRID = AprilGrid(rows=6, cols=7, tag_size=0.088, tag_spacing=0.3)  # not square, so that rows and columns differ
 
@@ -49,10 +49,13 @@ def test_unknown_corner(corner: int) -> None:
 
 CHARUCO = Charuco(squares_x=7, squares_y=5, square_size=0.04, marker_size=0.03, dictionary="5x5_100")
 BOARD = Checkerboard(rows=6, cols=9, square_size=0.03)
-TAG = Tag("apriltag_36h11", 12, 0.2)
+TAG = Tag("tag36h11", 12, 0.2)
+TAGS = Markers("tag36h11", 0.2, (90, 60, 75))
+SCENE = Scene(("grid", "tags"), (GRID, TAGS))
+AMBIGUOUS = Scene(("grid", "tags", "board"), (GRID, TAGS, BOARD))
 
 
-@pytest.mark.parametrize("target", [GRID, CHARUCO, BOARD, TAG], ids=lambda t: t.type)
+@pytest.mark.parametrize("target", [GRID, CHARUCO, BOARD, TAG, TAGS, SCENE], ids=lambda t: t.type)
 def test_identities_and_indices_are_inverse_and_the_origin_is_point_0(target: Target):
     index = np.arange(len(target.points))
     np.testing.assert_array_equal(target.point_index(*target.point_identity(index)), index)
@@ -98,6 +101,10 @@ def test_tag_corners_run_counterclockwise_from_the_bottom_left():
         (CHARUCO, 3, 0, "tag 3 is not on the target, whose corners have tag 0"),
         (BOARD, 0, -1, "corner -1 is not on the target (corners 0 to 53); check rows and cols"),
         (TAG, 11, 0, "tag 11 is not tag 12"),
+        (TAGS, 61, 0, "tag 61 is not one of the target's ids"),
+        (TAGS, 60, 4, "corner 4 is not one of a tag's corners"),
+        (SCENE, 42, 0, "corner 0 of tag 42 is on none of grid, tags"),
+        (AMBIGUOUS, 0, 2, "corner 2 of tag 0 is on grid and board"),
         (TAG, 12, 4, "corner 4 is not one of a tag's corners"),
     ],
 )
@@ -113,9 +120,12 @@ def test_points_that_a_target_lacks(target: Target, tag_id: int, corner: int, wo
         (lambda: Charuco(7, 5, 0.04, 0.04, "5x5_100"), "marker_size 0.04 does not fit a square of 0.04"),
         (lambda: Charuco(2, 5, 0.04, 0.03, "5x5_100"), "2 x 5 squares has too few inner corners"),
         (lambda: Charuco(20, 20, 0.04, 0.03, "5x5_100"), "needs 200 tags, but 5x5_100 has 100"),
-        (lambda: Charuco(7, 5, 0.04, 0.03, "5x5"), "no family of tags '5x5'; available are 4x4_50"),
+        (
+            lambda: Charuco(7, 5, 0.04, 0.03, "5x5"),
+            "no family of tags '5x5', did you mean '5x5_50'; available",
+        ),
         (lambda: Checkerboard(1, 5, 0.04), "1 x 5 inner corners cannot tell x from y"),
-        (lambda: Tag("apriltag_36h11", 587, 0.1), "needs 588 tags, but apriltag_36h11 has 587"),
+        (lambda: Tag("tag36h11", 587, 0.1), "needs 588 tags, but tag36h11 has 587"),
     ],
 )
 def test_targets_that_cannot_be(make, words: str):
@@ -127,20 +137,49 @@ def test_targets_that_cannot_be(make, words: str):
 def test_families_are_opencvs():
     aruco = pytest.importorskip("cv2").aruco
     for family, (bits, count) in FAMILIES.items():
-        name = next(n for n in dir(aruco) if n.lower() == f"dict_{family}")
+        name = next(n for n in dir(aruco) if n.lower() == "dict_" + family.replace("tag", "apriltag_"))
         dictionary = aruco.getPredefinedDictionary(getattr(aruco, name))
         assert (dictionary.markerSize, len(dictionary.bytesList)) == (bits, count)
         assert tag_bits(family, count - 1).shape == (bits, bits)
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("tag36h11", "tag36h11"),
+        ("apriltag_36h11", "tag36h11"),
+        ("AprilTag36h11", "tag36h11"),
+        ("36h11", "tag36h11"),
+        ("DICT_APRILTAG_36h11", "tag36h11"),
+        ("DICT_APRILTAG_16H5", "tag16h5"),
+        ("tag25h9", "tag25h9"),
+        ("5X5_100", "5x5_100"),
+        ("DICT_4X4_50", "4x4_50"),
+        ("DICT_ARUCO_ORIGINAL", "aruco_original"),
+        ("DICT_ARUCO_MIP_36h12", "aruco_mip_36h12"),
+    ],
+)
+def test_spellings_of_one_family(text: str, name: str):
+    assert family_name(text) == name
+    assert Tag(text, 3, 0.1) == Tag(name, 3, 0.1) and Markers(text, 0.1).family == name
+    assert Charuco(3, 3, 0.04, 0.03, text).dictionary == name
+
+
+@pytest.mark.parametrize("text", ["tagStandard41h12", "tagCircle21h7", "5x5", "", "36h12", "aruco_36h12"])
+def test_families_that_there_are_not(text: str):
+    with pytest.raises(RigError, match=f"no family of tags '{text}'.*; available are 4x4_50, .*tag36h11"):
+        family_name(text)
 
 
 def test_apriltags_stand_as_their_authors_draw_them():
     """36h11's code of id 0 is 0xd5d628584, its highest bit at the top left (Olson 2011; Kalibr draws it so too)."""
     pytest.importorskip("cv2")
     code = f"{0xD5D628584:036b}"
-    np.testing.assert_array_equal(tag_bits("apriltag_36h11", 0).ravel(), [c == "1" for c in code])
+    np.testing.assert_array_equal(tag_bits("tag36h11", 0).ravel(), [c == "1" for c in code])
 
 
 def test_without_opencv_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "cv2", None)
+    opencv_bits.cache_clear()
     with pytest.raises(CalibrationError, match=r"install icalib\[images\]"):
         tag_bits("4x4_50", 0)

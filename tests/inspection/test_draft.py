@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import stat
 from pathlib import Path
@@ -13,7 +14,7 @@ from icalib.cli import main
 from icalib.errors import CalibrationError, RigError
 from icalib.geometry.targets import AprilGrid
 from icalib.inspection.draft import write_draft
-from icalib.rig_file import load_rig
+from icalib.rig_file import load_rig, load_target
 
 SIZE = (32, 24)
 K = (40.5, 41.5, 15.25, 11.75)
@@ -246,3 +247,27 @@ def test_a_draft_of_cameras_alone_loads(bags, tmp_path):
     (tmp_path / "rig.yaml").write_text(text)
     rig = load_rig(tmp_path / "rig.yaml")
     assert rig.imu is None and rig.body == rig.cameras[0].name
+
+
+SCENE = """\
+targets:
+  grid: {type: aprilgrid, rows: 3, cols: 3, tag_size: 0.1, tag_spacing: 0.3}
+  wall: {type: markers, family: DICT_APRILTAG_36h11, size: 0.16, ids: [40, 43]}
+"""
+
+
+@pytest.mark.parametrize("text", [SCENE, "{type: markers, family: tag16h5, size: 0.2}"])
+def test_free_tags_and_several_targets_are_taken_over(text, bags, brief, tmp_path, capsys):
+    """Nothing of them is in the images, and the draft is written all the same."""
+    bag = bags.write(tmp_path / "run", bags.noise("/cam0/image_raw", SIZE) + bags.imu("/imu0", brief))
+    target, path, figures = (tmp_path / name for name in ("target.yaml", "rig.yaml", "figures.json"))
+    target.write_text(text)
+    options = ["--target", str(target), "--rig", str(path), "--json", str(figures)]
+    assert main(["inspect", str(bag), *options]) == 0, capsys.readouterr()
+    expected = load_target(target)
+    assert load_rig(path).target == expected
+    stated = json.loads(figures.read_text())["target"]
+    assert stated.pop("file") == str(target)
+    assert stated == (
+        expected.plain() if expected.type == "markers" else {"type": "scene", "targets": expected.plain()}
+    )

@@ -14,7 +14,7 @@ import pytest
 from rich.console import Console
 
 from icalib.cli import main
-from icalib.geometry.targets import AprilGrid
+from icalib.geometry.targets import AprilGrid, Markers
 from icalib.inspection import Inspection, inspect_recording, read_target
 from icalib.inspection.console import print_inspection
 from icalib.inspection.facts import CameraSource
@@ -165,6 +165,25 @@ def test_tilts_and_distances():
     assert view.tilt_deg == pytest.approx((4.0, 20.0, 36.0), abs=2.0)
     assert view.distance_ratio == pytest.approx(9.5 / 5.5, rel=0.05)
     assert view.images is None and view.cells is None
+
+
+def test_tilts_are_those_of_each_free_tag():
+    """Two tags in every image, one from the front, one tilted by 40 degrees about another axis."""
+    target, stamps = Markers("tag36h11", 0.2, (5, 8)), np.arange(20, dtype=np.int64) * STEP
+    xy = target.points[:4, :2] - 0.1
+    front = 1000.0 / 8.0 * xy
+    tilted = 1000.0 * xy * [np.cos(np.radians(40.0)), 1.0] / (8.0 + xy[:, :1] * np.sin(np.radians(40.0)))
+    stream = CornerStream(
+        "cam0", stamps, 8 * np.arange(21), np.tile(np.arange(8), 20), np.tile([*front, *tilted], (20, 1))
+    )
+
+    class Tables:
+        def corners(self, camera, target):
+            return stream
+
+    topic = TopicInfo("cam0/corners.csv", "table", "corners", 20, 0, 1)
+    view = target_view(Tables(), CameraSource("cam0", topic, None, topic, None), target, None, lambda _: None)
+    assert view.tilt_deg == pytest.approx((0.0, 20.0, 40.0), abs=0.5)
 
 
 def test_the_example_that_comes_with_icalib(tmp_path, capsys):

@@ -100,7 +100,7 @@ def test_a_film_shows_every_body_where_the_corners_are():
 
 def test_bodies_without_a_pose_are_refused():
     base = handheld(1.0)
-    tags = Markers("apriltag_36h11", 0.1, (1, 2, 3))
+    tags = Markers("tag36h11", 0.1, (1, 2, 3))
     with pytest.raises(RigError, match="T_world_bodies"):
         replace(base, target=tags)
     with pytest.raises(RigError, match=r"\(4, 4, 4\)"):

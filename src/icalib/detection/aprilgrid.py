@@ -8,14 +8,15 @@ from functools import cached_property
 import numpy as np
 
 from icalib.detection.consistency import consistent_corners, largest_group
-from icalib.detection.corners import ImageCorners, checked_image, judged, no_corners
+from icalib.detection.corners import ImageCorners, judged, no_corners
 from icalib.detection.families import Family, tag_family
 from icalib.detection.growth import grow
 from icalib.detection.markers import APRILTAG_CORNER
-from icalib.detection.quads import threshold_windows
+from icalib.detection.quads import View
 from icalib.detection.refinement import refined_corners, refined_crossings
 from icalib.detection.tags import Tags, find_tags
 from icalib.errors import RecordingError
+from icalib.geometry.targets.families import APRILGRID_FAMILY
 
 _ON_BOARD = np.array([(1.0, 0.0), (0.0, 0.0), (0.0, 1.0), (1.0, 1.0)])  # corners in OpenCV's order, tag sizes
 
@@ -32,7 +33,7 @@ class AprilGridDetector:
     rows: int
     cols: int
     tag_spacing: float
-    family: str = "tag36h11"
+    family: str = APRILGRID_FAMILY
     border_bits: int = 2
     squares: bool = True
 
@@ -69,13 +70,16 @@ class AprilGridDetector:
 
         Raises RecordingError for an image that is not grey with 8 bits.
         """
-        image = checked_image(image)
-        for window in threshold_windows(image.shape[1]):
+        return self.find(View(image))
+
+    def find(self, view: View) -> ImageCorners:
+        """As `detect`."""
+        for window in view.windows:
             for separate in (True, False):
-                tags = find_tags(image, self._family, self.border_bits, window, separate)
+                tags = find_tags(view, self._family, self.border_bits, window, separate)
                 known, quads = self._seeds(tags)
                 if known.any():
-                    return self._corners(image, known, quads)
+                    return self._corners(view.image, known, quads)
         return no_corners()
 
     def _seeds(self, tags: Tags) -> tuple[np.ndarray, np.ndarray]:

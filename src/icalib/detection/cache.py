@@ -19,7 +19,7 @@ import numpy as np
 from icalib.detection.corners import ImageCorners
 from icalib.recordings import Payload
 
-VERSION = 2  # of the detectors and of the format: whatever changes corners changes this
+VERSION = 3  # of the detectors and of the format: whatever changes corners changes this
 _FIELDS = ("point", "uv", "sigma", "blur", "verdict")
 
 

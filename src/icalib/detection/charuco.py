@@ -8,11 +8,12 @@ from functools import cached_property
 import numpy as np
 
 from icalib.detection.consistency import largest_group
-from icalib.detection.corners import ImageCorners, checked_image, no_corners
+from icalib.detection.corners import ImageCorners, no_corners
 from icalib.detection.decoding import mapped
 from icalib.detection.families import Family, tag_family
 from icalib.detection.growth import fit_homography
 from icalib.detection.markers import all_tags
+from icalib.detection.quads import View
 from icalib.detection.squares import square_corners
 from icalib.errors import RecordingError
 
@@ -70,10 +71,13 @@ class CharucoDetector:
 
         Raises RecordingError for an image that is not grey with 8 bits.
         """
-        image = checked_image(image)
+        return self.find(View(image))
+
+    def find(self, view: View) -> ImageCorners:
+        """As `detect`."""
         n = len(self._markers)
         known, quads = np.zeros(n, dtype=bool), np.zeros((n, 4, 2))
-        tags = all_tags(image, self._family, 1)
+        tags = all_tags(view, self._family, 1)
         ids, count = np.unique(tags.ids, return_counts=True)
         for tag in ids[(count == 1) & (ids < n)]:
             known[tag], quads[tag] = True, tags.quads[tags.ids == tag][0]
@@ -81,7 +85,7 @@ class CharucoDetector:
         if known.sum() < _LEAST_MARKERS:
             return no_corners()
         expected = self._expected(self._markers[known], quads[known])
-        return square_corners(image, expected, self._dark, 0.5 * (1.0 - self.marker_ratio))
+        return square_corners(view.image, expected, self._dark, 0.5 * (1.0 - self.marker_ratio))
 
     def _expected(self, markers: np.ndarray, quads: np.ndarray) -> np.ndarray:
         """(rows + 1, cols + 1, 2) px, the squares' corners where the nearest markers found place them.

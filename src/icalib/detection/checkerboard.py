@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.detection.corners import ImageCorners, checked_image, no_corners
-from icalib.detection.opencv import opencv
+from icalib.detection.corners import ImageCorners, no_corners
+from icalib.detection.quads import View
 from icalib.detection.squares import square_corners
 from icalib.errors import RecordingError
+from icalib.extras import load_cv2
 
 
 @dataclass(frozen=True)
@@ -42,8 +43,12 @@ class CheckerboardDetector:
 
         Raises RecordingError for an image that is not grey with 8 bits.
         """
-        image = checked_image(image)
-        cv2 = opencv()
+        return self.find(View(image))
+
+    def find(self, view: View) -> ImageCorners:
+        """As `detect`."""
+        image = view.image
+        cv2 = load_cv2()
         found, corners = cv2.findChessboardCornersSB(image, (self.cols, self.rows), flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
         if not found:
             return no_corners()

@@ -11,9 +11,13 @@ import numpy as np
 from icalib.detection.aprilgrid import AprilGridDetector
 from icalib.detection.charuco import CharucoDetector
 from icalib.detection.checkerboard import CheckerboardDetector
-from icalib.detection.corners import ImageCorners
+from icalib.detection.corners import ImageCorners, no_corners
+from icalib.detection.markers import MarkerDetector
+from icalib.detection.quads import View
 from icalib.errors import RigError
-from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Target
+from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Markers, Scene, Target
+
+_SAME_PX = 3.0  # corners this close are one
 
 
 class Detector(Protocol):
@@ -24,8 +28,26 @@ class Detector(Protocol):
         ...
 
 
+class _Finder(Detector, Protocol):
+    def find(self, view: View) -> ImageCorners:
+        """As `detect`."""
+        ...
+
+
 def detector_of(target: Target) -> Detector:
     """The detector that finds `target`. Raises RigError for one that none finds in images."""
+    return _finder_of(target)
+
+
+def _finder_of(target: Target) -> _Finder:
+    if isinstance(target, Scene):
+        members, tagged = (
+            tuple(_finder_of(t) for t in target.targets),
+            tuple(t.tags is not None for t in target.targets),
+        )
+        return _SceneDetector(members, target.first_points[:-1], tagged)
+    if isinstance(target, Markers):
+        return MarkerDetector(target.family, tuple(target.known.tolist()), target.border_bits)
     if isinstance(target, AprilGrid):
         return AprilGridDetector(
             target.rows, target.cols, target.tag_spacing, border_bits=target.border_bits, squares=target.squares
@@ -39,18 +61,46 @@ def detector_of(target: Target) -> Detector:
 
 
 @dataclass(frozen=True, eq=False)
+class _SceneDetector:
+    """Finds each target with its own of `members`; first (members,): a scene's number of its first point."""
+
+    members: tuple[_Finder, ...]
+    first: np.ndarray
+    tagged: tuple[bool, ...]  # whether tags tell a member from others
+
+    def detect(self, image: np.ndarray) -> ImageCorners:
+        return self.find(View(image))
+
+    def find(self, view: View) -> ImageCorners:
+        found = [member.find(view) for member in self.members]
+        of_tags = np.concatenate([np.zeros((0, 2))] + [f.uv for f, t in zip(found, self.tagged, strict=True) if t])
+        found = [f if t or _apart(f.uv, of_tags) else no_corners() for f, t in zip(found, self.tagged, strict=True)]
+        fields = {f.name: np.concatenate([getattr(one, f.name) for one in found]) for f in dataclasses.fields(found[0])}
+        point = np.concatenate([one.point + first for one, first in zip(found, self.first, strict=True)])
+        return ImageCorners(**fields | {"point": point})
+
+
+@dataclass(frozen=True, eq=False)
 class _Renumbered:
     """What `detector` calls k is the target's point number[k]."""
 
-    detector: Detector
+    detector: CheckerboardDetector
     number: np.ndarray
 
     def detect(self, image: np.ndarray) -> ImageCorners:
-        found = self.detector.detect(image)
+        return self.find(View(image))
+
+    def find(self, view: View) -> ImageCorners:
+        found = self.detector.find(view)
         point = self.number[found.point]
         order = np.argsort(point)
         fields = {f.name: getattr(found, f.name)[order] for f in dataclasses.fields(found)}
         return ImageCorners(**fields | {"point": point[order]})
+
+
+def _apart(uv: np.ndarray, others: np.ndarray) -> bool:
+    """Whether no corner of a board lies on another target's, whose squares may look like a small checkerboard."""
+    return not len(others) or bool((np.linalg.norm(uv[:, None] - others, axis=2) > _SAME_PX).all())
 
 
 def _from_the_bottom(rows: int, cols: int) -> np.ndarray:

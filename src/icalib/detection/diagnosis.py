@@ -8,11 +8,10 @@ from itertools import islice, product
 
 import numpy as np
 
-from icalib.detection.corners import checked_image
 from icalib.detection.families import tag_family
-from icalib.detection.opencv import FAMILIES, is_available
-from icalib.detection.quads import dark_quads, threshold_windows
+from icalib.detection.quads import View
 from icalib.detection.tags import tags_at
+from icalib.geometry.targets.families import FAMILIES, TagSet, is_available
 
 _MOST_IMAGES = 5
 _SIZES = (50, 100, 250, 1000)  # of OpenCV's families; each starts with the smaller ones
@@ -22,6 +21,7 @@ _TRIED = ("tag36h11", "tag25h9", "tag16h5", "tag36h10", "aruco_original", "aruco
 _BORDERS = (1, 2)
 _LEAST_TAGS = {4: 4}  # fewer tags of 4 x 4 cells may be chance
 _LEAST_TAGS_USUALLY = 2
+_MANY_MORE = 4  # times the tags with the border that was stated
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ def what_is_seen(images: Iterable[np.ndarray], family: str, border_bits: int, id
 
     `family`, `border_bits` and `ids` are those of the target. Raises RecordingError for an image that is not grey.
     """
-    candidates = _candidates([checked_image(image) for image in islice(images, _MOST_IMAGES)])
+    candidates = _candidates([View(image).image for image in islice(images, _MOST_IMAGES)])
     own_name = _largest(family)
     candidates.sort(key=lambda seen: (len(seen.ids), seen.family == own_name), reverse=True)
     if not candidates:
@@ -48,16 +48,38 @@ def what_is_seen(images: Iterable[np.ndarray], family: str, border_bits: int, id
     return _sentence(candidates[0], family, border_bits, ids)
 
 
+def with_other_border(images: Iterable[np.ndarray], tags: TagSet, others: Iterable[TagSet]) -> str:
+    """A sentence where the first images (h, w) uint8 show the target's `tags` with a border of the other width, and
+    hardly any with their own; "" otherwise. `others` are tags that may stand beside them.
+
+    A tag is sometimes read with the wrong width of border, and always at the wrong place.
+    """
+    swapped = TagSet(tags.family, 3 - tags.border_bits, tags.ids)
+    ids = sorted(set(tags.ids) - {i for other in others for i in swapped.shared_with(other)})
+    found: dict[int, list[np.ndarray]] = {1: [], 2: []}
+    for image in islice(images, _MOST_IMAGES):
+        view = View(image)
+        quads = np.concatenate([view.quads(window, apart) for window in view.windows for apart in (True, False)])
+        for border, seen in found.items():
+            read = tags_at(view.image, quads, tag_family(tags.family), border).ids
+            seen.append(read[np.isin(read, ids)])
+    own, swap = (np.concatenate([np.zeros(0, np.int64), *found[t.border_bits]]) for t in (tags, swapped))
+    if len(swap) < _MANY_MORE * max(len(own), 1):
+        return ""
+    return _sentence(_Seen(tags.family, swapped.border_bits, False, swap), tags.family, tags.border_bits, tags.ids)
+
+
 def _candidates(images: list[np.ndarray]) -> list[_Seen]:
     """What each family and border finds, where it is more than chance."""
     found: dict[tuple[str, int, bool], list[np.ndarray]] = {}
     tried = [name for name in _TRIED if is_available(name)]
     for image, mirrored in product(images, (False, True)):
-        view = np.ascontiguousarray(image[:, ::-1]) if mirrored else image
-        windows = threshold_windows(view.shape[1])
-        quads = np.concatenate([dark_quads(view, window, apart) for window in windows for apart in (True, False)])
+        view = View(image[:, ::-1] if mirrored else image)
+        quads = np.concatenate([view.quads(window, apart) for window in view.windows for apart in (True, False)])
         for name, border in product(tried, _BORDERS):
-            found.setdefault((name, border, mirrored), []).append(tags_at(view, quads, tag_family(name), border).ids)
+            found.setdefault((name, border, mirrored), []).append(
+                tags_at(view.image, quads, tag_family(name), border).ids
+            )
     seen = [_Seen(*key, np.concatenate(ids)) for key, ids in found.items()]
     least = {name: _LEAST_TAGS.get(tag_family(name).bits, _LEAST_TAGS_USUALLY) for name in tried}
     return [one for one in seen if len(one.ids) >= least[one.family]]

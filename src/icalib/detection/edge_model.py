@@ -15,7 +15,7 @@ _ITERATIONS = 10
 _CONVERGED_PX = 1e-3
 END_PX = 3.0  # left out at both ends of a side, where the corner's blur bends the edge
 _MOST_END = 0.25  # of the side
-_CURVED_FROM_PX = 40.0  # sides as long as that may be bent by the lens
+_CURVED_FROM_PX = 24.0  # sides as long as that may be bent by the lens
 _BLUR_RANGE = (0.35, 6.0)
 _LEAST_SINE = 0.17  # of the angle between two sides: 10 degrees
 

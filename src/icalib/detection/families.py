@@ -9,7 +9,7 @@ from math import comb
 import numpy as np
 
 from icalib.detection.decoding import least_distance
-from icalib.detection.opencv import dictionary
+from icalib.geometry.targets.families import family_name, is_apriltag, opencv_bits
 
 _FALSE_ALARMS = 1e-3  # most of all random patterns that may be taken for a tag
 
@@ -18,8 +18,8 @@ _FALSE_ALARMS = 1e-3  # most of all random patterns that may be taken for a tag
 class Family:
     """One family: `bits` x `bits` data cells; `codes` (n, 4) uint64, the pattern of id i turned by 0 to 3 quarters.
 
-    A pattern is packed row by row from its top left cell, the first cell the highest bit, white 1. `max_errors` is the
-    number of wrong cells with which a pattern is still taken for one of the family.
+    Patterns are OpenCV's, packed row by row from the top left cell, the first cell the highest bit, white 1.
+    `max_errors` is the number of wrong cells with which a pattern is still taken for one of the family.
     """
 
     name: str
@@ -29,19 +29,16 @@ class Family:
 
     @property
     def is_apriltag(self) -> bool:
-        return self.name.startswith("tag")
+        return is_apriltag(self.name)
 
 
 @lru_cache(maxsize=32)
 def tag_family(name: str) -> Family:
-    """The family `name`, one of `FAMILIES`. Raises RecordingError for another name."""
-    source = dictionary(name)
-    bits, n = int(source.markerSize), len(source.bytesList)
-    codes = np.zeros((n, 4), dtype=np.uint64)
-    for i in range(n):
-        pattern = source.generateImageMarker(i, bits + 2, None, 1)[1:-1, 1:-1] > 127
-        for turn in range(4):
-            codes[i, turn] = _packed(np.rot90(pattern, turn))
+    """The family of this name (see `family_name`, which raises RigError where there is none)."""
+    name = family_name(name)
+    patterns = opencv_bits(name)
+    n, bits, _ = patterns.shape
+    codes = np.array([[_packed(np.rot90(pattern, turn)) for turn in range(4)] for pattern in patterns])
     correctable = (int(least_distance(codes)) - 1) // 2
     return Family(name, bits, codes, min(correctable, _errors_allowed(4 * n, bits * bits)))
 

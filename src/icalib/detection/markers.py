@@ -7,9 +7,9 @@ from functools import cached_property
 
 import numpy as np
 
-from icalib.detection.corners import ImageCorners, checked_image, judged, no_corners
+from icalib.detection.corners import ImageCorners, judged, no_corners
 from icalib.detection.families import Family, tag_family
-from icalib.detection.quads import dark_quads, threshold_windows
+from icalib.detection.quads import View
 from icalib.detection.refinement import refined_corners
 from icalib.detection.tags import Tags, tags_at
 from icalib.errors import RecordingError
@@ -20,11 +20,10 @@ APRILTAG_CORNER = np.array([1, 0, 3, 2])
 ARUCO_CORNER = np.array([3, 2, 1, 0])
 
 
-def all_tags(image: np.ndarray, family: Family, border_bits: int) -> Tags:
-    """The tags that stand alone in the image (h, w) uint8, large ones and small ones."""
-    windows = threshold_windows(image.shape[1])
-    quads = np.concatenate([dark_quads(image, window, False) for window in windows])
-    return tags_at(image, quads, family, border_bits)
+def all_tags(view: View, family: Family, border_bits: int) -> Tags:
+    """The tags that stand alone, large ones and small ones."""
+    quads = np.concatenate([view.quads(window, False) for window in view.windows])
+    return tags_at(view.image, quads, family, border_bits)
 
 
 @dataclass(frozen=True)
@@ -56,14 +55,17 @@ class MarkerDetector:
 
         Raises RecordingError for an image that is not grey with 8 bits.
         """
-        image = checked_image(image)
-        tags = all_tags(image, self._family, self.border_bits)
+        return self.find(View(image))
+
+    def find(self, view: View) -> ImageCorners:
+        """As `detect`."""
+        tags = all_tags(view, self._family, self.border_bits)
         ids, count = np.unique(tags.ids, return_counts=True)
         rows = np.flatnonzero(np.isin(tags.ids, ids[count == 1]) & np.isin(tags.ids, self.ids))
         if not len(rows):
             return no_corners()
         clear = self.border_bits / (self._family.bits + 2 * self.border_bits)
-        uv, quality = refined_corners(image, tags.quads[rows], clear)
+        uv, quality = refined_corners(view.image, tags.quads[rows], clear)
         order = APRILTAG_CORNER if self._family.is_apriltag else ARUCO_CORNER
         place = np.array([self.ids.index(int(tag)) for tag in tags.ids[rows]])
         point = (4 * place[:, None] + order).ravel()

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 import numpy as np
 
-from icalib.detection.opencv import opencv
+from icalib.detection.corners import checked_image
+from icalib.extras import load_cv2
 
 _CONTRAST = 7  # grey levels below the local mean
 _LEAST_SIDE_PX = 7.0
@@ -13,13 +16,38 @@ _STRAIGHT = 0.05  # of the perimeter: how far a contour may leave its polygon
 _WINDOW_SHARES = (0.08, 0.03, 0.2)  # of the width of the image
 
 
+@dataclass(frozen=True, eq=False)
+class View:
+    """An image (h, w) uint8 and its dark quads: what one detector has worked out serves the next one.
+
+    Raises RecordingError for an image that is not grey with 8 bits.
+    """
+
+    image: np.ndarray
+    _quads: dict[tuple[int, bool], np.ndarray] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "image", checked_image(self.image))
+
+    @property
+    def windows(self) -> tuple[int, ...]:
+        """Those of `threshold_windows`."""
+        return threshold_windows(self.image.shape[1])
+
+    def quads(self, window: int, separate: bool) -> np.ndarray:
+        """As `dark_quads`."""
+        if (window, separate) not in self._quads:
+            self._quads[window, separate] = dark_quads(self.image, window, separate)
+        return self._quads[window, separate]
+
+
 def dark_quads(image: np.ndarray, window: int, separate: bool) -> np.ndarray:
     """(n, 4, 2) corners, clockwise in the image, of dark regions with about four straight sides, to about 2 px.
 
     image (h, w) uint8; dark is what is darker than the mean of `window` x `window` px (odd). `separate` takes the
     outermost pixel off all dark regions first, so that tags whose corners touch other dark squares come apart.
     """
-    cv2 = opencv()
+    cv2 = load_cv2()
     dark = cv2.adaptiveThreshold(
         image, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, window, float(_CONTRAST)
     )

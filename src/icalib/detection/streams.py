@@ -10,23 +10,26 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import islice
 
 import numpy as np
 
 from icalib.detection.cache import keep_corners, load_corners, stream_key
-from icalib.detection.corners import KEPT, VERDICTS, ImageCorners, corner_stream
+from icalib.detection.corners import ImageCorners, corner_stream
 from icalib.detection.detectors import Detector, detector_of
-from icalib.detection.diagnosis import what_is_seen
+from icalib.detection.diagnosis import what_is_seen, with_other_border
+from icalib.detection.sightings import parts_of, sightings, without_rare_tags
 from icalib.errors import RecordingError
-from icalib.geometry.targets import AprilGrid, Charuco, Target
+from icalib.extras import load_cv2
+from icalib.geometry.targets import Charuco, Markers, Scene, Target
 from icalib.measurements import CornerStream
 from icalib.recordings import DamagedImageError, Payload, Recording, decode
-from icalib.recordings.extras import load_cv2
 from icalib.rig import Camera
 
-DIAGNOSED = 10  # images in which tags are looked for that are not the target's
+DIAGNOSED = 5  # images in which tags are looked for that are not the target's
+# Of a target's points, and of free tags' corners, an image on average: with fewer the border may be another one.
+POOR_SHARE, POOR_CORNERS = 0.5, 8
 PER_WORKER = 4  # images in memory for each thread
 Progress = Callable[[float], None]  # the share of the images that is done, 0 to 1
 
@@ -49,25 +52,51 @@ def find_corners(
         if keep:
             keep_corners(key, *found)
     stamps_ns, images = found
-    if not any(i.kept.any() for i in images):
-        raise RecordingError(
-            f"{where}: the target is in none of {len(images)} images of {camera.name}; "
-            + _seen_instead(recording, topic, target)
-        )
-    return corner_stream(camera.name, stamps_ns, images), _notes(where, images)
+    images, rare = without_rare_tags(target, images)
+    seen = sum(bool(i.kept.any()) for i in images)
+    if not seen:
+        what = f"{where}: {_called(target)} in none of {len(images)} images of {camera.name}; "
+        raise RecordingError(what + _seen_instead(recording, topic, target))
+    if wrong := _other_border(recording, topic, target, images):
+        raise RecordingError(f"{where}: hardly anything is seen of {wrong}")
+    notes = tuple(f"{where}: {note}" for note in (*sightings(target, images), *rare))
+    return corner_stream(camera.name, stamps_ns, images), notes
+
+
+def _called(target: Target) -> str:
+    return f"{' and '.join(target.names)} are" if isinstance(target, Scene) else "the target is"
 
 
 def _seen_instead(recording: Recording, topic: str, target: Target) -> str:
     """What to do about a target that is never found: by what the images show instead, where it has tags."""
-    if isinstance(target, AprilGrid):
-        family, border, ids = "tag36h11", target.border_bits, range(target.rows * target.cols)
-    elif isinstance(target, Charuco):
-        family, border, ids = target.dictionary, 1, range(target.squares_x * target.squares_y // 2)
-    else:
+    tags = next((part.tags for _, part, _ in parts_of(target) if part.tags), None)
+    if tags is None:
         return "check the target's type and sizes, and that the camera saw it."
+    return what_is_seen(_spread(recording, topic), tags.family, tags.border_bits, tags.ids)
+
+
+def _other_border(recording: Recording, topic: str, target: Target, images: list[ImageCorners]) -> str:
+    """Where a part of the target is poorly seen, but in the images with the other width of border: what, and what to
+    do."""
+    for name, part, first in parts_of(target):
+        if not part.tags or isinstance(part, Charuco):
+            continue
+        usual = POOR_CORNERS if isinstance(part, Markers) else POOR_SHARE * len(part.points)
+        own = [i.kept & (i.point >= first) & (i.point < first + len(part.points)) for i in images]
+        if not sum(int(o.sum()) for o in own) < usual * len(images):
+            continue
+        others = [other.tags for _, other, _ in parts_of(target) if other.tags]
+        if sentence := with_other_border(_spread(recording, topic), part.tags, others):
+            return f"{name or 'the target'}: {sentence}"
+    return ""
+
+
+def _spread(recording: Recording, topic: str) -> Iterator[np.ndarray]:
+    """A few images, spread over the recording."""
     every = max(_count(recording, topic) // DIAGNOSED, 1)
-    images = (frame.image for frame in islice(recording.images(topic), 0, None, every))
-    return what_is_seen(images, family, border, ids)
+    for payload in islice(recording.payloads(topic), 0, None, every):
+        with suppress(DamagedImageError):
+            yield decode(payload)
 
 
 def _count(recording: Recording, topic: str) -> int:
@@ -145,13 +174,3 @@ def _one_thread_in_opencv() -> Iterator[None]:
         yield
     finally:
         cv2.setNumThreads(before)
-
-
-def _notes(where: str, images: list[ImageCorners]) -> tuple[str, ...]:
-    """How many images have the target, and how many corners were dropped, for which reasons."""
-    seen = sum(bool(i.kept.any()) for i in images)
-    kept = sum(int(i.kept.sum()) for i in images)
-    dropped = {name: sum(i.counts()[name] for i in images) for k, name in enumerate(VERDICTS) if k != KEPT}
-    reasons = ", ".join(f"{n} {name}" for name, n in dropped.items() if n)
-    tail = f"; corners left out: {reasons}" if reasons else ""
-    return (f"{where}: the target is in {seen} of {len(images)} images, {kept} corners{tail}.",)

@@ -10,7 +10,7 @@ from numba import njit
 from icalib.detection.decoding import cell_greys, dark_in_ring, levels, lookup, read_cells, unit_homography
 from icalib.detection.edges import fit_quad
 from icalib.detection.families import Family
-from icalib.detection.quads import dark_quads
+from icalib.detection.quads import View
 
 LEAST_CONTRAST = 16.0  # grey levels between black and white of a tag
 _LEAST_RISE = 4.0  # grey levels over 2 px at an edge
@@ -30,14 +30,13 @@ class Tags:
     contrast: np.ndarray
 
 
-def find_tags(image: np.ndarray, family: Family, border_bits: int, window: int, separate: bool) -> Tags:
-    """All tags of `family` with a black border of `border_bits` cells in the image (h, w) uint8.
+def find_tags(view: View, family: Family, border_bits: int, window: int, separate: bool) -> Tags:
+    """All tags of `family` with a black border of `border_bits` cells.
 
     An id may appear more than once, and a tag that was found as two quads appears once. `window` and `separate` are
     those of `dark_quads`.
     """
-    quads = dark_quads(image, window, separate)
-    return tags_at(image, quads, family, border_bits)
+    return tags_at(view.image, view.quads(window, separate), family, border_bits)
 
 
 def tags_at(image: np.ndarray, quads: np.ndarray, family: Family, border_bits: int) -> Tags:

@@ -244,11 +244,15 @@ def is_seen(inputs: Inputs, times: np.ndarray, nodes: np.ndarray) -> np.ndarray:
 
 def _with_bloom(factor: CornerFactor, camera: Camera, state: State, rig: Rig) -> CornerFactor:
     """The factor with the directions in which its corners bloom, frozen at `state`."""
-    X, R_cb = factor.points_in_camera(state)
-    inwards = (rig.target.tag_centers - rig.target.points)[factor.stream.point]
-    towards = np.einsum("nij,nj->ni", R_cb[factor.views.of_corner], inwards)
+    inwards = rig.target.tag_centers - rig.target.points
     params = np.concatenate([state.values[camera.name, "intrinsics"], state.values[camera.name, "distortion"]])
-    return factor.with_direction(bloom_direction(factor.model, params, X, towards))
+    direction = np.empty_like(factor.stream.uv)
+    for v0, v1 in factor.blocks():
+        own, (X, R_cb) = factor.corners_of(v0, v1), factor.points_in_camera(state, v0, v1)
+        view = factor.views.of_corner[own] - v0
+        towards = np.einsum("nij,nj->ni", R_cb[view], inwards[factor.stream.point[own]])
+        direction[own] = bloom_direction(factor.model, params, X, towards)
+    return factor.with_direction(direction)
 
 
 def start_values(inputs: Inputs, guess_values: dict[Key, np.ndarray]) -> dict[Key, np.ndarray]:

@@ -41,6 +41,7 @@ from icalib.geometry.targets.base import BOARD
 from icalib.measurements import CornerStream
 from icalib.rig import Scheme
 
+BLOCK = 256  # images at a time, where nothing is summed
 CHUNK = 64  # views at a time: what a chunk needs stays in the cache
 LOSSES = {"none": 0, "huber": 1, "cauchy": 2}
 
@@ -83,6 +84,10 @@ class Views:
     @classmethod
     def of(cls, stream: CornerStream, body: np.ndarray) -> Views:
         """Of a stream whose corners stand body by body in each image; body (n_points,) of each point."""
+        if not body.any():
+            seen = np.flatnonzero(np.diff(stream.start))
+            start = np.append(stream.start[seen], stream.start[-1])
+            return cls(start, seen, np.zeros(len(seen), dtype=np.int64))
         own, image = body[stream.point], stream.image
         fresh = np.ones(len(own), dtype=bool)
         fresh[1:] = (np.diff(image) != 0) | (np.diff(own) != 0)
@@ -92,7 +97,7 @@ class Views:
     @cached_property
     def of_corner(self) -> np.ndarray:
         """(N,) the view that each corner belongs to."""
-        return np.repeat(np.arange(len(self.image)), np.diff(self.start))
+        return np.repeat(np.arange(len(self.image), dtype=np.int32), np.diff(self.start))
 
 
 @dataclass(frozen=True)
@@ -151,16 +156,30 @@ class CornerFactor:
         R_cw = np.ascontiguousarray((poses.rotation @ R_ic).transpose(0, 2, 1))
         return poses, R_cw, poses.position + poses.rotation @ p_ic
 
-    def points_in_camera(self, state: State) -> tuple[np.ndarray, np.ndarray]:
-        """X (N, 3), each corner's point in its camera's frame, and R_cam_body (V, 3, 3) of each view."""
-        _, R_cw, p_wc = self.camera_poses(state)
-        views, R_sb = self.views, self.bodies.poses(state.values)[0]
-        R_cw, p_wc = R_cw[views.image], p_wc[views.image]
-        X, R_cb, start = np.empty((len(self.stream.uv), 3)), np.empty_like(R_cw), views.start
-        for a, b, scene in self.parts(0, len(views.image)):
-            world = self.world_points(state, scene)
-            camera_points(a, b, start, self.stream.point, R_cw, p_wc, world, X[start[a] : start[b]])
-            R_cb[a:b] = R_cw[a:b] @ state.values[scene, "tilt"] @ R_sb[views.body[a:b]]
+    def blocks(self) -> Iterator[tuple[int, int]]:
+        """Views v0..v1, whole images, a few at a time: what all corners need at once fills the memory."""
+        image, n = self.views.image, len(self.node)
+        for first in range(0, n, BLOCK):
+            v0, v1 = np.searchsorted(image, [first, min(first + BLOCK, n)])
+            if v0 < v1:
+                yield int(v0), int(v1)
+
+    def corners_of(self, v0: int, v1: int) -> slice:
+        """The corners of views v0..v1."""
+        return slice(int(self.views.start[v0]), int(self.views.start[v1]))
+
+    def points_in_camera(self, state: State, v0: int, v1: int) -> tuple[np.ndarray, np.ndarray]:
+        """Of views v0..v1: X (n, 3), each corner's point in its camera's frame, and R_cam_body (v1 - v0, 3, 3)."""
+        image, body, start = self.views.image[v0:v1], self.views.body[v0:v1], self.views.start[v0 : v1 + 1]
+        i0 = int(image[0])
+        _, R_cw, p_wc = self.camera_poses(state, i0, int(image[-1]) + 1)
+        R_cw, p_wc, R_sb = R_cw[image - i0], p_wc[image - i0], self.bodies.poses(state.values)[0]
+        X, R_cb = np.empty((start[-1] - start[0], 3)), np.empty_like(R_cw)
+        for first, end, scene in self.parts(v0, v1):
+            a, b = first - v0, end - v0
+            world, own = self.world_points(state, scene), X[start[a] - start[0] : start[b] - start[0]]
+            camera_points(a, b, start, self.stream.point, R_cw, p_wc, world, own)
+            R_cb[a:b] = R_cw[a:b] @ state.values[scene, "tilt"] @ R_sb[body[a:b]]
         return X, R_cb
 
     def output(self) -> CornerOutput:

@@ -42,10 +42,12 @@ class NoiseModel:
         """What the corner factor needs; speed (M,) px/s of each image."""
         blur = 0.0 if speed is None else self.exposure * speed
         sigma = np.hypot(self.base, np.broadcast_to(blur, stream.stamps_ns.shape))
-        half = 0.5 * np.array(camera.resolution)
-        x, y = ((stream.uv - half) / half[0]).T
-        field = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)[:, : len(self.tau)]
-        return CornerNoise(sigma, np.array(self.tau), np.ascontiguousarray(field), settings.loss, settings.loss_scale)
+        field = np.ones((len(stream.uv), len(self.tau)))
+        if len(self.tau) > 1:
+            half = 0.5 * np.array(camera.resolution)
+            x, y = ((stream.uv - half) / half[0]).T
+            field[:] = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)[:, : len(self.tau)]
+        return CornerNoise(sigma, np.array(self.tau), field, settings.loss, settings.loss_scale)
 
 
 def first_noise(camera: Camera) -> NoiseModel:
@@ -55,16 +57,24 @@ def first_noise(camera: Camera) -> NoiseModel:
 
 def image_speed(factor: CornerFactor, state: State) -> np.ndarray:
     """(M,) px/s, RMS over the corners of each image."""
-    X, _ = factor.points_in_camera(state)
-    poses, _, _ = factor.camera_poses(state)
+    square = np.empty(len(factor.stream.uv))
+    for v0, v1 in factor.blocks():
+        square[factor.corners_of(v0, v1)] = _squared_flow(factor, state, v0, v1)
+    return np.sqrt(image_mean(factor.stream, square, factor.keep))
+
+
+def _squared_flow(factor: CornerFactor, state: State, v0: int, v1: int) -> np.ndarray:
+    """(n,) squared speed in the image of the corners of views v0..v1."""
+    X, _ = factor.points_in_camera(state, v0, v1)
+    image = factor.views.image[v0:v1]
+    poses, _, _ = factor.camera_poses(state, int(image[0]), int(image[-1]) + 1)
     R_ic, p_ic = state.values[factor.name, "rotation"], state.values[factor.name, "translation"]
     rate = poses.rate @ R_ic
     velocity = (np.einsum("nji,nj->ni", poses.rotation, poses.velocity) + np.cross(poses.rate, p_ic)) @ R_ic
-    image = factor.stream.image
+    of_corner = np.repeat(image - image[0], np.diff(factor.views.start[v0 : v1 + 1]))
     params = np.concatenate([state.values[factor.name, "intrinsics"], state.values[factor.name, "distortion"]])
     _, _, J, _ = factor.model.project_with_jacobians(params, X)
-    flow = np.einsum("nij,nj->ni", J, -np.cross(rate[image], X) - velocity[image])
-    return np.sqrt(image_mean(factor.stream, (flow**2).sum(axis=1), factor.keep))
+    return (np.einsum("nij,nj->ni", J, -np.cross(rate[of_corner], X) - velocity[of_corner]) ** 2).sum(axis=1)
 
 
 def image_mean(stream: CornerStream, x: np.ndarray, keep: np.ndarray) -> np.ndarray:

@@ -83,6 +83,7 @@ def _probe(problem: Problem, outcome: Outcome, rng: np.random.Generator) -> dict
     noise, pieces, scratch = problem.white_noise(rng), problem.pieces(), problem.residuals()
     in_parallel(lambda piece: problem.add_noise(state, piece, noise, scratch), pieces)
     solution = solve(pieces, problem.n_nodes, problem.tolerance, held=problem.held)
+    del pieces
     # The sums hold J^T e where a solve expects J^T r: the step is -x.
     up, down = (
         _residuals_at(problem, state, -s * solution.chain, -s * solution.border) for s in (PROBE_STEP, -PROBE_STEP)

@@ -11,10 +11,11 @@ from numba import njit
 from icalib.estimation.arrowhead import Piece, in_parallel
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.integration import integrate
+from icalib.estimation.interval_sums import add_interval
 from icalib.estimation.prior_factor import accumulate_bias_prior
 from icalib.estimation.state import State
 from icalib.geometry import so3
-from icalib.geometry.small import mul3, tmul3
+from icalib.geometry.small import inverse_cholesky, mul3, tmul3
 
 ROWS = 15  # rotation, velocity, position, gyro bias, accelerometer bias
 
@@ -28,27 +29,7 @@ def _preintegrate(k0, k1, nodes, first, t, gyro, accel, bias, intrinsics, varian
             nodes[k], nodes[k + 1], first[k], t, gyro, accel, bias[k], intrinsics, variance, walk, linear,
             dR[k], dv[k], dp[k], J[k], P,
         )  # fmt: skip
-        _inverse_cholesky(P, W[k])
-
-
-@njit(cache=True, nogil=True)
-def _inverse_cholesky(P, W):
-    """W = L^-1 with P = L L^T, so that W r is white."""
-    n = P.shape[0]
-    for j in range(n):
-        for i in range(j, n):
-            s = P[i, j]
-            for k in range(j):
-                s -= P[i, k] * P[j, k]
-            P[i, j] = np.sqrt(s) if i == j else s / P[j, j]
-    W[:] = 0.0
-    for j in range(n):
-        W[j, j] = 1.0 / P[j, j]
-        for i in range(j + 1, n):
-            s = 0.0
-            for k in range(j, i):
-                s -= P[i, k] * W[k, j]
-            W[i, j] = s / P[i, i]
+        inverse_cholesky(P, W[k])
 
 
 class Chain(NamedTuple):
@@ -165,17 +146,6 @@ def _whiten(W, M, out):
 
 
 @njit(cache=True, nogil=True)
-def _add_gram(A, B, out):
-    """out += A^T B."""
-    for k in range(A.shape[0]):
-        for i in range(A.shape[1]):
-            f = A[k, i]
-            if f != 0.0:
-                for j in range(B.shape[1]):
-                    out[i, j] += f * B[k, j]
-
-
-@njit(cache=True, nogil=True)
 def _accumulate(k1, chain, made, dx, columns, noise, given, sums, out):
     """Adds intervals from `sums.first` to k1 to the normal equations; whitened residuals into out (K - 1, 15).
 
@@ -208,44 +178,8 @@ def _accumulate(k1, chain, made, dx, columns, noise, given, sums, out):
         if wanted:
             _whiten(made.W[k], J0, A0)
             _whiten(made.W[k], J1, A1)
-            _add_interval(k - sums.first, A0, A1, Ac, columns, sums)
+            add_interval(k - sums.first, A0, A1, Ac, columns, sums)
     return cost
-
-
-@njit(cache=True, nogil=True)
-def _add_interval(i, A0, A1, Ac, columns, sums):
-    """Whitened Jacobians of one interval into the sums of nodes i and i + 1 of the piece."""
-    n_b = sums.side.shape[2] - 1
-    _add_gram(A0, A0, sums.diagonal[i])
-    _add_gram(A0, A1, sums.upper[i])
-    _add_gram(A1, A1, sums.diagonal[i + 1])
-    _scatter(A0, Ac, columns, n_b, sums.side[i])
-    _scatter(A1, Ac, columns, n_b, sums.side[i + 1])
-    if len(columns):
-        _scatter_border(Ac, columns, n_b, sums.border)
-
-
-@njit(cache=True, nogil=True)
-def _scatter(A, Ac, cols, n_b, side):
-    """side[:, cols] += A^T Ac, its last column (the gradient) into column n_b."""
-    for k in range(A.shape[0]):
-        for i in range(A.shape[1]):
-            f = A[k, i]
-            if f != 0.0:
-                for j in range(len(cols)):
-                    side[i, cols[j]] += f * Ac[k, j]
-                side[i, n_b] += f * Ac[k, len(cols)]
-
-
-@njit(cache=True, nogil=True)
-def _scatter_border(Ac, cols, n_b, border):
-    for k in range(Ac.shape[0]):
-        for i in range(len(cols)):
-            f = Ac[k, i]
-            for j in range(len(cols)):
-                border[cols[i], cols[j]] += f * Ac[k, j]
-            border[cols[i], n_b] += f * Ac[k, len(cols)]
-            border[n_b, cols[i]] += f * Ac[k, len(cols)]
 
 
 @dataclass(frozen=True)

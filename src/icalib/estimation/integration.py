@@ -140,7 +140,9 @@ def step(rate, force, dt, dw_db, df_db, R, v, p, J, extra_w, extra_f, P, P_t, va
         _add_product(bias_step, by_rate, dw_db, 9)
         _add_product(bias_step, by_force, df_db, 9)
         _propagate_rows(E, A, B, dt, J)
-        _add_product(J[:, :6], np.eye(9), bias_step, 9)
+        for i in range(9):
+            for j in range(6):
+                J[i, j] += bias_step[i, j]
         if J.shape[1] > 6:
             _add_product(J[:, 6:], by_rate, extra_w, 9)
             _add_product(J[:, 6:], by_force, extra_f, 9)

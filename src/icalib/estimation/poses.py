@@ -10,6 +10,7 @@ A measurement keeps its node (`Assignment`) while the solver runs; only the time
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -40,6 +41,22 @@ class Poses:
     by_imu: np.ndarray
 
 
+class Velocities(NamedTuple):
+    """How the velocity in `Poses` (world, m/s) moves in the `inertial` scheme.
+
+    acceleration (n, 3) world m/s^2, its time derivative; by_node (n, 3, 15), by_imu (n, 3, 24 or 0): with respect to
+    the node and the IMU intrinsics. All of length 0 where not wanted.
+    """
+
+    acceleration: np.ndarray
+    by_node: np.ndarray
+    by_imu: np.ndarray
+
+    @classmethod
+    def empty(cls, n: int, n_imu: int) -> Velocities:
+        return cls(np.empty((n, 3)), np.zeros((n, 3, NODE)), np.zeros((n, 3, n_imu)))
+
+
 def assign_nodes(scheme: Scheme, nodes: np.ndarray, times: np.ndarray) -> np.ndarray:
     """(n,) node of each time: the nearest one, or for `pose` the one before it."""
     after = np.clip(np.searchsorted(nodes, times, side="right"), 1, len(nodes) - 1)
@@ -49,8 +66,27 @@ def assign_nodes(scheme: Scheme, nodes: np.ndarray, times: np.ndarray) -> np.nda
 
 
 @njit(cache=True, nogil=True)
+def _velocity(i, R0, R1, g, dv, force, J, moving):
+    """Fills entry i of `moving`: dv, J of the increments from the node (R0), force at the instant (R1)."""
+    turn = so3.hat(dv)
+    for a in range(3):
+        moving.acceleration[i, a] = R1[a, 0] * force[0] + R1[a, 1] * force[1] + R1[a, 2] * force[2]
+        moving.by_node[i, a, 6 + a] = 1.0
+        for c in range(3):
+            moving.by_node[i, a, c] = -(R0[a, 0] * turn[0, c] + R0[a, 1] * turn[1, c] + R0[a, 2] * turn[2, c])
+        for c in range(J.shape[1]):
+            s = R0[a, 0] * J[3, c] + R0[a, 1] * J[4, c] + R0[a, 2] * J[5, c]
+            if c < 6:
+                moving.by_node[i, a, 9 + c] = s
+            else:
+                moving.by_imu[i, a, c - 6] = s
+    moving.acceleration[i, 2] -= g
+
+
+@njit(cache=True, nogil=True)
 def _inertial(
-    times, node, first, nodes, R, p, v, b, g, linear, t, gyro, accel, intrinsics, out_R, out_p, rate, vel, Jn, Jx
+    times, node, first, nodes, R, p, v, b, g, linear, t, gyro, accel, intrinsics, out_R, out_p, rate, vel, Jn, Jx,
+    moving,
 ):  # fmt: skip
     variance, walk = np.zeros((len(t), 3)), np.zeros(2)
     width = 6 + Jx.shape[2]
@@ -59,7 +95,7 @@ def _inertial(
     for i in range(len(times)):
         k = node[i]
         dt = times[i] - nodes[k]
-        w, _ = integrate(
+        w, f = integrate(
             nodes[k], times[i], first[i], t, gyro, accel, b[k], intrinsics, variance, walk, linear, dR, dv, dp, J, P
         )  # fmt: skip
         rate[i] = w
@@ -95,6 +131,8 @@ def _inertial(
                 else:
                     Jx[i, a, c - 6] = J[a, c]
                     Jx[i, 3 + a, c - 6] = s
+        if len(moving.acceleration):
+            _velocity(i, R[k], out_R[i], g, dv, f, J, moving)
 
 
 @njit(cache=True, nogil=True)
@@ -170,26 +208,50 @@ def poses_at(
     scheme: Scheme, times: np.ndarray, node: np.ndarray, state: State, imu: ImuData, gravity: float, imu_free: bool
 ) -> Poses:
     """IMU poses at `times` (n,) seconds on the imu clock, each from its `node` (see `assign_nodes`)."""
+    if scheme == "inertial":
+        return _inertial_poses(times, node, state, imu, gravity, imu_free, Velocities.empty(0, 0))
     n = len(times)
     out = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
     by_node, by_imu = np.zeros((n, 6, NODE)), np.zeros((n, 6, N_INTRINSICS if imu_free else 0))
     by_next = np.zeros((n if scheme == "pose" else 0, 6, NODE))
-    intrinsics = state.values[imu.name, "intrinsics"]
-    raw = imu.seconds, imu.gyro, imu.accel, intrinsics
     if scheme == "pose":
         _between(times, node, state.seconds, state.rotation, state.position, *out, by_node, by_next)
     else:
-        # Integration backwards starts in the interval that ends at the node, if the node lies on a stamp.
-        first = imu.interval(state.seconds[node])
-        if scheme == "inertial":
-            on_stamp = (times < state.seconds[node]) & (imu.seconds[first] == state.seconds[node]) & (first > 0)
-            _inertial(
-                times, node, first - on_stamp, state.seconds, state.rotation, state.position, state.velocity,
-                state.bias, gravity, True, *raw, *out, by_node, by_imu,
-            )  # fmt: skip
-        else:
-            _kinematic(
-                times, node, first, state.seconds, state.rotation, state.position, state.velocity, state.bias,
-                *raw, *out, by_node, by_imu,
-            )  # fmt: skip
+        _kinematic(
+            times, node, imu.interval(state.seconds[node]), state.seconds, state.rotation, state.position,
+            state.velocity, state.bias, imu.seconds, imu.gyro, imu.accel, state.values[imu.name, "intrinsics"],
+            *out, by_node, by_imu,
+        )  # fmt: skip
     return Poses(*out, by_node, by_next, by_imu)
+
+
+def motion_at(
+    times: np.ndarray, node: np.ndarray, state: State, imu: ImuData, gravity: float, imu_free: bool
+) -> tuple[Poses, Velocities]:
+    """The `inertial` poses of `poses_at`, and how their velocities move."""
+    moving = Velocities.empty(len(times), N_INTRINSICS if imu_free else 0)
+    return _inertial_poses(times, node, state, imu, gravity, imu_free, moving), moving
+
+
+def _inertial_poses(
+    times: np.ndarray,
+    node: np.ndarray,
+    state: State,
+    imu: ImuData,
+    gravity: float,
+    imu_free: bool,
+    moving: Velocities,
+) -> Poses:
+    """The `inertial` poses; fills `moving` where it is not empty."""
+    n = len(times)
+    out = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
+    by_node, by_imu = np.zeros((n, 6, NODE)), np.zeros((n, 6, N_INTRINSICS if imu_free else 0))
+    # Integration backwards starts in the interval that ends at the node, if the node lies on a stamp.
+    first = imu.interval(state.seconds[node])
+    on_stamp = (times < state.seconds[node]) & (imu.seconds[first] == state.seconds[node]) & (first > 0)
+    _inertial(
+        times, node, first - on_stamp, state.seconds, state.rotation, state.position, state.velocity, state.bias,
+        gravity, True, imu.seconds, imu.gyro, imu.accel, state.values[imu.name, "intrinsics"], *out, by_node, by_imu,
+        moving,
+    )  # fmt: skip
+    return Poses(*out, by_node, np.zeros((0, 6, NODE)), by_imu)

@@ -108,7 +108,8 @@ class Problem:
         return sum(in_parallel(lambda p: self._accumulate(state, p, out, sums, curved), pieces))
 
     def _accumulate(self, state: State, piece: Piece, out: Residuals, sums: bool, curved: bool) -> float:
-        piece.clear()
+        if sums:
+            piece.clear()
         cost = self.add_measurements(state, piece, out, sums, curved) + self.add_bias_prior(state, piece, sums)
         if piece.first == 0:
             cost += sum(p.accumulate(state, piece, sums) for p in self.priors)

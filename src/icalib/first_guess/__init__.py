@@ -58,9 +58,9 @@ def initial_guess(rig: Rig, measurements: Measurements, scene: Placed | None = N
         for c, s, q, a in zip(rig.cameras, measurements.cameras, poses, aligned, strict=True)
     ]
     gravity = arms[best].gravity
-    check_gravity(float(np.linalg.norm(gravity)), rig.gravity, imu.name)
-    for c, m in zip(rig.cameras, arms, strict=True):
-        check_size(m, c.name)
+    check_gravity(float(np.linalg.norm(gravity)), rig.gravity, imu.name, aligned[best].given)
+    for c, m, a in zip(rig.cameras, arms, aligned, strict=True):
+        check_size(m, c.name, a.given)
     cameras = {
         c.name: _camera_guess(c, s, p, a, m, q, measurements)
         for c, s, p, a, m, q in zip(rig.cameras, measurements.cameras, params, aligned, arms, poses, strict=True)

@@ -12,6 +12,7 @@ from icalib.first_guess.clocks import (
     as_given,
     camera_rates,
     check_axes,
+    contradicts,
     turns_about_two_axes,
 )
 from icalib.first_guess.guess import relative_offset
@@ -45,5 +46,7 @@ def align_camera(
             check_axes(rates, camera.name)
         else:
             found = as_given(imu, camera.name, rates, at, rotation)
+            if contradicts(imu, rates, found):
+                raise
     keep_guess = trusted(camera.rotation) is None and turns_about_two_axes(rates)
     return found if rotation is None or keep_guess else as_given(imu, camera.name, rates, found.offset, rotation)

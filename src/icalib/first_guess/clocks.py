@@ -8,6 +8,7 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation.imu_data import ImuData
+from icalib.first_guess.correlation import best_shift
 from icalib.first_guess.target_poses import TargetPoses
 from icalib.geometry import so3
 from icalib.measurements import CornerStream
@@ -43,6 +44,7 @@ class Alignment:
     offset: float
     rotation: np.ndarray
     gyro_bias: np.ndarray
+    given: bool = False  # offset and rotation are the rig file's, and as good as these
 
 
 def camera_rates(stream: CornerStream, poses: TargetPoses) -> CameraRates:
@@ -122,9 +124,14 @@ def better_offset(imu: ImuData, name: str, rates: CameraRates, expected: float) 
     return own.offset if _unexplained(imu, rates, own) < CLEARLY_BETTER * there else None
 
 
-def _check_motion(imu: ImuData, name: str, rates: CameraRates) -> None:
+def _motion(imu: ImuData, rates: CameraRates) -> tuple[float, float]:
+    """RMS rate of the IMU about its median, and the median rate of the camera, rad/s."""
     spread = np.sqrt(((imu.gyro - np.median(imu.gyro, axis=0)) ** 2).sum(axis=1).mean())
-    seen = np.sqrt(np.median((rates.rate**2).sum(axis=1)))
+    return float(spread), float(np.sqrt(np.median((rates.rate**2).sum(axis=1))))
+
+
+def _check_motion(imu: ImuData, name: str, rates: CameraRates) -> None:
+    spread, seen = _motion(imu, rates)
     if spread < STILL_RAD_S and seen < 3.0 * STILL_RAD_S:
         raise EstimationError(
             f"the recording is motionless ({imu.name} turns at {spread:.4f} rad/s RMS, {name} at {seen:.4f}); "
@@ -152,34 +159,14 @@ def _correlate(imu: ImuData, name: str, rates: CameraRates) -> float:
     middle = 0.5 * (rates.start + rates.end)
     near = np.diff(middle, append=middle[-1]) < LONGEST_STEP_S
     b, mask_b = _grid(middle, np.linalg.norm(rates.rate, axis=1), near, middle[-1])
-    n = len(a) + len(b) - 1
-    size = 1 << (n - 1).bit_length()
-
-    def correlate(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """sum_t x(t + lag) y(t), lag from -(len(y) - 1) to len(x) - 1."""
-        product = np.fft.irfft(np.fft.rfft(x, size) * np.conj(np.fft.rfft(y, size)), size)
-        return np.concatenate([product[-(len(b) - 1) :], product[: len(a)]]) if len(b) > 1 else product[: len(a)]
-
-    ma, mb = mask_a.astype(float), mask_b.astype(float)
-    count = np.maximum(correlate(ma, mb), 1e-9)
-    sa, sb = correlate(a * ma, mb), correlate(ma, b * mb)
-    saa, sbb = correlate(a * a * ma, mb), correlate(ma, b * b * mb)
-    covariance = correlate(a * ma, b * mb) - sa * sb / count
-    variance = np.maximum(saa - sa**2 / count, 0.0) * np.maximum(sbb - sb**2 / count, 0.0)
-    whole = min(mask_a.sum(), mask_b.sum())
-    enough = count > min(SHORTEST_OVERLAP_S * GRID_HZ, 0.5 * whole)
-    # Against the shift's own overlap and a share of the whole, so that a short overlap of little motion cannot win.
-    floor = 1e-3 * (a[mask_a].var() * b[mask_b].var()) * count**2
-    r = np.where(enough, covariance / np.sqrt(variance + floor), 0.0)
-    score = np.arctanh(np.clip(r, 0.0, 0.999999)) * np.sqrt(count)
-    k = int(np.argmax(score))
-    if not r[k] > LEAST_CORRELATION:
+    found = best_shift(a, mask_a, b, mask_b, SHORTEST_OVERLAP_S * GRID_HZ)
+    if not found.correlation > LEAST_CORRELATION:
         raise EstimationError(
             f"the motion of {name} does not match that of {imu.name} at any shift of their clocks (best correlation "
-            f"{max(float(r.max()), 0.0):.2f}); check that both come from the same recording, overlap in time, "
+            f"{max(found.largest, 0.0):.2f}); check that both come from the same recording, overlap in time, "
             f"and are in rad/s."
         )
-    return (k - (len(b) - 1)) / GRID_HZ
+    return found.samples / GRID_HZ
 
 
 def _kabsch(w_imu: np.ndarray, w_cam: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -245,7 +232,15 @@ def as_given(imu: ImuData, name: str, rates: CameraRates, offset: float, rotatio
         raise _no_overlap(imu, name)
     middle = (0.5 * (rates.start + rates.end) + offset)[inside]
     gyro = np.stack([np.interp(middle, imu.seconds, imu.gyro[:, k]) for k in range(3)], axis=1)
-    return Alignment(offset, rotation, np.median(gyro - rates.rate[inside] @ rotation.T, axis=0))
+    return Alignment(offset, rotation, np.median(gyro - rates.rate[inside] @ rotation.T, axis=0), given=True)
+
+
+def contradicts(imu: ImuData, rates: CameraRates, given: Alignment) -> bool:
+    """Whether the two turn, but not alike, even allowing for what a guess is off."""
+    spread, seen = _motion(imu, rates)
+    return (spread >= STILL_RAD_S or seen >= 3.0 * STILL_RAD_S) and _unexplained(
+        imu, rates, given
+    ) > LARGEST_UNEXPLAINED
 
 
 def _no_overlap(imu: ImuData, name: str) -> EstimationError:

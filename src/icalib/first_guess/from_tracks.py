@@ -38,7 +38,8 @@ def guess_from_tracks(rig: Rig, measurements: Measurements) -> Guess:
     rays = _rays(rig, measurements, imu, params, [a.offset for a in aligned])
     arms = [trusted(c.translation) for c in rig.cameras]
     motion = track_motion(gyro, rays, [a.rotation for a in aligned], arms)
-    check_gravity(float(np.median(np.linalg.norm(motion.gravity, axis=1))), rig.gravity, imu.name)
+    measured = float(np.median(np.linalg.norm(motion.gravity, axis=1)))
+    check_gravity(measured, rig.gravity, imu.name, any(a.given for a in aligned))
     cameras = {}
     for k, (camera, stream, found) in enumerate(zip(rig.cameras, measurements.cameras, aligned, strict=True)):
         given = camera.time_offset.value

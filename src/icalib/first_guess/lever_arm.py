@@ -22,6 +22,7 @@ STEP_S = 0.12  # between the images of a triple: long against pose noise, short 
 BIAS_SIGMA = 0.3  # m/s^2
 ROW_SIGMA = 0.05  # m/s, of a row of the system
 G_TOLERANCE = 0.1
+GIVEN_TOLERANCE = 0.5  # of both, where a guess that may be degrees off goes into them
 SIZE_TOLERANCE = 0.15  # of the target, as the accelerometer shows it
 
 
@@ -131,18 +132,20 @@ def _double_integrals(
     return out[:, :3], out[:, 3:].reshape(-1, 3, 3)
 
 
-def check_size(arm: LeverArm, camera: str) -> None:
-    """Raises EstimationError where the accelerometer contradicts the size of the target."""
-    if abs(arm.size - 1.0) > max(SIZE_TOLERANCE, 5.0 * arm.size_std):
+def check_size(arm: LeverArm, camera: str, given: bool) -> None:
+    """Raises EstimationError where the accelerometer contradicts the size of the target. given: the camera's rotation
+    is a guess, whose error moves it, too."""
+    if abs(arm.size - 1.0) > max(GIVEN_TOLERANCE if given else SIZE_TOLERANCE, 5.0 * arm.size_std):
         raise EstimationError(
             f"{camera}: by the accelerometer the target is {arm.size:.2f} +- {arm.size_std:.2f} times the size that "
             "the rig file says; check its tag_size or square_size (in metres) and tag_spacing (gap over tag_size)."
         )
 
 
-def check_gravity(measured: float, expected: float, imu: str) -> None:
-    """Raises EstimationError where gravity as the IMU and the target's size show it is not `expected` m/s^2."""
-    if abs(measured / expected - 1.0) <= G_TOLERANCE:
+def check_gravity(measured: float, expected: float, imu: str, given: bool) -> None:
+    """Raises EstimationError where gravity as the IMU and the target's size show it is not `expected` m/s^2. given: see
+    `check_size`."""
+    if abs(measured / expected - 1.0) <= (GIVEN_TOLERANCE if given else G_TOLERANCE):
         return
     raise EstimationError(
         f"{imu} and the target together show gravity of {measured:.3g} m/s^2 instead of {expected:.3g}: check that the "

@@ -51,6 +51,26 @@ def cholesky(A):
 
 
 @njit(cache=True, nogil=True)
+def inverse_cholesky(P, W):
+    """W = L^-1 with P = L L^T (n, n), so that W r is white; overwrites P's lower triangle with L."""
+    n = P.shape[0]
+    for j in range(n):
+        for i in range(j, n):
+            s = P[i, j]
+            for k in range(j):
+                s -= P[i, k] * P[j, k]
+            P[i, j] = np.sqrt(s) if i == j else s / P[j, j]
+    W[:] = 0.0
+    for j in range(n):
+        W[j, j] = 1.0 / P[j, j]
+        for i in range(j + 1, n):
+            s = 0.0
+            for k in range(j, i):
+                s -= P[i, k] * W[k, j]
+            W[i, j] = s / P[i, i]
+
+
+@njit(cache=True, nogil=True)
 def solve_definite(A, b):
     """b (n,) <- A^-1 b, overwriting A with its Cholesky factor; False where A is not positive definite."""
     if not cholesky(A):

@@ -14,6 +14,7 @@ from typing import Any
 
 from icalib.errors import CalibrationError, RecordingError
 from icalib.geometry.cameras import CAMERA_MODELS
+from icalib.geometry.targets import Scene
 from icalib.imu_classes import DEFAULT_CLASS, IMU_CLASSES
 from icalib.inspection.facts import CameraSource, Inspection
 from icalib.inspection.inspect import resolution_of
@@ -33,6 +34,8 @@ target:
 # Other targets, in place of the lines above:
 #   target: {type: charuco, squares_x: , squares_y: , square_size: , marker_size: , dictionary: 5x5_100}
 #   target: {type: checkerboard, rows: , cols: , square_size: }  # rows and cols of INNER corners
+#   target: {type: markers, family: tag36h11, size: , ids: []}  # free tags, each stuck anywhere
+# Several at once: targets: {NAME: {type: ...}, NAME: {type: ...}}
 """
 
 
@@ -194,12 +197,16 @@ def _target(found: Inspection) -> str:
     if found.target is None:
         return _TEMPLATE
     target = found.target.target
-    fields = ", ".join(f"{k}: {_field(v)}" for k, v in ({"type": target.type} | dataclasses.asdict(target)).items())
-    return f"# The target is from {_comment(found.target.file)}; check its sizes with a ruler.\ntarget: {{{fields}}}\n"
+    if isinstance(target, Scene):
+        lines = ["targets:", *(f"  {name}: {_fields(fields)}" for name, fields in target.plain().items())]
+    else:
+        lines = [f"target: {_fields(target.plain())}"]
+    head = f"# The target is from {_comment(found.target.file)}; check its sizes with a ruler."
+    return "\n".join([head, *lines, ""])
 
 
-def _field(value: Any) -> str:
-    return _number(value) if isinstance(value, float) else str(value)
+def _fields(plain: dict[str, Any]) -> str:
+    return f"{{{', '.join(f'{k}: {_number(v) if isinstance(v, float) else v}' for k, v in plain.items())}}}"
 
 
 def _numbers(values: Iterable[float]) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from icalib.geometry.targets import Scene
 from icalib.inspection.facts import CameraSource, Inspection, StreamFacts
 from icalib.inspection.timing import overlap_s
 from icalib.inspection.views import GRID
@@ -65,7 +66,9 @@ def _overlap(found: Inspection, source: CameraSource) -> float | None:
 def _target(found: Inspection) -> dict[str, Any] | None:
     if found.target is None:
         return None
-    return {"type": found.target.target.type, **_plain(found.target.target), "file": found.target.file}
+    target = found.target.target
+    fields = {"type": target.type, "targets": target.plain()} if isinstance(target, Scene) else target.plain()
+    return fields | {"file": found.target.file}
 
 
 def _plain(value: Any) -> dict[str, Any]:

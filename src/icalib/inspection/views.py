@@ -15,7 +15,7 @@ from icalib.recordings import Recording
 from icalib.rig import Camera
 
 GRID = (8, 5)  # columns and rows of cells over the image
-_LEAST_CORNERS = 8  # for the pose of the target in one image
+_LEAST_CORNERS = 8  # for the pose of a board in one image; of a free tag, all four
 
 
 def target_view(
@@ -63,18 +63,21 @@ def coverage(uv: np.ndarray, resolution: tuple[int, int]) -> tuple[tuple[int, ..
 
 
 def _poses(corners: CornerStream, target: Target) -> tuple[tuple[float, float, float] | None, float | None]:
-    """Percentiles of the tilt [deg], and farthest over nearest, from how the target's plane is stretched in each image.
+    """Percentiles of the tilt [deg], and farthest over nearest, from how each body's plane is stretched in each image.
 
     Seen from far, a plane tilted by a keeps its scale f / distance along the axis of the tilt, and has cos(a) times it
     across.
     """
     scales: list[np.ndarray] = []
-    for a, b in zip(corners.start[:-1], corners.start[1:], strict=True):
-        if b - a < _LEAST_CORNERS:
+    body = target.body[corners.point]
+    order = np.lexsort((body, corners.image))
+    change = np.flatnonzero((np.diff(corners.image[order]) != 0) | (np.diff(body[order]) != 0)) + 1
+    for rows in np.split(order, change) if len(order) else []:
+        if len(rows) < (_LEAST_CORNERS if target.bends[body[rows[0]]] else 4):
             continue
-        xy = target.points[corners.point[a:b], :2]
+        xy = target.points[corners.point[rows], :2]
         design = np.column_stack([xy - xy.mean(axis=0), np.ones(len(xy))])
-        affine, _, rank, _ = np.linalg.lstsq(design, corners.uv[a:b], rcond=None)
+        affine, _, rank, _ = np.linalg.lstsq(design, corners.uv[rows], rcond=None)
         if rank == 3:
             scales.append(np.linalg.svd(affine[:2], compute_uv=False))
     if not scales:

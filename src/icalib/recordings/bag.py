@@ -11,11 +11,11 @@ from typing import Any, final
 import numpy as np
 
 from icalib.errors import RecordingError
+from icalib.extras import load_typesys, load_zstd
 from icalib.geometry.targets import Target
 from icalib.measurements import CornerStream, ImuStream, TrackStream
 from icalib.recordings.bags.opening import ZSTD_MAGIC, open_storages
 from icalib.recordings.bags.storage import Tally
-from icalib.recordings.extras import load_typesys, load_zstd
 from icalib.recordings.image_checks import checked_payloads, frames
 from icalib.recordings.images import Frame, Payload, file_payload
 from icalib.recordings.topics import KINDS, TopicInfo, choose_topic, find_topic

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from icalib.errors import RecordingError
-from icalib.recordings.extras import load_cv2
+from icalib.extras import load_cv2
 
 Convert = Callable[[np.ndarray, Any], np.ndarray]
 

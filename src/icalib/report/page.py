@@ -37,7 +37,7 @@ def report_html(calibration: Calibration) -> str:
         "notes": tables.sentences(c.notes, "", "None."),
         "fits": tables.fits(c),
         "parameters": tables.parameters(c),
-        "poses": tables.poses(c),
+        "poses": Html(tables.poses(c) + tables.bodies(c)),
         "corner_figures": _corner_sections(c),
         "facts": tables.facts(c),
         "figures": _script_json(figures),

@@ -8,7 +8,7 @@ from html import escape
 import numpy as np
 
 from icalib.calibration import Calibration, ParameterGroup, SensorFit
-from icalib.report.quantities import SHOWN_UNITS, rows, shown, shown_groups, worst
+from icalib.report.quantities import SHOWN_UNITS, rows, rpy_deg, shown, shown_groups, worst
 
 TRUST = {
     "good": "Yes. The solver converged, the motion determines every parameter, and nothing calls for attention.",
@@ -99,8 +99,28 @@ def _group_words(g: ParameterGroup) -> list[object]:
 
 def parameters(c: Calibration) -> Html:
     headers = ("sensor", "parameter", "value", "std", "unit", "formal std", "factor", "verdict")
-    body = [(r.sensor, r.name, r.value, r.std, r.unit, r.formal, r.factor, badge(r.verdict)) for r in rows(c)]
+    own = [r for r in rows(c) if r.sensor not in c.bodies]
+    body = [(r.sensor, r.name, r.value, r.std, r.unit, r.formal, r.factor, badge(r.verdict)) for r in own]
     return table(headers, body, ("value", "std", "formal std", "factor"))
+
+
+def bodies(c: Calibration) -> Html:
+    """Where the target's bodies stand; empty where there is one only."""
+    if not c.bodies:
+        return Html("")
+    sizes = ("x [mm]", "y [mm]", "z [mm]", "roll [deg]", "pitch [deg]", "yaw [deg]", "std [mm]", "std [deg]")
+    body = [(name, *_body_row(c, name)) for name in c.bodies]
+    title = element("h3", f"Target: bodies in the frame of {c.bodies[0]}, standard deviations the largest of three")
+    return Html(title + table(("body", *sizes, "verdict"), body, sizes))
+
+
+def _body_row(c: Calibration, body: str) -> list[object]:
+    turn, move = c.group(body, "rotation"), c.group(body, "translation")
+    values = [f"{1e3 * x:.2f}" for x in move.value] + [f"{x:.3f}" for x in rpy_deg(turn.value)]
+    if turn.columns is None:
+        return [*values, "", "", badge("fixed")]
+    std = [shown(1e3 * float(move.std.max())), shown(float(np.rad2deg(turn.std.max())))]
+    return [*values, *std, badge(worst((*turn.verdict, *move.verdict)))]
 
 
 def poses(c: Calibration) -> Html:

@@ -9,7 +9,9 @@ from icalib.simulation.robot import Drive, Features, SimLidar, SimWheels
 from icalib.simulation.room import Block, Hills, Room, hills_of_slope
 from icalib.simulation.scenario import ADIS16448, Motion, Scenario, SimCamera, handheld
 from icalib.simulation.scenario_file import load_scenario
+from icalib.simulation.sensor_bag import write_sensors
 from icalib.simulation.simulate import Simulation, Truth, simulate
+from icalib.simulation.tables import write_tables
 from icalib.simulation.tag_map import tag_map
 from icalib.simulation.tracks import TrackTruth
 from icalib.simulation.wheels import WheelTruth
@@ -51,4 +53,6 @@ __all__ = [
     "simulate",
     "tag_map",
     "write_film",
+    "write_sensors",
+    "write_tables",
 ]

@@ -6,12 +6,16 @@ from typing import Protocol
 
 import numpy as np
 
+from icalib.errors import RigError
+
 LEAD_S = 0.05  # sensors start and end this far inside the IMU's readings
 
 
 class Clocked(Protocol):
     """A simulated sensor with a clock of its own; see `SimCamera`."""
 
+    @property
+    def name(self) -> str: ...
     @property
     def time_offset_s(self) -> float: ...
     @property
@@ -24,9 +28,16 @@ class Clocked(Protocol):
 
 def stamped(sensor: Clocked, end_s: float) -> tuple[np.ndarray, np.ndarray]:
     """Stamps (M,) int64 ns on the sensor's clock up to end_s, and the instants (M,) [s] on the IMU's that these stamps
-    mean."""
+    mean. Raises RigError where there are fewer than two."""
     begin = LEAD_S + sensor.phase_s
     nominal = begin + np.arange(int((end_s - begin) * sensor.rate_hz + 1e-9) + 1) / sensor.rate_hz
+    check_enough(sensor.name, nominal)
     since_origin = np.round((nominal - sensor.time_offset_s) * 1e9).astype(np.int64)
     seconds = since_origin.astype(np.float64) * 1e-9 + sensor.time_offset_s
     return since_origin + np.int64(sensor.clock_origin_ns), seconds
+
+
+def check_enough(name: str, instants: np.ndarray) -> None:
+    """Raises RigError where a sensor has fewer than two instants at which it measures."""
+    if len(instants) < 2:
+        raise RigError(f"{name} measures less than twice in this time; make the scenario longer, or its rate higher.")

@@ -23,8 +23,7 @@ class _Sweep(NamedTuple):
 
     rotation: np.ndarray  # (A + 1, 3, 3) R_world_lidar
     position: np.ndarray  # (A + 1, 3)
-    azimuth: np.ndarray  # (A,) rad
-    elevation: np.ndarray  # (K,) rad
+    beam: np.ndarray  # (A, K, 3) unit directions in the LiDAR's frame
     firing: np.ndarray  # (K,) instants within a column, as a share of it
     noise: np.ndarray  # (A, K) m
     reach: tuple[float, float]  # m
@@ -72,12 +71,18 @@ def _sweep(lidar: SimLidar, trajectory: Trajectory, begin: float, noise: np.ndar
     return _Sweep(
         rotation @ lidar.T_imu_lidar[:3, :3],
         position + rotation @ lidar.T_imu_lidar[:3, 3],
-        2.0 * np.pi * np.arange(steps) / steps,
-        np.deg2rad(np.linspace(*lidar.elevation_deg, rings)),
+        _beams(lidar),
         firing,
         noise,
         lidar.range_m,
     )
+
+
+def _beams(lidar: SimLidar) -> np.ndarray:
+    azimuth = 2.0 * np.pi * np.arange(lidar.azimuth_steps)[:, None] / lidar.azimuth_steps
+    elevation = np.deg2rad(np.linspace(*lidar.elevation_deg, lidar.rings))
+    level, up = np.cos(elevation), np.sin(elevation)
+    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), up + 0.0 * azimuth], axis=2)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -87,14 +92,11 @@ def _shoot(surfaces: Surfaces, sweep: _Sweep, column_s: float, points: _Points) 
     Within a column, of some 0.1 ms, the pose runs straight: 5 m/s^2 and 2 rad/s bend it by 1e-8 m and rad.
     """
     count = 0
-    for a in range(len(sweep.azimuth)):
+    d, p = np.empty(3), np.empty(3)
+    for a in range(len(sweep.beam)):
         R0, R1, p0, p1 = sweep.rotation[a], sweep.rotation[a + 1], sweep.position[a], sweep.position[a + 1]
-        for k in range(len(sweep.elevation)):
-            s = sweep.firing[k]
-            level, z = np.cos(sweep.elevation[k]), np.sin(sweep.elevation[k])
-            x, y = level * np.cos(sweep.azimuth[a]), level * np.sin(sweep.azimuth[a])
-            d = np.empty(3)
-            p = np.empty(3)
+        for k in range(len(sweep.firing)):
+            s, x, y, z = sweep.firing[k], sweep.beam[a, k, 0], sweep.beam[a, k, 1], sweep.beam[a, k, 2]
             for i in range(3):
                 before = R0[i, 0] * x + R0[i, 1] * y + R0[i, 2] * z
                 after = R1[i, 0] * x + R1[i, 1] * y + R1[i, 2] * z
@@ -104,8 +106,10 @@ def _shoot(surfaces: Surfaces, sweep: _Sweep, column_s: float, points: _Points) 
             if not (sweep.reach[0] <= distance <= sweep.reach[1]):
                 continue
             measured = distance + sweep.noise[a, k]
-            points.xyz[count] = (np.float32(measured * x), np.float32(measured * y), np.float32(measured * z))
-            points.offset_s[count] = np.float32((a + s) * column_s)
+            points.xyz[count, 0] = measured * x
+            points.xyz[count, 1] = measured * y
+            points.xyz[count, 2] = measured * z
+            points.offset_s[count] = (a + s) * column_s
             points.plane[count] = face
             count += 1
     return count

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from numba import njit
 
 from icalib.errors import RigError
 
-_STEPS = 200  # of a ray's march over hills
+_STEPS = 1000  # of a ray's march over hills; one that grazes them for longer meets nothing
 _CLOSE_M = 1e-9  # to the ground, where the march ends
 
 
@@ -44,8 +45,10 @@ class Hills:
 
     @property
     def steepest(self) -> float:
-        """No slope is above this (a tangent)."""
-        return float((np.abs(self.amplitude) * np.linalg.norm(self.wave, axis=1)).sum())
+        """No slope is above this (a tangent): that of all waves together, at the worst of their phases."""
+        slopes = np.array(self.amplitude)[:, None] * np.array(self.wave)
+        signs = np.array(list(product((-1.0, 1.0), repeat=len(slopes))))
+        return float(np.linalg.norm(signs @ slopes, axis=1).max())
 
     def height(self, xy: np.ndarray) -> np.ndarray:
         """(N,) z at xy (N, 2)."""
@@ -53,20 +56,20 @@ class Hills:
 
 
 def hills_of_slope(slope_deg: float) -> Hills:
-    """Three waves of 6.3, 4.2 and 2.9 m in different directions, whose slopes add up to `slope_deg` at most."""
-    wave = np.array([[0.97, 0.24], [-0.45, 1.43], [1.6, -1.45]])
-    amplitude = np.array([0.5, 0.35, 0.15]) * np.tan(np.deg2rad(slope_deg)) / np.linalg.norm(wave, axis=1)
-    return Hills(tuple(amplitude.tolist()), ((0.97, 0.24), (-0.45, 1.43), (1.6, -1.45)), (0.3, 1.9, 4.0))
+    """Three waves of 6.3, 4.2 and 2.9 m in different directions, of which no slope is above `slope_deg`."""
+    waves, phases = ((0.97, 0.24), (-0.45, 1.43), (1.6, -1.45)), (0.3, 1.9, 4.0)
+    shares = np.array([0.5, 0.35, 0.15]) / np.linalg.norm(waves, axis=1)
+    scale = np.tan(np.deg2rad(slope_deg)) / Hills(tuple(shares), waves, phases).steepest
+    return Hills(tuple((scale * shares).tolist()), waves, phases)
 
 
 class Surfaces(NamedTuple):
     """What rays meet. Faces are parallelograms origin + s u + t v, 0 <= s, t <= 1, or triangles (s + t <= 1), seen
-    from the side that `normal` points to; s = s_of . q, t = t_of . q of q from the origin. The rest: see `Hills`."""
+    from the side that the normal points to. Of the hills: see `Hills`."""
 
-    origin: np.ndarray  # (F, 3)
-    normal: np.ndarray  # (F, 3)
-    s_of: np.ndarray  # (F, 3)
-    t_of: np.ndarray  # (F, 3)
+    plane: np.ndarray  # (F, 4) n, d: n . p = d
+    along: np.ndarray  # (F, 4) a, a0: s = a . p - a0
+    across: np.ndarray  # (F, 4) b, b0: t = b . p - b0
     triangle: np.ndarray  # (F,) bool
     amplitude: np.ndarray  # (W,), W = 0: no hills
     wave: np.ndarray  # (W, 2)
@@ -111,27 +114,23 @@ class Room:
     @property
     def planes(self) -> np.ndarray:
         """(F, 4): normal, into the open, and d [m] of each face; n . p = d on it."""
-        normal = _normals(self.faces)
-        return np.column_stack([normal, np.sum(normal * self.faces[:, 0], axis=1)])
+        return _with_offset(_normals(self.faces), self.faces[:, 0])
 
     @cached_property
     def surfaces(self) -> Surfaces:
-        origin, u, v, mark = np.moveaxis(self.faces, 1, 0).copy()
+        origin, u, v, mark = np.moveaxis(self.faces, 1, 0)
         normal = _normals(self.faces)
         area = np.sum(normal * np.cross(u, v), axis=1)[:, None]
         hills = self.hills or Hills((), (), ())
-        wave = np.array(hills.wave, dtype=np.float64).reshape(-1, 2)
-        steepest = hills.steepest if self.hills else 0.0
         return Surfaces(
-            origin,
-            normal,
-            np.cross(v, normal) / area,
-            np.cross(normal, u) / area,
+            self.planes,
+            _with_offset(np.cross(v, normal) / area, origin),
+            _with_offset(np.cross(normal, u) / area, origin),
             mark[:, 0] > 0.0,
             np.array(hills.amplitude, dtype=np.float64),
-            wave,
+            np.array(hills.wave, dtype=np.float64).reshape(-1, 2),
             np.array(hills.phase, dtype=np.float64),
-            steepest,
+            hills.steepest if self.hills else 0.0,
         )
 
     def points(self, count: int, rng: np.random.Generator) -> np.ndarray:
@@ -155,6 +154,11 @@ class Room:
 def _normals(faces: np.ndarray) -> np.ndarray:
     normal = np.cross(faces[:, 1], faces[:, 2])
     return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+
+def _with_offset(directions: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """(F, 4): each direction (F, 3) with its product with the origin (F, 3)."""
+    return np.column_stack([directions, np.sum(directions * origin, axis=1)])
 
 
 Face = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -187,32 +191,32 @@ def _ramp(block: Block, base: float) -> list[Face]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def nearest(surfaces, px, py, pz, dx, dy, dz):
-    """Distance in units of d and the face that the ray p + t d meets first; -1: the hills; t = inf: nothing."""
+    """Distance t in units of d, and the face that p + t d meets first, -1: the hills. t = inf or NaN: nothing."""
     best, hit = np.inf, -1
-    for f in range(len(surfaces.origin)):
-        n, o = surfaces.normal[f], surfaces.origin[f]
-        towards = n[0] * dx + n[1] * dy + n[2] * dz
+    plane, along, across = surfaces.plane, surfaces.along, surfaces.across
+    for f in range(len(plane)):
+        towards = plane[f, 0] * dx + plane[f, 1] * dy + plane[f, 2] * dz
         if towards >= 0.0:
             continue
-        t = (n[0] * (o[0] - px) + n[1] * (o[1] - py) + n[2] * (o[2] - pz)) / towards
+        t = (plane[f, 3] - plane[f, 0] * px - plane[f, 1] * py - plane[f, 2] * pz) / towards
         if t <= 0.0 or t >= best:
             continue
-        qx, qy, qz = px + t * dx - o[0], py + t * dy - o[1], pz + t * dz - o[2]
-        a, b = surfaces.s_of[f], surfaces.t_of[f]
-        along, across = a[0] * qx + a[1] * qy + a[2] * qz, b[0] * qx + b[1] * qy + b[2] * qz
-        inside = along >= 0.0 and across >= 0.0 and along <= 1.0 and across <= 1.0
-        if inside and not (surfaces.triangle[f] and along + across > 1.0):
+        x, y, z = px + t * dx, py + t * dy, pz + t * dz
+        u = along[f, 0] * x + along[f, 1] * y + along[f, 2] * z - along[f, 3]
+        v = across[f, 0] * x + across[f, 1] * y + across[f, 2] * z - across[f, 3]
+        if u >= 0.0 and v >= 0.0 and u <= 1.0 and v <= 1.0 and not (surfaces.triangle[f] and u + v > 1.0):
             best, hit = t, f
     if len(surfaces.amplitude):
         t = _ground(surfaces, px, py, pz, dx, dy, dz, best)
-        if t < best:
+        if not t >= best:
             return t, -1
     return best, hit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _ground(surfaces, px, py, pz, dx, dy, dz, limit):
-    """Where the ray meets the hills before `limit`, else inf: steps that can never pass through the ground."""
+    """Where the ray meets the hills before `limit`, else inf: steps that can never pass through the ground.
+    NaN where they are too many."""
     t = 0.0
     closing = surfaces.steepest * np.sqrt(dx * dx + dy * dy) - dz  # how fast the ray can near the ground at most
     if closing <= 0.0:
@@ -228,7 +232,7 @@ def _ground(surfaces, px, py, pz, dx, dy, dz, limit):
         t += gap / closing
         if t >= limit:
             return np.inf
-    return t
+    return np.nan
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Any, TypeVar, get_args, get_type_hints
 
 import numpy as np
 
 from icalib.errors import RigError
+from icalib.geometry.targets import TARGETS
 from icalib.rig import ImuNoise
 from icalib.simulation.projection import PARAMETER_COUNTS
 from icalib.simulation.robot import Drive, DriveKind, Features, SimLidar, SimWheels
@@ -29,22 +31,23 @@ Made = TypeVar("Made")
 def load_scenario(path: str | Path) -> Scenario:
     """Read a scenario file. Raises RigError, one sentence naming file, line, field, what is wrong and what to do."""
     root = read_yaml(Path(path), "scenario file")
-    found = root.record(("duration", "sensors", "room", "motion"), ("features", "seed", "start_ns"))
+    found = root.record(("duration", "sensors", "room", "motion"), ("features", "target", "seed", "start_ns"))
     start_ns = found["start_ns"].whole(0) if "start_ns" in found else _START_NS
     sensors = _sensors(found["sensors"], start_ns)
     room, motion = _room(found["room"]), _motion(found["motion"], Path(path).parent)
     features = _features(found["features"]) if "features" in found else None
+    board: dict[str, Any] = _board(found["target"]) if "target" in found else {"board": False}
     return _made(
         root,
         lambda: Scenario(
             duration_s=found["duration"].positive(),
             motion=motion,
             imu_clock_origin_ns=start_ns,
-            board=False,
             room=room,
             features=features,
             seed=found["seed"].whole(0) if "seed" in found else 0,
             **sensors,
+            **board,
         ),
     )
 
@@ -189,6 +192,29 @@ def _motion(value: YamlValue, folder: Path) -> Drive:
     if "seed" in found:
         chosen["seed"] = found["seed"].whole(0)
     return _made(value, lambda: Drive(**chosen))
+
+
+def _board(value: YamlValue) -> dict[str, Any]:
+    """The fields of `Scenario` that say which target stands where."""
+    fields = value.entries()
+    if "type" not in fields:
+        value.fail(f"type is missing; add type: {', type: '.join(TARGETS)}.")
+    kind = TARGETS[fields["type"].choice("target type", tuple(TARGETS))]
+    asked = [f for f in dataclasses.fields(kind) if f.init]
+    required = tuple(f.name for f in asked if f.default is dataclasses.MISSING)
+    optional = tuple(f.name for f in asked if f.name not in required)
+    found = value.record(("type", "T_world_board", *required), optional)
+    types = get_type_hints(kind)
+    chosen = {f.name: _of_type(found[f.name], types[f.name]) for f in asked if f.name in found}
+    return {"target": _made(value, lambda: kind(**chosen)), "T_world_board": _pose(found["T_world_board"])}
+
+
+def _of_type(value: YamlValue, kind: type) -> Any:
+    if kind is bool:
+        return value.boolean()
+    if kind is str:
+        return value.text()
+    return value.whole(0) if kind is int else value.positive()
 
 
 def _features(value: YamlValue) -> Features:

@@ -86,6 +86,8 @@ def simulate(scenario: Scenario, seed: int, progress: Progress = lambda stage, d
     """Simulate one recording; the same scenario and seed give the same numbers.
 
     Motion, IMU noise and each sensor draw from streams of their own: changing one leaves the others as they are.
+    Raises RigError where a robot's sensor measures less than twice, RecordingError where a recorded motion cannot be
+    used.
     """
     progress("motion", 0.0)
     imu_rng = np.random.default_rng([seed, 1])
@@ -96,7 +98,6 @@ def simulate(scenario: Scenario, seed: int, progress: Progress = lambda stage, d
     kept = ~inside(scenario.imu_gaps, seconds)
     stamps_ns = stamps[kept] + np.int64(scenario.imu_clock_origin_ns)
     imu = ImuStream("imu0", stamps_ns, readings.gyro[kept], readings.accel[kept])
-    rotation, position, velocity = trajectory.pose_at(seconds[kept])
     progress("images", 0.1)
     corners, corner_truth = _corners(scenario, trajectory, seed)
     followed = _tracks(scenario, trajectory, seed)
@@ -104,24 +105,14 @@ def simulate(scenario: Scenario, seed: int, progress: Progress = lambda stage, d
     progress("wheels", 0.95)
     wheels, wheel_truth = _wheels(scenario, trajectory, seconds, seed)
     truth = Truth(
-        scenario.imu_clock_origin_ns,
-        seconds[kept],
-        rotation,
-        position,
-        velocity,
-        readings.gyro_bias[kept],
-        readings.accel_bias[kept],
-        scenario.imu_intrinsics,
-        GRAVITY_WORLD,
-        scenario.body_poses,
-        np.array(scenario.bow),
+        **_motion_truth(scenario, trajectory, seconds[kept]),
         **_rig_truth(scenario),
+        gyro_bias=readings.gyro_bias[kept],
+        accel_bias=readings.accel_bias[kept],
         corners=corner_truth,
-        trajectory=trajectory,
         tracks={s.name: t for s, t in zip(followed.streams, followed.truths, strict=True)},
         wheels=wheel_truth,
         points=followed.points,
-        planes=np.empty((0, 4)) if scenario.room is None else scenario.room.planes,
     )
     measured = Measurements(imu, corners, tracks=followed.streams, lidars=lidars, wheels=wheels)
     return Simulation(scenario, measured, truth)
@@ -157,7 +148,7 @@ def _corners(
 
 
 def _tracks(scenario: Scenario, trajectory: Trajectory, seed: int) -> Followed:
-    if scenario.room is None or scenario.features is None:
+    if scenario.room is None or scenario.features is None or not scenario.cameras:
         return Followed((), (), np.empty((0, 3)))
     return follow(scenario, scenario.room, scenario.features, trajectory, seed)
 
@@ -186,10 +177,28 @@ def _wheels(
     return tuple(stream for stream, _ in read), {stream.name: truth for stream, truth in read}
 
 
+def _motion_truth(scenario: Scenario, trajectory: Trajectory, seconds: np.ndarray) -> dict[str, Any]:
+    """The fields of `Truth` on where the IMU was at its readings."""
+    rotation, position, velocity = trajectory.pose_at(seconds)
+    return {
+        "imu_clock_origin_ns": scenario.imu_clock_origin_ns,
+        "seconds": seconds,
+        "R_world_imu": rotation,
+        "position": position,
+        "velocity": velocity,
+        "trajectory": trajectory,
+    }
+
+
 def _rig_truth(scenario: Scenario) -> dict[str, Any]:
     """The fields of `Truth` that the scenario states."""
     cameras, lidars, wheels = scenario.cameras, scenario.lidars, scenario.wheels
     return {
+        "imu_intrinsics": scenario.imu_intrinsics,
+        "gravity": GRAVITY_WORLD,
+        "T_world_bodies": scenario.body_poses,
+        "bow": np.array(scenario.bow),
+        "planes": np.empty((0, 4)) if scenario.room is None else scenario.room.planes,
         "T_imu_cam": {c.name: c.T_imu_cam for c in cameras},
         "time_offset": {s.name: raw_time_offset(scenario, s) for s in (*cameras, *lidars, *wheels)},
         "intrinsics": {c.name: np.array(c.intrinsics) for c in cameras},

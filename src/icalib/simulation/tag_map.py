@@ -9,7 +9,7 @@ import numpy as np
 from icalib.geometry.targets import AprilGrid, Markers, Scene, Target
 from icalib.simulation.scenario import Scenario, handheld
 
-_TAGS = Markers("apriltag_36h11", 0.16, tuple(range(40, 76, 3)))
+_TAGS = Markers("tag36h11", 0.16, tuple(range(40, 76, 3)))
 _GRID = AprilGrid(3, 3, 0.1, 0.3)  # ids 0 to 8
 # Columns: x, y and normal of a surface in world. The walls are the planes x = 0 and y = 0, the floor is z = 0.
 _WALLS_AND_FLOOR = np.array([[(0, 0, 1), (1, 0, 0), (0, 1, 0)], [(-1, 0, 0), (0, 0, 1), (0, 1, 0)], np.eye(3)])

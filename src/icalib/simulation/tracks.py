@@ -8,6 +8,7 @@ import numpy as np
 
 from icalib.measurements import TrackStream
 from icalib.simulation.corners import image_stamps
+from icalib.simulation.instants import check_enough
 from icalib.simulation.motion import Trajectory
 from icalib.simulation.projection import project, visible
 from icalib.simulation.robot import Features
@@ -40,6 +41,8 @@ def follow(scenario: Scenario, room: Room, features: Features, trajectory: Traje
     points = room.points(features.count, np.random.default_rng(features.seed))
     front_end = _FrontEnd(features, min(c.rate_hz for c in scenario.cameras), np.random.default_rng([seed, 2, 0, 1]))
     images = [image_stamps(scenario, c, np.random.default_rng([seed, 2 + i])) for i, c in enumerate(scenario.cameras)]
+    for camera, (stamps, _) in zip(scenario.cameras, images, strict=True):
+        check_enough(camera.name, stamps)
     due = sorted((s, i, k) for i, (_, seconds) in enumerate(images) for k, s in enumerate(seconds.tolist()))
     taken: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in scenario.cameras]
     poses = [trajectory.pose_at(seconds)[:2] for _, seconds in images]

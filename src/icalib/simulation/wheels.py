@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.measurements import WheelPoses, WheelStream
-from icalib.simulation.instants import LEAD_S, stamped
+from icalib.simulation.instants import LEAD_S, check_enough, stamped
 from icalib.simulation.motion import Trajectory
 from icalib.simulation.robot import SimWheels
 
@@ -31,6 +31,7 @@ def read_wheels(
     stamps, seconds = stamped(wheels, imu_seconds[-1] - LEAD_S)
     if wheels.reports == "poses":
         stamps, seconds = stamps[:: wheels.poses_every], seconds[:: wheels.poses_every]
+        check_enough(wheels.name, stamps)
         true, covariance = relative_poses(wheels, trajectory, seconds)
         measured = true + _drawn(covariance, rng) * float(noisy)
         return WheelPoses(wheels.name, stamps, measured, covariance), WheelTruth(seconds, true)

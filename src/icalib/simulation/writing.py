@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
@@ -11,13 +10,12 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from icalib.errors import CalibrationError, RecordingError
+from icalib.errors import RecordingError
+from icalib.simulation.bag_writer import IMAGE, IMU, IMU_TOPIC, BagForm, BagWriter, package
 from icalib.simulation.filming import Film, Shot
 
-Form = Literal["ros1", "mcap", "sqlite3", "euroc"]
+Form = BagForm | Literal["euroc"]
 FORMS: tuple[Form, ...] = ("ros1", "mcap", "sqlite3", "euroc")
-_IMU_TOPIC = "/imu0"
-_IMAGE, _IMU = "sensor_msgs/msg/Image", "sensor_msgs/msg/Imu"
 Reading = tuple[int, list[float]]  # stamp [ns]; gyro, accel
 
 
@@ -67,67 +65,38 @@ def _in_time(film: Film, workers: int | None) -> Iterator[tuple[int, Shot | Read
 
 
 def _sink(form: Form, path: Path, cameras: list[str]) -> _Sink:
-    return _Folder(path, cameras) if form == "euroc" else _Bag(form, path, cameras)
+    return _Folder(path, cameras) if form == "euroc" else _FilmBag(form, path, cameras)
 
 
-class _Bag:
-    """A bag, by rosbags' writers."""
+class _FilmBag:
+    """A bag of images and readings."""
 
-    def __init__(self, form: Form, path: Path, cameras: list[str]) -> None:
-        typesys = _package("rosbags.typesys", "bags")
-        self._ros1 = form == "ros1"
-        stores = typesys.Stores
-        self._store: Any = typesys.get_typestore(stores.ROS1_NOETIC if self._ros1 else stores.ROS2_HUMBLE)
-        if self._ros1:
-            self._writer = _package("rosbags.rosbag1", "bags").Writer(path)
-        else:
-            rosbag2 = _package("rosbags.rosbag2", "bags")
-            plugin = rosbag2.StoragePlugin[form.upper()]
-            self._writer = rosbag2.Writer(path, version=9, storage_plugin=plugin)
-        self._topics = {_IMU_TOPIC: _IMU} | {_image_topic(name): _IMAGE for name in cameras}
-        self._connections: dict[str, Any] = {}
+    def __init__(self, form: BagForm, path: Path, cameras: list[str]) -> None:
+        self._bag = BagWriter(form, path, {IMU_TOPIC: IMU} | {_image_topic(name): IMAGE for name in cameras})
 
-    def __enter__(self) -> _Bag:
-        self._writer.__enter__()
-        for topic, kind in self._topics.items():
-            self._connections[topic] = self._writer.add_connection(topic, kind, typestore=self._store)
+    def __enter__(self) -> _FilmBag:
+        self._bag.__enter__()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._writer.__exit__(kind, error, trace)
+        self._bag.__exit__(kind, error, trace)
 
     def image(self, shot: Shot, received_ns: int) -> None:
-        height, width = shot.pixels.shape
-        header = self._header(shot.stamp_ns, shot.camera)
-        message = self._make(_IMAGE, header, height, width, "mono8", 0, width, shot.pixels.ravel())
-        self._write(_image_topic(shot.camera), message, received_ns)
+        message = self._bag.image(shot.stamp_ns, shot.camera, shot.pixels)
+        self._bag.write(_image_topic(shot.camera), message, received_ns)
 
     def reading(self, reading: Reading) -> None:
         stamp_ns, values = reading
-        unknown, turn = np.zeros(9), self._make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
-        w, f = (self._make("geometry_msgs/msg/Vector3", *v) for v in (values[:3], values[3:]))
-        message = self._make(_IMU, self._header(stamp_ns, "imu0"), turn, unknown, w, unknown, f, unknown)
-        self._write(_IMU_TOPIC, message, stamp_ns)
-
-    def _header(self, stamp_ns: int, frame: str) -> Any:
-        stamp = self._make("builtin_interfaces/msg/Time", *divmod(stamp_ns, 1_000_000_000))
-        return self._make("std_msgs/msg/Header", *([0] if self._ros1 else []), stamp, frame)
-
-    def _make(self, kind: str, *values: Any) -> Any:
-        return self._store.types[kind](*values)
-
-    def _write(self, topic: str, message: Any, received_ns: int) -> None:
-        serialise = self._store.serialize_ros1 if self._ros1 else self._store.serialize_cdr
-        self._writer.write(self._connections[topic], received_ns, serialise(message, self._topics[topic]))
+        self._bag.write(IMU_TOPIC, self._bag.imu(stamp_ns, values), stamp_ns)
 
 
 class _Folder:
     """EuRoC's layout; every digit of the readings is written."""
 
     def __init__(self, path: Path, cameras: list[str]) -> None:
-        self._cv2 = _package("cv2", "images")
+        self._cv2 = package("cv2", "images")
         self._root = path / "mav0"
         self._stack = ExitStack()
         self._headers = {"imu0": "#timestamp [ns],w_x [rad s^-1],w_y,w_z,a_x [m s^-2],a_y,a_z"}
@@ -161,12 +130,3 @@ class _Folder:
 
 def _image_topic(camera: str) -> str:
     return f"/{camera}/image_raw"
-
-
-def _package(name: str, extra: str) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        raise CalibrationError(
-            f"writing recordings needs {name}, which is not installed; run: pip install icalib[{extra}]."
-        ) from None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from icalib.geometry.targets.aprilgrid import AprilGrid
 from icalib.geometry.targets.base import Target
 from icalib.geometry.targets.charuco import Charuco
@@ -11,6 +13,29 @@ from icalib.geometry.targets.nothing import NoTarget
 from icalib.geometry.targets.scene import Scene
 from icalib.geometry.targets.tag import Tag
 
-__all__ = ["TARGETS", "AprilGrid", "Charuco", "Checkerboard", "Markers", "NoTarget", "Scene", "Tag", "Target"]
+__all__ = [
+    "TARGETS",
+    "AprilGrid",
+    "Charuco",
+    "Checkerboard",
+    "Markers",
+    "NoTarget",
+    "Scene",
+    "Tag",
+    "Target",
+    "target_from_plain",
+]
 
-TARGETS: dict[str, type[Target]] = {kind.type: kind for kind in (AprilGrid, Charuco, Checkerboard, Tag)}
+TARGETS: dict[str, type[Target]] = {kind.type: kind for kind in (AprilGrid, Charuco, Checkerboard, Markers, Tag)}
+
+
+def target_from_plain(rig: dict[str, Any]) -> Target | None:
+    """The target of a rig as plain data, back from `Target.plain`; None where there is none."""
+    if "targets" in rig:
+        return Scene(tuple(rig["targets"]), tuple(_one(fields) for fields in rig["targets"].values()))
+    return _one(rig["target"]) if rig.get("target") else None
+
+
+def _one(fields: dict[str, Any]) -> Target:
+    values = {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items() if k != "type"}
+    return TARGETS[fields["type"]](**values)

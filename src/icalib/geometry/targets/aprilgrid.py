@@ -10,6 +10,7 @@ import numpy as np
 
 from icalib.errors import RecordingError
 from icalib.geometry.targets.base import Target
+from icalib.geometry.targets.families import APRILGRID_FAMILY, TagSet
 
 UNIT_TAG = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])  # corner 0 to 3
 
@@ -47,6 +48,10 @@ class AprilGrid(Target):
         """(4 * rows * cols, 3) for each corner, the centre of its tag in metres."""
         centers = self.points.reshape(-1, 4, 3).mean(axis=1)
         return np.repeat(centers, 4, axis=0)
+
+    @property
+    def tags(self) -> TagSet:
+        return TagSet(APRILGRID_FAMILY, self.border_bits, tuple(range(self.rows * self.cols)))
 
     def point_index(self, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarray:
         """(N,) index into `points`. Raises RecordingError for a tag or corner that this target does not have."""

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from icalib.errors import RecordingError
+from icalib.geometry.targets.families import TagSet
 
 BOARD = "board0"
 
@@ -52,6 +53,17 @@ class Target(ABC):
     def bends(self) -> np.ndarray:
         """(bodies,) bool: whether a body is large enough to bend."""
         return np.ones(len(self.bodies), dtype=bool)
+
+    @property
+    def tags(self) -> TagSet | None:
+        """The tags by which images tell this target from others, where it has any."""
+        return None
+
+    def plain(self) -> dict[str, Any]:
+        """Its fields as a rig file has them: text, numbers, lists; those that list nothing are left out."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        lists = {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
+        return {"type": self.type} | {name: value for name, value in lists.items() if value != []}
 
     @property
     def symmetric(self) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 
 from icalib.errors import RigError
 from icalib.geometry.targets.base import Target, untagged_index
-from icalib.geometry.targets.families import check_family
+from icalib.geometry.targets.families import TagSet, checked_family
 
 
 @dataclass(frozen=True)
@@ -43,13 +43,17 @@ class Charuco(Target):
                 f"marker_size {self.marker_size:g} does not fit a square of {self.square_size:g}; "
                 "correct marker_size or square_size."
             )
-        check_family(self.dictionary, self.squares_x * self.squares_y // 2)
+        object.__setattr__(self, "dictionary", checked_family(self.dictionary, self.squares_x * self.squares_y // 2))
 
     @cached_property
     def points(self) -> np.ndarray:
         """((squares_x - 1) (squares_y - 1), 3) inner corners in metres."""
         row, col = np.divmod(np.arange((self.squares_x - 1) * (self.squares_y - 1)), self.squares_x - 1)
         return self.square_size * np.stack([col, -row, 0 * row], axis=1)
+
+    @property
+    def tags(self) -> TagSet:
+        return TagSet(self.dictionary, 1, tuple(range(self.squares_x * self.squares_y // 2)))
 
     def point_index(self, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarray:
         return untagged_index(tag_id, corner, len(self.points), "squares_x and squares_y")

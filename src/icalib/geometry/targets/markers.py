@@ -11,7 +11,7 @@ import numpy as np
 from icalib.errors import RecordingError, RigError
 from icalib.geometry.targets.aprilgrid import UNIT_TAG
 from icalib.geometry.targets.base import Target
-from icalib.geometry.targets.families import FAMILIES, check_family
+from icalib.geometry.targets.families import FAMILIES, TagSet, checked_family
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Markers(Target):
     border_bits: int = 1
 
     def __post_init__(self) -> None:
-        check_family(self.family, 1 + max(self.ids, default=0))
+        object.__setattr__(self, "family", checked_family(self.family, 1 + max(self.ids, default=0)))
         if repeated := [i for i in self.ids if self.ids.count(i) > 1]:
             raise RigError(f"tag {repeated[0]} is listed twice; each id may stand in one place only.")
 
@@ -62,6 +62,10 @@ class Markers(Target):
     @cached_property
     def bends(self) -> np.ndarray:
         return np.zeros(len(self.known), dtype=bool)
+
+    @property
+    def tags(self) -> TagSet:
+        return TagSet(self.family, self.border_bits, tuple(self.known.tolist()))
 
     def point_index(self, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarray:
         tag_id, corner = np.asarray(tag_id, dtype=np.int64), np.asarray(corner, dtype=np.int64)

@@ -11,11 +11,10 @@ from icalib.geometry.targets.aprilgrid import AprilGrid
 from icalib.geometry.targets.base import Target
 from icalib.geometry.targets.charuco import Charuco
 from icalib.geometry.targets.checkerboard import Checkerboard
-from icalib.geometry.targets.families import tag_bits
+from icalib.geometry.targets.families import APRILGRID_FAMILY, opencv_bits, tag_bits
 from icalib.geometry.targets.tag import Tag
 
 _SAME_M = 1e-9  # edges this close are one
-_APRILGRID_FAMILY = "apriltag_36h11"
 _Box = tuple[float, float, float, float, bool]  # left, bottom, right, top [m]; white
 
 
@@ -64,7 +63,7 @@ def pattern_of(target: Target, border_bits: int | None = None) -> Pattern:
         corner = (-target.square_size, -target.square_size)
         return _rasterised(_squares(target.cols + 1, target.rows + 1, target.square_size, corner, 0))
     if isinstance(target, Tag):
-        return _rasterised(_tag(target.family, target.id, target.size, (0.0, 0.0), border_bits or 1))
+        return _rasterised(_tag(tag_bits(target.family, target.id), target.size, (0.0, 0.0), border_bits or 1))
     raise RigError(f"there is no print of a target of type {target.type}; choose another.")
 
 
@@ -74,7 +73,7 @@ def _aprilgrid(grid: AprilGrid, border_bits: int) -> list[_Box]:
     pitch, boxes = size + gap, []
     for i in range(grid.rows * grid.cols):
         row, col = divmod(i, grid.cols)
-        boxes += _tag(_APRILGRID_FAMILY, i, size, (col * pitch, row * pitch), border_bits)
+        boxes += _tag(tag_bits(APRILGRID_FAMILY, i), size, (col * pitch, row * pitch), border_bits)
     corners = [(row, col) for row in range(grid.rows + 1) for col in range(grid.cols + 1)] if grid.squares else []
     for row, col in corners:
         left, bottom = col * pitch - gap, row * pitch - gap
@@ -89,10 +88,10 @@ def _charuco(board: Charuco, border_bits: int) -> list[_Box]:
     # The top left square is black: the one at the bottom left is, where the number of rows is odd.
     boxes = _squares(nx, ny, size, (left, top - ny * size), 1 - ny % 2)
     white = [(row, col) for row in range(ny) for col in range(nx) if (row + col) % 2 == 1]
-    inset = 0.5 * (size - marker)
+    inset, bits = 0.5 * (size - marker), opencv_bits(board.dictionary)  # AprilTags on their heads, as OpenCV does
     for tag_id, (row, col) in enumerate(white):
         corner = left + col * size + inset, top - (row + 1) * size + inset
-        boxes += _tag(board.dictionary, tag_id, marker, corner, border_bits)
+        boxes += _tag(bits[tag_id], marker, corner, border_bits)
     return boxes
 
 
@@ -104,9 +103,9 @@ def _squares(nx: int, ny: int, size: float, corner: tuple[float, float], parity:
     ]  # fmt: skip
 
 
-def _tag(family: str, tag_id: int, size: float, corner: tuple[float, float], border_bits: int) -> list[_Box]:
-    """One tag, black border included, `corner` its left and bottom."""
-    bits = tag_bits(family, tag_id)[::-1]
+def _tag(bits: np.ndarray, size: float, corner: tuple[float, float], border_bits: int) -> list[_Box]:
+    """One tag of bits (n, n), row 0 at the top, its black border included; `corner` is its left and bottom."""
+    bits = bits[::-1]
     n = len(bits) + 2 * border_bits
     x, y = ((c + size * np.arange(n + 1) / n).tolist() for c in corner)
     boxes: list[_Box] = [(x[0], y[0], x[-1], y[-1], False)]

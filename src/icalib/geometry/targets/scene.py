@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from itertools import combinations
+from typing import Any, ClassVar
 
 import numpy as np
 
-from icalib.errors import RecordingError
+from icalib.errors import RecordingError, RigError
 from icalib.geometry.targets.base import Target
+from icalib.geometry.targets.checkerboard import Checkerboard
 
 
 @dataclass(frozen=True)
@@ -17,7 +19,7 @@ class Scene(Target):
     """Targets that stand still to each other, by name. How they stand is unknown, and estimated.
 
     Points are those of the first, then those of the second, and so on; bodies are called as their target, or as the
-    target and its body where it has several.
+    target and its body where it has several. Raises RigError where images cannot tell two of them apart.
     """
 
     type: ClassVar[str] = "scene"
@@ -25,6 +27,15 @@ class Scene(Target):
 
     names: tuple[str, ...]
     targets: tuple[Target, ...]
+
+    def __post_init__(self) -> None:
+        for (name, one), (other_name, other) in combinations(zip(self.names, self.targets, strict=True), 2):
+            if common := _in_common(one, other):
+                raise RigError(f"images cannot tell {name} from {other_name}: {common}.")
+
+    def plain(self) -> dict[str, Any]:
+        """What a rig file has under `targets`: the fields of each target by name."""
+        return {name: target.plain() for name, target in zip(self.names, self.targets, strict=True)}
 
     @cached_property
     def first_points(self) -> np.ndarray:
@@ -87,6 +98,16 @@ class Scene(Target):
             own = owner == k
             tag_id[own], corner[own] = target.point_identity(index[own] - self.first_points[k])
         return tag_id, corner
+
+
+def _in_common(one: Target, other: Target) -> str:
+    """By what images would take one for the other, and what to do; "" where nothing."""
+    if one.tags and other.tags and (ids := one.tags.shared_with(other.tags)):
+        return f"both have tag {ids[0]} of {one.tags.family}; give them other ids or families, or leave one out"
+    boards = [{t.rows, t.cols} for t in (one, other) if isinstance(t, Checkerboard)]
+    if len(boards) == 2 and boards[0] == boards[1]:
+        return "both are checkerboards with as many corners; take another size, or boards with tags"
+    return ""
 
 
 def _rows_of(target: Target, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarray:

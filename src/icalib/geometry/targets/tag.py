@@ -11,12 +11,12 @@ import numpy as np
 from icalib.errors import RecordingError
 from icalib.geometry.targets.aprilgrid import UNIT_TAG
 from icalib.geometry.targets.base import Target
-from icalib.geometry.targets.families import check_family
+from icalib.geometry.targets.families import checked_family
 
 
 @dataclass(frozen=True)
 class Tag(Target):
-    """Tag `id` of `family`, its black border of edge `size` [m].
+    """Tag `id` of `family` (any of the names that `family_name` knows), its black border of edge `size` [m].
 
     Corners as on an AprilGrid: 0 at the bottom left, then counterclockwise. Raises RigError where there is no such tag.
     """
@@ -29,7 +29,7 @@ class Tag(Target):
     size: float
 
     def __post_init__(self) -> None:
-        check_family(self.family, self.id + 1)
+        object.__setattr__(self, "family", checked_family(self.family, self.id + 1))
 
     @cached_property
     def points(self) -> np.ndarray:

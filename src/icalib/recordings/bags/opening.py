@@ -11,11 +11,11 @@ from pathlib import Path
 import yaml
 
 from icalib.errors import RecordingError
+from icalib.extras import load_zstd
 from icalib.recordings.bags.mcap import MCAP_MAGIC, McapStorage
 from icalib.recordings.bags.ros1 import ROS1_MAGIC, Ros1Storage
 from icalib.recordings.bags.sqlite import SQLITE_MAGIC, SqliteStorage
 from icalib.recordings.bags.storage import Storage
-from icalib.recordings.extras import load_zstd
 
 _READERS = {ROS1_MAGIC: Ros1Storage, MCAP_MAGIC: McapStorage, SQLITE_MAGIC: SqliteStorage}
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"

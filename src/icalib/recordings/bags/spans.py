@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from icalib.errors import RecordingError
+from icalib.extras import load_lz4, load_zstd
 from icalib.recordings.bags.storage import Connection, Tally, cut_note
-from icalib.recordings.extras import load_lz4, load_zstd
 
 
 class _UnknownCompressionError(Exception):

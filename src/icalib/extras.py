@@ -1,4 +1,4 @@
-"""Packages that only some recordings need: they are imported on use, and where one is missing a sentence says so."""
+"""Packages that only some work needs: they are imported on use, and where one is missing a sentence says so."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from icalib.errors import RecordingError
 
 def load_cv2() -> Any:
     """OpenCV. Raises RecordingError where it is not installed."""
-    return _load("cv2", "images", "Images need OpenCV")
+    return _load("cv2", "images", "Images and tags need OpenCV")
 
 
 def load_typesys() -> Any:

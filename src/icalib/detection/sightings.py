@@ -1,0 +1,76 @@
+"""What a search found of a target: sentences on it, and tags too rarely seen to be true left out."""
+
+from __future__ import annotations
+
+import dataclasses
+from math import ceil
+
+import numpy as np
+
+from icalib.detection.corners import KEPT, VERDICTS, ImageCorners
+from icalib.geometry.targets import Markers, Scene, Target
+
+LEAST_IMAGES = 3  # with a tag whose id nobody listed; fewer may be chance
+LEAST_SHARE = 0.01  # of all images: the same
+_SHOWN = 10  # ids in a sentence
+Part = tuple[str, Target, int]  # name, target, number of its first point
+
+
+def parts_of(target: Target) -> list[Part]:
+    """The targets of a scene, or the target itself without a name."""
+    if not isinstance(target, Scene):
+        return [("", target, 0)]
+    return list(zip(target.names, target.targets, target.first_points[:-1].tolist(), strict=True))
+
+
+def seen_in(images: list[ImageCorners], part: Part) -> int:
+    """In how many images corners of the part were kept."""
+    _, target, first = part
+    return sum(bool((i.kept & (i.point >= first) & (i.point < first + len(target.points))).any()) for i in images)
+
+
+def without_rare_tags(target: Target, images: list[ImageCorners]) -> tuple[list[ImageCorners], tuple[str, ...]]:
+    """The images without free tags that are in fewer than 3 of them, or fewer than 1 %, and sentences that name these.
+
+    Small families are sometimes read where there is nothing, and a tag of a map that is not there would be placed
+    somewhere. Tags whose ids are listed are all kept.
+    """
+    least = max(LEAST_IMAGES, ceil(LEAST_SHARE * len(images)))
+    notes: list[str] = []
+    for name, part, first in parts_of(target):
+        if not isinstance(part, Markers) or part.ids:
+            continue
+        count = np.zeros(len(part.known), dtype=np.int64)
+        for i in images:
+            tags = (i.point[i.kept] - first) // 4
+            count[np.unique(tags[(tags >= 0) & (tags < len(count))])] += 1
+        rare = np.flatnonzero((count > 0) & (count < least))
+        if not len(rare):
+            continue
+        images = [_without(i, first, rare) for i in images]
+        ids = ", ".join(str(k) for k in part.known[rare[:_SHOWN]]) + (", ..." if len(rare) > _SHOWN else "")
+        notes.append(
+            f"{len(rare)} tags of {part.family} (ids {ids}) are in fewer than {least} of {len(images)} images and left "
+            f"out; list the ids{' of ' + name if name else ''} in the rig file if they are there."
+        )
+    return images, tuple(notes)
+
+
+def _without(image: ImageCorners, first: int, tags: np.ndarray) -> ImageCorners:
+    """Without the tags at these places in `Markers.known`, whose points begin at `first`."""
+    rows = ~np.isin((image.point - first) // 4, tags)
+    return ImageCorners(*(getattr(image, f.name)[rows] for f in dataclasses.fields(image)))
+
+
+def sightings(target: Target, images: list[ImageCorners]) -> tuple[str, ...]:
+    """How many images have the target, or each of several, how many corners were dropped, for which reasons; and which
+    of several targets is in none."""
+    kept = sum(int(i.kept.sum()) for i in images)
+    dropped = {name: sum(i.counts()[name] for i in images) for k, name in enumerate(VERDICTS) if k != KEPT}
+    reasons = ", ".join(f"{n} {name}" for name, n in dropped.items() if n)
+    tail = f"; corners left out: {reasons}" if reasons else ""
+    counts = {part[0] or "the target": seen_in(images, part) for part in parts_of(target)}
+    seen = ", ".join(f"{name} is in {n}" for name, n in counts.items())
+    missing = " and ".join(name for name, n in counts.items() if not n)
+    notes = (f"{seen} of {len(images)} images, {kept} corners{tail}.",)
+    return (*notes, f"{missing} is never seen; check its type, family, ids and sizes.") if missing else notes

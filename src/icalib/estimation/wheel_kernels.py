@@ -1,0 +1,308 @@
+"""Rows of the wheel factors: residuals and Jacobians between two instants, and their normal equations.
+
+Both factors compare (X, T), a displacement and a turn in wheel axes, made of (Y, Theta) in the axes of the IMU:
+
+    X = R_imu_wheel^T Y,  T = R_imu_wheel^T Theta,  Theta = Log(R(s_0)^T R(s_1))
+
+A row of the model is g_X X + g_T T; the derivatives of (Y, Theta) by what they hang on are common to all rows.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from icalib.estimation.corner_weights import weight
+from icalib.estimation.interval_sums import add_interval
+from icalib.geometry import so3
+from icalib.geometry.small import tmul3
+
+N_OWN = 10  # border columns of the wheels: rotation 3, translation 3, time offset 1, radii 2, baseline 1
+
+
+class Wheels(NamedTuple):
+    """R_imu_wheel (3, 3), p_imu_wheel (3,) m, drive (3,): left and right radius, baseline [m]."""
+
+    R: np.ndarray
+    p: np.ndarray
+    drive: np.ndarray
+
+
+class Track(NamedTuple):
+    """Of `Poses` what the kernels need, at m instants, and the node that each hangs on."""
+
+    node: np.ndarray
+    rotation: np.ndarray
+    position: np.ndarray
+    rate: np.ndarray
+    velocity: np.ndarray
+    by_node: np.ndarray
+    by_imu: np.ndarray
+
+
+class Rows(NamedTuple):
+    """n intervals of m rows: residual (n, m); by_node, by_next (n, m, 15), with respect to both nodes; by_border (n, m,
+    10 + 24 or 0): to the wheels' own parameters and the IMU intrinsics. Jacobians of length 0 where not wanted."""
+
+    residual: np.ndarray
+    by_node: np.ndarray
+    by_next: np.ndarray
+    by_border: np.ndarray
+
+    @classmethod
+    def empty(cls, n: int, m: int, n_imu: int, jacobians: bool) -> Rows:
+        k = n if jacobians else 0
+        return cls(np.empty((n, m)), np.zeros((k, m, 15)), np.zeros((k, m, 15)), np.zeros((k, m, N_OWN + n_imu)))
+
+
+class Loss(NamedTuple):
+    """Robust loss of the whitened rows, where it bends, and whether the sums have its true curvature."""
+
+    kind: int
+    scale: float
+    curved: bool
+
+
+@njit(cache=True, nogil=True)
+def _cross(a, b):
+    return np.array((a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]))
+
+
+@njit(cache=True, nogil=True)
+def _add(R, x, scale, sign, out):
+    """out (3,) += scale R x, or R^T x where sign is negative."""
+    for i in range(3):
+        for j in range(3):
+            out[i] += scale * (R[i, j] if sign > 0 else R[j, i]) * x[j]
+
+
+@njit(cache=True, nogil=True)
+def _turn(a, b, track, M0, M1, Mc):
+    """Theta (3,) between instants a and b; its derivatives by their nodes into rows 3: of M0, M1 (6, 15), by time and
+    the IMU intrinsics into those of Mc (6, 1 + 24 or 0)."""
+    theta = so3.log(tmul3(track.rotation[a], track.rotation[b]))
+    before, after = so3.left_jacobian_inverse(theta), so3.right_jacobian_inverse(theta)
+    for i in range(3):
+        for j in range(3):
+            Mc[3 + i, 0] += after[i, j] * track.rate[b, j] - before[i, j] * track.rate[a, j]
+            for c in range(15):
+                M0[3 + i, c] -= before[i, j] * track.by_node[a, j, c]
+                M1[3 + i, c] += after[i, j] * track.by_node[b, j, c]
+            for c in range(track.by_imu.shape[2]):
+                Mc[3 + i, 1 + c] += after[i, j] * track.by_imu[b, j, c] - before[i, j] * track.by_imu[a, j, c]
+    return theta
+
+
+@njit(cache=True, nogil=True)
+def _add_travel(j, w, track, moving, D, M, Mc, wanted):
+    """Adds w R^T v of instant j to D (3,), its derivatives to the first rows of M (6, 15) and Mc."""
+    R, u = track.rotation[j], np.zeros(3)
+    _add(R, track.velocity[j], 1.0, -1, u)
+    for i in range(3):
+        D[i] += w * u[i]
+    if not wanted:
+        return
+    spin = _cross(u, track.rate[j])  # hat(u) rate: how u moves as the body turns
+    pull = np.zeros(3)
+    _add(R, moving.acceleration[j], 1.0, -1, pull)
+    U = so3.hat(u)
+    for i in range(3):
+        Mc[i, 0] += w * (spin[i] + pull[i])
+        for k in range(3):
+            for c in range(15):
+                M[i, c] += w * (U[i, k] * track.by_node[j, k, c] + R[k, i] * moving.by_node[j, k, c])
+            for c in range(track.by_imu.shape[2]):
+                Mc[i, 1 + c] += w * (U[i, k] * track.by_imu[j, k, c] + R[k, i] * moving.by_imu[j, k, c])
+
+
+@njit(cache=True, nogil=True)
+def _shift(a, b, track, p, Y, M0, M1, Mc):
+    """Y = R_a^T (p_b - p_a) + R_a^T R_b p - p for a lever arm p (3,), and its derivatives into the first rows."""
+    Ra, d = track.rotation[a], track.position[b] - track.position[a]
+    R01 = tmul3(Ra, track.rotation[b])
+    before, speed = np.zeros(3), np.zeros(3)
+    _add(Ra, d, 1.0, -1, before)
+    _add(R01, p, 1.0, 1, before)
+    _add(Ra, track.velocity[b] - track.velocity[a], 1.0, -1, speed)
+    A, B = so3.hat(before), np.zeros((3, 3))
+    lever = so3.hat(p)
+    for i in range(3):
+        Y[i] = before[i] - p[i]
+        Mc[i, 0] += speed[i]
+        for k in range(3):
+            for m in range(3):
+                B[i, k] -= R01[i, m] * lever[m, k]
+    for i in range(3):
+        for k in range(3):
+            Mc[i, 0] += A[i, k] * track.rate[a, k] + B[i, k] * track.rate[b, k]
+            for c in range(15):
+                M0[i, c] += A[i, k] * track.by_node[a, k, c] - Ra[k, i] * track.by_node[a, 3 + k, c]
+                M1[i, c] += B[i, k] * track.by_node[b, k, c] + Ra[k, i] * track.by_node[b, 3 + k, c]
+            for c in range(track.by_imu.shape[2]):
+                Mc[i, 1 + c] += A[i, k] * track.by_imu[a, k, c] - Ra[k, i] * track.by_imu[a, 3 + k, c]
+                Mc[i, 1 + c] += B[i, k] * track.by_imu[b, k, c] + Ra[k, i] * track.by_imu[b, 3 + k, c]
+
+
+@njit(cache=True, nogil=True)
+def _fill_row(i, q, gX, gT, aY, aT, X, T, M0, M1, Mc, rows):
+    """Derivatives of row q of interval i, g_X X + g_T T = a_Y Y + a_T Theta: nodes, rotation, time, IMU intrinsics."""
+    # R <- R Exp(d) turns X and T by -d: d X = X x d.
+    x, t = _cross(gX, X), _cross(gT, T)
+    for c in range(3):
+        rows.by_border[i, q, c] = x[c] + t[c]
+    for k in range(3):
+        for c in range(15):
+            rows.by_node[i, q, c] += aY[k] * M0[k, c] + aT[k] * M0[3 + k, c]
+            rows.by_next[i, q, c] += aY[k] * M1[k, c] + aT[k] * M1[3 + k, c]
+        rows.by_border[i, q, 6] += aY[k] * Mc[k, 0] + aT[k] * Mc[3 + k, 0]
+        for c in range(Mc.shape[1] - 1):
+            rows.by_border[i, q, N_OWN + c] += aY[k] * Mc[k, 1 + c] + aT[k] * Mc[3 + k, 1 + c]
+
+
+@njit(cache=True, nogil=True)
+def _drive_rows(wheels):
+    """Of the increment factor's four rows: g_X, g_T (4, 3) in wheel axes, and a_Y, a_T (4, 3) in those of the IMU.
+
+    Y = D + Theta x p, so that a_T = R g_T + p x a_Y.
+    """
+    gX, gT, aY, aT = np.zeros((4, 3)), np.zeros((4, 3)), np.zeros((4, 3)), np.zeros((4, 3))
+    r_l, r_r, b = wheels.drive
+    gX[0, 0], gT[0, 2] = 1.0 / r_l, -0.5 * b / r_l
+    gX[1, 0], gT[1, 2] = 1.0 / r_r, 0.5 * b / r_r
+    gX[2, 1] = gX[3, 2] = 1.0
+    for q in range(4):
+        _add(wheels.R, gX[q], 1.0, 1, aY[q])
+        _add(wheels.R, gT[q], 1.0, 1, aT[q])
+        aT[q] += _cross(wheels.p, aY[q])
+    return gX, gT, aY, aT
+
+
+@njit(cache=True, nogil=True)
+def increment_rows(start, weights, track, moving, wheels, measured, rows):
+    """Rows of n increments, not whitened: left and right wheel [rad], slip sideways and upwards [m].
+
+    start (n + 1,), weights (m,): see Instants; track, moving: motion at these instants; measured (n, 4).
+    """
+    gX, gT, aY, aT = _drive_rows(wheels)
+    wanted = len(rows.by_node) > 0
+    n_c = 1 + track.by_imu.shape[2]
+    M0, M1, Mc, D = np.empty((6, 15)), np.empty((6, 15)), np.empty((6, n_c)), np.empty(3)
+    X, T = np.empty(3), np.empty(3)
+    for i in range(len(start) - 1):
+        a, b = start[i], start[i + 1] - 1
+        M0[:], M1[:], Mc[:], D[:], X[:], T[:] = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for j in range(a + 1, b):
+            _add_travel(
+                j, weights[j], track, moving, D, M0 if track.node[j] == track.node[a] else M1, Mc, wanted
+            )  # fmt: skip
+        theta = _turn(a, b, track, M0, M1, Mc)
+        Y = D + _cross(theta, wheels.p)
+        _add(wheels.R, Y, 1.0, -1, X)
+        _add(wheels.R, theta, 1.0, -1, T)
+        for q in range(4):
+            s = 0.0
+            for k in range(3):
+                s += gX[q, k] * X[k] + gT[q, k] * T[k]
+            rows.residual[i, q] = s - measured[i, q]
+            if not wanted:
+                continue
+            _fill_row(i, q, gX[q], gT[q], aY[q], aT[q], X, T, M0, M1, Mc, rows)
+            lever = _cross(aY[q], theta)
+            for k in range(3):
+                rows.by_border[i, q, 3 + k] = lever[k]
+            if q < 2:
+                rows.by_border[i, q, 7 + q] = -s / wheels.drive[q]
+                rows.by_border[i, q, 9] = (0.5 if q else -0.5) * T[2] / wheels.drive[q]
+
+
+@njit(cache=True, nogil=True)
+def relative_rows(track, wheels, z, J, drive0, rows):
+    """Rows of n relative poses, not whitened: yaw, x, y (paper (27); as printed, its yaw has the other sign
+    and its lever arm at k + 1 is turned by the wrong rotation).
+
+    track: motion at 2 n instants, first all begins, then all ends; z, J, drive0: see RelativePoses.
+    """
+    n, n_c = len(z), 1 + track.by_imu.shape[2]
+    wanted = len(rows.by_node) > 0
+    M0, M1, Mc, Y = np.empty((6, 15)), np.empty((6, 15)), np.empty((6, n_c)), np.empty(3)
+    X, T, none, axes = np.empty(3), np.empty(3), np.zeros(3), np.eye(3)
+    for i in range(n):
+        M0[:], M1[:], Mc[:], X[:], T[:] = 0.0, 0.0, 0.0, 0.0, 0.0
+        theta = _turn(i, n + i, track, M0, M1, Mc)
+        _shift(i, n + i, track, wheels.p, Y, M0, M1, Mc)
+        _add(wheels.R, Y, 1.0, -1, X)
+        _add(wheels.R, theta, 1.0, -1, T)
+        R01 = tmul3(track.rotation[i], track.rotation[n + i])
+        for q in range(3):
+            measured = z[i, q]
+            for k in range(3):
+                measured += J[i, q, k] * (wheels.drive[k] - drive0[k])
+            rows.residual[i, q] = (T[2] if q == 0 else X[q - 1]) - measured
+            if not wanted:
+                continue
+            if q == 0:
+                _fill_row(i, q, none, axes[2], none, wheels.R[:, 2], X, T, M0, M1, Mc, rows)
+            else:
+                aY = wheels.R[:, q - 1]
+                _fill_row(i, q, axes[q - 1], none, aY, none, X, T, M0, M1, Mc, rows)
+                for k in range(3):
+                    rows.by_border[i, q, 3 + k] = aY[0] * R01[0, k] + aY[1] * R01[1, k] + aY[2] * R01[2, k] - aY[k]
+            for k in range(3):
+                rows.by_border[i, q, 7 + k] = -J[i, q, k]
+
+
+@njit(cache=True, nogil=True)
+def _weigh(r, loss, scaled, root):
+    """root (m,): square roots of the weights of whitened residuals r (m,); scaled (2, m): what Jacobian and residual
+    are multiplied by, so that J^T J, J^T r are those of the weights or, curved, of the loss. Returns half the robust
+    chi^2."""
+    cost = 0.0
+    for q in range(len(r)):
+        w, c, curvature = weight(loss.kind, loss.scale, r[q] * r[q])
+        bend = np.sqrt(curvature) if loss.curved else 1.0
+        root[q] = np.sqrt(w)
+        scaled[0, q], scaled[1, q] = root[q] * bend, root[q] / bend
+        cost += c
+    return cost
+
+
+@njit(cache=True, nogil=True)
+def _whiten(W, J, columns, scale, out):
+    """out (m, n) = diag(scale) W J[:, columns] for lower triangular W (m, m)."""
+    for q in range(len(W)):
+        for j in range(len(columns)):
+            s = 0.0
+            for k in range(q + 1):
+                s += W[q, k] * J[k, columns[j]]
+            out[q, j] = scale[q] * s
+
+
+@njit(cache=True, nogil=True)
+def accumulate_rows(rows, node, W, loss, free, columns, given, noise, sums, residual, root):
+    """Whitens rows by W (n, m, m), weighs them, and adds them to the sums where these are wanted.
+
+    free, columns (c,): columns of by_border that are estimated, and theirs in the border. given: `noise` (n, m) stands
+    in for the weighted residuals. residual, root (n, m): whitened residuals and square roots of their weights, out.
+    Returns half the robust chi^2.
+    """
+    m, n_c = W.shape[1], len(free)
+    A0, A1, Ac = np.empty((m, 15)), np.empty((m, 15)), np.empty((m, n_c + 1))
+    scaled, chain = np.empty((2, m)), np.arange(15)
+    cost = 0.0
+    for i in range(len(W)):
+        for q in range(m):
+            residual[i, q] = 0.0
+            for k in range(q + 1):
+                residual[i, q] += W[i, q, k] * rows.residual[i, k]
+        cost += _weigh(residual[i], loss, scaled, root[i])
+        if len(sums.diagonal) == 0:
+            continue
+        _whiten(W[i], rows.by_node[i], chain, scaled[0], A0)
+        _whiten(W[i], rows.by_next[i], chain, scaled[0], A1)
+        _whiten(W[i], rows.by_border[i], free, scaled[0], Ac)
+        for q in range(m):
+            Ac[q, n_c] = noise[i, q] if given else scaled[1, q] * residual[i, q]
+        add_interval(node[i] - sums.first, A0, A1, Ac, columns, sums)
+    return cost

@@ -1,0 +1,42 @@
+"""By how much one signal lags behind another: masked, normalised cross-correlation over all shifts."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Shift(NamedTuple):
+    """b(t) is most like a(t + samples); their correlation there, and the largest at any shift."""
+
+    samples: int
+    correlation: float
+    largest: float
+
+
+def best_shift(a: np.ndarray, mask_a: np.ndarray, b: np.ndarray, mask_b: np.ndarray, least: float) -> Shift:
+    """Between a (n,) and b (m,) on one regular grid, where both masks hold; at least `least` samples must overlap, or
+    half of all there are."""
+    n = len(a) + len(b) - 1
+    size = 1 << (n - 1).bit_length()
+
+    def correlate(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """sum_t x(t + lag) y(t), lag from -(len(y) - 1) to len(x) - 1."""
+        product = np.fft.irfft(np.fft.rfft(x, size) * np.conj(np.fft.rfft(y, size)), size)
+        return np.concatenate([product[-(len(b) - 1) :], product[: len(a)]]) if len(b) > 1 else product[: len(a)]
+
+    ma, mb = mask_a.astype(float), mask_b.astype(float)
+    count = np.maximum(correlate(ma, mb), 1e-9)
+    sa, sb = correlate(a * ma, mb), correlate(ma, b * mb)
+    saa, sbb = correlate(a * a * ma, mb), correlate(ma, b * b * mb)
+    covariance = correlate(a * ma, b * mb) - sa * sb / count
+    variance = np.maximum(saa - sa**2 / count, 0.0) * np.maximum(sbb - sb**2 / count, 0.0)
+    whole = min(mask_a.sum(), mask_b.sum())
+    enough = count > min(least, 0.5 * whole)
+    # Against the shift's own overlap and a share of the whole, so that a short overlap of little motion cannot win.
+    floor = 1e-3 * (a[mask_a].var() * b[mask_b].var()) * count**2
+    r = np.where(enough, covariance / np.sqrt(variance + floor), 0.0)
+    score = np.arctanh(np.clip(r, 0.0, 0.999999)) * np.sqrt(count)
+    k = int(np.argmax(score))
+    return Shift(k - (len(b) - 1), float(r[k]), float(r.max()))

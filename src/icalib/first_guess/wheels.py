@@ -1,0 +1,205 @@
+"""A differential drive from rates and velocities: time offset by correlation, the rest linearly.
+
+The frame of the wheels stands level here, its z along `up`; roll, pitch and height are left to the estimate. In the
+plane across `up` the origin of the wheels, p_imu_wheel = l_1 e_1 + l_2 e_2, moves along e_1 alone:
+
+    e_2 u + l_1 w = 0                      (no slip)      u, w: velocity and rate of the IMU across and along `up`
+    r theta' = e_1 u - (l_2 -+ b/2) w      (right, left)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.errors import EstimationError
+from icalib.estimation.imu_data import ImuData
+from icalib.first_guess.correlation import best_shift
+
+GRID_HZ = 100.0
+SHORTEST_OVERLAP_S = 4.0
+LEAST_CORRELATION = 0.7
+WINDOW_S = 0.1  # of a mean rate of the wheels: long against the steps of ticks
+LEAST_WINDOWS = 20
+LONGEST_STEP_S = 0.25  # stamps further apart do not give a rate
+LEAST_TURN_RAD_S = 0.03  # RMS
+LEAST_SPEED_M_S = 0.05
+LEAST_SHARE = 0.02  # of speed and turning that does not go with the other
+ROUNDS = 8
+
+
+@dataclass(frozen=True)
+class WheelRates:
+    """Mean rates of both wheels (n, 2) rad/s, left and right, from start to end (n,) s on the wheels' clock."""
+
+    start: np.ndarray
+    end: np.ndarray
+    rate: np.ndarray
+
+
+@dataclass(frozen=True)
+class DriveGuess:
+    """R_imu_wheel, p_imu_wheel (3,) m across `up`, radii (2,) left and right [m], baseline [m]."""
+
+    rotation: np.ndarray
+    position: np.ndarray
+    radii: np.ndarray
+    baseline: float
+
+
+def wheel_rates(name: str, seconds: np.ndarray, angles: np.ndarray) -> WheelRates:
+    """Of the wheels `name`, over windows of about WINDOW_S, one from each of the stamps seconds (N,); angles (N, 2) rad
+    that they have turned. Raises EstimationError where there are hardly any."""
+    a = np.arange(len(seconds))
+    b = np.searchsorted(seconds, seconds + WINDOW_S - 1e-9)
+    good = (b < len(seconds)) & (b > a)
+    a, b = a[good], b[good]
+    near = seconds[b] - seconds[a] < LONGEST_STEP_S
+    a, b = a[near], b[near]
+    if len(a) < LEAST_WINDOWS:
+        raise EstimationError(
+            f"{name}: hardly any of its {len(seconds)} readings are closer than {LONGEST_STEP_S} s to the next; check "
+            "its stamps, or record for longer."
+        )
+    span = seconds[b] - seconds[a]
+    return WheelRates(seconds[a], seconds[b], (angles[b] - angles[a]) / span[:, None])
+
+
+def wheel_offset(imu: ImuData, up: np.ndarray, name: str, rates: WheelRates) -> float:
+    """Seconds to add to the clock of the wheels `name` to get that of the IMU, both since their first stamps.
+
+    From the rate about `up` (3,), upwards in the IMU's axes, and the difference of the wheels. Raises EstimationError
+    where they do not match at any shift.
+    """
+    axis = up / np.linalg.norm(up)
+    turn = imu.gyro @ axis
+    offset = _correlate(imu, turn, name, rates)
+    angle = np.concatenate([[0.0], np.cumsum(0.5 * (turn[1:] + turn[:-1]) * np.diff(imu.seconds))])
+    for _ in range(ROUNDS):
+        start, end = rates.start + offset, rates.end + offset
+        inside = _covered(imu, start, end)
+        start, end, rate = start[inside], end[inside], rates.rate[inside]
+        mean = (np.interp(end, imu.seconds, angle) - np.interp(start, imu.seconds, angle)) / (end - start)
+        slope = (np.interp(end, imu.seconds, turn) - np.interp(start, imu.seconds, turn)) / (end - start)
+        # mean(offset + d) = mean + slope d = what the wheels say, and the gyro's bias.
+        step = -_fit(np.column_stack([slope, rate, np.ones(len(rate))]), mean)[0]
+        offset += float(np.clip(step, -0.02, 0.02))
+        if abs(step) < 1e-6:
+            break
+    return offset
+
+
+def drive_guess(
+    name: str, wheel_rate: np.ndarray, rate: np.ndarray, velocity: np.ndarray, up: np.ndarray
+) -> DriveGuess:
+    """The drive `name` from mean rates of its wheels (n, 2) rad/s, and the IMU's rate (n, 3) rad/s, without bias, and
+    velocity (n, 3) m/s over the same spans, in the IMU's axes; up (3,): upwards in these.
+
+    Raises EstimationError where the motion does not show it, or left and right or their signs are mixed up.
+    """
+    axis = up / np.linalg.norm(up)
+    level = np.linalg.svd(axis[None])[2][1:]  # two axes across `up`
+    if level[0] @ np.cross(level[1], axis) < 0.0:
+        level = level[::-1]
+    w, u = rate @ axis, velocity @ level.T
+    _check_motion(name, w, u)
+    e2, l1 = _no_slip(w, u)
+    e1 = np.array([e2[1], -e2[0]])
+    left, right = (_fit(np.column_stack([u @ e1, w]), wheel_rate[:, k]) for k in range(2))
+    if left[0] + right[0] < 0.0:  # forwards is where the wheels turn forwards
+        e1, e2, l1, left, right = -e1, -e2, -l1, left * [-1.0, 1.0], right * [-1.0, 1.0]
+    _check_drive(name, w, u @ e1, left, right)
+    radii = np.array([1.0 / left[0], 1.0 / right[0]])
+    arm_left, arm_right = left[1] * radii[0], right[1] * radii[1]
+    baseline = float(arm_right - arm_left)
+    if baseline < 0.0:
+        raise EstimationError(
+            f"{name}: its left and right wheels are swapped, or both count backwards; swap their columns or topics, or "
+            "change the sign of both."
+        )
+    x, y = e1 @ level, e2 @ level
+    return DriveGuess(np.stack([x, y, axis], axis=1), l1 * x - 0.5 * (arm_left + arm_right) * y, radii, baseline)
+
+
+def _fit(A: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Least squares, twice more without rows that stand far off: wheels that slipped."""
+    weight, x = np.ones(len(b)), np.zeros(A.shape[1])
+    for _ in range(3):
+        x = np.linalg.lstsq(A * weight[:, None], b * weight, rcond=None)[0]
+        size = np.abs(b - A @ x)
+        weight = (size < 5.0 * np.median(size) + 1e-12).astype(float)
+    return x
+
+
+def _no_slip(w: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, float]:
+    """e_2 (2,), a unit vector of either sign, and l_1 with e_2 u + l_1 w = 0: the direction in which (u, w) does not
+    spread, w in units that make its spread like that of u."""
+    scale = np.linalg.norm(u) / np.linalg.norm(w)
+    rows, weight, x = np.column_stack([u, w * scale]), np.ones(len(w)), np.zeros(3)
+    for _ in range(3):
+        x = np.linalg.svd(rows * weight[:, None], full_matrices=False)[2][2]
+        size = np.abs(rows @ x)
+        weight = (size < 5.0 * np.median(size) + 1e-12).astype(float)
+    length = np.linalg.norm(x[:2])
+    return x[:2] / length, float(x[2] * scale / length)
+
+
+def _check_motion(name: str, w: np.ndarray, u: np.ndarray) -> None:
+    turn, speed = np.sqrt(np.mean(w**2)), np.sqrt(np.mean((u**2).sum(axis=1)))
+    if turn < LEAST_TURN_RAD_S or speed < LEAST_SPEED_M_S:
+        raise EstimationError(
+            f"{name}: the vehicle turned at {turn:.3f} rad/s and drove at {speed:.3f} m/s RMS, too little to find its "
+            "wheels; record again with curves of both hands, or give its parameters in the rig file."
+        )
+
+
+def _check_drive(name: str, w: np.ndarray, ahead: np.ndarray, left: np.ndarray, right: np.ndarray) -> None:
+    """The vehicle must drive and turn apart from each other, and both wheels turn forwards with it."""
+    a, b = ahead / np.linalg.norm(ahead), w / np.linalg.norm(w)
+    if 1.0 - abs(a @ b) < LEAST_SHARE:
+        raise EstimationError(
+            f"{name}: the vehicle drove one and the same arc all the time, which leaves its wheels open; record again "
+            "with curves of both hands, or give its parameters in the rig file."
+        )
+    if left[0] <= 0.0 or right[0] <= 0.0:
+        raise EstimationError(
+            f"{name}: its wheels count in opposite directions; change the sign of the one that falls as the vehicle "
+            "drives forwards."
+        )
+
+
+def _covered(imu: ImuData, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """(n,) whether each span lies within the IMU's recording and none of its gaps."""
+    inside = (start >= imu.seconds[0]) & (end <= imu.seconds[-1])
+    for a, b in imu.gaps:
+        inside &= (end <= a) | (start >= b)
+    return inside
+
+
+def _correlate(imu: ImuData, turn: np.ndarray, name: str, rates: WheelRates) -> float:
+    """Offset [s] at the peak of the correlation of the gyro's `turn` (N,) with the difference of the wheels."""
+    grid = np.arange(int(imu.seconds[-1] * GRID_HZ) + 1) / GRID_HZ
+    known = np.ones(len(grid), dtype=bool)
+    for start, end in imu.gaps:
+        known &= (grid <= start) | (grid >= end)
+    middle = 0.5 * (rates.start + rates.end)
+    wheels = np.arange(int(middle[-1] * GRID_HZ) + 1) / GRID_HZ
+    near = np.diff(middle, append=middle[-1]) < LONGEST_STEP_S
+    seen = (np.interp(wheels, middle, near.astype(float)) > 0.99) & (wheels >= middle[0])
+    difference = np.interp(wheels, middle, rates.rate[:, 1] - rates.rate[:, 0])
+    turned = np.interp(grid, imu.seconds, turn)
+    found, opposite = (
+        best_shift(sign * turned, known, difference, seen, SHORTEST_OVERLAP_S * GRID_HZ) for sign in (1.0, -1.0)
+    )
+    if opposite.correlation > max(found.correlation, LEAST_CORRELATION):
+        raise EstimationError(
+            f"{name} turns the other way round than {imu.name}: its left and right wheels are swapped, or both count "
+            "backwards; swap their columns or topics, or change the sign of both."
+        )
+    if not found.correlation > LEAST_CORRELATION:
+        raise EstimationError(
+            f"the turning of {name} does not match that of {imu.name} at any shift of their clocks (best correlation "
+            f"{max(found.largest, 0.0):.2f}); check that both come from the same recording and overlap in time."
+        )
+    return found.samples / GRID_HZ

@@ -1,0 +1,111 @@
+"""Targets in a rig file: `target`, or several by name under `targets`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+from icalib.errors import RigError
+from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Markers, Scene, Target
+from icalib.geometry.targets.families import family_name
+from icalib.yaml_nodes import YamlValue
+
+NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")  # of sensors and targets
+# type -> fields that must be there, and those that may
+_FIELDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "aprilgrid": (("rows", "cols", "tag_size", "tag_spacing"), ("border_bits", "squares")),
+    "charuco": (("squares_x", "squares_y", "square_size", "marker_size", "dictionary"), ()),
+    "checkerboard": (("rows", "cols", "square_size"), ()),
+    "markers": (("family", "size"), ("ids", "border_bits")),
+}
+_LARGEST_TAG_M = 2.0  # nobody prints a larger one; it is in millimetres
+_MOST_TAGS = 10_000
+
+
+def target_or_targets(root: YamlValue) -> Target:
+    """What the file has under `target`, or under `targets`: all of them in one scene, the target itself if it is one.
+
+    Raises RigError, one sentence naming file, line, field, what is wrong and what to do.
+    """
+    found = root.entries()
+    if "target" not in found and "targets" not in found:
+        root.fail("target is missing; add target, or targets for several by name.")
+    if "targets" not in found:
+        return target_of(found["target"])
+    if "target" in found:
+        found["targets"].fail("stands beside target; put all targets under targets.")
+    named = found["targets"].entries()
+    for name, value in named.items():
+        if not NAME.fullmatch(name):
+            value.fail("a target's name is a letter, then letters, digits, _ or -, as in wall; rename it.")
+    if not named:
+        found["targets"].fail("there is no target; add one, as in wall: {type: markers, ...}.")
+    targets = tuple(target_of(value) for value in named.values())
+    return targets[0] if len(targets) == 1 else _made(found["targets"], lambda: Scene(tuple(named), targets))
+
+
+def target_of(value: YamlValue) -> Target:
+    """One target from its fields. Raises RigError as `target_or_targets`."""
+    given = value.entries()
+    if "type" not in given:
+        value.fail(f"type is missing; add type: {', type: '.join(_FIELDS)}.")
+    kind = given["type"].choice("target type", tuple(_FIELDS))
+    required, optional = _FIELDS[kind]
+    found = value.record(("type", *required), optional)
+    if kind == "aprilgrid":
+        return _aprilgrid(value, found)
+    if kind == "markers":
+        return _markers(value, found)
+    size = _edge(found["square_size"], "square")
+    if kind == "checkerboard":
+        rows, cols = _counts(value, found, "rows", "cols", "corners")
+        return _made(value, lambda: Checkerboard(rows, cols, size))
+    squares = _counts(value, found, "squares_x", "squares_y", "squares")
+    marker, dictionary = _edge(found["marker_size"], "tag"), _family(found["dictionary"])
+    return _made(value, lambda: Charuco(*squares, size, marker, dictionary))
+
+
+def _aprilgrid(value: YamlValue, found: dict[str, YamlValue]) -> AprilGrid:
+    size = _edge(found["tag_size"], "tag")
+    rows, cols = _counts(value, found, "rows", "cols", "tags")
+    squares = found["squares"].boolean() if "squares" in found else True
+    return AprilGrid(rows, cols, size, found["tag_spacing"].positive(), _border(found, AprilGrid.border_bits), squares)
+
+
+def _markers(value: YamlValue, found: dict[str, YamlValue]) -> Target:
+    family, size = _family(found["family"]), _edge(found["size"], "tag")
+    ids = tuple(entry.whole(0) for entry in found["ids"].items()) if "ids" in found else ()
+    if "ids" in found and not ids:
+        found["ids"].fail("there are no ids; list them, or leave ids out to use all that are seen.")
+    return _made(value, lambda: Markers(family, size, ids, _border(found, Markers.border_bits)))
+
+
+def _family(value: YamlValue) -> str:
+    try:
+        return family_name(value.text())
+    except RigError as error:
+        value.fail(str(error))
+
+
+def _border(found: dict[str, YamlValue], default: int) -> int:
+    return int(found["border_bits"].choice("width of border", ("1", "2"))) if "border_bits" in found else default
+
+
+def _edge(value: YamlValue, what: str) -> float:
+    if (size := value.positive()) > _LARGEST_TAG_M:
+        value.fail(f"is in metres, and {size:g} m is no {what}; write 0.088 for 88 mm.")
+    return size
+
+
+def _counts(value: YamlValue, found: dict[str, YamlValue], first: str, second: str, what: str) -> tuple[int, int]:
+    a, b = found[first].whole(1), found[second].whole(1)
+    if a * b > _MOST_TAGS:
+        value.fail(f"{a} x {b} {what} are more than {_MOST_TAGS}; correct {first} and {second}.")
+    return a, b
+
+
+def _made(value: YamlValue, make: Callable[[], Target]) -> Target:
+    try:
+        return make()
+    except RigError as error:
+        value.fail(str(error))

@@ -1,0 +1,154 @@
+"""A simulated recording as a folder of tables, with its truth. The format: docs/simulation.md."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from icalib.errors import RecordingError
+from icalib.measurements import CornerStream, ImuStream, LidarStream, TrackStream, WheelPoses, WheelStream
+from icalib.simulation.scenario import Scenario
+from icalib.simulation.simulate import Simulation, Truth
+
+_TRUTH_HEADER = """\
+# Truth of a simulated recording, in SI units: p_imu = T_imu_sensor p_sensor, t_imu = t_sensor + time_offset.
+# Planes: [nx, ny, nz, d] in the world, n . p = d. The trajectory and the points of the tracks are in truth.npz.
+"""
+_WHEEL_MEANING = {"mean": "means since the stamp before", "instant": "values at the stamp"}
+
+
+def check_absent(path: Path) -> None:
+    """Raises RecordingError where `path` exists: a recording is never written over another."""
+    if path.exists():
+        raise RecordingError(f"{path} exists already; remove it, or write elsewhere.")
+
+
+@contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """A place beside `path` to write to; moved to `path` at the end, and removed where anything fails.
+
+    Raises RecordingError where `path` exists or cannot be written.
+    """
+    check_absent(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        staging = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be written ({error.strerror or error}); choose another folder.") from None
+    try:
+        yield staging / path.name
+        check_absent(path)
+        (staging / path.name).rename(path)
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be written ({error.strerror or error}); choose another folder.") from None
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+
+
+def write_tables(
+    simulation: Simulation, seed: int, path: Path, progress: Callable[[float], None] = lambda done: None
+) -> tuple[str, ...]:
+    """Writes the measurements as tables, and the truth beside them, into the new folder `path`: all or nothing.
+
+    Returns sentences on what was left out. Raises RecordingError where `path` exists or cannot be written.
+    """
+    measured = simulation.measurements
+    assert measured.imu is not None  # of every scenario
+    with whole(path) as folder:
+        steps: list[Callable[[], None]] = [partial(_write_imu, folder / measured.imu.name, measured.imu)]
+        steps += [partial(_write_corners, folder / c.name, c, simulation.scenario) for c in measured.cameras]
+        steps += [partial(_write_tracks, folder / t.name, t) for t in measured.tracks]
+        steps += [partial(_write_scans, folder / s.name, s) for s in measured.lidars]
+        steps += [partial(_write_wheels, folder / w.name, w) for w in measured.wheels]
+        steps += [partial(write_truth, simulation, seed, folder)]
+        for i, step in enumerate(steps):
+            step()
+            progress((i + 1) / len(steps))
+    return ()
+
+
+def write_truth(simulation: Simulation, seed: int, folder: Path) -> None:
+    """Writes truth.yaml and truth.npz into the folder `folder`, which is there."""
+    truth = simulation.truth
+    text = yaml.safe_dump(_plain_truth(simulation.scenario, truth, seed), sort_keys=False, default_flow_style=None)
+    (folder / "truth.yaml").write_text(_TRUTH_HEADER + text, encoding="utf-8")
+    trajectory = {name: getattr(truth, name) for name in ("position", "velocity", "gyro_bias", "accel_bias", "points")}
+    stamps_ns = truth.imu_clock_origin_ns + np.round(truth.seconds * 1e9).astype(np.int64)
+    np.savez(folder / "truth.npz", stamps_ns=stamps_ns, rotation=truth.R_world_imu, **trajectory)
+
+
+def _plain_truth(scenario: Scenario, truth: Truth, seed: int) -> dict[str, Any]:
+    sensors: dict[str, Any] = {
+        "imu0": {
+            "type": "imu",
+            "gyro_bias": truth.gyro_bias[0].tolist(),
+            "accel_bias": truth.accel_bias[0].tolist(),
+            "intrinsics": truth.imu_intrinsics.tolist(),
+        }
+    }
+    for c in scenario.cameras:
+        parameters = {"intrinsics": list(map(float, c.intrinsics)), "distortion": list(map(float, c.distortion))}
+        sensors[c.name] = _mounted(truth, c.name, "camera", c.T_imu_cam) | {"model": c.model} | parameters
+    for s in scenario.lidars:
+        sensors[s.name] = _mounted(truth, s.name, "lidar", s.T_imu_lidar)
+    for w in scenario.wheels:
+        sizes = {"radii": list(map(float, w.radii)), "baseline": float(w.baseline)}
+        sensors[w.name] = _mounted(truth, w.name, "wheels", w.T_imu_wheel) | sizes
+    plain: dict[str, Any] = {"seed": seed, "gravity": truth.gravity.tolist(), "sensors": sensors}
+    if scenario.board:
+        plain["T_world_bodies"] = truth.T_world_bodies.tolist()
+    return plain | {"planes": truth.planes.tolist()}
+
+
+def _mounted(truth: Truth, name: str, kind: str, T_imu_sensor: np.ndarray) -> dict[str, Any]:
+    return {"type": kind, "T_imu_sensor": T_imu_sensor.tolist(), "time_offset": float(truth.time_offset[name])}
+
+
+def _write_table(path: Path, header: str, *columns: np.ndarray) -> None:
+    """A CSV whose numbers read back exactly. columns: (N,) or (N, k) each."""
+    lists = [c.tolist() for column in columns for c in (column.T if column.ndim == 2 else [column])]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", encoding="utf-8") as file:
+        file.write(f"#{header}\n")
+        file.writelines(",".join(map(repr, row)) + "\n" for row in zip(*lists, strict=True))
+
+
+def _write_imu(folder: Path, imu: ImuStream) -> None:
+    header = "t [ns],wx [rad/s],wy [rad/s],wz [rad/s],ax [m/s^2],ay [m/s^2],az [m/s^2]"
+    _write_table(folder / "data.csv", header, imu.stamps_ns, imu.gyro, imu.accel)
+
+
+def _write_corners(folder: Path, corners: CornerStream, scenario: Scenario) -> None:
+    names = scenario.target.point_identity(corners.point)
+    stamps = corners.stamps_ns[corners.image]
+    _write_table(folder / "corners.csv", "t [ns],tag id,corner,u [px],v [px]", stamps, *names, corners.uv)
+
+
+def _write_tracks(folder: Path, tracks: TrackStream) -> None:
+    stamps = tracks.stamps_ns[tracks.image]
+    _write_table(folder / "tracks.csv", "t [ns],feature,u [px],v [px]", stamps, tracks.feature, tracks.uv)
+
+
+def _write_scans(folder: Path, lidar: LidarStream) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    arrays = {name: getattr(lidar, name) for name in ("stamps_ns", "start", "offset_s", "xyz", "plane")}
+    np.savez(folder / "scans.npz", **arrays)
+
+
+def _write_wheels(folder: Path, wheels: WheelStream | WheelPoses) -> None:
+    if isinstance(wheels, WheelStream):
+        header = f"t [ns],left [rad/s],right [rad/s]; {_WHEEL_MEANING[wheels.meaning]}"
+        _write_table(folder / "rates.csv", header, wheels.stamps_ns, wheels.rate)
+        return
+    header = "from [ns],to [ns],yaw [rad],x [m],y [m],covariance: yaw yaw,yaw x,yaw y,x x,x y,y y"
+    stamps = wheels.stamps_ns
+    upper = wheels.covariance[:, *np.triu_indices(3)]
+    _write_table(folder / "poses.csv", header, stamps[:-1], stamps[1:], wheels.pose, upper)
