@@ -29,11 +29,12 @@ DEGREES = 180.0 / np.pi
 @dataclass(frozen=True)
 class CameraRates:
     """Mean angular rates between neighbouring images: start, end (n,) camera clock [s]; rate (n, 3) camera axes
-    [rad/s]."""
+    [rad/s]; least_correlation: with the IMU's, below which the two do not match."""
 
     start: np.ndarray
     end: np.ndarray
     rate: np.ndarray
+    least_correlation: float = LEAST_CORRELATION
 
 
 @dataclass(frozen=True)
@@ -173,7 +174,7 @@ def _correlate(imu: ImuData, name: str, rates: CameraRates) -> float:
     r = np.where(enough, covariance / np.sqrt(variance + floor), 0.0)
     score = np.arctanh(np.clip(r, 0.0, 0.999999)) * np.sqrt(count)
     k = int(np.argmax(score))
-    if not r[k] > LEAST_CORRELATION:
+    if not r[k] > rates.least_correlation:
         raise EstimationError(
             f"the motion of {name} does not match that of {imu.name} at any shift of their clocks (best correlation "
             f"{max(float(r.max()), 0.0):.2f}); check that both come from the same recording, overlap in time, "
