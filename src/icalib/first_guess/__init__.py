@@ -8,7 +8,7 @@ import numpy as np
 from icalib.estimation.bodies import choose_bodies, restrict
 from icalib.estimation.imu_data import imu_data
 from icalib.first_guess.align_camera import align_camera, trusted
-from icalib.first_guess.clocks import Alignment
+from icalib.first_guess.clocks import Alignment, camera_rates
 from icalib.first_guess.guess import CameraGuess, Guess, relative_offset
 from icalib.first_guess.gyro import GyroRotation
 from icalib.first_guess.intrinsics import camera_params
@@ -47,7 +47,7 @@ def initial_guess(rig: Rig, measurements: Measurements, scene: Placed | None = N
     if imu is None:
         return guess_without_imu(rig, measurements, params, poses, scene.values)
     aligned = [
-        align_camera(c, s, q, imu, measurements)
+        align_camera(c, s, camera_rates(s, q), imu, measurements)
         for c, s, q in zip(rig.cameras, measurements.cameras, poses, strict=True)
     ]
     best = int(np.argmax([q.ok.sum() for q in poses]))

@@ -8,15 +8,14 @@ from icalib.errors import EstimationError
 from icalib.estimation.imu_data import ImuData
 from icalib.first_guess.clocks import (
     Alignment,
+    CameraRates,
     align,
     as_given,
-    camera_rates,
     check_axes,
     contradicts,
     turns_about_two_axes,
 )
 from icalib.first_guess.guess import relative_offset
-from icalib.first_guess.target_poses import TargetPoses
 from icalib.measurements import CornerStream, Measurements
 from icalib.rig import Camera, Parameter
 
@@ -27,10 +26,9 @@ def trusted(parameter: Parameter) -> np.ndarray | None:
 
 
 def align_camera(
-    camera: Camera, stream: CornerStream, poses: TargetPoses, imu: ImuData, measurements: Measurements
+    camera: Camera, stream: CornerStream, rates: CameraRates, imu: ImuData, measurements: Measurements
 ) -> Alignment:
     """What the motion shows; in its place what the rig trusts, and where it shows nothing what the rig guesses."""
-    rates = camera_rates(stream, poses)
     given, held = camera.time_offset.value, trusted(camera.time_offset)
     rotation = camera.rotation.value
     try:

@@ -14,14 +14,15 @@ from icalib.first_guess.align_camera import align_camera, trusted
 from icalib.first_guess.clocks import Alignment
 from icalib.first_guess.guess import CameraGuess, Guess, relative_offset
 from icalib.first_guess.gyro import GyroRotation
-from icalib.first_guess.lever_arm import check_gravity
 from icalib.first_guess.target_poses import TargetPoses
 from icalib.first_guess.track_alignment import align_together, pairs_of
 from icalib.first_guess.track_motion import Motion, Rays, track_motion
-from icalib.first_guess.track_rotation import turned_poses
+from icalib.first_guess.track_rotation import track_rates
 from icalib.geometry.cameras import camera_model
 from icalib.measurements import Measurements
 from icalib.rig import Camera, Rig
+
+LEAST_FELT = 0.7  # of gravity; half the time a rig is not thrown about
 
 
 def guess_from_tracks(rig: Rig, measurements: Measurements) -> Guess:
@@ -30,16 +31,15 @@ def guess_from_tracks(rig: Rig, measurements: Measurements) -> Guess:
     assert imu is not None  # tracks without an IMU are refused before
     params = [_params(c) for c in rig.cameras]
     aligned = [
-        align_camera(c, s, turned_poses(t, camera_model(c.model), p), imu, measurements)
+        align_camera(c, s, track_rates(t, camera_model(c.model), p), imu, measurements)
         for c, s, t, p in zip(rig.cameras, measurements.cameras, measurements.tracks, params, strict=True)
     ]
     aligned = _aligned_together(rig, measurements, imu, params, aligned)
     gyro = GyroRotation.integrate(imu, aligned[0].gyro_bias)
     rays = _rays(rig, measurements, imu, params, [a.offset for a in aligned])
     arms = [trusted(c.translation) for c in rig.cameras]
-    motion = track_motion(gyro, rays, [a.rotation for a in aligned], arms)
-    measured = float(np.median(np.linalg.norm(motion.gravity, axis=1)))
-    check_gravity(measured, rig.gravity, imu.name, any(a.given for a in aligned))
+    _check_units(imu, rig.gravity)
+    motion = track_motion(gyro, rays, [a.rotation for a in aligned], arms, rig.gravity)
     cameras = {}
     for k, (camera, stream, found) in enumerate(zip(rig.cameras, measurements.cameras, aligned, strict=True)):
         given = camera.time_offset.value
@@ -58,6 +58,16 @@ def _aligned_together(
         pairs += pairs_of(k, stream, camera_model(camera.model), params[k])
     held = [(trusted(c.rotation) is not None, trusted(c.time_offset) is not None) for c in rig.cameras]
     return align_together(GyroRotation.integrate(imu, aligned[0].gyro_bias), pairs, aligned, held)
+
+
+def _check_units(imu: ImuData, gravity: float) -> None:
+    """Raises EstimationError where the accelerometer does not feel about `gravity` m/s^2."""
+    felt = float(np.median(np.linalg.norm(imu.accel, axis=1)))
+    if not LEAST_FELT < felt / gravity < 1.0 / LEAST_FELT:
+        raise EstimationError(
+            f"{imu.name} feels {felt:.3g} m/s^2 most of the time instead of about {gravity:.3g}; check that the "
+            "accelerometer is in m/s^2, not in g."
+        )
 
 
 def _params(camera: Camera) -> np.ndarray:

@@ -39,7 +39,7 @@ def pairs_of(camera: int, stream: TrackStream, model: CameraModel, params: np.nd
     rays, valid = model.unproject(params, stream.uv)
     t, found = stream.seconds, []
     for step in STEPS_S:
-        every = image_pairs(stream, step, chain=False)
+        every = image_pairs(stream, step)
         for i, j in every[:: max(1, len(every) // MOST_PAIRS)]:
             p, q = common(stream, valid, i, j)
             if len(p) >= FEWEST_COMMON:

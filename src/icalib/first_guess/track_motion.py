@@ -6,7 +6,8 @@ Rotations come from the gyroscope. Within a window of a few seconds the position
 
 and a camera at p(t) + R p_imu_cam sees its points along known rays: the distance of each point from its rays is linear
 in the points, v0, g, b_a and the lever arms. Points are eliminated, then the windows' own v0 and g. A distance counts
-by the inverse of the point's range, found in rounds.
+by the inverse of the point's range, found in rounds. A window's gravity may differ a little from that of all, because
+the gyroscope drifts; how long gravity is is known.
 """
 
 from __future__ import annotations
@@ -23,7 +24,10 @@ ROUNDS = 5
 BIAS_SIGMA = 0.3  # m/s^2
 ARM_SIGMA = 0.5  # m
 RAY_SIGMA = 5e-3  # rad, of a ray: what rough intrinsics leave
-OWN = 6  # unknowns of a window: v0, g
+OWN = 6  # unknowns of a window: v0, what its g differs by
+SHARED = 6  # of all: g, b_a, then the lever arms
+DRIFT_SIGMA = 0.3  # m/s^2, of a window's gravity about that of all
+GRAVITY_SIGMA = 0.05  # m/s^2, of its length
 
 
 @dataclass(frozen=True)
@@ -98,29 +102,39 @@ class _Integrals:
         return D[:, :3], D[:, 3:].reshape(-1, 3, 3)
 
 
-def track_motion(gyro: GyroRotation, rays: Rays, R_imu_cam: list[np.ndarray], arms: list[np.ndarray | None]) -> Motion:
-    """The IMU's motion while `rays` were seen, by cameras of known rotation; `arms` where they are known."""
+def track_motion(
+    gyro: GyroRotation, rays: Rays, R_imu_cam: list[np.ndarray], arms: list[np.ndarray | None], gravity: float
+) -> Motion:
+    """The IMU's motion while `rays` were seen, by cameras of known rotation; `arms` where they are known; `gravity`
+    m/s^2."""
     low, high = float(rays.times.min()), float(rays.times.max())
     edges = np.linspace(low, high, max(int(round((high - low) / WINDOW_S)), 1) + 1)
     edges[-1] += 1e-6
-    integrals, shared = _Integrals.of(gyro), 3 + 3 * len(R_imu_cam)
+    integrals, shared = _Integrals.of(gyro), SHARED + 3 * len(R_imu_cam)
     systems = [_Window.of(gyro, integrals, rays, R_imu_cam, a, b) for a, b in pairwise(edges)]
-    prior = np.concatenate([np.full(3, BIAS_SIGMA**-2), np.full(shared - 3, ARM_SIGMA**-2)])
+    prior = np.concatenate([np.zeros(3), np.full(3, BIAS_SIGMA**-2), np.full(shared - 6, ARM_SIGMA**-2)])
     mean = np.zeros(shared)
     for k, arm in enumerate(arms):
         if arm is not None:
-            prior[3 + 3 * k : 6 + 3 * k], mean[3 + 3 * k : 6 + 3 * k] = 1e12, arm
+            at = slice(SHARED + 3 * k, SHARED + 3 * k + 3)
+            prior[at], mean[at] = 1e12, arm
     own, common = np.zeros((len(systems), OWN)), mean
     for _ in range(ROUNDS):
         reduced = [w.normal(np.concatenate([x, common])) for w, x in zip(systems, own, strict=True)]
         N, r = np.diag(prior), prior * mean
+        if (length := float(np.linalg.norm(common[:3]))) > 0.0:
+            down = common[:3] / length
+            N[:3, :3] += np.outer(down, down) / GRAVITY_SIGMA**2
+            r[:3] += gravity * down / GRAVITY_SIGMA**2
         for A, b in reduced:
+            A[range(3, OWN), range(3, OWN)] += DRIFT_SIGMA**-2
             K = np.linalg.solve(A[:OWN, :OWN], np.column_stack([A[:OWN, OWN:], b[:OWN]]))
             N = N + A[OWN:, OWN:] - A[OWN:, :OWN] @ K[:, :-1]
             r = r + b[OWN:] - A[OWN:, :OWN] @ K[:, -1]
         common = np.linalg.solve(N, r)
         own = np.array([np.linalg.solve(A[:OWN, :OWN], b[:OWN] - A[:OWN, OWN:] @ common) for A, b in reduced])
-    return Motion(gyro, edges[:-1], own[:, :3], own[:, 3:], common[:3], common[3:].reshape(-1, 3))
+    arms_found = common[SHARED:].reshape(-1, 3)
+    return Motion(gyro, edges[:-1], own[:, :3], own[:, 3:] + common[:3], common[3:6], arms_found)
 
 
 @dataclass
@@ -146,10 +160,11 @@ class _Window:
         t, camera = rays.times[own], rays.camera[own]
         s, R = (t - begin)[:, None, None], gyro.at(t)
         D_f, D_R = integrals.since(begin, t)
-        A = np.zeros((len(t), 3, OWN + 3 + 3 * len(R_ic)))
-        A[:, :, 0:3], A[:, :, 3:6], A[:, :, 6:9] = s * np.eye(3), 0.5 * s**2 * np.eye(3), -D_R
+        A = np.zeros((len(t), 3, OWN + SHARED + 3 * len(R_ic)))
+        A[:, :, 0:3], A[:, :, 3:6] = s * np.eye(3), 0.5 * s**2 * np.eye(3)
+        A[:, :, 6:9], A[:, :, 9:12] = A[:, :, 3:6], -D_R
         for k in range(len(R_ic)):
-            A[camera == k, :, 9 + 3 * k : 12 + 3 * k] = R[camera == k]
+            A[camera == k, :, 12 + 3 * k : 15 + 3 * k] = R[camera == k]
         direction = np.einsum("nij,njk,nk->ni", R, np.stack(R_ic)[camera], rays.direction[own])
         return cls(A, D_f, direction, track)
 

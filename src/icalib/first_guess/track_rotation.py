@@ -5,16 +5,19 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from icalib.first_guess.target_poses import TargetPoses
+from icalib.errors import EstimationError
+from icalib.first_guess.clocks import CameraRates
 from icalib.geometry import so3
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.small import solve_definite
 from icalib.measurements import TrackStream
 
 FEWEST_COMMON = 12  # points in two images
+FEWEST_RATES = 20
+LEAST_CORRELATION = 0.5  # with the IMU's rates; these here are noisy
 ROUNDS = 10
 DIRECTION_ROUNDS = 4
-STEP_S = 0.2  # between images: long against the noise of tracks, short against the loss of sight
+STEP_S = 0.4  # between images: over less, turning and moving sideways look alike
 DAMPING = 1e-9  # of the mean diagonal: a camera that does not move has no direction of motion
 
 
@@ -136,33 +139,33 @@ def _start(f: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.ascontiguousarray(R), start_direction(f, h, R)
 
 
-def turned_poses(stream: TrackStream, model: CameraModel, params: np.ndarray) -> TargetPoses:
-    """Rotations of images about STEP_S apart, one after the other from the first on; `ok` where enough points tie an
-    image to the one before it or after it. Positions are unknown, zero."""
+def track_rates(stream: TrackStream, model: CameraModel, params: np.ndarray) -> CameraRates:
+    """Mean angular rates from each image to the one about STEP_S later. Raises EstimationError where hardly any images
+    share enough points."""
     rays, valid = model.unproject(params, stream.uv)
-    m = len(stream.stamps_ns)
-    rotation, ok = np.tile(np.eye(3), (m, 1, 1)), np.zeros(m, dtype=bool)
-    for i, j in image_pairs(stream, STEP_S, chain=True):
+    t, found = stream.seconds, []
+    for i, j in image_pairs(stream, STEP_S):
         p, q = common(stream, valid, i, j)
-        rotation[j] = rotation[i]
         if len(p) < FEWEST_COMMON:
             continue
         f, h = rays[p], rays[q]
-        R, t = _start(f, h)
-        if turn_between(f, h, R, t):
-            rotation[j] = rotation[i] @ R.T
-            ok[i] = ok[j] = True
-    return TargetPoses(rotation, np.zeros((m, 3)), ok, np.zeros(m))
+        R, direction = _start(f, h)
+        if turn_between(f, h, R, direction):
+            found.append((t[i], t[j], *(-so3.log(R) / (t[j] - t[i]))))
+    if len(found) < FEWEST_RATES:
+        raise EstimationError(
+            f"{stream.name}: only {len(found)} pairs of images {STEP_S} s apart share {FEWEST_COMMON} points or more; "
+            "record for longer, or follow more points for longer."
+        )
+    rows = np.array(found)
+    return CameraRates(rows[:, 0].copy(), rows[:, 1].copy(), rows[:, 2:].copy(), LEAST_CORRELATION)
 
 
-def image_pairs(stream: TrackStream, step: float, chain: bool) -> list[tuple[int, int]]:
-    """Images about `step` seconds apart: in a `chain` each begins where the one before ends, else at each image."""
-    t, pairs, i = stream.seconds, [], 0
+def image_pairs(stream: TrackStream, step: float) -> list[tuple[int, int]]:
+    """Each image and the one about `step` seconds later."""
+    t = stream.seconds
     after = np.searchsorted(t, t + step - 0.5 * float(np.median(np.diff(t))))
-    while i < len(t) and after[i] < len(t):
-        pairs.append((i, int(max(after[i], i + 1))))
-        i = pairs[-1][1] if chain else i + 1
-    return [(i, j) for i, j in pairs if j < len(t)]
+    return [(i, int(j)) for i, j in enumerate(after) if i < j < len(t)]
 
 
 def common(stream: TrackStream, valid: np.ndarray, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:

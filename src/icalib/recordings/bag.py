@@ -94,7 +94,7 @@ class BagRecording:
         return f"{self.root} {topic}"
 
     def files(self) -> list[Path]:
-        return [storage.name for storage in self._storages]
+        return [*(storage.name for storage in self._storages), *self._tables]
 
     def notes(self) -> tuple[str, ...]:
         damage = (note for storage in self._storages for note in storage.notes)

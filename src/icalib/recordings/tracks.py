@@ -13,7 +13,7 @@ from icalib.recordings.table import read_table
 
 INTEGERS, DECIMALS = ("t [ns]", "feature"), ("u [px]", "v [px]")
 _RATE_HZ = (1e-3, 1000.0)
-_MARGIN_PX = 1.0  # trackers may step over the edge
+_MARGIN_PX = 5.0  # trackers step over the edge by a few times their noise
 
 
 def read_tracks(name: str, path: Path, resolution: tuple[int, int]) -> TrackStream:
