@@ -130,3 +130,24 @@ def test_without_a_guess_a_single_axis_is_refused_with_the_missing_motion():
     simulation = simulate(moving("single_axis"), 0)
     with pytest.raises(EstimationError, match="turned about one axis only.*turn the rig about two more axes"):
         calibrate_measurements(rig_for(simulation.scenario), simulation.measurements)
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "group"),
+    [
+        ({"rotation_tolerance_deg": 1e-4}, "rotation"),
+        ({"translation_tolerance_m": 1e-5}, "translation"),
+        ({"time_tolerance_s": 1e-7}, "time_offset"),
+        ({"pixel_tolerance": 1e-3}, "intrinsics"),
+    ],
+)
+def test_a_tighter_tolerance_makes_a_parameter_weak(tolerance: dict[str, float], group: str):
+    simulation = simulate(handheld(10.0), 0)
+    rig = rig_for(simulation.scenario, intrinsics="free")
+    tight = dataclasses.replace(rig, settings=dataclasses.replace(rig.settings, **tolerance))
+    usual, strict = (calibrate_measurements(r, simulation.measurements) for r in (rig, tight))
+    for name in ("rotation", "translation", "time_offset", "intrinsics"):
+        assert set(usual.group("cam0", name).verdict) == {"determined"}
+        weak = set(strict.group("cam0", name).verdict) != {"determined"}
+        assert weak == (name == group)
+    np.testing.assert_allclose(strict.group("cam0", group).std_formal, usual.group("cam0", group).std_formal, rtol=0.02)
