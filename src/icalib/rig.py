@@ -98,6 +98,11 @@ class Settings:
     splits: int = 8  # segments for the empirical factor, 0: none
     max_gap_s: float = 0.5  # IMU gaps up to this are bridged; longer ones split the recording
     node_spacing_s: float = 0.05  # no two nodes further apart
+    # What is known to better than these is determined.
+    rotation_tolerance_deg: float = 0.1
+    translation_tolerance_m: float = 5e-3
+    time_tolerance_s: float = 1e-3
+    pixel_tolerance: float = 1.0  # of fx, fy, cx, cy
 
 
 @dataclass(frozen=True)

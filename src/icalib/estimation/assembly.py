@@ -74,7 +74,8 @@ def inputs_for(rig: Rig, recordings: Sequence[Measurements]) -> Inputs:
     bodies = choose_bodies(rig.target, recordings, rig.settings.board_shape)
     joined, parts = join(rig, [on_common_images(rig, restrict(bodies, r)) for r in recordings])
     layout = layout_for(rig, bodies, len(parts))
-    return Inputs(rig, joined, bodies, joined_imu_data(rig, parts, joined), layout, Tolerances(), parts)
+    tolerances = Tolerances.asked_for(rig.settings)
+    return Inputs(rig, joined, bodies, joined_imu_data(rig, parts, joined), layout, tolerances, parts)
 
 
 def layout_for(rig: Rig, bodies: Bodies, n_recordings: int = 1) -> Layout:
