@@ -42,7 +42,7 @@ TOLERANCE = {
     "bloom": 0.1,
     "plane": (2e-3, 2e-3, 5e-3),
 }
-TABLE2 = Path(__file__).parents[2] / "examples" / "paper" / "table2-3d.yaml"
+PAPER = Path(__file__).parents[2] / "examples" / "paper"
 FEWEST_POINTS = 200  # of a plane in a setup
 
 
@@ -266,9 +266,11 @@ def make_room(sim: Simulation, *, imu_free: bool = False, spacing: float = 0.025
     return RoomSetup(sim, imu, make_layout(entries), planes, own[stream.plane], state)
 
 
-def room_scenario(duration_s: float, *, noiseless: bool = False, exact: bool = True, **lidar) -> Scenario:
-    """The paper's robot with IMU and LiDAR alone, moving freely; `lidar`: changes of it."""
-    scenario = load_scenario(TABLE2)
+def room_scenario(
+    duration_s: float, *, example: str = "table2-3d", noiseless: bool = False, exact: bool = True, **lidar
+) -> Scenario:
+    """The paper's robot with IMU and LiDAR alone, moving freely or as another example; `lidar`: changes of it."""
+    scenario = load_scenario(PAPER / f"{example}.yaml")
     return replace(
         scenario,
         duration_s=duration_s,
