@@ -25,6 +25,7 @@ from icalib.estimation.nodes import place_nodes
 from icalib.estimation.poses import assign_nodes
 from icalib.estimation.problem import Problem
 from icalib.estimation.state import NODE, Layout, State, make_layout
+from icalib.estimation.tolerances import Tolerances
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.planes import plane_of
 from icalib.geometry.targets import AprilGrid
@@ -236,7 +237,7 @@ class RoomSetup:
         imu = ImuFactor.build(self.imu, start, 9.81, columns[columns >= 0])
         gauge = Gauge(0, self.state.rotation[0], self.state.position[0])
         lidar = self.factor(start, noise, **options)
-        return Problem(self.layout, imu, (lidar,), (gauge,), self.columns_scale())
+        return Problem(self.layout, imu, (lidar,), (gauge,), Tolerances().of(self.layout, "imu0"))
 
 
 def make_room(sim: Simulation, *, imu_free: bool = False, spacing: float = 0.025) -> RoomSetup:

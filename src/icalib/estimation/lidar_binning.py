@@ -28,7 +28,7 @@ from icalib.measurements import LidarStream
 from icalib.rig import Loss
 
 BIN_S = 1e-3
-POINTS_AT_A_TIME = 500_000  # by one thread: what a chunk needs beside the cloud stays small
+POINTS_AT_A_TIME = 150_000  # by one thread: what a chunk needs beside the cloud stays small
 MOMENTS = 10  # of (1, x, y, z), lower triangle row by row
 LOSSES: dict[Loss, int] = {"none": 0, "huber": 1, "cauchy": 2}
 NO_PIVOT = 1e-13  # of a moment: below this a pivot is rounding
@@ -160,15 +160,15 @@ def _to_lidar(R_il, p_il, R, p, rate, velocity):
 
 
 @njit(cache=True, nogil=True)
-def _bin_range(start, offset_s, bin_s, low, count):
+def _bin_range(start, offset_s, per_s, low, count):
     """First bin of each scan, counted from its stamp, and how many there are."""
     for i in range(len(start) - 1):
         least, most = np.inf, -np.inf
         for n in range(start[i], start[i + 1]):
             least, most = min(least, offset_s[n]), max(most, offset_s[n])
         empty = start[i + 1] == start[i]
-        low[i] = 0 if empty else int(np.floor(least / bin_s))
-        count[i] = 0 if empty else int(np.floor(most / bin_s)) - low[i] + 1
+        low[i] = 0 if empty else int(np.floor(np.float64(least) * per_s))
+        count[i] = 0 if empty else int(np.floor(np.float64(most) * per_s)) - low[i] + 1
 
 
 @njit(cache=True, nogil=True)
@@ -181,40 +181,39 @@ def _see_plane(R, p, plane, seen):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def _add_point(x, y, z, seen, weights, sums):
-    """Adds one weighted point to ten moments."""
-    r = seen[0] + seen[1] * x + seen[2] * y + seen[3] * z
-    variance = weights.alike
-    if weights.along > 0.0:
-        across = seen[1] * x + seen[2] * y + seen[3] * z
-        variance += weights.along * across * across / (x * x + y * y + z * z)
-    w = 1.0 / variance
-    if weights.loss:
-        w *= weight(weights.loss, weights.scale, r * r * w)[0]
+def _add_point(x, y, z, s, seen, weights, sums):
+    """Adds one weighted point to the ten moments in row s."""
+    w = 1.0 / weights.alike
+    if weights.along > 0.0 or weights.loss:
+        across = seen[s, 1] * x + seen[s, 2] * y + seen[s, 3] * z
+        if weights.along > 0.0:
+            w = 1.0 / (weights.alike + weights.along * across * across / (x * x + y * y + z * z))
+        if weights.loss:
+            w *= weight(weights.loss, weights.scale, (seen[s, 0] + across) ** 2 * w)[0]
     wx, wy, wz = w * x, w * y, w * z
-    sums[0] += w
-    sums[1] += wx
-    sums[2] += wx * x
-    sums[3] += wy
-    sums[4] += wy * x
-    sums[5] += wy * y
-    sums[6] += wz
-    sums[7] += wz * x
-    sums[8] += wz * y
-    sums[9] += wz * z
+    sums[s, 0] += w
+    sums[s, 1] += wx
+    sums[s, 2] += wx * x
+    sums[s, 3] += wy
+    sums[s, 4] += wy * x
+    sums[s, 5] += wy * y
+    sums[s, 6] += wz
+    sums[s, 7] += wz * x
+    sums[s, 8] += wz * y
+    sums[s, 9] += wz * z
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _bin_scan(i, scans, motion, planes, weights, bin_s, slot, seen, sums, count, where):
+def _bin_scan(i, scans, motion, planes, weights, per_s, slot, seen, sums, count, where):
     """Moments of scan i in the order in which its bins and planes were met; returns how many. where (m, 2): which."""
-    used, low, first = 0, scans.low[i], scans.bins[i]
+    used, low, first, bin_s = 0, scans.low[i], scans.bins[i], 1.0 / per_s
     slot[: scans.bins[i + 1] - first] = -1
     for n in range(scans.start[i], scans.start[i + 1]):
         q = scans.plane[n]
         if q < 0:
             continue
         offset = np.float64(scans.offset_s[n])
-        k = int(np.floor(offset / bin_s)) - low
+        k = int(np.floor(offset * per_s)) - low
         b = first + k
         if not scans.ok[b]:
             continue
@@ -226,14 +225,15 @@ def _bin_scan(i, scans, motion, planes, weights, bin_s, slot, seen, sums, count,
             sums[s] = 0.0
             count[s] = 0
             where[s, 0], where[s, 1] = b, q
-        dt, h = offset - (k + low + 0.5) * bin_s, 0.5 * (offset - (k + low + 0.5) * bin_s)
+        dt = offset - (k + low + 0.5) * bin_s
+        h = 0.5 * dt
         x, y, z = np.float64(scans.xyz[n, 0]), np.float64(scans.xyz[n, 1]), np.float64(scans.xyz[n, 2])
         w0, w1, w2 = motion.rate[b, 0], motion.rate[b, 1], motion.rate[b, 2]
         mx, my, mz = x + h * (w1 * z - w2 * y), y + h * (w2 * x - w0 * z), z + h * (w0 * y - w1 * x)
         x += dt * (motion.velocity[b, 0] + w1 * mz - w2 * my)
         y += dt * (motion.velocity[b, 1] + w2 * mx - w0 * mz)
         z += dt * (motion.velocity[b, 2] + w0 * my - w1 * mx)
-        _add_point(x, y, z, seen[s], weights, sums[s])
+        _add_point(x, y, z, s, seen, weights, sums)
         count[s] += 1
     return used
 
@@ -256,7 +256,7 @@ def _root_in_place(M):
 
 
 @njit(cache=True, nogil=True)
-def _bin_scans(scans, motion, planes, weights, bin_s, bins, plane, count, root):
+def _bin_scans(scans, motion, planes, weights, per_s, bins, plane, count, root):
     """All scans one after the other: entries' bin, plane, count and root; returns how many."""
     longest, total = 0, 0
     for i in range(len(scans.start) - 1):
@@ -265,7 +265,7 @@ def _bin_scans(scans, motion, planes, weights, bin_s, bins, plane, count, root):
     slot, seen = np.empty((longest, len(planes)), np.int32), np.empty((n, 4))
     sums, number, where = np.empty((n, MOMENTS)), np.empty(n, np.int64), np.empty((n, 2), np.int64)
     for i in range(len(scans.start) - 1):
-        used = _bin_scan(i, scans, motion, planes, weights, bin_s, slot, seen, sums, number, where)
+        used = _bin_scan(i, scans, motion, planes, weights, per_s, slot, seen, sums, number, where)
         for s in range(used):
             bins[total], plane[total], count[total] = where[s, 0], where[s, 1], number[s]
             root[total] = sums[s]
@@ -314,7 +314,7 @@ def _moments_of(
     points = slice(start[0], start[-1])
     start, offset_s = start - start[0], stream.offset_s[points]
     low, width = np.empty(len(start) - 1, np.int64), np.empty(len(start) - 1, np.int64)
-    _bin_range(start, offset_s, bin_s, low, width)
+    _bin_range(start, offset_s, 1.0 / bin_s, low, width)
     bins = np.concatenate([[0], np.cumsum(width)])
     within = np.arange(bins[-1]) - np.repeat(bins[:-1] - low, width)
     seconds = np.repeat(stream.seconds[own], width) + (within + 0.5) * bin_s
@@ -326,7 +326,7 @@ def _moments_of(
     most = min(len(offset_s), bins[-1] * len(cloud.planes))
     bin_of, own_plane, count = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)
     root = np.empty((most, MOMENTS))
-    n = _bin_scans(scans, motion, cloud.planes, weights, bin_s, bin_of, own_plane, count, root)
+    n = _bin_scans(scans, motion, cloud.planes, weights, 1.0 / bin_s, bin_of, own_plane, count, root)
     return seconds, bin_of[:n].copy(), own_plane[:n].copy(), count[:n].copy(), root[:n].copy()
 
 
