@@ -8,7 +8,7 @@ is seen from the side that its normal points to.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -60,20 +60,23 @@ class PlaneSearch:
 
 @dataclass(frozen=True)
 class FoundPlanes:
-    """planes (P, 6): normal, towards whoever saw it, and centroid, world; cells: where they are."""
+    """cells: where planes are, the first `count` of them the planes found, the others surfaces that bend or are small
+    and only keep points from their neighbours."""
 
     cells: Cells
+    count: int
 
     @property
     def planes(self) -> np.ndarray:
-        return self.cells.planes
+        """(P, 6) normal, towards whoever saw it, and about the centroid, world frame."""
+        return self.cells.planes[: self.count]
 
     @property
     def areas_m2(self) -> np.ndarray:
         """(P,) of the cells of each."""
         edges = np.append(self.cells.first, len(self.cells.use))
         before = np.append(0, np.cumsum(self.cells.use == OWN))
-        return np.diff(before[edges]) * self.cells.edge_m**2
+        return np.diff(before[edges])[: self.count] * self.cells.edge_m**2
 
     def of_points(self, points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch) -> np.ndarray:
         """(N,) int32, the plane of each of points (N, 3) seen from (N, 3), world; -1: none."""
@@ -85,17 +88,17 @@ def find_planes(points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch =
     step = max(1, len(points) // MOST_POINTS)
     points, seen_from = points[::step], seen_from[::step]
     if not len(points):
-        return FoundPlanes(_packed([], [], [], [], [], search.voxel_m))
+        return FoundPlanes(_packed([], search.voxel_m), 0)
     voxels = _voxels(points, seen_from, search)
     region = np.full(len(voxels.centre), -1, dtype=np.int64)
     count = grow(voxels, np.argsort(voxels.sigma, kind="stable"), region)
     members = [
         np.flatnonzero(region == k) for k in np.flatnonzero(np.bincount(region[region >= 0], minlength=count) > 2)
     ]
-    cells = _cells(_join(voxels, members), voxels, search)
+    patches = _patches(_join(voxels, members), voxels, search)
     for _ in range(ROUNDS):
-        cells = _refined(cells, points, seen_from, search)
-    return FoundPlanes(cells)
+        patches = _refined(patches, points, seen_from, search)
+    return FoundPlanes(_packed(patches, search.voxel_m), sum(p.own > 0 for p in patches))
 
 
 def _voxels(points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch) -> Voxels:
@@ -175,39 +178,55 @@ def _join(voxels: Voxels, members: list[np.ndarray]) -> list[_Region]:
     return sorted(joined, key=lambda r: -len(r.members))
 
 
-def _cells(regions: list[_Region], voxels: Voxels, search: PlaneSearch) -> Cells:
-    """The squares that the voxels of regions lie in, and those around them; bent and small regions are left out."""
-    planes, axes, low, size, use = [], [], [], [], []
-    bent = np.zeros(len(voxels.centre), dtype=bool)
+@dataclass(frozen=True)
+class _Patch:
+    """One plane (6,) and its cells `use` (i, j) on a grid along axes (2, 3) from `low` (2,) on."""
+
+    plane: np.ndarray
+    axes: np.ndarray
+    low: np.ndarray
+    use: np.ndarray
+
+    @property
+    def own(self) -> int:
+        return int((self.use == OWN).sum())
+
+    def unowned(self) -> _Patch:
+        """What takes no points, but keeps others from taking them."""
+        return replace(self, use=np.minimum(self.use, NEAR))
+
+
+def _patches(regions: list[_Region], voxels: Voxels, search: PlaneSearch) -> list[_Patch]:
+    """The squares that the voxels of regions lie in, and those around them; bent regions own none."""
+    patches, bent = [], np.zeros(len(voxels.centre), dtype=bool)
     for region in regions:
-        if region.bends(voxels) or region.continues(voxels, bent):
-            bent[region.members] = True
-            continue
         across = tangents(region.normal)
         uv = (voxels.centre[region.members] - region.centre) @ across.T
-        start = uv.min(axis=0) - 1.5 * search.voxel_m
-        ij = np.floor((uv - start) / search.voxel_m).astype(int)
-        grid = np.full(ij.max(axis=0) + 2, OUTSIDE, dtype=np.uint8)
+        low = uv.min(axis=0) - 1.5 * search.voxel_m
+        ij = np.floor((uv - low) / search.voxel_m).astype(int)
+        use = np.full(ij.max(axis=0) + 2, OUTSIDE, dtype=np.uint8)
         for i in (-1, 0, 1):
             for j in (-1, 0, 1):
-                grid[ij[:, 0] + i, ij[:, 1] + j] = OWN
-        planes.append(plane_of(region.normal, region.centre))
-        axes.append(across)
-        low.append(start)
-        size.append(grid.shape)
-        use.append(grid.ravel())
-    return _packed(planes, axes, low, size, use, search.voxel_m)
+                use[ij[:, 0] + i, ij[:, 1] + j] = OWN
+        patch = _Patch(plane_of(region.normal, region.centre), across, low, use)
+        if region.bends(voxels) or region.continues(voxels, bent):
+            bent[region.members] = True
+            patch = patch.unowned()
+        patches.append(patch)
+    return patches
 
 
-def _packed(planes: list, axes: list, low: list, size: list, use: list, edge_m: float) -> Cells:
-    first = np.cumsum([0, *(len(u) for u in use)])[:-1].astype(np.int64)
+def _packed(patches: list[_Patch], edge_m: float) -> Cells:
+    """Patches in the arrays of kernels, those that own cells first."""
+    patches = sorted(patches, key=lambda p: -p.own)
+    first = np.cumsum([0, *(p.use.size for p in patches)])[:-1].astype(np.int64)
     return Cells(
-        np.array(planes).reshape(-1, 6),
-        np.array(axes).reshape(-1, 2, 3),
-        np.array(low).reshape(-1, 2),
-        np.array(size, dtype=np.int64).reshape(-1, 2),
+        np.array([p.plane for p in patches]).reshape(-1, 6),
+        np.array([p.axes for p in patches]).reshape(-1, 2, 3),
+        np.array([p.low for p in patches]).reshape(-1, 2),
+        np.array([p.use.shape for p in patches], dtype=np.int64).reshape(-1, 2),
         first,
-        np.concatenate(use) if use else np.zeros(0, dtype=np.uint8),
+        np.concatenate([np.zeros(0, dtype=np.uint8), *(p.use.ravel() for p in patches)]),
         edge_m,
     )
 
@@ -222,26 +241,24 @@ def _associate(
     return plane, cell, distance
 
 
-def _refined(cells: Cells, points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch) -> Cells:
-    """Planes fitted to their own points, without cells that are empty or not flat, and without planes that are small;
-    cells stay where they are."""
+def _refined(patches: list[_Patch], points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch) -> list[_Patch]:
+    """Planes fitted to their own points, without cells that are empty or not flat; small ones own none any more."""
+    patches = sorted(patches, key=lambda p: -p.own)
+    cells = _packed(patches, search.voxel_m)
     plane, cell, distance = _associate(cells, points, seen_from, search)
-    stats, moments = np.zeros((len(cells.use), 3)), np.zeros((len(cells.planes), MOMENTS))
+    stats, moments = np.zeros((len(cells.use), 3)), np.zeros((len(patches), MOMENTS))
     sum_cells(points, search.variance(points, seen_from), plane, cell, distance, stats, moments)
-    count = stats[:, 0]
-    good = (count >= FEWEST) & (stats[:, 2] < MIXED**2 * count)
-    use = np.where(cells.use == OUTSIDE, OUTSIDE, np.where(good, OWN, NEAR)).astype(np.uint8)
-    found: tuple[list, list, list, list, list] = ([], [], [], [], [])
-    for q, (i, j) in enumerate(cells.size):
-        own = slice(cells.first[q], cells.first[q] + i * j)
-        if (use[own] == OWN).sum() * search.voxel_m**2 < search.smallest_m2:
+    good = (stats[:, 0] >= FEWEST) & (stats[:, 2] < MIXED**2 * stats[:, 0])
+    use = np.where(good, cells.use, np.minimum(cells.use, NEAR))
+    refined = []
+    for patch, first, sums in zip(patches, cells.first, moments, strict=True):
+        own = use[first : first + patch.use.size].reshape(patch.use.shape)
+        if (own == OWN).sum() * search.voxel_m**2 < search.smallest_m2:
+            refined.append(patch.unowned())
             continue
-        normal, centre = cells.planes[q, :3].copy(), np.empty(3)
-        fit(moments[q], normal, centre)
-        # The cells' frame stays at the old point: the new one is where the normal through it meets the plane.
-        at = cells.planes[q, 3:] + normal * (normal @ (centre - cells.planes[q, 3:]))
-        for into, value in zip(
-            found, (np.append(normal, at), cells.axes[q], cells.low[q], (i, j), use[own]), strict=True
-        ):
-            into.append(value)
-    return _packed(*found, search.voxel_m)
+        normal, old, centre = patch.plane[:3].copy(), patch.plane[3:], np.empty(3)
+        fit(sums, normal, centre)
+        # The cells stay where they are: the point moves along the normal only.
+        at = old + normal * (normal @ (centre - old))
+        refined.append(replace(patch, plane=np.append(normal, at), use=own))
+    return refined
