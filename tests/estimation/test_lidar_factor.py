@@ -9,7 +9,7 @@ import pytest
 
 from icalib.errors import EstimationError
 from icalib.estimation.arrowhead import make_pieces, solve
-from icalib.estimation.lidar_binning import Associated, LidarNoise, take_moments
+from icalib.estimation.lidar_binning import Associated, LidarNoise, in_world, take_moments
 from icalib.estimation.poses import Poses, assign_nodes, poses_at
 from icalib.estimation.state import NODE
 from icalib.geometry.planes import moved
@@ -147,6 +147,16 @@ def test_points_move_to_the_centre_of_their_bin_as_the_sensor_moved(robot, room_
     assert np.linalg.norm(own.rate, axis=1).max() > np.deg2rad(60.0)
     assert np.linalg.norm(still - exact, axis=1).max() > 2e-3
     assert np.linalg.norm(found - exact, axis=1).max() < 1e-5
+
+
+def test_points_in_the_world_are_where_each_was_seen(robot, room_of):
+    setup = room_of(brisk(robot))
+    points, seen_from = in_world(setup.motion(setup.state), setup.stream)
+    poses, _ = poses_of_points(setup, setup.state, point_times(setup))
+    exact, _ = world_points(setup, setup.state, poses, setup.stream.xyz.astype(np.float64))
+    sensor, _ = world_points(setup, setup.state, poses, np.zeros(setup.stream.xyz.shape))
+    assert np.linalg.norm(points - exact, axis=1).max() < 2e-5
+    assert np.linalg.norm(seen_from - sensor, axis=1).max() < 5e-6
 
 
 def test_a_point_beyond_its_plane_has_a_positive_residual(sparse_room, room_of, dense):

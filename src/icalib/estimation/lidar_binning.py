@@ -305,25 +305,30 @@ def _groups(stream: LidarStream) -> Iterator[slice]:
     return (slice(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True))
 
 
-def _moments_of(
-    cloud: Associated, drive: Motion, noise: LidarNoise, bin_s: float, own: slice
-) -> tuple[np.ndarray, ...]:
-    """Of some of the scans: seconds of the bins, and of each entry bin, plane, count and root."""
-    stream, state = cloud.stream, drive.state
+def _laid_out(stream: LidarStream, plane: np.ndarray, bin_s: float, own: slice) -> tuple[_Scans, np.ndarray, slice]:
+    """Some of the scans with their bins, all usable; the bins' seconds on the LiDAR's clock; which points they are."""
     start = stream.start[own.start : own.stop + 1]
-    points = slice(start[0], start[-1])
+    points = slice(int(start[0]), int(start[-1]))
     start, offset_s = start - start[0], stream.offset_s[points]
     low, width = np.empty(len(start) - 1, np.int64), np.empty(len(start) - 1, np.int64)
     _bin_range(start, offset_s, 1.0 / bin_s, low, width)
     bins = np.concatenate([[0], np.cumsum(width)])
     within = np.arange(bins[-1]) - np.repeat(bins[:-1] - low, width)
     seconds = np.repeat(stream.seconds[own], width) + (within + 0.5) * bin_s
-    times = seconds + state.values[stream.name, "time_offset"][0]
-    ok = usable(drive.imu, times, drive.max_gap_s)
-    scans = _Scans(start, offset_s, stream.xyz[points], cloud.plane[points], low, bins, ok)
-    motion = sweep(drive, stream.name, times)
+    ok = np.ones(len(seconds), dtype=bool)
+    return _Scans(start, offset_s, stream.xyz[points], plane[points], low, bins, ok), seconds, points
+
+
+def _moments_of(
+    cloud: Associated, drive: Motion, noise: LidarNoise, bin_s: float, own: slice
+) -> tuple[np.ndarray, ...]:
+    """Of some of the scans: seconds of the bins, and of each entry bin, plane, count and root."""
+    scans, seconds, _ = _laid_out(cloud.stream, cloud.plane, bin_s, own)
+    times = seconds + drive.state.values[cloud.stream.name, "time_offset"][0]
+    scans = scans._replace(ok=usable(drive.imu, times, drive.max_gap_s))
+    motion = sweep(drive, cloud.stream.name, times)
     weights = _Weights(noise.sigma**2, noise.beam_sigma**2, LOSSES[noise.loss], noise.loss_scale)
-    most = min(len(offset_s), bins[-1] * len(cloud.planes))
+    most = min(len(scans.xyz), len(seconds) * len(cloud.planes))
     bin_of, own_plane, count = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)
     root = np.empty((most, MOMENTS))
     n = _bin_scans(scans, motion, cloud.planes, weights, 1.0 / bin_s, bin_of, own_plane, count, root)
@@ -343,3 +348,36 @@ def sweep(drive: Motion, name: str, times: np.ndarray) -> Sweep:
     R_il, p_il = state.values[name, "rotation"], state.values[name, "translation"]
     _to_lidar(np.ascontiguousarray(R_il), p_il, R, p, rate, velocity)
     return Sweep(R, p, rate, velocity)
+
+
+@njit(cache=True, nogil=True)
+def _move_to_world(scans, motion, bin_s, points, seen_from):
+    """World coordinates of all points, and where the LiDAR was when it saw them."""
+    for i in range(len(scans.start) - 1):
+        for n in range(scans.start[i], scans.start[i + 1]):
+            offset = np.float64(scans.offset_s[n])
+            k = int(np.floor(offset * (1.0 / bin_s)))
+            b, dt = scans.bins[i] + k - scans.low[i], offset - (k + 0.5) * bin_s
+            x, v, w = scans.xyz[n], motion.velocity[b], motion.rate[b]
+            for a in range(3):
+                points[n, a] = seen_from[n, a] = motion.position[b, a]
+            for c in range(3):
+                d, e = (c + 1) % 3, (c + 2) % 3
+                turned = x[c] + dt * (w[d] * x[e] - w[e] * x[d])
+                for a in range(3):
+                    points[n, a] += motion.rotation[b, a, c] * (turned + dt * v[c])
+                    seen_from[n, a] += motion.rotation[b, a, c] * dt * v[c]
+
+
+def in_world(drive: Motion, stream: LidarStream, bin_s: float = BIN_S) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, 3) of a LiDAR in the world frame, float32, and where it was at their instants (N, 3), as `drive` has
+    it. Within a bin it moves with its twist; at instants without IMU as its nearest reading says."""
+    points, seen_from = np.empty((len(stream.xyz), 3), np.float32), np.empty((len(stream.xyz), 3), np.float32)
+
+    def move(own: slice) -> None:
+        scans, seconds, ends = _laid_out(stream, stream.plane, bin_s, own)
+        motion = sweep(drive, stream.name, seconds + drive.state.values[stream.name, "time_offset"][0])
+        _move_to_world(scans, motion, bin_s, points[ends], seen_from[ends])
+
+    in_parallel(move, _groups(stream))
+    return points, seen_from
