@@ -19,7 +19,9 @@ import icalib.estimation
 from icalib.estimation.arrowhead import Piece, make_pieces
 from icalib.estimation.corner_factor import CornerNoise
 from icalib.estimation.corner_weights import LEAST_CURVATURE
+from icalib.estimation.gauge_factor import Gauge
 from icalib.estimation.imu_factor import ROWS, ImuFactor
+from icalib.estimation.lidar_binning import LidarNoise
 from icalib.estimation.prior_factor import FIRST_BIAS_SIGMA, Prior, accumulate_bias_prior
 from icalib.estimation.state import NODE, State, make_layout
 from icalib.estimation.wheel_factor import IncrementFactor, RelativePoseFactor, WheelNoise
@@ -194,6 +196,40 @@ def feature_sample(unlike, setup_of, features_of, scheme="inertial", loss="none"
     return Sample("FeatureFactor", setup, state, accumulate, residual, weights)
 
 
+def lidar_sample(room, room_of, scheme="inertial", loss="none", beam=0.0, imu_free=False):
+    """Its moments taken at another state, as in all but the first linearisation of a pass."""
+    setup = room_of(room, imu_free=imu_free, spacing=0.05)
+    rng = np.random.default_rng(5)
+    start = setup.perturbed(rng, 0.3)
+    factor = setup.factor(start, LidarNoise(0.03, beam, loss, LOSS_SCALE), scheme=scheme, bin_s=5e-3)
+    state = setup.perturbed(rng, 0.5)
+
+    def residual(at):
+        out = factor.output()
+        for piece in make_pieces(len(at.seconds), setup.layout.size):
+            factor.accumulate(at, piece, out, sums=False)
+        return out.ravel()
+
+    def accumulate(at, piece, sums):
+        return factor.accumulate(at, piece, factor.output(), sums)
+
+    return Sample("LidarFactor", setup, state, accumulate, residual, white(residual))
+
+
+def gauge_sample(room, room_of, node):
+    setup = room_of(room, spacing=0.05)
+    state = setup.perturbed(np.random.default_rng(6), 20.0)
+    gauge = Gauge(node, setup.state.rotation[node], setup.state.position[node])
+    return Sample(
+        "Gauge",
+        setup,
+        state,
+        gauge.accumulate,
+        lambda at: gauge.residual(at)[0],
+        white(lambda at: gauge.residual(at)[0]),
+    )
+
+
 def prior_sample(unlike, setup_of, sensor, name):
     setup = setup_of(unlike, imu_free=True)
     rng = np.random.default_rng(2)
@@ -318,6 +354,17 @@ SAMPLES = {
         "FeatureFactor",
         lambda u, s, f: feature_sample(u, s, f, "pose", "cauchy", curved=True),
     ),
+    "lidar": ("LidarFactor", lambda u, s, f: lidar_sample(*s)),
+    "lidar, huber, beam, kinematic, intrinsics": (
+        "LidarFactor",
+        lambda u, s, f: lidar_sample(*s, "kinematic", "huber", 0.02, imu_free=True),
+    ),
+    "lidar, cauchy, pose, intrinsics": (
+        "LidarFactor",
+        lambda u, s, f: lidar_sample(*s, "pose", "cauchy", imu_free=True),
+    ),
+    "gauge": ("Gauge", lambda u, s, f: gauge_sample(*s, 0)),
+    "gauge of a later recording": ("Gauge", lambda u, s, f: gauge_sample(*s, 7)),
     "prior on a rotation": ("Prior", lambda u, s, f: prior_sample(u, s, "cam1", "rotation")),
     "prior on a vector": ("Prior", lambda u, s, f: prior_sample(u, s, "cam0", "intrinsics")),
     "prior on IMU intrinsics": ("Prior", lambda u, s, f: prior_sample(u, s, "imu0", "intrinsics")),
@@ -383,9 +430,11 @@ def scales(sample):
 
 
 @pytest.fixture(scope="module", params=SAMPLES)
-def sample(request, unlike, setup_of, factor_of, features_of):
+def sample(request, unlike, setup_of, factor_of, features_of, sparse_room, room_of):
     name, make = SAMPLES[request.param]
-    made = make(unlike, setup_of, features_of if name == "FeatureFactor" else factor_of)
+    in_room = name in ("LidarFactor", "Gauge")
+    factors = features_of if name == "FeatureFactor" else factor_of
+    made = make(unlike, (sparse_room, room_of) if in_room else setup_of, factors)
     assert made.factor == name
     return made
 

@@ -22,6 +22,7 @@ class Tolerances:
     bloom: float = 0.1
     shape: float = 1e-3
     tilt: float = np.deg2rad(0.1)
+    plane: tuple[float, float, float] = (np.deg2rad(0.1), np.deg2rad(0.1), 5e-3)  # normal, distance
     imu_intrinsics: float = 1e-2  # scale, misalignment [rad]; g-sensitivity rad/s per m/s^2
 
     @classmethod
