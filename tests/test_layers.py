@@ -43,9 +43,10 @@ LEVELS = {
     "outputs": 8,
     "pipeline": 8,
     "console": 8,
-    "cli": 9,
-    "__main__": 10,
-    "__init__": 10,
+    "montecarlo": 9,
+    "cli": 10,
+    "__main__": 11,
+    "__init__": 11,
 }
 EVERYWHERE = {"errors", "extras"}  # so geometry, on the same level, may raise errors, and ask OpenCV for tags
 NEVER = {("estimation", "simulation")}  # a lower level, but a wrong sign must not cancel against itself
