@@ -82,6 +82,11 @@ def _add_montecarlo(commands: argparse._SubParsersAction[argparse.ArgumentParser
     c.add_argument("--guess", choices=("none", "drawn"), default="none", help="drawn: about the truth; by default none")
     _add_workers(c)
     c.set_defaults(run=_montecarlo)
+    r = commands.add_parser("reproduce", help="the paper's simulation again: errors against iterations, and a table")
+    r.add_argument("--runs", type=_count, default=6, metavar="N", help="of each motion; figures show the first six")
+    r.add_argument("--output", "-o", type=Path, required=True, help="folder for runs, figures and table")
+    _add_workers(r)
+    r.set_defaults(run=_reproduce)
 
 
 def _add_workers(parser: argparse.ArgumentParser) -> None:
@@ -215,6 +220,21 @@ def _montecarlo(options: argparse.Namespace) -> None:
         study = run_file(options.scenario, options.output, plan, progress)
     if not options.quiet:
         print_study(study, options.output)
+
+
+def _reproduce(options: argparse.Namespace) -> None:
+    from icalib.console import progress_bar
+    from icalib.montecarlo import Plan
+    from icalib.montecarlo.console import print_study
+    from icalib.montecarlo.reproduce import reproduce
+
+    plan = Plan(options.runs, guess="drawn", workers=options.workers, scheduler=options.scheduler)
+    with progress_bar(options.quiet) as progress:
+        studies = reproduce(options.output, plan, progress)
+    if not options.quiet:
+        for motion, study in studies.items():
+            print_study(study, options.output / motion)
+        print(f"Wrote {options.output / 'reproduce.html'}, and a PNG of each motion.")
 
 
 def _inspect(options: argparse.Namespace) -> None:
