@@ -30,9 +30,7 @@ def print_study(study: Study, folder: Path) -> None:
 
 def table(found: Consistency) -> Table:
     """One row for each block, and one for all together; outside its bounds the NEES is red."""
-    out = Table(
-        title="Consistency", title_justify="left", caption_justify="left", box=SIMPLE_HEAD, padding=0
-    )
+    out = Table(title="Consistency", title_justify="left", caption_justify="left", box=SIMPLE_HEAD, padding=0)
     out.caption = "NEES: per degree of freedom, 1 where the covariance is honest. Undetermined entries do not count."
     for header in HEADERS:
         out.add_column(header, justify="right" if header in NUMBERS else "left", no_wrap=header not in HEADERS[-1:])

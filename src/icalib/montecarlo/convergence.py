@@ -100,7 +100,7 @@ def png(rows: Sequence[Row], title: str) -> bytes:
     columns = max(len(r.panels) for r in rows)
     size = (_PANEL_INCHES[0] * columns, _PANEL_INCHES[1] * len(rows) + 0.6)
     sheet = load_matplotlib().Figure(figsize=size, layout="constrained")
-    sheet.suptitle(title, fontsize=10)
+    sheet.suptitle(f"{title}: error and 3 sigma (dashed) against iterations", fontsize=10)
     grid = sheet.subplots(len(rows), columns, squeeze=False)
     for places, row in zip(grid, rows, strict=True):
         for place in places[len(row.panels) :]:
@@ -120,6 +120,7 @@ def _draw(place, panel: Panel) -> None:
     place.set_title(panel.title, fontsize=7)
     place.set_ylabel(f"|error| [{panel.unit}]" if panel.unit else "|error|", fontsize=6)
     place.tick_params(labelsize=6)
+    place.xaxis.get_major_locator().set_params(integer=True)
     place.grid(True, color="#e5e7eb")
 
 

@@ -62,7 +62,7 @@ def plot_place(name: str) -> Html:
 
 def blocks_table(found: Consistency) -> Html:
     headers = (*HEADERS, "by chance", "verdicts")
-    body = [(*block_row(b), chance_words(b.spread), verdict_words(b)) for b in found.blocks]
+    body: list[tuple[str, ...]] = [(*block_row(b), chance_words(b.spread), verdict_words(b)) for b in found.blocks]
     if found.whole is not None:
         body.append(("all together", "", "", *nees_cells(found.whole), *[""] * (len(headers) - 5)))
     return table(headers, body, NUMBERS)

@@ -1,4 +1,4 @@
-"""What one run leaves: its errors and what its covariance said of them, as JSON that reads back without losing a bit."""
+"""What one run leaves: its errors and what its covariance said of them, as JSON that reads back bit for bit."""
 
 from __future__ import annotations
 
@@ -109,6 +109,4 @@ def from_json(text: bytes) -> Record:
 
 
 def _block(plain: dict[str, Any]) -> Block:
-    return Block(
-        plain["sensor"], plain["name"], tuple(plain["labels"]), plain["unit"], tuple(plain["verdict"])
-    )
+    return Block(plain["sensor"], plain["name"], tuple(plain["labels"]), plain["unit"], tuple(plain["verdict"]))

@@ -49,9 +49,7 @@ def reproduce(output: Path, plan: Plan, progress: Progress = lambda *_: None) ->
 def with_board(scenario: Scenario) -> Scenario:
     """The scenario with what the estimator takes: in place of tracks, LiDAR and wheels an AprilGrid of 2.3 m on a
     wall."""
-    return replace(
-        scenario, board=True, target=_BOARD, T_world_board=_ON_WALL, features=None, lidars=(), wheels=()
-    )
+    return replace(scenario, board=True, target=_BOARD, T_world_board=_ON_WALL, features=None, lidars=(), wheels=())
 
 
 def write_figures(output: Path, studies: dict[str, Study]) -> None:

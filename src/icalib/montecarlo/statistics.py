@@ -78,9 +78,7 @@ def spread(samples: list[Sample]) -> Spread | None:
         for _ in range(DRAWS)
     ]
     low, high = np.quantile(drawn, [0.5 - 0.5 * PROBABILITY, 0.5 + 0.5 * PROBABILITY], axis=0)
-    return Spread(
-        float(found[0]), (float(low[0]), float(high[0])), float(found[-1]), (float(low[-1]), float(high[-1]))
-    )
+    return Spread(float(found[0]), (float(low[0]), float(high[0])), float(found[-1]), (float(low[-1]), float(high[-1])))
 
 
 def _roots(errors: np.ndarray, predicted: np.ndarray) -> np.ndarray:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -86,21 +85,23 @@ class Store:
         except (ValueError, KeyError, TypeError) as error:
             raise CalibrationError(f"{path} is damaged; choose another folder.") from error
         if changed:
+            why = ", ".join(changed)
             raise CalibrationError(
-                f"{self.folder} holds runs of another study ({', '.join(changed)}); choose another folder, or delete it."
+                f"{self.folder} holds runs of another study ({why}); choose another folder, or delete it."
             )
 
 
 def write_whole(path: Path, content: bytes) -> None:
     """Writes the file at once: whoever looks finds the old one or the new one. Raises CalibrationError."""
-    name = ""
+    part = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".", suffix=".part", delete=False) as file:
-            name = file.name
+        with part.open("wb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        os.replace(name, path)
+        part.replace(path)
     except OSError as error:
-        Path(name).unlink(missing_ok=True) if name else None
-        raise CalibrationError(f"{path} cannot be written ({error.strerror or error}); check the disk.") from error
+        part.unlink(missing_ok=True)
+        raise CalibrationError(
+            f"{path} cannot be written ({error.strerror or error}); choose another folder."
+        ) from error

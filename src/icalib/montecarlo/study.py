@@ -93,7 +93,8 @@ def _fill(store: Store, scenario: Scenario, seeds: range, plan: Plan, progress: 
         return lost
     progress(_words(done, seeds), 0.0)
     try:
-        with closing(run_all([Task(scenario, s, plan.guess) for s in missing], plan.workers, plan.scheduler)) as records:
+        tasks = [Task(scenario, seed, plan.guess) for seed in missing]
+        with closing(run_all(tasks, plan.workers, plan.scheduler)) as records:
             for made, record in enumerate(records, 1):
                 if record.program:
                     store.add(record)
@@ -102,7 +103,8 @@ def _fill(store: Store, scenario: Scenario, seeds: range, plan: Plan, progress: 
                 progress(_words(done + made, seeds), made / len(missing))
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
-            f"{sum(s in store for s in seeds)} of {len(seeds)} runs are in {store.folder}; the same command goes on."
+            f"{sum(s in store for s in seeds)} of {len(seeds)} runs are in {store.folder}; the same command "
+            "goes on from there."
         ) from None
     return lost
 

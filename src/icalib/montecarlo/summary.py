@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import TypeVar
 
 import numpy as np
 
@@ -14,7 +13,6 @@ from icalib.montecarlo.record import Block, Record
 from icalib.montecarlo.statistics import Nees, Sample, Spread, nees, spread
 
 EVERYTHING = "calibration"  # all blocks together
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -65,6 +63,8 @@ class Mean:
 
 @dataclass(frozen=True)
 class Failure:
+    """A run that reached no result, and why."""
+
     seed: int
     sentence: str
 
@@ -98,15 +98,15 @@ def summarise(records: Sequence[Record]) -> Consistency:
         tuple(Failure(r.seed, r.failure) for r in ordered if r.failure),
         nees(whole) if whole else None,
         tuple(_block(good, block) for block in first.values()),
-        _means([r.sizes for r in good], lambda s: s.chi2 / s.dof if s.dof > 0.0 else np.nan),
-        _means([r.whiteness for r in good], lambda w: w.lag1),
+        _means([(s.sensor, s.kind, s.chi2 / s.dof) for r in good for s in r.sizes if s.dof > 0.0]),
+        _means([(w.sensor, w.kind, w.lag1) for r in good for w in r.whiteness]),
         dict(Counter(sentence.split(":")[0] for r in good for sentence in r.undetermined).most_common()),
     )
 
 
-def consistency_json(found: Consistency, study: dict[str, object]) -> bytes:
+def consistency_json(found: Consistency, study: Mapping[str, object]) -> bytes:
     """`consistency.json`: `study` says what the runs were made from."""
-    return json.dumps({"format": "icalib consistency", "study": study} | asdict(found), indent=1).encode()
+    return json.dumps({"format": "icalib consistency", "study": dict(study)} | asdict(found), indent=1).encode()
 
 
 def counting(record: Record, key: str) -> np.ndarray:
@@ -159,15 +159,13 @@ def _root_mean(squares: np.ndarray) -> float | None:
     return float(np.sqrt(np.mean(squares))) if len(squares) else None
 
 
-def _means(runs: list[tuple[T, ...]], figure: Callable[[T], float]) -> tuple[Mean, ...]:
-    """Of each sensor and kind, in the order in which they first appear."""
+def _means(figures: list[tuple[str, str, float]]) -> tuple[Mean, ...]:
+    """Of (sensor, kind, figure) of all runs, in the order in which they first appear."""
     found: dict[tuple[str, str], list[float]] = {}
-    for items in runs:
-        for item in items:
-            found.setdefault((item.sensor, item.kind), []).append(figure(item))  # pyright: ignore
+    for sensor, kind, figure in figures:
+        found.setdefault((sensor, kind), []).append(figure)
     out = []
     for (sensor, kind), values in found.items():
-        some = np.array(values)[np.isfinite(values)]
-        error = float(some.std(ddof=1) / np.sqrt(len(some))) if len(some) > 1 else 0.0
-        out += [Mean(sensor, kind, float(some.mean()), error)] if len(some) else []
+        error = float(np.std(values, ddof=1) / np.sqrt(len(values))) if len(values) > 1 else 0.0
+        out.append(Mean(sensor, kind, float(np.mean(values)), error))
     return tuple(out)

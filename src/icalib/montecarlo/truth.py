@@ -9,8 +9,8 @@ from icalib.simulation import Truth
 
 
 def true_value(truth: Truth, sensor: str, name: str) -> np.ndarray | None:
-    """The truth of the group `name` of `sensor`, in the form of `ParameterGroup.value`; None where the simulation states
-    none, as of a target's tilt."""
+    """The truth of the group `name` of `sensor`, in the form of `ParameterGroup.value`; None where none is stated, as
+    of a target's tilt."""
     poses = truth.T_imu_cam | truth.T_imu_lidar | truth.T_imu_wheel
     if sensor not in poses:
         return truth.imu_intrinsics if (sensor, name) == ("imu0", "intrinsics") else None

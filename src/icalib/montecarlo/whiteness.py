@@ -1,4 +1,4 @@
-"""Whether what a calibration leaves unexplained is white: each whitened residual against the next of its kind in time."""
+"""Whether what a calibration leaves unexplained is white: each whitened residual against the next in time."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable
 from contextlib import ExitStack
 from typing import Any
 
@@ -21,7 +21,9 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def run_all(tasks: Iterable[Task], workers: int | None = None, scheduler: str | None = None) -> Iterator[Record]:
+def run_all(
+    tasks: Iterable[Task], workers: int | None = None, scheduler: str | None = None
+) -> Generator[Record, None, None]:
     """Records as they are ready, in no order.
 
     workers: processes on this machine; None: one for each core. A solve has two threads, but the rest of a run has one.

@@ -92,9 +92,7 @@ def with_drawn_guess(rig: Rig, scenario: Scenario, seed: int, error: GuessError 
     return replace(rig, cameras=tuple(cameras))
 
 
-def _guessed(
-    camera: Camera, sim: SimCamera, scenario: Scenario, rng: np.random.Generator, error: GuessError
-) -> Camera:
+def _guessed(camera: Camera, sim: SimCamera, scenario: Scenario, rng: np.random.Generator, error: GuessError) -> Camera:
     drawn = _drawn_pose(sim.T_imu_cam, raw_time_offset(scenario, sim), rng, error)
     focal = np.array(sim.intrinsics[:2]) * (1.0 + error.focal_length * rng.standard_normal())
     drawn["intrinsics"] = np.array([*focal, *(0.5 * (side - 1) for side in sim.resolution)])
