@@ -49,11 +49,12 @@ class Spread:
     largest_bounds: tuple[float, float]
 
 
-def nees(samples: list[Sample]) -> Nees:
-    """Of samples that may differ in dimension; the sum over them is chi^2 of the sum of these."""
+def nees(samples: list[Sample], probability: float = PROBABILITY) -> Nees:
+    """Of samples that may differ in dimension; the sum over them is chi^2 of the sum of these. `probability` that an
+    honest covariance lies within the bounds."""
     each = np.array([_squared(s.error, s.covariance) for s in samples])
     dof = sum(len(s.error) for s in samples)
-    low, high = load_chi2().ppf([0.5 - 0.5 * PROBABILITY, 0.5 + 0.5 * PROBABILITY], dof) / dof
+    low, high = load_chi2().ppf([0.5 - 0.5 * probability, 0.5 + 0.5 * probability], dof) / dof
     per_dof = each / [len(s.error) for s in samples]
     worst = int(np.argmax(per_dof))
     return Nees(float(each.sum()) / dof, float(low), float(high), samples[worst].seed, float(per_dof[worst]))

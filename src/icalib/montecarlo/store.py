@@ -8,8 +8,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from icalib.errors import CalibrationError
+from icalib.montecarlo.one_run import GuessKind, program
 from icalib.montecarlo.record import Record, from_json, to_json
-from icalib.montecarlo.run import GuessKind, program
 from icalib.provenance import versions
 
 STUDY, RUNS = "study.json", "runs"

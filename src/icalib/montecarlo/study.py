@@ -9,9 +9,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from icalib.errors import CalibrationError
+from icalib.montecarlo.one_run import GuessKind, Task
 from icalib.montecarlo.page import study_html
 from icalib.montecarlo.record import Record
-from icalib.montecarlo.run import GuessKind, Task
 from icalib.montecarlo.store import Identity, Store, write_whole
 from icalib.montecarlo.summary import Consistency, consistency_json, summarise
 from icalib.montecarlo.workers import run_all

@@ -9,8 +9,8 @@ from typing import Any
 
 from icalib.errors import CalibrationError
 from icalib.extras import load_distributed
+from icalib.montecarlo.one_run import Task, run
 from icalib.montecarlo.record import Record
-from icalib.montecarlo.run import Task, run
 
 ANSWER_WITHIN_S = 10
 SILENT = 60  # above every level of logging: what goes wrong is said in a sentence
