@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.montecarlo.record import Record, from_json, to_json
+from icalib.montecarlo.record import Record, Size, from_json, to_json
 from icalib.montecarlo.summary import Consistency, consistency_json, summarise
 from icalib.montecarlo.words import answer, verdict_words
 
@@ -113,3 +113,10 @@ def test_figures_of_residuals_are_means_with_their_standard_error(record):
     assert found.sizes[0].mean == pytest.approx(ratios.mean())
     assert found.sizes[0].standard_error == pytest.approx(ratios.std(ddof=1) / 2.0)
     assert found.lag1[0].mean == pytest.approx(0.025)
+    assert found.lag1[0].standard_error == pytest.approx(0.01 * np.std([1, 2, 3, 4], ddof=1) / 2.0)
+
+
+def test_sizes_weigh_runs_by_their_degrees_of_freedom(record):
+    few, many = Size("cam0", "corners", 10, 1.0, 4.0), Size("cam0", "corners", 100, 99.0, 96.0)
+    runs = [replace(record(seed), sizes=(size,)) for seed, size in enumerate((few, many))]
+    assert summarise(runs).sizes[0].mean == pytest.approx(1.0)

@@ -37,7 +37,7 @@ def study_html(found: Consistency, identity: Identity, records: Sequence[Record]
                 "the predicted covariance; by chance: where these lie in 95 of 100 studies of an honest covariance."),
         element("h2", "Mean NEES"), plot_place("nees"),
         element("h2", "Failed runs"), element("p", failures_words(found)),
-        sentences([f"seed {f.seed}: {f.sentence}" for f in found.failures], "bad", "None."),
+        failures(found),
         element("h2", "Residuals"), _residuals(found),
         element("h2", "Made from"), table(("what", "value"), _facts(identity, records)),
     ]  # fmt: skip
@@ -58,6 +58,11 @@ def page(title: str, summary: str, sections: Sequence[Html], figures: dict[str, 
 def plot_place(name: str) -> Html:
     """Where the figure `name` is drawn."""
     return Html(f'<div class="plot" id="{name}"></div>')
+
+
+def failures(found: Consistency) -> Html:
+    """Every failed run with its sentence."""
+    return sentences([f"seed {f.seed}: {f.sentence}" for f in found.failures], "bad", "")
 
 
 def blocks_table(found: Consistency) -> Html:
@@ -82,7 +87,7 @@ def nees_figure(found: Consistency) -> Figure:
         "type": "scatter", "mode": "markers", "x": names, "y": numbers(np.array([n.mean for _, n in known])),
         "name": "mean NEES", "marker": {"color": COLORS[0], "size": 8},
     }  # fmt: skip
-    return figure([bounds, means], xaxis=axis(""), yaxis=axis("NEES per degree of freedom"))
+    return figure([bounds, means], xaxis=axis("", automargin=True), yaxis=axis("NEES per degree of freedom"))
 
 
 def _residuals(found: Consistency) -> Html:

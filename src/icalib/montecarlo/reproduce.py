@@ -11,12 +11,12 @@ import numpy as np
 
 from icalib.geometry.targets import AprilGrid
 from icalib.montecarlo.convergence import plotly_figure, png, rows
-from icalib.montecarlo.page import blocks_table, page, plot_place
+from icalib.montecarlo.page import blocks_table, failures, page, plot_place
 from icalib.montecarlo.store import write_whole
 from icalib.montecarlo.study import Plan, Study, run_study, scenario_digest
 from icalib.montecarlo.words import answer, failures_words
 from icalib.report.plot import Figure
-from icalib.report.tables import Html, element, sentences
+from icalib.report.tables import Html, element
 from icalib.simulation import Scenario, load_scenario
 
 MOTIONS = {"3d": "Motion in three dimensions", "planar": "Planar motion"}
@@ -59,8 +59,7 @@ def write_figures(output: Path, studies: dict[str, Study]) -> None:
     for motion, study in studies.items():
         found = study.consistency
         sections += [element("h2", MOTIONS[motion]), element("p", answer(found)), blocks_table(found)]
-        sections += [element("p", failures_words(found))]
-        sections += [sentences([f"seed {f.seed}: {f.sentence}" for f in found.failures], "bad", "None.")]
+        sections += [element("p", failures_words(found)), failures(found)]
         drawn = rows(study.records)
         for row in drawn:
             name = f"{motion}-{row.key}"

@@ -98,8 +98,8 @@ def summarise(records: Sequence[Record]) -> Consistency:
         tuple(Failure(r.seed, r.failure) for r in ordered if r.failure),
         nees(whole) if whole else None,
         tuple(_block(good, block) for block in first.values()),
-        _means([(s.sensor, s.kind, s.chi2 / s.dof) for r in good for s in r.sizes if s.dof > 0.0]),
-        _means([(w.sensor, w.kind, w.lag1) for r in good for w in r.whiteness]),
+        _means([(s.sensor, s.kind, s.chi2, s.dof) for r in good for s in r.sizes if s.dof > 0.0]),
+        _means([(w.sensor, w.kind, w.lag1, 1.0) for r in good for w in r.whiteness]),
         dict(Counter(sentence.split(":")[0] for r in good for sentence in r.undetermined).most_common()),
     )
 
@@ -159,13 +159,16 @@ def _root_mean(squares: np.ndarray) -> float | None:
     return float(np.sqrt(np.mean(squares))) if len(squares) else None
 
 
-def _means(figures: list[tuple[str, str, float]]) -> tuple[Mean, ...]:
-    """Of (sensor, kind, figure) of all runs, in the order in which they first appear."""
-    found: dict[tuple[str, str], list[float]] = {}
-    for sensor, kind, figure in figures:
-        found.setdefault((sensor, kind), []).append(figure)
+def _means(figures: list[tuple[str, str, float, float]]) -> tuple[Mean, ...]:
+    """Of (sensor, kind, amount, weight) of all runs: sum of the amounts over sum of the weights, in the order in which
+    they first appear."""
+    found: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    for sensor, kind, *pair in figures:
+        found.setdefault((sensor, kind), []).append((pair[0], pair[1]))
     out = []
-    for (sensor, kind), values in found.items():
-        error = float(np.std(values, ddof=1) / np.sqrt(len(values))) if len(values) > 1 else 0.0
-        out.append(Mean(sensor, kind, float(np.mean(values)), error))
+    for (sensor, kind), pairs in found.items():
+        amounts, weights = np.array(pairs).T
+        mean, n = amounts.sum() / weights.sum(), len(pairs)
+        error = np.std(amounts - mean * weights, ddof=1) / (weights.mean() * np.sqrt(n)) if n > 1 else 0.0
+        out.append(Mean(sensor, kind, float(mean), float(error)))
     return tuple(out)
