@@ -9,13 +9,15 @@ import sys
 import time
 from pathlib import Path
 
+import psutil
 import pytest
 
 from icalib.errors import CalibrationError
 from icalib.extras import load_distributed
-from icalib.montecarlo import Plan, Record, Study, run_study
+from icalib.montecarlo import Plan, Record, Study, Task, run_study
 from icalib.montecarlo import study as study_module
 from icalib.montecarlo.store import Identity, Store
+from icalib.montecarlo.workers import run_all
 from icalib.simulation import Scenario, handheld
 
 RUNS = 3
@@ -83,6 +85,16 @@ def test_a_study_that_was_killed_goes_on_and_repeats_nothing(alone: Path, tmp_pa
     after = written(folder)
     assert len(before) < len(after) and {name: after[name] for name in before} == before
     assert (folder / "consistency.json").read_bytes() == (alone / "consistency.json").read_bytes()
+
+
+def test_the_run_of_a_killed_worker_is_made_again():
+    records = run_all([Task(handheld(6.0), seed) for seed in range(4)], workers=2)
+    found = [next(records)]
+    workers = [p for p in psutil.Process().children(recursive=True) if any("spawn_main" in a for a in p.cmdline())]
+    assert len(workers) == 2
+    workers[0].kill()
+    found += records
+    assert sorted(r.seed for r in found) == [0, 1, 2, 3] and not any(r.failure for r in found)
 
 
 def test_a_finished_study_starts_no_worker(alone: Path, monkeypatch):
