@@ -15,7 +15,9 @@ from icalib.calibration import (
     SensorFit,
     Trajectory,
     Verdict,
+    Visited,
 )
+from icalib.estimation.arrowhead import restricted_inverse
 from icalib.estimation.assembly import Inputs, image_times, origin_difference
 from icalib.estimation.board import SHAPE_LABELS
 from icalib.estimation.bodies import words_on_left_out
@@ -26,6 +28,8 @@ from icalib.estimation.evidence import Fit, fits, place_covariances, split_covar
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.imu_model import LABELS as IMU_LABELS
 from icalib.estimation.nodes import usable
+from icalib.estimation.problem import Problem
+from icalib.estimation.solver import Visit
 from icalib.estimation.state import Block, State
 from icalib.geometry.cameras import camera_model
 from icalib.observability import Observability, observe
@@ -110,9 +114,19 @@ def _mode(inputs: Inputs, block: Block) -> str:
     return getattr(next(c for c in inputs.rig.cameras if c.name == block.sensor), block.name).mode
 
 
-def _raw_value(inputs: Inputs, found: Estimate, block: Block) -> np.ndarray:
+def visited(inputs: Inputs, stage: str, problem: Problem, visit: Visit) -> Visited:
+    """Where the solver stood, as users meet it."""
+    t = problem.tolerance
+    covariance = restricted_inverse(visit.information * t[:, None] * t, problem.held)
+    formal = t * np.sqrt(np.diag(covariance))
+    free = inputs.layout.free
+    values = {b.key: _raw_value(inputs, visit.state, b) for b in free}
+    return Visited(stage, values, {b.key: formal[b.columns] for b in free})
+
+
+def _raw_value(inputs: Inputs, state: State, block: Block) -> np.ndarray:
     """The value as users meet it: time offsets between raw stamps."""
-    value = found.outcome.state.values[block.key]
+    value = state.values[block.key]
     if block.name == "time_offset":
         stream = next(c for c in inputs.measurements.cameras if c.name == block.sensor)
         return value - origin_difference(inputs.measurements, stream)
@@ -146,7 +160,7 @@ def _groups(
         unit = "" if labels == IMU_LABELS else UNITS[block.name]
         groups.append(
             ParameterGroup(
-                block.sensor, block.name, labels, unit, _raw_value(inputs, found, block), std,
+                block.sensor, block.name, labels, unit, _raw_value(inputs, found.outcome.state, block), std,
                 std * np.maximum(factor, 1.0),
                 verdict, _mode(inputs, block),
                 None if block.start is None else tuple(int(i) for i in block.columns), factor,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -22,11 +23,14 @@ from icalib.estimation.corner_noise import (
 from icalib.estimation.evidence import fits
 from icalib.estimation.feature_noise import first_following, inliers, next_following
 from icalib.estimation.problem import Problem
-from icalib.estimation.solver import CONVERGED_DECREASE, Outcome, Step, minimise
+from icalib.estimation.solver import CONVERGED_DECREASE, Outcome, Step, Visit, minimise
 from icalib.estimation.state import State
 from icalib.rig import Settings
 
 EARLY_DECREASE = 0.5  # an early pass is followed by another
+
+
+OnVisit = Callable[[str, Problem, Visit], None]  # told of the pass's name, its problem, and where the solver stood
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,7 @@ def estimate(
     state: State,
     on_step: Callable[[str, Step], None] = lambda *_: None,
     held: np.ndarray = NOTHING,
+    on_visit: OnVisit = lambda *_: None,
 ) -> Estimate:
     """All passes from a first `state`, directions of the border in `held` (see Problem) left alone.
 
@@ -64,7 +69,8 @@ def estimate(
             on_step(name, step)
 
         last = name == names[-1]
-        outcome = minimise(problem, state, note, CONVERGED_DECREASE if last else EARLY_DECREASE)
+        tolerance = CONVERGED_DECREASE if last else EARLY_DECREASE
+        outcome = minimise(problem, state, note, tolerance, partial(on_visit, name, problem))
         if last:
             return Estimate(problem, outcome, tuple(models), tuple(history))
         if name == "first":
