@@ -27,7 +27,10 @@ def load_rig(path: str | Path) -> Rig:
     blind = [c.name for c in cameras if c.tracks is None]
     targeted = "target" in found or "targets" in found
     if blind and not targeted:
-        root.fail(f"target is missing; add target, or tracks (a table of followed points) to {' and '.join(blind)}.")
+        root.fail(
+            "target is missing; add target, targets for several by name, or tracks (a table of followed points) to "
+            f"{' and '.join(blind)}."
+        )
     return Rig(
         imu=imus[0] if imus else None,
         cameras=tuple(cameras),
