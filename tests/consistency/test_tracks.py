@@ -75,7 +75,7 @@ def test_noiseless_tracks_are_recovered_from_nothing_but_rough_intrinsics():
 def check(consistency, duration_s: float, seeds: range, probability: float) -> None:
     scenario = table2(duration_s)
     found = consistency(scenario, rig_of(scenario, 1.02), seeds, probability)
-    print({block: (round(c.nees, 3), round(c.low, 3), round(c.high, 3)) for block, c in found.items()})
+    print({block: (round(c.mean, 3), round(c.low, 3), round(c.high, 3)) for block, c in found.items()})
     assert {block: c for block, c in found.items() if not c.consistent} == {}
 
 
