@@ -81,7 +81,7 @@ ONE_BIT = GRID.replace("}", ", border_bits: 1}")
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "rig.yaml:1: target is missing; add target, or targets for several by name."),
+        ("", "rig.yaml:1: target is missing; add target, targets for several by name, or tracks"),
         (f"target: {GRID}\n" + several(a=TAGS), "targets: stands beside target; put all targets under targets."),
         ("targets: {}", "targets: there is no target; add one"),
         (several(**{"0a": TAGS}), "targets.0a: a target's name is a letter, then letters, digits"),

@@ -15,7 +15,9 @@ from icalib.calibration import (
     SensorFit,
     Trajectory,
     Verdict,
+    Visited,
 )
+from icalib.estimation.arrowhead import restricted_inverse
 from icalib.estimation.assembly import Inputs, image_times, origin_difference
 from icalib.estimation.board import SHAPE_LABELS
 from icalib.estimation.bodies import words_on_left_out
@@ -26,6 +28,8 @@ from icalib.estimation.evidence import Fit, fits, place_covariances, split_covar
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.imu_model import LABELS as IMU_LABELS
 from icalib.estimation.nodes import usable
+from icalib.estimation.problem import Problem
+from icalib.estimation.solver import Visit
 from icalib.estimation.state import Block, State
 from icalib.geometry.cameras import camera_model
 from icalib.observability import Observability, observe
@@ -41,6 +45,7 @@ EXPECTED_CHI2 = (0.5, 2.0)  # chi^2 per post-fit degree of freedom outside this 
 LARGE_FACTOR = 3.0
 LARGE_BLOOM_PX = 0.8  # ink and overexposure move edges by a third of that
 MANY_REJECTED = 0.05
+LEAST_DOF = 3.0  # times the square root of the number of residuals
 
 
 def assess(inputs: Inputs, determined: Determined) -> Calibration:
@@ -109,9 +114,19 @@ def _mode(inputs: Inputs, block: Block) -> str:
     return getattr(next(c for c in inputs.rig.cameras if c.name == block.sensor), block.name).mode
 
 
-def _raw_value(inputs: Inputs, found: Estimate, block: Block) -> np.ndarray:
+def visited(inputs: Inputs, stage: str, problem: Problem, visit: Visit) -> Visited:
+    """Where the solver stood, as users meet it."""
+    t = problem.tolerance
+    covariance = restricted_inverse(visit.information * t[:, None] * t, problem.held)
+    formal = t * np.sqrt(np.diag(covariance))
+    free = inputs.layout.free
+    values = {b.key: _raw_value(inputs, visit.state, b) for b in free}
+    return Visited(stage, values, {b.key: formal[b.columns] for b in free})
+
+
+def _raw_value(inputs: Inputs, state: State, block: Block) -> np.ndarray:
     """The value as users meet it: time offsets between raw stamps."""
-    value = found.outcome.state.values[block.key]
+    value = state.values[block.key]
     if block.name == "time_offset":
         stream = next(c for c in inputs.measurements.cameras if c.name == block.sensor)
         return value - origin_difference(inputs.measurements, stream)
@@ -145,7 +160,7 @@ def _groups(
         unit = "" if labels == IMU_LABELS else UNITS[block.name]
         groups.append(
             ParameterGroup(
-                block.sensor, block.name, labels, unit, _raw_value(inputs, found, block), std,
+                block.sensor, block.name, labels, unit, _raw_value(inputs, found.outcome.state, block), std,
                 std * np.maximum(factor, 1.0),
                 verdict, _mode(inputs, block),
                 None if block.start is None else tuple(int(i) for i in block.columns), factor,
@@ -177,12 +192,24 @@ def _calibration_only(inputs: Inputs, per_column: np.ndarray) -> np.ndarray:
 
 def _sensor_fit(fit: Fit, found: Estimate) -> SensorFit:
     rms, unit, rejected = None, "", 0
+    if fit.kind == "features":
+        return _feature_fit(fit, found)
     for camera, out in zip(found.problem.cameras, found.outcome.residuals.corners, strict=True):
         if camera.name == fit.sensor:
             used = out.root > 0.0
             rms, unit = float(np.sqrt(np.mean(out.residual[used] ** 2))), "px"
             rejected = int((~used).sum())
     return SensorFit(fit.sensor, fit.kind, fit.count, fit.dof, fit.chi2, rms, unit, rejected)
+
+
+def _feature_fit(fit: Fit, found: Estimate) -> SensorFit:
+    """Rejected are observations that stood out; those whose track was left out are not."""
+    factor, out = found.problem.features, found.outcome.residuals.features
+    assert factor is not None and out is not None
+    i = [c.name for c in factor.cameras].index(fit.sensor)
+    used = out.root[i] > 0.0
+    rms = float(np.sqrt(np.mean(out.residual[i][used] ** 2))) if used.any() else None
+    return SensorFit(fit.sensor, fit.kind, fit.count, fit.dof, fit.chi2, rms, "px", int((~factor.keep[i]).sum()))
 
 
 def _corner_residuals(found: Estimate, timeline: Timeline) -> tuple[CornerResiduals, ...]:
@@ -233,16 +260,17 @@ def _warnings(
         yield f"the solver did not converge: {found.outcome.status}"
     for f in judged:
         ratio = f.chi2 / max(f.dof, 1.0)
-        if f.kind in ("gyroscope", "accelerometer") and not EXPECTED_CHI2[0] <= ratio <= EXPECTED_CHI2[1]:
+        known = f.dof > LEAST_DOF * np.sqrt(f.count)  # dof are sampled: few among many are noise
+        if known and f.kind in ("gyroscope", "accelerometer") and not EXPECTED_CHI2[0] <= ratio <= EXPECTED_CHI2[1]:
             word = "larger" if ratio > 1.0 else "smaller"
             yield (
                 f"the {f.kind} of {f.sensor} leaves residuals {np.sqrt(ratio):.2g} times as large as its noise "
                 f"in the rig "
                 f"file says; a {word} noise density would fit."
             )
-        if f.kind == "corners" and f.rejected > MANY_REJECTED * 0.5 * f.count:
+        if f.kind in ("corners", "features") and f.rejected > MANY_REJECTED * 0.5 * f.count:
             share = f.rejected / (f.rejected + 0.5 * f.count)
-            yield f"{share:.0%} of the corners of {f.sensor} were set aside; look at its residuals in the report."
+            yield f"{share:.0%} of the {f.kind} of {f.sensor} were set aside; look at its residuals in the report."
     for g in groups:
         if g.name == "bloom" and abs(g.value[0]) > LARGE_BLOOM_PX:
             where = "in" if g.value[0] > 0.0 else "out"
@@ -273,8 +301,24 @@ def _notes(inputs: Inputs, found: Estimate, timeline: Timeline):
         yield words
     if inputs.imu is not None:
         yield from _imu_notes(inputs, inputs.imu, found, timeline)
-    for camera, model in zip(inputs.rig.cameras, found.noise, strict=True):
-        yield f"{camera.name}: {_noise_words(model)}."
+    for camera, factor, model in zip(inputs.rig.cameras, found.problem.cameras, found.noise, strict=True):
+        if len(factor.stream.uv):
+            yield f"{camera.name}: {_noise_words(model)}."
+    yield from _feature_notes(found)
+
+
+def _feature_notes(found: Estimate):
+    factor, out = found.problem.features, found.outcome.residuals.features
+    if factor is None or out is None:
+        return
+    all_of_them = len(np.unique(np.concatenate([s.feature for s in factor.streams])))
+    yield (
+        f"{all_of_them} points of the scene were followed, in {factor.tracks.count} tracks that show where they are; "
+        "tracks that do not, for lack of parallax, are left out."
+    )
+    for camera, sigma, root, stream in zip(factor.cameras, factor.sigma, out.root, factor.streams, strict=True):
+        share = f"{int((root > 0.0).sum())} of {len(stream.uv)}"
+        yield f"{camera.name}: track noise {sigma:.3f} px; {share} observations of tracks are in use."
 
 
 def _imu_notes(inputs: Inputs, imu: ImuData, found: Estimate, timeline: Timeline):

@@ -20,8 +20,8 @@ def main(arguments: list[str] | None = None) -> int:
     except CalibrationError as error:
         print(f"icalib: {error}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
-        print("icalib: interrupted; nothing was written.", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        print(f"icalib: interrupted; {str(stop) or 'nothing was written.'}", file=sys.stderr)
         return 130
     return 0
 
@@ -47,6 +47,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_inspect(commands)
     _add_target(commands)
     _add_simulate(commands)
+    _add_montecarlo(commands)
     return parser
 
 
@@ -69,6 +70,30 @@ def _add_simulate(commands: argparse._SubParsersAction[argparse.ArgumentParser])
     c.add_argument("--level", choices=("data", "sensor"), default="data", help=levels)
     c.add_argument("--quiet", "-q", action="store_true", help="no progress bar and no last line")
     c.set_defaults(run=_simulate)
+
+
+def _add_montecarlo(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    c = commands.add_parser("montecarlo", help="calibrate many simulated recordings, and judge the standard deviations")
+    c.add_argument("scenario", type=Path, help="scenario file (scenario.yaml)")
+    c.add_argument("--runs", type=_count, required=True, metavar="N", help="in all; those that are there already count")
+    folder = "folder for runs and results; a study that was stopped goes on from what it holds"
+    c.add_argument("--output", "-o", type=Path, required=True, help=folder)
+    c.add_argument("--seed", type=_whole, metavar="N", help="of the first run; by default the scenario's")
+    c.add_argument("--guess", choices=("none", "drawn"), default="none", help="drawn: about the truth; by default none")
+    _add_workers(c)
+    c.set_defaults(run=_montecarlo)
+    r = commands.add_parser("reproduce", help="the paper's simulation again: errors against iterations, and a table")
+    r.add_argument("--runs", type=_count, default=6, metavar="N", help="of each motion; figures show the first six")
+    r.add_argument("--output", "-o", type=Path, required=True, help="folder for runs, figures and table")
+    _add_workers(r)
+    r.set_defaults(run=_reproduce)
+
+
+def _add_workers(parser: argparse.ArgumentParser) -> None:
+    who = parser.add_mutually_exclusive_group()
+    who.add_argument("--workers", type=_count, metavar="N", help="processes on this machine; by default one a core")
+    who.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster that makes the runs")
+    parser.add_argument("--quiet", "-q", action="store_true", help="no progress bar and no table")
 
 
 def _add_target(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -183,6 +208,33 @@ def _simulate(options: argparse.Namespace) -> None:
         for sentence in notes:
             print(f"Note: {sentence}")
         print(f"Wrote {options.output}, seed {seed}.")
+
+
+def _montecarlo(options: argparse.Namespace) -> None:
+    from icalib.console import progress_bar
+    from icalib.montecarlo import Plan, run_file
+    from icalib.montecarlo.console import print_study
+
+    plan = Plan(options.runs, options.seed, options.guess, options.workers, options.scheduler)
+    with progress_bar(options.quiet) as progress:
+        study = run_file(options.scenario, options.output, plan, progress)
+    if not options.quiet:
+        print_study(study, options.output)
+
+
+def _reproduce(options: argparse.Namespace) -> None:
+    from icalib.console import progress_bar
+    from icalib.montecarlo import Plan
+    from icalib.montecarlo.console import print_study
+    from icalib.montecarlo.reproduce import reproduce
+
+    plan = Plan(options.runs, guess="drawn", workers=options.workers, scheduler=options.scheduler)
+    with progress_bar(options.quiet) as progress:
+        studies = reproduce(options.output, plan, progress)
+    if not options.quiet:
+        for motion, study in studies.items():
+            print_study(study, options.output / motion)
+        print(f"Wrote {options.output / 'reproduce.html'}, and a PNG of each motion.")
 
 
 def _inspect(options: argparse.Namespace) -> None:

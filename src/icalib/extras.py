@@ -32,6 +32,21 @@ def load_zstd() -> Any:
         return _load("backports.zstd", "bags", "Bags compressed by zstd need the package backports.zstd")
 
 
+def load_distributed() -> Any:
+    """Dask's distributed. Raises RecordingError where it is not installed."""
+    return _load("distributed", "montecarlo", "Studies of many runs need Dask's package distributed")
+
+
+def load_chi2() -> Any:
+    """scipy's chi^2 distribution. Raises RecordingError where it is not installed."""
+    return _load("scipy.stats", "montecarlo", "Bounds on NEES need the package scipy").chi2
+
+
+def load_matplotlib() -> Any:
+    """matplotlib's figures, drawn without a screen. Raises RecordingError where it is not installed."""
+    return _load("matplotlib.figure", "montecarlo", "Figures as PNG need the package matplotlib")
+
+
 def _load(module: str, extra: str, need: str) -> ModuleType:
     try:
         return importlib.import_module(module)

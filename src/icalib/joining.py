@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from icalib.measurements import CornerStream, ImuStream, Measurements
+from icalib.measurements import CornerStream, ImuStream, Measurements, TrackStream
 from icalib.rig import Rig
 
 PAUSE_NS = 10_000_000_000
@@ -84,7 +84,27 @@ def _joined(recordings: Sequence[Measurements], shifts: list[int]) -> Measuremen
         imu = ImuStream(imus[0][0].name, stamps, gyro, accel)
     cameras = (join_corners([(m.cameras[k], shift) for m, shift in shifted]) for k in range(len(recordings[0].cameras)))
     notes = tuple(f"{m.name}: {note}" for m in recordings for note in m.notes)
-    return Measurements(imu, tuple(cameras), notes)
+    return Measurements(imu, tuple(cameras), notes, tracks=_joined_tracks(shifted))
+
+
+def _joined_tracks(recordings: list[tuple[Measurements, int]]) -> tuple[TrackStream, ...]:
+    """Tracks of all recordings, each with what to add to its stamps [ns]; a number in two of them is two points."""
+    most = [1 + max((int(t.feature.max(initial=-1)) for t in m.tracks), default=-1) for m, _ in recordings]
+    least = [min((int(t.feature.min(initial=0)) for t in m.tracks), default=0) for m, _ in recordings]
+    sizes = np.cumsum([0, *(a - b for a, b in zip(most, least, strict=True))])
+    joined = []
+    for k, one in enumerate(recordings[0][0].tracks):
+        streams = [m.tracks[k] for m, _ in recordings]
+        stamps = [s.stamps_ns + np.int64(shift) for s, (_, shift) in zip(streams, recordings, strict=True)]
+        numbers = [s.feature - low + at for s, low, at in zip(streams, least, sizes, strict=False)]
+        start = np.concatenate([[0], np.cumsum(np.concatenate([np.diff(s.start) for s in streams]))])
+        joined.append(
+            TrackStream(
+                one.name, np.concatenate(stamps), start.astype(np.int64), np.concatenate(numbers),
+                np.concatenate([s.uv for s in streams]),
+            )
+        )  # fmt: skip
+    return tuple(joined)
 
 
 def join_corners(streams: list[tuple[CornerStream, int]]) -> CornerStream:

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from icalib.assessment import assess
-from icalib.calibration import Calibration
+from icalib.assessment import assess, visited
+from icalib.calibration import Calibration, Visited
 from icalib.detection.streams import find_corners
 from icalib.errors import RecordingError
 from icalib.estimation.assembly import Inputs, image_times, inputs_for, nodes_for, start_values
@@ -19,6 +19,8 @@ from icalib.estimation.board import board_in
 from icalib.estimation.determination import determine
 from icalib.estimation.nodes import first_nodes
 from icalib.estimation.pages import give_back
+from icalib.estimation.problem import Problem
+from icalib.estimation.solver import Visit
 from icalib.estimation.state import State
 from icalib.first_guess import Guess, initial_trajectory
 from icalib.first_guess.several import initial_guesses
@@ -44,7 +46,8 @@ def calibrate(
     rig = rig if isinstance(rig, Rig) else load_rig(rig)
     opened = open_all(recording)
     started = time.perf_counter()
-    pictured = any(not r.has_corners(c) for r in opened.values() for c in rig.cameras)
+    seeing = rig.cameras if rig.has_target else ()
+    pictured = any(not r.has_corners(c) for r in opened.values() for c in seeing)
     share = IMAGES_SHARE if pictured else READING_SHARE
     measurements = []
     for k, (name, one) in enumerate(opened.items()):
@@ -80,19 +83,25 @@ def _measure(rig: Rig, recording: Recording, progress: Progress) -> Measurements
 
 
 def calibrate_measurements(
-    rig: Rig, measurements: Measurements | Sequence[Measurements], progress: Progress = lambda *_: None
+    rig: Rig,
+    measurements: Measurements | Sequence[Measurements],
+    progress: Progress = lambda *_: None,
+    on_visit: Callable[[Visited], None] | None = None,
 ) -> Calibration:
-    """As `calibrate`, from measurements in memory. Those without a name are called by their number."""
+    """As `calibrate`, from measurements in memory. Those without a name are called by their number. `on_visit` is told
+    of each state that the solver looked for a step from."""
     given = [measurements] if isinstance(measurements, Measurements) else measurements
     if not given:
         raise RecordingError("no recording was given; give at least one.")
     recordings = [m if m.name else dataclasses.replace(m, name=f"recording {k}") for k, m in enumerate(given, 1)]
     # The kernels have threads of their own; those of BLAS beside them double the time.
     with threadpool_limits(limits=1, user_api="blas"):
-        return _calibrate(rig, recordings, progress)
+        return _calibrate(rig, recordings, progress, on_visit)
 
 
-def _calibrate(rig: Rig, recordings: Sequence[Measurements], progress: Progress) -> Calibration:
+def _calibrate(
+    rig: Rig, recordings: Sequence[Measurements], progress: Progress, on_visit: Callable[[Visited], None] | None
+) -> Calibration:
     clock = _Clock()
     progress("finding a first guess", 0.0)
     give_back()
@@ -103,7 +112,12 @@ def _calibrate(rig: Rig, recordings: Sequence[Measurements], progress: Progress)
     give_back()
     clock.lap("first state")
     steps = _StepProgress(progress)
-    found = determine(inputs, state, lambda name, step: steps.note(name))
+
+    def tell(stage: str, problem: Problem, visit: Visit) -> None:
+        if on_visit is not None:
+            on_visit(visited(inputs, stage, problem, visit))
+
+    found = determine(inputs, state, lambda name, step: steps.note(name), tell)
     clock.lap("solving")
     progress("judging the result", 0.9)
     result = assess(inputs, found)

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from icalib.geometry.targets import Target
+from icalib.geometry.targets import NoTarget, Target
 
 Mode = Literal["free", "fixed", "prior"]
 
@@ -71,6 +71,8 @@ class Camera:
     distortion: Parameter = Parameter()
     bloom: Parameter = Parameter()
     topic: str | None = None  # of its images; None: the one with the camera's name, or the only one
+    tracks: str | None = None  # path of the table of tracks, where it has one
+    track_noise_px: float | None = None  # None: estimated from the residuals
 
 
 Scheme = Literal["inertial", "pose", "kinematic"]
@@ -96,6 +98,11 @@ class Settings:
     splits: int = 8  # segments for the empirical factor, 0: none
     max_gap_s: float = 0.5  # IMU gaps up to this are bridged; longer ones split the recording
     node_spacing_s: float = 0.05  # no two nodes further apart
+    # What is known to better than these is determined.
+    rotation_tolerance_deg: float = 0.1
+    translation_tolerance_m: float = 5e-3
+    time_tolerance_s: float = 1e-3
+    pixel_tolerance: float = 1.0  # of fx, fy, cx, cy
 
 
 @dataclass(frozen=True)
@@ -105,10 +112,15 @@ class Rig:
 
     imu: ImuSensor | None
     cameras: tuple[Camera, ...]
-    target: Target
+    target: Target = NoTarget()
     gravity: float = 9.81  # m/s^2
     settings: Settings = Settings()
     path: Path | None = None
+
+    @property
+    def has_target(self) -> bool:
+        """Whether there is a target; else all cameras follow points of the scene."""
+        return len(self.target.bodies) > 0
 
     @property
     def blooms(self) -> bool:

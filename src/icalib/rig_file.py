@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from icalib.geometry.cameras import CAMERA_MODELS
-from icalib.geometry.targets import Scene, Target
+from icalib.geometry.targets import NoTarget, Scene, Target
 from icalib.imu_classes import DEFAULT_CLASS, IMU_CLASSES, class_noise
 from icalib.rig import Camera, ImuNoise, ImuSensor, Parameter, Rig, Settings
 from icalib.rig_parameters import imu_intrinsics_parameter, parameter_to_plain, rotation_parameter, vector_parameter
@@ -24,10 +24,17 @@ def load_rig(path: str | Path) -> Rig:
     root = read_yaml(file)
     found = root.record(("sensors",), ("target", "targets", "gravity", "settings"))
     imus, cameras = _sensors(found["sensors"])
+    blind = [c.name for c in cameras if c.tracks is None]
+    targeted = "target" in found or "targets" in found
+    if blind and not targeted:
+        root.fail(
+            "target is missing; add target, targets for several by name, or tracks (a table of followed points) to "
+            f"{' and '.join(blind)}."
+        )
     return Rig(
         imu=imus[0] if imus else None,
         cameras=tuple(cameras),
-        target=target_or_targets(root),
+        target=target_or_targets(root) if targeted else NoTarget(),
         gravity=found["gravity"].positive() if "gravity" in found else Rig.gravity,
         settings=_settings(found["settings"]) if "settings" in found else Settings(),
         path=file,
@@ -48,9 +55,11 @@ def rig_to_dict(rig: Rig) -> dict[str, Any]:
     """`rig` as lists, numbers and text; written as YAML or JSON, it loads back as the same rig."""
     imus = {} if rig.imu is None else {rig.imu.name: _imu_to_plain(rig.imu)}
     sensors = imus | {c.name: _camera_to_plain(c) for c in rig.cameras}
+    key = "targets" if isinstance(rig.target, Scene) else "target"
+    target = {key: rig.target.plain()} if rig.has_target else {}
     return {
         "sensors": sensors,
-        "targets" if isinstance(rig.target, Scene) else "target": rig.target.plain(),
+        **target,
         "gravity": rig.gravity,
         "settings": dataclasses.asdict(rig.settings),
     }
@@ -97,7 +106,9 @@ def _noise(value: YamlValue) -> ImuNoise:
 
 def _camera(name: str, value: YamlValue) -> Camera:
     groups = ("rotation", "translation", "time_offset", "intrinsics", "distortion", "bloom")
-    found = value.record(("type", "model", "resolution"), ("path", "topic", "corner_noise", *groups))
+    found = value.record(
+        ("type", "model", "resolution"), ("path", "topic", "corner_noise", "tracks", "track_noise", *groups)
+    )
     model = found["model"].choice("camera model", tuple(CAMERA_MODELS))
     sizes = {"translation": 3, "time_offset": 1, "intrinsics": 4, "bloom": 1}
     sizes["distortion"] = len(CAMERA_MODELS[model].parameter_names) - sizes["intrinsics"]
@@ -112,6 +123,8 @@ def _camera(name: str, value: YamlValue) -> Camera:
         resolution=_resolution(found["resolution"]),
         corner_noise_px=found["corner_noise"].positive() if "corner_noise" in found else None,
         topic=_topic(found),
+        tracks=found["tracks"].text() if "tracks" in found else None,
+        track_noise_px=found["track_noise"].positive() if "track_noise" in found else None,
         **parameters,
     )
 
@@ -166,5 +179,9 @@ def _camera_to_plain(camera: Camera) -> dict[str, Any]:
         plain["topic"] = camera.topic
     if camera.corner_noise_px is not None:
         plain["corner_noise"] = camera.corner_noise_px
+    if camera.tracks is not None:
+        plain["tracks"] = camera.tracks
+    if camera.track_noise_px is not None:
+        plain["track_noise"] = camera.track_noise_px
     groups = {f.name: getattr(camera, f.name) for f in dataclasses.fields(camera)}
     return plain | {name: parameter_to_plain(p) for name, p in groups.items() if isinstance(p, Parameter)}

@@ -130,3 +130,25 @@ def test_without_a_guess_a_single_axis_is_refused_with_the_missing_motion():
     simulation = simulate(moving("single_axis"), 0)
     with pytest.raises(EstimationError, match="turned about one axis only.*turn the rig about two more axes"):
         calibrate_measurements(rig_for(simulation.scenario), simulation.measurements)
+
+
+@pytest.mark.parametrize(
+    ("setting", "group", "unit"),
+    [
+        ("rotation_tolerance_deg", "rotation", 180.0 / np.pi),
+        ("translation_tolerance_m", "translation", 1.0),
+        ("time_tolerance_s", "time_offset", 1.0),
+        ("pixel_tolerance", "intrinsics", 1.0),
+    ],
+)
+def test_a_tighter_tolerance_makes_a_parameter_weak(setting: str, group: str, unit: float):
+    simulation = simulate(handheld(10.0), 0)
+    rig = rig_for(simulation.scenario, intrinsics="free")
+    usual = calibrate_measurements(rig, simulation.measurements)
+    std = usual.group("cam0", group).std_formal
+    settings = dataclasses.replace(rig.settings, **{setting: unit * 0.4 * float(std.max())})
+    strict = calibrate_measurements(dataclasses.replace(rig, settings=settings), simulation.measurements)
+    for name in ("rotation", "translation", "time_offset", "intrinsics"):
+        assert set(usual.group("cam0", name).verdict) == {"determined"}
+        assert ("weak" in strict.group("cam0", name).verdict) == (name == group)
+    np.testing.assert_allclose(strict.group("cam0", group).std_formal, std, rtol=0.02)

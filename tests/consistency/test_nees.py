@@ -13,7 +13,7 @@ def check(consistency, asynchronous: bool, imu: str, seeds: range, probability: 
     scenario = handheld(12.0, asynchronous=asynchronous, imu=imu)
     rig = rig_for(scenario, intrinsics="free", distortion="free")
     found = consistency(scenario, rig, seeds, probability)
-    print({block: (round(c.nees, 3), round(c.low, 3), round(c.high, 3)) for block, c in found.items()})
+    print({block: (round(c.mean, 3), round(c.low, 3), round(c.high, 3)) for block, c in found.items()})
     assert {block: c for block, c in found.items() if not c.consistent} == {}
 
 

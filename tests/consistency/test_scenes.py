@@ -158,5 +158,5 @@ def test_fifty_recordings_are_consistent(consistency):
     scenario = tag_map(10.0, with_grid=True)
     assert isinstance(scenario.target, Scene)
     found = consistency(scenario, free(scenario), range(50), 0.95)
-    print({block: (round(c.nees, 3), round(c.low, 3), round(c.high, 3)) for block, c in found.items()})
+    print({block: (round(c.mean, 3), round(c.low, 3), round(c.high, 3)) for block, c in found.items()})
     assert {block: c for block, c in found.items() if not c.consistent} == {}

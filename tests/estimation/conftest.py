@@ -3,28 +3,35 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.estimation.arrowhead import Piece
+from icalib.estimation.arrowhead import Piece, make_pieces
 from icalib.estimation.board import SHAPE_LABELS
 from icalib.estimation.bodies import Bodies, restrict
 from icalib.estimation.corner_factor import CornerFactor, CornerNoise
+from icalib.estimation.feature_factor import FeatureFactor
+from icalib.estimation.gauge_factor import Gauge
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.imu_factor import ImuFactor
+from icalib.estimation.lidar_binning import LidarNoise, Motion
+from icalib.estimation.lidar_factor import LidarFactor
 from icalib.estimation.nodes import place_nodes
 from icalib.estimation.poses import assign_nodes
 from icalib.estimation.problem import Problem
 from icalib.estimation.state import NODE, Layout, State, make_layout
+from icalib.estimation.tolerances import Tolerances
 from icalib.geometry.cameras import camera_model
+from icalib.geometry.planes import plane_of
 from icalib.geometry.targets import AprilGrid
-from icalib.measurements import CornerStream
-from icalib.simulation import Scenario, Simulation, handheld, simulate
+from icalib.measurements import CornerStream, LidarStream, TrackStream
+from icalib.simulation import Scenario, Simulation, handheld, load_scenario, simulate
 
 TOLERANCE = {
     "rotation": 2e-3,
@@ -37,7 +44,10 @@ TOLERANCE = {
     "bloom": 0.1,
     "radii": 1e-3,
     "baseline": 5e-3,
+    "plane": (2e-3, 2e-3, 5e-3),
 }
+PAPER = Path(__file__).parents[2] / "examples" / "paper"
+FEWEST_POINTS = 200  # of a plane in a setup
 
 
 @dataclass(frozen=True)
@@ -180,11 +190,119 @@ def make_factor(setup: Setup, camera: int, scheme: str = "inertial", **changes) 
     return replace(factor, **changes)
 
 
+def make_features(
+    setup: Setup, scheme: str = "inertial", loss: tuple[str, float] = ("none", 2.5), noise_px: float = 0.0
+) -> FeatureFactor:
+    """The corners of both cameras as features of unknown position, sigma 0.8 and 1.1 px; of every third image of the
+    first camera some are not in use."""
+    rng = np.random.default_rng(11)
+    streams = tuple(
+        TrackStream(s.name, s.stamps_ns, s.start, s.point, s.uv + noise_px * rng.normal(size=s.uv.shape))
+        for s in setup.streams
+    )
+    cameras = tuple(make_factor(setup, i, scheme) for i in range(len(streams)))
+    keep = [rng.random(len(s.uv)) < 0.9 for s in streams]
+    cuts = tuple(p.first for p in make_pieces(len(setup.state.seconds), 0)[1:])
+    return FeatureFactor.build(cameras, streams, (0.8, 1.1), tuple(keep), loss, setup.state, cuts)
+
+
 def make_problem(setup: Setup, start: State | None = None, scheme: str = "inertial") -> Problem:
     columns = setup.layout.columns("imu0", "intrinsics")
     imu = ImuFactor.build(setup.imu, start or setup.state, 9.81, columns[columns >= 0])
     cameras = tuple(make_factor(setup, i, scheme) for i in range(len(setup.sim.measurements.cameras)))
     return Problem(setup.layout, imu, cameras, (), setup.columns_scale())
+
+
+@dataclass(frozen=True)
+class RoomSetup:
+    """A robot with IMU and LiDAR in its room: state is the truth, planes those that enough points lie on; plane (N,)
+    is the index into them of each point, -1: none."""
+
+    sim: Simulation
+    imu: ImuData
+    layout: Layout
+    planes: tuple[tuple[str, str], ...]
+    plane: np.ndarray
+    state: State
+
+    @property
+    def stream(self) -> LidarStream:
+        return self.sim.measurements.lidars[0]
+
+    def columns_scale(self) -> np.ndarray:
+        """(B,) a reasonable step of each border column."""
+        scale = np.zeros(self.layout.size)
+        for b in self.layout.free:
+            scale[b.columns] = 1e-3 if b.key == ("imu0", "intrinsics") else TOLERANCE[b.name]
+        return scale
+
+    def perturbed(self, rng: np.random.Generator, size: float = 1.0) -> State:
+        chain = rng.normal(size=(len(self.state.seconds), NODE)) * np.repeat([2e-3, 2e-3, 5e-3, 5e-4, 5e-3], 3)
+        border = rng.normal(size=self.layout.size) * self.columns_scale()
+        return self.state.retract(self.layout, size * chain, size * border)
+
+    def motion(self, state: State) -> Motion:
+        return Motion(state, self.imu, 9.81, 0.5)
+
+    def factor(self, start: State | None = None, noise: LidarNoise | None = None, **options) -> LidarFactor:
+        """The LiDAR's, its moments taken at `start` or the truth."""
+        motion = self.motion(start or self.state)
+        noise = noise or LidarNoise(0.03)
+        return LidarFactor.build(self.stream, self.plane, self.planes, motion, noise, self.layout, **options)
+
+    def problem(self, start: State, noise: LidarNoise | None = None, **options) -> Problem:
+        """IMU and LiDAR, the first node held where it is in truth."""
+        columns = self.layout.columns("imu0", "intrinsics")
+        imu = ImuFactor.build(self.imu, start, 9.81, columns[columns >= 0])
+        gauge = Gauge(0, self.state.rotation[0], self.state.position[0])
+        lidar = self.factor(start, noise, **options)
+        return Problem(self.layout, imu, (lidar,), (gauge,), Tolerances().of(self.layout, "imu0"))
+
+
+def make_room(sim: Simulation, *, imu_free: bool = False, spacing: float = 0.025) -> RoomSetup:
+    """Of the first LiDAR; the planes' points are the means of the faces that the points were seen on."""
+    truth, stream = sim.truth, sim.measurements.lidars[0]
+    imu = ImuData.build(sim.measurements.imu, sim.scenario.imu_noise)
+    count = np.bincount(stream.plane[stream.plane >= 0], minlength=len(truth.planes))
+    used = np.flatnonzero(count >= FEWEST_POINTS)
+    own = np.full(len(truth.planes) + 1, -1, dtype=np.int32)
+    own[used] = np.arange(len(used))
+    planes = tuple((f"plane{k}", "plane") for k in used)
+    entries = [("imu0", "intrinsics", "vector", 24, imu_free), (stream.name, "rotation", "rotation", 3, True)]
+    entries += [(stream.name, "translation", "vector", 3, True), (stream.name, "time_offset", "vector", 1, True)]
+    entries += [(*key, "plane", 3, True) for key in planes]
+    T, origin_s = truth.T_imu_lidar[stream.name], (stream.origin_ns - sim.measurements.imu.origin_ns) * 1e-9
+    offset = truth.time_offset[stream.name] + origin_s
+    values = {("imu0", "intrinsics"): truth.imu_intrinsics.copy(), (stream.name, "time_offset"): np.array([offset])}
+    values[stream.name, "rotation"], values[stream.name, "translation"] = T[:3, :3].copy(), T[:3, 3].copy()
+    faces = sim.scenario.room.faces
+    for key, k in zip(planes, used, strict=True):
+        values[key] = plane_of(truth.planes[k, :3], faces[k, 0] + 0.5 * (faces[k, 1] + faces[k, 2]))
+    ends = stream.seconds[[0, -1]] + offset + np.array([0.0, stream.offset_s.max()])
+    seconds = place_nodes(imu, [np.clip(ends, 0.0, imu.seconds[-1])], spacing, 0.5)
+    R, p, v = truth.pose_at(seconds + truth.seconds[0])
+    bias = np.tile(np.concatenate([truth.gyro_bias[0], truth.accel_bias[0]]), (len(seconds), 1))
+    state = State(seconds, R, p, v, bias, values)
+    return RoomSetup(sim, imu, make_layout(entries), planes, own[stream.plane], state)
+
+
+def room_scenario(
+    duration_s: float, *, example: str = "table2-3d", noiseless: bool = False, exact: bool = True, **lidar
+) -> Scenario:
+    """The paper's robot with IMU and LiDAR alone, moving freely or as another example; `lidar`: changes of it."""
+    scenario = load_scenario(PAPER / f"{example}.yaml")
+    return replace(
+        scenario,
+        duration_s=duration_s,
+        cameras=(),
+        lidars=(replace(scenario.lidars[0], **lidar),),
+        wheels=(),
+        features=None,
+        board=False,
+        motion=replace(scenario.motion, exact=exact),
+        imu_noise_enabled=not noiseless,
+        robot_noise_enabled=not noiseless,
+    )
 
 
 def make_dense(pieces: tuple[Piece, ...], n_nodes: int) -> tuple[np.ndarray, np.ndarray]:
@@ -202,7 +320,23 @@ def make_dense(pieces: tuple[Piece, ...], n_nodes: int) -> tuple[np.ndarray, np.
                 H[a, NODE * k + NODE : NODE * k + 2 * NODE] += piece.upper[i]
         H[o:, o:] += piece.border[:-1, :-1]
         g[o:] += piece.border[:-1, -1]
+        for H_part, g_part in schur_of_features(piece, n_nodes) if piece.features else ():
+            H -= H_part
+            g -= g_part
     return np.triu(H) + np.triu(H, 1).T, g
+
+
+def schur_of_features(piece: Piece, n_nodes: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """What eliminating each feature of a piece takes from the dense normal matrix and its gradient."""
+    sums, o = piece.features.sums, NODE * n_nodes
+    for f in range(len(sums.own)):
+        K = np.zeros((3, o + sums.side.shape[2]))
+        K[:, o:] = sums.side[f]
+        for e in np.flatnonzero(sums.track == f):
+            a = NODE * (piece.first + sums.node[e])
+            K[:, a : a + NODE] += sums.block[e]
+        M = K[:, :-1].T @ np.linalg.solve(sums.own[f], K)
+        yield M[:, :-1], M[:, -1]
 
 
 def unlike_cameras(duration_s: float, asynchronous: bool = True) -> Scenario:
@@ -230,6 +364,11 @@ def factor_of() -> Callable[..., CornerFactor]:
 
 
 @pytest.fixture(scope="session")
+def features_of() -> Callable[..., FeatureFactor]:
+    return make_features
+
+
+@pytest.fixture(scope="session")
 def problem_of() -> Callable[..., Problem]:
     return make_problem
 
@@ -237,3 +376,21 @@ def problem_of() -> Callable[..., Problem]:
 @pytest.fixture(scope="session")
 def dense() -> Callable[..., tuple[np.ndarray, np.ndarray]]:
     return make_dense
+
+
+@pytest.fixture(scope="session")
+def room_of() -> Callable[..., RoomSetup]:
+    return make_room
+
+
+@pytest.fixture(scope="session")
+def robot() -> Callable[..., Scenario]:
+    return room_scenario
+
+
+@pytest.fixture(scope="session")
+def sparse_room() -> Simulation:
+    """Half a second, few points, no noise of the IMU: where its readings jump, `Poses.velocity` is not quite the
+    derivative of the position (a quarter of the jump times the time since the reading)."""
+    scenario = room_scenario(0.6, rings=8, azimuth_steps=300, elevation_deg=(-40.0, 30.0))
+    return simulate(replace(scenario, imu_noise_enabled=False), seed=3)

@@ -19,7 +19,9 @@ import icalib.estimation
 from icalib.estimation.arrowhead import Piece, make_pieces
 from icalib.estimation.corner_factor import CornerNoise
 from icalib.estimation.corner_weights import LEAST_CURVATURE
+from icalib.estimation.gauge_factor import Gauge
 from icalib.estimation.imu_factor import ROWS, ImuFactor
+from icalib.estimation.lidar_binning import LidarNoise
 from icalib.estimation.prior_factor import FIRST_BIAS_SIGMA, Prior, accumulate_bias_prior
 from icalib.estimation.state import NODE, State, make_layout
 from icalib.estimation.wheel_factor import IncrementFactor, RelativePoseFactor, WheelNoise
@@ -141,6 +143,93 @@ def corner_sample(
     return Sample("CornerFactor", setup, state, accumulate, residual, weights, tolerance)
 
 
+def feature_sample(unlike, setup_of, features_of, scheme="inertial", loss="none", imu_free=False, curved=False):
+    """Points are held where the cost is least at the sample's state; the weights take them out."""
+    setup = setup_of(unlike, imu_free=imu_free)
+    rng = np.random.default_rng(4)
+    factor = features_of(setup, scheme, (loss, LOSS_SCALE), 1.0)
+    state = setup.perturbed(rng, 0.02)
+    at_optimum = factor.output()
+    for piece in make_pieces(len(state.seconds), setup.layout.size):
+        factor.accumulate(state, piece, at_optimum, sums=False)
+    used = [root > 0 for root in at_optimum.root]
+    track = np.concatenate([t[u] for t, u in zip(factor.tracks.track, used, strict=True)])
+
+    def errors(at, points):
+        found = []
+        for i, (camera, stream, u) in enumerate(zip(factor.cameras, factor.streams, used, strict=True)):
+            _, R_cw, p_wc = camera.camera_poses(at)
+            image = stream.image[u]
+            X = np.einsum("nij,nj->ni", R_cw[image], points[factor.tracks.track[i][u]] - p_wc[image])
+            params = np.concatenate([at.values[camera.name, "intrinsics"], at.values[camera.name, "distortion"]])
+            found.append(camera.model.project(params, X)[0] - stream.uv[u])
+        return np.concatenate(found)
+
+    def residual(at):
+        return errors(at, at_optimum.points).ravel()
+
+    def weights(at):
+        e = errors(at, at_optimum.points)
+        root = np.concatenate([r[u] for r, u in zip(at_optimum.root, used, strict=True)])
+        sigma = np.repeat(factor.sigma, [u.sum() for u in used])
+        size = np.linalg.norm(e, axis=1)
+        bend = slope_along(loss if curved else "none", size / sigma)
+        W = np.zeros((len(e), 2, len(e), 2))
+        along = np.einsum("ni,nj->nij", e, e) / (size**2)[:, None, None]
+        blocks = (root**2)[:, None, None] * (np.eye(2) + (bend - 1.0)[:, None, None] * along)
+        W[np.arange(len(e)), :, np.arange(len(e))] = blocks
+        W = W.reshape(2 * len(e), 2 * len(e))
+        F, h = np.zeros((2 * len(e), 3 * factor.tracks.count)), 1e-5
+        for k in range(3):
+            step = h * np.eye(3)[k]
+            slope = (errors(at, at_optimum.points + step) - errors(at, at_optimum.points - step)) / (2 * h)
+            for r in range(2):
+                F[2 * np.arange(len(e)) + r, 3 * track + k] = slope[:, r]
+        y = (root[:, None] ** 2 * e).ravel()
+        return y, W - W @ F @ np.linalg.solve(F.T @ W @ F, F.T @ W)
+
+    def accumulate(at, piece, sums):
+        if sums:
+            piece.features = factor.attach(piece, keep=True).features
+        return factor.accumulate(at, piece, factor.output(), sums, curved)
+
+    return Sample("FeatureFactor", setup, state, accumulate, residual, weights)
+
+
+def lidar_sample(room, room_of, scheme="inertial", loss="none", beam=0.0, imu_free=False):
+    """Its moments taken at another state, as in all but the first linearisation of a pass."""
+    setup = room_of(room, imu_free=imu_free, spacing=0.05)
+    rng = np.random.default_rng(5)
+    start = setup.perturbed(rng, 0.3)
+    factor = setup.factor(start, LidarNoise(0.03, beam, loss, LOSS_SCALE), scheme=scheme, bin_s=5e-3)
+    state = setup.perturbed(rng, 0.5)
+
+    def residual(at):
+        out = factor.output()
+        for piece in make_pieces(len(at.seconds), setup.layout.size):
+            factor.accumulate(at, piece, out, sums=False)
+        return out.ravel()
+
+    def accumulate(at, piece, sums):
+        return factor.accumulate(at, piece, factor.output(), sums)
+
+    return Sample("LidarFactor", setup, state, accumulate, residual, white(residual))
+
+
+def gauge_sample(room, room_of, node):
+    setup = room_of(room, spacing=0.05)
+    state = setup.perturbed(np.random.default_rng(6), 20.0)
+    gauge = Gauge(node, setup.state.rotation[node], setup.state.position[node])
+    return Sample(
+        "Gauge",
+        setup,
+        state,
+        gauge.accumulate,
+        lambda at: gauge.residual(at)[0],
+        white(lambda at: gauge.residual(at)[0]),
+    )
+
+
 def prior_sample(unlike, setup_of, sensor, name):
     setup = setup_of(unlike, imu_free=True)
     rng = np.random.default_rng(2)
@@ -254,6 +343,28 @@ SAMPLES = {
         "CornerFactor",
         lambda u, s, f: corner_sample(u, s, f, 1, "pose", loss="huber", field=1, curved=True, split=True),
     ),
+    "features": ("FeatureFactor", lambda u, s, f: feature_sample(u, s, f)),
+    "features, intrinsics, kinematic": (
+        "FeatureFactor",
+        lambda u, s, f: feature_sample(u, s, f, "kinematic", imu_free=True),
+    ),
+    "features, pose": ("FeatureFactor", lambda u, s, f: feature_sample(u, s, f, "pose")),
+    "features, huber": ("FeatureFactor", lambda u, s, f: feature_sample(u, s, f, loss="huber")),
+    "features, cauchy, curved, pose": (
+        "FeatureFactor",
+        lambda u, s, f: feature_sample(u, s, f, "pose", "cauchy", curved=True),
+    ),
+    "lidar": ("LidarFactor", lambda u, s, f: lidar_sample(*s)),
+    "lidar, huber, beam, kinematic, intrinsics": (
+        "LidarFactor",
+        lambda u, s, f: lidar_sample(*s, "kinematic", "huber", 0.02, imu_free=True),
+    ),
+    "lidar, cauchy, pose, intrinsics": (
+        "LidarFactor",
+        lambda u, s, f: lidar_sample(*s, "pose", "cauchy", imu_free=True),
+    ),
+    "gauge": ("Gauge", lambda u, s, f: gauge_sample(*s, 0)),
+    "gauge of a later recording": ("Gauge", lambda u, s, f: gauge_sample(*s, 7)),
     "prior on a rotation": ("Prior", lambda u, s, f: prior_sample(u, s, "cam1", "rotation")),
     "prior on a vector": ("Prior", lambda u, s, f: prior_sample(u, s, "cam0", "intrinsics")),
     "prior on IMU intrinsics": ("Prior", lambda u, s, f: prior_sample(u, s, "imu0", "intrinsics")),
@@ -319,9 +430,11 @@ def scales(sample):
 
 
 @pytest.fixture(scope="module", params=SAMPLES)
-def sample(request, unlike, setup_of, factor_of):
+def sample(request, unlike, setup_of, factor_of, features_of, sparse_room, room_of):
     name, make = SAMPLES[request.param]
-    made = make(unlike, setup_of, factor_of)
+    in_room = name in ("LidarFactor", "Gauge")
+    factors = features_of if name == "FeatureFactor" else factor_of
+    made = make(unlike, (sparse_room, room_of) if in_room else setup_of, factors)
     assert made.factor == name
     return made
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import time
 from pathlib import Path
 
 import numpy as np
@@ -96,11 +95,8 @@ def test_euroc_folder_and_gzip(tmp_path):
     assert [p.name for p in recording.files()] == ["data.csv", "corners.csv.gz"]
 
 
-def test_whole_real_recording_is_read_exactly_and_fast(euroc):
-    read_measurements(open_recording(euroc), a_rig(2))
-    begin = time.perf_counter()
+def test_whole_real_recording_is_read_exactly(euroc):
     m = read_measurements(open_recording(euroc), a_rig(2))
-    assert time.perf_counter() - begin < 0.5
     assert [len(c.uv) for c in m.cameras] == [179524, 178764]
     rows = [r.split(",") for r in gzip.decompress((euroc / "imu0/data.csv.gz").read_bytes()).decode().split()[1:]]
     assert m.imu.stamps_ns.tolist() == [int(r[0]) for r in rows]

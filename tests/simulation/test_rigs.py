@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import icalib.simulation
 from icalib.rig import Parameter, Settings
-from icalib.simulation import ADIS16448, handheld, rig_for, settings_for, simulate
+from icalib.simulation import ADIS16448, GuessError, handheld, rig_for, settings_for, simulate, with_drawn_guess
 
 ALLOWED = (
     "icalib.errors",
@@ -64,3 +65,31 @@ def test_simulation_imports_nothing_that_it_is_to_check():
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
             for name in names:
                 assert not name.startswith("icalib") or name.startswith(ALLOWED), f"{path.name} imports {name}"
+
+
+def test_guesses_are_drawn_about_the_truth_with_the_given_spread():
+    scenario = handheld()
+    error = GuessError(rotation=0.1, translation=0.2, time_offset=0.3, focal_length=0.04)
+    found = {"turn": [], "move": [], "offset": [], "focal": []}
+    for seed in range(400):
+        cam0, truth = with_drawn_guess(rig_for(scenario), scenario, seed, error).cameras[0], scenario.cameras[0]
+        turn = truth.T_imu_cam[:3, :3].T @ cam0.rotation.value
+        found["turn"] += Rotation.from_matrix(turn).as_rotvec().tolist()
+        found["move"] += (cam0.translation.value - truth.T_imu_cam[:3, 3]).tolist()
+        found["offset"] += (cam0.time_offset.value - truth.time_offset_s).tolist()
+        drawn = with_drawn_guess(rig_for(scenario, intrinsics="free"), scenario, seed, error).cameras[0].intrinsics
+        found["focal"].append(drawn.value[0] / truth.intrinsics[0] - 1.0)
+        assert drawn.value[1] / truth.intrinsics[1] == pytest.approx(drawn.value[0] / truth.intrinsics[0])
+    sizes = {name: float(np.std(values)) for name, values in found.items()}
+    assert sizes == pytest.approx({"turn": 0.1, "move": 0.2, "offset": 0.3, "focal": 0.04}, rel=0.1)
+
+
+def test_guesses_are_of_what_is_free_and_the_same_for_a_seed():
+    scenario = handheld()
+    rig = rig_for(scenario, translation="fixed", distortion="free")
+    first, second = (with_drawn_guess(rig, scenario, 3).cameras[1] for _ in range(2))
+    assert first.rotation.mode == "free" and first.rotation.value.tolist() == second.rotation.value.tolist()
+    assert first.translation is rig.cameras[1].translation and first.intrinsics is rig.cameras[1].intrinsics
+    assert first.distortion.value is None
+    other = with_drawn_guess(rig, scenario, 4).cameras[1]
+    assert first.time_offset.value != other.time_offset.value

@@ -10,6 +10,7 @@ from icalib.calibration.result import (
     SensorFit,
     Trajectory,
     Verdict,
+    Visited,
 )
 from icalib.calibration.saving import calibration_files, load_calibration
 
@@ -23,6 +24,7 @@ __all__ = [
     "SensorFit",
     "Trajectory",
     "Verdict",
+    "Visited",
     "calibration_files",
     "load_calibration",
 ]

@@ -110,6 +110,16 @@ class Iteration:
 
 
 @dataclass(frozen=True)
+class Visited:
+    """Where the solver stood when it looked for a step: of each group (sensor, name) that is estimated its value and
+    formal standard deviation there, as in `ParameterGroup`. What is held at the guess has none: zeros."""
+
+    stage: str
+    values: dict[tuple[str, str], np.ndarray]
+    std: dict[tuple[str, str], np.ndarray]
+
+
+@dataclass(frozen=True)
 class Calibration:
     """Everything a run found, and what it was made from."""
 

@@ -22,6 +22,7 @@ from numba import njit
 
 from icalib.errors import EstimationError
 from icalib.estimation import pages
+from icalib.estimation.front import Eliminated, Features, eliminate, plan
 from icalib.estimation.state import NODE
 from icalib.geometry.small import cholesky
 
@@ -56,7 +57,8 @@ class Piece:
     """J^T J and J^T r of the factors between nodes `first` and `last`, both included.
 
     diagonal (n, 15, 15); upper (n, 15, 15), node k with node k + 1; side (n, 15, B + 1), node with border, the node's
-    gradient in the last column; border (B + 1, B + 1), the border's gradient in its last column.
+    gradient in the last column; border (B + 1, B + 1), the border's gradient in its last column; features: those that
+    are seen from its nodes alone, to be eliminated with them.
     """
 
     first: int
@@ -65,6 +67,7 @@ class Piece:
     upper: np.ndarray
     side: np.ndarray
     border: np.ndarray
+    features: Features | None = None
 
     @classmethod
     def zeros(cls, first: int, last: int, n_border: int) -> Piece:
@@ -87,10 +90,16 @@ class Piece:
     def clear(self) -> None:
         for a in (self.diagonal, self.upper, self.side, self.border):
             a[:] = 0.0
+        if self.features is not None:
+            self.features.sums.clear()
 
     def without_last(self) -> Piece:
         """The same sums without node `last`, of which they must say nothing."""
-        return Piece(self.first, self.last - 1, self.diagonal[:-1], self.upper[:-1], self.side[:-1], self.border)
+        features = self.features
+        if features is not None:
+            features = Features(features.sums, plan(features.sums, len(self.diagonal) - 1, True, False))
+        own = self.diagonal[:-1], self.upper[:-1], self.side[:-1]
+        return Piece(self.first, self.last - 1, *own, self.border, features)
 
     def sums(self, wanted: bool) -> Sums:
         """For a kernel to add to; empty where only residuals are wanted."""
@@ -98,12 +107,17 @@ class Piece:
         return Sums(piece.first, piece.diagonal, piece.upper, piece.side, piece.border)
 
 
+def chain_cuts(n_nodes: int) -> tuple[int, ...]:
+    """The nodes that two pieces share: the middle one; none where the chain is too short."""
+    middle = n_nodes // 2
+    return () if middle < 2 else (middle,)
+
+
 def make_pieces(n_nodes: int, n_border: int | None) -> tuple[Piece, ...]:
     """Two pieces of about the same length; one where the chain is too short to share. Without a border, bare ones."""
-    middle = n_nodes // 2
-    cuts = (0, n_nodes - 1) if middle < 2 else (0, middle, n_nodes - 1)
+    ends = (0, *chain_cuts(n_nodes), n_nodes - 1)
     return tuple(
-        Piece.bare(a, b) if n_border is None else Piece.zeros(a, b, n_border) for a, b in pairwise(cuts)
+        Piece.bare(a, b) if n_border is None else Piece.zeros(a, b, n_border) for a, b in pairwise(ends)
     )  # fmt: skip
 
 
@@ -205,7 +219,7 @@ class NotDefiniteError(EstimationError):
 
 
 def _eliminated_part(piece: Piece, keep: bool) -> np.ndarray:
-    """(B + 1, B + 1) what eliminating a piece's chain, but for a kept end node, takes from the border."""
+    """(B + 1, B + 1) what the eliminated chain of a piece, but for a kept end node, takes from the border."""
     rows = piece.side
     if keep:
         rows = rows[:-1] if piece.first == 0 else rows[1:]
@@ -213,11 +227,34 @@ def _eliminated_part(piece: Piece, keep: bool) -> np.ndarray:
     return flat.T @ flat
 
 
+def _reduce(piece: Piece, keep: bool) -> Eliminated | bool:
+    """Eliminates a piece in place, but for a kept end node: that node's sums and the border's are left. False: not
+    definite."""
+    forwards = piece.first == 0 or not keep
+    if piece.features is None:
+        done = _eliminate(piece.diagonal, piece.upper, piece.side, forwards, keep)
+        if done:
+            piece.border -= _eliminated_part(piece, keep)
+        return done
+    steps, sums = piece.features.steps, piece.features.sums
+    done = eliminate(steps, piece.diagonal, piece.upper, piece.side, sums, forwards)
+    if done is None:
+        return False
+    left = np.triu(done.left) + np.triu(done.left, 1).T
+    kept = NODE if keep else 0
+    piece.border += left[kept:, kept:]
+    if keep:
+        end = -1 if forwards else 0
+        piece.diagonal[end] += left[:NODE, :NODE]
+        piece.side[end] += left[:NODE, NODE:]
+    return done
+
+
 def marginalise(piece: Piece) -> np.ndarray:
     """Border (B + 1, B + 1) with all nodes of `piece` eliminated; overwrites the piece. Raises NotDefiniteError."""
-    if not _eliminate(piece.diagonal, piece.upper, piece.side, True, False):
+    if not _reduce(piece, False):
         raise NotDefiniteError("the motion between nodes is not determined.")
-    return piece.border - _eliminated_part(piece, keep=False)
+    return piece.border
 
 
 def marginalise_in_segments(piece: Callable[[int, int], Piece], n_nodes: int) -> np.ndarray:
@@ -285,6 +322,15 @@ def restricted_inverse(information: np.ndarray, held: np.ndarray) -> np.ndarray:
     return (basis / np.maximum(values, LEAST)) @ basis.T
 
 
+def _back(piece: Piece, done: Eliminated | bool, keep: bool, border: np.ndarray, chain: np.ndarray) -> None:
+    """Fills the part of `chain` (K, 15) that belongs to a piece, from the border's step and the kept node's."""
+    own = chain[piece.first : piece.last + 1]
+    if isinstance(done, Eliminated):
+        done.substitute(border, own)
+    else:
+        _substitute(piece.diagonal, piece.upper, piece.side, piece.first == 0, keep, border, own)
+
+
 def solve(
     pieces: tuple[Piece, ...], n_nodes: int, tolerance: np.ndarray, damping: float = 0.0, held: np.ndarray = NOTHING
 ) -> Solution:
@@ -292,16 +338,15 @@ def solve(
     overwrites the pieces. Raises NotDefiniteError."""
     keep = len(pieces) > 1
     n_border = len(tolerance)
-    rest = sum((p.border for p in pieces), np.zeros((n_border + 1, n_border + 1)))
-    rest[np.diag_indices(n_border)] *= 1.0 + damping
+    scale = np.append(np.full(n_border, damping), 0.0)
+    extra = np.diag(scale * sum((p.border.diagonal() for p in pieces), np.zeros(n_border + 1)))
     if damping:
         for piece in pieces:
             _damp(piece.diagonal, damping)
-    done = in_parallel(lambda p: _eliminate(p.diagonal, p.upper, p.side, p.first == 0, keep), pieces)
+    done = in_parallel(lambda p: _reduce(p, keep), pieces)
     if not all(done):
         raise NotDefiniteError("the motion between nodes is not determined.")
-    for piece in pieces:
-        rest -= _eliminated_part(piece, keep)
+    rest = sum((p.border for p in pieces), extra)
     shared, shared_side = np.zeros((0, 0)), np.zeros((0, n_border + 1))
     if keep:
         shared = pieces[0].diagonal[-1] + pieces[1].diagonal[0]
@@ -316,10 +361,5 @@ def solve(
     if keep:
         rhs = -(shared_side[:, -1] + shared_side[:, :-1] @ border)
         chain[pieces[0].last] = np.linalg.solve(np.tril(shared).T, rhs)
-    in_parallel(
-        lambda p: _substitute(
-            p.diagonal, p.upper, p.side, p.first == 0, keep, border, chain[p.first : p.last + 1]
-        ),
-        pieces,
-    )  # fmt: skip
+    in_parallel(lambda p: _back(p[0], p[1], keep, border, chain), zip(pieces, done, strict=True))
     return Solution(chain, border, decrease - 0.5 * float(rest[n_border, n_border]), information)

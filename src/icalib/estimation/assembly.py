@@ -9,11 +9,13 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation import pages
-from icalib.estimation.arrowhead import NOTHING
+from icalib.estimation.arrowhead import NOTHING, chain_cuts
 from icalib.estimation.board import SHAPE_LABELS, SHAPE_SIGMA_M, bloom_direction, board_in
 from icalib.estimation.bodies import Bodies, choose_bodies, restrict
 from icalib.estimation.corner_factor import CornerFactor, CornerNoise
+from icalib.estimation.feature_factor import FeatureFactor
 from icalib.estimation.free_nodes import FreeNodes
+from icalib.estimation.images import on_common_images
 from icalib.estimation.imu_data import ImuData, joined_imu_data
 from icalib.estimation.imu_factor import ImuFactor
 from icalib.estimation.imu_model import N_INTRINSICS
@@ -72,9 +74,10 @@ class Inputs:
 def inputs_for(rig: Rig, recordings: Sequence[Measurements]) -> Inputs:
     """Of one recording or several, joined."""
     bodies = choose_bodies(rig.target, recordings, rig.settings.board_shape)
-    joined, parts = join(rig, [restrict(bodies, r) for r in recordings])
+    joined, parts = join(rig, [on_common_images(rig, restrict(bodies, r)) for r in recordings])
     layout = layout_for(rig, bodies, len(parts))
-    return Inputs(rig, joined, bodies, joined_imu_data(rig, parts, joined), layout, Tolerances(), parts)
+    tolerances = Tolerances.asked_for(rig.settings)
+    return Inputs(rig, joined, bodies, joined_imu_data(rig, parts, joined), layout, tolerances, parts)
 
 
 def layout_for(rig: Rig, bodies: Bodies, n_recordings: int = 1) -> Layout:
@@ -84,7 +87,7 @@ def layout_for(rig: Rig, bodies: Bodies, n_recordings: int = 1) -> Layout:
     if imu is not None:
         entries.append((imu.name, "intrinsics", "vector", N_INTRINSICS, imu.intrinsics.mode != "fixed"))
     # Without an IMU the scene's frame is the world's, in all recordings.
-    for k in range(1 if imu is None else n_recordings):
+    for k in range(1 if imu is None else n_recordings) if bodies.used else ():
         entries.append((board_in(BOARD, k), "tilt", "tilt", 2, imu is not None))
     entries += bodies.shape_entries()
     for camera in rig.cameras:
@@ -168,8 +171,21 @@ def nodes_for(inputs: Inputs, times: list[np.ndarray]) -> np.ndarray:
     return nodes
 
 
+@dataclass(frozen=True)
+class Following:
+    """Of tracks, by camera: sigma px, and keep (N,), observations in use."""
+
+    sigma: tuple[float, ...]
+    keep: tuple[np.ndarray, ...]
+
+
 def assemble(
-    inputs: Inputs, state: State, noise: list[CornerNoise], keep: list[np.ndarray], held: np.ndarray = NOTHING
+    inputs: Inputs,
+    state: State,
+    noise: list[CornerNoise],
+    keep: list[np.ndarray],
+    held: np.ndarray = NOTHING,
+    following: Following | None = None,
 ) -> Problem:
     """The problem at the nodes of `state`, everything frozen that a pass freezes: nodes, assignment, preintegration.
     held: directions of the border that stay, see Problem."""
@@ -190,7 +206,22 @@ def assemble(
         )  # fmt: skip
         factors.append(_with_bloom(factor, camera, state, rig) if rig.blooms else factor)
     tolerance = inputs.tolerances.of(layout, None if rig.imu is None else rig.imu.name)
-    return Problem(layout, _chain(inputs, state), tuple(factors), _priors(inputs), tolerance, held)
+    features = None if following is None else _features(inputs, state, tuple(factors), following)
+    return Problem(
+        layout, _chain(inputs, state), tuple(factors), _priors(inputs), tolerance, held, features, rig.has_target
+    )
+
+
+def _features(inputs: Inputs, state: State, cameras: tuple[CornerFactor, ...], following: Following) -> FeatureFactor:
+    """Points of the scene, as tracks that the poses of `state` find."""
+    streams, settings = inputs.measurements.tracks, inputs.rig.settings
+    times, keep = image_times(inputs, state.values), []
+    for camera, stream, t, k in zip(cameras, streams, times, following.keep, strict=True):
+        seen = is_seen(inputs, t, state.seconds[camera.node])
+        keep.append(k & np.repeat(seen, np.diff(stream.start)))
+    loss = settings.loss, settings.loss_scale
+    cuts, seams = chain_cuts(len(state.seconds)), state.starts[1:]
+    return FeatureFactor.build(cameras, streams, following.sigma, tuple(keep), loss, state, cuts, seams)
 
 
 def _nodes_of(scheme: Scheme, state: State, times: np.ndarray, images: list[slice]) -> np.ndarray:
@@ -232,8 +263,8 @@ def start_values(inputs: Inputs, guess_values: dict[Key, np.ndarray]) -> dict[Ke
     values = dict(guess_values)
     for name in inputs.bodies.bending:
         values[name, "shape"] = np.zeros(len(SHAPE_LABELS))
-    reference = inputs.bodies.names[0]
-    values[reference, "rotation"], values[reference, "translation"] = np.eye(3), np.zeros(3)
+    for reference in inputs.bodies.names[:1]:
+        values[reference, "rotation"], values[reference, "translation"] = np.eye(3), np.zeros(3)
     if (imu := inputs.rig.imu) is not None:
         given = imu.intrinsics.value
         values[imu.name, "intrinsics"] = np.zeros(N_INTRINSICS) if given is None else given.copy()

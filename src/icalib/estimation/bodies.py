@@ -107,6 +107,8 @@ def choose_bodies(target: Target, recordings: Sequence[Measurements], bent: bool
     """
     streams = [c for m in recordings for c in m.cameras]
     n = len(target.bodies)
+    if n == 0:
+        return Bodies(target, ())
     count = sum((np.bincount(target.body[s.point], minlength=n) for s in streams), np.zeros(n, dtype=np.int64))
     if not count.any():
         raise EstimationError("no camera saw the target; check the target in the rig file.")

@@ -9,7 +9,7 @@ from icalib.geometry import so3
 
 
 @njit(cache=True, nogil=True)
-def _by_imu_pose(R_ic, p_ic, R_cw):
+def by_imu_pose(R_ic, p_ic, R_cw):
     """(6, 6) camera pose (right rotation, position in camera axes) by the IMU's (right rotation, position)."""
     A = np.zeros((6, 6))
     lever = so3.hat(p_ic)
@@ -41,7 +41,7 @@ def pose_chain(i, motion, Tn, Tm, Tc):
     body 6 or 0.
     """
     R_ic, R_cw, p_wc = motion.R_imu_cam, motion.R_cam_world[i], motion.p_world_cam[i]
-    A = _by_imu_pose(R_ic, motion.p_imu_cam, R_cw)
+    A = by_imu_pose(R_ic, motion.p_imu_cam, R_cw)
     _product(A, motion.by_node[i], Tn, 0)
     if len(motion.by_next):
         _product(A, motion.by_next[i], Tm, 0)

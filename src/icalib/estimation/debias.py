@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from icalib.estimation.arrowhead import in_parallel, marginalise_in_segments, solve
+from icalib.estimation.arrowhead import in_parallel, solve
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.imu_factor import ImuFactor
 from icalib.estimation.problem import Problem
@@ -42,7 +42,7 @@ def spurious_information(problem: Problem, outcome: Outcome, seed: int = 0) -> n
 
 def _information(problem: Problem, state: State) -> np.ndarray:
     n = problem.layout.size
-    return marginalise_in_segments(partial(problem.sums_of, state), problem.n_nodes)[:n, :n]
+    return problem.marginal(partial(problem.sums_of, state))[:n, :n]
 
 
 def _chain_sample(problem: Problem, state: State, rng: np.random.Generator) -> np.ndarray:
@@ -66,4 +66,6 @@ def _moved(problem: Problem, state: State, chain: np.ndarray, readings: np.ndarr
     old = problem.chain.imu
     imu = replace(old, gyro=old.gyro + readings[:, :3], accel=old.accel + readings[:, 3:])
     factor = ImuFactor.build(imu, state, problem.chain.gravity, problem.chain.columns)
-    return replace(problem, chain=factor, cameras=tuple(replace(c, imu=imu) for c in problem.cameras)), state
+    cameras = tuple(replace(c, imu=imu) for c in problem.cameras)
+    features = None if problem.features is None else replace(problem.features, cameras=cameras)
+    return replace(problem, chain=factor, cameras=cameras, features=features), state

@@ -16,7 +16,7 @@ import numpy as np
 from icalib.estimation.arrowhead import restricted_inverse
 from icalib.estimation.assembly import Inputs, given_priors
 from icalib.estimation.debias import spurious_information
-from icalib.estimation.estimate import EARLY_DECREASE, Estimate, estimate
+from icalib.estimation.estimate import EARLY_DECREASE, Estimate, OnVisit, estimate
 from icalib.estimation.imu_model import N_INTRINSICS
 from icalib.estimation.prior_factor import Prior
 from icalib.estimation.problem import Problem
@@ -64,18 +64,23 @@ class Determined:
         return np.sqrt(np.diag(restricted_inverse(self.data, self.held)) + ((self.shifts / t) ** 2).sum(axis=0))
 
 
-def determine(inputs: Inputs, start: State, on_step: Callable[[str, Step], None] = lambda *_: None) -> Determined:
+def determine(
+    inputs: Inputs,
+    start: State,
+    on_step: Callable[[str, Step], None] = lambda *_: None,
+    on_visit: OnVisit = lambda *_: None,
+) -> Determined:
     """Estimates from `start`, again and again until what is undetermined stays so.
 
     Raises EstimationError where the data do not carry an estimate.
     """
-    found = estimate(inputs, start, on_step)
+    found = estimate(inputs, start, on_step, on_visit=on_visit)
     data, undetermined = _judge(inputs, found)
     for _ in range(MOST_ROUNDS):
         if undetermined.shape == found.problem.held.shape or not (undetermined.size or found.problem.held.size):
             break
         del found  # before the next one takes as much memory
-        found = estimate(inputs, start, on_step, undetermined)
+        found = estimate(inputs, start, on_step, undetermined, on_visit)
         data, undetermined = _judge(inputs, found)
     held = found.problem.held if found.problem.held.size else np.zeros((inputs.layout.size, 0))
     shifts = np.array([_profile(inputs, found, u) for u in held.T]).reshape(-1, inputs.layout.size)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -21,12 +22,16 @@ from icalib.estimation.corner_noise import (
     scale_common_errors,
 )
 from icalib.estimation.evidence import fits
+from icalib.estimation.feature_noise import first_following, inliers, next_following
 from icalib.estimation.problem import Problem
-from icalib.estimation.solver import CONVERGED_DECREASE, Outcome, Step, minimise
+from icalib.estimation.solver import CONVERGED_DECREASE, Outcome, Step, Visit, minimise
 from icalib.estimation.state import State
 from icalib.rig import Settings
 
 EARLY_DECREASE = 0.5  # an early pass is followed by another
+
+
+OnVisit = Callable[[str, Problem, Visit], None]  # told of the pass's name, its problem, and where the solver stood
 
 
 @dataclass(frozen=True)
@@ -44,6 +49,7 @@ def estimate(
     state: State,
     on_step: Callable[[str, Step], None] = lambda *_: None,
     held: np.ndarray = NOTHING,
+    on_visit: OnVisit = lambda *_: None,
 ) -> Estimate:
     """All passes from a first `state`, directions of the border in `held` (see Problem) left alone.
 
@@ -53,17 +59,19 @@ def estimate(
     models = [first_noise(c) for c in rig.cameras]
     noise = [m.noise(s, c, rig.settings) for m, s, c in zip(models, streams, rig.cameras, strict=True)]
     keep = [np.ones(len(s.uv), dtype=bool) for s in streams]
+    following = first_following(inputs)
     history: list[tuple[str, Step]] = []
     names = pass_names(inputs)
     for name in names:
-        problem = assemble(inputs, state, noise, keep, held)
+        problem = assemble(inputs, state, noise, keep, held, following)
 
         def note(step: Step, name: str = name) -> None:
             history.append((name, step))
             on_step(name, step)
 
         last = name == names[-1]
-        outcome = minimise(problem, state, note, CONVERGED_DECREASE if last else EARLY_DECREASE)
+        tolerance = CONVERGED_DECREASE if last else EARLY_DECREASE
+        outcome = minimise(problem, state, note, tolerance, partial(on_visit, name, problem))
         if last:
             return Estimate(problem, outcome, tuple(models), tuple(history))
         if name == "first":
@@ -71,6 +79,8 @@ def estimate(
                 _inliers(f, out, rig.settings)
                 for f, out in zip(problem.cameras, outcome.residuals.corners, strict=True)
             ]
+        if following is not None:
+            following = next_following(rig, problem, outcome, following, name == "first")
         if _noise_is_estimated(inputs):
             models, noise = _next_noise(inputs, problem, outcome)
         state = resample(outcome.state, nodes_for(inputs, image_times(inputs, outcome.state.values)), inputs)
@@ -84,6 +94,10 @@ def _next_noise(inputs: Inputs, problem: Problem, outcome: Outcome) -> tuple[lis
     settings, models, noise = inputs.rig.settings, [], []
     common = [f for f in fits(problem, outcome) if f.kind.startswith("common")] if settings.common_error else []
     for camera, factor, out in zip(inputs.rig.cameras, problem.cameras, outcome.residuals.corners, strict=True):
+        if not len(factor.stream.uv):
+            models.append(first_noise(camera))
+            noise.append(factor.noise)
+            continue
         speed = image_speed(factor, outcome.state)
         tau = (FIRST_TAU_PX,) * COMMON_ERRORS if settings.common_error else ()
         if len(factor.noise.tau):
@@ -95,7 +109,13 @@ def _next_noise(inputs: Inputs, problem: Problem, outcome: Outcome) -> tuple[lis
 
 def _noise_is_estimated(inputs: Inputs) -> bool:
     settings = inputs.rig.settings
-    return settings.blur_noise or settings.common_error or any(c.corner_noise_px is None for c in inputs.rig.cameras)
+    cornered = [c for c, s in zip(inputs.rig.cameras, inputs.measurements.cameras, strict=True) if len(s.uv)]
+    tracked = inputs.rig.cameras if inputs.measurements.tracks else ()
+    return (
+        (bool(cornered) and (settings.blur_noise or settings.common_error))
+        or any(c.corner_noise_px is None for c in cornered)
+        or any(c.track_noise_px is None for c in tracked)
+    )
 
 
 def pass_names(inputs: Inputs) -> tuple[str, ...]:
@@ -108,21 +128,7 @@ def pass_names(inputs: Inputs) -> tuple[str, ...]:
 
 
 def _inliers(factor: CornerFactor, out: CornerOutput, settings: Settings) -> np.ndarray:
-    """(N,) bool: corners that stand with the rest of their image.
-
-    The rule: a corner is set aside when its residual is above mean + `outlier_std` standard deviations of its
-    image, and
-    above `outlier_min_px`; corners that the model cannot see go too.
-    """
+    """(N,) bool: corners that stand with the rest of their image; those that the model cannot see go too."""
     if settings.outlier_std <= 0.0:
         return np.ones(len(out.root), dtype=bool)
-    stream = factor.stream
-    size = np.linalg.norm(out.residual, axis=1)
-    used = factor.keep & (out.root > 0.0)
-    n = len(stream.stamps_ns)
-    image = stream.image
-    count = np.maximum(np.bincount(image[used], minlength=n), 1)
-    mean = np.bincount(image[used], size[used], minlength=n) / count
-    square = np.bincount(image[used], size[used] ** 2, minlength=n) / count
-    limit = mean + settings.outlier_std * np.sqrt(np.maximum(square - mean**2, 0.0))
-    return used & ((size <= limit[image]) | (size <= settings.outlier_min_px))
+    return inliers(factor.stream, out.residual, factor.keep & (out.root > 0.0), settings)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 
@@ -13,11 +13,11 @@ from icalib.estimation.arrowhead import (
     Piece,
     in_parallel,
     marginalise,
-    marginalise_in_segments,
     restricted_inverse,
     solve,
 )
 from icalib.estimation.corner_factor import CornerFactor, CornerOutput
+from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput, hold_frame
 from icalib.estimation.imu_factor import ROWS
 from icalib.estimation.problem import Problem
 from icalib.estimation.solver import Outcome
@@ -33,7 +33,8 @@ PROBE_STEP = 1e-2  # of a posterior sample: small enough to be linear
 class Fit:
     """chi^2 of one kind of residual, their number, and the degrees of freedom that are left after the fit.
 
-    kind: "gyroscope", "accelerometer", "bias walk", "corners", or "common error 0", 1, ... for the images' own.
+    kind: "gyroscope", "accelerometer", "bias walk", "corners", "features", or "common error 0", 1, ... for the images'
+    own.
     """
 
     sensor: str
@@ -61,8 +62,14 @@ def fits(problem: Problem, outcome: Outcome, seed: int = 0) -> list[Fit]:
         n = imu[:, rows].size - (len(problem.chain.starts) - 1) * imu[0, rows].size
         out.append(Fit(*key, n, n - float(np.mean(spent[key])), float((imu[:, rows] ** 2).sum())))
     for camera, corners in zip(problem.cameras, outcome.residuals.corners, strict=True):
-        for kind, (n, chi2) in _corner_chi2(camera, corners).items():
+        for kind, (n, chi2) in _corner_chi2(camera, corners).items() if len(camera.stream.uv) else ():
             key = camera.name, kind
+            out.append(Fit(*key, n, n - float(np.mean(spent[key])), chi2))
+    if problem.features is not None and outcome.residuals.features is not None:
+        left = outcome.residuals.features
+        for camera, residual, root in zip(problem.features.cameras, left.residual, left.root, strict=True):
+            key, n = (camera.name, "features"), 2 * int((root > 0.0).sum())
+            chi2 = float(((residual * root[:, None]) ** 2).sum())
             out.append(Fit(*key, n, n - float(np.mean(spent[key])), chi2))
     return out
 
@@ -79,7 +86,7 @@ def _corner_chi2(camera: CornerFactor, out: CornerOutput) -> dict[str, tuple[int
 
 def _probe(problem: Problem, outcome: Outcome, rng: np.random.Generator) -> dict[tuple[str, str], float]:
     """e_s^T J_s x of each sensor for one random e."""
-    state, at = outcome.state, outcome.residuals.corners
+    state, base = outcome.state, outcome.residuals
     noise, pieces = problem.white_noise(rng), problem.pieces()
     in_parallel(lambda piece: problem.add_noise(state, piece, noise), pieces)
     solution = solve(pieces, problem.n_nodes, problem.tolerance, held=problem.held)
@@ -89,10 +96,37 @@ def _probe(problem: Problem, outcome: Outcome, rng: np.random.Generator) -> dict
     up, down = (_imu_residuals(problem, end) for end in ends)
     along = noise.imu * (up - down) / (2.0 * PROBE_STEP)
     spent = {(problem.chain.name, k): float(along[:, r].sum()) for k, r in problem.chain.kinds.items()}
-    for camera, out, own in zip(problem.cameras, at, noise.corners, strict=True):
+    for camera, out, own in zip(problem.cameras, base.corners, noise.corners, strict=True):
         found = in_parallel(partial(_spent_by_views, camera, out, ends, own), camera.blocks())
-        for kind in found[0]:
+        for kind in found[0] if found else ():
             spent[camera.name, kind] = sum(one[kind] for one in found)
+    if problem.features is not None and base.features is not None:
+        spent |= _spent_by_features(problem.features, base.features, ends, noise.features)
+    return spent
+
+
+def _feature_residuals(factor: FeatureFactor, state: State) -> FeatureOutput:
+    out = factor.output()
+    factor.accumulate(state, Piece.bare(0, factor.n_nodes - 1), out, sums=False)
+    return out
+
+
+def _spent_by_features(
+    factor: FeatureFactor, at: FeatureOutput, ends: list[State], noise: tuple[np.ndarray, ...]
+) -> dict[tuple[str, str], float]:
+    """e^T J x of each camera's features. Their points follow x, and three degrees of freedom a point are its own, the
+    cameras' shares by the number of observations."""
+    up, down = (_feature_residuals(factor, state) for state in ends)
+    count = np.zeros(factor.tracks.count)
+    used = [root > 0.0 for root in at.root]
+    for track, u in zip(factor.tracks.track, used, strict=True):
+        count += np.bincount(track[u], minlength=len(count))
+    spent = {}
+    for i, camera in enumerate(factor.cameras):
+        root, u = at.root[i], used[i]
+        slope = (up.residual[i] - down.residual[i]) / (2.0 * PROBE_STEP)
+        own = float((3.0 / count[factor.tracks.track[i][u]]).sum())
+        spent[camera.name, "features"] = own + float((noise[i] * slope * root[:, None])[u].sum())
     return spent
 
 
@@ -147,11 +181,15 @@ def split_covariance(problem: Problem, outcome: Outcome, segments: int) -> np.nd
     segments = len(ends) - 1
     if np.diff(ends).min() < 3:
         return None
+    apart = problem.cut(outcome.state, ends[:-1])
+    scratch = apart.scratch(outcome.residuals)
 
     def gradient(g: int) -> np.ndarray | None:
-        piece = Piece.zeros(int(ends[g]), int(ends[g + 1]), problem.layout.size)
-        problem.add_measurements(outcome.state, piece, outcome.residuals)
-        problem.add_bias_prior(outcome.state, piece)
+        piece = apart.with_features(Piece.zeros(int(ends[g]), int(ends[g + 1]), problem.layout.size))
+        apart.add_measurements(outcome.state, piece, scratch)
+        apart.add_bias_prior(outcome.state, piece)
+        if not problem.framed:
+            hold_frame(outcome.state, piece, piece.first)
         if piece.last in problem.chain.starts:
             # The seam says nothing of the node behind it, and that node's own images are in the next segment.
             piece = piece.without_last()
@@ -183,8 +221,10 @@ def place_covariances(problem: Problem, outcome: Outcome) -> list[np.ndarray]:
     in all
     parts of a recording, and splitting it in time does not see them. The corners of a place are a cluster, whose
     gradient
-    would be zero but for noise; the IMU is one more.
+    would be zero but for noise; the IMU and all features are one more.
     """
+    if not any(len(c.stream.uv) for c in problem.cameras):
+        return []
     kinds = [[by(c, k) for k, c in enumerate(problem.cameras)] for by in (_image_cells, _target_parts, _tag_corners)]
     gradients = _cluster_gradients(problem, outcome, kinds)
     return [_spread(problem, outcome, np.vstack([b, -b.sum(axis=0)])) for b in gradients]
@@ -194,7 +234,7 @@ def _image_cells(camera: CornerFactor, index: int) -> np.ndarray:
     """(N,) cell of the image, cameras apart."""
     columns, rows = IMAGE_CELLS
     uv = camera.stream.uv
-    low, high = uv.min(axis=0), uv.max(axis=0) + 1e-9
+    low, high = uv.min(axis=0, initial=np.inf), uv.max(axis=0, initial=-np.inf) + 1e-9
     x, y = (((uv[:, k] - low[k]) / (high - low)[k] * IMAGE_CELLS[k]).astype(np.int32) for k in range(2))
     return (index * rows + y) * columns + x
 
@@ -222,24 +262,26 @@ def _tag_corners(camera: CornerFactor, index: int) -> np.ndarray:
 
 def _cluster_gradients(problem: Problem, outcome: Outcome, kinds: list[list[np.ndarray]]) -> list[np.ndarray]:
     """Of each of `kinds` of clusters, which name the cluster of every corner camera by camera: (clusters, B), the
-    gradient of each cluster, the chain marginalised a segment at a time."""
-    counts = [1 + max(int(c.max()) for c in clusters) for clusters in kinds]
-    B, state, at = problem.layout.size, outcome.state, outcome.residuals
+    gradient of each cluster, the chain marginalised."""
+    counts = [1 + max(int(c.max(initial=-1)) for c in clusters) for clusters in kinds]
+    B, state, at = problem.layout.size, outcome.state, problem.scratch(outcome.residuals)
     starts = B + np.cumsum([0, *counts])
 
     def segment(first: int, last: int) -> Piece:
         piece = Piece.zeros(first, last, int(starts[-1]))
-        narrow = problem.narrow(piece, B)
+        narrow = problem.with_features(problem.narrow(piece, B))
         problem.add_measurements(state, narrow, at)
         problem.add_bias_prior(state, narrow)
         piece.side[:, :, :B] = narrow.side[:, :, :B]
         piece.border[:B, :B] = narrow.border[:B, :B]
+        if narrow.features is not None:
+            piece = replace(piece, features=narrow.features.widened(int(starts[-1])))
         for clusters, n, column in zip(kinds, counts, starts, strict=False):
             for camera, corners, cluster in zip(problem.cameras, at.corners, clusters, strict=True):
                 camera.accumulate_clusters(state, piece, corners, cluster, n, int(column))
         return piece
 
-    rest = marginalise_in_segments(segment, problem.n_nodes)
+    rest = problem.marginal(segment)
     return [rest[:B, a:b].T for a, b in pairwise(starts)]
 
 

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Protocol
 
 import numpy as np
 
-from icalib.estimation.arrowhead import NOTHING, Piece, in_parallel, make_pieces
+from icalib.estimation.arrowhead import (
+    NOTHING,
+    Piece,
+    in_parallel,
+    make_pieces,
+    marginalise,
+    marginalise_in_segments,
+)
 from icalib.estimation.corner_factor import CornerFactor, CornerOutput
+from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput, hold_frame
 from icalib.estimation.imu_factor import ROWS
 from icalib.estimation.prior_factor import Prior
 from icalib.estimation.state import Layout, State
@@ -43,18 +52,22 @@ class ChainFactor(Protocol):
 
 @dataclass(frozen=True)
 class Residuals:
-    """What the factors left behind at a state: the chain's whitened residuals (K - 1, 15), the corners' by camera."""
+    """What the factors left behind at a state: the chain's whitened residuals (K - 1, 15), the corners' by camera, the
+    features'."""
 
     imu: np.ndarray
     corners: tuple[CornerOutput, ...]
+    features: FeatureOutput | None = None
 
 
 @dataclass(frozen=True)
-class Noise:
-    """White noise: imu (K - 1, 15); by camera the corners' (N, 2) and the common errors' (V, 2, m)."""
+class WhiteNoise:
+    """A draw in place of all whitened residuals: of the chain (K - 1, 15), of corners (N, 2) and common errors
+    (V, 2, m) by camera, of features (N, 2) by camera."""
 
     imu: np.ndarray
     corners: tuple[tuple[np.ndarray, np.ndarray], ...]
+    features: tuple[np.ndarray, ...]
 
 
 @dataclass(frozen=True)
@@ -69,41 +82,58 @@ class Problem:
     held: np.ndarray = field(
         default_factory=lambda: NOTHING
     )  # (B, m) orthonormal directions of the border, in tolerance units, that stay
+    features: FeatureFactor | None = None
+    framed: bool = True  # a target says where the world's origin is; else nothing does, and it stays where it is
 
     @property
     def n_nodes(self) -> int:
         return self.chain.n_nodes
 
     def pieces(self, sums: bool = True) -> tuple[Piece, ...]:
-        return make_pieces(self.n_nodes, self.layout.size if sums else None)
+        """The chain in pieces; without `sums`, only residuals can be asked for."""
+        pieces = make_pieces(self.n_nodes, self.layout.size if sums else None)
+        return tuple(self.with_features(p, len(pieces) > 1) for p in pieces) if sums else pieces
+
+    def with_features(self, piece: Piece, keep: bool = False) -> Piece:
+        """The piece with room for the features seen from its nodes; `keep`: another piece shares a node with it."""
+        return piece if self.features is None else self.features.attach(piece, keep)
+
+    def cut(self, state: State, nodes: np.ndarray) -> Problem:
+        """The same problem, in which features end at `nodes`, so that pieces between these can stand alone."""
+        if self.features is None:
+            return self
+        return replace(self, features=self.features.cut(state, tuple(int(k) for k in nodes)))
+
+    def marginal(self, sums_of: Callable[[int, int], Piece]) -> np.ndarray:
+        """Border (B + 1, B + 1) of `sums_of` from one node to another, all nodes eliminated: a segment at a time, but
+        where features tie distant nodes."""
+        if self.features is not None:
+            return marginalise(sums_of(0, self.n_nodes - 1))
+        return marginalise_in_segments(sums_of, self.n_nodes)
 
     def sums_of(self, state: State, first: int, last: int) -> Piece:
         """The sums between two nodes alone, with the true curvature of robust losses; residuals are not kept."""
-        piece = Piece.zeros(first, last, self.layout.size)
+        piece = self.with_features(Piece.zeros(first, last, self.layout.size))
         self.chain.accumulate(state, piece, np.zeros((self.n_nodes - 1, ROWS)))
         for camera in self.cameras:
             camera.accumulate(state, piece, None, curved=True)
+        if self.features is not None:
+            self.features.accumulate(state, piece, self.features.output(), curved=True)
         self.add_bias_prior(state, piece)
         for prior in self.priors if first == 0 else ():
             prior.accumulate(state, piece)
+        self._hold_frames(state, piece)
         return piece
-
-    def white_noise(self, rng: np.random.Generator) -> Noise:
-        """White noise in place of all whitened residuals."""
-        imu = rng.standard_normal((self.n_nodes - 1, ROWS))
-        return Noise(imu, tuple(c.white_noise(rng) for c in self.cameras))
-
-    def add_noise(self, state: State, piece: Piece, noise: Noise) -> None:
-        """Adds to `piece` what `noise` gives in place of the residuals: J^T J and J^T e, priors as if they were met."""
-        self.chain.accumulate(state, piece, noise.imu, noise=noise.imu)
-        for camera, own in zip(self.cameras, noise.corners, strict=True):
-            camera.accumulate(state, piece, None, noise=own)
-        self.add_prior_information(piece, state)
 
     def residuals(self) -> Residuals:
         """Empty arrays for `linearise` to fill."""
         corners = tuple(c.output() for c in self.cameras)
-        return Residuals(np.zeros((self.n_nodes - 1, ROWS)), corners)
+        features = None if self.features is None else self.features.output()
+        return Residuals(np.zeros((self.n_nodes - 1, ROWS)), corners, features)
+
+    def scratch(self, at: Residuals) -> Residuals:
+        """`at`, to be filled once more, with room for features of this problem's own."""
+        return replace(at, features=None if self.features is None else self.features.output())
 
     def linearise(
         self, state: State, pieces: tuple[Piece, ...], out: Residuals, sums: bool = True, curved: bool = False
@@ -117,16 +147,42 @@ class Problem:
         cost = self.add_measurements(state, piece, out, sums, curved) + self.add_bias_prior(state, piece, sums)
         if piece.first == 0:
             cost += sum(p.accumulate(state, piece, sums) for p in self.priors)
+        if sums:
+            self._hold_frames(state, piece)
         return cost
+
+    def _hold_frames(self, state: State, piece: Piece) -> None:
+        """Each recording's world stays where it is, if nothing says where that is."""
+        for node in self.chain.starts if not self.framed else ():
+            if piece.first <= node < piece.last:
+                hold_frame(state, piece, node)
 
     def add_measurements(
         self, state: State, piece: Piece, out: Residuals, sums: bool = True, curved: bool = False
     ) -> float:
-        """Adds IMU and corners in `piece`; returns half their robust chi^2."""
+        """Adds IMU, corners and features in `piece`; returns half their robust chi^2."""
         cost = self.chain.accumulate(state, piece, out.imu, sums)
         for camera, corners in zip(self.cameras, out.corners, strict=True):
             cost += camera.accumulate(state, piece, corners, sums, curved)
+        if self.features is not None and out.features is not None:
+            cost += self.features.accumulate(state, piece, out.features, sums, curved)
         return cost
+
+    def white_noise(self, rng: np.random.Generator) -> WhiteNoise:
+        """A draw in place of all residuals but those of priors."""
+        imu = rng.standard_normal((self.n_nodes - 1, ROWS))
+        corners = tuple(c.white_noise(rng) for c in self.cameras)
+        streams = () if self.features is None else self.features.streams
+        return WhiteNoise(imu, corners, tuple(rng.standard_normal(s.uv.shape) for s in streams))
+
+    def add_noise(self, state: State, piece: Piece, noise: WhiteNoise) -> None:
+        """Adds to `piece` what `noise` gives in place of the residuals: J^T J and J^T e, priors as if they were met."""
+        self.chain.accumulate(state, piece, noise.imu, noise=noise.imu)
+        for camera, own in zip(self.cameras, noise.corners, strict=True):
+            camera.accumulate(state, piece, None, noise=own)
+        if self.features is not None:
+            self.features.accumulate(state, piece, self.features.output(), noise=noise.features)
+        self.add_prior_information(piece, state)
 
     def add_bias_prior(self, state: State, piece: Piece, sums: bool = True) -> float:
         """Adds the broad prior on the biases of recordings' first nodes, about those that the pass started from."""
@@ -137,6 +193,7 @@ class Problem:
         for prior in self.priors if piece.first == 0 else ():
             prior.accumulate(state, piece, residual=np.zeros(len(prior.sigma)))
         self.chain.accumulate_bias_prior(state, piece, met=True)
+        self._hold_frames(state, piece)
 
     @staticmethod
     def narrow(piece: Piece, n_border: int) -> Piece:

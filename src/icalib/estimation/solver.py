@@ -34,6 +34,15 @@ class Step:
 
 
 @dataclass(frozen=True)
+class Visit:
+    """Where the solver stood when it looked for a step: the state, and the border's information (B, B) there, the chain
+    marginalised (damping included)."""
+
+    state: State
+    information: np.ndarray
+
+
+@dataclass(frozen=True)
 class Outcome:
     """Where the solver ended, with a status that is a sentence."""
 
@@ -51,8 +60,10 @@ def minimise(
     state: State,
     on_step: Callable[[Step], None] = lambda _: None,
     tolerance: float = CONVERGED_DECREASE,
+    on_visit: Callable[[Visit], None] = lambda _: None,
 ) -> Outcome:
-    """Minimises `problem` from `state` until half the chi^2 can fall by less than `tolerance`.
+    """Minimises `problem` from `state` until half the chi^2 can fall by less than `tolerance`. `on_visit` is told of
+    each state that a step was looked for from, and of the last.
 
     Raises EstimationError if no step can be computed at all.
     """
@@ -65,6 +76,7 @@ def minimise(
                 "the first guess predicts no finite measurement; give a better guess in the rig file."
             )
         solution, damping = _solve(problem, state, pieces, residuals, damping, curved)
+        on_visit(Visit(state, solution.information))
         candidate = state.retract(problem.layout, solution.chain, solution.border)
         settled = solution.decrease < curved_below * cost
         candidate_cost = problem.linearise(candidate, pieces, residuals, curved=settled)
@@ -91,7 +103,9 @@ def minimise(
         if damping > 1e6:
             break
         cost = problem.linearise(state, pieces, residuals)
-    return _finish(problem, state, cost, pieces, residuals, steps)
+    outcome = _finish(problem, state, cost, pieces, residuals, steps)
+    on_visit(Visit(outcome.state, outcome.information))
+    return outcome
 
 
 def _solve(problem, state, pieces, residuals, damping, curved):

@@ -11,11 +11,11 @@ from typing import Literal
 
 import numpy as np
 
-from icalib.geometry import so3
+from icalib.geometry import planes, so3
 
 NODE = 15
 Key = tuple[str, str]  # sensor, parameter
-Kind = Literal["vector", "rotation", "tilt"]
+Kind = Literal["vector", "rotation", "tilt", "plane"]
 Entry = tuple[str, str, Kind, int, bool]  # sensor, name, kind, size, whether it is estimated
 
 
@@ -24,7 +24,7 @@ class Block:
     """One lasting parameter. kind: how it is perturbed; start: its first border column, None where it is fixed.
 
     rotation: R <- R Exp(d). tilt (2 columns): R_world_board <- Exp((d0, d1, 0)) R_world_board; the third turn, about
-    gravity, is the freedom of the world frame.
+    gravity, is the freedom of the world frame. plane (3 columns): see `geometry.planes.moved`.
     """
 
     sensor: str
@@ -109,6 +109,8 @@ class State:
             elif b.kind == "tilt":
                 turns.append(np.array([d[0], d[1], 0.0]))
                 values[b.key] = so3.exp(turns[-1]) @ old
+            elif b.kind == "plane":
+                values[b.key] = planes.moved(old, d)
             else:
                 values[b.key] = old + d
         R, p, v = np.empty_like(self.rotation), np.empty_like(self.position), np.empty_like(self.velocity)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.estimation.state import Layout
+from icalib.rig import Settings
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,19 @@ class Tolerances:
     bloom: float = 0.1
     shape: float = 1e-3
     tilt: float = np.deg2rad(0.1)
+    plane: tuple[float, float, float] = (np.deg2rad(0.1), np.deg2rad(0.1), 5e-3)  # normal, distance
     imu_intrinsics: float = 1e-2  # scale, misalignment [rad]; g-sensitivity rad/s per m/s^2
+
+    @classmethod
+    def asked_for(cls, settings: Settings) -> Tolerances:
+        """Those of the rig file."""
+        turn = np.deg2rad(settings.rotation_tolerance_deg)
+        return cls(
+            rotation=turn,
+            translation=settings.translation_tolerance_m,
+            time_offset=settings.time_tolerance_s,
+            intrinsics=settings.pixel_tolerance,
+        )
 
     def of(self, layout: Layout, imu: str | None) -> np.ndarray:
         """(B,) tolerance of each border column."""

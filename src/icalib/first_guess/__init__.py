@@ -5,18 +5,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.errors import EstimationError
 from icalib.estimation.bodies import choose_bodies, restrict
-from icalib.estimation.imu_data import ImuData, imu_data
-from icalib.first_guess.clocks import (
-    Alignment,
-    align,
-    as_given,
-    camera_rates,
-    check_axes,
-    contradicts,
-    turns_about_two_axes,
-)
+from icalib.estimation.imu_data import imu_data
+from icalib.first_guess.align_camera import align_camera, trusted
+from icalib.first_guess.clocks import Alignment, camera_rates
 from icalib.first_guess.guess import CameraGuess, Guess, relative_offset
 from icalib.first_guess.gyro import GyroRotation
 from icalib.first_guess.intrinsics import camera_params
@@ -27,7 +19,7 @@ from icalib.first_guess.target_poses import TargetPoses
 from icalib.first_guess.without_imu import guess_without_imu, trajectory_without_imu
 from icalib.geometry.cameras import camera_model
 from icalib.measurements import CornerStream, Measurements
-from icalib.rig import Camera, Parameter, Rig
+from icalib.rig import Camera, Rig
 
 __all__ = ["CameraGuess", "Guess", "initial_guess", "initial_trajectory"]
 
@@ -55,17 +47,18 @@ def initial_guess(rig: Rig, measurements: Measurements, scene: Placed | None = N
     if imu is None:
         return guess_without_imu(rig, measurements, params, poses, scene.values)
     aligned = [
-        _align(c, s, q, imu, measurements) for c, s, q in zip(rig.cameras, measurements.cameras, poses, strict=True)
+        align_camera(c, s, camera_rates(s, q), imu, measurements)
+        for c, s, q in zip(rig.cameras, measurements.cameras, poses, strict=True)
     ]
     best = int(np.argmax([q.ok.sum() for q in poses]))
     gyro_bias = aligned[best].gyro_bias
     gyro = GyroRotation.integrate(imu, gyro_bias)
     arms = [
-        lever_arm(imu, s.seconds + a.offset, q, a.rotation, gyro, _trusted(c.translation))
+        lever_arm(imu, s.seconds + a.offset, q, a.rotation, gyro, trusted(c.translation))
         for c, s, q, a in zip(rig.cameras, measurements.cameras, poses, aligned, strict=True)
     ]
     gravity = arms[best].gravity
-    check_gravity(arms[best], rig.gravity, imu.name, aligned[best].given)
+    check_gravity(float(np.linalg.norm(gravity)), rig.gravity, imu.name, aligned[best].given)
     for c, m, a in zip(rig.cameras, arms, aligned, strict=True):
         check_size(m, c.name, a.given)
     cameras = {
@@ -73,39 +66,6 @@ def initial_guess(rig: Rig, measurements: Measurements, scene: Placed | None = N
         for c, s, p, a, m, q in zip(rig.cameras, measurements.cameras, params, aligned, arms, poses, strict=True)
     }
     return Guess(cameras, gyro_bias, _mean_bias(arms), _level(gravity), scene.values)
-
-
-def _trusted(parameter: Parameter) -> np.ndarray | None:
-    """A value that what else is guessed may rest on; one that is only a place to start from may be far off."""
-    return None if parameter.mode == "free" else parameter.value
-
-
-def _align(
-    camera: Camera, stream: CornerStream, poses: TargetPoses, imu: ImuData, measurements: Measurements
-) -> Alignment:
-    """What the motion shows; in its place what the rig trusts, and where it shows nothing what the rig guesses."""
-    rates = camera_rates(stream, poses)
-    given, trusted = camera.time_offset.value, _trusted(camera.time_offset)
-    rotation = camera.rotation.value
-    try:
-        found = align(
-            imu, camera.name, rates, None if trusted is None else relative_offset(trusted, stream, measurements)
-        )
-        if rotation is None:
-            check_axes(rates, camera.name)
-    except EstimationError:
-        if given is None:
-            raise
-        at = relative_offset(given, stream, measurements)
-        if rotation is None:
-            found = align(imu, camera.name, rates, at)
-            check_axes(rates, camera.name)
-        else:
-            found = as_given(imu, camera.name, rates, at, rotation)
-            if contradicts(imu, rates, found):
-                raise
-    keep_guess = _trusted(camera.rotation) is None and turns_about_two_axes(rates)
-    return found if rotation is None or keep_guess else as_given(imu, camera.name, rates, found.offset, rotation)
 
 
 def _camera_guess(

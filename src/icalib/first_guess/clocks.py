@@ -30,11 +30,12 @@ DEGREES = 180.0 / np.pi
 @dataclass(frozen=True)
 class CameraRates:
     """Mean angular rates between neighbouring images: start, end (n,) camera clock [s]; rate (n, 3) camera axes
-    [rad/s]."""
+    [rad/s]; least_correlation: with the IMU's, below which the two do not match."""
 
     start: np.ndarray
     end: np.ndarray
     rate: np.ndarray
+    least_correlation: float = LEAST_CORRELATION
 
 
 @dataclass(frozen=True)
@@ -160,7 +161,7 @@ def _correlate(imu: ImuData, name: str, rates: CameraRates) -> float:
     near = np.diff(middle, append=middle[-1]) < LONGEST_STEP_S
     b, mask_b = _grid(middle, np.linalg.norm(rates.rate, axis=1), near, middle[-1])
     found = best_shift(a, mask_a, b, mask_b, SHORTEST_OVERLAP_S * GRID_HZ)
-    if not found.correlation > LEAST_CORRELATION:
+    if not found.correlation > rates.least_correlation:
         raise EstimationError(
             f"the motion of {name} does not match that of {imu.name} at any shift of their clocks (best correlation "
             f"{max(found.largest, 0.0):.2f}); check that both come from the same recording, overlap in time, "

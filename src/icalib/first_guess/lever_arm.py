@@ -151,10 +151,9 @@ def check_size(arm: LeverArm, camera: str, given: bool) -> None:
         )
 
 
-def check_gravity(arm: LeverArm, expected: float, imu: str, given: bool) -> None:
+def check_gravity(measured: float, expected: float, imu: str, given: bool) -> None:
     """Raises EstimationError where gravity as the IMU and the target's size show it is not `expected` m/s^2. given: see
     `check_size`."""
-    measured = float(np.linalg.norm(arm.gravity))
     if abs(measured / expected - 1.0) <= (GIVEN_TOLERANCE if given else G_TOLERANCE):
         return
     raise EstimationError(

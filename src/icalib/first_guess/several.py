@@ -12,6 +12,7 @@ from icalib.estimation.bodies import Bodies
 from icalib.estimation.imu_data import imu_data
 from icalib.first_guess import initial_guess
 from icalib.first_guess.clocks import better_offset, camera_rates
+from icalib.first_guess.from_tracks import guess_from_tracks
 from icalib.first_guess.guess import CameraGuess, Guess
 from icalib.first_guess.scene import Placed, scene_poses
 from icalib.first_guess.scene_lens import find_scene
@@ -28,6 +29,8 @@ def initial_guesses(rig: Rig, bodies: Bodies, recordings: Sequence[Measurements]
     Raises EstimationError, one sentence; where there are several recordings it names the one that carries no guess, or
     whose clocks stand elsewhere.
     """
+    if not rig.has_target:
+        return _guesses_from_tracks(rig, recordings)
     scene = find_scene(rig, bodies, recordings)
     if len(recordings) == 1:
         return (initial_guess(rig, recordings[0], scene),)
@@ -43,6 +46,14 @@ def initial_guesses(rig: Rig, bodies: Bodies, recordings: Sequence[Measurements]
         _check_clocks(rig, scene, guess, recordings[best], recording)
         guesses.append(_named(held, scene, recording))
     return tuple(guesses)
+
+
+def _guesses_from_tracks(rig: Rig, recordings: Sequence[Measurements]) -> tuple[Guess, ...]:
+    """The calibration from the recording that shows most, and held for the others."""
+    best = max(recordings, key=lambda r: sum(len(t.uv) for t in r.tracks))
+    guess = guess_from_tracks(rig, best)
+    held = _held(rig, guess, best)
+    return tuple(guess if r is best else guess_from_tracks(held, r) for r in recordings)
 
 
 def _check_scene(rig: Rig, scene: Placed, recordings: Sequence[Measurements]) -> None:

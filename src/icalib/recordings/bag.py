@@ -13,12 +13,13 @@ import numpy as np
 from icalib.errors import RecordingError
 from icalib.extras import load_typesys, load_zstd
 from icalib.geometry.targets import Target
-from icalib.measurements import CornerStream, ImuStream
+from icalib.measurements import CornerStream, ImuStream, TrackStream
 from icalib.recordings.bags.opening import ZSTD_MAGIC, open_storages
 from icalib.recordings.bags.storage import Tally
 from icalib.recordings.image_checks import checked_payloads, frames
 from icalib.recordings.images import Frame, Payload, file_payload
 from icalib.recordings.topics import KINDS, TopicInfo, choose_topic, find_topic
+from icalib.recordings.tracks import read_tracks
 from icalib.rig import Camera, ImuSensor
 
 _SWAPPED_NS = 1_000_000_000  # readings overtake each other on the network by less; more is a clock that was set back
@@ -32,6 +33,7 @@ class BagRecording:
         self.root = root
         self._storages, self._notes = open_storages(root)
         self._topics = self._list_topics()
+        self._tables: list[Path] = []
 
     def topics(self) -> tuple[TopicInfo, ...]:
         return self._topics
@@ -71,12 +73,28 @@ class BagRecording:
     def corners(self, camera: Camera, target: Target) -> CornerStream:
         raise RecordingError(f"{self.root} holds images of {camera.name}, not corners; find them in its images.")
 
+    def sees(self, camera: Camera) -> bool:
+        del camera
+        return any(t.kind == "image" for t in self.topics())
+
+    def tracks(self, camera: Camera) -> TrackStream:
+        """A table beside the bag."""
+        assert camera.tracks is not None
+        path = self.root.parent / camera.tracks
+        if not path.is_file():
+            raise RecordingError(
+                f"{path} is not there, and bags hold no tracks; write the table beside the bag, or set `tracks` of "
+                f"{camera.name} in the rig file."
+            )
+        self._tables.append(path)
+        return read_tracks(camera.name, path, camera.resolution)
+
     def where(self, sensor: ImuSensor | Camera) -> str:
         topic = self._imu_topic(sensor) if isinstance(sensor, ImuSensor) else self.image_topic(sensor)
         return f"{self.root} {topic}"
 
     def files(self) -> list[Path]:
-        return [storage.name for storage in self._storages]
+        return [*(storage.name for storage in self._storages), *self._tables]
 
     def notes(self) -> tuple[str, ...]:
         damage = (note for storage in self._storages for note in storage.notes)

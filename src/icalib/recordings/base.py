@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from icalib.geometry.targets import Target
-from icalib.measurements import CornerStream, ImuStream
+from icalib.measurements import CornerStream, ImuStream, TrackStream
 from icalib.recordings.images import Frame, Payload
 from icalib.recordings.topics import TopicInfo
 from icalib.rig import Camera, ImuSensor
@@ -64,6 +64,17 @@ class Recording(Protocol):
 
         Raises RecordingError naming file and line or instant where the data are missing or cannot be read, where images
         are out of order, where a corner appears twice in an image, and where it is not on the target.
+        """
+        ...
+
+    def sees(self, camera: Camera) -> bool:
+        """Whether there are images or corners of the camera at all."""
+        ...
+
+    def tracks(self, camera: Camera) -> TrackStream:
+        """The points of the scene that the camera followed, from the table at its `tracks`.
+
+        Raises RecordingError as `tracks.read_tracks`, and where there is no such table.
         """
         ...
 

@@ -10,13 +10,14 @@ import numpy as np
 
 from icalib.errors import RecordingError
 from icalib.geometry.targets import Target
-from icalib.measurements import CornerStream, ImuStream
+from icalib.measurements import CornerStream, ImuStream, TrackStream
 from icalib.recordings.corners import group_corners
 from icalib.recordings.euroc_images import file_payloads, image_files
 from icalib.recordings.image_checks import checked_payloads, frames
 from icalib.recordings.images import Frame, Payload
 from icalib.recordings.table import columns_of, read_table
 from icalib.recordings.topics import TopicInfo, choose_topic, find_topic
+from icalib.recordings.tracks import read_tracks
 from icalib.rig import Camera, ImuSensor
 
 _IMU_DECIMALS = ("wx [rad/s]", "wy [rad/s]", "wz [rad/s]", "ax [m/s^2]", "ay [m/s^2]", "az [m/s^2]")
@@ -90,6 +91,15 @@ class FolderRecording:
         stamps, tag, corner = (table.integers[:, k].copy() for k in range(3))
         return group_corners(camera.name, str(table.path), stamps, tag, corner, table.decimals, target)
 
+    def sees(self, camera: Camera) -> bool:
+        return self._find(camera.path) is not None or len(self._image_topics()) > 0
+
+    def tracks(self, camera: Camera) -> TrackStream:
+        assert camera.tracks is not None
+        path = self._locate(camera.tracks, "tracks")
+        self._remember(path)
+        return read_tracks(camera.name, path, camera.resolution)
+
     def where(self, sensor: ImuSensor | Camera) -> str:
         if isinstance(sensor, Camera) and not self.has_corners(sensor):
             return f"{self.root / self.image_topic(sensor)}"
@@ -123,12 +133,13 @@ class FolderRecording:
             (p for folder in (self.root, self.root / "mav0") for n in names if (p := folder / n).is_file()), None
         )
 
-    def _locate(self, path_hint: str) -> Path:
+    def _locate(self, path_hint: str, field: str = "path") -> Path:
         if found := self._find(path_hint):
             return found
         plain = path_hint.removesuffix(".gz")
         raise RecordingError(
-            f"{self.root} has no {plain} (nor {plain}.gz); {self._listing()}; set `path` of the sensor in the rig file."
+            f"{self.root} has no {plain} (nor {plain}.gz); {self._listing()}; set `{field}` of the sensor in the rig "
+            "file."
         )
 
     def _listing(self) -> str:

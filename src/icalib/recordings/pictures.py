@@ -14,7 +14,7 @@ import numpy as np
 
 from icalib.errors import RecordingError
 from icalib.geometry.targets import Target
-from icalib.measurements import CornerStream, ImuStream
+from icalib.measurements import CornerStream, ImuStream, TrackStream
 from icalib.recordings.euroc_images import SUFFIXES, file_payloads
 from icalib.recordings.image_checks import checked_payloads, frames
 from icalib.recordings.images import Frame, Payload
@@ -73,6 +73,16 @@ class PictureFolder:
 
     def corners(self, camera: Camera, target: Target) -> CornerStream:
         raise RecordingError(f"{self.root} holds images of {camera.name}, not corners; find them in its images.")
+
+    def sees(self, camera: Camera) -> bool:
+        del camera
+        return True
+
+    def tracks(self, camera: Camera) -> TrackStream:
+        raise RecordingError(
+            f"{self.root} holds pictures without a clock, and the tracks of {camera.name} need one; give data.csv with "
+            "the stamps of the images, or take out `tracks`."
+        )
 
     def where(self, sensor: ImuSensor | Camera) -> str:
         return str(self.root) if isinstance(sensor, ImuSensor) else f"{self.root}/{self.image_topic(sensor)}"

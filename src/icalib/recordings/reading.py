@@ -27,12 +27,14 @@ def read_measurements(recording: Recording, rig: Rig, find: FindCorners = tables
     or instant, for data that are missing, unreadable, out of order, in other units, or not of this rig.
     """
     imu, notes = None, ()
+    tracks = tuple(recording.tracks(c) for c in rig.cameras if c.tracks is not None)
+    seeing = [c for c in rig.cameras if rig.has_target and (c.tracks is None or recording.sees(c))]
     if rig.imu is not None:
         imu, notes = checked_imu(recording.imu(rig.imu), recording.where(rig.imu))
-    pictured = [c for c in rig.cameras if not recording.has_corners(c)]
+    pictured = [c for c in seeing if not recording.has_corners(c)]
     image_topics(recording, pictured)
     cameras: list[CornerStream] = []
-    for camera in rig.cameras:
+    for camera in seeing:
         if camera in pictured:
             corners, found = find(recording, camera)
         else:
@@ -40,4 +42,4 @@ def read_measurements(recording: Recording, rig: Rig, find: FindCorners = tables
         corners, dropped = checked_corners(corners, recording.where(camera), camera.resolution)
         cameras.append(corners)
         notes = notes + found + dropped
-    return Measurements(imu, tuple(cameras), recording.notes() + notes)
+    return Measurements(imu, tuple(cameras), recording.notes() + notes, tracks=tracks)

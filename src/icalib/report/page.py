@@ -40,13 +40,13 @@ def report_html(calibration: Calibration) -> str:
         "poses": Html(tables.poses(c) + tables.bodies(c)),
         "corner_figures": _corner_sections(c),
         "facts": tables.facts(c),
-        "figures": _script_json(figures),
-        "css": _resource("icalib.report", "page.css"),
+        "figures": script_json(figures),
+        "css": resource("icalib.report", "page.css"),
         "without_imu": "" if c.imu else " hidden",
-        "plotly": _resource("plotly", "package_data/plotly.min.js"),
+        "plotly": resource("plotly", "package_data/plotly.min.js"),
     }
     escaped = {name: tables.html(value) for name, value in words.items()}
-    return Template(_resource("icalib.report", "page.html")).substitute(escaped | parts)
+    return Template(resource("icalib.report", "page.html")).substitute(escaped | parts)
 
 
 def _figures(c: Calibration) -> dict[str, Figure]:
@@ -84,11 +84,12 @@ def _place(name: str, css: str) -> Html:
     return Html(f'<div class="plot {css}" id="{name}"></div>')
 
 
-def _script_json(figures: dict[str, Figure]) -> str:
+def script_json(figures: dict[str, Figure]) -> str:
     """JSON that cannot end the script element around it, whatever a sensor is called."""
     text = json.dumps(figures, separators=(",", ":"), allow_nan=False)
     return text.replace("<", "\\u003c")
 
 
-def _resource(package: str, name: str) -> str:
+def resource(package: str, name: str) -> str:
+    """Text of a file that came with a package."""
     return files(package).joinpath(name).read_text(encoding="utf-8")

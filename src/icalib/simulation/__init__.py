@@ -4,7 +4,7 @@ from icalib.simulation.corners import CornerTruth
 from icalib.simulation.filming import Film, Shot, film, sheets_of
 from icalib.simulation.motion import Trajectory
 from icalib.simulation.rendering import Imaging, Picture, Renderer, Sheet, SheetTruth, exposure_poses
-from icalib.simulation.rigs import rig_for, settings_for
+from icalib.simulation.rigs import GuessError, rig_for, settings_for, with_drawn_guess
 from icalib.simulation.robot import Drive, Features, SimLidar, SimWheels
 from icalib.simulation.room import Block, Hills, Room, hills_of_slope
 from icalib.simulation.scenario import ADIS16448, Motion, Scenario, SimCamera, handheld
@@ -24,6 +24,7 @@ __all__ = [
     "Drive",
     "Features",
     "Film",
+    "GuessError",
     "Hills",
     "Imaging",
     "Motion",
@@ -52,6 +53,7 @@ __all__ = [
     "sheets_of",
     "simulate",
     "tag_map",
+    "with_drawn_guess",
     "write_film",
     "write_sensors",
     "write_tables",

@@ -2,15 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from icalib.rig import Camera, ImuSensor, Parameter, Rig, Settings
+from icalib.simulation.imu import rotation_from_vector
 from icalib.simulation.scenario import GRAVITY_WORLD, Scenario, SimCamera
 from icalib.simulation.simulate import raw_time_offset
 
 Treatment = Literal["free", "start", "fixed"] | Parameter
+_GUESS_STREAM = 3000  # of random numbers; see `simulate` for the others
+
+
+@dataclass(frozen=True)
+class GuessError:
+    """Standard deviations of a drawn first guess: of each axis of a rotation [rad] and of a translation [m], of a time
+    offset [s], and of a focal length, as a share of it."""
+
+    rotation: float = float(np.deg2rad(5.0))
+    translation: float = 0.05
+    time_offset: float = 0.02
+    focal_length: float = 0.03
 
 
 def settings_for(scenario: Scenario) -> Settings:
@@ -67,6 +81,34 @@ def rig_for(
         gravity=float(np.linalg.norm(GRAVITY_WORLD)),
         settings=settings_for(scenario) if settings is None else settings,
     )
+
+
+def with_drawn_guess(rig: Rig, scenario: Scenario, seed: int, error: GuessError | None = None) -> Rig:
+    """The rig with a guess of each free group, drawn about the truth; the same seed draws the same. Principal points
+    are guessed in the middle of the image, and of distortions there is no guess."""
+    rng = np.random.default_rng([seed, _GUESS_STREAM])
+    spread = GuessError() if error is None else error
+    cameras = [_guessed(c, s, scenario, rng, spread) for c, s in zip(rig.cameras, scenario.cameras, strict=True)]
+    return replace(rig, cameras=tuple(cameras))
+
+
+def _guessed(camera: Camera, sim: SimCamera, scenario: Scenario, rng: np.random.Generator, error: GuessError) -> Camera:
+    drawn = _drawn_pose(sim.T_imu_cam, raw_time_offset(scenario, sim), rng, error)
+    focal = np.array(sim.intrinsics[:2]) * (1.0 + error.focal_length * rng.standard_normal())
+    drawn["intrinsics"] = np.array([*focal, *(0.5 * (side - 1) for side in sim.resolution)])
+    free = {name: value for name, value in drawn.items() if getattr(camera, name).mode == "free"}
+    return replace(camera, **{name: Parameter("free", value) for name, value in free.items()})
+
+
+def _drawn_pose(
+    T_imu_sensor: np.ndarray, offset: float, rng: np.random.Generator, error: GuessError
+) -> dict[str, np.ndarray]:
+    """What every sensor has, by the names of its groups."""
+    return {
+        "rotation": T_imu_sensor[:3, :3] @ rotation_from_vector(error.rotation * rng.standard_normal(3)),
+        "translation": T_imu_sensor[:3, 3] + error.translation * rng.standard_normal(3),
+        "time_offset": offset + error.time_offset * rng.standard_normal(1),
+    }
 
 
 def _parameter(treatment: Treatment, truth: object) -> Parameter:

@@ -9,10 +9,22 @@ from icalib.geometry.targets.base import Target
 from icalib.geometry.targets.charuco import Charuco
 from icalib.geometry.targets.checkerboard import Checkerboard
 from icalib.geometry.targets.markers import Markers
+from icalib.geometry.targets.nothing import NoTarget
 from icalib.geometry.targets.scene import Scene
 from icalib.geometry.targets.tag import Tag
 
-__all__ = ["TARGETS", "AprilGrid", "Charuco", "Checkerboard", "Markers", "Scene", "Tag", "Target", "target_from_plain"]
+__all__ = [
+    "TARGETS",
+    "AprilGrid",
+    "Charuco",
+    "Checkerboard",
+    "Markers",
+    "NoTarget",
+    "Scene",
+    "Tag",
+    "Target",
+    "target_from_plain",
+]
 
 TARGETS: dict[str, type[Target]] = {kind.type: kind for kind in (AprilGrid, Charuco, Checkerboard, Markers, Tag)}
 

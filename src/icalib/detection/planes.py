@@ -1,0 +1,264 @@
+"""Planes in a cloud of points that is roughly in place, and which points lie on which.
+
+Voxels that are flat grow into regions, regions of one plane are joined, those that bend are dropped. Points then belong
+to a plane by their distance, within squares of the plane itself: cells in space would cut a noisy wall into layers.
+Points near two planes, in grazing beams, and in squares that are not flat belong to none. A wall has two sides: a plane
+is seen from the side that its normal points to.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from icalib.detection.plane_kernels import (
+    LARGEST_TURN,
+    MOMENTS,
+    NEAR,
+    OUTSIDE,
+    OWN,
+    Cells,
+    Voxels,
+    associate,
+    fit,
+    grow,
+    sum_cells,
+    sum_voxels,
+)
+from icalib.geometry.planes import plane_of, tangents
+
+MOST_POINTS = 2_000_000  # that the search looks at
+FEWEST = 12  # points of a voxel or a cell
+FEWEST_BENT = 9  # voxels that show whether a region bends
+ROUNDS = 3  # of association and fit
+ACROSS = 0.25  # of a voxel's edge: what spreads less in its own plane is a line
+SAME_TURN = np.deg2rad(4.0)  # between regions of one plane
+MIXED = 1.35  # whitened RMS of a cell that does not hold one plane
+BENT = 0.4  # standard deviations of a point by which a region may bow: flat ones up to 0.32, hills from 0.4 on
+
+
+@dataclass(frozen=True)
+class PlaneSearch:
+    """noise_m of a point; how far the cloud is out of place: position_m, and angle_rad about the sensor. voxel_m: edge
+    of voxels and cells; smallest_m2: of a plane's cells together; gate: standard deviations from a point to its plane.
+    """
+
+    noise_m: float = 0.03
+    position_m: float = 0.01
+    angle_rad: float = 0.005
+    voxel_m: float = 0.3
+    smallest_m2: float = 0.7
+    gate: float = 3.0
+    least_cosine: float = 0.1
+
+    def variance(self, points: np.ndarray, seen_from: np.ndarray) -> np.ndarray:
+        """(N,) m^2, what points (N, 3) seen from (N, 3) may be off."""
+        range2 = ((points - seen_from) ** 2).sum(axis=1)
+        return self.noise_m**2 + self.position_m**2 + self.angle_rad**2 * range2
+
+
+@dataclass(frozen=True)
+class FoundPlanes:
+    """cells: where planes are, the first `count` of them the planes found, the others surfaces that bend or are small
+    and only keep points from their neighbours."""
+
+    cells: Cells
+    count: int
+
+    @property
+    def planes(self) -> np.ndarray:
+        """(P, 6) normal, towards whoever saw it, and about the centroid, world frame."""
+        return self.cells.planes[: self.count]
+
+    @property
+    def areas_m2(self) -> np.ndarray:
+        """(P,) of the cells of each."""
+        edges = np.append(self.cells.first, len(self.cells.use))
+        before = np.append(0, np.cumsum(self.cells.use == OWN))
+        return np.diff(before[edges])[: self.count] * self.cells.edge_m**2
+
+    def of_points(self, points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch) -> np.ndarray:
+        """(N,) int32, the plane of each of points (N, 3) seen from (N, 3), world; -1: none."""
+        return _associate(self.cells, points, seen_from, search)[0]
+
+
+def find_planes(points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch = PlaneSearch()) -> FoundPlanes:
+    """Planes of points (N, 3) seen from (N, 3), both in the world frame; the largest first."""
+    step = max(1, len(points) // MOST_POINTS)
+    points, seen_from = points[::step], seen_from[::step]
+    if not len(points):
+        return FoundPlanes(_packed([], search.voxel_m), 0)
+    voxels = _voxels(points, seen_from, search)
+    region = np.full(len(voxels.centre), -1, dtype=np.int64)
+    count = grow(voxels, np.argsort(voxels.sigma, kind="stable"), region)
+    members = [
+        np.flatnonzero(region == k) for k in np.flatnonzero(np.bincount(region[region >= 0], minlength=count) > 2)
+    ]
+    patches = _patches(_join(voxels, members), voxels, search)
+    for _ in range(ROUNDS):
+        patches = _refined(patches, points, seen_from, search)
+    return FoundPlanes(_packed(patches, search.voxel_m), sum(p.own > 0 for p in patches))
+
+
+def _voxels(points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch) -> Voxels:
+    ijk = np.floor(points / search.voxel_m).astype(np.int64)
+    ijk -= ijk.min(axis=0) - 1
+    shape = ijk.max(axis=0) + 2
+    strides = np.array([shape[1] * shape[2], shape[2], 1])
+    keys, which = np.unique(ijk @ strides, return_inverse=True)
+    n = len(keys)
+    moments, towards, variance = np.zeros((n, MOMENTS)), np.zeros((n, 3)), np.zeros(n)
+    sum_voxels(points, seen_from, search.variance(points, seen_from), which, moments, towards, variance)
+    count = moments[:, 0]
+    S = moments[:, [2, 4, 7, 4, 5, 8, 7, 8, 9]].reshape(n, 3, 3) / count[:, None, None]
+    centre = moments[:, [1, 3, 6]] / count[:, None]
+    spread, axes = np.linalg.eigh(S - centre[:, :, None] * centre[:, None, :])
+    normal = axes[:, :, 0] * np.sign((axes[:, :, 0] * towards).sum(axis=1, keepdims=True))
+    sigma = np.sqrt(variance / count)
+    thin = spread[:, 0] < np.minimum((MIXED * sigma) ** 2, 0.25 * spread[:, 1])
+    flat = (count >= FEWEST) & thin & (spread[:, 1] > (ACROSS * search.voxel_m) ** 2 / 3.0)
+    around = np.array([(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1) if i or j or k]) @ strides
+    at = np.searchsorted(keys, keys[:, None] + around).clip(max=n - 1)
+    neighbour = np.where(keys[at] == keys[:, None] + around, at, -1)
+    return Voxels(moments, np.ascontiguousarray(normal), centre, sigma, neighbour, flat)
+
+
+@dataclass(frozen=True)
+class _Region:
+    """Voxels (m,) on one plane."""
+
+    members: np.ndarray
+    normal: np.ndarray
+    centre: np.ndarray
+    sigma: float
+
+    @classmethod
+    def of(cls, voxels: Voxels, members: np.ndarray) -> _Region:
+        normal, centre = voxels.normal[members].sum(axis=0), np.empty(3)
+        fit(voxels.moments[members].sum(axis=0), normal, centre)
+        return cls(members, normal, centre, float(np.sqrt((voxels.sigma[members] ** 2).mean())))
+
+    def is_plane_of(self, other: _Region) -> bool:
+        """Whether the other may lie on the same plane."""
+        gap = other.centre - self.centre
+        near = max(abs(self.normal @ gap), abs(other.normal @ gap)) < self.sigma + other.sigma
+        return bool(self.normal @ other.normal > np.cos(SAME_TURN) and near)
+
+    def bends(self, voxels: Voxels) -> bool:
+        """Whether a quadratic surface through the voxels' centres bows."""
+        gap, axes = voxels.centre[self.members] - self.centre, tangents(self.normal)
+        u, v = axes @ gap.T
+        if len(u) < FEWEST_BENT:
+            return False
+        A = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
+        root = np.sqrt(voxels.moments[self.members, 0])
+        x, *_ = np.linalg.lstsq(A * root[:, None], gap @ self.normal * root, rcond=None)
+        bow = A[:, 3:] @ x[3:]
+        return bool(0.5 * np.ptp(bow - A[:, :3] @ np.linalg.lstsq(A[:, :3], bow, rcond=None)[0]) > BENT * self.sigma)
+
+    def continues(self, voxels: Voxels, bent: np.ndarray) -> bool:
+        """Whether it is the rest of a larger surface that bends; bent (V,) voxels."""
+        around = voxels.neighbour[self.members]
+        alike = voxels.normal[around] @ self.normal > np.cos(LARGEST_TURN)
+        return bool((alike & bent[around] & (around >= 0)).any())
+
+
+def _join(voxels: Voxels, members: list[np.ndarray]) -> list[_Region]:
+    """Regions of the same plane as one; the largest take the others in."""
+    open_regions = sorted((_Region.of(voxels, m) for m in members), key=lambda r: -len(r.members))
+    joined: list[_Region] = []
+    for region in open_regions:
+        for k, other in enumerate(joined):
+            if other.is_plane_of(region):
+                joined[k] = _Region.of(voxels, np.concatenate([other.members, region.members]))
+                break
+        else:
+            joined.append(region)
+    return sorted(joined, key=lambda r: -len(r.members))
+
+
+@dataclass(frozen=True)
+class _Patch:
+    """One plane (6,) and its cells `use` (i, j) on a grid along axes (2, 3) from `low` (2,) on."""
+
+    plane: np.ndarray
+    axes: np.ndarray
+    low: np.ndarray
+    use: np.ndarray
+
+    @property
+    def own(self) -> int:
+        return int((self.use == OWN).sum())
+
+    def unowned(self) -> _Patch:
+        """What takes no points, but keeps others from taking them."""
+        return replace(self, use=np.minimum(self.use, NEAR))
+
+
+def _patches(regions: list[_Region], voxels: Voxels, search: PlaneSearch) -> list[_Patch]:
+    """The squares that the voxels of regions lie in, and those around them; bent regions own none."""
+    patches, bent = [], np.zeros(len(voxels.centre), dtype=bool)
+    for region in regions:
+        across = tangents(region.normal)
+        uv = (voxels.centre[region.members] - region.centre) @ across.T
+        low = uv.min(axis=0) - 1.5 * search.voxel_m
+        ij = np.floor((uv - low) / search.voxel_m).astype(int)
+        use = np.full(ij.max(axis=0) + 2, OUTSIDE, dtype=np.uint8)
+        for i in (-1, 0, 1):
+            for j in (-1, 0, 1):
+                use[ij[:, 0] + i, ij[:, 1] + j] = OWN
+        patch = _Patch(plane_of(region.normal, region.centre), across, low, use)
+        if region.bends(voxels) or region.continues(voxels, bent):
+            bent[region.members] = True
+            patch = patch.unowned()
+        patches.append(patch)
+    return patches
+
+
+def _packed(patches: list[_Patch], edge_m: float) -> Cells:
+    """Patches in the arrays of kernels, those that own cells first."""
+    patches = sorted(patches, key=lambda p: -p.own)
+    first = np.cumsum([0, *(p.use.size for p in patches)])[:-1].astype(np.int64)
+    return Cells(
+        np.array([p.plane for p in patches]).reshape(-1, 6),
+        np.array([p.axes for p in patches]).reshape(-1, 2, 3),
+        np.array([p.low for p in patches]).reshape(-1, 2),
+        np.array([p.use.shape for p in patches], dtype=np.int64).reshape(-1, 2),
+        first,
+        np.concatenate([np.zeros(0, dtype=np.uint8), *(p.use.ravel() for p in patches)]),
+        edge_m,
+    )
+
+
+def _associate(
+    cells: Cells, points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    n = len(points)
+    plane, cell, distance = np.empty(n, np.int32), np.empty(n, np.int64), np.empty(n)
+    variance = search.variance(points, seen_from)
+    associate(points, seen_from, variance, cells, search.gate, search.least_cosine, plane, cell, distance)
+    return plane, cell, distance
+
+
+def _refined(patches: list[_Patch], points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch) -> list[_Patch]:
+    """Planes fitted to their own points, without cells that are empty or not flat; small ones own none any more."""
+    patches = sorted(patches, key=lambda p: -p.own)
+    cells = _packed(patches, search.voxel_m)
+    plane, cell, distance = _associate(cells, points, seen_from, search)
+    stats, moments = np.zeros((len(cells.use), 3)), np.zeros((len(patches), MOMENTS))
+    sum_cells(points, search.variance(points, seen_from), plane, cell, distance, stats, moments)
+    good = (stats[:, 0] >= FEWEST) & (stats[:, 2] < MIXED**2 * stats[:, 0])
+    use = np.where(good, cells.use, np.minimum(cells.use, NEAR))
+    refined = []
+    for patch, first, sums in zip(patches, cells.first, moments, strict=True):
+        own = use[first : first + patch.use.size].reshape(patch.use.shape)
+        if (own == OWN).sum() * search.voxel_m**2 < search.smallest_m2:
+            refined.append(patch.unowned())
+            continue
+        normal, old, centre = patch.plane[:3].copy(), patch.plane[3:], np.empty(3)
+        fit(sums, normal, centre)
+        # The cells stay where they are: the point moves along the normal only.
+        at = old + normal * (normal @ (centre - old))
+        refined.append(replace(patch, plane=np.append(normal, at), use=own))
+    return refined

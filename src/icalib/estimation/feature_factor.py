@@ -1,0 +1,295 @@
+"""Points of the scene, of unknown position, as the cameras follow them (paper (20)-(22)).
+
+residual = K(R_cam_world (P - p_world_cam)) - uv
+
+Points are no part of the state: at every linearisation each is moved to where the poses and the calibration want it
+(variable projection), so that the cost is the least over all points. Their columns are eliminated with the nodes that
+saw them (`front.py`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from icalib.estimation.arrowhead import Piece
+from icalib.estimation.corner_factor import LOSSES, CornerFactor
+from icalib.estimation.corner_kernels import Motion
+from icalib.estimation.feature_kernels import (
+    Points,
+    Range,
+    Seeing,
+    Seen,
+    Weighing,
+    accumulate,
+    add_rays,
+    add_to_points,
+    camera_points,
+    take_trials,
+)
+from icalib.estimation.front import Features, FeatureSums, plan
+from icalib.estimation.state import Layout, State
+from icalib.estimation.tracks import NO_TRACKS, Sightings, Tracks
+from icalib.measurements import TrackStream
+
+MOST_STEPS = 20  # of a point; most settle in three
+WEAK = 1e-6  # information [1/m^2]: keeps a point defined that no image shows any more; steers nothing else
+LONGEST_GAP_S = 1.0  # a feature that was out of sight for longer is a new track
+MOST_UNCERTAIN = 0.1  # of its distance: a point that is less certain is left out
+MOST_UNLIKE = 10.0  # times the residuals of most points: a point that fits worse is left out
+
+
+@dataclass(frozen=True)
+class FeatureOutput:
+    """By camera: residual (N, 2) px, predicted - measured, and root (N,), square root of its weight over sigma (0 where
+    left out); points (T, 3) in the world."""
+
+    residual: tuple[np.ndarray, ...]
+    root: tuple[np.ndarray, ...]
+    points: np.ndarray
+
+
+@dataclass(frozen=True)
+class View:
+    """One camera in a piece: what it saw, and how it moved."""
+
+    camera: CornerFactor
+    index: int
+    first: int  # of its images
+    params: np.ndarray
+    seen: Seen
+    motion: Motion
+
+
+@dataclass(frozen=True)
+class FeatureFactor:
+    """All features of all cameras. cameras: their poses and models; streams: one per camera, on its images; sigma: px,
+    by camera; keep: (N,) by camera, observations in use; seams: nodes at which further recordings begin."""
+
+    cameras: tuple[CornerFactor, ...]
+    streams: tuple[TrackStream, ...]
+    sigma: tuple[float, ...]
+    keep: tuple[np.ndarray, ...]
+    loss: str
+    loss_scale: float
+    tracks: Tracks
+    layout: Layout
+    seams: tuple[int, ...] = ()
+
+    @classmethod
+    def build(
+        cls,
+        cameras: tuple[CornerFactor, ...],
+        streams: tuple[TrackStream, ...],
+        sigma: tuple[float, ...],
+        keep: tuple[np.ndarray, ...],
+        loss: tuple[str, float],
+        state: State,
+        cuts: tuple[int, ...],
+        seams: tuple[int, ...] = (),
+    ) -> FeatureFactor:
+        """Tracks chosen, and points first looked for, with the poses of `state`; the chain is cut at nodes `cuts`."""
+        factor = cls(cameras, streams, sigma, keep, loss[0], loss[1], NO_TRACKS, cameras[0].layout, seams)
+        return factor.cut(state, cuts)
+
+    @property
+    def n_nodes(self) -> int:
+        return self.cameras[0].n_nodes
+
+    def cut(self, state: State, cuts: tuple[int, ...]) -> FeatureFactor:
+        """The same features as tracks that end at nodes `cuts`. A track is left out whose point the poses of `state` do
+        not find where all its images can show it, whose distance they leave uncertain, or that fits far worse than
+        most."""
+        edges = np.unique([0, *cuts, *self.seams, self.n_nodes])
+        sightings = self._sightings()
+        label = sightings.in_order(sightings.labels(state.seconds, edges, LONGEST_GAP_S))
+        by_next = any(c.scheme == "pose" and c.imu is not None for c in self.cameras)
+        factor = replace(self, tracks=sightings.tracks(label, edges, by_next))
+        points, good = factor._triangulated(state)
+        label = np.where(label >= 0, np.where(np.append(good, False)[label], label, -1), -1)
+        number = np.append(np.where(good, np.cumsum(good) - 1, -1), -1)
+        factor = replace(factor, tracks=sightings.tracks(number[label], edges, by_next))
+        return replace(factor, tracks=replace(factor.tracks, start=factor._in_anchors(state, points[good])))
+
+    def _triangulated(self, state: State) -> tuple[np.ndarray, np.ndarray]:
+        """Points (T, 3) in the world of `state`, from the rays, and whether each is certain enough."""
+        views, n = self._views(state, 0, self.n_nodes), self.tracks.count
+        A, b = np.tile(1e-9 * np.eye(3), (n, 1, 1)), np.zeros((n, 3))
+        for view in views:
+            rays, valid = view.camera.model.unproject(view.params, view.seen.uv)
+            motion = view.motion
+            add_rays(view.seen, 0, motion.R_cam_world, motion.p_world_cam, rays, valid, A, b)
+        found = self._descend(views, np.linalg.solve(A, b[:, :, None])[:, :, 0], slice(0, n))
+        anchors = replace(self, tracks=replace(self.tracks, start=np.zeros((n, 3))))._from_anchors(views, slice(0, n))
+        distance = np.linalg.norm(found.xyz - anchors, axis=1)
+        information = np.linalg.eigvalsh(found.A)[:, 0]
+        seen = sum(
+            (np.bincount(t[(t >= 0) & k], minlength=n) for t, k in zip(self.tracks.track, self.keep, strict=True)),
+            np.zeros(n, dtype=np.int64),
+        )
+        square = found.cost / np.maximum(seen, 1)
+        fits = square <= MOST_UNLIKE**2 * np.median(square[found.shown == seen] if n else 0.0) + MOST_UNLIKE
+        certain = information * (MOST_UNCERTAIN * distance) ** 2 > 1.0
+        return found.xyz, np.isfinite(found.xyz).all(axis=1) & (found.shown == seen) & fits & certain
+
+    def output(self) -> FeatureOutput:
+        """Empty arrays for `accumulate` to fill."""
+        sizes = [len(s.uv) for s in self.streams]
+        return FeatureOutput(
+            tuple(np.zeros((n, 2)) for n in sizes), tuple(np.zeros(n) for n in sizes), np.zeros((self.tracks.count, 3))
+        )
+
+    def attach(self, piece: Piece, keep: bool) -> Piece:
+        """The piece with room for the features that its nodes saw; `keep`: its end is shared with another piece."""
+        tracks, pairs = self._within(piece)
+        track, node = self.tracks.pair_track[pairs] - tracks.start, self.tracks.pair_node[pairs] - piece.first
+        sums = FeatureSums.zeros(tracks.stop - tracks.start, track, node, piece.border.shape[0] - 1)
+        steps = plan(sums, len(piece.diagonal), piece.first == 0 or not keep, keep)
+        return replace(piece, features=Features(sums, steps))
+
+    def accumulate(
+        self,
+        state: State,
+        piece: Piece,
+        out: FeatureOutput,
+        sums: bool = True,
+        curved: bool = False,
+        noise: tuple[np.ndarray, ...] | None = None,
+    ) -> float:
+        """Fills `out` for the features that the nodes of `piece` saw, and adds them to its sums where these are wanted.
+
+        Returns half the robust chi^2, the least over the points. `curved`: see CornerFactor.accumulate. `noise`: by
+        camera (N, 2), white, in place of the whitened residuals.
+        """
+        tracks, pairs = self._within(piece)
+        views, base = self._views(state, piece.first, self._stop(piece)), Range(tracks.start, pairs.start)
+        points = self._descend(views, self._from_anchors(views, tracks), tracks)
+        out.points[tracks] = points.xyz
+        into = piece.sums(sums)
+        features = FeatureSums.zeros(0, np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), 0)
+        if sums and piece.features is not None:
+            features = piece.features.sums
+            features.own[:, range(3), range(3)] += WEAK
+        total = 0.0
+        for view in views:
+            i, X = view.index, _in_camera(view, points.xyz, tracks.start)
+            given = out.residual[i] if noise is None else noise[i]
+            seeing = self._seeing(view, X)
+            weighing = self._weighing(i, curved)
+            total += accumulate(
+                X, view.seen, base, view.motion, seeing, weighing, noise is not None, given, into, features,
+                out.residual[i], out.root[i],
+            )  # fmt: skip
+        return total
+
+    def _within(self, piece: Piece) -> tuple[slice, slice]:
+        return self.tracks.within(piece.first, self._stop(piece))
+
+    def _stop(self, piece: Piece) -> int:
+        """The node before which the images of `piece` hang: the last, or behind the chain's very last."""
+        return piece.last + 1 if piece.last == self.n_nodes - 1 else piece.last
+
+    def _sightings(self) -> Sightings:
+        pairs = list(zip(self.streams, self.cameras, strict=True))
+        return Sightings(
+            np.concatenate([s.feature for s in self.streams]),
+            np.concatenate([s.image for s in self.streams]),
+            np.concatenate([c.node[s.image] for s, c in pairs]),
+            np.concatenate(self.keep),
+            tuple(len(s.feature) for s in self.streams),
+        )
+
+    def _weighing(self, camera: int, curved: bool) -> Weighing:
+        return Weighing(self.sigma[camera], LOSSES[self.loss], self.loss_scale, curved)
+
+    def _views(self, state: State, first: int, stop: int) -> list[View]:
+        """What hangs on nodes first..stop."""
+        return [self._view(state, i, first, stop) for i in range(len(self.cameras))]
+
+    def _view(self, state: State, index: int, first: int, stop: int) -> View:
+        camera, stream, tracks = self.cameras[index], self.streams[index], self.tracks
+        i0, i1 = (int(i) for i in np.searchsorted(camera.node, [first, stop]))
+        poses, R_cw, p_wc = camera.camera_poses(state, i0, i1)
+        seen = Seen(
+            stream.start[i0 : i1 + 1], stream.uv, self.keep[index], tracks.track[index], tracks.pair[index],
+            tracks.next_pair[index], camera.node[i0:i1] - first,
+        )  # fmt: skip
+        motion = Motion(
+            np.ascontiguousarray(state.values[camera.name, "rotation"]), state.values[camera.name, "translation"],
+            R_cw, p_wc, poses.rate, poses.velocity, poses.by_node, poses.by_next, poses.by_imu,
+            np.eye(3), np.zeros((0, 3, 3)), np.zeros((0, 3)), np.tile(self._chained(camera), (i1 - i0, 1)),
+        )  # fmt: skip
+        params = np.concatenate([state.values[camera.name, "intrinsics"], state.values[camera.name, "distortion"]])
+        return View(camera, index, i0, params, seen, motion)
+
+    def _chained(self, camera: CornerFactor) -> np.ndarray:
+        """(c,) border columns that act through the camera's pose, in the order of `pose_chain`; points know no tilt."""
+        imu = np.zeros(0, dtype=np.int64)
+        if camera.imu is not None:
+            imu = self.layout.columns(camera.imu.name, "intrinsics")
+        own = self.layout.columns(camera.name, "rotation", "translation", "time_offset")
+        return np.concatenate([own, np.full(2, -1), imu[imu >= 0]]).astype(np.int64)
+
+    def _seeing(self, view: View, X: np.ndarray) -> Seeing:
+        """Observations of a view, their points at X (n, 3) in the camera."""
+        columns = self.layout.columns(view.camera.name, "intrinsics", "distortion")
+        pars = np.flatnonzero(columns >= 0)
+        found = view.camera.model.project_with_jacobians(view.params, X)
+        return Seeing(int(view.seen.start[0]), *found, pars, columns[pars])
+
+    def _descend(self, views: list[View], xyz: np.ndarray, tracks: slice) -> Points:
+        """The points of `tracks` where their cost is least, from `xyz` (n, 3) on."""
+        n = len(xyz)
+        points = Points(
+            xyz, xyz.copy(), np.zeros(n), np.zeros(n), np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3, 3)),
+            np.zeros((n, 3)), np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64), np.zeros(n),
+            np.ones(n, dtype=bool),
+        )  # fmt: skip
+        for step in range(MOST_STEPS):
+            for view in views:
+                X = _in_camera(view, points.trial, tracks.start)
+                weighing, R_cw = self._weighing(view.index, False), view.motion.R_cam_world
+                add_to_points(view.seen, tracks.start, R_cw, self._seeing(view, X), weighing, points)
+            if take_trials(points, step == 0) == 0:
+                break
+        return points
+
+    def _from_anchors(self, views: list[View], tracks: slice) -> np.ndarray:
+        """(n, 3) where the points of `tracks` are first looked for, in the world: they move with a camera."""
+        out, camera, image = np.empty((tracks.stop - tracks.start, 3)), self.tracks.camera[tracks], self.tracks.image
+        for view in views:
+            own = np.flatnonzero(camera == view.index)
+            i = image[tracks][own] - view.first
+            turned = np.einsum("nji,nj->ni", view.motion.R_cam_world[i], self.tracks.start[tracks][own])
+            out[own] = turned + view.motion.p_world_cam[i]
+        return out
+
+    def _in_anchors(self, state: State, points: np.ndarray) -> np.ndarray:
+        """(T, 3) points in the world of `state`, in the frames of the cameras that they move with."""
+        out = np.empty_like(points)
+        for view in self._views(state, 0, self.n_nodes):
+            own = np.flatnonzero(self.tracks.camera == view.index)
+            i = self.tracks.image[own]
+            out[own] = np.einsum("nij,nj->ni", view.motion.R_cam_world[i], points[own] - view.motion.p_world_cam[i])
+        return out
+
+
+def _in_camera(view: View, points: np.ndarray, first: int) -> np.ndarray:
+    """(n, 3) the points of tracks `first` and on, in the camera, for each observation of the view."""
+    seen, motion = view.seen, view.motion
+    X = np.empty((int(seen.start[-1] - seen.start[0]), 3))
+    camera_points(seen, first, motion.R_cam_world, motion.p_world_cam, points, X)
+    return X
+
+
+FRAME = 1e4  # information [1/m^2, 1/rad^2] along what nothing sees: any number does
+
+
+def hold_frame(state: State, piece: Piece, node: int) -> None:
+    """Holds the position of `node`, and its turn about gravity, where they are: without a target nothing in the world
+    says where its origin is. Adds to the sums of `piece`; there is no gradient, and what is seen does not depend on it.
+    """
+    k, up = node - piece.first, state.rotation[node][2]
+    piece.diagonal[k, 0:3, 0:3] += FRAME * np.outer(up, up)
+    piece.diagonal[k, range(3, 6), range(3, 6)] += FRAME

@@ -1,0 +1,277 @@
+"""Compiled sums of the feature factor: points from what is seen of them, and the normal equations of a piece.
+
+Images are those of one camera in the piece, observations counted from the first of the recording, tracks and pairs from
+the first of the recording too; `Range` says where the piece begins.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from icalib.estimation.corner_chain import add_image, pose_chain
+from icalib.estimation.corner_weights import bend, weight
+from icalib.geometry.small import solve_definite
+
+SETTLED = 1e-12  # of half the chi^2: what another step of a point could still take off
+FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-6, 1e8
+
+
+class Seen(NamedTuple):
+    """What one camera saw: observations of image i are start[i]:start[i + 1]; uv (N, 2), keep (N,), track (N,) -1 where
+    left out; pair and next_pair (N,) of feature and node (-1: none); node (n,), counted from the piece's first."""
+
+    start: np.ndarray
+    uv: np.ndarray
+    keep: np.ndarray
+    track: np.ndarray
+    pair: np.ndarray
+    next_pair: np.ndarray
+    node: np.ndarray
+
+
+class Weighing(NamedTuple):
+    """sigma px; the robust loss, where it bends, and whether the sums have its true curvature."""
+
+    sigma: float
+    loss: int
+    scale: float
+    curved: bool
+
+
+class Range(NamedTuple):
+    """The first track and the first pair of the piece."""
+
+    track: int
+    pair: int
+
+
+class Seeing(NamedTuple):
+    """What the model makes of observations `first` and on: uv, valid, Jacobians by the point in the camera and by the
+    parameters, those in `pars` free, their columns (d,) in the border."""
+
+    first: int
+    uv: np.ndarray
+    valid: np.ndarray
+    by_point: np.ndarray
+    by_params: np.ndarray
+    pars: np.ndarray
+    columns: np.ndarray
+
+
+class Points(NamedTuple):
+    """Points (T, 3) in the world on their way down: xyz and trial, half the chi^2 of both, the sums A (T, 3, 3) and
+    b (T, 3) of both, how many images show them of both, damping (T,), and which still move."""
+
+    xyz: np.ndarray
+    trial: np.ndarray
+    cost: np.ndarray
+    trial_cost: np.ndarray
+    A: np.ndarray
+    b: np.ndarray
+    trial_A: np.ndarray
+    trial_b: np.ndarray
+    shown: np.ndarray
+    trial_shown: np.ndarray
+    damping: np.ndarray
+    moves: np.ndarray
+
+
+@njit(cache=True, nogil=True)
+def camera_points(seen, t0, R_cw, p_wc, points, X):
+    """X (n, 3): each observation's point in its camera's frame; (0, 0, 1) where the track is left out."""
+    o = seen.start[0]
+    for i in range(len(seen.start) - 1):
+        for n in range(seen.start[i], seen.start[i + 1]):
+            t = seen.track[n]
+            if t < 0:
+                X[n - o, 0], X[n - o, 1], X[n - o, 2] = 0.0, 0.0, 1.0
+                continue
+            a = points[t - t0, 0] - p_wc[i, 0]
+            b = points[t - t0, 1] - p_wc[i, 1]
+            c = points[t - t0, 2] - p_wc[i, 2]
+            for r in range(3):
+                X[n - o, r] = R_cw[i, r, 0] * a + R_cw[i, r, 1] * b + R_cw[i, r, 2] * c
+
+
+@njit(cache=True, nogil=True)
+def add_rays(seen, t0, R_cw, p_wc, rays, valid, A, b):
+    """Adds what each ray (n, 3) in its camera says of its point: A P = b is the point nearest to all rays."""
+    o, d = seen.start[0], np.empty(3)
+    for i in range(len(seen.start) - 1):
+        for n in range(seen.start[i], seen.start[i + 1]):
+            t = seen.track[n]
+            if t < 0 or not (seen.keep[n] and valid[n - o]):
+                continue
+            for r in range(3):
+                d[r] = 0.0
+                for k in range(3):
+                    d[r] += R_cw[i, k, r] * rays[n - o, k]
+            along = d[0] * p_wc[i, 0] + d[1] * p_wc[i, 1] + d[2] * p_wc[i, 2]
+            for r in range(3):
+                b[t - t0, r] += p_wc[i, r] - along * d[r]
+                A[t - t0, r, r] += 1.0
+                for k in range(3):
+                    A[t - t0, r, k] -= d[r] * d[k]
+
+
+@njit(cache=True, nogil=True)
+def add_to_points(seen, t0, R_cw, seeing, weighing, points):
+    """Adds one camera's part to the sums, with the true curvature of the loss, and costs of the trial points."""
+    o, J, e = seeing.first, np.empty((2, 3)), np.empty(2)
+    for i in range(len(seen.start) - 1):
+        for n in range(seen.start[i], seen.start[i + 1]):
+            t = seen.track[n] - t0
+            if seen.track[n] < 0 or not points.moves[t] or not (seen.keep[n] and seeing.valid[n - o]):
+                continue
+            for r in range(2):
+                e[r] = seeing.uv[n - o, r] - seen.uv[n, r]
+                for k in range(3):
+                    J[r, k] = 0.0
+                    for c in range(3):
+                        J[r, k] += seeing.by_point[n - o, r, c] * R_cw[i, c, k]
+            square = (e[0] * e[0] + e[1] * e[1]) / (weighing.sigma * weighing.sigma)
+            w, cost, curvature = weight(weighing.loss, weighing.scale, square)
+            w /= weighing.sigma * weighing.sigma
+            less = (1.0 - curvature) / (e[0] * e[0] + e[1] * e[1]) if curvature < 1.0 else 0.0
+            points.trial_cost[t] += cost
+            points.trial_shown[t] += 1
+            for a in range(3):
+                slope = J[0, a] * e[0] + J[1, a] * e[1]
+                points.trial_b[t, a] += w * slope
+                for k in range(3):
+                    bent = less * slope * (J[0, k] * e[0] + J[1, k] * e[1])
+                    points.trial_A[t, a, k] += w * (J[0, a] * J[0, k] + J[1, a] * J[1, k] - bent)
+
+
+@njit(cache=True, nogil=True)
+def take_trials(points, start):
+    """Takes trials that lowered the cost (all, at the `start`), then sets new ones; returns how many points still
+    move. A point must not lower its cost by leaving an image."""
+    M, d, moving = np.empty((3, 3)), np.empty(3), 0
+    for t in range(len(points.xyz)):
+        if not points.moves[t]:
+            continue
+        stays = points.trial_shown[t] >= points.shown[t]
+        if start or (stays and points.trial_cost[t] <= points.cost[t]):
+            points.shown[t] = points.trial_shown[t]
+            points.xyz[t], points.cost[t] = points.trial[t], points.trial_cost[t]
+            points.A[t], points.b[t] = points.trial_A[t], points.trial_b[t]
+            points.damping[t] *= 0.1
+            if points.damping[t] < LEAST_DAMPING:
+                points.damping[t] = 0.0
+        else:
+            points.damping[t] = max(10.0 * points.damping[t], FIRST_DAMPING)
+        while points.damping[t] < MOST_DAMPING:
+            for a in range(3):
+                d[a] = -points.b[t, a]
+                for k in range(3):
+                    M[a, k] = points.A[t, a, k]
+                M[a, a] *= 1.0 + points.damping[t]
+            if solve_definite(M, d):
+                break
+            points.damping[t] = max(10.0 * points.damping[t], FIRST_DAMPING)
+        decrease = -0.5 * (d[0] * points.b[t, 0] + d[1] * points.b[t, 1] + d[2] * points.b[t, 2])
+        if points.damping[t] >= MOST_DAMPING or (points.damping[t] == 0.0 and decrease < SETTLED):
+            points.moves[t] = False
+            continue
+        moving += 1
+        for a in range(3):
+            points.trial[t, a] = points.xyz[t, a] + d[a]
+            points.trial_b[t, a] = 0.0
+            for k in range(3):
+                points.trial_A[t, a, k] = 0.0
+        points.trial_cost[t], points.trial_shown[t] = 0.0, 0
+    return moving
+
+
+@njit(cache=True, nogil=True)
+def _rows(i, n, X, seen, seeing, weighing, R_cw, error, A):
+    """Weighted rows of observation n, transposed: A (6 + d + 3 + 1, 2): camera pose, parameters, point, residual.
+    Returns the square root of the weight over sigma, 0 where left out, and half the robust chi^2."""
+    c, D = n - seeing.first, len(A) - 1
+    for r in range(2):
+        error[r] = seeing.uv[c, r] - seen.uv[n, r]
+    if not (seen.keep[n] and seeing.valid[c]):
+        return 0.0, 0.0
+    square = (error[0] ** 2 + error[1] ** 2) / (weighing.sigma * weighing.sigma)
+    w, cost, curvature = weight(weighing.loss, weighing.scale, square)
+    root = np.sqrt(w) / weighing.sigma
+    x, y, z = X[c, 0], X[c, 1], X[c, 2]
+    for r in range(2):
+        a0, a1, a2 = root * seeing.by_point[c, r, 0], root * seeing.by_point[c, r, 1], root * seeing.by_point[c, r, 2]
+        A[0, r], A[1, r], A[2, r] = a1 * z - a2 * y, a2 * x - a0 * z, a0 * y - a1 * x
+        A[3, r], A[4, r], A[5, r] = -a0, -a1, -a2
+        for q in range(len(seeing.pars)):
+            A[6 + q, r] = root * seeing.by_params[c, r, seeing.pars[q]]
+        for k in range(3):
+            A[D - 3 + k, r] = a0 * R_cw[i, 0, k] + a1 * R_cw[i, 1, k] + a2 * R_cw[i, 2, k]
+        A[D, r] = root * error[r]
+    if weighing.curved and curvature < 1.0:
+        bend(A, D, 0, 1, error, np.sqrt(curvature))
+    return root, cost
+
+
+@njit(cache=True, nogil=True)
+def _add_feature(A, pair, next_pair, t, Tn, Tm, Tc, chained, direct, features):
+    """One observation's rows A into the sums of its feature."""
+    D, n_b = len(A) - 1, features.side.shape[2] - 1
+    n_d = len(direct)
+    for a in range(3):
+        f0, f1 = A[D - 3 + a, 0], A[D - 3 + a, 1]
+        for k in range(3):
+            features.own[t, a, k] += f0 * A[D - 3 + k, 0] + f1 * A[D - 3 + k, 1]
+        features.side[t, a, n_b] += f0 * A[D, 0] + f1 * A[D, 1]
+        for q in range(n_d):
+            if direct[q] >= 0:
+                features.side[t, a, direct[q]] += f0 * A[6 + q, 0] + f1 * A[6 + q, 1]
+        for d in range(6):
+            by_pose = f0 * A[d, 0] + f1 * A[d, 1]
+            for j in range(15):
+                features.block[pair, a, j] += by_pose * Tn[d, j]
+            for j in range(Tm.shape[1]):
+                features.block[next_pair, a, j] += by_pose * Tm[d, j]
+            for j in range(len(chained)):
+                if chained[j] >= 0:
+                    features.side[t, a, chained[j]] += by_pose * Tc[d, j]
+
+
+@njit(cache=True, nogil=True)
+def accumulate(X, seen, base, motion, seeing, weighing, used, given, sums, features, residual, root):
+    """Residual (N, 2) and root (N,) of one camera's observations, and the normal equations where they are wanted; with
+    `used`, white noise `given` (N, 2) stands for the whitened residuals. Returns half the robust chi^2."""
+    n_d = len(seeing.pars)
+    A, G, error = np.zeros((10 + n_d, 2)), np.empty((7 + n_d, 7 + n_d)), np.empty(2)
+    Tn, Tm = np.empty((6, 15)), np.empty((6, 15 if len(motion.by_next) else 0))
+    Tc, total, D = np.empty((6, motion.columns.shape[1])), 0.0, 9 + n_d
+    wanted = len(sums.diagonal) > 0
+    for i in range(len(seen.start) - 1):
+        if wanted:
+            pose_chain(i, motion, Tn, Tm, Tc)
+            G[:] = 0.0
+        for n in range(seen.start[i], seen.start[i + 1]):
+            t = seen.track[n] - base.track
+            if seen.track[n] < 0:
+                root[n], residual[n, 0], residual[n, 1] = 0.0, 0.0, 0.0
+                continue
+            root[n], cost = _rows(i, n, X, seen, seeing, weighing, motion.R_cam_world, error, A)
+            residual[n, 0], residual[n, 1] = error[0], error[1]
+            total += cost
+            if not wanted or root[n] == 0.0:
+                continue
+            if used:
+                A[D, 0], A[D, 1] = given[n, 0], given[n, 1]
+            for a in range(7 + n_d):
+                p = a if a < 6 + n_d else D
+                for b in range(7 + n_d):
+                    q = b if b < 6 + n_d else D
+                    G[a, b] += A[p, 0] * A[q, 0] + A[p, 1] * A[q, 1]
+            _add_feature(
+                A, seen.pair[n] - base.pair, seen.next_pair[n] - base.pair, t, Tn, Tm, Tc, motion.columns[i],
+                seeing.columns, features,
+            )  # fmt: skip
+        if wanted:
+            add_image(seen.node[i], G, Tn, Tm, Tc, motion.columns[i], seeing.columns, sums)
+    return total

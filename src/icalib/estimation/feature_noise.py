@@ -1,0 +1,70 @@
+"""How large the errors of tracks are, and which observations stand out, judged from what a pass leaves behind."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icalib.estimation.assembly import Following, Inputs
+from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput
+from icalib.estimation.problem import Problem
+from icalib.estimation.solver import Outcome
+from icalib.measurements import CornerStream, TrackStream
+from icalib.rig import Camera, Rig, Settings
+
+FIRST_GUESS_PX = 1.0
+SMALLEST_PX = 0.005
+MEDIAN_OF_SQUARE = 2.0 * np.log(2.0)  # median of chi^2 with two degrees of freedom
+
+
+def first_following(inputs: Inputs) -> Following | None:
+    """Before anything is known: what the rig file says, or a pixel; everything in use. None where there are no
+    tracks."""
+    if not inputs.measurements.tracks:
+        return None
+    sigma = tuple(c.track_noise_px or FIRST_GUESS_PX for c in inputs.rig.cameras)
+    return Following(sigma, tuple(np.ones(len(t.uv), dtype=bool) for t in inputs.measurements.tracks))
+
+
+def next_following(rig: Rig, problem: Problem, outcome: Outcome, now: Following, first: bool) -> Following:
+    """Of the next pass: noise as the residuals show it, where it is not given, and after the `first` pass without
+    outliers."""
+    factor, out = problem.features, outcome.residuals.features
+    assert factor is not None and out is not None
+    sigma = tuple(_sigma(c, factor, out, i) for i, c in enumerate(rig.cameras))
+    keep = now.keep
+    if first and rig.settings.outlier_std > 0.0:
+        keep = tuple(_kept(factor, out, i, k, rig.settings) for i, k in enumerate(keep))
+    return Following(sigma, keep)
+
+
+def _sigma(camera: Camera, factor: FeatureFactor, out: FeatureOutput, index: int) -> float:
+    """From the median, so that outliers have no say; each point takes three of its observations' rows."""
+    used = [root > 0.0 for root in out.root]
+    if camera.track_noise_px is not None or not used[index].any():
+        return camera.track_noise_px or factor.sigma[index]
+    rows, points = 2 * sum(int(u.sum()) for u in used), factor.tracks.count
+    square = np.median((out.residual[index][used[index]] ** 2).sum(axis=1)) / MEDIAN_OF_SQUARE
+    return max(float(np.sqrt(square / max(1.0 - 3.0 * points / rows, 0.1))), SMALLEST_PX)
+
+
+def _kept(factor: FeatureFactor, out: FeatureOutput, index: int, keep: np.ndarray, settings: Settings) -> np.ndarray:
+    """Observations without outliers; those whose track was left out this time stay."""
+    used, followed = out.root[index] > 0.0, factor.tracks.track[index] >= 0
+    stands = inliers(factor.streams[index], out.residual[index], used, settings)
+    return keep & (stands | ~followed)
+
+
+def inliers(
+    stream: CornerStream | TrackStream, residual: np.ndarray, used: np.ndarray, settings: Settings
+) -> np.ndarray:
+    """(N,) bool: what stands with the rest of its image.
+
+    The rule: what is seen is set aside when its residual (N, 2) is above mean + `outlier_std` standard deviations of
+    those `used` (N,) of its image, and above `outlier_min_px`.
+    """
+    size, n, image = np.linalg.norm(residual, axis=1), len(stream.stamps_ns), stream.image
+    count = np.maximum(np.bincount(image[used], minlength=n), 1)
+    mean = np.bincount(image[used], size[used], minlength=n) / count
+    square = np.bincount(image[used], size[used] ** 2, minlength=n) / count
+    limit = mean + settings.outlier_std * np.sqrt(np.maximum(square - mean**2, 0.0))
+    return used & ((size <= limit[image]) | (size <= settings.outlier_min_px))

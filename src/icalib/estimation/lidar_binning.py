@@ -1,0 +1,383 @@
+"""From the points of LiDAR scans to moments: all that the point-on-plane residuals of a pass depend on.
+
+A residual n . (p + R x) - d is linear in (1, x). So the sum of its squares over the points of one plane in one bin of
+time, and all its derivatives by the bin's pose and the plane, follow exactly from ten weighted moments of (1, x).
+Points are first moved to the instant of their bin's centre with the sensor's twist there; what that leaves is an eighth
+of the acceleration times the bin's length squared at most: 1e-6 m for 5 m/s^2 and 1 ms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from icalib.errors import EstimationError
+from icalib.estimation.arrowhead import in_parallel
+from icalib.estimation.corner_weights import weight
+from icalib.estimation.imu_data import ImuData
+from icalib.estimation.integration import integrate
+from icalib.estimation.nodes import usable
+from icalib.estimation.poses import assign_nodes
+from icalib.estimation.state import State
+from icalib.geometry.small import mul3
+from icalib.measurements import LidarStream
+from icalib.rig import Loss
+
+BIN_S = 1e-3
+POINTS_AT_A_TIME = 150_000  # by one thread: what a chunk needs beside the cloud stays small
+MOMENTS = 10  # of (1, x, y, z), lower triangle row by row
+LOSSES: dict[Loss, int] = {"none": 0, "huber": 1, "cauchy": 2}
+NO_PIVOT = 1e-13  # of a moment: below this a pivot is rounding
+
+
+@dataclass(frozen=True)
+class LidarNoise:
+    """Of a point's distance to its plane: sigma [m] whatever the direction, and beam_sigma [m] along the beam, of which
+    the cosine of incidence counts. The robust loss, and where it starts to bend, in standard deviations."""
+
+    sigma: float
+    beam_sigma: float = 0.0
+    loss: Loss = "none"
+    loss_scale: float = 2.5
+
+
+@dataclass(frozen=True)
+class Associated:
+    """Points of one LiDAR that are known to lie on planes. plane (N,) int32: the row of `planes` (P, 6) that each lies
+    on, -1: none."""
+
+    stream: LidarStream
+    plane: np.ndarray
+    planes: np.ndarray
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The IMU's motion as a state has it. gravity [m/s^2]; IMU gaps up to max_gap_s are bridged."""
+
+    state: State
+    imu: ImuData
+    gravity: float
+    max_gap_s: float
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Bins of one LiDAR, in the order of time, and the planes that each saw: entries start[j]:start[j + 1] of bin j.
+
+    seconds (n,): the bins' instants on the LiDAR's clock, since its first stamp; plane, count (E,): plane and number of
+    points of each entry; root (E, 10): lower Cholesky factor L, row by row, of its moments sum w (1, x) (1, x)^T, with
+    w the points' robust weights over their variance.
+    """
+
+    seconds: np.ndarray
+    start: np.ndarray
+    plane: np.ndarray
+    count: np.ndarray
+    root: np.ndarray
+
+
+class Sweep(NamedTuple):
+    """The LiDAR at the centres of bins: R_world_lidar, p_world_lidar, and the twist in its own axes: rad/s, m/s."""
+
+    rotation: np.ndarray
+    position: np.ndarray
+    rate: np.ndarray
+    velocity: np.ndarray
+
+
+class _Scans(NamedTuple):
+    """Points of scans and the bins that they fall into: start (S + 1,); first bin of each scan, counted from its stamp,
+    and its place among all bins (S + 1,); ok: whether a bin can be used."""
+
+    start: np.ndarray
+    offset_s: np.ndarray
+    xyz: np.ndarray
+    plane: np.ndarray
+    low: np.ndarray
+    bins: np.ndarray
+    ok: np.ndarray
+
+
+class _Weights(NamedTuple):
+    """Variances [m^2] of what is alike in all directions and of what is along the beam; the loss."""
+
+    alike: float
+    along: float
+    loss: int
+    scale: float
+
+
+@njit(cache=True, nogil=True)
+def _imu_at(times, node, first, chain, raw, intrinsics, out_R, out_p, rate, velocity):
+    """IMU poses at `times` by integration from their nodes, without Jacobians; the rate is the body's."""
+    seconds, R, p, v, b, g = chain
+    t, gyro, accel = raw
+    variance, walk = np.zeros((len(t), 3)), np.zeros(2)
+    dR, dv, dp, J, P = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((9, 0)), np.empty((0, 0))
+    for i in range(len(times)):
+        k = node[i]
+        dt = times[i] - seconds[k]
+        w, _ = integrate(
+            seconds[k], times[i], first[i], t, gyro, accel, b[k], intrinsics, variance, walk, True, dR, dv, dp, J, P
+        )  # fmt: skip
+        turned = mul3(R[k], dR)
+        for a in range(3):
+            rate[i, a] = w[a]
+            out_p[i, a] = p[k, a] + v[k, a] * dt
+            velocity[i, a] = v[k, a]
+            for c in range(3):
+                out_R[i, a, c] = turned[a, c]
+                out_p[i, a] += R[k, a, c] * dp[c]
+                velocity[i, a] += R[k, a, c] * dv[c]
+        out_p[i, 2] -= 0.5 * g * dt * dt
+        velocity[i, 2] -= g * dt
+
+
+@njit(cache=True, nogil=True)
+def _to_lidar(R_il, p_il, R, p, rate, velocity):
+    """From the IMU's pose, rate and velocity to the LiDAR's, in place: its twist in its own axes."""
+    for i in range(len(R)):
+        w0, w1, w2 = rate[i, 0], rate[i, 1], rate[i, 2]
+        lever = (w1 * p_il[2] - w2 * p_il[1], w2 * p_il[0] - w0 * p_il[2], w0 * p_il[1] - w1 * p_il[0])
+        moving = np.empty(3)
+        for a in range(3):
+            moving[a] = lever[a]
+            for c in range(3):
+                moving[a] += R[i, c, a] * velocity[i, c]
+                p[i, a] += R[i, a, c] * p_il[c]
+        for a in range(3):
+            rate[i, a] = R_il[0, a] * w0 + R_il[1, a] * w1 + R_il[2, a] * w2
+            velocity[i, a] = R_il[0, a] * moving[0] + R_il[1, a] * moving[1] + R_il[2, a] * moving[2]
+        turned = mul3(R[i], R_il)
+        for a in range(3):
+            for c in range(3):
+                R[i, a, c] = turned[a, c]
+
+
+@njit(cache=True, nogil=True)
+def _bin_range(start, offset_s, per_s, low, count):
+    """First bin of each scan, counted from its stamp, and how many there are."""
+    for i in range(len(start) - 1):
+        least, most = np.inf, -np.inf
+        for n in range(start[i], start[i + 1]):
+            least, most = min(least, offset_s[n]), max(most, offset_s[n])
+        empty = start[i + 1] == start[i]
+        low[i] = 0 if empty else int(np.floor(np.float64(least) * per_s))
+        count[i] = 0 if empty else int(np.floor(np.float64(most) * per_s)) - low[i] + 1
+
+
+@njit(cache=True, nogil=True)
+def _see_plane(R, p, plane, seen):
+    """seen (4,): (n . p - d, R^T n), so that seen . (1, x) is the distance of a point x in the LiDAR's frame."""
+    seen[0] = 0.0
+    for a in range(3):
+        seen[0] += plane[a] * (p[a] - plane[3 + a])
+        seen[1 + a] = R[0, a] * plane[0] + R[1, a] * plane[1] + R[2, a] * plane[2]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _add_point(x, y, z, s, seen, weights, sums):
+    """Adds one weighted point to the ten moments in row s."""
+    w = 1.0 / weights.alike
+    if weights.along > 0.0 or weights.loss:
+        across = seen[s, 1] * x + seen[s, 2] * y + seen[s, 3] * z
+        if weights.along > 0.0:
+            w = 1.0 / (weights.alike + weights.along * across * across / (x * x + y * y + z * z))
+        if weights.loss:
+            w *= weight(weights.loss, weights.scale, (seen[s, 0] + across) ** 2 * w)[0]
+    wx, wy, wz = w * x, w * y, w * z
+    sums[s, 0] += w
+    sums[s, 1] += wx
+    sums[s, 2] += wx * x
+    sums[s, 3] += wy
+    sums[s, 4] += wy * x
+    sums[s, 5] += wy * y
+    sums[s, 6] += wz
+    sums[s, 7] += wz * x
+    sums[s, 8] += wz * y
+    sums[s, 9] += wz * z
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _bin_scan(i, scans, motion, planes, weights, per_s, slot, seen, sums, count, where):
+    """Moments of scan i in the order in which its bins and planes were met; returns how many. where (m, 2): which."""
+    used, low, first, bin_s = 0, scans.low[i], scans.bins[i], 1.0 / per_s
+    slot[: scans.bins[i + 1] - first] = -1
+    for n in range(scans.start[i], scans.start[i + 1]):
+        q = scans.plane[n]
+        if q < 0:
+            continue
+        offset = np.float64(scans.offset_s[n])
+        k = int(np.floor(offset * per_s)) - low
+        b = first + k
+        if not scans.ok[b]:
+            continue
+        s = slot[k, q]
+        if s < 0:
+            s = slot[k, q] = used
+            used += 1
+            _see_plane(motion.rotation[b], motion.position[b], planes[q], seen[s])
+            sums[s] = 0.0
+            count[s] = 0
+            where[s, 0], where[s, 1] = b, q
+        dt = offset - (k + low + 0.5) * bin_s
+        h = 0.5 * dt
+        x, y, z = np.float64(scans.xyz[n, 0]), np.float64(scans.xyz[n, 1]), np.float64(scans.xyz[n, 2])
+        w0, w1, w2 = motion.rate[b, 0], motion.rate[b, 1], motion.rate[b, 2]
+        mx, my, mz = x + h * (w1 * z - w2 * y), y + h * (w2 * x - w0 * z), z + h * (w0 * y - w1 * x)
+        x += dt * (motion.velocity[b, 0] + w1 * mz - w2 * my)
+        y += dt * (motion.velocity[b, 1] + w2 * mx - w0 * mz)
+        z += dt * (motion.velocity[b, 2] + w0 * my - w1 * mx)
+        _add_point(x, y, z, s, seen, weights, sums)
+        count[s] += 1
+    return used
+
+
+@njit(cache=True, nogil=True)
+def _root_in_place(M):
+    """Moments (10,) -> their lower Cholesky factor; where a pivot is nothing but rounding, its column is 0."""
+    for j in range(4):
+        d = M[j * (j + 1) // 2 + j]
+        least = NO_PIVOT * d
+        for k in range(j):
+            d -= M[j * (j + 1) // 2 + k] ** 2
+        f = 1.0 / np.sqrt(d) if d > least else 0.0
+        M[j * (j + 1) // 2 + j] = d * f
+        for i in range(j + 1, 4):
+            s = M[i * (i + 1) // 2 + j]
+            for k in range(j):
+                s -= M[i * (i + 1) // 2 + k] * M[j * (j + 1) // 2 + k]
+            M[i * (i + 1) // 2 + j] = s * f
+
+
+@njit(cache=True, nogil=True)
+def _bin_scans(scans, motion, planes, weights, per_s, bins, plane, count, root):
+    """All scans one after the other: entries' bin, plane, count and root; returns how many."""
+    longest, total = 0, 0
+    for i in range(len(scans.start) - 1):
+        longest = max(longest, scans.bins[i + 1] - scans.bins[i])
+    n = longest * len(planes)
+    slot, seen = np.empty((longest, len(planes)), np.int32), np.empty((n, 4))
+    sums, number, where = np.empty((n, MOMENTS)), np.empty(n, np.int64), np.empty((n, 2), np.int64)
+    for i in range(len(scans.start) - 1):
+        used = _bin_scan(i, scans, motion, planes, weights, per_s, slot, seen, sums, number, where)
+        for s in range(used):
+            bins[total], plane[total], count[total] = where[s, 0], where[s, 1], number[s]
+            root[total] = sums[s]
+            _root_in_place(root[total])
+            total += 1
+    return total
+
+
+def take_moments(cloud: Associated, drive: Motion, noise: LidarNoise, bin_s: float = BIN_S) -> Moments:
+    """Moments of all points that lie on a plane, everything as `drive` has it; weights are those of its residuals.
+
+    Points at instants without IMU are left out. Scans are taken one after the other, on two threads; what is needed
+    beside the cloud is small. Raises EstimationError where no point is left.
+    """
+    groups = _groups(cloud.stream)
+    seconds, bins, *entries = zip(
+        *in_parallel(lambda g: _moments_of(cloud, drive, noise, bin_s, g), groups), strict=True
+    )
+    at, (plane, count, root) = np.concatenate(seconds), (np.concatenate(e) for e in entries)
+    if not len(root):
+        raise EstimationError(
+            f"{cloud.stream.name}: no point lies on a plane while {drive.imu.name} was running; check that the clocks "
+            "overlap, or the time_offset in the rig file."
+        )
+    before = np.cumsum([0, *(len(s) for s in seconds[:-1])])
+    bin_of = np.concatenate(bins) + np.repeat(before, [len(b) for b in bins])
+    order = np.lexsort((plane, bin_of, at[bin_of]))  # by time first: scans may overlap
+    bin_of = bin_of[order]
+    fresh = np.flatnonzero(np.diff(bin_of, prepend=-1))
+    return Moments(at[bin_of[fresh]], np.append(fresh, len(bin_of)), plane[order], count[order], root[order])
+
+
+def _groups(stream: LidarStream) -> Iterator[slice]:
+    """Scans of about the same number of points together."""
+    ends = np.searchsorted(stream.start, np.arange(0, stream.start[-1], POINTS_AT_A_TIME))
+    edges = np.unique(np.append(ends, len(stream.stamps_ns)))
+    return (slice(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True))
+
+
+def _laid_out(stream: LidarStream, plane: np.ndarray, bin_s: float, own: slice) -> tuple[_Scans, np.ndarray, slice]:
+    """Some of the scans with their bins, all usable; the bins' seconds on the LiDAR's clock; which points they are."""
+    start = stream.start[own.start : own.stop + 1]
+    points = slice(int(start[0]), int(start[-1]))
+    start, offset_s = start - start[0], stream.offset_s[points]
+    low, width = np.empty(len(start) - 1, np.int64), np.empty(len(start) - 1, np.int64)
+    _bin_range(start, offset_s, 1.0 / bin_s, low, width)
+    bins = np.concatenate([[0], np.cumsum(width)])
+    within = np.arange(bins[-1]) - np.repeat(bins[:-1] - low, width)
+    seconds = np.repeat(stream.seconds[own], width) + (within + 0.5) * bin_s
+    ok = np.ones(len(seconds), dtype=bool)
+    return _Scans(start, offset_s, stream.xyz[points], plane[points], low, bins, ok), seconds, points
+
+
+def _moments_of(
+    cloud: Associated, drive: Motion, noise: LidarNoise, bin_s: float, own: slice
+) -> tuple[np.ndarray, ...]:
+    """Of some of the scans: seconds of the bins, and of each entry bin, plane, count and root."""
+    scans, seconds, _ = _laid_out(cloud.stream, cloud.plane, bin_s, own)
+    times = seconds + drive.state.values[cloud.stream.name, "time_offset"][0]
+    scans = scans._replace(ok=usable(drive.imu, times, drive.max_gap_s))
+    motion = sweep(drive, cloud.stream.name, times)
+    weights = _Weights(noise.sigma**2, noise.beam_sigma**2, LOSSES[noise.loss], noise.loss_scale)
+    most = min(len(scans.xyz), len(seconds) * len(cloud.planes))
+    bin_of, own_plane, count = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)
+    root = np.empty((most, MOMENTS))
+    n = _bin_scans(scans, motion, cloud.planes, weights, 1.0 / bin_s, bin_of, own_plane, count, root)
+    return seconds, bin_of[:n].copy(), own_plane[:n].copy(), count[:n].copy(), root[:n].copy()
+
+
+def sweep(drive: Motion, name: str, times: np.ndarray) -> Sweep:
+    """Where LiDAR `name` is and how it moves at `times` (n,) on the IMU's clock, by the IMU's readings."""
+    state, imu = drive.state, drive.imu
+    n, node = len(times), assign_nodes("inertial", state.seconds, times)
+    R, p, rate, velocity = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
+    first = imu.interval(state.seconds[node])
+    first -= (times < state.seconds[node]) & (imu.seconds[first] == state.seconds[node]) & (first > 0)
+    chain = (state.seconds, state.rotation, state.position, state.velocity, state.bias, drive.gravity)
+    raw = (imu.seconds, imu.gyro, imu.accel)
+    _imu_at(times, node, first, chain, raw, state.values[imu.name, "intrinsics"], R, p, rate, velocity)
+    R_il, p_il = state.values[name, "rotation"], state.values[name, "translation"]
+    _to_lidar(np.ascontiguousarray(R_il), p_il, R, p, rate, velocity)
+    return Sweep(R, p, rate, velocity)
+
+
+@njit(cache=True, nogil=True)
+def _move_to_world(scans, motion, bin_s, points, seen_from):
+    """World coordinates of all points, and where the LiDAR was when it saw them."""
+    for i in range(len(scans.start) - 1):
+        for n in range(scans.start[i], scans.start[i + 1]):
+            offset = np.float64(scans.offset_s[n])
+            k = int(np.floor(offset * (1.0 / bin_s)))
+            b, dt = scans.bins[i] + k - scans.low[i], offset - (k + 0.5) * bin_s
+            x, v, w = scans.xyz[n], motion.velocity[b], motion.rate[b]
+            for a in range(3):
+                points[n, a] = seen_from[n, a] = motion.position[b, a]
+            for c in range(3):
+                d, e = (c + 1) % 3, (c + 2) % 3
+                turned = x[c] + dt * (w[d] * x[e] - w[e] * x[d])
+                for a in range(3):
+                    points[n, a] += motion.rotation[b, a, c] * (turned + dt * v[c])
+                    seen_from[n, a] += motion.rotation[b, a, c] * dt * v[c]
+
+
+def in_world(drive: Motion, stream: LidarStream, bin_s: float = BIN_S) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, 3) of a LiDAR in the world frame, float32, and where it was at their instants (N, 3), as `drive` has
+    it. Within a bin it moves with its twist; at instants without IMU as its nearest reading says."""
+    points, seen_from = np.empty((len(stream.xyz), 3), np.float32), np.empty((len(stream.xyz), 3), np.float32)
+
+    def move(own: slice) -> None:
+        scans, seconds, ends = _laid_out(stream, stream.plane, bin_s, own)
+        motion = sweep(drive, stream.name, seconds + drive.state.values[stream.name, "time_offset"][0])
+        _move_to_world(scans, motion, bin_s, points[ends], seen_from[ends])
+
+    in_parallel(move, _groups(stream))
+    return points, seen_from

@@ -1,0 +1,138 @@
+"""Points of one LiDAR on planes (paper (23)-(26)).
+
+residual = n . (p_world_lidar(t) + R_world_lidar(t) x) - d of each point x at its own instant t. Of (24) and (25) this
+is the form that keeps its sign on both sides of the plane. What a factor holds are moments of the points
+(`take_moments`), taken once a pass: robust weights, like the association with planes, stay as they are while the solver
+runs.
+
+White noise: with X the rows (1, x) of an entry's points times the roots of their weights, J^T e of white noise e, one a
+point, has the covariance A X^T X A^T. So has A L e' with L L^T = X^T X and four white numbers e', exactly; the factor's
+residuals are these four.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from icalib.estimation import lidar_kernels
+from icalib.estimation.arrowhead import Piece
+from icalib.estimation.imu_data import ImuData
+from icalib.estimation.lidar_binning import BIN_S, Associated, LidarNoise, Moments, take_moments
+from icalib.estimation.lidar_binning import Motion as ImuMotion
+from icalib.estimation.lidar_kernels import ROWS, Bins, Motion, Planes
+from icalib.estimation.poses import assign_nodes, poses_at
+from icalib.estimation.state import Key, Layout, State
+from icalib.geometry.planes import tangents
+from icalib.measurements import LidarStream
+from icalib.rig import Scheme
+
+CHUNK = 512  # bins at a time: what a chunk needs stays in the cache
+
+
+@dataclass(frozen=True)
+class LidarFactor:
+    """All scans of one LiDAR. node (n,), increasing: the node that each bin of `moments` hangs on; planes: keys of the
+    values that the rows of the moments' planes have in a state."""
+
+    name: str
+    moments: Moments
+    node: np.ndarray
+    planes: tuple[Key, ...]
+    imu: ImuData
+    gravity: float
+    scheme: Scheme
+    layout: Layout
+    n_nodes: int
+
+    @classmethod
+    def build(
+        cls,
+        stream: LidarStream,
+        plane: np.ndarray,
+        planes: tuple[Key, ...],
+        motion: ImuMotion,
+        noise: LidarNoise,
+        layout: Layout,
+        scheme: Scheme = "inertial",
+        bin_s: float = BIN_S,
+    ) -> LidarFactor:
+        """The factor of a pass that starts from `motion`. plane (N,) int32: index into `planes` of each point, -1:
+        none. Raises EstimationError where no point is left."""
+        values = np.array([motion.state.values[p] for p in planes])
+        moments = take_moments(Associated(stream, plane, values), motion, noise, bin_s)
+        times = moments.seconds + motion.state.values[stream.name, "time_offset"][0]
+        node = assign_nodes(scheme, motion.state.seconds, times)
+        n_nodes = len(motion.state.seconds)
+        return cls(stream.name, moments, node, planes, motion.imu, motion.gravity, scheme, layout, n_nodes)
+
+    @cached_property
+    def _columns(self) -> tuple[np.ndarray, np.ndarray]:
+        """Border columns that act through the pose (c,), and those of each plane (P, 3)."""
+        imu = self.layout.columns(self.imu.name, "intrinsics")
+        pose = self.layout.columns(self.name, "rotation", "translation", "time_offset")
+        return np.concatenate([pose, imu[imu >= 0]]), np.array([self.layout.block(*p).columns for p in self.planes])
+
+    def output(self) -> np.ndarray:
+        """Empty whitened residuals (E, 4) for `accumulate` to fill."""
+        return np.zeros((len(self.moments.plane), ROWS))
+
+    def accumulate(
+        self,
+        state: State,
+        piece: Piece,
+        out: np.ndarray,
+        sums: bool = True,
+        curved: bool = False,
+        noise: np.ndarray | None = None,
+    ) -> float:
+        """Fills whitened residuals `out` (E, 4) of bins whose node lies in `piece`, and adds them to its sums where
+        `sums` are wanted.
+
+        Returns half the chi^2. `curved` changes nothing: within a pass weights are constant. With `noise` (E, 4), white
+        numbers in place of the residuals, `out` stays as it is.
+        """
+        del curved
+        into, total = piece.sums(sums), 0.0
+        given = noise is not None
+        for bins, motion, planes in self._chunks(state, *self._bins_of(piece)):
+            total += lidar_kernels.accumulate(bins, motion, planes, given, noise if given else out, into, out)
+        return total
+
+    def chi2(self, out: np.ndarray) -> dict[str, tuple[int, float]]:
+        """Number and chi^2 of the points, for `evidence.Fit`; robust weights as they were taken."""
+        return {"points": (int(self.moments.count.sum()), float((out**2).sum()))}
+
+    def spent(self, noise: np.ndarray, slope: np.ndarray) -> dict[str, float]:
+        """e^T J x of white noise e (E, 4) and the residuals' derivative `slope` (E, 4) along x."""
+        return {"points": float((noise * slope).sum())}
+
+    def _chunks(self, state: State, b0: int, b1: int) -> Iterator[tuple[Bins, Motion, Planes]]:
+        """Bins b0..b1 by the chunk, with their motion and the planes."""
+        through_pose, of_plane = self._columns
+        value = np.array([state.values[p] for p in self.planes])
+        across = np.array([tangents(v[:3]) for v in value])
+        planes = Planes(value[:, :3].copy(), across, value[:, 3:].copy(), of_plane)
+        R_il = np.ascontiguousarray(state.values[self.name, "rotation"])
+        p_il, offset = state.values[self.name, "translation"], state.values[self.name, "time_offset"][0]
+        imu_free = self.layout.block(self.imu.name, "intrinsics").start is not None
+        m = self.moments
+        for a in range(b0, b1, CHUNK):
+            b = min(a + CHUNK, b1)
+            node, times = self.node[a:b], m.seconds[a:b] + offset
+            poses = poses_at(self.scheme, times, node, state, self.imu, self.gravity, imu_free)
+            R_lw = np.ascontiguousarray((poses.rotation @ R_il).transpose(0, 2, 1))
+            motion = Motion(
+                R_il, p_il, R_lw, poses.position + poses.rotation @ p_il, poses.rate, poses.velocity,
+                poses.by_node, poses.by_next, poses.by_imu, through_pose,
+            )  # fmt: skip
+            yield Bins(node, m.start[a : b + 1], m.plane, m.root), motion, planes
+
+    def _bins_of(self, piece: Piece) -> tuple[int, int]:
+        """The bins that belong to `piece`: nodes from first to before last, the chain's very last node included."""
+        stop = piece.last + 1 if piece.last == self.n_nodes - 1 else piece.last
+        b0, b1 = np.searchsorted(self.node, [piece.first, stop])
+        return int(b0), int(b1)

@@ -1,0 +1,239 @@
+"""Compiled sums of the LiDAR factor: from moments of bins to the normal equations of a piece.
+
+A bin sees a plane as four whitened residuals L^T m with L L^T the moments of its points and m . (1, x) the distance of
+a point x. Sums of their squares and derivatives are those of the points.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from icalib.estimation.corner_chain import by_imu_pose
+
+POSE, PLANE = 6, 3
+ROWS = 4  # whitened residuals of a plane in a bin
+RESIDUAL = POSE + PLANE  # the last column of an entry's Jacobian
+
+
+class Bins(NamedTuple):
+    """Bins of a piece: node (n,); entries of bin i are start[i]:start[i + 1], with plane and root as in `Moments`."""
+
+    node: np.ndarray
+    start: np.ndarray
+    plane: np.ndarray
+    root: np.ndarray
+
+
+class Planes(NamedTuple):
+    """normal (P, 3), tangents (P, 2, 3), point (P, 3) of each plane; columns (P, 3) in the border, -1 where fixed."""
+
+    normal: np.ndarray
+    tangents: np.ndarray
+    point: np.ndarray
+    columns: np.ndarray
+
+
+class Motion(NamedTuple):
+    """LiDAR in the IMU, its poses (n, ...) in the world, and of the IMU what `Poses` holds; columns (c,): those of the
+    border that act through the pose: rotation, translation, time offset, IMU intrinsics; -1 where fixed."""
+
+    R_imu_lidar: np.ndarray
+    p_imu_lidar: np.ndarray
+    R_lidar_world: np.ndarray
+    p_world_lidar: np.ndarray
+    rate: np.ndarray
+    velocity: np.ndarray
+    by_node: np.ndarray
+    by_next: np.ndarray
+    by_imu: np.ndarray
+    columns: np.ndarray
+
+
+@njit(cache=True, nogil=True)
+def _pose_chain(i, motion, T):
+    """T (6, nodes + c): LiDAR pose (right rotation, position in its axes) by the nodes, then by `motion.columns`."""
+    R_il = motion.R_imu_lidar
+    A = by_imu_pose(R_il, motion.p_imu_lidar, motion.R_lidar_world[i])
+    n_nodes = T.shape[1] - len(motion.columns)
+    for r in range(POSE):
+        for j in range(15):
+            T[r, j] = 0.0
+            for k in range(POSE):
+                T[r, j] += A[r, k] * motion.by_node[i, k, j]
+        for j in range(n_nodes - 15):
+            T[r, 15 + j] = 0.0
+            for k in range(POSE):
+                T[r, 15 + j] += A[r, k] * motion.by_next[i, k, j]
+        o = n_nodes
+        for j in range(3):
+            T[r, o + j] = 1.0 if r == j else 0.0
+            T[r, o + 3 + j] = R_il[j, r - 3] if r >= 3 else 0.0
+        T[r, o + 6] = 0.0
+        for k in range(3):
+            T[r, o + 6] += A[r, k] * motion.rate[i, k] + A[r, 3 + k] * motion.velocity[i, k]
+        for j in range(motion.by_imu.shape[2]):
+            T[r, o + 7 + j] = 0.0
+            for k in range(POSE):
+                T[r, o + 7 + j] += A[r, k] * motion.by_imu[i, k, j]
+
+
+@njit(cache=True, nogil=True)
+def _distances(R_lw, p_wl, q, planes, m):
+    """m (4,) with m . (1, x) the distance of point x, in the LiDAR's frame, from plane q."""
+    m[0] = 0.0
+    for a in range(3):
+        m[0] += planes.normal[q, a] * (p_wl[a] - planes.point[q, a])
+        m[1 + a] = 0.0
+        for b in range(3):
+            m[1 + a] += R_lw[a, b] * planes.normal[q, b]
+
+
+@njit(cache=True, nogil=True)
+def _jacobian(R_lw, p_wl, q, planes, m, A):
+    """A (10, 4): derivatives of the distance by pose (x cross a; a) and plane, and itself, as factors of (1, x).
+
+    With a = R^T n: turning the LiDAR by t moves x by t cross x, and a . (t cross x) = t . (x cross a).
+    """
+    A[:] = 0.0
+    A[0, 2], A[0, 3] = m[3], -m[2]
+    A[1, 3], A[1, 1] = m[1], -m[3]
+    A[2, 1], A[2, 2] = m[2], -m[1]
+    for a in range(3):
+        A[3 + a, 0] = m[1 + a]
+    for t in range(2):
+        for a in range(3):
+            A[POSE + t, 0] += planes.tangents[q, t, a] * (p_wl[a] - planes.point[q, a])
+            for b in range(3):
+                A[POSE + t, 1 + a] += R_lw[a, b] * planes.tangents[q, t, b]
+    A[POSE + 2, 0] = -1.0
+    for c in range(ROWS):
+        A[RESIDUAL, c] = m[c]
+
+
+@njit(cache=True, nogil=True)
+def _times_root(A, n, root, B):
+    """B (n, 4) = A L with L the lower triangle `root` (10,), row by row."""
+    for i in range(n):
+        B[i, 0] = A[i, 0] * root[0] + A[i, 1] * root[1] + A[i, 2] * root[3] + A[i, 3] * root[6]
+        B[i, 1] = A[i, 1] * root[2] + A[i, 2] * root[4] + A[i, 3] * root[7]
+        B[i, 2] = A[i, 2] * root[5] + A[i, 3] * root[8]
+        B[i, 3] = A[i, 3] * root[9]
+
+
+@njit(cache=True, nogil=True)
+def _add_plane(k, B, T, columns, own, sums, G, V):
+    """One plane in one bin: its pose part to G (6, 7), what the plane's columns `own` share in to the sums."""
+    n_b, n_nodes = sums.border.shape[0] - 1, T.shape[1] - len(columns)
+    for i in range(POSE):
+        for j in range(POSE + 1):
+            c = j if j < POSE else RESIDUAL
+            G[i, j] += B[i, 0] * B[c, 0] + B[i, 1] * B[c, 1] + B[i, 2] * B[c, 2] + B[i, 3] * B[c, 3]
+    for t in range(PLANE):
+        u = own[t]
+        if u < 0:
+            continue
+        b = B[POSE + t]
+        for i in range(POSE):
+            V[i] = B[i, 0] * b[0] + B[i, 1] * b[1] + B[i, 2] * b[2] + B[i, 3] * b[3]
+        for j in range(T.shape[1]):
+            s = 0.0
+            for i in range(POSE):
+                s += T[i, j] * V[i]
+            if j < n_nodes:
+                sums.side[k + j // 15, j % 15, u] += s
+            elif columns[j - n_nodes] >= 0:
+                sums.border[columns[j - n_nodes], u] += s
+                sums.border[u, columns[j - n_nodes]] += s
+        for c in range(PLANE + 1):
+            other = n_b if c == PLANE else own[c]
+            if other >= 0:
+                d = B[POSE + c]
+                s = b[0] * d[0] + b[1] * d[1] + b[2] * d[2] + b[3] * d[3]
+                sums.border[u, other] += s
+                if c == PLANE:
+                    sums.border[n_b, u] += s
+
+
+@njit(cache=True, nogil=True)
+def _add_row(k, i, n_nodes, row, columns, sums):
+    """Row i of a bin's sums, by nodes, border and gradient, into those of node k, the next one, or the border."""
+    n_b, n_c = sums.border.shape[0] - 1, len(columns)
+    if i < n_nodes:
+        h, r = i // 15, i % 15
+        for j in range(15):
+            sums.diagonal[k + h, r, j] += row[15 * h + j]
+        if h == 0 and n_nodes > 15:
+            for j in range(15):
+                sums.upper[k, r, j] += row[15 + j]
+        for j in range(n_c):
+            if columns[j] >= 0:
+                sums.side[k + h, r, columns[j]] += row[n_nodes + j]
+        sums.side[k + h, r, n_b] += row[n_nodes + n_c]
+        return
+    a = columns[i - n_nodes]
+    for j in range(n_c):
+        if columns[j] >= 0:
+            sums.border[a, columns[j]] += row[n_nodes + j]
+    sums.border[a, n_b] += row[n_nodes + n_c]
+    sums.border[n_b, a] += row[n_nodes + n_c]
+
+
+@njit(cache=True, nogil=True)
+def _add_pose(k, G, T, columns, sums, F, row):
+    """A bin's pose part G (6, 7) through T into nodes and border; F (6, w + 1), row (w + 1,): work space."""
+    width, n_nodes = T.shape[1], T.shape[1] - len(columns)
+    for i in range(POSE):
+        for j in range(width + 1):
+            F[i, j] = G[i, POSE] if j == width else 0.0
+        for c in range(POSE):
+            g = G[i, c]
+            for j in range(width):
+                F[i, j] += g * T[c, j]
+    for i in range(width):
+        if i >= n_nodes and columns[i - n_nodes] < 0:
+            continue
+        row[:] = 0.0
+        for c in range(POSE):
+            t = T[c, i]
+            if t != 0.0:
+                for j in range(width + 1):
+                    row[j] += t * F[c, j]
+        _add_row(k, i, n_nodes, row, columns, sums)
+
+
+@njit(cache=True, nogil=True)
+def accumulate(bins, motion, planes, given, white, sums, rows):
+    """Whitened residuals `rows` (E, 4) of all bins, and their normal equations where they are wanted.
+
+    With `given`, white (E, 4) stands for the residuals in the gradient, and `rows` stay. Returns half the chi^2.
+    """
+    wanted = len(sums.diagonal) > 0
+    T = np.empty((POSE, (30 if len(motion.by_next) else 15) + len(motion.columns)))
+    A, B, m = np.empty((RESIDUAL + 1, ROWS)), np.empty((RESIDUAL + 1, ROWS)), np.empty(ROWS)
+    G, F, V, chi2 = np.empty((POSE, POSE + 1)), np.empty((POSE, T.shape[1] + 1)), np.empty(POSE), 0.0
+    row = np.empty(T.shape[1] + 1)
+    for i in range(len(bins.node)):
+        k = bins.node[i] - sums.first
+        if wanted:
+            _pose_chain(i, motion, T)
+            G[:] = 0.0
+        for e in range(bins.start[i], bins.start[i + 1]):
+            q = bins.plane[e]
+            _distances(motion.R_lidar_world[i], motion.p_world_lidar[i], q, planes, m)
+            if not given:
+                A[0] = m
+                _times_root(A, 1, bins.root[e], rows[e : e + 1])
+                for c in range(ROWS):
+                    chi2 += rows[e, c] ** 2
+            if wanted:
+                _jacobian(motion.R_lidar_world[i], motion.p_world_lidar[i], q, planes, m, A)
+                _times_root(A, RESIDUAL + 1, bins.root[e], B)
+                if given:
+                    B[RESIDUAL] = white[e]
+                _add_plane(k, B, T, motion.columns, planes.columns[q], sums, G, V)
+        if wanted:
+            _add_pose(k, G, T, motion.columns, sums, F, row)
+    return 0.5 * chi2

@@ -1,0 +1,112 @@
+"""Which features the estimate uses, and where each begins and ends: tracks.
+
+A feature of the scene becomes one track, or several: it is cut where the chain is cut, between recordings, and where
+it was out of sight for long, because a track costs while it lives. Cutting loses what ties the parts together, and
+nothing else: each part is a point of unknown position of its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+FEWEST = 3  # observations of a track; two images of one point are met by almost any pose
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Tracks in the order of their first nodes. By camera, of each observation: track (N,), -1 where it has none; pair
+    and next_pair (N,), of its track with its node and, where its pose hangs on two, with the next.
+
+    pair_track and pair_node (E,): what each pair joins; edges (S + 1,): nodes between which tracks are cut; tracks_from
+    and pairs_from (S + 1,): the first of each stretch; start (T, 3): where each point is first looked for, in the frame
+    of the camera that saw it in the middle of its life; camera and image (T,): which that was.
+    """
+
+    track: tuple[np.ndarray, ...]
+    pair: tuple[np.ndarray, ...]
+    next_pair: tuple[np.ndarray, ...]
+    pair_track: np.ndarray
+    pair_node: np.ndarray
+    edges: np.ndarray
+    tracks_from: np.ndarray
+    pairs_from: np.ndarray
+    camera: np.ndarray
+    image: np.ndarray
+    start: np.ndarray
+
+    @property
+    def count(self) -> int:
+        return len(self.start)
+
+    def within(self, first: int, stop: int) -> tuple[slice, slice]:
+        """Tracks and pairs of nodes first..stop, both of them edges."""
+        a, b = np.searchsorted(self.edges, [first, stop])
+        return slice(*self.tracks_from[[a, b]].tolist()), slice(*self.pairs_from[[a, b]].tolist())
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """All observations, camera after camera: feature, image of the camera, and node (N,); used (N,): whether they
+    count; counts: how many of them each camera has."""
+
+    feature: np.ndarray
+    image: np.ndarray
+    node: np.ndarray
+    used: np.ndarray
+    counts: tuple[int, ...]
+
+    def labels(self, seconds: np.ndarray, edges: np.ndarray, longest_gap: float) -> np.ndarray:
+        """(N,) a number for each stretch of a feature's life, -1 for observations that do not count; `seconds` (K,) of
+        the nodes."""
+        at = np.flatnonzero(self.used)
+        order = at[np.lexsort((self.node[at], self.feature[at]))]
+        feature, node = self.feature[order], self.node[order]
+        stretch = np.searchsorted(edges, node, side="right")
+        new = np.ones(len(order), dtype=bool)
+        new[1:] = (np.diff(feature) != 0) | (np.diff(stretch) != 0) | (np.diff(seconds[node]) > longest_gap)
+        out = np.full(len(self.feature), -1)
+        out[order] = np.cumsum(new) - 1
+        return out
+
+    def in_order(self, label: np.ndarray) -> np.ndarray:
+        """(N,) the same labels, but for those with too few observations, numbered in the order of their first nodes."""
+        seen = label >= 0
+        n = int(label.max(initial=-1)) + 1
+        first = np.full(n, np.iinfo(np.int64).max)
+        np.minimum.at(first, label[seen], self.node[seen])
+        left = np.bincount(label[seen], minlength=n) >= FEWEST
+        order = np.argsort(first, kind="stable")
+        number = np.full(n + 1, -1)
+        number[order[left[order]]] = np.arange(int(left.sum()))
+        return number[label]
+
+    def tracks(self, label: np.ndarray, edges: np.ndarray, by_next: bool) -> Tracks:
+        """Of labels that are in order; where points are looked for is unknown as yet."""
+        seen, n = np.flatnonzero(label >= 0), int(label.max(initial=-1)) + 1
+        n_nodes, ends = int(edges[-1]) + 1, np.cumsum(self.counts)[:-1]
+        key = label[seen] * n_nodes + self.node[seen]
+        pairs, at = np.unique(np.concatenate([key, key + 1]) if by_next else key, return_inverse=True)
+        pair, next_pair = (np.full(len(label), -1) for _ in range(2))
+        pair[seen] = at[: len(seen)]
+        if by_next:
+            next_pair[seen] = at[len(seen) :]
+        pair_track, pair_node = np.divmod(pairs, n_nodes)
+        middle = seen[np.lexsort((self.node[seen], label[seen]))]
+        middle = middle[np.searchsorted(label[middle], np.arange(n)) + np.bincount(label[seen], minlength=n) // 2]
+        first = pair_node[np.searchsorted(pair_track, np.arange(n))]
+        tracks_from = np.searchsorted(first, edges)
+        camera = np.repeat(np.arange(len(self.counts)), self.counts)[middle]
+        own_track, own_pair, own_next = (tuple(np.split(a, ends)) for a in (label, pair, next_pair))
+        return Tracks(
+            own_track, own_pair, own_next, pair_track, pair_node, edges, tracks_from,
+            np.searchsorted(pair_track, tracks_from), camera, self.image[middle], np.zeros((n, 3)),
+        )  # fmt: skip
+
+
+_NO_NUMBERS = np.zeros(0, dtype=np.int64)
+_NO_EDGES = np.zeros(2, dtype=np.int64)
+NO_TRACKS = Tracks(
+    (), (), (), _NO_NUMBERS, _NO_NUMBERS, _NO_EDGES, _NO_EDGES, _NO_EDGES, _NO_NUMBERS, _NO_NUMBERS, np.zeros((0, 3))
+)

@@ -1,0 +1,50 @@
+"""One camera against the IMU: time offset and rotation, as far as the rig file leaves them open."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icalib.errors import EstimationError
+from icalib.estimation.imu_data import ImuData
+from icalib.first_guess.clocks import (
+    Alignment,
+    CameraRates,
+    align,
+    as_given,
+    check_axes,
+    contradicts,
+    turns_about_two_axes,
+)
+from icalib.first_guess.guess import relative_offset
+from icalib.measurements import CornerStream, Measurements
+from icalib.rig import Camera, Parameter
+
+
+def trusted(parameter: Parameter) -> np.ndarray | None:
+    """A value that what else is guessed may rest on; one that is only a place to start from may be far off."""
+    return None if parameter.mode == "free" else parameter.value
+
+
+def align_camera(
+    camera: Camera, stream: CornerStream, rates: CameraRates, imu: ImuData, measurements: Measurements
+) -> Alignment:
+    """What the motion shows; in its place what the rig trusts, and where it shows nothing what the rig guesses."""
+    given, held = camera.time_offset.value, trusted(camera.time_offset)
+    rotation = camera.rotation.value
+    try:
+        found = align(imu, camera.name, rates, None if held is None else relative_offset(held, stream, measurements))
+        if rotation is None:
+            check_axes(rates, camera.name)
+    except EstimationError:
+        if given is None:
+            raise
+        at = relative_offset(given, stream, measurements)
+        if rotation is None:
+            found = align(imu, camera.name, rates, at)
+            check_axes(rates, camera.name)
+        else:
+            found = as_given(imu, camera.name, rates, at, rotation)
+            if contradicts(imu, rates, found):
+                raise
+    keep_guess = trusted(camera.rotation) is None and turns_about_two_axes(rates)
+    return found if rotation is None or keep_guess else as_given(imu, camera.name, rates, found.offset, rotation)

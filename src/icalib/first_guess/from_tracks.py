@@ -1,0 +1,102 @@
+"""The first guess where there is no target: rotations from the gyroscope, everything else linearly from tracks.
+
+Cameras turn as the epipolar geometry of their tracks says; what the gyroscope says of the same turns gives time
+offsets, rotations and its bias. With the gyroscope's rotations the rest is linear (`track_motion`).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icalib.errors import EstimationError
+from icalib.estimation.imu_data import ImuData, imu_data
+from icalib.first_guess.align_camera import align_camera, trusted
+from icalib.first_guess.clocks import Alignment
+from icalib.first_guess.guess import CameraGuess, Guess, relative_offset
+from icalib.first_guess.gyro import GyroRotation
+from icalib.first_guess.target_poses import TargetPoses
+from icalib.first_guess.track_alignment import align_together, pairs_of
+from icalib.first_guess.track_motion import Motion, Rays, track_motion
+from icalib.first_guess.track_rotation import track_rates
+from icalib.geometry.cameras import camera_model
+from icalib.measurements import Measurements
+from icalib.rig import Camera, Rig
+
+LEAST_FELT = 0.7  # of gravity; half the time a rig is not thrown about
+
+
+def guess_from_tracks(rig: Rig, measurements: Measurements) -> Guess:
+    """Raises EstimationError, one sentence, where the tracks do not carry a guess, or intrinsics are not given."""
+    imu = imu_data(rig, measurements)
+    assert imu is not None  # tracks without an IMU are refused before
+    params = [_params(c) for c in rig.cameras]
+    aligned = [
+        align_camera(c, s, track_rates(t, camera_model(c.model), p), imu, measurements)
+        for c, s, t, p in zip(rig.cameras, measurements.cameras, measurements.tracks, params, strict=True)
+    ]
+    aligned = _aligned_together(rig, measurements, imu, params, aligned)
+    gyro = GyroRotation.integrate(imu, aligned[0].gyro_bias)
+    rays = _rays(rig, measurements, imu, params, [a.offset for a in aligned])
+    arms = [trusted(c.translation) for c in rig.cameras]
+    _check_units(imu, rig.gravity)
+    motion = track_motion(gyro, rays, [a.rotation for a in aligned], arms, rig.gravity)
+    cameras = {}
+    for k, (camera, stream, found) in enumerate(zip(rig.cameras, measurements.cameras, aligned, strict=True)):
+        given = camera.time_offset.value
+        offset = found.offset if given is None else relative_offset(given, stream, measurements)
+        R = found.rotation if camera.rotation.value is None else camera.rotation.value
+        p = motion.arms[k] if camera.translation.value is None else camera.translation.value
+        cameras[camera.name] = CameraGuess(params[k], offset, R, p, _poses(motion, stream.seconds + offset, R, p))
+    return Guess(cameras, gyro_bias=aligned[0].gyro_bias, accel_bias=motion.accel_bias, R_world_board=np.eye(3))
+
+
+def _aligned_together(
+    rig: Rig, measurements: Measurements, imu: ImuData, params: list[np.ndarray], aligned: list[Alignment]
+) -> list[Alignment]:
+    pairs = []
+    for k, (camera, stream) in enumerate(zip(rig.cameras, measurements.tracks, strict=True)):
+        pairs += pairs_of(k, stream, camera_model(camera.model), params[k])
+    held = [(trusted(c.rotation) is not None, trusted(c.time_offset) is not None) for c in rig.cameras]
+    return align_together(GyroRotation.integrate(imu, aligned[0].gyro_bias), pairs, aligned, held)
+
+
+def _check_units(imu: ImuData, gravity: float) -> None:
+    """Raises EstimationError where the accelerometer does not feel about `gravity` m/s^2."""
+    felt = float(np.median(np.linalg.norm(imu.accel, axis=1)))
+    if not LEAST_FELT < felt / gravity < 1.0 / LEAST_FELT:
+        raise EstimationError(
+            f"{imu.name} feels {felt:.3g} m/s^2 most of the time instead of about {gravity:.3g}; check that the "
+            "accelerometer is in m/s^2, not in g."
+        )
+
+
+def _params(camera: Camera) -> np.ndarray:
+    """Intrinsics and distortion as the rig file gives them; a lens without a guess starts where its model does."""
+    if camera.intrinsics.value is None:
+        raise EstimationError(
+            f"{camera.name} follows points of the scene, which do not show its intrinsics from nothing; give a guess "
+            "of intrinsics: [fx, fy, cx, cy] in the rig file."
+        )
+    distortion = camera.distortion.value
+    if distortion is None:
+        distortion = np.array(camera_model(camera.model).start_distortions[0])
+    return np.concatenate([camera.intrinsics.value, distortion])
+
+
+def _rays(rig: Rig, measurements: Measurements, imu: ImuData, params: list[np.ndarray], offsets: list[float]) -> Rays:
+    """What was seen while the IMU was running."""
+    parts = []
+    for k, (camera, stream) in enumerate(zip(rig.cameras, measurements.tracks, strict=True)):
+        direction, valid = camera_model(camera.model).unproject(params[k], stream.uv)
+        t = (stream.seconds + offsets[k])[stream.image]
+        own = valid & (t >= imu.seconds[0]) & (t <= imu.seconds[-1])
+        parts.append((t[own], np.full(int(own.sum()), k), stream.feature[own], direction[own]))
+    return Rays(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _poses(motion: Motion, times: np.ndarray, R_imu_cam: np.ndarray, p_imu_cam: np.ndarray) -> TargetPoses:
+    """A camera's poses in the world at `times` (M,)."""
+    imu = motion.gyro.imu
+    R, p = motion.poses(times)
+    inside = (times >= imu.seconds[0]) & (times <= imu.seconds[-1])
+    return TargetPoses(R @ R_imu_cam, p + R @ p_imu_cam, inside, np.zeros(len(times)))

@@ -1,0 +1,104 @@
+"""Time offsets, rotations and gyroscope bias together, from the turns of all cameras and the gyroscope's own.
+
+Over half a second or more the gyroscope's turn, seen from camera c, is R_c2_c1 = R_i_c^T R_i2_i1 R_i_c; the epipolar
+geometry of the points in both images says what left turn d it lacks (`turn_information`), and to first order
+
+    d = (R_c2_c1 - 1) theta_i_c + R_i_c^T (R_i2_i1 w_1 - w_2) dt + R_i_c^T (int R_i2_i dt) b_g
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from icalib.first_guess.clocks import Alignment
+from icalib.first_guess.gyro import GyroRotation
+from icalib.first_guess.track_rotation import FEWEST_COMMON, common, image_pairs, start_direction, turn_information
+from icalib.geometry import so3
+from icalib.geometry.cameras.base import CameraModel
+from icalib.measurements import TrackStream
+
+STEPS_S = (0.5, 1.0)
+MOST_PAIRS = 400  # of images of a camera and a step
+ROUNDS = 6
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two images of camera `camera` at t1, t2 on its clock, rays f and h (n, 3) of the points they share."""
+
+    camera: int
+    t1: float
+    t2: float
+    f: np.ndarray
+    h: np.ndarray
+
+
+def pairs_of(camera: int, stream: TrackStream, model: CameraModel, params: np.ndarray) -> list[Pair]:
+    rays, valid = model.unproject(params, stream.uv)
+    t, found = stream.seconds, []
+    for step in STEPS_S:
+        every = image_pairs(stream, step)
+        for i, j in every[:: max(1, len(every) // MOST_PAIRS)]:
+            p, q = common(stream, valid, i, j)
+            if len(p) >= FEWEST_COMMON:
+                found.append(Pair(camera, float(t[i]), float(t[j]), rays[p], rays[q]))
+    return found
+
+
+def align_together(
+    gyro: GyroRotation, pairs: list[Pair], start: list[Alignment], fixed: list[tuple[bool, bool]]
+) -> list[Alignment]:
+    """The alignments improved, the bias that of `gyro` and more, the same for all; fixed: whether the rotation and the
+    time offset of each camera are known."""
+    imu, n, bias = gyro.imu, 4 * len(start), np.mean([a.gyro_bias for a in start], axis=0)
+    held = np.array([x for r, t in fixed for x in (r, r, r, t)] + [False] * 3)
+    for _ in range(ROUNDS):
+        gyro = GyroRotation.integrate(imu, bias)
+        N, r = np.zeros((n + 3, n + 3)), np.zeros(n + 3)
+        for pair, D, w1, w2, turned in _gyro_turns(gyro, pairs, start):
+            R_ic, k = start[pair.camera].rotation, 4 * pair.camera
+            R = np.ascontiguousarray(R_ic.T @ D @ R_ic)
+            H, g = np.empty((3, 3)), np.empty(3)
+            turn_information(pair.f, pair.h, R, start_direction(pair.f, pair.h, R), H, g)
+            J = np.zeros((3, n + 3))
+            J[:, k : k + 3], J[:, k + 3], J[:, n:] = R - np.eye(3), R_ic.T @ (D @ w1 - w2), R_ic.T @ turned
+            N += J.T @ H @ J
+            r += J.T @ g
+        N[held], N[:, held], r[held] = 0.0, 0.0, 0.0
+        N[held, held] = 1.0
+        x = np.linalg.solve(N + 1e-12 * np.diag(N.diagonal()), r)
+        bias = bias + x[n:]
+        start = [
+            replace(a, offset=a.offset + x[4 * k + 3], rotation=a.rotation @ so3.exp(x[4 * k : 4 * k + 3].copy()))
+            for k, a in enumerate(start)
+        ]
+    return [replace(a, gyro_bias=bias) for a in start]
+
+
+def _gyro_turns(gyro: GyroRotation, pairs: list[Pair], start: list[Alignment]):
+    """Of each pair that the gyroscope covers R_i2_i1, the rates at both, and the integral of R_i2_i in between."""
+    imu = gyro.imu
+    offset = np.array([start[p.camera].offset for p in pairs])
+    t1, t2 = np.array([p.t1 for p in pairs]) + offset, np.array([p.t2 for p in pairs]) + offset
+    h = np.diff(imu.seconds)[:, None]
+    flat = gyro.rotation.reshape(-1, 9)
+    whole = np.concatenate([np.zeros((1, 9)), np.cumsum(0.5 * h * (flat[1:] + flat[:-1]), axis=0)])
+
+    def at(x: np.ndarray, t: np.ndarray) -> np.ndarray:
+        return np.stack([np.interp(t, imu.seconds, x[:, k]) for k in range(x.shape[1])], axis=1)
+
+    R1, R2 = gyro.at(t1), gyro.at(t2)
+    w1, w2 = at(imu.gyro, t1), at(imu.gyro, t2)
+    turned = R2.transpose(0, 2, 1) @ (at(whole, t2) - at(whole, t1)).reshape(-1, 3, 3)
+    D = R2.transpose(0, 2, 1) @ R1
+    inside = (t1 > imu.seconds[0]) & (t2 < imu.seconds[-1])
+    bias = gyro_bias_of(gyro)
+    for i in np.flatnonzero(inside):
+        yield pairs[i], D[i], w1[i] - bias, w2[i] - bias, turned[i]
+
+
+def gyro_bias_of(gyro: GyroRotation) -> np.ndarray:
+    """(3,) the bias that `gyro` was integrated with."""
+    return 0.5 * (gyro.imu.gyro[0] + gyro.imu.gyro[1]) - gyro.rate[0]

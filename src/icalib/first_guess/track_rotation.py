@@ -1,0 +1,183 @@
+"""How a camera turned from image to image, from the points that it followed: epipolar geometry, no guess needed."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from icalib.errors import EstimationError
+from icalib.first_guess.clocks import CameraRates
+from icalib.geometry import so3
+from icalib.geometry.cameras.base import CameraModel
+from icalib.geometry.small import solve_definite
+from icalib.measurements import TrackStream
+
+FEWEST_COMMON = 12  # points in two images
+FEWEST_RATES = 20
+LEAST_CORRELATION = 0.5  # with the IMU's rates; these here are noisy
+ROUNDS = 10
+DIRECTION_ROUNDS = 4
+STEP_S = 0.4  # between images: over less, turning and moving sideways look alike
+DAMPING = 1e-9  # of the mean diagonal: a camera that does not move has no direction of motion
+
+
+@njit(cache=True, nogil=True)
+def _across(t, a, b):
+    """Two unit vectors at right angles to t."""
+    k = 0
+    for i in range(3):
+        if abs(t[i]) < abs(t[k]):
+            k = i
+    a[:] = 0.0
+    a[k] = 1.0
+    along = t[k]
+    for i in range(3):
+        a[i] -= along * t[i]
+    n = np.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
+    for i in range(3):
+        a[i] /= n
+    b[0], b[1], b[2] = t[1] * a[2] - t[2] * a[1], t[2] * a[0] - t[0] * a[2], t[0] * a[1] - t[1] * a[0]
+
+
+@njit(cache=True, nogil=True)
+def _epipolar_sums(f, h, R, t, a, b, A, x):
+    """A (5, 5) and x (5,): normal equations of a left turn of R, and of t along a and b, for e = t . (R f x h) by its
+    own standard deviation, Cauchy's weights of the median error."""
+    n = len(f)
+    g, c, e, spread, row = np.empty((n, 3)), np.empty((n, 3)), np.empty(n), np.empty(n), np.empty(5)
+    for i in range(n):
+        for r in range(3):
+            g[i, r] = R[r, 0] * f[i, 0] + R[r, 1] * f[i, 1] + R[r, 2] * f[i, 2]
+        c[i, 0] = g[i, 1] * h[i, 2] - g[i, 2] * h[i, 1]
+        c[i, 1] = g[i, 2] * h[i, 0] - g[i, 0] * h[i, 2]
+        c[i, 2] = g[i, 0] * h[i, 1] - g[i, 1] * h[i, 0]
+        tg = t[0] * g[i, 0] + t[1] * g[i, 1] + t[2] * g[i, 2]
+        th = t[0] * h[i, 0] + t[1] * h[i, 1] + t[2] * h[i, 2]
+        spread[i] = np.sqrt(max(2.0 - tg * tg - th * th, 1e-4))
+        e[i] = (t[0] * c[i, 0] + t[1] * c[i, 1] + t[2] * c[i, 2]) / spread[i]
+    scale = 3.0 * np.median(np.abs(e)) + 1e-12
+    _across(t, a, b)
+    A[:] = 0.0
+    x[:] = 0.0
+    for i in range(n):
+        m0, m1 = h[i, 1] * t[2] - h[i, 2] * t[1], h[i, 2] * t[0] - h[i, 0] * t[2]
+        m2 = h[i, 0] * t[1] - h[i, 1] * t[0]
+        row[0], row[1] = g[i, 1] * m2 - g[i, 2] * m1, g[i, 2] * m0 - g[i, 0] * m2
+        row[2] = g[i, 0] * m1 - g[i, 1] * m0
+        row[3] = a[0] * c[i, 0] + a[1] * c[i, 1] + a[2] * c[i, 2]
+        row[4] = b[0] * c[i, 0] + b[1] * c[i, 1] + b[2] * c[i, 2]
+        w = 1.0 / (1.0 + (e[i] / scale) ** 2)
+        for r in range(5):
+            row[r] /= spread[i]
+            x[r] -= w * row[r] * e[i]
+            for k in range(r + 1):
+                A[r, k] += w * row[r] * row[k]
+    for r in range(5):
+        for k in range(r):
+            A[k, r] = A[r, k]
+
+
+@njit(cache=True, nogil=True)
+def _move_direction(t, a, b, da, db):
+    """t turned by da along a and db along b, half a radian at most."""
+    size = np.sqrt(da * da + db * db)
+    shorter = 0.5 / size if size > 0.5 else 1.0
+    for r in range(3):
+        t[r] += shorter * (da * a[r] + db * b[r])
+    norm = np.sqrt(t[0] * t[0] + t[1] * t[1] + t[2] * t[2])
+    for r in range(3):
+        t[r] /= norm
+
+
+@njit(cache=True, nogil=True)
+def turn_between(f, h, R, t):
+    """R and t (unit), improved: rays f (n, 3) and h (n, 3) of the same points in two images lie in planes with t,
+    h ~ R f + s t. False where that is singular."""
+    a, b, A, x = np.empty(3), np.empty(3), np.empty((5, 5)), np.empty(5)
+    for _ in range(ROUNDS):
+        _epipolar_sums(f, h, R, t, a, b, A, x)
+        mean = DAMPING * (A[0, 0] + A[1, 1] + A[2, 2])
+        for r in range(5):
+            A[r, r] += mean
+        if not solve_definite(A, x):
+            return False
+        R[:] = so3.exp(x[:3].copy()) @ R
+        _move_direction(t, a, b, x[3], x[4])
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _direction_step(A, x, y):
+    """Solves the part of A (5, 5) that belongs to the direction for (x, y)."""
+    mean = DAMPING * (A[0, 0] + A[1, 1] + A[2, 2])
+    p, q, r = A[3, 3] + mean, A[3, 4], A[4, 4] + mean
+    inverse = 1.0 / (p * r - q * q)
+    return inverse * (r * x - q * y), inverse * (p * y - q * x)
+
+
+@njit(cache=True, nogil=True)
+def turn_information(f, h, R, t, H, g):
+    """H (3, 3) and g (3,): what two images say of a left turn of R, and what step they ask for, H step = g; the
+    direction of motion t is found on the way."""
+    a, b, A, x = np.empty(3), np.empty(3), np.empty((5, 5)), np.empty(5)
+    for _ in range(DIRECTION_ROUNDS):
+        _epipolar_sums(f, h, R, t, a, b, A, x)
+        u, v = _direction_step(A, x[3], x[4])
+        _move_direction(t, a, b, u, v)
+    _epipolar_sums(f, h, R, t, a, b, A, x)
+    for i in range(3):
+        u, v = _direction_step(A, A[3, i], A[4, i])
+        g[i] = x[i] - u * x[3] - v * x[4]
+        for k in range(3):
+            H[i, k] = A[i, k] - u * A[3, k] - v * A[4, k]
+
+
+def _start(f: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The turn that brings rays f nearest to h, and the direction of motion that is left."""
+    U, _, Vt = np.linalg.svd(h.T @ f)
+    R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    return np.ascontiguousarray(R), start_direction(f, h, R)
+
+
+def track_rates(stream: TrackStream, model: CameraModel, params: np.ndarray) -> CameraRates:
+    """Mean angular rates from each image to the one about STEP_S later. Raises EstimationError where hardly any images
+    share enough points."""
+    rays, valid = model.unproject(params, stream.uv)
+    t, found = stream.seconds, []
+    for i, j in image_pairs(stream, STEP_S):
+        p, q = common(stream, valid, i, j)
+        if len(p) < FEWEST_COMMON:
+            continue
+        f, h = rays[p], rays[q]
+        R, direction = _start(f, h)
+        if turn_between(f, h, R, direction):
+            found.append((t[i], t[j], *(-so3.log(R) / (t[j] - t[i]))))
+    if len(found) < FEWEST_RATES:
+        raise EstimationError(
+            f"{stream.name}: only {len(found)} pairs of images {STEP_S} s apart share {FEWEST_COMMON} points or more; "
+            "record for longer, or follow more points for longer."
+        )
+    rows = np.array(found)
+    return CameraRates(rows[:, 0].copy(), rows[:, 1].copy(), rows[:, 2:].copy(), LEAST_CORRELATION)
+
+
+def image_pairs(stream: TrackStream, step: float) -> list[tuple[int, int]]:
+    """Each image and the one about `step` seconds later."""
+    t = stream.seconds
+    after = np.searchsorted(t, t + step - 0.5 * float(np.median(np.diff(t))))
+    return [(i, int(j)) for i, j in enumerate(after) if i < j < len(t)]
+
+
+def common(stream: TrackStream, valid: np.ndarray, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of the points that images i and j share, as i and as j saw them."""
+    own, after = (slice(stream.start[k], stream.start[k + 1]) for k in (i, j))
+    _, p, q = np.intersect1d(stream.feature[own], stream.feature[after], return_indices=True)
+    p, q = p + own.start, q + after.start
+    seen = valid[p] & valid[q]
+    return p[seen], q[seen]
+
+
+def start_direction(f: np.ndarray, h: np.ndarray, R: np.ndarray) -> np.ndarray:
+    """(3,) the direction of motion that rays f and h leave once turned by R."""
+    normals = np.cross(f @ R.T, h)
+    return np.linalg.eigh(normals.T @ normals)[1][:, 0].copy()

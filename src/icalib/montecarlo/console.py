@@ -1,0 +1,56 @@
+"""A study for the terminal."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from icalib.montecarlo.study import Study
+from icalib.montecarlo.summary import Consistency
+from icalib.montecarlo.words import HEADERS, NUMBERS, answer, block_row, failures_words, nees_cells
+
+MOST_FAILURES = 10
+
+
+def print_study(study: Study, folder: Path) -> None:
+    """The table of blocks, failed runs, and where the files are, on standard output."""
+    console, found = Console(), study.consistency
+    console.print(table(found))
+    for line in (answer(found), *_failures(found), *_undetermined(found)):
+        console.print(line, markup=False)
+    seconds = [r.seconds for r in study.records]
+    console.print(f"A run took {np.median(seconds):.1f} s (median).", markup=False)
+    console.print(f"Wrote {folder / 'consistency.json'}, consistency.html.", markup=False)
+
+
+def table(found: Consistency) -> Table:
+    """One row for each block, and one for all together; outside its bounds the NEES is red."""
+    out = Table(title="Consistency", title_justify="left", caption_justify="left", box=SIMPLE_HEAD, padding=0)
+    out.caption = "NEES: per degree of freedom, 1 where the covariance is honest. Undetermined entries do not count."
+    for header in HEADERS:
+        out.add_column(header, justify="right" if header in NUMBERS else "left", no_wrap=header not in HEADERS[-1:])
+    for block in found.blocks:
+        cells = [Text(cell) for cell in block_row(block)]
+        if block.nees is not None:
+            cells[3].stylize("green" if block.nees.consistent else "bold red")
+        out.add_row(*cells)
+    if found.whole is not None:
+        out.add_section()
+        out.add_row("all together", "", "", *nees_cells(found.whole))
+    return out
+
+
+def _failures(found: Consistency) -> list[str]:
+    lines = [failures_words(found)]
+    lines += [f"  seed {f.seed}: {f.sentence}" for f in found.failures[:MOST_FAILURES]]
+    more = len(found.failures) - MOST_FAILURES
+    return lines + ([f"  and {more} more, in consistency.json"] if more > 0 else [])
+
+
+def _undetermined(found: Consistency) -> list[str]:
+    return [f"Undetermined in {n} runs: {what}" for what, n in found.undetermined.items()]

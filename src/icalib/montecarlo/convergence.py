@@ -1,0 +1,133 @@
+"""Error of each calibration parameter against the solver's iterations with its 3 sigma bound, as in the paper's Figures
+2 and 3; on logarithmic axes, since an error falls from degrees to thousandths of them."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.extras import load_matplotlib
+from icalib.montecarlo.record import Block, Record
+from icalib.report.plot import COLORS, Figure, axis, figure, line
+from icalib.report.quantities import SHOWN_UNITS
+
+MOST_RUNS = 6
+SIGMAS = 3.0
+_PANEL_INCHES = (2.6, 1.9)
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One parameter in one run: |error| (k,) and 3 sigma (k,) at the solver's iterations, in the unit that is shown."""
+
+    seed: int
+    error: np.ndarray
+    bound: np.ndarray
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One parameter in several runs."""
+
+    title: str
+    unit: str
+    curves: tuple[Curve, ...]
+
+
+@dataclass(frozen=True)
+class Row:
+    """The panels of one block."""
+
+    key: str
+    panels: tuple[Panel, ...]
+
+
+def rows(records: Sequence[Record]) -> tuple[Row, ...]:
+    """Of the first runs that did not fail: all sensors, of cameras the first alone, as in the paper."""
+    runs = [r for r in sorted(records, key=lambda r: r.seed) if not r.failure][:MOST_RUNS]
+    blocks = {b.key: b for r in runs for b in r.blocks}
+    lenses = [b.sensor for b in blocks.values() if b.name == "distortion"]
+    return tuple(_row(runs, b) for b in blocks.values() if b.sensor not in lenses[1:])
+
+
+def _row(runs: Sequence[Record], block: Block) -> Row:
+    unit, scale = SHOWN_UNITS.get(block.unit, (block.unit, 1.0))
+    panels = []
+    for k, label in enumerate(block.labels):
+        curves = tuple(_curve(r, int(r.columns(block.key)[k]), scale) for r in runs if len(r.columns(block.key)))
+        own = [b.verdict[k] for r in runs for b in r.blocks if b.key == block.key]
+        times = own.count("undetermined")
+        words = f" (undetermined in {times} of {len(own)})" if times else ""
+        name = block.name if label == block.name else f"{block.name} {label}"
+        panels.append(Panel(f"{block.sensor} {name}{words}".replace("_", " "), unit, curves))
+    return Row(block.key, tuple(panels))
+
+
+def _curve(record: Record, column: int, scale: float) -> Curve:
+    """Where a parameter is held at the guess, iterations say nothing of how well it is known: the result does."""
+    verdicts = [v for b in record.blocks for v in b.verdict]
+    error = np.array([w.error[column] for w in record.path])
+    sigma = np.array([w.std[column] for w in record.path])
+    if verdicts[column] == "undetermined":
+        sigma = np.full(len(error), np.sqrt(record.covariance[column, column]))
+    return Curve(record.seed, scale * np.abs(error), scale * SIGMAS * sigma)
+
+
+def plotly_figure(row: Row) -> Figure:
+    """The panels of a block side by side."""
+    n, gap, traces, layout = len(row.panels), 0.08, [], {}
+    width = (1.0 - gap * (n - 1)) / n
+    for i, panel in enumerate(row.panels):
+        number = "" if i == 0 else str(i + 1)
+        left = i * (width + gap)
+        layout[f"xaxis{number}"] = axis("iteration", domain=[left, left + width], anchor=f"y{number}")
+        layout[f"yaxis{number}"] = axis(_words(panel), type="log", anchor=f"x{number}")
+        axes = {"xaxis": f"x{number}", "yaxis": f"y{number}"}
+        for k, curve in enumerate(panel.curves):
+            own = axes | {"legendgroup": str(curve.seed), "showlegend": i == 0}
+            x, color = np.arange(len(curve.error)), COLORS[k % len(COLORS)]
+            dashed = {"line": {"color": color, "width": 1, "dash": "dash"}, "showlegend": False}
+            traces.append(line(x, _positive(curve.error), f"seed {curve.seed}", color, **own))
+            traces.append(line(x, _positive(curve.bound), f"3 sigma, seed {curve.seed}", color, **(own | dashed)))
+    return figure(traces, height=300, **layout)
+
+
+def png(rows: Sequence[Row], title: str) -> bytes:
+    """All blocks as one picture, a row each. Raises RecordingError where matplotlib is not installed."""
+    columns = max(len(r.panels) for r in rows)
+    size = (_PANEL_INCHES[0] * columns, _PANEL_INCHES[1] * len(rows) + 0.6)
+    sheet = load_matplotlib().Figure(figsize=size, layout="constrained")
+    sheet.suptitle(f"{title}: error and 3 sigma (dashed) against iterations", fontsize=10)
+    grid = sheet.subplots(len(rows), columns, squeeze=False)
+    for places, row in zip(grid, rows, strict=True):
+        for place in places[len(row.panels) :]:
+            place.set_visible(False)
+        for place, panel in zip(places, row.panels, strict=False):
+            _draw(place, panel)
+    out = io.BytesIO()
+    sheet.savefig(out, format="png", dpi=130)
+    return out.getvalue()
+
+
+def _draw(place, panel: Panel) -> None:
+    for k, curve in enumerate(panel.curves):
+        color = COLORS[k % len(COLORS)]
+        place.semilogy(_positive(curve.error), color=color, linewidth=1.0)
+        place.semilogy(_positive(curve.bound), color=color, linewidth=0.7, linestyle="--")
+    place.set_title(panel.title, fontsize=7)
+    place.set_ylabel(f"|error| [{panel.unit}]" if panel.unit else "|error|", fontsize=6)
+    place.tick_params(labelsize=6)
+    place.xaxis.get_major_locator().set_params(integer=True)
+    place.grid(True, color="#e5e7eb")
+
+
+def _words(panel: Panel) -> str:
+    return f"{panel.title} [{panel.unit}]" if panel.unit else panel.title
+
+
+def _positive(values: np.ndarray) -> np.ndarray:
+    """What a logarithmic axis can show."""
+    return np.where(values > 0.0, values, np.nan)

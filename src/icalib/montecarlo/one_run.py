@@ -1,0 +1,100 @@
+"""One run: simulate, calibrate, compare with the truth. Whatever goes wrong in it becomes part of its record."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from icalib.calibration import Calibration, Visited
+from icalib.errors import CalibrationError
+from icalib.montecarlo.record import Block, Record, Size, Waypoint
+from icalib.montecarlo.truth import error, true_value
+from icalib.montecarlo.whiteness import whiteness
+from icalib.pipeline import calibrate_measurements
+from icalib.simulation import Scenario, Truth, rig_for, simulate, with_drawn_guess
+
+GuessKind = Literal["none", "drawn"]
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """What a run is made from. guess: the program finds its own, or starts from one drawn about the truth."""
+
+    scenario: Scenario
+    seed: int
+    guess: GuessKind = "none"
+
+
+def run(task: Task) -> Record:
+    """Extrinsics, time offsets, intrinsics and distortions are estimated. The same task gives the same record, but for
+    the seconds that it took."""
+    started, visits = time.perf_counter(), list[Visited]()
+    try:
+        simulation = simulate(task.scenario, task.seed)
+        rig = rig_for(task.scenario, intrinsics="free", distortion="free")
+        if task.guess == "drawn":
+            rig = with_drawn_guess(rig, task.scenario, task.seed)
+        result = calibrate_measurements(rig, simulation.measurements, on_visit=visits.append)
+    except CalibrationError as caught:
+        return Record(task.seed, str(caught), time.perf_counter() - started, program())
+    except Exception as caught:  # a fault of the program must not end a study of a thousand runs, nor be lost in it
+        sentence = f"the program failed ({type(caught).__name__}: {caught}); this is a fault of icalib."
+        return Record(task.seed, sentence, time.perf_counter() - started, program())
+    return compare(task.seed, result, simulation.truth, visits, time.perf_counter() - started)
+
+
+def compare(seed: int, result: Calibration, truth: Truth, visits: list[Visited], seconds: float) -> Record:
+    """The record of a run that reached a result."""
+    blocks, errors, columns = [], [np.empty(0)], list[int]()
+    for g in result.groups:
+        true = true_value(truth, g.sensor, g.name)
+        if g.columns is not None and true is not None:
+            blocks.append(Block(g.sensor, g.name, g.labels, g.unit, g.verdict))
+            errors.append(error(g.name, g.value, true))
+            columns += g.columns
+    return Record(
+        seed,
+        "" if result.converged else f"the solver did not converge: {result.status}",
+        seconds,
+        program(),
+        tuple(blocks),
+        np.concatenate(errors),
+        result.covariance[np.ix_(columns, columns)],
+        result.undetermined,
+        tuple(Size(f.sensor, f.kind, f.count, f.dof, f.chi2) for f in result.fits),
+        whiteness(result),
+        _path(tuple(blocks), truth, visits),
+    )
+
+
+def _path(blocks: tuple[Block, ...], truth: Truth, visits: list[Visited]) -> tuple[Waypoint, ...]:
+    """From the guess that the answer was found from: what is undetermined is held there, and all estimated anew."""
+    stages = [v.stage for v in visits]
+    begins = [k for k, stage in enumerate(stages) if k == 0 or (stage == stages[0] and stages[k - 1] != stage)]
+    return tuple(_waypoint(blocks, truth, v) for v in visits[begins[-1] :]) if visits else ()
+
+
+def _waypoint(blocks: tuple[Block, ...], truth: Truth, visit: Visited) -> Waypoint:
+    errors, deviations = [np.empty(0)], [np.empty(0)]
+    for b in blocks:
+        true = true_value(truth, b.sensor, b.name)
+        assert true is not None  # `compare` sees to it
+        errors.append(error(b.name, visit.values[b.sensor, b.name], true))
+        deviations.append(visit.std[b.sensor, b.name])
+    return Waypoint(visit.stage, np.concatenate(errors), np.concatenate(deviations))
+
+
+@cache
+def program() -> str:
+    """Digest of icalib's own source: runs of two versions, released or not, must not be mixed."""
+    digest = hashlib.sha256()
+    root = Path(__file__).parents[1]
+    for file in sorted(root.rglob("*.py")):
+        digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()[:16]

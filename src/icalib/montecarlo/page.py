@@ -1,0 +1,109 @@
+"""`consistency.html`: a study as one file without network."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from string import Template
+
+import numpy as np
+
+from icalib.montecarlo.record import Record
+from icalib.montecarlo.statistics import Nees
+from icalib.montecarlo.store import Identity
+from icalib.montecarlo.summary import Consistency
+from icalib.montecarlo.words import (
+    HEADERS,
+    NUMBERS,
+    answer,
+    block_row,
+    chance_words,
+    failures_words,
+    mean_cells,
+    nees_cells,
+    verdict_words,
+)
+from icalib.report.page import resource, script_json
+from icalib.report.plot import COLORS, Figure, axis, figure, numbers
+from icalib.report.tables import Html, element, html, sentences, table
+
+MEAN = ("sensor", "kind", "mean over runs")
+
+
+def study_html(found: Consistency, identity: Identity, records: Sequence[Record]) -> str:
+    """The whole page; `records` for the NEES of each run."""
+    sections = [
+        element("h2", "Blocks"), blocks_table(found),
+        element("p", "Sampled / predicted: square roots of the least and the largest eigenvalue of the sampled against "
+                "the predicted covariance; by chance: where these lie in 95 of 100 studies of an honest covariance."),
+        element("h2", "Mean NEES"), plot_place("nees"),
+        element("h2", "Failed runs"), element("p", failures_words(found)),
+        failures(found),
+        element("h2", "Residuals"), _residuals(found),
+        element("h2", "Made from"), table(("what", "value"), _facts(identity, records)),
+    ]  # fmt: skip
+    if found.undetermined:
+        open_ones = [f"{n} runs: {what}" for what, n in found.undetermined.items()]
+        sections[4:4] = [element("h2", "Undetermined"), sentences(open_ones, "care", "None.")]
+    return page(f"Consistency, {identity.scenario}", answer(found), sections, {"nees": nees_figure(found)})
+
+
+def page(title: str, summary: str, sections: Sequence[Html], figures: dict[str, Figure]) -> str:
+    """A document in the style of the reports."""
+    return Template(resource("icalib.montecarlo", "page.html")).substitute(
+        title=html(title), answer=html(summary), sections="".join(sections), figures=script_json(figures),
+        css=resource("icalib.report", "page.css"), plotly=resource("plotly", "package_data/plotly.min.js"),
+    )  # fmt: skip
+
+
+def plot_place(name: str) -> Html:
+    """Where the figure `name` is drawn."""
+    return Html(f'<div class="plot" id="{name}"></div>')
+
+
+def failures(found: Consistency) -> Html:
+    """Every failed run with its sentence."""
+    return sentences([f"seed {f.seed}: {f.sentence}" for f in found.failures], "bad", "")
+
+
+def blocks_table(found: Consistency) -> Html:
+    headers = (*HEADERS, "by chance", "verdicts")
+    body: list[tuple[str, ...]] = [(*block_row(b), chance_words(b.spread), verdict_words(b)) for b in found.blocks]
+    if found.whole is not None:
+        body.append(("all together", "", "", *nees_cells(found.whole), *[""] * (len(headers) - 5)))
+    return table(headers, body, NUMBERS)
+
+
+def nees_figure(found: Consistency) -> Figure:
+    """Mean NEES of each block with the bounds within which it lies by chance."""
+    known: list[tuple[str, Nees]] = [(b.key, b.nees) for b in found.blocks if b.nees is not None]
+    names = [name for name, _ in known]
+    middle = np.array([0.5 * (n.low + n.high) for _, n in known])
+    half = np.array([0.5 * (n.high - n.low) for _, n in known])
+    bounds = {
+        "type": "scatter", "mode": "markers", "x": names, "y": numbers(middle), "name": "95 % bounds",
+        "marker": {"opacity": 0}, "error_y": {"array": numbers(half), "color": "#94a3b8", "thickness": 6, "width": 0},
+    }  # fmt: skip
+    means = {
+        "type": "scatter", "mode": "markers", "x": names, "y": numbers(np.array([n.mean for _, n in known])),
+        "name": "mean NEES", "marker": {"color": COLORS[0], "size": 8},
+    }  # fmt: skip
+    return figure([bounds, means], xaxis=axis("", automargin=True), yaxis=axis("NEES per degree of freedom"))
+
+
+def _residuals(found: Consistency) -> Html:
+    sizes = [element("h3", "chi2 per post-fit degree of freedom"), table(MEAN, map(mean_cells, found.sizes))]
+    lags = [element("h3", "Correlation with the next in time"), table(MEAN, map(mean_cells, found.lag1))]
+    return element("div", [element("section", sizes), element("section", lags)], "grid")
+
+
+def _facts(identity: Identity, records: Sequence[Record]) -> list[tuple[str, object]]:
+    seconds = float(np.median([r.seconds for r in records]))
+    return [
+        ("scenario", identity.scenario),
+        ("sha256", element("code", identity.scenario_sha256)),
+        ("first guess", identity.guess),
+        ("seeds", f"{records[0].seed} to {records[-1].seed}"),
+        ("time of a run", f"{seconds:.1f} s (median)"),
+        ("program", element("code", identity.program)),
+        *identity.versions.items(),
+    ]

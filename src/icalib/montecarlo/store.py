@@ -1,0 +1,107 @@
+"""The folder of a study: one file for each run, whole or not there, and what the runs were made from."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from icalib.errors import CalibrationError
+from icalib.montecarlo.one_run import GuessKind, program
+from icalib.montecarlo.record import Record, from_json, to_json
+from icalib.provenance import versions
+
+STUDY, RUNS = "study.json", "runs"
+
+
+@dataclass(frozen=True)
+class Identity:
+    """What all runs of a folder have in common. scenario_sha256: of the scenario file, and of the motion it names."""
+
+    scenario: str
+    scenario_sha256: str
+    guess: GuessKind
+    program: str
+    versions: dict[str, str]
+
+    @classmethod
+    def of(cls, scenario: str, scenario_sha256: str, guess: GuessKind) -> Identity:
+        """With the program that runs now."""
+        return cls(scenario, scenario_sha256, guess, program(), versions())
+
+
+_CHANGED = {
+    "scenario_sha256": "the scenario changed",
+    "guess": "their first guess is another",
+    "program": "icalib changed",
+    "versions": "Python or a library changed",
+}
+
+
+class Store:
+    """Runs by seed in a folder. Raises CalibrationError where it holds another study's, or cannot be written."""
+
+    def __init__(self, folder: Path, identity: Identity) -> None:
+        self.folder, self.identity = folder, identity
+        try:
+            (folder / RUNS).mkdir(parents=True, exist_ok=True)
+            if (folder / STUDY).exists():
+                self._check()
+            else:
+                write_whole(folder / STUDY, json.dumps(asdict(identity), indent=1).encode())
+        except OSError as error:
+            raise CalibrationError(
+                f"{folder} cannot be written ({error.strerror or error}); choose another folder."
+            ) from error
+
+    def __contains__(self, seed: int) -> bool:
+        return self._file(seed).exists()
+
+    def add(self, record: Record) -> None:
+        """Raises CalibrationError where the worker ran another icalib, or the file cannot be written."""
+        if record.program != self.identity.program:
+            raise CalibrationError(
+                "a worker of the cluster runs another version of icalib than this one; install the same everywhere."
+            )
+        write_whole(self._file(record.seed), to_json(record))
+
+    def read(self, seed: int) -> Record:
+        """Raises CalibrationError where the file is damaged."""
+        path = self._file(seed)
+        try:
+            return from_json(path.read_bytes())
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise CalibrationError(f"{path} is damaged; delete it, and the run will be made again.") from error
+
+    def _file(self, seed: int) -> Path:
+        return self.folder / RUNS / f"{seed:06d}.json"
+
+    def _check(self) -> None:
+        path = self.folder / STUDY
+        try:
+            found = json.loads(path.read_bytes())
+            changed = [words for name, words in _CHANGED.items() if found[name] != getattr(self.identity, name)]
+        except (ValueError, KeyError, TypeError) as error:
+            raise CalibrationError(f"{path} is damaged; choose another folder.") from error
+        if changed:
+            why = ", ".join(changed)
+            raise CalibrationError(
+                f"{self.folder} holds runs of another study ({why}); choose another folder, or delete it."
+            )
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Writes the file at once: whoever looks finds the old one or the new one. Raises CalibrationError."""
+    part = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with part.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise CalibrationError(
+            f"{path} cannot be written ({error.strerror or error}); choose another folder."
+        ) from error

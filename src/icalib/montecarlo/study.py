@@ -1,0 +1,113 @@
+"""A study: many runs of one scenario, resumed where it was left, and what they say together. This page is all of it."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from icalib.errors import CalibrationError
+from icalib.montecarlo.one_run import GuessKind, Task
+from icalib.montecarlo.page import study_html
+from icalib.montecarlo.record import Record
+from icalib.montecarlo.store import Identity, Store, write_whole
+from icalib.montecarlo.summary import Consistency, consistency_json, summarise
+from icalib.montecarlo.workers import run_all
+from icalib.simulation import Drive, Scenario, load_scenario
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How many runs, from which seed on (the scenario's where None), from which guess, and who makes them.
+
+    workers: processes on this machine, one for each core where None; scheduler: address of a Dask cluster instead.
+    """
+
+    runs: int
+    seed: int | None = None
+    guess: GuessKind = "none"
+    workers: int | None = None
+    scheduler: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.runs < 1:
+            raise CalibrationError(f"a study needs at least 1 run, but {self.runs} were asked for.")
+        if self.workers is not None and self.workers < 1:
+            raise CalibrationError(f"a study needs at least 1 worker, but {self.workers} were asked for.")
+        if self.workers is not None and self.scheduler is not None:
+            raise CalibrationError("a cluster has its own number of workers; give workers or a scheduler, not both.")
+
+
+@dataclass(frozen=True)
+class Study:
+    """The records of all runs in the order of their seeds, and their summary."""
+
+    identity: Identity
+    records: tuple[Record, ...]
+    consistency: Consistency
+
+
+def run_file(path: str | Path, output: str | Path, plan: Plan, progress: Progress = lambda *_: None) -> Study:
+    """`run_study` of a scenario file. Raises RigError too, where the file is wrong."""
+    scenario = load_scenario(path)
+    return run_study(scenario, str(path), scenario_digest(path, scenario), Path(output), plan, progress)
+
+
+def run_study(
+    scenario: Scenario, name: str, digest: str, output: Path, plan: Plan, progress: Progress = lambda *_: None
+) -> Study:
+    """Makes the runs that `output` does not hold yet, and writes consistency.json and consistency.html there.
+
+    digest: of all that the scenario is made from. Raises CalibrationError where the folder holds another study's runs,
+    cannot be written, or no cluster answers; KeyboardInterrupt with a sentence on what was reached.
+    """
+    store = Store(output, Identity.of(name, digest, plan.guess))
+    first = scenario.seed if plan.seed is None else plan.seed
+    seeds = range(first, first + plan.runs)
+    lost = _fill(store, scenario, seeds, plan, progress)
+    records = tuple(lost[seed] if seed in lost else store.read(seed) for seed in seeds)
+    study = Study(store.identity, records, summarise(records))
+    about = asdict(store.identity) | {"first_seed": first}
+    write_whole(output / "consistency.json", consistency_json(study.consistency, about))
+    write_whole(output / "consistency.html", study_html(study.consistency, study.identity, records).encode())
+    return study
+
+
+def scenario_digest(path: str | Path, scenario: Scenario) -> str:
+    """sha256 of the file, and of that of the motion which it names."""
+    digest = hashlib.sha256(Path(path).read_bytes())
+    if isinstance(scenario.motion, Drive) and scenario.motion.path is not None:
+        digest.update(scenario.motion.path.read_bytes())
+    return digest.hexdigest()
+
+
+def _fill(store: Store, scenario: Scenario, seeds: range, plan: Plan, progress: Progress) -> dict[int, Record]:
+    """Makes and stores the runs that are missing; gives those back whose worker died, which are not stored."""
+    missing = [seed for seed in seeds if seed not in store]
+    done, lost = len(seeds) - len(missing), dict[int, Record]()
+    if not missing:
+        return lost
+    progress(_words(done, seeds), 0.0)
+    try:
+        tasks = [Task(scenario, seed, plan.guess) for seed in missing]
+        with closing(run_all(tasks, plan.workers, plan.scheduler)) as records:
+            for made, record in enumerate(records, 1):
+                if record.program:
+                    store.add(record)
+                else:
+                    lost[record.seed] = record
+                progress(_words(done + made, seeds), made / len(missing))
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(
+            f"{sum(s in store for s in seeds)} of {len(seeds)} runs are in {store.folder}; the same command "
+            "goes on from there."
+        ) from None
+    return lost
+
+
+def _words(done: int, seeds: range) -> str:
+    return f"{done} of {len(seeds)} runs"

@@ -1,0 +1,35 @@
+"""How far a result is from the truth, in the perturbations that its covariance is of."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icalib.geometry import so3
+from icalib.simulation import Truth
+
+
+def true_value(truth: Truth, sensor: str, name: str) -> np.ndarray | None:
+    """The truth of the group `name` of `sensor`, in the form of `ParameterGroup.value`; None where none is stated, as
+    of a target's tilt."""
+    poses = truth.T_imu_cam | truth.T_imu_lidar | truth.T_imu_wheel
+    if sensor not in poses:
+        return truth.imu_intrinsics if (sensor, name) == ("imu0", "intrinsics") else None
+    if name == "rotation":
+        return poses[sensor][:3, :3]
+    if name == "translation":
+        return poses[sensor][:3, 3]
+    stated = {
+        "time_offset": truth.time_offset,
+        "intrinsics": truth.intrinsics,
+        "distortion": truth.distortion,
+        "bloom": truth.bloom_px,
+        "radii": truth.radii,
+        "baseline": truth.baseline,
+    }
+    found = stated.get(name, {}).get(sensor)
+    return None if found is None else np.atleast_1d(np.asarray(found, dtype=np.float64))
+
+
+def error(name: str, value: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """(n,) estimated minus true; of rotations e of R_estimated = R_true Exp(e), in the sensor's axes."""
+    return so3.log(np.ascontiguousarray(true.T @ value)) if name == "rotation" else value - true

@@ -1,0 +1,68 @@
+"""A study's figures as people read them: degrees, millimetres, milliseconds."""
+
+from __future__ import annotations
+
+from icalib.montecarlo.statistics import PROBABILITY, Nees, Spread
+from icalib.montecarlo.summary import BlockSummary, Consistency, Mean
+from icalib.report.quantities import SHOWN_UNITS, shown
+
+HEADERS = ("block", "dim", "runs", "NEES", "95 %", "RMSE", "mean sigma", "unit", "sampled / predicted")
+NUMBERS = HEADERS[1:7] + HEADERS[8:]
+
+
+def block_row(block: BlockSummary) -> tuple[str, ...]:
+    """Cells under HEADERS."""
+    unit, scale = SHOWN_UNITS.get(block.unit, (block.unit, 1.0))
+    sizes = ["" if x is None else shown(scale * x, 3) for x in (block.rmse, block.mean_sigma)]
+    return (
+        f"{block.sensor} {block.name.replace('_', ' ')}", str(block.dimension), str(block.runs),
+        *nees_cells(block.nees), *sizes, unit, spread_words(block.spread),
+    )  # fmt: skip
+
+
+def nees_cells(found: Nees | None) -> tuple[str, str]:
+    """Mean NEES per degree of freedom, and its bounds."""
+    return ("", "") if found is None else (f"{found.mean:.3f}", f"{found.low:.2f}-{found.high:.2f}")
+
+
+def spread_words(found: Spread | None) -> str:
+    return "" if found is None else f"{found.least:.2f}-{found.largest:.2f}"
+
+
+def chance_words(found: Spread | None) -> str:
+    """What chance alone makes of the spread."""
+    if found is None:
+        return ""
+    (a, b), (c, d) = found.least_bounds, found.largest_bounds
+    return f"{a:.2f}-{b:.2f}, {c:.2f}-{d:.2f}"
+
+
+def verdict_words(block: BlockSummary) -> str:
+    """How the entries were judged over the runs, those always determined left out."""
+    odd = []
+    for entry in block.entries:
+        if set(entry.verdicts) - {"determined"}:
+            odd.append(f"{entry.label}: {', '.join(f'{n} {v}' for v, n in entry.verdicts.items())}")
+    return "; ".join(odd) or "determined in all"
+
+
+def mean_cells(mean: Mean) -> tuple[str, str, str]:
+    return mean.sensor, mean.kind, f"{mean.mean:.3f} +- {mean.standard_error:.3f}"
+
+
+def answer(found: Consistency) -> str:
+    """The study in a sentence."""
+    counted = [b for b in found.blocks if b.nees is not None]
+    if not counted:
+        return "No run reached a result."
+    out = [b.key for b in counted if b.nees is not None and not b.nees.consistent]
+    by_chance = (1.0 - PROBABILITY) * len(counted)
+    inside = f"{len(counted) - len(out)} of {len(counted)} blocks have their mean NEES within its 95 % bounds"
+    named = f"; outside: {', '.join(out)}" if out else ""
+    return f"{inside}, where chance alone leaves {by_chance:.1f} outside{named}."
+
+
+def failures_words(found: Consistency) -> str:
+    if not found.failures:
+        return f"All {found.runs} runs reached a result."
+    return f"{len(found.failures)} of {found.runs} runs failed, and count for nothing else here."

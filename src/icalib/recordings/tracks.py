@@ -1,0 +1,68 @@
+"""Rows of tracks -> one camera's stream, grouped by image and checked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from icalib.errors import RecordingError
+from icalib.measurements import TrackStream
+from icalib.recordings.clocks import rate_sentence
+from icalib.recordings.table import read_table
+
+INTEGERS, DECIMALS = ("t [ns]", "feature"), ("u [px]", "v [px]")
+_RATE_HZ = (1e-3, 1000.0)
+_MARGIN_PX = 5.0  # trackers step over the edge by a few times their noise
+
+
+def read_tracks(name: str, path: Path, resolution: tuple[int, int]) -> TrackStream:
+    """The table t [ns], feature, u, v [px] at `path`; `resolution` (width, height) px of the camera.
+
+    Raises RecordingError naming file and line or instant: a table that cannot be read, images out of order or at an
+    impossible rate, a feature that appears twice in an image or lies outside it, and tracks of one image only.
+    """
+    table = read_table(path, INTEGERS, DECIMALS)
+    stamps_ns, feature, uv = table.integers[:, 0].copy(), table.integers[:, 1].copy(), table.decimals
+    what = f"{path} ({name})"
+    step = np.diff(stamps_ns)
+    if (step < 0).any():
+        i = int(np.argmax(step < 0))
+        raise RecordingError(
+            f"{what}: the image at {stamps_ns[i + 1]} ns comes after the one at {stamps_ns[i]} ns; "
+            "sort the rows by stamp."
+        )
+    first = np.flatnonzero(np.concatenate([[True], step > 0]))
+    stream = TrackStream(
+        name, stamps_ns[first], np.append(first, len(stamps_ns)).astype(np.int64), feature, np.ascontiguousarray(uv)
+    )
+    _check(stream, what, resolution)
+    return stream
+
+
+def _check(stream: TrackStream, what: str, resolution: tuple[int, int]) -> None:
+    key = np.lexsort((stream.feature, stream.image))
+    repeated = key[1:][(np.diff(stream.feature[key]) == 0) & (np.diff(stream.image[key]) == 0)]
+    if len(repeated):
+        row = int(repeated.min())
+        raise RecordingError(
+            f"{what}: the image at {stream.stamps_ns[stream.image[row]]} ns has feature {stream.feature[row]} twice; "
+            "remove one: a number is one point."
+        )
+    sentence = rate_sentence(what, stream.stamps_ns, *_RATE_HZ) if len(stream.stamps_ns) > 1 else None
+    if sentence:
+        raise RecordingError(sentence)
+    high = np.array(resolution) - 0.5 + _MARGIN_PX
+    inside = ((stream.uv >= -0.5 - _MARGIN_PX) & (stream.uv <= high)).all(axis=1)
+    if not inside.all():
+        row = int(np.argmin(inside))
+        u, v = stream.uv[row]
+        raise RecordingError(
+            f"{what}: in the image at {stream.stamps_ns[stream.image[row]]} ns, feature {stream.feature[row]} lies at "
+            f"({u:.1f}, {v:.1f}), outside the image of {resolution[0]} x {resolution[1]} px; "
+            "check the camera's resolution [width, height] in the rig file."
+        )
+    if np.unique(stream.feature).size == len(stream.feature):
+        raise RecordingError(
+            f"{what}: no feature is in more than one image; a point keeps its number from image to image."
+        )

@@ -1,0 +1,88 @@
+"""Cameras that follow points of the scene, without a target: truth recovered, and the covariance honest."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from icalib.estimation.assembly import assemble, image_times, inputs_for, nodes_for, origin_difference, resample
+from icalib.estimation.corner_noise import first_noise
+from icalib.estimation.feature_noise import first_following
+from icalib.estimation.solver import minimise
+from icalib.first_guess.several import initial_guesses
+from icalib.geometry.targets import NoTarget
+from icalib.pipeline import first_state
+from icalib.rig import Parameter, Rig
+from icalib.simulation import Scenario, load_scenario, rig_for, simulate
+
+SCENARIO = Path(__file__).parents[2] / "examples" / "paper" / "table2-3d.yaml"
+
+CALIBRATED = ("rotation", "translation", "time_offset", "intrinsics", "distortion")
+EXACT = 1e-7  # rad, m, s; relative for intrinsics
+
+
+def table2(duration_s: float) -> Scenario:
+    """IMU and three cameras of Table II that follow points of a room, alone."""
+    return replace(load_scenario(SCENARIO), lidars=(), wheels=(), duration_s=duration_s)
+
+
+def rig_of(scenario: Scenario, scale: float = 1.0) -> Rig:
+    """No guess but intrinsics, focal lengths off by `scale`; the distortion free, from the truth."""
+    rig = rig_for(scenario, intrinsics="start", distortion="start")
+    cameras = []
+    for camera in rig.cameras:
+        guess = camera.intrinsics.value * np.array([scale, scale, 1.0, 1.0])
+        cameras.append(replace(camera, intrinsics=Parameter("free", guess), track_noise_px=1.0))
+    return replace(rig, target=NoTarget(), cameras=tuple(cameras))
+
+
+def test_noiseless_tracks_are_recovered_from_nothing_but_rough_intrinsics():
+    """In passes, each with nodes and preintegration made anew from what the last one found."""
+    scenario = table2(8.0)
+    exact = {"imu_noise_enabled": False, "robot_noise_enabled": False}
+    # At 1000 Hz all images stand at stamps of the IMU: in between, readings are taken to run linearly.
+    motion = replace(scenario.motion, exact=True)
+    scenario = replace(
+        scenario, **exact, motion=motion, imu_rate_hz=1000.0, gyro_bias=(0.0,) * 3, accel_bias=(0.0,) * 3
+    )
+    simulation, rig = simulate(scenario, 1), rig_of(scenario, 1.03)
+    inputs = inputs_for(rig, [simulation.measurements])
+    state = first_state(inputs, *initial_guesses(rig, inputs.bodies, [m.measurements for m in inputs.motions]))
+    state = replace(state, bias=np.zeros_like(state.bias))  # the prior on the first biases then pulls nothing
+    streams = inputs.measurements.cameras
+    noise = [first_noise(c).noise(s, c, rig.settings) for c, s in zip(rig.cameras, streams, strict=True)]
+    nothing = [np.zeros(0, dtype=bool) for _ in streams]
+    for _ in range(3):
+        problem = assemble(inputs, state, noise, nothing, following=first_following(inputs))
+        outcome = minimise(problem, state, tolerance=1e-10)
+        assert outcome.converged, outcome.status
+        state = outcome.state
+        state = resample(state, nodes_for(inputs, image_times(inputs, state.values)), inputs)
+    for camera, stream in zip(scenario.cameras, streams, strict=True):
+        value, T = {name: state.values[camera.name, name] for name in CALIBRATED}, camera.T_imu_cam
+        offset = simulation.truth.time_offset[camera.name] + origin_difference(inputs.measurements, stream)
+        assert Rotation.from_matrix(T[:3, :3].T @ value["rotation"]).magnitude() < EXACT
+        assert np.abs(value["translation"] - T[:3, 3]).max() < EXACT
+        assert abs(value["time_offset"][0] - offset) < EXACT
+        assert value["intrinsics"] == pytest.approx(np.array(camera.intrinsics), rel=EXACT)
+        assert np.abs(value["distortion"] - np.array(camera.distortion)).max() < EXACT
+
+
+def check(consistency, duration_s: float, seeds: range, probability: float) -> None:
+    scenario = table2(duration_s)
+    found = consistency(scenario, rig_of(scenario, 1.02), seeds, probability)
+    print({block: (round(c.mean, 3), round(c.low, 3), round(c.high, 3)) for block, c in found.items()})
+    assert {block: c for block, c in found.items() if not c.consistent} == {}
+
+
+def test_a_few_recordings(consistency):
+    check(consistency, 8.0, range(3), 0.9999)
+
+
+@pytest.mark.statistical
+def test_many_recordings(consistency):
+    check(consistency, 10.0, range(24), 0.99)

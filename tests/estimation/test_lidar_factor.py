@@ -1,0 +1,282 @@
+"""The LiDAR factor against its points one by one: each at its own instant, each a residual of its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from icalib.errors import EstimationError
+from icalib.estimation.arrowhead import make_pieces, solve
+from icalib.estimation.lidar_binning import Associated, LidarNoise, in_world, take_moments
+from icalib.estimation.poses import Poses, assign_nodes, poses_at
+from icalib.estimation.state import NODE
+from icalib.geometry.planes import moved
+from icalib.simulation import simulate
+
+
+def moments_of(setup, noise=None, state=None, stream=None, plane=None, bin_s=1e-3):
+    state = state or setup.state
+    values = np.array([state.values[p] for p in setup.planes])
+    own = setup.plane if plane is None else plane
+    return take_moments(Associated(stream or setup.stream, own, values), setup.motion(state), noise, bin_s)
+
+
+def point_times(setup):
+    stream = setup.stream
+    return np.repeat(stream.seconds, np.diff(stream.start)) + stream.offset_s
+
+
+def poses_of_points(setup, state, times, nodes_at=None) -> tuple[Poses, np.ndarray]:
+    """IMU poses at times on the LiDAR's clock, each from the node next to `nodes_at`, or to itself."""
+    offset = state.values["lidar0", "time_offset"][0]
+    node = assign_nodes("inertial", state.seconds, (times if nodes_at is None else nodes_at) + offset)
+    return poses_at("inertial", times + offset, node, state, setup.imu, 9.81, False), node
+
+
+def world_points(setup, state, poses, xyz):
+    R_il, p_il = state.values["lidar0", "rotation"], state.values["lidar0", "translation"]
+    in_imu = xyz @ R_il.T + p_il
+    return poses.position + np.einsum("nij,nj->ni", poses.rotation, in_imu), in_imu
+
+
+@dataclass
+class Point:
+    """Residual (N,) and Jacobian (N, chain + border) of all points on planes, by obvious formulas."""
+
+    r: np.ndarray
+    J: np.ndarray
+    incidence: np.ndarray
+
+
+def pointwise(setup, state, bin_s=1e-3) -> Point:
+    """The points of a bin hang on one node, though each has a pose of its own."""
+    used = np.flatnonzero(setup.plane >= 0)
+    xyz = setup.stream.xyz[used].astype(np.float64)
+    scan = np.repeat(setup.stream.seconds, np.diff(setup.stream.start))
+    centre = scan + (np.floor(setup.stream.offset_s.astype(np.float64) / bin_s) + 0.5) * bin_s
+    poses, node = poses_of_points(setup, state, point_times(setup)[used], centre[used])
+    world, in_imu = world_points(setup, state, poses, xyz)
+    value = np.array([state.values[p] for p in setup.planes])[setup.plane[used]]
+    n, c = value[:, :3], value[:, 3:]
+    R, R_il = poses.rotation, state.values["lidar0", "rotation"]
+    r = np.einsum("ni,ni->n", n, world - c)
+    in_body = np.einsum("nij,ni->nj", R, n)
+    by_pose = np.concatenate([np.cross(in_imu, in_body), n], axis=1)
+    o = NODE * len(state.seconds)
+    J = np.zeros((len(used), o + setup.layout.size))
+    for i, k in enumerate(node):
+        J[i, NODE * k : NODE * (k + 1)] = by_pose[i] @ poses.by_node[i]
+    columns = [o + setup.layout.columns("lidar0", name) for name in ("rotation", "translation", "time_offset")]
+    J[:, columns[0]] = np.cross(xyz, in_body @ R_il)
+    J[:, columns[1]] = in_body
+    J[:, columns[2][0]] = (by_pose * np.concatenate([poses.rate, poses.velocity], axis=1)).sum(axis=1)
+    h = 1e-6
+    for q, key in enumerate(setup.planes):
+        own = setup.plane[used] == q
+        for t in range(3):
+            up, down = (moved(state.values[key], s * h * np.eye(3)[t]) for s in (1, -1))
+            distances = [(world[own] - p[3:]) @ p[:3] for p in (up, down)]
+            J[own, o + setup.layout.columns(*key)[t]] = (distances[0] - distances[1]) / (2 * h)
+    incidence = np.einsum("ni,ni->n", in_body @ R_il, xyz) / np.linalg.norm(xyz, axis=1)
+    return Point(r, J, incidence)
+
+
+def sums(setup, factor, state, dense, **options):
+    pieces, out = make_pieces(factor.n_nodes, setup.layout.size), factor.output()
+    cost = sum(factor.accumulate(state, p, out, **options) for p in pieces)
+    return cost, *dense(pieces, factor.n_nodes), out
+
+
+@pytest.mark.parametrize("bin_s", [1e-3, 1e-4, 2e-6])
+@pytest.mark.parametrize("loss", ["none", "huber", "cauchy"])
+@pytest.mark.parametrize("beam", [0.0, 0.03])
+def test_sums_are_those_of_the_points(sparse_room, room_of, dense, bin_s, loss, beam):
+    """But for the instants at which states act on them, wrong by half a bin at most: of 25 ms from the node."""
+    setup = room_of(sparse_room, spacing=0.05)
+    state = setup.perturbed(np.random.default_rng(0), 0.3)
+    noise = LidarNoise(0.02, beam, loss, 1.2)
+    cost, H, g, _ = sums(setup, setup.factor(state, noise, bin_s=bin_s), state, dense)
+    point = pointwise(setup, state, bin_s)
+    sigma = np.hypot(noise.sigma, beam * point.incidence)
+    t = np.abs(point.r) / sigma
+    root = {
+        "none": np.ones_like(t),
+        "huber": np.minimum(1.0, 1.2 / np.maximum(t, 1e-300)) ** 0.5,
+        "cauchy": (1.0 + (t / 1.2) ** 2) ** -0.5,
+    }[loss]
+    assert 0.05 < (t > 1.2).mean() < 0.9
+    J, r = point.J * (root / sigma)[:, None], point.r * root / sigma
+    size = np.sqrt(np.maximum((J**2).sum(axis=0), 1e-6 * (J**2).sum(axis=0).max()))
+    found, expected = (M / np.outer(size, size) for M in (H, J.T @ J))
+    bound, o = 10.0 * bin_s, NODE * len(state.seconds)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=bound)
+    np.testing.assert_allclose(found[o:, o:], expected[o:, o:], rtol=0, atol=0.1 * bound)
+    np.testing.assert_allclose(g / size, (J.T @ r) / size, rtol=0, atol=bound * np.linalg.norm(r))
+    np.testing.assert_allclose((g / size)[o:], ((J.T @ r) / size)[o:], rtol=0, atol=0.1 * bound * np.linalg.norm(r))
+    assert cost == pytest.approx(0.5 * r @ r, rel=bound)
+
+
+def brisk(robot):
+    """One point in each millisecond, anywhere in it; 2 rad/s and 8 m/s^2 at times."""
+    scenario = robot(4.0, noiseless=True, exact=False)
+    simulation = simulate(scenario, seed=0)
+    stream = simulation.measurements.lidars[0]
+    rng = np.random.default_rng(1)
+    at = np.floor(stream.offset_s.astype(np.float64) / 1e-3) + 1000 * np.repeat(
+        np.arange(len(stream.stamps_ns)), np.diff(stream.start)
+    )
+    order = rng.permutation(len(at))
+    keep = np.sort(order[np.unique(at[order], return_index=True)[1]])
+    start = np.searchsorted(keep, stream.start)
+    few = replace(stream, start=start, xyz=stream.xyz[keep], offset_s=stream.offset_s[keep], plane=stream.plane[keep])
+    return replace(simulation, measurements=replace(simulation.measurements, lidars=(few,)))
+
+
+def test_points_move_to_the_centre_of_their_bin_as_the_sensor_moved(robot, room_of):
+    setup = room_of(brisk(robot))
+    moments = moments_of(setup, LidarNoise(1.0))
+    assert (moments.count == 1).all()
+    xyz = moments.root[:, [1, 3, 6]] / moments.root[:, :1]
+    centre, _ = poses_of_points(setup, setup.state, moments.seconds)
+    found, _ = world_points(setup, setup.state, centre, xyz)
+    own, _ = poses_of_points(setup, setup.state, point_times(setup))
+    exact = world_points(setup, setup.state, own, setup.stream.xyz.astype(np.float64))[0][setup.plane >= 0]
+    still = world_points(setup, setup.state, centre, setup.stream.xyz[setup.plane >= 0].astype(np.float64))[0]
+    assert np.linalg.norm(own.rate, axis=1).max() > np.deg2rad(60.0)
+    assert np.linalg.norm(still - exact, axis=1).max() > 2e-3
+    assert np.linalg.norm(found - exact, axis=1).max() < 1e-5
+
+
+def test_points_in_the_world_are_where_each_was_seen(robot, room_of):
+    setup = room_of(brisk(robot))
+    points, seen_from = in_world(setup.motion(setup.state), setup.stream)
+    poses, _ = poses_of_points(setup, setup.state, point_times(setup))
+    exact, _ = world_points(setup, setup.state, poses, setup.stream.xyz.astype(np.float64))
+    sensor, _ = world_points(setup, setup.state, poses, np.zeros(setup.stream.xyz.shape))
+    assert np.linalg.norm(points - exact, axis=1).max() < 2e-5
+    assert np.linalg.norm(seen_from - sensor, axis=1).max() < 5e-6
+
+
+def test_a_point_beyond_its_plane_has_a_positive_residual(sparse_room, room_of, dense):
+    setup = room_of(sparse_room, spacing=0.05)
+    before, after = setup.state, dict(setup.state.values)
+    for key in setup.planes:
+        after[key] = moved(after[key], np.array([0.0, 0.0, -0.1]))
+    factor = setup.factor(before)
+    _, _, g, _ = sums(setup, factor, replace(before, values=after), dense)
+    distance = [NODE * factor.n_nodes + setup.layout.columns(*key)[2] for key in setup.planes]
+    # Predicted - measured is then +0.1 m, and moving the plane along its normal lowers it.
+    count = np.bincount(factor.moments.plane, factor.moments.count)
+    np.testing.assert_allclose(g[distance] / count * 0.03**2, -0.1, atol=0.01)
+
+
+def test_points_without_a_plane_or_without_imu_are_left_out(sparse_room, room_of):
+    setup = room_of(sparse_room)
+    noise = LidarNoise(0.03)
+    whole = moments_of(setup, noise)
+    assert whole.count.sum() == (setup.plane >= 0).sum()
+    some = np.where(np.arange(len(setup.plane)) % 3 == 0, np.int32(-1), setup.plane)
+    assert moments_of(setup, noise, plane=some).count.sum() == (some >= 0).sum()
+    late = setup.state.values | {("lidar0", "time_offset"): np.array([0.4])}
+    beyond = moments_of(setup, noise, state=replace(setup.state, values=late))
+    assert beyond.count.sum() < whole.count.sum()
+    assert (beyond.seconds + 0.4).max() <= setup.imu.seconds[-1]
+    never = setup.state.values | {("lidar0", "time_offset"): np.array([100.0])}
+    with pytest.raises(EstimationError, match="lidar0.*time_offset"):
+        moments_of(setup, noise, state=replace(setup.state, values=never))
+
+
+def with_stream(setup, stream, plane=None):
+    measurements = replace(setup.sim.measurements, lidars=(stream,))
+    return replace(
+        setup, sim=replace(setup.sim, measurements=measurements), plane=setup.plane if plane is None else plane
+    )
+
+
+def test_stamps_at_the_end_of_scans_and_points_in_any_order_change_nothing(sparse_room, room_of, dense):
+    setup = room_of(sparse_room, spacing=0.05)
+    stream, rng = setup.stream, np.random.default_rng(0)
+    ends = zip(stream.start[:-1], stream.start[1:], strict=True)
+    order = np.concatenate([rng.permutation(np.arange(a, b)) for a, b in ends])
+    offset = (stream.offset_s.astype(np.float64) - 0.125).astype(np.float32)
+    ended = with_stream(setup, replace(stream, xyz=stream.xyz[order], offset_s=offset[order]), setup.plane[order])
+    later = setup.state.values | {("lidar0", "time_offset"): setup.state.values["lidar0", "time_offset"] + 0.125}
+    state = replace(setup.state, values=later)
+    found = sums(ended, ended.factor(state), state, dense)
+    expected = sums(setup, setup.factor(), setup.state, dense)
+    # Points at the edge of bins change theirs, and with it perhaps the node; to the border that is all the same.
+    H, H_expected = (h[NODE * len(state.seconds) :, NODE * len(state.seconds) :] for h in (found[1], expected[1]))
+    size = np.sqrt(np.diag(H_expected))
+    np.testing.assert_allclose(H / np.outer(size, size), H_expected / np.outer(size, size), atol=1e-4)
+    assert found[0] == pytest.approx(expected[0], rel=1e-4)
+
+
+def test_scans_that_overlap_in_time_are_sorted(sparse_room, room_of, dense):
+    setup = room_of(sparse_room, spacing=0.05)
+    stream = setup.stream
+    early = replace(stream, stamps_ns=stream.stamps_ns - np.arange(len(stream.stamps_ns)) * 60_000_000)
+    factor = with_stream(setup, early).factor()
+    assert (np.diff(factor.moments.seconds) >= 0.0).all()
+    assert (np.diff(factor.node) >= 0).all()
+    assert factor.moments.count.sum() == (setup.plane >= 0).sum()
+    _, H, _, _ = sums(setup, factor, setup.state, dense)
+    assert np.isfinite(H).all()
+
+
+def test_white_numbers_have_the_covariance_of_white_noise_of_the_points(sparse_room, room_of, dense):
+    """J^T e of noise given for the moments' rows: mean zero, covariance J^T J."""
+    setup = room_of(sparse_room, spacing=0.05)
+    factor = setup.factor(noise=LidarNoise(0.03))
+    rng = np.random.default_rng(0)
+    _, H, _, out = sums(setup, factor, setup.state, dense)
+    before = out.copy()
+    g = []
+    for _ in range(400):
+        noise = rng.standard_normal(out.shape)
+        pieces = make_pieces(factor.n_nodes, setup.layout.size)
+        for p in pieces:
+            factor.accumulate(setup.state, p, out, noise=noise)
+        again, own = dense(pieces, factor.n_nodes)
+        g.append(own)
+        np.testing.assert_array_equal(again, H)
+    np.testing.assert_array_equal(out, before)
+    o = NODE * factor.n_nodes
+    size = np.sqrt(np.diag(H)[o:])
+    sampled = np.cov(np.array(g)[:, o:].T)
+    np.testing.assert_allclose(sampled / np.outer(size, size), H[o:, o:] / np.outer(size, size), atol=0.3)
+    np.testing.assert_allclose(np.diag(sampled) / size**2, 1.0, atol=0.3)
+
+
+def test_degrees_of_freedom_that_the_parameters_cost(sparse_room, room_of, dense):
+    """The mean of e^T J x is the trace of J H^-1 J^T, all factors in H."""
+    setup = room_of(sparse_room, spacing=0.05)
+    problem = setup.problem(setup.state)
+    factor = problem.cameras[0]
+    pieces = problem.pieces()
+    problem.linearise(setup.state, pieces, problem.residuals())
+    H, _ = dense(pieces, problem.n_nodes)
+    _, H_lidar, _, _ = sums(setup, factor, setup.state, dense)
+    scale = 1.0 / np.sqrt(np.diag(H))
+    expected = np.trace(np.linalg.solve(H * np.outer(scale, scale), H_lidar * np.outer(scale, scale)))
+    rng, found, no_noise = np.random.default_rng(1), [], np.zeros((problem.n_nodes - 1, 15))
+    for _ in range(40):
+        noise = rng.standard_normal(factor.output().shape)
+        pieces = problem.pieces()
+        for p in pieces:
+            factor.accumulate(setup.state, p, factor.output(), noise=noise)
+            problem.chain.accumulate(setup.state, p, np.zeros((problem.n_nodes - 1, 15)), noise=no_noise)
+            problem.add_prior_information(p, setup.state)
+        step = solve(pieces, problem.n_nodes, problem.tolerance)
+        up, down = factor.output(), factor.output()
+        for out, s in ((up, -1e-2), (down, 1e-2)):
+            at = setup.state.retract(setup.layout, s * step.chain, s * step.border)
+            for p in pieces:
+                factor.accumulate(at, p, out, sums=False)
+        found.append(factor.spent(noise, (up - down) / 2e-2)["points"])
+    assert np.mean(found) == pytest.approx(expected, abs=4.0 * np.std(found) / np.sqrt(len(found)))
+    n, chi2 = factor.chi2(sums(setup, factor, setup.state, dense)[3])["points"]
+    assert n == (setup.plane >= 0).sum()
+    assert expected < 0.1 * n
+    assert chi2 == pytest.approx(((pointwise(setup, setup.state).r / 0.03) ** 2).sum(), rel=1e-3)

@@ -1,0 +1,137 @@
+"""`icalib montecarlo` and `icalib reproduce`: what they print, and one sentence where something is wrong."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from icalib.cli import main
+from icalib.montecarlo import study as study_module
+from icalib.montecarlo.one_run import program
+from icalib.montecarlo.record import Record
+from icalib.montecarlo.reproduce import FOLDER, MOTIONS, with_board
+from icalib.simulation import load_scenario
+
+PAPER = Path(__file__).parents[2] / "examples" / "paper"
+SCENARIO = PAPER / "table2-3d.yaml"
+
+
+@pytest.fixture
+def runs(monkeypatch, record):
+    """Runs are made up: every third fails."""
+
+    def make(tasks, workers, scheduler):
+        for task in tasks:
+            one = replace(record(task.seed), program=program())
+            yield one if task.seed % 3 != 2 else Record(task.seed, "no camera saw the target.", 1.0, program())
+
+    monkeypatch.setattr(study_module, "run_all", make)
+
+
+def test_montecarlo_prints_the_table_and_the_failed_runs(runs, tmp_path: Path, capsys):
+    assert main(["montecarlo", str(SCENARIO), "--runs", "30", "-o", str(tmp_path), "--seed", "6"]) == 0
+    out = capsys.readouterr().out
+    assert "cam0 rotation" in out and "wheel0 radii" in out and "all together" in out
+    assert "10 of 30 runs failed" in out and "seed 8: no camera saw the target." in out
+    assert sorted(f.stem for f in (tmp_path / "runs").iterdir())[::29] == ["000006", "000035"]
+    assert main(["montecarlo", str(SCENARIO), "--runs", "30", "-o", str(tmp_path), "--seed", "6", "--quiet"]) == 0
+    assert capsys.readouterr().out == ""
+
+
+def test_reproduce_leaves_figures_and_tables(runs, tmp_path: Path, capsys):
+    assert main(["reproduce", "--runs", "8", "--output", str(tmp_path)]) == 0
+    page = (tmp_path / "reproduce.html").read_text()
+    for motion, title in MOTIONS.items():
+        assert (tmp_path / f"convergence-{motion}.png").read_bytes().startswith(b"\x89PNG")
+        assert f"<h2>{title}</h2>" in page and f'id="{motion}-cam0.rotation"' in page
+        assert (tmp_path / motion / "consistency.json").exists()
+    assert "reproduce.html" in capsys.readouterr().out
+
+
+def test_reproduce_without_any_good_run_still_reports(tmp_path: Path, monkeypatch, capsys):
+    failed = [Record(0, "no camera saw the target.", 1.0, program())]
+    monkeypatch.setattr(study_module, "run_all", lambda *_: (r for r in failed))
+    assert main(["reproduce", "--runs", "1", "--output", str(tmp_path)]) == 0
+    assert "no camera saw the target." in (tmp_path / "reproduce.html").read_text()
+    assert not list(tmp_path.glob("*.png"))
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_the_scenarios_are_those_of_the_examples(motion: str):
+    name = f"table2-{motion}.yaml"
+    assert (FOLDER / name).read_bytes() == (PAPER / name).read_bytes()
+    scenario = with_board(load_scenario(FOLDER / name))
+    assert scenario.board and not scenario.lidars
+
+
+def sentence(capsys, *arguments: str) -> str:
+    """What the command says on standard error; exit code 1."""
+    assert main(list(arguments)) == 1
+    text = capsys.readouterr().err
+    assert text.startswith("icalib: ") and text.count("\n") == 1 and text.endswith(".\n")
+    return text
+
+
+def test_a_bad_scenario_is_one_sentence_and_leaves_nothing(tmp_path: Path, capsys):
+    out = tmp_path / "out"
+    assert "absent.yaml does not exist" in sentence(
+        capsys, "montecarlo", str(tmp_path / "absent.yaml"), "--runs", "1", "-o", str(out)
+    )
+    (tmp_path / "bad.yaml").write_text(SCENARIO.read_text().replace("duration: 60", "duration: -1"))
+    text = sentence(capsys, "montecarlo", str(tmp_path / "bad.yaml"), "--runs", "1", "-o", str(out))
+    assert "bad.yaml:" in text and "duration" in text
+    assert not out.exists()
+
+
+def test_a_folder_that_cannot_be_written(tmp_path: Path, capsys):
+    (tmp_path / "file").write_text("")
+    text = sentence(capsys, "montecarlo", str(SCENARIO), "--runs", "1", "-o", str(tmp_path / "file" / "out"))
+    assert "cannot be written" in text and "choose another folder" in text
+
+
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense://1"])
+def test_no_scheduler_answers(tmp_path: Path, capsys, monkeypatch, address: str):
+    monkeypatch.setattr("icalib.montecarlo.workers.ANSWER_WITHIN_S", 1)
+    arguments = ("montecarlo", str(SCENARIO), "--runs", "1", "-o", str(tmp_path), "--scheduler", address)
+    assert f"no Dask scheduler answers at {address}; start one" in sentence(capsys, *arguments)
+
+
+@pytest.mark.parametrize("module", ["distributed", "scipy.stats", "matplotlib.figure"])
+def test_missing_packages_are_named(runs, tmp_path: Path, capsys, monkeypatch, module: str):
+    if module == "distributed":
+        monkeypatch.undo()
+    monkeypatch.setitem(sys.modules, module, None)
+    text = sentence(capsys, "reproduce", "--runs", "3", "-o", str(tmp_path))
+    assert "pip install icalib[montecarlo]" in text
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["montecarlo", "x.yaml", "-o", "out"],
+        ["montecarlo", "x.yaml", "-o", "out", "--runs", "0"],
+        ["montecarlo", "x.yaml", "-o", "out", "--runs", "many"],
+        ["montecarlo", "x.yaml", "-o", "out", "--runs", "2", "--workers", "0"],
+        ["montecarlo", "x.yaml", "-o", "out", "--runs", "2", "--workers", "2", "--scheduler", "tcp://a:1"],
+        ["montecarlo", "x.yaml", "-o", "out", "--runs", "2", "--guess", "truth"],
+        ["reproduce"],
+    ],
+)
+def test_wrong_usage(arguments: list[str], capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(arguments)
+    assert stopped.value.code == 2
+    assert "error:" in capsys.readouterr().err
+
+
+def test_an_interrupted_command_says_how_to_go_on(tmp_path: Path, monkeypatch, capsys, record):
+    def make(tasks, workers, scheduler):
+        yield replace(record(0), program=program())
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(study_module, "run_all", make)
+    assert main(["montecarlo", str(SCENARIO), "--runs", "5", "-o", str(tmp_path)]) == 130
+    assert capsys.readouterr().err.startswith(f"icalib: interrupted; 1 of 5 runs are in {tmp_path};")

@@ -1,0 +1,74 @@
+"""Tables of tracks, and the sentences on what is wrong with them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from icalib.errors import RecordingError, RigError
+from icalib.recordings.tracks import read_tracks
+from icalib.rig_file import load_rig, rig_to_dict
+
+GOOD = "#t [ns],feature,u [px],v [px]\n1000000000,7,10.5,20\n1000000000,3,11,21\n1050000000,7,10.75,20.25\n"
+RIG = """
+sensors:
+  imu0: {type: imu}
+  cam0:
+    type: camera
+    model: pinhole-radtan
+    resolution: [752, 480]
+    tracks: cam0/tracks.csv
+    track_noise: 1.5
+    intrinsics: {guess: [460, 460, 370, 240]}
+"""
+
+
+def read(tmp_path: Path, text: str):
+    path = tmp_path / "tracks.csv"
+    path.write_text(text)
+    return read_tracks("cam0", path, (752, 480))
+
+
+def test_a_table_is_read(tmp_path):
+    stream = read(tmp_path, GOOD)
+    assert stream.stamps_ns.tolist() == [1_000_000_000, 1_050_000_000]
+    assert stream.start.tolist() == [0, 2, 3] and stream.feature.tolist() == [7, 3, 7]
+    np.testing.assert_array_equal(stream.uv, [[10.5, 20.0], [11.0, 21.0], [10.75, 20.25]])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("1050000000,7", "950000000,7", "the image at 950000000 ns comes after the one at 1000000000 ns; sort"),
+        ("1000000000,3", "1000000000,7", "the image at 1000000000 ns has feature 7 twice"),
+        ("10.75,20.25", "10.75,nan", "tracks.csv"),
+        ("10.75,20.25", "10.75,20.25,4", "tracks.csv"),
+        ("10.75,20.25", "10.75", "tracks.csv"),
+        ("10.75,20.25", "10.75,900", "feature 7 lies at (10.8, 900.0), outside the image of 752 x 480 px"),
+        ("1050000000,7", "1050000000,8", "no feature is in more than one image"),
+        (GOOD, "", "is empty"),
+    ],
+)
+def test_what_is_wrong_is_named(tmp_path, old, new, words):
+    with pytest.raises(RecordingError, match=r"tracks\.csv") as error:
+        read(tmp_path, GOOD.replace(old, new))
+    assert words in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_rig_without_a_target(tmp_path):
+    path = tmp_path / "rig.yaml"
+    path.write_text(RIG)
+    rig = load_rig(path)
+    assert not rig.has_target and not rig.blooms
+    assert rig.cameras[0].tracks == "cam0/tracks.csv" and rig.cameras[0].track_noise_px == 1.5
+    again = rig_to_dict(rig)
+    assert "target" not in again and again["sensors"]["cam0"]["tracks"] == "cam0/tracks.csv"
+
+
+def test_a_camera_without_tracks_needs_a_target(tmp_path):
+    path = tmp_path / "rig.yaml"
+    path.write_text(RIG.replace("    tracks: cam0/tracks.csv\n", ""))
+    with pytest.raises(RigError, match="target is missing; add target, targets .*, or tracks .* to cam0"):
+        load_rig(path)
