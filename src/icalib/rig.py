@@ -75,6 +75,60 @@ class Camera:
     track_noise_px: float | None = None  # None: estimated from the residuals
 
 
+PointTime = Literal["auto", "start", "end", "azimuth", "snapshot"]
+
+
+@dataclass(frozen=True)
+class Lidar:
+    """One LiDAR. Points nearer than near_m or farther than far_m are left out.
+
+    point_time: what a point's time is counted from; `recordings.point_times` says what each choice means.
+    """
+
+    name: str
+    path: str
+    range_noise_m: float | None = None  # along the beam; None: estimated from the residuals
+    rotation: Parameter = Parameter()
+    translation: Parameter = Parameter()
+    time_offset: Parameter = Parameter()
+    near_m: float = 0.5
+    far_m: float = 100.0
+    point_time: PointTime = "auto"
+    topic: str | None = None  # of its clouds; None: the one with the LiDAR's name, or the only one
+
+
+WheelFactor = Literal["increments", "relative-poses"]
+WheelMeasure = Literal["rates", "angles", "ticks", "poses"]
+
+
+@dataclass(frozen=True)
+class Wheels:
+    """Two driven wheels of one axle. Their frame has x forward, y to the left, z up, its origin midway between them.
+
+    measures: rates [rad/s], angles turned [rad], counts of encoders (ticks), or relative planar poses (tables only).
+    meaning: of rates, as in `WheelStream`. Densities: of each wheel's angle, and of slip.
+    """
+
+    name: str
+    path: str
+    drive: Literal["differential"] = "differential"
+    rotation: Parameter = Parameter()
+    translation: Parameter = Parameter()
+    time_offset: Parameter = Parameter()
+    radii: Parameter = Parameter()  # (2,) left, right [m]
+    baseline: Parameter = Parameter()  # (1,) between the wheels [m]
+    wheel_noise: float = 0.03  # rad/sqrt(s): of rates at 70 Hz 0.25 rad/s each, as simulated wheels have it
+    sideways_slip: float = 5e-3  # m/sqrt(s)
+    upwards_slip: float = 5e-3  # m/sqrt(s), off the ground
+    factor: WheelFactor = "increments"  # relative-poses: the paper's (27)
+    measures: WheelMeasure = "rates"
+    meaning: Literal["mean", "instant"] = "mean"
+    counts_per_turn: float | None = None  # of ticks, for one turn of the wheel
+    counter_size: int | None = None  # the counters go back to zero after so many ticks; None: never
+    topic: str | None = None  # of its JointState; None: the one with the wheels' name, or the only one
+    joints: tuple[str, str] | None = None  # left, right in JointState; None: told by "left" and "right" in the names
+
+
 Scheme = Literal["inertial", "pose", "kinematic"]
 Loss = Literal["none", "huber", "cauchy"]
 Nodes = Literal["every-image", "first-camera"]
@@ -108,7 +162,8 @@ class Settings:
 @dataclass(frozen=True)
 class Rig:
     """The whole robot. Without an IMU the first camera's frame is the body frame, and time stands still: images taken
-    at the same stamp are taken together, nothing ties one instant to the next."""
+    at the same stamp are taken together, nothing ties one instant to the next. There may be no camera beside an IMU and
+    a LiDAR."""
 
     imu: ImuSensor | None
     cameras: tuple[Camera, ...]
@@ -116,6 +171,8 @@ class Rig:
     gravity: float = 9.81  # m/s^2
     settings: Settings = Settings()
     path: Path | None = None
+    lidars: tuple[Lidar, ...] = ()
+    wheels: tuple[Wheels, ...] = ()
 
     @property
     def has_target(self) -> bool:

@@ -3,18 +3,32 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from icalib.geometry.cameras import CAMERA_MODELS
 from icalib.geometry.targets import NoTarget, Scene, Target
 from icalib.imu_classes import DEFAULT_CLASS, IMU_CLASSES, class_noise
-from icalib.rig import Camera, ImuNoise, ImuSensor, Parameter, Rig, Settings
+from icalib.rig import (
+    Camera,
+    ImuNoise,
+    ImuSensor,
+    Lidar,
+    Parameter,
+    PointTime,
+    Rig,
+    Settings,
+    WheelFactor,
+    WheelMeasure,
+    Wheels,
+)
 from icalib.rig_parameters import imu_intrinsics_parameter, parameter_to_plain, rotation_parameter, vector_parameter
 from icalib.rig_targets import NAME, target_of, target_or_targets
 from icalib.yaml_nodes import YamlValue, read_yaml
 
-_SENSOR_TYPES = ("imu", "camera")
+_SENSOR_TYPES = ("imu", "camera", "lidar", "wheels")
+_MOUNTED = ("rotation", "translation", "time_offset")
 _DENSITIES = ("gyro", "gyro_walk", "accel", "accel_walk")
 
 
@@ -23,8 +37,8 @@ def load_rig(path: str | Path) -> Rig:
     file = Path(path)
     root = read_yaml(file)
     found = root.record(("sensors",), ("target", "targets", "gravity", "settings"))
-    imus, cameras = _sensors(found["sensors"])
-    blind = [c.name for c in cameras if c.tracks is None]
+    sensors = _sensors(found["sensors"])
+    blind = [c.name for c in sensors.cameras if c.tracks is None]
     targeted = "target" in found or "targets" in found
     if blind and not targeted:
         root.fail(
@@ -32,12 +46,14 @@ def load_rig(path: str | Path) -> Rig:
             f"{' and '.join(blind)}."
         )
     return Rig(
-        imu=imus[0] if imus else None,
-        cameras=tuple(cameras),
+        imu=sensors.imus[0] if sensors.imus else None,
+        cameras=tuple(sensors.cameras),
         target=target_or_targets(root) if targeted else NoTarget(),
         gravity=found["gravity"].positive() if "gravity" in found else Rig.gravity,
         settings=_settings(found["settings"]) if "settings" in found else Settings(),
         path=file,
+        lidars=tuple(sensors.lidars),
+        wheels=tuple(sensors.wheels),
     )
 
 
@@ -55,6 +71,7 @@ def rig_to_dict(rig: Rig) -> dict[str, Any]:
     """`rig` as lists, numbers and text; written as YAML or JSON, it loads back as the same rig."""
     imus = {} if rig.imu is None else {rig.imu.name: _imu_to_plain(rig.imu)}
     sensors = imus | {c.name: _camera_to_plain(c) for c in rig.cameras}
+    sensors |= {s.name: _lidar_to_plain(s) for s in rig.lidars} | {w.name: _wheels_to_plain(w) for w in rig.wheels}
     key = "targets" if isinstance(rig.target, Scene) else "target"
     target = {key: rig.target.plain()} if rig.has_target else {}
     return {
@@ -65,24 +82,46 @@ def rig_to_dict(rig: Rig) -> dict[str, Any]:
     }
 
 
-def _sensors(value: YamlValue) -> tuple[list[ImuSensor], list[Camera]]:
-    imus: list[ImuSensor] = []
-    cameras: list[Camera] = []
+@dataclass(frozen=True)
+class _Sensors:
+    """Those of each type, in the order of the file."""
+
+    imus: list[ImuSensor] = field(default_factory=list)
+    cameras: list[Camera] = field(default_factory=list)
+    lidars: list[Lidar] = field(default_factory=list)
+    wheels: list[Wheels] = field(default_factory=list)
+
+
+def _sensors(value: YamlValue) -> _Sensors:
+    found = _Sensors()
     for name, sensor in value.entries().items():
         if not NAME.fullmatch(name):
             sensor.fail("a sensor's name is a letter, then letters, digits, _ or -, as in cam0; rename it.")
         fields = sensor.entries()
         if "type" not in fields:
             sensor.fail(f"type is missing; add type: {' or type: '.join(_SENSOR_TYPES)}.")
-        if fields["type"].choice("sensor type", _SENSOR_TYPES) == "camera":
-            cameras.append(_camera(name, sensor))
-        elif imus:
-            sensor.fail(f"is a second IMU beside {imus[0].name}; keep the one that is the body frame.")
-        else:
-            imus.append(_imu(name, sensor))
-    if not cameras:
-        value.fail("there is no camera; add a sensor of type: camera.")
-    return imus, cameras
+        match fields["type"].choice("sensor type", _SENSOR_TYPES):
+            case "camera":
+                found.cameras.append(_camera(name, sensor))
+            case "lidar":
+                found.lidars.append(_lidar(name, sensor))
+            case "wheels":
+                found.wheels.append(_wheels(name, sensor))
+            case _ if found.imus:
+                sensor.fail(f"is a second IMU beside {found.imus[0].name}; keep the one that is the body frame.")
+            case _:
+                found.imus.append(_imu(name, sensor))
+    _refuse_incomplete(value, found)
+    return found
+
+
+def _refuse_incomplete(value: YamlValue, found: _Sensors) -> None:
+    """Where the sensors together cannot be calibrated."""
+    if not found.cameras and not found.lidars:
+        value.fail("there is no camera and no LiDAR; add a sensor of type: camera or type: lidar.")
+    if not found.imus and (found.lidars or found.wheels):
+        first = (*found.lidars, *found.wheels)[0]
+        value.entries()[first.name].fail("needs an IMU; add a sensor of type: imu, or remove this one.")
 
 
 def _imu(name: str, value: YamlValue) -> ImuSensor:
@@ -105,16 +144,14 @@ def _noise(value: YamlValue) -> ImuNoise:
 
 
 def _camera(name: str, value: YamlValue) -> Camera:
-    groups = ("rotation", "translation", "time_offset", "intrinsics", "distortion", "bloom")
+    groups = (*_MOUNTED, "intrinsics", "distortion", "bloom")
     found = value.record(
         ("type", "model", "resolution"), ("path", "topic", "corner_noise", "tracks", "track_noise", *groups)
     )
     model = found["model"].choice("camera model", tuple(CAMERA_MODELS))
-    sizes = {"translation": 3, "time_offset": 1, "intrinsics": 4, "bloom": 1}
+    sizes = {"intrinsics": 4, "bloom": 1}
     sizes["distortion"] = len(CAMERA_MODELS[model].parameter_names) - sizes["intrinsics"]
     parameters = {group: vector_parameter(found[group], n) for group, n in sizes.items() if group in found}
-    if "rotation" in found:
-        parameters["rotation"] = rotation_parameter(found["rotation"])
     _refuse_negative_focal_length(found, parameters)
     return Camera(
         name=name,
@@ -125,8 +162,97 @@ def _camera(name: str, value: YamlValue) -> Camera:
         topic=_topic(found),
         tracks=found["tracks"].text() if "tracks" in found else None,
         track_noise_px=found["track_noise"].positive() if "track_noise" in found else None,
+        **_mounting(found),
         **parameters,
     )
+
+
+def _mounting(found: dict[str, YamlValue]) -> dict[str, Parameter]:
+    """Where a sensor is and how its clock goes, as far as it is said."""
+    sizes = {"translation": 3, "time_offset": 1}
+    groups = {group: vector_parameter(found[group], n) for group, n in sizes.items() if group in found}
+    return groups | ({"rotation": rotation_parameter(found["rotation"])} if "rotation" in found else {})
+
+
+def _lidar(name: str, value: YamlValue) -> Lidar:
+    found = value.record(("type",), ("path", "topic", "range_noise", "near", "far", "point_time", *_MOUNTED))
+    near, far = _positive(found, "near", Lidar.near_m), _positive(found, "far", Lidar.far_m)
+    if near >= far:
+        found["near" if "near" in found else "far"].fail(
+            f"points from {near:g} to {far:g} m are none; near must be below far."
+        )
+    return Lidar(
+        name=name,
+        path=_path(found, f"{name}/scans.npz"),
+        range_noise_m=found["range_noise"].positive() if "range_noise" in found else None,
+        near_m=near,
+        far_m=far,
+        point_time=_choice(found, "point_time", PointTime, Lidar.point_time),
+        topic=_topic(found),
+        **_mounting(found),
+    )
+
+
+def _wheels(name: str, value: YamlValue) -> Wheels:
+    sizes, densities = {"radii": 2, "baseline": 1}, ("wheel_noise", "sideways_slip", "upwards_slip")
+    words = ("path", "topic", "drive", "measures", "meaning", "counts_per_turn", "counter_size", "joints", "factor")
+    found = value.record(("type",), (*words, *densities, *_MOUNTED, *sizes))
+    measures = _choice(found, "measures", WheelMeasure, Wheels.measures)
+    _refuse_other_measures(value, found, measures)
+    groups = {group: vector_parameter(found[group], n) for group, n in sizes.items() if group in found}
+    _refuse_negative_lengths(found, groups)
+    return Wheels(
+        name=name,
+        path=_path(found, f"{name}/{measures}.csv"),
+        drive=_choice(found, "drive", Literal["differential"], Wheels.drive),
+        wheel_noise=_positive(found, "wheel_noise", Wheels.wheel_noise),
+        sideways_slip=_positive(found, "sideways_slip", Wheels.sideways_slip),
+        upwards_slip=_positive(found, "upwards_slip", Wheels.upwards_slip),
+        factor=_choice(found, "factor", WheelFactor, "relative-poses" if measures == "poses" else Wheels.factor),
+        measures=measures,
+        meaning=_choice(found, "meaning", Literal["mean", "instant"], Wheels.meaning),
+        counts_per_turn=found["counts_per_turn"].positive() if "counts_per_turn" in found else None,
+        counter_size=found["counter_size"].whole(2) if "counter_size" in found else None,
+        topic=_topic(found),
+        joints=_joints(found["joints"]) if "joints" in found else None,
+        **_mounting(found),
+        **groups,
+    )
+
+
+_ONLY_OF = {"meaning": "rates", "counts_per_turn": "ticks", "counter_size": "ticks"}
+
+
+def _refuse_other_measures(value: YamlValue, found: dict[str, YamlValue], measures: WheelMeasure) -> None:
+    """Fields that do not go with what the wheels measure, or are missing."""
+    for name, kind in _ONLY_OF.items():
+        if name in found and measures != kind:
+            found[name].fail(f"belongs to wheels that measure {kind}, not {measures}; remove it, or correct measures.")
+    if measures == "ticks" and "counts_per_turn" not in found:
+        value.fail("counts_per_turn is missing; add how many ticks one turn of the wheel has, gears included.")
+    if measures == "poses" and "factor" in found and found["factor"].text() == "increments":
+        found["factor"].fail("increments cannot be had from relative poses; write relative-poses.")
+
+
+def _refuse_negative_lengths(found: dict[str, YamlValue], groups: dict[str, Parameter]) -> None:
+    for name, group in groups.items():
+        if group.value is not None and (group.value <= 0).any():
+            found[name].fail("is in metres and must be above 0; correct it.")
+
+
+def _joints(value: YamlValue) -> tuple[str, str]:
+    names = [item.text() for item in value.items()]
+    if len(names) != 2 or names[0] == names[1]:
+        value.fail("must be the names of two joints, [left, right].")
+    return names[0], names[1]
+
+
+def _positive(found: dict[str, YamlValue], name: str, default: float) -> float:
+    return found[name].positive() if name in found else default
+
+
+def _choice(found: dict[str, YamlValue], name: str, kind: Any, default: Any) -> Any:
+    return found[name].choice("such choice as", get_args(kind)) if name in found else default
 
 
 def _refuse_negative_focal_length(found: dict[str, YamlValue], parameters: dict[str, Parameter]) -> None:
@@ -183,5 +309,24 @@ def _camera_to_plain(camera: Camera) -> dict[str, Any]:
         plain["tracks"] = camera.tracks
     if camera.track_noise_px is not None:
         plain["track_noise"] = camera.track_noise_px
-    groups = {f.name: getattr(camera, f.name) for f in dataclasses.fields(camera)}
-    return plain | {name: parameter_to_plain(p) for name, p in groups.items() if isinstance(p, Parameter)}
+    return plain | _groups_to_plain(camera)
+
+
+def _lidar_to_plain(lidar: Lidar) -> dict[str, Any]:
+    plain: dict[str, Any] = {"type": "lidar", "path": lidar.path, "near": lidar.near_m, "far": lidar.far_m}
+    plain["point_time"] = lidar.point_time
+    given = {"range_noise": lidar.range_noise_m, "topic": lidar.topic}
+    return plain | {name: value for name, value in given.items() if value is not None} | _groups_to_plain(lidar)
+
+
+def _wheels_to_plain(wheels: Wheels) -> dict[str, Any]:
+    same = ("path", "drive", "measures", "factor", "wheel_noise", "sideways_slip", "upwards_slip")
+    plain: dict[str, Any] = {"type": "wheels", **{name: getattr(wheels, name) for name in same}}
+    given = {name: getattr(wheels, name) for name, kind in _ONLY_OF.items() if kind == wheels.measures}
+    given |= {"topic": wheels.topic, "joints": None if wheels.joints is None else list(wheels.joints)}
+    return plain | {name: value for name, value in given.items() if value is not None} | _groups_to_plain(wheels)
+
+
+def _groups_to_plain(sensor: Camera | Lidar | Wheels) -> dict[str, Any]:
+    groups = {f.name: getattr(sensor, f.name) for f in dataclasses.fields(sensor)}
+    return {name: parameter_to_plain(p) for name, p in groups.items() if isinstance(p, Parameter)}

@@ -1,0 +1,130 @@
+"""LiDARs and wheels in rig files."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from icalib.errors import RigError
+from icalib.rig import Lidar, Parameter, Rig, Wheels
+from icalib.rig_file import load_rig, rig_to_dict
+
+ROBOT = """\
+sensors:
+  imu0: {type: imu}
+  lidar0:
+    type: lidar
+    range_noise: 0.02
+    translation: {guess: [0.1, 0, 0.3]}
+    time_offset: {fixed: 0.01}
+    near: 1
+    far: 60
+    point_time: azimuth
+    topic: /lidar/points
+  lidar1: {type: lidar, path: top/scans.npz}
+  wheel0:
+    type: wheels
+    drive: differential
+    rotation: {prior: {rpy_deg: [0, 0, 90]}, sigma_deg: 2}
+    radii: {prior: [0.1, 0.11], sigma: 0.01}
+    baseline: {guess: 0.4}
+    wheel_noise: 0.01
+    sideways_slip: 0.002
+    upwards_slip: 0.003
+    factor: relative-poses
+    measures: ticks
+    counts_per_turn: 4096.5
+    counter_size: 65536
+    topic: /joints
+    joints: [l, r]
+  wheel1: {type: wheels, meaning: instant}
+  wheel2: {type: wheels, measures: poses}
+"""
+
+
+def load(tmp_path: Path, text: str) -> Rig:
+    path = tmp_path / "rig.yaml"
+    path.write_text(text, encoding="utf-8")
+    return load_rig(path)
+
+
+def complaint(tmp_path: Path, text: str) -> str:
+    with pytest.raises(RigError) as error:
+        load(tmp_path, text)
+    sentence = str(error.value)
+    assert sentence.startswith(str(tmp_path)) and sentence.endswith(".") and "\n" not in sentence
+    return sentence.removeprefix(f"{tmp_path}/")
+
+
+def test_lidars_and_wheels_are_read(tmp_path):
+    rig = load(tmp_path, ROBOT)
+    a, b = rig.lidars
+    assert (a.name, a.path, a.range_noise_m, a.near_m, a.far_m) == ("lidar0", "lidar0/scans.npz", 0.02, 1.0, 60.0)
+    assert (a.point_time, a.topic, a.time_offset.mode) == ("azimuth", "/lidar/points", "fixed")
+    assert a.rotation == Parameter() and np.array_equal(a.translation.value, [0.1, 0, 0.3])
+    assert b == Lidar("lidar1", "top/scans.npz") and (rig.cameras, rig.body) == ((), "imu0")
+    ticks, rates, poses = rig.wheels
+    assert (ticks.measures, ticks.counts_per_turn, ticks.counter_size) == ("ticks", 4096.5, 65536)
+    assert (ticks.path, ticks.topic, ticks.joints) == ("wheel0/ticks.csv", "/joints", ("l", "r"))
+    assert (ticks.wheel_noise, ticks.sideways_slip, ticks.upwards_slip) == (0.01, 0.002, 0.003)
+    assert ticks.factor == "relative-poses" and np.array_equal(ticks.radii.value, [0.1, 0.11])
+    assert ticks.rotation.mode == "prior" and np.allclose(ticks.rotation.value @ [1, 0, 0], [0, 1, 0])
+    assert ticks.baseline.mode == "free" and np.array_equal(ticks.baseline.value, [0.4])
+    assert rates == Wheels("wheel1", "wheel1/rates.csv", meaning="instant")
+    assert poses == Wheels("wheel2", "wheel2/poses.csv", measures="poses", factor="relative-poses")
+
+
+def test_plain_lidars_and_wheels_load_back(tmp_path):
+    plain = rig_to_dict(load(tmp_path, ROBOT))
+    again = load(tmp_path, yaml.safe_dump(plain, sort_keys=False))
+    assert rig_to_dict(again) == plain
+    first = load(tmp_path, ROBOT)
+    for a, b in zip((*again.lidars, *again.wheels), (*first.lidars, *first.wheels), strict=True):
+        for one in dataclasses.fields(a):
+            p, q = getattr(a, one.name), getattr(b, one.name)
+            assert repr(p) == repr(q), one.name
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("range_noise: 0.02", "range_noise: 0", "rig.yaml:5: sensors.lidar0.range_noise: must be above 0"),
+        ("near: 1", "near: 70", "rig.yaml:8: sensors.lidar0.near: points from 70 to 60 m are none; near must be"),
+        (
+            "azimuth",
+            "guess",
+            "sensors.lidar0.point_time: there is no such choice as 'guess'; available are auto, start",
+        ),
+        ("    near: 1", "    nera: 1", "sensors.lidar0.nera: there is no such field, did you mean 'near'"),
+        ("drive: differential", "drive: ackermann", "wheel0.drive: there is no such choice as 'ackermann'"),
+        ("[0.1, 0.11]", "[0.1, -0.11]", "sensors.wheel0.radii: is in metres and must be above 0"),
+        ("[0.1, 0.11]", "[0.1]", "sensors.wheel0.radii.prior: must be a list of 2 numbers"),
+        ("{guess: 0.4}", "{guess: 0}", "sensors.wheel0.baseline: is in metres and must be above 0"),
+        ("wheel_noise: 0.01", "wheel_noise: -1", "sensors.wheel0.wheel_noise: must be above 0"),
+        ("    counts_per_turn: 4096.5\n", "", "rig.yaml:14: sensors.wheel0: counts_per_turn is missing; add how many"),
+        ("measures: ticks", "measures: angles", "wheel0.counts_per_turn: belongs to wheels that measure ticks, not an"),
+        ("measures: ticks", "meaning: mean\n    measures: ticks", "wheel0.meaning: belongs to wheels that measure rat"),
+        ("65536", "1.5", "sensors.wheel0.counter_size: must be a whole number of at least 2"),
+        ("[l, r]", "[l]", "sensors.wheel0.joints: must be the names of two joints, [left, right]"),
+        ("[l, r]", "[l, l]", "sensors.wheel0.joints: must be the names of two joints, [left, right]"),
+        ("measures: poses", "measures: poses, factor: increments", "sensors.wheel2.factor: increments cannot be had"),
+        ("  imu0: {type: imu}\n", "", "rig.yaml:3: sensors.lidar0: needs an IMU; add a sensor of type: imu"),
+    ],
+)
+def test_what_is_wrong_with_lidars_and_wheels_is_named(tmp_path, old, new, words):
+    assert ROBOT.count(old) == 1
+    assert words in complaint(tmp_path, ROBOT.replace(old, new))
+
+
+def test_examples_of_the_page_are_right(tmp_path):
+    page = (Path(__file__).parents[1] / "docs/rig-file.md").read_text(encoding="utf-8")
+    blocks = [block.split("```")[0] for block in page.split("```yaml\nsensors:\n")[2:]]
+    rig = load(tmp_path, "sensors:\n  imu0: {type: imu}\n" + "".join(blocks))
+    assert ([s.name for s in rig.lidars], [w.name for w in rig.wheels]) == (["lidar0"], ["wheel0"])
+    for field in dataclasses.fields(Wheels):
+        if isinstance(field.default, (str, float)):
+            assert f"| `{field.default}`" in page or f"| {field.default:g} |" in page, field.name
