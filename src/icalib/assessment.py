@@ -34,13 +34,15 @@ from icalib.estimation.state import Block, State
 from icalib.geometry.cameras import camera_model
 from icalib.observability import Observability, observe
 from icalib.provenance import versions
+from icalib.rig import Camera
 from icalib.rig_file import rig_to_dict
 from icalib.timeline import Timeline
 
 UNITS = {
     "rotation": "rad", "translation": "m", "time_offset": "s", "intrinsics": "px", "distortion": "", "bloom": "px",
-    "shape": "m", "tilt": "rad",
+    "shape": "m", "tilt": "rad", "radii": "m", "baseline": "m",
 }  # fmt: skip
+LABELS = {"shape": SHAPE_LABELS, "radii": ("left", "right"), "plane": ("turn 1", "turn 2", "distance")}
 EXPECTED_CHI2 = (0.5, 2.0)  # chi^2 per post-fit degree of freedom outside this is worth a warning
 LARGE_FACTOR = 3.0
 LARGE_BLOOM_PX = 0.8  # ink and overexposure move edges by a third of that
@@ -84,7 +86,8 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
 def _rates(inputs: Inputs) -> dict[str, float]:
     """Hz of each sensor, from the median step of its stamps."""
     imu = inputs.measurements.imu
-    streams = (*(() if imu is None else (imu,)), *inputs.measurements.cameras)
+    m = inputs.measurements
+    streams = (*(() if imu is None else (imu,)), *m.cameras, *m.lidars, *m.wheels)
     return {s.name: float(1.0 / np.median(np.diff(s.seconds))) for s in streams if len(s.stamps_ns) > 1}
 
 
@@ -92,11 +95,12 @@ def _labels(inputs: Inputs, block: Block) -> tuple[str, ...]:
     if inputs.imu is not None and block.sensor == inputs.imu.name:
         return IMU_LABELS
     if block.name in ("intrinsics", "distortion"):
-        camera = next(c for c in inputs.rig.cameras if c.name == block.sensor)
+        camera = inputs.sensor(block.sensor)
+        assert isinstance(camera, Camera)
         model = camera_model(camera.model).parameter_names
         return model[:4] if block.name == "intrinsics" else model[4:]
-    if block.name == "shape":
-        return SHAPE_LABELS
+    if block.name in LABELS:
+        return LABELS[block.name]
     return ("x", "y", "z")[: block.size] if block.size > 1 else (block.name,)
 
 
@@ -111,7 +115,7 @@ def _mode(inputs: Inputs, block: Block) -> str:
         return "free"
     if inputs.rig.imu is not None and block.sensor == inputs.rig.imu.name:
         return inputs.rig.imu.intrinsics.mode
-    return getattr(next(c for c in inputs.rig.cameras if c.name == block.sensor), block.name).mode
+    return getattr(inputs.sensor(block.sensor), block.name).mode
 
 
 def visited(inputs: Inputs, stage: str, problem: Problem, visit: Visit) -> Visited:
@@ -119,7 +123,7 @@ def visited(inputs: Inputs, stage: str, problem: Problem, visit: Visit) -> Visit
     t = problem.tolerance
     covariance = restricted_inverse(visit.information * t[:, None] * t, problem.held)
     formal = t * np.sqrt(np.diag(covariance))
-    free = inputs.layout.free
+    free = [b for b in inputs.layout.free if b.name != "plane"]
     values = {b.key: _raw_value(inputs, visit.state, b) for b in free}
     return Visited(stage, values, {b.key: formal[b.columns] for b in free})
 
@@ -128,8 +132,7 @@ def _raw_value(inputs: Inputs, state: State, block: Block) -> np.ndarray:
     """The value as users meet it: time offsets between raw stamps."""
     value = state.values[block.key]
     if block.name == "time_offset":
-        stream = next(c for c in inputs.measurements.cameras if c.name == block.sensor)
-        return value - origin_difference(inputs.measurements, stream)
+        return value - origin_difference(inputs.measurements, inputs.stream(block.sensor))
     return value
 
 
@@ -141,6 +144,8 @@ def _groups(
     overall = float(np.sqrt(np.mean(_calibration_only(inputs, ratio) ** 2))) if len(ratio) else 1.0
     groups = []
     for block in inputs.layout.blocks:
+        if block.name == "plane" or _unheard_of(inputs, block):
+            continue
         if block.start is None and block.name in ("shape", "bloom", "tilt"):
             continue
         labels = _labels(inputs, block)
@@ -167,6 +172,12 @@ def _groups(
             )
         )  # fmt: skip
     return tuple(groups)
+
+
+def _unheard_of(inputs: Inputs, block: Block) -> bool:
+    """Whether it belongs to wheels that report poses, in which it has no part."""
+    wheels = [w.name for w in inputs.rig.wheels if w.measures == "poses"]
+    return block.sensor in wheels and block.name in ("radii", "baseline")
 
 
 def _with_factor(formal: Verdict, loose: bool) -> Verdict:
@@ -199,6 +210,9 @@ def _sensor_fit(fit: Fit, found: Estimate) -> SensorFit:
             used = out.root > 0.0
             rms, unit = float(np.sqrt(np.mean(out.residual[used] ** 2))), "px"
             rejected = int((~used).sum())
+    for factor, out in zip(found.problem.sensors, found.outcome.residuals.sensors, strict=True):
+        if factor.name == fit.sensor:
+            rms, unit = factor.rms(out, fit.kind)
     return SensorFit(fit.sensor, fit.kind, fit.count, fit.dof, fit.chi2, rms, unit, rejected)
 
 

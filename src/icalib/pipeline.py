@@ -23,6 +23,7 @@ from icalib.estimation.problem import Problem
 from icalib.estimation.solver import Visit
 from icalib.estimation.state import State
 from icalib.first_guess import Guess, initial_trajectory
+from icalib.first_guess.robot import with_robot
 from icalib.first_guess.several import initial_guesses
 from icalib.geometry.targets.base import BOARD
 from icalib.measurements import CornerStream, Measurements
@@ -105,12 +106,17 @@ def _calibrate(
     clock = _Clock()
     progress("finding a first guess", 0.0)
     give_back()
-    inputs = inputs_for(rig, recordings)
+    whole = inputs_for(rig, recordings)
+    inputs = _without_robot(rig, recordings) if rig.wheels or rig.lidars else whole
     guesses = initial_guesses(rig, inputs.bodies, [m.measurements for m in inputs.motions])
     clock.lap("first guess")
     state = first_state(inputs, *guesses)
     give_back()
     clock.lap("first state")
+    if rig.wheels or rig.lidars:
+        progress("finding wheels and LiDARs", 0.05)
+        inputs, state = with_robot(inputs, state, whole)
+        clock.lap("wheels and LiDARs")
     steps = _StepProgress(progress)
 
     def tell(stage: str, problem: Problem, visit: Visit) -> None:
@@ -138,6 +144,12 @@ def first_state(inputs: Inputs, *guesses: Guess) -> State:
     rotation, position, velocity = (np.concatenate(x) for x in zip(*paths, strict=True))
     bias = np.concatenate([guess.biases(len(t)) for guess, _, t in own])
     return State(nodes, rotation, position, velocity, bias, values, starts)
+
+
+def _without_robot(rig: Rig, recordings: Sequence[Measurements]) -> Inputs:
+    """Cameras and IMU alone, which give the motion that LiDARs and wheels are found by."""
+    bare = [dataclasses.replace(m, wheels=(), lidars=()) for m in recordings]
+    return inputs_for(dataclasses.replace(rig, wheels=(), lidars=()), bare)
 
 
 class _Clock:

@@ -17,7 +17,6 @@ from icalib.estimation.board import SHAPE_LABELS
 from icalib.estimation.bodies import Bodies, restrict
 from icalib.estimation.corner_factor import CornerFactor, CornerNoise
 from icalib.estimation.feature_factor import FeatureFactor
-from icalib.estimation.gauge_factor import Gauge
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.imu_factor import ImuFactor
 from icalib.estimation.lidar_binning import LidarNoise, Motion
@@ -251,12 +250,12 @@ class RoomSetup:
         return LidarFactor.build(self.stream, self.plane, self.planes, motion, noise, self.layout, **options)
 
     def problem(self, start: State, noise: LidarNoise | None = None, **options) -> Problem:
-        """IMU and LiDAR, the first node held where it is in truth."""
+        """IMU and LiDAR, the first node held where it is."""
         columns = self.layout.columns("imu0", "intrinsics")
         imu = ImuFactor.build(self.imu, start, 9.81, columns[columns >= 0])
-        gauge = Gauge(0, self.state.rotation[0], self.state.position[0])
         lidar = self.factor(start, noise, **options)
-        return Problem(self.layout, imu, (lidar,), (gauge,), Tolerances().of(self.layout, "imu0"))
+        tolerance = Tolerances().of(self.layout, "imu0")
+        return Problem(self.layout, imu, (), (), tolerance, sensors=(lidar,), framed=False)
 
 
 def make_room(sim: Simulation, *, imu_free: bool = False, spacing: float = 0.025) -> RoomSetup:

@@ -19,7 +19,6 @@ import icalib.estimation
 from icalib.estimation.arrowhead import Piece, make_pieces
 from icalib.estimation.corner_factor import CornerNoise
 from icalib.estimation.corner_weights import LEAST_CURVATURE
-from icalib.estimation.gauge_factor import Gauge
 from icalib.estimation.imu_factor import ROWS, ImuFactor
 from icalib.estimation.lidar_binning import LidarNoise
 from icalib.estimation.prior_factor import FIRST_BIAS_SIGMA, Prior, accumulate_bias_prior
@@ -208,26 +207,12 @@ def lidar_sample(room, room_of, scheme="inertial", loss="none", beam=0.0, imu_fr
         out = factor.output()
         for piece in make_pieces(len(at.seconds), setup.layout.size):
             factor.accumulate(at, piece, out, sums=False)
-        return out.ravel()
+        return out.residual.ravel()
 
     def accumulate(at, piece, sums):
         return factor.accumulate(at, piece, factor.output(), sums)
 
     return Sample("LidarFactor", setup, state, accumulate, residual, white(residual))
-
-
-def gauge_sample(room, room_of, node):
-    setup = room_of(room, spacing=0.05)
-    state = setup.perturbed(np.random.default_rng(6), 20.0)
-    gauge = Gauge(node, setup.state.rotation[node], setup.state.position[node])
-    return Sample(
-        "Gauge",
-        setup,
-        state,
-        gauge.accumulate,
-        lambda at: gauge.residual(at)[0],
-        white(lambda at: gauge.residual(at)[0]),
-    )
 
 
 def prior_sample(unlike, setup_of, sensor, name):
@@ -299,7 +284,7 @@ def wheel_sample(unlike, setup_of, factor, imu_free=False, rate_hz=70.0, loss="n
     state = setup.perturbed(rng, 0.3)
 
     def run(at):
-        out = made.empty_output()
+        out = made.output()
         for piece in make_pieces(len(at.seconds), setup.layout.size):
             made.accumulate(at, piece, out, sums=False)
         return out.residual.ravel(), out.root.ravel()
@@ -310,7 +295,7 @@ def wheel_sample(unlike, setup_of, factor, imu_free=False, rate_hz=70.0, loss="n
         return root**2 * r, np.diag(root**2 * slope)
 
     def accumulate(at, piece, sums):
-        return made.accumulate(at, piece, made.empty_output(), sums, curved)
+        return made.accumulate(at, piece, made.output(), sums, curved)
 
     return Sample(factor.__name__, setup, state, accumulate, lambda at: run(at)[0], weights)
 
@@ -363,8 +348,6 @@ SAMPLES = {
         "LidarFactor",
         lambda u, s, f: lidar_sample(*s, "pose", "cauchy", imu_free=True),
     ),
-    "gauge": ("Gauge", lambda u, s, f: gauge_sample(*s, 0)),
-    "gauge of a later recording": ("Gauge", lambda u, s, f: gauge_sample(*s, 7)),
     "prior on a rotation": ("Prior", lambda u, s, f: prior_sample(u, s, "cam1", "rotation")),
     "prior on a vector": ("Prior", lambda u, s, f: prior_sample(u, s, "cam0", "intrinsics")),
     "prior on IMU intrinsics": ("Prior", lambda u, s, f: prior_sample(u, s, "imu0", "intrinsics")),
@@ -432,7 +415,7 @@ def scales(sample):
 @pytest.fixture(scope="module", params=SAMPLES)
 def sample(request, unlike, setup_of, factor_of, features_of, sparse_room, room_of):
     name, make = SAMPLES[request.param]
-    in_room = name in ("LidarFactor", "Gauge")
+    in_room = name == "LidarFactor"
     factors = features_of if name == "FeatureFactor" else factor_of
     made = make(unlike, (sparse_room, room_of) if in_room else setup_of, factors)
     assert made.factor == name

@@ -11,6 +11,8 @@ from icalib.errors import EstimationError
 from icalib.estimation.arrowhead import make_pieces, solve
 from icalib.estimation.lidar_binning import Associated, LidarNoise, in_world, take_moments
 from icalib.estimation.poses import Poses, assign_nodes, poses_at
+from icalib.estimation.sensor_factor import Whitened, spent
+from icalib.estimation.sensor_factor import chi2 as weighted_squares
 from icalib.estimation.state import NODE
 from icalib.geometry.planes import moved
 from icalib.simulation import simulate
@@ -86,7 +88,7 @@ def pointwise(setup, state, bin_s=1e-3) -> Point:
 def sums(setup, factor, state, dense, **options):
     pieces, out = make_pieces(factor.n_nodes, setup.layout.size), factor.output()
     cost = sum(factor.accumulate(state, p, out, **options) for p in pieces)
-    return cost, *dense(pieces, factor.n_nodes), out
+    return cost, *dense(pieces, factor.n_nodes), out.residual
 
 
 @pytest.mark.parametrize("bin_s", [1e-3, 1e-4, 2e-6])
@@ -230,18 +232,18 @@ def test_white_numbers_have_the_covariance_of_white_noise_of_the_points(sparse_r
     setup = room_of(sparse_room, spacing=0.05)
     factor = setup.factor(noise=LidarNoise(0.03))
     rng = np.random.default_rng(0)
-    _, H, _, out = sums(setup, factor, setup.state, dense)
-    before = out.copy()
+    _, H, _, before = sums(setup, factor, setup.state, dense)
+    out = Whitened(before.copy(), np.ones_like(before))
     g = []
     for _ in range(400):
-        noise = rng.standard_normal(out.shape)
+        noise = rng.standard_normal(before.shape)
         pieces = make_pieces(factor.n_nodes, setup.layout.size)
         for p in pieces:
             factor.accumulate(setup.state, p, out, noise=noise)
         again, own = dense(pieces, factor.n_nodes)
         g.append(own)
         np.testing.assert_array_equal(again, H)
-    np.testing.assert_array_equal(out, before)
+    np.testing.assert_array_equal(out.residual, before)
     o = NODE * factor.n_nodes
     size = np.sqrt(np.diag(H)[o:])
     sampled = np.cov(np.array(g)[:, o:].T)
@@ -253,7 +255,7 @@ def test_degrees_of_freedom_that_the_parameters_cost(sparse_room, room_of, dense
     """The mean of e^T J x is the trace of J H^-1 J^T, all factors in H."""
     setup = room_of(sparse_room, spacing=0.05)
     problem = setup.problem(setup.state)
-    factor = problem.cameras[0]
+    factor = problem.sensors[0]
     pieces = problem.pieces()
     problem.linearise(setup.state, pieces, problem.residuals())
     H, _ = dense(pieces, problem.n_nodes)
@@ -262,7 +264,7 @@ def test_degrees_of_freedom_that_the_parameters_cost(sparse_room, room_of, dense
     expected = np.trace(np.linalg.solve(H * np.outer(scale, scale), H_lidar * np.outer(scale, scale)))
     rng, found, no_noise = np.random.default_rng(1), [], np.zeros((problem.n_nodes - 1, 15))
     for _ in range(40):
-        noise = rng.standard_normal(factor.output().shape)
+        noise = rng.standard_normal(factor.output().residual.shape)
         pieces = problem.pieces()
         for p in pieces:
             factor.accumulate(setup.state, p, factor.output(), noise=noise)
@@ -274,9 +276,11 @@ def test_degrees_of_freedom_that_the_parameters_cost(sparse_room, room_of, dense
             at = setup.state.retract(setup.layout, s * step.chain, s * step.border)
             for p in pieces:
                 factor.accumulate(at, p, out, sums=False)
-        found.append(factor.spent(noise, (up - down) / 2e-2)["points"])
+        found.append(spent(factor.output(), noise, (up.residual - down.residual) / 2e-2, factor.kinds["points"]))
     assert np.mean(found) == pytest.approx(expected, abs=4.0 * np.std(found) / np.sqrt(len(found)))
-    n, chi2 = factor.chi2(sums(setup, factor, setup.state, dense)[3])["points"]
+    out = factor.output()
+    problem.linearise(setup.state, pieces, replace(problem.residuals(), sensors=(out,)))
+    n, chi2 = factor.count(out, "points"), weighted_squares(out, factor.kinds["points"])
     assert n == (setup.plane >= 0).sum()
     assert expected < 0.1 * n
     assert chi2 == pytest.approx(((pointwise(setup, setup.state).r / 0.03) ** 2).sum(), rel=1e-3)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,17 +19,20 @@ from icalib.estimation.images import on_common_images
 from icalib.estimation.imu_data import ImuData, joined_imu_data
 from icalib.estimation.imu_factor import ImuFactor
 from icalib.estimation.imu_model import N_INTRINSICS
+from icalib.estimation.lidar_binning import LidarNoise, Motion
 from icalib.estimation.nodes import MERGED_WITHIN_S, distinct, first_nodes, place_nodes, usable
 from icalib.estimation.poses import assign_nodes, poses_at
 from icalib.estimation.prior_factor import Prior
 from icalib.estimation.problem import ChainFactor, Problem
+from icalib.estimation.robot import NO_CLOUDS, Clouds, own_entries, plane_entries, robot_factors
+from icalib.estimation.sensor_factor import SensorFactor
 from icalib.estimation.state import Entry, Key, Kind, Layout, State, make_layout
 from icalib.estimation.tolerances import Tolerances
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets.base import BOARD
 from icalib.joining import Part, join
-from icalib.measurements import CornerStream, Measurements
-from icalib.rig import Camera, Parameter, Rig, Scheme
+from icalib.measurements import CornerStream, LidarStream, Measurements, WheelPoses, WheelStream
+from icalib.rig import Camera, Lidar, Parameter, Rig, Scheme, Wheels
 
 BLOOM_SIGMA_PX = 1.0
 NO_BLOOM = np.zeros((0, 2), dtype=np.float32)  # single precision: directions as such are near enough
@@ -47,7 +50,7 @@ SIZES = {"rotation": 3, "translation": 3, "time_offset": 1, "intrinsics": 4, "bl
 @dataclass(frozen=True)
 class Inputs:
     """What does not change from pass to pass. bodies: what of the target is used; parts: the recordings that
-    `measurements` were joined from."""
+    `measurements` were joined from; clouds: points of LiDARs on planes, without which these have no part in it."""
 
     rig: Rig
     measurements: Measurements
@@ -56,10 +59,23 @@ class Inputs:
     layout: Layout
     tolerances: Tolerances
     parts: tuple[Part, ...]
+    clouds: Clouds = NO_CLOUDS
+
+    @property
+    def sensors(self) -> tuple[Camera | Lidar | Wheels, ...]:
+        """All that take part, but for the IMU."""
+        return (*self.rig.cameras, *(self.rig.lidars if self.clouds.count else ()), *self.rig.wheels)
+
+    def sensor(self, name: str) -> Camera | Lidar | Wheels:
+        return next(s for s in self.sensors if s.name == name)
+
+    def stream(self, name: str) -> CornerStream | LidarStream | WheelStream | WheelPoses:
+        m = self.measurements
+        return next(s for s in (*m.cameras, *m.lidars, *m.wheels) if s.name == name)
 
     def is_sensor(self, name: str) -> bool:
-        """Whether `name` is a sensor's, not a body's of the target."""
-        return name == self.rig.body or name in [c.name for c in self.rig.cameras]
+        """Whether `name` is a sensor's, not a body's of the target or a plane's."""
+        return name == self.rig.body or name in [s.name for s in self.sensors]
 
     @property
     def motions(self) -> tuple[Part, ...]:
@@ -80,8 +96,14 @@ def inputs_for(rig: Rig, recordings: Sequence[Measurements]) -> Inputs:
     return Inputs(rig, joined, bodies, joined_imu_data(rig, parts, joined), layout, tolerances, parts)
 
 
-def layout_for(rig: Rig, bodies: Bodies, n_recordings: int = 1) -> Layout:
-    """The border: IMU intrinsics, the scene and its bodies, then each camera's parameters."""
+def with_clouds(inputs: Inputs, clouds: Clouds) -> Inputs:
+    """The same with points of the LiDARs on planes."""
+    layout = layout_for(inputs.rig, inputs.bodies, len(inputs.parts), clouds)
+    return replace(inputs, layout=layout, clouds=clouds)
+
+
+def layout_for(rig: Rig, bodies: Bodies, n_recordings: int = 1, clouds: Clouds = NO_CLOUDS) -> Layout:
+    """The border: IMU intrinsics, the scene and its bodies, then each sensor's parameters, and planes."""
     imu = rig.imu
     entries: list[Entry] = []
     if imu is not None:
@@ -94,7 +116,9 @@ def layout_for(rig: Rig, bodies: Bodies, n_recordings: int = 1) -> Layout:
         sizes = SIZES | {"distortion": len(camera_model(camera.model).parameter_names) - 4}
         for name, kind in CAMERA_PARAMETERS:
             entries.append((camera.name, name, kind, sizes[name], _is_estimated(rig, camera, name)))
-    return make_layout(entries + bodies.pose_entries())
+    for sensor in (*(rig.lidars if clouds.count else ()), *rig.wheels):
+        entries += own_entries(sensor)
+    return make_layout(entries + bodies.pose_entries() + plane_entries(clouds))
 
 
 def _is_estimated(rig: Rig, camera: Camera, name: str) -> bool:
@@ -103,8 +127,10 @@ def _is_estimated(rig: Rig, camera: Camera, name: str) -> bool:
     return getattr(camera, name).mode != "fixed" and (name != "bloom" or rig.blooms)
 
 
-def origin_difference(measurements: Measurements, stream: CornerStream) -> float:
-    """Seconds from the body's first stamp to the camera's, each on its own clock: what a raw time offset lacks."""
+def origin_difference(
+    measurements: Measurements, stream: CornerStream | LidarStream | WheelStream | WheelPoses
+) -> float:
+    """Seconds from the body's first stamp to the sensor's, each on its own clock: what a raw time offset lacks."""
     return (stream.origin_ns - measurements.origin_ns) * 1e-9
 
 
@@ -125,10 +151,14 @@ def _priors(inputs: Inputs) -> tuple[Prior, ...]:
 def given_priors(inputs: Inputs) -> tuple[Prior, ...]:
     """The priors that the rig file gives on what is calibrated."""
     priors = []
-    for camera, stream in zip(inputs.rig.cameras, inputs.measurements.cameras, strict=True):
-        for name, _ in CAMERA_PARAMETERS:
-            shift = origin_difference(inputs.measurements, stream) if name == "time_offset" else 0.0
-            priors += _given(inputs.layout, camera.name, name, getattr(camera, name), shift)
+    names = {s.name: s for s in inputs.sensors}
+    for block in inputs.layout.free:
+        if block.sensor not in names:
+            continue
+        difference = origin_difference(inputs.measurements, inputs.stream(block.sensor))
+        shift = difference if block.name == "time_offset" else 0.0
+        given = getattr(names[block.sensor], block.name)
+        priors += _given(inputs.layout, block.sensor, block.name, given, shift)
     return tuple(priors)
 
 
@@ -186,6 +216,7 @@ def assemble(
     keep: list[np.ndarray],
     held: np.ndarray = NOTHING,
     following: Following | None = None,
+    ranging: Sequence[LidarNoise] = (),
 ) -> Problem:
     """The problem at the nodes of `state`, everything frozen that a pass freezes: nodes, assignment, preintegration.
     held: directions of the border that stay, see Problem."""
@@ -208,8 +239,22 @@ def assemble(
     tolerance = inputs.tolerances.of(layout, None if rig.imu is None else rig.imu.name)
     features = None if following is None else _features(inputs, state, tuple(factors), following)
     return Problem(
-        layout, _chain(inputs, state), tuple(factors), _priors(inputs), tolerance, held, features, rig.has_target
-    )
+        layout, _chain(inputs, state), tuple(factors), _priors(inputs), tolerance, held, features,
+        _others(inputs, state, ranging), rig.has_target,
+    )  # fmt: skip
+
+
+def motion_of(inputs: Inputs, state: State) -> Motion:
+    """The IMU's motion as `state` has it."""
+    assert inputs.imu is not None
+    return Motion(state, inputs.imu, inputs.rig.gravity, inputs.rig.settings.max_gap_s)
+
+
+def _others(inputs: Inputs, state: State, ranging: Sequence[LidarNoise]) -> tuple[SensorFactor, ...]:
+    if inputs.imu is None:
+        return ()
+    motion = motion_of(inputs, state)
+    return robot_factors(inputs.rig, inputs.measurements, inputs.clouds, ranging, motion, inputs.layout)
 
 
 def _features(inputs: Inputs, state: State, cameras: tuple[CornerFactor, ...], following: Following) -> FeatureFactor:

@@ -68,4 +68,5 @@ def _moved(problem: Problem, state: State, chain: np.ndarray, readings: np.ndarr
     factor = ImuFactor.build(imu, state, problem.chain.gravity, problem.chain.columns)
     cameras = tuple(replace(c, imu=imu) for c in problem.cameras)
     features = None if problem.features is None else replace(problem.features, cameras=cameras)
-    return replace(problem, chain=factor, cameras=cameras, features=features), state
+    sensors = tuple(s.with_imu(imu) for s in problem.sensors)
+    return replace(problem, chain=factor, cameras=cameras, features=features, sensors=sensors), state

@@ -23,7 +23,11 @@ from icalib.estimation.corner_noise import (
 )
 from icalib.estimation.evidence import fits
 from icalib.estimation.feature_noise import first_following, inliers, next_following
+from icalib.estimation.lidar_binning import LidarNoise
+from icalib.estimation.lidar_factor import LidarFactor
 from icalib.estimation.problem import Problem
+from icalib.estimation.robot import first_ranging, next_ranging
+from icalib.estimation.sensor_factor import chi2
 from icalib.estimation.solver import CONVERGED_DECREASE, Outcome, Step, Visit, minimise
 from icalib.estimation.state import State
 from icalib.rig import Settings
@@ -60,10 +64,11 @@ def estimate(
     noise = [m.noise(s, c, rig.settings) for m, s, c in zip(models, streams, rig.cameras, strict=True)]
     keep = [np.ones(len(s.uv), dtype=bool) for s in streams]
     following = first_following(inputs)
+    ranging = [first_ranging(x, rig.settings) for x in rig.lidars]
     history: list[tuple[str, Step]] = []
     names = pass_names(inputs)
     for name in names:
-        problem = assemble(inputs, state, noise, keep, held, following)
+        problem = assemble(inputs, state, noise, keep, held, following, ranging)
 
         def note(step: Step, name: str = name) -> None:
             history.append((name, step))
@@ -83,10 +88,24 @@ def estimate(
             following = next_following(rig, problem, outcome, following, name == "first")
         if _noise_is_estimated(inputs):
             models, noise = _next_noise(inputs, problem, outcome)
+            ranging = _next_ranging(inputs, problem, outcome, ranging)
         state = resample(outcome.state, nodes_for(inputs, image_times(inputs, outcome.state.values)), inputs)
         del problem, outcome  # before the next ones take as much memory
         pages.give_back()
     raise AssertionError("pass_names is never empty")
+
+
+def first_pass(inputs: Inputs, state: State) -> State:
+    """Where the solver is led by all measurements from a first `state`, before any is judged.
+
+    Raises EstimationError where the data do not carry an estimate.
+    """
+    rig, streams = inputs.rig, inputs.measurements.cameras
+    noise = [first_noise(c).noise(s, c, rig.settings) for s, c in zip(streams, rig.cameras, strict=True)]
+    keep = [np.ones(len(s.uv), dtype=bool) for s in streams]
+    ranging = [first_ranging(x, rig.settings) for x in rig.lidars]
+    problem = assemble(inputs, state, noise, keep, following=first_following(inputs), ranging=ranging)
+    return minimise(problem, state, tolerance=EARLY_DECREASE).state
 
 
 def _next_noise(inputs: Inputs, problem: Problem, outcome: Outcome) -> tuple[list[NoiseModel], list[CornerNoise]]:
@@ -107,6 +126,17 @@ def _next_noise(inputs: Inputs, problem: Problem, outcome: Outcome) -> tuple[lis
     return models, noise
 
 
+def _next_ranging(inputs: Inputs, problem: Problem, outcome: Outcome, ranging: list[LidarNoise]) -> list[LidarNoise]:
+    """Noise of the LiDARs, as the residuals of this pass show it."""
+    found = []
+    pairs = list(zip(problem.sensors, outcome.residuals.sensors, strict=True))
+    for lidar, noise in zip(inputs.rig.lidars, ranging, strict=True):
+        own = [(f, out) for f, out in pairs if isinstance(f, LidarFactor) and f.name == lidar.name]
+        shown = [(chi2(out, f.kinds["points"]), f.count(out, "points")) for f, out in own]
+        found.append(next_ranging(lidar, noise, *shown[0]) if shown else noise)
+    return found
+
+
 def _noise_is_estimated(inputs: Inputs) -> bool:
     settings = inputs.rig.settings
     cornered = [c for c, s in zip(inputs.rig.cameras, inputs.measurements.cameras, strict=True) if len(s.uv)]
@@ -115,6 +145,7 @@ def _noise_is_estimated(inputs: Inputs) -> bool:
         (bool(cornered) and (settings.blur_noise or settings.common_error))
         or any(c.corner_noise_px is None for c in cornered)
         or any(c.track_noise_px is None for c in tracked)
+        or (inputs.clouds.count > 0 and any(x.range_noise_m is None for x in inputs.rig.lidars))
     )
 
 

@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from icalib.errors import EstimationError
+from icalib.estimation import sensor_factor
 from icalib.estimation.arrowhead import (
     Piece,
     in_parallel,
@@ -17,9 +18,11 @@ from icalib.estimation.arrowhead import (
     solve,
 )
 from icalib.estimation.corner_factor import CornerFactor, CornerOutput
-from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput, hold_frame
+from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput
+from icalib.estimation.gauge import hold_frame
 from icalib.estimation.imu_factor import ROWS
 from icalib.estimation.problem import Problem
+from icalib.estimation.sensor_factor import SensorFactor
 from icalib.estimation.solver import Outcome
 from icalib.estimation.state import State
 
@@ -71,6 +74,10 @@ def fits(problem: Problem, outcome: Outcome, seed: int = 0) -> list[Fit]:
             key, n = (camera.name, "features"), 2 * int((root > 0.0).sum())
             chi2 = float(((residual * root[:, None]) ** 2).sum())
             out.append(Fit(*key, n, n - float(np.mean(spent[key])), chi2))
+    for sensor, rows in zip(problem.sensors, outcome.residuals.sensors, strict=True):
+        for kind, r in sensor.kinds.items():
+            key, n = (sensor.name, kind), sensor.count(rows, kind)
+            out.append(Fit(*key, n, n - float(np.mean(spent[key])), sensor_factor.chi2(rows, r)))
     return out
 
 
@@ -102,7 +109,18 @@ def _probe(problem: Problem, outcome: Outcome, rng: np.random.Generator) -> dict
             spent[camera.name, kind] = sum(one[kind] for one in found)
     if problem.features is not None and base.features is not None:
         spent |= _spent_by_features(problem.features, base.features, ends, noise.features)
+    for sensor, at, own in zip(problem.sensors, base.sensors, noise.sensors, strict=True):
+        slope = _slope(sensor, problem.n_nodes, ends)
+        spent |= {(sensor.name, kind): sensor_factor.spent(at, own, slope, r) for kind, r in sensor.kinds.items()}
     return spent
+
+
+def _slope(sensor: SensorFactor, n_nodes: int, ends: list[State]) -> np.ndarray:
+    """(n, m) derivative of the whitened residuals from the second of `ends` to the first, by a posterior sample."""
+    up, down = (sensor.output() for _ in ends)
+    for out, state in zip((up, down), ends, strict=True):
+        sensor.accumulate(state, Piece.bare(0, n_nodes - 1), out, sums=False)
+    return (up.residual - down.residual) / (2.0 * PROBE_STEP)
 
 
 def _feature_residuals(factor: FeatureFactor, state: State) -> FeatureOutput:

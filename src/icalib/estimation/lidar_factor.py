@@ -13,8 +13,9 @@ residuals are these four.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
@@ -25,6 +26,7 @@ from icalib.estimation.lidar_binning import BIN_S, Associated, LidarNoise, Momen
 from icalib.estimation.lidar_binning import Motion as ImuMotion
 from icalib.estimation.lidar_kernels import ROWS, Bins, Motion, Planes
 from icalib.estimation.poses import assign_nodes, poses_at
+from icalib.estimation.sensor_factor import Whitened
 from icalib.estimation.state import Key, Layout, State
 from icalib.geometry.planes import tangents
 from icalib.measurements import LidarStream
@@ -37,6 +39,8 @@ CHUNK = 512  # bins at a time: what a chunk needs stays in the cache
 class LidarFactor:
     """All scans of one LiDAR. node (n,), increasing: the node that each bin of `moments` hangs on; planes: keys of the
     values that the rows of the moments' planes have in a state."""
+
+    kinds: ClassVar[dict[str, slice]] = {"points": slice(0, ROWS)}
 
     name: str
     moments: Moments
@@ -76,39 +80,45 @@ class LidarFactor:
         pose = self.layout.columns(self.name, "rotation", "translation", "time_offset")
         return np.concatenate([pose, imu[imu >= 0]]), np.array([self.layout.block(*p).columns for p in self.planes])
 
-    def output(self) -> np.ndarray:
-        """Empty whitened residuals (E, 4) for `accumulate` to fill."""
-        return np.zeros((len(self.moments.plane), ROWS))
+    def with_imu(self, imu: ImuData) -> LidarFactor:
+        """See `SensorFactor`."""
+        return replace(self, imu=imu)
+
+    def output(self) -> Whitened:
+        """Empty rows (E, 4) for `accumulate` to fill; the moments hold the robust weights."""
+        shape = len(self.moments.plane), ROWS
+        return Whitened(np.zeros(shape), np.broadcast_to(1.0, shape))
 
     def accumulate(
         self,
         state: State,
         piece: Piece,
-        out: np.ndarray,
+        out: Whitened,
         sums: bool = True,
         curved: bool = False,
         noise: np.ndarray | None = None,
     ) -> float:
-        """Fills whitened residuals `out` (E, 4) of bins whose node lies in `piece`, and adds them to its sums where
-        `sums` are wanted.
-
-        Returns half the chi^2. `curved` changes nothing: within a pass weights are constant. With `noise` (E, 4), white
-        numbers in place of the residuals, `out` stays as it is.
-        """
+        """See `SensorFactor`. `curved` changes nothing: within a pass weights are constant. With `noise` (E, 4) `out`
+        stays as it is."""
         del curved
         into, total = piece.sums(sums), 0.0
         given = noise is not None
         for bins, motion, planes in self._chunks(state, *self._bins_of(piece)):
-            total += lidar_kernels.accumulate(bins, motion, planes, given, noise if given else out, into, out)
+            total += lidar_kernels.accumulate(
+                bins, motion, planes, given, noise if given else out.residual, into, out.residual
+            )
         return total
 
-    def chi2(self, out: np.ndarray) -> dict[str, tuple[int, float]]:
-        """Number and chi^2 of the points, for `evidence.Fit`; robust weights as they were taken."""
-        return {"points": (int(self.moments.count.sum()), float((out**2).sum()))}
+    def count(self, out: Whitened, kind: str) -> int:
+        """The points: their chi^2 is that of the rows, exactly."""
+        del out, kind
+        return int(self.moments.count.sum())
 
-    def spent(self, noise: np.ndarray, slope: np.ndarray) -> dict[str, float]:
-        """e^T J x of white noise e (E, 4) and the residuals' derivative `slope` (E, 4) along x."""
-        return {"points": float((noise * slope).sum())}
+    def rms(self, out: Whitened, kind: str) -> tuple[float, str]:
+        """Of the points' distances to their planes, weighted as they are."""
+        del kind
+        weight = float((self.moments.root[:, 0] ** 2).sum())
+        return float(np.sqrt((out.residual**2).sum() / weight)), "m"
 
     def _chunks(self, state: State, b0: int, b1: int) -> Iterator[tuple[Bins, Motion, Planes]]:
         """Bins b0..b1 by the chunk, with their motion and the planes."""

@@ -17,9 +17,11 @@ from icalib.estimation.arrowhead import (
     marginalise_in_segments,
 )
 from icalib.estimation.corner_factor import CornerFactor, CornerOutput
-from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput, hold_frame
+from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput
+from icalib.estimation.gauge import hold_frame
 from icalib.estimation.imu_factor import ROWS
 from icalib.estimation.prior_factor import Prior
+from icalib.estimation.sensor_factor import SensorFactor, Whitened
 from icalib.estimation.state import Layout, State
 
 
@@ -58,16 +60,18 @@ class Residuals:
     imu: np.ndarray
     corners: tuple[CornerOutput, ...]
     features: FeatureOutput | None = None
+    sensors: tuple[Whitened, ...] = ()  # but for the cameras
 
 
 @dataclass(frozen=True)
 class WhiteNoise:
     """A draw in place of all whitened residuals: of the chain (K - 1, 15), of corners (N, 2) and common errors
-    (V, 2, m) by camera, of features (N, 2) by camera."""
+    (V, 2, m) by camera, of features (N, 2) by camera, of other sensors (n, m) by sensor."""
 
     imu: np.ndarray
     corners: tuple[tuple[np.ndarray, np.ndarray], ...]
     features: tuple[np.ndarray, ...]
+    sensors: tuple[np.ndarray, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -83,6 +87,7 @@ class Problem:
         default_factory=lambda: NOTHING
     )  # (B, m) orthonormal directions of the border, in tolerance units, that stay
     features: FeatureFactor | None = None
+    sensors: tuple[SensorFactor, ...] = ()  # but for the cameras
     framed: bool = True  # a target says where the world's origin is; else nothing does, and it stays where it is
 
     @property
@@ -119,6 +124,8 @@ class Problem:
             camera.accumulate(state, piece, None, curved=True)
         if self.features is not None:
             self.features.accumulate(state, piece, self.features.output(), curved=True)
+        for sensor in self.sensors:
+            sensor.accumulate(state, piece, sensor.output(), curved=True)
         self.add_bias_prior(state, piece)
         for prior in self.priors if first == 0 else ():
             prior.accumulate(state, piece)
@@ -129,7 +136,8 @@ class Problem:
         """Empty arrays for `linearise` to fill."""
         corners = tuple(c.output() for c in self.cameras)
         features = None if self.features is None else self.features.output()
-        return Residuals(np.zeros((self.n_nodes - 1, ROWS)), corners, features)
+        sensors = tuple(s.output() for s in self.sensors)
+        return Residuals(np.zeros((self.n_nodes - 1, ROWS)), corners, features, sensors)
 
     def scratch(self, at: Residuals) -> Residuals:
         """`at`, to be filled once more, with room for features of this problem's own."""
@@ -160,12 +168,14 @@ class Problem:
     def add_measurements(
         self, state: State, piece: Piece, out: Residuals, sums: bool = True, curved: bool = False
     ) -> float:
-        """Adds IMU, corners and features in `piece`; returns half their robust chi^2."""
+        """Adds IMU, corners, features and other sensors in `piece`; returns half their robust chi^2."""
         cost = self.chain.accumulate(state, piece, out.imu, sums)
         for camera, corners in zip(self.cameras, out.corners, strict=True):
             cost += camera.accumulate(state, piece, corners, sums, curved)
         if self.features is not None and out.features is not None:
             cost += self.features.accumulate(state, piece, out.features, sums, curved)
+        for sensor, rows in zip(self.sensors, out.sensors, strict=True):
+            cost += sensor.accumulate(state, piece, rows, sums, curved)
         return cost
 
     def white_noise(self, rng: np.random.Generator) -> WhiteNoise:
@@ -173,7 +183,9 @@ class Problem:
         imu = rng.standard_normal((self.n_nodes - 1, ROWS))
         corners = tuple(c.white_noise(rng) for c in self.cameras)
         streams = () if self.features is None else self.features.streams
-        return WhiteNoise(imu, corners, tuple(rng.standard_normal(s.uv.shape) for s in streams))
+        features = tuple(rng.standard_normal(s.uv.shape) for s in streams)
+        sensors = tuple(rng.standard_normal(s.output().residual.shape) for s in self.sensors)
+        return WhiteNoise(imu, corners, features, sensors)
 
     def add_noise(self, state: State, piece: Piece, noise: WhiteNoise) -> None:
         """Adds to `piece` what `noise` gives in place of the residuals: J^T J and J^T e, priors as if they were met."""
@@ -182,6 +194,8 @@ class Problem:
             camera.accumulate(state, piece, None, noise=own)
         if self.features is not None:
             self.features.accumulate(state, piece, self.features.output(), noise=noise.features)
+        for sensor, own in zip(self.sensors, noise.sensors, strict=True):
+            sensor.accumulate(state, piece, sensor.output(), noise=own)
         self.add_prior_information(piece, state)
 
     def add_bias_prior(self, state: State, piece: Piece, sums: bool = True) -> float:

@@ -22,7 +22,10 @@ class Tolerances:
     bloom: float = 0.1
     shape: float = 1e-3
     tilt: float = np.deg2rad(0.1)
-    plane: tuple[float, float, float] = (np.deg2rad(0.1), np.deg2rad(0.1), 5e-3)  # normal, distance
+    radii: float = 1e-4
+    baseline: float = 1e-3
+    # Of normal and distance: wide, so that what is open is told in words of the sensors that it is open for.
+    plane: tuple[float, float, float] = (np.deg2rad(10.0), np.deg2rad(10.0), 0.5)
     imu_intrinsics: float = 1e-2  # scale, misalignment [rad]; g-sensitivity rad/s per m/s^2
 
     @classmethod

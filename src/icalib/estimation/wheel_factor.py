@@ -13,7 +13,7 @@ between the wheels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -22,8 +22,15 @@ from icalib.estimation.arrowhead import Piece
 from icalib.estimation.corner_factor import LOSSES
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.poses import Poses, motion_at, poses_at
+from icalib.estimation.sensor_factor import Whitened
 from icalib.estimation.state import Layout, State
-from icalib.estimation.wheel_intervals import Instants, WheelIntervals, choose_intervals, quadrature
+from icalib.estimation.wheel_intervals import (
+    Instants,
+    WheelIntervals,
+    choose_intervals,
+    pose_intervals,
+    quadrature,
+)
 from icalib.estimation.wheel_kernels import (
     Loss,
     Rows,
@@ -34,6 +41,7 @@ from icalib.estimation.wheel_kernels import (
     relative_rows,
 )
 from icalib.estimation.wheel_poses import RelativePoses, preintegrated
+from icalib.measurements import WheelPoses
 
 OWN = ("rotation", "translation", "time_offset", "radii", "baseline")
 
@@ -48,15 +56,6 @@ class WheelNoise:
     upwards: float = 5e-3
     loss: str = "none"
     loss_scale: float = 2.5
-
-
-@dataclass(frozen=True)
-class WheelOutput:
-    """Per interval and row: whitened residual (n, m), predicted - measured, and root (n, m), square root of its robust
-    weight."""
-
-    residual: np.ndarray
-    root: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -75,6 +74,7 @@ class IncrementFactor:
     kinds: ClassVar[dict[str, slice]] = {
         "wheels": slice(0, 2), "sideways slip": slice(2, 3), "upwards slip": slice(3, 4),
     }  # fmt: skip
+    units: ClassVar[dict[str, str]] = {"wheels": "rad", "sideways slip": "m", "upwards slip": "m"}
 
     name: str
     intervals: WheelIntervals
@@ -108,15 +108,27 @@ class IncrementFactor:
         measured[:, :2] = angles[found.last] - angles[found.first]
         return cls(name, found, measured, whitening, quadrature(seconds, found), imu, gravity, noise, layout)
 
-    def empty_output(self) -> WheelOutput:
+    def with_imu(self, imu: ImuData) -> IncrementFactor:
+        """See `SensorFactor`."""
+        return replace(self, imu=imu)
+
+    def output(self) -> Whitened:
         """Empty arrays for `accumulate` to fill."""
-        return _empty_output(len(self.measured), 4)
+        return _output(len(self.measured), 4)
+
+    def count(self, out: Whitened, kind: str) -> int:
+        """Intervals times the rows of `kind`."""
+        return out.residual[:, self.kinds[kind]].size
+
+    def rms(self, out: Whitened, kind: str) -> tuple[float, str]:
+        """Of the residuals of `kind`."""
+        return _rms(out, self.whitening, self.kinds[kind]), self.units[kind]
 
     def accumulate(
         self,
         state: State,
         piece: Piece,
-        out: WheelOutput,
+        out: Whitened,
         sums: bool = True,
         curved: bool = False,
         noise: np.ndarray | None = None,
@@ -153,7 +165,8 @@ class RelativePoseFactor:
     variables): the shorter the intervals, the more.
     """
 
-    kinds: ClassVar[dict[str, slice]] = {"wheels": slice(0, 3)}
+    kinds: ClassVar[dict[str, slice]] = {"yaw": slice(0, 1), "path": slice(1, 3)}
+    units: ClassVar[dict[str, str]] = {"yaw": "rad", "path": "m"}
 
     name: str
     seconds: np.ndarray  # (N,) stamps since the first on the wheels' clock
@@ -163,6 +176,21 @@ class RelativePoseFactor:
     gravity: float
     noise: WheelNoise
     layout: Layout
+
+    @classmethod
+    def of_poses(
+        cls, stream: WheelPoses, imu: ImuData, gravity: float, noise: WheelNoise, layout: Layout, state: State
+    ) -> RelativePoseFactor:
+        """Of relative poses that were measured as such: they say nothing of radii and baseline."""
+        found = pose_intervals(imu, state.seconds, state.starts, stream.seconds + _offset(stream.name, state))
+        k = found.first
+        W = np.linalg.inv(np.linalg.cholesky(stream.covariance[k]))
+        poses = RelativePoses(stream.pose[k], np.zeros((len(k), 3, 3)), W, np.zeros(3))
+        return cls(stream.name, stream.seconds, found, poses, imu, gravity, noise, layout)
+
+    @property
+    def whitening(self) -> np.ndarray:
+        return self.poses.W
 
     @classmethod
     def build(
@@ -182,15 +210,27 @@ class RelativePoseFactor:
         poses = preintegrated(seconds, angles, found, drive_of(name, state), noise.wheel, noise.sideways)
         return cls(name, seconds, found, poses, imu, gravity, noise, layout)
 
-    def empty_output(self) -> WheelOutput:
+    def with_imu(self, imu: ImuData) -> RelativePoseFactor:
+        """See `SensorFactor`."""
+        return replace(self, imu=imu)
+
+    def output(self) -> Whitened:
         """Empty arrays for `accumulate` to fill."""
-        return _empty_output(len(self.poses.z), 3)
+        return _output(len(self.poses.z), 3)
+
+    def count(self, out: Whitened, kind: str) -> int:
+        """Intervals times the rows of `kind`."""
+        return out.residual[:, self.kinds[kind]].size
+
+    def rms(self, out: Whitened, kind: str) -> tuple[float, str]:
+        """Of the residuals of `kind`."""
+        return _rms(out, self.whitening, self.kinds[kind]), self.units[kind]
 
     def accumulate(
         self,
         state: State,
         piece: Piece,
-        out: WheelOutput,
+        out: Whitened,
         sums: bool = True,
         curved: bool = False,
         noise: np.ndarray | None = None,
@@ -233,8 +273,13 @@ def _track(node: np.ndarray, poses: Poses) -> Track:
     return Track(node, poses.rotation, poses.position, poses.rate, poses.velocity, poses.by_node, poses.by_imu)
 
 
-def _empty_output(n: int, m: int) -> WheelOutput:
-    return WheelOutput(np.zeros((n, m)), np.zeros((n, m)))
+def _output(n: int, m: int) -> Whitened:
+    return Whitened(np.zeros((n, m)), np.zeros((n, m)))
+
+
+def _rms(out: Whitened, whitening: np.ndarray, rows: slice) -> float:
+    residual = np.linalg.solve(whitening, out.residual[:, :, None])[:, rows, 0]
+    return float(np.sqrt(np.mean(residual**2)))
 
 
 def _in_piece(intervals: WheelIntervals, piece: Piece) -> slice:
@@ -249,7 +294,7 @@ def _add(
     rows: Rows,
     whitening: np.ndarray,
     piece: Piece,
-    out: WheelOutput,
+    out: Whitened,
     sums: bool,
     curved: bool,
     noise: np.ndarray | None,

@@ -16,8 +16,8 @@ PANEL_S = 0.025
 
 @dataclass(frozen=True)
 class WheelIntervals:
-    """n stretches between wheel stamps `first` and `last` (n,). The first end hangs on `node` (n,), strictly
-    increasing, the last one on the node after it."""
+    """n stretches between wheel stamps `first` and `last` (n,). The first end hangs on `node` (n,), in order, the last
+    one on the node after it."""
 
     first: np.ndarray
     last: np.ndarray
@@ -40,6 +40,21 @@ def choose_intervals(imu: ImuData, nodes: np.ndarray, starts: tuple[int, ...], t
     good[np.array(starts[1:], dtype=np.int64) - 1] = False
     node = np.flatnonzero(good)
     return WheelIntervals(near[node], near[node + 1], node)
+
+
+def pose_intervals(imu: ImuData, nodes: np.ndarray, starts: tuple[int, ...], times: np.ndarray) -> WheelIntervals:
+    """All stretches from one stamp to the next, each on the two nodes about its middle; `times` (N,): stamps on the imu
+    clock. None leaves the IMU's recording, touches a gap in it, or lies beyond the nodes or between recordings."""
+    a, b = times[:-1], times[1:]
+    middle = 0.5 * (a + b)
+    good = (b - a <= LONGEST_S) & (a >= imu.seconds[0]) & (b <= imu.seconds[-1])
+    good &= (middle > nodes[0]) & (middle < nodes[-1])
+    for start, end in (*imu.gaps, *imu.seams):
+        good &= (b <= start) | (a >= end)
+    node = np.searchsorted(nodes, middle) - 1
+    good &= ~np.isin(node + 1, starts)
+    k = np.flatnonzero(good)
+    return WheelIntervals(k, k + 1, node[k])
 
 
 class Instants(NamedTuple):

@@ -41,6 +41,12 @@ def moved(plane: np.ndarray, d: np.ndarray) -> np.ndarray:
     return plane_of(turned, point + d[2] * normal)
 
 
+def difference(to: np.ndarray, plane: np.ndarray) -> np.ndarray:
+    """(3,) d with `moved(plane, d)` the plane `to` (6,), to first order."""
+    across = tangents(np.ascontiguousarray(plane[:3]))
+    return np.append(across @ to[:3], plane[:3] @ (to[3:] - plane[3:]))
+
+
 def closest_point(plane: np.ndarray) -> np.ndarray:
     """(3,) the paper's p_pi = d n: the point of `plane` (6,) closest to the origin [m]."""
     return (plane[:3] @ plane[3:]) * plane[:3]

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 
-from icalib.rig import Camera, ImuSensor, Parameter, Rig, Settings
+from icalib.rig import Camera, ImuSensor, Lidar, Parameter, Rig, Settings, Wheels
 from icalib.simulation.imu import rotation_from_vector
+from icalib.simulation.robot import SimLidar, SimWheels
 from icalib.simulation.scenario import GRAVITY_WORLD, Scenario, SimCamera
 from icalib.simulation.simulate import raw_time_offset
 
+Sensor = TypeVar("Sensor", Camera, Lidar, Wheels)
+Robotic = TypeVar("Robotic", Lidar, Wheels)
 Treatment = Literal["free", "start", "fixed"] | Parameter
 _GUESS_STREAM = 3000  # of random numbers; see `simulate` for the others
 
@@ -51,6 +54,7 @@ def rig_for(
     distortion: Treatment = "fixed",
     bloom: Treatment = "free",
     imu_intrinsics: Treatment = "fixed",
+    drive: Treatment = "free",
 ) -> Rig:
     """The scenario's rig, noise as simulated (as stated by the scenario, where its noise is switched off).
 
@@ -73,6 +77,27 @@ def rig_for(
             bloom=_parameter(bloom, [sim.bloom_px]),
         )
 
+    def mounted(sensor: Robotic, sim: SimLidar | SimWheels, T_imu_sensor: np.ndarray) -> Robotic:
+        return replace(
+            sensor,
+            rotation=_parameter(rotation, T_imu_sensor[:3, :3]),
+            translation=_parameter(translation, T_imu_sensor[:3, 3]),
+            time_offset=_parameter(time_offset, [raw_time_offset(scenario, sim)]),
+        )
+
+    def wheels(sim: SimWheels) -> Wheels:
+        kind = "poses" if sim.reports == "poses" else "rates"
+        given = Wheels(
+            sim.name, f"{sim.name}/{kind}.csv", radii=_parameter(drive, sim.radii),
+            baseline=_parameter(drive, [sim.baseline]), wheel_noise=sim.noise, measures=kind, meaning=sim.meaning,
+        )  # fmt: skip
+        return mounted(given, sim, sim.T_imu_wheel)
+
+    def lidar(sim: SimLidar) -> Lidar:
+        near, far = sim.range_m
+        given = Lidar(sim.name, f"{sim.name}/scans.npz", sim.range_noise_m, near_m=near, far_m=far)
+        return mounted(given, sim, sim.T_imu_lidar)
+
     imu = ImuSensor("imu0", "imu0/data.csv", scenario.imu_noise, _parameter(imu_intrinsics, scenario.imu_intrinsics))
     return Rig(
         imu,
@@ -80,6 +105,8 @@ def rig_for(
         scenario.target,
         gravity=float(np.linalg.norm(GRAVITY_WORLD)),
         settings=settings_for(scenario) if settings is None else settings,
+        lidars=tuple(lidar(s) for s in scenario.lidars),
+        wheels=tuple(wheels(s) for s in scenario.wheels),
     )
 
 
@@ -89,15 +116,36 @@ def with_drawn_guess(rig: Rig, scenario: Scenario, seed: int, error: GuessError 
     rng = np.random.default_rng([seed, _GUESS_STREAM])
     spread = GuessError() if error is None else error
     cameras = [_guessed(c, s, scenario, rng, spread) for c, s in zip(rig.cameras, scenario.cameras, strict=True)]
-    return replace(rig, cameras=tuple(cameras))
+    lidars = [
+        _with_guess(x, _drawn_pose(s.T_imu_lidar, raw_time_offset(scenario, s), rng, spread))
+        for x, s in zip(rig.lidars, scenario.lidars, strict=True)
+    ]
+    wheels = [
+        _with_guess(
+            x, _drawn_pose(s.T_imu_wheel, raw_time_offset(scenario, s), rng, spread) | _drawn_drive(s, rng, spread)
+        )
+        for x, s in zip(rig.wheels, scenario.wheels, strict=True)
+    ]
+    return replace(rig, cameras=tuple(cameras), lidars=tuple(lidars), wheels=tuple(wheels))
 
 
 def _guessed(camera: Camera, sim: SimCamera, scenario: Scenario, rng: np.random.Generator, error: GuessError) -> Camera:
     drawn = _drawn_pose(sim.T_imu_cam, raw_time_offset(scenario, sim), rng, error)
     focal = np.array(sim.intrinsics[:2]) * (1.0 + error.focal_length * rng.standard_normal())
     drawn["intrinsics"] = np.array([*focal, *(0.5 * (side - 1) for side in sim.resolution)])
-    free = {name: value for name, value in drawn.items() if getattr(camera, name).mode == "free"}
-    return replace(camera, **{name: Parameter("free", value) for name, value in free.items()})
+    return _with_guess(camera, drawn)
+
+
+def _with_guess(sensor: Sensor, drawn: dict[str, np.ndarray]) -> Sensor:
+    """The sensor with what was drawn for its free groups."""
+    free = {name: value for name, value in drawn.items() if getattr(sensor, name).mode == "free"}
+    return replace(sensor, **{name: Parameter("free", value) for name, value in free.items()})
+
+
+def _drawn_drive(sim: SimWheels, rng: np.random.Generator, error: GuessError) -> dict[str, np.ndarray]:
+    """Radii and baseline, as far off as focal lengths."""
+    share = 1.0 + error.focal_length * rng.standard_normal(3)
+    return {"radii": np.array(sim.radii) * share[:2], "baseline": np.array([sim.baseline * share[2]])}
 
 
 def _drawn_pose(

@@ -255,7 +255,7 @@ class DriveProblem:
         return make_pieces(self.n_nodes, self.layout.size)
 
     def residuals(self):
-        return np.zeros((self.n_nodes - 1, ROWS)), self.wheels.empty_output()
+        return np.zeros((self.n_nodes - 1, ROWS)), self.wheels.output()
 
     def linearise(self, state, pieces, out, sums=True, curved=False):
         def add(piece):

@@ -19,7 +19,7 @@ def factor_on(world, noise=UNIT):
 
 
 def output(factor, state, **options):
-    out = factor.empty_output()
+    out = factor.output()
     pieces = make_pieces(len(state.seconds), factor.layout.size)
     return out, sum(factor.accumulate(state, p, out, **options) for p in pieces), pieces
 

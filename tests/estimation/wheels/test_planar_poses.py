@@ -114,7 +114,7 @@ def factor_on(world):
 
 def residuals(factor, state):
     """(n, 3) rad, m, m."""
-    out = factor.empty_output()
+    out = factor.output()
     for piece in make_pieces(len(state.seconds), factor.layout.size):
         factor.accumulate(state, piece, out, sums=False)
     return np.linalg.solve(factor.poses.W, out.residual[:, :, None])[:, :, 0]

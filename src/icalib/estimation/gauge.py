@@ -1,0 +1,23 @@
+"""Where the world's origin is and which way x points, in a rig without a target: the first node stays where it is.
+
+A target's frame is the world's; planes and points have none of their own, and turning all about gravity or moving
+it changes no measurement.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icalib.estimation.arrowhead import Piece
+from icalib.estimation.state import State
+
+FRAME = 1e4  # information [1/m^2, 1/rad^2] along what nothing sees: any number does
+
+
+def hold_frame(state: State, piece: Piece, node: int) -> None:
+    """Holds the position of `node`, and its turn about gravity, where they are: without a target nothing in the world
+    says where its origin is. Adds to the sums of `piece`; there is no gradient, and what is seen does not depend on it.
+    """
+    k, up = node - piece.first, state.rotation[node][2]
+    piece.diagonal[k, 0:3, 0:3] += FRAME * np.outer(up, up)
+    piece.diagonal[k, range(3, 6), range(3, 6)] += FRAME

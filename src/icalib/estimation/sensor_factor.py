@@ -1,0 +1,77 @@
+"""What the problem and the evidence ask of a sensor's factor, whatever it measures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Protocol
+
+import numpy as np
+
+from icalib.estimation.arrowhead import Piece
+from icalib.estimation.imu_data import ImuData
+from icalib.estimation.state import State
+
+
+@dataclass(frozen=True)
+class Whitened:
+    """Rows of a factor: residual (n, m), whitened, predicted - measured, and root (n, m), square root of the robust
+    weight of each."""
+
+    residual: np.ndarray
+    root: np.ndarray
+
+
+class SensorFactor(Protocol):
+    """All measurements of one sensor. kinds: rows of its residuals by name; imu: the readings that carry it from nodes
+    to its own instants."""
+
+    kinds: ClassVar[dict[str, slice]]
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def imu(self) -> ImuData: ...
+
+    def with_imu(self, imu: ImuData) -> SensorFactor:
+        """The same measurements, carried by other readings."""
+        ...
+
+    def output(self) -> Whitened:
+        """Empty rows for `accumulate` to fill."""
+        ...
+
+    def accumulate(
+        self,
+        state: State,
+        piece: Piece,
+        out: Whitened,
+        sums: bool = True,
+        curved: bool = False,
+        noise: np.ndarray | None = None,
+    ) -> float:
+        """Fills `out` for what lies in `piece`, and adds it to the piece's sums where `sums` are wanted. Returns half
+        the robust chi^2.
+
+        `curved`: J^T J has the true curvature of the robust loss, not its weights alone. `noise` (n, m), white, stands
+        in for the weighted residuals where given.
+        """
+        ...
+
+    def count(self, out: Whitened, kind: str) -> int:
+        """How many measurements of a kind are in use."""
+        ...
+
+    def rms(self, out: Whitened, kind: str) -> tuple[float, str]:
+        """Of the residuals of a kind as they were before whitening, and their unit."""
+        ...
+
+
+def chi2(out: Whitened, rows: slice) -> float:
+    """Of some columns of the rows, robust weights as they are."""
+    return float(((out.residual[:, rows] * out.root[:, rows]) ** 2).sum())
+
+
+def spent(out: Whitened, noise: np.ndarray, slope: np.ndarray, rows: slice) -> float:
+    """e^T J x of white noise e (n, m), slope (n, m) the derivative of the whitened residuals along x."""
+    return float((noise[:, rows] * slope[:, rows] * out.root[:, rows]).sum())

@@ -1,0 +1,138 @@
+"""First guesses of what stands on a robot beside its cameras, once these have given its motion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from icalib.errors import EstimationError
+from icalib.estimation.assembly import Inputs, motion_of, origin_difference, with_clouds
+from icalib.estimation.estimate import first_pass
+from icalib.estimation.lidar_binning import Motion, in_world
+from icalib.estimation.poses import assign_nodes, poses_at
+from icalib.estimation.robot import DRIVE, MOUNT, Clouds, known_planes, plane_key, wheel_angles
+from icalib.estimation.state import Key, State
+from icalib.first_guess.wheels import WheelRates, drive_guess, wheel_offset, wheel_rates
+from icalib.geometry.planes import plane_of
+from icalib.measurements import WheelPoses, WheelStream
+from icalib.rig import Lidar, Wheels
+
+SIMPSON = np.array([1.0, 4.0, 1.0]) / 6.0
+
+
+def wheel_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
+    """Where the solver starts with the wheels, `state` having the motion. What the rig gives is used.
+
+    Raises EstimationError where neither the rig nor the motion shows it.
+    """
+    out: dict[Key, np.ndarray] = {}
+    for wheels, stream in zip(inputs.rig.wheels, inputs.measurements.wheels, strict=True):
+        out |= _wheels(inputs, state, wheels, stream)
+    return out
+
+
+def with_robot(bare: Inputs, state: State, whole: Inputs) -> tuple[Inputs, State]:
+    """`whole` with the points of its LiDARs on planes, and where the solver starts with it: from the motion that the
+    measurements of `bare`, which have no LiDAR and no wheels, give from `state` on.
+
+    Raises EstimationError where a sensor shows no guess, and the rig has none.
+    """
+    settled = first_pass(bare, state)
+    values = state.values | wheel_values(whole, settled)
+    inputs, own = with_lidars(whole, replace(settled, values=values))
+    return inputs, replace(settled, values=values | own)
+
+
+def given(inputs: Inputs, sensor: Lidar | Wheels, names: Sequence[str]) -> dict[Key, np.ndarray]:
+    """What the rig gives of a sensor, time offsets between clocks that start at their first stamps."""
+    out: dict[Key, np.ndarray] = {}
+    for name in names:
+        value = getattr(sensor, name).value
+        if value is not None:
+            shift = origin_difference(inputs.measurements, inputs.stream(sensor.name)) if name == "time_offset" else 0.0
+            out[sensor.name, name] = np.array(value, dtype=np.float64) + shift
+    return out
+
+
+def _wheels(inputs: Inputs, state: State, wheels: Wheels, stream: WheelStream | WheelPoses) -> dict[Key, np.ndarray]:
+    names = [name for name, _, _ in (*MOUNT, *DRIVE)]
+    known = given(inputs, wheels, names)
+    if isinstance(stream, WheelPoses):
+        known |= {(wheels.name, name): np.ones(n) for name, _, n in DRIVE}
+    if len(known) == len(names):
+        return known
+    assert inputs.imu is not None
+    if isinstance(stream, WheelPoses):
+        raise EstimationError(
+            f"{wheels.name} reports poses, from which nothing is guessed; give its rotation, translation and "
+            "time_offset in the rig file."
+        )
+    rates = wheel_rates(wheels.name, stream.seconds, wheel_angles(stream))
+    up = np.einsum("nji,j->i", state.rotation, [0.0, 0.0, 1.0])
+    offset = known.get((wheels.name, "time_offset"))
+    if offset is None:
+        offset = np.array([wheel_offset(inputs.imu, up, wheels.name, rates)])
+    drive = drive_guess(wheels.name, *_means(motion_of(inputs, state), rates, offset[0]), up)
+    found = {
+        "rotation": drive.rotation, "translation": drive.position, "time_offset": offset,
+        "radii": drive.radii, "baseline": np.array([drive.baseline]),
+    }  # fmt: skip
+    return {(wheels.name, name): value for name, value in found.items()} | known
+
+
+def _means(motion: Motion, rates: WheelRates, offset: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(n, 2) rates of the wheels, and the means (n, 3) of the IMU's rate and velocity over the same spans, in its axes.
+
+    Raises EstimationError where the wheels turned while nothing else was recorded.
+    """
+    state = motion.state
+    start, end = rates.start + offset, rates.end + offset
+    inside = (start >= state.seconds[0]) & (end <= state.seconds[-1])
+    if not inside.any():
+        raise EstimationError(
+            "no reading of the wheels falls within the recording of the other sensors; check their clocks, or "
+            "time_offset in the rig file."
+        )
+    start, end = start[inside], end[inside]
+    times = np.stack([start, 0.5 * (start + end), end], axis=1).ravel()
+    node = assign_nodes("inertial", state.seconds, times)
+    poses = poses_at("inertial", times, node, state, motion.imu, motion.gravity, False)
+    velocity = np.einsum("nji,nj->ni", poses.rotation, poses.velocity)
+    rate, speed = (np.einsum("k,nki->ni", SIMPSON, x.reshape(-1, 3, 3)) for x in (poses.rate, velocity))
+    return rates.rate[inside], rate, speed
+
+
+def with_lidars(inputs: Inputs, state: State) -> tuple[Inputs, dict[Key, np.ndarray]]:
+    """Points of the LiDARs on planes, and the values that start with them: of the LiDARs and of the planes."""
+    if not inputs.rig.lidars:
+        return inputs, {}
+    assert inputs.imu is not None
+    names, values = [name for name, _, _ in MOUNT], dict[Key, np.ndarray]()
+    for lidar in inputs.rig.lidars:
+        known = given(inputs, lidar, names)
+        if len(known) < len(names):
+            raise EstimationError(f"{lidar.name}: give its rotation, translation and time_offset in the rig file.")
+        values |= known
+    clouds, _ = known_planes(inputs.measurements.lidars)
+    planes = fitted_planes(inputs, replace(state, values=state.values | values), clouds)
+    return with_clouds(inputs, clouds), values | planes
+
+
+def fitted_planes(inputs: Inputs, state: State, clouds: Clouds) -> dict[Key, np.ndarray]:
+    """Values of the planes that fit the points best in which `state` puts them."""
+    motion, sums = motion_of(inputs, state), np.zeros((clouds.count, 4, 4))
+    for stream, plane in zip(inputs.measurements.lidars, clouds.plane, strict=True):
+        points, _ = in_world(motion, stream)
+        homogeneous = np.column_stack([np.ones(len(points), dtype=np.float32), points])[plane >= 0].astype(np.float64)
+        own = plane[plane >= 0]
+        for i in range(4):
+            for j in range(4):
+                sums[:, i, j] += np.bincount(own, homogeneous[:, i] * homogeneous[:, j], clouds.count)
+    out = {}
+    for k, M in enumerate(sums):
+        centre = M[0, 1:] / M[0, 0]
+        spread = M[1:, 1:] / M[0, 0] - np.outer(centre, centre)
+        out[plane_key(k)] = plane_of(np.linalg.eigh(spread)[1][:, 0], centre)
+    return out
