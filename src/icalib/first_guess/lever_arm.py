@@ -21,7 +21,8 @@ from icalib.first_guess.target_poses import TargetPoses
 STEP_S = 0.12  # between the images of a triple: long against pose noise, short against the loss of sight
 READINGS = 8192  # of the IMU at a time, whose rotations are made together
 BIAS_SIGMA = 0.3  # m/s^2
-ROW_SIGMA = 0.05  # m/s, of a row of the system
+SHARED = 2.0  # rows share images: the error of their mean falls as if they were a quarter as many
+ROW_SIGMA = 0.05  # m/s, of a row of the system; more where the poses of the target are worse
 G_TOLERANCE = 0.1
 GIVEN_TOLERANCE = 0.5  # of both, where a guess that may be degrees off goes into them
 SIZE_TOLERANCE = 0.15  # of the target, as the accelerometer shows it
@@ -77,16 +78,16 @@ def lever_arm(
 
 
 def _solve(rows: np.ndarray, rhs: np.ndarray) -> np.ndarray:
-    """Least squares with a weak prior on the bias, twice: the second time without rows that stand far off."""
-    prior = np.zeros((9, 9))
-    prior[np.arange(9), np.arange(9)] = ROW_SIGMA / np.array([10.0] * 3 + [1e3] * 3 + [BIAS_SIGMA] * 3)
-    weight, x = np.ones(len(rows)), np.zeros(9)
-    for _ in range(3):
-        A = np.concatenate([(rows * weight[:, None, None]).reshape(-1, 9), prior])
+    """Least squares with a weak prior on lever arm and bias, again without rows that stand far off."""
+    prior = np.diag(1.0 / np.array([1.0] * 3 + [1e3] * 3 + [BIAS_SIGMA] * 3))
+    weight, sigma, x = np.ones(len(rows)), ROW_SIGMA, np.zeros(9)
+    for _ in range(4):
+        A = np.concatenate([(rows * weight[:, None, None]).reshape(-1, 9), sigma * prior])
         b = np.concatenate([(rhs * weight[:, None]).ravel(), np.zeros(9)])
         x = np.linalg.lstsq(A, b, rcond=None)[0]
         size = np.linalg.norm(rhs - rows @ x, axis=1)
         weight = (size < 4.0 * np.median(size) + 1e-9).astype(float)
+        sigma = max(ROW_SIGMA, SHARED * float(np.median(size)))
     return x
 
 
