@@ -11,8 +11,8 @@ from icalib.errors import EstimationError
 from icalib.estimation.arrowhead import make_pieces, solve
 from icalib.estimation.lidar_binning import Associated, LidarNoise, in_world, take_moments
 from icalib.estimation.poses import Poses, assign_nodes, poses_at
-from icalib.estimation.sensor_factor import Whitened, spent
-from icalib.estimation.sensor_factor import chi2 as weighted_squares
+from icalib.estimation.sensors import Whitened, spent
+from icalib.estimation.sensors import chi2 as weighted_squares
 from icalib.estimation.state import NODE
 from icalib.geometry.planes import moved
 from icalib.simulation import simulate

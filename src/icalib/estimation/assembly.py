@@ -25,7 +25,7 @@ from icalib.estimation.poses import assign_nodes, poses_at
 from icalib.estimation.prior_factor import Prior
 from icalib.estimation.problem import ChainFactor, Problem
 from icalib.estimation.robot import NO_CLOUDS, Clouds, own_entries, plane_entries, robot_factors
-from icalib.estimation.sensor_factor import SensorFactor
+from icalib.estimation.sensors import SensorFactor
 from icalib.estimation.state import Entry, Key, Kind, Layout, State, make_layout
 from icalib.estimation.tolerances import Tolerances
 from icalib.geometry.cameras import camera_model

@@ -27,7 +27,7 @@ from icalib.estimation.lidar_binning import LidarNoise
 from icalib.estimation.lidar_factor import LidarFactor
 from icalib.estimation.problem import Problem
 from icalib.estimation.robot import first_ranging, next_ranging
-from icalib.estimation.sensor_factor import chi2
+from icalib.estimation.sensors import chi2
 from icalib.estimation.solver import CONVERGED_DECREASE, Outcome, Step, Visit, minimise
 from icalib.estimation.state import State
 from icalib.rig import Settings

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation import sensor_factor
+from icalib.estimation import sensors
 from icalib.estimation.arrowhead import (
     Piece,
     in_parallel,
@@ -22,7 +22,7 @@ from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput
 from icalib.estimation.gauge import hold_frame
 from icalib.estimation.imu_factor import ROWS
 from icalib.estimation.problem import Problem
-from icalib.estimation.sensor_factor import SensorFactor
+from icalib.estimation.sensors import SensorFactor
 from icalib.estimation.solver import Outcome
 from icalib.estimation.state import State
 
@@ -77,7 +77,7 @@ def fits(problem: Problem, outcome: Outcome, seed: int = 0) -> list[Fit]:
     for sensor, rows in zip(problem.sensors, outcome.residuals.sensors, strict=True):
         for kind, r in sensor.kinds.items():
             key, n = (sensor.name, kind), sensor.count(rows, kind)
-            out.append(Fit(*key, n, n - float(np.mean(spent[key])), sensor_factor.chi2(rows, r)))
+            out.append(Fit(*key, n, n - float(np.mean(spent[key])), sensors.chi2(rows, r)))
     return out
 
 
@@ -111,7 +111,7 @@ def _probe(problem: Problem, outcome: Outcome, rng: np.random.Generator) -> dict
         spent |= _spent_by_features(problem.features, base.features, ends, noise.features)
     for sensor, at, own in zip(problem.sensors, base.sensors, noise.sensors, strict=True):
         slope = _slope(sensor, problem.n_nodes, ends)
-        spent |= {(sensor.name, kind): sensor_factor.spent(at, own, slope, r) for kind, r in sensor.kinds.items()}
+        spent |= {(sensor.name, kind): sensors.spent(at, own, slope, r) for kind, r in sensor.kinds.items()}
     return spent
 
 

@@ -26,7 +26,7 @@ from icalib.estimation.lidar_binning import BIN_S, Associated, LidarNoise, Momen
 from icalib.estimation.lidar_binning import Motion as ImuMotion
 from icalib.estimation.lidar_kernels import ROWS, Bins, Motion, Planes
 from icalib.estimation.poses import assign_nodes, poses_at
-from icalib.estimation.sensor_factor import Whitened
+from icalib.estimation.sensors import Whitened
 from icalib.estimation.state import Key, Layout, State
 from icalib.geometry.planes import tangents
 from icalib.measurements import LidarStream

@@ -21,7 +21,7 @@ from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput
 from icalib.estimation.gauge import hold_frame
 from icalib.estimation.imu_factor import ROWS
 from icalib.estimation.prior_factor import Prior
-from icalib.estimation.sensor_factor import SensorFactor, Whitened
+from icalib.estimation.sensors import SensorFactor, Whitened
 from icalib.estimation.state import Layout, State
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from icalib.estimation.lidar_binning import LidarNoise, Motion
 from icalib.estimation.lidar_factor import LidarFactor
-from icalib.estimation.sensor_factor import SensorFactor
+from icalib.estimation.sensors import SensorFactor
 from icalib.estimation.state import Entry, Key, Kind, Layout
 from icalib.estimation.wheel_angles import angles_from_rates
 from icalib.estimation.wheel_factor import IncrementFactor, RelativePoseFactor, WheelNoise

@@ -22,7 +22,7 @@ from icalib.estimation.arrowhead import Piece
 from icalib.estimation.corner_factor import LOSSES
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.poses import Poses, motion_at, poses_at
-from icalib.estimation.sensor_factor import Whitened
+from icalib.estimation.sensors import Whitened
 from icalib.estimation.state import Layout, State
 from icalib.estimation.wheel_intervals import (
     Instants,
