@@ -229,8 +229,8 @@ REFUSED = {
     "no times": (stamped((PLAIN, lambda t, s: {})), {}, "no times (their fields are x, y, z, intensity); record a clo"),
     "milliseconds": (
         stamped((VELODYNE, lambda t, s: {"time": (t - s) * 1e-6})), {},
-        "times `time`, read as s, spread over 98.89 s, though scans are 0.1 s apart; they look like another unit; divide "
-        "them by 1000.",
+        "times `time`, read as s, spread over 98.89 s, though scans are 0.1 s apart; they look like another unit; "
+        "divide them by 1000.",
     ),
     "microseconds": (
         stamped((OUSTER, lambda t, s: {"t": (t - s) // 1000})), {},

@@ -32,10 +32,11 @@ def checked_wheels(
     if len(read.stamps_ns) < 3:
         raise RecordingError(f"{what}: only {len(read.stamps_ns)} readings; a calibration needs the whole recording.")
     _refuse_non_finite(read, what)
-    read, notes = _in_order(read, what)
+    _refuse_disorder(read, what)
     sentence = rate_sentence(what, read.stamps_ns, *_RATE_HZ)
     if sentence:
         raise RecordingError(sentence)
+    read, notes = _without_repeats(read, what)
     rate = read.value if wheels.measures == "rates" else _mean_rates(read, wheels)
     _refuse_units(rate, wheels, what)
     meaning = wheels.meaning if wheels.measures == "rates" else "mean"
@@ -49,16 +50,18 @@ def _refuse_non_finite(read: WheelReadings, what: str) -> None:
         raise RecordingError(f"{what}: the reading at {read.stamps_ns[np.argmax(bad)]} ns is not finite; remove it.")
 
 
-def _in_order(read: WheelReadings, what: str) -> tuple[WheelReadings, tuple[str, ...]]:
-    """Without readings that repeat."""
-    step = np.diff(read.stamps_ns)
-    if (step < 0).any():
-        i = int(np.argmax(step < 0))
+def _refuse_disorder(read: WheelReadings, what: str) -> None:
+    back = np.diff(read.stamps_ns) < 0
+    if back.any():
+        i = int(np.argmax(back))
         raise RecordingError(
             f"{what}: the reading at {read.stamps_ns[i + 1]} ns comes after the one at {read.stamps_ns[i]} ns; sort "
             "the readings by stamp, or record again if the clock was set back."
         )
-    repeat = np.concatenate([[False], step == 0])
+
+
+def _without_repeats(read: WheelReadings, what: str) -> tuple[WheelReadings, tuple[str, ...]]:
+    repeat = np.concatenate([[False], np.diff(read.stamps_ns) == 0])
     if not repeat.any():
         return read, ()
     differs = repeat.copy()
@@ -86,18 +89,18 @@ def _mean_rates(read: WheelReadings, wheels: Wheels) -> np.ndarray:
 
 
 def _refuse_units(rate: np.ndarray, wheels: Wheels, what: str) -> None:
-    fast = float(np.percentile(np.abs(rate).max(axis=1), 99))
+    faster = np.abs(rate).max(axis=1)
+    fast = float(np.percentile(faster, 50 if wheels.measures == "ticks" else 99))
     if fast > _FASTEST_RAD_S:
         advice = {
             "rates": "deg/s are to be multiplied by pi / 180, turns a minute by pi / 30",
-            "angles": "degrees are to be multiplied by pi / 180; counts of an encoder are `measures: ticks`",
+            "angles": "degrees are to be multiplied by pi / 180, counts of an encoder are `measures: ticks`",
             "ticks": "correct counts_per_turn",
         }[wheels.measures]
-        raise RecordingError(f"{what}: the wheels turn at up to {fast:.4g} rad/s, faster than any robot's; {advice}.")
-    peak = float(np.abs(rate).max())
-    if wheels.measures == "ticks" and peak > _FASTEST_RAD_S:
+        raise RecordingError(f"{what}: the wheels turn at {fast:.4g} rad/s, faster than any robot's; {advice}.")
+    if wheels.measures == "ticks" and faster.max() > _FASTEST_RAD_S:
         raise RecordingError(
-            f"{what}: a wheel turns at {peak:.4g} rad/s for an instant, as where a counter starts anew; set "
+            f"{what}: a wheel turns at {faster.max():.4g} rad/s for an instant, as where a counter starts anew; set "
             f"counter_size of {wheels.name} in the rig file (65536 for 16 bits), or remove what is wrong."
         )
 
@@ -122,7 +125,7 @@ def _stuck_notes(stream: WheelStream, what: str) -> tuple[str, ...]:
         same &= np.abs(stream.rate[:, other]) > _TURNING_RAD_S
         same &= np.concatenate([[False], np.diff(stream.rate[:, other]) != 0])
         begin, end = _longest_run(same)
-        duration = (stream.stamps_ns[end] - stream.stamps_ns[begin]) * 1e-9 if end > begin else 0.0
+        duration = (stream.stamps_ns[end] - stream.stamps_ns[begin]) * 1e-9
         if duration > _STUCK_S:
             notes.append(
                 f"{what}: the {name} wheel reports {stream.rate[begin, side]:.4g} rad/s for {duration:.3g} s from "
@@ -131,11 +134,12 @@ def _stuck_notes(stream: WheelStream, what: str) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _longest_run(flag: np.ndarray) -> tuple[int, int]:
-    """First and last index of the longest run of True in `flag` (N,); (0, 0) without one."""
-    edge = np.diff(np.concatenate([[0], flag.astype(np.int8), [0]]))
+def _longest_run(repeats: np.ndarray) -> tuple[int, int]:
+    """First and last reading of the longest run in which each but the first `repeats` (N,) the one before; (0, 0)
+    without one."""
+    edge = np.diff(np.concatenate([[0], repeats.astype(np.int8), [0]]))
     begin, end = np.flatnonzero(edge == 1), np.flatnonzero(edge == -1)
     if not len(begin):
         return 0, 0
     longest = int(np.argmax(end - begin))
-    return int(begin[longest]), int(end[longest] - 1)
+    return int(begin[longest] - 1), int(end[longest] - 1)
