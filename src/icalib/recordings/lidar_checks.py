@@ -47,17 +47,21 @@ class Sieve:
 
 
 def sifted(stream: LidarStream, sieve: Sieve) -> LidarStream:
-    """`stream` with those of its points that the sieve keeps; a scan may lose all."""
+    """`stream` with those of its points that the sieve keeps; a scan may lose all. What is kept moves up in the arrays
+    of `stream` itself, which are no longer of use: a second cloud would not fit in memory."""
     n = len(stream.xyz)
+    columns = (stream.offset_s, stream.xyz, stream.plane)
     keep = np.empty(n, bool)
-    for i in range(0, n, _BATCH):
-        part = slice(i, i + _BATCH)
+    kept = 0
+    for begin in range(0, n, _BATCH):
+        part = slice(begin, min(begin + _BATCH, n))
         keep[part] = sieve.keep(stream.xyz[part], stream.offset_s[part])
-    if keep.all():
-        return stream
+        count = int(np.count_nonzero(keep[part]))
+        for column in columns:
+            column[kept : kept + count] = column[part][keep[part]]
+        kept += count
     start = stream.start - np.searchsorted(np.flatnonzero(~keep), stream.start)
-    columns = (stream.offset_s[keep], stream.xyz[keep], stream.plane[keep])
-    return LidarStream(stream.name, stream.stamps_ns, start, *columns)
+    return LidarStream(stream.name, stream.stamps_ns, start, *(column[:kept] for column in columns))
 
 
 def checked_lidar(stream: LidarStream, where: str) -> tuple[LidarStream, tuple[str, ...]]:
