@@ -14,6 +14,7 @@ from icalib.errors import RecordingError
 from icalib.extras import load_typesys, load_zstd
 from icalib.geometry.targets import Target
 from icalib.measurements import CornerStream, ImuStream, LidarStream, TrackStream, WheelPoses
+from icalib.recordings import livox
 from icalib.recordings.bags.opening import ZSTD_MAGIC, open_storages
 from icalib.recordings.bags.storage import Tally
 from icalib.recordings.clouds import read_clouds
@@ -223,6 +224,8 @@ def _deserialise(encoding: str, content: bytes, kind: str) -> Any:
     if content.startswith(ZSTD_MAGIC):  # ROS 2 can compress message by message
         content = _decompress(content)
     try:
+        if kind in livox.TYPES:
+            return (livox.parse_ros1 if encoding == "ros1" else livox.parse_cdr)(content)
         return _stores()[encoding](content, kind)
     except (struct.error, IndexError, *_serde_errors()) as error:
         raise ValueError(str(error)) from error

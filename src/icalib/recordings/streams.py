@@ -11,6 +11,7 @@ import numpy as np
 
 from icalib.errors import RecordingError
 from icalib.recordings.clouds import PointCloud
+from icalib.recordings.livox import LivoxCloud
 
 
 class HasMessages(Protocol):
@@ -118,9 +119,12 @@ def read_joints(bag: HasMessages, topic: str) -> JointStream:
 
 
 def point_clouds(bag: HasMessages, topic: str) -> Iterator[PointCloud]:
-    """The PointCloud2 of `topic`, one at a time. Raises RecordingError as `BagRecording.messages`, and for a message
-    shorter than its points."""
+    """The PointCloud2, or Livox's CustomMsg, of `topic`, one at a time. Raises RecordingError as
+    `BagRecording.messages`, and for a message shorter than its points."""
     for stamp_ns, m in bag.messages(topic, "points"):
+        if isinstance(m, LivoxCloud):
+            yield PointCloud(stamp_ns, m.header.frame_id, m.points)
+            continue
         if len(m.data) < m.row_step * m.height or m.row_step < m.point_step * m.width:
             raise RecordingError(f"{bag.root} {topic}: the points at {stamp_ns} ns are cut off; record again.")
         rows = m.data[: m.row_step * m.height].reshape(m.height, m.row_step)[:, : m.point_step * m.width]

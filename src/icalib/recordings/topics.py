@@ -16,6 +16,8 @@ KINDS = {
     "sensor_msgs/msg/CameraInfo": "camera info",
     "sensor_msgs/msg/Imu": "imu",
     "sensor_msgs/msg/PointCloud2": "points",
+    "livox_ros_driver/msg/CustomMsg": "points",
+    "livox_ros_driver2/msg/CustomMsg": "points",
     "sensor_msgs/msg/JointState": "joints",
     "nav_msgs/msg/Odometry": "odometry",
     "geometry_msgs/msg/TwistStamped": "twist",
