@@ -8,7 +8,16 @@ from itertools import pairwise
 
 import numpy as np
 
-from icalib.measurements import CornerStream, ImuStream, Measurements, TrackStream
+from icalib.errors import RecordingError
+from icalib.measurements import (
+    CornerStream,
+    ImuStream,
+    LidarStream,
+    Measurements,
+    TrackStream,
+    WheelPoses,
+    WheelStream,
+)
 from icalib.rig import Rig
 
 PAUSE_NS = 10_000_000_000
@@ -49,8 +58,9 @@ def join(rig: Rig, recordings: Sequence[Measurements]) -> tuple[Measurements, tu
     return (_joined(recordings, shifts) if len(recordings) > 1 else recordings[0]), parts
 
 
-def _streams(measurements: Measurements) -> list[ImuStream | CornerStream]:
-    return [*([] if measurements.imu is None else [measurements.imu]), *measurements.cameras]
+def _streams(measurements: Measurements) -> list[ImuStream | CornerStream | LidarStream | WheelStream | WheelPoses]:
+    imus = [] if measurements.imu is None else [measurements.imu]
+    return [*imus, *measurements.cameras, *measurements.lidars, *measurements.wheels]
 
 
 def _shifts(rig: Rig, recordings: Sequence[Measurements]) -> list[int]:
@@ -84,7 +94,11 @@ def _joined(recordings: Sequence[Measurements], shifts: list[int]) -> Measuremen
         imu = ImuStream(imus[0][0].name, stamps, gyro, accel)
     cameras = (join_corners([(m.cameras[k], shift) for m, shift in shifted]) for k in range(len(recordings[0].cameras)))
     notes = tuple(f"{m.name}: {note}" for m in recordings for note in m.notes)
-    return Measurements(imu, tuple(cameras), notes, tracks=_joined_tracks(shifted))
+    lidars = (join_scans([(m.lidars[k], shift) for m, shift in shifted]) for k in range(len(recordings[0].lidars)))
+    wheels = (join_wheels([(m.wheels[k], shift) for m, shift in shifted]) for k in range(len(recordings[0].wheels)))
+    return Measurements(
+        imu, tuple(cameras), notes, tracks=_joined_tracks(shifted), lidars=tuple(lidars), wheels=tuple(wheels)
+    )
 
 
 def _joined_tracks(recordings: list[tuple[Measurements, int]]) -> tuple[TrackStream, ...]:
@@ -113,3 +127,28 @@ def join_corners(streams: list[tuple[CornerStream, int]]) -> CornerStream:
     start = np.concatenate([[0], np.cumsum(np.concatenate([np.diff(s.start) for s, _ in streams]))])
     point, uv = np.concatenate([s.point for s, _ in streams]), np.concatenate([s.uv for s, _ in streams])
     return CornerStream(streams[0][0].name, stamps, start.astype(np.int64), point, uv)
+
+
+def join_scans(streams: list[tuple[LidarStream, int]]) -> LidarStream:
+    """One LiDAR's scans of all recordings, each with what to add to its stamps [ns]."""
+    stamps = np.concatenate([s.stamps_ns + np.int64(shift) for s, shift in streams])
+    start = np.concatenate([[0], np.cumsum(np.concatenate([np.diff(s.start) for s, _ in streams]))]).astype(np.int64)
+    columns = (np.concatenate([getattr(s, name) for s, _ in streams]) for name in ("offset_s", "xyz", "plane"))
+    return LidarStream(streams[0][0].name, stamps, start, *columns)
+
+
+def join_wheels(streams: list[tuple[WheelStream | WheelPoses, int]]) -> WheelStream:
+    """The readings of all recordings, each with what to add to its stamps [ns]; a mean rate from the end of one to the
+    beginning of the next means nothing. Raises RecordingError for relative poses: there is none between recordings."""
+    stamps, rates = [], []
+    for wheels, shift in streams:
+        if isinstance(wheels, WheelPoses):
+            raise RecordingError(
+                f"{wheels.name} measures relative poses, and there is none from one recording to the next; give one "
+                "recording, or wheels that measure rates, angles or ticks."
+            )
+        stamps.append(wheels.stamps_ns + np.int64(shift))
+        rates.append(wheels.rate)
+    first = streams[0][0]
+    assert isinstance(first, WheelStream)  # see above
+    return WheelStream(first.name, np.concatenate(stamps), np.concatenate(rates), first.meaning)

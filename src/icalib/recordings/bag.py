@@ -13,15 +13,20 @@ import numpy as np
 from icalib.errors import RecordingError
 from icalib.extras import load_typesys, load_zstd
 from icalib.geometry.targets import Target
-from icalib.measurements import CornerStream, ImuStream, TrackStream
+from icalib.measurements import CornerStream, ImuStream, LidarStream, TrackStream, WheelPoses
+from icalib.recordings import livox
 from icalib.recordings.bags.opening import ZSTD_MAGIC, open_storages
 from icalib.recordings.bags.storage import Tally
+from icalib.recordings.clouds import read_clouds
 from icalib.recordings.image_checks import checked_payloads, frames
 from icalib.recordings.images import Frame, Payload, file_payload
+from icalib.recordings.streams import point_clouds, read_joints
 from icalib.recordings.topics import KINDS, TopicInfo, choose_topic, find_topic
 from icalib.recordings.tracks import read_tracks
-from icalib.rig import Camera, ImuSensor
+from icalib.recordings.wheels import WheelReadings, read_wheel_joints
+from icalib.rig import Camera, ImuSensor, Lidar, Wheels
 
+_KINDS_OF = {ImuSensor: "imu", Lidar: "points", Wheels: "joints"}
 _SWAPPED_NS = 1_000_000_000  # readings overtake each other on the network by less; more is a clock that was set back
 
 
@@ -56,7 +61,7 @@ class BagRecording:
         return frames(self.payloads(topic), f"{self.root} {topic}", self._note)
 
     def imu(self, sensor: ImuSensor) -> ImuStream:
-        topic = self._imu_topic(sensor)
+        topic = self._topic(sensor)
         stamps: list[int] = []
         rows: list[tuple[float, ...]] = []
         for stamp, message in self.messages(topic, "imu"):
@@ -89,9 +94,23 @@ class BagRecording:
         self._tables.append(path)
         return read_tracks(camera.name, path, camera.resolution)
 
-    def where(self, sensor: ImuSensor | Camera) -> str:
-        topic = self._imu_topic(sensor) if isinstance(sensor, ImuSensor) else self.image_topic(sensor)
-        return f"{self.root} {topic}"
+    def lidar(self, sensor: Lidar) -> LidarStream:
+        topic = self._topic(sensor)
+        stream, notes = read_clouds(point_clouds(self, topic), sensor, f"{self.root} {topic} ({sensor.name})")
+        for note in notes:
+            self._note(note)
+        return stream
+
+    def wheels(self, sensor: Wheels) -> WheelReadings | WheelPoses:
+        topic = self._topic(sensor)
+        read = read_wheel_joints(sensor, read_joints(self, topic), f"{self.root} {topic} ({sensor.name})")
+        order = self._order(topic, read.stamps_ns)
+        return WheelReadings(sensor.name, read.stamps_ns[order], read.value[order])
+
+    def where(self, sensor: ImuSensor | Camera | Lidar | Wheels) -> str:
+        if isinstance(sensor, Camera):
+            return f"{self.root} {self.image_topic(sensor)}"
+        return f"{self.root} {self._topic(sensor)}"
 
     def files(self) -> list[Path]:
         return [*(storage.name for storage in self._storages), *self._tables]
@@ -141,8 +160,8 @@ class BagRecording:
             for key, received_ns, content in storage.messages(wanted):
                 yield received_ns, storage.connections[key].encoding, content
 
-    def _imu_topic(self, imu: ImuSensor) -> str:
-        return choose_topic(str(self.root), self._topics, "imu", imu.name, imu.topic).name
+    def _topic(self, sensor: ImuSensor | Lidar | Wheels) -> str:
+        return choose_topic(str(self.root), self._topics, _KINDS_OF[type(sensor)], sensor.name, sensor.topic).name
 
     def _order(self, topic: str, stamps_ns: np.ndarray) -> np.ndarray:
         """The order by stamp; as it is where the clock was set back, which the checks refuse."""
@@ -205,6 +224,8 @@ def _deserialise(encoding: str, content: bytes, kind: str) -> Any:
     if content.startswith(ZSTD_MAGIC):  # ROS 2 can compress message by message
         content = _decompress(content)
     try:
+        if kind in livox.TYPES:
+            return (livox.parse_ros1 if encoding == "ros1" else livox.parse_cdr)(content)
         return _stores()[encoding](content, kind)
     except (struct.error, IndexError, *_serde_errors()) as error:
         raise ValueError(str(error)) from error

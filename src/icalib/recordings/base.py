@@ -9,10 +9,11 @@ from typing import Protocol
 import numpy as np
 
 from icalib.geometry.targets import Target
-from icalib.measurements import CornerStream, ImuStream, TrackStream
+from icalib.measurements import CornerStream, ImuStream, LidarStream, TrackStream, WheelPoses
 from icalib.recordings.images import Frame, Payload
 from icalib.recordings.topics import TopicInfo
-from icalib.rig import Camera, ImuSensor
+from icalib.recordings.wheels import WheelReadings
+from icalib.rig import Camera, ImuSensor, Lidar, Wheels
 
 
 class Recording(Protocol):
@@ -78,7 +79,22 @@ class Recording(Protocol):
         """
         ...
 
-    def where(self, sensor: ImuSensor | Camera) -> str:
+    def lidar(self, sensor: Lidar) -> LidarStream:
+        """All scans of the LiDAR, points that cannot be used left out, which the notes say; a scan may have none.
+
+        Raises RecordingError naming file or topic where the data are missing or cannot be read, and where the times of
+        points are not known.
+        """
+        ...
+
+    def wheels(self, sensor: Wheels) -> WheelReadings | WheelPoses:
+        """All readings of the wheels as they were written: stamps may still repeat or run backwards.
+
+        Raises RecordingError naming file and line, or topic, where the data are missing or cannot be read.
+        """
+        ...
+
+    def where(self, sensor: ImuSensor | Camera | Lidar | Wheels) -> str:
         """How a sentence names the place of the sensor's data, for example the file."""
         ...
 

@@ -10,15 +10,18 @@ import numpy as np
 
 from icalib.errors import RecordingError
 from icalib.geometry.targets import Target
-from icalib.measurements import CornerStream, ImuStream, TrackStream
+from icalib.measurements import CornerStream, ImuStream, LidarStream, TrackStream, WheelPoses
 from icalib.recordings.corners import group_corners
 from icalib.recordings.euroc_images import file_payloads, image_files
 from icalib.recordings.image_checks import checked_payloads, frames
 from icalib.recordings.images import Frame, Payload
+from icalib.recordings.lidar_checks import Sieve, sifted
+from icalib.recordings.scans import read_scan_stamps, read_scans
 from icalib.recordings.table import columns_of, read_table
 from icalib.recordings.topics import TopicInfo, choose_topic, find_topic
 from icalib.recordings.tracks import read_tracks
-from icalib.rig import Camera, ImuSensor
+from icalib.recordings.wheels import ENDS, POSES, STAMP, VALUES, WheelReadings, read_wheel_table
+from icalib.rig import Camera, ImuSensor, Lidar, Wheels
 
 _IMU_DECIMALS = ("wx [rad/s]", "wy [rad/s]", "wz [rad/s]", "ax [m/s^2]", "ay [m/s^2]", "az [m/s^2]")
 _IMU_STAMP = ("t [ns]",)
@@ -31,8 +34,8 @@ class FolderRecording:
     """A folder of tables and images; those of EuRoC's `mav0` are found, too.
 
     IMU: t [ns], wx, wy, wz [rad/s], ax, ay, az [m/s^2], which is also EuRoC's `imu0/data.csv`. Corners: t [ns], tag id,
-    corner (as the target names its points), u, v [px]. Images: the folder `data` beside a `data.csv` of t [ns], file
-    name.
+    corner (as the target names its points), u, v [px]. Scans of a LiDAR: arrays (`scans`). Wheels: tables
+    (`wheels`). Images: the folder `data` beside a `data.csv` of t [ns], file name.
     """
 
     def __init__(self, root: Path) -> None:
@@ -51,6 +54,7 @@ class FolderRecording:
             if table := _existing(folder, "corners.csv"):
                 stamps_ns = np.unique(read_table(table, _CORNER_INTEGERS, _CORNER_DECIMALS).integers[:, 0])
                 found.append(_info(f"{folder.name}/corners.csv", "table of corners", "corners", stamps_ns))
+            found += [_info(f"{folder.name}/{table.name}", *what, _stamps(table)) for table, what in _robot(folder)]
         return tuple(found)
 
     def stamps(self, topic: str) -> np.ndarray:
@@ -60,6 +64,8 @@ class FolderRecording:
             return np.array([stamp_ns for stamp_ns, _ in image_files(folder)], np.int64)
         if chosen.kind == "imu":
             return read_table(self._locate(chosen.name), _IMU_STAMP, _IMU_DECIMALS).integers[:, 0].copy()
+        if chosen.kind in ("points", "wheels"):
+            return _stamps(self._locate(chosen.name))
         return np.unique(read_table(self._locate(chosen.name), _CORNER_INTEGERS, _CORNER_DECIMALS).integers[:, 0])
 
     def image_topic(self, camera: Camera) -> str:
@@ -100,7 +106,21 @@ class FolderRecording:
         self._remember(path)
         return read_tracks(camera.name, path, camera.resolution)
 
-    def where(self, sensor: ImuSensor | Camera) -> str:
+    def lidar(self, sensor: Lidar) -> LidarStream:
+        path = self._locate(sensor.path)
+        self._remember(path)
+        sieve = Sieve(sensor.near_m, sensor.far_m)
+        stream = sifted(read_scans(sensor.name, path), sieve)
+        if note := sieve.note(f"{path} ({sensor.name})"):
+            self._note(note)
+        return stream
+
+    def wheels(self, sensor: Wheels) -> WheelReadings | WheelPoses:
+        path = self._locate(sensor.path)
+        self._remember(path)
+        return read_wheel_table(sensor, path)
+
+    def where(self, sensor: ImuSensor | Camera | Lidar | Wheels) -> str:
         if isinstance(sensor, Camera) and not self.has_corners(sensor):
             return f"{self.root / self.image_topic(sensor)}"
         return str(self._locate(sensor.path))
@@ -152,6 +172,23 @@ class FolderRecording:
 
 def _existing(folder: Path, name: str) -> Path | None:
     return next((p for p in (folder / name, folder / f"{name}.gz") if p.is_file()), None)
+
+
+def _robot(folder: Path) -> Iterator[tuple[Path, tuple[str, str]]]:
+    """Tables of LiDARs and wheels with their type and kind."""
+    names = {"scans.npz": ("scans", "points")} | {f"{m}.csv": (f"table of {m}", "wheels") for m in (*VALUES, "poses")}
+    for name, what in names.items():
+        if table := _existing(folder, name):
+            yield table, what
+
+
+def _stamps(table: Path) -> np.ndarray:
+    """(N,) int64 ns of scans or wheels."""
+    if table.suffix == ".npz":
+        return read_scan_stamps(table)
+    poses = columns_of(table) == len(ENDS + POSES)
+    integers, decimals = (ENDS, POSES) if poses else (STAMP, VALUES["rates"])
+    return read_table(table, integers, decimals).integers[:, 0].copy()
 
 
 def _images(folder: Path) -> TopicInfo | None:

@@ -14,12 +14,13 @@ import numpy as np
 
 from icalib.errors import RecordingError
 from icalib.geometry.targets import Target
-from icalib.measurements import CornerStream, ImuStream, TrackStream
+from icalib.measurements import CornerStream, ImuStream, LidarStream, TrackStream, WheelPoses
 from icalib.recordings.euroc_images import SUFFIXES, file_payloads
 from icalib.recordings.image_checks import checked_payloads, frames
 from icalib.recordings.images import Frame, Payload
 from icalib.recordings.topics import TopicInfo, choose_topic
-from icalib.rig import Camera, ImuSensor
+from icalib.recordings.wheels import WheelReadings
+from icalib.rig import Camera, ImuSensor, Lidar, Wheels
 
 APART_NS = 1_000_000_000  # from one number to the next
 MOST = 9_000_000_000  # beyond, nanoseconds do not fit
@@ -84,8 +85,14 @@ class PictureFolder:
             "the stamps of the images, or take out `tracks`."
         )
 
-    def where(self, sensor: ImuSensor | Camera) -> str:
-        return str(self.root) if isinstance(sensor, ImuSensor) else f"{self.root}/{self.image_topic(sensor)}"
+    def lidar(self, sensor: Lidar) -> LidarStream:
+        raise RecordingError(f"{self.root} holds pictures, and no scans of {sensor.name}; take it out of the rig file.")
+
+    def wheels(self, sensor: Wheels) -> WheelReadings | WheelPoses:
+        raise RecordingError(f"{self.root} holds pictures, and nothing of {sensor.name}; take it out of the rig file.")
+
+    def where(self, sensor: ImuSensor | Camera | Lidar | Wheels) -> str:
+        return f"{self.root}/{self.image_topic(sensor)}" if isinstance(sensor, Camera) else str(self.root)
 
     def files(self) -> list[Path]:
         return list(self._read)

@@ -9,7 +9,9 @@ from icalib.measurements import CornerStream, Measurements
 from icalib.recordings.base import Recording
 from icalib.recordings.camera_checks import checked_corners
 from icalib.recordings.imu_checks import checked_imu
+from icalib.recordings.lidar_checks import checked_lidar
 from icalib.recordings.topics import image_topics
+from icalib.recordings.wheel_checks import checked_wheels
 from icalib.rig import Camera, Rig
 
 FindCorners = Callable[[Recording, Camera], tuple[CornerStream, tuple[str, ...]]]
@@ -28,12 +30,24 @@ def read_measurements(recording: Recording, rig: Rig, find: FindCorners = tables
     """
     imu, notes = None, ()
     tracks = tuple(recording.tracks(c) for c in rig.cameras if c.tracks is not None)
-    seeing = [c for c in rig.cameras if rig.has_target and (c.tracks is None or recording.sees(c))]
     if rig.imu is not None:
         imu, notes = checked_imu(recording.imu(rig.imu), recording.where(rig.imu))
+    cameras, seen = _corners(recording, rig, find)
+    lidars = [checked_lidar(recording.lidar(s), recording.where(s)) for s in rig.lidars]
+    wheels = [checked_wheels(recording.wheels(w), w, recording.where(w)) for w in rig.wheels]
+    notes = sum((found for _, found in (*lidars, *wheels)), notes + seen)
+    return Measurements(
+        imu, cameras, recording.notes() + notes, tracks=tracks,
+        lidars=tuple(stream for stream, _ in lidars), wheels=tuple(stream for stream, _ in wheels),
+    )  # fmt: skip
+
+
+def _corners(recording: Recording, rig: Rig, find: FindCorners) -> tuple[tuple[CornerStream, ...], tuple[str, ...]]:
+    """Of each camera that sees the target, from its table or its images, checked; and notes."""
+    seeing = [c for c in rig.cameras if rig.has_target and (c.tracks is None or recording.sees(c))]
     pictured = [c for c in seeing if not recording.has_corners(c)]
     image_topics(recording, pictured)
-    cameras: list[CornerStream] = []
+    cameras, notes = [], ()
     for camera in seeing:
         if camera in pictured:
             corners, found = find(recording, camera)
@@ -42,4 +56,4 @@ def read_measurements(recording: Recording, rig: Rig, find: FindCorners = tables
         corners, dropped = checked_corners(corners, recording.where(camera), camera.resolution)
         cameras.append(corners)
         notes = notes + found + dropped
-    return Measurements(imu, tuple(cameras), recording.notes() + notes, tracks=tracks)
+    return tuple(cameras), notes

@@ -4,12 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 
 from icalib.errors import RecordingError
-from icalib.recordings.bag import BagRecording
+from icalib.recordings.clouds import PointCloud
+from icalib.recordings.livox import LivoxCloud
+
+
+class HasMessages(Protocol):
+    """The part of a bag that is needed here; see `BagRecording`."""
+
+    root: Path
+
+    def messages(self, topic: str, kind: str) -> Iterator[tuple[int, Any]]: ...
 
 
 @dataclass(frozen=True)
@@ -61,35 +71,26 @@ class JointStream:
     effort: np.ndarray
 
 
-@dataclass(frozen=True)
-class PointCloud:
-    """One message of points: (N,) with the message's fields (x, y, z [m], ...), in the order in which they came."""
-
-    stamp_ns: int
-    frame: str
-    points: np.ndarray
-
-
-def read_camera_info(bag: BagRecording, topic: str) -> CameraInfo:
+def read_camera_info(bag: HasMessages, topic: str) -> CameraInfo:
     """The first CameraInfo of `topic`. Raises RecordingError as `BagRecording.messages`."""
     _, m = next(bag.messages(topic, "camera info"))
     d, k = (m.D, m.K) if hasattr(m, "K") else (m.d, m.k)  # ROS 1, ROS 2
     return CameraInfo((m.width, m.height), m.distortion_model, np.array(d), np.array(k).reshape(3, 3))
 
 
-def read_poses(bag: BagRecording, topic: str) -> PoseStream:
+def read_poses(bag: HasMessages, topic: str) -> PoseStream:
     """All PoseStamped of `topic`. Raises RecordingError as `BagRecording.messages`, and for a frame that changes."""
     stamps_ns, found = _all(bag, topic, "pose")
     return _poses(bag, topic, _frame(bag, topic, found), stamps_ns, [m.pose for m in found])
 
 
-def read_twists(bag: BagRecording, topic: str) -> TwistStream:
+def read_twists(bag: HasMessages, topic: str) -> TwistStream:
     """All TwistStamped of `topic`. Raises RecordingError as `BagRecording.messages`, and for a frame that changes."""
     stamps_ns, found = _all(bag, topic, "twist")
     return _twists(_frame(bag, topic, found), stamps_ns, [m.twist for m in found])
 
 
-def read_odometry(bag: BagRecording, topic: str) -> OdometryStream:
+def read_odometry(bag: HasMessages, topic: str) -> OdometryStream:
     """All Odometry of `topic`. Raises RecordingError as `BagRecording.messages`, and for a frame that changes."""
     stamps_ns, found = _all(bag, topic, "odometry")
     pose = _poses(bag, topic, _frame(bag, topic, found), stamps_ns, [m.pose.pose for m in found])
@@ -97,7 +98,7 @@ def read_odometry(bag: BagRecording, topic: str) -> OdometryStream:
     return OdometryStream(pose, _twists(body, stamps_ns, [m.twist.twist for m in found]))
 
 
-def read_joints(bag: BagRecording, topic: str) -> JointStream:
+def read_joints(bag: HasMessages, topic: str) -> JointStream:
     """All JointState of `topic`; a message may name some of the joints only. Raises RecordingError as
     `BagRecording.messages`, and for an array that is not as long as the names."""
     stamps_ns, found = _all(bag, topic, "joints")
@@ -117,17 +118,20 @@ def read_joints(bag: BagRecording, topic: str) -> JointStream:
     return JointStream(names, stamps_ns, *values)
 
 
-def point_clouds(bag: BagRecording, topic: str) -> Iterator[PointCloud]:
-    """The PointCloud2 of `topic`, one at a time. Raises RecordingError as `BagRecording.messages`, and for a message
-    shorter than its points."""
+def point_clouds(bag: HasMessages, topic: str) -> Iterator[PointCloud]:
+    """The PointCloud2, or Livox's CustomMsg, of `topic`, one at a time. Raises RecordingError as
+    `BagRecording.messages`, and for a message shorter than its points."""
     for stamp_ns, m in bag.messages(topic, "points"):
+        if isinstance(m, LivoxCloud):
+            yield PointCloud(stamp_ns, m.header.frame_id, m.points)
+            continue
         if len(m.data) < m.row_step * m.height or m.row_step < m.point_step * m.width:
             raise RecordingError(f"{bag.root} {topic}: the points at {stamp_ns} ns are cut off; record again.")
         rows = m.data[: m.row_step * m.height].reshape(m.height, m.row_step)[:, : m.point_step * m.width]
         points = (
             np.ascontiguousarray(rows).reshape(-1).view(_point_type(m)) if rows.size else np.empty(0, _point_type(m))
         )
-        yield PointCloud(stamp_ns, m.header.frame_id, points)
+        yield PointCloud(stamp_ns, m.header.frame_id, points, m.height)
 
 
 _FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # of PointField
@@ -146,13 +150,13 @@ def _point_type(message: Any) -> np.dtype:
     )
 
 
-def _all(bag: BagRecording, topic: str, kind: str) -> tuple[np.ndarray, list[Any]]:
+def _all(bag: HasMessages, topic: str, kind: str) -> tuple[np.ndarray, list[Any]]:
     found = list(bag.messages(topic, kind))
     return np.array([stamp_ns for stamp_ns, _ in found], np.int64), [message for _, message in found]
 
 
 def _frame(
-    bag: BagRecording, topic: str, found: list[Any], of: Callable[[Any], str] = lambda m: m.header.frame_id
+    bag: HasMessages, topic: str, found: list[Any], of: Callable[[Any], str] = lambda m: m.header.frame_id
 ) -> str:
     frames = list(dict.fromkeys(of(m) for m in found))
     if len(frames) > 1:
@@ -162,7 +166,7 @@ def _frame(
     return frames[0] if frames else ""
 
 
-def _poses(bag: BagRecording, topic: str, frame: str, stamps_ns: np.ndarray, poses: list[Any]) -> PoseStream:
+def _poses(bag: HasMessages, topic: str, frame: str, stamps_ns: np.ndarray, poses: list[Any]) -> PoseStream:
     position = np.array([_xyz(p.position) for p in poses]).reshape(-1, 3)
     xyzw = np.array([(*_xyz(p.orientation), p.orientation.w) for p in poses]).reshape(-1, 4)
     length = np.linalg.norm(xyzw, axis=1)

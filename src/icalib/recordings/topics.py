@@ -16,6 +16,8 @@ KINDS = {
     "sensor_msgs/msg/CameraInfo": "camera info",
     "sensor_msgs/msg/Imu": "imu",
     "sensor_msgs/msg/PointCloud2": "points",
+    "livox_ros_driver/msg/CustomMsg": "points",
+    "livox_ros_driver2/msg/CustomMsg": "points",
     "sensor_msgs/msg/JointState": "joints",
     "nav_msgs/msg/Odometry": "odometry",
     "geometry_msgs/msg/TwistStamped": "twist",
@@ -28,9 +30,9 @@ class TopicInfo:
     """One stream of a recording.
 
     name: what `topic` (of a folder's tables: `path`) of a sensor in the rig file may be. type: of its messages, or what
-    it is in a folder. kind: image, camera info, imu, points, joints, odometry, twist, pose, corners; empty for what
-    icalib does not read. first_ns, last_ns: when the first and last message were received in a bag, the first and last
-    stamp in a folder; None where there are no messages.
+    it is in a folder. kind: image, camera info, imu, points, joints, odometry, twist, pose, corners, wheels; empty for
+    what icalib does not read. first_ns, last_ns: when the first and last message were received in a bag, the first and
+    last stamp in a folder; None where there are no messages.
     """
 
     name: str

@@ -1,0 +1,131 @@
+"""Clouds of points, message by message -> the stream of a LiDAR."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import chain, islice
+
+import numpy as np
+
+from icalib.errors import RecordingError
+from icalib.measurements import LidarStream
+from icalib.recordings.lidar_checks import Sieve, refuse_disorder
+from icalib.recordings.point_times import PointTimes, clock_note, find_point_times
+from icalib.recordings.sweeps import Sweep, find_sweep, sweep_share
+from icalib.rig import Lidar
+
+_AHEAD = 8  # clouds that tell how points are timed
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """One message of points: (N,) with the message's fields (x, y, z [m], ...), in the order in which they came; height
+    rows of them, one after the other."""
+
+    stamp_ns: int
+    frame: str
+    points: np.ndarray
+    height: int = 1
+
+
+Timing = Callable[
+    [PointCloud, np.ndarray], tuple[int, np.ndarray]
+]  # cloud, points -> stamp [ns], times from it [s, or turns]
+
+
+def read_clouds(clouds: Iterator[PointCloud], lidar: Lidar, what: str) -> tuple[LidarStream, tuple[str, ...]]:
+    """All points of `clouds` that can be used, and notes on the others and on how they are timed. `what` names the
+    topic in sentences.
+
+    Raises RecordingError: fewer than two clouds with points, no coordinates, points whose times are not known.
+    """
+    ahead = list(islice(clouds, _AHEAD))
+    filled = [cloud for cloud in ahead if len(cloud.points)]
+    if len(filled) < 2:
+        raise RecordingError(
+            f"{what}: {len(filled)} of the first {len(ahead)} clouds have points; check the driver, and record again."
+        )
+    refuse_disorder(np.array([cloud.stamp_ns for cloud in ahead]), what)
+    timing, notes = _timing(filled, lidar, what)
+    sieve = Sieve(lidar.near_m, lidar.far_m)
+    stamps: list[int] = []
+    parts: list[tuple[np.ndarray, np.ndarray]] = []
+    for cloud in chain(ahead, clouds):
+        xyz = coordinates(cloud, what)
+        stamp_ns, offset = timing(cloud, xyz)
+        keep = sieve.keep(xyz, offset)
+        stamps.append(stamp_ns)
+        parts.append((xyz, offset) if keep.all() else (xyz[keep], offset[keep]))
+    del ahead, filled
+    stream = _joined(lidar, np.array(stamps, np.int64), parts)
+    if lidar.point_time == "azimuth":
+        period_s = float(np.median(np.diff(stream.stamps_ns))) * 1e-9
+        np.multiply(stream.offset_s, np.float32(period_s), out=stream.offset_s)
+    dropped = sieve.note(what)
+    return stream, notes + ((dropped,) if dropped else ())
+
+
+def coordinates(cloud: PointCloud, what: str) -> np.ndarray:
+    """(N, 3) float32 m. Raises RecordingError where the cloud has no x, y, z."""
+    names = cloud.points.dtype.names or ()
+    if any(axis not in names for axis in "xyz"):
+        raise RecordingError(
+            f"{what}: the points at {cloud.stamp_ns} ns have no x, y, z, but {', '.join(names)}; choose another topic."
+        )
+    xyz = np.empty((len(cloud.points), 3), np.float32)
+    for column, axis in enumerate("xyz"):
+        xyz[:, column] = cloud.points[axis]
+    return xyz
+
+
+def _timing(clouds: Sequence[PointCloud], lidar: Lidar, what: str) -> tuple[Timing, tuple[str, ...]]:
+    """How points are timed, told from the first clouds."""
+    stamps_ns = np.array([cloud.stamp_ns for cloud in clouds], np.int64)
+    if lidar.point_time == "snapshot":
+        note = f"{what}: all points of a cloud are taken at its stamp, as point_time says; motion within it is ignored."
+        return _at_the_stamp, (note,)
+    if lidar.point_time == "azimuth":
+        sweep = find_sweep([coordinates(cloud, what) for cloud in clouds])
+        if sweep is None:
+            raise RecordingError(
+                f"{what}: the points do not go round, so their times cannot be had from their azimuth; set point_time "
+                f"of {lidar.name} to snapshot in the rig file, or record a cloud with times."
+            )
+        turn = "against the clock" if sweep.direction > 0 else "with the clock"
+        note = (
+            f"{what}: points are timed by their azimuth, {turn} and one turn from cloud to cloud, as point_time says."
+        )
+        return partial(_by_azimuth, sweep), (note,)
+    times = find_point_times(what, stamps_ns, [cloud.points for cloud in clouds], lidar.point_time)
+    first_ns, _ = _by_field(times, clouds[0], clouds[0].points)
+    note = clock_note(what, times, clouds[0].stamp_ns, first_ns)
+    return partial(_by_field, times), (note,) if note else ()
+
+
+def _at_the_stamp(cloud: PointCloud, xyz: np.ndarray) -> tuple[int, np.ndarray]:
+    return cloud.stamp_ns, np.zeros(len(xyz), np.float32)
+
+
+def _by_azimuth(sweep: Sweep, cloud: PointCloud, xyz: np.ndarray) -> tuple[int, np.ndarray]:
+    """Times in turns."""
+    return cloud.stamp_ns, sweep_share(sweep, xyz, cloud.height).astype(np.float32)
+
+
+def _by_field(times: PointTimes, cloud: PointCloud, xyz: np.ndarray) -> tuple[int, np.ndarray]:
+    del xyz
+    return times.of(cloud.stamp_ns, cloud.points[times.field])
+
+
+def _joined(lidar: Lidar, stamps_ns: np.ndarray, parts: list[tuple[np.ndarray, np.ndarray]]) -> LidarStream:
+    """Column by column, so that no more than one column is held twice. Empties `parts`."""
+    start = np.concatenate([[0], np.cumsum([len(offset) for _, offset in parts], dtype=np.int64)])
+    offsets = [offset for _, offset in parts]
+    points = [xyz for xyz, _ in parts]
+    parts.clear()
+    xyz = np.concatenate(points)
+    points.clear()
+    return LidarStream(
+        lidar.name, stamps_ns, start, np.concatenate(offsets), xyz, np.full(len(xyz), -1, np.int32)
+    )  # fmt: skip

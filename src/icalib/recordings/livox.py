@@ -1,0 +1,71 @@
+"""Livox's own message of points (CustomMsg of livox_ros_driver and livox_ros_driver2), which ROS does not define:
+
+Header header; uint64 timebase; uint32 point_num; uint8 lidar_id; uint8[3] rsvd; CustomPoint[] points
+CustomPoint: uint32 offset_time [ns]; float32 x, y, z [m]; uint8 reflectivity, tag, line
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+
+TYPES = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
+_FIELDS = {"offset_time": "u4", "x": "f4", "y": "f4", "z": "f4", "reflectivity": "u1", "tag": "u1", "line": "u1"}
+_POINT = 19  # bytes; in CDR the next one begins after a multiple of 4
+
+
+@dataclass(frozen=True)
+class Stamp:
+    """Seconds and nanoseconds since 1970."""
+
+    sec: int
+    nanosec: int
+
+
+@dataclass(frozen=True)
+class Header:
+    """Named as ROS names them."""
+
+    stamp: Stamp
+    frame_id: str
+
+
+@dataclass(frozen=True)
+class LivoxCloud:
+    """points (N,): structured, with the message's fields."""
+
+    header: Header
+    points: np.ndarray
+
+
+def parse_ros1(content: bytes) -> LivoxCloud:
+    """Raises ValueError or struct.error where the bytes are not such a message."""
+    _, sec, nanosec, length = struct.unpack_from("<4I", content)
+    at = 16 + length
+    header = Header(Stamp(sec, nanosec), content[16:at].decode("utf-8", "replace"))
+    return LivoxCloud(header, _points(content, at + 16, "<", _POINT))
+
+
+def parse_cdr(content: bytes) -> LivoxCloud:
+    """Raises ValueError or struct.error where the bytes are not such a message."""
+    body = content[4:]  # alignment counts from here
+    order = "<" if content[1:2] == b"\x01" else ">"
+    sec, nanosec, length = struct.unpack_from(order + "iII", body)
+    name = body[12 : 12 + length].rstrip(b"\0").decode("utf-8", "replace")
+    timebase = -(-(12 + length) // 8) * 8
+    return LivoxCloud(Header(Stamp(sec, nanosec), name), _points(body, timebase + 16, order, -(-_POINT // 4) * 4))
+
+
+def _points(content: bytes, at: int, order: str, step: int) -> np.ndarray:
+    """Those whose number stands at `at`, each `step` bytes after the one before."""
+    (count,) = struct.unpack_from(order + "I", content, at)
+    size = step * count - (step - _POINT) * (count > 0)
+    data = content[at + 4 : at + 4 + size]
+    if len(data) < size:
+        raise ValueError(f"{count} points do not fit {len(content)} bytes")
+    offsets = np.cumsum([0, *(np.dtype(kind).itemsize for kind in _FIELDS.values())])[:-1].tolist()
+    kinds = [order + kind for kind in _FIELDS.values()]
+    dtype = np.dtype({"names": list(_FIELDS), "formats": kinds, "offsets": offsets, "itemsize": step})
+    return np.frombuffer(data + bytes(step * count - size), dtype)

@@ -1,0 +1,61 @@
+"""Scans of a LiDAR as arrays in a file (npz), as `icalib simulate` writes them. The format: docs/recordings.md."""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+
+from icalib.errors import RecordingError
+from icalib.measurements import LidarStream
+
+_REQUIRED = {"stamps_ns": np.int64, "start": np.int64, "offset_s": np.float32, "xyz": np.float32}
+_OPTIONAL = {"plane": np.int32}
+
+
+def read_scans(name: str, path: Path) -> LidarStream:
+    """The scans at `path`. Raises RecordingError naming the file, and the array that is missing or of another kind."""
+    arrays = _arrays(path, tuple(_REQUIRED | _OPTIONAL))
+    missing = [n for n in _REQUIRED if n not in arrays]
+    if missing:
+        raise RecordingError(f"{path} has no array {missing[0]}; it needs {', '.join(_REQUIRED)}.")
+    kinds = _REQUIRED | _OPTIONAL
+    found = {n: _of_kind(path, n, array, kinds[n]) for n, array in arrays.items()}
+    if "plane" not in found:
+        found["plane"] = np.full(len(found["xyz"]), -1, np.int32)
+    try:
+        return LidarStream(name, **found)
+    except RecordingError as error:
+        raise RecordingError(f"{path}: {error}") from error
+
+
+def read_scan_stamps(path: Path) -> np.ndarray:
+    """(S,) int64 ns. Raises RecordingError as `read_scans`."""
+    arrays = _arrays(path, ("stamps_ns",))
+    if "stamps_ns" not in arrays:
+        raise RecordingError(f"{path} has no array stamps_ns; it needs {', '.join(_REQUIRED)}.")
+    return _of_kind(path, "stamps_ns", arrays["stamps_ns"], np.int64)
+
+
+def _arrays(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+    try:
+        if not zipfile.is_zipfile(path):
+            raise RecordingError(f"{path} is not a file of arrays (npz); write it by numpy.savez.")
+        with np.load(path, allow_pickle=False) as found:
+            return {name: found[name] for name in names if name in found.files}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise RecordingError(f"{path} cannot be read ({error}); copy or write it again.") from error
+
+
+def _of_kind(path: Path, name: str, array: np.ndarray, kind: type[np.generic]) -> np.ndarray:
+    axes = 2 if name == "xyz" else 1
+    numbers = "iu" if np.issubdtype(kind, np.integer) else "iuf"
+    if array.ndim != axes or array.dtype.kind not in numbers or (name == "start" and not array.size):
+        wanted = "whole numbers" if numbers == "iu" else "numbers"
+        raise RecordingError(
+            f"{path}: {name} must be {wanted} along {axes} axes, but is {array.dtype} of shape {array.shape}; correct "
+            "what writes it."
+        )
+    return np.ascontiguousarray(array, dtype=kind)

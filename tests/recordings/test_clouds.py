@@ -1,0 +1,303 @@
+"""Clouds of points as drivers write them, packed by hand: where each point is, and when it was measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+
+from icalib.errors import RecordingError
+from icalib.measurements import LidarStream
+from icalib.recordings import BagRecording
+from icalib.recordings.lidar_checks import checked_lidar
+from icalib.rig import Lidar
+
+POINTS = "sensor_msgs/msg/PointCloud2"
+ORIGIN, PERIOD, SCANS = 1_700_000_000_123_456_789, 100_000_000, 12  # ns
+RINGS, COLUMNS = 4, 90
+CODES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+
+
+@dataclass(frozen=True)
+class Scans:
+    """Points of a LiDAR that turns, in the order of firing, column by column: stamps (S,) of each scan's first point,
+    since (N,) that [ns], xyz (S, N, 3), ring (N,)."""
+
+    stamps: np.ndarray
+    since: np.ndarray
+    xyz: np.ndarray
+    ring: np.ndarray
+
+
+def scans(direction: int = 1) -> Scans:
+    rng = np.random.default_rng(5)
+    column, ring = (a.ravel() for a in np.meshgrid(np.arange(COLUMNS), np.arange(RINGS), indexing="ij"))
+    since = (column * (PERIOD // COLUMNS) + ring * 2_304).astype(np.int64)
+    azimuth = 1.3 + direction * 2 * np.pi * since / PERIOD
+    elevation = np.deg2rad([-10.0, -3.0, 3.0, 10.0])[ring]
+    beam = np.stack([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)], 1)
+    xyz = rng.uniform(1.0, 20.0, (SCANS, len(since), 1)) * beam
+    return Scans(ORIGIN + PERIOD * np.arange(SCANS), since, xyz.astype(np.float32), ring)
+
+
+def cloud(make: Any, stamp_ns: int, dtype: np.dtype, columns: dict[str, np.ndarray], height: int = 1) -> Any:
+    rows = np.zeros(len(columns["x"]), dtype)
+    for name, values in columns.items():
+        rows[name] = values
+    assert dtype.fields is not None
+    fields = [
+        make.make("sensor_msgs/msg/PointField", name, int(at[1]), CODES[at[0].str[1:]], 1)
+        for name, at in dtype.fields.items()
+    ]
+    width, size = len(rows) // height, dtype.itemsize
+    big = any(at[0].str.startswith(">") for at in dtype.fields.values())
+    data = rows.view(np.uint8).reshape(-1)
+    return make.make(POINTS, make.header(stamp_ns), height, width, fields, big, size, size * width, data, False)
+
+
+def layout(itemsize: int, **fields: tuple[str, int]) -> np.dtype:
+    fields = {"x": ("f4", 0), "y": ("f4", 4), "z": ("f4", 8)} | fields
+    formats, offsets = zip(*fields.values(), strict=True)
+    return np.dtype({"names": list(fields), "formats": formats, "offsets": offsets, "itemsize": itemsize})
+
+
+VELODYNE = layout(22, intensity=("f4", 12), ring=("u2", 16), time=("f4", 18))
+OUSTER = layout(48, intensity=("f4", 16), t=("u4", 20), reflectivity=("u2", 24), ring=("u1", 26), range=("u4", 32))
+HESAI = layout(32, intensity=("f4", 12), timestamp=("f8", 16), ring=("u2", 24))
+LIVOX = layout(26, intensity=("f4", 12), tag=("u1", 16), line=("u1", 17), timestamp=("f8", 18))
+LIVOX_OFFSET = layout(18, offset_time=("u4", 12), line=("u1", 16), tag=("u1", 17))
+PLAIN = layout(16, intensity=("f4", 12))
+
+
+@pytest.fixture
+def read(tmp_path, write):
+    """Messages at their stamps -> the LiDAR's stream and the notes."""
+
+    def build(messages: list[tuple[int, Any]], **fields: Any) -> tuple[LidarStream, tuple[str, ...]]:
+        path = write.ros2(tmp_path / "run", [("/lidar0/points", POINTS, t + 5, m) for t, m in messages])
+        bag, lidar = BagRecording(path), Lidar("lidar0", "", **fields)
+        stream, notes = checked_lidar(bag.lidar(lidar), bag.where(lidar))
+        return stream, bag.notes() + notes
+
+    return build
+
+
+def packed(
+    make: Any, found: Scans, dtype: np.dtype, times: Any, stamp_at: int = 0, **others: Any
+) -> list[tuple[int, Any]]:
+    """A message for each scan, stamped `stamp_at` after its first point; times: scan, message's stamp -> columns."""
+    messages = []
+    for k, first in enumerate(found.stamps.tolist()):
+        xyz = dict(zip("xyz", found.xyz[k].T, strict=True))
+        ring = {name: found.ring for name in ("ring", "line") if name in (dtype.names or ())}
+        stamp = first + stamp_at
+        messages.append((stamp, cloud(make, stamp, dtype, xyz | ring | times(first + found.since, stamp), **others)))
+    return messages
+
+
+def check(stream: LidarStream, found: Scans, within_ns: float):
+    """The points are where they were, at the instants at which they were measured."""
+    assert stream.start.tolist() == [k * len(found.since) for k in range(SCANS + 1)]
+    np.testing.assert_array_equal(stream.xyz, found.xyz.reshape(-1, 3))
+    assert (stream.plane == -1).all()
+    instants = (found.stamps[:, None] + found.since).ravel()
+    scan = np.repeat(np.arange(SCANS), np.diff(stream.start))
+    error = (stream.stamps_ns[scan] - instants) + np.float64(1e9) * stream.offset_s
+    assert np.abs(error).max() < within_ns
+
+
+LAST = int(scans().since[-1])
+DRIVERS = {
+    "velodyne, first stamped": (VELODYNE, lambda t, s: {"time": (t - s) * 1e-9}, 0, {}, 10),
+    "velodyne, last stamped": (VELODYNE, lambda t, s: {"time": (t - s) * 1e-9}, LAST, {}, 10),
+    "ouster": (OUSTER, lambda t, s: {"t": t - s}, 0, {}, 10),
+    "ouster, big endian": (OUSTER.newbyteorder(">"), lambda t, s: {"t": t - s}, 0, {}, 10),
+    "hesai": (HESAI, lambda t, s: {"timestamp": t // 10**9 + t % 10**9 * 1e-9}, 0, {}, 130),
+    "robosense, last stamped": (HESAI, lambda t, s: {"timestamp": t // 10**9 + t % 10**9 * 1e-9}, LAST, {}, 130),
+    "hesai, own clock": (HESAI, lambda t, s: {"timestamp": (t - ORIGIN) * 1e-9 + 77.0}, 0, {"point_time": "start"}, 10),
+    "hesai, relative": (HESAI, lambda t, s: {"timestamp": (t - s) * 1e-9}, 0, {}, 10),
+    "livox, absolute ns": (LIVOX, lambda t, s: {"timestamp": t.astype(np.float64)}, 3_000_000, {}, 140),
+    "livox, offset": (LIVOX_OFFSET, lambda t, s: {"offset_time": t - s}, 0, {}, 10),
+    "counted from the first, stamped at the last": (
+        VELODYNE, lambda t, s: {"time": (t - t[0]) * 1e-9}, LAST, {"point_time": "end"}, 10
+    ),
+    "counted to the last, stamped at the first": (
+        VELODYNE, lambda t, s: {"time": (t - t[-1]) * 1e-9}, 0, {"point_time": "start"}, 10
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("driver", DRIVERS)
+def test_points_are_timed_as_drivers_write_it(write, read, driver):
+    dtype, times, stamp_at, fields, within_ns = DRIVERS[driver]
+    found = scans()
+    stream, notes = read(packed(write.maker(), found, dtype, times, stamp_at), **fields)
+    check(stream, found, within_ns)
+    assert notes == ()
+
+
+def test_points_on_a_clock_of_their_own(write, read):
+    """The clock started 77 s before the first scan; the stream is on it."""
+    found = scans()
+    messages = packed(write.maker(), found, HESAI, lambda t, s: {"timestamp": (t - ORIGIN) * 1e-9 + 77.0}, 20_000_000)
+    stream, notes = read(messages)
+    moved = Scans(found.stamps - ORIGIN + 77_000_000_000, found.since, found.xyz, found.ring)
+    check(stream, moved, 10)
+    assert len(notes) == 1 and "`timestamp` is on another clock than the messages' stamps" in notes[0]
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+@pytest.mark.parametrize("order", ["columns", "rows", "organised"])
+def test_points_are_timed_by_azimuth(write, read, direction, order):
+    """Within the firing of a column; the second message begins with a hole of a quarter of a turn."""
+    found = scans(direction)
+    if order != "columns":
+        by_ring = np.lexsort((found.since, found.ring))
+        found = Scans(found.stamps, found.since[by_ring], found.xyz[:, by_ring], found.ring[by_ring])
+    if order == "organised":
+        found.xyz[1, found.since < PERIOD // 4] = np.nan
+    height = RINGS if order == "organised" else 1
+    messages = packed(write.maker(), found, PLAIN, lambda t, s: {}, height=height)
+    stream, notes = read(messages, point_time="azimuth")
+    assert "by their azimuth, " + ("against" if direction > 0 else "with") + " the clock" in " ".join(notes)
+    if order == "organised":
+        lost = np.isnan(found.xyz[1, :, 0])
+        assert lost.any() and f"{lost.sum()} without numbers" in " ".join(notes)
+        instants = (found.stamps[:, None] + found.since)[~np.isnan(found.xyz[:, :, 0])]
+        scan = np.repeat(np.arange(SCANS), np.diff(stream.start))
+        error = stream.stamps_ns[scan] - instants + 1e9 * stream.offset_s
+        assert np.abs(error).max() < 2 * RINGS * 2_304
+    else:
+        check(stream, found, 2 * RINGS * 2_304)
+
+
+def test_a_point_left_of_where_the_sweep_begins_is_not_late_by_a_turn(write, read):
+    """Lasers look up to 2 degrees to the side."""
+    found = scans()
+    turn = np.deg2rad(np.linspace(-2.0, 2.0, RINGS))[found.ring]
+    x, y = found.xyz[..., 0].copy(), found.xyz[..., 1].copy()
+    found.xyz[..., 0], found.xyz[..., 1] = np.cos(turn) * x - np.sin(turn) * y, np.sin(turn) * x + np.cos(turn) * y
+    stream, _ = read(packed(write.maker(), found, PLAIN, lambda t, s: {}), point_time="azimuth")
+    check(stream, found, 4.1 / 360 * PERIOD + 2 * RINGS * 2_304)
+
+
+def test_snapshots(write, read):
+    found = scans()
+    still = Scans(found.stamps, np.zeros_like(found.since), found.xyz, found.ring)
+    stream, notes = read(packed(write.maker(), still, PLAIN, lambda t, s: {}), point_time="snapshot")
+    check(stream, still, 1)
+    assert "all points of a cloud are taken at its stamp" in notes[0]
+
+
+def test_points_that_cannot_be_used_are_counted(write, read):
+    found = scans()
+    found.xyz[0, 0], found.xyz[0, 1, 2], found.xyz[1, 3:6] = np.nan, np.inf, 0.0
+    found.xyz[2, 7] = [0.3, 0.2, 0.1]
+    found.xyz[3, :4] *= 200.0 / np.linalg.norm(found.xyz[3, :4], axis=1, keepdims=True)
+    found.xyz[4] = 0.0
+    found.xyz[5, 9] = [0.6, 0.0, 0.0]
+    messages = packed(write.maker(), found, VELODYNE, lambda t, s: {"time": (t - s) * 1e-9})
+    stream, notes = read(messages, near_m=0.5, far_m=150.0)
+    n = len(found.since)
+    assert (
+        f"of {SCANS * n} points 2 without numbers, {3 + n} at zero, 1 nearer than 0.5 m, 4 farther than 150 m"
+        in (notes[0])
+    )
+    assert "1 of 12 scans have no usable point and were left out" in notes[1] and len(notes) == 2
+    kept = np.delete(found.xyz.reshape(-1, 3), _flat(n, [(0, 0), (0, 1), (1, 3), (1, 4), (1, 5), (2, 7)]), axis=0)
+    kept = kept[(kept != 0).any(axis=1) & (np.linalg.norm(kept, axis=1) < 150.0)]
+    np.testing.assert_array_equal(stream.xyz, kept)
+    assert np.diff(stream.start).tolist() == [n - 2, n - 3, n - 1, n - 4] + [n] * 7
+    np.testing.assert_allclose(stream.offset_s[: n - 2], found.since[2:] * 1e-9, atol=1e-8)
+
+
+def _flat(n: int, places: list[tuple[int, int]]) -> list[int]:
+    return [scan * n + point for scan, point in places]
+
+
+def stamped(times: Any, shuffle: bool = False) -> Any:
+    def build(make: Any) -> list[tuple[int, Any]]:
+        messages = packed(make, scans(), times[0], times[1])
+        return [*messages[6:], *messages[:6]] if shuffle else messages
+
+    return build
+
+
+REFUSED = {
+    "no times": (stamped((PLAIN, lambda t, s: {})), {}, "no times (their fields are x, y, z, intensity); record a clo"),
+    "milliseconds": (
+        stamped((VELODYNE, lambda t, s: {"time": (t - s) * 1e-6})), {},
+        "times `time`, read as s, spread over 98.89 s, though scans are 0.1 s apart; they look like another unit; "
+        "divide them by 1000.",
+    ),
+    "microseconds": (
+        stamped((OUSTER, lambda t, s: {"t": (t - s) // 1000})), {},
+        "times `t`, read as ns, spread over 9.889e-05 s, though scans are 0.1 s apart; they look like another unit; "
+        "multiply them by 1000.",
+    ),
+    "seconds as whole numbers": (
+        stamped((OUSTER, lambda t, s: {"t": (t - s) // 10**6})), {}, "multiply them by 1e+06"),
+    "no unit": (
+        stamped((HESAI, lambda t, s: {"timestamp": t * 3e-8})), {}, "goes on by 3 from scan to scan, which is 0.1 s in"
+    ),
+    "times of float32": (
+        stamped((layout(16, timestamp=("f4", 12)), lambda t, s: {"timestamp": t * 1e-9})), {},
+        "all points of a scan have the same `timestamp`",
+    ),
+    "zeros": (stamped((VELODYNE, lambda t, s: {})), {}, "all points of a scan have the same `time`; correct"),
+    "set back": (
+        stamped((VELODYNE, lambda t, s: {"time": (t - s) * 1e-9}), shuffle=True), {},
+        f"the scan at {ORIGIN} ns comes after the one at {ORIGIN + 11 * PERIOD} ns",
+    ),
+    "all too far": (
+        stamped((VELODYNE, lambda t, s: {"time": (t - s) * 1e-9})), {"near_m": 50.0}, "0 of 12 scans have usable points"
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_would_be_wrong_is_refused(write, read, case):
+    build, fields, words = REFUSED[case]
+    with pytest.raises(RecordingError) as error:
+        read(build(write.maker()), **fields)
+    assert words in str(error.value) and "/lidar0/points (lidar0)" in str(error.value)
+
+
+def test_what_does_not_turn_has_no_azimuth(write, read):
+    found = scans()
+    azimuth = 0.6 * np.sin(40.0 * found.since / PERIOD)
+    found.xyz[...] = 5.0 * np.stack([np.cos(azimuth), np.sin(azimuth), 0.0 * azimuth], axis=1)
+    with pytest.raises(RecordingError, match="the points do not go round"):
+        read(packed(write.maker(), found, PLAIN, lambda t, s: {}), point_time="azimuth")
+
+
+def test_empty_clouds(write, read):
+    make = write.maker()
+    messages = [(t, cloud(make, t, VELODYNE, {"x": np.zeros(0)})) for t in scans().stamps.tolist()]
+    with pytest.raises(RecordingError, match="0 of the first 8 clouds have points"):
+        read(messages)
+
+
+def test_no_coordinates(write, read):
+    make, dtype = write.maker(), np.dtype([("x", "<f4"), ("y", "<f4"), ("time", "<f4")])
+    with pytest.raises(RecordingError, match="have no x, y, z, but x, y, time; choose another topic"):
+        read(
+            [
+                (t, cloud(make, t, dtype, {"x": np.ones(3), "time": np.arange(3) * 0.03}))
+                for t in scans().stamps.tolist()
+            ]
+        )
+
+
+def test_the_topic_is_chosen_as_that_of_cameras(tmp_path, write):
+    make = write.maker()
+    messages = packed(make, scans(), VELODYNE, lambda t, s: {"time": (t - s) * 1e-9})
+    both = [(topic, POINTS, t + 5, m) for t, m in messages for topic in ("/front/points", "/rear/points")]
+    bag = BagRecording(write.ros2(tmp_path / "run", both))
+    assert bag.where(Lidar("rear", "")).endswith("run /rear/points")
+    with pytest.raises(RecordingError, match="top may be any of /front/points, /rear/points; set `topic` of top"):
+        bag.lidar(Lidar("top", ""))
+    with pytest.raises(RecordingError, match="has no topic /top; it holds /front/points \\(sensor_msgs"):
+        bag.lidar(Lidar("top", "", topic="/top"))

@@ -1,0 +1,108 @@
+"""Scans as arrays in a file: what is read, and what is refused."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from icalib.errors import RecordingError
+from icalib.measurements import LidarStream
+from icalib.recordings import FolderRecording, open_recording
+from icalib.recordings.lidar_checks import checked_lidar
+from icalib.rig import Lidar
+
+LIDAR = Lidar("lidar0", "lidar0/scans.npz")
+RNG = np.random.default_rng(2)
+GOOD: dict[str, Any] = {
+    "stamps_ns": 10**18 + 10**8 * np.arange(5),
+    "start": np.array([0, 40, 80, 80, 150, 200]),
+    "offset_s": RNG.uniform(0, 0.1, 200).astype(np.float32),
+    "xyz": RNG.uniform(1, 9, (200, 3)).astype(np.float32),
+}
+
+
+def read(tmp_path, arrays: dict[str, Any]) -> tuple[LidarStream, tuple[str, ...]]:
+    (tmp_path / "lidar0").mkdir(exist_ok=True)
+    np.savez(tmp_path / "lidar0" / "scans.npz", **arrays)
+    folder = FolderRecording(tmp_path)
+    stream, notes = checked_lidar(folder.lidar(LIDAR), folder.where(LIDAR))
+    assert folder.files() == [tmp_path / "lidar0" / "scans.npz"]
+    return stream, folder.notes() + notes
+
+
+def test_scans_of_others(tmp_path):
+    """float64, no planes; the third scan is empty."""
+    wide = GOOD | {name: GOOD[name].astype(np.float64) for name in ("xyz", "offset_s")}
+    stream, notes = read(tmp_path, wide)
+    np.testing.assert_array_equal(stream.xyz, GOOD["xyz"], strict=True)
+    np.testing.assert_array_equal(stream.offset_s, GOOD["offset_s"], strict=True)
+    assert stream.start.tolist() == [0, 40, 80, 150, 200] and (stream.plane == -1).all()
+    assert stream.stamps_ns.tolist() == GOOD["stamps_ns"][[0, 1, 3, 4]].tolist()
+    assert len(notes) == 1 and "(lidar0): 1 of 5 scans have no usable point" in notes[0]
+
+
+def test_points_that_cannot_be_used(tmp_path):
+    """A whole scan among them; planes stay with their points."""
+    xyz, plane = GOOD["xyz"].copy(), np.arange(200, dtype=np.int32)
+    xyz[3], xyz[90, 0], xyz[160] = 0.0, np.nan, [0.1, 0.1, 0.1]
+    xyz[40:80] = 300.0
+    stream, notes = read(tmp_path, GOOD | {"xyz": xyz, "plane": plane})
+    kept = np.setdiff1d(plane, [3, 90, 160, *range(40, 80)])
+    np.testing.assert_array_equal(stream.plane, kept)
+    np.testing.assert_array_equal(stream.xyz, xyz[kept])
+    np.testing.assert_array_equal(stream.offset_s, GOOD["offset_s"][kept])
+    assert stream.start.tolist() == [0, 39, 108, 157]
+    assert "of 200 points 1 without numbers, 1 at zero, 1 nearer than 0.5 m, 40 farther than 100 m were" in notes[0]
+    assert "2 of 5 scans have no usable point" in notes[1]
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"xyz": None}, "has no array xyz; it needs stamps_ns, start, offset_s, xyz"),
+        ({"xyz": GOOD["xyz"][:, :2]}, "xyz must have shape"),
+        ({"xyz": GOOD["xyz"].ravel()}, "xyz must be numbers along 2 axes, but is float32 of shape \\(600,\\)"),
+        ({"stamps_ns": GOOD["stamps_ns"] * 1e-9}, "stamps_ns must be whole numbers along 1 axes, but is float64"),
+        ({"start": GOOD["start"][:-1]}, "start must have shape \\(6,\\)"),
+        ({"start": GOOD["start"] + 1}, "start must run upwards from 0"),
+        ({"start": np.zeros(0, np.int64)}, "start must be whole numbers"),
+        ({"offset_s": GOOD["offset_s"][1:]}, "offset_s must have a row for each of the 200 points"),
+        ({"offset_s": GOOD["offset_s"] * 1e9}, "they look like another unit; divide them by 1e\\+09"),
+        ({"offset_s": GOOD["offset_s"] * 1e-3}, "they look like another unit; multiply them by 1000"),
+        ({"offset_s": GOOD["offset_s"] + 5}, "points are 5[.\\d]* to 5.\\d* s from their scan's stamp"),
+        ({"stamps_ns": GOOD["stamps_ns"][::-1]}, "the scan at \\d* ns comes after the one at \\d* ns"),
+        ({"stamps_ns": GOOD["stamps_ns"] // 10**6}, "they look like milliseconds; export them in nanoseconds"),
+        ({"xyz": np.array([object()] * 200)}, "cannot be read \\(Object arrays cannot be loaded"),
+    ],
+)  # fmt: skip
+def test_what_is_refused(tmp_path, changed, words):
+    arrays = {name: array for name, array in (GOOD | changed).items() if array is not None}
+    with pytest.raises(RecordingError, match=words) as error:
+        read(tmp_path, arrays)
+    assert str(tmp_path / "lidar0" / "scans.npz") in str(error.value)
+
+
+def test_files_that_are_none(tmp_path):
+    read(tmp_path, GOOD)
+    path = tmp_path / "lidar0" / "scans.npz"
+    content = path.read_bytes()
+    for damaged, words in (
+        (b"hello", "is not a file of arrays"),
+        (content[: len(content) // 2], "is not a file of arrays"),
+        (content.replace(b"\x93NUMPY", b"\x93NUMBY"), "cannot be read"),
+        (content[:2000] + bytes(300) + content[2300:], "cannot be read"),
+    ):
+        path.write_bytes(damaged)
+        with pytest.raises(RecordingError, match=words):
+            FolderRecording(tmp_path).lidar(LIDAR)
+    np.save(tmp_path / "lidar0" / "scans.npy", GOOD["xyz"])
+    with pytest.raises(RecordingError, match="is not a file of arrays"):
+        FolderRecording(tmp_path).lidar(Lidar("lidar0", "lidar0/scans.npy"))
+
+
+def test_there_are_no_scans_among_pictures(tmp_path):
+    (tmp_path / "0001.png").write_bytes(b"")
+    with pytest.raises(RecordingError, match="holds pictures, and no scans of lidar0"):
+        open_recording(tmp_path).lidar(LIDAR)

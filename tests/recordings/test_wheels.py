@@ -1,0 +1,196 @@
+"""Wheels in tables and joints: the rates that come out, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from icalib.errors import RecordingError
+from icalib.measurements import WheelStream
+from icalib.recordings import BagRecording, FolderRecording
+from icalib.recordings.wheel_checks import checked_wheels
+from icalib.rig import Wheels
+
+N, STEP, ORIGIN = 400, 20_000_000, 1_700_000_000_000_000_000
+STAMPS = ORIGIN + STEP * np.arange(N) + np.random.default_rng(1).integers(-(10**6), 10**6, N)
+SECONDS = (STAMPS - STAMPS[0]) * 1e-9
+ANGLES = np.stack([4.0 * SECONDS + np.sin(SECONDS), 5.0 * SECONDS - 2.0 * np.cos(0.7 * SECONDS)], axis=1)
+RATES = np.stack([4.0 + np.cos(SECONDS), 5.0 + 1.4 * np.sin(0.7 * SECONDS)], axis=1)
+MEAN = np.diff(ANGLES, axis=0) / np.diff(SECONDS)[:, None]  # between the stamps
+NAMES = {"rates": RATES, "angles": ANGLES}
+
+
+def from_table(
+    tmp_path, values: np.ndarray, stamps: np.ndarray = STAMPS, **fields: Any
+) -> tuple[WheelStream, tuple[str, ...]]:
+    wheels = Wheels("wheel0", "wheel0/data.csv", **fields)
+    path = tmp_path / "wheel0"
+    path.mkdir(exist_ok=True)
+    rows = zip(stamps.tolist(), values.tolist(), strict=True)
+    (path / "data.csv").write_text("#t,left,right\n" + "".join(f"{t},{a!r},{b!r}\n" for t, (a, b) in rows))
+    folder = FolderRecording(tmp_path)
+    stream, notes = checked_wheels(folder.wheels(wheels), wheels, folder.where(wheels))
+    assert isinstance(stream, WheelStream)
+    assert folder.files() == [path / "data.csv"]
+    return stream, notes
+
+
+@pytest.mark.parametrize("meaning", ["mean", "instant"])
+def test_rates(tmp_path, meaning):
+    stream, notes = from_table(tmp_path, RATES, meaning=meaning)
+    np.testing.assert_array_equal(stream.stamps_ns, STAMPS)
+    np.testing.assert_allclose(stream.rate, RATES, rtol=1e-15)
+    assert (stream.meaning, notes) == (meaning, ())
+
+
+def test_angles(tmp_path):
+    stream, notes = from_table(tmp_path, ANGLES, measures="angles")
+    np.testing.assert_allclose(stream.rate[1:], MEAN, atol=1e-11)
+    np.testing.assert_array_equal(stream.rate[0], stream.rate[1])
+    assert (stream.meaning, notes) == ("mean", ())
+
+
+@pytest.mark.parametrize("size", [None, 256, 65536])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_ticks(tmp_path, size, sign):
+    """Forwards and backwards; a counter of 8 bits starts anew every 1.6 rad."""
+    counts = np.floor(sign * ANGLES * 1000.5 / (2 * np.pi) + 200.0)
+    assert np.ptp(counts // 256) > 10
+    shown = counts if size is None else np.mod(counts, size)
+    stream, _ = from_table(tmp_path, shown, measures="ticks", counts_per_turn=1000.5, counter_size=size)
+    turned = np.concatenate([np.zeros((1, 2)), np.cumsum(stream.rate[1:] * np.diff(SECONDS)[:, None], axis=0)])
+    np.testing.assert_allclose(turned, (counts - counts[0]) * 2 * np.pi / 1000.5, atol=1e-9)
+    assert np.abs(turned - sign * (ANGLES - ANGLES[0])).max() < 2 * np.pi / 1000.5
+
+
+TWICE = np.insert(STAMPS, 7, STAMPS[7])
+REFUSED = {
+    "back": (RATES, np.where(np.arange(N) == 9, STAMPS - 10**9, STAMPS), {}, f"ing at {STAMPS[9] - 10**9} ns comes"),
+    "two": (np.insert(RATES, 7, 1.0, axis=0), TWICE, {}, f"two different readings are both stamped {STAMPS[7]} ns"),
+    "deg/s": (np.rad2deg(RATES), STAMPS, {}, "(wheel0): the wheels turn at 366.7 rad/s, faster than any robot's"),
+    "degrees": (np.rad2deg(ANGLES), STAMPS, {"measures": "angles"}, "degrees are to be multiplied by pi / 180"),
+    "counter": (
+        np.mod(np.round(ANGLES * 5000), 65536), STAMPS, {"measures": "ticks", "counts_per_turn": 31416.0},
+        "as where a counter starts anew; set counter_size of wheel0 in the rig file (65536",
+    ),
+    "counts": (ANGLES * 1e3, STAMPS, {"measures": "ticks", "counts_per_turn": 1.0}, "s; correct counts_per_turn"),
+    "seconds": (RATES, STAMPS // 10**9, {}, "they look like seconds; export them in nanoseconds"),
+    "short": (RATES[:2], STAMPS[:2], {}, "only 2 readings"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_would_be_wrong_is_refused(tmp_path, case):
+    values, stamps, fields, words = REFUSED[case]
+    with pytest.raises(RecordingError) as error:
+        from_table(tmp_path, values, stamps, **fields)
+    assert words in str(error.value) and str(error.value).startswith(str(tmp_path))
+
+
+def test_what_looks_odd_is_noted(tmp_path):
+    stream, notes = from_table(tmp_path, np.insert(RATES, 7, RATES[7], axis=0), TWICE)
+    assert len(stream.rate) == N and f"1 repeated readings were dropped, the first at {STAMPS[7]} ns" in notes[0]
+    gone = np.delete(np.arange(N), np.r_[50:60, 200:250])
+    _, notes = from_table(tmp_path, RATES[gone], STAMPS[gone])
+    assert len(notes) == 1 and f"2 gaps in the readings, the longest of 1.02 s from {STAMPS[199]} ns on" in notes[0]
+    stuck = RATES.copy()
+    stuck[50:350, 1] = 0.0
+    _, notes = from_table(tmp_path, stuck)
+    assert len(notes) == 1
+    assert f"the right wheel reports 0 rad/s for 5.98 s from {STAMPS[50]} ns on while the left one" in notes[0]
+    stuck[200, 1] = 0.1
+    assert from_table(tmp_path, stuck)[1] == ()
+
+
+def test_the_table_that_is_not_there(tmp_path):
+    (tmp_path / "imu0").mkdir()
+    (tmp_path / "imu0" / "data.csv").write_text("1,2\n")
+    with pytest.raises(RecordingError, match="has no wheel0/rates.csv .* it holds imu0/data.csv; set `path`"):
+        FolderRecording(tmp_path).wheels(Wheels("wheel0", "wheel0/rates.csv"))
+
+
+POSES = "0,10,0.1,1,0,1e-4,0,0,1e-4,0,1e-4\n"
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        (POSES + POSES.replace("0,10,", "11,20,", 1), "the pose from 11 to 20 ns does not go on where the one before"),
+        (POSES.replace("0,10,", "10,10,", 1), "the pose from 10 to 10 ns does not go on"),
+        (POSES.replace("1e-4,0,0,1e-4", "1e-4,2e-4,0,1e-4"), "the covariance of the pose from 0 ns is none"),
+        (POSES.replace("1e-4", "0"), "the covariance of the pose from 0 ns is none"),
+    ],
+)
+def test_relative_poses_that_are_none(tmp_path, rows, words):
+    (tmp_path / "wheel0").mkdir()
+    (tmp_path / "wheel0" / "poses.csv").write_text(rows)
+    with pytest.raises(RecordingError, match=words):
+        FolderRecording(tmp_path).wheels(Wheels("wheel0", "wheel0/poses.csv", measures="poses"))
+
+
+@pytest.fixture
+def bag_of(tmp_path, write):
+    """What each message holds (names, positions, velocities) -> a bag."""
+
+    def build(content: Any, kind: str = "sensor_msgs/msg/JointState") -> BagRecording:
+        make = write.maker()
+        messages = []
+        for k, t in enumerate(STAMPS.tolist()):
+            names, position, velocity = content(k)
+            message = make.make(kind, make.header(t), names, np.array(position), np.array(velocity), np.zeros(0))
+            messages.append(("/joint_states", kind, t + 5, message))
+        return BagRecording(write.ros2(tmp_path / "run", messages))
+
+    return build
+
+
+def arm_and_wheels(k: int) -> tuple[list[str], list[float], list[float]]:
+    """Each third message is that of an arm."""
+    if k % 3 == 2:
+        return ["elbow"], [0.3], [0.1]
+    (left, right), (left_rate, right_rate) = ANGLES[k], RATES[k]
+    return ["wheel_right", "elbow", "wheel_left"], [right, 0.3, left], [right_rate, 0.1, left_rate]
+
+
+@pytest.mark.parametrize("measures", ["rates", "angles"])
+@pytest.mark.parametrize("joints", [None, ("wheel_left", "wheel_right")])
+def test_joints(bag_of, measures, joints):
+    bag, wheels = bag_of(arm_and_wheels), Wheels("wheel0", "", measures=measures, joints=joints)
+    stream, notes = checked_wheels(bag.wheels(wheels), wheels, bag.where(wheels))
+    sent = np.arange(N) % 3 != 2
+    assert isinstance(stream, WheelStream) and notes == ()
+    np.testing.assert_array_equal(stream.stamps_ns, STAMPS[sent])
+    if measures == "rates":
+        np.testing.assert_array_equal(stream.rate, RATES[sent])
+    else:
+        mean = np.diff(ANGLES[sent], axis=0) / np.diff(SECONDS[sent])[:, None]
+        np.testing.assert_allclose(stream.rate[1:], mean, atol=1e-11)
+
+
+def test_joints_that_do_not_do(bag_of, tmp_path):
+    bag = bag_of(lambda k: (["left", "right"], [1.0 * k, 2.0 * k], []))
+    wheels = Wheels("wheel0", "")
+    with pytest.raises(RecordingError, match="left and right have no velocity; set `measures` of wheel0 to angles"):
+        bag.wheels(wheels)
+    with pytest.raises(RecordingError, match="has no joint rear; it has left, right; correct `joints` of wheel0"):
+        bag.wheels(replace(wheels, joints=("left", "rear")))
+    with pytest.raises(RecordingError, match="bags hold no relative poses; set `measures`"):
+        bag.wheels(replace(wheels, measures="poses"))
+    with pytest.raises(RecordingError, match="has no topic /wheels; it holds /joint_states"):
+        bag.wheels(replace(wheels, topic="/wheels"))
+
+
+def test_joints_without_names_that_tell(bag_of):
+    bag = bag_of(lambda k: (["a", "b"], [], [1.0, 2.0]))
+    with pytest.raises(RecordingError, match="which of the joints a, b are the left and the right wheel"):
+        bag.wheels(Wheels("wheel0", ""))
+    assert bag.wheels(Wheels("wheel0", "", joints=("b", "a"))).value[0].tolist() == [2.0, 1.0]
+
+
+def test_joints_one_at_a_time(bag_of):
+    bag = bag_of(lambda k: ([["left"], ["right"]][k % 2], [], [1.0]))
+    with pytest.raises(RecordingError, match=f"the message at {STAMPS[0]} ns has only one of left and right"):
+        bag.wheels(Wheels("wheel0", ""))
