@@ -1,8 +1,8 @@
 """A LiDAR's extrinsics and time offset from nothing, with the motion of the IMU where nothing else shows it.
 
 Its scans, registered one after the other, say how it turned; the gyroscope says the same of the IMU, which gives time
-offset and rotation. Turned by the gyroscope, the scans are registered again, ten times better. Their positions then give
-the lever arm: against a motion that cameras or another LiDAR showed, or against the IMU's own readings, with gravity.
+offset and rotation. Turned by the gyroscope, the scans are registered again, and better. Their positions then give the
+lever arm: against a motion that cameras or another LiDAR showed, or against the IMU's own readings, with gravity.
 """
 
 from __future__ import annotations
@@ -116,20 +116,27 @@ def _poses(known: State, gyro: GyroRotation, t: np.ndarray) -> tuple[np.ndarray,
 def _aligned(imu: ImuData, stream: LidarStream, held: Held) -> tuple[Alignment, LidarPath, CameraRates]:
     """Time offset, rotation and gyroscope bias; the LiDAR's path by the gyroscope's turns, as far as the IMU was
     running, and its rates."""
-    path = lidar_path(stream)
-    for _ in range(2):
-        rates = _rates(stream.name, path)
-        _check_turning(imu, stream.name, rates)
-        if held.rotation is not None and held.offset is not None:
-            aligned = as_given(imu, stream.name, rates, held.offset, held.rotation)
-        else:
-            aligned = align(imu, stream.name, rates, held.offset)
-        rotation = aligned.rotation if held.rotation is None else held.rotation
-        gyro, offset = GyroRotation.integrate(imu, aligned.gyro_bias), aligned.offset
-        path = lidar_path(stream, lambda t, R=rotation, gyro=gyro, offset=offset: gyro.at(t + offset) @ R)
-    inside = path.ok & (path.seconds + offset > imu.seconds[0]) & (path.seconds + offset < imu.seconds[-1])
+    path = _turned_path(imu, stream, _align(imu, stream.name, _rates(stream.name, lidar_path(stream)), held))
+    rates = _rates(stream.name, path)
+    aligned = _align(imu, stream.name, rates, held)
+    path = _turned_path(imu, stream, aligned)
+    t = path.seconds + aligned.offset
+    inside = path.ok & (t > imu.seconds[0]) & (t < imu.seconds[-1])
     path = LidarPath(path.seconds[inside], path.rotation[inside], path.position[inside], path.ok[inside])
-    return Alignment(offset, rotation, aligned.gyro_bias), path, rates
+    return aligned, path, rates
+
+
+def _align(imu: ImuData, name: str, rates: CameraRates, held: Held) -> Alignment:
+    if held.rotation is not None and held.offset is not None:
+        return as_given(imu, name, rates, held.offset, held.rotation)
+    _check_turning(imu, name, rates)
+    found = align(imu, name, rates, held.offset)
+    return found if held.rotation is None else as_given(imu, name, rates, found.offset, held.rotation)
+
+
+def _turned_path(imu: ImuData, stream: LidarStream, aligned: Alignment) -> LidarPath:
+    gyro = GyroRotation.integrate(imu, aligned.gyro_bias)
+    return lidar_path(stream, lambda t: gyro.at(t + aligned.offset) @ aligned.rotation)
 
 
 def _rates(name: str, path: LidarPath) -> CameraRates:
@@ -148,7 +155,7 @@ def _check_turning(imu: ImuData, name: str, rates: CameraRates) -> None:
     if turned < STILL_RAD_S and seen < 3.0 * STILL_RAD_S:
         raise EstimationError(
             f"{name} and {imu.name} hardly turn ({turned:.4f} rad/s RMS), which leaves their clocks and axes open; "
-            f"record again with turns about two axes or more, or give rotation and time_offset of {name} in the rig file."
+            "record again with turns about two axes or more, or give its rotation and time_offset in the rig file."
         )
 
 
@@ -162,8 +169,8 @@ def _too_short(stream: LidarStream) -> EstimationError:
 def _check_gravity(measured: float, expected: float, imu: str, lidar: str) -> None:
     if abs(measured / expected - 1.0) > G_TOLERANCE:
         raise EstimationError(
-            f"{imu} and {lidar} together show gravity of {measured:.3g} m/s^2 instead of {expected:.3g}: check that the "
-            "accelerometer is in m/s^2 (not in g), and the points in metres."
+            f"{imu} and {lidar} together show gravity of {measured:.3g} m/s^2 instead of {expected:.3g}: check that "
+            "the accelerometer is in m/s^2 (not in g), and the points in metres."
         )
 
 

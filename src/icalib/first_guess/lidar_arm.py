@@ -9,8 +9,8 @@ velocities have dropped out (as of a camera in `lever_arm`, whose board is the L
 
     A[p_map_lidar] = A[R_map_imu] p_imu_lidar + A[D_f] - A[D_R] b_a + g (h_1 + h_2) / 2
 
-Both are linear in a turn R_imu_lidar Exp(d), too. What turned about one axis leaves d about it to these rows alone; then
-the turn that fits them best among all is where to start.
+Both are linear in a turn R_imu_lidar Exp(d), too. Where a LiDAR turned about one axis, d about it is left to these rows
+alone; then the turn that fits them best among all is where to start.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from icalib.estimation.imu_data import ImuData
 from icalib.first_guess.lidar_motion import Integrals
 from icalib.geometry import so3
 
-ARM_SIGMA = 1.0  # m: what the motion leaves open stays small
+ARM_SIGMA = 0.5  # m: what the motion leaves open stays small
 BIAS_SIGMA = 0.3  # m/s^2
 ANY_SIGMA = 1e3
 HELD_SIGMA = 1e-6
@@ -66,7 +66,9 @@ def arm_prior(others: np.ndarray, rates: np.ndarray, row_sigma: float, rotation_
     mean = np.concatenate([np.zeros(3), np.zeros(3) if held is None else held, np.zeros(len(others))])
     w = rates - rates.mean(axis=0)
     information = (w**2).sum() * np.eye(3) - w.T @ w
-    return Prior(mean, np.concatenate([[d] * 3, [arm] * 3, others]) / row_sigma, information * (row_sigma / RATE_SIGMA) ** 2)
+    return Prior(
+        mean, np.concatenate([[d] * 3, [arm] * 3, others]) / row_sigma, information * (row_sigma / RATE_SIGMA) ** 2
+    )
 
 
 def against_motion(

@@ -95,9 +95,7 @@ class ImuMotion:
         for a, b in self.gyro.imu.gaps:
             unfelt |= (t[1:] > a) & (t[:-1] < b)
         position, velocity = _least_squares(h[:, 0], self.position, way, speed, np.where(unfelt, UNFELT, 1.0))
-        return ImuMotion(
-            self.gyro, t, self.rotation, position, velocity, self.gyro_bias, self.accel_bias, self.gravity
-        )
+        return ImuMotion(self.gyro, t, self.rotation, position, velocity, self.gyro_bias, self.accel_bias, self.gravity)
 
 
 def _least_squares(

@@ -1,8 +1,8 @@
 """How a LiDAR moved, scan by scan: each is registered to a map of flat voxels that those before it made.
 
-A scan has a pose at its middle and a twist, so points are where they were seen from at their own instants. Without the
-gyroscope the twist holds for the turning, too; once the LiDAR is aligned with the IMU, the gyroscope turns the points of
-a scan back to its middle, and says how it stands to the scan before.
+A scan has a pose at its middle and a twist, so that each point is seen from where the LiDAR was at its own instant. Without
+the gyroscope the twist holds for the turning, too; once the LiDAR is aligned with the IMU, the gyroscope turns the points
+of a scan back to its middle, and says how it stands to the scan before.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ ROUNDS = 14
 WIDE_ROUNDS = 4  # that look into voxels around
 SCALE = 0.5  # of an edge: of the weights in the first round
 LAST_SCALE, LAST_SCALE_TURNED = 0.2, 0.1
-POINT_SIGMA_M = 0.3  # of a point against what is expected of the motion: points of one plane err together
+POINT_SIGMA_M = 0.1  # of a point against what is expected of the motion: points of one plane err together
 LEAST_NEAR = 0.3  # of a scan's points must lie on the map's planes
 FIRST_ROUNDS = 4  # to find how the LiDAR moved in its first scan, which makes the map
 KEEP, KEEP_TURNED = 0.85, 0.995  # of what a voxel holds, by the scan
@@ -70,8 +70,8 @@ def lidar_path(stream: LidarStream, turning: Turning | None = None) -> LidarPath
     scans = [s for s in scans if len(s.tau) >= FEWEST_POINTS]
     if len(scans) < FEWEST_SCANS:
         raise EstimationError(
-            f"{stream.name}: only {len(scans)} of its {len(stream.stamps_ns)} scans have {FEWEST_POINTS} points or more; "
-            f"check its topic, or record for longer."
+            f"{stream.name}: only {len(scans)} of its {len(stream.stamps_ns)} scans have {FEWEST_POINTS} points or "
+            "more; check its topic, or record for longer."
         )
     turns = None
     if turning is not None:

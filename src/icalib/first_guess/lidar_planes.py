@@ -1,7 +1,7 @@
 """Planes that several LiDARs share, and which of their points lie on which, found anew in every round of a solve.
 
-Each round moves all points to where the last state has them, finds planes there and associates points with them, allowing
-for what that state may be off. A plane keeps its name from round to round by the points that it keeps.
+Each round moves all points to where the last state has them, finds planes there and associates points with them,
+allowing for what that state may be off. A plane keeps its name from round to round by the points that it keeps.
 """
 
 from __future__ import annotations
