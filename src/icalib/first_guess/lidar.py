@@ -170,7 +170,7 @@ def _check_gravity(measured: float, expected: float, imu: str, lidar: str) -> No
     if abs(measured / expected - 1.0) > G_TOLERANCE:
         raise EstimationError(
             f"{imu} and {lidar} together show gravity of {measured:.3g} m/s^2 instead of {expected:.3g}: check that "
-            "the accelerometer is in m/s^2 (not in g), and the points in metres."
+            "the accelerometer is in m/s^2, not in g, and that the LiDAR sees walls in all directions."
         )
 
 

@@ -176,6 +176,19 @@ def _voxel_at(voxels, y, around):
 
 
 @njit(cache=True, nogil=True)
+def _derivatives(R, normal, y, tau, J):
+    """J (12,) of a distance; n . (-R [z]x d) = d . (z x R^T n)."""
+    b0 = R[0, 0] * normal[0] + R[1, 0] * normal[1] + R[2, 0] * normal[2]
+    b1 = R[0, 1] * normal[0] + R[1, 1] * normal[1] + R[2, 1] * normal[2]
+    b2 = R[0, 2] * normal[0] + R[1, 2] * normal[1] + R[2, 2] * normal[2]
+    J[0], J[1], J[2] = y[4] * b2 - y[5] * b1, y[5] * b0 - y[3] * b2, y[3] * b1 - y[4] * b0
+    for a in range(3):
+        J[3 + a] = normal[a]
+    for a in range(6):
+        J[6 + a] = tau * J[a]
+
+
+@njit(cache=True, nogil=True)
 def sums(voxels, pose, xyz, tau, around, scale, H, g):
     """Fills the normal equations H (12, 12), g (12,) of the scan's distances [m] from the map, Geman and McClure's
     weights of `scale` m. Returns how many points met a plane, and how many of these are near it."""
@@ -193,16 +206,7 @@ def sums(voxels, pose, xyz, tau, around, scale, H, g):
         met += 1
         near += abs(r) < NEAR * voxels.edge_m
         w = 1.0 / (1.0 + (r / scale) ** 2) ** 2
-        b0, b1, b2 = 0.0, 0.0, 0.0
-        for a in range(3):
-            b0 += pose.rotation[a, 0] * normal[a]
-            b1 += pose.rotation[a, 1] * normal[a]
-            b2 += pose.rotation[a, 2] * normal[a]
-        J[0], J[1], J[2] = y[4] * b2 - y[5] * b1, y[5] * b0 - y[3] * b2, y[3] * b1 - y[4] * b0
-        for a in range(3):
-            J[3 + a] = normal[a]
-        for a in range(6):
-            J[6 + a] = tau[n] * J[a]
+        _derivatives(pose.rotation, normal, y, tau[n], J)
         for a in range(UNKNOWNS):
             g[a] += w * r * J[a]
             for b in range(a + 1):

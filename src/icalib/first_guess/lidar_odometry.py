@@ -1,7 +1,7 @@
 """How a LiDAR moved, scan by scan: each is registered to a map of flat voxels that those before it made.
 
-A scan has a pose at its middle and a twist, so that each point is seen from where the LiDAR was at its own instant. Without
-the gyroscope the twist holds for the turning, too; once the LiDAR is aligned with the IMU, the gyroscope turns the points
+A scan has a pose at its middle and a twist: each point is seen from where the LiDAR was at its own instant. Without the
+gyroscope the twist holds for the turning, too; once the LiDAR is aligned with the IMU, the gyroscope turns the points
 of a scan back to its middle, and says how it stands to the scan before.
 """
 
