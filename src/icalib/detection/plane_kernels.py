@@ -132,21 +132,29 @@ def _reach(q, x, y, z, cells):
 def associate(points, seen_from, variance, cells, gate, least_cosine, plane, cell, distance):
     """The plane within `gate` standard deviations of each point, on the side that it was seen from; -1: none, or one
     more is near. Fills its cell and distance."""
+    count = len(cells.planes)
+    equation, r = np.empty((4, count)), np.empty(count)  # by rows: the loop over all planes is then a few instructions
+    for q in range(count):
+        p = cells.planes[q]
+        equation[0, q], equation[1, q], equation[2, q] = p[0], p[1], p[2]
+        equation[3, q] = p[0] * p[3] + p[1] * p[4] + p[2] * p[5]
     for n in range(len(points)):
         x, y, z = np.float64(points[n, 0]), np.float64(points[n, 1]), np.float64(points[n, 2])
         a, b, c = seen_from[n, 0] - x, seen_from[n, 1] - y, seen_from[n, 2] - z
         reach, least = gate * np.sqrt(variance[n]), least_cosine * np.sqrt(a * a + b * b + c * c)
         plane[n], found = -1, 0
-        for q in range(len(cells.planes)):
-            p = cells.planes[q]
-            r = p[0] * (x - p[3]) + p[1] * (y - p[4]) + p[2] * (z - p[5])
-            if abs(r) > APART * reach or p[0] * a + p[1] * b + p[2] * c < least:
+        for q in range(count):
+            r[q] = equation[0, q] * x + equation[1, q] * y + equation[2, q] * z - equation[3, q]
+        for q in range(count):
+            if abs(r[q]) > APART * reach:
+                continue
+            if equation[0, q] * a + equation[1, q] * b + equation[2, q] * c < least:
                 continue
             k = _reach(q, x, y, z, cells)
             if k >= 0:
                 found += 1
-                if abs(r) <= reach and cells.use[k] == OWN:
-                    plane[n], cell[n], distance[n] = q, k, r
+                if abs(r[q]) <= reach and cells.use[k] == OWN:
+                    plane[n], cell[n], distance[n] = q, k, r[q]
         if found > 1:
             plane[n] = -1
 

@@ -1,0 +1,184 @@
+"""A LiDAR's extrinsics and time offset from nothing, with the motion of the IMU where nothing else shows it.
+
+Its scans, registered one after the other, say how it turned; the gyroscope says the same of the IMU, which gives time
+offset and rotation. Turned by the gyroscope, the scans are registered again, and better. Their positions then give the
+lever arm: against a motion that cameras or another LiDAR showed, or against the IMU's own readings, with gravity.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.errors import EstimationError
+from icalib.estimation.imu_data import ImuData
+from icalib.estimation.state import Key, State
+from icalib.first_guess.clocks import STILL_RAD_S, Alignment, CameraRates, align, as_given
+from icalib.first_guess.gyro import GyroRotation
+from icalib.first_guess.lidar_arm import (
+    ANY_SIGMA,
+    BIAS_SIGMA,
+    SPEED_SIGMA,
+    WAY_SIGMA,
+    against_motion,
+    against_readings,
+    arm_prior,
+    solve,
+)
+from icalib.first_guess.lidar_motion import LONGEST_STEP_S, ImuMotion
+from icalib.first_guess.lidar_odometry import LidarPath, lidar_path
+from icalib.geometry import so3
+from icalib.measurements import LidarStream
+
+LEAST_CORRELATION = 0.6  # of turning rates with the IMU's
+G_TOLERANCE = 0.1
+
+
+@dataclass(frozen=True)
+class Held:
+    """What is known of a LiDAR, or None: R_imu_lidar (3, 3), p_imu_lidar (3,) m, offset: t_imu - t_lidar, both since
+    their clocks' first stamps [s]."""
+
+    rotation: np.ndarray | None = None
+    position: np.ndarray | None = None
+    offset: float | None = None
+
+
+@dataclass(frozen=True)
+class LidarGuess:
+    """R_imu_lidar, p_imu_lidar (3,) m; offset: as in `Held`."""
+
+    rotation: np.ndarray
+    position: np.ndarray
+    offset: float
+
+    def values(self, name: str) -> dict[Key, np.ndarray]:
+        """As lasting parameters of a state."""
+        return {
+            (name, "rotation"): self.rotation,
+            (name, "translation"): self.position,
+            (name, "time_offset"): np.array([self.offset]),
+        }
+
+
+def lidar_and_motion(
+    imu: ImuData, stream: LidarStream, gravity: float, held: Held = Held()
+) -> tuple[LidarGuess, ImuMotion]:
+    """From one LiDAR and the IMU alone; gravity [m/s^2]. Raises EstimationError, one sentence, where the recording does
+    not show it."""
+    aligned, path, rates = _aligned(imu, stream, held)
+    gyro, t = GyroRotation.integrate(imu, aligned.gyro_bias), path.seconds + aligned.offset
+
+    def carry(at_scans: np.ndarray) -> np.ndarray:
+        return gyro.carry(t, at_scans, imu.seconds)
+
+    prior = arm_prior(
+        np.array([ANY_SIGMA] * 3 + [BIAS_SIGMA] * 3), rates.rate, SPEED_SIGMA, held.rotation is not None, held.position
+    )
+    system = against_readings(imu, carry, t, path.rotation, path.position)
+    found = solve(system, prior, aligned.rotation, rates.rate)
+    if found is None:
+        raise _too_short(stream)
+    R_il, x = found
+    _check_gravity(float(np.linalg.norm(x[6:9])), gravity, imu.name, stream.name)
+    level, R_imu = _level(x[6:9]), path.rotation @ R_il.T
+    position = (path.position - R_imu @ x[3:6]) @ level.T
+    start = ImuMotion(gyro, t, level @ R_imu, position, np.zeros_like(position), aligned.gyro_bias, x[9:12], gravity)
+    return LidarGuess(R_il, x[3:6], aligned.offset), start.smoothed()
+
+
+def lidar_on_motion(imu: ImuData, stream: LidarStream, known: State, held: Held = Held()) -> LidarGuess:
+    """From the motion of the IMU in `known`: nodes no further apart than 50 ms or so. Raises EstimationError, one
+    sentence, where the recording does not show it."""
+    aligned, path, rates = _aligned(imu, stream, held)
+    t = path.seconds + aligned.offset
+    inside = (t >= known.seconds[0]) & (t <= known.seconds[-1])
+    R, p = _poses(known, GyroRotation.integrate(imu, known.bias[:, :3].mean(axis=0)), t[inside])
+    prior = arm_prior(np.zeros(0), rates.rate, WAY_SIGMA, held.rotation is not None, held.position)
+    system = against_motion(R, p, t[inside], path.rotation[inside], path.position[inside])
+    found = solve(system, prior, aligned.rotation, rates.rate)
+    if found is None:
+        raise _too_short(stream)
+    return LidarGuess(found[0], found[1][3:6], aligned.offset)
+
+
+def _poses(known: State, gyro: GyroRotation, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """R_world_imu (n, 3, 3), p (n, 3) at times t: cubic between nodes, by their velocities."""
+    k = np.clip(np.searchsorted(known.seconds, t, side="right") - 1, 0, len(known.seconds) - 2)
+    h = np.diff(known.seconds)[k][:, None]
+    s = (t - known.seconds[k])[:, None] / h
+    p0, p1, v0, v1 = known.position[k], known.position[k + 1], known.velocity[k] * h, known.velocity[k + 1] * h
+    p = p0 + s * (v0 + s * (3.0 * (p1 - p0) - 2.0 * v0 - v1 + s * (2.0 * (p0 - p1) + v0 + v1)))
+    return gyro.carry(known.seconds, known.rotation, t), p
+
+
+def _aligned(imu: ImuData, stream: LidarStream, held: Held) -> tuple[Alignment, LidarPath, CameraRates]:
+    """Time offset, rotation and gyroscope bias; the LiDAR's path by the gyroscope's turns, as far as the IMU was
+    running, and its rates."""
+    path = _turned_path(imu, stream, _align(imu, stream.name, _rates(stream.name, lidar_path(stream)), held))
+    rates = _rates(stream.name, path)
+    aligned = _align(imu, stream.name, rates, held)
+    path = _turned_path(imu, stream, aligned)
+    t = path.seconds + aligned.offset
+    inside = path.ok & (t > imu.seconds[0]) & (t < imu.seconds[-1])
+    path = LidarPath(path.seconds[inside], path.rotation[inside], path.position[inside], path.ok[inside])
+    return aligned, path, rates
+
+
+def _align(imu: ImuData, name: str, rates: CameraRates, held: Held) -> Alignment:
+    if held.rotation is not None and held.offset is not None:
+        return as_given(imu, name, rates, held.offset, held.rotation)
+    _check_turning(imu, name, rates)
+    found = align(imu, name, rates, held.offset)
+    return found if held.rotation is None else as_given(imu, name, rates, found.offset, held.rotation)
+
+
+def _turned_path(imu: ImuData, stream: LidarStream, aligned: Alignment) -> LidarPath:
+    gyro = GyroRotation.integrate(imu, aligned.gyro_bias)
+    return lidar_path(stream, lambda t: gyro.at(t + aligned.offset) @ aligned.rotation)
+
+
+def _rates(name: str, path: LidarPath) -> CameraRates:
+    t, R = path.seconds[path.ok], path.rotation[path.ok]
+    near = np.diff(t) < LONGEST_STEP_S
+    turn = so3.log_many(np.ascontiguousarray(R[:-1].transpose(0, 2, 1) @ R[1:])) / np.diff(t)[:, None]
+    if near.sum() < 2:
+        raise EstimationError(f"{name}: its scans are further apart than {LONGEST_STEP_S} s; record with more of them.")
+    return CameraRates(t[:-1][near], t[1:][near], turn[near], LEAST_CORRELATION)
+
+
+def _check_turning(imu: ImuData, name: str, rates: CameraRates) -> None:
+    """Raises EstimationError where neither turns."""
+    turned = np.sqrt(((imu.gyro - np.median(imu.gyro, axis=0)) ** 2).sum(axis=1).mean())
+    seen = np.sqrt(np.median((rates.rate**2).sum(axis=1)))
+    if turned < STILL_RAD_S and seen < 3.0 * STILL_RAD_S:
+        raise EstimationError(
+            f"{name} and {imu.name} hardly turn ({turned:.4f} rad/s RMS), which leaves their clocks and axes open; "
+            "record again with turns about two axes or more, or give its rotation and time_offset in the rig file."
+        )
+
+
+def _too_short(stream: LidarStream) -> EstimationError:
+    return EstimationError(
+        f"{stream.name}: too few of its scans fall within the recording of the IMU to find its lever arm; check that "
+        "both clocks overlap, or record for longer."
+    )
+
+
+def _check_gravity(measured: float, expected: float, imu: str, lidar: str) -> None:
+    if abs(measured / expected - 1.0) > G_TOLERANCE:
+        raise EstimationError(
+            f"{imu} and {lidar} together show gravity of {measured:.3g} m/s^2 instead of {expected:.3g}: check that "
+            "the accelerometer is in m/s^2, not in g, and that the LiDAR sees walls in all directions."
+        )
+
+
+def _level(gravity: np.ndarray) -> np.ndarray:
+    """R_world_map: the smallest turn that brings gravity (3,) down."""
+    d = -gravity / np.linalg.norm(gravity)
+    axis = np.array([d[1], -d[0], 0.0])  # d x z
+    sine = np.linalg.norm(axis)
+    if sine < 1e-12:
+        return np.diag([1.0, np.sign(d[2]), np.sign(d[2])])
+    return so3.exp(axis * (np.arctan2(sine, d[2]) / sine))

@@ -1,0 +1,194 @@
+"""A LiDAR's lever arm, and what rates leave open of its rotation: linear in its positions.
+
+Against a known motion of the IMU, with u the LiDAR's own way from instant i to j in its axes at i (hand and eye):
+
+    (R_j - R_i) p_imu_lidar - R_i R_imu_lidar u = p_i - p_j                                     R, p: of the IMU
+
+Against the IMU's readings alone, with A[x] = (x_2 - x_1) / h_2 - (x_1 - x_0) / h_1 over three scans, in which
+velocities have dropped out (as of a camera in `lever_arm`, whose board is the LiDAR's map here):
+
+    A[p_map_lidar] = A[R_map_imu] p_imu_lidar + A[D_f] - A[D_R] b_a + g (h_1 + h_2) / 2
+
+Both are linear in a turn R_imu_lidar Exp(d), too. Where a LiDAR turned about one axis, d about it is left to these rows
+alone; then the turn that fits them best among all is where to start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from icalib.estimation.imu_data import ImuData
+from icalib.first_guess.lidar_motion import Integrals
+from icalib.geometry import so3
+
+ARM_SIGMA = 0.5  # m: what the motion leaves open stays small
+BIAS_SIGMA = 0.3  # m/s^2
+ANY_SIGMA = 1e3
+HELD_SIGMA = 1e-6
+WAY_SIGMA, SPEED_SIGMA = 0.1, 0.05  # m, m/s: of a row
+RATE_SIGMA = 0.02  # rad/s, of a rate of the LiDAR
+SPANS_S = (0.5, 2.0)  # of ways
+STEP_S = 0.1  # between the scans of a triple, at least
+FEWEST_ROWS = 10
+ONE_AXIS = 0.1  # of the spread of rates about the first axis: below, turns about the second are lost in noise
+CANDIDATES = 24  # turns about that axis
+ROUNDS = 5
+
+
+class Rows(NamedTuple):
+    """A x = b with A (n, 3, m), b (n, 3); the first six of x are d and p_imu_lidar."""
+
+    A: np.ndarray
+    b: np.ndarray
+
+
+System = Callable[[np.ndarray, np.ndarray], Rows]  # of R_imu_lidar, and p_imu_lidar for the derivative by d
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Of x (m,): mean and sigma, in the units of a row's sigma; information (3, 3) of d from rates, likewise."""
+
+    mean: np.ndarray
+    sigma: np.ndarray
+    information: np.ndarray
+
+
+def arm_prior(others: np.ndarray, rates: np.ndarray, row_sigma: float, rotation_held: bool, held: np.ndarray | None):
+    """Of a system with unknowns of sigma `others` (k,) beside d and p, and rates (n, 3) of the LiDAR; held (3,): the
+    lever arm where it is known."""
+    d = HELD_SIGMA if rotation_held else ANY_SIGMA
+    arm = ARM_SIGMA if held is None else HELD_SIGMA
+    mean = np.concatenate([np.zeros(3), np.zeros(3) if held is None else held, np.zeros(len(others))])
+    w = rates - rates.mean(axis=0)
+    information = (w**2).sum() * np.eye(3) - w.T @ w
+    return Prior(
+        mean, np.concatenate([[d] * 3, [arm] * 3, others]) / row_sigma, information * (row_sigma / RATE_SIGMA) ** 2
+    )
+
+
+def against_motion(
+    R_imu: np.ndarray, p_imu: np.ndarray, seconds: np.ndarray, rotation: np.ndarray, position: np.ndarray
+) -> System:
+    """Of a LiDAR at seconds (n,), R_map_lidar and p_map_lidar, while the IMU was at R_imu, p_imu in any world."""
+    i, j = _pairs(seconds)
+    u = np.einsum("nji,nj->ni", rotation[i], position[j] - position[i])
+    hat_u = _hats(u)
+
+    def rows(R_il: np.ndarray, p_il: np.ndarray) -> Rows:
+        del p_il
+        R = R_imu[i] @ R_il
+        A = np.concatenate([R @ hat_u, R_imu[j] - R_imu[i]], axis=2)
+        return Rows(A, np.einsum("nij,nj->ni", R, u) - (p_imu[j] - p_imu[i]))
+
+    return rows
+
+
+def against_readings(
+    imu: ImuData,
+    carry: Callable[[np.ndarray], np.ndarray],
+    seconds: np.ndarray,
+    rotation: np.ndarray,
+    position: np.ndarray,
+) -> System:
+    """Of a LiDAR at seconds (n,) on the imu clock; carry: R_map_imu (N, 3, 3) at the IMU's stamps from that (n, 3, 3)
+    at the scans. The unknowns after p are gravity in the map and the accelerometer's bias."""
+    i, j, k = _triples(seconds, imu.gaps)
+    h1, h2 = (seconds[j] - seconds[i])[:, None], (seconds[k] - seconds[j])[:, None]
+
+    def second(x: np.ndarray) -> np.ndarray:
+        flat = x.reshape(len(x), -1)
+        return ((flat[k] - flat[j]) / h2 - (flat[j] - flat[i]) / h1).reshape(len(i), *x.shape[1:])
+
+    bend = second(position)
+
+    def rows(R_il: np.ndarray, p_il: np.ndarray) -> Rows:
+        at_scans = rotation @ R_il.T
+        R = carry(at_scans)
+        felt = np.einsum("nij,nj->ni", R, imu.accel)
+        # R_map_lidar is what is known: with R_imu_lidar Exp(d) what is felt turns by -d in the LiDAR's axes.
+        by_turn = _hats(felt) @ R @ R_il
+        x = np.concatenate([felt, R.reshape(-1, 9), by_turn.reshape(-1, 9)], axis=1)
+        D = Integrals.of(imu, x).at(seconds)[1]
+        A = np.zeros((len(i), 3, 12))
+        A[:, :, :3] = second(rotation @ _hats((R_il.T @ p_il)[None])[0] + D[:, 12:].reshape(-1, 3, 3))
+        A[:, :, 3:6] = second(at_scans)
+        A[:, :, 6:9] = 0.5 * (h1 + h2)[:, :, None] * np.eye(3)
+        A[:, :, 9:] = -second(D[:, 3:12].reshape(-1, 3, 3))
+        return Rows(A, bend - second(D[:, :3]))
+
+    return rows
+
+
+def solve(rows: System, prior: Prior, R_il: np.ndarray, rates: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """R_imu_lidar and x (m,) that fit the rows best, from a rotation that fits rates (n, 3) of the LiDAR; None where
+    rows are too few."""
+    start = prior.mean[3:6]
+    if len(rows(R_il, start).b) < FEWEST_ROWS:
+        return None
+    held = prior.sigma[0] < 1.0
+    _, spread, axes = np.linalg.svd(rates - rates.mean(axis=0), full_matrices=False)
+    if not held and spread[1] < ONE_AXIS * spread[0]:
+        angles = 2.0 * np.pi * np.arange(CANDIDATES) / CANDIDATES
+        turns = so3.exp_many(angles[:, None] * axes[0])
+        R_il = min((R_il @ turn for turn in turns), key=lambda R: _misfit(rows(R, start), prior))
+    x = prior.mean
+    for _ in range(ROUNDS):
+        x = _fit(rows(R_il, x[3:6]), prior, 0)[0]
+        R_il = R_il @ so3.exp(x[:3].copy())
+    return R_il, x
+
+
+def _misfit(rows: Rows, prior: Prior) -> float:
+    """RMS of what rows lack with d = 0."""
+    return _fit(rows, prior, 3)[1]
+
+
+def _fit(rows: Rows, prior: Prior, without: int) -> tuple[np.ndarray, float]:
+    """Least squares for x without its first `without`, twice more without rows that stand far off; RMS of the rest."""
+    A, free = rows.A[:, :, without:], slice(without, None)
+    N0, mean = np.diag(prior.sigma[free] ** -2), prior.mean[free]
+    weight, x, size = np.ones(len(A)), mean, np.zeros(len(A))
+    r0 = N0 @ mean
+    if not without:
+        N0[:3, :3] += prior.information
+    for _ in range(3):
+        wA = A * weight[:, None, None]
+        x = np.linalg.solve(N0 + np.einsum("nia,nib->ab", wA, A), r0 + np.einsum("nia,ni->a", wA, rows.b))
+        size = np.linalg.norm(rows.b - A @ x, axis=1)
+        weight = (size < 4.0 * np.median(size) + 1e-9).astype(float)
+    return np.concatenate([np.zeros(without), x]), float(np.sqrt(np.mean(size[weight > 0.0] ** 2)))
+
+
+def _hats(v: np.ndarray) -> np.ndarray:
+    """(n, 3, 3) with hat(v) w = v x w of v (n, 3)."""
+    m = np.zeros((len(v), 3, 3))
+    m[:, 0, 1], m[:, 0, 2], m[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
+    return m - m.transpose(0, 2, 1)
+
+
+def _pairs(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Instants (i, j) about SPANS_S apart."""
+    i = np.tile(np.arange(len(t)), len(SPANS_S))
+    span = np.repeat(SPANS_S, len(t))
+    j = np.searchsorted(t, t[i] + span - 1e-3)
+    good = (j < len(t)) & (t[np.minimum(j, len(t) - 1)] - t[i] < 2.0 * span)
+    return i[good], j[good]
+
+
+def _triples(t: np.ndarray, gaps: tuple[tuple[float, float], ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Scans (i, j, k) about STEP_S apart, or next to each other, and no part of them in a gap of the IMU."""
+    i = np.arange(len(t))
+    step = max(STEP_S, float(np.median(np.diff(t))))
+    j = np.searchsorted(t, t + 0.99 * step - 1e-3)
+    k = np.searchsorted(t, t + 1.98 * step - 1e-3)
+    good = (k < len(t)) & (j < k) & (i < j)
+    i, j, k = i[good], j[good], k[good]
+    close = (t[j] - t[i] < 2.0 * step) & (t[k] - t[j] < 2.0 * step)
+    for start, end in gaps:
+        close &= (t[k] <= start) | (t[i] >= end)
+    return i[close], j[close], k[close]

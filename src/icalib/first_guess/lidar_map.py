@@ -1,0 +1,232 @@
+"""Compiled parts of LiDAR odometry: a map of flat voxels, and a scan's distances from it.
+
+A point x at tau seconds from its scan's middle is seen at y = R Exp(w tau) x + p + v tau in the map: the scan's pose
+(R, p) and its twist, w in its own axes and v in the map's. Its distance from the plane of the voxel that y falls into
+moves by
+
+    dr = n . (-R [z]x dtheta + dp - R [z]x tau dw + tau dv)     z = Exp(w tau) x
+
+where Exp((w + dw) tau) = Exp(w tau) Exp(tau dw) is good enough within a scan.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from icalib.geometry import so3
+
+UNKNOWNS = 12  # of a scan: turn, position, rate, velocity
+MOMENTS = 9  # x; y; z; xx; yx, yy; zx, zy, zz about the voxel's middle
+FEWEST = 6  # points of a voxel
+ACROSS = 0.06  # of a voxel's edge: what spreads less in its own plane is a line
+FLATTEST = 0.15  # of a voxel's edge: what spreads more across is no plane
+NEAR = 0.2  # of a voxel's edge
+REACH = 1 << 20  # voxels from the origin to either side
+
+
+class VoxelMap(NamedTuple):
+    """Voxels of an edge [m], found by an open hash table: key (H,), -1: empty, and place (H,) of each among the voxels;
+    size (1,) of them. weight (V,), moments (V, 9), touched (V,): last scan; centre, normal (V, 3); flat (V,)."""
+
+    edge_m: float
+    key: np.ndarray
+    place: np.ndarray
+    size: np.ndarray
+    middle: np.ndarray
+    weight: np.ndarray
+    moments: np.ndarray
+    touched: np.ndarray
+    centre: np.ndarray
+    normal: np.ndarray
+    flat: np.ndarray
+
+    @classmethod
+    def empty(cls, edge_m: float, capacity: int) -> VoxelMap:
+        """Room for `capacity` voxels, a power of two; points of further ones are not kept."""
+        n = capacity
+        return cls(
+            edge_m, np.full(2 * n, -1, np.int64), np.zeros(2 * n, np.int64), np.zeros(1, np.int64), np.zeros((n, 3)),
+            np.zeros(n), np.zeros((n, MOMENTS)), np.zeros(n, np.int64), np.zeros((n, 3)), np.zeros((n, 3)),
+            np.zeros(n, np.bool_),
+        )  # fmt: skip
+
+    def clear(self) -> None:
+        """As if nothing had been put in."""
+        self.key[:], self.size[:], self.weight[:], self.moments[:], self.flat[:] = -1, 0, 0.0, 0.0, False
+
+
+class ScanPose(NamedTuple):
+    """Of a scan's middle, in the map: R (3, 3), p (3,) m; rate (3,) rad/s in its own axes, velocity (3,) m/s."""
+
+    rotation: np.ndarray
+    position: np.ndarray
+    rate: np.ndarray
+    velocity: np.ndarray
+
+
+@njit(cache=True, nogil=True)
+def _index(x, voxels):
+    return int(np.floor(x / voxels.edge_m))
+
+
+@njit(cache=True, nogil=True)
+def _slot(key, i, j, k):
+    """Where voxel (i, j, k) is in the hash table, or would be; and its key."""
+    own = ((i + REACH) << 42) + ((j + REACH) << 21) + (k + REACH)
+    mask = len(key) - 1
+    s = ((own * 0x9E3779B97F4A7C1) >> 20) & mask
+    while key[s] != own and key[s] != -1:
+        s = (s + 1) & mask
+    return s, own
+
+
+@njit(cache=True, nogil=True)
+def place_point(pose, x, y, z, tau, out):
+    """out (6,): the point in the map, then z = Exp(w tau) x."""
+    w = pose.rate
+    a, b, c = w[0] * tau, w[1] * tau, w[2] * tau
+    # Exp to second order: a scan turns by less than half a radian to either side.
+    ux, uy, uz = b * z - c * y, c * x - a * z, a * y - b * x
+    out[3] = x + ux + 0.5 * (b * uz - c * uy)
+    out[4] = y + uy + 0.5 * (c * ux - a * uz)
+    out[5] = z + uz + 0.5 * (a * uy - b * ux)
+    R, p, v = pose.rotation, pose.position, pose.velocity
+    for i in range(3):
+        out[i] = R[i, 0] * out[3] + R[i, 1] * out[4] + R[i, 2] * out[5] + p[i] + v[i] * tau
+
+
+@njit(cache=True, nogil=True)
+def insert(voxels, pose, xyz, tau, scan, keep):
+    """Adds points xyz (n, 3) of scan number `scan`; what voxels held counts by `keep` per scan since."""
+    y, touched, n_touched = np.empty(6), np.empty(len(xyz), np.int64), 0
+    for n in range(len(xyz)):
+        place_point(pose, xyz[n, 0], xyz[n, 1], xyz[n, 2], tau[n], y)
+        i, j, k = _index(y[0], voxels), _index(y[1], voxels), _index(y[2], voxels)
+        if max(abs(i), abs(j), abs(k)) >= REACH - 1:
+            continue
+        s, own = _slot(voxels.key, i, j, k)
+        if voxels.key[s] == -1:
+            if voxels.size[0] == len(voxels.weight):
+                continue
+            voxels.key[s], voxels.place[s] = own, voxels.size[0]
+            v = voxels.size[0]
+            voxels.size[0] += 1
+            for a, index in enumerate((i, j, k)):
+                voxels.middle[v, a] = (index + 0.5) * voxels.edge_m
+            voxels.touched[v] = -1
+        v = voxels.place[s]
+        if voxels.touched[v] != scan:
+            f = keep ** (scan - voxels.touched[v])
+            voxels.weight[v] *= f
+            for a in range(MOMENTS):
+                voxels.moments[v, a] *= f
+            voxels.touched[v] = scan
+            touched[n_touched] = v
+            n_touched += 1
+        voxels.weight[v] += 1.0
+        a, b, c = y[0] - voxels.middle[v, 0], y[1] - voxels.middle[v, 1], y[2] - voxels.middle[v, 2]
+        row = (a, b, c, a * a, b * a, b * b, c * a, c * b, c * c)
+        for m in range(MOMENTS):
+            voxels.moments[v, m] += row[m]
+    for i in range(n_touched):
+        _fit(voxels, touched[i])
+
+
+@njit(cache=True, nogil=True)
+def _fit(voxels, v):
+    """Centre, normal and flatness of a voxel from its moments."""
+    m, w = voxels.moments[v], voxels.weight[v]
+    a, b, c = m[0] / w, m[1] / w, m[2] / w
+    S = np.empty((3, 3))
+    S[0, 0], S[1, 1], S[2, 2] = m[3] / w - a * a, m[5] / w - b * b, m[8] / w - c * c
+    S[1, 0], S[2, 0], S[2, 1] = m[4] / w - b * a, m[6] / w - c * a, m[7] / w - c * b
+    S[0, 1], S[0, 2], S[1, 2] = S[1, 0], S[2, 0], S[2, 1]
+    spread, axes = np.linalg.eigh(S)
+    edge2 = voxels.edge_m * voxels.edge_m
+    thin = spread[0] < FLATTEST * FLATTEST * edge2 and spread[0] < 0.25 * spread[1]
+    voxels.flat[v] = w >= FEWEST and thin and spread[1] > ACROSS * ACROSS * edge2
+    for i, x in enumerate((a, b, c)):
+        voxels.centre[v, i] = voxels.middle[v, i] + x
+        voxels.normal[v, i] = axes[i, 0]
+
+
+@njit(cache=True, nogil=True)
+def _voxel_at(voxels, y, around):
+    """The flat voxel that y falls into, or with `around` of the 27 there the one with the nearest centre; -1: none."""
+    i0, j0, k0 = _index(y[0], voxels), _index(y[1], voxels), _index(y[2], voxels)
+    if max(abs(i0), abs(j0), abs(k0)) >= REACH - 2:
+        return -1
+    found, least = -1, np.inf
+    for i in range(i0 - around, i0 + around + 1):
+        for j in range(j0 - around, j0 + around + 1):
+            for k in range(k0 - around, k0 + around + 1):
+                s, _ = _slot(voxels.key, i, j, k)
+                v = voxels.place[s]
+                if voxels.key[s] == -1 or not voxels.flat[v]:
+                    continue
+                d = 0.0
+                for a in range(3):
+                    d += (y[a] - voxels.centre[v, a]) ** 2
+                if d < least:
+                    found, least = v, d
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _derivatives(R, normal, y, tau, J):
+    """J (12,) of a distance; n . (-R [z]x d) = d . (z x R^T n)."""
+    b0 = R[0, 0] * normal[0] + R[1, 0] * normal[1] + R[2, 0] * normal[2]
+    b1 = R[0, 1] * normal[0] + R[1, 1] * normal[1] + R[2, 1] * normal[2]
+    b2 = R[0, 2] * normal[0] + R[1, 2] * normal[1] + R[2, 2] * normal[2]
+    J[0], J[1], J[2] = y[4] * b2 - y[5] * b1, y[5] * b0 - y[3] * b2, y[3] * b1 - y[4] * b0
+    for a in range(3):
+        J[3 + a] = normal[a]
+    for a in range(6):
+        J[6 + a] = tau * J[a]
+
+
+@njit(cache=True, nogil=True)
+def sums(voxels, pose, xyz, tau, around, scale, H, g):
+    """Fills the normal equations H (12, 12), g (12,) of the scan's distances [m] from the map, Geman and McClure's
+    weights of `scale` m. Returns how many points met a plane, and how many of these are near it."""
+    y, J, met, near = np.empty(6), np.empty(UNKNOWNS), 0, 0
+    H[:] = 0.0
+    g[:] = 0.0
+    for n in range(len(xyz)):
+        place_point(pose, xyz[n, 0], xyz[n, 1], xyz[n, 2], tau[n], y)
+        v = _voxel_at(voxels, y, around)
+        if v < 0:
+            continue
+        normal, r = voxels.normal[v], 0.0
+        for a in range(3):
+            r += normal[a] * (y[a] - voxels.centre[v, a])
+        met += 1
+        near += abs(r) < NEAR * voxels.edge_m
+        w = 1.0 / (1.0 + (r / scale) ** 2) ** 2
+        _derivatives(pose.rotation, normal, y, tau[n], J)
+        for a in range(UNKNOWNS):
+            g[a] += w * r * J[a]
+            for b in range(a + 1):
+                H[a, b] += w * J[a] * J[b]
+    for a in range(UNKNOWNS):
+        for b in range(a):
+            H[b, a] = H[a, b]
+    return met, near
+
+
+@njit(cache=True, nogil=True)
+def turn_back(xyz, which, turns):
+    """Points xyz (n, 3) turned by turns[which] each, in place."""
+    for n in range(len(xyz)):
+        R, x, y, z = turns[which[n]], xyz[n, 0], xyz[n, 1], xyz[n, 2]
+        for a in range(3):
+            xyz[n, a] = R[a, 0] * x + R[a, 1] * y + R[a, 2] * z
+
+
+def moved(pose: ScanPose, d: np.ndarray) -> ScanPose:
+    """The pose corrected by d (12,)."""
+    R = pose.rotation @ so3.exp(d[:3].copy())
+    return ScanPose(R, pose.position + d[3:6], pose.rate + d[6:9], pose.velocity + d[9:])

@@ -1,0 +1,190 @@
+"""How a LiDAR moved, scan by scan: each is registered to a map of flat voxels that those before it made.
+
+A scan has a pose at its middle and a twist: each point is seen from where the LiDAR was at its own instant. Without the
+gyroscope the twist holds for the turning, too; once the LiDAR is aligned with the IMU, the gyroscope turns the points
+of a scan back to its middle, and says how it stands to the scan before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.errors import EstimationError
+from icalib.first_guess.lidar_map import UNKNOWNS, ScanPose, VoxelMap, insert, moved, sums, turn_back
+from icalib.geometry import so3
+from icalib.measurements import LidarStream
+
+MOST_MATCHED, MOST_MAPPED = 1500, 6000  # points of a scan
+FEWEST_POINTS = 100
+FEWEST_SCANS = 20
+NEAREST_M = 0.3  # nearer than this is the LiDAR's own housing
+VOXELS_IN_REACH = 8.0  # edges in the median range
+EDGES_M = (0.3, 2.0)
+CAPACITY = 1 << 17
+ROUNDS = 14
+WIDE_ROUNDS = 4  # that look into voxels around
+SCALE = 0.5  # of an edge: of the weights in the first round
+LAST_SCALE, LAST_SCALE_TURNED = 0.2, 0.1
+POINT_SIGMA_M = 0.1  # of a point against what is expected of the motion: points of one plane err together
+LEAST_NEAR = 0.3  # of a scan's points must lie on the map's planes
+FIRST_ROUNDS = 4  # to find how the LiDAR moved in its first scan, which makes the map
+KEEP, KEEP_TURNED = 0.85, 0.995  # of what a voxel holds, by the scan
+# What a motion may do between scans: change its rates (rad/s^2, m/s^2), and depart from their means (rad, m).
+ANGULAR_ACCELERATION, ACCELERATION = 6.0, 5.0
+TURN_SIGMA, MOVE_SIGMA = 0.02, 0.02
+# Where the gyroscope turns the points: its bias and the alignment may err by this much (rad/s, rad).
+RATE_SIGMA, GYRO_SIGMA = 0.01, 0.004
+TURN_STEP_S = 1e-3  # of the gyroscope's turns within a scan
+LONGEST_STEP_S = 1.0
+
+Turning = Callable[[np.ndarray], np.ndarray]  # instants (n,) on the LiDAR's clock -> R_start_lidar (n, 3, 3)
+
+
+@dataclass(frozen=True)
+class LidarPath:
+    """A LiDAR at the middles of its scans: seconds (n,) on its clock since its first stamp; R_map_lidar (n, 3, 3),
+    p_map_lidar (n, 3) m; ok (n,) whether it was found there. The map is where the LiDAR first stood."""
+
+    seconds: np.ndarray
+    rotation: np.ndarray
+    position: np.ndarray
+    ok: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Scan:
+    """middle [s]; points xyz (n, 3) and instants tau (n,) s from the middle, in a random order."""
+
+    middle: float
+    xyz: np.ndarray
+    tau: np.ndarray
+
+
+def lidar_path(stream: LidarStream, turning: Turning | None = None) -> LidarPath:
+    """`turning`: how it turned, where that is known. Raises EstimationError where scans are too few or do not fit one
+    another."""
+    scans = [_scan_of(stream, i) for i in range(len(stream.stamps_ns))]
+    scans = [s for s in scans if len(s.tau) >= FEWEST_POINTS]
+    if len(scans) < FEWEST_SCANS:
+        raise EstimationError(
+            f"{stream.name}: only {len(scans)} of its {len(stream.stamps_ns)} scans have {FEWEST_POINTS} points or "
+            "more; check its topic, or record for longer."
+        )
+    turns = None
+    if turning is not None:
+        turns = turning(np.array([s.middle for s in scans]))
+        scans = [_turned(s, turning) for s in scans]
+    reach = float(np.median([np.median(np.linalg.norm(s.xyz, axis=1)) for s in scans]))
+    poses, ok = _follow(scans, turns, float(np.clip(reach / VOXELS_IN_REACH, *EDGES_M)))
+    if ok.mean() < 0.5:
+        raise EstimationError(
+            f"{stream.name}: only {ok.sum()} of {len(scans)} scans fit the surfaces that others show; there may be too "
+            "few flat surfaces in sight, or the point times may be wrong."
+        )
+    seconds = np.array([s.middle for s in scans])
+    return LidarPath(seconds, np.array([p.rotation for p in poses]), np.array([p.position for p in poses]), ok)
+
+
+def _scan_of(stream: LidarStream, i: int) -> _Scan:
+    own = slice(int(stream.start[i]), int(stream.start[i + 1]))
+    offset, xyz = stream.offset_s[own], stream.xyz[own]
+    if not len(offset):
+        return _Scan(float(stream.seconds[i]), np.empty((0, 3)), np.empty(0))
+    middle = 0.5 * (float(offset.min()) + float(offset.max()))
+    chosen = np.random.default_rng(i).permutation(len(offset))[:MOST_MAPPED]
+    points = xyz[chosen].astype(np.float64)
+    size2 = (points**2).sum(axis=1)
+    good = np.isfinite(size2) & (size2 > NEAREST_M**2)
+    return _Scan(float(stream.seconds[i]) + middle, points[good], offset[chosen][good].astype(np.float64) - middle)
+
+
+def _turned(scan: _Scan, turning: Turning) -> _Scan:
+    """The scan as seen by a LiDAR that stands as in its middle."""
+    which = np.floor(scan.tau / TURN_STEP_S).astype(np.int64)
+    low = which.min()
+    steps = scan.middle + (np.arange(low, which.max() + 1) + 0.5) * TURN_STEP_S
+    R = turning(np.append(steps, scan.middle))
+    xyz = scan.xyz.copy()
+    turn_back(xyz, which - low, np.ascontiguousarray(R[-1].T @ R[:-1]))
+    return _Scan(scan.middle, xyz, scan.tau)
+
+
+def _follow(scans: list[_Scan], turns: np.ndarray | None, edge_m: float) -> tuple[list[ScanPose], np.ndarray]:
+    ok = np.ones(len(scans), dtype=bool)
+
+    def register(k: int, before: ScanPose, scale: float) -> ScanPose:
+        step = scans[k].middle - scans[k - 1].middle
+        turned = None if turns is None else turns[k - 1].T @ turns[k]
+        pose, ok[k] = _register(voxels, scans[k], _Expected(before, min(step, LONGEST_STEP_S), turned), scale)
+        return pose
+
+    still = ScanPose(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
+    voxels, poses = VoxelMap.empty(edge_m, CAPACITY), [still]
+    for _ in range(FIRST_ROUNDS):
+        voxels.clear()
+        insert(voxels, poses[0], scans[0].xyz, scans[0].tau, 0, 1.0)
+        after = register(1, poses[0], LAST_SCALE)
+        poses[0] = still._replace(rate=after.rate, velocity=after.velocity)
+    for k in range(1, len(scans)):
+        pose = register(k, poses[-1], LAST_SCALE if turns is None else LAST_SCALE_TURNED)
+        poses.append(pose)
+        if ok[k]:
+            insert(voxels, pose, scans[k].xyz, scans[k].tau, k, KEEP if turns is None else KEEP_TURNED)
+    return poses, ok
+
+
+@dataclass(frozen=True)
+class _Expected:
+    """What the scan before says of a pose: `before` it by `step` s; `turned` (3, 3) where the gyroscope says so."""
+
+    before: ScanPose
+    step: float
+    turned: np.ndarray | None
+
+    @property
+    def pose(self) -> ScanPose:
+        b = self.before
+        turned = so3.exp(b.rate * self.step) if self.turned is None else self.turned
+        return ScanPose(b.rotation @ turned, b.position + b.velocity * self.step, b.rate, b.velocity)
+
+    def add(self, pose: ScanPose, H: np.ndarray, g: np.ndarray) -> None:
+        """Adds to the normal equations that rates change little, and poses by the mean of the rates around them."""
+        b, h = self.before, self.step
+        J, r, sigma = np.zeros((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS), np.empty(UNKNOWNS)
+        J[range(UNKNOWNS), range(UNKNOWNS)] = 1.0
+        if self.turned is None:
+            turn = so3.log(np.ascontiguousarray(b.rotation.T @ pose.rotation))
+            r[:3] = turn - 0.5 * h * (b.rate + pose.rate)
+            J[:3, 6:9] = -0.5 * h * np.eye(3)
+            r[6:9] = pose.rate - b.rate
+            sigma[:3], sigma[6:9] = TURN_SIGMA, ANGULAR_ACCELERATION * h
+        else:
+            r[:3] = so3.log(np.ascontiguousarray((b.rotation @ self.turned).T @ pose.rotation))
+            r[6:9] = pose.rate
+            sigma[:3], sigma[6:9] = GYRO_SIGMA, RATE_SIGMA
+        r[3:6] = pose.position - b.position - 0.5 * h * (b.velocity + pose.velocity)
+        J[3:6, 9:] = -0.5 * h * np.eye(3)
+        r[9:] = pose.velocity - b.velocity
+        sigma[3:6], sigma[9:] = MOVE_SIGMA, ACCELERATION * h
+        W = J / sigma[:, None] * POINT_SIGMA_M
+        H += W.T @ W
+        g += W.T @ (r / sigma * POINT_SIGMA_M)
+
+
+def _register(voxels: VoxelMap, scan: _Scan, expected: _Expected, last: float) -> tuple[ScanPose, bool]:
+    """The scan's pose, and whether it fits the map."""
+    xyz, tau = scan.xyz[:MOST_MATCHED], scan.tau[:MOST_MATCHED]
+    H, g, pose, near = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS), expected.pose, 0
+    for k in range(ROUNDS):
+        share = min(k / (WIDE_ROUNDS + 1.0), 1.0)
+        scale = voxels.edge_m * SCALE ** (1.0 - share) * last**share
+        _, near = sums(voxels, pose, xyz, tau, 1 if k < WIDE_ROUNDS else 0, scale, H, g)
+        expected.add(pose, H, g)
+        d = -np.linalg.solve(H, g)
+        pose = moved(pose, d)
+        if share == 1.0 and np.abs(d[:6]).max() < 1e-4:
+            break
+    return (pose, True) if near > LEAST_NEAR * len(tau) else (expected.pose, False)
