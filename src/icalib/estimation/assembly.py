@@ -24,7 +24,7 @@ from icalib.estimation.nodes import MERGED_WITHIN_S, distinct, first_nodes, plac
 from icalib.estimation.poses import assign_nodes, poses_at
 from icalib.estimation.prior_factor import Prior
 from icalib.estimation.problem import ChainFactor, Problem
-from icalib.estimation.robot import NO_CLOUDS, Clouds, own_entries, plane_entries, robot_factors
+from icalib.estimation.robot import NO_CLOUDS, Clouds, own_entries, robot_factors
 from icalib.estimation.sensors import SensorFactor
 from icalib.estimation.state import Entry, Key, Kind, Layout, State, make_layout
 from icalib.estimation.tolerances import Tolerances
@@ -118,7 +118,7 @@ def layout_for(rig: Rig, bodies: Bodies, n_recordings: int = 1, clouds: Clouds =
             entries.append((camera.name, name, kind, sizes[name], _is_estimated(rig, camera, name)))
     for sensor in (*(rig.lidars if clouds.count else ()), *rig.wheels):
         entries += own_entries(sensor)
-    return make_layout(entries + bodies.pose_entries() + plane_entries(clouds))
+    return make_layout(entries + bodies.pose_entries() + clouds.entries)
 
 
 def _is_estimated(rig: Rig, camera: Camera, name: str) -> bool:
@@ -174,6 +174,14 @@ def image_times(inputs: Inputs, values: dict[Key, np.ndarray]) -> list[np.ndarra
     return [c.seconds + values[c.name, "time_offset"][0] for c in inputs.measurements.cameras]
 
 
+def host_times(inputs: Inputs, values: dict[Key, np.ndarray]) -> list[np.ndarray]:
+    """Instants that nodes are placed at, by sensor, seconds on the body's clock since its first stamp: those of images,
+    or without cameras those of scans."""
+    if inputs.rig.cameras:
+        return image_times(inputs, values)
+    return [x.seconds + values[x.name, "time_offset"][0] for x in inputs.measurements.lidars]
+
+
 def resample(state: State, nodes: np.ndarray, inputs: Inputs) -> State:
     """The same motion at other nodes, by integrating the IMU from the nearest old one; without an IMU nodes stay."""
     if inputs.imu is None:
@@ -185,7 +193,7 @@ def resample(state: State, nodes: np.ndarray, inputs: Inputs) -> State:
 
 
 def nodes_for(inputs: Inputs, times: list[np.ndarray]) -> np.ndarray:
-    """Node times for images at `times`. Raises EstimationError where clocks do not overlap."""
+    """Node times for images or scans at `times`. Raises EstimationError where clocks do not overlap."""
     settings = inputs.rig.settings
     if inputs.imu is None:
         return distinct(np.sort(np.concatenate(times)))
@@ -195,10 +203,14 @@ def nodes_for(inputs: Inputs, times: list[np.ndarray]) -> np.ndarray:
     if counts.min() < 3:
         where = f"{inputs.parts[int(np.argmin(counts))].name}: " if len(inputs.parts) > 1 else ""
         raise EstimationError(
-            f"{where}fewer than 3 images of {', '.join(c.name for c in inputs.rig.cameras)} fall within the recording "
-            f"of {inputs.imu.name}; check that the clocks overlap, or the time_offset in the rig file."
+            f"{where}fewer than 3 {_hosts(inputs.rig)} fall within the recording of {inputs.imu.name}; check that the clocks overlap, or the time_offset in the rig file."
         )
     return nodes
+
+
+def _hosts(rig: Rig) -> str:
+    what, sensors = ("images", rig.cameras) if rig.cameras else ("scans", rig.lidars)
+    return f"{what} of {', '.join(s.name for s in sensors)}"
 
 
 @dataclass(frozen=True)

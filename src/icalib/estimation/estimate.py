@@ -10,7 +10,7 @@ import numpy as np
 
 from icalib.estimation import pages
 from icalib.estimation.arrowhead import NOTHING
-from icalib.estimation.assembly import Inputs, assemble, image_times, nodes_for, resample
+from icalib.estimation.assembly import Inputs, assemble, host_times, nodes_for, resample
 from icalib.estimation.corner_factor import CornerFactor, CornerNoise, CornerOutput
 from icalib.estimation.corner_noise import (
     COMMON_ERRORS,
@@ -89,7 +89,7 @@ def estimate(
         if _noise_is_estimated(inputs):
             models, noise = _next_noise(inputs, problem, outcome)
             ranging = _next_ranging(inputs, problem, outcome, ranging)
-        state = resample(outcome.state, nodes_for(inputs, image_times(inputs, outcome.state.values)), inputs)
+        state = resample(outcome.state, nodes_for(inputs, host_times(inputs, outcome.state.values)), inputs)
         del problem, outcome  # before the next ones take as much memory
         pages.give_back()
     raise AssertionError("pass_names is never empty")

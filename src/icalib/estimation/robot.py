@@ -28,23 +28,35 @@ FEWEST_POINTS = 100  # of a plane
 
 @dataclass(frozen=True)
 class Clouds:
-    """Which of `count` planes each point lies on: plane (N,) int32 by LiDAR, -1: none. worlds (count,): the recording
-    that each plane stands in."""
+    """Which plane each point lies on. names (P,): of the planes, no sensor is called so; plane (N,) int32 by LiDAR:
+    index of each point's plane, -1: none."""
 
+    names: tuple[str, ...]
     plane: tuple[np.ndarray, ...]
-    worlds: np.ndarray
 
     @property
     def count(self) -> int:
-        return len(self.worlds)
+        return len(self.names)
+
+    @property
+    def keys(self) -> tuple[Key, ...]:
+        """Where the planes' values stand in a state."""
+        return tuple((name, "plane") for name in self.names)
+
+    @property
+    def entries(self) -> list[Entry]:
+        """The planes as parameters of a layout."""
+        return [(*key, "plane", 3, True) for key in self.keys]
+
+    @property
+    def points(self) -> np.ndarray:
+        """(P,) how many lie on each plane."""
+        return sum(
+            (np.bincount(p[p >= 0], minlength=self.count) for p in self.plane), np.zeros(self.count, dtype=np.int64)
+        )
 
 
-NO_CLOUDS = Clouds((), np.zeros(0, dtype=np.int64))
-
-
-def plane_key(k: int) -> Key:
-    """Of the value of plane k; no sensor is called that."""
-    return f"plane {k}", "plane"
+NO_CLOUDS = Clouds((), ())
 
 
 def own_entries(sensor: Lidar | Wheels) -> list[Entry]:
@@ -54,19 +66,14 @@ def own_entries(sensor: Lidar | Wheels) -> list[Entry]:
     return [(sensor.name, *g, getattr(sensor, g[0]).mode != "fixed" and g not in mute) for g in (*MOUNT, *drive)]
 
 
-def plane_entries(clouds: Clouds) -> list[Entry]:
-    return [(*plane_key(k), "plane", 3, True) for k in range(clouds.count)]
-
-
-def known_planes(streams: Sequence[LidarStream]) -> tuple[Clouds, np.ndarray]:
-    """The association that the streams of one recording come with, planes with few points left out, and the numbers
-    (P,) that its planes had."""
+def known_planes(streams: Sequence[LidarStream]) -> Clouds:
+    """The association that streams come with, planes with few points left out."""
     most = max((int(s.plane.max(initial=-1)) for s in streams), default=-1) + 1
     count = sum((np.bincount(s.plane[s.plane >= 0], minlength=most) for s in streams), np.zeros(most, dtype=np.int64))
     used = np.flatnonzero(count >= FEWEST_POINTS)
     own = np.full(most + 1, -1, dtype=np.int32)
     own[used] = np.arange(len(used))
-    return Clouds(tuple(own[s.plane] for s in streams), np.zeros(len(used), dtype=np.int64)), used
+    return Clouds(tuple(f"plane {k}" for k in used), tuple(own[s.plane] for s in streams))
 
 
 def first_ranging(lidar: Lidar, settings: Settings) -> LidarNoise:
@@ -90,9 +97,8 @@ def robot_factors(
     rig: Rig, measurements: Measurements, clouds: Clouds, ranging: Sequence[LidarNoise], motion: Motion, layout: Layout
 ) -> tuple[SensorFactor, ...]:
     """Of LiDARs, if points are known to lie on planes, and of wheels, everything frozen that a pass freezes."""
-    planes = tuple(plane_key(k) for k in range(clouds.count))
     lidars = (
-        LidarFactor.build(stream, plane, planes, motion, noise, layout, rig.settings.scheme)
+        LidarFactor.build(stream, plane, clouds.keys, motion, noise, layout, rig.settings.scheme)
         for stream, plane, noise in zip(measurements.lidars, clouds.plane, ranging, strict=False)
     )
     wheels = (

@@ -15,7 +15,8 @@ from icalib.detection.planes import MOST_POINTS, FoundPlanes, PlaneSearch, find_
 from icalib.errors import EstimationError
 from icalib.estimation.arrowhead import in_parallel
 from icalib.estimation.lidar_binning import Motion, in_world
-from icalib.estimation.state import Entry, Key
+from icalib.estimation.robot import Clouds
+from icalib.estimation.state import Key
 from icalib.measurements import LidarStream
 
 POINTS_AT_A_TIME = 200_000  # by one thread: what association needs beside the clouds stays small
@@ -26,33 +27,15 @@ LEAST_SHARED = 0.5  # of a plane's points that had a plane before
 
 @dataclass(frozen=True)
 class Association:
-    """names (P,) and planes (P, 6), normal and a point on it in the world, in their order; plane: of each LiDAR the
-    index (N,) int32 of each point's plane, -1: none."""
+    """Which of the planes (P, 6), normal and a point on it in the world, each point lies on, in the order of their
+    names."""
 
-    names: tuple[str, ...]
+    clouds: Clouds
     planes: np.ndarray
-    plane: tuple[np.ndarray, ...]
-
-    @property
-    def keys(self) -> tuple[Key, ...]:
-        """Where the planes' values stand in a state."""
-        return tuple((name, "plane") for name in self.names)
-
-    @property
-    def entries(self) -> list[Entry]:
-        """The planes as parameters of a layout."""
-        return [(*key, "plane", 3, True) for key in self.keys]
 
     @property
     def values(self) -> dict[Key, np.ndarray]:
-        return {key: plane.copy() for key, plane in zip(self.keys, self.planes, strict=True)}
-
-    @property
-    def counts(self) -> np.ndarray:
-        """(P,) points on each plane."""
-        return sum(
-            (np.bincount(p[p >= 0], minlength=len(self.names)) for p in self.plane), np.zeros(len(self.names), np.int64)
-        )
+        return {key: plane.copy() for key, plane in zip(self.clouds.keys, self.planes, strict=True)}
 
 
 def round_search(k: int, noise_m: float) -> PlaneSearch:
@@ -66,16 +49,17 @@ def associate(
 ) -> Association:
     """Planes and points as the state of `motion` has them; names of planes are those of `before` where they share their
     points. Raises EstimationError where there is no plane."""
-    clouds = [in_world(motion, s) for s in streams]
-    found = find_planes(*_thinned(clouds), search)
+    moved = [in_world(motion, s) for s in streams]
+    found = find_planes(*_thinned(moved), search)
     if not found.count:
         names = " and ".join(s.name for s in streams)
         raise EstimationError(
             f"{names} saw no flat surface of {search.smallest_m2} m^2 or more; record among walls and floors, or check "
             "the times of the points."
         )
-    plane = tuple(_of_points(found, points, seen_from, search) for points, seen_from in clouds)
-    return Association(_names(found.count, plane, before), found.planes.copy(), plane)
+    plane = tuple(_of_points(found, points, seen_from, search) for points, seen_from in moved)
+    clouds = Clouds(_names(found.count, plane, before and before.clouds), plane)
+    return Association(clouds, found.planes.copy())
 
 
 def _thinned(clouds: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
@@ -93,10 +77,10 @@ def _of_points(found: FoundPlanes, points: np.ndarray, seen_from: np.ndarray, se
     return np.concatenate([np.zeros(0, np.int32), *own])
 
 
-def _names(count: int, plane: tuple[np.ndarray, ...], before: Association | None) -> tuple[str, ...]:
+def _names(count: int, plane: tuple[np.ndarray, ...], before: Clouds | None) -> tuple[str, ...]:
     """One for each of `count` planes: that of the plane before with which it shares most points, else a new one."""
     if before is None:
-        return tuple(f"plane{k}" for k in range(count))
+        return tuple(f"plane {k}" for k in range(count))
     shared = np.zeros((count, len(before.names)), dtype=np.int64)
     for now, then in zip(plane, before.plane, strict=True):
         both = (now >= 0) & (then >= 0)
@@ -109,8 +93,8 @@ def _names(count: int, plane: tuple[np.ndarray, ...], before: Association | None
         name = before.names[k]
         if not names[q] and name not in names and shared[q, k] > LEAST_SHARED * total[q]:
             names[q] = name
-    number = 1 + max(int(name.removeprefix("plane")) for name in before.names)
+    number = 1 + max(int(name.removeprefix("plane ")) for name in before.names)
     for q in range(count):
         if not names[q]:
-            names[q], number = f"plane{number}", number + 1
+            names[q], number = f"plane {number}", number + 1
     return tuple(names)

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.assembly import Inputs, motion_of, origin_difference, with_clouds
+from icalib.estimation.assembly import Inputs, motion_of
 from icalib.estimation.estimate import first_pass
-from icalib.estimation.lidar_binning import Motion, in_world
+from icalib.estimation.lidar_binning import Motion
 from icalib.estimation.poses import assign_nodes, poses_at
-from icalib.estimation.robot import DRIVE, MOUNT, Clouds, known_planes, plane_key, wheel_angles
+from icalib.estimation.robot import DRIVE, MOUNT, wheel_angles
 from icalib.estimation.state import Key, State
+from icalib.first_guess.lidar_rounds import given, with_lidars
 from icalib.first_guess.wheels import WheelRates, drive_guess, wheel_offset, wheel_rates
-from icalib.geometry.planes import plane_of
 from icalib.measurements import WheelPoses, WheelStream
-from icalib.rig import Lidar, Wheels
+from icalib.rig import Wheels
 
 SIMPSON = np.array([1.0, 4.0, 1.0]) / 6.0
 
@@ -40,20 +39,10 @@ def with_robot(bare: Inputs, state: State, whole: Inputs) -> tuple[Inputs, State
     Raises EstimationError where a sensor shows no guess, and the rig has none.
     """
     settled = first_pass(bare, state)
-    values = state.values | wheel_values(whole, settled)
-    inputs, own = with_lidars(whole, replace(settled, values=values))
-    return inputs, replace(settled, values=values | own)
-
-
-def given(inputs: Inputs, sensor: Lidar | Wheels, names: Sequence[str]) -> dict[Key, np.ndarray]:
-    """What the rig gives of a sensor, time offsets between clocks that start at their first stamps."""
-    out: dict[Key, np.ndarray] = {}
-    for name in names:
-        value = getattr(sensor, name).value
-        if value is not None:
-            shift = origin_difference(inputs.measurements, inputs.stream(sensor.name)) if name == "time_offset" else 0.0
-            out[sensor.name, name] = np.array(value, dtype=np.float64) + shift
-    return out
+    settled = replace(settled, values=settled.values | wheel_values(whole, settled))
+    inputs, found = with_lidars(whole, settled) if whole.rig.lidars else (whole, settled)
+    # What the guess had of the cameras stays: where the motion shows nothing it is what the rig gave.
+    return inputs, replace(found, values=found.values | state.values)
 
 
 def _wheels(inputs: Inputs, state: State, wheels: Wheels, stream: WheelStream | WheelPoses) -> dict[Key, np.ndarray]:
@@ -102,37 +91,3 @@ def _means(motion: Motion, rates: WheelRates, offset: float) -> tuple[np.ndarray
     velocity = np.einsum("nji,nj->ni", poses.rotation, poses.velocity)
     rate, speed = (np.einsum("k,nki->ni", SIMPSON, x.reshape(-1, 3, 3)) for x in (poses.rate, velocity))
     return rates.rate[inside], rate, speed
-
-
-def with_lidars(inputs: Inputs, state: State) -> tuple[Inputs, dict[Key, np.ndarray]]:
-    """Points of the LiDARs on planes, and the values that start with them: of the LiDARs and of the planes."""
-    if not inputs.rig.lidars:
-        return inputs, {}
-    assert inputs.imu is not None
-    names, values = [name for name, _, _ in MOUNT], dict[Key, np.ndarray]()
-    for lidar in inputs.rig.lidars:
-        known = given(inputs, lidar, names)
-        if len(known) < len(names):
-            raise EstimationError(f"{lidar.name}: give its rotation, translation and time_offset in the rig file.")
-        values |= known
-    clouds, _ = known_planes(inputs.measurements.lidars)
-    planes = fitted_planes(inputs, replace(state, values=state.values | values), clouds)
-    return with_clouds(inputs, clouds), values | planes
-
-
-def fitted_planes(inputs: Inputs, state: State, clouds: Clouds) -> dict[Key, np.ndarray]:
-    """Values of the planes that fit the points best in which `state` puts them."""
-    motion, sums = motion_of(inputs, state), np.zeros((clouds.count, 4, 4))
-    for stream, plane in zip(inputs.measurements.lidars, clouds.plane, strict=True):
-        points, _ = in_world(motion, stream)
-        homogeneous = np.column_stack([np.ones(len(points), dtype=np.float32), points])[plane >= 0].astype(np.float64)
-        own = plane[plane >= 0]
-        for i in range(4):
-            for j in range(4):
-                sums[:, i, j] += np.bincount(own, homogeneous[:, i] * homogeneous[:, j], clouds.count)
-    out = {}
-    for k, M in enumerate(sums):
-        centre = M[0, 1:] / M[0, 0]
-        spread = M[1:, 1:] / M[0, 0] - np.outer(centre, centre)
-        out[plane_key(k)] = plane_of(np.linalg.eigh(spread)[1][:, 0], centre)
-    return out
