@@ -82,7 +82,7 @@ PointTime = Literal["auto", "start", "end", "azimuth", "snapshot"]
 class Lidar:
     """One LiDAR. Points nearer than near_m or farther than far_m are left out.
 
-    point_time: what a point's time is counted from; `recordings.point_times` says what each choice means.
+    point_time: what a point's time is counted from; see `recordings.point_times`.
     """
 
     name: str

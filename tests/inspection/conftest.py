@@ -101,6 +101,8 @@ class Bags:
     noise: Callable[..., list[Message]] = noise_images
     pose: Callable[[str, int], Message] = pose
     text: Callable[[str, int], Message] = text
+    make: Callable[..., Any] = make
+    header: Callable[[int, str], Any] = header
     write: Callable[[Path, list[Message]], Path] = write_bag
 
 

@@ -78,6 +78,23 @@ def test_a_draft_loads_once_the_target_is_filled_in(draft, bags):
     assert "ruler" in text and "The default class" in text
 
 
+def test_lidars_are_drafted_and_wheels_suggested(draft, bags):
+    cloud, joints = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/JointState"
+    fields = [bags.make("sensor_msgs/msg/PointField", "x", 0, 7, 1)]
+    messages = bags.noise("/cam0/image_raw", SIZE)
+    for t in range(1_700_000_000_000_000_000, 1_700_000_001_000_000_000, 100_000_000):
+        points = bags.make(cloud, bags.header(t, "top"), 1, 2, fields, False, 4, 8, np.zeros(8, np.uint8), True)
+        states = bags.make(joints, bags.header(t, ""), ["l", "r"], np.zeros(2), np.zeros(2), np.zeros(2))
+        messages += [("/top/points", cloud, t, points), ("/joint_states", joints, t, states)]
+    text, path = draft(messages)
+    fill(path)
+    rig = load_rig(path)
+    assert [(s.name, s.topic) for s in rig.lidars] == [("top", "/top/points")] and rig.wheels == ()
+    commented = text.split("  # Are these wheels?")[1].splitlines()[1:4]
+    path.write_text(path.read_text().replace("\n".join(commented), "\n".join("  " + c[4:] for c in commented)))
+    assert [(w.name, w.topic) for w in load_rig(path).wheels] == [("wheel0", "/joint_states")]
+
+
 @pytest.mark.parametrize(
     ("model", "D", "expected", "guess"),
     [

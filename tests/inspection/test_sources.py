@@ -54,6 +54,17 @@ def test_the_same_images_twice_are_one_camera():
     assert found.left_out == {k: "the images of c once more" for k in ("/c/image_raw/compressed", "/c/image_rect")}
 
 
+def test_lidars_and_wheels():
+    given = {"/imu0": "imu", "/top/points": "points", "/velodyne_points": "points", "lidar0/scans.npz": "points",
+             "/joint_states": "joints", "wheel1/ticks.csv": "wheels"}  # fmt: skip
+    found = find_sources([TopicInfo(name, "", kind, 10, 0, 1) for name, kind in given.items()])
+    assert list(found.imus) == ["imu0"] and list(found.lidars) == ["top", "velodyne_points", "lidar0"]
+    assert {name: t.name for name, t in found.wheels.items()} == {
+        "wheel0": "/joint_states",
+        "wheel1": "wheel1/ticks.csv",
+    }
+
+
 def test_depth_images_are_no_camera():
     found = find_sources(topics("/d455/depth/image_rect_raw", "/d455/color/image_raw"))
     assert [c.name for c in found.cameras] == ["color"]

@@ -55,6 +55,8 @@ def draft_rig(found: Inspection) -> str:
     ]
     for camera in cameras:
         lines += _camera(found, camera)
+    if found.sources.imus:
+        lines += _robot(found)
     left_out = {**broken, **found.sources.left_out}
     lines += [f"  # Not used: {_comment(topic)} ({_comment(why)})" for topic, why in left_out.items()]
     return "\n".join([*lines, _target(found)])
@@ -148,6 +150,16 @@ def _imu(found: Inspection) -> list[str]:
     return lines
 
 
+def _robot(found: Inspection) -> Iterable[str]:
+    """LiDARs, and wheels as a comment: joints may be an arm's."""
+    for name, topic in found.sources.lidars.items():
+        yield from (f"  {name}:", "    type: lidar", _place(topic.name, topic.type, ""))
+    for name, topic in found.sources.wheels.items():
+        yield "  # Are these wheels? Then take the # away, and say what they measure (docs/rig-file.md#wheels)."
+        for line in (f"  {name}:", "    type: wheels", _place(topic.name, topic.type, "")):
+            yield f"  # {line.removeprefix('  ')}"
+
+
 def _kalibr_imu(found: Inspection, topic: str) -> KalibrImu | None:
     """The entry with the IMU's topic; else the only one, where it names no topic of this recording."""
     entries = found.kalibr.imus
@@ -188,7 +200,7 @@ def _starts(lens: LensStart) -> Iterable[str]:
 
 def _place(name: str, kind: str, frame: str) -> str:
     """`topic` of a bag or a folder of images; `path` of a table."""
-    field = "path" if name.endswith((".csv", ".csv.gz")) else "topic"
+    field = "path" if name.endswith((".csv", ".csv.gz", ".npz")) else "topic"
     shown = name if _PLAIN.fullmatch(name) else json.dumps(name)
     return f"    {field}: {shown}  # {_comment(kind)}" + (f", frame {json.dumps(frame)}" if frame else "")
 
