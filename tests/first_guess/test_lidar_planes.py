@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from icalib.errors import EstimationError
-from icalib.estimation.gauge_factor import Gauge
 from icalib.estimation.imu_factor import ImuFactor
 from icalib.estimation.lidar_binning import LidarNoise, Motion
 from icalib.estimation.lidar_factor import LidarFactor
@@ -42,17 +41,17 @@ def solved(r, state, found):
     """The state of a solve with the planes and association `found`."""
     entries = [("imu0", "intrinsics", "vector", 24, False)]
     entries += [(s.name, name, kind, size, True) for s in r.streams for name, kind, size in FREE]
-    layout = make_layout(entries + found.entries)
+    layout = make_layout(entries + found.clouds.entries)
     kept = {k: v for k, v in state.values.items() if k[1] != "plane"}
     state = replace(state, values=kept | found.values)
     motion = Motion(state, r.imu, 9.81, 0.5)
     lidars = tuple(
-        LidarFactor.build(s, plane, found.keys, motion, NOISE, layout)
-        for s, plane in zip(r.streams, found.plane, strict=True)
+        LidarFactor.build(s, plane, found.clouds.keys, motion, NOISE, layout)
+        for s, plane in zip(r.streams, found.clouds.plane, strict=True)
     )
     imu = ImuFactor.build(r.imu, state, 9.81, np.zeros(0, dtype=np.int64))
-    gauge = Gauge(0, state.rotation[0], state.position[0])
-    outcome = minimise(Problem(layout, imu, lidars, (gauge,), Tolerances().of(layout, "imu0")), state)
+    tolerance = Tolerances().of(layout, "imu0")
+    outcome = minimise(Problem(layout, imu, (), (), tolerance, sensors=lidars, framed=False), state)
     assert outcome.converged, outcome.status
     return outcome.state
 
@@ -79,8 +78,8 @@ def errors(r, state, k=0):
 def faces_of(found, streams):
     """(P, F) points of each plane found by the face of the room that they lie on; the last: the hills."""
     most = max(int(s.plane.max()) for s in streams) + 1
-    table = np.zeros((len(found.names), most + 1), dtype=int)
-    for plane, stream in zip(found.plane, streams, strict=True):
+    table = np.zeros((len(found.clouds.names), most + 1), dtype=int)
+    for plane, stream in zip(found.clouds.plane, streams, strict=True):
         used = plane >= 0
         np.add.at(table, (plane[used], np.where(stream.plane >= 0, stream.plane, most)[used]), 1)
     return table
@@ -108,14 +107,14 @@ def test_hardly_a_point_is_on_a_wrong_plane(two_lidars):
     assert len(set(own)) == len(own)
     assert table.max(axis=1).sum() > 0.995 * table.sum()
     assert table.sum() > 0.75 * sum(len(s.xyz) for s in r.streams)
-    np.testing.assert_array_equal(found[-1].counts, table.sum(axis=1))
+    np.testing.assert_array_equal(found[-1].clouds.points, table.sum(axis=1))
 
 
 def test_a_plane_keeps_its_name(two_lidars):
     r, _, found = two_lidars
     for before, after in zip(found[:-1], found[1:], strict=True):
-        assert len(set(after.names)) == len(after.names)
-        faces = [dict(zip(a.names, faces_of(a, r.streams).argmax(axis=1), strict=True)) for a in (before, after)]
+        assert len(set(after.clouds.names)) == len(after.clouds.names)
+        faces = [dict(zip(a.clouds.names, faces_of(a, r.streams).argmax(axis=1), strict=True)) for a in (before, after)]
         shared = set(faces[0]) & set(faces[1])
         assert len(shared) >= 0.9 * len(faces[0])
         assert all(faces[0][name] == faces[1][name] for name in shared)

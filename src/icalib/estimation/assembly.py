@@ -203,7 +203,8 @@ def nodes_for(inputs: Inputs, times: list[np.ndarray]) -> np.ndarray:
     if counts.min() < 3:
         where = f"{inputs.parts[int(np.argmin(counts))].name}: " if len(inputs.parts) > 1 else ""
         raise EstimationError(
-            f"{where}fewer than 3 {_hosts(inputs.rig)} fall within the recording of {inputs.imu.name}; check that the clocks overlap, or the time_offset in the rig file."
+            f"{where}fewer than 3 {_hosts(inputs.rig)} fall within the recording of {inputs.imu.name}; check that the "
+            "clocks overlap, or the time_offset in the rig file."
         )
     return nodes
 
