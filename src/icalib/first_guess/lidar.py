@@ -33,6 +33,7 @@ from icalib.measurements import LidarStream
 
 LEAST_CORRELATION = 0.6  # of turning rates with the IMU's
 G_TOLERANCE = 0.1
+ARM_ROUNDS = 2  # each brings the path nearer to the known motion
 
 
 @dataclass(frozen=True)
@@ -91,16 +92,39 @@ def lidar_and_motion(
 def lidar_on_motion(imu: ImuData, stream: LidarStream, known: State, held: Held = Held()) -> LidarGuess:
     """From the motion of the IMU in `known`: nodes no further apart than 50 ms or so. Raises EstimationError, one
     sentence, where the recording does not show it."""
-    aligned, path, rates = _aligned(imu, stream, held)
-    t = path.seconds + aligned.offset
-    inside = (t >= known.seconds[0]) & (t <= known.seconds[-1])
-    R, p = _poses(known, GyroRotation.integrate(imu, known.bias[:, :3].mean(axis=0)), t[inside])
+    aligned, _, rates = _aligned(imu, stream, held)
+    guess = LidarGuess(aligned.rotation, np.zeros(3) if held.position is None else held.position, aligned.offset)
     prior = arm_prior(np.zeros(0), rates.rate, WAY_SIGMA, held.rotation is not None, held.position)
-    system = against_motion(R, p, t[inside], path.rotation[inside], path.position[inside])
-    found = solve(system, prior, aligned.rotation, rates.rate)
-    if found is None:
-        raise _too_short(stream)
-    return LidarGuess(found[0], found[1][3:6], aligned.offset)
+    gyro = GyroRotation.integrate(imu, known.bias[:, :3].mean(axis=0))
+    for _ in range(ARM_ROUNDS):
+        path = _path_on(stream, known, gyro, guess)
+        t = path.seconds + guess.offset
+        R, p = _poses(known, gyro, t)
+        found = solve(against_motion(R, p, t, path.rotation, path.position), prior, guess.rotation, rates.rate)
+        if found is None:
+            raise _too_short(stream)
+        guess = LidarGuess(found[0], found[1][3:6], aligned.offset)
+    return guess
+
+
+def _path_on(stream: LidarStream, known: State, gyro: GyroRotation, guess: LidarGuess) -> LidarPath:
+    """The path while the motion is known, near what motion and guess say: scans that show nothing of one direction do
+    not drift."""
+
+    def moving(t: np.ndarray) -> np.ndarray:
+        R, p = _poses(known, gyro, np.clip(t + guess.offset, known.seconds[0], known.seconds[-1]))
+        return p + R @ guess.position
+
+    def turning(t: np.ndarray) -> np.ndarray:
+        return gyro.carry(known.seconds, known.rotation, t + guess.offset) @ guess.rotation
+
+    path = lidar_path(stream, turning, moving)
+    t = path.seconds + guess.offset
+    return _where(path, path.ok & (t >= known.seconds[0]) & (t <= known.seconds[-1]))
+
+
+def _where(path: LidarPath, own: np.ndarray) -> LidarPath:
+    return LidarPath(path.seconds[own], path.rotation[own], path.position[own], path.ok[own])
 
 
 def _poses(known: State, gyro: GyroRotation, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -122,8 +146,7 @@ def _aligned(imu: ImuData, stream: LidarStream, held: Held) -> tuple[Alignment, 
     path = _turned_path(imu, stream, aligned)
     t = path.seconds + aligned.offset
     inside = path.ok & (t > imu.seconds[0]) & (t < imu.seconds[-1])
-    path = LidarPath(path.seconds[inside], path.rotation[inside], path.position[inside], path.ok[inside])
-    return aligned, path, rates
+    return aligned, _where(path, inside), rates
 
 
 def _align(imu: ImuData, name: str, rates: CameraRates, held: Held) -> Alignment:

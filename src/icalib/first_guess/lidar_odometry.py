@@ -37,10 +37,12 @@ ANGULAR_ACCELERATION, ACCELERATION = 6.0, 5.0
 TURN_SIGMA, MOVE_SIGMA = 0.02, 0.02
 # Where the gyroscope turns the points: its bias and the alignment may err by this much (rad/s, rad).
 RATE_SIGMA, GYRO_SIGMA = 0.01, 0.004
+KNOWN_SIGMA = 0.03  # m, of a known way between scans: what a lever arm that is not known makes of it
 TURN_STEP_S = 1e-3  # of the gyroscope's turns within a scan
 LONGEST_STEP_S = 1.0
 
 Turning = Callable[[np.ndarray], np.ndarray]  # instants (n,) on the LiDAR's clock -> R_start_lidar (n, 3, 3)
+Moving = Callable[[np.ndarray], np.ndarray]  # -> p_start_lidar (n, 3) m, roughly
 
 
 @dataclass(frozen=True)
@@ -63,9 +65,9 @@ class _Scan:
     tau: np.ndarray
 
 
-def lidar_path(stream: LidarStream, turning: Turning | None = None) -> LidarPath:
-    """`turning`: how it turned, where that is known. Raises EstimationError where scans are too few or do not fit one
-    another."""
+def lidar_path(stream: LidarStream, turning: Turning | None = None, moving: Moving | None = None) -> LidarPath:
+    """`turning`: how it turned, where that is known, and `moving`: how it moved. Raises EstimationError where scans are
+    too few or do not fit one another."""
     scans = [_scan_of(stream, i) for i in range(len(stream.stamps_ns))]
     scans = [s for s in scans if len(s.tau) >= FEWEST_POINTS]
     if len(scans) < FEWEST_SCANS:
@@ -73,18 +75,17 @@ def lidar_path(stream: LidarStream, turning: Turning | None = None) -> LidarPath
             f"{stream.name}: only {len(scans)} of its {len(stream.stamps_ns)} scans have {FEWEST_POINTS} points or "
             "more; check its topic, or record for longer."
         )
-    turns = None
+    seconds = np.array([s.middle for s in scans])
+    known = _Known.of(seconds, turning, moving)
     if turning is not None:
-        turns = turning(np.array([s.middle for s in scans]))
         scans = [_turned(s, turning) for s in scans]
     reach = float(np.median([np.median(np.linalg.norm(s.xyz, axis=1)) for s in scans]))
-    poses, ok = _follow(scans, turns, float(np.clip(reach / VOXELS_IN_REACH, *EDGES_M)))
+    poses, ok = _follow(scans, known, float(np.clip(reach / VOXELS_IN_REACH, *EDGES_M)))
     if ok.mean() < 0.5:
         raise EstimationError(
             f"{stream.name}: only {ok.sum()} of {len(scans)} scans fit the surfaces that others show; there may be too "
             "few flat surfaces in sight, or the point times may be wrong."
         )
-    seconds = np.array([s.middle for s in scans])
     return LidarPath(seconds, np.array([p.rotation for p in poses]), np.array([p.position for p in poses]), ok)
 
 
@@ -112,15 +113,34 @@ def _turned(scan: _Scan, turning: Turning) -> _Scan:
     return _Scan(scan.middle, xyz, scan.tau)
 
 
-def _follow(scans: list[_Scan], turns: np.ndarray | None, edge_m: float) -> tuple[list[ScanPose], np.ndarray]:
+@dataclass(frozen=True)
+class _Known:
+    """Of each scan (n,) but the first, as far as it is known: R_before_scan (3, 3), and p_before_scan (3,)."""
+
+    turned: np.ndarray | None
+    way: np.ndarray | None
+
+    @classmethod
+    def of(cls, seconds: np.ndarray, turning: Turning | None, moving: Moving | None) -> _Known:
+        if turning is None:
+            return cls(None, None)
+        R = turning(seconds)
+        back = np.concatenate([R[:1], R[:-1]]).transpose(0, 2, 1)
+        way = None if moving is None else np.diff(p := moving(seconds), axis=0, prepend=p[:1])
+        return cls(back @ R, None if way is None else np.einsum("nij,nj->ni", back, way))
+
+
+def _follow(scans: list[_Scan], known: _Known, edge_m: float) -> tuple[list[ScanPose], np.ndarray]:
     ok = np.ones(len(scans), dtype=bool)
 
     def register(k: int, before: ScanPose, scale: float) -> ScanPose:
         step = scans[k].middle - scans[k - 1].middle
-        turned = None if turns is None else turns[k - 1].T @ turns[k]
-        pose, ok[k] = _register(voxels, scans[k], _Expected(before, min(step, LONGEST_STEP_S), turned), scale)
+        turned, way = (None if x is None else x[k] for x in (known.turned, known.way))
+        expected = _Expected(before, min(step, LONGEST_STEP_S), turned, way)
+        pose, ok[k] = _register(voxels, scans[k], expected, scale)
         return pose
 
+    last, keep = (LAST_SCALE, KEEP) if known.turned is None else (LAST_SCALE_TURNED, KEEP_TURNED)
     still = ScanPose(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
     voxels, poses = VoxelMap.empty(edge_m, CAPACITY), [still]
     for _ in range(FIRST_ROUNDS):
@@ -129,26 +149,29 @@ def _follow(scans: list[_Scan], turns: np.ndarray | None, edge_m: float) -> tupl
         after = register(1, poses[0], LAST_SCALE)
         poses[0] = still._replace(rate=after.rate, velocity=after.velocity)
     for k in range(1, len(scans)):
-        pose = register(k, poses[-1], LAST_SCALE if turns is None else LAST_SCALE_TURNED)
+        pose = register(k, poses[-1], last)
         poses.append(pose)
         if ok[k]:
-            insert(voxels, pose, scans[k].xyz, scans[k].tau, k, KEEP if turns is None else KEEP_TURNED)
+            insert(voxels, pose, scans[k].xyz, scans[k].tau, k, keep)
     return poses, ok
 
 
 @dataclass(frozen=True)
 class _Expected:
-    """What the scan before says of a pose: `before` it by `step` s; `turned` (3, 3) where the gyroscope says so."""
+    """What the scan before says of a pose: `before` it by `step` s; `turned` (3, 3) and `way` (3,) since, in the axes
+    of the one before, where they are known."""
 
     before: ScanPose
     step: float
     turned: np.ndarray | None
+    way: np.ndarray | None
 
     @property
     def pose(self) -> ScanPose:
         b = self.before
         turned = so3.exp(b.rate * self.step) if self.turned is None else self.turned
-        return ScanPose(b.rotation @ turned, b.position + b.velocity * self.step, b.rate, b.velocity)
+        way = b.velocity * self.step if self.way is None else b.rotation @ self.way
+        return ScanPose(b.rotation @ turned, b.position + way, b.rate, way / self.step)
 
     def add(self, pose: ScanPose, H: np.ndarray, g: np.ndarray) -> None:
         """Adds to the normal equations that rates change little, and poses by the mean of the rates around them."""
@@ -165,10 +188,14 @@ class _Expected:
             r[:3] = so3.log(np.ascontiguousarray((b.rotation @ self.turned).T @ pose.rotation))
             r[6:9] = pose.rate
             sigma[:3], sigma[6:9] = GYRO_SIGMA, RATE_SIGMA
-        r[3:6] = pose.position - b.position - 0.5 * h * (b.velocity + pose.velocity)
-        J[3:6, 9:] = -0.5 * h * np.eye(3)
-        r[9:] = pose.velocity - b.velocity
-        sigma[3:6], sigma[9:] = MOVE_SIGMA, ACCELERATION * h
+        if self.way is None:
+            r[3:6] = pose.position - b.position - 0.5 * h * (b.velocity + pose.velocity)
+            J[3:6, 9:] = -0.5 * h * np.eye(3)
+            r[9:] = pose.velocity - b.velocity
+        else:
+            r[3:6] = pose.position - b.position - b.rotation @ self.way
+            r[9:] = pose.velocity - b.rotation @ self.way / h
+        sigma[3:6], sigma[9:] = MOVE_SIGMA if self.way is None else KNOWN_SIGMA, ACCELERATION * h
         W = J / sigma[:, None] * POINT_SIGMA_M
         H += W.T @ W
         g += W.T @ (r / sigma * POINT_SIGMA_M)

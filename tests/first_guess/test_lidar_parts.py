@@ -1,0 +1,152 @@
+"""Parts of the LiDAR's guess against obvious formulas: registration, its linear systems, the IMU's motion."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from icalib.first_guess.gyro import GyroRotation
+from icalib.first_guess.lidar_arm import against_motion, against_readings
+from icalib.first_guess.lidar_map import ScanPose, VoxelMap, insert, moved, sums
+from icalib.first_guess.lidar_motion import ImuMotion, Integrals
+from icalib.geometry import so3
+
+SCALE = 0.3
+
+
+@pytest.fixture(scope="module")
+def scan():
+    """A map of one voxel, whose plane z = 1 + 0.1 x + 0.2 y it holds, and points of a scan near it with their instants."""
+    rng = np.random.default_rng(0)
+    xy = rng.uniform(1.0, 9.0, (500, 2))
+    surface = np.column_stack([xy, 1.0 + xy @ [0.1, 0.2]])
+    voxels = VoxelMap.empty(10.0, 16)
+    still = ScanPose(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
+    insert(voxels, still, surface, np.zeros(500), 0, 1.0)
+    R = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
+    pose = ScanPose(R, np.array([2.0, 1.0, 0.5]), np.array([0.2, -0.3, 0.4]), np.array([0.5, -0.2, 0.3]))
+    tau = rng.uniform(-0.06, 0.06, 200)
+    near = surface[:200] + rng.normal(size=(200, 3)) * 0.2 - (pose.position + tau[:, None] * pose.velocity)
+    xyz = np.einsum(
+        "nij,nj->ni", (R @ Rotation.from_rotvec(tau[:, None] * pose.rate).as_matrix()).transpose(0, 2, 1), near
+    )
+    return voxels, pose, np.ascontiguousarray(xyz), tau
+
+
+def distances(pose, xyz, tau):
+    turned = pose.rotation @ Rotation.from_rotvec(tau[:, None] * pose.rate).as_matrix()
+    y = np.einsum("nij,nj->ni", turned, xyz) + pose.position + tau[:, None] * pose.velocity
+    return (y[:, 2] - 1.0 - y[:, :2] @ [0.1, 0.2]) / np.sqrt(1.05)
+
+
+def test_normal_equations_of_a_scan(scan):
+    voxels, pose, xyz, tau = scan
+    H, g = np.empty((12, 12)), np.empty(12)
+    met, near = sums(voxels, pose, xyz, tau, 0, SCALE, H, g)
+    r, h = distances(pose, xyz, tau), 1e-6
+    assert met == len(tau) and near == (np.abs(r) < 2.0).sum()
+    J = np.stack(
+        [distances(moved(pose, h * e), xyz, tau) - distances(moved(pose, -h * e), xyz, tau) for e in np.eye(12)]
+    )
+    J = J.T / (2.0 * h)
+    w = (1.0 + (r / SCALE) ** 2) ** -2.0
+    size = np.sqrt(np.diag(J.T @ (w[:, None] * J)))
+    # A turn of up to 0.03 rad within the scan stands beside dw, and is left out of its columns.
+    np.testing.assert_allclose(H / np.outer(size, size), J.T @ (w[:, None] * J) / np.outer(size, size), atol=0.03)
+    np.testing.assert_allclose(
+        H[:6, :6] / np.outer(size, size)[:6, :6], (J.T @ (w[:, None] * J) / np.outer(size, size))[:6, :6], atol=1e-3
+    )
+    np.testing.assert_allclose(g[:6] / size[:6], (J.T @ (w * r) / size)[:6], atol=1e-3 * np.linalg.norm(r))
+
+
+def test_voxels_forget(scan):
+    voxels, pose, _, _ = scan
+    own = VoxelMap.empty(10.0, 16)
+    still = pose._replace(rotation=np.eye(3), position=np.zeros(3), rate=np.zeros(3), velocity=np.zeros(3))
+    rng = np.random.default_rng(1)
+    for k, height in enumerate((2.0, 3.0)):
+        points = np.column_stack([rng.uniform(1.0, 9.0, (300, 2)), np.full(300, height)])
+        insert(own, still, points, np.zeros(300), 5 * k, 0.5)
+    assert own.size[0] == 1 and own.flat[0]
+    assert own.centre[0, 2] == pytest.approx((300 * 0.5**5 * 2.0 + 300 * 3.0) / (300 * 0.5**5 + 300))
+    assert abs(own.normal[0, 2]) > 0.999
+    own.clear()
+    assert own.size[0] == 0 and (own.key == -1).all()
+
+
+def test_a_full_map_takes_no_more():
+    own = VoxelMap.empty(1.0, 16)
+    still = ScanPose(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
+    insert(own, still, np.random.default_rng(0).uniform(-50.0, 50.0, (1000, 3)), np.zeros(1000), 0, 1.0)
+    assert own.size[0] == 16
+
+
+@pytest.fixture(scope="module")
+def path(free_robot):
+    """The true path of the LiDAR in the world: instants on the imu clock, R_world_lidar, p_world_lidar."""
+    t = np.arange(1.0, 15.0, 0.125)
+    R, p, _ = free_robot.pose_at(t)
+    true = free_robot.truth()
+    return t, R, p, R @ true.rotation, p + R @ true.position
+
+
+def residual(rows, x):
+    return rows.b - rows.A @ x
+
+
+def test_way_against_a_known_motion(free_robot, path):
+    t, R, p, R_lidar, p_lidar = path
+    true = free_robot.truth()
+    Q = Rotation.from_rotvec([1.0, 2.0, -0.5]).as_matrix()  # the map stands anyhow
+    system = against_motion(R, p, t, Q @ R_lidar, (p_lidar - 3.0) @ Q.T)
+    x = np.concatenate([np.zeros(3), true.position])
+    np.testing.assert_allclose(residual(system(true.rotation, true.position), x), 0.0, atol=1e-9)
+    check_turn(system, true, x, 1e-9)
+
+
+def check_turn(system, true, x, atol):
+    """The columns of d against central differences of what rows lack."""
+    A, h = system(true.rotation, true.position).A, 1e-5
+    for k, e in enumerate(np.eye(3)):
+        apart = [residual(system(true.rotation @ so3.exp(s * h * e), true.position), x) for s in (1.0, -1.0)]
+        np.testing.assert_allclose(A[:, :, k], (apart[1] - apart[0]) / (2.0 * h), atol=atol)
+
+
+def test_positions_against_the_readings(free_robot, path):
+    t, _, _, R_lidar, p_lidar = path
+    true, imu, sim = free_robot.truth(), free_robot.imu, free_robot.sim.truth
+    gyro = GyroRotation.integrate(imu, sim.gyro_bias.mean(axis=0))
+    system = against_readings(imu, lambda R: gyro.carry(t, R, imu.seconds), t, R_lidar, p_lidar)
+    bias = sim.accel_bias.mean(axis=0)
+    x = np.concatenate([np.zeros(3), true.position, [0.0, 0.0, -9.81], bias])
+    left = residual(system(true.rotation, true.position), x)
+    assert np.sqrt((left**2).mean()) < 2e-3  # m/s: white noise of 2e-3 m/s^2/sqrt(Hz) over 0.1 s is 7e-4
+    # Columns take the LiDAR's rotation between scans as known; the gyroscope carries it there: 0.3 % apart.
+    no_bias = np.concatenate([x[:9], np.zeros(3)])
+    check_turn(system, true, no_bias, 0.01)
+
+
+def test_integrals_of_a_line_are_exact(free_robot):
+    imu = free_robot.imu
+    x = np.column_stack([np.ones_like(imu.seconds), imu.seconds])
+    once, twice = Integrals.of(imu, x).at(np.array([0.0, 1.2345, 7.7]))
+    t = np.array([0.0, 1.2345, 7.7])
+    np.testing.assert_allclose(once, np.column_stack([t, t**2 / 2]), atol=1e-10)
+    np.testing.assert_allclose(twice, np.column_stack([t**2 / 2, t**3 / 6]), atol=1e-9)
+
+
+def test_motion_between_noisy_positions(free_robot, path):
+    """Smoothing takes most of 1 cm away, and gives velocities; a gap does not bend it."""
+    t, R, p, _, _ = path
+    sim, rng = free_robot.sim.truth, np.random.default_rng(3)
+    gyro = GyroRotation.integrate(free_robot.imu, sim.gyro_bias.mean(axis=0))
+    kept = (t < 6.0) | (t > 6.4)
+    seen = p[kept] + 0.01 * rng.normal(size=p[kept].shape)
+    bias = sim.accel_bias.mean(axis=0)
+    rough = ImuMotion(gyro, t[kept], R[kept], seen, np.zeros_like(seen), sim.gyro_bias.mean(axis=0), bias, 9.81)
+    at = np.linspace(1.0, 14.5, 400)
+    _, p_found, v_found = rough.smoothed().at(at)
+    _, p_true, v_true = free_robot.pose_at(at)
+    assert np.sqrt(((p_found - p_true) ** 2).mean()) < 0.006
+    assert np.sqrt(((v_found - v_true) ** 2).mean()) < 0.015
