@@ -123,7 +123,7 @@ def test_a_plane_keeps_its_name(two_lidars):
 
 def test_two_lidars_share_their_planes(two_lidars):
     r, _, found = two_lidars
-    seen = [np.bincount(p[p >= 0], minlength=len(found[-1].names)) > 100 for p in found[-1].plane]
+    seen = [np.bincount(p[p >= 0], minlength=len(found[-1].clouds.names)) > 100 for p in found[-1].clouds.plane]
     assert (seen[0] & seen[1]).sum() > 0.5 * len(seen[0])
 
 
@@ -145,7 +145,7 @@ def test_one_wall_is_one_plane(free_robot):
     alone = replace(stream, start=start, offset_s=stream.offset_s[wall], xyz=stream.xyz[wall], plane=stream.plane[wall])
     state = free_robot.state(np.arange(0.0, free_robot.imu.seconds[-1], 0.05))
     found = associate([alone], Motion(state, free_robot.imu, 9.81, 0.5), round_search(3, NOISE.sigma))
-    assert found.names == ("plane0",)
+    assert found.clouds.names == ("plane 0",)
     assert found.counts[0] > 0.8 * len(alone.xyz)
 
 
