@@ -146,7 +146,7 @@ def test_one_wall_is_one_plane(free_robot):
     state = free_robot.state(np.arange(0.0, free_robot.imu.seconds[-1], 0.05))
     found = associate([alone], Motion(state, free_robot.imu, 9.81, 0.5), round_search(3, NOISE.sigma))
     assert found.clouds.names == ("plane 0",)
-    assert found.counts[0] > 0.8 * len(alone.xyz)
+    assert found.clouds.points[0] > 0.8 * len(alone.xyz)
 
 
 @pytest.mark.statistical
