@@ -64,16 +64,17 @@ class CornerNoise:
 @dataclass(frozen=True)
 class CornerOutput:
     """Per corner: residual (N, 2) px, predicted - measured, and root (N,), square root of its weight over sigma (0
-    where left out), float32 because there are many; per view: shared (V, 2, m), the sizes of the common error."""
+    where left out), in single precision because there are many; per view: shared (V, 2, m), the sizes of the common
+    error."""
 
     residual: np.ndarray
     root: np.ndarray
     shared: np.ndarray
 
     @classmethod
-    def empty(cls, n: int, n_views: int, m: int) -> CornerOutput:
+    def empty(cls, n: int, n_views: int, m: int, dtype: type = np.float32) -> CornerOutput:
         """For n corners in `n_views` views with m sizes of a common error."""
-        return cls(pages.zeros((n, 2), np.float32), pages.zeros((n,), np.float32), np.zeros((n_views, 2, m)))
+        return cls(pages.zeros((n, 2), dtype), pages.zeros((n,), dtype), np.zeros((n_views, 2, m)))
 
 
 @dataclass(frozen=True)
@@ -212,9 +213,9 @@ class CornerFactor:
         shared = rng.standard_normal((len(self.views.image), 2, len(self.noise.tau)))
         return CornerWhite(int(rng.integers(2**63)), shared)
 
-    def output(self) -> CornerOutput:
-        """Empty arrays for `accumulate` to fill."""
-        return CornerOutput.empty(len(self.stream.uv), len(self.views.image), len(self.noise.tau))
+    def output(self, dtype: type = np.float32) -> CornerOutput:
+        """Empty arrays for `accumulate` to fill. Its sums do not depend on `dtype`."""
+        return CornerOutput.empty(len(self.stream.uv), len(self.views.image), len(self.noise.tau), dtype)
 
     def squared_errors(self, out: CornerOutput) -> np.ndarray:
         """(N,) px^2, of the residuals with their images' common errors in them."""
