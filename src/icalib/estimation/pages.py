@@ -30,7 +30,7 @@ def give_back() -> None:
 
 
 def keep_apart() -> None:
-    """From now on whatever is large has pages of its own, in the whole process, where the C library can do that (glibc).
+    """From now on all that is large has pages of its own, in the whole process, where the C library can do that (glibc).
 
     It does so at first, but after one such array has been freed the next ones as large lie between the small ones.
     """
