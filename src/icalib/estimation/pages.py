@@ -30,9 +30,9 @@ def give_back() -> None:
 
 
 def keep_apart() -> None:
-    """From now on all that is large has pages of its own, in the whole process, where the C library can do that (glibc).
+    """From now on large arrays have pages of their own, in the whole process, where the C library can do that (glibc).
 
-    It does so at first, but after one such array has been freed the next ones as large lie between the small ones.
+    It does so at first, but once such an array has been freed, the next ones as large lie between the small ones.
     """
     _in_glibc("mallopt", _M_MMAP_THRESHOLD, LEAST)
 
