@@ -208,7 +208,7 @@ def _sensor_fit(fit: Fit, found: Estimate) -> SensorFit:
     for camera, out in zip(found.problem.cameras, found.outcome.residuals.corners, strict=True):
         if camera.name == fit.sensor:
             used = out.root > 0.0
-            rms, unit = float(np.sqrt(np.mean(out.residual[used] ** 2))), "px"
+            rms, unit = float(np.sqrt(np.mean(out.residual[used] ** 2, dtype=np.float64))), "px"
             rejected = int((~used).sum())
     for factor, out in zip(found.problem.sensors, found.outcome.residuals.sensors, strict=True):
         if factor.name == fit.sensor:

@@ -18,7 +18,7 @@ from icalib.estimation.assembly import Inputs, host_times, inputs_for, nodes_for
 from icalib.estimation.board import board_in
 from icalib.estimation.determination import determine
 from icalib.estimation.nodes import first_nodes
-from icalib.estimation.pages import give_back
+from icalib.estimation.pages import give_back, keep_apart
 from icalib.estimation.problem import Problem
 from icalib.estimation.solver import Visit
 from icalib.estimation.state import State
@@ -46,6 +46,7 @@ def calibrate(
     All may be paths. Raises CalibrationError, one sentence; where there are several recordings it names the one meant.
     """
     rig = rig if isinstance(rig, Rig) else load_rig(rig)
+    keep_apart()
     opened = open_all(recording)
     started = time.perf_counter()
     seeing = rig.cameras if rig.has_target else ()
@@ -106,6 +107,7 @@ def _calibrate(
 ) -> Calibration:
     clock = _Clock()
     progress("finding a first guess", 0.0)
+    keep_apart()
     give_back()
     inputs, state = _start(rig, recordings, clock)
     give_back()

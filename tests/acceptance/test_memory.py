@@ -21,11 +21,11 @@ assert calibrate_measurements(rig, measurements).converged
 print(next(line.split()[1] for line in open("/proc/self/status") if line.startswith("VmHWM")))
 """
 SHORT_S, LONG_S = 60.0, 180.0
-# Of a corner: where it is, its point, residual, weight, bloom, noise, and whether it is kept.
-CORNER_BYTES = 16 + 8 + 16 + 8 + 8 + 8 + 1
+# Of a corner: where it is, its point, residual, weight, bloom, and whether it is kept.
+CORNER_BYTES = 16 + 8 + 8 + 4 + 8 + 1
 # Of a node: two blocks of 15 x 15, 15 x 25 with the border, preintegration, ten readings, states and steps.
 NODE_BYTES = 8 * (2 * 225 + 15 * 25 + 225 + 54 + 150 + 200)
-BOUND = 1.5  # with work space and what the allocator holds
+LEAST, MOST = 0.75, 1.2  # of what is needed: work space and what the allocator holds are much the same in both
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="peak memory in kilobytes, and an allocator that gives back")
@@ -33,7 +33,7 @@ def test_memory_grows_with_what_corners_and_nodes_need(tmp_path: Path) -> None:
     _peak(tmp_path, 10.0)  # compiles what is not yet compiled
     (short, corners0, nodes0), (long, corners1, nodes1) = (_peak(tmp_path, s) for s in (SHORT_S, LONG_S))
     needed = CORNER_BYTES * (corners1 - corners0) + NODE_BYTES * (nodes1 - nodes0)
-    assert 0.5 * needed < long - short < BOUND * needed
+    assert LEAST * needed < long - short < MOST * needed
 
 
 def _peak(folder: Path, duration_s: float) -> tuple[int, int, int]:

@@ -69,7 +69,9 @@ def detector(monkeypatch, tmp_path) -> FakeDetector:
     return fake
 
 
-def test_every_image_is_searched_once_and_stands_in_order(detector):
+@pytest.mark.parametrize("together", [1, 6, 10, 256])
+def test_every_image_is_searched_once_and_stands_in_order(detector, monkeypatch, together):
+    monkeypatch.setattr(streams, "PACKED", together)
     done = []
     found, notes = streams.find_corners(FakeRecording(), CAMERA, GRID, True, done.append)
     assert sorted(detector.seen) == list(range(20))

@@ -3,7 +3,17 @@
 import numpy as np
 import pytest
 
-from icalib.estimation.arrowhead import HELD_BELOW, NotDefiniteError, border_step, make_pieces, marginalise, solve
+from icalib.estimation import arrowhead
+from icalib.estimation.arrowhead import (
+    HELD_BELOW,
+    NotDefiniteError,
+    Piece,
+    border_step,
+    make_pieces,
+    marginalise,
+    marginalise_in_segments,
+    solve,
+)
 from icalib.estimation.state import NODE
 
 
@@ -97,6 +107,53 @@ def test_marginalise_is_the_schur_complement(dense, n_nodes):
     np.testing.assert_allclose(border[:-1, :-1], information, rtol=0, atol=1e-10)
     np.testing.assert_allclose(border[:-1, -1], gradient, rtol=0, atol=1e-10)
     np.testing.assert_allclose(border[-1, :-1], gradient, rtol=0, atol=1e-10)
+
+
+def whole_and_segments(n_nodes, n_border, seed):
+    """A random chain whole, and a function that makes its part between two nodes: factors on a node and the next one
+    belong to the part that holds both, those on a node alone to the part that it begins (the last one: ends)."""
+    rng = np.random.default_rng(seed)
+    factors = []
+    for k in range(n_nodes):
+        for both in (True, False) if k < n_nodes - 1 else (False,):
+            A, B = rng.normal(size=(2, 30, NODE))
+            factors.append((k, A, B if both else None, rng.normal(size=(30, n_border)), rng.normal(size=30)))
+
+    def part(first, last):
+        piece = Piece.zeros(first, last, n_border)
+        for k, A, B, C, r in factors:
+            if first <= k < last or (k == last == n_nodes - 1 and B is None):
+                add_factor(piece, k - first, A, B, C, r)
+        return piece
+
+    return part(0, n_nodes - 1), part
+
+
+@pytest.mark.parametrize("segment", [1, 2, 3, 100])
+@pytest.mark.parametrize("n_nodes", [1, 2, 3, 4, 6, 7, 8])
+def test_marginalising_in_segments_is_the_schur_complement(monkeypatch, dense, n_nodes, segment):
+    monkeypatch.setattr(arrowhead, "SEGMENT", segment)
+    whole, part = whole_and_segments(n_nodes, 5, seed=4)
+    H, g = dense((whole,), n_nodes)
+    information, gradient = schur(H, g, n_nodes)
+    border = marginalise_in_segments(part, n_nodes)
+    np.testing.assert_allclose(border[:-1, :-1], information, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(border[:-1, -1], gradient, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("node", [0, 2, 3, 6])
+def test_marginalising_in_segments_raises_where_a_node_is_not_determined(monkeypatch, node):
+    monkeypatch.setattr(arrowhead, "SEGMENT", 3)
+    _, part = whole_and_segments(7, 2, seed=4)
+
+    def spoilt(first, last):
+        piece = part(first, last)
+        if first <= node <= last:
+            piece.diagonal[node - first] -= 1e3 * np.eye(NODE)
+        return piece
+
+    with pytest.raises(NotDefiniteError):
+        marginalise_in_segments(spoilt, 7)
 
 
 @pytest.mark.parametrize("n_nodes", [3, 8])

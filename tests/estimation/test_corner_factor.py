@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import minimize
 
 from icalib.estimation.arrowhead import Piece, make_pieces
-from icalib.estimation.corner_factor import CornerNoise
+from icalib.estimation.corner_factor import DRAWN, CornerNoise, CornerWhite
 from icalib.simulation.projection import project
 
 
@@ -23,8 +23,8 @@ def near(setup):
 
 
 def run(factor, state, sums=False, **options):
-    """Cost, output and pieces."""
-    out = factor.output()
+    """Cost, output in double precision, and pieces."""
+    out = factor.output(np.float64)
     pieces = make_pieces(factor.n_nodes, factor.layout.size)
     return sum(factor.accumulate(state, p, out, sums, **options) for p in pieces), out, pieces
 
@@ -190,9 +190,11 @@ def test_given_noise_takes_the_place_of_the_whitened_residuals(setup, near, fact
     n, images = len(factor.stream.uv), len(factor.times)
     field, tau = rng.normal(size=(n, 3)), np.array([0.4, 0.3, 0.2])
     with_field = replace(factor, noise=replace(factor.noise, tau=tau, field=field))
-    white, own = rng.normal(size=(n, 2)), rng.normal(size=(images, 2, 3))
+    own = rng.normal(size=(images, 2, 3))
+    noise = CornerWhite(7, own)
+    white = noise.corners(0, n)
     plain = dense(run(with_field, near, sums=True)[2], factor.n_nodes)[0]
-    total, _, pieces = run(with_field, near, sums=True, noise=(white, own))
+    total, _, pieces = run(with_field, near, sums=True, noise=noise)
     H, g = dense(pieces, factor.n_nodes)
     np.testing.assert_array_equal(H, plain)
     J, _, F = whitened(factor, setup, near, field)
@@ -204,6 +206,30 @@ def test_given_noise_takes_the_place_of_the_whitened_residuals(setup, near, fact
     size = np.sqrt(np.maximum(np.diag(H), 1e-9 * np.diag(H).max()))
     np.testing.assert_allclose(g / size, expected / size, rtol=0, atol=1e-6 * np.linalg.norm(e))
     assert total == pytest.approx(rhs @ np.linalg.solve(M, rhs), rel=1e-9)
+
+
+def test_noise_of_a_corner_is_the_same_whatever_else_is_asked_for():
+    noise = CornerWhite(3, np.zeros((0, 2, 0)))
+    n = 3 * DRAWN + 5
+    every = noise.corners(0, n)
+    for a, b in ((0, 0), (0, 1), (7, DRAWN), (DRAWN, DRAWN), (DRAWN - 1, DRAWN + 1), (5, n), (2 * DRAWN, n)):
+        np.testing.assert_array_equal(noise.corners(a, b), every[a:b])
+    assert every.shape == (n, 2) and len(np.unique(every)) > 0.99 * every.size  # blocks are not repeated
+    assert abs(every.mean()) < 4.0 / np.sqrt(2 * n) and abs(every.var() - 1.0) < 4.0 / np.sqrt(n)
+    assert not np.isin(CornerWhite(4, noise.shared).corners(0, 100), every).all()
+
+
+@pytest.mark.parametrize("loss", ["none", "cauchy"])
+def test_single_precision_rounds_what_is_kept_and_not_the_sums(setup, near, factor_of, dense, loss):
+    factor = noisy(factor_of(setup, 0))
+    factor = replace(factor, noise=replace(factor.noise, loss=loss))
+    cost, exact, pieces = run(factor, near, sums=True)
+    out, others = factor.output(), make_pieces(factor.n_nodes, factor.layout.size)
+    assert sum(factor.accumulate(near, p, out, True) for p in others) == cost
+    for a, b in zip(dense(others, factor.n_nodes), dense(pieces, factor.n_nodes), strict=True):
+        np.testing.assert_array_equal(a, b)
+    for a, b in ((out.residual, exact.residual), (out.root, exact.root)):
+        np.testing.assert_array_equal(a, b.astype(np.float32))
 
 
 def test_corners_left_out_are_as_if_they_were_not_there(setup, factor_of, dense):

@@ -111,7 +111,7 @@ def corner_sample(
     state = setup.perturbed(rng, 0.02)
 
     def run(at):
-        out = factor.output()
+        out = factor.output(np.float64)
         for piece in make_pieces(len(at.seconds), setup.layout.size):
             factor.accumulate(at, piece, out, sums=False)
         return out, out.root > 0
@@ -136,7 +136,7 @@ def corner_sample(
         return (root[:, None] ** 2 * e).T.ravel(), B @ W @ B
 
     def accumulate(at, piece, sums):
-        return factor.accumulate(at, piece, factor.output(), sums, curved)
+        return factor.accumulate(at, piece, factor.output(np.float64), sums, curved)
 
     tolerance = 1e-3 if field and loss != "none" else 1e-6
     return Sample("CornerFactor", setup, state, accumulate, residual, weights, tolerance)

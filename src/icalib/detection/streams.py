@@ -16,7 +16,7 @@ from itertools import islice
 import numpy as np
 
 from icalib.detection.cache import keep_corners, load_corners, stream_key
-from icalib.detection.corners import ImageCorners, corner_stream
+from icalib.detection.corners import ImageCorners, corner_stream, packed
 from icalib.detection.detectors import Detector, detector_of
 from icalib.detection.diagnosis import what_is_seen, with_other_border
 from icalib.detection.sightings import parts_of, sightings, without_rare_tags
@@ -31,6 +31,7 @@ DIAGNOSED = 5  # images in which tags are looked for that are not the target's
 # Of a target's points, and of free tags' corners, an image on average: with fewer the border may be another one.
 POOR_SHARE, POOR_CORNERS = 0.5, 8
 PER_WORKER = 4  # images in memory for each thread
+PACKED = 256  # images whose corners are put together
 Progress = Callable[[float], None]  # the share of the images that is done, 0 to 1
 
 
@@ -132,6 +133,8 @@ def _search(
                 return str(error)
             stamps.append(stamp)
             images.append(found)
+            if len(images) % PACKED == 0:
+                images[-PACKED:] = packed(images[-PACKED:])
             done(len(images))
             return ""
 

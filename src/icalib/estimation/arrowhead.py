@@ -116,6 +116,8 @@ def chain_cuts(n_nodes: int) -> tuple[int, ...]:
 def make_pieces(n_nodes: int, n_border: int | None) -> tuple[Piece, ...]:
     """Two pieces of about the same length; one where the chain is too short to share. Without a border, bare ones."""
     ends = (0, *chain_cuts(n_nodes), n_nodes - 1)
+    if n_border is not None:
+        pages.give_back()  # there is no moment at which more is needed
     return tuple(
         Piece.bare(a, b) if n_border is None else Piece.zeros(a, b, n_border) for a, b in pairwise(ends)
     )  # fmt: skip

@@ -43,7 +43,7 @@ from icalib.measurements import CornerStream
 from icalib.rig import Scheme
 
 BLOCK = 256  # images at a time, where nothing is summed
-DRAWN = 65536  # corners at a time, for which noise is drawn
+DRAWN = 8192  # corners whose noise is drawn together
 POSES = 1024  # views at a time, whose poses and how these move are made together
 CHUNK = 64  # views at a time: what a chunk needs stays in the cache
 LOSSES = {"none": 0, "huber": 1, "cauchy": 2}
@@ -64,16 +64,33 @@ class CornerNoise:
 @dataclass(frozen=True)
 class CornerOutput:
     """Per corner: residual (N, 2) px, predicted - measured, and root (N,), square root of its weight over sigma (0
-    where left out); per view: shared (V, 2, m), the sizes of the common error."""
+    where left out), in single precision because there are many; per view: shared (V, 2, m), the sizes of the common
+    error."""
 
     residual: np.ndarray
     root: np.ndarray
     shared: np.ndarray
 
     @classmethod
-    def empty(cls, n: int, n_views: int, m: int) -> CornerOutput:
+    def empty(cls, n: int, n_views: int, m: int, dtype: type = np.float32) -> CornerOutput:
         """For n corners in `n_views` views with m sizes of a common error."""
-        return cls(pages.zeros((n, 2)), pages.zeros((n,)), np.zeros((n_views, 2, m)))
+        return cls(pages.zeros((n, 2), dtype), pages.zeros((n,), dtype), np.zeros((n_views, 2, m)))
+
+
+@dataclass(frozen=True)
+class CornerWhite:
+    """White noise in place of whitened residuals: of corners, drawn anew from `seed` wherever it is asked for, and of
+    common errors, shared (V, 2, m)."""
+
+    seed: int
+    shared: np.ndarray
+
+    def corners(self, a: int, b: int) -> np.ndarray:
+        """(b - a, 2) float32, of corners a..b: the same for a corner whatever else is asked for."""
+        first, end = a // DRAWN, -(-b // DRAWN)
+        rngs = (np.random.default_rng((self.seed, k)) for k in range(first, end))
+        drawn = [np.zeros((0, 2), np.float32), *(r.standard_normal((DRAWN, 2), np.float32) for r in rngs)]
+        return np.concatenate(drawn)[a - first * DRAWN : b - first * DRAWN]
 
 
 @dataclass(frozen=True)
@@ -191,18 +208,14 @@ class CornerFactor:
         uv = self.model.project(params, X)[0] - self.stream.uv[own]
         return uv + state.values[self.name, "bloom"] * self.direction[own] if len(self.direction) else uv
 
-    def white_noise(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """In place of whitened residuals: corners (N, 2), float32 because there are many, common errors (V, 2, m)."""
-        n = len(self.stream.uv)
-        corners = pages.zeros((n, 2), np.float32)
-        for a in range(0, n, DRAWN):
-            b = min(a + DRAWN, n)
-            corners[a:b] = rng.standard_normal((b - a, 2))
-        return corners, rng.standard_normal((len(self.views.image), 2, len(self.noise.tau)))
+    def white_noise(self, rng: np.random.Generator) -> CornerWhite:
+        """In place of whitened residuals."""
+        shared = rng.standard_normal((len(self.views.image), 2, len(self.noise.tau)))
+        return CornerWhite(int(rng.integers(2**63)), shared)
 
-    def output(self) -> CornerOutput:
-        """Empty arrays for `accumulate` to fill."""
-        return CornerOutput.empty(len(self.stream.uv), len(self.views.image), len(self.noise.tau))
+    def output(self, dtype: type = np.float32) -> CornerOutput:
+        """Empty arrays for `accumulate` to fill. Its sums do not depend on `dtype`."""
+        return CornerOutput.empty(len(self.stream.uv), len(self.views.image), len(self.noise.tau), dtype)
 
     def squared_errors(self, out: CornerOutput) -> np.ndarray:
         """(N,) px^2, of the residuals with their images' common errors in them."""
@@ -243,24 +256,24 @@ class CornerFactor:
         out: CornerOutput | None,
         sums: bool = True,
         curved: bool = False,
-        noise: tuple[np.ndarray, np.ndarray] | None = None,
+        noise: CornerWhite | None = None,
     ) -> float:
         """Fills `out`, if given, for the images whose node lies in `piece`, and adds them to its sums where `sums`
         are wanted.
 
         Returns half the robust chi^2. `curved`: J^T J has the true curvature of the robust loss, not its weights alone.
-        With `noise` (corners (N, 2), common errors (V, 2, m), white) in place of the whitened residuals, returns the
-        quadratic form of the common errors' rows instead.
+        With `noise` in place of the whitened residuals, returns the quadratic form of the common errors' rows instead.
         """
-        m = len(self.noise.tau)
-        white, white_shared = noise or (np.zeros((0, 2), dtype=np.float32), np.zeros((0, 2, m)))
         into, total = piece.sums(sums), 0.0
         for v0, v1, scene in self._blocks_of(piece):
             images, noise_model, direct, motion = self._arguments(state, v0, v1, scene, curved)
-            given = Given(noise is not None, white, white_shared[v0:v1])
+            first, end = int(images.start[0]), int(images.start[-1])
+            given = Given(False, 0, np.zeros((0, 2), np.float32), np.zeros((0, 2, len(self.noise.tau))))
+            if noise is not None:
+                given = Given(True, first, noise.corners(first, end), noise.shared[v0:v1])
             if out is None:
-                own = CornerOutput.empty(int(images.start[-1] - images.start[0]), v1 - v0, m)
-                found = Found(int(images.start[0]), own.residual, own.root, own.shared)
+                own = CornerOutput.empty(end - first, v1 - v0, len(self.noise.tau))
+                found = Found(first, own.residual, own.root, own.shared)
             else:
                 found = Found(0, out.residual, out.root, out.shared[v0:v1])
             for a, b, predicted in self._chunks(state, images, motion, scene, sums):

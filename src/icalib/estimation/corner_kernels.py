@@ -80,15 +80,18 @@ class Predicted(NamedTuple):
 
 
 class Given(NamedTuple):
-    """White noise in place of the whitened residuals, where `used`: corners (N, 2), common errors (n, 2, m)."""
+    """White noise in place of the whitened residuals, where `used`: of corners `first` and on (n, 2), common errors
+    (n, 2, m)."""
 
     used: bool
+    first: int
     corners: np.ndarray
     shared: np.ndarray
 
 
 class Found(NamedTuple):
-    """What is left: residual (n, 2) and root (n,) of corners `first` and on, shared (n, 2, m) by image."""
+    """What is left: residual (n, 2) and root (n,) of corners `first` and on, in single precision; shared (n, 2, m) by
+    image."""
 
     first: int
     residual: np.ndarray
@@ -123,11 +126,10 @@ def _gram(A, D, n, out):
 
 
 @njit(cache=True, nogil=True)
-def _predict_image(i, images, noise, direct, predicted, found):
-    """Residuals, weights and common error of image i; returns its half robust chi^2."""
-    n0, n1, o = images.start[i], images.start[i + 1], predicted.first
-    f0, f1 = n0 - found.first, n1 - found.first
-    res, ok = found.residual[f0:f1], np.empty(n1 - n0, np.bool_)
+def _predict_image(i, images, noise, direct, predicted, res, root, found):
+    """Residuals res (n, 2), weights root (n,) and common error of image i; returns its half robust chi^2."""
+    n0, n1, o, f0 = images.start[i], images.start[i + 1], predicted.first, images.start[i] - found.first
+    ok = np.empty(n1 - n0, np.bool_)
     for k in range(n1 - n0):
         n = n0 + k
         ok[k] = images.keep[n] and predicted.valid[n - o]
@@ -135,14 +137,28 @@ def _predict_image(i, images, noise, direct, predicted, found):
             res[k, r] = predicted.uv[n - o, r] - images.uv[n, r]
             if len(direct.direction):
                 res[k, r] += direct.bloom * direct.direction[n, r]
-    return robust_weights(
-        res, ok, noise.field[n0:n1], noise.precision, noise.sigma[i], noise.loss, noise.scale, found.root[f0:f1],
-        found.shared[i],
-    )  # fmt: skip
+    cost = robust_weights(
+        res, ok, noise.field[n0:n1], noise.precision, noise.sigma[i], noise.loss, noise.scale, root, found.shared[i]
+    )
+    for k in range(n1 - n0):
+        found.root[f0 + k] = root[k]
+        for r in range(2):
+            found.residual[f0 + k, r] = res[k, r]
+    return cost
 
 
 @njit(cache=True, nogil=True)
-def _fill_rows(i, images, noise, direct, motion, predicted, found, error, A):
+def _recall_image(i, images, found, res, root):
+    """What `_predict_image` left of image i."""
+    n0, f0 = images.start[i], images.start[i] - found.first
+    for k in range(images.start[i + 1] - n0):
+        root[k] = found.root[f0 + k]
+        for r in range(2):
+            res[k, r] = found.residual[f0 + k, r]
+
+
+@njit(cache=True, nogil=True)
+def _fill_rows(i, images, noise, direct, motion, predicted, roots, error, A):
     """Weighted Jacobian of image i, transposed: A (D + 1, 2 n), u rows first; the last row the residual.
 
     With `curved`, where the loss bends the rows are scaled so that A^T A is the true curvature, A^T r the true
@@ -154,7 +170,7 @@ def _fill_rows(i, images, noise, direct, motion, predicted, found, error, A):
     D = 6 + n_pars + has_bloom + ns
     moved = np.empty((3, ns))
     for k in range(n):
-        c, root = n0 + k - predicted.first, found.root[n0 + k - found.first]
+        c, root = n0 + k - predicted.first, roots[k]
         x, y, z = predicted.X[c, 0], predicted.X[c, 1], predicted.X[c, 2]
         _turn(motion.R_cam_world[i], direct.basis[images.point[n0 + k]], moved)
         for r in range(2):
@@ -191,14 +207,15 @@ def _turn(R, b, out):
 
 @njit(cache=True, nogil=True)
 def _work(images, direct, motion):
-    """Arrays for one image: rows A, their Gram matrix, errors (n, 2), and the chain matrices Tn, Tm, Tc."""
+    """Arrays for one image: rows A, their Gram matrix, residuals and errors (n, 2), roots (n,), and the chain matrices
+    Tn, Tm, Tc."""
     most = 0
     for i in range(len(images.start) - 1):
         most = max(most, images.start[i + 1] - images.start[i])
     D = 6 + len(direct.pars) + (len(direct.direction) > 0) + direct.basis.shape[1]
     Tm = np.empty((6, 15 if len(motion.by_next) else 0))
     return (
-        np.empty((D + 1, 2 * most)), np.empty((D + 1, D + 1)), np.empty((most, 2)),
+        np.empty((D + 1, 2 * most)), np.empty((D + 1, D + 1)), np.empty((most, 2)), np.empty((most, 2)), np.empty(most),
         np.empty((6, 15)), Tm, np.empty((6, motion.columns.shape[1])),
     )  # fmt: skip
 
@@ -209,28 +226,28 @@ def accumulate(i0, i1, images, noise, direct, motion, predicted, given, sums, fo
 
     Returns half the robust chi^2, or with `given` noise the quadratic form of the common errors' own rows.
     """
-    A, G, error, Tn, Tm, Tc = _work(images, direct, motion)
+    A, G, all_residuals, error, all_roots, Tn, Tm, Tc = _work(images, direct, motion)
     D = len(G) - 1
     total = 0.0
     for i in range(i0, i1):
-        cost = _predict_image(i, images, noise, direct, predicted, found)
+        n0, n1 = images.start[i], images.start[i + 1]
+        n, g0 = n1 - n0, n0 - given.first
+        res, root = all_residuals[:n], all_roots[:n]
+        cost = _predict_image(i, images, noise, direct, predicted, res, root, found)
         if not given.used:
             total += cost
         if len(sums.diagonal) == 0:
             continue
-        n0, n1 = images.start[i], images.start[i + 1]
-        n, f0, f1 = n1 - n0, n0 - found.first, n1 - found.first
-        whole_error(found.residual[f0:f1], noise.field[n0:n1], found.shared[i], error)
-        _fill_rows(i, images, noise, direct, motion, predicted, found, error, A)
+        whole_error(res, noise.field[n0:n1], found.shared[i], error)
+        _fill_rows(i, images, noise, direct, motion, predicted, root, error, A)
         if given.used:
             for k in range(n):
-                ok = found.root[f0 + k] > 0.0
-                A[D, k] = given.corners[n0 + k, 0] if ok else 0.0
-                A[D, n + k] = given.corners[n0 + k, 1] if ok else 0.0
+                A[D, k] = given.corners[g0 + k, 0] if root[k] > 0.0 else 0.0
+                A[D, n + k] = given.corners[g0 + k, 1] if root[k] > 0.0 else 0.0
         _gram(A, D + 1, 2 * n, G)
         if len(noise.precision):
             rows = marginalise_shared(
-                A, D, n, found.root[f0:f1], noise.field[n0:n1], noise.precision, given.shared[i], given.used, G
+                A, D, n, root, noise.field[n0:n1], noise.precision, given.shared[i], given.used, G
             )
             total += rows if given.used else 0.0
         pose_chain(i, motion, Tn, Tm, Tc)
@@ -241,14 +258,16 @@ def accumulate(i0, i1, images, noise, direct, motion, predicted, given, sums, fo
 @njit(cache=True, nogil=True)
 def accumulate_clusters(i0, i1, cluster, n_clusters, column, images, noise, direct, motion, predicted, sums, found):
     """Gradients of images i0..i1 by cluster of corners, into columns `column` and on of side and border."""
-    A, gram, error, Tn, Tm, Tc = _work(images, direct, motion)
+    A, gram, all_residuals, error, all_roots, Tn, Tm, Tc = _work(images, direct, motion)
     D = len(gram) - 1
     G = np.empty((D, n_clusters))
     for i in range(i0, i1):
         n0, n1 = images.start[i], images.start[i + 1]
-        n, f0, f1 = n1 - n0, n0 - found.first, n1 - found.first
-        whole_error(found.residual[f0:f1], noise.field[n0:n1], found.shared[i], error)
-        _fill_rows(i, images, noise, direct, motion, predicted, found, error, A)
+        n = n1 - n0
+        res, root = all_residuals[:n], all_roots[:n]
+        _recall_image(i, images, found, res, root)
+        whole_error(res, noise.field[n0:n1], found.shared[i], error)
+        _fill_rows(i, images, noise, direct, motion, predicted, root, error, A)
         for d in range(D):
             for g in range(n_clusters):
                 G[d, g] = 0.0

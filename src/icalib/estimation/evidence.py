@@ -17,7 +17,7 @@ from icalib.estimation.arrowhead import (
     restricted_inverse,
     solve,
 )
-from icalib.estimation.corner_factor import CornerFactor, CornerOutput
+from icalib.estimation.corner_factor import CornerFactor, CornerOutput, CornerWhite
 from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput
 from icalib.estimation.gauge import hold_frame
 from icalib.estimation.imu_factor import ROWS
@@ -159,7 +159,7 @@ def _spent_by_views(
     camera: CornerFactor,
     at: CornerOutput,
     ends: list[State],
-    noise: tuple[np.ndarray, np.ndarray],
+    noise: CornerWhite,
     views: tuple[int, int],
 ) -> dict[str, float]:
     """e^T J x of some views of one camera, their images' common errors solved along."""
@@ -167,7 +167,8 @@ def _spent_by_views(
     up, down = (camera.residual(state, *views) for state in ends)
     root, view = at.root[own], camera.views.of_corners(*views) - views[0]
     along = (up - down) / (2.0 * PROBE_STEP) * root[:, None]
-    e, e_shared = np.where((root > 0.0)[:, None], noise[0][own], 0.0), noise[1][slice(*views)]
+    white = noise.corners(own.start, own.stop)
+    e, e_shared = np.where((root > 0.0)[:, None], white, 0.0), noise.shared[slice(*views)]
     total = float((e * along).sum())
     if m == 0:
         return {"corners": total}

@@ -13,6 +13,7 @@ import sys
 import numpy as np
 
 LEAST = 1 << 20  # bytes, below which the allocator does better
+_M_MMAP_THRESHOLD = -3  # of mallopt, in malloc.h
 
 
 def zeros(shape: tuple[int, ...], dtype: type = np.float64) -> np.ndarray:
@@ -25,6 +26,18 @@ def zeros(shape: tuple[int, ...], dtype: type = np.float64) -> np.ndarray:
 
 def give_back() -> None:
     """What nobody uses any more goes back to the system, where the C library knows how to (glibc). Takes about 1 ms."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
-    if trim is not None:
-        trim(0)
+    _in_glibc("malloc_trim", 0)
+
+
+def keep_apart() -> None:
+    """From now on large arrays have pages of their own, in the whole process, where the C library can do that (glibc).
+
+    It does so at first, but once such an array has been freed, the next ones as large lie between the small ones.
+    """
+    _in_glibc("mallopt", _M_MMAP_THRESHOLD, LEAST)
+
+
+def _in_glibc(name: str, *arguments: int) -> None:
+    function = getattr(ctypes.CDLL(None), name, None) if sys.platform == "linux" else None
+    if function is not None:
+        function(*arguments)

@@ -16,7 +16,7 @@ from icalib.estimation.arrowhead import (
     marginalise,
     marginalise_in_segments,
 )
-from icalib.estimation.corner_factor import CornerFactor, CornerOutput
+from icalib.estimation.corner_factor import CornerFactor, CornerOutput, CornerWhite
 from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput
 from icalib.estimation.gauge import hold_frame
 from icalib.estimation.imu_factor import ROWS
@@ -65,11 +65,11 @@ class Residuals:
 
 @dataclass(frozen=True)
 class WhiteNoise:
-    """A draw in place of all whitened residuals: of the chain (K - 1, 15), of corners (N, 2) and common errors
-    (V, 2, m) by camera, of features (N, 2) by camera, of other sensors (n, m) by sensor."""
+    """A draw in place of all whitened residuals: of the chain (K - 1, 15), of corners by camera, of features (N, 2) by
+    camera, of other sensors (n, m) by sensor."""
 
     imu: np.ndarray
-    corners: tuple[tuple[np.ndarray, np.ndarray], ...]
+    corners: tuple[CornerWhite, ...]
     features: tuple[np.ndarray, ...]
     sensors: tuple[np.ndarray, ...] = ()
 
