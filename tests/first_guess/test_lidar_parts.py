@@ -17,7 +17,7 @@ SCALE = 0.3
 
 @pytest.fixture(scope="module")
 def scan():
-    """A map of one voxel that holds the plane z = 1 + 0.1 x + 0.2 y, and points of a scan near it."""
+    """A map of one voxel, with the plane z = 1 + 0.1 x + 0.2 y, and points of a scan near it with their instants."""
     rng = np.random.default_rng(0)
     xy = rng.uniform(1.0, 9.0, (500, 2))
     surface = np.column_stack([xy, 1.0 + xy @ [0.1, 0.2]])
