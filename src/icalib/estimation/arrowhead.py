@@ -21,7 +21,8 @@ import numpy as np
 from numba import njit
 
 from icalib.errors import EstimationError
-from icalib.estimation.front import Eliminated, Features, eliminate, plan
+from icalib.estimation.front import Eliminated, Features, eliminate
+from icalib.estimation.front_plan import plan
 from icalib.estimation.state import NODE
 from icalib.geometry.small import cholesky
 
@@ -228,8 +229,7 @@ def _reduce(piece: Piece, keep: bool) -> Eliminated | bool:
         if done:
             piece.border -= _eliminated_part(piece, keep)
         return done
-    steps, sums = piece.features.steps, piece.features.sums
-    done = eliminate(steps, piece.diagonal, piece.upper, piece.side, sums, forwards)
+    done = eliminate(piece.features, piece.diagonal, piece.upper, piece.side, forwards, keep)
     if done is None:
         return False
     left = np.triu(done.left) + np.triu(done.left, 1).T

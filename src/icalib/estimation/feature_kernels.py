@@ -21,14 +21,13 @@ FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-6, 1e8
 
 class Seen(NamedTuple):
     """What one camera saw: observations of image i are start[i]:start[i + 1]; uv (N, 2), keep (N,), track (N,) -1 where
-    left out; pair and next_pair (N,) of feature and node (-1: none); node (n,), counted from the piece's first."""
+    left out; pair (N,) of feature and image (-1: none); node (n,), counted from the piece's first."""
 
     start: np.ndarray
     uv: np.ndarray
     keep: np.ndarray
     track: np.ndarray
     pair: np.ndarray
-    next_pair: np.ndarray
     node: np.ndarray
 
 
@@ -215,7 +214,7 @@ def _rows(i, n, X, seen, seeing, weighing, R_cw, error, A):
 
 
 @njit(cache=True, nogil=True)
-def _add_feature(A, pair, next_pair, t, Tn, Tm, Tc, chained, direct, features):
+def _add_feature(A, pair, t, Tc, chained, direct, features):
     """One observation's rows A into the sums of its feature."""
     D, n_b = len(A) - 1, features.side.shape[2] - 1
     n_d = len(direct)
@@ -229,10 +228,7 @@ def _add_feature(A, pair, next_pair, t, Tn, Tm, Tc, chained, direct, features):
                 features.side[t, a, direct[q]] += f0 * A[6 + q, 0] + f1 * A[6 + q, 1]
         for d in range(6):
             by_pose = f0 * A[d, 0] + f1 * A[d, 1]
-            for j in range(15):
-                features.block[pair, a, j] += by_pose * Tn[d, j]
-            for j in range(Tm.shape[1]):
-                features.block[next_pair, a, j] += by_pose * Tm[d, j]
+            features.block[pair, a, d] += by_pose
             for j in range(len(chained)):
                 if chained[j] >= 0:
                     features.side[t, a, chained[j]] += by_pose * Tc[d, j]
@@ -250,6 +246,9 @@ def accumulate(X, seen, base, motion, seeing, weighing, used, given, sums, featu
     for i in range(len(seen.start) - 1):
         if wanted:
             pose_chain(i, motion, Tn, Tm, Tc)
+            features.pose[i] = Tn
+            if len(features.next_pose):
+                features.next_pose[i] = Tm
             G[:] = 0.0
         for n in range(seen.start[i], seen.start[i + 1]):
             t = seen.track[n] - base.track
@@ -268,10 +267,7 @@ def accumulate(X, seen, base, motion, seeing, weighing, used, given, sums, featu
                 for b in range(7 + n_d):
                     q = b if b < 6 + n_d else D
                     G[a, b] += A[p, 0] * A[q, 0] + A[p, 1] * A[q, 1]
-            _add_feature(
-                A, seen.pair[n] - base.pair, seen.next_pair[n] - base.pair, t, Tn, Tm, Tc, motion.columns[i],
-                seeing.columns, features,
-            )  # fmt: skip
+            _add_feature(A, seen.pair[n] - base.pair, t, Tc, motion.columns[i], seeing.columns, features)
         if wanted:
             add_image(seen.node[i], G, Tn, Tm, Tc, motion.columns[i], seeing.columns, sums)
     return total
