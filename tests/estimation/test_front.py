@@ -7,7 +7,7 @@ import pytest
 
 from icalib.estimation.arrowhead import NotDefiniteError, Piece, make_pieces, marginalise, solve
 from icalib.estimation.front import Features
-from icalib.estimation.front_plan import FeatureSums, plan
+from icalib.estimation.front_plan import SIZES, FeatureSums, plan
 from icalib.estimation.state import NODE
 
 
@@ -62,7 +62,7 @@ def add(piece, sums, rows):
     piece.border[-1, -1] = 0.0
 
 
-def build(n_nodes, n_tracks, n_border, seed=0, pieces=None, per_node=1, by_next=False, size=2):
+def build(n_nodes, n_tracks, n_border, seed=0, pieces=None, per_node=1, by_next=False, sizes=(2,)):
     """Pieces with features, and the dense normal equations of chain and border with the features taken out."""
     rng, J = np.random.default_rng(seed), []
     pieces = make_pieces(n_nodes, n_border) if pieces is None else pieces
@@ -74,7 +74,7 @@ def build(n_nodes, n_tracks, n_border, seed=0, pieces=None, per_node=1, by_next=
         sums = FeatureSums.zeros(n_tracks, pairs[:, 0].copy(), pairs[:, 1].copy(), images[0], n_border, by_next)
         sums.pose[:], sums.next_pose[:] = images[1:]
         add(piece, sums, rows)
-        piece.features = Features(sums, plan(sums, n, piece.first == 0 or not keep, keep, size))
+        piece.features = Features(sums, plan(sums, n, piece.first == 0 or not keep, keep, sizes=sizes))
         for column, A, f, _, F, _, C, r in rows:
             row = np.zeros((len(r), width))
             row[:, column : column + A.shape[1]], row[:, o : o + n_border], row[:, o + n_border] = A, C, r
@@ -103,10 +103,10 @@ def test_solution_is_the_dense_one(n_nodes, n_tracks):
     check(*build(n_nodes, n_tracks, 3), n_nodes)
 
 
-@pytest.mark.parametrize("size", [1, 3, None])
+@pytest.mark.parametrize("sizes", [(1,), (3,), SIZES])
 @pytest.mark.parametrize(("per_node", "by_next"), [(1, False), (2, False), (3, False), (1, True), (2, True)])
-def test_solution_is_the_dense_one_however_images_hang_on_nodes(per_node, by_next, size):
-    check(*build(13, 30, 2, per_node=per_node, by_next=by_next, size=size), 13)
+def test_solution_is_the_dense_one_however_images_hang_on_nodes(per_node, by_next, sizes):
+    check(*build(13, 30, 2, per_node=per_node, by_next=by_next, sizes=sizes), 13)
 
 
 def test_marginalise_takes_features_out():
@@ -126,13 +126,13 @@ def by_step(lists, n):
 def test_features_are_in_the_front_from_the_first_group_that_sees_them_to_the_last():
     track, node = np.array([0, 0, 1, 1, 2, 3, 3]), np.array([1, 6, 2, 4, 7, 0, 2])
     for forwards in (True, False):
-        order = plan(FeatureSums.zeros(4, track, node, np.arange(8), 2), 8, forwards, False, 2)
+        order = plan(FeatureSums.zeros(4, track, node, np.arange(8), 2), 8, forwards, False, sizes=(2,))
         assert by_step(order.nodes, 4) == ([[0, 1], [2, 3], [4, 5], [6, 7]] if forwards else [[7, 6], [5, 4], [3, 2], [1, 0]])
         assert by_step(order.local, 4) == ([[], [], [], [2]] if forwards else [[2], [], [], []])
         assert by_step(order.born, 4) == ([[0, 3], [1], [], []] if forwards else [[0], [1], [3], []])
         assert order.alive.tolist() == ([2, 3, 2, 1] if forwards else [1, 2, 3, 2])
     # Forwards, feature 3 leaves slot 1 in the second step, and 1 moves there from slot 2 in the third.
-    order = plan(FeatureSums.zeros(4, track, node, np.arange(8), 2), 8, True, False, 2)
+    order = plan(FeatureSums.zeros(4, track, node, np.arange(8), 2), 8, True, False, sizes=(2,))
     assert by_step(order.dying, 4) == [[], [1], [1], [0]]
     assert by_step(order.leave, 4) == [[], [], [2], []]
     assert order.enter.tolist() == [1]

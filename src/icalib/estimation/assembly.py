@@ -31,6 +31,7 @@ from icalib.measurements import CornerStream, Measurements
 from icalib.rig import Camera, Parameter, Rig, Scheme
 
 BLOOM_SIGMA_PX = 1.0
+CUT_S = 0.5
 CAMERA_PARAMETERS: tuple[tuple[str, Kind], ...] = (
     ("rotation", "rotation"),
     ("translation", "vector"),
@@ -171,10 +172,11 @@ def nodes_for(inputs: Inputs, times: list[np.ndarray]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Following:
-    """Of tracks, by camera: sigma px, and keep (N,), observations in use."""
+    """Of tracks, by camera: sigma px, and keep (N,), observations in use. cut: whether tracks are cut short."""
 
     sigma: tuple[float, ...]
     keep: tuple[np.ndarray, ...]
+    cut: bool = False
 
 
 def assemble(
@@ -219,6 +221,8 @@ def _features(inputs: Inputs, state: State, cameras: tuple[CornerFactor, ...], f
         keep.append(k & np.repeat(seen, np.diff(stream.start)))
     loss = settings.loss, settings.loss_scale
     cuts, seams = chain_cuts(len(state.seconds)), state.starts[1:]
+    if following.cut:
+        cuts = (*cuts, *np.flatnonzero(np.diff(np.floor(state.seconds / CUT_S))) + 1)
     return FeatureFactor.build(cameras, streams, following.sigma, tuple(keep), loss, state, cuts, seams)
 
 

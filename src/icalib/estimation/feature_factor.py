@@ -152,7 +152,9 @@ class FeatureFactor:
             tracks.stop - tracks.start, self.tracks.pair_track[pairs] - tracks.start, image, node - piece.first,
             piece.border.shape[0] - 1, by_next,
         )  # fmt: skip
-        return replace(piece, features=Features(sums, plan(sums, len(piece.diagonal), piece.first == 0 or not keep, keep)))
+        ends = self.tracks.edges - piece.first
+        steps = plan(sums, len(piece.diagonal), piece.first == 0 or not keep, keep, ends)
+        return replace(piece, features=Features(sums, steps))
 
     def accumulate(
         self,

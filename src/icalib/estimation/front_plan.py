@@ -19,6 +19,7 @@ POSE = 6  # of a camera
 SIZES = (4, 8, 12, 16, 24, 32)  # nodes of a group
 BYTE = 4.0  # what moving a byte costs, in multiplications
 STEP = 1e6  # and a step's many small ones
+NO_ENDS = np.zeros(0, dtype=np.int64)
 
 
 class FeatureSums(NamedTuple):
@@ -111,10 +112,13 @@ class _Lives:
     local: np.ndarray
 
     @classmethod
-    def of(cls, sums: FeatureSums, n_nodes: int, forwards: bool, keep: bool, size: int) -> _Lives:
+    def of(
+        cls, sums: FeatureSums, n_nodes: int, forwards: bool, keep: bool, size: int, ends: np.ndarray
+    ) -> _Lives:
         order = np.arange(n_nodes) if forwards else np.arange(n_nodes)[::-1]
         pivots = order[:-1] if keep else order
-        groups = [pivots[k : k + size] for k in range(0, len(pivots), size)]
+        stretches = np.split(pivots, np.flatnonzero(np.diff(np.searchsorted(ends, pivots, side="right"))) + 1)
+        groups = [s[k : k + size] for s in stretches for k in range(0, len(s), size)]
         if keep:
             groups.append(order[:0])  # what still ties the kept node to features
         which = np.full(n_nodes + 1, len(groups) - 1)
@@ -143,17 +147,21 @@ class _Lives:
         return float((flops + BYTE * 8.0 * (wide**2 + 2.0 * rank * wide + nodes**2) + STEP).sum())
 
 
-def plan(sums: FeatureSums, n_nodes: int, forwards: bool, keep: bool, size: int | None = None) -> Plan:
+def plan(
+    sums: FeatureSums,
+    n_nodes: int,
+    forwards: bool,
+    keep: bool,
+    ends: np.ndarray = NO_ENDS,
+    sizes: tuple[int, ...] = SIZES,
+) -> Plan:
     """Steps that eliminate `n_nodes` nodes and all features; with `keep`, all but the last node in this direction.
-    size: nodes of a group, by cost where none is given."""
+    ends: nodes before which all features end; sizes: of groups, tried for the cheapest."""
     met = np.zeros(n_nodes, dtype=np.int64)
     np.add.at(met, sums.node[np.unique(sums.image)], POSE)
     coupled = np.minimum(met, NODE) if not len(sums.next_pose) else np.full(n_nodes, NODE)
-    if size is None:
-        tried = [_Lives.of(sums, n_nodes, forwards, keep, s) for s in SIZES]
-        lives = min(tried, key=lambda x: x.cost(coupled, sums.side.shape[2]))
-    else:
-        lives = _Lives.of(sums, n_nodes, forwards, keep, size)
+    tried = [_Lives.of(sums, n_nodes, forwards, keep, s, ends) for s in sizes]
+    lives = min(tried, key=lambda x: x.cost(coupled, sums.side.shape[2]))
     return _steps(sums, lives, coupled, n_nodes, forwards)
 
 
