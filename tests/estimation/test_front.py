@@ -127,7 +127,9 @@ def test_features_are_in_the_front_from_the_first_group_that_sees_them_to_the_la
     track, node = np.array([0, 0, 1, 1, 2, 3, 3]), np.array([1, 6, 2, 4, 7, 0, 2])
     for forwards in (True, False):
         order = plan(FeatureSums.zeros(4, track, node, np.arange(8), 2), 8, forwards, False, sizes=(2,))
-        assert by_step(order.nodes, 4) == ([[0, 1], [2, 3], [4, 5], [6, 7]] if forwards else [[7, 6], [5, 4], [3, 2], [1, 0]])
+        assert by_step(order.nodes, 4) == (
+            [[0, 1], [2, 3], [4, 5], [6, 7]] if forwards else [[7, 6], [5, 4], [3, 2], [1, 0]]
+        )
         assert by_step(order.local, 4) == ([[], [], [], [2]] if forwards else [[2], [], [], []])
         assert by_step(order.born, 4) == ([[0, 3], [1], [], []] if forwards else [[0], [1], [3], []])
         assert order.alive.tolist() == ([2, 3, 2, 1] if forwards else [1, 2, 3, 2])
@@ -139,13 +141,18 @@ def test_features_are_in_the_front_from_the_first_group_that_sees_them_to_the_la
 
 
 def test_the_size_of_groups_is_chosen_by_cost():
-    """Many features that a few nodes see call for groups that hold their lives; without features small ones will do."""
-    n, rng = 400, np.random.default_rng(0)
-    begin = rng.integers(0, n - 12, 2000)
-    track, image = np.repeat(np.arange(2000), 12), (begin[:, None] + np.arange(12)).ravel()
-    many = plan(FeatureSums.zeros(2000, track, image, np.arange(n), 40), n, True, False)
-    none = plan(FeatureSums.zeros(0, track[:0], image[:0], np.arange(n), 40), n, True, False)
-    assert len(many.after) < len(none.after)
+    """A group that holds all of its features' lives spares them the front; long lives make small groups best."""
+    n, per_node = 192, 200
+    image = np.repeat(np.arange(n), per_node)
+    ends = np.arange(0, n, 24)
+    sums = FeatureSums.zeros(
+        len(image) // 24, image // 24 * per_node + np.arange(len(image)) % per_node, image, np.arange(n), 40
+    )
+    short = plan(sums, n, True, False, ends)
+    assert np.diff(short.nodes.start).tolist() == [24] * 8
+    assert short.alive.max() == 0 and len(short.local.values) == len(sums.own)
+    lasting = FeatureSums.zeros(200, np.tile(np.arange(200), 2), np.repeat([0, n - 1], 200), np.arange(n), 40)
+    assert np.diff(plan(lasting, n, True, False).nodes.start).max() < 24
 
 
 def test_a_feature_that_nothing_determines_is_an_error():

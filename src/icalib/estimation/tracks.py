@@ -19,9 +19,10 @@ class Tracks:
     """Tracks in the order of their first nodes. By camera, of each observation: track (N,), -1 where it has none; pair
     (N,), of its track with its image.
 
-    pair_track, pair_camera and pair_image (E,): what each pair joins; edges (S + 1,): nodes between which tracks are cut; tracks_from
-    and pairs_from (S + 1,): the first of each stretch; start (T, 3): where each point is first looked for, in the frame
-    of the camera that saw it in the middle of its life; camera and image (T,): which that was.
+    pair_track, pair_camera and pair_image (E,): what each pair joins, in the order of nodes; edges (S + 1,): nodes
+    between which tracks are cut; tracks_from and pairs_from (S + 1,): the first of each stretch; start (T, 3): where
+    each point is first looked for, in the frame of the camera that saw it in the middle of its life; camera and image
+    (T,): which that was.
     """
 
     track: tuple[np.ndarray, ...]
@@ -85,23 +86,33 @@ class Sightings:
     def tracks(self, label: np.ndarray, edges: np.ndarray) -> Tracks:
         """Of labels that are in order; where points are looked for is unknown as yet."""
         seen, n = np.flatnonzero(label >= 0), int(label.max(initial=-1)) + 1
-        at = seen[np.lexsort((self.node[seen], label[seen]))]
-        pair, pair_track = np.full(len(label), -1), label[at]
-        pair[at] = np.arange(len(at))
-        begins = np.searchsorted(pair_track, np.arange(n))
-        tracks_from = np.searchsorted(self.node[at[begins]], edges)
-        middle = begins + np.bincount(pair_track, minlength=n) // 2
-        camera = np.repeat(np.arange(len(self.counts)), self.counts)[at]
+        pairs = seen[np.argsort(self.node[seen], kind="stable")]
+        pair = np.full(len(label), -1)
+        pair[pairs] = np.arange(len(pairs))
+        lives = pairs[np.argsort(label[pairs], kind="stable")]
+        begins = np.searchsorted(label[lives], np.arange(n))
+        middle = lives[begins + np.bincount(label[lives], minlength=n) // 2]
+        tracks_from = np.searchsorted(self.node[lives[begins]], edges)
+        camera = np.repeat(np.arange(len(self.counts)), self.counts)
         own_track, own_pair = (tuple(np.split(a, np.cumsum(self.counts)[:-1])) for a in (label, pair))
         return Tracks(
-            own_track, own_pair, pair_track, camera, self.image[at], edges, tracks_from,
-            np.searchsorted(pair_track, tracks_from), camera[middle], self.image[at[middle]], np.zeros((n, 3)),
+            own_track, own_pair, label[pairs], camera[pairs], self.image[pairs], edges, tracks_from,
+            np.searchsorted(self.node[pairs], edges), camera[middle], self.image[middle], np.zeros((n, 3)),
         )  # fmt: skip
 
 
 _NO_NUMBERS = np.zeros(0, dtype=np.int64)
 _NO_EDGES = np.zeros(2, dtype=np.int64)
 NO_TRACKS = Tracks(
-    (), (), _NO_NUMBERS, _NO_NUMBERS, _NO_NUMBERS, _NO_EDGES, _NO_EDGES, _NO_EDGES, _NO_NUMBERS, _NO_NUMBERS,
+    (),
+    (),
+    _NO_NUMBERS,
+    _NO_NUMBERS,
+    _NO_NUMBERS,
+    _NO_EDGES,
+    _NO_EDGES,
+    _NO_EDGES,
+    _NO_NUMBERS,
+    _NO_NUMBERS,
     np.zeros((0, 3)),
 )

@@ -150,8 +150,8 @@ def start_direction(f, h, R):
 
 @njit(cache=True, nogil=True)
 def turns_information(f, h, begin, R, H, g):
-    """H (M, 3, 3) and g (M, 3) of `turn_information` for pairs of images, of which pair i has rays begin[i]..begin[i + 1]
-    of f and h, from the turns R (M, 3, 3) on."""
+    """H (M, 3, 3) and g (M, 3) of `turn_information` for pairs of images with turns R (M, 3, 3); rays of pair i are
+    begin[i]..begin[i + 1] of f and h."""
     for i in range(len(R)):
         own = slice(begin[i], begin[i + 1])
         t = start_direction(f[own], h[own], R[i])
@@ -201,5 +201,3 @@ def common(stream: TrackStream, valid: np.ndarray, i: int, j: int) -> tuple[np.n
     p, q = p + own.start, q + after.start
     seen = valid[p] & valid[q]
     return p[seen], q[seen]
-
-
