@@ -74,7 +74,7 @@ def build(n_nodes, n_tracks, n_border, seed=0, pieces=None, per_node=1, by_next=
         sums = FeatureSums.zeros(n_tracks, pairs[:, 0].copy(), pairs[:, 1].copy(), images[0], n_border, by_next)
         sums.pose[:], sums.next_pose[:] = images[1:]
         add(piece, sums, rows)
-        piece.features = Features(sums, plan(sums, n, piece.first == 0 or not keep, keep, sizes=sizes))
+        piece.features = Features.of(sums, plan(sums, n, piece.first == 0 or not keep, keep, sizes=sizes))
         for column, A, f, _, F, _, C, r in rows:
             row = np.zeros((len(r), width))
             row[:, column : column + A.shape[1]], row[:, o : o + n_border], row[:, o + n_border] = A, C, r

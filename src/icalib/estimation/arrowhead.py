@@ -90,7 +90,7 @@ class Piece:
         """The same sums without node `last`, of which they must say nothing."""
         features = self.features
         if features is not None:
-            features = Features(features.sums, plan(features.sums, len(self.diagonal) - 1, True, False))
+            features = Features.of(features.sums, plan(features.sums, len(self.diagonal) - 1, True, False))
         own = self.diagonal[:-1], self.upper[:-1], self.side[:-1]
         return Piece(self.first, self.last - 1, *own, self.border, features)
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from icalib.estimation.arrowhead import in_parallel, solve
+from icalib.estimation.arrowhead import Piece, in_parallel, solve
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.imu_factor import ImuFactor
 from icalib.estimation.problem import Problem
@@ -33,10 +33,11 @@ def spurious_information(problem: Problem, outcome: Outcome, seed: int = 0) -> n
     rng = np.random.default_rng(seed)
     t = problem.tolerance
     clear = np.linalg.eigvalsh(outcome.information * t[:, None] * t).min(initial=np.inf) > CLEAR
-    found = []
+    found, pieces = [], problem.pieces()
     while len(found) < 2 * (1 if clear else PAIRS):
-        sample, imu = _chain_sample(problem, outcome.state, rng), _reading_noise(problem.chain.imu, rng)
-        found += [_information(*_moved(problem, outcome.state, s * sample, s * imu)) for s in (1.0, -1.0)]
+        sample, imu = _chain_sample(problem, outcome.state, rng, pieces), _reading_noise(problem.chain.imu, rng)
+        for sign in (1.0, -1.0):
+            found.append(_information(*_moved(problem, outcome.state, sign * sample, sign * imu), pieces))
         if _largest_share(np.mean(found, axis=0) - outcome.information, outcome.information) < SLIGHT:
             break
     return np.mean(found, axis=0) - outcome.information
@@ -51,15 +52,14 @@ def _largest_share(noise: np.ndarray, information: np.ndarray) -> float:
     return float(np.abs(np.linalg.eigvalsh(half.T @ noise @ half)).max(initial=0.0))
 
 
-def _information(problem: Problem, state: State) -> np.ndarray:
-    pieces = problem.pieces()
+def _information(problem: Problem, state: State, pieces: tuple[Piece, ...]) -> np.ndarray:
     problem.linearise(state, pieces, problem.residuals(), curved=True)
     return solve(pieces, problem.n_nodes, problem.tolerance).information
 
 
-def _chain_sample(problem: Problem, state: State, rng: np.random.Generator) -> np.ndarray:
+def _chain_sample(problem: Problem, state: State, rng: np.random.Generator, pieces: tuple[Piece, ...]) -> np.ndarray:
     """(K, 15) a draw from the posterior of the chain, the border held: T^-1 J^T e for white e."""
-    scratch, pieces, noise = problem.residuals(), problem.pieces(), problem.white_noise(rng)
+    scratch, noise = problem.residuals(), problem.white_noise(rng)
     in_parallel(lambda piece: problem.add_noise(state, piece, noise, scratch), pieces)
     return solve(pieces, problem.n_nodes, problem.tolerance, held=np.eye(problem.layout.size)).chain
 

@@ -154,7 +154,7 @@ class FeatureFactor:
         )  # fmt: skip
         ends = self.tracks.edges - piece.first
         steps = plan(sums, len(piece.diagonal), piece.first == 0 or not keep, keep, ends)
-        return replace(piece, features=Features(sums, steps))
+        return replace(piece, features=Features.of(sums, steps))
 
     def accumulate(
         self,

@@ -17,17 +17,23 @@ from icalib.estimation.state import NODE
 
 @dataclass(frozen=True)
 class Features:
-    """Those of a `Piece`: their sums, and the steps in which nodes and features are eliminated."""
+    """Those of a `Piece`: their sums, the steps in which nodes and features are eliminated, and room for the factors:
+    each elimination overwrites that of the one before, because memory that is new costs more than what it is for."""
 
     sums: FeatureSums
     plan: Plan
+    room: np.ndarray
+
+    @classmethod
+    def of(cls, sums: FeatureSums, plan: Plan) -> Features:
+        return cls(sums, plan, np.empty(_sizes(plan, sums.side.shape[2]).start[-1]))
 
     def widened(self, n_border: int) -> Features:
         """The same with further columns of the border, between those there are and the gradient; zero, this too."""
         side = self.sums.side
         wide = np.zeros((*side.shape[:2], n_border + 1))
         wide[:, :, : side.shape[2] - 1] = side[:, :, :-1]
-        return Features(self.sums._replace(side=wide), self.plan)
+        return Features.of(self.sums._replace(side=wide), self.plan)
 
 
 @dataclass(frozen=True)
@@ -59,11 +65,11 @@ def _sizes(plan: Plan, n_border: int) -> Sizes:
 def eliminate(
     features: Features, diagonal: np.ndarray, upper: np.ndarray, side: np.ndarray, forwards: bool, keep: bool
 ) -> Eliminated | None:
-    """All steps; None where the sums are not positive definite."""
+    """All steps; None where the sums are not positive definite. The factors are in the room of `features`."""
     plan, sums, n_border = features.plan, features.sums, side.shape[2]
     sizes = _sizes(plan, n_border)
     widest = int(sizes.wide.max())
-    turn, room = np.empty_like(diagonal), np.empty(sizes.start[-1])
+    turn, room = np.empty_like(diagonal), features.room
     chain = Chain(
         diagonal, upper, side, forwards, turn, np.empty_like(sums.pose), np.empty_like(sums.next_pose)
     )  # fmt: skip
