@@ -158,7 +158,9 @@ def test_the_size_of_groups_is_chosen_by_cost():
 def test_a_feature_that_nothing_determines_is_an_error():
     for f in range(4):
         pieces, _, _ = build(8, 4, 2)
-        sums = pieces[1].features.sums
+        features = pieces[1].features
+        assert features is not None
+        sums = features.sums
         sums.own[f], sums.side[f], sums.block[sums.track == f] = 0.0, 0.0, 0.0
         with pytest.raises(NotDefiniteError):
             solve(pieces, 8, np.ones(2))

@@ -44,9 +44,11 @@ def fits(problem: Problem, outcome: Outcome, seed: int = 0) -> list[Fit]:
     """
     rng = np.random.default_rng(seed)
     spent: dict[tuple[str, str], list[float]] = {}
+    pieces = problem.pieces()
     for _ in range(PROBES):
-        for key, value in _probe(problem, outcome, rng).items():
+        for key, value in _probe(problem, outcome, rng, pieces).items():
             spent.setdefault(key, []).append(value)
+    del pieces
     out = []
     imu = outcome.residuals.imu
     for kind, rows in problem.chain.kinds.items():
@@ -77,16 +79,18 @@ def _corner_chi2(camera: CornerFactor, out: CornerOutput) -> dict[str, tuple[int
     return found
 
 
-def _probe(problem: Problem, outcome: Outcome, rng: np.random.Generator) -> dict[tuple[str, str], float]:
+def _probe(
+    problem: Problem, outcome: Outcome, rng: np.random.Generator, pieces: tuple[Piece, ...]
+) -> dict[tuple[str, str], float]:
     """e_s^T J_s x of each sensor for one random e."""
     state, base = outcome.state, outcome.residuals
-    noise, pieces, scratch = problem.white_noise(rng), problem.pieces(), problem.residuals()
+    noise, scratch = problem.white_noise(rng), problem.residuals()
     in_parallel(lambda piece: problem.add_noise(state, piece, noise, scratch), pieces)
     solution = solve(pieces, problem.n_nodes, problem.tolerance, held=problem.held)
-    del pieces
     # The sums hold J^T e where a solve expects J^T r: the step is -x.
     up, down = (
-        _residuals_at(problem, state, -s * solution.chain, -s * solution.border) for s in (PROBE_STEP, -PROBE_STEP)
+        _residuals_at(problem, state.retract(problem.layout, -s * solution.chain, -s * solution.border), pieces)
+        for s in (PROBE_STEP, -PROBE_STEP)
     )
     slope_imu = (up.imu - down.imu) / (2.0 * PROBE_STEP)
     kinds = problem.chain.kinds.items()
@@ -119,9 +123,9 @@ def _spent_by_features(
     return spent
 
 
-def _residuals_at(problem: Problem, state: State, chain: np.ndarray, border: np.ndarray):
+def _residuals_at(problem: Problem, state: State, pieces: tuple[Piece, ...]):
     out = problem.residuals()
-    problem.linearise(state.retract(problem.layout, chain, border), problem.pieces(), out, sums=False)
+    problem.linearise(state, pieces, out, sums=False)
     return out
 
 

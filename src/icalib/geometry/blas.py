@@ -5,6 +5,8 @@ A row-major matrix is the transpose of what BLAS takes it for, so upper triangle
 
 from __future__ import annotations
 
+from typing import Any
+
 import llvmlite.binding as llvm
 import numpy as np
 from numba import njit, types
@@ -13,7 +15,7 @@ from numba.extending import get_cython_function_address
 _TEXT, _INT, _REAL = types.CPointer(types.uint8), types.CPointer(types.int32), types.CPointer(types.float64)
 
 
-def _external(module: str, name: str, *arguments: types.Type) -> types.ExternalFunction:
+def _external(module: str, name: str, *arguments: types.Type) -> Any:
     """scipy's own `name`, known to the compiler by a name that a cached kernel finds again."""
     llvm.add_symbol(f"icalib_{name}", get_cython_function_address(f"scipy.linalg.cython_{module}", name))
     return types.ExternalFunction(f"icalib_{name}", types.void(*arguments))
