@@ -332,8 +332,11 @@ def schur_of_features(piece: Piece, n_nodes: int) -> Iterator[tuple[np.ndarray, 
         K = np.zeros((3, o + sums.side.shape[2]))
         K[:, o:] = sums.side[f]
         for e in np.flatnonzero(sums.track == f):
-            a = NODE * (piece.first + sums.node[e])
-            K[:, a : a + NODE] += sums.block[e]
+            i = sums.image[e]
+            a = NODE * (piece.first + sums.node[i])
+            K[:, a : a + NODE] += sums.block[e] @ sums.pose[i]
+            if len(sums.next_pose):
+                K[:, a + NODE : a + 2 * NODE] += sums.block[e] @ sums.next_pose[i]
         M = K[:, :-1].T @ np.linalg.solve(sums.own[f], K)
         yield M[:, :-1], M[:, -1]
 

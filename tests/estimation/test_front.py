@@ -6,66 +6,78 @@ import numpy as np
 import pytest
 
 from icalib.estimation.arrowhead import NotDefiniteError, Piece, make_pieces, marginalise, solve
-from icalib.estimation.front import Features, FeatureSums, plan
+from icalib.estimation.front import Features
+from icalib.estimation.front_plan import SIZES, FeatureSums, plan
 from icalib.estimation.state import NODE
 
 
-def random_sums(piece, n_tracks, rng, whole):
-    """Adds random IMU-like factors and features, each seen from nodes of the piece; returns rows of the whole system.
+def random_images(n, per_node, by_next, rng):
+    """Node (I,) of each image, and poses by node and by the next one."""
+    node = np.repeat(np.arange(n - by_next), per_node)
+    pose = rng.normal(size=(len(node), 6, NODE))
+    return node, pose, rng.normal(size=pose.shape) if by_next else pose[:0]
 
-    whole: rows (m, columns + 1) are appended of [chain, features of all pieces, border, residual].
+
+def random_sums(piece, n_tracks, images, rng, whole):
+    """Random IMU-like factors and features, each seen in images of the piece; returns pairs of feature and image.
+
+    whole: rows (node columns, their Jacobian, feature, image, Jacobians by feature and camera pose, by the border,
+    residual) are appended.
     """
     n, B = piece.last - piece.first + 1, piece.border.shape[0] - 1
     for k in range(n - 1):
         A, C, r = rng.normal(size=(40, 2 * NODE)), rng.normal(size=(40, B)), rng.normal(size=40)
-        whole.append((np.arange(NODE * k, NODE * k + 2 * NODE) + NODE * piece.first, A, None, None, C, r))
-    pairs = []
+        whole.append((NODE * (piece.first + k), A, None, None, None, None, C, r))
+    pairs, (node, pose, next_pose) = [], images
     for f in range(n_tracks):
-        seen = rng.choice(n, size=min(n, rng.integers(1, 6)), replace=False)
-        for k in np.sort(seen):
-            pairs.append((f, int(k)))
-            A, F = rng.normal(size=(3, NODE)), rng.normal(size=(3, 3))
+        begin, length = rng.integers(len(node)), rng.integers(1, 1 + len(node))
+        life = np.arange(begin, min(begin + length, len(node)))
+        seen = rng.choice(life, size=min(len(life), rng.integers(1, 6)), replace=False)
+        for i in np.sort(seen):
+            pairs.append((f, int(i)))
+            G, F = rng.normal(size=(3, 6)), rng.normal(size=(3, 3))
             C, r = rng.normal(size=(3, B)), rng.normal(size=3)
-            whole.append((np.arange(NODE) + NODE * (piece.first + k), A, f, F, C, r))
+            A = np.concatenate([G @ pose[i], *([G @ next_pose[i]] if len(next_pose) else [])], axis=1)
+            whole.append((NODE * (piece.first + node[i]), A, f, i, F, G, C, r))
     return np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
 
-def add(piece, sums, pairs, rows):
+def add(piece, sums, rows):
     """The same factors in the sums of the piece."""
-    index = {(f, k): e for e, (f, k) in enumerate(map(tuple, pairs))}
-    for columns, A, f, F, C, r in rows:
-        k = columns[0] // NODE - piece.first
+    index = {pair: e for e, pair in enumerate(zip(sums.track.tolist(), sums.image.tolist(), strict=True))}
+    for column, A, f, i, F, G, C, r in rows:
+        k = column // NODE - piece.first
         Cr = np.concatenate([C, r[:, None]], axis=1)
         piece.diagonal[k] += A[:, :NODE].T @ A[:, :NODE]
         piece.side[k] += A[:, :NODE].T @ Cr
         piece.border += Cr.T @ Cr
-        if f is None:
+        if A.shape[1] > NODE:
             piece.upper[k] += A[:, :NODE].T @ A[:, NODE:]
             piece.diagonal[k + 1] += A[:, NODE:].T @ A[:, NODE:]
             piece.side[k + 1] += A[:, NODE:].T @ Cr
-        else:
+        if f is not None:
             sums.own[f] += F.T @ F
             sums.side[f] += F.T @ Cr
-            sums.block[index[f, k]] += F.T @ A
+            sums.block[index[f, i]] += F.T @ G
     piece.border[-1, -1] = 0.0
 
 
-def build(n_nodes, n_tracks, n_border, seed=0, pieces=None):
+def build(n_nodes, n_tracks, n_border, seed=0, pieces=None, per_node=1, by_next=False, sizes=(2,)):
     """Pieces with features, and the dense normal equations of chain and border with the features taken out."""
     rng, J = np.random.default_rng(seed), []
     pieces = make_pieces(n_nodes, n_border) if pieces is None else pieces
     o, width = NODE * n_nodes, NODE * n_nodes + n_border + 1 + 3 * n_tracks * len(pieces)
     for i, piece in enumerate(pieces):
-        rows = []
-        pairs = random_sums(piece, n_tracks, rng, rows)
-        sums = FeatureSums.zeros(n_tracks, pairs[:, 0].copy(), pairs[:, 1].copy(), n_border)
-        add(piece, sums, pairs, rows)
-        keep = len(pieces) > 1
-        n = piece.last - piece.first + 1
-        piece.features = Features(sums, plan(sums, n, piece.first == 0 or not keep, keep, 2))
-        for columns, A, f, F, C, r in rows:
+        rows, n, keep = [], piece.last - piece.first + 1, len(pieces) > 1
+        images = random_images(n, per_node, by_next, rng)
+        pairs = random_sums(piece, n_tracks, images, rng, rows)
+        sums = FeatureSums.zeros(n_tracks, pairs[:, 0].copy(), pairs[:, 1].copy(), images[0], n_border, by_next)
+        sums.pose[:], sums.next_pose[:] = images[1:]
+        add(piece, sums, rows)
+        piece.features = Features.of(sums, plan(sums, n, piece.first == 0 or not keep, keep, sizes=sizes))
+        for column, A, f, _, F, _, C, r in rows:
             row = np.zeros((len(r), width))
-            row[:, columns], row[:, o : o + n_border], row[:, o + n_border] = A, C, r
+            row[:, column : column + A.shape[1]], row[:, o : o + n_border], row[:, o + n_border] = A, C, r
             if f is not None:
                 at = o + n_border + 1 + 3 * (i * n_tracks + f)
                 row[:, at : at + 3] = F
@@ -76,16 +88,25 @@ def build(n_nodes, n_tracks, n_border, seed=0, pieces=None):
     return pieces, H[:-1, :-1], H[:-1, -1]
 
 
-@pytest.mark.parametrize("n_tracks", [0, 1, 7])
-@pytest.mark.parametrize("n_nodes", [3, 4, 5, 8, 11])
-def test_solution_is_the_dense_one(n_nodes, n_tracks):
-    pieces, H, g = build(n_nodes, n_tracks, 3)
+def check(pieces, H, g, n_nodes):
     step, o = np.linalg.solve(H, -g), NODE * n_nodes
     information = H[o:, o:] - H[o:, :o] @ np.linalg.solve(H[:o, :o], H[:o, o:])
-    solution = solve(pieces, n_nodes, np.ones(3))
+    solution = solve(pieces, n_nodes, np.ones(len(H) - o))
     found = np.concatenate([solution.chain.ravel(), solution.border])
     np.testing.assert_allclose(found, step, rtol=0, atol=1e-9 * np.abs(step).max())
     np.testing.assert_allclose(solution.information, information, rtol=0, atol=1e-8 * np.abs(information).max())
+
+
+@pytest.mark.parametrize("n_tracks", [0, 1, 7, 40])
+@pytest.mark.parametrize("n_nodes", [3, 4, 5, 8, 11])
+def test_solution_is_the_dense_one(n_nodes, n_tracks):
+    check(*build(n_nodes, n_tracks, 3), n_nodes)
+
+
+@pytest.mark.parametrize("sizes", [(1,), (3,), SIZES])
+@pytest.mark.parametrize(("per_node", "by_next"), [(1, False), (2, False), (3, False), (1, True), (2, True)])
+def test_solution_is_the_dense_one_however_images_hang_on_nodes(per_node, by_next, sizes):
+    check(*build(13, 30, 2, per_node=per_node, by_next=by_next, sizes=sizes), 13)
 
 
 def test_marginalise_takes_features_out():
@@ -98,18 +119,48 @@ def test_marginalise_takes_features_out():
     np.testing.assert_allclose(border, border.T, rtol=0, atol=0)
 
 
-def test_features_are_alive_from_the_first_node_that_sees_them_to_the_last():
-    track, node = np.array([0, 0, 1, 1, 2]), np.array([1, 6, 2, 3, 7])
-    steps = plan(FeatureSums.zeros(3, track, node, 2), 8, True, False, 2)
-    assert [s.surviving.tolist() for s in steps] == [[0], [0], [0], []]
-    assert [s.dying.tolist() for s in steps] == [[], [1], [], [0, 2]]
-    backwards = plan(FeatureSums.zeros(3, track, node, 2), 8, False, False, 2)
-    assert [s.surviving.tolist() for s in backwards] == [[0], [0], [0], []]
+def by_step(lists, n):
+    return [lists.values[lists.start[g] : lists.start[g + 1]].tolist() for g in range(n)]
+
+
+def test_features_are_in_the_front_from_the_first_group_that_sees_them_to_the_last():
+    track, node = np.array([0, 0, 1, 1, 2, 3, 3]), np.array([1, 6, 2, 4, 7, 0, 2])
+    for forwards in (True, False):
+        order = plan(FeatureSums.zeros(4, track, node, np.arange(8), 2), 8, forwards, False, sizes=(2,))
+        assert by_step(order.nodes, 4) == (
+            [[0, 1], [2, 3], [4, 5], [6, 7]] if forwards else [[7, 6], [5, 4], [3, 2], [1, 0]]
+        )
+        assert by_step(order.local, 4) == ([[], [], [], [2]] if forwards else [[2], [], [], []])
+        assert by_step(order.born, 4) == ([[0, 3], [1], [], []] if forwards else [[0], [1], [3], []])
+        assert order.alive.tolist() == ([2, 3, 2, 1] if forwards else [1, 2, 3, 2])
+    # Forwards, feature 3 leaves slot 1 in the second step, and 1 moves there from slot 2 in the third.
+    order = plan(FeatureSums.zeros(4, track, node, np.arange(8), 2), 8, True, False, sizes=(2,))
+    assert by_step(order.dying, 4) == [[], [1], [1], [0]]
+    assert by_step(order.leave, 4) == [[], [], [2], []]
+    assert order.enter.tolist() == [1]
+
+
+def test_the_size_of_groups_is_chosen_by_cost():
+    """A group that holds all of its features' lives spares them the front; long lives make small groups best."""
+    n, per_node = 192, 200
+    image = np.repeat(np.arange(n), per_node)
+    ends = np.arange(0, n, 24)
+    sums = FeatureSums.zeros(
+        len(image) // 24, image // 24 * per_node + np.arange(len(image)) % per_node, image, np.arange(n), 40
+    )
+    short = plan(sums, n, True, False, ends)
+    assert np.diff(short.nodes.start).tolist() == [24] * 8
+    assert short.alive.max() == 0 and len(short.local.values) == len(sums.own)
+    lasting = FeatureSums.zeros(200, np.tile(np.arange(200), 2), np.repeat([0, n - 1], 200), np.arange(n), 40)
+    assert np.diff(plan(lasting, n, True, False).nodes.start).max() < 24
 
 
 def test_a_feature_that_nothing_determines_is_an_error():
-    pieces, _, _ = build(8, 4, 2)
-    sums = pieces[1].features.sums
-    sums.own[2], sums.side[2], sums.block[sums.track == 2] = 0.0, 0.0, 0.0
-    with pytest.raises(NotDefiniteError):
-        solve(pieces, 8, np.ones(2))
+    for f in range(4):
+        pieces, _, _ = build(8, 4, 2)
+        features = pieces[1].features
+        assert features is not None
+        sums = features.sums
+        sums.own[f], sums.side[f], sums.block[sums.track == f] = 0.0, 0.0, 0.0
+        with pytest.raises(NotDefiniteError):
+            solve(pieces, 8, np.ones(2))

@@ -22,7 +22,8 @@ from numba import njit
 
 from icalib.errors import EstimationError
 from icalib.estimation import pages
-from icalib.estimation.front import Eliminated, Features, eliminate, plan
+from icalib.estimation.front import Eliminated, Features, eliminate
+from icalib.estimation.front_plan import plan
 from icalib.estimation.state import NODE
 from icalib.geometry.small import cholesky
 
@@ -97,7 +98,7 @@ class Piece:
         """The same sums without node `last`, of which they must say nothing."""
         features = self.features
         if features is not None:
-            features = Features(features.sums, plan(features.sums, len(self.diagonal) - 1, True, False))
+            features = Features.of(features.sums, plan(features.sums, len(self.diagonal) - 1, True, False))
         own = self.diagonal[:-1], self.upper[:-1], self.side[:-1]
         return Piece(self.first, self.last - 1, *own, self.border, features)
 
@@ -238,8 +239,7 @@ def _reduce(piece: Piece, keep: bool) -> Eliminated | bool:
         if done:
             piece.border -= _eliminated_part(piece, keep)
         return done
-    steps, sums = piece.features.steps, piece.features.sums
-    done = eliminate(steps, piece.diagonal, piece.upper, piece.side, sums, forwards)
+    done = eliminate(piece.features, piece.diagonal, piece.upper, piece.side, forwards, keep)
     if done is None:
         return False
     left = np.triu(done.left) + np.triu(done.left, 1).T

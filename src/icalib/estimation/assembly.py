@@ -36,6 +36,7 @@ from icalib.rig import Camera, Lidar, Parameter, Rig, Scheme, Wheels
 
 BLOOM_SIGMA_PX = 1.0
 NO_BLOOM = np.zeros((0, 2), dtype=np.float32)  # single precision: directions as such are near enough
+CUT_S = 0.5
 CAMERA_PARAMETERS: tuple[tuple[str, Kind], ...] = (
     ("rotation", "rotation"),
     ("translation", "vector"),
@@ -216,10 +217,11 @@ def _hosts(rig: Rig) -> str:
 
 @dataclass(frozen=True)
 class Following:
-    """Of tracks, by camera: sigma px, and keep (N,), observations in use."""
+    """Of tracks, by camera: sigma px, and keep (N,), observations in use. cut: whether tracks are cut short."""
 
     sigma: tuple[float, ...]
     keep: tuple[np.ndarray, ...]
+    cut: bool = False
 
 
 def assemble(
@@ -279,6 +281,8 @@ def _features(inputs: Inputs, state: State, cameras: tuple[CornerFactor, ...], f
         keep.append(k & np.repeat(seen, np.diff(stream.start)))
     loss = settings.loss, settings.loss_scale
     cuts, seams = chain_cuts(len(state.seconds)), state.starts[1:]
+    if following.cut:
+        cuts = (*cuts, *np.flatnonzero(np.diff(np.floor(state.seconds / CUT_S))) + 1)
     return FeatureFactor.build(cameras, streams, following.sigma, tuple(keep), loss, state, cuts, seams)
 
 

@@ -55,9 +55,11 @@ def fits(problem: Problem, outcome: Outcome, seed: int = 0) -> list[Fit]:
     """
     rng = np.random.default_rng(seed)
     spent: dict[tuple[str, str], list[float]] = {}
+    room = problem.room()
     for _ in range(PROBES):
-        for key, value in _probe(problem, outcome, rng).items():
+        for key, value in _probe(problem, outcome, rng, room).items():
             spent.setdefault(key, []).append(value)
+    del room
     out = []
     imu = outcome.residuals.imu
     for kind, rows in problem.chain.kinds.items():
@@ -91,10 +93,12 @@ def _corner_chi2(camera: CornerFactor, out: CornerOutput) -> dict[str, tuple[int
     return found
 
 
-def _probe(problem: Problem, outcome: Outcome, rng: np.random.Generator) -> dict[tuple[str, str], float]:
+def _probe(
+    problem: Problem, outcome: Outcome, rng: np.random.Generator, room: tuple[Piece, ...] | None
+) -> dict[tuple[str, str], float]:
     """e_s^T J_s x of each sensor for one random e."""
     state, base = outcome.state, outcome.residuals
-    noise, pieces = problem.white_noise(rng), problem.pieces()
+    noise, pieces = problem.white_noise(rng), room or problem.pieces()
     in_parallel(lambda piece: problem.add_noise(state, piece, noise), pieces)
     solution = solve(pieces, problem.n_nodes, problem.tolerance, held=problem.held)
     del pieces

@@ -28,7 +28,8 @@ from icalib.estimation.feature_kernels import (
     camera_points,
     take_trials,
 )
-from icalib.estimation.front import Features, FeatureSums, plan
+from icalib.estimation.front import Features
+from icalib.estimation.front_plan import FeatureSums, plan
 from icalib.estimation.state import Layout, State
 from icalib.estimation.tracks import NO_TRACKS, Sightings, Tracks
 from icalib.measurements import TrackStream
@@ -104,12 +105,11 @@ class FeatureFactor:
         edges = np.unique([0, *cuts, *self.seams, self.n_nodes])
         sightings = self._sightings()
         label = sightings.in_order(sightings.labels(state.seconds, edges, LONGEST_GAP_S))
-        by_next = any(c.scheme == "pose" and c.imu is not None for c in self.cameras)
-        factor = replace(self, tracks=sightings.tracks(label, edges, by_next))
+        factor = replace(self, tracks=sightings.tracks(label, edges))
         points, good = factor._triangulated(state)
         label = np.where(label >= 0, np.where(np.append(good, False)[label], label, -1), -1)
         number = np.append(np.where(good, np.cumsum(good) - 1, -1), -1)
-        factor = replace(factor, tracks=sightings.tracks(number[label], edges, by_next))
+        factor = replace(factor, tracks=sightings.tracks(number[label], edges))
         return replace(factor, tracks=replace(factor.tracks, start=factor._in_anchors(state, points[good])))
 
     def _triangulated(self, state: State) -> tuple[np.ndarray, np.ndarray]:
@@ -143,10 +143,18 @@ class FeatureFactor:
     def attach(self, piece: Piece, keep: bool) -> Piece:
         """The piece with room for the features that its nodes saw; `keep`: its end is shared with another piece."""
         tracks, pairs = self._within(piece)
-        track, node = self.tracks.pair_track[pairs] - tracks.start, self.tracks.pair_node[pairs] - piece.first
-        sums = FeatureSums.zeros(tracks.stop - tracks.start, track, node, piece.border.shape[0] - 1)
-        steps = plan(sums, len(piece.diagonal), piece.first == 0 or not keep, keep)
-        return replace(piece, features=Features(sums, steps))
+        images = self._images(piece.first, self._stop(piece))
+        begins = np.cumsum([0] + [len(i) for i in images])[:-1] - np.array([i.start for i in images])
+        image = self.tracks.pair_image[pairs] + begins[self.tracks.pair_camera[pairs]]
+        node = np.concatenate([c.node[i.start : i.stop] for c, i in zip(self.cameras, images, strict=True)])
+        by_next = any(c.scheme == "pose" and c.imu is not None for c in self.cameras)
+        sums = FeatureSums.zeros(
+            tracks.stop - tracks.start, self.tracks.pair_track[pairs] - tracks.start, image, node - piece.first,
+            piece.border.shape[0] - 1, by_next,
+        )  # fmt: skip
+        ends = self.tracks.edges - piece.first
+        steps = plan(sums, len(piece.diagonal), piece.first == 0 or not keep, keep, ends)
+        return replace(piece, features=Features.of(sums, steps))
 
     def accumulate(
         self,
@@ -167,18 +175,21 @@ class FeatureFactor:
         points = self._descend(views, self._from_anchors(views, tracks), tracks)
         out.points[tracks] = points.xyz
         into = piece.sums(sums)
-        features = FeatureSums.zeros(0, np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), 0)
+        features = NO_SUMS
         if sums and piece.features is not None:
             features = piece.features.sums
             features.own[:, range(3), range(3)] += WEAK
-        total = 0.0
+        total, begin = 0.0, 0
         for view in views:
             i, X = view.index, _in_camera(view, points.xyz, tracks.start)
             given = out.residual[i] if noise is None else noise[i]
             seeing = self._seeing(view, X)
             weighing = self._weighing(i, curved)
+            own = slice(begin, begin + len(view.seen.node))
+            begin = own.stop
+            mine = features._replace(pose=features.pose[own], next_pose=features.next_pose[own])
             total += accumulate(
-                X, view.seen, base, view.motion, seeing, weighing, noise is not None, given, into, features,
+                X, view.seen, base, view.motion, seeing, weighing, noise is not None, given, into, mine,
                 out.residual[i], out.root[i],
             )  # fmt: skip
         return total
@@ -189,6 +200,10 @@ class FeatureFactor:
     def _stop(self, piece: Piece) -> int:
         """The node before which the images of `piece` hang: the last, or behind the chain's very last."""
         return piece.last + 1 if piece.last == self.n_nodes - 1 else piece.last
+
+    def _images(self, first: int, stop: int) -> list[range]:
+        """By camera, the images that hang on nodes first..stop."""
+        return [range(*(int(i) for i in np.searchsorted(c.node, [first, stop]))) for c in self.cameras]
 
     def _sightings(self) -> Sightings:
         pairs = list(zip(self.streams, self.cameras, strict=True))
@@ -205,15 +220,15 @@ class FeatureFactor:
 
     def _views(self, state: State, first: int, stop: int) -> list[View]:
         """What hangs on nodes first..stop."""
-        return [self._view(state, i, first, stop) for i in range(len(self.cameras))]
+        return [self._view(state, i, images, first) for i, images in enumerate(self._images(first, stop))]
 
-    def _view(self, state: State, index: int, first: int, stop: int) -> View:
+    def _view(self, state: State, index: int, images: range, first: int) -> View:
         camera, stream, tracks = self.cameras[index], self.streams[index], self.tracks
-        i0, i1 = (int(i) for i in np.searchsorted(camera.node, [first, stop]))
+        i0, i1 = images.start, images.stop
         poses, R_cw, p_wc = camera.camera_poses(state, i0, i1)
         seen = Seen(
             stream.start[i0 : i1 + 1], stream.uv, self.keep[index], tracks.track[index], tracks.pair[index],
-            tracks.next_pair[index], camera.node[i0:i1] - first,
+            camera.node[i0:i1] - first,
         )  # fmt: skip
         motion = Motion(
             np.ascontiguousarray(state.values[camera.name, "rotation"]), state.values[camera.name, "translation"],
@@ -281,3 +296,7 @@ def _in_camera(view: View, points: np.ndarray, first: int) -> np.ndarray:
     X = np.empty((int(seen.start[-1] - seen.start[0]), 3))
     camera_points(seen, first, motion.R_cam_world, motion.p_world_cam, points, X)
     return X
+
+
+NO_NUMBERS = np.zeros(0, dtype=np.int64)
+NO_SUMS = FeatureSums.zeros(0, NO_NUMBERS, NO_NUMBERS, NO_NUMBERS, 0)

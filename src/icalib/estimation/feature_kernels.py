@@ -21,14 +21,13 @@ FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-6, 1e8
 
 class Seen(NamedTuple):
     """What one camera saw: observations of image i are start[i]:start[i + 1]; uv (N, 2), keep (N,), track (N,) -1 where
-    left out; pair and next_pair (N,) of feature and node (-1: none); node (n,), counted from the piece's first."""
+    left out; pair (N,) of feature and image (-1: none); node (n,), counted from the piece's first."""
 
     start: np.ndarray
     uv: np.ndarray
     keep: np.ndarray
     track: np.ndarray
     pair: np.ndarray
-    next_pair: np.ndarray
     node: np.ndarray
 
 
@@ -215,27 +214,42 @@ def _rows(i, n, X, seen, seeing, weighing, R_cw, error, A):
 
 
 @njit(cache=True, nogil=True)
-def _add_feature(A, pair, next_pair, t, Tn, Tm, Tc, chained, direct, features):
-    """One observation's rows A into the sums of its feature."""
-    D, n_b = len(A) - 1, features.side.shape[2] - 1
-    n_d = len(direct)
+def _add_gram(A, n_d, rows, G):
+    """Upper triangle of G (7 + d, 7 + d) += what one observation's rows A say of camera pose, parameters and residual;
+    rows (2, 7 + d) is room for a copy that runs along memory."""
+    n, D = 7 + n_d, len(A) - 1
+    for r in range(2):
+        for a in range(n - 1):
+            rows[r, a] = A[a, r]
+        rows[r, n - 1] = A[D, r]
+    for a in range(n):
+        x, y = rows[0, a], rows[1, a]
+        for b in range(a, n):
+            G[a, b] += x * rows[0, b] + y * rows[1, b]
+
+
+@njit(cache=True, nogil=True)
+def _add_feature(A, pair, t, own_side, chained, direct, features):
+    """One observation's rows A into the sums of its feature; own_side (6, c): camera pose by the border, its columns
+    `chained` (c,)."""
+    D, n_b, n_d, side = len(A) - 1, features.side.shape[2] - 1, len(direct), features.side[t]
+    block = features.block[pair]
     for a in range(3):
         f0, f1 = A[D - 3 + a, 0], A[D - 3 + a, 1]
         for k in range(3):
             features.own[t, a, k] += f0 * A[D - 3 + k, 0] + f1 * A[D - 3 + k, 1]
-        features.side[t, a, n_b] += f0 * A[D, 0] + f1 * A[D, 1]
+        side[a, n_b] += f0 * A[D, 0] + f1 * A[D, 1]
         for q in range(n_d):
             if direct[q] >= 0:
-                features.side[t, a, direct[q]] += f0 * A[6 + q, 0] + f1 * A[6 + q, 1]
+                side[a, direct[q]] += f0 * A[6 + q, 0] + f1 * A[6 + q, 1]
         for d in range(6):
-            by_pose = f0 * A[d, 0] + f1 * A[d, 1]
-            for j in range(15):
-                features.block[pair, a, j] += by_pose * Tn[d, j]
-            for j in range(Tm.shape[1]):
-                features.block[next_pair, a, j] += by_pose * Tm[d, j]
-            for j in range(len(chained)):
-                if chained[j] >= 0:
-                    features.side[t, a, chained[j]] += by_pose * Tc[d, j]
+            block[a, d] += f0 * A[d, 0] + f1 * A[d, 1]
+        for j in range(len(chained)):
+            if chained[j] >= 0:
+                s = 0.0
+                for d in range(6):
+                    s += (f0 * A[d, 0] + f1 * A[d, 1]) * own_side[d, j]
+                side[a, chained[j]] += s
 
 
 @njit(cache=True, nogil=True)
@@ -244,12 +258,16 @@ def accumulate(X, seen, base, motion, seeing, weighing, used, given, sums, featu
     `used`, white noise `given` (N, 2) stands for the whitened residuals. Returns half the robust chi^2."""
     n_d = len(seeing.pars)
     A, G, error = np.zeros((10 + n_d, 2)), np.empty((7 + n_d, 7 + n_d)), np.empty(2)
+    rows = np.empty((2, 7 + n_d))
     Tn, Tm = np.empty((6, 15)), np.empty((6, 15 if len(motion.by_next) else 0))
     Tc, total, D = np.empty((6, motion.columns.shape[1])), 0.0, 9 + n_d
     wanted = len(sums.diagonal) > 0
     for i in range(len(seen.start) - 1):
         if wanted:
             pose_chain(i, motion, Tn, Tm, Tc)
+            features.pose[i] = Tn
+            if len(features.next_pose):
+                features.next_pose[i] = Tm
             G[:] = 0.0
         for n in range(seen.start[i], seen.start[i + 1]):
             t = seen.track[n] - base.track
@@ -263,15 +281,11 @@ def accumulate(X, seen, base, motion, seeing, weighing, used, given, sums, featu
                 continue
             if used:
                 A[D, 0], A[D, 1] = given[n, 0], given[n, 1]
-            for a in range(7 + n_d):
-                p = a if a < 6 + n_d else D
-                for b in range(7 + n_d):
-                    q = b if b < 6 + n_d else D
-                    G[a, b] += A[p, 0] * A[q, 0] + A[p, 1] * A[q, 1]
-            _add_feature(
-                A, seen.pair[n] - base.pair, seen.next_pair[n] - base.pair, t, Tn, Tm, Tc, motion.columns[i],
-                seeing.columns, features,
-            )  # fmt: skip
+            _add_gram(A, n_d, rows, G)
+            _add_feature(A, seen.pair[n] - base.pair, t, Tc, motion.columns[i], seeing.columns, features)
         if wanted:
+            for a in range(7 + n_d):
+                for b in range(a):
+                    G[a, b] = G[b, a]
             add_image(seen.node[i], G, Tn, Tm, Tc, motion.columns[i], seeing.columns, sums)
     return total

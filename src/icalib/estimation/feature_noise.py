@@ -17,12 +17,12 @@ MEDIAN_OF_SQUARE = 2.0 * np.log(2.0)  # median of chi^2 with two degrees of free
 
 
 def first_following(inputs: Inputs) -> Following | None:
-    """Before anything is known: what the rig file says, or a pixel; everything in use. None where there are no
-    tracks."""
+    """Before anything is known: what the rig file says, or a pixel; everything in use, tracks cut short, which costs
+    little and leads near. None where there are no tracks."""
     if not inputs.measurements.tracks:
         return None
     sigma = tuple(c.track_noise_px or FIRST_GUESS_PX for c in inputs.rig.cameras)
-    return Following(sigma, tuple(np.ones(len(t.uv), dtype=bool) for t in inputs.measurements.tracks))
+    return Following(sigma, tuple(np.ones(len(t.uv), dtype=bool) for t in inputs.measurements.tracks), True)
 
 
 def next_following(rig: Rig, problem: Problem, outcome: Outcome, now: Following, first: bool) -> Following:

@@ -99,6 +99,10 @@ class Problem:
         pieces = make_pieces(self.n_nodes, self.layout.size if sums else None)
         return tuple(self.with_features(p, len(pieces) > 1) for p in pieces) if sums else pieces
 
+    def room(self) -> tuple[Piece, ...] | None:
+        """Pieces that are worth keeping from solve to solve: fronts of features are large; None without these."""
+        return None if self.features is None else self.pieces()
+
     def with_features(self, piece: Piece, keep: bool = False) -> Piece:
         """The piece with room for the features seen from its nodes; `keep`: another piece shares a node with it."""
         return piece if self.features is None else self.features.attach(piece, keep)
@@ -188,7 +192,10 @@ class Problem:
         return WhiteNoise(imu, corners, features, sensors)
 
     def add_noise(self, state: State, piece: Piece, noise: WhiteNoise) -> None:
-        """Adds to `piece` what `noise` gives in place of the residuals: J^T J and J^T e, priors as if they were met."""
+        """Fills `piece` with what `noise` gives in place of the residuals: J^T J and J^T e, priors as if they were met.
+
+        What the piece held before is gone."""
+        piece.clear()
         self.chain.accumulate(state, piece, noise.imu, noise=noise.imu)
         for camera, own in zip(self.cameras, noise.corners, strict=True):
             camera.accumulate(state, piece, None, noise=own)

@@ -103,7 +103,8 @@ def minimise(
         if damping > 1e6:
             break
         cost = problem.linearise(state, pieces, residuals)
-    outcome = _finish(problem, state, cost, pieces, residuals, steps)
+    fresh = curved and bool(steps) and steps[-1].accepted  # the sums are those of `state` already
+    outcome = _finish(problem, state, cost, pieces, residuals, steps, fresh)
     on_visit(Visit(outcome.state, outcome.information))
     return outcome
 
@@ -120,8 +121,9 @@ def _solve(problem, state, pieces, residuals, damping, curved):
             problem.linearise(state, pieces, residuals, curved=curved)
 
 
-def _finish(problem, state, cost, pieces, residuals, steps) -> Outcome:
-    problem.linearise(state, pieces, residuals, curved=True)
+def _finish(problem, state, cost, pieces, residuals, steps, fresh) -> Outcome:
+    if not fresh:
+        problem.linearise(state, pieces, residuals, curved=True)
     last = solve(pieces, problem.n_nodes, problem.tolerance, 0.0, problem.held)
     converged, n = last.decrease < STALLED_DECREASE, len(steps)
     # Half a chi^2 of d is a step of sqrt(2 d) standard deviations at most.

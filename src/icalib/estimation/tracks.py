@@ -17,18 +17,19 @@ FEWEST = 3  # observations of a track; two images of one point are met by almost
 @dataclass(frozen=True)
 class Tracks:
     """Tracks in the order of their first nodes. By camera, of each observation: track (N,), -1 where it has none; pair
-    and next_pair (N,), of its track with its node and, where its pose hangs on two, with the next.
+    (N,), of its track with its image.
 
-    pair_track and pair_node (E,): what each pair joins; edges (S + 1,): nodes between which tracks are cut; tracks_from
-    and pairs_from (S + 1,): the first of each stretch; start (T, 3): where each point is first looked for, in the frame
-    of the camera that saw it in the middle of its life; camera and image (T,): which that was.
+    pair_track, pair_camera and pair_image (E,): what each pair joins, in the order of nodes; edges (S + 1,): nodes
+    between which tracks are cut; tracks_from and pairs_from (S + 1,): the first of each stretch; start (T, 3): where
+    each point is first looked for, in the frame of the camera that saw it in the middle of its life; camera and image
+    (T,): which that was.
     """
 
     track: tuple[np.ndarray, ...]
     pair: tuple[np.ndarray, ...]
-    next_pair: tuple[np.ndarray, ...]
     pair_track: np.ndarray
-    pair_node: np.ndarray
+    pair_camera: np.ndarray
+    pair_image: np.ndarray
     edges: np.ndarray
     tracks_from: np.ndarray
     pairs_from: np.ndarray
@@ -82,31 +83,36 @@ class Sightings:
         number[order[left[order]]] = np.arange(int(left.sum()))
         return number[label]
 
-    def tracks(self, label: np.ndarray, edges: np.ndarray, by_next: bool) -> Tracks:
+    def tracks(self, label: np.ndarray, edges: np.ndarray) -> Tracks:
         """Of labels that are in order; where points are looked for is unknown as yet."""
         seen, n = np.flatnonzero(label >= 0), int(label.max(initial=-1)) + 1
-        n_nodes, ends = int(edges[-1]) + 1, np.cumsum(self.counts)[:-1]
-        key = label[seen] * n_nodes + self.node[seen]
-        pairs, at = np.unique(np.concatenate([key, key + 1]) if by_next else key, return_inverse=True)
-        pair, next_pair = (np.full(len(label), -1) for _ in range(2))
-        pair[seen] = at[: len(seen)]
-        if by_next:
-            next_pair[seen] = at[len(seen) :]
-        pair_track, pair_node = np.divmod(pairs, n_nodes)
-        middle = seen[np.lexsort((self.node[seen], label[seen]))]
-        middle = middle[np.searchsorted(label[middle], np.arange(n)) + np.bincount(label[seen], minlength=n) // 2]
-        first = pair_node[np.searchsorted(pair_track, np.arange(n))]
-        tracks_from = np.searchsorted(first, edges)
-        camera = np.repeat(np.arange(len(self.counts)), self.counts)[middle]
-        own_track, own_pair, own_next = (tuple(np.split(a, ends)) for a in (label, pair, next_pair))
+        pairs = seen[np.argsort(self.node[seen], kind="stable")]
+        pair = np.full(len(label), -1)
+        pair[pairs] = np.arange(len(pairs))
+        lives = pairs[np.argsort(label[pairs], kind="stable")]
+        begins = np.searchsorted(label[lives], np.arange(n))
+        middle = lives[begins + np.bincount(label[lives], minlength=n) // 2]
+        tracks_from = np.searchsorted(self.node[lives[begins]], edges)
+        camera = np.repeat(np.arange(len(self.counts)), self.counts)
+        own_track, own_pair = (tuple(np.split(a, np.cumsum(self.counts)[:-1])) for a in (label, pair))
         return Tracks(
-            own_track, own_pair, own_next, pair_track, pair_node, edges, tracks_from,
-            np.searchsorted(pair_track, tracks_from), camera, self.image[middle], np.zeros((n, 3)),
+            own_track, own_pair, label[pairs], camera[pairs], self.image[pairs], edges, tracks_from,
+            np.searchsorted(self.node[pairs], edges), camera[middle], self.image[middle], np.zeros((n, 3)),
         )  # fmt: skip
 
 
 _NO_NUMBERS = np.zeros(0, dtype=np.int64)
 _NO_EDGES = np.zeros(2, dtype=np.int64)
 NO_TRACKS = Tracks(
-    (), (), (), _NO_NUMBERS, _NO_NUMBERS, _NO_EDGES, _NO_EDGES, _NO_EDGES, _NO_NUMBERS, _NO_NUMBERS, np.zeros((0, 3))
+    (),
+    (),
+    _NO_NUMBERS,
+    _NO_NUMBERS,
+    _NO_NUMBERS,
+    _NO_EDGES,
+    _NO_EDGES,
+    _NO_EDGES,
+    _NO_NUMBERS,
+    _NO_NUMBERS,
+    np.zeros((0, 3)),
 )

@@ -22,6 +22,7 @@ from icalib.geometry.cameras import camera_model
 from icalib.measurements import Measurements
 from icalib.rig import Camera, Rig
 
+APART_S = 0.15
 LEAST_FELT = 0.7  # of gravity; half the time a rig is not thrown about
 
 
@@ -84,14 +85,19 @@ def _params(camera: Camera) -> np.ndarray:
 
 
 def _rays(rig: Rig, measurements: Measurements, imu: ImuData, params: list[np.ndarray], offsets: list[float]) -> Rays:
-    """What was seen while the IMU was running."""
+    """What was seen while the IMU was running, in images APART_S or more apart: those between say little more."""
     parts = []
     for k, (camera, stream) in enumerate(zip(rig.cameras, measurements.tracks, strict=True)):
         direction, valid = camera_model(camera.model).unproject(params[k], stream.uv)
         t = (stream.seconds + offsets[k])[stream.image]
-        own = valid & (t >= imu.seconds[0]) & (t <= imu.seconds[-1])
+        own = valid & (t >= imu.seconds[0]) & (t <= imu.seconds[-1]) & _apart(stream.seconds)[stream.image]
         parts.append((t[own], np.full(int(own.sum()), k), stream.feature[own], direction[own]))
     return Rays(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _apart(seconds: np.ndarray) -> np.ndarray:
+    """(n,) whether images at `seconds` are used: the first of each stretch of APART_S that has any."""
+    return np.diff(np.floor((seconds - seconds[0]) / APART_S + 1e-6), prepend=-1.0) > 0.0
 
 
 def _poses(motion: Motion, times: np.ndarray, R_imu_cam: np.ndarray, p_imu_cam: np.ndarray) -> TargetPoses:

@@ -14,7 +14,7 @@ import numpy as np
 
 from icalib.first_guess.clocks import Alignment
 from icalib.first_guess.gyro import GyroRotation
-from icalib.first_guess.track_rotation import FEWEST_COMMON, common, image_pairs, start_direction, turn_information
+from icalib.first_guess.track_rotation import FEWEST_COMMON, common, image_pairs, turns_information
 from icalib.geometry import so3
 from icalib.geometry.cameras.base import CameraModel
 from icalib.measurements import TrackStream
@@ -56,16 +56,8 @@ def align_together(
     held = np.array([x for r, t in fixed for x in (r, r, r, t)] + [False] * 3)
     for _ in range(ROUNDS):
         gyro = GyroRotation.integrate(imu, bias)
-        N, r = np.zeros((n + 3, n + 3)), np.zeros(n + 3)
-        for pair, D, w1, w2, turned in _gyro_turns(gyro, pairs, start):
-            R_ic, k = start[pair.camera].rotation, 4 * pair.camera
-            R = np.ascontiguousarray(R_ic.T @ D @ R_ic)
-            H, g = np.empty((3, 3)), np.empty(3)
-            turn_information(pair.f, pair.h, R, start_direction(pair.f, pair.h, R), H, g)
-            J = np.zeros((3, n + 3))
-            J[:, k : k + 3], J[:, k + 3], J[:, n:] = R - np.eye(3), R_ic.T @ (D @ w1 - w2), R_ic.T @ turned
-            N += J.T @ H @ J
-            r += J.T @ g
+        own, D, swept, turned = _gyro_turns(gyro, pairs, start)
+        N, r = _normal([pairs[i] for i in own], start, D, swept, turned)
         N[held], N[:, held], r[held] = 0.0, 0.0, 0.0
         N[held, held] = 1.0
         x = np.linalg.solve(N + 1e-12 * np.diag(N.diagonal()), r)
@@ -77,8 +69,33 @@ def align_together(
     return [replace(a, gyro_bias=bias) for a in start]
 
 
-def _gyro_turns(gyro: GyroRotation, pairs: list[Pair], start: list[Alignment]):
-    """Of each pair that the gyroscope covers R_i2_i1, the rates at both, and the integral of R_i2_i in between."""
+def _normal(
+    pairs: list[Pair], start: list[Alignment], D: np.ndarray, swept: np.ndarray, turned: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Normal matrix and right-hand side of all alignments and the bias; see `_gyro_turns`."""
+    n, m, camera = 4 * len(start), len(pairs), np.array([p.camera for p in pairs], dtype=np.int64)
+    R_ci = np.array([a.rotation.T for a in start])[camera]
+    R = np.ascontiguousarray(R_ci @ D @ R_ci.transpose(0, 2, 1))
+    H, g, J = np.empty((m, 3, 3)), np.empty((m, 3)), np.zeros((m, 3, n + 3))
+    begin = np.cumsum([0] + [len(p.f) for p in pairs])
+    empty = [np.zeros((0, 3))]
+    turns_information(
+        np.concatenate([p.f for p in pairs] or empty), np.concatenate([p.h for p in pairs] or empty), begin, R, H, g
+    )
+    for c in range(len(start)):
+        own = camera == c
+        J[own, :, 4 * c : 4 * c + 3] = R[own] - np.eye(3)
+        J[own, :, 4 * c + 3] = np.einsum("nij,nj->ni", R_ci[own], swept[own])
+    J[:, :, n:] = R_ci @ turned
+    flat = J.reshape(3 * m, n + 3)
+    return flat.T @ (H @ J).reshape(3 * m, n + 3), flat.T @ g.ravel()
+
+
+def _gyro_turns(
+    gyro: GyroRotation, pairs: list[Pair], start: list[Alignment]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Which pairs the gyroscope covers (m,); of each R_i2_i1 (m, 3, 3), R_i2_i1 w_1 - w_2 (m, 3), and the integral of
+    R_i2_i in between (m, 3, 3)."""
     imu = gyro.imu
     offset = np.array([start[p.camera].offset for p in pairs])
     t1, t2 = np.array([p.t1 for p in pairs]) + offset, np.array([p.t2 for p in pairs]) + offset
@@ -95,8 +112,8 @@ def _gyro_turns(gyro: GyroRotation, pairs: list[Pair], start: list[Alignment]):
     D = R2.transpose(0, 2, 1) @ R1
     inside = (t1 > imu.seconds[0]) & (t2 < imu.seconds[-1])
     bias = gyro_bias_of(gyro)
-    for i in np.flatnonzero(inside):
-        yield pairs[i], D[i], w1[i] - bias, w2[i] - bias, turned[i]
+    swept = np.einsum("nij,nj->ni", D, w1 - bias) - (w2 - bias)
+    return np.flatnonzero(inside), D[inside], swept[inside], turned[inside]
 
 
 def gyro_bias_of(gyro: GyroRotation) -> np.ndarray:

@@ -13,6 +13,7 @@ the gyroscope drifts; how long gravity is is known.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -52,10 +53,14 @@ class Motion:
     accel_bias: np.ndarray
     arms: np.ndarray
 
+    @cached_property
+    def _integrals(self) -> _Integrals:
+        return _Integrals.of(self.gyro)
+
     def within(self, window: int, t: np.ndarray) -> np.ndarray:
         """(n, 3) positions of the IMU from the window's beginning on."""
         s = (t - self.begins[window])[:, None]
-        D_f, D_R = _Integrals.of(self.gyro).since(self.begins[window], t)
+        D_f, D_R = self._integrals.since(self.begins[window], t)
         return self.velocity[window] * s + 0.5 * self.gravity[window] * s**2 + D_f - D_R @ self.accel_bias
 
     def poses(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -139,13 +144,13 @@ def track_motion(
 
 @dataclass
 class _Window:
-    """One window's observations: camera centre = A x + c with A (n, 3, m); direction (n, 3) of the ray; track (n,);
-    weight (n,), of the round."""
+    """One window's observations, those of a track together: camera centre = full (x, 1) with full (n, 3, m + 1);
+    direction (n, 3) of the ray; track (n,), and where each begins (t,); weight (n,), of the round."""
 
-    A: np.ndarray
-    c: np.ndarray
+    full: np.ndarray
     direction: np.ndarray
     track: np.ndarray
+    begins: np.ndarray
     weight: np.ndarray | None = None
 
     @classmethod
@@ -154,45 +159,45 @@ class _Window:
     ) -> _Window:
         own = np.flatnonzero((rays.times >= begin) & (rays.times < end))
         number, track, count = np.unique(rays.feature[own], return_inverse=True, return_counts=True)
-        own = own[count[track] >= 3]
-        _, track = np.unique(rays.feature[own], return_inverse=True)
+        own, feature = own[count[track] >= 3], rays.feature[own[count[track] >= 3]]
+        own = own[np.argsort(feature, kind="stable")]
+        _, begins, track = np.unique(rays.feature[own], return_index=True, return_inverse=True)
         del number
         t, camera = rays.times[own], rays.camera[own]
         s, R = (t - begin)[:, None, None], gyro.at(t)
         D_f, D_R = integrals.since(begin, t)
-        A = np.zeros((len(t), 3, OWN + SHARED + 3 * len(R_ic)))
+        A = np.zeros((len(t), 3, OWN + SHARED + 3 * len(R_ic) + 1))
         A[:, :, 0:3], A[:, :, 3:6] = s * np.eye(3), 0.5 * s**2 * np.eye(3)
-        A[:, :, 6:9], A[:, :, 9:12] = A[:, :, 3:6], -D_R
+        A[:, :, 6:9], A[:, :, 9:12], A[:, :, -1] = A[:, :, 3:6], -D_R, D_f
         for k in range(len(R_ic)):
             A[camera == k, :, 12 + 3 * k : 15 + 3 * k] = R[camera == k]
         direction = np.einsum("nij,njk,nk->ni", R, np.stack(R_ic)[camera], rays.direction[own])
-        return cls(A, D_f, direction, track)
+        return cls(A, direction, track, begins)
+
+    def _by_track(self, x: np.ndarray) -> np.ndarray:
+        """(t, ...) sums of x (n, ...) over the observations of each track."""
+        return np.add.reduceat(x, self.begins, axis=0) if len(x) else x
 
     def normal(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Normal matrix and right-hand side of the unknowns x, points eliminated; weights by those found with x."""
-        n = int(self.track.max(initial=-1)) + 1
         Q = np.eye(3) - self.direction[:, :, None] * self.direction[:, None, :]
         if self.weight is not None:
-            self.weight = self._reweighted(Q, self.weight, x, n)
+            self.weight = self._reweighted(Q, self.weight, x)
         else:
             self.weight = np.ones(len(self.track))
-        wQ = self.weight[:, None, None] * Q
-        full = np.concatenate([self.A, self.c[:, :, None]], axis=2)
-        QA = wQ @ full
-        M, side = np.zeros((n, 3, 3)), np.zeros((n, 3, full.shape[2]))
-        np.add.at(M, self.track, wQ)
-        np.add.at(side, self.track, QA)
+        full, m = self.full, self.full.shape[2]
+        along = np.einsum("ni,nia->na", self.direction, full)
+        QA = self.weight[:, None, None] * (full - self.direction[:, :, None] * along[:, None, :])
+        M, side = self._by_track(self.weight[:, None, None] * Q), self._by_track(QA)
         M += 1e-9 * np.trace(M, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-        G = np.einsum("nia,nib->ab", full, QA) - np.einsum("tia,tib->ab", side, np.linalg.solve(M, side))
+        G = full.reshape(-1, m).T @ QA.reshape(-1, m) - side.reshape(-1, m).T @ np.linalg.solve(M, side).reshape(-1, m)
         G[range(len(x)), range(len(x))] += 1e-9 * np.trace(G) / len(x)
         return G[:-1, :-1], -G[:-1, -1]
 
-    def _reweighted(self, Q: np.ndarray, weight: np.ndarray, x: np.ndarray, n: int) -> np.ndarray:
+    def _reweighted(self, Q: np.ndarray, weight: np.ndarray, x: np.ndarray) -> np.ndarray:
         """By the inverse square of each point's range, less where a ray misses its point."""
-        centre, wQ = self.A @ x + self.c, weight[:, None, None] * Q
-        M, b = np.zeros((n, 3, 3)), np.zeros((n, 3))
-        np.add.at(M, self.track, wQ)
-        np.add.at(b, self.track, np.einsum("nij,nj->ni", wQ, centre))
+        centre, wQ = self.full @ np.append(x, 1.0), weight[:, None, None] * Q
+        M, b = self._by_track(wQ), self._by_track(np.einsum("nij,nj->ni", wQ, centre))
         M += 1e-9 * np.trace(M, axis1=1, axis2=2)[:, None, None] * np.eye(3)
         away = np.linalg.solve(M, b[:, :, None])[self.track, :, 0] - centre
         reach = np.maximum(np.linalg.norm(away, axis=1), 0.1)

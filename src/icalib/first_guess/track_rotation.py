@@ -132,6 +132,32 @@ def turn_information(f, h, R, t, H, g):
             H[i, k] = A[i, k] - u * A[3, k] - v * A[4, k]
 
 
+@njit(cache=True, nogil=True)
+def start_direction(f, h, R):
+    """(3,) the direction of motion that rays f and h leave once turned by R."""
+    N, g, c = np.zeros((3, 3)), np.empty(3), np.empty(3)
+    for i in range(len(f)):
+        for r in range(3):
+            g[r] = R[r, 0] * f[i, 0] + R[r, 1] * f[i, 1] + R[r, 2] * f[i, 2]
+        c[0] = g[1] * h[i, 2] - g[2] * h[i, 1]
+        c[1] = g[2] * h[i, 0] - g[0] * h[i, 2]
+        c[2] = g[0] * h[i, 1] - g[1] * h[i, 0]
+        for r in range(3):
+            for k in range(3):
+                N[r, k] += c[r] * c[k]
+    return np.linalg.eigh(N)[1][:, 0].copy()
+
+
+@njit(cache=True, nogil=True)
+def turns_information(f, h, begin, R, H, g):
+    """H (M, 3, 3) and g (M, 3) of `turn_information` for pairs of images with turns R (M, 3, 3); rays of pair i are
+    begin[i]..begin[i + 1] of f and h."""
+    for i in range(len(R)):
+        own = slice(begin[i], begin[i + 1])
+        t = start_direction(f[own], h[own], R[i])
+        turn_information(f[own], h[own], R[i], t, H[i], g[i])
+
+
 def _start(f: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The turn that brings rays f nearest to h, and the direction of motion that is left."""
     U, _, Vt = np.linalg.svd(h.T @ f)
@@ -175,9 +201,3 @@ def common(stream: TrackStream, valid: np.ndarray, i: int, j: int) -> tuple[np.n
     p, q = p + own.start, q + after.start
     seen = valid[p] & valid[q]
     return p[seen], q[seen]
-
-
-def start_direction(f: np.ndarray, h: np.ndarray, R: np.ndarray) -> np.ndarray:
-    """(3,) the direction of motion that rays f and h leave once turned by R."""
-    normals = np.cross(f @ R.T, h)
-    return np.linalg.eigh(normals.T @ normals)[1][:, 0].copy()

@@ -1,0 +1,239 @@
+"""In which order the nodes of a piece and the features seen from them are eliminated, and what that costs.
+
+Nodes go in groups, from one end of the piece to the other. A feature that one group alone sees goes before that group,
+whatever else there is. Any other joins the front with the first group that sees it and leaves with the last one, so
+that the answer is exact however long it lives; one that lives as long as the piece is a column of the border, but in
+name. A larger group keeps more features out of the front, and fewer are at its end: its size is chosen by cost.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from icalib.estimation.state import NODE
+
+POSE = 6  # of a camera
+SIZES = (4, 8, 12, 16, 24, 32)  # nodes of a group
+# What costs beside the products of the front, in their multiplications (measured on one machine; groups of half or
+# twice the size that this finds best cost 10 % more):
+SMALL = 3.0  # one of a small factorisation or triangular solve
+CACHED, STORED = 2.0, 32.0  # moving a number of the front, and of the factors
+STEP = 3e5  # a step's many small calls
+NO_ENDS = np.zeros(0, dtype=np.int64)
+
+
+class FeatureSums(NamedTuple):
+    """What features add to the normal equations of a `Piece`: own (T, 3, 3); side (T, 3, B + 1), feature with border,
+    its gradient in the last column; block (E, 3, 6), feature with the camera's pose, of each pair of feature and image.
+
+    pose (I, 6, 15), a camera's pose by the node its image hangs on; next_pose (I or 0, 6, 15), by the node after. track
+    and image (E,) of the pairs, node (I,) of the images, all counted from the first of the piece.
+    """
+
+    own: np.ndarray
+    side: np.ndarray
+    block: np.ndarray
+    pose: np.ndarray
+    next_pose: np.ndarray
+    track: np.ndarray
+    image: np.ndarray
+    node: np.ndarray
+
+    @classmethod
+    def zeros(
+        cls, n_tracks: int, track: np.ndarray, image: np.ndarray, node: np.ndarray, n_border: int, by_next: bool = False
+    ) -> FeatureSums:
+        pose = np.zeros((len(node), POSE, NODE))
+        return cls(
+            np.zeros((n_tracks, 3, 3)), np.zeros((n_tracks, 3, n_border + 1)), np.zeros((len(track), 3, POSE)), pose,
+            pose.copy() if by_next else pose[:0], track, image, node,
+        )  # fmt: skip
+
+    def clear(self) -> None:
+        for a in (self.own, self.side, self.block):
+            a[:] = 0.0
+
+
+class Lists(NamedTuple):
+    """Lists of integers, one for each step: that of step g is values[start[g]:start[g + 1]]."""
+
+    start: np.ndarray
+    values: np.ndarray
+
+    @classmethod
+    def of(cls, lists: list[np.ndarray]) -> Lists:
+        sizes = [len(x) for x in lists]
+        values = np.concatenate([*lists, np.zeros(0, dtype=np.int64)]).astype(np.int64)
+        return cls(np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64), values)
+
+    @classmethod
+    def sorted_by(cls, step: np.ndarray, values: np.ndarray, n_steps: int) -> Lists:
+        """`values` (n,), each in the list of its `step` (n,); those of step -1 in none."""
+        order = np.argsort(step, kind="stable")
+        start = np.searchsorted(step[order], np.arange(n_steps + 1))
+        return cls((start - start[0]).astype(np.int64), values[order][start[0] :].astype(np.int64))
+
+
+class Plan(NamedTuple):
+    """Steps of the elimination; each takes its nodes, in order, and `after` them (G,) comes another node (-1: none).
+
+    coupled (K,): how many of a node's dimensions meet features; turned such that these come first. Features in the
+    front have slots 0..alive (G,): at a step's beginning some move from slots `leave` to `enter`, then `born` ones join
+    in slots `born_at`; at its end those in slots `dying` go. pair: pairs of the step's images with features in slots
+    `pair_at`. local: features that go before all else, with their pairs: local_pair, of local feature l from
+    local_start[l] on.
+    """
+
+    nodes: Lists
+    after: np.ndarray
+    coupled: np.ndarray
+    alive: np.ndarray
+    leave: Lists
+    enter: np.ndarray
+    born: Lists
+    born_at: np.ndarray
+    dying: Lists
+    pair: Lists
+    pair_at: np.ndarray
+    local: Lists
+    local_start: np.ndarray
+    local_pair: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Lives:
+    """Groups of nodes, the step (I,) of each image, first and last step (T,) of each feature (none: first > last), and
+    whether that is `local` (T,)."""
+
+    groups: list[np.ndarray]
+    step: np.ndarray
+    first: np.ndarray
+    last: np.ndarray
+    local: np.ndarray
+
+    @classmethod
+    def of(cls, sums: FeatureSums, n_nodes: int, forwards: bool, keep: bool, size: int, ends: np.ndarray) -> _Lives:
+        order = np.arange(n_nodes) if forwards else np.arange(n_nodes)[::-1]
+        pivots = order[:-1] if keep else order
+        stretches = np.split(pivots, np.flatnonzero(np.diff(np.searchsorted(ends, pivots, side="right"))) + 1)
+        groups = [s[k : k + size] for s in stretches for k in range(0, len(s), size)]
+        if keep:
+            groups.append(order[:0])  # what still ties the kept node to features
+        which = np.full(n_nodes + 1, len(groups) - 1)
+        for g, nodes in enumerate(groups):
+            which[nodes] = g
+        step = which[sums.node]
+        if len(sums.next_pose):
+            step = np.minimum(step, which[sums.node + 1])
+        first, last = np.full(len(sums.own), len(groups)), np.full(len(sums.own), -1)
+        np.minimum.at(first, sums.track, step[sums.image])
+        np.maximum.at(last, sums.track, step[sums.image])
+        nodeless = len(groups) - 1 if keep else -1
+        local = (first == last) & (first != nodeless) & (len(sums.next_pose) == 0)
+        return cls(groups, step, first, last, local)
+
+    def cost(self, coupled: np.ndarray, n_border: int) -> float:
+        """Multiplications of an elimination, moving numbers included."""
+        n, lasting = len(self.groups), ~self.local & (self.last >= 0)
+        born = np.bincount(self.first[lasting], minlength=n)[:n]
+        died = np.bincount(self.last[lasting], minlength=n)[:n]
+        wide = n_border + 3.0 * (np.cumsum(born) - np.cumsum(died) + died)
+        nodes = NODE * np.array([len(g) for g in self.groups])
+        meets = np.array([coupled[g].sum() + (NODE - coupled[g[:1]]).sum() for g in self.groups])
+        rank = meets + 3.0 * died
+        small = nodes**3 / 6.0 + nodes**2 * n_border / 2.0 + wide * rank**2 / 2.0
+        moved = CACHED * wide**2 + STORED * (rank * wide + nodes**2)
+        return float((rank * wide**2 / 2.0 + SMALL * small + moved + STEP).sum())
+
+
+def plan(
+    sums: FeatureSums,
+    n_nodes: int,
+    forwards: bool,
+    keep: bool,
+    ends: np.ndarray = NO_ENDS,
+    sizes: tuple[int, ...] = SIZES,
+) -> Plan:
+    """Steps that eliminate `n_nodes` nodes and all features; with `keep`, all but the last node in this direction.
+    ends: nodes before which all features end; sizes: of groups, tried for the cheapest."""
+    met = np.zeros(n_nodes, dtype=np.int64)
+    np.add.at(met, sums.node[np.unique(sums.image)], POSE)
+    coupled = np.minimum(met, NODE) if not len(sums.next_pose) else np.full(n_nodes, NODE)
+    tried = [_Lives.of(sums, n_nodes, forwards, keep, s, ends) for s in sizes]
+    lives = min(tried, key=lambda x: x.cost(coupled, sums.side.shape[2]))
+    return _steps(sums, lives, coupled, n_nodes, forwards)
+
+
+def _steps(sums: FeatureSums, lives: _Lives, coupled: np.ndarray, n_nodes: int, forwards: bool) -> Plan:
+    groups, n = lives.groups, len(lives.groups)
+    ends = np.cumsum([len(g) for g in groups])
+    order = np.arange(n_nodes) if forwards else np.arange(n_nodes)[::-1]
+    after = np.append(order, -1)[np.minimum(ends, n_nodes)]
+    own = coupled.copy()
+    for group in groups:
+        own[group[:1]] = NODE  # the step before left something in all of its dimensions
+    own[after[after >= 0]] = NODE
+    tracks, in_front = np.arange(len(sums.own)), ~lives.local
+    slots = _slots(lives, n)
+    step = np.where(in_front[sums.track], lives.step[sums.image], -1)
+    pair = Lists.sorted_by(step, np.arange(len(step)), n)
+    local = Lists.sorted_by(np.where(in_front, -1, lives.first), tracks, n)
+    rank = np.full(len(tracks), -1)
+    rank[local.values] = np.arange(len(local.values))
+    local_pair = Lists.sorted_by(rank[sums.track], np.arange(len(step)), len(local.values))
+    return Plan(
+        Lists.of(groups), after, own, slots.alive, Lists.of(slots.leave), Lists.of(slots.enter).values,
+        Lists.of(slots.born), Lists.of(slots.born_at).values, Lists.of(slots.dying), pair,
+        _places(slots, pair, sums.track, n), local, local_pair.start, local_pair.values,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Slots:
+    """What moves, joins and leaves in each step, and `at`: tracks in the order of the slots, of each step."""
+
+    alive: np.ndarray
+    leave: list[np.ndarray]
+    enter: list[np.ndarray]
+    born: list[np.ndarray]
+    born_at: list[np.ndarray]
+    dying: list[np.ndarray]
+    at: list[np.ndarray]
+
+
+def _slots(lives: _Lives, n_steps: int) -> _Slots:
+    """Slots without holes: who stays keeps its own but for those beyond the end, who move into holes."""
+    lasting = ~lives.local
+    born = Lists.sorted_by(np.where(lasting & (lives.last >= 0), lives.first, -1), np.arange(len(lasting)), n_steps)
+    here, out = np.zeros(0, dtype=np.int64), _Slots(np.zeros(n_steps, dtype=np.int64), [], [], [], [], [], [])
+    for g in range(n_steps):
+        new = born.values[born.start[g] : born.start[g + 1]]
+        stays = lives.last[here] >= g
+        n = int(stays.sum()) + len(new)
+        held = np.flatnonzero(stays)
+        now = np.full(n, -1)
+        now[held[held < n]] = here[held[held < n]]
+        leave, holes = held[held >= n], np.flatnonzero(now < 0)
+        now[holes] = np.concatenate([here[leave], new])
+        out.alive[g] = n
+        out.leave.append(leave)
+        out.enter.append(holes[: len(leave)])
+        out.born.append(new)
+        out.born_at.append(holes[len(leave) :])
+        out.dying.append(np.flatnonzero(lives.last[now] == g))
+        out.at.append(now)
+        here = now
+    return out
+
+
+def _places(slots: _Slots, pair: Lists, track: np.ndarray, n_steps: int) -> np.ndarray:
+    """(e,) the slot of the feature of each pair in the front."""
+    at, found = np.full(int(track.max(initial=-1)) + 1, -1), np.empty(len(pair.values), dtype=np.int64)
+    for g in range(n_steps):
+        at[slots.at[g]] = np.arange(len(slots.at[g]))
+        own = slice(pair.start[g], pair.start[g + 1])
+        found[own] = at[track[pair.values[own]]]
+    return found
