@@ -282,7 +282,7 @@ def _features(inputs: Inputs, state: State, cameras: tuple[CornerFactor, ...], f
     loss = settings.loss, settings.loss_scale
     cuts, seams = chain_cuts(len(state.seconds)), state.starts[1:]
     if following.cut:
-        cuts = (*cuts, *np.flatnonzero(np.diff(np.floor(state.seconds / CUT_S))) + 1)
+        cuts = (*cuts, *(int(k) + 1 for k in np.flatnonzero(np.diff(np.floor(state.seconds / CUT_S)))))
     return FeatureFactor.build(cameras, streams, following.sigma, tuple(keep), loss, state, cuts, seams)
 
 
