@@ -14,7 +14,8 @@ from icalib.estimation.poses import assign_nodes, poses_at
 from icalib.estimation.robot import DRIVE, MOUNT, wheel_angles
 from icalib.estimation.state import Key, State
 from icalib.first_guess.lidar_rounds import given, with_lidars
-from icalib.first_guess.wheels import WheelRates, drive_guess, wheel_offset, wheel_rates
+from icalib.first_guess.wheel_poses import mount_guess, poses_offset
+from icalib.first_guess.wheels import drive_guess, wheel_offset, wheel_rates
 from icalib.measurements import WheelPoses, WheelStream
 from icalib.rig import Wheels
 
@@ -54,16 +55,14 @@ def _wheels(inputs: Inputs, state: State, wheels: Wheels, stream: WheelStream | 
         return known
     assert inputs.imu is not None
     if isinstance(stream, WheelPoses):
-        raise EstimationError(
-            f"{wheels.name} reports poses, from which nothing is guessed; give its rotation, translation and "
-            "time_offset in the rig file."
-        )
+        return _posing(inputs, state, stream, known.get((wheels.name, "time_offset"))) | known
     rates = wheel_rates(wheels.name, stream.seconds, wheel_angles(stream))
     up = np.einsum("nji,j->i", state.rotation, [0.0, 0.0, 1.0])
     offset = known.get((wheels.name, "time_offset"))
     if offset is None:
         offset = np.array([wheel_offset(inputs.imu, up, wheels.name, rates)])
-    drive = drive_guess(wheels.name, *_means(motion_of(inputs, state), rates, offset[0]), up)
+    inside, rate, velocity = _means(motion_of(inputs, state), rates.start, rates.end, offset[0])
+    drive = drive_guess(wheels.name, rates.rate[inside], rate, velocity, up)
     found = {
         "rotation": drive.rotation, "translation": drive.position, "time_offset": offset,
         "radii": drive.radii, "baseline": np.array([drive.baseline]),
@@ -71,13 +70,27 @@ def _wheels(inputs: Inputs, state: State, wheels: Wheels, stream: WheelStream | 
     return {(wheels.name, name): value for name, value in found.items()} | known
 
 
-def _means(motion: Motion, rates: WheelRates, offset: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(n, 2) rates of the wheels, and the means (n, 3) of the IMU's rate and velocity over the same spans, in its axes.
+def _posing(inputs: Inputs, state: State, stream: WheelPoses, offset: np.ndarray | None) -> dict[Key, np.ndarray]:
+    """Of wheels that report relative poses."""
+    assert inputs.imu is not None
+    if offset is None:
+        offset = np.array([poses_offset(inputs.imu, stream)])
+    inside, rate, velocity = _means(motion_of(inputs, state), stream.seconds[:-1], stream.seconds[1:], offset[0])
+    found = mount_guess(stream, inside, rate, velocity)
+    values = {"rotation": found.rotation, "translation": found.position, "time_offset": offset}
+    return {(stream.name, name): np.ascontiguousarray(value) for name, value in values.items()}
+
+
+def _means(
+    motion: Motion, start: np.ndarray, end: np.ndarray, offset: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Which spans from start to end (m,), on the wheels' clock, fall within the motion, and over these n the means
+    (n, 3) of the IMU's rate, without bias, and velocity, in its axes.
 
     Raises EstimationError where the wheels turned while nothing else was recorded.
     """
     state = motion.state
-    start, end = rates.start + offset, rates.end + offset
+    start, end = start + offset, end + offset
     inside = (start >= state.seconds[0]) & (end <= state.seconds[-1])
     if not inside.any():
         raise EstimationError(
@@ -90,4 +103,4 @@ def _means(motion: Motion, rates: WheelRates, offset: float) -> tuple[np.ndarray
     poses = poses_at("inertial", times, node, state, motion.imu, motion.gravity, False)
     velocity = np.einsum("nji,nj->ni", poses.rotation, poses.velocity)
     rate, speed = (np.einsum("k,nki->ni", SIMPSON, x.reshape(-1, 3, 3)) for x in (poses.rate, velocity))
-    return rates.rate[inside], rate, speed
+    return inside, rate, speed

@@ -7,6 +7,7 @@ from typing import Literal, TypeVar
 
 import numpy as np
 
+from icalib.geometry.targets import NoTarget
 from icalib.rig import Camera, ImuSensor, Lidar, Parameter, Rig, Settings, Wheels
 from icalib.simulation.imu import rotation_from_vector
 from icalib.simulation.robot import SimLidar, SimWheels
@@ -69,6 +70,8 @@ def rig_for(
             sim.model,
             sim.resolution,
             corner_noise_px=sim.corner_noise_px,
+            tracks=None if scenario.features is None else f"{sim.name}/tracks.csv",
+            track_noise_px=None if scenario.features is None else sim.corner_noise_px,
             rotation=_parameter(rotation, sim.T_imu_cam[:3, :3]),
             translation=_parameter(translation, sim.T_imu_cam[:3, 3]),
             time_offset=_parameter(time_offset, [raw_time_offset(scenario, sim)]),
@@ -102,7 +105,7 @@ def rig_for(
     return Rig(
         imu,
         tuple(camera(c) for c in scenario.cameras),
-        scenario.target,
+        scenario.target if scenario.board else NoTarget(),
         gravity=float(np.linalg.norm(GRAVITY_WORLD)),
         settings=settings_for(scenario) if settings is None else settings,
         lidars=tuple(lidar(s) for s in scenario.lidars),
