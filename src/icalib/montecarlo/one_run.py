@@ -24,7 +24,9 @@ GuessKind = Literal["none", "drawn"]
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What a run is made from. guess: the program finds its own, or starts from one drawn about the truth."""
+    """What a run is made from. guess: the program finds its own, or starts from one drawn about the truth. Cameras that
+    follow points of the scene have a drawn guess of their intrinsics in either case: points do not show these from
+    nothing."""
 
     scenario: Scenario
     seed: int
@@ -38,8 +40,9 @@ def run(task: Task) -> Record:
     try:
         simulation = simulate(task.scenario, task.seed)
         rig = rig_for(task.scenario, intrinsics="free", distortion="free")
-        if task.guess == "drawn":
-            rig = with_drawn_guess(rig, task.scenario, task.seed)
+        if task.guess == "drawn" or not rig.has_target:
+            only = None if task.guess == "drawn" else ("intrinsics",)
+            rig = with_drawn_guess(rig, task.scenario, task.seed, only=only)
         result = calibrate_measurements(rig, simulation.measurements, on_visit=visits.append)
     except CalibrationError as caught:
         return Record(task.seed, str(caught), time.perf_counter() - started, program())

@@ -113,36 +113,35 @@ def rig_for(
     )
 
 
-def with_drawn_guess(rig: Rig, scenario: Scenario, seed: int, error: GuessError | None = None) -> Rig:
-    """The rig with a guess of each free group, drawn about the truth; the same seed draws the same. Principal points
-    are guessed in the middle of the image, and of distortions there is no guess."""
+def with_drawn_guess(
+    rig: Rig, scenario: Scenario, seed: int, error: GuessError | None = None, only: tuple[str, ...] | None = None
+) -> Rig:
+    """The rig with a guess of each free group, or of those named in `only`, drawn about the truth; the same seed draws
+    the same. Principal points are guessed in the middle of the image, and of distortions there is no guess."""
     rng = np.random.default_rng([seed, _GUESS_STREAM])
     spread = GuessError() if error is None else error
-    cameras = [_guessed(c, s, scenario, rng, spread) for c, s in zip(rig.cameras, scenario.cameras, strict=True)]
-    lidars = [
-        _with_guess(x, _drawn_pose(s.T_imu_lidar, raw_time_offset(scenario, s), rng, spread))
-        for x, s in zip(rig.lidars, scenario.lidars, strict=True)
-    ]
-    wheels = [
-        _with_guess(
-            x, _drawn_pose(s.T_imu_wheel, raw_time_offset(scenario, s), rng, spread) | _drawn_drive(s, rng, spread)
-        )
-        for x, s in zip(rig.wheels, scenario.wheels, strict=True)
-    ]
-    return replace(rig, cameras=tuple(cameras), lidars=tuple(lidars), wheels=tuple(wheels))
+
+    def mount(sim: SimCamera | SimLidar | SimWheels, T_imu_sensor: np.ndarray) -> dict[str, np.ndarray]:
+        return _drawn_pose(T_imu_sensor, raw_time_offset(scenario, sim), rng, spread)
+
+    def guessed(sensor: Sensor, drawn: dict[str, np.ndarray]) -> Sensor:
+        free = {k: v for k, v in drawn.items() if getattr(sensor, k).mode == "free" and (only is None or k in only)}
+        return replace(sensor, **{name: Parameter("free", value) for name, value in free.items()})
+
+    cameras = zip(rig.cameras, scenario.cameras, strict=True)
+    lidars = zip(rig.lidars, scenario.lidars, strict=True)
+    wheels = zip(rig.wheels, scenario.wheels, strict=True)
+    return replace(
+        rig,
+        cameras=tuple(guessed(c, mount(s, s.T_imu_cam) | _drawn_lens(s, rng, spread)) for c, s in cameras),
+        lidars=tuple(guessed(x, mount(s, s.T_imu_lidar)) for x, s in lidars),
+        wheels=tuple(guessed(x, mount(s, s.T_imu_wheel) | _drawn_drive(s, rng, spread)) for x, s in wheels),
+    )
 
 
-def _guessed(camera: Camera, sim: SimCamera, scenario: Scenario, rng: np.random.Generator, error: GuessError) -> Camera:
-    drawn = _drawn_pose(sim.T_imu_cam, raw_time_offset(scenario, sim), rng, error)
+def _drawn_lens(sim: SimCamera, rng: np.random.Generator, error: GuessError) -> dict[str, np.ndarray]:
     focal = np.array(sim.intrinsics[:2]) * (1.0 + error.focal_length * rng.standard_normal())
-    drawn["intrinsics"] = np.array([*focal, *(0.5 * (side - 1) for side in sim.resolution)])
-    return _with_guess(camera, drawn)
-
-
-def _with_guess(sensor: Sensor, drawn: dict[str, np.ndarray]) -> Sensor:
-    """The sensor with what was drawn for its free groups."""
-    free = {name: value for name, value in drawn.items() if getattr(sensor, name).mode == "free"}
-    return replace(sensor, **{name: Parameter("free", value) for name, value in free.items()})
+    return {"intrinsics": np.array([*focal, *(0.5 * (side - 1) for side in sim.resolution)])}
 
 
 def _drawn_drive(sim: SimWheels, rng: np.random.Generator, error: GuessError) -> dict[str, np.ndarray]:
