@@ -20,8 +20,9 @@ import icalib
 from icalib.estimation.assembly import assemble, inputs_for
 from icalib.estimation.corner_noise import first_noise
 from icalib.first_guess import initial_guess
+from icalib.first_guess.start import first_state
 from icalib.measurements import CornerStream, ImuStream, Measurements
-from icalib.pipeline import calibrate_measurements, first_state
+from icalib.pipeline import calibrate_measurements
 from icalib.recordings import open_recording, read_measurements
 from icalib.rig import Rig
 

@@ -26,8 +26,8 @@ from icalib.estimation.assembly import Inputs, inputs_for
 from icalib.estimation.estimate import Estimate, estimate
 from icalib.estimation.state import State
 from icalib.first_guess import initial_guess
+from icalib.first_guess.start import first_state
 from icalib.measurements import CornerStream, ImuStream, Measurements
-from icalib.pipeline import first_state
 from icalib.rig import Rig, fixed
 
 SECONDS = 20.0  # of the recording, from its first image on

@@ -20,9 +20,10 @@ from icalib.estimation.arrowhead import Piece, solve
 from icalib.estimation.assembly import inputs_for
 from icalib.estimation.estimate import Estimate, estimate
 from icalib.first_guess.several import initial_guesses
+from icalib.first_guess.start import first_state
 from icalib.geometry.blas import subtract_gram
 from icalib.geometry.targets import NoTarget
-from icalib.pipeline import calibrate_measurements, first_state
+from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter, Rig
 from icalib.simulation import load_scenario, rig_for, simulate
 

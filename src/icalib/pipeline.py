@@ -7,26 +7,17 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import numpy as np
 from threadpoolctl import threadpool_limits
 
 from icalib.assessment import assess, visited
 from icalib.calibration import Calibration, Visited
 from icalib.detection.streams import find_corners
 from icalib.errors import RecordingError
-from icalib.estimation.assembly import Inputs, host_times, inputs_for, nodes_for, start_values
-from icalib.estimation.board import board_in
 from icalib.estimation.determination import determine
-from icalib.estimation.nodes import first_nodes
 from icalib.estimation.pages import give_back, keep_apart
 from icalib.estimation.problem import Problem
 from icalib.estimation.solver import Visit
-from icalib.estimation.state import State
-from icalib.first_guess import Guess, initial_trajectory
-from icalib.first_guess.lidar_rounds import state_from_lidar, with_lidars
-from icalib.first_guess.robot import wheel_values, with_robot
-from icalib.first_guess.several import initial_guesses
-from icalib.geometry.targets.base import BOARD
+from icalib.first_guess.start import start
 from icalib.measurements import CornerStream, Measurements
 from icalib.provenance import provenance
 from icalib.recordings import Recording, read_measurements
@@ -109,7 +100,7 @@ def _calibrate(
     progress("finding a first guess", 0.0)
     keep_apart()
     give_back()
-    inputs, state = _start(rig, recordings, clock)
+    inputs, state = start(rig, recordings, clock.lap)
     give_back()
     steps = _StepProgress(progress)
 
@@ -123,51 +114,6 @@ def _calibrate(
     result = assess(inputs, found)
     clock.lap("judging")
     return dataclasses.replace(result, timings=clock.laps)
-
-
-def _start(rig: Rig, recordings: Sequence[Measurements], clock: _Clock) -> tuple[Inputs, State]:
-    """What the estimate is made from, and where it starts: cameras give the motion, if there are any, else a LiDAR."""
-    whole = inputs_for(rig, recordings)
-    if not rig.cameras:
-        return _start_from_lidar(whole, clock)
-    bare = whole
-    if rig.wheels or rig.lidars:
-        seen = [dataclasses.replace(m, wheels=(), lidars=()) for m in recordings]
-        bare = inputs_for(dataclasses.replace(rig, wheels=(), lidars=()), seen)
-    guesses = initial_guesses(rig, bare.bodies, [m.measurements for m in bare.motions])
-    clock.lap("first guess")
-    state = first_state(bare, *guesses)
-    give_back()
-    clock.lap("first state")
-    if bare is whole:
-        return whole, state
-    inputs, state = with_robot(bare, state, whole)
-    clock.lap("wheels and LiDARs")
-    return inputs, state
-
-
-def _start_from_lidar(inputs: Inputs, clock: _Clock) -> tuple[Inputs, State]:
-    state = state_from_lidar(inputs)
-    clock.lap("first guess")
-    inputs, state = with_lidars(inputs, state)
-    state = dataclasses.replace(state, values=state.values | wheel_values(inputs, state))
-    clock.lap("first state")
-    return inputs, state
-
-
-def first_state(inputs: Inputs, *guesses: Guess) -> State:
-    """The state that the first pass starts from: the guess of each of `inputs.motions` at all its nodes."""
-    values = guesses[0].values()
-    for k, guess in enumerate(guesses):
-        values[board_in(BOARD, k), "tilt"] = guess.R_world_board
-    values = start_values(inputs, values)
-    nodes = nodes_for(inputs, host_times(inputs, values))
-    starts = first_nodes(inputs.imu, nodes)
-    own = [(g, m, t - m.begin) for g, m, t in zip(guesses, inputs.motions, np.split(nodes, starts[1:]), strict=True)]
-    paths = [initial_trajectory(guess, inputs.rig, motion.measurements, t) for guess, motion, t in own]
-    rotation, position, velocity = (np.concatenate(x) for x in zip(*paths, strict=True))
-    bias = np.concatenate([guess.biases(len(t)) for guess, _, t in own])
-    return State(nodes, rotation, position, velocity, bias, values, starts)
 
 
 class _Clock:

@@ -14,8 +14,8 @@ from icalib.estimation.corner_noise import first_noise
 from icalib.estimation.feature_noise import first_following
 from icalib.estimation.solver import minimise
 from icalib.first_guess.several import initial_guesses
+from icalib.first_guess.start import first_state
 from icalib.geometry.targets import NoTarget
-from icalib.pipeline import first_state
 from icalib.rig import Parameter, Rig
 from icalib.simulation import Scenario, load_scenario, rig_for, simulate
 

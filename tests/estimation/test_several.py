@@ -15,10 +15,10 @@ from icalib.estimation.imu_factor import ImuFactor
 from icalib.estimation.nodes import first_nodes, place_nodes, usable
 from icalib.estimation.state import NODE, State
 from icalib.first_guess.several import initial_guesses
+from icalib.first_guess.start import first_state
 from icalib.geometry import so3
 from icalib.joining import PAUSE_NS, join
 from icalib.measurements import Measurements
-from icalib.pipeline import first_state
 from icalib.recordings.several import naming, open_all
 from icalib.rig import Rig, fixed
 from icalib.simulation import handheld, rig_for, simulate

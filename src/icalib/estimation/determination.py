@@ -22,17 +22,12 @@ from icalib.estimation.prior_factor import Prior
 from icalib.estimation.problem import Problem
 from icalib.estimation.solver import Step, minimise
 from icalib.estimation.state import State
+from icalib.estimation.tolerances import GUESS_SIGMA, OTHER_SIGMA
 from icalib.geometry import planes, so3
 
 UNDETERMINED_BELOW = 1e-2  # information in tolerance units: known to less than ten tolerances
 SPURIOUS_SHARE = 0.5  # a direction most of whose information is noise is not determined either
 MOST_ROUNDS = 4
-# What a guess without a standard deviation is taken to be worth: rad, m, s, px, 1.
-GUESS_SIGMA = {
-    "rotation": 0.1, "translation": 0.1, "time_offset": 0.01, "intrinsics": 15.0, "distortion": 0.1, "bloom": 1.0,
-    "shape": 1e-3, "tilt": 0.1, "radii": 0.01, "baseline": 0.05, "plane": 0.1,
-}  # fmt: skip
-OTHER_SIGMA = 0.1  # of IMU intrinsics
 
 
 @dataclass(frozen=True)

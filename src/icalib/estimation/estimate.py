@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -23,15 +23,19 @@ from icalib.estimation.corner_noise import (
 )
 from icalib.estimation.evidence import fits
 from icalib.estimation.feature_noise import first_following, inliers, next_following
+from icalib.estimation.imu_model import N_INTRINSICS
 from icalib.estimation.lidar_binning import LidarNoise
 from icalib.estimation.lidar_factor import LidarFactor
+from icalib.estimation.prior_factor import Prior
 from icalib.estimation.problem import Problem
 from icalib.estimation.robot import first_ranging, next_ranging
 from icalib.estimation.sensors import chi2
 from icalib.estimation.solver import CONVERGED_DECREASE, Outcome, Step, Visit, minimise
 from icalib.estimation.state import State
+from icalib.estimation.tolerances import GUESS_SIGMA
 from icalib.rig import Settings
 
+LOOSE = 3.0  # times what a guess is worth
 EARLY_DECREASE = 0.5  # an early pass is followed by another
 
 
@@ -96,7 +100,8 @@ def estimate(
 
 
 def first_pass(inputs: Inputs, state: State) -> State:
-    """Where the solver is led by all measurements from a first `state`, before any is judged.
+    """Where the solver is led by all measurements from a first `state`, before any is judged. Calibration stays about
+    where it is, to a few times what a guess is worth: what the motion leaves open does not wander.
 
     Raises EstimationError where the data do not carry an estimate.
     """
@@ -105,6 +110,12 @@ def first_pass(inputs: Inputs, state: State) -> State:
     keep = [np.ones(len(s.uv), dtype=bool) for s in streams]
     ranging = [first_ranging(x, rig.settings) for x in rig.lidars]
     problem = assemble(inputs, state, noise, keep, following=first_following(inputs), ranging=ranging)
+    loose = [
+        Prior(b, state.values[b.key], np.full(b.size, LOOSE * GUESS_SIGMA[b.name]))
+        for b in inputs.layout.free
+        if inputs.is_sensor(b.sensor) and b.size != N_INTRINSICS
+    ]
+    problem = replace(problem, priors=(*problem.priors, *loose))
     return minimise(problem, state, tolerance=EARLY_DECREASE).state
 
 

@@ -30,7 +30,7 @@ def guess_from_tracks(rig: Rig, measurements: Measurements) -> Guess:
     """Raises EstimationError, one sentence, where the tracks do not carry a guess, or intrinsics are not given."""
     imu = imu_data(rig, measurements)
     assert imu is not None  # tracks without an IMU are refused before
-    params = [_params(c) for c in rig.cameras]
+    params = [lens_start(c) for c in rig.cameras]
     aligned = [
         align_camera(c, s, track_rates(t, camera_model(c.model), p), imu, measurements)
         for c, s, t, p in zip(rig.cameras, measurements.cameras, measurements.tracks, params, strict=True)
@@ -71,7 +71,7 @@ def _check_units(imu: ImuData, gravity: float) -> None:
         )
 
 
-def _params(camera: Camera) -> np.ndarray:
+def lens_start(camera: Camera) -> np.ndarray:
     """Intrinsics and distortion as the rig file gives them; a lens without a guess starts where its model does."""
     if camera.intrinsics.value is None:
         raise EstimationError(

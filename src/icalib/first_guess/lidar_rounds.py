@@ -28,12 +28,12 @@ from icalib.first_guess.align_camera import trusted
 from icalib.first_guess.lidar import Held, lidar_and_motion, lidar_on_motion
 from icalib.first_guess.lidar_planes import ROUNDS, associate, round_search
 from icalib.geometry.planes import plane_of
-from icalib.rig import Lidar, Wheels
+from icalib.rig import Camera, Lidar, Wheels
 
 NAMES = tuple(name for name, _, _ in MOUNT)
 
 
-def given(inputs: Inputs, sensor: Lidar | Wheels, names: Sequence[str]) -> dict[Key, np.ndarray]:
+def given(inputs: Inputs, sensor: Camera | Lidar | Wheels, names: Sequence[str]) -> dict[Key, np.ndarray]:
     """What the rig gives of a sensor, time offsets between clocks that start at their first stamps."""
     out: dict[Key, np.ndarray] = {}
     for name in names:

@@ -13,6 +13,7 @@ from icalib.estimation.lidar_binning import Motion
 from icalib.estimation.poses import assign_nodes, poses_at
 from icalib.estimation.robot import DRIVE, MOUNT, wheel_angles
 from icalib.estimation.state import Key, State
+from icalib.first_guess.from_tracks import lens_start
 from icalib.first_guess.lidar_rounds import given, with_lidars
 from icalib.first_guess.wheel_poses import mount_guess, poses_offset
 from icalib.first_guess.wheels import drive_guess, wheel_offset, wheel_rates
@@ -44,6 +45,18 @@ def with_robot(bare: Inputs, state: State, whole: Inputs) -> tuple[Inputs, State
     inputs, found = with_lidars(whole, settled) if whole.rig.lidars else (whole, settled)
     # What the guess had of the cameras stays: where the motion shows nothing it is what the rig gave.
     return inputs, replace(found, values=found.values | state.values)
+
+
+def given_cameras(inputs: Inputs) -> dict[Key, np.ndarray] | None:
+    """What the rig gives of the cameras, if that is a place to start from: pose, clock and intrinsics of all."""
+    out: dict[Key, np.ndarray] = {}
+    for camera in inputs.rig.cameras:
+        names = (*(name for name, _, _ in MOUNT), "intrinsics")
+        known = given(inputs, camera, names)
+        if len(known) < len(names):
+            return None
+        out |= known | {(camera.name, "distortion"): lens_start(camera)[4:]}
+    return out
 
 
 def _wheels(inputs: Inputs, state: State, wheels: Wheels, stream: WheelStream | WheelPoses) -> dict[Key, np.ndarray]:

@@ -1,0 +1,78 @@
+"""What the estimate is made from, and the state that its first pass starts from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from icalib.estimation.assembly import Inputs, host_times, inputs_for, nodes_for, resample, start_values, with_clouds
+from icalib.estimation.board import board_in
+from icalib.estimation.nodes import first_nodes
+from icalib.estimation.state import Key, State
+from icalib.first_guess import Guess, initial_trajectory
+from icalib.first_guess.lidar_rounds import state_from_lidar, with_lidars
+from icalib.first_guess.robot import given_cameras, wheel_values, with_robot
+from icalib.first_guess.several import initial_guesses
+from icalib.geometry.targets.base import BOARD
+from icalib.measurements import Measurements
+from icalib.rig import Rig
+
+
+def start(
+    rig: Rig, recordings: Sequence[Measurements], lap: Callable[[str], None] = lambda stage: None
+) -> tuple[Inputs, State]:
+    """What the estimate is made from, and where it starts.
+
+    A target gives the motion, or else a LiDAR, if nothing is to be found of the cameras, or else points of the scene;
+    what has no part in it is placed on that motion. Raises EstimationError where the recordings do not carry it.
+    """
+    whole = inputs_for(rig, recordings)
+    cameras = given_cameras(whole)
+    if rig.lidars and not rig.has_target and cameras is not None:
+        return _start_from_lidar(whole, recordings, cameras, lap)
+    bare = whole
+    if rig.wheels or rig.lidars:
+        seen = [replace(m, wheels=(), lidars=()) for m in recordings]
+        bare = inputs_for(replace(rig, wheels=(), lidars=()), seen)
+    guesses = initial_guesses(rig, bare.bodies, [m.measurements for m in bare.motions])
+    lap("first guess")
+    state = first_state(bare, *guesses)
+    lap("first state")
+    if bare is whole:
+        return whole, state
+    inputs, state = with_robot(bare, state, whole)
+    lap("wheels and LiDARs")
+    return inputs, state
+
+
+def _start_from_lidar(
+    whole: Inputs, recordings: Sequence[Measurements], cameras: dict[Key, np.ndarray], lap: Callable[[str], None]
+) -> tuple[Inputs, State]:
+    rig = replace(whole.rig, cameras=(), wheels=())
+    alone = inputs_for(rig, [replace(m, cameras=(), tracks=(), wheels=()) for m in recordings])
+    state = state_from_lidar(alone)
+    lap("first guess")
+    alone, state = with_lidars(alone, state)
+    inputs = with_clouds(whole, alone.clouds)
+    values = start_values(inputs, state.values | cameras)
+    state = resample(replace(state, values=values), nodes_for(inputs, host_times(inputs, values)), inputs)
+    state = replace(state, values=state.values | wheel_values(inputs, state))
+    lap("wheels and LiDARs")
+    return inputs, state
+
+
+def first_state(inputs: Inputs, *guesses: Guess) -> State:
+    """The state that the first pass starts from: the guess of each of `inputs.motions` at all its nodes."""
+    values = guesses[0].values()
+    for k, guess in enumerate(guesses):
+        values[board_in(BOARD, k), "tilt"] = guess.R_world_board
+    values = start_values(inputs, values)
+    nodes = nodes_for(inputs, host_times(inputs, values))
+    starts = first_nodes(inputs.imu, nodes)
+    own = [(g, m, t - m.begin) for g, m, t in zip(guesses, inputs.motions, np.split(nodes, starts[1:]), strict=True)]
+    paths = [initial_trajectory(guess, inputs.rig, motion.measurements, t) for guess, motion, t in own]
+    rotation, position, velocity = (np.concatenate(x) for x in zip(*paths, strict=True))
+    bias = np.concatenate([guess.biases(len(t)) for guess, _, t in own])
+    return State(nodes, rotation, position, velocity, bias, values, starts)
