@@ -12,7 +12,7 @@ from icalib.cli import main
 from icalib.montecarlo import study as study_module
 from icalib.montecarlo.one_run import program
 from icalib.montecarlo.record import Record
-from icalib.montecarlo.reproduce import FOLDER, MOTIONS, with_board
+from icalib.montecarlo.reproduce import FOLDER, MOTIONS
 from icalib.simulation import load_scenario
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
@@ -63,8 +63,8 @@ def test_reproduce_without_any_good_run_still_reports(tmp_path: Path, monkeypatc
 def test_the_scenarios_are_those_of_the_examples(motion: str):
     name = f"table2-{motion}.yaml"
     assert (FOLDER / name).read_bytes() == (PAPER / name).read_bytes()
-    scenario = with_board(load_scenario(FOLDER / name))
-    assert scenario.board and not scenario.lidars
+    scenario = load_scenario(FOLDER / name)
+    assert scenario.features and scenario.lidars and scenario.wheels
 
 
 def sentence(capsys, *arguments: str) -> str:

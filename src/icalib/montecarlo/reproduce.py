@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
-from icalib.geometry.targets import AprilGrid
 from icalib.montecarlo.convergence import plotly_figure, png, rows
 from icalib.montecarlo.page import blocks_table, failures, page, plot_place
 from icalib.montecarlo.store import write_whole
@@ -17,12 +12,10 @@ from icalib.montecarlo.study import Plan, Study, run_study, scenario_digest
 from icalib.montecarlo.words import answer, failures_words
 from icalib.report.plot import Figure
 from icalib.report.tables import Html, element
-from icalib.simulation import Scenario, load_scenario
+from icalib.simulation import load_scenario
 
 MOTIONS = {"3d": "Motion in three dimensions", "planar": "Planar motion"}
 FOLDER = Path(__file__).parent / "paper"
-_BOARD = AprilGrid(6, 6, 0.3, 0.3)
-_ON_WALL = np.array([[0.0, 0.0, -1.0, 5.9], [-1.0, 0.0, 0.0, 1.1], [0.0, 1.0, 0.0, 0.4], [0.0, 0.0, 0.0, 1.0]])
 Progress = Callable[[str, float], None]
 
 
@@ -39,17 +32,10 @@ def reproduce(output: Path, plan: Plan, progress: Progress = lambda *_: None) ->
 
         file = FOLDER / f"table2-{motion}.yaml"
         scenario = load_scenario(file)
-        digest = hashlib.sha256((scenario_digest(file, scenario) + " board on a wall").encode()).hexdigest()
         name = f"Table II, {motion}"
-        studies[motion] = run_study(with_board(scenario), name, digest, output / motion, plan, show)
+        studies[motion] = run_study(scenario, name, scenario_digest(file, scenario), output / motion, plan, show)
     write_figures(output, studies)
     return studies
-
-
-def with_board(scenario: Scenario) -> Scenario:
-    """The scenario with what the estimator takes: in place of tracks, LiDAR and wheels an AprilGrid of 2.3 m on a
-    wall."""
-    return replace(scenario, board=True, target=_BOARD, T_world_board=_ON_WALL, features=None, lidars=(), wheels=())
 
 
 def write_figures(output: Path, studies: dict[str, Study]) -> None:
