@@ -1,8 +1,8 @@
 """From bags of rendered images to calibrations, against the truth: `python benchmarks/rendered.py FOLDER --seeds 8`.
 
 Bags are kept in FOLDER (290 MB for each camera of 40 s), so that only the first run renders. Each is calibrated from
-nothing by `icalib.calibrate`; then the first once more in a process of its own, whose corners nobody has kept, for time
-and memory. Needs icalib[bags,images], and Linux or macOS (for the peak memory).
+nothing by `icalib.calibrate`; then the first once more in a process of its own, whose corners nobody has kept, for the
+time; `memory.py` measures the memory. Needs icalib[bags,images].
 """
 
 from __future__ import annotations
@@ -152,14 +152,10 @@ def _end_to_end(options: argparse.Namespace) -> None:
 
 
 def _child(options: argparse.Namespace) -> int:
-    import resource
-
     scenario = scenario_of(options.kind, options.duration)
     result = icalib.calibrate(rig_of(scenario), _path(options, options.first))
-    unit = 1 if sys.platform == "darwin" else 1024
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit * 1e-6
     stages = ", ".join(f"{stage} {seconds:.2f} s" for stage, seconds in result.timings.items())
-    print(f"of all processors {time.process_time():.2f} s, peak {peak:.0f} MB; {stages}")
+    print(f"of all processors {time.process_time():.2f} s; {stages}")
     return 0
 
 
