@@ -14,7 +14,7 @@ import numpy as np
 from icalib.errors import EstimationError
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.state import Key, State
-from icalib.first_guess.clocks import STILL_RAD_S, Alignment, CameraRates, align, as_given
+from icalib.first_guess.clocks import STILL_RAD_S, Alignment, CameraRates, align, as_given, contradicts
 from icalib.first_guess.gyro import GyroRotation
 from icalib.first_guess.lidar_arm import (
     ANY_SIGMA,
@@ -151,7 +151,13 @@ def _aligned(imu: ImuData, stream: LidarStream, held: Held) -> tuple[Alignment, 
 
 def _align(imu: ImuData, name: str, rates: CameraRates, held: Held) -> Alignment:
     if held.rotation is not None and held.offset is not None:
-        return as_given(imu, name, rates, held.offset, held.rotation)
+        found = as_given(imu, name, rates, held.offset, held.rotation)
+        if contradicts(imu, rates, found):
+            raise EstimationError(
+                f"{name} does not turn as {imu.name} does with the rotation and time_offset in the rig file; correct "
+                "them, or leave them out to have them found."
+            )
+        return found
     _check_turning(imu, name, rates)
     found = align(imu, name, rates, held.offset)
     return found if held.rotation is None else as_given(imu, name, rates, found.offset, held.rotation)

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from icalib.errors import EstimationError
 from icalib.estimation.assembly import (
     Inputs,
     host_times,
@@ -51,7 +52,14 @@ def state_from_lidar(inputs: Inputs) -> State:
     """
     assert inputs.imu is not None
     lidar, stream = inputs.rig.lidars[0], inputs.measurements.lidars[0]
-    guess, motion = lidar_and_motion(inputs.imu, stream, inputs.rig.gravity, _held(inputs, lidar))
+    try:
+        guess, motion = lidar_and_motion(inputs.imu, stream, inputs.rig.gravity, _held(inputs, lidar))
+    except EstimationError:
+        known = _held(inputs, lidar, guesses=True)
+        if known.rotation is None or known.offset is None:
+            raise
+        # The motion shows too little; the rig file's guess stands in.
+        guess, motion = lidar_and_motion(inputs.imu, stream, inputs.rig.gravity, known)
     values = start_values(inputs, guess.values(lidar.name) | given(inputs, lidar, NAMES))
     hosts = {(x.name, "time_offset"): values[lidar.name, "time_offset"] for x in inputs.rig.lidars}
     nodes = nodes_for(inputs, host_times(inputs, hosts)[:1])
@@ -99,9 +107,9 @@ def _lidar_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
     return out
 
 
-def _held(inputs: Inputs, lidar: Lidar) -> Held:
-    """What the rig trusts of a LiDAR."""
-    known = given(inputs, lidar, [name for name in NAMES if trusted(getattr(lidar, name)) is not None])
+def _held(inputs: Inputs, lidar: Lidar, guesses: bool = False) -> Held:
+    """What the rig trusts of a LiDAR, and with `guesses` what it guesses."""
+    known = given(inputs, lidar, [name for name in NAMES if guesses or trusted(getattr(lidar, name)) is not None])
     offset = known.get((lidar.name, "time_offset"))
     return Held(
         known.get((lidar.name, "rotation")),
