@@ -17,14 +17,15 @@ from icalib.errors import RecordingError
 from icalib.estimation.assembly import Inputs, host_times, inputs_for, nodes_for, start_values
 from icalib.estimation.board import board_in
 from icalib.estimation.determination import determine
+from icalib.estimation.estimate import first_pass
 from icalib.estimation.nodes import first_nodes
 from icalib.estimation.pages import give_back
 from icalib.estimation.problem import Problem
 from icalib.estimation.solver import Visit
-from icalib.estimation.state import State
+from icalib.estimation.state import Key, State
 from icalib.first_guess import Guess, initial_trajectory
-from icalib.first_guess.lidar_rounds import state_from_lidar, with_lidars
-from icalib.first_guess.robot import wheel_values, with_robot
+from icalib.first_guess.lidar_rounds import state_from_lidar
+from icalib.first_guess.robot import with_robot
 from icalib.first_guess.several import initial_guesses
 from icalib.geometry.targets.base import BOARD
 from icalib.measurements import CornerStream, Measurements
@@ -107,7 +108,7 @@ def _calibrate(
     clock = _Clock()
     progress("finding a first guess", 0.0)
     give_back()
-    inputs, state = _start(rig, recordings, clock)
+    inputs, state, guess = _start(rig, recordings, clock)
     give_back()
     steps = _StepProgress(progress)
 
@@ -115,7 +116,7 @@ def _calibrate(
         if on_visit is not None:
             on_visit(visited(inputs, stage, problem, visit))
 
-    found = determine(inputs, state, lambda name, step: steps.note(name), tell)
+    found = determine(inputs, state, lambda name, step: steps.note(name), tell, guess)
     clock.lap("solving")
     progress("judging the result", 0.9)
     result = assess(inputs, found)
@@ -123,11 +124,18 @@ def _calibrate(
     return dataclasses.replace(result, timings=clock.laps)
 
 
-def _start(rig: Rig, recordings: Sequence[Measurements], clock: _Clock) -> tuple[Inputs, State]:
-    """What the estimate is made from, and where it starts: cameras give the motion, if there are any, else a LiDAR."""
+def _start(rig: Rig, recordings: Sequence[Measurements], clock: _Clock) -> tuple[Inputs, State, dict[Key, np.ndarray]]:
+    """What the estimate is made from, where it starts, and the guess at which stays what the data do not determine.
+
+    Cameras give the motion, if there are any, else a LiDAR.
+    """
     whole = inputs_for(rig, recordings)
     if not rig.cameras:
-        return _start_from_lidar(whole, clock)
+        state = state_from_lidar(whole)
+        clock.lap("first guess")
+        inputs, state, guess = with_robot(whole, state)
+        clock.lap("first state")
+        return inputs, state, guess
     bare = whole
     if rig.wheels or rig.lidars:
         seen = [dataclasses.replace(m, wheels=(), lidars=()) for m in recordings]
@@ -138,19 +146,10 @@ def _start(rig: Rig, recordings: Sequence[Measurements], clock: _Clock) -> tuple
     give_back()
     clock.lap("first state")
     if bare is whole:
-        return whole, state
-    inputs, state = with_robot(bare, state, whole)
+        return whole, state, state.values
+    inputs, settled, guess = with_robot(whole, first_pass(bare, state))
     clock.lap("wheels and LiDARs")
-    return inputs, state
-
-
-def _start_from_lidar(inputs: Inputs, clock: _Clock) -> tuple[Inputs, State]:
-    state = state_from_lidar(inputs)
-    clock.lap("first guess")
-    inputs, state = with_lidars(inputs, state)
-    state = dataclasses.replace(state, values=state.values | wheel_values(inputs, state))
-    clock.lap("first state")
-    return inputs, state
+    return inputs, settled, guess | state.values
 
 
 def first_state(inputs: Inputs, *guesses: Guess) -> State:
