@@ -100,7 +100,7 @@ def _calibrate(
     progress("finding a first guess", 0.0)
     keep_apart()
     give_back()
-    inputs, state = start(rig, recordings, clock.lap)
+    inputs, state, guess = start(rig, recordings, clock.lap)
     give_back()
     steps = _StepProgress(progress)
 
@@ -108,7 +108,7 @@ def _calibrate(
         if on_visit is not None:
             on_visit(visited(inputs, stage, problem, visit))
 
-    found = determine(inputs, state, lambda name, step: steps.note(name), tell)
+    found = determine(inputs, state, lambda name, step: steps.note(name), tell, guess)
     clock.lap("solving")
     progress("judging the result", 0.9)
     result = assess(inputs, found)

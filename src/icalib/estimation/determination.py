@@ -9,7 +9,7 @@ stays. How much the rest depends on where they are held is tried out, and is par
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from icalib.estimation.imu_model import N_INTRINSICS
 from icalib.estimation.prior_factor import Prior
 from icalib.estimation.problem import Problem
 from icalib.estimation.solver import Step, minimise
-from icalib.estimation.state import State
+from icalib.estimation.state import Key, State
 from icalib.estimation.tolerances import GUESS_SIGMA, OTHER_SIGMA
 from icalib.geometry import planes, so3
 
@@ -64,8 +64,10 @@ def determine(
     start: State,
     on_step: Callable[[str, Step], None] = lambda *_: None,
     on_visit: OnVisit = lambda *_: None,
+    guess: dict[Key, np.ndarray] | None = None,
 ) -> Determined:
-    """Estimates from `start`, again and again until what is undetermined stays so.
+    """Estimates from `start`, again and again until what is undetermined stays so: at `guess`, or if there is none at
+    `start`.
 
     Raises EstimationError where the data do not carry an estimate.
     """
@@ -74,12 +76,20 @@ def determine(
     for _ in range(MOST_ROUNDS):
         if undetermined.shape == found.problem.held.shape or not (undetermined.size or found.problem.held.size):
             break
+        begin = _as_guessed(found.problem, start, guess or {}, undetermined)
         del found  # before the next one takes as much memory
-        found = estimate(inputs, start, on_step, undetermined, on_visit)
+        found = estimate(inputs, begin, on_step, undetermined, on_visit)
         data, undetermined = _judge(inputs, found)
     held = found.problem.held if found.problem.held.size else np.zeros((inputs.layout.size, 0))
     shifts = np.array([_profile(inputs, found, u) for u in held.T]).reshape(-1, inputs.layout.size)
     return Determined(found, data, held, shifts)
+
+
+def _as_guessed(problem: Problem, start: State, guess: dict[Key, np.ndarray], held: np.ndarray) -> State:
+    """`start`, moved along the directions `held` (B, m) to where `guess` has them."""
+    way = border_difference(problem, replace(start, values=start.values | guess), start) / problem.tolerance
+    step = problem.tolerance * (held @ (held.T @ way))
+    return start.retract(problem.layout, np.zeros((len(start.seconds), 15)), step)
 
 
 def _judge(inputs: Inputs, found: Estimate) -> tuple[np.ndarray, np.ndarray]:

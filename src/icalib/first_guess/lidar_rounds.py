@@ -68,16 +68,13 @@ def state_from_lidar(inputs: Inputs) -> State:
 
 
 def with_lidars(inputs: Inputs, state: State) -> tuple[Inputs, State]:
-    """`inputs` with points of the LiDARs on planes, and `state`, which has the motion, with the values of both.
-
-    Raises EstimationError where a LiDAR shows no guess and the rig has none, or there are no planes.
-    """
-    state = replace(state, values=state.values | _lidar_values(inputs, state))
+    """`inputs` with points of the LiDARs on planes, and `state`, which has the motion and a guess of all, with the
+    planes, led on by the rounds. Raises EstimationError where there are no planes."""
     streams = inputs.measurements.lidars
     if any((s.plane >= 0).any() for s in streams):
         clouds = known_planes(streams)
         return with_clouds(inputs, clouds), replace(state, values=state.values | fitted_planes(inputs, state, clouds))
-    start, before = state, None
+    before = None
     noise = max(x.range_noise_m or FIRST_RANGE_M for x in inputs.rig.lidars)
     for k in range(ROUNDS):
         before = associate(streams, motion_of(inputs, state), round_search(k, noise), before)
@@ -85,17 +82,18 @@ def with_lidars(inputs: Inputs, state: State) -> tuple[Inputs, State]:
         state = replace(state, values=_without_planes(state) | before.values)
         if k < ROUNDS - 1:
             state = first_pass(inputs, state)
-    # Of the LiDARs what the rig gave stays, as does what the cameras gave.
-    kept = {key: start.values[key] for x in inputs.rig.lidars for key in given(inputs, x, NAMES)}
-    return inputs, replace(state, values=state.values | kept)
+    return inputs, state
 
 
 def _without_planes(state: State) -> dict[Key, np.ndarray]:
     return {key: value for key, value in state.values.items() if key[1] != "plane"}
 
 
-def _lidar_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
-    """Of all LiDARs: what is known already, what the rig gives, or what their scans show."""
+def lidar_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
+    """Of all LiDARs that `state` does not have, which has the motion: what the rig gives, or what their scans show.
+
+    Raises EstimationError where neither does.
+    """
     assert inputs.imu is not None
     out: dict[Key, np.ndarray] = {}
     for lidar, stream in zip(inputs.rig.lidars, inputs.measurements.lidars, strict=True):

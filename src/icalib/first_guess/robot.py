@@ -8,13 +8,12 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation.assembly import Inputs, motion_of
-from icalib.estimation.estimate import first_pass
 from icalib.estimation.lidar_binning import Motion
 from icalib.estimation.poses import assign_nodes, poses_at
 from icalib.estimation.robot import DRIVE, MOUNT, wheel_angles
 from icalib.estimation.state import Key, State
 from icalib.first_guess.from_tracks import lens_start
-from icalib.first_guess.lidar_rounds import given, with_lidars
+from icalib.first_guess.lidar_rounds import given, lidar_values, with_lidars
 from icalib.first_guess.wheel_poses import mount_guess, poses_offset
 from icalib.first_guess.wheels import drive_guess, wheel_offset, wheel_rates
 from icalib.measurements import WheelPoses, WheelStream
@@ -34,17 +33,18 @@ def wheel_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
     return out
 
 
-def with_robot(bare: Inputs, state: State, whole: Inputs) -> tuple[Inputs, State]:
-    """`whole` with the points of its LiDARs on planes, and where the solver starts with it: from the motion that the
-    measurements of `bare`, which have no LiDAR and no wheels, give from `state` on.
+def with_robot(inputs: Inputs, settled: State) -> tuple[Inputs, State, dict[Key, np.ndarray]]:
+    """`inputs` with the points of its LiDARs on planes, where the solver starts with them and the wheels, `settled`
+    having the motion, and the guess of all: what the rig gives, and else what the motion shows.
 
+    The start is where rounds of association lead, which may stray from the guess where the motion shows nothing.
     Raises EstimationError where a sensor shows no guess, and the rig has none.
     """
-    settled = first_pass(bare, state)
-    settled = replace(settled, values=settled.values | wheel_values(whole, settled))
-    inputs, found = with_lidars(whole, settled) if whole.rig.lidars else (whole, settled)
-    # What the guess had of the cameras stays: where the motion shows nothing it is what the rig gave.
-    return inputs, replace(found, values=found.values | state.values)
+    state = replace(settled, values=settled.values | lidar_values(inputs, settled) | wheel_values(inputs, settled))
+    guess = state.values
+    if inputs.rig.lidars:
+        inputs, state = with_lidars(inputs, state)
+    return inputs, state, guess
 
 
 def given_cameras(inputs: Inputs) -> dict[Key, np.ndarray] | None:

@@ -9,10 +9,11 @@ import numpy as np
 
 from icalib.estimation.assembly import Inputs, host_times, inputs_for, nodes_for, resample, start_values, with_clouds
 from icalib.estimation.board import board_in
+from icalib.estimation.estimate import first_pass
 from icalib.estimation.nodes import first_nodes
 from icalib.estimation.state import Key, State
 from icalib.first_guess import Guess, initial_trajectory
-from icalib.first_guess.lidar_rounds import state_from_lidar, with_lidars
+from icalib.first_guess.lidar_rounds import state_from_lidar
 from icalib.first_guess.robot import given_cameras, wheel_values, with_robot
 from icalib.first_guess.several import initial_guesses
 from icalib.geometry.targets.base import BOARD
@@ -22,8 +23,8 @@ from icalib.rig import Rig
 
 def start(
     rig: Rig, recordings: Sequence[Measurements], lap: Callable[[str], None] = lambda stage: None
-) -> tuple[Inputs, State]:
-    """What the estimate is made from, and where it starts.
+) -> tuple[Inputs, State, dict[Key, np.ndarray]]:
+    """What the estimate is made from, where it starts, and the guess at which stays what the data do not determine.
 
     A target gives the motion, or else a LiDAR, if nothing is to be found of the cameras, or else points of the scene;
     what has no part in it is placed on that motion. Raises EstimationError where the recordings do not carry it.
@@ -41,26 +42,26 @@ def start(
     state = first_state(bare, *guesses)
     lap("first state")
     if bare is whole:
-        return whole, state
-    inputs, state = with_robot(bare, state, whole)
+        return whole, state, state.values
+    inputs, settled, guess = with_robot(whole, first_pass(bare, state))
     lap("wheels and LiDARs")
-    return inputs, state
+    return inputs, settled, guess | state.values
 
 
 def _start_from_lidar(
     whole: Inputs, recordings: Sequence[Measurements], cameras: dict[Key, np.ndarray], lap: Callable[[str], None]
-) -> tuple[Inputs, State]:
+) -> tuple[Inputs, State, dict[Key, np.ndarray]]:
     rig = replace(whole.rig, cameras=(), wheels=())
     alone = inputs_for(rig, [replace(m, cameras=(), tracks=(), wheels=()) for m in recordings])
     state = state_from_lidar(alone)
     lap("first guess")
-    alone, state = with_lidars(alone, state)
+    alone, state, guess = with_robot(alone, state)
     inputs = with_clouds(whole, alone.clouds)
     values = start_values(inputs, state.values | cameras)
     state = resample(replace(state, values=values), nodes_for(inputs, host_times(inputs, values)), inputs)
-    state = replace(state, values=state.values | wheel_values(inputs, state))
+    wheels = wheel_values(inputs, state)
     lap("wheels and LiDARs")
-    return inputs, state
+    return inputs, replace(state, values=state.values | wheels), guess | cameras | wheels
 
 
 def first_state(inputs: Inputs, *guesses: Guess) -> State:
