@@ -9,6 +9,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from icalib.calibration.robot import LidarResiduals, Plane, WheelResiduals
+
 Verdict = Literal["determined", "weak", "undetermined", "fixed"]
 
 
@@ -38,7 +40,7 @@ class SensorFit:
     """How well one kind of measurement is explained: chi^2 over post-fit degrees of freedom."""
 
     sensor: str
-    kind: str  # "corners", "gyroscope", "accelerometer", "bias walk"
+    kind: str  # "corners", "gyroscope", "accelerometer", "bias walk", "points", "wheels", "sideways slip", ...
     count: int  # scalar residuals used
     dof: float  # post-fit degrees of freedom
     chi2: float
@@ -143,6 +145,9 @@ class Calibration:
     versions: dict[str, str] = field(default_factory=dict)
     timings: dict[str, float] = field(default_factory=dict)  # stage -> seconds
     recordings: tuple[RecordingSpan, ...] = ()  # in order; arrays of seconds run through all of them
+    lidar_residuals: tuple[LidarResiduals, ...] = ()
+    wheel_residuals: tuple[WheelResiduals, ...] = ()
+    planes: tuple[Plane, ...] = ()  # that LiDARs see
 
     def recording_of(self, seconds: np.ndarray) -> np.ndarray:
         """(n,) which of `recordings` each instant of this result lies in."""
@@ -186,6 +191,21 @@ class Calibration:
     def cameras(self) -> tuple[str, ...]:
         """Names of the cameras, in the rig's order."""
         return self._of_type("camera")
+
+    @property
+    def lidars(self) -> tuple[str, ...]:
+        """Names of the LiDARs, in the rig's order."""
+        return self._of_type("lidar")
+
+    @property
+    def wheels(self) -> tuple[str, ...]:
+        """Names of the sets of wheels, in the rig's order."""
+        return self._of_type("wheels")
+
+    @property
+    def mounted(self) -> tuple[str, ...]:
+        """Names of all that have a pose on the body: cameras, LiDARs, wheels."""
+        return (*self.cameras, *self.lidars, *self.wheels)
 
     def save(self, folder: str | Path) -> None:
         """Writes calibration.yaml, result.json and result.npz (docs/files.md) into `folder`, as one set.

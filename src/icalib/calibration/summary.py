@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from icalib.calibration.relative import RelativePose, relative_poses
 from icalib.calibration.result import Calibration, ParameterGroup, SensorFit
 
 HEADER = """\
@@ -18,6 +19,8 @@ HEADER = """\
 # std: standard deviations, of rotation about the sensor's axes, of translation along the {body} axes. They include
 #   empirical_factor, by which parts of the recording disagree more than their noise explains; formal = std / factor.
 # T_scene_body: poses of a target's bodies, in the frame of that body whose pose is the identity.
+# relative: T_a_b takes coordinates in the frame of b to that of a. Its covariance, from the joint one of both, is of
+#   rotation about the axes of b and translation along those of a; where one is undetermined it is that of the guess.
 # verdict: determined, weak or undetermined by the data, or fixed by the rig file. Undetermined values are guesses.
 # The full covariance and all residuals are in result.npz.
 """
@@ -35,6 +38,7 @@ def calibration_yaml(calibration: Calibration) -> str:
         "converged": bool(c.converged),
         "sensors": sensors,
         "targets": targets,
+        "relative": {r.name: _relative(r) for r in relative_poses(c)},
         "undetermined": list(c.undetermined),
         "warnings": list(c.warnings),
         "notes": list(c.notes),
@@ -46,9 +50,11 @@ def calibration_yaml(calibration: Calibration) -> str:
 
 
 def parameter_keys(groups: tuple[ParameterGroup, ...]) -> dict[tuple[str, str], str]:
-    """(group, label) -> key among the parameters of one sensor: the label, with its group where two share it."""
+    """(group, label) -> key among the parameters of one sensor: the label, with its group where two share it, or where
+    it says nothing alone."""
     count = Counter(label for g in groups for label in g.labels)
-    return {(g.name, n): n if n and count[n] == 1 else f"{g.name}_{n}".rstrip("_") for g in groups for n in g.labels}
+    own = {(g.name, n): n if n and count[n] == 1 else f"{g.name}_{n}".rstrip("_") for g in groups for n in g.labels}
+    return own | {("radii", side): f"radius_{side}" for name, side in own if name == "radii"}
 
 
 def pose_key(c: Calibration) -> str:
@@ -65,6 +71,11 @@ def _sensor(c: Calibration, name: str) -> dict[str, Any]:
     fixed = {"rotation": ["fixed"] * 3, "translation": ["fixed"] * 3, "time_offset": "fixed"}
     pose = {"type": kind, "T_imu_sensor": np.eye(4).tolist(), "time_offset": 0.0}
     return pose | entry | {"std": still | entry["std"], "verdict": fixed | entry["verdict"]}
+
+
+def _relative(r: RelativePose) -> dict[str, Any]:
+    std = {"rotation": r.std[:3].tolist(), "translation": r.std[3:].tolist()}
+    return {"T": r.T.tolist(), "std": std, "covariance": r.covariance.tolist()}
 
 
 def _target(c: Calibration, name: str) -> dict[str, Any]:

@@ -65,6 +65,7 @@ def with_lidars(inputs: Inputs, state: State) -> tuple[Inputs, State]:
     Raises EstimationError where a LiDAR shows no guess and the rig has none, or there are no planes.
     """
     state = replace(state, values=state.values | _lidar_values(inputs, state))
+    inputs = replace(inputs, guess=state)
     streams = inputs.measurements.lidars
     if any((s.plane >= 0).any() for s in streams):
         clouds = known_planes(streams)

@@ -7,7 +7,7 @@ from math import asin, atan2, floor, isfinite, log10
 
 import numpy as np
 
-from icalib.calibration import Calibration, ParameterGroup, Verdict
+from icalib.calibration import Calibration, ParameterGroup, SensorFit, Verdict
 
 SHOWN_UNITS = {"rad": ("deg", 180.0 / np.pi), "m": ("mm", 1e3), "s": ("ms", 1e3)}
 TURNS = ("roll", "pitch", "yaw")
@@ -57,6 +57,14 @@ def shown(value: float, digits: int = 2) -> str:
     if value == 0.0 or not 1e-5 <= abs(value) < 1e6:
         return f"{value:.{digits - 1}e}" if value else "0"
     return f"{value:.{max(0, digits - 1 - floor(log10(abs(value))))}f}"
+
+
+def rms_words(fit: SensorFit) -> str:
+    """The RMS of what was measured, with its unit; empty where there is none. Angles here are small: mrad."""
+    if fit.rms is None:
+        return ""
+    unit, scale = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}.get(fit.unit, (fit.unit, 1.0))
+    return f"{shown(scale * fit.rms, 3)} {unit}".rstrip()
 
 
 def _rows_of(group: ParameterGroup) -> list[Row]:
