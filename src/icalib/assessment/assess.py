@@ -56,7 +56,7 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
     found = determined.estimate
     problem, outcome = found.problem, found.outcome
     names = _column_names(inputs)
-    seen = observe(determined, names)
+    seen = observe(determined, names, [w.name for w in inputs.rig.wheels])
     empirical = _empirical_variance(inputs, found, np.diag(seen.covariance))
     groups = _groups(inputs, found, seen, empirical)
     judged = [_sensor_fit(f, found) for f in fits(problem, outcome)]

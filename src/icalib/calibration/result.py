@@ -48,6 +48,12 @@ class SensorFit:
     unit: str = ""
     rejected: int = 0  # corners set aside
 
+    @property
+    def chi2_per_dof(self) -> float | None:
+        """Near 1 where residuals are as large as their noise says. None where the fit leaves next to no freedom: dof
+        are sampled, and good to the root of the count."""
+        return float(self.chi2 / self.dof) if self.dof > np.sqrt(self.count) else None
+
 
 @dataclass(frozen=True)
 class CornerResiduals:

@@ -14,8 +14,7 @@ from icalib.calibration.result import Calibration, ParameterGroup, SensorFit
 HEADER = """\
 # Calibration by icalib {version}. Lengths in m, times in s, angles in rad, image quantities in px.
 # {key} takes coordinates in the sensor's frame to the {body} frame: p_{body} = {key} p_sensor.
-#   (Kalibr's T_cam_imu is the inverse; see camchain-imucam.yaml.)
-# time_offset: t_{body} = t_sensor + time_offset.
+{kalibr}# time_offset: t_{body} = t_sensor + time_offset.
 # std: standard deviations, of rotation about the sensor's axes, of translation along the {body} axes. They include
 #   empirical_factor, by which parts of the recording disagree more than their noise explains; formal = std / factor.
 # T_scene_body: poses of a target's bodies, in the frame of that body whose pose is the identity.
@@ -24,6 +23,7 @@ HEADER = """\
 # verdict: determined, weak or undetermined by the data, or fixed by the rig file. Undetermined values are guesses.
 # The full covariance and all residuals are in result.npz.
 """
+KALIBR = "#   (Kalibr's T_cam_imu is the inverse; see camchain-imucam.yaml.)\n"
 _OWN_KEY = ("rotation", "translation", "time_offset")
 
 
@@ -45,7 +45,9 @@ def calibration_yaml(calibration: Calibration) -> str:
         "fits": [_fit(f) for f in c.fits],
     }
     body = c.body if c.imu is None else "imu"
-    header = HEADER.format(version=c.versions.get("icalib", "of unknown version"), key=pose_key(c), body=body)
+    kalibr = KALIBR if c.cameras else ""
+    version = c.versions.get("icalib", "of unknown version")
+    header = HEADER.format(version=version, key=pose_key(c), body=body, kalibr=kalibr)
     return header + yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=1000, allow_unicode=True)
 
 
@@ -120,7 +122,7 @@ def _factor(group: ParameterGroup) -> np.ndarray | None:
 
 def _fit(f: SensorFit) -> dict[str, Any]:
     fit: dict[str, Any] = {"sensor": f.sensor, "kind": f.kind, "count": int(f.count), "dof": float(f.dof)}
-    fit |= {"chi2": float(f.chi2), "chi2_per_dof": float(f.chi2 / f.dof) if f.dof > 0 else None}
+    fit |= {"chi2": float(f.chi2), "chi2_per_dof": f.chi2_per_dof}
     if f.rms is not None:
         fit |= {"rms": float(f.rms), "unit": f.unit, "rejected": int(f.rejected)}
     return fit

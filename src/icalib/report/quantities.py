@@ -59,6 +59,11 @@ def shown(value: float, digits: int = 2) -> str:
     return f"{value:.{max(0, digits - 1 - floor(log10(abs(value))))}f}"
 
 
+def chi2_words(fit: SensorFit) -> str:
+    """chi^2 over the degrees of freedom that the fit left over."""
+    return "no freedom left" if fit.chi2_per_dof is None else shown(fit.chi2_per_dof, 3)
+
+
 def rms_words(fit: SensorFit) -> str:
     """The RMS of what was measured, with its unit; empty where there is none. Angles here are small: mrad."""
     if fit.rms is None:
@@ -93,7 +98,8 @@ def _names(group: ParameterGroup) -> list[str]:
         return [group.name.replace("_", " ")]
     if group.name in ("intrinsics", "distortion"):
         return list(group.labels)
-    return [f"{group.name} {label}".replace("_", " ") for label in group.labels]
+    one = {"radii": "radius"}.get(group.name, group.name)
+    return [f"{one} {label}".replace("_", " ") for label in group.labels]
 
 
 def _values(group: ParameterGroup, scale: float) -> list[float | None]:

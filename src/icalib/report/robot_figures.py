@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from icalib.calibration import Calibration, LidarResiduals, Plane, WheelResiduals
-from icalib.geometry.planes import tangents
 from icalib.report.plot import (
     COLORS,
     VIEW,
@@ -29,6 +28,7 @@ BINS = 60
 FEWEST_IN_BIN = 20
 WIDEST = 4.0  # of a scale of colours, in RMS of the result
 TOP = 5.0  # of a scale of residuals, in their RMS
+NEARLY_LEVEL = 0.1  # sine of a slope; below it a plane lies along the axes of the world
 _WALL = "#64748b"
 
 
@@ -105,16 +105,24 @@ def _map(cloud: tuple[np.ndarray, np.ndarray], top: float, walls: list[dict[str,
 
 
 def _outlines(planes: tuple[Plane, ...], points: np.ndarray, plane: np.ndarray) -> dict[str, Any]:
-    """The rectangle of each plane about its points, sides along its tangents; the pen is lifted between them."""
+    """The rectangle of each plane about its points, one side level; the pen is lifted between them."""
     pen = []
     for k, p in enumerate(planes):
         own = points[plane == k]
         if not len(own):
             continue
-        across = tangents(p.normal)
+        across = _level_axes(p.normal)
         flat = (own - p.point) @ across.T
         (u0, v0), (u1, v1) = flat.min(axis=0), flat.max(axis=0)
         corners = np.array([(u0, v0), (u1, v0), (u1, v1), (u0, v1), (u0, v0)])
         pen += [p.point + corners @ across, np.full((1, 3), np.nan)]
     path = np.concatenate(pen) if pen else np.zeros((0, 3))
     return path_3d(path, "planes", _WALL, line={"color": _WALL, "width": 2}, showlegend=False, hoverinfo="skip")
+
+
+def _level_axes(normal: np.ndarray) -> np.ndarray:
+    """(2, 3) unit vectors across a unit normal, the first of them level."""
+    level = np.array([-normal[1], normal[0], 0.0])
+    length = float(np.linalg.norm(level))
+    level = level / length if length > NEARLY_LEVEL else np.array([0.0, normal[2], -normal[1]]) / np.hypot(*normal[1:])
+    return np.stack([level, np.cross(normal, level)])
