@@ -289,7 +289,7 @@ def _warnings(
         if f.kind in ("corners", "features") and f.rejected > MANY_REJECTED * 0.5 * f.count:
             share = f.rejected / (f.rejected + 0.5 * f.count)
             yield f"{share:.0%} of the {f.kind} of {f.sensor} were set aside; look at its residuals in the report."
-    yield from robot_warnings(inputs, judged)
+    yield from robot_warnings(inputs.rig, judged)
     for g in groups:
         if g.name == "bloom" and abs(g.value[0]) > LARGE_BLOOM_PX:
             where = "in" if g.value[0] > 0.0 else "out"

@@ -16,7 +16,7 @@ from icalib.estimation.state import State
 from icalib.estimation.wheel_factor import IncrementFactor, RelativePoseFactor
 from icalib.geometry.planes import plane_of
 from icalib.measurements import LidarStream
-from icalib.rig import Wheels
+from icalib.rig import Rig, Wheels
 from icalib.timeline import Timeline
 
 MOST_POINTS = 200_000  # kept of all LiDARs together
@@ -147,10 +147,10 @@ def robot_notes(inputs: Inputs, found: Estimate) -> Iterator[str]:
         )
 
 
-def robot_warnings(inputs: Inputs, judged: list[SensorFit]) -> Iterator[str]:
+def robot_warnings(rig: Rig, judged: list[SensorFit]) -> Iterator[str]:
     """Where points or wheels leave more than their noise explains."""
-    lidars = {x.name: x for x in inputs.rig.lidars}
-    wheels = {w.name: w for w in inputs.rig.wheels}
+    lidars = {x.name: x for x in rig.lidars}
+    wheels = {w.name: w for w in rig.wheels}
     for f in judged:
         ratio = f.chi2 / max(f.dof, 1.0)
         if ratio <= LARGE_CHI2 or f.dof <= LEAST_DOF * np.sqrt(f.count):  # dof are sampled: few among many are noise
