@@ -222,7 +222,7 @@ def robot(calibration: Calibration) -> Calibration:
         fits=(*calibration.fits, *fits),
         lidar_residuals=(_points(rng),),
         wheel_residuals=(WheelResiduals("wheel0", labels, units, seconds, 1e-3 * whitened, whitened),),
-        planes=tuple(Plane(f"plane {k}", *map(np.array, wall), 9000 + k) for k, wall in enumerate(WALLS)),
+        planes=tuple(Plane(f"plane {k}", np.array(n), np.array(p), 9000 + k) for k, (n, p) in enumerate(WALLS)),
     )
 
 

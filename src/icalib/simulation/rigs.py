@@ -7,6 +7,7 @@ from typing import Literal, TypeVar
 
 import numpy as np
 
+from icalib.geometry.targets import NoTarget
 from icalib.rig import Camera, ImuSensor, Lidar, Parameter, Rig, Settings, Wheels
 from icalib.simulation.imu import rotation_from_vector
 from icalib.simulation.robot import SimLidar, SimWheels
@@ -102,7 +103,7 @@ def rig_for(
     return Rig(
         imu,
         tuple(camera(c) for c in scenario.cameras),
-        scenario.target,
+        scenario.target if scenario.cameras else NoTarget(),
         gravity=float(np.linalg.norm(GRAVITY_WORLD)),
         settings=settings_for(scenario) if settings is None else settings,
         lidars=tuple(lidar(s) for s in scenario.lidars),
