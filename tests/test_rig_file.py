@@ -300,6 +300,7 @@ CHARUCO = "{type: charuco, squares_x: 7, squares_y: 5, square_size: 0.04, marker
         ("splits: 0", "splits: -1", "settings.splits: must be a whole number of at least 0"),
         ("bloom: false", "bloom: 0", "settings.bloom: must be true or false, but is '0'"),
         ("bloom: false", "loss_scale: 0", "settings.loss_scale: must be above 0"),
+        ("bloom: false", "outlier_std: -1", "settings.outlier_std: must be 0 or above, but is -1"),
         ("gravity: 9.80665", "gravity: [", "this is not valid YAML"),
         ("gravity: 9.80665", "[1]: 9.8", "a name must be plain text"),
         ("type: imu", '"\\U99999999": 1', "is not valid YAML"),

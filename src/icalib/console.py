@@ -11,7 +11,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from icalib.calibration import Calibration
 from icalib.export.kalibr import camchain_name
-from icalib.report.console import bodies_words, table
+from icalib.report.console import bodies_words, relative_words, table
+from icalib.report.quantities import chi2_words, rms_words
 
 
 @contextmanager
@@ -39,11 +40,13 @@ def print_result(calibration: Calibration, folder: Path) -> None:
     console.print(table(calibration))
     if placed := bodies_words(calibration):
         console.print(f"  target: {placed}", markup=False)
+    for sentence in relative_words(calibration):
+        console.print(f"  {sentence}", markup=False)
     for f in calibration.fits:
-        ratio = f.chi2 / max(f.dof, 1.0)
-        rms = f", {f.rms:.3f} {f.unit} RMS, {f.rejected} set aside" if f.rms is not None else ""
+        rms = f", {rms_words(f)} RMS" if f.rms is not None else ""
+        rms += f", {f.rejected} set aside" if f.unit == "px" else ""
         console.print(
-            f"  {f.sensor} {f.kind}: chi^2 {ratio:.2f} per degree of freedom ({f.dof:.0f}){rms}", markup=False
+            f"  {f.sensor} {f.kind}: chi^2 per degree of freedom {chi2_words(f)} ({f.dof:.0f}){rms}", markup=False
         )
     for title, sentences in (
         ("Undetermined", calibration.undetermined),
@@ -53,5 +56,6 @@ def print_result(calibration: Calibration, folder: Path) -> None:
         for sentence in sentences:
             console.print(f"{title}: {sentence}", markup=False)
     console.print(f"Status: {calibration.status}", markup=False)
-    written = [camchain_name(calibration), *(["imu.yaml"] if calibration.imu else []), "report.html"]
+    chain = [camchain_name(calibration)] if calibration.cameras else []
+    written = [*chain, *(["imu.yaml"] if calibration.imu else []), "report.html"]
     console.print(f"Wrote {folder / 'calibration.yaml'}, {', '.join(written)}.", markup=False)

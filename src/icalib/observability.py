@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,14 @@ MISSING_MOTION = {
     "tilt": "turn the rig through larger angles, so that gravity is felt on every axis",
     "shape": "show the target from more sides and closer",
     "bloom": "show the target from more distances",
+    "radii": "drive further",
+    "baseline": "turn more, both ways",
+}
+# Of wheels, which stay on the ground.
+ON_THE_GROUND = {
+    "translation": "turn, and drive over ramps: on a flat floor wheels do not show how high they are",
+    "rotation": "drive over ramps: on a flat floor wheels do not show how they are tilted",
+    "time_offset": "speed up, brake and turn more",
 }
 
 
@@ -34,15 +43,15 @@ class Observability:
     undetermined: tuple[str, ...]
 
 
-def observe(found: Determined, names: tuple[str, ...]) -> Observability:
+def observe(found: Determined, names: tuple[str, ...], wheels: Collection[str] = ()) -> Observability:
     """Verdicts by what the data alone say: determined where they know a parameter to a tolerance. `names` (B,) as in
-    "cam0.translation.x"."""
+    "cam0.translation.x"; `wheels`: which sensors are wheels."""
     directions = sparse_basis(found.held)
     share = (directions**2).sum(axis=1)
     verdicts: list[Verdict] = []
     for part, spread in zip(share, found.spread, strict=True):
         verdicts.append("undetermined" if part > SHARE else "determined" if spread <= 1.0 else "weak")
-    sentences = tuple(_sentence(u, names) for u in directions.T)
+    sentences = tuple(_sentence(u, names, wheels) for u in directions.T)
     return Observability(found.covariance, tuple(verdicts), sentences)
 
 
@@ -58,9 +67,10 @@ def sparse_basis(directions: np.ndarray, rounds: int = 50) -> np.ndarray:
     return directions @ turn if m else np.zeros((n, 0))
 
 
-def _sentence(direction: np.ndarray, names: tuple[str, ...]) -> str:
+def _sentence(direction: np.ndarray, names: tuple[str, ...], wheels: Collection[str]) -> str:
     order = np.argsort(-np.abs(direction))
     parts = [i for i in order if abs(direction[i]) >= NAMED][:4] or [order[0]]
     words = " with ".join(names[i].replace(".", " ") for i in parts)
-    kind = names[parts[0]].split(".")[1]
-    return f"{words}: not determined by this motion; {MISSING_MOTION.get(kind, 'move the rig more')}."
+    sensor, kind = names[parts[0]].split(".")[:2]
+    motions = MISSING_MOTION | (ON_THE_GROUND if sensor in wheels else {})
+    return f"{words}: not determined by this motion; {motions.get(kind, 'move the rig more')}."

@@ -11,11 +11,14 @@ from icalib.result_files import check_writable, write_files
 
 
 def write_outputs(calibration: Calibration, folder: str | Path) -> None:
-    """Writes the result, Kalibr's two files and the report into `folder`: all or none.
+    """Writes the result, Kalibr's two files and the report into `folder`: all or none. Without a camera Kalibr has no
+    camchain.
 
     Raises CalibrationError where the folder cannot be written.
     """
-    texts = {camchain_name(calibration): camchain(calibration), "report.html": report_html(calibration)}
+    texts = {"report.html": report_html(calibration)}
+    if calibration.cameras:
+        texts[camchain_name(calibration)] = camchain(calibration)
     if calibration.imu is not None:
         texts["imu.yaml"] = imu_yaml(calibration)
     files = calibration_files(calibration) | {name: text.encode() for name, text in texts.items()}

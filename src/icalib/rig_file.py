@@ -279,7 +279,15 @@ def _topic(found: dict[str, YamlValue]) -> str | None:
 def _settings(value: YamlValue) -> Settings:
     kinds = get_type_hints(Settings)
     found = value.record((), tuple(kinds))
-    return Settings(**{name: _setting(given, kinds[name]) for name, given in found.items()})
+    return Settings(
+        **{
+            name: given.not_negative() if name in _MAY_BE_ZERO else _setting(given, kinds[name])
+            for name, given in found.items()
+        }
+    )
+
+
+_MAY_BE_ZERO = ("outlier_std", "outlier_min_px")
 
 
 def _setting(value: YamlValue, kind: Any) -> Any:

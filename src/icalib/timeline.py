@@ -41,9 +41,13 @@ class Timeline:
         counts = [p.images[camera].stop - p.images[camera].start for p in self.parts]
         return np.repeat(np.arange(len(counts)), counts)
 
+    def recording_of(self, seconds: np.ndarray) -> np.ndarray:
+        """(n,) the recording that each of the joined seconds lies in, at all of which the IMU was running."""
+        return np.searchsorted([p.begin for p in self.parts[1:]], seconds, side="right")
+
     def words(self, second: float) -> str:
         """How a sentence names an instant of the joined clock at which the IMU was running."""
-        k = int(np.searchsorted([p.begin for p in self.parts[1:]], second, side="right"))
+        k = int(self.recording_of(np.array(second)))
         own = f"{second - self.parts[k].begin:.3f} s"
         return own if len(self.parts) == 1 else f"{own} of {self.parts[k].name}"
 

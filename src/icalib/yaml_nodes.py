@@ -112,6 +112,12 @@ class YamlValue:
             self.fail(f"must be above 0, but is {value:g}.")
         return value
 
+    def not_negative(self) -> float:
+        value = self.number()
+        if value < 0:
+            self.fail(f"must be 0 or above, but is {value:g}.")
+        return value
+
     def whole(self, least: int) -> int:
         """A whole number that is at least `least`."""
         self.number()

@@ -3,6 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import re
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,12 +19,15 @@ from icalib.calibration import (
     CornerResiduals,
     ImuResiduals,
     Iteration,
+    LidarResiduals,
     ParameterGroup,
+    Plane,
     SensorFit,
     Trajectory,
+    WheelResiduals,
 )
 from icalib.geometry.targets import AprilGrid
-from icalib.rig import Camera, ImuNoise, ImuSensor, Parameter, Rig, Settings
+from icalib.rig import Camera, ImuNoise, ImuSensor, Lidar, Parameter, Rig, Settings, Wheels
 from icalib.rig_file import rig_to_dict
 
 NODES, CORNERS_PER_IMAGE = 300, 34
@@ -38,7 +47,10 @@ SIZES = {  # tangent size, unit, labels, formal standard deviation
     "bloom": ("px", ("bloom",), 3e-3),
     "shape": ("m", ("bow_xx", "bow_xy", "bow_yy"), 2e-5),
     "tilt": ("rad", ("x", "y"), 5e-5),
+    "radii": ("m", ("left", "right"), 4e-5),
+    "baseline": ("m", ("baseline",), 5e-4),
 }
+LIDAR, WHEELS = Lidar("lidar0", "lidar0"), Wheels("wheel0", "wheel0/rates.csv")
 
 
 @pytest.fixture(scope="session")
@@ -179,3 +191,112 @@ def _iterations():
             cost, damping = (
                 (2e4 + 0.08 * (cost - 2e4), 0.0 if k > 2 else 0.1 * damping) if accepted else (cost, damping)
             )
+
+
+ROBOT_POSES = {"lidar0": ([2.0, -1.5, 8.0], [0.02, 0.03, 0.18]), "wheel0": ([3.0, 2.0, -3.0], [-0.15, 0.04, -0.33])}
+WALLS = (([1.0, 0.0, 0.0], [6.0, 0.5, 1.0]), ([0.0, -1.0, 0.0], [0.0, 5.0, 1.2]), ([0.0, 0.0, 1.0], [0.3, 0.2, 0.0]))
+
+
+@pytest.fixture(scope="session")
+def robot(calibration: Calibration) -> Calibration:
+    """The same with a LiDAR, which sees two walls and the floor, and wheels."""
+    rng, rig = np.random.default_rng(8), dataclasses.replace(_rig(), lidars=(LIDAR,), wheels=(WHEELS,))
+    groups = list(calibration.groups)
+    for name, (rpy, position) in ROBOT_POSES.items():
+        R = Rotation.from_euler("xyz", rpy, degrees=True).as_matrix()
+        values: dict[str, object] = {"rotation": R, "translation": position, "time_offset": [-0.01]}
+        values |= {"radii": [0.1, 0.102], "baseline": [0.42]} if name == "wheel0" else {}
+        groups += [_group(groups, name, key, value, False) for key, value in values.items()]
+    names = tuple(f"{g.sensor}.{g.name}.{n}" for g in groups if g.columns for n in g.labels)
+    seconds = 0.05 * np.arange(NODES - 1)
+    whitened = rng.normal(size=(len(seconds), 4))
+    labels, units = ("left", "right", "sideways", "upwards"), ("rad", "rad", "m", "m")
+    fits = (SensorFit("lidar0", "points", 40000, 39900.0, 40100.0, 0.03, "m"),)
+    fits += (SensorFit("wheel0", "sideways slip", 299, 297.0, 310.0, 1.1e-3, "m"),)
+    return dataclasses.replace(
+        calibration,
+        groups=tuple(groups),
+        covariance=_covariance(tuple(groups), rng),
+        covariance_names=names,
+        rig=rig_to_dict(rig),
+        fits=(*calibration.fits, *fits),
+        lidar_residuals=(_points(rng),),
+        wheel_residuals=(WheelResiduals("wheel0", labels, units, seconds, 1e-3 * whitened, whitened),),
+        planes=tuple(Plane(f"plane {k}", np.array(n), np.array(p), 9000 + k) for k, (n, p) in enumerate(WALLS)),
+    )
+
+
+@pytest.fixture(scope="session")
+def without_cameras(robot: Calibration) -> Calibration:
+    """What is left of it where there is neither camera nor target."""
+    gone = (*POSES, "board0")
+    groups, columns = [], []
+    for g in robot.groups:
+        if g.sensor not in gone and g.columns:
+            groups.append(dataclasses.replace(g, columns=tuple(range(len(columns), len(columns) + len(g.columns)))))
+            columns += g.columns
+    rig = {"sensors": {n: s for n, s in robot.rig["sensors"].items() if n not in gone}}
+    return dataclasses.replace(
+        robot,
+        groups=tuple(groups),
+        covariance=robot.covariance[np.ix_(columns, columns)],
+        covariance_names=tuple(robot.covariance_names[k] for k in columns),
+        fits=tuple(f for f in robot.fits if f.sensor not in gone),
+        corner_residuals=(),
+        undetermined=(),
+        rig=rig,
+    )
+
+
+def _points(rng: np.random.Generator) -> LidarResiduals:
+    """Points of walls about the LiDAR, which is at the origin, with noise along the walls' normals."""
+    n = 6000
+    plane = np.arange(n, dtype=np.int32) % len(WALLS)
+    normal, point = (np.array([wall[i] for wall in WALLS])[plane] for i in (0, 1))
+    along = rng.uniform(-3.0, 3.0, (n, 3))
+    flat = point + along - np.einsum("na,na,nb->nb", along, normal, normal)
+    residual, first = 0.03 * rng.normal(size=n), 0.2 * rng.normal(size=n)
+    world, first_world = (flat + r[:, None] * normal for r in (residual, first))
+    seconds, sigma = np.sort(rng.uniform(0.0, 15.0, n)), np.full(n, 0.03)
+    columns = (np.linalg.norm(world, axis=1), sigma, world, residual, first_world, first)
+    return LidarResiduals("lidar0", 150, 90_000, 40_000, seconds, plane, *(x.astype(np.float32) for x in columns))
+
+
+@pytest.fixture(scope="session", name="same")
+def _same_fixture() -> Callable[[Any, Any], bool]:
+    return _same
+
+
+def _same(a: Any, b: Any) -> bool:
+    """Equal in type, shape and every bit."""
+    if isinstance(a, np.ndarray):
+        return isinstance(b, np.ndarray) and a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+    if dataclasses.is_dataclass(a):
+        return type(a) is type(b) and all(_same(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a))
+    if isinstance(a, tuple | list):
+        return type(a) is type(b) and len(a) == len(b) and all(map(_same, a, b))
+    return type(a) is type(b) and a == b
+
+
+@pytest.fixture
+def assert_drawn(tmp_path: Path) -> Callable[[str, set[str]], None]:
+    """Fails where a browser finds an error in a report, or leaves one of its figures undrawn."""
+    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if chromium is None:
+        pytest.skip("no chromium is installed; install one to have the report drawn")
+    file = tmp_path / "report.html"
+    flags = (
+        "--headless --no-sandbox --disable-quic --no-first-run --disable-background-networking "
+        "--disable-component-update --disable-sync --use-angle=swiftshader --enable-unsafe-swiftshader "
+        "--enable-logging=stderr --v=0 --dump-dom --virtual-time-budget=8000"
+    )
+
+    def draw(text: str, figures: set[str]) -> None:
+        file.write_text(text, encoding="utf-8")
+        command = [chromium, *flags.split(), f"--user-data-dir={tmp_path / 'profile'}", file.as_uri()]
+        found = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+        assert not re.findall(r"CONSOLE.*(?:Error|error).*", found.stderr)
+        for name in figures:
+            assert re.search(rf'<div class="plot [^"]*js-plotly-plot[^"]*" id="{name}"', found.stdout), name
+
+    return draw

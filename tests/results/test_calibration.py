@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +17,6 @@ from icalib.calibration import Calibration, load_calibration
 from icalib.errors import CalibrationError
 
 
-def same(a: Any, b: Any) -> bool:
-    """Equal in type, shape and every bit."""
-    if isinstance(a, np.ndarray):
-        return isinstance(b, np.ndarray) and a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
-    if dataclasses.is_dataclass(a):
-        return type(a) is type(b) and all(same(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a))
-    if isinstance(a, tuple | list):
-        return type(a) is type(b) and len(a) == len(b) and all(map(same, a, b))
-    return type(a) is type(b) and a == b
-
-
 @pytest.fixture
 def saved(calibration: Calibration, tmp_path: Path) -> Path:
     folder = tmp_path / "made" / "for" / "it"
@@ -34,11 +24,13 @@ def saved(calibration: Calibration, tmp_path: Path) -> Path:
     return folder
 
 
-def test_round_trip_is_exact(calibration: Calibration, saved: Path):
+def test_round_trip_is_exact(calibration: Calibration, saved: Path, same: Callable[[Any, Any], bool]):
     assert same(load_calibration(saved), calibration)
 
 
-def test_round_trip_of_what_is_not_finite_or_empty(calibration: Calibration, tmp_path: Path):
+def test_round_trip_of_what_is_not_finite_or_empty(
+    calibration: Calibration, tmp_path: Path, same: Callable[[Any, Any], bool]
+):
     g = calibration.groups[0]
     groups = (dataclasses.replace(g, std=np.array([np.inf, np.nan, 5e-324])), *calibration.groups[1:])
     odd = dataclasses.replace(calibration, groups=groups, iterations=(), warnings=())

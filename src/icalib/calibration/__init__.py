@@ -1,5 +1,6 @@
 """The result of a calibration: values with standard deviations and verdicts, saved and loaded whole."""
 
+from icalib.calibration.relative import RelativePose, relative_pose, relative_poses
 from icalib.calibration.result import (
     Calibration,
     CornerResiduals,
@@ -12,6 +13,7 @@ from icalib.calibration.result import (
     Verdict,
     Visited,
 )
+from icalib.calibration.robot import LidarResiduals, Plane, WheelResiduals
 from icalib.calibration.saving import calibration_files, load_calibration
 
 __all__ = [
@@ -19,12 +21,18 @@ __all__ = [
     "CornerResiduals",
     "ImuResiduals",
     "Iteration",
+    "LidarResiduals",
     "ParameterGroup",
+    "Plane",
     "RecordingSpan",
+    "RelativePose",
     "SensorFit",
     "Trajectory",
     "Verdict",
     "Visited",
+    "WheelResiduals",
     "calibration_files",
     "load_calibration",
+    "relative_pose",
+    "relative_poses",
 ]

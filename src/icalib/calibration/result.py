@@ -9,6 +9,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from icalib.calibration.robot import LidarResiduals, Plane, WheelResiduals
+
 Verdict = Literal["determined", "weak", "undetermined", "fixed"]
 
 
@@ -38,13 +40,19 @@ class SensorFit:
     """How well one kind of measurement is explained: chi^2 over post-fit degrees of freedom."""
 
     sensor: str
-    kind: str  # "corners", "gyroscope", "accelerometer", "bias walk"
+    kind: str  # "corners", "gyroscope", "accelerometer", "bias walk", "points", "wheels", "sideways slip", ...
     count: int  # scalar residuals used
     dof: float  # post-fit degrees of freedom
     chi2: float
     rms: float | None = None  # of the raw residual, in `unit`
     unit: str = ""
     rejected: int = 0  # corners set aside
+
+    @property
+    def chi2_per_dof(self) -> float | None:
+        """Near 1 where residuals are as large as their noise says. None where the fit leaves next to no freedom: dof
+        are sampled, and good to the root of the count."""
+        return float(self.chi2 / self.dof) if self.dof > np.sqrt(self.count) else None
 
 
 @dataclass(frozen=True)
@@ -143,6 +151,9 @@ class Calibration:
     versions: dict[str, str] = field(default_factory=dict)
     timings: dict[str, float] = field(default_factory=dict)  # stage -> seconds
     recordings: tuple[RecordingSpan, ...] = ()  # in order; arrays of seconds run through all of them
+    lidar_residuals: tuple[LidarResiduals, ...] = ()
+    wheel_residuals: tuple[WheelResiduals, ...] = ()
+    planes: tuple[Plane, ...] = ()  # that LiDARs see
 
     def recording_of(self, seconds: np.ndarray) -> np.ndarray:
         """(n,) which of `recordings` each instant of this result lies in."""
@@ -186,6 +197,21 @@ class Calibration:
     def cameras(self) -> tuple[str, ...]:
         """Names of the cameras, in the rig's order."""
         return self._of_type("camera")
+
+    @property
+    def lidars(self) -> tuple[str, ...]:
+        """Names of the LiDARs, in the rig's order."""
+        return self._of_type("lidar")
+
+    @property
+    def wheels(self) -> tuple[str, ...]:
+        """Names of the sets of wheels, in the rig's order."""
+        return self._of_type("wheels")
+
+    @property
+    def mounted(self) -> tuple[str, ...]:
+        """Names of all that have a pose on the body: cameras, LiDARs, wheels."""
+        return (*self.cameras, *self.lidars, *self.wheels)
 
     def save(self, folder: str | Path) -> None:
         """Writes calibration.yaml, result.json and result.npz (docs/files.md) into `folder`, as one set.

@@ -22,6 +22,7 @@ from icalib.calibration.result import (
     SensorFit,
     Trajectory,
 )
+from icalib.calibration.robot import LidarResiduals, Plane, WheelResiduals
 from icalib.calibration.summary import calibration_yaml
 from icalib.errors import CalibrationError
 from icalib.result_files import read_file
@@ -68,20 +69,31 @@ def _plain(c: Calibration, arrays: bytes) -> dict[str, Any]:
         "fits": [dataclasses.asdict(f) for f in c.fits],
         "recordings": [dataclasses.asdict(r) for r in c.recordings],
         "corner_sensors": [r.sensor for r in c.corner_residuals],
+        "lidars": [_without_arrays(r) for r in c.lidar_residuals],
+        "wheels": [_without_arrays(r) for r in c.wheel_residuals],
+        "planes": [_lists(p) for p in c.planes],
         **{name: list(getattr(c, name)) for name in _TEXTS},
         **{name: getattr(c, name) for name in _PLAIN},
     }
 
 
-def _lists(group: ParameterGroup) -> dict[str, Any]:
+def _lists(group: ParameterGroup | Plane) -> dict[str, Any]:
     plain = {f.name: getattr(group, f.name) for f in dataclasses.fields(group)}
     return {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in plain.items()}
+
+
+def _without_arrays(residuals: LidarResiduals | WheelResiduals) -> dict[str, Any]:
+    arrays = _array_names(type(residuals))
+    return {f.name: getattr(residuals, f.name) for f in dataclasses.fields(residuals) if f.name not in arrays}
 
 
 def _npz(c: Calibration) -> bytes:
     arrays = {"covariance": c.covariance, "covariance_names": np.array(c.covariance_names, dtype=np.str_)}
     for r in c.corner_residuals:
         arrays |= {f"corners/{r.sensor}/{name}": getattr(r, name) for name in _array_names(CornerResiduals)}
+    for folder, found in (("lidars", c.lidar_residuals), ("wheels", c.wheel_residuals)):
+        for r in found:
+            arrays |= {f"{folder}/{r.sensor}/{name}": getattr(r, name) for name in _array_names(type(r))}
     arrays |= {f"imu_residuals/{name}": getattr(c.imu_residuals, name) for name in _array_names(ImuResiduals)}
     arrays |= {f"trajectory/{name}": getattr(c.trajectory, name) for name in _array_names(Trajectory)}
     for f in dataclasses.fields(Iteration):
@@ -93,7 +105,7 @@ def _npz(c: Calibration) -> bytes:
 
 
 def _array_names(kind: type) -> list[str]:
-    return [f.name for f in dataclasses.fields(kind) if f.name != "sensor"]
+    return [f.name for f in dataclasses.fields(kind) if f.type == "np.ndarray"]
 
 
 def _read_json(folder: Path) -> dict[str, Any]:
@@ -127,7 +139,7 @@ def _read_npz(folder: Path, plain: dict[str, Any]) -> dict[str, np.ndarray]:
 
 
 def _build(plain: dict[str, Any], arrays: dict[str, np.ndarray]) -> Calibration:
-    def of(kind: type, prefix: str) -> dict[str, np.ndarray]:
+    def of(kind: type, prefix: str) -> dict[str, Any]:
         return {name: arrays[f"{prefix}/{name}"] for name in _array_names(kind)}
 
     steps = (arrays[f"iterations/{f.name}"].tolist() for f in dataclasses.fields(Iteration))
@@ -139,6 +151,15 @@ def _build(plain: dict[str, Any], arrays: dict[str, np.ndarray]) -> Calibration:
         corner_residuals=tuple(
             CornerResiduals(sensor=s, **of(CornerResiduals, f"corners/{s}")) for s in plain["corner_sensors"]
         ),
+        lidar_residuals=tuple(
+            LidarResiduals(**r, **of(LidarResiduals, f"lidars/{r['sensor']}")) for r in plain.get("lidars", [])
+        ),
+        wheel_residuals=tuple(
+            WheelResiduals(**_tuples(r), **of(WheelResiduals, f"wheels/{r['sensor']}")) for r in plain.get("wheels", [])
+        ),
+        planes=tuple(
+            Plane(p["name"], np.array(p["normal"]), np.array(p["point"]), p["count"]) for p in plain.get("planes", [])
+        ),
         imu_residuals=ImuResiduals(**of(ImuResiduals, "imu_residuals")),
         trajectory=Trajectory(**of(Trajectory, "trajectory")),
         recordings=tuple(RecordingSpan(**r) for r in plain.get("recordings", [])),
@@ -146,6 +167,10 @@ def _build(plain: dict[str, Any], arrays: dict[str, np.ndarray]) -> Calibration:
         **{name: tuple(plain[name]) for name in _TEXTS},
         **{name: plain[name] for name in _PLAIN},
     )
+
+
+def _tuples(plain: dict[str, Any]) -> dict[str, Any]:
+    return {name: tuple(v) if isinstance(v, list) else v for name, v in plain.items()}
 
 
 def _group(plain: dict[str, Any]) -> ParameterGroup:
@@ -168,5 +193,8 @@ def _check(c: Calibration) -> None:
         sizes |= {len(x) for x in (g.columns, g.factor) if x is not None}
         if sizes != {size} or (g.columns is not None and not all(0 <= k < n for k in g.columns)):
             raise ValueError(f"{g.sensor}.{g.name} does not have {size} entries throughout")
-    if not c.cameras:
-        raise ValueError("the rig has no camera")
+    if not (c.imu or c.cameras):
+        raise ValueError("the rig has neither IMU nor camera")
+    for r in c.lidar_residuals:
+        if len(r.plane) and not 0 <= r.plane.min() <= r.plane.max() < len(c.planes):
+            raise ValueError(f"{r.sensor} has points on planes that are not there")

@@ -8,19 +8,22 @@ from typing import Any
 import numpy as np
 import yaml
 
+from icalib.calibration.relative import RelativePose, relative_poses
 from icalib.calibration.result import Calibration, ParameterGroup, SensorFit
 
 HEADER = """\
 # Calibration by icalib {version}. Lengths in m, times in s, angles in rad, image quantities in px.
 # {key} takes coordinates in the sensor's frame to the {body} frame: p_{body} = {key} p_sensor.
-#   (Kalibr's T_cam_imu is the inverse; see camchain-imucam.yaml.)
-# time_offset: t_{body} = t_sensor + time_offset.
+{kalibr}# time_offset: t_{body} = t_sensor + time_offset.
 # std: standard deviations, of rotation about the sensor's axes, of translation along the {body} axes. They include
 #   empirical_factor, by which parts of the recording disagree more than their noise explains; formal = std / factor.
 # T_scene_body: poses of a target's bodies, in the frame of that body whose pose is the identity.
+# relative: T_a_b takes coordinates in the frame of b to that of a. Its covariance, from the joint one of both, is of
+#   rotation about the axes of b and translation along those of a; where one is undetermined it is that of the guess.
 # verdict: determined, weak or undetermined by the data, or fixed by the rig file. Undetermined values are guesses.
 # The full covariance and all residuals are in result.npz.
 """
+KALIBR = "#   (Kalibr's T_cam_imu is the inverse; see camchain-imucam.yaml.)\n"
 _OWN_KEY = ("rotation", "translation", "time_offset")
 
 
@@ -35,20 +38,25 @@ def calibration_yaml(calibration: Calibration) -> str:
         "converged": bool(c.converged),
         "sensors": sensors,
         "targets": targets,
+        "relative": {r.name: _relative(r) for r in relative_poses(c)},
         "undetermined": list(c.undetermined),
         "warnings": list(c.warnings),
         "notes": list(c.notes),
         "fits": [_fit(f) for f in c.fits],
     }
     body = c.body if c.imu is None else "imu"
-    header = HEADER.format(version=c.versions.get("icalib", "of unknown version"), key=pose_key(c), body=body)
+    kalibr = KALIBR if c.cameras else ""
+    version = c.versions.get("icalib", "of unknown version")
+    header = HEADER.format(version=version, key=pose_key(c), body=body, kalibr=kalibr)
     return header + yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=1000, allow_unicode=True)
 
 
 def parameter_keys(groups: tuple[ParameterGroup, ...]) -> dict[tuple[str, str], str]:
-    """(group, label) -> key among the parameters of one sensor: the label, with its group where two share it."""
+    """(group, label) -> key among the parameters of one sensor: the label, with its group where two share it, or where
+    it says nothing alone."""
     count = Counter(label for g in groups for label in g.labels)
-    return {(g.name, n): n if n and count[n] == 1 else f"{g.name}_{n}".rstrip("_") for g in groups for n in g.labels}
+    own = {(g.name, n): n if n and count[n] == 1 else f"{g.name}_{n}".rstrip("_") for g in groups for n in g.labels}
+    return own | {("radii", side): f"radius_{side}" for name, side in own if name == "radii"}
 
 
 def pose_key(c: Calibration) -> str:
@@ -65,6 +73,11 @@ def _sensor(c: Calibration, name: str) -> dict[str, Any]:
     fixed = {"rotation": ["fixed"] * 3, "translation": ["fixed"] * 3, "time_offset": "fixed"}
     pose = {"type": kind, "T_imu_sensor": np.eye(4).tolist(), "time_offset": 0.0}
     return pose | entry | {"std": still | entry["std"], "verdict": fixed | entry["verdict"]}
+
+
+def _relative(r: RelativePose) -> dict[str, Any]:
+    std = {"rotation": r.std[:3].tolist(), "translation": r.std[3:].tolist()}
+    return {"T": r.T.tolist(), "std": std, "covariance": r.covariance.tolist()}
 
 
 def _target(c: Calibration, name: str) -> dict[str, Any]:
@@ -109,7 +122,7 @@ def _factor(group: ParameterGroup) -> np.ndarray | None:
 
 def _fit(f: SensorFit) -> dict[str, Any]:
     fit: dict[str, Any] = {"sensor": f.sensor, "kind": f.kind, "count": int(f.count), "dof": float(f.dof)}
-    fit |= {"chi2": float(f.chi2), "chi2_per_dof": float(f.chi2 / f.dof) if f.dof > 0 else None}
+    fit |= {"chi2": float(f.chi2), "chi2_per_dof": f.chi2_per_dof}
     if f.rms is not None:
         fit |= {"rms": float(f.rms), "unit": f.unit, "rejected": int(f.rejected)}
     return fit

@@ -51,7 +51,8 @@ SIZES = {"rotation": 3, "translation": 3, "time_offset": 1, "intrinsics": 4, "bl
 @dataclass(frozen=True)
 class Inputs:
     """What does not change from pass to pass. bodies: what of the target is used; parts: the recordings that
-    `measurements` were joined from; clouds: points of LiDARs on planes, without which these have no part in it."""
+    `measurements` were joined from; clouds: points of LiDARs on planes, without which these have no part in it; guess:
+    where everything was before points were looked at by the plane."""
 
     rig: Rig
     measurements: Measurements
@@ -61,6 +62,7 @@ class Inputs:
     tolerances: Tolerances
     parts: tuple[Part, ...]
     clouds: Clouds = NO_CLOUDS
+    guess: State | None = None
 
     @property
     def sensors(self) -> tuple[Camera | Lidar | Wheels, ...]:

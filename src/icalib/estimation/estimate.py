@@ -44,12 +44,13 @@ OnVisit = Callable[[str, Problem, Visit], None]  # told of the pass's name, its 
 
 @dataclass(frozen=True)
 class Estimate:
-    """The last pass: its problem, where the solver ended, and each camera's noise."""
+    """The last pass: its problem, where the solver ended, and the noise of each camera and each LiDAR."""
 
     problem: Problem
     outcome: Outcome
     noise: tuple[NoiseModel, ...]
     steps: tuple[tuple[str, Step], ...]  # of all passes, with the pass's name
+    ranging: tuple[LidarNoise, ...] = ()
 
 
 def estimate(
@@ -82,7 +83,7 @@ def estimate(
         tolerance = CONVERGED_DECREASE if last else EARLY_DECREASE
         outcome = minimise(problem, state, note, tolerance, partial(on_visit, name, problem))
         if last:
-            return Estimate(problem, outcome, tuple(models), tuple(history))
+            return Estimate(problem, outcome, tuple(models), tuple(history), tuple(ranging))
         if name == "first":
             keep = [
                 _inliers(f, out, rig.settings)

@@ -70,6 +70,7 @@ def state_from_lidar(inputs: Inputs) -> State:
 def with_lidars(inputs: Inputs, state: State) -> tuple[Inputs, State]:
     """`inputs` with points of the LiDARs on planes, and `state`, which has the motion and a guess of all, with the
     planes, led on by the rounds. Raises EstimationError where there are no planes."""
+    inputs = replace(inputs, guess=state)
     streams = inputs.measurements.lidars
     if any((s.plane >= 0).any() for s in streams):
         clouds = known_planes(streams)

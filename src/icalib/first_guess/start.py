@@ -56,7 +56,7 @@ def _start_from_lidar(
     state = state_from_lidar(alone)
     lap("first guess")
     alone, state, guess = with_robot(alone, state)
-    inputs = with_clouds(whole, alone.clouds)
+    inputs = replace(with_clouds(whole, alone.clouds), guess=alone.guess)
     values = start_values(inputs, state.values | cameras)
     state = resample(replace(state, values=values), nodes_for(inputs, host_times(inputs, values)), inputs)
     wheels = wheel_values(inputs, state)

@@ -6,8 +6,8 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from icalib.calibration import Calibration
-from icalib.report.quantities import rows, shown
+from icalib.calibration import Calibration, relative_poses
+from icalib.report.quantities import rows, rpy_deg, shown
 
 STYLES = {"determined": "green", "weak": "yellow", "undetermined": "bold red", "fixed": "dim"}
 
@@ -38,6 +38,17 @@ def bodies_words(calibration: Calibration) -> str:
         f"{len(placed)} bodies placed in the frame of {calibration.bodies[0]}, std up to {shown(np.rad2deg(turn))} "
         f"deg, {shown(1e3 * shift)} mm; poses are in calibration.yaml."
     )
+
+
+def relative_words(calibration: Calibration) -> list[str]:
+    """Where LiDARs and wheels are as seen from cameras and LiDARs, a line each."""
+    lines = []
+    for r in relative_poses(calibration):
+        turn, move = np.rad2deg(r.std[:3]), 1e3 * r.std[3:]
+        x, y, z = (f"{v:.1f} +- {shown(s)}" for v, s in zip(1e3 * r.T[:3, 3], move, strict=True))
+        a, b, c = (f"{v:.3f} +- {shown(s)}" for v, s in zip(rpy_deg(r.T[:3, :3]), turn, strict=True))
+        lines.append(f"{r.name}: x, y, z {x}, {y}, {z} mm; roll, pitch, yaw {a}, {b}, {c} deg")
+    return lines
 
 
 def _caption(calibration: Calibration) -> str:

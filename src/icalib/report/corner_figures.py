@@ -1,4 +1,4 @@
-"""Residuals of one camera's corners (predicted - measured), and of all cameras together."""
+"""Residuals of one camera's corners (predicted - measured)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from icalib.calibration import CornerResiduals
-from icalib.report.plot import COLORS, REJECTED, Figure, axis, dots, figure, line, numbers, thin
+from icalib.report.plot import REJECTED, Figure, axis, dots, figure, line, numbers, thin
 
 MOST_DOTS = 2500  # of each kind in one figure
 BINS = 60
@@ -120,27 +120,3 @@ def _arrows(at: np.ndarray, mean: np.ndarray) -> list[dict[str, Any]]:
         line(pieces[:, 0], pieces[:, 1], name, "#111827", hoverinfo="skip"),
         dots(foot[:, 0], foot[:, 1], "", "#111827", 3, showlegend=False, hoverinfo="skip"),
     ]
-
-
-def normalised_histogram(streams: tuple[CornerResiduals, ...]) -> Figure:
-    """Residuals over their standard deviation against the normal density, logarithmic so that tails show."""
-    edges = np.linspace(-6.0, 6.0, 97)
-    x = 0.5 * (edges[1:] + edges[:-1])
-    traces = []
-    for i, r in enumerate(streams):
-        z = (r.residual[~r.rejected] / r.sigma[~r.rejected, None]).ravel()
-        count, _ = np.histogram(z, edges)
-        density = count / max(1, len(z)) / (edges[1] - edges[0])
-        density = np.where(count > 0, density, np.nan)
-        step = {"color": COLORS[i % len(COLORS)], "width": 1.6, "shape": "hvh"}
-        traces.append(line(x, density, f"{r.sensor} (u and v)", COLORS[i % len(COLORS)], line=step))
-    normal = np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
-    traces.append(
-        line(x, normal, "standard normal", "#6b7280", line={"color": "#6b7280", "dash": "dash", "width": 1.4})
-    )
-    return figure(
-        traces,
-        380,
-        xaxis=axis("residual / standard deviation"),
-        yaxis=axis("density", type="log", range=[-5, 0], exponentformat="power"),
-    )

@@ -6,13 +6,17 @@ import json
 from importlib.resources import files
 from string import Template
 
-from icalib.calibration import Calibration
-from icalib.report import corner_figures, motion_figures, rig_figures, tables
+import numpy as np
+
+from icalib.calibration import Calibration, CornerResiduals
+from icalib.report import corner_figures, motion_figures, rig_figures, robot_figures, tables
+from icalib.report.histogram import normalised_histogram
 from icalib.report.plot import Figure
 from icalib.report.tables import Html, element
 
 _NO_UNDETERMINED = "None: the motion determines every direction."
 _NO_WARNINGS = "None."
+_MAPS = (("As the first guess had them", "map-before"), ("As calibrated", "map-after"))
 
 
 def report_html(calibration: Calibration) -> str:
@@ -21,13 +25,14 @@ def report_html(calibration: Calibration) -> str:
     figures = _figures(c)
     trust = tables.trust(c)
     words = {
-        "sensors": " + ".join((*(() if c.imu is None else (c.imu,)), *c.cameras)),
+        "sensors": " + ".join((*(() if c.imu is None else (c.imu,)), *c.mounted)),
         "size": tables.size_words(c),
         "body": "imu" if c.imu else c.body,
         "status": c.status,
         "answer": tables.TRUST[trust],
         "most_dots": corner_figures.MOST_DOTS,
         "most_nodes": motion_figures.MOST_NODES,
+        "most_points": robot_figures.MOST_IN_SPACE,
     }
     parts = {
         "trust": trust,
@@ -37,8 +42,13 @@ def report_html(calibration: Calibration) -> str:
         "notes": tables.sentences(c.notes, "", "None."),
         "fits": tables.fits(c),
         "parameters": tables.parameters(c),
-        "poses": Html(tables.poses(c) + tables.bodies(c)),
+        "poses": Html(tables.poses(c) + tables.relative(c) + tables.bodies(c)),
         "corner_figures": _corner_sections(c),
+        "without_corners": "" if _seen(c) else " hidden",
+        "lidar_figures": _lidar_sections(c),
+        "without_lidars": "" if c.lidar_residuals else " hidden",
+        "wheel_figures": _wheel_sections(c),
+        "without_wheels": "" if c.wheel_residuals else " hidden",
         "facts": tables.facts(c),
         "figures": script_json(figures),
         "css": resource("icalib.report", "page.css"),
@@ -53,7 +63,7 @@ def _figures(c: Calibration) -> dict[str, Figure]:
     """Every figure by the id of its place in the page."""
     found = {
         "rig": rig_figures.rig_picture(c),
-        "histogram": corner_figures.normalised_histogram(c.corner_residuals),
+        "histogram": normalised_histogram(c),
         "imu-residuals": motion_figures.imu_residuals(c),
         "trajectory": motion_figures.trajectory(c),
         "motion": motion_figures.motion(c),
@@ -62,22 +72,54 @@ def _figures(c: Calibration) -> dict[str, Figure]:
     }
     if c.imu is None:
         del found["imu-residuals"], found["motion"]
-    for i, r in enumerate(c.corner_residuals):
+    for i, r in enumerate(_seen(c)):
         width, height = c.rig["sensors"][r.sensor]["resolution"]
         found[f"plane-{i}"] = corner_figures.residual_plane(r)
         found[f"image-{i}"] = corner_figures.residuals_over_image(r, (width, height))
         found[f"time-{i}"] = corner_figures.residuals_over_time(r)
-    return found
+    for i, r in enumerate(c.lidar_residuals):
+        found[f"points-{i}"] = robot_figures.residuals_over_time(r)
+        found[f"distance-{i}"] = robot_figures.residuals_over_distance(r)
+    for i, r in enumerate(c.wheel_residuals):
+        found[f"wheels-{i}"] = robot_figures.wheel_panels(r)
+    return found | (robot_figures.plane_maps(c) if c.lidar_residuals else {})
+
+
+def _seen(c: Calibration) -> list[CornerResiduals]:
+    """Of the cameras that saw a target; those that follow points of the scene have no corners."""
+    return [r for r in c.corner_residuals if len(r.uv)]
 
 
 def _corner_sections(c: Calibration) -> Html:
     sections = []
-    for i, r in enumerate(c.corner_residuals):
+    for i, r in enumerate(_seen(c)):
         counts = f"{int((~r.rejected).sum())} corners used, {int(r.rejected.sum())} rejected"
         plots = [_place(f"{kind}-{i}", css) for kind, css in (("plane", ""), ("image", ""), ("time", "wide"))]
         head = element("h3", [tables.html(r.sensor), element("small", f" {counts}")])
         sections.append(Html(head + element("div", plots, "pair")))
     return Html("".join(sections))
+
+
+def _lidar_sections(c: Calibration) -> Html:
+    """The planes before and after, then each LiDAR."""
+    if not c.lidar_residuals:
+        return Html("")
+    maps = [element("div", [element("h3", title), _place(name, "")]) for title, name in _MAPS]
+    sections = [element("div", maps, "pair")]
+    for i, r in enumerate(c.lidar_residuals):
+        first, now = (1e3 * float(np.sqrt(np.mean(x.astype(np.float64) ** 2))) for x in (r.first_residual, r.residual))
+        counts = (
+            f"{r.points_used} of {r.points_read} points used; off their planes {first:.1f} mm RMS at first, "
+            f"{now:.1f} mm now"
+        )
+        head = element("h3", [tables.html(r.sensor), element("small", f" {counts}")])
+        plots = [_place(f"points-{i}", ""), _place(f"distance-{i}", "")]
+        sections.append(Html(head + element("div", plots, "pair")))
+    return Html("".join(sections))
+
+
+def _wheel_sections(c: Calibration) -> Html:
+    return Html("".join(element("h3", r.sensor) + _place(f"wheels-{i}", "") for i, r in enumerate(c.wheel_residuals)))
 
 
 def _place(name: str, css: str) -> Html:

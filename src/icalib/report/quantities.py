@@ -7,7 +7,7 @@ from math import asin, atan2, floor, isfinite, log10
 
 import numpy as np
 
-from icalib.calibration import Calibration, ParameterGroup, Verdict
+from icalib.calibration import Calibration, ParameterGroup, SensorFit, Verdict
 
 SHOWN_UNITS = {"rad": ("deg", 180.0 / np.pi), "m": ("mm", 1e3), "s": ("ms", 1e3)}
 TURNS = ("roll", "pitch", "yaw")
@@ -59,6 +59,19 @@ def shown(value: float, digits: int = 2) -> str:
     return f"{value:.{max(0, digits - 1 - floor(log10(abs(value))))}f}"
 
 
+def chi2_words(fit: SensorFit) -> str:
+    """chi^2 over the degrees of freedom that the fit left over."""
+    return "no freedom left" if fit.chi2_per_dof is None else shown(fit.chi2_per_dof, 3)
+
+
+def rms_words(fit: SensorFit) -> str:
+    """The RMS of what was measured, with its unit; empty where there is none. Angles here are small: mrad."""
+    if fit.rms is None:
+        return ""
+    unit, scale = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}.get(fit.unit, (fit.unit, 1.0))
+    return f"{shown(scale * fit.rms, 3)} {unit}".rstrip()
+
+
 def _rows_of(group: ParameterGroup) -> list[Row]:
     unit, scale = SHOWN_UNITS.get(group.unit, (group.unit, 1.0))
     names, values = _names(group), _values(group, scale)
@@ -85,7 +98,8 @@ def _names(group: ParameterGroup) -> list[str]:
         return [group.name.replace("_", " ")]
     if group.name in ("intrinsics", "distortion"):
         return list(group.labels)
-    return [f"{group.name} {label}".replace("_", " ") for label in group.labels]
+    one = {"radii": "radius"}.get(group.name, group.name)
+    return [f"{one} {label}".replace("_", " ") for label in group.labels]
 
 
 def _values(group: ParameterGroup, scale: float) -> list[float | None]:

@@ -8,29 +8,26 @@ from icalib.calibration import Calibration
 from icalib.report.plot import AXIS_COLORS, COLORS, VIEW, Figure, axis, figure, numbers, path_3d
 
 _PEN_UP = np.full((1, 3), np.nan)
+_ROUND = np.linspace(0.0, 2.0 * np.pi, 41)
 
 
 def rig_picture(c: Calibration) -> Figure:
-    """Frames of all sensors and the cameras' fields of view, in the imu frame."""
-    positions = np.array([c.T_imu_sensor(name)[:3, 3] for name in c.cameras])
-    spread = max(np.ptp(np.vstack([positions, np.zeros(3)]), axis=0).max(), 0.02)
-    frames = {c.body: np.eye(4)} | {name: c.T_imu_sensor(name) for name in c.cameras}
+    """Frames of all sensors, the cameras' fields of view, rings about LiDARs, and wheels, in the imu frame."""
+    frames = {c.body: np.eye(4)} | {name: c.T_imu_sensor(name) for name in c.mounted}
+    origins = np.array([T[:3, 3] for T in frames.values()])
+    spread = max(np.ptp(np.vstack([origins, np.zeros(3)]), axis=0).max(), 0.02)
     traces = [
         path_3d(
             _axis_line(frames, i, 0.25 * spread), "xyz"[i], AXIS_COLORS[i], line={"color": AXIS_COLORS[i], "width": 6}
         )
         for i in range(3)
     ]
-    traces += [
-        path_3d(
-            _frustum(c, name, 0.45 * spread),
-            name,
-            COLORS[i % len(COLORS)],
-            line={"color": COLORS[i % len(COLORS)], "width": 2},
-        )
-        for i, name in enumerate(c.cameras)
-    ]
-    origins = np.array([T[:3, 3] for T in frames.values()])
+    shapes = {name: _frustum(c, name, 0.45 * spread) for name in c.cameras}
+    shapes |= {name: _rings(0.3 * spread) for name in c.lidars}
+    shapes |= {name: _axle(c, name) for name in c.wheels}
+    for i, (name, pen) in enumerate(shapes.items()):
+        color, T = COLORS[i % len(COLORS)], frames[name]
+        traces.append(path_3d(pen @ T[:3, :3].T + T[:3, 3], name, color, line={"color": color, "width": 2}))
     traces.append(
         path_3d(
             origins, "sensors", "#111827", mode="markers+text", text=list(frames), marker={"size": 4}, showlegend=False
@@ -42,13 +39,35 @@ def rig_picture(c: Calibration) -> Figure:
     return figure(traces, 520, scene=scene | VIEW, margin={"l": 0, "r": 0, "t": 30, "b": 0})
 
 
+def _rings(radius: float) -> np.ndarray:
+    """Three circles about z, as a spinning LiDAR looks level, up and down."""
+    x, y = np.cos(_ROUND), np.sin(_ROUND)
+    tilted = ((np.cos(e), np.sin(e)) for e in np.deg2rad([-15.0, 0.0, 15.0]))
+    circles = [radius * np.stack([a * x, a * y, np.full_like(x, b)], axis=1) for a, b in tilted]
+    return np.vstack([part for circle in circles for part in (circle, _PEN_UP)])
+
+
+def _axle(c: Calibration, name: str) -> np.ndarray:
+    """The two wheels as discs, and the axle between them; nothing where radii and baseline are not known."""
+    known = {g.name: g.value for g in c.groups if g.sensor == name}
+    if "radii" not in known:
+        return _PEN_UP
+    left, right = (np.array([0.0, s * 0.5 * known["baseline"][0], 0.0]) for s in (1.0, -1.0))
+    rim = np.stack([np.cos(_ROUND), np.zeros_like(_ROUND), np.sin(_ROUND)], axis=1)
+    discs = [(hub + r * rim, hub + r * rim[::5]) for hub, r in zip((left, right), known["radii"], strict=True)]
+    pen = [left, right, _PEN_UP]
+    for hub, (circle, ends) in zip((left, right), discs, strict=True):
+        pen += [circle, _PEN_UP, *(np.stack([hub, end, _PEN_UP[0]]) for end in ends)]
+    return np.vstack(pen)
+
+
 def _axis_line(frames: dict[str, np.ndarray], i: int, length: float) -> np.ndarray:
     pieces = [np.stack([T[:3, 3], T[:3, 3] + length * T[:3, i]]) for T in frames.values()]
     return np.concatenate([np.vstack([p, _PEN_UP]) for p in pieces])
 
 
 def _frustum(c: Calibration, name: str, depth: float) -> np.ndarray:
-    """Edges of the field of view to `depth`, distortion left out, kept inside 60 deg of the axis."""
+    """Edges of the field of view to `depth`, in the camera's frame, without distortion, inside 60 deg of the axis."""
     fx, fy, cx, cy = c.group(name, "intrinsics").value
     width, height = c.rig["sensors"][name]["resolution"]
     u, v = np.array([0, width, width, 0]) - 0.5, np.array([0, 0, height, height]) - 0.5
@@ -56,17 +75,18 @@ def _frustum(c: Calibration, name: str, depth: float) -> np.ndarray:
     a, b = np.clip((u - cx) / fx, -widest, widest), np.clip((v - cy) / fy, -widest, widest)
     corners = depth * np.stack([a, b, np.ones(4)], axis=1)
     origin = np.zeros(3)
-    pen = np.vstack([corners, corners[:1], _PEN_UP, *(np.stack([origin, p, _PEN_UP[0]]) for p in corners)])
-    T = c.T_imu_sensor(name)
-    return pen @ T[:3, :3].T + T[:3, 3]
+    return np.vstack([corners, corners[:1], _PEN_UP, *(np.stack([origin, p, _PEN_UP[0]]) for p in corners)])
 
 
 def correlation(c: Calibration) -> Figure:
-    """Correlation coefficients of all estimated parameters, formal covariance."""
-    std = np.sqrt(np.diag(c.covariance))
+    """Correlation coefficients of all estimated parameters but planes, formal covariance."""
+    planes = {p.name for p in c.planes}
+    own = [i for i, name in enumerate(c.covariance_names) if name.split(".")[0] not in planes]
+    covariance = c.covariance[np.ix_(own, own)]
+    std = np.sqrt(np.diag(covariance))
     scale = np.where(std > 0.0, std, 1.0)
-    rho = c.covariance / np.outer(scale, scale)
-    names = [name.replace("time_offset.time_offset", "time_offset") for name in c.covariance_names]
+    rho = covariance / np.outer(scale, scale)
+    names = [c.covariance_names[i].replace("time_offset.time_offset", "time_offset") for i in own]
     heat = {
         "type": "heatmap",
         "z": numbers(np.round(rho, 3)),

@@ -7,8 +7,8 @@ from html import escape
 
 import numpy as np
 
-from icalib.calibration import Calibration, ParameterGroup, SensorFit
-from icalib.report.quantities import SHOWN_UNITS, rows, rpy_deg, shown, shown_groups, worst
+from icalib.calibration import Calibration, ParameterGroup, relative_poses
+from icalib.report.quantities import SHOWN_UNITS, chi2_words, rms_words, rows, rpy_deg, shown, shown_groups, worst
 
 TRUST = {
     "good": "Yes. The solver converged, the motion determines every parameter, and nothing calls for attention.",
@@ -124,26 +124,41 @@ def _body_row(c: Calibration, body: str) -> list[object]:
 
 
 def poses(c: Calibration) -> Html:
-    """T_imu_sensor of each camera, as a matrix to copy."""
-    blocks = []
-    for name in c.cameras:
-        lines = "\n".join("[" + ", ".join(f"{x: .9f}" for x in row) + "]" for row in c.T_imu_sensor(name))
-        blocks.append(element("figure", [element("figcaption", f"T_{c.body}_{name}"), element("pre", lines)]))
-    return element("div", blocks, "grid")
+    """T_imu_sensor of each sensor, as a matrix to copy."""
+    return element("div", [_matrix(f"T_{c.body}_{name}", c.T_imu_sensor(name)) for name in c.mounted], "grid")
+
+
+def _matrix(name: str, T: np.ndarray) -> Html:
+    lines = "\n".join("[" + ", ".join(f"{x: .9f}" for x in row) + "]" for row in T)
+    return element("figure", [element("figcaption", name), element("pre", lines)])
+
+
+def relative(c: Calibration) -> Html:
+    """Where LiDARs and wheels are as seen from cameras and LiDARs; empty where there are none."""
+    found = relative_poses(c)
+    if not found:
+        return Html("")
+    title = element("h3", "One sensor seen from another")
+    words = element(
+        "p",
+        "From the joint covariance of both, empirical factors included; the whole of it is in calibration.yaml. "
+        "T_a_b takes coordinates in the frame of b to that of a. Turns have their standard deviation about the axes of "
+        "b, positions along those of a; where one of the two is undetermined it is that of the guess.",
+    )
+    headers = ("", "x [mm]", "y [mm]", "z [mm]", "roll [deg]", "pitch [deg]", "yaw [deg]")
+    body = []
+    for r in found:
+        values = [*(1e3 * r.T[:3, 3]), *rpy_deg(r.T[:3, :3])]
+        std = [*(1e3 * r.std[3:]), *np.rad2deg(r.std[:3])]
+        body.append((r.name, *(f"{x:.3f} ± {shown(s)}" for x, s in zip(values, std, strict=True))))
+    matrices = element("div", [_matrix(r.name, r.T) for r in found], "grid")
+    return Html(title + words + table(headers, body, headers[1:]) + matrices)
 
 
 def fits(c: Calibration) -> Html:
     headers = ("sensor", "kind", "residuals", "post-fit dof", "chi2 / dof", "RMS", "rejected")
-    body = [(f.sensor, f.kind, f.count, f"{f.dof:.0f}", _ratio(f), _rms(f), f.rejected or "") for f in c.fits]
+    body = [(f.sensor, f.kind, f.count, f"{f.dof:.0f}", chi2_words(f), rms_words(f), f.rejected or "") for f in c.fits]
     return table(headers, body, headers[2:])
-
-
-def _ratio(f: SensorFit) -> str:
-    return shown(f.chi2 / f.dof, 3) if f.dof > 0.0 else "no freedom"
-
-
-def _rms(f: SensorFit) -> str:
-    return "" if f.rms is None else f"{shown(f.rms, 3)} {f.unit}".rstrip()
 
 
 def facts(c: Calibration) -> Html:
@@ -163,9 +178,16 @@ def facts(c: Calibration) -> Html:
 
 def size_words(c: Calibration) -> str:
     """How much was used, in a line."""
-    corners = sum(len(r.uv) for r in c.corner_residuals)
-    images = sum(len(r.seconds) for r in c.corner_residuals)
     whole = float(np.ptp(c.trajectory.seconds)) if len(c.trajectory.seconds) else 0.0
     several = f"{len(c.recordings)} recordings, " if len(c.recordings) > 1 else ""
     span = sum(r.end - r.start for r in c.recordings) if several else whole
-    return f"{several}{span:.1f} s, {images} images with {corners} corners, {len(c.trajectory.seconds)} nodes"
+    parts = [f"{several}{span:.1f} s"]
+    if c.cameras:
+        images = sum(len(r.seconds) for r in c.corner_residuals)
+        parts.append(f"{images} images with {sum(len(r.uv) for r in c.corner_residuals)} corners")
+    if c.lidar_residuals:
+        points = sum(r.points_used for r in c.lidar_residuals)
+        parts.append(f"{sum(r.scans for r in c.lidar_residuals)} scans with {points} points on {len(c.planes)} planes")
+    if c.wheel_residuals:
+        parts.append(f"{sum(len(r.seconds) for r in c.wheel_residuals)} stretches of wheel turns")
+    return ", ".join([*parts, f"{len(c.trajectory.seconds)} nodes"])

@@ -105,7 +105,7 @@ def rig_for(
     return Rig(
         imu,
         tuple(camera(c) for c in scenario.cameras),
-        scenario.target if scenario.board else NoTarget(),
+        scenario.target if scenario.board and scenario.cameras else NoTarget(),
         gravity=float(np.linalg.norm(GRAVITY_WORLD)),
         settings=settings_for(scenario) if settings is None else settings,
         lidars=tuple(lidar(s) for s in scenario.lidars),

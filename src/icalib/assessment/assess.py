@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 
+from icalib.assessment.robot import lidar_residuals, planes, robot_notes, robot_warnings, wheel_residuals
 from icalib.calibration import (
     Calibration,
     CornerResiduals,
@@ -55,7 +56,7 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
     found = determined.estimate
     problem, outcome = found.problem, found.outcome
     names = _column_names(inputs)
-    seen = observe(determined, names)
+    seen = observe(determined, names, [w.name for w in inputs.rig.wheels])
     empirical = _empirical_variance(inputs, found, np.diag(seen.covariance))
     groups = _groups(inputs, found, seen, empirical)
     judged = [_sensor_fit(f, found) for f in fits(problem, outcome)]
@@ -80,6 +81,9 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
         rates=_rates(inputs),
         versions=versions(),
         recordings=timeline.spans,
+        lidar_residuals=lidar_residuals(inputs, found, timeline),
+        wheel_residuals=wheel_residuals(inputs, found, timeline),
+        planes=planes(inputs, outcome.state),
     )
 
 
@@ -285,6 +289,7 @@ def _warnings(
         if f.kind in ("corners", "features") and f.rejected > MANY_REJECTED * 0.5 * f.count:
             share = f.rejected / (f.rejected + 0.5 * f.count)
             yield f"{share:.0%} of the {f.kind} of {f.sensor} were set aside; look at its residuals in the report."
+    yield from robot_warnings(inputs.rig, judged)
     for g in groups:
         if g.name == "bloom" and abs(g.value[0]) > LARGE_BLOOM_PX:
             where = "in" if g.value[0] > 0.0 else "out"
@@ -296,7 +301,7 @@ def _warnings(
     factors = [g.factor.max() for g in judged_groups if g.factor is not None]
     if factors and max(factors) > LARGE_FACTOR:
         yield (
-            f"parts of the recording disagree by up to {max(factors):.1f} times what corner and IMU noise explain; the "
+            f"parts of the recording disagree by up to {max(factors):.1f} times what noise explains; the "
             "standard deviations here include that factor, those of other programs would not."
         )
     if empirical is None:
@@ -319,6 +324,7 @@ def _notes(inputs: Inputs, found: Estimate, timeline: Timeline):
         if len(factor.stream.uv):
             yield f"{camera.name}: {_noise_words(model)}."
     yield from _feature_notes(found)
+    yield from robot_notes(inputs, found) if inputs.clouds.count else ()
 
 
 def _feature_notes(found: Estimate):

@@ -1,0 +1,187 @@
+"""What an estimate leaves of points on planes and of wheels, and what there is to say about it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from icalib.calibration import LidarResiduals, Plane, SensorFit, WheelResiduals
+from icalib.estimation.assembly import Inputs, motion_of
+from icalib.estimation.estimate import Estimate
+from icalib.estimation.lidar_binning import LidarNoise, Motion, in_world
+from icalib.estimation.lidar_factor import LidarFactor
+from icalib.estimation.nodes import usable
+from icalib.estimation.state import State
+from icalib.estimation.wheel_factor import IncrementFactor, RelativePoseFactor
+from icalib.geometry.planes import plane_of
+from icalib.measurements import LidarStream
+from icalib.rig import Rig, Wheels
+from icalib.timeline import Timeline
+
+MOST_POINTS = 200_000  # kept of all LiDARs together
+FEWEST_FITTED = 4
+LARGE_CHI2 = 2.0  # chi^2 per post-fit degree of freedom above this is worth a warning
+LEAST_DOF = 3.0  # times the square root of the number of residuals
+LABELS = {"wheels": ("left", "right"), "sideways slip": ("sideways",), "upwards slip": ("upwards",)} | {
+    "yaw": ("yaw",), "path": ("forward", "sideways"),
+}  # fmt: skip
+
+
+def planes(inputs: Inputs, state: State) -> tuple[Plane, ...]:
+    """Where the planes are."""
+    clouds = inputs.clouds
+    found = (state.values[key] for key in clouds.keys)
+    return tuple(
+        Plane(name, v[:3].copy(), v[3:].copy(), int(n))
+        for name, v, n in zip(clouds.names, found, clouds.points if clouds.count else (), strict=True)
+    )
+
+
+def lidar_residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> tuple[LidarResiduals, ...]:
+    """Of each LiDAR that takes part, evenly thinned."""
+    if not inputs.clouds.count:
+        return ()
+    state = found.outcome.state
+    now, first = motion_of(inputs, state), motion_of(inputs, inputs.guess or state)
+    values = np.array([state.values[key] for key in inputs.clouds.keys])
+    thinned = [_thinned(inputs, k, state) for k in range(len(inputs.rig.lidars))]
+    guessed = _fitted([(in_world(first, stream)[0], plane) for stream, plane in thinned], values)
+    out = []
+    for whole, (stream, plane), noise in zip(inputs.measurements.lidars, thinned, found.ranging, strict=True):
+        seconds = _seconds_of(stream, state)
+        world, residual, cosine = _on_planes(now, stream, values[plane])
+        first_world, first_residual, _ = _on_planes(first, stream, guessed[plane])
+        out.append(
+            LidarResiduals(
+                stream.name, len(whole.stamps_ns), len(whole.xyz), _used(found, stream.name),
+                timeline.shown(seconds, timeline.recording_of(seconds)), plane, np.linalg.norm(stream.xyz, axis=1),
+                _sigma(noise, cosine), world, residual, first_world, first_residual,
+            )
+        )  # fmt: skip
+    return tuple(out)
+
+
+def _thinned(inputs: Inputs, index: int, state: State) -> tuple[LidarStream, np.ndarray]:
+    """Fewer points of a LiDAR, all seen while the IMU was running, and the plane (N,) that each lies on."""
+    assert inputs.imu is not None
+    stream, plane = inputs.measurements.lidars[index], inputs.clouds.plane[index]
+    own = np.flatnonzero(plane >= 0)
+    own = own[:: max(1, -(-len(own) * len(inputs.rig.lidars) // MOST_POINTS))]
+    one = _some_points(stream, own)
+    running = usable(inputs.imu, _seconds_of(one, state), inputs.rig.settings.max_gap_s)
+    return _some_points(one, np.flatnonzero(running)), plane[own[running]]
+
+
+def _fitted(clouds: list[tuple[np.ndarray, np.ndarray]], values: np.ndarray) -> np.ndarray:
+    """(P, 6) planes that fit points (N, 3) best, of which plane (N,) each lies on is known; where there are too few,
+    and which side is up, as in `values` (P, 6)."""
+    out = values.copy()
+    for k in range(len(values)):
+        own = np.concatenate([points[plane == k] for points, plane in clouds]).astype(np.float64)
+        if len(own) >= FEWEST_FITTED:
+            centre = own.mean(axis=0)
+            normal = np.linalg.eigh(np.cov(own.T))[1][:, 0]
+            out[k] = plane_of(np.copysign(1.0, normal @ values[k, :3]) * normal, centre)
+    return out
+
+
+def _some_points(stream: LidarStream, own: np.ndarray) -> LidarStream:
+    """The points `own`, increasing, of all scans."""
+    start = np.searchsorted(own, stream.start)
+    columns = (getattr(stream, name)[own] for name in ("offset_s", "xyz", "plane"))
+    return LidarStream(stream.name, stream.stamps_ns, start, *columns)
+
+
+def _seconds_of(stream: LidarStream, state: State) -> np.ndarray:
+    """(N,) instants of the points, seconds on the joined clock of the body."""
+    stamps = np.repeat(stream.seconds, np.diff(stream.start))
+    return stamps + stream.offset_s + state.values[stream.name, "time_offset"][0]
+
+
+def _on_planes(motion: Motion, stream: LidarStream, planes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points (N, 3) in the world, float32; distance (N,) of each to its plane (N, 6), float32; cosine (N,) of the
+    angle between its beam and the plane's normal."""
+    points, seen_from = in_world(motion, stream)
+    normal, beam = planes[:, :3], points - seen_from
+    residual = np.einsum("na,na->n", normal, points - planes[:, 3:])
+    cosine = np.einsum("na,na->n", normal, beam) / np.linalg.norm(beam, axis=1)
+    return points, residual.astype(np.float32), cosine
+
+
+def _sigma(noise: LidarNoise, cosine: np.ndarray) -> np.ndarray:
+    return np.sqrt(noise.sigma**2 + (noise.beam_sigma * cosine) ** 2).astype(np.float32)
+
+
+def _used(found: Estimate, name: str) -> int:
+    own = (f for f in found.problem.sensors if isinstance(f, LidarFactor) and f.name == name)
+    return sum(int(f.moments.count.sum()) for f in own)
+
+
+def wheel_residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> tuple[WheelResiduals, ...]:
+    """Of each set of wheels."""
+    out = []
+    for factor, rows in zip(found.problem.sensors, found.outcome.residuals.sensors, strict=True):
+        if not isinstance(factor, IncrementFactor | RelativePoseFactor):
+            continue
+        stamps = inputs.stream(factor.name).seconds[factor.intervals.first]
+        seconds = stamps + found.outcome.state.values[factor.name, "time_offset"][0]
+        residual = np.linalg.solve(factor.whitening, rows.residual[:, :, None])[:, :, 0]
+        labels = [(label, factor.units[kind]) for kind in factor.kinds for label in LABELS[kind]]
+        names, units = zip(*labels, strict=True)
+        shown = timeline.shown(seconds, timeline.recording_of(seconds))
+        out.append(WheelResiduals(factor.name, names, units, shown, residual, rows.residual.copy()))
+    return tuple(out)
+
+
+def robot_notes(inputs: Inputs, found: Estimate) -> Iterator[str]:
+    """How much of the LiDARs is in use, and their noise."""
+    for lidar, stream, noise in zip(inputs.rig.lidars, inputs.measurements.lidars, found.ranging, strict=True):
+        given = lidar.range_noise_m is not None
+        size = f"{1e3 * noise.beam_sigma:.1f} mm along the beam, as the rig file has it"
+        if not given:
+            size = f"{1e3 * noise.sigma:.1f} mm from their planes, as residuals show it"
+        yield (
+            f"{_used(found, lidar.name)} of the {len(stream.xyz)} points of {lidar.name} lie on "
+            f"{inputs.clouds.count} planes; noise {size}."
+        )
+
+
+def robot_warnings(rig: Rig, judged: list[SensorFit]) -> Iterator[str]:
+    """Where points or wheels leave more than their noise explains."""
+    lidars = {x.name: x for x in rig.lidars}
+    wheels = {w.name: w for w in rig.wheels}
+    for f in judged:
+        ratio = f.chi2 / max(f.dof, 1.0)
+        if ratio <= LARGE_CHI2 or f.dof <= LEAST_DOF * np.sqrt(f.count):  # dof are sampled: few among many are noise
+            continue
+        times = f"{np.sqrt(ratio):.2g} times"
+        if f.sensor in lidars and lidars[f.sensor].range_noise_m is not None:
+            yield (
+                f"the points of {f.sensor} lie {times} as far from their planes as its range_noise in the rig file "
+                "says; leave it out, and it is estimated."
+            )
+        if f.sensor in wheels:
+            yield _wheel_words(f.kind, wheels[f.sensor], times, float(np.sqrt(ratio)))
+
+
+def _wheel_words(kind: str, wheels: Wheels, times: str, root: float) -> str:
+    if kind == "sideways slip":
+        return (
+            f"{wheels.name} slips sideways {times} as much as its sideways_slip in the rig file allows, so yaw and "
+            f"position look better known than they are; {root * wheels.sideways_slip:.2g} m/sqrt(s) would fit."
+        )
+    if kind == "upwards slip":
+        return (
+            f"{wheels.name} leaves the ground {times} as much as its upwards_slip in the rig file allows, so pitch "
+            f"looks better known than it is; {root * wheels.upwards_slip:.2g} m/sqrt(s) would fit."
+        )
+    if kind == "wheels":
+        return (
+            f"the angles that {wheels.name} turned leave residuals {times} as large as its wheel_noise in the rig file "
+            f"says; {root * wheels.wheel_noise:.2g} rad/sqrt(s) would fit, if the wheels do not slip forwards."
+        )
+    return (
+        f"the {kind} of {wheels.name} leaves residuals {times} as large as its noise says; larger wheel_noise or "
+        "sideways_slip would fit, or the increments factor."
+    )

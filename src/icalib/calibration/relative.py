@@ -1,0 +1,66 @@
+"""Where one sensor is as seen from another: from the joint covariance of both."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from icalib.calibration.result import Calibration
+
+
+@dataclass(frozen=True)
+class RelativePose:
+    """T_frame_sensor (4, 4): p_frame = T p_sensor. covariance (6, 6): rotation [rad] about the sensor's axes (right
+    perturbation), translation [m] along the frame's, empirical factors included."""
+
+    frame: str
+    sensor: str
+    T: np.ndarray
+    covariance: np.ndarray
+
+    @property
+    def name(self) -> str:
+        return f"T_{self.frame}_{self.sensor}"
+
+    @property
+    def std(self) -> np.ndarray:
+        """(6,) rotation, translation."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+def relative_poses(c: Calibration) -> tuple[RelativePose, ...]:
+    """Of each LiDAR and each set of wheels as seen from each camera, and of wheels as seen from each LiDAR."""
+    pairs = [(frame, sensor) for frame in c.cameras for sensor in (*c.lidars, *c.wheels)]
+    pairs += [(frame, sensor) for frame in c.lidars for sensor in c.wheels]
+    return tuple(relative_pose(c, frame, sensor) for frame, sensor in pairs)
+
+
+def relative_pose(c: Calibration, frame: str, sensor: str) -> RelativePose:
+    """Pose of `sensor` in the frame of another sensor. Raises KeyError where one of them was not calibrated.
+
+    With T_imu_frame = (R, p), T_imu_sensor = (Q, q) and the relative pose (S, s) = (R^T Q, R^T (q - p)), perturbations
+    dR, dQ on the right, dp and dq give dS = dQ - S^T dR on the right and ds = R^T (dq - dp) + s x dR.
+    """
+    T = np.linalg.inv(c.T_imu_sensor(frame)) @ c.T_imu_sensor(sensor)
+    R, S, s = c.T_imu_sensor(frame)[:3, :3], T[:3, :3], T[:3, 3]
+    J = np.zeros((6, 12))
+    J[:3, :3], J[:3, 6:9] = -S.T, np.eye(3)
+    J[3:, :3] = [[0.0, -s[2], s[1]], [s[2], 0.0, -s[0]], [-s[1], s[0], 0.0]]
+    J[3:, 3:6], J[3:, 9:] = -R.T, R.T
+    return RelativePose(frame, sensor, T, J @ _joint_covariance(c, frame, sensor) @ J.T)
+
+
+def _joint_covariance(c: Calibration, *sensors: str) -> np.ndarray:
+    """(6 n, 6 n) of rotation and translation of each of n sensors, empirical factors included; 0 where fixed."""
+    groups = [c.group(sensor, name) for sensor in sensors for name in ("rotation", "translation")]
+    out, at, columns, scale = np.zeros((3 * len(groups),) * 2), [], [], []
+    for k, g in enumerate(groups):
+        if g.columns is not None:
+            at += range(3 * k, 3 * k + 3)
+            columns += g.columns
+            scale += [1.0] * 3 if g.factor is None else np.maximum(g.factor, 1.0).tolist()
+    out[np.ix_(at, at)] = c.covariance[np.ix_(columns, columns)] * np.outer(scale, scale)
+    return out

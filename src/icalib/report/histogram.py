@@ -1,0 +1,42 @@
+"""Residuals of all sensors against what their noise says."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icalib.calibration import Calibration
+from icalib.report.plot import COLORS, Figure, axis, figure, line
+
+REACH = 6.0  # standard deviations
+BINS = 96
+
+
+def normalised_histogram(c: Calibration) -> Figure:
+    """Residuals over their standard deviation against the normal density, logarithmic so that tails show."""
+    edges = np.linspace(-REACH, REACH, BINS + 1)
+    x = 0.5 * (edges[1:] + edges[:-1])
+    traces = []
+    for i, (name, z) in enumerate(_normalised(c).items()):
+        count, _ = np.histogram(z, edges)
+        density = count / max(1, len(z)) / (edges[1] - edges[0])
+        density = np.where(count > 0, density, np.nan)
+        step = {"color": COLORS[i % len(COLORS)], "width": 1.6, "shape": "hvh"}
+        traces.append(line(x, density, name, COLORS[i % len(COLORS)], line=step))
+    normal = np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
+    dashed = {"color": "#6b7280", "dash": "dash", "width": 1.4}
+    traces.append(line(x, normal, "standard normal", "#6b7280", line=dashed))
+    return figure(
+        traces,
+        380,
+        xaxis=axis("residual / standard deviation"),
+        yaxis=axis("density", type="log", range=[-5, 0], exponentformat="power"),
+    )
+
+
+def _normalised(c: Calibration) -> dict[str, np.ndarray]:
+    """Residuals over their standard deviation, by what they are of."""
+    out = {f"{r.sensor} (u and v)": (r.residual / r.sigma[:, None])[~r.rejected].ravel() for r in c.corner_residuals}
+    out |= {f"{r.sensor} points": r.residual / r.sigma for r in c.lidar_residuals}
+    for r in c.wheel_residuals:
+        out |= {f"{r.sensor} {label}": r.whitened[:, k] for k, label in enumerate(r.labels)}
+    return {name: z for name, z in out.items() if len(z)}
