@@ -279,23 +279,20 @@ def _topic(found: dict[str, YamlValue]) -> str | None:
 def _settings(value: YamlValue) -> Settings:
     kinds = get_type_hints(Settings)
     found = value.record((), tuple(kinds))
-    return Settings(
-        **{
-            name: given.not_negative() if name in _MAY_BE_ZERO else _setting(given, kinds[name])
-            for name, given in found.items()
-        }
-    )
+    return Settings(**{name: _setting(name, given, kinds[name]) for name, given in found.items()})
 
 
 _MAY_BE_ZERO = ("outlier_std", "outlier_min_px")
 
 
-def _setting(value: YamlValue, kind: Any) -> Any:
+def _setting(name: str, value: YamlValue, kind: Any) -> Any:
     if get_origin(kind) is Literal:
         return value.choice("such choice as", get_args(kind))
     if kind is bool:
         return value.boolean()
-    return value.whole(0) if kind is int else value.positive()
+    if kind is int:
+        return value.whole(0)
+    return value.not_negative() if name in _MAY_BE_ZERO else value.positive()
 
 
 def _imu_to_plain(imu: ImuSensor) -> dict[str, Any]:

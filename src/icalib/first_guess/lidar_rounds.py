@@ -29,8 +29,10 @@ from icalib.first_guess.align_camera import trusted
 from icalib.first_guess.lidar import Held, lidar_and_motion, lidar_on_motion
 from icalib.first_guess.lidar_planes import ROUNDS, associate, round_search
 from icalib.geometry.planes import plane_of
+from icalib.measurements import LidarStream
 from icalib.rig import Camera, Lidar, Wheels
 
+NEAR_NODE_S = 0.15  # a scan of a LiDAR alone goes on so long after its node
 NAMES = tuple(name for name, _, _ in MOUNT)
 
 
@@ -70,7 +72,7 @@ def state_from_lidar(inputs: Inputs) -> State:
 def with_lidars(inputs: Inputs, state: State) -> tuple[Inputs, State]:
     """`inputs` with points of the LiDARs on planes, and `state`, which has the motion and a guess of all, with the
     planes, led on by the rounds. Raises EstimationError where there are no planes."""
-    inputs = replace(inputs, guess=state)
+    inputs = replace(while_known(inputs, state), guess=state)
     streams = inputs.measurements.lidars
     if any((s.plane >= 0).any() for s in streams):
         clouds = known_planes(streams)
@@ -88,6 +90,47 @@ def with_lidars(inputs: Inputs, state: State) -> tuple[Inputs, State]:
 
 def _without_planes(state: State) -> dict[Key, np.ndarray]:
     return {key: value for key, value in state.values.items() if key[1] != "plane"}
+
+
+def while_known(inputs: Inputs, state: State) -> Inputs:
+    """`inputs` without points of scans that lie beyond the nodes of `state`: carried there by the IMU alone, they would
+    count as if its readings had no noise. Raises EstimationError where none is left."""
+    measured, lidars, notes = inputs.measurements, [], list(inputs.measurements.notes)
+    for stream in measured.lidars:
+        begin = stream.seconds + state.values[stream.name, "time_offset"][0]
+        scan = np.repeat(np.arange(len(begin)), np.diff(stream.start))
+        last = np.zeros(len(begin))
+        np.maximum.at(last, scan, stream.offset_s)
+        known = _near(state.seconds, begin) & _near(state.seconds, begin + last)
+        if not known.any():
+            raise EstimationError(
+                f"{stream.name}: none of its scans falls within the recording of the other sensors; check that the "
+                "clocks overlap, or the time_offset in the rig file."
+            )
+        if not known.all():
+            notes.append(
+                f"{np.count_nonzero(~known)} of {len(known)} scans of {stream.name} are left out: nothing else shows "
+                "the motion then."
+            )
+        lidars.append(_points_of(stream, known[scan], scan))
+    return replace(inputs, measurements=replace(measured, lidars=tuple(lidars), notes=tuple(notes)))
+
+
+def _near(nodes: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """(n,) whether there is a node near each of the times (n,)."""
+    k = np.clip(np.searchsorted(nodes, times), 1, len(nodes) - 1)
+    return np.minimum(np.abs(times - nodes[k - 1]), np.abs(times - nodes[k])) < NEAR_NODE_S
+
+
+def _points_of(stream: LidarStream, kept: np.ndarray, scan: np.ndarray) -> LidarStream:
+    """The stream with the points in `kept` (N,) of `scan` (N,); its scans stay, if empty."""
+    if kept.all():
+        return stream
+    count = np.bincount(scan[kept], minlength=len(stream.stamps_ns))
+    start = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
+    return LidarStream(
+        stream.name, stream.stamps_ns, start, stream.offset_s[kept], stream.xyz[kept], stream.plane[kept]
+    )
 
 
 def lidar_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
