@@ -8,7 +8,7 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation.imu_data import ImuData
-from icalib.first_guess.correlation import best_shift
+from icalib.first_guess.correlation import Shift, best_shift
 from icalib.first_guess.target_poses import TargetPoses
 from icalib.geometry import so3
 from icalib.measurements import CornerStream
@@ -20,6 +20,8 @@ LEAST_CORRELATION = 0.7
 LARGEST_UNEXPLAINED = 0.6  # of the angular rate, at an offset that was given
 CLOCKS_AGREE_S = 0.01  # of the time offsets that two recordings show
 CLEARLY_BETTER = 0.5  # of what another offset leaves unexplained
+AVERAGED_S = 0.25  # over which the two are compared
+LEAST_ALIKE = 0.3  # share of the camera's rate that goes with the IMU's, below which their ratio says nothing
 STILL_RAD_S = 0.03
 _SAME_RECORDING = "check that both come from the same recording, overlap in time, and are in rad/s"
 LEAST_SECOND_AXIS = 0.05  # of the spread of rates about the first
@@ -76,8 +78,8 @@ def align(imu: ImuData, name: str, rates: CameraRates, given_offset: float | Non
     if not _covered(imu, rates, offset).any():
         raise _no_overlap(imu, name)
     found = _refine(imu, rates, offset, given_offset is not None)
-    _check_scale(imu, name, rates, found)
     _check_offset(imu, name, rates, found, given_offset is not None)
+    _check_scale(imu, name, rates, found)
     return found
 
 
@@ -103,12 +105,28 @@ def _check_offset(imu: ImuData, name: str, rates: CameraRates, found: Alignment,
 
 
 def _unexplained(imu: ImuData, rates: CameraRates, found: Alignment) -> float:
-    """Share of the angular rate that the camera did not see."""
-    inside = _covered(imu, rates, found.offset)
-    seen = rates.rate[inside] @ found.rotation.T
-    middle = (0.5 * (rates.start + rates.end) + found.offset)[inside]
-    gyro = np.stack([np.interp(middle, imu.seconds, imu.gyro[:, k]) for k in range(3)], axis=1) - found.gyro_bias
+    """Share of the angular rate that the camera did not see, whatever the unit of either."""
+    gyro, seen = _side_by_side(imu, rates, found)
+    gyro = gyro - found.gyro_bias
+    seen = seen * (np.sum(gyro * seen) / max(np.sum(seen * seen), 1e-12))
     return float(np.median(np.linalg.norm(gyro - seen, axis=1)) / np.median(np.linalg.norm(gyro, axis=1)))
+
+
+def _side_by_side(imu: ImuData, rates: CameraRates, found: Alignment) -> tuple[np.ndarray, np.ndarray]:
+    """(n, 3) each, rad/s in IMU axes: what the gyroscope and the camera have, both as means over some images: a rate
+    between neighbours has little but noise where the target is far or the motion slow."""
+    inside = _covered(imu, rates, found.offset)
+    start, end = rates.start[inside], rates.end[inside]
+    middle = 0.5 * (start + end) + found.offset
+    gyro = np.stack([np.interp(middle, imu.seconds, imu.gyro[:, k]) for k in range(3)], axis=1)
+    count = min(max(1, round(AVERAGED_S / float(np.median(end - start)))), len(start))
+    return _means(gyro, count), _means(rates.rate[inside] @ found.rotation.T, count)
+
+
+def _means(values: np.ndarray, count: int) -> np.ndarray:
+    """(n - count + 1, 3) means over `count` neighbours of (n, 3)."""
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(values, axis=0)])
+    return (total[count:] - total[:-count]) / count
 
 
 def better_offset(imu: ImuData, name: str, rates: CameraRates, expected: float) -> float | None:
@@ -141,26 +159,21 @@ def _check_motion(imu: ImuData, name: str, rates: CameraRates) -> None:
         )
 
 
-def _grid(t: np.ndarray, x: np.ndarray, covered: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray]:
-    """x on a regular grid from 0 to `length`, and a mask of where it is known."""
-    grid = np.arange(int(length * GRID_HZ) + 1) / GRID_HZ
-    mask = np.interp(grid, t, covered.astype(float)) > 0.99
-    return np.interp(grid, t, x), mask
+def _grid(t: np.ndarray, rate: np.ndarray, covered: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Size of rates (n, 3) on a regular grid from 0 to the last of `t`, each a mean over `count` points of the grid,
+    and a mask of where all of these are known."""
+    grid = np.arange(int(t[-1] * GRID_HZ) + 1) / GRID_HZ
+    count = min(count, len(grid))
+    known = np.interp(grid, t, covered.astype(float)) > 0.99
+    fine = np.stack([np.interp(grid, t, rate[:, k]) for k in range(3)], axis=1)
+    return np.linalg.norm(_means(fine, count), axis=1), _means(np.tile(known[:, None], 3), count)[:, 0] > 0.99
 
 
 def _correlate(imu: ImuData, name: str, rates: CameraRates) -> float:
-    """Offset [s] at the peak of the masked, normalised cross-correlation of |w| over all shifts."""
-    bias = np.median(imu.gyro, axis=0)
-    a, mask_a = _grid(
-        imu.seconds, np.linalg.norm(imu.gyro - bias, axis=1), np.ones(len(imu.seconds), bool), imu.seconds[-1]
-    )  # fmt: skip
-    grid = np.arange(len(a)) / GRID_HZ
-    for start, end in imu.gaps:
-        mask_a &= (grid <= start) | (grid >= end)
-    middle = 0.5 * (rates.start + rates.end)
-    near = np.diff(middle, append=middle[-1]) < LONGEST_STEP_S
-    b, mask_b = _grid(middle, np.linalg.norm(rates.rate, axis=1), near, middle[-1])
-    found = best_shift(a, mask_a, b, mask_b, SHORTEST_OVERLAP_S * GRID_HZ)
+    """Offset [s] at the peak of the masked, normalised cross-correlation of |w| over all shifts, of rates as they are
+    or of their means, whichever is higher: fast motion shows in the ones, slow motion in the others."""
+    shown = [_shift(imu, rates, count) for count in (1, round(AVERAGED_S * GRID_HZ))]
+    found = max(shown, key=lambda s: s.correlation if np.isfinite(s.correlation) else -1.0)
     if not found.correlation > rates.least_correlation:
         raise EstimationError(
             f"the motion of {name} does not match that of {imu.name} at any shift of their clocks (best correlation "
@@ -168,6 +181,16 @@ def _correlate(imu: ImuData, name: str, rates: CameraRates) -> float:
             f"and are in rad/s."
         )
     return found.samples / GRID_HZ
+
+
+def _shift(imu: ImuData, rates: CameraRates, count: int) -> Shift:
+    """Of the camera's grid against the IMU's; means over `count` points of them."""
+    known = ~np.isin(imu.seconds, [start for start, _ in imu.gaps])
+    a, mask_a = _grid(imu.seconds, imu.gyro - np.median(imu.gyro, axis=0), known, count)
+    middle = 0.5 * (rates.start + rates.end)
+    near = np.diff(middle, append=middle[-1]) < LONGEST_STEP_S
+    b, mask_b = _grid(middle, rates.rate, near, count)
+    return best_shift(a, mask_a, b, mask_b, SHORTEST_OVERLAP_S * GRID_HZ)
 
 
 def _kabsch(w_imu: np.ndarray, w_cam: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -253,18 +276,24 @@ def _no_overlap(imu: ImuData, name: str) -> EstimationError:
 
 def _check_scale(imu: ImuData, name: str, rates: CameraRates, found: Alignment) -> None:
     """The two must turn equally fast: a ratio of 57 is degrees."""
-    inside = _covered(imu, rates, found.offset)
-    middle = (0.5 * (rates.start + rates.end) + found.offset)[inside]
-    gyro = np.stack([np.interp(middle, imu.seconds, imu.gyro[:, k]) for k in range(3)], axis=1)
-    ratio = _median_size(gyro) / max(_median_size(rates.rate[inside]), 1e-9)
+    ratio = _ratio(*_side_by_side(imu, rates, found))
     if 0.8 < ratio < 1.25:
         return
     cause = (
-        "its angular rate looks like deg/s; convert it to rad/s" if 0.8 < ratio / DEGREES < 1.25 else "check its units"
+        "its angular rate looks like deg/s; convert it to rad/s"
+        if 0.8 < ratio / DEGREES < 1.25
+        else "check its units, or, where the target is small in the images, give the intrinsics in the rig file"
     )
     raise EstimationError(f"{imu.name} turns {ratio:.3g} times as fast as {name}: {cause}.")
 
 
-def _median_size(rate: np.ndarray) -> float:
-    """Median length of rates about their own median: a bias has no say."""
-    return float(np.median(np.linalg.norm(rate - np.median(rate, axis=0), axis=1)))
+def _ratio(gyro: np.ndarray, camera: np.ndarray) -> float:
+    """How much faster the gyroscope (n, 3) turns than the camera (n, 3): both about their medians, as a bias has no
+    say, and along the gyroscope's axis, where noise of the camera, which would make it seem slower, has none. Where
+    it does not turn alike at all, none is faster."""
+    gyro, camera = gyro - np.median(gyro, axis=0), camera - np.median(camera, axis=0)
+    size = np.linalg.norm(gyro, axis=1)
+    fast = size > np.median(size)
+    along = np.median(np.einsum("na,na->n", gyro, camera)[fast] / size[fast])
+    alike = along > LEAST_ALIKE * np.median(np.linalg.norm(camera[fast], axis=1))
+    return float(np.median(size[fast]) / along) if alike else 1.0
