@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,7 +17,7 @@ GRID_HZ = 100.0
 LONGEST_STEP_S = 0.25  # images further apart do not give an angular rate
 SHORTEST_OVERLAP_S = 4.0
 LEAST_CORRELATION = 0.7
-LARGEST_UNEXPLAINED = 0.6  # of the angular rate, at an offset that was given
+LARGEST_UNEXPLAINED = 0.35  # of the angular rate
 CLOCKS_AGREE_S = 0.01  # of the time offsets that two recordings show
 CLEARLY_BETTER = 0.5  # of what another offset leaves unexplained
 AVERAGED_S = 0.25  # over which the two are compared
@@ -77,8 +77,12 @@ def align(imu: ImuData, name: str, rates: CameraRates, given_offset: float | Non
     offset = _correlate(imu, name, rates) if given_offset is None else given_offset
     if not _covered(imu, rates, offset).any():
         raise _no_overlap(imu, name)
-    found = _refine(imu, rates, offset, given_offset is not None)
-    _check_offset(imu, name, rates, found, given_offset is not None)
+    rough = _rough(imu, rates, offset)
+    _check_degrees(imu, name, rates, offset)
+    scale = _scale(imu, rates, rough)
+    alike = rates if 0.8 < scale < 1.25 else replace(rates, rate=scale * rates.rate)
+    found = _refine(imu, alike, rough, given_offset is not None)
+    _check_offset(imu, name, alike, found, given_offset is not None)
     _check_scale(imu, name, rates, found)
     return found
 
@@ -105,22 +109,21 @@ def _check_offset(imu: ImuData, name: str, rates: CameraRates, found: Alignment,
 
 
 def _unexplained(imu: ImuData, rates: CameraRates, found: Alignment) -> float:
-    """Share of the angular rate that the camera did not see, whatever the unit of either."""
-    gyro, seen = _side_by_side(imu, rates, found)
-    gyro = gyro - found.gyro_bias
-    seen = seen * (np.sum(gyro * seen) / max(np.sum(seen * seen), 1e-12))
+    """Share of the angular rate that the camera did not see."""
+    gyro, seen = _side_by_side(imu, rates, found.offset)
+    gyro, seen = gyro - found.gyro_bias, seen @ found.rotation.T
     return float(np.median(np.linalg.norm(gyro - seen, axis=1)) / np.median(np.linalg.norm(gyro, axis=1)))
 
 
-def _side_by_side(imu: ImuData, rates: CameraRates, found: Alignment) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 3) each, rad/s in IMU axes: what the gyroscope and the camera have, both as means over some images: a rate
+def _side_by_side(imu: ImuData, rates: CameraRates, offset: float) -> tuple[np.ndarray, np.ndarray]:
+    """(n, 3) each, rad/s in own axes: what the gyroscope and the camera have, both as means over some images: a rate
     between neighbours has little but noise where the target is far or the motion slow."""
-    inside = _covered(imu, rates, found.offset)
+    inside = _covered(imu, rates, offset)
     start, end = rates.start[inside], rates.end[inside]
-    middle = 0.5 * (start + end) + found.offset
-    gyro = np.stack([np.interp(middle, imu.seconds, imu.gyro[:, k]) for k in range(3)], axis=1)
+    angle = _integral(imu)
+    gyro = (_at(imu, angle, end + offset) - _at(imu, angle, start + offset)) / (end - start)[:, None]
     count = min(max(1, round(AVERAGED_S / float(np.median(end - start)))), len(start))
-    return _means(gyro, count), _means(rates.rate[inside] @ found.rotation.T, count)
+    return _means(gyro, count), _means(rates.rate[inside], count)
 
 
 def _means(values: np.ndarray, count: int) -> np.ndarray:
@@ -139,7 +142,7 @@ def better_offset(imu: ImuData, name: str, rates: CameraRates, expected: float) 
         return None
     if not _covered(imu, rates, expected).any():
         return own.offset
-    there = _unexplained(imu, rates, _refine(imu, rates, expected, True))
+    there = _unexplained(imu, rates, _rough(imu, rates, expected))
     return own.offset if _unexplained(imu, rates, own) < CLEARLY_BETTER * there else None
 
 
@@ -203,27 +206,40 @@ def _kabsch(w_imu: np.ndarray, w_cam: np.ndarray, weight: np.ndarray) -> tuple[n
     return R, mi - R @ mc
 
 
-def _refine(imu: ImuData, rates: CameraRates, offset: float, keep_offset: bool) -> Alignment:
-    """Gauss-Newton on the offset, Kabsch on rotation and bias in turn; rates are means over each image interval."""
+def _rough(imu: ImuData, rates: CameraRates, offset: float) -> Alignment:
+    """At this offset, from means over some images: a pose that flips to its mirror image and back cancels in them."""
+    gyro, seen = _side_by_side(imu, rates, offset)
+    return Alignment(offset, *_kabsch(gyro, seen, np.ones(len(gyro))))
+
+
+def _integral(imu: ImuData) -> np.ndarray:
+    """(N, 3) of the angular rate from the first reading to each, rad."""
     angle = np.zeros((len(imu.seconds), 3))
     angle[1:] = np.cumsum(0.5 * (imu.gyro[1:] + imu.gyro[:-1]) * np.diff(imu.seconds)[:, None], axis=0)
+    return angle
 
-    def at(x: np.ndarray, t: np.ndarray) -> np.ndarray:
-        return np.stack([np.interp(t, imu.seconds, x[:, k]) for k in range(3)], axis=1)
 
-    R, bias, residual = np.eye(3), np.zeros(3), np.zeros_like(rates.rate)
+def _at(imu: ImuData, values: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """(n, 3) of what is known at each reading, at other times."""
+    return np.stack([np.interp(seconds, imu.seconds, values[:, k]) for k in range(3)], axis=1)
+
+
+def _refine(imu: ImuData, rates: CameraRates, rough: Alignment, keep_offset: bool) -> Alignment:
+    """Gauss-Newton on the offset, Kabsch on rotation and bias in turn; rates are means over each image interval."""
+    angle = _integral(imu)
+    offset, R, bias, residual = rough.offset, rough.rotation, rough.gyro_bias, np.zeros_like(rates.rate)
     for _ in range(ROUNDS):
         start, end = rates.start + offset, rates.end + offset
         inside = _covered(imu, rates, offset).astype(float)
         span = (end - start)[:, None]
-        mean = (at(angle, end) - at(angle, start)) / span
-        slope = (at(imu.gyro, end) - at(imu.gyro, start)) / span
+        mean = (_at(imu, angle, end) - _at(imu, angle, start)) / span
+        slope = (_at(imu, imu.gyro, end) - _at(imu, imu.gyro, start)) / span
         weight = inside
         for _ in range(3):
-            R, bias = _kabsch(mean, rates.rate, weight)
             residual = mean - rates.rate @ R.T - bias
             size = np.linalg.norm(residual, axis=1)
             weight = inside * (size < 5.0 * np.median(size[inside > 0.0]) + 1e-9)
+            R, bias = _kabsch(mean, rates.rate, weight)
         if keep_offset:
             break
         step = -float((weight @ (slope * residual)).sum() / (weight @ slope**2).sum())
@@ -274,24 +290,33 @@ def _no_overlap(imu: ImuData, name: str) -> EstimationError:
     )
 
 
+def _check_degrees(imu: ImuData, name: str, rates: CameraRates, offset: float) -> None:
+    """By size alone: readings in degrees match no camera's motion, and must not be blamed for that."""
+    size = [np.linalg.norm(w - np.median(w, axis=0), axis=1) for w in _side_by_side(imu, rates, offset)]
+    ratio = float(np.median(size[0]) / max(np.median(size[1]), 1e-9))
+    if 0.8 < ratio / DEGREES < 1.25:
+        raise EstimationError(
+            f"{imu.name} turns {ratio:.3g} times as fast as {name}: its angular rate looks like deg/s; convert it to "
+            "rad/s."
+        )
+
+
 def _check_scale(imu: ImuData, name: str, rates: CameraRates, found: Alignment) -> None:
-    """The two must turn equally fast: a ratio of 57 is degrees."""
-    ratio = _ratio(*_side_by_side(imu, rates, found))
-    if 0.8 < ratio < 1.25:
-        return
-    cause = (
-        "its angular rate looks like deg/s; convert it to rad/s"
-        if 0.8 < ratio / DEGREES < 1.25
-        else "check its units, or, where the target is small in the images, give the intrinsics in the rig file"
-    )
-    raise EstimationError(f"{imu.name} turns {ratio:.3g} times as fast as {name}: {cause}.")
+    """The two must turn equally fast."""
+    ratio = _scale(imu, rates, found)
+    if not 0.8 < ratio < 1.25:
+        raise EstimationError(
+            f"{imu.name} turns {ratio:.3g} times as fast as {name}: check its units, or, where the target is small in "
+            "the images, give the intrinsics in the rig file."
+        )
 
 
-def _ratio(gyro: np.ndarray, camera: np.ndarray) -> float:
-    """How much faster the gyroscope (n, 3) turns than the camera (n, 3): both about their medians, as a bias has no
+def _scale(imu: ImuData, rates: CameraRates, found: Alignment) -> float:
+    """How much faster the gyroscope turns than the camera: both about their medians, as a bias has no
     say, and along the gyroscope's axis, where noise of the camera, which would make it seem slower, has none. Where
     it does not turn alike at all, none is faster."""
-    gyro, camera = gyro - np.median(gyro, axis=0), camera - np.median(camera, axis=0)
+    gyro, camera = _side_by_side(imu, rates, found.offset)
+    gyro, camera = gyro - np.median(gyro, axis=0), (camera - np.median(camera, axis=0)) @ found.rotation.T
     size = np.linalg.norm(gyro, axis=1)
     fast = size > np.median(size)
     along = np.median(np.einsum("na,na->n", gyro, camera)[fast] / size[fast])
