@@ -125,8 +125,8 @@ def _without_planes(state: State) -> dict[Key, np.ndarray]:
 
 
 def while_known(inputs: Inputs, state: State) -> Inputs:
-    """`inputs` without points of scans that lie beyond the nodes of `state`: carried there by the IMU alone, they would
-    count as if its readings had no noise. Raises EstimationError where none is left."""
+    """`inputs` without points that are nowhere, and without scans beyond the nodes of `state`: carried there by the IMU
+    alone, their points would count as if its readings had no noise. Raises EstimationError where no scan is left."""
     measured, lidars, notes = inputs.measurements, [], list(inputs.measurements.notes)
     for stream in measured.lidars:
         begin = stream.seconds + state.values[stream.name, "time_offset"][0]
@@ -144,7 +144,8 @@ def while_known(inputs: Inputs, state: State) -> Inputs:
                 f"{np.count_nonzero(~known)} of {len(known)} scans of {stream.name} are left out: nothing else shows "
                 "the motion then."
             )
-        lidars.append(with_points(stream, known[scan]))
+        size2 = np.einsum("na,na->n", stream.xyz, stream.xyz)
+        lidars.append(with_points(stream, known[scan] & np.isfinite(size2) & (size2 > 0.0)))
     return replace(inputs, measurements=replace(measured, lidars=tuple(lidars), notes=tuple(notes)))
 
 
