@@ -73,6 +73,6 @@ def _sentence(direction: np.ndarray, names: tuple[str, ...], wheels: Collection[
     order = np.argsort(-np.abs(direction))
     parts = [i for i in order if abs(direction[i]) >= NAMED][:4] or [order[0]]
     words = " with ".join(names[i].replace(".", " ") for i in parts)
-    sensor, kind = names[parts[0]].split(".")[:2]
+    sensor, kind = names[parts[0]].rsplit(".", 2)[:2]
     motions = MISSING_MOTION | (ON_THE_GROUND if sensor in wheels else {})
     return f"{words}: not determined by this motion; {motions.get(kind, 'move the rig more')}."

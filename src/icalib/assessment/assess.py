@@ -6,7 +6,14 @@ import dataclasses
 
 import numpy as np
 
-from icalib.assessment.robot import lidar_residuals, planes, robot_notes, robot_warnings, wheel_residuals
+from icalib.assessment.robot import (
+    lidar_residuals,
+    lidar_warnings,
+    planes,
+    robot_notes,
+    robot_warnings,
+    wheel_residuals,
+)
 from icalib.calibration import (
     Calibration,
     CornerResiduals,
@@ -290,6 +297,7 @@ def _warnings(
             share = f.rejected / (f.rejected + 0.5 * f.count)
             yield f"{share:.0%} of the {f.kind} of {f.sensor} were set aside; look at its residuals in the report."
     yield from robot_warnings(inputs.rig, judged)
+    yield from lidar_warnings(inputs, found) if inputs.clouds.count else ()
     for g in groups:
         if g.name == "bloom" and abs(g.value[0]) > LARGE_BLOOM_PX:
             where = "in" if g.value[0] > 0.0 else "out"

@@ -249,19 +249,36 @@ def _refine(imu: ImuData, rates: CameraRates, rough: Alignment, keep_offset: boo
     return Alignment(offset, R, bias)
 
 
-def turns_about_two_axes(rates: CameraRates) -> bool:
-    """Whether the camera turned about more than one axis; else its rotation about that axis stays open."""
-    _, spread, _ = np.linalg.svd(rates.rate - rates.rate.mean(axis=0), full_matrices=False)
-    return bool(spread[1] >= LEAST_SECOND_AXIS * spread[0])
+def turns_about_two_axes(imu: ImuData, rates: CameraRates, found: Alignment) -> bool:
+    """Whether the camera turned about more than one axis, and the IMU with it: of a target far away a camera alone
+    sees turns that are noise. Else its rotation about that axis stays open."""
+    middle = (0.5 * (rates.start + rates.end) + found.offset)[_covered(imu, rates, found.offset)]
+    gyro = np.stack([np.interp(middle, imu.seconds, imu.gyro[:, k]) for k in range(3)], axis=1)
+    return all(_second_axis(w) >= LEAST_SECOND_AXIS for w in (rates.rate, gyro))
 
 
-def check_axes(rates: CameraRates, name: str) -> None:
+def _second_axis(rate: np.ndarray) -> float:
+    """The spread of rates (n, 3) about their second axis over that about the first."""
+    _, spread, _ = np.linalg.svd(rate - rate.mean(axis=0), full_matrices=False)
+    return float(spread[1] / spread[0])
+
+
+def check_axes(imu: ImuData, rates: CameraRates, found: Alignment, name: str) -> None:
     """Raises EstimationError where the camera turned about one axis only."""
-    if not turns_about_two_axes(rates):
+    if not turns_about_two_axes(imu, rates, found):
         raise EstimationError(
             f"{name} turned about one axis only, and its rotation about that axis is not determined; turn the rig "
             "about two more axes, or give rotation in the rig file."
         )
+
+
+def better_given(imu: ImuData, name: str, rates: CameraRates, found: Alignment, offset: float) -> Alignment:
+    """`found`, or what a guess of the `offset` makes of it where the two turn alike there far better: rates about one
+    axis fit the other way round, too."""
+    if not _covered(imu, rates, offset).any():
+        return found
+    other = as_given(imu, name, rates, offset, found.rotation)
+    return other if _unexplained(imu, rates, other) < CLEARLY_BETTER * _unexplained(imu, rates, found) else found
 
 
 def as_given(imu: ImuData, name: str, rates: CameraRates, offset: float, rotation: np.ndarray) -> Alignment:

@@ -19,6 +19,7 @@ from icalib.first_guess.gyro import GyroRotation
 from icalib.first_guess.target_poses import TargetPoses
 
 STEP_S = 0.12  # between the images of a triple: long against pose noise, short against the loss of sight
+SMOOTHED_S = 0.5  # to both sides: short against the drift of the gyroscope
 READINGS = 8192  # of the IMU at a time, whose rotations are made together
 BIAS_SIGMA = 0.3  # m/s^2
 SHARED = 2.0  # rows share images: the error of their mean falls as if they were a quarter as many
@@ -53,8 +54,8 @@ def lever_arm(
     Raises EstimationError where too few images can be used.
     """
     ok = poses.ok & (times >= imu.seconds[1]) & (times <= imu.seconds[-2])
-    t, R_bc, p = times[ok], poses.rotation[ok], poses.position[ok]
-    R_bi = R_bc @ R_imu_cam.T
+    t, p = times[ok], poses.position[ok]
+    R_bi = _smoothed(poses.rotation[ok] @ R_imu_cam.T, t, gyro)
     D_f, D_R = _double_integrals(imu, t, R_bi, gyro)
     i, j, k = _triples(t, imu.gaps)
     if len(i) < 10:
@@ -75,6 +76,19 @@ def lever_arm(
         rows[:, :, 0:3] = 0.0
     x = _solve(rows, rhs)
     return LeverArm(x[0:3] if given is None else given, x[3:6], x[6:9], *_target_size(rows, rhs, second(D_f)))
+
+
+def _smoothed(R_board_imu: np.ndarray, t: np.ndarray, gyro: GyroRotation) -> np.ndarray:
+    """(n, 3, 3) means of what the images around times t show, carried by the gyroscope. The error of one image's
+    rotation goes with that of its position, as if the lever arm reached to the target."""
+    turned = gyro.at(t)
+    start = R_board_imu @ turned.transpose(0, 2, 1)
+    total = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(start, axis=0)])
+    part = np.searchsorted([gap for gap, _ in gyro.imu.gaps], t)
+    low = np.maximum(np.searchsorted(t, t - SMOOTHED_S), np.searchsorted(part, part))
+    high = np.minimum(np.searchsorted(t, t + SMOOTHED_S, side="right"), np.searchsorted(part, part, side="right"))
+    left, _, right = np.linalg.svd(total[high] - total[low])
+    return left @ right @ turned
 
 
 def _solve(rows: np.ndarray, rhs: np.ndarray) -> np.ndarray:

@@ -24,6 +24,7 @@ from icalib.first_guess.lidar_arm import (
     against_motion,
     against_readings,
     arm_prior,
+    is_mirrored,
     solve,
 )
 from icalib.first_guess.lidar_motion import LONGEST_STEP_S, ImuMotion
@@ -82,6 +83,7 @@ def lidar_and_motion(
     if found is None:
         raise _too_short(stream)
     R_il, x = found
+    _check_axes(stream.name, imu.name, is_mirrored(system, R_il, x))
     _check_gravity(float(np.linalg.norm(x[6:9])), gravity, imu.name, stream.name)
     level, R_imu = _level(x[6:9]), path.rotation @ R_il.T
     position = (path.position - R_imu @ x[3:6]) @ level.T
@@ -100,9 +102,11 @@ def lidar_on_motion(imu: ImuData, stream: LidarStream, known: State, held: Held 
         path = _path_on(stream, known, gyro, guess)
         t = path.seconds + guess.offset
         R, p = _poses(known, gyro, t)
-        found = solve(against_motion(R, p, t, path.rotation, path.position), prior, guess.rotation, rates.rate)
+        system = against_motion(R, p, t, path.rotation, path.position)
+        found = solve(system, prior, guess.rotation, rates.rate)
         if found is None:
             raise _too_short(stream)
+        _check_axes(stream.name, imu.name, is_mirrored(system, *found))
         guess = LidarGuess(found[0], found[1][3:6], aligned.offset)
     return guess
 
@@ -193,6 +197,14 @@ def _too_short(stream: LidarStream) -> EstimationError:
         f"{stream.name}: too few of its scans fall within the recording of the IMU to find its lever arm; check that "
         "both clocks overlap, or record for longer."
     )
+
+
+def _check_axes(lidar: str, imu: str, mirrored: bool) -> None:
+    if mirrored:
+        raise EstimationError(
+            f"{lidar} turns as {imu} does, but moves the other way: its points are mirrored; one of its axes, or the "
+            "sense in which its azimuth counts, is reversed. Make its axes right-handed."
+        )
 
 
 def _check_gravity(measured: float, expected: float, imu: str, lidar: str) -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from icalib.errors import EstimationError
 from icalib.estimation.assembly import Inputs, host_times, inputs_for, nodes_for, resample, start_values, with_clouds
 from icalib.estimation.board import board_in
 from icalib.estimation.estimate import first_pass
@@ -37,6 +38,11 @@ def start(
     if rig.wheels or rig.lidars:
         seen = [replace(m, wheels=(), lidars=()) for m in recordings]
         bare = inputs_for(replace(rig, wheels=(), lidars=()), seen)
+    if not rig.cameras:
+        raise EstimationError(
+            f"{' and '.join(w.name for w in rig.wheels)} and {rig.body} do not show the motion; add a camera or a "
+            "LiDAR to the rig file."
+        )
     guesses = initial_guesses(rig, bare.bodies, [m.measurements for m in bare.motions])
     lap("first guess")
     state = first_state(bare, *guesses)
