@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 from icalib.errors import CalibrationError
+from icalib.result_commands import add_result_commands
 
 _MOST_IDS = 10_000  # more than any family has
 
@@ -48,6 +49,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_target(commands)
     _add_simulate(commands)
     _add_montecarlo(commands)
+    add_result_commands(commands)
     return parser
 
 
