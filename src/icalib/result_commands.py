@@ -9,6 +9,7 @@ from pathlib import Path
 def add_result_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Adds the parsers to those of the other commands."""
     _add_allan(commands)
+    _add_export(commands)
 
 
 def _add_allan(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -31,3 +32,43 @@ def _allan(options: argparse.Namespace) -> None:
     if not options.quiet:
         print_study(study)
         print(f"Wrote {options.output / 'allan.html'}, allan.json and noise.yaml.")
+
+
+def _add_export(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    from icalib.export.names import FORMATS, ONE_FILE
+
+    c = commands.add_parser("export", help="a result as files of other programs")
+    c.add_argument("result", type=Path, help="folder that a calibration was written to")
+    c.add_argument("--to", required=True, choices=FORMATS, help="whose files")
+    where = f"folder for the files; for {', '.join(ONE_FILE)} the file itself"
+    c.add_argument("--output", "-o", type=Path, required=True, metavar="PATH", help=where)
+    c.add_argument("--urdf", type=Path, metavar="FILE", help="existing URDF: set the origins of its joints")
+    frame = "name of a sensor's frame or link, where it is not the sensor's (ros2-static, urdf); may be repeated"
+    c.add_argument("--frame", type=_pair, action="append", default=[], metavar="SENSOR=FRAME", help=frame)
+    c.add_argument("--quiet", "-q", action="store_true", help="do not say what the format cannot hold")
+    c.set_defaults(run=_export)
+
+
+def _pair(text: str) -> tuple[str, str]:
+    name, equals, value = text.partition("=")
+    if not (name and equals and value):
+        raise argparse.ArgumentTypeError(f"must be SENSOR=FRAME, but is {text!r}")
+    return name, value
+
+
+def _export(options: argparse.Namespace) -> None:
+    from icalib.calibration import load_calibration
+    from icalib.export.formats import export
+    from icalib.export.names import ONE_FILE
+    from icalib.text_files import write_texts
+
+    calibration = load_calibration(options.result)
+    found = export(calibration, options.to, dict(options.frame), options.urdf)
+    files, folder = found.files, options.output
+    if options.to in ONE_FILE:
+        files, folder = {options.output.name: next(iter(files.values()))}, options.output.parent
+    write_texts(folder, files)
+    if not options.quiet:
+        for sentence in found.sentences:
+            print(f"Note: {sentence}")
+        print(f"Wrote {', '.join(str(folder / name) for name in files)}.")

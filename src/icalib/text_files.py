@@ -20,7 +20,7 @@ def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
         mode = 0o666 & ~_umask()
         for name, text in texts.items():
             with tempfile.NamedTemporaryFile(
-                "w", encoding="utf-8", newline="", dir=folder, suffix=".part", delete=False
+                "w", encoding="utf-8", errors="surrogateescape", newline="", dir=folder, suffix=".part", delete=False
             ) as file:
                 parts[name] = Path(file.name)
                 file.write(text)
