@@ -42,6 +42,7 @@ LEVELS = {
     "export": 7,
     "text_files": 1,
     "allan": 8,
+    "comparison": 8,
     "outputs": 8,
     "pipeline": 8,
     "console": 8,

@@ -10,6 +10,7 @@ def add_result_commands(commands: argparse._SubParsersAction[argparse.ArgumentPa
     """Adds the parsers to those of the other commands."""
     _add_allan(commands)
     _add_export(commands)
+    _add_compare(commands)
 
 
 def _add_allan(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -72,3 +73,49 @@ def _export(options: argparse.Namespace) -> None:
         for sentence in found.sentences:
             print(f"Note: {sentence}")
         print(f"Wrote {', '.join(str(folder / name) for name in files)}.")
+
+
+def _add_compare(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    kinds = "folder of a result, Kalibr camchain or imu file, URDF, or rig file with typed values"
+    about = "what changed from A to B, in words; exit code 0: the same, 1: something differs, 2: an error"
+    c = commands.add_parser("compare", help=about, description=about[0].upper() + about[1:] + ".")
+    c.add_argument("a", type=Path, metavar="A", help=kinds)
+    c.add_argument("b", type=Path, metavar="B", help="the same")
+    tolerance = "differences up to it do not count: deg, mm, ms, px or percent; may be repeated, as in deg=0.1"
+    c.add_argument("--tolerance", type=_tolerance, action="append", default=[], metavar="UNIT=VALUE", help=tolerance)
+    c.add_argument("--sigma", type=float, default=3.0, metavar="N", help="nor those up to N sigma; by default 3")
+    frame = "link of a sensor in a URDF, where it is not the sensor's name; may be repeated"
+    c.add_argument("--frame", type=_pair, action="append", default=[], metavar="SENSOR=LINK", help=frame)
+    c.add_argument("--json", type=Path, metavar="FILE", help="write the differences as JSON")
+    c.add_argument("--quiet", "-q", action="store_true", help="print nothing; the exit code says it")
+    c.set_defaults(run=_compare, error_code=2)
+
+
+def _tolerance(text: str) -> tuple[str, float]:
+    from icalib.comparison.units import UNITS
+
+    unit, _, number = text.partition("=")
+    try:
+        value = float(number)
+    except ValueError:
+        value = -1.0
+    if unit not in UNITS or not 0.0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(
+            f"must be UNIT=VALUE with a unit of {', '.join(UNITS)} and a number from 0 up, but is {text!r}"
+        )
+    return unit, value
+
+
+def _compare(options: argparse.Namespace) -> int:
+    from icalib.comparison.compare import Tolerances
+    from icalib.comparison.reading import compare_files
+    from icalib.comparison.words import comparison_json, lines
+    from icalib.text_files import write_texts
+
+    tolerances = Tolerances(**dict(options.tolerance))
+    found = compare_files(options.a, options.b, dict(options.frame), tolerances, options.sigma)
+    if options.json:
+        write_texts(options.json.parent, {options.json.name: comparison_json(found)})
+    if not options.quiet:
+        print("\n".join(lines(found)))
+    return 0 if found.same else 1

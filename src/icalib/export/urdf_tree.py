@@ -82,6 +82,12 @@ class UrdfTree:
         up, down = (self._product([j for j in c if j not in shared]) for c in (one, other))
         return np.linalg.inv(up) @ down
 
+    def is_fixed(self, frame: str, link: str) -> bool:
+        """Whether the two are in one tree and no joint between them moves."""
+        one, other = self.chain(frame), self.chain(link)
+        joined = (one[-1].parent if one else frame) == (other[-1].parent if other else link)
+        return joined and all(j.type == "fixed" for j in [*one, *other] if not (j in one and j in other))
+
     def _product(self, upwards: list[Joint]) -> np.ndarray:
         T = np.eye(4)
         for joint in upwards:

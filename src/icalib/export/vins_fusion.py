@@ -88,17 +88,16 @@ def _camera(name: str, lens: Lens) -> str:
     """As camodocal's models write themselves."""
     fx, fy, cx, cy = lens.intrinsics
     d = lens.distortion
-    parts: dict[str, dict[str, float]]
     match lens.model:
         case "pinhole-radtan":
-            kind, parts = "PINHOLE", {"distortion": dict(zip(("k1", "k2", "p1", "p2"), d, strict=True))}
+            kind, parts = "PINHOLE", {"distortion": _named(("k1", "k2", "p1", "p2"), d)}
             parts["projection"] = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
         case "omni-radtan":
             kind, parts = "MEI", {"mirror": {"xi": d[0]}}
-            parts["distortion"] = dict(zip(("k1", "k2", "p1", "p2"), d[1:], strict=True))
+            parts["distortion"] = _named(("k1", "k2", "p1", "p2"), d[1:])
             parts["projection"] = {"gamma1": fx, "gamma2": fy, "u0": cx, "v0": cy}
         case _:
-            kind, terms = "KANNALA_BRANDT", dict(zip(("k2", "k3", "k4", "k5"), d, strict=True))
+            kind, terms = "KANNALA_BRANDT", _named(("k2", "k3", "k4", "k5"), d)
             parts = {"projection": terms | {"mu": fx, "mv": fy, "u0": cx, "v0": cy}}
     width, height = lens.resolution
     lines = ["%YAML:1.0", f"# The lens of {name}, by icalib.", "---", f"model_type: {kind}", f"camera_name: {name}"]
@@ -106,3 +105,7 @@ def _camera(name: str, lens: Lens) -> str:
     for part, values in parts.items():
         lines += [f"{part}_parameters:", *(f"   {key}: {float(value)!r}" for key, value in values.items())]
     return "\n".join(lines) + "\n"
+
+
+def _named(names: tuple[str, ...], values: list[float]) -> dict[str, float]:
+    return dict(zip(names, values, strict=True))
