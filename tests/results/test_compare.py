@@ -14,7 +14,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, norm
 
-from icalib.calibration import Calibration, relative_pose
+from icalib.calibration import Calibration, Verdict, relative_pose
 from icalib.cli import main
 from icalib.comparison.compare import Comparison, Difference, Tolerances, compare_sides
 from icalib.comparison.reading import compare_files
@@ -22,8 +22,8 @@ from icalib.comparison.results import side_of_result
 from icalib.comparison.significance import chi2_above, sigmas
 from icalib.comparison.words import lines, sentence
 from icalib.export.formats import export
-from icalib.rig_parameters import parameter_to_plain
 from icalib.rig import fixed
+from icalib.rig_parameters import parameter_to_plain
 
 NOISE = {"gyro": 1.6e-4, "gyro_walk": 2.2e-5, "accel": 2.8e-3, "accel_walk": 8.6e-4}
 
@@ -63,13 +63,13 @@ def test_a_result_is_the_same_as_itself(robot: Calibration, without_cameras: Cal
         found = compared(c, c)
         assert found.same and found.notes == () and all(d.size < 1e-9 for d in found.differences)
         assert lines(found)[-1] == "The same."
-    sensors = {(d.sensor, d.frame, d.what) for d in compared(robot, robot).differences}
-    assert {("cam1", "imu0", "rotation"), ("cam1", "cam0", "translation"), ("lidar0", "imu0", "translation")} <= sensors
+    blocks = {(d.sensor, d.frame, d.what) for d in compared(robot, robot).differences}
+    assert {("cam1", "imu0", "rotation"), ("cam1", "cam0", "translation"), ("lidar0", "imu0", "translation")} <= blocks
     assert {
         ("wheel0", "imu0", "radius"),
         ("cam0", "cam0", "lens"),
         ("imu0", "imu0", "bias walk of the gyroscope"),
-    } <= sensors
+    } <= blocks
 
 
 def test_what_changed_is_said_in_words(robot: Calibration):
@@ -129,14 +129,13 @@ def test_sigmas_use_the_joint_covariance(robot: Calibration):
             for g in robot.groups
             if g.columns is not None and g.sensor != "board0"
         }
-        # Half of the difference's variance is the other side's, which stays: sigmas are root 2 too small.
         for d in compared(robot, changed(robot, moves)).differences:
             if d.sigmas is not None:
-                counts.setdefault((d.sensor, d.frame, d.what), []).append(np.sqrt(2.0) * d.sigmas)
-    # chi^2 in normal deviates of half the size is not chi^2 again, so it is taken back first.
+                counts.setdefault((d.sensor, d.frame, d.what), []).append(d.sigmas)
+    # Back to chi^2. Half of the difference's variance is of the other side, which stays.
     for key, found in counts.items():
         dof = {"rotation": 3, "translation": 3, "radius": 2, "lens": 4}.get(key[2], 1)
-        distance = chi2.isf(2.0 * norm.sf(np.array(found) / np.sqrt(2.0)), dof) * 2.0
+        distance = 2.0 * chi2.isf(2.0 * norm.sf(np.array(found)), dof)
         assert distance.mean() == pytest.approx(dof, abs=4.5 * np.sqrt(2.0 * dof / 400)), key
     assert ("cam1", "cam0", "translation") in counts and ("wheel0", "imu0", "radius") in counts
 
@@ -161,7 +160,7 @@ def test_significance_is_that_of_chi2():
 def test_what_counts_is_a_matter_of_tolerance_and_sigma(robot: Calibration):
     other = changed(robot, {("cam1", "rotation"): np.deg2rad([0.2, 0.0, 0.0])})
     turned = only(compared(robot, other), "cam1", "rotation", "imu0")
-    assert turned.sigmas is not None and 3.0 < turned.sigmas and turned.differs and turned.given_by == "both"
+    assert turned.sigmas is not None and turned.sigmas > 3.0 and turned.differs and turned.given_by == "both"
     assert not only(compared(robot, other, tolerances=Tolerances(deg=0.25)), "cam1", "rotation", "imu0").differs
     assert only(compared(robot, other, tolerances=Tolerances(deg=0.15)), "cam1", "rotation", "imu0").differs
     assert not only(compared(robot, other, limit=turned.sigmas + 0.1), "cam1", "rotation", "imu0").differs
@@ -231,7 +230,7 @@ def test_a_urdf(robot: Calibration, tmp_path: Path):
 def test_values_typed_into_a_rig_file(robot: Calibration, tmp_path: Path):
     """CAD's pose of the LiDAR with its tolerances, a translation of the camera alone, and a data sheet's wheels."""
     robot.save(tmp_path / "out")
-    lidar = {"type": "lidar"}
+    lidar: dict[str, Any] = {"type": "lidar"}
     lidar |= {"rotation": {"prior": robot.group("lidar0", "rotation").value.tolist(), "sigma_deg": 0.5}}
     lidar |= {
         "translation": {
@@ -274,10 +273,11 @@ def test_what_has_no_standard_deviation_is_held_to_the_tolerance(robot: Calibrat
 
 def test_lenses_of_other_models_are_compared_by_pixels(robot: Calibration):
     sensors = {n: s | ({"model": "pinhole-radtan5"} if n == "cam1" else {}) for n, s in robot.rig["sensors"].items()}
+    fixed_: Verdict = "fixed"
     groups = tuple(
         dataclasses.replace(
             g, value=np.append(g.value, 0.0), labels=(*g.labels, "k3"), std=np.zeros(5), std_formal=np.zeros(5),
-            verdict=("fixed",) * 5,
+            verdict=(fixed_, fixed_, fixed_, fixed_, fixed_),
         )
         if (g.sensor, g.name) == ("cam1", "distortion")
         else g
