@@ -46,6 +46,8 @@ def _add_export(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     c.add_argument("--urdf", type=Path, metavar="FILE", help="existing URDF: set the origins of its joints")
     frame = "name of a sensor's frame or link, where it is not the sensor's (ros2-static, urdf); may be repeated"
     c.add_argument("--frame", type=_pair, action="append", default=[], metavar="SENSOR=FRAME", help=frame)
+    joint = "joint to set in --urdf, by default the one right above the sensor's link; may be repeated"
+    c.add_argument("--joint", type=_pair, action="append", default=[], metavar="SENSOR=JOINT", help=joint)
     c.add_argument("--quiet", "-q", action="store_true", help="do not say what the format cannot hold")
     c.set_defaults(run=_export)
 
@@ -53,7 +55,7 @@ def _add_export(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
 def _pair(text: str) -> tuple[str, str]:
     name, equals, value = text.partition("=")
     if not (name and equals and value):
-        raise argparse.ArgumentTypeError(f"must be SENSOR=FRAME, but is {text!r}")
+        raise argparse.ArgumentTypeError(f"must be SENSOR=NAME, but is {text!r}")
     return name, value
 
 
@@ -64,7 +66,7 @@ def _export(options: argparse.Namespace) -> None:
     from icalib.text_files import write_texts
 
     calibration = load_calibration(options.result)
-    found = export(calibration, options.to, dict(options.frame), options.urdf)
+    found = export(calibration, options.to, dict(options.frame), options.urdf, dict(options.joint))
     files, folder = found.files, options.output
     if options.to in ONE_FILE:
         files, folder = {options.output.name: next(iter(files.values()))}, options.output.parent

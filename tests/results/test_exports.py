@@ -394,6 +394,8 @@ def test_options_of_other_formats(calibration: Calibration, tmp_path: Path):
         export(calibration, "json", {"cam0": "left"})
     with pytest.raises(CalibrationError, match="--urdf belongs to --to urdf, not to json"):
         export(calibration, "json", existing_urdf=tmp_path / "robot.urdf")
+    with pytest.raises(CalibrationError, match="--joint names joints of an existing file; give it as --to urdf --urdf"):
+        export(calibration, "urdf", joints={"cam0": "a"})
     with pytest.raises(CalibrationError, match="there is no sensor cam9; this calibration has imu0, cam0, cam1."):
         export(calibration, "ros2-static", {"cam9": "left"})
 
@@ -447,4 +449,4 @@ def test_bad_input_is_one_sentence(
 def test_a_pair_that_is_none_is_wrong_usage(capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit):
         main(["export", "out", "--to", "urdf", "-o", "x", "--frame", "cam0"])
-    assert "must be SENSOR=FRAME, but is 'cam0'" in capsys.readouterr().err
+    assert "must be SENSOR=NAME, but is 'cam0'" in capsys.readouterr().err

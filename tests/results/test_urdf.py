@@ -233,3 +233,16 @@ def test_a_file_with_none_of_the_sensors(robot: Calibration, file: Path):
     file.write_text(ROBOT.replace('"cam0"', '"a"').replace('"lidar0"', '"b"'))
     with pytest.raises(CalibrationError, match="there is no link cam0; .*say which is cam0: --frame cam0=LINK"):
         updated(c, file, {})
+
+
+def test_a_joint_further_up_is_set(robot: Calibration, file: Path):
+    """The optical frame stays where it is on its camera."""
+    found = export(robot, "urdf", FRAMES | {"cam0": "right_eye", "cam1": "mast"}, file, {"cam0": "cam0_joint"})
+    old, new = (URDF.from_xml_string(text.encode()) for text in (ROBOT, found.files[file.name]))
+    np.testing.assert_allclose(T_of(new, "imu0", "right_eye"), robot.T_imu_sensor("cam0"), atol=1e-12)
+    np.testing.assert_allclose(T_of(new, "imu0", "mast"), robot.T_imu_sensor("cam1"), atol=1e-12)
+    np.testing.assert_allclose(T_of(new, "cam0", "right_eye"), T_of(old, "cam0", "right_eye"), atol=1e-14)
+    with pytest.raises(
+        CalibrationError, match="no joint drive above cam0; above it are cam0_joint, mast_joint; correct"
+    ):
+        export(robot, "urdf", FRAMES, file, {"cam0": "drive"})

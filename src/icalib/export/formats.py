@@ -21,14 +21,20 @@ _FRAMED = ("ros2-static", "urdf")
 
 
 def export(
-    c: Calibration, to: str, frames: Mapping[str, str] | None = None, existing_urdf: Path | None = None
+    c: Calibration,
+    to: str,
+    frames: Mapping[str, str] | None = None,
+    existing_urdf: Path | None = None,
+    joints: Mapping[str, str] | None = None,
 ) -> Export:
     """`c` in the format `to`, one of FORMATS.
 
-    frames: sensor -> frame or link, where the two differ (ros2-static, urdf). existing_urdf: the file to be updated.
+    frames: sensor -> frame or link, where the two differ (ros2-static, urdf). existing_urdf: the file to be updated,
+    and joints: sensor -> joint of it to be set, by default the one above the sensor's link.
     Raises CalibrationError where the format needs what is not there, or an option belongs to another format.
     """
-    _check(c, to, frames or {}, existing_urdf)
+    frames, joints = frames or {}, joints or {}
+    _check(c, to, frames, joints, existing_urdf)
     match to:
         case "kalibr":
             return kalibr(c)
@@ -37,11 +43,11 @@ def export(
         case "vins-fusion":
             return vins_fusion(c)
         case "ros2-static":
-            return ros2_static(c, frames or {})
+            return ros2_static(c, frames)
         case "camera-info":
             return camera_info(c)
         case "urdf":
-            return urdf(c, frames or {}) if existing_urdf is None else updated_urdf(c, existing_urdf, frames or {})
+            return urdf(c, frames) if existing_urdf is None else updated_urdf(c, existing_urdf, frames, joints)
         case "mins":
             return mins(c)
         case "fast-lio":
@@ -60,14 +66,18 @@ def kalibr(c: Calibration) -> Export:
     return Export(files, sentences)
 
 
-def _check(c: Calibration, to: str, frames: Mapping[str, str], existing: Path | None) -> None:
+def _check(
+    c: Calibration, to: str, frames: Mapping[str, str], joints: Mapping[str, str], existing: Path | None
+) -> None:
     if to not in FORMATS:
         raise CalibrationError(f"there is no format {to}; available are {', '.join(FORMATS)}.")
     if frames and to not in _FRAMED:
         raise CalibrationError(f"--frame belongs to {' and '.join(_FRAMED)}; {to} names no frames, so leave it out.")
     if existing is not None and to != "urdf":
         raise CalibrationError(f"--urdf belongs to --to urdf, not to {to}; leave it out.")
+    if joints and existing is None:
+        raise CalibrationError("--joint names joints of an existing file; give it as --to urdf --urdf FILE.")
     known = list(dict.fromkeys([c.body, *c.mounted]))
-    for sensor in frames:
+    for sensor in (*frames, *joints):
         if sensor not in known:
             raise CalibrationError(f"there is no sensor {sensor}; this calibration has {', '.join(known)}.")

@@ -52,10 +52,10 @@ def urdf(c: Calibration, frames: Mapping[str, str]) -> Export:
     return Export({"sensors.urdf": "\n".join([*lines, "</robot>"]) + "\n"}, sentences)
 
 
-def updated_urdf(c: Calibration, path: Path, frames: Mapping[str, str]) -> Export:
+def updated_urdf(c: Calibration, path: Path, frames: Mapping[str, str], joints: Mapping[str, str]) -> Export:
     """The file at `path` with the origins of the joints right above the sensors' links set so that each link has its
     calibrated pose from the body's. Nothing else changes. frames: sensor -> link, where the two differ; sensors without
-    a link are left out, and said.
+    a link are left out, and said. joints: sensor -> joint to be set instead, further up (an optical frame's camera).
 
     Raises CalibrationError where the body's link or a link of `frames` is not there, where a joint on the way moves,
     and where the file would have to be computed (xacro).
@@ -72,17 +72,21 @@ def updated_urdf(c: Calibration, path: Path, frames: Mapping[str, str]) -> Expor
         tree.check_link(sensors[0] if sensors else "a sensor", sensors[0] if sensors else "it")
     # From the root downwards: a joint's new origin holds for all that is below.
     for name in sorted(links, key=lambda sensor: len(tree.chain(links[sensor]))):
-        tree = _set(tree, body, links[name], c.T_imu_sensor(name))
+        tree = _set(tree, body, links[name], joints.get(name), c.T_imu_sensor(name))
     absent = tuple(f"{path.name} has no link {n}, so {n} was left out." for n in sensors if n not in links)
     text = tree.content.decode("utf-8", "surrogateescape")
     return Export({path.name: text}, absent + _left_out(c))
 
 
-def _set(tree: UrdfTree, body: str, link: str, T_body_link: np.ndarray) -> UrdfTree:
-    """The tree with the origin of the joint above `link` set."""
-    joint = tree.above(link)
-    if joint is None:
+def _set(tree: UrdfTree, body: str, link: str, named: str | None, T_body_link: np.ndarray) -> UrdfTree:
+    """The tree with the origin of the joint above `link`, or of the one `named` further up, set."""
+    chain = tree.chain(link)
+    if not chain:
         raise tree.fail(f"{link} is the root, so no joint can be set for it; join it to {body} or below.")
+    joint = next((j for j in chain if j.name == named), None) if named else chain[0]
+    if joint is None:
+        names = ", ".join(j.name for j in chain)
+        raise tree.fail(f"there is no joint {named} above {link}; above it are {names}; correct --joint.")
     if joint in tree.chain(body):
         raise tree.fail(f"{body} is below {link}; the sensors' links must not be above that of {body}.")
     if joint.type != "fixed":
@@ -92,7 +96,7 @@ def _set(tree: UrdfTree, body: str, link: str, T_body_link: np.ndarray) -> UrdfT
             f"joint {joint.name} stands in a xacro macro, where a change would be one for all its uses; expand the "
             "file first (xacro robot.xacro > robot.urdf)."
         )
-    origin = inverse(tree.T(body, joint.parent)) @ T_body_link
+    origin = inverse(tree.T(body, joint.parent)) @ T_body_link @ inverse(tree.T(joint.child, link))
     return _with_origin(tree, joint, _text(origin[:3, 3]), _text(rpy(origin[:3, :3])))
 
 
