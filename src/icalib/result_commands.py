@@ -86,8 +86,8 @@ def _add_compare(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     tolerance = "differences up to it do not count: deg, mm, ms, px or percent; may be repeated, as in deg=0.1"
     c.add_argument("--tolerance", type=_tolerance, action="append", default=[], metavar="UNIT=VALUE", help=tolerance)
     c.add_argument("--sigma", type=float, default=3.0, metavar="N", help="nor those up to N sigma; by default 3")
-    frame = "link of a sensor in a URDF, where it is not the sensor's name; may be repeated"
-    c.add_argument("--frame", type=_pair, action="append", default=[], metavar="SENSOR=LINK", help=frame)
+    frame = "name in B of a sensor of A, or its link in a URDF, where it is another; may be repeated"
+    c.add_argument("--frame", type=_pair, action="append", default=[], metavar="SENSOR=NAME", help=frame)
     c.add_argument("--json", type=Path, metavar="FILE", help="write the differences as JSON")
     c.add_argument("--quiet", "-q", action="store_true", help="print nothing; the exit code says it")
     c.set_defaults(run=_compare, error_code=2)

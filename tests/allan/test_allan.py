@@ -21,6 +21,8 @@ from icalib.cli import main
 from icalib.errors import EstimationError
 from icalib.measurements import ImuStream
 from icalib.rig_file import load_rig
+from icalib.simulation import handheld
+from icalib.simulation.imu import read_imu
 
 TRUTH = {"gyro": 1.6e-4, "gyro_walk": 2.2e-5, "accel": 2.8e-3, "accel_walk": 8.6e-4}
 REST = np.array([2e-3, -1e-3, 3e-3, 0.1, -0.2, 9.8])
@@ -209,7 +211,7 @@ def test_what_was_moved_is_left_out():
     readings[25_000:, 3:] += [1.0, 0.0, 0.0]  # tilted
     study = study_imu(with_readings(imu, readings), "here")
     assert study.seconds == pytest.approx(220.0, abs=2.0)
-    assert any("of 300 s the longest stretch without is used, 220 s from 30 s on" in w for w in study.warnings)
+    assert any("of 300 s the longest stretch without is used, 219 s from 31 s on" in w for w in study.warnings)
     assert study.gyro.together.white == pytest.approx(TRUTH["gyro"], rel=0.05)
 
 
@@ -323,3 +325,17 @@ def test_a_fit_is_plain_numbers():
 
 def _fit() -> NoiseFit:
     return fit_noise(bands_of(noise(2_000, 0.01, 1e-3, 1e-3, np.random.default_rng(0)), 0.01), 0.01)
+
+
+def test_the_simulated_imu_has_the_densities_of_its_scenario():
+    """The units are those of the rig file, and of the simulator."""
+    scenario = handheld(imu="noisy")
+    rng, rate = np.random.default_rng(5), scenario.imu_rate_hz
+    seconds = np.arange(round(1200 * rate)) / rate
+    readings = read_imu(scenario, seconds, np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 9.81], (len(seconds), 1)), rng)
+    stamps = np.round(1e9 * seconds).astype(np.int64)
+    study = study_imu(ImuStream("imu0", stamps, readings.gyro, readings.accel), "here")
+    for sensor, white, walk in ((study.gyro, "gyro", "gyro_walk"), (study.accel, "accel", "accel_walk")):
+        fit = sensor.together
+        assert abs(fit.white - getattr(scenario.imu_noise, white)) < 4.0 * fit.white_std < 0.02 * fit.white
+        assert abs(fit.walk - getattr(scenario.imu_noise, walk)) < 4.0 * fit.walk_std < 0.4 * fit.walk

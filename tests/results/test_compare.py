@@ -332,7 +332,8 @@ def test_exit_codes(folders: tuple[Path, Path], capsys: pytest.CaptureFixture[st
             ["a", "imu.yaml"],
             "imu.yaml:1: gyroscope_random_walk, accelerometer_noise_density, accelerometer_random_walk are",
         ),
-        (["a", "b", "--frame", "cam0=left"], "--frame names links of a URDF, and neither file is one"),
+        (["a", "b", "--frame", "cam9=cam0"], "there is no sensor cam9 in a; it has cam0"),
+        (["a", "b", "--frame", "cam0=left"], "there is no sensor left in b; it has cam0"),
         (["a", "few.urdf", "--frame", "cam9=left"], "there is no sensor cam9 in a; it has cam0"),
         (["a", "few.urdf", "--frame", "imu0=base", "--frame", "cam0=eye"], "there is no link eye; it has base"),
         (["a", "few.urdf", "--frame", "imu0=base"], "have nothing in common"),
@@ -371,3 +372,25 @@ def test_a_tolerance_that_is_none_is_wrong_usage(capsys: pytest.CaptureFixture[s
     with pytest.raises(SystemExit):
         main(["compare", "a", "b", "--tolerance", text])
     assert "must be UNIT=VALUE with a unit of deg, mm, ms, px, percent" in capsys.readouterr().err
+
+
+def test_sensors_of_other_names_and_openvins_files(robot: Calibration, tmp_path: Path):
+    """Kalibr numbers the cameras anew; OpenVINS turns the transform around, and OpenCV heads the file."""
+    robot.save(tmp_path / "out")
+    files = export(robot, "openvins").files
+    chain = tmp_path / "chain.yaml"
+    chain.write_text(files["kalibr_imucam_chain.yaml"].replace("\ncam0:", "\nleft:").replace("\ncam1:", "\nright:"))
+    found = compare_files(tmp_path / "out", chain, {"cam0": "left", "cam1": "right"})
+    assert found.same and {d.sensor for d in found.differences} == {"cam0", "cam1"}
+    turned = changed(robot, {("cam1", "rotation"): np.deg2rad([0.0, 0.0, 0.5])})
+    turned.save(tmp_path / "turned")
+    found = compare_files(chain, tmp_path / "turned", {"left": "cam0", "right": "cam1"})
+    assert only(found, "right", "rotation", "imu").vector[2] == pytest.approx(0.5)
+    assert only(found, "right", "rotation", "imu").given_by == "B"
+    chain.write_text(files["kalibr_imu_chain.yaml"])
+    assert len(compare_files(tmp_path / "out", chain).differences) == 4
+
+
+def test_entries_that_say_the_same_count_once():
+    """A correlation of 1: three times the same number is one degree of freedom."""
+    assert sigmas(np.full(3, 2.0), np.ones((3, 3))) == pytest.approx(2.0, rel=1e-9)

@@ -12,7 +12,8 @@ from icalib.measurements import ImuStream
 _GAP_PERIODS = 5.0  # a longer step between stamps is a gap; shorter ones are jitter of whoever stamps
 _MOST_FILLED = 0.05  # share of readings; beyond it stamps come in bursts, and say nothing about gaps
 _WINDOW_S = 1.0
-_RATE_OFF, _FORCE_OFF = 0.02, 0.2  # rad/s, m/s^2: no bias walks that far from its median in hours
+_JUMP = np.repeat([0.02, 0.2], 3)  # rad/s, m/s^2: no bias walks that far from one second to the next,
+_OFF = np.repeat([0.1, 2.0], 3)  # nor that far from its median in hours
 _NOISE_OFF = 5.0  # times the median noise of a window
 _LEAST_S = 10.0
 
@@ -84,8 +85,8 @@ def _disturbed(readings: np.ndarray, period: float) -> np.ndarray:
         return np.ones(1, dtype=bool)
     parts = readings[: count * window].reshape(count, window, 6)
     mean, noise = parts.mean(axis=1), parts.std(axis=1)
-    off = np.abs(mean - np.median(mean, axis=0))
-    moved = (off[:, :3] > _RATE_OFF).any(axis=1) | (off[:, 3:] > _FORCE_OFF).any(axis=1)
+    jump = np.abs(np.diff(mean, axis=0, prepend=mean[:1]))
+    moved = ((jump > _JUMP) | (np.abs(mean - np.median(mean, axis=0)) > _OFF)).any(axis=1)
     return moved | (noise > _NOISE_OFF * np.median(noise, axis=0) + 1e-12).any(axis=1)
 
 

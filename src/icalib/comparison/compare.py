@@ -118,7 +118,7 @@ def compare_sides(a: Side, b: Side, tolerances: Tolerances | None = None, limit:
     Raises CalibrationError where they share nothing.
     """
     if a.has_imu and b.has_imu and a.body != b.body:
-        b = b.with_body(a.body)
+        b = b.renamed(b.body, a.body)
     pair = _Pair(a, b, tolerances or Tolerances(), limit)
     shared = [name for name in a.poses if name in b.poses]
     reference = a.body if a.body == b.body else next(iter(shared), a.body)
@@ -126,14 +126,13 @@ def compare_sides(a: Side, b: Side, tolerances: Tolerances | None = None, limit:
     if not found:
         raise CalibrationError(
             f"{a.path} ({_names(a)}) and {b.path} ({_names(b)}) have nothing in common to compare; names of sensors "
-            "must match, or be given as --frame SENSOR=LINK for a URDF."
+            "must match, or be given as --frame SENSOR=NAME."
         )
     return Comparison(a, b, reference, found, _notes(a, b, shared))
 
 
 def _names(side: Side) -> str:
-    sensors = dict.fromkeys([*side.poses, *(name for name, _ in side.quantities), *side.lenses])
-    return ", ".join(sensors) or "no sensors"
+    return ", ".join(side.sensors) or "no sensors"
 
 
 def _notes(a: Side, b: Side, shared: list[str]) -> tuple[str, ...]:

@@ -35,7 +35,7 @@ def side_of_kalibr(root: YamlValue) -> Side:
     parts = {"imu0": root} if _KALIBR_NOISE["gyro"] in entries else {n: v for n, v in entries.items() if v.is_mapping}
     cameras = {n: v.entries() for n, v in parts.items() if "camera_model" in v.entries()}
     imus = {n: v.entries() for n, v in parts.items() if _KALIBR_NOISE["gyro"] in v.entries()}
-    has_imu = bool(imus) or any("T_cam_imu" in found for found in cameras.values())
+    has_imu = bool(imus) or any({"T_cam_imu", "T_imu_cam"} & set(found) for found in cameras.values())
     body = next(iter(imus), "imu") if has_imu else next(iter(cameras))
     poses = {body: np.eye(4)}
     for i, (name, found) in enumerate(cameras.items()):
@@ -55,9 +55,11 @@ def side_of_kalibr(root: YamlValue) -> Side:
 def _camera_pose(
     root: YamlValue, name: str, found: dict[str, YamlValue], poses: dict[str, np.ndarray], before: str | None
 ) -> np.ndarray:
-    """T_body_cam: from T_cam_imu, else along the chain of cameras; NaN where neither is given."""
+    """T_body_cam: from T_cam_imu, or OpenVINS' inverse of it, else along the chain of cameras; else NaN."""
     if "T_cam_imu" in found:
         return np.linalg.inv(_transform(found["T_cam_imu"]))
+    if "T_imu_cam" in found:
+        return _transform(found["T_imu_cam"])
     if before is not None and "T_cn_cnm1" in found:
         return poses[before] @ np.linalg.inv(_transform(found["T_cn_cnm1"]))
     return poses.get(name, np.full((4, 4), np.nan))

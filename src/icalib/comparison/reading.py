@@ -23,31 +23,44 @@ def compare_files(
     tolerances: Tolerances | None = None,
     limit: float = 3.0,
 ) -> Comparison:
-    """Each of a, b: the folder of a result, a Kalibr camchain or imu file, a URDF, or a rig file. frames: sensor ->
-    link of a URDF, where the two differ.
+    """Each of a, b: the folder of a result, a Kalibr camchain or imu file, a URDF, or a rig file. frames: sensor of
+    A -> its name in B, or of the other side -> its link in a URDF, where the two differ.
 
     Raises CalibrationError, one sentence, where a file cannot be read or the two have nothing in common.
     """
     frames = frames or {}
-    if frames and not (_is_urdf(a) or _is_urdf(b)):
-        raise CalibrationError("--frame names links of a URDF, and neither file is one; leave it out.")
     if _is_urdf(a) and _is_urdf(b):
         one, other = side_of_urdf_alone(a, b, frames), side_of_urdf_alone(b, a, frames)
     elif _is_urdf(a):
         other = _side(b)
         one = _beside(a, other, frames)
-    else:
+    elif _is_urdf(b):
         one = _side(a)
-        other = _beside(b, one, frames) if _is_urdf(b) else _side(b)
+        other = _beside(b, one, frames)
+    else:
+        one, other = _renamed(_side(a), _side(b), frames)
     return compare_sides(one, other, tolerances, limit)
 
 
 def _beside(urdf: Path, side: Side, frames: Mapping[str, str]) -> Side:
-    unknown = [name for name in frames if name not in side.poses]
-    if unknown:
-        raise CalibrationError(f"there is no sensor {unknown[0]} in {side.path}; it has {', '.join(side.poses)}.")
+    for name in frames:
+        _check_known(name, side)
     sensors = [name for name in side.poses if name != side.body]
     return side_of_urdf(urdf, side.body, side.has_imu, sensors, frames)
+
+
+def _renamed(a: Side, b: Side, frames: Mapping[str, str]) -> tuple[Side, Side]:
+    """b with its sensors called as in a."""
+    for name, theirs in frames.items():
+        _check_known(name, a)
+        _check_known(theirs, b)
+        b = b.renamed(theirs, name)
+    return a, b
+
+
+def _check_known(name: str, side: Side) -> None:
+    if name not in side.sensors:
+        raise CalibrationError(f"there is no sensor {name} in {side.path}; it has {', '.join(side.sensors)}.")
 
 
 def _side(path: Path) -> Side:

@@ -62,22 +62,28 @@ class Side:
         out[:3, 3] = a[:3, :3].T @ (b[:3, 3] - a[:3, 3])
         return out
 
-    def with_body(self, name: str) -> Side:
-        """The same with the body's sensor called `name`: IMUs are one, whatever they are called."""
-        old = self.body
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of all that something is said of."""
+        return tuple(dict.fromkeys([*self.poses, *(name for name, _ in self.quantities), *self.lenses]))
 
-        def renamed(sensor: str) -> str:
-            return name if sensor == old else sensor
+    def renamed(self, old: str, new: str) -> Side:
+        """The same with the sensor `old` called `new`."""
+
+        def now(name: str) -> str:
+            return new if name == old else name
 
         def covariance(frame: str, sensor: str) -> np.ndarray:
-            return self.covariance(*(old if n == name else n for n in (frame, sensor)))
+            return self.covariance(*(old if name == new else name for name in (frame, sensor)))
 
         return dataclasses.replace(
             self,
-            body=name,
-            poses={renamed(n): T for n, T in self.poses.items()},
+            body=now(self.body),
+            poses={now(name): T for name, T in self.poses.items()},
             covariance=covariance,
-            quantities={(renamed(n), key): q for (n, key), q in self.quantities.items()},
+            open=frozenset((now(name), key) for name, key in self.open),
+            quantities={(now(name), key): q for (name, key), q in self.quantities.items()},
+            lenses={now(name): lens for name, lens in self.lenses.items()},
         )
 
 

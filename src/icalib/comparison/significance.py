@@ -7,6 +7,7 @@ from statistics import NormalDist
 
 import numpy as np
 
+_SINGULAR = 1e-10  # of the correlation; below, entries say the same
 _SMALLEST_P = 1e-14  # below, the quantile of the normal distribution loses its digits
 
 
@@ -24,8 +25,8 @@ def sigmas(difference: np.ndarray, covariance: np.ndarray) -> float | None:
     scale = np.sqrt(np.diag(covariance)[loose])
     correlation = covariance[np.ix_(loose, loose)] / np.outer(scale, scale)
     whitened = difference[loose] / scale
-    chi2 = float(whitened @ np.linalg.pinv(correlation, hermitian=True) @ whitened)
-    dof = int(np.linalg.matrix_rank(correlation, hermitian=True))
+    chi2 = float(whitened @ np.linalg.pinv(correlation, _SINGULAR, hermitian=True) @ whitened)
+    dof = int(np.linalg.matrix_rank(correlation, _SINGULAR * len(scale), hermitian=True))
     p = chi2_above(chi2, dof)
     return sqrt(chi2) if p < _SMALLEST_P else max(0.0, NormalDist().inv_cdf(1.0 - 0.5 * p))
 
