@@ -86,8 +86,12 @@ def _axis(d: Difference, one: str, several: str) -> str:
 
 def _certainty(d: Difference) -> str:
     if d.sigmas is None:
-        words = f"no standard deviation is known (tolerance {d.tolerance:g} {d.unit})"
+        words = f"no standard deviation is known (tolerance {_tolerance(d)})"
     else:
         words = f"{d.sigmas:.1f} sigma" + (f" of {d.given_by} alone" if d.given_by in ("A", "B") else "")
-        words += f" (tolerance {d.tolerance:g} {d.unit})" if d.tolerance > 0 else ""
+        words += f" (tolerance {_tolerance(d)})" if d.tolerance > 0 else ""
     return words + (f", undetermined in {' and '.join(d.open)}" if d.open else "")
+
+
+def _tolerance(d: Difference) -> str:
+    return f"{d.tolerance:g} {'%' if d.unit == 'percent' else d.unit}"

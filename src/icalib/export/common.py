@@ -74,10 +74,10 @@ def need(names: Sequence[str], kind: str, program: str) -> None:
         raise CalibrationError(f"this calibration has no {kind}, so there is nothing to export to {program}.")
 
 
-def guesses(c: Calibration) -> tuple[str, ...]:
-    """A sentence for each sensor with parameters that the data did not determine."""
+def guesses(c: Calibration, names: Sequence[str]) -> tuple[str, ...]:
+    """A sentence for each of the sensors `names` with parameters that the data did not determine."""
     found = []
-    for name in c.mounted:
+    for name in names:
         open_ = [
             g.name.replace("_", " ") + ("" if len(g.labels) == 1 else f" {label}")
             for g in c.groups

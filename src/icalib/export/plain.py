@@ -30,4 +30,4 @@ def plain_json(c: Calibration) -> Export:
     for sensor in data["sensors"].values():
         T = np.array(sensor[key])
         sensor |= {"quaternion_xyzw": list(quaternion(T[:3, :3])), "translation": T[:3, 3].tolist()}
-    return Export({"calibration.json": json.dumps(data, indent=1, ensure_ascii=False) + "\n"}, guesses(c))
+    return Export({"calibration.json": json.dumps(data, indent=1, ensure_ascii=False) + "\n"}, guesses(c, c.mounted))

@@ -59,7 +59,7 @@ def ros2_static(c: Calibration, frames: Mapping[str, str]) -> Export:
     others = [name for name in c.mounted if name != c.body]
     offsets, lenses = time_offsets(c, others), [f"the lens of {name}" for name in c.cameras]
     wheels = [f"radii and baseline of {name}" for name in c.wheels]
-    sentences = no_place_for("tf", [*offsets, *lenses, *wheels, *imu_intrinsics(c)]) + guesses(c)
+    sentences = no_place_for("tf", [*offsets, *lenses, *wheels, *imu_intrinsics(c)]) + guesses(c, c.mounted)
     parent = frames.get(c.body, c.body)
     comments = [
         "Static transforms for ROS 2, by icalib.",
