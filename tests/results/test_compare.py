@@ -394,3 +394,15 @@ def test_sensors_of_other_names_and_openvins_files(robot: Calibration, tmp_path:
 def test_entries_that_say_the_same_count_once():
     """A correlation of 1: three times the same number is one degree of freedom."""
     assert sigmas(np.full(3, 2.0), np.ones((3, 3))) == pytest.approx(2.0, rel=1e-9)
+
+
+def test_what_is_undetermined_of_the_camera_seen_from_is_marked(robot: Calibration):
+    groups = tuple(
+        dataclasses.replace(g, verdict=("undetermined", "determined", "determined"))
+        if (g.sensor, g.name) == ("cam0", "rotation")
+        else g
+        for g in robot.groups
+    )
+    found = compared(robot, dataclasses.replace(robot, groups=groups))
+    assert only(found, "cam1", "rotation", "cam0").open == ("B",)
+    assert only(found, "cam1", "rotation", "imu0").open == ()

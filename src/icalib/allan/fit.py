@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 _PER_OCTAVE = 8
-_HIGHEST = 0.1  # of the rate: above, the sensor's own filter and rounding shape the spectrum
+_HIGHEST = 0.05  # of the rate: above, the sensor's own filter and rounding shape the spectrum
 _LEAST_IN_BAND = 8  # coefficients that make a band's power about Gaussian
 _RESOLVED = 9.0  # twice the gain in log-likelihood by the walk, as 3 sigma
 _UPPER = 2.71  # one-sided 95 %
@@ -55,7 +55,7 @@ class NoiseFit:
 
 
 def bands_of(readings: np.ndarray, period: float) -> Bands:
-    """Of readings (n,), one every `period` seconds, up to a tenth of the rate."""
+    """Of readings (n,), one every `period` seconds, up to a twentieth of the rate."""
     differences = np.diff(readings)
     n = _smooth_size(len(differences) + 1) - 1
     odd = np.concatenate([[0.0], differences[:n], [0.0], -differences[:n][::-1]])
