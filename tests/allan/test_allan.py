@@ -13,15 +13,16 @@ import numpy as np
 import pytest
 import yaml
 
-from icalib.allan import allan_deviation, study_imu, write_study
+from icalib.allan import allan_deviation, study_imu, study_recording, write_study
 from icalib.allan.deviation import model_variance
 from icalib.allan.fit import NoiseFit, _most_likely, _std, bands_of, fit_noise, pooled
 from icalib.allan.sampling import still_readings
 from icalib.cli import main
-from icalib.errors import EstimationError
+from icalib.errors import EstimationError, RecordingError
 from icalib.measurements import ImuStream
 from icalib.rig_file import load_rig
 from icalib.simulation import handheld
+from icalib.simulation.bag_writer import IMU, BagForm, BagWriter
 from icalib.simulation.imu import read_imu
 
 TRUTH = {"gyro": 1.6e-4, "gyro_walk": 2.2e-5, "accel": 2.8e-3, "accel_walk": 8.6e-4}
@@ -317,6 +318,13 @@ def test_several_imus_or_none_are_one_sentence(tmp_path: Path, capsys: pytest.Ca
     shutil.rmtree(recording / "imu0")
     assert main(["allan", str(recording), "-o", str(tmp_path / "out")]) == 1
     assert "did not stand still for 10 s anywhere in 2 s" in capsys.readouterr().err
+    (recording / "cam0").mkdir()
+    (recording / "imu1" / "data.csv").rename(recording / "cam0" / "corners.csv")
+    (recording / "cam0" / "corners.csv").write_text("1,0,0,1.0,2.0\n")
+    assert main(["allan", str(recording), "-o", str(tmp_path / "out")]) == 1
+    assert "has no readings of an IMU; it holds cam0/corners.csv" in capsys.readouterr().err
+    assert main(["allan", str(tmp_path / "nowhere"), "-o", str(tmp_path / "out")]) == 1
+    assert "nowhere does not exist" in capsys.readouterr().err
 
 
 def test_a_fit_is_plain_numbers():
@@ -350,3 +358,21 @@ def test_the_filter_of_a_sensor_does_not_pass_for_low_noise():
     fit = study_imu(filtered, "here").gyro.together
     assert fit.white == pytest.approx(TRUTH["gyro"], rel=0.02)
     assert fit.walk == pytest.approx(TRUTH["gyro_walk"], rel=0.15)
+
+
+@pytest.mark.parametrize("form", ["ros1", "mcap"])
+def test_a_bag_gives_what_its_table_gives(tmp_path: Path, form: BagForm):
+    """Two IMUs in it: the topic says which."""
+    imu = at_rest(30.0, 100.0, 7)
+    bag = tmp_path / "static.bag"
+    topics = ("/left/imu", "/right/imu")
+    with BagWriter(form, bag, dict.fromkeys(topics, IMU)) as writer:
+        for t, row in zip(imu.stamps_ns.tolist(), np.hstack([imu.gyro, imu.accel]).tolist(), strict=True):
+            writer.write(topics[0], writer.imu(t, row), t)
+            writer.write(topics[1], writer.imu(t, [2.0 * v for v in row[:3]] + row[3:]), t)
+    table = study_recording(write(imu, tmp_path)).gyro.together
+    left, right = (study_recording(bag, topic).gyro.together for topic in topics)
+    assert left.white == pytest.approx(table.white, rel=1e-6)
+    assert right.white == pytest.approx(2.0 * table.white, rel=1e-6)
+    with pytest.raises(RecordingError, match="has several IMUs, /left/imu, /right/imu; give one as --imu"):
+        study_recording(bag)
