@@ -116,9 +116,10 @@ class _Cells(NamedTuple):
 
 
 class _Weights(NamedTuple):
-    """Variances [m^2] of what is alike in all directions and of what is along the beam; the loss."""
+    """Variances [m^2] of what is alike in all directions (and 1 over it), and of what is along the beam; the loss."""
 
     alike: float
+    whole: float
     along: float
     loss: int
     scale: float
@@ -213,11 +214,12 @@ def _see_plane(R, p, plane, seen):
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _add_point(x, y, z, s, seen, weights, sums):
     """Adds one weighted point to the ten moments in row s."""
-    w = 1.0 / weights.alike
+    w = weights.whole
     if weights.along > 0.0 or weights.loss:
         across = seen[s, 1] * x + seen[s, 2] * y + seen[s, 3] * z
         if weights.along > 0.0:
-            w = 1.0 / (weights.alike + weights.along * across * across / (x * x + y * y + z * z))
+            square = x * x + y * y + z * z
+            w = square / (weights.alike * square + weights.along * across * across)
         if weights.loss:
             w *= weight(weights.loss, weights.scale, (seen[s, 0] + across) ** 2 * w)[0]
     wx, wy, wz = w * x, w * y, w * z
@@ -371,7 +373,7 @@ def _moments_of(
         np.empty((n // each, 3)),
     )  # fmt: skip
     _to_centres(motion, each, usable(drive.imu, times, drive.max_gap_s), cells)
-    weights = _Weights(noise.sigma**2, noise.beam_sigma**2, LOSSES[noise.loss], noise.loss_scale)
+    weights = _Weights(noise.sigma**2, noise.sigma**-2, noise.beam_sigma**2, LOSSES[noise.loss], noise.loss_scale)
     most = min(len(scans.xyz), len(cells.position) * len(cloud.planes))
     bin_of, own_plane, count = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)
     root = np.empty((most, MOMENTS))
