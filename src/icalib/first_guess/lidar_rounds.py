@@ -22,7 +22,8 @@ from icalib.estimation.assembly import (
     with_clouds,
 )
 from icalib.estimation.estimate import first_pass
-from icalib.estimation.lidar_binning import Associated, LidarNoise, Moments, Motion, sweep, take_moments
+from icalib.estimation.lidar_binning import Associated, LidarNoise, Moments, take_moments
+from icalib.estimation.lidar_sweep import Motion, sweep
 from icalib.estimation.robot import FIRST_RANGE_M, MOUNT, Clouds, known_planes
 from icalib.estimation.state import Key, State
 from icalib.first_guess.align_camera import trusted
