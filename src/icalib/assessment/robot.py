@@ -9,8 +9,9 @@ import numpy as np
 from icalib.calibration import LidarResiduals, Plane, SensorFit, WheelResiduals
 from icalib.estimation.assembly import Inputs, motion_of, origin_difference
 from icalib.estimation.estimate import Estimate
-from icalib.estimation.lidar_binning import LidarNoise, Motion, in_world
+from icalib.estimation.lidar_binning import LidarNoise, in_world
 from icalib.estimation.lidar_factor import LidarFactor
+from icalib.estimation.lidar_sweep import Motion
 from icalib.estimation.nodes import usable
 from icalib.estimation.state import State
 from icalib.estimation.wheel_factor import IncrementFactor, RelativePoseFactor

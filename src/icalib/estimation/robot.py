@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.estimation.lidar_binning import LidarNoise, Motion
+from icalib.estimation.lidar_binning import LidarNoise
 from icalib.estimation.lidar_factor import LidarFactor
+from icalib.estimation.lidar_sweep import Motion
 from icalib.estimation.sensors import SensorFactor
 from icalib.estimation.state import Entry, Key, Kind, Layout
 from icalib.estimation.wheel_angles import angles_from_rates

@@ -35,6 +35,7 @@ from icalib.measurements import LidarStream
 LEAST_CORRELATION = 0.6  # of turning rates with the IMU's
 G_TOLERANCE = 0.1
 ARM_ROUNDS = 2  # each brings the path nearer to the known motion
+SAME_RAD, SAME_S = 5e-3, 1e-3  # alignments this near turn a scan's points alike, to what the registration allows for
 
 
 @dataclass(frozen=True)
@@ -144,13 +145,20 @@ def _poses(known: State, gyro: GyroRotation, t: np.ndarray) -> tuple[np.ndarray,
 def _aligned(imu: ImuData, stream: LidarStream, held: Held) -> tuple[Alignment, LidarPath, CameraRates]:
     """Time offset, rotation and gyroscope bias; the LiDAR's path by the gyroscope's turns, as far as the IMU was
     running, and its rates."""
-    path = _turned_path(imu, stream, _align(imu, stream.name, _rates(stream.name, lidar_path(stream)), held))
+    first = _align(imu, stream.name, _rates(stream.name, lidar_path(stream)), held)
+    path = _turned_path(imu, stream, first)
     rates = _rates(stream.name, path)
     aligned = _align(imu, stream.name, rates, held)
-    path = _turned_path(imu, stream, aligned)
+    if not _alike(first, aligned):
+        path = _turned_path(imu, stream, aligned)
     t = path.seconds + aligned.offset
     inside = path.ok & (t > imu.seconds[0]) & (t < imu.seconds[-1])
     return aligned, _where(path, inside), rates
+
+
+def _alike(a: Alignment, b: Alignment) -> bool:
+    apart = so3.log(np.ascontiguousarray(a.rotation.T @ b.rotation))
+    return float(np.linalg.norm(apart)) < SAME_RAD and abs(a.offset - b.offset) < SAME_S
 
 
 def _align(imu: ImuData, name: str, rates: CameraRates, held: Held) -> Alignment:

@@ -22,7 +22,8 @@ from icalib.estimation.assembly import (
     with_clouds,
 )
 from icalib.estimation.estimate import first_pass
-from icalib.estimation.lidar_binning import in_world
+from icalib.estimation.lidar_binning import Associated, LidarNoise, Moments, take_moments
+from icalib.estimation.lidar_sweep import Motion, sweep
 from icalib.estimation.robot import FIRST_RANGE_M, MOUNT, Clouds, joined_clouds, known_planes
 from icalib.estimation.state import Key, State
 from icalib.first_guess.align_camera import trusted
@@ -130,9 +131,8 @@ def while_known(inputs: Inputs, state: State) -> Inputs:
     measured, lidars, notes = inputs.measurements, [], list(inputs.measurements.notes)
     for stream in measured.lidars:
         begin = stream.seconds + state.values[stream.name, "time_offset"][0]
-        scan = np.repeat(np.arange(len(begin)), np.diff(stream.start))
-        last = np.zeros(len(begin))
-        np.maximum.at(last, scan, stream.offset_s)
+        last, some = np.zeros(len(begin)), np.diff(stream.start) > 0
+        last[some] = np.maximum.reduceat(stream.offset_s, stream.start[:-1][some]) if some.any() else 0.0
         known = near_nodes(state.seconds, begin) & near_nodes(state.seconds, begin + last)
         if not known.any():
             raise EstimationError(
@@ -145,7 +145,8 @@ def while_known(inputs: Inputs, state: State) -> Inputs:
                 "the motion then."
             )
         size2 = np.einsum("na,na->n", stream.xyz, stream.xyz)
-        lidars.append(with_points(stream, known[scan] & np.isfinite(size2) & (size2 > 0.0)))
+        usable = np.isfinite(size2) & (size2 > 0.0)
+        lidars.append(with_points(stream, np.repeat(known, np.diff(stream.start)) & usable))
     return replace(inputs, measurements=replace(measured, lidars=tuple(lidars), notes=tuple(notes)))
 
 
@@ -190,14 +191,23 @@ def fitted_planes(inputs: Inputs, state: State, clouds: Clouds) -> dict[Key, np.
     """Values of the planes that fit the points best where `state` puts them."""
     motion, sums = motion_of(inputs, state), np.zeros((clouds.count, 4, 4))
     for stream, plane in zip(inputs.measurements.lidars, clouds.plane, strict=True):
-        own, (points, _) = plane[plane >= 0], in_world(motion, stream)
-        columns = [np.ones(len(own)), *points[plane >= 0].T.astype(np.float64)]
-        for i in range(4):
-            for j in range(i + 1):
-                sums[:, i, j] += np.bincount(own, columns[i] * columns[j], clouds.count)
+        if (plane >= 0).any():
+            moments = take_moments(Associated(stream, plane, np.zeros((clouds.count, 6))), motion, LidarNoise(1.0))
+            _add_in_world(moments, motion, stream.name, sums)
     out = {}
     for key, M in zip(clouds.keys, sums, strict=True):
         centre = M[1:, 0] / M[0, 0]
-        spread = np.tril(M[1:, 1:]) / M[0, 0] - np.outer(centre, centre)
-        out[key] = plane_of(np.linalg.eigh(spread, UPLO="L")[1][:, 0], centre)
+        spread = M[1:, 1:] / M[0, 0] - np.outer(centre, centre)
+        out[key] = plane_of(np.linalg.eigh(spread)[1][:, 0], centre)
     return out
+
+
+def _add_in_world(moments: Moments, motion: Motion, name: str, sums: np.ndarray) -> None:
+    """Adds to sums (P, 4, 4) those of (1, x) (1, x)^T over the points x of each plane, in the world."""
+    at = sweep(motion, name, moments.seconds + motion.state.values[name, "time_offset"][0])
+    bin_of = np.repeat(np.arange(len(moments.seconds)), np.diff(moments.start))
+    L, A = np.zeros((len(bin_of), 4, 4)), np.zeros((len(bin_of), 4, 4))
+    L[:, *np.tril_indices(4)] = moments.root
+    A[:, 0, 0], A[:, 1:, 0], A[:, 1:, 1:] = 1.0, at.position[bin_of], at.rotation[bin_of]
+    X = A @ L
+    np.add.at(sums, moments.plane, X @ X.transpose(0, 2, 1))

@@ -8,7 +8,7 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation.assembly import Inputs, motion_of
-from icalib.estimation.lidar_binning import Motion
+from icalib.estimation.lidar_sweep import Motion
 from icalib.estimation.poses import assign_nodes, poses_at
 from icalib.estimation.robot import DRIVE, MOUNT, wheel_angles
 from icalib.estimation.state import Key, State
