@@ -150,3 +150,70 @@ def test_a_flat_floor_leaves_heights_and_the_roll_of_wheels_at_the_guess(robot, 
 @pytest.mark.parametrize("parts", ["cw", "clw", "l"])
 def test_flat_floors(robot, parts: str, seed: int):
     check_planar(robot("planar", 30.0, parts, 600), seed, unassociated)
+
+
+# What the model does not know of.
+
+
+def displaced(measurements: Measurements, seed: int) -> Measurements:
+    """A tenth of the points is nearer or farther than what they should have hit."""
+    rng, damaged = np.random.default_rng(seed), []
+    for x in measurements.lidars:
+        own, xyz = rng.random(len(x.xyz)) < 0.1, x.xyz.copy()
+        xyz[own] *= rng.uniform(0.2, 1.1, (own.sum(), 1)).astype(np.float32)
+        damaged.append(replace(x, xyz=xyz))
+    return unassociated(replace(measurements, lidars=tuple(damaged)))
+
+
+def passed_by(measurements: Measurements, seed: int) -> Measurements:
+    """Somebody walks round the LiDAR two metres away, and hides a tenth of what it would see."""
+    rng, damaged = np.random.default_rng(seed), []
+    for x in measurements.lidars:
+        seconds = np.repeat(x.seconds, np.diff(x.start)) + x.offset_s
+        aside = (np.arctan2(x.xyz[:, 1], x.xyz[:, 0]) - 0.5 * seconds + np.pi) % (2.0 * np.pi) - np.pi
+        far = np.linalg.norm(x.xyz, axis=1)
+        hidden = (np.abs(aside) < 0.1 * np.pi) & (far > 2.3)
+        near = 2.0 + 0.2 * np.cos(10.0 * aside) + 0.03 * rng.standard_normal(len(far))
+        damaged.append(replace(x, xyz=np.where(hidden, near / far, 1.0).astype(np.float32)[:, None] * x.xyz))
+    return unassociated(replace(measurements, lidars=tuple(damaged)))
+
+
+def check_outliers(robot, seed: int, damage, case: Case) -> None:
+    scenario = robot(case.example, case.seconds, case.parts, case.azimuth_steps)
+    simulation, rig = simulate(scenario, seed), rig_for(scenario)
+    rig = replace(rig, settings=replace(rig.settings, loss="huber"))
+    result = calibrate_measurements(rig, damage(simulation.measurements, seed))
+    check_known(result, simulation)
+    T = simulation.truth.T_imu_lidar["lidar0"]
+    assert np.linalg.norm(result.group("lidar0", "translation").value - T[:3, 3]) < 3e-3
+    assert np.rad2deg(np.linalg.norm(error("rotation", result.group("lidar0", "rotation").value, T[:3, :3]))) < 0.03
+
+
+def test_points_that_hit_something_else(robot):
+    check_outliers(robot, 0, displaced, replace(FOUND, seconds=10.0, azimuth_steps=300))
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("damage", [displaced, passed_by])
+def test_a_tenth_of_the_points_are_outliers(robot, damage, seed: int):
+    check_outliers(robot, seed, damage, FOUND)
+
+
+def check_slip(robot, degrees: float, seed: int) -> None:
+    """At the slip density that rigs have if they say nothing."""
+    scenario = robot("ramp", 30.0, "cw")
+    scenario = replace(scenario, motion=replace(scenario.motion, sideslip_deg=degrees))
+    simulation = simulate(scenario, seed)
+    check_known(calibrate_measurements(rig_for(scenario), simulation.measurements), simulation)
+
+
+def test_wheels_that_slide_sideways(robot):
+    check_slip(robot, 1.25, 0)
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("degrees", [0.5, 1.25])  # at the drives' 0.9 m/s or so 4 and 10 mm/s RMS
+def test_drives_with_sideslip(robot, degrees: float, seed: int):
+    check_slip(robot, degrees, seed)
