@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -19,6 +20,7 @@ from icalib.estimation.state import State, make_layout
 from icalib.estimation.tolerances import Tolerances
 from icalib.first_guess.lidar import LidarGuess, lidar_and_motion, lidar_on_motion
 from icalib.first_guess.lidar_planes import ROUNDS, associate, round_search
+from icalib.first_guess.lidar_rounds import check_shares
 
 NOISE = LidarNoise(0.03, loss="huber")
 FREE = (("rotation", "rotation", 3), ("translation", "vector", 3), ("time_offset", "vector", 1))
@@ -162,3 +164,11 @@ def test_many_recordings(robot, example, turn, way, late, wrong):
         assert (np.array(errors(r, state)) < [turn, way, late]).all()
         table = faces_of(found[-1], r.streams)
         assert table.max(axis=1).sum() > (1.0 - wrong) * table.sum()
+
+
+@pytest.mark.parametrize(
+    ("shares", "lost"), [((0.15, 0.07, 0.06), True), ((0.1, 0.5, 0.9), False), ((0.1, 0.09), False)]
+)
+def test_planes_that_get_lost_from_round_to_round_are_an_error(shares: tuple[float, ...], lost: bool):
+    with pytest.raises(EstimationError, match="lidar0.*15%, then 6%") if lost else nullcontext():
+        check_shares(shares, "lidar0")

@@ -42,6 +42,7 @@ from icalib.first_guess.lidar_planes import ROUNDS, Association, associate, roun
 from icalib.geometry.planes import plane_of
 from icalib.rig import Camera, Lidar, Wheels
 
+FEW, LOST = 0.2, 0.7  # share of points on planes, and of what there was at first, below which the planes are lost
 NEAR_NODE_S = 0.15  # a scan of a LiDAR alone goes on so long after its node
 NAMES = tuple(name for name, _, _ in MOUNT)
 
@@ -106,6 +107,7 @@ def with_lidars(inputs: Inputs, state: State) -> tuple[Inputs, State]:
         return with_clouds(inputs, clouds), replace(state, values=state.values | fitted_planes(inputs, state, clouds))
     before: list[Association | None] = [None] * len(recordings)
     noise = max(x.range_noise_m or FIRST_RANGE_M for x in inputs.rig.lidars)
+    shares = []
     for k in range(ROUNDS):
         found = []
         for r, streams in enumerate(recordings):
@@ -116,9 +118,27 @@ def with_lidars(inputs: Inputs, state: State) -> tuple[Inputs, State]:
         planes = np.concatenate([a.planes for a in found])
         inputs = with_clouds(inputs, clouds)
         state = replace(state, values=_without_planes(state) | dict(zip(clouds.keys, planes, strict=True)))
+        shares.append(share_on_planes(clouds))
         if k < ROUNDS - 1:
             state = first_pass(inputs, state)
+    check_shares(shares, " and ".join(s.name for s in inputs.measurements.lidars))
     return inputs, state
+
+
+def share_on_planes(clouds: Clouds) -> float:
+    """Of all points."""
+    return sum(int((p >= 0).sum()) for p in clouds.plane) / max(sum(len(p) for p in clouds.plane), 1)
+
+
+def check_shares(shares: Sequence[float], names: str) -> None:
+    """From round to round walls get thinner and more points lie on them; where fewer do, the estimate leads away."""
+    first, last = shares[0], shares[-1]
+    if last < FEW and last < LOST * first:
+        raise EstimationError(
+            f"ever fewer points of {names} lie on planes as the estimate goes on ({first:.0%}, then {last:.0%}): it "
+            "starts too far off; correct rotation, translation and time_offset in the rig file, or leave them out to "
+            "have them found."
+        )
 
 
 def _without_planes(state: State) -> dict[Key, np.ndarray]:
