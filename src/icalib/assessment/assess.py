@@ -41,7 +41,7 @@ from icalib.timeline import Timeline
 
 UNITS = {
     "rotation": "rad", "translation": "m", "time_offset": "s", "intrinsics": "px", "distortion": "", "bloom": "px",
-    "shape": "m", "tilt": "rad", "radii": "m", "baseline": "m",
+    "shape": "m", "tilt": "rad", "radii": "m", "baseline": "m", "frame_rotation": "rad", "frame_translation": "m",
 }  # fmt: skip
 LABELS = {"shape": SHAPE_LABELS, "radii": ("left", "right"), "plane": ("turn 1", "turn 2", "distance")}
 EXPECTED_CHI2 = (0.5, 2.0)  # chi^2 per post-fit degree of freedom outside this is worth a warning
@@ -91,7 +91,7 @@ def _rates(inputs: Inputs) -> dict[str, float]:
     """Hz of each sensor, from the median step of its stamps."""
     imu = inputs.measurements.imu
     m = inputs.measurements
-    streams = (*(() if imu is None else (imu,)), *m.cameras, *m.lidars, *m.wheels)
+    streams = (*(() if imu is None else (imu,)), *m.cameras, *m.lidars, *m.wheels, *m.poses)
     return {s.name: float(1.0 / np.median(np.diff(s.seconds))) for s in streams if len(s.stamps_ns) > 1}
 
 

@@ -48,7 +48,7 @@ def lidar_residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> tupl
     thinned = [_thinned(inputs, k, state) for k in range(len(inputs.rig.lidars))]
     guessed = _fitted([(in_world(first, stream)[0], plane) for stream, plane in thinned], values)
     out = []
-    for whole, (stream, plane), noise in zip(inputs.measurements.lidars, thinned, found.ranging, strict=True):
+    for whole, (stream, plane), noise in zip(inputs.measurements.lidars, thinned, found.robot.ranging, strict=True):
         seconds = _seconds_of(stream, state)
         world, residual, cosine = _on_planes(now, stream, values[plane])
         first_world, first_residual, _ = _on_planes(first, stream, guessed[plane])
@@ -136,7 +136,7 @@ def wheel_residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> tupl
 
 def robot_notes(inputs: Inputs, found: Estimate) -> Iterator[str]:
     """How much of the LiDARs is in use, and their noise."""
-    for lidar, stream, noise in zip(inputs.rig.lidars, inputs.measurements.lidars, found.ranging, strict=True):
+    for lidar, stream, noise in zip(inputs.rig.lidars, inputs.measurements.lidars, found.robot.ranging, strict=True):
         given = lidar.range_noise_m is not None
         size = f"{1e3 * noise.beam_sigma:.1f} mm along the beam, as the rig file has it"
         if not given:

@@ -13,6 +13,7 @@ from icalib.rig import Settings
 GUESS_SIGMA = {
     "rotation": 0.1, "translation": 0.1, "time_offset": 0.01, "intrinsics": 15.0, "distortion": 0.1, "bloom": 1.0,
     "shape": 1e-3, "tilt": 0.1, "radii": 0.01, "baseline": 0.05, "plane": 0.1,
+    "frame_rotation": 0.1, "frame_translation": 0.1,
 }  # fmt: skip
 OTHER_SIGMA = 0.1  # of IMU intrinsics
 
@@ -33,6 +34,9 @@ class Tolerances:
     baseline: float = 1e-3
     # Of normal and distance: wide, so that what is open is told in words of the sensors that it is open for.
     plane: tuple[float, float, float] = (np.deg2rad(10.0), np.deg2rad(10.0), 0.5)
+    # Of where the frame of a pose sensor stands: wide, too.
+    frame_rotation: float = np.deg2rad(10.0)
+    frame_translation: float = 0.5
     imu_intrinsics: float = 1e-2  # scale, misalignment [rad]; g-sensitivity rad/s per m/s^2
 
     @classmethod

@@ -30,13 +30,13 @@ from icalib.first_guess.lidar import Held, lidar_and_motion, lidar_on_motion
 from icalib.first_guess.lidar_planes import ROUNDS, associate, round_search
 from icalib.geometry.planes import plane_of
 from icalib.measurements import LidarStream
-from icalib.rig import Camera, Lidar, Wheels
+from icalib.rig import Camera, Lidar, PoseSensor, Wheels
 
 NEAR_NODE_S = 0.15  # a scan of a LiDAR alone goes on so long after its node
 NAMES = tuple(name for name, _, _ in MOUNT)
 
 
-def given(inputs: Inputs, sensor: Camera | Lidar | Wheels, names: Sequence[str]) -> dict[Key, np.ndarray]:
+def given(inputs: Inputs, sensor: Camera | Lidar | Wheels | PoseSensor, names: Sequence[str]) -> dict[Key, np.ndarray]:
     """What the rig gives of a sensor, time offsets between clocks that start at their first stamps."""
     out: dict[Key, np.ndarray] = {}
     for name in names:
@@ -55,9 +55,9 @@ def state_from_lidar(inputs: Inputs) -> State:
     assert inputs.imu is not None
     lidar, stream = inputs.rig.lidars[0], inputs.measurements.lidars[0]
     try:
-        guess, motion = lidar_and_motion(inputs.imu, stream, inputs.rig.gravity, _held(inputs, lidar))
+        guess, motion = lidar_and_motion(inputs.imu, stream, inputs.rig.gravity, held_of(inputs, lidar))
     except EstimationError:
-        known = _held(inputs, lidar, guesses=True)
+        known = held_of(inputs, lidar, guesses=True)
         if known.rotation is None or known.offset is None:
             raise
         # The motion shows too little; the rig file's guess stands in.
@@ -143,14 +143,14 @@ def lidar_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
     for lidar, stream in zip(inputs.rig.lidars, inputs.measurements.lidars, strict=True):
         known = given(inputs, lidar, NAMES)
         if len(known) < len(NAMES) and (lidar.name, "rotation") not in state.values:
-            found = lidar_on_motion(inputs.imu, stream, state, _held(inputs, lidar))
+            found = lidar_on_motion(inputs.imu, stream, state, held_of(inputs, lidar))
             known = found.values(lidar.name) | known
         out |= known
     return out
 
 
-def _held(inputs: Inputs, lidar: Lidar, guesses: bool = False) -> Held:
-    """What the rig trusts of a LiDAR, and with `guesses` what it guesses."""
+def held_of(inputs: Inputs, lidar: Lidar | PoseSensor, guesses: bool = False) -> Held:
+    """What the rig trusts of a LiDAR or a pose sensor, and with `guesses` what it guesses."""
     known = given(inputs, lidar, [name for name in NAMES if guesses or trusted(getattr(lidar, name)) is not None])
     offset = known.get((lidar.name, "time_offset"))
     return Held(

@@ -5,7 +5,8 @@ from icalib.simulation.filming import Film, Shot, film, sheets_of
 from icalib.simulation.motion import Trajectory
 from icalib.simulation.rendering import Imaging, Picture, Renderer, Sheet, SheetTruth, exposure_poses
 from icalib.simulation.rigs import GuessError, rig_for, settings_for, with_drawn_guess
-from icalib.simulation.robot import Drive, Features, SimLidar, SimWheels
+from icalib.simulation.poses import PoseTruth
+from icalib.simulation.robot import Drive, Features, SimLidar, SimPoses, SimWheels
 from icalib.simulation.room import Block, Hills, Room, hills_of_slope
 from icalib.simulation.scenario import ADIS16448, Motion, Scenario, SimCamera, handheld
 from icalib.simulation.scenario_file import load_scenario
@@ -37,6 +38,7 @@ __all__ = [
     "Shot",
     "SimCamera",
     "SimLidar",
+    "SimPoses",
     "SimWheels",
     "Simulation",
     "TrackTruth",
