@@ -6,13 +6,22 @@ import dataclasses
 
 import numpy as np
 
-from icalib.assessment.robot import lidar_residuals, planes, robot_notes, robot_warnings, wheel_residuals
+from icalib.assessment.robot import (
+    lidar_residuals,
+    planes,
+    pose_residuals,
+    pose_warnings,
+    robot_notes,
+    robot_warnings,
+    wheel_residuals,
+)
 from icalib.calibration import (
     Calibration,
     CornerResiduals,
     ImuResiduals,
     Iteration,
     ParameterGroup,
+    PoseResiduals,
     SensorFit,
     Trajectory,
     Verdict,
@@ -29,6 +38,7 @@ from icalib.estimation.evidence import Fit, fits, place_covariances, split_covar
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.imu_model import LABELS as IMU_LABELS
 from icalib.estimation.nodes import usable
+from icalib.estimation.pose_factor import FRAME
 from icalib.estimation.problem import Problem
 from icalib.estimation.solver import Visit
 from icalib.estimation.state import Block, State
@@ -41,9 +51,10 @@ from icalib.timeline import Timeline
 
 UNITS = {
     "rotation": "rad", "translation": "m", "time_offset": "s", "intrinsics": "px", "distortion": "", "bloom": "px",
-    "shape": "m", "tilt": "rad", "radii": "m", "baseline": "m", "frame_rotation": "rad", "frame_translation": "m",
+    "shape": "m", "tilt": "rad", "radii": "m", "baseline": "m",
 }  # fmt: skip
 LABELS = {"shape": SHAPE_LABELS, "radii": ("left", "right"), "plane": ("turn 1", "turn 2", "distance")}
+NUISANCE = ("plane", *FRAME)  # estimated along, in a world of which only gravity's direction means anything
 EXPECTED_CHI2 = (0.5, 2.0)  # chi^2 per post-fit degree of freedom outside this is worth a warning
 LARGE_FACTOR = 3.0
 LARGE_BLOOM_PX = 0.8  # ink and overexposure move edges by a third of that
@@ -61,7 +72,7 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
     groups = _groups(inputs, found, seen, empirical)
     judged = [_sensor_fit(f, found) for f in fits(problem, outcome)]
     timeline = Timeline.of(inputs.parts, image_times(inputs, outcome.state.values))
-    trajectory = _trajectory(inputs, outcome.state, timeline)
+    trajectory, poses = _trajectory(inputs, outcome.state, timeline), pose_residuals(inputs, found, timeline)
     return Calibration(
         groups=groups,
         covariance=seen.covariance,
@@ -74,7 +85,7 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
         iterations=tuple(Iteration(n, s.cost, s.predicted_decrease, s.damping, s.accepted) for n, s in found.steps),
         converged=outcome.converged,
         status=outcome.status,
-        warnings=tuple(_warnings(inputs, found, groups, judged, empirical)),
+        warnings=tuple(_warnings(inputs, found, groups, judged, empirical, poses)),
         notes=tuple(_notes(inputs, found, timeline)),
         rig=rig_to_dict(inputs.rig),
         settings=dataclasses.asdict(inputs.rig.settings),
@@ -84,6 +95,7 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
         lidar_residuals=lidar_residuals(inputs, found, timeline),
         wheel_residuals=wheel_residuals(inputs, found, timeline),
         planes=planes(inputs, outcome.state),
+        pose_residuals=poses,
     )
 
 
@@ -127,7 +139,7 @@ def visited(inputs: Inputs, stage: str, problem: Problem, visit: Visit) -> Visit
     t = problem.tolerance
     covariance = restricted_inverse(visit.information * t[:, None] * t, problem.held)
     formal = t * np.sqrt(np.diag(covariance))
-    free = [b for b in inputs.layout.free if b.name != "plane"]
+    free = [b for b in inputs.layout.free if b.name not in NUISANCE]
     values = {b.key: _raw_value(inputs, visit.state, b) for b in free}
     return Visited(stage, values, {b.key: formal[b.columns] for b in free})
 
@@ -148,7 +160,7 @@ def _groups(
     overall = float(np.sqrt(np.mean(_calibration_only(inputs, ratio) ** 2))) if len(ratio) else 1.0
     groups = []
     for block in inputs.layout.blocks:
-        if block.name == "plane" or _unheard_of(inputs, block):
+        if block.name in NUISANCE or _unheard_of(inputs, block):
             continue
         if block.start is None and block.name in ("shape", "bloom", "tilt"):
             continue
@@ -273,6 +285,7 @@ def _warnings(
     groups: tuple[ParameterGroup, ...],
     judged: list[SensorFit],
     empirical: np.ndarray | None,
+    poses: tuple[PoseResiduals, ...],
 ):
     if not found.outcome.converged:
         yield f"the solver did not converge: {found.outcome.status}"
@@ -290,6 +303,7 @@ def _warnings(
             share = f.rejected / (f.rejected + 0.5 * f.count)
             yield f"{share:.0%} of the {f.kind} of {f.sensor} were set aside; look at its residuals in the report."
     yield from robot_warnings(inputs.rig, judged)
+    yield from pose_warnings(poses, inputs.rig)
     for g in groups:
         if g.name == "bloom" and abs(g.value[0]) > LARGE_BLOOM_PX:
             where = "in" if g.value[0] > 0.0 else "out"
@@ -324,7 +338,7 @@ def _notes(inputs: Inputs, found: Estimate, timeline: Timeline):
         if len(factor.stream.uv):
             yield f"{camera.name}: {_noise_words(model)}."
     yield from _feature_notes(found)
-    yield from robot_notes(inputs, found) if inputs.clouds.count else ()
+    yield from robot_notes(inputs, found)
 
 
 def _feature_notes(found: Estimate):

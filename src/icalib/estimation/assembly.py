@@ -24,7 +24,7 @@ from icalib.estimation.nodes import MERGED_WITHIN_S, distinct, first_nodes, plac
 from icalib.estimation.poses import assign_nodes, poses_at
 from icalib.estimation.prior_factor import Prior
 from icalib.estimation.problem import ChainFactor, Problem
-from icalib.estimation.robot import NO_CLOUDS, Clouds, RobotNoise, frame_entries, own_entries, robot_factors
+from icalib.estimation.robot import NO_CLOUDS, NO_ROBOT, Clouds, RobotNoise, frame_entries, own_entries, robot_factors
 from icalib.estimation.sensors import SensorFactor
 from icalib.estimation.state import Entry, Key, Kind, Layout, State, make_layout
 from icalib.estimation.tolerances import Tolerances
@@ -247,7 +247,7 @@ def assemble(
     keep: list[np.ndarray],
     held: np.ndarray = NOTHING,
     following: Following | None = None,
-    robot: RobotNoise = RobotNoise(),
+    robot: RobotNoise = NO_ROBOT,
 ) -> Problem:
     """The problem at the nodes of `state`, everything frozen that a pass freezes: nodes, assignment, preintegration.
     held: directions of the border that stay, see Problem."""

@@ -27,7 +27,7 @@ from icalib.estimation.imu_model import N_INTRINSICS
 from icalib.estimation.lidar_factor import LidarFactor
 from icalib.estimation.prior_factor import Prior
 from icalib.estimation.problem import Problem
-from icalib.estimation.robot import RobotNoise, next_posing, next_ranging
+from icalib.estimation.robot import NO_ROBOT, RobotNoise, next_posing, next_ranging
 from icalib.estimation.sensors import chi2
 from icalib.estimation.solver import CONVERGED_DECREASE, Outcome, Step, Visit, minimise
 from icalib.estimation.state import State
@@ -49,7 +49,7 @@ class Estimate:
     outcome: Outcome
     noise: tuple[NoiseModel, ...]
     steps: tuple[tuple[str, Step], ...]  # of all passes, with the pass's name
-    robot: RobotNoise = RobotNoise()
+    robot: RobotNoise = NO_ROBOT
 
 
 def estimate(

@@ -9,7 +9,14 @@ import numpy as np
 
 from icalib.estimation.lidar_binning import LidarNoise, Motion
 from icalib.estimation.lidar_factor import LidarFactor
-from icalib.estimation.pose_factor import FRAME, AbsolutePoseFactor, PoseFactor, PoseNoise, RelativePosesFactor, frame_of
+from icalib.estimation.pose_factor import (
+    FRAME,
+    AbsolutePoseFactor,
+    PoseFactor,
+    PoseNoise,
+    RelativePosesFactor,
+    frame_of,
+)
 from icalib.estimation.sensors import SensorFactor
 from icalib.estimation.state import Entry, Key, Kind, Layout
 from icalib.estimation.wheel_angles import angles_from_rates
@@ -136,6 +143,9 @@ class RobotNoise:
         return cls(ranging, tuple(first_posing(x, rig.settings) for x in rig.poses))
 
 
+NO_ROBOT = RobotNoise()
+
+
 def robot_factors(
     rig: Rig, measurements: Measurements, clouds: Clouds, noise: RobotNoise, motion: Motion, layout: Layout
 ) -> tuple[SensorFactor, ...]:
@@ -156,9 +166,7 @@ def robot_factors(
     return (*(lidars if clouds.count else ()), *wheels, *poses)
 
 
-def pose_factor(
-    sensor: PoseSensor, stream: PoseStream, motion: Motion, noise: PoseNoise, layout: Layout
-) -> PoseFactor:
+def pose_factor(sensor: PoseSensor, stream: PoseStream, motion: Motion, noise: PoseNoise, layout: Layout) -> PoseFactor:
     kind = AbsolutePoseFactor if sensor.kind == "absolute" else RelativePosesFactor
     return kind.build(stream, motion, noise, layout)
 

@@ -108,9 +108,7 @@ def motion_of_path(
     level, R_imu = _level(x[6:9]), path.rotation @ R_il.T
     position = (path.position - R_imu @ x[3:6]) @ level.T
     start = ImuMotion(gyro, t, level @ R_imu, position, np.zeros_like(position), aligned.gyro_bias, x[9:12], gravity)
-    return FromPath(
-        LidarGuess(R_il, x[3:6], aligned.offset), start.smoothed(), float(np.linalg.norm(x[6:9])), level
-    )
+    return FromPath(LidarGuess(R_il, x[3:6], aligned.offset), start.smoothed(), float(np.linalg.norm(x[6:9])), level)
 
 
 def lidar_on_motion(imu: ImuData, stream: LidarStream, known: State, held: Held = Held()) -> LidarGuess:

@@ -85,8 +85,8 @@ def pose_rates(stream: PoseStream) -> CameraRates:
     a, b = a[near], b[near]
     if len(a) < FEWEST_WINDOWS:
         raise EstimationError(
-            f"{stream.name}: hardly any of its {len(t)} poses are closer than {LONGEST_STEP_S} s to the next; check its "
-            "stamps, or record for longer."
+            f"{stream.name}: hardly any of its {len(t)} poses are closer than {LONGEST_STEP_S} s to the next; check "
+            "its stamps, or record for longer."
         )
     turn = so3.log_many(np.ascontiguousarray(R[a].transpose(0, 2, 1) @ R[b]))
     return CameraRates(t[a], t[b], turn / (t[b] - t[a])[:, None], LEAST_CORRELATION)
@@ -110,8 +110,8 @@ def _with_motion(imu: ImuData, stream: PoseStream, gravity: float, held: Held) -
         raise _too_short(stream)
     if abs(found.gravity / gravity - 1.0) > G_TOLERANCE:
         raise EstimationError(
-            f"{imu.name} and {stream.name} together show gravity of {found.gravity:.3g} m/s^2 instead of {gravity:.3g}: "
-            f"check that the accelerometer is in m/s^2, not in g, and the positions of {stream.name} in metres."
+            f"{imu.name} and {stream.name} together show gravity of {found.gravity:.3g} m/s^2 instead of "
+            f"{gravity:.3g}: check that the accelerometer is in m/s^2, not in g, and the positions of {stream.name} in metres."
         )
     return found
 

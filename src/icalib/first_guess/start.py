@@ -28,7 +28,8 @@ def start(
     """What the estimate is made from, where it starts, and the guess at which stays what the data do not determine.
 
     A target gives the motion, or else a LiDAR, if nothing is to be found of the cameras, or else points of the scene,
-    or where there is neither camera nor LiDAR a pose sensor; what has no part in it is placed on that motion. Raises EstimationError where the recordings do not carry it.
+    or where there is neither camera nor LiDAR a pose sensor; what has no part in it is placed on that motion.
+    Raises EstimationError where the recordings do not carry it.
     """
     whole = inputs_for(rig, recordings)
     cameras = given_cameras(whole)

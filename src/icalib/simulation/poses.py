@@ -39,7 +39,7 @@ def report_poses(
 
 
 def _scattered(sensor: SimPoses, seen: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Each pose (N, 4, 4) with an error of its own: of its rotation in the sensor's axes, its position in the frame's."""
+    """Each pose (N, 4, 4) with an error of its own: its rotation in the sensor's axes, its position in the frame's."""
     out = seen.copy()
     for T in out:
         T[:3, :3] = T[:3, :3] @ rotation_from_vector(sensor.rotation_noise * rng.standard_normal(3))

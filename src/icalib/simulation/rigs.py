@@ -102,7 +102,7 @@ def rig_for(
         return mounted(given, sim, sim.T_imu_lidar)
 
     def poses(sim: SimPoses) -> PoseSensor:
-        given = PoseSensor(sim.name, f"{sim.name}/frames.csv", sim.kind, sim.rotation_noise, sim.position_noise)
+        given = PoseSensor(sim.name, f"{sim.name}/poses.csv", sim.kind, sim.rotation_noise, sim.position_noise)
         return mounted(given, sim, sim.T_imu_sensor)
 
     imu = ImuSensor("imu0", "imu0/data.csv", scenario.imu_noise, _parameter(imu_intrinsics, scenario.imu_intrinsics))
