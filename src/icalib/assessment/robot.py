@@ -159,7 +159,8 @@ def robot_notes(inputs: Inputs, found: Estimate) -> Iterator[str]:
     counts = {f.name: f.count(out, "rotation") // 3 for f, out in _pose_factors(found)}
     for sensor, stream, noise in zip(inputs.rig.poses, inputs.measurements.poses, found.robot.posing, strict=True):
         what = "poses" if sensor.kind == "absolute" else "steps"
-        yield f"{counts[sensor.name]} {what} from {len(stream.stamps_ns)} poses of {sensor.name}; {_noise(sensor, noise)}."
+        count = f"{counts[sensor.name]} {what} from {len(stream.stamps_ns)} poses"
+        yield f"{count} of {sensor.name}; {_noise(sensor, noise)}."
     if not inputs.clouds.count:
         return
     for lidar, stream, noise in zip(inputs.rig.lidars, inputs.measurements.lidars, found.robot.ranging, strict=True):
@@ -196,14 +197,14 @@ def pose_warnings(residuals: tuple[PoseResiduals, ...], rig: Rig) -> Iterator[st
             correlation = neighbours(own)
             if kinds[r.sensor] == "absolute" and correlation > CORRELATED:
                 yield (
-                    f"the {what} residuals of {r.sensor} follow one another (correlation {correlation:.2f} from pose to "
-                    "pose): its poses are filtered, or drift, so its rows look more certain than they are; trust the "
-                    "empirical standard deviations, or try kind: relative."
+                    f"the {what} residuals of {r.sensor} follow one another (correlation {correlation:.2f} from pose "
+                    "to pose): its poses are filtered, or drift, so all looks better known than it is; trust the "
+                    "empirical factor, or try kind: relative, which lets poses drift."
                 )
             if kinds[r.sensor] == "relative" and correlation < -ALTERNATING:
                 yield (
-                    f"the {what} residuals of {r.sensor} alternate (correlation {correlation:.2f} from step to step), as "
-                    "those of poses that are noisy but do not drift; try kind: absolute."
+                    f"the {what} residuals of {r.sensor} alternate (correlation {correlation:.2f} from step to step), "
+                    "as those of poses that are noisy but do not drift; try kind: absolute."
                 )
 
 

@@ -33,8 +33,8 @@ class Frame:
 @dataclass(frozen=True)
 class PoseRows:
     """n poses of 6 rows, rotation and position, not whitened. residual (n, 6); by_pose (n, 6, 6) by rotation and
-    position of the IMU, of relative poses one for each end; by_mount (n, 6, 6) by R_imu_sensor, p_imu_sensor; by_frame (n, 6, 6
-    or 0) by R_world_frame, p_world_frame."""
+    position of the IMU, of relative poses one for each end; by_mount (n, 6, 6) by R_imu_sensor, p_imu_sensor; by_frame
+    (n, 6, 6 or 0) by R_world_frame, p_world_frame."""
 
     residual: np.ndarray
     by_pose: tuple[np.ndarray, ...]

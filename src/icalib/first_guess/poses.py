@@ -111,7 +111,8 @@ def _with_motion(imu: ImuData, stream: PoseStream, gravity: float, held: Held) -
     if abs(found.gravity / gravity - 1.0) > G_TOLERANCE:
         raise EstimationError(
             f"{imu.name} and {stream.name} together show gravity of {found.gravity:.3g} m/s^2 instead of "
-            f"{gravity:.3g}: check that the accelerometer is in m/s^2, not in g, and the positions of {stream.name} in metres."
+            f"{gravity:.3g}: check that the accelerometer is in m/s^2, not in g, and the positions of {stream.name} "
+            "in metres."
         )
     return found
 

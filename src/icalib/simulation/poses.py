@@ -56,3 +56,10 @@ def _drifting(sensor: SimPoses, seen: np.ndarray, seconds: np.ndarray, rng: np.r
         step[:3, 3] += sensor.position_noise * root * rng.standard_normal(3)
         out[k] = out[k - 1] @ step
     return out
+
+
+def quaternion(R: np.ndarray) -> np.ndarray:
+    """(4,) x, y, z, w of a rotation (3, 3): the eigenvector of Bar-Itzhack's matrix, which has no bad angles."""
+    (a, b, c), (d, e, f), (g, h, i) = R
+    K = [[a - e - i, b + d, c + g, h - f], [b + d, e - a - i, f + h, c - g], [c + g, f + h, i - a - e, d - b]]
+    return np.linalg.eigh(np.array([*K, [h - f, c - g, d - b, a + e + i]]) / 3.0)[1][:, -1]
