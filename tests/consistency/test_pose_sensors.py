@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from icalib.calibration import relative_poses
 from icalib.errors import EstimationError
 from icalib.measurements import PoseStream
 from icalib.montecarlo.truth import error, true_value
@@ -64,27 +65,23 @@ def test_without_noise_it_is_recovered(kind):
 
 @pytest.mark.parametrize("kind", ["absolute", "relative"])
 def test_beside_a_camera_it_is_recovered(kind):
-    """The target gives the motion, the world is the target's; frames still are anywhere."""
-    scenario = replace(handheld(8.0, noiseless=True), poses=(sensor(kind, clock_origin_ns=10**18, rate_hz=50.0),))
+    """The target gives the motion, the world is the target's; frames still are anywhere. Poses are taken at stamps of
+    the IMU: between these the simulated rates are constant, and the scheme takes them to be linear."""
+    poses = (sensor(kind, clock_origin_ns=10**18, rate_hz=50.0, phase_s=0.0),)
+    scenario = replace(handheld(8.0, noiseless=True), poses=poses)
     scenario = replace(scenario, robot_noise_enabled=False, cameras=scenario.cameras[:1])
     sim = simulate(scenario, 1)
     result = calibrate_measurements(rig_for(scenario), sim.measurements)
     turn, way, late = errors(result, sim.truth, "mocap0")
     assert np.abs(turn).max() < 2e-7 and np.abs(way).max() < 2e-7 and np.abs(late).max() < 2e-7
-    assert [r.name for r in result_relative(result)] == ["T_cam0_mocap0"]
-
-
-def result_relative(result):
-    from icalib.calibration import relative_poses
-
-    return relative_poses(result)
+    assert [r.name for r in relative_poses(result)] == ["T_cam0_mocap0"]
 
 
 @pytest.mark.parametrize("kind", ["absolute", "relative"])
 def test_errors_are_as_the_covariance_says(kind, consistency):
     """Six seeds, noise found from the residuals; 20 seeds by hand gave 0.98 and 1.04 per degree of freedom."""
     scenario = alone(kind)
-    found = consistency(scenario, without_noise(rig_for(scenario)), range(6), 1e-4, BLOCKS)
+    found = consistency(scenario, without_noise(rig_for(scenario)), range(6), 1.0 - 1e-4, BLOCKS)
     for name, nees in found.items():
         assert nees.consistent, f"{name}: {nees}"
 
@@ -124,11 +121,13 @@ def test_planar_motion_leaves_height_open():
     result = calibrate_measurements(rig_for(scenario), sim.measurements)
     assert result.undetermined
     assert all("mocap0 translation" in s for s in result.undetermined)
-    T = scenario.poses[0].T_imu_sensor
     turn, way, late = errors(result, sim.truth, "mocap0")
     assert np.abs(way[:2]).max() < 6e-3 and np.abs(late).max() < 1e-3
-    assert np.rad2deg(np.linalg.norm(turn)) < 0.1
-    assert result.group("mocap0", "translation").verdict[2] == "undetermined", T
+    rotation, translation = result.group("mocap0", "rotation"), result.group("mocap0", "translation")
+    assert (np.abs(turn) < 4.0 * rotation.std).all() and rotation.std.max() < 5e-3
+    assert translation.verdict[2] == "undetermined"
+    assert translation.std[2] == pytest.approx(0.1, rel=0.05)  # what a guess is worth
+    assert way[2] == pytest.approx(-0.15, abs=0.01)  # held where nobody said anything: at 0
 
 
 def test_two_of_them_and_one_gives_the_motion():
@@ -154,13 +153,13 @@ def test_what_cannot_be_calibrated_is_said():
     with pytest.raises(EstimationError, match="mocap0 does not match that of imu0 at any shift of their clocks"):
         calibrate_measurements(rig, cut(sim, other))
     still = PoseStream("mocap0", stream.stamps_ns, np.tile(np.eye(3), (len(stream.stamps_ns), 1, 1)), stream.position)
-    with pytest.raises(EstimationError, match="mocap0"):
+    with pytest.raises(EstimationError, match="its rotation is the same in all poses"):
         calibrate_measurements(rig, cut(sim, still))
     sparse = PoseStream("mocap0", stream.stamps_ns[::100], stream.rotation[::100], stream.position[::100])
     with pytest.raises(EstimationError, match="hardly any of its 12 poses"):
         calibrate_measurements(rig, cut(sim, sparse))
     large = PoseStream("mocap0", stream.stamps_ns, stream.rotation, 3.28 * stream.position)
-    with pytest.raises(EstimationError, match="the positions of mocap0 in metres"):
+    with pytest.raises(EstimationError, match=r"its motion is 0\.3\d \+- 0\.0\d times as large as its positions say"):
         calibrate_measurements(rig, cut(sim, large))
     with pytest.raises(EstimationError, match="several recordings cannot be joined where mocap0 alone"):
         calibrate_measurements(rig, [sim.measurements, sim.measurements])

@@ -13,7 +13,7 @@ from icalib.rig import Settings
 GUESS_SIGMA = {
     "rotation": 0.1, "translation": 0.1, "time_offset": 0.01, "intrinsics": 15.0, "distortion": 0.1, "bloom": 1.0,
     "shape": 1e-3, "tilt": 0.1, "radii": 0.01, "baseline": 0.05, "plane": 0.1,
-    "frame_rotation": 0.1, "frame_translation": 0.1,
+    "frame_rotation": 3.0, "frame_translation": 10.0,  # nobody guesses these: they follow from all else
 }  # fmt: skip
 OTHER_SIGMA = 0.1  # of IMU intrinsics
 

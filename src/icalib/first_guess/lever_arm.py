@@ -74,7 +74,7 @@ def lever_arm(
         rhs = rhs - rows[:, :, 0:3] @ given
         rows[:, :, 0:3] = 0.0
     x = _solve(rows, rhs)
-    return LeverArm(x[0:3] if given is None else given, x[3:6], x[6:9], *_target_size(rows, rhs, second(D_f)))
+    return LeverArm(x[0:3] if given is None else given, x[3:6], x[6:9], *size_of(rows, rhs, second(D_f)))
 
 
 def _solve(rows: np.ndarray, rhs: np.ndarray) -> np.ndarray:
@@ -91,16 +91,17 @@ def _solve(rows: np.ndarray, rhs: np.ndarray) -> np.ndarray:
     return x
 
 
-def _target_size(rows: np.ndarray, rhs: np.ndarray, felt: np.ndarray) -> tuple[float, float]:
-    """True size of the target over the one given, and its standard deviation: the inverse of the factor that the
-    accelerometer's part asks for. (A factor on the noisy positions instead would be pulled to zero.)"""
-    A = np.concatenate([rows, felt[:, :, None]], axis=2).reshape(-1, 10)
+def size_of(rows: np.ndarray, rhs: np.ndarray, felt: np.ndarray) -> tuple[float, float]:
+    """True size of the target, or of a motion, over the one given, and its standard deviation: the inverse of the
+    factor that the accelerometer's part asks for; rows (n, 3, m), rhs, felt (n, 3). (A factor on the noisy positions
+    instead would be pulled to zero.)"""
+    A = np.concatenate([rows, felt[:, :, None]], axis=2).reshape(felt.size, -1)
     b = rhs.ravel()
-    information = A.T @ A + 1e-9 * np.eye(10)
+    information = A.T @ A + 1e-9 * np.eye(A.shape[1])
     x = np.linalg.solve(information, A.T @ b)
     variance = np.mean((b - A @ x) ** 2)
-    factor = max(1.0 + float(x[9]), 1e-3)
-    return 1.0 / factor, float(np.sqrt(variance * np.linalg.inv(information)[9, 9])) / factor**2
+    factor = max(1.0 + float(x[-1]), 1e-3)
+    return 1.0 / factor, float(np.sqrt(variance * np.linalg.inv(information)[-1, -1])) / factor**2
 
 
 def _triples(t: np.ndarray, gaps: tuple[tuple[float, float], ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -7,6 +7,7 @@ is known.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from icalib.estimation.robot import MOUNT
 from icalib.estimation.state import Key, State
 from icalib.first_guess.clocks import LEAST_CORRELATION, LONGEST_STEP_S, Alignment, CameraRates
 from icalib.first_guess.gyro import GyroRotation
+from icalib.first_guess.lever_arm import SIZE_TOLERANCE, size_of
 from icalib.first_guess.lidar import (
     G_TOLERANCE,
     FromPath,
@@ -28,7 +30,7 @@ from icalib.first_guess.lidar import (
     poses_in,
     where,
 )
-from icalib.first_guess.lidar_arm import WAY_SIGMA, against_motion, arm_prior, solve
+from icalib.first_guess.lidar_arm import WAY_SIGMA, Rows, against_motion, against_readings, arm_prior, solve
 from icalib.first_guess.lidar_odometry import LidarPath
 from icalib.first_guess.lidar_rounds import given, held_of
 from icalib.geometry import so3
@@ -89,6 +91,11 @@ def pose_rates(stream: PoseStream) -> CameraRates:
             "its stamps, or record for longer."
         )
     turn = so3.log_many(np.ascontiguousarray(R[a].transpose(0, 2, 1) @ R[b]))
+    if not np.linalg.norm(turn, axis=1).max() > 0.0:
+        raise EstimationError(
+            f"{stream.name}: its rotation is the same in all poses, as where only positions are measured; a pose "
+            "sensor needs both."
+        )
     return CameraRates(t[a], t[b], turn / (t[b] - t[a])[:, None], LEAST_CORRELATION)
 
 
@@ -114,7 +121,26 @@ def _with_motion(imu: ImuData, stream: PoseStream, gravity: float, held: Held) -
             f"{gravity:.3g}: check that the accelerometer is in m/s^2, not in g, and the positions of {stream.name} "
             "in metres."
         )
+    _check_size(imu, stream.name, path, aligned, found)
     return found
+
+
+def _check_size(imu: ImuData, name: str, path: LidarPath, aligned: Alignment, found: FromPath) -> None:
+    """Raises EstimationError where the accelerometer contradicts the size of the motion: the rows of `against_readings`
+    with what it felt as one more column, as of a target in `lever_arm`."""
+    gyro, t = GyroRotation.integrate(imu, aligned.gyro_bias), path.seconds + aligned.offset
+
+    def rows_at(position: np.ndarray) -> Rows:
+        carry = partial(gyro.carry, t, to=imu.seconds)
+        return against_readings(imu, carry, t, path.rotation, position)(found.guess.rotation, found.guess.position)
+
+    rows, felt = rows_at(path.position), -rows_at(np.zeros_like(path.position)).b
+    size, std = size_of(rows.A[:, :, 3:], rows.b, felt)
+    if abs(size - 1.0) > max(SIZE_TOLERANCE, 5.0 * std):
+        raise EstimationError(
+            f"{name}: by the accelerometer its motion is {size:.2f} +- {std:.2f} times as large as its positions say; "
+            "these must be in metres (an odometry from one camera has no scale of its own)."
+        )
 
 
 def _on_motion(imu: ImuData, stream: PoseStream, known: State, held: Held) -> LidarGuess:

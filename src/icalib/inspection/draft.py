@@ -160,8 +160,8 @@ def _robot(found: Inspection) -> Iterable[str]:
         for line in (f"  {name}:", "    type: wheels", _place(topic.name, topic.type, "")):
             yield f"  # {line.removeprefix('  ')}"
     for name, topic in found.sources.poses.items():
-        yield "  # Poses of something on the robot, and not made from the sensors above? Then take the # away; absolute is"
-        yield "  # motion capture, relative an odometry, which drifts (docs/rig-file.md#pose-sensor)."
+        yield "  # Poses of something on the robot, and not made from the sensors above? Then take the # away; absolute"
+        yield "  # is motion capture, relative an odometry, which drifts (docs/rig-file.md#pose-sensor)."
         for line in (f"  {name}:", "    type: pose", _place(topic.name, topic.type, ""), f"    kind: {_kind(topic)}"):
             yield f"  # {line.removeprefix('  ')}"
 

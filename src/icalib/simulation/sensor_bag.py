@@ -31,8 +31,8 @@ def write_sensors(
 
     Topics are /imu0 (Imu), /NAME/points (PointCloud2: x, y, z and `time` [s] from the stamp), /NAME/joint_states
     (JointState), /NAME/pose (PoseStamped) and, where a target stands in the scene, /NAME/image_raw (Image, mono8).
-    Returns sentences on what was left out. Raises RecordingError where `path` exists or cannot be written, CalibrationError where a package is
-    missing, RigError for a board that is not flat.
+    Returns sentences on what was left out. Raises RecordingError where `path` exists or cannot be written,
+    CalibrationError where a package is missing, RigError for a board that is not flat.
     """
     if any(simulation.scenario.bow):
         raise RigError("boards are rendered flat; set the scenario's bow to zero.")
