@@ -141,6 +141,19 @@ def test_two_of_them_and_one_gives_the_motion():
             assert (np.abs(e) < 4.0 * result.group(name, block).std).all(), (name, block)
 
 
+def test_two_recordings_share_what_is_calibrated():
+    """Each has a world and a frame of its own; the frame was put up anew in between."""
+    scenario = replace(handheld(6.0), poses=(sensor("absolute", clock_origin_ns=10**18, rate_hz=50.0),))
+    scenario = replace(scenario, cameras=scenario.cameras[:1])
+    other = replace(scenario, poses=(replace(scenario.poses[0], T_world_frame=pose([0.0, -0.3, 1.0], [0, 1, 2])),))
+    sims = [simulate(scenario, 1), simulate(other, 2)]
+    both = calibrate_measurements(rig_for(scenario), [s.measurements for s in sims])
+    one = calibrate_measurements(rig_for(scenario), sims[0].measurements)
+    for block, e in zip(BLOCKS, errors(both, sims[0].truth, "mocap0"), strict=True):
+        std = both.group("mocap0", block).std
+        assert (np.abs(e) < 4.0 * std).all() and (std < one.group("mocap0", block).std).all(), block
+
+
 def cut(sim, stream: PoseStream):
     return replace(sim.measurements, poses=(stream,))
 
