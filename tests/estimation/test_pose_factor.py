@@ -154,5 +154,6 @@ def test_noise_that_is_given_stays():
     noise = PoseNoise(0.01, 0.02)
     ratios = {"rotation": 4.0, "position": 9.0}
     assert next_posing(PoseSensor("a", "a"), noise, ratios) == PoseNoise(0.02, 0.06)
+    assert next_posing(PoseSensor("a", "a"), noise, {"rotation": 4.0}) == PoseNoise(0.02, 0.02)
     assert next_posing(PoseSensor("a", "a", rotation_noise=0.01), noise, ratios) == PoseNoise(0.01, 0.06)
     assert next_posing(PoseSensor("a", "a", position_noise=0.02), noise, ratios) == PoseNoise(0.02, 0.02)

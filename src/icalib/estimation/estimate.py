@@ -35,6 +35,7 @@ from icalib.estimation.tolerances import GUESS_SIGMA
 from icalib.rig import PoseSensor, Settings
 
 LOOSE = 3.0  # times what a guess is worth
+LEAST_LEFT = 0.2  # of the residuals of poses: where the motion takes all, nothing is left to show their noise
 EARLY_DECREASE = 0.5  # an early pass is followed by another
 
 
@@ -149,8 +150,8 @@ def _next_robot(inputs: Inputs, problem: Problem, outcome: Outcome, robot: Robot
     judged = fits(problem, outcome) if any(_is_open(s) for s in inputs.rig.poses) else []
     posing = []
     for sensor, noise in zip(inputs.rig.poses, robot.posing, strict=True):
-        ratios = {f.kind: f.chi2 / max(f.dof, 1.0) for f in judged if f.sensor == sensor.name}
-        posing.append(next_posing(sensor, noise, ratios) if ratios else noise)
+        ratios = {f.kind: f.chi2 / f.dof for f in judged if f.sensor == sensor.name and f.dof > LEAST_LEFT * f.count}
+        posing.append(next_posing(sensor, noise, ratios))
     return RobotNoise(tuple(ranging), tuple(posing))
 
 

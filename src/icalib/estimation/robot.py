@@ -119,9 +119,10 @@ def first_posing(sensor: PoseSensor, settings: Settings) -> PoseNoise:
 
 
 def next_posing(sensor: PoseSensor, noise: PoseNoise, ratios: dict[str, float]) -> PoseNoise:
-    """With the sizes that chi^2 over degrees of freedom shows, by kind of row, where the rig file has none."""
+    """With the sizes that chi^2 over degrees of freedom shows, by kind of row, where the rig file has none. A kind that
+    `ratios` lacks stays as it is."""
     turn, way = (
-        max(size * float(np.sqrt(ratios[kind])), LEAST_POSE_NOISE)
+        max(size * float(np.sqrt(ratios.get(kind, 1.0))), LEAST_POSE_NOISE)
         for kind, size in (("rotation", noise.rotation), ("position", noise.position))
     )
     turn = turn if sensor.rotation_noise is None else noise.rotation
