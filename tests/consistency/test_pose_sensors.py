@@ -174,5 +174,8 @@ def test_what_cannot_be_calibrated_is_said():
     large = PoseStream("mocap0", stream.stamps_ns, stream.rotation, 3.28 * stream.position)
     with pytest.raises(EstimationError, match=r"its motion is 0\.3\d \+- 0\.0\d times as large as its positions say"):
         calibrate_measurements(rig, cut(sim, large))
+    in_g = replace(sim.measurements.imu, accel=sim.measurements.imu.accel / 9.81)
+    with pytest.raises(EstimationError, match=r"show gravity of [\d.]* m/s\^2 instead of 9.81: check that the acc"):
+        calibrate_measurements(rig, replace(sim.measurements, imu=in_g))
     with pytest.raises(EstimationError, match="several recordings cannot be joined where mocap0 alone"):
         calibrate_measurements(rig, [sim.measurements, sim.measurements])

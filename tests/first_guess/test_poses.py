@@ -82,7 +82,8 @@ def test_on_a_motion_that_is_known(sim):
 
 @pytest.mark.parametrize("sim", ["absolute"], indirect=True)
 def test_noise_of_rotations_does_not_shorten_the_lever_arm(sim):
-    """It stands in the coefficients of the arm; taken as they come, poses of half that noise shorten it by 10 to 40 %."""
+    """It stands in the coefficients of the arm; taken as they come, poses of half that noise shorten it by up
+    to 40 %."""
     (stream,), rng = sim.measurements.poses, np.random.default_rng(0)
     turns = Rotation.from_rotvec(4e-3 * rng.normal(size=(len(stream.stamps_ns), 3))).as_matrix()
     noisy = replace(stream, rotation=stream.rotation @ turns)

@@ -40,6 +40,7 @@ from icalib.rig import PoseSensor
 WINDOW_S = 0.1  # of a mean rate: long against the noise of poses
 FEWEST_WINDOWS = 20
 STEADY_S = 0.5
+G_OTHER_UNITS = 0.5  # of gravity: positions do not make it so wrong
 NAMES = tuple(name for name, _, _ in MOUNT)
 
 
@@ -116,13 +117,15 @@ def _with_motion(imu: ImuData, stream: PoseStream, gravity: float, held: Held) -
     found = motion_of_path(imu, path, rates, aligned, gravity, held)
     if found is None:
         raise _too_short(stream)
-    if abs(found.gravity / gravity - 1.0) > G_TOLERANCE:
+    off = abs(found.gravity / gravity - 1.0)
+    if off <= G_OTHER_UNITS:
+        _check_size(imu, stream.name, path, aligned, found)
+    if off > G_TOLERANCE:
         raise EstimationError(
             f"{imu.name} and {stream.name} together show gravity of {found.gravity:.3g} m/s^2 instead of "
             f"{gravity:.3g}: check that the accelerometer is in m/s^2, not in g, and the positions of {stream.name} "
             "in metres."
         )
-    _check_size(imu, stream.name, path, aligned, found)
     return found
 
 
