@@ -29,6 +29,7 @@ class Case:
     scenario: Scenario
     nodes: str
     scheme: str
+    spacing_s: float = 0.05  # between nodes, at most
 
 
 def cases() -> list[Case]:
@@ -49,7 +50,9 @@ def run(case: Case, seed: int) -> tuple[dict[str, float], float, float]:
     """Squared error by its covariance of each block, over dof; RMS offset and position errors [s, m]."""
     simulated = simulate(case.scenario, seed)
     rig = rig_for(case.scenario, intrinsics="fixed", distortion="fixed")
-    settings = dataclasses.replace(rig.settings, nodes=case.nodes, scheme=case.scheme, splits=0)
+    settings = dataclasses.replace(
+        rig.settings, nodes=case.nodes, scheme=case.scheme, splits=0, node_spacing_s=case.spacing_s
+    )
     found = calibrate_measurements(dataclasses.replace(rig, settings=settings), simulated.measurements)
     errors = {b: _errors(found, simulated.truth, b) for b in BLOCKS}
     rms = {b: float(np.sqrt(np.mean(e**2))) for b, (e, _) in errors.items()}

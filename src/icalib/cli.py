@@ -7,23 +7,24 @@ import sys
 from pathlib import Path
 
 from icalib.errors import CalibrationError
+from icalib.result_commands import add_result_commands
 
 _MOST_IDS = 10_000  # more than any family has
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Entry point of the `icalib` command. Returns the exit code: 0 good, 1 an error, 2 wrong usage, 130
-    interrupted."""
+    """Entry point of the `icalib` command. Returns the exit code: 0 good, 1 an error, 2 wrong usage, 130 interrupted;
+    of `compare` 1 where something differs, 2 an error."""
     options = _parser().parse_args(arguments)
     try:
-        options.run(options)
+        code = options.run(options)
     except CalibrationError as error:
         print(f"icalib: {error}", file=sys.stderr)
-        return 1
+        return getattr(options, "error_code", 1)
     except KeyboardInterrupt as stop:
         print(f"icalib: interrupted; {str(stop) or 'nothing was written.'}", file=sys.stderr)
         return 130
-    return 0
+    return code or 0
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -48,6 +49,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_target(commands)
     _add_simulate(commands)
     _add_montecarlo(commands)
+    add_result_commands(commands)
     return parser
 
 

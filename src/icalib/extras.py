@@ -37,11 +37,6 @@ def load_distributed() -> Any:
     return _load("distributed", "montecarlo", "Studies of many runs need Dask's package distributed")
 
 
-def load_chi2() -> Any:
-    """scipy's chi^2 distribution. Raises RecordingError where it is not installed."""
-    return _load("scipy.stats", "montecarlo", "Bounds on NEES need the package scipy").chi2
-
-
 def load_matplotlib() -> Any:
     """matplotlib's figures, drawn without a screen. Raises RecordingError where it is not installed."""
     return _load("matplotlib.figure", "montecarlo", "Figures as PNG need the package matplotlib")

@@ -10,6 +10,7 @@ import numpy as np
 from icalib.calibration import Verdict
 from icalib.estimation.determination import Determined
 
+SPREAD = 10.0  # a parameter known, with what it owes to the guess, to no more tolerances than this is undetermined
 SHARE = 0.25  # a parameter that makes up this much of an undetermined direction is undetermined itself
 NAMED = 0.2  # parts of a direction smaller than this are not named
 
@@ -50,7 +51,8 @@ def observe(found: Determined, names: tuple[str, ...], wheels: Collection[str] =
     share = (directions**2).sum(axis=1)
     verdicts: list[Verdict] = []
     for part, spread in zip(share, found.spread, strict=True):
-        verdicts.append("undetermined" if part > SHARE else "determined" if spread <= 1.0 else "weak")
+        is_open = part > SHARE or spread > SPREAD
+        verdicts.append("undetermined" if is_open else "determined" if spread <= 1.0 else "weak")
     sentences = tuple(_sentence(u, names, wheels) for u in directions.T)
     return Observability(found.covariance, tuple(verdicts), sentences)
 
@@ -71,6 +73,6 @@ def _sentence(direction: np.ndarray, names: tuple[str, ...], wheels: Collection[
     order = np.argsort(-np.abs(direction))
     parts = [i for i in order if abs(direction[i]) >= NAMED][:4] or [order[0]]
     words = " with ".join(names[i].replace(".", " ") for i in parts)
-    sensor, kind = names[parts[0]].split(".")[:2]
+    sensor, kind = names[parts[0]].rsplit(".", 2)[:2]
     motions = MISSING_MOTION | (ON_THE_GROUND if sensor in wheels else {})
     return f"{words}: not determined by this motion; {motions.get(kind, 'move the rig more')}."

@@ -148,7 +148,10 @@ def read_yaml(path: Path, kind: str = "rig file") -> YamlValue:
     Raises RigError where there is no such file, it cannot be read, is not YAML or is empty.
     """
     try:
-        root = yaml.compose(path.read_text(encoding="utf-8-sig"), Loader=yaml.SafeLoader)
+        # OpenCV heads its files with a directive that YAML does not have.
+        text = path.read_text(encoding="utf-8-sig")
+        text = re.sub(r"\A%YAML:1\.0", "#", text)
+        root = yaml.compose(text, Loader=yaml.SafeLoader)
     except FileNotFoundError:
         raise RigError(f"{path} does not exist; check the path of the {kind}.") from None
     except OSError as error:

@@ -19,8 +19,9 @@ from icalib.estimation.corner_factor import CornerFactor, CornerNoise
 from icalib.estimation.feature_factor import FeatureFactor
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.imu_factor import ImuFactor
-from icalib.estimation.lidar_binning import LidarNoise, Motion
+from icalib.estimation.lidar_binning import LidarNoise
 from icalib.estimation.lidar_factor import LidarFactor
+from icalib.estimation.lidar_sweep import Motion
 from icalib.estimation.nodes import place_nodes
 from icalib.estimation.poses import assign_nodes
 from icalib.estimation.problem import Problem

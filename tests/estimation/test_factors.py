@@ -21,7 +21,8 @@ from icalib.estimation.board import board_in
 from icalib.estimation.corner_factor import CornerNoise
 from icalib.estimation.corner_weights import LEAST_CURVATURE
 from icalib.estimation.imu_factor import ROWS, ImuFactor
-from icalib.estimation.lidar_binning import LidarNoise, Motion
+from icalib.estimation.lidar_binning import LidarNoise
+from icalib.estimation.lidar_sweep import Motion
 from icalib.estimation.pose_factor import AbsolutePoseFactor, PoseNoise, RelativePosesFactor, frame_of
 from icalib.estimation.prior_factor import FIRST_BIAS_SIGMA, Prior, accumulate_bias_prior
 from icalib.estimation.state import NODE, State, make_layout

@@ -151,6 +151,24 @@ def test_points_move_to_the_centre_of_their_bin_as_the_sensor_moved(robot, room_
     assert np.linalg.norm(found - exact, axis=1).max() < 1e-5
 
 
+def test_points_of_a_bin_of_several_steps_move_to_its_centre(robot, room_of):
+    """The mean of each bin's points on each plane is in the world where these were seen."""
+    setup = room_of(brisk(robot))
+    moments = moments_of(setup, LidarNoise(1.0), bin_s=5e-3)
+    assert moments.count.max() > 3
+    centre, _ = poses_of_points(setup, setup.state, np.repeat(moments.seconds, np.diff(moments.start)))
+    mean = moments.root[:, [1, 3, 6]] / moments.root[:, :1]
+    found, _ = world_points(setup, setup.state, centre, mean)
+    used = np.flatnonzero(setup.plane >= 0)
+    own, _ = poses_of_points(setup, setup.state, point_times(setup)[used])
+    exact, _ = world_points(setup, setup.state, own, setup.stream.xyz[used].astype(np.float64))
+    scan = np.repeat(np.arange(len(setup.stream.stamps_ns)), np.diff(setup.stream.start))[used]
+    bin_of = np.floor(setup.stream.offset_s[used].astype(np.float64) / 5e-3)
+    _, entry = np.unique(np.stack([scan, bin_of, setup.plane[used]]), axis=1, return_inverse=True)
+    expected = np.stack([np.bincount(entry, x) for x in exact.T], axis=1) / np.bincount(entry)[:, None]
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)
+
+
 def test_points_in_the_world_are_where_each_was_seen(robot, room_of):
     setup = room_of(brisk(robot))
     points, seen_from = in_world(setup.motion(setup.state), setup.stream)

@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2
 
 from icalib.detection.planes import PlaneSearch, find_planes
-from icalib.estimation.lidar_binning import LidarNoise, in_world
+from icalib.estimation.lidar_binning import BIN_S, LidarNoise, in_world
 from icalib.estimation.solver import minimise
 from icalib.estimation.state import make_layout
 from icalib.geometry import so3
@@ -66,6 +66,16 @@ def test_a_start_far_off_leads_to_the_same_place(robot, room_of):
     far = recover(setup, setup.perturbed(np.random.default_rng(0), 30.0), BEAM, 4)
     apart = np.abs(errors(setup, far.state) - errors(setup, near.state))
     assert (apart < 0.05 * np.sqrt(np.diag(covariance(setup, near)))).all()
+
+
+def test_longer_bins_change_the_answer_little(robot, room_of):
+    """Far less than its standard deviations, which stay."""
+    setup = room_of(simulate(robot(5.0), seed=3))
+    start = recover(setup, setup.state, BEAM, 2).state
+    short, long = (minimise(setup.problem(start, BEAM, bin_s=b), start) for b in (1e-3, BIN_S))
+    std = np.sqrt(np.diag(covariance(setup, short)))
+    assert (np.abs(errors(setup, long.state) - errors(setup, short.state)) < 0.1 * std).all()
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance(setup, long))), std, rtol=0.01)
 
 
 def test_gauge_changes_no_calibration(robot, room_of):

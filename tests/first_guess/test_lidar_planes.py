@@ -9,8 +9,9 @@ import pytest
 
 from icalib.errors import EstimationError
 from icalib.estimation.imu_factor import ImuFactor
-from icalib.estimation.lidar_binning import LidarNoise, Motion
+from icalib.estimation.lidar_binning import LidarNoise
 from icalib.estimation.lidar_factor import LidarFactor
+from icalib.estimation.lidar_sweep import Motion
 from icalib.estimation.nodes import place_nodes
 from icalib.estimation.problem import Problem
 from icalib.estimation.solver import minimise

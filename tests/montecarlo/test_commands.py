@@ -99,7 +99,7 @@ def test_no_scheduler_answers(tmp_path: Path, capsys, monkeypatch, address: str)
     assert f"no Dask scheduler answers at {address}; start one" in sentence(capsys, *arguments)
 
 
-@pytest.mark.parametrize("module", ["distributed", "scipy.stats", "matplotlib.figure"])
+@pytest.mark.parametrize("module", ["distributed", "matplotlib.figure"])
 def test_missing_packages_are_named(runs, tmp_path: Path, capsys, monkeypatch, module: str):
     if module == "distributed":
         monkeypatch.undo()

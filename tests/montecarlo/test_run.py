@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.calibration import Calibration, CornerResiduals, Visited
+from icalib.calibration import Calibration, CornerResiduals, LidarResiduals, Visited, WheelResiduals
 from icalib.errors import RecordingError
 from icalib.montecarlo import one_run
 from icalib.montecarlo.one_run import Task, compare, run
@@ -164,3 +164,38 @@ def test_a_solver_that_did_not_converge_is_a_failed_run_with_its_errors(result, 
     lost = compare(1, replace(result, converged=False, status="not converged."), simulation.truth, [], 1.0)
     assert lost.failure == "the solver did not converge: not converged."
     assert len(lost.error) and lost.path == ()
+
+
+def _steps(rng: np.random.Generator, n: int, rho: float) -> np.ndarray:
+    """(n,) of variance 1, each correlated with the last by `rho`."""
+    x = rng.normal(size=n)
+    for k in range(1, n):
+        x[k] = rho * x[k - 1] + np.sqrt(1.0 - rho**2) * x[k]
+    return x
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.6])
+def test_points_are_compared_along_their_plane(result: Calibration, rho: float):
+    """Two walls in turn, each with its own noise; a pause between the halves ties nothing."""
+    n = 20000
+    rng = np.random.default_rng(3)
+    plane = np.arange(n, dtype=np.int32) % 2
+    residual = np.empty(n)
+    residual[0::2], residual[1::2] = _steps(rng, n // 2, rho), _steps(rng, n // 2, rho)
+    seconds = np.arange(n) * 1e-3 + np.where(np.arange(n) < n // 2, 0.0, 60.0)
+    rest = (np.ones(n), np.full(n, 0.02), np.zeros((n, 3)), 0.02 * residual, np.zeros((n, 3)), np.zeros(n))
+    points = LidarResiduals("lidar0", 10, n, n, seconds, plane, *rest)
+    own = {w.kind: w for w in whiteness(replace(result, lidar_residuals=(points,)))}
+    assert own["points"].lag1 == pytest.approx(rho, abs=0.03)
+    assert own["points"].mean_square == pytest.approx(1.0, abs=0.05)
+
+
+def test_rows_of_wheels_are_compared_apart(result: Calibration):
+    n = 20000
+    rng = np.random.default_rng(4)
+    whitened = np.stack([_steps(rng, n, 0.0), 2.0 * _steps(rng, n, 0.7)], axis=1)
+    wheels = WheelResiduals("wheel0", ("left", "sideways"), ("rad", "m"), np.arange(n) * 0.02, whitened, whitened)
+    own = {w.kind: w for w in whiteness(replace(result, wheel_residuals=(wheels,)))}
+    assert own["left"].lag1 == pytest.approx(0.0, abs=0.03)
+    assert own["sideways"].lag1 == pytest.approx(0.7, abs=0.03)
+    assert own["sideways"].mean_square == pytest.approx(4.0, rel=0.1)

@@ -105,7 +105,8 @@ def _groups() -> tuple[ParameterGroup, ...]:
             "distortion": DISTORTION[cam],
             "bloom": [0.27],
         }
-        groups += [_group(groups, cam, name, value, name == "distortion") for name, value in values.items()]
+        for name, value in values.items():
+            groups.append(_group(groups, cam, name, value, name == "distortion"))
     groups.append(_group(groups, "board0", "shape", [8e-4, -2e-4, 5e-4], False))
     groups.append(_group(groups, "board0", "tilt", Rotation.from_euler("x", 88.0, degrees=True).as_matrix(), False))
     groups.append(
@@ -206,7 +207,8 @@ def robot(calibration: Calibration) -> Calibration:
         R = Rotation.from_euler("xyz", rpy, degrees=True).as_matrix()
         values: dict[str, object] = {"rotation": R, "translation": position, "time_offset": [-0.01]}
         values |= {"radii": [0.1, 0.102], "baseline": [0.42]} if name == "wheel0" else {}
-        groups += [_group(groups, name, key, value, False) for key, value in values.items()]
+        for key, value in values.items():
+            groups.append(_group(groups, name, key, value, False))
     names = tuple(f"{g.sensor}.{g.name}.{n}" for g in groups if g.columns for n in g.labels)
     seconds = 0.05 * np.arange(NODES - 1)
     whitened = rng.normal(size=(len(seconds), 4))

@@ -8,6 +8,7 @@ import numpy as np
 
 from icalib.assessment.robot import (
     lidar_residuals,
+    lidar_warnings,
     planes,
     pose_residuals,
     pose_warnings,
@@ -304,6 +305,7 @@ def _warnings(
             yield f"{share:.0%} of the {f.kind} of {f.sensor} were set aside; look at its residuals in the report."
     yield from robot_warnings(inputs.rig, judged)
     yield from pose_warnings(poses, inputs.rig)
+    yield from lidar_warnings(inputs, found) if inputs.clouds.count else ()
     for g in groups:
         if g.name == "bloom" and abs(g.value[0]) > LARGE_BLOOM_PX:
             where = "in" if g.value[0] > 0.0 else "out"

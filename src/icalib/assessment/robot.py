@@ -7,10 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from icalib.calibration import LidarResiduals, Plane, PoseResiduals, SensorFit, WheelResiduals
-from icalib.estimation.assembly import Inputs, motion_of
+from icalib.estimation.assembly import Inputs, motion_of, origin_difference
 from icalib.estimation.estimate import Estimate
-from icalib.estimation.lidar_binning import LidarNoise, Motion, in_world
+from icalib.estimation.lidar_binning import LidarNoise, in_world
 from icalib.estimation.lidar_factor import LidarFactor
+from icalib.estimation.lidar_sweep import Motion
 from icalib.estimation.nodes import usable
 from icalib.estimation.pose_factor import AbsolutePoseFactor, PoseNoise, RelativePosesFactor
 from icalib.estimation.sensors import Whitened
@@ -23,6 +24,8 @@ from icalib.timeline import Timeline
 
 MOST_POINTS = 200_000  # kept of all LiDARs together
 FEWEST_FITTED = 4
+FEW_ON_PLANES = 0.2  # of the points
+NEARLY_A_PERIOD = 0.15  # of the period
 LARGE_CHI2 = 2.0  # chi^2 per post-fit degree of freedom above this is worth a warning
 LEAST_DOF = 3.0  # times the square root of the number of residuals
 # Correlations of residuals of poses with their neighbours. Of white noise between poses, steps have -0.5.
@@ -212,6 +215,26 @@ def neighbours(rows: np.ndarray) -> float:
     """Correlation of rows (n, 3) with the ones before, large ones clipped; 0 where there are none."""
     clipped = np.clip(rows, -CLIP, CLIP)
     return float((clipped[1:] * clipped[:-1]).sum() / max((clipped**2).sum(), 1e-30))
+
+
+def lidar_warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
+    """Where few points lie on planes, or stamps are those of the wrong end of a scan."""
+    for lidar, stream in zip(inputs.rig.lidars, inputs.measurements.lidars, strict=True):
+        share = _used(found, lidar.name) / max(len(stream.xyz), 1)
+        if share < FEW_ON_PLANES:
+            yield (
+                f"only {share:.1%} of the points of {lidar.name} lie on planes; there is little flat in sight, or the "
+                "times of its points, their order within a scan, or its range_noise in the rig file are wrong."
+            )
+        value = float(found.outcome.state.values[lidar.name, "time_offset"][0])
+        offset = value - origin_difference(inputs.measurements, stream)
+        period = float(np.median(np.diff(stream.seconds)))
+        if abs(abs(offset) - period) < NEARLY_A_PERIOD * period:
+            yield (
+                f"the time_offset of {lidar.name}, {offset:+.4f} s, is about the period of its scans: its stamps may "
+                "be those of the end of a scan while times of points count from its start, or the other way; see "
+                "point_time."
+            )
 
 
 def robot_warnings(rig: Rig, judged: list[SensorFit]) -> Iterator[str]:

@@ -1,6 +1,6 @@
 """The result of a calibration: values with standard deviations and verdicts, saved and loaded whole."""
 
-from icalib.calibration.relative import RelativePose, relative_pose, relative_poses
+from icalib.calibration.relative import RelativePose, joint_covariance, relative_pose, relative_poses
 from icalib.calibration.result import (
     Calibration,
     CornerResiduals,
@@ -33,6 +33,7 @@ __all__ = [
     "Visited",
     "WheelResiduals",
     "calibration_files",
+    "joint_covariance",
     "load_calibration",
     "relative_pose",
     "relative_poses",

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from icalib.calibration.result import Calibration
+    from icalib.calibration.result import Calibration, ParameterGroup
 
 
 @dataclass(frozen=True)
@@ -41,13 +42,14 @@ def relative_poses(c: Calibration) -> tuple[RelativePose, ...]:
 
 
 def relative_pose(c: Calibration, frame: str, sensor: str) -> RelativePose:
-    """Pose of `sensor` in the frame of another sensor. Raises KeyError where one of them was not calibrated.
+    """Pose of `sensor` in the frame of another sensor, or of the IMU. Raises KeyError where one was not calibrated.
 
     With T_imu_frame = (R, p), T_imu_sensor = (Q, q) and the relative pose (S, s) = (R^T Q, R^T (q - p)), perturbations
     dR, dQ on the right, dp and dq give dS = dQ - S^T dR on the right and ds = R^T (dq - dp) + s x dR.
     """
-    T = np.linalg.inv(c.T_imu_sensor(frame)) @ c.T_imu_sensor(sensor)
-    R, S, s = c.T_imu_sensor(frame)[:3, :3], T[:3, :3], T[:3, 3]
+    T_imu_frame = np.eye(4) if frame == c.imu else c.T_imu_sensor(frame)
+    T = np.linalg.inv(T_imu_frame) @ c.T_imu_sensor(sensor)
+    R, S, s = T_imu_frame[:3, :3], T[:3, :3], T[:3, 3]
     J = np.zeros((6, 12))
     J[:3, :3], J[:3, 6:9] = -S.T, np.eye(3)
     J[3:, :3] = [[0.0, -s[2], s[1]], [s[2], 0.0, -s[0]], [-s[1], s[0], 0.0]]
@@ -57,12 +59,20 @@ def relative_pose(c: Calibration, frame: str, sensor: str) -> RelativePose:
 
 def _joint_covariance(c: Calibration, *sensors: str) -> np.ndarray:
     """(6 n, 6 n) of rotation and translation of each of n sensors, empirical factors included; 0 where fixed."""
-    groups = [c.group(sensor, name) for sensor in sensors for name in ("rotation", "translation")]
-    out, at, columns, scale = np.zeros((3 * len(groups),) * 2), [], [], []
+    wanted = [(sensor, name) for sensor in sensors for name in ("rotation", "translation")]
+    return joint_covariance(c, [None if sensor == c.imu else c.group(sensor, name) for sensor, name in wanted], 3)
+
+
+def joint_covariance(c: Calibration, groups: Sequence[ParameterGroup | None], none: int = 0) -> np.ndarray:
+    """Of all entries of `groups`, one after the other, empirical factors included; 0 where fixed, and for each None in
+    place of a group `none` zeros: what is exactly known."""
+    sizes = [none if g is None else len(g.labels) for g in groups]
+    out, at, columns, scale = np.zeros((sum(sizes),) * 2), [], [], []
     for k, g in enumerate(groups):
-        if g.columns is not None:
-            at += range(3 * k, 3 * k + 3)
+        if g is not None and g.columns is not None:
+            first = sum(sizes[:k])
+            at += range(first, first + sizes[k])
             columns += g.columns
-            scale += [1.0] * 3 if g.factor is None else np.maximum(g.factor, 1.0).tolist()
+            scale += [1.0] * sizes[k] if g.factor is None else np.maximum(g.factor, 1.0).tolist()
     out[np.ix_(at, at)] = c.covariance[np.ix_(columns, columns)] * np.outer(scale, scale)
     return out

@@ -217,6 +217,12 @@ class Solution:
     information: np.ndarray
 
 
+BROKEN_DOWN = (
+    "the estimate broke down: from where it started the measurements do not determine the motion; give rough "
+    "extrinsics, time offsets and intrinsics in the rig file."
+)
+
+
 class NotDefiniteError(EstimationError):
     """The normal equations are not positive definite: something is not determined, or damping is too small."""
 
@@ -255,7 +261,7 @@ def _reduce(piece: Piece, keep: bool) -> Eliminated | bool:
 def marginalise(piece: Piece) -> np.ndarray:
     """Border (B + 1, B + 1) with all nodes of `piece` eliminated; overwrites the piece. Raises NotDefiniteError."""
     if not _reduce(piece, False):
-        raise NotDefiniteError("the motion between nodes is not determined.")
+        raise NotDefiniteError(BROKEN_DOWN)
     return piece.border
 
 
@@ -277,7 +283,7 @@ def marginalise_in_segments(piece: Callable[[int, int], Piece], n_nodes: int) ->
 def _onto_last(piece: Piece) -> Piece:
     """The last node and the border, all other nodes eliminated. Raises NotDefiniteError."""
     if not _eliminate(piece.diagonal, piece.upper, piece.side, True, True):
-        raise NotDefiniteError("the motion between nodes is not determined.")
+        raise NotDefiniteError(BROKEN_DOWN)
     last = Piece.zeros(piece.last, piece.last, piece.side.shape[2] - 1)
     last.diagonal[0], last.side[0] = piece.diagonal[-1], piece.side[-1]
     flat = piece.side[:-1].reshape(-1, piece.side.shape[2])
@@ -347,14 +353,14 @@ def solve(
             _damp(piece.diagonal, damping)
     done = in_parallel(lambda p: _reduce(p, keep), pieces)
     if not all(done):
-        raise NotDefiniteError("the motion between nodes is not determined.")
+        raise NotDefiniteError(BROKEN_DOWN)
     rest = sum((p.border for p in pieces), extra)
     shared, shared_side = np.zeros((0, 0)), np.zeros((0, n_border + 1))
     if keep:
         shared = pieces[0].diagonal[-1] + pieces[1].diagonal[0]
         shared_side = pieces[0].side[-1] + pieces[1].side[0]
         if not cholesky(shared):
-            raise NotDefiniteError("the motion between nodes is not determined.")
+            raise NotDefiniteError(BROKEN_DOWN)
         _forward_solve(shared, shared_side)
         rest -= shared_side.T @ shared_side
     information = rest[:n_border, :n_border]

@@ -19,7 +19,7 @@ from icalib.estimation.images import on_common_images
 from icalib.estimation.imu_data import ImuData, joined_imu_data
 from icalib.estimation.imu_factor import ImuFactor
 from icalib.estimation.imu_model import N_INTRINSICS
-from icalib.estimation.lidar_binning import Motion
+from icalib.estimation.lidar_sweep import Motion
 from icalib.estimation.nodes import MERGED_WITHIN_S, distinct, first_nodes, place_nodes, usable
 from icalib.estimation.poses import assign_nodes, poses_at
 from icalib.estimation.prior_factor import Prior

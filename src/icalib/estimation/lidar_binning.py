@@ -2,8 +2,9 @@
 
 A residual n . (p + R x) - d is linear in (1, x). So the sum of its squares over the points of one plane in one bin of
 time, and all its derivatives by the bin's pose and the plane, follow exactly from ten weighted moments of (1, x).
-Points are first moved to the instant of their bin's centre with the sensor's twist there; what that leaves is an eighth
-of the acceleration times the bin's length squared at most: 1e-6 m for 5 m/s^2 and 1 ms.
+Points are first moved to the instant of their bin's centre: by the sensor's twist within a step of 1 ms, and from step
+to step by its poses. What that leaves is an eighth of the acceleration times the step's length squared at most: 1e-6 m
+for 5 m/s^2.
 """
 
 from __future__ import annotations
@@ -18,16 +19,13 @@ from numba import njit
 from icalib.errors import EstimationError
 from icalib.estimation.arrowhead import in_parallel
 from icalib.estimation.corner_weights import weight
-from icalib.estimation.imu_data import ImuData
-from icalib.estimation.integration import integrate
+from icalib.estimation.lidar_sweep import Motion, sweep
 from icalib.estimation.nodes import usable
-from icalib.estimation.poses import assign_nodes
-from icalib.estimation.state import State
-from icalib.geometry.small import mul3
 from icalib.measurements import LidarStream
 from icalib.rig import Loss
 
-BIN_S = 1e-3
+BIN_S = 3e-3
+STEP_S = 1e-3  # of a longer bin
 POINTS_AT_A_TIME = 150_000  # by one thread: what a chunk needs beside the cloud stays small
 MOMENTS = 10  # of (1, x, y, z), lower triangle row by row
 LOSSES: dict[Loss, int] = {"none": 0, "huber": 1, "cauchy": 2}
@@ -56,16 +54,6 @@ class Associated:
 
 
 @dataclass(frozen=True)
-class Motion:
-    """The IMU's motion as a state has it. gravity [m/s^2]; IMU gaps up to max_gap_s are bridged."""
-
-    state: State
-    imu: ImuData
-    gravity: float
-    max_gap_s: float
-
-
-@dataclass(frozen=True)
 class Moments:
     """Bins of one LiDAR, in the order of time, and the planes that each saw: entries start[j]:start[j + 1] of bin j.
 
@@ -81,94 +69,67 @@ class Moments:
     root: np.ndarray
 
 
-class Sweep(NamedTuple):
-    """The LiDAR at the centres of bins: R_world_lidar, p_world_lidar, and the twist in its own axes: rad/s, m/s."""
-
-    rotation: np.ndarray
-    position: np.ndarray
-    rate: np.ndarray
-    velocity: np.ndarray
-
-
 class _Scans(NamedTuple):
-    """Points of scans and the bins that they fall into: start (S + 1,); first bin of each scan, counted from its stamp,
-    and its place among all bins (S + 1,); ok: whether a bin can be used."""
+    """Points of scans and the steps of time that they fall into: start (S + 1,); first step of each scan, counted from
+    its stamp, and its place among all steps (S + 1,), both a multiple of the steps of a bin."""
 
     start: np.ndarray
     offset_s: np.ndarray
     xyz: np.ndarray
     plane: np.ndarray
     low: np.ndarray
-    bins: np.ndarray
-    ok: np.ndarray
+    steps: np.ndarray
+
+
+class _Cells(NamedTuple):
+    """Of each step (n,): its bin, -1 where the LiDAR's motion is not known; where the LiDAR is at its middle, seen from
+    the bin's centre (turn, shift). Of each bin (m,): rotation and position of the LiDAR at its centre."""
+
+    bin: np.ndarray
+    turn: np.ndarray
+    shift: np.ndarray
+    rotation: np.ndarray
+    position: np.ndarray
 
 
 class _Weights(NamedTuple):
-    """Variances [m^2] of what is alike in all directions and of what is along the beam; the loss."""
+    """Variances [m^2] of what is alike in all directions (and 1 over it), and of what is along the beam; the loss."""
 
     alike: float
+    whole: float
     along: float
     loss: int
     scale: float
 
 
 @njit(cache=True, nogil=True)
-def _imu_at(times, node, first, chain, raw, intrinsics, out_R, out_p, rate, velocity):
-    """IMU poses at `times` by integration from their nodes, without Jacobians; the rate is the body's."""
-    seconds, R, p, v, b, g = chain
-    t, gyro, accel = raw
-    variance, walk = np.zeros((len(t), 3)), np.zeros(2)
-    dR, dv, dp, J, P = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((9, 0)), np.empty((0, 0))
-    for i in range(len(times)):
-        k = node[i]
-        dt = times[i] - seconds[k]
-        w, _ = integrate(
-            seconds[k], times[i], first[i], t, gyro, accel, b[k], intrinsics, variance, walk, True, dR, dv, dp, J, P
-        )  # fmt: skip
-        turned = mul3(R[k], dR)
-        for a in range(3):
-            rate[i, a] = w[a]
-            out_p[i, a] = p[k, a] + v[k, a] * dt
-            velocity[i, a] = v[k, a]
-            for c in range(3):
-                out_R[i, a, c] = turned[a, c]
-                out_p[i, a] += R[k, a, c] * dp[c]
-                velocity[i, a] += R[k, a, c] * dv[c]
-        out_p[i, 2] -= 0.5 * g * dt * dt
-        velocity[i, 2] -= g * dt
-
-
-@njit(cache=True, nogil=True)
-def _to_lidar(R_il, p_il, R, p, rate, velocity):
-    """From the IMU's pose, rate and velocity to the LiDAR's, in place: its twist in its own axes."""
-    for i in range(len(R)):
-        w0, w1, w2 = rate[i, 0], rate[i, 1], rate[i, 2]
-        lever = (w1 * p_il[2] - w2 * p_il[1], w2 * p_il[0] - w0 * p_il[2], w0 * p_il[1] - w1 * p_il[0])
-        moving = np.empty(3)
-        for a in range(3):
-            moving[a] = lever[a]
-            for c in range(3):
-                moving[a] += R[i, c, a] * velocity[i, c]
-                p[i, a] += R[i, a, c] * p_il[c]
-        for a in range(3):
-            rate[i, a] = R_il[0, a] * w0 + R_il[1, a] * w1 + R_il[2, a] * w2
-            velocity[i, a] = R_il[0, a] * moving[0] + R_il[1, a] * moving[1] + R_il[2, a] * moving[2]
-        turned = mul3(R[i], R_il)
-        for a in range(3):
-            for c in range(3):
-                R[i, a, c] = turned[a, c]
-
-
-@njit(cache=True, nogil=True)
-def _bin_range(start, offset_s, per_s, low, count):
-    """First bin of each scan, counted from its stamp, and how many there are."""
+def _step_range(start, offset_s, per_s, each, low, count):
+    """First step of each scan, counted from its stamp, and how many there are: whole bins of `each` steps."""
     for i in range(len(start) - 1):
         least, most = np.inf, -np.inf
         for n in range(start[i], start[i + 1]):
             least, most = min(least, offset_s[n]), max(most, offset_s[n])
         empty = start[i + 1] == start[i]
-        low[i] = 0 if empty else int(np.floor(np.float64(least) * per_s))
-        count[i] = 0 if empty else int(np.floor(np.float64(most) * per_s)) - low[i] + 1
+        low[i] = 0 if empty else each * (int(np.floor(np.float64(least) * per_s)) // each)
+        count[i] = 0 if empty else each * ((int(np.floor(np.float64(most) * per_s)) - low[i]) // each + 1)
+
+
+@njit(cache=True, nogil=True)
+def _to_centres(motion, each, ok, cells):
+    """Fills `cells` for bins of `each` steps."""
+    for c in range(len(ok) // each):
+        m = c * each + each // 2
+        R, p = motion.rotation[m], motion.position[m]
+        cells.rotation[c], cells.position[c] = R, p
+        for b in range(c * each, (c + 1) * each):
+            cells.bin[b] = c if ok[b] and ok[m] else -1
+            for i in range(3):
+                cells.shift[b, i] = 0.0
+                for j in range(3):
+                    cells.shift[b, i] += R[j, i] * (motion.position[b, j] - p[j])
+                    cells.turn[b, i, j] = 0.0
+                    for k in range(3):
+                        cells.turn[b, i, j] += R[k, i] * motion.rotation[b, k, j]
 
 
 @njit(cache=True, nogil=True)
@@ -183,11 +144,12 @@ def _see_plane(R, p, plane, seen):
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _add_point(x, y, z, s, seen, weights, sums):
     """Adds one weighted point to the ten moments in row s."""
-    w = 1.0 / weights.alike
+    w = weights.whole
     if weights.along > 0.0 or weights.loss:
         across = seen[s, 1] * x + seen[s, 2] * y + seen[s, 3] * z
         if weights.along > 0.0:
-            w = 1.0 / (weights.alike + weights.along * across * across / (x * x + y * y + z * z))
+            square = x * x + y * y + z * z
+            w = square / (weights.alike * square + weights.along * across * across)
         if weights.loss:
             w *= weight(weights.loss, weights.scale, (seen[s, 0] + across) ** 2 * w)[0]
     wx, wy, wz = w * x, w * y, w * z
@@ -203,29 +165,32 @@ def _add_point(x, y, z, s, seen, weights, sums):
     sums[s, 9] += wz * z
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _bin_scan(i, scans, motion, planes, weights, per_s, slot, seen, sums, count, where):
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _bin_scan(i, scans, motion, cells, planes, weights, per_s, each, slot, seen, sums, count, where):
     """Moments of scan i in the order in which its bins and planes were met; returns how many. where (m, 2): which."""
-    used, low, first, bin_s = 0, scans.low[i], scans.bins[i], 1.0 / per_s
-    slot[: scans.bins[i + 1] - first] = -1
-    for n in range(scans.start[i], scans.start[i + 1]):
+    used, low, first, step_s = 0, scans.low[i], scans.steps[i], 1.0 / per_s
+    begin = first // each
+    slot[: scans.steps[i + 1] // each - begin] = -1
+    # Unsigned indices spare the test of each whether it counts from the end.
+    for n in range(np.uint64(scans.start[i]), np.uint64(scans.start[i + 1])):
         q = scans.plane[n]
         if q < 0:
             continue
         offset = np.float64(scans.offset_s[n])
-        k = int(np.floor(offset * per_s)) - low
-        b = first + k
-        if not scans.ok[b]:
+        k = int(np.floor(offset * per_s))
+        b = np.uint64(first + k - low)
+        c = cells.bin[b]
+        if c < 0:
             continue
-        s = slot[k, q]
+        s = slot[np.uint64(c - begin), np.uint64(q)]
         if s < 0:
-            s = slot[k, q] = used
+            s = slot[c - begin, q] = used
             used += 1
-            _see_plane(motion.rotation[b], motion.position[b], planes[q], seen[s])
+            _see_plane(cells.rotation[c], cells.position[c], planes[q], seen[s])
             sums[s] = 0.0
             count[s] = 0
-            where[s, 0], where[s, 1] = b, q
-        dt = offset - (k + low + 0.5) * bin_s
+            where[s, 0], where[s, 1] = c, q
+        dt = offset - (k + 0.5) * step_s
         h = 0.5 * dt
         x, y, z = np.float64(scans.xyz[n, 0]), np.float64(scans.xyz[n, 1]), np.float64(scans.xyz[n, 2])
         w0, w1, w2 = motion.rate[b, 0], motion.rate[b, 1], motion.rate[b, 2]
@@ -233,8 +198,12 @@ def _bin_scan(i, scans, motion, planes, weights, per_s, slot, seen, sums, count,
         x += dt * (motion.velocity[b, 0] + w1 * mz - w2 * my)
         y += dt * (motion.velocity[b, 1] + w2 * mx - w0 * mz)
         z += dt * (motion.velocity[b, 2] + w0 * my - w1 * mx)
-        _add_point(x, y, z, s, seen, weights, sums)
-        count[s] += 1
+        R, t = cells.turn[b], cells.shift[b]
+        mx = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0]
+        my = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1]
+        mz = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2]
+        _add_point(mx, my, mz, np.uint64(s), seen, weights, sums)
+        count[np.uint64(s)] += 1
     return used
 
 
@@ -256,16 +225,16 @@ def _root_in_place(M):
 
 
 @njit(cache=True, nogil=True)
-def _bin_scans(scans, motion, planes, weights, per_s, bins, plane, count, root):
+def _bin_scans(scans, motion, cells, planes, weights, per_s, bins, plane, count, root):
     """All scans one after the other: entries' bin, plane, count and root; returns how many."""
-    longest, total = 0, 0
+    longest, total, each = 0, 0, max(len(cells.bin) // max(len(cells.position), 1), 1)
     for i in range(len(scans.start) - 1):
-        longest = max(longest, scans.bins[i + 1] - scans.bins[i])
+        longest = max(longest, (scans.steps[i + 1] - scans.steps[i]) // each)
     n = longest * len(planes)
     slot, seen = np.empty((longest, len(planes)), np.int32), np.empty((n, 4))
     sums, number, where = np.empty((n, MOMENTS)), np.empty(n, np.int64), np.empty((n, 2), np.int64)
     for i in range(len(scans.start) - 1):
-        used = _bin_scan(i, scans, motion, planes, weights, per_s, slot, seen, sums, number, where)
+        used = _bin_scan(i, scans, motion, cells, planes, weights, per_s, each, slot, seen, sums, number, where)
         for s in range(used):
             bins[total], plane[total], count[total] = where[s, 0], where[s, 1], number[s]
             root[total] = sums[s]
@@ -305,59 +274,57 @@ def _groups(stream: LidarStream) -> Iterator[slice]:
     return (slice(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True))
 
 
-def _laid_out(stream: LidarStream, plane: np.ndarray, bin_s: float, own: slice) -> tuple[_Scans, np.ndarray, slice]:
-    """Some of the scans with their bins, all usable; the bins' seconds on the LiDAR's clock; which points they are."""
+def _laid_out(
+    stream: LidarStream, plane: np.ndarray, step_s: float, each: int, own: slice
+) -> tuple[_Scans, np.ndarray, slice]:
+    """Some of the scans with their steps, `each` so many a bin; the middles of steps in seconds on the LiDAR's clock;
+    which points they are."""
     start = stream.start[own.start : own.stop + 1]
     points = slice(int(start[0]), int(start[-1]))
     start, offset_s = start - start[0], stream.offset_s[points]
     low, width = np.empty(len(start) - 1, np.int64), np.empty(len(start) - 1, np.int64)
-    _bin_range(start, offset_s, 1.0 / bin_s, low, width)
-    bins = np.concatenate([[0], np.cumsum(width)])
-    within = np.arange(bins[-1]) - np.repeat(bins[:-1] - low, width)
-    seconds = np.repeat(stream.seconds[own], width) + (within + 0.5) * bin_s
-    ok = np.ones(len(seconds), dtype=bool)
-    return _Scans(start, offset_s, stream.xyz[points], plane[points], low, bins, ok), seconds, points
+    _step_range(start, offset_s, 1.0 / step_s, each, low, width)
+    steps = np.concatenate([[0], np.cumsum(width)])
+    within = np.arange(steps[-1]) - np.repeat(steps[:-1] - low, width)
+    seconds = np.repeat(stream.seconds[own], width) + (within + 0.5) * step_s
+    return _Scans(start, offset_s, stream.xyz[points], plane[points], low, steps), seconds, points
 
 
 def _moments_of(
     cloud: Associated, drive: Motion, noise: LidarNoise, bin_s: float, own: slice
 ) -> tuple[np.ndarray, ...]:
     """Of some of the scans: seconds of the bins, and of each entry bin, plane, count and root."""
-    scans, seconds, _ = _laid_out(cloud.stream, cloud.plane, bin_s, own)
+    each = steps_of(bin_s)
+    scans, seconds, _ = _laid_out(cloud.stream, cloud.plane, bin_s / each, each, own)
     times = seconds + drive.state.values[cloud.stream.name, "time_offset"][0]
-    scans = scans._replace(ok=usable(drive.imu, times, drive.max_gap_s))
-    motion = sweep(drive, cloud.stream.name, times)
-    weights = _Weights(noise.sigma**2, noise.beam_sigma**2, LOSSES[noise.loss], noise.loss_scale)
-    most = min(len(scans.xyz), len(seconds) * len(cloud.planes))
+    # All steps of a bin hang on one node: between two nodes a state that has not settled yet may jump.
+    motion, n = sweep(drive, cloud.stream.name, times, np.repeat(times[each // 2 :: each], each)), len(times)
+    cells = _Cells(
+        np.empty(n, np.int64), np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n // each, 3, 3)),
+        np.empty((n // each, 3)),
+    )  # fmt: skip
+    _to_centres(motion, each, usable(drive.imu, times, drive.max_gap_s), cells)
+    weights = _Weights(noise.sigma**2, noise.sigma**-2, noise.beam_sigma**2, LOSSES[noise.loss], noise.loss_scale)
+    most = min(len(scans.xyz), len(cells.position) * len(cloud.planes))
     bin_of, own_plane, count = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)
     root = np.empty((most, MOMENTS))
-    n = _bin_scans(scans, motion, cloud.planes, weights, 1.0 / bin_s, bin_of, own_plane, count, root)
-    return seconds, bin_of[:n].copy(), own_plane[:n].copy(), count[:n].copy(), root[:n].copy()
+    k = _bin_scans(scans, motion, cells, cloud.planes, weights, each / bin_s, bin_of, own_plane, count, root)
+    return seconds[each // 2 :: each], bin_of[:k].copy(), own_plane[:k].copy(), count[:k].copy(), root[:k].copy()
 
 
-def sweep(drive: Motion, name: str, times: np.ndarray) -> Sweep:
-    """Where LiDAR `name` is and how it moves at `times` (n,) on the IMU's clock, by the IMU's readings."""
-    state, imu = drive.state, drive.imu
-    n, node = len(times), assign_nodes("inertial", state.seconds, times)
-    R, p, rate, velocity = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
-    first = imu.interval(state.seconds[node])
-    first -= (times < state.seconds[node]) & (imu.seconds[first] == state.seconds[node]) & (first > 0)
-    chain = (state.seconds, state.rotation, state.position, state.velocity, state.bias, drive.gravity)
-    raw = (imu.seconds, imu.gyro, imu.accel)
-    _imu_at(times, node, first, chain, raw, state.values[imu.name, "intrinsics"], R, p, rate, velocity)
-    R_il, p_il = state.values[name, "rotation"], state.values[name, "translation"]
-    _to_lidar(np.ascontiguousarray(R_il), p_il, R, p, rate, velocity)
-    return Sweep(R, p, rate, velocity)
+def steps_of(bin_s: float) -> int:
+    """Steps of a bin, an odd number: the middle of one is the bin's centre."""
+    return max(2 * (int(bin_s / STEP_S + 0.5) // 2) + 1, 1) if bin_s > STEP_S else 1
 
 
 @njit(cache=True, nogil=True)
-def _move_to_world(scans, motion, bin_s, points, seen_from):
+def _move_to_world(scans, motion, step_s, points, seen_from):
     """World coordinates of all points, and where the LiDAR was when it saw them."""
     for i in range(len(scans.start) - 1):
         for n in range(scans.start[i], scans.start[i + 1]):
             offset = np.float64(scans.offset_s[n])
-            k = int(np.floor(offset * (1.0 / bin_s)))
-            b, dt = scans.bins[i] + k - scans.low[i], offset - (k + 0.5) * bin_s
+            k = int(np.floor(offset * (1.0 / step_s)))
+            b, dt = scans.steps[i] + k - scans.low[i], offset - (k + 0.5) * step_s
             x, v, w = scans.xyz[n], motion.velocity[b], motion.rate[b]
             for a in range(3):
                 points[n, a] = seen_from[n, a] = motion.position[b, a]
@@ -369,15 +336,15 @@ def _move_to_world(scans, motion, bin_s, points, seen_from):
                     seen_from[n, a] += motion.rotation[b, a, c] * dt * v[c]
 
 
-def in_world(drive: Motion, stream: LidarStream, bin_s: float = BIN_S) -> tuple[np.ndarray, np.ndarray]:
+def in_world(drive: Motion, stream: LidarStream) -> tuple[np.ndarray, np.ndarray]:
     """Points (N, 3) of a LiDAR in the world frame, float32, and where it was at their instants (N, 3), as `drive` has
-    it. Within a bin it moves with its twist; at instants without IMU as its nearest reading says."""
+    it. Within a step it moves with its twist; at instants without IMU as its nearest reading says."""
     points, seen_from = np.empty((len(stream.xyz), 3), np.float32), np.empty((len(stream.xyz), 3), np.float32)
 
     def move(own: slice) -> None:
-        scans, seconds, ends = _laid_out(stream, stream.plane, bin_s, own)
+        scans, seconds, ends = _laid_out(stream, stream.plane, STEP_S, 1, own)
         motion = sweep(drive, stream.name, seconds + drive.state.values[stream.name, "time_offset"][0])
-        _move_to_world(scans, motion, bin_s, points[ends], seen_from[ends])
+        _move_to_world(scans, motion, STEP_S, points[ends], seen_from[ends])
 
     in_parallel(move, _groups(stream))
     return points, seen_from

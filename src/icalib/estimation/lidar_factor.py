@@ -23,8 +23,8 @@ from icalib.estimation import lidar_kernels
 from icalib.estimation.arrowhead import Piece
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.lidar_binning import BIN_S, Associated, LidarNoise, Moments, take_moments
-from icalib.estimation.lidar_binning import Motion as ImuMotion
 from icalib.estimation.lidar_kernels import ROWS, Bins, Motion, Planes
+from icalib.estimation.lidar_sweep import Motion as ImuMotion
 from icalib.estimation.poses import assign_nodes, poses_at
 from icalib.estimation.sensors import Whitened
 from icalib.estimation.state import Key, Layout, State

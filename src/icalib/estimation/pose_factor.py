@@ -18,7 +18,7 @@ from icalib.estimation.arrowhead import Piece
 from icalib.estimation.board import board_in
 from icalib.estimation.corner_factor import LOSSES
 from icalib.estimation.imu_data import ImuData
-from icalib.estimation.lidar_binning import Motion
+from icalib.estimation.lidar_sweep import Motion
 from icalib.estimation.nodes import usable
 from icalib.estimation.pose_rows import Frame, Mount, PoseRows, absolute_rows, relative_rows
 from icalib.estimation.poses import Poses, assign_nodes, poses_at

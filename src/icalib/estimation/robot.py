@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.estimation.lidar_binning import LidarNoise, Motion
+from icalib.estimation.lidar_binning import LidarNoise
 from icalib.estimation.lidar_factor import LidarFactor
+from icalib.estimation.lidar_sweep import Motion
 from icalib.estimation.pose_factor import (
     FRAME,
     AbsolutePoseFactor,
@@ -68,6 +69,21 @@ class Clouds:
 
 
 NO_CLOUDS = Clouds((), ())
+
+
+def joined_clouds(each: Sequence[Clouds]) -> Clouds:
+    """Of recordings whose points follow one another. Each has a world and planes of its own: "plane 2.0" is of the
+    second recording."""
+    if len(each) == 1:
+        return each[0]
+    names = tuple(f"plane {r}.{own.removeprefix('plane ')}" for r, c in enumerate(each, 1) for own in c.names)
+    first = np.cumsum([0, *(c.count for c in each)])
+    pairs = zip(*(c.plane for c in each), strict=True)
+    plane = (
+        np.concatenate([np.where(p >= 0, p + n, -1) for p, n in zip(own, first, strict=False)]).astype(np.int32)
+        for own in pairs
+    )
+    return Clouds(names, tuple(plane))
 
 
 def own_entries(sensor: Lidar | Wheels | PoseSensor) -> list[Entry]:

@@ -19,6 +19,7 @@ ROUNDING = 1e-11  # of the cost: what rounding makes of a sum of 1e6 squares
 CURVED_BELOW = 1e-2  # of the cost: steps that promise less use the true curvature of the robust loss
 STALLED_DECREASE = 0.05  # of half the chi^2: a third of a standard deviation, good enough where smaller steps fail
 MOST_STALLED = 4  # steps this small that fail before the solver rests
+RESTING = 20.0  # times the tolerance of an early pass: a step that promises less and fails ends it
 FIRST_DAMPING = 1e-8
 ZERO_DAMPING = 1e-10  # below this, none: the weak information of a planar drive must not be swamped
 
@@ -94,7 +95,7 @@ def minimise(
                 break
             continue
         stalled += solution.decrease < STALLED_DECREASE
-        if stalled > MOST_STALLED:
+        if stalled > MOST_STALLED or (tolerance > STALLED_DECREASE and solution.decrease < RESTING * tolerance):
             break
         # Too far out for the true curvature of the loss: weights alone, and only then more damping.
         damping = damping if curved else max(damping * 10.0, 1e-6)

@@ -9,11 +9,13 @@ import numpy as np
 from icalib.estimation.state import Layout
 from icalib.rig import Settings
 
-# What a guess without a standard deviation is taken to be worth: rad, m, s, px, 1.
+# What a guess without a standard deviation is taken to be worth: rad, m, s, px, 1. Nobody guesses where the walls
+# and frames of poses and which way the board are: if these moved with a sensor at some worth, little of a direction's
+# would be left to it.
 GUESS_SIGMA = {
     "rotation": 0.1, "translation": 0.1, "time_offset": 0.01, "intrinsics": 15.0, "distortion": 0.1, "bloom": 1.0,
-    "shape": 1e-3, "tilt": 0.1, "radii": 0.01, "baseline": 0.05, "plane": 0.1,
-    "frame_rotation": 3.0, "frame_translation": 10.0,  # nobody guesses these: they follow from all else
+    "shape": 1e-3, "tilt": 10.0, "radii": 0.01, "baseline": 0.05, "plane": 10.0,
+    "frame_rotation": 10.0, "frame_translation": 10.0,
 }  # fmt: skip
 OTHER_SIGMA = 0.1  # of IMU intrinsics
 

@@ -12,6 +12,7 @@ import yaml
 
 from icalib.calibration import Calibration, CornerResiduals
 from icalib.errors import CalibrationError
+from icalib.export.common import inverse
 from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.cameras.convert import fit_model
@@ -36,8 +37,7 @@ def camchain(calibration: Calibration) -> str:
     """Text of camchain-imucam.yaml, or of camchain.yaml without an IMU. Cameras are renamed cam0, cam1, ... in the
     rig's order, as Kalibr wants them."""
     c = calibration
-    seen = {r.sensor: r for r in c.corner_residuals}
-    overlaps = _overlaps([seen[name] for name in c.cameras])
+    overlaps = cam_overlaps(c)
     data = {f"cam{i}": _camera(c, i, overlaps) for i in range(len(c.cameras))}
     comment = "# Kalibr's camchain by icalib. "
     if c.imu is None:
@@ -79,7 +79,7 @@ def imu_yaml(calibration: Calibration) -> str:
 
 def _camera(c: Calibration, index: int, overlaps: np.ndarray) -> dict[str, Any]:
     name = c.cameras[index]
-    T_cam_imu = _inverse(c.T_imu_sensor(name))
+    T_cam_imu = inverse(c.T_imu_sensor(name))
     data: dict[str, Any] = {} if c.imu is None else {"T_cam_imu": T_cam_imu.tolist()}
     if index > 0:
         data["T_cn_cnm1"] = (T_cam_imu @ c.T_imu_sensor(c.cameras[index - 1])).tolist()
@@ -134,31 +134,26 @@ def _intrinsics(c: Calibration) -> dict[str, Any]:
     C = so3.exp(x[12:15])
     return {
         "model": "scale-misalignment",
-        "accelerometers": {"M": _lower(x[:6]).tolist()},
+        "accelerometers": {"M": lower(x[:6]).tolist()},
         "gyroscopes": {
-            "M": _lower(x[6:12]).tolist(),
+            "M": lower(x[6:12]).tolist(),
             "A": (x[15:].reshape(3, 3) @ C.T).tolist(),
             "C_gyro_i": C.tolist(),
         },
     }
 
 
-def _lower(x: np.ndarray) -> np.ndarray:
+def lower(x: np.ndarray) -> np.ndarray:
     """(3, 3) identity plus a lower triangle given row by row."""
     M = np.eye(3)
     M[np.tril_indices(3)] += x
     return M
 
 
-def _inverse(T: np.ndarray) -> np.ndarray:
-    inverse = np.eye(4)
-    inverse[:3, :3] = T[:3, :3].T
-    inverse[:3, 3] = -T[:3, :3].T @ T[:3, 3]
-    return inverse
-
-
-def _overlaps(streams: list[CornerResiduals]) -> np.ndarray:
+def cam_overlaps(c: Calibration) -> np.ndarray:
     """(n, n) bool: two cameras saw the same point of the target at the same instant."""
+    seen = {r.sensor: r for r in c.corner_residuals}
+    streams = [seen[name] for name in c.cameras]
     n = len(streams)
     overlaps = np.zeros((n, n), dtype=bool)
     for i in range(n):

@@ -11,6 +11,7 @@ from icalib.first_guess.clocks import (
     CameraRates,
     align,
     as_given,
+    better_given,
     check_axes,
     contradicts,
     turns_about_two_axes,
@@ -34,17 +35,21 @@ def align_camera(
     try:
         found = align(imu, camera.name, rates, None if held is None else relative_offset(held, stream, measurements))
         if rotation is None:
-            check_axes(rates, camera.name)
+            check_axes(imu, rates, found, camera.name)
     except EstimationError:
         if given is None:
             raise
         at = relative_offset(given, stream, measurements)
         if rotation is None:
             found = align(imu, camera.name, rates, at)
-            check_axes(rates, camera.name)
+            check_axes(imu, rates, found, camera.name)
         else:
             found = as_given(imu, camera.name, rates, at, rotation)
             if contradicts(imu, rates, found):
                 raise
-    keep_guess = trusted(camera.rotation) is None and turns_about_two_axes(rates)
-    return found if rotation is None or keep_guess else as_given(imu, camera.name, rates, found.offset, rotation)
+    if rotation is None or (trusted(camera.rotation) is None and turns_about_two_axes(imu, rates, found)):
+        return found
+    own = as_given(imu, camera.name, rates, found.offset, rotation)
+    if given is None or held is not None:
+        return own
+    return better_given(imu, camera.name, rates, own, relative_offset(given, stream, measurements))

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation.imu_data import ImuData
-from icalib.first_guess.correlation import best_shift
+from icalib.first_guess.correlation import Shift, best_shift
 from icalib.first_guess.target_poses import TargetPoses
 from icalib.geometry import so3
 from icalib.measurements import CornerStream
@@ -17,9 +17,11 @@ GRID_HZ = 100.0
 LONGEST_STEP_S = 0.25  # images further apart do not give an angular rate
 SHORTEST_OVERLAP_S = 4.0
 LEAST_CORRELATION = 0.7
-LARGEST_UNEXPLAINED = 0.6  # of the angular rate, at an offset that was given
+LARGEST_UNEXPLAINED = 0.35  # of the angular rate
 CLOCKS_AGREE_S = 0.01  # of the time offsets that two recordings show
 CLEARLY_BETTER = 0.5  # of what another offset leaves unexplained
+AVERAGED_S = 0.25  # over which the two are compared
+LEAST_ALIKE = 0.3  # share of the camera's rate that goes with the IMU's, below which their ratio says nothing
 STILL_RAD_S = 0.03
 _SAME_RECORDING = "check that both come from the same recording, overlap in time, and are in rad/s"
 LEAST_SECOND_AXIS = 0.05  # of the spread of rates about the first
@@ -75,9 +77,13 @@ def align(imu: ImuData, name: str, rates: CameraRates, given_offset: float | Non
     offset = _correlate(imu, name, rates) if given_offset is None else given_offset
     if not _covered(imu, rates, offset).any():
         raise _no_overlap(imu, name)
-    found = _refine(imu, rates, offset, given_offset is not None)
+    rough = _rough(imu, rates, offset)
+    _check_degrees(imu, name, rates, offset)
+    scale = _scale(imu, rates, rough)
+    alike = rates if 0.8 < scale < 1.25 else replace(rates, rate=scale * rates.rate)
+    found = _refine(imu, alike, rough, given_offset is not None)
+    _check_offset(imu, name, alike, found, given_offset is not None)
     _check_scale(imu, name, rates, found)
-    _check_offset(imu, name, rates, found, given_offset is not None)
     return found
 
 
@@ -104,11 +110,26 @@ def _check_offset(imu: ImuData, name: str, rates: CameraRates, found: Alignment,
 
 def _unexplained(imu: ImuData, rates: CameraRates, found: Alignment) -> float:
     """Share of the angular rate that the camera did not see."""
-    inside = _covered(imu, rates, found.offset)
-    seen = rates.rate[inside] @ found.rotation.T
-    middle = (0.5 * (rates.start + rates.end) + found.offset)[inside]
-    gyro = np.stack([np.interp(middle, imu.seconds, imu.gyro[:, k]) for k in range(3)], axis=1) - found.gyro_bias
+    gyro, seen = _side_by_side(imu, rates, found.offset)
+    gyro, seen = gyro - found.gyro_bias, seen @ found.rotation.T
     return float(np.median(np.linalg.norm(gyro - seen, axis=1)) / np.median(np.linalg.norm(gyro, axis=1)))
+
+
+def _side_by_side(imu: ImuData, rates: CameraRates, offset: float) -> tuple[np.ndarray, np.ndarray]:
+    """(n, 3) each, rad/s in own axes: what the gyroscope and the camera have, both as means over some images: a rate
+    between neighbours has little but noise where the target is far or the motion slow."""
+    inside = _covered(imu, rates, offset)
+    start, end = rates.start[inside], rates.end[inside]
+    angle = _integral(imu)
+    gyro = (_at(imu, angle, end + offset) - _at(imu, angle, start + offset)) / (end - start)[:, None]
+    count = min(max(1, round(AVERAGED_S / float(np.median(end - start)))), len(start))
+    return _means(gyro, count), _means(rates.rate[inside], count)
+
+
+def _means(values: np.ndarray, count: int) -> np.ndarray:
+    """(n - count + 1, 3) means over `count` neighbours of (n, 3)."""
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(values, axis=0)])
+    return (total[count:] - total[:-count]) / count
 
 
 def better_offset(imu: ImuData, name: str, rates: CameraRates, expected: float) -> float | None:
@@ -121,7 +142,7 @@ def better_offset(imu: ImuData, name: str, rates: CameraRates, expected: float) 
         return None
     if not _covered(imu, rates, expected).any():
         return own.offset
-    there = _unexplained(imu, rates, _refine(imu, rates, expected, True))
+    there = _unexplained(imu, rates, _rough(imu, rates, expected))
     return own.offset if _unexplained(imu, rates, own) < CLEARLY_BETTER * there else None
 
 
@@ -141,26 +162,21 @@ def _check_motion(imu: ImuData, name: str, rates: CameraRates) -> None:
         )
 
 
-def _grid(t: np.ndarray, x: np.ndarray, covered: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray]:
-    """x on a regular grid from 0 to `length`, and a mask of where it is known."""
-    grid = np.arange(int(length * GRID_HZ) + 1) / GRID_HZ
-    mask = np.interp(grid, t, covered.astype(float)) > 0.99
-    return np.interp(grid, t, x), mask
+def _grid(t: np.ndarray, rate: np.ndarray, covered: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Size of rates (n, 3) on a regular grid from 0 to the last of `t`, each a mean over `count` points of the grid,
+    and a mask of where all of these are known."""
+    grid = np.arange(int(t[-1] * GRID_HZ) + 1) / GRID_HZ
+    count = min(count, len(grid))
+    known = np.interp(grid, t, covered.astype(float)) > 0.99
+    fine = np.stack([np.interp(grid, t, rate[:, k]) for k in range(3)], axis=1)
+    return np.linalg.norm(_means(fine, count), axis=1), _means(np.tile(known[:, None], 3), count)[:, 0] > 0.99
 
 
 def _correlate(imu: ImuData, name: str, rates: CameraRates) -> float:
-    """Offset [s] at the peak of the masked, normalised cross-correlation of |w| over all shifts."""
-    bias = np.median(imu.gyro, axis=0)
-    a, mask_a = _grid(
-        imu.seconds, np.linalg.norm(imu.gyro - bias, axis=1), np.ones(len(imu.seconds), bool), imu.seconds[-1]
-    )  # fmt: skip
-    grid = np.arange(len(a)) / GRID_HZ
-    for start, end in imu.gaps:
-        mask_a &= (grid <= start) | (grid >= end)
-    middle = 0.5 * (rates.start + rates.end)
-    near = np.diff(middle, append=middle[-1]) < LONGEST_STEP_S
-    b, mask_b = _grid(middle, np.linalg.norm(rates.rate, axis=1), near, middle[-1])
-    found = best_shift(a, mask_a, b, mask_b, SHORTEST_OVERLAP_S * GRID_HZ)
+    """Offset [s] at the peak of the masked, normalised cross-correlation of |w| over all shifts, of rates as they are
+    or of their means, whichever is higher: fast motion shows in the ones, slow motion in the others."""
+    shown = [_shift(imu, rates, count) for count in (1, round(AVERAGED_S * GRID_HZ))]
+    found = max(shown, key=lambda s: s.correlation if np.isfinite(s.correlation) else -1.0)
     if not found.correlation > rates.least_correlation:
         raise EstimationError(
             f"the motion of {name} does not match that of {imu.name} at any shift of their clocks (best correlation "
@@ -168,6 +184,16 @@ def _correlate(imu: ImuData, name: str, rates: CameraRates) -> float:
             f"and are in rad/s."
         )
     return found.samples / GRID_HZ
+
+
+def _shift(imu: ImuData, rates: CameraRates, count: int) -> Shift:
+    """Of the camera's grid against the IMU's; means over `count` points of them."""
+    known = ~np.isin(imu.seconds, [start for start, _ in imu.gaps])
+    a, mask_a = _grid(imu.seconds, imu.gyro - np.median(imu.gyro, axis=0), known, count)
+    middle = 0.5 * (rates.start + rates.end)
+    near = np.diff(middle, append=middle[-1]) < LONGEST_STEP_S
+    b, mask_b = _grid(middle, rates.rate, near, count)
+    return best_shift(a, mask_a, b, mask_b, SHORTEST_OVERLAP_S * GRID_HZ)
 
 
 def _kabsch(w_imu: np.ndarray, w_cam: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -180,27 +206,40 @@ def _kabsch(w_imu: np.ndarray, w_cam: np.ndarray, weight: np.ndarray) -> tuple[n
     return R, mi - R @ mc
 
 
-def _refine(imu: ImuData, rates: CameraRates, offset: float, keep_offset: bool) -> Alignment:
-    """Gauss-Newton on the offset, Kabsch on rotation and bias in turn; rates are means over each image interval."""
+def _rough(imu: ImuData, rates: CameraRates, offset: float) -> Alignment:
+    """At this offset, from means over some images: a pose that flips to its mirror image and back cancels in them."""
+    gyro, seen = _side_by_side(imu, rates, offset)
+    return Alignment(offset, *_kabsch(gyro, seen, np.ones(len(gyro))))
+
+
+def _integral(imu: ImuData) -> np.ndarray:
+    """(N, 3) of the angular rate from the first reading to each, rad."""
     angle = np.zeros((len(imu.seconds), 3))
     angle[1:] = np.cumsum(0.5 * (imu.gyro[1:] + imu.gyro[:-1]) * np.diff(imu.seconds)[:, None], axis=0)
+    return angle
 
-    def at(x: np.ndarray, t: np.ndarray) -> np.ndarray:
-        return np.stack([np.interp(t, imu.seconds, x[:, k]) for k in range(3)], axis=1)
 
-    R, bias, residual = np.eye(3), np.zeros(3), np.zeros_like(rates.rate)
+def _at(imu: ImuData, values: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """(n, 3) of what is known at each reading, at other times."""
+    return np.stack([np.interp(seconds, imu.seconds, values[:, k]) for k in range(3)], axis=1)
+
+
+def _refine(imu: ImuData, rates: CameraRates, rough: Alignment, keep_offset: bool) -> Alignment:
+    """Gauss-Newton on the offset, Kabsch on rotation and bias in turn; rates are means over each image interval."""
+    angle = _integral(imu)
+    offset, R, bias, residual = rough.offset, rough.rotation, rough.gyro_bias, np.zeros_like(rates.rate)
     for _ in range(ROUNDS):
         start, end = rates.start + offset, rates.end + offset
         inside = _covered(imu, rates, offset).astype(float)
         span = (end - start)[:, None]
-        mean = (at(angle, end) - at(angle, start)) / span
-        slope = (at(imu.gyro, end) - at(imu.gyro, start)) / span
+        mean = (_at(imu, angle, end) - _at(imu, angle, start)) / span
+        slope = (_at(imu, imu.gyro, end) - _at(imu, imu.gyro, start)) / span
         weight = inside
         for _ in range(3):
-            R, bias = _kabsch(mean, rates.rate, weight)
             residual = mean - rates.rate @ R.T - bias
             size = np.linalg.norm(residual, axis=1)
             weight = inside * (size < 5.0 * np.median(size[inside > 0.0]) + 1e-9)
+            R, bias = _kabsch(mean, rates.rate, weight)
         if keep_offset:
             break
         step = -float((weight @ (slope * residual)).sum() / (weight @ slope**2).sum())
@@ -210,19 +249,36 @@ def _refine(imu: ImuData, rates: CameraRates, offset: float, keep_offset: bool) 
     return Alignment(offset, R, bias)
 
 
-def turns_about_two_axes(rates: CameraRates) -> bool:
-    """Whether the camera turned about more than one axis; else its rotation about that axis stays open."""
-    _, spread, _ = np.linalg.svd(rates.rate - rates.rate.mean(axis=0), full_matrices=False)
-    return bool(spread[1] >= LEAST_SECOND_AXIS * spread[0])
+def turns_about_two_axes(imu: ImuData, rates: CameraRates, found: Alignment) -> bool:
+    """Whether the camera turned about more than one axis, and the IMU with it: of a target far away a camera alone
+    sees turns that are noise. Else its rotation about that axis stays open."""
+    middle = (0.5 * (rates.start + rates.end) + found.offset)[_covered(imu, rates, found.offset)]
+    gyro = np.stack([np.interp(middle, imu.seconds, imu.gyro[:, k]) for k in range(3)], axis=1)
+    return all(_second_axis(w) >= LEAST_SECOND_AXIS for w in (rates.rate, gyro))
 
 
-def check_axes(rates: CameraRates, name: str) -> None:
+def _second_axis(rate: np.ndarray) -> float:
+    """The spread of rates (n, 3) about their second axis over that about the first."""
+    _, spread, _ = np.linalg.svd(rate - rate.mean(axis=0), full_matrices=False)
+    return float(spread[1] / spread[0])
+
+
+def check_axes(imu: ImuData, rates: CameraRates, found: Alignment, name: str) -> None:
     """Raises EstimationError where the camera turned about one axis only."""
-    if not turns_about_two_axes(rates):
+    if not turns_about_two_axes(imu, rates, found):
         raise EstimationError(
             f"{name} turned about one axis only, and its rotation about that axis is not determined; turn the rig "
             "about two more axes, or give rotation in the rig file."
         )
+
+
+def better_given(imu: ImuData, name: str, rates: CameraRates, found: Alignment, offset: float) -> Alignment:
+    """`found`, or what a guess of the `offset` makes of it where the two turn alike there far better: rates about one
+    axis fit the other way round, too."""
+    if not _covered(imu, rates, offset).any():
+        return found
+    other = as_given(imu, name, rates, offset, found.rotation)
+    return other if _unexplained(imu, rates, other) < CLEARLY_BETTER * _unexplained(imu, rates, found) else found
 
 
 def as_given(imu: ImuData, name: str, rates: CameraRates, offset: float, rotation: np.ndarray) -> Alignment:
@@ -251,20 +307,35 @@ def _no_overlap(imu: ImuData, name: str) -> EstimationError:
     )
 
 
+def _check_degrees(imu: ImuData, name: str, rates: CameraRates, offset: float) -> None:
+    """By size alone: readings in degrees match no camera's motion, and must not be blamed for that."""
+    size = [np.linalg.norm(w - np.median(w, axis=0), axis=1) for w in _side_by_side(imu, rates, offset)]
+    ratio = float(np.median(size[0]) / max(np.median(size[1]), 1e-9))
+    if 0.8 < ratio / DEGREES < 1.25:
+        raise EstimationError(
+            f"{imu.name} turns {ratio:.3g} times as fast as {name}: its angular rate looks like deg/s; convert it to "
+            "rad/s."
+        )
+
+
 def _check_scale(imu: ImuData, name: str, rates: CameraRates, found: Alignment) -> None:
-    """The two must turn equally fast: a ratio of 57 is degrees."""
-    inside = _covered(imu, rates, found.offset)
-    middle = (0.5 * (rates.start + rates.end) + found.offset)[inside]
-    gyro = np.stack([np.interp(middle, imu.seconds, imu.gyro[:, k]) for k in range(3)], axis=1)
-    ratio = _median_size(gyro) / max(_median_size(rates.rate[inside]), 1e-9)
-    if 0.8 < ratio < 1.25:
-        return
-    cause = (
-        "its angular rate looks like deg/s; convert it to rad/s" if 0.8 < ratio / DEGREES < 1.25 else "check its units"
-    )
-    raise EstimationError(f"{imu.name} turns {ratio:.3g} times as fast as {name}: {cause}.")
+    """The two must turn equally fast."""
+    ratio = _scale(imu, rates, found)
+    if not 0.8 < ratio < 1.25:
+        raise EstimationError(
+            f"{imu.name} turns {ratio:.3g} times as fast as {name}: check its units, or, where the target is small in "
+            "the images, give the intrinsics in the rig file."
+        )
 
 
-def _median_size(rate: np.ndarray) -> float:
-    """Median length of rates about their own median: a bias has no say."""
-    return float(np.median(np.linalg.norm(rate - np.median(rate, axis=0), axis=1)))
+def _scale(imu: ImuData, rates: CameraRates, found: Alignment) -> float:
+    """How much faster the gyroscope turns than the camera: both about their medians, as a bias has no
+    say, and along the gyroscope's axis, where noise of the camera, which would make it seem slower, has none. Where
+    it does not turn alike at all, none is faster."""
+    gyro, camera = _side_by_side(imu, rates, found.offset)
+    gyro, camera = gyro - np.median(gyro, axis=0), (camera - np.median(camera, axis=0)) @ found.rotation.T
+    size = np.linalg.norm(gyro, axis=1)
+    fast = size > np.median(size)
+    along = np.median(np.einsum("na,na->n", gyro, camera)[fast] / size[fast])
+    alike = along > LEAST_ALIKE * np.median(np.linalg.norm(camera[fast], axis=1))
+    return float(np.median(size[fast]) / along) if alike else 1.0

@@ -53,8 +53,9 @@ def lever_arm(
     Raises EstimationError where too few images can be used.
     """
     ok = poses.ok & (times >= imu.seconds[1]) & (times <= imu.seconds[-2])
-    t, R_bc, p = times[ok], poses.rotation[ok], poses.position[ok]
-    R_bi = R_bc @ R_imu_cam.T
+    t, p = times[ok], poses.position[ok]
+    # The error of one image's rotation goes with that of its position, as if the lever arm reached to the target.
+    R_bi = gyro.smoothed(t, poses.rotation[ok] @ R_imu_cam.T)
     D_f, D_R = _double_integrals(imu, t, R_bi, gyro)
     i, j, k = _triples(t, imu.gaps)
     if len(i) < 10:

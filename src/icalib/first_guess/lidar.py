@@ -24,6 +24,7 @@ from icalib.first_guess.lidar_arm import (
     against_motion,
     against_readings,
     arm_prior,
+    is_mirrored,
     solve,
 )
 from icalib.first_guess.lidar_motion import LONGEST_STEP_S, ImuMotion
@@ -34,6 +35,7 @@ from icalib.measurements import LidarStream
 LEAST_CORRELATION = 0.6  # of turning rates with the IMU's
 G_TOLERANCE = 0.1
 ARM_ROUNDS = 2  # each brings the path nearer to the known motion
+SAME_RAD, SAME_S = 5e-3, 1e-3  # alignments this near turn a scan's points alike, to what the registration allows for
 
 
 @dataclass(frozen=True)
@@ -72,6 +74,7 @@ def lidar_and_motion(
     found = motion_of_path(imu, path, rates, aligned, gravity, held)
     if found is None:
         raise _too_short(stream)
+    _check_axes(stream.name, imu.name, found.mirrored)
     _check_gravity(found.gravity, gravity, imu.name, stream.name)
     return found.guess, found.motion
 
@@ -79,12 +82,13 @@ def lidar_and_motion(
 @dataclass(frozen=True)
 class FromPath:
     """What a path shows: the sensor's guess, the motion of the IMU, how long gravity is [m/s^2], and R_world_map, which
-    brings it down; the origin of the world is the map's."""
+    brings it down; the origin of the world is the map's. mirrored: see `is_mirrored`."""
 
     guess: LidarGuess
     motion: ImuMotion
     gravity: float
     level: np.ndarray
+    mirrored: bool
 
 
 def motion_of_path(
@@ -108,7 +112,8 @@ def motion_of_path(
     level, R_imu = _level(x[6:9]), path.rotation @ R_il.T
     position = (path.position - R_imu @ x[3:6]) @ level.T
     start = ImuMotion(gyro, t, level @ R_imu, position, np.zeros_like(position), aligned.gyro_bias, x[9:12], gravity)
-    return FromPath(LidarGuess(R_il, x[3:6], aligned.offset), start.smoothed(), float(np.linalg.norm(x[6:9])), level)
+    guess, mirrored = LidarGuess(R_il, x[3:6], aligned.offset), is_mirrored(system, R_il, x)
+    return FromPath(guess, start.smoothed(), float(np.linalg.norm(x[6:9])), level, mirrored)
 
 
 def lidar_on_motion(imu: ImuData, stream: LidarStream, known: State, held: Held = Held()) -> LidarGuess:
@@ -122,9 +127,11 @@ def lidar_on_motion(imu: ImuData, stream: LidarStream, known: State, held: Held 
         path = _path_on(stream, known, gyro, guess)
         t = path.seconds + guess.offset
         R, p = poses_in(known, gyro, t)
-        found = solve(against_motion(R, p, t, path.rotation, path.position), prior, guess.rotation, rates.rate)
+        system = against_motion(R, p, t, path.rotation, path.position)
+        found = solve(system, prior, guess.rotation, rates.rate)
         if found is None:
             raise _too_short(stream)
+        _check_axes(stream.name, imu.name, is_mirrored(system, *found))
         guess = LidarGuess(found[0], found[1][3:6], aligned.offset)
     return guess
 
@@ -163,13 +170,20 @@ def poses_in(known: State, gyro: GyroRotation, t: np.ndarray) -> tuple[np.ndarra
 def _aligned(imu: ImuData, stream: LidarStream, held: Held) -> tuple[Alignment, LidarPath, CameraRates]:
     """Time offset, rotation and gyroscope bias; the LiDAR's path by the gyroscope's turns, as far as the IMU was
     running, and its rates."""
-    path = _turned_path(imu, stream, align_path(imu, stream.name, _rates(stream.name, lidar_path(stream)), held))
+    first = align_path(imu, stream.name, _rates(stream.name, lidar_path(stream)), held)
+    path = _turned_path(imu, stream, first)
     rates = _rates(stream.name, path)
     aligned = align_path(imu, stream.name, rates, held)
-    path = _turned_path(imu, stream, aligned)
+    if not _alike(first, aligned):
+        path = _turned_path(imu, stream, aligned)
     t = path.seconds + aligned.offset
     inside = path.ok & (t > imu.seconds[0]) & (t < imu.seconds[-1])
     return aligned, where(path, inside), rates
+
+
+def _alike(a: Alignment, b: Alignment) -> bool:
+    apart = so3.log(np.ascontiguousarray(a.rotation.T @ b.rotation))
+    return float(np.linalg.norm(apart)) < SAME_RAD and abs(a.offset - b.offset) < SAME_S
 
 
 def align_path(imu: ImuData, name: str, rates: CameraRates, held: Held) -> Alignment:
@@ -217,6 +231,14 @@ def _too_short(stream: LidarStream) -> EstimationError:
         f"{stream.name}: too few of its scans fall within the recording of the IMU to find its lever arm; check that "
         "both clocks overlap, or record for longer."
     )
+
+
+def _check_axes(lidar: str, imu: str, mirrored: bool) -> None:
+    if mirrored:
+        raise EstimationError(
+            f"{lidar} turns as {imu} does, but moves the other way: its points are mirrored; one of its axes, or the "
+            "sense in which its azimuth counts, is reversed. Make its axes right-handed."
+        )
 
 
 def _check_gravity(measured: float, expected: float, imu: str, lidar: str) -> None:

@@ -37,13 +37,16 @@ FEWEST_ROWS = 10
 ONE_AXIS = 0.1  # of the spread of rates about the first axis: below, turns about the second are lost in noise
 CANDIDATES = 24  # turns about that axis
 ROUNDS = 5
+MIRRORED = 1.4  # times what was seen is left: 2 without noise, and 1 or less where axes are right-handed
 
 
 class Rows(NamedTuple):
-    """A x = b with A (n, 3, m), b (n, 3); the first six of x are d and p_imu_lidar."""
+    """A x = b with A (n, 3, m), b (n, 3); the first six of x are d and p_imu_lidar. seen (n, 3): what the LiDAR's path
+    has part in b."""
 
     A: np.ndarray
     b: np.ndarray
+    seen: np.ndarray
 
 
 System = Callable[[np.ndarray, np.ndarray], Rows]  # of R_imu_lidar, and p_imu_lidar for the derivative by d
@@ -83,7 +86,8 @@ def against_motion(
         del p_il
         R = R_imu[i] @ R_il
         A = np.concatenate([R @ hat_u, R_imu[j] - R_imu[i]], axis=2)
-        return Rows(A, np.einsum("nij,nj->ni", R, u) - (p_imu[j] - p_imu[i]))
+        way = np.einsum("nij,nj->ni", R, u)
+        return Rows(A, way - (p_imu[j] - p_imu[i]), way)
 
     return rows
 
@@ -119,7 +123,7 @@ def against_readings(
         A[:, :, 3:6] = second(at_scans)
         A[:, :, 6:9] = 0.5 * (h1 + h2)[:, :, None] * np.eye(3)
         A[:, :, 9:] = -second(D[:, 3:12].reshape(-1, 3, 3))
-        return Rows(A, bend - second(D[:, :3]))
+        return Rows(A, bend - second(D[:, :3]), bend)
 
     return rows
 
@@ -141,6 +145,14 @@ def solve(rows: System, prior: Prior, R_il: np.ndarray, rates: np.ndarray) -> tu
         x = _fit(rows(R_il, x[3:6]), prior, 0)[0]
         R_il = R_il @ so3.exp(x[:3].copy())
     return R_il, x
+
+
+def is_mirrored(rows: System, R_il: np.ndarray, x: np.ndarray) -> bool:
+    """Whether the LiDAR moved the other way than the solution x (m,) and `R_il` say. Rates of mirrored axes are those
+    of axes turned by half a turn, and fit; of ways twice their length is left then."""
+    A, b, seen = rows(R_il, x[3:6])
+    left = b - A[:, :, 3:] @ x[3:]
+    return bool(np.median(np.linalg.norm(left, axis=1)) > MIRRORED * np.median(np.linalg.norm(seen, axis=1)))
 
 
 def _misfit(rows: Rows, prior: Prior) -> float:

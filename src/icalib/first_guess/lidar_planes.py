@@ -14,7 +14,8 @@ import numpy as np
 from icalib.detection.planes import MOST_POINTS, FoundPlanes, PlaneSearch, find_planes
 from icalib.errors import EstimationError
 from icalib.estimation.arrowhead import in_parallel
-from icalib.estimation.lidar_binning import Motion, in_world
+from icalib.estimation.lidar_binning import in_world
+from icalib.estimation.lidar_sweep import Motion
 from icalib.estimation.robot import Clouds
 from icalib.estimation.state import Key
 from icalib.measurements import LidarStream

@@ -22,14 +22,24 @@ from icalib.estimation.assembly import (
     with_clouds,
 )
 from icalib.estimation.estimate import first_pass
-from icalib.estimation.lidar_binning import in_world
-from icalib.estimation.robot import FIRST_RANGE_M, MOUNT, Clouds, known_planes
+from icalib.estimation.lidar_binning import Associated, LidarNoise, Moments, take_moments
+from icalib.estimation.lidar_sweep import Motion, sweep
+from icalib.estimation.robot import FIRST_RANGE_M, MOUNT, Clouds, joined_clouds, known_planes
 from icalib.estimation.state import Key, State
 from icalib.first_guess.align_camera import trusted
+from icalib.first_guess.by_recording import (
+    alone,
+    most_points,
+    motion_alone,
+    naming_recording,
+    one_after_another,
+    other_clocks,
+    points_by_recording,
+    with_points,
+)
 from icalib.first_guess.lidar import Held, lidar_and_motion, lidar_on_motion
-from icalib.first_guess.lidar_planes import ROUNDS, associate, round_search
+from icalib.first_guess.lidar_planes import ROUNDS, Association, associate, round_search
 from icalib.geometry.planes import plane_of
-from icalib.measurements import LidarStream
 from icalib.rig import Camera, Lidar, PoseSensor, Wheels
 
 NEAR_NODE_S = 0.15  # a scan of a LiDAR alone goes on so long after its node
@@ -48,17 +58,34 @@ def given(inputs: Inputs, sensor: Camera | Lidar | Wheels | PoseSensor, names: S
 
 
 def state_from_lidar(inputs: Inputs) -> State:
-    """Where the solver starts where no camera shows the motion: the first LiDAR and the IMU do.
+    """Where the solver starts where no camera shows the motion: the first LiDAR and the IMU do. Of several recordings
+    the one with most points says how the LiDAR stands.
 
     Raises EstimationError where they do not.
     """
+    recordings = [alone(inputs, k) for k in range(len(inputs.parts))]
+    best, name = most_points(inputs, 0), inputs.rig.lidars[0].name
+    with naming_recording(inputs, best):
+        states = {best: _state_of_one(recordings[best])}
+    values, offset = dict(states[best].values), float(states[best].values[name, "time_offset"][0])
+    for k, own in enumerate(recordings):
+        if k != best:
+            there = other_clocks(offset, name, recordings[best], own)
+            with naming_recording(inputs, k):
+                states[k] = _state_of_one(own, Held(values[name, "rotation"], values[name, "translation"], there))
+    values[name, "time_offset"] = np.array([other_clocks(offset, name, recordings[best], inputs)])
+    return one_after_another(inputs, [states[k] for k in range(len(recordings))], values)
+
+
+def _state_of_one(inputs: Inputs, held: Held | None = None) -> State:
+    """Of one recording; `held`: how the LiDAR stands, where another has shown it."""
     assert inputs.imu is not None
     lidar, stream = inputs.rig.lidars[0], inputs.measurements.lidars[0]
     try:
-        guess, motion = lidar_and_motion(inputs.imu, stream, inputs.rig.gravity, held_of(inputs, lidar))
+        guess, motion = lidar_and_motion(inputs.imu, stream, inputs.rig.gravity, held or held_of(inputs, lidar))
     except EstimationError:
         known = held_of(inputs, lidar, guesses=True)
-        if known.rotation is None or known.offset is None:
+        if held is not None or known.rotation is None or known.offset is None:
             raise
         # The motion shows too little; the rig file's guess stands in.
         guess, motion = lidar_and_motion(inputs.imu, stream, inputs.rig.gravity, known)
@@ -73,16 +100,22 @@ def with_lidars(inputs: Inputs, state: State) -> tuple[Inputs, State]:
     """`inputs` with points of the LiDARs on planes, and `state`, which has the motion and a guess of all, with the
     planes, led on by the rounds. Raises EstimationError where there are no planes."""
     inputs = replace(while_known(inputs, state), guess=state)
-    streams = inputs.measurements.lidars
-    if any((s.plane >= 0).any() for s in streams):
-        clouds = known_planes(streams)
+    recordings = points_by_recording(inputs)
+    if any((s.plane >= 0).any() for streams in recordings for s in streams):
+        clouds = joined_clouds([known_planes(streams) for streams in recordings])
         return with_clouds(inputs, clouds), replace(state, values=state.values | fitted_planes(inputs, state, clouds))
-    before = None
+    before: list[Association | None] = [None] * len(recordings)
     noise = max(x.range_noise_m or FIRST_RANGE_M for x in inputs.rig.lidars)
     for k in range(ROUNDS):
-        before = associate(streams, motion_of(inputs, state), round_search(k, noise), before)
-        inputs = with_clouds(inputs, before.clouds)
-        state = replace(state, values=_without_planes(state) | before.values)
+        found = []
+        for r, streams in enumerate(recordings):
+            with naming_recording(inputs, r):
+                found.append(associate(streams, motion_of(inputs, state), round_search(k, noise), before[r]))
+        before = found
+        clouds = joined_clouds([a.clouds for a in found])
+        planes = np.concatenate([a.planes for a in found])
+        inputs = with_clouds(inputs, clouds)
+        state = replace(state, values=_without_planes(state) | dict(zip(clouds.keys, planes, strict=True)))
         if k < ROUNDS - 1:
             state = first_pass(inputs, state)
     return inputs, state
@@ -93,15 +126,14 @@ def _without_planes(state: State) -> dict[Key, np.ndarray]:
 
 
 def while_known(inputs: Inputs, state: State) -> Inputs:
-    """`inputs` without points of scans that lie beyond the nodes of `state`: carried there by the IMU alone, they would
-    count as if its readings had no noise. Raises EstimationError where none is left."""
+    """`inputs` without points that are nowhere, and without scans beyond the nodes of `state`: carried there by the IMU
+    alone, their points would count as if its readings had no noise. Raises EstimationError where no scan is left."""
     measured, lidars, notes = inputs.measurements, [], list(inputs.measurements.notes)
     for stream in measured.lidars:
         begin = stream.seconds + state.values[stream.name, "time_offset"][0]
-        scan = np.repeat(np.arange(len(begin)), np.diff(stream.start))
-        last = np.zeros(len(begin))
-        np.maximum.at(last, scan, stream.offset_s)
-        known = _near(state.seconds, begin) & _near(state.seconds, begin + last)
+        last, some = np.zeros(len(begin)), np.diff(stream.start) > 0
+        last[some] = np.maximum.reduceat(stream.offset_s, stream.start[:-1][some]) if some.any() else 0.0
+        known = near_nodes(state.seconds, begin) & near_nodes(state.seconds, begin + last)
         if not known.any():
             raise EstimationError(
                 f"{stream.name}: none of its scans falls within the recording of the other sensors; check that the "
@@ -112,25 +144,16 @@ def while_known(inputs: Inputs, state: State) -> Inputs:
                 f"{np.count_nonzero(~known)} of {len(known)} scans of {stream.name} are left out: nothing else shows "
                 "the motion then."
             )
-        lidars.append(_points_of(stream, known[scan], scan))
+        size2 = np.einsum("na,na->n", stream.xyz, stream.xyz)
+        usable = np.isfinite(size2) & (size2 > 0.0)
+        lidars.append(with_points(stream, np.repeat(known, np.diff(stream.start)) & usable))
     return replace(inputs, measurements=replace(measured, lidars=tuple(lidars), notes=tuple(notes)))
 
 
-def _near(nodes: np.ndarray, times: np.ndarray) -> np.ndarray:
+def near_nodes(nodes: np.ndarray, times: np.ndarray) -> np.ndarray:
     """(n,) whether there is a node near each of the times (n,)."""
     k = np.clip(np.searchsorted(nodes, times), 1, len(nodes) - 1)
     return np.minimum(np.abs(times - nodes[k - 1]), np.abs(times - nodes[k])) < NEAR_NODE_S
-
-
-def _points_of(stream: LidarStream, kept: np.ndarray, scan: np.ndarray) -> LidarStream:
-    """The stream with the points in `kept` (N,) of `scan` (N,); its scans stay, if empty."""
-    if kept.all():
-        return stream
-    count = np.bincount(scan[kept], minlength=len(stream.stamps_ns))
-    start = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
-    return LidarStream(
-        stream.name, stream.stamps_ns, start, stream.offset_s[kept], stream.xyz[kept], stream.plane[kept]
-    )
 
 
 def lidar_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
@@ -138,12 +161,16 @@ def lidar_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
 
     Raises EstimationError where neither does.
     """
-    assert inputs.imu is not None
     out: dict[Key, np.ndarray] = {}
-    for lidar, stream in zip(inputs.rig.lidars, inputs.measurements.lidars, strict=True):
+    for i, lidar in enumerate(inputs.rig.lidars):
         known = given(inputs, lidar, NAMES)
         if len(known) < len(NAMES) and (lidar.name, "rotation") not in state.values:
-            found = lidar_on_motion(inputs.imu, stream, state, held_of(inputs, lidar))
+            k = most_points(inputs, i)
+            own, motion = alone(inputs, k), motion_alone(inputs, k, state)
+            assert own.imu is not None
+            with naming_recording(inputs, k):
+                found = lidar_on_motion(own.imu, own.measurements.lidars[i], motion, held_of(own, lidar))
+            found = replace(found, offset=other_clocks(found.offset, lidar.name, own, inputs))
             known = found.values(lidar.name) | known
         out |= known
     return out
@@ -164,14 +191,23 @@ def fitted_planes(inputs: Inputs, state: State, clouds: Clouds) -> dict[Key, np.
     """Values of the planes that fit the points best where `state` puts them."""
     motion, sums = motion_of(inputs, state), np.zeros((clouds.count, 4, 4))
     for stream, plane in zip(inputs.measurements.lidars, clouds.plane, strict=True):
-        own, (points, _) = plane[plane >= 0], in_world(motion, stream)
-        columns = [np.ones(len(own)), *points[plane >= 0].T.astype(np.float64)]
-        for i in range(4):
-            for j in range(i + 1):
-                sums[:, i, j] += np.bincount(own, columns[i] * columns[j], clouds.count)
+        if (plane >= 0).any():
+            moments = take_moments(Associated(stream, plane, np.zeros((clouds.count, 6))), motion, LidarNoise(1.0))
+            _add_in_world(moments, motion, stream.name, sums)
     out = {}
     for key, M in zip(clouds.keys, sums, strict=True):
         centre = M[1:, 0] / M[0, 0]
-        spread = np.tril(M[1:, 1:]) / M[0, 0] - np.outer(centre, centre)
-        out[key] = plane_of(np.linalg.eigh(spread, UPLO="L")[1][:, 0], centre)
+        spread = M[1:, 1:] / M[0, 0] - np.outer(centre, centre)
+        out[key] = plane_of(np.linalg.eigh(spread)[1][:, 0], centre)
     return out
+
+
+def _add_in_world(moments: Moments, motion: Motion, name: str, sums: np.ndarray) -> None:
+    """Adds to sums (P, 4, 4) those of (1, x) (1, x)^T over the points x of each plane, in the world."""
+    at = sweep(motion, name, moments.seconds + motion.state.values[name, "time_offset"][0])
+    bin_of = np.repeat(np.arange(len(moments.seconds)), np.diff(moments.start))
+    L, A = np.zeros((len(bin_of), 4, 4)), np.zeros((len(bin_of), 4, 4))
+    L[:, *np.tril_indices(4)] = moments.root
+    A[:, 0, 0], A[:, 1:, 0], A[:, 1:, 1:] = 1.0, at.position[bin_of], at.rotation[bin_of]
+    X = A @ L
+    np.add.at(sums, moments.plane, X @ X.transpose(0, 2, 1))

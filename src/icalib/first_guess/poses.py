@@ -39,7 +39,6 @@ from icalib.rig import PoseSensor
 
 WINDOW_S = 0.1  # of a mean rate: long against the noise of poses
 FEWEST_WINDOWS = 20
-STEADY_S = 0.5
 G_OTHER_UNITS = 0.5  # of gravity: positions do not make it so wrong
 NAMES = tuple(name for name, _, _ in MOUNT)
 
@@ -113,7 +112,9 @@ def _aligned(imu: ImuData, stream: PoseStream, held: Held) -> tuple[Alignment, C
 def _with_motion(imu: ImuData, stream: PoseStream, gravity: float, held: Held) -> FromPath:
     aligned, rates = _aligned(imu, stream, held)
     path, t = _path(stream), stream.seconds + aligned.offset
-    path = _steadied(imu, where(path, (t > imu.seconds[0]) & (t < imu.seconds[-1])), aligned)
+    path = where(path, (t > imu.seconds[0]) & (t < imu.seconds[-1]))
+    gyro, R_is = GyroRotation.integrate(imu, aligned.gyro_bias), aligned.rotation
+    path = replace(path, rotation=gyro.smoothed(path.seconds + aligned.offset, path.rotation @ R_is.T) @ R_is)
     found = motion_of_path(imu, path, rates, aligned, gravity, held)
     if found is None:
         raise _too_short(stream)
@@ -127,19 +128,6 @@ def _with_motion(imu: ImuData, stream: PoseStream, gravity: float, held: Held) -
             "in metres."
         )
     return found
-
-
-def _steadied(imu: ImuData, path: LidarPath, aligned: Alignment) -> LidarPath:
-    """The path with rotations that follow the gyroscope within STEADY_S: where they are unknowns' coefficients, their
-    noise would pull the lever arm to zero."""
-    t = path.seconds + aligned.offset
-    turned = GyroRotation.integrate(imu, aligned.gyro_bias).at(t) @ aligned.rotation
-    total = np.cumsum(path.rotation @ turned.transpose(0, 2, 1), axis=0)
-    total = np.concatenate([np.zeros((1, 3, 3)), total])
-    first, last = np.searchsorted(t, t - 0.5 * STEADY_S), np.searchsorted(t, t + 0.5 * STEADY_S)
-    U, _, Vt = np.linalg.svd(total[last] - total[first])
-    U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
-    return replace(path, rotation=U @ Vt @ turned)
 
 
 def _check_size(imu: ImuData, name: str, path: LidarPath, aligned: Alignment, found: FromPath) -> None:

@@ -8,12 +8,12 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation.assembly import Inputs, motion_of
-from icalib.estimation.lidar_binning import Motion
+from icalib.estimation.lidar_sweep import Motion
 from icalib.estimation.poses import assign_nodes, poses_at
 from icalib.estimation.robot import DRIVE, MOUNT, wheel_angles
 from icalib.estimation.state import Key, State
 from icalib.first_guess.from_tracks import lens_start
-from icalib.first_guess.lidar_rounds import given, lidar_values, with_lidars
+from icalib.first_guess.lidar_rounds import given, lidar_values, near_nodes, with_lidars
 from icalib.first_guess.poses import pose_values
 from icalib.first_guess.wheel_poses import mount_guess, poses_offset
 from icalib.first_guess.wheels import drive_guess, wheel_offset, wheel_rates
@@ -107,6 +107,7 @@ def _means(
     state = motion.state
     start, end = start + offset, end + offset
     inside = (start >= state.seconds[0]) & (end <= state.seconds[-1])
+    inside &= near_nodes(state.seconds, start) & near_nodes(state.seconds, end)
     if not inside.any():
         raise EstimationError(
             "no reading of the wheels falls within the recording of the other sensors; check their clocks, or "

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from icalib.errors import EstimationError
 from icalib.estimation.assembly import Inputs, host_times, inputs_for, nodes_for, resample, start_values, with_clouds
 from icalib.estimation.board import board_in
 from icalib.estimation.estimate import first_pass
@@ -36,6 +37,11 @@ def start(
     if rig.lidars and not rig.has_target and cameras is not None:
         return _start_from_lidar(whole, recordings, cameras, lap)
     if not rig.cameras and not rig.lidars:
+        if not rig.poses:
+            raise EstimationError(
+                f"{' and '.join(w.name for w in rig.wheels)} and {rig.body} do not show the motion; add a camera, a "
+                "LiDAR or a pose sensor to the rig file."
+            )
         return _start_from_poses(whole, recordings, lap)
     bare = whole
     if rig.wheels or rig.lidars or rig.poses:

@@ -25,6 +25,8 @@ LEAST_WINDOWS = 20
 LONGEST_STEP_S = 0.25  # stamps further apart do not give a rate
 LEAST_TURN_RAD_S = 0.03  # RMS
 LEAST_SPEED_M_S = 0.05
+STILL_SHARE = 0.02  # of the other wheel's rate
+RADII_M = (0.005, 5.0)
 LEAST_SHARE = 0.02  # of speed and turning that does not go with the other
 ROUNDS = 8
 
@@ -63,7 +65,20 @@ def wheel_rates(name: str, seconds: np.ndarray, angles: np.ndarray) -> WheelRate
             "its stamps, or record for longer."
         )
     span = seconds[b] - seconds[a]
-    return WheelRates(seconds[a], seconds[b], (angles[b] - angles[a]) / span[:, None])
+    rate = (angles[b] - angles[a]) / span[:, None]
+    _check_turning(name, rate)
+    return WheelRates(seconds[a], seconds[b], rate)
+
+
+def _check_turning(name: str, rate: np.ndarray) -> None:
+    """Raises EstimationError where a wheel, or both, do not turn."""
+    size = np.sqrt((rate**2).mean(axis=0))
+    still = [which for which, own in zip(("left", "right"), size, strict=True) if own <= STILL_SHARE * size.max()]
+    if still:
+        raise EstimationError(
+            f"{name}: by its readings the {' and the '.join(still)} wheel did not turn; check the encoder, its column "
+            "or joint, and that the vehicle drove."
+        )
 
 
 def wheel_offset(imu: ImuData, up: np.ndarray, name: str, rates: WheelRates) -> float:
@@ -111,6 +126,11 @@ def drive_guess(
         e1, e2, l1, left, right = -e1, -e2, -l1, left * [-1.0, 1.0], right * [-1.0, 1.0]
     _check_drive(name, w, u @ e1, left, right)
     radii = np.array([1.0 / left[0], 1.0 / right[0]])
+    if radii.min() < RADII_M[0] or radii.max() > RADII_M[1]:
+        raise EstimationError(
+            f"{name}: its wheels would have radii of {radii[0]:.3g} and {radii[1]:.3g} m; check that it measures "
+            "radians (not degrees or turns) per second, or its counts_per_turn."
+        )
     arm_left, arm_right = left[1] * radii[0], right[1] * radii[1]
     baseline = float(arm_right - arm_left)
     if baseline < 0.0:

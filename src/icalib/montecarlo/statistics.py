@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-
-from icalib.extras import load_chi2
+from scipy.special import gammaincinv
 
 PROBABILITY = 0.95
 LEAST_VARIANCE = 1e-13  # of a scaled covariance: rounding
@@ -54,7 +53,7 @@ def nees(samples: list[Sample], probability: float = PROBABILITY) -> Nees:
     honest covariance lies within the bounds."""
     each = np.array([_squared(s.error, s.covariance) for s in samples])
     dof = sum(len(s.error) for s in samples)
-    low, high = load_chi2().ppf([0.5 - 0.5 * probability, 0.5 + 0.5 * probability], dof) / dof
+    low, high = gammaincinv(dof / 2, [0.5 - 0.5 * probability, 0.5 + 0.5 * probability]) / (dof / 2)
     per_dof = each / [len(s.error) for s in samples]
     worst = int(np.argmax(per_dof))
     return Nees(float(each.sum()) / dof, float(low), float(high), samples[worst].seed, float(per_dof[worst]))

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.calibration import Calibration, CornerResiduals
+from icalib.calibration import Calibration, CornerResiduals, LidarResiduals, WheelResiduals
 from icalib.montecarlo.record import Whiteness
 
+SAME_WALL_S = 0.3  # between two points of a plane that are neighbours in time
 IMU_ROWS = ("rotation", "velocity", "position", "gyroscope walk", "accelerometer walk")  # three columns each
 
 
@@ -17,7 +18,23 @@ def whiteness(result: Calibration) -> tuple[Whiteness, ...]:
         for k, kind in enumerate(IMU_ROWS):
             rows = result.imu_residuals.whitened[:, 3 * k : 3 * k + 3]
             found.append(_statistics(result.imu, kind, rows, rows[:-1], rows[1:]))
+    found += [_of_points(r) for r in result.lidar_residuals]
+    found += [w for r in result.wheel_residuals for w in _of_wheels(r)]
     return tuple(found)
+
+
+def _of_points(r: LidarResiduals) -> Whiteness:
+    """A point's next one is on the same plane, and soon after."""
+    order = np.lexsort((r.seconds, r.plane))
+    whitened = (r.residual[order] / r.sigma[order])[:, None]
+    follows = (np.diff(r.plane[order]) == 0) & (np.diff(r.seconds[order]) < SAME_WALL_S)
+    return _statistics(r.sensor, "points", whitened, whitened[:-1][follows], whitened[1:][follows])
+
+
+def _of_wheels(r: WheelResiduals) -> list[Whiteness]:
+    """Each row of every stretch against that of the next stretch."""
+    columns = np.split(r.whitened, r.whitened.shape[1], axis=1)
+    return [_statistics(r.sensor, name, x, x[:-1], x[1:]) for name, x in zip(r.labels, columns, strict=True)]
 
 
 def _of_corners(r: CornerResiduals) -> Whiteness:

@@ -81,7 +81,7 @@ def _frustum(c: Calibration, name: str, depth: float) -> np.ndarray:
 def correlation(c: Calibration) -> Figure:
     """Correlation coefficients of all estimated parameters but planes, formal covariance."""
     planes = {p.name for p in c.planes}
-    own = [i for i, name in enumerate(c.covariance_names) if name.split(".")[0] not in planes]
+    own = [i for i, name in enumerate(c.covariance_names) if name.rsplit(".", 2)[0] not in planes]
     covariance = c.covariance[np.ix_(own, own)]
     std = np.sqrt(np.diag(covariance))
     scale = np.where(std > 0.0, std, 1.0)

@@ -1,0 +1,165 @@
+"""From a recording of an IMU at rest to its noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from icalib.allan.deviation import Deviation, allan_deviation
+from icalib.allan.fit import NoiseFit, bands_of, fit_noise, pooled
+from icalib.allan.sampling import still_readings
+from icalib.errors import RecordingError
+from icalib.imu_classes import DEFAULT_CLASS, class_noise
+from icalib.measurements import ImuStream
+from icalib.recordings import Recording, TopicInfo, open_recording
+from icalib.recordings.imu_checks import checked_imu
+from icalib.recordings.topics import find_topic, listing
+from icalib.rig import ImuSensor
+
+AXES = ("x", "y", "z")
+_WALK_KNOWN = 1.0  # of NoiseFit.lacking
+_WORSE = 1.5  # times the mean density
+_MISFIT = 0.15
+_SAMPLE = 200_000  # readings in which the steps of rounding are looked for
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """Noise of the gyroscope (unit rad/s) or the accelerometer (m/s^2). together: what all three axes are taken for.
+
+    instability (3,) in `unit`, and the averaging time (3,) [s] where the deviation is lowest; open: where that is the
+    longest or shortest averaging time, so that the instability is only bounded.
+    """
+
+    kind: str
+    unit: str
+    axes: tuple[NoiseFit, ...]
+    together: NoiseFit
+    deviation: Deviation
+    instability: np.ndarray
+    instability_tau: np.ndarray
+    open: tuple[bool, ...]
+
+
+@dataclass(frozen=True)
+class ImuNoiseStudy:
+    """What `study_imu` found. warnings, notes: sentences."""
+
+    name: str
+    where: str
+    seconds: float
+    period: float
+    gyro: SensorNoise
+    accel: SensorNoise
+    warnings: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def sensors(self) -> tuple[SensorNoise, SensorNoise]:
+        return self.gyro, self.accel
+
+
+def study_recording(path: str | Path, imu: str | None = None) -> ImuNoiseStudy:
+    """Of the IMU at `imu` (topic or table) in the recording; by default the only one.
+
+    Raises RecordingError as the readers do, and EstimationError where nothing stood still for 10 s.
+    """
+    recording: Recording = open_recording(path)
+    topic = _imu_topic(str(path), recording.topics(), imu)
+    sensor = ImuSensor(topic.name, topic.name, class_noise(DEFAULT_CLASS), topic=topic.name)
+    stream, notes = checked_imu(recording.imu(sensor), recording.where(sensor))
+    return study_imu(stream, recording.where(sensor), recording.notes() + notes)
+
+
+def study_imu(imu: ImuStream, where: str, notes: tuple[str, ...] = ()) -> ImuNoiseStudy:
+    """Noise densities, bias walks and Allan deviations of `imu`. Raises EstimationError as `still_readings`."""
+    still = still_readings(imu)
+    gyro = _sensor_noise("gyroscope", "rad/s", still.readings[:, :3], still.period)
+    accel = _sensor_noise("accelerometer", "m/s^2", still.readings[:, 3:], still.period)
+    rounding = _rounding(gyro.kind, still.readings[:, :3]) + _rounding(accel.kind, still.readings[:, 3:])
+    warnings = still.warnings + rounding
+    for sensor in (gyro, accel):
+        warnings += _walk_warnings(sensor, still.seconds) + _shape_warnings(sensor)
+    return ImuNoiseStudy(imu.name, where, still.seconds, still.period, gyro, accel, warnings, notes)
+
+
+def _imu_topic(where: str, topics: tuple[TopicInfo, ...], given: str | None) -> TopicInfo:
+    """The topic or table `given`, else the only one of an IMU. Raises RecordingError listing what there is."""
+    if given is not None:
+        topic = find_topic(where, topics, given)
+        if topic.kind != "imu" or not topic.count:
+            raise RecordingError(f"{where}: {given} holds no readings of an IMU; {listing(topics)}; correct --imu.")
+        return topic
+    found = [t for t in topics if t.kind == "imu" and t.count]
+    if not found:
+        raise RecordingError(f"{where} has no readings of an IMU; {listing(topics)}; record one at rest.")
+    if len(found) > 1:
+        raise RecordingError(f"{where} has several IMUs, {', '.join(t.name for t in found)}; give one as --imu.")
+    return found[0]
+
+
+def _sensor_noise(kind: str, unit: str, readings: np.ndarray, period: float) -> SensorNoise:
+    bands = [bands_of(readings[:, k], period) for k in range(3)]
+    deviation = allan_deviation(readings, period)
+    instability, tau = deviation.instability()
+    ends = deviation.tau[[0, -1]]
+    return SensorNoise(
+        kind=kind,
+        unit=unit,
+        axes=tuple(fit_noise(b, period) for b in bands),
+        together=fit_noise(pooled(bands), period),
+        deviation=deviation,
+        instability=instability,
+        instability_tau=tau,
+        open=tuple(bool(t in ends) for t in tau),
+    )
+
+
+def _walk_warnings(sensor: SensorNoise, seconds: float) -> tuple[str, ...]:
+    fit, unit = sensor.together, f"{sensor.unit[:-2]}/s^2" if sensor.unit == "rad/s" else "m/s^3"
+    if fit.lacking <= _WALK_KNOWN:
+        return ()
+    known = f"its standard deviation is {fit.walk_std / fit.walk:.0%}" if fit.resolved else "none is seen"
+    factor = f"{fit.lacking:.2g}" if fit.lacking < 1e6 else "a million"
+    at_least = "" if fit.resolved else "at least "
+    return (
+        f"{seconds:.0f} s are too short for the bias walk of the {sensor.kind}: {known}, and it may be up to "
+        f"{fit.walk_upper:.2g} {unit}/sqrt(Hz); to know it to 20 % record {at_least}{factor} times as long.",
+    )
+
+
+def _shape_warnings(sensor: SensorNoise) -> tuple[str, ...]:
+    found: tuple[str, ...] = ()
+    for axis, fit in zip(AXES, sensor.axes, strict=True):
+        if fit.white > _WORSE * sensor.together.white:
+            ratio = fit.white / sensor.together.white
+            found += (f"the {sensor.kind} {axis} is {ratio:.1f} times as noisy as the axes together.",)
+    if sensor.together.misfit > _MISFIT:
+        found += (
+            f"the {sensor.kind} is not white noise and a random walk alone: its spectrum departs from their sum by "
+            f"{sensor.together.misfit:.0%}, which the standard deviations allow for; look for a slow drift "
+            "(temperature) or vibration in the plot.",
+        )
+    return found
+
+
+def _rounding(kind: str, readings: np.ndarray) -> tuple[str, ...]:
+    """A warning where readings are rounded as coarsely as they are noisy."""
+    part = readings[:_SAMPLE]
+    for axis, values in zip(AXES, part.T, strict=True):
+        levels = np.unique(values)
+        noise = float(np.diff(values).std() / np.sqrt(2.0))
+        step = float(np.median(np.diff(levels))) if len(levels) > 1 else 0.0
+        if step > noise and len(levels) < _levels_of_noise(values, step):
+            return (
+                f"the {kind} {axis} is rounded to {step:.2g}, which is more than its noise from reading to reading; "
+                "its density is that of the rounding: set a narrower range, or read more digits.",
+            )
+    return ()
+
+
+def _levels_of_noise(values: np.ndarray, step: float) -> float:
+    """More levels than the range holds are no rounding."""
+    return float(np.ptp(values) / step) + 2.0

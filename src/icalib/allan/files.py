@@ -1,0 +1,24 @@
+"""The folder that a study of an IMU's noise leaves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from icalib.allan.analysis import ImuNoiseStudy
+from icalib.allan.page import allan_html
+from icalib.allan.words import rig_snippet, study_json
+from icalib.result_files import check_writable
+from icalib.text_files import write_texts
+
+FILES = ("allan.html", "noise.yaml", "allan.json")
+
+
+def check_folder(folder: Path) -> None:
+    """Makes `folder` and tries to write in it, before the work starts. Raises CalibrationError."""
+    check_writable(folder)
+
+
+def write_study(study: ImuNoiseStudy, folder: Path) -> None:
+    """Writes allan.html, noise.yaml (fields of a rig file) and allan.json. Raises CalibrationError."""
+    texts = (allan_html(study), rig_snippet(study), study_json(study))
+    write_texts(folder, dict(zip(FILES, texts, strict=True)))

@@ -1,0 +1,178 @@
+"""White noise and random walk of a bias, by maximum likelihood of the differences of neighbouring readings.
+
+With readings y_i = b_i + w_i, w white with variance N^2 / T and b a random walk with steps of variance K^2 T (T: the
+period), the differences have the covariance K^2 T I + N^2 / T tridiag(-1, 2, -1). The discrete sine transform (type I)
+makes it diagonal, so the likelihood is exact: coefficients z_k are independent, of variance
+
+    s_k = c + a (2 - 2 cos(pi k / (n + 1))),     a = N^2 / T,  c = K^2 T.
+
+Differences only drop the constant bias. Coefficients are averaged in bands; the model is linear in (a, c).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+_PER_OCTAVE = 8
+_HIGHEST = 0.05  # of the rate: above, the sensor's own filter and rounding shape the spectrum
+_LEAST_IN_BAND = 8  # coefficients that make a band's power about Gaussian
+_RESOLVED = 9.0  # twice the gain in log-likelihood by the walk, as 3 sigma
+_UPPER = 2.71  # one-sided 95 %
+_SURE = 5.0  # standard deviations of chi^2, beyond which the model does not fit
+_RATIOS = np.concatenate([[0.0], np.geomspace(1e-16, 1e4, 401)])  # c / a
+
+
+@dataclass(frozen=True)
+class Bands:
+    """Mean squares `power` (j,) of `count` (j,) coefficients each, about `frequency` (j,) [Hz]; slope (j,): the mean of
+    2 - 2 cos, the model's factor of a."""
+
+    frequency: np.ndarray
+    count: np.ndarray
+    power: np.ndarray
+    slope: np.ndarray
+
+
+@dataclass(frozen=True)
+class NoiseFit:
+    """white: density N [unit/sqrt(Hz)]; walk: density K [unit s^-1/sqrt(Hz)], with standard deviations.
+
+    resolved: whether there is a walk for certain. walk_upper: what K stays below with 95 %. misfit: relative standard
+    deviation by which bands depart from the model beyond their noise, which the standard deviations allow for.
+    lacking: times as long a recording would give K to 20 %; below 1 this one does.
+    """
+
+    white: float
+    white_std: float
+    walk: float
+    walk_std: float
+    walk_upper: float
+    resolved: bool
+    misfit: float
+    lacking: float
+
+
+def bands_of(readings: np.ndarray, period: float) -> Bands:
+    """Of readings (n,), one every `period` seconds, up to a twentieth of the rate."""
+    differences = np.diff(readings)
+    n = _smooth_size(len(differences) + 1) - 1
+    odd = np.concatenate([[0.0], differences[:n], [0.0], -differences[:n][::-1]])
+    squares = (np.fft.rfft(odd).imag[1 : n + 1] / 2.0) ** 2 * 2.0 / (n + 1)
+    last = max(3, int(2.0 * _HIGHEST * n))
+    k = np.arange(1, last + 1)
+    edges = np.unique(np.concatenate([[0], np.round(np.geomspace(1, last, 1 + int(_PER_OCTAVE * np.log2(last))))]))
+    starts = edges[:-1].astype(np.int64)
+    count = np.diff(edges)
+    angle = np.pi * k / (n + 1)
+    power, slope, middle = (np.add.reduceat(x, starts) / count for x in (squares[:last], _slope(angle), angle))
+    return Bands(middle / (2.0 * np.pi * period), count, power, slope)
+
+
+def pooled(axes: list[Bands]) -> Bands:
+    """The mean of the axes' spectra, whose a and c are the means of theirs. Axes that are weaker count for less."""
+    power = np.array([b.power for b in axes])
+    weight = np.array([(b.power * b.count).sum() / b.count.sum() for b in axes])
+    return Bands(axes[0].frequency, axes[0].count * weight.sum() ** 2 / (weight**2).sum(), power.mean(0), axes[0].slope)
+
+
+def fit_noise(bands: Bands, period: float) -> NoiseFit:
+    """N and K of readings one every `period` seconds."""
+    misfit, weight = 0.0, 0.5 * bands.count
+    ratio, a = _most_likely(bands, weight)
+    for _ in range(20):
+        found = _misfit(bands, a * (bands.slope + ratio))
+        if abs(found - misfit) <= 0.01 * misfit:
+            break
+        misfit, weight = found, 1.0 / (2.0 / bands.count + found**2)
+        ratio, a = _most_likely(bands, weight)
+    floor = _cost(bands, weight, ratio)
+    upper = _upper_ratio(bands, weight, ratio, floor)
+    c = ratio * a
+    std_a, std_c = _std(bands, weight, a, c)
+    resolved = bool(2.0 * (_cost(bands, weight, 0.0) - floor) > _RESOLVED)
+    known_c = c if resolved else upper * a
+    relative = 0.5 * _std(bands, weight, a, known_c)[1] / known_c if known_c > 0 else np.inf
+    walk = np.sqrt(c / period)
+    return NoiseFit(
+        white=float(np.sqrt(a * period)),
+        white_std=float(0.5 * std_a / a * np.sqrt(a * period)),
+        walk=float(walk),
+        walk_std=float(0.5 * std_c / c * walk) if c > 0 else float(np.sqrt(upper * a / period)),
+        walk_upper=float(np.sqrt(upper * a / period)),
+        resolved=resolved,
+        misfit=float(misfit),
+        lacking=float((relative / 0.2) ** 2),
+    )
+
+
+def _slope(angle: np.ndarray) -> np.ndarray:
+    return 4.0 * np.sin(0.5 * angle) ** 2
+
+
+def _cost(bands: Bands, weight: np.ndarray, ratio: float) -> float:
+    """Minus the log-likelihood at c / a = ratio, with the best a."""
+    shape = bands.slope + ratio
+    a = (weight * bands.power / shape).sum() / weight.sum()
+    return float((weight * np.log(a * shape)).sum())
+
+
+def _most_likely(bands: Bands, weight: np.ndarray) -> tuple[float, float]:
+    """c / a and a: a grid, then golden sections between its neighbours."""
+    costs = [_cost(bands, weight, float(r)) for r in _RATIOS]
+    best = int(np.argmin(costs))
+    low, high = (float(_RATIOS[min(max(best + side, 0), len(_RATIOS) - 1)]) for side in (-1, 1))
+    golden = 0.5 * (np.sqrt(5.0) - 1.0)
+    for _ in range(60):
+        left, right = high - golden * (high - low), low + golden * (high - low)
+        if _cost(bands, weight, left) < _cost(bands, weight, right):
+            high = right
+        else:
+            low = left
+    ratio = 0.0 if best == 0 else 0.5 * (low + high)
+    return ratio, float((weight * bands.power / (bands.slope + ratio)).sum() / weight.sum())
+
+
+def _upper_ratio(bands: Bands, weight: np.ndarray, ratio: float, floor: float) -> float:
+    """The largest c / a that the data allow with 95 %."""
+    for r in _RATIOS[np.searchsorted(_RATIOS, ratio, "right") :]:
+        if 2.0 * (_cost(bands, weight, float(r)) - floor) > _UPPER:
+            return float(r)
+    return float(_RATIOS[-1])
+
+
+def _std(bands: Bands, weight: np.ndarray, a: float, c: float) -> tuple[float, float]:
+    """Standard deviations of a and c, from the Fisher information."""
+    variance = c + a * bands.slope
+    gradient = np.stack([bands.slope, np.ones_like(bands.slope)], axis=1) / variance[:, None]
+    covariance = np.linalg.inv(gradient.T @ (weight[:, None] * gradient))
+    return float(np.sqrt(covariance[0, 0])), float(np.sqrt(covariance[1, 1]))
+
+
+def _misfit(bands: Bands, variance: np.ndarray) -> float:
+    """Relative standard deviation of the bands about the model beyond their own noise; 0 where chi^2 is as expected."""
+    wide = bands.count >= _LEAST_IN_BAND
+    off = (bands.power[wide] / variance[wide] - 1.0) ** 2
+    noise, dof = 2.0 / bands.count[wide], max(1, int(wide.sum()) - 2)
+    # The mean of m squares has an excess kurtosis of 12 / m: 2 + 12 / m is the variance of its whitened square.
+    if (off / noise).sum() < dof + _SURE * np.sqrt((2.0 + 6.0 * noise).sum()):
+        return 0.0
+    low, high = 0.0, 10.0
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if (off / (noise + middle**2)).sum() > dof else (low, middle)
+    return 0.5 * (low + high)
+
+
+def _smooth_size(n: int) -> int:
+    """The largest number up to n with no prime factor above 5, which transforms fast."""
+    best = 1
+    five = 1
+    while five <= n:
+        three = five
+        while three <= n:
+            best = max(best, three << ((n // three).bit_length() - 1))
+            three *= 3
+        five *= 5
+    return best

@@ -1,0 +1,124 @@
+"""A side from files of others: Kalibr's camchain and imu file, URDF."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from icalib.comparison.results import DENSITIES, noise_quantities
+from icalib.comparison.sides import LensSide, Quantity, Side, unknown
+from icalib.errors import CalibrationError
+from icalib.export.urdf_tree import read_urdf
+from icalib.inspection.kalibr import MODELS
+from icalib.yaml_nodes import YamlValue
+
+_KALIBR_NOISE = {
+    "gyro": "gyroscope_noise_density",
+    "gyro_walk": "gyroscope_random_walk",
+    "accel": "accelerometer_noise_density",
+    "accel_walk": "accelerometer_random_walk",
+}
+_ROUNDING = 1e-3
+
+
+def is_kalibr(entries: Mapping[str, YamlValue]) -> bool:
+    """Whether the entries of a YAML file are those of a camchain or an imu file."""
+    inside = [set(value.entries()) for value in entries.values() if value.is_mapping]
+    return any({"camera_model"} <= keys or {_KALIBR_NOISE["gyro"]} <= keys for keys in [set(entries), *inside])
+
+
+def side_of_kalibr(root: YamlValue) -> Side:
+    """Raises RigError naming line and field."""
+    entries = root.entries()
+    parts = {"imu0": root} if _KALIBR_NOISE["gyro"] in entries else {n: v for n, v in entries.items() if v.is_mapping}
+    cameras = {n: v.entries() for n, v in parts.items() if "camera_model" in v.entries()}
+    imus = {n: v.entries() for n, v in parts.items() if _KALIBR_NOISE["gyro"] in v.entries()}
+    has_imu = bool(imus) or any({"T_cam_imu", "T_imu_cam"} & set(found) for found in cameras.values())
+    body = next(iter(imus), "imu") if has_imu else next(iter(cameras))
+    poses = {body: np.eye(4)}
+    for i, (name, found) in enumerate(cameras.items()):
+        poses[name] = _camera_pose(root, name, found, poses, list(cameras)[i - 1] if i else None)
+    quantities: dict[tuple[str, str], Quantity] = {}
+    for name, found in cameras.items():
+        if "timeshift_cam_imu" in found:
+            shift = np.array([found["timeshift_cam_imu"].number()])
+            quantities[name, "time_offset"] = Quantity("time offset", ("",), shift, unknown(1))
+    for name, found in list(imus.items())[:1]:
+        parts[name].record(tuple(_KALIBR_NOISE.values()), tuple(k for k in found if k not in _KALIBR_NOISE.values()))
+        quantities |= noise_quantities(name, {key: found[_KALIBR_NOISE[key]].positive() for key in DENSITIES})
+    lenses = {n: lens for n, found in cameras.items() if (lens := _lens(found)) is not None}
+    return Side(root.file, "Kalibr file", body, has_imu, poses, quantities=quantities, lenses=lenses)
+
+
+def _camera_pose(
+    root: YamlValue, name: str, found: dict[str, YamlValue], poses: dict[str, np.ndarray], before: str | None
+) -> np.ndarray:
+    """T_body_cam: from T_cam_imu, or OpenVINS' inverse of it, else along the chain of cameras; else NaN."""
+    if "T_cam_imu" in found:
+        return np.linalg.inv(_transform(found["T_cam_imu"]))
+    if "T_imu_cam" in found:
+        return _transform(found["T_imu_cam"])
+    if before is not None and "T_cn_cnm1" in found:
+        return poses[before] @ np.linalg.inv(_transform(found["T_cn_cnm1"]))
+    return poses.get(name, np.full((4, 4), np.nan))
+
+
+def _transform(value: YamlValue) -> np.ndarray:
+    rows = value.items()
+    if len(rows) != 4:
+        value.fail(f"a transform has 4 rows of 4 numbers, but this has {len(rows)}; correct it.")
+    T = np.array([row.vector(4) for row in rows])
+    R = T[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > _ROUNDING or np.linalg.det(R) < 0 or np.abs(T[3] - [0, 0, 0, 1]).max() > 0:
+        value.fail("is not a transform: its first 3 x 3 must be a rotation, its last row 0, 0, 0, 1; correct it.")
+    u, _, vt = np.linalg.svd(R)
+    T[:3, :3] = u @ vt
+    return T
+
+
+def _lens(found: dict[str, YamlValue]) -> LensSide | None:
+    distortion = found["distortion_model"].text() if "distortion_model" in found else "none"
+    kind = (found["camera_model"].text(), distortion)
+    if kind not in MODELS or not {"intrinsics", "resolution"} <= set(found):
+        return None
+    model, before = MODELS[kind]
+    values = found["intrinsics"].vector(before + 4)
+    more = found["distortion_coeffs"].vector(4) if distortion != "none" and "distortion_coeffs" in found else []
+    width, height = (side.whole(1) for side in found["resolution"].items()[:2])
+    params = np.concatenate([values[before:], values[:before], more])
+    return LensSide(model, (width, height), params, unknown(len(params)))
+
+
+def side_of_urdf(path: Path, body: str, has_imu: bool, sensors: Sequence[str], frames: Mapping[str, str]) -> Side:
+    """Links that have the name of one of `sensors`, or are its link by `frames`; `body`: whose link poses are from.
+
+    Raises CalibrationError where the file cannot be read or the body has no link.
+    """
+    tree = read_urdf(path)
+    link = {name: frames.get(name, name) for name in sensors}
+    for name in frames:
+        if name in link:
+            tree.check_link(link[name], name)
+    tree.check_link(frames.get(body, body), body)
+    known = [name for name in sensors if link[name] in tree.links]
+    poses = {name: tree.T(frames.get(body, body), link[name]) for name in known}
+    return Side(str(path), "URDF", body, has_imu, poses | {body: np.eye(4)})
+
+
+def side_of_urdf_alone(path: Path, other: Path, frames: Mapping[str, str]) -> Side:
+    """Links that both files have, as seen from the first of them; those that can move are left out.
+
+    Raises CalibrationError where one cannot be read, or they have no link in common.
+    """
+    tree, links = read_urdf(path), read_urdf(other).links
+    common = sorted(set(tree.links) & set(links))
+    if frames or not common:
+        why = "share no link" if not common else "are compared by the names of their links, so leave out --frame"
+        raise CalibrationError(f"{path} and {other} {why}.")
+    poses = {common[0]: np.eye(4)}
+    for link in common[1:]:
+        if tree.is_fixed(common[0], link):
+            poses[link] = tree.T(common[0], link)
+    return Side(str(path), "URDF", common[0], False, poses)

@@ -1,0 +1,90 @@
+"""A path -> a side: which kind of file lies there is told by what is in it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from icalib.calibration import load_calibration
+from icalib.comparison.compare import Comparison, Tolerances, compare_sides
+from icalib.comparison.other_files import is_kalibr, side_of_kalibr, side_of_urdf, side_of_urdf_alone
+from icalib.comparison.results import side_of_result, side_of_rig
+from icalib.comparison.sides import Side
+from icalib.errors import CalibrationError, RigError
+from icalib.yaml_nodes import read_yaml
+
+_XML = b"<"
+
+
+def compare_files(
+    a: Path,
+    b: Path,
+    frames: Mapping[str, str] | None = None,
+    tolerances: Tolerances | None = None,
+    limit: float = 3.0,
+) -> Comparison:
+    """Each of a, b: the folder of a result, a Kalibr camchain or imu file, a URDF, or a rig file. frames: sensor of
+    A -> its name in B, or of the other side -> its link in a URDF, where the two differ.
+
+    Raises CalibrationError, one sentence, where a file cannot be read or the two have nothing in common.
+    """
+    frames = frames or {}
+    if _is_urdf(a) and _is_urdf(b):
+        one, other = side_of_urdf_alone(a, b, frames), side_of_urdf_alone(b, a, frames)
+    elif _is_urdf(a):
+        other = _side(b)
+        one = _beside(a, other, frames)
+    elif _is_urdf(b):
+        one = _side(a)
+        other = _beside(b, one, frames)
+    else:
+        one, other = _renamed(_side(a), _side(b), frames)
+    return compare_sides(one, other, tolerances, limit)
+
+
+def _beside(urdf: Path, side: Side, frames: Mapping[str, str]) -> Side:
+    for name in frames:
+        _check_known(name, side)
+    sensors = [name for name in side.poses if name != side.body]
+    return side_of_urdf(urdf, side.body, side.has_imu, sensors, frames)
+
+
+def _renamed(a: Side, b: Side, frames: Mapping[str, str]) -> tuple[Side, Side]:
+    """b with its sensors called as in a."""
+    for name, theirs in frames.items():
+        _check_known(name, a)
+        _check_known(theirs, b)
+        b = b.renamed(theirs, name)
+    return a, b
+
+
+def _check_known(name: str, side: Side) -> None:
+    if name not in side.sensors:
+        raise CalibrationError(f"there is no sensor {name} in {side.path}; it has {', '.join(side.sensors)}.")
+
+
+def _side(path: Path) -> Side:
+    if path.is_dir():
+        return side_of_result(load_calibration(path), str(path))
+    if path.name == "calibration.yaml":
+        return side_of_result(load_calibration(path.parent), str(path))
+    root = read_yaml(path, "result's folder, Kalibr file, URDF or rig file")
+    entries = root.entries()
+    if "sensors" in entries:
+        return side_of_rig(path)
+    if is_kalibr(entries):
+        return side_of_kalibr(root)
+    raise RigError(
+        f"{path} is neither a Kalibr file nor a rig file; give a result's folder, a Kalibr camchain or imu file, a "
+        "URDF or a rig file."
+    )
+
+
+def _is_urdf(path: Path) -> bool:
+    if path.suffix in (".urdf", ".xacro"):
+        return True
+    try:
+        with path.open("rb") as file:
+            return file.read(64).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(_XML)
+    except OSError:
+        return False

@@ -1,0 +1,121 @@
+"""A side from a calibration of icalib, or from a rig file, in which values may be typed from CAD or a data sheet."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from icalib.calibration import Calibration, joint_covariance, relative_pose
+from icalib.comparison.sides import LensSide, Quantity, Side, unknown
+from icalib.rig import Camera, Lidar, Parameter, PoseSensor, Wheels
+from icalib.rig_file import load_rig
+
+DENSITIES = {
+    "gyro": "noise density of the gyroscope",
+    "gyro_walk": "bias walk of the gyroscope",
+    "accel": "noise density of the accelerometer",
+    "accel_walk": "bias walk of the accelerometer",
+}
+_WHAT = {"time_offset": "time offset", "radii": "radius", "baseline": "baseline"}
+_LABELS = {"time_offset": ("",), "radii": ("left", "right"), "baseline": ("",)}
+
+
+def noise_quantities(imu: str, noise: dict[str, Any]) -> dict[tuple[str, str], Quantity]:
+    """Densities by name, which have no standard deviation."""
+    return {
+        (imu, key): Quantity(what, ("",), np.array([float(noise[key])]), unknown(1)) for key, what in DENSITIES.items()
+    }
+
+
+def side_of_result(c: Calibration, path: str) -> Side:
+    """All that was calibrated, with the joint covariance of it."""
+    poses = {name: c.T_imu_sensor(name) for name in c.mounted} | {c.body: np.eye(4)}
+    bad = [g for g in c.groups if "undetermined" in g.verdict]
+    quantities = {}
+    for g in c.groups:
+        if g.sensor in c.mounted and g.name in _WHAT:
+            quantities[g.sensor, g.name] = Quantity(
+                _WHAT[g.name], _LABELS[g.name], g.value, joint_covariance(c, [g]), g in bad
+            )
+    if c.imu is not None:
+        quantities |= noise_quantities(c.imu, c.rig["sensors"][c.imu]["noise"])
+    return Side(
+        path=path,
+        kind="result",
+        body=c.body,
+        has_imu=c.imu is not None,
+        poses=poses,
+        covariance=lambda frame, sensor: relative_pose(c, frame, sensor).covariance,
+        open=frozenset((g.sensor, g.name) for g in bad),
+        quantities=quantities,
+        lenses={name: _lens_of_result(c, name) for name in c.cameras},
+    )
+
+
+def _lens_of_result(c: Calibration, name: str) -> LensSide:
+    sensor, groups = c.rig["sensors"][name], [c.group(name, key) for key in ("intrinsics", "distortion")]
+    width, height = sensor["resolution"]
+    return LensSide(
+        model=sensor["model"],
+        resolution=(int(width), int(height)),
+        params=np.concatenate([g.value for g in groups]),
+        covariance=joint_covariance(c, groups),
+        open=any("undetermined" in g.verdict for g in groups),
+    )
+
+
+def side_of_rig(path: Path) -> Side:
+    """Values that a rig file gives, whether guessed, fixed or prior; priors with their sigma. Raises RigError."""
+    rig = load_rig(path)
+    sensors = {s.name: s for s in (*rig.cameras, *rig.lidars, *rig.wheels, *rig.poses)}
+    poses = {name: _pose(s) for name, s in sensors.items()} | {rig.body: np.eye(4)}
+    quantities = {}
+    for name, s in sensors.items():
+        for key, what in _WHAT.items():
+            p = getattr(s, key, None)
+            if p is not None and p.value is not None:
+                quantities[name, key] = Quantity(
+                    what, _LABELS[key], np.atleast_1d(p.value), _covariance(p, p.value.size)
+                )
+    if rig.imu is not None:
+        noise = {key: getattr(rig.imu.noise, key) for key in DENSITIES}
+        quantities |= noise_quantities(rig.imu.name, noise)
+
+    def covariance(frame: str, sensor: str) -> np.ndarray:
+        out = unknown(6)
+        if frame == rig.body:
+            out[:3, :3] = _covariance(sensors[sensor].rotation, 3)
+            out[3:, 3:] = _covariance(sensors[sensor].translation, 3)
+        return out
+
+    return Side(
+        path=str(path),
+        kind="rig file",
+        body=rig.body,
+        has_imu=rig.imu is not None,
+        poses=poses,
+        covariance=covariance,
+        quantities=quantities,
+        lenses={c.name: lens for c in rig.cameras if (lens := _lens_of_rig(c)) is not None},
+    )
+
+
+def _pose(sensor: Camera | Lidar | Wheels | PoseSensor) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3] = np.nan if sensor.rotation.value is None else sensor.rotation.value
+    T[:3, 3] = np.nan if sensor.translation.value is None else sensor.translation.value
+    return T
+
+
+def _covariance(p: Parameter, size: int) -> np.ndarray:
+    return unknown(size) if p.sigma is None else np.diag(np.broadcast_to(p.sigma, size) ** 2)
+
+
+def _lens_of_rig(camera: Camera) -> LensSide | None:
+    values = [p.value for p in (camera.intrinsics, camera.distortion)]
+    if values[0] is None or values[1] is None:
+        return None
+    params = np.concatenate([values[0], values[1]])
+    return LensSide(camera.model, camera.resolution, params, unknown(len(params)))

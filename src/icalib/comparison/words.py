@@ -1,0 +1,97 @@
+"""A comparison in sentences, and as plain data."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from math import floor, log10
+
+import numpy as np
+
+from icalib.comparison.compare import Comparison, Difference
+
+_ALONG = 0.95  # of the whole: then it is about one axis
+_TITLES = {True: "same", False: "DIFFERS"}
+
+
+def lines(comparison: Comparison) -> list[str]:
+    """What to print: the two sides, a line for each block, what differs first, notes, and the verdict."""
+    c = comparison
+    found = [f"A: {c.a.path} ({c.a.kind})", f"B: {c.b.path} ({c.b.kind}); from A to B:"]
+    width = max(map(len, _TITLES.values()))
+    for d in sorted(c.differences, key=lambda d: not d.differs):
+        found.append(f"  {_TITLES[not d.differs]:<{width}}  {sentence(d, c)}")
+    found += [f"Note: {note}" for note in c.notes]
+    count = sum(d.differs for d in c.differences)
+    return [*found, "The same." if c.same else f"{count} of {len(c.differences)} differ."]
+
+
+def sentence(d: Difference, c: Comparison) -> str:
+    """For example: cam1 turned by 0.12 deg about its x axis, 4.0 sigma."""
+    seen = "" if d.frame in (c.reference, d.sensor) else f" as seen from {d.frame}"
+    match d.what:
+        case "rotation":
+            turn = _axis(d, "about its {} axis", "about the axis {} of its own")
+            words = f"{d.sensor} turned by {turn}{seen}"
+        case "translation":
+            along = f"along {{}} of {d.frame}"
+            words = f"{d.sensor} moved by {_axis(d, along, along)}"
+        case "lens":
+            words = (
+                f"the lens of {d.sensor} moved points by {digits(d.size)} px RMS, {digits(d.most or 0.0)} px at most"
+            )
+        case "time offset":
+            words = f"the time offset of {d.sensor} changed by {_signed(d.vector[0])} ms"
+        case _:
+            most = int(np.argmax(np.abs(d.vector)))
+            label = f"{d.labels[most]} " if d.labels[most] else ""
+            words = f"the {label}{d.what} of {d.sensor} changed by {_signed(d.vector[most])} %"
+    return f"{words}, {_certainty(d)}"
+
+
+def comparison_json(comparison: Comparison) -> str:
+    """The same as plain data."""
+    c = comparison
+    plain = {
+        "a": {"path": c.a.path, "kind": c.a.kind},
+        "b": {"path": c.b.path, "kind": c.b.kind},
+        "same": c.same,
+        "reference": c.reference,
+        "differences": [dataclasses.asdict(d) | {"sentence": sentence(d, c)} for d in c.differences],
+        "notes": list(c.notes),
+    }
+    return json.dumps(plain, indent=1, ensure_ascii=False, allow_nan=False)
+
+
+def digits(value: float) -> str:
+    """Two significant digits, without an exponent where that is readable."""
+    if value == 0.0 or not 1e-4 <= abs(value) < 1e5:
+        return f"{value:.1e}" if value else "0"
+    return f"{value:.{max(0, 1 - floor(log10(abs(value))))}f}"
+
+
+def _signed(value: float) -> str:
+    return f"{'+' if value >= 0 else '-'}{digits(abs(value))}"
+
+
+def _axis(d: Difference, one: str, several: str) -> str:
+    """Size and axis: the coordinate's own where it is about one."""
+    vector = np.array(d.vector)
+    most = int(np.argmax(np.abs(vector)))
+    if d.size == 0.0 or abs(vector[most]) >= _ALONG * d.size:
+        return f"{digits(float(vector[most]))} {d.unit} {one.format(d.labels[most])}"
+    axis = ", ".join(f"{v:.2f}" for v in vector / d.size)
+    return f"{digits(d.size)} {d.unit} {several.format(f'[{axis}]')}"
+
+
+def _certainty(d: Difference) -> str:
+    if d.sigmas is None:
+        words = f"no standard deviation is known (tolerance {_tolerance(d)})"
+    else:
+        words = f"{d.sigmas:.1f} sigma" + (f" of {d.given_by} alone" if d.given_by in ("A", "B") else "")
+        words += f" (tolerance {_tolerance(d)})" if d.tolerance > 0 else ""
+    return words + (f", undetermined in {' and '.join(d.open)}" if d.open else "")
+
+
+def _tolerance(d: Difference) -> str:
+    return f"{d.tolerance:g} {'%' if d.unit == 'percent' else d.unit}"

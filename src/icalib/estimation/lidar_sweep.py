@@ -1,0 +1,97 @@
+"""Where a LiDAR is at any instant, and how it moves there, by the IMU's readings from the nodes of a state."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from icalib.estimation.imu_data import ImuData
+from icalib.estimation.integration import integrate
+from icalib.estimation.poses import assign_nodes
+from icalib.estimation.state import State
+from icalib.geometry.small import mul3
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The IMU's motion as a state has it. gravity [m/s^2]; IMU gaps up to max_gap_s are bridged."""
+
+    state: State
+    imu: ImuData
+    gravity: float
+    max_gap_s: float
+
+
+class Sweep(NamedTuple):
+    """The LiDAR at the centres of bins: R_world_lidar, p_world_lidar, and the twist in its own axes: rad/s, m/s."""
+
+    rotation: np.ndarray
+    position: np.ndarray
+    rate: np.ndarray
+    velocity: np.ndarray
+
+
+@njit(cache=True, nogil=True)
+def _imu_at(times, node, first, chain, raw, intrinsics, out_R, out_p, rate, velocity):
+    """IMU poses at `times` by integration from their nodes, without Jacobians; the rate is the body's."""
+    seconds, R, p, v, b, g = chain
+    t, gyro, accel = raw
+    variance, walk = np.zeros((len(t), 3)), np.zeros(2)
+    dR, dv, dp, J, P = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((9, 0)), np.empty((0, 0))
+    for i in range(len(times)):
+        k = node[i]
+        dt = times[i] - seconds[k]
+        w, _ = integrate(
+            seconds[k], times[i], first[i], t, gyro, accel, b[k], intrinsics, variance, walk, True, dR, dv, dp, J, P
+        )  # fmt: skip
+        turned = mul3(R[k], dR)
+        for a in range(3):
+            rate[i, a] = w[a]
+            out_p[i, a] = p[k, a] + v[k, a] * dt
+            velocity[i, a] = v[k, a]
+            for c in range(3):
+                out_R[i, a, c] = turned[a, c]
+                out_p[i, a] += R[k, a, c] * dp[c]
+                velocity[i, a] += R[k, a, c] * dv[c]
+        out_p[i, 2] -= 0.5 * g * dt * dt
+        velocity[i, 2] -= g * dt
+
+
+@njit(cache=True, nogil=True)
+def _to_lidar(R_il, p_il, R, p, rate, velocity):
+    """From the IMU's pose, rate and velocity to the LiDAR's, in place: its twist in its own axes."""
+    for i in range(len(R)):
+        w0, w1, w2 = rate[i, 0], rate[i, 1], rate[i, 2]
+        lever = (w1 * p_il[2] - w2 * p_il[1], w2 * p_il[0] - w0 * p_il[2], w0 * p_il[1] - w1 * p_il[0])
+        moving = np.empty(3)
+        for a in range(3):
+            moving[a] = lever[a]
+            for c in range(3):
+                moving[a] += R[i, c, a] * velocity[i, c]
+                p[i, a] += R[i, a, c] * p_il[c]
+        for a in range(3):
+            rate[i, a] = R_il[0, a] * w0 + R_il[1, a] * w1 + R_il[2, a] * w2
+            velocity[i, a] = R_il[0, a] * moving[0] + R_il[1, a] * moving[1] + R_il[2, a] * moving[2]
+        turned = mul3(R[i], R_il)
+        for a in range(3):
+            for c in range(3):
+                R[i, a, c] = turned[a, c]
+
+
+def sweep(drive: Motion, name: str, times: np.ndarray, near: np.ndarray | None = None) -> Sweep:
+    """Where LiDAR `name` is and how it moves at `times` (n,) on the IMU's clock, by the IMU's readings from the nodes
+    next to them, or next to `near` (n,)."""
+    state, imu = drive.state, drive.imu
+    n, node = len(times), assign_nodes("inertial", state.seconds, times if near is None else near)
+    R, p, rate, velocity = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
+    first = imu.interval(state.seconds[node])
+    first -= (times < state.seconds[node]) & (imu.seconds[first] == state.seconds[node]) & (first > 0)
+    chain = (state.seconds, state.rotation, state.position, state.velocity, state.bias, drive.gravity)
+    raw = (imu.seconds, imu.gyro, imu.accel)
+    _imu_at(times, node, first, chain, raw, state.values[imu.name, "intrinsics"], R, p, rate, velocity)
+    R_il, p_il = state.values[name, "rotation"], state.values[name, "translation"]
+    _to_lidar(np.ascontiguousarray(R_il), p_il, R, p, rate, velocity)
+    return Sweep(R, p, rate, velocity)

@@ -1,0 +1,156 @@
+"""What the formats share: how an export is handed over, rotations in other programs' terms, and what cannot be said."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import atan2, cos, hypot, sin
+from typing import Any
+
+import numpy as np
+import yaml
+
+from icalib.calibration import Calibration
+from icalib.errors import CalibrationError
+from icalib.geometry.cameras import camera_model
+from icalib.geometry.cameras.convert import fit_model
+
+
+@dataclass(frozen=True)
+class Export:
+    """files: name -> text. sentences: what the format cannot hold, and what to know of the values."""
+
+    files: dict[str, str]
+    sentences: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A camera's model with fx, fy, cx, cy [px] and distortion; sentence: where they are a fit to another model."""
+
+    model: str
+    intrinsics: list[float]
+    distortion: list[float]
+    resolution: tuple[int, int]
+    sentence: str
+
+
+def lens_of(c: Calibration, name: str, program: str, held: Sequence[str]) -> Lens:
+    """The lens of camera `name` in one of the models that `program` has (`held`): its own, or the last that can follow
+    it, pinhole-radtan for narrow lenses and pinhole-equidistant for wide ones."""
+    sensor = c.rig["sensors"][name]
+    model, (width, height) = sensor["model"], (int(side) for side in sensor["resolution"])
+    params = np.concatenate([c.group(name, "intrinsics").value, c.group(name, "distortion").value])
+    sentence = ""
+    if model not in held:
+        target = camera_model("pinhole-radtan" if model.startswith("pinhole") else "pinhole-equidistant")
+        params, rms, most = fit_model(camera_model(model), params, target, (width, height))
+        sentence = (
+            f"{program} has no {model}: {name} is given as the nearest {target.name}, {rms:.2f} px RMS away over the "
+            f"image, {most:.1f} px at most."
+        )
+        model = target.name
+    return Lens(model, params[:4].tolist(), params[4:].tolist(), (width, height), sentence)
+
+
+def body_frame(c: Calibration) -> str:
+    """How files name the frame that all poses are seen from."""
+    return "imu" if c.imu else c.body
+
+
+def need_imu(c: Calibration, program: str) -> str:
+    """Name of the IMU. Raises CalibrationError where there is none."""
+    if c.imu is None:
+        raise CalibrationError(
+            f"{program} needs an IMU, and this calibration has none; export to kalibr, camera-info, ros2-static, urdf "
+            "or json."
+        )
+    return c.imu
+
+
+def need(names: Sequence[str], kind: str, program: str) -> None:
+    """Raises CalibrationError where there is no sensor of the kind that `program` is for."""
+    if not names:
+        raise CalibrationError(f"this calibration has no {kind}, so there is nothing to export to {program}.")
+
+
+def guesses(c: Calibration, names: Sequence[str]) -> tuple[str, ...]:
+    """A sentence for each of the sensors `names` with parameters that the data did not determine."""
+    found = []
+    for name in names:
+        open_ = [
+            g.name.replace("_", " ") + ("" if len(g.labels) == 1 else f" {label}")
+            for g in c.groups
+            if g.sensor == name
+            for label, verdict in zip(g.labels, g.verdict, strict=True)
+            if verdict == "undetermined"
+        ]
+        if open_:
+            found.append(f"{name}: {', '.join(open_)} was not determined by the data; what stands here is the guess.")
+    return tuple(found)
+
+
+def no_place_for(program: str, things: Sequence[str]) -> tuple[str, ...]:
+    """One sentence for what a format cannot hold; none where there is nothing."""
+    if not things:
+        return ()
+    return (f"{program} has no place for {', '.join(things)}; see calibration.yaml.",)
+
+
+def time_offsets(c: Calibration, names: Sequence[str]) -> list[str]:
+    """Words for the time offsets of sensors that have one."""
+    groups = {g.sensor: float(g.value[0]) for g in c.groups if g.name == "time_offset"}
+    return [f"the time offset of {name} ({1e3 * groups[name]:+.3f} ms)" for name in names if groups.get(name)]
+
+
+def imu_intrinsics(c: Calibration) -> list[str]:
+    """Words for the IMU's scale and misalignment, where they were estimated or given."""
+    found = any((g.sensor, g.name) == (c.imu, "intrinsics") and g.value.any() for g in c.groups)
+    return [f"scale and misalignment of {c.imu}"] if found else []
+
+
+def topic(c: Calibration, name: str, default: str) -> str:
+    """The topic of a sensor, as the rig file has it."""
+    return str(c.rig["sensors"][name].get("topic") or default)
+
+
+def inverse(T: np.ndarray) -> np.ndarray:
+    """(4, 4) of a rigid transform."""
+    out = np.eye(4)
+    out[:3, :3] = T[:3, :3].T
+    out[:3, 3] = -T[:3, :3].T @ T[:3, 3]
+    return out
+
+
+def rpy(R: np.ndarray) -> tuple[float, float, float]:
+    """Roll, pitch, yaw [rad] with R = Rz(yaw) Ry(pitch) Rx(roll), as in URDF; good at pitch = 90 deg, too: what yaw
+    leaves over is roll."""
+    yaw = atan2(R[1, 0], R[0, 0])
+    s, k = sin(yaw), cos(yaw)
+    return atan2(s * R[0, 2] - k * R[1, 2], k * R[1, 1] - s * R[0, 1]), atan2(-R[2, 0], hypot(R[0, 0], R[1, 0])), yaw
+
+
+def quaternion(R: np.ndarray) -> tuple[float, float, float, float]:
+    """x, y, z, w of a rotation, w >= 0: the strongest eigenvector of a symmetric matrix (Bar-Itzhack 2000), which has
+    no special cases."""
+    K = np.zeros((4, 4))
+    K[:3, :3] = R + R.T - np.trace(R) * np.eye(3)
+    K[3, :3] = K[:3, 3] = [R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]
+    K[3, 3] = np.trace(R)
+    x, y, z, w = np.linalg.eigh(K)[1][:, -1].tolist()
+    sign = -1.0 if w < 0 else 1.0
+    return sign * x, sign * y, sign * z, sign * w
+
+
+def yaml_text(comments: Sequence[str], data: Mapping[str, Any], head: str = "") -> str:
+    """YAML with a comment a line above it; lists of numbers in one line, one line for each row of a matrix, indented as
+    OpenCV's reader wants it."""
+    body = yaml.dump(
+        dict(data), Dumper=_Indented, sort_keys=False, default_flow_style=None, width=100_000, allow_unicode=True
+    )
+    return head + "".join(f"# {line}\n" for line in comments) + body
+
+
+class _Indented(yaml.SafeDumper):
+    def increase_indent(self, flow: bool = False, indentless: bool = False) -> None:
+        super().increase_indent(flow, False)

@@ -1,0 +1,83 @@
+"""Which formats there are, and a calibration in one of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from icalib.calibration import Calibration
+from icalib.errors import CalibrationError
+from icalib.export.common import Export, guesses, no_place_for
+from icalib.export.kalibr import camchain, camchain_name, imu_yaml
+from icalib.export.lidar_programs import fast_lio, mins
+from icalib.export.names import FORMATS
+from icalib.export.openvins import openvins
+from icalib.export.plain import plain_json
+from icalib.export.ros import camera_info, ros2_static
+from icalib.export.urdf import updated_urdf, urdf
+from icalib.export.vins_fusion import vins_fusion
+
+_FRAMED = ("ros2-static", "urdf")
+
+
+def export(
+    c: Calibration,
+    to: str,
+    frames: Mapping[str, str] | None = None,
+    existing_urdf: Path | None = None,
+    joints: Mapping[str, str] | None = None,
+) -> Export:
+    """`c` in the format `to`, one of FORMATS.
+
+    frames: sensor -> frame or link, where the two differ (ros2-static, urdf). existing_urdf: the file to be updated,
+    and joints: sensor -> joint of it to be set, by default the one above the sensor's link.
+    Raises CalibrationError where the format needs what is not there, or an option belongs to another format.
+    """
+    frames, joints = frames or {}, joints or {}
+    _check(c, to, frames, joints, existing_urdf)
+    match to:
+        case "kalibr":
+            return kalibr(c)
+        case "openvins":
+            return openvins(c)
+        case "vins-fusion":
+            return vins_fusion(c)
+        case "ros2-static":
+            return ros2_static(c, frames)
+        case "camera-info":
+            return camera_info(c)
+        case "urdf":
+            return urdf(c, frames) if existing_urdf is None else updated_urdf(c, existing_urdf, frames, joints)
+        case "mins":
+            return mins(c)
+        case "fast-lio":
+            return fast_lio(c)
+        case _:
+            return plain_json(c)
+
+
+def kalibr(c: Calibration) -> Export:
+    """Kalibr's camchain, and its imu.yaml where there is an IMU."""
+    sentences = no_place_for("Kalibr", [*c.lidars, *c.wheels, *c.pose_sensors]) + guesses(c, c.cameras)
+    said = "".join(f"# {sentence}\n" for sentence in sentences)
+    files = {camchain_name(c): said + camchain(c)} if c.cameras else {}
+    if c.imu is not None:
+        files["imu.yaml"] = imu_yaml(c)
+    return Export(files, sentences)
+
+
+def _check(
+    c: Calibration, to: str, frames: Mapping[str, str], joints: Mapping[str, str], existing: Path | None
+) -> None:
+    if to not in FORMATS:
+        raise CalibrationError(f"there is no format {to}; available are {', '.join(FORMATS)}.")
+    if frames and to not in _FRAMED:
+        raise CalibrationError(f"--frame belongs to {' and '.join(_FRAMED)}; {to} names no frames, so leave it out.")
+    if existing is not None and to != "urdf":
+        raise CalibrationError(f"--urdf belongs to --to urdf, not to {to}; leave it out.")
+    if joints and existing is None:
+        raise CalibrationError("--joint names joints of an existing file; give it as --to urdf --urdf FILE.")
+    known = list(dict.fromkeys([c.body, *c.mounted]))
+    for sensor in (*frames, *joints):
+        if sensor not in known:
+            raise CalibrationError(f"there is no sensor {sensor}; this calibration has {', '.join(known)}.")

@@ -1,0 +1,100 @@
+"""MINS and FAST-LIO: the calibrated fields of their configuration."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from icalib.calibration import Calibration
+from icalib.export.common import (
+    Export,
+    guesses,
+    imu_intrinsics,
+    lens_of,
+    need,
+    need_imu,
+    no_place_for,
+    topic,
+    yaml_text,
+)
+from icalib.export.openvins import HEAD, MODELS
+
+_MERGE = "Put these fields into MINS's file of the same name; it has others besides, which are not calibrated."
+_TIME = "t_imu = t_{0} + timeoffset [s]."
+_POSE = "T_imu_{0} takes coordinates in the {1} frame to the imu frame: p_imu = T_imu_{0} p_{0}."
+
+
+def mins(c: Calibration) -> Export:
+    """A file for each kind of sensor. Raises CalibrationError without an IMU."""
+    imu = need_imu(c, "MINS")
+    lenses = {name: lens_of(c, name, "MINS", tuple(MODELS)) for name in c.cameras}
+    sentences = tuple(lens.sentence for lens in lenses.values() if lens.sentence)
+    sentences += no_place_for("MINS", [*imu_intrinsics(c), *c.wheels[1:], *c.pose_sensors])
+    sentences += guesses(c, [*c.cameras, *c.lidars, *c.wheels[:1]])
+    noise = c.rig["sensors"][imu]["noise"]
+    fields = {"accel_noise": "accel", "accel_bias": "accel_walk", "gyro_noise": "gyro", "gyro_bias": "gyro_walk"}
+    imu_data = {theirs: float(noise[ours]) for theirs, ours in fields.items()} | {"topic": topic(c, imu, f"/{imu}")}
+    files = {"config_imu.yaml": _file(["Densities in continuous time, SI."], {"imu": imu_data}, ())}
+    if c.cameras:
+        cameras = {}
+        for i, (name, lens) in enumerate(lenses.items()):
+            cameras[f"cam{i}"] = _placed(c, name, "cam") | {
+                "intrinsics": lens.intrinsics,
+                "distortion_coeffs": lens.distortion,
+                "distortion_model": MODELS[lens.model],
+                "resolution": list(lens.resolution),
+                "topic": topic(c, name, f"/{name}/image_raw"),
+            }
+        files["config_camera.yaml"] = _file(_said("cam", "camera", c.cameras), cameras, sentences)
+    if c.lidars:
+        lidars = {
+            f"lidar{i}": _placed(c, name, "lidar") | {"topic": topic(c, name, f"/{name}")}
+            for i, name in enumerate(c.lidars)
+        }
+        files["config_lidar.yaml"] = _file(_said("lidar", "LiDAR", c.lidars), lidars, sentences)
+    if c.wheels:
+        files["config_wheel.yaml"] = _wheels(c, c.wheels[0], sentences)
+    return Export(files, sentences)
+
+
+def fast_lio(c: Calibration) -> Export:
+    """A file for each LiDAR. Raises CalibrationError without an IMU or a LiDAR."""
+    imu = need_imu(c, "FAST-LIO")
+    need(c.lidars, "LiDAR", "FAST-LIO")
+    away = [*c.cameras, *c.wheels, *c.pose_sensors, *imu_intrinsics(c)]
+    sentences = no_place_for("FAST-LIO", away) + guesses(c, c.lidars)
+    comments = [
+        "For FAST-LIO, by icalib: put these fields into its own configuration, which has others besides.",
+        "extrinsic_R (row by row) and extrinsic_T [m] place the LiDAR in the imu frame:",
+        "p_imu = extrinsic_R p_lidar + extrinsic_T. t_imu = t_lidar + time_offset_lidar_to_imu [s].",
+    ]
+    files = {}
+    for name in c.lidars:
+        T = c.T_imu_sensor(name)
+        offset = float(c.group(name, "time_offset").value[0])
+        common = {"lid_topic": topic(c, name, f"/{name}"), "imu_topic": topic(c, imu, f"/{imu}")}
+        common |= {"time_sync_en": False, "time_offset_lidar_to_imu": offset}
+        place = {"extrinsic_est_en": False, "extrinsic_T": T[:3, 3].tolist(), "extrinsic_R": T[:3, :3].ravel().tolist()}
+        files[f"{name}.yaml"] = yaml_text([*comments, *sentences], {"common": common, "mapping": place})
+    return Export(files, sentences)
+
+
+def _placed(c: Calibration, name: str, kind: str) -> dict[str, Any]:
+    offset = float(c.group(name, "time_offset").value[0])
+    return {"timeoffset": offset, f"T_imu_{kind}": c.T_imu_sensor(name).tolist()}
+
+
+def _said(kind: str, word: str, names: tuple[str, ...]) -> list[str]:
+    other = [f"{kind}{i} is {name}." for i, name in enumerate(names) if name != f"{kind}{i}"]
+    return [_POSE.format(kind, word), _TIME.format(kind), *other]
+
+
+def _wheels(c: Calibration, name: str, sentences: tuple[str, ...]) -> str:
+    left, right = c.group(name, "radii").value.tolist()
+    data = _placed(c, name, "wheel")
+    data |= {"intrinsics": [left, right, float(c.group(name, "baseline").value[0])]}
+    said = [*_said("wheel", "wheel", ()), "intrinsics: radius of the left wheel, of the right one, baseline [m]."]
+    return _file(said, {"wheel": data | {"topic": topic(c, name, f"/{name}")}}, sentences)
+
+
+def _file(comments: list[str], data: dict[str, Any], sentences: tuple[str, ...]) -> str:
+    return yaml_text(["For MINS, by icalib.", _MERGE, *comments, *sentences], data, HEAD)

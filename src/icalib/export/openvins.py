@@ -1,0 +1,92 @@
+"""OpenVINS: `kalibr_imucam_chain.yaml` and `kalibr_imu_chain.yaml`, as its configuration names them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from icalib.calibration import Calibration
+from icalib.errors import CalibrationError
+from icalib.export.common import Export, guesses, inverse, lens_of, need, need_imu, no_place_for, topic, yaml_text
+from icalib.export.kalibr import cam_overlaps, lower
+from icalib.geometry import so3
+
+HEAD = "%YAML:1.0\n"
+MODELS = {"pinhole-radtan": "radtan", "pinhole-equidistant": "equidistant"}
+_OTHER_OFFSET_S = 1e-5
+
+
+def openvins(c: Calibration) -> Export:
+    """Raises CalibrationError without an IMU whose rate is known, or without a camera."""
+    imu = need_imu(c, "OpenVINS")
+    need(c.cameras, "camera", "OpenVINS")
+    if imu not in c.rates:
+        raise CalibrationError(f"the rate of {imu} is not known, and OpenVINS wants one; calibrate again.")
+    lenses = [lens_of(c, name, "OpenVINS", tuple(MODELS)) for name in c.cameras]
+    sentences = tuple(lens.sentence for lens in lenses if lens.sentence)
+    sentences += _offsets(c) + no_place_for("OpenVINS", [*c.lidars, *c.wheels, *c.pose_sensors]) + guesses(c, c.cameras)
+    overlaps = cam_overlaps(c)
+    chain: dict[str, Any] = {}
+    for i, (name, lens) in enumerate(zip(c.cameras, lenses, strict=True)):
+        before = c.T_imu_sensor(c.cameras[i - 1])
+        step = {"T_cn_cnm1": (inverse(c.T_imu_sensor(name)) @ before).tolist()} if i else {}
+        chain[f"cam{i}"] = {
+            "T_imu_cam": c.T_imu_sensor(name).tolist(),
+            **step,
+            "cam_overlaps": np.flatnonzero(overlaps[i]).tolist(),
+            "camera_model": "pinhole",
+            "distortion_coeffs": lens.distortion,
+            "distortion_model": MODELS[lens.model],
+            "intrinsics": lens.intrinsics,
+            "resolution": list(lens.resolution),
+            "rostopic": topic(c, name, f"/{name}/image_raw"),
+            "timeshift_cam_imu": float(c.group(name, "time_offset").value[0]),
+        }
+    comments = [
+        "Cameras for OpenVINS, by icalib.",
+        "T_imu_cam takes coordinates in the camera frame to the imu frame: p_imu = T_imu_cam p_cam.",
+        "T_cn_cnm1 takes those of the camera before to this one's. t_imu = t_cam + timeshift_cam_imu [s].",
+        *(f"cam{i} is {name}." for i, name in enumerate(c.cameras) if name != f"cam{i}"),
+        *sentences,
+    ]
+    files = {"kalibr_imucam_chain.yaml": yaml_text(comments, chain, HEAD), "kalibr_imu_chain.yaml": _imu(c, imu)}
+    return Export(files, sentences)
+
+
+def _offsets(c: Calibration) -> tuple[str, ...]:
+    """OpenVINS moves all images by the first camera's offset."""
+    first = float(c.group(c.cameras[0], "time_offset").value[0])
+    others = {n: float(c.group(n, "time_offset").value[0]) - first for n in c.cameras[1:]}
+    off = [f"{n} by {1e3 * d:+.3f} ms" for n, d in others.items() if abs(d) > _OTHER_OFFSET_S]
+    if not off:
+        return ()
+    return (f"OpenVINS uses the time offset of {c.cameras[0]} for all cameras; from it differ {', '.join(off)}.",)
+
+
+def _imu(c: Calibration, imu: str) -> str:
+    """gyro = Tw R_IMUtoGYRO w + Tg f and accel = Ta R_IMUtoACC f, of rate w and force f in the imu frame."""
+    noise, x = c.rig["sensors"][imu]["noise"], np.zeros(24)
+    found = [g.value for g in c.groups if (g.sensor, g.name) == (imu, "intrinsics") and len(g.value) == 24]
+    x = found[0] if found else x
+    data = {
+        "T_i_b": np.eye(4).tolist(),
+        "accelerometer_noise_density": float(noise["accel"]),
+        "accelerometer_random_walk": float(noise["accel_walk"]),
+        "gyroscope_noise_density": float(noise["gyro"]),
+        "gyroscope_random_walk": float(noise["gyro_walk"]),
+        "rostopic": topic(c, imu, f"/{imu}"),
+        "time_offset": 0.0,
+        "update_rate": float(c.rates[imu]),
+        "model": "kalibr",
+        "Tw": lower(x[6:12]).tolist(),
+        "R_IMUtoGYRO": so3.exp(x[12:15]).tolist(),
+        "Ta": lower(x[:6]).tolist(),
+        "R_IMUtoACC": np.eye(3).tolist(),
+        "Tg": x[15:].reshape(3, 3).tolist(),
+    }
+    comments = [
+        f"{imu} for OpenVINS, by icalib. The imu frame is the body frame. Densities are in continuous time, SI.",
+        "gyro = Tw R_IMUtoGYRO rate + Tg force, accel = Ta R_IMUtoACC force, of rate and force in the imu frame.",
+    ]
+    return yaml_text(comments, {"imu0": data}, HEAD)

@@ -1,0 +1,33 @@
+"""Plain JSON: poses as matrices and quaternions, with standard deviations and verdicts."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import yaml
+
+from icalib.calibration import Calibration
+from icalib.calibration.summary import calibration_yaml, pose_key
+from icalib.export.common import Export, body_frame, guesses, quaternion
+
+
+def plain_json(c: Calibration) -> Export:
+    """calibration.json, with everything of calibration.yaml."""
+    body, key = body_frame(c), pose_key(c)
+    data: dict[str, Any] = {
+        "conventions": {
+            key: f"p_{body} = {key} p_sensor, 4 x 4, m",
+            "quaternion_xyzw": f"the rotation of {key}",
+            "translation": f"the sensor's origin in the {body} frame, m",
+            "time_offset": f"t_{body} = t_sensor + time_offset, s",
+            "std": f"rotation about the sensor's axes, rad; translation along those of {body}, m",
+            "relative": "T_a_b takes coordinates in the frame of b to that of a",
+        }
+    }
+    data |= yaml.safe_load(calibration_yaml(c))
+    for sensor in data["sensors"].values():
+        T = np.array(sensor[key])
+        sensor |= {"quaternion_xyzw": list(quaternion(T[:3, :3])), "translation": T[:3, 3].tolist()}
+    return Export({"calibration.json": json.dumps(data, indent=1, ensure_ascii=False) + "\n"}, guesses(c, c.mounted))

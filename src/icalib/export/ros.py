@@ -1,0 +1,113 @@
+"""ROS 2: a launch file of static transforms, and CameraInfo as camera_info_manager reads it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from icalib.calibration import Calibration
+from icalib.export.common import (
+    Export,
+    Lens,
+    guesses,
+    imu_intrinsics,
+    lens_of,
+    need,
+    no_place_for,
+    quaternion,
+    time_offsets,
+    yaml_text,
+)
+
+_DISTORTION = {
+    "pinhole-radtan": "plumb_bob",
+    "pinhole-radtan5": "plumb_bob",
+    "pinhole-equidistant": "equidistant",
+}
+_LAUNCH = '''\
+{comments}
+from launch import LaunchDescription
+from launch_ros.actions import Node
+
+# child frame: (parent frame, x, y, z [m], quaternion x, y, z, w)
+TRANSFORMS = {{
+{rows}
+}}
+
+
+def generate_launch_description():
+    return LaunchDescription(
+        [
+            Node(
+                package="tf2_ros",
+                executable="static_transform_publisher",
+                name="static_tf_{{}}".format(child.replace("/", "_").replace("-", "_")),
+                arguments=[
+                    "--x", x, "--y", y, "--z", z, "--qx", qx, "--qy", qy, "--qz", qz, "--qw", qw,
+                    "--frame-id", parent, "--child-frame-id", child,
+                ],
+            )
+            for child, (parent, x, y, z, qx, qy, qz, qw) in TRANSFORMS.items()
+        ]
+    )
+'''  # fmt: skip
+
+
+def ros2_static(c: Calibration, frames: Mapping[str, str]) -> Export:
+    """static_transforms.launch.py. frames: sensor -> frame, where the two differ."""
+    others = [name for name in c.mounted if name != c.body]
+    offsets, lenses = time_offsets(c, others), [f"the lens of {name}" for name in c.cameras]
+    wheels = [f"radii and baseline of {name}" for name in c.wheels]
+    sentences = no_place_for("tf", [*offsets, *lenses, *wheels, *imu_intrinsics(c)]) + guesses(c, c.mounted)
+    parent = frames.get(c.body, c.body)
+    comments = [
+        "Static transforms for ROS 2, by icalib.",
+        f"Each is the pose of the child frame in its parent's: p_parent = T p_child, the parent being {parent}.",
+        "Frames of cameras are optical frames: x right, y down, z forward.",
+        *sentences,
+    ]
+    rows = []
+    for name in others:
+        T = c.T_imu_sensor(name)
+        values = [repr(float(v)) for v in (*T[:3, 3], *quaternion(T[:3, :3]))]
+        rows.append(f"    {frames.get(name, name)!r}: {(parent, *values)!r},")
+    text = _LAUNCH.format(comments="\n".join(f"# {line}" for line in comments), rows="\n".join(rows))
+    return Export({"static_transforms.launch.py": text}, sentences)
+
+
+def camera_info(c: Calibration) -> Export:
+    """A file for each camera. Raises CalibrationError without one."""
+    need(c.cameras, "camera", "CameraInfo")
+    lenses = {name: lens_of(c, name, "CameraInfo", tuple(_DISTORTION)) for name in c.cameras}
+    sentences = tuple(lens.sentence for lens in lenses.values() if lens.sentence)
+    away = ["poses", *time_offsets(c, c.mounted), *c.lidars, *c.wheels, *c.pose_sensors, *imu_intrinsics(c)]
+    sentences += no_place_for("CameraInfo", away)
+    return Export({f"{name}.yaml": _info(name, lens, sentences) for name, lens in lenses.items()}, sentences)
+
+
+def _info(name: str, lens: Lens, sentences: tuple[str, ...]) -> str:
+    fx, fy, cx, cy = lens.intrinsics
+    D = lens.distortion + ([0.0] if lens.model == "pinhole-radtan" else [])
+    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    width, height = lens.resolution
+    data = {
+        "image_width": width,
+        "image_height": height,
+        "camera_name": name,
+        "camera_matrix": _matrix(K),
+        "distortion_model": _DISTORTION[lens.model],
+        "distortion_coefficients": _matrix(np.array([D])),
+        "rectification_matrix": _matrix(np.eye(3)),
+        "projection_matrix": _matrix(np.hstack([K, np.zeros((3, 1))])),
+    }
+    comments = [
+        f"CameraInfo of {name}, by icalib. It holds the lens and no pose; pixel (0, 0) is the centre of the first one.",
+        "Not rectified: rectification_matrix is the identity, and projection_matrix that of the camera itself.",
+        *sentences,
+    ]
+    return yaml_text(comments, data)
+
+
+def _matrix(values: np.ndarray) -> dict[str, object]:
+    return {"rows": values.shape[0], "cols": values.shape[1], "data": values.ravel().tolist()}

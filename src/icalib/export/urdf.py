@@ -1,0 +1,146 @@
+"""URDF: a robot of the sensors, or an existing file whose joints' origins are set."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from icalib.calibration import Calibration
+from icalib.export.common import (
+    Export,
+    guesses,
+    imu_intrinsics,
+    inverse,
+    no_place_for,
+    rpy,
+    time_offsets,
+)
+from icalib.export.urdf_tree import Joint, UrdfTree, read_urdf
+
+_TOO_DEEP = 1e-12
+
+
+def urdf(c: Calibration, frames: Mapping[str, str]) -> Export:
+    """sensors.urdf: the body's frame, and the sensors joined to it. frames: sensor -> link, where the two differ."""
+    sentences = _left_out(c)
+    body = frames.get(c.body, c.body)
+    comments = [
+        "Sensors by icalib.",
+        "The origin of a joint is the pose of its child in its parent: p_parent = T p_child, xyz in m, rpy in rad,",
+        "R = Rz(yaw) Ry(pitch) Rx(roll). Links of cameras are optical frames: x right, y down, z forward.",
+        *sentences,
+    ]
+    lines = ['<?xml version="1.0"?>', *(f"<!-- {line.replace('--', '- -')} -->" for line in comments)]
+    lines += ['<robot name="sensors">', f"  <link name={quoteattr(body)}/>"]
+    for name in c.mounted:
+        if name == c.body:
+            continue
+        link, T = frames.get(name, name), c.T_imu_sensor(name)
+        lines += [
+            f"  <link name={quoteattr(link)}/>",
+            f'  <joint name={quoteattr(f"{link}_joint")} type="fixed">',
+            f"    <parent link={quoteattr(body)}/>",
+            f"    <child link={quoteattr(link)}/>",
+            f'    <origin xyz="{_text(T[:3, 3])}" rpy="{_text(rpy(T[:3, :3]))}"/>',
+            "  </joint>",
+        ]
+    return Export({"sensors.urdf": "\n".join([*lines, "</robot>"]) + "\n"}, sentences)
+
+
+def updated_urdf(c: Calibration, path: Path, frames: Mapping[str, str], joints: Mapping[str, str]) -> Export:
+    """The file at `path` with the origins of the joints right above the sensors' links set so that each link has its
+    calibrated pose from the body's. Nothing else changes. frames: sensor -> link, where the two differ; sensors without
+    a link are left out, and said. joints: sensor -> joint to be set instead, further up (an optical frame's camera).
+
+    Raises CalibrationError where the body's link or a link of `frames` is not there, where a joint on the way moves,
+    and where the file would have to be computed (xacro).
+    """
+    tree = read_urdf(path)
+    body = frames.get(c.body, c.body)
+    tree.check_link(body, c.body)
+    sensors = [name for name in c.mounted if name != c.body]
+    for name in sensors:
+        if name in frames:
+            tree.check_link(frames[name], name)
+    links = {name: frames.get(name, name) for name in sensors if frames.get(name, name) in tree.links}
+    if not links:
+        tree.check_link(sensors[0] if sensors else "a sensor", sensors[0] if sensors else "it")
+    # From the root downwards: a joint's new origin holds for all that is below.
+    for name in sorted(links, key=lambda sensor: len(tree.chain(links[sensor]))):
+        tree = _set(tree, body, links[name], joints.get(name), c.T_imu_sensor(name))
+    absent = tuple(f"{path.name} has no link {n}, so {n} was left out." for n in sensors if n not in links)
+    text = tree.content.decode("utf-8", "surrogateescape")
+    return Export({path.name: text}, absent + _left_out(c))
+
+
+def _set(tree: UrdfTree, body: str, link: str, named: str | None, T_body_link: np.ndarray) -> UrdfTree:
+    """The tree with the origin of the joint above `link`, or of the one `named` further up, set."""
+    chain = tree.chain(link)
+    if not chain:
+        raise tree.fail(f"{link} is the root, so no joint can be set for it; join it to {body} or below.")
+    joint = next((j for j in chain if j.name == named), None) if named else chain[0]
+    if joint is None:
+        names = ", ".join(j.name for j in chain)
+        raise tree.fail(f"there is no joint {named} above {link}; above it are {names}; correct --joint.")
+    if joint in tree.chain(body):
+        raise tree.fail(f"{body} is below {link}; the sensors' links must not be above that of {body}.")
+    if joint.type != "fixed":
+        raise tree.fail(f"joint {joint.name} above {link} is {joint.type}; only a fixed joint can hold a calibration.")
+    if joint.in_macro:
+        raise tree.fail(
+            f"joint {joint.name} stands in a xacro macro, where a change would be one for all its uses; expand the "
+            "file first (xacro robot.xacro > robot.urdf)."
+        )
+    origin = inverse(tree.T(body, joint.parent)) @ T_body_link @ inverse(tree.T(joint.child, link))
+    return _with_origin(tree, joint, _text(origin[:3, 3]), _text(rpy(origin[:3, :3])))
+
+
+def _with_origin(tree: UrdfTree, joint: Joint, xyz: str, turn: str) -> UrdfTree:
+    content = tree.content
+    if joint.origin is None:
+        begin = end = joint.start_end
+        gap = re.match(rb"\s*", content[end:])
+        indent = gap.group() if gap and b"\n" in gap.group() else b""
+        new = indent + f'<origin xyz="{xyz}" rpy="{turn}"/>'.encode()
+    else:
+        begin, end = joint.origin
+        new = _attribute(_attribute(content[begin:end], "rpy", turn), "xyz", xyz)
+    shift = len(new) - (end - begin)
+
+    def moved(at: int) -> int:
+        return at + shift if at >= end else at
+
+    joints = []
+    for other in tree.joints:
+        span = other.origin
+        moved_span = None if span is None else (moved(span[0]), moved(span[1]))
+        now = dataclasses.replace(other, start_end=moved(other.start_end), origin=moved_span)
+        if other is joint:
+            at = begin + (len(new) - len(new.lstrip()))
+            now = dataclasses.replace(other, xyz=xyz, rpy=turn, origin=(at, begin + len(new)))
+        joints.append(now)
+    return dataclasses.replace(tree, content=content[:begin] + new + content[end:], joints=tuple(joints))
+
+
+def _attribute(tag: bytes, name: str, value: str) -> bytes:
+    """The start tag with the attribute set; all else as it was."""
+    found = re.search(rb"""(?<=\s)%s\s*=\s*("[^"]*"|'[^']*')""" % name.encode(), tag)
+    if found is None:
+        return re.sub(rb"^<origin", f'<origin {name}="{value}"'.encode(), tag)
+    begin, end = found.span(1)
+    return tag[: begin + 1] + value.encode() + tag[end - 1 :]
+
+
+def _left_out(c: Calibration) -> tuple[str, ...]:
+    away = time_offsets(c, c.mounted) + [f"the lens of {name}" for name in c.cameras]
+    away += [f"radii and baseline of {name}" for name in c.wheels] + imu_intrinsics(c)
+    return no_place_for("URDF", away) + guesses(c, c.mounted)
+
+
+def _text(values: object) -> str:
+    return " ".join(repr(0.0 if abs(v) < _TOO_DEEP else float(v)) for v in np.asarray(values, dtype=np.float64))

@@ -1,0 +1,186 @@
+"""The joints of a URDF or xacro file: who is whose child, where, and where that is written in the file."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from xml.parsers import expat
+
+import numpy as np
+
+from icalib.errors import CalibrationError
+
+_ATTRIBUTES = ("xyz", "rpy")
+
+
+@dataclass
+class Joint:
+    """One joint. xyz [m], rpy [rad]: text of its origin, as written; in_macro: inside a xacro macro.
+
+    start_end: offset behind the joint's start tag [bytes]; origin: begin and end of its origin's start tag, None where
+    it has no origin.
+    """
+
+    name: str
+    type: str
+    in_macro: bool
+    start_end: int
+    parent: str = ""
+    child: str = ""
+    xyz: str = "0 0 0"
+    rpy: str = "0 0 0"
+    origin: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True)
+class UrdfTree:
+    """What stands in the file `path`; content: its bytes. links: names of all links."""
+
+    path: str
+    content: bytes
+    links: tuple[str, ...]
+    joints: tuple[Joint, ...] = field(default=())
+
+    def fail(self, sentence: str) -> CalibrationError:
+        return CalibrationError(f"{self.path}: {sentence}")
+
+    def above(self, link: str) -> Joint | None:
+        """The joint whose child is `link`; None for a root. Raises CalibrationError where there are several."""
+        found = [j for j in self.joints if j.child == link]
+        if len(found) > 1:
+            raise self.fail(
+                f"{link} is the child of {' and '.join(j.name for j in found)}; a link has one joint above."
+            )
+        return found[0] if found else None
+
+    def check_link(self, link: str, sensor: str) -> None:
+        """Raises CalibrationError where there is no such link."""
+        if link not in self.links:
+            named = ", ".join(self.links[:20]) + (", ..." if len(self.links) > 20 else "")
+            raise self.fail(f"there is no link {link}; it has {named}; say which is {sensor}: --frame {sensor}=LINK.")
+
+    def chain(self, link: str) -> list[Joint]:
+        """Joints from `link` up to its root. Raises CalibrationError where they go in a circle."""
+        joints: list[Joint] = []
+        joint = self.above(link)
+        while joint is not None:
+            if joint in joints:
+                raise self.fail(f"joint {joint.name} is above itself; correct the parents.")
+            joints.append(joint)
+            joint = self.above(joint.parent)
+        return joints
+
+    def T(self, frame: str, link: str) -> np.ndarray:
+        """4x4, `link` seen from the link `frame`: p_frame = T p_link. Raises CalibrationError where they are not in one
+        tree, where a joint between can move, or where its origin is not plain numbers."""
+        one, other = self.chain(frame), self.chain(link)
+        roots = {(c[-1].parent if c else name) for c, name in ((one, frame), (other, link))}
+        if len(roots) > 1:
+            raise self.fail(f"{frame} and {link} are not joined; their roots are {' and '.join(sorted(roots))}.")
+        shared = [j for j in one if j in other]
+        up, down = (self._product([j for j in c if j not in shared]) for c in (one, other))
+        return np.linalg.inv(up) @ down
+
+    def is_fixed(self, frame: str, link: str) -> bool:
+        """Whether the two are in one tree and no joint between them moves."""
+        one, other = self.chain(frame), self.chain(link)
+        joined = (one[-1].parent if one else frame) == (other[-1].parent if other else link)
+        return joined and all(j.type == "fixed" for j in [*one, *other] if not (j in one and j in other))
+
+    def _product(self, upwards: list[Joint]) -> np.ndarray:
+        T = np.eye(4)
+        for joint in upwards:
+            if joint.type != "fixed":
+                raise self.fail(f"joint {joint.name} is {joint.type}, not fixed, so what is below it has no one pose.")
+            T = self.origin(joint) @ T
+        return T
+
+    def origin(self, joint: Joint) -> np.ndarray:
+        """4x4 T_parent_child. Raises CalibrationError where it is not plain numbers."""
+        x, y, z = self._numbers(joint, "xyz")
+        roll, pitch, yaw = self._numbers(joint, "rpy")
+        cr, sr, cp, sp, cy, sy = (f(a) for a in (roll, pitch, yaw) for f in (np.cos, np.sin))
+        R = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]]) @ np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+        T = np.eye(4)
+        T[:3, :3] = R @ np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+        T[:3, 3] = x, y, z
+        return T
+
+    def _numbers(self, joint: Joint, name: str) -> list[float]:
+        text = getattr(joint, name)
+        try:
+            values = [float(part) for part in text.split()]
+        except ValueError:
+            values = []
+        if len(values) != 3 or not np.isfinite(values).all():
+            raise self.fail(
+                f'joint {joint.name}: {name}="{text}" is not three plain numbers; expand the file first '
+                "(xacro robot.xacro > robot.urdf)."
+            )
+        return values
+
+
+def read_urdf(path: Path) -> UrdfTree:
+    """The file at `path`. Raises CalibrationError where it cannot be read, is not XML, or has no robot."""
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise CalibrationError(f"{path} cannot be read ({error.strerror or error}); give a URDF file.") from error
+    reader = _Reader(content)
+    try:
+        reader.parser.Parse(content, True)
+    except expat.ExpatError as error:
+        raise CalibrationError(f"{path}:{error.lineno}: this is not XML ({error}); correct it.") from error
+    if reader.root != "robot":
+        raise CalibrationError(f"{path} has <{reader.root}> where a URDF has <robot>; give a URDF or xacro file.")
+    return UrdfTree(str(path), content, tuple(reader.links), tuple(reader.joints))
+
+
+class _Reader:
+    """Collects links and joints while expat goes through the bytes."""
+
+    def __init__(self, content: bytes) -> None:
+        self.content, self.root = content, ""
+        self.links: list[str] = []
+        self.joints: list[Joint] = []
+        self._open: list[str] = []
+        self._joint: Joint | None = None
+        self.parser = expat.ParserCreate()
+        self.parser.StartElementHandler, self.parser.EndElementHandler = self._start, self._end
+
+    def _start(self, name: str, attributes: dict[str, str]) -> None:
+        self.root = self.root or name
+        begin = self.parser.CurrentByteIndex
+        above = self._open[-1] if self._open else ""
+        self._open.append(name)
+        if name == "link" and above != "joint":
+            self.links.append(attributes.get("name", ""))
+        elif name == "joint" and "type" in attributes and self._joint is None:
+            in_macro = "xacro:macro" in self._open
+            end = tag_end(self.content, begin)
+            self._joint = Joint(attributes.get("name", ""), attributes["type"], in_macro, end)
+        elif self._joint is not None and above == "joint":
+            self._part(name, attributes, begin)
+
+    def _part(self, name: str, attributes: dict[str, str], begin: int) -> None:
+        assert self._joint is not None
+        if name in ("parent", "child"):
+            setattr(self._joint, name, attributes.get("link", ""))
+        elif name == "origin":
+            self._joint.origin = begin, tag_end(self.content, begin)
+            for key in _ATTRIBUTES:
+                setattr(self._joint, key, attributes.get(key, "0 0 0"))
+
+    def _end(self, name: str) -> None:
+        self._open.pop()
+        if name == "joint" and self._joint is not None:
+            self.joints.append(self._joint)
+            self._joint = None
+
+
+def tag_end(content: bytes, begin: int) -> int:
+    """Offset behind the start tag that begins at `begin`; > may stand inside quotes."""
+    found = re.compile(rb"""<(?:[^>"']|"[^"]*"|'[^']*')*>""").match(content, begin)
+    assert found is not None, "expat has read a tag here"
+    return found.end()

@@ -1,0 +1,84 @@
+"""One of several recordings by itself: each has a world of its own, and first guesses look at one at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from dataclasses import replace
+
+import numpy as np
+
+from icalib.estimation.assembly import Inputs, origin_difference
+from icalib.estimation.imu_data import imu_data
+from icalib.estimation.state import Key, State
+from icalib.measurements import LidarStream
+from icalib.recordings.several import naming
+
+
+def alone(inputs: Inputs, k: int) -> Inputs:
+    """The recording number `k` of a rig with an IMU, on clocks of its own."""
+    if len(inputs.parts) == 1:
+        return inputs
+    part = inputs.parts[k]
+    own = replace(part, shift_ns=0, begin=0.0)
+    return replace(inputs, measurements=part.measurements, imu=imu_data(inputs.rig, part.measurements), parts=(own,))
+
+
+def naming_recording(inputs: Inputs, k: int) -> AbstractContextManager[None]:
+    """Errors raised within begin with the name of recording `k`, where there are several."""
+    return naming(inputs.parts[k].name if len(inputs.parts) > 1 else "")
+
+
+def motion_alone(inputs: Inputs, k: int, state: State) -> State:
+    """What `state` has of recording `k`, on its own clock."""
+    if len(inputs.parts) == 1:
+        return state
+    own = state.recordings[k]
+    seconds = state.seconds[own] - inputs.parts[k].begin
+    return State(seconds, state.rotation[own], state.position[own], state.velocity[own], state.bias[own], state.values)
+
+
+def one_after_another(inputs: Inputs, states: Sequence[State], values: dict[Key, np.ndarray]) -> State:
+    """All recordings' own states as one, with the lasting parameters `values`."""
+    if len(states) == 1:
+        return replace(states[0], values=values)
+    seconds = np.concatenate([s.seconds + part.begin for s, part in zip(states, inputs.parts, strict=True)])
+    rotation, position, velocity, bias = (
+        np.concatenate([getattr(s, name) for s in states]) for name in ("rotation", "position", "velocity", "bias")
+    )
+    starts = np.cumsum([0, *(len(s.seconds) for s in states[:-1])])
+    return State(seconds, rotation, position, velocity, bias, values, tuple(int(k) for k in starts))
+
+
+def other_clocks(offset: float, sensor: str, before: Inputs, now: Inputs) -> float:
+    """A time offset between first stamps as `before` has them, between those that `now` has."""
+    shifts = (origin_difference(i.measurements, i.stream(sensor)) for i in (now, before))
+    return offset + next(shifts) - next(shifts)
+
+
+def most_points(inputs: Inputs, lidar: int) -> int:
+    """The recording that has most points of a LiDAR, given by its number."""
+    return int(np.argmax([len(part.measurements.lidars[lidar].xyz) for part in inputs.parts]))
+
+
+def points_by_recording(inputs: Inputs) -> list[tuple[LidarStream, ...]]:
+    """All LiDARs' points of each recording, on the joined clock; scans of the others stay, without points."""
+    streams = inputs.measurements.lidars
+    if len(inputs.parts) == 1:
+        return [streams]
+    scans = [[len(part.measurements.lidars[i].stamps_ns) for part in inputs.parts] for i in range(len(streams))]
+    own = [np.repeat(np.arange(len(n)), n) for n in scans]
+    return [
+        tuple(with_points(s, np.repeat(o == r, np.diff(s.start))) for s, o in zip(streams, own, strict=True))
+        for r in range(len(inputs.parts))
+    ]
+
+
+def with_points(stream: LidarStream, kept: np.ndarray) -> LidarStream:
+    """The stream with the points in `kept` (N,) bool; its scans stay, if empty."""
+    if kept.all():
+        return stream
+    start = np.concatenate([[0], np.cumsum(kept)])[stream.start].astype(np.int64)
+    return LidarStream(
+        stream.name, stream.stamps_ns, start, stream.offset_s[kept], stream.xyz[kept], stream.plane[kept]
+    )

@@ -1,0 +1,123 @@
+"""Commands that look at results and sensors: `icalib allan`, and what others do with a calibration."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+
+def add_result_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Adds the parsers to those of the other commands."""
+    _add_allan(commands)
+    _add_export(commands)
+    _add_compare(commands)
+
+
+def _add_allan(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    c = commands.add_parser("allan", help="noise densities and bias walks of an IMU, from a recording of it at rest")
+    c.add_argument("recording", type=Path, help="folder of the recording, or bag: hours of an IMU that stands still")
+    c.add_argument("--imu", metavar="TOPIC", help="topic or table of the IMU; by default the only one")
+    c.add_argument("--output", "-o", type=Path, required=True, help="folder for plot, figures and rig file fields")
+    c.add_argument("--quiet", "-q", action="store_true", help="no table")
+    c.set_defaults(run=_allan)
+
+
+def _allan(options: argparse.Namespace) -> None:
+    from icalib.allan import study_recording, write_study
+    from icalib.allan.files import check_folder
+    from icalib.allan.words import print_study
+
+    check_folder(options.output)
+    study = study_recording(options.recording, options.imu)
+    write_study(study, options.output)
+    if not options.quiet:
+        print_study(study)
+        print(f"Wrote {options.output / 'allan.html'}, allan.json and noise.yaml.")
+
+
+def _add_export(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    from icalib.export.names import FORMATS, ONE_FILE
+
+    c = commands.add_parser("export", help="a result as files of other programs")
+    c.add_argument("result", type=Path, help="folder that a calibration was written to")
+    c.add_argument("--to", required=True, choices=FORMATS, help="whose files")
+    where = f"folder for the files; for {', '.join(ONE_FILE)} the file itself"
+    c.add_argument("--output", "-o", type=Path, required=True, metavar="PATH", help=where)
+    c.add_argument("--urdf", type=Path, metavar="FILE", help="existing URDF: set the origins of its joints")
+    frame = "name of a sensor's frame or link, where it is not the sensor's (ros2-static, urdf); may be repeated"
+    c.add_argument("--frame", type=_pair, action="append", default=[], metavar="SENSOR=FRAME", help=frame)
+    joint = "joint to set in --urdf, by default the one right above the sensor's link; may be repeated"
+    c.add_argument("--joint", type=_pair, action="append", default=[], metavar="SENSOR=JOINT", help=joint)
+    c.add_argument("--quiet", "-q", action="store_true", help="do not say what the format cannot hold")
+    c.set_defaults(run=_export)
+
+
+def _pair(text: str) -> tuple[str, str]:
+    name, equals, value = text.partition("=")
+    if not (name and equals and value):
+        raise argparse.ArgumentTypeError(f"must be SENSOR=NAME, but is {text!r}")
+    return name, value
+
+
+def _export(options: argparse.Namespace) -> None:
+    from icalib.calibration import load_calibration
+    from icalib.export.formats import export
+    from icalib.export.names import ONE_FILE
+    from icalib.text_files import write_texts
+
+    calibration = load_calibration(options.result)
+    found = export(calibration, options.to, dict(options.frame), options.urdf, dict(options.joint))
+    files, folder = found.files, options.output
+    if options.to in ONE_FILE:
+        files, folder = {options.output.name: next(iter(files.values()))}, options.output.parent
+    write_texts(folder, files)
+    if not options.quiet:
+        for sentence in found.sentences:
+            print(f"Note: {sentence}")
+        print(f"Wrote {', '.join(str(folder / name) for name in files)}.")
+
+
+def _add_compare(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    kinds = "folder of a result, Kalibr camchain or imu file, URDF, or rig file with typed values"
+    about = "what changed from A to B, in words; exit code 0: the same, 1: something differs, 2: an error"
+    c = commands.add_parser("compare", help=about, description=about[0].upper() + about[1:] + ".")
+    c.add_argument("a", type=Path, metavar="A", help=kinds)
+    c.add_argument("b", type=Path, metavar="B", help="the same")
+    tolerance = "differences up to it do not count: deg, mm, ms, px or percent; may be repeated, as in deg=0.1"
+    c.add_argument("--tolerance", type=_tolerance, action="append", default=[], metavar="UNIT=VALUE", help=tolerance)
+    c.add_argument("--sigma", type=float, default=3.0, metavar="N", help="nor those up to N sigma; by default 3")
+    frame = "name in B of a sensor of A, or its link in a URDF, where it is another; may be repeated"
+    c.add_argument("--frame", type=_pair, action="append", default=[], metavar="SENSOR=NAME", help=frame)
+    c.add_argument("--json", type=Path, metavar="FILE", help="write the differences as JSON")
+    c.add_argument("--quiet", "-q", action="store_true", help="print nothing; the exit code says it")
+    c.set_defaults(run=_compare, error_code=2)
+
+
+def _tolerance(text: str) -> tuple[str, float]:
+    from icalib.comparison.units import UNITS
+
+    unit, _, number = text.partition("=")
+    try:
+        value = float(number)
+    except ValueError:
+        value = -1.0
+    if unit not in UNITS or not 0.0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(
+            f"must be UNIT=VALUE with a unit of {', '.join(UNITS)} and a number from 0 up, but is {text!r}"
+        )
+    return unit, value
+
+
+def _compare(options: argparse.Namespace) -> int:
+    from icalib.comparison.compare import Tolerances
+    from icalib.comparison.reading import compare_files
+    from icalib.comparison.words import comparison_json, lines
+    from icalib.text_files import write_texts
+
+    tolerances = Tolerances(**dict(options.tolerance))
+    found = compare_files(options.a, options.b, dict(options.frame), tolerances, options.sigma)
+    if options.json:
+        write_texts(options.json.parent, {options.json.name: comparison_json(found)})
+    if not options.quiet:
+        print("\n".join(lines(found)))
+    return 0 if found.same else 1

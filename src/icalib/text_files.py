@@ -1,0 +1,43 @@
+"""Text files that nobody sees half of."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+
+from icalib.errors import CalibrationError
+
+
+def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
+    """Writes `texts` (name -> content) into `folder`, which is made where absent: each file is the old one or the new
+    one whole, and none is touched before all are written. Raises CalibrationError where that is not possible."""
+    parts: dict[str, Path] = {}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        mode = 0o666 & ~_umask()
+        for name, text in texts.items():
+            with tempfile.NamedTemporaryFile(
+                "w", encoding="utf-8", errors="surrogateescape", newline="", dir=folder, suffix=".part", delete=False
+            ) as file:
+                parts[name] = Path(file.name)
+                file.write(text)
+            parts[name].chmod(mode)
+        for name, part in parts.items():
+            part.replace(folder / name)
+    except OSError as error:
+        raise CalibrationError(
+            f"{folder} cannot be written ({error.strerror or error}); choose another place."
+        ) from error
+    finally:
+        for part in parts.values():
+            with contextlib.suppress(OSError):
+                part.unlink()
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

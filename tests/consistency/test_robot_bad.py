@@ -1,0 +1,171 @@
+"""Bad input from LiDARs and wheels: one sentence, or a warning that says what is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from icalib.calibration import Calibration
+from icalib.errors import CalibrationError
+from icalib.measurements import LidarStream, Measurements, WheelStream
+from icalib.pipeline import calibrate_measurements
+from icalib.rig import Rig
+from icalib.simulation import Simulation, rig_for, simulate, with_drawn_guess
+
+MOUNTS = ("rotation", "translation", "time_offset")
+SCAN_S = 0.125
+Damage = Callable[[LidarStream], LidarStream]
+
+
+@pytest.fixture(scope="module")
+def drive(robot):
+    """A simulated drive: the paper's example, its length, what stands on the robot, how it moves if not as there."""
+
+    @cache
+    def run(example: str, seconds: float, parts: str, kind: str = "") -> Simulation:
+        scenario = robot(example, seconds, parts, 300)
+        if kind:
+            scenario = replace(scenario, motion=replace(scenario.motion, kind=kind))
+        return simulate(scenario, 1)
+
+    return run
+
+
+def guessed(simulation: Simulation) -> Rig:
+    return with_drawn_guess(rig_for(simulation.scenario), simulation.scenario, 1, only=MOUNTS)
+
+
+def with_wheels(measurements: Measurements, damage: Callable[[WheelStream], WheelStream]) -> Measurements:
+    return replace(measurements, wheels=tuple(damage(w) for w in measurements.wheels if isinstance(w, WheelStream)))
+
+
+def with_scans(measurements: Measurements, damage: Damage) -> Measurements:
+    """Damaged scans, of which nobody knows what lies on which plane."""
+    damaged = (damage(x) for x in measurements.lidars)
+    return replace(measurements, lidars=tuple(replace(x, plane=np.full(len(x.xyz), -1, np.int32)) for x in damaged))
+
+
+def refusal(rig: Rig, measurements: Measurements) -> str:
+    with pytest.raises(CalibrationError) as caught:
+        calibrate_measurements(rig, measurements)
+    return str(caught.value)
+
+
+TURNED = [
+    (lambda rate: rate * [1.0, -1.0], "wheel0.*opposite directions"),
+    (lambda rate: -rate, "wheel0.*swapped, or both count backwards"),
+    (lambda rate: rate[:, ::-1].copy(), "wheel0.*swapped, or both count backwards"),
+    (lambda rate: rate * [1.0, 0.0], "wheel0.*the right wheel did not turn"),
+    (lambda rate: rate * 0.0, "wheel0.*the left and the right wheel did not turn"),
+    (lambda rate: np.rad2deg(rate), "wheel0.*radii of 0.00.*not degrees"),
+    (lambda rate: np.random.default_rng(0).normal(size=rate.shape), "wheel0 does not match that of imu0"),
+]
+
+
+@pytest.mark.parametrize(("damage", "words"), TURNED, ids=[words for _, words in TURNED])
+def test_wheels_that_cannot_be(drive, damage, words: str):
+    simulation = drive("ramp", 16.0, "cw")
+    broken = with_wheels(simulation.measurements, lambda w: replace(w, rate=damage(w.rate)))
+    with pytest.raises(CalibrationError, match=words):
+        calibrate_measurements(rig_for(simulation.scenario), broken)
+
+
+def test_wheels_that_never_turned_while_the_camera_looked(drive):
+    simulation = drive("ramp", 16.0, "cw")
+    late = with_wheels(simulation.measurements, lambda w: replace(w, stamps_ns=w.stamps_ns + np.int64(10**12)))
+    assert "no reading of the wheels falls within" in refusal(guessed(simulation), late)
+
+
+@pytest.mark.parametrize(
+    ("kind", "parts", "words"),
+    [
+        ("straight-line", "cw", "wheel0: the vehicle turned at 0.00"),
+        ("arc", "cw", "one and the same arc"),
+        ("standing", "cw", "motionless|hardly turn"),
+        ("standing", "lw", "hardly turn"),
+        ("arc", "lw", "one and the same arc"),
+        ("planar", "w", "wheel0 and imu0 do not show the motion"),
+    ],
+)  # fmt: skip
+def test_drives_that_show_too_little(drive, kind: str, parts: str, words: str):
+    simulation = drive("planar", 16.0, parts, kind)
+    rig = rig_for(simulation.scenario) if kind == "standing" else guessed(simulation)
+    with pytest.raises(CalibrationError, match=words):
+        calibrate_measurements(rig, simulation.measurements)
+
+
+def open_field(x: LidarStream) -> LidarStream:
+    return replace(x, xyz=np.random.default_rng(0).normal(scale=15.0, size=x.xyz.shape).astype(np.float32))
+
+
+def one_wall(x: LidarStream) -> LidarStream:
+    own = x.plane == 1
+    start = np.concatenate([[0], np.cumsum(own)])[x.start].astype(np.int64)
+    return LidarStream(x.name, x.stamps_ns, start, x.offset_s[own], x.xyz[own], x.plane[own])
+
+
+def mirrored(x: LidarStream) -> LidarStream:
+    return replace(x, xyz=x.xyz * np.array([1.0, -1.0, 1.0], np.float32))
+
+
+def milliseconds(x: LidarStream) -> LidarStream:
+    return replace(x, offset_s=x.offset_s * np.float32(1e3))
+
+
+SEEN: list[tuple[Damage, str]] = [
+    (open_field, "lidar0.*too few flat surfaces"),
+    (one_wall, "lidar0"),
+    (mirrored, "lidar0 turns as imu0 does, but moves the other way"),
+    (milliseconds, "lidar0.*point times may be wrong"),
+]
+
+
+@pytest.mark.parametrize(("damage", "words"), SEEN)
+def test_clouds_that_cannot_be(drive, damage: Damage, words: str):
+    simulation = drive("3d", 12.0, "l")
+    with pytest.raises(CalibrationError, match=words):
+        calibrate_measurements(rig_for(simulation.scenario), with_scans(simulation.measurements, damage))
+
+
+def calibrated(simulation: Simulation, damage: Damage) -> Calibration:
+    return calibrate_measurements(rig_for(simulation.scenario), with_scans(simulation.measurements, damage))
+
+
+def test_points_without_numbers_and_at_zero_are_left_out(drive):
+    def damage(x: LidarStream) -> LidarStream:
+        xyz = x.xyz.copy()
+        xyz[::7], xyz[::11] = np.nan, 0.0
+        return replace(x, xyz=xyz)
+
+    simulation = drive("3d", 12.0, "l")
+    result = calibrated(simulation, damage)
+    assert result.converged
+    off = result.group("lidar0", "translation").value - simulation.truth.T_imu_lidar["lidar0"][:3, 3]
+    assert np.linalg.norm(off) < 5e-3
+
+
+def test_stamps_of_the_end_of_scans_are_told(drive):
+    def damage(x: LidarStream) -> LidarStream:
+        return replace(x, stamps_ns=x.stamps_ns + np.int64(SCAN_S * 1e9))
+
+    result = calibrated(drive("3d", 12.0, "l"), damage)
+    assert any("about the period of its scans" in w and "point_time" in w for w in result.warnings)
+
+
+def test_points_in_the_reverse_order_are_told(drive):
+    """Most of them lie on no plane; nothing in the numbers alone would say so."""
+
+    def damage(x: LidarStream) -> LidarStream:
+        return replace(x, offset_s=np.float32(SCAN_S) - x.offset_s)
+
+    simulation = drive("3d", 12.0, "l")
+    try:
+        result = calibrate_measurements(guessed(simulation), with_scans(simulation.measurements, damage))
+    except CalibrationError as error:
+        assert "lidar0" in str(error)
+    else:
+        assert any("of the points of lidar0 lie on planes" in w for w in result.warnings)

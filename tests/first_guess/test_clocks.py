@@ -1,0 +1,51 @@
+"""Angular rates of a camera and an IMU side by side, with more noise in an image than motion between two."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from icalib.errors import EstimationError
+from icalib.estimation.imu_data import ImuData
+from icalib.first_guess.clocks import CameraRates, align
+from icalib.measurements import ImuStream
+from icalib.rig import ImuNoise
+from icalib.simulation.imu import rotation_from_vector
+
+R_IMU_CAM = rotation_from_vector(np.array([0.4, -1.1, 0.7]))
+OFFSET = 0.04
+NOISE_RAD = 0.02  # of one image's rotation: at 20 Hz 0.57 rad/s of the rate, as fast as the motion
+
+
+def _rate(seconds: np.ndarray) -> np.ndarray:
+    """About 0.5 rad/s about each axis, of ten frequencies below 0.8 Hz."""
+    rng = np.random.default_rng(0)
+    omega, phase = rng.uniform(0.5, 5.0, (3, 10)), rng.uniform(0.0, 6.0, (3, 10))
+    return 0.22 * np.sin(seconds[:, None, None] * omega + phase).sum(axis=2)
+
+
+def _imu(scale: float) -> ImuData:
+    seconds = np.arange(0.0, 40.0, 0.005)
+    stream = ImuStream("imu0", (1e9 * seconds).astype(np.int64), scale * _rate(seconds), np.zeros((len(seconds), 3)))
+    return ImuData.build(stream, ImuNoise(1e-3, 1e-2, 1e-5, 1e-4))
+
+
+def _camera(seed: int) -> CameraRates:
+    """20 Hz: an error of an image is in the rate before it and, the other way round, in the rate after it."""
+    seconds = np.arange(0.5, 39.0, 0.05)
+    error = np.random.default_rng(seed).normal(scale=NOISE_RAD, size=(len(seconds), 3))
+    rate = _rate(0.5 * (seconds[:-1] + seconds[1:])) @ R_IMU_CAM + np.diff(error, axis=0) / 0.05
+    return CameraRates(seconds[:-1] - OFFSET, seconds[1:] - OFFSET, rate, least_correlation=0.3)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_noise_of_the_images_is_not_taken_for_another_scale(seed: int):
+    found = align(_imu(1.0), "cam0", _camera(seed), None)
+    assert found.offset == pytest.approx(OFFSET, abs=0.02)
+    assert np.trace(found.rotation.T @ R_IMU_CAM) > 2.99
+
+
+@pytest.mark.parametrize(("scale", "words"), [(1.4, "turns 1.[34]"), (180.0 / np.pi, "deg/s")])
+def test_another_scale_is_named(scale: float, words: str):
+    with pytest.raises(EstimationError, match=words):
+        align(_imu(scale), "cam0", _camera(0), None)
