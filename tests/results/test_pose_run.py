@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -10,6 +12,8 @@ import yaml
 
 from icalib.calibration import Calibration, load_calibration
 from icalib.cli import main
+from icalib.comparison.reading import compare_files
+from icalib.export.formats import export
 from icalib.rig_file import rig_to_dict
 from icalib.simulation import Scenario, load_scenario, rig_for
 
@@ -68,6 +72,32 @@ def test_residuals_are_kept(found: Calibration):
     assert r.residual.shape == (len(r.seconds), 6) and len(r.seconds) > 480
     np.testing.assert_allclose(r.whitened, r.residual / 2e-3, rtol=1e-9)
     assert (np.diff(r.seconds) > 0).all() and r.whitened.std() == pytest.approx(1.0, abs=0.06)
+
+
+def test_it_is_exported(found: Calibration):
+    sensor = json.loads(export(found, "json").files["calibration.json"])["sensors"]["mocap0"]
+    np.testing.assert_array_equal(sensor["T_imu_sensor"], found.T_imu_sensor("mocap0"))
+    robot = ElementTree.fromstring(export(found, "urdf").files["sensors.urdf"])
+    (origin,) = robot.findall("joint[@name='mocap0_joint']/origin")
+    position = np.array(origin.attrib["xyz"].split(), dtype=np.float64)
+    np.testing.assert_allclose(position, found.group("mocap0", "translation").value)
+    (text,) = export(found, "ros2-static").files.values()
+    assert "'mocap0': ('imu0', " in text
+
+
+def test_it_is_compared_with_what_is_typed_into_a_rig_file(out: Path, found: Calibration, tmp_path: Path):
+    rig = yaml.safe_load((out.parent / "rig.yaml").read_text())
+    typed = {name: found.group("mocap0", name).value for name in ("rotation", "translation", "time_offset")}
+    typed["translation"] = typed["translation"] + [0.0, 0.0, 0.05]
+    rig["sensors"]["mocap0"] |= {name: {"guess": value.tolist()} for name, value in typed.items()}
+    (tmp_path / "cad.yaml").write_text(yaml.safe_dump(rig))
+    differences = compare_files(out, tmp_path / "cad.yaml").differences
+    (moved,) = [d for d in differences if d.differs]
+    assert (moved.sensor, moved.what) == ("mocap0", "translation")
+    np.testing.assert_allclose(moved.vector, [0.0, 0.0, 50.0], atol=1e-6)
+    same = {d.what for d in differences if d.sensor == "mocap0"} - {"translation"}
+    assert same == {"rotation", "time offset"}
+    assert not any(d.differs for d in compare_files(out, out).differences)
 
 
 def test_the_files_speak_of_it_and_not_of_its_frame(found: Calibration, out: Path):
