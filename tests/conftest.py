@@ -39,3 +39,9 @@ def euroc() -> Path:
 def aprilgrid_images() -> Path:
     """Stereo stills of the same board by the same cameras, with another detector's corners."""
     return _recording("aprilgrid_images")
+
+
+@pytest.fixture(scope="session")
+def odometry_logs() -> Path:
+    """Rates, poses of a LiDAR odometry and IMU readings of two rigs, as LI-Init logged them, and its results."""
+    return _recording("lidar_imu_odometry")

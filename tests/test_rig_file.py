@@ -329,9 +329,9 @@ def test_other_targets_are_read_and_written(tmp_path, text, target):
 def test_two_imus_no_camera(tmp_path):
     imu, rest = "  imu0: {type: imu}\n", f"target: {TARGET}\n"
     camera = "  cam0: {type: camera, model: pinhole-radtan, resolution: [752, 480]}\n"
-    assert "there is no camera and no LiDAR" in complaint(tmp_path, "sensors:\n" + imu + rest)
+    assert "there is no camera, no LiDAR and no pose sensor" in complaint(tmp_path, "sensors:\n" + imu + rest)
     wheels = "  wheel0: {type: wheels}\n"
-    assert "there is no camera and no LiDAR" in complaint(tmp_path, "sensors:\n" + imu + wheels + rest)
+    assert "there is no camera, no LiDAR and no pose sensor" in complaint(tmp_path, "sensors:\n" + imu + wheels + rest)
     assert "sensors.wheel0: needs an IMU" in complaint(tmp_path, "sensors:\n" + camera + wheels + rest)
     second = complaint(tmp_path, "sensors:\n" + imu + "  imu1: {type: imu}\n" + camera + rest)
     assert "rig.yaml:3: sensors.imu1: is a second IMU beside imu0" in second

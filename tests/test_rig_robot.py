@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from icalib.errors import RigError
-from icalib.rig import Lidar, Parameter, Rig, Wheels
+from icalib.rig import Lidar, Parameter, PoseSensor, Rig, Wheels
 from icalib.rig_file import load_rig, rig_to_dict
 
 ROBOT = """\
@@ -43,6 +43,13 @@ sensors:
     joints: [l, r]
   wheel1: {type: wheels, meaning: instant}
   wheel2: {type: wheels, measures: poses}
+  mocap0:
+    type: pose
+    topic: /vrpn/robot
+    rotation_noise: 0.002
+    position_noise: 0.001
+    time_offset: {prior: 0.1, sigma: 0.01}
+  odom0: {type: pose, kind: relative, path: other/trajectory.tum}
 """
 
 
@@ -78,12 +85,34 @@ def test_lidars_and_wheels_are_read(tmp_path):
     assert poses == Wheels("wheel2", "wheel2/poses.csv", measures="poses", factor="relative-poses")
 
 
+def test_pose_sensors_are_read(tmp_path):
+    mocap, odom = load(tmp_path, ROBOT).poses
+    assert (mocap.name, mocap.path, mocap.kind, mocap.topic) == (
+        "mocap0",
+        "mocap0/poses.csv",
+        "absolute",
+        "/vrpn/robot",
+    )
+    assert (mocap.rotation_noise, mocap.position_noise) == (0.002, 0.001)
+    assert (mocap.time_offset.mode, mocap.rotation) == ("prior", Parameter())
+    assert odom == PoseSensor("odom0", "other/trajectory.tum", "relative")
+
+
+def test_an_imu_and_a_pose_sensor_are_enough(tmp_path):
+    rig = load(tmp_path, "sensors:\n  imu0: {type: imu}\n  mocap0: {type: pose}\n")
+    assert (rig.cameras, rig.lidars, [p.name for p in rig.poses]) == ((), (), ["mocap0"])
+    words = complaint(tmp_path, "sensors:\n  mocap0: {type: pose}\n")
+    assert "sensors.mocap0: needs an IMU" in words
+
+
 def test_plain_lidars_and_wheels_load_back(tmp_path):
     plain = rig_to_dict(load(tmp_path, ROBOT))
     again = load(tmp_path, yaml.safe_dump(plain, sort_keys=False))
     assert rig_to_dict(again) == plain
     first = load(tmp_path, ROBOT)
-    for a, b in zip((*again.lidars, *again.wheels), (*first.lidars, *first.wheels), strict=True):
+    for a, b in zip(
+        (*again.lidars, *again.wheels, *again.poses), (*first.lidars, *first.wheels, *first.poses), strict=True
+    ):
         for one in dataclasses.fields(a):
             p, q = getattr(a, one.name), getattr(b, one.name)
             assert repr(p) == repr(q), one.name
@@ -112,6 +141,17 @@ def test_plain_lidars_and_wheels_load_back(tmp_path):
         ("[l, r]", "[l]", "sensors.wheel0.joints: must be the names of two joints, [left, right]"),
         ("[l, r]", "[l, l]", "sensors.wheel0.joints: must be the names of two joints, [left, right]"),
         ("measures: poses", "measures: poses, factor: increments", "sensors.wheel2.factor: increments cannot be had"),
+        (
+            "kind: relative",
+            "kind: drifting",
+            "odom0.kind: there is no such choice as 'drifting'; available are absolute",
+        ),
+        ("position_noise: 0.001", "position_noise: 0", "sensors.mocap0.position_noise: must be above 0"),
+        (
+            "position_noise: 0.001",
+            "position_nose: 1",
+            "mocap0.position_nose: there is no such field, did you mean 'pos",
+        ),
         ("  imu0: {type: imu}\n", "", "rig.yaml:3: sensors.lidar0: needs an IMU; add a sensor of type: imu"),
     ],
 )
@@ -125,8 +165,9 @@ def test_examples_of_the_page_are_right(tmp_path):
     blocks = [block.split("```")[0] for block in page.split("```yaml\nsensors:\n")[2:]]
     rig = load(tmp_path, "sensors:\n  imu0: {type: imu}\n" + "".join(blocks))
     assert ([s.name for s in rig.lidars], [w.name for w in rig.wheels]) == (["lidar0"], ["wheel0"])
+    assert [s.name for s in rig.poses] == ["mocap0"]
     rows = [line for line in page.splitlines() if line.startswith("| `")]
-    for field in (f for kind in (Lidar, Wheels) for f in dataclasses.fields(kind)):
+    for field in (f for kind in (Lidar, Wheels, PoseSensor) for f in dataclasses.fields(kind)):
         if isinstance(field.default, (str, float)):
             name = field.name.removesuffix("_m")
             found = [row.split("|")[2] for row in rows if f"`{name}`" in row.split("|")[1]]

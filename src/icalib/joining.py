@@ -14,6 +14,7 @@ from icalib.measurements import (
     ImuStream,
     LidarStream,
     Measurements,
+    PoseStream,
     TrackStream,
     WheelPoses,
     WheelStream,
@@ -58,9 +59,11 @@ def join(rig: Rig, recordings: Sequence[Measurements]) -> tuple[Measurements, tu
     return (_joined(recordings, shifts) if len(recordings) > 1 else recordings[0]), parts
 
 
-def _streams(measurements: Measurements) -> list[ImuStream | CornerStream | LidarStream | WheelStream | WheelPoses]:
+def _streams(
+    measurements: Measurements,
+) -> list[ImuStream | CornerStream | LidarStream | WheelStream | WheelPoses | PoseStream]:
     imus = [] if measurements.imu is None else [measurements.imu]
-    return [*imus, *measurements.cameras, *measurements.lidars, *measurements.wheels]
+    return [*imus, *measurements.cameras, *measurements.lidars, *measurements.wheels, *measurements.poses]
 
 
 def _shifts(rig: Rig, recordings: Sequence[Measurements]) -> list[int]:
@@ -96,9 +99,11 @@ def _joined(recordings: Sequence[Measurements], shifts: list[int]) -> Measuremen
     notes = tuple(f"{m.name}: {note}" for m in recordings for note in m.notes)
     lidars = (join_scans([(m.lidars[k], shift) for m, shift in shifted]) for k in range(len(recordings[0].lidars)))
     wheels = (join_wheels([(m.wheels[k], shift) for m, shift in shifted]) for k in range(len(recordings[0].wheels)))
+    poses = (join_poses([(m.poses[k], shift) for m, shift in shifted]) for k in range(len(recordings[0].poses)))
     return Measurements(
-        imu, tuple(cameras), notes, tracks=_joined_tracks(shifted), lidars=tuple(lidars), wheels=tuple(wheels)
-    )
+        imu, tuple(cameras), notes, tracks=_joined_tracks(shifted), lidars=tuple(lidars), wheels=tuple(wheels),
+        poses=tuple(poses),
+    )  # fmt: skip
 
 
 def _joined_tracks(recordings: list[tuple[Measurements, int]]) -> tuple[TrackStream, ...]:
@@ -152,3 +157,10 @@ def join_wheels(streams: list[tuple[WheelStream | WheelPoses, int]]) -> WheelStr
     first = streams[0][0]
     assert isinstance(first, WheelStream)  # see above
     return WheelStream(first.name, np.concatenate(stamps), np.concatenate(rates), first.meaning)
+
+
+def join_poses(streams: list[tuple[PoseStream, int]]) -> PoseStream:
+    """The poses of all recordings, each with what to add to its stamps [ns]; each recording has a frame of its own."""
+    stamps = np.concatenate([s.stamps_ns + np.int64(shift) for s, shift in streams])
+    rotation, position = (np.concatenate([getattr(s, name) for s, _ in streams]) for name in ("rotation", "position"))
+    return PoseStream(streams[0][0].name, stamps, rotation, position)

@@ -228,6 +228,36 @@ class WheelPoses:
 
 
 @dataclass(frozen=True)
+class PoseStream:
+    """Where a sensor said that it was: its poses in a frame that stands still, or nearly so.
+
+    stamps_ns (N,) int64, strictly increasing; rotation (N, 3, 3) R_frame_sensor; position (N, 3) p_frame_sensor [m].
+    """
+
+    name: str
+    stamps_ns: np.ndarray
+    rotation: np.ndarray
+    position: np.ndarray
+
+    def __post_init__(self) -> None:
+        n = len(self.stamps_ns)
+        _check(self.stamps_ns.dtype == np.int64, f"{self.name}: stamps must be int64 nanoseconds.")
+        shape = self.rotation.shape
+        _check(shape == (n, 3, 3), f"{self.name}: rotation must have shape ({n}, 3, 3), not {shape}.")
+        shape = self.position.shape
+        _check(shape == (n, 3), f"{self.name}: position must have shape ({n}, 3), not {shape}.")
+
+    @property
+    def origin_ns(self) -> int:
+        return int(self.stamps_ns[0])
+
+    @property
+    def seconds(self) -> np.ndarray:
+        """(N,) seconds since this clock's own first stamp."""
+        return seconds_since(self.stamps_ns, self.origin_ns)
+
+
+@dataclass(frozen=True)
 class Measurements:
     """Everything one recording holds that the rig asks for."""
 
@@ -238,6 +268,7 @@ class Measurements:
     tracks: tuple[TrackStream, ...] = ()
     lidars: tuple[LidarStream, ...] = ()
     wheels: tuple[WheelStream | WheelPoses, ...] = ()
+    poses: tuple[PoseStream, ...] = ()
 
     @property
     def origin_ns(self) -> int:

@@ -129,6 +129,28 @@ class Wheels:
     joints: tuple[str, str] | None = None  # left, right in JointState; None: told by "left" and "right" in the names
 
 
+PoseKind = Literal["absolute", "relative"]
+
+
+@dataclass(frozen=True)
+class PoseSensor:
+    """Something that says where it is: motion capture, or another program's odometry.
+
+    absolute: in a frame that stands still, whose place in the world is estimated; noise is white, rad and m. relative:
+    only the way from each pose to the next counts; noise is a random walk, rad/sqrt(s) and m/sqrt(s).
+    """
+
+    name: str
+    path: str
+    kind: PoseKind = "absolute"
+    rotation_noise: float | None = None  # of each axis; None: estimated from the residuals
+    position_noise: float | None = None
+    rotation: Parameter = Parameter()
+    translation: Parameter = Parameter()
+    time_offset: Parameter = Parameter()
+    topic: str | None = None  # of its poses; None: the one with the sensor's name, or the only one
+
+
 Scheme = Literal["inertial", "pose", "kinematic"]
 Loss = Literal["none", "huber", "cauchy"]
 Nodes = Literal["every-image", "first-camera"]
@@ -163,7 +185,7 @@ class Settings:
 class Rig:
     """The whole robot. Without an IMU the first camera's frame is the body frame, and time stands still: images taken
     at the same stamp are taken together, nothing ties one instant to the next. There may be no camera beside an IMU and
-    a LiDAR."""
+    a LiDAR or a pose sensor."""
 
     imu: ImuSensor | None
     cameras: tuple[Camera, ...]
@@ -173,6 +195,7 @@ class Rig:
     path: Path | None = None
     lidars: tuple[Lidar, ...] = ()
     wheels: tuple[Wheels, ...] = ()
+    poses: tuple[PoseSensor, ...] = ()
 
     @property
     def has_target(self) -> bool:

@@ -17,6 +17,8 @@ from icalib.rig import (
     Lidar,
     Parameter,
     PointTime,
+    PoseKind,
+    PoseSensor,
     Rig,
     Settings,
     WheelFactor,
@@ -27,7 +29,7 @@ from icalib.rig_parameters import imu_intrinsics_parameter, parameter_to_plain, 
 from icalib.rig_targets import NAME, target_of, target_or_targets
 from icalib.yaml_nodes import YamlValue, read_yaml
 
-_SENSOR_TYPES = ("imu", "camera", "lidar", "wheels")
+_SENSOR_TYPES = ("imu", "camera", "lidar", "wheels", "pose")
 _MOUNTED = ("rotation", "translation", "time_offset")
 _DENSITIES = ("gyro", "gyro_walk", "accel", "accel_walk")
 
@@ -54,6 +56,7 @@ def load_rig(path: str | Path) -> Rig:
         path=file,
         lidars=tuple(sensors.lidars),
         wheels=tuple(sensors.wheels),
+        poses=tuple(sensors.poses),
     )
 
 
@@ -72,6 +75,7 @@ def rig_to_dict(rig: Rig) -> dict[str, Any]:
     imus = {} if rig.imu is None else {rig.imu.name: _imu_to_plain(rig.imu)}
     sensors = imus | {c.name: _camera_to_plain(c) for c in rig.cameras}
     sensors |= {s.name: _lidar_to_plain(s) for s in rig.lidars} | {w.name: _wheels_to_plain(w) for w in rig.wheels}
+    sensors |= {s.name: _pose_to_plain(s) for s in rig.poses}
     key = "targets" if isinstance(rig.target, Scene) else "target"
     target = {key: rig.target.plain()} if rig.has_target else {}
     return {
@@ -90,6 +94,7 @@ class _Sensors:
     cameras: list[Camera] = field(default_factory=list)
     lidars: list[Lidar] = field(default_factory=list)
     wheels: list[Wheels] = field(default_factory=list)
+    poses: list[PoseSensor] = field(default_factory=list)
 
 
 def _sensors(value: YamlValue) -> _Sensors:
@@ -107,6 +112,8 @@ def _sensors(value: YamlValue) -> _Sensors:
                 found.lidars.append(_lidar(name, sensor))
             case "wheels":
                 found.wheels.append(_wheels(name, sensor))
+            case "pose":
+                found.poses.append(_pose(name, sensor))
             case _ if found.imus:
                 sensor.fail(f"is a second IMU beside {found.imus[0].name}; keep the one that is the body frame.")
             case _:
@@ -117,10 +124,10 @@ def _sensors(value: YamlValue) -> _Sensors:
 
 def _refuse_incomplete(value: YamlValue, found: _Sensors) -> None:
     """Where the sensors together cannot be calibrated."""
-    if not found.cameras and not found.lidars:
-        value.fail("there is no camera and no LiDAR; add a sensor of type: camera or type: lidar.")
-    if not found.imus and (found.lidars or found.wheels):
-        first = (*found.lidars, *found.wheels)[0]
+    if not found.cameras and not found.lidars and not found.poses:
+        value.fail("there is no camera, no LiDAR and no pose sensor; add a sensor of type: camera, lidar or pose.")
+    if not found.imus and (found.lidars or found.wheels or found.poses):
+        first = (*found.lidars, *found.wheels, *found.poses)[0]
         value.entries()[first.name].fail("needs an IMU; add a sensor of type: imu, or remove this one.")
 
 
@@ -217,6 +224,19 @@ def _wheels(name: str, value: YamlValue) -> Wheels:
         joints=_joints(found["joints"]) if "joints" in found else None,
         **_mounting(found),
         **groups,
+    )
+
+
+def _pose(name: str, value: YamlValue) -> PoseSensor:
+    found = value.record(("type",), ("path", "topic", "kind", "rotation_noise", "position_noise", *_MOUNTED))
+    return PoseSensor(
+        name=name,
+        path=_path(found, f"{name}/poses.csv"),
+        kind=_choice(found, "kind", PoseKind, PoseSensor.kind),
+        topic=_topic(found),
+        rotation_noise=found["rotation_noise"].positive() if "rotation_noise" in found else None,
+        position_noise=found["position_noise"].positive() if "position_noise" in found else None,
+        **_mounting(found),
     )
 
 
@@ -332,6 +352,12 @@ def _wheels_to_plain(wheels: Wheels) -> dict[str, Any]:
     return plain | {name: value for name, value in given.items() if value is not None} | _groups_to_plain(wheels)
 
 
-def _groups_to_plain(sensor: Camera | Lidar | Wheels) -> dict[str, Any]:
+def _pose_to_plain(sensor: PoseSensor) -> dict[str, Any]:
+    plain: dict[str, Any] = {"type": "pose", "path": sensor.path, "kind": sensor.kind}
+    given = {name: getattr(sensor, name) for name in ("rotation_noise", "position_noise", "topic")}
+    return plain | {name: value for name, value in given.items() if value is not None} | _groups_to_plain(sensor)
+
+
+def _groups_to_plain(sensor: Camera | Lidar | Wheels | PoseSensor) -> dict[str, Any]:
     groups = {f.name: getattr(sensor, f.name) for f in dataclasses.fields(sensor)}
     return {name: parameter_to_plain(p) for name, p in groups.items() if isinstance(p, Parameter)}

@@ -45,6 +45,8 @@ TOLERANCE = {
     "radii": 1e-3,
     "baseline": 5e-3,
     "plane": (2e-3, 2e-3, 5e-3),
+    "frame_rotation": 2e-3,
+    "frame_translation": 5e-3,
 }
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
 FEWEST_POINTS = 200  # of a plane in a setup

@@ -17,14 +17,18 @@ import pytest
 
 import icalib.estimation
 from icalib.estimation.arrowhead import Piece, make_pieces
+from icalib.estimation.board import board_in
 from icalib.estimation.corner_factor import CornerNoise
 from icalib.estimation.corner_weights import LEAST_CURVATURE
 from icalib.estimation.imu_factor import ROWS, ImuFactor
 from icalib.estimation.lidar_binning import LidarNoise
+from icalib.estimation.lidar_sweep import Motion
+from icalib.estimation.pose_factor import AbsolutePoseFactor, PoseNoise, RelativePosesFactor, frame_of
 from icalib.estimation.prior_factor import FIRST_BIAS_SIGMA, Prior, accumulate_bias_prior
 from icalib.estimation.state import NODE, State, make_layout
 from icalib.estimation.wheel_factor import IncrementFactor, RelativePoseFactor, WheelNoise
 from icalib.geometry import so3
+from icalib.measurements import PoseStream
 
 
 @dataclass(frozen=True)
@@ -192,7 +196,8 @@ def feature_sample(unlike, setup_of, features_of, scheme="inertial", loss="none"
             piece.features = factor.attach(piece, keep=True).features
         return factor.accumulate(at, piece, factor.output(), sums, curved)
 
-    return Sample("FeatureFactor", setup, state, accumulate, residual, weights)
+    # Points rest within 1e-12 of their least cost; the gradient is that of points which are there.
+    return Sample("FeatureFactor", setup, state, accumulate, residual, weights, 5e-6)
 
 
 def lidar_sample(room, room_of, scheme="inertial", loss="none", beam=0.0, imu_free=False):
@@ -300,6 +305,57 @@ def wheel_sample(unlike, setup_of, factor, imu_free=False, rate_hz=70.0, loss="n
     return Sample(factor.__name__, setup, state, accumulate, lambda at: run(at)[0], weights)
 
 
+def with_poses(setup, starts):
+    """The setup with mocap0 in its state and border, and the nodes of recordings that begin at `starts`; readings are
+    constant, as in `with_wheels`."""
+    rng = np.random.default_rng(6)
+    mount = {"rotation": so3.exp(rng.normal(size=3)), "translation": rng.normal(size=3), "time_offset": np.zeros(1)}
+    entries = [(b.sensor, b.name, b.kind, b.size, b.start is not None) for b in setup.layout.blocks]
+    entries += [("mocap0", k, "rotation" if k == "rotation" else "vector", len(v), True) for k, v in mount.items()]
+    values = setup.state.values | {("mocap0", k): v for k, v in mount.items()}
+    for k in range(1, len(starts)):
+        entries += [(board_in("board0", k), "tilt", "tilt", 2, True)]
+        values[board_in("board0", k), "tilt"] = so3.exp(rng.normal(size=3))
+    for k in range(len(starts)):
+        entries += [(frame_of("mocap0", k), "frame_rotation", "rotation", 3, True)]
+        entries += [(frame_of("mocap0", k), "frame_translation", "vector", 3, True)]
+        values[frame_of("mocap0", k), "frame_rotation"] = so3.exp(rng.normal(size=3))
+        values[frame_of("mocap0", k), "frame_translation"] = rng.normal(size=3)
+    gyro, accel = (np.ones((len(x), 1)) * x[5] for x in (setup.imu.gyro, setup.imu.accel))
+    imu = replace(setup.imu, gyro=gyro, accel=accel)
+    return replace(
+        setup, layout=make_layout(entries), imu=imu, state=replace(setup.state, values=values, starts=starts)
+    )
+
+
+def pose_sample(unlike, setup_of, factor, imu_free=False, loss="none", curved=False, rate_hz=90.0, starts=(0,)):
+    """Poses that wander by 0.1 to 0.3 rad and m, far from what the state predicts: residuals are large."""
+    setup = with_poses(setup_of(unlike, imu_free=imu_free), starts)
+    rng = np.random.default_rng(7)
+    seconds = np.arange(0.0, setup.imu.seconds[-1], 1.0 / rate_hz)
+    rotation = np.array([so3.exp(v) for v in np.cumsum(0.1 * rng.normal(size=(len(seconds), 3)), axis=0)])
+    position = np.cumsum(0.1 * rng.normal(size=(len(seconds), 3)), axis=0)
+    stream = PoseStream("mocap0", np.round(1e9 * seconds).astype(np.int64), rotation, position)
+    motion = Motion(setup.state, setup.imu, 9.81, 0.5)
+    made = factor.build(stream, motion, PoseNoise(0.5, 0.3, loss, LOSS_SCALE), setup.layout)
+    state = setup.perturbed(rng, 0.3)
+
+    def run(at):
+        out = made.output()
+        for piece in make_pieces(len(at.seconds), setup.layout.size):
+            made.accumulate(at, piece, out, sums=False)
+        return out.residual.ravel(), out.root.ravel()
+
+    def weights(at):
+        r, root = run(at)
+        return root**2 * r, np.diag(root**2 * slope_along(loss if curved else "none", np.abs(r)))
+
+    def accumulate(at, piece, sums):
+        return made.accumulate(at, piece, made.output(), sums, curved)
+
+    return Sample(factor.__name__, setup, state, accumulate, lambda at: run(at)[0], weights)
+
+
 SAMPLES = {
     "imu": ("ImuFactor", lambda u, s, f: imu_sample(u, s, False)),
     "imu, intrinsics": ("ImuFactor", lambda u, s, f: imu_sample(u, s, True)),
@@ -367,6 +423,24 @@ SAMPLES = {
     "planar poses, huber, curved": (
         "RelativePoseFactor",
         lambda u, s, f: wheel_sample(u, s, RelativePoseFactor, loss="huber", curved=True),
+    ),
+    "poses": ("AbsolutePoseFactor", lambda u, s, f: pose_sample(u, s, AbsolutePoseFactor)),
+    "poses of two recordings, intrinsics": (
+        "AbsolutePoseFactor",
+        lambda u, s, f: pose_sample(u, s, AbsolutePoseFactor, True, starts=(0, 5)),
+    ),
+    "poses, cauchy, curved": (
+        "AbsolutePoseFactor",
+        lambda u, s, f: pose_sample(u, s, AbsolutePoseFactor, loss="cauchy", curved=True),
+    ),
+    "relative poses": ("RelativePosesFactor", lambda u, s, f: pose_sample(u, s, RelativePosesFactor)),
+    "relative poses, intrinsics, few": (
+        "RelativePosesFactor",
+        lambda u, s, f: pose_sample(u, s, RelativePosesFactor, True, rate_hz=9.0),
+    ),
+    "relative poses, huber": (
+        "RelativePosesFactor",
+        lambda u, s, f: pose_sample(u, s, RelativePosesFactor, loss="huber"),
     ),
     "bias prior": ("accumulate_bias_prior", lambda u, s, f: bias_prior_sample(u, s)),
 }

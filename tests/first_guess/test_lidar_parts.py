@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -150,3 +152,17 @@ def test_motion_between_noisy_positions(free_robot, path):
     _, p_true, v_true = free_robot.pose_at(at)
     assert np.sqrt(((p_found - p_true) ** 2).mean()) < 0.006
     assert np.sqrt(((v_found - v_true) ** 2).mean()) < 0.015
+
+
+def test_rotations_that_follow_the_gyroscope(free_robot, path):
+    """Nine of them within half a second take most of 1 deg away; none from beyond a gap, where another map stands."""
+    t, R, _, _, _ = path
+    rng, imu = np.random.default_rng(4), replace(free_robot.imu, gaps=((6.0, 6.1),))
+    gyro = GyroRotation.integrate(imu, free_robot.sim.truth.gyro_bias.mean(axis=0))
+    turn = Rotation.from_rotvec([0.5, -1.0, 2.0]).as_matrix()
+    true = np.where((t > 6.05)[:, None, None], turn @ R, R)
+    found = gyro.smoothed(t, true @ so3.exp_many(np.deg2rad(1.0) * rng.normal(size=(len(t), 3))))
+    np.testing.assert_allclose(found @ found.transpose(0, 2, 1), np.tile(np.eye(3), (len(t), 1, 1)), atol=1e-12)
+    off = np.rad2deg(so3.log_many(np.ascontiguousarray(true.transpose(0, 2, 1) @ found)))
+    assert 0.8 < 3.0 * np.sqrt((off**2).mean()) < 1.2
+    assert np.abs(off).max() < 1.5

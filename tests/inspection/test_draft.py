@@ -95,6 +95,24 @@ def test_lidars_are_drafted_and_wheels_suggested(draft, bags):
     assert [(w.name, w.topic) for w in load_rig(path).wheels] == [("wheel0", "/joint_states")]
 
 
+def test_poses_are_suggested(draft, bags):
+    kind = "geometry_msgs/msg/PoseStamped"
+    point, turn = (
+        bags.make("geometry_msgs/msg/Point", 0.0, 0.0, 0.0),
+        bags.make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0),
+    )
+    pose = bags.make("geometry_msgs/msg/Pose", point, turn)
+    messages = bags.noise("/cam0/image_raw", SIZE)
+    for t in range(1_700_000_000_000_000_000, 1_700_000_001_000_000_000, 100_000_000):
+        messages.append(("/vrpn/robot/pose", kind, t, bags.make(kind, bags.header(t, "map"), pose)))
+    text, path = draft(messages)
+    fill(path)
+    assert load_rig(path).poses == ()
+    commented = text.split("docs/rig-file.md#pose-sensor).\n")[1].splitlines()[:4]
+    path.write_text(path.read_text().replace("\n".join(commented), "\n".join("  " + c[4:] for c in commented)))
+    assert [(p.name, p.topic, p.kind) for p in load_rig(path).poses] == [("robot", "/vrpn/robot/pose", "absolute")]
+
+
 @pytest.mark.parametrize(
     ("model", "D", "expected", "guess"),
     [

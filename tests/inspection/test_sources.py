@@ -65,6 +65,16 @@ def test_lidars_and_wheels():
     }
 
 
+def test_poses_and_odometry():
+    given = {"/imu0": "imu", "/vrpn/robot/pose": "pose", "/odom": "odometry", "odom0/poses.tum": "pose"}
+    found = find_sources([TopicInfo(name, "", kind, 10, 0, 1) for name, kind in given.items()])
+    assert {name: t.name for name, t in found.poses.items()} == {
+        "robot": "/vrpn/robot/pose",
+        "pose0": "/odom",
+        "odom0": "odom0/poses.tum",
+    }
+
+
 def test_depth_images_are_no_camera():
     found = find_sources(topics("/d455/depth/image_rect_raw", "/d455/color/image_raw"))
     assert [c.name for c in found.cameras] == ["color"]

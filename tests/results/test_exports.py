@@ -94,6 +94,14 @@ def test_every_format_says_which_way_its_transform_goes(robot: Calibration, to: 
     assert (guessed in found.sentences) == (to not in ("camera-info", "fast-lio"))
 
 
+@pytest.mark.parametrize("to", ["kalibr", "openvins", "vins-fusion", "camera-info", "mins", "fast-lio"])
+def test_a_pose_sensor_is_said_to_have_no_place(robot: Calibration, to: str):
+    sensors = robot.rig["sensors"] | {"mocap0": {"type": "pose"}}
+    sentences = export(dataclasses.replace(robot, rig=robot.rig | {"sensors": sensors}), to).sentences
+    assert any(re.search(r"has no place for .*\bmocap0\b.*; see calibration.yaml.$", s) for s in sentences)
+    assert "mocap0" not in " ".join(export(robot, to).sentences)
+
+
 def test_openvins(robot: Calibration, tmp_path: Path):
     found = export(with_offset(robot, "cam1", 2e-3), "openvins")
     assert list(found.files) == ["kalibr_imucam_chain.yaml", "kalibr_imu_chain.yaml"]

@@ -58,6 +58,14 @@ sensors:
     meaning: instant
     poses_every: 5
     T_imu_sensor: {POSE}
+  mocap:
+    type: pose
+    kind: relative
+    rate: 30
+    T_world_frame: {POSE}
+    rotation_noise: 0.003
+    position_noise: 0.004
+    T_imu_sensor: {POSE}
 room:
   size: [8, 7, 3]
   blocks:
@@ -103,6 +111,10 @@ def test_every_field_arrives(tmp_path):
     assert (lidar.range_m, lidar.range_noise_m) == ((1.0, 30.0), 0.02)
     assert (wheels.radii, wheels.baseline, wheels.noise, wheels.slip) == ((0.1, 0.11), 0.5, 0.01, 0.002)
     assert (wheels.reports, wheels.meaning, wheels.poses_every) == ("rates", "instant", 5)
+    (mocap,) = s.poses
+    assert (mocap.name, mocap.kind, mocap.rate_hz) == ("mocap", "relative", 30.0)
+    assert (mocap.rotation_noise, mocap.position_noise) == (0.003, 0.004)
+    np.testing.assert_allclose([mocap.T_imu_sensor, mocap.T_world_frame], [T, T], atol=1e-12)
     ramp, box = s.room.blocks
     assert s.room.size == (8.0, 7.0, 3.0) and s.room.hills is None
     assert (ramp.center, ramp.size, ramp.ramp) == ((3.0, 2.0), (1.0, 1.5, 0.5), True)

@@ -10,6 +10,8 @@ from icalib.assessment.robot import (
     lidar_residuals,
     lidar_warnings,
     planes,
+    pose_residuals,
+    pose_warnings,
     robot_notes,
     robot_warnings,
     wheel_residuals,
@@ -20,6 +22,7 @@ from icalib.calibration import (
     ImuResiduals,
     Iteration,
     ParameterGroup,
+    PoseResiduals,
     SensorFit,
     Trajectory,
     Verdict,
@@ -36,6 +39,7 @@ from icalib.estimation.evidence import Fit, fits, place_covariances, split_covar
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.imu_model import LABELS as IMU_LABELS
 from icalib.estimation.nodes import usable
+from icalib.estimation.pose_factor import FRAME
 from icalib.estimation.problem import Problem
 from icalib.estimation.solver import Visit
 from icalib.estimation.state import Block, State
@@ -51,6 +55,7 @@ UNITS = {
     "shape": "m", "tilt": "rad", "radii": "m", "baseline": "m",
 }  # fmt: skip
 LABELS = {"shape": SHAPE_LABELS, "radii": ("left", "right"), "plane": ("turn 1", "turn 2", "distance")}
+NUISANCE = ("plane", *FRAME)  # estimated along, in a world of which only gravity's direction means anything
 EXPECTED_CHI2 = (0.5, 2.0)  # chi^2 per post-fit degree of freedom outside this is worth a warning
 LARGE_FACTOR = 3.0
 LARGE_BLOOM_PX = 0.8  # ink and overexposure move edges by a third of that
@@ -68,7 +73,7 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
     groups = _groups(inputs, found, seen, empirical)
     judged = [_sensor_fit(f, found) for f in fits(problem, outcome)]
     timeline = Timeline.of(inputs.parts, image_times(inputs, outcome.state.values))
-    trajectory = _trajectory(inputs, outcome.state, timeline)
+    trajectory, poses = _trajectory(inputs, outcome.state, timeline), pose_residuals(inputs, found, timeline)
     return Calibration(
         groups=groups,
         covariance=seen.covariance,
@@ -81,7 +86,7 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
         iterations=tuple(Iteration(n, s.cost, s.predicted_decrease, s.damping, s.accepted) for n, s in found.steps),
         converged=outcome.converged,
         status=outcome.status,
-        warnings=tuple(_warnings(inputs, found, groups, judged, empirical)),
+        warnings=tuple(_warnings(inputs, found, groups, judged, empirical, poses)),
         notes=tuple(_notes(inputs, found, timeline)),
         rig=rig_to_dict(inputs.rig),
         settings=dataclasses.asdict(inputs.rig.settings),
@@ -91,6 +96,7 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
         lidar_residuals=lidar_residuals(inputs, found, timeline),
         wheel_residuals=wheel_residuals(inputs, found, timeline),
         planes=planes(inputs, outcome.state),
+        pose_residuals=poses,
     )
 
 
@@ -98,7 +104,7 @@ def _rates(inputs: Inputs) -> dict[str, float]:
     """Hz of each sensor, from the median step of its stamps."""
     imu = inputs.measurements.imu
     m = inputs.measurements
-    streams = (*(() if imu is None else (imu,)), *m.cameras, *m.lidars, *m.wheels)
+    streams = (*(() if imu is None else (imu,)), *m.cameras, *m.lidars, *m.wheels, *m.poses)
     return {s.name: float(1.0 / np.median(np.diff(s.seconds))) for s in streams if len(s.stamps_ns) > 1}
 
 
@@ -134,7 +140,7 @@ def visited(inputs: Inputs, stage: str, problem: Problem, visit: Visit) -> Visit
     t = problem.tolerance
     covariance = restricted_inverse(visit.information * t[:, None] * t, problem.held)
     formal = t * np.sqrt(np.diag(covariance))
-    free = [b for b in inputs.layout.free if b.name != "plane"]
+    free = [b for b in inputs.layout.free if b.name not in NUISANCE]
     values = {b.key: _raw_value(inputs, visit.state, b) for b in free}
     return Visited(stage, values, {b.key: formal[b.columns] for b in free})
 
@@ -155,7 +161,7 @@ def _groups(
     overall = float(np.sqrt(np.mean(_calibration_only(inputs, ratio) ** 2))) if len(ratio) else 1.0
     groups = []
     for block in inputs.layout.blocks:
-        if block.name == "plane" or _unheard_of(inputs, block):
+        if block.name in NUISANCE or _unheard_of(inputs, block):
             continue
         if block.start is None and block.name in ("shape", "bloom", "tilt"):
             continue
@@ -280,6 +286,7 @@ def _warnings(
     groups: tuple[ParameterGroup, ...],
     judged: list[SensorFit],
     empirical: np.ndarray | None,
+    poses: tuple[PoseResiduals, ...],
 ):
     if not found.outcome.converged:
         yield f"the solver did not converge: {found.outcome.status}"
@@ -297,6 +304,7 @@ def _warnings(
             share = f.rejected / (f.rejected + 0.5 * f.count)
             yield f"{share:.0%} of the {f.kind} of {f.sensor} were set aside; look at its residuals in the report."
     yield from robot_warnings(inputs.rig, judged)
+    yield from pose_warnings(poses, inputs.rig)
     yield from lidar_warnings(inputs, found) if inputs.clouds.count else ()
     for g in groups:
         if g.name == "bloom" and abs(g.value[0]) > LARGE_BLOOM_PX:
@@ -332,7 +340,7 @@ def _notes(inputs: Inputs, found: Estimate, timeline: Timeline):
         if len(factor.stream.uv):
             yield f"{camera.name}: {_noise_words(model)}."
     yield from _feature_notes(found)
-    yield from robot_notes(inputs, found) if inputs.clouds.count else ()
+    yield from robot_notes(inputs, found)
 
 
 def _feature_notes(found: Estimate):

@@ -1,4 +1,4 @@
-"""What an estimate leaves of points on planes and of wheels, and what there is to say about it."""
+"""What an estimate leaves of points on planes, of wheels and of pose sensors, and what there is to say about it."""
 
 from __future__ import annotations
 
@@ -6,18 +6,20 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from icalib.calibration import LidarResiduals, Plane, SensorFit, WheelResiduals
+from icalib.calibration import LidarResiduals, Plane, PoseResiduals, SensorFit, WheelResiduals
 from icalib.estimation.assembly import Inputs, motion_of, origin_difference
 from icalib.estimation.estimate import Estimate
 from icalib.estimation.lidar_binning import LidarNoise, in_world
 from icalib.estimation.lidar_factor import LidarFactor
 from icalib.estimation.lidar_sweep import Motion
 from icalib.estimation.nodes import usable
+from icalib.estimation.pose_factor import AbsolutePoseFactor, PoseNoise, RelativePosesFactor
+from icalib.estimation.sensors import Whitened
 from icalib.estimation.state import State
 from icalib.estimation.wheel_factor import IncrementFactor, RelativePoseFactor
 from icalib.geometry.planes import plane_of
 from icalib.measurements import LidarStream
-from icalib.rig import Rig, Wheels
+from icalib.rig import PoseSensor, Rig, Wheels
 from icalib.timeline import Timeline
 
 MOST_POINTS = 200_000  # kept of all LiDARs together
@@ -26,6 +28,9 @@ FEW_ON_PLANES = 0.2  # of the points
 NEARLY_A_PERIOD = 0.15  # of the period
 LARGE_CHI2 = 2.0  # chi^2 per post-fit degree of freedom above this is worth a warning
 LEAST_DOF = 3.0  # times the square root of the number of residuals
+# Correlations of residuals of poses with their neighbours. Of white noise between poses, steps have -0.5.
+CORRELATED, ALTERNATING = 0.5, 0.35
+CLIP = 4.0  # standard deviations
 LABELS = {"wheels": ("left", "right"), "sideways slip": ("sideways",), "upwards slip": ("upwards",)} | {
     "yaw": ("yaw",), "path": ("forward", "sideways"),
 }  # fmt: skip
@@ -51,7 +56,7 @@ def lidar_residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> tupl
     thinned = [_thinned(inputs, k, state) for k in range(len(inputs.rig.lidars))]
     guessed = _fitted([(in_world(first, stream)[0], plane) for stream, plane in thinned], values)
     out = []
-    for whole, (stream, plane), noise in zip(inputs.measurements.lidars, thinned, found.ranging, strict=True):
+    for whole, (stream, plane), noise in zip(inputs.measurements.lidars, thinned, found.robot.ranging, strict=True):
         seconds = _seconds_of(stream, state)
         world, residual, cosine = _on_planes(now, stream, values[plane])
         first_world, first_residual, _ = _on_planes(first, stream, guessed[plane])
@@ -137,9 +142,31 @@ def wheel_residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> tupl
     return tuple(out)
 
 
+def pose_residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> tuple[PoseResiduals, ...]:
+    """Of each pose sensor."""
+    out = []
+    labels = tuple(f"{kind} {axis}" for kind in ("rotation", "position") for axis in "xyz")
+    for factor, rows in zip(found.problem.sensors, found.outcome.residuals.sensors, strict=True):
+        if not isinstance(factor, AbsolutePoseFactor | RelativePosesFactor):
+            continue
+        seconds = factor.instants + found.outcome.state.values[factor.name, "time_offset"][0]
+        shown = timeline.shown(seconds, timeline.recording_of(seconds))
+        units = ("rad",) * 3 + ("m",) * 3
+        whitened = rows.residual.copy()
+        out.append(PoseResiduals(factor.name, labels, units, shown, whitened * factor.sigma, whitened))
+    return tuple(out)
+
+
 def robot_notes(inputs: Inputs, found: Estimate) -> Iterator[str]:
-    """How much of the LiDARs is in use, and their noise."""
-    for lidar, stream, noise in zip(inputs.rig.lidars, inputs.measurements.lidars, found.ranging, strict=True):
+    """How much of LiDARs and pose sensors is in use, and their noise."""
+    counts = {f.name: f.count(out, "rotation") // 3 for f, out in _pose_factors(found)}
+    for sensor, stream, noise in zip(inputs.rig.poses, inputs.measurements.poses, found.robot.posing, strict=True):
+        what = "poses" if sensor.kind == "absolute" else "steps"
+        count = f"{counts[sensor.name]} {what} from {len(stream.stamps_ns)} poses"
+        yield f"{count} of {sensor.name}; {_noise(sensor, noise)}."
+    if not inputs.clouds.count:
+        return
+    for lidar, stream, noise in zip(inputs.rig.lidars, inputs.measurements.lidars, found.robot.ranging, strict=True):
         given = lidar.range_noise_m is not None
         size = f"{1e3 * noise.beam_sigma:.1f} mm along the beam, as the rig file has it"
         if not given:
@@ -148,6 +175,46 @@ def robot_notes(inputs: Inputs, found: Estimate) -> Iterator[str]:
             f"{_used(found, lidar.name)} of the {len(stream.xyz)} points of {lidar.name} lie on "
             f"{inputs.clouds.count} planes; noise {size}."
         )
+
+
+def _pose_factors(found: Estimate) -> list[tuple[AbsolutePoseFactor | RelativePosesFactor, Whitened]]:
+    pairs = zip(found.problem.sensors, found.outcome.residuals.sensors, strict=True)
+    return [(f, out) for f, out in pairs if isinstance(f, AbsolutePoseFactor | RelativePosesFactor)]
+
+
+def _noise(sensor: PoseSensor, noise: PoseNoise) -> str:
+    root = "" if sensor.kind == "absolute" else "/sqrt(s)"
+    turn = f"{np.rad2deg(noise.rotation):.3g} deg{root} {_source(sensor.rotation_noise)}"
+    return f"noise {turn}, {1e3 * noise.position:.3g} mm{root} {_source(sensor.position_noise)}"
+
+
+def _source(given: float | None) -> str:
+    return "as residuals show it" if given is None else "as the rig file has it"
+
+
+def pose_warnings(residuals: tuple[PoseResiduals, ...], rig: Rig) -> Iterator[str]:
+    """Where residuals of poses follow one another, which noise does not."""
+    kinds = {s.name: s.kind for s in rig.poses}
+    for r in residuals:
+        for what, own in (("rotation", r.whitened[:, :3]), ("position", r.whitened[:, 3:])):
+            correlation = neighbours(own)
+            if kinds[r.sensor] == "absolute" and correlation > CORRELATED:
+                yield (
+                    f"the {what} residuals of {r.sensor} follow one another (correlation {correlation:.2f} from pose "
+                    "to pose): its poses are filtered, or drift, so all looks better known than it is; trust the "
+                    "empirical factor, or try kind: relative, which lets poses drift."
+                )
+            if kinds[r.sensor] == "relative" and correlation < -ALTERNATING:
+                yield (
+                    f"the {what} residuals of {r.sensor} alternate (correlation {correlation:.2f} from step to step), "
+                    "as those of poses that are noisy but do not drift; try kind: absolute."
+                )
+
+
+def neighbours(rows: np.ndarray) -> float:
+    """Correlation of rows (n, 3) with the ones before, large ones clipped; 0 where there are none."""
+    clipped = np.clip(rows, -CLIP, CLIP)
+    return float((clipped[1:] * clipped[:-1]).sum() / max((clipped**2).sum(), 1e-30))
 
 
 def lidar_warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
@@ -173,6 +240,7 @@ def lidar_warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
 def robot_warnings(rig: Rig, judged: list[SensorFit]) -> Iterator[str]:
     """Where points or wheels leave more than their noise explains."""
     lidars = {x.name: x for x in rig.lidars}
+    poses = {x.name: x for x in rig.poses}
     wheels = {w.name: w for w in rig.wheels}
     for f in judged:
         ratio = f.chi2 / max(f.dof, 1.0)
@@ -184,6 +252,8 @@ def robot_warnings(rig: Rig, judged: list[SensorFit]) -> Iterator[str]:
                 f"the points of {f.sensor} lie {times} as far from their planes as its range_noise in the rig file "
                 "says; leave it out, and it is estimated."
             )
+        if f.sensor in poses:
+            yield f"the {f.kind} of {f.sensor} leaves residuals {times} as large as its noise in the rig file says."
         if f.sensor in wheels:
             yield _wheel_words(f.kind, wheels[f.sensor], times, float(np.sqrt(ratio)))
 

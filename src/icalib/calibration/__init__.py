@@ -13,7 +13,7 @@ from icalib.calibration.result import (
     Verdict,
     Visited,
 )
-from icalib.calibration.robot import LidarResiduals, Plane, WheelResiduals
+from icalib.calibration.robot import LidarResiduals, Plane, PoseResiduals, WheelResiduals
 from icalib.calibration.saving import calibration_files, load_calibration
 
 __all__ = [
@@ -24,6 +24,7 @@ __all__ = [
     "LidarResiduals",
     "ParameterGroup",
     "Plane",
+    "PoseResiduals",
     "RecordingSpan",
     "RelativePose",
     "SensorFit",

@@ -33,9 +33,11 @@ class RelativePose:
 
 
 def relative_poses(c: Calibration) -> tuple[RelativePose, ...]:
-    """Of each LiDAR and each set of wheels as seen from each camera, and of wheels as seen from each LiDAR."""
-    pairs = [(frame, sensor) for frame in c.cameras for sensor in (*c.lidars, *c.wheels)]
-    pairs += [(frame, sensor) for frame in c.lidars for sensor in c.wheels]
+    """Of each LiDAR, each set of wheels and each pose sensor as seen from each camera, of the latter two as seen from
+    each LiDAR, and of pose sensors as seen from wheels."""
+    pairs = [(frame, sensor) for frame in c.cameras for sensor in (*c.lidars, *c.wheels, *c.pose_sensors)]
+    pairs += [(frame, sensor) for frame in c.lidars for sensor in (*c.wheels, *c.pose_sensors)]
+    pairs += [(frame, sensor) for frame in c.wheels for sensor in c.pose_sensors]
     return tuple(relative_pose(c, frame, sensor) for frame, sensor in pairs)
 
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from icalib.calibration.robot import LidarResiduals, Plane, WheelResiduals
+from icalib.calibration.robot import LidarResiduals, Plane, PoseResiduals, WheelResiduals
 
 Verdict = Literal["determined", "weak", "undetermined", "fixed"]
 
@@ -154,6 +154,7 @@ class Calibration:
     lidar_residuals: tuple[LidarResiduals, ...] = ()
     wheel_residuals: tuple[WheelResiduals, ...] = ()
     planes: tuple[Plane, ...] = ()  # that LiDARs see
+    pose_residuals: tuple[PoseResiduals, ...] = ()
 
     def recording_of(self, seconds: np.ndarray) -> np.ndarray:
         """(n,) which of `recordings` each instant of this result lies in."""
@@ -209,9 +210,14 @@ class Calibration:
         return self._of_type("wheels")
 
     @property
+    def pose_sensors(self) -> tuple[str, ...]:
+        """Names of the pose sensors, in the rig's order."""
+        return self._of_type("pose")
+
+    @property
     def mounted(self) -> tuple[str, ...]:
-        """Names of all that have a pose on the body: cameras, LiDARs, wheels."""
-        return (*self.cameras, *self.lidars, *self.wheels)
+        """Names of all that have a pose on the body: cameras, LiDARs, wheels, pose sensors."""
+        return (*self.cameras, *self.lidars, *self.wheels, *self.pose_sensors)
 
     def save(self, folder: str | Path) -> None:
         """Writes calibration.yaml, result.json and result.npz (docs/files.md) into `folder`, as one set.

@@ -1,4 +1,4 @@
-"""What is left of a robot's measurements beside images: points of LiDARs on planes, and turns of wheels."""
+"""What is left of a robot's measurements beside images: points of LiDARs on planes, turns of wheels, and poses."""
 
 from __future__ import annotations
 
@@ -53,3 +53,19 @@ class WheelResiduals:
     seconds: np.ndarray  # (n,) start of each stretch, imu clock, s since the first IMU stamp
     residual: np.ndarray  # (n, m)
     whitened: np.ndarray  # (n, m)
+
+
+@dataclass(frozen=True)
+class PoseResiduals:
+    """Residuals (predicted - measured) of one pose sensor: rotation about its own axes, position along those in which
+    it was measured. A row is a pose, or of relative poses a stretch between two.
+
+    labels, units (6,): of the columns.
+    """
+
+    sensor: str
+    labels: tuple[str, ...]
+    units: tuple[str, ...]  # rad, m
+    seconds: np.ndarray  # (n,) of each pose or start of each stretch, imu clock, s since the first IMU stamp
+    residual: np.ndarray  # (n, 6)
+    whitened: np.ndarray  # (n, 6)

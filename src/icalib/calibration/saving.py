@@ -22,7 +22,7 @@ from icalib.calibration.result import (
     SensorFit,
     Trajectory,
 )
-from icalib.calibration.robot import LidarResiduals, Plane, WheelResiduals
+from icalib.calibration.robot import LidarResiduals, Plane, PoseResiduals, WheelResiduals
 from icalib.calibration.summary import calibration_yaml
 from icalib.errors import CalibrationError
 from icalib.result_files import read_file
@@ -71,6 +71,7 @@ def _plain(c: Calibration, arrays: bytes) -> dict[str, Any]:
         "corner_sensors": [r.sensor for r in c.corner_residuals],
         "lidars": [_without_arrays(r) for r in c.lidar_residuals],
         "wheels": [_without_arrays(r) for r in c.wheel_residuals],
+        "poses": [_without_arrays(r) for r in c.pose_residuals],
         "planes": [_lists(p) for p in c.planes],
         **{name: list(getattr(c, name)) for name in _TEXTS},
         **{name: getattr(c, name) for name in _PLAIN},
@@ -82,7 +83,7 @@ def _lists(group: ParameterGroup | Plane) -> dict[str, Any]:
     return {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in plain.items()}
 
 
-def _without_arrays(residuals: LidarResiduals | WheelResiduals) -> dict[str, Any]:
+def _without_arrays(residuals: LidarResiduals | WheelResiduals | PoseResiduals) -> dict[str, Any]:
     arrays = _array_names(type(residuals))
     return {f.name: getattr(residuals, f.name) for f in dataclasses.fields(residuals) if f.name not in arrays}
 
@@ -91,7 +92,8 @@ def _npz(c: Calibration) -> bytes:
     arrays = {"covariance": c.covariance, "covariance_names": np.array(c.covariance_names, dtype=np.str_)}
     for r in c.corner_residuals:
         arrays |= {f"corners/{r.sensor}/{name}": getattr(r, name) for name in _array_names(CornerResiduals)}
-    for folder, found in (("lidars", c.lidar_residuals), ("wheels", c.wheel_residuals)):
+    residuals = {"lidars": c.lidar_residuals, "wheels": c.wheel_residuals, "poses": c.pose_residuals}
+    for folder, found in residuals.items():
         for r in found:
             arrays |= {f"{folder}/{r.sensor}/{name}": getattr(r, name) for name in _array_names(type(r))}
     arrays |= {f"imu_residuals/{name}": getattr(c.imu_residuals, name) for name in _array_names(ImuResiduals)}
@@ -156,6 +158,9 @@ def _build(plain: dict[str, Any], arrays: dict[str, np.ndarray]) -> Calibration:
         ),
         wheel_residuals=tuple(
             WheelResiduals(**_tuples(r), **of(WheelResiduals, f"wheels/{r['sensor']}")) for r in plain.get("wheels", [])
+        ),
+        pose_residuals=tuple(
+            PoseResiduals(**_tuples(r), **of(PoseResiduals, f"poses/{r['sensor']}")) for r in plain.get("poses", [])
         ),
         planes=tuple(
             Plane(p["name"], np.array(p["normal"]), np.array(p["point"]), p["count"]) for p in plain.get("planes", [])

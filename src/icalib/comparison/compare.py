@@ -177,7 +177,7 @@ def _pose(pair: _Pair, frame: str, sensor: str) -> Iterator[Difference]:
 
 def _open(pair: _Pair, frame: str, sensor: str, name: str) -> tuple[str, ...]:
     sides = (("A", pair.a), ("B", pair.b))
-    return tuple(letter for letter, side in sides if {(sensor, name)} & side.open)
+    return tuple(letter for letter, side in sides if {(frame, name), (sensor, name)} & side.open)
 
 
 def _quantities(pair: _Pair) -> Iterator[Difference]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from icalib.calibration import Calibration, joint_covariance, relative_pose
 from icalib.comparison.sides import LensSide, Quantity, Side, unknown
-from icalib.rig import Camera, Lidar, Parameter, Wheels
+from icalib.rig import Camera, Lidar, Parameter, PoseSensor, Wheels
 from icalib.rig_file import load_rig
 
 DENSITIES = {
@@ -69,7 +69,7 @@ def _lens_of_result(c: Calibration, name: str) -> LensSide:
 def side_of_rig(path: Path) -> Side:
     """Values that a rig file gives, whether guessed, fixed or prior; priors with their sigma. Raises RigError."""
     rig = load_rig(path)
-    sensors = {s.name: s for s in (*rig.cameras, *rig.lidars, *rig.wheels)}
+    sensors = {s.name: s for s in (*rig.cameras, *rig.lidars, *rig.wheels, *rig.poses)}
     poses = {name: _pose(s) for name, s in sensors.items()} | {rig.body: np.eye(4)}
     quantities = {}
     for name, s in sensors.items():
@@ -102,7 +102,7 @@ def side_of_rig(path: Path) -> Side:
     )
 
 
-def _pose(sensor: Camera | Lidar | Wheels) -> np.ndarray:
+def _pose(sensor: Camera | Lidar | Wheels | PoseSensor) -> np.ndarray:
     T = np.eye(4)
     T[:3, :3] = np.nan if sensor.rotation.value is None else sensor.rotation.value
     T[:3, 3] = np.nan if sensor.translation.value is None else sensor.translation.value

@@ -19,25 +19,26 @@ from icalib.estimation.images import on_common_images
 from icalib.estimation.imu_data import ImuData, joined_imu_data
 from icalib.estimation.imu_factor import ImuFactor
 from icalib.estimation.imu_model import N_INTRINSICS
-from icalib.estimation.lidar_binning import LidarNoise
 from icalib.estimation.lidar_sweep import Motion
 from icalib.estimation.nodes import MERGED_WITHIN_S, distinct, first_nodes, place_nodes, usable
 from icalib.estimation.poses import assign_nodes, poses_at
 from icalib.estimation.prior_factor import Prior
 from icalib.estimation.problem import ChainFactor, Problem
-from icalib.estimation.robot import NO_CLOUDS, Clouds, own_entries, robot_factors
+from icalib.estimation.robot import NO_CLOUDS, NO_ROBOT, Clouds, RobotNoise, frame_entries, own_entries, robot_factors
 from icalib.estimation.sensors import SensorFactor
 from icalib.estimation.state import Entry, Key, Kind, Layout, State, make_layout
 from icalib.estimation.tolerances import Tolerances
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets.base import BOARD
 from icalib.joining import Part, join
-from icalib.measurements import CornerStream, LidarStream, Measurements, WheelPoses, WheelStream
-from icalib.rig import Camera, Lidar, Parameter, Rig, Scheme, Wheels
+from icalib.measurements import CornerStream, LidarStream, Measurements, PoseStream, WheelPoses, WheelStream
+from icalib.rig import Camera, Lidar, Parameter, PoseSensor, Rig, Scheme, Wheels
 
 BLOOM_SIGMA_PX = 1.0
 NO_BLOOM = np.zeros((0, 2), dtype=np.float32)  # single precision: directions as such are near enough
 CUT_S = 0.5
+POSE_NODES_S = 0.02  # between nodes where poses alone place them
+Stream = CornerStream | LidarStream | WheelStream | WheelPoses | PoseStream
 CAMERA_PARAMETERS: tuple[tuple[str, Kind], ...] = (
     ("rotation", "rotation"),
     ("translation", "vector"),
@@ -66,16 +67,17 @@ class Inputs:
     guess: State | None = None
 
     @property
-    def sensors(self) -> tuple[Camera | Lidar | Wheels, ...]:
+    def sensors(self) -> tuple[Camera | Lidar | Wheels | PoseSensor, ...]:
         """All that take part, but for the IMU."""
-        return (*self.rig.cameras, *(self.rig.lidars if self.clouds.count else ()), *self.rig.wheels)
+        lidars = self.rig.lidars if self.clouds.count else ()
+        return (*self.rig.cameras, *lidars, *self.rig.wheels, *self.rig.poses)
 
-    def sensor(self, name: str) -> Camera | Lidar | Wheels:
+    def sensor(self, name: str) -> Camera | Lidar | Wheels | PoseSensor:
         return next(s for s in self.sensors if s.name == name)
 
-    def stream(self, name: str) -> CornerStream | LidarStream | WheelStream | WheelPoses:
+    def stream(self, name: str) -> Stream:
         m = self.measurements
-        return next(s for s in (*m.cameras, *m.lidars, *m.wheels) if s.name == name)
+        return next(s for s in (*m.cameras, *m.lidars, *m.wheels, *m.poses) if s.name == name)
 
     def is_sensor(self, name: str) -> bool:
         """Whether `name` is a sensor's, not a body's of the target or a plane's."""
@@ -120,8 +122,10 @@ def layout_for(rig: Rig, bodies: Bodies, n_recordings: int = 1, clouds: Clouds =
         sizes = SIZES | {"distortion": len(camera_model(camera.model).parameter_names) - 4}
         for name, kind in CAMERA_PARAMETERS:
             entries.append((camera.name, name, kind, sizes[name], _is_estimated(rig, camera, name)))
-    for sensor in (*(rig.lidars if clouds.count else ()), *rig.wheels):
+    for sensor in (*(rig.lidars if clouds.count else ()), *rig.wheels, *rig.poses):
         entries += own_entries(sensor)
+    for sensor in rig.poses:
+        entries += frame_entries(sensor, n_recordings)
     return make_layout(entries + bodies.pose_entries() + clouds.entries)
 
 
@@ -131,9 +135,7 @@ def _is_estimated(rig: Rig, camera: Camera, name: str) -> bool:
     return getattr(camera, name).mode != "fixed" and (name != "bloom" or rig.blooms)
 
 
-def origin_difference(
-    measurements: Measurements, stream: CornerStream | LidarStream | WheelStream | WheelPoses
-) -> float:
+def origin_difference(measurements: Measurements, stream: Stream) -> float:
     """Seconds from the body's first stamp to the sensor's, each on its own clock: what a raw time offset lacks."""
     return (stream.origin_ns - measurements.origin_ns) * 1e-9
 
@@ -180,10 +182,19 @@ def image_times(inputs: Inputs, values: dict[Key, np.ndarray]) -> list[np.ndarra
 
 def host_times(inputs: Inputs, values: dict[Key, np.ndarray]) -> list[np.ndarray]:
     """Instants that nodes are placed at, by sensor, seconds on the body's clock since its first stamp: those of images,
-    or without cameras those of scans."""
+    or without cameras those of scans, or without either those of poses, as many as are needed."""
     if inputs.rig.cameras:
         return image_times(inputs, values)
-    return [x.seconds + values[x.name, "time_offset"][0] for x in inputs.measurements.lidars]
+    if inputs.rig.lidars:
+        return [x.seconds + values[x.name, "time_offset"][0] for x in inputs.measurements.lidars]
+    (first, *_), (sensor, *_) = inputs.measurements.poses, inputs.rig.poses
+    return [thinned(first.seconds, POSE_NODES_S) + values[sensor.name, "time_offset"][0]]
+
+
+def thinned(times: np.ndarray, apart: float) -> np.ndarray:
+    """The first of `times` (n,), in order, in each stretch of `apart` seconds, and the last of all."""
+    k = np.flatnonzero(np.diff(np.floor(times / apart + 1e-6), prepend=-1.0))
+    return times[np.append(k, len(times) - 1)] if k[-1] < len(times) - 1 else times[k]
 
 
 def resample(state: State, nodes: np.ndarray, inputs: Inputs) -> State:
@@ -215,6 +226,8 @@ def nodes_for(inputs: Inputs, times: list[np.ndarray]) -> np.ndarray:
 
 def _hosts(rig: Rig) -> str:
     what, sensors = ("images", rig.cameras) if rig.cameras else ("scans", rig.lidars)
+    if not sensors:
+        what, sensors = "poses", rig.poses[:1]
     return f"{what} of {', '.join(s.name for s in sensors)}"
 
 
@@ -234,7 +247,7 @@ def assemble(
     keep: list[np.ndarray],
     held: np.ndarray = NOTHING,
     following: Following | None = None,
-    ranging: Sequence[LidarNoise] = (),
+    robot: RobotNoise = NO_ROBOT,
 ) -> Problem:
     """The problem at the nodes of `state`, everything frozen that a pass freezes: nodes, assignment, preintegration.
     held: directions of the border that stay, see Problem."""
@@ -258,7 +271,7 @@ def assemble(
     features = None if following is None else _features(inputs, state, tuple(factors), following)
     return Problem(
         layout, _chain(inputs, state), tuple(factors), _priors(inputs), tolerance, held, features,
-        _others(inputs, state, ranging), rig.has_target,
+        _others(inputs, state, robot), rig.has_target,
     )  # fmt: skip
 
 
@@ -268,11 +281,11 @@ def motion_of(inputs: Inputs, state: State) -> Motion:
     return Motion(state, inputs.imu, inputs.rig.gravity, inputs.rig.settings.max_gap_s)
 
 
-def _others(inputs: Inputs, state: State, ranging: Sequence[LidarNoise]) -> tuple[SensorFactor, ...]:
+def _others(inputs: Inputs, state: State, noise: RobotNoise) -> tuple[SensorFactor, ...]:
     if inputs.imu is None:
         return ()
     motion = motion_of(inputs, state)
-    return robot_factors(inputs.rig, inputs.measurements, inputs.clouds, ranging, motion, inputs.layout)
+    return robot_factors(inputs.rig, inputs.measurements, inputs.clouds, noise, motion, inputs.layout)
 
 
 def _features(inputs: Inputs, state: State, cameras: tuple[CornerFactor, ...], following: Following) -> FeatureFactor:

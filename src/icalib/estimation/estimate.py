@@ -24,18 +24,18 @@ from icalib.estimation.corner_noise import (
 from icalib.estimation.evidence import fits
 from icalib.estimation.feature_noise import first_following, inliers, next_following
 from icalib.estimation.imu_model import N_INTRINSICS
-from icalib.estimation.lidar_binning import LidarNoise
 from icalib.estimation.lidar_factor import LidarFactor
 from icalib.estimation.prior_factor import Prior
 from icalib.estimation.problem import Problem
-from icalib.estimation.robot import first_ranging, next_ranging
+from icalib.estimation.robot import NO_ROBOT, RobotNoise, next_posing, next_ranging
 from icalib.estimation.sensors import chi2
 from icalib.estimation.solver import CONVERGED_DECREASE, Outcome, Step, Visit, minimise
 from icalib.estimation.state import State
 from icalib.estimation.tolerances import GUESS_SIGMA
-from icalib.rig import Settings
+from icalib.rig import PoseSensor, Settings
 
 LOOSE = 3.0  # times what a guess is worth
+LEAST_LEFT = 0.2  # of the residuals of poses: where the motion takes all, nothing is left to show their noise
 EARLY_DECREASE = 0.5  # an early pass is followed by another
 
 
@@ -44,13 +44,13 @@ OnVisit = Callable[[str, Problem, Visit], None]  # told of the pass's name, its 
 
 @dataclass(frozen=True)
 class Estimate:
-    """The last pass: its problem, where the solver ended, and the noise of each camera and each LiDAR."""
+    """The last pass: its problem, where the solver ended, and the noise of each camera and of the robot's sensors."""
 
     problem: Problem
     outcome: Outcome
     noise: tuple[NoiseModel, ...]
     steps: tuple[tuple[str, Step], ...]  # of all passes, with the pass's name
-    ranging: tuple[LidarNoise, ...] = ()
+    robot: RobotNoise = NO_ROBOT
 
 
 def estimate(
@@ -69,11 +69,11 @@ def estimate(
     noise = [m.noise(s, c, rig.settings) for m, s, c in zip(models, streams, rig.cameras, strict=True)]
     keep = [np.ones(len(s.uv), dtype=bool) for s in streams]
     following = first_following(inputs)
-    ranging = [first_ranging(x, rig.settings) for x in rig.lidars]
+    robot = RobotNoise.first(rig)
     history: list[tuple[str, Step]] = []
     names = pass_names(inputs)
     for name in names:
-        problem = assemble(inputs, state, noise, keep, held, following, ranging)
+        problem = assemble(inputs, state, noise, keep, held, following, robot)
 
         def note(step: Step, name: str = name) -> None:
             history.append((name, step))
@@ -83,7 +83,7 @@ def estimate(
         tolerance = CONVERGED_DECREASE if last else EARLY_DECREASE
         outcome = minimise(problem, state, note, tolerance, partial(on_visit, name, problem))
         if last:
-            return Estimate(problem, outcome, tuple(models), tuple(history), tuple(ranging))
+            return Estimate(problem, outcome, tuple(models), tuple(history), robot)
         if name == "first":
             keep = [
                 _inliers(f, out, rig.settings)
@@ -93,7 +93,7 @@ def estimate(
             following = next_following(rig, problem, outcome, following, name == "first")
         if _noise_is_estimated(inputs):
             models, noise = _next_noise(inputs, problem, outcome)
-            ranging = _next_ranging(inputs, problem, outcome, ranging)
+            robot = _next_robot(inputs, problem, outcome, robot)
         state = resample(outcome.state, nodes_for(inputs, host_times(inputs, outcome.state.values)), inputs)
         del problem, outcome  # before the next ones take as much memory
         pages.give_back()
@@ -109,8 +109,8 @@ def first_pass(inputs: Inputs, state: State) -> State:
     rig, streams = inputs.rig, inputs.measurements.cameras
     noise = [first_noise(c).noise(s, c, rig.settings) for s, c in zip(streams, rig.cameras, strict=True)]
     keep = [np.ones(len(s.uv), dtype=bool) for s in streams]
-    ranging = [first_ranging(x, rig.settings) for x in rig.lidars]
-    problem = assemble(inputs, state, noise, keep, following=first_following(inputs), ranging=ranging)
+    robot = RobotNoise.first(rig)
+    problem = assemble(inputs, state, noise, keep, following=first_following(inputs), robot=robot)
     loose = [
         Prior(b, state.values[b.key], np.full(b.size, LOOSE * GUESS_SIGMA[b.name]))
         for b in inputs.layout.free
@@ -138,15 +138,26 @@ def _next_noise(inputs: Inputs, problem: Problem, outcome: Outcome) -> tuple[lis
     return models, noise
 
 
-def _next_ranging(inputs: Inputs, problem: Problem, outcome: Outcome, ranging: list[LidarNoise]) -> list[LidarNoise]:
-    """Noise of the LiDARs, as the residuals of this pass show it."""
-    found = []
+def _next_robot(inputs: Inputs, problem: Problem, outcome: Outcome, robot: RobotNoise) -> RobotNoise:
+    """Noise of LiDARs and pose sensors, as the residuals of this pass show it: of the latter by degrees of freedom, for
+    where nothing else shows the motion they pay for most of it."""
+    ranging = []
     pairs = list(zip(problem.sensors, outcome.residuals.sensors, strict=True))
-    for lidar, noise in zip(inputs.rig.lidars, ranging, strict=True):
+    for lidar, noise in zip(inputs.rig.lidars, robot.ranging, strict=True):
         own = [(f, out) for f, out in pairs if isinstance(f, LidarFactor) and f.name == lidar.name]
         shown = [(chi2(out, f.kinds["points"]), f.count(out, "points")) for f, out in own]
-        found.append(next_ranging(lidar, noise, *shown[0]) if shown else noise)
-    return found
+        ranging.append(next_ranging(lidar, noise, *shown[0]) if shown else noise)
+    judged = fits(problem, outcome) if any(_is_open(s) for s in inputs.rig.poses) else []
+    posing = []
+    for sensor, noise in zip(inputs.rig.poses, robot.posing, strict=True):
+        ratios = {f.kind: f.chi2 / f.dof for f in judged if f.sensor == sensor.name and f.dof > LEAST_LEFT * f.count}
+        posing.append(next_posing(sensor, noise, ratios))
+    return RobotNoise(tuple(ranging), tuple(posing))
+
+
+def _is_open(sensor: PoseSensor) -> bool:
+    """Whether some of its noise is estimated."""
+    return sensor.rotation_noise is None or sensor.position_noise is None
 
 
 def _noise_is_estimated(inputs: Inputs) -> bool:
@@ -158,6 +169,7 @@ def _noise_is_estimated(inputs: Inputs) -> bool:
         or any(c.corner_noise_px is None for c in cornered)
         or any(c.track_noise_px is None for c in tracked)
         or (inputs.clouds.count > 0 and any(x.range_noise_m is None for x in inputs.rig.lidars))
+        or any(_is_open(x) for x in inputs.rig.poses)
     )
 
 
@@ -165,9 +177,8 @@ def pass_names(inputs: Inputs) -> tuple[str, ...]:
     """The passes: nodes and assignment are made anew once; noise that is estimated takes more."""
     if not _noise_is_estimated(inputs):
         return ("first", "final")
-    return (
-        ("first", "noise", "noise again", "final") if inputs.rig.settings.common_error else ("first", "noise", "final")
-    )
+    twice = inputs.rig.settings.common_error or any(_is_open(x) for x in inputs.rig.poses)
+    return ("first", "noise", "noise again", "final") if twice else ("first", "noise", "final")
 
 
 def _inliers(factor: CornerFactor, out: CornerOutput, settings: Settings) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""LiDARs and wheels of a rig: what they add to the border, and their factors in one pass."""
+"""LiDARs, wheels and pose sensors of a rig: what they add to the border, and their factors in one pass."""
 
 from __future__ import annotations
 
@@ -10,12 +10,20 @@ import numpy as np
 from icalib.estimation.lidar_binning import LidarNoise
 from icalib.estimation.lidar_factor import LidarFactor
 from icalib.estimation.lidar_sweep import Motion
+from icalib.estimation.pose_factor import (
+    FRAME,
+    AbsolutePoseFactor,
+    PoseFactor,
+    PoseNoise,
+    RelativePosesFactor,
+    frame_of,
+)
 from icalib.estimation.sensors import SensorFactor
 from icalib.estimation.state import Entry, Key, Kind, Layout
 from icalib.estimation.wheel_angles import angles_from_rates
 from icalib.estimation.wheel_factor import IncrementFactor, RelativePoseFactor, WheelNoise
-from icalib.measurements import LidarStream, Measurements, WheelPoses, WheelStream
-from icalib.rig import Lidar, Rig, Settings, Wheels
+from icalib.measurements import LidarStream, Measurements, PoseStream, WheelPoses, WheelStream
+from icalib.rig import Lidar, PoseSensor, Rig, Settings, Wheels
 
 MOUNT: tuple[tuple[str, Kind, int], ...] = (
     ("rotation", "rotation", 3), ("translation", "vector", 3), ("time_offset", "vector", 1),
@@ -25,6 +33,9 @@ NEAR_PLANE_M = 1e-3  # of a point's distance whatever the direction: what the mo
 FIRST_RANGE_M = 0.03  # of a LiDAR whose noise is not given
 LEAST_RANGE_M = 1e-3
 FEWEST_POINTS = 100  # of a plane
+# Of a pose sensor whose noise is not given: rad, m; of relative poses rad/sqrt(s), m/sqrt(s).
+FIRST_POSE_NOISE = 0.01, 0.02
+LEAST_POSE_NOISE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -75,11 +86,17 @@ def joined_clouds(each: Sequence[Clouds]) -> Clouds:
     return Clouds(names, tuple(plane))
 
 
-def own_entries(sensor: Lidar | Wheels) -> list[Entry]:
+def own_entries(sensor: Lidar | Wheels | PoseSensor) -> list[Entry]:
     """Of the border."""
     drive = DRIVE if isinstance(sensor, Wheels) else ()
     mute = drive if isinstance(sensor, Wheels) and sensor.measures == "poses" else ()  # of them poses say nothing
     return [(sensor.name, *g, getattr(sensor, g[0]).mode != "fixed" and g not in mute) for g in (*MOUNT, *drive)]
+
+
+def frame_entries(sensor: PoseSensor, n_recordings: int) -> list[Entry]:
+    """Of the border: where the frame of absolute poses stands in each recording's world."""
+    frames = [frame_of(sensor.name, k) for k in range(n_recordings if sensor.kind == "absolute" else 0)]
+    return [(f, name, kind, 3, True) for f in frames for name, kind in zip(FRAME, ("rotation", "vector"), strict=True)]
 
 
 def known_planes(streams: Sequence[LidarStream]) -> Clouds:
@@ -109,19 +126,66 @@ def next_ranging(lidar: Lidar, noise: LidarNoise, chi2: float, count: int) -> Li
     return LidarNoise(sigma, 0.0, noise.loss, noise.loss_scale)
 
 
+def first_posing(sensor: PoseSensor, settings: Settings) -> PoseNoise:
+    """Noise of a pose sensor before its residuals are known."""
+    turn, way = FIRST_POSE_NOISE
+    turn = turn if sensor.rotation_noise is None else sensor.rotation_noise
+    way = way if sensor.position_noise is None else sensor.position_noise
+    return PoseNoise(turn, way, settings.loss, settings.loss_scale)
+
+
+def next_posing(sensor: PoseSensor, noise: PoseNoise, ratios: dict[str, float]) -> PoseNoise:
+    """With the sizes that chi^2 over degrees of freedom shows, by kind of row, where the rig file has none. A kind that
+    `ratios` lacks stays as it is."""
+    turn, way = (
+        max(size * float(np.sqrt(ratios.get(kind, 1.0))), LEAST_POSE_NOISE)
+        for kind, size in (("rotation", noise.rotation), ("position", noise.position))
+    )
+    turn = turn if sensor.rotation_noise is None else noise.rotation
+    way = way if sensor.position_noise is None else noise.position
+    return PoseNoise(turn, way, noise.loss, noise.loss_scale)
+
+
+@dataclass(frozen=True)
+class RobotNoise:
+    """Noise of the LiDARs and of the pose sensors, in the rig's order."""
+
+    ranging: tuple[LidarNoise, ...] = ()
+    posing: tuple[PoseNoise, ...] = ()
+
+    @classmethod
+    def first(cls, rig: Rig) -> RobotNoise:
+        """Before any residuals are known."""
+        ranging = tuple(first_ranging(x, rig.settings) for x in rig.lidars)
+        return cls(ranging, tuple(first_posing(x, rig.settings) for x in rig.poses))
+
+
+NO_ROBOT = RobotNoise()
+
+
 def robot_factors(
-    rig: Rig, measurements: Measurements, clouds: Clouds, ranging: Sequence[LidarNoise], motion: Motion, layout: Layout
+    rig: Rig, measurements: Measurements, clouds: Clouds, noise: RobotNoise, motion: Motion, layout: Layout
 ) -> tuple[SensorFactor, ...]:
-    """Of LiDARs, if points are known to lie on planes, and of wheels, everything frozen that a pass freezes."""
+    """Of LiDARs, if points are known to lie on planes, of wheels and of pose sensors, everything frozen that a pass
+    freezes."""
     lidars = (
-        LidarFactor.build(stream, plane, clouds.keys, motion, noise, layout, rig.settings.scheme)
-        for stream, plane, noise in zip(measurements.lidars, clouds.plane, ranging, strict=False)
+        LidarFactor.build(stream, plane, clouds.keys, motion, size, layout, rig.settings.scheme)
+        for stream, plane, size in zip(measurements.lidars, clouds.plane, noise.ranging, strict=False)
     )
     wheels = (
         wheel_factor(sensor, rig.settings, stream, motion, layout)
         for sensor, stream in zip(rig.wheels, measurements.wheels, strict=True)
     )
-    return (*(lidars if clouds.count else ()), *wheels)
+    poses = (
+        pose_factor(sensor, stream, motion, size, layout)
+        for sensor, stream, size in zip(rig.poses, measurements.poses, noise.posing, strict=True)
+    )
+    return (*(lidars if clouds.count else ()), *wheels, *poses)
+
+
+def pose_factor(sensor: PoseSensor, stream: PoseStream, motion: Motion, noise: PoseNoise, layout: Layout) -> PoseFactor:
+    kind = AbsolutePoseFactor if sensor.kind == "absolute" else RelativePosesFactor
+    return kind.build(stream, motion, noise, layout)
 
 
 def wheel_factor(

@@ -9,11 +9,13 @@ import numpy as np
 from icalib.estimation.state import Layout
 from icalib.rig import Settings
 
-# What a guess without a standard deviation is taken to be worth: rad, m, s, px, 1. Nobody guesses where the walls and
-# which way the board are: if these moved with a sensor at some worth, little of a direction's would be left to it.
+# What a guess without a standard deviation is taken to be worth: rad, m, s, px, 1. Nobody guesses where the walls
+# and frames of poses and which way the board are: if these moved with a sensor at some worth, little of a direction's
+# would be left to it.
 GUESS_SIGMA = {
     "rotation": 0.1, "translation": 0.1, "time_offset": 0.01, "intrinsics": 15.0, "distortion": 0.1, "bloom": 1.0,
     "shape": 1e-3, "tilt": 10.0, "radii": 0.01, "baseline": 0.05, "plane": 10.0,
+    "frame_rotation": 10.0, "frame_translation": 10.0,
 }  # fmt: skip
 OTHER_SIGMA = 0.1  # of IMU intrinsics
 
@@ -34,6 +36,9 @@ class Tolerances:
     baseline: float = 1e-3
     # Of normal and distance: wide, so that what is open is told in words of the sensors that it is open for.
     plane: tuple[float, float, float] = (np.deg2rad(10.0), np.deg2rad(10.0), 0.5)
+    # Of where the frame of a pose sensor stands: wide, too.
+    frame_rotation: float = np.deg2rad(10.0)
+    frame_translation: float = 0.5
     imu_intrinsics: float = 1e-2  # scale, misalignment [rad]; g-sensitivity rad/s per m/s^2
 
     @classmethod

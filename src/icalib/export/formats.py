@@ -58,7 +58,7 @@ def export(
 
 def kalibr(c: Calibration) -> Export:
     """Kalibr's camchain, and its imu.yaml where there is an IMU."""
-    sentences = no_place_for("Kalibr", [*c.lidars, *c.wheels]) + guesses(c, c.cameras)
+    sentences = no_place_for("Kalibr", [*c.lidars, *c.wheels, *c.pose_sensors]) + guesses(c, c.cameras)
     said = "".join(f"# {sentence}\n" for sentence in sentences)
     files = {camchain_name(c): said + camchain(c)} if c.cameras else {}
     if c.imu is not None:

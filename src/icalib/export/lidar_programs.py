@@ -28,7 +28,7 @@ def mins(c: Calibration) -> Export:
     imu = need_imu(c, "MINS")
     lenses = {name: lens_of(c, name, "MINS", tuple(MODELS)) for name in c.cameras}
     sentences = tuple(lens.sentence for lens in lenses.values() if lens.sentence)
-    sentences += no_place_for("MINS", [*imu_intrinsics(c), *c.wheels[1:]])
+    sentences += no_place_for("MINS", [*imu_intrinsics(c), *c.wheels[1:], *c.pose_sensors])
     sentences += guesses(c, [*c.cameras, *c.lidars, *c.wheels[:1]])
     noise = c.rig["sensors"][imu]["noise"]
     fields = {"accel_noise": "accel", "accel_bias": "accel_walk", "gyro_noise": "gyro", "gyro_bias": "gyro_walk"}
@@ -60,7 +60,8 @@ def fast_lio(c: Calibration) -> Export:
     """A file for each LiDAR. Raises CalibrationError without an IMU or a LiDAR."""
     imu = need_imu(c, "FAST-LIO")
     need(c.lidars, "LiDAR", "FAST-LIO")
-    sentences = no_place_for("FAST-LIO", [*c.cameras, *c.wheels, *imu_intrinsics(c)]) + guesses(c, c.lidars)
+    away = [*c.cameras, *c.wheels, *c.pose_sensors, *imu_intrinsics(c)]
+    sentences = no_place_for("FAST-LIO", away) + guesses(c, c.lidars)
     comments = [
         "For FAST-LIO, by icalib: put these fields into its own configuration, which has others besides.",
         "extrinsic_R (row by row) and extrinsic_T [m] place the LiDAR in the imu frame:",

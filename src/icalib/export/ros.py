@@ -81,7 +81,7 @@ def camera_info(c: Calibration) -> Export:
     need(c.cameras, "camera", "CameraInfo")
     lenses = {name: lens_of(c, name, "CameraInfo", tuple(_DISTORTION)) for name in c.cameras}
     sentences = tuple(lens.sentence for lens in lenses.values() if lens.sentence)
-    away = ["poses", *time_offsets(c, c.mounted), *c.lidars, *c.wheels, *imu_intrinsics(c)]
+    away = ["poses", *time_offsets(c, c.mounted), *c.lidars, *c.wheels, *c.pose_sensors, *imu_intrinsics(c)]
     sentences += no_place_for("CameraInfo", away)
     return Export({f"{name}.yaml": _info(name, lens, sentences) for name, lens in lenses.items()}, sentences)
 

@@ -33,7 +33,7 @@ def vins_fusion(c: Calibration) -> Export:
     names = c.cameras[:_MOST]
     lenses = [lens_of(c, name, "VINS-Fusion", _MODELS) for name in names]
     sentences = tuple(lens.sentence for lens in lenses if lens.sentence) + _offset(c, names)
-    left = [*c.cameras[_MOST:], *c.lidars, *c.wheels, *imu_intrinsics(c)]
+    left = [*c.cameras[_MOST:], *c.lidars, *c.wheels, *c.pose_sensors, *imu_intrinsics(c)]
     sentences += no_place_for("VINS-Fusion", left) + guesses(c, names)
     files = {"vins.yaml": _main(c, imu, names, lenses, sentences)}
     for i, (name, lens) in enumerate(zip(names, lenses, strict=True)):

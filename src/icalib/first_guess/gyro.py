@@ -9,6 +9,8 @@ import numpy as np
 from icalib.estimation.imu_data import ImuData
 from icalib.geometry import so3
 
+SMOOTHED_S = 0.5  # to both sides: short against the drift of the gyroscope
+
 
 @dataclass(frozen=True)
 class GyroRotation:
@@ -38,3 +40,15 @@ class GyroRotation:
         near = after - (to - t[after - 1] < t[after] - to)
         start = self.at(t)[near]
         return rotation[near] @ start.transpose(0, 2, 1) @ self.at(to)
+
+    def smoothed(self, t: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+        """(n, 3, 3) means of the R_any_imu that are known around times t (in order), carried by the gyroscope, and over
+        no gap of it. Where rotations are coefficients of unknowns, their noise would pull these to zero."""
+        turned = self.at(t)
+        start = rotation @ turned.transpose(0, 2, 1)
+        total = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(start, axis=0)])
+        part = np.searchsorted([gap for gap, _ in self.imu.gaps], t)
+        low = np.maximum(np.searchsorted(t, t - SMOOTHED_S), np.searchsorted(part, part))
+        high = np.minimum(np.searchsorted(t, t + SMOOTHED_S, side="right"), np.searchsorted(part, part, side="right"))
+        left, _, right = np.linalg.svd(total[high] - total[low])
+        return left @ right @ turned

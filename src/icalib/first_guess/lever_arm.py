@@ -19,7 +19,6 @@ from icalib.first_guess.gyro import GyroRotation
 from icalib.first_guess.target_poses import TargetPoses
 
 STEP_S = 0.12  # between the images of a triple: long against pose noise, short against the loss of sight
-SMOOTHED_S = 0.5  # to both sides: short against the drift of the gyroscope
 READINGS = 8192  # of the IMU at a time, whose rotations are made together
 BIAS_SIGMA = 0.3  # m/s^2
 SHARED = 2.0  # rows share images: the error of their mean falls as if they were a quarter as many
@@ -55,7 +54,8 @@ def lever_arm(
     """
     ok = poses.ok & (times >= imu.seconds[1]) & (times <= imu.seconds[-2])
     t, p = times[ok], poses.position[ok]
-    R_bi = _smoothed(poses.rotation[ok] @ R_imu_cam.T, t, gyro)
+    # The error of one image's rotation goes with that of its position, as if the lever arm reached to the target.
+    R_bi = gyro.smoothed(t, poses.rotation[ok] @ R_imu_cam.T)
     D_f, D_R = _double_integrals(imu, t, R_bi, gyro)
     i, j, k = _triples(t, imu.gaps)
     if len(i) < 10:
@@ -75,20 +75,7 @@ def lever_arm(
         rhs = rhs - rows[:, :, 0:3] @ given
         rows[:, :, 0:3] = 0.0
     x = _solve(rows, rhs)
-    return LeverArm(x[0:3] if given is None else given, x[3:6], x[6:9], *_target_size(rows, rhs, second(D_f)))
-
-
-def _smoothed(R_board_imu: np.ndarray, t: np.ndarray, gyro: GyroRotation) -> np.ndarray:
-    """(n, 3, 3) means of what the images around times t show, carried by the gyroscope. The error of one image's
-    rotation goes with that of its position, as if the lever arm reached to the target."""
-    turned = gyro.at(t)
-    start = R_board_imu @ turned.transpose(0, 2, 1)
-    total = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(start, axis=0)])
-    part = np.searchsorted([gap for gap, _ in gyro.imu.gaps], t)
-    low = np.maximum(np.searchsorted(t, t - SMOOTHED_S), np.searchsorted(part, part))
-    high = np.minimum(np.searchsorted(t, t + SMOOTHED_S, side="right"), np.searchsorted(part, part, side="right"))
-    left, _, right = np.linalg.svd(total[high] - total[low])
-    return left @ right @ turned
+    return LeverArm(x[0:3] if given is None else given, x[3:6], x[6:9], *size_of(rows, rhs, second(D_f)))
 
 
 def _solve(rows: np.ndarray, rhs: np.ndarray) -> np.ndarray:
@@ -105,16 +92,17 @@ def _solve(rows: np.ndarray, rhs: np.ndarray) -> np.ndarray:
     return x
 
 
-def _target_size(rows: np.ndarray, rhs: np.ndarray, felt: np.ndarray) -> tuple[float, float]:
-    """True size of the target over the one given, and its standard deviation: the inverse of the factor that the
-    accelerometer's part asks for. (A factor on the noisy positions instead would be pulled to zero.)"""
-    A = np.concatenate([rows, felt[:, :, None]], axis=2).reshape(-1, 10)
+def size_of(rows: np.ndarray, rhs: np.ndarray, felt: np.ndarray) -> tuple[float, float]:
+    """True size of the target, or of a motion, over the one given, and its standard deviation: the inverse of the
+    factor that the accelerometer's part asks for; rows (n, 3, m), rhs, felt (n, 3). (A factor on the noisy positions
+    instead would be pulled to zero.)"""
+    A = np.concatenate([rows, felt[:, :, None]], axis=2).reshape(felt.size, -1)
     b = rhs.ravel()
-    information = A.T @ A + 1e-9 * np.eye(10)
+    information = A.T @ A + 1e-9 * np.eye(A.shape[1])
     x = np.linalg.solve(information, A.T @ b)
     variance = np.mean((b - A @ x) ** 2)
-    factor = max(1.0 + float(x[9]), 1e-3)
-    return 1.0 / factor, float(np.sqrt(variance * np.linalg.inv(information)[9, 9])) / factor**2
+    factor = max(1.0 + float(x[-1]), 1e-3)
+    return 1.0 / factor, float(np.sqrt(variance * np.linalg.inv(information)[-1, -1])) / factor**2
 
 
 def _triples(t: np.ndarray, gaps: tuple[tuple[float, float], ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

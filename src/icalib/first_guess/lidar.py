@@ -50,7 +50,7 @@ class Held:
 
 @dataclass(frozen=True)
 class LidarGuess:
-    """R_imu_lidar, p_imu_lidar (3,) m; offset: as in `Held`."""
+    """Of a LiDAR, or whatever else has a path: R_imu_lidar, p_imu_lidar (3,) m; offset: as in `Held`."""
 
     rotation: np.ndarray
     position: np.ndarray
@@ -71,6 +71,31 @@ def lidar_and_motion(
     """From one LiDAR and the IMU alone; gravity [m/s^2]. Raises EstimationError, one sentence, where the recording does
     not show it."""
     aligned, path, rates = _aligned(imu, stream, held)
+    found = motion_of_path(imu, path, rates, aligned, gravity, held)
+    if found is None:
+        raise _too_short(stream)
+    _check_axes(stream.name, imu.name, found.mirrored)
+    _check_gravity(found.gravity, gravity, imu.name, stream.name)
+    return found.guess, found.motion
+
+
+@dataclass(frozen=True)
+class FromPath:
+    """What a path shows: the sensor's guess, the motion of the IMU, how long gravity is [m/s^2], and R_world_map, which
+    brings it down; the origin of the world is the map's. mirrored: see `is_mirrored`."""
+
+    guess: LidarGuess
+    motion: ImuMotion
+    gravity: float
+    level: np.ndarray
+    mirrored: bool
+
+
+def motion_of_path(
+    imu: ImuData, path: LidarPath, rates: CameraRates, aligned: Alignment, gravity: float, held: Held
+) -> FromPath | None:
+    """From the path of one sensor, all of it while the IMU was running, and the IMU alone; None where it is too
+    short."""
     gyro, t = GyroRotation.integrate(imu, aligned.gyro_bias), path.seconds + aligned.offset
 
     def carry(at_scans: np.ndarray) -> np.ndarray:
@@ -82,14 +107,13 @@ def lidar_and_motion(
     system = against_readings(imu, carry, t, path.rotation, path.position)
     found = solve(system, prior, aligned.rotation, rates.rate)
     if found is None:
-        raise _too_short(stream)
+        return None
     R_il, x = found
-    _check_axes(stream.name, imu.name, is_mirrored(system, R_il, x))
-    _check_gravity(float(np.linalg.norm(x[6:9])), gravity, imu.name, stream.name)
     level, R_imu = _level(x[6:9]), path.rotation @ R_il.T
     position = (path.position - R_imu @ x[3:6]) @ level.T
     start = ImuMotion(gyro, t, level @ R_imu, position, np.zeros_like(position), aligned.gyro_bias, x[9:12], gravity)
-    return LidarGuess(R_il, x[3:6], aligned.offset), start.smoothed()
+    guess, mirrored = LidarGuess(R_il, x[3:6], aligned.offset), is_mirrored(system, R_il, x)
+    return FromPath(guess, start.smoothed(), float(np.linalg.norm(x[6:9])), level, mirrored)
 
 
 def lidar_on_motion(imu: ImuData, stream: LidarStream, known: State, held: Held = Held()) -> LidarGuess:
@@ -102,7 +126,7 @@ def lidar_on_motion(imu: ImuData, stream: LidarStream, known: State, held: Held 
     for _ in range(ARM_ROUNDS):
         path = _path_on(stream, known, gyro, guess)
         t = path.seconds + guess.offset
-        R, p = _poses(known, gyro, t)
+        R, p = poses_in(known, gyro, t)
         system = against_motion(R, p, t, path.rotation, path.position)
         found = solve(system, prior, guess.rotation, rates.rate)
         if found is None:
@@ -117,7 +141,7 @@ def _path_on(stream: LidarStream, known: State, gyro: GyroRotation, guess: Lidar
     not drift."""
 
     def moving(t: np.ndarray) -> np.ndarray:
-        R, p = _poses(known, gyro, np.clip(t + guess.offset, known.seconds[0], known.seconds[-1]))
+        R, p = poses_in(known, gyro, np.clip(t + guess.offset, known.seconds[0], known.seconds[-1]))
         return p + R @ guess.position
 
     def turning(t: np.ndarray) -> np.ndarray:
@@ -125,14 +149,15 @@ def _path_on(stream: LidarStream, known: State, gyro: GyroRotation, guess: Lidar
 
     path = lidar_path(stream, turning, moving)
     t = path.seconds + guess.offset
-    return _where(path, path.ok & (t >= known.seconds[0]) & (t <= known.seconds[-1]))
+    return where(path, path.ok & (t >= known.seconds[0]) & (t <= known.seconds[-1]))
 
 
-def _where(path: LidarPath, own: np.ndarray) -> LidarPath:
+def where(path: LidarPath, own: np.ndarray) -> LidarPath:
+    """The part `own` (n,) of a path."""
     return LidarPath(path.seconds[own], path.rotation[own], path.position[own], path.ok[own])
 
 
-def _poses(known: State, gyro: GyroRotation, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def poses_in(known: State, gyro: GyroRotation, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """R_world_imu (n, 3, 3), p (n, 3) at times t: cubic between nodes, by their velocities."""
     k = np.clip(np.searchsorted(known.seconds, t, side="right") - 1, 0, len(known.seconds) - 2)
     h = np.diff(known.seconds)[k][:, None]
@@ -145,15 +170,15 @@ def _poses(known: State, gyro: GyroRotation, t: np.ndarray) -> tuple[np.ndarray,
 def _aligned(imu: ImuData, stream: LidarStream, held: Held) -> tuple[Alignment, LidarPath, CameraRates]:
     """Time offset, rotation and gyroscope bias; the LiDAR's path by the gyroscope's turns, as far as the IMU was
     running, and its rates."""
-    first = _align(imu, stream.name, _rates(stream.name, lidar_path(stream)), held)
+    first = align_path(imu, stream.name, _rates(stream.name, lidar_path(stream)), held)
     path = _turned_path(imu, stream, first)
     rates = _rates(stream.name, path)
-    aligned = _align(imu, stream.name, rates, held)
+    aligned = align_path(imu, stream.name, rates, held)
     if not _alike(first, aligned):
         path = _turned_path(imu, stream, aligned)
     t = path.seconds + aligned.offset
     inside = path.ok & (t > imu.seconds[0]) & (t < imu.seconds[-1])
-    return aligned, _where(path, inside), rates
+    return aligned, where(path, inside), rates
 
 
 def _alike(a: Alignment, b: Alignment) -> bool:
@@ -161,7 +186,8 @@ def _alike(a: Alignment, b: Alignment) -> bool:
     return float(np.linalg.norm(apart)) < SAME_RAD and abs(a.offset - b.offset) < SAME_S
 
 
-def _align(imu: ImuData, name: str, rates: CameraRates, held: Held) -> Alignment:
+def align_path(imu: ImuData, name: str, rates: CameraRates, held: Held) -> Alignment:
+    """Time offset, rotation and gyroscope bias from rates. Raises EstimationError where they do not show them."""
     if held.rotation is not None and held.offset is not None:
         found = as_given(imu, name, rates, held.offset, held.rotation)
         if contradicts(imu, rates, found):

@@ -40,14 +40,14 @@ from icalib.first_guess.by_recording import (
 from icalib.first_guess.lidar import Held, lidar_and_motion, lidar_on_motion
 from icalib.first_guess.lidar_planes import ROUNDS, Association, associate, round_search
 from icalib.geometry.planes import plane_of
-from icalib.rig import Camera, Lidar, Wheels
+from icalib.rig import Camera, Lidar, PoseSensor, Wheels
 
 FEW, LOST = 0.2, 0.7  # share of points on planes, and of what there was at first, below which the planes are lost
 NEAR_NODE_S = 0.15  # a scan of a LiDAR alone goes on so long after its node
 NAMES = tuple(name for name, _, _ in MOUNT)
 
 
-def given(inputs: Inputs, sensor: Camera | Lidar | Wheels, names: Sequence[str]) -> dict[Key, np.ndarray]:
+def given(inputs: Inputs, sensor: Camera | Lidar | Wheels | PoseSensor, names: Sequence[str]) -> dict[Key, np.ndarray]:
     """What the rig gives of a sensor, time offsets between clocks that start at their first stamps."""
     out: dict[Key, np.ndarray] = {}
     for name in names:
@@ -83,9 +83,9 @@ def _state_of_one(inputs: Inputs, held: Held | None = None) -> State:
     assert inputs.imu is not None
     lidar, stream = inputs.rig.lidars[0], inputs.measurements.lidars[0]
     try:
-        guess, motion = lidar_and_motion(inputs.imu, stream, inputs.rig.gravity, held or _held(inputs, lidar))
+        guess, motion = lidar_and_motion(inputs.imu, stream, inputs.rig.gravity, held or held_of(inputs, lidar))
     except EstimationError:
-        known = _held(inputs, lidar, guesses=True)
+        known = held_of(inputs, lidar, guesses=True)
         if held is not None or known.rotation is None or known.offset is None:
             raise
         # The motion shows too little; the rig file's guess stands in.
@@ -189,15 +189,15 @@ def lidar_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
             own, motion = alone(inputs, k), motion_alone(inputs, k, state)
             assert own.imu is not None
             with naming_recording(inputs, k):
-                found = lidar_on_motion(own.imu, own.measurements.lidars[i], motion, _held(own, lidar))
+                found = lidar_on_motion(own.imu, own.measurements.lidars[i], motion, held_of(own, lidar))
             found = replace(found, offset=other_clocks(found.offset, lidar.name, own, inputs))
             known = found.values(lidar.name) | known
         out |= known
     return out
 
 
-def _held(inputs: Inputs, lidar: Lidar, guesses: bool = False) -> Held:
-    """What the rig trusts of a LiDAR, and with `guesses` what it guesses."""
+def held_of(inputs: Inputs, lidar: Lidar | PoseSensor, guesses: bool = False) -> Held:
+    """What the rig trusts of a LiDAR or a pose sensor, and with `guesses` what it guesses."""
     known = given(inputs, lidar, [name for name in NAMES if guesses or trusted(getattr(lidar, name)) is not None])
     offset = known.get((lidar.name, "time_offset"))
     return Held(

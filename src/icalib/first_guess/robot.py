@@ -14,6 +14,7 @@ from icalib.estimation.robot import DRIVE, MOUNT, wheel_angles
 from icalib.estimation.state import Key, State
 from icalib.first_guess.from_tracks import lens_start
 from icalib.first_guess.lidar_rounds import given, lidar_values, near_nodes, with_lidars
+from icalib.first_guess.poses import pose_values
 from icalib.first_guess.wheel_poses import mount_guess, poses_offset
 from icalib.first_guess.wheels import drive_guess, wheel_offset, wheel_rates
 from icalib.measurements import WheelPoses, WheelStream
@@ -34,13 +35,14 @@ def wheel_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
 
 
 def with_robot(inputs: Inputs, settled: State) -> tuple[Inputs, State, dict[Key, np.ndarray]]:
-    """`inputs` with the points of its LiDARs on planes, where the solver starts with them and the wheels, `settled`
-    having the motion, and the guess of all: what the rig gives, and else what the motion shows.
+    """`inputs` with the points of its LiDARs on planes, where the solver starts with them, the wheels and the pose
+    sensors, `settled` having the motion, and the guess of all: what the rig gives, and else what the motion shows.
 
     The start is where rounds of association lead, which may stray from the guess where the motion shows nothing.
     Raises EstimationError where a sensor shows no guess, and the rig has none.
     """
-    state = replace(settled, values=settled.values | lidar_values(inputs, settled) | wheel_values(inputs, settled))
+    found = lidar_values(inputs, settled) | wheel_values(inputs, settled) | pose_values(inputs, settled)
+    state = replace(settled, values=settled.values | found)
     guess = state.values
     if inputs.rig.lidars:
         inputs, state = with_lidars(inputs, state)

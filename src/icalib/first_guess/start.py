@@ -15,6 +15,7 @@ from icalib.estimation.nodes import first_nodes
 from icalib.estimation.state import Key, State
 from icalib.first_guess import Guess, initial_trajectory
 from icalib.first_guess.lidar_rounds import state_from_lidar
+from icalib.first_guess.poses import pose_values, state_from_poses
 from icalib.first_guess.robot import given_cameras, wheel_values, with_robot
 from icalib.first_guess.several import initial_guesses
 from icalib.geometry.targets.base import BOARD
@@ -27,22 +28,25 @@ def start(
 ) -> tuple[Inputs, State, dict[Key, np.ndarray]]:
     """What the estimate is made from, where it starts, and the guess at which stays what the data do not determine.
 
-    A target gives the motion, or else a LiDAR, if nothing is to be found of the cameras, or else points of the scene;
-    what has no part in it is placed on that motion. Raises EstimationError where the recordings do not carry it.
+    A target gives the motion, or else a LiDAR, if nothing is to be found of the cameras, or else points of the scene,
+    or where there is neither camera nor LiDAR a pose sensor; what has no part in it is placed on that motion.
+    Raises EstimationError where the recordings do not carry it.
     """
     whole = inputs_for(rig, recordings)
     cameras = given_cameras(whole)
     if rig.lidars and not rig.has_target and cameras is not None:
         return _start_from_lidar(whole, recordings, cameras, lap)
+    if not rig.cameras and not rig.lidars:
+        if not rig.poses:
+            raise EstimationError(
+                f"{' and '.join(w.name for w in rig.wheels)} and {rig.body} do not show the motion; add a camera, a "
+                "LiDAR or a pose sensor to the rig file."
+            )
+        return _start_from_poses(whole, recordings, lap)
     bare = whole
-    if rig.wheels or rig.lidars:
-        seen = [replace(m, wheels=(), lidars=()) for m in recordings]
-        bare = inputs_for(replace(rig, wheels=(), lidars=()), seen)
-    if not rig.cameras:
-        raise EstimationError(
-            f"{' and '.join(w.name for w in rig.wheels)} and {rig.body} do not show the motion; add a camera or a "
-            "LiDAR to the rig file."
-        )
+    if rig.wheels or rig.lidars or rig.poses:
+        seen = [replace(m, wheels=(), lidars=(), poses=()) for m in recordings]
+        bare = inputs_for(replace(rig, wheels=(), lidars=(), poses=()), seen)
     guesses = initial_guesses(rig, bare.bodies, [m.measurements for m in bare.motions])
     lap("first guess")
     state = first_state(bare, *guesses)
@@ -50,15 +54,15 @@ def start(
     if bare is whole:
         return whole, state, state.values
     inputs, settled, guess = with_robot(whole, first_pass(bare, state))
-    lap("wheels and LiDARs")
+    lap("other sensors")
     return inputs, settled, guess | state.values
 
 
 def _start_from_lidar(
     whole: Inputs, recordings: Sequence[Measurements], cameras: dict[Key, np.ndarray], lap: Callable[[str], None]
 ) -> tuple[Inputs, State, dict[Key, np.ndarray]]:
-    rig = replace(whole.rig, cameras=(), wheels=())
-    alone = inputs_for(rig, [replace(m, cameras=(), tracks=(), wheels=()) for m in recordings])
+    rig = replace(whole.rig, cameras=(), wheels=(), poses=())
+    alone = inputs_for(rig, [replace(m, cameras=(), tracks=(), wheels=(), poses=()) for m in recordings])
     state = state_from_lidar(alone)
     lap("first guess")
     alone, state, guess = with_robot(alone, state)
@@ -66,9 +70,23 @@ def _start_from_lidar(
     inputs = replace(with_clouds(replace(whole, measurements=measured), alone.clouds), guess=alone.guess)
     values = start_values(inputs, state.values | cameras)
     state = resample(replace(state, values=values), nodes_for(inputs, host_times(inputs, values)), inputs)
-    wheels = wheel_values(inputs, state)
-    lap("wheels and LiDARs")
-    return inputs, replace(state, values=state.values | wheels), guess | cameras | wheels
+    others = wheel_values(inputs, state) | pose_values(inputs, state)
+    lap("other sensors")
+    return inputs, replace(state, values=state.values | others), guess | cameras | others
+
+
+def _start_from_poses(
+    whole: Inputs, recordings: Sequence[Measurements], lap: Callable[[str], None]
+) -> tuple[Inputs, State, dict[Key, np.ndarray]]:
+    """The first pose sensor gives the motion; others are placed on it, and so are wheels."""
+    rig = replace(whole.rig, wheels=(), poses=whole.rig.poses[:1])
+    alone = inputs_for(rig, [replace(m, wheels=(), poses=m.poses[:1]) for m in recordings])
+    state = state_from_poses(alone)
+    lap("first guess")
+    state = first_pass(alone, replace(state, values=state.values | pose_values(alone, state)))
+    guess = state.values | wheel_values(whole, state) | pose_values(whole, state)
+    lap("other sensors")
+    return whole, replace(state, values=guess), guess
 
 
 def first_state(inputs: Inputs, *guesses: Guess) -> State:

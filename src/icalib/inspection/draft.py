@@ -20,6 +20,7 @@ from icalib.inspection.facts import CameraSource, Inspection
 from icalib.inspection.inspect import resolution_of
 from icalib.inspection.kalibr import KalibrImu
 from icalib.inspection.lens import LensStart, lens_start
+from icalib.recordings import TopicInfo
 
 _PLAIN = re.compile(r"[A-Za-z0-9_./][A-Za-z0-9_./-]*")
 _TEMPLATE = """\
@@ -151,13 +152,22 @@ def _imu(found: Inspection) -> list[str]:
 
 
 def _robot(found: Inspection) -> Iterable[str]:
-    """LiDARs, and wheels as a comment: joints may be an arm's."""
+    """LiDARs, and wheels and poses as comments: joints may be an arm's, poses what came of these very sensors."""
     for name, topic in found.sources.lidars.items():
         yield from (f"  {name}:", "    type: lidar", _place(topic.name, topic.type, ""))
     for name, topic in found.sources.wheels.items():
         yield "  # Are these wheels? Then take the # away, and say what they measure (docs/rig-file.md#wheels)."
         for line in (f"  {name}:", "    type: wheels", _place(topic.name, topic.type, "")):
             yield f"  # {line.removeprefix('  ')}"
+    for name, topic in found.sources.poses.items():
+        yield "  # Poses of something on the robot, and not made from the sensors above? Then take the # away; absolute"
+        yield "  # is motion capture, relative an odometry, which drifts (docs/rig-file.md#pose-sensor)."
+        for line in (f"  {name}:", "    type: pose", _place(topic.name, topic.type, ""), f"    kind: {_kind(topic)}"):
+            yield f"  # {line.removeprefix('  ')}"
+
+
+def _kind(topic: TopicInfo) -> str:
+    return "relative" if topic.kind == "odometry" or "odom" in topic.name else "absolute"
 
 
 def _kalibr_imu(found: Inspection, topic: str) -> KalibrImu | None:
@@ -200,7 +210,7 @@ def _starts(lens: LensStart) -> Iterable[str]:
 
 def _place(name: str, kind: str, frame: str) -> str:
     """`topic` of a bag or a folder of images; `path` of a table."""
-    field = "path" if name.endswith((".csv", ".csv.gz", ".npz")) else "topic"
+    field = "path" if name.endswith((".csv", ".csv.gz", ".npz", ".tum", ".txt")) else "topic"
     shown = name if _PLAIN.fullmatch(name) else json.dumps(name)
     return f"    {field}: {shown}  # {_comment(kind)}" + (f", frame {json.dumps(frame)}" if frame else "")
 

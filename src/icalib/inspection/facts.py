@@ -132,13 +132,14 @@ class CameraSource:
 @dataclass(frozen=True)
 class Sources:
     """The sensors of a recording by name; left_out: topics of images that are no camera's to calibrate, and why.
-    wheels: also joints that may be of anything else."""
+    wheels: also joints that may be of anything else; poses: also those that are of no sensor on the robot."""
 
     cameras: tuple[CameraSource, ...]
     imus: Mapping[str, TopicInfo]
     left_out: Mapping[str, str]
     lidars: Mapping[str, TopicInfo] = field(default_factory=dict)
     wheels: Mapping[str, TopicInfo] = field(default_factory=dict)
+    poses: Mapping[str, TopicInfo] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

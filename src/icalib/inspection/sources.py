@@ -11,7 +11,7 @@ from icalib.recordings import TopicInfo
 # Parts of a topic's name that say what it carries, not whose it is.
 _WHAT = re.compile(
     r"(image(_(raw|color|mono|rect|rect_raw|rect_color))?|compressed|raw|camera_info|data(_raw)?|sample"
-    r"|(data|corners|rates|angles|ticks|poses)\.csv|scans\.npz|points(_raw)?|joint_states)"
+    r"|(data|corners|rates|angles|ticks|poses)\.csv|poses\.(tum|txt)|scans\.npz|points(_raw)?|joint_states|pose|odom(etry)?)"
 )
 _UNNAMEABLE = re.compile(r"[^A-Za-z0-9_-]+")
 Key = tuple[str, ...]
@@ -24,7 +24,7 @@ def find_sources(topics: Sequence[TopicInfo]) -> Sources:
     images = _by_key([t for t in filled if t.kind == "image" and t not in depth])
     corners = _by_key([t for t in filled if t.kind == "corners"])
     infos = _by_key([t for t in filled if t.kind == "camera info"])
-    others = {"imu": ("imu",), "lidar": ("points",), "wheel": ("joints", "wheels")}
+    others = {"imu": ("imu",), "lidar": ("points",), "wheel": ("joints", "wheels"), "pose": ("pose", "odometry")}
     found = [(t, what) for what, kinds in others.items() for t in filled if t.kind in kinds]
     keys = sorted({*images, *corners})
     names = _names([(k, "cam") for k in keys] + [(_key(t), what) for t, what in found])
@@ -32,8 +32,8 @@ def find_sources(topics: Sequence[TopicInfo]) -> Sources:
     left_out = {t.name: "depth images" for t in depth}
     left_out |= {other: f"the images of {c.name} once more" for c in cameras for other in c.others}
     named = [(name, *of) for name, of in zip(names[len(keys) :], found, strict=True)]
-    imus, lidars, wheels = ({name: t for name, t, kind in named if kind == what} for what in others)
-    return Sources(cameras, imus, left_out, lidars, wheels)
+    imus, lidars, wheels, poses = ({name: t for name, t, kind in named if kind == what} for what in others)
+    return Sources(cameras, imus, left_out, lidars, wheels, poses)
 
 
 def _camera(

@@ -11,7 +11,7 @@ from icalib.simulation import Truth
 def true_value(truth: Truth, sensor: str, name: str) -> np.ndarray | None:
     """The truth of the group `name` of `sensor`, in the form of `ParameterGroup.value`; None where none is stated, as
     of a target's tilt."""
-    poses = truth.T_imu_cam | truth.T_imu_lidar | truth.T_imu_wheel
+    poses = truth.T_imu_cam | truth.T_imu_lidar | truth.T_imu_wheel | truth.T_imu_pose
     if sensor not in poses:
         return truth.imu_intrinsics if (sensor, name) == ("imu0", "intrinsics") else None
     if name == "rotation":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any, final
@@ -20,11 +21,12 @@ from icalib.recordings.bags.storage import Tally
 from icalib.recordings.clouds import read_clouds
 from icalib.recordings.image_checks import checked_payloads, frames
 from icalib.recordings.images import Frame, Payload, file_payload
-from icalib.recordings.streams import point_clouds, read_joints
+from icalib.recordings.poses import PoseReadings, read_pose_file
+from icalib.recordings.streams import point_clouds, read_joints, read_odometry, read_poses
 from icalib.recordings.topics import KINDS, TopicInfo, choose_topic, find_topic
 from icalib.recordings.tracks import read_tracks
 from icalib.recordings.wheels import WheelReadings, read_wheel_joints
-from icalib.rig import Camera, ImuSensor, Lidar, Wheels
+from icalib.rig import Camera, ImuSensor, Lidar, PoseSensor, Wheels
 
 _KINDS_OF = {ImuSensor: "imu", Lidar: "points", Wheels: "joints"}
 _SWAPPED_NS = 1_000_000_000  # readings overtake each other on the network by less; more is a clock that was set back
@@ -107,9 +109,31 @@ class BagRecording:
         order = self._order(topic, read.stamps_ns)
         return WheelReadings(sensor.name, read.stamps_ns[order], read.value[order])
 
-    def where(self, sensor: ImuSensor | Camera | Lidar | Wheels) -> str:
+    def poses(self, sensor: PoseSensor) -> PoseReadings:
+        """Of a topic, or a table beside the bag."""
+        if (table := self._pose_table(sensor)) is not None:
+            self._tables.append(table)
+            return read_pose_file(sensor.name, table)
+        topic = self._pose_topic(sensor)
+        found = read_odometry(self, topic.name).pose if topic.kind == "odometry" else read_poses(self, topic.name)
+        order = self._order(topic.name, found.stamps_ns)
+        return PoseReadings(sensor.name, found.stamps_ns[order], found.rotation[order], found.position[order])
+
+    def _pose_table(self, sensor: PoseSensor) -> Path | None:
+        table = self.root.parent / sensor.path
+        return table if sensor.topic is None and table.is_file() else None
+
+    def _pose_topic(self, sensor: PoseSensor) -> TopicInfo:
+        """An odometry's will do, too."""
+        alike = [replace(t, kind="pose") if t.kind == "odometry" else t for t in self._topics]
+        chosen = choose_topic(str(self.root), alike, "pose", sensor.name, sensor.topic)
+        return find_topic(str(self.root), self._topics, chosen.name)
+
+    def where(self, sensor: ImuSensor | Camera | Lidar | Wheels | PoseSensor) -> str:
         if isinstance(sensor, Camera):
             return f"{self.root} {self.image_topic(sensor)}"
+        if isinstance(sensor, PoseSensor):
+            return str(self._pose_table(sensor) or f"{self.root} {self._pose_topic(sensor).name}")
         return f"{self.root} {self._topic(sensor)}"
 
     def files(self) -> list[Path]:

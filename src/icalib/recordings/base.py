@@ -11,9 +11,10 @@ import numpy as np
 from icalib.geometry.targets import Target
 from icalib.measurements import CornerStream, ImuStream, LidarStream, TrackStream, WheelPoses
 from icalib.recordings.images import Frame, Payload
+from icalib.recordings.poses import PoseReadings
 from icalib.recordings.topics import TopicInfo
 from icalib.recordings.wheels import WheelReadings
-from icalib.rig import Camera, ImuSensor, Lidar, Wheels
+from icalib.rig import Camera, ImuSensor, Lidar, PoseSensor, Wheels
 
 
 class Recording(Protocol):
@@ -94,7 +95,15 @@ class Recording(Protocol):
         """
         ...
 
-    def where(self, sensor: ImuSensor | Camera | Lidar | Wheels) -> str:
+    def poses(self, sensor: PoseSensor) -> PoseReadings:
+        """All poses of the sensor as they were written: stamps may still repeat or run backwards.
+
+        Raises RecordingError naming file and line, or topic, where the data are missing or cannot be read, and the
+        instant of a rotation that is none.
+        """
+        ...
+
+    def where(self, sensor: ImuSensor | Camera | Lidar | Wheels | PoseSensor) -> str:
         """How a sentence names the place of the sensor's data, for example the file."""
         ...
 

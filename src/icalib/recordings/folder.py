@@ -16,12 +16,14 @@ from icalib.recordings.euroc_images import file_payloads, image_files
 from icalib.recordings.image_checks import checked_payloads, frames
 from icalib.recordings.images import Frame, Payload
 from icalib.recordings.lidar_checks import Sieve, sifted
+from icalib.recordings.poses import FILES as POSE_FILES
+from icalib.recordings.poses import POSE, PoseReadings, is_tum_text, read_pose_file
 from icalib.recordings.scans import read_scan_stamps, read_scans
 from icalib.recordings.table import columns_of, read_table
 from icalib.recordings.topics import TopicInfo, choose_topic, find_topic
 from icalib.recordings.tracks import read_tracks
 from icalib.recordings.wheels import ENDS, POSES, STAMP, VALUES, WheelReadings, read_wheel_table
-from icalib.rig import Camera, ImuSensor, Lidar, Wheels
+from icalib.rig import Camera, ImuSensor, Lidar, PoseSensor, Wheels
 
 _IMU_DECIMALS = ("wx [rad/s]", "wy [rad/s]", "wz [rad/s]", "ax [m/s^2]", "ay [m/s^2]", "az [m/s^2]")
 _IMU_STAMP = ("t [ns]",)
@@ -35,7 +37,7 @@ class FolderRecording:
 
     IMU: t [ns], wx, wy, wz [rad/s], ax, ay, az [m/s^2], which is also EuRoC's `imu0/data.csv`. Corners: t [ns], tag id,
     corner (as the target names its points), u, v [px]. Scans of a LiDAR: arrays (`scans`). Wheels: tables
-    (`wheels`). Images: the folder `data` beside a `data.csv` of t [ns], file name.
+    (`wheels`). Poses: tables, TUM's text (`poses`). Images: the folder `data` beside a `data.csv` of t [ns], file name.
     """
 
     def __init__(self, root: Path) -> None:
@@ -64,7 +66,7 @@ class FolderRecording:
             return np.array([stamp_ns for stamp_ns, _ in image_files(folder)], np.int64)
         if chosen.kind == "imu":
             return read_table(self._locate(chosen.name), _IMU_STAMP, _IMU_DECIMALS).integers[:, 0].copy()
-        if chosen.kind in ("points", "wheels"):
+        if chosen.kind in ("points", "wheels", "pose"):
             return _stamps(self._locate(chosen.name))
         return np.unique(read_table(self._locate(chosen.name), _CORNER_INTEGERS, _CORNER_DECIMALS).integers[:, 0])
 
@@ -120,7 +122,12 @@ class FolderRecording:
         self._remember(path)
         return read_wheel_table(sensor, path)
 
-    def where(self, sensor: ImuSensor | Camera | Lidar | Wheels) -> str:
+    def poses(self, sensor: PoseSensor) -> PoseReadings:
+        path = self._locate(sensor.path)
+        self._remember(path)
+        return read_pose_file(sensor.name, path)
+
+    def where(self, sensor: ImuSensor | Camera | Lidar | Wheels | PoseSensor) -> str:
         if isinstance(sensor, Camera) and not self.has_corners(sensor):
             return f"{self.root / self.image_topic(sensor)}"
         return str(self._locate(sensor.path))
@@ -175,17 +182,25 @@ def _existing(folder: Path, name: str) -> Path | None:
 
 
 def _robot(folder: Path) -> Iterator[tuple[Path, tuple[str, str]]]:
-    """Tables of LiDARs and wheels with their type and kind."""
+    """Tables of LiDARs, wheels and pose sensors with their type and kind."""
     names = {"scans.npz": ("scans", "points")} | {f"{m}.csv": (f"table of {m}", "wheels") for m in (*VALUES, "poses")}
+    names |= {name: ("table of poses", "pose") for name in POSE_FILES[1:]}
     for name, what in names.items():
         if table := _existing(folder, name):
-            yield table, what
+            yield table, ("table of poses", "pose") if _is_poses(table) else what
+
+
+def _is_poses(table: Path) -> bool:
+    """Whether these are poses in a frame, and not relative ones of wheels."""
+    return table.name.startswith("poses.") and (is_tum_text(table) or columns_of(table) == 1 + len(POSE))
 
 
 def _stamps(table: Path) -> np.ndarray:
-    """(N,) int64 ns of scans or wheels."""
+    """(N,) int64 ns of scans, wheels or poses."""
     if table.suffix == ".npz":
         return read_scan_stamps(table)
+    if _is_poses(table):
+        return read_pose_file(table.parent.name, table).stamps_ns
     poses = columns_of(table) == len(ENDS + POSES)
     integers, decimals = (ENDS, POSES) if poses else (STAMP, VALUES["rates"])
     return read_table(table, integers, decimals).integers[:, 0].copy()

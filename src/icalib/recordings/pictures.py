@@ -18,9 +18,10 @@ from icalib.measurements import CornerStream, ImuStream, LidarStream, TrackStrea
 from icalib.recordings.euroc_images import SUFFIXES, file_payloads
 from icalib.recordings.image_checks import checked_payloads, frames
 from icalib.recordings.images import Frame, Payload
+from icalib.recordings.poses import PoseReadings
 from icalib.recordings.topics import TopicInfo, choose_topic
 from icalib.recordings.wheels import WheelReadings
-from icalib.rig import Camera, ImuSensor, Lidar, Wheels
+from icalib.rig import Camera, ImuSensor, Lidar, PoseSensor, Wheels
 
 APART_NS = 1_000_000_000  # from one number to the next
 MOST = 9_000_000_000  # beyond, nanoseconds do not fit
@@ -91,7 +92,10 @@ class PictureFolder:
     def wheels(self, sensor: Wheels) -> WheelReadings | WheelPoses:
         raise RecordingError(f"{self.root} holds pictures, and nothing of {sensor.name}; take it out of the rig file.")
 
-    def where(self, sensor: ImuSensor | Camera | Lidar | Wheels) -> str:
+    def poses(self, sensor: PoseSensor) -> PoseReadings:
+        raise RecordingError(f"{self.root} holds pictures, and nothing of {sensor.name}; take it out of the rig file.")
+
+    def where(self, sensor: ImuSensor | Camera | Lidar | Wheels | PoseSensor) -> str:
         return f"{self.root}/{self.image_topic(sensor)}" if isinstance(sensor, Camera) else str(self.root)
 
     def files(self) -> list[Path]:

@@ -10,6 +10,7 @@ from icalib.recordings.base import Recording
 from icalib.recordings.camera_checks import checked_corners
 from icalib.recordings.imu_checks import checked_imu
 from icalib.recordings.lidar_checks import checked_lidar
+from icalib.recordings.pose_checks import checked_poses
 from icalib.recordings.topics import image_topics
 from icalib.recordings.wheel_checks import checked_wheels
 from icalib.rig import Camera, Rig
@@ -35,10 +36,12 @@ def read_measurements(recording: Recording, rig: Rig, find: FindCorners = tables
     cameras, seen = _corners(recording, rig, find)
     lidars = [checked_lidar(recording.lidar(s), recording.where(s)) for s in rig.lidars]
     wheels = [checked_wheels(recording.wheels(w), w, recording.where(w)) for w in rig.wheels]
-    notes = sum((found for _, found in (*lidars, *wheels)), notes + seen)
+    poses = [checked_poses(recording.poses(s), s, recording.where(s)) for s in rig.poses]
+    notes = sum((found for _, found in (*lidars, *wheels, *poses)), notes + seen)
     return Measurements(
         imu, cameras, recording.notes() + notes, tracks=tracks,
         lidars=tuple(stream for stream, _ in lidars), wheels=tuple(stream for stream, _ in wheels),
+        poses=tuple(stream for stream, _ in poses),
     )  # fmt: skip
 
 

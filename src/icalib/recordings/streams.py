@@ -79,9 +79,26 @@ def read_camera_info(bag: HasMessages, topic: str) -> CameraInfo:
 
 
 def read_poses(bag: HasMessages, topic: str) -> PoseStream:
-    """All PoseStamped of `topic`. Raises RecordingError as `BagRecording.messages`, and for a frame that changes."""
+    """All PoseStamped, PoseWithCovarianceStamped or TransformStamped of `topic`. Raises RecordingError as
+    `BagRecording.messages`, and for a frame that changes."""
     stamps_ns, found = _all(bag, topic, "pose")
-    return _poses(bag, topic, _frame(bag, topic, found), stamps_ns, [m.pose for m in found])
+    if found and hasattr(found[0], "child_frame_id"):
+        _frame(bag, topic, found, lambda m: m.child_frame_id)
+    return _poses(bag, topic, _frame(bag, topic, found), stamps_ns, [_pose_of(m) for m in found])
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """A transform by the names of a pose."""
+
+    position: Any
+    orientation: Any
+
+
+def _pose_of(message: Any) -> Any:
+    if hasattr(message, "transform"):
+        return _Placed(message.transform.translation, message.transform.rotation)
+    return message.pose.pose if hasattr(message.pose, "pose") else message.pose
 
 
 def read_twists(bag: HasMessages, topic: str) -> TwistStream:
@@ -176,10 +193,11 @@ def _poses(bag: HasMessages, topic: str, frame: str, stamps_ns: np.ndarray, pose
             f"{bag.root} {topic}: the orientation at {stamps_ns[np.argmax(wrong)]} ns is no unit quaternion; "
             "correct what publishes it."
         )
-    return PoseStream(frame, stamps_ns, position, _rotations(xyzw / length[:, None]))
+    return PoseStream(frame, stamps_ns, position, rotations(xyzw / length[:, None]))
 
 
-def _rotations(xyzw: np.ndarray) -> np.ndarray:
+def rotations(xyzw: np.ndarray) -> np.ndarray:
+    """(N, 3, 3) of unit quaternions (N, 4)."""
     x, y, z, w = xyzw.T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

@@ -58,6 +58,18 @@ def columns_of(path: Path) -> int:
     return 0
 
 
+def header_of(path: Path) -> str:
+    """The last line of column names before the first row, with or without #; empty if there is none. Raises
+    RecordingError as `read_table`."""
+    content, header = _read_bytes(path), ""
+    for line in content.splitlines():
+        text = line.strip()
+        if text and not text.startswith(b"#") and not text[:1].isalpha():
+            break
+        header = text.decode("utf-8", "replace") or header
+    return header
+
+
 def _read_bytes(path: Path) -> bytes:
     try:
         content = path.read_bytes()

@@ -22,6 +22,8 @@ KINDS = {
     "nav_msgs/msg/Odometry": "odometry",
     "geometry_msgs/msg/TwistStamped": "twist",
     "geometry_msgs/msg/PoseStamped": "pose",
+    "geometry_msgs/msg/PoseWithCovarianceStamped": "pose",
+    "geometry_msgs/msg/TransformStamped": "pose",
 }
 
 

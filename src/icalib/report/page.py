@@ -49,6 +49,8 @@ def report_html(calibration: Calibration) -> str:
         "without_lidars": "" if c.lidar_residuals else " hidden",
         "wheel_figures": _wheel_sections(c),
         "without_wheels": "" if c.wheel_residuals else " hidden",
+        "pose_figures": _pose_sections(c),
+        "without_poses": "" if c.pose_residuals else " hidden",
         "facts": tables.facts(c),
         "figures": script_json(figures),
         "css": resource("icalib.report", "page.css"),
@@ -81,7 +83,9 @@ def _figures(c: Calibration) -> dict[str, Figure]:
         found[f"points-{i}"] = robot_figures.residuals_over_time(r)
         found[f"distance-{i}"] = robot_figures.residuals_over_distance(r)
     for i, r in enumerate(c.wheel_residuals):
-        found[f"wheels-{i}"] = robot_figures.wheel_panels(r)
+        found[f"wheels-{i}"] = robot_figures.panels(r)
+    for i, r in enumerate(c.pose_residuals):
+        found[f"poses-{i}"] = robot_figures.panels(r)
     return found | (robot_figures.plane_maps(c) if c.lidar_residuals else {})
 
 
@@ -120,6 +124,10 @@ def _lidar_sections(c: Calibration) -> Html:
 
 def _wheel_sections(c: Calibration) -> Html:
     return Html("".join(element("h3", r.sensor) + _place(f"wheels-{i}", "") for i, r in enumerate(c.wheel_residuals)))
+
+
+def _pose_sections(c: Calibration) -> Html:
+    return Html("".join(element("h3", r.sensor) + _place(f"poses-{i}", "") for i, r in enumerate(c.pose_residuals)))
 
 
 def _place(name: str, css: str) -> Html:

@@ -1,4 +1,4 @@
-"""Residuals of LiDARs' points and of wheels, and the planes that LiDARs see."""
+"""Residuals of LiDARs' points, of wheels and of poses, and the planes that LiDARs see."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from icalib.calibration import Calibration, LidarResiduals, Plane, WheelResiduals
+from icalib.calibration import Calibration, LidarResiduals, Plane, PoseResiduals, WheelResiduals
 from icalib.report.plot import (
     COLORS,
     VIEW,
@@ -65,8 +65,8 @@ def _residuals_over(r: LidarResiduals, x: np.ndarray, title: str) -> Figure:
     )
 
 
-def wheel_panels(r: WheelResiduals) -> Figure:
-    """What each wheel turned, and slip, over time."""
+def panels(r: WheelResiduals | PoseResiduals) -> Figure:
+    """What each wheel turned, and slip, or rotation and position of poses, over time."""
     keep = thin(len(r.seconds), MOST_DOTS)
     units = ["mrad" if unit == "rad" else "mm" for unit in r.units]
     traces = [

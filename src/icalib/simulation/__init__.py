@@ -3,9 +3,10 @@
 from icalib.simulation.corners import CornerTruth
 from icalib.simulation.filming import Film, Shot, film, sheets_of
 from icalib.simulation.motion import Trajectory
+from icalib.simulation.poses import PoseTruth
 from icalib.simulation.rendering import Imaging, Picture, Renderer, Sheet, SheetTruth, exposure_poses
 from icalib.simulation.rigs import GuessError, rig_for, settings_for, with_drawn_guess
-from icalib.simulation.robot import Drive, Features, SimLidar, SimWheels
+from icalib.simulation.robot import Drive, Features, SimLidar, SimPoses, SimWheels
 from icalib.simulation.room import Block, Hills, Room, hills_of_slope
 from icalib.simulation.scenario import ADIS16448, Motion, Scenario, SimCamera, handheld
 from icalib.simulation.scenario_file import load_scenario
@@ -29,6 +30,7 @@ __all__ = [
     "Imaging",
     "Motion",
     "Picture",
+    "PoseTruth",
     "Renderer",
     "Room",
     "Scenario",
@@ -37,6 +39,7 @@ __all__ = [
     "Shot",
     "SimCamera",
     "SimLidar",
+    "SimPoses",
     "SimWheels",
     "Simulation",
     "TrackTruth",

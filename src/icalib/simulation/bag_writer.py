@@ -14,11 +14,12 @@ from icalib.errors import CalibrationError
 BagForm = Literal["ros1", "mcap", "sqlite3"]
 IMU_TOPIC = "/imu0"
 IMAGE, IMU, POINTS, JOINTS = (f"sensor_msgs/msg/{kind}" for kind in ("Image", "Imu", "PointCloud2", "JointState"))
+POSE = "geometry_msgs/msg/PoseStamped"
 _FLOAT32 = 7  # of PointField
 
 
 class BagWriter:
-    """A bag that is being written. topics: the type of each. `imu`, `image`, `points`, `joints` make messages."""
+    """A bag that is being written. topics: the type of each. `imu`, `image`, ... make messages."""
 
     def __init__(self, form: BagForm, path: Path, topics: dict[str, str]) -> None:
         typesys = package("rosbags.typesys", "bags")
@@ -73,6 +74,13 @@ class BagWriter:
     def joints(self, stamp_ns: int, frame: str, names: list[str], position: np.ndarray, velocity: np.ndarray) -> Any:
         """position [rad] and velocity [rad/s] of each name, or empty."""
         return self._make(JOINTS, self._header(stamp_ns, frame), names, position, velocity, np.empty(0))
+
+    def pose(self, stamp_ns: int, frame: str, position: np.ndarray, xyzw: np.ndarray) -> Any:
+        """position (3,) [m] and quaternion (4,) of a sensor in `frame`."""
+        point = self._make("geometry_msgs/msg/Point", *position.tolist())
+        turn = self._make("geometry_msgs/msg/Quaternion", *xyzw.tolist())
+        pose = self._make("geometry_msgs/msg/Pose", point, turn)
+        return self._make(POSE, self._header(stamp_ns, frame), pose)
 
     def _header(self, stamp_ns: int, frame: str) -> Any:
         stamp = self._make("builtin_interfaces/msg/Time", *divmod(stamp_ns, 1_000_000_000))

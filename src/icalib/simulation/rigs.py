@@ -8,14 +8,14 @@ from typing import Literal, TypeVar
 import numpy as np
 
 from icalib.geometry.targets import NoTarget
-from icalib.rig import Camera, ImuSensor, Lidar, Parameter, Rig, Settings, Wheels
+from icalib.rig import Camera, ImuSensor, Lidar, Parameter, PoseSensor, Rig, Settings, Wheels
 from icalib.simulation.imu import rotation_from_vector
-from icalib.simulation.robot import SimLidar, SimWheels
+from icalib.simulation.robot import SimLidar, SimPoses, SimWheels
 from icalib.simulation.scenario import GRAVITY_WORLD, Scenario, SimCamera
 from icalib.simulation.simulate import raw_time_offset
 
-Sensor = TypeVar("Sensor", Camera, Lidar, Wheels)
-Robotic = TypeVar("Robotic", Lidar, Wheels)
+Sensor = TypeVar("Sensor", Camera, Lidar, Wheels, PoseSensor)
+Robotic = TypeVar("Robotic", Lidar, Wheels, PoseSensor)
 Treatment = Literal["free", "start", "fixed"] | Parameter
 _GUESS_STREAM = 3000  # of random numbers; see `simulate` for the others
 
@@ -80,7 +80,7 @@ def rig_for(
             bloom=_parameter(bloom, [sim.bloom_px]),
         )
 
-    def mounted(sensor: Robotic, sim: SimLidar | SimWheels, T_imu_sensor: np.ndarray) -> Robotic:
+    def mounted(sensor: Robotic, sim: SimLidar | SimWheels | SimPoses, T_imu_sensor: np.ndarray) -> Robotic:
         return replace(
             sensor,
             rotation=_parameter(rotation, T_imu_sensor[:3, :3]),
@@ -101,6 +101,10 @@ def rig_for(
         given = Lidar(sim.name, f"{sim.name}/scans.npz", sim.range_noise_m, near_m=near, far_m=far)
         return mounted(given, sim, sim.T_imu_lidar)
 
+    def poses(sim: SimPoses) -> PoseSensor:
+        given = PoseSensor(sim.name, f"{sim.name}/poses.csv", sim.kind, sim.rotation_noise, sim.position_noise)
+        return mounted(given, sim, sim.T_imu_sensor)
+
     imu = ImuSensor("imu0", "imu0/data.csv", scenario.imu_noise, _parameter(imu_intrinsics, scenario.imu_intrinsics))
     return Rig(
         imu,
@@ -110,6 +114,7 @@ def rig_for(
         settings=settings_for(scenario) if settings is None else settings,
         lidars=tuple(lidar(s) for s in scenario.lidars),
         wheels=tuple(wheels(s) for s in scenario.wheels),
+        poses=tuple(poses(s) for s in scenario.poses),
     )
 
 
@@ -121,7 +126,7 @@ def with_drawn_guess(
     rng = np.random.default_rng([seed, _GUESS_STREAM])
     spread = GuessError() if error is None else error
 
-    def mount(sim: SimCamera | SimLidar | SimWheels, T_imu_sensor: np.ndarray) -> dict[str, np.ndarray]:
+    def mount(sim: SimCamera | SimLidar | SimWheels | SimPoses, T_imu_sensor: np.ndarray) -> dict[str, np.ndarray]:
         return _drawn_pose(T_imu_sensor, raw_time_offset(scenario, sim), rng, spread)
 
     def guessed(sensor: Sensor, drawn: dict[str, np.ndarray]) -> Sensor:
@@ -131,11 +136,13 @@ def with_drawn_guess(
     cameras = zip(rig.cameras, scenario.cameras, strict=True)
     lidars = zip(rig.lidars, scenario.lidars, strict=True)
     wheels = zip(rig.wheels, scenario.wheels, strict=True)
+    poses = zip(rig.poses, scenario.poses, strict=True)
     return replace(
         rig,
         cameras=tuple(guessed(c, mount(s, s.T_imu_cam) | _drawn_lens(s, rng, spread)) for c, s in cameras),
         lidars=tuple(guessed(x, mount(s, s.T_imu_lidar)) for x, s in lidars),
         wheels=tuple(guessed(x, mount(s, s.T_imu_wheel) | _drawn_drive(s, rng, spread)) for x, s in wheels),
+        poses=tuple(guessed(x, mount(s, s.T_imu_sensor)) for x, s in poses),
     )
 
 

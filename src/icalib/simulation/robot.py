@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -132,3 +132,24 @@ class SimWheels:
     reports: Literal["rates", "poses"] = "rates"
     meaning: Literal["mean", "instant"] = "mean"
     poses_every: int = 3
+
+
+@dataclass(frozen=True, eq=False)
+class SimPoses:
+    """One true sensor that reports its pose T_frame_sensor in a frame that stands at T_world_frame; clocks as in
+    `SimCamera`.
+
+    absolute: each pose has noise of its own, rotation_noise [rad] and position_noise [m] on each axis. relative: each
+    step from pose to pose has, which adds up to a drift: rad/sqrt(s) and m/sqrt(s).
+    """
+
+    name: str
+    T_imu_sensor: np.ndarray  # (4, 4)
+    kind: Literal["absolute", "relative"] = "absolute"
+    T_world_frame: np.ndarray = field(default_factory=lambda: np.eye(4))
+    time_offset_s: float = 0.0
+    rate_hz: float = 100.0
+    phase_s: float = 0.0
+    clock_origin_ns: int = 0
+    rotation_noise: float = 2e-3
+    position_noise: float = 1e-3

@@ -10,7 +10,7 @@ import numpy as np
 from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Target
 from icalib.rig import ImuNoise
-from icalib.simulation.robot import Drive, Features, SimLidar, SimWheels
+from icalib.simulation.robot import Drive, Features, SimLidar, SimPoses, SimWheels
 from icalib.simulation.room import Room
 
 MotionKind = Literal["handheld", "planar", "single_axis", "motionless"]
@@ -148,7 +148,8 @@ class Scenario:
     features: Features | None = None  # on the room's surfaces; None: no tracks
     lidars: tuple[SimLidar, ...] = ()
     wheels: tuple[SimWheels, ...] = ()
-    robot_noise_enabled: bool = True  # of tracks, LiDARs and wheels
+    poses: tuple[SimPoses, ...] = ()
+    robot_noise_enabled: bool = True  # of tracks, LiDARs, wheels and pose sensors
     seed: int = 0  # where none is asked for
 
     def __post_init__(self) -> None:

@@ -13,12 +13,12 @@ from icalib.errors import RigError
 from icalib.geometry.targets import TARGETS
 from icalib.rig import ImuNoise
 from icalib.simulation.projection import PARAMETER_COUNTS
-from icalib.simulation.robot import Drive, DriveKind, Features, SimLidar, SimWheels
+from icalib.simulation.robot import Drive, DriveKind, Features, SimLidar, SimPoses, SimWheels
 from icalib.simulation.room import Block, Room, hills_of_slope
 from icalib.simulation.scenario import MODELS, Scenario, SimCamera, pose_from_rows
 from icalib.yaml_nodes import YamlValue, read_yaml
 
-_SENSOR_TYPES = ("imu", "camera", "lidar", "wheels")
+_SENSOR_TYPES = ("imu", "camera", "lidar", "wheels", "pose")
 _DENSITIES = ("gyro", "gyro_walk", "accel", "accel_walk")
 _CLOCK = ("T_imu_sensor", "rate")
 _CLOCK_OPTIONS = ("time_offset", "phase")
@@ -66,6 +66,7 @@ def _sensors(value: YamlValue, start_ns: int) -> dict[str, Any]:
     cameras: list[SimCamera] = []
     lidars: list[SimLidar] = []
     wheels: list[SimWheels] = []
+    poses: list[SimPoses] = []
     for name, sensor in value.entries().items():
         fields = sensor.entries()
         if "type" not in fields:
@@ -77,11 +78,14 @@ def _sensors(value: YamlValue, start_ns: int) -> dict[str, Any]:
             cameras.append(_camera(name, sensor, start_ns))
         elif kind == "lidar":
             lidars.append(_lidar(name, sensor, start_ns))
+        elif kind == "pose":
+            poses.append(_poses(name, sensor, start_ns))
         else:
             wheels.append(_wheels(name, sensor, start_ns))
     if len(imus) != 1:
         value.fail(f"there must be one sensor of type: imu, not {len(imus)}; its frame is the robot's.")
-    return imus[0] | {"cameras": tuple(cameras), "lidars": tuple(lidars), "wheels": tuple(wheels)}
+    others = {"cameras": tuple(cameras), "lidars": tuple(lidars), "wheels": tuple(wheels), "poses": tuple(poses)}
+    return imus[0] | others
 
 
 def _imu(name: str, value: YamlValue) -> dict[str, Any]:
@@ -155,6 +159,17 @@ def _wheels(name: str, value: YamlValue, start_ns: int) -> SimWheels:
         **chosen,
         **_clock(found, start_ns),
     )
+
+
+def _poses(name: str, value: YamlValue, start_ns: int) -> SimPoses:
+    options = ("kind", "T_world_frame", "rotation_noise", "position_noise")
+    found = value.record(("type", *_CLOCK), _CLOCK_OPTIONS + options)
+    chosen: dict[str, Any] = {key: _least(found[key], 0.0) for key in options[2:] if key in found}
+    if "kind" in found:
+        chosen["kind"] = found["kind"].choice("kind", ("absolute", "relative"))
+    if "T_world_frame" in found:
+        chosen["T_world_frame"] = _pose(found["T_world_frame"])
+    return SimPoses(name, _pose(found["T_imu_sensor"]), **chosen, **_clock(found, start_ns))
 
 
 def _room(value: YamlValue) -> Room:

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from icalib.errors import RigError
-from icalib.measurements import ImuStream, LidarStream, WheelPoses, WheelStream
-from icalib.simulation.bag_writer import IMAGE, IMU, IMU_TOPIC, JOINTS, POINTS, BagWriter
+from icalib.measurements import ImuStream, LidarStream, PoseStream, WheelPoses, WheelStream
+from icalib.simulation.bag_writer import IMAGE, IMU, IMU_TOPIC, JOINTS, POINTS, POSE, BagWriter
 from icalib.simulation.filming import Film
+from icalib.simulation.poses import quaternion
 from icalib.simulation.rendering import Imaging
 from icalib.simulation.simulate import Simulation
 from icalib.simulation.tables import whole, write_truth
@@ -29,9 +30,9 @@ def write_sensors(
     bag of ROS 1, and has no truth.
 
     Topics are /imu0 (Imu), /NAME/points (PointCloud2: x, y, z and `time` [s] from the stamp), /NAME/joint_states
-    (JointState) and, where a target stands in the scene, /NAME/image_raw (Image, mono8). Returns sentences on what was
-    left out. Raises RecordingError where `path` exists or cannot be written, CalibrationError where a package is
-    missing, RigError for a board that is not flat.
+    (JointState), /NAME/pose (PoseStamped) and, where a target stands in the scene, /NAME/image_raw (Image, mono8).
+    Returns sentences on what was left out. Raises RecordingError where `path` exists or cannot be written,
+    CalibrationError where a package is missing, RigError for a board that is not flat.
     """
     if any(simulation.scenario.bow):
         raise RigError("boards are rendered flat; set the scenario's bow to zero.")
@@ -63,6 +64,9 @@ def _streams(simulation: Simulation, seed: int) -> tuple[dict[str, str], list[It
             continue
         topics[f"/{wheels.name}/joint_states"] = JOINTS
         streams.append(_joints(wheels, round(truth.time_offset[wheels.name] * 1e9)))
+    for poses in measured.poses:
+        topics[f"/{poses.name}/pose"] = POSE
+        streams.append(_poses(poses, round(truth.time_offset[poses.name] * 1e9)))
     if simulation.scenario.board:
         topics |= {f"/{camera.name}/image_raw": IMAGE for camera in simulation.scenario.cameras}
         streams.append(_images(simulation, seed))
@@ -114,5 +118,16 @@ def _joints(wheels: WheelStream, offset_ns: int) -> Iterator[Event]:
             f"/{wheels.name}/joint_states",
             lambda bag, stamp_ns=stamp_ns, angle=angle, rate=rate: bag.joints(
                 stamp_ns, wheels.name, _WHEELS, angle, rate
+            ),
+        )
+
+
+def _poses(poses: PoseStream, offset_ns: int) -> Iterator[Event]:
+    for stamp_ns, R, position in zip(poses.stamps_ns.tolist(), poses.rotation, poses.position, strict=True):
+        yield (
+            stamp_ns + offset_ns,
+            f"/{poses.name}/pose",
+            lambda bag, stamp_ns=stamp_ns, R=R, position=position: bag.pose(
+                stamp_ns, f"{poses.name}_frame", position, quaternion(R)
             ),
         )

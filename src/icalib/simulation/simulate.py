@@ -8,19 +8,28 @@ from typing import Any
 
 import numpy as np
 
-from icalib.measurements import CornerStream, ImuStream, LidarStream, Measurements, WheelPoses, WheelStream
+from icalib.measurements import (
+    CornerStream,
+    ImuStream,
+    LidarStream,
+    Measurements,
+    PoseStream,
+    WheelPoses,
+    WheelStream,
+)
 from icalib.simulation.corners import CornerTruth, see_corners
 from icalib.simulation.drives import drive_motion
 from icalib.simulation.imu import imu_stamps, inside, read_imu
 from icalib.simulation.lidar import scan_room
 from icalib.simulation.motion import ClosedForm, Trajectory, exact_motion, reference_motion
-from icalib.simulation.robot import SimLidar, SimWheels
+from icalib.simulation.poses import PoseTruth, report_poses
+from icalib.simulation.robot import SimLidar, SimPoses, SimWheels
 from icalib.simulation.scenario import GRAVITY_WORLD, Motion, Scenario, SimCamera
 from icalib.simulation.tracks import Followed, TrackTruth, follow
 from icalib.simulation.wheels import WheelTruth, read_wheels
 
 Progress = Callable[[str, float], None]  # what is being done, and the share of all that is done
-_LIDAR_STREAM, _WHEEL_STREAM = 1000, 2000  # of random numbers; those of cameras count from 2
+_LIDAR_STREAM, _WHEEL_STREAM, _POSE_STREAM = 1000, 2000, 4000  # of random numbers; those of cameras count from 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +66,9 @@ class Truth:
     T_imu_wheel: dict[str, np.ndarray] = field(default_factory=dict)
     radii: dict[str, np.ndarray] = field(default_factory=dict)  # (2,) m, left and right
     baseline: dict[str, float] = field(default_factory=dict)  # m
+    T_imu_pose: dict[str, np.ndarray] = field(default_factory=dict)  # of pose sensors
+    T_world_frame: dict[str, np.ndarray] = field(default_factory=dict)  # of theirs
+    poses: dict[str, PoseTruth] = field(default_factory=dict)
 
     @property
     def T_world_board(self) -> np.ndarray:
@@ -77,7 +89,7 @@ class Simulation:
     truth: Truth
 
 
-def raw_time_offset(scenario: Scenario, sensor: SimCamera | SimLidar | SimWheels) -> float:
+def raw_time_offset(scenario: Scenario, sensor: SimCamera | SimLidar | SimWheels | SimPoses) -> float:
     """Seconds to add to the sensor's raw stamps to get the IMU's: the offset and the distance of the clock origins."""
     return sensor.time_offset_s + (scenario.imu_clock_origin_ns - sensor.clock_origin_ns) * 1e-9
 
@@ -104,6 +116,7 @@ def simulate(scenario: Scenario, seed: int, progress: Progress = lambda stage, d
     lidars = _scans(scenario, trajectory, seed, progress)
     progress("wheels", 0.95)
     wheels, wheel_truth = _wheels(scenario, trajectory, seconds, seed)
+    poses, pose_truth = _poses(scenario, trajectory, seconds, seed)
     truth = Truth(
         **_motion_truth(scenario, trajectory, seconds[kept]),
         **_rig_truth(scenario),
@@ -112,9 +125,10 @@ def simulate(scenario: Scenario, seed: int, progress: Progress = lambda stage, d
         corners=corner_truth,
         tracks={s.name: t for s, t in zip(followed.streams, followed.truths, strict=True)},
         wheels=wheel_truth,
+        poses=pose_truth,
         points=followed.points,
     )
-    measured = Measurements(imu, corners, tracks=followed.streams, lidars=lidars, wheels=wheels)
+    measured = Measurements(imu, corners, tracks=followed.streams, lidars=lidars, wheels=wheels, poses=poses)
     return Simulation(scenario, measured, truth)
 
 
@@ -177,6 +191,16 @@ def _wheels(
     return tuple(stream for stream, _ in read), {stream.name: truth for stream, truth in read}
 
 
+def _poses(
+    scenario: Scenario, trajectory: Trajectory, seconds: np.ndarray, seed: int
+) -> tuple[tuple[PoseStream, ...], dict[str, PoseTruth]]:
+    read = []
+    for i, sensor in enumerate(scenario.poses):
+        rng = np.random.default_rng([seed, _POSE_STREAM + i])
+        read.append(report_poses(sensor, trajectory, seconds, scenario.robot_noise_enabled, rng))
+    return tuple(stream for stream, _ in read), {stream.name: truth for stream, truth in read}
+
+
 def _motion_truth(scenario: Scenario, trajectory: Trajectory, seconds: np.ndarray) -> dict[str, Any]:
     """The fields of `Truth` on where the IMU was at its readings."""
     rotation, position, velocity = trajectory.pose_at(seconds)
@@ -192,7 +216,7 @@ def _motion_truth(scenario: Scenario, trajectory: Trajectory, seconds: np.ndarra
 
 def _rig_truth(scenario: Scenario) -> dict[str, Any]:
     """The fields of `Truth` that the scenario states."""
-    cameras, lidars, wheels = scenario.cameras, scenario.lidars, scenario.wheels
+    cameras, lidars, wheels, poses = scenario.cameras, scenario.lidars, scenario.wheels, scenario.poses
     return {
         "imu_intrinsics": scenario.imu_intrinsics,
         "gravity": GRAVITY_WORLD,
@@ -200,7 +224,7 @@ def _rig_truth(scenario: Scenario) -> dict[str, Any]:
         "bow": np.array(scenario.bow),
         "planes": np.empty((0, 4)) if scenario.room is None else scenario.room.planes,
         "T_imu_cam": {c.name: c.T_imu_cam for c in cameras},
-        "time_offset": {s.name: raw_time_offset(scenario, s) for s in (*cameras, *lidars, *wheels)},
+        "time_offset": {s.name: raw_time_offset(scenario, s) for s in (*cameras, *lidars, *wheels, *poses)},
         "intrinsics": {c.name: np.array(c.intrinsics) for c in cameras},
         "distortion": {c.name: np.array(c.distortion) for c in cameras},
         "bloom_px": {c.name: c.bloom_px for c in cameras},
@@ -208,4 +232,6 @@ def _rig_truth(scenario: Scenario) -> dict[str, Any]:
         "T_imu_wheel": {s.name: s.T_imu_wheel for s in wheels},
         "radii": {s.name: np.array(s.radii) for s in wheels},
         "baseline": {s.name: s.baseline for s in wheels},
+        "T_imu_pose": {s.name: s.T_imu_sensor for s in poses},
+        "T_world_frame": {s.name: s.T_world_frame for s in poses},
     }

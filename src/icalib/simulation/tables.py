@@ -14,7 +14,16 @@ import numpy as np
 import yaml
 
 from icalib.errors import RecordingError
-from icalib.measurements import CornerStream, ImuStream, LidarStream, TrackStream, WheelPoses, WheelStream
+from icalib.measurements import (
+    CornerStream,
+    ImuStream,
+    LidarStream,
+    PoseStream,
+    TrackStream,
+    WheelPoses,
+    WheelStream,
+)
+from icalib.simulation.poses import quaternion
 from icalib.simulation.scenario import Scenario
 from icalib.simulation.simulate import Simulation, Truth
 
@@ -68,6 +77,7 @@ def write_tables(
         steps += [partial(_write_tracks, folder / t.name, t) for t in measured.tracks]
         steps += [partial(_write_scans, folder / s.name, s) for s in measured.lidars]
         steps += [partial(_write_wheels, folder / w.name, w) for w in measured.wheels]
+        steps += [partial(_write_poses, folder / s.name, s) for s in measured.poses]
         steps += [partial(write_truth, simulation, seed, folder)]
         for i, step in enumerate(steps):
             step()
@@ -102,6 +112,9 @@ def _plain_truth(scenario: Scenario, truth: Truth, seed: int) -> dict[str, Any]:
     for w in scenario.wheels:
         sizes = {"radii": list(map(float, w.radii)), "baseline": float(w.baseline)}
         sensors[w.name] = _mounted(truth, w.name, "wheels", w.T_imu_wheel) | sizes
+    for p in scenario.poses:
+        frame = {"kind": p.kind, "T_world_frame": p.T_world_frame.tolist()}
+        sensors[p.name] = _mounted(truth, p.name, "pose", p.T_imu_sensor) | frame
     plain: dict[str, Any] = {"seed": seed, "gravity": truth.gravity.tolist(), "sensors": sensors}
     if scenario.board:
         plain["T_world_bodies"] = truth.T_world_bodies.tolist()
@@ -152,3 +165,9 @@ def _write_wheels(folder: Path, wheels: WheelStream | WheelPoses) -> None:
     stamps = wheels.stamps_ns
     upper = wheels.covariance[:, *np.triu_indices(3)]
     _write_table(folder / "poses.csv", header, stamps[:-1], stamps[1:], wheels.pose, upper)
+
+
+def _write_poses(folder: Path, poses: PoseStream) -> None:
+    header = "t [ns],x [m],y [m],z [m],qx,qy,qz,qw"
+    xyzw = np.array([quaternion(R) for R in poses.rotation])
+    _write_table(folder / "poses.csv", header, poses.stamps_ns, poses.position, xyzw)

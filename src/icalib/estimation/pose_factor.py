@@ -1,0 +1,302 @@
+"""Poses that a sensor reports, motion capture or another program's odometry, against the motion of the IMU.
+
+`AbsolutePoseFactor`: each pose at its own instant, in a frame that stands still in the world of each recording.
+`RelativePosesFactor`: the way from one pose to another, about from node to node; their frame may drift.
+
+The sensor's parameters are the blocks rotation, translation (R_imu_sensor, p_imu_sensor) and time_offset. The frame has
+the blocks frame_rotation and frame_translation (R_world_frame, p_world_frame), in each recording its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+
+from icalib.estimation.arrowhead import Piece
+from icalib.estimation.board import board_in
+from icalib.estimation.corner_factor import LOSSES
+from icalib.estimation.imu_data import ImuData
+from icalib.estimation.lidar_sweep import Motion
+from icalib.estimation.nodes import usable
+from icalib.estimation.pose_rows import Frame, Mount, PoseRows, absolute_rows, relative_rows
+from icalib.estimation.poses import Poses, assign_nodes, poses_at
+from icalib.estimation.sensors import Whitened
+from icalib.estimation.state import Layout, State
+from icalib.estimation.wheel_intervals import WheelIntervals, choose_intervals
+from icalib.estimation.wheel_kernels import Loss, Rows, accumulate_rows
+from icalib.measurements import PoseStream
+
+OWN = ("rotation", "translation", "time_offset")
+FRAME = ("frame_rotation", "frame_translation")
+NEAR_NODE_S = 0.05  # a pose further from all nodes is left out: the IMU alone would carry it there
+KINDS = {"rotation": slice(0, 3), "position": slice(3, 6)}
+UNITS = {"rotation": "rad", "position": "m"}
+
+
+@dataclass(frozen=True)
+class PoseNoise:
+    """Standard deviations of each axis, rad and m; of relative poses densities, rad/sqrt(s) and m/sqrt(s). The robust
+    loss of each whitened row, and where it bends, in standard deviations."""
+
+    rotation: float
+    position: float
+    loss: str = "none"
+    loss_scale: float = 2.5
+
+
+def frame_of(sensor: str, recording: int) -> str:
+    """Name of the frame in which a sensor's poses are given in one of several recordings, counted from 0."""
+    return board_in(f"frame of {sensor}", recording)
+
+
+@dataclass(frozen=True)
+class AbsolutePoseFactor:
+    """n poses of one sensor in its frame, see `pose_rows.absolute_rows`. node (n,), in order: of each; sigma: of its
+    rotation [rad] and position [m]."""
+
+    kinds: ClassVar[dict[str, slice]] = KINDS
+    units: ClassVar[dict[str, str]] = UNITS
+
+    name: str
+    seconds: np.ndarray  # (n,) since the first stamp on the sensor's clock
+    rotation: np.ndarray  # (n, 3, 3)
+    position: np.ndarray  # (n, 3)
+    node: np.ndarray
+    starts: tuple[int, ...]  # the first node of each recording
+    n_nodes: int
+    imu: ImuData
+    gravity: float
+    noise: PoseNoise
+    layout: Layout
+
+    @classmethod
+    def build(cls, stream: PoseStream, motion: Motion, noise: PoseNoise, layout: Layout) -> AbsolutePoseFactor:
+        """Of the poses that lie near nodes; those in gaps of the IMU that are not bridged are left out."""
+        state = motion.state
+        times = stream.seconds + float(state.values[stream.name, "time_offset"][0])
+        node = assign_nodes("inertial", state.seconds, times)
+        near = np.abs(times - state.seconds[node]) <= NEAR_NODE_S
+        k = np.flatnonzero(near & usable(motion.imu, times, motion.max_gap_s))
+        k = k[np.argsort(node[k], kind="stable")]
+        return cls(
+            stream.name, stream.seconds[k], stream.rotation[k], stream.position[k], node[k], state.starts,
+            len(state.seconds), motion.imu, motion.gravity, noise, layout,
+        )  # fmt: skip
+
+    @property
+    def instants(self) -> np.ndarray:
+        """(n,) that the rows are at, on the sensor's clock."""
+        return self.seconds
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """(n, 6) of each row."""
+        return np.tile(np.repeat([self.noise.rotation, self.noise.position], 3), (len(self.seconds), 1))
+
+    def with_imu(self, imu: ImuData) -> AbsolutePoseFactor:
+        """See `SensorFactor`."""
+        return replace(self, imu=imu)
+
+    def output(self) -> Whitened:
+        """Empty arrays for `accumulate` to fill."""
+        return _output(len(self.seconds))
+
+    def count(self, out: Whitened, kind: str) -> int:
+        """Poses times the rows of `kind`."""
+        return out.residual[:, KINDS[kind]].size
+
+    def rms(self, out: Whitened, kind: str) -> tuple[float, str]:
+        """Of the residuals of `kind`."""
+        return _rms(out, self.sigma, KINDS[kind]), UNITS[kind]
+
+    def accumulate(
+        self,
+        state: State,
+        piece: Piece,
+        out: Whitened,
+        sums: bool = True,
+        curved: bool = False,
+        noise: np.ndarray | None = None,
+    ) -> float:
+        """See `SensorFactor`; `noise` is (n, 6)."""
+        cost, at = 0.0, np.minimum(self.node, self.n_nodes - 2)  # the sums take intervals: the last node is an end
+        edges = np.searchsorted(self.node, (*self.starts, self.n_nodes))
+        low, high = np.searchsorted(at, [piece.first, piece.last])
+        for k in range(len(self.starts)):
+            own = slice(max(int(edges[k]), int(low)), min(int(edges[k + 1]), int(high)))
+            if own.start < own.stop:
+                cost += self._of_recording(k, own, at[own], state, piece, out, sums, curved, noise)
+        return cost
+
+    def _of_recording(
+        self,
+        recording: int,
+        own: slice,
+        at: np.ndarray,
+        state: State,
+        piece: Piece,
+        out: Whitened,
+        sums: bool,
+        curved: bool,
+        noise: np.ndarray | None,
+    ) -> float:
+        """Adds the poses `own`, of one recording; at: the first node of the interval that each is added to."""
+        frame = frame_of(self.name, recording)
+        v, node = state.values, self.node[own]
+        found = Frame(v[frame, FRAME[0]], v[frame, FRAME[1]])
+        poses = _poses(self, self.seconds[own], node, state)
+        rows = absolute_rows(
+            poses.rotation, poses.position, _mount(self.name, state), found, self.rotation[own], self.position[own]
+        )
+        (by_pose,) = rows.by_pose
+        by_node = by_pose @ poses.by_node
+        last = (node > at)[:, None, None]
+        made = Rows(
+            rows.residual, np.where(last, 0.0, by_node), np.where(last, by_node, 0.0),
+            _by_border(rows, by_pose @ _moving(poses), by_pose @ poses.by_imu),
+        )  # fmt: skip
+        columns = np.concatenate([self.layout.columns(self.name, *OWN), self.layout.columns(frame, *FRAME)])
+        return _add(self, own, made, columns, at, piece, out, sums, curved, noise)
+
+
+@dataclass(frozen=True)
+class RelativePosesFactor:
+    """n ways of one sensor, see `pose_rows.relative_rows`, each between two of its stamps about from node to node;
+    duration (n,) s. Their noise is that of a random walk, and independent."""
+
+    kinds: ClassVar[dict[str, slice]] = KINDS
+    units: ClassVar[dict[str, str]] = UNITS
+
+    name: str
+    seconds: np.ndarray  # (N,) stamps since the first on the sensor's clock
+    intervals: WheelIntervals
+    rotation: np.ndarray  # (n, 3, 3)
+    position: np.ndarray  # (n, 3)
+    imu: ImuData
+    gravity: float
+    noise: PoseNoise
+    layout: Layout
+
+    @classmethod
+    def build(cls, stream: PoseStream, motion: Motion, noise: PoseNoise, layout: Layout) -> RelativePosesFactor:
+        """Chooses the stretches at the time offset and the nodes of the motion."""
+        state, seconds = motion.state, stream.seconds
+        times = seconds + float(state.values[stream.name, "time_offset"][0])
+        found = choose_intervals(motion.imu, state.seconds, state.starts, times)
+        R0, R1 = stream.rotation[found.first], stream.rotation[found.last]
+        way = stream.position[found.last] - stream.position[found.first]
+        position = np.einsum("nji,nj->ni", R0, way)
+        rotation = np.ascontiguousarray(R0.transpose(0, 2, 1) @ R1)
+        return cls(stream.name, seconds, found, rotation, position, motion.imu, motion.gravity, noise, layout)
+
+    @property
+    def instants(self) -> np.ndarray:
+        """(n,) at which the stretches begin, on the sensor's clock."""
+        return self.seconds[self.intervals.first]
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """(n, 6) of each row."""
+        duration = self.seconds[self.intervals.last] - self.seconds[self.intervals.first]
+        return np.sqrt(duration)[:, None] * np.repeat([self.noise.rotation, self.noise.position], 3)
+
+    def with_imu(self, imu: ImuData) -> RelativePosesFactor:
+        """See `SensorFactor`."""
+        return replace(self, imu=imu)
+
+    def output(self) -> Whitened:
+        """Empty arrays for `accumulate` to fill."""
+        return _output(len(self.rotation))
+
+    def count(self, out: Whitened, kind: str) -> int:
+        """Stretches times the rows of `kind`."""
+        return out.residual[:, KINDS[kind]].size
+
+    def rms(self, out: Whitened, kind: str) -> tuple[float, str]:
+        """Of the residuals of `kind`."""
+        return _rms(out, self.sigma, KINDS[kind]), UNITS[kind]
+
+    def accumulate(
+        self,
+        state: State,
+        piece: Piece,
+        out: Whitened,
+        sums: bool = True,
+        curved: bool = False,
+        noise: np.ndarray | None = None,
+    ) -> float:
+        """See `SensorFactor`; `noise` is (n, 6)."""
+        low, high = np.searchsorted(self.intervals.node, [piece.first, piece.last])
+        own = slice(int(low), int(high))
+        first, last, node = (x[own] for x in (self.intervals.first, self.intervals.last, self.intervals.node))
+        a = _poses(self, self.seconds[first], node, state)
+        b = _poses(self, self.seconds[last], node + 1, state)
+        rows = relative_rows(
+            (a.rotation, b.rotation), (a.position, b.position), _mount(self.name, state), self.rotation[own],
+            self.position[own],
+        )  # fmt: skip
+        before, after = rows.by_pose
+        by_time = before @ _moving(a) + after @ _moving(b)
+        made = Rows(
+            rows.residual, before @ a.by_node, after @ b.by_node,
+            _by_border(rows, by_time, before @ a.by_imu + after @ b.by_imu),
+        )  # fmt: skip
+        columns = self.layout.columns(self.name, *OWN)
+        return _add(self, own, made, columns, node, piece, out, sums, curved, noise)
+
+
+PoseFactor = AbsolutePoseFactor | RelativePosesFactor
+
+
+def _output(n: int) -> Whitened:
+    return Whitened(np.zeros((n, 6)), np.zeros((n, 6)))
+
+
+def _rms(out: Whitened, sigma: np.ndarray, rows: slice) -> float:
+    return float(np.sqrt(np.mean((out.residual * sigma)[:, rows] ** 2)))
+
+
+def _mount(name: str, state: State) -> Mount:
+    return Mount(state.values[name, "rotation"], state.values[name, "translation"])
+
+
+def _poses(factor: PoseFactor, seconds: np.ndarray, node: np.ndarray, state: State) -> Poses:
+    times = seconds + float(state.values[factor.name, "time_offset"][0])
+    imu_free = factor.layout.block(factor.imu.name, "intrinsics").start is not None
+    return poses_at("inertial", times, node, state, factor.imu, factor.gravity, imu_free)
+
+
+def _moving(poses: Poses) -> np.ndarray:
+    """(n, 6, 1) derivative of the IMU's rotation and position by time."""
+    return np.concatenate([poses.rate, poses.velocity], axis=1)[:, :, None]
+
+
+def _by_border(rows: PoseRows, by_time: np.ndarray, by_imu: np.ndarray) -> np.ndarray:
+    return np.concatenate([rows.by_mount, by_time, rows.by_frame, by_imu], axis=2)
+
+
+def _add(
+    factor: PoseFactor,
+    own: slice,
+    rows: Rows,
+    columns: np.ndarray,
+    node: np.ndarray,
+    piece: Piece,
+    out: Whitened,
+    sums: bool,
+    curved: bool,
+    noise: np.ndarray | None,
+) -> float:
+    """Adds the rows `own` to `piece`, each to the interval that begins at its `node`, and fills `out`."""
+    if rows.by_border.shape[2] > len(columns):
+        columns = np.concatenate([columns, factor.layout.columns(factor.imu.name, "intrinsics")])
+    free = np.flatnonzero(columns >= 0)
+    loss = Loss(LOSSES[factor.noise.loss], factor.noise.loss_scale, curved)
+    given = out.residual if noise is None else noise
+    whitening = np.eye(6) / factor.sigma[own][:, :, None]
+    return accumulate_rows(
+        rows, node, whitening, loss, free, columns[free], noise is not None, given[own], piece.sums(sums),
+        out.residual[own], out.root[own],
+    )  # fmt: skip

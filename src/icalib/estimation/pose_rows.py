@@ -1,0 +1,119 @@
+"""Residuals of poses that a sensor reports, and their derivatives by the pose of the IMU (see `pose_factor`).
+
+Rotations e = Log(measured^T predicted) are perturbed on the right, so de = J_r^-1(e) d of whatever stands on the right
+of the prediction; positions are predicted - measured, in the axes in which they were measured.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from icalib.geometry import so3
+
+
+@dataclass(frozen=True)
+class Mount:
+    """R_imu_sensor (3, 3), p_imu_sensor (3,) m."""
+
+    R: np.ndarray
+    p: np.ndarray
+
+
+@dataclass(frozen=True)
+class Frame:
+    """R_world_frame (3, 3), p_world_frame (3,) m."""
+
+    R: np.ndarray
+    p: np.ndarray
+
+
+@dataclass(frozen=True)
+class PoseRows:
+    """n poses of 6 rows, rotation and position, not whitened. residual (n, 6); by_pose (n, 6, 6) by rotation and
+    position of the IMU, of relative poses one for each end; by_mount (n, 6, 6) by R_imu_sensor, p_imu_sensor; by_frame
+    (n, 6, 6 or 0) by R_world_frame, p_world_frame."""
+
+    residual: np.ndarray
+    by_pose: tuple[np.ndarray, ...]
+    by_mount: np.ndarray
+    by_frame: np.ndarray
+
+
+def absolute_rows(
+    R: np.ndarray, p: np.ndarray, mount: Mount, frame: Frame, rotation: np.ndarray, position: np.ndarray
+) -> PoseRows:
+    """Of poses R_frame_sensor (n, 3, 3), p_frame_sensor (n, 3), while the IMU was at R (n, 3, 3), p (n, 3):
+
+    Log(rotation^T R_world_frame^T R R_imu_sensor),  R_world_frame^T (p + R p_imu_sensor - p_world_frame) - position
+    """
+    n = len(R)
+    in_frame = frame.R.T @ R  # R_frame_imu
+    predicted = in_frame @ mount.R
+    e = so3.log_many(np.ascontiguousarray(_t(rotation) @ predicted))
+    J = right_jacobians_inverse(e)
+    x = (p + R @ mount.p - frame.p) @ frame.R
+    by_pose, by_mount, by_frame = (np.zeros((n, 6, 6)) for _ in range(3))
+    by_pose[:, :3, :3] = J @ mount.R.T
+    by_pose[:, 3:, :3] = -in_frame @ hats(mount.p)
+    by_pose[:, 3:, 3:] = frame.R.T
+    by_mount[:, :3, :3] = J
+    by_mount[:, 3:, 3:] = in_frame
+    by_frame[:, :3, :3] = -J @ _t(predicted)
+    by_frame[:, 3:, :3] = hats(x)
+    by_frame[:, 3:, 3:] = -frame.R.T
+    return PoseRows(np.concatenate([e, x - position], axis=1), (by_pose,), by_mount, by_frame)
+
+
+def relative_rows(
+    R: tuple[np.ndarray, np.ndarray],
+    p: tuple[np.ndarray, np.ndarray],
+    mount: Mount,
+    rotation: np.ndarray,
+    position: np.ndarray,
+) -> PoseRows:
+    """Of poses (n, 3, 3), (n, 3) of the sensor at the later of two instants, seen from the earlier, while the IMU was
+    at R[0], p[0] and R[1], p[1]:
+
+    Log(rotation^T Q),  Q = R_imu_sensor^T R_0^T R_1 R_imu_sensor
+    R_imu_sensor^T (R_0^T (p_1 + R_1 p_imu_sensor - p_0) - p_imu_sensor) - position
+    """
+    n, turn = len(R[0]), _t(R[0]) @ R[1]
+    Q = mount.R.T @ turn @ mount.R
+    e = so3.log_many(np.ascontiguousarray(_t(rotation) @ Q))
+    J = right_jacobians_inverse(e)
+    way = np.einsum("nji,nj->ni", R[0], p[1] + R[1] @ mount.p - p[0])
+    x = (way - mount.p) @ mount.R
+    before, after, by_mount = (np.zeros((n, 6, 6)) for _ in range(3))
+    before[:, :3, :3] = -J @ mount.R.T @ _t(turn)
+    before[:, 3:, :3] = mount.R.T @ hats(way)
+    before[:, 3:, 3:] = -mount.R.T @ _t(R[0])
+    after[:, :3, :3] = J @ mount.R.T
+    after[:, 3:, :3] = -mount.R.T @ turn @ hats(mount.p)
+    after[:, 3:, 3:] = mount.R.T @ _t(R[0])
+    by_mount[:, :3, :3] = J @ (np.eye(3) - _t(Q))
+    by_mount[:, 3:, :3] = hats(x)
+    by_mount[:, 3:, 3:] = mount.R.T @ (turn - np.eye(3))
+    return PoseRows(np.concatenate([e, x - position], axis=1), (before, after), by_mount, np.zeros((n, 6, 0)))
+
+
+def hats(v: np.ndarray) -> np.ndarray:
+    """(..., 3, 3) with hat(v) w = v x w, of v (..., 3)."""
+    m = np.zeros((*v.shape, 3))
+    m[..., 0, 1], m[..., 0, 2], m[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    return m - np.swapaxes(m, -1, -2)
+
+
+@njit(cache=True, nogil=True)
+def right_jacobians_inverse(e: np.ndarray) -> np.ndarray:
+    """(n, 3, 3) J_r^-1 at rotation vectors e (n, 3) rad."""
+    out = np.empty((len(e), 3, 3))
+    for i in range(len(e)):
+        out[i] = so3.right_jacobian_inverse(e[i])
+    return out
+
+
+def _t(R: np.ndarray) -> np.ndarray:
+    return np.swapaxes(R, -1, -2)

@@ -1,0 +1,197 @@
+"""A pose sensor from nothing: offset and rotation from angular rates, lever arm linearly, and where its frame stands.
+
+It is placed on a motion that other sensors showed, or gives the motion itself, with the IMU, as a LiDAR does whose path
+is known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from icalib.errors import EstimationError
+from icalib.estimation.assembly import Inputs, host_times, nodes_for, start_values
+from icalib.estimation.imu_data import ImuData
+from icalib.estimation.pose_factor import FRAME, frame_of
+from icalib.estimation.robot import MOUNT
+from icalib.estimation.state import Key, State
+from icalib.first_guess.clocks import LEAST_CORRELATION, LONGEST_STEP_S, Alignment, CameraRates
+from icalib.first_guess.gyro import GyroRotation
+from icalib.first_guess.lever_arm import SIZE_TOLERANCE, size_of
+from icalib.first_guess.lidar import (
+    G_TOLERANCE,
+    FromPath,
+    Held,
+    LidarGuess,
+    align_path,
+    motion_of_path,
+    poses_in,
+    where,
+)
+from icalib.first_guess.lidar_arm import WAY_SIGMA, Rows, against_motion, against_readings, arm_prior, solve
+from icalib.first_guess.lidar_odometry import LidarPath
+from icalib.first_guess.lidar_rounds import given, held_of
+from icalib.geometry import so3
+from icalib.measurements import PoseStream
+from icalib.rig import PoseSensor
+
+WINDOW_S = 0.1  # of a mean rate: long against the noise of poses
+FEWEST_WINDOWS = 20
+G_OTHER_UNITS = 0.5  # of gravity: positions do not make it so wrong
+NAMES = tuple(name for name, _, _ in MOUNT)
+
+
+def pose_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
+    """Of all pose sensors, `state` having the motion: what the rig gives, or what their poses show, and where their
+    frames stand. Raises EstimationError where neither shows it."""
+    assert inputs.imu is not None
+    out: dict[Key, np.ndarray] = {}
+    for sensor, stream in zip(inputs.rig.poses, inputs.measurements.poses, strict=True):
+        known = given(inputs, sensor, NAMES)
+        if len(known) < len(NAMES):
+            known = _on_motion(inputs.imu, stream, state, held_of(inputs, sensor)).values(sensor.name) | known
+        out |= known | _frames(inputs.imu, sensor, stream, state, known)
+    return out
+
+
+def state_from_poses(inputs: Inputs) -> State:
+    """Where the solver starts where neither camera nor LiDAR shows the motion: the first pose sensor and the IMU do.
+
+    Raises EstimationError where they do not, or there are several recordings.
+    """
+    assert inputs.imu is not None
+    sensor, stream = inputs.rig.poses[0], inputs.measurements.poses[0]
+    if len(inputs.parts) > 1:
+        raise EstimationError(
+            f"several recordings cannot be joined where {sensor.name} alone shows the motion; calibrate each, or add "
+            "a camera or a LiDAR."
+        )
+    found = _with_motion(inputs.imu, stream, inputs.rig.gravity, held_of(inputs, sensor))
+    own = found.guess.values(sensor.name) | given(inputs, sensor, NAMES)
+    values = start_values(inputs, own)
+    hosts = {(x.name, "time_offset"): values[sensor.name, "time_offset"] for x in inputs.rig.poses}
+    nodes = nodes_for(inputs, host_times(inputs, hosts))
+    rotation, position, velocity = found.motion.at(nodes)
+    return State(nodes, rotation, position, velocity, np.tile(found.motion.bias, (len(nodes), 1)), values)
+
+
+def pose_rates(stream: PoseStream) -> CameraRates:
+    """Mean angular rates over windows of about WINDOW_S, one from each pose. Raises EstimationError where there are
+    hardly any."""
+    t, R = stream.seconds, stream.rotation
+    a = np.arange(len(t))
+    b = np.searchsorted(t, t + WINDOW_S - 1e-9)
+    a, b = a[b < len(t)], b[b < len(t)]
+    near = t[b] - t[a] <= LONGEST_STEP_S
+    a, b = a[near], b[near]
+    if len(a) < FEWEST_WINDOWS:
+        raise EstimationError(
+            f"{stream.name}: hardly any of its {len(t)} poses are closer than {LONGEST_STEP_S} s to the next; check "
+            "its stamps, or record for longer."
+        )
+    turn = so3.log_many(np.ascontiguousarray(R[a].transpose(0, 2, 1) @ R[b]))
+    if not np.linalg.norm(turn, axis=1).max() > 0.0:
+        raise EstimationError(
+            f"{stream.name}: its rotation is the same in all poses, as where only positions are measured; a pose "
+            "sensor needs both."
+        )
+    return CameraRates(t[a], t[b], turn / (t[b] - t[a])[:, None], LEAST_CORRELATION)
+
+
+def _path(stream: PoseStream) -> LidarPath:
+    return LidarPath(stream.seconds, stream.rotation, stream.position, np.ones(len(stream.stamps_ns), dtype=bool))
+
+
+def _aligned(imu: ImuData, stream: PoseStream, held: Held) -> tuple[Alignment, CameraRates]:
+    rates = pose_rates(stream)
+    return align_path(imu, stream.name, rates, held), rates
+
+
+def _with_motion(imu: ImuData, stream: PoseStream, gravity: float, held: Held) -> FromPath:
+    aligned, rates = _aligned(imu, stream, held)
+    path, t = _path(stream), stream.seconds + aligned.offset
+    path = where(path, (t > imu.seconds[0]) & (t < imu.seconds[-1]))
+    gyro, R_is = GyroRotation.integrate(imu, aligned.gyro_bias), aligned.rotation
+    path = replace(path, rotation=gyro.smoothed(path.seconds + aligned.offset, path.rotation @ R_is.T) @ R_is)
+    found = motion_of_path(imu, path, rates, aligned, gravity, held)
+    if found is None:
+        raise _too_short(stream)
+    off = abs(found.gravity / gravity - 1.0)
+    if off <= G_OTHER_UNITS:
+        _check_size(imu, stream.name, path, aligned, found)
+    if off > G_TOLERANCE:
+        raise EstimationError(
+            f"{imu.name} and {stream.name} together show gravity of {found.gravity:.3g} m/s^2 instead of "
+            f"{gravity:.3g}: check that the accelerometer is in m/s^2, not in g, and the positions of {stream.name} "
+            "in metres."
+        )
+    return found
+
+
+def _check_size(imu: ImuData, name: str, path: LidarPath, aligned: Alignment, found: FromPath) -> None:
+    """Raises EstimationError where the accelerometer contradicts the size of the motion: the rows of `against_readings`
+    with what it felt as one more column, as of a target in `lever_arm`."""
+    gyro, t = GyroRotation.integrate(imu, aligned.gyro_bias), path.seconds + aligned.offset
+
+    def rows_at(position: np.ndarray) -> Rows:
+        carry = partial(gyro.carry, t, to=imu.seconds)
+        return against_readings(imu, carry, t, path.rotation, position)(found.guess.rotation, found.guess.position)
+
+    rows, felt = rows_at(path.position), -rows_at(np.zeros_like(path.position)).b
+    size, std = size_of(rows.A[:, :, 3:], rows.b, felt)
+    if abs(size - 1.0) > max(SIZE_TOLERANCE, 5.0 * std):
+        raise EstimationError(
+            f"{name}: by the accelerometer its motion is {size:.2f} +- {std:.2f} times as large as its positions say; "
+            "these must be in metres (an odometry from one camera has no scale of its own)."
+        )
+
+
+def _on_motion(imu: ImuData, stream: PoseStream, known: State, held: Held) -> LidarGuess:
+    """From the motion of the IMU in `known`."""
+    aligned, rates = _aligned(imu, stream, held)
+    path, t = _path(stream), stream.seconds + aligned.offset
+    path = where(path, (t >= known.seconds[0]) & (t <= known.seconds[-1]))
+    if not len(path.seconds):
+        raise _too_short(stream)
+    t = path.seconds + aligned.offset
+    R, p = poses_in(known, GyroRotation.integrate(imu, known.bias[:, :3].mean(axis=0)), t)
+    prior = arm_prior(np.zeros(0), rates.rate, WAY_SIGMA, held.rotation is not None, held.position)
+    found = solve(against_motion(R, p, t, path.rotation, path.position), prior, aligned.rotation, rates.rate)
+    if found is None:
+        raise _too_short(stream)
+    return LidarGuess(found[0], found[1][3:6], aligned.offset)
+
+
+def _frames(
+    imu: ImuData, sensor: PoseSensor, stream: PoseStream, known: State, values: dict[Key, np.ndarray]
+) -> dict[Key, np.ndarray]:
+    """Where the frame of absolute poses stands in each recording's world: the mean of what the poses say."""
+    out: dict[Key, np.ndarray] = {}
+    R_is, p_is, offset = (values[sensor.name, name] for name in NAMES)
+    for k, nodes in enumerate(known.recordings if sensor.kind == "absolute" else ()):
+        part = _nodes(known, nodes)
+        t = stream.seconds + float(offset[0])
+        own = np.flatnonzero((t >= part.seconds[0]) & (t <= part.seconds[-1]))
+        if not len(own):
+            raise _too_short(stream)
+        R, p = poses_in(part, GyroRotation.integrate(imu, part.bias[:, :3].mean(axis=0)), t[own])
+        U, _, Vt = np.linalg.svd((R @ R_is @ stream.rotation[own].transpose(0, 2, 1)).sum(axis=0))
+        R_wf = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+        origin = np.median(p + R @ p_is - stream.position[own] @ R_wf.T, axis=0)
+        frame = frame_of(sensor.name, k)
+        out |= {(frame, FRAME[0]): R_wf, (frame, FRAME[1]): origin}
+    return out
+
+
+def _nodes(state: State, own: slice) -> State:
+    columns = {name: getattr(state, name)[own] for name in ("seconds", "rotation", "position", "velocity", "bias")}
+    return replace(state, **columns, starts=(0,))
+
+
+def _too_short(stream: PoseStream) -> EstimationError:
+    return EstimationError(
+        f"{stream.name}: too few of its poses fall within the recording of the other sensors to find its lever arm; "
+        "check that the clocks overlap, or record for longer."
+    )

@@ -1,0 +1,214 @@
+"""Poses in tables, TUM's text and bags: what comes out, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from icalib.errors import RecordingError
+from icalib.measurements import PoseStream
+from icalib.recordings import BagRecording, FolderRecording
+from icalib.recordings.pose_checks import checked_poses
+from icalib.recordings.poses import PoseReadings
+from icalib.rig import PoseSensor
+
+N, STEP, ORIGIN = 300, 20_000_000, 1_700_000_000_123_456_789
+STAMPS = ORIGIN + STEP * np.arange(N)
+T = STEP * 1e-9 * np.arange(N)
+POSITION = np.stack([np.sin(T), 0.5 * np.cos(0.7 * T), 0.1 * T], axis=1)
+TURNS = Rotation.from_rotvec(np.stack([0.3 * np.sin(T), 0.4 * np.cos(2 * T), T], axis=1))
+XYZW = TURNS.as_quat()
+ABSOLUTE, RELATIVE = PoseSensor("mocap0", "mocap0/poses.csv"), PoseSensor("mocap0", "mocap0/poses.csv", "relative")
+
+
+def table(folder: Path, stamps=STAMPS, position=POSITION, xyzw=XYZW, header="#t,x,y,z,qx,qy,qz,qw", name="poses.csv"):
+    (folder / "mocap0").mkdir(exist_ok=True)
+    rows = zip(np.asarray(stamps).tolist(), np.hstack([position, xyzw]).tolist(), strict=True)
+    path = folder / "mocap0" / name
+    path.write_text(header + "\n" + "".join(f"{t},{','.join(map(repr, row))}\n" for t, row in rows))
+    return path
+
+
+def read(folder: Path, sensor: PoseSensor = ABSOLUTE) -> tuple[PoseStream, tuple[str, ...]]:
+    recording = FolderRecording(folder)
+    return checked_poses(recording.poses(sensor), sensor, recording.where(sensor))
+
+
+def refused(folder: Path, sensor: PoseSensor = ABSOLUTE) -> str:
+    with pytest.raises(RecordingError) as error:
+        read(folder, sensor)
+    sentence = str(error.value)
+    assert str(folder) in sentence and sentence.endswith(".") and "\n" not in sentence
+    return sentence
+
+
+def test_table(tmp_path):
+    path = table(tmp_path)
+    stream, notes = read(tmp_path)
+    np.testing.assert_array_equal(stream.stamps_ns, STAMPS)
+    np.testing.assert_allclose(stream.position, POSITION, rtol=1e-15)
+    np.testing.assert_allclose(stream.rotation, TURNS.as_matrix(), atol=1e-14)
+    assert notes == ()
+    (topic,) = FolderRecording(tmp_path).topics()
+    assert (topic.name, topic.kind, topic.count) == ("mocap0/poses.csv", "pose", N)
+    assert path.is_file()
+
+
+def test_table_with_w_first_as_eurocs(tmp_path):
+    header = "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
+    table(tmp_path, xyzw=XYZW[:, [3, 0, 1, 2]], header=header)
+    np.testing.assert_allclose(read(tmp_path)[0].rotation, TURNS.as_matrix(), atol=1e-14)
+
+
+def test_relative_poses_of_wheels_are_another_table(tmp_path):
+    (tmp_path / "wheel0").mkdir()
+    row = f"{STAMPS[0]},{STAMPS[1]},0.1,0.2,0.3,1,0,0,1,0,1\n"
+    (tmp_path / "wheel0" / "poses.csv").write_text("#from,to,yaw,x,y\n" + row)
+    (topic,) = FolderRecording(tmp_path).topics()
+    assert topic.kind == "wheels"
+
+
+def test_tums_text(tmp_path):
+    (tmp_path / "mocap0").mkdir()
+    seconds = [f"{t // 10**9}.{t % 10**9:09d}" for t in STAMPS.tolist()]
+    rows = np.hstack([POSITION, XYZW]).tolist()
+    text = "# t x y z qx qy qz qw\n\n" + "".join(
+        f"{t} {' '.join(map(repr, r))}\n" for t, r in zip(seconds, rows, strict=True)
+    )
+    (tmp_path / "mocap0" / "poses.tum").write_text(text)
+    sensor = PoseSensor("mocap0", "mocap0/poses.tum")
+    stream, _ = read(tmp_path, sensor)
+    np.testing.assert_array_equal(stream.stamps_ns, STAMPS)
+    np.testing.assert_allclose(stream.rotation, TURNS.as_matrix(), atol=1e-14)
+    assert [t.kind for t in FolderRecording(tmp_path).topics()] == ["pose"]
+    np.testing.assert_array_equal(FolderRecording(tmp_path).stamps("mocap0/poses.tum"), STAMPS)
+    for stamp, ns in (("-1.5", -1_500_000_000), ("1.7e9", 1_700_000_000_000_000_000), ("12", 12_000_000_000)):
+        (tmp_path / "mocap0" / "poses.tum").write_text(f"{stamp} 0 0 0 0 0 0 1\n")
+        assert FolderRecording(tmp_path).poses(sensor).stamps_ns.tolist() == [ns]
+
+
+@pytest.mark.parametrize("line", ["1.0 2 3 4 0 0 0", "1.0 2 3 4 0 0 0 x", "1.0 2 3 nan 0 0 0 1", "a 2 3 4 0 0 0 1"])
+def test_a_bad_line_of_tums_text_is_named(tmp_path, line):
+    (tmp_path / "mocap0").mkdir()
+    (tmp_path / "mocap0" / "poses.txt").write_text(f"0.5 2 3 4 0 0 0 1\n{line}\n")
+    assert "poses.txt:2: the line is not TUM's" in refused(tmp_path, PoseSensor("mocap0", "mocap0/poses.txt"))
+
+
+def test_an_empty_text(tmp_path):
+    (tmp_path / "mocap0").mkdir()
+    (tmp_path / "mocap0" / "poses.txt").write_text("# nothing\n")
+    assert "holds no poses" in refused(tmp_path, PoseSensor("mocap0", "mocap0/poses.txt"))
+
+
+def test_bad_poses(tmp_path):
+    table(tmp_path, xyzw=1.1 * XYZW)
+    assert f"the quaternion at {STAMPS[0]} ns has length 1.1, not 1" in refused(tmp_path)
+    table(tmp_path, stamps=STAMPS // 1_000_000)
+    assert "they look like milliseconds" in refused(tmp_path)
+    table(tmp_path, position=1000.0 * POSITION)
+    assert "in millimetres are to be divided by 1000" in refused(tmp_path)
+    table(tmp_path, position=0.0 * POSITION, xyzw=np.tile([0.0, 0.0, 0.0, 1.0], (N, 1)))
+    assert "all poses are the same within 0 m and 0 rad" in refused(tmp_path)
+    table(tmp_path, stamps=STAMPS[::-1])
+    assert f"the pose at {STAMPS[-2]} ns comes after the one at {STAMPS[-1]} ns" in refused(tmp_path)
+    table(tmp_path, STAMPS[:2], POSITION[:2], XYZW[:2])
+    assert "only 2 poses" in refused(tmp_path)
+
+
+def test_not_finite():
+    position = POSITION.copy()
+    position[7, 1] = np.nan
+    with pytest.raises(RecordingError, match=f"the pose at {STAMPS[7]} ns is not finite"):
+        checked_poses(PoseReadings("mocap0", STAMPS, TURNS.as_matrix(), position), ABSOLUTE, "here")
+
+
+def test_repeated_stamps(tmp_path):
+    twice = np.insert(np.arange(N), 10, 9)
+    table(tmp_path, STAMPS[twice], POSITION[twice], XYZW[twice])
+    stream, notes = read(tmp_path)
+    assert len(stream.stamps_ns) == N
+    assert f"1 repeated poses were dropped, the first at {STAMPS[9]} ns" in notes[0]
+    stamps = STAMPS.copy()
+    stamps[10] = stamps[9]
+    table(tmp_path, stamps)
+    assert f"two different poses are both stamped {STAMPS[9]} ns" in refused(tmp_path)
+
+
+def test_a_frame_that_jumps(tmp_path):
+    """A loop that is closed: of absolute poses refused, of relative ones noted."""
+    position = POSITION.copy()
+    position[150:] += [0.3, 0.0, 0.1]
+    table(tmp_path, position=position)
+    sentence = refused(tmp_path)
+    assert f"1 jumps of its poses, the first at {STAMPS[150]} ns, by up to 0.32 m" in sentence
+    assert "kind: relative" in sentence
+    _, notes = read(tmp_path, RELATIVE)
+    assert len(notes) == 1 and "1 jumps" in notes[0]
+
+
+def test_a_turn_that_jumps_is_one_too(tmp_path):
+    xyzw = XYZW.copy()
+    xyzw[150:] = (Rotation.from_rotvec([0.0, 0.2, 0.0]) * TURNS[150:]).as_quat()
+    table(tmp_path, xyzw=xyzw)
+    assert "1 jumps of its poses" in read(tmp_path)[1][0]
+
+
+def test_poses_that_come_back_are_noted(tmp_path):
+    position = POSITION.copy()
+    position[150:152] += [0.3, 0.0, 0.1]
+    table(tmp_path, position=position)
+    _, notes = read(tmp_path)
+    assert "2 jumps" in notes[0]
+
+
+def test_brisk_motion_is_no_jump(tmp_path):
+    """5 m/s^2 and 6 rad/s at 50 Hz, with noise."""
+    noise = 2e-3 * np.random.default_rng(0).normal(size=(N, 3))
+    fast = 0.5 * np.stack([np.sin(3 * T), np.cos(3 * T), np.sin(2 * T)], axis=1) + noise
+    turns = Rotation.from_rotvec(np.stack([2.0 * np.sin(3 * T), np.cos(2 * T), np.sin(T)], axis=1))
+    table(tmp_path, position=fast, xyzw=turns.as_quat())
+    assert read(tmp_path)[1] == ()
+
+
+@pytest.mark.parametrize("kind", ["PoseStamped", "PoseWithCovarianceStamped", "TransformStamped", "Odometry"])
+def test_bags(tmp_path, write, kind):
+    make = write.maker("ros2")
+
+    def message(k: int):
+        header, turn = make.header(int(STAMPS[k]), "map"), make.make("geometry_msgs/msg/Quaternion", *XYZW[k].tolist())
+        if kind == "TransformStamped":
+            transform = make.make("geometry_msgs/msg/Transform", make.vector(POSITION[k]), turn)
+            return make.make("geometry_msgs/msg/TransformStamped", header, "body", transform)
+        pose = make.make("geometry_msgs/msg/Pose", make.vector(POSITION[k], "Point"), turn)
+        if kind == "PoseStamped":
+            return make.make("geometry_msgs/msg/PoseStamped", header, pose)
+        wide = make.make("geometry_msgs/msg/PoseWithCovariance", pose, np.zeros(36))
+        if kind == "PoseWithCovarianceStamped":
+            return make.make("geometry_msgs/msg/PoseWithCovarianceStamped", header, wide)
+        twist = make.make("geometry_msgs/msg/Twist", make.vector([0.0] * 3), make.vector([0.0] * 3))
+        speed = make.make("geometry_msgs/msg/TwistWithCovariance", twist, np.zeros(36))
+        return make.make("nav_msgs/msg/Odometry", header, "body", wide, speed)
+
+    name = f"{'nav' if kind == 'Odometry' else 'geometry'}_msgs/msg/{kind}"
+    path = write.ros2(tmp_path / "run", [("/vrpn/robot", name, int(t) + 5, message(k)) for k, t in enumerate(STAMPS)])
+    recording, sensor = BagRecording(path), PoseSensor("mocap0", "mocap0/poses.csv")
+    stream, _ = checked_poses(recording.poses(sensor), sensor, recording.where(sensor))
+    np.testing.assert_array_equal(stream.stamps_ns, STAMPS)
+    np.testing.assert_array_equal(stream.position, POSITION)
+    np.testing.assert_allclose(stream.rotation, TURNS.as_matrix(), atol=1e-14)
+    assert recording.where(sensor) == f"{path} /vrpn/robot"
+
+
+def test_a_table_beside_a_bag(tmp_path, write):
+    """Another program's odometry, made from the bag: the table goes before topics."""
+    make = write.maker("ros2")
+    imu = [("/imu", "sensor_msgs/msg/Imu", int(t), make.imu(int(t), np.zeros(3), np.zeros(3))) for t in STAMPS[:3]]
+    recording, path = BagRecording(write.ros2(tmp_path / "run", imu)), table(tmp_path)
+    np.testing.assert_allclose(recording.poses(ABSOLUTE).position, POSITION, rtol=1e-15)
+    assert recording.where(ABSOLUTE) == str(path) and path in recording.files()
+    path.unlink()
+    with pytest.raises(RecordingError, match="has no pose for mocap0"):
+        recording.poses(ABSOLUTE)
