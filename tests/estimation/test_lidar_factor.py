@@ -226,7 +226,7 @@ def test_stamps_at_the_end_of_scans_and_points_in_any_order_change_nothing(spars
     state = replace(setup.state, values=later)
     found = sums(ended, ended.factor(state), state, dense)
     expected = sums(setup, setup.factor(), setup.state, dense)
-    # Points at the edge of bins of 3 ms change theirs, and perhaps the node with it; to the border that is all the same.
+    # Points at the edge of bins of 3 ms change theirs, and perhaps the node; to the border that is all the same.
     H, H_expected = (h[NODE * len(state.seconds) :, NODE * len(state.seconds) :] for h in (found[1], expected[1]))
     size = np.sqrt(np.diag(H_expected))
     np.testing.assert_allclose(H / np.outer(size, size), H_expected / np.outer(size, size), atol=3e-4)
