@@ -1,4 +1,4 @@
-"""Calibrates cameras and an IMU jointly, in space and in time, from recordings of a target."""
+"""Calibrates cameras, LiDARs, wheels, pose sensors and an IMU jointly, in space and in time, from recordings."""
 
 from __future__ import annotations
 

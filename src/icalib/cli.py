@@ -31,7 +31,8 @@ def _parser() -> argparse.ArgumentParser:
     from icalib import __version__
 
     parser = argparse.ArgumentParser(
-        prog="icalib", description="Calibrates cameras, LiDARs, wheels, pose sensors and an IMU jointly, from one recording or several."
+        prog="icalib",
+        description="Calibrates cameras, LiDARs, wheels, pose sensors and an IMU jointly, from recordings.",
     )
     parser.add_argument("--version", action="version", version=f"icalib {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
