@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import signal
+import socket
 import subprocess
 import sys
 import time
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import psutil
@@ -97,6 +99,14 @@ def test_the_run_of_a_killed_worker_is_made_again():
     assert sorted(r.seed for r in found) == [0, 1, 2, 3] and not any(r.failure for r in found)
 
 
+def test_studies_run_side_by_side():
+    """Dask takes the port of its dashboard even without one, and warns where another study has it."""
+    with ExitStack() as stack:
+        with suppress(OSError):  # somebody else has it: all the better
+            stack.enter_context(socket.create_server(("127.0.0.1", 8787)))
+        assert list(run_all([], workers=1)) == []
+
+
 def test_a_finished_study_starts_no_worker(alone: Path, monkeypatch):
     monkeypatch.setattr(study_module, "run_all", lambda *_: pytest.fail("a run was repeated"))
     before = written(alone)
@@ -110,7 +120,7 @@ def test_more_runs_are_added_by_a_cluster(alone: Path, tmp_path: Path):
     distributed = load_distributed()
     study(tmp_path, 1, workers=1)
     before = written(tmp_path)
-    local = {"n_workers": 1, "threads_per_worker": 1, "dashboard_address": None}
+    local = {"n_workers": 1, "threads_per_worker": 1, "dashboard_address": ":0"}
     with distributed.LocalCluster(**local, silence_logs=60) as cluster:
         study(tmp_path, RUNS, scheduler=cluster.scheduler_address)
     assert {name: written(tmp_path)[name] for name in before} == before

@@ -41,8 +41,13 @@ def run_all(
 
 def _client(distributed: Any, workers: int | None, scheduler: str | None, stack: ExitStack) -> Any:
     if scheduler is None:
+        # No dashboard, but its port is taken all the same: any one, so that two studies can run side by side.
         cluster = distributed.LocalCluster(
-            n_workers=workers or cores(), threads_per_worker=1, dashboard_address=None, silence_logs=SILENT
+            n_workers=workers or cores(),
+            threads_per_worker=1,
+            dashboard_address=None,
+            scheduler_kwargs={"dashboard_address": ":0"},
+            silence_logs=SILENT,
         )
         return stack.enter_context(distributed.Client(stack.enter_context(cluster)))
     try:
