@@ -1,0 +1,32 @@
+"""Verdicts where many sensors share what the data leave open."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from icalib.observability import observe
+
+SENSORS = ("cam0", "cam1", "cam2", "lidar0", "wheel0")
+
+
+def shared(worth: float) -> Any:
+    """Five sensors whose turns against each other are known to 0.1 tolerances, and a sixth column to 0.1: open is the
+    turn of all five together, of which the guess is worth so many tolerances."""
+    n = len(SENSORS)
+    held = np.append(np.ones(n), 0.0)[:, None] / np.sqrt(n)
+    spread = np.sqrt(0.01 + np.append(np.full(n, worth**2 / n), 0.0))
+    return cast(Any, SimpleNamespace(held=held, spread=spread, covariance=np.diag(spread**2)))
+
+
+@pytest.mark.parametrize(("worth", "verdict"), [(50.0, "undetermined"), (1.0, "determined"), (10.0, "weak")])
+def test_what_five_share_is_as_open_as_the_guess_is_wide(worth: float, verdict: str):
+    """A fifth of a direction each: the share alone would let none of them be open."""
+    names = tuple(f"{s}.rotation.z" for s in SENSORS) + ("cam0.time_offset.time_offset",)
+    found = observe(shared(worth), names)
+    assert found.verdicts == (verdict,) * len(SENSORS) + ("determined",)
+    (sentence,) = found.undetermined
+    assert all(s in sentence for s in SENSORS[:4]) and "turn the rig" in sentence
