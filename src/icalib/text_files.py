@@ -17,14 +17,8 @@ def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
     parts: dict[str, Path] = {}
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        mode = 0o666 & ~_umask()
         for name, text in texts.items():
-            with tempfile.NamedTemporaryFile(
-                "w", encoding="utf-8", errors="surrogateescape", newline="", dir=folder, suffix=".part", delete=False
-            ) as file:
-                parts[name] = Path(file.name)
-                file.write(text)
-            parts[name].chmod(mode)
+            parts[name] = write_part(folder, text)
         for name, part in parts.items():
             part.replace(folder / name)
     except OSError as error:
@@ -35,6 +29,22 @@ def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
         for part in parts.values():
             with contextlib.suppress(OSError):
                 part.unlink()
+
+
+def write_part(folder: Path, text: str) -> Path:
+    """A new file in `folder` with the text and a name of its own, to be given its name once all is well; none is left
+    where it cannot be written. Raises OSError."""
+    handle, name = tempfile.mkstemp(suffix=".part", dir=folder)
+    part = Path(name)
+    try:
+        with open(handle, "w", encoding="utf-8", errors="surrogateescape", newline="") as file:
+            file.write(text)
+        part.chmod(0o666 & ~_umask())
+    except BaseException:
+        with contextlib.suppress(OSError):
+            part.unlink()
+        raise
+    return part
 
 
 def _umask() -> int:

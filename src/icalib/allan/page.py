@@ -9,7 +9,7 @@ import numpy as np
 from icalib.allan.analysis import AXES, ImuNoiseStudy, SensorNoise
 from icalib.allan.deviation import model_variance
 from icalib.allan.words import rig_snippet, rows
-from icalib.report.page import resource, script_json
+from icalib.report.page import document, resource
 from icalib.report.plot import AXIS_COLORS, Figure, axis, figure, line
 from icalib.report.tables import Html, element, html, sentences
 
@@ -25,12 +25,10 @@ def allan_html(study: ImuNoiseStudy) -> str:
         "table": _table(study),
         "warnings": sentences(study.warnings, "care", "None."),
         "notes": sentences(study.notes, "", "None."),
-        "figures": script_json(figures),
-        "css": resource("icalib.report", "page.css"),
-        "plotly": resource("plotly", "package_data/plotly.min.js"),
     }
     escaped = {name: html(value) for name, value in words.items()}
-    return Template(resource("icalib.allan", "page.html")).substitute(escaped | parts)
+    body = Template(resource("icalib.allan", "page.html")).substitute(escaped | parts)
+    return document(f"Noise of {study.name}", body, figures)
 
 
 def deviation_figure(sensor: SensorNoise, period: float) -> Figure:

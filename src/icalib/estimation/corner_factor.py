@@ -169,7 +169,7 @@ class CornerFactor:
             poses = poses_of_nodes(self.node[i0:i1], state)
         else:
             times = self.times[i0:i1] + state.values[self.name, "time_offset"][0]
-            imu_free = self.layout.block(self.imu.name, "intrinsics").start is not None
+            imu_free = self.layout.is_free(self.imu.name, "intrinsics")
             poses = poses_at(self.scheme, times, self.node[i0:i1], state, self.imu, self.gravity, imu_free)
         R_ic, p_ic = state.values[self.name, "rotation"], state.values[self.name, "translation"]
         R_cw = np.ascontiguousarray((poses.rotation @ R_ic).transpose(0, 2, 1))

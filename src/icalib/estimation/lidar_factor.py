@@ -128,7 +128,7 @@ class LidarFactor:
         planes = Planes(value[:, :3].copy(), across, value[:, 3:].copy(), of_plane)
         R_il = np.ascontiguousarray(state.values[self.name, "rotation"])
         p_il, offset = state.values[self.name, "translation"], state.values[self.name, "time_offset"][0]
-        imu_free = self.layout.block(self.imu.name, "intrinsics").start is not None
+        imu_free = self.layout.is_free(self.imu.name, "intrinsics")
         m = self.moments
         for a in range(b0, b1, CHUNK):
             b = min(a + CHUNK, b1)

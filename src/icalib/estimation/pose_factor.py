@@ -16,16 +16,16 @@ import numpy as np
 
 from icalib.estimation.arrowhead import Piece
 from icalib.estimation.board import board_in
-from icalib.estimation.corner_factor import LOSSES
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.lidar_sweep import Motion
 from icalib.estimation.nodes import usable
 from icalib.estimation.pose_rows import Frame, Mount, PoseRows, absolute_rows, relative_rows
 from icalib.estimation.poses import Poses, assign_nodes, poses_at
+from icalib.estimation.row_sums import Into, Weighing, add_rows
 from icalib.estimation.sensors import Whitened
 from icalib.estimation.state import Layout, State
 from icalib.estimation.wheel_intervals import WheelIntervals, choose_intervals
-from icalib.estimation.wheel_kernels import Loss, Rows, accumulate_rows
+from icalib.estimation.wheel_kernels import Rows
 from icalib.measurements import PoseStream
 
 OWN = ("rotation", "translation", "time_offset")
@@ -101,7 +101,7 @@ class AbsolutePoseFactor:
 
     def output(self) -> Whitened:
         """Empty arrays for `accumulate` to fill."""
-        return _output(len(self.seconds))
+        return Whitened.empty(len(self.seconds), 6)
 
     def count(self, out: Whitened, kind: str) -> int:
         """Poses times the rows of `kind`."""
@@ -127,21 +127,10 @@ class AbsolutePoseFactor:
         for k in range(len(self.starts)):
             own = slice(max(int(edges[k]), int(low)), min(int(edges[k + 1]), int(high)))
             if own.start < own.stop:
-                cost += self._of_recording(k, own, at[own], state, piece, out, sums, curved, noise)
+                cost += self._of_recording(k, own, at[own], state, Into(piece, out, sums, curved, noise))
         return cost
 
-    def _of_recording(
-        self,
-        recording: int,
-        own: slice,
-        at: np.ndarray,
-        state: State,
-        piece: Piece,
-        out: Whitened,
-        sums: bool,
-        curved: bool,
-        noise: np.ndarray | None,
-    ) -> float:
+    def _of_recording(self, recording: int, own: slice, at: np.ndarray, state: State, into: Into) -> float:
         """Adds the poses `own`, of one recording; at: the first node of the interval that each is added to."""
         frame = frame_of(self.name, recording)
         v, node = state.values, self.node[own]
@@ -158,7 +147,7 @@ class AbsolutePoseFactor:
             _by_border(rows, by_pose @ _moving(poses), by_pose @ poses.by_imu),
         )  # fmt: skip
         columns = np.concatenate([self.layout.columns(self.name, *OWN), self.layout.columns(frame, *FRAME)])
-        return _add(self, own, made, columns, at, piece, out, sums, curved, noise)
+        return _add(self, own, made, columns, at, into)
 
 
 @dataclass(frozen=True)
@@ -208,7 +197,7 @@ class RelativePosesFactor:
 
     def output(self) -> Whitened:
         """Empty arrays for `accumulate` to fill."""
-        return _output(len(self.rotation))
+        return Whitened.empty(len(self.rotation), 6)
 
     def count(self, out: Whitened, kind: str) -> int:
         """Stretches times the rows of `kind`."""
@@ -244,14 +233,10 @@ class RelativePosesFactor:
             _by_border(rows, by_time, before @ a.by_imu + after @ b.by_imu),
         )  # fmt: skip
         columns = self.layout.columns(self.name, *OWN)
-        return _add(self, own, made, columns, node, piece, out, sums, curved, noise)
+        return _add(self, own, made, columns, node, Into(piece, out, sums, curved, noise))
 
 
 PoseFactor = AbsolutePoseFactor | RelativePosesFactor
-
-
-def _output(n: int) -> Whitened:
-    return Whitened(np.zeros((n, 6)), np.zeros((n, 6)))
 
 
 def _rms(out: Whitened, sigma: np.ndarray, rows: slice) -> float:
@@ -264,7 +249,7 @@ def _mount(name: str, state: State) -> Mount:
 
 def _poses(factor: PoseFactor, seconds: np.ndarray, node: np.ndarray, state: State) -> Poses:
     times = seconds + float(state.values[factor.name, "time_offset"][0])
-    imu_free = factor.layout.block(factor.imu.name, "intrinsics").start is not None
+    imu_free = factor.layout.is_free(factor.imu.name, "intrinsics")
     return poses_at("inertial", times, node, state, factor.imu, factor.gravity, imu_free)
 
 
@@ -277,26 +262,7 @@ def _by_border(rows: PoseRows, by_time: np.ndarray, by_imu: np.ndarray) -> np.nd
     return np.concatenate([rows.by_mount, by_time, rows.by_frame, by_imu], axis=2)
 
 
-def _add(
-    factor: PoseFactor,
-    own: slice,
-    rows: Rows,
-    columns: np.ndarray,
-    node: np.ndarray,
-    piece: Piece,
-    out: Whitened,
-    sums: bool,
-    curved: bool,
-    noise: np.ndarray | None,
-) -> float:
-    """Adds the rows `own` to `piece`, each to the interval that begins at its `node`, and fills `out`."""
-    if rows.by_border.shape[2] > len(columns):
-        columns = np.concatenate([columns, factor.layout.columns(factor.imu.name, "intrinsics")])
-    free = np.flatnonzero(columns >= 0)
-    loss = Loss(LOSSES[factor.noise.loss], factor.noise.loss_scale, curved)
-    given = out.residual if noise is None else noise
-    whitening = np.eye(6) / factor.sigma[own][:, :, None]
-    return accumulate_rows(
-        rows, node, whitening, loss, free, columns[free], noise is not None, given[own], piece.sums(sums),
-        out.residual[own], out.root[own],
-    )  # fmt: skip
+def _add(factor: PoseFactor, own: slice, rows: Rows, columns: np.ndarray, node: np.ndarray, into: Into) -> float:
+    """Adds the rows `own`, each to the interval that begins at its `node`."""
+    by = Weighing(np.eye(6) / factor.sigma[own][:, :, None], factor.noise.loss, factor.noise.loss_scale)
+    return add_rows(rows, own, node, columns, factor.layout, factor.imu, by, into)

@@ -20,6 +20,11 @@ class Whitened:
     residual: np.ndarray
     root: np.ndarray
 
+    @classmethod
+    def empty(cls, n: int, m: int) -> Whitened:
+        """Rows (n, m) to be filled."""
+        return cls(np.zeros((n, m)), np.zeros((n, m)))
+
 
 class SensorFactor(Protocol):
     """All measurements of one sensor. kinds: rows of its residuals by name; imu: the readings that carry it from nodes

@@ -60,6 +60,10 @@ class Layout:
     def block(self, sensor: str, name: str) -> Block:
         return next(b for b in self.blocks if b.key == (sensor, name))
 
+    def is_free(self, sensor: str, name: str) -> bool:
+        """Whether the block is estimated."""
+        return self.block(sensor, name).start is not None
+
     def columns(self, sensor: str, *names: str) -> np.ndarray:
         return np.concatenate([self.block(sensor, n).columns for n in names])
 

@@ -19,9 +19,9 @@ from typing import ClassVar
 import numpy as np
 
 from icalib.estimation.arrowhead import Piece
-from icalib.estimation.corner_factor import LOSSES
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.poses import Poses, motion_at, poses_at
+from icalib.estimation.row_sums import Into, Weighing, add_rows
 from icalib.estimation.sensors import Whitened
 from icalib.estimation.state import Layout, State
 from icalib.estimation.wheel_intervals import (
@@ -32,11 +32,9 @@ from icalib.estimation.wheel_intervals import (
     quadrature,
 )
 from icalib.estimation.wheel_kernels import (
-    Loss,
     Rows,
     Track,
     Wheels,
-    accumulate_rows,
     increment_rows,
     relative_rows,
 )
@@ -114,7 +112,7 @@ class IncrementFactor:
 
     def output(self) -> Whitened:
         """Empty arrays for `accumulate` to fill."""
-        return _output(len(self.measured), 4)
+        return Whitened.empty(len(self.measured), 4)
 
     def count(self, out: Whitened, kind: str) -> int:
         """Intervals times the rows of `kind`."""
@@ -142,14 +140,14 @@ class IncrementFactor:
         start = self.instants.start[own.start : own.stop + 1]
         seen = slice(int(start[0]), int(start[-1]))
         times, node = self.instants.times[seen] + _offset(self.name, state), self.instants.node[seen]
-        free = _imu_free(self.layout, self.imu)
+        free = self.layout.is_free(self.imu.name, "intrinsics")
         poses, moving = motion_at(times, node, state, self.imu, self.gravity, free)
         rows = Rows.empty(len(start) - 1, 4, poses.by_imu.shape[2], sums)
         wheels = _wheels(self.name, state)
         increment_rows(
             start - start[0], self.instants.weight[seen], _track(node, poses), moving, wheels, self.measured[own], rows
         )
-        return _add(self, own, rows, self.whitening, piece, out, sums, curved, noise)
+        return _add(self, own, rows, self.whitening, Into(piece, out, sums, curved, noise))
 
 
 @dataclass(frozen=True)
@@ -216,7 +214,7 @@ class RelativePoseFactor:
 
     def output(self) -> Whitened:
         """Empty arrays for `accumulate` to fill."""
-        return _output(len(self.poses.z), 3)
+        return Whitened.empty(len(self.poses.z), 3)
 
     def count(self, out: Whitened, kind: str) -> int:
         """Intervals times the rows of `kind`."""
@@ -240,10 +238,11 @@ class RelativePoseFactor:
         i, z = self.intervals, self.poses
         times = np.concatenate([self.seconds[i.first[own]], self.seconds[i.last[own]]]) + _offset(self.name, state)
         node = np.concatenate([i.node[own], i.node[own] + 1])
-        poses = poses_at("inertial", times, node, state, self.imu, self.gravity, _imu_free(self.layout, self.imu))
+        free = self.layout.is_free(self.imu.name, "intrinsics")
+        poses = poses_at("inertial", times, node, state, self.imu, self.gravity, free)
         rows = Rows.empty(len(times) // 2, 3, poses.by_imu.shape[2], sums)
         relative_rows(_track(node, poses), _wheels(self.name, state), z.z[own], z.J[own], z.drive0, rows)
-        return _add(self, own, rows, z.W, piece, out, sums, curved, noise)
+        return _add(self, own, rows, z.W, Into(piece, out, sums, curved, noise))
 
 
 def wheel_intervals(name: str, seconds: np.ndarray, imu: ImuData, state: State) -> WheelIntervals:
@@ -265,16 +264,8 @@ def _wheels(name: str, state: State) -> Wheels:
     return Wheels(rotation, state.values[name, "translation"], drive_of(name, state))
 
 
-def _imu_free(layout: Layout, imu: ImuData) -> bool:
-    return layout.block(imu.name, "intrinsics").start is not None
-
-
 def _track(node: np.ndarray, poses: Poses) -> Track:
     return Track(node, poses.rotation, poses.position, poses.rate, poses.velocity, poses.by_node, poses.by_imu)
-
-
-def _output(n: int, m: int) -> Whitened:
-    return Whitened(np.zeros((n, m)), np.zeros((n, m)))
 
 
 def _rms(out: Whitened, whitening: np.ndarray, rows: slice) -> float:
@@ -289,24 +280,9 @@ def _in_piece(intervals: WheelIntervals, piece: Piece) -> slice:
 
 
 def _add(
-    factor: IncrementFactor | RelativePoseFactor,
-    own: slice,
-    rows: Rows,
-    whitening: np.ndarray,
-    piece: Piece,
-    out: Whitened,
-    sums: bool,
-    curved: bool,
-    noise: np.ndarray | None,
+    factor: IncrementFactor | RelativePoseFactor, own: slice, rows: Rows, whitening: np.ndarray, into: Into
 ) -> float:
-    """Adds the rows of intervals `own` to `piece`, and fills `out`."""
+    """Adds the rows of intervals `own`."""
+    by = Weighing(whitening[own], factor.noise.loss, factor.noise.loss_scale)
     columns = factor.layout.columns(factor.name, *OWN)
-    if rows.by_border.shape[2] > len(columns):
-        columns = np.concatenate([columns, factor.layout.columns(factor.imu.name, "intrinsics")])
-    free = np.flatnonzero(columns >= 0)
-    loss = Loss(LOSSES[factor.noise.loss], factor.noise.loss_scale, curved)
-    given = out.residual if noise is None else noise
-    return accumulate_rows(
-        rows, factor.intervals.node[own], whitening[own], loss, free, columns[free], noise is not None, given[own],
-        piece.sums(sums), out.residual[own], out.root[own],
-    )  # fmt: skip
+    return add_rows(rows, own, factor.intervals.node[own], columns, factor.layout, factor.imu, by, into)

@@ -77,9 +77,10 @@ def align(imu: ImuData, name: str, rates: CameraRates, given_offset: float | Non
     offset = _correlate(imu, name, rates) if given_offset is None else given_offset
     if not _covered(imu, rates, offset).any():
         raise _no_overlap(imu, name)
-    rough = _rough(imu, rates, offset)
-    _check_degrees(imu, name, rates, offset)
-    scale = _scale(imu, rates, rough)
+    pair = _side_by_side(imu, rates, offset)
+    _check_degrees(imu, name, *pair)
+    rough = _rough(offset, *pair)
+    scale = _scale(rough, *pair)
     alike = rates if 0.8 < scale < 1.25 else replace(rates, rate=scale * rates.rate)
     found = _refine(imu, alike, rough, given_offset is not None)
     _check_offset(imu, name, alike, found, given_offset is not None)
@@ -121,7 +122,7 @@ def _side_by_side(imu: ImuData, rates: CameraRates, offset: float) -> tuple[np.n
     inside = _covered(imu, rates, offset)
     start, end = rates.start[inside], rates.end[inside]
     angle = _integral(imu)
-    gyro = (_at(imu, angle, end + offset) - _at(imu, angle, start + offset)) / (end - start)[:, None]
+    gyro = (_at(imu.seconds, angle, end + offset) - _at(imu.seconds, angle, start + offset)) / (end - start)[:, None]
     count = min(max(1, round(AVERAGED_S / float(np.median(end - start)))), len(start))
     return _means(gyro, count), _means(rates.rate[inside], count)
 
@@ -142,7 +143,7 @@ def better_offset(imu: ImuData, name: str, rates: CameraRates, expected: float) 
         return None
     if not _covered(imu, rates, expected).any():
         return own.offset
-    there = _unexplained(imu, rates, _rough(imu, rates, expected))
+    there = _unexplained(imu, rates, _rough(expected, *_side_by_side(imu, rates, expected)))
     return own.offset if _unexplained(imu, rates, own) < CLEARLY_BETTER * there else None
 
 
@@ -168,7 +169,7 @@ def _grid(t: np.ndarray, rate: np.ndarray, covered: np.ndarray, count: int) -> t
     grid = np.arange(int(t[-1] * GRID_HZ) + 1) / GRID_HZ
     count = min(count, len(grid))
     known = np.interp(grid, t, covered.astype(float)) > 0.99
-    fine = np.stack([np.interp(grid, t, rate[:, k]) for k in range(3)], axis=1)
+    fine = _at(t, rate, grid)
     return np.linalg.norm(_means(fine, count), axis=1), _means(np.tile(known[:, None], 3), count)[:, 0] > 0.99
 
 
@@ -206,9 +207,8 @@ def _kabsch(w_imu: np.ndarray, w_cam: np.ndarray, weight: np.ndarray) -> tuple[n
     return R, mi - R @ mc
 
 
-def _rough(imu: ImuData, rates: CameraRates, offset: float) -> Alignment:
+def _rough(offset: float, gyro: np.ndarray, seen: np.ndarray) -> Alignment:
     """At this offset, from means over some images: a pose that flips to its mirror image and back cancels in them."""
-    gyro, seen = _side_by_side(imu, rates, offset)
     return Alignment(offset, *_kabsch(gyro, seen, np.ones(len(gyro))))
 
 
@@ -219,9 +219,9 @@ def _integral(imu: ImuData) -> np.ndarray:
     return angle
 
 
-def _at(imu: ImuData, values: np.ndarray, seconds: np.ndarray) -> np.ndarray:
-    """(n, 3) of what is known at each reading, at other times."""
-    return np.stack([np.interp(seconds, imu.seconds, values[:, k]) for k in range(3)], axis=1)
+def _at(known: np.ndarray, values: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """(n, 3) of values (N, 3) that are `known` (N,) s at some times, at others."""
+    return np.stack([np.interp(seconds, known, values[:, k]) for k in range(3)], axis=1)
 
 
 def _refine(imu: ImuData, rates: CameraRates, rough: Alignment, keep_offset: bool) -> Alignment:
@@ -232,8 +232,8 @@ def _refine(imu: ImuData, rates: CameraRates, rough: Alignment, keep_offset: boo
         start, end = rates.start + offset, rates.end + offset
         inside = _covered(imu, rates, offset).astype(float)
         span = (end - start)[:, None]
-        mean = (_at(imu, angle, end) - _at(imu, angle, start)) / span
-        slope = (_at(imu, imu.gyro, end) - _at(imu, imu.gyro, start)) / span
+        mean = (_at(imu.seconds, angle, end) - _at(imu.seconds, angle, start)) / span
+        slope = (_at(imu.seconds, imu.gyro, end) - _at(imu.seconds, imu.gyro, start)) / span
         weight = inside
         for _ in range(3):
             residual = mean - rates.rate @ R.T - bias
@@ -253,7 +253,7 @@ def turns_about_two_axes(imu: ImuData, rates: CameraRates, found: Alignment) -> 
     """Whether the camera turned about more than one axis, and the IMU with it: of a target far away a camera alone
     sees turns that are noise. Else its rotation about that axis stays open."""
     middle = (0.5 * (rates.start + rates.end) + found.offset)[_covered(imu, rates, found.offset)]
-    gyro = np.stack([np.interp(middle, imu.seconds, imu.gyro[:, k]) for k in range(3)], axis=1)
+    gyro = _at(imu.seconds, imu.gyro, middle)
     return all(_second_axis(w) >= LEAST_SECOND_AXIS for w in (rates.rate, gyro))
 
 
@@ -288,7 +288,7 @@ def as_given(imu: ImuData, name: str, rates: CameraRates, offset: float, rotatio
     if not inside.any():
         raise _no_overlap(imu, name)
     middle = (0.5 * (rates.start + rates.end) + offset)[inside]
-    gyro = np.stack([np.interp(middle, imu.seconds, imu.gyro[:, k]) for k in range(3)], axis=1)
+    gyro = _at(imu.seconds, imu.gyro, middle)
     return Alignment(offset, rotation, np.median(gyro - rates.rate[inside] @ rotation.T, axis=0), given=True)
 
 
@@ -307,9 +307,9 @@ def _no_overlap(imu: ImuData, name: str) -> EstimationError:
     )
 
 
-def _check_degrees(imu: ImuData, name: str, rates: CameraRates, offset: float) -> None:
+def _check_degrees(imu: ImuData, name: str, gyro: np.ndarray, seen: np.ndarray) -> None:
     """By size alone: readings in degrees match no camera's motion, and must not be blamed for that."""
-    size = [np.linalg.norm(w - np.median(w, axis=0), axis=1) for w in _side_by_side(imu, rates, offset)]
+    size = [np.linalg.norm(w - np.median(w, axis=0), axis=1) for w in (gyro, seen)]
     ratio = float(np.median(size[0]) / max(np.median(size[1]), 1e-9))
     if 0.8 < ratio / DEGREES < 1.25:
         raise EstimationError(
@@ -320,7 +320,7 @@ def _check_degrees(imu: ImuData, name: str, rates: CameraRates, offset: float) -
 
 def _check_scale(imu: ImuData, name: str, rates: CameraRates, found: Alignment) -> None:
     """The two must turn equally fast."""
-    ratio = _scale(imu, rates, found)
+    ratio = _scale(found, *_side_by_side(imu, rates, found.offset))
     if not 0.8 < ratio < 1.25:
         raise EstimationError(
             f"{imu.name} turns {ratio:.3g} times as fast as {name}: check its units, or, where the target is small in "
@@ -328,11 +328,10 @@ def _check_scale(imu: ImuData, name: str, rates: CameraRates, found: Alignment) 
         )
 
 
-def _scale(imu: ImuData, rates: CameraRates, found: Alignment) -> float:
-    """How much faster the gyroscope turns than the camera: both about their medians, as a bias has no
+def _scale(found: Alignment, gyro: np.ndarray, camera: np.ndarray) -> float:
+    """How much faster the gyroscope turns than the camera, side by side: both about their medians, as a bias has no
     say, and along the gyroscope's axis, where noise of the camera, which would make it seem slower, has none. Where
     it does not turn alike at all, none is faster."""
-    gyro, camera = _side_by_side(imu, rates, found.offset)
     gyro, camera = gyro - np.median(gyro, axis=0), (camera - np.median(camera, axis=0)) @ found.rotation.T
     size = np.linalg.norm(gyro, axis=1)
     fast = size > np.median(size)

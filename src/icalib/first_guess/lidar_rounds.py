@@ -118,16 +118,11 @@ def with_lidars(inputs: Inputs, state: State) -> tuple[Inputs, State]:
         planes = np.concatenate([a.planes for a in found])
         inputs = with_clouds(inputs, clouds)
         state = replace(state, values=_without_planes(state) | dict(zip(clouds.keys, planes, strict=True)))
-        shares.append(share_on_planes(clouds))
+        shares.append(clouds.points.sum() / max(sum(len(p) for p in clouds.plane), 1))
         if k < ROUNDS - 1:
             state = first_pass(inputs, state)
     check_shares(shares, " and ".join(s.name for s in inputs.measurements.lidars))
     return inputs, state
-
-
-def share_on_planes(clouds: Clouds) -> float:
-    """Of all points."""
-    return sum(int((p >= 0).sum()) for p in clouds.plane) / max(sum(len(p) for p in clouds.plane), 1)
 
 
 def check_shares(shares: Sequence[float], names: str) -> None:

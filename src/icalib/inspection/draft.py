@@ -7,7 +7,6 @@ import dataclasses
 import json
 import os
 import re
-import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from icalib.inspection.inspect import resolution_of
 from icalib.inspection.kalibr import KalibrImu
 from icalib.inspection.lens import LensStart, lens_start
 from icalib.recordings import TopicInfo
+from icalib.text_files import write_part
 
 _PLAIN = re.compile(r"[A-Za-z0-9_./][A-Za-z0-9_./-]*")
 _TEMPLATE = """\
@@ -86,10 +86,7 @@ def write_whole(path: Path, text: str, replace: bool = True) -> None:
     FileExistsError where the file is there and `replace` is False."""
     part: Path | None = None
     try:
-        with tempfile.NamedTemporaryFile("w", encoding="utf-8", dir=path.parent, suffix=".part", delete=False) as file:
-            part = Path(file.name)
-            file.write(text)
-        part.chmod(0o666 & ~_umask())
+        part = write_part(path.parent, text)
         if replace:
             part.replace(path)
         else:
@@ -115,12 +112,6 @@ def _link(part: Path, path: Path, text: str) -> None:
     except OSError:  # a file system without links
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 def _imu(found: Inspection) -> list[str]:

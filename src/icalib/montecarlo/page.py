@@ -22,7 +22,7 @@ from icalib.montecarlo.words import (
     nees_cells,
     verdict_words,
 )
-from icalib.report.page import resource, script_json
+from icalib.report.page import document, resource
 from icalib.report.plot import COLORS, Figure, axis, figure, numbers
 from icalib.report.tables import Html, element, html, sentences, table
 
@@ -49,10 +49,10 @@ def study_html(found: Consistency, identity: Identity, records: Sequence[Record]
 
 def page(title: str, summary: str, sections: Sequence[Html], figures: dict[str, Figure]) -> str:
     """A document in the style of the reports."""
-    return Template(resource("icalib.montecarlo", "page.html")).substitute(
-        title=html(title), answer=html(summary), sections="".join(sections), figures=script_json(figures),
-        css=resource("icalib.report", "page.css"), plotly=resource("plotly", "package_data/plotly.min.js"),
-    )  # fmt: skip
+    body = Template(resource("icalib.montecarlo", "page.html")).substitute(
+        title=html(title), answer=html(summary), sections="".join(sections)
+    )
+    return document(title, body, figures)
 
 
 def plot_place(name: str) -> Html:

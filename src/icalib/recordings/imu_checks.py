@@ -8,7 +8,7 @@ import numpy as np
 
 from icalib.errors import RecordingError
 from icalib.measurements import ImuStream
-from icalib.recordings.clocks import rate_sentence
+from icalib.recordings.ordered import kept_readings, longest_run
 
 _RATE_HZ = (10.0, 20_000.0)
 _FASTEST_RAD_S = 35.0  # 2000 deg/s, the widest range of common gyroscopes
@@ -39,48 +39,12 @@ def checked_imu(imu: ImuStream, where: str) -> tuple[ImuStream, tuple[str, ...]]
     what = f"{where} ({imu.name})"
     if len(imu.stamps_ns) < 2:
         raise RecordingError(f"{what}: only {len(imu.stamps_ns)} reading; a calibration needs the whole recording.")
-    _refuse_non_finite(imu, what)
-    _refuse_disorder(imu, what)
-    sentence = rate_sentence(what, imu.stamps_ns, *_RATE_HZ)
-    if sentence:
-        raise RecordingError(sentence)
-    imu, notes = _without_repeats(imu, what)
+    values, own = np.hstack([imu.gyro, imu.accel]), "export the IMU's own stamps"
+    kept, notes = kept_readings(imu.stamps_ns, values, what, _RATE_HZ, "reading", own)
+    if notes:
+        imu = ImuStream(imu.name, imu.stamps_ns[kept], imu.gyro[kept], imu.accel[kept])
     _refuse_units(imu, what)
     return imu, notes + _saturation_notes(imu, what)
-
-
-def _refuse_non_finite(imu: ImuStream, what: str) -> None:
-    bad = ~(np.isfinite(imu.gyro).all(axis=1) & np.isfinite(imu.accel).all(axis=1))
-    if bad.any():
-        raise RecordingError(f"{what}: the reading at {imu.stamps_ns[np.argmax(bad)]} ns is not finite; remove it.")
-
-
-def _refuse_disorder(imu: ImuStream, what: str) -> None:
-    back = np.diff(imu.stamps_ns) < 0
-    if back.any():
-        i = int(np.argmax(back))
-        raise RecordingError(
-            f"{what}: the reading at {imu.stamps_ns[i + 1]} ns comes after the one at {imu.stamps_ns[i]} ns; "
-            "sort the readings by stamp, or record again if the clock was set back."
-        )
-
-
-def _without_repeats(imu: ImuStream, what: str) -> tuple[ImuStream, tuple[str, ...]]:
-    repeat = np.concatenate([[False], np.diff(imu.stamps_ns) == 0])
-    if not repeat.any():
-        return imu, ()
-    readings = np.hstack([imu.gyro, imu.accel])
-    differs = repeat.copy()
-    differs[1:] &= (np.diff(readings, axis=0) != 0).any(axis=1)
-    if differs.any():
-        instant = imu.stamps_ns[np.argmax(differs)]
-        raise RecordingError(
-            f"{what}: two different readings are both stamped {instant} ns; export the IMU's own stamps, or remove one."
-        )
-    first = imu.stamps_ns[np.argmax(repeat)]
-    note = f"{what}: {int(repeat.sum())} repeated readings were dropped, the first at {first} ns."
-    keep = ~repeat
-    return ImuStream(imu.name, imu.stamps_ns[keep], imu.gyro[keep], imu.accel[keep]), (note,)
 
 
 def _refuse_units(imu: ImuStream, what: str) -> None:
@@ -120,15 +84,7 @@ def saturations(imu: ImuStream) -> tuple[Saturation, ...]:
     for kind, values in (("gyroscope", imu.gyro), ("accelerometer", imu.accel)):
         for axis, name in enumerate("xyz"):
             for limit in (values[:, axis].max(), values[:, axis].min()):
-                at, count = _longest_run(values[:, axis] == limit)
+                at, count = longest_run(values[:, axis] == limit)
                 if abs(limit) >= _NARROWEST_RANGE[kind] and count >= _SATURATED_RUN:
                     found.append(Saturation(kind, name, float(limit), count, int(imu.stamps_ns[at])))
     return tuple(found)
-
-
-def _longest_run(flag: np.ndarray) -> tuple[int, int]:
-    """Where the longest run of True in `flag` (N,) begins, and its length."""
-    edge = np.diff(np.concatenate([[0], flag.astype(np.int8), [0]]))
-    begin, end = np.flatnonzero(edge == 1), np.flatnonzero(edge == -1)
-    longest = int(np.argmax(end - begin))
-    return int(begin[longest]), int(end[longest] - begin[longest])

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from icalib.errors import RecordingError
+from icalib.geometry import so3
 from icalib.measurements import PoseStream
-from icalib.recordings.clocks import rate_sentence
+from icalib.recordings.ordered import kept_readings
 from icalib.recordings.poses import PoseReadings
 from icalib.rig import PoseSensor
 
@@ -27,43 +28,20 @@ def checked_poses(read: PoseReadings, sensor: PoseSensor, where: str) -> tuple[P
     what = f"{where} ({read.name})"
     if len(read.stamps_ns) < 3:
         raise RecordingError(f"{what}: only {len(read.stamps_ns)} poses; a calibration needs the whole recording.")
-    bad = ~(np.isfinite(read.position).all(axis=1) & np.isfinite(read.rotation).all(axis=(1, 2)))
-    if bad.any():
-        raise RecordingError(f"{what}: the pose at {read.stamps_ns[np.argmax(bad)]} ns is not finite; remove it.")
-    if (np.diff(read.stamps_ns) < 0).any():
-        i = int(np.argmax(np.diff(read.stamps_ns) < 0))
-        raise RecordingError(
-            f"{what}: the pose at {read.stamps_ns[i + 1]} ns comes after the one at {read.stamps_ns[i]} ns; sort the "
-            "poses by stamp, or record again if the clock was set back."
-        )
-    if sentence := rate_sentence(what, read.stamps_ns, *_RATE_HZ):
-        raise RecordingError(sentence)
-    read, notes = _without_repeats(read, what)
+    values = np.hstack([read.position, read.rotation.reshape(-1, 9)])
+    own = "write the sensor's own stamps"
+    kept, notes = kept_readings(read.stamps_ns, values, what, _RATE_HZ, "pose", own)
+    if notes:
+        read = PoseReadings(read.name, read.stamps_ns[kept], read.rotation[kept], read.position[kept])
     _refuse_stillness(read, what)
     _refuse_units(read, what)
     stream = PoseStream(read.name, read.stamps_ns, np.ascontiguousarray(read.rotation), read.position)
     return stream, notes + _jumps(stream, sensor, what)
 
 
-def _without_repeats(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple[str, ...]]:
-    repeat = np.concatenate([[False], np.diff(read.stamps_ns) == 0])
-    if not repeat.any():
-        return read, ()
-    differs = repeat.copy()
-    differs[1:] &= (np.diff(read.position, axis=0) != 0).any(axis=1) | (np.diff(read.rotation, axis=0) != 0).any((1, 2))
-    if differs.any():
-        raise RecordingError(
-            f"{what}: two different poses are both stamped {read.stamps_ns[np.argmax(differs)]} ns; write the sensor's "
-            "own stamps, or remove one."
-        )
-    first, kept = read.stamps_ns[np.argmax(repeat)], ~repeat
-    note = f"{what}: {int(repeat.sum())} repeated poses were dropped, the first at {first} ns."
-    return PoseReadings(read.name, read.stamps_ns[kept], read.rotation[kept], read.position[kept]), (note,)
-
-
 def _refuse_stillness(read: PoseReadings, what: str) -> None:
     far = np.linalg.norm(read.position - np.median(read.position, axis=0), axis=1).max()
-    turned = _angles(read.rotation[0].T @ read.rotation).max()
+    turned = _sizes(so3.log_many(np.ascontiguousarray(read.rotation[0].T @ read.rotation))).max()
     if far < _STILL_M and turned < _STILL_RAD:
         raise RecordingError(
             f"{what}: all poses are the same within {far:.2g} m and {turned:.2g} rad; check that it follows the robot, "
@@ -118,14 +96,5 @@ def _sizes(vectors: np.ndarray) -> np.ndarray:
 
 
 def _turn_steps(rotation: np.ndarray) -> np.ndarray:
-    """(N - 1, 3) what each pose turned from the one before, about axes of the sensor, rad; good for small turns."""
-    R = rotation[:-1].transpose(0, 2, 1) @ rotation[1:]
-    axis = 0.5 * np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
-    sine = np.maximum(_sizes(axis), 1e-12)
-    return axis * (_angles(R) / sine)[:, None]
-
-
-def _angles(R: np.ndarray) -> np.ndarray:
-    """(n,) angles of rotations (n, 3, 3), rad."""
-    sine = 0.5 * np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
-    return np.arctan2(_sizes(sine), 0.5 * (np.trace(R, axis1=1, axis2=2) - 1.0))
+    """(N - 1, 3) what each pose turned from the one before, about axes of the sensor, rad."""
+    return so3.log_many(np.ascontiguousarray(rotation[:-1].transpose(0, 2, 1) @ rotation[1:]))

@@ -6,7 +6,7 @@ import numpy as np
 
 from icalib.errors import RecordingError
 from icalib.measurements import WheelPoses, WheelStream
-from icalib.recordings.clocks import rate_sentence
+from icalib.recordings.ordered import kept_readings, longest_run
 from icalib.recordings.wheels import WheelReadings
 from icalib.rig import Wheels
 
@@ -31,49 +31,15 @@ def checked_wheels(
     what = f"{where} ({read.name})"
     if len(read.stamps_ns) < 3:
         raise RecordingError(f"{what}: only {len(read.stamps_ns)} readings; a calibration needs the whole recording.")
-    _refuse_non_finite(read, what)
-    _refuse_disorder(read, what)
-    sentence = rate_sentence(what, read.stamps_ns, *_RATE_HZ)
-    if sentence:
-        raise RecordingError(sentence)
-    read, notes = _without_repeats(read, what)
+    own = "write the encoders' own stamps"
+    kept, notes = kept_readings(read.stamps_ns, read.value, what, _RATE_HZ, "reading", own)
+    if notes:
+        read = WheelReadings(read.name, read.stamps_ns[kept], read.value[kept])
     rate = read.value if wheels.measures == "rates" else _mean_rates(read, wheels)
     _refuse_units(rate, wheels, what)
     meaning = wheels.meaning if wheels.measures == "rates" else "mean"
     stream = WheelStream(read.name, read.stamps_ns, np.ascontiguousarray(rate), meaning)
     return stream, notes + _gap_notes(stream, what) + _stuck_notes(stream, what)
-
-
-def _refuse_non_finite(read: WheelReadings, what: str) -> None:
-    bad = ~np.isfinite(read.value).all(axis=1)
-    if bad.any():
-        raise RecordingError(f"{what}: the reading at {read.stamps_ns[np.argmax(bad)]} ns is not finite; remove it.")
-
-
-def _refuse_disorder(read: WheelReadings, what: str) -> None:
-    back = np.diff(read.stamps_ns) < 0
-    if back.any():
-        i = int(np.argmax(back))
-        raise RecordingError(
-            f"{what}: the reading at {read.stamps_ns[i + 1]} ns comes after the one at {read.stamps_ns[i]} ns; sort "
-            "the readings by stamp, or record again if the clock was set back."
-        )
-
-
-def _without_repeats(read: WheelReadings, what: str) -> tuple[WheelReadings, tuple[str, ...]]:
-    repeat = np.concatenate([[False], np.diff(read.stamps_ns) == 0])
-    if not repeat.any():
-        return read, ()
-    differs = repeat.copy()
-    differs[1:] &= (np.diff(read.value, axis=0) != 0).any(axis=1)
-    if differs.any():
-        raise RecordingError(
-            f"{what}: two different readings are both stamped {read.stamps_ns[np.argmax(differs)]} ns; write the "
-            "encoders' own stamps, or remove one."
-        )
-    first = read.stamps_ns[np.argmax(repeat)]
-    note = f"{what}: {int(repeat.sum())} repeated readings were dropped, the first at {first} ns."
-    return WheelReadings(read.name, read.stamps_ns[~repeat], read.value[~repeat]), (note,)
 
 
 def _mean_rates(read: WheelReadings, wheels: Wheels) -> np.ndarray:
@@ -124,22 +90,12 @@ def _stuck_notes(stream: WheelStream, what: str) -> tuple[str, ...]:
         same = np.concatenate([[False], np.diff(stream.rate[:, side]) == 0])
         same &= np.abs(stream.rate[:, other]) > _TURNING_RAD_S
         same &= np.concatenate([[False], np.diff(stream.rate[:, other]) != 0])
-        begin, end = _longest_run(same)
-        duration = (stream.stamps_ns[end] - stream.stamps_ns[begin]) * 1e-9
+        second, count = longest_run(same)  # of readings that are the one before
+        begin = max(second - 1, 0)
+        duration = (stream.stamps_ns[begin + count] - stream.stamps_ns[begin]) * 1e-9
         if duration > _STUCK_S:
             notes.append(
                 f"{what}: the {name} wheel reports {stream.rate[begin, side]:.4g} rad/s for {duration:.3g} s from "
                 f"{stream.stamps_ns[begin]} ns on while the {other_name} one turns; check its encoder."
             )
     return tuple(notes)
-
-
-def _longest_run(repeats: np.ndarray) -> tuple[int, int]:
-    """First and last reading of the longest run in which each but the first `repeats` (N,) the one before; (0, 0)
-    without one."""
-    edge = np.diff(np.concatenate([[0], repeats.astype(np.int8), [0]]))
-    begin, end = np.flatnonzero(edge == 1), np.flatnonzero(edge == -1)
-    if not len(begin):
-        return 0, 0
-    longest = int(np.argmax(end - begin))
-    return int(begin[longest] - 1), int(end[longest] - 1)

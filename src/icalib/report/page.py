@@ -22,7 +22,6 @@ _MAPS = (("As the first guess had them", "map-before"), ("As calibrated", "map-a
 def report_html(calibration: Calibration) -> str:
     """The whole report as one HTML document, plotly.js included."""
     c = calibration
-    figures = _figures(c)
     trust = tables.trust(c)
     words = {
         "sensors": " + ".join((*(() if c.imu is None else (c.imu,)), *c.mounted)),
@@ -52,13 +51,19 @@ def report_html(calibration: Calibration) -> str:
         "pose_figures": _pose_sections(c),
         "without_poses": "" if c.pose_residuals else " hidden",
         "facts": tables.facts(c),
-        "figures": script_json(figures),
-        "css": resource("icalib.report", "page.css"),
         "without_imu": "" if c.imu else " hidden",
-        "plotly": resource("plotly", "package_data/plotly.min.js"),
     }
     escaped = {name: tables.html(value) for name, value in words.items()}
-    return Template(resource("icalib.report", "page.html")).substitute(escaped | parts)
+    body = Template(resource("icalib.report", "page.html")).substitute(escaped | parts)
+    return document(f"Calibration of {words['sensors']}", body, _figures(c))
+
+
+def document(title: str, body: str, figures: dict[str, Figure]) -> str:
+    """One HTML file, plotly.js included, that draws each of the `figures` in the place with its id."""
+    return Template(resource("icalib.report", "frame.html")).substitute(
+        title=tables.html(title), body=body, figures=script_json(figures),
+        css=resource("icalib.report", "page.css"), plotly=resource("plotly", "package_data/plotly.min.js"),
+    )  # fmt: skip
 
 
 def _figures(c: Calibration) -> dict[str, Figure]:

@@ -63,59 +63,74 @@ def rig_for(
     truth), or a Parameter. settings: by default those of `settings_for`.
     """
 
-    def camera(sim: SimCamera) -> Camera:
+    treated = _Treated(scenario, rotation, translation, time_offset, intrinsics, distortion, bloom, drive)
+    imu = ImuSensor("imu0", "imu0/data.csv", scenario.imu_noise, _parameter(imu_intrinsics, scenario.imu_intrinsics))
+    return Rig(
+        imu,
+        tuple(treated.camera(c) for c in scenario.cameras),
+        scenario.target if scenario.board and scenario.cameras else NoTarget(),
+        gravity=float(np.linalg.norm(GRAVITY_WORLD)),
+        settings=settings_for(scenario) if settings is None else settings,
+        lidars=tuple(treated.lidar(s) for s in scenario.lidars),
+        wheels=tuple(treated.wheels(s) for s in scenario.wheels),
+        poses=tuple(treated.poses(s) for s in scenario.poses),
+    )
+
+
+@dataclass(frozen=True)
+class _Treated:
+    """Sensors of the rig, with each group of parameters treated alike in all."""
+
+    scenario: Scenario
+    rotation: Treatment
+    translation: Treatment
+    time_offset: Treatment
+    intrinsics: Treatment
+    distortion: Treatment
+    bloom: Treatment
+    drive: Treatment
+
+    def camera(self, sim: SimCamera) -> Camera:
         return Camera(
             sim.name,
             f"{sim.name}/corners.csv",
             sim.model,
             sim.resolution,
             corner_noise_px=sim.corner_noise_px,
-            tracks=None if scenario.features is None else f"{sim.name}/tracks.csv",
-            track_noise_px=None if scenario.features is None else sim.corner_noise_px,
-            rotation=_parameter(rotation, sim.T_imu_cam[:3, :3]),
-            translation=_parameter(translation, sim.T_imu_cam[:3, 3]),
-            time_offset=_parameter(time_offset, [raw_time_offset(scenario, sim)]),
-            intrinsics=_parameter(intrinsics, sim.intrinsics),
-            distortion=_parameter(distortion, sim.distortion),
-            bloom=_parameter(bloom, [sim.bloom_px]),
+            tracks=None if self.scenario.features is None else f"{sim.name}/tracks.csv",
+            track_noise_px=None if self.scenario.features is None else sim.corner_noise_px,
+            rotation=_parameter(self.rotation, sim.T_imu_cam[:3, :3]),
+            translation=_parameter(self.translation, sim.T_imu_cam[:3, 3]),
+            time_offset=_parameter(self.time_offset, [raw_time_offset(self.scenario, sim)]),
+            intrinsics=_parameter(self.intrinsics, sim.intrinsics),
+            distortion=_parameter(self.distortion, sim.distortion),
+            bloom=_parameter(self.bloom, [sim.bloom_px]),
         )
 
-    def mounted(sensor: Robotic, sim: SimLidar | SimWheels | SimPoses, T_imu_sensor: np.ndarray) -> Robotic:
+    def _mounted(self, sensor: Robotic, sim: SimLidar | SimWheels | SimPoses, T_imu_sensor: np.ndarray) -> Robotic:
         return replace(
             sensor,
-            rotation=_parameter(rotation, T_imu_sensor[:3, :3]),
-            translation=_parameter(translation, T_imu_sensor[:3, 3]),
-            time_offset=_parameter(time_offset, [raw_time_offset(scenario, sim)]),
+            rotation=_parameter(self.rotation, T_imu_sensor[:3, :3]),
+            translation=_parameter(self.translation, T_imu_sensor[:3, 3]),
+            time_offset=_parameter(self.time_offset, [raw_time_offset(self.scenario, sim)]),
         )
 
-    def wheels(sim: SimWheels) -> Wheels:
+    def wheels(self, sim: SimWheels) -> Wheels:
         kind = "poses" if sim.reports == "poses" else "rates"
         given = Wheels(
-            sim.name, f"{sim.name}/{kind}.csv", radii=_parameter(drive, sim.radii),
-            baseline=_parameter(drive, [sim.baseline]), wheel_noise=sim.noise, measures=kind, meaning=sim.meaning,
+            sim.name, f"{sim.name}/{kind}.csv", radii=_parameter(self.drive, sim.radii),
+            baseline=_parameter(self.drive, [sim.baseline]), wheel_noise=sim.noise, measures=kind, meaning=sim.meaning,
         )  # fmt: skip
-        return mounted(given, sim, sim.T_imu_wheel)
+        return self._mounted(given, sim, sim.T_imu_wheel)
 
-    def lidar(sim: SimLidar) -> Lidar:
+    def lidar(self, sim: SimLidar) -> Lidar:
         near, far = sim.range_m
         given = Lidar(sim.name, f"{sim.name}/scans.npz", sim.range_noise_m, near_m=near, far_m=far)
-        return mounted(given, sim, sim.T_imu_lidar)
+        return self._mounted(given, sim, sim.T_imu_lidar)
 
-    def poses(sim: SimPoses) -> PoseSensor:
+    def poses(self, sim: SimPoses) -> PoseSensor:
         given = PoseSensor(sim.name, f"{sim.name}/poses.csv", sim.kind, sim.rotation_noise, sim.position_noise)
-        return mounted(given, sim, sim.T_imu_sensor)
-
-    imu = ImuSensor("imu0", "imu0/data.csv", scenario.imu_noise, _parameter(imu_intrinsics, scenario.imu_intrinsics))
-    return Rig(
-        imu,
-        tuple(camera(c) for c in scenario.cameras),
-        scenario.target if scenario.board and scenario.cameras else NoTarget(),
-        gravity=float(np.linalg.norm(GRAVITY_WORLD)),
-        settings=settings_for(scenario) if settings is None else settings,
-        lidars=tuple(lidar(s) for s in scenario.lidars),
-        wheels=tuple(wheels(s) for s in scenario.wheels),
-        poses=tuple(poses(s) for s in scenario.poses),
-    )
+        return self._mounted(given, sim, sim.T_imu_sensor)
 
 
 def with_drawn_guess(

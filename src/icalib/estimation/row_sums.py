@@ -1,0 +1,55 @@
+"""Rows of a sensor between nodes, into the normal equations: what factors of wheels and of poses share."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from icalib.estimation.arrowhead import Piece
+from icalib.estimation.corner_factor import LOSSES
+from icalib.estimation.imu_data import ImuData
+from icalib.estimation.sensors import Whitened
+from icalib.estimation.state import Layout
+from icalib.estimation.wheel_kernels import Loss, Rows, accumulate_rows
+
+
+class Into(NamedTuple):
+    """Where rows go, as `SensorFactor.accumulate` is told."""
+
+    piece: Piece
+    out: Whitened
+    sums: bool
+    curved: bool
+    noise: np.ndarray | None
+
+
+class Weighing(NamedTuple):
+    """whitening (n, m, m) of the rows at hand; name and bend of the robust loss of each whitened row."""
+
+    whitening: np.ndarray
+    loss: str
+    loss_scale: float
+
+
+def add_rows(
+    rows: Rows,
+    own: slice,
+    node: np.ndarray,
+    columns: np.ndarray,
+    layout: Layout,
+    imu: ImuData,
+    by: Weighing,
+    into: Into,
+) -> float:
+    """Adds the rows `own` of a factor, each to the interval that begins at its `node`, and fills `into.out`; returns
+    half the robust chi^2. columns (c,): of the border; those of the IMU's intrinsics follow where rows have them."""
+    if rows.by_border.shape[2] > len(columns):
+        columns = np.concatenate([columns, layout.columns(imu.name, "intrinsics")])
+    free = np.flatnonzero(columns >= 0)
+    loss = Loss(LOSSES[by.loss], by.loss_scale, into.curved)
+    given = into.out.residual if into.noise is None else into.noise
+    return accumulate_rows(
+        rows, node, by.whitening, loss, free, columns[free], into.noise is not None, given[own],
+        into.piece.sums(into.sums), into.out.residual[own], into.out.root[own],
+    )  # fmt: skip
