@@ -45,11 +45,13 @@ def world_points(setup, state, poses, xyz):
 
 @dataclass
 class Point:
-    """Residual (N,) and Jacobian (N, chain + border) of all points on planes, by obvious formulas."""
+    """Residual (N,), cosine of incidence (N,), and the Jacobians (N, chain + border) of both, by obvious formulas, of
+    all points on planes."""
 
     r: np.ndarray
     J: np.ndarray
     incidence: np.ndarray
+    J_incidence: np.ndarray
 
 
 def pointwise(setup, state, bin_s=1e-3) -> Point:
@@ -65,15 +67,21 @@ def pointwise(setup, state, bin_s=1e-3) -> Point:
     R, R_il = poses.rotation, state.values["lidar0", "rotation"]
     r = np.einsum("ni,ni->n", n, world - c)
     in_body = np.einsum("nij,ni->nj", R, n)
+    beam = xyz / np.linalg.norm(xyz, axis=1, keepdims=True)
     by_pose = np.concatenate([np.cross(in_imu, in_body), n], axis=1)
+    turned = np.concatenate([np.cross(beam @ R_il.T, in_body), np.zeros_like(n)], axis=1)
     o = NODE * len(state.seconds)
-    J = np.zeros((len(used), o + setup.layout.size))
+    J, J_c = np.zeros((2, len(used), o + setup.layout.size))
     for i, k in enumerate(node):
         J[i, NODE * k : NODE * (k + 1)] = by_pose[i] @ poses.by_node[i]
+        J_c[i, NODE * k : NODE * (k + 1)] = turned[i] @ poses.by_node[i]
     columns = [o + setup.layout.columns("lidar0", name) for name in ("rotation", "translation", "time_offset")]
     J[:, columns[0]] = np.cross(xyz, in_body @ R_il)
     J[:, columns[1]] = in_body
-    J[:, columns[2][0]] = (by_pose * np.concatenate([poses.rate, poses.velocity], axis=1)).sum(axis=1)
+    twist = np.concatenate([poses.rate, poses.velocity], axis=1)
+    J[:, columns[2][0]] = (by_pose * twist).sum(axis=1)
+    J_c[:, columns[0]] = np.cross(beam, in_body @ R_il)
+    J_c[:, columns[2][0]] = (turned * twist).sum(axis=1)
     h = 1e-6
     for q, key in enumerate(setup.planes):
         own = setup.plane[used] == q
@@ -81,8 +89,9 @@ def pointwise(setup, state, bin_s=1e-3) -> Point:
             up, down = (moved(state.values[key], s * h * np.eye(3)[t]) for s in (1, -1))
             distances = [(world[own] - p[3:]) @ p[:3] for p in (up, down)]
             J[own, o + setup.layout.columns(*key)[t]] = (distances[0] - distances[1]) / (2 * h)
-    incidence = np.einsum("ni,ni->n", in_body @ R_il, xyz) / np.linalg.norm(xyz, axis=1)
-    return Point(r, J, incidence)
+            in_world = np.einsum("nij,nj->ni", R[own] @ R_il, beam[own])
+            J_c[own, o + setup.layout.columns(*key)[t]] = in_world @ (up[:3] - down[:3]) / (2 * h)
+    return Point(r, J, np.einsum("ni,ni->n", in_body @ R_il, beam), J_c)
 
 
 def sums(setup, factor, state, dense, **options):
@@ -115,8 +124,11 @@ def test_sums_are_those_of_the_points(sparse_room, room_of, dense, bin_s, loss, 
     bound, o = 10.0 * bin_s, NODE * len(state.seconds)
     np.testing.assert_allclose(found, expected, rtol=0, atol=bound)
     np.testing.assert_allclose(found[o:, o:], expected[o:, o:], rtol=0, atol=0.1 * bound)
-    np.testing.assert_allclose(g / size, (J.T @ r) / size, rtol=0, atol=bound * np.linalg.norm(r))
-    np.testing.assert_allclose((g / size)[o:], ((J.T @ r) / size)[o:], rtol=0, atol=0.1 * bound * np.linalg.norm(r))
+    # Half of r^2 / sigma^2 by the pose: sigma turns with the incidence.
+    share = np.minimum(t, 5.0) ** 2 * root**2 * beam**2 * point.incidence / sigma**2
+    slope = (J.T @ r - point.J_incidence.T @ share) / size
+    np.testing.assert_allclose(g / size, slope, rtol=0, atol=bound * np.linalg.norm(r))
+    np.testing.assert_allclose((g / size)[o:], slope[o:], rtol=0, atol=0.1 * bound * np.linalg.norm(r))
     assert cost == pytest.approx(0.5 * r @ r, rel=bound)
 
 

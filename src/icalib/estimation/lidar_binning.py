@@ -5,6 +5,11 @@ time, and all its derivatives by the bin's pose and the plane, follow exactly fr
 Points are first moved to the instant of their bin's centre: by the sensor's twist within a step of 1 ms, and from step
 to step by its poses. What that leaves is an eighth of the acceleration times the step's length squared at most: 1e-6 m
 for 5 m/s^2.
+
+Noise along the beam moves a point across its plane and along it, both at once. So J^T r of noisy points has a mean of
+its own, as far from nought as beams are slanted: 0.8 standard deviations of a focal length in a room, where roll and
+pitch of the LiDAR hold the images. What is left to minimise is r^2 over the variance of r, which turns with the beam's
+incidence; the derivative of that variance takes the mean away. It is linear in R^T n and is kept beside the moments.
 """
 
 from __future__ import annotations
@@ -28,6 +33,8 @@ BIN_S = 3e-3
 STEP_S = 1e-3  # of a longer bin
 POINTS_AT_A_TIME = 150_000  # by one thread: what a chunk needs beside the cloud stays small
 MOMENTS = 10  # of (1, x, y, z), lower triangle row by row
+SUMS = MOMENTS + 3  # and the slant
+MOST_TURNED = 25.0  # of a point's chi^2: what is beyond comes of a poor state, where no noise has a say
 LOSSES: dict[Loss, int] = {"none": 0, "huber": 1, "cauchy": 2}
 NO_PIVOT = 1e-13  # of a moment: below this a pivot is rounding
 
@@ -59,7 +66,8 @@ class Moments:
 
     seconds (n,): the bins' instants on the LiDAR's clock, since its first stamp; plane, count (E,): plane and number of
     points of each entry; root (E, 10): lower Cholesky factor L, row by row, of its moments sum w (1, x) (1, x)^T, with
-    w the points' robust weights over their variance.
+    w the points' robust weights over their variance; slant (E, 4): half the chi^2 changes with the variances, too, by
+    slant . (1, R_world_lidar^T n).
     """
 
     seconds: np.ndarray
@@ -67,6 +75,7 @@ class Moments:
     plane: np.ndarray
     count: np.ndarray
     root: np.ndarray
+    slant: np.ndarray
 
 
 class _Scans(NamedTuple):
@@ -143,15 +152,23 @@ def _see_plane(R, p, plane, seen):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _add_point(x, y, z, s, seen, weights, sums):
-    """Adds one weighted point to the ten moments in row s."""
-    w = weights.whole
+    """Adds one weighted point to the sums in row s."""
+    w, robust = weights.whole, 1.0
     if weights.along > 0.0 or weights.loss:
         across = seen[s, 1] * x + seen[s, 2] * y + seen[s, 3] * z
+        off, over = seen[s, 0] + across, 0.0
         if weights.along > 0.0:
             square = x * x + y * y + z * z
-            w = square / (weights.alike * square + weights.along * across * across)
+            over = 1.0 / (weights.alike * square + weights.along * across * across)
+            w = square * over
+        chi2 = off * off * w
         if weights.loss:
-            w *= weight(weights.loss, weights.scale, (seen[s, 0] + across) ** 2 * w)[0]
+            robust = weight(weights.loss, weights.scale, chi2)[0]
+            w *= robust
+        turns = robust * min(chi2, MOST_TURNED) * weights.along * across * over
+        sums[s, 10] -= turns * x
+        sums[s, 11] -= turns * y
+        sums[s, 12] -= turns * z
     wx, wy, wz = w * x, w * y, w * z
     sums[s, 0] += w
     sums[s, 1] += wx
@@ -225,20 +242,25 @@ def _root_in_place(M):
 
 
 @njit(cache=True, nogil=True)
-def _bin_scans(scans, motion, cells, planes, weights, per_s, bins, plane, count, root):
-    """All scans one after the other: entries' bin, plane, count and root; returns how many."""
+def _bin_scans(scans, motion, cells, planes, weights, per_s, entries):
+    """All scans one after the other: entries' bin, plane, count, root and slant; returns how many."""
+    bins, plane, count, root, slant = entries
     longest, total, each = 0, 0, max(len(cells.bin) // max(len(cells.position), 1), 1)
     for i in range(len(scans.start) - 1):
         longest = max(longest, (scans.steps[i + 1] - scans.steps[i]) // each)
     n = longest * len(planes)
     slot, seen = np.empty((longest, len(planes)), np.int32), np.empty((n, 4))
-    sums, number, where = np.empty((n, MOMENTS)), np.empty(n, np.int64), np.empty((n, 2), np.int64)
+    sums, number, where = np.empty((n, SUMS)), np.empty(n, np.int64), np.empty((n, 2), np.int64)
     for i in range(len(scans.start) - 1):
         used = _bin_scan(i, scans, motion, cells, planes, weights, per_s, each, slot, seen, sums, number, where)
         for s in range(used):
             bins[total], plane[total], count[total] = where[s, 0], where[s, 1], number[s]
-            root[total] = sums[s]
+            root[total] = sums[s, :MOMENTS]
             _root_in_place(root[total])
+            slant[total, 0] = 0.0
+            for a in range(3):
+                slant[total, 1 + a] = sums[s, MOMENTS + a]
+                slant[total, 0] -= sums[s, MOMENTS + a] * seen[s, 1 + a]
             total += 1
     return total
 
@@ -253,7 +275,7 @@ def take_moments(cloud: Associated, drive: Motion, noise: LidarNoise, bin_s: flo
     seconds, bins, *entries = zip(
         *in_parallel(lambda g: _moments_of(cloud, drive, noise, bin_s, g), groups), strict=True
     )
-    at, (plane, count, root) = np.concatenate(seconds), (np.concatenate(e) for e in entries)
+    at, (plane, count, root, slant) = np.concatenate(seconds), (np.concatenate(e) for e in entries)
     if not len(root):
         raise EstimationError(
             f"{cloud.stream.name}: no point lies on a plane while {drive.imu.name} was running; check that the clocks "
@@ -264,7 +286,8 @@ def take_moments(cloud: Associated, drive: Motion, noise: LidarNoise, bin_s: flo
     order = np.lexsort((plane, bin_of, at[bin_of]))  # by time first: scans may overlap
     bin_of = bin_of[order]
     fresh = np.flatnonzero(np.diff(bin_of, prepend=-1))
-    return Moments(at[bin_of[fresh]], np.append(fresh, len(bin_of)), plane[order], count[order], root[order])
+    start = np.append(fresh, len(bin_of))
+    return Moments(at[bin_of[fresh]], start, plane[order], count[order], root[order], slant[order])
 
 
 def _groups(stream: LidarStream) -> Iterator[slice]:
@@ -293,7 +316,7 @@ def _laid_out(
 def _moments_of(
     cloud: Associated, drive: Motion, noise: LidarNoise, bin_s: float, own: slice
 ) -> tuple[np.ndarray, ...]:
-    """Of some of the scans: seconds of the bins, and of each entry bin, plane, count and root."""
+    """Of some of the scans: seconds of the bins, and of each entry bin, plane, count, root and slant."""
     each = steps_of(bin_s)
     scans, seconds, _ = _laid_out(cloud.stream, cloud.plane, bin_s / each, each, own)
     times = seconds + drive.state.values[cloud.stream.name, "time_offset"][0]
@@ -306,10 +329,12 @@ def _moments_of(
     _to_centres(motion, each, usable(drive.imu, times, drive.max_gap_s), cells)
     weights = _Weights(noise.sigma**2, noise.sigma**-2, noise.beam_sigma**2, LOSSES[noise.loss], noise.loss_scale)
     most = min(len(scans.xyz), len(cells.position) * len(cloud.planes))
-    bin_of, own_plane, count = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)
-    root = np.empty((most, MOMENTS))
-    k = _bin_scans(scans, motion, cells, cloud.planes, weights, each / bin_s, bin_of, own_plane, count, root)
-    return seconds[each // 2 :: each], bin_of[:k].copy(), own_plane[:k].copy(), count[:k].copy(), root[:k].copy()
+    entries = (
+        np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64), np.empty((most, MOMENTS)),
+        np.empty((most, 4)),
+    )  # fmt: skip
+    k = _bin_scans(scans, motion, cells, cloud.planes, weights, each / bin_s, entries)
+    return seconds[each // 2 :: each], *(e[:k].copy() for e in entries)
 
 
 def steps_of(bin_s: float) -> int:

@@ -139,7 +139,7 @@ class LidarFactor:
                 R_il, p_il, R_lw, poses.position + poses.rotation @ p_il, poses.rate, poses.velocity,
                 poses.by_node, poses.by_next, poses.by_imu, through_pose,
             )  # fmt: skip
-            yield Bins(node, m.start[a : b + 1], m.plane, m.root), motion, planes
+            yield Bins(node, m.start[a : b + 1], m.plane, m.root, m.slant), motion, planes
 
     def _bins_of(self, piece: Piece) -> tuple[int, int]:
         """The bins that belong to `piece`: nodes from first to before last, the chain's very last node included."""

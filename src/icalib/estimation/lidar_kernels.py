@@ -19,12 +19,14 @@ RESIDUAL = POSE + PLANE  # the last column of an entry's Jacobian
 
 
 class Bins(NamedTuple):
-    """Bins of a piece: node (n,); entries of bin i are start[i]:start[i + 1], with plane and root as in `Moments`."""
+    """Bins of a piece: node (n,); entries of bin i are start[i]:start[i + 1], with plane, root and slant as in
+    `Moments`."""
 
     node: np.ndarray
     start: np.ndarray
     plane: np.ndarray
     root: np.ndarray
+    slant: np.ndarray
 
 
 class Planes(NamedTuple):
@@ -158,6 +160,19 @@ def _add_plane(k, B, T, columns, own, sums, G, V):
 
 
 @njit(cache=True, nogil=True)
+def _add_slant(A, slant, own, sums, G):
+    """The gradient of slant . (1, R^T n) by pose and plane; it bends too little to count."""
+    n_b = sums.border.shape[0] - 1
+    for i in range(POSE + PLANE):
+        s = A[i, 1] * slant[1] + A[i, 2] * slant[2] + A[i, 3] * slant[3]
+        if i < POSE:
+            G[i, POSE] += s
+        elif own[i - POSE] >= 0:
+            sums.border[own[i - POSE], n_b] += s
+            sums.border[n_b, own[i - POSE]] += s
+
+
+@njit(cache=True, nogil=True)
 def _add_row(k, i, n_nodes, row, columns, sums):
     """Row i of a bin's sums, by nodes, border and gradient, into those of node k, the next one, or the border."""
     n_b, n_c = sums.border.shape[0] - 1, len(columns)
@@ -208,12 +223,14 @@ def _add_pose(k, G, T, columns, sums, F, row):
 def accumulate(bins, motion, planes, given, white, sums, rows):
     """Whitened residuals `rows` (E, 4) of all bins, and their normal equations where they are wanted.
 
-    With `given`, white (E, 4) stands for the residuals in the gradient, and `rows` stay. Returns half the chi^2.
+    With `given`, white (E, 4) stands for the residuals in the gradient, and `rows` stay. Returns half the chi^2, and
+    what the variances add to it as beams turn.
     """
     wanted = len(sums.diagonal) > 0
     T = np.empty((POSE, (30 if len(motion.by_next) else 15) + len(motion.columns)))
     A, B, m = np.empty((RESIDUAL + 1, ROWS)), np.empty((RESIDUAL + 1, ROWS)), np.empty(ROWS)
     G, F, V, chi2 = np.empty((POSE, POSE + 1)), np.empty((POSE, T.shape[1] + 1)), np.empty(POSE), 0.0
+    turned = 0.0
     row = np.empty(T.shape[1] + 1)
     for i in range(len(bins.node)):
         k = bins.node[i] - sums.first
@@ -226,14 +243,19 @@ def accumulate(bins, motion, planes, given, white, sums, rows):
             if not given:
                 A[0] = m
                 _times_root(A, 1, bins.root[e], rows[e : e + 1])
+                turned += bins.slant[e, 0]
                 for c in range(ROWS):
                     chi2 += rows[e, c] ** 2
+                for c in range(1, ROWS):
+                    turned += bins.slant[e, c] * m[c]
             if wanted:
                 _jacobian(motion.R_lidar_world[i], motion.p_world_lidar[i], q, planes, m, A)
                 _times_root(A, RESIDUAL + 1, bins.root[e], B)
                 if given:
                     B[RESIDUAL] = white[e]
+                else:
+                    _add_slant(A, bins.slant[e], planes.columns[q], sums, G)
                 _add_plane(k, B, T, motion.columns, planes.columns[q], sums, G, V)
         if wanted:
             _add_pose(k, G, T, motion.columns, sums, F, row)
-    return 0.5 * chi2
+    return 0.5 * chi2 + turned
