@@ -18,10 +18,10 @@ from itertools import pairwise
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from numba import njit
 
 from icalib.errors import EstimationError
 from icalib.estimation import pages
+from icalib.estimation.chain_kernels import damp, eliminate_chain, forward_solve, substitute_chain
 from icalib.estimation.front import Eliminated, Features, eliminate
 from icalib.estimation.front_plan import plan
 from icalib.estimation.state import NODE
@@ -124,97 +124,70 @@ def make_pieces(n_nodes: int, n_border: int | None) -> tuple[Piece, ...]:
     )  # fmt: skip
 
 
-@njit(cache=True, nogil=True)
-def _forward_solve(L, X):
-    """X <- L^-1 X."""
-    for i in range(L.shape[0]):
-        for k in range(i):
-            f = L[i, k]
-            for j in range(X.shape[1]):
-                X[i, j] -= f * X[k, j]
-        f = 1.0 / L[i, i]
-        for j in range(X.shape[1]):
-            X[i, j] *= f
+@dataclass(frozen=True)
+class Draw:
+    """A draw from the posterior, as a step: chain (K, 15), border (B,)."""
+
+    chain: np.ndarray
+    border: np.ndarray
 
 
-@njit(cache=True, nogil=True)
-def _subtract_product(A, B, X):
-    """X <- X - A^T B."""
-    for k in range(A.shape[0]):
-        for i in range(A.shape[1]):
-            f = A[k, i]
-            if f != 0.0:
-                for j in range(B.shape[1]):
-                    X[i, j] -= f * B[k, j]
+@dataclass(frozen=True)
+class Factors:
+    """What an elimination leaves behind, in `pieces` too: of each piece what is `done`, of the node that they share its
+    factor and side (15, B + 1), and the `information` (B, B) of the border. tolerance, held: see border_step."""
 
+    pieces: tuple[Piece, ...]
+    done: list[Eliminated | bool]
+    n_nodes: int
+    shared: np.ndarray
+    shared_side: np.ndarray
+    information: np.ndarray
+    tolerance: np.ndarray
+    held: np.ndarray
 
-@njit(cache=True, nogil=True)
-def _eliminate(diagonal, upper, side, forwards, keep):
-    """Factorises in place from one end to the other; with `keep`, the last node is only updated. False: not definite.
+    def back(self, border: np.ndarray, white: list[np.ndarray]) -> np.ndarray:
+        """(K, 15, m) the chain's part of m solutions: from border (B + 1, m), its last row what the gradient counts,
+        and what stands on the right beside the gradient, of each piece and of the shared node."""
+        m = border.shape[1]
+        chain = np.zeros((self.n_nodes, NODE, m))
+        if len(self.shared):
+            chain[self.pieces[0].last] = np.linalg.solve(np.tril(self.shared).T, white[-1] - self.shared_side @ border)
+        keep = len(self.shared) > 0
+        own = list(zip(self.pieces, self.done, white, strict=False))
+        in_parallel(lambda p: _back(p[0], p[1], p[2], keep, border, chain), own)
+        return chain
 
-    Afterwards diagonal holds L_k, link (upper, turned when running backwards) L_k^-1 T[k, next], side L_k^-1 side.
-    """
-    n = diagonal.shape[0]
-    for step in range(n):
-        k = step if forwards else n - 1 - step
-        if step == n - 1 and keep:
-            return True
-        if not cholesky(diagonal[k]):
-            return False
-        _forward_solve(diagonal[k], side[k])
-        if step < n - 1:
-            after = k + 1 if forwards else k - 1
-            link = upper[k] if forwards else upper[k - 1].T.copy()
-            _forward_solve(diagonal[k], link)
-            if not forwards:
-                upper[k - 1] = link
-            _subtract_product(link, link, diagonal[after])
-            _subtract_product(link, side[k], side[after])
-    return True
+    def rows(self) -> list[int]:
+        """Unknowns of each piece, and of the shared node."""
+        own = [
+            d.rows if isinstance(d, Eliminated) else p.diagonal.shape[0] * NODE
+            for p, d in zip(self.pieces, self.done, strict=True)
+        ]
+        return [*own, len(self.shared)]
 
-
-@njit(cache=True, nogil=True)
-def _substitute(diagonal, upper, side, forwards, keep, border, chain):
-    """Back substitution: fills chain (n, 15) from the border step and, with `keep`, the last node's step in it."""
-    n = diagonal.shape[0]
-    B = side.shape[2] - 1
-    for step in range(n - 2 if keep else n - 1, -1, -1):
-        k = step if forwards else n - 1 - step
-        L = diagonal[k]
-        for i in range(L.shape[0]):
-            s = side[k, i, B]
-            for j in range(B):
-                s += side[k, i, j] * border[j]
-            chain[k, i] = -s
-        if step < n - 1:
-            after = k + 1 if forwards else k - 1
-            link = upper[k] if forwards else upper[k - 1]
-            for i in range(L.shape[0]):
-                for j in range(L.shape[0]):
-                    chain[k, i] -= link[i, j] * chain[after, j]
-        for i in range(L.shape[0] - 1, -1, -1):
-            s = chain[k, i]
-            for j in range(i + 1, L.shape[0]):
-                s -= L[j, i] * chain[k, j]
-            chain[k, i] = s / L[i, i]
-
-
-@njit(cache=True, nogil=True)
-def _damp(diagonal, damping):
-    for k in range(diagonal.shape[0]):
-        for i in range(diagonal.shape[1]):
-            diagonal[k, i, i] *= 1.0 + damping
+    def draws(self, rng: np.random.Generator, free: int, still: int) -> tuple[Draw, ...]:
+        """Draws from the posterior, to be made before the pieces are filled anew: `free` ones in which undetermined
+        directions of the border are held, then `still` ones in which all of it is."""
+        m = free + still
+        border = np.zeros((len(self.tolerance) + 1, m))
+        border[:-1, :free] = _border_draws(
+            self.information, self.tolerance, self.held, rng.standard_normal((len(self.tolerance), free))
+        )
+        chain = self.back(border, [rng.standard_normal((n, m)) for n in self.rows()])
+        return tuple(Draw(np.ascontiguousarray(chain[:, :, k]), border[:-1, k].copy()) for k in range(m))
 
 
 @dataclass(frozen=True)
 class Solution:
-    """Step (chain (K, 15), border (B,)), `decrease` of half the chi^2 that the linear model predicts, and the
-    `information` (B, B) of the border, the chain marginalised (damping included)."""
+    """Step (chain (K, 15), border (B,)), `decrease` of half the chi^2 that the linear model predicts, the
+    `information` (B, B) of the border, the chain marginalised (damping included), and the factors."""
 
     chain: np.ndarray
     border: np.ndarray
     decrease: float
     information: np.ndarray
+    factors: Factors
 
 
 BROKEN_DOWN = (
@@ -241,7 +214,7 @@ def _reduce(piece: Piece, keep: bool) -> Eliminated | bool:
     definite."""
     forwards = piece.first == 0 or not keep
     if piece.features is None:
-        done = _eliminate(piece.diagonal, piece.upper, piece.side, forwards, keep)
+        done = eliminate_chain(piece.diagonal, piece.upper, piece.side, forwards, keep)
         if done:
             piece.border -= _eliminated_part(piece, keep)
         return done
@@ -282,7 +255,7 @@ def marginalise_in_segments(piece: Callable[[int, int], Piece], n_nodes: int) ->
 
 def _onto_last(piece: Piece) -> Piece:
     """The last node and the border, all other nodes eliminated. Raises NotDefiniteError."""
-    if not _eliminate(piece.diagonal, piece.upper, piece.side, True, True):
+    if not eliminate_chain(piece.diagonal, piece.upper, piece.side, True, True):
         raise NotDefiniteError(BROKEN_DOWN)
     last = Piece.zeros(piece.last, piece.last, piece.side.shape[2] - 1)
     last.diagonal[0], last.side[0] = piece.diagonal[-1], piece.side[-1]
@@ -306,12 +279,21 @@ def border_step(
 
     Directions are those of the information in units of `tolerance` (B,).
     """
-    scaled, g = information * tolerance[:, None] * tolerance, tolerance * gradient
-    free = complement(held, len(tolerance))
-    values, vectors = np.linalg.eigh(free.T @ scaled @ free)
-    projected = vectors.T @ (free.T @ g)
+    free, values, vectors = _directions(information, tolerance, held)
+    projected = vectors.T @ (free.T @ (tolerance * gradient))
     step = np.where(values > HELD_BELOW, -projected / np.maximum(values, HELD_BELOW), 0.0)
     return tolerance * (free @ (vectors @ step)), float(-0.5 * projected @ step)
+
+
+def _directions(
+    information: np.ndarray, tolerance: np.ndarray, held: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Columns (B, n) that are free, and the eigenvalues and -vectors of the information among them, in units of
+    `tolerance`."""
+    free = complement(held, len(tolerance))
+    scaled = information * tolerance[:, None] * tolerance
+    values, vectors = np.linalg.eigh(free.T @ scaled @ free)
+    return free, values, vectors
 
 
 def complement(held: np.ndarray, n: int) -> np.ndarray:
@@ -330,13 +312,38 @@ def restricted_inverse(information: np.ndarray, held: np.ndarray) -> np.ndarray:
     return (basis / np.maximum(values, LEAST)) @ basis.T
 
 
-def _back(piece: Piece, done: Eliminated | bool, keep: bool, border: np.ndarray, chain: np.ndarray) -> None:
-    """Fills the part of `chain` (K, 15) that belongs to a piece, from the border's step and the kept node's."""
+def _border_draws(information: np.ndarray, tolerance: np.ndarray, held: np.ndarray, white: np.ndarray) -> np.ndarray:
+    """(B, m) from white noise (B, m): what has the inverse of the information for its covariance, what `border_step`
+    holds held."""
+    free, values, vectors = _directions(information, tolerance, held)
+    scaled = np.where(values > HELD_BELOW, 1.0 / np.sqrt(np.maximum(values, HELD_BELOW)), 0.0)
+    return tolerance[:, None] * (free @ (vectors @ (scaled[:, None] * white[: len(values)])))
+
+
+def _back(
+    piece: Piece, done: Eliminated | bool, white: np.ndarray, keep: bool, border: np.ndarray, chain: np.ndarray
+) -> None:
+    """Fills the part of `chain` (K, 15, m) that belongs to a piece, from border and the kept node's; see Factors."""
     own = chain[piece.first : piece.last + 1]
     if isinstance(done, Eliminated):
-        done.substitute(border, own)
-    else:
-        _substitute(piece.diagonal, piece.upper, piece.side, piece.first == 0, keep, border, own)
+        done.substitute(border, white, own)
+        return
+    for k in range(border.shape[1]):
+        one = np.ascontiguousarray(own[:, :, k])
+        noise = white[:, k].reshape(-1, NODE)
+        substitute_chain(
+            piece.diagonal,
+            piece.upper,
+            piece.side,
+            piece.first == 0,
+            keep,
+            np.ascontiguousarray(border[:, k]),
+            noise,
+            one,
+        )
+        # The shared node is given, and both pieces write their own nodes alone.
+        inner = slice(None) if not keep else slice(None, -1) if piece.first == 0 else slice(1, None)
+        own[inner, :, k] = one[inner]
 
 
 def solve(
@@ -350,7 +357,7 @@ def solve(
     extra = np.diag(scale * sum((p.border.diagonal() for p in pieces), np.zeros(n_border + 1)))
     if damping:
         for piece in pieces:
-            _damp(piece.diagonal, damping)
+            damp(piece.diagonal, damping)
     done = in_parallel(lambda p: _reduce(p, keep), pieces)
     if not all(done):
         raise NotDefiniteError(BROKEN_DOWN)
@@ -361,13 +368,12 @@ def solve(
         shared_side = pieces[0].side[-1] + pieces[1].side[0]
         if not cholesky(shared):
             raise NotDefiniteError(BROKEN_DOWN)
-        _forward_solve(shared, shared_side)
+        forward_solve(shared, shared_side)
         rest -= shared_side.T @ shared_side
     information = rest[:n_border, :n_border]
+    factors = Factors(pieces, done, n_nodes, shared, shared_side, information, tolerance, held)
     border, decrease = border_step(information, rest[:n_border, n_border], tolerance, held)
-    chain = np.zeros((n_nodes, NODE))
-    if keep:
-        rhs = -(shared_side[:, -1] + shared_side[:, :-1] @ border)
-        chain[pieces[0].last] = np.linalg.solve(np.tril(shared).T, rhs)
-    in_parallel(lambda p: _back(p[0], p[1], keep, border, chain), zip(pieces, done, strict=True))
-    return Solution(chain, border, decrease - 0.5 * float(rest[n_border, n_border]), information)
+    chain = factors.back(np.append(border, 1.0)[:, None], [np.zeros((n, 1)) for n in factors.rows()])[:, :, 0]
+    return Solution(
+        np.ascontiguousarray(chain), border, decrease - 0.5 * float(rest[n_border, n_border]), information, factors
+    )

@@ -12,14 +12,13 @@ from functools import partial
 
 import numpy as np
 
-from icalib.estimation.arrowhead import Piece, in_parallel, solve
+from icalib.estimation.arrowhead import Piece, solve
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.imu_factor import ImuFactor
 from icalib.estimation.problem import Problem
-from icalib.estimation.solver import Outcome
+from icalib.estimation.solver import Outcome, posterior
 from icalib.estimation.state import State
 
-PAIRS = 3
 CLEAR = 10.0  # information in tolerance units: where all is known to a third of a tolerance, one pair will do
 SLIGHT = 0.02  # of the information: where one pair finds less noise than this in all directions, it will do, too
 
@@ -34,11 +33,12 @@ def spurious_information(problem: Problem, outcome: Outcome, seed: int = 0) -> n
     rng = np.random.default_rng(seed)
     t = problem.tolerance
     clear = np.linalg.eigvalsh(outcome.information * t[:, None] * t).min(initial=np.inf) > CLEAR
+    samples = (outcome.draws or posterior(problem, outcome.state)).still
     found, room = [], problem.room()
-    while len(found) < 2 * (1 if clear else PAIRS):
-        sample, imu = _chain_sample(problem, outcome.state, rng, room), _reading_noise(problem.chain.imu, rng)
+    for sample in samples[:1] if clear else samples:
+        imu = _reading_noise(problem.chain.imu, rng)
         for sign in (1.0, -1.0):
-            found.append(_information(*_moved(problem, outcome.state, sign * sample, sign * imu), room))
+            found.append(_information(*_moved(problem, outcome.state, sign * sample.chain, sign * imu), room))
         if _largest_share(np.mean(found, axis=0) - outcome.information, outcome.information) < SLIGHT:
             break
     return np.mean(found, axis=0) - outcome.information
@@ -59,15 +59,6 @@ def _information(problem: Problem, state: State, room: tuple[Piece, ...] | None)
         return problem.marginal(partial(problem.sums_of, state))[:n, :n]
     problem.linearise(state, room, problem.residuals(), curved=True)
     return solve(room, problem.n_nodes, problem.tolerance).information
-
-
-def _chain_sample(
-    problem: Problem, state: State, rng: np.random.Generator, room: tuple[Piece, ...] | None
-) -> np.ndarray:
-    """(K, 15) a draw from the posterior of the chain, the border held: T^-1 J^T e for white e."""
-    noise, pieces = problem.white_noise(rng), room or problem.pieces()
-    in_parallel(lambda piece: problem.add_noise(state, piece, noise), pieces)
-    return solve(pieces, problem.n_nodes, problem.tolerance, held=np.eye(problem.layout.size)).chain
 
 
 def _reading_noise(imu: ImuData, rng: np.random.Generator) -> np.ndarray:

@@ -11,25 +11,24 @@ import numpy as np
 from icalib.errors import EstimationError
 from icalib.estimation import sensors
 from icalib.estimation.arrowhead import (
+    Draw,
     Piece,
     in_parallel,
     marginalise,
     restricted_inverse,
-    solve,
 )
-from icalib.estimation.corner_factor import CornerFactor, CornerOutput, CornerWhite
+from icalib.estimation.corner_factor import CornerFactor, CornerOutput
 from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput
 from icalib.estimation.gauge import hold_frame
 from icalib.estimation.imu_factor import ROWS
 from icalib.estimation.problem import Problem
 from icalib.estimation.sensors import SensorFactor
-from icalib.estimation.solver import Outcome
+from icalib.estimation.solver import Outcome, posterior
 from icalib.estimation.state import State
 
-PROBES = 2  # random right-hand sides; one already gives the dof of 1e5 residuals to 1 %
 IMAGE_CELLS = (4, 3)  # columns, rows
 TARGET_PARTS = 3  # along each side
-PROBE_STEP = 1e-2  # of a posterior sample: small enough to be linear
+DRAW_STEP = 1e-2  # of a posterior sample: small enough to be linear
 
 
 @dataclass(frozen=True)
@@ -47,19 +46,16 @@ class Fit:
     chi2: float
 
 
-def fits(problem: Problem, outcome: Outcome, seed: int = 0) -> list[Fit]:
+def fits(problem: Problem, outcome: Outcome) -> list[Fit]:
     """chi^2 over post-fit degrees of freedom of every sensor.
 
-    A random whitened residual e gives x = H^-1 J^T e; then e_s^T J_s x has the mean tr(J_s H^-1 J_s^T), the parameters
+    A draw x from the posterior has the covariance H^-1; then |J_s x|^2 has the mean tr(J_s H^-1 J_s^T), the parameters
     that sensor s pays for. J x is taken by central differences of the residuals themselves.
     """
-    rng = np.random.default_rng(seed)
     spent: dict[tuple[str, str], list[float]] = {}
-    room = problem.room()
-    for _ in range(PROBES):
-        for key, value in _probe(problem, outcome, rng, room).items():
+    for draw in (outcome.draws or posterior(problem, outcome.state)).free:
+        for key, value in _spent(problem, outcome, draw).items():
             spent.setdefault(key, []).append(value)
-    del room
     out = []
     imu = outcome.residuals.imu
     for kind, rows in problem.chain.kinds.items():
@@ -93,29 +89,22 @@ def _corner_chi2(camera: CornerFactor, out: CornerOutput) -> dict[str, tuple[int
     return found
 
 
-def _probe(
-    problem: Problem, outcome: Outcome, rng: np.random.Generator, room: tuple[Piece, ...] | None
-) -> dict[tuple[str, str], float]:
-    """e_s^T J_s x of each sensor for one random e."""
+def _spent(problem: Problem, outcome: Outcome, draw: Draw) -> dict[tuple[str, str], float]:
+    """|J_s x|^2 of each sensor for one draw x."""
     state, base = outcome.state, outcome.residuals
-    noise, pieces = problem.white_noise(rng), room or problem.pieces()
-    in_parallel(lambda piece: problem.add_noise(state, piece, noise), pieces)
-    solution = solve(pieces, problem.n_nodes, problem.tolerance, held=problem.held)
-    del pieces
-    # The sums hold J^T e where a solve expects J^T r: the step is -x.
-    ends = [state.retract(problem.layout, -s * solution.chain, -s * solution.border) for s in (PROBE_STEP, -PROBE_STEP)]
+    ends = [state.retract(problem.layout, s * draw.chain, s * draw.border) for s in (DRAW_STEP, -DRAW_STEP)]
     up, down = (_imu_residuals(problem, end) for end in ends)
-    along = noise.imu * (up - down) / (2.0 * PROBE_STEP)
-    spent = {(problem.chain.name, k): float(along[:, r].sum()) for k, r in problem.chain.kinds.items()}
-    for camera, out, own in zip(problem.cameras, base.corners, noise.corners, strict=True):
-        found = in_parallel(partial(_spent_by_views, camera, out, ends, own), camera.blocks())
+    along = (up - down) / (2.0 * DRAW_STEP)
+    spent = {(problem.chain.name, k): float((along[:, r] ** 2).sum()) for k, r in problem.chain.kinds.items()}
+    for camera, out in zip(problem.cameras, base.corners, strict=True):
+        found = in_parallel(partial(_spent_by_views, camera, out, ends), camera.blocks())
         for kind in found[0] if found else ():
             spent[camera.name, kind] = sum(one[kind] for one in found)
     if problem.features is not None and base.features is not None:
-        spent |= _spent_by_features(problem.features, base.features, ends, noise.features)
-    for sensor, at, own in zip(problem.sensors, base.sensors, noise.sensors, strict=True):
-        slope = _slope(sensor, problem.n_nodes, ends)
-        spent |= {(sensor.name, kind): sensors.spent(at, own, slope, r) for kind, r in sensor.kinds.items()}
+        spent |= _spent_by_features(problem.features, base.features, ends)
+    for sensor, at in zip(problem.sensors, base.sensors, strict=True):
+        slope = _slope(sensor, problem.n_nodes, ends) * at.root
+        spent |= {(sensor.name, kind): float((slope[:, r] ** 2).sum()) for kind, r in sensor.kinds.items()}
     return spent
 
 
@@ -124,7 +113,7 @@ def _slope(sensor: SensorFactor, n_nodes: int, ends: list[State]) -> np.ndarray:
     up, down = (sensor.output() for _ in ends)
     for out, state in zip((up, down), ends, strict=True):
         sensor.accumulate(state, Piece.bare(0, n_nodes - 1), out, sums=False)
-    return (up.residual - down.residual) / (2.0 * PROBE_STEP)
+    return (up.residual - down.residual) / (2.0 * DRAW_STEP)
 
 
 def _feature_residuals(factor: FeatureFactor, state: State) -> FeatureOutput:
@@ -133,10 +122,8 @@ def _feature_residuals(factor: FeatureFactor, state: State) -> FeatureOutput:
     return out
 
 
-def _spent_by_features(
-    factor: FeatureFactor, at: FeatureOutput, ends: list[State], noise: tuple[np.ndarray, ...]
-) -> dict[tuple[str, str], float]:
-    """e^T J x of each camera's features. Their points follow x, and three degrees of freedom a point are its own, the
+def _spent_by_features(factor: FeatureFactor, at: FeatureOutput, ends: list[State]) -> dict[tuple[str, str], float]:
+    """|J x|^2 of each camera's features. Their points follow x, and three degrees of freedom a point are its own, the
     cameras' shares by the number of observations."""
     up, down = (_feature_residuals(factor, state) for state in ends)
     count = np.zeros(factor.tracks.count)
@@ -146,9 +133,9 @@ def _spent_by_features(
     spent = {}
     for i, camera in enumerate(factor.cameras):
         root, u = at.root[i], used[i]
-        slope = (up.residual[i] - down.residual[i]) / (2.0 * PROBE_STEP)
+        slope = (up.residual[i] - down.residual[i]) / (2.0 * DRAW_STEP)
         own = float((3.0 / count[factor.tracks.track[i][u]]).sum())
-        spent[camera.name, "features"] = own + float((noise[i] * slope * root[:, None])[u].sum())
+        spent[camera.name, "features"] = own + float(((slope * root[:, None])[u] ** 2).sum())
     return spent
 
 
@@ -160,32 +147,26 @@ def _imu_residuals(problem: Problem, state: State) -> np.ndarray:
 
 
 def _spent_by_views(
-    camera: CornerFactor,
-    at: CornerOutput,
-    ends: list[State],
-    noise: CornerWhite,
-    views: tuple[int, int],
+    camera: CornerFactor, at: CornerOutput, ends: list[State], views: tuple[int, int]
 ) -> dict[str, float]:
-    """e^T J x of some views of one camera, their images' common errors solved along."""
+    """|J x|^2 of some views of one camera, its mean over their images' common errors, which follow x."""
     own, n, m = camera.corners_of(*views), views[1] - views[0], len(camera.noise.tau)
     up, down = (camera.residual(state, *views) for state in ends)
     root, view = at.root[own], camera.views.of_corners(*views) - views[0]
-    along = (up - down) / (2.0 * PROBE_STEP) * root[:, None]
-    white = noise.corners(own.start, own.stop)
-    e, e_shared = np.where((root > 0.0)[:, None], white, 0.0), noise.shared[slice(*views)]
-    total = float((e * along).sum())
+    along = (up - down) / (2.0 * DRAW_STEP) * root[:, None]
     if m == 0:
-        return {"corners": total}
+        return {"corners": float((along**2).sum())}
+    # An error c takes what is least: |along + f c|^2 + |c / tau|^2; about that its covariance is M^-1, on each axis.
     f = camera.noise.field[own] * root[:, None]
-    M = np.zeros((n, m, m))
-    rhs = np.zeros((n, 2, m))
+    M, rhs = np.zeros((n, m, m)), np.zeros((n, m, 2))
     np.add.at(M, view, f[:, :, None] * f[:, None, :])
-    np.add.at(rhs, view, (e - along)[:, :, None] * f[:, None, :])
+    np.add.at(rhs, view, -f[:, :, None] * along[:, None, :])
     M += np.diag(1.0 / camera.noise.tau**2)
-    rhs += e_shared / camera.noise.tau
-    shared = np.linalg.solve(M, rhs.transpose(0, 2, 1)).transpose(0, 2, 1)
-    total += float((e[:, :, None] * f[:, None, :] * shared[view]).sum())
-    spent = (e_shared * shared / camera.noise.tau).sum(axis=(0, 1))
+    inverse = np.linalg.inv(M)
+    shared = inverse @ rhs
+    total = float(((along + np.einsum("ik,ikj->ij", f, shared[view])) ** 2).sum())
+    total += 2.0 * float(np.einsum("ik,ikl,il->", f, inverse[view], f))
+    spent = ((shared**2).sum(axis=2) + 2.0 * np.diagonal(inverse, axis1=1, axis2=2)).sum(axis=0) / camera.noise.tau**2
     return {"corners": total} | {f"common error {k}": float(spent[k]) for k in range(m)}
 
 

@@ -47,9 +47,15 @@ class Eliminated:
     room: np.ndarray
     left: np.ndarray
 
-    def substitute(self, border: np.ndarray, chain: np.ndarray) -> None:
-        """Back substitution: fills `chain` (n, 15), of which the kept node is given, from the border's step (B,)."""
-        substitute_all(self.plan, self.sizes, self.turn, self.room, border, chain)
+    @property
+    def rows(self) -> int:
+        """How many unknowns were eliminated, those of features that one step alone sees aside."""
+        return int(self.sizes.rest.sum() + self.sizes.coupled.sum() + self.sizes.dying.sum())
+
+    def substitute(self, border: np.ndarray, white: np.ndarray, chain: np.ndarray) -> None:
+        """Back substitution: fills `chain` (n, 15, m), of which the kept node is given, from border (B + 1, m), its
+        last row what the gradient counts; white (rows, m): what stands on the right beside the gradient."""
+        substitute_all(self.plan, self.sizes, self.turn, self.room, border, white, chain)
 
 
 def _sizes(plan: Plan, n_border: int) -> Sizes:

@@ -316,27 +316,40 @@ def eliminate_all(plan, sizes, sums, chain, room, front, carry):
 
 
 @njit(cache=True, nogil=True)
-def substitute_all(plan, sizes, turn, room, border, chain):
-    """Fills `chain` (n, 15), of which the kept node is given, from the border's step (B,)."""
-    n_b = len(border) + 1
-    known = np.zeros(NODE + sizes.wide.max())
-    known[NODE : NODE + n_b - 1], known[NODE + n_b - 1] = border, 1.0
+def _solve_columns(U, X):
+    """X (p, m) <- U^-1 X."""
+    for j in range(X.shape[1]):
+        solve_upper(U, X[:, j])
+
+
+@njit(cache=True, nogil=True)
+def substitute_all(plan, sizes, turn, room, border, white, chain):
+    """Fills `chain` (n, 15, m), of which the kept node is given, from border (B + 1, m), its last row what the gradient
+    counts; white (rows, m): what stands on the right beside the gradient, by step: rest, coupled, dying."""
+    n_b, m, end = len(border), border.shape[1], len(white)
+    known = np.zeros((NODE + sizes.wide.max(), m))
+    known[NODE : NODE + n_b] = border
     for g in range(len(plan.after) - 1, -1, -1):
         a, c = sizes.rest[g], sizes.coupled[g]
         U, Ud, D, Wr, Wc = _factors(g, sizes, n_b, room)
-        known[:NODE] = chain[plan.after[g]] if plan.after[g] >= 0 else np.zeros(NODE)
-        x = -(Wc @ known[: Wc.shape[1]])
-        solve_upper(Ud, x[c:])
-        z = np.empty(a + c)
+        begin = end - a - len(Wc)
+        known[:NODE] = 0.0
+        if plan.after[g] >= 0:
+            known[:NODE] = chain[plan.after[g]]
+        x = white[begin + a : end] - Wc @ known[: Wc.shape[1]]
+        _solve_columns(Ud, x[c:])
+        z = np.empty((a + c, m))
         z[a:] = x[:c] - D @ x[c:]
-        solve_upper(U[a:, a:], z[a:])
-        z[:a] = -(Wr @ known[: NODE + n_b])
+        _solve_columns(U[a:, a:], z[a:])
+        z[:a] = white[begin : begin + a] - Wr @ known[: NODE + n_b]
         for i in range(a):
             for j in range(a, a + c):
-                z[i] -= U[i, j] * z[j]
-        solve_upper(U[:a, :a], z[:a])
+                for k in range(m):
+                    z[i, k] -= U[i, j] * z[j, k]
+        _solve_columns(U[:a, :a], z[:a])
         _take_back(g, plan, n_b, x[c:], known)
         _turn_back(g, plan, a, turn, z, chain)
+        end = begin
 
 
 @njit(cache=True, nogil=True)
@@ -354,7 +367,7 @@ def _take_back(g, plan, n_b, dying, known):
 @njit(cache=True, nogil=True)
 def _turn_back(g, plan, rest, turn, z, chain):
     """Steps of the nodes, in their own dimensions."""
-    r, c, x = 0, rest, np.empty(NODE)
+    r, c, x = 0, rest, np.empty((NODE, z.shape[1]))
     for q in range(plan.nodes.start[g], plan.nodes.start[g + 1]):
         k = plan.nodes.values[q]
         n = plan.coupled[k]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.arrowhead import NotDefiniteError, solve
+from icalib.estimation.arrowhead import NOTHING, Draw, NotDefiniteError, Solution, solve
 from icalib.estimation.problem import Problem, Residuals
 from icalib.estimation.state import State
 
@@ -20,8 +20,10 @@ CURVED_BELOW = 1e-2  # of the cost: steps that promise less use the true curvatu
 STALLED_DECREASE = 0.05  # of half the chi^2: a third of a standard deviation, good enough where smaller steps fail
 MOST_STALLED = 4  # steps this small that fail before the solver rests
 RESTING = 20.0  # times the tolerance of an early pass: a step that promises less and fails ends it
+FREE_DRAWS, STILL_DRAWS = 2, 3  # from the posterior, for what is made of the outcome
 FIRST_DAMPING = 1e-8
 ZERO_DAMPING = 1e-10  # below this, none: the weak information of a planar drive must not be swamped
+LEAST_DECREASE = 2e-5  # of half the chi^2: a step of 0.006 standard deviations, not worth a relinearisation
 
 
 @dataclass(frozen=True)
@@ -50,10 +52,28 @@ class Outcome:
     state: State
     cost: float
     residuals: Residuals
-    information: np.ndarray  # (B, B) of the border at the last linearisation, the chain marginalised, no damping
+    information: (
+        np.ndarray
+    )  # (B, B) of the border at `state`, the chain marginalised, no damping; empty where another pass follows
     steps: tuple[Step, ...]
     converged: bool
     status: str
+    draws: Draws | None = None  # as well
+
+
+@dataclass(frozen=True)
+class Draws:
+    """Steps drawn from the posterior: `free` ones, undetermined directions of the border held, and `still` ones, all of
+    the border held."""
+
+    free: tuple[Draw, ...]
+    still: tuple[Draw, ...]
+
+    @classmethod
+    def of(cls, solution: Solution) -> Draws:
+        """From what was solved last, the pieces as the solve left them."""
+        drawn = solution.factors.draws(np.random.default_rng(0), FREE_DRAWS, STILL_DRAWS)
+        return cls(drawn[:FREE_DRAWS], drawn[FREE_DRAWS:])
 
 
 def minimise(
@@ -64,11 +84,12 @@ def minimise(
     on_visit: Callable[[Visit], None] = lambda _: None,
 ) -> Outcome:
     """Minimises `problem` from `state` until half the chi^2 can fall by less than `tolerance`. `on_visit` is told of
-    each state that a step was looked for from, and of the last.
+    each state that a step was looked for from, and of the last. Where the tolerance is wide another pass follows, and
+    the end is not linearised once more: the outcome has no information and no draws.
 
     Raises EstimationError if no step can be computed at all.
     """
-    pieces, residuals = problem.pieces(), problem.residuals()
+    pieces, residuals, early = problem.pieces(), problem.residuals(), tolerance > STALLED_DECREASE
     cost = problem.linearise(state, pieces, residuals)
     damping, curved, curved_below, stalled, steps = 0.0, False, CURVED_BELOW, 0, []
     for _ in range(MAX_ITERATIONS):
@@ -78,10 +99,16 @@ def minimise(
             )
         solution, damping = _solve(problem, state, pieces, residuals, damping, curved)
         on_visit(Visit(state, solution.information))
+        if curved and damping == 0.0 and solution.decrease < min(ROUNDING * cost, LEAST_DECREASE):
+            # Nothing that counts would change: the sums were those of the end already.
+            steps.append(Step(cost, solution.decrease, damping, True))
+            on_step(steps[-1])
+            return _outcome(state, cost, residuals, solution.decrease, steps, solution)
         candidate = state.retract(problem.layout, solution.chain, solution.border)
         settled = solution.decrease < curved_below * cost
-        candidate_cost = problem.linearise(candidate, pieces, residuals, curved=settled)
         converged = damping == 0.0 and solution.decrease < max(tolerance, ROUNDING * cost)
+        sums = not (converged and early)
+        candidate_cost = problem.linearise(candidate, pieces, residuals, sums, settled)
         # At the bottom rounding decides whether the cost falls; a step this small is taken anyway.
         accepted = bool(candidate_cost < cost) or converged
         steps.append(Step(cost, solution.decrease, damping, accepted))
@@ -95,7 +122,7 @@ def minimise(
                 break
             continue
         stalled += solution.decrease < STALLED_DECREASE
-        if stalled > MOST_STALLED or (tolerance > STALLED_DECREASE and solution.decrease < RESTING * tolerance):
+        if stalled > MOST_STALLED or (early and solution.decrease < RESTING * tolerance):
             break
         # Too far out for the true curvature of the loss: weights alone, and only then more damping.
         damping = damping if curved else max(damping * 10.0, 1e-6)
@@ -104,10 +131,23 @@ def minimise(
         if damping > 1e6:
             break
         cost = problem.linearise(state, pieces, residuals)
-    fresh = curved and bool(steps) and steps[-1].accepted  # the sums are those of `state` already
-    outcome = _finish(problem, state, cost, pieces, residuals, steps, fresh)
-    on_visit(Visit(outcome.state, outcome.information))
-    return outcome
+    fresh = steps[-1].accepted  # what was filled last is that of `state`
+    if early:
+        if not fresh:
+            problem.linearise(state, pieces, residuals, sums=False)
+        return _outcome(state, cost, residuals, steps[-1].predicted_decrease, steps)
+    if not (curved and fresh):
+        problem.linearise(state, pieces, residuals, curved=True)
+    solution = solve(pieces, problem.n_nodes, problem.tolerance, 0.0, problem.held)
+    on_visit(Visit(state, solution.information))
+    return _outcome(state, cost, residuals, solution.decrease, steps, solution)
+
+
+def posterior(problem: Problem, state: State) -> Draws:
+    """Draws from the posterior at `state`. Raises NotDefiniteError."""
+    pieces = problem.pieces()
+    problem.linearise(state, pieces, problem.residuals(), curved=True)
+    return Draws.of(solve(pieces, problem.n_nodes, problem.tolerance, held=problem.held))
 
 
 def _solve(problem, state, pieces, residuals, damping, curved):
@@ -122,18 +162,19 @@ def _solve(problem, state, pieces, residuals, damping, curved):
             problem.linearise(state, pieces, residuals, curved=curved)
 
 
-def _finish(problem, state, cost, pieces, residuals, steps, fresh) -> Outcome:
-    if not fresh:
-        problem.linearise(state, pieces, residuals, curved=True)
-    last = solve(pieces, problem.n_nodes, problem.tolerance, 0.0, problem.held)
-    converged, n = last.decrease < STALLED_DECREASE, len(steps)
+def _outcome(
+    state: State, cost: float, residuals: Residuals, left: float, steps: list[Step], end: Solution | None = None
+) -> Outcome:
+    """`left`: what half the chi^2 can still fall by; `end`: what was solved there."""
+    converged, n = left < STALLED_DECREASE, len(steps)
     # Half a chi^2 of d is a step of sqrt(2 d) standard deviations at most.
-    share = max(100.0 * np.sqrt(2.0 * max(last.decrease, 0.0)), 1.0)
+    share = max(100.0 * np.sqrt(2.0 * max(left, 0.0)), 1.0)
     status = (
         f"converged in {n} iterations: the next step would move no parameter by more than {share:.0f} % of its "
         "standard deviation."
         if converged
         else f"not converged after {n} iterations: the next step would still lower half the chi^2 of {cost:.6g} by "
-        f"{last.decrease:.3g}; give a better first guess, or check the noise in the rig file."
+        f"{left:.3g}; give a better first guess, or check the noise in the rig file."
     )
-    return Outcome(state, cost, residuals, last.information, tuple(steps), converged, status)
+    information, draws = (NOTHING, None) if end is None else (end.information, Draws.of(end))
+    return Outcome(state, cost, residuals, information, tuple(steps), converged, status, draws)
