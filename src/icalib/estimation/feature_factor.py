@@ -26,6 +26,7 @@ from icalib.estimation.feature_kernels import (
     add_rays,
     add_to_points,
     camera_points,
+    moving_points,
     take_trials,
 )
 from icalib.estimation.front import Features
@@ -263,12 +264,20 @@ class FeatureFactor:
         )  # fmt: skip
         for step in range(MOST_STEPS):
             for view in views:
-                X = _in_camera(view, points.trial, tracks.start)
-                weighing, R_cw = self._weighing(view.index, False), view.motion.R_cam_world
-                add_to_points(view.seen, tracks.start, R_cw, self._seeing(view, X), weighing, points)
+                self._add_to_points(view, tracks.start, points)
             if take_trials(points, step == 0) == 0:
                 break
         return points
+
+    def _add_to_points(self, view: View, first: int, points: Points) -> None:
+        """Adds what a view's observations say of those points that still move."""
+        seen, motion = view.seen, view.motion
+        most = int(seen.start[-1] - seen.start[0])
+        image, which, X = np.empty(most, dtype=np.int64), np.empty(most, dtype=np.int64), np.empty((most, 3))
+        m = moving_points(seen, first, motion.R_cam_world, motion.p_world_cam, points, image, which, X)
+        uv, valid, by_point, _ = view.camera.model.project_with_jacobians(view.params, X[:m])
+        weighing = self._weighing(view.index, False)
+        add_to_points(seen, first, motion.R_cam_world, image[:m], which[:m], uv, valid, by_point, weighing, points)
 
     def _from_anchors(self, views: list[View], tracks: slice) -> np.ndarray:
         """(n, 3) where the points of `tracks` are first looked for, in the world: they move with a camera."""

@@ -87,12 +87,29 @@ def camera_points(seen, t0, R_cw, p_wc, points, X):
             t = seen.track[n]
             if t < 0:
                 X[n - o, 0], X[n - o, 1], X[n - o, 2] = 0.0, 0.0, 1.0
-                continue
-            a = points[t - t0, 0] - p_wc[i, 0]
-            b = points[t - t0, 1] - p_wc[i, 1]
-            c = points[t - t0, 2] - p_wc[i, 2]
-            for r in range(3):
-                X[n - o, r] = R_cw[i, r, 0] * a + R_cw[i, r, 1] * b + R_cw[i, r, 2] * c
+            else:
+                _in_camera(R_cw[i], p_wc[i], points[t - t0], X[n - o])
+
+
+@njit(cache=True, nogil=True)
+def _in_camera(R_cw, p_wc, point, x):
+    a, b, c = point[0] - p_wc[0], point[1] - p_wc[1], point[2] - p_wc[2]
+    for r in range(3):
+        x[r] = R_cw[r, 0] * a + R_cw[r, 1] * b + R_cw[r, 2] * c
+
+
+@njit(cache=True, nogil=True)
+def moving_points(seen, t0, R_cw, p_wc, points, image, which, X):
+    """Observations in use of points that still move: their image, which they are, and X their trial points in the
+    camera's frame. Returns how many."""
+    m = 0
+    for i in range(len(seen.start) - 1):
+        for n in range(seen.start[i], seen.start[i + 1]):
+            if seen.track[n] >= 0 and seen.keep[n] and points.moves[seen.track[n] - t0]:
+                image[m], which[m] = i, n
+                _in_camera(R_cw[i], p_wc[i], points.trial[seen.track[n] - t0], X[m])
+                m += 1
+    return m
 
 
 @njit(cache=True, nogil=True)
@@ -117,32 +134,31 @@ def add_rays(seen, t0, R_cw, p_wc, rays, valid, A, b):
 
 
 @njit(cache=True, nogil=True)
-def add_to_points(seen, t0, R_cw, seeing, weighing, points):
-    """Adds one camera's part to the sums, with the true curvature of the loss, and costs of the trial points."""
-    o, J, e = seeing.first, np.empty((2, 3)), np.empty(2)
-    for i in range(len(seen.start) - 1):
-        for n in range(seen.start[i], seen.start[i + 1]):
-            t = seen.track[n] - t0
-            if seen.track[n] < 0 or not points.moves[t] or not (seen.keep[n] and seeing.valid[n - o]):
-                continue
-            for r in range(2):
-                e[r] = seeing.uv[n - o, r] - seen.uv[n, r]
-                for k in range(3):
-                    J[r, k] = 0.0
-                    for c in range(3):
-                        J[r, k] += seeing.by_point[n - o, r, c] * R_cw[i, c, k]
-            square = (e[0] * e[0] + e[1] * e[1]) / (weighing.sigma * weighing.sigma)
-            w, cost, curvature = weight(weighing.loss, weighing.scale, square)
-            w /= weighing.sigma * weighing.sigma
-            less = (1.0 - curvature) / (e[0] * e[0] + e[1] * e[1]) if curvature < 1.0 else 0.0
-            points.trial_cost[t] += cost
-            points.trial_shown[t] += 1
-            for a in range(3):
-                slope = J[0, a] * e[0] + J[1, a] * e[1]
-                points.trial_b[t, a] += w * slope
-                for k in range(3):
-                    bent = less * slope * (J[0, k] * e[0] + J[1, k] * e[1])
-                    points.trial_A[t, a, k] += w * (J[0, a] * J[0, k] + J[1, a] * J[1, k] - bent)
+def add_to_points(seen, t0, R_cw, image, which, uv, valid, by_point, weighing, points):
+    """Adds one camera's observations `which` (m,), of images (m,), to the sums, with the true curvature of the loss,
+    and costs of the trial points; uv, valid and by_point (m, ...): what the model makes of these."""
+    J, e = np.empty((2, 3)), np.empty(2)
+    for m in range(len(which)):
+        n, R = which[m], R_cw[image[m]]
+        t = seen.track[n] - t0
+        if not valid[m]:
+            continue
+        for r in range(2):
+            e[r] = uv[m, r] - seen.uv[n, r]
+            for k in range(3):
+                J[r, k] = by_point[m, r, 0] * R[0, k] + by_point[m, r, 1] * R[1, k] + by_point[m, r, 2] * R[2, k]
+        square = (e[0] * e[0] + e[1] * e[1]) / (weighing.sigma * weighing.sigma)
+        w, cost, curvature = weight(weighing.loss, weighing.scale, square)
+        w /= weighing.sigma * weighing.sigma
+        less = (1.0 - curvature) / (e[0] * e[0] + e[1] * e[1]) if curvature < 1.0 else 0.0
+        points.trial_cost[t] += cost
+        points.trial_shown[t] += 1
+        for a in range(3):
+            slope = J[0, a] * e[0] + J[1, a] * e[1]
+            points.trial_b[t, a] += w * slope
+            for k in range(3):
+                bent = less * slope * (J[0, k] * e[0] + J[1, k] * e[1])
+                points.trial_A[t, a, k] += w * (J[0, a] * J[0, k] + J[1, a] * J[1, k] - bent)
 
 
 @njit(cache=True, nogil=True)
