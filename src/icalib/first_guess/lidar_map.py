@@ -17,6 +17,7 @@ import numpy as np
 from numba import njit
 
 from icalib.geometry import so3
+from icalib.geometry.small import eigen3
 
 UNKNOWNS = 12  # of a scan: turn, position, rate, velocity
 MOMENTS = 9  # x; y; z; xx; yx, yy; zx, zy, zz about the voxel's middle
@@ -74,10 +75,11 @@ def _index(x, voxels):
 
 @njit(cache=True, nogil=True)
 def _slot(key, i, j, k):
-    """Where voxel (i, j, k) is in the hash table, or would be; and its key."""
-    own = ((i + REACH) << 42) + ((j + REACH) << 21) + (k + REACH)
-    mask = len(key) - 1
-    s = ((own * 0x9E3779B97F4A7C1) >> 20) & mask
+    """Where voxel (i, j, k) is in the hash table, or would be; and its key. Voxels above one another are neighbours
+    there, too: searches look at these together."""
+    column = ((i + REACH) << 21) + (j + REACH)
+    own, mask = (column << 21) + (k + REACH), len(key) - 1
+    s = (((column * 0x9E3779B97F4A7C1) >> 20) + k) & mask
     while key[s] != own and key[s] != -1:
         s = (s + 1) & mask
     return s, own
@@ -140,11 +142,11 @@ def _fit(voxels, v):
     """Centre, normal and flatness of a voxel from its moments."""
     m, w = voxels.moments[v], voxels.weight[v]
     a, b, c = m[0] / w, m[1] / w, m[2] / w
-    S = np.empty((3, 3))
+    S, spread, axes = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
     S[0, 0], S[1, 1], S[2, 2] = m[3] / w - a * a, m[5] / w - b * b, m[8] / w - c * c
     S[1, 0], S[2, 0], S[2, 1] = m[4] / w - b * a, m[6] / w - c * a, m[7] / w - c * b
     S[0, 1], S[0, 2], S[1, 2] = S[1, 0], S[2, 0], S[2, 1]
-    spread, axes = np.linalg.eigh(S)
+    eigen3(S, spread, axes)
     edge2 = voxels.edge_m * voxels.edge_m
     thin = spread[0] < FLATTEST * FLATTEST * edge2 and spread[0] < 0.25 * spread[1]
     voxels.flat[v] = w >= FEWEST and thin and spread[1] > ACROSS * ACROSS * edge2

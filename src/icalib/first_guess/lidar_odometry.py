@@ -18,6 +18,7 @@ from icalib.geometry import so3
 from icalib.measurements import LidarStream
 
 MOST_MATCHED, MOST_MAPPED = 1500, 6000  # points of a scan
+GOLDEN = 0.6180339887498949  # steps of this share of the whole leave no gaps, wherever they end
 FEWEST_POINTS = 100
 FEWEST_SCANS = 20
 NEAREST_M = 0.3  # nearer than this is the LiDAR's own housing
@@ -58,7 +59,7 @@ class LidarPath:
 
 @dataclass(frozen=True)
 class _Scan:
-    """middle [s]; points xyz (n, 3) and instants tau (n,) s from the middle, in a random order."""
+    """middle [s]; points xyz (n, 3) and instants tau (n,) s from the middle, in an order that spreads them."""
 
     middle: float
     xyz: np.ndarray
@@ -95,11 +96,19 @@ def _scan_of(stream: LidarStream, i: int) -> _Scan:
     if not len(offset):
         return _Scan(float(stream.seconds[i]), np.empty((0, 3)), np.empty(0))
     middle = 0.5 * (float(offset.min()) + float(offset.max()))
-    chosen = np.random.default_rng(i).permutation(len(offset))[:MOST_MAPPED]
+    chosen = spread(len(offset), MOST_MAPPED, i)
     points = xyz[chosen].astype(np.float64)
     size2 = (points**2).sum(axis=1)
     good = np.isfinite(size2) & (size2 > NEAREST_M**2)
     return _Scan(float(stream.seconds[i]) + middle, points[good], offset[chosen][good].astype(np.float64) - middle)
+
+
+def spread(n: int, most: int, begin: int) -> np.ndarray:
+    """(min(n, most),) different indices below n, of which the first few, too, are spread over all."""
+    step = max(int(GOLDEN * n), 1)
+    while np.gcd(step, n) > 1:
+        step += 1
+    return (begin + np.arange(min(n, most)) * step) % n
 
 
 def _turned(scan: _Scan, turning: Turning) -> _Scan:

@@ -7,6 +7,7 @@ from math import sqrt
 import numpy as np
 from numba import njit
 
+SWEEPS = 12  # of rotations at most; five are usual
 # Loops throughout: array expressions compile ten times as slowly, and are no faster on matrices this small.
 
 
@@ -85,3 +86,39 @@ def solve_definite(A, b):
             b[i] -= A[k, i] * b[k]
         b[i] /= A[i, i]
     return True
+
+
+@njit(cache=True, nogil=True)
+def eigen3(A, values, vectors):
+    """Eigenvalues (3,), in increasing order, and -vectors, columns (3, 3), of a symmetric A (3, 3), which is
+    overwritten: Jacobi's rotations (Golub and Van Loan, Matrix Computations, 8.5)."""
+    for i in range(3):
+        for j in range(3):
+            vectors[i, j] = 1.0 if i == j else 0.0
+    for _ in range(SWEEPS):
+        size = A[0, 0] * A[0, 0] + A[1, 1] * A[1, 1] + A[2, 2] * A[2, 2]
+        if A[0, 1] * A[0, 1] + A[0, 2] * A[0, 2] + A[1, 2] * A[1, 2] <= 1e-32 * size:
+            break
+        for p, q in ((0, 1), (0, 2), (1, 2)):
+            if A[p, q] == 0.0:
+                continue
+            tau = (A[q, q] - A[p, p]) / (2.0 * A[p, q])
+            t = 1.0 / (abs(tau) + sqrt(1.0 + tau * tau))
+            t = t if tau >= 0.0 else -t
+            c = 1.0 / sqrt(1.0 + t * t)
+            s = t * c
+            for k in range(3):
+                A[k, p], A[k, q] = c * A[k, p] - s * A[k, q], s * A[k, p] + c * A[k, q]
+            for k in range(3):
+                A[p, k], A[q, k] = c * A[p, k] - s * A[q, k], s * A[p, k] + c * A[q, k]
+                vectors[k, p], vectors[k, q] = (
+                    c * vectors[k, p] - s * vectors[k, q],
+                    s * vectors[k, p] + c * vectors[k, q],
+                )
+    for i in range(3):
+        values[i] = A[i, i]
+    for i, j in ((0, 1), (1, 2), (0, 1)):
+        if values[j] < values[i]:
+            values[i], values[j] = values[j], values[i]
+            for k in range(3):
+                vectors[k, i], vectors[k, j] = vectors[k, j], vectors[k, i]
