@@ -11,7 +11,6 @@ from icalib.estimation.assembly import Inputs, motion_of, origin_difference
 from icalib.estimation.estimate import Estimate
 from icalib.estimation.lidar_binning import LidarNoise, in_world
 from icalib.estimation.lidar_factor import LidarFactor
-from icalib.estimation.lidar_sweep import Motion
 from icalib.estimation.nodes import usable
 from icalib.estimation.pose_factor import AbsolutePoseFactor, PoseNoise, RelativePosesFactor
 from icalib.estimation.sensors import Whitened
@@ -54,12 +53,16 @@ def lidar_residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> tupl
     now, first = motion_of(inputs, state), motion_of(inputs, inputs.guess or state)
     values = np.array([state.values[key] for key in inputs.clouds.keys])
     thinned = [_thinned(inputs, k, state) for k in range(len(inputs.rig.lidars))]
-    guessed = _fitted([(in_world(first, stream)[0], plane) for stream, plane in thinned], values)
+    before = [in_world(first, stream) for stream, _ in thinned]
+    guessed = _fitted([(points, plane) for (points, _), (_, plane) in zip(before, thinned, strict=True)], values)
     out = []
-    for whole, (stream, plane), noise in zip(inputs.measurements.lidars, thinned, found.robot.ranging, strict=True):
+    for whole, (stream, plane), noise, (first_world, seen_from) in zip(
+        inputs.measurements.lidars, thinned, found.robot.ranging, before, strict=True
+    ):
         seconds = _seconds_of(stream, state)
-        world, residual, cosine = _on_planes(now, stream, values[plane])
-        first_world, first_residual, _ = _on_planes(first, stream, guessed[plane])
+        world, at = in_world(now, stream)
+        residual, cosine = _on_planes(world, at, values[plane])
+        first_residual, _ = _on_planes(first_world, seen_from, guessed[plane])
         out.append(
             LidarResiduals(
                 stream.name, len(whole.stamps_ns), len(whole.xyz), _used(found, stream.name),
@@ -107,14 +110,13 @@ def _seconds_of(stream: LidarStream, state: State) -> np.ndarray:
     return stamps + stream.offset_s + state.values[stream.name, "time_offset"][0]
 
 
-def _on_planes(motion: Motion, stream: LidarStream, planes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points (N, 3) in the world, float32; distance (N,) of each to its plane (N, 6), float32; cosine (N,) of the
-    angle between its beam and the plane's normal."""
-    points, seen_from = in_world(motion, stream)
+def _on_planes(points: np.ndarray, seen_from: np.ndarray, planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of points (N, 3) in the world the distance (N,) of each to its plane (N, 6), float32; cosine (N,) of the angle
+    between its beam and the plane's normal."""
     normal, beam = planes[:, :3], points - seen_from
     residual = np.einsum("na,na->n", normal, points - planes[:, 3:])
     cosine = np.einsum("na,na->n", normal, beam) / np.linalg.norm(beam, axis=1)
-    return points, residual.astype(np.float32), cosine
+    return residual.astype(np.float32), cosine
 
 
 def _sigma(noise: LidarNoise, cosine: np.ndarray) -> np.ndarray:

@@ -29,14 +29,14 @@ from icalib.estimation.prior_factor import Prior
 from icalib.estimation.problem import Problem
 from icalib.estimation.robot import NO_ROBOT, RobotNoise, next_posing, next_ranging
 from icalib.estimation.sensors import chi2
-from icalib.estimation.solver import CONVERGED_DECREASE, Outcome, Step, Visit, minimise
+from icalib.estimation.solver import CONVERGED_DECREASE, ROUNDING, Outcome, Step, Visit, minimise
 from icalib.estimation.state import State
 from icalib.estimation.tolerances import GUESS_SIGMA
 from icalib.rig import PoseSensor, Settings
 
 LOOSE = 3.0  # times what a guess is worth
 LEAST_LEFT = 0.2  # of the residuals of poses: where the motion takes all, nothing is left to show their noise
-EARLY_DECREASE = 0.5  # an early pass is followed by another
+EARLY_DECREASE, EARLY_SHARE = 0.5, 1e-6  # an early pass is followed by another
 
 
 OnVisit = Callable[[str, Problem, Visit], None]  # told of the pass's name, its problem, and where the solver stood
@@ -80,8 +80,8 @@ def estimate(
             on_step(name, step)
 
         last = name == names[-1]
-        tolerance = CONVERGED_DECREASE if last else EARLY_DECREASE
-        outcome = minimise(problem, state, note, tolerance, partial(on_visit, name, problem))
+        goal = (CONVERGED_DECREASE, ROUNDING) if last else (EARLY_DECREASE, EARLY_SHARE)
+        outcome = minimise(problem, state, note, goal[0], partial(on_visit, name, problem), goal[1])
         if last:
             return Estimate(problem, outcome, tuple(models), tuple(history), robot)
         if name == "first":
@@ -94,6 +94,7 @@ def estimate(
         if _noise_is_estimated(inputs):
             models, noise = _next_noise(inputs, problem, outcome)
             robot = _next_robot(inputs, problem, outcome, robot)
+        robot = replace(robot, coarse=False)
         state = resample(outcome.state, nodes_for(inputs, host_times(inputs, outcome.state.values)), inputs)
         del problem, outcome  # before the next ones take as much memory
         pages.give_back()
@@ -117,7 +118,7 @@ def first_pass(inputs: Inputs, state: State) -> State:
         if inputs.is_sensor(b.sensor) and b.size != N_INTRINSICS
     ]
     problem = replace(problem, priors=(*problem.priors, *loose))
-    return minimise(problem, state, tolerance=EARLY_DECREASE).state
+    return minimise(problem, state, tolerance=EARLY_DECREASE, share=EARLY_SHARE).state
 
 
 def _next_noise(inputs: Inputs, problem: Problem, outcome: Outcome) -> tuple[list[NoiseModel], list[CornerNoise]]:

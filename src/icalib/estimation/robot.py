@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.estimation.lidar_binning import LidarNoise
+from icalib.estimation.lidar_binning import BIN_S, LidarNoise
 from icalib.estimation.lidar_factor import LidarFactor
 from icalib.estimation.lidar_sweep import Motion
 from icalib.estimation.pose_factor import (
@@ -32,6 +32,7 @@ DRIVE: tuple[tuple[str, Kind, int], ...] = (("radii", "vector", 2), ("baseline",
 NEAR_PLANE_M = 1e-3  # of a point's distance whatever the direction: what the model lacks where beams graze a plane
 FIRST_RANGE_M = 0.03  # of a LiDAR whose noise is not given
 LEAST_RANGE_M = 1e-3
+COARSE_BIN_S, COARSE_POINTS = 11e-3, 3_000_000
 FEWEST_POINTS = 100  # of a plane
 # Of a pose sensor whose noise is not given: rad, m; of relative poses rad/sqrt(s), m/sqrt(s).
 FIRST_POSE_NOISE = 0.01, 0.02
@@ -148,16 +149,18 @@ def next_posing(sensor: PoseSensor, noise: PoseNoise, ratios: dict[str, float]) 
 
 @dataclass(frozen=True)
 class RobotNoise:
-    """Noise of the LiDARs and of the pose sensors, in the rig's order."""
+    """Noise of the LiDARs and of the pose sensors, in the rig's order. coarse: whether of LiDARs fewer points count, in
+    longer bins."""
 
     ranging: tuple[LidarNoise, ...] = ()
     posing: tuple[PoseNoise, ...] = ()
+    coarse: bool = False
 
     @classmethod
     def first(cls, rig: Rig) -> RobotNoise:
-        """Before any residuals are known."""
+        """Before any residuals are known: coarse, which costs little and leads near."""
         ranging = tuple(first_ranging(x, rig.settings) for x in rig.lidars)
-        return cls(ranging, tuple(first_posing(x, rig.settings) for x in rig.poses))
+        return cls(ranging, tuple(first_posing(x, rig.settings) for x in rig.poses), True)
 
 
 NO_ROBOT = RobotNoise()
@@ -168,8 +171,18 @@ def robot_factors(
 ) -> tuple[SensorFactor, ...]:
     """Of LiDARs, if points are known to lie on planes, of wheels and of pose sensors, everything frozen that a pass
     freezes."""
+    bin_s = COARSE_BIN_S if noise.coarse else BIN_S
     lidars = (
-        LidarFactor.build(stream, plane, clouds.keys, motion, size, layout, rig.settings.scheme)
+        LidarFactor.build(
+            stream,
+            _thinned(plane) if noise.coarse else plane,
+            clouds.keys,
+            motion,
+            size,
+            layout,
+            rig.settings.scheme,
+            bin_s,
+        )
         for stream, plane, size in zip(measurements.lidars, clouds.plane, noise.ranging, strict=False)
     )
     wheels = (
@@ -181,6 +194,14 @@ def robot_factors(
         for sensor, stream, size in zip(rig.poses, measurements.poses, noise.posing, strict=True)
     )
     return (*(lidars if clouds.count else ()), *wheels, *poses)
+
+
+def _thinned(plane: np.ndarray) -> np.ndarray:
+    """(N,) plane of each point, -1 for all but some of many; by an odd step, or some lasers would be left out."""
+    step = len(plane) // COARSE_POINTS | 1
+    some = np.full_like(plane, -1)
+    some[::step] = plane[::step]
+    return some
 
 
 def pose_factor(sensor: PoseSensor, stream: PoseStream, motion: Motion, noise: PoseNoise, layout: Layout) -> PoseFactor:

@@ -82,8 +82,10 @@ def minimise(
     on_step: Callable[[Step], None] = lambda _: None,
     tolerance: float = CONVERGED_DECREASE,
     on_visit: Callable[[Visit], None] = lambda _: None,
+    share: float = ROUNDING,
 ) -> Outcome:
-    """Minimises `problem` from `state` until half the chi^2 can fall by less than `tolerance`. `on_visit` is told of
+    """Minimises `problem` from `state` until half the chi^2 can fall by less than `tolerance`, or this share of it.
+    `on_visit` is told of
     each state that a step was looked for from, and of the last. Where the tolerance is wide another pass follows, and
     the end is not linearised once more: the outcome has no information and no draws.
 
@@ -106,7 +108,7 @@ def minimise(
             return _outcome(state, cost, residuals, solution.decrease, steps, solution)
         candidate = state.retract(problem.layout, solution.chain, solution.border)
         settled = solution.decrease < curved_below * cost
-        converged = damping == 0.0 and solution.decrease < max(tolerance, ROUNDING * cost)
+        converged = damping == 0.0 and solution.decrease < max(tolerance, share * cost)
         sums = not (converged and early)
         candidate_cost = problem.linearise(candidate, pieces, residuals, sums, settled)
         # At the bottom rounding decides whether the cost falls; a step this small is taken anyway.
