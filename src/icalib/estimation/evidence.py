@@ -20,15 +20,13 @@ from icalib.estimation.arrowhead import (
 from icalib.estimation.corner_factor import CornerFactor, CornerOutput
 from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput
 from icalib.estimation.gauge import hold_frame
-from icalib.estimation.imu_factor import ROWS
-from icalib.estimation.problem import Problem
-from icalib.estimation.sensors import SensorFactor
+from icalib.estimation.problem import Problem, Residuals
 from icalib.estimation.solver import Outcome, posterior
 from icalib.estimation.state import State
 
 IMAGE_CELLS = (4, 3)  # columns, rows
 TARGET_PARTS = 3  # along each side
-DRAW_STEP = 1e-2  # of a posterior sample: small enough to be linear
+DRAW_STEP = 1e-3  # of a posterior sample: small enough to be linear
 
 
 @dataclass(frozen=True)
@@ -50,7 +48,7 @@ def fits(problem: Problem, outcome: Outcome) -> list[Fit]:
     """chi^2 over post-fit degrees of freedom of every sensor.
 
     A draw x from the posterior has the covariance H^-1; then |J_s x|^2 has the mean tr(J_s H^-1 J_s^T), the parameters
-    that sensor s pays for. J x is taken by central differences of the residuals themselves.
+    that sensor s pays for. J x is taken by differences of the residuals themselves.
     """
     spent: dict[tuple[str, str], list[float]] = {}
     for draw in (outcome.draws or posterior(problem, outcome.state)).free:
@@ -92,40 +90,33 @@ def _corner_chi2(camera: CornerFactor, out: CornerOutput) -> dict[str, tuple[int
 def _spent(problem: Problem, outcome: Outcome, draw: Draw) -> dict[tuple[str, str], float]:
     """|J_s x|^2 of each sensor for one draw x."""
     state, base = outcome.state, outcome.residuals
-    ends = [state.retract(problem.layout, s * draw.chain, s * draw.border) for s in (DRAW_STEP, -DRAW_STEP)]
-    up, down = (_imu_residuals(problem, end) for end in ends)
-    along = (up - down) / (2.0 * DRAW_STEP)
+    ends = [state.retract(problem.layout, s * draw.chain, s * draw.border) for s in (DRAW_STEP, 0.0)]
+    there = _residuals(problem, ends[0])
+    along = (there.imu - base.imu) / DRAW_STEP
     spent = {(problem.chain.name, k): float((along[:, r] ** 2).sum()) for k, r in problem.chain.kinds.items()}
     for camera, out in zip(problem.cameras, base.corners, strict=True):
         found = in_parallel(partial(_spent_by_views, camera, out, ends), camera.blocks())
         for kind in found[0] if found else ():
             spent[camera.name, kind] = sum(one[kind] for one in found)
-    if problem.features is not None and base.features is not None:
-        spent |= _spent_by_features(problem.features, base.features, ends)
-    for sensor, at in zip(problem.sensors, base.sensors, strict=True):
-        slope = _slope(sensor, problem.n_nodes, ends) * at.root
+    if problem.features is not None and base.features is not None and there.features is not None:
+        spent |= _spent_by_features(problem.features, base.features, there.features)
+    for sensor, at, moved in zip(problem.sensors, base.sensors, there.sensors, strict=True):
+        slope = (moved.residual - at.residual) / DRAW_STEP * at.root
         spent |= {(sensor.name, kind): float((slope[:, r] ** 2).sum()) for kind, r in sensor.kinds.items()}
     return spent
 
 
-def _slope(sensor: SensorFactor, n_nodes: int, ends: list[State]) -> np.ndarray:
-    """(n, m) derivative of the whitened residuals from the second of `ends` to the first, by a posterior sample."""
-    up, down = (sensor.output() for _ in ends)
-    for out, state in zip((up, down), ends, strict=True):
-        sensor.accumulate(state, Piece.bare(0, n_nodes - 1), out, sums=False)
-    return (up.residual - down.residual) / (2.0 * DRAW_STEP)
-
-
-def _feature_residuals(factor: FeatureFactor, state: State) -> FeatureOutput:
-    out = factor.output()
-    factor.accumulate(state, Piece.bare(0, factor.n_nodes - 1), out, sums=False)
+def _residuals(problem: Problem, state: State) -> Residuals:
+    """Those at `state`, corners aside."""
+    bare = replace(problem, cameras=())
+    out = bare.residuals()
+    bare.linearise(state, bare.pieces(sums=False), out, sums=False)
     return out
 
 
-def _spent_by_features(factor: FeatureFactor, at: FeatureOutput, ends: list[State]) -> dict[tuple[str, str], float]:
+def _spent_by_features(factor: FeatureFactor, at: FeatureOutput, there: FeatureOutput) -> dict[tuple[str, str], float]:
     """|J x|^2 of each camera's features. Their points follow x, and three degrees of freedom a point are its own, the
     cameras' shares by the number of observations."""
-    up, down = (_feature_residuals(factor, state) for state in ends)
     count = np.zeros(factor.tracks.count)
     used = [root > 0.0 for root in at.root]
     for track, u in zip(factor.tracks.track, used, strict=True):
@@ -133,17 +124,10 @@ def _spent_by_features(factor: FeatureFactor, at: FeatureOutput, ends: list[Stat
     spent = {}
     for i, camera in enumerate(factor.cameras):
         root, u = at.root[i], used[i]
-        slope = (up.residual[i] - down.residual[i]) / (2.0 * DRAW_STEP)
+        slope = (there.residual[i] - at.residual[i]) / DRAW_STEP
         own = float((3.0 / count[factor.tracks.track[i][u]]).sum())
         spent[camera.name, "features"] = own + float(((slope * root[:, None])[u] ** 2).sum())
     return spent
-
-
-def _imu_residuals(problem: Problem, state: State) -> np.ndarray:
-    out = np.zeros((problem.n_nodes - 1, ROWS))
-    for piece in problem.pieces(sums=False):
-        problem.chain.accumulate(state, piece, out, sums=False)
-    return out
 
 
 def _spent_by_views(
@@ -153,7 +137,7 @@ def _spent_by_views(
     own, n, m = camera.corners_of(*views), views[1] - views[0], len(camera.noise.tau)
     up, down = (camera.residual(state, *views) for state in ends)
     root, view = at.root[own], camera.views.of_corners(*views) - views[0]
-    along = (up - down) / (2.0 * DRAW_STEP) * root[:, None]
+    along = (up - down) / DRAW_STEP * root[:, None]
     if m == 0:
         return {"corners": float((along**2).sum())}
     # An error c takes what is least: |along + f c|^2 + |c / tau|^2; about that its covariance is M^-1, on each axis.

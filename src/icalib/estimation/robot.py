@@ -10,6 +10,7 @@ import numpy as np
 from icalib.estimation.lidar_binning import BIN_S, LidarNoise
 from icalib.estimation.lidar_factor import LidarFactor
 from icalib.estimation.lidar_sweep import Motion
+from icalib.estimation.point_planes import count_points, thinned
 from icalib.estimation.pose_factor import (
     FRAME,
     AbsolutePoseFactor,
@@ -32,7 +33,7 @@ DRIVE: tuple[tuple[str, Kind, int], ...] = (("radii", "vector", 2), ("baseline",
 NEAR_PLANE_M = 1e-3  # of a point's distance whatever the direction: what the model lacks where beams graze a plane
 FIRST_RANGE_M = 0.03  # of a LiDAR whose noise is not given
 LEAST_RANGE_M = 1e-3
-COARSE_BIN_S, COARSE_POINTS = 11e-3, 3_000_000
+COARSE_BIN_S = 11e-3
 FEWEST_POINTS = 100  # of a plane
 # Of a pose sensor whose noise is not given: rad, m; of relative poses rad/sqrt(s), m/sqrt(s).
 FIRST_POSE_NOISE = 0.01, 0.02
@@ -64,9 +65,7 @@ class Clouds:
     @property
     def points(self) -> np.ndarray:
         """(P,) how many lie on each plane."""
-        return sum(
-            (np.bincount(p[p >= 0], minlength=self.count) for p in self.plane), np.zeros(self.count, dtype=np.int64)
-        )
+        return sum((count_points(p, self.count) for p in self.plane), np.zeros(self.count, dtype=np.int64))
 
 
 NO_CLOUDS = Clouds((), ())
@@ -103,7 +102,7 @@ def frame_entries(sensor: PoseSensor, n_recordings: int) -> list[Entry]:
 def known_planes(streams: Sequence[LidarStream]) -> Clouds:
     """The association that streams come with, planes with few points left out."""
     most = max((int(s.plane.max(initial=-1)) for s in streams), default=-1) + 1
-    count = sum((np.bincount(s.plane[s.plane >= 0], minlength=most) for s in streams), np.zeros(most, dtype=np.int64))
+    count = sum((count_points(s.plane, most) for s in streams), np.zeros(most, dtype=np.int64))
     used = np.flatnonzero(count >= FEWEST_POINTS)
     own = np.full(most + 1, -1, dtype=np.int32)
     own[used] = np.arange(len(used))
@@ -175,7 +174,7 @@ def robot_factors(
     lidars = (
         LidarFactor.build(
             stream,
-            _thinned(plane) if noise.coarse else plane,
+            thinned(plane) if noise.coarse else plane,
             clouds.keys,
             motion,
             size,
@@ -194,14 +193,6 @@ def robot_factors(
         for sensor, stream, size in zip(rig.poses, measurements.poses, noise.posing, strict=True)
     )
     return (*(lidars if clouds.count else ()), *wheels, *poses)
-
-
-def _thinned(plane: np.ndarray) -> np.ndarray:
-    """(N,) plane of each point, -1 for all but some of many; by an odd step, or some lasers would be left out."""
-    step = len(plane) // COARSE_POINTS | 1
-    some = np.full_like(plane, -1)
-    some[::step] = plane[::step]
-    return some
 
 
 def pose_factor(sensor: PoseSensor, stream: PoseStream, motion: Motion, noise: PoseNoise, layout: Layout) -> PoseFactor:

@@ -24,7 +24,8 @@ from icalib.estimation.assembly import (
 from icalib.estimation.estimate import first_pass
 from icalib.estimation.lidar_binning import Associated, LidarNoise, Moments, take_moments
 from icalib.estimation.lidar_sweep import Motion, sweep
-from icalib.estimation.robot import FIRST_RANGE_M, MOUNT, Clouds, joined_clouds, known_planes
+from icalib.estimation.point_planes import thinned
+from icalib.estimation.robot import COARSE_BIN_S, FIRST_RANGE_M, MOUNT, Clouds, joined_clouds, known_planes
 from icalib.estimation.state import Key, State
 from icalib.first_guess.align_camera import trusted
 from icalib.first_guess.by_recording import (
@@ -203,11 +204,12 @@ def held_of(inputs: Inputs, lidar: Lidar | PoseSensor, guesses: bool = False) ->
 
 
 def fitted_planes(inputs: Inputs, state: State, clouds: Clouds) -> dict[Key, np.ndarray]:
-    """Values of the planes that fit the points best where `state` puts them."""
+    """Values of the planes that fit the points best where `state` puts them, some of very many."""
     motion, sums = motion_of(inputs, state), np.zeros((clouds.count, 4, 4))
     for stream, plane in zip(inputs.measurements.lidars, clouds.plane, strict=True):
         if (plane >= 0).any():
-            moments = take_moments(Associated(stream, plane, np.zeros((clouds.count, 6))), motion, LidarNoise(1.0))
+            some = Associated(stream, thinned(plane), np.zeros((clouds.count, 6)))
+            moments = take_moments(some, motion, LidarNoise(1.0), COARSE_BIN_S)
             _add_in_world(moments, motion, stream.name, sums)
     out = {}
     for key, M in zip(clouds.keys, sums, strict=True):

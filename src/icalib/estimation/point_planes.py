@@ -1,0 +1,36 @@
+"""Compiled passes over which plane each point of a LiDAR lies on: tens of millions of numbers."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+COARSE_POINTS = 3_000_000  # of a LiDAR, where some of its points will do
+FEW = 20_000  # points of a plane that are all looked at
+
+
+@njit(cache=True, nogil=True)
+def count_points(plane, n):
+    """(n,) how many points lie on each of n planes; plane (N,), -1: on none."""
+    count = np.zeros(n, dtype=np.int64)
+    for q in plane:
+        if q >= 0:
+            count[q] += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _some(plane, step, count, out):
+    for i in range(len(plane)):
+        q = plane[i]
+        out[i] = q if i % step == 0 or (q >= 0 and count[q] < FEW) else -1
+
+
+def thinned(plane: np.ndarray) -> np.ndarray:
+    """(N,) plane of each point, -1 for all but some of very many; by an odd step, or some lasers would be left out."""
+    step = len(plane) // COARSE_POINTS | 1
+    if step == 1:
+        return plane
+    out = np.empty_like(plane)
+    _some(plane, step, count_points(plane, int(plane.max()) + 1), out)
+    return out
