@@ -101,7 +101,7 @@ def minimise(
             )
         solution, damping = _solve(problem, state, pieces, residuals, damping, curved)
         on_visit(Visit(state, solution.information))
-        if curved and damping == 0.0 and solution.decrease < min(ROUNDING * cost, LEAST_DECREASE):
+        if not early and curved and damping == 0.0 and solution.decrease < min(ROUNDING * cost, LEAST_DECREASE):
             # Nothing that counts would change: the sums were those of the end already.
             steps.append(Step(cost, solution.decrease, damping, True))
             on_step(steps[-1])

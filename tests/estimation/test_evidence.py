@@ -1,0 +1,167 @@
+"""Draws from the posterior and the degrees of freedom that they show, against dense linear algebra."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.estimation.test_arrowhead import random_pieces
+from tests.estimation.test_front import build
+
+from icalib.estimation.arrowhead import Piece, solve
+from icalib.estimation.debias import spurious_information
+from icalib.estimation.evidence import fits
+from icalib.estimation.solver import Draws, Outcome, minimise, posterior
+from icalib.simulation import handheld, simulate
+
+DRAWS = 40
+
+
+def columns_of(solution):
+    """(n, m) the columns of a factor X of the inverse, X X^T, chain first: what unit vectors give in place of noise."""
+    factors, n_border = solution.factors, len(solution.border)
+    rows = factors.rows()
+    ends = np.cumsum([n_border, *rows])
+    white = [np.eye(ends[-1])[a:b] for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    border = np.zeros((n_border + 1, ends[-1]))
+    border[:n_border, :n_border] = np.linalg.cholesky(np.linalg.inv(solution.information))
+    chain = factors.back(border, white)
+    return np.concatenate([chain.reshape(-1, ends[-1]), border[:-1]])
+
+
+@pytest.mark.parametrize("n_nodes", [1, 3, 4, 9])
+def test_draws_have_the_covariance_of_the_posterior(dense, n_nodes):
+    pieces = random_pieces(n_nodes, 3)
+    H, _ = dense(pieces, n_nodes)
+    X = columns_of(solve(pieces, n_nodes, np.ones(3)))
+    inverse = np.linalg.inv(H)
+    np.testing.assert_allclose(X @ X.T, inverse, rtol=0, atol=1e-10 * np.abs(inverse).max())
+
+
+@pytest.mark.parametrize(("per_node", "by_next"), [(1, False), (2, False), (2, True)])
+def test_draws_have_the_covariance_of_the_posterior_where_features_tie_nodes(per_node, by_next):
+    pieces, H, _ = build(9, 12, 3, per_node=per_node, by_next=by_next)
+    X = columns_of(solve(pieces, 9, np.ones(3)))
+    inverse = np.linalg.inv(H)
+    np.testing.assert_allclose(X @ X.T, inverse, rtol=0, atol=1e-9 * np.abs(inverse).max())
+
+
+def test_still_draws_leave_the_border_and_free_ones_what_is_held():
+    pieces, held = random_pieces(6, 3), np.eye(3)[:, 1:2]
+    drawn = solve(pieces, 6, np.array([1.0, 2.0, 3.0]), held=held).factors.draws(np.random.default_rng(1), 4, 2)
+    assert [bool(d.border.any()) for d in drawn] == [True] * 4 + [False] * 2
+    assert all(d.border[1] == 0.0 and d.border[[0, 2]].all() and d.chain.all() for d in drawn[:4])
+    assert all(d.chain.all() for d in drawn[4:])
+
+
+@pytest.fixture(scope="module")
+def setup(setup_of):
+    return setup_of(simulate(handheld(1.5), seed=4))
+
+
+@pytest.fixture(scope="module")
+def cornered(setup, problem_of):
+    """Corners of both cameras, of one with errors that are common to an image."""
+    problem, rng = problem_of(setup), np.random.default_rng(2)
+    first, second = problem.cameras
+    noise = replace(second.noise, tau=np.array([0.4, 0.3]), field=0.05 * rng.normal(size=(len(second.stream.uv), 2)))
+    return replace(problem, cameras=(first, replace(second, noise=noise)))
+
+
+@pytest.fixture(scope="module")
+def followed(setup, problem_of, features_of):
+    """Corners as features too, which leaves the world defined."""
+    return replace(problem_of(setup), features=features_of(setup, noise_px=0.5))
+
+
+@pytest.fixture(scope="module")
+def scanned(room_of, sparse_room):
+    room = room_of(sparse_room)
+    return room.problem(room.state), room.state
+
+
+def outcome_of(problem, state):
+    """As if the solver had ended here."""
+    pieces, residuals = problem.pieces(), problem.residuals()
+    problem.linearise(state, pieces, residuals, curved=True)
+    solution = solve(pieces, problem.n_nodes, problem.tolerance)
+    draws = solution.factors.draws(np.random.default_rng(3), DRAWS, 1)
+    return Outcome(state, 0.0, residuals, solution.information, (), True, "", Draws(draws[:-1], draws[-1:]))
+
+
+def paid(problem, state, dense, what):
+    """What some factors pay for of chain and border: tr(H_s H^-1), H_s their own sums."""
+    pieces = problem.pieces()
+    problem.linearise(state, pieces, problem.residuals(), curved=True)
+    H, _ = dense(pieces, problem.n_nodes)
+    for piece in pieces:
+        piece.clear()
+        what(piece)
+    own, _ = dense(pieces, problem.n_nodes)
+    return float(np.trace(np.linalg.solve(H, own)))
+
+
+def spent(problem, outcome):
+    return {(f.sensor, f.kind): f.count - f.dof for f in fits(problem, outcome)}
+
+
+def of_imu(problem, state):
+    return lambda p: problem.chain.accumulate(state, p, np.zeros((problem.n_nodes - 1, 15)))
+
+
+def near(found, expected):
+    """A mean of draws, each with a variance of twice its mean at most."""
+    return abs(found - expected) < 4.0 * np.sqrt(2.0 * expected / DRAWS)
+
+
+def test_degrees_of_freedom_of_corners_and_their_common_errors(cornered, setup, dense):
+    state = setup.state
+    found = spent(cornered, outcome_of(cornered, state))
+    assert near(
+        sum(v for (_, k), v in found.items() if k in cornered.chain.kinds),
+        paid(cornered, state, dense, of_imu(cornered, state)),
+    )
+    for camera in cornered.cameras:
+        # Each common error has a row of its own, its prior, and takes one degree of freedom of corners and prior.
+        own = 2 * len(camera.noise.tau) * len(camera.times)
+        own += paid(cornered, state, dense, lambda p, c=camera: c.accumulate(state, p, c.output(), curved=True))
+        assert near(sum(v for (name, _), v in found.items() if name == camera.name), own)
+    assert found["cam1", "common error 0"] > 0.1 * 2 * len(cornered.cameras[1].times)
+
+
+def test_degrees_of_freedom_of_features(followed, setup, dense):
+    factor, state = followed.features, setup.state
+    outcome = outcome_of(followed, state)
+    found = spent(followed, outcome)
+    own = paid(followed, state, dense, lambda p: factor.accumulate(state, p, factor.output(), curved=True))
+    cameras = [found[c.name, "features"] for c in factor.cameras]
+    assert near(sum(cameras) - 3 * factor.tracks.count, own)
+    assert min(cameras) > 0.2 * sum(cameras)
+
+
+def test_degrees_of_freedom_of_points_on_planes(scanned, dense):
+    problem, state = scanned
+    found = spent(problem, outcome_of(problem, state))
+    (lidar,) = problem.sensors
+    own = paid(problem, state, dense, lambda p: lidar.accumulate(state, p, lidar.output()))
+    assert near(found[lidar.name, "points"], own)
+
+
+def test_an_early_outcome_has_no_draws_and_they_are_made_where_they_are_asked_for(followed, setup):
+    start = setup.perturbed(np.random.default_rng(5), 1.0)
+    early, late = minimise(followed, start, tolerance=0.5), minimise(followed, start)
+    assert early.draws is None and early.information.size == 0
+    there = posterior(followed, late.state)
+    for a, b in zip((*there.free, *there.still), (*late.draws.free, *late.draws.still), strict=True):
+        np.testing.assert_allclose(a.chain, b.chain, atol=1e-6 * np.abs(b.chain).max())
+        np.testing.assert_allclose(a.border, b.border, atol=1e-6 * np.abs(b.border).max())
+    without = replace(late, draws=None)
+    np.testing.assert_allclose(
+        spurious_information(followed, without), spurious_information(followed, late), rtol=1e-3, atol=1e-3
+    )
+    bare = Piece.bare(0, followed.n_nodes - 1)
+    out = followed.features.output()
+    followed.features.accumulate(early.state, bare, out, sums=False)
+    for a, b in zip(early.residuals.features.residual, out.residual, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-6)
