@@ -112,27 +112,29 @@ def _join(g, plan, sums, n_b, front, carry, old_wide):
     """Features move, and others join."""
     for q in range(plan.leave.start[g], plan.leave.start[g + 1]):
         a, b = n_b + 3 * plan.leave.values[q], n_b + 3 * plan.enter[q]
-        for i in range(3):
-            for x in range(old_wide):
-                if b <= x < b + 3 or a <= x < a + 3:
-                    continue
+        # Columns of a row lie side by side, rows do not: all three of a feature at a time.
+        for x in range(old_wide):
+            if b <= x < b + 3 or a <= x < a + 3:
+                continue
+            for i in range(3):
                 front[min(b + i, x), max(b + i, x)] = front[min(a + i, x), max(a + i, x)]
+        for i in range(3):
             for j in range(i, 3):
                 front[b + i, b + j] = front[a + i, a + j]
             carry[:, NODE + b + i] = carry[:, NODE + a + i]
     wide = n_b + 3 * plan.alive[g]
     for q in range(plan.born.start[g], plan.born.start[g + 1]):
         f, a = plan.born.values[q], n_b + 3 * plan.born_at[q]
-        for i in range(3):
-            front[: a + i, a + i] = 0.0
-            front[a + i, a + i : wide] = 0.0
-            carry[:, NODE + a + i] = 0.0
+        front[:a, a : a + 3] = 0.0
+        front[a : a + 3, a:wide] = 0.0
+        carry[:, NODE + a : NODE + a + 3] = 0.0
     for q in range(plan.born.start[g], plan.born.start[g + 1]):
         f, a = plan.born.values[q], n_b + 3 * plan.born_at[q]
         for i in range(3):
             for j in range(i, 3):
                 front[a + i, a + j] += sums.own[f, i, j]
-            for j in range(n_b):
+        for j in range(n_b):
+            for i in range(3):
                 front[j, a + i] += sums.side[f, i, j]
 
 
@@ -224,7 +226,7 @@ def _fill_pairs(g, plan, sums, chain, row, rest, n_b, Wc, carry):
 def _eliminate_local(g, plan, sums, chain, row, rest, U, Wc, front, coupled):
     """Features that this step alone sees. False: not definite."""
     n, n_b = plan.local.start[g + 1] - plan.local.start[g], sums.side.shape[2]
-    V, own = np.zeros((3 * n, coupled + n_b)), np.empty((3, 3))
+    V, own, used = np.zeros((3 * n, coupled + n_b)), np.empty((3, 3)), 0
     for q in range(n):
         at = plan.local.start[g] + q
         f, rows = plan.local.values[at], V[3 * q : 3 * q + 3]
@@ -232,18 +234,29 @@ def _eliminate_local(g, plan, sums, chain, row, rest, U, Wc, front, coupled):
             e = plan.local_pair[p]
             i = sums.image[e]
             k = sums.node[i]
+            begin = row[k, 0] - rest
             for a in range(3):
-                for b in range(plan.coupled[k]):
-                    for j in range(POSE):
-                        rows[a, row[k, b] - rest] += sums.block[e, a, j] * chain.pose[i, j, b]
-        rows[:, coupled:] = sums.side[f]
+                for j in range(POSE):
+                    w = sums.block[e, a, j]
+                    for b in range(plan.coupled[k]):
+                        rows[a, begin + b] += w * chain.pose[i, j, b]
+        for a in range(3):
+            for j in range(n_b):
+                rows[a, coupled + j] = sums.side[f, a, j]
+                if j < n_b - 1 and rows[a, coupled + j] != 0.0:
+                    used = max(used, j + 1)
         own[:] = sums.own[f]
         if not factorise(own):
             return False
         solve_transposed(own, rows)
     subtract_gram(V[:, :coupled], U[rest:, rest:])
-    subtract_product(V[:, :coupled], V[:, coupled:], Wc[:coupled, NODE : NODE + n_b])
-    subtract_gram(V[:, coupled:], front[:n_b, :n_b])
+    # Of the border features meet the `used` columns at most, and the gradient.
+    here, gradient, last = V[:, coupled : coupled + used], V[:, coupled + n_b - 1 :], NODE + n_b
+    subtract_product(V[:, :coupled], here, Wc[:coupled, NODE : NODE + used])
+    subtract_product(V[:, :coupled], gradient, Wc[:coupled, last - 1 : last])
+    subtract_gram(here, front[:used, :used])
+    subtract_product(here, gradient, front[:used, n_b - 1 : n_b])
+    subtract_gram(gradient, front[n_b - 1 : n_b, n_b - 1 : n_b])
     return True
 
 
@@ -267,10 +280,14 @@ def _eliminate_dying(g, plan, n_b, c, Ud, D, Wc, carry, front):
     """Takes dying features out of what comes next, and these and the nodes out of the front. False: not definite."""
     dying, W, wide = plan.dying.values[plan.dying.start[g] : plan.dying.start[g + 1]], Wc[c:], Wc.shape[1] - NODE
     for q in range(len(dying)):
+        o = n_b + 3 * dying[q]
+        for y in range(o):
+            for i in range(3):
+                W[3 * q + i, NODE + y] = front[y, o + i]
         for i in range(3):
-            f, x = n_b + 3 * dying[q] + i, 3 * q + i
+            f, x = o + i, 3 * q + i
             W[x, :NODE] = carry[:, NODE + f]
-            W[x, NODE : NODE + f] = front[:f, f]
+            W[x, NODE + o : NODE + f] = front[o:f, f]
             W[x, NODE + f :] = front[f, f:wide]
             D[:, x] = Wc[:c, NODE + f]
     subtract_product(D, Wc[:c, NODE:], W[:, NODE:])
