@@ -13,6 +13,7 @@ from numba import njit
 
 from icalib.estimation.corner_chain import add_image, pose_chain
 from icalib.estimation.corner_weights import bend, weight
+from icalib.geometry.blas import subtract_gram
 from icalib.geometry.small import solve_definite
 
 SETTLED = 1e-12  # of half the chi^2: what another step of a point could still take off
@@ -230,18 +231,13 @@ def _rows(i, n, X, seen, seeing, weighing, R_cw, error, A):
 
 
 @njit(cache=True, nogil=True)
-def _add_gram(A, n_d, rows, G):
-    """Upper triangle of G (7 + d, 7 + d) += what one observation's rows A say of camera pose, parameters and residual;
-    rows (2, 7 + d) is room for a copy that runs along memory."""
-    n, D = 7 + n_d, len(A) - 1
-    for r in range(2):
-        for a in range(n - 1):
-            rows[r, a] = A[a, r]
-        rows[r, n - 1] = A[D, r]
-    for a in range(n):
-        x, y = rows[0, a], rows[1, a]
-        for b in range(a, n):
-            G[a, b] += x * rows[0, b] + y * rows[1, b]
+def _gram(rows, G):
+    """G = rows^T rows."""
+    G[:] = 0.0
+    subtract_gram(rows, G)
+    for a in range(len(G)):
+        for b in range(a, len(G)):
+            G[a, b] = G[b, a] = -G[a, b]
 
 
 @njit(cache=True, nogil=True)
@@ -276,7 +272,10 @@ def accumulate(X, seen, base, motion, seeing, weighing, used, given, sums, featu
     `used`, white noise `given` (N, 2) stands for the whitened residuals. Returns half the robust chi^2."""
     n_d = len(seeing.pars)
     A, G, error = np.zeros((10 + n_d, 2)), np.empty((7 + n_d, 7 + n_d)), np.empty(2)
-    rows = np.empty((2, 7 + n_d))
+    most = 0
+    for i in range(len(seen.start) - 1):
+        most = max(most, seen.start[i + 1] - seen.start[i])
+    rows = np.empty((2 * most, 7 + n_d))
     Tn, Tm = np.empty((6, 15)), np.empty((6, 15 if len(motion.by_next) else 0))
     Tc, total, D = np.empty((6, motion.columns.shape[1])), 0.0, 9 + n_d
     wanted = len(sums.diagonal) > 0
@@ -286,7 +285,7 @@ def accumulate(X, seen, base, motion, seeing, weighing, used, given, sums, featu
             features.pose[i] = Tn
             if len(features.next_pose):
                 features.next_pose[i] = Tm
-            G[:] = 0.0
+        m = 0
         for n in range(seen.start[i], seen.start[i + 1]):
             t = seen.track[n] - base.track
             if seen.track[n] < 0:
@@ -299,11 +298,13 @@ def accumulate(X, seen, base, motion, seeing, weighing, used, given, sums, featu
                 continue
             if used:
                 A[D, 0], A[D, 1] = given[n, 0], given[n, 1]
-            _add_gram(A, n_d, rows, G)
+            for r in range(2):
+                for a in range(6 + n_d):
+                    rows[m + r, a] = A[a, r]
+                rows[m + r, 6 + n_d] = A[D, r]
+            m += 2
             _add_feature(A, seen.pair[n] - base.pair, t, Tc, motion.columns[i], seeing.columns, used, features)
         if wanted:
-            for a in range(7 + n_d):
-                for b in range(a):
-                    G[a, b] = G[b, a]
+            _gram(rows[:m], G)
             add_image(seen.node[i], G, Tn, Tm, Tc, motion.columns[i], seeing.columns, sums)
     return total

@@ -127,36 +127,39 @@ def _times_root(A, n, root, B):
 
 @njit(cache=True, nogil=True)
 def _add_plane(k, B, T, columns, own, sums, G, V):
-    """One plane in one bin: its pose part to G (6, 7), what the plane's columns `own` share in to the sums."""
+    """One plane in one bin: its pose part to G (6, 7), what the plane's columns `own` share in to the sums; V (3, w):
+    work space."""
     n_b, n_nodes = sums.border.shape[0] - 1, T.shape[1] - len(columns)
     for i in range(POSE):
         for j in range(POSE + 1):
             c = j if j < POSE else RESIDUAL
             G[i, j] += B[i, 0] * B[c, 0] + B[i, 1] * B[c, 1] + B[i, 2] * B[c, 2] + B[i, 3] * B[c, 3]
+    if own[0] < 0:
+        return
+    V[:] = 0.0
+    for i in range(POSE):
+        for t in range(PLANE):
+            b = B[POSE + t]
+            v = B[i, 0] * b[0] + B[i, 1] * b[1] + B[i, 2] * b[2] + B[i, 3] * b[3]
+            for j in range(T.shape[1]):
+                V[t, j] += v * T[i, j]
+    for h in range(n_nodes // 15):
+        for r in range(15):
+            for t in range(PLANE):
+                sums.side[k + h, r, own[t]] += V[t, 15 * h + r]
+    for j in range(len(columns)):
+        if columns[j] >= 0:
+            for t in range(PLANE):
+                sums.border[columns[j], own[t]] += V[t, n_nodes + j]
+                sums.border[own[t], columns[j]] += V[t, n_nodes + j]
     for t in range(PLANE):
-        u = own[t]
-        if u < 0:
-            continue
         b = B[POSE + t]
-        for i in range(POSE):
-            V[i] = B[i, 0] * b[0] + B[i, 1] * b[1] + B[i, 2] * b[2] + B[i, 3] * b[3]
-        for j in range(T.shape[1]):
-            s = 0.0
-            for i in range(POSE):
-                s += T[i, j] * V[i]
-            if j < n_nodes:
-                sums.side[k + j // 15, j % 15, u] += s
-            elif columns[j - n_nodes] >= 0:
-                sums.border[columns[j - n_nodes], u] += s
-                sums.border[u, columns[j - n_nodes]] += s
         for c in range(PLANE + 1):
-            other = n_b if c == PLANE else own[c]
-            if other >= 0:
-                d = B[POSE + c]
-                s = b[0] * d[0] + b[1] * d[1] + b[2] * d[2] + b[3] * d[3]
-                sums.border[u, other] += s
-                if c == PLANE:
-                    sums.border[n_b, u] += s
+            d, other = B[POSE + c], n_b if c == PLANE else own[c]
+            s = b[0] * d[0] + b[1] * d[1] + b[2] * d[2] + b[3] * d[3]
+            sums.border[own[t], other] += s
+            if c == PLANE:
+                sums.border[n_b, own[t]] += s
 
 
 @njit(cache=True, nogil=True)
@@ -229,9 +232,9 @@ def accumulate(bins, motion, planes, given, white, sums, rows):
     wanted = len(sums.diagonal) > 0
     T = np.empty((POSE, (30 if len(motion.by_next) else 15) + len(motion.columns)))
     A, B, m = np.empty((RESIDUAL + 1, ROWS)), np.empty((RESIDUAL + 1, ROWS)), np.empty(ROWS)
-    G, F, V, chi2 = np.empty((POSE, POSE + 1)), np.empty((POSE, T.shape[1] + 1)), np.empty(POSE), 0.0
+    G, F, chi2 = np.empty((POSE, POSE + 1)), np.empty((POSE, T.shape[1] + 1)), 0.0
     turned = 0.0
-    row = np.empty(T.shape[1] + 1)
+    row, V = np.empty(T.shape[1] + 1), np.empty((PLANE, T.shape[1]))
     for i in range(len(bins.node)):
         k = bins.node[i] - sums.first
         if wanted:

@@ -28,7 +28,7 @@ from icalib.first_guess.lidar_arm import (
     solve,
 )
 from icalib.first_guess.lidar_motion import LONGEST_STEP_S, ImuMotion
-from icalib.first_guess.lidar_odometry import LidarPath, lidar_path
+from icalib.first_guess.lidar_odometry import LidarPath, Scan, lidar_path, scans_of
 from icalib.geometry import so3
 from icalib.measurements import LidarStream
 
@@ -147,7 +147,7 @@ def _path_on(stream: LidarStream, known: State, gyro: GyroRotation, guess: Lidar
     def turning(t: np.ndarray) -> np.ndarray:
         return gyro.carry(known.seconds, known.rotation, t + guess.offset) @ guess.rotation
 
-    path = lidar_path(stream, turning, moving)
+    path = lidar_path(stream.name, scans_of(stream), turning, moving)
     t = path.seconds + guess.offset
     return where(path, path.ok & (t >= known.seconds[0]) & (t <= known.seconds[-1]))
 
@@ -170,12 +170,13 @@ def poses_in(known: State, gyro: GyroRotation, t: np.ndarray) -> tuple[np.ndarra
 def _aligned(imu: ImuData, stream: LidarStream, held: Held) -> tuple[Alignment, LidarPath, CameraRates]:
     """Time offset, rotation and gyroscope bias; the LiDAR's path by the gyroscope's turns, as far as the IMU was
     running, and its rates."""
-    first = align_path(imu, stream.name, _rates(stream.name, lidar_path(stream)), held)
-    path = _turned_path(imu, stream, first)
+    scans = scans_of(stream)
+    first = align_path(imu, stream.name, _rates(stream.name, lidar_path(stream.name, scans)), held)
+    path = _turned_path(imu, stream.name, scans, first)
     rates = _rates(stream.name, path)
     aligned = align_path(imu, stream.name, rates, held)
     if not _alike(first, aligned):
-        path = _turned_path(imu, stream, aligned)
+        path = _turned_path(imu, stream.name, scans, aligned)
     t = path.seconds + aligned.offset
     inside = path.ok & (t > imu.seconds[0]) & (t < imu.seconds[-1])
     return aligned, where(path, inside), rates
@@ -201,9 +202,9 @@ def align_path(imu: ImuData, name: str, rates: CameraRates, held: Held) -> Align
     return found if held.rotation is None else as_given(imu, name, rates, found.offset, held.rotation)
 
 
-def _turned_path(imu: ImuData, stream: LidarStream, aligned: Alignment) -> LidarPath:
+def _turned_path(imu: ImuData, name: str, scans: list[Scan], aligned: Alignment) -> LidarPath:
     gyro = GyroRotation.integrate(imu, aligned.gyro_bias)
-    return lidar_path(stream, lambda t: gyro.at(t + aligned.offset) @ aligned.rotation)
+    return lidar_path(name, scans, lambda t: gyro.at(t + aligned.offset) @ aligned.rotation)
 
 
 def _rates(name: str, path: LidarPath) -> CameraRates:

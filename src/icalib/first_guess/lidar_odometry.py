@@ -58,7 +58,7 @@ class LidarPath:
 
 
 @dataclass(frozen=True)
-class _Scan:
+class Scan:
     """middle [s]; points xyz (n, 3) and instants tau (n,) s from the middle, in an order that spreads them."""
 
     middle: float
@@ -66,9 +66,8 @@ class _Scan:
     tau: np.ndarray
 
 
-def lidar_path(stream: LidarStream, turning: Turning | None = None, moving: Moving | None = None) -> LidarPath:
-    """`turning`: how it turned, where that is known, and `moving`: how it moved. Raises EstimationError where scans are
-    too few or do not fit one another."""
+def scans_of(stream: LidarStream) -> list[Scan]:
+    """Some points of each scan. Raises EstimationError where scans are too few."""
     scans = [_scan_of(stream, i) for i in range(len(stream.stamps_ns))]
     scans = [s for s in scans if len(s.tau) >= FEWEST_POINTS]
     if len(scans) < FEWEST_SCANS:
@@ -76,6 +75,12 @@ def lidar_path(stream: LidarStream, turning: Turning | None = None, moving: Movi
             f"{stream.name}: only {len(scans)} of its {len(stream.stamps_ns)} scans have {FEWEST_POINTS} points or "
             "more; check its topic, or record for longer."
         )
+    return scans
+
+
+def lidar_path(name: str, scans: list[Scan], turning: Turning | None = None, moving: Moving | None = None) -> LidarPath:
+    """Of LiDAR `name`. `turning`: how it turned, where that is known, and `moving`: how it moved. Raises
+    EstimationError where scans do not fit one another."""
     seconds = np.array([s.middle for s in scans])
     known = _Known.of(seconds, turning, moving)
     if turning is not None:
@@ -84,23 +89,23 @@ def lidar_path(stream: LidarStream, turning: Turning | None = None, moving: Movi
     poses, ok = _follow(scans, known, float(np.clip(reach / VOXELS_IN_REACH, *EDGES_M)))
     if ok.mean() < 0.5:
         raise EstimationError(
-            f"{stream.name}: only {ok.sum()} of {len(scans)} scans fit the surfaces that others show; there may be too "
+            f"{name}: only {ok.sum()} of {len(scans)} scans fit the surfaces that others show; there may be too "
             "few flat surfaces in sight, or the point times may be wrong."
         )
     return LidarPath(seconds, np.array([p.rotation for p in poses]), np.array([p.position for p in poses]), ok)
 
 
-def _scan_of(stream: LidarStream, i: int) -> _Scan:
+def _scan_of(stream: LidarStream, i: int) -> Scan:
     own = slice(int(stream.start[i]), int(stream.start[i + 1]))
     offset, xyz = stream.offset_s[own], stream.xyz[own]
     if not len(offset):
-        return _Scan(float(stream.seconds[i]), np.empty((0, 3)), np.empty(0))
+        return Scan(float(stream.seconds[i]), np.empty((0, 3)), np.empty(0))
     middle = 0.5 * (float(offset.min()) + float(offset.max()))
     chosen = spread(len(offset), MOST_MAPPED, i)
     points = xyz[chosen].astype(np.float64)
     size2 = (points**2).sum(axis=1)
     good = np.isfinite(size2) & (size2 > NEAREST_M**2)
-    return _Scan(float(stream.seconds[i]) + middle, points[good], offset[chosen][good].astype(np.float64) - middle)
+    return Scan(float(stream.seconds[i]) + middle, points[good], offset[chosen][good].astype(np.float64) - middle)
 
 
 def spread(n: int, most: int, begin: int) -> np.ndarray:
@@ -111,7 +116,7 @@ def spread(n: int, most: int, begin: int) -> np.ndarray:
     return (begin + np.arange(min(n, most)) * step) % n
 
 
-def _turned(scan: _Scan, turning: Turning) -> _Scan:
+def _turned(scan: Scan, turning: Turning) -> Scan:
     """The scan as seen by a LiDAR that stands as in its middle."""
     which = np.floor(scan.tau / TURN_STEP_S).astype(np.int64)
     low = which.min()
@@ -119,7 +124,7 @@ def _turned(scan: _Scan, turning: Turning) -> _Scan:
     R = turning(np.append(steps, scan.middle))
     xyz = scan.xyz.copy()
     turn_back(xyz, which - low, np.ascontiguousarray(R[-1].T @ R[:-1]))
-    return _Scan(scan.middle, xyz, scan.tau)
+    return Scan(scan.middle, xyz, scan.tau)
 
 
 @dataclass(frozen=True)
@@ -139,7 +144,7 @@ class _Known:
         return cls(back @ R, None if way is None else np.einsum("nij,nj->ni", back, way))
 
 
-def _follow(scans: list[_Scan], known: _Known, edge_m: float) -> tuple[list[ScanPose], np.ndarray]:
+def _follow(scans: list[Scan], known: _Known, edge_m: float) -> tuple[list[ScanPose], np.ndarray]:
     ok = np.ones(len(scans), dtype=bool)
 
     def register(k: int, before: ScanPose, scale: float) -> ScanPose:
@@ -210,7 +215,7 @@ class _Expected:
         g += W.T @ (r / sigma * POINT_SIGMA_M)
 
 
-def _register(voxels: VoxelMap, scan: _Scan, expected: _Expected, last: float) -> tuple[ScanPose, bool]:
+def _register(voxels: VoxelMap, scan: Scan, expected: _Expected, last: float) -> tuple[ScanPose, bool]:
     """The scan's pose, and whether it fits the map."""
     xyz, tau = scan.xyz[:MOST_MATCHED], scan.tau[:MOST_MATCHED]
     H, g, pose, near = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS), expected.pose, 0
