@@ -13,13 +13,14 @@ from icalib.observability import observe
 SENSORS = ("cam0", "cam1", "cam2", "lidar0", "wheel0")
 
 
-def shared(worth: float) -> Any:
+def shared(worth: float, converged: bool = True) -> Any:
     """Five sensors whose turns against each other are known to 0.1 tolerances, and a sixth column to 0.1: open is the
     turn of all five together, of which the guess is worth so many tolerances."""
     n = len(SENSORS)
     held = np.append(np.ones(n), 0.0)[:, None] / np.sqrt(n)
     spread = np.sqrt(0.01 + np.append(np.full(n, worth**2 / n), 0.0))
-    return cast(Any, SimpleNamespace(held=held, spread=spread, covariance=np.diag(spread**2)))
+    estimate = SimpleNamespace(outcome=SimpleNamespace(converged=converged))
+    return cast(Any, SimpleNamespace(held=held, spread=spread, covariance=np.diag(spread**2), estimate=estimate))
 
 
 @pytest.mark.parametrize(("worth", "verdict"), [(50.0, "undetermined"), (1.0, "determined"), (10.0, "weak")])
@@ -30,3 +31,8 @@ def test_what_five_share_is_as_open_as_the_guess_is_wide(worth: float, verdict: 
     assert found.verdicts == (verdict,) * len(SENSORS) + ("determined",)
     (sentence,) = found.undetermined
     assert all(s in sentence for s in SENSORS[:4]) and "turn the rig" in sentence
+
+
+def test_an_answer_that_did_not_converge_determines_nothing():
+    names = tuple(f"{s}.rotation.z" for s in SENSORS) + ("cam0.time_offset.time_offset",)
+    assert observe(shared(1.0, converged=False), names).verdicts == ("undetermined",) * 6

@@ -45,13 +45,13 @@ class Observability:
 
 
 def observe(found: Determined, names: tuple[str, ...], wheels: Collection[str] = ()) -> Observability:
-    """Verdicts by what the data alone say: determined where they know a parameter to a tolerance. `names` (B,) as in
-    "cam0.translation.x"; `wheels`: which sensors are wheels."""
+    """Verdicts by what the data alone say: determined where they know a parameter to a tolerance, nothing where the
+    solver did not converge. `names` (B,) as in "cam0.translation.x"; `wheels`: which sensors are wheels."""
     directions = sparse_basis(found.held)
     share = (directions**2).sum(axis=1)
     verdicts: list[Verdict] = []
     for part, spread in zip(share, found.spread, strict=True):
-        is_open = part > SHARE or spread > SPREAD
+        is_open = part > SHARE or spread > SPREAD or not found.estimate.outcome.converged
         verdicts.append("undetermined" if is_open else "determined" if spread <= 1.0 else "weak")
     sentences = tuple(_sentence(u, names, wheels) for u in directions.T)
     return Observability(found.covariance, tuple(verdicts), sentences)

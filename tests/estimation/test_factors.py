@@ -34,7 +34,7 @@ from icalib.measurements import PoseStream
 @dataclass(frozen=True)
 class Sample:
     """factor: its name in the source. accumulate(state, piece, sums) -> cost; residual(state) -> r (n,);
-    weights(state) -> y (n,), W (n, n)."""
+    weights(state) -> y (n,), W (n, n); potential(state): what the cost has beside the residuals."""
 
     factor: str
     setup: object
@@ -43,6 +43,7 @@ class Sample:
     residual: Callable[[State], np.ndarray]
     weights: Callable[[State], tuple[np.ndarray, np.ndarray]]
     tolerance: float = 1e-6  # of the gradient, where weights are found by iteration
+    potential: Callable[[State], float] = lambda at: 0.0
 
 
 def white(residual):
@@ -217,7 +218,11 @@ def lidar_sample(room, room_of, scheme="inertial", loss="none", beam=0.0, imu_fr
     def accumulate(at, piece, sums):
         return factor.accumulate(at, piece, factor.output(), sums)
 
-    return Sample("LidarFactor", setup, state, accumulate, residual, white(residual))
+    def turned(at):
+        pieces, r = make_pieces(len(at.seconds), setup.layout.size), residual(at)
+        return sum(accumulate(at, p, False) for p in pieces) - 0.5 * float(r @ r)
+
+    return Sample("LidarFactor", setup, state, accumulate, residual, white(residual), potential=turned)
 
 
 def prior_sample(unlike, setup_of, sensor, name):
@@ -500,13 +505,15 @@ def test_sums_are_those_of_numeric_derivatives(sample, dense):
     _, H, g = sums_of(sample, dense)
     y, W = sample.weights(sample.state)
     scale, h = scales(sample), 1e-3
-    J = np.empty((len(y), len(g)))
+    J, slope = np.empty((len(y), len(g))), np.empty(len(g))
     for n in range(len(g)):
         d = np.zeros(len(g))
         d[n] = h * scale[n]
-        J[:, n] = (sample.residual(moved(sample, d)) - sample.residual(moved(sample, -d))) / (2 * h)
+        up, down = moved(sample, d), moved(sample, -d)
+        J[:, n] = (sample.residual(up) - sample.residual(down)) / (2 * h)
+        slope[n] = (sample.potential(up) - sample.potential(down)) / (2 * h)
     H, g = H * np.outer(scale, scale), g * scale
-    numeric_H, numeric_g = J.T @ W @ J, J.T @ y
+    numeric_H, numeric_g = J.T @ W @ J, J.T @ y + slope
     size = np.sqrt(np.maximum(np.diag(numeric_H), 1e-9 * np.diag(numeric_H).max()))
     assert np.abs(numeric_g).max() > 0
     np.testing.assert_allclose(H / np.outer(size, size), numeric_H / np.outer(size, size), rtol=0, atol=2e-6)

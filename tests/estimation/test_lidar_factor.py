@@ -125,7 +125,7 @@ def test_sums_are_those_of_the_points(sparse_room, room_of, dense, bin_s, loss, 
     np.testing.assert_allclose(found, expected, rtol=0, atol=bound)
     np.testing.assert_allclose(found[o:, o:], expected[o:, o:], rtol=0, atol=0.1 * bound)
     # Half of r^2 / sigma^2 by the pose: sigma turns with the incidence.
-    share = np.minimum(t, 5.0) ** 2 * root**2 * beam**2 * point.incidence / sigma**2
+    share = np.where(t < 4.0, t**2, 0.0) * root**2 * beam**2 * point.incidence / sigma**2
     slope = (J.T @ r - point.J_incidence.T @ share) / size
     np.testing.assert_allclose(g / size, slope, rtol=0, atol=bound * np.linalg.norm(r))
     np.testing.assert_allclose((g / size)[o:], slope[o:], rtol=0, atol=0.1 * bound * np.linalg.norm(r))

@@ -193,6 +193,8 @@ class FeatureFactor:
                 X, view.seen, base, view.motion, seeing, weighing, noise is not None, given, into, mine,
                 out.residual[i], out.root[i],
             )  # fmt: skip
+        if noise is None and sums and piece.features is not None:
+            piece.border[-1, -1] += _held_back(features)
         return total
 
     def _within(self, piece: Piece) -> tuple[slice, slice]:
@@ -297,6 +299,13 @@ class FeatureFactor:
             i = self.tracks.image[own]
             out[own] = np.einsum("nij,nj->ni", view.motion.R_cam_world[i], points[own] - view.motion.p_world_cam[i])
         return out
+
+
+def _held_back(features: FeatureSums) -> float:
+    """Twice what the points would still take off the cost if they could: those that an image's edge stops. It pulls at
+    poses and calibration as it should, but is no gain of a step."""
+    gradient = features.side[:, :, -1:]
+    return float((gradient * np.linalg.solve(features.own, gradient)).sum()) if len(gradient) else 0.0
 
 
 def _in_camera(view: View, points: np.ndarray, first: int) -> np.ndarray:

@@ -241,18 +241,16 @@ def _gram(rows, G):
 
 
 @njit(cache=True, nogil=True)
-def _add_feature(A, pair, t, own_side, chained, direct, used, features):
+def _add_feature(A, pair, t, own_side, chained, direct, features):
     """One observation's rows A into the sums of its feature; own_side (6, c): camera pose by the border, its columns
-    `chained` (c,). A feature's own gradient comes from noise (`used`) alone: its point is where the cost is least, or
-    where an image's edge stops it, and what it would gain beyond is no gain of a step."""
+    `chained` (c,)."""
     D, n_b, n_d, side = len(A) - 1, features.side.shape[2] - 1, len(direct), features.side[t]
     block = features.block[pair]
     for a in range(3):
         f0, f1 = A[D - 3 + a, 0], A[D - 3 + a, 1]
         for k in range(3):
             features.own[t, a, k] += f0 * A[D - 3 + k, 0] + f1 * A[D - 3 + k, 1]
-        if used:
-            side[a, n_b] += f0 * A[D, 0] + f1 * A[D, 1]
+        side[a, n_b] += f0 * A[D, 0] + f1 * A[D, 1]
         for q in range(n_d):
             if direct[q] >= 0:
                 side[a, direct[q]] += f0 * A[6 + q, 0] + f1 * A[6 + q, 1]
@@ -303,7 +301,7 @@ def accumulate(X, seen, base, motion, seeing, weighing, used, given, sums, featu
                     rows[m + r, a] = A[a, r]
                 rows[m + r, 6 + n_d] = A[D, r]
             m += 2
-            _add_feature(A, seen.pair[n] - base.pair, t, Tc, motion.columns[i], seeing.columns, used, features)
+            _add_feature(A, seen.pair[n] - base.pair, t, Tc, motion.columns[i], seeing.columns, features)
         if wanted:
             _gram(rows[:m], G)
             add_image(seen.node[i], G, Tn, Tm, Tc, motion.columns[i], seeing.columns, sums)

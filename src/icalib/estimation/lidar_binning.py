@@ -34,7 +34,7 @@ STEP_S = 1e-3  # of a longer bin
 POINTS_AT_A_TIME = 150_000  # by one thread: what a chunk needs beside the cloud stays small
 MOMENTS = 10  # of (1, x, y, z), lower triangle row by row
 SUMS = MOMENTS + 3  # and the slant
-MOST_TURNED = 25.0  # of a point's chi^2: what is beyond comes of a poor state, where no noise has a say
+NO_NOISE = 16.0  # a point's chi^2 beyond this comes of a poor state, or of an outlier, and has no part in the slant
 LOSSES: dict[Loss, int] = {"none": 0, "huber": 1, "cauchy": 2}
 NO_PIVOT = 1e-13  # of a moment: below this a pivot is rounding
 
@@ -165,7 +165,7 @@ def _add_point(x, y, z, s, seen, weights, sums):
         if weights.loss:
             robust = weight(weights.loss, weights.scale, chi2)[0]
             w *= robust
-        turns = robust * min(chi2, MOST_TURNED) * weights.along * across * over
+        turns = robust * chi2 * weights.along * across * over if chi2 < NO_NOISE else 0.0
         sums[s, 10] -= turns * x
         sums[s, 11] -= turns * y
         sums[s, 12] -= turns * z
