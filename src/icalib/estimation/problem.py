@@ -16,7 +16,7 @@ from icalib.estimation.arrowhead import (
     marginalise,
     marginalise_in_segments,
 )
-from icalib.estimation.corner_factor import CornerFactor, CornerOutput, CornerWhite
+from icalib.estimation.corner_factor import CornerFactor, CornerOutput
 from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput
 from icalib.estimation.gauge import hold_frame
 from icalib.estimation.imu_factor import ROWS
@@ -61,17 +61,6 @@ class Residuals:
     corners: tuple[CornerOutput, ...]
     features: FeatureOutput | None = None
     sensors: tuple[Whitened, ...] = ()  # but for the cameras
-
-
-@dataclass(frozen=True)
-class WhiteNoise:
-    """A draw in place of all whitened residuals: of the chain (K - 1, 15), of corners by camera, of features (N, 2) by
-    camera, of other sensors (n, m) by sensor."""
-
-    imu: np.ndarray
-    corners: tuple[CornerWhite, ...]
-    features: tuple[np.ndarray, ...]
-    sensors: tuple[np.ndarray, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -181,29 +170,6 @@ class Problem:
         for sensor, rows in zip(self.sensors, out.sensors, strict=True):
             cost += sensor.accumulate(state, piece, rows, sums, curved)
         return cost
-
-    def white_noise(self, rng: np.random.Generator) -> WhiteNoise:
-        """A draw in place of all residuals but those of priors."""
-        imu = rng.standard_normal((self.n_nodes - 1, ROWS))
-        corners = tuple(c.white_noise(rng) for c in self.cameras)
-        streams = () if self.features is None else self.features.streams
-        features = tuple(rng.standard_normal(s.uv.shape) for s in streams)
-        sensors = tuple(rng.standard_normal(s.output().residual.shape) for s in self.sensors)
-        return WhiteNoise(imu, corners, features, sensors)
-
-    def add_noise(self, state: State, piece: Piece, noise: WhiteNoise) -> None:
-        """Fills `piece` with what `noise` gives in place of the residuals: J^T J and J^T e, priors as if they were met.
-
-        What the piece held before is gone."""
-        piece.clear()
-        self.chain.accumulate(state, piece, noise.imu, noise=noise.imu)
-        for camera, own in zip(self.cameras, noise.corners, strict=True):
-            camera.accumulate(state, piece, None, noise=own)
-        if self.features is not None:
-            self.features.accumulate(state, piece, self.features.output(), noise=noise.features)
-        for sensor, own in zip(self.sensors, noise.sensors, strict=True):
-            sensor.accumulate(state, piece, sensor.output(), noise=own)
-        self.add_prior_information(piece, state)
 
     def add_bias_prior(self, state: State, piece: Piece, sums: bool = True) -> float:
         """Adds the broad prior on the biases of recordings' first nodes, about those that the pass started from."""

@@ -75,8 +75,3 @@ class SensorFactor(Protocol):
 def chi2(out: Whitened, rows: slice) -> float:
     """Of some columns of the rows, robust weights as they are."""
     return float(((out.residual[:, rows] * out.root[:, rows]) ** 2).sum())
-
-
-def spent(out: Whitened, noise: np.ndarray, slope: np.ndarray, rows: slice) -> float:
-    """e^T J x of white noise e (n, m), slope (n, m) the derivative of the whitened residuals along x."""
-    return float((noise[:, rows] * slope[:, rows] * out.root[:, rows]).sum())
