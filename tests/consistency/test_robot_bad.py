@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -103,8 +103,9 @@ def open_field(x: LidarStream) -> LidarStream:
     return replace(x, xyz=np.random.default_rng(0).normal(scale=15.0, size=x.xyz.shape).astype(np.float32))
 
 
-def one_wall(x: LidarStream) -> LidarStream:
-    own = x.plane == 1
+def seeing(faces: list[int], x: LidarStream) -> LidarStream:
+    """Nothing but some faces of the room: 0 the floor, 1 the ceiling, 2 and 3, 4 and 5 walls that face each other."""
+    own = np.isin(x.plane, faces)
     start = np.concatenate([[0], np.cumsum(own)])[x.start].astype(np.int64)
     return LidarStream(x.name, x.stamps_ns, start, x.offset_s[own], x.xyz[own], x.plane[own])
 
@@ -119,7 +120,10 @@ def milliseconds(x: LidarStream) -> LidarStream:
 
 SEEN: list[tuple[Damage, str]] = [
     (open_field, "lidar0.*too few flat surfaces"),
-    (one_wall, "lidar0"),
+    (partial(seeing, [2]), "surfaces that lidar0 sees face one direction only"),
+    (partial(seeing, [0]), "surfaces that lidar0 sees face one direction only"),
+    (partial(seeing, [2, 3]), "surfaces that lidar0 sees face one direction only"),
+    (partial(seeing, [0, 2]), "surfaces that lidar0 sees face two directions only, as in a corridor"),
     (mirrored, "lidar0 turns as imu0 does, but moves the other way"),
     (milliseconds, "lidar0.*point times may be wrong"),
 ]
@@ -130,6 +134,24 @@ def test_clouds_that_cannot_be(drive, damage: Damage, words: str):
     simulation = drive("3d", 12.0, "l")
     with pytest.raises(CalibrationError, match=words):
         calibrate_measurements(rig_for(simulation.scenario), with_scans(simulation.measurements, damage))
+
+
+@pytest.mark.parametrize("faces", [[0], [2, 3]])
+def test_too_few_surfaces_with_a_guess(drive, faces: list[int]):
+    simulation = drive("3d", 12.0, "l")
+    broken = with_scans(simulation.measurements, partial(seeing, faces))
+    assert "surfaces that lidar0 sees face" in refusal(guessed(simulation), broken)
+
+
+@pytest.mark.parametrize(("seconds", "faces"), [(16.0, [0, 2, 3]), (12.0, [0, 2])])
+def test_a_corridor_is_told(drive, seconds: float, faces: list[int]):
+    """One or two walls and a floor: what the motion along them leaves open is the world's, not the LiDAR's."""
+    simulation = drive("3d", seconds, "l")
+    corridor = with_scans(simulation.measurements, partial(seeing, faces))
+    result = calibrate_measurements(guessed(simulation), corridor)
+    assert any("planes that lidar0 saw face two directions only, as in a corridor" in w for w in result.warnings)
+    off = result.group("lidar0", "translation").value - simulation.truth.T_imu_lidar["lidar0"][:3, 3]
+    assert (np.abs(off) < 4.0 * result.group("lidar0", "translation").std).all()
 
 
 def calibrated(simulation: Simulation, damage: Damage) -> Calibration:
@@ -144,7 +166,7 @@ def test_points_without_numbers_and_at_zero_are_left_out(drive):
 
     simulation = drive("3d", 12.0, "l")
     result = calibrated(simulation, damage)
-    assert result.converged
+    assert result.converged and not any("directions only" in w for w in result.warnings)
     off = result.group("lidar0", "translation").value - simulation.truth.T_imu_lidar["lidar0"][:3, 3]
     assert np.linalg.norm(off) < 5e-3
 

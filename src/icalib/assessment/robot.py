@@ -17,6 +17,7 @@ from icalib.estimation.pose_factor import AbsolutePoseFactor, PoseNoise, Relativ
 from icalib.estimation.sensors import Whitened
 from icalib.estimation.state import State
 from icalib.estimation.wheel_factor import IncrementFactor, RelativePoseFactor
+from icalib.first_guess.lidar_sight import count_of, facing
 from icalib.geometry.planes import plane_of
 from icalib.measurements import LidarStream
 from icalib.rig import PoseSensor, Rig, Wheels
@@ -218,7 +219,8 @@ def neighbours(rows: np.ndarray) -> float:
 
 
 def lidar_warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
-    """Where few points lie on planes, or stamps are those of the wrong end of a scan."""
+    """Where few points lie on planes, planes face too few directions, or stamps are those of a scan's other end."""
+    yield from _sight_warnings(inputs, found)
     for lidar, stream in zip(inputs.rig.lidars, inputs.measurements.lidars, strict=True):
         share = _used(found, lidar.name) / max(len(stream.xyz), 1)
         if share < FEW_ON_PLANES:
@@ -235,6 +237,20 @@ def lidar_warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
                 "be those of the end of a scan while times of points count from its start, or the other way; see "
                 "point_time."
             )
+
+
+def _sight_warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
+    """Where LiDARs alone show the motion, and not all of it."""
+    if inputs.rig.cameras or inputs.rig.poses:
+        return
+    normals = np.array([found.outcome.state.values[key][:3] for key in inputs.clouds.keys])
+    if count_of(facing(normals, inputs.clouds.points)) < 3:
+        names = " and ".join(x.name for x in inputs.rig.lidars)
+        yield (
+            f"the planes that {names} saw face two directions only, as in a corridor: how it moved along both the IMU "
+            "alone says. Do not trust the result if the solver did not converge; better record where walls and floor "
+            "face three directions."
+        )
 
 
 def robot_warnings(rig: Rig, judged: list[SensorFit]) -> Iterator[str]:

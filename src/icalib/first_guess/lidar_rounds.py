@@ -39,6 +39,7 @@ from icalib.first_guess.by_recording import (
 )
 from icalib.first_guess.lidar import Held, lidar_and_motion, lidar_on_motion
 from icalib.first_guess.lidar_planes import ROUNDS, Association, associate, round_search
+from icalib.first_guess.lidar_sight import naming_sight
 from icalib.geometry.planes import plane_of
 from icalib.rig import Camera, Lidar, PoseSensor, Wheels
 
@@ -66,13 +67,13 @@ def state_from_lidar(inputs: Inputs) -> State:
     """
     recordings = [alone(inputs, k) for k in range(len(inputs.parts))]
     best, name = most_points(inputs, 0), inputs.rig.lidars[0].name
-    with naming_recording(inputs, best):
+    with naming_recording(inputs, best), naming_sight(recordings[best].measurements.lidars[:1]):
         states = {best: _state_of_one(recordings[best])}
     values, offset = dict(states[best].values), float(states[best].values[name, "time_offset"][0])
     for k, own in enumerate(recordings):
         if k != best:
             there = other_clocks(offset, name, recordings[best], own)
-            with naming_recording(inputs, k):
+            with naming_recording(inputs, k), naming_sight(own.measurements.lidars[:1]):
                 states[k] = _state_of_one(own, Held(values[name, "rotation"], values[name, "translation"], there))
     values[name, "time_offset"] = np.array([other_clocks(offset, name, recordings[best], inputs)])
     return one_after_another(inputs, [states[k] for k in range(len(recordings))], values)
@@ -120,7 +121,8 @@ def with_lidars(inputs: Inputs, state: State) -> tuple[Inputs, State]:
         state = replace(state, values=_without_planes(state) | dict(zip(clouds.keys, planes, strict=True)))
         shares.append(clouds.points.sum() / max(sum(len(p) for p in clouds.plane), 1))
         if k < ROUNDS - 1:
-            state = first_pass(inputs, state)
+            with naming_sight(inputs.measurements.lidars):
+                state = first_pass(inputs, state)
     check_shares(shares, " and ".join(s.name for s in inputs.measurements.lidars))
     return inputs, state
 
@@ -183,8 +185,9 @@ def lidar_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
             k = most_points(inputs, i)
             own, motion = alone(inputs, k), motion_alone(inputs, k, state)
             assert own.imu is not None
-            with naming_recording(inputs, k):
-                found = lidar_on_motion(own.imu, own.measurements.lidars[i], motion, held_of(own, lidar))
+            stream = own.measurements.lidars[i]
+            with naming_recording(inputs, k), naming_sight([stream]):
+                found = lidar_on_motion(own.imu, stream, motion, held_of(own, lidar))
             found = replace(found, offset=other_clocks(found.offset, lidar.name, own, inputs))
             known = found.values(lidar.name) | known
         out |= known
