@@ -200,6 +200,14 @@ def test_stamps_of_the_end_of_scans_are_told(drive):
     assert any("about the period of its scans" in w and "point_time" in w for w in result.warnings)
 
 
+@pytest.mark.parametrize(("factor", "words"), [(0.5, "too short"), (2.0, "too long"), (1.0, "")])
+def test_times_of_points_that_are_stretched_are_told(drive, factor: float, words: str):
+    """The time between scans does not tell: some LiDARs look to one side only, others overlap."""
+    result = calibrated(drive("3d", 12.0, "l"), lambda x: replace(x, offset_s=x.offset_s * np.float32(factor)))
+    said = [w for w in result.warnings if "times of points within a scan" in w]
+    assert len(said) == bool(words) and all(words in w for w in said)
+
+
 def test_points_in_the_reverse_order_are_told(drive):
     """Most of them lie on no plane; nothing in the numbers alone would say so."""
 
