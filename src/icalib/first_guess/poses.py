@@ -17,6 +17,7 @@ from icalib.estimation.imu_data import ImuData
 from icalib.estimation.pose_factor import FRAME, frame_of
 from icalib.estimation.robot import MOUNT
 from icalib.estimation.state import Key, State
+from icalib.first_guess.by_recording import alone, naming_recording, one_after_another, other_clocks
 from icalib.first_guess.clocks import LEAST_CORRELATION, LONGEST_STEP_S, Alignment, CameraRates
 from icalib.first_guess.gyro import GyroRotation
 from icalib.first_guess.lever_arm import SIZE_TOLERANCE, size_of
@@ -68,19 +69,32 @@ def pose_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
 
 
 def state_from_poses(inputs: Inputs) -> State:
-    """Where the solver starts where neither camera nor LiDAR shows the motion: the first pose sensor and the IMU do.
+    """Where the solver starts where neither camera nor LiDAR shows the motion: the first pose sensor and the IMU do. Of
+    several recordings the one with most poses says how the sensor stands.
 
-    Raises EstimationError where they do not, or there are several recordings.
+    Raises EstimationError where they do not.
     """
+    name = inputs.rig.poses[0].name
+    recordings = [alone(inputs, k) for k in range(len(inputs.parts))]
+    best = int(np.argmax([len(own.measurements.poses[0].stamps_ns) for own in recordings]))
+    with naming_recording(inputs, best):
+        states = {best: _state_of_one(recordings[best], None)}
+    values, offset = dict(states[best].values), float(states[best].values[name, "time_offset"][0])
+    for k, own in enumerate(recordings):
+        if k != best:
+            there = other_clocks(offset, name, recordings[best], own)
+            with naming_recording(inputs, k):
+                states[k] = _state_of_one(own, Held(values[name, "rotation"], values[name, "translation"], there))
+    values[name, "time_offset"] = np.array([other_clocks(offset, name, recordings[best], inputs)])
+    return one_after_another(inputs, [states[k] for k in range(len(recordings))], values)
+
+
+def _state_of_one(inputs: Inputs, held: Held | None) -> State:
+    """Of one recording; `held`: how the sensor stands, where another has shown it."""
     assert inputs.imu is not None
-    sensor, stream = inputs.rig.poses[0], inputs.measurements.poses[0]
-    if len(inputs.parts) > 1:
-        raise EstimationError(
-            f"several recordings cannot be joined where {sensor.name} alone shows the motion; calibrate each, or add "
-            "a camera or a LiDAR."
-        )
-    imu, gravity, held = inputs.imu, inputs.rig.gravity, held_of(inputs, sensor)
-    found = placed(stream, lambda x: _with_motion(imu, x, gravity, held))
+    sensor, stream, imu, gravity = inputs.rig.poses[0], inputs.measurements.poses[0], inputs.imu, inputs.rig.gravity
+    known = held or held_of(inputs, sensor)
+    found = placed(stream, lambda x: _with_motion(imu, x, gravity, known))
     own = found.guess.values(sensor.name) | given(inputs, sensor, NAMES)
     values = start_values(inputs, own)
     hosts = {(x.name, "time_offset"): values[sensor.name, "time_offset"] for x in inputs.rig.poses}
