@@ -31,7 +31,7 @@ def main() -> None:
     parser.add_argument("--motion", choices=("3d", "ramp", "planar"), default="3d")
     parser.add_argument("--save", type=Path, help="a file (npz) for the scans, for other programs")
     given = parser.parse_args()
-    calibrate_measurements(*_recording(_simulated(given.motion, COMPILING_S, AZIMUTH_STEPS // 8)))
+    calibrate_measurements(*_recording(_simulated(given.motion, COMPILING_S, AZIMUTH_STEPS // 4)))
     simulation = _simulated(given.motion, given.seconds, AZIMUTH_STEPS)
     rig, recording = _recording(simulation)
     (stream,) = recording.lidars

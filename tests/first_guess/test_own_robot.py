@@ -67,6 +67,17 @@ def test_that_the_floor_is_seen_from_afar_is_what_saves_it(robot, monkeypatch):
     assert own_points(stream) is not None
 
 
+def test_of_a_long_recording_its_middle_tells(robot, monkeypatch):
+    """And the robot is found in all of it."""
+    monkeypatch.setattr(own_robot, "MOST_SCANS", 70)
+    whole = robot(16.0, 1, {"azimuth_steps": 300}, example="table2-planar").streams[0]
+    assert len(whole.stamps_ns) > 1.5 * own_robot.MOST_SCANS
+    stream, hit = with_panel(whole, *PANELS["panel ahead"])
+    own = own_points(stream)
+    assert own is not None and own[hit].mean() > 0.99 and own[~hit].mean() < 0.01
+    assert own_points(raw(whole)) is None
+
+
 def test_what_is_said_and_what_stays(robot):
     r = robot(16.0, 1, {"azimuth_steps": 300}, example="table2-planar")
     stream, hit = with_panel(r.streams[0], *PANELS["panel ahead"])

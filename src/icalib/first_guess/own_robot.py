@@ -22,6 +22,7 @@ VOXEL_M = 0.1
 SIDE = int(2 * REACH_M / VOXEL_M)
 PLACES = (SIDE + 2) ** 3  # with a margin all round
 SCANS_TOGETHER = 3  # so that each voxel of the robot has a point
+MOST_SCANS = 600  # a minute at 10 Hz
 MOST_GROUPS, FEWEST_GROUPS = 200, 10
 STEADY = 0.8  # of the groups of scans have a point in a voxel of the robot
 APART_M, APART_RAD = 0.2, 0.2  # between groups of scans that tell
@@ -46,22 +47,39 @@ def without_own_robot(recording: Measurements) -> Measurements:
 
 def own_points(stream: LidarStream) -> np.ndarray | None:
     """(N,) bool: points on the LiDAR's own robot; None where there are none, or too few to do harm."""
+    robot = _robot(_middle(stream))
+    if robot is None:
+        return None
+    near, own = _Near.of(stream), np.zeros(len(stream.xyz), dtype=bool)
+    own[near.point[robot[near.place]]] = True
+    return own if np.count_nonzero(own) >= LEAST_SHARE * len(own) else None
+
+
+def _middle(stream: LidarStream) -> LidarStream:
+    """The scans in the middle of a recording, as many as it takes to tell."""
+    first = max(0, len(stream.stamps_ns) - MOST_SCANS) // 2
+    scans = slice(first, first + MOST_SCANS)
+    start = stream.start[first : first + MOST_SCANS + 1]
+    points = slice(int(start[0]), int(start[-1]))
+    columns = (getattr(stream, name)[points] for name in ("offset_s", "xyz", "plane"))
+    return LidarStream(stream.name, stream.stamps_ns[scans], start - start[0], *columns)
+
+
+def _robot(stream: LidarStream) -> np.ndarray | None:
+    """(PLACES,) bool: voxels of the robot; None where there are none, or nothing shows them."""
     near = _Near.of(stream)
     steady = near.steady(np.arange(near.groups))
-    at = near.place[steady[near.place]]
+    at = near.point[steady[near.place]]
     if len(at) < LEAST_SHARE * len(stream.xyz):
         return None
-    path = _path_without(stream, near.point[steady[near.place]])
+    path = _path_without(stream, at)
     if path is None:
         return None
     apart = _apart(path, _scan_of(path, stream, near.first + SCANS_TOGETHER // 2))
     if len(apart) < FEWEST_GROUPS:
         return None
     steady = near.steady(apart)
-    steady &= ~_seen_from_afar(stream, path, near, apart, steady)
-    own = np.zeros(len(stream.xyz), dtype=bool)
-    own[near.point[_grown(steady)[near.place]]] = True
-    return own if np.count_nonzero(own) >= LEAST_SHARE * len(own) else None
+    return _grown(steady & ~_seen_from_afar(stream, path, near, apart, steady))
 
 
 @dataclass(frozen=True)
