@@ -96,13 +96,15 @@ def _joined(recordings: Sequence[Measurements], shifts: list[int]) -> Measuremen
         gyro, accel = np.concatenate([i.gyro for i, _ in imus]), np.concatenate([i.accel for i, _ in imus])
         imu = ImuStream(imus[0][0].name, stamps, gyro, accel)
     cameras = (join_corners([(m.cameras[k], shift) for m, shift in shifted]) for k in range(len(recordings[0].cameras)))
-    notes = tuple(f"{m.name}: {note}" for m in recordings for note in m.notes)
+    notes, warnings = (
+        tuple(f"{m.name}: {words}" for m in recordings for words in getattr(m, kind)) for kind in ("notes", "warnings")
+    )
     lidars = (join_scans([(m.lidars[k], shift) for m, shift in shifted]) for k in range(len(recordings[0].lidars)))
     wheels = (join_wheels([(m.wheels[k], shift) for m, shift in shifted]) for k in range(len(recordings[0].wheels)))
     poses = (join_poses([(m.poses[k], shift) for m, shift in shifted]) for k in range(len(recordings[0].poses)))
     return Measurements(
         imu, tuple(cameras), notes, tracks=_joined_tracks(shifted), lidars=tuple(lidars), wheels=tuple(wheels),
-        poses=tuple(poses),
+        poses=tuple(poses), warnings=warnings,
     )  # fmt: skip
 
 

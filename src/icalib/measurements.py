@@ -269,6 +269,7 @@ class Measurements:
     lidars: tuple[LidarStream, ...] = ()
     wheels: tuple[WheelStream | WheelPoses, ...] = ()
     poses: tuple[PoseStream, ...] = ()
+    warnings: tuple[str, ...] = ()  # what was found to be wrong with them, one sentence each
 
     @property
     def origin_ns(self) -> int:

@@ -17,6 +17,7 @@ from icalib.estimation.determination import determine
 from icalib.estimation.pages import give_back, keep_apart
 from icalib.estimation.problem import Problem
 from icalib.estimation.solver import Visit
+from icalib.first_guess.lidar_sight import naming_sight
 from icalib.first_guess.start import start
 from icalib.measurements import CornerStream, Measurements
 from icalib.provenance import provenance
@@ -108,7 +109,8 @@ def _calibrate(
         if on_visit is not None:
             on_visit(visited(inputs, stage, problem, visit))
 
-    found = determine(inputs, state, lambda name, step: steps.note(name), tell, guess)
+    with naming_sight(() if rig.cameras else inputs.measurements.lidars):
+        found = determine(inputs, state, lambda name, step: steps.note(name), tell, guess)
     clock.lap("solving")
     progress("judging the result", 0.9)
     result = assess(inputs, found)

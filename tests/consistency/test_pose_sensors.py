@@ -154,6 +154,22 @@ def test_two_recordings_share_what_is_calibrated():
         assert (np.abs(e) < 4.0 * std).all() and (std < one.group("mocap0", block).std).all(), block
 
 
+@pytest.mark.parametrize("kind", ["absolute", "relative"])
+def test_two_recordings_without_any_other_sensor(kind):
+    """The shorter one first; its frame stands elsewhere, and its clocks began at another time."""
+    scenario = alone(kind)
+    short = replace(scenario, duration_s=8.0)
+    if kind == "absolute":
+        short = replace(short, poses=(replace(short.poses[0], T_world_frame=pose([0.0, -0.3, 1.0], [0, 1, 2])),))
+    sims = [simulate(short, 3), simulate(scenario, 4)]
+    both = calibrate_measurements(rig_for(scenario), [s.measurements for s in sims])
+    one = calibrate_measurements(rig_for(scenario), sims[1].measurements)
+    assert both.converged and len(both.recordings) == 2
+    for block, e in zip(BLOCKS, errors(both, sims[1].truth, "mocap0"), strict=True):
+        std, own = (c.group("mocap0", block).std for c in (both, one))
+        assert (np.abs(e) < 4.0 * std).all() and (std < 1.05 * own).all(), block
+
+
 def cut(sim, stream: PoseStream):
     return replace(sim.measurements, poses=(stream,))
 
@@ -177,5 +193,6 @@ def test_what_cannot_be_calibrated_is_said():
     in_g = replace(sim.measurements.imu, accel=sim.measurements.imu.accel / 9.81)
     with pytest.raises(EstimationError, match=r"show gravity of [\d.]* m/s\^2 instead of 9.81: check that the acc"):
         calibrate_measurements(rig, replace(sim.measurements, imu=in_g))
-    with pytest.raises(EstimationError, match="several recordings cannot be joined where mocap0 alone"):
-        calibrate_measurements(rig, [sim.measurements, sim.measurements])
+    bad = replace(cut(sim, other), name="second")
+    with pytest.raises(EstimationError, match="second: .*mocap0 does not turn as imu0 does"):
+        calibrate_measurements(rig, [replace(sim.measurements, name="first"), bad])

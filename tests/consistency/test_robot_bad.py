@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
 
 from icalib.calibration import Calibration
 from icalib.errors import CalibrationError
+from icalib.geometry import so3
 from icalib.measurements import LidarStream, Measurements, WheelStream
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Rig
@@ -102,8 +103,9 @@ def open_field(x: LidarStream) -> LidarStream:
     return replace(x, xyz=np.random.default_rng(0).normal(scale=15.0, size=x.xyz.shape).astype(np.float32))
 
 
-def one_wall(x: LidarStream) -> LidarStream:
-    own = x.plane == 1
+def seeing(faces: list[int], x: LidarStream) -> LidarStream:
+    """Nothing but some faces of the room: 0 the floor, 1 the ceiling, 2 and 3, 4 and 5 walls that face each other."""
+    own = np.isin(x.plane, faces)
     start = np.concatenate([[0], np.cumsum(own)])[x.start].astype(np.int64)
     return LidarStream(x.name, x.stamps_ns, start, x.offset_s[own], x.xyz[own], x.plane[own])
 
@@ -118,7 +120,10 @@ def milliseconds(x: LidarStream) -> LidarStream:
 
 SEEN: list[tuple[Damage, str]] = [
     (open_field, "lidar0.*too few flat surfaces"),
-    (one_wall, "lidar0"),
+    (partial(seeing, [2]), "surfaces that lidar0 sees face one direction only"),
+    (partial(seeing, [0]), "surfaces that lidar0 sees face one direction only"),
+    (partial(seeing, [2, 3]), "surfaces that lidar0 sees face one direction only"),
+    (partial(seeing, [0, 2]), "surfaces that lidar0 sees face two directions only, as in a corridor"),
     (mirrored, "lidar0 turns as imu0 does, but moves the other way"),
     (milliseconds, "lidar0.*point times may be wrong"),
 ]
@@ -129,6 +134,24 @@ def test_clouds_that_cannot_be(drive, damage: Damage, words: str):
     simulation = drive("3d", 12.0, "l")
     with pytest.raises(CalibrationError, match=words):
         calibrate_measurements(rig_for(simulation.scenario), with_scans(simulation.measurements, damage))
+
+
+@pytest.mark.parametrize("faces", [[0], [2, 3]])
+def test_too_few_surfaces_with_a_guess(drive, faces: list[int]):
+    simulation = drive("3d", 12.0, "l")
+    broken = with_scans(simulation.measurements, partial(seeing, faces))
+    assert "surfaces that lidar0 sees face" in refusal(guessed(simulation), broken)
+
+
+@pytest.mark.parametrize(("seconds", "faces"), [(16.0, [0, 2, 3]), (12.0, [0, 2])])
+def test_a_corridor_is_told(drive, seconds: float, faces: list[int]):
+    """One or two walls and a floor: what the motion along them leaves open is the world's, not the LiDAR's."""
+    simulation = drive("3d", seconds, "l")
+    corridor = with_scans(simulation.measurements, partial(seeing, faces))
+    result = calibrate_measurements(guessed(simulation), corridor)
+    assert any("planes that lidar0 saw face two directions only, as in a corridor" in w for w in result.warnings)
+    off = result.group("lidar0", "translation").value - simulation.truth.T_imu_lidar["lidar0"][:3, 3]
+    assert (np.abs(off) < 4.0 * result.group("lidar0", "translation").std).all()
 
 
 def calibrated(simulation: Simulation, damage: Damage) -> Calibration:
@@ -143,9 +166,30 @@ def test_points_without_numbers_and_at_zero_are_left_out(drive):
 
     simulation = drive("3d", 12.0, "l")
     result = calibrated(simulation, damage)
-    assert result.converged
+    assert result.converged and not any("directions only" in w for w in result.warnings)
     off = result.group("lidar0", "translation").value - simulation.truth.T_imu_lidar["lidar0"][:3, 3]
     assert np.linalg.norm(off) < 5e-3
+
+
+def test_points_on_the_robot_itself_are_left_out_and_told(drive):
+    """A panel 0.9 m ahead, in a quarter of the points. Left in, they made the rotation wrong by 31 standard deviations,
+    the translation by 42."""
+
+    def damage(x: LidarStream) -> LidarStream:
+        distance = 0.9 / np.maximum(x.xyz[:, 0], 1e-6)
+        at = distance[:, None] * x.xyz
+        hit = (distance < 1.0) & (np.abs(at[:, 1]) < 1.0) & (at[:, 2] > -0.6) & (at[:, 2] < 0.3)
+        blur = 1.0 + 0.03 * np.random.default_rng(0).standard_normal(len(at)) / np.linalg.norm(at, axis=1)
+        return replace(x, xyz=np.where(hit[:, None], blur[:, None] * at, x.xyz).astype(np.float32))
+
+    simulation = drive("3d", 12.0, "l")
+    result = calibrated(simulation, damage)
+    assert result.converged and [w for w in result.warnings if "lidar0 sees its own robot" in w]
+    truth = simulation.truth.T_imu_lidar["lidar0"]
+    off = {"rotation": np.zeros(3), "translation": result.group("lidar0", "translation").value - truth[:3, 3]}
+    off["rotation"] = so3.log(np.ascontiguousarray(truth[:3, :3].T @ result.group("lidar0", "rotation").value))
+    for name, error in off.items():
+        assert (np.abs(error) < 4.0 * result.group("lidar0", name).std).all(), name
 
 
 def test_stamps_of_the_end_of_scans_are_told(drive):
@@ -154,6 +198,14 @@ def test_stamps_of_the_end_of_scans_are_told(drive):
 
     result = calibrated(drive("3d", 12.0, "l"), damage)
     assert any("about the period of its scans" in w and "point_time" in w for w in result.warnings)
+
+
+@pytest.mark.parametrize(("factor", "words"), [(0.5, "too short"), (2.0, "too long"), (1.0, "")])
+def test_times_of_points_that_are_stretched_are_told(drive, factor: float, words: str):
+    """The time between scans does not tell: some LiDARs look to one side only, others overlap."""
+    result = calibrated(drive("3d", 12.0, "l"), lambda x: replace(x, offset_s=x.offset_s * np.float32(factor)))
+    said = [w for w in result.warnings if "times of points within a scan" in w]
+    assert len(said) == bool(words) and all(words in w for w in said)
 
 
 def test_points_in_the_reverse_order_are_told(drive):

@@ -16,7 +16,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from icalib.assessment.robot import robot_warnings
-from icalib.calibration import Calibration, SensorFit, load_calibration, relative_pose, relative_poses
+from icalib.calibration import Calibration, RecordingSpan, SensorFit, load_calibration, relative_pose, relative_poses
 from icalib.console import print_result
 from icalib.errors import CalibrationError
 from icalib.outputs import write_outputs
@@ -165,6 +165,28 @@ def test_points_in_space_are_coloured_by_their_residual(robot: Calibration):
     assert np.mean(before["marker"]["color"]) > 2.5 * np.mean(after["marker"]["color"])
     np.testing.assert_allclose(after["x"], r.world[:, 0], atol=1e-3)
     assert before["marker"]["cmax"] == after["marker"]["cmax"]
+
+
+def test_each_recording_has_a_map_of_its_own(robot: Calibration, assert_drawn: Callable[[str, set[str]], None]):
+    r = robot.lidar_residuals[0]
+    middle = float(np.median(r.seconds))
+    first, second = r.seconds <= middle, r.seconds > middle
+    spans = tuple(
+        RecordingSpan(name, float(r.seconds[own].min()), float(r.seconds[own].max()), 0)
+        for name, own in (("hall", first), ("yard", second))
+    )
+    several = dataclasses.replace(robot, recordings=spans)
+    maps = robot_figures.plane_maps(several)
+    one, other = (t for t in maps["map-after"]["data"] if t["name"] == "points")
+    np.testing.assert_allclose(one["x"], r.world[first, 0], atol=1e-3)
+    np.testing.assert_allclose(other["x"], r.world[second, 0], atol=1e-3)
+    assert [t["visible"] for t in maps["map-after"]["data"]] == [True, True, False, False]
+    (menu,) = maps["map-after"]["layout"]["updatemenus"]
+    assert [b["label"] for b in menu["buttons"]] == ["hall", "yard"]
+    assert menu["buttons"][1]["args"] == ["visible", [False, False, True, True]]
+    assert [len(m["data"]) for m in maps.values()] == [2, 4]
+    assert "updatemenus" not in robot_figures.plane_maps(robot)["map-after"]["layout"]
+    assert_drawn(report_html(several), {"map-before", "map-after"})
 
 
 def test_outlines_lie_in_their_planes_about_their_points(robot: Calibration):

@@ -290,6 +290,7 @@ def _warnings(
 ):
     if not found.outcome.converged:
         yield f"the solver did not converge: {found.outcome.status}"
+    yield from inputs.measurements.warnings
     for f in judged:
         ratio = f.chi2 / max(f.dof, 1.0)
         known = f.dof > LEAST_DOF * np.sqrt(f.count)  # dof are sampled: few among many are noise

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from icalib.estimation.pose_factor import AbsolutePoseFactor, PoseNoise, Relativ
 from icalib.estimation.sensors import Whitened
 from icalib.estimation.state import State
 from icalib.estimation.wheel_factor import IncrementFactor, RelativePoseFactor
+from icalib.first_guess.lidar_sight import count_of, facing
 from icalib.geometry.planes import plane_of
 from icalib.measurements import LidarStream
 from icalib.rig import PoseSensor, Rig, Wheels
@@ -25,6 +27,10 @@ MOST_POINTS = 200_000  # kept of all LiDARs together
 FEWEST_FITTED = 4
 FEW_ON_PLANES = 0.2  # of the points
 NEARLY_A_PERIOD = 0.15  # of the period
+# Of the times of points within a scan: by how much they may look stretched, against 0.0015 where they are right, 0.06
+# and more where they are half or twice as long; and in how many standard deviations it must show.
+STRETCHED, CLEARLY = 0.03, 10.0
+HALF_STEP_S = np.float32(2e-3)  # of a difference of positions
 LARGE_CHI2 = 2.0  # chi^2 per post-fit degree of freedom above this is worth a warning
 LEAST_DOF = 3.0  # times the square root of the number of residuals
 # Correlations of residuals of poses with their neighbours. Of white noise between poses, steps have -0.5.
@@ -220,8 +226,16 @@ def neighbours(rows: np.ndarray) -> float:
 
 
 def lidar_warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
-    """Where few points lie on planes, or stamps are those of the wrong end of a scan."""
-    for lidar, stream in zip(inputs.rig.lidars, inputs.measurements.lidars, strict=True):
+    """Where few points lie on planes, planes face too few directions, or stamps are those of a scan's other end."""
+    yield from _sight_warnings(inputs, found)
+    for index, (lidar, stream) in enumerate(zip(inputs.rig.lidars, inputs.measurements.lidars, strict=True)):
+        stretch, std = _stretch(inputs, found, index)
+        if abs(stretch) > max(STRETCHED, CLEARLY * std):
+            yield (
+                f"the points of {lidar.name} lie off their planes as if the times of points within a scan were too "
+                f"{'short' if stretch > 0.0 else 'long'}, or in another order than written; check their unit, what "
+                "they count from and which way it turns, or set point_time in the rig file."
+            )
         share = _used(found, lidar.name) / max(len(stream.xyz), 1)
         if share < FEW_ON_PLANES:
             yield (
@@ -237,6 +251,41 @@ def lidar_warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
                 "be those of the end of a scan while times of points count from its start, or the other way; see "
                 "point_time."
             )
+
+
+def _stretch(inputs: Inputs, found: Estimate, index: int) -> tuple[float, float]:
+    """By which share of themselves the times of points within a scan look too short, and its standard deviation.
+
+    A point that is taken at a wrong instant is off its plane by how fast it moves along the normal; a time offset takes
+    up what all points of a scan have in common.
+    """
+    state = found.outcome.state
+    motion, values = motion_of(inputs, state), np.array([state.values[key] for key in inputs.clouds.keys])
+    stream, plane = _thinned(inputs, index, state)
+    if len(plane) < FEWEST_FITTED:
+        return 0.0, np.inf
+    later, earlier = (
+        in_world(motion, replace(stream, offset_s=stream.offset_s + step))[0] for step in (HALF_STEP_S, -HALF_STEP_S)
+    )
+    speed = np.einsum("na,na->n", values[plane, :3], later - earlier) / (2.0 * float(HALF_STEP_S))
+    by_stretch = speed * (stream.offset_s - stream.offset_s.mean(dtype=np.float64))
+    residual = _on_planes(motion, stream, values[plane])[1].astype(np.float64)
+    information = max(float(by_stretch @ by_stretch), 1e-30)
+    return -float(by_stretch @ residual) / information, float(residual.std()) / np.sqrt(information)
+
+
+def _sight_warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
+    """Where LiDARs alone show the motion, and not all of it."""
+    if inputs.rig.cameras or inputs.rig.poses:
+        return
+    normals = np.array([found.outcome.state.values[key][:3] for key in inputs.clouds.keys])
+    if count_of(facing(normals, inputs.clouds.points)) < 3:
+        names = " and ".join(x.name for x in inputs.rig.lidars)
+        yield (
+            f"the planes that {names} saw face two directions only, as in a corridor: how it moved along both the IMU "
+            "alone says. Do not trust the result if the solver did not converge; better record where walls and floor "
+            "face three directions."
+        )
 
 
 def robot_warnings(rig: Rig, judged: list[SensorFit]) -> Iterator[str]:

@@ -8,6 +8,7 @@ is seen from the side that its normal points to.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -80,7 +81,7 @@ class FoundPlanes:
 
     def of_points(self, points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch) -> np.ndarray:
         """(N,) int32, the plane of each of points (N, 3) seen from (N, 3), world; -1: none."""
-        return _associate(self.cells, points, seen_from, search)[0]
+        return _associate(self.cells, points, seen_from, search.variance(points, seen_from), search)[0]
 
 
 def find_planes(points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch = PlaneSearch()) -> FoundPlanes:
@@ -89,7 +90,8 @@ def find_planes(points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch =
     points, seen_from = points[::step], seen_from[::step]
     if not len(points):
         return FoundPlanes(_packed([], search.voxel_m), 0)
-    voxels = _voxels(points, seen_from, search)
+    variance = search.variance(points, seen_from)
+    voxels = _voxels(points, seen_from, variance, search)
     region = np.full(len(voxels.centre), -1, dtype=np.int64)
     count = grow(voxels, np.argsort(voxels.sigma, kind="stable"), region)
     members = [
@@ -97,25 +99,25 @@ def find_planes(points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch =
     ]
     patches = _patches(_join(voxels, members), voxels, search)
     for _ in range(ROUNDS):
-        patches = _refined(patches, points, seen_from, search)
+        patches = _refined(patches, points, seen_from, variance, search)
     return FoundPlanes(_packed(patches, search.voxel_m), sum(p.own > 0 for p in patches))
 
 
-def _voxels(points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch) -> Voxels:
+def _voxels(points: np.ndarray, seen_from: np.ndarray, variance: np.ndarray, search: PlaneSearch) -> Voxels:
     ijk = np.floor(points / search.voxel_m).astype(np.int64)
     ijk -= ijk.min(axis=0) - 1
     shape = ijk.max(axis=0) + 2
     strides = np.array([shape[1] * shape[2], shape[2], 1])
     keys, which = np.unique(ijk @ strides, return_inverse=True)
     n = len(keys)
-    moments, towards, variance = np.zeros((n, MOMENTS)), np.zeros((n, 3)), np.zeros(n)
-    sum_voxels(points, seen_from, search.variance(points, seen_from), which, moments, towards, variance)
+    moments, towards, total = np.zeros((n, MOMENTS)), np.zeros((n, 3)), np.zeros(n)
+    sum_voxels(points, seen_from, variance, which, moments, towards, total)
     count = moments[:, 0]
     S = moments[:, [2, 4, 7, 4, 5, 8, 7, 8, 9]].reshape(n, 3, 3) / count[:, None, None]
     centre = moments[:, [1, 3, 6]] / count[:, None]
     spread, axes = np.linalg.eigh(S - centre[:, :, None] * centre[:, None, :])
     normal = axes[:, :, 0] * np.sign((axes[:, :, 0] * towards).sum(axis=1, keepdims=True))
-    sigma = np.sqrt(variance / count)
+    sigma = np.sqrt(total / count)
     thin = spread[:, 0] < np.minimum((MIXED * sigma) ** 2, 0.25 * spread[:, 1])
     flat = (count >= FEWEST) & thin & (spread[:, 1] > (ACROSS * search.voxel_m) ** 2 / 3.0)
     around = np.array([(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1) if i or j or k]) @ strides
@@ -232,22 +234,34 @@ def _packed(patches: list[_Patch], edge_m: float) -> Cells:
 
 
 def _associate(
-    cells: Cells, points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch
+    cells: Cells, points: np.ndarray, seen_from: np.ndarray, variance: np.ndarray, search: PlaneSearch
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     n = len(points)
     plane, cell, distance = np.empty(n, np.int32), np.empty(n, np.int64), np.empty(n)
-    variance = search.variance(points, seen_from)
     associate(points, seen_from, variance, cells, search.gate, search.least_cosine, plane, cell, distance)
     return plane, cell, distance
 
 
-def _refined(patches: list[_Patch], points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch) -> list[_Patch]:
+def _associate_at_once(
+    cells: Cells, points: np.ndarray, seen_from: np.ndarray, variance: np.ndarray, search: PlaneSearch
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """As `_associate`, on two threads."""
+    halves = (slice(0, len(points) // 2), slice(len(points) // 2, None))
+    with ThreadPoolExecutor(len(halves)) as pool:
+        parts = pool.map(lambda h: _associate(cells, points[h], seen_from[h], variance[h], search), halves)
+        plane, cell, distance = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return plane, cell, distance
+
+
+def _refined(
+    patches: list[_Patch], points: np.ndarray, seen_from: np.ndarray, variance: np.ndarray, search: PlaneSearch
+) -> list[_Patch]:
     """Planes fitted to their own points, without cells that are empty or not flat; small ones own none any more."""
     patches = sorted(patches, key=lambda p: -p.own)
     cells = _packed(patches, search.voxel_m)
-    plane, cell, distance = _associate(cells, points, seen_from, search)
+    plane, cell, distance = _associate_at_once(cells, points, seen_from, variance, search)
     stats, moments = np.zeros((len(cells.use), 3)), np.zeros((len(patches), MOMENTS))
-    sum_cells(points, search.variance(points, seen_from), plane, cell, distance, stats, moments)
+    sum_cells(points, variance, plane, cell, distance, stats, moments)
     good = (stats[:, 0] >= FEWEST) & (stats[:, 2] < MIXED**2 * stats[:, 0])
     use = np.where(good, cells.use, np.minimum(cells.use, NEAR))
     refined = []

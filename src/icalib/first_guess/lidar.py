@@ -19,12 +19,14 @@ from icalib.first_guess.gyro import GyroRotation
 from icalib.first_guess.lidar_arm import (
     ANY_SIGMA,
     BIAS_SIGMA,
+    MIRRORED,
     SPEED_SIGMA,
     WAY_SIGMA,
     against_motion,
     against_readings,
     arm_prior,
     is_mirrored,
+    left_over,
     solve,
 )
 from icalib.first_guess.lidar_motion import LONGEST_STEP_S, ImuMotion
@@ -74,7 +76,7 @@ def lidar_and_motion(
     found = motion_of_path(imu, path, rates, aligned, gravity, held)
     if found is None:
         raise _too_short(stream)
-    _check_axes(stream.name, imu.name, found.mirrored)
+    _check_axes(stream.name, imu.name, found.left > MIRRORED)
     _check_gravity(found.gravity, gravity, imu.name, stream.name)
     return found.guess, found.motion
 
@@ -82,13 +84,13 @@ def lidar_and_motion(
 @dataclass(frozen=True)
 class FromPath:
     """What a path shows: the sensor's guess, the motion of the IMU, how long gravity is [m/s^2], and R_world_map, which
-    brings it down; the origin of the world is the map's. mirrored: see `is_mirrored`."""
+    brings it down; the origin of the world is the map's. left: see `left_over`."""
 
     guess: LidarGuess
     motion: ImuMotion
     gravity: float
     level: np.ndarray
-    mirrored: bool
+    left: float
 
 
 def motion_of_path(
@@ -112,8 +114,8 @@ def motion_of_path(
     level, R_imu = _level(x[6:9]), path.rotation @ R_il.T
     position = (path.position - R_imu @ x[3:6]) @ level.T
     start = ImuMotion(gyro, t, level @ R_imu, position, np.zeros_like(position), aligned.gyro_bias, x[9:12], gravity)
-    guess, mirrored = LidarGuess(R_il, x[3:6], aligned.offset), is_mirrored(system, R_il, x)
-    return FromPath(guess, start.smoothed(), float(np.linalg.norm(x[6:9])), level, mirrored)
+    guess, left = LidarGuess(R_il, x[3:6], aligned.offset), left_over(system, R_il, x)
+    return FromPath(guess, start.smoothed(), float(np.linalg.norm(x[6:9])), level, left)
 
 
 def lidar_on_motion(imu: ImuData, stream: LidarStream, known: State, held: Held = Held()) -> LidarGuess:

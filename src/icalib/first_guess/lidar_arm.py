@@ -147,12 +147,17 @@ def solve(rows: System, prior: Prior, R_il: np.ndarray, rates: np.ndarray) -> tu
     return R_il, x
 
 
+def left_over(rows: System, R_il: np.ndarray, x: np.ndarray) -> float:
+    """How much of what the path has part in the solution x (m,) and `R_il` leave: the ratio of the medians."""
+    A, b, seen = rows(R_il, x[3:6])
+    left = b - A[:, :, 3:] @ x[3:]
+    return float(np.median(np.linalg.norm(left, axis=1)) / max(np.median(np.linalg.norm(seen, axis=1)), 1e-30))
+
+
 def is_mirrored(rows: System, R_il: np.ndarray, x: np.ndarray) -> bool:
     """Whether the LiDAR moved the other way than the solution x (m,) and `R_il` say. Rates of mirrored axes are those
     of axes turned by half a turn, and fit; of ways twice their length is left then."""
-    A, b, seen = rows(R_il, x[3:6])
-    left = b - A[:, :, 3:] @ x[3:]
-    return bool(np.median(np.linalg.norm(left, axis=1)) > MIRRORED * np.median(np.linalg.norm(seen, axis=1)))
+    return left_over(rows, R_il, x) > MIRRORED
 
 
 def _misfit(rows: Rows, prior: Prior) -> float:

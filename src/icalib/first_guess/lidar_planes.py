@@ -66,9 +66,14 @@ def associate(
 def _thinned(clouds: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
     """Points and where they were seen from, of all clouds together, as many as the search looks at; by an odd step, or
     only some of a spinning LiDAR's lasers would be left."""
-    step = -(-sum(len(points) for points, _ in clouds) // MOST_POINTS) | 1
+    step = odd_step(sum(len(points) for points, _ in clouds))
     points, seen_from = zip(*clouds, strict=True)
     return np.concatenate([p[::step] for p in points]), np.concatenate([s[::step] for s in seen_from])
+
+
+def odd_step(points: int) -> int:
+    """Every how manyth of so many points makes no more than the search looks at."""
+    return -(-points // MOST_POINTS) | 1
 
 
 def _of_points(found: FoundPlanes, points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch) -> np.ndarray:

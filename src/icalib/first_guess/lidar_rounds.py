@@ -39,8 +39,10 @@ from icalib.first_guess.by_recording import (
     with_points,
 )
 from icalib.first_guess.lidar import Held, lidar_and_motion, lidar_on_motion
-from icalib.first_guess.lidar_planes import ROUNDS, Association, associate, round_search
+from icalib.first_guess.lidar_planes import ROUNDS, Association, associate, odd_step, round_search
+from icalib.first_guess.lidar_sight import naming_sight
 from icalib.geometry.planes import plane_of
+from icalib.measurements import LidarStream
 from icalib.rig import Camera, Lidar, PoseSensor, Wheels
 
 FEW, LOST = 0.2, 0.7  # share of points on planes, and of what there was at first, below which the planes are lost
@@ -67,13 +69,13 @@ def state_from_lidar(inputs: Inputs) -> State:
     """
     recordings = [alone(inputs, k) for k in range(len(inputs.parts))]
     best, name = most_points(inputs, 0), inputs.rig.lidars[0].name
-    with naming_recording(inputs, best):
+    with naming_recording(inputs, best), naming_sight(recordings[best].measurements.lidars[:1]):
         states = {best: _state_of_one(recordings[best])}
     values, offset = dict(states[best].values), float(states[best].values[name, "time_offset"][0])
     for k, own in enumerate(recordings):
         if k != best:
             there = other_clocks(offset, name, recordings[best], own)
-            with naming_recording(inputs, k):
+            with naming_recording(inputs, k), naming_sight(own.measurements.lidars[:1]):
                 states[k] = _state_of_one(own, Held(values[name, "rotation"], values[name, "translation"], there))
     values[name, "time_offset"] = np.array([other_clocks(offset, name, recordings[best], inputs)])
     return one_after_another(inputs, [states[k] for k in range(len(recordings))], values)
@@ -106,24 +108,67 @@ def with_lidars(inputs: Inputs, state: State) -> tuple[Inputs, State]:
     if any((s.plane >= 0).any() for streams in recordings for s in streams):
         clouds = joined_clouds([known_planes(streams) for streams in recordings])
         return with_clouds(inputs, clouds), replace(state, values=state.values | fitted_planes(inputs, state, clouds))
-    before: list[Association | None] = [None] * len(recordings)
-    noise = max(x.range_noise_m or FIRST_RANGE_M for x in inputs.rig.lidars)
+    step = odd_step(sum(len(s.xyz) for s in inputs.measurements.lidars))
+    fewer = _thinned(inputs, step)
+    found: Sequence[Association | None] = [None] * len(recordings)
     shares = []
-    for k in range(ROUNDS):
-        found = []
-        for r, streams in enumerate(recordings):
-            with naming_recording(inputs, r):
-                found.append(associate(streams, motion_of(inputs, state), round_search(k, noise), before[r]))
-        before = found
-        clouds = joined_clouds([a.clouds for a in found])
-        planes = np.concatenate([a.planes for a in found])
-        inputs = with_clouds(inputs, clouds)
-        state = replace(state, values=_without_planes(state) | dict(zip(clouds.keys, planes, strict=True)))
-        shares.append(clouds.points.sum() / max(sum(len(p) for p in clouds.plane), 1))
-        if k < ROUNDS - 1:
-            state = first_pass(inputs, state)
-    check_shares(shares, " and ".join(s.name for s in inputs.measurements.lidars))
+    for k in range(ROUNDS - 1):
+        fewer, state, found = _associated(fewer, state, k, found)
+        shares.append(_share(fewer.clouds))
+        with naming_sight(inputs.measurements.lidars):
+            state = first_pass(fewer, state)
+    before = [
+        _of_all(a, streams, first, step)
+        for a, streams, first in zip(found, recordings, _firsts(recordings), strict=True)
+    ]
+    inputs, state, _ = _associated(inputs, state, ROUNDS - 1, before)
+    check_shares([*shares, _share(inputs.clouds)], " and ".join(s.name for s in inputs.measurements.lidars))
     return inputs, state
+
+
+def _associated(
+    inputs: Inputs, state: State, k: int, before: Sequence[Association | None]
+) -> tuple[Inputs, State, list[Association]]:
+    """Round k: points on planes as the state has them; `before`: of each recording, what the round before found."""
+    noise = max(x.range_noise_m or FIRST_RANGE_M for x in inputs.rig.lidars)
+    found = []
+    for r, streams in enumerate(points_by_recording(inputs)):
+        with naming_recording(inputs, r):
+            found.append(associate(streams, motion_of(inputs, state), round_search(k, noise), before[r]))
+    clouds = joined_clouds([a.clouds for a in found])
+    planes = np.concatenate([a.planes for a in found])
+    values = _without_planes(state) | dict(zip(clouds.keys, planes, strict=True))
+    return with_clouds(inputs, clouds), replace(state, values=values), found
+
+
+def _thinned(inputs: Inputs, step: int) -> Inputs:
+    """With every `step`th point only, no more than the search for planes looks at: where all is does not depend on
+    more, and the last round uses all."""
+    streams = inputs.measurements.lidars
+    fewer = tuple(with_points(s, np.arange(len(s.xyz)) % step == 0) for s in streams)
+    return replace(inputs, measurements=replace(inputs.measurements, lidars=fewer))
+
+
+def _firsts(recordings: Sequence[tuple[LidarStream, ...]]) -> np.ndarray:
+    """(R, L) number of the first point of each recording among all of a LiDAR."""
+    sizes = np.array([[len(s.xyz) for s in streams] for streams in recordings])
+    return np.cumsum(sizes, axis=0) - sizes
+
+
+def _of_all(
+    found: Association | None, streams: tuple[LidarStream, ...], first: np.ndarray, step: int
+) -> Association | None:
+    """What was found of thinned points as of all points of a recording; `first` (L,): see `_firsts`."""
+    if found is None:
+        return None
+    planes = tuple(np.full(len(s.xyz), -1, np.int32) for s in streams)
+    for plane, own, n in zip(planes, found.clouds.plane, first, strict=True):
+        plane[-n % step :: step] = own
+    return replace(found, clouds=replace(found.clouds, plane=planes))
+
+
+def _share(clouds: Clouds) -> float:
+    return float(clouds.points.sum() / max(sum(len(p) for p in clouds.plane), 1))
 
 
 def check_shares(shares: Sequence[float], names: str) -> None:
@@ -184,8 +229,9 @@ def lidar_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
             k = most_points(inputs, i)
             own, motion = alone(inputs, k), motion_alone(inputs, k, state)
             assert own.imu is not None
-            with naming_recording(inputs, k):
-                found = lidar_on_motion(own.imu, own.measurements.lidars[i], motion, held_of(own, lidar))
+            stream = own.measurements.lidars[i]
+            with naming_recording(inputs, k), naming_sight([stream]):
+                found = lidar_on_motion(own.imu, stream, motion, held_of(own, lidar))
             found = replace(found, offset=other_clocks(found.offset, lidar.name, own, inputs))
             known = found.values(lidar.name) | known
         out |= known

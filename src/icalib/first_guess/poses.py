@@ -17,6 +17,7 @@ from icalib.estimation.imu_data import ImuData
 from icalib.estimation.pose_factor import FRAME, frame_of
 from icalib.estimation.robot import MOUNT
 from icalib.estimation.state import Key, State
+from icalib.first_guess.by_recording import alone, naming_recording, one_after_another, other_clocks
 from icalib.first_guess.clocks import LEAST_CORRELATION, LONGEST_STEP_S, Alignment, CameraRates
 from icalib.first_guess.gyro import GyroRotation
 from icalib.first_guess.lever_arm import SIZE_TOLERANCE, size_of
@@ -30,15 +31,25 @@ from icalib.first_guess.lidar import (
     poses_in,
     where,
 )
-from icalib.first_guess.lidar_arm import WAY_SIGMA, Rows, against_motion, against_readings, arm_prior, solve
+from icalib.first_guess.lidar_arm import (
+    WAY_SIGMA,
+    Rows,
+    against_motion,
+    against_readings,
+    arm_prior,
+    left_over,
+    solve,
+)
 from icalib.first_guess.lidar_odometry import LidarPath
 from icalib.first_guess.lidar_rounds import given, held_of
+from icalib.first_guess.pose_ways import placed
 from icalib.geometry import so3
 from icalib.measurements import PoseStream
 from icalib.rig import PoseSensor
 
 WINDOW_S = 0.1  # of a mean rate: long against the noise of poses
 FEWEST_WINDOWS = 20
+APART_S = 0.4  # of poses that show whether they fit: next to each other they differ by little but noise
 G_OTHER_UNITS = 0.5  # of gravity: positions do not make it so wrong
 NAMES = tuple(name for name, _, _ in MOUNT)
 
@@ -51,24 +62,39 @@ def pose_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
     for sensor, stream in zip(inputs.rig.poses, inputs.measurements.poses, strict=True):
         known = given(inputs, sensor, NAMES)
         if len(known) < len(NAMES):
-            known = _on_motion(inputs.imu, stream, state, held_of(inputs, sensor)).values(sensor.name) | known
+            place = partial(_on_motion, inputs.imu, known=state, held=held_of(inputs, sensor))
+            known = placed(stream, place).values(sensor.name) | known
         out |= known | _frames(inputs.imu, sensor, stream, state, known)
     return out
 
 
 def state_from_poses(inputs: Inputs) -> State:
-    """Where the solver starts where neither camera nor LiDAR shows the motion: the first pose sensor and the IMU do.
+    """Where the solver starts where neither camera nor LiDAR shows the motion: the first pose sensor and the IMU do. Of
+    several recordings the one with most poses says how the sensor stands.
 
-    Raises EstimationError where they do not, or there are several recordings.
+    Raises EstimationError where they do not.
     """
+    name = inputs.rig.poses[0].name
+    recordings = [alone(inputs, k) for k in range(len(inputs.parts))]
+    best = int(np.argmax([len(own.measurements.poses[0].stamps_ns) for own in recordings]))
+    with naming_recording(inputs, best):
+        states = {best: _state_of_one(recordings[best], None)}
+    values, offset = dict(states[best].values), float(states[best].values[name, "time_offset"][0])
+    for k, own in enumerate(recordings):
+        if k != best:
+            there = other_clocks(offset, name, recordings[best], own)
+            with naming_recording(inputs, k):
+                states[k] = _state_of_one(own, Held(values[name, "rotation"], values[name, "translation"], there))
+    values[name, "time_offset"] = np.array([other_clocks(offset, name, recordings[best], inputs)])
+    return one_after_another(inputs, [states[k] for k in range(len(recordings))], values)
+
+
+def _state_of_one(inputs: Inputs, held: Held | None) -> State:
+    """Of one recording; `held`: how the sensor stands, where another has shown it."""
     assert inputs.imu is not None
-    sensor, stream = inputs.rig.poses[0], inputs.measurements.poses[0]
-    if len(inputs.parts) > 1:
-        raise EstimationError(
-            f"several recordings cannot be joined where {sensor.name} alone shows the motion; calibrate each, or add "
-            "a camera or a LiDAR."
-        )
-    found = _with_motion(inputs.imu, stream, inputs.rig.gravity, held_of(inputs, sensor))
+    sensor, stream, imu, gravity = inputs.rig.poses[0], inputs.measurements.poses[0], inputs.imu, inputs.rig.gravity
+    known = held or held_of(inputs, sensor)
+    found = placed(stream, lambda x: _with_motion(imu, x, gravity, known))
     own = found.guess.values(sensor.name) | given(inputs, sensor, NAMES)
     values = start_values(inputs, own)
     hosts = {(x.name, "time_offset"): values[sensor.name, "time_offset"] for x in inputs.rig.poses}
@@ -109,7 +135,8 @@ def _aligned(imu: ImuData, stream: PoseStream, held: Held) -> tuple[Alignment, C
     return align_path(imu, stream.name, rates, held), rates
 
 
-def _with_motion(imu: ImuData, stream: PoseStream, gravity: float, held: Held) -> FromPath:
+def _with_motion(imu: ImuData, stream: PoseStream, gravity: float, held: Held) -> tuple[FromPath, float]:
+    """What the poses show with the IMU alone, and what is left of them. Raises EstimationError where they do not."""
     aligned, rates = _aligned(imu, stream, held)
     path, t = _path(stream), stream.seconds + aligned.offset
     path = where(path, (t > imu.seconds[0]) & (t < imu.seconds[-1]))
@@ -127,7 +154,9 @@ def _with_motion(imu: ImuData, stream: PoseStream, gravity: float, held: Held) -
             f"{gravity:.3g}: check that the accelerometer is in m/s^2, not in g, and the positions of {stream.name} "
             "in metres."
         )
-    return found
+    step = max(1, round(APART_S / float(np.median(np.diff(path.seconds)))))
+    apart = motion_of_path(imu, where(path, np.arange(len(path.seconds)) % step == 0), rates, aligned, gravity, held)
+    return found, 0.0 if apart is None else apart.left
 
 
 def _check_size(imu: ImuData, name: str, path: LidarPath, aligned: Alignment, found: FromPath) -> None:
@@ -148,8 +177,8 @@ def _check_size(imu: ImuData, name: str, path: LidarPath, aligned: Alignment, fo
         )
 
 
-def _on_motion(imu: ImuData, stream: PoseStream, known: State, held: Held) -> LidarGuess:
-    """From the motion of the IMU in `known`."""
+def _on_motion(imu: ImuData, stream: PoseStream, known: State, held: Held) -> tuple[LidarGuess, float]:
+    """From the motion of the IMU in `known`, and what is left of the poses. Raises EstimationError as above."""
     aligned, rates = _aligned(imu, stream, held)
     path, t = _path(stream), stream.seconds + aligned.offset
     path = where(path, (t >= known.seconds[0]) & (t <= known.seconds[-1]))
@@ -158,10 +187,11 @@ def _on_motion(imu: ImuData, stream: PoseStream, known: State, held: Held) -> Li
     t = path.seconds + aligned.offset
     R, p = poses_in(known, GyroRotation.integrate(imu, known.bias[:, :3].mean(axis=0)), t)
     prior = arm_prior(np.zeros(0), rates.rate, WAY_SIGMA, held.rotation is not None, held.position)
-    found = solve(against_motion(R, p, t, path.rotation, path.position), prior, aligned.rotation, rates.rate)
+    system = against_motion(R, p, t, path.rotation, path.position)
+    found = solve(system, prior, aligned.rotation, rates.rate)
     if found is None:
         raise _too_short(stream)
-    return LidarGuess(found[0], found[1][3:6], aligned.offset)
+    return LidarGuess(found[0], found[1][3:6], aligned.offset), left_over(system, *found)
 
 
 def _frames(

@@ -15,6 +15,7 @@ from icalib.estimation.nodes import first_nodes
 from icalib.estimation.state import Key, State
 from icalib.first_guess import Guess, initial_trajectory
 from icalib.first_guess.lidar_rounds import state_from_lidar
+from icalib.first_guess.own_robot import without_own_robot
 from icalib.first_guess.poses import pose_values, state_from_poses
 from icalib.first_guess.robot import given_cameras, wheel_values, with_robot
 from icalib.first_guess.several import initial_guesses
@@ -32,6 +33,7 @@ def start(
     or where there is neither camera nor LiDAR a pose sensor; what has no part in it is placed on that motion.
     Raises EstimationError where the recordings do not carry it.
     """
+    recordings = [without_own_robot(m) for m in recordings]
     whole = inputs_for(rig, recordings)
     cameras = given_cameras(whole)
     if rig.lidars and not rig.has_target and cameras is not None:

@@ -81,27 +81,50 @@ def panels(r: WheelResiduals | PoseResiduals) -> Figure:
 
 
 def plane_maps(c: Calibration) -> dict[str, Figure]:
-    """The planes with points of all LiDARs, coloured by how far they lie off: as the first guess had them, and now."""
+    """The planes with points of all LiDARs, coloured by how far they lie off: as the first guess had them, and now.
+
+    Each recording has a world of its own: of several one is shown, and a menu chooses it.
+    """
     most = MOST_IN_SPACE // len(c.lidar_residuals)
     kept = [(r, thin(len(r.seconds), most)) for r in c.lidar_residuals]
-    plane = np.concatenate([r.plane[k] for r, k in kept])
+    plane, seconds = (np.concatenate([getattr(r, name)[k] for r, k in kept]) for name in ("plane", "seconds"))
     before = np.concatenate([r.first_world[k] for r, k in kept]), np.concatenate([r.first_residual[k] for r, k in kept])
     after = np.concatenate([r.world[k] for r, k in kept]), np.concatenate([r.residual[k] for r, k in kept])
     top = WIDEST * 1e3 * float(np.sqrt(np.mean(after[1].astype(np.float64) ** 2))) if len(plane) else 1.0
-    walls = [_outlines(c.planes, after[0], plane)]
-    return {"map-before": _map(before, top, []), "map-after": _map(after, top, walls)}
+    names = [span.name for span in c.recordings] or [""]
+    of_recording = c.recording_of(seconds)
+    found: list[tuple[list[dict[str, Any]], list[dict[str, Any]]]] = []
+    for k in range(len(names)):
+        own = of_recording == k
+        walls = _outlines(c.planes, after[0][own], plane[own])
+        found.append(([_cloud(before, own, top)], [_cloud(after, own, top), walls]))
+    first, now = zip(*found, strict=True)
+    return {"map-before": _map(list(first), names), "map-after": _map(list(now), names)}
 
 
-def _map(cloud: tuple[np.ndarray, np.ndarray], top: float, walls: list[dict[str, Any]]) -> Figure:
-    points, residual = cloud
+def _cloud(cloud: tuple[np.ndarray, np.ndarray], own: np.ndarray, top: float) -> dict[str, Any]:
+    """The points `own` (N,) bool of a cloud: points and residuals, colours up to `top` mm."""
+    points, residual = (x[own] for x in cloud)
     size = np.minimum(np.abs(1e3 * residual.astype(np.float64)), top)
     marker: dict[str, Any] = {"size": 1.6, "color": numbers(np.round(size, 1)), "colorscale": "Viridis"}
     marker |= {"cmin": 0.0, "cmax": top, "colorbar": {"title": {"text": "off its plane [mm]"}, "thickness": 10}}
     shown = np.round(points.astype(np.float64), 3)
-    cloud_trace = path_3d(shown, "points", "", mode="markers", marker=marker, hoverinfo="skip", showlegend=False)
+    return path_3d(shown, "points", "", mode="markers", marker=marker, hoverinfo="skip", showlegend=False)
+
+
+def _map(traces: list[list[dict[str, Any]]], names: list[str]) -> Figure:
+    """Traces of each recording, of which the first is shown."""
     scene = {name: {"title": {"text": f"world {name[0]} [m]"}, "nticks": 6} for name in ("xaxis", "yaxis", "zaxis")}
-    margin = {"l": 0, "r": 0, "t": 10, "b": 0}
-    return figure([cloud_trace, *walls], 460, scene=scene | VIEW, margin=margin)
+    layout: dict[str, Any] = {"scene": scene | VIEW, "margin": {"l": 0, "r": 0, "t": 10, "b": 0}}
+    of = [k for k, own in enumerate(traces) for _ in own]
+    shown = [trace | {"visible": k == 0} for k, own in enumerate(traces) for trace in own]
+    if len(names) > 1:
+        choices = [
+            {"label": name, "method": "restyle", "args": ["visible", [k == number for k in of]]}
+            for number, name in enumerate(names)
+        ]
+        layout |= {"updatemenus": [{"buttons": choices, "x": 0.0, "xanchor": "left", "y": 1.0, "yanchor": "top"}]}
+    return figure(shown, 460, **layout)
 
 
 def _outlines(planes: tuple[Plane, ...], points: np.ndarray, plane: np.ndarray) -> dict[str, Any]:

@@ -1,0 +1,47 @@
+"""In how many directions the surfaces face that a LiDAR sees."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from icalib.errors import EstimationError
+from icalib.first_guess.lidar_sight import count_of, directions, facing, naming_sight
+from icalib.measurements import LidarStream
+
+
+def seeing(stream: LidarStream, faces: list[int]) -> LidarStream:
+    own = np.isin(stream.plane, faces)
+    start = np.concatenate([[0], np.cumsum(own)])[stream.start].astype(np.int64)
+    return LidarStream(stream.name, stream.stamps_ns, start, stream.offset_s[own], stream.xyz[own], stream.plane[own])
+
+
+@pytest.mark.parametrize(
+    ("faces", "count"),
+    [([0], 1), ([3], 1), ([0, 1], 1), ([2, 3], 1), ([0, 2], 2), ([0, 4, 5], 2), ([2, 4], 2), ([0, 2, 4], 3), ([], 0)],
+)
+def test_of_parts_of_a_room(free_robot, faces, count):
+    """0: floor, 1: ceiling, 2 and 3, 4 and 5: walls that face each other."""
+    assert directions(seeing(free_robot.streams[0], faces)) == count
+
+
+@pytest.mark.parametrize("example", ["table2-planar", "table2-ramp", "straight-line"])
+def test_of_whole_rooms(robot, example):
+    assert directions(robot(6.0, 1, example=example).streams[0]) == 3
+
+
+def test_shares_of_normals():
+    normal = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.6, 0.8]])
+    np.testing.assert_allclose(facing(normal, np.array([1.0, 2.0, 1.0])), [0.0, 0.25, 0.75], atol=1e-12)
+    assert count_of(np.array([0.001, 0.25, 0.75])) == 2
+
+
+def test_only_what_a_lidar_saw_too_little_for_is_blamed_on_it(free_robot):
+    whole = free_robot.streams[0]
+    with pytest.raises(EstimationError, match="another reason"), naming_sight([whole]):
+        raise EstimationError("another reason.")
+    with (
+        pytest.raises(EstimationError, match="lidar0 sees face two directions only"),
+        naming_sight([whole, seeing(whole, [0, 2])]),
+    ):
+        raise EstimationError("another reason.")

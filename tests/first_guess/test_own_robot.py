@@ -1,0 +1,103 @@
+"""Points of a LiDAR on its own robot: found, and told from a floor and walls that also stay where they are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from icalib.first_guess import own_robot
+from icalib.first_guess.own_robot import _Near, own_points, without_own_robot
+from icalib.measurements import LidarStream, Measurements
+
+NOISE_M = 0.03
+
+
+def raw(stream: LidarStream) -> LidarStream:
+    return replace(stream, plane=np.full(len(stream.xyz), -1, np.int32))
+
+
+def with_panel(stream: LidarStream, axis: int, at: float, low: list[float], high: list[float]):
+    """The scans of a LiDAR behind a rectangle that goes along with it, at x (axis 0) or z (axis 2) = `at` from `low` to
+    `high` on the other axes; and which points lie on it."""
+    xyz = stream.xyz.astype(np.float64)
+    beam = xyz / np.linalg.norm(xyz, axis=1)[:, None]
+    distance = at / np.where(beam[:, axis] == 0.0, 1e-9, beam[:, axis])
+    others = [i for i in range(3) if i != axis]
+    across = (distance[:, None] * beam)[:, others]
+    hit = (distance > 0.0) & (distance < np.linalg.norm(xyz, axis=1))
+    hit &= (across > low).all(axis=1) & (across < high).all(axis=1)
+    measured = distance + NOISE_M * np.random.default_rng(0).standard_normal(len(xyz))
+    xyz[hit] = (measured[:, None] * beam)[hit]
+    return replace(raw(stream), xyz=xyz.astype(np.float32)), hit
+
+
+PANELS = {
+    "small panel ahead": (0, 0.5, [-0.2, -0.2], [0.2, 0.1]),
+    "panel ahead": (0, 0.9, [-1.0, -0.6], [1.0, 0.3]),
+    "deck below": (2, -0.2, [-0.8, -0.7], [0.8, 0.7]),
+}
+
+
+@pytest.mark.parametrize("panel", PANELS.values(), ids=list(PANELS))
+@pytest.mark.parametrize("example", ["table2-3d", "table2-planar", "table2-ramp"])
+def test_points_on_the_robot_are_found(robot, example, panel):
+    stream, hit = with_panel(robot(16.0, 1, {"azimuth_steps": 300}, example=example).streams[0], *panel)
+    own = own_points(stream)
+    assert own is not None and hit.mean() > 0.03
+    assert own[hit].mean() > 0.99 and own[~hit].mean() < 0.01
+
+
+@pytest.mark.parametrize(
+    ("example", "changes"),
+    [("table2-planar", {"range_m": (0.5, 5.0)}), ("straight-line", {}), ("standing", {}), ("table2-planar", {})],
+)
+def test_what_stays_in_place_but_is_not_the_robot_s(robot, example, changes):
+    """The floor that a robot drives on, and everything while it stands."""
+    stream = raw(robot(16.0, 1, {"azimuth_steps": 300} | changes, example=example).streams[0])
+    near = _Near.of(stream)
+    assert near.steady(np.arange(near.groups))[near.place].sum() > 0.02 * len(stream.xyz)
+    assert own_points(stream) is None
+
+
+def test_that_the_floor_is_seen_from_afar_is_what_saves_it(robot, monkeypatch):
+    stream = raw(robot(16.0, 1, {"azimuth_steps": 300}, example="table2-planar").streams[0])
+    monkeypatch.setattr(own_robot, "SEEN_FROM_AFAR", 2.0)
+    assert own_points(stream) is not None
+
+
+def test_of_a_long_recording_its_middle_tells(robot, monkeypatch):
+    """And the robot is found in all of it."""
+    monkeypatch.setattr(own_robot, "MOST_SCANS", 70)
+    whole = robot(16.0, 1, {"azimuth_steps": 300}, example="table2-planar").streams[0]
+    assert len(whole.stamps_ns) > 1.5 * own_robot.MOST_SCANS
+    stream, hit = with_panel(whole, *PANELS["panel ahead"])
+    own = own_points(stream)
+    assert own is not None and own[hit].mean() > 0.99 and own[~hit].mean() < 0.01
+    assert own_points(raw(whole)) is None
+
+
+def test_what_is_said_and_what_stays(robot):
+    r = robot(16.0, 1, {"azimuth_steps": 300}, example="table2-planar")
+    stream, hit = with_panel(r.streams[0], *PANELS["panel ahead"])
+    recording = Measurements(r.sim.measurements.imu, (), lidars=(stream,), warnings=("before.",))
+    found = without_own_robot(recording)
+    before, (said,) = found.warnings[0], found.warnings[1:]
+    assert before == "before." and said.startswith("lidar0 sees its own robot: ") and said.endswith(".")
+    assert "% of its points" in said and "0.86 to 1.3" in said and "azimuth -0 deg" not in said
+    assert "azimuth 0 deg" in said and "set near of lidar0 to 1.5 in the rig file" in said
+    (kept,) = found.lidars
+    assert len(kept.stamps_ns) == len(stream.stamps_ns)
+    assert len(kept.xyz) == pytest.approx((~hit).sum(), rel=0.01)
+    all_round = without_own_robot(replace(recording, lidars=(with_panel(r.streams[0], *PANELS["deck below"])[0],)))
+    assert "on all sides" in all_round.warnings[-1]
+
+
+def test_points_of_known_planes_are_left_alone(robot):
+    """Whoever knows what lies on which plane knows what is the robot's."""
+    stream, _ = with_panel(robot(16.0, 1, {"azimuth_steps": 300}).streams[0], *PANELS["panel ahead"])
+    known = Measurements(
+        None, (), lidars=(replace(stream, plane=np.where(stream.xyz[:, 0] < 0.0, 1, -1).astype(np.int32)),)
+    )
+    assert without_own_robot(known).lidars[0] is known.lidars[0]

@@ -1,0 +1,93 @@
+"""Poses written another way than they should be are named, whether they give the motion or are placed on it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from icalib.errors import EstimationError
+from icalib.estimation.assembly import inputs_for
+from icalib.estimation.state import State
+from icalib.first_guess.poses import pose_values, state_from_poses
+from icalib.measurements import PoseStream
+from icalib.simulation import Drive, Room, Scenario, SimPoses, rig_for, simulate
+
+
+def inverted(x: PoseStream) -> PoseStream:
+    T = np.tile(np.eye(4), (len(x.stamps_ns), 1, 1))
+    T[:, :3, :3], T[:, :3, 3] = x.rotation, x.position
+    T = np.linalg.inv(T)
+    return replace(x, rotation=T[:, :3, :3].copy(), position=T[:, :3, 3].copy())
+
+
+def conjugated(x: PoseStream) -> PoseStream:
+    q = Rotation.from_matrix(x.rotation).as_quat() * [-1.0, -1.0, -1.0, 1.0]
+    return replace(x, rotation=Rotation.from_quat(q).as_matrix())
+
+
+def left_handed(x: PoseStream) -> PoseStream:
+    """x and y swapped, of the frame and of the sensor."""
+    swap = np.eye(3)[[1, 0, 2]]
+    return replace(x, rotation=swap @ x.rotation @ swap, position=x.position @ swap)
+
+
+def upside_down(x: PoseStream) -> PoseStream:
+    return replace(x, position=x.position * [1.0, 1.0, -1.0])
+
+
+WRONG = [
+    (inverted, "the poses of mocap0 are inverted"),
+    (conjugated, "the poses of mocap0 have inverted rotations"),
+    (left_handed, "the poses of mocap0 are those of left-handed axes"),
+    (upside_down, "the poses of mocap0 have their position's z reversed"),
+]
+
+
+@pytest.fixture(scope="module", params=[1, 2])
+def sim(request):
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.from_rotvec([2.0, -0.5, 1.0]).as_matrix(), [0.1, -0.2, 0.15]
+    frame = np.eye(4)
+    frame[:3, :3], frame[:3, 3] = Rotation.from_rotvec([0.0, 0.0, 2.0]).as_matrix(), [3.0, -1.0, 0.5]
+    mocap = SimPoses("mocap0", T, "absolute", frame, time_offset_s=0.5, rate_hz=50.0, clock_origin_ns=777)
+    scenario = Scenario((), duration_s=12.0, motion=Drive("free"), board=False, room=Room(), poses=(mocap,))
+    return simulate(scenario, request.param)
+
+
+def state_of(sim) -> State:
+    nodes = np.arange(0.05, 11.5, 0.05)
+    bias = np.concatenate([sim.truth.gyro_bias.mean(axis=0), sim.truth.accel_bias.mean(axis=0)])
+    R, p, v = sim.truth.pose_at(nodes + sim.truth.seconds[0])
+    return State(nodes, R, p, v, np.tile(bias, (len(nodes), 1)), {("imu0", "intrinsics"): np.zeros(24)})
+
+
+@pytest.mark.parametrize(("way", "words"), WRONG)
+def test_written_another_way(sim, way, words):
+    written = replace(sim.measurements, poses=tuple(way(x) for x in sim.measurements.poses))
+    inputs = inputs_for(rig_for(sim.scenario), [written])
+    with pytest.raises(EstimationError, match=words):
+        state_from_poses(inputs)
+    with pytest.raises(EstimationError, match=words):
+        pose_values(inputs, state_of(sim))
+
+
+def test_on_a_floor_inverted_poses_fit_by_their_rates_alone():
+    """The inverse turns the other way about the one axis, as if the sensor stood upside down."""
+    scenario = Scenario(
+        (), duration_s=12.0, motion=Drive("planar"), board=False, room=Room(), poses=(SimPoses("mocap0", np.eye(4)),)
+    )
+    sim = simulate(scenario, 1)
+    inputs = inputs_for(rig_for(scenario), [replace(sim.measurements, poses=(inverted(sim.measurements.poses[0]),))])
+    with pytest.raises(EstimationError, match="the poses of mocap0 are inverted"):
+        state_from_poses(inputs)
+    state_from_poses(inputs_for(rig_for(scenario), [sim.measurements]))
+
+
+def test_a_motion_of_another_recording_is_not_called_inverted(sim):
+    other = simulate(sim.scenario, 7).measurements.poses
+    inputs = inputs_for(rig_for(sim.scenario), [replace(sim.measurements, poses=other)])
+    with pytest.raises(EstimationError, match="does not match"):
+        state_from_poses(inputs)
