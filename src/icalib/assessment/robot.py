@@ -32,7 +32,8 @@ LEAST_DOF = 3.0  # times the square root of the number of residuals
 CORRELATED, ALTERNATING = 0.5, 0.35
 CLIP = 4.0  # standard deviations
 LABELS = {"wheels": ("left", "right"), "sideways slip": ("sideways",), "upwards slip": ("upwards",)} | {
-    "yaw": ("yaw",), "path": ("forward", "sideways"),
+    "yaw": ("yaw",), "path": ("forward", "sideways"), "speed": ("speed",), "wheel": ("wheel",),
+    "steering": ("steering",),
 }  # fmt: skip
 
 
@@ -258,6 +259,16 @@ def robot_warnings(rig: Rig, judged: list[SensorFit]) -> Iterator[str]:
             yield _wheel_words(f.kind, wheels[f.sensor], times, float(np.sqrt(ratio)))
 
 
+# Of rows of wheels: what they are, the field of the rig file that says how far off they may be, and its unit.
+_ROWS = {
+    "wheels": ("angles that {} turned leave", "wheel_noise", "rad/sqrt(s)", ", if the wheels do not slip forwards"),
+    "wheel": ("angles that the wheel of {} turned leave", "wheel_noise", "rad/sqrt(s)", ", if it does not slip"),
+    "speed": ("speeds of {} leave", "speed_noise", "m/sqrt(s)", ""),
+    "yaw": ("yaw rates of {} leave", "yaw_noise", "rad/sqrt(s)", ""),
+    "steering": ("steering angles of {} leave", "steering_noise", "rad/sqrt(Hz)", ", or more sideways_slip"),
+}
+
+
 def _wheel_words(kind: str, wheels: Wheels, times: str, root: float) -> str:
     if kind == "sideways slip":
         return (
@@ -269,10 +280,14 @@ def _wheel_words(kind: str, wheels: Wheels, times: str, root: float) -> str:
             f"{wheels.name} leaves the ground {times} as much as its upwards_slip in the rig file allows, so pitch "
             f"looks better known than it is; {root * wheels.upwards_slip:.2g} m/sqrt(s) would fit."
         )
-    if kind == "wheels":
+    rows = _ROWS | (
+        {"yaw": ("yaw rates of {} leave", "yaw_noise", "rad/sqrt(s)", "")} if wheels.kind == "twist" else {}
+    )
+    if kind in rows:
+        what, field, unit, unless = rows[kind]
         return (
-            f"the angles that {wheels.name} turned leave residuals {times} as large as its wheel_noise in the rig file "
-            f"says; {root * wheels.wheel_noise:.2g} rad/sqrt(s) would fit, if the wheels do not slip forwards."
+            f"the {what.format(wheels.name)} residuals {times} as large as its {field} in the rig file says; "
+            f"{root * getattr(wheels, field):.2g} {unit} would fit{unless}."
         )
     return (
         f"the {kind} of {wheels.name} leaves residuals {times} as large as its noise says; larger wheel_noise or "
