@@ -257,7 +257,14 @@ def bias_prior_sample(unlike, setup_of):
     )
 
 
-def with_wheels(setup):
+DRIVES = {
+    "pair": {"radii": np.array([0.1, 0.11]), "baseline": np.array([0.45])},
+    "twist": {"scales": np.array([1.1, 0.9])},
+    "steered": {"radius": np.array([0.1]), "wheelbase": np.array([0.6]), "steering_offset": np.array([0.05])},
+}
+
+
+def with_wheels(setup, kind="pair"):
     """The setup with wheel0 in its state and border; no motion that wheels could follow, which its Jacobians need not.
 
     Readings are constant: where they are not, the time derivative of a pose between stamps is exact to the part of the
@@ -267,8 +274,7 @@ def with_wheels(setup):
         "rotation": so3.exp(np.array([0.03, -0.05, 0.4])),
         "translation": np.array([-0.2, 0.1, -0.15]),
         "time_offset": np.array([0.013]),
-        "radii": np.array([0.1, 0.11]),
-        "baseline": np.array([0.45]),
+        **DRIVES[kind],
     }
     entries = [(b.sensor, b.name, b.kind, b.size, b.start is not None) for b in setup.layout.blocks]
     entries += [("wheel0", k, "rotation" if k == "rotation" else "vector", len(v), True) for k, v in wheels.items()]
@@ -278,14 +284,19 @@ def with_wheels(setup):
     return replace(setup, layout=make_layout(entries), state=state, imu=imu)
 
 
-def wheel_sample(unlike, setup_of, factor, imu_free=False, rate_hz=70.0, loss="none", curved=False):
-    setup = with_wheels(setup_of(unlike, imu_free=imu_free))
+def wheel_sample(unlike, setup_of, factor, imu_free=False, rate_hz=70.0, loss="none", curved=False, kind="pair"):
+    setup = with_wheels(setup_of(unlike, imu_free=imu_free), kind)
     rng = np.random.default_rng(4)
     # The last stamps lie beyond the IMU's recording.
     seconds = np.arange(0.0, setup.imu.seconds[-1], 1.0 / rate_hz)
     angles = 0.2 * np.cumsum(rng.normal(size=(len(seconds), 2)), axis=0)
-    noise = WheelNoise(1.0, 0.5, 0.3, loss, LOSS_SCALE)
-    made = factor.build("wheel0", seconds, angles, setup.imu, 9.81, noise, setup.layout, setup.state)
+    if kind == "steered":
+        steer = np.cumsum(0.05 * rng.normal(size=len(seconds)))
+        others = np.stack([np.cos(steer), np.sin(steer), np.ones(len(steer))], axis=1)
+        angles = np.concatenate([angles[:, :1], np.cumsum(others, axis=0) / rate_hz], axis=1)
+    noise = WheelNoise(1.0, 0.5, 0.3, loss, LOSS_SCALE, 0.7, 0.9, 0.4)
+    own = "wheel0", seconds, angles, setup.imu, 9.81, noise, setup.layout, setup.state
+    made = factor.build(*own) if kind == "pair" else factor.build(*own, kind)
     state = setup.perturbed(rng, 0.3)
 
     def run(at):
@@ -417,6 +428,15 @@ SAMPLES = {
     "wheels, cauchy, curved": (
         "IncrementFactor",
         lambda u, s, f: wheel_sample(u, s, IncrementFactor, loss="cauchy", curved=True),
+    ),
+    "speed and yaw rate": ("IncrementFactor", lambda u, s, f: wheel_sample(u, s, IncrementFactor, kind="twist")),
+    "steered, intrinsics": (
+        "IncrementFactor",
+        lambda u, s, f: wheel_sample(u, s, IncrementFactor, True, kind="steered"),
+    ),
+    "steered, huber, curved": (
+        "IncrementFactor",
+        lambda u, s, f: wheel_sample(u, s, IncrementFactor, loss="huber", curved=True, kind="steered"),
     ),
     "planar poses": ("RelativePoseFactor", lambda u, s, f: wheel_sample(u, s, RelativePoseFactor)),
     "planar poses, intrinsics": ("RelativePoseFactor", lambda u, s, f: wheel_sample(u, s, RelativePoseFactor, True)),

@@ -58,12 +58,14 @@ class WheelRates:
 
     @property
     def turning(self) -> np.ndarray:
-        """(n, k) of which some sum is the yaw rate, to scale."""
+        """(n, k) of which some sum is the yaw rate; of steered wheels to first order in their offset."""
         if self.kind == "pair":
             return self.rate
         if self.kind == "twist":
             return self.rate[:, 1:]
-        return self.rate[:, :1] * self.rate[:, 2:3] / np.maximum(self.rate[:, 1:2], 1e-3)
+        return self.rate[:, :1] * np.concatenate(
+            [np.ones((len(self.rate), 1)), self.rate[:, 2:3] / np.maximum(self.rate[:, 1:2], 1e-3)], axis=1
+        )
 
     @property
     def turn(self) -> np.ndarray:

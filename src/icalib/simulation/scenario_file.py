@@ -142,7 +142,8 @@ def _lidar(name: str, value: YamlValue, start_ns: int) -> SimLidar:
 
 # What wheels must have, by what they report, and what noise they may have.
 _DRIVES = {
-    "rates": (("radii", "baseline"), ("noise",)), "poses": (("radii", "baseline"), ("noise", "slip", "poses_every")),
+    "rates": (("radii", "baseline"), ("noise", "slip", "poses_every")),
+    "poses": (("radii", "baseline"), ("noise", "slip", "poses_every")),
     "twist": (("scales",), ("speed_noise", "yaw_noise")),
     "steering": (("radius", "wheelbase"), ("steering_offset", "noise", "steering_noise")),
 }  # fmt: skip
