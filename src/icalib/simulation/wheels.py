@@ -71,9 +71,9 @@ def reported(wheels: SimWheels, trajectory: Trajectory, seconds: np.ndarray) -> 
 
 
 def _steering(wheels: SimWheels, ahead: np.ndarray, turning: np.ndarray) -> np.ndarray:
-    """(N,) rad: a point a wheelbase ahead moves at v_x forwards and at wheelbase w_z to the left. Raises RigError where
-    no front wheels can be steered so."""
-    angle = np.arctan2(wheels.wheelbase * turning, ahead)
+    """(N,) rad: a point a wheelbase ahead moves at v_x forwards, or backwards, and at wheelbase w_z to the left. Raises
+    RigError where no front wheels can be steered so."""
+    angle = np.arctan2(np.copysign(wheels.wheelbase, ahead) * turning, np.abs(ahead))
     if np.abs(angle).max() > _STEEPEST_RAD:
         raise RigError(
             f"{wheels.name} would have to steer by {np.rad2deg(np.abs(angle).max()):.0f} deg; choose a motion with "
