@@ -110,6 +110,25 @@ DRIVE_SIZES: dict[WheelKind, dict[str, int]] = {
 }
 
 
+GroundPlane = Literal["floor", "level"]
+
+
+@dataclass(frozen=True)
+class Ground:
+    """What wheels stand on: the floor that LiDARs see, or a plane as level as the horizon through the world's origin.
+
+    tilt_noise: of the wheels' frame on the plane, at each node, about each axis; None: it may be tilted anyhow. height:
+    of the frame's origin over the plane, with height_sigma, the same error all the time; None: it is not known.
+    bump_noise: of the height at each node.
+    """
+
+    plane: GroundPlane
+    tilt_noise: float | None = None  # rad
+    height: float = 0.0  # m
+    height_sigma: float | None = None  # m
+    bump_noise: float = 3e-3  # m
+
+
 @dataclass(frozen=True)
 class Wheels:
     """What rolls on the ground. Its frame has x forward, y to the left, z up, its origin midway between the wheels of
@@ -146,6 +165,12 @@ class Wheels:
     counter_size: int | None = None  # the counters go back to zero after so many ticks; None: never
     topic: str | None = None  # of its messages; None: the one with the wheels' name, or the only one
     joints: tuple[str, ...] | None = None  # in JointState; None: told by "left" and "right" in the names
+    ground: Ground | None = None
+
+    @property
+    def ground_height(self) -> Parameter:
+        """What the height over the ground starts from, where it is estimated."""
+        return Parameter("free", np.array([0.0 if self.ground is None else self.ground.height]))
 
     @property
     def kind(self) -> WheelKind:
@@ -156,8 +181,13 @@ class Wheels:
 
     @property
     def sizes(self) -> dict[str, int]:
-        """Its groups beside pose and clock, with how many numbers they have."""
+        """Its groups beside pose and clock that the rig file treats, with how many numbers they have."""
         return DRIVE_SIZES[self.kind]
+
+    @property
+    def knows_height(self) -> bool:
+        """Whether the group ground_height (1,) [m] is estimated."""
+        return self.ground is not None and self.ground.height_sigma is not None
 
 
 PoseKind = Literal["absolute", "relative"]

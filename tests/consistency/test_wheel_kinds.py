@@ -1,4 +1,4 @@
-"""Speed and yaw rate, and front wheels that steer, on whole robots: honest covariances, and what straight lines leave."""
+"""Speed and yaw rate, and steered front wheels, on whole robots: honest covariances, and what straight lines leave."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ from icalib.timeline import Timeline
 UNITS = {
     "rotation": "rad", "translation": "m", "time_offset": "s", "intrinsics": "px", "distortion": "", "bloom": "px",
     "shape": "m", "tilt": "rad", "radii": "m", "baseline": "m", "radius": "m", "wheelbase": "m",
-    "steering_offset": "rad", "scales": "",
+    "steering_offset": "rad", "scales": "", "ground_height": "m",
 }  # fmt: skip
 LABELS = {
     "shape": SHAPE_LABELS, "radii": ("left", "right"), "scales": ("speed", "yaw_rate"),
@@ -232,7 +232,7 @@ def _sensor_fit(fit: Fit, found: Estimate) -> SensorFit:
             rms, unit = float(np.sqrt(np.mean(out.residual[used] ** 2, dtype=np.float64))), "px"
             rejected = int((~used).sum())
     for factor, out in zip(found.problem.sensors, found.outcome.residuals.sensors, strict=True):
-        if factor.name == fit.sensor:
+        if factor.name == fit.sensor and fit.kind in factor.kinds:
             rms, unit = factor.rms(out, fit.kind)
     return SensorFit(fit.sensor, fit.kind, fit.count, fit.dof, fit.chi2, rms, unit, rejected)
 

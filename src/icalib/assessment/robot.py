@@ -9,6 +9,7 @@ import numpy as np
 from icalib.calibration import LidarResiduals, Plane, PoseResiduals, SensorFit, WheelResiduals
 from icalib.estimation.assembly import Inputs, motion_of, origin_difference
 from icalib.estimation.estimate import Estimate
+from icalib.estimation.ground_factor import HEIGHT, TILT
 from icalib.estimation.lidar_binning import LidarNoise, in_world
 from icalib.estimation.lidar_factor import LidarFactor
 from icalib.estimation.lidar_sweep import Motion
@@ -270,6 +271,13 @@ _ROWS = {
 
 
 def _wheel_words(kind: str, wheels: Wheels, times: str, root: float) -> str:
+    if kind in (TILT, HEIGHT):
+        field = "tilt_noise" if kind == TILT else "bump_noise"
+        what = "not parallel to" if kind == TILT else "not at one height over"
+        return (
+            f"{wheels.name} is {what} its ground by {times} as much as {field} in the rig file says, as where it "
+            "drives over ramps or the ground is another plane; take ground out, or part of it."
+        )
     if kind == "sideways slip":
         return (
             f"{wheels.name} slips sideways {times} as much as its sideways_slip in the rig file allows, so yaw and "

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from icalib.estimation.ground_factor import HEIGHT_BLOCK, GroundFactor, floors
 from icalib.estimation.lidar_binning import LidarNoise
 from icalib.estimation.lidar_factor import LidarFactor
 from icalib.estimation.lidar_sweep import Motion
@@ -91,10 +92,15 @@ def own_entries(sensor: Lidar | Wheels | PoseSensor) -> list[Entry]:
     if not isinstance(sensor, Wheels):
         return mounts
     heard = sensor.measures != "poses"  # which say nothing of what rolls
-    return mounts + [
-        (sensor.name, name, "vector", n, heard and getattr(sensor, name).mode != "fixed")
-        for name, n in sensor.sizes.items()
-    ]
+    height: list[Entry] = [(sensor.name, HEIGHT_BLOCK, "vector", 1, True)] if sensor.knows_height else []
+    return (
+        mounts
+        + height
+        + [
+            (sensor.name, name, "vector", n, heard and getattr(sensor, name).mode != "fixed")
+            for name, n in sensor.sizes.items()
+        ]
+    )
 
 
 def frame_entries(sensor: PoseSensor, n_recordings: int) -> list[Entry]:
@@ -184,7 +190,18 @@ def robot_factors(
         pose_factor(sensor, stream, motion, size, layout)
         for sensor, stream, size in zip(rig.poses, measurements.poses, noise.posing, strict=True)
     )
-    return (*(lidars if clouds.count else ()), *wheels, *poses)
+    return (*(lidars if clouds.count else ()), *wheels, *ground_factors(rig, clouds, motion, layout), *poses)
+
+
+def ground_factors(rig: Rig, clouds: Clouds, motion: Motion, layout: Layout) -> Iterator[GroundFactor]:
+    """Of wheels that stand on a plane; of the floor once it is seen."""
+    for wheels in rig.wheels:
+        if wheels.ground is not None:
+            state = motion.state
+            floor: tuple[Key | None, ...] = (None,) * len(state.recordings)
+            if wheels.ground.plane == "floor" and clouds.count:
+                floor = floors(state, clouds.keys, clouds.points)
+            yield GroundFactor.build(wheels.name, wheels.ground, floor, state, motion.imu, layout)
 
 
 def pose_factor(sensor: PoseSensor, stream: PoseStream, motion: Motion, noise: PoseNoise, layout: Layout) -> PoseFactor:

@@ -8,6 +8,7 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation.assembly import Inputs, motion_of
+from icalib.estimation.ground_factor import HEIGHT_BLOCK
 from icalib.estimation.lidar_sweep import Motion
 from icalib.estimation.poses import assign_nodes, poses_at
 from icalib.estimation.robot import MOUNT
@@ -63,7 +64,7 @@ def given_cameras(inputs: Inputs) -> dict[Key, np.ndarray] | None:
 
 
 def _wheels(inputs: Inputs, state: State, wheels: Wheels, stream: WheelStream | WheelPoses) -> dict[Key, np.ndarray]:
-    names = [name for name, _, _ in MOUNT] + list(wheels.sizes)
+    names = [name for name, _, _ in MOUNT] + list(wheels.sizes) + ([HEIGHT_BLOCK] if wheels.knows_height else [])
     known = given(inputs, wheels, names)
     if isinstance(stream, WheelPoses):
         known |= {(wheels.name, name): np.ones(n) for name, n in wheels.sizes.items()}

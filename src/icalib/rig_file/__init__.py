@@ -46,6 +46,7 @@ def load_rig(path: str | Path) -> Rig:
             "target is missing; add target, targets for several by name, or tracks (a table of followed points) to "
             f"{' and '.join(blind)}."
         )
+    _refuse_unseen_ground(found["sensors"], sensors, targeted)
     return Rig(
         imu=sensors.imus[0] if sensors.imus else None,
         cameras=tuple(sensors.cameras),
@@ -128,6 +129,20 @@ def _refuse_incomplete(value: YamlValue, found: _Sensors) -> None:
     if not found.imus and (found.lidars or found.wheels or found.poses):
         first = (*found.lidars, *found.wheels, *found.poses)[0]
         value.entries()[first.name].fail("needs an IMU; add a sensor of type: imu, or remove this one.")
+
+
+def _refuse_unseen_ground(value: YamlValue, found: _Sensors, targeted: bool) -> None:
+    """Ground that wheels are said to stand on, which nothing shows."""
+    for wheels in found.wheels:
+        if wheels.ground is None:
+            continue
+        field = value.entries()[wheels.name].entries()["ground"].entries()
+        if wheels.ground.plane == "floor" and not found.lidars:
+            field["plane"].fail("the floor is what a LiDAR sees, and there is none; write level.")
+        if wheels.ground.plane == "level" and wheels.knows_height and not targeted:
+            field["height_sigma"].fail(
+                "heights are counted from the target, and there is none; remove it, or with a LiDAR write plane: floor."
+            )
 
 
 def _imu(name: str, value: YamlValue) -> ImuSensor:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from icalib.rig import DRIVE_SIZES, Parameter, WheelDrive, WheelFactor, WheelMeasure, Wheels
+from icalib.rig import DRIVE_SIZES, Ground, GroundPlane, Parameter, WheelDrive, WheelFactor, WheelMeasure, Wheels
 from icalib.rig_file.fields import MOUNTED, choice_or, groups_to_plain, mounting, path_or, positive_or, topic_or_none
 from icalib.rig_parameters import vector_parameter
 from icalib.yaml_nodes import YamlValue
 
 _WORDS = ("path", "topic", "drive", "measures", "meaning", "counts_per_turn", "counter_size", "joints", "factor")
 _NOISES = ("wheel_noise", "speed_noise", "yaw_noise", "steering_noise")
+_GROUND = ("tilt_noise", "height", "height_sigma", "bump_noise")
 _SLIP = ("sideways_slip", "upwards_slip")
 _LENGTHS = ("radii", "baseline", "radius", "wheelbase")
 _TURNED = ("rates", "angles", "ticks")
@@ -37,7 +38,7 @@ _JOINTS = {
 def read_wheels(name: str, value: YamlValue) -> Wheels:
     """Raises RigError naming line and field."""
     found = value.record(
-        ("type",), (*_WORDS, *_NOISES, *_SLIP, *MOUNTED, *(g for s in DRIVE_SIZES.values() for g in s))
+        ("type",), (*_WORDS, "ground", *_NOISES, *_SLIP, *MOUNTED, *(g for s in DRIVE_SIZES.values() for g in s))
     )
     measures: WheelMeasure = choice_or(found, "measures", WheelMeasure, Wheels.measures)
     drive: WheelDrive = choice_or(found, "drive", WheelDrive, Wheels.drive)
@@ -45,12 +46,12 @@ def read_wheels(name: str, value: YamlValue) -> Wheels:
     _refuse_other_measures(value, found, bare)
     groups = {group: vector_parameter(found[group], n) for group, n in bare.sizes.items() if group in found}
     _refuse_negative_lengths(found, groups)
-    densities: dict[str, Any] = {d: positive_or(found, d, getattr(Wheels, d)) for d in (*_NOISES, *_SLIP)}
+    given: dict[str, Any] = {d: positive_or(found, d, getattr(Wheels, d)) for d in (*_NOISES, *_SLIP)}
+    given |= mounting(found) | groups
     return Wheels(
         name=name,
         path=path_or(found, f"{name}/{measures}.csv"),
         drive=drive,
-        **densities,
         factor=choice_or(found, "factor", WheelFactor, "relative-poses" if measures == "poses" else Wheels.factor),
         measures=measures,
         meaning=choice_or(found, "meaning", Literal["mean", "instant"], Wheels.meaning),
@@ -58,8 +59,8 @@ def read_wheels(name: str, value: YamlValue) -> Wheels:
         counter_size=found["counter_size"].whole(2) if "counter_size" in found else None,
         topic=topic_or_none(found),
         joints=_joints(found["joints"], drive) if "joints" in found else None,
-        **mounting(found),
-        **groups,
+        ground=_ground(found["ground"]) if "ground" in found else None,
+        **given,
     )
 
 
@@ -107,12 +108,35 @@ def _joints(value: YamlValue, drive: WheelDrive) -> tuple[str, ...]:
     return names
 
 
+def _ground(value: YamlValue) -> Ground:
+    found = value.record(("plane",), _GROUND)
+    if "tilt_noise" not in found and "height_sigma" not in found:
+        value.fail("says nothing yet; add tilt_noise (rad), or height and height_sigma (m), or both.")
+    for name in ("height", "bump_noise"):
+        if name in found and "height_sigma" not in found:
+            found[name].fail("goes with height_sigma, how well the height is known (m); add it.")
+    return Ground(
+        choice_or(found, "plane", GroundPlane, "level"),
+        tilt_noise=found["tilt_noise"].positive() if "tilt_noise" in found else None,
+        height=found["height"].number() if "height" in found else Ground.height,
+        height_sigma=found["height_sigma"].positive() if "height_sigma" in found else None,
+        bump_noise=positive_or(found, "bump_noise", Ground.bump_noise),
+    )
+
+
+def _ground_to_plain(ground: Ground) -> dict[str, Any]:
+    fields = [name for name in _GROUND if name == "tilt_noise" or ground.height_sigma is not None]
+    plain = {name: getattr(ground, name) for name in ("plane", *fields)}
+    return {name: value for name, value in plain.items() if value is not None}
+
+
 def wheels_to_plain(wheels: Wheels) -> dict[str, Any]:
     """Lists, numbers and text that load back as `wheels`."""
     noises = [name for name in _NOISES if wheels.kind in _ONLY_OF_KIND[name]]
     same = ("path", "drive", "measures", "factor", *noises, *_SLIP)
     plain: dict[str, Any] = {"type": "wheels", **{name: getattr(wheels, name) for name in same}}
     given = {name: getattr(wheels, name) for name, of in _ONLY_OF.items() if wheels.measures in of}
+    given["ground"] = None if wheels.ground is None else _ground_to_plain(wheels.ground)
     given |= {"topic": wheels.topic, "joints": None if wheels.joints is None else list(wheels.joints)}
     groups = {name: p for name, p in groups_to_plain(wheels).items() if name in (*MOUNTED, *wheels.sizes)}
     return plain | {name: value for name, value in given.items() if value is not None} | groups

@@ -16,6 +16,7 @@ from icalib.simulation.robot import SimWheels
 
 _GAUSS = np.polynomial.legendre.leggauss(3)
 _STEEPEST_RAD = 1.3
+_KINDS: dict[str, Literal["pair", "steered", "twist"]] = {"rates": "pair", "steering": "steered", "twist": "twist"}
 _SUBSTEPS = 12  # of an interval of (27), for its noise
 
 
@@ -50,10 +51,9 @@ def read_wheels(
     densities = {"twist": [wheels.speed_noise, wheels.yaw_noise], "steering": [wheels.noise, wheels.steering_noise]}
     density = np.array(densities.get(wheels.reports, [wheels.noise, wheels.noise]))
     noise = density * np.sqrt(wheels.rate_hz) * rng.standard_normal(true.shape)
-    kinds: dict[str, Literal["twist", "steered"]] = {"twist": "twist", "steering": "steered"}
-    kind = kinds.get(wheels.reports, "pair")
     measured = true + noise * float(noisy)
-    return WheelStream(wheels.name, stamps, measured, wheels.meaning, kind), WheelTruth(seconds, true)
+    stream = WheelStream(wheels.name, stamps, measured, wheels.meaning, _KINDS[wheels.reports])
+    return stream, WheelTruth(seconds, true)
 
 
 def reported(wheels: SimWheels, trajectory: Trajectory, seconds: np.ndarray) -> np.ndarray:
