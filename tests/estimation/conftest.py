@@ -48,6 +48,7 @@ TOLERANCE = {
     "radius": 1e-3,
     "wheelbase": 5e-3,
     "steering_offset": 5e-3,
+    "ground_height": 5e-3,
     "plane": (2e-3, 2e-3, 5e-3),
     "frame_rotation": 2e-3,
     "frame_translation": 5e-3,

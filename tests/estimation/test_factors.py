@@ -20,6 +20,7 @@ from icalib.estimation.arrowhead import Piece, make_pieces
 from icalib.estimation.board import board_in
 from icalib.estimation.corner_factor import CornerNoise
 from icalib.estimation.corner_weights import LEAST_CURVATURE
+from icalib.estimation.ground_factor import GroundFactor
 from icalib.estimation.imu_factor import ROWS, ImuFactor
 from icalib.estimation.lidar_binning import LidarNoise
 from icalib.estimation.lidar_sweep import Motion
@@ -28,7 +29,9 @@ from icalib.estimation.prior_factor import FIRST_BIAS_SIGMA, Prior, accumulate_b
 from icalib.estimation.state import NODE, State, make_layout
 from icalib.estimation.wheel_factor import IncrementFactor, RelativePoseFactor, WheelNoise
 from icalib.geometry import so3
+from icalib.geometry.planes import plane_of
 from icalib.measurements import PoseStream
+from icalib.rig import Ground
 
 
 @dataclass(frozen=True)
@@ -316,6 +319,32 @@ def wheel_sample(unlike, setup_of, factor, imu_free=False, rate_hz=70.0, loss="n
     return Sample(factor.__name__, setup, state, accumulate, lambda at: run(at)[0], weights)
 
 
+def ground_sample(unlike, setup_of, plane, seen=True):
+    """Wheels that are tilted on the plane and high above it."""
+    setup = with_wheels(setup_of(unlike))
+    key = ("plane 0", "plane")
+    own = {("wheel0", "ground_height"): np.array([0.05])}
+    own |= {key: plane_of(np.array([0.1, -0.2, -1.0]), np.array([0.3, 0.2, -0.4]))} if seen else {}
+    entries = [(b.sensor, b.name, b.kind, b.size, b.start is not None) for b in setup.layout.blocks]
+    entries += [("wheel0", "ground_height", "vector", 1, True)] + ([(*key, "plane", 3, True)] if seen else [])
+    state = replace(setup.state, values=setup.state.values | own)
+    setup = replace(setup, layout=make_layout(entries), state=state)
+    ground = Ground(plane, 0.3, 0.1, 0.4, 0.2)
+    made = GroundFactor.build("wheel0", ground, (key if seen else None,), state, setup.imu, setup.layout)
+    at = setup.perturbed(np.random.default_rng(3), 0.3)
+
+    def residual(at):
+        out = made.output()
+        for piece in make_pieces(len(at.seconds), setup.layout.size):
+            made.accumulate(at, piece, out, sums=False)
+        return out.residual.ravel()
+
+    def accumulate(at, piece, sums):
+        return made.accumulate(at, piece, made.output(), sums)
+
+    return Sample("GroundFactor", setup, at, accumulate, residual, white(residual))
+
+
 def with_poses(setup, starts):
     """The setup with mocap0 in its state and border, and the nodes of recordings that begin at `starts`; readings are
     constant, as in `with_wheels`."""
@@ -438,6 +467,8 @@ SAMPLES = {
         "IncrementFactor",
         lambda u, s, f: wheel_sample(u, s, IncrementFactor, loss="huber", curved=True, kind="steered"),
     ),
+    "ground, level": ("GroundFactor", lambda u, s, f: ground_sample(u, s, "level", False)),
+    "ground, floor": ("GroundFactor", lambda u, s, f: ground_sample(u, s, "floor")),
     "planar poses": ("RelativePoseFactor", lambda u, s, f: wheel_sample(u, s, RelativePoseFactor)),
     "planar poses, intrinsics": ("RelativePoseFactor", lambda u, s, f: wheel_sample(u, s, RelativePoseFactor, True)),
     "planar poses, huber, curved": (
