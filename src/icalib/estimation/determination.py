@@ -112,6 +112,12 @@ def _as_worth(inputs: Inputs, found: Estimate, guess: State) -> State | None:
         return None
     sigma, directions = _guess_sigma(inputs), problem.tolerance[:, None] * problem.held
     way = border_difference(problem, guess, state)
+    # What nobody guessed moves along, but nothing turns: what little a turn moves would be paid for with all of it.
+    for block in (b for b in problem.layout.free if not inputs.is_sensor(b.sensor)):
+        way[block.columns] = 0.0
+        turns = block.columns[:2] if block.kind == "plane" else block.columns
+        if block.kind != "vector":
+            sigma[turns] = GUESS_SIGMA["rotation"]
     step = directions @ np.linalg.lstsq(directions / sigma[:, None], way / sigma, rcond=None)[0]
     if np.linalg.norm(step / sigma) < NEAR_GUESS:
         return None
