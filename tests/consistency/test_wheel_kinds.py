@@ -24,7 +24,7 @@ def steady(rig: Rig) -> Rig:
 def reporting(scenario: Scenario, reports: str) -> Scenario:
     """Its wheels as good as the encoders of the other tests, with parameters that are not the defaults."""
     changed = replace(
-        scenario.wheels[0], reports=reports, scales=(1.03, 0.97), speed_noise=5e-4, yaw_noise=2e-3, wheelbase=0.5,
+        scenario.wheels[0], reports=reports, scales=(1.03, 0.97), speed_noise=5e-4, yaw_noise=2e-3, wheelbase=0.25,
         steering_offset=0.02, steering_noise=5e-4,
     )  # fmt: skip
     return replace(scenario, wheels=(changed,))
