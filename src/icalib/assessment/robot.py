@@ -9,7 +9,7 @@ import numpy as np
 from icalib.calibration import LidarResiduals, Plane, PoseResiduals, SensorFit, WheelResiduals
 from icalib.estimation.assembly import Inputs, motion_of, origin_difference
 from icalib.estimation.estimate import Estimate
-from icalib.estimation.ground_factor import HEIGHT, TILT
+from icalib.estimation.ground_factor import HEIGHT, TILT, GroundFactor
 from icalib.estimation.lidar_binning import LidarNoise, in_world
 from icalib.estimation.lidar_factor import LidarFactor
 from icalib.estimation.lidar_sweep import Motion
@@ -219,8 +219,20 @@ def neighbours(rows: np.ndarray) -> float:
     return float((clipped[1:] * clipped[:-1]).sum() / max((clipped**2).sum(), 1e-30))
 
 
+def ground_warnings(found: Estimate) -> Iterator[str]:
+    """Where wheels are said to stand on a floor that is not seen."""
+    for factor in found.problem.sensors:
+        if isinstance(factor, GroundFactor) and not len(factor.nodes):
+            yield (
+                f"none of the planes that LiDARs see is a floor (nearly level and below the IMU), so the ground of "
+                f"{factor.name} counts for nothing; see that a LiDAR sees it, or write plane: level."
+            )
+
+
 def lidar_warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
-    """Where few points lie on planes, or stamps are those of the wrong end of a scan."""
+    """Where few points lie on planes, none is the floor that it must be, or stamps are those of the wrong end of a
+    scan."""
+    yield from ground_warnings(found)
     for lidar, stream in zip(inputs.rig.lidars, inputs.measurements.lidars, strict=True):
         share = _used(found, lidar.name) / max(len(stream.xyz), 1)
         if share < FEW_ON_PLANES:

@@ -1,11 +1,13 @@
 """Wheels on a plane: rows against the obvious geometry, and which plane is the floor."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from icalib.assessment.robot import ground_warnings
 from icalib.estimation.arrowhead import make_pieces
 from icalib.estimation.ground_factor import GroundFactor, floors
 from icalib.estimation.state import make_layout
@@ -132,4 +134,9 @@ def test_recordings_that_do_not_see_the_floor_have_no_part(world_of, drive_of_ki
     factor = GroundFactor.build("wheel0", FLOOR, (None, KEY), state, world.imu, world.layout)
     assert factor.nodes.tolist() == list(range(30, len(state.seconds) - 1))
     none = GroundFactor.build("wheel0", FLOOR, (None, None), state, world.imu, world.layout)
+    found = SimpleNamespace(problem=SimpleNamespace(sensors=(factor, none)))
+    (words,) = ground_warnings(found)
+    assert (
+        "none of the planes that LiDARs see is a floor" in words and "the ground of wheel0 counts for nothing" in words
+    )
     assert len(none.nodes) == 0 and none.rms(none.output(), "ground tilt") == (0.0, "rad")
