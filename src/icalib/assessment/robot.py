@@ -300,11 +300,8 @@ def _wheel_words(kind: str, wheels: Wheels, times: str, root: float) -> str:
             f"{wheels.name} leaves the ground {times} as much as its upwards_slip in the rig file allows, so pitch "
             f"looks better known than it is; {root * wheels.upwards_slip:.2g} m/sqrt(s) would fit."
         )
-    rows = _ROWS | (
-        {"yaw": ("yaw rates of {} leave", "yaw_noise", "rad/sqrt(s)", "")} if wheels.kind == "twist" else {}
-    )
-    if kind in rows:
-        what, field, unit, unless = rows[kind]
+    if kind in _ROWS and (kind, wheels.kind) != ("yaw", "pair"):  # the paper's relative poses have a yaw, too
+        what, field, unit, unless = _ROWS[kind]
         return (
             f"the {what.format(wheels.name)} residuals {times} as large as its {field} in the rig file says; "
             f"{root * getattr(wheels, field):.2g} {unit} would fit{unless}."
