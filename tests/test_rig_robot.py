@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from icalib.errors import RigError
-from icalib.rig import Lidar, Parameter, PoseSensor, Rig, Wheels
+from icalib.rig import Ground, Lidar, Parameter, PoseSensor, Rig, Wheels
 from icalib.rig_file import load_rig, rig_to_dict
 
 ROBOT = """\
@@ -129,7 +129,14 @@ def test_plain_lidars_and_wheels_load_back(tmp_path):
             "sensors.lidar0.point_time: there is no such choice as 'guess'; available are auto, start",
         ),
         ("    near: 1", "    nera: 1", "sensors.lidar0.nera: there is no such field, did you mean 'near'"),
-        ("drive: differential", "drive: ackermann", "wheel0.drive: there is no such choice as 'ackermann'"),
+        ("drive: differential", "drive: tracks", "wheel0.drive: there is no such choice as 'tracks'"),
+        ("drive: differential", "drive: ackermann", "radii: belongs to wheels with a left and a right side"),
+        (
+            "drive: differential",
+            "drive: skid-steer",
+            "joints: must be the names of four joints, [front left",
+        ),
+        ("drive: differential", "steering_noise: 0.1", "steering_noise: belongs to wheels with drive: ackermann"),
         ("[0.1, 0.11]", "[0.1, -0.11]", "sensors.wheel0.radii: is in metres and must be above 0"),
         ("[0.1, 0.11]", "[0.1]", "sensors.wheel0.radii.prior: must be a list of 2 numbers"),
         ("{guess: 0.4}", "{guess: 0}", "sensors.wheel0.baseline: is in metres and must be above 0"),
@@ -158,6 +165,91 @@ def test_plain_lidars_and_wheels_load_back(tmp_path):
 def test_what_is_wrong_with_lidars_and_wheels_is_named(tmp_path, old, new, words):
     assert ROBOT.count(old) == 1
     assert words in complaint(tmp_path, ROBOT.replace(old, new))
+
+
+KINDS = """\
+sensors:
+  imu0: {type: imu}
+  lidar0: {type: lidar}
+  twist0:
+    type: wheels
+    measures: twist
+    meaning: instant
+    scales: {prior: [1, 1], sigma: 0.1}
+    speed_noise: 0.01
+    yaw_noise: 0.02
+    ground: {plane: floor, tilt_noise: 0.01}
+  car0:
+    type: wheels
+    drive: ackermann
+    measures: ticks
+    counts_per_turn: 100
+    radius: {guess: 0.3}
+    wheelbase: {fixed: 2.5}
+    steering_offset: {prior: -0.01, sigma: 0.02}
+    steering_noise: 0.002
+    joints: [wheel, steer]
+    ground: {plane: floor, height: 0.3, height_sigma: 0.01, bump_noise: 0.005}
+  skid0: {type: wheels, drive: skid-steer, joints: [a, b, c, d]}
+"""
+
+
+def test_kinds_of_wheels_are_read_and_load_back(tmp_path):
+    twist, car, skid = load(tmp_path, KINDS).wheels
+    assert [w.kind for w in (twist, car, skid)] == ["twist", "steered", "pair"]
+    assert (twist.path, twist.meaning, twist.speed_noise, twist.yaw_noise) == (
+        "twist0/twist.csv",
+        "instant",
+        0.01,
+        0.02,
+    )
+    assert twist.scales.mode == "prior" and twist.ground == Ground("floor", 0.01) and not twist.knows_height
+    assert (car.steering_noise, car.joints, car.wheelbase.mode) == (0.002, ("wheel", "steer"), "fixed")
+    assert car.steering_offset.value == [-0.01] and car.radius.value == [0.3]
+    assert car.ground == Ground("floor", None, 0.3, 0.01, 0.005) and car.ground_height.value == [0.3]
+    assert (skid.drive, skid.joints, skid.ground) == ("skid-steer", ("a", "b", "c", "d"), None)
+    plain = rig_to_dict(load(tmp_path, KINDS))
+    again = load(tmp_path, yaml.safe_dump(plain, sort_keys=False))
+    assert rig_to_dict(again) == plain
+    for a, b in zip(again.wheels, (twist, car, skid), strict=True):
+        assert all(repr(getattr(a, f.name)) == repr(getattr(b, f.name)) for f in dataclasses.fields(a))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        (
+            "meaning: instant",
+            "joints: [a, b]",
+            "twist0.joints: belongs to wheels that measure rates or angles or ticks",
+        ),
+        ("meaning: instant", "drive: skid-steer", "twist0.drive: goes with wheels that measure rates or angles or tic"),
+        ("meaning: instant", "factor: relative-poses", "factor: the paper's relative-poses are of a left and a right"),
+        ("meaning: instant", "wheel_noise: 0.1", "wheel_noise: belongs to wheels with a left and a right side or driv"),
+        ("scales: {prior: [1, 1]", "scales: {prior: [1, -1]", "twist0.scales: are factors and must be above 0"),
+        ("{guess: 0.3}", "{guess: -0.3}", "car0.radius: is in metres and must be above 0"),
+        (
+            "[wheel, steer]",
+            "[wheel, left, right]",
+            "joints: must be the names of two joints, [driven wheel, steering],",
+        ),
+        ("[a, b, c, d]", "[a, b]", "skid0.joints: must be the names of four joints, [front left, rear left, front rig"),
+        (", tilt_noise: 0.01}", "}", "twist0.ground: says nothing yet; add tilt_noise (rad), or height and"),
+        ("height_sigma: 0.01, ", "", "car0.ground: says nothing yet"),
+        (", tilt_noise: 0.01}", ", tilt_noise: 0.01, height: 1}", "ground.height: goes with height_sigma"),
+        ("plane: floor, tilt", "plane: ceiling, tilt", "ground.plane: there is no such choice as 'ceiling'; available"),
+        ("tilt_noise: 0.01", "tilt_noise: 0", "ground.tilt_noise: must be above 0"),
+        ("  lidar0: {type: lidar}\n", "  mocap0: {type: pose}\n", "ground.plane: the floor is what a LiDAR sees, and"),
+        (
+            "plane: floor, height",
+            "plane: level, height",
+            "ground.height_sigma: heights are counted from the target, an",
+        ),
+    ],
+)
+def test_what_is_wrong_with_kinds_of_wheels_is_named(tmp_path, old, new, words):
+    assert KINDS.count(old) == 1
+    assert words in complaint(tmp_path, KINDS.replace(old, new))
 
 
 def test_examples_of_the_page_are_right(tmp_path):

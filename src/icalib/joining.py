@@ -158,7 +158,7 @@ def join_wheels(streams: list[tuple[WheelStream | WheelPoses, int]]) -> WheelStr
         rates.append(wheels.rate)
     first = streams[0][0]
     assert isinstance(first, WheelStream)  # see above
-    return WheelStream(first.name, np.concatenate(stamps), np.concatenate(rates), first.meaning)
+    return WheelStream(first.name, np.concatenate(stamps), np.concatenate(rates), first.meaning, first.kind)
 
 
 def join_poses(streams: list[tuple[PoseStream, int]]) -> PoseStream:

@@ -169,18 +169,21 @@ class LidarStream:
 
 @dataclass(frozen=True)
 class WheelStream:
-    """Turning rates of a left and a right wheel.
+    """What wheels, or the driver of a vehicle, report of its motion.
 
-    stamps_ns (N,) int64, strictly increasing; rate (N, 2) rad/s, left and right, positive forwards. meaning "mean":
-    reading i is the mean over the period from stamp i-1 to stamp i, so rate x period is the angle turned (what a
-    difference of encoder counts gives; the first reading's period began one unknown stamp earlier). "instant": the
-    rate at the stamp.
+    stamps_ns (N,) int64, strictly increasing; rate (N, 2), by kind: "pair", rates of the left and the right wheel
+    [rad/s], positive forwards; "steered", rate of the driven wheel [rad/s] and steering angle [rad], positive to the
+    left; "twist", forward speed [m/s] and yaw rate [rad/s], positive to the left. meaning "mean": reading i is the
+    mean over the period from stamp i-1 to stamp i, so rate x period is the angle turned (what a difference of encoder
+    counts gives; the first reading's period began one unknown stamp earlier). "instant": the rate at the stamp, as
+    steering angles always are.
     """
 
     name: str
     stamps_ns: np.ndarray
     rate: np.ndarray
     meaning: Literal["mean", "instant"] = "mean"
+    kind: Literal["pair", "steered", "twist"] = "pair"
 
     def __post_init__(self) -> None:
         n = len(self.stamps_ns)

@@ -26,6 +26,10 @@ MISSING_MOTION = {
     "bloom": "show the target from more distances",
     "radii": "drive further",
     "baseline": "turn more, both ways",
+    "radius": "drive further",
+    "wheelbase": "turn more, both ways",
+    "steering_offset": "drive further",
+    "scales": "drive further, and turn more, both ways",
 }
 # Of wheels, which stay on the ground.
 ON_THE_GROUND = {

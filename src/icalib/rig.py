@@ -98,26 +98,64 @@ class Lidar:
 
 
 WheelFactor = Literal["increments", "relative-poses"]
-WheelMeasure = Literal["rates", "angles", "ticks", "poses"]
+WheelMeasure = Literal["rates", "angles", "ticks", "poses", "twist"]
+WheelDrive = Literal["differential", "skid-steer", "ackermann"]
+WheelKind = Literal["pair", "steered", "twist"]  # what the two columns of a `WheelStream` are
+
+# The groups of each kind of wheels, with how many numbers they have.
+DRIVE_SIZES: dict[WheelKind, dict[str, int]] = {
+    "pair": {"radii": 2, "baseline": 1},
+    "steered": {"radius": 1, "wheelbase": 1, "steering_offset": 1},
+    "twist": {"scales": 2},
+}
+
+
+GroundPlane = Literal["floor", "level"]
+
+
+@dataclass(frozen=True)
+class Ground:
+    """What wheels stand on: the floor that LiDARs see, or a plane as level as the horizon through the world's origin.
+
+    tilt_noise: of the wheels' frame on the plane, at each node, about each axis; None: it may be tilted anyhow. height:
+    of the frame's origin over the plane, with height_sigma, the same error all the time; None: it is not known.
+    bump_noise: of the height at each node.
+    """
+
+    plane: GroundPlane
+    tilt_noise: float | None = None  # rad
+    height: float = 0.0  # m
+    height_sigma: float | None = None  # m
+    bump_noise: float = 3e-3  # m
 
 
 @dataclass(frozen=True)
 class Wheels:
-    """Two driven wheels of one axle. Their frame has x forward, y to the left, z up, its origin midway between them.
+    """What rolls on the ground. Its frame has x forward, y to the left, z up, its origin midway between the wheels of
+    the axle that is not steered.
 
-    measures: rates [rad/s], angles turned [rad], counts of encoders (ticks), or relative planar poses (tables only).
-    meaning: of rates, as in `WheelStream`. Densities: of each wheel's angle, and of slip.
+    drive: differential, two driven wheels of one axle; skid-steer, two pairs of which each turns alike; ackermann, the
+    front wheels steer. measures: rates [rad/s], angles turned [rad], counts of encoders (ticks), relative planar poses
+    (tables only), or twist, forward speed [m/s] and yaw rate [rad/s]. meaning: of rates and twist, as in `WheelStream`.
+    Densities: of each wheel's angle, of speed and yaw rate, of the steering angle, and of slip.
     """
 
     name: str
     path: str
-    drive: Literal["differential"] = "differential"
+    drive: WheelDrive = "differential"
     rotation: Parameter = Parameter()
     translation: Parameter = Parameter()
     time_offset: Parameter = Parameter()
     radii: Parameter = Parameter()  # (2,) left, right [m]
-    baseline: Parameter = Parameter()  # (1,) between the wheels [m]
+    baseline: Parameter = Parameter()  # (1,) between the wheels [m]; of skid-steer the effective one
+    radius: Parameter = Parameter()  # (1,) of the driven wheel of ackermann [m]
+    wheelbase: Parameter = Parameter()  # (1,) from rear to front axle [m]
+    steering_offset: Parameter = Parameter()  # (1,) what to add to the steering angle [rad]
+    scales: Parameter = Parameter()  # (2,) what to multiply speed and yaw rate by
     wheel_noise: float = 0.03  # rad/sqrt(s): of rates at 70 Hz 0.25 rad/s each, as simulated wheels have it
+    speed_noise: float = 2e-3  # m/sqrt(s)
+    yaw_noise: float = 1e-2  # rad/sqrt(s)
+    steering_noise: float = 1e-3  # rad/sqrt(Hz): of angles at 70 Hz half a degree each
     sideways_slip: float = 5e-3  # m/sqrt(s)
     upwards_slip: float = 5e-3  # m/sqrt(s), off the ground
     factor: WheelFactor = "increments"  # relative-poses: the paper's (27)
@@ -125,8 +163,31 @@ class Wheels:
     meaning: Literal["mean", "instant"] = "mean"
     counts_per_turn: float | None = None  # of ticks, for one turn of the wheel
     counter_size: int | None = None  # the counters go back to zero after so many ticks; None: never
-    topic: str | None = None  # of its JointState; None: the one with the wheels' name, or the only one
-    joints: tuple[str, str] | None = None  # left, right in JointState; None: told by "left" and "right" in the names
+    topic: str | None = None  # of its messages; None: the one with the wheels' name, or the only one
+    joints: tuple[str, ...] | None = None  # in JointState; None: told by "left" and "right" in the names
+    ground: Ground | None = None
+
+    @property
+    def ground_height(self) -> Parameter:
+        """What the height over the ground starts from, where it is estimated."""
+        return Parameter("free", np.array([0.0 if self.ground is None else self.ground.height]))
+
+    @property
+    def kind(self) -> WheelKind:
+        """Which parameters it has: see `DRIVE_SIZES`."""
+        if self.measures == "twist":
+            return "twist"
+        return "steered" if self.drive == "ackermann" else "pair"
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Its groups beside pose and clock that the rig file treats, with how many numbers they have."""
+        return DRIVE_SIZES[self.kind]
+
+    @property
+    def knows_height(self) -> bool:
+        """Whether the group ground_height (1,) [m] is estimated."""
+        return self.ground is not None and self.ground.height_sigma is not None
 
 
 PoseKind = Literal["absolute", "relative"]

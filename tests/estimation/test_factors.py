@@ -20,6 +20,7 @@ from icalib.estimation.arrowhead import Piece, make_pieces
 from icalib.estimation.board import board_in
 from icalib.estimation.corner_factor import CornerNoise
 from icalib.estimation.corner_weights import LEAST_CURVATURE
+from icalib.estimation.ground_factor import GroundFactor
 from icalib.estimation.imu_factor import ROWS, ImuFactor
 from icalib.estimation.lidar_binning import LidarNoise
 from icalib.estimation.lidar_sweep import Motion
@@ -28,7 +29,9 @@ from icalib.estimation.prior_factor import FIRST_BIAS_SIGMA, Prior, accumulate_b
 from icalib.estimation.state import NODE, State, make_layout
 from icalib.estimation.wheel_factor import IncrementFactor, RelativePoseFactor, WheelNoise
 from icalib.geometry import so3
+from icalib.geometry.planes import plane_of
 from icalib.measurements import PoseStream
+from icalib.rig import Ground
 
 
 @dataclass(frozen=True)
@@ -262,7 +265,14 @@ def bias_prior_sample(unlike, setup_of):
     )
 
 
-def with_wheels(setup):
+DRIVES = {
+    "pair": {"radii": np.array([0.1, 0.11]), "baseline": np.array([0.45])},
+    "twist": {"scales": np.array([1.1, 0.9])},
+    "steered": {"radius": np.array([0.1]), "wheelbase": np.array([0.6]), "steering_offset": np.array([0.05])},
+}
+
+
+def with_wheels(setup, kind="pair"):
     """The setup with wheel0 in its state and border; no motion that wheels could follow, which its Jacobians need not.
 
     Readings are constant: where they are not, the time derivative of a pose between stamps is exact to the part of the
@@ -272,8 +282,7 @@ def with_wheels(setup):
         "rotation": so3.exp(np.array([0.03, -0.05, 0.4])),
         "translation": np.array([-0.2, 0.1, -0.15]),
         "time_offset": np.array([0.013]),
-        "radii": np.array([0.1, 0.11]),
-        "baseline": np.array([0.45]),
+        **DRIVES[kind],
     }
     entries = [(b.sensor, b.name, b.kind, b.size, b.start is not None) for b in setup.layout.blocks]
     entries += [("wheel0", k, "rotation" if k == "rotation" else "vector", len(v), True) for k, v in wheels.items()]
@@ -283,14 +292,19 @@ def with_wheels(setup):
     return replace(setup, layout=make_layout(entries), state=state, imu=imu)
 
 
-def wheel_sample(unlike, setup_of, factor, imu_free=False, rate_hz=70.0, loss="none", curved=False):
-    setup = with_wheels(setup_of(unlike, imu_free=imu_free))
+def wheel_sample(unlike, setup_of, factor, imu_free=False, rate_hz=70.0, loss="none", curved=False, kind="pair"):
+    setup = with_wheels(setup_of(unlike, imu_free=imu_free), kind)
     rng = np.random.default_rng(4)
     # The last stamps lie beyond the IMU's recording.
     seconds = np.arange(0.0, setup.imu.seconds[-1], 1.0 / rate_hz)
     angles = 0.2 * np.cumsum(rng.normal(size=(len(seconds), 2)), axis=0)
-    noise = WheelNoise(1.0, 0.5, 0.3, loss, LOSS_SCALE)
-    made = factor.build("wheel0", seconds, angles, setup.imu, 9.81, noise, setup.layout, setup.state)
+    if kind == "steered":
+        steer = np.cumsum(0.05 * rng.normal(size=len(seconds)))
+        others = np.stack([np.cos(steer), np.sin(steer), np.ones(len(steer))], axis=1)
+        angles = np.concatenate([angles[:, :1], np.cumsum(others, axis=0) / rate_hz], axis=1)
+    noise = WheelNoise(1.0, 0.5, 0.3, loss, LOSS_SCALE, 0.7, 0.9, 0.4)
+    own = "wheel0", seconds, angles, setup.imu, 9.81, noise, setup.layout, setup.state
+    made = factor.build(*own) if kind == "pair" else factor.build(*own, kind)
     state = setup.perturbed(rng, 0.3)
 
     def run(at):
@@ -308,6 +322,32 @@ def wheel_sample(unlike, setup_of, factor, imu_free=False, rate_hz=70.0, loss="n
         return made.accumulate(at, piece, made.output(), sums, curved)
 
     return Sample(factor.__name__, setup, state, accumulate, lambda at: run(at)[0], weights)
+
+
+def ground_sample(unlike, setup_of, plane, seen=True):
+    """Wheels that are tilted on the plane and high above it."""
+    setup = with_wheels(setup_of(unlike))
+    key = ("plane 0", "plane")
+    own = {("wheel0", "ground_height"): np.array([0.05])}
+    own |= {key: plane_of(np.array([0.1, -0.2, -1.0]), np.array([0.3, 0.2, -0.4]))} if seen else {}
+    entries = [(b.sensor, b.name, b.kind, b.size, b.start is not None) for b in setup.layout.blocks]
+    entries += [("wheel0", "ground_height", "vector", 1, True)] + ([(*key, "plane", 3, True)] if seen else [])
+    state = replace(setup.state, values=setup.state.values | own)
+    setup = replace(setup, layout=make_layout(entries), state=state)
+    ground = Ground(plane, 0.3, 0.1, 0.4, 0.2)
+    made = GroundFactor.build("wheel0", ground, (key if seen else None,), state, setup.imu, setup.layout)
+    at = setup.perturbed(np.random.default_rng(3), 0.3)
+
+    def residual(at):
+        out = made.output()
+        for piece in make_pieces(len(at.seconds), setup.layout.size):
+            made.accumulate(at, piece, out, sums=False)
+        return out.residual.ravel()
+
+    def accumulate(at, piece, sums):
+        return made.accumulate(at, piece, made.output(), sums)
+
+    return Sample("GroundFactor", setup, at, accumulate, residual, white(residual))
 
 
 def with_poses(setup, starts):
@@ -423,6 +463,17 @@ SAMPLES = {
         "IncrementFactor",
         lambda u, s, f: wheel_sample(u, s, IncrementFactor, loss="cauchy", curved=True),
     ),
+    "speed and yaw rate": ("IncrementFactor", lambda u, s, f: wheel_sample(u, s, IncrementFactor, kind="twist")),
+    "steered, intrinsics": (
+        "IncrementFactor",
+        lambda u, s, f: wheel_sample(u, s, IncrementFactor, True, kind="steered"),
+    ),
+    "steered, huber, curved": (
+        "IncrementFactor",
+        lambda u, s, f: wheel_sample(u, s, IncrementFactor, loss="huber", curved=True, kind="steered"),
+    ),
+    "ground, level": ("GroundFactor", lambda u, s, f: ground_sample(u, s, "level", False)),
+    "ground, floor": ("GroundFactor", lambda u, s, f: ground_sample(u, s, "floor")),
     "planar poses": ("RelativePoseFactor", lambda u, s, f: wheel_sample(u, s, RelativePoseFactor)),
     "planar poses, intrinsics": ("RelativePoseFactor", lambda u, s, f: wheel_sample(u, s, RelativePoseFactor, True)),
     "planar poses, huber, curved": (

@@ -70,7 +70,7 @@ def differences(found):
     """Yaw, x, y in the wheels' axes, relative radii and baseline."""
     turn = Rotation.from_matrix(R_IMU_WHEEL.T @ found.rotation).as_rotvec()
     p = R_IMU_WHEEL.T @ found.position - LEVER
-    return turn, p, found.radii / RADII - 1.0, found.baseline / BASELINE - 1.0
+    return turn, p, found.values["radii"] / RADII - 1.0, found.values["baseline"][0] / BASELINE - 1.0
 
 
 def test_without_noise_the_drive_is_exact():

@@ -95,6 +95,20 @@ def test_lidars_are_drafted_and_wheels_suggested(draft, bags):
     assert [(w.name, w.topic) for w in load_rig(path).wheels] == [("wheel0", "/joint_states")]
 
 
+def test_a_twist_is_suggested_as_one(draft, bags):
+    kind, messages = "geometry_msgs/msg/TwistStamped", bags.noise("/cam0/image_raw", SIZE)
+    for t in range(1_700_000_000_000_000_000, 1_700_000_001_000_000_000, 100_000_000):
+        none = bags.make("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
+        twist = bags.make("geometry_msgs/msg/Twist", none, none)
+        messages += [("/odom/twist", kind, t, bags.make(kind, bags.header(t, ""), twist))]
+    text, path = draft(messages)
+    fill(path)
+    commented = text.split("  # Are these wheels?")[1].splitlines()[1:5]
+    path.write_text(path.read_text().replace("\n".join(commented), "\n".join("  " + c[4:] for c in commented)))
+    (wheels,) = load_rig(path).wheels
+    assert (wheels.kind, wheels.topic) == ("twist", "/odom/twist")
+
+
 def test_poses_are_suggested(draft, bags):
     kind = "geometry_msgs/msg/PoseStamped"
     point, turn = (

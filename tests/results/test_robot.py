@@ -226,9 +226,11 @@ def test_files_and_words_without_a_camera(
     assert "camchain" not in shown and "camchain" not in (tmp_path / "calibration.yaml").read_text()
 
 
-def warnings(kind: str, ratio: float, dof: float = 300.0, sensor: str = "wheel0", noise: float | None = 0.02) -> str:
+def warnings(
+    kind: str, ratio: float, dof: float = 300.0, sensor: str = "wheel0", noise: float | None = 0.02, **wheels: Any
+) -> str:
     imu = ImuSensor("imu0", "imu0", ImuNoise(1e-4, 1e-5, 1e-3, 1e-4))
-    rig = Rig(imu, (), lidars=(Lidar("lidar0", "lidar0", noise),), wheels=(Wheels("wheel0", "wheel0"),))
+    rig = Rig(imu, (), lidars=(Lidar("lidar0", "lidar0", noise),), wheels=(Wheels("wheel0", "wheel0", **wheels),))
     return " ".join(robot_warnings(rig, [SensorFit(sensor, kind, 400, dof, ratio * dof)]))
 
 
@@ -238,6 +240,16 @@ def test_more_slip_than_allowed_is_warned_of():
     assert "pitch" in warnings("upwards slip", 4.0) and "0.06 rad/sqrt(s)" in warnings("wheels", 4.0)
     assert "relative" not in warnings("yaw", 4.0) and "the yaw of wheel0" in warnings("yaw", 4.0)
     assert warnings("sideways slip", 1.9) == "" and warnings("sideways slip", 9.0, dof=30.0) == ""
+
+
+def test_more_noise_of_other_kinds_of_wheels_is_warned_of():
+    yaw = warnings("yaw", 4.0, measures="twist")
+    assert "the yaw rates of wheel0 leave residuals 2 times" in yaw and "0.02 rad/sqrt(s) would fit." in yaw
+    assert "0.004 m/sqrt(s) would fit" in warnings("speed", 4.0, measures="twist")
+    assert "0.002 rad/sqrt(Hz) would fit, or more sideways_slip" in warnings("steering", 4.0, drive="ackermann")
+    assert "the wheel of wheel0 turned" in warnings("wheel", 4.0, drive="ackermann")
+    assert "not parallel to its ground by 2 times as much as tilt_noise" in warnings("ground tilt", 4.0)
+    assert "not at one height over its ground by 3 times as much as bump_noise" in warnings("ground height", 9.0)
 
 
 def test_more_range_noise_than_given_is_warned_of():

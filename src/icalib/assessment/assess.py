@@ -46,15 +46,19 @@ from icalib.estimation.state import Block, State
 from icalib.geometry.cameras import camera_model
 from icalib.observability import Observability, observe
 from icalib.provenance import versions
-from icalib.rig import Camera
+from icalib.rig import DRIVE_SIZES, Camera
 from icalib.rig_file import rig_to_dict
 from icalib.timeline import Timeline
 
 UNITS = {
     "rotation": "rad", "translation": "m", "time_offset": "s", "intrinsics": "px", "distortion": "", "bloom": "px",
-    "shape": "m", "tilt": "rad", "radii": "m", "baseline": "m",
+    "shape": "m", "tilt": "rad", "radii": "m", "baseline": "m", "radius": "m", "wheelbase": "m",
+    "steering_offset": "rad", "scales": "", "ground_height": "m",
 }  # fmt: skip
-LABELS = {"shape": SHAPE_LABELS, "radii": ("left", "right"), "plane": ("turn 1", "turn 2", "distance")}
+LABELS = {
+    "shape": SHAPE_LABELS, "radii": ("left", "right"), "scales": ("speed", "yaw_rate"),
+    "plane": ("turn 1", "turn 2", "distance"),
+}  # fmt: skip
 NUISANCE = ("plane", *FRAME)  # estimated along, in a world of which only gravity's direction means anything
 EXPECTED_CHI2 = (0.5, 2.0)  # chi^2 per post-fit degree of freedom outside this is worth a warning
 LARGE_FACTOR = 3.0
@@ -194,7 +198,7 @@ def _groups(
 def _unheard_of(inputs: Inputs, block: Block) -> bool:
     """Whether it belongs to wheels that report poses, in which it has no part."""
     wheels = [w.name for w in inputs.rig.wheels if w.measures == "poses"]
-    return block.sensor in wheels and block.name in ("radii", "baseline")
+    return block.sensor in wheels and block.name in DRIVE_SIZES["pair"]
 
 
 def _with_factor(formal: Verdict, loose: bool) -> Verdict:
@@ -228,7 +232,7 @@ def _sensor_fit(fit: Fit, found: Estimate) -> SensorFit:
             rms, unit = float(np.sqrt(np.mean(out.residual[used] ** 2, dtype=np.float64))), "px"
             rejected = int((~used).sum())
     for factor, out in zip(found.problem.sensors, found.outcome.residuals.sensors, strict=True):
-        if factor.name == fit.sensor:
+        if factor.name == fit.sensor and fit.kind in factor.kinds:
             rms, unit = factor.rms(out, fit.kind)
     return SensorFit(fit.sensor, fit.kind, fit.count, fit.dof, fit.chi2, rms, unit, rejected)
 

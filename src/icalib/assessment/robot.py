@@ -10,6 +10,7 @@ import numpy as np
 from icalib.calibration import LidarResiduals, Plane, PoseResiduals, SensorFit, WheelResiduals
 from icalib.estimation.assembly import Inputs, motion_of, origin_difference
 from icalib.estimation.estimate import Estimate
+from icalib.estimation.ground_factor import HEIGHT, TILT, GroundFactor
 from icalib.estimation.lidar_binning import LidarNoise, in_world
 from icalib.estimation.lidar_factor import LidarFactor
 from icalib.estimation.nodes import usable
@@ -37,7 +38,8 @@ LEAST_DOF = 3.0  # times the square root of the number of residuals
 CORRELATED, ALTERNATING = 0.5, 0.35
 CLIP = 4.0  # standard deviations
 LABELS = {"wheels": ("left", "right"), "sideways slip": ("sideways",), "upwards slip": ("upwards",)} | {
-    "yaw": ("yaw",), "path": ("forward", "sideways"),
+    "yaw": ("yaw",), "path": ("forward", "sideways"), "speed": ("speed",), "wheel": ("wheel",),
+    "steering": ("steering",),
 }  # fmt: skip
 
 
@@ -225,9 +227,21 @@ def neighbours(rows: np.ndarray) -> float:
     return float((clipped[1:] * clipped[:-1]).sum() / max((clipped**2).sum(), 1e-30))
 
 
+def ground_warnings(found: Estimate) -> Iterator[str]:
+    """Where wheels are said to stand on a floor that is not seen."""
+    for factor in found.problem.sensors:
+        if isinstance(factor, GroundFactor) and not len(factor.nodes):
+            yield (
+                f"none of the planes that LiDARs see is a floor (nearly level and below the IMU), so the ground of "
+                f"{factor.name} counts for nothing; see that a LiDAR sees it, or write plane: level."
+            )
+
+
 def lidar_warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
-    """Where few points lie on planes, planes face too few directions, or stamps are those of a scan's other end."""
+    """Where few points lie on planes, planes face too few directions, none is the floor that it must be, or stamps are
+    those of a scan's other end."""
     yield from _sight_warnings(inputs, found)
+    yield from ground_warnings(found)
     for index, (lidar, stream) in enumerate(zip(inputs.rig.lidars, inputs.measurements.lidars, strict=True)):
         stretch, std = _stretch(inputs, found, index)
         if abs(stretch) > max(STRETCHED, CLEARLY * std):
@@ -269,7 +283,7 @@ def _stretch(inputs: Inputs, found: Estimate, index: int) -> tuple[float, float]
     )
     speed = np.einsum("na,na->n", values[plane, :3], later - earlier) / (2.0 * float(HALF_STEP_S))
     by_stretch = speed * (stream.offset_s - stream.offset_s.mean(dtype=np.float64))
-    residual = _on_planes(motion, stream, values[plane])[1].astype(np.float64)
+    residual = _on_planes(*in_world(motion, stream), values[plane])[0].astype(np.float64)
     information = max(float(by_stretch @ by_stretch), 1e-30)
     return -float(by_stretch @ residual) / information, float(residual.std()) / np.sqrt(information)
 
@@ -309,7 +323,24 @@ def robot_warnings(rig: Rig, judged: list[SensorFit]) -> Iterator[str]:
             yield _wheel_words(f.kind, wheels[f.sensor], times, float(np.sqrt(ratio)))
 
 
+# Of rows of wheels: what they are, the field of the rig file that says how far off they may be, and its unit.
+_ROWS = {
+    "wheels": ("angles that {} turned leave", "wheel_noise", "rad/sqrt(s)", ", if the wheels do not slip forwards"),
+    "wheel": ("angles that the wheel of {} turned leave", "wheel_noise", "rad/sqrt(s)", ", if it does not slip"),
+    "speed": ("speeds of {} leave", "speed_noise", "m/sqrt(s)", ""),
+    "yaw": ("yaw rates of {} leave", "yaw_noise", "rad/sqrt(s)", ""),
+    "steering": ("steering angles of {} leave", "steering_noise", "rad/sqrt(Hz)", ", or more sideways_slip"),
+}
+
+
 def _wheel_words(kind: str, wheels: Wheels, times: str, root: float) -> str:
+    if kind in (TILT, HEIGHT):
+        field = "tilt_noise" if kind == TILT else "bump_noise"
+        what = "not parallel to" if kind == TILT else "not at one height over"
+        return (
+            f"{wheels.name} is {what} its ground by {times} as much as {field} in the rig file says, as where it "
+            "drives over ramps or the ground is another plane; take ground out, or part of it."
+        )
     if kind == "sideways slip":
         return (
             f"{wheels.name} slips sideways {times} as much as its sideways_slip in the rig file allows, so yaw and "
@@ -320,10 +351,11 @@ def _wheel_words(kind: str, wheels: Wheels, times: str, root: float) -> str:
             f"{wheels.name} leaves the ground {times} as much as its upwards_slip in the rig file allows, so pitch "
             f"looks better known than it is; {root * wheels.upwards_slip:.2g} m/sqrt(s) would fit."
         )
-    if kind == "wheels":
+    if kind in _ROWS and (kind, wheels.kind) != ("yaw", "pair"):  # the paper's relative poses have a yaw, too
+        what, field, unit, unless = _ROWS[kind]
         return (
-            f"the angles that {wheels.name} turned leave residuals {times} as large as its wheel_noise in the rig file "
-            f"says; {root * wheels.wheel_noise:.2g} rad/sqrt(s) would fit, if the wheels do not slip forwards."
+            f"the {what.format(wheels.name)} residuals {times} as large as its {field} in the rig file says; "
+            f"{root * getattr(wheels, field):.2g} {unit} would fit{unless}."
         )
     return (
         f"the {kind} of {wheels.name} leaves residuals {times} as large as its noise says; larger wheel_noise or "

@@ -56,7 +56,8 @@ def parameter_keys(groups: tuple[ParameterGroup, ...]) -> dict[tuple[str, str], 
     it says nothing alone."""
     count = Counter(label for g in groups for label in g.labels)
     own = {(g.name, n): n if n and count[n] == 1 else f"{g.name}_{n}".rstrip("_") for g in groups for n in g.labels}
-    return own | {("radii", side): f"radius_{side}" for name, side in own if name == "radii"}
+    one = {"radii": "radius", "scales": "scale"}
+    return own | {(name, label): f"{one[name]}_{label}" for name, label in own if name in one}
 
 
 def pose_key(c: Calibration) -> str:

@@ -187,7 +187,9 @@ def _quantities(pair: _Pair) -> Iterator[Difference]:
         if qb is None or (key == "time_offset" and not clocks):
             continue
         change, (Ca, Cb), unit, scale = qb.value - qa.value, (qa.covariance, qb.covariance), "ms", 1e3
-        if key != "time_offset":
+        if key == "steering_offset":
+            unit, scale = "deg", 180.0 / np.pi
+        elif key != "time_offset":
             relative = np.outer(1.0 / qa.value, 1.0 / qa.value)
             change, Ca, Cb, unit, scale = change / qa.value, Ca * relative, Cb * relative, "percent", 1e2
         names = (sensor, pair.a.body, qa.what)

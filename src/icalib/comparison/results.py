@@ -18,8 +18,13 @@ DENSITIES = {
     "accel": "noise density of the accelerometer",
     "accel_walk": "bias walk of the accelerometer",
 }
-_WHAT = {"time_offset": "time offset", "radii": "radius", "baseline": "baseline"}
-_LABELS = {"time_offset": ("",), "radii": ("left", "right"), "baseline": ("",)}
+_WHAT = {
+    "time_offset": "time offset", "radii": "radius", "baseline": "baseline", "radius": "radius",
+    "wheelbase": "wheelbase", "steering_offset": "steering offset", "scales": "scale",
+}  # fmt: skip
+_LABELS = {"radii": ("left", "right"), "scales": ("speed", "yaw_rate")} | {
+    name: ("",) for name in _WHAT if name not in ("radii", "scales")
+}
 
 
 def noise_quantities(imu: str, noise: dict[str, Any]) -> dict[tuple[str, str], Quantity]:

@@ -42,6 +42,8 @@ def sentence(d: Difference, c: Comparison) -> str:
             )
         case "time offset":
             words = f"the time offset of {d.sensor} changed by {_signed(d.vector[0])} ms"
+        case "steering offset":
+            words = f"the steering offset of {d.sensor} changed by {_signed(d.vector[0])} deg"
         case _:
             most = int(np.argmax(np.abs(d.vector)))
             label = f"{d.labels[most]} " if d.labels[most] else ""

@@ -28,6 +28,8 @@ from icalib.geometry import planes, so3
 UNDETERMINED_BELOW = 1e-2  # information in tolerance units: known to less than ten tolerances
 SPURIOUS_SHARE = 0.5  # a direction most of whose information is noise is not determined either
 MOST_ROUNDS = 4
+MOVED_BY_HELD = 0.1  # parts of a direction smaller than this do not count as in it
+NEAR_GUESS = 0.05  # of what the guess is worth
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,12 @@ def determine(
         del found  # before the next one takes as much memory
         found = estimate(inputs, begin, on_step, undetermined, on_visit)
         data, undetermined = _judge(inputs, found)
+    for _ in range(MOST_ROUNDS):
+        begin = _as_worth(inputs, found, replace(start, values=start.values | (guess or {})))
+        if begin is None:
+            break
+        found = estimate(inputs, begin, on_step, found.problem.held, on_visit)
+        data, _ = _judge(inputs, found)
     held = found.problem.held if found.problem.held.size else np.zeros((inputs.layout.size, 0))
     shifts = np.array([_profile(inputs, found, u) for u in held.T]).reshape(-1, inputs.layout.size)
     return Determined(found, data, held, shifts)
@@ -90,6 +98,30 @@ def _as_guessed(problem: Problem, start: State, guess: dict[Key, np.ndarray], he
     way = border_difference(problem, replace(start, values=start.values | guess), start) / problem.tolerance
     step = problem.tolerance * (held @ (held.T @ way))
     return start.retract(problem.layout, np.zeros((len(start.seconds), 15)), step)
+
+
+def _as_worth(inputs: Inputs, found: Estimate, guess: State) -> State | None:
+    """The estimate, moved along the held directions to where the guesses of all that they move have it, each by what it
+    is worth; None where the rig file says no guess is worth more than others, or it stands there already.
+
+    Where the data know only how two heights differ, and one was measured, `_as_guessed` would leave both half-way.
+    """
+    problem, state = found.problem, found.outcome.state
+    own = np.concatenate([np.empty(0, dtype=np.int64), *(p.block.columns for p in given_priors(inputs))])
+    if not problem.held.size or not np.any(np.abs(problem.held[own]) > MOVED_BY_HELD):
+        return None
+    sigma, directions = _guess_sigma(inputs), problem.tolerance[:, None] * problem.held
+    way = border_difference(problem, guess, state)
+    # What nobody guessed moves along, but nothing turns: what little a turn moves would be paid for with all of it.
+    for block in (b for b in problem.layout.free if not inputs.is_sensor(b.sensor)):
+        way[block.columns] = 0.0
+        turns = block.columns[:2] if block.kind == "plane" else block.columns
+        if block.kind != "vector":
+            sigma[turns] = GUESS_SIGMA["rotation"]
+    step = directions @ np.linalg.lstsq(directions / sigma[:, None], way / sigma, rcond=None)[0]
+    if np.linalg.norm(step / sigma) < NEAR_GUESS:
+        return None
+    return state.retract(problem.layout, np.zeros((len(state.seconds), 15)), step)
 
 
 def _judge(inputs: Inputs, found: Estimate) -> tuple[np.ndarray, np.ndarray]:

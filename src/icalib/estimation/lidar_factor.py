@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar
 
 import numpy as np
 
@@ -39,8 +38,6 @@ CHUNK = 512  # bins at a time: what a chunk needs stays in the cache
 class LidarFactor:
     """All scans of one LiDAR. node (n,), increasing: the node that each bin of `moments` hangs on; planes: keys of the
     values that the rows of the moments' planes have in a state."""
-
-    kinds: ClassVar[dict[str, slice]] = {"points": slice(0, ROWS)}
 
     name: str
     moments: Moments
@@ -79,6 +76,11 @@ class LidarFactor:
         imu = self.layout.columns(self.imu.name, "intrinsics")
         pose = self.layout.columns(self.name, "rotation", "translation", "time_offset")
         return np.concatenate([pose, imu[imu >= 0]]), np.array([self.layout.block(*p).columns for p in self.planes])
+
+    @property
+    def kinds(self) -> dict[str, slice]:
+        """See `SensorFactor`."""
+        return {"points": slice(0, ROWS)}
 
     def with_imu(self, imu: ImuData) -> LidarFactor:
         """See `SensorFactor`."""

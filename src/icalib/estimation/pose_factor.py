@@ -56,7 +56,6 @@ class AbsolutePoseFactor:
     """n poses of one sensor in its frame, see `pose_rows.absolute_rows`. node (n,), in order: of each; sigma: of its
     rotation [rad] and position [m]."""
 
-    kinds: ClassVar[dict[str, slice]] = KINDS
     units: ClassVar[dict[str, str]] = UNITS
 
     name: str
@@ -94,6 +93,11 @@ class AbsolutePoseFactor:
     def sigma(self) -> np.ndarray:
         """(n, 6) of each row."""
         return np.tile(np.repeat([self.noise.rotation, self.noise.position], 3), (len(self.seconds), 1))
+
+    @property
+    def kinds(self) -> dict[str, slice]:
+        """See `SensorFactor`."""
+        return KINDS
 
     def with_imu(self, imu: ImuData) -> AbsolutePoseFactor:
         """See `SensorFactor`."""
@@ -155,7 +159,6 @@ class RelativePosesFactor:
     """n ways of one sensor, see `pose_rows.relative_rows`, each between two of its stamps about from node to node;
     duration (n,) s. Their noise is that of a random walk, and independent."""
 
-    kinds: ClassVar[dict[str, slice]] = KINDS
     units: ClassVar[dict[str, str]] = UNITS
 
     name: str
@@ -190,6 +193,11 @@ class RelativePosesFactor:
         """(n, 6) of each row."""
         duration = self.seconds[self.intervals.last] - self.seconds[self.intervals.first]
         return np.sqrt(duration)[:, None] * np.repeat([self.noise.rotation, self.noise.position], 3)
+
+    @property
+    def kinds(self) -> dict[str, slice]:
+        """See `SensorFactor`."""
+        return KINDS
 
     def with_imu(self, imu: ImuData) -> RelativePosesFactor:
         """See `SensorFactor`."""

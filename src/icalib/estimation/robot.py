@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from icalib.estimation.ground_factor import HEIGHT_BLOCK, GroundFactor, floors
 from icalib.estimation.lidar_binning import BIN_S, LidarNoise
 from icalib.estimation.lidar_factor import LidarFactor
 from icalib.estimation.lidar_sweep import Motion
@@ -21,7 +22,7 @@ from icalib.estimation.pose_factor import (
 )
 from icalib.estimation.sensors import SensorFactor
 from icalib.estimation.state import Entry, Key, Kind, Layout
-from icalib.estimation.wheel_angles import angles_from_rates
+from icalib.estimation.wheel_angles import integrals_of
 from icalib.estimation.wheel_factor import IncrementFactor, RelativePoseFactor, WheelNoise
 from icalib.measurements import LidarStream, Measurements, PoseStream, WheelPoses, WheelStream
 from icalib.rig import Lidar, PoseSensor, Rig, Settings, Wheels
@@ -29,7 +30,6 @@ from icalib.rig import Lidar, PoseSensor, Rig, Settings, Wheels
 MOUNT: tuple[tuple[str, Kind, int], ...] = (
     ("rotation", "rotation", 3), ("translation", "vector", 3), ("time_offset", "vector", 1),
 )  # fmt: skip
-DRIVE: tuple[tuple[str, Kind, int], ...] = (("radii", "vector", 2), ("baseline", "vector", 1))
 NEAR_PLANE_M = 1e-3  # of a point's distance whatever the direction: what the model lacks where beams graze a plane
 FIRST_RANGE_M = 0.03  # of a LiDAR whose noise is not given
 LEAST_RANGE_M = 1e-3
@@ -88,9 +88,19 @@ def joined_clouds(each: Sequence[Clouds]) -> Clouds:
 
 def own_entries(sensor: Lidar | Wheels | PoseSensor) -> list[Entry]:
     """Of the border."""
-    drive = DRIVE if isinstance(sensor, Wheels) else ()
-    mute = drive if isinstance(sensor, Wheels) and sensor.measures == "poses" else ()  # of them poses say nothing
-    return [(sensor.name, *g, getattr(sensor, g[0]).mode != "fixed" and g not in mute) for g in (*MOUNT, *drive)]
+    mounts: list[Entry] = [(sensor.name, *g, getattr(sensor, g[0]).mode != "fixed") for g in MOUNT]
+    if not isinstance(sensor, Wheels):
+        return mounts
+    heard = sensor.measures != "poses"  # which say nothing of what rolls
+    height: list[Entry] = [(sensor.name, HEIGHT_BLOCK, "vector", 1, True)] if sensor.knows_height else []
+    return (
+        mounts
+        + height
+        + [
+            (sensor.name, name, "vector", n, heard and getattr(sensor, name).mode != "fixed")
+            for name, n in sensor.sizes.items()
+        ]
+    )
 
 
 def frame_entries(sensor: PoseSensor, n_recordings: int) -> list[Entry]:
@@ -192,7 +202,18 @@ def robot_factors(
         pose_factor(sensor, stream, motion, size, layout)
         for sensor, stream, size in zip(rig.poses, measurements.poses, noise.posing, strict=True)
     )
-    return (*(lidars if clouds.count else ()), *wheels, *poses)
+    return (*(lidars if clouds.count else ()), *wheels, *ground_factors(rig, clouds, motion, layout), *poses)
+
+
+def ground_factors(rig: Rig, clouds: Clouds, motion: Motion, layout: Layout) -> Iterator[GroundFactor]:
+    """Of wheels that stand on a plane; of the floor once it is seen."""
+    for wheels in rig.wheels:
+        if wheels.ground is not None:
+            state = motion.state
+            floor: tuple[Key | None, ...] = (None,) * len(state.recordings)
+            if wheels.ground.plane == "floor" and clouds.count:
+                floor = floors(state, clouds.keys, clouds.points)
+            yield GroundFactor.build(wheels.name, wheels.ground, floor, state, motion.imu, layout)
 
 
 def pose_factor(sensor: PoseSensor, stream: PoseStream, motion: Motion, noise: PoseNoise, layout: Layout) -> PoseFactor:
@@ -204,17 +225,12 @@ def wheel_factor(
     wheels: Wheels, settings: Settings, stream: WheelStream | WheelPoses, motion: Motion, layout: Layout
 ) -> IncrementFactor | RelativePoseFactor:
     noise = WheelNoise(
-        wheels.wheel_noise, wheels.sideways_slip, wheels.upwards_slip, settings.loss, settings.loss_scale
-    )
+        wheels.wheel_noise, wheels.sideways_slip, wheels.upwards_slip, settings.loss, settings.loss_scale,
+        wheels.speed_noise, wheels.yaw_noise, wheels.steering_noise,
+    )  # fmt: skip
     if isinstance(stream, WheelPoses):
         return RelativePoseFactor.of_poses(stream, motion.imu, motion.gravity, noise, layout, motion.state)
-    kind = IncrementFactor if wheels.factor == "increments" else RelativePoseFactor
-    angles = wheel_angles(stream)
-    return kind.build(
-        wheels.name, stream.seconds, angles, motion.imu, motion.gravity, noise, layout, motion.state
-    )  # fmt: skip
-
-
-def wheel_angles(stream: WheelStream) -> np.ndarray:
-    """(N, 2) rad that both wheels have turned since the first stamp."""
-    return angles_from_rates(stream.seconds, stream.rate, stream.meaning)
+    own = wheels.name, stream.seconds, integrals_of(stream), motion.imu, motion.gravity, noise, layout, motion.state
+    if wheels.factor == "relative-poses":
+        return RelativePoseFactor.build(*own)
+    return IncrementFactor.build(*own, stream.kind)

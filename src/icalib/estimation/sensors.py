@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -30,7 +30,8 @@ class SensorFactor(Protocol):
     """All measurements of one sensor. kinds: rows of its residuals by name; imu: the readings that carry it from nodes
     to its own instants."""
 
-    kinds: ClassVar[dict[str, slice]]
+    @property
+    def kinds(self) -> dict[str, slice]: ...
 
     @property
     def name(self) -> str: ...

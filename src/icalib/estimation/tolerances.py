@@ -14,7 +14,8 @@ from icalib.rig import Settings
 # would be left to it.
 GUESS_SIGMA = {
     "rotation": 0.1, "translation": 0.1, "time_offset": 0.01, "intrinsics": 15.0, "distortion": 0.1, "bloom": 1.0,
-    "shape": 1e-3, "tilt": 10.0, "radii": 0.01, "baseline": 0.05, "plane": 10.0,
+    "shape": 1e-3, "tilt": 10.0, "radii": 0.01, "baseline": 0.05, "plane": 10.0, "radius": 0.01,
+    "wheelbase": 0.1, "steering_offset": 0.1, "scales": 0.1, "ground_height": 0.1,
     "frame_rotation": 10.0, "frame_translation": 10.0,
 }  # fmt: skip
 OTHER_SIGMA = 0.1  # of IMU intrinsics
@@ -34,6 +35,11 @@ class Tolerances:
     tilt: float = np.deg2rad(0.1)
     radii: float = 1e-4
     baseline: float = 1e-3
+    radius: float = 1e-4
+    wheelbase: float = 2e-3
+    steering_offset: float = np.deg2rad(0.1)
+    ground_height: float = 5e-3
+    scales: float = 1e-3
     # Of normal and distance: wide, so that what is open is told in words of the sensors that it is open for.
     plane: tuple[float, float, float] = (np.deg2rad(10.0), np.deg2rad(10.0), 0.5)
     # Of where the frame of a pose sensor stands: wide, too.

@@ -1,4 +1,4 @@
-"""What wheels have turned: angles from rates."""
+"""What wheels have turned, and what else is summed up of their readings: integrals from rates."""
 
 from __future__ import annotations
 
@@ -6,11 +6,14 @@ from typing import Literal
 
 import numpy as np
 
+from icalib.measurements import WheelStream
+
 RateReading = Literal["mean", "instant"]
+STEEPEST_RAD = 1.55  # beyond it a wheel stands across the vehicle
 
 
 def angles_from_rates(seconds: np.ndarray, rates: np.ndarray, reading: RateReading) -> np.ndarray:
-    """(N, 2) rad that both wheels have turned since the first stamp, from their rates (N, 2) rad/s at seconds (N,).
+    """(N, m) integrals since the first stamp of rates (N, m) at seconds (N,): of wheels [rad/s] the angles turned.
 
     A rate is the "mean" over the period that ends at its stamp, as drivers that difference ticks publish it, or the
     value at the "instant" of its stamp (trapezoid). Taken for the other, it is late or early by half a period.
@@ -19,3 +22,15 @@ def angles_from_rates(seconds: np.ndarray, rates: np.ndarray, reading: RateReadi
     angles = np.zeros_like(rates, dtype=np.float64)
     np.cumsum(mean * np.diff(seconds)[:, None], axis=0, out=angles[1:])
     return angles
+
+
+def integrals_of(stream: WheelStream) -> np.ndarray:
+    """What the increment factor asks of a stream, since the first stamp. pair: (N, 2) rad that both wheels have turned;
+    twist: (N, 2) path [m] and yaw [rad]; steered: (N, 4) rad that the driven wheel has turned, and the integrals of
+    cos and sin of the steering angle [s] and of the square of the rate at which the wheel turns over cos [rad^2/s]."""
+    whole = angles_from_rates(stream.seconds, stream.rate, stream.meaning)
+    if stream.kind != "steered":
+        return whole
+    rate, steer = stream.rate[:, 0], np.clip(stream.rate[:, 1], -STEEPEST_RAD, STEEPEST_RAD)
+    others = np.stack([np.cos(steer), np.sin(steer), (rate / np.cos(steer)) ** 2], axis=1)
+    return np.concatenate([whole[:, :1], angles_from_rates(stream.seconds, others, "instant")], axis=1)

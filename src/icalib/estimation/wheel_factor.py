@@ -1,14 +1,15 @@
-"""Wheels of a differential drive against the motion between neighbouring nodes: two factors.
+"""Wheels against the motion between neighbouring nodes: two factors.
 
-`IncrementFactor`, the default: what each wheel has turned, and that the vehicle moves neither sideways nor off the
-ground beyond a slip density. `RelativePoseFactor`: paper (27)-(28), a planar pose integrated from the wheels.
+`IncrementFactor`, the default: what the wheels have turned, or what is reported of speed and yaw rate, and that the
+vehicle moves neither sideways nor off the ground beyond a slip density. `RelativePoseFactor`: paper (27)-(28), a planar
+pose integrated from a left and a right wheel.
 
 Both look at stretches between two fixed instants of the wheels' clock (`wheel_intervals`). Only where these lie on the
 clock of the IMU, and so the states' poses there, moves with the time offset.
 
-The frame of the wheels has x forward, y to the left, z up, its origin midway between them. Their parameters are the
-blocks rotation, translation (R_imu_wheel, p_imu_wheel), time_offset, radii (left, right) and baseline, the distance
-between the wheels.
+The frame of the wheels has x forward, y to the left, z up, its origin midway between those of the axle that is not
+steered. Their parameters are the blocks rotation, translation (R_imu_wheel, p_imu_wheel), time_offset, and those of
+their kind: of a pair radii (left, right) and baseline, the distance between the wheels; see `wheel_drives`.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from icalib.estimation.poses import Poses, motion_at, poses_at
 from icalib.estimation.row_sums import Into, Weighing, add_rows
 from icalib.estimation.sensors import Whitened
 from icalib.estimation.state import Layout, State
+from icalib.estimation.wheel_drives import KINDS, N_DRIVE, UNITS, Kinds, coefficients
 from icalib.estimation.wheel_intervals import (
     Instants,
     WheelIntervals,
@@ -32,6 +34,7 @@ from icalib.estimation.wheel_intervals import (
     quadrature,
 )
 from icalib.estimation.wheel_kernels import (
+    N_OWN,
     Rows,
     Track,
     Wheels,
@@ -40,27 +43,32 @@ from icalib.estimation.wheel_kernels import (
 )
 from icalib.estimation.wheel_poses import RelativePoses, preintegrated
 from icalib.measurements import WheelPoses
+from icalib.rig import DRIVE_SIZES, WheelKind
 
-OWN = ("rotation", "translation", "time_offset", "radii", "baseline")
+MOUNTED = ("rotation", "translation", "time_offset")
 
 
 @dataclass(frozen=True)
 class WheelNoise:
     """Densities: of each wheel's angle, rad/sqrt(s); of slip sideways and off the ground, m/sqrt(s). The robust loss of
-    each whitened row, and where it bends, in standard deviations."""
+    each whitened row, and where it bends, in standard deviations. Of the path [m/sqrt(s)] and the yaw [rad/sqrt(s)]
+    that a twist reports, and of a steering angle [rad/sqrt(Hz)]."""
 
     wheel: float
     sideways: float = 5e-3
     upwards: float = 5e-3
     loss: str = "none"
     loss_scale: float = 2.5
+    speed: float = 2e-3
+    yaw: float = 1e-2
+    steering: float = 1e-3
 
 
 @dataclass(frozen=True)
 class IncrementFactor:
-    """Both wheels' increments over n intervals. With Theta = Log(R(s_0)^T R(s_1)), D the integral of R(t)^T v(t) along
-    the `inertial` scheme, X = R_wheel_imu (D + Theta x p_imu_wheel) and T = R_wheel_imu Theta, the rows of an interval
-    of length dt are
+    """Increments over n intervals. With Theta = Log(R(s_0)^T R(s_1)), D the integral of R(t)^T v(t) along the
+    `inertial` scheme, X = R_wheel_imu (D + Theta x p_imu_wheel) and T = R_wheel_imu Theta, the rows of an interval of
+    length dt are those of `wheel_drives`; of a pair
 
         (e_1 X -+ b/2 e_3 T) / r - turned, over wheel sqrt(dt)     left, right
         e_2 X, e_3 X, over sideways sqrt(dt), upwards sqrt(dt)
@@ -69,14 +77,11 @@ class IncrementFactor:
     where a vehicle on a ramp turns at 1 rad/s and pitches at 1 rad/s^2, over 50 ms.
     """
 
-    kinds: ClassVar[dict[str, slice]] = {
-        "wheels": slice(0, 2), "sideways slip": slice(2, 3), "upwards slip": slice(3, 4),
-    }  # fmt: skip
-    units: ClassVar[dict[str, str]] = {"wheels": "rad", "sideways slip": "m", "upwards slip": "m"}
-
     name: str
+    kind: WheelKind
     intervals: WheelIntervals
     measured: np.ndarray  # (n, 4): what the wheels turned, rad; slip, which nobody measured: 0 m
+    mean: np.ndarray  # (n, m - 1): see `coefficients`
     whitening: np.ndarray  # (n, 4, 4)
     instants: Instants
     imu: ImuData
@@ -84,27 +89,41 @@ class IncrementFactor:
     noise: WheelNoise
     layout: Layout
 
+    @property
+    def kinds(self) -> Kinds:
+        return KINDS[self.kind]
+
+    @property
+    def units(self) -> dict[str, str]:
+        return UNITS
+
     @classmethod
     def build(
         cls,
         name: str,
         seconds: np.ndarray,
-        angles: np.ndarray,
+        integrals: np.ndarray,
         imu: ImuData,
         gravity: float,
         noise: WheelNoise,
         layout: Layout,
         state: State,
+        kind: WheelKind = "pair",
     ) -> IncrementFactor:
-        """From angles (N, 2) rad that the wheels, left and right, have turned at stamps seconds (N,) since the first on
-        the wheels' clock. Chooses the intervals at the time offset and the nodes of `state`."""
+        """From `integrals_of` (N, m), of a pair the angles in rad that the left and the right wheel have turned, at
+        stamps seconds (N,) since the first on the wheels' clock. Chooses the intervals at the time offset and the nodes
+        of `state`."""
         found = wheel_intervals(name, seconds, imu, state)
-        scale = np.array([noise.wheel, noise.wheel, noise.sideways, noise.upwards])
-        root_dt = np.sqrt(seconds[found.last] - seconds[found.first])
-        whitening = np.eye(4) / (scale * root_dt[:, None])[:, :, None]
-        measured = np.zeros((len(root_dt), 4))
-        measured[:, :2] = angles[found.last] - angles[found.first]
-        return cls(name, found, measured, whitening, quadrature(seconds, found), imu, gravity, noise, layout)
+        dt = seconds[found.last] - seconds[found.first]
+        whole = integrals[found.last] - integrals[found.first]
+        sigma = _row_sigma(kind, noise, dt, whole, drive_of(name, state, kind))
+        whitening = np.eye(4) / sigma[:, :, None]
+        measured = np.zeros((len(dt), 4))
+        n_measured = 1 if kind == "steered" else 2
+        measured[:, :n_measured] = whole[:, :n_measured]
+        mean = whole[:, 1:] / dt[:, None]
+        instants = quadrature(seconds, found)
+        return cls(name, kind, found, measured, mean, whitening, instants, imu, gravity, noise, layout)
 
     def with_imu(self, imu: ImuData) -> IncrementFactor:
         """See `SensorFactor`."""
@@ -143,10 +162,12 @@ class IncrementFactor:
         free = self.layout.is_free(self.imu.name, "intrinsics")
         poses, moving = motion_at(times, node, state, self.imu, self.gravity, free)
         rows = Rows.empty(len(start) - 1, 4, poses.by_imu.shape[2], sums)
-        wheels = _wheels(self.name, state)
+        wheels = _wheels(self.name, state, self.kind)
+        c = coefficients(self.kind, wheels.drive, self.mean[own])
         increment_rows(
-            start - start[0], self.instants.weight[seen], _track(node, poses), moving, wheels, self.measured[own], rows
-        )
+            start - start[0], self.instants.weight[seen], _track(node, poses), moving, wheels, c, self.measured[own],
+            rows,
+        )  # fmt: skip
         return _add(self, own, rows, self.whitening, Into(piece, out, sums, curved, noise))
 
 
@@ -163,7 +184,7 @@ class RelativePoseFactor:
     variables): the shorter the intervals, the more.
     """
 
-    kinds: ClassVar[dict[str, slice]] = {"yaw": slice(0, 1), "path": slice(1, 3)}
+    kind: ClassVar[WheelKind] = "pair"
     units: ClassVar[dict[str, str]] = {"yaw": "rad", "path": "m"}
 
     name: str
@@ -208,6 +229,11 @@ class RelativePoseFactor:
         poses = preintegrated(seconds, angles, found, drive_of(name, state), noise.wheel, noise.sideways)
         return cls(name, seconds, found, poses, imu, gravity, noise, layout)
 
+    @property
+    def kinds(self) -> dict[str, slice]:
+        """See `SensorFactor`."""
+        return {"yaw": slice(0, 1), "path": slice(1, 3)}
+
     def with_imu(self, imu: ImuData) -> RelativePoseFactor:
         """See `SensorFactor`."""
         return replace(self, imu=imu)
@@ -241,7 +267,7 @@ class RelativePoseFactor:
         free = self.layout.is_free(self.imu.name, "intrinsics")
         poses = poses_at("inertial", times, node, state, self.imu, self.gravity, free)
         rows = Rows.empty(len(times) // 2, 3, poses.by_imu.shape[2], sums)
-        relative_rows(_track(node, poses), _wheels(self.name, state), z.z[own], z.J[own], z.drive0, rows)
+        relative_rows(_track(node, poses), _wheels(self.name, state, self.kind), z.z[own], z.J[own], z.drive0, rows)
         return _add(self, own, rows, z.W, Into(piece, out, sums, curved, noise))
 
 
@@ -250,18 +276,35 @@ def wheel_intervals(name: str, seconds: np.ndarray, imu: ImuData, state: State) 
     return choose_intervals(imu, state.seconds, state.starts, seconds + _offset(name, state))
 
 
-def drive_of(name: str, state: State) -> np.ndarray:
-    """(3,) left radius, right radius, baseline [m] of the wheels `name`."""
-    return np.concatenate([state.values[name, "radii"], state.values[name, "baseline"]])
+def drive_of(name: str, state: State, kind: WheelKind = "pair") -> np.ndarray:
+    """(3,) parameters of the wheels `name` beside pose and clock, in the order of `DRIVE_SIZES`, zeros after the last:
+    of a pair left radius, right radius, baseline [m]."""
+    found = np.concatenate([state.values[name, group] for group in DRIVE_SIZES[kind]])
+    return np.concatenate([found, np.zeros(N_DRIVE - len(found))])
+
+
+def _row_sigma(kind: WheelKind, noise: WheelNoise, dt: np.ndarray, whole: np.ndarray, drive: np.ndarray) -> np.ndarray:
+    """(n, 4) standard deviations of the rows of intervals of dt (n,) s, over which the integrals are whole (n, m).
+
+    The front wheels of a steered vehicle slip sideways as the rear ones do; and by an angle that is off, the way of the
+    front axle, at v / cos(angle), goes aside.
+    """
+    first, second = {"pair": (noise.wheel, noise.wheel), "twist": (noise.speed, noise.yaw)}.get(
+        kind, (noise.wheel, noise.sideways)
+    )
+    sigma = np.array([first, second, noise.sideways, noise.upwards]) * np.sqrt(dt)[:, None]
+    if kind == "steered":
+        sigma[:, 1] = np.hypot(sigma[:, 1], noise.steering * drive[0] * np.sqrt(whole[:, 3]))
+    return sigma
 
 
 def _offset(name: str, state: State) -> float:
     return float(state.values[name, "time_offset"][0])
 
 
-def _wheels(name: str, state: State) -> Wheels:
+def _wheels(name: str, state: State, kind: WheelKind) -> Wheels:
     rotation = np.ascontiguousarray(state.values[name, "rotation"])
-    return Wheels(rotation, state.values[name, "translation"], drive_of(name, state))
+    return Wheels(rotation, state.values[name, "translation"], drive_of(name, state, kind))
 
 
 def _track(node: np.ndarray, poses: Poses) -> Track:
@@ -284,5 +327,6 @@ def _add(
 ) -> float:
     """Adds the rows of intervals `own`."""
     by = Weighing(whitening[own], factor.noise.loss, factor.noise.loss_scale)
-    columns = factor.layout.columns(factor.name, *OWN)
+    columns = factor.layout.columns(factor.name, *MOUNTED, *DRIVE_SIZES[factor.kind])
+    columns = np.concatenate([columns, np.full(N_OWN - len(columns), -1)])
     return add_rows(rows, own, factor.intervals.node[own], columns, factor.layout, factor.imu, by, into)

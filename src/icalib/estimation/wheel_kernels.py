@@ -19,11 +19,12 @@ from icalib.estimation.interval_sums import add_interval
 from icalib.geometry import so3
 from icalib.geometry.small import tmul3
 
-N_OWN = 10  # border columns of the wheels: rotation 3, translation 3, time offset 1, radii 2, baseline 1
+N_OWN = 10  # border columns of the wheels: rotation 3, translation 3, time offset 1, up to three of the drive
 
 
 class Wheels(NamedTuple):
-    """R_imu_wheel (3, 3), p_imu_wheel (3,) m, drive (3,): left and right radius, baseline [m]."""
+    """R_imu_wheel (3, 3), p_imu_wheel (3,) m, drive (3,): its own parameters, of a pair left and right radius and
+    baseline [m]; see `wheel_drives`."""
 
     R: np.ndarray
     p: np.ndarray
@@ -162,36 +163,38 @@ def _fill_row(i, q, gX, gT, aY, aT, X, T, M0, M1, Mc, rows):
 
 
 @njit(cache=True, nogil=True)
-def _drive_rows(wheels):
-    """Of the increment factor's four rows: g_X, g_T (4, 3) in wheel axes, and a_Y, a_T (4, 3) in those of the IMU.
-
-    Y = D + Theta x p, so that a_T = R g_T + p x a_Y.
-    """
-    gX, gT, aY, aT = np.zeros((4, 3)), np.zeros((4, 3)), np.zeros((4, 3)), np.zeros((4, 3))
-    r_l, r_r, b = wheels.drive
-    gX[0, 0], gT[0, 2] = 1.0 / r_l, -0.5 * b / r_l
-    gX[1, 0], gT[1, 2] = 1.0 / r_r, 0.5 * b / r_r
-    gX[2, 1] = gX[3, 2] = 1.0
-    for q in range(4):
-        _add(wheels.R, gX[q], 1.0, 1, aY[q])
-        _add(wheels.R, gT[q], 1.0, 1, aT[q])
-        aT[q] += _cross(wheels.p, aY[q])
-    return gX, gT, aY, aT
+def _in_imu_axes(wheels, gX, gT, aY, aT):
+    """Of a row g_X, g_T (3,) in wheel axes: a_Y, a_T (3,) in those of the IMU. Y = D + Theta x p, so that
+    a_T = R g_T + p x a_Y."""
+    aY[:], aT[:] = 0.0, 0.0
+    _add(wheels.R, gX, 1.0, 1, aY)
+    _add(wheels.R, gT, 1.0, 1, aT)
+    aT += _cross(wheels.p, aY)
 
 
 @njit(cache=True, nogil=True)
-def increment_rows(start, weights, track, moving, wheels, measured, rows):
-    """Rows of n increments, not whitened: left and right wheel [rad], slip sideways and upwards [m].
+def _by_drive(i, q, by_X, by_T, X, T, rows):
+    """Derivatives of row q of interval i by the drive's parameters, from by_X, by_T (3, 3) of its coefficients."""
+    for d in range(3):
+        s = 0.0
+        for k in range(3):
+            s += by_X[d, k] * X[k] + by_T[d, k] * T[k]
+        rows.by_border[i, q, 7 + d] = s
 
-    start (n + 1,), weights (m,): see Instants; track, moving: motion at these instants; measured (n, 4).
+
+@njit(cache=True, nogil=True)
+def increment_rows(start, weights, track, moving, wheels, c, measured, rows):
+    """Four rows of each of n increments, not whitened, see `wheel_drives`.
+
+    start (n + 1,), weights (m,): see Instants; track, moving: motion at these instants; c: Coefficients; measured
+    (n, 4).
     """
-    gX, gT, aY, aT = _drive_rows(wheels)
     wanted = len(rows.by_node) > 0
     n_c = 1 + track.by_imu.shape[2]
     M0, M1, Mc, D = np.empty((6, 15)), np.empty((6, 15)), np.empty((6, n_c)), np.empty(3)
-    X, T = np.empty(3), np.empty(3)
+    X, T, aY, aT = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(len(start) - 1):
-        a, b = start[i], start[i + 1] - 1
+        a, b, g = start[i], start[i + 1] - 1, min(i, len(c.X) - 1)
         M0[:], M1[:], Mc[:], D[:], X[:], T[:] = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for j in range(a + 1, b):
             _add_travel(
@@ -204,17 +207,16 @@ def increment_rows(start, weights, track, moving, wheels, measured, rows):
         for q in range(4):
             s = 0.0
             for k in range(3):
-                s += gX[q, k] * X[k] + gT[q, k] * T[k]
+                s += c.X[g, q, k] * X[k] + c.T[g, q, k] * T[k]
             rows.residual[i, q] = s - measured[i, q]
             if not wanted:
                 continue
-            _fill_row(i, q, gX[q], gT[q], aY[q], aT[q], X, T, M0, M1, Mc, rows)
-            lever = _cross(aY[q], theta)
+            _in_imu_axes(wheels, c.X[g, q], c.T[g, q], aY, aT)
+            _fill_row(i, q, c.X[g, q], c.T[g, q], aY, aT, X, T, M0, M1, Mc, rows)
+            lever = _cross(aY, theta)
             for k in range(3):
                 rows.by_border[i, q, 3 + k] = lever[k]
-            if q < 2:
-                rows.by_border[i, q, 7 + q] = -s / wheels.drive[q]
-                rows.by_border[i, q, 9] = (0.5 if q else -0.5) * T[2] / wheels.drive[q]
+            _by_drive(i, q, c.by_X[g, q], c.by_T[g, q], X, T, rows)
 
 
 @njit(cache=True, nogil=True)

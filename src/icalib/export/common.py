@@ -103,6 +103,18 @@ def time_offsets(c: Calibration, names: Sequence[str]) -> list[str]:
     return [f"the time offset of {name} ({1e3 * groups[name]:+.3f} ms)" for name in names if groups.get(name)]
 
 
+def drives(c: Calibration) -> list[str]:
+    """What wheels have beside pose and clock, as "radii and baseline of wheel0"."""
+    found = []
+    for name in c.wheels:
+        own = [
+            g.name for g in c.groups if g.sensor == name and g.name not in ("rotation", "translation", "time_offset")
+        ]
+        words = [group.replace("_", " ") for group in own]
+        found += [f"{', '.join(words[:-1])}{' and ' if words[1:] else ''}{words[-1]} of {name}"] if words else []
+    return found
+
+
 def imu_intrinsics(c: Calibration) -> list[str]:
     """Words for the IMU's scale and misalignment, where they were estimated or given."""
     found = any((g.sensor, g.name) == (c.imu, "intrinsics") and g.value.any() for g in c.groups)

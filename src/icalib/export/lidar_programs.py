@@ -28,8 +28,10 @@ def mins(c: Calibration) -> Export:
     imu = need_imu(c, "MINS")
     lenses = {name: lens_of(c, name, "MINS", tuple(MODELS)) for name in c.cameras}
     sentences = tuple(lens.sentence for lens in lenses.values() if lens.sentence)
-    sentences += no_place_for("MINS", [*imu_intrinsics(c), *c.wheels[1:], *c.pose_sensors])
-    sentences += guesses(c, [*c.cameras, *c.lidars, *c.wheels[:1]])
+    pairs = [name for name in c.wheels if (name, "radii") in ((g.sensor, g.name) for g in c.groups)]
+    away = [name for name in c.wheels if name not in pairs[:1]]
+    sentences += no_place_for("MINS", [*imu_intrinsics(c), *away, *c.pose_sensors])
+    sentences += guesses(c, [*c.cameras, *c.lidars, *pairs[:1]])
     noise = c.rig["sensors"][imu]["noise"]
     fields = {"accel_noise": "accel", "accel_bias": "accel_walk", "gyro_noise": "gyro", "gyro_bias": "gyro_walk"}
     imu_data = {theirs: float(noise[ours]) for theirs, ours in fields.items()} | {"topic": topic(c, imu, f"/{imu}")}
@@ -51,8 +53,8 @@ def mins(c: Calibration) -> Export:
             for i, name in enumerate(c.lidars)
         }
         files["config_lidar.yaml"] = _file(_said("lidar", "LiDAR", c.lidars), lidars, sentences)
-    if c.wheels:
-        files["config_wheel.yaml"] = _wheels(c, c.wheels[0], sentences)
+    if pairs:
+        files["config_wheel.yaml"] = _wheels(c, pairs[0], sentences)
     return Export(files, sentences)
 
 

@@ -10,6 +10,7 @@ from icalib.calibration import Calibration
 from icalib.export.common import (
     Export,
     Lens,
+    drives,
     guesses,
     imu_intrinsics,
     lens_of,
@@ -58,7 +59,7 @@ def ros2_static(c: Calibration, frames: Mapping[str, str]) -> Export:
     """static_transforms.launch.py. frames: sensor -> frame, where the two differ."""
     others = [name for name in c.mounted if name != c.body]
     offsets, lenses = time_offsets(c, others), [f"the lens of {name}" for name in c.cameras]
-    wheels = [f"radii and baseline of {name}" for name in c.wheels]
+    wheels = drives(c)
     sentences = no_place_for("tf", [*offsets, *lenses, *wheels, *imu_intrinsics(c)]) + guesses(c, c.mounted)
     parent = frames.get(c.body, c.body)
     comments = [

@@ -13,6 +13,7 @@ import numpy as np
 from icalib.calibration import Calibration
 from icalib.export.common import (
     Export,
+    drives,
     guesses,
     imu_intrinsics,
     inverse,
@@ -138,7 +139,7 @@ def _attribute(tag: bytes, name: str, value: str) -> bytes:
 
 def _left_out(c: Calibration) -> tuple[str, ...]:
     away = time_offsets(c, c.mounted) + [f"the lens of {name}" for name in c.cameras]
-    away += [f"radii and baseline of {name}" for name in c.wheels] + imu_intrinsics(c)
+    away += drives(c) + imu_intrinsics(c)
     return no_place_for("URDF", away) + guesses(c, c.mounted)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.first_guess.by_recording import with_points
-from icalib.first_guess.lidar_odometry import MOST_MAPPED, LidarPath, lidar_path
+from icalib.first_guess.lidar_odometry import MOST_MAPPED, LidarPath, lidar_path, scans_of
 from icalib.geometry import so3
 from icalib.measurements import LidarStream, Measurements
 
@@ -126,7 +126,7 @@ def _path_without(stream: LidarStream, steady: np.ndarray) -> LidarPath | None:
     kept[::step] = True
     kept[steady] = False
     try:
-        return lidar_path(with_points(stream, kept))
+        return lidar_path(stream.name, scans_of(with_points(stream, kept)))
     except EstimationError:
         return None
 

@@ -8,10 +8,12 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation.assembly import Inputs, motion_of
+from icalib.estimation.ground_factor import HEIGHT_BLOCK
 from icalib.estimation.lidar_sweep import Motion
 from icalib.estimation.poses import assign_nodes, poses_at
-from icalib.estimation.robot import DRIVE, MOUNT, wheel_angles
+from icalib.estimation.robot import MOUNT
 from icalib.estimation.state import Key, State
+from icalib.estimation.wheel_angles import integrals_of
 from icalib.first_guess.from_tracks import lens_start
 from icalib.first_guess.lidar_rounds import given, lidar_values, near_nodes, with_lidars
 from icalib.first_guess.poses import pose_values
@@ -62,26 +64,23 @@ def given_cameras(inputs: Inputs) -> dict[Key, np.ndarray] | None:
 
 
 def _wheels(inputs: Inputs, state: State, wheels: Wheels, stream: WheelStream | WheelPoses) -> dict[Key, np.ndarray]:
-    names = [name for name, _, _ in (*MOUNT, *DRIVE)]
+    names = [name for name, _, _ in MOUNT] + list(wheels.sizes) + ([HEIGHT_BLOCK] if wheels.knows_height else [])
     known = given(inputs, wheels, names)
     if isinstance(stream, WheelPoses):
-        known |= {(wheels.name, name): np.ones(n) for name, _, n in DRIVE}
+        known |= {(wheels.name, name): np.ones(n) for name, n in wheels.sizes.items()}
     if len(known) == len(names):
         return known
     assert inputs.imu is not None
     if isinstance(stream, WheelPoses):
         return _posing(inputs, state, stream, known.get((wheels.name, "time_offset"))) | known
-    rates = wheel_rates(wheels.name, stream.seconds, wheel_angles(stream))
+    rates = wheel_rates(wheels.name, stream.seconds, integrals_of(stream), stream.kind)
     up = np.einsum("nji,j->i", state.rotation, [0.0, 0.0, 1.0])
     offset = known.get((wheels.name, "time_offset"))
     if offset is None:
         offset = np.array([wheel_offset(inputs.imu, up, wheels.name, rates)])
     inside, rate, velocity = _means(motion_of(inputs, state), rates.start, rates.end, offset[0])
-    drive = drive_guess(wheels.name, rates.rate[inside], rate, velocity, up)
-    found = {
-        "rotation": drive.rotation, "translation": drive.position, "time_offset": offset,
-        "radii": drive.radii, "baseline": np.array([drive.baseline]),
-    }  # fmt: skip
+    drive = drive_guess(wheels.name, rates.rate[inside], rate, velocity, up, stream.kind)
+    found = {"rotation": drive.rotation, "translation": drive.position, "time_offset": offset} | drive.values
     return {(wheels.name, name): value for name, value in found.items()} | known
 
 

@@ -1,10 +1,12 @@
-"""A differential drive from rates and velocities: time offset by correlation, the rest linearly.
+"""Wheels from rates and velocities: time offset by correlation, the rest linearly.
 
 The frame of the wheels stands level here, its z along `up`; roll, pitch and height are left to the estimate. In the
 plane across `up` the origin of the wheels, p_imu_wheel = l_1 e_1 + l_2 e_2, moves along e_1 alone:
 
     e_2 u + l_1 w = 0                      (no slip)      u, w: velocity and rate of the IMU across and along `up`
-    r theta' = e_1 u - (l_2 -+ b/2) w      (right, left)
+    r theta' = e_1 u - (l_2 -+ b/2) w      (right, left of a pair; b = 0 of the driven wheel of a steered vehicle)
+    s_v v' = e_1 u - l_2 w,  s_w w' = w    (speed and yaw rate of a twist)
+    v sin(d) = L w cos(d)                  (front axle; v = r theta', d: steering angle + offset)
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ import numpy as np
 from icalib.errors import EstimationError
 from icalib.estimation.imu_data import ImuData
 from icalib.first_guess.correlation import best_shift
+from icalib.rig import WheelKind
 
 GRID_HZ = 100.0
 SHORTEST_OVERLAP_S = 4.0
@@ -29,30 +32,59 @@ STILL_SHARE = 0.02  # of the other wheel's rate
 RADII_M = (0.005, 5.0)
 LEAST_SHARE = 0.02  # of speed and turning that does not go with the other
 ROUNDS = 8
+SCALES = 0.5, 2.0
+KMH, DEGREE = 1.0 / 3.6, np.pi / 180.0
+NEARLY = 0.1  # of a scale that is that of a unit
+STEERS_RAD = 1.2  # offsets beyond are none
+
+OPPOSITE: dict[WheelKind, str] = {
+    "pair": "its left and right wheels are swapped, or both count backwards; swap their columns or topics, or change "
+    "the sign of both",
+    "twist": "its yaw rate must be positive to the left; change its sign",
+    "steered": "its steering angle must be positive to the left and its wheel turn forwards; change the sign that is "
+    "wrong",
+}
 
 
 @dataclass(frozen=True)
 class WheelRates:
-    """Mean rates of both wheels (n, 2) rad/s, left and right, from start to end (n,) s on the wheels' clock."""
+    """Means from start to end (n,) s on the wheels' clock of the rates (n, m) of what `integrals_of` has, by kind: of a
+    pair those of both wheels, rad/s, left and right."""
 
     start: np.ndarray
     end: np.ndarray
     rate: np.ndarray
+    kind: WheelKind = "pair"
+
+    @property
+    def turning(self) -> np.ndarray:
+        """(n, k) of which some sum is the yaw rate; of steered wheels to first order in their offset."""
+        if self.kind == "pair":
+            return self.rate
+        if self.kind == "twist":
+            return self.rate[:, 1:]
+        return self.rate[:, :1] * np.concatenate(
+            [np.ones((len(self.rate), 1)), self.rate[:, 2:3] / np.maximum(self.rate[:, 1:2], 1e-3)], axis=1
+        )
+
+    @property
+    def turn(self) -> np.ndarray:
+        """(n,) about what the yaw rate is, to scale."""
+        return self.turning[:, -1] - (self.turning[:, 0] if self.kind == "pair" else 0.0)
 
 
 @dataclass(frozen=True)
 class DriveGuess:
-    """R_imu_wheel, p_imu_wheel (3,) m across `up`, radii (2,) left and right [m], baseline [m]."""
+    """R_imu_wheel, p_imu_wheel (3,) m across `up`; values of the groups of the wheels' kind, by name."""
 
     rotation: np.ndarray
     position: np.ndarray
-    radii: np.ndarray
-    baseline: float
+    values: dict[str, np.ndarray]
 
 
-def wheel_rates(name: str, seconds: np.ndarray, angles: np.ndarray) -> WheelRates:
-    """Of the wheels `name`, over windows of about WINDOW_S, one from each of the stamps seconds (N,); angles (N, 2) rad
-    that they have turned. Raises EstimationError where there are hardly any."""
+def wheel_rates(name: str, seconds: np.ndarray, integrals: np.ndarray, kind: WheelKind = "pair") -> WheelRates:
+    """Of the wheels `name`, over windows of about WINDOW_S, one from each of the stamps seconds (N,); integrals (N, m)
+    as `integrals_of` has them. Raises EstimationError where there are hardly any."""
     a = np.arange(len(seconds))
     b = np.searchsorted(seconds, seconds + WINDOW_S - 1e-9)
     good = (b < len(seconds)) & (b > a)
@@ -65,13 +97,19 @@ def wheel_rates(name: str, seconds: np.ndarray, angles: np.ndarray) -> WheelRate
             "its stamps, or record for longer."
         )
     span = seconds[b] - seconds[a]
-    rate = (angles[b] - angles[a]) / span[:, None]
-    _check_turning(name, rate)
-    return WheelRates(seconds[a], seconds[b], rate)
+    rate = (integrals[b] - integrals[a]) / span[:, None]
+    _check_turning(name, rate, kind)
+    return WheelRates(seconds[a], seconds[b], rate, kind)
 
 
-def _check_turning(name: str, rate: np.ndarray) -> None:
-    """Raises EstimationError where a wheel, or both, do not turn."""
+def _check_turning(name: str, rate: np.ndarray, kind: WheelKind) -> None:
+    """Raises EstimationError where a wheel, or both, or the vehicle does not move."""
+    if kind != "pair":
+        if not np.abs(rate[:, 0]).max() > 0.0:
+            raise EstimationError(
+                f"{name}: by its readings the vehicle stood still; check its topic or table, and that it drove."
+            )
+        return
     size = np.sqrt((rate**2).mean(axis=0))
     still = [which for which, own in zip(("left", "right"), size, strict=True) if own <= STILL_SHARE * size.max()]
     if still:
@@ -84,7 +122,7 @@ def _check_turning(name: str, rate: np.ndarray) -> None:
 def wheel_offset(imu: ImuData, up: np.ndarray, name: str, rates: WheelRates) -> float:
     """Seconds to add to the clock of the wheels `name` to get that of the IMU, both since their first stamps.
 
-    From the rate about `up` (3,), upwards in the IMU's axes, and the difference of the wheels. Raises EstimationError
+    From the rate about `up` (3,), upwards in the IMU's axes, and how the wheels turn. Raises EstimationError
     where they do not match at any shift.
     """
     axis = up / np.linalg.norm(up)
@@ -94,7 +132,7 @@ def wheel_offset(imu: ImuData, up: np.ndarray, name: str, rates: WheelRates) -> 
     for _ in range(ROUNDS):
         start, end = rates.start + offset, rates.end + offset
         inside = _covered(imu, start, end)
-        start, end, rate = start[inside], end[inside], rates.rate[inside]
+        start, end, rate = start[inside], end[inside], rates.turning[inside]
         mean = (np.interp(end, imu.seconds, angle) - np.interp(start, imu.seconds, angle)) / (end - start)
         slope = (np.interp(end, imu.seconds, turn) - np.interp(start, imu.seconds, turn)) / (end - start)
         # mean(offset + d) = mean + slope d = what the wheels say, and the gyro's bias.
@@ -106,10 +144,10 @@ def wheel_offset(imu: ImuData, up: np.ndarray, name: str, rates: WheelRates) -> 
 
 
 def drive_guess(
-    name: str, wheel_rate: np.ndarray, rate: np.ndarray, velocity: np.ndarray, up: np.ndarray
+    name: str, wheel_rate: np.ndarray, rate: np.ndarray, velocity: np.ndarray, up: np.ndarray, kind: WheelKind = "pair"
 ) -> DriveGuess:
-    """The drive `name` from mean rates of its wheels (n, 2) rad/s, and the IMU's rate (n, 3) rad/s, without bias, and
-    velocity (n, 3) m/s over the same spans, in the IMU's axes; up (3,): upwards in these.
+    """The drive `name` from mean rates of its wheels (n, m), see `WheelRates`, and the IMU's rate (n, 3) rad/s, without
+    bias, and velocity (n, 3) m/s over the same spans, in the IMU's axes; up (3,): upwards in these.
 
     Raises EstimationError where the motion does not show it, or left and right or their signs are mixed up.
     """
@@ -121,16 +159,25 @@ def drive_guess(
     _check_motion(name, w, u)
     e2, l1 = _no_slip(w, u)
     e1 = np.array([e2[1], -e2[0]])
-    left, right = (_fit(np.column_stack([u @ e1, w]), wheel_rate[:, k]) for k in range(2))
-    if left[0] + right[0] < 0.0:  # forwards is where the wheels turn forwards
-        e1, e2, l1, left, right = -e1, -e2, -l1, left * [-1.0, 1.0], right * [-1.0, 1.0]
-    _check_drive(name, w, u @ e1, left, right)
-    radii = np.array([1.0 / left[0], 1.0 / right[0]])
-    if radii.min() < RADII_M[0] or radii.max() > RADII_M[1]:
+    forwards = wheel_rate[:, :2].sum(axis=1) if kind == "pair" else wheel_rate[:, 0]
+    if _fit(np.column_stack([u @ e1, w]), forwards)[0] < 0.0:  # forwards is where the wheels turn forwards
+        e1, e2, l1 = -e1, -e2, -l1
+    _check_arcs(name, w, u @ e1)
+    l2, values = {"pair": _pair, "twist": _twist, "steered": _steered}[kind](name, w, u @ e1, wheel_rate)
+    x, y = e1 @ level, e2 @ level
+    return DriveGuess(np.stack([x, y, axis], axis=1), l1 * x + l2 * y, values)
+
+
+def _pair(name: str, w: np.ndarray, ahead: np.ndarray, rate: np.ndarray) -> tuple[float, dict[str, np.ndarray]]:
+    """l_2, radii, baseline."""
+    left, right = (_fit(np.column_stack([ahead, w]), rate[:, k]) for k in range(2))
+    if left[0] <= 0.0 or right[0] <= 0.0:
         raise EstimationError(
-            f"{name}: its wheels would have radii of {radii[0]:.3g} and {radii[1]:.3g} m; check that it measures "
-            "radians (not degrees or turns) per second, or its counts_per_turn."
+            f"{name}: its wheels count in opposite directions; change the sign of the one that falls as the vehicle "
+            "drives forwards."
         )
+    radii = np.array([1.0 / left[0], 1.0 / right[0]])
+    _check_radii(name, radii)
     arm_left, arm_right = left[1] * radii[0], right[1] * radii[1]
     baseline = float(arm_right - arm_left)
     if baseline < 0.0:
@@ -138,8 +185,59 @@ def drive_guess(
             f"{name}: its left and right wheels are swapped, or both count backwards; swap their columns or topics, or "
             "change the sign of both."
         )
-    x, y = e1 @ level, e2 @ level
-    return DriveGuess(np.stack([x, y, axis], axis=1), l1 * x - 0.5 * (arm_left + arm_right) * y, radii, baseline)
+    return -0.5 * float(arm_left + arm_right), {"radii": radii, "baseline": np.array([baseline])}
+
+
+def _twist(name: str, w: np.ndarray, ahead: np.ndarray, rate: np.ndarray) -> tuple[float, dict[str, np.ndarray]]:
+    """l_2, scales."""
+    along = _fit(np.column_stack([ahead, w]), rate[:, 0])
+    # A bias of the gyro besides, which the yaw rate of the wheels does not have.
+    turned = _fit(np.column_stack([w, np.ones(len(w))]), rate[:, 1])
+    scales = 1.0 / np.array([along[0], turned[0]])
+    for scale, unit, what, should in (
+        (scales[0], KMH, "forward speed", "m/s, not km/h: multiply it by 1 / 3.6"),
+        (scales[1], DEGREE, "yaw rate", "rad/s, not deg/s: multiply it by pi / 180"),
+    ):
+        if abs(scale / unit - 1.0) < NEARLY:
+            raise EstimationError(f"{name}: its {what} must be in {should}.")
+        if not SCALES[0] < scale < SCALES[1]:
+            raise EstimationError(
+                f"{name}: its {what} would have to be multiplied by {scale:.3g}; check its unit, and that it is of "
+                "this vehicle."
+            )
+    return float(-along[1] * scales[0]), {"scales": scales}
+
+
+def _steered(name: str, w: np.ndarray, ahead: np.ndarray, rate: np.ndarray) -> tuple[float, dict[str, np.ndarray]]:
+    """l_2, radius, wheelbase, steering offset. v sin(d) = L w cos(d), with the offset t = tan(d) - tan(steering angle)
+    to first order, and again from there."""
+    turned = _fit(np.column_stack([ahead, w]), rate[:, 0])
+    radius = 1.0 / turned[:1]
+    _check_radii(name, radius)
+    v, offset, base = radius[0] * rate[:, 0], 0.0, 0.0
+    for _ in range(ROUNDS):
+        c = rate[:, 1] * np.cos(offset) - rate[:, 2] * np.sin(offset)
+        s = rate[:, 2] * np.cos(offset) + rate[:, 1] * np.sin(offset)
+        base, step = _fit(np.column_stack([w * c, -(v * c + base * w * s)]), v * s)
+        offset += float(np.arctan(step))
+    if base < 0.0:
+        raise EstimationError(f"{name}: its steering angle is positive to the right; change its sign.")
+    if abs(offset) > STEERS_RAD or base == 0.0:
+        raise EstimationError(
+            f"{name}: its steering angle does not go with how the vehicle turned; check that it is in radians, "
+            "and of the front wheels, not of the steering wheel."
+        )
+    found = {"radius": radius, "wheelbase": np.array([base]), "steering_offset": np.array([offset])}
+    return float(-turned[1] * radius[0]), found
+
+
+def _check_radii(name: str, radii: np.ndarray) -> None:
+    if radii.min() < RADII_M[0] or radii.max() > RADII_M[1]:
+        which = " and ".join(f"{r:.3g}" for r in radii)
+        raise EstimationError(
+            f"{name}: its wheels would have radii of {which} m; check that it measures radians (not degrees or turns) "
+            "per second, or its counts_per_turn."
+        )
 
 
 def _fit(A: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -174,18 +272,13 @@ def _check_motion(name: str, w: np.ndarray, u: np.ndarray) -> None:
         )
 
 
-def _check_drive(name: str, w: np.ndarray, ahead: np.ndarray, left: np.ndarray, right: np.ndarray) -> None:
-    """The vehicle must drive and turn apart from each other, and both wheels turn forwards with it."""
+def _check_arcs(name: str, w: np.ndarray, ahead: np.ndarray) -> None:
+    """The vehicle must drive and turn apart from each other."""
     a, b = ahead / np.linalg.norm(ahead), w / np.linalg.norm(w)
     if 1.0 - abs(a @ b) < LEAST_SHARE:
         raise EstimationError(
             f"{name}: the vehicle drove one and the same arc all the time, which leaves its wheels open; record again "
             "with curves of both hands, or give its parameters in the rig file."
-        )
-    if left[0] <= 0.0 or right[0] <= 0.0:
-        raise EstimationError(
-            f"{name}: its wheels count in opposite directions; change the sign of the one that falls as the vehicle "
-            "drives forwards."
         )
 
 
@@ -198,7 +291,7 @@ def _covered(imu: ImuData, start: np.ndarray, end: np.ndarray) -> np.ndarray:
 
 
 def _correlate(imu: ImuData, turn: np.ndarray, name: str, rates: WheelRates) -> float:
-    """Offset [s] at the peak of the correlation of the gyro's `turn` (N,) with the difference of the wheels."""
+    """Offset [s] at the peak of the correlation of the gyro's `turn` (N,) with how the wheels turn."""
     grid = np.arange(int(imu.seconds[-1] * GRID_HZ) + 1) / GRID_HZ
     known = np.ones(len(grid), dtype=bool)
     for start, end in imu.gaps:
@@ -207,16 +300,13 @@ def _correlate(imu: ImuData, turn: np.ndarray, name: str, rates: WheelRates) -> 
     wheels = np.arange(int(middle[-1] * GRID_HZ) + 1) / GRID_HZ
     near = np.diff(middle, append=middle[-1]) < LONGEST_STEP_S
     seen = (np.interp(wheels, middle, near.astype(float)) > 0.99) & (wheels >= middle[0])
-    difference = np.interp(wheels, middle, rates.rate[:, 1] - rates.rate[:, 0])
+    turning = np.interp(wheels, middle, rates.turn)
     turned = np.interp(grid, imu.seconds, turn)
     found, opposite = (
-        best_shift(sign * turned, known, difference, seen, SHORTEST_OVERLAP_S * GRID_HZ) for sign in (1.0, -1.0)
+        best_shift(sign * turned, known, turning, seen, SHORTEST_OVERLAP_S * GRID_HZ) for sign in (1.0, -1.0)
     )
     if opposite.correlation > max(found.correlation, LEAST_CORRELATION):
-        raise EstimationError(
-            f"{name} turns the other way round than {imu.name}: its left and right wheels are swapped, or both count "
-            "backwards; swap their columns or topics, or change the sign of both."
-        )
+        raise EstimationError(f"{name} turns the other way round than {imu.name}: {OPPOSITE[rates.kind]}.")
     if not found.correlation > LEAST_CORRELATION:
         raise EstimationError(
             f"the turning of {name} does not match that of {imu.name} at any shift of their clocks (best correlation "

@@ -148,7 +148,8 @@ def _robot(found: Inspection) -> Iterable[str]:
         yield from (f"  {name}:", "    type: lidar", _place(topic.name, topic.type, ""))
     for name, topic in found.sources.wheels.items():
         yield "  # Are these wheels? Then take the # away, and say what they measure (docs/rig-file.md#wheels)."
-        for line in (f"  {name}:", "    type: wheels", _place(topic.name, topic.type, "")):
+        lines = [f"  {name}:", "    type: wheels", _place(topic.name, topic.type, "")]
+        for line in lines + (["    measures: twist"] if topic.kind == "twist" or "twist" in topic.type else []):
             yield f"  # {line.removeprefix('  ')}"
     for name, topic in found.sources.poses.items():
         yield "  # Poses of something on the robot, and not made from the sensors above? Then take the # away; absolute"

@@ -24,7 +24,12 @@ def find_sources(topics: Sequence[TopicInfo]) -> Sources:
     images = _by_key([t for t in filled if t.kind == "image" and t not in depth])
     corners = _by_key([t for t in filled if t.kind == "corners"])
     infos = _by_key([t for t in filled if t.kind == "camera info"])
-    others = {"imu": ("imu",), "lidar": ("points",), "wheel": ("joints", "wheels"), "pose": ("pose", "odometry")}
+    others = {
+        "imu": ("imu",),
+        "lidar": ("points",),
+        "wheel": ("joints", "twist", "wheels"),
+        "pose": ("pose", "odometry"),
+    }
     found = [(t, what) for what, kinds in others.items() for t in filled if t.kind in kinds]
     keys = sorted({*images, *corners})
     names = _names([(k, "cam") for k in keys] + [(_key(t), what) for t, what in found])

@@ -23,10 +23,8 @@ def true_value(truth: Truth, sensor: str, name: str) -> np.ndarray | None:
         "intrinsics": truth.intrinsics,
         "distortion": truth.distortion,
         "bloom": truth.bloom_px,
-        "radii": truth.radii,
-        "baseline": truth.baseline,
     }
-    found = stated.get(name, {}).get(sensor)
+    found = stated.get(name, {}).get(sensor, truth.drive.get(sensor, {}).get(name))
     return None if found is None else np.atleast_1d(np.asarray(found, dtype=np.float64))
 
 

@@ -22,13 +22,20 @@ from icalib.recordings.clouds import read_clouds
 from icalib.recordings.image_checks import checked_payloads, frames
 from icalib.recordings.images import Frame, Payload, file_payload
 from icalib.recordings.poses import PoseReadings, read_pose_file
-from icalib.recordings.streams import point_clouds, read_joints, read_odometry, read_poses
+from icalib.recordings.streams import (
+    point_clouds,
+    read_joints,
+    read_odometry,
+    read_odometry_twists,
+    read_poses,
+    read_twists,
+)
 from icalib.recordings.topics import KINDS, TopicInfo, choose_topic, find_topic
 from icalib.recordings.tracks import read_tracks
-from icalib.recordings.wheels import WheelReadings, read_wheel_joints
+from icalib.recordings.wheels import WheelReadings, read_wheel_joints, read_wheel_twists
 from icalib.rig import Camera, ImuSensor, Lidar, PoseSensor, Wheels
 
-_KINDS_OF = {ImuSensor: "imu", Lidar: "points", Wheels: "joints"}
+_KINDS_OF = {ImuSensor: "imu", Lidar: "points"}
 _SWAPPED_NS = 1_000_000_000  # readings overtake each other on the network by less; more is a clock that was set back
 
 
@@ -104,9 +111,15 @@ class BagRecording:
         return stream
 
     def wheels(self, sensor: Wheels) -> WheelReadings | WheelPoses:
-        topic = self._topic(sensor)
-        read = read_wheel_joints(sensor, read_joints(self, topic), f"{self.root} {topic} ({sensor.name})")
-        order = self._order(topic, read.stamps_ns)
+        topic = self._wheel_topic(sensor)
+        if topic.kind == "odometry":
+            read = read_wheel_twists(sensor, read_odometry_twists(self, topic.name))
+        elif topic.kind == "twist":
+            read = read_wheel_twists(sensor, read_twists(self, topic.name))
+        else:
+            what = f"{self.root} {topic.name} ({sensor.name})"
+            read = read_wheel_joints(sensor, read_joints(self, topic.name), what)
+        order = self._order(topic.name, read.stamps_ns)
         return WheelReadings(sensor.name, read.stamps_ns[order], read.value[order])
 
     def poses(self, sensor: PoseSensor) -> PoseReadings:
@@ -125,13 +138,24 @@ class BagRecording:
 
     def _pose_topic(self, sensor: PoseSensor) -> TopicInfo:
         """An odometry's will do, too."""
-        alike = [replace(t, kind="pose") if t.kind == "odometry" else t for t in self._topics]
-        chosen = choose_topic(str(self.root), alike, "pose", sensor.name, sensor.topic)
+        return self._choose(sensor, "pose", "odometry")
+
+    def _wheel_topic(self, sensor: Wheels) -> TopicInfo:
+        """Joints; of a twist its own, or that of an odometry."""
+        kinds = ("twist", "odometry") if sensor.measures == "twist" else ("joints",)
+        return self._choose(sensor, *kinds)
+
+    def _choose(self, sensor: Wheels | PoseSensor, kind: str, *others: str) -> TopicInfo:
+        """The sensor's topic of `kind`, or of one of the others, which will do, too."""
+        alike = [replace(t, kind=kind) if t.kind in others else t for t in self._topics]
+        chosen = choose_topic(str(self.root), alike, kind, sensor.name, sensor.topic)
         return find_topic(str(self.root), self._topics, chosen.name)
 
     def where(self, sensor: ImuSensor | Camera | Lidar | Wheels | PoseSensor) -> str:
         if isinstance(sensor, Camera):
             return f"{self.root} {self.image_topic(sensor)}"
+        if isinstance(sensor, Wheels):
+            return f"{self.root} {self._wheel_topic(sensor).name}"
         if isinstance(sensor, PoseSensor):
             return str(self._pose_table(sensor) or f"{self.root} {self._pose_topic(sensor).name}")
         return f"{self.root} {self._topic(sensor)}"
@@ -184,7 +208,7 @@ class BagRecording:
             for key, received_ns, content in storage.messages(wanted):
                 yield received_ns, storage.connections[key].encoding, content
 
-    def _topic(self, sensor: ImuSensor | Lidar | Wheels) -> str:
+    def _topic(self, sensor: ImuSensor | Lidar) -> str:
         return choose_topic(str(self.root), self._topics, _KINDS_OF[type(sensor)], sensor.name, sensor.topic).name
 
     def _order(self, topic: str, stamps_ns: np.ndarray) -> np.ndarray:

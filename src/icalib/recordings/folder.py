@@ -22,7 +22,7 @@ from icalib.recordings.scans import read_scan_stamps, read_scans
 from icalib.recordings.table import columns_of, read_table
 from icalib.recordings.topics import TopicInfo, choose_topic, find_topic
 from icalib.recordings.tracks import read_tracks
-from icalib.recordings.wheels import ENDS, POSES, STAMP, VALUES, WheelReadings, read_wheel_table
+from icalib.recordings.wheels import ENDS, POSES, STAMP, TWIST, UNITS, WheelReadings, read_wheel_table
 from icalib.rig import Camera, ImuSensor, Lidar, PoseSensor, Wheels
 
 _IMU_DECIMALS = ("wx [rad/s]", "wy [rad/s]", "wz [rad/s]", "ax [m/s^2]", "ay [m/s^2]", "az [m/s^2]")
@@ -183,7 +183,8 @@ def _existing(folder: Path, name: str) -> Path | None:
 
 def _robot(folder: Path) -> Iterator[tuple[Path, tuple[str, str]]]:
     """Tables of LiDARs, wheels and pose sensors with their type and kind."""
-    names = {"scans.npz": ("scans", "points")} | {f"{m}.csv": (f"table of {m}", "wheels") for m in (*VALUES, "poses")}
+    names = {f"{m}.csv": (f"table of {m}", "wheels") for m in (*UNITS, "twist", "poses")}
+    names |= {"scans.npz": ("scans", "points")}
     names |= {name: ("table of poses", "pose") for name in POSE_FILES[1:]}
     for name, what in names.items():
         if table := _existing(folder, name):
@@ -201,8 +202,9 @@ def _stamps(table: Path) -> np.ndarray:
         return read_scan_stamps(table)
     if _is_poses(table):
         return read_pose_file(table.parent.name, table).stamps_ns
-    poses = columns_of(table) == len(ENDS + POSES)
-    integers, decimals = (ENDS, POSES) if poses else (STAMP, VALUES["rates"])
+    n = columns_of(table)
+    wheels = tuple(f"value {k}" for k in range(1, max(n, 1 + len(TWIST))))
+    integers, decimals = (ENDS, POSES) if n == len(ENDS + POSES) else (STAMP, wheels)
     return read_table(table, integers, decimals).integers[:, 0].copy()
 
 

@@ -115,6 +115,12 @@ def read_odometry(bag: HasMessages, topic: str) -> OdometryStream:
     return OdometryStream(pose, _twists(body, stamps_ns, [m.twist.twist for m in found]))
 
 
+def read_odometry_twists(bag: HasMessages, topic: str) -> TwistStream:
+    """The velocities of all Odometry of `topic`, whatever its poses are. Raises RecordingError as `read_twists`."""
+    stamps_ns, found = _all(bag, topic, "odometry")
+    return _twists(_frame(bag, topic, found, lambda m: m.child_frame_id), stamps_ns, [m.twist.twist for m in found])
+
+
 def read_joints(bag: HasMessages, topic: str) -> JointStream:
     """All JointState of `topic`; a message may name some of the joints only. Raises RecordingError as
     `BagRecording.messages`, and for an array that is not as long as the names."""

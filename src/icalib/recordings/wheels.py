@@ -11,26 +11,48 @@ import numpy as np
 from icalib.errors import RecordingError
 from icalib.measurements import WheelPoses
 from icalib.recordings.table import read_table
-from icalib.rig import WheelMeasure, Wheels
+from icalib.rig import WheelDrive, WheelMeasure, Wheels
 
 STAMP = ("t [ns]",)
-VALUES: dict[WheelMeasure, tuple[str, str]] = {
-    "rates": ("left [rad/s]", "right [rad/s]"),
-    "angles": ("left [rad]", "right [rad]"),
-    "ticks": ("left [ticks]", "right [ticks]"),
+SIDES: dict[WheelDrive, tuple[str, ...]] = {
+    "differential": ("left", "right"),
+    "skid-steer": ("front left", "rear left", "front right", "rear right"),
+    "ackermann": ("wheel", "steering"),
 }
+UNITS: dict[WheelMeasure, str] = {"rates": "rad/s", "angles": "rad", "ticks": "ticks"}
+TWIST = ("v [m/s]", "w [rad/s]")
 ENDS = ("from [ns]", "to [ns]")
 POSES = ("yaw [rad]", "x [m]", "y [m]", "yaw yaw", "yaw x", "yaw y", "x x", "x y", "y y")
 
 
 @dataclass(frozen=True)
 class WheelReadings:
-    """stamps_ns (N,) int64, which may still repeat or run backwards; value (N, 2), left and right, in the unit of what
-    the wheels measure, see `VALUES`."""
+    """stamps_ns (N,) int64, which may still repeat or run backwards; value (N, m) in the unit of what the wheels
+    measure: left and right; of skid-steer front and rear left, front and rear right; of ackermann the driven wheel
+    and the steering angle [rad], or two of each, left and right; of twist forward speed and yaw rate."""
 
     name: str
     stamps_ns: np.ndarray
     value: np.ndarray
+
+
+def value_columns(wheels: Wheels) -> tuple[str, ...]:
+    """Of its table, after the stamp."""
+    if wheels.measures == "twist":
+        return TWIST
+    unit = UNITS[wheels.measures]
+    return tuple(f"{side} [{'rad' if side == 'steering' else unit}]" for side in SIDES[wheels.drive])
+
+
+class Twists(Protocol):
+    """See `streams.TwistStream`."""
+
+    @property
+    def stamps_ns(self) -> np.ndarray: ...
+    @property
+    def linear(self) -> np.ndarray: ...
+    @property
+    def angular(self) -> np.ndarray: ...
 
 
 class Joints(Protocol):
@@ -51,7 +73,7 @@ def read_wheel_table(wheels: Wheels, path: Path) -> WheelReadings | WheelPoses:
     relative poses do not follow one another."""
     if wheels.measures == "poses":
         return _read_poses(wheels.name, path)
-    table = read_table(path, STAMP, VALUES[wheels.measures])
+    table = read_table(path, STAMP, value_columns(wheels))
     return WheelReadings(wheels.name, table.integers[:, 0].copy(), table.decimals)
 
 
@@ -78,33 +100,46 @@ def _read_poses(name: str, path: Path) -> WheelPoses:
     return WheelPoses(name, np.append(begin, end[-1]), table.decimals[:, :3].copy(), covariance)
 
 
+def read_wheel_twists(wheels: Wheels, twists: Twists) -> WheelReadings:
+    """Forward speed and yaw rate."""
+    value = np.stack([twists.linear[:, 0], twists.angular[:, 2]], axis=1)
+    return WheelReadings(wheels.name, twists.stamps_ns, value)
+
+
 def read_wheel_joints(wheels: Wheels, joints: Joints, what: str) -> WheelReadings:
-    """Both wheels' joints. Raises RecordingError naming the topic (`what`): relative poses, which joints do not have,
+    """The wheels' joints. Raises RecordingError naming the topic (`what`): relative poses, which joints do not have,
     joints that are not there or not sent together, and what they do not say."""
     if wheels.measures == "poses":
         raise RecordingError(f"{what}: bags hold no relative poses; set `measures` of {wheels.name} in the rig file.")
-    pair = _pair(wheels, joints.names, what)
-    of = {"rates": joints.velocity}.get(wheels.measures, joints.position)
-    value = of[:, [joints.names.index(name) for name in pair]]
+    own = _own_joints(wheels, joints.names, what)
+    column = [joints.names.index(name) for name in own]
+    value = (joints.velocity if wheels.measures == "rates" else joints.position)[:, column]
+    if wheels.drive == "ackermann":
+        half = len(own) // 2
+        value[:, half:] = joints.position[:, column[half:]]
     sent = ~np.isnan(value)
-    if not sent.any():
-        field, other = ("velocity", "angles") if wheels.measures == "rates" else ("position", "rates")
-        raise RecordingError(
-            f"{what}: {pair[0]} and {pair[1]} have no {field}; set `measures` of {wheels.name} to {other} in the "
-            "rig file."
+    ever = np.any(sent, axis=0).tolist()
+    missing = [name for name, once in zip(own, ever, strict=True) if not once]
+    if missing:
+        steering = wheels.drive == "ackermann" and missing[0] in own[len(own) // 2 :]
+        field, other = ("velocity", "angles") if wheels.measures == "rates" and not steering else ("position", "rates")
+        advice = (
+            "record the steering angle" if steering else f"set `measures` of {wheels.name} to {other} in the rig file"
         )
+        have = "has" if len(missing) == 1 else "have"
+        raise RecordingError(f"{what}: {' and '.join(missing)} {have} no {field}; {advice}.")
     both = sent.all(axis=1)
     if (sent.any(axis=1) & ~both).any():
         at = joints.stamps_ns[np.argmax(sent.any(axis=1) & ~both)]
         raise RecordingError(
-            f"{what}: the message at {at} ns has only one of {pair[0]} and {pair[1]}; let the driver send both "
-            "together."
+            f"{what}: the message at {at} ns has only one of {' and '.join(own)}; let the driver send "
+            f"{'both' if len(own) == 2 else 'all'} together."
         )
     return WheelReadings(wheels.name, joints.stamps_ns[both], value[both])
 
 
-def _pair(wheels: Wheels, names: tuple[str, ...], what: str) -> tuple[str, str]:
-    """The names of the left and the right joint."""
+def _own_joints(wheels: Wheels, names: tuple[str, ...], what: str) -> tuple[str, ...]:
+    """The names of its joints, in the order of `WheelReadings`."""
     if wheels.joints is not None:
         missing = [name for name in wheels.joints if name not in names]
         if missing:
@@ -113,10 +148,12 @@ def _pair(wheels: Wheels, names: tuple[str, ...], what: str) -> tuple[str, str]:
                 "in the rig file."
             )
         return wheels.joints
-    sides = [[name for name in names if side in name.lower()] for side in ("left", "right")]
-    if len(sides[0]) != 1 or len(sides[1]) != 1:
+    sides = SIDES[wheels.drive]
+    found = [[name for name in names if all(word in name.lower() for word in side.split())] for side in sides]
+    if any(len(own) != 1 for own in found):
+        which = "the left and the right wheel" if wheels.drive == "differential" else f"the {', the '.join(sides)}"
         raise RecordingError(
-            f"{what}: which of the joints {', '.join(names)} are the left and the right wheel? Set `joints: [LEFT, "
-            f"RIGHT]` of {wheels.name} in the rig file."
+            f"{what}: which of the joints {', '.join(names)} are {which}? Set `joints: "
+            f"[{', '.join(side.upper() for side in sides)}]` of {wheels.name} in the rig file."
         )
-    return sides[0][0], sides[1][0]
+    return tuple(own[0] for own in found)

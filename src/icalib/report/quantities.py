@@ -98,7 +98,7 @@ def _names(group: ParameterGroup) -> list[str]:
         return [group.name.replace("_", " ")]
     if group.name in ("intrinsics", "distortion"):
         return list(group.labels)
-    one = {"radii": "radius"}.get(group.name, group.name)
+    one = {"radii": "radius", "scales": "scale"}.get(group.name, group.name)
     return [f"{one} {label}".replace("_", " ") for label in group.labels]
 
 

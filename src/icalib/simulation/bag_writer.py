@@ -14,6 +14,7 @@ from icalib.errors import CalibrationError
 BagForm = Literal["ros1", "mcap", "sqlite3"]
 IMU_TOPIC = "/imu0"
 IMAGE, IMU, POINTS, JOINTS = (f"sensor_msgs/msg/{kind}" for kind in ("Image", "Imu", "PointCloud2", "JointState"))
+TWIST = "geometry_msgs/msg/TwistStamped"
 POSE = "geometry_msgs/msg/PoseStamped"
 _FLOAT32 = 7  # of PointField
 
@@ -74,6 +75,14 @@ class BagWriter:
     def joints(self, stamp_ns: int, frame: str, names: list[str], position: np.ndarray, velocity: np.ndarray) -> Any:
         """position [rad] and velocity [rad/s] of each name, or empty."""
         return self._make(JOINTS, self._header(stamp_ns, frame), names, position, velocity, np.empty(0))
+
+    def twist(self, stamp_ns: int, frame: str, speed: float, yaw_rate: float) -> Any:
+        """Forward speed [m/s] and yaw rate [rad/s]."""
+        ahead = self._make("geometry_msgs/msg/Vector3", speed, 0.0, 0.0)
+        twist = self._make(
+            "geometry_msgs/msg/Twist", ahead, self._make("geometry_msgs/msg/Vector3", 0.0, 0.0, yaw_rate)
+        )
+        return self._make(TWIST, self._header(stamp_ns, frame), twist)
 
     def pose(self, stamp_ns: int, frame: str, position: np.ndarray, xyzw: np.ndarray) -> Any:
         """position (3,) [m] and quaternion (4,) of a sensor in `frame`."""

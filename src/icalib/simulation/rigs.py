@@ -116,11 +116,13 @@ class _Treated:
         )
 
     def wheels(self, sim: SimWheels) -> Wheels:
-        kind = "poses" if sim.reports == "poses" else "rates"
+        kind = "rates" if sim.reports == "steering" else sim.reports
         given = Wheels(
-            sim.name, f"{sim.name}/{kind}.csv", radii=_parameter(self.drive, sim.radii),
-            baseline=_parameter(self.drive, [sim.baseline]), wheel_noise=sim.noise, measures=kind, meaning=sim.meaning,
+            sim.name, f"{sim.name}/{kind}.csv", "ackermann" if sim.reports == "steering" else "differential",
+            wheel_noise=sim.noise, speed_noise=sim.speed_noise, yaw_noise=sim.yaw_noise,
+            steering_noise=sim.steering_noise, measures=kind, meaning=sim.meaning,
         )  # fmt: skip
+        given = replace(given, **{name: _parameter(self.drive, value) for name, value in sim.drive.items()})
         return self._mounted(given, sim, sim.T_imu_wheel)
 
     def lidar(self, sim: SimLidar) -> Lidar:
@@ -167,9 +169,12 @@ def _drawn_lens(sim: SimCamera, rng: np.random.Generator, error: GuessError) -> 
 
 
 def _drawn_drive(sim: SimWheels, rng: np.random.Generator, error: GuessError) -> dict[str, np.ndarray]:
-    """Radii and baseline, as far off as focal lengths."""
-    share = 1.0 + error.focal_length * rng.standard_normal(3)
-    return {"radii": np.array(sim.radii) * share[:2], "baseline": np.array([sim.baseline * share[2]])}
+    """Radii, baseline and the like, as far off as focal lengths; an angle by as many radians."""
+    drawn, off = {}, error.focal_length * rng.standard_normal(3)
+    for name, value in sim.drive.items():
+        own, off = off[: value.size], off[value.size :]
+        drawn[name] = value + own * (1.0 if name == "steering_offset" else value)
+    return drawn
 
 
 def _drawn_pose(

@@ -109,14 +109,17 @@ class SimLidar:
 
 @dataclass(frozen=True, eq=False)
 class SimWheels:
-    """Two true wheels of one axle; their frame is the middle of it on the floor, x forwards, z up.
+    """True wheels; their frame is the middle of the axle that is not steered, on the floor, x forwards, z up.
 
     radii (left, right) [m], baseline [m]. noise: density of each wheel's rate [rad/s/sqrt(Hz)]; slip: density of a
     lateral random path [m/sqrt(s)], in poses only.
 
-    rates: what encoders report, by `meaning` as in `WheelStream`: (v_x -+ baseline/2 w_z) / radius. Raised as RigError
-    by `Scenario` where the motion is not a wheel frame's. poses: relative poses as the paper's (27) predicts them from
-    the truth, one for every `poses_every` readings, with the noise that integrating the readings would have.
+    rates: what encoders report, by `meaning` as in `WheelStream`: (v_x -+ baseline/2 w_z) / radius. twist: forward
+    speed and yaw rate, v_x and w_z over their scales, by `meaning`, too. steering: the rate v_x / radius of a driven
+    wheel, and the angle by which front wheels a wheelbase ahead point to where they move, less steering_offset [rad].
+    Raised as RigError by `Scenario` where the motion is not a wheel frame's. poses: relative poses as the paper's (27)
+    predicts them from the truth, one for every `poses_every` readings, with the noise that integrating the readings
+    would have.
     """
 
     name: str
@@ -129,9 +132,26 @@ class SimWheels:
     clock_origin_ns: int = 0
     noise: float = 0.03
     slip: float = 0.0
-    reports: Literal["rates", "poses"] = "rates"
+    reports: Literal["rates", "twist", "steering", "poses"] = "rates"
     meaning: Literal["mean", "instant"] = "mean"
     poses_every: int = 3
+    scales: tuple[float, float] = (1.0, 1.0)
+    speed_noise: float = 2e-3  # m/s/sqrt(Hz)
+    yaw_noise: float = 1e-2  # rad/s/sqrt(Hz)
+    radius: float = 0.1
+    wheelbase: float = 0.6
+    steering_offset: float = 0.0
+    steering_noise: float = 1e-3  # rad/sqrt(Hz)
+
+    @property
+    def drive(self) -> dict[str, np.ndarray]:
+        """Its parameters beside pose and clock, by the names of the rig's groups."""
+        if self.reports == "twist":
+            return {"scales": np.array(self.scales)}
+        if self.reports == "steering":
+            one = {"radius": self.radius, "wheelbase": self.wheelbase, "steering_offset": self.steering_offset}
+            return {name: np.array([value]) for name, value in one.items()}
+        return {"radii": np.array(self.radii), "baseline": np.array([self.baseline])}
 
 
 @dataclass(frozen=True, eq=False)

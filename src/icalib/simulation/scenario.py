@@ -177,7 +177,7 @@ def _check_robot(scenario: Scenario) -> None:
     if scenario.room and scenario.room.hills and drive is not None and drive.on_ground and drive.kind != "ramps":
         raise RigError(f"the motion {drive.kind} is on a flat floor; take the slope out of the room.")
     for wheels in scenario.wheels:
-        if wheels.reports == "rates" and not (drive is not None and drive.on_ground):
+        if wheels.reports != "poses" and not (drive is not None and drive.on_ground):
             raise RigError(
                 f"{wheels.name} cannot roll: the motion is not that of wheels on a floor; let it report poses, or "
                 "choose a motion on the ground."

@@ -140,25 +140,40 @@ def _lidar(name: str, value: YamlValue, start_ns: int) -> SimLidar:
     return SimLidar(name, _pose(found["T_imu_sensor"]), **chosen, **_clock(found, start_ns))
 
 
+# What wheels must have, by what they report, and what noise they may have.
+_DRIVES = {
+    "rates": (("radii", "baseline"), ("noise", "slip", "poses_every")),
+    "poses": (("radii", "baseline"), ("noise", "slip", "poses_every")),
+    "twist": (("scales",), ("speed_noise", "yaw_noise")),
+    "steering": (("radius", "wheelbase"), ("steering_offset", "noise", "steering_noise")),
+}  # fmt: skip
+
+
 def _wheels(name: str, value: YamlValue, start_ns: int) -> SimWheels:
-    options = ("noise", "slip", "reports", "meaning", "poses_every")
-    found = value.record(("type", *_CLOCK, "radii", "baseline"), _CLOCK_OPTIONS + options)
-    radii = found["radii"].items()
-    if len(radii) != 2:
-        found["radii"].fail(f"must be [left, right] in metres, but has {len(radii)} entries.")
-    chosen: dict[str, Any] = {key: _least(found[key], 0.0) for key in ("noise", "slip") if key in found}
-    choices = {"reports": ("rates", "poses"), "meaning": ("mean", "instant")}
-    chosen |= {key: found[key].choice(key, available) for key, available in choices.items() if key in found}
-    if "poses_every" in found:
-        chosen["poses_every"] = found["poses_every"].whole(1)
-    return SimWheels(
-        name,
-        _pose(found["T_imu_sensor"]),
-        (radii[0].positive(), radii[1].positive()),
-        found["baseline"].positive(),
-        **chosen,
-        **_clock(found, start_ns),
-    )
+    fields = value.entries()
+    reports = fields["reports"].choice("reports", tuple(_DRIVES)) if "reports" in fields else SimWheels.reports
+    required, options = _DRIVES[reports]
+    found = value.record(("type", *_CLOCK, *required), (*_CLOCK_OPTIONS, *options, "reports", "meaning"))
+    chosen: dict[str, Any] = {"reports": reports}
+    for key in found.keys() & {*required, *options}:
+        chosen[key] = _drive_value(key, found[key])
+    if "meaning" in found:
+        chosen["meaning"] = found["meaning"].choice("meaning", ("mean", "instant"))
+    return SimWheels(name, _pose(found["T_imu_sensor"]), **chosen, **_clock(found, start_ns))
+
+
+def _drive_value(key: str, value: YamlValue) -> Any:
+    if key in ("radii", "scales"):
+        two = value.items()
+        if len(two) != 2:
+            words = "[left, right] in metres" if key == "radii" else "[speed, yaw rate]"
+            value.fail(f"must be {words}, but has {len(two)} entries.")
+        return two[0].positive(), two[1].positive()
+    if key == "poses_every":
+        return value.whole(1)
+    if key == "steering_offset":
+        return value.number()
+    return _least(value, 0.0) if key.endswith(("noise", "slip")) else value.positive()
 
 
 def _poses(name: str, value: YamlValue, start_ns: int) -> SimPoses:

@@ -11,7 +11,7 @@ import numpy as np
 
 from icalib.errors import RigError
 from icalib.measurements import ImuStream, LidarStream, PoseStream, WheelPoses, WheelStream
-from icalib.simulation.bag_writer import IMAGE, IMU, IMU_TOPIC, JOINTS, POINTS, POSE, BagWriter
+from icalib.simulation.bag_writer import IMAGE, IMU, IMU_TOPIC, JOINTS, POINTS, POSE, TWIST, BagWriter
 from icalib.simulation.filming import Film
 from icalib.simulation.poses import quaternion
 from icalib.simulation.rendering import Imaging
@@ -20,7 +20,7 @@ from icalib.simulation.tables import whole, write_truth
 
 Event = tuple[int, str, Callable[[BagWriter], Any]]  # when on the IMU's clock [ns], topic, what makes the message
 _EXPOSURE_S = 0.004
-_WHEELS = ["left_wheel", "right_wheel"]
+_JOINTS = {"pair": ["left_wheel", "right_wheel"], "steered": ["wheel", "steering"]}
 
 
 def write_sensors(
@@ -30,7 +30,8 @@ def write_sensors(
     bag of ROS 1, and has no truth.
 
     Topics are /imu0 (Imu), /NAME/points (PointCloud2: x, y, z and `time` [s] from the stamp), /NAME/joint_states
-    (JointState), /NAME/pose (PoseStamped) and, where a target stands in the scene, /NAME/image_raw (Image, mono8).
+    (JointState) or /NAME/twist (TwistStamped), /NAME/pose (PoseStamped) and, where a target stands in the scene,
+    /NAME/image_raw (Image, mono8).
     Returns sentences on what was left out. Raises RecordingError where `path` exists or cannot be written,
     CalibrationError where a package is missing, RigError for a board that is not flat.
     """
@@ -62,8 +63,13 @@ def _streams(simulation: Simulation, seed: int) -> tuple[dict[str, str], list[It
         if isinstance(wheels, WheelPoses):
             notes.append(f"{wheels.name} reports relative poses, which no sensor does; they are left out.")
             continue
+        offset_ns = round(truth.time_offset[wheels.name] * 1e9)
+        if wheels.kind == "twist":
+            topics[f"/{wheels.name}/twist"] = TWIST
+            streams.append(_twists(wheels, offset_ns))
+            continue
         topics[f"/{wheels.name}/joint_states"] = JOINTS
-        streams.append(_joints(wheels, round(truth.time_offset[wheels.name] * 1e9)))
+        streams.append(_joints(wheels, offset_ns))
     for poses in measured.poses:
         topics[f"/{poses.name}/pose"] = POSE
         streams.append(_poses(poses, round(truth.time_offset[poses.name] * 1e9)))
@@ -107,18 +113,32 @@ def _clouds(lidar: LidarStream, offset_ns: int) -> Iterator[Event]:
 
 
 def _joints(wheels: WheelStream, offset_ns: int) -> Iterator[Event]:
-    """Positions are the angles turned since the first stamp, where the readings are means; else there are none."""
-    angles = np.empty((len(wheels.stamps_ns), 0))
+    """Positions are the angles turned since the first stamp, where the readings are means; else there are none, but
+    steering angles, which have no velocity."""
+    angles, rates = np.full(wheels.rate.shape, np.nan), wheels.rate.copy()
     if wheels.meaning == "mean":
         turned = wheels.rate[1:] * np.diff(wheels.stamps_ns)[:, None] * 1e-9
         angles = np.concatenate([np.zeros((1, 2)), np.cumsum(turned, axis=0)])
-    for stamp_ns, angle, rate in zip(wheels.stamps_ns.tolist(), angles, wheels.rate, strict=True):
+    if wheels.kind == "steered":
+        angles[:, 1], rates[:, 1] = wheels.rate[:, 1], np.nan
+    elif wheels.meaning == "instant":
+        angles = np.empty((len(rates), 0))
+    for stamp_ns, angle, rate in zip(wheels.stamps_ns.tolist(), angles, rates, strict=True):
         yield (
             stamp_ns + offset_ns,
             f"/{wheels.name}/joint_states",
             lambda bag, stamp_ns=stamp_ns, angle=angle, rate=rate: bag.joints(
-                stamp_ns, wheels.name, _WHEELS, angle, rate
+                stamp_ns, wheels.name, _JOINTS[wheels.kind], angle, rate
             ),
+        )
+
+
+def _twists(wheels: WheelStream, offset_ns: int) -> Iterator[Event]:
+    for stamp_ns, values in zip(wheels.stamps_ns.tolist(), wheels.rate.tolist(), strict=True):
+        yield (
+            stamp_ns + offset_ns,
+            f"/{wheels.name}/twist",
+            lambda bag, stamp_ns=stamp_ns, values=values: bag.twist(stamp_ns, wheels.name, *values),
         )
 
 

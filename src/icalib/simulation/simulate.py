@@ -64,8 +64,7 @@ class Truth:
     planes: np.ndarray = field(default_factory=lambda: np.empty((0, 4)))  # (P, 4) n, d: n . p = d, world
     T_imu_lidar: dict[str, np.ndarray] = field(default_factory=dict)
     T_imu_wheel: dict[str, np.ndarray] = field(default_factory=dict)
-    radii: dict[str, np.ndarray] = field(default_factory=dict)  # (2,) m, left and right
-    baseline: dict[str, float] = field(default_factory=dict)  # m
+    drive: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)  # of wheels, see `SimWheels.drive`
     T_imu_pose: dict[str, np.ndarray] = field(default_factory=dict)  # of pose sensors
     T_world_frame: dict[str, np.ndarray] = field(default_factory=dict)  # of theirs
     poses: dict[str, PoseTruth] = field(default_factory=dict)
@@ -230,8 +229,7 @@ def _rig_truth(scenario: Scenario) -> dict[str, Any]:
         "bloom_px": {c.name: c.bloom_px for c in cameras},
         "T_imu_lidar": {s.name: s.T_imu_lidar for s in lidars},
         "T_imu_wheel": {s.name: s.T_imu_wheel for s in wheels},
-        "radii": {s.name: np.array(s.radii) for s in wheels},
-        "baseline": {s.name: s.baseline for s in wheels},
+        "drive": {s.name: s.drive for s in wheels},
         "T_imu_pose": {s.name: s.T_imu_sensor for s in poses},
         "T_world_frame": {s.name: s.T_world_frame for s in poses},
     }

@@ -31,6 +31,10 @@ _TRUTH_HEADER = """\
 # Truth of a simulated recording, in SI units: p_imu = T_imu_sensor p_sensor, t_imu = t_sensor + time_offset.
 # Planes: [nx, ny, nz, d] in the world, n . p = d. The trajectory and the points of the tracks are in truth.npz.
 """
+_WHEEL_COLUMNS = {
+    "pair": ("rates", "left [rad/s],right [rad/s]"), "steered": ("rates", "wheel [rad/s],steering [rad]"),
+    "twist": ("twist", "v [m/s],w [rad/s]"),
+}  # fmt: skip
 _WHEEL_MEANING = {"mean": "means since the stamp before", "instant": "values at the stamp"}
 
 
@@ -110,7 +114,7 @@ def _plain_truth(scenario: Scenario, truth: Truth, seed: int) -> dict[str, Any]:
     for s in scenario.lidars:
         sensors[s.name] = _mounted(truth, s.name, "lidar", s.T_imu_lidar)
     for w in scenario.wheels:
-        sizes = {"radii": list(map(float, w.radii)), "baseline": float(w.baseline)}
+        sizes = {name: v.tolist() if v.size > 1 else float(v[0]) for name, v in w.drive.items()}
         sensors[w.name] = _mounted(truth, w.name, "wheels", w.T_imu_wheel) | sizes
     for p in scenario.poses:
         frame = {"kind": p.kind, "T_world_frame": p.T_world_frame.tolist()}
@@ -158,8 +162,9 @@ def _write_scans(folder: Path, lidar: LidarStream) -> None:
 
 def _write_wheels(folder: Path, wheels: WheelStream | WheelPoses) -> None:
     if isinstance(wheels, WheelStream):
-        header = f"t [ns],left [rad/s],right [rad/s]; {_WHEEL_MEANING[wheels.meaning]}"
-        _write_table(folder / "rates.csv", header, wheels.stamps_ns, wheels.rate)
+        name, columns = _WHEEL_COLUMNS[wheels.kind]
+        header = f"t [ns],{columns}; {_WHEEL_MEANING[wheels.meaning]}"
+        _write_table(folder / f"{name}.csv", header, wheels.stamps_ns, wheels.rate)
         return
     header = "from [ns],to [ns],yaw [rad],x [m],y [m],covariance: yaw yaw,yaw x,yaw y,x x,x y,y y"
     stamps = wheels.stamps_ns

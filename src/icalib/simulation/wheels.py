@@ -1,24 +1,29 @@
-"""What wheels report: turning rates from encoders, or relative poses of their frame as the paper's (27) has them."""
+"""What wheels report: turning rates from encoders, speed and yaw rate, a steering angle, or relative poses of their
+frame as the paper's (27) has them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
+from icalib.errors import RigError
 from icalib.measurements import WheelPoses, WheelStream
 from icalib.simulation.instants import LEAD_S, check_enough, stamped
 from icalib.simulation.motion import Trajectory
 from icalib.simulation.robot import SimWheels
 
 _GAUSS = np.polynomial.legendre.leggauss(3)
+_STEEPEST_RAD = 1.3
+_KINDS: dict[str, Literal["pair", "steered", "twist"]] = {"rates": "pair", "steering": "steered", "twist": "twist"}
 _SUBSTEPS = 12  # of an interval of (27), for its noise
 
 
 @dataclass(frozen=True, eq=False)
 class WheelTruth:
-    """seconds (N,) on the IMU's clock of each stamp; value: (N, 2) rates, or (N - 1, 3) relative poses, both without
-    noise."""
+    """seconds (N,) on the IMU's clock of each stamp; value: (N, 2) as in `WheelStream`, or (N - 1, 3) relative poses,
+    both without noise."""
 
     seconds: np.ndarray
     value: np.ndarray
@@ -37,21 +42,44 @@ def read_wheels(
         return WheelPoses(wheels.name, stamps, measured, covariance), WheelTruth(seconds, true)
     if wheels.meaning == "instant":
         stamps, seconds = stamps[1:], seconds[1:]
-        true = wheel_rates(wheels, trajectory, seconds)
+        true = reported(wheels, trajectory, seconds)
     else:
-        true = _mean_rates(wheels, trajectory, seconds, imu_seconds)
+        true = _means(wheels, trajectory, seconds, imu_seconds)
         stamps, seconds = stamps[1:], seconds[1:]
-    noise = wheels.noise * np.sqrt(wheels.rate_hz) * rng.standard_normal(true.shape)
-    return WheelStream(wheels.name, stamps, true + noise * float(noisy), wheels.meaning), WheelTruth(seconds, true)
+        if wheels.reports == "steering":
+            true[:, 1] = reported(wheels, trajectory, seconds)[:, 1]
+    densities = {"twist": [wheels.speed_noise, wheels.yaw_noise], "steering": [wheels.noise, wheels.steering_noise]}
+    density = np.array(densities.get(wheels.reports, [wheels.noise, wheels.noise]))
+    noise = density * np.sqrt(wheels.rate_hz) * rng.standard_normal(true.shape)
+    measured = true + noise * float(noisy)
+    stream = WheelStream(wheels.name, stamps, measured, wheels.meaning, _KINDS[wheels.reports])
+    return stream, WheelTruth(seconds, true)
 
 
-def wheel_rates(wheels: SimWheels, trajectory: Trajectory, seconds: np.ndarray) -> np.ndarray:
-    """(N, 2) rad/s that the left and the right wheel turn at each instant: (v_x -+ baseline/2 w_z) / radius."""
+def reported(wheels: SimWheels, trajectory: Trajectory, seconds: np.ndarray) -> np.ndarray:
+    """(N, 2) at each instant, without noise, as in `WheelStream`. Of rates (v_x -+ baseline/2 w_z) / radius."""
     velocity, rate = wheel_velocity(wheels.T_imu_wheel, trajectory, seconds)
+    ahead, turning = velocity[:, 0], rate[:, 2]
+    if wheels.reports == "twist":
+        return np.stack([ahead / wheels.scales[0], turning / wheels.scales[1]], axis=1)
+    if wheels.reports == "steering":
+        return np.stack([ahead / wheels.radius, _steering(wheels, ahead, turning)], axis=1)
     half = 0.5 * wheels.baseline
-    left = (velocity[:, 0] - half * rate[:, 2]) / wheels.radii[0]
-    right = (velocity[:, 0] + half * rate[:, 2]) / wheels.radii[1]
+    left = (ahead - half * turning) / wheels.radii[0]
+    right = (ahead + half * turning) / wheels.radii[1]
     return np.stack([left, right], axis=1)
+
+
+def _steering(wheels: SimWheels, ahead: np.ndarray, turning: np.ndarray) -> np.ndarray:
+    """(N,) rad: a point a wheelbase ahead moves at v_x forwards, or backwards, and at wheelbase w_z to the left. Raises
+    RigError where no front wheels can be steered so."""
+    angle = np.arctan2(np.copysign(wheels.wheelbase, ahead) * turning, np.abs(ahead))
+    if np.abs(angle).max() > _STEEPEST_RAD:
+        raise RigError(
+            f"{wheels.name} would have to steer by {np.rad2deg(np.abs(angle).max()):.0f} deg; choose a motion with "
+            "wider curves that never drives backwards, or a shorter wheelbase."
+        )
+    return angle - wheels.steering_offset
 
 
 def wheel_velocity(
@@ -64,13 +92,13 @@ def wheel_velocity(
     return in_imu @ T_imu_wheel[:3, :3], rate @ T_imu_wheel[:3, :3]
 
 
-def _mean_rates(wheels: SimWheels, trajectory: Trajectory, seconds: np.ndarray, imu_seconds: np.ndarray) -> np.ndarray:
+def _means(wheels: SimWheels, trajectory: Trajectory, seconds: np.ndarray, imu_seconds: np.ndarray) -> np.ndarray:
     """(N - 1, 2) means between the instants, by Gauss's rule between all these and the IMU's, where rates may jump."""
     within = imu_seconds[(imu_seconds > seconds[0]) & (imu_seconds < seconds[-1])]
     cuts = np.union1d(seconds, within)
     width = np.diff(cuts)
     at = 0.5 * (cuts[:-1] + cuts[1:])[:, None] + 0.5 * width[:, None] * _GAUSS[0]
-    rates = wheel_rates(wheels, trajectory, at.ravel()).reshape(*at.shape, 2)
+    rates = reported(wheels, trajectory, at.ravel()).reshape(*at.shape, 2)
     angle = 0.5 * width[:, None] * np.einsum("g,ngw->nw", _GAUSS[1], rates)
     turned = np.concatenate([np.zeros((1, 2)), np.cumsum(angle, axis=0)])[np.searchsorted(cuts, seconds)]
     return np.diff(turned, axis=0) / np.diff(seconds)[:, None]

@@ -21,16 +21,15 @@ from icalib.rig import (
     PoseSensor,
     Rig,
     Settings,
-    WheelFactor,
-    WheelMeasure,
     Wheels,
 )
-from icalib.rig_parameters import imu_intrinsics_parameter, parameter_to_plain, rotation_parameter, vector_parameter
+from icalib.rig_file.fields import MOUNTED, choice_or, groups_to_plain, mounting, path_or, positive_or, topic_or_none
+from icalib.rig_file.wheels import read_wheels, wheels_to_plain
+from icalib.rig_parameters import imu_intrinsics_parameter, parameter_to_plain, vector_parameter
 from icalib.rig_targets import NAME, target_of, target_or_targets
 from icalib.yaml_nodes import YamlValue, read_yaml
 
 _SENSOR_TYPES = ("imu", "camera", "lidar", "wheels", "pose")
-_MOUNTED = ("rotation", "translation", "time_offset")
 _DENSITIES = ("gyro", "gyro_walk", "accel", "accel_walk")
 
 
@@ -47,6 +46,7 @@ def load_rig(path: str | Path) -> Rig:
             "target is missing; add target, targets for several by name, or tracks (a table of followed points) to "
             f"{' and '.join(blind)}."
         )
+    _refuse_unseen_ground(found["sensors"], sensors, targeted)
     return Rig(
         imu=sensors.imus[0] if sensors.imus else None,
         cameras=tuple(sensors.cameras),
@@ -74,7 +74,7 @@ def rig_to_dict(rig: Rig) -> dict[str, Any]:
     """`rig` as lists, numbers and text; written as YAML or JSON, it loads back as the same rig."""
     imus = {} if rig.imu is None else {rig.imu.name: _imu_to_plain(rig.imu)}
     sensors = imus | {c.name: _camera_to_plain(c) for c in rig.cameras}
-    sensors |= {s.name: _lidar_to_plain(s) for s in rig.lidars} | {w.name: _wheels_to_plain(w) for w in rig.wheels}
+    sensors |= {s.name: _lidar_to_plain(s) for s in rig.lidars} | {w.name: wheels_to_plain(w) for w in rig.wheels}
     sensors |= {s.name: _pose_to_plain(s) for s in rig.poses}
     key = "targets" if isinstance(rig.target, Scene) else "target"
     target = {key: rig.target.plain()} if rig.has_target else {}
@@ -111,7 +111,7 @@ def _sensors(value: YamlValue) -> _Sensors:
             case "lidar":
                 found.lidars.append(_lidar(name, sensor))
             case "wheels":
-                found.wheels.append(_wheels(name, sensor))
+                found.wheels.append(read_wheels(name, sensor))
             case "pose":
                 found.poses.append(_pose(name, sensor))
             case _ if found.imus:
@@ -131,14 +131,28 @@ def _refuse_incomplete(value: YamlValue, found: _Sensors) -> None:
         value.entries()[first.name].fail("needs an IMU; add a sensor of type: imu, or remove this one.")
 
 
+def _refuse_unseen_ground(value: YamlValue, found: _Sensors, targeted: bool) -> None:
+    """Ground that wheels are said to stand on, which nothing shows."""
+    for wheels in found.wheels:
+        if wheels.ground is None:
+            continue
+        field = value.entries()[wheels.name].entries()["ground"].entries()
+        if wheels.ground.plane == "floor" and not found.lidars:
+            field["plane"].fail("the floor is what a LiDAR sees, and there is none; write level.")
+        if wheels.ground.plane == "level" and wheels.knows_height and not targeted:
+            field["height_sigma"].fail(
+                "heights are counted from the target, and there is none; remove it, or with a LiDAR write plane: floor."
+            )
+
+
 def _imu(name: str, value: YamlValue) -> ImuSensor:
     found = value.record(("type",), ("path", "topic", "noise", "intrinsics"))
     return ImuSensor(
         name=name,
-        path=_path(found, f"{name}/data.csv"),
+        path=path_or(found, f"{name}/data.csv"),
         noise=_noise(found["noise"]) if "noise" in found else class_noise(DEFAULT_CLASS),
         intrinsics=imu_intrinsics_parameter(found["intrinsics"]) if "intrinsics" in found else Parameter("fixed"),
-        topic=_topic(found),
+        topic=topic_or_none(found),
     )
 
 
@@ -151,7 +165,7 @@ def _noise(value: YamlValue) -> ImuNoise:
 
 
 def _camera(name: str, value: YamlValue) -> Camera:
-    groups = (*_MOUNTED, "intrinsics", "distortion", "bloom")
+    groups = (*MOUNTED, "intrinsics", "distortion", "bloom")
     found = value.record(
         ("type", "model", "resolution"), ("path", "topic", "corner_noise", "tracks", "track_noise", *groups)
     )
@@ -162,117 +176,48 @@ def _camera(name: str, value: YamlValue) -> Camera:
     _refuse_negative_focal_length(found, parameters)
     return Camera(
         name=name,
-        path=_path(found, f"{name}/corners.csv"),
+        path=path_or(found, f"{name}/corners.csv"),
         model=model,
         resolution=_resolution(found["resolution"]),
         corner_noise_px=found["corner_noise"].positive() if "corner_noise" in found else None,
-        topic=_topic(found),
+        topic=topic_or_none(found),
         tracks=found["tracks"].text() if "tracks" in found else None,
         track_noise_px=found["track_noise"].positive() if "track_noise" in found else None,
-        **_mounting(found),
+        **mounting(found),
         **parameters,
     )
 
 
-def _mounting(found: dict[str, YamlValue]) -> dict[str, Parameter]:
-    """Where a sensor is and how its clock goes, as far as it is said."""
-    sizes = {"translation": 3, "time_offset": 1}
-    groups = {group: vector_parameter(found[group], n) for group, n in sizes.items() if group in found}
-    return groups | ({"rotation": rotation_parameter(found["rotation"])} if "rotation" in found else {})
-
-
 def _lidar(name: str, value: YamlValue) -> Lidar:
-    found = value.record(("type",), ("path", "topic", "range_noise", "near", "far", "point_time", *_MOUNTED))
-    near, far = _positive(found, "near", Lidar.near_m), _positive(found, "far", Lidar.far_m)
+    found = value.record(("type",), ("path", "topic", "range_noise", "near", "far", "point_time", *MOUNTED))
+    near, far = positive_or(found, "near", Lidar.near_m), positive_or(found, "far", Lidar.far_m)
     if near >= far:
         found["near" if "near" in found else "far"].fail(
             f"points from {near:g} to {far:g} m are none; near must be below far."
         )
     return Lidar(
         name=name,
-        path=_path(found, f"{name}/scans.npz"),
+        path=path_or(found, f"{name}/scans.npz"),
         range_noise_m=found["range_noise"].positive() if "range_noise" in found else None,
         near_m=near,
         far_m=far,
-        point_time=_choice(found, "point_time", PointTime, Lidar.point_time),
-        topic=_topic(found),
-        **_mounting(found),
-    )
-
-
-def _wheels(name: str, value: YamlValue) -> Wheels:
-    sizes, densities = {"radii": 2, "baseline": 1}, ("wheel_noise", "sideways_slip", "upwards_slip")
-    words = ("path", "topic", "drive", "measures", "meaning", "counts_per_turn", "counter_size", "joints", "factor")
-    found = value.record(("type",), (*words, *densities, *_MOUNTED, *sizes))
-    measures = _choice(found, "measures", WheelMeasure, Wheels.measures)
-    _refuse_other_measures(value, found, measures)
-    groups = {group: vector_parameter(found[group], n) for group, n in sizes.items() if group in found}
-    _refuse_negative_lengths(found, groups)
-    return Wheels(
-        name=name,
-        path=_path(found, f"{name}/{measures}.csv"),
-        drive=_choice(found, "drive", Literal["differential"], Wheels.drive),
-        wheel_noise=_positive(found, "wheel_noise", Wheels.wheel_noise),
-        sideways_slip=_positive(found, "sideways_slip", Wheels.sideways_slip),
-        upwards_slip=_positive(found, "upwards_slip", Wheels.upwards_slip),
-        factor=_choice(found, "factor", WheelFactor, "relative-poses" if measures == "poses" else Wheels.factor),
-        measures=measures,
-        meaning=_choice(found, "meaning", Literal["mean", "instant"], Wheels.meaning),
-        counts_per_turn=found["counts_per_turn"].positive() if "counts_per_turn" in found else None,
-        counter_size=found["counter_size"].whole(2) if "counter_size" in found else None,
-        topic=_topic(found),
-        joints=_joints(found["joints"]) if "joints" in found else None,
-        **_mounting(found),
-        **groups,
+        point_time=choice_or(found, "point_time", PointTime, Lidar.point_time),
+        topic=topic_or_none(found),
+        **mounting(found),
     )
 
 
 def _pose(name: str, value: YamlValue) -> PoseSensor:
-    found = value.record(("type",), ("path", "topic", "kind", "rotation_noise", "position_noise", *_MOUNTED))
+    found = value.record(("type",), ("path", "topic", "kind", "rotation_noise", "position_noise", *MOUNTED))
     return PoseSensor(
         name=name,
-        path=_path(found, f"{name}/poses.csv"),
-        kind=_choice(found, "kind", PoseKind, PoseSensor.kind),
-        topic=_topic(found),
+        path=path_or(found, f"{name}/poses.csv"),
+        kind=choice_or(found, "kind", PoseKind, PoseSensor.kind),
+        topic=topic_or_none(found),
         rotation_noise=found["rotation_noise"].positive() if "rotation_noise" in found else None,
         position_noise=found["position_noise"].positive() if "position_noise" in found else None,
-        **_mounting(found),
+        **mounting(found),
     )
-
-
-_ONLY_OF = {"meaning": "rates", "counts_per_turn": "ticks", "counter_size": "ticks"}
-
-
-def _refuse_other_measures(value: YamlValue, found: dict[str, YamlValue], measures: WheelMeasure) -> None:
-    """Fields that do not go with what the wheels measure, or are missing."""
-    for name, kind in _ONLY_OF.items():
-        if name in found and measures != kind:
-            found[name].fail(f"belongs to wheels that measure {kind}, not {measures}; remove it, or correct measures.")
-    if measures == "ticks" and "counts_per_turn" not in found:
-        value.fail("counts_per_turn is missing; add how many ticks one turn of the wheel has, gears included.")
-    if measures == "poses" and "factor" in found and found["factor"].text() == "increments":
-        found["factor"].fail("increments cannot be had from relative poses; write relative-poses.")
-
-
-def _refuse_negative_lengths(found: dict[str, YamlValue], groups: dict[str, Parameter]) -> None:
-    for name, group in groups.items():
-        if group.value is not None and (group.value <= 0).any():
-            found[name].fail("is in metres and must be above 0; correct it.")
-
-
-def _joints(value: YamlValue) -> tuple[str, str]:
-    names = [item.text() for item in value.items()]
-    if len(names) != 2 or names[0] == names[1]:
-        value.fail("must be the names of two joints, [left, right].")
-    return names[0], names[1]
-
-
-def _positive(found: dict[str, YamlValue], name: str, default: float) -> float:
-    return found[name].positive() if name in found else default
-
-
-def _choice(found: dict[str, YamlValue], name: str, kind: Any, default: Any) -> Any:
-    return found[name].choice("such choice as", get_args(kind)) if name in found else default
 
 
 def _refuse_negative_focal_length(found: dict[str, YamlValue], parameters: dict[str, Parameter]) -> None:
@@ -286,14 +231,6 @@ def _resolution(value: YamlValue) -> tuple[int, int]:
     if len(sides) != 2:
         value.fail(f"must be [width, height] in pixels, but has {len(sides)} entries.")
     return sides[0].whole(1), sides[1].whole(1)
-
-
-def _path(found: dict[str, YamlValue], default: str) -> str:
-    return found["path"].text() if "path" in found else default
-
-
-def _topic(found: dict[str, YamlValue]) -> str | None:
-    return found["topic"].text() if "topic" in found else None
 
 
 def _settings(value: YamlValue) -> Settings:
@@ -334,30 +271,17 @@ def _camera_to_plain(camera: Camera) -> dict[str, Any]:
         plain["tracks"] = camera.tracks
     if camera.track_noise_px is not None:
         plain["track_noise"] = camera.track_noise_px
-    return plain | _groups_to_plain(camera)
+    return plain | groups_to_plain(camera)
 
 
 def _lidar_to_plain(lidar: Lidar) -> dict[str, Any]:
     plain: dict[str, Any] = {"type": "lidar", "path": lidar.path, "near": lidar.near_m, "far": lidar.far_m}
     plain["point_time"] = lidar.point_time
     given = {"range_noise": lidar.range_noise_m, "topic": lidar.topic}
-    return plain | {name: value for name, value in given.items() if value is not None} | _groups_to_plain(lidar)
-
-
-def _wheels_to_plain(wheels: Wheels) -> dict[str, Any]:
-    same = ("path", "drive", "measures", "factor", "wheel_noise", "sideways_slip", "upwards_slip")
-    plain: dict[str, Any] = {"type": "wheels", **{name: getattr(wheels, name) for name in same}}
-    given = {name: getattr(wheels, name) for name, kind in _ONLY_OF.items() if kind == wheels.measures}
-    given |= {"topic": wheels.topic, "joints": None if wheels.joints is None else list(wheels.joints)}
-    return plain | {name: value for name, value in given.items() if value is not None} | _groups_to_plain(wheels)
+    return plain | {name: value for name, value in given.items() if value is not None} | groups_to_plain(lidar)
 
 
 def _pose_to_plain(sensor: PoseSensor) -> dict[str, Any]:
     plain: dict[str, Any] = {"type": "pose", "path": sensor.path, "kind": sensor.kind}
     given = {name: getattr(sensor, name) for name in ("rotation_noise", "position_noise", "topic")}
-    return plain | {name: value for name, value in given.items() if value is not None} | _groups_to_plain(sensor)
-
-
-def _groups_to_plain(sensor: Camera | Lidar | Wheels | PoseSensor) -> dict[str, Any]:
-    groups = {f.name: getattr(sensor, f.name) for f in dataclasses.fields(sensor)}
-    return {name: parameter_to_plain(p) for name, p in groups.items() if isinstance(p, Parameter)}
+    return plain | {name: value for name, value in given.items() if value is not None} | groups_to_plain(sensor)

@@ -1,0 +1,180 @@
+"""The wheels stand on a plane: their frame is upright on it, and its origin at a height over it, at every node.
+
+With n the plane's normal (3,) upwards, q a point on it, R_k, p_k the IMU's pose at node k and R, p that of the wheels
+in the IMU's frame, the rows of a node are
+
+    e_1, e_2 of (R_k R)^T n                  over tilt_noise         how the frame is tilted on the plane [rad]
+    n . (p_k + R_k p - q) - h                over bump_noise         its height [m]
+    (h - height) / sqrt(nodes)               over height_sigma       what was measured of the height [m]
+
+The first three are noise of each node: springs and an uneven floor. The last are together one measurement of h: a tape
+has the same error all the time. It is a measurement and no prior, so that verdicts are those of the data with it.
+
+`level`: n is upwards, q the origin of the world. `floor`: the plane that the LiDARs see most of, of those that are
+nearly level and below the IMU, in each recording its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.estimation.arrowhead import Piece
+from icalib.estimation.imu_data import ImuData
+from icalib.estimation.row_sums import Into, Weighing, add_rows
+from icalib.estimation.sensors import Whitened
+from icalib.estimation.state import Key, Layout, State
+from icalib.estimation.wheel_kernels import Rows
+from icalib.geometry import planes, so3
+from icalib.rig import Ground
+
+LEVEL = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])  # normal and point
+NEARLY_LEVEL = np.cos(np.deg2rad(20.0))
+LEAST_BELOW_M = 0.02
+TILT, HEIGHT = "ground tilt", "ground height"
+HEIGHT_BLOCK = "ground_height"
+N_COLUMNS = 10  # of the border: rotation 3, translation 3, height 1, plane 3
+
+
+def floors(state: State, keys: tuple[Key, ...], points: np.ndarray) -> tuple[Key | None, ...]:
+    """The key of the floor in each recording, None where it is not seen; points (P,): how many lie on each of the
+    planes `keys`. Planes of several recordings are called after theirs, see `joined_clouds`."""
+    several, found = len(state.recordings) > 1, []
+    for r, nodes in enumerate(state.recordings, 1):
+        own = [k for k, (name, _) in enumerate(keys) if not several or name.startswith(f"plane {r}.")]
+        middle = state.position[nodes].mean(axis=0)
+        seen = [k for k in own if _is_floor(state.values[keys[k]], middle)]
+        found.append(keys[max(seen, key=lambda k: points[k])] if seen else None)
+    return tuple(found)
+
+
+def _is_floor(plane: np.ndarray, above: np.ndarray) -> bool:
+    n = plane[:3] * np.sign(plane[2])
+    return bool(n[2] > NEARLY_LEVEL and n @ (above - plane[3:]) > LEAST_BELOW_M)
+
+
+@dataclass(frozen=True)
+class GroundFactor:
+    """Rows of the wheels `name` at n nodes: tilt about both level axes, height, and what was measured of it; those that
+    `ground` does not ask for weigh nothing. floor: the key of the plane in each recording; None: the horizon's, or none
+    where `ground` asks for a floor that is not seen."""
+
+    name: str
+    ground: Ground
+    floor: tuple[Key | None, ...]
+    nodes: np.ndarray  # (n,)
+    starts: tuple[int, ...]
+    imu: ImuData
+    layout: Layout
+
+    @classmethod
+    def build(
+        cls, name: str, ground: Ground, floor: tuple[Key | None, ...], state: State, imu: ImuData, layout: Layout
+    ) -> GroundFactor:
+        """At all nodes of recordings that have the plane, but the last of each."""
+        used = [
+            np.arange(r.start, r.stop - 1)
+            for r, key in zip(state.recordings, floor, strict=True)
+            if ground.plane == "level" or key is not None
+        ]
+        nodes = np.concatenate([np.empty(0, dtype=np.int64), *used])
+        return cls(name, ground, floor, nodes, state.starts, imu, layout)
+
+    @property
+    def kinds(self) -> dict[str, slice]:
+        """See `SensorFactor`."""
+        tilt = {TILT: slice(0, 2)} if self.ground.tilt_noise is not None else {}
+        return tilt | ({HEIGHT: slice(2, 3)} if self.ground.height_sigma is not None else {})
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """(4,) of the rows, infinite where they are not asked for."""
+        tilt, height = self.ground.tilt_noise, self.ground.height_sigma
+        bump = np.inf if height is None else self.ground.bump_noise
+        once = np.inf if height is None else height * np.sqrt(len(self.nodes))
+        return np.array([*[np.inf if tilt is None else tilt] * 2, bump, once])
+
+    def with_imu(self, imu: ImuData) -> GroundFactor:
+        """The same: no reading carries it anywhere."""
+        del imu
+        return self
+
+    def output(self) -> Whitened:
+        """Empty arrays for `accumulate` to fill."""
+        return Whitened.empty(len(self.nodes), 4)
+
+    def count(self, out: Whitened, kind: str) -> int:
+        """Nodes times the rows of `kind`."""
+        return out.residual[:, self.kinds[kind]].size
+
+    def rms(self, out: Whitened, kind: str) -> tuple[float, str]:
+        """Of the residuals of `kind`."""
+        rows = self.kinds[kind]
+        r = out.residual[:, rows] * self.sigma[rows]
+        return float(np.sqrt(np.mean(r**2))) if r.size else 0.0, "rad" if kind == TILT else "m"
+
+    def accumulate(
+        self,
+        state: State,
+        piece: Piece,
+        out: Whitened,
+        sums: bool = True,
+        curved: bool = False,
+        noise: np.ndarray | None = None,
+    ) -> float:
+        """See `SensorFactor`; `noise` is (n, 4)."""
+        cost = 0.0
+        ends = (*self.starts[1:], len(state.seconds))
+        for begin, end, key in zip(self.starts, ends, self.floor, strict=True):
+            low, high = np.searchsorted(self.nodes, [max(begin, piece.first), min(end, piece.last)])
+            if low >= high:
+                continue
+            own = slice(int(low), int(high))
+            rows = self._rows(state, self.nodes[own], None if key is None else state.values[key])
+            whitening = np.tile(np.diag(1.0 / self.sigma), (high - low, 1, 1))
+            by = Weighing(whitening, "none", 1.0)
+            into = Into(piece, out, sums, curved, noise)
+            cost += add_rows(rows, own, self.nodes[own], self._columns(key), self.layout, self.imu, by, into)
+        return cost
+
+    def _columns(self, key: Key | None) -> np.ndarray:
+        """(10,) of the border, -1 where a row does not hang on it."""
+        columns = np.full(N_COLUMNS, -1)
+        columns[:6] = self.layout.columns(self.name, "rotation", "translation")
+        if self.ground.height_sigma is not None:
+            columns[6:7] = self.layout.columns(self.name, HEIGHT_BLOCK)
+        if key is not None:
+            columns[7:] = self.layout.columns(*key)
+        return columns
+
+    def _rows(self, state: State, nodes: np.ndarray, floor: np.ndarray | None) -> Rows:
+        plane = LEVEL if floor is None else floor
+        sign = 1.0 if plane[2] >= 0.0 else -1.0
+        n, across = sign * plane[:3], sign * planes.tangents(np.ascontiguousarray(plane[:3]))
+        R, p = state.values[self.name, "rotation"], state.values[self.name, "translation"]
+        R_k = state.rotation[nodes]
+        up = np.einsum("kji,j->ki", R_k, n)  # in the axes of the IMU
+        way = state.position[nodes] + R_k @ p - plane[3:]
+        own = np.zeros((len(nodes), 4, N_COLUMNS))
+        by_node = np.zeros((len(nodes), 4, 15))
+        tilt = up @ R
+        # R_k <- R_k Exp(d) takes up to up + up x d, and R <- R Exp(d) the tilt to tilt + tilt x d.
+        by_node[:, :2, :3] = np.einsum("ji,kjl->kil", R[:, :2], _hat(up))
+        own[:, :2, :3] = _hat(tilt)[:, :2]
+        own[:, :2, 7:9] = np.einsum("kji,tj->kit", R_k @ R[:, :2], across)
+        by_node[:, 2, :3] = np.cross(p, up)
+        by_node[:, 2, 3:6] = n
+        own[:, 2, 3:6] = up
+        own[:, 2, 7:9] = way @ across.T
+        own[:, 2, 9] = -sign
+        own[:, 2:, 6] = [-1.0, 1.0]
+        h = state.values.get((self.name, HEIGHT_BLOCK), np.zeros(1))[0]
+        height = way @ n - h
+        residual = np.column_stack([tilt[:, :2], height, np.full(len(nodes), h - self.ground.height)])
+        return Rows(residual, by_node, np.zeros_like(by_node), own)
+
+
+def _hat(v: np.ndarray) -> np.ndarray:
+    """(n, 3, 3) of v (n, 3)."""
+    return np.array([so3.hat(x) for x in np.ascontiguousarray(v)])

@@ -1,0 +1,40 @@
+"""Fields that several types of sensors of the rig file share, and back to plain data."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, get_args
+
+from icalib.rig import Camera, Lidar, Parameter, PoseSensor, Wheels
+from icalib.rig_parameters import parameter_to_plain, rotation_parameter, vector_parameter
+from icalib.yaml_nodes import YamlValue
+
+MOUNTED = ("rotation", "translation", "time_offset")
+
+
+def mounting(found: dict[str, YamlValue]) -> dict[str, Parameter]:
+    """Where a sensor is and how its clock goes, as far as it is said."""
+    sizes = {"translation": 3, "time_offset": 1}
+    groups = {group: vector_parameter(found[group], n) for group, n in sizes.items() if group in found}
+    return groups | ({"rotation": rotation_parameter(found["rotation"])} if "rotation" in found else {})
+
+
+def positive_or(found: dict[str, YamlValue], name: str, default: float) -> float:
+    return found[name].positive() if name in found else default
+
+
+def choice_or(found: dict[str, YamlValue], name: str, kind: Any, default: Any) -> Any:
+    return found[name].choice("such choice as", get_args(kind)) if name in found else default
+
+
+def path_or(found: dict[str, YamlValue], default: str) -> str:
+    return found["path"].text() if "path" in found else default
+
+
+def topic_or_none(found: dict[str, YamlValue]) -> str | None:
+    return found["topic"].text() if "topic" in found else None
+
+
+def groups_to_plain(sensor: Camera | Lidar | Wheels | PoseSensor) -> dict[str, Any]:
+    groups = {f.name: getattr(sensor, f.name) for f in dataclasses.fields(sensor)}
+    return {name: parameter_to_plain(p) for name, p in groups.items() if isinstance(p, Parameter)}

@@ -1,0 +1,142 @@
+"""Wheels of the rig file, and back to plain data."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from icalib.rig import DRIVE_SIZES, Ground, GroundPlane, Parameter, WheelDrive, WheelFactor, WheelMeasure, Wheels
+from icalib.rig_file.fields import MOUNTED, choice_or, groups_to_plain, mounting, path_or, positive_or, topic_or_none
+from icalib.rig_parameters import vector_parameter
+from icalib.yaml_nodes import YamlValue
+
+_WORDS = ("path", "topic", "drive", "measures", "meaning", "counts_per_turn", "counter_size", "joints", "factor")
+_NOISES = ("wheel_noise", "speed_noise", "yaw_noise", "steering_noise")
+_GROUND = ("tilt_noise", "height", "height_sigma", "bump_noise")
+_SLIP = ("sideways_slip", "upwards_slip")
+_LENGTHS = ("radii", "baseline", "radius", "wheelbase")
+_TURNED = ("rates", "angles", "ticks")
+# Fields that go with some of `measures` only.
+_ONLY_OF: dict[str, tuple[str, ...]] = {
+    "meaning": ("rates", "twist"), "counts_per_turn": ("ticks",), "counter_size": ("ticks",), "joints": _TURNED,
+}  # fmt: skip
+# And with some kinds of wheels only.
+_ONLY_OF_KIND: dict[str, tuple[str, ...]] = {
+    **{group: (kind,) for kind, sizes in DRIVE_SIZES.items() for group in sizes},
+    "wheel_noise": ("pair", "steered"), "speed_noise": ("twist",), "yaw_noise": ("twist",),
+    "steering_noise": ("steered",),
+}  # fmt: skip
+_CALLED = {"pair": "a left and a right side", "steered": "drive: ackermann", "twist": "measures: twist"}
+_JOINTS = {
+    "differential": ((2,), "two joints, [left, right]"),
+    "skid-steer": ((4,), "four joints, [front left, rear left, front right, rear right]"),
+    "ackermann": (
+        (2, 4), "two joints, [driven wheel, steering], or four, [rear left, rear right, steering left, steering right]",
+    ),
+}  # fmt: skip
+
+
+def read_wheels(name: str, value: YamlValue) -> Wheels:
+    """Raises RigError naming line and field."""
+    found = value.record(
+        ("type",), (*_WORDS, "ground", *_NOISES, *_SLIP, *MOUNTED, *(g for s in DRIVE_SIZES.values() for g in s))
+    )
+    measures: WheelMeasure = choice_or(found, "measures", WheelMeasure, Wheels.measures)
+    drive: WheelDrive = choice_or(found, "drive", WheelDrive, Wheels.drive)
+    bare = Wheels(name, "", drive, measures=measures)
+    _refuse_other_measures(value, found, bare)
+    groups = {group: vector_parameter(found[group], n) for group, n in bare.sizes.items() if group in found}
+    _refuse_negative_lengths(found, groups)
+    given: dict[str, Any] = {d: positive_or(found, d, getattr(Wheels, d)) for d in (*_NOISES, *_SLIP)}
+    given |= mounting(found) | groups
+    return Wheels(
+        name=name,
+        path=path_or(found, f"{name}/{measures}.csv"),
+        drive=drive,
+        factor=choice_or(found, "factor", WheelFactor, "relative-poses" if measures == "poses" else Wheels.factor),
+        measures=measures,
+        meaning=choice_or(found, "meaning", Literal["mean", "instant"], Wheels.meaning),
+        counts_per_turn=found["counts_per_turn"].positive() if "counts_per_turn" in found else None,
+        counter_size=found["counter_size"].whole(2) if "counter_size" in found else None,
+        topic=topic_or_none(found),
+        joints=_joints(found["joints"], drive) if "joints" in found else None,
+        ground=_ground(found["ground"]) if "ground" in found else None,
+        **given,
+    )
+
+
+def _refuse_other_measures(value: YamlValue, found: dict[str, YamlValue], bare: Wheels) -> None:
+    """Fields that do not go with what the wheels measure or with how they are driven, or are missing."""
+    for name, measures in _ONLY_OF.items():
+        if name in found and bare.measures not in measures:
+            found[name].fail(
+                f"belongs to wheels that measure {' or '.join(measures)}, not {bare.measures}; remove it, or correct "
+                "measures."
+            )
+    if bare.measures == "ticks" and "counts_per_turn" not in found:
+        value.fail("counts_per_turn is missing; add how many ticks one turn of the wheel has, gears included.")
+    if bare.drive != "differential" and bare.measures not in _TURNED:
+        found["drive"].fail(f"goes with wheels that measure {' or '.join(_TURNED)}; remove it, or correct measures.")
+    for name, kinds in _ONLY_OF_KIND.items():
+        if name in found and bare.kind not in kinds:
+            found[name].fail(
+                f"belongs to wheels with {' or '.join(_CALLED[k] for k in kinds)}; remove it, or correct drive and "
+                "measures."
+            )
+    _refuse_factor(found, bare)
+
+
+def _refuse_factor(found: dict[str, YamlValue], bare: Wheels) -> None:
+    given = found["factor"].text() if "factor" in found else None
+    if bare.measures == "poses" and given == "increments":
+        found["factor"].fail("increments cannot be had from relative poses; write relative-poses.")
+    if bare.kind != "pair" and given == "relative-poses":
+        found["factor"].fail("the paper's relative-poses are of a left and a right wheel; write increments.")
+
+
+def _refuse_negative_lengths(found: dict[str, YamlValue], groups: dict[str, Parameter]) -> None:
+    for name, group in groups.items():
+        if name != "steering_offset" and group.value is not None and (group.value <= 0).any():
+            unit = "is in metres and" if name in _LENGTHS else "are factors and"
+            found[name].fail(f"{unit} must be above 0; correct it.")
+
+
+def _joints(value: YamlValue, drive: WheelDrive) -> tuple[str, ...]:
+    names = tuple(item.text() for item in value.items())
+    counts, words = _JOINTS[drive]
+    if len(names) not in counts or len(set(names)) < len(names):
+        value.fail(f"must be the names of {words}.")
+    return names
+
+
+def _ground(value: YamlValue) -> Ground:
+    found = value.record(("plane",), _GROUND)
+    if "tilt_noise" not in found and "height_sigma" not in found:
+        value.fail("says nothing yet; add tilt_noise (rad), or height and height_sigma (m), or both.")
+    for name in ("height", "bump_noise"):
+        if name in found and "height_sigma" not in found:
+            found[name].fail("goes with height_sigma, how well the height is known (m); add it.")
+    return Ground(
+        choice_or(found, "plane", GroundPlane, "level"),
+        tilt_noise=found["tilt_noise"].positive() if "tilt_noise" in found else None,
+        height=found["height"].number() if "height" in found else Ground.height,
+        height_sigma=found["height_sigma"].positive() if "height_sigma" in found else None,
+        bump_noise=positive_or(found, "bump_noise", Ground.bump_noise),
+    )
+
+
+def _ground_to_plain(ground: Ground) -> dict[str, Any]:
+    fields = [name for name in _GROUND if name == "tilt_noise" or ground.height_sigma is not None]
+    plain = {name: getattr(ground, name) for name in ("plane", *fields)}
+    return {name: value for name, value in plain.items() if value is not None}
+
+
+def wheels_to_plain(wheels: Wheels) -> dict[str, Any]:
+    """Lists, numbers and text that load back as `wheels`."""
+    noises = [name for name in _NOISES if wheels.kind in _ONLY_OF_KIND[name]]
+    same = ("path", "drive", "measures", "factor", *noises, *_SLIP)
+    plain: dict[str, Any] = {"type": "wheels", **{name: getattr(wheels, name) for name in same}}
+    given = {name: getattr(wheels, name) for name, of in _ONLY_OF.items() if wheels.measures in of}
+    given["ground"] = None if wheels.ground is None else _ground_to_plain(wheels.ground)
+    given |= {"topic": wheels.topic, "joints": None if wheels.joints is None else list(wheels.joints)}
+    groups = {name: p for name, p in groups_to_plain(wheels).items() if name in (*MOUNTED, *wheels.sizes)}
+    return plain | {name: value for name, value in given.items() if value is not None} | groups
