@@ -80,8 +80,7 @@ def test_truth_of_every_sensor(simulation):
         simulation.truth,
         T_imu_lidar={"lidar0": np.diag([-1.0, -1.0, 1.0, 1.0])},
         T_imu_wheel={"wheel0": np.eye(4) + np.eye(4, k=3)},
-        radii={"wheel0": np.array([0.1, 0.2])},
-        baseline={"wheel0": 0.4},
+        drive={"wheel0": {"radii": np.array([0.1, 0.2]), "baseline": np.array([0.4])}},
     )
     np.testing.assert_array_equal(true_value(truth, "lidar0", "rotation"), np.diag([-1.0, -1.0, 1.0]))
     np.testing.assert_array_equal(true_value(truth, "wheel0", "translation"), [1.0, 0.0, 0.0])
@@ -89,6 +88,7 @@ def test_truth_of_every_sensor(simulation):
     np.testing.assert_array_equal(true_value(truth, "wheel0", "baseline"), [0.4])
     np.testing.assert_array_equal(true_value(truth, "cam0", "bloom"), [0.0])
     np.testing.assert_array_equal(true_value(truth, "imu0", "intrinsics"), np.zeros(24))
+    assert true_value(truth, "wheel0", "scales") is None
     assert true_value(truth, "board0", "tilt") is None and true_value(truth, "lidar0", "radii") is None
 
 
