@@ -123,7 +123,6 @@ SEEN: list[tuple[Damage, str]] = [
     (partial(seeing, [2]), "surfaces that lidar0 sees face one direction only"),
     (partial(seeing, [0]), "surfaces that lidar0 sees face one direction only"),
     (partial(seeing, [2, 3]), "surfaces that lidar0 sees face one direction only"),
-    (partial(seeing, [0, 2]), "surfaces that lidar0 sees face two directions only, as in a corridor"),
     (mirrored, "lidar0 turns as imu0 does, but moves the other way"),
     (milliseconds, "lidar0.*point times may be wrong"),
 ]
@@ -143,15 +142,23 @@ def test_too_few_surfaces_with_a_guess(drive, faces: list[int]):
     assert "surfaces that lidar0 sees face" in refusal(guessed(simulation), broken)
 
 
+@pytest.mark.parametrize("known", [False, True])
 @pytest.mark.parametrize(("seconds", "faces"), [(16.0, [0, 2, 3]), (12.0, [0, 2])])
-def test_a_corridor_is_told(drive, seconds: float, faces: list[int]):
-    """One or two walls and a floor: what the motion along them leaves open is the world's, not the LiDAR's."""
+def test_a_corridor_is_told(drive, seconds: float, faces: list[int], known: bool):
+    """One or two walls and a floor leave the motion along them open. Whether the IMU carries the solver through is a
+    matter of luck: it ends in words, or in a result that says so and calls nothing determined that is wrong."""
     simulation = drive("3d", seconds, "l")
     corridor = with_scans(simulation.measurements, partial(seeing, faces))
-    result = calibrate_measurements(guessed(simulation), corridor)
+    try:
+        result = calibrate_measurements(guessed(simulation) if known else rig_for(simulation.scenario), corridor)
+    except CalibrationError as refused:
+        assert "surfaces that lidar0 sees face two directions only, as in a corridor" in str(refused)
+        return
     assert any("planes that lidar0 saw face two directions only, as in a corridor" in w for w in result.warnings)
-    off = result.group("lidar0", "translation").value - simulation.truth.T_imu_lidar["lidar0"][:3, 3]
-    assert (np.abs(off) < 4.0 * result.group("lidar0", "translation").std).all()
+    translation = result.group("lidar0", "translation")
+    sure = np.array([v != "undetermined" for v in translation.verdict])
+    off = translation.value - simulation.truth.T_imu_lidar["lidar0"][:3, 3]
+    assert (np.abs(off) < 4.0 * translation.std)[sure].all()
 
 
 def calibrated(simulation: Simulation, damage: Damage) -> Calibration:
