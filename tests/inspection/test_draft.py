@@ -78,15 +78,25 @@ def test_a_draft_loads_once_the_target_is_filled_in(draft, bags):
     assert "ruler" in text and "The default class" in text
 
 
-def test_lidars_are_drafted_and_wheels_suggested(draft, bags):
+def clouds_and_joints(bags):
     cloud, joints = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/JointState"
-    fields = [bags.make("sensor_msgs/msg/PointField", "x", 0, 7, 1)]
-    messages = bags.noise("/cam0/image_raw", SIZE)
+    fields, messages = [bags.make("sensor_msgs/msg/PointField", "x", 0, 7, 1)], []
     for t in range(1_700_000_000_000_000_000, 1_700_000_001_000_000_000, 100_000_000):
         points = bags.make(cloud, bags.header(t, "top"), 1, 2, fields, False, 4, 8, np.zeros(8, np.uint8), True)
         states = bags.make(joints, bags.header(t, ""), ["l", "r"], np.zeros(2), np.zeros(2), np.zeros(2))
         messages += [("/top/points", cloud, t, points), ("/joint_states", joints, t, states)]
-    text, path = draft(messages)
+    return messages
+
+
+def test_a_draft_of_a_lidar_and_an_imu_needs_no_target(draft, bags):
+    text, path = draft(clouds_and_joints(bags))
+    rig = load_rig(path)
+    assert [x.name for x in rig.lidars] == ["top"] and rig.imu.name == "imu0" and not rig.cameras
+    assert "target" not in text
+
+
+def test_lidars_are_drafted_and_wheels_suggested(draft, bags):
+    text, path = draft(bags.noise("/cam0/image_raw", SIZE) + clouds_and_joints(bags))
     fill(path)
     rig = load_rig(path)
     assert [(s.name, s.topic) for s in rig.lidars] == [("top", "/top/points")] and rig.wheels == ()
@@ -283,7 +293,7 @@ def test_a_folder_that_is_not_there(tmp_path):
 def test_no_draft_without_camera(bags, brief, tmp_path, capsys):
     bag = bags.write(tmp_path / "run", bags.imu("/imu0", brief))
     assert main(["inspect", str(bag), "--rig", str(tmp_path / "rig.yaml"), "-q"]) == 1
-    assert "holds no camera that can be read, so there is no rig to draft" in capsys.readouterr().err
+    assert "holds no camera that can be read, nor a LiDAR or poses beside an IMU" in capsys.readouterr().err
     assert not (tmp_path / "rig.yaml").exists()
 
 

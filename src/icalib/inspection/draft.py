@@ -41,12 +41,15 @@ target:
 
 
 def draft_rig(found: Inspection) -> str:
-    """The text of a rig file. Raises RecordingError where there is no camera to write down."""
+    """The text of a rig file. Raises RecordingError where there is nothing to calibrate: no camera, and no LiDAR or
+    poses beside an IMU."""
     broken = {c.name: problem for c in found.sources.cameras if (problem := found.stream(c.topic).problem)}
     cameras = [c for c in found.sources.cameras if c.name not in broken]
-    if not cameras:
+    beside_imu = found.sources.imus and (found.sources.lidars or found.sources.poses)
+    if not cameras and not beside_imu:
         raise RecordingError(
-            f"{found.recording} holds no camera that can be read, so there is no rig to draft; record one, too."
+            f"{found.recording} holds no camera that can be read, nor a LiDAR or poses beside an IMU, so there is no "
+            "rig to draft; record one, too."
         )
     lines = [
         f"# Draft by icalib inspect from {json.dumps(found.recording)}. Check every line (docs/rig-file.md).",
@@ -60,7 +63,7 @@ def draft_rig(found: Inspection) -> str:
         lines += _robot(found)
     left_out = {**broken, **found.sources.left_out}
     lines += [f"  # Not used: {_comment(topic)} ({_comment(why)})" for topic, why in left_out.items()]
-    return "\n".join([*lines, _target(found)])
+    return "\n".join([*lines, _target(found) if cameras else ""])
 
 
 def check_draft(path: Path) -> None:
