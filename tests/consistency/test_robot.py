@@ -145,6 +145,19 @@ def test_a_flat_floor_leaves_heights_and_the_roll_of_wheels_at_the_guess(robot, 
     check_planar(robot("planar", seconds, parts), seed)
 
 
+def test_a_flat_floor_with_no_guess_at_all(robot):
+    """Wheels a third of a metre below the IMU, where nobody guessed them to be: a pitch of 2 deg leaks 12 mm of it into
+    x, which must know so."""
+    scenario = robot("planar", 16.0, "lw", 600)
+    simulation = simulate(scenario, 0)
+    result = calibrate_measurements(rig_for(scenario), unassociated(simulation.measurements))
+    check_known(result, simulation)
+    wheels = result.group("wheel0", "translation")
+    off = wheels.value - simulation.truth.T_imu_wheel["wheel0"][:3, 3]
+    assert abs(off[2]) > 0.3 and wheels.verdict[2] == "undetermined"
+    assert (np.abs(off) < 2.0 * wheels.std_formal).all()
+
+
 @pytest.mark.statistical
 @pytest.mark.parametrize("seed", range(10))
 @pytest.mark.parametrize("parts", ["cw", "clw", "l"])

@@ -22,7 +22,7 @@ from icalib.estimation.prior_factor import Prior
 from icalib.estimation.problem import Problem
 from icalib.estimation.solver import Step, minimise
 from icalib.estimation.state import Key, State
-from icalib.estimation.tolerances import GUESS_SIGMA, OTHER_SIGMA
+from icalib.estimation.tolerances import FROM_NOTHING_M, GUESS_SIGMA, OTHER_SIGMA
 from icalib.geometry import planes, so3
 
 UNDETERMINED_BELOW = 1e-2  # information in tolerance units: known to less than ten tolerances
@@ -161,9 +161,11 @@ def _profile(inputs: Inputs, found: Estimate, direction: np.ndarray) -> np.ndarr
 
 def _guess_sigma(inputs: Inputs) -> np.ndarray:
     """(B,) standard deviations of the guess: given ones, or what one without is worth."""
-    sigma = np.zeros(inputs.layout.size)
+    sigma, sensors = np.zeros(inputs.layout.size), {s.name: s for s in inputs.sensors}
     for b in inputs.layout.free:
         sigma[b.columns] = OTHER_SIGMA if b.size == N_INTRINSICS else GUESS_SIGMA[b.name]
+        if b.name == "translation" and b.sensor in sensors and getattr(sensors[b.sensor], b.name).value is None:
+            sigma[b.columns] = FROM_NOTHING_M
     for prior in given_priors(inputs):
         sigma[prior.block.columns] = prior.sigma
     return sigma

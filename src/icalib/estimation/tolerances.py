@@ -18,6 +18,7 @@ GUESS_SIGMA = {
     "wheelbase": 0.1, "steering_offset": 0.1, "scales": 0.1, "ground_height": 0.1,
     "frame_rotation": 10.0, "frame_translation": 10.0,
 }  # fmt: skip
+FROM_NOTHING_M = 0.5  # what a translation is worth that nobody guessed: where the program took it to be
 OTHER_SIGMA = 0.1  # of IMU intrinsics
 
 
