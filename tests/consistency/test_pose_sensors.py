@@ -126,7 +126,7 @@ def test_planar_motion_leaves_height_open():
     rotation, translation = result.group("mocap0", "rotation"), result.group("mocap0", "translation")
     assert (np.abs(turn) < 4.0 * rotation.std).all() and rotation.std.max() < 5e-3
     assert translation.verdict[2] == "undetermined"
-    assert translation.std[2] == pytest.approx(0.1, rel=0.05)  # what a guess is worth
+    assert translation.std[2] == pytest.approx(0.5, rel=0.05)  # what a place that nobody guessed is worth
     assert way[2] == pytest.approx(-0.15, abs=0.01)  # held where nobody said anything: at 0
 
 
