@@ -194,7 +194,7 @@ class FeatureFactor:
                 out.residual[i], out.root[i],
             )  # fmt: skip
         if noise is None and sums and piece.features is not None:
-            piece.border[-1, -1] += _held_back(features)
+            piece.border[-1, -1] += held_back(features)
         return total
 
     def _within(self, piece: Piece) -> tuple[slice, slice]:
@@ -301,11 +301,13 @@ class FeatureFactor:
         return out
 
 
-def _held_back(features: FeatureSums) -> float:
+def held_back(features: FeatureSums) -> float:
     """Twice what the points would still take off the cost if they could: those that an image's edge stops. It pulls at
     poses and calibration as it should, but is no gain of a step."""
-    gradient = features.side[:, :, -1:]
-    return float((gradient * np.linalg.solve(features.own, gradient)).sum()) if len(gradient) else 0.0
+    gradient = features.side[:, :, -1]
+    # A point at a camera's very centre has no inverse; what is not known of it promises nothing.
+    step = np.einsum("nij,nj->ni", np.linalg.pinv(features.own, hermitian=True), gradient)
+    return float((gradient * step).sum())
 
 
 def _in_camera(view: View, points: np.ndarray, first: int) -> np.ndarray:
