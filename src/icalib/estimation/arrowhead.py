@@ -329,18 +329,9 @@ def _back(
         done.substitute(border, white, own)
         return
     for k in range(border.shape[1]):
-        one = np.ascontiguousarray(own[:, :, k])
-        noise = white[:, k].reshape(-1, NODE)
-        substitute_chain(
-            piece.diagonal,
-            piece.upper,
-            piece.side,
-            piece.first == 0,
-            keep,
-            np.ascontiguousarray(border[:, k]),
-            noise,
-            one,
-        )
+        one, known = np.ascontiguousarray(own[:, :, k]), np.ascontiguousarray(border[:, k])
+        noise, forwards = white[:, k].reshape(-1, NODE), piece.first == 0
+        substitute_chain(piece.diagonal, piece.upper, piece.side, forwards, keep, known, noise, one)
         # The shared node is given, and both pieces write their own nodes alone.
         inner = slice(None) if not keep else slice(None, -1) if piece.first == 0 else slice(1, None)
         own[inner, :, k] = one[inner]

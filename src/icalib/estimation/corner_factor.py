@@ -208,11 +208,6 @@ class CornerFactor:
         uv = self.model.project(params, X)[0] - self.stream.uv[own]
         return uv + state.values[self.name, "bloom"] * self.direction[own] if len(self.direction) else uv
 
-    def white_noise(self, rng: np.random.Generator) -> CornerWhite:
-        """In place of whitened residuals."""
-        shared = rng.standard_normal((len(self.views.image), 2, len(self.noise.tau)))
-        return CornerWhite(int(rng.integers(2**63)), shared)
-
     def output(self, dtype: type = np.float32) -> CornerOutput:
         """Empty arrays for `accumulate` to fill. Its sums do not depend on `dtype`."""
         return CornerOutput.empty(len(self.stream.uv), len(self.views.image), len(self.noise.tau), dtype)

@@ -26,7 +26,7 @@ from icalib.estimation.row_sums import Into, Weighing, add_rows
 from icalib.estimation.sensors import Whitened
 from icalib.estimation.state import Key, Layout, State
 from icalib.estimation.wheel_kernels import Rows
-from icalib.geometry import planes, so3
+from icalib.geometry import planes
 from icalib.rig import Ground
 
 LEVEL = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])  # normal and point
@@ -160,8 +160,8 @@ class GroundFactor:
         by_node = np.zeros((len(nodes), 4, 15))
         tilt = up @ R
         # R_k <- R_k Exp(d) takes up to up + up x d, and R <- R Exp(d) the tilt to tilt + tilt x d.
-        by_node[:, :2, :3] = np.einsum("ji,kjl->kil", R[:, :2], _hat(up))
-        own[:, :2, :3] = _hat(tilt)[:, :2]
+        by_node[:, :2, :3] = np.cross(R[:, :2].T, up[:, None])
+        own[:, :2, :3] = np.cross(np.eye(3)[:2], tilt[:, None])
         own[:, :2, 7:9] = np.einsum("kji,tj->kit", R_k @ R[:, :2], across)
         by_node[:, 2, :3] = np.cross(p, up)
         by_node[:, 2, 3:6] = n
@@ -173,8 +173,3 @@ class GroundFactor:
         height = way @ n - h
         residual = np.column_stack([tilt[:, :2], height, np.full(len(nodes), h - self.ground.height)])
         return Rows(residual, by_node, np.zeros_like(by_node), own)
-
-
-def _hat(v: np.ndarray) -> np.ndarray:
-    """(n, 3, 3) of v (n, 3)."""
-    return np.array([so3.hat(x) for x in np.ascontiguousarray(v)])

@@ -93,14 +93,11 @@ def own_entries(sensor: Lidar | Wheels | PoseSensor) -> list[Entry]:
         return mounts
     heard = sensor.measures != "poses"  # which say nothing of what rolls
     height: list[Entry] = [(sensor.name, HEIGHT_BLOCK, "vector", 1, True)] if sensor.knows_height else []
-    return (
-        mounts
-        + height
-        + [
-            (sensor.name, name, "vector", n, heard and getattr(sensor, name).mode != "fixed")
-            for name, n in sensor.sizes.items()
-        ]
-    )
+    drive: list[Entry] = [
+        (sensor.name, name, "vector", n, heard and getattr(sensor, name).mode != "fixed")
+        for name, n in sensor.sizes.items()
+    ]
+    return mounts + height + drive
 
 
 def frame_entries(sensor: PoseSensor, n_recordings: int) -> list[Entry]:

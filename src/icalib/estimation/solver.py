@@ -47,18 +47,17 @@ class Visit:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Where the solver ended, with a status that is a sentence."""
+    """Where the solver ended, with a status that is a sentence. information (B, B): of the border at `state`, the chain
+    marginalised, no damping; empty, and no draws, where another pass follows."""
 
     state: State
     cost: float
     residuals: Residuals
-    information: (
-        np.ndarray
-    )  # (B, B) of the border at `state`, the chain marginalised, no damping; empty where another pass follows
+    information: np.ndarray
     steps: tuple[Step, ...]
     converged: bool
     status: str
-    draws: Draws | None = None  # as well
+    draws: Draws | None = None
 
 
 @dataclass(frozen=True)
@@ -85,9 +84,9 @@ def minimise(
     share: float = ROUNDING,
 ) -> Outcome:
     """Minimises `problem` from `state` until half the chi^2 can fall by less than `tolerance`, or this share of it.
-    `on_visit` is told of
-    each state that a step was looked for from, and of the last. Where the tolerance is wide another pass follows, and
-    the end is not linearised once more: the outcome has no information and no draws.
+
+    `on_visit` is told of each state that a step was looked for from, and of the last. Where the tolerance is wide
+    another pass follows, and the end is not linearised once more: the outcome has no information and no draws.
 
     Raises EstimationError if no step can be computed at all.
     """
@@ -133,12 +132,19 @@ def minimise(
         if damping > 1e6:
             break
         cost = problem.linearise(state, pieces, residuals)
-    fresh = steps[-1].accepted  # what was filled last is that of `state`
     if early:
-        if not fresh:
-            problem.linearise(state, pieces, residuals, sums=False)
-        return _outcome(state, cost, residuals, steps[-1].predicted_decrease, steps)
-    if not (curved and fresh):
+        return _early_end(problem, state, cost, pieces, residuals, steps)
+    return _end(problem, state, cost, pieces, residuals, steps, curved, on_visit)
+
+
+def _early_end(problem, state, cost, pieces, residuals, steps) -> Outcome:
+    if not steps[-1].accepted:  # what was filled last is not that of `state`
+        problem.linearise(state, pieces, residuals, sums=False)
+    return _outcome(state, cost, residuals, steps[-1].predicted_decrease, steps)
+
+
+def _end(problem, state, cost, pieces, residuals, steps, curved, on_visit) -> Outcome:
+    if not (curved and steps[-1].accepted):
         problem.linearise(state, pieces, residuals, curved=True)
     solution = solve(pieces, problem.n_nodes, problem.tolerance, 0.0, problem.held)
     on_visit(Visit(state, solution.information))

@@ -47,17 +47,21 @@ def without_own_robot(recording: Measurements) -> Measurements:
 
 def own_points(stream: LidarStream) -> np.ndarray | None:
     """(N,) bool: points on the LiDAR's own robot; None where there are none, or too few to do harm."""
-    robot = _robot(_middle(stream))
+    middle = _middle(stream)
+    near = _Near.of(middle)
+    robot = _robot(middle, near)
     if robot is None:
         return None
-    near, own = _Near.of(stream), np.zeros(len(stream.xyz), dtype=bool)
-    own[near.point[robot[near.place]]] = True
+    whole, own = near if middle is stream else _Near.of(stream), np.zeros(len(stream.xyz), dtype=bool)
+    own[whole.point[robot[whole.place]]] = True
     return own if np.count_nonzero(own) >= LEAST_SHARE * len(own) else None
 
 
 def _middle(stream: LidarStream) -> LidarStream:
     """The scans in the middle of a recording, as many as it takes to tell."""
-    first = max(0, len(stream.stamps_ns) - MOST_SCANS) // 2
+    if len(stream.stamps_ns) <= MOST_SCANS:
+        return stream
+    first = (len(stream.stamps_ns) - MOST_SCANS) // 2
     scans = slice(first, first + MOST_SCANS)
     start = stream.start[first : first + MOST_SCANS + 1]
     points = slice(int(start[0]), int(start[-1]))
@@ -65,9 +69,8 @@ def _middle(stream: LidarStream) -> LidarStream:
     return LidarStream(stream.name, stream.stamps_ns[scans], start - start[0], *columns)
 
 
-def _robot(stream: LidarStream) -> np.ndarray | None:
+def _robot(stream: LidarStream, near: _Near) -> np.ndarray | None:
     """(PLACES,) bool: voxels of the robot; None where there are none, or nothing shows them."""
-    near = _Near.of(stream)
     steady = near.steady(np.arange(near.groups))
     at = near.point[steady[near.place]]
     if len(at) < LEAST_SHARE * len(stream.xyz):
