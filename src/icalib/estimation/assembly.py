@@ -20,7 +20,7 @@ from icalib.estimation.imu_data import ImuData, joined_imu_data
 from icalib.estimation.imu_factor import ImuFactor
 from icalib.estimation.imu_model import N_INTRINSICS
 from icalib.estimation.lidar_sweep import Motion
-from icalib.estimation.nodes import MERGED_WITHIN_S, distinct, first_nodes, place_nodes, usable
+from icalib.estimation.nodes import MERGED_WITHIN_S, SLACK, distinct, first_nodes, place_nodes, usable
 from icalib.estimation.poses import assign_nodes, poses_at
 from icalib.estimation.prior_factor import Prior
 from icalib.estimation.problem import ChainFactor, Problem
@@ -181,14 +181,36 @@ def image_times(inputs: Inputs, values: dict[Key, np.ndarray]) -> list[np.ndarra
 
 
 def host_times(inputs: Inputs, values: dict[Key, np.ndarray]) -> list[np.ndarray]:
-    """Instants that nodes are placed at, by sensor, seconds on the body's clock since its first stamp: those of images,
-    or without cameras those of scans, or without either those of poses, as many as are needed."""
+    """Instants that nodes are placed at, by sensor, seconds on the body's clock since its first stamp: those of wheels
+    that report relative poses, else those of images, or without cameras those of scans, or without either those of
+    poses, as many as are needed."""
+    tight = _ends_of_wheel_poses(inputs, values)
+    if tight is not None:
+        return [tight]
     if inputs.rig.cameras:
         return image_times(inputs, values)
     if inputs.rig.lidars:
         return [x.seconds + values[x.name, "time_offset"][0] for x in inputs.measurements.lidars]
     (first, *_), (sensor, *_) = inputs.measurements.poses, inputs.rig.poses
     return [thinned(first.seconds, POSE_NODES_S) + values[sensor.name, "time_offset"][0]]
+
+
+def _ends_of_wheel_poses(inputs: Inputs, values: dict[Key, np.ndarray]) -> np.ndarray | None:
+    """Where wheels report relative poses, their stamps, and the images before and after these. Sideways such a pose
+    may be good to 0.01 mm, which is what the IMU loses in 20 ms: at its ends there must be nodes, and none between, as
+    it hangs on neighbours. All else is content with the nearest one. None where no poses are that close together.
+    """
+    settings = inputs.rig.settings
+    if inputs.imu is None or settings.scheme != "inertial" or settings.nodes != "every-image":
+        return None
+    for stream in inputs.measurements.wheels:
+        offset = values.get((stream.name, "time_offset"))
+        close = np.median(np.diff(stream.seconds)) <= (1.0 + SLACK) * settings.node_spacing_s
+        if isinstance(stream, WheelPoses) and offset is not None and close:
+            times = stream.seconds + offset[0]
+            others = [times[:0], *image_times(inputs, values)]
+            return np.concatenate([times, *(t[(t < times[0]) | (t > times[-1])] for t in others)])
+    return None
 
 
 def thinned(times: np.ndarray, apart: float) -> np.ndarray:
