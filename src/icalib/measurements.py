@@ -276,5 +276,5 @@ class Measurements:
 
     @property
     def origin_ns(self) -> int:
-        """The first stamp of the body's clock: the IMU's, or without one the first camera's."""
-        return self.cameras[0].origin_ns if self.imu is None else self.imu.origin_ns
+        """The first stamp of the body's clock: the IMU's, or without one the first camera's or pose sensor's."""
+        return (*self.cameras, *self.poses)[0].origin_ns if self.imu is None else self.imu.origin_ns

@@ -46,13 +46,15 @@ class ImuNoise:
 
 @dataclass(frozen=True)
 class ImuSensor:
-    """The inertial sensor; its frame is the body frame."""
+    """The inertial sensor; its frame is the body frame. assumed: there is none, but an assumption of smooth motion in
+    its place (see `first_guess.assumed_motion`)."""
 
     name: str
     path: str
     noise: ImuNoise
     intrinsics: Parameter = field(default_factory=lambda: Parameter("fixed"))  # 24: see estimation.imu_model
     topic: str | None = None  # in a bag; None: the one with the sensor's name, or the only one
+    assumed: bool = False
 
 
 @dataclass(frozen=True)
@@ -244,9 +246,10 @@ class Settings:
 
 @dataclass(frozen=True)
 class Rig:
-    """The whole robot. Without an IMU the first camera's frame is the body frame, and time stands still: images taken
-    at the same stamp are taken together, nothing ties one instant to the next. There may be no camera beside an IMU and
-    a LiDAR or a pose sensor."""
+    """The whole robot. Without an IMU the first camera's frame is the body frame, or that of the first pose sensor. If
+    cameras are all there is, time stands still: images taken at the same stamp are taken together, nothing ties one
+    instant to the next; else the motion is assumed to be smooth. There may be no camera beside a pose sensor, or beside
+    an IMU and a LiDAR."""
 
     imu: ImuSensor | None
     cameras: tuple[Camera, ...]
@@ -271,4 +274,9 @@ class Rig:
     @property
     def body(self) -> str:
         """Name of the sensor whose frame is the body frame."""
-        return self.cameras[0].name if self.imu is None else self.imu.name
+        return (*self.cameras, *self.poses)[0].name if self.imu is None else self.imu.name
+
+    @property
+    def assumes_motion(self) -> bool:
+        """Whether an assumption stands in for the IMU."""
+        return self.imu is not None and self.imu.assumed

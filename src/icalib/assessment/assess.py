@@ -75,7 +75,8 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
     seen = observe(determined, names, [w.name for w in inputs.rig.wheels])
     empirical = _empirical_variance(inputs, found, np.diag(seen.covariance))
     groups = _groups(inputs, found, seen, empirical)
-    judged = [_sensor_fit(f, found) for f in fits(problem, outcome)]
+    assumed = {inputs.rig.imu.name} if inputs.rig.imu is not None and inputs.rig.assumes_motion else set()
+    judged = [_sensor_fit(f, found) for f in fits(problem, outcome) if f.sensor not in assumed]
     timeline = Timeline.of(inputs.parts, image_times(inputs, outcome.state.values))
     trajectory, poses = _trajectory(inputs, outcome.state, timeline), pose_residuals(inputs, found, timeline)
     return Calibration(
@@ -92,7 +93,7 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
         status=outcome.status,
         warnings=tuple(_warnings(inputs, found, groups, judged, empirical, poses)),
         notes=tuple(_notes(inputs, found, timeline)),
-        rig=rig_to_dict(inputs.rig),
+        rig=rig_to_dict(inputs.asked or inputs.rig),
         settings=dataclasses.asdict(inputs.rig.settings),
         rates=_rates(inputs),
         versions=versions(),
@@ -108,7 +109,13 @@ def _rates(inputs: Inputs) -> dict[str, float]:
     """Hz of each sensor, from the median step of its stamps."""
     imu = inputs.measurements.imu
     m = inputs.measurements
-    streams = (*(() if imu is None else (imu,)), *m.cameras, *m.lidars, *m.wheels, *m.poses)
+    streams = (
+        *(() if imu is None or inputs.rig.assumes_motion else (imu,)),
+        *m.cameras,
+        *m.lidars,
+        *m.wheels,
+        *m.poses,
+    )
     return {s.name: float(1.0 / np.median(np.diff(s.seconds))) for s in streams if len(s.stamps_ns) > 1}
 
 
@@ -166,6 +173,8 @@ def _groups(
     groups = []
     for block in inputs.layout.blocks:
         if block.name in NUISANCE or _unheard_of(inputs, block):
+            continue
+        if inputs.rig.assumes_motion and block.sensor == inputs.rig.body:
             continue
         if block.start is None and block.name in ("shape", "bloom", "tilt"):
             continue
@@ -365,6 +374,12 @@ def _feature_notes(found: Estimate):
 def _imu_notes(inputs: Inputs, imu: ImuData, found: Estimate, timeline: Timeline):
     assert inputs.rig.imu is not None
     n, most = inputs.rig.imu.noise, inputs.rig.settings.max_gap_s
+    if inputs.rig.assumes_motion:
+        yield (
+            f"there is no IMU: the motion is assumed to be smooth, its rate changing by {n.gyro_walk:.2g} rad/s and its "
+            f"acceleration by {n.accel_walk:.2g} m/s^2 in a second (standard deviations of each axis), as poses show."
+        )
+        return
     yield (
         f"IMU noise ({n.source}): gyro {n.gyro:.3g} rad/s/sqrt(Hz), walk {n.gyro_walk:.3g}; accelerometer "
         f"{n.accel:.3g} m/s^2/sqrt(Hz), walk {n.accel_walk:.3g}."

@@ -169,7 +169,7 @@ class Calibration:
         raise KeyError(f"no {name} of {sensor}; there are {', '.join(f'{g.sensor}.{g.name}' for g in self.groups)}")
 
     def T_imu_sensor(self, sensor: str) -> np.ndarray:
-        """4x4 pose of `sensor` in the imu frame; without an IMU in that of the first camera, the body's."""
+        """4x4 pose of `sensor` in the imu frame; without an IMU in that of `body`."""
         T = np.eye(4)
         T[:3, :3] = self.group(sensor, "rotation").value
         T[:3, 3] = self.group(sensor, "translation").value
@@ -191,8 +191,8 @@ class Calibration:
 
     @property
     def body(self) -> str:
-        """Name of the sensor whose frame is the body frame: the IMU, or without one the first camera."""
-        return self.imu or self.cameras[0]
+        """Name of the sensor whose frame is the body frame: the IMU, or without one the first camera or pose sensor."""
+        return self.imu or (*self.cameras, *self._of_type("pose"))[0]
 
     @property
     def cameras(self) -> tuple[str, ...]:

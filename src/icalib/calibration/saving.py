@@ -198,8 +198,8 @@ def _check(c: Calibration) -> None:
         sizes |= {len(x) for x in (g.columns, g.factor) if x is not None}
         if sizes != {size} or (g.columns is not None and not all(0 <= k < n for k in g.columns)):
             raise ValueError(f"{g.sensor}.{g.name} does not have {size} entries throughout")
-    if not (c.imu or c.cameras):
-        raise ValueError("the rig has neither IMU nor camera")
+    if not any(s.get("type") in ("imu", "camera", "pose") for s in c.rig["sensors"].values()):
+        raise ValueError("the rig has neither IMU nor camera nor pose sensor")
     for r in c.lidar_residuals:
         if len(r.plane) and not 0 <= r.plane.min() <= r.plane.max() < len(c.planes):
             raise ValueError(f"{r.sensor} has points on planes that are not there")

@@ -54,7 +54,8 @@ SIZES = {"rotation": 3, "translation": 3, "time_offset": 1, "intrinsics": 4, "bl
 class Inputs:
     """What does not change from pass to pass. bodies: what of the target is used; parts: the recordings that
     `measurements` were joined from; clouds: points of LiDARs on planes, without which these have no part in it; guess:
-    where everything was before points were looked at by the plane."""
+    where everything was before points were looked at by the plane; asked: the rig as it was given, where `rig` has
+    more."""
 
     rig: Rig
     measurements: Measurements
@@ -65,6 +66,7 @@ class Inputs:
     parts: tuple[Part, ...]
     clouds: Clouds = NO_CLOUDS
     guess: State | None = None
+    asked: Rig | None = None
 
     @property
     def sensors(self) -> tuple[Camera | Lidar | Wheels | PoseSensor, ...]:
@@ -115,8 +117,9 @@ def layout_for(rig: Rig, bodies: Bodies, n_recordings: int = 1, clouds: Clouds =
     if imu is not None:
         entries.append((imu.name, "intrinsics", "vector", N_INTRINSICS, imu.intrinsics.mode != "fixed"))
     # Without an IMU the scene's frame is the world's, in all recordings.
+    levelled = imu is not None and not rig.assumes_motion
     for k in range(1 if imu is None else n_recordings) if bodies.used else ():
-        entries.append((board_in(BOARD, k), "tilt", "tilt", 2, imu is not None))
+        entries.append((board_in(BOARD, k), "tilt", "tilt", 2, levelled))
     entries += bodies.shape_entries()
     for camera in rig.cameras:
         sizes = SIZES | {"distortion": len(camera_model(camera.model).parameter_names) - 4}
@@ -124,8 +127,9 @@ def layout_for(rig: Rig, bodies: Bodies, n_recordings: int = 1, clouds: Clouds =
             entries.append((camera.name, name, kind, sizes[name], _is_estimated(rig, camera, name)))
     for sensor in (*(rig.lidars if clouds.count else ()), *rig.wheels, *rig.poses):
         entries += own_entries(sensor)
-    for sensor in rig.poses:
-        entries += frame_entries(sensor, n_recordings)
+    for k, sensor in enumerate(rig.poses):
+        is_world = rig.assumes_motion and not rig.cameras and k == 0
+        entries += frame_entries(sensor, n_recordings, not is_world)
     return make_layout(entries + bodies.pose_entries() + clouds.entries)
 
 
@@ -293,7 +297,7 @@ def assemble(
     features = None if following is None else _features(inputs, state, tuple(factors), following)
     return Problem(
         layout, _chain(inputs, state), tuple(factors), _priors(inputs), tolerance, held, features,
-        _others(inputs, state, robot), rig.has_target,
+        _others(inputs, state, robot), rig.has_target or rig.assumes_motion,
     )  # fmt: skip
 
 

@@ -100,10 +100,12 @@ def own_entries(sensor: Lidar | Wheels | PoseSensor) -> list[Entry]:
     return mounts + height + drive
 
 
-def frame_entries(sensor: PoseSensor, n_recordings: int) -> list[Entry]:
+def frame_entries(sensor: PoseSensor, n_recordings: int, estimated: bool = True) -> list[Entry]:
     """Of the border: where the frame of absolute poses stands in each recording's world."""
     frames = [frame_of(sensor.name, k) for k in range(n_recordings if sensor.kind == "absolute" else 0)]
-    return [(f, name, kind, 3, True) for f in frames for name, kind in zip(FRAME, ("rotation", "vector"), strict=True)]
+    return [
+        (f, name, kind, 3, estimated) for f in frames for name, kind in zip(FRAME, ("rotation", "vector"), strict=True)
+    ]
 
 
 def known_planes(streams: Sequence[LidarStream]) -> Clouds:

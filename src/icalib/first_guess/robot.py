@@ -18,7 +18,7 @@ from icalib.first_guess.from_tracks import lens_start
 from icalib.first_guess.lidar_rounds import given, lidar_values, near_nodes, with_lidars
 from icalib.first_guess.poses import pose_values
 from icalib.first_guess.wheel_poses import mount_guess, poses_offset
-from icalib.first_guess.wheels import drive_guess, wheel_offset, wheel_rates
+from icalib.first_guess.wheels import WheelRates, drive_guess, wheel_offset, wheel_rates
 from icalib.measurements import WheelPoses, WheelStream
 from icalib.rig import Wheels
 
@@ -74,14 +74,37 @@ def _wheels(inputs: Inputs, state: State, wheels: Wheels, stream: WheelStream | 
     if isinstance(stream, WheelPoses):
         return _posing(inputs, state, stream, known.get((wheels.name, "time_offset"))) | known
     rates = wheel_rates(wheels.name, stream.seconds, integrals_of(stream), stream.kind)
-    up = np.einsum("nji,j->i", state.rotation, [0.0, 0.0, 1.0])
     offset = known.get((wheels.name, "time_offset"))
+    failed: list[EstimationError] = []
+    for up in _ways_up(inputs, state):
+        try:
+            return _turning(inputs, state, rates, up, wheels.name, offset) | known
+        except EstimationError as error:
+            failed.append(error)
+    raise failed[0]
+
+
+def _ways_up(inputs: Inputs, state: State) -> tuple[np.ndarray, ...]:
+    """Upwards (3,) in the IMU's axes. Where gravity is not known, the axis that the vehicle turns about most, which may
+    point either way: then a vehicle whose left and right are mixed up is one that drives on the ceiling."""
+    if not inputs.rig.assumes_motion:
+        return (np.einsum("nji,j->i", state.rotation, [0.0, 0.0, 1.0]),)
+    assert inputs.imu is not None
+    axis = np.linalg.svd(inputs.imu.gyro.T @ inputs.imu.gyro)[0][:, 0]
+    return axis, -axis
+
+
+def _turning(
+    inputs: Inputs, state: State, rates: WheelRates, up: np.ndarray, name: str, offset: np.ndarray | None
+) -> dict[Key, np.ndarray]:
+    """Of wheels that turn, or report what a vehicle does. Raises EstimationError where the motion does not show it."""
+    assert inputs.imu is not None
     if offset is None:
-        offset = np.array([wheel_offset(inputs.imu, up, wheels.name, rates)])
+        offset = np.array([wheel_offset(inputs.imu, up, name, rates)])
     inside, rate, velocity = _means(motion_of(inputs, state), rates.start, rates.end, offset[0])
-    drive = drive_guess(wheels.name, rates.rate[inside], rate, velocity, up, stream.kind)
+    drive = drive_guess(name, rates.rate[inside], rate, velocity, up, rates.kind)
     found = {"rotation": drive.rotation, "translation": drive.position, "time_offset": offset} | drive.values
-    return {(wheels.name, name): value for name, value in found.items()} | known
+    return {(name, group): value for group, value in found.items()}
 
 
 def _posing(inputs: Inputs, state: State, stream: WheelPoses, offset: np.ndarray | None) -> dict[Key, np.ndarray]:

@@ -14,6 +14,7 @@ from icalib.estimation.estimate import first_pass
 from icalib.estimation.nodes import first_nodes
 from icalib.estimation.state import Key, State
 from icalib.first_guess import Guess, initial_trajectory
+from icalib.first_guess.assumed_motion import start_without_imu
 from icalib.first_guess.lidar_rounds import state_from_lidar
 from icalib.first_guess.own_robot import without_own_robot
 from icalib.first_guess.poses import pose_values, state_from_poses
@@ -33,6 +34,10 @@ def start(
     or where there is neither camera nor LiDAR a pose sensor; what has no part in it is placed on that motion.
     Raises EstimationError where the recordings do not carry it.
     """
+    if rig.imu is None and (rig.wheels or rig.poses):
+        found = start_without_imu(rig, recordings)
+        lap("first guess")
+        return found
     recordings = [without_own_robot(m) for m in recordings]
     whole = inputs_for(rig, recordings)
     cameras = given_cameras(whole)

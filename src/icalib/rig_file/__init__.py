@@ -126,9 +126,17 @@ def _refuse_incomplete(value: YamlValue, found: _Sensors) -> None:
     """Where the sensors together cannot be calibrated."""
     if not found.cameras and not found.lidars and not found.poses:
         value.fail("there is no camera, no LiDAR and no pose sensor; add a sensor of type: camera, lidar or pose.")
-    if not found.imus and (found.lidars or found.wheels or found.poses):
-        first = (*found.lidars, *found.wheels, *found.poses)[0]
-        value.entries()[first.name].fail("needs an IMU; add a sensor of type: imu, or remove this one.")
+    if found.imus:
+        return
+    if found.lidars:
+        entry = value.entries()[found.lidars[0].name]
+        entry.fail("needs an IMU; add a sensor of type: imu, or remove this one.")
+    for sensor in found.poses[: 0 if found.cameras else 1]:
+        entry = value.entries()[sensor.name]
+        if sensor.kind != "absolute":
+            entry.fail("without camera and IMU it has to show the motion by itself; write kind: absolute, or add one.")
+        if len(found.poses) == 1 and not found.wheels:
+            entry.fail("is alone; add what is to be calibrated with it.")
 
 
 def _refuse_unseen_ground(value: YamlValue, found: _Sensors, targeted: bool) -> None:

@@ -1,0 +1,144 @@
+"""Without an IMU, but with wheels or a pose sensor: what is assumed of the motion in its place.
+
+The chain keeps its IMU, one that reads zero and knows no gravity. The biases of a node are then minus its angular rate
+and minus its acceleration, in the axes of the body, and their random walk is white noise on angular acceleration and on
+jerk: a motion prior, by which nodes are tied, and sensors carried from nodes to their own instants. Its densities are
+those of the motion itself, as the poses of the body show it; they are the only thing that is taken from these twice.
+
+The body is the first camera, whose target is the world, or the first pose sensor, whose frame is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from icalib.errors import EstimationError
+from icalib.estimation.assembly import Inputs, host_times, inputs_for, nodes_for, start_values
+from icalib.estimation.board import board_in
+from icalib.estimation.nodes import first_nodes
+from icalib.estimation.pose_factor import FRAME, frame_of
+from icalib.estimation.state import Key, State
+from icalib.first_guess.poses import pose_values
+from icalib.first_guess.robot import wheel_values
+from icalib.first_guess.several import initial_guesses
+from icalib.first_guess.smooth_path import FEWEST, SmoothPath, smooth_path
+from icalib.geometry.targets.base import BOARD
+from icalib.measurements import ImuStream, Measurements
+from icalib.rig import ImuNoise, ImuSensor, Rig, fixed
+
+NAME = "assumed motion"  # no sensor is called so
+STEP_S = 0.01  # between readings
+WHITE_STEP_S = 5e-3  # white noise is what the walks make of so long a step: keeps covariances regular
+LAG_S = 0.1  # over which the change of rate and acceleration tells their densities
+LEAST_DENSITY = 1e-3  # rad/s^2/sqrt(Hz), m/s^3/sqrt(Hz): of a body that stood still
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """Poses of the body in one recording, on its clock: seconds (n,), R_world_body, p_world_body."""
+
+    seconds: np.ndarray
+    rotation: np.ndarray
+    position: np.ndarray
+
+    def at(self, seconds: np.ndarray) -> SmoothPath:
+        return smooth_path(self.seconds, self.rotation, self.position, seconds)
+
+
+def start_without_imu(rig: Rig, recordings: Sequence[Measurements]) -> tuple[Inputs, State, dict[Key, np.ndarray]]:
+    """As `start.start`. Raises EstimationError where the body's poses do not show its motion, or where wheels and pose
+    sensors do not show how they stand."""
+    shown, cameras = _shown(rig, recordings)
+    for own, m in zip(shown, recordings, strict=True):
+        if len(own.seconds) < FEWEST:
+            where = f"{m.name}: " if len(recordings) > 1 else ""
+            raise EstimationError(
+                f"{where}{rig.body} shows where it is at {len(own.seconds)} instants only; record more."
+            )
+    paths = [own.at(np.arange(own.seconds[0], own.seconds[-1], STEP_S)) for own in shown]
+    body = _with_assumption(rig, paths)
+    inputs = replace(inputs_for(body, _readings(recordings, paths, felt=False)), asked=rig)
+    felt = inputs_for(body, _readings(recordings, paths, felt=True))
+    values = start_values(inputs, cameras | _identity(inputs))
+    nodes = nodes_for(inputs, host_times(inputs, values))
+    starts = first_nodes(inputs.imu, nodes)
+    parts = np.split(nodes, starts[1:])
+    ways = [own.at(t - part.begin) for own, t, part in zip(shown, parts, inputs.parts, strict=True)]
+    R, p, v, rate, force = (
+        np.concatenate([getattr(w, name) for w in ways])
+        for name in ("rotation", "position", "velocity", "rate", "acceleration")
+    )
+    moving = State(nodes, R, p, v, np.zeros((len(nodes), 6)), values, starts)
+    values = wheel_values(felt, moving) | pose_values(felt, moving) | values
+    return inputs, replace(moving, bias=-np.concatenate([rate, force], axis=1), values=values), values
+
+
+def _shown(rig: Rig, recordings: Sequence[Measurements]) -> tuple[list[_Shown], dict[Key, np.ndarray]]:
+    """The body's poses in each recording, and what was found of the cameras on the way."""
+    if not rig.cameras:
+        return [_Shown(s.seconds, s.rotation, s.position) for s in (m.poses[0] for m in recordings)], {}
+    if not rig.has_target:
+        raise EstimationError(
+            "without an IMU cameras need a target: nothing else says how large the scene is; add one to the rig file."
+        )
+    seen = [replace(m, wheels=(), poses=()) for m in recordings]
+    alone = inputs_for(replace(rig, wheels=(), poses=()), seen)
+    (guess,) = initial_guesses(alone.rig, alone.bodies, [m.measurements for m in alone.motions])
+    t, R, p = guess.body_poses(alone.measurements)
+    begins = [part.begin for part in alone.parts]
+    own = np.searchsorted(begins, t, side="right") - 1
+    found = [_Shown(t[own == k] - begin, R[own == k], p[own == k]) for k, begin in enumerate(begins)]
+    return found, guess.values()
+
+
+def _with_assumption(rig: Rig, paths: Sequence[SmoothPath]) -> Rig:
+    """The rig with the assumption as its IMU, which is where the body is."""
+    turning, jerking = (
+        np.sqrt(np.mean(np.concatenate([_changes(p, what) for p in paths]) ** 2) / LAG_S) + LEAST_DENSITY
+        for what in ("rate", "acceleration")
+    )
+    noise = ImuNoise(WHITE_STEP_S * turning, turning, WHITE_STEP_S * jerking, jerking, NAME)
+    here = {"rotation": fixed(np.eye(3)), "translation": fixed(np.zeros(3)), "time_offset": fixed(np.zeros(1))}
+    imu = ImuSensor(NAME, "", noise, assumed=True)
+    if rig.cameras:
+        return replace(rig, imu=imu, gravity=0.0, cameras=(replace(rig.cameras[0], **here), *rig.cameras[1:]))
+    return replace(rig, imu=imu, gravity=0.0, poses=(replace(rig.poses[0], **here), *rig.poses[1:]))
+
+
+def _changes(path: SmoothPath, what: str) -> np.ndarray:
+    """(n, 3) over LAG_S, where poses show both ends."""
+    n = round(LAG_S / STEP_S)
+    x = getattr(path, what)
+    return (x[n:] - x[:-n])[path.near[n:] & path.near[:-n]]
+
+
+def _readings(recordings: Sequence[Measurements], paths: Sequence[SmoothPath], felt: bool) -> list[Measurements]:
+    """The recordings with readings of the assumed IMU: zero, or `felt`, those that an IMU in the body would have."""
+    out = []
+    for m, path in zip(recordings, paths, strict=True):
+        stamps = m.origin_ns + np.round(path.seconds * 1e9).astype(np.int64)
+        used = path.near if felt else np.ones(len(stamps), dtype=bool)
+        used[:1] = True  # its clock begins where the body's does
+        gyro, accel = (x[used] * float(felt) for x in (path.rate, path.acceleration))
+        out.append(replace(m, imu=ImuStream(NAME, stamps[used], gyro, accel)))
+    return out
+
+
+def _identity(inputs: Inputs) -> dict[Key, np.ndarray]:
+    """The body is where the assumed IMU is, and its target or its frame is the world."""
+    rig, n = inputs.rig, len(inputs.parts)
+    sensor = (*rig.cameras, *rig.poses)[0]
+    out: dict[Key, np.ndarray] = {
+        (sensor.name, "rotation"): np.eye(3),
+        (sensor.name, "translation"): np.zeros(3),
+        (sensor.name, "time_offset"): np.zeros(1),
+    }
+    if rig.cameras:
+        return out | {(board_in(BOARD, k), "tilt"): np.eye(3) for k in range(n)}
+    for k in range(n):
+        frame = frame_of(sensor.name, k)
+        out |= {(frame, FRAME[0]): np.eye(3), (frame, FRAME[1]): np.zeros(3)}
+    return out
