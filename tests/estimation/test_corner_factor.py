@@ -22,11 +22,11 @@ def near(setup):
     return setup.perturbed(np.random.default_rng(8), 0.1)
 
 
-def run(factor, state, sums=False, **options):
+def run(factor, state, sums=False):
     """Cost, output in double precision, and pieces."""
     out = factor.output(np.float64)
     pieces = make_pieces(factor.n_nodes, factor.layout.size)
-    return sum(factor.accumulate(state, p, out, sums, **options) for p in pieces), out, pieces
+    return sum(factor.accumulate(state, p, out, sums) for p in pieces), out, pieces
 
 
 def noisy(factor, seed=0, size=1.0):

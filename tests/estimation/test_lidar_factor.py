@@ -93,9 +93,9 @@ def pointwise(setup, state, bin_s=1e-3) -> Point:
     return Point(r, J, np.einsum("ni,ni->n", in_body @ R_il, beam), J_c)
 
 
-def sums(setup, factor, state, dense, **options):
+def sums(setup, factor, state, dense):
     pieces, out = make_pieces(factor.n_nodes, setup.layout.size), factor.output()
-    cost = sum(factor.accumulate(state, p, out, **options) for p in pieces)
+    cost = sum(factor.accumulate(state, p, out) for p in pieces)
     return cost, *dense(pieces, factor.n_nodes), out.residual
 
 

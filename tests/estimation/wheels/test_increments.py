@@ -18,10 +18,10 @@ def factor_on(world, noise=UNIT):
     )  # fmt: skip
 
 
-def output(factor, state, **options):
+def output(factor, state, sums=True):
     out = factor.output()
     pieces = make_pieces(len(state.seconds), factor.layout.size)
-    return out, sum(factor.accumulate(state, p, out, **options) for p in pieces), pieces
+    return out, sum(factor.accumulate(state, p, out, sums) for p in pieces), pieces
 
 
 def raw_residuals(factor, state):
