@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import minimize
 
 from icalib.estimation.arrowhead import Piece, make_pieces
-from icalib.estimation.corner_factor import DRAWN, CornerNoise, CornerWhite
+from icalib.estimation.corner_factor import CornerNoise
 from icalib.simulation.projection import project
 
 
@@ -22,11 +22,11 @@ def near(setup):
     return setup.perturbed(np.random.default_rng(8), 0.1)
 
 
-def run(factor, state, sums=False, **options):
+def run(factor, state, sums=False):
     """Cost, output in double precision, and pieces."""
     out = factor.output(np.float64)
     pieces = make_pieces(factor.n_nodes, factor.layout.size)
-    return sum(factor.accumulate(state, p, out, sums, **options) for p in pieces), out, pieces
+    return sum(factor.accumulate(state, p, out, sums) for p in pieces), out, pieces
 
 
 def noisy(factor, seed=0, size=1.0):
@@ -181,42 +181,6 @@ def whitened(factor, setup, state, field):
     image, f = factor.stream.image[factor.keep], field[factor.keep]
     F = np.hstack([(image == i)[:, None] * f for i in range(len(factor.times))]) / 0.2
     return J, residual(np.zeros(len(basis))), np.kron(np.eye(2), F)
-
-
-def test_given_noise_takes_the_place_of_the_whitened_residuals(setup, near, factor_of, dense):
-    rng = np.random.default_rng(5)
-    factor = factor_of(setup, 1)
-    factor = replace(noisy(factor), keep=rng.random(len(factor.keep)) < 0.1)
-    n, images = len(factor.stream.uv), len(factor.times)
-    field, tau = rng.normal(size=(n, 3)), np.array([0.4, 0.3, 0.2])
-    with_field = replace(factor, noise=replace(factor.noise, tau=tau, field=field))
-    own = rng.normal(size=(images, 2, 3))
-    noise = CornerWhite(7, own)
-    white = noise.corners(0, n)
-    plain = dense(run(with_field, near, sums=True)[2], factor.n_nodes)[0]
-    total, _, pieces = run(with_field, near, sums=True, noise=noise)
-    H, g = dense(pieces, factor.n_nodes)
-    np.testing.assert_array_equal(H, plain)
-    J, _, F = whitened(factor, setup, near, field)
-    e = white[factor.keep].T.ravel()
-    # Rows of the common error itself: unit noise over tau, ordered as F's columns (axis, image, function).
-    rhs = F.T @ e + (own / tau).transpose(1, 0, 2).ravel()
-    M = F.T @ F + np.diag(np.tile(tau**-2.0, F.shape[1] // 3))
-    expected = J.T @ e - J.T @ F @ np.linalg.solve(M, rhs)
-    size = np.sqrt(np.maximum(np.diag(H), 1e-9 * np.diag(H).max()))
-    np.testing.assert_allclose(g / size, expected / size, rtol=0, atol=1e-6 * np.linalg.norm(e))
-    assert total == pytest.approx(rhs @ np.linalg.solve(M, rhs), rel=1e-9)
-
-
-def test_noise_of_a_corner_is_the_same_whatever_else_is_asked_for():
-    noise = CornerWhite(3, np.zeros((0, 2, 0)))
-    n = 3 * DRAWN + 5
-    every = noise.corners(0, n)
-    for a, b in ((0, 0), (0, 1), (7, DRAWN), (DRAWN, DRAWN), (DRAWN - 1, DRAWN + 1), (5, n), (2 * DRAWN, n)):
-        np.testing.assert_array_equal(noise.corners(a, b), every[a:b])
-    assert every.shape == (n, 2) and len(np.unique(every)) > 0.99 * every.size  # blocks are not repeated
-    assert abs(every.mean()) < 4.0 / np.sqrt(2 * n) and abs(every.var() - 1.0) < 4.0 / np.sqrt(n)
-    assert not np.isin(CornerWhite(4, noise.shared).corners(0, 100), every).all()
 
 
 @pytest.mark.parametrize("loss", ["none", "cauchy"])

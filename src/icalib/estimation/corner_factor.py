@@ -25,7 +25,6 @@ from icalib.estimation.bodies import Bodies
 from icalib.estimation.corner_kernels import (
     Direct,
     Found,
-    Given,
     Images,
     Motion,
     Noise,
@@ -43,7 +42,6 @@ from icalib.measurements import CornerStream
 from icalib.rig import Scheme
 
 BLOCK = 256  # images at a time, where nothing is summed
-DRAWN = 8192  # corners whose noise is drawn together
 POSES = 1024  # views at a time, whose poses and how these move are made together
 CHUNK = 64  # views at a time: what a chunk needs stays in the cache
 LOSSES = {"none": 0, "huber": 1, "cauchy": 2}
@@ -75,22 +73,6 @@ class CornerOutput:
     def empty(cls, n: int, n_views: int, m: int, dtype: type = np.float32) -> CornerOutput:
         """For n corners in `n_views` views with m sizes of a common error."""
         return cls(pages.zeros((n, 2), dtype), pages.zeros((n,), dtype), np.zeros((n_views, 2, m)))
-
-
-@dataclass(frozen=True)
-class CornerWhite:
-    """White noise in place of whitened residuals: of corners, drawn anew from `seed` wherever it is asked for, and of
-    common errors, shared (V, 2, m)."""
-
-    seed: int
-    shared: np.ndarray
-
-    def corners(self, a: int, b: int) -> np.ndarray:
-        """(b - a, 2) float32, of corners a..b: the same for a corner whatever else is asked for."""
-        first, end = a // DRAWN, -(-b // DRAWN)
-        rngs = (np.random.default_rng((self.seed, k)) for k in range(first, end))
-        drawn = [np.zeros((0, 2), np.float32), *(r.standard_normal((DRAWN, 2), np.float32) for r in rngs)]
-        return np.concatenate(drawn)[a - first * DRAWN : b - first * DRAWN]
 
 
 @dataclass(frozen=True)
@@ -245,34 +227,24 @@ class CornerFactor:
         return np.concatenate([chained_of_all, pose], axis=1), np.concatenate([direct_of_all, shape], axis=1), pars
 
     def accumulate(
-        self,
-        state: State,
-        piece: Piece,
-        out: CornerOutput | None,
-        sums: bool = True,
-        curved: bool = False,
-        noise: CornerWhite | None = None,
+        self, state: State, piece: Piece, out: CornerOutput | None, sums: bool = True, curved: bool = False
     ) -> float:
         """Fills `out`, if given, for the images whose node lies in `piece`, and adds them to its sums where `sums`
         are wanted.
 
         Returns half the robust chi^2. `curved`: J^T J has the true curvature of the robust loss, not its weights alone.
-        With `noise` in place of the whitened residuals, returns the quadratic form of the common errors' rows instead.
         """
         into, total = piece.sums(sums), 0.0
         for v0, v1, scene in self._blocks_of(piece):
-            images, noise_model, direct, motion = self._arguments(state, v0, v1, scene, curved)
-            first, end = int(images.start[0]), int(images.start[-1])
-            given = Given(False, 0, np.zeros((0, 2), np.float32), np.zeros((0, 2, len(self.noise.tau))))
-            if noise is not None:
-                given = Given(True, first, noise.corners(first, end), noise.shared[v0:v1])
+            images, noise, direct, motion = self._arguments(state, v0, v1, scene, curved)
             if out is None:
+                first, end = int(images.start[0]), int(images.start[-1])
                 own = CornerOutput.empty(end - first, v1 - v0, len(self.noise.tau))
                 found = Found(first, own.residual, own.root, own.shared)
             else:
                 found = Found(0, out.residual, out.root, out.shared[v0:v1])
             for a, b, predicted in self._chunks(state, images, motion, scene, sums):
-                total += accumulate(a, b, images, noise_model, direct, motion, predicted, given, into, found)
+                total += accumulate(a, b, images, noise, direct, motion, predicted, into, found)
         return total
 
     def accumulate_clusters(

@@ -79,16 +79,6 @@ class Predicted(NamedTuple):
     by_params: np.ndarray
 
 
-class Given(NamedTuple):
-    """White noise in place of the whitened residuals, where `used`: of corners `first` and on (n, 2), common errors
-    (n, 2, m)."""
-
-    used: bool
-    first: int
-    corners: np.ndarray
-    shared: np.ndarray
-
-
 class Found(NamedTuple):
     """What is left: residual (n, 2) and root (n,) of corners `first` and on, in single precision; shared (n, 2, m) by
     image."""
@@ -221,35 +211,26 @@ def _work(images, direct, motion):
 
 
 @njit(cache=True, nogil=True)
-def accumulate(i0, i1, images, noise, direct, motion, predicted, given, sums, found):
+def accumulate(i0, i1, images, noise, direct, motion, predicted, sums, found):
     """Images i0..i1: residuals, weights and common errors out, and the normal equations where they are wanted.
 
-    Returns half the robust chi^2, or with `given` noise the quadratic form of the common errors' own rows.
+    Returns half the robust chi^2.
     """
     A, G, all_residuals, error, all_roots, Tn, Tm, Tc = _work(images, direct, motion)
     D = len(G) - 1
     total = 0.0
     for i in range(i0, i1):
         n0, n1 = images.start[i], images.start[i + 1]
-        n, g0 = n1 - n0, n0 - given.first
+        n = n1 - n0
         res, root = all_residuals[:n], all_roots[:n]
-        cost = _predict_image(i, images, noise, direct, predicted, res, root, found)
-        if not given.used:
-            total += cost
+        total += _predict_image(i, images, noise, direct, predicted, res, root, found)
         if len(sums.diagonal) == 0:
             continue
         whole_error(res, noise.field[n0:n1], found.shared[i], error)
         _fill_rows(i, images, noise, direct, motion, predicted, root, error, A)
-        if given.used:
-            for k in range(n):
-                A[D, k] = given.corners[g0 + k, 0] if root[k] > 0.0 else 0.0
-                A[D, n + k] = given.corners[g0 + k, 1] if root[k] > 0.0 else 0.0
         _gram(A, D + 1, 2 * n, G)
         if len(noise.precision):
-            rows = marginalise_shared(
-                A, D, n, root, noise.field[n0:n1], noise.precision, given.shared[i], given.used, G
-            )
-            total += rows if given.used else 0.0
+            marginalise_shared(A, D, n, root, noise.field[n0:n1], noise.precision, G)
         pose_chain(i, motion, Tn, Tm, Tc)
         add_image(images.node[i] - sums.first, G, Tn, Tm, Tc, motion.columns[i], direct.columns[i], sums)
     return total

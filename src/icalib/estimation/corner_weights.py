@@ -122,36 +122,31 @@ def bend(A, D, i, n, r, factor):
 
 
 @njit(cache=True, nogil=True)
-def marginalise_shared(A, D, n, root, f, precision, own, given, G):
+def marginalise_shared(A, D, n, root, f, precision, G):
     """Takes the image's common error out of the Gram matrix G (D + 1, D + 1).
 
-    Its own gradient is zero: the cost is the least over it. With `given` noise, own (2, m) stands for its whitened
-    residual; returns rhs^T M^-1 rhs of its rows then.
+    Its own gradient is zero: the cost is the least over it.
     """
     m = f.shape[1]
     M, inv = np.empty((m, m)), np.empty((m, m))
-    C = np.empty((m, D + 1))
-    quad = 0.0
+    C = np.empty((m, D))
     for axis in range(2):
         for a in range(m):
             for b in range(m):
                 M[a, b] = precision[a] if a == b else 0.0
-            for k in range(D + 1):
+            for k in range(D):
                 C[a, k] = 0.0
-            C[a, D] = own[axis, a] * np.sqrt(precision[a]) if given else 0.0
         for i in range(n):
             for a in range(m):
                 wf = root[i] * f[i, a]
                 for b in range(m):
                     M[a, b] += wf * root[i] * f[i, b]
-                for k in range(D + 1 if given else D):
+                for k in range(D):
                     C[a, k] += wf * A[k, axis * n + i]
         _invert_small(M, inv)
         for a in range(m):
             for b in range(m):
-                for k in range(D + 1):
+                for k in range(D):
                     s = inv[a, b] * C[a, k]
-                    for c in range(D + 1):
+                    for c in range(D):
                         G[k, c] -= s * C[b, c]
-                quad += inv[a, b] * C[a, D] * C[b, D]
-    return quad

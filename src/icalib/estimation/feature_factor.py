@@ -158,18 +158,11 @@ class FeatureFactor:
         return replace(piece, features=Features.of(sums, steps))
 
     def accumulate(
-        self,
-        state: State,
-        piece: Piece,
-        out: FeatureOutput,
-        sums: bool = True,
-        curved: bool = False,
-        noise: tuple[np.ndarray, ...] | None = None,
+        self, state: State, piece: Piece, out: FeatureOutput, sums: bool = True, curved: bool = False
     ) -> float:
         """Fills `out` for the features that the nodes of `piece` saw, and adds them to its sums where these are wanted.
 
-        Returns half the robust chi^2, the least over the points. `curved`: see CornerFactor.accumulate. `noise`: by
-        camera (N, 2), white, in place of the whitened residuals.
+        Returns half the robust chi^2, the least over the points. `curved`: see CornerFactor.accumulate.
         """
         tracks, pairs = self._within(piece)
         views, base = self._views(state, piece.first, self._stop(piece)), Range(tracks.start, pairs.start)
@@ -183,17 +176,15 @@ class FeatureFactor:
         total, begin = 0.0, 0
         for view in views:
             i, X = view.index, _in_camera(view, points.xyz, tracks.start)
-            given = out.residual[i] if noise is None else noise[i]
             seeing = self._seeing(view, X)
             weighing = self._weighing(i, curved)
             own = slice(begin, begin + len(view.seen.node))
             begin = own.stop
             mine = features._replace(pose=features.pose[own], next_pose=features.next_pose[own])
             total += accumulate(
-                X, view.seen, base, view.motion, seeing, weighing, noise is not None, given, into, mine,
-                out.residual[i], out.root[i],
-            )  # fmt: skip
-        if noise is None and sums and piece.features is not None:
+                X, view.seen, base, view.motion, seeing, weighing, into, mine, out.residual[i], out.root[i]
+            )
+        if sums and piece.features is not None:
             piece.border[-1, -1] += held_back(features)
         return total
 

@@ -265,9 +265,9 @@ def _add_feature(A, pair, t, own_side, chained, direct, features):
 
 
 @njit(cache=True, nogil=True)
-def accumulate(X, seen, base, motion, seeing, weighing, used, given, sums, features, residual, root):
-    """Residual (N, 2) and root (N,) of one camera's observations, and the normal equations where they are wanted; with
-    `used`, white noise `given` (N, 2) stands for the whitened residuals. Returns half the robust chi^2."""
+def accumulate(X, seen, base, motion, seeing, weighing, sums, features, residual, root):
+    """Residual (N, 2) and root (N,) of one camera's observations, and the normal equations where they are wanted.
+    Returns half the robust chi^2."""
     n_d = len(seeing.pars)
     A, G, error = np.zeros((10 + n_d, 2)), np.empty((7 + n_d, 7 + n_d)), np.empty(2)
     most = 0
@@ -294,8 +294,6 @@ def accumulate(X, seen, base, motion, seeing, weighing, used, given, sums, featu
             total += cost
             if not wanted or root[n] == 0.0:
                 continue
-            if used:
-                A[D, 0], A[D, 1] = given[n, 0], given[n, 1]
             for r in range(2):
                 for a in range(6 + n_d):
                     rows[m + r, a] = A[a, r]

@@ -28,17 +28,15 @@ class FreeNodes:
         """One chain: where nothing ties neighbours, recordings make no difference."""
         return (0,)
 
-    def accumulate(
-        self, state: State, piece: Piece, out: np.ndarray, sums: bool = True, noise: np.ndarray | None = None
-    ) -> float:
+    def accumulate(self, state: State, piece: Piece, out: np.ndarray, sums: bool = True) -> float:
         """Defines what corners leave open in the nodes of `piece`. Returns half a chi^2 of nothing."""
-        del state, out, noise
+        del state, out
         if sums:
             own = np.concatenate([np.full(POSE, WEAK), np.ones(NODE - POSE)])
             piece.diagonal[:, range(NODE), range(NODE)] += own
         return 0.0
 
-    def accumulate_bias_prior(self, state: State, piece: Piece, sums: bool = True, met: bool = False) -> float:
+    def accumulate_bias_prior(self, state: State, piece: Piece, sums: bool = True) -> float:
         """Nothing: there are no biases."""
-        del state, piece, sums, met
+        del state, piece, sums
         return 0.0

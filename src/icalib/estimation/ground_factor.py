@@ -114,16 +114,8 @@ class GroundFactor:
         r = out.residual[:, rows] * self.sigma[rows]
         return float(np.sqrt(np.mean(r**2))) if r.size else 0.0, "rad" if kind == TILT else "m"
 
-    def accumulate(
-        self,
-        state: State,
-        piece: Piece,
-        out: Whitened,
-        sums: bool = True,
-        curved: bool = False,
-        noise: np.ndarray | None = None,
-    ) -> float:
-        """See `SensorFactor`; `noise` is (n, 4)."""
+    def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
+        """See `SensorFactor`."""
         cost = 0.0
         ends = (*self.starts[1:], len(state.seconds))
         for begin, end, key in zip(self.starts, ends, self.floor, strict=True):
@@ -134,7 +126,7 @@ class GroundFactor:
             rows = self._rows(state, self.nodes[own], None if key is None else state.values[key])
             whitening = np.tile(np.diag(1.0 / self.sigma), (high - low, 1, 1))
             by = Weighing(whitening, "none", 1.0)
-            into = Into(piece, out, sums, curved, noise)
+            into = Into(piece, out, sums, curved)
             cost += add_rows(rows, own, self.nodes[own], self._columns(key), self.layout, self.imu, by, into)
         return cost
 

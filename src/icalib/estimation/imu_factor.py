@@ -147,11 +147,10 @@ def _whiten(W, M, out):
 
 
 @njit(cache=True, nogil=True)
-def _accumulate(k1, chain, made, dx, columns, noise, given, sums, out):
+def _accumulate(k1, chain, made, dx, columns, sums, out):
     """Adds intervals from `sums.first` to k1 to the normal equations; whitened residuals into out (K - 1, 15).
 
-    dx, columns (24 or 0,): change and border columns of the intrinsics. given: use `noise` (K - 1, 15) in place of the
-    whitened residuals. Returns half the chi^2.
+    dx, columns (24 or 0,): change and border columns of the intrinsics. Returns half the chi^2.
     """
     n_x = len(columns)
     r, change = np.zeros(ROWS), np.zeros(9)
@@ -172,8 +171,6 @@ def _accumulate(k1, chain, made, dx, columns, noise, given, sums, out):
             Jcr[i, n_x] = r[i]
         _whiten(made.W[k], Jcr, Ac)
         for i in range(ROWS):
-            if given:
-                Ac[i, n_x] = noise[k, i]
             out[k, i] = Ac[i, n_x]
             cost += 0.5 * Ac[i, n_x] * Ac[i, n_x]
         if wanted:
@@ -211,11 +208,11 @@ class ImuFactor:
     def n_nodes(self) -> int:
         return len(self.made.dR) + 1
 
-    def accumulate_bias_prior(self, state: State, piece: Piece, sums: bool = True, met: bool = False) -> float:
+    def accumulate_bias_prior(self, state: State, piece: Piece, sums: bool = True) -> float:
         """The broad prior on the biases of the recordings' first nodes in `piece`, about those of the pass's start.
         Returns half its chi^2."""
         own = [k for k in self.starts if piece.first <= k < piece.last]
-        return sum(accumulate_bias_prior(state, piece, sums, met, self.made.bias0[k], k) for k in own)
+        return sum(accumulate_bias_prior(state, piece, sums, self.made.bias0[k], k) for k in own)
 
     @classmethod
     def build(cls, imu: ImuData, state: State, gravity: float, columns: np.ndarray) -> ImuFactor:
@@ -247,16 +244,11 @@ class ImuFactor:
         dR[seams] = state.rotation[seams].transpose(0, 2, 1) @ state.rotation[seams + 1]
         return cls(imu, gravity, columns, Increments(*arrays, bias0), intrinsics, state.starts)
 
-    def accumulate(
-        self, state: State, piece: Piece, out: np.ndarray, sums: bool = True, noise: np.ndarray | None = None
-    ) -> float:
+    def accumulate(self, state: State, piece: Piece, out: np.ndarray, sums: bool = True) -> float:
         """Fills whitened residuals `out` (K - 1, 15) for the intervals in `piece`, and adds them to its sums.
 
-        `noise` (K - 1, 15) stands in for the whitened residuals where given. Returns half the chi^2.
+        Returns half the chi^2.
         """
         dx = state.values[self.imu.name, "intrinsics"] - self.intrinsics0 if len(self.columns) else np.zeros(0)
         chain = Chain(state.rotation, state.position, state.velocity, state.bias, state.seconds, self.gravity)
-        return _accumulate(
-            piece.last, chain, self.made, dx, self.columns, out if noise is None else noise, noise is not None,
-            piece.sums(sums), out,
-        )  # fmt: skip
+        return _accumulate(piece.last, chain, self.made, dx, self.columns, piece.sums(sums), out)

@@ -3,11 +3,7 @@
 residual = n . (p_world_lidar(t) + R_world_lidar(t) x) - d of each point x at its own instant t. Of (24) and (25) this
 is the form that keeps its sign on both sides of the plane. What a factor holds are moments of the points
 (`take_moments`), taken once a pass: robust weights, like the association with planes, stay as they are while the solver
-runs.
-
-White noise: with X the rows (1, x) of an entry's points times the roots of their weights, J^T e of white noise e, one a
-point, has the covariance A X^T X A^T. So has A L e' with L L^T = X^T X and four white numbers e', exactly; the factor's
-residuals are these four.
+runs. Its residuals are the four of each plane in a bin that stand for all points there (`lidar_kernels`).
 """
 
 from __future__ import annotations
@@ -91,24 +87,12 @@ class LidarFactor:
         shape = len(self.moments.plane), ROWS
         return Whitened(np.zeros(shape), np.broadcast_to(1.0, shape))
 
-    def accumulate(
-        self,
-        state: State,
-        piece: Piece,
-        out: Whitened,
-        sums: bool = True,
-        curved: bool = False,
-        noise: np.ndarray | None = None,
-    ) -> float:
-        """See `SensorFactor`. `curved` changes nothing: within a pass weights are constant. With `noise` (E, 4) `out`
-        stays as it is."""
+    def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
+        """See `SensorFactor`. `curved` changes nothing: within a pass weights are constant."""
         del curved
         into, total = piece.sums(sums), 0.0
-        given = noise is not None
         for bins, motion, planes in self._chunks(state, *self._bins_of(piece)):
-            total += lidar_kernels.accumulate(
-                bins, motion, planes, given, noise if given else out.residual, into, out.residual
-            )
+            total += lidar_kernels.accumulate(bins, motion, planes, into, out.residual)
         return total
 
     def count(self, out: Whitened, kind: str) -> int:

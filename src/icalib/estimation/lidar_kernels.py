@@ -223,11 +223,10 @@ def _add_pose(k, G, T, columns, sums, F, row):
 
 
 @njit(cache=True, nogil=True)
-def accumulate(bins, motion, planes, given, white, sums, rows):
+def accumulate(bins, motion, planes, sums, rows):
     """Whitened residuals `rows` (E, 4) of all bins, and their normal equations where they are wanted.
 
-    With `given`, white (E, 4) stands for the residuals in the gradient, and `rows` stay. Returns half the chi^2, and
-    what the variances add to it as beams turn.
+    Returns half the chi^2, and what the variances add to it as beams turn.
     """
     wanted = len(sums.diagonal) > 0
     T = np.empty((POSE, (30 if len(motion.by_next) else 15) + len(motion.columns)))
@@ -243,21 +242,17 @@ def accumulate(bins, motion, planes, given, white, sums, rows):
         for e in range(bins.start[i], bins.start[i + 1]):
             q = bins.plane[e]
             _distances(motion.R_lidar_world[i], motion.p_world_lidar[i], q, planes, m)
-            if not given:
-                A[0] = m
-                _times_root(A, 1, bins.root[e], rows[e : e + 1])
-                turned += bins.slant[e, 0]
-                for c in range(ROWS):
-                    chi2 += rows[e, c] ** 2
-                for c in range(1, ROWS):
-                    turned += bins.slant[e, c] * m[c]
+            A[0] = m
+            _times_root(A, 1, bins.root[e], rows[e : e + 1])
+            turned += bins.slant[e, 0]
+            for c in range(ROWS):
+                chi2 += rows[e, c] ** 2
+            for c in range(1, ROWS):
+                turned += bins.slant[e, c] * m[c]
             if wanted:
                 _jacobian(motion.R_lidar_world[i], motion.p_world_lidar[i], q, planes, m, A)
                 _times_root(A, RESIDUAL + 1, bins.root[e], B)
-                if given:
-                    B[RESIDUAL] = white[e]
-                else:
-                    _add_slant(A, bins.slant[e], planes.columns[q], sums, G)
+                _add_slant(A, bins.slant[e], planes.columns[q], sums, G)
                 _add_plane(k, B, T, motion.columns, planes.columns[q], sums, G, V)
         if wanted:
             _add_pose(k, G, T, motion.columns, sums, F, row)

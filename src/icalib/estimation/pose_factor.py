@@ -115,23 +115,15 @@ class AbsolutePoseFactor:
         """Of the residuals of `kind`."""
         return _rms(out, self.sigma, KINDS[kind]), UNITS[kind]
 
-    def accumulate(
-        self,
-        state: State,
-        piece: Piece,
-        out: Whitened,
-        sums: bool = True,
-        curved: bool = False,
-        noise: np.ndarray | None = None,
-    ) -> float:
-        """See `SensorFactor`; `noise` is (n, 6)."""
+    def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
+        """See `SensorFactor`."""
         cost, at = 0.0, np.minimum(self.node, self.n_nodes - 2)  # the sums take intervals: the last node is an end
         edges = np.searchsorted(self.node, (*self.starts, self.n_nodes))
         low, high = np.searchsorted(at, [piece.first, piece.last])
         for k in range(len(self.starts)):
             own = slice(max(int(edges[k]), int(low)), min(int(edges[k + 1]), int(high)))
             if own.start < own.stop:
-                cost += self._of_recording(k, own, at[own], state, Into(piece, out, sums, curved, noise))
+                cost += self._of_recording(k, own, at[own], state, Into(piece, out, sums, curved))
         return cost
 
     def _of_recording(self, recording: int, own: slice, at: np.ndarray, state: State, into: Into) -> float:
@@ -215,16 +207,8 @@ class RelativePosesFactor:
         """Of the residuals of `kind`."""
         return _rms(out, self.sigma, KINDS[kind]), UNITS[kind]
 
-    def accumulate(
-        self,
-        state: State,
-        piece: Piece,
-        out: Whitened,
-        sums: bool = True,
-        curved: bool = False,
-        noise: np.ndarray | None = None,
-    ) -> float:
-        """See `SensorFactor`; `noise` is (n, 6)."""
+    def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
+        """See `SensorFactor`."""
         low, high = np.searchsorted(self.intervals.node, [piece.first, piece.last])
         own = slice(int(low), int(high))
         first, last, node = (x[own] for x in (self.intervals.first, self.intervals.last, self.intervals.node))
@@ -241,7 +225,7 @@ class RelativePosesFactor:
             _by_border(rows, by_time, before @ a.by_imu + after @ b.by_imu),
         )  # fmt: skip
         columns = self.layout.columns(self.name, *OWN)
-        return _add(self, own, made, columns, node, Into(piece, out, sums, curved, noise))
+        return _add(self, own, made, columns, node, Into(piece, out, sums, curved))
 
 
 PoseFactor = AbsolutePoseFactor | RelativePosesFactor

@@ -30,10 +30,9 @@ class Prior:
             return error / self.sigma, so3.right_jacobian_inverse(error) / self.sigma[:, None]
         return (x - self.value) / self.sigma, np.diag(1.0 / self.sigma)
 
-    def accumulate(self, state: State, piece: Piece, sums: bool = True, residual: np.ndarray | None = None) -> float:
-        """Adds the prior to the sums of `piece`, with `residual` in place of its own; returns half its chi^2."""
+    def accumulate(self, state: State, piece: Piece, sums: bool = True) -> float:
+        """Adds the prior to the sums of `piece`; returns half its chi^2."""
         r, J = self.residual(state)
-        r = r if residual is None else residual
         columns = self.block.columns
         if sums:
             piece.border[np.ix_(columns, columns)] += J.T @ J
@@ -43,14 +42,11 @@ class Prior:
 
 
 def accumulate_bias_prior(
-    state: State, piece: Piece, sums: bool = True, met: bool = False, centre: np.ndarray | None = None, node: int = 0
+    state: State, piece: Piece, sums: bool = True, centre: np.ndarray | None = None, node: int = 0
 ) -> float:
-    """The broad prior on the biases of `node`, a recording's first, about `centre` (6,) or zero (`met`: as if they
-    were there).
-
-    Returns half its chi^2.
-    """
-    r = np.zeros(6) if met else (state.bias[node] - (0.0 if centre is None else centre)) / FIRST_BIAS_SIGMA
+    """The broad prior on the biases of `node`, a recording's first, about `centre` (6,) or zero. Returns half its
+    chi^2."""
+    r = (state.bias[node] - (0.0 if centre is None else centre)) / FIRST_BIAS_SIGMA
     if sums:
         index, k = np.arange(9, 15), node - piece.first
         piece.diagonal[k, index, index] += 1.0 / FIRST_BIAS_SIGMA**2

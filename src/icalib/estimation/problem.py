@@ -40,15 +40,13 @@ class ChainFactor(Protocol):
 
     kinds: ClassVar[dict[str, slice]]
 
-    def accumulate(
-        self, state: State, piece: Piece, out: np.ndarray, sums: bool = True, noise: np.ndarray | None = None
-    ) -> float:
+    def accumulate(self, state: State, piece: Piece, out: np.ndarray, sums: bool = True) -> float:
         """Fills whitened residuals `out` (K - 1, 15) of `piece`, adds them to its sums; returns half the chi^2."""
         ...
 
-    def accumulate_bias_prior(self, state: State, piece: Piece, sums: bool = True, met: bool = False) -> float:
-        """Adds what keeps the biases of those `starts` defined that lie in `piece`, its last node aside (`met`: as if
-        they were met); returns half its chi^2."""
+    def accumulate_bias_prior(self, state: State, piece: Piece, sums: bool = True) -> float:
+        """Adds what keeps the biases of those `starts` defined that lie in `piece`, its last node aside; returns half
+        its chi^2."""
         ...
 
 
@@ -174,13 +172,6 @@ class Problem:
     def add_bias_prior(self, state: State, piece: Piece, sums: bool = True) -> float:
         """Adds the broad prior on the biases of recordings' first nodes, about those that the pass started from."""
         return self.chain.accumulate_bias_prior(state, piece, sums)
-
-    def add_prior_information(self, piece: Piece, state: State) -> None:
-        """Adds the priors as if they were met exactly: their information, no gradient."""
-        for prior in self.priors if piece.first == 0 else ():
-            prior.accumulate(state, piece, residual=np.zeros(len(prior.sigma)))
-        self.chain.accumulate_bias_prior(state, piece, met=True)
-        self._hold_frames(state, piece)
 
     @staticmethod
     def narrow(piece: Piece, n_border: int) -> Piece:

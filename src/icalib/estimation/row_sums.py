@@ -21,7 +21,6 @@ class Into(NamedTuple):
     out: Whitened
     sums: bool
     curved: bool
-    noise: np.ndarray | None
 
 
 class Weighing(NamedTuple):
@@ -48,8 +47,7 @@ def add_rows(
         columns = np.concatenate([columns, layout.columns(imu.name, "intrinsics")])
     free = np.flatnonzero(columns >= 0)
     loss = Loss(LOSSES[by.loss], by.loss_scale, into.curved)
-    given = into.out.residual if into.noise is None else into.noise
     return accumulate_rows(
-        rows, node, by.whitening, loss, free, columns[free], into.noise is not None, given[own],
-        into.piece.sums(into.sums), into.out.residual[own], into.out.root[own],
+        rows, node, by.whitening, loss, free, columns[free], into.piece.sums(into.sums), into.out.residual[own],
+        into.out.root[own],
     )  # fmt: skip

@@ -47,20 +47,11 @@ class SensorFactor(Protocol):
         """Empty rows for `accumulate` to fill."""
         ...
 
-    def accumulate(
-        self,
-        state: State,
-        piece: Piece,
-        out: Whitened,
-        sums: bool = True,
-        curved: bool = False,
-        noise: np.ndarray | None = None,
-    ) -> float:
+    def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """Fills `out` for what lies in `piece`, and adds it to the piece's sums where `sums` are wanted. Returns half
         the robust chi^2.
 
-        `curved`: J^T J has the true curvature of the robust loss, not its weights alone. `noise` (n, m), white, stands
-        in for the weighted residuals where given.
+        `curved`: J^T J has the true curvature of the robust loss, not its weights alone.
         """
         ...
 

@@ -141,19 +141,10 @@ class IncrementFactor:
         """Of the residuals of `kind`."""
         return _rms(out, self.whitening, self.kinds[kind]), self.units[kind]
 
-    def accumulate(
-        self,
-        state: State,
-        piece: Piece,
-        out: Whitened,
-        sums: bool = True,
-        curved: bool = False,
-        noise: np.ndarray | None = None,
-    ) -> float:
+    def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """Fills `out` for the intervals in `piece`, and adds them to its sums where `sums` are wanted.
 
         Returns half the robust chi^2. `curved`: J^T J has the true curvature of the robust loss, not its weights alone.
-        `noise` (n, 4), white, stands in for the whitened residuals where given.
         """
         own = _in_piece(self.intervals, piece)
         start = self.instants.start[own.start : own.stop + 1]
@@ -168,7 +159,7 @@ class IncrementFactor:
             start - start[0], self.instants.weight[seen], _track(node, poses), moving, wheels, c, self.measured[own],
             rows,
         )  # fmt: skip
-        return _add(self, own, rows, self.whitening, Into(piece, out, sums, curved, noise))
+        return _add(self, own, rows, self.whitening, Into(piece, out, sums, curved))
 
 
 @dataclass(frozen=True)
@@ -250,16 +241,8 @@ class RelativePoseFactor:
         """Of the residuals of `kind`."""
         return _rms(out, self.whitening, self.kinds[kind]), self.units[kind]
 
-    def accumulate(
-        self,
-        state: State,
-        piece: Piece,
-        out: Whitened,
-        sums: bool = True,
-        curved: bool = False,
-        noise: np.ndarray | None = None,
-    ) -> float:
-        """See IncrementFactor.accumulate; `noise` is (n, 3)."""
+    def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
+        """See IncrementFactor.accumulate."""
         own = _in_piece(self.intervals, piece)
         i, z = self.intervals, self.poses
         times = np.concatenate([self.seconds[i.first[own]], self.seconds[i.last[own]]]) + _offset(self.name, state)
@@ -268,7 +251,7 @@ class RelativePoseFactor:
         poses = poses_at("inertial", times, node, state, self.imu, self.gravity, free)
         rows = Rows.empty(len(times) // 2, 3, poses.by_imu.shape[2], sums)
         relative_rows(_track(node, poses), _wheels(self.name, state, self.kind), z.z[own], z.J[own], z.drive0, rows)
-        return _add(self, own, rows, z.W, Into(piece, out, sums, curved, noise))
+        return _add(self, own, rows, z.W, Into(piece, out, sums, curved))
 
 
 def wheel_intervals(name: str, seconds: np.ndarray, imu: ImuData, state: State) -> WheelIntervals:

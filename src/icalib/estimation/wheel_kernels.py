@@ -282,12 +282,11 @@ def _whiten(W, J, columns, scale, out):
 
 
 @njit(cache=True, nogil=True)
-def accumulate_rows(rows, node, W, loss, free, columns, given, noise, sums, residual, root):
+def accumulate_rows(rows, node, W, loss, free, columns, sums, residual, root):
     """Whitens rows by W (n, m, m), weighs them, and adds them to the sums where these are wanted.
 
-    free, columns (c,): columns of by_border that are estimated, and theirs in the border. given: `noise` (n, m) stands
-    in for the weighted residuals. residual, root (n, m): whitened residuals and square roots of their weights, out.
-    Returns half the robust chi^2.
+    free, columns (c,): columns of by_border that are estimated, and theirs in the border. residual, root (n, m):
+    whitened residuals and square roots of their weights, out. Returns half the robust chi^2.
     """
     m, n_c = W.shape[1], len(free)
     A0, A1, Ac = np.empty((m, 15)), np.empty((m, 15)), np.empty((m, n_c + 1))
@@ -305,6 +304,6 @@ def accumulate_rows(rows, node, W, loss, free, columns, given, noise, sums, resi
         _whiten(W[i], rows.by_next[i], chain, scaled[0], A1)
         _whiten(W[i], rows.by_border[i], free, scaled[0], Ac)
         for q in range(m):
-            Ac[q, n_c] = noise[i, q] if given else scaled[1, q] * residual[i, q]
+            Ac[q, n_c] = scaled[1, q] * residual[i, q]
         add_interval(node[i] - sums.first, A0, A1, Ac, columns, sums)
     return cost
