@@ -45,3 +45,9 @@ def aprilgrid_images() -> Path:
 def odometry_logs() -> Path:
     """Rates, poses of a LiDAR odometry and IMU readings of two rigs, as LI-Init logged them, and its results."""
     return _recording("lidar_imu_odometry")
+
+
+@pytest.fixture(scope="session")
+def wheel_mocap() -> Path:
+    """A differential drive: encoder ticks and planar poses by motion capture."""
+    return _recording("wheel_mocap")

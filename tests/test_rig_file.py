@@ -332,7 +332,8 @@ def test_two_imus_no_camera(tmp_path):
     assert "there is no camera, no LiDAR and no pose sensor" in complaint(tmp_path, "sensors:\n" + imu + rest)
     wheels = "  wheel0: {type: wheels}\n"
     assert "there is no camera, no LiDAR and no pose sensor" in complaint(tmp_path, "sensors:\n" + imu + wheels + rest)
-    assert "sensors.wheel0: needs an IMU" in complaint(tmp_path, "sensors:\n" + camera + wheels + rest)
+    lidar = "  lidar0: {type: lidar}\n"
+    assert "sensors.lidar0: needs an IMU" in complaint(tmp_path, "sensors:\n" + camera + wheels + lidar + rest)
     second = complaint(tmp_path, "sensors:\n" + imu + "  imu1: {type: imu}\n" + camera + rest)
     assert "rig.yaml:3: sensors.imu1: is a second IMU beside imu0" in second
 

@@ -101,8 +101,15 @@ def test_pose_sensors_are_read(tmp_path):
 def test_an_imu_and_a_pose_sensor_are_enough(tmp_path):
     rig = load(tmp_path, "sensors:\n  imu0: {type: imu}\n  mocap0: {type: pose}\n")
     assert (rig.cameras, rig.lidars, [p.name for p in rig.poses]) == ((), (), ["mocap0"])
-    words = complaint(tmp_path, "sensors:\n  mocap0: {type: pose}\n")
-    assert "sensors.mocap0: needs an IMU" in words
+
+
+def test_without_an_imu_a_pose_sensor_shows_the_motion(tmp_path):
+    mocap, wheels = "sensors:\n  mocap0: {type: pose}\n", "  wheel0: {type: wheels}\n"
+    assert load(tmp_path, mocap + wheels).body == "mocap0"
+    assert load(tmp_path, mocap + "  slam0: {type: pose, kind: relative}\n").imu is None
+    assert "sensors.mocap0: is alone; add what is to be calibrated" in complaint(tmp_path, mocap)
+    relative = mocap.replace("pose}", "pose, kind: relative}")
+    assert "sensors.mocap0: without camera and IMU it has to show" in complaint(tmp_path, relative + wheels)
 
 
 def test_plain_lidars_and_wheels_load_back(tmp_path):

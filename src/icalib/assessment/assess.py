@@ -376,8 +376,8 @@ def _imu_notes(inputs: Inputs, imu: ImuData, found: Estimate, timeline: Timeline
     n, most = inputs.rig.imu.noise, inputs.rig.settings.max_gap_s
     if inputs.rig.assumes_motion:
         yield (
-            f"there is no IMU: the motion is assumed to be smooth, its rate changing by {n.gyro_walk:.2g} rad/s and its "
-            f"acceleration by {n.accel_walk:.2g} m/s^2 in a second (standard deviations of each axis), as poses show."
+            f"there is no IMU: the motion is assumed to be smooth, in a second its rate to change by {n.gyro_walk:.2g} "
+            f"rad/s and its acceleration by {n.accel_walk:.2g} m/s^2 (standard deviations of each axis), as poses show."
         )
         return
     yield (

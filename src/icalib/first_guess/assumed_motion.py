@@ -58,7 +58,7 @@ def start_without_imu(rig: Rig, recordings: Sequence[Measurements]) -> tuple[Inp
             raise EstimationError(
                 f"{where}{rig.body} shows where it is at {len(own.seconds)} instants only; record more."
             )
-    paths = [own.at(np.arange(own.seconds[0], own.seconds[-1], STEP_S)) for own in shown]
+    paths = [own.at(np.arange(0.0, own.seconds[-1], STEP_S)) for own in shown]  # from the body's first stamp on
     body = _with_assumption(rig, paths)
     inputs = replace(inputs_for(body, _readings(recordings, paths, felt=False)), asked=rig)
     felt = inputs_for(body, _readings(recordings, paths, felt=True))

@@ -35,6 +35,7 @@ ROUNDS = 8
 SCALES = 0.5, 2.0
 KMH, DEGREE = 1.0 / 3.6, np.pi / 180.0
 NEARLY = 0.1  # of a scale that is that of a unit
+ONE_RATE = 0.5  # spread over mean
 STEERS_RAD = 1.2  # offsets beyond are none
 
 OPPOSITE: dict[WheelKind, str] = {
@@ -308,6 +309,11 @@ def _correlate(imu: ImuData, turn: np.ndarray, name: str, rates: WheelRates) -> 
     if opposite.correlation > max(found.correlation, LEAST_CORRELATION):
         raise EstimationError(f"{name} turns the other way round than {imu.name}: {OPPOSITE[rates.kind]}.")
     if not found.correlation > LEAST_CORRELATION:
+        if np.std(turned[known]) < ONE_RATE * abs(np.mean(turned[known])):
+            raise EstimationError(
+                f"{name}: the vehicle turned at the same rate nearly all the time, which does not show how its clock "
+                "goes; record again with curves of both hands, or give its time_offset in the rig file."
+            )
         raise EstimationError(
             f"the turning of {name} does not match that of {imu.name} at any shift of their clocks (best correlation "
             f"{max(found.largest, 0.0):.2f}); check that both come from the same recording and overlap in time."

@@ -1,0 +1,137 @@
+"""Wheels and pose sensors without an IMU: smooth motion is assumed in its place."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from icalib.calibration import Calibration, load_calibration
+from icalib.errors import EstimationError
+from icalib.measurements import Measurements
+from icalib.montecarlo.truth import error, true_value
+from icalib.outputs import write_outputs
+from icalib.pipeline import calibrate_measurements
+from icalib.rig import Rig
+from icalib.simulation import Drive, Scenario, SimPoses, Simulation, rig_for, simulate
+
+MOUNT = ("rotation", "translation", "time_offset")
+T_IMU_MOCAP = np.array([[0.0, -1.0, 0.0, 0.1], [1.0, 0.0, 0.0, 0.05], [0.0, 0.0, 1.0, 0.3], [0.0, 0.0, 0.0, 1.0]])
+
+
+def mocap(name: str = "mocap0", T: np.ndarray = T_IMU_MOCAP, **others) -> SimPoses:
+    """With a frame that is tilted by a quarter turn: nothing says where up is."""
+    tilted = np.array([[1.0, 0.0, 0.0, 2.0], [0.0, 0.0, -1.0, 1.0], [0.0, 1.0, 0.0, 0.5], [0.0, 0.0, 0.0, 1.0]])
+    usual = {"rotation_noise": 1e-3, "position_noise": 5e-4, "time_offset_s": 0.004, "clock_origin_ns": 5_000_000_000}
+    return SimPoses(name, T, T_world_frame=tilted, **usual | others)
+
+
+def without_imu(scenario: Scenario, seed: int = 0) -> tuple[Rig, Measurements, Simulation]:
+    simulation = simulate(replace(scenario, imu_noise_enabled=False), seed)
+    return replace(rig_for(scenario), imu=None), replace(simulation.measurements, imu=None), simulation
+
+
+def true_beside(simulation: Simulation, body: str, sensor: str, name: str) -> np.ndarray | None:
+    """As `true_value`, of a sensor as seen from the body's."""
+    values = {s: {n: true_value(simulation.truth, s, n) for n in MOUNT} for s in (body, sensor)}
+    (R, p, t), (Q, q, u) = (tuple(values[s][n] for n in MOUNT) for s in (body, sensor))
+    beside = {"rotation": R.T @ Q, "translation": R.T @ (q - p), "time_offset": u - t}
+    return beside.get(name, true_value(simulation.truth, sensor, name))
+
+
+def normalised(result: Calibration, simulation: Simulation, only: str | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of what is estimated, and their covariance, of all sensors or `only` one."""
+    errors, columns = [], []
+    for g in result.groups:
+        if g.columns is None or only not in (None, g.sensor):
+            continue
+        true = true_beside(simulation, result.body, g.sensor, g.name)
+        if true is not None:
+            errors += list(error(g.name, g.value, true))
+            columns += list(g.columns)
+    return np.array(errors), result.covariance[np.ix_(columns, columns)]
+
+
+def check_known(result: Calibration, simulation: Simulation, count: int) -> None:
+    assert result.converged, result.status
+    e, P = normalised(result, simulation)
+    assert len(e) == count
+    assert np.abs(e / np.sqrt(np.diag(P))).max() < 4.0, (e, np.sqrt(np.diag(P)))
+
+
+def test_wheels_and_motion_capture_on_ramps(robot, tmp_path):
+    scenario = replace(robot("ramp", 20.0, "w"), poses=(mocap(),))
+    rig, measurements, simulation = without_imu(scenario)
+    result = calibrate_measurements(rig, measurements)
+    check_known(result, simulation, 10)
+    assert result.imu is None and result.body == "mocap0"
+    assert {g.sensor for g in result.groups} == {"mocap0", "wheel0"}
+    assert {f.sensor for f in result.fits} == {"mocap0", "wheel0"}
+    assert set(result.group("mocap0", "rotation").verdict) == {"fixed"}
+    assert set(result.group("wheel0", "radii").verdict) == {"determined"}
+    assert result.group("wheel0", "radii").std_formal.max() < 3e-5
+    assert any("there is no IMU" in words for words in result.notes)
+    assert not any("noise" in words for words in result.warnings)
+    write_outputs(result, tmp_path)
+    assert "T_mocap0_sensor" in (tmp_path / "calibration.yaml").read_text()
+    again = load_calibration(tmp_path)
+    assert again.body == "mocap0"
+    np.testing.assert_array_equal(again.T_imu_sensor("wheel0"), result.T_imu_sensor("wheel0"))
+
+
+def test_a_camera_with_a_target_and_wheels(robot):
+    rig, measurements, simulation = without_imu(robot("ramp", 20.0, "cw"))
+    result = calibrate_measurements(rig, measurements)
+    check_known(result, simulation, 10)
+    assert result.body == "cam0" and set(result.group("cam0", "time_offset").verdict) == {"fixed"}
+    assert result.group("wheel0", "radii").std_formal.max() < 1e-4
+
+
+def test_two_pose_sensors(robot):
+    """What is called hand-eye calibration."""
+    other = np.array([[0.0, 0.0, 1.0, -0.2], [1.0, 0.0, 0.0, 0.3], [0.0, 1.0, 0.0, 0.1], [0.0, 0.0, 0.0, 1.0]])
+    poses = (mocap(), mocap("slam0", other, time_offset_s=-0.02, rate_hz=30.0))
+    scenario = replace(robot("3d", 12.0, ""), poses=poses)
+    rig, measurements, simulation = without_imu(scenario)
+    result = calibrate_measurements(rig, measurements)
+    check_known(result, simulation, 7)
+    assert result.undetermined == ()
+    assert np.rad2deg(result.group("slam0", "rotation").std_formal).max() < 0.05
+
+
+def test_on_a_flat_floor_height_and_roll_remain_open(robot):
+    rig, measurements, simulation = without_imu(replace(robot("planar", 20.0, "w"), poses=(mocap(),)))
+    result = calibrate_measurements(rig, measurements)
+    assert result.converged, result.status
+    assert result.group("wheel0", "rotation").verdict[0] == "undetermined"
+    assert result.group("wheel0", "translation").verdict[2] == "undetermined"
+    e, P = normalised(result, simulation)
+    known = [k for k, v in enumerate(sum((g.verdict for g in result.groups if g.columns), ())) if v != "undetermined"]
+    assert np.abs(e / np.sqrt(np.diag(P)))[known].max() < 4.0
+
+
+def test_one_arc_all_the_time_is_refused(robot):
+    """What its wheels then show is one ratio, no radii and no baseline."""
+    scenario = replace(robot("planar", 20.0, "w"), motion=Drive("arc"), poses=(mocap(),))
+    rig, measurements, _ = without_imu(scenario)
+    with pytest.raises(EstimationError, match="turned at the same rate nearly all the time"):
+        calibrate_measurements(rig, measurements)
+
+
+def test_cameras_need_a_target(robot):
+    rig, measurements, _ = without_imu(replace(robot("ramp", 8.0, "cw")))
+    rig = replace(rig, target=type(rig_for(robot("ramp", 8.0, "w")).target)())
+    with pytest.raises(EstimationError, match="cameras need a target"):
+        calibrate_measurements(rig, measurements)
+
+
+@pytest.mark.statistical
+def test_nees(robot):
+    scenario = replace(robot("ramp", 20.0, "w"), poses=(mocap(),))
+    runs = []
+    for seed in range(20):
+        rig, measurements, simulation = without_imu(scenario, seed)
+        e, P = normalised(calibrate_measurements(rig, measurements), simulation)
+        runs.append(float(e @ np.linalg.solve(P, e)) / len(e))
+    assert 0.7 < np.mean(runs) < 1.35, runs  # 99 % of chi^2 of 200 degrees of freedom: 0.76 to 1.28
