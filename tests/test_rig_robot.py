@@ -261,7 +261,8 @@ def test_what_is_wrong_with_kinds_of_wheels_is_named(tmp_path, old, new, words):
 
 def test_examples_of_the_page_are_right(tmp_path):
     page = (Path(__file__).parents[1] / "docs/rig-file.md").read_text(encoding="utf-8")
-    blocks = [block.split("```")[0] for block in page.split("```yaml\nsensors:\n")[2:]]
+    no_imu, *blocks = [block.split("```")[0] for block in page.split("```yaml\nsensors:\n")[2:]]
+    assert load(tmp_path, "sensors:\n" + no_imu).body == "mocap"
     rig = load(tmp_path, "sensors:\n  imu0: {type: imu}\n" + "".join(blocks))
     assert ([s.name for s in rig.lidars], [w.name for w in rig.wheels]) == (["lidar0"], ["wheel0"])
     assert [s.name for s in rig.poses] == ["mocap0"]
