@@ -37,7 +37,7 @@ def over_time(results: list[JobResult], sensor: str) -> Figure:
     dated = all(r.time is not None for r in results)
     layout["xaxis"] = layout["xaxis"] | {"title": {"text": "time" if dated else "job"}}
     layout["xaxis"] |= {"type": "date" if dated else "category"}
-    return figure(traces, height=_EDGE_PX + _PANEL_PX * len(names), showlegend=False, **layout)
+    return figure(_in_legend_once(traces), height=_EDGE_PX + _PANEL_PX * len(names), showlegend=True, **layout)
 
 
 def change(first: Block, now: Block) -> np.ndarray:
@@ -66,12 +66,18 @@ def _traces(results: list[JobResult], first: Block, panel: int) -> list[dict[str
         {
             "type": "scatter", "mode": "lines+markers", "x": x, "y": numbers(values[:, k]), "yaxis": y_of(panel),
             "name": label or first.name, "line": {"width": 1, "color": colors[k % len(colors)]},
-            "text": [r.job.name for r in at],
+            "text": [r.job.name for r in at], "showlegend": len(first.labels) > 1,
             "marker": {"size": 7, "symbol": ["circle-open" if b.verdict[k] == OPEN else "circle" for b in blocks]},
             "error_y": {"array": numbers(scale * np.array([_bar(b, k) for b in blocks])), "thickness": 1.2, "width": 3},
         }
         for k, label in enumerate(first.labels)
     ]  # fmt: skip
+
+
+def _in_legend_once(traces: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """x, y and z have the same colours in all panels."""
+    firsts = {t["name"]: k for k, t in reversed(list(enumerate(traces)))}
+    return [t | {"showlegend": t["showlegend"] and firsts[t["name"]] == k} for k, t in enumerate(traces)]
 
 
 def _bar(b: Block, entry: int) -> float:

@@ -83,6 +83,6 @@ def from_json(text: bytes) -> Record:
 
 
 def _block_of(plain: dict[str, Any]) -> Block:
-    arrays = {name: np.array(plain[name], dtype=np.float64) for name in ("value", "std")}
-    texts = {name: tuple(plain[name]) for name in ("labels", "verdict")}
-    return Block(**(plain | arrays | texts))
+    value, std = (np.array(plain[name], dtype=np.float64) for name in ("value", "std"))
+    labels, verdict = (tuple(plain[name]) for name in ("labels", "verdict"))
+    return Block(plain["sensor"], plain["name"], labels, plain["unit"], value, std, verdict)

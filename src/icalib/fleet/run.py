@@ -31,7 +31,7 @@ def run_fleet(
     progress: Progress = lambda *_: None,
     say: Callable[[str], None] = lambda sentence: None,
 ) -> Fleet:
-    """Does the jobs of the file at `path` that `output` does not hold yet, and writes fleet.sqlite and fleet.html there.
+    """Does the jobs of the file at `path` that `output` does not hold yet; writes fleet.sqlite and fleet.html there.
 
     crew: by default a worker for each core. limit: sigmas beyond which a change counts. say: is told what is done
     again, before it is. Raises RigError where the file is wrong, CalibrationError where the folder cannot be written or
@@ -44,9 +44,8 @@ def run_fleet(
     done, again = to_do(store, inputs)
     for name, why in again.items():
         say(f"{name} is done again: {why}.")
-    records = done | _do(
-        [Task(j, inputs[j.name]) for j in jobs if j.name not in done], store, crew, len(jobs), progress
-    )
+    tasks = [Task(job, inputs[job.name]) for job in jobs if job.name not in done]
+    records = done | _do(tasks, store, crew or Crew(), len(jobs), progress)
     results = tuple(JobResult(job, records[job.name]) for job in jobs)
     robots = by_robot(results)
     drifts = tuple(drift_of(robot, [r.job.name for r in own], store.load, limit) for robot, own in robots.items())
@@ -56,7 +55,7 @@ def run_fleet(
     return fleet
 
 
-def _do(tasks: list[Task], store: Store, crew: Crew | None, total: int, progress: Progress) -> dict[str, Record]:
+def _do(tasks: list[Task], store: Store, crew: Crew, total: int, progress: Progress) -> dict[str, Record]:
     """Records of the tasks; all are stored but those whose worker died, which will be tried again the next time."""
     found: dict[str, Record] = {}
     before = total - len(tasks)
@@ -64,7 +63,7 @@ def _do(tasks: list[Task], store: Store, crew: Crew | None, total: int, progress
         return found
     progress(f"{before} of {total} jobs", 0.0)
     try:
-        with closing(run_all(run, tasks, crew or Crew())) as outcomes:
+        with closing(run_all(run, tasks, crew)) as outcomes:
             for task, outcome in outcomes:
                 name = task.job.name
                 if isinstance(outcome, Lost):
