@@ -37,6 +37,11 @@ def load_distributed() -> Any:
     return _load("distributed", "montecarlo", "Many runs need Dask's package distributed")
 
 
+def load_dask() -> Any:
+    """Dask, whose settings distributed has. Raises RecordingError where it is not installed."""
+    return _load("dask", "montecarlo", "Many runs need Dask's package distributed")
+
+
 def load_matplotlib() -> Any:
     """matplotlib's figures, drawn without a screen. Raises RecordingError where it is not installed."""
     return _load("matplotlib.figure", "montecarlo", "Figures as PNG need the package matplotlib")

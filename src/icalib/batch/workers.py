@@ -9,9 +9,11 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from icalib.errors import CalibrationError
-from icalib.extras import load_distributed
+from icalib.extras import load_dask, load_distributed
 
 ANSWER_WITHIN_S = 10
+# A task that waits at a worker would share the blame when that worker dies, and be given up in the end with the guilty.
+_ONE_TASK_A_WORKER = {"distributed.scheduler.worker-saturation": 1.0}
 SILENT = 60  # above every level of logging: what goes wrong is said in a sentence
 
 Task = TypeVar("Task")
@@ -65,13 +67,14 @@ def run_all(
 def _client(distributed: Any, crew: Crew, stack: ExitStack) -> Any:
     if crew.scheduler is None:
         # No dashboard, but its port is taken all the same: any one, so that two studies can run side by side.
-        cluster = distributed.LocalCluster(
-            n_workers=crew.workers or cores(),
-            threads_per_worker=1,
-            dashboard_address=None,
-            scheduler_kwargs={"dashboard_address": ":0"},
-            silence_logs=SILENT,
-        )
+        with load_dask().config.set(_ONE_TASK_A_WORKER):
+            cluster = distributed.LocalCluster(
+                n_workers=crew.workers or cores(),
+                threads_per_worker=1,
+                dashboard_address=None,
+                scheduler_kwargs={"dashboard_address": ":0"},
+                silence_logs=SILENT,
+            )
         return stack.enter_context(distributed.Client(stack.enter_context(cluster)))
     try:
         return stack.enter_context(distributed.Client(crew.scheduler, timeout=ANSWER_WITHIN_S))
@@ -93,5 +96,6 @@ def _answer(distributed: Any, future: Any) -> Any:
             "the Dask scheduler went away; what was finished is kept, and the same command goes on from there."
         ) from None
     if isinstance(error, distributed.KilledWorker):
-        return Lost(f"its worker died again and again ({error}); give it more memory.")
+        times = error.allowed_failures + 1
+        return Lost(f"its worker died again and again, {times} times at this task; give it more memory.")
     return Lost(f"its worker cannot do it ({type(error).__name__}: {error}); install the same icalib everywhere.")
