@@ -1,6 +1,6 @@
-"""A fleet under fire: ten robots with ten simulated recordings each, on two workers. A worker is killed, then the command
-with its scheduler, then a cluster with its scheduler; no finished job may be lost or done twice. In one robot a camera was
-turned half-way, which must be found.
+"""A fleet under fire: ten robots with ten simulated recordings each, on two workers. A worker is killed, then the
+command with its scheduler, then a cluster with its scheduler; no finished job may be lost or done twice. In one robot a
+camera was turned half-way, which must be found.
 
 python benchmarks/fleet.py FOLDER [--seconds 6]      FOLDER is new; about 3 MB a job
 """
@@ -117,7 +117,9 @@ def under_fire(folder: Path) -> None:
     wait_for(process, folder, 7 * jobs // 10)
     before = check(folder, before, "the command and its scheduler killed, gone on with a cluster")
     kill_all(cluster)
-    print(f"the cluster killed: exit code {process.wait()}, {(folder / 'log').read_text().splitlines()[-1]}")
+    code, said = process.wait(), (folder / "log").read_text().splitlines()[-1]
+    print(f"the cluster killed: exit code {code}, {said}")
+    assert code == 1 and said.startswith("icalib: the Dask scheduler went away")
     before = check(folder, before, "the cluster killed")
     process = fleet(folder, "--workers", "2")
     print(f"to the end: exit code {process.wait()}")

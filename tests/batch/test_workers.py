@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 
 from icalib.batch import Crew, Lost, run_all, write_whole
+from icalib.batch.workers import _answer
 from icalib.errors import CalibrationError
+from icalib.extras import load_distributed
 
 
 def test_a_task_that_kills_its_workers_is_given_up_and_takes_no_other_with_it():
@@ -22,6 +24,19 @@ def test_a_task_that_kills_its_workers_is_given_up_and_takes_no_other_with_it():
             "install the same icalib everywhere."
         ),
     }
+
+
+@pytest.mark.parametrize("error", [OSError("closed"), TimeoutError("late"), load_distributed().CancelledError("gone")])
+def test_an_answer_that_never_comes_is_a_scheduler_that_went_away(error: BaseException):
+    class Future:
+        def exception(self) -> None:
+            return None
+
+        def result(self) -> None:
+            raise error
+
+    with pytest.raises(CalibrationError, match="the Dask scheduler went away; what was finished is kept"):
+        _answer(load_distributed(), Future())
 
 
 def test_a_file_is_the_old_one_or_the_new_one(tmp_path: Path):

@@ -86,12 +86,12 @@ def _client(distributed: Any, crew: Crew, stack: ExitStack) -> Any:
 
 
 def _answer(distributed: Any, future: Any) -> Any:
-    """Raises CalibrationError where the scheduler is gone, and with it what it knew."""
+    """Raises CalibrationError where the scheduler is gone, and with it what it knew, or on the way the answer."""
     try:
         error = future.exception()
         if error is None:
             return future.result()
-    except distributed.CancelledError:
+    except (distributed.CancelledError, distributed.TimeoutError, OSError):
         raise CalibrationError(
             "the Dask scheduler went away; what was finished is kept, and the same command goes on from there."
         ) from None
