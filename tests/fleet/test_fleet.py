@@ -297,4 +297,22 @@ def test_the_page_is_drawn_and_opens_offline(fleet_folder: Path, workshop, asser
     assert "5 jobs of 2 robots: 4 calibrated, 1 failed. Changed over time: anton (cam1)." in page
     assert '<a href="jobs/anton-r0/report.html">anton-r0</a>' in page and 'src="http' not in page
     assert page.count("<details open>") == 1 and page.count("<details>") == 1
-    assert_drawn(page, {"time-0-0", "time-0-1"})
+    opened = page.replace(
+        "</body>", "<script>document.querySelector('details:not([open])').open = true</script></body>"
+    )
+    assert_drawn(opened, {"time-0-0", "time-0-1", "time-1-0", "time-1-1"})
+
+
+def test_what_cannot_be_judged_is_pointed_to_on_the_first_screen(fleet_folder: Path, workshop, capsys):
+    def edited(job, c):
+        lens = c.group("cam0", "intrinsics")
+        other = dataclasses.replace(lens, value=lens.value * (1.1 if job == "berta-r1" else 1.0))
+        return dataclasses.replace(c, groups=tuple(other if g is lens else g for g in c.groups))
+
+    workshop.change = edited
+    assert main(["fleet", str(fleet_folder / "JOBS.yaml"), "-o", str(fleet_folder / "out")]) == 0
+    out = capsys.readouterr().out
+    assert "Cannot be judged: berta, berta-r0 to berta-r1: the lens of cam0 moved points by" in out
+    page = (fleet_folder / "out" / "fleet.html").read_text()
+    assert '<a href="#facts">Cannot be judged</a>: 1 more, undetermined or typed.' in page
+    assert "<li>berta, berta-r0 to berta-r1: the lens of cam0 moved points by" in page

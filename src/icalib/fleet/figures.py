@@ -13,7 +13,7 @@ from icalib.report.plot import AXIS_COLORS, COLORS, Figure, figure, numbers, sta
 from icalib.report.quantities import SHOWN_UNITS
 from icalib.report.tables import WORDS
 
-_PANEL_PX, _EDGE_PX = 170, 90
+_PANEL_PX, _EDGE_PX, _GAPS = 170, 90, 0.2
 OPEN = "undetermined"
 
 
@@ -31,10 +31,10 @@ def over_time(results: list[JobResult], sensor: str) -> Figure:
     found = [b for r in results for b in r.record.blocks if b.sensor == sensor and _estimated(b)]
     firsts = {b.name: b for b in reversed(found)}
     names = list(dict.fromkeys(b.name for b in found))
-    traces = [t for k, name in enumerate(names) for t in _traces(results, firsts[name], k)]
+    places, dated = _places(results)
+    traces = [t for k, name in enumerate(names) for t in _traces(results, places, firsts[name], k)]
     titles = [f"{WORDS.get(n, n.replace('_', ' '))}{_unit_words(firsts[n])}" for n in names]
-    layout = stacked_axes(titles, gap=0.06)
-    dated = all(r.time is not None for r in results)
+    layout = stacked_axes(titles, gap=_GAPS / len(names))
     layout["xaxis"] = layout["xaxis"] | {"title": {"text": "time" if dated else "job"}}
     layout["xaxis"] |= {"type": "date" if dated else "category"}
     return figure(_in_legend_once(traces), height=_EDGE_PX + _PANEL_PX * len(names), showlegend=True, **layout)
@@ -48,7 +48,15 @@ def change(first: Block, now: Block) -> np.ndarray:
     return now.value - first.value
 
 
-def _traces(results: list[JobResult], first: Block, panel: int) -> list[dict[str, Any]]:
+def _places(results: list[JobResult]) -> tuple[dict[str, str], bool]:
+    """Where each job stands, by name, and whether that is a time: else the name, where two share a time or have none."""
+    times = {r.job.name: r.time.isoformat() for r in results if r.time is not None}
+    if len(set(times.values())) == len(results):
+        return times, True
+    return {r.job.name: r.job.name for r in results}, False
+
+
+def _traces(results: list[JobResult], places: dict[str, str], first: Block, panel: int) -> list[dict[str, Any]]:
     """A trace for each entry of the block. Calibrations that do not have the same entries are left out."""
     at, blocks = [], []
     for r in results:
@@ -58,13 +66,11 @@ def _traces(results: list[JobResult], first: Block, panel: int) -> list[dict[str
                 blocks.append(b)
     scale = SHOWN_UNITS.get(first.unit, (first.unit, 1.0))[1]
     values = scale * np.array([change(first, b) for b in blocks])
-    x = [r.time.isoformat() if r.time else r.job.name for r in at]
-    if not all(r.time for r in results):
-        x = [r.job.name for r in at]
     colors = AXIS_COLORS if len(first.labels) == len(AXIS_COLORS) else COLORS
     return [
         {
-            "type": "scatter", "mode": "lines+markers", "x": x, "y": numbers(values[:, k]), "yaxis": y_of(panel),
+            "type": "scatter", "mode": "lines+markers", "x": [places[r.job.name] for r in at],
+            "y": numbers(values[:, k]), "yaxis": y_of(panel),
             "name": label or first.name, "line": {"width": 1, "color": colors[k % len(colors)]},
             "text": [r.job.name for r in at], "showlegend": len(first.labels) > 1,
             "marker": {"size": 7, "symbol": ["circle-open" if b.verdict[k] == OPEN else "circle" for b in blocks]},

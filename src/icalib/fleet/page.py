@@ -28,6 +28,7 @@ def fleet_html(fleet: Fleet, title: str) -> str:
     parts = {
         "failures": _titled("Failed", words.failures(fleet), "bad"),
         "changes": _titled("Changed", words.changes(fleet), "care"),
+        "aside": _aside(len(words.unsure(fleet))),
         "robots": _robots(fleet),
         "figures": folds,
         "jobs": _jobs(fleet),
@@ -41,6 +42,13 @@ def fleet_html(fleet: Fleet, title: str) -> str:
 
 def _titled(title: str, found: list[str], css: str) -> Html:
     return Html(element("h3", title) + sentences(found, css, "")) if found else Html("")
+
+
+def _aside(count: int) -> Html:
+    """Where to find the differences that nobody can judge."""
+    if not count:
+        return Html("")
+    return element("p", [Html('<a href="#facts">Cannot be judged</a>'), f": {count} more, undetermined or typed."])
 
 
 def _robots(fleet: Fleet) -> Html:
