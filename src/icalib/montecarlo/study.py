@@ -37,7 +37,7 @@ class Plan:
     def __post_init__(self) -> None:
         if self.runs < 1:
             raise CalibrationError(f"a study needs at least 1 run, but {self.runs} were asked for.")
-        Crew(self.workers, self.scheduler)
+        Crew(self.workers, self.scheduler)  # refuses what makes no sense
 
 
 @dataclass(frozen=True)
