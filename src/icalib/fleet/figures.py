@@ -49,7 +49,7 @@ def change(first: Block, now: Block) -> np.ndarray:
 
 
 def _places(results: list[JobResult]) -> tuple[dict[str, str], bool]:
-    """Where each job stands, by name, and whether that is a time; the name is used where a time is shared or missing."""
+    """Where each job stands, by name, and whether that is a time; it is the name where two share a time or lack it."""
     times = {r.job.name: r.time.isoformat() for r in results if r.time is not None}
     if len(set(times.values())) == len(results):
         return times, True
