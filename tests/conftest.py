@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
-from collections.abc import Iterator
+import re
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 
@@ -51,3 +57,43 @@ def odometry_logs() -> Path:
 def wheel_mocap() -> Path:
     """A differential drive: encoder ticks and planar poses by motion capture."""
     return _recording("wheel_mocap")
+
+
+@pytest.fixture(scope="session", name="same")
+def _same_fixture() -> Callable[[Any, Any], bool]:
+    return _same
+
+
+def _same(a: Any, b: Any) -> bool:
+    """Equal in type, shape and every bit."""
+    if isinstance(a, np.ndarray):
+        return isinstance(b, np.ndarray) and a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+    if dataclasses.is_dataclass(a):
+        return type(a) is type(b) and all(_same(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a))
+    if isinstance(a, tuple | list):
+        return type(a) is type(b) and len(a) == len(b) and all(map(_same, a, b))
+    return type(a) is type(b) and a == b
+
+
+@pytest.fixture
+def assert_drawn(tmp_path: Path) -> Callable[[str, set[str]], None]:
+    """Fails where a browser finds an error in a report, or leaves one of its figures undrawn."""
+    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if chromium is None:
+        pytest.skip("no chromium is installed; install one to have the report drawn")
+    file = tmp_path / "report.html"
+    flags = (
+        "--headless --no-sandbox --disable-quic --no-first-run --disable-background-networking "
+        "--disable-component-update --disable-sync --use-angle=swiftshader --enable-unsafe-swiftshader "
+        "--enable-logging=stderr --v=0 --dump-dom --virtual-time-budget=8000"
+    )
+
+    def draw(text: str, figures: set[str]) -> None:
+        file.write_text(text, encoding="utf-8")
+        command = [chromium, *flags.split(), f"--user-data-dir={tmp_path / 'profile'}", file.as_uri()]
+        found = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+        assert not re.findall(r"CONSOLE.*(?:Error|error).*", found.stderr)
+        for name in figures:
+            assert re.search(rf'<div class="plot [^"]*js-plotly-plot[^"]*" id="{name}"', found.stdout), name
+
+    return draw

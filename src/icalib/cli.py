@@ -50,6 +50,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_target(commands)
     _add_simulate(commands)
     _add_montecarlo(commands)
+    _add_fleet(commands)
     add_result_commands(commands)
     return parser
 
@@ -92,10 +93,20 @@ def _add_montecarlo(commands: argparse._SubParsersAction[argparse.ArgumentParser
     r.set_defaults(run=_reproduce)
 
 
+def _add_fleet(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    c = commands.add_parser("fleet", help="calibrate many recordings of many robots, and say what changed over time")
+    c.add_argument("jobs", type=Path, help="file of jobs (JOBS.yaml)")
+    folder = "folder for the results; jobs that are there already are not done again unless their inputs changed"
+    c.add_argument("--output", "-o", type=Path, required=True, help=folder)
+    c.add_argument("--sigma", type=float, default=3.0, metavar="N", help="changes up to it do not count; by default 3")
+    _add_workers(c)
+    c.set_defaults(run=_fleet)
+
+
 def _add_workers(parser: argparse.ArgumentParser) -> None:
     who = parser.add_mutually_exclusive_group()
     who.add_argument("--workers", type=_count, metavar="N", help="processes on this machine; by default one a core")
-    who.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster that makes the runs")
+    who.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster that does the work")
     parser.add_argument("--quiet", "-q", action="store_true", help="no progress bar and no table")
 
 
@@ -238,6 +249,20 @@ def _reproduce(options: argparse.Namespace) -> None:
         for motion, study in studies.items():
             print_study(study, options.output / motion)
         print(f"Wrote {options.output / 'reproduce.html'}, and a PNG of each motion.")
+
+
+def _fleet(options: argparse.Namespace) -> int:
+    from icalib.console import progress_bar
+    from icalib.fleet import Crew, run_fleet
+    from icalib.fleet.console import print_fleet
+
+    crew = Crew(options.workers, options.scheduler)
+    say = (lambda sentence: None) if options.quiet else print
+    with progress_bar(options.quiet) as progress:
+        fleet = run_fleet(options.jobs, options.output, crew, options.sigma, progress, say)
+    if not options.quiet:
+        print_fleet(fleet, options.output)
+    return 1 if fleet.failed else 0
 
 
 def _inspect(options: argparse.Namespace) -> None:

@@ -34,7 +34,12 @@ def load_zstd() -> Any:
 
 def load_distributed() -> Any:
     """Dask's distributed. Raises RecordingError where it is not installed."""
-    return _load("distributed", "montecarlo", "Studies of many runs need Dask's package distributed")
+    return _load("distributed", "montecarlo", "Many runs need Dask's package distributed")
+
+
+def load_dask() -> Any:
+    """Dask, whose settings distributed has. Raises RecordingError where it is not installed."""
+    return _load("dask", "montecarlo", "Many runs need Dask's package distributed")
 
 
 def load_matplotlib() -> Any:

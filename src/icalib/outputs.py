@@ -11,18 +11,18 @@ from icalib.result_files import check_writable, write_files
 
 
 def write_outputs(calibration: Calibration, folder: str | Path) -> None:
-    """Writes the result, Kalibr's two files and the report into `folder`: all or none. Without a camera Kalibr has no
-    camchain.
+    """Writes `output_files` into `folder`: all or none. Raises CalibrationError where it cannot be written."""
+    write_files(Path(folder), output_files(calibration))
 
-    Raises CalibrationError where the folder cannot be written.
-    """
+
+def output_files(calibration: Calibration) -> dict[str, bytes]:
+    """The result, Kalibr's two files and the report, by name. Without a camera Kalibr has no camchain."""
     texts = {"report.html": report_html(calibration)}
     if calibration.cameras:
         texts[camchain_name(calibration)] = camchain(calibration)
     if calibration.imu is not None:
         texts["imu.yaml"] = imu_yaml(calibration)
-    files = calibration_files(calibration) | {name: text.encode() for name, text in texts.items()}
-    write_files(Path(folder), files)
+    return calibration_files(calibration) | {name: text.encode() for name, text in texts.items()}
 
 
 def check_folder(folder: str | Path) -> None:

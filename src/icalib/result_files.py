@@ -19,7 +19,8 @@ from icalib.errors import CalibrationError
 COMMIT = ".icalib-commit"
 # Every name that icalib writes: a leftover of an earlier result beside a new one would be a silently wrong number.
 OWN_FILES = (
-    "calibration.yaml", "camchain-imucam.yaml", "camchain.yaml", "imu.yaml", "report.html", "result.json", "result.npz",
+    "calibration.yaml", "camchain-imucam.yaml", "camchain.yaml", "fleet-job.json", "imu.yaml", "report.html",
+    "result.json", "result.npz",
 )  # fmt: skip
 
 
@@ -52,6 +53,15 @@ def read_file(folder: Path, name: str) -> bytes:
         with contextlib.suppress(FileNotFoundError), _errors_named(path, "read"):
             return path.read_bytes()
     raise CalibrationError(f"{folder} holds no {name}; give the folder that a calibration was written to.")
+
+
+def finish_writing(folder: Path) -> None:
+    """Moves into place what a writer that was killed left half-moved, so that other programs see it, too.
+
+    Raises CalibrationError where the folder cannot be written.
+    """
+    with _errors_named(folder):
+        _move_in(folder)
 
 
 def check_writable(folder: Path) -> None:

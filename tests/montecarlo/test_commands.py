@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from icalib.batch import program
 from icalib.cli import main
 from icalib.montecarlo import study as study_module
-from icalib.montecarlo.one_run import program
 from icalib.montecarlo.record import Record
 from icalib.montecarlo.reproduce import FOLDER, MOTIONS
 from icalib.simulation import load_scenario
@@ -94,7 +94,7 @@ def test_a_folder_that_cannot_be_written(tmp_path: Path, capsys):
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense://1"])
 def test_no_scheduler_answers(tmp_path: Path, capsys, monkeypatch, address: str):
-    monkeypatch.setattr("icalib.montecarlo.workers.ANSWER_WITHIN_S", 1)
+    monkeypatch.setattr("icalib.batch.workers.ANSWER_WITHIN_S", 1)
     arguments = ("montecarlo", str(SCENARIO), "--runs", "1", "-o", str(tmp_path), "--scheduler", address)
     assert f"no Dask scheduler answers at {address}; start one" in sentence(capsys, *arguments)
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from dataclasses import dataclass
-from functools import cache
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
+from icalib.batch import program
 from icalib.calibration import Calibration, Visited
 from icalib.errors import CalibrationError
 from icalib.montecarlo.record import Block, Record, Size, Waypoint
@@ -91,13 +89,3 @@ def _waypoint(blocks: tuple[Block, ...], truth: Truth, visit: Visited) -> Waypoi
         errors.append(error(b.name, visit.values[b.sensor, b.name], true))
         deviations.append(visit.std[b.sensor, b.name])
     return Waypoint(visit.stage, np.concatenate(errors), np.concatenate(deviations))
-
-
-@cache
-def program() -> str:
-    """Digest of icalib's own source: runs of two versions, released or not, must not be mixed."""
-    digest = hashlib.sha256()
-    root = Path(__file__).parents[1]
-    for file in sorted(root.rglob("*.py")):
-        digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes())
-    return digest.hexdigest()[:16]

@@ -22,7 +22,7 @@ from icalib.montecarlo.words import (
     nees_cells,
     verdict_words,
 )
-from icalib.report.page import document, resource
+from icalib.report.page import document, plot_place, resource
 from icalib.report.plot import COLORS, Figure, axis, figure, numbers
 from icalib.report.tables import Html, element, html, sentences, table
 
@@ -53,11 +53,6 @@ def page(title: str, summary: str, sections: Sequence[Html], figures: dict[str, 
         title=html(title), answer=html(summary), sections="".join(sections)
     )
     return document(title, body, figures)
-
-
-def plot_place(name: str) -> Html:
-    """Where the figure `name` is drawn."""
-    return Html(f'<div class="plot" id="{name}"></div>')
 
 
 def failures(found: Consistency) -> Html:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from icalib.batch import write_whole
 from icalib.montecarlo.convergence import plotly_figure, png, rows
-from icalib.montecarlo.page import blocks_table, failures, page, plot_place
-from icalib.montecarlo.store import write_whole
+from icalib.montecarlo.page import blocks_table, failures, page
 from icalib.montecarlo.study import Plan, Study, run_study, scenario_digest
 from icalib.montecarlo.words import answer, failures_words
+from icalib.report.page import plot_place
 from icalib.report.plot import Figure
 from icalib.report.tables import Html, element
 from icalib.simulation import load_scenario

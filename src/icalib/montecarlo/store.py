@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from icalib.batch import program, write_whole
 from icalib.errors import CalibrationError
-from icalib.montecarlo.one_run import GuessKind, program
+from icalib.montecarlo.one_run import GuessKind
 from icalib.montecarlo.record import Record, from_json, to_json
 from icalib.provenance import versions
 
@@ -89,19 +89,3 @@ class Store:
             raise CalibrationError(
                 f"{self.folder} holds runs of another study ({why}); choose another folder, or delete it."
             )
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Writes the file at once: whoever looks finds the old one or the new one. Raises CalibrationError."""
-    part = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        with part.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise CalibrationError(
-            f"{path} cannot be written ({error.strerror or error}); choose another folder."
-        ) from error

@@ -8,11 +8,12 @@ from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from icalib.batch import Crew, write_whole
 from icalib.errors import CalibrationError
 from icalib.montecarlo.one_run import GuessKind, Task
 from icalib.montecarlo.page import study_html
 from icalib.montecarlo.record import Record
-from icalib.montecarlo.store import Identity, Store, write_whole
+from icalib.montecarlo.store import Identity, Store
 from icalib.montecarlo.summary import Consistency, consistency_json, summarise
 from icalib.montecarlo.workers import run_all
 from icalib.simulation import Drive, Scenario, load_scenario
@@ -36,10 +37,7 @@ class Plan:
     def __post_init__(self) -> None:
         if self.runs < 1:
             raise CalibrationError(f"a study needs at least 1 run, but {self.runs} were asked for.")
-        if self.workers is not None and self.workers < 1:
-            raise CalibrationError(f"a study needs at least 1 worker, but {self.workers} were asked for.")
-        if self.workers is not None and self.scheduler is not None:
-            raise CalibrationError("a cluster has its own number of workers; give workers or a scheduler, not both.")
+        Crew(self.workers, self.scheduler)  # refuses what makes no sense
 
 
 @dataclass(frozen=True)

@@ -103,7 +103,7 @@ def _corner_sections(c: Calibration) -> Html:
     sections = []
     for i, r in enumerate(_seen(c)):
         counts = f"{int((~r.rejected).sum())} corners used, {int(r.rejected.sum())} rejected"
-        plots = [_place(f"{kind}-{i}", css) for kind, css in (("plane", ""), ("image", ""), ("time", "wide"))]
+        plots = [plot_place(f"{kind}-{i}", css) for kind, css in (("plane", ""), ("image", ""), ("time", "wide"))]
         head = element("h3", [tables.html(r.sensor), element("small", f" {counts}")])
         sections.append(Html(head + element("div", plots, "pair")))
     return Html("".join(sections))
@@ -113,7 +113,7 @@ def _lidar_sections(c: Calibration) -> Html:
     """The planes before and after, then each LiDAR."""
     if not c.lidar_residuals:
         return Html("")
-    maps = [element("div", [element("h3", title), _place(name, "")]) for title, name in _MAPS]
+    maps = [element("div", [element("h3", title), plot_place(name, "")]) for title, name in _MAPS]
     sections = [element("div", maps, "pair")]
     for i, r in enumerate(c.lidar_residuals):
         first, now = (1e3 * float(np.sqrt(np.mean(x.astype(np.float64) ** 2))) for x in (r.first_residual, r.residual))
@@ -122,21 +122,24 @@ def _lidar_sections(c: Calibration) -> Html:
             f"{now:.1f} mm now"
         )
         head = element("h3", [tables.html(r.sensor), element("small", f" {counts}")])
-        plots = [_place(f"points-{i}", ""), _place(f"distance-{i}", "")]
+        plots = [plot_place(f"points-{i}", ""), plot_place(f"distance-{i}", "")]
         sections.append(Html(head + element("div", plots, "pair")))
     return Html("".join(sections))
 
 
 def _wheel_sections(c: Calibration) -> Html:
-    return Html("".join(element("h3", r.sensor) + _place(f"wheels-{i}", "") for i, r in enumerate(c.wheel_residuals)))
+    return Html(
+        "".join(element("h3", r.sensor) + plot_place(f"wheels-{i}", "") for i, r in enumerate(c.wheel_residuals))
+    )
 
 
 def _pose_sections(c: Calibration) -> Html:
-    return Html("".join(element("h3", r.sensor) + _place(f"poses-{i}", "") for i, r in enumerate(c.pose_residuals)))
+    return Html("".join(element("h3", r.sensor) + plot_place(f"poses-{i}", "") for i, r in enumerate(c.pose_residuals)))
 
 
-def _place(name: str, css: str) -> Html:
-    return Html(f'<div class="plot {css}" id="{name}"></div>')
+def plot_place(name: str, css: str = "") -> Html:
+    """Where the figure `name` is drawn."""
+    return Html(f'<div class="plot {css}" id="{tables.html(name)}"></div>')
 
 
 def script_json(figures: dict[str, Figure]) -> str:

@@ -1,0 +1,37 @@
+"""One file at a time, whole or not there."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from icalib.errors import CalibrationError
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Writes the file at once: whoever looks finds the old one or the new one. Raises CalibrationError."""
+    with replacing(path) as part, part.open("wb") as file:
+        file.write(content)
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A place beside `path` to write to, which takes its place at the end, and is removed where anything fails.
+
+    Raises CalibrationError where it cannot be written.
+    """
+    part = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        yield part
+        with part.open("r+b") as file:
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError as error:
+        raise CalibrationError(
+            f"{path} cannot be written ({error.strerror or error}); choose another folder."
+        ) from error
+    finally:
+        with suppress(OSError):
+            part.unlink()

@@ -1,0 +1,46 @@
+"""A fleet for the terminal."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from icalib.fleet import words
+from icalib.fleet.result import Fleet
+
+MOST = 20  # sentences of a kind; all are on the page
+
+
+def print_fleet(fleet: Fleet, folder: Path) -> None:
+    """A row for each robot, what failed and what changed, and where the files are, on standard output."""
+    console = Console()
+    console.print(table(fleet))
+    console.print(words.answer(fleet), markup=False)
+    if any(d.judged for d in fleet.drifts):
+        console.print(words.chance_words(fleet), markup=False)
+    for title, sentences in (
+        ("Failed", words.failures(fleet)),
+        ("Changed", words.changes(fleet)),
+        ("Cannot be judged", words.unsure(fleet)),
+        ("Note", words.notes(fleet)),
+    ):
+        for sentence in sentences[:MOST]:
+            console.print(f"{title}: {sentence}", markup=False)
+        if len(sentences) > MOST:
+            console.print(f"{title}: {len(sentences) - MOST} more, in fleet.html", markup=False)
+    console.print(f"Wrote {folder / 'fleet.html'}, fleet.sqlite, and a result for each job in jobs.", markup=False)
+
+
+def table(fleet: Fleet) -> Table:
+    """One row for each robot."""
+    out = Table(title="Fleet", title_justify="left", box=SIMPLE_HEAD, padding=(0, 1))
+    for header in ("robot", "jobs", "failed", "time", "changed"):
+        out.add_column(header, justify="right" if header in ("jobs", "failed") else "left")
+    for drift in fleet.drifts:
+        own = [r for r in fleet.results if r.job.robot == drift.robot]
+        failed = sum(r.failed for r in own)
+        out.add_row(drift.robot, str(len(own)), str(failed), words.span_words(own), words.drift_cell(drift))
+    return out

@@ -1,0 +1,112 @@
+"""What changed between calibrations of one robot, by the measure and in the words of `icalib compare`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import erfc, sqrt
+
+from icalib.calibration import Calibration
+from icalib.comparison.compare import Comparison, Difference, compare_sides
+from icalib.comparison.results import side_of_result
+from icalib.comparison.sides import Side
+from icalib.comparison.words import sentence
+from icalib.errors import CalibrationError
+
+
+@dataclass(frozen=True)
+class Change:
+    """A block that differs from the job `before` to the job `after`. at_its_sensor: seen from the body or from nothing,
+    so that the change is the sensor's own. judged: both sides have determined it, with standard deviations."""
+
+    before: str
+    after: str
+    difference: Difference
+    words: str
+    at_its_sensor: bool
+    judged: bool
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Of one robot. jobs: those that reached a result, in order of time. changes: beyond `limit` sigmas, from each job
+    to the next, and from the first to the last where no step shows it. unsure: differences that nobody can judge,
+    undetermined or without standard deviations. judged: how many comparisons there were. notes: what could not be
+    compared."""
+
+    robot: str
+    jobs: tuple[str, ...]
+    changes: tuple[Change, ...] = ()
+    unsure: tuple[Change, ...] = ()
+    judged: int = 0
+    notes: tuple[str, ...] = ()
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Those that changed; where only poses between two sensors did, the farther one."""
+        own = [c for c in self.changes if c.at_its_sensor] or self.changes
+        return tuple(dict.fromkeys(c.difference.sensor for c in own))
+
+
+@dataclass(frozen=True)
+class _Step:
+    """One comparison: what differs, how many blocks were judged, and sentences."""
+
+    changes: tuple[Change, ...] = ()
+    judged: int = 0
+    notes: tuple[str, ...] = ()
+
+
+def drift_of(robot: str, jobs: Sequence[str], load: Callable[[str], Calibration], limit: float) -> Drift:
+    """jobs: names in order of time. load: gives the result of a job; where it raises CalibrationError, its sentence is
+    a note. No more than three results are in memory at a time."""
+    steps, notes, first, last = list[_Step](), list[str](), None, None
+    for name in jobs:
+        try:
+            side = side_of_result(load(name), name)
+        except CalibrationError as error:
+            notes.append(str(error))
+            continue
+        if last is not None:
+            steps.append(_step(last, side, limit))
+        first, last = first or side, side
+    seen = {_block(c) for s in steps for c in s.changes}
+    if first is not None and last is not None and len(steps) > 1:
+        slow = _step(first, last, limit)
+        steps.append(_Step(tuple(c for c in slow.changes if _block(c) not in seen), slow.judged))
+    changes = [c for s in steps for c in s.changes]
+    return Drift(
+        robot,
+        tuple(jobs),
+        tuple(c for c in changes if c.judged),
+        tuple(c for c in changes if not c.judged),
+        sum(s.judged for s in steps),
+        tuple(dict.fromkeys([*notes, *(n for s in steps for n in s.notes)])),
+    )
+
+
+def by_chance(judged: int, limit: float) -> float:
+    """How many of `judged` comparisons are beyond `limit` sigmas by chance alone."""
+    return judged * erfc(limit / sqrt(2.0))
+
+
+def _step(a: Side, b: Side, limit: float) -> _Step:
+    try:
+        found = compare_sides(a, b, limit=limit)
+    except CalibrationError as error:
+        return _Step(notes=(str(error),))
+    changes = tuple(_change(d, found) for d in found.differences if d.differs)
+    return _Step(changes, sum(_judged(d) for d in found.differences), found.notes)
+
+
+def _change(d: Difference, c: Comparison) -> Change:
+    own = d.frame in (c.reference, d.sensor, c.a.body)
+    return Change(c.a.path, c.b.path, d, sentence(d, c), own, _judged(d))
+
+
+def _judged(d: Difference) -> bool:
+    return d.sigmas is not None and d.given_by == "both" and not d.open
+
+
+def _block(c: Change) -> tuple[str, str, str]:
+    return c.difference.sensor, c.difference.frame, c.difference.what

@@ -1,0 +1,99 @@
+"""Parameters of a robot over time: each against its first calibration, with bars of one sigma."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from icalib.fleet.record import Block
+from icalib.fleet.result import JobResult
+from icalib.geometry import so3
+from icalib.report.plot import AXIS_COLORS, COLORS, Figure, figure, numbers, stacked_axes, y_of
+from icalib.report.quantities import SHOWN_UNITS
+from icalib.report.tables import WORDS
+
+_PANEL_PX, _EDGE_PX, _GAPS = 170, 90, 0.2
+OPEN = "undetermined"
+
+
+def sensors(results: list[JobResult]) -> tuple[str, ...]:
+    """Those of which something was estimated."""
+    blocks = [b for r in results for b in r.record.blocks if _estimated(b)]
+    return tuple(dict.fromkeys(b.sensor for b in blocks))
+
+
+def over_time(results: list[JobResult], sensor: str) -> Figure:
+    """results: in order of time. One panel for each block of the sensor, all its entries in it.
+
+    Undetermined entries, which hold the guess, are hollow, and have no bars.
+    """
+    found = [b for r in results for b in r.record.blocks if b.sensor == sensor and _estimated(b)]
+    firsts = {b.name: b for b in reversed(found)}
+    names = list(dict.fromkeys(b.name for b in found))
+    places, dated = _places(results)
+    traces = [t for k, name in enumerate(names) for t in _traces(results, places, firsts[name], k)]
+    titles = [f"{WORDS.get(n, n.replace('_', ' '))}{_unit_words(firsts[n])}" for n in names]
+    layout = stacked_axes(titles, gap=_GAPS / len(names))
+    layout["xaxis"] = layout["xaxis"] | {"title": {"text": "time" if dated else "job"}}
+    layout["xaxis"] |= {"type": "date" if dated else "category"}
+    return figure(_in_legend_once(traces), height=_EDGE_PX + _PANEL_PX * len(names), showlegend=True, **layout)
+
+
+def change(first: Block, now: Block) -> np.ndarray:
+    """(n,) what takes `first` to `now`, as standard deviations are stated: of rotations the vector in the sensor's axes
+    [rad]."""
+    if now.value.ndim == 2:
+        return so3.log(np.ascontiguousarray(first.value.T @ now.value))
+    return now.value - first.value
+
+
+def _places(results: list[JobResult]) -> tuple[dict[str, str], bool]:
+    """Where each job stands, by name, and whether that is a time; it is the name where two share a time or lack it."""
+    times = {r.job.name: r.time.isoformat() for r in results if r.time is not None}
+    if len(set(times.values())) == len(results):
+        return times, True
+    return {r.job.name: r.job.name for r in results}, False
+
+
+def _traces(results: list[JobResult], places: dict[str, str], first: Block, panel: int) -> list[dict[str, Any]]:
+    """A trace for each entry of the block. Calibrations that do not have the same entries are left out."""
+    at, blocks = [], []
+    for r in results:
+        for b in r.record.blocks:
+            if (b.sensor, b.name, b.labels) == (first.sensor, first.name, first.labels):
+                at.append(r)
+                blocks.append(b)
+    scale = SHOWN_UNITS.get(first.unit, (first.unit, 1.0))[1]
+    values = scale * np.array([change(first, b) for b in blocks])
+    colors = AXIS_COLORS if len(first.labels) == len(AXIS_COLORS) else COLORS
+    return [
+        {
+            "type": "scatter", "mode": "lines+markers", "x": [places[r.job.name] for r in at],
+            "y": numbers(values[:, k]), "yaxis": y_of(panel),
+            "name": label or first.name, "line": {"width": 1, "color": colors[k % len(colors)]},
+            "text": [r.job.name for r in at], "showlegend": len(first.labels) > 1,
+            "marker": {"size": 7, "symbol": ["circle-open" if b.verdict[k] == OPEN else "circle" for b in blocks]},
+            "error_y": {"array": numbers(scale * np.array([_bar(b, k) for b in blocks])), "thickness": 1.2, "width": 3},
+        }
+        for k, label in enumerate(first.labels)
+    ]  # fmt: skip
+
+
+def _in_legend_once(traces: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """x, y and z have the same colours in all panels."""
+    firsts = {t["name"]: k for k, t in reversed(list(enumerate(traces)))}
+    return [t | {"showlegend": t["showlegend"] and firsts[t["name"]] == k} for k, t in enumerate(traces)]
+
+
+def _bar(b: Block, entry: int) -> float:
+    return 0.0 if b.verdict[entry] == OPEN else float(b.std[entry])
+
+
+def _estimated(b: Block) -> bool:
+    return any(v != "fixed" for v in b.verdict)
+
+
+def _unit_words(b: Block) -> str:
+    unit = SHOWN_UNITS.get(b.unit, (b.unit, 1.0))[0]
+    return f" [{unit}]" if unit else ""

@@ -1,0 +1,92 @@
+"""JOBS.yaml -> jobs. The format: docs/fleet.md."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from icalib.yaml_nodes import YamlValue, read_yaml
+
+_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}")
+_UNFIT = re.compile(r"[^A-Za-z0-9_.-]+")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One calibration. name: of its folder. recordings: one, or several that are solved jointly. time: when they were
+    made, where the file says so."""
+
+    name: str
+    robot: str
+    rig: Path
+    recordings: tuple[Path, ...]
+    time: datetime | None = None
+
+
+def load_jobs(path: str | Path) -> tuple[Job, ...]:
+    """Read a file of jobs. Paths in it are relative to it. Whether recordings are there is seen when they are read.
+
+    Raises RigError, one sentence naming file, line, field, what is wrong and what to do.
+    """
+    root = read_yaml(Path(path), "file of jobs")
+    found = root.record(("jobs",), ("defaults",))
+    defaults = found["defaults"].record((), ("robot", "rig")) if "defaults" in found else {}
+    folder = Path(path).absolute().parent
+    values = found["jobs"].items()
+    if not values:
+        found["jobs"].fail("has no job; add one with robot, rig and recording.")
+    jobs = tuple(_job(value, defaults, folder) for value in values)
+    _refuse_twins(jobs, values)
+    return jobs
+
+
+def _job(value: YamlValue, defaults: dict[str, YamlValue], folder: Path) -> Job:
+    own = value.record(("recording",), ("name", "robot", "rig", "time"))
+    found = defaults | own
+    for field in ("robot", "rig"):
+        if field not in found:
+            value.fail(f"{field} is missing; add {field}, here or for all jobs in defaults.")
+    rig = folder / found["rig"].text()
+    if not rig.is_file():
+        found["rig"].fail(f"{rig} does not exist; correct the path of the rig file.")
+    robot = found["robot"].text()
+    recordings = tuple(folder / text for text in _texts(found["recording"]))
+    name = _name(own["name"]) if "name" in own else _UNFIT.sub("_", f"{robot}-{recordings[0].name}").lstrip(".-")[:100]
+    return Job(name or "_", robot, rig, recordings, _time(own["time"]) if "time" in own else None)
+
+
+def _texts(value: YamlValue) -> list[str]:
+    items = value.items() if value.is_list else [value]
+    if not items:
+        value.fail("is an empty list; give the path of a recording, or several.")
+    return [item.text() for item in items]
+
+
+def _name(value: YamlValue) -> str:
+    text = value.text()
+    if not _NAME.fullmatch(text):
+        value.fail(
+            f"is the name of a folder: letters, digits, _, - and dots, 100 at most, but is {value.shown()}; rename it."
+        )
+    return text
+
+
+def _time(value: YamlValue) -> datetime:
+    try:
+        found = datetime.fromisoformat(value.text())
+    except ValueError:
+        value.fail(f"must be a date or time as in 2026-11-02 or 2026-11-02T13:05:00+01:00, but is {value.shown()}.")
+    return found.replace(tzinfo=UTC) if found.tzinfo is None else found.astimezone(UTC)
+
+
+def _refuse_twins(jobs: tuple[Job, ...], values: list[YamlValue]) -> None:
+    """Names that some file systems take for the same count as the same."""
+    seen: dict[str, int] = {}
+    for k, job in enumerate(jobs):
+        first = seen.setdefault(job.name.casefold(), k)
+        if first != k:
+            values[k].fail(
+                f"this job and {values[first].field} are both called {job.name}; give each a name of its own."
+            )

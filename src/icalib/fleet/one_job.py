@@ -1,0 +1,44 @@
+"""One job, on a worker: calibrate, and give back all that is to be written. What goes wrong becomes part of it."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+
+from icalib.batch import program
+from icalib.errors import CalibrationError
+from icalib.fleet.inputs import Inputs
+from icalib.fleet.jobs import Job
+from icalib.fleet.record import Record
+from icalib.outputs import output_files
+from icalib.pipeline import calibrate
+
+
+@dataclass(frozen=True)
+class Task:
+    """A job, and what it would be made from, looked at before: what changes while it waits is seen the next time."""
+
+    job: Job
+    inputs: Inputs
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """files: of the result, by name; none where there is none."""
+
+    record: Record
+    files: dict[str, bytes]
+
+
+def run(task: Task) -> Outcome:
+    """Never raises: the sentence of a job that failed is in its record. The inputs name the program that worked."""
+    started, inputs = time.perf_counter(), replace(task.inputs, program=program())
+    try:
+        result = calibrate(task.job.rig, task.job.recordings)
+        files = output_files(result)
+    except CalibrationError as caught:
+        return Outcome(Record(task.job.name, str(caught), time.perf_counter() - started, inputs), {})
+    except Exception as caught:  # a fault of the program must not end the work on a hundred robots, nor be lost in it
+        sentence = f"the program failed ({type(caught).__name__}: {caught}); this is a fault of icalib."
+        return Outcome(Record(task.job.name, sentence, time.perf_counter() - started, inputs), {})
+    return Outcome(Record.of(task.job.name, result, time.perf_counter() - started, inputs), files)

@@ -1,0 +1,98 @@
+"""`fleet.html`: a fleet as one file without network, which says first what to look at."""
+
+from __future__ import annotations
+
+from string import Template
+
+from icalib.fleet import words
+from icalib.fleet.figures import over_time, sensors
+from icalib.fleet.result import Fleet, JobResult, by_robot
+from icalib.fleet.store import JOBS
+from icalib.report.page import document, plot_place, resource
+from icalib.report.plot import Figure
+from icalib.report.tables import Html, element, html, sentences, table
+
+_BADGES = {"done": "determined", "failed": "undetermined"}  # green, red
+
+
+def fleet_html(fleet: Fleet, title: str) -> str:
+    """The whole page. title: name of the file of jobs."""
+    figures, folds = _over_time(fleet)
+    texts = {
+        "title": title,
+        "answer": words.answer(fleet),
+        "chance": words.chance_words(fleet) if any(d.judged for d in fleet.drifts) else "",
+        "limit": f"{fleet.limit:g}",
+        "trust": "bad" if fleet.failed else ("care" if fleet.drifted else "good"),
+    }
+    parts = {
+        "failures": _titled("Failed", words.failures(fleet), "bad"),
+        "changes": _titled("Changed", words.changes(fleet), "care"),
+        "aside": _aside(len(words.unsure(fleet))),
+        "robots": _robots(fleet),
+        "figures": folds,
+        "jobs": _jobs(fleet),
+        "unsure": sentences(words.unsure(fleet), "", "None."),
+        "notes": sentences(words.notes(fleet), "", "None."),
+    }
+    escaped = {name: html(text) for name, text in texts.items()}
+    body = Template(resource("icalib.fleet", "page.html")).substitute(escaped | parts)
+    return document(f"Fleet of {title}", body, figures)
+
+
+def _titled(title: str, found: list[str], css: str) -> Html:
+    return Html(element("h3", title) + sentences(found, css, "")) if found else Html("")
+
+
+def _aside(count: int) -> Html:
+    """Where to find the differences that nobody can judge."""
+    if not count:
+        return Html("")
+    return element("p", [Html('<a href="#facts">Cannot be judged</a>'), f": {count} more, undetermined or typed."])
+
+
+def _robots(fleet: Fleet) -> Html:
+    body = []
+    for drift in fleet.drifts:
+        own = [r for r in fleet.results if r.job.robot == drift.robot]
+        failed = sum(r.failed for r in own)
+        body.append((drift.robot, len(own), failed or "", words.span_words(own), words.drift_cell(drift)))
+    headers = ("robot", "jobs", "failed", "time", "changed")
+    return Html(element("h3", "Robots") + table(headers, body, headers[1:3]))
+
+
+def _over_time(fleet: Fleet) -> tuple[dict[str, Figure], Html]:
+    """Figures by the id of their places, and a fold for each robot that has more than one calibration."""
+    robots, figures, folds = by_robot(fleet.results), dict[str, Figure](), list[Html]()
+    for i, drift in enumerate(fleet.drifts):
+        results = robots[drift.robot]
+        if len(results) < 2:
+            continue
+        parts = [element("summary", drift.robot)]
+        for k, sensor in enumerate(sensors(results)):
+            figures[f"time-{i}-{k}"] = over_time(results, sensor)
+            parts += [element("h3", sensor), plot_place(f"time-{i}-{k}")]
+        opening = "<details open>" if drift.changes else "<details>"
+        folds.append(Html(f"{opening}{html(list(parts))}</details>"))
+    return figures, html(list(folds)) if folds else element("p", "No robot has two calibrations.", "quiet")
+
+
+def _jobs(fleet: Fleet) -> Html:
+    body = [
+        (
+            _link(r), r.job.robot, words.time_words(r.time), _status(r), words.care_words(r),
+            f"{r.record.seconds:.1f}", r.record.failure or fleet.again.get(r.job.name, ""),
+        )
+        for r in fleet.results
+    ]  # fmt: skip
+    return table(("job", "robot", "time", "status", "to know", "took [s]", "why"), body, ("took [s]",))
+
+
+def _link(one: JobResult) -> Html:
+    """To the job's report, where it has one; names of jobs are names of folders and need no quotes."""
+    name = html(one.job.name)
+    return Html(f'<a href="{JOBS}/{name}/report.html">{name}</a>') if one.record.blocks else name
+
+
+def _status(one: JobResult) -> Html:
+    return element("span", one.status, f"badge {_BADGES[one.status]}")

@@ -1,0 +1,88 @@
+"""What one job leaves beside its result: how it ended, and its parameters, as JSON."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from icalib.calibration import Calibration, ParameterGroup
+from icalib.fleet.inputs import Inputs
+from icalib.report.quantities import shown_groups
+
+FORMAT = 1
+WALL_CLOCK_NS = (10**18, 4 * 10**18)  # 2001 to 2096; clocks that start with the computer are far below
+
+
+@dataclass(frozen=True)
+class Block:
+    """One group of parameters of one sensor, as in `ParameterGroup`. value: (n,), of a rotation (3, 3)."""
+
+    sensor: str
+    name: str
+    labels: tuple[str, ...]
+    unit: str
+    value: np.ndarray
+    std: np.ndarray  # (n,)
+    verdict: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Record:
+    """One job. failure: a sentence, or "" where the solver converged. status: how the solver ended, in a sentence.
+
+    stamp_ns: the recording's first stamp where it is of a wall clock. undetermined, warnings: sentences. inputs: what
+    it was made from; None where its worker died, and nothing is kept.
+    """
+
+    name: str
+    failure: str
+    seconds: float
+    inputs: Inputs | None
+    status: str = ""
+    stamp_ns: int | None = None
+    undetermined: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    blocks: tuple[Block, ...] = ()
+
+    @classmethod
+    def of(cls, name: str, result: Calibration, seconds: float, inputs: Inputs) -> Record:
+        """Of a calibration that reached a result, whether it converged or not."""
+        failure = "" if result.converged else f"the solver did not converge: {result.status}"
+        stamp = min((r.origin_ns for r in result.recordings), default=0)
+        low, high = WALL_CLOCK_NS
+        blocks = tuple(_block(g) for g in shown_groups(result) if g.sensor in result.rig["sensors"])
+        known = stamp if low <= stamp < high else None
+        return cls(
+            name, failure, seconds, inputs, result.status, known, result.undetermined, result.warnings, blocks
+        )  # fmt: skip
+
+
+def _block(g: ParameterGroup) -> Block:
+    return Block(g.sensor, g.name, g.labels, g.unit, g.value, g.std, g.verdict)
+
+
+def to_json(record: Record) -> bytes:
+    """The record as JSON, numbers in full."""
+    return json.dumps({"format": FORMAT} | asdict(record), default=lambda array: array.tolist()).encode()
+
+
+def from_json(text: bytes) -> Record:
+    """The record that `to_json` was given. Raises ValueError, KeyError or TypeError where `text` is something else."""
+    plain: dict[str, Any] = json.loads(text)
+    if plain.pop("format") != FORMAT:
+        raise ValueError("another format")
+    inputs = plain["inputs"]
+    plain["inputs"] = Inputs(inputs["rig"], tuple(inputs["recordings"]), inputs["program"])
+    for name in ("undetermined", "warnings"):
+        plain[name] = tuple(plain[name])
+    plain["blocks"] = tuple(_block_of(b) for b in plain["blocks"])
+    return Record(**plain)
+
+
+def _block_of(plain: dict[str, Any]) -> Block:
+    value, std = (np.array(plain[name], dtype=np.float64) for name in ("value", "std"))
+    labels, verdict = (tuple(plain[name]) for name in ("labels", "verdict"))
+    return Block(plain["sensor"], plain["name"], labels, plain["unit"], value, std, verdict)

@@ -1,0 +1,80 @@
+"""A fleet: many calibrations, resumed where they were left, and what changed over time. This page is all of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import closing
+from math import isfinite
+from pathlib import Path
+
+from icalib.batch import Crew, Lost, run_all, write_whole
+from icalib.errors import CalibrationError
+from icalib.fleet.drift import drift_of
+from icalib.fleet.inputs import Inputs
+from icalib.fleet.jobs import load_jobs
+from icalib.fleet.one_job import Task, run
+from icalib.fleet.page import fleet_html
+from icalib.fleet.record import Record
+from icalib.fleet.result import Fleet, JobResult, by_robot
+from icalib.fleet.store import Store, to_do
+from icalib.fleet.table import write_table
+
+Progress = Callable[[str, float], None]
+LIMIT = 3.0  # sigmas, as in `icalib compare`
+
+
+def run_fleet(
+    path: str | Path,
+    output: str | Path,
+    crew: Crew | None = None,
+    limit: float = LIMIT,
+    progress: Progress = lambda *_: None,
+    say: Callable[[str], None] = lambda sentence: None,
+) -> Fleet:
+    """Does the jobs of the file at `path` that `output` does not hold yet; writes fleet.sqlite and fleet.html there.
+
+    crew: by default a worker for each core. limit: sigmas beyond which a change counts. say: is told what is done
+    again, before it is. Raises RigError where the file is wrong, CalibrationError where the folder cannot be written or
+    no cluster answers; KeyboardInterrupt with a sentence on what was reached.
+    """
+    if not (isfinite(limit) and limit > 0.0):
+        raise CalibrationError(f"a change counts from a number of sigmas above 0 on, not {limit:g}; the usual is 3.")
+    jobs, store = load_jobs(path), Store(Path(output))
+    inputs = {job.name: Inputs.of(job) for job in jobs}
+    done, again = to_do(store, inputs)
+    for name, why in again.items():
+        say(f"{name} is done again: {why}.")
+    tasks = [Task(job, inputs[job.name]) for job in jobs if job.name not in done]
+    records = done | _do(tasks, store, crew or Crew(), len(jobs), progress)
+    results = tuple(JobResult(job, records[job.name]) for job in jobs)
+    robots = by_robot(results)
+    drifts = tuple(drift_of(robot, [r.job.name for r in own], store.load, limit) for robot, own in robots.items())
+    fleet = Fleet(results, drifts, limit, again)
+    write_table(store.folder / "fleet.sqlite", results)
+    write_whole(store.folder / "fleet.html", fleet_html(fleet, Path(path).name).encode())
+    return fleet
+
+
+def _do(tasks: list[Task], store: Store, crew: Crew, total: int, progress: Progress) -> dict[str, Record]:
+    """Records of the tasks; all are stored but those whose worker died, which will be tried again the next time."""
+    found: dict[str, Record] = {}
+    before = total - len(tasks)
+    if not tasks:
+        return found
+    progress(f"{before} of {total} jobs", 0.0)
+    try:
+        with closing(run_all(run, tasks, crew)) as outcomes:
+            for task, outcome in outcomes:
+                name = task.job.name
+                if isinstance(outcome, Lost):
+                    found[name] = Record(name, outcome.sentence, 0.0, None)
+                else:
+                    store.add(outcome)
+                    found[name] = outcome.record
+                progress(f"{before + len(found)} of {total} jobs", len(found) / len(tasks))
+    except KeyboardInterrupt:
+        kept = before + sum(r.inputs is not None for r in found.values())
+        raise KeyboardInterrupt(
+            f"{kept} of {total} jobs are in {store.folder}; the same command goes on from there."
+        ) from None
+    return found

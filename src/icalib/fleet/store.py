@@ -1,0 +1,75 @@
+"""The folder of a fleet: below jobs/ one folder for each job, with its result and its record as one set."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from icalib.batch import program
+from icalib.calibration import Calibration, load_calibration
+from icalib.errors import CalibrationError
+from icalib.fleet.inputs import Inputs
+from icalib.fleet.one_job import Outcome
+from icalib.fleet.record import Record, from_json, to_json
+from icalib.result_files import check_writable, finish_writing, read_file, write_files
+
+JOBS, RECORD = "jobs", "fleet-job.json"
+
+
+class Store:
+    """Records and results by the name of the job. Raises CalibrationError where the folder cannot be written."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        check_writable(folder / JOBS)
+
+    def place(self, name: str) -> Path:
+        """Where the job's files are."""
+        return self.folder / JOBS / name
+
+    def find(self, name: str) -> Record | None:
+        """None where the job is not done, or its result was taken away.
+
+        Raises CalibrationError where its record is damaged, or what a killed writer left cannot be put in place.
+        """
+        place = self.place(name)
+        if not place.is_dir():
+            return None
+        finish_writing(place)
+        if not (place / RECORD).exists():
+            return None
+        try:
+            record = from_json(read_file(place, RECORD))
+        except (ValueError, KeyError, TypeError) as error:
+            raise CalibrationError(
+                f"{place / RECORD} is damaged; delete it, and the job will be done again."
+            ) from error
+        return record if not record.blocks or (place / "result.json").exists() else None
+
+    def add(self, outcome: Outcome) -> None:
+        """Raises CalibrationError where the worker ran another icalib, or the folder cannot be written."""
+        inputs = outcome.record.inputs
+        if inputs is None or inputs.program != program():
+            raise CalibrationError(
+                "a worker of the cluster runs another version of icalib than this one; install the same everywhere."
+            )
+        write_files(self.place(outcome.record.name), outcome.files | {RECORD: to_json(outcome.record)})
+
+    def load(self, name: str) -> Calibration:
+        """The job's result. Raises CalibrationError where there is none, or it is damaged."""
+        return load_calibration(self.place(name))
+
+
+def to_do(store: Store, inputs: dict[str, Inputs]) -> tuple[dict[str, Record], dict[str, str]]:
+    """Records of the jobs that are done, and of those whose inputs are others now what changed, in words. inputs: by
+    the name of the job."""
+    done, changed = dict[str, Record](), dict[str, str]()
+    for name, now in inputs.items():
+        record = store.find(name)
+        if record is None or record.inputs is None:
+            continue
+        why = record.inputs.changed(now)
+        if why:
+            changed[name] = why
+        else:
+            done[name] = record
+    return done, changed

@@ -1,0 +1,54 @@
+"""All results of a fleet as one table of SQLite, made anew from the records each time."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterable, Iterator
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+
+from icalib.batch import replacing
+from icalib.errors import CalibrationError
+from icalib.fleet.record import Block
+from icalib.fleet.result import JobResult
+from icalib.report.quantities import rpy_deg
+
+_COLUMNS = (
+    "robot TEXT", "time TEXT", "job TEXT", "status TEXT", "sentence TEXT", "sensor TEXT", "block TEXT", "entry TEXT",
+    "value REAL", "sigma REAL", "unit TEXT", "verdict TEXT",
+)  # fmt: skip
+_NOTHING = (None,) * 7
+
+
+def write_table(path: Path, results: Iterable[JobResult]) -> None:
+    """Table `results`: a row for each entry of each job, and one for a job without a result. SI units; of rotations
+    roll, pitch and yaw, with sigma of small turns about the sensor's x, y and z. Written at once.
+
+    Raises CalibrationError where that is not possible.
+    """
+    try:
+        with replacing(path) as part, closing(sqlite3.connect(part)) as base:
+            base.execute(f"CREATE TABLE results ({', '.join(_COLUMNS)})")
+            base.executemany(
+                f"INSERT INTO results VALUES ({', '.join('?' * len(_COLUMNS))})",
+                (r for one in results for r in rows(one)),
+            )
+            base.commit()
+    except sqlite3.Error as error:
+        raise CalibrationError(f"{path} cannot be written ({error}); choose another folder.") from error
+
+
+def rows(one: JobResult) -> Iterator[tuple[object, ...]]:
+    """Of one job, cells as in the table."""
+    about = (one.job.robot, one.time.isoformat() if one.time else None, one.job.name, one.status, one.sentence)
+    if not one.record.blocks:
+        yield about + _NOTHING
+    for b in one.record.blocks:
+        for label, value, std, verdict in zip(b.labels, _values(b), b.std.tolist(), b.verdict, strict=True):
+            yield (*about, b.sensor, b.name, label or b.name, value, std, b.unit, verdict)
+
+
+def _values(b: Block) -> list[float]:
+    return (np.deg2rad(rpy_deg(b.value)) if b.value.ndim == 2 else b.value).tolist()

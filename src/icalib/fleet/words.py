@@ -1,0 +1,89 @@
+"""A fleet in sentences, for the terminal and the page."""
+
+from __future__ import annotations
+
+from datetime import datetime
+
+from icalib.comparison.words import digits
+from icalib.fleet.drift import Change, Drift
+from icalib.fleet.result import Fleet, JobResult
+
+
+def answer(fleet: Fleet) -> str:
+    """How many jobs, how many failed, and who changed."""
+    jobs, robots, failed = len(fleet.results), len(fleet.drifts), len(fleet.failed)
+    counts = f"{_count(jobs, 'job')} of {_count(robots, 'robot')}: {jobs - failed} calibrated, {failed} failed."
+    return f"{counts} {changed_words(fleet)}"
+
+
+def changed_words(fleet: Fleet) -> str:
+    if fleet.drifted:
+        return f"Changed over time: {'; '.join(f'{d.robot} ({_listed(d.sensors)})' for d in fleet.drifted)}."
+    if not sum(d.judged for d in fleet.drifts):
+        return "No robot has two calibrations to compare."
+    return "Nothing changed over time."
+
+
+def chance_words(fleet: Fleet) -> str:
+    """How to take the number of changes."""
+    judged = sum(d.judged for d in fleet.drifts)
+    changes = sum(len(d.changes) for d in fleet.drifts)
+    return (
+        f"{changes} of {judged} comparisons are beyond {fleet.limit:g} sigma, where chance alone leaves about "
+        f"{digits(fleet.by_chance)}."
+    )
+
+
+def change_words(robot: str, change: Change) -> str:
+    return f"{robot}, {change.before} to {change.after}: {change.words}"
+
+
+def changes(fleet: Fleet) -> list[str]:
+    return [change_words(d.robot, c) for d in fleet.drifts for c in d.changes]
+
+
+def unsure(fleet: Fleet) -> list[str]:
+    """What differs where one side did not determine it, or no standard deviation is known."""
+    return [change_words(d.robot, c) for d in fleet.drifts for c in d.unsure]
+
+
+def notes(fleet: Fleet) -> list[str]:
+    return [f"{d.robot}: {note}" for d in fleet.drifts for note in d.notes]
+
+
+def failures(fleet: Fleet) -> list[str]:
+    return [f"{r.job.name}: {r.sentence}" for r in fleet.failed]
+
+
+def time_words(time: datetime | None) -> str:
+    """Without the time of day where it is not known, or midnight."""
+    if time is None:
+        return ""
+    return f"{time:%Y-%m-%d}" if (time.hour, time.minute, time.second) == (0, 0, 0) else f"{time:%Y-%m-%d %H:%M}"
+
+
+def span_words(results: list[JobResult]) -> str:
+    """First and last time; empty where none is known."""
+    known = sorted(r.time for r in results if r.time is not None)
+    return " to ".join(dict.fromkeys(time_words(t) for t in known[:1] + known[-1:]))
+
+
+def care_words(one: JobResult) -> str:
+    """What calls for a look into the job's report."""
+    parts = [_count(len(one.record.undetermined), "combination") + " undetermined"] if one.record.undetermined else []
+    parts += [_count(len(one.record.warnings), "warning")] if one.record.warnings else []
+    return ", ".join(parts)
+
+
+def drift_cell(drift: Drift) -> str:
+    if drift.changes:
+        return _listed(drift.sensors)
+    return "nothing" if drift.judged else ""
+
+
+def _listed(names: tuple[str, ...]) -> str:
+    return ", ".join(names)
+
+
+def _count(n: int, what: str) -> str:
+    return f"{n} {what}{'' if n == 1 else 's'}"

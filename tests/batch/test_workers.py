@@ -1,0 +1,50 @@
+"""Tasks on real workers: what becomes of those that raise, and of those that kill their worker."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from icalib.batch import Crew, Lost, run_all, write_whole
+from icalib.batch.workers import _answer
+from icalib.errors import CalibrationError
+from icalib.extras import load_distributed
+
+
+def test_a_task_that_kills_its_workers_is_given_up_and_takes_no_other_with_it():
+    """`eval` is work that any worker has."""
+    killer = "__import__('time').sleep(0.5) or __import__('os')._exit(1)"
+    found = dict(run_all(eval, [killer, "7", "int('x')", "8"], Crew(workers=1)))
+    assert (found.pop("7"), found.pop("8")) == (7, 8)
+    assert found == {
+        killer: Lost("its worker died again and again, 4 times at this task; give it more memory."),
+        "int('x')": Lost(
+            "its worker cannot do it (ValueError: invalid literal for int() with base 10: 'x'); "
+            "install the same icalib everywhere."
+        ),
+    }
+
+
+@pytest.mark.parametrize("error", [OSError("closed"), TimeoutError("late"), load_distributed().CancelledError("gone")])
+def test_an_answer_that_never_comes_is_a_scheduler_that_went_away(error: BaseException):
+    class Future:
+        def exception(self) -> None:
+            return None
+
+        def result(self) -> None:
+            raise error
+
+    with pytest.raises(CalibrationError, match="the Dask scheduler went away; what was finished is kept"):
+        _answer(load_distributed(), Future())
+
+
+def test_a_file_is_the_old_one_or_the_new_one(tmp_path: Path):
+    write_whole(tmp_path / "a", b"old")
+    write_whole(tmp_path / "a", b"new")
+    assert (tmp_path / "a").read_bytes() == b"new"
+    (tmp_path / "b").mkdir()
+    for place in (tmp_path / "b", tmp_path / "a" / "c", tmp_path / "absent" / "c"):
+        with pytest.raises(CalibrationError, match=r"cannot be written .*; choose another folder\."):
+            write_whole(place, b"new")
+    assert sorted(f.name for f in tmp_path.iterdir()) == ["a", "b"]
