@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from icalib.errors import EstimationError
 from icalib.first_guess.gyro import GyroRotation
 from icalib.first_guess.lidar_arm import against_motion, against_readings
 from icalib.first_guess.lidar_map import ScanPose, VoxelMap, insert, moved, sums
 from icalib.first_guess.lidar_motion import ImuMotion, Integrals
+from icalib.first_guess.lidar_odometry import lidar_path, scans_of
 from icalib.geometry import so3
 
 SCALE = 0.3
@@ -166,3 +168,31 @@ def test_rotations_that_follow_the_gyroscope(free_robot, path):
     off = np.rad2deg(so3.log_many(np.ascontiguousarray(true.transpose(0, 2, 1) @ found)))
     assert 0.8 < 3.0 * np.sqrt((off**2).mean()) < 1.2
     assert np.abs(off).max() < 1.5
+
+
+def turns_between(free_robot, path, first, last):
+    """Errors [rad] of the turns from scan to scan that `path` has of scans `first` to `last`, and how many of them are
+    ok."""
+    own, true = slice(first, last), free_robot.truth()
+    R = free_robot.pose_at(path.seconds[own] + true.offset)[0] @ true.rotation
+    found = path.rotation[own]
+    apart = (R[:-1].transpose(0, 2, 1) @ R[1:]).transpose(0, 2, 1) @ found[:-1].transpose(0, 2, 1) @ found[1:]
+    both = path.ok[own][:-1] & path.ok[own][1:]
+    return np.linalg.norm(so3.log_many(np.ascontiguousarray(apart)), axis=1)[both], both.sum()
+
+
+def test_a_path_that_lost_its_way_goes_on_in_another_map(free_robot):
+    """Scans are missing, and the LiDAR stands elsewhere after them, turned by half a turn."""
+    scans = scans_of(free_robot.streams[0])
+    turned = [replace(s, xyz=s.xyz * [-1.0, -1.0, 1.0]) for s in scans]
+    path = lidar_path("lidar0", [*scans[:50], *turned[74:]], whole=False)
+    errors, n = turns_between(free_robot, path, 0, 50)
+    assert n == 49 and errors.max() < 0.02
+    half = np.diag([-1.0, -1.0, 1.0])
+    after = replace(path, rotation=path.rotation @ half)
+    errors, n = turns_between(free_robot, after, 50, len(path.seconds))
+    assert n > 25 and errors.max() < 0.02
+    known = path.seconds[path.ok]
+    assert np.diff(known).max() > 1.0
+    with pytest.raises(EstimationError, match="only 50 of 103 scans fit"):
+        lidar_path("lidar0", [*scans[:50], *turned[74:]])

@@ -173,7 +173,7 @@ def _aligned(imu: ImuData, stream: LidarStream, held: Held) -> tuple[Alignment, 
     """Time offset, rotation and gyroscope bias; the LiDAR's path by the gyroscope's turns, as far as the IMU was
     running, and its rates."""
     scans = scans_of(stream)
-    first = align_path(imu, stream.name, _rates(stream.name, lidar_path(stream.name, scans)), held)
+    first = align_path(imu, stream.name, _rates(stream.name, lidar_path(stream.name, scans, whole=False)), held)
     path = _turned_path(imu, stream.name, scans, first)
     rates = _rates(stream.name, path)
     aligned = align_path(imu, stream.name, rates, held)

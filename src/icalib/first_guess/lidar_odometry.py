@@ -30,6 +30,7 @@ WIDE_ROUNDS = 4  # that look into voxels around
 SCALE = 0.5  # of an edge: of the weights in the first round
 LAST_SCALE, LAST_SCALE_TURNED = 0.2, 0.1
 POINT_SIGMA_M = 0.1  # of a point against what is expected of the motion: points of one plane err together
+MOST_LOST = 5  # scans in a row that do not fit the map, before there is another
 LEAST_NEAR = 0.3  # of a scan's points must lie on the map's planes
 FIRST_ROUNDS = 4  # to find how the LiDAR moved in its first scan, which makes the map
 KEEP, KEEP_TURNED = 0.85, 0.995  # of what a voxel holds, by the scan
@@ -78,15 +79,18 @@ def scans_of(stream: LidarStream) -> list[Scan]:
     return scans
 
 
-def lidar_path(name: str, scans: list[Scan], turning: Turning | None = None, moving: Moving | None = None) -> LidarPath:
-    """Of LiDAR `name`. `turning`: how it turned, where that is known, and `moving`: how it moved. Raises
-    EstimationError where scans do not fit one another."""
+def lidar_path(
+    name: str, scans: list[Scan], turning: Turning | None = None, moving: Moving | None = None, whole: bool = True
+) -> LidarPath:
+    """Of LiDAR `name`. `turning`: how it turned, where that is known, and `moving`: how it moved. Unless it is to be
+    `whole`, a path that lost its way goes on in another map: LONGEST_STEP_S lie between what is ok in one and in the
+    next. Raises EstimationError where scans do not fit one another."""
     seconds = np.array([s.middle for s in scans])
     known = _Known.of(seconds, turning, moving)
     if turning is not None:
         scans = [_turned(s, turning) for s in scans]
     reach = float(np.median([np.median(np.linalg.norm(s.xyz, axis=1)) for s in scans]))
-    poses, ok = _follow(scans, known, float(np.clip(reach / VOXELS_IN_REACH, *EDGES_M)))
+    poses, ok = _follow(scans, known, float(np.clip(reach / VOXELS_IN_REACH, *EDGES_M)), whole)
     if ok.mean() < 0.5:
         raise EstimationError(
             f"{name}: only {ok.sum()} of {len(scans)} scans fit the surfaces that others show; there may be too "
@@ -144,30 +148,42 @@ class _Known:
         return cls(back @ R, None if way is None else np.einsum("nij,nj->ni", back, way))
 
 
-def _follow(scans: list[Scan], known: _Known, edge_m: float) -> tuple[list[ScanPose], np.ndarray]:
-    ok = np.ones(len(scans), dtype=bool)
+def _follow(scans: list[Scan], known: _Known, edge_m: float, whole: bool) -> tuple[list[ScanPose], np.ndarray]:
+    """Poses, and whether each fits its map; see `lidar_path`."""
+    fits = np.ones(len(scans), dtype=bool)
 
     def register(k: int, before: ScanPose, scale: float) -> ScanPose:
         step = scans[k].middle - scans[k - 1].middle
         turned, way = (None if x is None else x[k] for x in (known.turned, known.way))
         expected = _Expected(before, min(step, LONGEST_STEP_S), turned, way)
-        pose, ok[k] = _register(voxels, scans[k], expected, scale)
+        pose, fits[k] = _register(voxels, scans[k], expected, scale)
+        return pose
+
+    def begin(k: int) -> ScanPose:
+        """A map of one scan, moving as the next one shows."""
+        pose = still
+        for _ in range(FIRST_ROUNDS):
+            voxels.clear()
+            insert(voxels, pose, scans[k].xyz, scans[k].tau, k, 1.0)
+            after = register(k + 1, pose, LAST_SCALE)
+            pose = still._replace(rate=after.rate, velocity=after.velocity)
         return pose
 
     last, keep = (LAST_SCALE, KEEP) if known.turned is None else (LAST_SCALE_TURNED, KEEP_TURNED)
     still = ScanPose(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
-    voxels, poses = VoxelMap.empty(edge_m, CAPACITY), [still]
-    for _ in range(FIRST_ROUNDS):
-        voxels.clear()
-        insert(voxels, poses[0], scans[0].xyz, scans[0].tau, 0, 1.0)
-        after = register(1, poses[0], LAST_SCALE)
-        poses[0] = still._replace(rate=after.rate, velocity=after.velocity)
+    voxels = VoxelMap.empty(edge_m, CAPACITY)
+    poses, lost, apart = [begin(0)], 0, np.zeros(len(scans), dtype=bool)
     for k in range(1, len(scans)):
         pose = register(k, poses[-1], last)
+        lost = 0 if fits[k] else lost + 1
+        if lost == MOST_LOST and not whole and k + 1 < len(scans):
+            seconds = np.array([s.middle for s in scans])
+            apart |= (seconds >= scans[k].middle) & (seconds - scans[k - lost].middle < LONGEST_STEP_S)
+            pose, lost = begin(k), 0
         poses.append(pose)
-        if ok[k]:
+        if fits[k]:
             insert(voxels, pose, scans[k].xyz, scans[k].tau, k, keep)
-    return poses, ok
+    return poses, fits & ~apart
 
 
 @dataclass(frozen=True)

@@ -34,8 +34,12 @@ def rows(calibration: Calibration) -> list[Row]:
 
 
 def shown_groups(calibration: Calibration) -> list[ParameterGroup]:
-    """The groups without those that are fixed at zero, which say nothing."""
-    return [g for g in calibration.groups if g.columns is not None or g.value.any()]
+    """The groups without those that are fixed at zero, and where the body is in itself, which say nothing."""
+    return [
+        g
+        for g in calibration.groups
+        if g.columns is not None or (g.value.any() and not (g.sensor == calibration.body and g.name == "rotation"))
+    ]
 
 
 def rpy_deg(R: np.ndarray) -> np.ndarray:
