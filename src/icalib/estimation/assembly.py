@@ -227,7 +227,7 @@ def resample(state: State, nodes: np.ndarray, inputs: Inputs) -> State:
     """The same motion at other nodes, by integrating the IMU from the nearest old one; without an IMU nodes stay."""
     if inputs.imu is None:
         return state
-    near = assign_nodes("inertial", state.seconds, nodes)
+    near = assign_nodes("inertial", state.seconds, nodes, inputs.imu.forwards)
     poses = poses_at("inertial", nodes, near, state, inputs.imu, inputs.rig.gravity, False)
     starts = first_nodes(inputs.imu, nodes)
     return State(nodes, poses.rotation, poses.position, poses.velocity, state.bias[near].copy(), state.values, starts)
@@ -285,7 +285,7 @@ def assemble(
         zip(rig.cameras, inputs.measurements.cameras, times, noise, keep, strict=True)
     ):
         own = [m.images[i] for m in inputs.motions]
-        node = _nodes_of(scheme, state, t, own)
+        node = _nodes_of(scheme, state, t, own, inputs.imu is not None and inputs.imu.forwards)
         seen = is_seen(inputs, t, state.seconds[node])
         factor = CornerFactor(
             stream, camera_model(camera.model), inputs.imu, rig.gravity, scheme, stream.seconds, node,
@@ -328,10 +328,10 @@ def _features(inputs: Inputs, state: State, cameras: tuple[CornerFactor, ...], f
     return FeatureFactor.build(cameras, streams, following.sigma, tuple(keep), loss, state, cuts, seams)
 
 
-def _nodes_of(scheme: Scheme, state: State, times: np.ndarray, images: list[slice]) -> np.ndarray:
+def _nodes_of(scheme: Scheme, state: State, times: np.ndarray, images: list[slice], forwards: bool) -> np.ndarray:
     """(n,) node of each image at `times`, one of its own recording; `images` of each recording."""
     pairs = zip(images, state.recordings, strict=True)
-    return np.concatenate([assign_nodes(scheme, state.seconds[k], times[i]) + k.start for i, k in pairs])
+    return np.concatenate([assign_nodes(scheme, state.seconds[k], times[i], forwards) + k.start for i, k in pairs])
 
 
 def _chain(inputs: Inputs, state: State) -> ChainFactor:

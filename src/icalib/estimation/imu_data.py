@@ -15,6 +15,7 @@ GAP = 3.0  # an interval longer than this many median periods is a gap
 # Within a gap the motion goes on unseen: what is not known of rate and force, their spread over the recording,
 # is taken to stay correlated for this long.
 MOTION_CORRELATION_S = 0.1
+DENSE_S = 0.025  # with 20 Hz, jumping rates moved a time offset by a whole step; with 100 Hz, steady ones by 0.6 ms
 WITHIN = 1e-4  # keeps the covariance of a stretch without a stamp in it definite; nothing else
 
 
@@ -25,6 +26,8 @@ class ImuData:
     variance (N - 1, 3): squared noise densities of each interval: gyroscope, accelerometer, and how the force departs
     from its mean within the interval; walk (2,): squared densities of the bias walks. gaps: (start, end) of intervals
     without readings. seams: (end, begin) of recordings that were joined; nothing is known of what lies between.
+    forwards: the biases of a node hold until the next one, and what is between is carried forwards only; they are what
+    is assumed of the motion, and change a lot from node to node.
     """
 
     name: str
@@ -35,9 +38,10 @@ class ImuData:
     walk: np.ndarray
     gaps: tuple[tuple[float, float], ...]
     seams: tuple[tuple[float, float], ...] = ()
+    forwards: bool = False
 
     @classmethod
-    def build(cls, stream: ImuStream, noise: ImuNoise) -> ImuData:
+    def build(cls, stream: ImuStream, noise: ImuNoise, forwards: bool = False) -> ImuData:
         t = stream.seconds
         dt = np.diff(t)
         variance = np.tile([noise.gyro**2, noise.accel**2, WITHIN * noise.accel**2], (len(dt), 1))
@@ -52,6 +56,7 @@ class ImuData:
             variance,
             np.array([noise.gyro_walk**2, noise.accel_walk**2]),
             tuple(zip(t[:-1][gap], t[1:][gap], strict=True)),
+            forwards=forwards,
         )
 
     def interval(self, seconds: np.ndarray) -> np.ndarray:
@@ -63,7 +68,13 @@ def imu_data(rig: Rig, measurements: Measurements) -> ImuData | None:
     """The rig's IMU, or None where it has none."""
     if rig.imu is None or measurements.imu is None:
         return None
-    return ImuData.build(measurements.imu, rig.imu.noise)
+    return ImuData.build(measurements.imu, rig.imu.noise, rig.assumes_motion and _is_dense(measurements))
+
+
+def _is_dense(measurements: Measurements) -> bool:
+    """Whether the body's poses, where there is no IMU, come so fast that rates may jump at nodes."""
+    body = (*measurements.cameras, *measurements.poses)[0]
+    return float(np.median(np.diff(body.seconds))) <= DENSE_S
 
 
 def joined_imu_data(rig: Rig, parts: Sequence[Part], joined: Measurements) -> ImuData | None:
@@ -78,4 +89,5 @@ def joined_imu_data(rig: Rig, parts: Sequence[Part], joined: Measurements) -> Im
     last = np.cumsum([len(imu.seconds) for _, imu in found])[:-1] - 1
     seams = tuple((float(seconds[i]), float(seconds[i + 1])) for i in last)
     gyro, accel = np.ascontiguousarray(joined.imu.gyro), np.ascontiguousarray(joined.imu.accel)
-    return ImuData(joined.imu.name, seconds, gyro, accel, variance, found[0][1].walk, gaps, seams)
+    one = found[0][1]
+    return ImuData(joined.imu.name, seconds, gyro, accel, variance, one.walk, gaps, seams, one.forwards)

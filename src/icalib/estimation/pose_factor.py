@@ -75,7 +75,7 @@ class AbsolutePoseFactor:
         """Of the poses that lie near nodes; those in gaps of the IMU that are not bridged are left out."""
         state = motion.state
         times = stream.seconds + float(state.values[stream.name, "time_offset"][0])
-        node = assign_nodes("inertial", state.seconds, times)
+        node = assign_nodes("inertial", state.seconds, times, motion.imu.forwards)
         near = np.abs(times - state.seconds[node]) <= NEAR_NODE_S
         k = np.flatnonzero(near & usable(motion.imu, times, motion.max_gap_s))
         k = k[np.argsort(node[k], kind="stable")]

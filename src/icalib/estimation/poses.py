@@ -57,10 +57,11 @@ class Velocities(NamedTuple):
         return cls(np.empty((n, 3)), np.zeros((n, 3, NODE)), np.zeros((n, 3, n_imu)))
 
 
-def assign_nodes(scheme: Scheme, nodes: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """(n,) node of each time: the nearest one, or for `pose` the one before it."""
+def assign_nodes(scheme: Scheme, nodes: np.ndarray, times: np.ndarray, forwards: bool = False) -> np.ndarray:
+    """(n,) node of each time: the nearest one, or for `pose`, and where motion is carried `forwards` only (see
+    `ImuData`), the one before it."""
     after = np.clip(np.searchsorted(nodes, times, side="right"), 1, len(nodes) - 1)
-    if scheme == "pose":
+    if scheme == "pose" or forwards:
         return after - 1
     return after - (times - nodes[after - 1] < nodes[after] - times)
 

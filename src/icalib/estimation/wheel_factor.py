@@ -122,7 +122,8 @@ class IncrementFactor:
         n_measured = 1 if kind == "steered" else 2
         measured[:, :n_measured] = whole[:, :n_measured]
         mean = whole[:, 1:] / dt[:, None]
-        instants = quadrature(seconds, found)
+        change = state.seconds[found.node + 1] - _offset(name, state) if imu.forwards else None
+        instants = quadrature(seconds, found, change)
         return cls(name, kind, found, measured, mean, whitening, instants, imu, gravity, noise, layout)
 
     def with_imu(self, imu: ImuData) -> IncrementFactor:

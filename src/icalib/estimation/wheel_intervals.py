@@ -29,10 +29,11 @@ def choose_intervals(imu: ImuData, nodes: np.ndarray, starts: tuple[int, ...], t
 
     Where nodes are denser than stamps, neighbours may share a stamp; the stretch to the next stamp then hangs on the
     two nodes about its middle. None leaves the IMU's recording, touches a gap in it, or goes from one of the recordings
-    that begin at the nodes `starts` to another.
+    that begin at the nodes `starts` to another. Where motion is carried forwards only (see `ImuData`), the stamp is the
+    first after the node.
     """
     after = np.clip(np.searchsorted(times, nodes), 1, len(times) - 1)
-    near = after - (nodes - times[after - 1] < times[after] - nodes)
+    near = after if imu.forwards else after - (nodes - times[after - 1] < times[after] - nodes)
     a, b = times[near[:-1]], times[near[1:]]
     good = (a < b) & (b - a <= LONGEST_S) & (a >= imu.seconds[0]) & (b <= imu.seconds[-1])
     for start, end in (*imu.gaps, *imu.seams):
@@ -67,9 +68,9 @@ class Instants(NamedTuple):
     weight: np.ndarray
 
 
-def quadrature(seconds: np.ndarray, intervals: WheelIntervals) -> Instants:
-    """Gauss's two points in panels of at most PANEL_S, the first half of each interval seen from its first node, the
-    second half from the other; seconds (N,): the stamps."""
+def quadrature(seconds: np.ndarray, intervals: WheelIntervals, change: np.ndarray | None = None) -> Instants:
+    """Gauss's two points in panels of at most PANEL_S, those before `change` (n,) s of each interval, by default its
+    middle, seen from its first node, the others from the other; seconds (N,): the stamps."""
     begin = seconds[intervals.first]
     length = seconds[intervals.last] - begin
     panels = np.maximum(np.ceil(0.5 * length / PANEL_S - 1e-6), 1.0).astype(np.int64)  # of a half
@@ -80,7 +81,9 @@ def quadrature(seconds: np.ndarray, intervals: WheelIntervals) -> Instants:
     panel, second = at // 2, at % 2
     times = begin[interval] + (panel + 0.5 + (second - 0.5) / np.sqrt(3.0)) * width
     weight = 0.5 * width
-    node = intervals.node[interval] + (panel >= panels[interval])
+    change = begin + 0.5 * length if change is None else change
+    node = intervals.node[interval] + (times > change[interval])
     times[start[:-1]], times[start[1:] - 1] = begin, seconds[intervals.last]
+    node[start[:-1]], node[start[1:] - 1] = intervals.node, intervals.node + 1
     weight[start[:-1]] = weight[start[1:] - 1] = 0.0
     return Instants(start, times, node, weight)

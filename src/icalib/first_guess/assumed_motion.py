@@ -62,6 +62,8 @@ def start_without_imu(rig: Rig, recordings: Sequence[Measurements]) -> tuple[Inp
     body = _with_assumption(rig, paths)
     inputs = replace(inputs_for(body, _readings(recordings, paths, felt=False)), asked=rig)
     felt = inputs_for(body, _readings(recordings, paths, felt=True))
+    assert felt.imu is not None
+    felt = replace(felt, imu=replace(felt.imu, forwards=False))
     values = start_values(inputs, cameras | _identity(inputs))
     nodes = nodes_for(inputs, host_times(inputs, values))
     starts = first_nodes(inputs.imu, nodes)
