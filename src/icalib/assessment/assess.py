@@ -6,13 +6,13 @@ import dataclasses
 
 import numpy as np
 
+from icalib.assessment.notes import notes
 from icalib.assessment.robot import (
     lidar_residuals,
     lidar_warnings,
     planes,
     pose_residuals,
     pose_warnings,
-    robot_notes,
     robot_warnings,
     wheel_residuals,
 )
@@ -31,14 +31,10 @@ from icalib.calibration import (
 from icalib.estimation.arrowhead import restricted_inverse
 from icalib.estimation.assembly import Inputs, image_times, origin_difference
 from icalib.estimation.board import SHAPE_LABELS
-from icalib.estimation.bodies import words_on_left_out
-from icalib.estimation.corner_noise import NoiseModel
 from icalib.estimation.determination import Determined
 from icalib.estimation.estimate import Estimate
 from icalib.estimation.evidence import Fit, fits, place_covariances, split_covariance
-from icalib.estimation.imu_data import ImuData
 from icalib.estimation.imu_model import LABELS as IMU_LABELS
-from icalib.estimation.nodes import usable
 from icalib.estimation.pose_factor import FRAME
 from icalib.estimation.problem import Problem
 from icalib.estimation.solver import Visit
@@ -75,8 +71,7 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
     seen = observe(determined, names, [w.name for w in inputs.rig.wheels])
     empirical = _empirical_variance(inputs, found, np.diag(seen.covariance))
     groups = _groups(inputs, found, seen, empirical)
-    assumed = {inputs.rig.imu.name} if inputs.rig.imu is not None and inputs.rig.assumes_motion else set()
-    judged = [_sensor_fit(f, found) for f in fits(problem, outcome) if f.sensor not in assumed]
+    judged = [_sensor_fit(f, found) for f in fits(problem, outcome) if not _is_assumed(inputs, f.sensor)]
     timeline = Timeline.of(inputs.parts, image_times(inputs, outcome.state.values))
     trajectory, poses = _trajectory(inputs, outcome.state, timeline), pose_residuals(inputs, found, timeline)
     return Calibration(
@@ -92,7 +87,7 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
         converged=outcome.converged,
         status=outcome.status,
         warnings=tuple(_warnings(inputs, found, groups, judged, empirical, poses)),
-        notes=tuple(_notes(inputs, found, timeline)),
+        notes=tuple(notes(inputs, found, timeline)),
         rig=rig_to_dict(inputs.asked or inputs.rig),
         settings=dataclasses.asdict(inputs.rig.settings),
         rates=_rates(inputs),
@@ -107,16 +102,15 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
 
 def _rates(inputs: Inputs) -> dict[str, float]:
     """Hz of each sensor, from the median step of its stamps."""
-    imu = inputs.measurements.imu
     m = inputs.measurements
-    streams = (
-        *(() if imu is None or inputs.rig.assumes_motion else (imu,)),
-        *m.cameras,
-        *m.lidars,
-        *m.wheels,
-        *m.poses,
-    )
-    return {s.name: float(1.0 / np.median(np.diff(s.seconds))) for s in streams if len(s.stamps_ns) > 1}
+    streams = (*(() if m.imu is None else (m.imu,)), *m.cameras, *m.lidars, *m.wheels, *m.poses)
+    own = (s for s in streams if len(s.stamps_ns) > 1 and not _is_assumed(inputs, s.name))
+    return {s.name: float(1.0 / np.median(np.diff(s.seconds))) for s in own}
+
+
+def _is_assumed(inputs: Inputs, name: str) -> bool:
+    """Whether it is no sensor, but what is assumed in the IMU's place."""
+    return inputs.rig.assumes_motion and name == inputs.rig.body
 
 
 def _labels(inputs: Inputs, block: Block) -> tuple[str, ...]:
@@ -172,9 +166,7 @@ def _groups(
     overall = float(np.sqrt(np.mean(_calibration_only(inputs, ratio) ** 2))) if len(ratio) else 1.0
     groups = []
     for block in inputs.layout.blocks:
-        if block.name in NUISANCE or _unheard_of(inputs, block):
-            continue
-        if inputs.rig.assumes_motion and block.sensor == inputs.rig.body:
+        if block.name in NUISANCE or _unheard_of(inputs, block) or _is_assumed(inputs, block.sensor):
             continue
         if block.start is None and block.name in ("shape", "bloom", "tilt"):
             continue
@@ -338,66 +330,3 @@ def _warnings(
         yield (
             "the recording is too short to be split (or splits are off): standard deviations are formal, and too small."
         )
-
-
-def _notes(inputs: Inputs, found: Estimate, timeline: Timeline):
-    for k, span in enumerate(timeline.spans if len(timeline.spans) > 1 else (), 1):
-        number = f"recording {k}"
-        name = number if span.name == number else f"{number}, {span.name}"
-        yield f"{name}: {span.end - span.start:.1f} s from {span.origin_ns} ns on."
-    yield from inputs.measurements.notes
-    if words := words_on_left_out(inputs.bodies):
-        yield words
-    if inputs.imu is not None:
-        yield from _imu_notes(inputs, inputs.imu, found, timeline)
-    for camera, factor, model in zip(inputs.rig.cameras, found.problem.cameras, found.noise, strict=True):
-        if len(factor.stream.uv):
-            yield f"{camera.name}: {_noise_words(model)}."
-    yield from _feature_notes(found)
-    yield from robot_notes(inputs, found)
-
-
-def _feature_notes(found: Estimate):
-    factor, out = found.problem.features, found.outcome.residuals.features
-    if factor is None or out is None:
-        return
-    all_of_them = len(np.unique(np.concatenate([s.feature for s in factor.streams])))
-    yield (
-        f"{all_of_them} points of the scene were followed, in {factor.tracks.count} tracks that show where they are; "
-        "tracks that do not, for lack of parallax, are left out."
-    )
-    for camera, sigma, root, stream in zip(factor.cameras, factor.sigma, out.root, factor.streams, strict=True):
-        share = f"{int((root > 0.0).sum())} of {len(stream.uv)}"
-        yield f"{camera.name}: track noise {sigma:.3f} px; {share} observations of tracks are in use."
-
-
-def _imu_notes(inputs: Inputs, imu: ImuData, found: Estimate, timeline: Timeline):
-    assert inputs.rig.imu is not None
-    n, most = inputs.rig.imu.noise, inputs.rig.settings.max_gap_s
-    if inputs.rig.assumes_motion:
-        yield (
-            f"there is no IMU: the motion is assumed to be smooth, in a second its rate to change by {n.gyro_walk:.2g} "
-            f"rad/s and its acceleration by {n.accel_walk:.2g} m/s^2 (standard deviations of each axis), as poses show."
-        )
-        return
-    yield (
-        f"IMU noise ({n.source}): gyro {n.gyro:.3g} rad/s/sqrt(Hz), walk {n.gyro_walk:.3g}; accelerometer "
-        f"{n.accel:.3g} m/s^2/sqrt(Hz), walk {n.accel_walk:.3g}."
-    )
-    for a, b in imu.gaps:
-        how = "bridged" if b - a <= most else "left out, with the images in it"
-        yield f"{imu.name} has a gap of {b - a:.3f} s at {timeline.words(a)}, {how}."
-    for camera in found.problem.cameras:
-        t = camera.times + found.outcome.state.values[camera.name, "time_offset"][0]
-        left_out = int((~usable(imu, t, most)).sum())
-        if left_out:
-            yield f"{left_out} images of {camera.name} are left out: {imu.name} was not running then."
-
-
-def _noise_words(model: NoiseModel) -> str:
-    words = f"corner noise {model.base:.3f} px"
-    if model.exposure > 0.0:
-        words += f", {1e3 * model.exposure:.2f} px more (in squares) per 1000 px/s of image speed"
-    if model.tau:
-        words += f", {' and '.join(f'{t:.3f}' for t in model.tau)} px common to an image"
-    return words

@@ -2,6 +2,18 @@
 
 from icalib.batch.files import replacing, write_whole
 from icalib.batch.program import program
+from icalib.batch.records import check_worker, plain_record, record_json, sentence_on
 from icalib.batch.workers import Crew, Lost, run_all
 
-__all__ = ["Crew", "Lost", "program", "replacing", "run_all", "write_whole"]
+__all__ = [
+    "Crew",
+    "Lost",
+    "check_worker",
+    "plain_record",
+    "program",
+    "record_json",
+    "replacing",
+    "run_all",
+    "sentence_on",
+    "write_whole",
+]

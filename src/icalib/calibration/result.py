@@ -156,6 +156,11 @@ class Calibration:
     planes: tuple[Plane, ...] = ()  # that LiDARs see
     pose_residuals: tuple[PoseResiduals, ...] = ()
 
+    @property
+    def failure(self) -> str:
+        """A sentence where the solver did not converge, else empty."""
+        return "" if self.converged else f"the solver did not converge: {self.status}"
+
     def recording_of(self, seconds: np.ndarray) -> np.ndarray:
         """(n,) which of `recordings` each instant of this result lies in."""
         middles = [0.5 * (a.end + b.start) for a, b in pairwise(self.recordings)]

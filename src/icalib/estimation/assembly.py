@@ -212,8 +212,8 @@ def _ends_of_wheel_poses(inputs: Inputs, values: dict[Key, np.ndarray]) -> np.nd
         close = np.median(np.diff(stream.seconds)) <= (1.0 + SLACK) * settings.node_spacing_s
         if isinstance(stream, WheelPoses) and offset is not None and close:
             times = stream.seconds + offset[0]
-            others = [times[:0], *image_times(inputs, values)]
-            return np.concatenate([times, *(t[(t < times[0]) | (t > times[-1])] for t in others)])
+            images = image_times(inputs, values)
+            return np.concatenate([times, *(t[(t < times[0]) | (t > times[-1])] for t in images)])
     return None
 
 

@@ -164,7 +164,7 @@ def _guess_sigma(inputs: Inputs) -> np.ndarray:
     sigma, sensors = np.zeros(inputs.layout.size), {s.name: s for s in inputs.sensors}
     for b in inputs.layout.free:
         sigma[b.columns] = OTHER_SIGMA if b.size == N_INTRINSICS else GUESS_SIGMA[b.name]
-        if b.name == "translation" and b.sensor in sensors and getattr(sensors[b.sensor], b.name).value is None:
+        if b.name == "translation" and b.sensor in sensors and sensors[b.sensor].translation.value is None:
             sigma[b.columns] = FROM_NOTHING_M
     for prior in given_priors(inputs):
         sigma[prior.block.columns] = prior.sigma

@@ -21,7 +21,8 @@ from icalib.estimation.board import board_in
 from icalib.estimation.nodes import first_nodes
 from icalib.estimation.pose_factor import FRAME, frame_of
 from icalib.estimation.state import Key, State
-from icalib.first_guess.poses import pose_values
+from icalib.first_guess.lidar_rounds import given
+from icalib.first_guess.poses import NAMES, pose_values
 from icalib.first_guess.robot import wheel_values
 from icalib.first_guess.several import initial_guesses
 from icalib.first_guess.smooth_path import FEWEST, SmoothPath, smooth_path
@@ -29,7 +30,7 @@ from icalib.geometry.targets.base import BOARD
 from icalib.measurements import ImuStream, Measurements
 from icalib.rig import ImuNoise, ImuSensor, Rig, fixed
 
-NAME = "assumed motion"  # no sensor is called so
+ASSUMPTION = "assumed motion"  # no sensor is called so
 STEP_S = 0.01  # between readings
 WHITE_STEP_S = 5e-3  # white noise is what the walks make of so long a step: keeps covariances regular
 LAG_S = 0.1  # over which the change of rate and acceleration tells their densities
@@ -102,9 +103,9 @@ def _with_assumption(rig: Rig, paths: Sequence[SmoothPath]) -> Rig:
         np.sqrt(np.mean(np.concatenate([_changes(p, what) for p in paths]) ** 2) / LAG_S) + LEAST_DENSITY
         for what in ("rate", "acceleration")
     )
-    noise = ImuNoise(WHITE_STEP_S * turning, turning, WHITE_STEP_S * jerking, jerking, NAME)
+    noise = ImuNoise(WHITE_STEP_S * turning, turning, WHITE_STEP_S * jerking, jerking, ASSUMPTION)
     here = {"rotation": fixed(np.eye(3)), "translation": fixed(np.zeros(3)), "time_offset": fixed(np.zeros(1))}
-    imu = ImuSensor(NAME, "", noise, assumed=True)
+    imu = ImuSensor(ASSUMPTION, "", noise, assumed=True)
     if rig.cameras:
         return replace(rig, imu=imu, gravity=0.0, cameras=(replace(rig.cameras[0], **here), *rig.cameras[1:]))
     return replace(rig, imu=imu, gravity=0.0, poses=(replace(rig.poses[0], **here), *rig.poses[1:]))
@@ -125,7 +126,7 @@ def _readings(recordings: Sequence[Measurements], paths: Sequence[SmoothPath], f
         used = path.near if felt else np.ones(len(stamps), dtype=bool)
         used[:1] = True  # its clock begins where the body's does
         gyro, accel = (x[used] * float(felt) for x in (path.rate, path.acceleration))
-        out.append(replace(m, imu=ImuStream(NAME, stamps[used], gyro, accel)))
+        out.append(replace(m, imu=ImuStream(ASSUMPTION, stamps[used], gyro, accel)))
     return out
 
 
@@ -133,11 +134,7 @@ def _identity(inputs: Inputs) -> dict[Key, np.ndarray]:
     """The body is where the assumed IMU is, and its target or its frame is the world."""
     rig, n = inputs.rig, len(inputs.parts)
     sensor = (*rig.cameras, *rig.poses)[0]
-    out: dict[Key, np.ndarray] = {
-        (sensor.name, "rotation"): np.eye(3),
-        (sensor.name, "translation"): np.zeros(3),
-        (sensor.name, "time_offset"): np.zeros(1),
-    }
+    out = given(inputs, sensor, NAMES)
     if rig.cameras:
         return out | {(board_in(BOARD, k), "tilt"): np.eye(3) for k in range(n)}
     for k in range(n):

@@ -172,14 +172,15 @@ def _follow(scans: list[Scan], known: _Known, edge_m: float, whole: bool) -> tup
     last, keep = (LAST_SCALE, KEEP) if known.turned is None else (LAST_SCALE_TURNED, KEEP_TURNED)
     still = ScanPose(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
     voxels = VoxelMap.empty(edge_m, CAPACITY)
-    poses, lost, apart = [begin(0)], 0, np.zeros(len(scans), dtype=bool)
+    poses, lost = [begin(0)], 0
+    apart, again = np.zeros(len(scans), dtype=bool), -np.inf
     for k in range(1, len(scans)):
         pose = register(k, poses[-1], last)
         lost = 0 if fits[k] else lost + 1
         if lost == MOST_LOST and not whole and k + 1 < len(scans):
-            seconds = np.array([s.middle for s in scans])
-            apart |= (seconds >= scans[k].middle) & (seconds - scans[k - lost].middle < LONGEST_STEP_S)
+            again = scans[k - lost].middle + LONGEST_STEP_S
             pose, lost = begin(k), 0
+        apart[k] = scans[k].middle < again
         poses.append(pose)
         if fits[k]:
             insert(voxels, pose, scans[k].xyz, scans[k].tau, k, keep)

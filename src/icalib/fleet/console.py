@@ -37,10 +37,8 @@ def print_fleet(fleet: Fleet, folder: Path) -> None:
 def table(fleet: Fleet) -> Table:
     """One row for each robot."""
     out = Table(title="Fleet", title_justify="left", box=SIMPLE_HEAD, padding=(0, 1))
-    for header in ("robot", "jobs", "failed", "time", "changed"):
-        out.add_column(header, justify="right" if header in ("jobs", "failed") else "left")
-    for drift in fleet.drifts:
-        own = [r for r in fleet.results if r.job.robot == drift.robot]
-        failed = sum(r.failed for r in own)
-        out.add_row(drift.robot, str(len(own)), str(failed), words.span_words(own), words.drift_cell(drift))
+    for header in words.ROBOT_HEADERS:
+        out.add_column(header, justify="right" if header in words.ROBOT_HEADERS[1:3] else "left")
+    for row in words.robot_rows(fleet):
+        out.add_row(*map(str, row))
     return out

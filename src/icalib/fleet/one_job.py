@@ -5,8 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, replace
 
-from icalib.batch import program
-from icalib.errors import CalibrationError
+from icalib.batch import program, sentence_on
 from icalib.fleet.inputs import Inputs
 from icalib.fleet.jobs import Job
 from icalib.fleet.record import Record
@@ -36,9 +35,6 @@ def run(task: Task) -> Outcome:
     try:
         result = calibrate(task.job.rig, task.job.recordings)
         files = output_files(result)
-    except CalibrationError as caught:
-        return Outcome(Record(task.job.name, str(caught), time.perf_counter() - started, inputs), {})
-    except Exception as caught:  # a fault of the program must not end the work on a hundred robots, nor be lost in it
-        sentence = f"the program failed ({type(caught).__name__}: {caught}); this is a fault of icalib."
-        return Outcome(Record(task.job.name, sentence, time.perf_counter() - started, inputs), {})
+    except Exception as caught:
+        return Outcome(Record(task.job.name, sentence_on(caught), time.perf_counter() - started, inputs), {})
     return Outcome(Record.of(task.job.name, result, time.perf_counter() - started, inputs), files)

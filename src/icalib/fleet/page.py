@@ -52,13 +52,8 @@ def _aside(count: int) -> Html:
 
 
 def _robots(fleet: Fleet) -> Html:
-    body = []
-    for drift in fleet.drifts:
-        own = [r for r in fleet.results if r.job.robot == drift.robot]
-        failed = sum(r.failed for r in own)
-        body.append((drift.robot, len(own), failed or "", words.span_words(own), words.drift_cell(drift)))
-    headers = ("robot", "jobs", "failed", "time", "changed")
-    return Html(element("h3", "Robots") + table(headers, body, headers[1:3]))
+    body = [(robot, jobs, failed or "", *rest) for robot, jobs, failed, *rest in words.robot_rows(fleet)]
+    return Html(element("h3", "Robots") + table(words.ROBOT_HEADERS, body, words.ROBOT_HEADERS[1:3]))
 
 
 def _over_time(fleet: Fleet) -> tuple[dict[str, Figure], Html]:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from icalib.batch import plain_record, record_json
 from icalib.calibration import Calibration, ParameterGroup
 from icalib.fleet.inputs import Inputs
 from icalib.report.quantities import shown_groups
@@ -50,13 +50,12 @@ class Record:
     @classmethod
     def of(cls, name: str, result: Calibration, seconds: float, inputs: Inputs) -> Record:
         """Of a calibration that reached a result, whether it converged or not."""
-        failure = "" if result.converged else f"the solver did not converge: {result.status}"
         stamp = min((r.origin_ns for r in result.recordings), default=0)
         low, high = WALL_CLOCK_NS
         blocks = tuple(_block(g) for g in shown_groups(result) if g.sensor in result.rig["sensors"])
         known = stamp if low <= stamp < high else None
         return cls(
-            name, failure, seconds, inputs, result.status, known, result.undetermined, result.warnings, blocks
+            name, result.failure, seconds, inputs, result.status, known, result.undetermined, result.warnings, blocks
         )  # fmt: skip
 
 
@@ -66,14 +65,12 @@ def _block(g: ParameterGroup) -> Block:
 
 def to_json(record: Record) -> bytes:
     """The record as JSON, numbers in full."""
-    return json.dumps({"format": FORMAT} | asdict(record), default=lambda array: array.tolist()).encode()
+    return record_json(record, FORMAT)
 
 
 def from_json(text: bytes) -> Record:
     """The record that `to_json` was given. Raises ValueError, KeyError or TypeError where `text` is something else."""
-    plain: dict[str, Any] = json.loads(text)
-    if plain.pop("format") != FORMAT:
-        raise ValueError("another format")
+    plain = plain_record(text, FORMAT)
     inputs = plain["inputs"]
     plain["inputs"] = Inputs(inputs["rig"], tuple(inputs["recordings"]), inputs["program"])
     for name in ("undetermined", "warnings"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from icalib.batch import program
+from icalib.batch import check_worker, program
 from icalib.calibration import Calibration, load_calibration
 from icalib.errors import CalibrationError
 from icalib.fleet.inputs import Inputs
@@ -48,10 +48,7 @@ class Store:
     def add(self, outcome: Outcome) -> None:
         """Raises CalibrationError where the worker ran another icalib, or the folder cannot be written."""
         inputs = outcome.record.inputs
-        if inputs is None or inputs.program != program():
-            raise CalibrationError(
-                "a worker of the cluster runs another version of icalib than this one; install the same everywhere."
-            )
+        check_worker(inputs.program if inputs is not None else "", program())
         write_files(self.place(outcome.record.name), outcome.files | {RECORD: to_json(outcome.record)})
 
     def load(self, name: str) -> Calibration:

@@ -75,6 +75,18 @@ def care_words(one: JobResult) -> str:
     return ", ".join(parts)
 
 
+ROBOT_HEADERS = "robot", "jobs", "failed", "time", "changed"
+
+
+def robot_rows(fleet: Fleet) -> list[tuple[str, int, int, str, str]]:
+    """A row for each robot, cells as in ROBOT_HEADERS."""
+    rows = []
+    for drift in fleet.drifts:
+        own = [r for r in fleet.results if r.job.robot == drift.robot]
+        rows.append((drift.robot, len(own), sum(r.failed for r in own), span_words(own), drift_cell(drift)))
+    return rows
+
+
 def drift_cell(drift: Drift) -> str:
     if drift.changes:
         return _listed(drift.sensors)

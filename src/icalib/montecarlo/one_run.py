@@ -8,9 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from icalib.batch import program
+from icalib.batch import program, sentence_on
 from icalib.calibration import Calibration, Visited
-from icalib.errors import CalibrationError
 from icalib.montecarlo.record import Block, Record, Size, Waypoint
 from icalib.montecarlo.truth import error, true_value
 from icalib.montecarlo.whiteness import whiteness
@@ -42,11 +41,8 @@ def run(task: Task) -> Record:
             only = None if task.guess == "drawn" else ("intrinsics",)
             rig = with_drawn_guess(rig, task.scenario, task.seed, only=only)
         result = calibrate_measurements(rig, simulation.measurements, on_visit=visits.append)
-    except CalibrationError as caught:
-        return Record(task.seed, str(caught), time.perf_counter() - started, program())
-    except Exception as caught:  # a fault of the program must not end a study of a thousand runs, nor be lost in it
-        sentence = f"the program failed ({type(caught).__name__}: {caught}); this is a fault of icalib."
-        return Record(task.seed, sentence, time.perf_counter() - started, program())
+    except Exception as caught:
+        return Record(task.seed, sentence_on(caught), time.perf_counter() - started, program())
     return compare(task.seed, result, simulation.truth, visits, time.perf_counter() - started)
 
 
@@ -61,7 +57,7 @@ def compare(seed: int, result: Calibration, truth: Truth, visits: list[Visited],
             columns += g.columns
     return Record(
         seed,
-        "" if result.converged else f"the solver did not converge: {result.status}",
+        result.failure,
         seconds,
         program(),
         tuple(blocks),

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+
+from icalib.batch import plain_record, record_json
 
 FORMAT = 1
 
@@ -89,14 +90,12 @@ class Record:
 
 def to_json(record: Record) -> bytes:
     """The record as JSON, numbers in full."""
-    return json.dumps({"format": FORMAT} | asdict(record), default=lambda array: array.tolist()).encode()
+    return record_json(record, FORMAT)
 
 
 def from_json(text: bytes) -> Record:
     """The record that `to_json` was given. Raises ValueError, KeyError or TypeError where `text` is something else."""
-    plain: dict[str, Any] = json.loads(text)
-    if plain.pop("format") != FORMAT:
-        raise ValueError("another format")
+    plain = plain_record(text, FORMAT)
     plain["blocks"] = tuple(_block(b) for b in plain["blocks"])
     plain["sizes"] = tuple(Size(**s) for s in plain["sizes"])
     plain["whiteness"] = tuple(Whiteness(**w) for w in plain["whiteness"])

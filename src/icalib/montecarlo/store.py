@@ -6,7 +6,7 @@ import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from icalib.batch import program, write_whole
+from icalib.batch import check_worker, program, write_whole
 from icalib.errors import CalibrationError
 from icalib.montecarlo.one_run import GuessKind
 from icalib.montecarlo.record import Record, from_json, to_json
@@ -60,10 +60,7 @@ class Store:
 
     def add(self, record: Record) -> None:
         """Raises CalibrationError where the worker ran another icalib, or the file cannot be written."""
-        if record.program != self.identity.program:
-            raise CalibrationError(
-                "a worker of the cluster runs another version of icalib than this one; install the same everywhere."
-            )
+        check_worker(record.program, self.identity.program)
         write_whole(self._file(record.seed), to_json(record))
 
     def read(self, seed: int) -> Record:

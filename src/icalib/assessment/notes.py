@@ -1,0 +1,80 @@
+"""What a reader should know of a result besides its numbers, one sentence each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from icalib.assessment.robot import robot_notes
+from icalib.estimation.assembly import Inputs
+from icalib.estimation.bodies import words_on_left_out
+from icalib.estimation.corner_noise import NoiseModel
+from icalib.estimation.estimate import Estimate
+from icalib.estimation.imu_data import ImuData
+from icalib.estimation.nodes import usable
+from icalib.timeline import Timeline
+
+
+def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
+    """Of the recordings, then of each kind of sensor."""
+    for k, span in enumerate(timeline.spans if len(timeline.spans) > 1 else (), 1):
+        number = f"recording {k}"
+        name = number if span.name == number else f"{number}, {span.name}"
+        yield f"{name}: {span.end - span.start:.1f} s from {span.origin_ns} ns on."
+    yield from inputs.measurements.notes
+    if words := words_on_left_out(inputs.bodies):
+        yield words
+    if inputs.imu is not None:
+        yield from _imu_notes(inputs, inputs.imu, found, timeline)
+    for camera, factor, model in zip(inputs.rig.cameras, found.problem.cameras, found.noise, strict=True):
+        if len(factor.stream.uv):
+            yield f"{camera.name}: {_noise_words(model)}."
+    yield from _feature_notes(found)
+    yield from robot_notes(inputs, found)
+
+
+def _feature_notes(found: Estimate):
+    factor, out = found.problem.features, found.outcome.residuals.features
+    if factor is None or out is None:
+        return
+    all_of_them = len(np.unique(np.concatenate([s.feature for s in factor.streams])))
+    yield (
+        f"{all_of_them} points of the scene were followed, in {factor.tracks.count} tracks that show where they are; "
+        "tracks that do not, for lack of parallax, are left out."
+    )
+    for camera, sigma, root, stream in zip(factor.cameras, factor.sigma, out.root, factor.streams, strict=True):
+        share = f"{int((root > 0.0).sum())} of {len(stream.uv)}"
+        yield f"{camera.name}: track noise {sigma:.3f} px; {share} observations of tracks are in use."
+
+
+def _imu_notes(inputs: Inputs, imu: ImuData, found: Estimate, timeline: Timeline):
+    assert inputs.rig.imu is not None
+    n, most = inputs.rig.imu.noise, inputs.rig.settings.max_gap_s
+    if inputs.rig.assumes_motion:
+        yield (
+            f"there is no IMU: the motion is assumed to be smooth, in a second its rate to change by {n.gyro_walk:.2g} "
+            f"rad/s and its acceleration by {n.accel_walk:.2g} m/s^2 (standard deviations of each axis), as poses show."
+        )
+        return
+    yield (
+        f"IMU noise ({n.source}): gyro {n.gyro:.3g} rad/s/sqrt(Hz), walk {n.gyro_walk:.3g}; accelerometer "
+        f"{n.accel:.3g} m/s^2/sqrt(Hz), walk {n.accel_walk:.3g}."
+    )
+    for a, b in imu.gaps:
+        how = "bridged" if b - a <= most else "left out, with the images in it"
+        yield f"{imu.name} has a gap of {b - a:.3f} s at {timeline.words(a)}, {how}."
+    for camera in found.problem.cameras:
+        t = camera.times + found.outcome.state.values[camera.name, "time_offset"][0]
+        left_out = int((~usable(imu, t, most)).sum())
+        if left_out:
+            yield f"{left_out} images of {camera.name} are left out: {imu.name} was not running then."
+
+
+def _noise_words(model: NoiseModel) -> str:
+    words = f"corner noise {model.base:.3f} px"
+    if model.exposure > 0.0:
+        words += f", {1e3 * model.exposure:.2f} px more (in squares) per 1000 px/s of image speed"
+    if model.tau:
+        words += f", {' and '.join(f'{t:.3f}' for t in model.tau)} px common to an image"
+    return words
