@@ -78,7 +78,7 @@ def determine(
     for _ in range(MOST_ROUNDS):
         if undetermined.shape == found.problem.held.shape or not (undetermined.size or found.problem.held.size):
             break
-        begin = _as_guessed(found.problem, start, guess or {}, undetermined)
+        begin = _as_guessed(found, start, guess or {}, undetermined)
         del found  # before the next one takes as much memory
         found = estimate(inputs, begin, on_step, undetermined, on_visit)
         data, undetermined = _judge(inputs, found)
@@ -93,11 +93,13 @@ def determine(
     return Determined(found, data, held, shifts)
 
 
-def _as_guessed(problem: Problem, start: State, guess: dict[Key, np.ndarray], held: np.ndarray) -> State:
-    """`start`, moved along the directions `held` (B, m) to where `guess` has them."""
-    way = border_difference(problem, replace(start, values=start.values | guess), start) / problem.tolerance
+def _as_guessed(found: Estimate, start: State, guess: dict[Key, np.ndarray], held: np.ndarray) -> State:
+    """The estimate, or where it did not converge `start`, moved along the directions `held` (B, m) to where `guess` has
+    them."""
+    problem, state = found.problem, found.outcome.state if found.outcome.converged else start
+    way = border_difference(problem, replace(start, values=start.values | guess), state) / problem.tolerance
     step = problem.tolerance * (held @ (held.T @ way))
-    return start.retract(problem.layout, np.zeros((len(start.seconds), 15)), step)
+    return state.retract(problem.layout, np.zeros((len(state.seconds), 15)), step)
 
 
 def _as_worth(inputs: Inputs, found: Estimate, guess: State) -> State | None:

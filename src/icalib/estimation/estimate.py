@@ -37,6 +37,7 @@ from icalib.rig import PoseSensor, Settings
 LOOSE = 3.0  # times what a guess is worth
 LEAST_LEFT = 0.2  # of the residuals of poses: where the motion takes all, nothing is left to show their noise
 EARLY_DECREASE, EARLY_SHARE = 0.5, 1e-6  # an early pass is followed by another
+FIRST_SHARE = 1e-3  # of half the chi^2: what is made anew after the first pass is worth more
 
 
 OnVisit = Callable[[str, Problem, Visit], None]  # told of the pass's name, its problem, and where the solver stood
@@ -80,7 +81,8 @@ def estimate(
             on_step(name, step)
 
         last = name == names[-1]
-        goal = (CONVERGED_DECREASE, ROUNDING) if last else (EARLY_DECREASE, EARLY_SHARE)
+        share = FIRST_SHARE if name == "first" else EARLY_SHARE
+        goal = (CONVERGED_DECREASE, ROUNDING) if last else (EARLY_DECREASE, share)
         outcome = minimise(problem, state, note, goal[0], partial(on_visit, name, problem), goal[1])
         if last:
             return Estimate(problem, outcome, tuple(models), tuple(history), robot)

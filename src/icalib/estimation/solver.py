@@ -123,7 +123,7 @@ def minimise(
                 break
             continue
         stalled += solution.decrease < STALLED_DECREASE
-        if stalled > MOST_STALLED or (early and solution.decrease < RESTING * tolerance):
+        if stalled > MOST_STALLED or (early and solution.decrease < RESTING * max(tolerance, share * cost)):
             break
         # Too far out for the true curvature of the loss: weights alone, and only then more damping.
         damping = damping if curved else max(damping * 10.0, 1e-6)
