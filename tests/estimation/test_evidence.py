@@ -87,7 +87,7 @@ def outcome_of(problem, state):
     problem.linearise(state, pieces, residuals, curved=True)
     solution = solve(pieces, problem.n_nodes, problem.tolerance)
     draws = solution.factors.draws(np.random.default_rng(3), DRAWS, 1)
-    return Outcome(state, 0.0, residuals, solution.information, (), True, "", Draws(draws[:-1], draws[-1:]))
+    return Outcome(problem, state, 0.0, residuals, solution.information, (), True, "", Draws(draws[:-1], draws[-1:]))
 
 
 def paid(problem, state, dense, what):

@@ -84,6 +84,7 @@ def estimate(
         share = FIRST_SHARE if name == "first" else EARLY_SHARE
         goal = (CONVERGED_DECREASE, ROUNDING) if last else (EARLY_DECREASE, share)
         outcome = minimise(problem, state, note, goal[0], partial(on_visit, name, problem), goal[1])
+        problem = outcome.problem
         if last:
             return Estimate(problem, outcome, tuple(models), tuple(history), robot)
         if name == "first":

@@ -45,11 +45,12 @@ MOST_UNLIKE = 10.0  # times the residuals of most points: a point that fits wors
 @dataclass(frozen=True)
 class FeatureOutput:
     """By camera: residual (N, 2) px, predicted - measured, and root (N,), square root of its weight over sigma (0 where
-    left out); points (T, 3) in the world."""
+    left out); points (T, 3) in the world, and in the frames of the cameras that they move with."""
 
     residual: tuple[np.ndarray, ...]
     root: tuple[np.ndarray, ...]
     points: np.ndarray
+    in_anchors: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -111,7 +112,8 @@ class FeatureFactor:
         label = np.where(label >= 0, np.where(np.append(good, False)[label], label, -1), -1)
         number = np.append(np.where(good, np.cumsum(good) - 1, -1), -1)
         factor = replace(factor, tracks=sightings.tracks(number[label], edges))
-        return replace(factor, tracks=replace(factor.tracks, start=factor._in_anchors(state, points[good])))
+        start = factor._in_anchors(factor._views(state, 0, factor.n_nodes), points[good], slice(0, factor.tracks.count))
+        return replace(factor, tracks=replace(factor.tracks, start=start))
 
     def _triangulated(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         """Points (T, 3) in the world of `state`, from the rays, and whether each is certain enough."""
@@ -122,8 +124,7 @@ class FeatureFactor:
             motion = view.motion
             add_rays(view.seen, 0, motion.R_cam_world, motion.p_world_cam, rays, valid, A, b)
         found = self._descend(views, np.linalg.solve(A, b[:, :, None])[:, :, 0], slice(0, n))
-        anchors = replace(self, tracks=replace(self.tracks, start=np.zeros((n, 3))))._from_anchors(views, slice(0, n))
-        distance = np.linalg.norm(found.xyz - anchors, axis=1)
+        distance = np.linalg.norm(found.xyz - found.seen_from, axis=1)
         information = np.linalg.eigvalsh(found.A)[:, 0]
         seen = sum(
             (np.bincount(t[(t >= 0) & k], minlength=n) for t, k in zip(self.tracks.track, self.keep, strict=True)),
@@ -136,10 +137,14 @@ class FeatureFactor:
 
     def output(self) -> FeatureOutput:
         """Empty arrays for `accumulate` to fill."""
-        sizes = [len(s.uv) for s in self.streams]
-        return FeatureOutput(
-            tuple(np.zeros((n, 2)) for n in sizes), tuple(np.zeros(n) for n in sizes), np.zeros((self.tracks.count, 3))
-        )
+        sizes, n_points = [len(s.uv) for s in self.streams], self.tracks.count
+        residual, root = tuple(np.zeros((n, 2)) for n in sizes), tuple(np.zeros(n) for n in sizes)
+        return FeatureOutput(residual, root, np.zeros((n_points, 3)), np.zeros((n_points, 3)))
+
+    def settled(self, at: FeatureOutput) -> FeatureFactor:
+        """The same features, first looked for where `at` found them: from far off a point may stop short, or end
+        elsewhere, and the cost would jump from one step to the next."""
+        return replace(self, tracks=replace(self.tracks, start=at.in_anchors.copy()))
 
     def attach(self, piece: Piece, keep: bool) -> Piece:
         """The piece with room for the features that its nodes saw; `keep`: its end is shared with another piece."""
@@ -166,8 +171,9 @@ class FeatureFactor:
         """
         tracks, pairs = self._within(piece)
         views, base = self._views(state, piece.first, self._stop(piece)), Range(tracks.start, pairs.start)
-        points = self._descend(views, self._from_anchors(views, tracks), tracks)
+        points = self._descend(views, self._from_anchors(views, tracks, self.tracks.start[tracks]), tracks)
         out.points[tracks] = points.xyz
+        out.in_anchors[tracks] = self._in_anchors(views, points.xyz, tracks)
         into = piece.sums(sums)
         features = NO_SUMS
         if sums and piece.features is not None:
@@ -249,9 +255,9 @@ class FeatureFactor:
 
     def _descend(self, views: list[View], xyz: np.ndarray, tracks: slice) -> Points:
         """The points of `tracks` where their cost is least, from `xyz` (n, 3) on."""
-        n = len(xyz)
+        n, eyes = len(xyz), self._from_anchors(views, tracks, np.zeros_like(xyz))
         points = Points(
-            xyz, xyz.copy(), np.zeros(n), np.zeros(n), np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3, 3)),
+            eyes, xyz, xyz.copy(), np.zeros(n), np.zeros(n), np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3, 3)),
             np.zeros((n, 3)), np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64), np.zeros(n),
             np.ones(n, dtype=bool),
         )  # fmt: skip
@@ -272,22 +278,22 @@ class FeatureFactor:
         weighing = self._weighing(view.index, False)
         add_to_points(seen, first, motion.R_cam_world, image[:m], which[:m], uv, valid, by_point, weighing, points)
 
-    def _from_anchors(self, views: list[View], tracks: slice) -> np.ndarray:
-        """(n, 3) where the points of `tracks` are first looked for, in the world: they move with a camera."""
-        out, camera, image = np.empty((tracks.stop - tracks.start, 3)), self.tracks.camera[tracks], self.tracks.image
+    def _from_anchors(self, views: list[View], tracks: slice, points: np.ndarray) -> np.ndarray:
+        """(n, 3) in the world what is at `points` (n, 3) in the frames of the cameras that `tracks` move with."""
+        out, camera, image = np.empty_like(points), self.tracks.camera[tracks], self.tracks.image
         for view in views:
             own = np.flatnonzero(camera == view.index)
             i = image[tracks][own] - view.first
-            turned = np.einsum("nji,nj->ni", view.motion.R_cam_world[i], self.tracks.start[tracks][own])
+            turned = np.einsum("nji,nj->ni", view.motion.R_cam_world[i], points[own])
             out[own] = turned + view.motion.p_world_cam[i]
         return out
 
-    def _in_anchors(self, state: State, points: np.ndarray) -> np.ndarray:
-        """(T, 3) points in the world of `state`, in the frames of the cameras that they move with."""
-        out = np.empty_like(points)
-        for view in self._views(state, 0, self.n_nodes):
-            own = np.flatnonzero(self.tracks.camera == view.index)
-            i = self.tracks.image[own]
+    def _in_anchors(self, views: list[View], points: np.ndarray, tracks: slice) -> np.ndarray:
+        """(n, 3) the points of `tracks`, in the world, in the frames of the cameras that they move with."""
+        out, camera, image = np.empty_like(points), self.tracks.camera[tracks], self.tracks.image
+        for view in views:
+            own = np.flatnonzero(camera == view.index)
+            i = image[tracks][own] - view.first
             out[own] = np.einsum("nij,nj->ni", view.motion.R_cam_world[i], points[own] - view.motion.p_world_cam[i])
         return out
 

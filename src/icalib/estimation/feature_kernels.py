@@ -18,6 +18,7 @@ from icalib.geometry.small import solve_definite
 
 SETTLED = 1e-12  # of half the chi^2: what another step of a point could still take off
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-6, 1e8
+FARTHEST_M, AT_END = 1e5, 1.0 - 1e-6  # of a point from the camera that it moves with
 
 
 class Seen(NamedTuple):
@@ -62,9 +63,11 @@ class Seeing(NamedTuple):
 
 
 class Points(NamedTuple):
-    """Points (T, 3) in the world on their way down: xyz and trial, half the chi^2 of both, the sums A (T, 3, 3) and
-    b (T, 3) of both, how many images show them of both, damping (T,), and which still move."""
+    """Points (T, 3) in the world on their way down: seen_from, where the camera is that each moves with; xyz and trial,
+    half the chi^2 of both, the sums A (T, 3, 3) and b (T, 3) of both, how many images show them of both, damping (T,),
+    and which still move."""
 
+    seen_from: np.ndarray
     xyz: np.ndarray
     trial: np.ndarray
     cost: np.ndarray
@@ -166,7 +169,7 @@ def add_to_points(seen, t0, R_cw, image, which, uv, valid, by_point, weighing, p
 def take_trials(points, start):
     """Takes trials that lowered the cost (all, at the `start`), then sets new ones; returns how many points still
     move. A point must not lower its cost by leaving an image."""
-    M, d, moving = np.empty((3, 3)), np.empty(3), 0
+    M, d, axes, moving = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), 0
     for t in range(len(points.xyz)):
         if not points.moves[t]:
             continue
@@ -180,27 +183,89 @@ def take_trials(points, start):
                 points.damping[t] = 0.0
         else:
             points.damping[t] = max(10.0 * points.damping[t], FIRST_DAMPING)
+        distance = _ray_axes(points.seen_from[t], points.xyz[t], axes)
         while points.damping[t] < MOST_DAMPING:
-            for a in range(3):
-                d[a] = -points.b[t, a]
-                for k in range(3):
-                    M[a, k] = points.A[t, a, k]
-                M[a, a] *= 1.0 + points.damping[t]
-            if solve_definite(M, d):
+            if _step(axes, points.A[t], points.b[t], points.damping[t], distance > AT_END * FARTHEST_M, M, d):
                 break
             points.damping[t] = max(10.0 * points.damping[t], FIRST_DAMPING)
-        decrease = -0.5 * (d[0] * points.b[t, 0] + d[1] * points.b[t, 1] + d[2] * points.b[t, 2])
+        decrease = 0.0
+        for a in range(3):
+            for k in range(3):
+                decrease -= 0.5 * d[a] * axes[a, k] * points.b[t, k]
         if points.damping[t] >= MOST_DAMPING or (points.damping[t] == 0.0 and decrease < SETTLED):
             points.moves[t] = False
             continue
+        _move(points.seen_from[t], axes, distance, d, points.trial[t])
         moving += 1
         for a in range(3):
-            points.trial[t, a] = points.xyz[t, a] + d[a]
             points.trial_b[t, a] = 0.0
             for k in range(3):
                 points.trial_A[t, a, k] = 0.0
         points.trial_cost[t], points.trial_shown[t] = 0.0, 0
     return moving
+
+
+@njit(cache=True, nogil=True)
+def _ray_axes(eye, point, axes):
+    """axes (3, 3): rows of length one, the last from `eye` to `point`; returns how far it is."""
+    x, y, z = point[0] - eye[0], point[1] - eye[1], point[2] - eye[2]
+    distance = max(np.sqrt(x * x + y * y + z * z), 1e-9)
+    x, y, z = x / distance, y / distance, z / distance
+    if abs(x) < 0.6:
+        a, b, c = 0.0, z, -y
+    else:
+        a, b, c = -z, 0.0, x
+    size = np.sqrt(a * a + b * b + c * c)
+    a, b, c = a / size, b / size, c / size
+    axes[0, 0], axes[0, 1], axes[0, 2] = a, b, c
+    axes[1, 0], axes[1, 1], axes[1, 2] = y * c - z * b, z * a - x * c, x * b - y * a
+    axes[2, 0], axes[2, 1], axes[2, 2] = x, y, z
+    return distance
+
+
+@njit(cache=True, nogil=True)
+def _step(axes, A, b, damping, at_end, M, d):
+    """Fills the step d (3,) along `axes`, not further out where the point is as far as it may be; False where the sums
+    are not definite."""
+    for outwards in (True, False):
+        _along(axes, A, b, M, d)
+        for a in range(3):
+            M[a, a] *= 1.0 + damping
+        if not outwards:
+            M[2, 0] = M[0, 2] = M[2, 1] = M[1, 2] = d[2] = 0.0
+        if not solve_definite(M, d):
+            return False
+        if not at_end or d[2] <= 0.0:
+            break
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _along(axes, A, b, M, d):
+    """M = axes A axes^T, d = -axes b."""
+    for i in range(3):
+        d[i] = 0.0
+        for a in range(3):
+            d[i] -= axes[i, a] * b[a]
+        for j in range(3):
+            M[i, j] = 0.0
+            for a in range(3):
+                for k in range(3):
+                    M[i, j] += axes[i, a] * A[a, k] * axes[j, k]
+
+
+@njit(cache=True, nogil=True)
+def _move(eye, axes, distance, d, point):
+    """A step d along `axes` from where `point` is at `distance`. What is nearly linear is the direction in which it is
+    seen, and the inverse of its distance: a step along the ray that long, to infinity and beyond, is an ordinary one
+    there, and none leads behind the camera."""
+    nearness = max((1.0 - d[2] / distance) / distance, 1.0 / FARTHEST_M)
+    size = 0.0
+    for a in range(3):
+        point[a] = axes[2, a] + (d[0] * axes[0, a] + d[1] * axes[1, a]) / distance
+        size += point[a] * point[a]
+    for a in range(3):
+        point[a] = eye[a] + point[a] / (np.sqrt(size) * nearness)
 
 
 @njit(cache=True, nogil=True)

@@ -134,6 +134,12 @@ class Problem:
         """`at`, to be filled once more, with room for features of this problem's own."""
         return replace(at, features=None if self.features is None else self.features.output())
 
+    def settled(self, at: Residuals) -> Problem:
+        """The same problem, points of the scene first looked for where they were at `at`."""
+        if self.features is None or at.features is None:
+            return self
+        return replace(self, features=self.features.settled(at.features))
+
     def linearise(
         self, state: State, pieces: tuple[Piece, ...], out: Residuals, sums: bool = True, curved: bool = False
     ) -> float:

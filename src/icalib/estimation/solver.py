@@ -47,9 +47,11 @@ class Visit:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Where the solver ended, with a status that is a sentence. information (B, B): of the border at `state`, the chain
-    marginalised, no damping; empty, and no draws, where another pass follows."""
+    """Where the solver ended, with a status that is a sentence. problem: the one that was solved, points of the scene
+    looked for where they were; information (B, B): of the border at `state`, the chain marginalised, no damping; empty,
+    and no draws, where another pass follows."""
 
+    problem: Problem
     state: State
     cost: float
     residuals: Residuals
@@ -104,7 +106,7 @@ def minimise(
             # Nothing that counts would change: the sums were those of the end already.
             steps.append(Step(cost, solution.decrease, damping, True))
             on_step(steps[-1])
-            return _outcome(state, cost, residuals, solution.decrease, steps, solution)
+            return _outcome(problem, state, cost, residuals, solution.decrease, steps, solution)
         candidate = state.retract(problem.layout, solution.chain, solution.border)
         settled = solution.decrease < curved_below * cost
         converged = damping == 0.0 and solution.decrease < max(tolerance, share * cost)
@@ -117,6 +119,7 @@ def minimise(
         if accepted:
             good = cost - candidate_cost > 0.25 * solution.decrease
             state, cost, curved = candidate, candidate_cost, settled
+            problem = problem.settled(residuals)
             damping = damping * (0.1 if good else 1.0)
             damping = 0.0 if damping < ZERO_DAMPING else damping
             if converged:
@@ -140,7 +143,7 @@ def minimise(
 def _early_end(problem, state, cost, pieces, residuals, steps) -> Outcome:
     if not steps[-1].accepted:  # what was filled last is not that of `state`
         problem.linearise(state, pieces, residuals, sums=False)
-    return _outcome(state, cost, residuals, steps[-1].predicted_decrease, steps)
+    return _outcome(problem, state, cost, residuals, steps[-1].predicted_decrease, steps)
 
 
 def _end(problem, state, cost, pieces, residuals, steps, curved, on_visit) -> Outcome:
@@ -148,7 +151,7 @@ def _end(problem, state, cost, pieces, residuals, steps, curved, on_visit) -> Ou
         problem.linearise(state, pieces, residuals, curved=True)
     solution = solve(pieces, problem.n_nodes, problem.tolerance, 0.0, problem.held)
     on_visit(Visit(state, solution.information))
-    return _outcome(state, cost, residuals, solution.decrease, steps, solution)
+    return _outcome(problem, state, cost, residuals, solution.decrease, steps, solution)
 
 
 def posterior(problem: Problem, state: State) -> Draws:
@@ -171,7 +174,13 @@ def _solve(problem, state, pieces, residuals, damping, curved):
 
 
 def _outcome(
-    state: State, cost: float, residuals: Residuals, left: float, steps: list[Step], end: Solution | None = None
+    problem: Problem,
+    state: State,
+    cost: float,
+    residuals: Residuals,
+    left: float,
+    steps: list[Step],
+    end: Solution | None = None,
 ) -> Outcome:
     """`left`: what half the chi^2 can still fall by; `end`: what was solved there."""
     converged, n = left < STALLED_DECREASE, len(steps)
@@ -185,4 +194,4 @@ def _outcome(
         f"{left:.3g}; give a better first guess, or check the noise in the rig file."
     )
     information, draws = (NOTHING, None) if end is None else (end.information, Draws.of(end))
-    return Outcome(state, cost, residuals, information, tuple(steps), converged, status, draws)
+    return Outcome(problem, state, cost, residuals, information, tuple(steps), converged, status, draws)

@@ -1,0 +1,70 @@
+"""Points of the scene on their way to where they cost least, from wherever they are first looked for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from icalib.estimation.arrowhead import make_pieces
+from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput
+from icalib.estimation.feature_kernels import FARTHEST_M
+from icalib.simulation import handheld, simulate
+
+
+@pytest.fixture(scope="module")
+def setup(setup_of):
+    return setup_of(simulate(handheld(1.5), seed=4))
+
+
+@pytest.fixture(scope="module")
+def factor(setup, features_of) -> FeatureFactor:
+    return features_of(setup, noise_px=0.5)
+
+
+def outcome(factor: FeatureFactor, state) -> tuple[float, FeatureOutput]:
+    out = factor.output()
+    cost = sum(factor.accumulate(state, p, out, sums=False) for p in make_pieces(factor.n_nodes, None))
+    return cost, out
+
+
+def looked_for(factor: FeatureFactor, start: np.ndarray) -> FeatureFactor:
+    return replace(factor, tracks=replace(factor.tracks, start=start))
+
+
+@pytest.mark.parametrize("times", [0.5, 10.0, 1e4])
+def test_points_come_back_from_near_and_far(factor, setup, times: float):
+    """Once a step had thrown one to 1e13 m it stayed there, a hundred of them costing as much as all else."""
+    cost, out = outcome(factor, setup.state)
+    away, there = outcome(looked_for(factor, times * factor.tracks.start), setup.state)
+    assert away == pytest.approx(cost, rel=1e-9)
+    np.testing.assert_allclose(there.points, out.points, atol=1e-5)
+
+
+def test_a_point_at_infinity_stays_in_its_direction(factor, setup):
+    """Seen from everywhere in one direction, as a star is, it goes as far as points may, and its cost is that of the
+    star."""
+    views = factor._views(setup.state, 0, factor.n_nodes)
+    track = next(t for t in range(factor.tracks.count) if factor.tracks.camera[t] == 0)
+    star = views[0].motion.R_cam_world[factor.tracks.image[track]].T @ [0.05, 0.02, 1.0]
+    streams = list(factor.streams)
+    for view in views:
+        stream, own = streams[view.index], np.flatnonzero(factor.tracks.track[view.index] == track)
+        seen, _ = view.camera.model.project(view.params, np.einsum("nij,j->ni", view.motion.R_cam_world, star))
+        uv = stream.uv.copy()
+        uv[own] = seen[stream.image[own]]
+        streams[view.index] = replace(stream, uv=uv)
+    distant = replace(factor, streams=tuple(streams))
+    _, out = outcome(distant, setup.state)
+    for view in views:
+        own = np.flatnonzero((factor.tracks.track[view.index] == track) & factor.keep[view.index])
+        assert np.abs(out.residual[view.index][own]).max(initial=0.0) < 0.02
+    assert np.linalg.norm(out.in_anchors[track]) == pytest.approx(FARTHEST_M, rel=1e-6)
+
+
+def test_settled_features_are_where_they_were(factor, setup):
+    cost, out = outcome(looked_for(factor, 3.0 * factor.tracks.start), setup.state)
+    again, there = outcome(factor.settled(out), setup.state)
+    assert again == pytest.approx(cost, rel=1e-12)
+    np.testing.assert_allclose(there.points, out.points, atol=1e-9)
