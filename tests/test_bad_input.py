@@ -213,6 +213,11 @@ def other_focal_length(t: Tables) -> None:
     t.rig = t.rig.replace("458.654, 457.296", "700.0, 700.0")
 
 
+def mirrored_images(t: Tables) -> None:
+    cells = [x.split(",") for x in t.cam0]
+    t.cam0 = [",".join([*c[:3], repr(751.0 - float(c[3])), c[4]]) for c in cells]
+
+
 def stopped_imu(t: Tables) -> None:
     t.imu = t.imu[:1]
 
@@ -240,6 +245,7 @@ BROKEN: list[tuple[Callable[[Tables], None], str]] = [
     (stamps_in_microseconds, r"microseconds"),
     (tag_size_halved, r"tag_size"),
     (other_focal_length, r"intrinsics|tag_size|focal"),
+    (mirrored_images, r"cam0 would see the target from behind.*mirrored"),
     (stopped_imu, r"imu0/data\.csv.*only 1 reading"),
     (small_image, r"resolution"),
 ]

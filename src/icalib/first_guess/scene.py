@@ -24,6 +24,7 @@ from icalib.first_guess.target_poses import (
     Flat,
     TargetPoses,
     camera_in_target,
+    check_side,
     chosen_corners,
     flat_poses,
     refine,
@@ -72,9 +73,12 @@ def body_poses(stream: CornerStream, views: Views, bodies: Bodies, model: Camera
 
 
 def scene_poses(stream: CornerStream, model: CameraModel, params: np.ndarray, scene: Placed) -> TargetPoses:
-    """Poses of the camera in the scene, image by image, from all its bodies together."""
+    """Poses of the camera in the scene, image by image, from all its bodies together. Raises EstimationError where
+    images are mirrored."""
     if not scene.bodies.several:
-        return target_poses(stream, model, params, Flat(scene.bodies.target.points))
+        poses = target_poses(stream, model, params, Flat(scene.bodies.target.points))
+        check_side(stream.name, poses)
+        return poses
     views = Views.of(stream, scene.bodies.target.body)
     seen = body_poses(stream, views, scene.bodies, model, params)
     R_sb, p_sb = scene.bodies.poses(scene.values)

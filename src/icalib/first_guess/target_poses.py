@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from icalib.errors import EstimationError
 from icalib.geometry import so3
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.small import solve_definite
@@ -224,6 +225,17 @@ def target_poses(stream: CornerStream, model: CameraModel, params: np.ndarray, t
     fewest = np.full(len(stream.stamps_ns), target.fewest)
     found = flat_poses(stream, stream.start, fewest, model, params, target.points, 1)
     return TargetPoses(found.rotation[:, 0], found.position[:, 0], found.ok[:, 0], found.rms_px[:, 0])
+
+
+def check_side(camera: str, poses: TargetPoses) -> None:
+    """Raises EstimationError where most `poses` of the camera in the frame of a flat body are behind its sheet: a
+    mirrored image looks as the sheet would through its back."""
+    behind = poses.position[poses.ok, 2] < 0.0
+    if 2 * behind.sum() > len(behind):
+        raise EstimationError(
+            f"{camera} would see the target from behind: its images or corners are mirrored; record them as the camera "
+            "takes them, u to the right and v down, and check that the target was not printed mirrored."
+        )
 
 
 def flat_poses(

@@ -1,0 +1,76 @@
+"""The figures of docs/tour.md: parts of the reports of its calibrations, as a browser draws them.
+
+python benchmarks/tour_figures.py FOLDER      FOLDER is where the commands of the page were run
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+FIGURES = Path(__file__).resolve().parent.parent / "docs" / "tour"
+WIDTH, TALLEST = 1100, 1600  # px
+COLOURS = 256  # of the palette: keeps a figure below 150 kB
+FLAGS = (
+    "--headless --no-sandbox --disable-quic --no-first-run --disable-background-networking "
+    "--disable-component-update --disable-sync --use-angle=swiftshader --enable-unsafe-swiftshader "
+    "--hide-scrollbars --virtual-time-budget=8000"
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Figure:
+    """A section of the report in the folder `result`, without the elements that match `hidden` (CSS)."""
+
+    name: str
+    result: str
+    section: str
+    hidden: str = ""
+
+
+FIGURES_OF_THE_PAGE = (
+    Figure("trust", "out", "trust"),
+    Figure("corners", "out", "corners", "#corners > :nth-child(n + 5), #time-0"),
+    Figure("corners-lens", "out-lens", "corners", "#corners > :nth-child(n + 5), #time-0"),
+    Figure("jump", "out-jump", "corners", "#corners > p, #plane-0, #image-0, #plane-1, #image-1"),
+)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    folder = parser.parse_args().folder
+    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if chromium is None:
+        raise SystemExit("tour_figures.py: no chromium is installed; install one to have the reports drawn.")
+    FIGURES.mkdir(exist_ok=True)
+    for figure in FIGURES_OF_THE_PAGE:
+        draw(chromium, folder / figure.result / "report.html", figure, FIGURES / f"{figure.name}.png")
+
+
+def draw(chromium: str, report: Path, figure: Figure, file: Path) -> None:
+    """Write the part of `report` that `figure` says."""
+    hidden = f"header, main > section:not(#{figure.section}){', ' + figure.hidden if figure.hidden else ''}"
+    style = f"<style>body {{ background: #fff; }} {hidden} {{ display: none !important; }}</style></head>"
+    with tempfile.TemporaryDirectory() as scratch:
+        page, shot = Path(scratch) / "page.html", Path(scratch) / "shot.png"
+        page.write_text(report.read_text(encoding="utf-8").replace("</head>", style, 1), encoding="utf-8")
+        where = [f"--user-data-dir={scratch}/profile", f"--window-size={WIDTH},{TALLEST}", f"--screenshot={shot}"]
+        command = [chromium, *FLAGS.split(), *where, page.as_uri()]
+        subprocess.run(command, check=True, capture_output=True, timeout=300)
+        image = Image.open(shot).convert("RGB")
+    rows = np.flatnonzero((np.asarray(image) != 255).any(axis=(1, 2)))
+    image = image.crop((0, max(int(rows[0]) - 8, 0), WIDTH, min(int(rows[-1]) + 9, TALLEST)))
+    image.quantize(COLOURS).save(file, optimize=True)
+    print(f"{file.name}: {file.stat().st_size / 1e3:.0f} kB")
+
+
+if __name__ == "__main__":
+    main()
