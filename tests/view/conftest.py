@@ -42,11 +42,11 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> Shown:
     folder, scenario = tmp_path_factory.mktemp("shown"), load_scenario(THREE_D)
     scenario = replace(
         scenario,
-        duration_s=6.0,
+        duration_s=12.0,
         features=None,
         wheels=(),
         cameras=(replace(scenario.cameras[0], corner_noise_px=0.15),),
-        lidars=tuple(replace(x, azimuth_steps=150) for x in scenario.lidars),
+        lidars=tuple(replace(x, azimuth_steps=300) for x in scenario.lidars),
         board=True,
         T_world_board=ON_WALL,
         target=AprilGrid(4, 10, 0.6, 0.3),
@@ -101,7 +101,5 @@ def _read(path: Path) -> dict[str, Rows]:
         seconds = np.full(n, np.nan) if times is None else 1e-9 * np.asarray(times.cast("int64"), np.float64)
         entity = found.setdefault(chunk.entity_path.lstrip("/"), Rows(np.empty(0), {}))
         values = {name: entity.values.get(name, []) + column.to_pylist() for name, column in columns.items()}
-        found[chunk.entity_path.lstrip("/")] = Rows(
-            np.concatenate([entity.seconds, seconds]), entity.values | values
-        )
+        found[chunk.entity_path.lstrip("/")] = Rows(np.concatenate([entity.seconds, seconds]), entity.values | values)
     return found

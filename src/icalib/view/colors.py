@@ -13,3 +13,8 @@ def by_value(values: np.ndarray, low: float, high: float) -> np.ndarray:
     share = np.clip((values - low) / max(high - low, np.finfo(float).tiny), 0.0, 1.0)
     at = np.linspace(0.0, 1.0, len(_STOPS))
     return np.stack([np.interp(share, at, channel) for channel in _STOPS.T], axis=1).round().astype(np.uint8)
+
+
+def rgb(*colors: str) -> np.ndarray:
+    """(n, 3) uint8 of colours as in HTML, "#rrggbb"."""
+    return np.array([list(bytes.fromhex(color[1:])) for color in colors], np.uint8)

@@ -12,7 +12,7 @@ from icalib.geometry.targets import target_from_plain
 from icalib.report import rig_shapes
 from icalib.report.plot import COLORS
 from icalib.report.quantities import worst
-from icalib.view.colors import by_value
+from icalib.view.colors import by_value, rgb
 from icalib.view.stream import Stream
 
 SIGMAS = 3.0
@@ -45,7 +45,7 @@ def log_rig(s: Stream, c: Calibration) -> None:
     shapes = {name: rig_shapes.rings(0.3 * spread) for name in c.lidars}
     shapes |= {name: rig_shapes.axle(c, name) for name in c.wheels}
     for i, (name, pen) in enumerate(shapes.items()):
-        strips = s.rr.LineStrips3D(_strips(pen), colors=COLORS[i % len(COLORS)])
+        strips = s.rr.LineStrips3D(_strips(pen), colors=rgb(COLORS[i % len(COLORS)]))
         s.still(f"{place(c, name)}/shape", strips)
 
 
@@ -98,7 +98,7 @@ def log_uncertainty(s: Stream, c: Calibration) -> None:
     for e in ellipsoids(c):
         ellipsoid = s.rr.Ellipsoids3D(
             half_sizes=[factor * e.half_sizes], centers=[c.group(e.sensor, "translation").value],
-            quaternions=[Rotation.from_matrix(e.axes).as_quat()], colors=[_VERDICT_COLORS[e.verdict]],
+            quaternions=[Rotation.from_matrix(e.axes).as_quat()], colors=rgb(_VERDICT_COLORS[e.verdict]),
             labels=[f"{e.sensor}: {SIGMAS:g} sigma x {factor:g}"], show_labels=False,
         )  # fmt: skip
         s.still(f"world/{c.body}/uncertainty/{e.sensor}", ellipsoid)
@@ -114,7 +114,7 @@ def log_motion(s: Stream, c: Calibration) -> None:
     )  # fmt: skip
     of = c.recording_of(path.seconds)
     for k, span in enumerate(spans(c)):
-        s.at("world/way", span.start, s.rr.LineStrips3D([path.position[of == k]], colors=_WAY))
+        s.at("world/way", span.start, s.rr.LineStrips3D([path.position[of == k]], colors=rgb(_WAY)))
 
 
 def log_target(s: Stream, c: Calibration) -> None:
@@ -128,8 +128,9 @@ def log_target(s: Stream, c: Calibration) -> None:
         k, T = target.bodies.index(body), c.T_scene_body(body) if c.bodies else np.eye(4)
         entity = f"world/target/{body}"
         s.still(entity, s.rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
-        s.still(f"{entity}/outline", s.rr.LineStrips3D(_strips(rig_shapes.body_outline(target, k)), colors=_TARGET))
-        s.still(f"{entity}/points", s.rr.Points3D(target.points[target.body == k], colors=_TARGET))
+        outline = _strips(rig_shapes.body_outline(target, k))
+        s.still(f"{entity}/outline", s.rr.LineStrips3D(outline, colors=rgb(_TARGET)))
+        s.still(f"{entity}/points", s.rr.Points3D(target.points[target.body == k], colors=rgb(_TARGET)))
 
 
 def log_planes(s: Stream, c: Calibration) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from icalib.calibration import Calibration, CornerResiduals, LidarResiduals
 from icalib.report.motion_figures import BLOCKS
 from icalib.report.plot import AXIS_COLORS, COLORS
+from icalib.view.colors import rgb
 from icalib.view.scene import place
 from icalib.view.stream import Stream
 
@@ -49,7 +50,7 @@ def log_states(s: Stream, c: Calibration) -> None:
 def log_lines(s: Stream, entity: str, seconds: np.ndarray, values: np.ndarray, names: Sequence[str]) -> None:
     """Lines over time: values (n, m), a column for each of the m names."""
     colors = AXIS_COLORS if len(names) == 3 else COLORS[: len(names)]
-    s.still(entity, s.rr.SeriesLines(names=list(names), colors=list(colors)))
+    s.still(entity, s.rr.SeriesLines(names=list(names), colors=rgb(*colors)))
     n, m = values.shape
     s.over(entity, seconds, s.rr.Scalars.columns(scalars=values.reshape(-1)).partition([m] * n))
 
@@ -59,7 +60,7 @@ def rms_of_images(r: CornerResiduals) -> tuple[np.ndarray, np.ndarray]:
     image = np.repeat(np.arange(len(r.seconds)), np.diff(r.start))
     used = ~r.rejected
     count = np.bincount(image[used], minlength=len(r.seconds))
-    total = np.bincount(image[used], np.mean(r.residual[used] ** 2, axis=1), len(r.seconds))
+    total = np.bincount(image[used], np.mean(r.residual[used].astype(np.float64) ** 2, axis=1), len(r.seconds))
     some = count > 0
     return r.seconds[some], np.sqrt(total[some] / count[some])
 
@@ -76,6 +77,6 @@ def _log_corners(s: Stream, c: Calibration, r: CornerResiduals) -> None:
     if not len(r.uv):
         return
     rr = s.rr
-    colors = np.where(r.rejected, int(_REJECTED[1:] + "ff", 16), int(_GOOD[1:] + "ff", 16)).astype(np.uint32)
+    colors = rgb(_GOOD, _REJECTED)[r.rejected.astype(np.int64)]
     columns = rr.Points2D.columns(positions=r.uv + 0.5, colors=colors).partition(np.diff(r.start))
     s.over(f"{place(c, r.sensor)}/image/corners", r.seconds, columns)
