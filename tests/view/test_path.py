@@ -37,8 +37,10 @@ def nodes(shown):
 
 @pytest.mark.parametrize("step", [0.05, 0.025])
 def test_between_nodes_the_error_falls_with_the_third_power_of_their_distance(nodes, step):
-    """A parabola's slope is off by f''' h^2 / 6, and what a cubic makes of that is at most 0.0963 h times as large. The
-    third derivative of the position is 8 m/s^3, that of the rotation below 15 rad/s^3; nodes are up to 1.2 steps apart."""
+    """A parabola's slope is off by f''' h^2 / 6, and what a cubic makes of that is at most 0.0963 h times as large.
+
+    The third derivative of the position is 8 m/s^3, that of the rotation below 15 rad/s^3; nodes are up to 1.2 steps
+    apart."""
     seconds = np.arange(0.0, 3.0, step)
     seconds[1:-1] += 0.2 * step * np.sin(np.arange(len(seconds) - 2))
     path = nodes(seconds)
@@ -61,8 +63,8 @@ def test_at_a_node_the_pose_is_that_of_the_node(nodes):
 
 
 def test_beyond_the_ends_and_in_gaps_nothing_is_known(nodes):
-    """Beside them the slope is that of the one interval: off by h / 2 times the acceleration, 4 m/s^2 and below 6 rad/s^2,
-    of which a cubic makes 0.149 h times as much."""
+    """Beside them the slope is that of the one interval: off by h / 2 times the acceleration, 4 m/s^2 and below
+    6 rad/s^2, of which a cubic makes 0.149 h times as much."""
     seconds = np.array([0.0, 0.05, 0.1, 1.1, 1.15, 1.2])
     t = np.array([-0.01, 0.02, 0.099, 0.1, 0.3, 1.0999, 1.1, 1.12, 1.21])
     R, p, known = nodes(seconds).at(t)

@@ -89,7 +89,7 @@ def test_images_are_at_their_corrected_times(found, shown):
 def test_corners_are_on_the_pixels_that_were_measured(found, shown):
     r, rows = shown.calibration.corner_residuals[0], found[f"{IMAGE}/corners"]
     k = int(np.argmax(np.diff(r.start) > 3))
-    np.testing.assert_allclose(rows.seconds, r.seconds, atol=1e-9)
+    np.testing.assert_allclose(rows.seconds[np.isfinite(rows.seconds)], r.seconds, atol=1e-9)
     uv = r.uv[r.start[k] : r.start[k + 1]]
     np.testing.assert_allclose(rows.values["Points2D:positions"][k], uv + 0.5, atol=1e-4)
 

@@ -20,7 +20,12 @@ def blueprint(rr: Any, c: Calibration, readings: bool) -> Any:
     if readings and c.imu is not None:
         shown.append(b.TimeSeriesView(origin=f"readings/{c.imu}", name=f"readings of {c.imu}"))
     right = b.Vertical(b.Tabs(rig, b.TextDocumentView(origin="summary", name="summary")), *images[:2])
-    left = b.Vertical(b.Spatial3DView(origin="world", name="world"), b.Tabs(*shown), row_shares=[3, 1])
+    # All points of all planes at once hide what moves among them.
+    space = [b.Spatial3DView(origin="world", contents=["$origin/**", "- $origin/planes/**"], name="world")]
+    if c.lidar_residuals:
+        parts = [f"$origin/{part}/**" for part in ("planes", "target", "way")]
+        space.append(b.Spatial3DView(origin="world", contents=parts, name="planes"))
+    left = b.Vertical(b.Tabs(*space), b.Tabs(*shown), row_shares=[3, 1])
     more = [b.Tabs(*images[2:])] if images[2:] else []
     return b.Blueprint(
         b.Horizontal(left, right, *more, column_shares=[3, 2, 1][: 2 + len(more)]),

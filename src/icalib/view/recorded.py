@@ -16,7 +16,7 @@ from icalib.recordings import DamagedImageError, Recording, decode, image_topics
 from icalib.rig import Camera, ImuSensor, Lidar, Rig
 from icalib.view.colors import by_value
 from icalib.view.path import Path
-from icalib.view.scene import place
+from icalib.view.scene import POINT, place
 from icalib.view.series import log_lines
 from icalib.view.stream import Stream
 
@@ -155,7 +155,8 @@ class Recorded:
             if len(points) and heights is None:
                 heights = np.percentile(points[:, 2], _HEIGHTS)
             low, high = (0.0, 1.0) if heights is None else heights
-            cloud = s.rr.Points3D(points, colors=by_value(points[:, 2], low, high))
+            colors, radius = by_value(points[:, 2], low, high), s.rr.Radius.ui_points(POINT)
+            cloud = s.rr.Points3D(points, colors=colors, radii=radius)
             s.at(f"world/scans/{sensor.name}", float(seconds[k]), cloud)
         most = int(np.diff(stream.start)[inside].max())
         return [

@@ -16,6 +16,7 @@ from icalib.view.colors import by_value, rgb
 from icalib.view.stream import Stream
 
 SIGMAS = 3.0
+POINT = 1.5  # radius of a point of a LiDAR, in points of the screen
 _LARGEST = 0.4  # of the spread of the rig, up to which the best known ellipsoids are magnified
 _VERDICT_COLORS = {"determined": "#15803d", "weak": "#d97706", "undetermined": "#dc2626"}
 _TARGET, _WAY = "#be185d", "#64748b"
@@ -140,7 +141,8 @@ def log_planes(s: Stream, c: Calibration) -> None:
         top = _WORST_OF_SCALE * float(np.sqrt(np.mean(size**2))) if len(size) else 1.0
         for k, span in enumerate(spans(c)):
             own = of == k
-            points = s.rr.Points3D(r.world[own], colors=by_value(size[own], 0.0, top))
+            colors, radius = by_value(size[own], 0.0, top), s.rr.Radius.ui_points(POINT)
+            points = s.rr.Points3D(r.world[own], colors=colors, radii=radius)
             s.at(f"world/planes/{r.sensor}", span.start, points)
 
 

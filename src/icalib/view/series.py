@@ -15,7 +15,8 @@ from icalib.view.scene import place
 from icalib.view.stream import Stream
 
 BIN_S = 0.1  # over which points of a LiDAR are taken together
-_GOOD, _REJECTED = "#15803d", "#dc2626"
+_CORNER = 3.0  # radius, in points of the screen
+_GOOD, _REJECTED = "#22c55e", "#dc2626"
 
 
 def log_residuals(s: Stream, c: Calibration) -> None:
@@ -76,7 +77,8 @@ def _log_corners(s: Stream, c: Calibration, r: CornerResiduals) -> None:
     """Corners as they were measured, in the camera's image; red where they were set aside."""
     if not len(r.uv):
         return
-    rr = s.rr
+    rr, entity = s.rr, f"{place(c, r.sensor)}/image/corners"
+    s.still(entity, rr.Points2D.from_fields(radii=rr.Radius.ui_points(_CORNER)))
     colors = rgb(_GOOD, _REJECTED)[r.rejected.astype(np.int64)]
     columns = rr.Points2D.columns(positions=r.uv + 0.5, colors=colors).partition(np.diff(r.start))
-    s.over(f"{place(c, r.sensor)}/image/corners", r.seconds, columns)
+    s.over(entity, r.seconds, columns)
