@@ -82,6 +82,7 @@ def test_images_are_at_their_corrected_times(found, shown):
     for k in (0, 7):
         blob = np.frombuffer(bytes(rows.values["EncodedImage:blob"][k][0]), np.uint8)
         image = cv2.imdecode(blob, cv2.IMREAD_GRAYSCALE)
+        assert image is not None
         assert image.shape == (480, 752)
         assert abs(float(image[20:, 20:].mean()) - (20 + k)) < 1.0
 
