@@ -68,6 +68,13 @@ def test_a_recording_with_corners_but_no_images_is_shown_without(shown, drive, t
     assert view(shown.result, drive, tmp_path / "a.rrd") == ["cam0: the recording holds no images of it."]
 
 
+def test_images_of_another_camera_are_not_shown(shown, drive, tmp_path):
+    (drive / "other").mkdir()
+    for name in ("data", "data.csv"):
+        (drive / "cam0" / name).rename(drive / "other" / name)
+    assert view(shown.result, drive, tmp_path / "a.rrd") == ["cam0: the recording holds no images of it."]
+
+
 def test_a_recording_of_another_time(complaint, shown, tmp_path):
     c = shown.calibration
     later = dataclasses.replace(c.recordings[0], origin_ns=c.recordings[0].origin_ns + 10**12)

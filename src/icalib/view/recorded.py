@@ -98,12 +98,14 @@ class Recorded:
         return notes
 
     def _pictured(self, camera: Camera) -> bool:
-        """Whether there are images of the camera; those without may have tables of corners or tracks."""
+        """Whether there are images of the camera. Where its corners come from a table, the only images that there are
+        may be another camera's."""
         try:
-            self.recording.image_topic(camera)
+            topic = self.recording.image_topic(camera)
         except RecordingError:
             return False
-        return True
+        named = camera.topic is not None or camera.name in topic.split("/")
+        return named or not self.recording.has_corners(camera)
 
     def _clock(self, sensor: str) -> Clock:
         return Clock.of(self.calibration, self.span, sensor)
