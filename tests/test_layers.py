@@ -45,6 +45,7 @@ LEVELS = {
     "comparison": 8,
     "outputs": 8,
     "pipeline": 8,
+    "view": 8,
     "console": 8,
     "batch": 1,
     "montecarlo": 9,

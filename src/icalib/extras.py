@@ -47,6 +47,12 @@ def load_matplotlib() -> Any:
     return _load("matplotlib.figure", "montecarlo", "Figures as PNG need the package matplotlib")
 
 
+def load_rerun() -> Any:
+    """Rerun's SDK with its blueprints. Raises RecordingError where it is not installed."""
+    _load("rerun.blueprint", "view", "The 3D view needs the package rerun-sdk")
+    return importlib.import_module("rerun")
+
+
 def _load(module: str, extra: str, need: str) -> ModuleType:
     try:
         return importlib.import_module(module)

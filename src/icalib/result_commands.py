@@ -11,6 +11,7 @@ def add_result_commands(commands: argparse._SubParsersAction[argparse.ArgumentPa
     _add_allan(commands)
     _add_export(commands)
     _add_compare(commands)
+    _add_view(commands)
 
 
 def _add_allan(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -121,3 +122,26 @@ def _compare(options: argparse.Namespace) -> int:
     if not options.quiet:
         print("\n".join(lines(found)))
     return 0 if found.same else 1
+
+
+def _add_view(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    c = commands.add_parser("view", help="a result, and the recording that it is of, in 3D over time, in Rerun")
+    c.add_argument("result", type=Path, help="folder that a calibration was written to, or the result.json in it")
+    c.add_argument("recording", type=Path, nargs="?", help="the recording of the result, or one of them")
+    file = "write a file that Rerun opens, instead of starting its viewer"
+    c.add_argument("--save", type=Path, metavar="FILE.rrd", help=file)
+    c.add_argument("--quiet", "-q", action="store_true", help="no progress bar, and do not say what is left out")
+    c.set_defaults(run=_view)
+
+
+def _view(options: argparse.Namespace) -> None:
+    from icalib.console import progress_bar
+    from icalib.view import view
+
+    with progress_bar(options.quiet) as progress:
+        notes = view(options.result, options.recording, options.save, progress)
+    if not options.quiet:
+        for sentence in notes:
+            print(f"Note: {sentence}")
+        if options.save is not None:
+            print(f"Wrote {options.save}: open it by `rerun {options.save}`.")

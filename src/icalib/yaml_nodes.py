@@ -148,16 +148,24 @@ def read_yaml(path: Path, kind: str = "rig file") -> YamlValue:
     Raises RigError where there is no such file, it cannot be read, is not YAML or is empty.
     """
     try:
-        # OpenCV heads its files with a directive that YAML does not have.
         text = path.read_text(encoding="utf-8-sig")
-        text = re.sub(r"\A%YAML:1\.0", "#", text)
-        root = yaml.compose(text, Loader=yaml.SafeLoader)
     except FileNotFoundError:
         raise RigError(f"{path} does not exist; check the path of the {kind}.") from None
     except OSError as error:
         raise RigError(f"{path} cannot be read ({error.strerror or error}); give the path of a {kind}.") from error
     except UnicodeDecodeError as error:
         raise RigError(f"{path} is not a text file in UTF-8 ({error.reason}); give a YAML file.") from error
+    return parse_yaml(text, str(path), kind)
+
+
+def parse_yaml(text: str, path: str, kind: str = "rig file") -> YamlValue:
+    """The YAML `text`, composed but never constructed; `path` names its place, `kind` what it is, in sentences.
+
+    Raises RigError where it is not YAML or is empty.
+    """
+    try:
+        # OpenCV heads its files with a directive that YAML does not have.
+        root = yaml.compose(re.sub(r"\A%YAML:1\.0", "#", text), Loader=yaml.SafeLoader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         place = f"{path}:{mark.line + 1}" if mark else str(path)
@@ -168,7 +176,7 @@ def read_yaml(path: Path, kind: str = "rig file") -> YamlValue:
         raise RigError(f"{path} is not valid YAML ({str(error).splitlines()[0]}); correct it.") from error
     if root is None:
         raise RigError(f"{path} is empty; give a {kind}.")
-    return YamlValue(root, str(path), "")
+    return YamlValue(root, path, "")
 
 
 def suggestion(name: str, valid: tuple[str, ...]) -> str:

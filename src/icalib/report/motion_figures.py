@@ -7,6 +7,7 @@ import numpy as np
 from icalib.calibration import Calibration
 from icalib.geometry import so3
 from icalib.geometry.targets import Target, target_from_plain
+from icalib.report import rig_shapes
 from icalib.report.plot import (
     AXIS_COLORS,
     COLORS,
@@ -71,24 +72,19 @@ def trajectory(c: Calibration) -> Figure:
 
 
 def _board(c: Calibration) -> list[dict]:
-    """Outlines of the target's bodies as they stand in each recording; without an IMU the scene's frame is the
-    world's."""
-    target = target_from_plain(c.rig)
-    tilts = [g for g in c.groups if g.name == "tilt"]
-    if target is None or not (tilts or c.imu is None):
+    """Outlines of the target's bodies as they stand in each recording."""
+    target, stands = target_from_plain(c.rig), rig_shapes.scene_in_worlds(c)
+    if target is None or not stands:
         return []
     shown = c.bodies or target.bodies
     outline = np.concatenate([_outline(c, target, target.bodies.index(body)) for body in shown])
-    stands = [(g.value, g.sensor) for g in tilts] or [(np.eye(3), "board0")]
-    return [path_3d(outline @ R.T, name, "#be185d") for R, name in stands]
+    return [path_3d(outline @ R.T, name, "#be185d") for name, R in stands]
 
 
 def _outline(c: Calibration, target: Target, body: int) -> np.ndarray:
     """(6, 3) the rectangle about a body in the scene, the pen lifted behind it."""
-    (x0, y0, _), (x, y, _) = (f(target.points[target.body == body], axis=0) for f in (np.min, np.max))
-    corners = np.array([(x0, y0, 0.0), (x, y0, 0.0), (x, y, 0.0), (x0, y, 0.0), (x0, y0, 0.0)])
     T = c.T_scene_body(target.bodies[body]) if c.bodies else np.eye(4)
-    return np.vstack([corners @ T[:3, :3].T + T[:3, 3], np.full((1, 3), np.nan)])
+    return rig_shapes.body_outline(target, body) @ T[:3, :3].T + T[:3, 3]
 
 
 def _seams(c: Calibration) -> np.ndarray:

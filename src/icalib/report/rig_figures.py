@@ -5,17 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from icalib.calibration import Calibration
+from icalib.report import rig_shapes
 from icalib.report.plot import AXIS_COLORS, COLORS, VIEW, Figure, axis, figure, numbers, path_3d
-
-_PEN_UP = np.full((1, 3), np.nan)
-_ROUND = np.linspace(0.0, 2.0 * np.pi, 41)
+from icalib.report.rig_shapes import PEN_UP
 
 
 def rig_picture(c: Calibration) -> Figure:
     """Frames of all sensors, the cameras' fields of view, rings about LiDARs, and wheels, in the imu frame."""
-    frames = {c.body: np.eye(4)} | {name: c.T_imu_sensor(name) for name in c.mounted}
+    frames, spread = rig_shapes.frames(c), rig_shapes.spread(c)
     origins = np.array([T[:3, 3] for T in frames.values()])
-    spread = max(np.ptp(np.vstack([origins, np.zeros(3)]), axis=0).max(), 0.02)
     traces = [
         path_3d(
             _axis_line(frames, i, 0.25 * spread), "xyz"[i], AXIS_COLORS[i], line={"color": AXIS_COLORS[i], "width": 6}
@@ -23,8 +21,8 @@ def rig_picture(c: Calibration) -> Figure:
         for i in range(3)
     ]
     shapes = {name: _frustum(c, name, 0.45 * spread) for name in c.cameras}
-    shapes |= {name: _rings(0.3 * spread) for name in c.lidars}
-    shapes |= {name: _axle(c, name) for name in c.wheels}
+    shapes |= {name: rig_shapes.rings(0.3 * spread) for name in c.lidars}
+    shapes |= {name: rig_shapes.axle(c, name) for name in c.wheels}
     for i, (name, pen) in enumerate(shapes.items()):
         color, T = COLORS[i % len(COLORS)], frames[name]
         traces.append(path_3d(pen @ T[:3, :3].T + T[:3, 3], name, color, line={"color": color, "width": 2}))
@@ -39,31 +37,9 @@ def rig_picture(c: Calibration) -> Figure:
     return figure(traces, 520, scene=scene | VIEW, margin={"l": 0, "r": 0, "t": 30, "b": 0})
 
 
-def _rings(radius: float) -> np.ndarray:
-    """Three circles about z, as a spinning LiDAR looks level, up and down."""
-    x, y = np.cos(_ROUND), np.sin(_ROUND)
-    tilted = ((np.cos(e), np.sin(e)) for e in np.deg2rad([-15.0, 0.0, 15.0]))
-    circles = [radius * np.stack([a * x, a * y, np.full_like(x, b)], axis=1) for a, b in tilted]
-    return np.vstack([part for circle in circles for part in (circle, _PEN_UP)])
-
-
-def _axle(c: Calibration, name: str) -> np.ndarray:
-    """The two wheels as discs, and the axle between them; nothing where radii and baseline are not known."""
-    known = {g.name: g.value for g in c.groups if g.sensor == name}
-    if "radii" not in known:
-        return _PEN_UP
-    left, right = (np.array([0.0, s * 0.5 * known["baseline"][0], 0.0]) for s in (1.0, -1.0))
-    rim = np.stack([np.cos(_ROUND), np.zeros_like(_ROUND), np.sin(_ROUND)], axis=1)
-    discs = [(hub + r * rim, hub + r * rim[::5]) for hub, r in zip((left, right), known["radii"], strict=True)]
-    pen = [left, right, _PEN_UP]
-    for hub, (circle, ends) in zip((left, right), discs, strict=True):
-        pen += [circle, _PEN_UP, *(np.stack([hub, end, _PEN_UP[0]]) for end in ends)]
-    return np.vstack(pen)
-
-
 def _axis_line(frames: dict[str, np.ndarray], i: int, length: float) -> np.ndarray:
     pieces = [np.stack([T[:3, 3], T[:3, 3] + length * T[:3, i]]) for T in frames.values()]
-    return np.concatenate([np.vstack([p, _PEN_UP]) for p in pieces])
+    return np.concatenate([np.vstack([p, PEN_UP]) for p in pieces])
 
 
 def _frustum(c: Calibration, name: str, depth: float) -> np.ndarray:
@@ -75,7 +51,7 @@ def _frustum(c: Calibration, name: str, depth: float) -> np.ndarray:
     a, b = np.clip((u - cx) / fx, -widest, widest), np.clip((v - cy) / fy, -widest, widest)
     corners = depth * np.stack([a, b, np.ones(4)], axis=1)
     origin = np.zeros(3)
-    return np.vstack([corners, corners[:1], _PEN_UP, *(np.stack([origin, p, _PEN_UP[0]]) for p in corners)])
+    return np.vstack([corners, corners[:1], PEN_UP, *(np.stack([origin, p, PEN_UP[0]]) for p in corners)])
 
 
 def correlation(c: Calibration) -> Figure:

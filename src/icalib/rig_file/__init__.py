@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
+import yaml
+
 from icalib.geometry.cameras import CAMERA_MODELS
 from icalib.geometry.targets import NoTarget, Scene, Target
 from icalib.imu_classes import DEFAULT_CLASS, IMU_CLASSES, class_noise
@@ -27,7 +29,7 @@ from icalib.rig_file.fields import MOUNTED, choice_or, groups_to_plain, mounting
 from icalib.rig_file.wheels import read_wheels, wheels_to_plain
 from icalib.rig_parameters import imu_intrinsics_parameter, parameter_to_plain, vector_parameter
 from icalib.rig_targets import NAME, target_of, target_or_targets
-from icalib.yaml_nodes import YamlValue, read_yaml
+from icalib.yaml_nodes import YamlValue, parse_yaml, read_yaml
 
 _SENSOR_TYPES = ("imu", "camera", "lidar", "wheels", "pose")
 _DENSITIES = ("gyro", "gyro_walk", "accel", "accel_walk")
@@ -36,7 +38,15 @@ _DENSITIES = ("gyro", "gyro_walk", "accel", "accel_walk")
 def load_rig(path: str | Path) -> Rig:
     """Read a rig file. Raises RigError, one sentence naming file, line, field, what is wrong and what to do."""
     file = Path(path)
-    root = read_yaml(file)
+    return dataclasses.replace(_rig(read_yaml(file)), path=file)
+
+
+def rig_from_dict(plain: dict[str, Any], source: str) -> Rig:
+    """The rig that `rig_to_dict` gave as `plain`; `source` names it in sentences. Raises RigError as `load_rig`."""
+    return _rig(parse_yaml(yaml.safe_dump(plain, sort_keys=False), source))
+
+
+def _rig(root: YamlValue) -> Rig:
     found = root.record(("sensors",), ("target", "targets", "gravity", "settings"))
     sensors = _sensors(found["sensors"])
     blind = [c.name for c in sensors.cameras if c.tracks is None]
@@ -53,7 +63,6 @@ def load_rig(path: str | Path) -> Rig:
         target=target_or_targets(root) if targeted else NoTarget(),
         gravity=found["gravity"].positive() if "gravity" in found else Rig.gravity,
         settings=_settings(found["settings"]) if "settings" in found else Settings(),
-        path=file,
         lidars=tuple(sensors.lidars),
         wheels=tuple(sensors.wheels),
         poses=tuple(sensors.poses),

@@ -1,0 +1,40 @@
+"""Which windows the viewer opens: the world, the rig, each camera, and lines over time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from icalib.calibration import Calibration
+from icalib.view.scene import place
+from icalib.view.stream import TIMELINE
+
+
+def blueprint(rr: Any, c: Calibration, readings: bool) -> Any:
+    """The layout; `readings`: those of the IMU are shown."""
+    b = rr.blueprint
+    images = [b.Spatial2DView(origin=f"{place(c, name)}/image", name=name) for name in c.cameras]
+    rig = b.Spatial3DView(origin=f"world/{c.body}", name="rig")
+    shown = [b.TimeSeriesView(origin=f"residuals/{name}", name=f"residuals of {name}") for name in _measured(c)]
+    if c.imu is not None:
+        shown.append(b.TimeSeriesView(origin="motion", name="motion"))
+    if readings and c.imu is not None:
+        shown.append(b.TimeSeriesView(origin=f"readings/{c.imu}", name=f"readings of {c.imu}"))
+    right = b.Vertical(b.Tabs(rig, b.TextDocumentView(origin="summary", name="summary")), *images[:2])
+    # All points of all planes at once hide what moves among them.
+    space = [b.Spatial3DView(origin="world", contents=["$origin/**", "- $origin/planes/**"], name="world")]
+    if c.lidar_residuals:
+        parts = [f"$origin/{part}/**" for part in ("planes", "target", "way")]
+        space.append(b.Spatial3DView(origin="world", contents=parts, name="planes"))
+    left = b.Vertical(b.Tabs(*space), b.Tabs(*shown), row_shares=[3, 1])
+    more = [b.Tabs(*images[2:])] if images[2:] else []
+    return b.Blueprint(
+        b.Horizontal(left, right, *more, column_shares=[3, 2, 1][: 2 + len(more)]),
+        b.TimePanel(timeline=TIMELINE, state="collapsed"),
+        collapse_panels=True,
+    )
+
+
+def _measured(c: Calibration) -> list[str]:
+    """Sensors of which something is left over time."""
+    residuals = (*c.corner_residuals, *c.lidar_residuals, *c.wheel_residuals, *c.pose_residuals)
+    return list(dict.fromkeys([*(r.sensor for r in residuals), *([c.imu] if c.imu else [])]))

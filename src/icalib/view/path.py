@@ -1,0 +1,82 @@
+"""Where the body was at any instant, from the nodes of a result."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.calibration import Calibration
+from icalib.geometry import so3
+
+LONGEST_STEP_S = 0.5  # between nodes; what lies between two that are further apart is not known
+_AT_NODE_S = 1e-6
+
+
+@dataclass(frozen=True)
+class Path:
+    """A cubic through the nodes: of positions, and of the rotation vector from each node to the next.
+
+    The slopes at the nodes are those of the parabola through a node and its neighbours; that of the rotation is the
+    angular rate in the body's axes. K nodes, seconds on the clock of the result. usable (K - 1,): the interval can be
+    looked into.
+    """
+
+    seconds: np.ndarray  # (K,)
+    rotation: np.ndarray  # (K, 3, 3) R_world_body
+    position: np.ndarray  # (K, 3) m, world
+    turn: np.ndarray  # (K - 1, 3) rad
+    rate: np.ndarray  # (K, 3) rad/s
+    slope: np.ndarray  # (K, 3) m/s
+    usable: np.ndarray
+
+    @classmethod
+    def of(cls, c: Calibration) -> Path:
+        path = c.trajectory
+        step = np.diff(path.seconds)
+        usable = (np.diff(c.recording_of(path.seconds)) == 0) & (step <= LONGEST_STEP_S)
+        between = np.einsum("kji,kjl->kil", path.rotation[:-1], path.rotation[1:])
+        turn = so3.log_many(np.ascontiguousarray(between))
+        rate = _slopes(turn / step[:, None], step, usable)
+        slope = _slopes(np.diff(path.position, axis=0) / step[:, None], step, usable)
+        return cls(path.seconds, path.rotation, path.position, turn, rate, slope, usable)
+
+    def at(self, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """R_world_body (n, 3, 3), p_world_body (n, 3) at `seconds` (n,) of the result, and (n,) bool: where they are
+        known. Elsewhere they are those of a node nearby."""
+        last = max(len(self.seconds) - 2, 0)
+        k = np.clip(np.searchsorted(self.seconds, seconds, side="right") - 1, 0, last)
+        h = self.seconds[k + 1] - self.seconds[k]
+        s = np.clip((seconds - self.seconds[k]) / h, 0.0, 1.0)
+        node = np.where(s < 0.5, k, k + 1)
+        at_node = np.abs(seconds - self.seconds[node]) <= _AT_NODE_S
+        inside = self.usable[k] & (seconds >= self.seconds[0]) & (seconds <= self.seconds[-1])
+        s = np.where(inside, s, np.round(s))[:, None]
+        turn = self.turn[k]
+        # The rate at the far node as a derivative of the rotation vector: the inverse right Jacobian, to second order.
+        far = self.rate[k + 1]
+        far = far + 0.5 * np.cross(turn, far) + np.cross(turn, np.cross(turn, far)) / 12.0
+        phi = _hermite(s, turn, h[:, None] * self.rate[k], h[:, None] * far)
+        moved = self.position[k + 1] - self.position[k]
+        way = _hermite(s, moved, h[:, None] * self.slope[k], h[:, None] * self.slope[k + 1])
+        R = self.rotation[k] @ so3.exp_many(np.ascontiguousarray(phi))
+        return R, self.position[k] + way, inside | at_node
+
+
+def _slopes(between: np.ndarray, step: np.ndarray, usable: np.ndarray) -> np.ndarray:
+    """(K, 3) at the nodes, from the mean slopes `between` them (K - 1, 3); those across gaps have no part in it."""
+    weight = np.zeros((2, len(step) + 1))  # of the interval before and behind each node
+    weight[0, 1:], weight[1, :-1] = usable, usable
+    i = np.flatnonzero((weight > 0.0).all(axis=0))
+    weight[0, i], weight[1, i] = step[i], step[i - 1]
+    padded = np.zeros((2, len(step) + 1, 3))
+    padded[0, 1:], padded[1, :-1] = between, between
+    total = np.maximum(weight.sum(axis=0), np.finfo(float).tiny)
+    return (weight[:, :, None] * padded).sum(axis=0) / total[:, None]
+
+
+def _hermite(s: np.ndarray, end: np.ndarray, before: np.ndarray, behind: np.ndarray) -> np.ndarray:
+    """The cubic from 0 at s = 0 to `end` at s = 1, with derivatives by s `before` and `behind` there."""
+    s2 = s * s
+    s3 = s2 * s
+    return (3.0 * s2 - 2.0 * s3) * end + (s3 - 2.0 * s2 + s) * before + (s3 - s2) * behind

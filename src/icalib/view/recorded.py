@@ -1,0 +1,193 @@
+"""The recording beside its result: readings, images and scans where the calibration puts them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path as FilePath
+
+import numpy as np
+
+from icalib.calibration import Calibration, RecordingSpan
+from icalib.errors import CalibrationError, RecordingError
+from icalib.measurements import LidarStream
+from icalib.recordings import DamagedImageError, Recording, decode, image_topics
+from icalib.rig import Camera, ImuSensor, Lidar, Rig
+from icalib.view.colors import by_value
+from icalib.view.path import Path
+from icalib.view.scene import POINT, place
+from icalib.view.series import log_lines
+from icalib.view.stream import Stream
+
+MOST_READINGS = 100_000
+MOST_IMAGES = 600  # of a camera
+MOST_SCANS, MOST_POINTS = 400, 15_000  # of a LiDAR, of a scan
+JPEG_QUALITY = 75
+_EDGE_S = 1.0  # around the result, in which data still are of it
+_HEIGHTS = (2.0, 98.0)  # percentiles between which colours change
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Clock:
+    """From raw stamps of one sensor to seconds of the result: the body's clock shows what this sensor's shows, and
+    `offset_s` more."""
+
+    span: RecordingSpan
+    offset_s: float
+
+    @classmethod
+    def of(cls, c: Calibration, span: RecordingSpan, sensor: str) -> Clock:
+        found = (float(g.value[0]) for g in c.groups if (g.sensor, g.name) == (sensor, "time_offset"))
+        return cls(span, next(found, 0.0))
+
+    def seconds(self, stamps_ns: np.ndarray) -> np.ndarray:
+        """(n,) from int64 stamps; whole nanoseconds are subtracted first, so that no digit is lost."""
+        since = stamps_ns - np.int64(self.span.origin_ns) + np.int64(round(1e9 * self.offset_s))
+        return self.span.start + 1e-9 * since.astype(np.float64)
+
+    def within(self, seconds: np.ndarray) -> np.ndarray:
+        """(n,) bool: during the recording, or so close to it that it is of it."""
+        return (seconds > self.span.start - _EDGE_S) & (seconds < self.span.end + _EDGE_S)
+
+
+def span_of(c: Calibration, recording: FilePath) -> RecordingSpan:
+    """The recording of the result that lies at a path. Raises CalibrationError where it is none of them."""
+    if not c.recordings:
+        raise CalibrationError("the result does not say when its recording was; calibrate again to see both.")
+    path = recording.resolve()
+    named = [span for span in c.recordings if span.name in (path.name, str(path))]
+    if len(c.recordings) == 1 or named:
+        return (named or c.recordings)[0]
+    names = ", ".join(span.name for span in c.recordings)
+    raise CalibrationError(f"{recording} is none of the recordings of the result, which are {names}; give one of them.")
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """One of the recordings of a result, opened. Everything here raises RecordingError, one sentence."""
+
+    calibration: Calibration
+    rig: Rig
+    recording: Recording
+    span: RecordingSpan
+    where: FilePath
+
+    def check(self) -> None:
+        """Raises where a sensor of the result is not in the recording."""
+        mounted = (*self.rig.lidars, *self.rig.wheels, *self.rig.poses)
+        for sensor in (*([self.rig.imu] if self.rig.imu else []), *mounted):
+            self.recording.where(sensor)
+        for camera in self.rig.cameras:
+            if camera.tracks is None or self.recording.sees(camera):
+                self.recording.where(camera)
+
+    def log(self, s: Stream, progress: Progress) -> list[str]:
+        """Logs all, and returns sentences on what was left out."""
+        topics = image_topics(self.recording, [c for c in self.rig.cameras if self._pictured(c)])
+        imus = () if self.rig.imu is None else (self.rig.imu,)
+        work = [(sensor.name, lambda x=sensor: self._readings(s, x)) for sensor in imus]
+        work += [(sensor.name, lambda x=sensor: self._scans(s, x)) for sensor in self.rig.lidars]
+        work += [(name, lambda n=name, t=topic: self._images(s, n, t)) for name, topic in topics.items()]
+        notes = [f"{c.name}: the recording holds no images of it." for c in self.rig.cameras if c.name not in topics]
+        for k, (name, do) in enumerate(work):
+            progress(f"showing {name}", k / len(work))
+            notes += do()
+        return notes
+
+    def _pictured(self, camera: Camera) -> bool:
+        """Whether there are images of the camera. Where its corners come from a table, the only images that there are
+        may be another camera's."""
+        try:
+            topic = self.recording.image_topic(camera)
+        except RecordingError:
+            return False
+        named = camera.topic is not None or camera.name in topic.split("/")
+        return named or not self.recording.has_corners(camera)
+
+    def _clock(self, sensor: str) -> Clock:
+        return Clock.of(self.calibration, self.span, sensor)
+
+    def _during(self, sensor: str, seconds: np.ndarray) -> np.ndarray:
+        """Indices of what lies within the result. Raises where nothing does."""
+        inside = np.flatnonzero(self._clock(sensor).within(seconds))
+        if not len(inside):
+            raise RecordingError(
+                f"{self.where} holds nothing of {sensor} from the time of the result; give the recording "
+                f"{self.span.name}, of which the result is."
+            )
+        return inside
+
+    def _readings(self, s: Stream, sensor: ImuSensor) -> list[str]:
+        imu = self.recording.imu(sensor)
+        seconds = self._clock(sensor.name).seconds(imu.stamps_ns)
+        inside = self._during(sensor.name, seconds)
+        keep = inside[:: _stride(len(inside), MOST_READINGS)]
+        keep = keep[np.argsort(seconds[keep], kind="stable")]
+        log_lines(s, f"readings/{sensor.name}/gyro", seconds[keep], np.rad2deg(imu.gyro[keep]), "xyz")
+        log_lines(s, f"readings/{sensor.name}/accel", seconds[keep], imu.accel[keep], "xyz")
+        return _thinned(sensor.name, len(inside), MOST_READINGS, "readings")
+
+    def _images(self, s: Stream, name: str, topic: str) -> list[str]:
+        """One after the other, and of those that are left out not even the pixels."""
+        seconds = self._clock(name).seconds(self.recording.stamps(topic))
+        count = len(self._during(name, np.sort(seconds)))
+        clock, damaged, shown = self._clock(name), 0, 0
+        within = (p for p in self.recording.payloads(topic) if clock.within(_instant(clock, p.stamp_ns))[0])
+        for payload in islice(within, 0, None, _stride(count, MOST_IMAGES)):
+            try:
+                image = s.rr.Image(decode(payload), "L").compress(jpeg_quality=JPEG_QUALITY)
+            except DamagedImageError:
+                damaged += 1
+                continue
+            s.at(f"{place(self.calibration, name)}/image", float(_instant(clock, payload.stamp_ns)[0]), image)
+            shown += 1
+        notes = [f"{name}: {damaged} images are damaged, and not shown."] if damaged else []
+        return notes + _thinned(name, count, MOST_IMAGES, "images")
+
+    def _scans(self, s: Stream, sensor: Lidar) -> list[str]:
+        stream = self.recording.lidar(sensor)
+        seconds = self._clock(sensor.name).seconds(stream.stamps_ns)
+        inside = self._during(sensor.name, seconds)
+        heights, path = None, Path.of(self.calibration)
+        for k in inside[:: _stride(len(inside), MOST_SCANS)]:
+            points = self.points_in_world(path, sensor.name, stream, int(k), float(seconds[k]))
+            if len(points) and heights is None:
+                heights = np.percentile(points[:, 2], _HEIGHTS)
+            low, high = (0.0, 1.0) if heights is None else heights
+            colors, radius = by_value(points[:, 2], low, high), s.rr.Radius.ui_points(POINT)
+            cloud = s.rr.Points3D(points, colors=colors, radii=radius)
+            s.at(f"world/scans/{sensor.name}", float(seconds[k]), cloud)
+        most = int(np.diff(stream.start)[inside].max())
+        return [
+            *_thinned(sensor.name, len(inside), MOST_SCANS, "scans"),
+            *_thinned(sensor.name, most, MOST_POINTS, "points of a scan"),
+        ]
+
+    def points_in_world(self, path: Path, name: str, stream: LidarStream, scan: int, second: float) -> np.ndarray:
+        """(n, 3) float32 points of a scan in the world [m], each moved by the pose of the body at its own instant.
+
+        They are thinned evenly to MOST_POINTS; those whose instant the trajectory does not reach are left out."""
+        begin, end = (int(x) for x in stream.start[scan : scan + 2])
+        own = slice(begin, end, _stride(end - begin, MOST_POINTS))
+        T = self.calibration.T_imu_sensor(name)
+        R, p, known = path.at(second + stream.offset_s[own].astype(np.float64))
+        on_body = stream.xyz[own].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
+        world = np.einsum("nij,nj->ni", R, on_body) + p
+        return world[known].astype(np.float32)
+
+
+def _instant(clock: Clock, stamp_ns: int) -> np.ndarray:
+    return clock.seconds(np.array([stamp_ns], np.int64))
+
+
+def _stride(count: int, most: int) -> int:
+    """Every how many-th of `count` to take, so that no more than `most` are left."""
+    return max(1, -(-count // most))
+
+
+def _thinned(name: str, count: int, most: int, what: str) -> list[str]:
+    stride = _stride(count, most)
+    return [f"{name}: of its {count} {what} one in {stride} is shown."] if stride > 1 else []

@@ -1,0 +1,153 @@
+"""The solution in space: the rig, how well it is known, its way, the target, and points on planes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from icalib.calibration import Calibration, RecordingSpan, joint_covariance
+from icalib.geometry.targets import target_from_plain
+from icalib.report import rig_shapes
+from icalib.report.plot import COLORS
+from icalib.report.quantities import worst
+from icalib.view.colors import by_value, rgb
+from icalib.view.stream import Stream
+
+SIGMAS = 3.0
+POINT = 1.5  # radius of a point of a LiDAR, in points of the screen
+_LARGEST = 0.4  # of the spread of the rig, up to which the best known ellipsoids are magnified
+_VERDICT_COLORS = {"determined": "#15803d", "weak": "#d97706", "undetermined": "#dc2626"}
+_TARGET, _WAY = "#be185d", "#64748b"
+_WORST_OF_SCALE = 4.0  # of a scale of colours, in RMS of the result
+
+
+def place(c: Calibration, sensor: str) -> str:
+    """The entity of a sensor: the body is in the world, all else on the body."""
+    return f"world/{sensor}" if sensor == c.body else f"world/{c.body}/{sensor}"
+
+
+def spans(c: Calibration) -> tuple[RecordingSpan, ...]:
+    """The recordings of the result; one without a name where it does not list them."""
+    ends = c.trajectory.seconds[[0, -1]].tolist()
+    return c.recordings or (RecordingSpan("", ends[0], ends[1], 0),)
+
+
+def log_rig(s: Stream, c: Calibration) -> None:
+    """Frames of all sensors, fields of view, rings about LiDARs, wheels; all but the body stand still on it."""
+    spread = rig_shapes.spread(c)
+    for name, T in rig_shapes.frames(c).items():
+        s.still(place(c, name), s.rr.TransformAxes3D(0.25 * spread))
+        if name != c.body:
+            s.still(place(c, name), s.rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
+    for name in c.cameras:
+        s.still(f"{place(c, name)}/image", _pinhole(s, c, name, 0.45 * spread))
+    shapes = {name: rig_shapes.rings(0.3 * spread) for name in c.lidars}
+    shapes |= {name: rig_shapes.axle(c, name) for name in c.wheels}
+    for i, (name, pen) in enumerate(shapes.items()):
+        strips = s.rr.LineStrips3D(_strips(pen), colors=rgb(COLORS[i % len(COLORS)]))
+        s.still(f"{place(c, name)}/shape", strips)
+
+
+def _pinhole(s: Stream, c: Calibration, name: str, depth: float):
+    """Rerun's pixel (0, 0) is the corner of the image, ours the centre of its first pixel; it knows no distortion."""
+    fx, fy, cx, cy = c.group(name, "intrinsics").value
+    return s.rr.Pinhole(
+        resolution=c.rig["sensors"][name]["resolution"], focal_length=(fx, fy), principal_point=(cx + 0.5, cy + 0.5),
+        image_plane_distance=depth,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Ellipsoid:
+    """Where a sensor may be: axes (3, 3) of unit length in columns, imu frame; half_sizes (3,) [m], of SIGMAS standard
+    deviations, empirical factors included."""
+
+    sensor: str
+    verdict: str
+    axes: np.ndarray
+    half_sizes: np.ndarray
+
+
+def ellipsoids(c: Calibration) -> list[Ellipsoid]:
+    """Of the translation of each mounted sensor that was estimated."""
+    found = []
+    for name in c.mounted:
+        group = c.group(name, "translation")
+        if group.columns is None:
+            continue
+        values, axes = np.linalg.eigh(joint_covariance(c, [group]))
+        axes[:, 0] *= np.sign(np.linalg.det(axes))
+        found.append(Ellipsoid(name, worst(group.verdict), axes, SIGMAS * np.sqrt(np.maximum(values, 0.0))))
+    return found
+
+
+def magnification(c: Calibration) -> float:
+    """The power of ten by which ellipsoids are drawn larger: as large as they can be while those that are determined,
+    or where none is the smallest one, stay smaller than the rig."""
+    sizes = [(e.verdict, float(e.half_sizes.max())) for e in ellipsoids(c)]
+    shown = [size for verdict, size in sizes if verdict == "determined"] or [min((x for _, x in sizes), default=0.0)]
+    if not 0.0 < max(shown) < np.inf:
+        return 1.0
+    return max(1.0, 10.0 ** float(np.floor(np.log10(_LARGEST * rig_shapes.spread(c) / max(shown)))))
+
+
+def log_uncertainty(s: Stream, c: Calibration) -> None:
+    """The ellipsoids, magnified alike, coloured by verdict."""
+    factor = magnification(c)
+    for e in ellipsoids(c):
+        ellipsoid = s.rr.Ellipsoids3D(
+            half_sizes=[factor * e.half_sizes], centers=[c.group(e.sensor, "translation").value],
+            quaternions=[Rotation.from_matrix(e.axes).as_quat()], colors=rgb(_VERDICT_COLORS[e.verdict]),
+            labels=[f"{e.sensor}: {SIGMAS:g} sigma x {factor:g}"], show_labels=False,
+        )  # fmt: skip
+        s.still(f"world/{c.body}/uncertainty/{e.sensor}", ellipsoid)
+
+
+def log_motion(s: Stream, c: Calibration) -> None:
+    """The pose of the body at every node, and the way of each recording from its start on."""
+    path = c.trajectory
+    s.still("world", s.rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+    s.over(
+        f"world/{c.body}", path.seconds,
+        s.rr.Transform3D.columns(translation=path.position, mat3x3=path.rotation.reshape(-1, 9)),
+    )  # fmt: skip
+    of = c.recording_of(path.seconds)
+    for k, span in enumerate(spans(c)):
+        s.at("world/way", span.start, s.rr.LineStrips3D([path.position[of == k]], colors=rgb(_WAY)))
+
+
+def log_target(s: Stream, c: Calibration) -> None:
+    """Outline and points of each body of the target, as the scene stands in the world of each recording."""
+    target, stands = target_from_plain(c.rig), rig_shapes.scene_in_worlds(c)
+    if target is None or not stands:
+        return
+    for span, (_, R) in zip(spans(c), stands, strict=False):
+        s.at("world/target", span.start, s.rr.Transform3D(mat3x3=R))
+    for body in c.bodies or target.bodies:
+        k, T = target.bodies.index(body), c.T_scene_body(body) if c.bodies else np.eye(4)
+        entity = f"world/target/{body}"
+        s.still(entity, s.rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
+        outline = _strips(rig_shapes.body_outline(target, k))
+        s.still(f"{entity}/outline", s.rr.LineStrips3D(outline, colors=rgb(_TARGET)))
+        s.still(f"{entity}/points", s.rr.Points3D(target.points[target.body == k], colors=rgb(_TARGET)))
+
+
+def log_planes(s: Stream, c: Calibration) -> None:
+    """Points of LiDARs on the planes that they were found to lie on, coloured by how far off they are."""
+    for r in c.lidar_residuals:
+        of, size = c.recording_of(r.seconds), np.abs(r.residual.astype(np.float64))
+        top = _WORST_OF_SCALE * float(np.sqrt(np.mean(size**2))) if len(size) else 1.0
+        for k, span in enumerate(spans(c)):
+            own = of == k
+            colors, radius = by_value(size[own], 0.0, top), s.rr.Radius.ui_points(POINT)
+            points = s.rr.Points3D(r.world[own], colors=colors, radii=radius)
+            s.at(f"world/planes/{r.sensor}", span.start, points)
+
+
+def _strips(pen: np.ndarray) -> list[np.ndarray]:
+    """Lines from points (N, 3) in which a row of NaN lifts the pen."""
+    up = np.isnan(pen[:, 0])
+    pieces = np.split(pen, np.flatnonzero(up))
+    return [p for piece in pieces if len(p := piece[~np.isnan(piece[:, 0])]) > 1]

@@ -1,0 +1,84 @@
+"""What is left of the measurements, and the motion, over time."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+from icalib.calibration import Calibration, CornerResiduals, LidarResiduals
+from icalib.report.motion_figures import BLOCKS
+from icalib.report.plot import AXIS_COLORS, COLORS
+from icalib.view.colors import rgb
+from icalib.view.scene import place
+from icalib.view.stream import Stream
+
+BIN_S = 0.1  # over which points of a LiDAR are taken together
+_CORNER = 3.0  # radius, in points of the screen
+_GOOD, _REJECTED = "#22c55e", "#dc2626"
+
+
+def log_residuals(s: Stream, c: Calibration) -> None:
+    """Of cameras the RMS of each image [px], of LiDARs that of each tenth of a second [mm], of all else whitened."""
+    for r in c.corner_residuals:
+        seconds, rms = rms_of_images(r)
+        log_lines(s, f"residuals/{r.sensor}", seconds, rms[:, None], ["RMS [px]"])
+        _log_corners(s, c, r)
+    for r in c.lidar_residuals:
+        seconds, rms = rms_of_bins(r)
+        log_lines(s, f"residuals/{r.sensor}", seconds, 1e3 * rms[:, None], ["RMS [mm]"])
+    if c.imu is not None:
+        for b, block in enumerate(BLOCKS):
+            columns = c.imu_residuals.whitened[:, 3 * b : 3 * b + 3]
+            log_lines(s, f"residuals/{c.imu}/{block.replace(' ', '_')}", c.imu_residuals.seconds, columns, "xyz")
+    for r in (*c.wheel_residuals, *c.pose_residuals):
+        for k, label in enumerate(r.labels):
+            entity = f"residuals/{r.sensor}/{re.sub(r'[^0-9a-zA-Z]+', '_', label)}"
+            log_lines(s, entity, r.seconds, r.whitened[:, k : k + 1], [f"{label}, whitened"])
+
+
+def log_states(s: Stream, c: Calibration) -> None:
+    """Velocity [m/s] and biases [deg/s, m/s^2] at the nodes; without an IMU they say nothing."""
+    path = c.trajectory
+    if c.imu is None:
+        return
+    log_lines(s, "motion/velocity", path.seconds, path.velocity, "xyz")
+    log_lines(s, "motion/gyro_bias", path.seconds, np.rad2deg(path.gyro_bias), "xyz")
+    log_lines(s, "motion/accel_bias", path.seconds, path.accel_bias, "xyz")
+
+
+def log_lines(s: Stream, entity: str, seconds: np.ndarray, values: np.ndarray, names: Sequence[str]) -> None:
+    """Lines over time: values (n, m), a column for each of the m names."""
+    colors = AXIS_COLORS if len(names) == 3 else COLORS[: len(names)]
+    s.still(entity, s.rr.SeriesLines(names=list(names), colors=rgb(*colors)))
+    n, m = values.shape
+    s.over(entity, seconds, s.rr.Scalars.columns(scalars=values.reshape(-1)).partition([m] * n))
+
+
+def rms_of_images(r: CornerResiduals) -> tuple[np.ndarray, np.ndarray]:
+    """(m,) seconds and RMS [px] per coordinate of the images in which corners were used."""
+    image = np.repeat(np.arange(len(r.seconds)), np.diff(r.start))
+    used = ~r.rejected
+    count = np.bincount(image[used], minlength=len(r.seconds))
+    total = np.bincount(image[used], np.mean(r.residual[used].astype(np.float64) ** 2, axis=1), len(r.seconds))
+    some = count > 0
+    return r.seconds[some], np.sqrt(total[some] / count[some])
+
+
+def rms_of_bins(r: LidarResiduals) -> tuple[np.ndarray, np.ndarray]:
+    """(m,) middle [s] and RMS [m] of the stretches of time in which there are points."""
+    number, of = np.unique(np.floor(r.seconds / BIN_S).astype(np.int64), return_inverse=True)
+    total = np.bincount(of, r.residual.astype(np.float64) ** 2, len(number))
+    return BIN_S * (number + 0.5), np.sqrt(total / np.bincount(of, minlength=len(number)))
+
+
+def _log_corners(s: Stream, c: Calibration, r: CornerResiduals) -> None:
+    """Corners as they were measured, in the camera's image; red where they were set aside."""
+    if not len(r.uv):
+        return
+    rr, entity = s.rr, f"{place(c, r.sensor)}/image/corners"
+    s.still(entity, rr.Points2D.from_fields(radii=rr.Radius.ui_points(_CORNER)))
+    colors = rgb(_GOOD, _REJECTED)[r.rejected.astype(np.int64)]
+    columns = rr.Points2D.columns(positions=r.uv + 0.5, colors=colors).partition(np.diff(r.start))
+    s.over(entity, r.seconds, columns)

@@ -1,0 +1,65 @@
+"""From a result on disk to what the viewer shows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from icalib.calibration import Calibration, load_calibration
+from icalib.extras import load_rerun
+from icalib.recordings import open_recording
+from icalib.report.quantities import rows
+from icalib.rig_file import rig_from_dict
+from icalib.view.layout import blueprint
+from icalib.view.recorded import Recorded, span_of
+from icalib.view.scene import SIGMAS, log_motion, log_planes, log_rig, log_target, log_uncertainty, magnification
+from icalib.view.series import log_residuals, log_states
+from icalib.view.stream import Stream, opened
+
+
+def view(
+    result: str | Path,
+    recording: str | Path | None = None,
+    save: str | Path | None = None,
+    progress: Callable[[str, float], None] = lambda *_: None,
+) -> list[str]:
+    """Shows the result of a calibration, and the recording that it is of, in Rerun's viewer, or writes the file `save`
+    that the viewer opens. Returns sentences on what was left out.
+
+    result: the folder that a calibration was written to, or the result.json in it. Raises CalibrationError: there is no
+    result, the recording is not that of the result, the file cannot be written, or Rerun is not installed.
+    """
+    rr, folder = load_rerun(), Path(result)
+    folder = folder.parent if folder.name == "result.json" else folder
+    c = load_calibration(folder)
+    recorded = None if recording is None else _recorded(c, folder, Path(recording))
+    layout = blueprint(rr, c, recorded is not None)
+    with opened(rr, layout, None if save is None else Path(save)) as stream:
+        _log_result(stream, c)
+        notes = [] if recorded is None else recorded.log(stream, progress)
+        stream.still("summary", rr.TextDocument(summary(c, notes), media_type=rr.MediaType.MARKDOWN))
+    return notes
+
+
+def _recorded(c: Calibration, folder: Path, recording: Path) -> Recorded:
+    opened_recording = open_recording(recording)
+    rig = rig_from_dict(c.rig, str(folder / "result.json"))
+    found = Recorded(c, rig, opened_recording, span_of(c, recording), recording)
+    found.check()
+    return found
+
+
+def _log_result(stream: Stream, c: Calibration) -> None:
+    for log in (log_rig, log_uncertainty, log_motion, log_target, log_planes, log_residuals, log_states):
+        log(stream, c)
+
+
+def summary(c: Calibration, notes: list[str]) -> str:
+    """Status, parameters and what to know, in Markdown."""
+    sentences = [("Undetermined", c.undetermined), ("Warning", c.warnings), ("Shown", notes)]
+    if c.mounted:
+        sentences.append(("Ellipsoids", [f"{SIGMAS:g} sigma of each position, {magnification(c):g} times as large."]))
+    listed = [f"- {title}: {sentence}" for title, of in sentences for sentence in of]
+    table = ["| sensor | parameter | value | std | unit | verdict |", "|---|---|---|---|---|---|"]
+    table += [f"| {r.sensor} | {r.name} | {r.value} | {r.std} | {r.unit} | {r.verdict} |" for r in rows(c)]
+    return "\n".join([f"**{c.status}**", "", *listed, "", *table])

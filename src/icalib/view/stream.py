@@ -1,0 +1,86 @@
+"""What is sent to Rerun: to its viewer, or into a file that appears whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import uuid
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from icalib.errors import CalibrationError
+
+TIMELINE = "imu clock"
+_PATIENCE_S = 30.0  # until the viewer has taken what it was sent
+
+
+@dataclass(frozen=True)
+class Stream:
+    """One recording of Rerun, which may be watched while it grows. rr: the package, rec: its stream. All that is not
+    still stands on one timeline, in seconds of the result's clock."""
+
+    rr: Any
+    rec: Any
+
+    def still(self, entity: str, *what: Any) -> None:
+        """Logs archetypes that hold at all times."""
+        self.rec.log(entity, *what, static=True, strict=True)
+
+    def at(self, entity: str, seconds: float, *what: Any) -> None:
+        """Logs archetypes that hold from an instant on."""
+        self.rec.set_time(TIMELINE, duration=_rounded(np.array([seconds]))[0])
+        self.rec.log(entity, *what, strict=True)
+
+    def over(self, entity: str, seconds: np.ndarray, columns: Any) -> None:
+        """Sends columns with a row for each of the seconds (n,)."""
+        if len(seconds):
+            index = self.rr.TimeColumn(TIMELINE, duration=_rounded(seconds))
+            self.rec.send_columns(entity, [index], columns, strict=True)
+
+
+@contextlib.contextmanager
+def opened(rr: Any, blueprint: Any, save: Path | None) -> Iterator[Stream]:
+    """A stream into the file `save`, which replaces an old one once all is written; without it into a viewer that is
+    started. Raises CalibrationError where the file cannot be written, or there is no viewer."""
+    rec = rr.RecordingStream("icalib")
+    rec.set_log_time_enabled(False)
+    if save is None:
+        with _sentence("Rerun's viewer cannot be started or does not answer", "write a file by --save"):
+            rec.spawn(default_blueprint=blueprint)
+        yield Stream(rr, rec)
+        with _sentence("Rerun's viewer cannot be started or does not answer", "write a file by --save"):
+            rec.flush(timeout_sec=_PATIENCE_S)
+        return
+    part = save.parent / f".{save.name}.{uuid.uuid4().hex}.part"
+    try:
+        with _sentence(f"{save} cannot be written", "choose another place"):
+            if save.is_dir():
+                raise IsADirectoryError(0, "it is a folder")
+            rec.save(part, default_blueprint=blueprint)
+        yield Stream(rr, rec)
+        with _sentence(f"{save} cannot be written", "choose another place"):
+            rec.flush()
+            rec.disconnect()
+            os.replace(part, save)
+    finally:
+        rec.disconnect()
+        with contextlib.suppress(OSError):
+            part.unlink()
+
+
+@contextlib.contextmanager
+def _sentence(what: str, advice: str) -> Iterator[None]:
+    try:
+        yield
+    except (OSError, RuntimeError, ValueError) as error:
+        reason = (error.strerror if isinstance(error, OSError) else None) or str(error).splitlines()[0]
+        raise CalibrationError(f"{what} ({reason}); {advice}.") from error
+
+
+def _rounded(seconds: np.ndarray) -> np.ndarray:
+    """As Rerun counts: whole nanoseconds."""
+    return np.rint(1e9 * seconds).astype(np.int64).astype("timedelta64[ns]")
