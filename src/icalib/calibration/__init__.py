@@ -1,5 +1,6 @@
 """The result of a calibration: values with standard deviations and verdicts, saved and loaded whole."""
 
+from icalib.calibration.projection import ProjectionMap, projection_uncertainty, working_distance
 from icalib.calibration.relative import RelativePose, joint_covariance, relative_pose, relative_poses
 from icalib.calibration.result import (
     Calibration,
@@ -25,6 +26,7 @@ __all__ = [
     "ParameterGroup",
     "Plane",
     "PoseResiduals",
+    "ProjectionMap",
     "RecordingSpan",
     "RelativePose",
     "SensorFit",
@@ -35,6 +37,8 @@ __all__ = [
     "calibration_files",
     "joint_covariance",
     "load_calibration",
+    "projection_uncertainty",
     "relative_pose",
     "relative_poses",
+    "working_distance",
 ]

@@ -8,8 +8,8 @@ from string import Template
 
 import numpy as np
 
-from icalib.calibration import Calibration, CornerResiduals
-from icalib.report import corner_figures, motion_figures, rig_figures, robot_figures, tables
+from icalib.calibration import Calibration, CornerResiduals, ProjectionMap
+from icalib.report import corner_figures, motion_figures, projection_figures, rig_figures, robot_figures, tables
 from icalib.report.histogram import normalised_histogram
 from icalib.report.plot import Figure
 from icalib.report.tables import Html, element
@@ -23,6 +23,7 @@ def report_html(calibration: Calibration) -> str:
     """The whole report as one HTML document, plotly.js included."""
     c = calibration
     trust = tables.trust(c)
+    maps = {name: projection_figures.projection_maps(c, name) for name in c.cameras}
     words = {
         "sensors": " + ".join((*(() if c.imu is None else (c.imu,)), *c.mounted)),
         "size": tables.size_words(c),
@@ -44,6 +45,8 @@ def report_html(calibration: Calibration) -> str:
         "poses": Html(tables.poses(c) + tables.relative(c) + tables.bodies(c)),
         "corner_figures": _corner_sections(c),
         "without_corners": "" if _seen(c) else " hidden",
+        "projection_figures": _projection_sections(maps),
+        "without_cameras": "" if c.cameras else " hidden",
         "lidar_figures": _lidar_sections(c),
         "without_lidars": "" if c.lidar_residuals else " hidden",
         "wheel_figures": _wheel_sections(c),
@@ -55,7 +58,7 @@ def report_html(calibration: Calibration) -> str:
     }
     escaped = {name: tables.html(value) for name, value in words.items()}
     body = Template(resource("icalib.report", "page.html")).substitute(escaped | parts)
-    return document(f"Calibration of {words['sensors']}", body, _figures(c))
+    return document(f"Calibration of {words['sensors']}", body, _figures(c) | _projection_figures(c, maps))
 
 
 def document(title: str, body: str, figures: dict[str, Figure]) -> str:
@@ -106,6 +109,38 @@ def _corner_sections(c: Calibration) -> Html:
         plots = [plot_place(f"{kind}-{i}", css) for kind, css in (("plane", ""), ("image", ""), ("time", "wide"))]
         head = element("h3", [tables.html(r.sensor), element("small", f" {counts}")])
         sections.append(Html(head + element("div", plots, "pair")))
+    return Html("".join(sections))
+
+
+def _projection_figures(c: Calibration, maps: dict[str, list[ProjectionMap]]) -> dict[str, Figure]:
+    """The maps of camera i as `projection-i-0`, `projection-i-1`."""
+    seen, found = {r.sensor: r for r in _seen(c)}, {}
+    for i, (name, own) in enumerate(maps.items()):
+        size = c.rig["sensors"][name]["resolution"]
+        for k, m in enumerate(own):
+            found[f"projection-{i}-{k}"] = projection_figures.projection_figure(m, seen.get(name), size)
+    return found
+
+
+def _projection_sections(maps: dict[str, list[ProjectionMap]]) -> Html:
+    """Each camera, or that its lens is fixed."""
+    sections = []
+    for i, (name, own) in enumerate(maps.items()):
+        parts = [
+            element(
+                "div",
+                [
+                    element("h3", f"{name}: {projection_figures.title(m).lower()}"),
+                    element("p", projection_figures.words(m)),
+                    plot_place(f"projection-{i}-{k}"),
+                ],
+            )
+            for k, m in enumerate(own)
+        ]
+        fixed = element(
+            "p", f"{name}: intrinsics and distortion are fixed by the rig file, and taken as exact.", "quiet"
+        )
+        sections.append(element("div", parts, "pair") if parts else fixed)
     return Html("".join(sections))
 
 
