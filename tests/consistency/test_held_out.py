@@ -7,6 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.consistency.test_several import pair
+from tests.consistency.test_without_imu import alone, stereo
 
 from icalib.calibration import Calibration, HeldOut
 from icalib.measurements import Measurements
@@ -86,7 +88,9 @@ def test_errors_that_stay_for_a_second_show():
             streams.append(replace(s, uv=s.uv + errors[second, s.point]))
         return replace(m, cameras=tuple(streams))
 
-    found = held(run(handheld(12.0), 1, off, corner_noise_px=None))
+    result = run(handheld(12.0), 1, off, corner_noise_px=None)
+    found, ratios = held(result), [f.chi2_per_dof for f in result.fits if f.kind == "corners"]
+    assert ratios == pytest.approx([1.0, 1.0], abs=0.1)
     assert found.optimistic and found.excess > 2.0 * found.expected
 
 
@@ -96,6 +100,42 @@ def test_a_recording_too_short_to_be_split_says_so():
     result = calibrate_measurements(rig, simulate(scenario, 0).measurements)
     assert result.held_out is None
     assert any("too short to be split" in w for w in result.warnings)
+
+
+def as_noise_makes_it(found: HeldOut) -> bool:
+    return abs(found.excess - found.expected) < 4.0 * found.spread
+
+
+def test_of_two_recordings_each_finds_how_its_board_leans():
+    """A part each: each half has a tilt of its own, of which the other knows nothing."""
+    simulations = pair(1)
+    rig = rig_for(simulations[0].scenario, settings=replace(PLAIN, splits=2), intrinsics="free", distortion="free")
+    result = calibrate_measurements(rig, [s.measurements for s in simulations])
+    found = held(result)
+    assert (found.parts, found.directions) == (2, len(result.covariance) - 4)
+    assert as_noise_makes_it(found)
+
+
+def test_without_an_imu_parts_are_runs_of_images():
+    simulation = simulate(stereo(), 2)
+    rig, measurements = alone(simulation)
+    result = calibrate_measurements(replace(rig, settings=replace(PLAIN, splits=4)), measurements)
+    found = held(result)
+    assert (found.parts, found.directions) == (4, len(result.covariance))
+    assert [f.kind for f in found.fits] == ["corners", "corners"]
+    assert as_noise_makes_it(found)
+
+
+def test_where_planes_are_in_the_world_is_nothing_to_predict(robot: Callable[..., Scenario]):
+    """A LiDAR and an IMU: nobody sees where the world's origin is, nor which way it faces."""
+    scenario = robot("3d", 15.0, "l")
+    rig = rig_for(scenario, settings=replace(PLAIN, splits=8))
+    result = calibrate_measurements(rig, simulate(scenario, 0).measurements)
+    found = held(result)
+    assert found.directions == len(result.covariance) - 4
+    assert as_noise_makes_it(found)
+    points = next(f for f in found.fits if f.kind == "points")
+    assert points.unit == "m" and points.rms_inside == pytest.approx(points.rms_outside, rel=0.01)
 
 
 @pytest.mark.statistical
