@@ -91,11 +91,11 @@ def test_what_noise_makes_of_it_is_that_of_draws():
     S, T = information(rng, 6), information(rng, 9)
     Pi = np.diag([1.0, 0.0, 4.0])
     roots = [np.linalg.cholesky(x + 1e-12 * np.eye(3)) for x in (S, T, Pi)]
-    drawn = []
+    own, drawn = np.zeros((0, 4)), []
+    found = excess(Half(S, np.zeros(3), own), Half(T, np.zeros(3), own), (Pi, np.zeros(3)))
     for _ in range(4000):
         b, c, d = (root @ rng.normal(size=3) for root in roots)
-        found = excess(Half(S, b, np.zeros((0, 4))), Half(T, c, np.zeros((0, 4))), (Pi, d))
-        drawn.append(found.value)
+        drawn.append(excess(Half(S, b, own), Half(T, c, own), (Pi, d)).value)
     assert found.mean == pytest.approx(np.mean(drawn), rel=0.05)
     assert found.std == pytest.approx(np.std(drawn), rel=0.1)
 
