@@ -10,9 +10,9 @@ import pytest
 from icalib.errors import RecordingError
 from icalib.estimation.assembly import assemble, inputs_for
 from icalib.estimation.corner_noise import NoiseModel
-from icalib.estimation.evidence import segment_ends
 from icalib.estimation.imu_factor import ImuFactor
 from icalib.estimation.nodes import first_nodes, place_nodes, usable
+from icalib.estimation.parts import segment_ends
 from icalib.estimation.state import NODE, State
 from icalib.first_guess.several import initial_guesses
 from icalib.first_guess.start import first_state

@@ -11,11 +11,13 @@ from scipy.spatial.transform import Rotation
 from icalib.calibration import (
     Calibration,
     CornerResiduals,
+    HeldOut,
     ImuResiduals,
     Iteration,
     LidarResiduals,
     ParameterGroup,
     Plane,
+    PredictedFit,
     SensorFit,
     Trajectory,
     WheelResiduals,
@@ -76,7 +78,19 @@ def calibration() -> Calibration:
         settings=dataclasses.asdict(rig.settings),
         versions={"icalib": "0.1.0", "python": "3.11.2", "numpy": "2.0.0"},
         timings={"reading": 0.41, "first guess": 0.25, "solving": 1.3},
+        held_out=_held_out(groups),
     )
+
+
+def _held_out(groups: tuple[ParameterGroup, ...]) -> HeldOut:
+    """Eight parts, what moves without each three times what is allowed."""
+    fits = (
+        PredictedFit("cam0", "corners", 20_000, 19_500.0, 19_900.0, 0.2, 0.20204, "px"),
+        PredictedFit("imu0", "gyroscope", 897, 640.0, 655.5),
+    )
+    std = np.concatenate([g.std_formal for g in groups if g.columns])
+    moved = 1.2 * std * np.random.default_rng(9).normal(size=(8, len(std)))
+    return HeldOut(8, len(std), 900.0, 100.0, 25.0, fits, moved, np.tile(0.4 * std, (8, 1)))
 
 
 def _rig() -> Rig:
@@ -214,6 +228,7 @@ def robot(calibration: Calibration) -> Calibration:
         groups=tuple(groups),
         covariance=_covariance(tuple(groups), rng),
         covariance_names=names,
+        held_out=_held_out(tuple(groups)),
         rig=rig_to_dict(rig),
         fits=(*calibration.fits, *fits),
         lidar_residuals=(_points(rng),),
@@ -241,6 +256,7 @@ def without_cameras(robot: Calibration) -> Calibration:
         corner_residuals=(),
         undetermined=(),
         rig=rig,
+        held_out=None,
     )
 
 

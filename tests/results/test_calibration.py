@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
+from icalib.assessment.assess import _factor_warnings
 from icalib.calibration import Calibration, load_calibration
 from icalib.errors import CalibrationError
 
@@ -143,11 +144,27 @@ def test_arrays_that_would_run_code(saved: Path):
         {"rig": {}},
         {"rig": {"sensors": {}}},
         {"rig": []},
+        {"held_out": {"parts": 8}},
+        {"held_out": 3},
     ],
 )
 def test_changed_json(saved: Path, changes: dict[str, Any]):
     change(saved, **changes)
     sentence_of(saved)
+
+
+def test_parts_that_do_not_fit_the_covariance(saved: Path):
+    plain = json.loads((saved / "result.json").read_text())["held_out"]
+    change(saved, held_out=plain | {"parts": 7})
+    assert "of 7 parts" in sentence_of(saved)
+
+
+def test_a_result_of_before_halves_were_held_out(calibration: Calibration, saved: Path):
+    plain = json.loads((saved / "result.json").read_text())
+    del plain["held_out"]
+    (saved / "result.json").write_text(json.dumps(plain))
+    found = load_calibration(saved)
+    assert found.held_out is None and found.fits == calibration.fits
 
 
 @pytest.mark.parametrize(
@@ -158,6 +175,18 @@ def test_changed_group(saved: Path, field: str, value: Any):
     groups[0][field] = value
     change(saved, groups=groups)
     sentence_of(saved)
+
+
+def test_a_warning_where_halves_disagree_by_more_than_is_printed(calibration: Calibration):
+    """Excess 900 for 100: the factor is 3, and 1.9 would do."""
+    held = calibration.held_out
+    assert held is not None and held.optimistic and held.factor == pytest.approx(3.0)
+    (sentence,) = _factor_warnings(np.array([1.5, 1.9]), True, held)
+    assert "predicts the other 3.0 times worse" in sentence and "only 1.9 times" in sentence
+    by_chance = dataclasses.replace(held, spread=300.0)
+    assert not by_chance.optimistic
+    for factors, other in ((np.array([1.5, 2.1]), held), (np.array([1.9]), by_chance), (np.array([1.9]), None)):
+        assert not list(_factor_warnings(factors, True, other))
 
 
 def test_group_lists_what_there_is(calibration: Calibration):

@@ -7,22 +7,23 @@ import json
 from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from rich.console import Console
 
-from icalib.calibration import Calibration
+from icalib.calibration import Calibration, ProjectionMap, projection_uncertainty, working_distance
 from icalib.outputs import check_folder, write_outputs
-from icalib.report import corner_figures, report_html
+from icalib.report import corner_figures, projection_figures, report_html
 from icalib.report.console import table
 from icalib.report.plot import numbers, thin
 from icalib.report.quantities import rows, rpy_deg, shown
 from icalib.report.tables import trust
 
 VOID = {"meta", "link", "br", "img", "hr"}
-FIGURES = {"rig", "histogram", "imu-residuals", "trajectory", "motion", "convergence", "correlation"} | {
-    f"{kind}-{i}" for kind in ("plane", "image", "time") for i in (0, 1)
+FIGURES = {"rig", "histogram", "imu-residuals", "trajectory", "motion", "convergence", "correlation", "held-out"} | {
+    f"{kind}-{i}" for kind in ("plane", "image", "time", "projection-0", "projection-1") for i in (0, 1)
 }
 NASTY = '</script><script>alert("1 & 2")</script>'
 
@@ -128,6 +129,73 @@ def test_figures_show_the_numbers(calibration: Calibration, text: str):
     np.testing.assert_allclose(diagonal, 1.0)
     rate = figures["motion"]["data"][0]["y"]
     assert np.rad2deg(0.5 * 2.1) * 0.9 < max(rate) < np.rad2deg(0.5 * 2.1 + 0.6 * 1.3)
+
+
+def test_maps_of_projection_say_what_they_show(calibration: Calibration, text: str):
+    """Camera 1 at the target's distance: its numbers, its corners, and a scale that edges without data do not take."""
+    page, distance = Page(text), working_distance(calibration, "cam1")
+    drawn = json.loads(page.scripts[0])["projection-1-1"]["data"]
+    assert distance is not None
+    m = projection_uncertainty(calibration, "cam1", distance)
+    assert m is not None
+    np.testing.assert_allclose(drawn[0]["z"], m.sigma, rtol=1e-4)
+    assert drawn[0]["zmax"] <= 6.0 * m.median_seen and drawn[0]["contours"]["size"] <= drawn[0]["zmax"] / 9
+    assert drawn[1]["name"] == "corners" and 500 < len(drawn[1]["x"]) <= projection_figures.MOST_DOTS
+    size, u, v = m.worst
+    assert f"Known to {shown(m.median_seen)} px where corners were seen (median), to {shown(size)} px" in page.words
+    assert f"at pixel ({u:.0f}, {v:.0f})" in page.words
+    assert f"cam1: points {shown(distance)} m away" in page.words
+
+
+def test_a_fixed_lens_has_no_map_but_a_sentence(calibration: Calibration):
+    fixed: dict[str, Any] = {"columns": None, "factor": None}
+    groups = tuple(
+        dataclasses.replace(g, **fixed) if (g.sensor, g.name) == ("cam0", "intrinsics") else g
+        for g in calibration.groups
+    )
+    page = Page(report_html(dataclasses.replace(calibration, groups=groups)))
+    assert set(json.loads(page.scripts[0])) == FIGURES - {"projection-0-0", "projection-0-1"}
+    assert "cam0: intrinsics and distortion are fixed by the rig file" in page.words
+
+
+@pytest.mark.parametrize(("seen", "sentence"), [(True, "Move the target there too"), (False, "px over the image")])
+def test_what_is_said_of_an_edge_without_data(seen: bool, sentence: str):
+    sigma, cells = np.array([[0.1, 0.1, 0.9]]), np.array([[seen, seen, False]])
+    m = ProjectionMap("cam0", np.inf, np.array([0.0, 10.0, 20.0]), np.zeros(1), sigma, cells)
+    found = projection_figures.words(m)
+    assert sentence in found and "0.10 px" in found and "0.90 px at the worst, at pixel (20, 0)" in found
+    assert ("Move" in found) == seen
+
+
+def test_what_halves_say_of_each_other(calibration: Calibration, text: str):
+    held, page = calibration.held_out, Page(text)
+    assert held is not None
+    assert "the formal standard deviations are too small by a factor of about 3.0." in page.words
+    assert "chi^2 is 900 higher" in page.words and "would make that 100 ± 25" in page.words
+    assert "the standard deviations printed here are 2.7 times the formal ones" in page.words
+    for cell in ("0.9874", "0.9975", "0.2 px", "0.202 px", "+400.0", "+15.5"):
+        assert f'<td class="number">{cell}</td>' in text
+    factor, allowed, moved = json.loads(page.scripts[0])["held-out"]["data"]
+    assert (factor["x"][:2], allowed["x"][:2]) == ([-2.7, 2.7], [-1.0, 1.0])
+    np.testing.assert_allclose(np.reshape(moved["x"], (8, -1)), held.moved / held.allowed, rtol=1e-4)
+    rows = json.loads(page.scripts[0])["held-out"]["layout"]["yaxis"]["ticktext"]
+    assert rows[6:8] == ["cam0 time offset", "cam0 intrinsics fx"] and len(rows) == held.directions
+    assert moved["text"][len(rows) + 7] == "cam0 intrinsics fx, without part 2"
+
+
+@pytest.mark.parametrize(
+    ("excess", "sentence"),
+    [(170.0, "That is chance"), (176.0, "too small by a factor of about 1.3"), (20.0, "if anything, too large")],
+)
+def test_the_verdict_of_halves_leaves_room_for_chance(calibration: Calibration, excess: float, sentence: str):
+    held = dataclasses.replace(calibration.held_out, excess=excess)  # pyright: ignore
+    assert sentence in Page(report_html(dataclasses.replace(calibration, held_out=held))).words
+
+
+def test_where_nothing_was_held_out_it_says_so(calibration: Calibration):
+    page = Page(report_html(dataclasses.replace(calibration, held_out=None)))
+    assert "Nothing was held out: the recording is too short to be split" in page.words
+    assert set(json.loads(page.scripts[0])) == FIGURES - {"held-out"}
 
 
 def test_nothing_seen_and_nothing_iterated(calibration: Calibration):

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 
+from icalib.assessment.held_out import held_out, raw_rms
 from icalib.assessment.notes import notes
 from icalib.assessment.robot import (
     lidar_residuals,
@@ -19,6 +20,7 @@ from icalib.assessment.robot import (
 from icalib.calibration import (
     Calibration,
     CornerResiduals,
+    HeldOut,
     ImuResiduals,
     Iteration,
     ParameterGroup,
@@ -35,6 +37,7 @@ from icalib.estimation.determination import Determined
 from icalib.estimation.estimate import Estimate
 from icalib.estimation.evidence import Fit, fits, place_covariances, split_covariance
 from icalib.estimation.imu_model import LABELS as IMU_LABELS
+from icalib.estimation.parts import Parts
 from icalib.estimation.pose_factor import FRAME
 from icalib.estimation.problem import Problem
 from icalib.estimation.solver import Visit
@@ -58,6 +61,7 @@ LABELS = {
 NUISANCE = ("plane", *FRAME)  # estimated along, in a world of which only gravity's direction means anything
 EXPECTED_CHI2 = (0.5, 2.0)  # chi^2 per post-fit degree of freedom outside this is worth a warning
 LARGE_FACTOR = 3.0
+BEYOND_FACTOR = 1.5  # times the largest factor: what halves say of each other is worth a warning
 LARGE_BLOOM_PX = 0.8  # ink and overexposure move edges by a third of that
 MANY_REJECTED = 0.05
 LEAST_DOF = 3.0  # times the square root of the number of residuals
@@ -69,9 +73,11 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
     problem, outcome = found.problem, found.outcome
     names = _column_names(inputs)
     seen = observe(determined, names, [w.name for w in inputs.rig.wheels])
-    empirical = _empirical_variance(inputs, found, np.diag(seen.covariance))
+    parts = Parts.of(problem, outcome, inputs.rig.settings.splits)
+    empirical = _empirical_variance(found, parts, np.diag(seen.covariance))
     groups = _groups(inputs, found, seen, empirical)
     judged = [_sensor_fit(f, found) for f in fits(problem, outcome) if not _is_assumed(inputs, f.sensor)]
+    held = held_out(parts, [s for s in (inputs.rig.body,) if _is_assumed(inputs, s)])
     timeline = Timeline.of(inputs.parts, image_times(inputs, outcome.state.values))
     trajectory, poses = _trajectory(inputs, outcome.state, timeline), pose_residuals(inputs, found, timeline)
     return Calibration(
@@ -86,7 +92,7 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
         iterations=tuple(Iteration(n, s.cost, s.predicted_decrease, s.damping, s.accepted) for n, s in found.steps),
         converged=outcome.converged,
         status=outcome.status,
-        warnings=tuple(_warnings(inputs, found, groups, judged, empirical, poses)),
+        warnings=tuple(_warnings(inputs, found, groups, judged, parts is not None, held, poses)),
         notes=tuple(notes(inputs, found, timeline)),
         rig=rig_to_dict(inputs.asked or inputs.rig),
         settings=dataclasses.asdict(inputs.rig.settings),
@@ -97,6 +103,7 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
         wheel_residuals=wheel_residuals(inputs, found, timeline),
         planes=planes(inputs, outcome.state),
         pose_residuals=poses,
+        held_out=held,
     )
 
 
@@ -207,14 +214,13 @@ def _with_factor(formal: Verdict, loose: bool) -> Verdict:
     return "weak" if formal == "determined" and loose else formal
 
 
-def _empirical_variance(inputs: Inputs, found: Estimate, formal: np.ndarray) -> np.ndarray | None:
+def _empirical_variance(found: Estimate, parts: Parts | None, formal: np.ndarray) -> np.ndarray | None:
     """(B,) variances as the spread over parts of the recording shows them, plus what places in the image and on the
     target show beyond white noise; None where the recording cannot be split."""
-    split = split_covariance(found.problem, found.outcome, inputs.rig.settings.splits)
-    if split is None:
+    if parts is None:
         return None
     excess = [np.maximum(np.diag(V) - formal, 0.0) for V in place_covariances(found.problem, found.outcome)]
-    return np.diag(split) + sum(excess)
+    return np.diag(split_covariance(found.outcome, parts)) + sum(excess)
 
 
 def _calibration_only(inputs: Inputs, per_column: np.ndarray) -> np.ndarray:
@@ -224,28 +230,17 @@ def _calibration_only(inputs: Inputs, per_column: np.ndarray) -> np.ndarray:
 
 
 def _sensor_fit(fit: Fit, found: Estimate) -> SensorFit:
-    rms, unit, rejected = None, "", 0
+    """Rejected features are observations that stood out; those whose track was left out are not."""
+    problem, out, rejected = found.problem, found.outcome.residuals, 0
+    rms, unit = raw_rms(problem, out, fit.sensor, fit.kind)
     if fit.kind == "features":
-        return _feature_fit(fit, found)
-    for camera, out in zip(found.problem.cameras, found.outcome.residuals.corners, strict=True):
-        if camera.name == fit.sensor:
-            used = out.root > 0.0
-            rms, unit = float(np.sqrt(np.mean(out.residual[used] ** 2, dtype=np.float64))), "px"
-            rejected = int((~used).sum())
-    for factor, out in zip(found.problem.sensors, found.outcome.residuals.sensors, strict=True):
-        if factor.name == fit.sensor and fit.kind in factor.kinds:
-            rms, unit = factor.rms(out, fit.kind)
+        assert problem.features is not None
+        i = [c.name for c in problem.features.cameras].index(fit.sensor)
+        rejected = int((~problem.features.keep[i]).sum())
+    elif unit == "px":
+        i = [c.name for c in problem.cameras].index(fit.sensor)
+        rejected = int((out.corners[i].root == 0.0).sum())
     return SensorFit(fit.sensor, fit.kind, fit.count, fit.dof, fit.chi2, rms, unit, rejected)
-
-
-def _feature_fit(fit: Fit, found: Estimate) -> SensorFit:
-    """Rejected are observations that stood out; those whose track was left out are not."""
-    factor, out = found.problem.features, found.outcome.residuals.features
-    assert factor is not None and out is not None
-    i = [c.name for c in factor.cameras].index(fit.sensor)
-    used = out.root[i] > 0.0
-    rms = float(np.sqrt(np.mean(out.residual[i][used] ** 2))) if used.any() else None
-    return SensorFit(fit.sensor, fit.kind, fit.count, fit.dof, fit.chi2, rms, "px", int((~factor.keep[i]).sum()))
 
 
 def _corner_residuals(found: Estimate, timeline: Timeline) -> tuple[CornerResiduals, ...]:
@@ -290,7 +285,8 @@ def _warnings(
     found: Estimate,
     groups: tuple[ParameterGroup, ...],
     judged: list[SensorFit],
-    empirical: np.ndarray | None,
+    split: bool,
+    held: HeldOut | None,
     poses: tuple[PoseResiduals, ...],
 ):
     if not found.outcome.converged:
@@ -320,13 +316,24 @@ def _warnings(
                 "light and ink do; check tag_size and tag_spacing (the gap over tag_size) of the target."
             )
     judged_groups = (g for g in groups if g.mode != "fixed" and inputs.is_sensor(g.sensor) and g.name != "bloom")
-    factors = [g.factor.max() for g in judged_groups if g.factor is not None]
-    if factors and max(factors) > LARGE_FACTOR:
+    factors = [g.factor for g in judged_groups if g.factor is not None]
+    yield from _factor_warnings(np.concatenate([*factors, np.ones(0)]), split, held)
+
+
+def _factor_warnings(factors: np.ndarray, split: bool, held: HeldOut | None):
+    """`factors`: of what users take away; `split`: whether they are from parts of the recording."""
+    if len(factors) and factors.max() > LARGE_FACTOR:
         yield (
-            f"parts of the recording disagree by up to {max(factors):.1f} times what noise explains; the "
+            f"parts of the recording disagree by up to {factors.max():.1f} times what noise explains; the "
             "standard deviations here include that factor, those of other programs would not."
         )
-    if empirical is None:
+    if held is not None and len(factors) and held.optimistic and held.factor > BEYOND_FACTOR * factors.max():
+        yield (
+            f"one half of the recording predicts the other {held.factor:.1f} times worse than noise explains, and "
+            f"the standard deviations here are only {factors.max():.1f} times the formal ones: take them for too "
+            "small, and look for what changed while recording."
+        )
+    if not split:
         yield (
             "the recording is too short to be split (or splits are off): standard deviations are formal, and too small."
         )

@@ -1,5 +1,7 @@
 """The result of a calibration: values with standard deviations and verdicts, saved and loaded whole."""
 
+from icalib.calibration.held_out import HeldOut, PredictedFit
+from icalib.calibration.projection import ProjectionMap, projection_uncertainty, working_distance
 from icalib.calibration.relative import RelativePose, joint_covariance, relative_pose, relative_poses
 from icalib.calibration.result import (
     Calibration,
@@ -19,12 +21,15 @@ from icalib.calibration.saving import calibration_files, load_calibration
 __all__ = [
     "Calibration",
     "CornerResiduals",
+    "HeldOut",
     "ImuResiduals",
     "Iteration",
     "LidarResiduals",
     "ParameterGroup",
     "Plane",
     "PoseResiduals",
+    "PredictedFit",
+    "ProjectionMap",
     "RecordingSpan",
     "RelativePose",
     "SensorFit",
@@ -35,6 +40,8 @@ __all__ = [
     "calibration_files",
     "joint_covariance",
     "load_calibration",
+    "projection_uncertainty",
     "relative_pose",
     "relative_poses",
+    "working_distance",
 ]

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from icalib.calibration.held_out import HeldOut
 from icalib.calibration.robot import LidarResiduals, Plane, PoseResiduals, WheelResiduals
 
 Verdict = Literal["determined", "weak", "undetermined", "fixed"]
@@ -155,6 +156,7 @@ class Calibration:
     wheel_residuals: tuple[WheelResiduals, ...] = ()
     planes: tuple[Plane, ...] = ()  # that LiDARs see
     pose_residuals: tuple[PoseResiduals, ...] = ()
+    held_out: HeldOut | None = None  # None where the recording could not be split
 
     @property
     def failure(self) -> str:

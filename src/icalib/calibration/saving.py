@@ -7,11 +7,13 @@ import hashlib
 import io
 import json
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from icalib.calibration.held_out import HeldOut, PredictedFit
 from icalib.calibration.result import (
     Calibration,
     CornerResiduals,
@@ -73,6 +75,7 @@ def _plain(c: Calibration, arrays: bytes) -> dict[str, Any]:
         "wheels": [_without_arrays(r) for r in c.wheel_residuals],
         "poses": [_without_arrays(r) for r in c.pose_residuals],
         "planes": [_lists(p) for p in c.planes],
+        "held_out": None if c.held_out is None else _plain_held_out(c.held_out),
         **{name: list(getattr(c, name)) for name in _TEXTS},
         **{name: getattr(c, name) for name in _PLAIN},
     }
@@ -83,7 +86,11 @@ def _lists(group: ParameterGroup | Plane) -> dict[str, Any]:
     return {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in plain.items()}
 
 
-def _without_arrays(residuals: LidarResiduals | WheelResiduals | PoseResiduals) -> dict[str, Any]:
+def _plain_held_out(held: HeldOut) -> dict[str, Any]:
+    return _without_arrays(held) | {"fits": [dataclasses.asdict(f) for f in held.fits]}
+
+
+def _without_arrays(residuals: LidarResiduals | WheelResiduals | PoseResiduals | HeldOut) -> dict[str, Any]:
     arrays = _array_names(type(residuals))
     return {f.name: getattr(residuals, f.name) for f in dataclasses.fields(residuals) if f.name not in arrays}
 
@@ -96,6 +103,8 @@ def _npz(c: Calibration) -> bytes:
     for folder, found in residuals.items():
         for r in found:
             arrays |= {f"{folder}/{r.sensor}/{name}": getattr(r, name) for name in _array_names(type(r))}
+    if c.held_out is not None:
+        arrays |= {f"held_out/{name}": getattr(c.held_out, name) for name in _array_names(HeldOut)}
     arrays |= {f"imu_residuals/{name}": getattr(c.imu_residuals, name) for name in _array_names(ImuResiduals)}
     arrays |= {f"trajectory/{name}": getattr(c.trajectory, name) for name in _array_names(Trajectory)}
     for f in dataclasses.fields(Iteration):
@@ -165,6 +174,7 @@ def _build(plain: dict[str, Any], arrays: dict[str, np.ndarray]) -> Calibration:
         planes=tuple(
             Plane(p["name"], np.array(p["normal"]), np.array(p["point"]), p["count"]) for p in plain.get("planes", [])
         ),
+        held_out=_held_out(plain.get("held_out"), of),
         imu_residuals=ImuResiduals(**of(ImuResiduals, "imu_residuals")),
         trajectory=Trajectory(**of(Trajectory, "trajectory")),
         recordings=tuple(RecordingSpan(**r) for r in plain.get("recordings", [])),
@@ -172,6 +182,13 @@ def _build(plain: dict[str, Any], arrays: dict[str, np.ndarray]) -> Calibration:
         **{name: tuple(plain[name]) for name in _TEXTS},
         **{name: plain[name] for name in _PLAIN},
     )
+
+
+def _held_out(plain: dict[str, Any] | None, of: Callable[[type, str], dict[str, Any]]) -> HeldOut | None:
+    if plain is None:
+        return None
+    fits = tuple(PredictedFit(**f) for f in plain["fits"])
+    return HeldOut(**(plain | {"fits": fits}), **of(HeldOut, "held_out"))
 
 
 def _tuples(plain: dict[str, Any]) -> dict[str, Any]:
@@ -200,6 +217,8 @@ def _check(c: Calibration) -> None:
             raise ValueError(f"{g.sensor}.{g.name} does not have {size} entries throughout")
     if not any(s.get("type") in ("imu", "camera", "pose") for s in c.rig["sensors"].values()):
         raise ValueError("the rig has neither IMU nor camera nor pose sensor")
+    if c.held_out is not None and not c.held_out.moved.shape == c.held_out.allowed.shape == (c.held_out.parts, n):
+        raise ValueError(f"what parts make of one another is not of {c.held_out.parts} parts and {n} parameters")
     for r in c.lidar_residuals:
         if len(r.plane) and not 0 <= r.plane.min() <= r.plane.max() < len(c.planes):
             raise ValueError(f"{r.sensor} has points on planes that are not there")

@@ -238,6 +238,19 @@ def marginalise(piece: Piece) -> np.ndarray:
     return piece.border
 
 
+def given_border(piece: Piece, border: np.ndarray) -> np.ndarray:
+    """(n, 15, m) the best steps of the nodes of `piece` where the border makes steps (B, m); overwrites the piece.
+    Raises NotDefiniteError."""
+    done = _reduce(piece, False)
+    if not done:
+        raise NotDefiniteError(BROKEN_DOWN)
+    n, m = len(piece.diagonal), border.shape[1]
+    chain = np.zeros((piece.first + n, NODE, m))
+    rows = done.rows if isinstance(done, Eliminated) else NODE * n
+    _back(piece, done, np.zeros((rows, m)), False, np.vstack([border, np.ones((1, m))]), chain)
+    return chain[piece.first :]
+
+
 def marginalise_in_segments(piece: Callable[[int, int], Piece], n_nodes: int) -> np.ndarray:
     """As `marginalise`, of a whole chain whose `piece` from one node to another is made when it is its turn, so that
     the chain never lies in memory as a whole."""
@@ -330,7 +343,7 @@ def _back(
         return
     for k in range(border.shape[1]):
         one, known = np.ascontiguousarray(own[:, :, k]), np.ascontiguousarray(border[:, k])
-        noise, forwards = white[:, k].reshape(-1, NODE), piece.first == 0
+        noise, forwards = white[:, k].reshape(-1, NODE), piece.first == 0 or not keep
         substitute_chain(piece.diagonal, piece.upper, piece.side, forwards, keep, known, noise, one)
         # The shared node is given, and both pieces write their own nodes alone.
         inner = slice(None) if not keep else slice(None, -1) if piece.first == 0 else slice(1, None)

@@ -8,18 +8,16 @@ from itertools import pairwise
 
 import numpy as np
 
-from icalib.errors import EstimationError
 from icalib.estimation import sensors
 from icalib.estimation.arrowhead import (
     Draw,
     Piece,
     in_parallel,
-    marginalise,
     restricted_inverse,
 )
 from icalib.estimation.corner_factor import CornerFactor, CornerOutput
 from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput
-from icalib.estimation.gauge import hold_frame
+from icalib.estimation.parts import Parts
 from icalib.estimation.problem import Problem, Residuals
 from icalib.estimation.solver import Outcome, posterior
 from icalib.estimation.state import State
@@ -54,27 +52,28 @@ def fits(problem: Problem, outcome: Outcome) -> list[Fit]:
     for draw in (outcome.draws or posterior(problem, outcome.state)).free:
         for key, value in _spent(problem, outcome, draw).items():
             spent.setdefault(key, []).append(value)
-    out = []
-    imu = outcome.residuals.imu
-    for kind, rows in problem.chain.kinds.items():
-        key = problem.chain.name, kind
-        n = imu[:, rows].size - (len(problem.chain.starts) - 1) * imu[0, rows].size
-        out.append(Fit(*key, n, n - float(np.mean(spent[key])), float((imu[:, rows] ** 2).sum())))
-    for camera, corners in zip(problem.cameras, outcome.residuals.corners, strict=True):
-        for kind, (n, chi2) in _corner_chi2(camera, corners).items() if len(camera.stream.uv) else ():
-            key = camera.name, kind
-            out.append(Fit(*key, n, n - float(np.mean(spent[key])), chi2))
-    if problem.features is not None and outcome.residuals.features is not None:
-        left = outcome.residuals.features
+    found = chi2_by_kind(problem, outcome.residuals)
+    return [Fit(*key, n, n - float(np.mean(spent[key])), chi2) for key, (n, chi2) in found.items()]
+
+
+def chi2_by_kind(problem: Problem, at: Residuals) -> dict[tuple[str, str], tuple[int, float]]:
+    """Number and chi^2 of each kind of residual of each sensor, robust weights as they are."""
+    chain, found = problem.chain, {}
+    for kind, rows in chain.kinds.items():
+        n = at.imu[:, rows].size - (len(chain.starts) - 1) * at.imu[0, rows].size
+        found[chain.name, kind] = n, float((at.imu[:, rows] ** 2).sum())
+    for camera, corners in zip(problem.cameras, at.corners, strict=True):
+        if len(camera.stream.uv):
+            found |= {(camera.name, kind): own for kind, own in _corner_chi2(camera, corners).items()}
+    if problem.features is not None and at.features is not None:
+        left = at.features
         for camera, residual, root in zip(problem.features.cameras, left.residual, left.root, strict=True):
-            key, n = (camera.name, "features"), 2 * int((root > 0.0).sum())
             chi2 = float(((residual * root[:, None]) ** 2).sum())
-            out.append(Fit(*key, n, n - float(np.mean(spent[key])), chi2))
-    for sensor, rows in zip(problem.sensors, outcome.residuals.sensors, strict=True):
+            found[camera.name, "features"] = 2 * int((root > 0.0).sum()), chi2
+    for sensor, rows in zip(problem.sensors, at.sensors, strict=True):
         for kind, r in sensor.kinds.items():
-            key, n = (sensor.name, kind), sensor.count(rows, kind)
-            out.append(Fit(*key, n, n - float(np.mean(spent[key])), sensors.chi2(rows, r)))
-    return out
+            found[sensor.name, kind] = sensor.count(rows, kind), sensors.chi2(rows, r)
+    return found
 
 
 def _corner_chi2(camera: CornerFactor, out: CornerOutput) -> dict[str, tuple[int, float]]:
@@ -154,52 +153,15 @@ def _spent_by_views(
     return {"corners": total} | {f"common error {k}": float(spent[k]) for k in range(m)}
 
 
-def split_covariance(problem: Problem, outcome: Outcome, segments: int) -> np.ndarray | None:
-    """(B, B) covariance of the border as the spread over `segments` of the recording shows it; None if it is too short.
-    Several recordings share them by length, at least one each.
+def split_covariance(outcome: Outcome, parts: Parts) -> np.ndarray:
+    """(B, B) covariance of the border as the spread over `parts` of the recording shows it.
 
-    Each segment's own gradient b_g at the joint optimum (its chain marginalised) would be zero but for noise; their
+    Each part's own gradient b_g at the joint optimum (its chain marginalised) would be zero but for noise; their
     spread through the joint information S gives S^-1 (G / (G - 1) sum (b_g - b)(b_g - b)^T) S^-1, the block
-    jackknife to
-    first order.
+    jackknife to first order.
     """
-    if segments < 2:
-        return None
-    ends = segment_ends(problem.chain.starts, problem.n_nodes, segments)
-    segments = len(ends) - 1
-    if np.diff(ends).min() < 3:
-        return None
-    apart = problem.cut(outcome.state, ends[:-1])
-    scratch = apart.scratch(outcome.residuals)
-
-    def gradient(g: int) -> np.ndarray | None:
-        piece = apart.with_features(Piece.zeros(int(ends[g]), int(ends[g + 1]), problem.layout.size))
-        apart.add_measurements(outcome.state, piece, scratch)
-        apart.add_bias_prior(outcome.state, piece)
-        if not problem.framed:
-            hold_frame(outcome.state, piece, piece.first)
-        if piece.last in problem.chain.starts:
-            # The seam says nothing of the node behind it, and that node's own images are in the next segment.
-            piece = piece.without_last()
-        try:
-            return marginalise(piece)[:-1, -1]
-        except EstimationError:
-            return None
-
-    found = [b for b in in_parallel(gradient, range(segments)) if b is not None]
-    if len(found) < segments:
-        return None
-    b = np.array(found)
-    return segments / (segments - 1.0) * _spread(problem, outcome, b - b.mean(axis=0))
-
-
-def segment_ends(starts: tuple[int, ...], n_nodes: int, segments: int) -> np.ndarray:
-    """(segments + 1,) nodes between which segments lie; each start of a recording is one. More segments where there are
-    more recordings."""
-    edges = np.array([*starts, n_nodes - 1])
-    counts = np.maximum(np.round(segments * np.diff(edges) / edges[-1]).astype(int), 1)
-    pieces = [np.linspace(a, b, n + 1)[:-1] for a, b, n in zip(edges[:-1], edges[1:], counts, strict=True)]
-    return np.concatenate([*pieces, edges[-1:]]).astype(int)
+    b, n = parts.sums[:, :-1, -1], parts.count
+    return n / (n - 1.0) * _spread(parts.problem, outcome, b - b.mean(axis=0))
 
 
 def place_covariances(problem: Problem, outcome: Outcome) -> list[np.ndarray]:

@@ -14,10 +14,10 @@ from icalib.estimation.state import State
 FRAME = 1e4  # information [1/m^2, 1/rad^2] along what nothing sees: any number does
 
 
-def hold_frame(state: State, piece: Piece, node: int) -> None:
+def hold_frame(state: State, piece: Piece, node: int, information: float = FRAME) -> None:
     """Holds the position of `node`, and its turn about gravity, where they are: without a target nothing in the world
     says where its origin is. Adds to the sums of `piece`; there is no gradient, and what is seen does not depend on it.
     """
     k, up = node - piece.first, state.rotation[node][2]
-    piece.diagonal[k, 0:3, 0:3] += FRAME * np.outer(up, up)
-    piece.diagonal[k, range(3, 6), range(3, 6)] += FRAME
+    piece.diagonal[k, 0:3, 0:3] += information * np.outer(up, up)
+    piece.diagonal[k, range(3, 6), range(3, 6)] += information

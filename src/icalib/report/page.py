@@ -8,14 +8,26 @@ from string import Template
 
 import numpy as np
 
-from icalib.calibration import Calibration, CornerResiduals
-from icalib.report import corner_figures, motion_figures, rig_figures, robot_figures, tables
+from icalib.calibration import Calibration, CornerResiduals, ProjectionMap
+from icalib.report import (
+    corner_figures,
+    held_out_figures,
+    motion_figures,
+    projection_figures,
+    rig_figures,
+    robot_figures,
+    tables,
+)
 from icalib.report.histogram import normalised_histogram
 from icalib.report.plot import Figure
 from icalib.report.tables import Html, element
 
 _NO_UNDETERMINED = "None: the motion determines every direction."
 _NO_WARNINGS = "None."
+_NOT_HELD_OUT = (
+    "Nothing was held out: the recording is too short to be split, or splits are off in the rig file, or its halves "
+    "have no parameter in common that both know."
+)
 _MAPS = (("As the first guess had them", "map-before"), ("As calibrated", "map-after"))
 
 
@@ -23,6 +35,7 @@ def report_html(calibration: Calibration) -> str:
     """The whole report as one HTML document, plotly.js included."""
     c = calibration
     trust = tables.trust(c)
+    maps = {name: projection_figures.projection_maps(c, name) for name in c.cameras}
     words = {
         "sensors": " + ".join((*(() if c.imu is None else (c.imu,)), *c.mounted)),
         "size": tables.size_words(c),
@@ -44,6 +57,9 @@ def report_html(calibration: Calibration) -> str:
         "poses": Html(tables.poses(c) + tables.relative(c) + tables.bodies(c)),
         "corner_figures": _corner_sections(c),
         "without_corners": "" if _seen(c) else " hidden",
+        "held_out": _held_out_section(c),
+        "projection_figures": _projection_sections(maps),
+        "without_cameras": "" if c.cameras else " hidden",
         "lidar_figures": _lidar_sections(c),
         "without_lidars": "" if c.lidar_residuals else " hidden",
         "wheel_figures": _wheel_sections(c),
@@ -55,7 +71,7 @@ def report_html(calibration: Calibration) -> str:
     }
     escaped = {name: tables.html(value) for name, value in words.items()}
     body = Template(resource("icalib.report", "page.html")).substitute(escaped | parts)
-    return document(f"Calibration of {words['sensors']}", body, _figures(c))
+    return document(f"Calibration of {words['sensors']}", body, _figures(c) | _projection_figures(c, maps))
 
 
 def document(title: str, body: str, figures: dict[str, Figure]) -> str:
@@ -84,6 +100,8 @@ def _figures(c: Calibration) -> dict[str, Figure]:
         found[f"plane-{i}"] = corner_figures.residual_plane(r)
         found[f"image-{i}"] = corner_figures.residuals_over_image(r, (width, height))
         found[f"time-{i}"] = corner_figures.residuals_over_time(r)
+    if c.held_out is not None:
+        found["held-out"] = held_out_figures.moved_without_parts(c, c.held_out)
     for i, r in enumerate(c.lidar_residuals):
         found[f"points-{i}"] = robot_figures.residuals_over_time(r)
         found[f"distance-{i}"] = robot_figures.residuals_over_distance(r)
@@ -106,6 +124,47 @@ def _corner_sections(c: Calibration) -> Html:
         plots = [plot_place(f"{kind}-{i}", css) for kind, css in (("plane", ""), ("image", ""), ("time", "wide"))]
         head = element("h3", [tables.html(r.sensor), element("small", f" {counts}")])
         sections.append(Html(head + element("div", plots, "pair")))
+    return Html("".join(sections))
+
+
+def _held_out_section(c: Calibration) -> Html:
+    held = c.held_out
+    if held is None:
+        return element("p", _NOT_HELD_OUT, "quiet")
+    rise, verdict, parts = held_out_figures.words(c, held)
+    found = [element("p", verdict, "answer"), element("p", f"{rise} {parts}"), held_out_figures.predicted_fits(held)]
+    return Html("".join((*found, element("h3", "Parameters without each part"), plot_place("held-out"))))
+
+
+def _projection_figures(c: Calibration, maps: dict[str, list[ProjectionMap]]) -> dict[str, Figure]:
+    """The maps of camera i as `projection-i-0`, `projection-i-1`."""
+    seen, found = {r.sensor: r for r in _seen(c)}, {}
+    for i, (name, own) in enumerate(maps.items()):
+        size = c.rig["sensors"][name]["resolution"]
+        for k, m in enumerate(own):
+            found[f"projection-{i}-{k}"] = projection_figures.projection_figure(m, seen.get(name), size)
+    return found
+
+
+def _projection_sections(maps: dict[str, list[ProjectionMap]]) -> Html:
+    """Each camera, or that its lens is fixed."""
+    sections = []
+    for i, (name, own) in enumerate(maps.items()):
+        parts = [
+            element(
+                "div",
+                [
+                    element("h3", f"{name}: {projection_figures.title(m).lower()}"),
+                    element("p", projection_figures.words(m)),
+                    plot_place(f"projection-{i}-{k}"),
+                ],
+            )
+            for k, m in enumerate(own)
+        ]
+        fixed = element(
+            "p", f"{name}: intrinsics and distortion are fixed by the rig file, and taken as exact.", "quiet"
+        )
+        sections.append(element("div", parts, "pair") if parts else fixed)
     return Html("".join(sections))
 
 

@@ -1,0 +1,81 @@
+"""Parts of a recording that stand alone: what each says of the border, its own nodes eliminated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.errors import EstimationError
+from icalib.estimation.arrowhead import Piece, in_parallel, marginalise
+from icalib.estimation.gauge import hold_frame
+from icalib.estimation.problem import Problem, Residuals
+from icalib.estimation.solver import Outcome
+from icalib.estimation.state import State
+
+FEWEST_NODES = 3  # between the ends of a part
+# Information [1/m^2, 1/rad^2] that holds the frame of each part where the world has none. Parts share planes: held
+# firmly, each would seem to say where these are in a world that nobody sees.
+LOOSE_FRAME = 1e-3
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Of `problem`, in which features end where parts do, at `state`; ends (G + 1,): nodes between which parts lie.
+
+    sums (G, B + 1, B + 1): each part's information of the border, its gradient in the last column.
+    """
+
+    problem: Problem
+    state: State
+    ends: np.ndarray
+    sums: np.ndarray
+
+    @classmethod
+    def of(cls, problem: Problem, outcome: Outcome, count: int) -> Parts | None:
+        """About `count` parts of about one length, which several recordings share, at least one each. None where they
+        would be too short, or one does not stand alone."""
+        if count < 2:
+            return None
+        ends = segment_ends(problem.chain.starts, problem.n_nodes, count)
+        if len(ends) < 3 or np.diff(ends).min() < FEWEST_NODES:
+            return None
+        parts = cls(problem.cut(outcome.state, ends[:-1]), outcome.state, ends, np.zeros(0))
+        scratch = parts.problem.scratch(outcome.residuals)
+        try:
+            sums = in_parallel(lambda g: marginalise(parts.piece(g, scratch)), range(len(ends) - 1))
+        except EstimationError:
+            return None
+        return cls(parts.problem, parts.state, ends, np.array(sums))
+
+    @property
+    def count(self) -> int:
+        return len(self.ends) - 1
+
+    def piece(self, g: int, scratch: Residuals) -> Piece:
+        """All sums of part `g`, its nodes not yet eliminated; fills `scratch` for its measurements."""
+        problem, state = self.problem, self.state
+        first, last = (int(k) for k in self.ends[g : g + 2])
+        piece = problem.with_features(Piece.zeros(first, last, problem.layout.size))
+        problem.add_measurements(state, piece, scratch)
+        problem.add_bias_prior(state, piece)
+        if not problem.framed:
+            hold_frame(state, piece, first, LOOSE_FRAME)
+        # A seam says nothing of the node behind it, and that node's own images are in the next part.
+        return piece.without_last() if last in problem.chain.starts else piece
+
+    def cost(self, g: int, state: State, out: Residuals) -> float:
+        """Half the robust chi^2 of part `g` at `state`; fills `out` for its measurements."""
+        piece = Piece.bare(int(self.ends[g]), int(self.ends[g + 1]))
+        return self.problem.add_measurements(state, piece, out, sums=False) + self.problem.add_bias_prior(
+            state, piece, sums=False
+        )
+
+
+def segment_ends(starts: tuple[int, ...], n_nodes: int, segments: int) -> np.ndarray:
+    """(segments + 1,) nodes between which segments lie; each start of a recording is one. More segments where there are
+    more recordings."""
+    edges = np.array([*starts, n_nodes - 1])
+    counts = np.maximum(np.round(segments * np.diff(edges) / edges[-1]).astype(int), 1)
+    pieces = [np.linspace(a, b, n + 1)[:-1] for a, b, n in zip(edges[:-1], edges[1:], counts, strict=True)]
+    return np.concatenate([*pieces, edges[-1:]]).astype(int)

@@ -1,0 +1,113 @@
+"""What parts of the recording make of one another: what moves without each part, and how halves predict each other."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from icalib.calibration import Calibration, HeldOut, ParameterGroup, PredictedFit
+from icalib.report.plot import Figure, axis, dots, figure, line
+from icalib.report.quantities import shown, shown_groups
+from icalib.report.tables import Html, table
+
+ROW_PX = 17
+_ALLOWED = "#94a3b8"
+_PRINTED = "#fde2b3"
+
+
+def moved_without_parts(c: Calibration, held: HeldOut) -> Figure:
+    """Of each parameter a row: a dot for each part, how far the answer moves without it in units of what noise allows;
+    grey what noise allows, orange the same times the factor that the printed standard deviation includes."""
+    groups = [g for g in shown_groups(c) if g.columns is not None]
+    columns = np.array([k for g in groups for k in g.columns or ()], dtype=np.int64)
+    names = [f"{g.sensor} {_name(g, label)}" for g in groups for label in g.labels]
+    factors = np.concatenate([np.ones(len(g.labels)) if g.factor is None else np.maximum(g.factor, 1) for g in groups])
+    z, row = held.whitened[:, columns], np.arange(len(columns), dtype=float)
+    traces = [
+        _bars(factors, row, "the same, times the printed factor", _PRINTED, 5),
+        _bars(np.ones(len(row)), row, "what noise allows, one standard deviation", _ALLOWED, 9),
+        dots(z.ravel(), np.tile(row, held.parts), "without one part", "#14304f", 5, text=_which(held, names)),
+    ]
+    traces[-1] |= {"hovertemplate": "%{text}: %{x}<extra></extra>"}
+    rows: dict[str, Any] = {"tickvals": row.tolist(), "ticktext": names, "automargin": True, "showgrid": False}
+    rows |= {"tickfont": {"size": 10}, "range": [len(row) - 0.5, -0.5], "zeroline": False}
+    title = axis("moved without one part, in formal standard deviations of that")
+    return figure(traces, ROW_PX * len(row) + 110, xaxis=title, yaxis=axis("", **rows))
+
+
+def _name(g: ParameterGroup, label: str) -> str:
+    return (g.name if label in (g.name, "") else f"{g.name} {label}").replace("_", " ")
+
+
+def _bars(half: np.ndarray, row: np.ndarray, name: str, color: str, width: int) -> dict[str, Any]:
+    """A bar from -half to half in each row."""
+    x = np.stack([-half, half, np.full_like(half, np.nan)], axis=1).ravel()
+    return line(x, np.repeat(row, 3), name, color, line={"color": color, "width": width}, hoverinfo="skip")
+
+
+def _which(held: HeldOut, names: list[str]) -> list[str]:
+    return [f"{name}, without part {g + 1}" for g in range(held.parts) for name in names]
+
+
+def predicted_fits(held: HeldOut) -> Html:
+    """Each kind of residual where it took part, and where the other half predicts it."""
+    whitened, raw = "whitened RMS, took part", "RMS, took part"
+    headers = ("sensor", "kind", "residuals", whitened, "predicted", raw, "predicted", "more chi2")
+    body = [_row(f) for f in held.fits if f.count]
+    return table(headers, body, headers[2:])
+
+
+def _row(f: PredictedFit) -> tuple[object, ...]:
+    inside, outside = (np.sqrt(x / f.count) for x in (f.chi2_inside, f.chi2_outside))
+    rms = (_raw(f.rms_inside, f.unit), _raw(f.rms_outside, f.unit))
+    return (
+        f.sensor, f.kind, f.count, f"{inside:.4f}", f"{outside:.4f}", *rms, f"{f.chi2_outside - f.chi2_inside:+.1f}"
+    )  # fmt: skip
+
+
+def _raw(rms: float | None, unit: str) -> str:
+    scale, name = {"m": (1e3, "mm"), "rad": (1e3, "mrad")}.get(unit, (1.0, unit))
+    return "" if rms is None else f"{scale * rms:.4g} {name}"
+
+
+def words(c: Calibration, held: HeldOut) -> list[str]:
+    """What was found, and by which factor the formal standard deviations are too small."""
+    expected, spread = f"{held.expected:.0f}", f"{held.spread:.0f}"
+    rise = (
+        f"Predicted by the other half, chi^2 is {held.excess:.0f} higher than where both halves took part; noise of "
+        f"the stated sizes would make that {expected} ± {spread}, with {held.directions} parameters that both "
+        "halves know."
+    )
+    moved = float(np.sqrt(np.nanmean(held.whitened[:, _columns(c)] ** 2))) if len(_columns(c)) else 1.0
+    parts = f"By what moves without each of {held.parts} parts it is {shown(moved)} on average"
+    if held.optimistic:
+        verdict = (
+            f"On these data the formal standard deviations are too small by a factor of about {shown(held.factor)}."
+        )
+    elif held.excess < held.expected - 3.0 * held.spread:
+        verdict = (
+            f"On these data the formal standard deviations are, if anything, too large (factor {shown(held.factor)})."
+        )
+    else:
+        verdict = f"That is chance: on these data the formal standard deviations hold (factor {shown(held.factor)})."
+    return [rise, verdict, f"{parts}; {_printed(c)}"]
+
+
+def _columns(c: Calibration) -> np.ndarray:
+    return np.array([k for g in _own(c) for k in g.columns or ()], dtype=np.int64)
+
+
+def _own(c: Calibration) -> list[ParameterGroup]:
+    """Groups of sensors, but for bloom: what users take away."""
+    return [g for g in c.groups if g.columns is not None and g.sensor in c.rig["sensors"] and g.name != "bloom"]
+
+
+def _printed(c: Calibration) -> str:
+    factors = [float(g.factor.max()) for g in _own(c) if g.factor is not None]
+    if not factors:
+        return "none is printed."
+    low, high = shown(min(factors)), shown(max(factors))
+    return (
+        f"the standard deviations printed here are {low if low == high else f'{low} to {high}'} times the formal ones."
+    )

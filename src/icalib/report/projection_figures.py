@@ -1,0 +1,85 @@
+"""Where in the image a camera's calibration can be trusted, and to how many pixels."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from icalib.calibration import Calibration, CornerResiduals, ProjectionMap, projection_uncertainty, working_distance
+from icalib.report.plot import Figure, axis, dots, figure, numbers, thin
+from icalib.report.quantities import shown
+
+MOST_DOTS = 1500
+WIDEST = 6.0  # of the scale of colours, in the median where corners are: edges without data would take it all
+LEVELS = 9  # at least, of contours
+NOT_SEEN = 3.0  # times the median: a region that the target did not reach
+
+
+def projection_maps(c: Calibration, camera: str) -> list[ProjectionMap]:
+    """At infinity, and at the target's distance where it was seen; none where the rig file fixes the lens."""
+    if all(c.group(camera, name).columns is None for name in ("intrinsics", "distortion")):
+        return []
+    ranges = [np.inf, *(x for x in [working_distance(c, camera)] if x is not None)]
+    maps = (projection_uncertainty(c, camera, x) for x in ranges)
+    return [m for m in maps if m is not None]
+
+
+def projection_figure(m: ProjectionMap, corners: CornerResiduals | None, resolution: tuple[int, int]) -> Figure:
+    """Standard deviation over the image with its contours, and where corners were."""
+    width, height = resolution
+    top = float(min(np.nanmax(m.sigma), WIDEST * m.median_seen))
+    step = _round(top / LEVELS)
+    heat: dict[str, Any] = {
+        "type": "contour",
+        "x": numbers(m.u),
+        "y": numbers(m.v),
+        "z": numbers(m.sigma),
+        "zmin": 0,
+        "zmax": top,
+        "colorscale": [[0, "#f0f9e8"], [0.25, "#a8ddb5"], [0.55, "#43a2ca"], [1, "#0868ac"]],
+        "contours": {"start": step, "end": top, "size": step, "showlabels": True},
+        "line": {"width": 1, "color": "#1f2937"},
+        "colorbar": {"title": {"text": "std [px]"}, "thickness": 10},
+        "hovertemplate": "u %{x}, v %{y}: %{z} px<extra></extra>",
+    }
+    heat["contours"] |= {"coloring": "heatmap", "labelfont": {"size": 10, "color": "#111827"}}
+    traces = [heat]
+    if corners is not None:
+        used = corners.uv[~corners.rejected]
+        used = used[thin(len(used), MOST_DOTS)]
+        marker = {"color": "#b45309", "size": 2.5, "opacity": 0.35}
+        traces.append(dots(used[:, 0], used[:, 1], "corners", "", marker=marker, hoverinfo="skip"))
+    return figure(
+        traces,
+        330,
+        xaxis=axis("u [px]", range=[-0.5, width - 0.5], constrain="domain"),
+        yaxis=axis("v [px]", range=[height - 0.5, -0.5], scaleanchor="x", constrain="domain"),
+    )
+
+
+def _round(step: float) -> float:
+    """The largest of 1, 2 or 5 times a power of ten that is not above a positive `step`; 1 of nothing."""
+    if not step > 0.0:
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(step))
+    return float(power * max(k for k in (1.0, 2.0, 5.0) if k * power <= 1.001 * step))
+
+
+def title(m: ProjectionMap) -> str:
+    """What a map is of."""
+    return "Points far away" if np.isinf(m.range_m) else f"Points {shown(m.range_m)} m away, as the target was"
+
+
+def words(m: ProjectionMap) -> str:
+    """The median, the worst, and what they mean."""
+    size, u, v = m.worst
+    where = "where corners were seen" if m.seen.any() else "over the image"
+    moved = "turned" if np.isinf(m.range_m) else "turned and moved"
+    text = (
+        f"Known to {shown(m.median_seen)} px {where} (median), to {shown(size)} px at the worst, at pixel "
+        f"({u:.0f}, {v:.0f}): by so much, one standard deviation, this camera disagrees with the true one that is "
+        f"{moved} to fit it best."
+    )
+    worse = size > NOT_SEEN * m.median_seen and m.seen.any()
+    return text + (" Move the target there too to know the lens there." if worse else "")
