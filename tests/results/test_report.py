@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
@@ -13,7 +14,13 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from icalib.calibration import Calibration, ProjectionMap, projection_uncertainty, working_distance
+from icalib.calibration import (
+    Calibration,
+    ProjectionMap,
+    joint_covariance,
+    projection_uncertainty,
+    working_distance,
+)
 from icalib.outputs import check_folder, write_outputs
 from icalib.report import corner_figures, projection_figures, report_html
 from icalib.report.console import table
@@ -129,6 +136,19 @@ def test_figures_show_the_numbers(calibration: Calibration, text: str):
     np.testing.assert_allclose(diagonal, 1.0)
     rate = figures["motion"]["data"][0]["y"]
     assert np.rad2deg(0.5 * 2.1) * 0.9 < max(rate) < np.rad2deg(0.5 * 2.1 + 0.6 * 1.3)
+
+
+def test_ellipsoids_are_three_sigma_of_a_position(calibration: Calibration, text: str):
+    traces = {t["name"]: t for t in json.loads(Page(text).scripts[0])["rig"]["data"]}
+    factor = float(re.search(r"position, ([\d.e+-]+) times as large", Page(text).words).group(1))  # pyright: ignore
+    for name in calibration.mounted:
+        group = calibration.group(name, "translation")
+        drawn = next(t for n, t in traces.items() if n.startswith(f"{name}: "))
+        points = np.array([drawn[axis] for axis in "xyz"], dtype=float).T
+        away = (points[~np.isnan(points[:, 0])] - group.value) / factor
+        information = np.linalg.inv(joint_covariance(calibration, [group]))
+        size = np.sqrt(np.einsum("ni,ij,nj->n", away, information, away))
+        np.testing.assert_allclose(size, 3.0, rtol=1e-2)  # coordinates are written with few digits
 
 
 def test_maps_of_projection_say_what_they_show(calibration: Calibration, text: str):

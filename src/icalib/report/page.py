@@ -18,6 +18,7 @@ from icalib.report import (
     robot_figures,
     tables,
 )
+from icalib.report.ellipsoids import SIGMAS, ellipsoids, magnification
 from icalib.report.histogram import normalised_histogram
 from icalib.report.plot import Figure
 from icalib.report.tables import Html, element
@@ -42,6 +43,7 @@ def report_html(calibration: Calibration) -> str:
         "body": "imu" if c.imu else c.body,
         "status": c.status,
         "answer": tables.TRUST[trust],
+        "ellipsoids": _ellipsoid_words(c),
         "most_dots": corner_figures.MOST_DOTS,
         "most_nodes": motion_figures.MOST_NODES,
         "most_points": robot_figures.MOST_IN_SPACE,
@@ -72,6 +74,15 @@ def report_html(calibration: Calibration) -> str:
     escaped = {name: tables.html(value) for name, value in words.items()}
     body = Template(resource("icalib.report", "page.html")).substitute(escaped | parts)
     return document(f"Calibration of {words['sensors']}", body, _figures(c) | _projection_figures(c, maps))
+
+
+def _ellipsoid_words(c: Calibration) -> str:
+    if not ellipsoids(c):
+        return ""
+    return (
+        f" Ellipsoids of green, amber or red lines show where a sensor may be: {SIGMAS:g} standard deviations of its "
+        f"position, {magnification(c):g} times as large as they are; red ones are not determined."
+    )
 
 
 def document(title: str, body: str, figures: dict[str, Figure]) -> str:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from icalib.calibration import Calibration
 from icalib.report import rig_shapes
+from icalib.report.ellipsoids import VERDICT_COLORS, Ellipsoid, ellipsoids, magnification, outline
 from icalib.report.plot import AXIS_COLORS, COLORS, VIEW, Figure, axis, figure, numbers, path_3d
 from icalib.report.rig_shapes import PEN_UP
 
 
 def rig_picture(c: Calibration) -> Figure:
-    """Frames of all sensors, the cameras' fields of view, rings about LiDARs, and wheels, in the imu frame."""
+    """Frames of all sensors, the cameras' fields of view, rings about LiDARs, and wheels in the imu frame, and how well
+    their places are known."""
     frames, spread = rig_shapes.frames(c), rig_shapes.spread(c)
     origins = np.array([T[:3, 3] for T in frames.values()])
     traces = [
@@ -26,6 +30,8 @@ def rig_picture(c: Calibration) -> Figure:
     for i, (name, pen) in enumerate(shapes.items()):
         color, T = COLORS[i % len(COLORS)], frames[name]
         traces.append(path_3d(pen @ T[:3, :3].T + T[:3, 3], name, color, line={"color": color, "width": 2}))
+    factor = magnification(c)
+    traces += [_uncertainty(e, frames[e.sensor][:3, 3], factor) for e in ellipsoids(c)]
     traces.append(
         path_3d(
             origins, "sensors", "#111827", mode="markers+text", text=list(frames), marker={"size": 4}, showlegend=False
@@ -40,6 +46,11 @@ def rig_picture(c: Calibration) -> Figure:
 def _axis_line(frames: dict[str, np.ndarray], i: int, length: float) -> np.ndarray:
     pieces = [np.stack([T[:3, 3], T[:3, 3] + length * T[:3, i]]) for T in frames.values()]
     return np.concatenate([np.vstack([p, PEN_UP]) for p in pieces])
+
+
+def _uncertainty(e: Ellipsoid, origin: np.ndarray, factor: float) -> dict[str, Any]:
+    color = VERDICT_COLORS[e.verdict]
+    return path_3d(outline(e, factor) + origin, f"{e.sensor}: {e.verdict}", color, line={"color": color, "width": 3})
 
 
 def _frustum(c: Calibration, name: str, depth: float) -> np.ndarray:

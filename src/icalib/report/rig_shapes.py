@@ -9,6 +9,7 @@ from icalib.geometry.targets import Target
 
 PEN_UP = np.full((1, 3), np.nan)  # a row between two lines
 _ROUND = np.linspace(0.0, 2.0 * np.pi, 41)
+CIRCLE = np.stack([np.cos(_ROUND), np.sin(_ROUND)], axis=1)
 _LEAST_SPREAD_M = 0.02
 
 
@@ -25,7 +26,7 @@ def spread(c: Calibration) -> float:
 
 def rings(radius: float) -> np.ndarray:
     """Three circles about z, as a spinning LiDAR looks level, up and down."""
-    x, y = np.cos(_ROUND), np.sin(_ROUND)
+    x, y = CIRCLE.T
     tilted = ((np.cos(e), np.sin(e)) for e in np.deg2rad([-15.0, 0.0, 15.0]))
     circles = [radius * np.stack([a * x, a * y, np.full_like(x, b)], axis=1) for a, b in tilted]
     return np.vstack([part for circle in circles for part in (circle, PEN_UP)])
@@ -37,7 +38,7 @@ def axle(c: Calibration, name: str) -> np.ndarray:
     if "radii" not in known:
         return PEN_UP
     left, right = (np.array([0.0, s * 0.5 * known["baseline"][0], 0.0]) for s in (1.0, -1.0))
-    rim = np.stack([np.cos(_ROUND), np.zeros_like(_ROUND), np.sin(_ROUND)], axis=1)
+    rim = np.insert(CIRCLE, 1, 0.0, axis=1)
     discs = [(hub + r * rim, hub + r * rim[::5]) for hub, r in zip((left, right), known["radii"], strict=True)]
     pen = [left, right, PEN_UP]
     for hub, (circle, ends) in zip((left, right), discs, strict=True):

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from icalib.calibration import Calibration, RecordingSpan, joint_covariance
+from icalib.calibration import Calibration, RecordingSpan
 from icalib.geometry.targets import target_from_plain
 from icalib.report import rig_shapes
+from icalib.report.ellipsoids import SIGMAS, VERDICT_COLORS, ellipsoids, magnification
 from icalib.report.plot import COLORS
-from icalib.report.quantities import worst
 from icalib.view.colors import by_value, rgb
 from icalib.view.stream import Stream
 
-SIGMAS = 3.0
 POINT = 1.5  # radius of a point of a LiDAR, in points of the screen
-_LARGEST = 0.4  # of the spread of the rig, up to which the best known ellipsoids are magnified
-_VERDICT_COLORS = {"determined": "#15803d", "weak": "#d97706", "undetermined": "#dc2626"}
 _TARGET, _WAY = "#be185d", "#64748b"
 _WORST_OF_SCALE = 4.0  # of a scale of colours, in RMS of the result
 
@@ -59,47 +54,13 @@ def _pinhole(s: Stream, c: Calibration, name: str, depth: float):
     )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Ellipsoid:
-    """Where a sensor may be: axes (3, 3) of unit length in columns, imu frame; half_sizes (3,) [m], of SIGMAS standard
-    deviations, empirical factors included."""
-
-    sensor: str
-    verdict: str
-    axes: np.ndarray
-    half_sizes: np.ndarray
-
-
-def ellipsoids(c: Calibration) -> list[Ellipsoid]:
-    """Of the translation of each mounted sensor that was estimated."""
-    found = []
-    for name in c.mounted:
-        group = c.group(name, "translation")
-        if group.columns is None:
-            continue
-        values, axes = np.linalg.eigh(joint_covariance(c, [group]))
-        axes[:, 0] *= np.sign(np.linalg.det(axes))
-        found.append(Ellipsoid(name, worst(group.verdict), axes, SIGMAS * np.sqrt(np.maximum(values, 0.0))))
-    return found
-
-
-def magnification(c: Calibration) -> float:
-    """The power of ten by which ellipsoids are drawn larger: as large as they can be while those that are determined,
-    or where none is the smallest one, stay smaller than the rig."""
-    sizes = [(e.verdict, float(e.half_sizes.max())) for e in ellipsoids(c)]
-    shown = [size for verdict, size in sizes if verdict == "determined"] or [min((x for _, x in sizes), default=0.0)]
-    if not 0.0 < max(shown) < np.inf:
-        return 1.0
-    return max(1.0, 10.0 ** float(np.floor(np.log10(_LARGEST * rig_shapes.spread(c) / max(shown)))))
-
-
 def log_uncertainty(s: Stream, c: Calibration) -> None:
     """The ellipsoids, magnified alike, coloured by verdict."""
     factor = magnification(c)
     for e in ellipsoids(c):
         ellipsoid = s.rr.Ellipsoids3D(
             half_sizes=[factor * e.half_sizes], centers=[c.group(e.sensor, "translation").value],
-            quaternions=[Rotation.from_matrix(e.axes).as_quat()], colors=rgb(_VERDICT_COLORS[e.verdict]),
+            quaternions=[Rotation.from_matrix(e.axes).as_quat()], colors=rgb(VERDICT_COLORS[e.verdict]),
             labels=[f"{e.sensor}: {SIGMAS:g} sigma x {factor:g}"], show_labels=False,
         )  # fmt: skip
         s.still(f"world/{c.body}/uncertainty/{e.sensor}", ellipsoid)

@@ -8,11 +8,12 @@ from pathlib import Path
 from icalib.calibration import Calibration, load_calibration
 from icalib.extras import load_rerun
 from icalib.recordings import open_recording
+from icalib.report.ellipsoids import SIGMAS, magnification
 from icalib.report.quantities import rows
 from icalib.rig_file import rig_from_dict
 from icalib.view.layout import blueprint
 from icalib.view.recorded import Recorded, span_of
-from icalib.view.scene import SIGMAS, log_motion, log_planes, log_rig, log_target, log_uncertainty, magnification
+from icalib.view.scene import log_motion, log_planes, log_rig, log_target, log_uncertainty
 from icalib.view.series import log_residuals, log_states
 from icalib.view.stream import Stream, opened
 

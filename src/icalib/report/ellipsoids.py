@@ -1,0 +1,56 @@
+"""How well the place of each sensor is known, as ellipsoids: what the report and the 3D view draw alike."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.calibration import Calibration, joint_covariance
+from icalib.report import rig_shapes
+from icalib.report.quantities import worst
+
+SIGMAS = 3.0
+VERDICT_COLORS = {"determined": "#15803d", "weak": "#d97706", "undetermined": "#dc2626"}
+_LARGEST = 0.4  # of the spread of the rig, up to which the best known ellipsoids are magnified
+
+
+@dataclass(frozen=True)
+class Ellipsoid:
+    """Where a sensor may be: axes (3, 3) of unit length in columns, imu frame; half_sizes (3,) [m], of SIGMAS standard
+    deviations, empirical factors included."""
+
+    sensor: str
+    verdict: str
+    axes: np.ndarray
+    half_sizes: np.ndarray
+
+
+def ellipsoids(c: Calibration) -> list[Ellipsoid]:
+    """Of the translation of each mounted sensor that was estimated."""
+    found = []
+    for name in c.mounted:
+        group = c.group(name, "translation")
+        if group.columns is None:
+            continue
+        values, axes = np.linalg.eigh(joint_covariance(c, [group]))
+        axes[:, 0] *= np.sign(np.linalg.det(axes))
+        found.append(Ellipsoid(name, worst(group.verdict), axes, SIGMAS * np.sqrt(np.maximum(values, 0.0))))
+    return found
+
+
+def magnification(c: Calibration) -> float:
+    """The power of ten by which ellipsoids are drawn larger: as large as they can be while those that are determined,
+    or where none is the smallest one, stay smaller than the rig."""
+    sizes = [(e.verdict, float(e.half_sizes.max())) for e in ellipsoids(c)]
+    shown = [size for verdict, size in sizes if verdict == "determined"] or [min((x for _, x in sizes), default=0.0)]
+    if not 0.0 < max(shown) < np.inf:
+        return 1.0
+    return max(1.0, 10.0 ** float(np.floor(np.log10(_LARGEST * rig_shapes.spread(c) / max(shown)))))
+
+
+def outline(e: Ellipsoid, factor: float) -> np.ndarray:
+    """Its three ellipses about where the sensor is, `factor` times as large, in the axes of the imu frame."""
+    x, y = rig_shapes.CIRCLE.T
+    circles = [np.insert(np.stack([x, y], axis=1), k, 0.0, axis=1) for k in range(3)]
+    return np.vstack([p for c in circles for p in (factor * (c * e.half_sizes) @ e.axes.T, rig_shapes.PEN_UP)])
