@@ -257,6 +257,9 @@ class DriveProblem:
     def residuals(self):
         return np.zeros((self.n_nodes - 1, ROWS)), self.wheels.output()
 
+    def settled(self, _at):
+        return self  # no points of the scene
+
     def linearise(self, state, pieces, out, sums=True, curved=False):
         def add(piece):
             piece.clear()
