@@ -159,6 +159,8 @@ def feature_sample(unlike, setup_of, features_of, scheme="inertial", loss="none"
     at_optimum = factor.output()
     for piece in make_pieces(len(state.seconds), setup.layout.size):
         factor.accumulate(state, piece, at_optimum, sums=False)
+    views = factor._views(state, 0, factor.n_nodes)
+    world = factor._from_anchors(views, slice(0, factor.tracks.count), at_optimum.points)
     used = [root > 0 for root in at_optimum.root]
     track = np.concatenate([t[u] for t, u in zip(factor.tracks.track, used, strict=True)])
 
@@ -173,10 +175,10 @@ def feature_sample(unlike, setup_of, features_of, scheme="inertial", loss="none"
         return np.concatenate(found)
 
     def residual(at):
-        return errors(at, at_optimum.points).ravel()
+        return errors(at, world).ravel()
 
     def weights(at):
-        e = errors(at, at_optimum.points)
+        e = errors(at, world)
         root = np.concatenate([r[u] for r, u in zip(at_optimum.root, used, strict=True)])
         sigma = np.repeat(factor.sigma, [u.sum() for u in used])
         size = np.linalg.norm(e, axis=1)
@@ -189,7 +191,7 @@ def feature_sample(unlike, setup_of, features_of, scheme="inertial", loss="none"
         F, h = np.zeros((2 * len(e), 3 * factor.tracks.count)), 1e-5
         for k in range(3):
             step = h * np.eye(3)[k]
-            slope = (errors(at, at_optimum.points + step) - errors(at, at_optimum.points - step)) / (2 * h)
+            slope = (errors(at, world + step) - errors(at, world - step)) / (2 * h)
             for r in range(2):
                 F[2 * np.arange(len(e)) + r, 3 * track + k] = slope[:, r]
         y = (root[:, None] ** 2 * e).ravel()

@@ -60,7 +60,7 @@ def test_a_point_at_infinity_stays_in_its_direction(factor, setup):
     for view in views:
         own = np.flatnonzero((factor.tracks.track[view.index] == track) & factor.keep[view.index])
         assert np.abs(out.residual[view.index][own]).max(initial=0.0) < 0.02
-    assert np.linalg.norm(out.in_anchors[track]) == pytest.approx(FARTHEST_M, rel=1e-6)
+    assert np.linalg.norm(out.points[track]) == pytest.approx(FARTHEST_M, rel=1e-6)
 
 
 def test_settled_features_are_where_they_were(factor, setup):

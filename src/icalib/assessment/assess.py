@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from icalib.assessment.held_out import held_out, raw_rms
+from icalib.assessment.held_out import held_out
 from icalib.assessment.notes import notes
 from icalib.assessment.robot import (
     lidar_residuals,
@@ -35,7 +35,7 @@ from icalib.estimation.assembly import Inputs, image_times, origin_difference
 from icalib.estimation.board import SHAPE_LABELS
 from icalib.estimation.determination import Determined
 from icalib.estimation.estimate import Estimate
-from icalib.estimation.evidence import Fit, fits, place_covariances, split_covariance
+from icalib.estimation.evidence import Fit, fits, place_covariances, raw_rms, split_covariance
 from icalib.estimation.imu_model import LABELS as IMU_LABELS
 from icalib.estimation.parts import Parts
 from icalib.estimation.pose_factor import FRAME

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-import numpy as np
-
 from icalib.calibration import HeldOut, PredictedFit
-from icalib.estimation.evidence import chi2_by_kind
+from icalib.estimation.evidence import chi2_by_kind, raw_rms
 from icalib.estimation.held_out import Prediction, predict, shifts
 from icalib.estimation.parts import Parts
-from icalib.estimation.problem import Problem, Residuals
+from icalib.estimation.problem import Problem
 
 
 def held_out(parts: Parts | None, assumed: Collection[str]) -> HeldOut | None:
@@ -33,24 +31,3 @@ def _fits(problem: Problem, found: Prediction) -> list[PredictedFit]:
         (rms, unit), (rms_outside, _) = (raw_rms(problem, out, sensor, kind) for out in (found.inside, found.outside))
         fits.append(PredictedFit(sensor, kind, count, chi2, outside[sensor, kind][1], rms, rms_outside, unit))
     return fits
-
-
-def raw_rms(problem: Problem, out: Residuals, sensor: str, kind: str) -> tuple[float | None, str]:
-    """RMS of one kind of residual as it was before whitening, and its unit; None where it has none."""
-    if kind == "features":
-        factor, left = problem.features, out.features
-        assert factor is not None and left is not None
-        i = [c.name for c in factor.cameras].index(sensor)
-        return _rms_px(left.residual[i], left.root[i]), "px"
-    for camera, corners in zip(problem.cameras, out.corners, strict=True):
-        if camera.name == sensor:
-            return _rms_px(corners.residual, corners.root), "px"
-    for factor, rows in zip(problem.sensors, out.sensors, strict=True):
-        if factor.name == sensor and kind in factor.kinds:
-            return factor.rms(rows, kind)
-    return None, ""
-
-
-def _rms_px(residual: np.ndarray, root: np.ndarray) -> float | None:
-    used = residual[root > 0.0]
-    return float(np.sqrt(np.mean(used**2, dtype=np.float64))) if len(used) else None

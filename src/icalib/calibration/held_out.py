@@ -55,6 +55,11 @@ class HeldOut:
         return self.excess > self.expected + SIGNIFICANT * self.spread
 
     @property
+    def pessimistic(self) -> bool:
+        """Whether they are too large, chance aside."""
+        return self.excess < self.expected - SIGNIFICANT * self.spread
+
+    @property
     def whitened(self) -> np.ndarray:
         """(G, B) `moved` in units of `allowed`, each like a standard normal number where noise is all there is; NaN
         where nothing is allowed."""

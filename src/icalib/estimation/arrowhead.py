@@ -160,11 +160,7 @@ class Factors:
 
     def rows(self) -> list[int]:
         """Unknowns of each piece, and of the shared node."""
-        own = [
-            d.rows if isinstance(d, Eliminated) else p.diagonal.shape[0] * NODE
-            for p, d in zip(self.pieces, self.done, strict=True)
-        ]
-        return [*own, len(self.shared)]
+        return [*(_unknowns(p, d) for p, d in zip(self.pieces, self.done, strict=True)), len(self.shared)]
 
     def draws(self, rng: np.random.Generator, free: int, still: int) -> tuple[Draw, ...]:
         """Draws from the posterior, to be made before the pieces are filled anew: `free` ones in which undetermined
@@ -231,23 +227,31 @@ def _reduce(piece: Piece, keep: bool) -> Eliminated | bool:
     return done
 
 
+def _reduce_all(piece: Piece) -> Eliminated | bool:
+    """Eliminates a piece in place. Raises NotDefiniteError."""
+    done = _reduce(piece, False)
+    if not done:
+        raise NotDefiniteError(BROKEN_DOWN)
+    return done
+
+
+def _unknowns(piece: Piece, done: Eliminated | bool) -> int:
+    """How many of a piece's were eliminated, or stand in it."""
+    return done.rows if isinstance(done, Eliminated) else len(piece.diagonal) * NODE
+
+
 def marginalise(piece: Piece) -> np.ndarray:
     """Border (B + 1, B + 1) with all nodes of `piece` eliminated; overwrites the piece. Raises NotDefiniteError."""
-    if not _reduce(piece, False):
-        raise NotDefiniteError(BROKEN_DOWN)
+    _reduce_all(piece)
     return piece.border
 
 
 def given_border(piece: Piece, border: np.ndarray) -> np.ndarray:
     """(n, 15, m) the best steps of the nodes of `piece` where the border makes steps (B, m); overwrites the piece.
     Raises NotDefiniteError."""
-    done = _reduce(piece, False)
-    if not done:
-        raise NotDefiniteError(BROKEN_DOWN)
-    n, m = len(piece.diagonal), border.shape[1]
-    chain = np.zeros((piece.first + n, NODE, m))
-    rows = done.rows if isinstance(done, Eliminated) else NODE * n
-    _back(piece, done, np.zeros((rows, m)), False, np.vstack([border, np.ones((1, m))]), chain)
+    done, m = _reduce_all(piece), border.shape[1]
+    chain = np.zeros((piece.last + 1, NODE, m))
+    _back(piece, done, np.zeros((_unknowns(piece, done), m)), False, np.vstack([border, np.ones((1, m))]), chain)
     return chain[piece.first :]
 
 

@@ -45,13 +45,16 @@ OnVisit = Callable[[str, Problem, Visit], None]  # told of the pass's name, its 
 
 @dataclass(frozen=True)
 class Estimate:
-    """The last pass: its problem, where the solver ended, and the noise of each camera and of the robot's sensors."""
+    """The last pass: where the solver ended, and the noise of each camera and of the robot's sensors."""
 
-    problem: Problem
     outcome: Outcome
     noise: tuple[NoiseModel, ...]
     steps: tuple[tuple[str, Step], ...]  # of all passes, with the pass's name
     robot: RobotNoise = NO_ROBOT
+
+    @property
+    def problem(self) -> Problem:
+        return self.outcome.problem
 
 
 def estimate(
@@ -81,12 +84,12 @@ def estimate(
             on_step(name, step)
 
         last = name == names[-1]
-        share = FIRST_SHARE if name == "first" else EARLY_SHARE
-        goal = (CONVERGED_DECREASE, ROUNDING) if last else (EARLY_DECREASE, share)
-        outcome = minimise(problem, state, note, goal[0], partial(on_visit, name, problem), goal[1])
+        early = EARLY_DECREASE, FIRST_SHARE if name == "first" else EARLY_SHARE
+        tolerance, share = (CONVERGED_DECREASE, ROUNDING) if last else early
+        outcome = minimise(problem, state, note, tolerance, partial(on_visit, name, problem), share)
         problem = outcome.problem
         if last:
-            return Estimate(problem, outcome, tuple(models), tuple(history), robot)
+            return Estimate(outcome, tuple(models), tuple(history), robot)
         if name == "first":
             keep = [
                 _inliers(f, out, rig.settings)

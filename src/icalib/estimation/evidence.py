@@ -76,6 +76,27 @@ def chi2_by_kind(problem: Problem, at: Residuals) -> dict[tuple[str, str], tuple
     return found
 
 
+def raw_rms(problem: Problem, out: Residuals, sensor: str, kind: str) -> tuple[float | None, str]:
+    """RMS of one kind of residual as it was before whitening, and its unit; None where it has none."""
+    if kind == "features":
+        factor, left = problem.features, out.features
+        assert factor is not None and left is not None
+        i = [c.name for c in factor.cameras].index(sensor)
+        return _rms_px(left.residual[i], left.root[i]), "px"
+    for camera, corners in zip(problem.cameras, out.corners, strict=True):
+        if camera.name == sensor:
+            return _rms_px(corners.residual, corners.root), "px"
+    for factor, rows in zip(problem.sensors, out.sensors, strict=True):
+        if factor.name == sensor and kind in factor.kinds:
+            return factor.rms(rows, kind)
+    return None, ""
+
+
+def _rms_px(residual: np.ndarray, root: np.ndarray) -> float | None:
+    used = residual[root > 0.0]
+    return float(np.sqrt(np.mean(used**2, dtype=np.float64))) if len(used) else None
+
+
 def _corner_chi2(camera: CornerFactor, out: CornerOutput) -> dict[str, tuple[int, float]]:
     """Number and chi^2 of one camera's corner rows and of each kind of common error's rows."""
     chi2 = np.einsum("i,i,i->", camera.squared_errors(out), out.root, out.root)

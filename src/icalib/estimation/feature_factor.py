@@ -45,12 +45,11 @@ MOST_UNLIKE = 10.0  # times the residuals of most points: a point that fits wors
 @dataclass(frozen=True)
 class FeatureOutput:
     """By camera: residual (N, 2) px, predicted - measured, and root (N,), square root of its weight over sigma (0 where
-    left out); points (T, 3) in the world, and in the frames of the cameras that they move with."""
+    left out); points (T, 3) in the frames of the cameras that they move with."""
 
     residual: tuple[np.ndarray, ...]
     root: tuple[np.ndarray, ...]
     points: np.ndarray
-    in_anchors: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -112,11 +111,11 @@ class FeatureFactor:
         label = np.where(label >= 0, np.where(np.append(good, False)[label], label, -1), -1)
         number = np.append(np.where(good, np.cumsum(good) - 1, -1), -1)
         factor = replace(factor, tracks=sightings.tracks(number[label], edges))
-        start = factor._in_anchors(factor._views(state, 0, factor.n_nodes), points[good], slice(0, factor.tracks.count))
-        return replace(factor, tracks=replace(factor.tracks, start=start))
+        return replace(factor, tracks=replace(factor.tracks, start=points[good]))
 
     def _triangulated(self, state: State) -> tuple[np.ndarray, np.ndarray]:
-        """Points (T, 3) in the world of `state`, from the rays, and whether each is certain enough."""
+        """Points (T, 3) in the frames of the cameras that they move with, from the rays with the poses of `state`, and
+        whether each is certain enough."""
         views, n = self._views(state, 0, self.n_nodes), self.tracks.count
         A, b = np.tile(1e-9 * np.eye(3), (n, 1, 1)), np.zeros((n, 3))
         for view in views:
@@ -124,7 +123,8 @@ class FeatureFactor:
             motion = view.motion
             add_rays(view.seen, 0, motion.R_cam_world, motion.p_world_cam, rays, valid, A, b)
         found = self._descend(views, np.linalg.solve(A, b[:, :, None])[:, :, 0], slice(0, n))
-        distance = np.linalg.norm(found.xyz - found.seen_from, axis=1)
+        points = self._in_anchors(views, found.xyz, slice(0, n))
+        distance = np.linalg.norm(points, axis=1)
         information = np.linalg.eigvalsh(found.A)[:, 0]
         seen = sum(
             (np.bincount(t[(t >= 0) & k], minlength=n) for t, k in zip(self.tracks.track, self.keep, strict=True)),
@@ -133,18 +133,19 @@ class FeatureFactor:
         square = found.cost / np.maximum(seen, 1)
         fits = square <= MOST_UNLIKE**2 * np.median(square[found.shown == seen] if n else 0.0) + MOST_UNLIKE
         certain = information * (MOST_UNCERTAIN * distance) ** 2 > 1.0
-        return found.xyz, np.isfinite(found.xyz).all(axis=1) & (found.shown == seen) & fits & certain
+        return points, np.isfinite(points).all(axis=1) & (found.shown == seen) & fits & certain
 
     def output(self) -> FeatureOutput:
         """Empty arrays for `accumulate` to fill."""
-        sizes, n_points = [len(s.uv) for s in self.streams], self.tracks.count
-        residual, root = tuple(np.zeros((n, 2)) for n in sizes), tuple(np.zeros(n) for n in sizes)
-        return FeatureOutput(residual, root, np.zeros((n_points, 3)), np.zeros((n_points, 3)))
+        sizes = [len(s.uv) for s in self.streams]
+        return FeatureOutput(
+            tuple(np.zeros((n, 2)) for n in sizes), tuple(np.zeros(n) for n in sizes), np.zeros((self.tracks.count, 3))
+        )
 
     def settled(self, at: FeatureOutput) -> FeatureFactor:
         """The same features, first looked for where `at` found them: from far off a point may stop short, or end
         elsewhere, and the cost would jump from one step to the next."""
-        return replace(self, tracks=replace(self.tracks, start=at.in_anchors.copy()))
+        return replace(self, tracks=replace(self.tracks, start=at.points.copy()))
 
     def attach(self, piece: Piece, keep: bool) -> Piece:
         """The piece with room for the features that its nodes saw; `keep`: its end is shared with another piece."""
@@ -172,8 +173,7 @@ class FeatureFactor:
         tracks, pairs = self._within(piece)
         views, base = self._views(state, piece.first, self._stop(piece)), Range(tracks.start, pairs.start)
         points = self._descend(views, self._from_anchors(views, tracks, self.tracks.start[tracks]), tracks)
-        out.points[tracks] = points.xyz
-        out.in_anchors[tracks] = self._in_anchors(views, points.xyz, tracks)
+        out.points[tracks] = self._in_anchors(views, points.xyz, tracks)
         into = piece.sums(sums)
         features = NO_SUMS
         if sums and piece.features is not None:

@@ -14,6 +14,7 @@ from numba import njit
 from icalib.estimation.corner_chain import add_image, pose_chain
 from icalib.estimation.corner_weights import bend, weight
 from icalib.geometry.blas import subtract_gram
+from icalib.geometry.planes import tangents
 from icalib.geometry.small import solve_definite
 
 SETTLED = 1e-12  # of half the chi^2: what another step of a point could still take off
@@ -210,16 +211,8 @@ def _ray_axes(eye, point, axes):
     """axes (3, 3): rows of length one, the last from `eye` to `point`; returns how far it is."""
     x, y, z = point[0] - eye[0], point[1] - eye[1], point[2] - eye[2]
     distance = max(np.sqrt(x * x + y * y + z * z), 1e-9)
-    x, y, z = x / distance, y / distance, z / distance
-    if abs(x) < 0.6:
-        a, b, c = 0.0, z, -y
-    else:
-        a, b, c = -z, 0.0, x
-    size = np.sqrt(a * a + b * b + c * c)
-    a, b, c = a / size, b / size, c / size
-    axes[0, 0], axes[0, 1], axes[0, 2] = a, b, c
-    axes[1, 0], axes[1, 1], axes[1, 2] = y * c - z * b, z * a - x * c, x * b - y * a
-    axes[2, 0], axes[2, 1], axes[2, 2] = x, y, z
+    axes[2, 0], axes[2, 1], axes[2, 2] = x / distance, y / distance, z / distance
+    axes[:2] = tangents(axes[2])
     return distance
 
 

@@ -108,17 +108,17 @@ def minimise(
             on_step(steps[-1])
             return _outcome(problem, state, cost, residuals, solution.decrease, steps, solution)
         candidate = state.retract(problem.layout, solution.chain, solution.border)
-        settled = solution.decrease < curved_below * cost
+        near = solution.decrease < curved_below * cost
         converged = damping == 0.0 and solution.decrease < max(tolerance, share * cost)
         sums = not (converged and early)
-        candidate_cost = problem.linearise(candidate, pieces, residuals, sums, settled)
+        candidate_cost = problem.linearise(candidate, pieces, residuals, sums, near)
         # At the bottom rounding decides whether the cost falls; a step this small is taken anyway.
         accepted = bool(candidate_cost < cost) or converged
         steps.append(Step(cost, solution.decrease, damping, accepted))
         on_step(steps[-1])
         if accepted:
             good = cost - candidate_cost > 0.25 * solution.decrease
-            state, cost, curved = candidate, candidate_cost, settled
+            state, cost, curved = candidate, candidate_cost, near
             problem = problem.settled(residuals)
             damping = damping * (0.1 if good else 1.0)
             damping = 0.0 if damping < ZERO_DAMPING else damping

@@ -85,7 +85,7 @@ def words(c: Calibration, held: HeldOut) -> list[str]:
         verdict = (
             f"On these data the formal standard deviations are too small by a factor of about {shown(held.factor)}."
         )
-    elif held.excess < held.expected - 3.0 * held.spread:
+    elif held.pessimistic:
         verdict = (
             f"On these data the formal standard deviations are, if anything, too large (factor {shown(held.factor)})."
         )

@@ -9,14 +9,14 @@ import numpy as np
 
 from icalib.calibration import Calibration, CornerResiduals, LidarResiduals
 from icalib.report.motion_figures import BLOCKS
-from icalib.report.plot import AXIS_COLORS, COLORS
+from icalib.report.plot import AXIS_COLORS, COLORS, REJECTED
 from icalib.view.colors import rgb
 from icalib.view.scene import place
 from icalib.view.stream import Stream
 
 BIN_S = 0.1  # over which points of a LiDAR are taken together
 _CORNER = 3.0  # radius, in points of the screen
-_GOOD, _REJECTED = "#22c55e", "#dc2626"
+_GOOD = "#22c55e"
 
 
 def log_residuals(s: Stream, c: Calibration) -> None:
@@ -79,6 +79,6 @@ def _log_corners(s: Stream, c: Calibration, r: CornerResiduals) -> None:
         return
     rr, entity = s.rr, f"{place(c, r.sensor)}/image/corners"
     s.still(entity, rr.Points2D.from_fields(radii=rr.Radius.ui_points(_CORNER)))
-    colors = rgb(_GOOD, _REJECTED)[r.rejected.astype(np.int64)]
+    colors = rgb(_GOOD, REJECTED)[r.rejected.astype(np.int64)]
     columns = rr.Points2D.columns(positions=r.uv + 0.5, colors=colors).partition(np.diff(r.start))
     s.over(entity, r.seconds, columns)
