@@ -27,7 +27,7 @@ def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
         yield words
     if inputs.imu is not None:
         yield from _imu_notes(inputs, inputs.imu, found, timeline)
-    for camera, factor, model in zip(inputs.rig.cameras, found.problem.cameras, found.noise, strict=True):
+    for camera, factor, model in zip(inputs.rig.cameras, found.problem.cameras, found.judged.models, strict=True):
         if len(factor.stream.uv):
             yield f"{camera.name}: {_noise_words(model)}."
     yield from _feature_notes(found)

@@ -65,7 +65,7 @@ def lidar_residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> tupl
     guessed = _fitted([(points, plane) for (points, _), (_, plane) in zip(before, thinned, strict=True)], values)
     out = []
     for whole, (stream, plane), noise, (first_world, seen_from) in zip(
-        inputs.measurements.lidars, thinned, found.robot.ranging, before, strict=True
+        inputs.measurements.lidars, thinned, found.judged.robot.ranging, before, strict=True
     ):
         seconds = _seconds_of(stream, state)
         world, at = in_world(now, stream)
@@ -170,13 +170,15 @@ def pose_residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> tuple
 def robot_notes(inputs: Inputs, found: Estimate) -> Iterator[str]:
     """How much of LiDARs and pose sensors is in use, and their noise."""
     counts = {f.name: f.count(out, "rotation") // 3 for f, out in _pose_factors(found)}
-    for sensor, stream, noise in zip(inputs.rig.poses, inputs.measurements.poses, found.robot.posing, strict=True):
+    posing = found.judged.robot.posing
+    for sensor, stream, noise in zip(inputs.rig.poses, inputs.measurements.poses, posing, strict=True):
         what = "poses" if sensor.kind == "absolute" else "steps"
         count = f"{counts[sensor.name]} {what} from {len(stream.stamps_ns)} poses"
         yield f"{count} of {sensor.name}; {_noise(sensor, noise)}."
     if not inputs.clouds.count:
         return
-    for lidar, stream, noise in zip(inputs.rig.lidars, inputs.measurements.lidars, found.robot.ranging, strict=True):
+    ranging = found.judged.robot.ranging
+    for lidar, stream, noise in zip(inputs.rig.lidars, inputs.measurements.lidars, ranging, strict=True):
         given = lidar.range_noise_m is not None
         size = f"{1e3 * noise.beam_sigma:.1f} mm along the beam, as the rig file has it"
         if not given:

@@ -269,8 +269,8 @@ class Following:
 def assemble(
     inputs: Inputs,
     state: State,
-    noise: list[CornerNoise],
-    keep: list[np.ndarray],
+    noise: Sequence[CornerNoise],
+    keep: Sequence[np.ndarray],
     held: np.ndarray = NOTHING,
     following: Following | None = None,
     robot: RobotNoise = NO_ROBOT,

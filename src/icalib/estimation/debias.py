@@ -20,7 +20,8 @@ from icalib.estimation.solver import Outcome, posterior
 from icalib.estimation.state import State
 
 CLEAR = 10.0  # information in tolerance units: where all is known to a third of a tolerance, one pair will do
-SLIGHT = 0.02  # of the information: where one pair finds less noise than this in all directions, it will do, too
+SLIGHT = 0.05  # of the information: where one pair finds less noise than this, it will do, too
+UNKNOWN = 1e-2  # information in tolerance units: too little to be of use, whatever part of it is noise
 
 
 def spurious_information(problem: Problem, outcome: Outcome, seed: int = 0) -> np.ndarray:
@@ -39,17 +40,17 @@ def spurious_information(problem: Problem, outcome: Outcome, seed: int = 0) -> n
         imu = _reading_noise(problem.chain.imu, rng)
         for sign in (1.0, -1.0):
             found.append(_information(*_moved(problem, outcome.state, sign * sample.chain, sign * imu), room))
-        if _largest_share(np.mean(found, axis=0) - outcome.information, outcome.information) < SLIGHT:
+        noise = np.mean(found, axis=0) - outcome.information
+        if _largest_share(t[:, None] * noise * t, t[:, None] * outcome.information * t) < SLIGHT:
             break
     return np.mean(found, axis=0) - outcome.information
 
 
 def _largest_share(noise: np.ndarray, information: np.ndarray) -> float:
-    """Of what is noise, in absolute value, in any direction; infinite where there is no information."""
+    """Of what is noise, in absolute value, in any direction that is known to some extent; both in tolerance units."""
     values, vectors = np.linalg.eigh(information)
-    if values.min(initial=1.0) <= 0.0:
-        return np.inf
-    half = vectors / np.sqrt(values)
+    known = values > UNKNOWN
+    half = vectors[:, known] / np.sqrt(values[known])
     return float(np.abs(np.linalg.eigvalsh(half.T @ noise @ half)).max(initial=0.0))
 
 

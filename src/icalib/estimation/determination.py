@@ -16,7 +16,7 @@ import numpy as np
 from icalib.estimation.arrowhead import restricted_inverse
 from icalib.estimation.assembly import Inputs, given_priors
 from icalib.estimation.debias import spurious_information
-from icalib.estimation.estimate import EARLY_DECREASE, Estimate, OnVisit, estimate
+from icalib.estimation.estimate import EARLY_DECREASE, Estimate, Judged, OnVisit, estimate
 from icalib.estimation.imu_model import N_INTRINSICS
 from icalib.estimation.prior_factor import Prior
 from icalib.estimation.problem import Problem
@@ -78,19 +78,24 @@ def determine(
     for _ in range(MOST_ROUNDS):
         if undetermined.shape == found.problem.held.shape or not (undetermined.size or found.problem.held.size):
             break
-        begin = _as_guessed(found, start, guess or {}, undetermined)
+        begin, judged = _as_guessed(found, start, guess or {}, undetermined), _worth_keeping(found)
         del found  # before the next one takes as much memory
-        found = estimate(inputs, begin, on_step, undetermined, on_visit)
+        found = estimate(inputs, begin, on_step, undetermined, on_visit, judged)
         data, undetermined = _judge(inputs, found)
     for _ in range(MOST_ROUNDS):
         begin = _as_worth(inputs, found, replace(start, values=start.values | (guess or {})))
         if begin is None:
             break
-        found = estimate(inputs, begin, on_step, found.problem.held, on_visit)
+        found = estimate(inputs, begin, on_step, found.problem.held, on_visit, _worth_keeping(found))
         data, _ = _judge(inputs, found)
     held = found.problem.held if found.problem.held.size else np.zeros((inputs.layout.size, 0))
     shifts = np.array([_profile(inputs, found, u) for u in held.T]).reshape(-1, inputs.layout.size)
     return Determined(found, data, held, shifts)
+
+
+def _worth_keeping(found: Estimate) -> Judged | None:
+    """Noise and outliers, where the estimate that judged them converged."""
+    return found.judged if found.outcome.converged else None
 
 
 def _as_guessed(found: Estimate, start: State, guess: dict[Key, np.ndarray], held: np.ndarray) -> State:

@@ -10,7 +10,7 @@ import numpy as np
 
 from icalib.estimation import pages
 from icalib.estimation.arrowhead import NOTHING
-from icalib.estimation.assembly import Inputs, assemble, host_times, nodes_for, resample
+from icalib.estimation.assembly import Following, Inputs, assemble, host_times, nodes_for, resample
 from icalib.estimation.corner_factor import CornerFactor, CornerNoise, CornerOutput
 from icalib.estimation.corner_noise import (
     COMMON_ERRORS,
@@ -27,7 +27,7 @@ from icalib.estimation.imu_model import N_INTRINSICS
 from icalib.estimation.lidar_factor import LidarFactor
 from icalib.estimation.prior_factor import Prior
 from icalib.estimation.problem import Problem
-from icalib.estimation.robot import NO_ROBOT, RobotNoise, next_posing, next_ranging
+from icalib.estimation.robot import RobotNoise, next_posing, next_ranging
 from icalib.estimation.sensors import chi2
 from icalib.estimation.solver import CONVERGED_DECREASE, ROUNDING, Outcome, Step, Visit, minimise
 from icalib.estimation.state import State
@@ -44,13 +44,50 @@ OnVisit = Callable[[str, Problem, Visit], None]  # told of the pass's name, its 
 
 
 @dataclass(frozen=True)
+class Judged:
+    """What the residuals of a pass say before the next: how each camera's corners err, as a model and as their `noise`,
+    which of them to `keep`; of tracks what is `following`; and the noise of the robot's sensors."""
+
+    models: tuple[NoiseModel, ...]
+    noise: tuple[CornerNoise, ...]
+    keep: tuple[np.ndarray, ...]
+    following: Following | None
+    robot: RobotNoise
+
+    @classmethod
+    def first(cls, inputs: Inputs) -> Judged:
+        """Before any pass: what the rig file says, or what is usual, of all there is."""
+        rig, streams = inputs.rig, inputs.measurements.cameras
+        models = tuple(first_noise(c) for c in rig.cameras)
+        noise = tuple(m.noise(s, c, rig.settings) for m, s, c in zip(models, streams, rig.cameras, strict=True))
+        keep = tuple(np.ones(len(s.uv), dtype=bool) for s in streams)
+        return cls(models, noise, keep, first_following(inputs), RobotNoise.first(rig))
+
+    def problem(self, inputs: Inputs, state: State, held: np.ndarray = NOTHING) -> Problem:
+        """See `assemble`."""
+        return assemble(inputs, state, self.noise, self.keep, held, self.following, self.robot)
+
+    def next(self, inputs: Inputs, outcome: Outcome, first: bool) -> Judged:
+        """As what a pass left behind, the `first` or another, shows it."""
+        rig, problem, now = inputs.rig, outcome.problem, self
+        if first:
+            pairs = zip(problem.cameras, outcome.residuals.corners, strict=True)
+            now = replace(now, keep=tuple(_inliers(f, out, rig.settings) for f, out in pairs))
+        if now.following is not None:
+            now = replace(now, following=next_following(rig, problem, outcome, now.following, first))
+        if _noise_is_estimated(inputs):
+            models, noise = _next_noise(inputs, problem, outcome)
+            now = replace(now, models=models, noise=noise, robot=_next_robot(inputs, problem, outcome, now.robot))
+        return replace(now, robot=replace(now.robot, coarse=False))
+
+
+@dataclass(frozen=True)
 class Estimate:
-    """The last pass: where the solver ended, and the noise of each camera and of the robot's sensors."""
+    """The last pass: where the solver ended, and what it was told of the noise."""
 
     outcome: Outcome
-    noise: tuple[NoiseModel, ...]
+    judged: Judged
     steps: tuple[tuple[str, Step], ...]  # of all passes, with the pass's name
-    robot: RobotNoise = NO_ROBOT
 
     @property
     def problem(self) -> Problem:
@@ -63,21 +100,20 @@ def estimate(
     on_step: Callable[[str, Step], None] = lambda *_: None,
     held: np.ndarray = NOTHING,
     on_visit: OnVisit = lambda *_: None,
+    judged: Judged | None = None,
 ) -> Estimate:
-    """All passes from a first `state`, directions of the border in `held` (see Problem) left alone.
+    """All passes from a first `state`, directions of the border in `held` (see Problem) left alone; the last one alone
+    where noise and outliers are `judged` already.
 
     Raises EstimationError where the data do not carry an estimate.
     """
-    rig, streams = inputs.rig, inputs.measurements.cameras
-    models = [first_noise(c) for c in rig.cameras]
-    noise = [m.noise(s, c, rig.settings) for m, s, c in zip(models, streams, rig.cameras, strict=True)]
-    keep = [np.ones(len(s.uv), dtype=bool) for s in streams]
-    following = first_following(inputs)
-    robot = RobotNoise.first(rig)
-    history: list[tuple[str, Step]] = []
     names = pass_names(inputs)
+    if judged is None:
+        judged = Judged.first(inputs)
+    else:
+        names, state = names[-1:], _on_own_nodes(inputs, state)
+    history: list[tuple[str, Step]] = []
     for name in names:
-        problem = assemble(inputs, state, noise, keep, held, following, robot)
 
         def note(step: Step, name: str = name) -> None:
             history.append((name, step))
@@ -86,25 +122,20 @@ def estimate(
         last = name == names[-1]
         early = EARLY_DECREASE, FIRST_SHARE if name == "first" else EARLY_SHARE
         tolerance, share = (CONVERGED_DECREASE, ROUNDING) if last else early
+        problem = judged.problem(inputs, state, held)
         outcome = minimise(problem, state, note, tolerance, partial(on_visit, name, problem), share)
-        problem = outcome.problem
         if last:
-            return Estimate(outcome, tuple(models), tuple(history), robot)
-        if name == "first":
-            keep = [
-                _inliers(f, out, rig.settings)
-                for f, out in zip(problem.cameras, outcome.residuals.corners, strict=True)
-            ]
-        if following is not None:
-            following = next_following(rig, problem, outcome, following, name == "first")
-        if _noise_is_estimated(inputs):
-            models, noise = _next_noise(inputs, problem, outcome)
-            robot = _next_robot(inputs, problem, outcome, robot)
-        robot = replace(robot, coarse=False)
-        state = resample(outcome.state, nodes_for(inputs, host_times(inputs, outcome.state.values)), inputs)
+            return Estimate(outcome, judged, tuple(history))
+        judged = judged.next(inputs, outcome, name == "first")
+        state = _on_own_nodes(inputs, outcome.state)
         del problem, outcome  # before the next ones take as much memory
         pages.give_back()
     raise AssertionError("pass_names is never empty")
+
+
+def _on_own_nodes(inputs: Inputs, state: State) -> State:
+    """The same motion, at the nodes that its clocks want."""
+    return resample(state, nodes_for(inputs, host_times(inputs, state.values)), inputs)
 
 
 def first_pass(inputs: Inputs, state: State) -> State:
@@ -113,11 +144,7 @@ def first_pass(inputs: Inputs, state: State) -> State:
 
     Raises EstimationError where the data do not carry an estimate.
     """
-    rig, streams = inputs.rig, inputs.measurements.cameras
-    noise = [first_noise(c).noise(s, c, rig.settings) for s, c in zip(streams, rig.cameras, strict=True)]
-    keep = [np.ones(len(s.uv), dtype=bool) for s in streams]
-    robot = RobotNoise.first(rig)
-    problem = assemble(inputs, state, noise, keep, following=first_following(inputs), robot=robot)
+    problem = Judged.first(inputs).problem(inputs, state)
     loose = [
         Prior(b, state.values[b.key], np.full(b.size, LOOSE * GUESS_SIGMA[b.name]))
         for b in inputs.layout.free
@@ -127,7 +154,9 @@ def first_pass(inputs: Inputs, state: State) -> State:
     return minimise(problem, state, tolerance=EARLY_DECREASE, share=EARLY_SHARE).state
 
 
-def _next_noise(inputs: Inputs, problem: Problem, outcome: Outcome) -> tuple[list[NoiseModel], list[CornerNoise]]:
+def _next_noise(
+    inputs: Inputs, problem: Problem, outcome: Outcome
+) -> tuple[tuple[NoiseModel, ...], tuple[CornerNoise, ...]]:
     """The noise of the next pass, as the residuals of this one show it."""
     settings, models, noise = inputs.rig.settings, [], []
     common = [f for f in fits(problem, outcome) if f.kind.startswith("common")] if settings.common_error else []
@@ -142,7 +171,7 @@ def _next_noise(inputs: Inputs, problem: Problem, outcome: Outcome) -> tuple[lis
             tau = scale_common_errors(tuple(factor.noise.tau), [f for f in common if f.sensor == camera.name])
         models.append(estimate_noise(camera, settings, factor, out, speed, tau))
         noise.append(models[-1].noise(factor.stream, camera, settings, speed))
-    return models, noise
+    return tuple(models), tuple(noise)
 
 
 def _next_robot(inputs: Inputs, problem: Problem, outcome: Outcome, robot: RobotNoise) -> RobotNoise:

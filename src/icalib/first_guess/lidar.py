@@ -27,6 +27,7 @@ from icalib.first_guess.lidar_arm import (
     arm_prior,
     is_mirrored,
     left_over,
+    only_axis,
     solve,
 )
 from icalib.first_guess.lidar_motion import LONGEST_STEP_S, ImuMotion
@@ -121,20 +122,27 @@ def motion_of_path(
 def lidar_on_motion(imu: ImuData, stream: LidarStream, known: State, held: Held = Held()) -> LidarGuess:
     """From the motion of the IMU in `known`: nodes no further apart than 50 ms or so. Raises EstimationError, one
     sentence, where the recording does not show it."""
-    aligned, _, rates = _aligned(imu, stream, held)
+    aligned, alone, rates = _aligned(imu, stream, held)
     guess = LidarGuess(aligned.rotation, np.zeros(3) if held.position is None else held.position, aligned.offset)
     prior = arm_prior(np.zeros(0), rates.rate, WAY_SIGMA, held.rotation is not None, held.position)
     gyro = GyroRotation.integrate(imu, known.bias[:, :3].mean(axis=0))
-    for _ in range(ARM_ROUNDS):
-        path = _path_on(stream, known, gyro, guess)
-        t = path.seconds + guess.offset
-        R, p = poses_in(known, gyro, t)
-        system = against_motion(R, p, t, path.rotation, path.position)
-        found = solve(system, prior, guess.rotation, rates.rate)
+
+    def against(path: LidarPath, now: LidarGuess) -> LidarGuess:
+        t = path.seconds + now.offset
+        path = where(path, path.ok & (t >= known.seconds[0]) & (t <= known.seconds[-1]))
+        R, p = poses_in(known, gyro, path.seconds + now.offset)
+        system = against_motion(R, p, path.seconds, path.rotation, path.position)
+        found = solve(system, prior, now.rotation, rates.rate)
         if found is None:
             raise _too_short(stream)
         _check_axes(stream.name, imu.name, is_mirrored(system, *found))
-        guess = LidarGuess(found[0], found[1][3:6], aligned.offset)
+        return LidarGuess(found[0], found[1][3:6], aligned.offset)
+
+    if held.rotation is None and only_axis(rates.rate) is not None:
+        # Which way the known motion is for the LiDAR, that motion itself has to show first.
+        guess = against(alone, guess)
+    for _ in range(ARM_ROUNDS):
+        guess = against(_path_on(stream, known, gyro, guess), guess)
     return guess
 
 
@@ -149,9 +157,7 @@ def _path_on(stream: LidarStream, known: State, gyro: GyroRotation, guess: Lidar
     def turning(t: np.ndarray) -> np.ndarray:
         return gyro.carry(known.seconds, known.rotation, t + guess.offset) @ guess.rotation
 
-    path = lidar_path(stream.name, scans_of(stream), turning, moving)
-    t = path.seconds + guess.offset
-    return where(path, path.ok & (t >= known.seconds[0]) & (t <= known.seconds[-1]))
+    return lidar_path(stream.name, scans_of(stream), turning, moving)
 
 
 def where(path: LidarPath, own: np.ndarray) -> LidarPath:

@@ -135,16 +135,23 @@ def solve(rows: System, prior: Prior, R_il: np.ndarray, rates: np.ndarray) -> tu
     if len(rows(R_il, start).b) < FEWEST_ROWS:
         return None
     held = prior.sigma[0] < 1.0
-    _, spread, axes = np.linalg.svd(rates - rates.mean(axis=0), full_matrices=False)
-    if not held and spread[1] < ONE_AXIS * spread[0]:
+    axis = only_axis(rates)
+    if not held and axis is not None:
         angles = 2.0 * np.pi * np.arange(CANDIDATES) / CANDIDATES
-        turns = so3.exp_many(angles[:, None] * axes[0])
+        turns = so3.exp_many(angles[:, None] * axis)
         R_il = min((R_il @ turn for turn in turns), key=lambda R: _misfit(rows(R, start), prior))
     x = prior.mean
     for _ in range(ROUNDS):
         x = _fit(rows(R_il, x[3:6]), prior, 0)[0]
         R_il = R_il @ so3.exp(x[:3].copy())
     return R_il, x
+
+
+def only_axis(rates: np.ndarray) -> np.ndarray | None:
+    """(3,) the axis that a LiDAR of rates (n, 3) turned about, where there is no other: its rotation about that axis
+    they do not show."""
+    _, spread, axes = np.linalg.svd(rates - rates.mean(axis=0), full_matrices=False)
+    return axes[0] if spread[1] < ONE_AXIS * spread[0] else None
 
 
 def left_over(rows: System, R_il: np.ndarray, x: np.ndarray) -> float:

@@ -18,6 +18,7 @@ from icalib.geometry import so3
 from icalib.measurements import LidarStream
 
 MOST_MATCHED, MOST_MAPPED = 1500, 6000  # points of a scan
+MOST_WIDE = 500  # while the pose is rough, and every point looks into many voxels
 GOLDEN = 0.6180339887498949  # steps of this share of the whole leave no gaps, wherever they end
 FEWEST_POINTS = 100
 FEWEST_SCANS = 20
@@ -237,9 +238,10 @@ def _register(voxels: VoxelMap, scan: Scan, expected: _Expected, last: float) ->
     xyz, tau = scan.xyz[:MOST_MATCHED], scan.tau[:MOST_MATCHED]
     H, g, pose, near = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS), expected.pose, 0
     for k in range(ROUNDS):
-        share = min(k / (WIDE_ROUNDS + 1.0), 1.0)
+        share, wide = min(k / (WIDE_ROUNDS + 1.0), 1.0), k < WIDE_ROUNDS
+        own = slice(MOST_WIDE if wide else MOST_MATCHED)
         scale = voxels.edge_m * SCALE ** (1.0 - share) * last**share
-        _, near = sums(voxels, pose, xyz, tau, 1 if k < WIDE_ROUNDS else 0, scale, H, g)
+        _, near = sums(voxels, pose, xyz[own], tau[own], int(wide), scale, H, g)
         expected.add(pose, H, g)
         d = -np.linalg.solve(H, g)
         pose = moved(pose, d)
