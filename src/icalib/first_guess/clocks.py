@@ -259,8 +259,21 @@ def turns_about_two_axes(imu: ImuData, rates: CameraRates, found: Alignment) -> 
 
 def _second_axis(rate: np.ndarray) -> float:
     """The spread of rates (n, 3) about their second axis over that about the first."""
-    _, spread, _ = np.linalg.svd(rate - rate.mean(axis=0), full_matrices=False)
+    spread, _ = _axes(rate)
     return float(spread[1] / spread[0])
+
+
+def only_axis(rate: np.ndarray, least: float) -> np.ndarray | None:
+    """(3,) the axis of rates (n, 3), or turns, where there is no other: of those about the second there are less than
+    `least` of those about the first, and how much is turned about the axis itself they do not show."""
+    spread, axes = _axes(rate)
+    return axes[0] if spread[1] < least * spread[0] else None
+
+
+def _axes(rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How rates (n, 3) spread about their axes (3, 3), by rows, the widest first."""
+    _, spread, axes = np.linalg.svd(rate - rate.mean(axis=0), full_matrices=False)
+    return spread, axes
 
 
 def check_axes(imu: ImuData, rates: CameraRates, found: Alignment, name: str) -> None:

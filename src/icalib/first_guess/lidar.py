@@ -14,12 +14,13 @@ import numpy as np
 from icalib.errors import EstimationError
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.state import Key, State
-from icalib.first_guess.clocks import STILL_RAD_S, Alignment, CameraRates, align, as_given, contradicts
+from icalib.first_guess.clocks import STILL_RAD_S, Alignment, CameraRates, align, as_given, contradicts, only_axis
 from icalib.first_guess.gyro import GyroRotation
 from icalib.first_guess.lidar_arm import (
     ANY_SIGMA,
     BIAS_SIGMA,
     MIRRORED,
+    ONE_AXIS,
     SPEED_SIGMA,
     WAY_SIGMA,
     against_motion,
@@ -27,7 +28,6 @@ from icalib.first_guess.lidar_arm import (
     arm_prior,
     is_mirrored,
     left_over,
-    only_axis,
     solve,
 )
 from icalib.first_guess.lidar_motion import LONGEST_STEP_S, ImuMotion
@@ -138,7 +138,7 @@ def lidar_on_motion(imu: ImuData, stream: LidarStream, known: State, held: Held 
         _check_axes(stream.name, imu.name, is_mirrored(system, *found))
         return LidarGuess(found[0], found[1][3:6], aligned.offset)
 
-    if held.rotation is None and only_axis(rates.rate) is not None:
+    if held.rotation is None and only_axis(rates.rate, ONE_AXIS) is not None:
         # Which way the known motion is for the LiDAR, that motion itself has to show first.
         guess = against(alone, guess)
     for _ in range(ARM_ROUNDS):

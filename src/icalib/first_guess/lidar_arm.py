@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icalib.estimation.imu_data import ImuData
+from icalib.first_guess.clocks import only_axis
 from icalib.first_guess.lidar_motion import Integrals
 from icalib.geometry import so3
 
@@ -135,7 +136,7 @@ def solve(rows: System, prior: Prior, R_il: np.ndarray, rates: np.ndarray) -> tu
     if len(rows(R_il, start).b) < FEWEST_ROWS:
         return None
     held = prior.sigma[0] < 1.0
-    axis = only_axis(rates)
+    axis = only_axis(rates, ONE_AXIS)
     if not held and axis is not None:
         angles = 2.0 * np.pi * np.arange(CANDIDATES) / CANDIDATES
         turns = so3.exp_many(angles[:, None] * axis)
@@ -145,13 +146,6 @@ def solve(rows: System, prior: Prior, R_il: np.ndarray, rates: np.ndarray) -> tu
         x = _fit(rows(R_il, x[3:6]), prior, 0)[0]
         R_il = R_il @ so3.exp(x[:3].copy())
     return R_il, x
-
-
-def only_axis(rates: np.ndarray) -> np.ndarray | None:
-    """(3,) the axis that a LiDAR of rates (n, 3) turned about, where there is no other: its rotation about that axis
-    they do not show."""
-    _, spread, axes = np.linalg.svd(rates - rates.mean(axis=0), full_matrices=False)
-    return axes[0] if spread[1] < ONE_AXIS * spread[0] else None
 
 
 def left_over(rows: System, R_il: np.ndarray, x: np.ndarray) -> float:

@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from icalib.first_guess.clocks import Alignment
+from icalib.estimation.arrowhead import complement
+from icalib.first_guess.clocks import LEAST_SECOND_AXIS, Alignment, only_axis
 from icalib.first_guess.gyro import GyroRotation
 from icalib.first_guess.track_rotation import FEWEST_COMMON, common, image_pairs, turns_information
 from icalib.geometry import so3
@@ -58,15 +59,32 @@ def align_together(
         gyro = GyroRotation.integrate(imu, bias)
         own, D, swept, turned = _gyro_turns(gyro, pairs, start)
         N, r = _normal([pairs[i] for i in own], start, D, swept, turned)
-        N[held], N[:, held], r[held] = 0.0, 0.0, 0.0
-        N[held, held] = 1.0
-        x = np.linalg.solve(N + 1e-12 * np.diag(N.diagonal()), r)
+        x = _solve(N, r, held, _open(start, so3.log_many(D)))
         bias = bias + x[n:]
         start = [
             replace(a, offset=a.offset + x[4 * k + 3], rotation=a.rotation @ so3.exp(x[4 * k : 4 * k + 3].copy()))
             for k, a in enumerate(start)
         ]
     return [replace(a, gyro_bias=bias) for a in start]
+
+
+def _open(start: list[Alignment], turns: np.ndarray) -> np.ndarray:
+    """(4 C + 3, C or 0) what turns (m, 3) of the gyroscope about one axis leave open: each camera's turn about it."""
+    axis = only_axis(turns, LEAST_SECOND_AXIS)
+    if axis is None:
+        return np.zeros((4 * len(start) + 3, 0))
+    out = np.zeros((4 * len(start) + 3, len(start)))
+    for k, a in enumerate(start):
+        out[4 * k : 4 * k + 3, k] = a.rotation.T @ axis
+    return out
+
+
+def _solve(N: np.ndarray, r: np.ndarray, held: np.ndarray, still: np.ndarray) -> np.ndarray:
+    """The x of N x = r without what is `held` (n,), and at right angles to the columns of `still` (n, m)."""
+    bound = np.concatenate([np.eye(len(r))[:, held], still], axis=1)
+    free = complement(np.linalg.qr(bound)[0], len(r))
+    M = free.T @ N @ free
+    return free @ np.linalg.solve(M + 1e-12 * np.diag(M.diagonal()), free.T @ r)
 
 
 def _normal(

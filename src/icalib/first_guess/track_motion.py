@@ -25,6 +25,7 @@ ROUNDS = 5
 BIAS_SIGMA = 0.3  # m/s^2
 ARM_SIGMA = 0.5  # m
 RAY_SIGMA = 5e-3  # rad, of a ray: what rough intrinsics leave
+ALIKE = 100  # rays of a window: more tell no more, because rough intrinsics bend them alike
 OWN = 6  # unknowns of a window: v0, what its g differs by
 SHARED = 6  # of all: g, b_a, then the lever arms
 DRIFT_SIGMA = 0.3  # m/s^2, of a window's gravity about that of all
@@ -202,8 +203,10 @@ class _Window:
         away = np.linalg.solve(M, b[:, :, None])[self.track, :, 0] - centre
         reach = np.maximum(np.linalg.norm(away, axis=1), 0.1)
         miss = np.linalg.norm(np.einsum("nij,nj->ni", Q, away), axis=1) / reach
-        scale = 3.0 * np.median(miss) + 1e-12
-        return 1.0 / ((RAY_SIGMA * reach) ** 2 * (1.0 + (miss / scale) ** 2))
+        typical = float(np.median(miss))
+        few = max(1.0, len(reach) / ALIKE)
+        sigma, scale = np.sqrt(few) * max(RAY_SIGMA, typical), 3.0 * typical + 1e-12
+        return 1.0 / ((sigma * reach) ** 2 * (1.0 + (miss / scale) ** 2))
 
 
 def _level(gravity: np.ndarray) -> np.ndarray:
