@@ -17,6 +17,7 @@ from icalib.assessment.robot import (
     robot_warnings,
     wheel_residuals,
 )
+from icalib.assessment.size import felt_size, size_words
 from icalib.calibration import (
     Calibration,
     CornerResiduals,
@@ -79,6 +80,8 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
     judged = [_sensor_fit(f, found) for f in fits(problem, outcome) if not _is_assumed(inputs, f.sensor)]
     held = held_out(parts, [s for s in (inputs.rig.body,) if _is_assumed(inputs, s)])
     timeline = Timeline.of(inputs.parts, image_times(inputs, outcome.state.values))
+    factors = _factors(inputs, groups)
+    on_size, wrong_size = size_words(inputs, felt_size(found, factors.max(initial=1.0)))
     trajectory, poses = _trajectory(inputs, outcome.state, timeline), pose_residuals(inputs, found, timeline)
     return Calibration(
         groups=groups,
@@ -92,8 +95,12 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
         iterations=tuple(Iteration(n, s.cost, s.predicted_decrease, s.damping, s.accepted) for n, s in found.steps),
         converged=outcome.converged,
         status=outcome.status,
-        warnings=tuple(_warnings(inputs, found, groups, judged, parts is not None, held, poses)),
-        notes=tuple(notes(inputs, found, timeline)),
+        warnings=(
+            *_warnings(inputs, found, groups, judged, poses),
+            *([on_size] if wrong_size else []),
+            *_factor_warnings(factors, parts is not None, held),
+        ),
+        notes=(*notes(inputs, found, timeline), *([on_size] if on_size and not wrong_size else [])),
         rig=rig_to_dict(inputs.asked or inputs.rig),
         settings=dataclasses.asdict(inputs.rig.settings),
         rates=_rates(inputs),
@@ -285,8 +292,6 @@ def _warnings(
     found: Estimate,
     groups: tuple[ParameterGroup, ...],
     judged: list[SensorFit],
-    split: bool,
-    held: HeldOut | None,
     poses: tuple[PoseResiduals, ...],
 ):
     if not found.outcome.converged:
@@ -315,9 +320,12 @@ def _warnings(
                 f"the corners of {g.sensor} lie {abs(g.value[0]):.1f} px too far {where} on their tags, more than "
                 "light and ink do; check tag_size and tag_spacing (the gap over tag_size) of the target."
             )
-    judged_groups = (g for g in groups if g.mode != "fixed" and inputs.is_sensor(g.sensor) and g.name != "bloom")
-    factors = [g.factor for g in judged_groups if g.factor is not None]
-    yield from _factor_warnings(np.concatenate([*factors, np.ones(0)]), split, held)
+
+
+def _factors(inputs: Inputs, groups: tuple[ParameterGroup, ...]) -> np.ndarray:
+    """(n,) empirical factors of what users take away."""
+    own = (g for g in groups if g.mode != "fixed" and inputs.is_sensor(g.sensor) and g.name != "bloom")
+    return np.concatenate([np.ones(0), *(g.factor for g in own if g.factor is not None)])
 
 
 def _factor_warnings(factors: np.ndarray, split: bool, held: HeldOut | None):

@@ -24,12 +24,13 @@ MOST_NAMED = 8  # bodies in a sentence
 @dataclass(frozen=True)
 class Bodies:
     """used: indices of the target's bodies that are estimated, the reference first; left_out: those that were seen, but
-    too seldom with others; bent: whether bodies may bend."""
+    too seldom with others; bent: whether bodies may bend; size: of each body, in what the target says."""
 
     target: Target
     used: tuple[int, ...]
     left_out: tuple[int, ...] = ()
     bent: bool = False
+    size: float = 1.0
 
     @property
     def several(self) -> bool:
@@ -86,7 +87,7 @@ class Bodies:
 
     def points(self, values: dict[Key, np.ndarray]) -> np.ndarray:
         """(n_points, 3) the target's points in the scene, shapes included."""
-        points, body = self.target.points, self.target.body
+        points, body = self.size * self.target.points, self.target.body
         if self.bending:
             sizes = np.zeros((len(self.target.bodies), self.basis.shape[1]))
             for k in self.used:

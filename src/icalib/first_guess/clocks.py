@@ -23,6 +23,7 @@ CLEARLY_BETTER = 0.5  # of what another offset leaves unexplained
 AVERAGED_S = 0.25  # over which the two are compared
 LEAST_ALIKE = 0.3  # share of the camera's rate that goes with the IMU's, below which their ratio says nothing
 STILL_RAD_S = 0.03
+NOISE_ALONE = 1.5  # times what noise makes of the rate
 _SAME_RECORDING = "check that both come from the same recording, overlap in time, and are in rad/s"
 LEAST_SECOND_AXIS = 0.05  # of the spread of rates about the first
 ROUNDS = 12
@@ -147,10 +148,19 @@ def better_offset(imu: ImuData, name: str, rates: CameraRates, expected: float) 
     return own.offset if _unexplained(imu, rates, own) < CLEARLY_BETTER * there else None
 
 
+def turning(imu: ImuData) -> float:
+    """RMS rate of the IMU about its median, rad/s; of means over AVERAGED_S where it is no more than noise explains."""
+    dt = float(np.median(np.diff(imu.seconds)))
+    rate = imu.gyro - np.median(imu.gyro, axis=0)
+    noise = np.sqrt(3.0 * np.median(imu.variance[:, 0]) / dt)
+    if np.sqrt((rate**2).sum(axis=1).mean()) < NOISE_ALONE * noise:
+        rate = _means(rate, min(max(1, round(AVERAGED_S / dt)), len(rate)))
+    return float(np.sqrt((rate**2).sum(axis=1).mean()))
+
+
 def _motion(imu: ImuData, rates: CameraRates) -> tuple[float, float]:
-    """RMS rate of the IMU about its median, and the median rate of the camera, rad/s."""
-    spread = np.sqrt(((imu.gyro - np.median(imu.gyro, axis=0)) ** 2).sum(axis=1).mean())
-    return float(spread), float(np.sqrt(np.median((rates.rate**2).sum(axis=1))))
+    """How the IMU turned, and the median rate of the camera, rad/s."""
+    return turning(imu), float(np.sqrt(np.median((rates.rate**2).sum(axis=1))))
 
 
 def _check_motion(imu: ImuData, name: str, rates: CameraRates) -> None:

@@ -14,7 +14,16 @@ import numpy as np
 from icalib.errors import EstimationError
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.state import Key, State
-from icalib.first_guess.clocks import STILL_RAD_S, Alignment, CameraRates, align, as_given, contradicts, only_axis
+from icalib.first_guess.clocks import (
+    STILL_RAD_S,
+    Alignment,
+    CameraRates,
+    align,
+    as_given,
+    contradicts,
+    only_axis,
+    turning,
+)
 from icalib.first_guess.gyro import GyroRotation
 from icalib.first_guess.lidar_arm import (
     ANY_SIGMA,
@@ -226,7 +235,7 @@ def _rates(name: str, path: LidarPath) -> CameraRates:
 
 def _check_turning(imu: ImuData, name: str, rates: CameraRates) -> None:
     """Raises EstimationError where neither turns."""
-    turned = np.sqrt(((imu.gyro - np.median(imu.gyro, axis=0)) ** 2).sum(axis=1).mean())
+    turned = turning(imu)
     seen = np.sqrt(np.median((rates.rate**2).sum(axis=1)))
     if turned < STILL_RAD_S and seen < 3.0 * STILL_RAD_S:
         raise EstimationError(

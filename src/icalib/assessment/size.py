@@ -1,0 +1,36 @@
+"""What is said of the size of the target, which the rig file gives and the accelerometer feels."""
+
+from __future__ import annotations
+
+from icalib.errors import EstimationError
+from icalib.estimation.assembly import Inputs
+from icalib.estimation.estimate import Estimate
+from icalib.estimation.target_size import TargetSize, target_size
+
+WRONG = 0.02  # of the size: more than a ruler or a good accelerometer is off by
+CLEARLY = 5.0  # standard deviations
+
+
+def felt_size(found: Estimate, factor: float) -> TargetSize | None:
+    """Of the target, its standard deviation `factor` times the formal one; None where nothing shows it."""
+    try:
+        size = target_size(found.problem, found.outcome.state)
+    except EstimationError:  # the way to another size leads off the map
+        return None
+    return None if size is None else TargetSize(size.ratio, factor * size.std)
+
+
+def size_words(inputs: Inputs, size: TargetSize | None) -> tuple[str, bool]:
+    """A sentence on it, empty where there is nothing to say, and whether it is a warning."""
+    if size is None:
+        return "", False
+    rig, ratio = inputs.rig, f"{size.ratio:.4f} +- {size.std:.4f}"
+    by = "the accelerometer" + (" and what else shows it" if rig.lidars or rig.wheels or rig.poses else "")
+    words = f"by {by} the target is {ratio} times the size that the rig file says"
+    if abs(size.ratio - 1.0) <= max(WRONG, CLEARLY * size.std):
+        return f"{words}; accelerometers may be off by 1 to 3 % themselves.", False
+    return (
+        f"{words}, and so are the distances that cameras show; measure the printed target and correct its tag_size or "
+        "square_size, or if these are right calibrate the accelerometer, whose scale is off.",
+        True,
+    )

@@ -1,0 +1,71 @@
+"""How large the target is to everything but the ruler that it was measured with: above all to the accelerometer.
+
+Cameras alone see a target of any size. Its size is no parameter of the estimate, because accelerometers know it to a
+few per cent only, a ruler to a tenth of one. As one more parameter, s, it would be where the least cost over all
+others, p(s), is least. All lengths that cameras see grow with the target, which costs the cameras nothing; p(s) is the
+cost there, less what one step takes off.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from icalib.estimation.arrowhead import solve
+from icalib.estimation.imu_factor import ImuFactor
+from icalib.estimation.problem import Problem
+from icalib.estimation.solver import minimise
+from icalib.estimation.state import State
+
+STEP = 1e-3  # of the size: small against what bends p, large against rounding
+OPEN = 0.05  # a size that is known no better is not known
+NEAR = 5e-3  # what one step about the state is good for
+ROUNDS = 3
+TOLERANCE = 0.5  # of half the chi^2, of the states in between
+
+
+@dataclass(frozen=True)
+class TargetSize:
+    """True size over the one given, and its formal standard deviation."""
+
+    ratio: float
+    std: float
+
+
+def target_size(problem: Problem, state: State) -> TargetSize | None:
+    """By all that was measured, from where the solver ended; None where nothing but cameras shows a size, or there is
+    no target."""
+    seen = any(len(c.stream.uv) for c in problem.cameras)
+    if not seen or not problem.framed or not isinstance(problem.chain, ImuFactor):
+        return None
+    ratio = std = 1.0
+    for _ in range(ROUNDS):
+        costs = [_least_cost(*_grown(problem, state, ratio, ratio + step)) for step in (-STEP, 0.0, STEP)]
+        slope, curvature = (costs[2] - costs[0]) / (2.0 * STEP), (costs[2] - 2.0 * costs[1] + costs[0]) / STEP**2
+        if curvature * OPEN**2 < 1.0:
+            return None
+        change, std = -slope / curvature, curvature**-0.5
+        grown, begin = _grown(problem, state, ratio, ratio + change)
+        ratio += change
+        if abs(change) < NEAR:
+            break
+        state = minimise(grown, begin, tolerance=TOLERANCE).state
+    return TargetSize(float(ratio), float(std))
+
+
+def _grown(problem: Problem, state: State, now: float, size: float) -> tuple[Problem, State]:
+    """The same problem with a target `size` times as large, and all that cameras see with it as large where it was
+    `now`."""
+    cameras, by = tuple(replace(c, bodies=replace(c.bodies, size=size)) for c in problem.cameras), size / now
+    bodies = cameras[0].bodies
+    lengths = {(c.name, "translation") for c in cameras} | {(b, "shape") for b in bodies.bending}
+    lengths |= {(b, "translation") for b in bodies.names if bodies.several}
+    values = {key: by * v if key in lengths else v for key, v in state.values.items()}
+    begin = replace(state, position=by * state.position, velocity=by * state.velocity, values=values)
+    return replace(problem, cameras=cameras), begin
+
+
+def _least_cost(problem: Problem, state: State) -> float:
+    """Half the robust chi^2, the least over all parameters."""
+    pieces = problem.pieces()
+    cost = problem.linearise(state, pieces, problem.residuals(), curved=True)
+    return cost - solve(pieces, problem.n_nodes, problem.tolerance, held=problem.held).decrease

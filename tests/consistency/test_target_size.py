@@ -1,0 +1,94 @@
+"""A target of another size than the rig file says: the accelerometer tells how large it is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from icalib.estimation.determination import determine
+from icalib.estimation.target_size import TargetSize, target_size
+from icalib.first_guess.start import start
+from icalib.pipeline import calibrate_measurements
+from icalib.rig import Rig
+from icalib.simulation import handheld, rig_for, simulate
+
+SECONDS = 10.0
+
+
+def of_size(rig: Rig, size: float) -> Rig:
+    """The rig with a target said to be `size` times as large as it is."""
+    target = rig.target
+    return replace(rig, target=replace(target, tag_size=size * target.tag_size))
+
+
+def found(seed: int, said: float, **scenario) -> TargetSize:
+    made = handheld(SECONDS, **scenario)
+    inputs, state, guess = start(of_size(rig_for(made), said), [simulate(made, seed).measurements])
+    estimate = determine(inputs, state, guess=guess).estimate
+    size = target_size(estimate.problem, estimate.outcome.state)
+    assert size is not None
+    return size
+
+
+@pytest.mark.parametrize("said", [1.0, 0.97, 1.1])
+def test_without_noise_the_size_is_found(said):
+    assert found(0, said, noiseless=True).ratio == pytest.approx(1.0 / said, abs=2e-5)
+
+
+def excess(seeds: range, said: float) -> list[float]:
+    sizes = [found(seed, said, exact=False) for seed in seeds]
+    return [(s.ratio - 1.0 / said) / s.std for s in sizes]
+
+
+@pytest.mark.parametrize("said", [1.0, 0.95])
+def test_with_noise_it_is_off_by_what_is_said(said):
+    z = np.array(excess(range(6), said))
+    assert chi2.ppf(0.001, len(z)) < z @ z < chi2.ppf(0.999, len(z))
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("said", [1.0, 0.95])
+def test_over_many_recordings_it_is_off_by_what_is_said(said):
+    z = np.array(excess(range(100, 150), said))
+    assert chi2.ppf(0.025, len(z)) < z @ z < chi2.ppf(0.975, len(z))
+
+
+def sentences(said: float, **changes) -> tuple[str, str]:
+    """Warnings and notes on the size."""
+    scenario = replace(handheld(SECONDS, exact=False), **changes)
+    result = calibrate_measurements(of_size(rig_for(scenario), said), simulate(scenario, 0).measurements)
+    return tuple(" ".join(s for s in of if "the target is" in s) for of in (result.warnings, result.notes))  # type: ignore[return-value]
+
+
+def test_a_print_that_was_fitted_to_the_page_is_a_warning():
+    warnings, notes = sentences(0.95)
+    assert "by the accelerometer the target is 1.05" in warnings
+    assert "correct its tag_size" in warnings
+    assert not notes
+
+
+def test_the_right_size_is_a_note():
+    warnings, notes = sentences(1.0)
+    assert not warnings
+    assert "by the accelerometer the target is 1.000" in notes or "by the accelerometer the target is 0.999" in notes
+
+
+def test_a_recording_that_does_not_show_it_says_nothing():
+    """Turned in place about one axis next to the wall: no acceleration to speak of."""
+    scenario = handheld(SECONDS, exact=False)
+    still = replace(scenario, motion=replace(scenario.motion, kind="motionless", exact=False))
+    rig, simulation = rig_for(still), simulate(still, 0)
+    cameras = tuple(
+        replace(
+            c,
+            rotation=replace(c.rotation, mode="fixed", value=simulation.truth.T_imu_cam[c.name][:3, :3]),
+            translation=replace(c.translation, mode="fixed", value=simulation.truth.T_imu_cam[c.name][:3, 3]),
+            time_offset=replace(c.time_offset, mode="fixed", value=np.array([simulation.truth.time_offset[c.name]])),
+        )
+        for c in rig.cameras
+    )
+    result = calibrate_measurements(replace(rig, cameras=cameras), simulation.measurements)
+    assert not [s for s in (*result.warnings, *result.notes) if "the target is" in s]
