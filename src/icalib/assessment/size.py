@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from icalib.errors import EstimationError
 from icalib.estimation.assembly import Inputs
 from icalib.estimation.estimate import Estimate
@@ -24,8 +26,10 @@ def size_words(inputs: Inputs, size: TargetSize | None) -> tuple[str, bool]:
     """A sentence on it, empty where there is nothing to say, and whether it is a warning."""
     if size is None:
         return "", False
-    rig, ratio = inputs.rig, f"{size.ratio:.4f} +- {size.std:.4f}"
-    by = "the accelerometer" + (" and what else shows it" if rig.lidars or rig.wheels or rig.poses else "")
+    rig, digits = inputs.rig, max(2, 1 - int(np.floor(np.log10(size.std))))
+    ratio = f"{size.ratio:.{digits}f} +- {size.std:.{digits}f}"
+    others = rig.lidars or rig.wheels or rig.poses or any(c.translation.mode != "free" for c in rig.cameras)
+    by = "the accelerometer" + (" and what else shows it" if others else "")
     words = f"by {by} the target is {ratio} times the size that the rig file says"
     if abs(size.ratio - 1.0) <= max(WRONG, CLEARLY * size.std):
         return f"{words}; accelerometers may be off by 1 to 3 % themselves.", False

@@ -53,12 +53,13 @@ def target_size(problem: Problem, state: State) -> TargetSize | None:
 
 
 def _grown(problem: Problem, state: State, now: float, size: float) -> tuple[Problem, State]:
-    """The same problem with a target `size` times as large, and all that cameras see with it as large where it was
-    `now`."""
+    """The same problem with a target `size` times as large, and all that cameras see grown with it from where it was
+    `now`, but for lengths that are fixed."""
     cameras, by = tuple(replace(c, bodies=replace(c.bodies, size=size)) for c in problem.cameras), size / now
     bodies = cameras[0].bodies
     lengths = {(c.name, "translation") for c in cameras} | {(b, "shape") for b in bodies.bending}
     lengths |= {(b, "translation") for b in bodies.names if bodies.several}
+    lengths &= {b.key for b in problem.layout.free}
     values = {key: by * v if key in lengths else v for key, v in state.values.items()}
     begin = replace(state, position=by * state.position, velocity=by * state.velocity, values=values)
     return replace(problem, cameras=cameras), begin
