@@ -96,8 +96,8 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
         converged=outcome.converged,
         status=outcome.status,
         warnings=(
+            *([on_size] if wrong_size else []),  # first: what others complain of may come of it
             *_warnings(inputs, found, groups, judged, poses),
-            *([on_size] if wrong_size else []),
             *_factor_warnings(factors, parts is not None, held),
         ),
         notes=(*notes(inputs, found, timeline), *([on_size] if on_size and not wrong_size else [])),

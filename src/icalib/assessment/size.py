@@ -14,7 +14,10 @@ CLEARLY = 5.0  # standard deviations
 
 
 def felt_size(found: Estimate, factor: float) -> TargetSize | None:
-    """Of the target, its standard deviation `factor` times the formal one; None where nothing shows it."""
+    """Of the target, its standard deviation `factor` times the formal one; None where nothing shows it, or the solver
+    did not converge."""
+    if not found.outcome.converged:
+        return None
     try:
         size = target_size(found.problem, found.outcome.state)
     except EstimationError:  # the way to another size leads off the map

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from icalib.estimation.arrowhead import solve
+from icalib.estimation.arrowhead import Piece, solve
 from icalib.estimation.imu_factor import ImuFactor
-from icalib.estimation.problem import Problem
+from icalib.estimation.problem import Problem, Residuals
 from icalib.estimation.solver import minimise
 from icalib.estimation.state import State
 
@@ -38,8 +38,9 @@ def target_size(problem: Problem, state: State) -> TargetSize | None:
     if not seen or not problem.framed or not isinstance(problem.chain, ImuFactor):
         return None
     ratio = std = 1.0
+    room = problem.pieces(), problem.residuals()
     for _ in range(ROUNDS):
-        costs = [_least_cost(*_grown(problem, state, ratio, ratio + step)) for step in (-STEP, 0.0, STEP)]
+        costs = [_least_cost(*_grown(problem, state, ratio, ratio + step), *room) for step in (-STEP, 0.0, STEP)]
         slope, curvature = (costs[2] - costs[0]) / (2.0 * STEP), (costs[2] - 2.0 * costs[1] + costs[0]) / STEP**2
         if curvature * OPEN**2 < 1.0:
             return None
@@ -65,8 +66,7 @@ def _grown(problem: Problem, state: State, now: float, size: float) -> tuple[Pro
     return replace(problem, cameras=cameras), begin
 
 
-def _least_cost(problem: Problem, state: State) -> float:
+def _least_cost(problem: Problem, state: State, pieces: tuple[Piece, ...], scratch: Residuals) -> float:
     """Half the robust chi^2, the least over all parameters."""
-    pieces = problem.pieces()
-    cost = problem.linearise(state, pieces, problem.residuals(), curved=True)
+    cost = problem.linearise(state, pieces, scratch, curved=True)
     return cost - solve(pieces, problem.n_nodes, problem.tolerance, held=problem.held).decrease
