@@ -13,7 +13,7 @@ from icalib.estimation.target_size import TargetSize, target_size
 from icalib.first_guess.start import start
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter, Rig
-from icalib.simulation import handheld, rig_for, simulate
+from icalib.simulation import handheld, rig_for, simulate, tag_map
 
 SECONDS = 10.0
 
@@ -36,6 +36,18 @@ def found(seed: int, said: float, **scenario) -> TargetSize:
 @pytest.mark.parametrize("said", [1.0, 0.97, 1.1])
 def test_without_noise_the_size_is_found(said):
     assert found(0, said, noiseless=True).ratio == pytest.approx(1.0 / said, abs=2e-5)
+
+
+def test_of_tags_in_a_room_all_sizes_and_distances_grow_together():
+    made = replace(tag_map(), duration_s=15.0)
+    rig = rig_for(made)
+    smaller = replace(rig, target=replace(rig.target, size=0.95 * rig.target.size))
+    inputs, state, guess = start(smaller, [simulate(made, 0).measurements])
+    estimate = determine(inputs, state, guess=guess).estimate
+    size = target_size(estimate.problem, estimate.outcome.state)
+    assert size is not None
+    assert size.std < 1e-3
+    assert abs(size.ratio - 1.0 / 0.95) < 4.0 * size.std
 
 
 def test_a_length_that_is_known_shows_the_size_too():
@@ -82,7 +94,7 @@ def sentences(said: float, **changes) -> tuple[str, str]:
 def test_a_print_that_was_fitted_to_the_page_is_a_warning():
     warnings, notes = sentences(0.95)
     assert "by the accelerometer the target is 1.05" in warnings
-    assert "correct its tag_size" in warnings
+    assert "correct its size" in warnings
     assert not notes
 
 

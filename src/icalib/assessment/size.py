@@ -37,7 +37,7 @@ def size_words(inputs: Inputs, size: TargetSize | None) -> tuple[str, bool]:
     if abs(size.ratio - 1.0) <= max(WRONG, CLEARLY * size.std):
         return f"{words}; accelerometers may be off by 1 to 3 % themselves.", False
     return (
-        f"{words}, and so are the distances that cameras show; measure the printed target and correct its tag_size or "
-        "square_size, or if these are right calibrate the accelerometer, whose scale is off.",
+        f"{words}, and so are the distances that cameras show; measure the printed target and correct its size in "
+        "the rig file, or if that is right calibrate the accelerometer, whose scale is off.",
         True,
     )
