@@ -37,6 +37,9 @@ from icalib.rig import PoseSensor, Settings
 LOOSE = 3.0  # times what a guess is worth
 LEAST_LEFT = 0.2  # of the residuals of poses: where the motion takes all, nothing is left to show their noise
 EARLY_DECREASE, EARLY_SHARE = 0.5, 1e-6  # an early pass is followed by another
+AGAIN = 2  # further passes, at most, where the last one shows points whose tracks it began without
+ENOUGH = 0.8  # of the observations of tracks take part: no need to see whether more would
+MORE = 1.1  # times as many that would are worth another pass
 FIRST_SHARE = 1e-3  # of half the chi^2: what is made anew after the first pass is worth more
 
 
@@ -113,24 +116,34 @@ def estimate(
     else:
         names, state = names[-1:], _on_own_nodes(inputs, state)
     history: list[tuple[str, Step]] = []
-    for name in names:
+    for k, name in enumerate((*names, *names[-1:] * AGAIN)):
 
         def note(step: Step, name: str = name) -> None:
             history.append((name, step))
             on_step(name, step)
 
-        last = name == names[-1]
+        last = k + 1 >= len(names)
         early = EARLY_DECREASE, FIRST_SHARE if name == "first" else EARLY_SHARE
         tolerance, share = (CONVERGED_DECREASE, ROUNDING) if last else early
         problem = judged.problem(inputs, state, held)
         outcome = minimise(problem, state, note, tolerance, partial(on_visit, name, problem), share)
-        if last:
+        if last and (k + 1 == len(names) + AGAIN or not _follows_more(inputs, outcome, judged)):
             return Estimate(outcome, judged, tuple(history))
-        judged = judged.next(inputs, outcome, name == "first")
+        judged = judged if last else judged.next(inputs, outcome, name == "first")
         state = _on_own_nodes(inputs, outcome.state)
         del problem, outcome  # before the next ones take as much memory
         pages.give_back()
     raise AssertionError("pass_names is never empty")
+
+
+def _follows_more(inputs: Inputs, outcome: Outcome, judged: Judged) -> bool:
+    """Whether many tracks were left out because the poses that the pass began with did not find their points, and those
+    that it ended with do."""
+    now = outcome.problem.features
+    if now is None or now.followed > ENOUGH * sum(int(k.sum()) for k in now.keep):
+        return False
+    anew = judged.problem(inputs, _on_own_nodes(inputs, outcome.state)).features
+    return anew is not None and anew.followed > MORE * now.followed
 
 
 def _on_own_nodes(inputs: Inputs, state: State) -> State:

@@ -99,6 +99,11 @@ class FeatureFactor:
     def n_nodes(self) -> int:
         return self.cameras[0].n_nodes
 
+    @property
+    def followed(self) -> int:
+        """How many observations take part."""
+        return sum(int((t >= 0).sum()) for t in self.tracks.track)
+
     def cut(self, state: State, cuts: tuple[int, ...]) -> FeatureFactor:
         """The same features as tracks that end at nodes `cuts`. A track is left out whose point the poses of `state` do
         not find where all its images can show it, whose distance they leave uncertain, or that fits far worse than

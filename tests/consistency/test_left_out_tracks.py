@@ -1,0 +1,62 @@
+"""Tracks whose points the first poses do not find are left out of a pass, but not out of the result."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from icalib.estimation.estimate import ENOUGH, estimate
+from icalib.first_guess.start import start
+from icalib.geometry import so3
+from icalib.simulation import load_scenario, rig_for, simulate, with_drawn_guess
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "paper" / "table2-3d.yaml"
+
+
+@pytest.fixture(scope="module")
+def settled():
+    """Cameras that follow points and a LiDAR, and where they are estimated to be."""
+    scenario = replace(load_scenario(EXAMPLE), duration_s=8.0, wheels=())
+    rig = with_drawn_guess(rig_for(scenario), scenario, 0)
+    inputs, state, _ = start(rig, [simulate(scenario, 0).measurements])
+    return inputs, estimate(inputs, state)
+
+
+def passes(inputs, found, turned_deg: float):
+    """The last pass from where the estimate ended, but for cam0, turned by that much; and how many passes it took."""
+    end, key = found.outcome.state, ("cam0", "rotation")
+    turned = end.values[key] @ so3.exp(np.radians(turned_deg) * np.array([0.0, 1.0, 0.0]))
+    begun = []
+
+    def note(stage, problem, visit):
+        if not any(problem.features is p for p in begun):
+            begun.append(problem.features)
+
+    again = estimate(
+        inputs, replace(end, values=end.values | {key: turned}), on_visit=note, judged=found.judged
+    )  # fmt: skip
+    return again, begun
+
+
+def test_tracks_that_a_wrong_pose_left_out_come_back(settled):
+    inputs, found = settled
+    again, begun = passes(inputs, found, 15.0)
+    assert begun[0].followed < 0.5 * found.problem.features.followed
+    assert len(begun) == 2
+    assert again.problem.features.followed >= 0.99 * found.problem.features.followed
+    way = so3.log(
+        np.ascontiguousarray(
+            found.outcome.state.values["cam0", "rotation"].T @ again.outcome.state.values["cam0", "rotation"]
+        )
+    )
+    assert np.linalg.norm(way) < 1e-4
+
+
+def test_where_enough_take_part_there_is_one_pass(settled):
+    inputs, found = settled
+    again, begun = passes(inputs, found, 0.5)
+    assert len(begun) == 1
+    assert again.problem.features.followed > ENOUGH * sum(int(k.sum()) for k in again.problem.features.keep)
