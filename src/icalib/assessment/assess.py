@@ -81,7 +81,7 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
     held = held_out(parts, [s for s in (inputs.rig.body,) if _is_assumed(inputs, s)])
     timeline = Timeline.of(inputs.parts, image_times(inputs, outcome.state.values))
     factors = _factors(inputs, groups)
-    on_size, wrong_size = size_words(inputs, felt_size(found, factors.max(initial=1.0)))
+    wrong_size, size_notes = size_words(inputs, felt_size(found, factors.max(initial=1.0)))
     trajectory, poses = _trajectory(inputs, outcome.state, timeline), pose_residuals(inputs, found, timeline)
     return Calibration(
         groups=groups,
@@ -96,11 +96,11 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
         converged=outcome.converged,
         status=outcome.status,
         warnings=(
-            *([on_size] if wrong_size else []),  # first: what others complain of may come of it
+            *wrong_size,  # first: what others complain of may come of it
             *_warnings(inputs, found, groups, judged, poses),
             *_factor_warnings(factors, parts is not None, held),
         ),
-        notes=(*notes(inputs, found, timeline), *([on_size] if on_size and not wrong_size else [])),
+        notes=(*notes(inputs, found, timeline), *size_notes),
         rig=rig_to_dict(inputs.asked or inputs.rig),
         settings=dataclasses.asdict(inputs.rig.settings),
         rates=_rates(inputs),

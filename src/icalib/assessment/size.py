@@ -25,19 +25,19 @@ def felt_size(found: Estimate, factor: float) -> TargetSize | None:
     return None if size is None else TargetSize(size.ratio, factor * size.std)
 
 
-def size_words(inputs: Inputs, size: TargetSize | None) -> tuple[str, bool]:
-    """A sentence on it, empty where there is nothing to say, and whether it is a warning."""
+def size_words(inputs: Inputs, size: TargetSize | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """What to warn of, and what to note."""
     if size is None:
-        return "", False
+        return (), ()
     rig, digits = inputs.rig, max(2, 1 - int(np.floor(np.log10(size.std))))
     ratio = f"{size.ratio:.{digits}f} +- {size.std:.{digits}f}"
     others = rig.lidars or rig.wheels or rig.poses or any(c.translation.mode != "free" for c in rig.cameras)
     by = "the accelerometer" + (" and what else shows it" if others else "")
     words = f"by {by} the target is {ratio} times the size that the rig file says"
     if abs(size.ratio - 1.0) <= max(WRONG, CLEARLY * size.std):
-        return f"{words}; accelerometers may be off by 1 to 3 % themselves.", False
-    return (
+        return (), (f"{words}; accelerometers may be off by 1 to 3 % themselves.",)
+    warning = (
         f"{words}, and so are the distances that cameras show; measure the printed target and correct its size in "
-        "the rig file, or if that is right calibrate the accelerometer, whose scale is off.",
-        True,
+        "the rig file, or if that is right calibrate the accelerometer, whose scale is off."
     )
+    return (warning,), ()

@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from icalib.estimation.arrowhead import Piece, solve
+from icalib.estimation.arrowhead import HELD_BELOW, Piece, solve
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.imu_factor import ImuFactor
 from icalib.estimation.problem import Problem
@@ -21,7 +21,6 @@ from icalib.estimation.state import State
 
 CLEAR = 10.0  # information in tolerance units: where all is known to a third of a tolerance, one pair will do
 SLIGHT = 0.05  # of the information: where one pair finds less noise than this, it will do, too
-UNKNOWN = 1e-2  # information in tolerance units: too little to be of use, whatever part of it is noise
 
 
 def spurious_information(problem: Problem, outcome: Outcome, seed: int = 0) -> np.ndarray:
@@ -33,7 +32,8 @@ def spurious_information(problem: Problem, outcome: Outcome, seed: int = 0) -> n
         return np.zeros_like(outcome.information)
     rng = np.random.default_rng(seed)
     t = problem.tolerance
-    clear = np.linalg.eigvalsh(outcome.information * t[:, None] * t).min(initial=np.inf) > CLEAR
+    scaled = t[:, None] * outcome.information * t
+    clear = np.linalg.eigvalsh(scaled).min(initial=np.inf) > CLEAR
     samples = (outcome.draws or posterior(problem, outcome.state)).still
     found, room = [], problem.room()
     for sample in samples[:1] if clear else samples:
@@ -41,15 +41,15 @@ def spurious_information(problem: Problem, outcome: Outcome, seed: int = 0) -> n
         for sign in (1.0, -1.0):
             found.append(_information(*_moved(problem, outcome.state, sign * sample.chain, sign * imu), room))
         noise = np.mean(found, axis=0) - outcome.information
-        if _largest_share(t[:, None] * noise * t, t[:, None] * outcome.information * t) < SLIGHT:
+        if _largest_share(t[:, None] * noise * t, scaled) < SLIGHT:
             break
     return np.mean(found, axis=0) - outcome.information
 
 
 def _largest_share(noise: np.ndarray, information: np.ndarray) -> float:
-    """Of what is noise, in absolute value, in any direction that is known to some extent; both in tolerance units."""
+    """Of what is noise, in absolute value, in any direction that the solver moves along; both in tolerance units."""
     values, vectors = np.linalg.eigh(information)
-    known = values > UNKNOWN
+    known = values > HELD_BELOW
     half = vectors[:, known] / np.sqrt(values[known])
     return float(np.abs(np.linalg.eigvalsh(half.T @ noise @ half)).max(initial=0.0))
 

@@ -2,8 +2,9 @@
 
 Broad priors do not make an undetermined direction harmless: the solver wanders along it, and what couples with it at
 second order comes out wrong with a small standard deviation. So the information of the data alone, without what noise
-makes of it, says which directions are open; from the guess all is estimated anew with these held, until their number
-stays. How much the rest depends on where they are held is tried out, and is part of the covariance.
+makes of it, says which directions are open; these are moved to the guess and held there while all else is estimated
+again, until their number stays. How much the rest depends on where they are held is tried out, and is part of the
+covariance.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from icalib.estimation.arrowhead import restricted_inverse
+from icalib.estimation.arrowhead import HELD_BELOW, restricted_inverse
 from icalib.estimation.assembly import Inputs, given_priors
 from icalib.estimation.debias import spurious_information
 from icalib.estimation.estimate import EARLY_DECREASE, Estimate, Judged, OnVisit, estimate
@@ -25,7 +26,6 @@ from icalib.estimation.state import Key, State
 from icalib.estimation.tolerances import FROM_NOTHING_M, GUESS_SIGMA, OTHER_SIGMA
 from icalib.geometry import planes, so3
 
-UNDETERMINED_BELOW = 1e-2  # information in tolerance units: known to less than ten tolerances
 SPURIOUS_SHARE = 0.5  # a direction most of whose information is noise is not determined either
 MOST_ROUNDS = 4
 MOVED_BY_HELD = 0.1  # parts of a direction smaller than this do not count as in it
@@ -143,7 +143,7 @@ def _judge(inputs: Inputs, found: Estimate) -> tuple[np.ndarray, np.ndarray]:
     scaled = t[:, None] * asked * t
     values, vectors = np.linalg.eigh(scaled - t[:, None] * noise * t)
     raw = np.einsum("ik,ij,jk->k", vectors, scaled, vectors)
-    open_ones = (values < UNDETERMINED_BELOW) | (values < SPURIOUS_SHARE * raw)
+    open_ones = (values < HELD_BELOW) | (values < SPURIOUS_SHARE * raw)
     data = _without(outcome.information - noise, problem.priors, outcome.state)
     return t[:, None] * data * t, vectors[:, open_ones]
 

@@ -148,26 +148,27 @@ def better_offset(imu: ImuData, name: str, rates: CameraRates, expected: float) 
     return own.offset if _unexplained(imu, rates, own) < CLEARLY_BETTER * there else None
 
 
-def turning(imu: ImuData) -> float:
-    """RMS rate of the IMU about its median, rad/s; of means over AVERAGED_S where it is no more than noise explains."""
+def turning(imu: ImuData, rates: CameraRates) -> tuple[float, float]:
+    """How the IMU turned and how the camera, rad/s: RMS about the median, of means over AVERAGED_S where it is no more
+    than noise explains; and the median."""
     dt = float(np.median(np.diff(imu.seconds)))
     rate = imu.gyro - np.median(imu.gyro, axis=0)
     noise = np.sqrt(3.0 * np.median(imu.variance[:, 0]) / dt)
     if np.sqrt((rate**2).sum(axis=1).mean()) < NOISE_ALONE * noise:
         rate = _means(rate, min(max(1, round(AVERAGED_S / dt)), len(rate)))
-    return float(np.sqrt((rate**2).sum(axis=1).mean()))
+    return float(np.sqrt((rate**2).sum(axis=1).mean())), float(np.sqrt(np.median((rates.rate**2).sum(axis=1))))
 
 
-def _motion(imu: ImuData, rates: CameraRates) -> tuple[float, float]:
-    """How the IMU turned, and the median rate of the camera, rad/s."""
-    return turning(imu), float(np.sqrt(np.median((rates.rate**2).sum(axis=1))))
+def is_still(turned: float, seen: float) -> bool:
+    """Whether neither turned to speak of; see `turning`."""
+    return turned < STILL_RAD_S and seen < 3.0 * STILL_RAD_S
 
 
 def _check_motion(imu: ImuData, name: str, rates: CameraRates) -> None:
-    spread, seen = _motion(imu, rates)
-    if spread < STILL_RAD_S and seen < 3.0 * STILL_RAD_S:
+    turned, seen = turning(imu, rates)
+    if is_still(turned, seen):
         raise EstimationError(
-            f"the recording is motionless ({imu.name} turns at {spread:.4f} rad/s RMS, {name} at {seen:.4f}); "
+            f"the recording is motionless ({imu.name} turns at {turned:.4f} rad/s RMS, {name} at {seen:.4f}); "
             f"record again "
             "while turning the rig about all axes in front of the target."
         )
@@ -317,10 +318,7 @@ def as_given(imu: ImuData, name: str, rates: CameraRates, offset: float, rotatio
 
 def contradicts(imu: ImuData, rates: CameraRates, given: Alignment) -> bool:
     """Whether the two turn, but not alike, even allowing for what a guess is off."""
-    spread, seen = _motion(imu, rates)
-    return (spread >= STILL_RAD_S or seen >= 3.0 * STILL_RAD_S) and _unexplained(
-        imu, rates, given
-    ) > LARGEST_UNEXPLAINED
+    return not is_still(*turning(imu, rates)) and _unexplained(imu, rates, given) > LARGEST_UNEXPLAINED
 
 
 def _no_overlap(imu: ImuData, name: str) -> EstimationError:

@@ -15,12 +15,12 @@ from icalib.errors import EstimationError
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.state import Key, State
 from icalib.first_guess.clocks import (
-    STILL_RAD_S,
     Alignment,
     CameraRates,
     align,
     as_given,
     contradicts,
+    is_still,
     only_axis,
     turning,
 )
@@ -82,7 +82,7 @@ def lidar_and_motion(
 ) -> tuple[LidarGuess, ImuMotion]:
     """From one LiDAR and the IMU alone; gravity [m/s^2]. Raises EstimationError, one sentence, where the recording does
     not show it."""
-    aligned, path, rates = _aligned(imu, stream, held)
+    aligned, path, rates = _aligned(imu, stream.name, scans_of(stream), held)
     found = motion_of_path(imu, path, rates, aligned, gravity, held)
     if found is None:
         raise _too_short(stream)
@@ -131,7 +131,8 @@ def motion_of_path(
 def lidar_on_motion(imu: ImuData, stream: LidarStream, known: State, held: Held = Held()) -> LidarGuess:
     """From the motion of the IMU in `known`: nodes no further apart than 50 ms or so. Raises EstimationError, one
     sentence, where the recording does not show it."""
-    aligned, alone, rates = _aligned(imu, stream, held)
+    scans = scans_of(stream)
+    aligned, alone, rates = _aligned(imu, stream.name, scans, held)
     guess = LidarGuess(aligned.rotation, np.zeros(3) if held.position is None else held.position, aligned.offset)
     prior = arm_prior(np.zeros(0), rates.rate, WAY_SIGMA, held.rotation is not None, held.position)
     gyro = GyroRotation.integrate(imu, known.bias[:, :3].mean(axis=0))
@@ -151,11 +152,11 @@ def lidar_on_motion(imu: ImuData, stream: LidarStream, known: State, held: Held 
         # Which way the known motion is for the LiDAR, that motion itself has to show first.
         guess = against(alone, guess)
     for _ in range(ARM_ROUNDS):
-        guess = against(_path_on(stream, known, gyro, guess), guess)
+        guess = against(_path_on(stream.name, scans, known, gyro, guess), guess)
     return guess
 
 
-def _path_on(stream: LidarStream, known: State, gyro: GyroRotation, guess: LidarGuess) -> LidarPath:
+def _path_on(name: str, scans: list[Scan], known: State, gyro: GyroRotation, guess: LidarGuess) -> LidarPath:
     """The path while the motion is known, near what motion and guess say: scans that show nothing of one direction do
     not drift."""
 
@@ -163,10 +164,10 @@ def _path_on(stream: LidarStream, known: State, gyro: GyroRotation, guess: Lidar
         R, p = poses_in(known, gyro, np.clip(t + guess.offset, known.seconds[0], known.seconds[-1]))
         return p + R @ guess.position
 
-    def turning(t: np.ndarray) -> np.ndarray:
+    def turned(t: np.ndarray) -> np.ndarray:
         return gyro.carry(known.seconds, known.rotation, t + guess.offset) @ guess.rotation
 
-    return lidar_path(stream.name, scans_of(stream), turning, moving)
+    return lidar_path(name, scans, turned, moving)
 
 
 def where(path: LidarPath, own: np.ndarray) -> LidarPath:
@@ -184,16 +185,15 @@ def poses_in(known: State, gyro: GyroRotation, t: np.ndarray) -> tuple[np.ndarra
     return gyro.carry(known.seconds, known.rotation, t), p
 
 
-def _aligned(imu: ImuData, stream: LidarStream, held: Held) -> tuple[Alignment, LidarPath, CameraRates]:
+def _aligned(imu: ImuData, name: str, scans: list[Scan], held: Held) -> tuple[Alignment, LidarPath, CameraRates]:
     """Time offset, rotation and gyroscope bias; the LiDAR's path by the gyroscope's turns, as far as the IMU was
     running, and its rates."""
-    scans = scans_of(stream)
-    first = align_path(imu, stream.name, _rates(stream.name, lidar_path(stream.name, scans, whole=False)), held)
-    path = _turned_path(imu, stream.name, scans, first)
-    rates = _rates(stream.name, path)
-    aligned = align_path(imu, stream.name, rates, held)
+    first = align_path(imu, name, _rates(name, lidar_path(name, scans, whole=False)), held)
+    path = _turned_path(imu, name, scans, first)
+    rates = _rates(name, path)
+    aligned = align_path(imu, name, rates, held)
     if not _alike(first, aligned):
-        path = _turned_path(imu, stream.name, scans, aligned)
+        path = _turned_path(imu, name, scans, aligned)
     t = path.seconds + aligned.offset
     inside = path.ok & (t > imu.seconds[0]) & (t < imu.seconds[-1])
     return aligned, where(path, inside), rates
@@ -235,9 +235,8 @@ def _rates(name: str, path: LidarPath) -> CameraRates:
 
 def _check_turning(imu: ImuData, name: str, rates: CameraRates) -> None:
     """Raises EstimationError where neither turns."""
-    turned = turning(imu)
-    seen = np.sqrt(np.median((rates.rate**2).sum(axis=1)))
-    if turned < STILL_RAD_S and seen < 3.0 * STILL_RAD_S:
+    turned, seen = turning(imu, rates)
+    if is_still(turned, seen):
         raise EstimationError(
             f"{name} and {imu.name} hardly turn ({turned:.4f} rad/s RMS), which leaves their clocks and axes open; "
             "record again with turns about two axes or more, or give its rotation and time_offset in the rig file."

@@ -204,8 +204,8 @@ class _Window:
         reach = np.maximum(np.linalg.norm(away, axis=1), 0.1)
         miss = np.linalg.norm(np.einsum("nij,nj->ni", Q, away), axis=1) / reach
         typical = float(np.median(miss))
-        few = max(1.0, len(reach) / ALIKE)
-        sigma, scale = np.sqrt(few) * max(RAY_SIGMA, typical), 3.0 * typical + 1e-12
+        alike = max(1.0, len(reach) / ALIKE)
+        sigma, scale = np.sqrt(alike) * max(RAY_SIGMA, typical), 3.0 * typical + 1e-12
         return 1.0 / ((sigma * reach) ** 2 * (1.0 + (miss / scale) ** 2))
 
 

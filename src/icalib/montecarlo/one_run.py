@@ -71,7 +71,7 @@ def compare(seed: int, result: Calibration, truth: Truth, visits: list[Visited],
 
 
 def _path(blocks: tuple[Block, ...], truth: Truth, visits: list[Visited]) -> tuple[Waypoint, ...]:
-    """From the guess that the answer was found from: what is undetermined is held there, and all estimated anew."""
+    """From the last guess that all was estimated from, through every estimate that went on from there."""
     stages = [v.stage for v in visits]
     begins = [k for k, stage in enumerate(stages) if k == 0 or (stage == stages[0] and stages[k - 1] != stage)]
     return tuple(_waypoint(blocks, truth, v) for v in visits[begins[-1] :]) if visits else ()
