@@ -112,6 +112,25 @@ def test_without_an_imu_a_pose_sensor_shows_the_motion(tmp_path):
     assert "sensors.mocap0: without camera and IMU it has to show" in complaint(tmp_path, relative + wheels)
 
 
+def test_clocks_that_restart(tmp_path):
+    """Of any sensor, as far as there is another clock to go by."""
+    lines = "sensors:\n  imu0: {type: imu}\n  lidar0: {type: lidar, clock_restarts: true}\n"
+    lines += "  wheel0: {type: wheels, clock_restarts: true, time_offset: {guess: 0.1}}\n"
+    lines += "  mocap0: {type: pose, clock_restarts: false}\n"
+    rig = load(tmp_path, lines)
+    assert [s.clock_restarts for s in (*rig.lidars, *rig.wheels, *rig.poses)] == [True, True, False]
+    again = load(tmp_path, yaml.safe_dump(rig_to_dict(rig), sort_keys=False))
+    assert [s.clock_restarts for s in (*again.lidars, *again.wheels, *again.poses)] == [True, True, False]
+    fixed = complaint(tmp_path, lines.replace("{guess: 0.1}", "{fixed: 0.1}"))
+    assert "wheel0.clock_restarts: each recording has a time offset of its own, but time_offset is fixed" in fixed
+    first = "sensors:\n  mocap0: {type: pose, clock_restarts: true}\n  wheel0: {type: wheels}\n"
+    assert "mocap0.clock_restarts: without an IMU the clock of the first sensor" in complaint(tmp_path, first)
+    camera = "cam0: {type: camera, model: pinhole-radtan, resolution: [752, 480], clock_restarts: true}"
+    target = "target: {type: aprilgrid, rows: 6, cols: 6, tag_size: 0.088, tag_spacing: 0.3}\n"
+    said = complaint(tmp_path, f"sensors:\n  {camera}\n{target}")
+    assert "cam0.clock_restarts: cameras alone have no time offsets" in said
+
+
 def test_plain_lidars_and_wheels_load_back(tmp_path):
     plain = rig_to_dict(load(tmp_path, ROBOT))
     again = load(tmp_path, yaml.safe_dump(plain, sort_keys=False))

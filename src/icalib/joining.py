@@ -42,13 +42,16 @@ class Part:
         return self.measurements.name
 
 
-def join(rig: Rig, recordings: Sequence[Measurements]) -> tuple[Measurements, tuple[Part, ...]]:
-    """All recordings as one, and where each stands in it; a single one stays as it is.
+def join(
+    rig: Rig, recordings: Sequence[Measurements], shifts_ns: Sequence[int] | None = None
+) -> tuple[Measurements, tuple[Part, ...]]:
+    """All recordings as one, and where each stands in it; a single one stays as it is. shifts_ns: those of a join of
+    these and more streams, which the clock is to go by.
 
     All clocks of a recording are shifted alike, so that time offsets between raw clocks stay. Whatever these are, two
     recordings stay apart as long as the streams of each overlap: the pause between them is longer than both.
     """
-    shifts = _shifts(rig, recordings)
+    shifts = _shifts(rig, recordings) if shifts_ns is None else shifts_ns
     ends = np.cumsum([[0] * len(rig.cameras), *([len(c.stamps_ns) for c in m.cameras] for m in recordings)], axis=0)
     own = [tuple(slice(int(a), int(b)) for a, b in zip(*pair, strict=True)) for pair in pairwise(ends)]
     first = recordings[0].origin_ns
@@ -67,7 +70,14 @@ def _streams(
 
 
 def _shifts(rig: Rig, recordings: Sequence[Measurements]) -> list[int]:
-    """What to add to the stamps of each recording [ns]."""
+    """What to add to the stamps of each recording [ns]. Raises RecordingError where a stream of one is empty."""
+    for recording in recordings if len(recordings) > 1 else ():
+        empty = [s.name for s in _streams(recording) if not len(s.stamps_ns)]
+        if empty:
+            raise RecordingError(
+                f"{recording.name}: there is nothing of {' and '.join(empty)} that the others could be joined with "
+                "(of a camera, no image that shows the target); leave this recording out."
+            )
     shifts = [0]
     for before, after in pairwise(recordings):
         pairs = zip(_streams(before), _streams(after), strict=True)
@@ -87,7 +97,7 @@ def _length_ns(rig: Rig, measurements: Measurements) -> int:
     return max(ends) - min(begins)
 
 
-def _joined(recordings: Sequence[Measurements], shifts: list[int]) -> Measurements:
+def _joined(recordings: Sequence[Measurements], shifts: Sequence[int]) -> Measurements:
     shifted = list(zip(recordings, shifts, strict=True))
     imus = [(m.imu, shift) for m, shift in shifted if m.imu is not None]
     imu = None
@@ -133,7 +143,7 @@ def join_corners(streams: list[tuple[CornerStream, int]]) -> CornerStream:
     stamps = np.concatenate([s.stamps_ns + np.int64(shift) for s, shift in streams])
     start = np.concatenate([[0], np.cumsum(np.concatenate([np.diff(s.start) for s, _ in streams]))])
     point, uv = np.concatenate([s.point for s, _ in streams]), np.concatenate([s.uv for s, _ in streams])
-    return CornerStream(streams[0][0].name, stamps, start.astype(np.int64), point, uv)
+    return CornerStream(streams[0][0].name, stamps, start.astype(np.int64), point, uv, joins_ns=_joins(streams))
 
 
 def join_scans(streams: list[tuple[LidarStream, int]]) -> LidarStream:
@@ -141,7 +151,7 @@ def join_scans(streams: list[tuple[LidarStream, int]]) -> LidarStream:
     stamps = np.concatenate([s.stamps_ns + np.int64(shift) for s, shift in streams])
     start = np.concatenate([[0], np.cumsum(np.concatenate([np.diff(s.start) for s, _ in streams]))]).astype(np.int64)
     columns = (np.concatenate([getattr(s, name) for s, _ in streams]) for name in ("offset_s", "xyz", "plane"))
-    return LidarStream(streams[0][0].name, stamps, start, *columns)
+    return LidarStream(streams[0][0].name, stamps, start, *columns, joins_ns=_joins(streams))
 
 
 def join_wheels(streams: list[tuple[WheelStream | WheelPoses, int]]) -> WheelStream:
@@ -158,11 +168,19 @@ def join_wheels(streams: list[tuple[WheelStream | WheelPoses, int]]) -> WheelStr
         rates.append(wheels.rate)
     first = streams[0][0]
     assert isinstance(first, WheelStream)  # see above
-    return WheelStream(first.name, np.concatenate(stamps), np.concatenate(rates), first.meaning, first.kind)
+    stamps, rates = np.concatenate(stamps), np.concatenate(rates)
+    return WheelStream(first.name, stamps, rates, first.meaning, first.kind, joins_ns=_joins(streams))
 
 
 def join_poses(streams: list[tuple[PoseStream, int]]) -> PoseStream:
     """The poses of all recordings, each with what to add to its stamps [ns]; each recording has a frame of its own."""
     stamps = np.concatenate([s.stamps_ns + np.int64(shift) for s, shift in streams])
     rotation, position = (np.concatenate([getattr(s, name) for s, _ in streams]) for name in ("rotation", "position"))
-    return PoseStream(streams[0][0].name, stamps, rotation, position)
+    return PoseStream(streams[0][0].name, stamps, rotation, position, joins_ns=_joins(streams))
+
+
+def _joins(
+    streams: Sequence[tuple[CornerStream | LidarStream | WheelStream | WheelPoses | PoseStream, int]],
+) -> tuple[int, ...]:
+    """The first stamp of each recording but the first."""
+    return tuple(int(s.stamps_ns[0]) + shift for s, shift in streams[1:])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -62,6 +62,7 @@ class CornerStream:
     start: np.ndarray
     point: np.ndarray
     uv: np.ndarray
+    joins_ns: tuple[int, ...] = field(default=(), kw_only=True)  # the first stamp of each further recording joined
 
     def __post_init__(self) -> None:
         n, m = len(self.uv), len(self.stamps_ns)
@@ -148,6 +149,7 @@ class LidarStream:
     offset_s: np.ndarray
     xyz: np.ndarray
     plane: np.ndarray
+    joins_ns: tuple[int, ...] = field(default=(), kw_only=True)  # the first stamp of each further recording joined
 
     def __post_init__(self) -> None:
         counts = {"offset_s": len(self.offset_s), "xyz": len(self.xyz), "plane": len(self.plane)}
@@ -184,6 +186,7 @@ class WheelStream:
     rate: np.ndarray
     meaning: Literal["mean", "instant"] = "mean"
     kind: Literal["pair", "steered", "twist"] = "pair"
+    joins_ns: tuple[int, ...] = field(default=(), kw_only=True)  # the first stamp of each further recording joined
 
     def __post_init__(self) -> None:
         n = len(self.stamps_ns)
@@ -241,6 +244,7 @@ class PoseStream:
     stamps_ns: np.ndarray
     rotation: np.ndarray
     position: np.ndarray
+    joins_ns: tuple[int, ...] = field(default=(), kw_only=True)  # the first stamp of each further recording joined
 
     def __post_init__(self) -> None:
         n = len(self.stamps_ns)

@@ -69,6 +69,7 @@ class Camera:
     rotation: Parameter = Parameter()
     translation: Parameter = Parameter()
     time_offset: Parameter = Parameter()
+    clock_restarts: bool = False  # from recording to recording: each has a time offset of its own
     intrinsics: Parameter = Parameter()
     distortion: Parameter = Parameter()
     bloom: Parameter = Parameter()
@@ -93,6 +94,7 @@ class Lidar:
     rotation: Parameter = Parameter()
     translation: Parameter = Parameter()
     time_offset: Parameter = Parameter()
+    clock_restarts: bool = False  # from recording to recording: each has a time offset of its own
     near_m: float = 0.5
     far_m: float = 100.0
     point_time: PointTime = "auto"
@@ -148,6 +150,7 @@ class Wheels:
     rotation: Parameter = Parameter()
     translation: Parameter = Parameter()
     time_offset: Parameter = Parameter()
+    clock_restarts: bool = False  # from recording to recording: each has a time offset of its own
     radii: Parameter = Parameter()  # (2,) left, right [m]
     baseline: Parameter = Parameter()  # (1,) between the wheels [m]; of skid-steer the effective one
     radius: Parameter = Parameter()  # (1,) of the driven wheel of ackermann [m]
@@ -211,6 +214,7 @@ class PoseSensor:
     rotation: Parameter = Parameter()
     translation: Parameter = Parameter()
     time_offset: Parameter = Parameter()
+    clock_restarts: bool = False  # from recording to recording: each has a time offset of its own
     topic: str | None = None  # of its poses; None: the one with the sensor's name, or the only one
 
 

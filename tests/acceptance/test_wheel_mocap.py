@@ -110,6 +110,27 @@ def test_heading_at_the_end_of_another_run(found, wheel_mocap, made, checked):
     assert abs(ours) < 3.0 * np.sqrt(by_drive @ P @ by_drive)
 
 
+def test_runs_together_with_an_offset_each(found, wheel_mocap, tmp_path):
+    """They were aligned by hand, each by itself. Together they show the drive better than any does, and each the time
+    offset that it shows alone."""
+    names = ("square-01", "square-02", "free-01")
+    folders = [record(tmp_path / name, run(wheel_mocap, name)) for name in names]
+    rig = tmp_path / "rig.yaml"
+    rig.write_text(RIG.replace("wheel_noise: 0.02", "wheel_noise: 0.02, clock_restarts: true"))
+    together = icalib.calibrate(rig, folders)
+    assert together.converged
+    offsets = together.group("wheel0", "time_offset")
+    assert offsets.labels == ("in recording 1", "in recording 2", "in recording 3")
+    drive, std = drive_of(together)
+    for k, name in enumerate(names):
+        alone = found[name].group("wheel0", "time_offset")
+        assert abs(offsets.value[k] - alone.value[0]) < 3.0 * np.hypot(offsets.std[k], alone.std[0])
+        x, s = drive_of(found[name])
+        assert (np.abs(drive - x) < 3.0 * np.hypot(std, s)).all()
+    formal = [found[name].group("wheel0", "baseline").std_formal[0] for name in names]
+    assert together.group("wheel0", "baseline").std_formal[0] < min(formal)
+
+
 @pytest.mark.parametrize("name", ["circular-01", "circular-02"])
 def test_circles_alone_are_refused(wheel_mocap, tmp_path, name):
     """They show one ratio of radii and baseline."""

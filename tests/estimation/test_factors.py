@@ -87,6 +87,19 @@ def slope_along(loss, t):
     return np.maximum((psi(t + 1e-6) - psi(t - 1e-6)) / 2e-6 / (psi(t) / t), LEAST_CURVATURE)
 
 
+def with_two_clocks(setup, node=5):
+    """The setup as two recordings, the second from `node` on; each clock has a time offset of its own in it."""
+    entries = [
+        (b.sensor, b.name, b.kind, 2 if b.name == "time_offset" else b.size, b.start is not None)
+        for b in setup.layout.blocks
+    ]
+    values = {k: np.repeat(v, 2) if k[1] == "time_offset" else v for k, v in setup.state.values.items()}
+    if ("board0", "tilt") in values and (board_in("board0", 1), "tilt") not in values:
+        entries.append((board_in("board0", 1), "tilt", "tilt", 2, True))
+        values[board_in("board0", 1), "tilt"] = values["board0", "tilt"]
+    return replace(setup, layout=make_layout(entries), state=replace(setup.state, values=values, starts=(0, node)))
+
+
 def corner_sample(
     unlike,
     setup_of,
@@ -98,8 +111,10 @@ def corner_sample(
     imu_free=False,
     curved=False,
     split=False,
+    restarts=False,
 ):
     setup = setup_of(unlike, imu_free=imu_free, shape=True, bloom=True, split=split)
+    setup = with_two_clocks(setup) if restarts else setup
     rng = np.random.default_rng(1)
     stream = setup.streams[camera]
     n, m = len(stream.uv), len(stream.stamps_ns)
@@ -115,6 +130,7 @@ def corner_sample(
         keep=rng.random(n) < 0.15,
         noise=noise,
         direction=rng.normal(size=(n, 2)),
+        seams=(int(np.searchsorted(factor.node, setup.state.starts[1])),) if restarts else (),
     )
     state = setup.perturbed(rng, 0.02)
 
@@ -150,9 +166,12 @@ def corner_sample(
     return Sample("CornerFactor", setup, state, accumulate, residual, weights, tolerance)
 
 
-def feature_sample(unlike, setup_of, features_of, scheme="inertial", loss="none", imu_free=False, curved=False):
+def feature_sample(
+    unlike, setup_of, features_of, scheme="inertial", loss="none", imu_free=False, curved=False, restarts=False
+):
     """Points are held where the cost is least at the sample's state; the weights take them out."""
     setup = setup_of(unlike, imu_free=imu_free)
+    setup = with_two_clocks(setup) if restarts else setup
     rng = np.random.default_rng(4)
     factor = features_of(setup, scheme, (loss, LOSS_SCALE), 1.0)
     state = setup.perturbed(rng, 0.02)
@@ -206,9 +225,13 @@ def feature_sample(unlike, setup_of, features_of, scheme="inertial", loss="none"
     return Sample("FeatureFactor", setup, state, accumulate, residual, weights, 5e-6)
 
 
-def lidar_sample(room, room_of, scheme="inertial", loss="none", beam=0.0, imu_free=False):
+def lidar_sample(room, room_of, scheme="inertial", loss="none", beam=0.0, imu_free=False, restarts=False):
     """Its moments taken at another state, as in all but the first linearisation of a pass."""
     setup = room_of(room, imu_free=imu_free, spacing=0.05)
+    if restarts:
+        stream = replace(setup.stream, joins_ns=(int(setup.stream.stamps_ns[2]),))
+        measured = replace(setup.sim.measurements, lidars=(stream,))
+        setup = with_two_clocks(replace(setup, sim=replace(setup.sim, measurements=measured)))
     rng = np.random.default_rng(5)
     start = setup.perturbed(rng, 0.3)
     factor = setup.factor(start, LidarNoise(0.03, beam, loss, LOSS_SCALE), scheme=scheme, bin_s=5e-3)
@@ -294,8 +317,11 @@ def with_wheels(setup, kind="pair"):
     return replace(setup, layout=make_layout(entries), state=state, imu=imu)
 
 
-def wheel_sample(unlike, setup_of, factor, imu_free=False, rate_hz=70.0, loss="none", curved=False, kind="pair"):
+def wheel_sample(
+    unlike, setup_of, factor, imu_free=False, rate_hz=70.0, loss="none", curved=False, kind="pair", restarts=False
+):
     setup = with_wheels(setup_of(unlike, imu_free=imu_free), kind)
+    setup = with_two_clocks(setup) if restarts else setup
     rng = np.random.default_rng(4)
     # The last stamps lie beyond the IMU's recording.
     seconds = np.arange(0.0, setup.imu.seconds[-1], 1.0 / rate_hz)
@@ -306,7 +332,8 @@ def wheel_sample(unlike, setup_of, factor, imu_free=False, rate_hz=70.0, loss="n
         angles = np.concatenate([angles[:, :1], np.cumsum(others, axis=0) / rate_hz], axis=1)
     noise = WheelNoise(1.0, 0.5, 0.3, loss, LOSS_SCALE, 0.7, 0.9, 0.4)
     own = "wheel0", seconds, angles, setup.imu, 9.81, noise, setup.layout, setup.state
-    made = factor.build(*own) if kind == "pair" else factor.build(*own, kind)
+    times = {"times": seconds + setup.state.values["wheel0", "time_offset"][0]} if restarts else {}
+    made = factor.build(*own, **times) if kind == "pair" else factor.build(*own, kind, **times)
     state = setup.perturbed(rng, 0.3)
 
     def run(at):
@@ -375,14 +402,19 @@ def with_poses(setup, starts):
     )
 
 
-def pose_sample(unlike, setup_of, factor, imu_free=False, loss="none", curved=False, rate_hz=90.0, starts=(0,)):
+def pose_sample(
+    unlike, setup_of, factor, imu_free=False, loss="none", curved=False, rate_hz=90.0, starts=(0,), restarts=False
+):
     """Poses that wander by 0.1 to 0.3 rad and m, far from what the state predicts: residuals are large."""
     setup = with_poses(setup_of(unlike, imu_free=imu_free), starts)
+    setup = with_two_clocks(setup, starts[1]) if restarts else setup
     rng = np.random.default_rng(7)
     seconds = np.arange(0.0, setup.imu.seconds[-1], 1.0 / rate_hz)
     rotation = np.array([so3.exp(v) for v in np.cumsum(0.1 * rng.normal(size=(len(seconds), 3)), axis=0)])
     position = np.cumsum(0.1 * rng.normal(size=(len(seconds), 3)), axis=0)
-    stream = PoseStream("mocap0", np.round(1e9 * seconds).astype(np.int64), rotation, position)
+    stamps = np.round(1e9 * seconds).astype(np.int64)
+    joins = (int(stamps[len(stamps) // 2]),) if restarts else ()
+    stream = PoseStream("mocap0", stamps, rotation, position, joins_ns=joins)
     motion = Motion(setup.state, setup.imu, 9.81, 0.5)
     made = factor.build(stream, motion, PoseNoise(0.5, 0.3, loss, LOSS_SCALE), setup.layout)
     state = setup.perturbed(rng, 0.3)
@@ -431,6 +463,14 @@ SAMPLES = {
         "CornerFactor",
         lambda u, s, f: corner_sample(u, s, f, 1, "pose", loss="huber", field=1, curved=True, split=True),
     ),
+    "clocks that restart": (
+        "CornerFactor",
+        lambda u, s, f: corner_sample(u, s, f, 0, imu_free=True, restarts=True),
+    ),
+    "features, clocks that restart": (
+        "FeatureFactor",
+        lambda u, s, f: feature_sample(u, s, f, imu_free=True, restarts=True),
+    ),
     "features": ("FeatureFactor", lambda u, s, f: feature_sample(u, s, f)),
     "features, intrinsics, kinematic": (
         "FeatureFactor",
@@ -451,6 +491,7 @@ SAMPLES = {
         "LidarFactor",
         lambda u, s, f: lidar_sample(*s, "pose", "cauchy", imu_free=True),
     ),
+    "lidar, clock that restarts": ("LidarFactor", lambda u, s, f: lidar_sample(*s, imu_free=True, restarts=True)),
     "prior on a rotation": ("Prior", lambda u, s, f: prior_sample(u, s, "cam1", "rotation")),
     "prior on a vector": ("Prior", lambda u, s, f: prior_sample(u, s, "cam0", "intrinsics")),
     "prior on IMU intrinsics": ("Prior", lambda u, s, f: prior_sample(u, s, "imu0", "intrinsics")),
@@ -473,6 +514,14 @@ SAMPLES = {
     "steered, huber, curved": (
         "IncrementFactor",
         lambda u, s, f: wheel_sample(u, s, IncrementFactor, loss="huber", curved=True, kind="steered"),
+    ),
+    "wheels, clock that restarts": (
+        "IncrementFactor",
+        lambda u, s, f: wheel_sample(u, s, IncrementFactor, True, restarts=True),
+    ),
+    "planar poses, clock that restarts": (
+        "RelativePoseFactor",
+        lambda u, s, f: wheel_sample(u, s, RelativePoseFactor, restarts=True),
     ),
     "ground, level": ("GroundFactor", lambda u, s, f: ground_sample(u, s, "level", False)),
     "ground, floor": ("GroundFactor", lambda u, s, f: ground_sample(u, s, "floor")),
@@ -499,6 +548,14 @@ SAMPLES = {
     "relative poses, huber": (
         "RelativePosesFactor",
         lambda u, s, f: pose_sample(u, s, RelativePosesFactor, loss="huber"),
+    ),
+    "poses of two recordings, clock that restarts": (
+        "AbsolutePoseFactor",
+        lambda u, s, f: pose_sample(u, s, AbsolutePoseFactor, starts=(0, 5), restarts=True),
+    ),
+    "relative poses, clock that restarts": (
+        "RelativePosesFactor",
+        lambda u, s, f: pose_sample(u, s, RelativePosesFactor, True, starts=(0, 5), restarts=True),
     ),
     "bias prior": ("accumulate_bias_prior", lambda u, s, f: bias_prior_sample(u, s)),
 }

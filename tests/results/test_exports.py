@@ -337,6 +337,36 @@ def test_kalibr_says_what_it_leaves_out(robot: Calibration, without_cameras: Cal
     assert list(export(without_cameras, "kalibr").files) == ["imu.yaml"]
 
 
+@pytest.mark.parametrize("to", FORMATS)
+def test_a_clock_that_restarts_has_no_offset_to_give(robot: Calibration, to: str):
+    """What it will be next time nobody knows."""
+    restarting = robot
+    for name in ("cam0", "lidar0"):
+        group = dataclasses.replace(
+            robot.group(name, "time_offset"),
+            labels=("in recording 1", "in recording 2"),
+            value=np.array([0.01, -3.2]),
+            std=np.full(2, 1e-4),
+            std_formal=np.full(2, 1e-4),
+            verdict=("determined", "undetermined"),
+            factor=np.ones(2),
+        )
+        groups = (*(g for g in restarting.groups if (g.sensor, g.name) != (name, "time_offset")), group)
+        restarting = dataclasses.replace(restarting, groups=groups)
+    if to in ("openvins", "vins-fusion", "mins", "fast-lio"):
+        with pytest.raises(CalibrationError, match="the clock of (cam0|lidar0) restarts, and each recording has a"):
+            export(restarting, to)
+        return
+    texts = " ".join(export(restarting, to).files.values())
+    if to == "kalibr":
+        assert "timeshift_cam_imu" not in by_yaml(export(restarting, to).files["camchain-imucam.yaml"])["cam0"]
+        assert "# cam0 has no timeshift_cam_imu: its clock restarts" in texts
+    elif to == "json":
+        assert json.loads(texts)["sensors"]["cam0"]["time_offset"] == [0.01, -3.2]
+    else:
+        assert "the time offsets of cam0 (one for each recording)" in texts
+
+
 def test_imu_intrinsics_that_have_no_place_are_said(robot: Calibration):
     c = with_imu_intrinsics(robot, np.full(24, 0.01))
     for to in ("vins-fusion", "mins", "fast-lio", "ros2-static", "camera-info", "urdf"):

@@ -34,6 +34,7 @@ from icalib.calibration import (
 from icalib.estimation.arrowhead import restricted_inverse
 from icalib.estimation.assembly import Inputs, image_times, origin_difference
 from icalib.estimation.board import SHAPE_LABELS
+from icalib.estimation.clocks import instants
 from icalib.estimation.determination import Determined
 from icalib.estimation.estimate import Estimate
 from icalib.estimation.evidence import Fit, fits, place_covariances, raw_rms, split_covariance
@@ -137,6 +138,8 @@ def _labels(inputs: Inputs, block: Block) -> tuple[str, ...]:
         return model[:4] if block.name == "intrinsics" else model[4:]
     if block.name in LABELS:
         return LABELS[block.name]
+    if block.name == "time_offset" and block.size > 1:
+        return tuple(f"in recording {k}" for k in range(1, block.size + 1))
     return ("x", "y", "z")[: block.size] if block.size > 1 else (block.name,)
 
 
@@ -254,7 +257,7 @@ def _corner_residuals(found: Estimate, timeline: Timeline) -> tuple[CornerResidu
     out = []
     for i, (camera, corners) in enumerate(zip(found.problem.cameras, found.outcome.residuals.corners, strict=True)):
         stream = camera.stream
-        times = stream.seconds + found.outcome.state.values[camera.name, "time_offset"][0]
+        times = instants(stream, found.outcome.state.values)
         out.append(
             CornerResiduals(
                 camera.name, timeline.shown(times, timeline.of_images(i)), stream.start, stream.point, stream.uv,

@@ -9,6 +9,7 @@ import numpy as np
 from icalib.assessment.robot import robot_notes
 from icalib.estimation.assembly import Inputs
 from icalib.estimation.bodies import words_on_left_out
+from icalib.estimation.clocks import instants
 from icalib.estimation.corner_noise import NoiseModel
 from icalib.estimation.estimate import Estimate
 from icalib.estimation.imu_data import ImuData
@@ -65,7 +66,7 @@ def _imu_notes(inputs: Inputs, imu: ImuData, found: Estimate, timeline: Timeline
         how = "bridged" if b - a <= most else "left out, with the images in it"
         yield f"{imu.name} has a gap of {b - a:.3f} s at {timeline.words(a)}, {how}."
     for camera in found.problem.cameras:
-        t = camera.times + found.outcome.state.values[camera.name, "time_offset"][0]
+        t = instants(camera.stream, found.outcome.state.values)
         left_out = int((~usable(imu, t, most)).sum())
         if left_out:
             yield f"{left_out} images of {camera.name} are left out: {imu.name} was not running then."

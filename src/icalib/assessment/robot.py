@@ -9,6 +9,7 @@ import numpy as np
 
 from icalib.calibration import LidarResiduals, Plane, PoseResiduals, SensorFit, WheelResiduals
 from icalib.estimation.assembly import Inputs, motion_of, origin_difference
+from icalib.estimation.clocks import instants
 from icalib.estimation.estimate import Estimate
 from icalib.estimation.ground_factor import HEIGHT, TILT, GroundFactor
 from icalib.estimation.lidar_binning import LidarNoise, in_world
@@ -108,14 +109,14 @@ def _fitted(clouds: list[tuple[np.ndarray, np.ndarray]], values: np.ndarray) -> 
 def _some_points(stream: LidarStream, own: np.ndarray) -> LidarStream:
     """The points `own`, increasing, of all scans."""
     start = np.searchsorted(own, stream.start)
-    columns = (getattr(stream, name)[own] for name in ("offset_s", "xyz", "plane"))
-    return LidarStream(stream.name, stream.stamps_ns, start, *columns)
+    columns = {name: getattr(stream, name)[own] for name in ("offset_s", "xyz", "plane")}
+    return replace(stream, start=start, **columns)
 
 
 def _seconds_of(stream: LidarStream, state: State) -> np.ndarray:
     """(N,) instants of the points, seconds on the joined clock of the body."""
     stamps = np.repeat(stream.seconds, np.diff(stream.start))
-    return stamps + stream.offset_s + state.values[stream.name, "time_offset"][0]
+    return instants(stream, state.values, stamps) + stream.offset_s
 
 
 def _on_planes(points: np.ndarray, seen_from: np.ndarray, planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -142,8 +143,7 @@ def wheel_residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> tupl
     for factor, rows in zip(found.problem.sensors, found.outcome.residuals.sensors, strict=True):
         if not isinstance(factor, IncrementFactor | RelativePoseFactor):
             continue
-        stamps = inputs.stream(factor.name).seconds[factor.intervals.first]
-        seconds = stamps + found.outcome.state.values[factor.name, "time_offset"][0]
+        seconds = instants(inputs.stream(factor.name), found.outcome.state.values)[factor.intervals.first]
         residual = np.linalg.solve(factor.whitening, rows.residual[:, :, None])[:, :, 0]
         labels = [(label, factor.units[kind]) for kind in factor.kinds for label in LABELS[kind]]
         names, units = zip(*labels, strict=True)
@@ -159,7 +159,7 @@ def pose_residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> tuple
     for factor, rows in zip(found.problem.sensors, found.outcome.residuals.sensors, strict=True):
         if not isinstance(factor, AbsolutePoseFactor | RelativePosesFactor):
             continue
-        seconds = factor.instants + found.outcome.state.values[factor.name, "time_offset"][0]
+        seconds = instants(inputs.stream(factor.name), found.outcome.state.values, factor.instants)
         shown = timeline.shown(seconds, timeline.recording_of(seconds))
         units = ("rad",) * 3 + ("m",) * 3
         whitened = rows.residual.copy()
@@ -258,9 +258,9 @@ def lidar_warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
                 f"only {share:.1%} of the points of {lidar.name} lie on planes; there is little flat in sight, or the "
                 "times of its points, their order within a scan, or its range_noise in the rig file are wrong."
             )
-        value = float(found.outcome.state.values[lidar.name, "time_offset"][0])
-        offset = value - origin_difference(inputs.measurements, stream)
+        own = found.outcome.state.values[lidar.name, "time_offset"] - origin_difference(inputs.measurements, stream)
         period = float(np.median(np.diff(stream.seconds)))
+        offset = float(own[np.argmin(np.abs(np.abs(own) - period))])
         if abs(abs(offset) - period) < NEARLY_A_PERIOD * period:
             yield (
                 f"the time_offset of {lidar.name}, {offset:+.4f} s, is about the period of its scans: its stamps may "

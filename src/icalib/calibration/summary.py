@@ -14,7 +14,7 @@ from icalib.calibration.result import Calibration, ParameterGroup, SensorFit
 HEADER = """\
 # Calibration by icalib {version}. Lengths in m, times in s, angles in rad, image quantities in px.
 # {key} takes coordinates in the sensor's frame to the {body} frame: p_{body} = {key} p_sensor.
-{kalibr}# time_offset: t_{body} = t_sensor + time_offset.
+{kalibr}# time_offset: t_{body} = t_sensor + time_offset; a list, one for each recording, where a clock restarts.
 # std: standard deviations, of rotation about the sensor's axes, of translation along the {body} axes. They include
 #   empirical_factor, by which parts of the recording disagree more than their noise explains; formal = std / factor.
 # T_scene_body: poses of a target's bodies, in the frame of that body whose pose is the identity.
@@ -106,7 +106,7 @@ def _by_key(groups: tuple[ParameterGroup, ...], values: dict[str, np.ndarray | N
 
 
 def _short(group: ParameterGroup, value: np.ndarray) -> Any:
-    return value.tolist()[0] if group.name == "time_offset" else value.tolist()
+    return value.tolist()[0] if group.name == "time_offset" and len(value) == 1 else value.tolist()
 
 
 def _std(group: ParameterGroup) -> np.ndarray:

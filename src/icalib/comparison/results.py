@@ -40,7 +40,9 @@ def side_of_result(c: Calibration, path: str) -> Side:
     bad = [g for g in c.groups if "undetermined" in g.verdict]
     quantities = {}
     for g in c.groups:
-        if g.sensor in c.mounted and g.name in _WHAT:
+        # A clock that restarts has no time offset that another result could have, too.
+        several = g.name == "time_offset" and len(g.value) > 1
+        if g.sensor in c.mounted and g.name in _WHAT and not several:
             quantities[g.sensor, g.name] = Quantity(
                 _WHAT[g.name], _LABELS[g.name], g.value, joint_covariance(c, [g]), g in bad
             )

@@ -12,6 +12,7 @@ from icalib.estimation import pages
 from icalib.estimation.arrowhead import NOTHING, chain_cuts
 from icalib.estimation.board import SHAPE_LABELS, SHAPE_SIGMA_M, bloom_direction, board_in
 from icalib.estimation.bodies import Bodies, choose_bodies, restrict
+from icalib.estimation.clocks import Stream, instants
 from icalib.estimation.corner_factor import CornerFactor, CornerNoise
 from icalib.estimation.feature_factor import FeatureFactor
 from icalib.estimation.free_nodes import FreeNodes
@@ -31,14 +32,13 @@ from icalib.estimation.tolerances import Tolerances
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets.base import BOARD
 from icalib.joining import Part, join
-from icalib.measurements import CornerStream, LidarStream, Measurements, PoseStream, WheelPoses, WheelStream
+from icalib.measurements import Measurements, WheelPoses
 from icalib.rig import Camera, Lidar, Parameter, PoseSensor, Rig, Scheme, Wheels
 
 BLOOM_SIGMA_PX = 1.0
 NO_BLOOM = np.zeros((0, 2), dtype=np.float32)  # single precision: directions as such are near enough
 CUT_S = 0.5
 POSE_NODES_S = 0.02  # between nodes where poses alone place them
-Stream = CornerStream | LidarStream | WheelStream | WheelPoses | PoseStream
 CAMERA_PARAMETERS: tuple[tuple[str, Kind], ...] = (
     ("rotation", "rotation"),
     ("translation", "vector"),
@@ -47,7 +47,7 @@ CAMERA_PARAMETERS: tuple[tuple[str, Kind], ...] = (
     ("distortion", "vector"),
     ("bloom", "vector"),
 )
-SIZES = {"rotation": 3, "translation": 3, "time_offset": 1, "intrinsics": 4, "bloom": 1}
+SIZES = {"rotation": 3, "translation": 3, "intrinsics": 4, "bloom": 1}
 
 
 @dataclass(frozen=True)
@@ -81,6 +81,10 @@ class Inputs:
         m = self.measurements
         return next(s for s in (*m.cameras, *m.lidars, *m.wheels, *m.poses) if s.name == name)
 
+    def clocks_of(self, sensor: Camera | Lidar | Wheels | PoseSensor) -> int:
+        """How many time offsets it has."""
+        return len(self.parts) if sensor.clock_restarts else 1
+
     def is_sensor(self, name: str) -> bool:
         """Whether `name` is a sensor's, not a body's of the target or a plane's."""
         return name == self.rig.body or name in [s.name for s in self.sensors]
@@ -95,10 +99,11 @@ class Inputs:
         return (Part(self.measurements, 0, everything, 0.0),)
 
 
-def inputs_for(rig: Rig, recordings: Sequence[Measurements]) -> Inputs:
-    """Of one recording or several, joined."""
+def inputs_for(rig: Rig, recordings: Sequence[Measurements], whole: Inputs | None = None) -> Inputs:
+    """Of one recording or several, joined; on the clock of `whole`, where these are some of its streams."""
     bodies = choose_bodies(rig.target, recordings, rig.settings.board_shape)
-    joined, parts = join(rig, [on_common_images(rig, restrict(bodies, r)) for r in recordings])
+    shifts = None if whole is None else [part.shift_ns for part in whole.parts]
+    joined, parts = join(rig, [on_common_images(rig, restrict(bodies, r)) for r in recordings], shifts)
     layout = layout_for(rig, bodies, len(parts))
     tolerances = Tolerances.asked_for(rig.settings)
     return Inputs(rig, joined, bodies, joined_imu_data(rig, parts, joined), layout, tolerances, parts)
@@ -123,10 +128,11 @@ def layout_for(rig: Rig, bodies: Bodies, n_recordings: int = 1, clouds: Clouds =
     entries += bodies.shape_entries()
     for camera in rig.cameras:
         sizes = SIZES | {"distortion": len(camera_model(camera.model).parameter_names) - 4}
+        sizes["time_offset"] = n_recordings if camera.clock_restarts else 1
         for name, kind in CAMERA_PARAMETERS:
             entries.append((camera.name, name, kind, sizes[name], _is_estimated(rig, camera, name)))
     for sensor in (*(rig.lidars if clouds.count else ()), *rig.wheels, *rig.poses):
-        entries += own_entries(sensor)
+        entries += own_entries(sensor, n_recordings)
     for k, sensor in enumerate(rig.poses):
         is_world = rig.assumes_motion and not rig.cameras and k == 0
         entries += frame_entries(sensor, n_recordings, not is_world)
@@ -176,12 +182,14 @@ def _given(layout: Layout, sensor: str, name: str, parameter: Parameter, shift: 
     block = layout.block(sensor, name)
     if block.start is None or parameter.mode != "prior" or parameter.value is None or parameter.sigma is None:
         return []
-    return [Prior(block, parameter.value + shift, parameter.sigma)]
+    # One that stands for several, of a clock that restarts, is of each.
+    value, sigma = (np.broadcast_to(x, block.size) for x in (parameter.value + shift, parameter.sigma))
+    return [Prior(block, value, sigma)]
 
 
 def image_times(inputs: Inputs, values: dict[Key, np.ndarray]) -> list[np.ndarray]:
     """Instants of each camera's images, seconds on the body's clock since its first stamp."""
-    return [c.seconds + values[c.name, "time_offset"][0] for c in inputs.measurements.cameras]
+    return [instants(c, values) for c in inputs.measurements.cameras]
 
 
 def host_times(inputs: Inputs, values: dict[Key, np.ndarray]) -> list[np.ndarray]:
@@ -194,9 +202,9 @@ def host_times(inputs: Inputs, values: dict[Key, np.ndarray]) -> list[np.ndarray
     if inputs.rig.cameras:
         return image_times(inputs, values)
     if inputs.rig.lidars:
-        return [x.seconds + values[x.name, "time_offset"][0] for x in inputs.measurements.lidars]
-    (first, *_), (sensor, *_) = inputs.measurements.poses, inputs.rig.poses
-    return [thinned(first.seconds, POSE_NODES_S) + values[sensor.name, "time_offset"][0]]
+        return [instants(x, values) for x in inputs.measurements.lidars]
+    first = inputs.measurements.poses[0]
+    return [instants(first, values, thinned(first.seconds, POSE_NODES_S))]
 
 
 def _ends_of_wheel_poses(inputs: Inputs, values: dict[Key, np.ndarray]) -> np.ndarray | None:
@@ -208,10 +216,9 @@ def _ends_of_wheel_poses(inputs: Inputs, values: dict[Key, np.ndarray]) -> np.nd
     if inputs.imu is None or settings.scheme != "inertial" or settings.nodes != "every-image":
         return None
     for stream in inputs.measurements.wheels:
-        offset = values.get((stream.name, "time_offset"))
         close = np.median(np.diff(stream.seconds)) <= (1.0 + SLACK) * settings.node_spacing_s
-        if isinstance(stream, WheelPoses) and offset is not None and close:
-            times = stream.seconds + offset[0]
+        if isinstance(stream, WheelPoses) and (stream.name, "time_offset") in values and close:
+            times = instants(stream, values)
             images = image_times(inputs, values)
             return np.concatenate([times, *(t[(t < times[0]) | (t > times[-1])] for t in images)])
     return None
@@ -375,4 +382,7 @@ def start_values(inputs: Inputs, guess_values: dict[Key, np.ndarray]) -> dict[Ke
     for camera in inputs.rig.cameras:
         bloom = camera.bloom.value if inputs.rig.blooms else None
         values[camera.name, "bloom"] = np.zeros(1) if bloom is None else bloom.copy()
+    for sensor in (*inputs.rig.cameras, *inputs.rig.lidars, *inputs.rig.wheels, *inputs.rig.poses):
+        if (own := values.get((sensor.name, "time_offset"))) is not None:
+            values[sensor.name, "time_offset"] = np.broadcast_to(own, inputs.clocks_of(sensor))
     return {key: np.ascontiguousarray(v, dtype=np.float64) for key, v in values.items()}

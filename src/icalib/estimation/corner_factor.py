@@ -22,6 +22,7 @@ from icalib.estimation import pages
 from icalib.estimation.arrowhead import Piece
 from icalib.estimation.board import board_in
 from icalib.estimation.bodies import Bodies
+from icalib.estimation.clocks import mounted_columns, offset_at
 from icalib.estimation.corner_kernels import (
     Direct,
     Found,
@@ -133,24 +134,24 @@ class CornerFactor:
     def views(self) -> Views:
         return Views.of(self.stream, self.bodies.target.body)
 
-    def parts(self, v0: int, v1: int) -> Iterator[tuple[int, int, str]]:
-        """Views v0..v1 recording by recording, each with the name of the scene there."""
+    def parts(self, v0: int, v1: int) -> Iterator[tuple[int, int, int]]:
+        """Views v0..v1 recording by recording, each with the number of it."""
         seams = np.searchsorted(self.views.image, (0, *self.seams, len(self.node)))
         for k, (first, end) in enumerate(pairwise(seams)):
             a, b = max(v0, int(first)), min(v1, int(end))
             if a < b:
-                yield a, b, board_in(BOARD, k)
+                yield a, b, k
 
-    def world_points(self, state: State, scene: str) -> np.ndarray:
-        """(n_points, 3) the target's points, shapes included, in the world frame of `scene`'s recording."""
-        return self.bodies.points(state.values) @ state.values[scene, "tilt"].T
+    def world_points(self, state: State, recording: int) -> np.ndarray:
+        """(n_points, 3) the target's points, shapes included, in the world frame of a recording."""
+        return self.bodies.points(state.values) @ _scene(state, recording).T
 
     def camera_poses(self, state: State, i0: int = 0, i1: int | None = None) -> tuple[Poses, np.ndarray, np.ndarray]:
         """IMU poses, and R_cam_world (n, 3, 3), p_world_cam (n, 3) at the instants of images i0..i1."""
         if self.imu is None:
             poses = poses_of_nodes(self.node[i0:i1], state)
         else:
-            times = self.times[i0:i1] + state.values[self.name, "time_offset"][0]
+            times = self.times[i0:i1] + offset_at(state, self.name, self.node[i0:i1])
             imu_free = self.layout.is_free(self.imu.name, "intrinsics")
             poses = poses_at(self.scheme, times, self.node[i0:i1], state, self.imu, self.gravity, imu_free)
         R_ic, p_ic = state.values[self.name, "rotation"], state.values[self.name, "translation"]
@@ -176,11 +177,11 @@ class CornerFactor:
         _, R_cw, p_wc = self.camera_poses(state, i0, int(image[-1]) + 1)
         R_cw, p_wc, R_sb = R_cw[image - i0], p_wc[image - i0], self.bodies.poses(state.values)[0]
         X, R_cb = np.empty((start[-1] - start[0], 3)), np.empty_like(R_cw)
-        for first, end, scene in self.parts(v0, v1):
+        for first, end, recording in self.parts(v0, v1):
             a, b = first - v0, end - v0
-            world, own = self.world_points(state, scene), X[start[a] - start[0] : start[b] - start[0]]
+            world, own = self.world_points(state, recording), X[start[a] - start[0] : start[b] - start[0]]
             camera_points(a, b, start, self.stream.point, R_cw, p_wc, world, own)
-            R_cb[a:b] = R_cw[a:b] @ state.values[scene, "tilt"] @ R_sb[body[a:b]]
+            R_cb[a:b] = R_cw[a:b] @ _scene(state, recording) @ R_sb[body[a:b]]
         return X, R_cb
 
     def residual(self, state: State, v0: int, v1: int) -> np.ndarray:
@@ -207,15 +208,15 @@ class CornerFactor:
         """The same factor with bloom along `direction` (N, 2)."""
         return replace(self, direction=direction)
 
-    def _columns(self, scene: str, body: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _columns(self, recording: int, body: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Border columns of the chained (n, c) and of the direct parameters (n, d) of views of `body` (n,), and which
         model parameters the latter hold."""
         nothing = np.zeros(0, dtype=np.int64)
         imu = nothing if self.imu is None else self.layout.columns(self.imu.name, "intrinsics")
         pose, shape = (columns[body] for columns in self.bodies.columns(self.layout))
         chained = [
-            self.layout.columns(self.name, "rotation", "translation", "time_offset"),
-            self.layout.columns(scene, "tilt"),
+            mounted_columns(self.layout, self.name, recording),
+            self.layout.columns(board_in(BOARD, recording), "tilt"),
             imu[imu >= 0],
         ]
         model = self.layout.columns(self.name, "intrinsics", "distortion")
@@ -235,15 +236,15 @@ class CornerFactor:
         Returns half the robust chi^2. `curved`: J^T J has the true curvature of the robust loss, not its weights alone.
         """
         into, total = piece.sums(sums), 0.0
-        for v0, v1, scene in self._blocks_of(piece):
-            images, noise, direct, motion = self._arguments(state, v0, v1, scene, curved)
+        for v0, v1, recording in self._blocks_of(piece):
+            images, noise, direct, motion = self._arguments(state, v0, v1, recording, curved)
             if out is None:
                 first, end = int(images.start[0]), int(images.start[-1])
                 own = CornerOutput.empty(end - first, v1 - v0, len(self.noise.tau))
                 found = Found(first, own.residual, own.root, own.shared)
             else:
                 found = Found(0, out.residual, out.root, out.shared[v0:v1])
-            for a, b, predicted in self._chunks(state, images, motion, scene, sums):
+            for a, b, predicted in self._chunks(state, images, motion, recording, sums):
                 total += accumulate(a, b, images, noise, direct, motion, predicted, into, found)
         return total
 
@@ -253,25 +254,25 @@ class CornerFactor:
         """Adds the gradient of each cluster of corners (N,), weights as in `at`, to columns of `piece` from
         `column` on."""
         into = piece.sums(True)
-        for v0, v1, scene in self._blocks_of(piece):
-            images, noise, direct, motion = self._arguments(state, v0, v1, scene, False)
+        for v0, v1, recording in self._blocks_of(piece):
+            images, noise, direct, motion = self._arguments(state, v0, v1, recording, False)
             found = Found(0, at.residual, at.root, at.shared[v0:v1])
-            for a, b, predicted in self._chunks(state, images, motion, scene, True):
+            for a, b, predicted in self._chunks(state, images, motion, recording, True):
                 accumulate_clusters(
                     a, b, cluster, n_clusters, column, images, noise, direct, motion, predicted, into, found
                 )  # fmt: skip
 
     def _arguments(
-        self, state: State, v0: int, v1: int, scene: str, curved: bool
+        self, state: State, v0: int, v1: int, recording: int, curved: bool
     ) -> tuple[Images, Noise, Direct, Motion]:
         """What the kernels need to know of views v0..v1, of one recording."""
         image, body = self.views.image[v0:v1], self.views.body[v0:v1]
-        chained, direct, pars = self._columns(scene, body)
+        chained, direct, pars = self._columns(recording, body)
         s, n = self.stream, self.noise
         images = Images(self.views.start[v0 : v1 + 1], s.uv, s.point, self.keep, self.node[image])
         noise = Noise(n.sigma[image], LOSSES[n.loss], n.loss_scale, curved, n.field, 1.0 / n.tau**2)
         bloom = float(state.values[self.name, "bloom"][0])
-        R_ws, R_sb = state.values[scene, "tilt"], self.bodies.poses(state.values)[0]
+        R_ws, R_sb = _scene(state, recording), self.bodies.poses(state.values)[0]
         basis = np.ascontiguousarray(self.bodies.basis @ (R_ws @ R_sb)[self.bodies.target.body].transpose(0, 2, 1))
         motion = self._motion(state, image, body, R_ws, chained)
         return images, noise, Direct(pars, bloom, self.direction, basis, direct), motion
@@ -292,11 +293,11 @@ class CornerFactor:
         )  # fmt: skip
 
     def _chunks(
-        self, state: State, images: Images, motion: Motion, scene: str, jacobians: bool
+        self, state: State, images: Images, motion: Motion, recording: int, jacobians: bool
     ) -> Iterator[tuple[int, int, Predicted]]:
         """Views a..b by the chunk, and what the model makes of them."""
         params = np.concatenate([state.values[self.name, "intrinsics"], state.values[self.name, "distortion"]])
-        world, start = self.world_points(state, scene), images.start
+        world, start = self.world_points(state, recording), images.start
         for a in range(0, len(images.node), CHUNK):
             b = min(a + CHUNK, len(images.node))
             X = np.empty((start[b] - start[a], 3))
@@ -307,7 +308,7 @@ class CornerFactor:
                 uv, valid = self.model.project(params, X)
                 yield a, b, Predicted(int(start[a]), X, uv, valid, np.zeros((0, 2, 3)), np.zeros((0, 2, 0)))
 
-    def _blocks_of(self, piece: Piece) -> Iterator[tuple[int, int, str]]:
+    def _blocks_of(self, piece: Piece) -> Iterator[tuple[int, int, int]]:
         """The views that belong to `piece`, nodes from first to before last, the chain's very last node included; some
         at a time, as `parts` has them."""
         stop = piece.last + 1 if piece.last == self.n_nodes - 1 else piece.last
@@ -315,3 +316,8 @@ class CornerFactor:
         v0, v1 = (int(v) for v in np.searchsorted(self.views.image, images))
         for first in range(v0, v1, POSES):
             yield from self.parts(first, min(first + POSES, v1))
+
+
+def _scene(state: State, recording: int) -> np.ndarray:
+    """R_world_scene (3, 3)."""
+    return state.values[board_in(BOARD, recording), "tilt"]

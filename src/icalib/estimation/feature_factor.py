@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from icalib.estimation.arrowhead import Piece
+from icalib.estimation.clocks import mounted_columns, recording_of
 from icalib.estimation.corner_factor import LOSSES, CornerFactor
 from icalib.estimation.corner_kernels import Motion
 from icalib.estimation.feature_kernels import (
@@ -238,18 +239,22 @@ class FeatureFactor:
         motion = Motion(
             np.ascontiguousarray(state.values[camera.name, "rotation"]), state.values[camera.name, "translation"],
             R_cw, p_wc, poses.rate, poses.velocity, poses.by_node, poses.by_next, poses.by_imu,
-            np.eye(3), np.zeros((0, 3, 3)), np.zeros((0, 3)), np.tile(self._chained(camera), (i1 - i0, 1)),
+            np.eye(3), np.zeros((0, 3, 3)), np.zeros((0, 3)), self._chained(camera, state, i0, i1),
         )  # fmt: skip
         params = np.concatenate([state.values[camera.name, "intrinsics"], state.values[camera.name, "distortion"]])
         return View(camera, index, i0, params, seen, motion)
 
-    def _chained(self, camera: CornerFactor) -> np.ndarray:
-        """(c,) border columns that act through the camera's pose, in the order of `pose_chain`; points know no tilt."""
+    def _chained(self, camera: CornerFactor, state: State, i0: int, i1: int) -> np.ndarray:
+        """(i1 - i0, c) border columns that act through the camera's pose in its images i0..i1, in the order of
+        `pose_chain`; points know no tilt."""
         imu = np.zeros(0, dtype=np.int64)
         if camera.imu is not None:
             imu = self.layout.columns(camera.imu.name, "intrinsics")
-        own = self.layout.columns(camera.name, "rotation", "translation", "time_offset")
-        return np.concatenate([own, np.full(2, -1), imu[imu >= 0]]).astype(np.int64)
+        clocks = range(len(state.values[camera.name, "time_offset"]))
+        own = np.array([mounted_columns(self.layout, camera.name, k) for k in clocks])
+        of_image = own[recording_of(state, camera.node[i0:i1]) if len(own) > 1 else np.zeros(i1 - i0, dtype=np.int64)]
+        rest = np.concatenate([np.full(2, -1), imu[imu >= 0]])
+        return np.concatenate([of_image, np.tile(rest, (i1 - i0, 1))], axis=1).astype(np.int64)
 
     def _seeing(self, view: View, X: np.ndarray) -> Seeing:
         """Observations of a view, their points at X (n, 3) in the camera."""

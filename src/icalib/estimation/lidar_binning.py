@@ -23,6 +23,7 @@ from numba import njit
 
 from icalib.errors import EstimationError
 from icalib.estimation.arrowhead import in_parallel
+from icalib.estimation.clocks import instants
 from icalib.estimation.corner_weights import weight
 from icalib.estimation.lidar_sweep import Motion, sweep
 from icalib.estimation.nodes import usable
@@ -319,7 +320,7 @@ def _moments_of(
     """Of some of the scans: seconds of the bins, and of each entry bin, plane, count, root and slant."""
     each = steps_of(bin_s)
     scans, seconds, _ = _laid_out(cloud.stream, cloud.plane, bin_s / each, each, own)
-    times = seconds + drive.state.values[cloud.stream.name, "time_offset"][0]
+    times = instants(cloud.stream, drive.state.values, seconds)
     # All steps of a bin hang on one node: between two nodes a state that has not settled yet may jump.
     motion, n = sweep(drive, cloud.stream.name, times, np.repeat(times[each // 2 :: each], each)), len(times)
     cells = _Cells(
@@ -368,7 +369,7 @@ def in_world(drive: Motion, stream: LidarStream) -> tuple[np.ndarray, np.ndarray
 
     def move(own: slice) -> None:
         scans, seconds, ends = _laid_out(stream, stream.plane, STEP_S, 1, own)
-        motion = sweep(drive, stream.name, seconds + drive.state.values[stream.name, "time_offset"][0])
+        motion = sweep(drive, stream.name, instants(stream, drive.state.values, seconds))
         _move_to_world(scans, motion, STEP_S, points[ends], seen_from[ends])
 
     in_parallel(move, _groups(stream))

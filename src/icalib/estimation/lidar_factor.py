@@ -16,6 +16,7 @@ import numpy as np
 
 from icalib.estimation import lidar_kernels
 from icalib.estimation.arrowhead import Piece
+from icalib.estimation.clocks import by_clock, instants, mounted_columns, offset_at
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.lidar_binning import BIN_S, Associated, LidarNoise, Moments, take_moments
 from icalib.estimation.lidar_kernels import ROWS, Bins, Motion, Planes
@@ -61,17 +62,20 @@ class LidarFactor:
         none. Raises EstimationError where no point is left."""
         values = np.array([motion.state.values[p] for p in planes])
         moments = take_moments(Associated(stream, plane, values), motion, noise, bin_s)
-        times = moments.seconds + motion.state.values[stream.name, "time_offset"][0]
+        times = instants(stream, motion.state.values, moments.seconds)
         node = assign_nodes(scheme, motion.state.seconds, times)
         n_nodes = len(motion.state.seconds)
         return cls(stream.name, moments, node, planes, motion.imu, motion.gravity, scheme, layout, n_nodes)
 
     @cached_property
-    def _columns(self) -> tuple[np.ndarray, np.ndarray]:
-        """Border columns that act through the pose (c,), and those of each plane (P, 3)."""
+    def _of_planes(self) -> np.ndarray:
+        """(P, 3) border columns of each plane."""
+        return np.array([self.layout.block(*p).columns for p in self.planes])
+
+    def _through_pose(self, clock: int) -> np.ndarray:
+        """(c,) border columns that act through the pose."""
         imu = self.layout.columns(self.imu.name, "intrinsics")
-        pose = self.layout.columns(self.name, "rotation", "translation", "time_offset")
-        return np.concatenate([pose, imu[imu >= 0]]), np.array([self.layout.block(*p).columns for p in self.planes])
+        return np.concatenate([mounted_columns(self.layout, self.name, clock), imu[imu >= 0]])
 
     @property
     def kinds(self) -> dict[str, slice]:
@@ -108,24 +112,29 @@ class LidarFactor:
 
     def _chunks(self, state: State, b0: int, b1: int) -> Iterator[tuple[Bins, Motion, Planes]]:
         """Bins b0..b1 by the chunk, with their motion and the planes."""
-        through_pose, of_plane = self._columns
         value = np.array([state.values[p] for p in self.planes])
         across = np.array([tangents(v[:3]) for v in value])
-        planes = Planes(value[:, :3].copy(), across, value[:, 3:].copy(), of_plane)
+        planes = Planes(value[:, :3].copy(), across, value[:, 3:].copy(), self._of_planes)
         R_il = np.ascontiguousarray(state.values[self.name, "rotation"])
-        p_il, offset = state.values[self.name, "translation"], state.values[self.name, "time_offset"][0]
+        p_il = state.values[self.name, "translation"]
         imu_free = self.layout.is_free(self.imu.name, "intrinsics")
         m = self.moments
-        for a in range(b0, b1, CHUNK):
-            b = min(a + CHUNK, b1)
-            node, times = self.node[a:b], m.seconds[a:b] + offset
+        for clock, a, b in self._stretches(state, b0, b1):
+            node = self.node[a:b]
+            times = m.seconds[a:b] + offset_at(state, self.name, node)
             poses = poses_at(self.scheme, times, node, state, self.imu, self.gravity, imu_free)
             R_lw = np.ascontiguousarray((poses.rotation @ R_il).transpose(0, 2, 1))
             motion = Motion(
                 R_il, p_il, R_lw, poses.position + poses.rotation @ p_il, poses.rate, poses.velocity,
-                poses.by_node, poses.by_next, poses.by_imu, through_pose,
+                poses.by_node, poses.by_next, poses.by_imu, self._through_pose(clock),
             )  # fmt: skip
             yield Bins(node, m.start[a : b + 1], m.plane, m.root, m.slant), motion, planes
+
+    def _stretches(self, state: State, b0: int, b1: int) -> Iterator[tuple[int, int, int]]:
+        """Bins b0..b1 by the chunk, each with the number of their time offset."""
+        for clock, own in by_clock(state, self.name, self.node[b0:b1]):
+            for a in range(b0 + own.start, b0 + own.stop, CHUNK):
+                yield clock, a, min(a + CHUNK, b0 + own.stop)
 
     def _bins_of(self, piece: Piece) -> tuple[int, int]:
         """The bins that belong to `piece`: nodes from first to before last, the chain's very last node included."""

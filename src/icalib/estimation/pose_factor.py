@@ -16,6 +16,7 @@ import numpy as np
 
 from icalib.estimation.arrowhead import Piece
 from icalib.estimation.board import board_in
+from icalib.estimation.clocks import by_clock, instants, mounted_columns, offset_at
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.lidar_sweep import Motion
 from icalib.estimation.nodes import usable
@@ -28,7 +29,6 @@ from icalib.estimation.wheel_intervals import WheelIntervals, choose_intervals
 from icalib.estimation.wheel_kernels import Rows
 from icalib.measurements import PoseStream
 
-OWN = ("rotation", "translation", "time_offset")
 FRAME = ("frame_rotation", "frame_translation")
 NEAR_NODE_S = 0.05  # a pose further from all nodes is left out: the IMU alone would carry it there
 KINDS = {"rotation": slice(0, 3), "position": slice(3, 6)}
@@ -74,7 +74,7 @@ class AbsolutePoseFactor:
     def build(cls, stream: PoseStream, motion: Motion, noise: PoseNoise, layout: Layout) -> AbsolutePoseFactor:
         """Of the poses that lie near nodes; those in gaps of the IMU that are not bridged are left out."""
         state = motion.state
-        times = stream.seconds + float(state.values[stream.name, "time_offset"][0])
+        times = instants(stream, state.values)
         node = assign_nodes("inertial", state.seconds, times, motion.imu.forwards)
         near = np.abs(times - state.seconds[node]) <= NEAR_NODE_S
         k = np.flatnonzero(near & usable(motion.imu, times, motion.max_gap_s))
@@ -142,7 +142,9 @@ class AbsolutePoseFactor:
             rows.residual, np.where(last, 0.0, by_node), np.where(last, by_node, 0.0),
             _by_border(rows, by_pose @ _moving(poses), by_pose @ poses.by_imu),
         )  # fmt: skip
-        columns = np.concatenate([self.layout.columns(self.name, *OWN), self.layout.columns(frame, *FRAME)])
+        columns = np.concatenate(
+            [mounted_columns(self.layout, self.name, recording), self.layout.columns(frame, *FRAME)]
+        )
         return _add(self, own, made, columns, at, into)
 
 
@@ -167,7 +169,7 @@ class RelativePosesFactor:
     def build(cls, stream: PoseStream, motion: Motion, noise: PoseNoise, layout: Layout) -> RelativePosesFactor:
         """Chooses the stretches at the time offset and the nodes of the motion."""
         state, seconds = motion.state, stream.seconds
-        times = seconds + float(state.values[stream.name, "time_offset"][0])
+        times = instants(stream, state.values)
         found = choose_intervals(motion.imu, state.seconds, state.starts, times)
         R0, R1 = stream.rotation[found.first], stream.rotation[found.last]
         way = stream.position[found.last] - stream.position[found.first]
@@ -209,8 +211,14 @@ class RelativePosesFactor:
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """See `SensorFactor`."""
-        low, high = np.searchsorted(self.intervals.node, [piece.first, piece.last])
-        own = slice(int(low), int(high))
+        low, high = (int(k) for k in np.searchsorted(self.intervals.node, [piece.first, piece.last]))
+        into, cost = Into(piece, out, sums, curved), 0.0
+        for clock, part in by_clock(state, self.name, self.intervals.node[low:high]):
+            cost += self._of_clock(clock, slice(low + part.start, low + part.stop), state, into)
+        return cost
+
+    def _of_clock(self, clock: int, own: slice, state: State, into: Into) -> float:
+        """Adds the ways `own`, which go by one time offset."""
         first, last, node = (x[own] for x in (self.intervals.first, self.intervals.last, self.intervals.node))
         a = _poses(self, self.seconds[first], node, state)
         b = _poses(self, self.seconds[last], node + 1, state)
@@ -224,8 +232,7 @@ class RelativePosesFactor:
             rows.residual, before @ a.by_node, after @ b.by_node,
             _by_border(rows, by_time, before @ a.by_imu + after @ b.by_imu),
         )  # fmt: skip
-        columns = self.layout.columns(self.name, *OWN)
-        return _add(self, own, made, columns, node, Into(piece, out, sums, curved))
+        return _add(self, own, made, mounted_columns(self.layout, self.name, clock), node, into)
 
 
 PoseFactor = AbsolutePoseFactor | RelativePosesFactor
@@ -240,7 +247,7 @@ def _mount(name: str, state: State) -> Mount:
 
 
 def _poses(factor: PoseFactor, seconds: np.ndarray, node: np.ndarray, state: State) -> Poses:
-    times = seconds + float(state.values[factor.name, "time_offset"][0])
+    times = seconds + offset_at(state, factor.name, node)
     imu_free = factor.layout.is_free(factor.imu.name, "intrinsics")
     return poses_at("inertial", times, node, state, factor.imu, factor.gravity, imu_free)
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from icalib.estimation.clocks import instants
 from icalib.estimation.ground_factor import HEIGHT_BLOCK, GroundFactor, floors
 from icalib.estimation.lidar_binning import BIN_S, LidarNoise
 from icalib.estimation.lidar_factor import LidarFactor
@@ -86,9 +87,12 @@ def joined_clouds(each: Sequence[Clouds]) -> Clouds:
     return Clouds(names, tuple(plane))
 
 
-def own_entries(sensor: Lidar | Wheels | PoseSensor) -> list[Entry]:
+def own_entries(sensor: Lidar | Wheels | PoseSensor, n_recordings: int) -> list[Entry]:
     """Of the border."""
-    mounts: list[Entry] = [(sensor.name, *g, getattr(sensor, g[0]).mode != "fixed") for g in MOUNT]
+    clocks = {"time_offset": n_recordings if sensor.clock_restarts else 1}
+    mounts: list[Entry] = [
+        (sensor.name, name, kind, clocks.get(name, n), getattr(sensor, name).mode != "fixed") for name, kind, n in MOUNT
+    ]
     if not isinstance(sensor, Wheels):
         return mounts
     heard = sensor.measures != "poses"  # which say nothing of what rolls
@@ -230,6 +234,7 @@ def wheel_factor(
     if isinstance(stream, WheelPoses):
         return RelativePoseFactor.of_poses(stream, motion.imu, motion.gravity, noise, layout, motion.state)
     own = wheels.name, stream.seconds, integrals_of(stream), motion.imu, motion.gravity, noise, layout, motion.state
+    times = instants(stream, motion.state.values)
     if wheels.factor == "relative-poses":
-        return RelativePoseFactor.build(*own)
-    return IncrementFactor.build(*own, stream.kind)
+        return RelativePoseFactor.build(*own, times)
+    return IncrementFactor.build(*own, stream.kind, times)

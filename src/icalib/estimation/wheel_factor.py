@@ -20,6 +20,7 @@ from typing import ClassVar
 import numpy as np
 
 from icalib.estimation.arrowhead import Piece
+from icalib.estimation.clocks import by_clock, instants, mounted_columns, offset_at
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.poses import Poses, motion_at, poses_at
 from icalib.estimation.row_sums import Into, Weighing, add_rows
@@ -44,8 +45,6 @@ from icalib.estimation.wheel_kernels import (
 from icalib.estimation.wheel_poses import RelativePoses, preintegrated
 from icalib.measurements import WheelPoses
 from icalib.rig import DRIVE_SIZES, WheelKind
-
-MOUNTED = ("rotation", "translation", "time_offset")
 
 
 @dataclass(frozen=True)
@@ -109,11 +108,12 @@ class IncrementFactor:
         layout: Layout,
         state: State,
         kind: WheelKind = "pair",
+        times: np.ndarray | None = None,
     ) -> IncrementFactor:
         """From `integrals_of` (N, m), of a pair the angles in rad that the left and the right wheel have turned, at
-        stamps seconds (N,) since the first on the wheels' clock. Chooses the intervals at the time offset and the nodes
-        of `state`."""
-        found = wheel_intervals(name, seconds, imu, state)
+        stamps seconds (N,) since the first on the wheels' clock. Chooses the intervals at the nodes of `state`, with
+        stamps at `times` (N,) on the IMU's clock, by default those of the only time offset."""
+        found = wheel_intervals(name, seconds, imu, state, times)
         dt = seconds[found.last] - seconds[found.first]
         whole = integrals[found.last] - integrals[found.first]
         sigma = _row_sigma(kind, noise, dt, whole, drive_of(name, state, kind))
@@ -122,7 +122,7 @@ class IncrementFactor:
         n_measured = 1 if kind == "steered" else 2
         measured[:, :n_measured] = whole[:, :n_measured]
         mean = whole[:, 1:] / dt[:, None]
-        change = state.seconds[found.node + 1] - _offset(name, state) if imu.forwards else None
+        change = state.seconds[found.node + 1] - offset_at(state, name, found.node) if imu.forwards else None
         instants = quadrature(seconds, found, change)
         return cls(name, kind, found, measured, mean, whitening, instants, imu, gravity, noise, layout)
 
@@ -150,7 +150,8 @@ class IncrementFactor:
         own = _in_piece(self.intervals, piece)
         start = self.instants.start[own.start : own.stop + 1]
         seen = slice(int(start[0]), int(start[-1]))
-        times, node = self.instants.times[seen] + _offset(self.name, state), self.instants.node[seen]
+        node = self.instants.node[seen]
+        times = self.instants.times[seen] + offset_at(state, self.name, node)
         free = self.layout.is_free(self.imu.name, "intrinsics")
         poses, moving = motion_at(times, node, state, self.imu, self.gravity, free)
         rows = Rows.empty(len(start) - 1, 4, poses.by_imu.shape[2], sums)
@@ -160,7 +161,7 @@ class IncrementFactor:
             start - start[0], self.instants.weight[seen], _track(node, poses), moving, wheels, c, self.measured[own],
             rows,
         )  # fmt: skip
-        return _add(self, own, rows, self.whitening, Into(piece, out, sums, curved))
+        return _add(self, own, rows, self.whitening, state, Into(piece, out, sums, curved))
 
 
 @dataclass(frozen=True)
@@ -193,7 +194,7 @@ class RelativePoseFactor:
         cls, stream: WheelPoses, imu: ImuData, gravity: float, noise: WheelNoise, layout: Layout, state: State
     ) -> RelativePoseFactor:
         """Of relative poses that were measured as such: they say nothing of radii and baseline."""
-        found = pose_intervals(imu, state.seconds, state.starts, stream.seconds + _offset(stream.name, state))
+        found = pose_intervals(imu, state.seconds, state.starts, instants(stream, state.values))
         k = found.first
         W = np.linalg.inv(np.linalg.cholesky(stream.covariance[k]))
         poses = RelativePoses(stream.pose[k], np.zeros((len(k), 3, 3)), W, np.zeros(3))
@@ -214,10 +215,11 @@ class RelativePoseFactor:
         noise: WheelNoise,
         layout: Layout,
         state: State,
+        times: np.ndarray | None = None,
     ) -> RelativePoseFactor:
         """See IncrementFactor.build; integrated at the radii and the baseline of `state`. Of the slip densities it uses
         `sideways`."""
-        found = wheel_intervals(name, seconds, imu, state)
+        found = wheel_intervals(name, seconds, imu, state, times)
         poses = preintegrated(seconds, angles, found, drive_of(name, state), noise.wheel, noise.sideways)
         return cls(name, seconds, found, poses, imu, gravity, noise, layout)
 
@@ -246,18 +248,25 @@ class RelativePoseFactor:
         """See IncrementFactor.accumulate."""
         own = _in_piece(self.intervals, piece)
         i, z = self.intervals, self.poses
-        times = np.concatenate([self.seconds[i.first[own]], self.seconds[i.last[own]]]) + _offset(self.name, state)
         node = np.concatenate([i.node[own], i.node[own] + 1])
+        seconds = np.concatenate([self.seconds[i.first[own]], self.seconds[i.last[own]]])
+        times = seconds + offset_at(state, self.name, node)
         free = self.layout.is_free(self.imu.name, "intrinsics")
         poses = poses_at("inertial", times, node, state, self.imu, self.gravity, free)
         rows = Rows.empty(len(times) // 2, 3, poses.by_imu.shape[2], sums)
         relative_rows(_track(node, poses), _wheels(self.name, state, self.kind), z.z[own], z.J[own], z.drive0, rows)
-        return _add(self, own, rows, z.W, Into(piece, out, sums, curved))
+        return _add(self, own, rows, z.W, state, Into(piece, out, sums, curved))
 
 
-def wheel_intervals(name: str, seconds: np.ndarray, imu: ImuData, state: State) -> WheelIntervals:
-    """The intervals of the wheels `name`, stamped at `seconds` (N,), at their time offset and the nodes in `state`."""
-    return choose_intervals(imu, state.seconds, state.starts, seconds + _offset(name, state))
+def wheel_intervals(
+    name: str, seconds: np.ndarray, imu: ImuData, state: State, times: np.ndarray | None = None
+) -> WheelIntervals:
+    """The intervals of the wheels `name`, stamped at `seconds` (N,), at the nodes in `state`; `times` as in
+    `IncrementFactor.build`."""
+    if times is not None:
+        return choose_intervals(imu, state.seconds, state.starts, times)
+    (offset,) = state.values[name, "time_offset"]
+    return choose_intervals(imu, state.seconds, state.starts, seconds + offset)
 
 
 def drive_of(name: str, state: State, kind: WheelKind = "pair") -> np.ndarray:
@@ -282,10 +291,6 @@ def _row_sigma(kind: WheelKind, noise: WheelNoise, dt: np.ndarray, whole: np.nda
     return sigma
 
 
-def _offset(name: str, state: State) -> float:
-    return float(state.values[name, "time_offset"][0])
-
-
 def _wheels(name: str, state: State, kind: WheelKind) -> Wheels:
     rotation = np.ascontiguousarray(state.values[name, "rotation"])
     return Wheels(rotation, state.values[name, "translation"], drive_of(name, state, kind))
@@ -307,10 +312,20 @@ def _in_piece(intervals: WheelIntervals, piece: Piece) -> slice:
 
 
 def _add(
-    factor: IncrementFactor | RelativePoseFactor, own: slice, rows: Rows, whitening: np.ndarray, into: Into
+    factor: IncrementFactor | RelativePoseFactor,
+    own: slice,
+    rows: Rows,
+    whitening: np.ndarray,
+    state: State,
+    into: Into,
 ) -> float:
     """Adds the rows of intervals `own`."""
-    by = Weighing(whitening[own], factor.noise.loss, factor.noise.loss_scale)
-    columns = factor.layout.columns(factor.name, *MOUNTED, *DRIVE_SIZES[factor.kind])
-    columns = np.concatenate([columns, np.full(N_OWN - len(columns), -1)])
-    return add_rows(rows, own, factor.intervals.node[own], columns, factor.layout, factor.imu, by, into)
+    cost, node, layout = 0.0, factor.intervals.node[own], factor.layout
+    drive = layout.columns(factor.name, *DRIVE_SIZES[factor.kind])
+    for clock, part in by_clock(state, factor.name, node):
+        columns = np.concatenate([mounted_columns(layout, factor.name, clock), drive])
+        columns = np.concatenate([columns, np.full(N_OWN - len(columns), -1)])
+        mine = slice(own.start + part.start, own.start + part.stop)
+        by = Weighing(whitening[mine], factor.noise.loss, factor.noise.loss_scale)
+        cost += add_rows(Rows(*(x[part] for x in rows)), mine, node[part], columns, layout, factor.imu, by, into)
+    return cost

@@ -97,10 +97,27 @@ def no_place_for(program: str, things: Sequence[str]) -> tuple[str, ...]:
     return (f"{program} has no place for {', '.join(things)}; see calibration.yaml.",)
 
 
+def time_offset(c: Calibration, name: str) -> float:
+    """Seconds. Raises CalibrationError where the sensor's clock restarts: what it will be next time nobody knows."""
+    value = c.group(name, "time_offset").value
+    if len(value) > 1:
+        raise CalibrationError(
+            f"the clock of {name} restarts, and each recording has a time offset of its own, while this format needs "
+            "the one that will be; export to ros2-static, camera-info, urdf or json, or calibrate one recording alone."
+        )
+    return float(value[0])
+
+
 def time_offsets(c: Calibration, names: Sequence[str]) -> list[str]:
     """Words for the time offsets of sensors that have one."""
-    groups = {g.sensor: float(g.value[0]) for g in c.groups if g.name == "time_offset"}
-    return [f"the time offset of {name} ({1e3 * groups[name]:+.3f} ms)" for name in names if groups.get(name)]
+    found = {g.sensor: g.value for g in c.groups if g.name == "time_offset" and g.value.any()}
+    return [_time_offset_words(name, found[name]) for name in names if name in found]
+
+
+def _time_offset_words(name: str, value: np.ndarray) -> str:
+    if len(value) > 1:
+        return f"the time offsets of {name} (one for each recording)"
+    return f"the time offset of {name} ({1e3 * value[0]:+.3f} ms)"
 
 
 def drives(c: Calibration) -> list[str]:

@@ -13,6 +13,7 @@ from icalib.export.common import (
     need,
     need_imu,
     no_place_for,
+    time_offset,
     topic,
     yaml_text,
 )
@@ -72,7 +73,7 @@ def fast_lio(c: Calibration) -> Export:
     files = {}
     for name in c.lidars:
         T = c.T_imu_sensor(name)
-        offset = float(c.group(name, "time_offset").value[0])
+        offset = time_offset(c, name)
         common = {"lid_topic": topic(c, name, f"/{name}"), "imu_topic": topic(c, imu, f"/{imu}")}
         common |= {"time_sync_en": False, "time_offset_lidar_to_imu": offset}
         place = {"extrinsic_est_en": False, "extrinsic_T": T[:3, 3].tolist(), "extrinsic_R": T[:3, :3].ravel().tolist()}
@@ -81,7 +82,7 @@ def fast_lio(c: Calibration) -> Export:
 
 
 def _placed(c: Calibration, name: str, kind: str) -> dict[str, Any]:
-    offset = float(c.group(name, "time_offset").value[0])
+    offset = time_offset(c, name)
     return {"timeoffset": offset, f"T_imu_{kind}": c.T_imu_sensor(name).tolist()}
 
 

@@ -8,7 +8,18 @@ import numpy as np
 
 from icalib.calibration import Calibration
 from icalib.errors import CalibrationError
-from icalib.export.common import Export, guesses, inverse, lens_of, need, need_imu, no_place_for, topic, yaml_text
+from icalib.export.common import (
+    Export,
+    guesses,
+    inverse,
+    lens_of,
+    need,
+    need_imu,
+    no_place_for,
+    time_offset,
+    topic,
+    yaml_text,
+)
 from icalib.export.kalibr import cam_overlaps, lower
 from icalib.geometry import so3
 
@@ -41,7 +52,7 @@ def openvins(c: Calibration) -> Export:
             "intrinsics": lens.intrinsics,
             "resolution": list(lens.resolution),
             "rostopic": topic(c, name, f"/{name}/image_raw"),
-            "timeshift_cam_imu": float(c.group(name, "time_offset").value[0]),
+            "timeshift_cam_imu": time_offset(c, name),
         }
     comments = [
         "Cameras for OpenVINS, by icalib.",
@@ -56,8 +67,8 @@ def openvins(c: Calibration) -> Export:
 
 def _offsets(c: Calibration) -> tuple[str, ...]:
     """OpenVINS moves all images by the first camera's offset."""
-    first = float(c.group(c.cameras[0], "time_offset").value[0])
-    others = {n: float(c.group(n, "time_offset").value[0]) - first for n in c.cameras[1:]}
+    first = time_offset(c, c.cameras[0])
+    others = {n: time_offset(c, n) - first for n in c.cameras[1:]}
     off = [f"{n} by {1e3 * d:+.3f} ms" for n, d in others.items() if abs(d) > _OTHER_OFFSET_S]
     if not off:
         return ()

@@ -17,6 +17,7 @@ from icalib.export.common import (
     need,
     need_imu,
     no_place_for,
+    time_offset,
     topic,
 )
 
@@ -42,7 +43,7 @@ def vins_fusion(c: Calibration) -> Export:
 
 
 def _offset(c: Calibration, names: tuple[str, ...]) -> tuple[str, ...]:
-    offsets = [float(c.group(name, "time_offset").value[0]) for name in names]
+    offsets = [time_offset(c, name) for name in names]
     if len(names) < 2 or abs(offsets[1] - offsets[0]) < 1e-5:
         return ()
     return (
@@ -65,7 +66,7 @@ def _main(c: Calibration, imu: str, names: tuple[str, ...], lenses: list[Lens], 
     lines += _noise(c, imu)
     lines += [f"g_norm: {float(c.rig['gravity'])!r}", "estimate_td: 0"]
     lines.append("# What to add to an image's stamp to have the IMU's clock [s].")
-    lines.append(f"td: {float(c.group(names[0], 'time_offset').value[0])!r}")
+    lines.append(f"td: {time_offset(c, names[0])!r}")
     return "\n".join(lines) + "\n"
 
 

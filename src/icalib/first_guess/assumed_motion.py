@@ -62,7 +62,7 @@ def start_without_imu(rig: Rig, recordings: Sequence[Measurements]) -> tuple[Inp
     paths = [own.at(np.arange(0.0, own.seconds[-1], STEP_S)) for own in shown]  # from the body's first stamp on
     body = _with_assumption(rig, paths)
     inputs = replace(inputs_for(body, _readings(recordings, paths, felt=False)), asked=rig)
-    felt = inputs_for(body, _readings(recordings, paths, felt=True))
+    felt = inputs_for(body, _readings(recordings, paths, felt=True), inputs)
     assert felt.imu is not None
     felt = replace(felt, imu=replace(felt.imu, forwards=False))
     values = start_values(inputs, cameras | _identity(inputs))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
 
@@ -13,6 +13,7 @@ from icalib.estimation.imu_data import imu_data
 from icalib.estimation.state import Key, State
 from icalib.measurements import LidarStream
 from icalib.recordings.several import naming
+from icalib.rig import Camera, Lidar, PoseSensor, Wheels
 
 
 def alone(inputs: Inputs, k: int) -> Inputs:
@@ -56,6 +57,33 @@ def other_clocks(offset: float, sensor: str, before: Inputs, now: Inputs) -> flo
     return offset + next(shifts) - next(shifts)
 
 
+def own_offset(state: State, sensor: str, before: Inputs, now: Inputs) -> float:
+    """The time offset that `state` of one recording, `before`, has of a clock that runs on, in another one."""
+    return other_clocks(float(state.values[sensor, "time_offset"][0]), sensor, before, now)
+
+
+def joined_offsets(
+    inputs: Inputs,
+    sensor: Camera | Lidar | Wheels | PoseSensor,
+    recordings: Sequence[Inputs],
+    states: Mapping[int, State],
+    best: int,
+) -> np.ndarray:
+    """A sensor's time offsets in `inputs`: those of each recording's own state, or that of the `best` where its clock
+    runs on."""
+    used = range(len(recordings)) if sensor.clock_restarts else (best,)
+    return np.array([own_offset(states[k], sensor.name, recordings[k], inputs) for k in used])
+
+
+def each_clock(inputs: Inputs, sensor: str, find: Callable[[int], float]) -> np.ndarray:
+    """(R,) time offsets of a clock that restarts; `find`: that of a recording alone, given by its number."""
+    found = []
+    for k in range(len(inputs.parts)):
+        with naming_recording(inputs, k):
+            found.append(other_clocks(find(k), sensor, alone(inputs, k), inputs))
+    return np.array(found)
+
+
 def most_points(inputs: Inputs, lidar: int) -> int:
     """The recording that has most points of a LiDAR, given by its number."""
     return int(np.argmax([len(part.measurements.lidars[lidar].xyz) for part in inputs.parts]))
@@ -79,6 +107,5 @@ def with_points(stream: LidarStream, kept: np.ndarray) -> LidarStream:
     if kept.all():
         return stream
     start = np.concatenate([[0], np.cumsum(kept)])[stream.start].astype(np.int64)
-    return LidarStream(
-        stream.name, stream.stamps_ns, start, stream.offset_s[kept], stream.xyz[kept], stream.plane[kept]
-    )
+    columns = {name: getattr(stream, name)[kept] for name in ("offset_s", "xyz", "plane")}
+    return replace(stream, start=start, **columns)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from icalib.estimation.assembly import (
     start_values,
     with_clouds,
 )
+from icalib.estimation.clocks import instants
 from icalib.estimation.estimate import first_pass
 from icalib.estimation.lidar_binning import Associated, LidarNoise, Moments, take_moments
 from icalib.estimation.lidar_sweep import Motion, sweep
@@ -30,11 +32,14 @@ from icalib.estimation.state import Key, State
 from icalib.first_guess.align_camera import trusted
 from icalib.first_guess.by_recording import (
     alone,
+    each_clock,
+    joined_offsets,
     most_points,
     motion_alone,
     naming_recording,
     one_after_another,
     other_clocks,
+    own_offset,
     points_by_recording,
     with_points,
 )
@@ -58,6 +63,8 @@ def given(inputs: Inputs, sensor: Camera | Lidar | Wheels | PoseSensor, names: S
         if value is not None:
             shift = origin_difference(inputs.measurements, inputs.stream(sensor.name)) if name == "time_offset" else 0.0
             out[sensor.name, name] = np.array(value, dtype=np.float64) + shift
+    if (offset := out.get((sensor.name, "time_offset"))) is not None:
+        out[sensor.name, "time_offset"] = np.repeat(offset, inputs.clocks_of(sensor))
     return out
 
 
@@ -71,13 +78,13 @@ def state_from_lidar(inputs: Inputs) -> State:
     best, name = most_points(inputs, 0), inputs.rig.lidars[0].name
     with naming_recording(inputs, best), naming_sight(recordings[best].measurements.lidars[:1]):
         states = {best: _state_of_one(recordings[best])}
-    values, offset = dict(states[best].values), float(states[best].values[name, "time_offset"][0])
+    values, restarts = dict(states[best].values), inputs.rig.lidars[0].clock_restarts
     for k, own in enumerate(recordings):
         if k != best:
-            there = other_clocks(offset, name, recordings[best], own)
+            there = None if restarts else own_offset(states[best], name, recordings[best], own)
             with naming_recording(inputs, k), naming_sight(own.measurements.lidars[:1]):
                 states[k] = _state_of_one(own, Held(values[name, "rotation"], values[name, "translation"], there))
-    values[name, "time_offset"] = np.array([other_clocks(offset, name, recordings[best], inputs)])
+    values[name, "time_offset"] = joined_offsets(inputs, inputs.rig.lidars[0], recordings, states, best)
     return one_after_another(inputs, [states[k] for k in range(len(recordings))], values)
 
 
@@ -191,7 +198,7 @@ def while_known(inputs: Inputs, state: State) -> Inputs:
     alone, their points would count as if its readings had no noise. Raises EstimationError where no scan is left."""
     measured, lidars, notes = inputs.measurements, [], list(inputs.measurements.notes)
     for stream in measured.lidars:
-        begin = stream.seconds + state.values[stream.name, "time_offset"][0]
+        begin = instants(stream, state.values)
         last, some = np.zeros(len(begin)), np.diff(stream.start) > 0
         last[some] = np.maximum.reduceat(stream.offset_s, stream.start[:-1][some]) if some.any() else 0.0
         known = near_nodes(state.seconds, begin) & near_nodes(state.seconds, begin + last)
@@ -232,10 +239,22 @@ def lidar_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
             stream = own.measurements.lidars[i]
             with naming_recording(inputs, k), naming_sight([stream]):
                 found = lidar_on_motion(own.imu, stream, motion, held_of(own, lidar))
-            found = replace(found, offset=other_clocks(found.offset, lidar.name, own, inputs))
-            known = found.values(lidar.name) | known
+            offsets = np.array([other_clocks(found.offset, lidar.name, own, inputs)])
+            if lidar.clock_restarts:
+                held = Held(found.rotation, found.position)
+                offsets = each_clock(inputs, lidar.name, partial(_offset_on_motion, inputs, state, i, held))
+            known = found.values(lidar.name) | {(lidar.name, "time_offset"): offsets} | known
         out |= known
     return out
+
+
+def _offset_on_motion(inputs: Inputs, state: State, lidar: int, held: Held, recording: int) -> float:
+    """Of a LiDAR in one recording, between its own first stamps, which stands as `held` in all."""
+    own, motion = alone(inputs, recording), motion_alone(inputs, recording, state)
+    assert own.imu is not None
+    stream = own.measurements.lidars[lidar]
+    with naming_sight([stream]):
+        return lidar_on_motion(own.imu, stream, motion, held).offset
 
 
 def held_of(inputs: Inputs, lidar: Lidar | PoseSensor, guesses: bool = False) -> Held:
@@ -256,7 +275,7 @@ def fitted_planes(inputs: Inputs, state: State, clouds: Clouds) -> dict[Key, np.
         if (plane >= 0).any():
             some = Associated(stream, thinned(plane), np.zeros((clouds.count, 6)))
             moments = take_moments(some, motion, LidarNoise(1.0), COARSE_BIN_S)
-            _add_in_world(moments, motion, stream.name, sums)
+            _add_in_world(moments, motion, stream, sums)
     out = {}
     for key, M in zip(clouds.keys, sums, strict=True):
         centre = M[1:, 0] / M[0, 0]
@@ -265,9 +284,9 @@ def fitted_planes(inputs: Inputs, state: State, clouds: Clouds) -> dict[Key, np.
     return out
 
 
-def _add_in_world(moments: Moments, motion: Motion, name: str, sums: np.ndarray) -> None:
+def _add_in_world(moments: Moments, motion: Motion, stream: LidarStream, sums: np.ndarray) -> None:
     """Adds to sums (P, 4, 4) those of (1, x) (1, x)^T over the points x of each plane, in the world."""
-    at = sweep(motion, name, moments.seconds + motion.state.values[name, "time_offset"][0])
+    at = sweep(motion, stream.name, instants(stream, motion.state.values, moments.seconds))
     bin_of = np.repeat(np.arange(len(moments.seconds)), np.diff(moments.start))
     L, A = np.zeros((len(bin_of), 4, 4)), np.zeros((len(bin_of), 4, 4))
     L[:, *np.tril_indices(4)] = moments.root

@@ -13,11 +13,20 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation.assembly import Inputs, host_times, nodes_for, start_values
+from icalib.estimation.clocks import instants
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.pose_factor import FRAME, frame_of
 from icalib.estimation.robot import MOUNT
 from icalib.estimation.state import Key, State
-from icalib.first_guess.by_recording import alone, naming_recording, one_after_another, other_clocks
+from icalib.first_guess.by_recording import (
+    alone,
+    each_clock,
+    joined_offsets,
+    motion_alone,
+    naming_recording,
+    one_after_another,
+    own_offset,
+)
 from icalib.first_guess.clocks import LEAST_CORRELATION, LONGEST_STEP_S, Alignment, CameraRates
 from icalib.first_guess.gyro import GyroRotation
 from icalib.first_guess.lever_arm import SIZE_TOLERANCE, size_of
@@ -62,10 +71,35 @@ def pose_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
     for sensor, stream in zip(inputs.rig.poses, inputs.measurements.poses, strict=True):
         known = given(inputs, sensor, NAMES)
         if len(known) < len(NAMES):
-            place = partial(_on_motion, inputs.imu, known=state, held=held_of(inputs, sensor))
-            known = placed(stream, place).values(sensor.name) | known
+            known = _placed(inputs, state, sensor, stream) | known
         out |= known | _frames(inputs.imu, sensor, stream, state, known)
     return out
+
+
+def _placed(inputs: Inputs, state: State, sensor: PoseSensor, stream: PoseStream) -> dict[Key, np.ndarray]:
+    """Where a sensor stands, as `state` has the motion. Where its clock restarts between recordings, the one with most
+    poses says so."""
+    assert inputs.imu is not None
+    held = held_of(inputs, sensor)
+    if not sensor.clock_restarts:
+        return placed(stream, partial(_on_motion, inputs.imu, known=state, held=held)).values(sensor.name)
+    i = inputs.rig.poses.index(sensor)
+    recordings = [alone(inputs, k) for k in range(len(inputs.parts))]
+    k = int(np.argmax([len(own.measurements.poses[i].stamps_ns) for own in recordings]))
+    own = recordings[k]
+    assert own.imu is not None
+    with naming_recording(inputs, k):
+        place = partial(_on_motion, own.imu, known=motion_alone(inputs, k, state), held=held)
+        found = placed(own.measurements.poses[i], place)
+
+    def offset(recording: int) -> float:
+        if recording == k:
+            return found.offset
+        other = recordings[recording]
+        assert other.imu is not None
+        return _aligned(other.imu, other.measurements.poses[i], Held(found.rotation))[0].offset
+
+    return found.values(sensor.name) | {(sensor.name, "time_offset"): each_clock(inputs, sensor.name, offset)}
 
 
 def state_from_poses(inputs: Inputs) -> State:
@@ -79,13 +113,13 @@ def state_from_poses(inputs: Inputs) -> State:
     best = int(np.argmax([len(own.measurements.poses[0].stamps_ns) for own in recordings]))
     with naming_recording(inputs, best):
         states = {best: _state_of_one(recordings[best], None)}
-    values, offset = dict(states[best].values), float(states[best].values[name, "time_offset"][0])
+    values, restarts = dict(states[best].values), inputs.rig.poses[0].clock_restarts
     for k, own in enumerate(recordings):
         if k != best:
-            there = other_clocks(offset, name, recordings[best], own)
+            there = None if restarts else own_offset(states[best], name, recordings[best], own)
             with naming_recording(inputs, k):
                 states[k] = _state_of_one(own, Held(values[name, "rotation"], values[name, "translation"], there))
-    values[name, "time_offset"] = np.array([other_clocks(offset, name, recordings[best], inputs)])
+    values[name, "time_offset"] = joined_offsets(inputs, inputs.rig.poses[0], recordings, states, best)
     return one_after_another(inputs, [states[k] for k in range(len(recordings))], values)
 
 
@@ -199,10 +233,10 @@ def _frames(
 ) -> dict[Key, np.ndarray]:
     """Where the frame of absolute poses stands in each recording's world: the mean of what the poses say."""
     out: dict[Key, np.ndarray] = {}
-    R_is, p_is, offset = (values[sensor.name, name] for name in NAMES)
+    R_is, p_is, _ = (values[sensor.name, name] for name in NAMES)
+    t = instants(stream, values)
     for k, nodes in enumerate(known.recordings if sensor.kind == "absolute" else ()):
         part = _nodes(known, nodes)
-        t = stream.seconds + float(offset[0])
         own = np.flatnonzero((t >= part.seconds[0]) & (t <= part.seconds[-1]))
         if not len(own):
             raise _too_short(stream)

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation.assembly import Inputs, motion_of
+from icalib.estimation.clocks import instants
 from icalib.estimation.ground_factor import HEIGHT_BLOCK
 from icalib.estimation.lidar_sweep import Motion
 from icalib.estimation.poses import assign_nodes, poses_at
 from icalib.estimation.robot import MOUNT
 from icalib.estimation.state import Key, State
 from icalib.estimation.wheel_angles import integrals_of
+from icalib.first_guess.by_recording import alone, each_clock
 from icalib.first_guess.from_tracks import lens_start
 from icalib.first_guess.lidar_rounds import given, lidar_values, near_nodes, with_lidars
 from icalib.first_guess.poses import pose_values
@@ -78,7 +81,7 @@ def _wheels(inputs: Inputs, state: State, wheels: Wheels, stream: WheelStream | 
     failed: list[EstimationError] = []
     for up in _ways_up(inputs, state):
         try:
-            return _turning(inputs, state, rates, up, wheels.name, offset) | known
+            return _turning(inputs, state, stream, rates, up, offset) | known
         except EstimationError as error:
             failed.append(error)
     raise failed[0]
@@ -95,16 +98,34 @@ def _ways_up(inputs: Inputs, state: State) -> tuple[np.ndarray, ...]:
 
 
 def _turning(
-    inputs: Inputs, state: State, rates: WheelRates, up: np.ndarray, name: str, offset: np.ndarray | None
+    inputs: Inputs, state: State, stream: WheelStream, rates: WheelRates, up: np.ndarray, offset: np.ndarray | None
 ) -> dict[Key, np.ndarray]:
     """Of wheels that turn, or report what a vehicle does. Raises EstimationError where the motion does not show it."""
     assert inputs.imu is not None
-    if offset is None:
+    name = stream.name
+    if offset is None and _wheels_of(inputs, name).clock_restarts:
+        offset = each_clock(inputs, name, partial(_offset_alone, inputs, name, up))
+    elif offset is None:
         offset = np.array([wheel_offset(inputs.imu, up, name, rates)])
-    inside, rate, velocity = _means(motion_of(inputs, state), rates.start, rates.end, offset[0])
+    clock = {(name, "time_offset"): offset}
+    start, end = instants(stream, clock, rates.start), instants(stream, clock, rates.end)
+    inside, rate, velocity = _means(motion_of(inputs, state), start, end)
     drive = drive_guess(name, rates.rate[inside], rate, velocity, up, rates.kind)
     found = {"rotation": drive.rotation, "translation": drive.position, "time_offset": offset} | drive.values
     return {(name, group): value for group, value in found.items()}
+
+
+def _wheels_of(inputs: Inputs, name: str) -> Wheels:
+    return next(w for w in inputs.rig.wheels if w.name == name)
+
+
+def _offset_alone(inputs: Inputs, name: str, up: np.ndarray, recording: int) -> float:
+    """Of wheels in one recording, between its own first stamps; `up` (3,) in the IMU's axes."""
+    own = alone(inputs, recording)
+    assert own.imu is not None
+    (stream,) = (s for s in own.measurements.wheels if s.name == name)
+    assert isinstance(stream, WheelStream)
+    return wheel_offset(own.imu, up, name, wheel_rates(name, stream.seconds, integrals_of(stream), stream.kind))
 
 
 def _posing(inputs: Inputs, state: State, stream: WheelPoses, offset: np.ndarray | None) -> dict[Key, np.ndarray]:
@@ -112,22 +133,20 @@ def _posing(inputs: Inputs, state: State, stream: WheelPoses, offset: np.ndarray
     assert inputs.imu is not None
     if offset is None:
         offset = np.array([poses_offset(inputs.imu, stream)])
-    inside, rate, velocity = _means(motion_of(inputs, state), stream.seconds[:-1], stream.seconds[1:], offset[0])
+    times = stream.seconds + offset[0]  # there is but one recording of relative poses
+    inside, rate, velocity = _means(motion_of(inputs, state), times[:-1], times[1:])
     found = mount_guess(stream, inside, rate, velocity)
     values = {"rotation": found.rotation, "translation": found.position, "time_offset": offset}
     return {(stream.name, name): np.ascontiguousarray(value) for name, value in values.items()}
 
 
-def _means(
-    motion: Motion, start: np.ndarray, end: np.ndarray, offset: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Which spans from start to end (m,), on the wheels' clock, fall within the motion, and over these n the means
-    (n, 3) of the IMU's rate, without bias, and velocity, in its axes.
+def _means(motion: Motion, start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Which spans from start to end (m,), on the IMU's clock, fall within the motion, and over these n the means (n, 3)
+    of the IMU's rate, without bias, and velocity, in its axes.
 
     Raises EstimationError where the wheels turned while nothing else was recorded.
     """
     state = motion.state
-    start, end = start + offset, end + offset
     inside = (start >= state.seconds[0]) & (end <= state.seconds[-1])
     inside &= near_nodes(state.seconds, start) & near_nodes(state.seconds, end)
     if not inside.any():

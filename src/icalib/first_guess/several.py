@@ -87,7 +87,7 @@ def _named(rig: Rig, scene: Placed, recording: Measurements) -> Guess:
 
 
 def _held(rig: Rig, guess: Guess, recording: Measurements) -> Rig:
-    """The rig with the calibration of `guess`, made from `recording`, fixed."""
+    """The rig with the calibration of `guess`, made from `recording`, fixed, but for clocks that restart."""
 
     def camera(c: Camera, found: CameraGuess, origin_ns: int) -> Camera:
         offset = found.offset - (origin_ns - recording.origin_ns) * 1e-9
@@ -95,7 +95,7 @@ def _held(rig: Rig, guess: Guess, recording: Measurements) -> Rig:
             c,
             rotation=fixed(found.rotation),
             translation=fixed(found.position),
-            time_offset=fixed(np.array([offset])),
+            time_offset=c.time_offset if c.clock_restarts else fixed(np.array([offset])),
             intrinsics=fixed(found.params[:4]),
             distortion=fixed(found.params[4:]),
         )
@@ -111,6 +111,8 @@ def _check_clocks(rig: Rig, scene: Placed, guess: Guess, reference: Measurements
     if imu is None:
         return
     for camera, stream, before in zip(rig.cameras, recording.cameras, reference.cameras, strict=True):
+        if camera.clock_restarts:
+            continue
         known = guess.cameras[camera.name]
         origins_ns = (stream.origin_ns - recording.origin_ns) - (before.origin_ns - reference.origin_ns)
         expected = known.offset + origins_ns * 1e-9
@@ -123,6 +125,6 @@ def _check_clocks(rig: Rig, scene: Placed, guess: Guess, reference: Measurements
         if found is not None:
             raise EstimationError(
                 f"{recording.name}: the time offset of {camera.name} is {found - expected:+.3f} s from that in "
-                f"{reference.name}; recordings share one calibration only while no clock is set or "
-                "restarted between them, so calibrate this one alone."
+                f"{reference.name}; if a clock was set or restarted between them, write clock_restarts: true for "
+                "the sensor in the rig file, or calibrate this one alone."
             )

@@ -15,6 +15,7 @@ from icalib.estimation.nodes import first_nodes
 from icalib.estimation.state import Key, State
 from icalib.first_guess import Guess, initial_trajectory
 from icalib.first_guess.assumed_motion import start_without_imu
+from icalib.first_guess.by_recording import each_clock
 from icalib.first_guess.lidar_rounds import state_from_lidar
 from icalib.first_guess.own_robot import without_own_robot
 from icalib.first_guess.poses import pose_values, state_from_poses
@@ -53,7 +54,7 @@ def start(
     bare = whole
     if rig.wheels or rig.lidars or rig.poses:
         seen = [replace(m, wheels=(), lidars=(), poses=()) for m in recordings]
-        bare = inputs_for(replace(rig, wheels=(), lidars=(), poses=()), seen)
+        bare = inputs_for(replace(rig, wheels=(), lidars=(), poses=()), seen, whole)
     guesses = initial_guesses(rig, bare.bodies, [m.measurements for m in bare.motions])
     lap("first guess")
     state = first_state(bare, *guesses)
@@ -69,7 +70,7 @@ def _start_from_lidar(
     whole: Inputs, recordings: Sequence[Measurements], cameras: dict[Key, np.ndarray], lap: Callable[[str], None]
 ) -> tuple[Inputs, State, dict[Key, np.ndarray]]:
     rig = replace(whole.rig, cameras=(), wheels=(), poses=())
-    alone = inputs_for(rig, [replace(m, cameras=(), tracks=(), wheels=(), poses=()) for m in recordings])
+    alone = inputs_for(rig, [replace(m, cameras=(), tracks=(), wheels=(), poses=()) for m in recordings], whole)
     state = state_from_lidar(alone)
     lap("first guess")
     alone, state, guess = with_robot(alone, state)
@@ -87,7 +88,7 @@ def _start_from_poses(
 ) -> tuple[Inputs, State, dict[Key, np.ndarray]]:
     """The first pose sensor gives the motion; others are placed on it, and so are wheels."""
     rig = replace(whole.rig, wheels=(), poses=whole.rig.poses[:1])
-    alone = inputs_for(rig, [replace(m, wheels=(), poses=m.poses[:1]) for m in recordings])
+    alone = inputs_for(rig, [replace(m, wheels=(), poses=m.poses[:1]) for m in recordings], whole)
     state = state_from_poses(alone)
     lap("first guess")
     state = first_pass(alone, replace(state, values=state.values | pose_values(alone, state)))
@@ -101,6 +102,10 @@ def first_state(inputs: Inputs, *guesses: Guess) -> State:
     values = guesses[0].values()
     for k, guess in enumerate(guesses):
         values[board_in(BOARD, k), "tilt"] = guess.R_world_board
+    for camera in inputs.rig.cameras if len(guesses) > 1 else ():
+        if camera.clock_restarts:
+            own = [g.cameras[camera.name].offset for g in guesses]
+            values[camera.name, "time_offset"] = each_clock(inputs, camera.name, own.__getitem__)
     values = start_values(inputs, values)
     nodes = nodes_for(inputs, host_times(inputs, values))
     starts = first_nodes(inputs.imu, nodes)

@@ -26,7 +26,7 @@ def read_scans(name: str, path: Path) -> LidarStream:
     if "plane" not in found:
         found["plane"] = np.full(len(found["xyz"]), -1, np.int32)
     try:
-        return LidarStream(name, **found)
+        return LidarStream(name, *(found[n] for n in kinds))
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from error
 

@@ -25,7 +25,7 @@ from icalib.rig import (
     Settings,
     Wheels,
 )
-from icalib.rig_file.fields import MOUNTED, choice_or, groups_to_plain, mounting, path_or, positive_or, topic_or_none
+from icalib.rig_file.fields import MOUNTING, choice_or, groups_to_plain, mounting, path_or, positive_or, topic_or_none
 from icalib.rig_file.wheels import read_wheels, wheels_to_plain
 from icalib.rig_parameters import imu_intrinsics_parameter, parameter_to_plain, vector_parameter
 from icalib.rig_targets import NAME, target_of, target_or_targets
@@ -146,6 +146,19 @@ def _refuse_incomplete(value: YamlValue, found: _Sensors) -> None:
             entry.fail("without camera and IMU it has to show the motion by itself; write kind: absolute, or add one.")
         if len(found.poses) == 1 and not found.wheels:
             entry.fail("is alone; add what is to be calibrated with it.")
+    _refuse_clocks_of_nothing(value, found)
+
+
+def _refuse_clocks_of_nothing(value: YamlValue, found: _Sensors) -> None:
+    """Clocks said to restart, without an IMU, that have no time offset."""
+    timed = found.wheels or found.poses
+    for k, sensor in enumerate((*found.cameras, *found.poses)):
+        if sensor.clock_restarts and (k == 0 or not timed):
+            value.entries()[sensor.name].entries()["clock_restarts"].fail(
+                "without an IMU the clock of the first sensor is that of all others; say it of those, or write false."
+                if timed
+                else "cameras alone have no time offsets; remove it, or add a sensor of type: imu."
+            )
 
 
 def _refuse_unseen_ground(value: YamlValue, found: _Sensors, targeted: bool) -> None:
@@ -182,15 +195,18 @@ def _noise(value: YamlValue) -> ImuNoise:
 
 
 def _camera(name: str, value: YamlValue) -> Camera:
-    groups = (*MOUNTED, "intrinsics", "distortion", "bloom")
+    groups = (*MOUNTING, "intrinsics", "distortion", "bloom")
     found = value.record(
         ("type", "model", "resolution"), ("path", "topic", "corner_noise", "tracks", "track_noise", *groups)
     )
     model = found["model"].choice("camera model", tuple(CAMERA_MODELS))
     sizes = {"intrinsics": 4, "bloom": 1}
     sizes["distortion"] = len(CAMERA_MODELS[model].parameter_names) - sizes["intrinsics"]
-    parameters = {group: vector_parameter(found[group], n) for group, n in sizes.items() if group in found}
+    parameters: dict[str, Any] = {
+        group: vector_parameter(found[group], n) for group, n in sizes.items() if group in found
+    }
     _refuse_negative_focal_length(found, parameters)
+    given: dict[str, Any] = mounting(found) | parameters
     return Camera(
         name=name,
         path=path_or(found, f"{name}/corners.csv"),
@@ -200,13 +216,12 @@ def _camera(name: str, value: YamlValue) -> Camera:
         topic=topic_or_none(found),
         tracks=found["tracks"].text() if "tracks" in found else None,
         track_noise_px=found["track_noise"].positive() if "track_noise" in found else None,
-        **mounting(found),
-        **parameters,
+        **given,
     )
 
 
 def _lidar(name: str, value: YamlValue) -> Lidar:
-    found = value.record(("type",), ("path", "topic", "range_noise", "near", "far", "point_time", *MOUNTED))
+    found = value.record(("type",), ("path", "topic", "range_noise", "near", "far", "point_time", *MOUNTING))
     near, far = positive_or(found, "near", Lidar.near_m), positive_or(found, "far", Lidar.far_m)
     if near >= far:
         found["near" if "near" in found else "far"].fail(
@@ -225,7 +240,7 @@ def _lidar(name: str, value: YamlValue) -> Lidar:
 
 
 def _pose(name: str, value: YamlValue) -> PoseSensor:
-    found = value.record(("type",), ("path", "topic", "kind", "rotation_noise", "position_noise", *MOUNTED))
+    found = value.record(("type",), ("path", "topic", "kind", "rotation_noise", "position_noise", *MOUNTING))
     return PoseSensor(
         name=name,
         path=path_or(found, f"{name}/poses.csv"),

@@ -10,13 +10,22 @@ from icalib.rig_parameters import parameter_to_plain, rotation_parameter, vector
 from icalib.yaml_nodes import YamlValue
 
 MOUNTED = ("rotation", "translation", "time_offset")
+MOUNTING = (*MOUNTED, "clock_restarts")
 
 
-def mounting(found: dict[str, YamlValue]) -> dict[str, Parameter]:
+def mounting(found: dict[str, YamlValue]) -> dict[str, Any]:
     """Where a sensor is and how its clock goes, as far as it is said."""
     sizes = {"translation": 3, "time_offset": 1}
-    groups = {group: vector_parameter(found[group], n) for group, n in sizes.items() if group in found}
-    return groups | ({"rotation": rotation_parameter(found["rotation"])} if "rotation" in found else {})
+    groups: dict[str, Any] = {group: vector_parameter(found[group], n) for group, n in sizes.items() if group in found}
+    if "rotation" in found:
+        groups["rotation"] = rotation_parameter(found["rotation"])
+    if "clock_restarts" in found:
+        groups["clock_restarts"] = found["clock_restarts"].boolean()
+        if groups["clock_restarts"] and "time_offset" in groups and groups["time_offset"].mode == "fixed":
+            found["clock_restarts"].fail(
+                "each recording has a time offset of its own, but time_offset is fixed; leave out one of them."
+            )
+    return groups
 
 
 def positive_or(found: dict[str, YamlValue], name: str, default: float) -> float:
@@ -37,4 +46,5 @@ def topic_or_none(found: dict[str, YamlValue]) -> str | None:
 
 def groups_to_plain(sensor: Camera | Lidar | Wheels | PoseSensor) -> dict[str, Any]:
     groups = {f.name: getattr(sensor, f.name) for f in dataclasses.fields(sensor)}
-    return {name: parameter_to_plain(p) for name, p in groups.items() if isinstance(p, Parameter)}
+    plain = {name: parameter_to_plain(p) for name, p in groups.items() if isinstance(p, Parameter)}
+    return plain | ({"clock_restarts": True} if sensor.clock_restarts else {})

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, Literal
 
 from icalib.rig import DRIVE_SIZES, Ground, GroundPlane, Parameter, WheelDrive, WheelFactor, WheelMeasure, Wheels
-from icalib.rig_file.fields import MOUNTED, choice_or, groups_to_plain, mounting, path_or, positive_or, topic_or_none
+from icalib.rig_file.fields import MOUNTING, choice_or, groups_to_plain, mounting, path_or, positive_or, topic_or_none
 from icalib.rig_parameters import vector_parameter
 from icalib.yaml_nodes import YamlValue
 
@@ -38,7 +38,7 @@ _JOINTS = {
 def read_wheels(name: str, value: YamlValue) -> Wheels:
     """Raises RigError naming line and field."""
     found = value.record(
-        ("type",), (*_WORDS, "ground", *_NOISES, *_SLIP, *MOUNTED, *(g for s in DRIVE_SIZES.values() for g in s))
+        ("type",), (*_WORDS, "ground", *_NOISES, *_SLIP, *MOUNTING, *(g for s in DRIVE_SIZES.values() for g in s))
     )
     measures: WheelMeasure = choice_or(found, "measures", WheelMeasure, Wheels.measures)
     drive: WheelDrive = choice_or(found, "drive", WheelDrive, Wheels.drive)
@@ -138,5 +138,5 @@ def wheels_to_plain(wheels: Wheels) -> dict[str, Any]:
     given = {name: getattr(wheels, name) for name, of in _ONLY_OF.items() if wheels.measures in of}
     given["ground"] = None if wheels.ground is None else _ground_to_plain(wheels.ground)
     given |= {"topic": wheels.topic, "joints": None if wheels.joints is None else list(wheels.joints)}
-    groups = {name: p for name, p in groups_to_plain(wheels).items() if name in (*MOUNTED, *wheels.sizes)}
+    groups = {name: p for name, p in groups_to_plain(wheels).items() if name in (*MOUNTING, *wheels.sizes)}
     return plain | {name: value for name, value in given.items() if value is not None} | groups

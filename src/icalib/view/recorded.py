@@ -40,8 +40,11 @@ class Clock:
 
     @classmethod
     def of(cls, c: Calibration, span: RecordingSpan, sensor: str) -> Clock:
-        found = (float(g.value[0]) for g in c.groups if (g.sensor, g.name) == (sensor, "time_offset"))
-        return cls(span, next(found, 0.0))
+        values = [g.value for g in c.groups if (g.sensor, g.name) == (sensor, "time_offset")]
+        if not values:
+            return cls(span, 0.0)
+        (value,) = values
+        return cls(span, float(value[c.recordings.index(span) if len(value) > 1 else 0]))
 
     def seconds(self, stamps_ns: np.ndarray) -> np.ndarray:
         """(n,) from int64 stamps; whole nanoseconds are subtracted first, so that no digit is lost."""

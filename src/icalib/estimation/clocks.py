@@ -1,0 +1,62 @@
+"""Sensors' clocks against the body's: one time offset, or one in each recording where the clock restarts between them.
+
+The value of the block time_offset is (1,) or (R,), seconds to add to a sensor's time since its first stamp to get the
+body's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from icalib.estimation.state import Key, Layout, State
+from icalib.measurements import CornerStream, LidarStream, PoseStream, WheelPoses, WheelStream
+
+EARLY_S = 5.0  # by which what a stamp stands for may come before it; recordings are further apart
+MOUNTED = ("rotation", "translation", "time_offset")
+Stream = CornerStream | LidarStream | WheelStream | WheelPoses | PoseStream
+
+
+def instants(stream: Stream, values: dict[Key, np.ndarray], seconds: np.ndarray | None = None) -> np.ndarray:
+    """(n,) on the body's clock, of a stream's own stamps or of other `seconds` (n,) since its first."""
+    own, offset = stream.seconds if seconds is None else seconds, values[stream.name, "time_offset"]
+    if len(offset) == 1:
+        return own + offset[0]
+    joins = np.array([1e-9 * (ns - stream.origin_ns) for ns in _joins(stream)]) - EARLY_S
+    assert len(joins) == len(offset) - 1
+    return own + offset[np.searchsorted(joins, own, side="right")]
+
+
+def _joins(stream: Stream) -> tuple[int, ...]:
+    return () if isinstance(stream, WheelPoses) else stream.joins_ns
+
+
+def recording_of(state: State, node: np.ndarray) -> np.ndarray:
+    """(n,) the recording that each `node` (n,) belongs to."""
+    return np.searchsorted(state.starts, node, side="right") - 1
+
+
+def offset_at(state: State, name: str, node: np.ndarray) -> np.ndarray:
+    """Time offset (1,) or (n,) of a sensor's measurements that hang on `node` (n,)."""
+    offset = state.values[name, "time_offset"]
+    return offset if len(offset) == 1 else offset[recording_of(state, node)]
+
+
+def by_clock(state: State, name: str, node: np.ndarray) -> Iterator[tuple[int, slice]]:
+    """Stretches of measurements that hang on `node` (n,), in order, and go by one time offset: its number, and which
+    they are."""
+    if len(state.values[name, "time_offset"]) == 1:
+        yield 0, slice(0, len(node))
+        return
+    edges = np.searchsorted(node, (*state.starts, len(state.seconds)))
+    for k, (a, b) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+        if a < b:
+            yield k, slice(int(a), int(b))
+
+
+def mounted_columns(layout: Layout, name: str, clock: int = 0) -> np.ndarray:
+    """(7,) border columns of a sensor's rotation, translation and the time offset number `clock`, or its only one."""
+    offset = layout.columns(name, "time_offset")
+    own = offset[clock if len(offset) > 1 else 0]
+    return np.append(layout.columns(name, "rotation", "translation"), own)

@@ -1,0 +1,150 @@
+"""Clocks that were set or restarted between recordings: a time offset in each, everything else shared."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from scipy.stats import chi2
+
+from icalib.calibration import Calibration, joint_covariance, load_calibration
+from icalib.errors import EstimationError, RecordingError
+from icalib.outputs import write_outputs
+from icalib.pipeline import calibrate_measurements
+from icalib.rig import Parameter, Rig
+from icalib.simulation import Scenario, Simulation, rig_for, simulate
+
+KINDS = {"c": "cameras", "l": "lidars", "w": "wheels"}
+SET_BACK_S = {"c": 37.123, "l": -512.3, "w": 1234.567}
+
+
+def reset(scenario: Scenario, parts: str) -> Scenario:
+    """The same scenario, the clocks of some of its sensors set back or forward, each by another time."""
+    moved = {
+        KINDS[p]: tuple(
+            replace(s, clock_origin_ns=s.clock_origin_ns - round(1e9 * SET_BACK_S[p]))
+            for s in getattr(scenario, KINDS[p])
+        )
+        for p in parts
+    }
+    return replace(scenario, **moved)
+
+
+def open_rig(scenario: Scenario, restarting: str) -> Rig:
+    """Nothing is known of how sensors stand and of their clocks."""
+    rig, free = rig_for(scenario), Parameter()
+    for part, kind in KINDS.items():
+        changes = {"rotation": free, "translation": free, "time_offset": free, "clock_restarts": part in restarting}
+        if kind == "wheels":
+            changes |= {"radii": free, "baseline": free, "sideways_slip": 1e-4, "upwards_slip": 1e-4}
+        rig = replace(rig, **{kind: tuple(replace(s, **changes) for s in getattr(rig, kind))})
+    return rig
+
+
+def pair(robot, example: str, parts: str, azimuth_steps: int) -> tuple[Simulation, Simulation]:
+    scenario = robot(example, 18.0, parts, azimuth_steps)
+    return simulate(scenario, 1), simulate(reset(replace(scenario, duration_s=16.0), parts), 2)
+
+
+def joint(simulations: tuple[Simulation, ...], rig: Rig) -> Calibration:
+    return calibrate_measurements(rig, [s.measurements for s in simulations])
+
+
+def check_offsets(result: Calibration, simulations: tuple[Simulation, ...]) -> None:
+    """All of them together, inside their chi^2 bounds."""
+    groups = [g for g in result.groups if g.name == "time_offset"]
+    errors = np.concatenate([g.value - [s.truth.time_offset[g.sensor] for s in simulations] for g in groups])
+    P = joint_covariance(result, groups)
+    low, high = chi2.ppf([0.0005, 0.9995], len(errors))
+    assert low < errors @ np.linalg.solve(P, errors) < high, errors / np.sqrt(np.diag(P))
+    assert np.abs(errors).max() < 5e-3
+
+
+@pytest.mark.parametrize(
+    ("example", "parts", "azimuth_steps"), [("3d", "c", 0), ("3d", "l", 300), ("ramp", "clw", 300)]
+)
+def test_each_recording_has_its_own(robot, example, parts, azimuth_steps):
+    simulations = pair(robot, example, parts, azimuth_steps)
+    result = joint(simulations, open_rig(simulations[0].scenario, parts))
+    assert result.converged, result.status
+    group = next(g for g in result.groups if g.name == "time_offset")
+    assert group.labels == ("in recording 1", "in recording 2")
+    check_offsets(result, simulations)
+
+
+def test_a_clock_that_ran_on_is_no_worse(robot):
+    """Two offsets of one clock agree, and all else is what one offset gives, if not quite as well known."""
+    scenario = robot("3d", 14.0, "c")
+    simulations = simulate(scenario, 1), simulate(replace(scenario, duration_s=12.0), 2)
+    one, two = (joint(simulations, open_rig(scenario, parts)) for parts in ("", "c"))
+    for name in ("rotation", "translation"):
+        a, b = one.group("cam0", name), two.group("cam0", name)
+        assert (b.std_formal > 0.9 * a.std_formal).all()
+    offsets = two.group("cam0", "time_offset")
+    P = joint_covariance(two, [offsets])
+    apart = np.array([1.0, -1.0])
+    assert abs(apart @ offsets.value) < 4.0 * np.sqrt(apart @ P @ apart)
+    assert one.group("cam0", "time_offset").labels == ("time_offset",)
+
+
+def test_one_recording_has_one(robot):
+    scenario = robot("3d", 14.0, "c")
+    result = joint((simulate(scenario, 1),), open_rig(scenario, "c"))
+    assert result.group("cam0", "time_offset").labels == ("time_offset",)
+
+
+def test_a_prior_is_one_of_each(robot):
+    """It moves both offsets as it moves one."""
+    scenario = robot("3d", 14.0, "c")
+    simulations = simulate(scenario, 1), simulate(replace(scenario, duration_s=12.0), 2)
+    rig = open_rig(scenario, "c")
+    prior = Parameter("prior", np.array([0.01]), np.array([1e-7]))
+    held = replace(rig, cameras=tuple(replace(c, time_offset=prior) for c in rig.cameras))
+    group = joint(simulations, held).group("cam0", "time_offset")
+    assert np.abs(group.value - 0.01).max() < 1e-6
+    assert (np.abs(group.std_formal / 1e-7 - 1.0) < 0.01).all()
+
+
+def test_without_saying_so_it_is_named(robot):
+    simulations = pair(robot, "3d", "c", 0)
+    with pytest.raises(EstimationError, match="write clock_restarts: true for the sensor in the rig file"):
+        joint(simulations, open_rig(simulations[0].scenario, ""))
+
+
+def test_a_stream_that_outlasts_the_others(robot):
+    """Recordings follow one another on one clock, whichever of their sensors is looked at first."""
+    scenario = robot("ramp", 18.0, "cw")
+    first, second = simulate(scenario, 1), simulate(replace(scenario, duration_s=16.0), 2)
+    (wheels,) = first.measurements.wheels
+    n, step = 4000, int(np.median(np.diff(wheels.stamps_ns)))
+    stamps = np.concatenate([wheels.stamps_ns, wheels.stamps_ns[-1] + step * np.arange(1, n + 1)])
+    longer = replace(wheels, stamps_ns=stamps, rate=np.concatenate([wheels.rate, np.zeros((n, 2))]))
+    first = replace(first, measurements=replace(first.measurements, wheels=(longer,)))
+    result = joint((first, second), open_rig(scenario, ""))
+    assert result.converged
+    check = result.group("wheel0", "time_offset")
+    assert abs(check.value[0] - first.truth.time_offset["wheel0"]) < 4.0 * check.std[0]
+
+
+def test_outputs(robot, tmp_path):
+    """Files, summaries and the report name the recordings."""
+    simulations = pair(robot, "3d", "c", 0)
+    result = joint(simulations, open_rig(simulations[0].scenario, "c"))
+    write_outputs(result, tmp_path)
+    back = load_calibration(tmp_path)
+    assert back.group("cam0", "time_offset").labels == ("in recording 1", "in recording 2")
+    assert (back.group("cam0", "time_offset").value == result.group("cam0", "time_offset").value).all()
+    (first, second) = yaml.safe_load((tmp_path / "calibration.yaml").read_text())["sensors"]["cam0"]["time_offset"]
+    assert abs(first - 0.01) < 1e-3 and abs(second - 0.01 - SET_BACK_S["c"]) < 1e-2
+    assert "in recording 2" in (tmp_path / "report.html").read_text()
+
+
+def test_a_recording_with_nothing_of_a_sensor_is_named(robot):
+    scenario = robot("ramp", 18.0, "cw")
+    blind = simulate(replace(scenario, duration_s=12.0), 2).measurements
+    assert len(blind.cameras[0].stamps_ns) == 0
+    blind = replace(blind, name="second")
+    with pytest.raises(RecordingError, match="second: there is nothing of cam0"):
+        calibrate_measurements(open_rig(scenario, ""), [simulate(scenario, 1).measurements, blind])
