@@ -182,8 +182,9 @@ def _given(layout: Layout, sensor: str, name: str, parameter: Parameter, shift: 
     block = layout.block(sensor, name)
     if block.start is None or parameter.mode != "prior" or parameter.value is None or parameter.sigma is None:
         return []
-    # One that stands for several, of a clock that restarts, is of each.
-    value, sigma = (np.broadcast_to(x, block.size) for x in (parameter.value + shift, parameter.sigma))
+    value, sigma = parameter.value + shift, parameter.sigma
+    if name == "time_offset":  # of a clock that restarts, the prior of each
+        value, sigma = np.broadcast_to(value, block.size), np.broadcast_to(sigma, block.size)
     return [Prior(block, value, sigma)]
 
 
