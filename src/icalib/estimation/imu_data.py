@@ -48,6 +48,9 @@ class ImuData:
         gap = dt > GAP * np.median(dt)
         gyro, accel = stream.gyro.var(axis=0).sum() / 3.0, stream.accel.var(axis=0).sum() / 3.0
         variance[gap] += 2.0 * MOTION_CORRELATION_S * np.array([gyro, accel, accel])
+        # A step of integration holds biases still; what their walk makes of so long a one is white noise here.
+        walked = np.array([noise.gyro_walk, noise.accel_walk, noise.accel_walk]) * dt[gap][:, None]
+        variance[gap] += walked**2 / 3.0
         return cls(
             stream.name,
             t,

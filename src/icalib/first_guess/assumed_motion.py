@@ -61,8 +61,8 @@ def start_without_imu(rig: Rig, recordings: Sequence[Measurements]) -> tuple[Inp
             )
     paths = [own.at(np.arange(0.0, own.seconds[-1], STEP_S)) for own in shown]  # from the body's first stamp on
     body = _with_assumption(rig, paths)
-    inputs = replace(inputs_for(body, _readings(recordings, paths, felt=False)), asked=rig)
-    felt = inputs_for(body, _readings(recordings, paths, felt=True), inputs)
+    inputs = replace(inputs_for(body, _readings(recordings, paths, rig.settings.max_gap_s)), asked=rig)
+    felt = inputs_for(body, _readings(recordings, paths), inputs)
     assert felt.imu is not None
     felt = replace(felt, imu=replace(felt.imu, forwards=False))
     values = start_values(inputs, cameras | _identity(inputs))
@@ -118,16 +118,30 @@ def _changes(path: SmoothPath, what: str) -> np.ndarray:
     return (x[n:] - x[:-n])[path.near[n:] & path.near[:-n]]
 
 
-def _readings(recordings: Sequence[Measurements], paths: Sequence[SmoothPath], felt: bool) -> list[Measurements]:
-    """The recordings with readings of the assumed IMU: zero, or `felt`, those that an IMU in the body would have."""
+def _readings(
+    recordings: Sequence[Measurements], paths: Sequence[SmoothPath], max_gap_s: float | None = None
+) -> list[Measurements]:
+    """The recordings with readings of the assumed IMU: zero, but in gaps of poses that are longer than `max_gap_s`; or
+    without it those that an IMU in the body would have, where poses show them."""
     out = []
     for m, path in zip(recordings, paths, strict=True):
         stamps = m.origin_ns + np.round(path.seconds * 1e9).astype(np.int64)
-        used = path.near if felt else np.ones(len(stamps), dtype=bool)
+        used = path.near.copy() if max_gap_s is None else _bridged(path, max_gap_s)
         used[:1] = True  # its clock begins where the body's does
-        gyro, accel = (x[used] * float(felt) for x in (path.rate, path.acceleration))
+        gyro, accel = (x[used] * float(max_gap_s is None) for x in (path.rate, path.acceleration))
         out.append(replace(m, imu=ImuStream(ASSUMPTION, stamps[used], gyro, accel)))
     return out
+
+
+def _bridged(path: SmoothPath, max_gap_s: float) -> np.ndarray:
+    """(m,) whether poses show the path, or it is unseen for a short while only: for longer an assumption says nothing
+    of where the body is."""
+    seen = path.seconds[path.near]
+    if not len(seen):
+        return np.zeros(len(path.seconds), dtype=bool)
+    after = np.searchsorted(seen, path.seconds)
+    before, behind = seen[np.maximum(after - 1, 0)], seen[np.minimum(after, len(seen) - 1)]
+    return path.near | (behind - before <= max_gap_s)
 
 
 def _identity(inputs: Inputs) -> dict[Key, np.ndarray]:
