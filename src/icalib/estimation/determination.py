@@ -29,6 +29,7 @@ from icalib.geometry import planes, so3
 SPURIOUS_SHARE = 0.5  # a direction most of whose information is noise is not determined either
 MOST_ROUNDS = 4
 MOVED_BY_HELD = 0.1  # parts of a direction smaller than this do not count as in it
+MOSTLY = 0.5  # of the square of a direction
 NEAR_GUESS = 0.05  # of what the guess is worth
 
 
@@ -89,7 +90,7 @@ def determine(
         found = estimate(inputs, begin, on_step, found.problem.held, on_visit, _worth_keeping(found))
         data, _ = _judge(inputs, found)
     held = found.problem.held if found.problem.held.size else np.zeros((inputs.layout.size, 0))
-    shifts = np.array([_profile(inputs, found, u) for u in held.T]).reshape(-1, inputs.layout.size)
+    shifts = np.array([_profile(inputs, found, data, u) for u in held.T]).reshape(-1, inputs.layout.size)
     return Determined(found, data, held, shifts)
 
 
@@ -157,11 +158,20 @@ def _without(information: np.ndarray, priors: Sequence[Prior], state: State) -> 
     return bare
 
 
-def _profile(inputs: Inputs, found: Estimate, direction: np.ndarray) -> np.ndarray:
-    """(B,) how the border moves when the guess moves along `direction` (B,), which is held, by what it is worth."""
+def _profile(inputs: Inputs, found: Estimate, data: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """(B,) how the border moves when the guess moves along `direction` (B,), which is held, by what it is worth.
+
+    A direction that is mostly of what nobody guessed moves by what `data` (B, B) leave open, where that is less: a
+    board turned against gravity by as much as it likes would be turned round and round, with a bias of the
+    accelerometer that nobody believes.
+    """
     problem, state = found.problem, found.outcome.state
     step = problem.tolerance * direction
-    step = step / np.linalg.norm(step / _guess_sigma(inputs))
+    inverse = float(np.linalg.norm(step / _guess_sigma(inputs)))
+    guessed = sum(float((direction[b.columns] ** 2).sum()) for b in problem.layout.free if inputs.is_sensor(b.sensor))
+    if guessed < MOSTLY:
+        inverse = max(inverse, float(np.sqrt(np.clip(direction @ data @ direction, 0.0, UNDETERMINED_BELOW))))
+    step = step / inverse
     moved = state.retract(problem.layout, np.zeros((len(state.seconds), 15)), step)
     return border_difference(problem, minimise(problem, moved, tolerance=EARLY_DECREASE).state, state)
 

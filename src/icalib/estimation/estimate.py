@@ -37,7 +37,8 @@ from icalib.rig import PoseSensor, Settings
 LOOSE = 3.0  # times what a guess is worth
 LEAST_LEFT = 0.2  # of the residuals of poses: where the motion takes all, nothing is left to show their noise
 EARLY_DECREASE, EARLY_SHARE = 0.5, 1e-6  # an early pass is followed by another
-AGAIN = 2  # further passes, at most, where the last one shows points whose tracks it began without
+AGAIN = 2  # further passes, at most, where the last one began too far from its end, or without tracks that it found
+FAR = 1.1  # times the chi^2 at its end: what a pass froze where it began is not what it would freeze at the end
 ENOUGH = 0.8  # of the observations of tracks take part: no need to see whether more would
 MORE = 1.1  # times as many that would are worth another pass
 FIRST_SHARE = 1e-3  # of half the chi^2: what is made anew after the first pass is worth more
@@ -127,13 +128,19 @@ def estimate(
         tolerance, share = (CONVERGED_DECREASE, ROUNDING) if last else early
         problem = judged.problem(inputs, state, held)
         outcome = minimise(problem, state, note, tolerance, partial(on_visit, name, problem), share)
-        if last and (k + 1 == len(names) + AGAIN or not _follows_more(inputs, outcome, judged)):
+        if last and (k + 1 == len(names) + AGAIN or not _again(inputs, outcome, judged)):
             return Estimate(outcome, judged, tuple(history))
         judged = judged if last else judged.next(inputs, outcome, name == "first")
         state = _on_own_nodes(inputs, outcome.state)
         del problem, outcome  # before the next ones take as much memory
         pages.give_back()
     raise AssertionError("pass_names is never empty")
+
+
+def _again(inputs: Inputs, outcome: Outcome, judged: Judged) -> bool:
+    """Whether the last pass is to be made anew: what it froze, such as the weights of points on planes, is of a state
+    far from its end, or tracks come back."""
+    return outcome.steps[0].cost > FAR * outcome.cost or _follows_more(inputs, outcome, judged)
 
 
 def _follows_more(inputs: Inputs, outcome: Outcome, judged: Judged) -> bool:
@@ -164,7 +171,7 @@ def first_pass(inputs: Inputs, state: State) -> State:
         if inputs.is_sensor(b.sensor) and b.size != N_INTRINSICS
     ]
     problem = replace(problem, priors=(*problem.priors, *loose))
-    return minimise(problem, state, tolerance=EARLY_DECREASE, share=EARLY_SHARE).state
+    return minimise(problem, state, tolerance=EARLY_DECREASE, share=EARLY_SHARE, comes_back=False).state
 
 
 def _next_noise(

@@ -19,6 +19,8 @@ ROUNDING = 1e-11  # of the cost: what rounding makes of a sum of 1e6 squares
 CURVED_BELOW = 1e-2  # of the cost: steps that promise less use the true curvature of the robust loss
 STALLED_DECREASE = 0.05  # of half the chi^2: a third of a standard deviation, good enough where smaller steps fail
 MOST_STALLED = 4  # steps this small that fail before the solver rests
+COMES_BACK = 0.25  # of what a step costs too much, where its error is of second order: this much at most is left next
+ACROSS = 1e-6  # damping of a step that comes back: across a valley, not along it
 RESTING = 20.0  # times the tolerance of an early pass: a step that promises less and fails ends it
 FREE_DRAWS, STILL_DRAWS = 2, 3  # from the posterior, for what is made of the outcome
 FIRST_DAMPING = 1e-8
@@ -84,11 +86,13 @@ def minimise(
     tolerance: float = CONVERGED_DECREASE,
     on_visit: Callable[[Visit], None] = lambda _: None,
     share: float = ROUNDING,
+    comes_back: bool = True,
 ) -> Outcome:
     """Minimises `problem` from `state` until half the chi^2 can fall by less than `tolerance`, or this share of it.
 
     `on_visit` is told of each state that a step was looked for from, and of the last. Where the tolerance is wide
     another pass follows, and the end is not linearised once more: the outcome has no information and no draws.
+    `comes_back`: steps may go as far as the next ones can make good, see `_corrected`.
 
     Raises EstimationError if no step can be computed at all.
     """
@@ -112,6 +116,9 @@ def minimise(
         converged = damping == 0.0 and solution.decrease < max(tolerance, share * cost)
         sums = not (converged and early)
         candidate_cost = problem.linearise(candidate, pieces, residuals, sums, near)
+        if comes_back and sums and not (candidate_cost < cost or converged):
+            trial = problem, candidate, pieces, residuals, damping, near
+            candidate, candidate_cost = _corrected(*trial, candidate_cost, cost)
         # At the bottom rounding decides whether the cost falls; a step this small is taken anyway.
         accepted = bool(candidate_cost < cost) or converged
         steps.append(Step(cost, solution.decrease, damping, accepted))
@@ -138,6 +145,26 @@ def minimise(
     if early:
         return _early_end(problem, state, cost, pieces, residuals, steps)
     return _end(problem, state, cost, pieces, residuals, steps, curved, on_visit)
+
+
+def _corrected(problem, state, pieces, residuals, damping, curved, cost, least) -> tuple[State, float]:
+    """Further steps from a candidate that was linearised at `state` and costs more than `least`, as long as each leaves
+    but a part of the excess; and what that costs.
+
+    What the data hardly tell, gravity's direction on a straight drive for one, moves far in a step, along a valley that
+    is curved: a step along its tangent leaves it by the square of the way, the next ones come back. More damping would
+    make the way so short that the solver creeps.
+    """
+    share = 0.0
+    while cost >= least and share < COMES_BACK:
+        try:
+            solution = solve(pieces, problem.n_nodes, problem.tolerance, max(damping, ACROSS), problem.held)
+        except NotDefiniteError:
+            break
+        state = state.retract(problem.layout, solution.chain, solution.border)
+        before, cost = cost, problem.linearise(state, pieces, residuals, True, curved)
+        share = (cost - least) / max(before - least, ROUNDING * least) if np.isfinite(cost) else np.inf
+    return state, cost
 
 
 def _early_end(problem, state, cost, pieces, residuals, steps) -> Outcome:
