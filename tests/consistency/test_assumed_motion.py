@@ -18,6 +18,7 @@ from icalib.rig import Rig
 from icalib.simulation import Drive, Scenario, SimPoses, Simulation, rig_for, simulate
 
 MOUNT = ("rotation", "translation", "time_offset")
+STEADY = 1e-4  # m/sqrt(s)
 T_IMU_MOCAP = np.array([[0.0, -1.0, 0.0, 0.1], [1.0, 0.0, 0.0, 0.05], [0.0, 0.0, 1.0, 0.3], [0.0, 0.0, 0.0, 1.0]])
 
 
@@ -89,6 +90,14 @@ def test_a_camera_with_a_target_and_wheels(robot):
     assert result.group("wheel0", "radii").std_formal.max() < 1e-4
 
 
+@pytest.mark.parametrize("seed", [3, 6])
+def test_a_target_that_is_out_of_sight_for_long(robot, seed):
+    """Nothing is made up of the 14 s between."""
+    rig, measurements, simulation = without_imu(robot("ramp", 20.0, "cw"), seed)
+    assert np.diff(measurements.cameras[0].seconds).max() > 13.0
+    check_known(calibrate_measurements(rig, measurements), simulation, 10)
+
+
 def test_two_pose_sensors(robot):
     """What is called hand-eye calibration."""
     other = np.array([[0.0, 0.0, 1.0, -0.2], [1.0, 0.0, 0.0, 0.3], [0.0, 1.0, 0.0, 0.1], [0.0, 0.0, 0.0, 1.0]])
@@ -139,6 +148,22 @@ def test_nees(robot):
         e, P = normalised(calibrate_measurements(rig, measurements), simulation)
         runs.append(e[seen] @ np.linalg.solve(P[np.ix_(seen, seen)], e[seen]))
     low, high = chi2.ppf([0.005, 0.995], 20 * len(seen))
+    assert low < np.sum(runs) < high, np.array(runs) / len(seen)
+
+
+@pytest.mark.statistical
+def test_nees_of_a_camera_and_wheels(robot):
+    """Wheels as free of slip as simulated ones."""
+    scenario, seen, runs = robot("ramp", 30.0, "cw"), np.array([0, 3, 5, 6, 7, 8, 9]), []
+    for seed in range(30):
+        rig, measurements, simulation = without_imu(scenario, seed)
+        (wheels,) = rig.wheels
+        steady = replace(rig, wheels=(replace(wheels, sideways_slip=STEADY, upwards_slip=STEADY),))
+        result = calibrate_measurements(steady, measurements)
+        assert result.converged, seed
+        e, P = normalised(result, simulation)
+        runs.append(e[seen] @ np.linalg.solve(P[np.ix_(seen, seen)], e[seen]))
+    low, high = chi2.ppf([0.005, 0.995], len(runs) * len(seen))
     assert low < np.sum(runs) < high, np.array(runs) / len(seen)
 
 

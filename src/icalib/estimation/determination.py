@@ -170,7 +170,7 @@ def _profile(inputs: Inputs, found: Estimate, data: np.ndarray, direction: np.nd
     inverse = float(np.linalg.norm(step / _guess_sigma(inputs)))
     guessed = sum(float((direction[b.columns] ** 2).sum()) for b in problem.layout.free if inputs.is_sensor(b.sensor))
     if guessed < MOSTLY:
-        inverse = max(inverse, float(np.sqrt(np.clip(direction @ data @ direction, 0.0, UNDETERMINED_BELOW))))
+        inverse = max(inverse, float(np.sqrt(np.clip(direction @ data @ direction, 0.0, HELD_BELOW))))
     step = step / inverse
     moved = state.retract(problem.layout, np.zeros((len(state.seconds), 15)), step)
     return border_difference(problem, minimise(problem, moved, tolerance=EARLY_DECREASE).state, state)
