@@ -239,7 +239,9 @@ def test_more_slip_than_allowed_is_warned_of():
     assert "wheel0 slips sideways 3 times as much" in words and "0.015 m/sqrt(s) would fit" in words
     assert "pitch" in warnings("upwards slip", 4.0) and "0.06 rad/sqrt(s)" in warnings("wheels", 4.0)
     assert "relative" not in warnings("yaw", 4.0) and "the yaw of wheel0" in warnings("yaw", 4.0)
-    assert warnings("sideways slip", 1.9) == "" and warnings("sideways slip", 9.0, dof=30.0) == ""
+    assert warnings("sideways slip", 1.9) == "" and warnings("sideways slip", 5.0, dof=30.0) == ""
+    # Few degrees of freedom, which are sampled: 30 of 400 rows may as well be 90.
+    assert "slips sideways at least 1.7 times as much" in warnings("sideways slip", 9.0, dof=30.0)
 
 
 def test_more_noise_of_other_kinds_of_wheels_is_warned_of():

@@ -6,6 +6,8 @@ import dataclasses
 
 import numpy as np
 
+from icalib.assessment.cameras import camera_warnings
+from icalib.assessment.excess import dof_known, excess, times
 from icalib.assessment.held_out import held_out
 from icalib.assessment.notes import notes
 from icalib.assessment.robot import (
@@ -61,12 +63,10 @@ LABELS = {
     "plane": ("turn 1", "turn 2", "distance"),
 }  # fmt: skip
 NUISANCE = ("plane", *FRAME)  # estimated along, in a world of which only gravity's direction means anything
-EXPECTED_CHI2 = (0.5, 2.0)  # chi^2 per post-fit degree of freedom outside this is worth a warning
+SMALL_CHI2 = 0.5  # chi^2 per post-fit degree of freedom below this is worth a warning
 LARGE_FACTOR = 3.0
 BEYOND_FACTOR = 1.5  # times the largest factor: what halves say of each other is worth a warning
 LARGE_BLOOM_PX = 0.8  # ink and overexposure move edges by a third of that
-MANY_REJECTED = 0.05
-LEAST_DOF = 3.0  # times the square root of the number of residuals
 
 
 def assess(inputs: Inputs, determined: Determined) -> Calibration:
@@ -301,18 +301,9 @@ def _warnings(
         yield f"the solver did not converge: {found.outcome.status}"
     yield from inputs.measurements.warnings
     for f in judged:
-        ratio = f.chi2 / max(f.dof, 1.0)
-        known = f.dof > LEAST_DOF * np.sqrt(f.count)  # dof are sampled: few among many are noise
-        if known and f.kind in ("gyroscope", "accelerometer") and not EXPECTED_CHI2[0] <= ratio <= EXPECTED_CHI2[1]:
-            word = "larger" if ratio > 1.0 else "smaller"
-            yield (
-                f"the {f.kind} of {f.sensor} leaves residuals {np.sqrt(ratio):.2g} times as large as its noise "
-                f"in the rig "
-                f"file says; a {word} noise density would fit."
-            )
-        if f.kind in ("corners", "features") and f.rejected > MANY_REJECTED * 0.5 * f.count:
-            share = f.rejected / (f.rejected + 0.5 * f.count)
-            yield f"{share:.0%} of the {f.kind} of {f.sensor} were set aside; look at its residuals in the report."
+        if f.kind in ("gyroscope", "accelerometer"):
+            yield from _imu_noise_warnings(f)
+    yield from camera_warnings(inputs.rig.cameras, groups, judged)
     yield from robot_warnings(inputs.rig, judged)
     yield from pose_warnings(poses, inputs.rig)
     yield from lidar_warnings(inputs, found) if inputs.clouds.count else ()
@@ -323,6 +314,20 @@ def _warnings(
                 f"the corners of {g.sensor} lie {abs(g.value[0]):.1f} px too far {where} on their tags, more than "
                 "light and ink do; check tag_size and tag_spacing (the gap over tag_size) of the target."
             )
+
+
+def _imu_noise_warnings(f: SensorFit):
+    ratio = f.chi2 / max(f.dof, 1.0)
+    if excess(f) > 1.0:
+        size, word = times(f), "larger"
+    elif dof_known(f) and ratio < SMALL_CHI2:
+        size, word = f"{np.sqrt(ratio):.2g} times", "smaller"
+    else:
+        return
+    yield (
+        f"the {f.kind} of {f.sensor} leaves residuals {size} as large as its noise in the rig file says; a {word} "
+        "noise density would fit."
+    )
 
 
 def _factors(inputs: Inputs, groups: tuple[ParameterGroup, ...]) -> np.ndarray:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from icalib.assessment.excess import excess, times
 from icalib.calibration import LidarResiduals, Plane, PoseResiduals, SensorFit, WheelResiduals
 from icalib.estimation.assembly import Inputs, motion_of, origin_difference
 from icalib.estimation.clocks import instants
@@ -33,8 +34,6 @@ NEARLY_A_PERIOD = 0.15  # of the period
 # and more where they are half or twice as long; and in how many standard deviations it must show.
 STRETCHED, CLEARLY = 0.03, 10.0
 HALF_STEP_S = np.float32(2e-3)  # of a difference of positions
-LARGE_CHI2 = 2.0  # chi^2 per post-fit degree of freedom above this is worth a warning
-LEAST_DOF = 3.0  # times the square root of the number of residuals
 # Correlations of residuals of poses with their neighbours. Of white noise between poses, steps have -0.5.
 CORRELATED, ALTERNATING = 0.5, 0.35
 CLIP = 4.0  # standard deviations
@@ -310,19 +309,17 @@ def robot_warnings(rig: Rig, judged: list[SensorFit]) -> Iterator[str]:
     poses = {x.name: x for x in rig.poses}
     wheels = {w.name: w for w in rig.wheels}
     for f in judged:
-        ratio = f.chi2 / max(f.dof, 1.0)
-        if ratio <= LARGE_CHI2 or f.dof <= LEAST_DOF * np.sqrt(f.count):  # dof are sampled: few among many are noise
+        if excess(f) == 1.0:
             continue
-        times = f"{np.sqrt(ratio):.2g} times"
         if f.sensor in lidars and lidars[f.sensor].range_noise_m is not None:
             yield (
-                f"the points of {f.sensor} lie {times} as far from their planes as its range_noise in the rig file "
+                f"the points of {f.sensor} lie {times(f)} as far from their planes as its range_noise in the rig file "
                 "says; leave it out, and it is estimated."
             )
         if f.sensor in poses:
-            yield f"the {f.kind} of {f.sensor} leaves residuals {times} as large as its noise in the rig file says."
+            yield f"the {f.kind} of {f.sensor} leaves residuals {times(f)} as large as its noise in the rig file says."
         if f.sensor in wheels:
-            yield _wheel_words(f.kind, wheels[f.sensor], times, float(np.sqrt(ratio)))
+            yield _wheel_words(f.kind, wheels[f.sensor], times(f), excess(f))
 
 
 # Of rows of wheels: what they are, the field of the rig file that says how far off they may be, and its unit.

@@ -1,0 +1,70 @@
+"""Cameras that do not fit: taken for one another, or off by more than corners are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import combinations
+
+import numpy as np
+
+from icalib.assessment.excess import excess, times
+from icalib.calibration import ParameterGroup, SensorFit
+from icalib.estimation.tolerances import GUESS_SIGMA
+from icalib.geometry import so3
+from icalib.rig import Camera
+
+GIVEN = ("rotation", "translation", "intrinsics")
+FAR = 0.5  # of what guesses are worth: 5 cm, 3 deg, 8 px
+MUCH_NEARER = 0.3  # times as far, in all that is given
+POOR_FIT_PX = 1.0  # RMS: detectors are off by a tenth of that, blurred images by half
+MANY_REJECTED = 0.05
+
+
+def camera_warnings(
+    cameras: Sequence[Camera], groups: Sequence[ParameterGroup], judged: Sequence[SensorFit]
+) -> Iterator[str]:
+    """One sentence each."""
+    yield from _mixed_up(cameras, {(g.sensor, g.name): g.value for g in groups})
+    stated = {c.name for c in cameras if c.corner_noise_px is not None}
+    for f in judged:
+        if f.kind in ("corners", "features") and f.rejected > MANY_REJECTED * 0.5 * f.count:
+            share = f.rejected / (f.rejected + 0.5 * f.count)
+            yield f"{share:.0%} of the {f.kind} of {f.sensor} were set aside; look at its residuals in the report."
+        if f.kind != "corners":
+            continue
+        if f.sensor in stated and excess(f) > 1.0:
+            yield (
+                f"the corners of {f.sensor} are off by {times(f)} as much as its corner_noise in the rig file says: "
+                "its camera model, intrinsics that are fixed or its topic may be wrong; if not, leave corner_noise "
+                "out, and it is estimated."
+            )
+        if f.rms is not None and f.rms > POOR_FIT_PX:
+            yield (
+                f"the corners of {f.sensor} fit to {f.rms:.1f} px only, while detectors are good to a tenth of that: "
+                "its camera model, intrinsics that are fixed, its topic, or the target in the rig file may be wrong, "
+                "or its images blurred."
+            )
+
+
+def _mixed_up(cameras: Sequence[Camera], found: dict[tuple[str, str], np.ndarray]) -> Iterator[str]:
+    """Pairs of which each is found about where the rig file has the other, and far from where it should be."""
+    for a, b in combinations(cameras, 2):
+        own = _away(a, found, a.name), _away(b, found, b.name)
+        crossed = _away(a, found, b.name), _away(b, found, a.name)
+        if max(own) > FAR and max(crossed) < MUCH_NEARER * max(own):
+            yield (
+                f"{a.name} and {b.name} seem to be mixed up: each is found about where the rig file has the other; "
+                "correct their topics or paths, or the values that the rig file gives."
+            )
+
+
+def _away(camera: Camera, found: dict[tuple[str, str], np.ndarray], name: str) -> float:
+    """How far camera `name` is from what the rig file gives of `camera`, in what guesses are worth."""
+    away = 0.0
+    for group in GIVEN:
+        given, value = getattr(camera, group).value, found.get((name, group))
+        if given is None or value is None:
+            continue
+        off = so3.log(np.ascontiguousarray(given.T @ value)) if group == "rotation" else value - given
+        away = max(away, float(np.linalg.norm(off)) / GUESS_SIGMA[group])
+    return away

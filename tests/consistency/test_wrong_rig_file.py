@@ -1,0 +1,94 @@
+"""What the rig file states wrongly is said: noise of the IMU, and cameras that are taken for one another."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from icalib.calibration import Calibration
+from icalib.measurements import Measurements
+from icalib.pipeline import calibrate_measurements
+from icalib.simulation import Simulation, handheld, rig_for, simulate
+
+
+@pytest.fixture(scope="module")
+def simulation() -> Simulation:
+    return simulate(handheld(20.0), 1)
+
+
+def with_noise(simulation: Simulation, times: float) -> Calibration:
+    """Calibrated with densities that are so many times the true ones."""
+    rig = rig_for(simulation.scenario)
+    noise = rig.imu.noise
+    names = ("gyro", "gyro_walk", "accel", "accel_walk")
+    wrong = replace(noise, **{name: times * getattr(noise, name) for name in names})
+    return calibrate_measurements(replace(rig, imu=replace(rig.imu, noise=wrong)), simulation.measurements)
+
+
+def said(result: Calibration) -> list[str]:
+    return [words for words in result.warnings if "of imu0 leaves residuals" in words]
+
+
+def test_the_right_noise_is_no_news(simulation):
+    assert said(with_noise(simulation, 1.0)) == []
+
+
+@pytest.mark.parametrize("times", [0.2, 0.05, 0.01])
+def test_noise_that_is_far_too_small_is_said(simulation, times):
+    """The motion then follows the IMU, and hardly any degrees of freedom are left to judge it by."""
+    words = said(with_noise(simulation, times))
+    assert any(w.startswith("the gyroscope") and "larger noise density would fit" in w for w in words), words
+    assert any(w.startswith("the accelerometer") and "larger noise density would fit" in w for w in words), words
+
+
+def test_noise_that_is_far_too_large_is_said(simulation):
+    words = said(with_noise(simulation, 20.0))
+    assert any(w.startswith("the gyroscope") and "smaller noise density would fit" in w for w in words), words
+
+
+def swapped(simulation: Simulation) -> Measurements:
+    """Each camera's images under the other's name."""
+    a, b = simulation.measurements.cameras
+    return replace(simulation.measurements, cameras=(replace(b, name=a.name), replace(a, name=b.name)))
+
+
+GUESSES = [
+    {"rotation": "start", "translation": "start", "time_offset": "start", "intrinsics": "start"},
+    {"rotation": "start", "translation": "start", "time_offset": "free", "intrinsics": "free"},
+    {"rotation": "free", "translation": "free", "time_offset": "free", "intrinsics": "start"},
+]
+
+
+@pytest.mark.parametrize("modes", GUESSES)
+def test_cameras_that_are_mixed_up_are_named(simulation, modes):
+    rig = rig_for(simulation.scenario, distortion="free", **modes)
+    words = "cam0 and cam1 seem to be mixed up"
+    assert any(w.startswith(words) for w in calibrate_measurements(rig, swapped(simulation)).warnings)
+    assert not any(words in w for w in calibrate_measurements(rig, simulation.measurements).warnings)
+
+
+def test_a_poor_guess_is_not_taken_for_the_other_camera(simulation):
+    """Of one camera, by as much as cameras are apart, and of both."""
+    rig = rig_for(simulation.scenario, **GUESSES[0])
+    for moved in ((0.11, 0.0), (0.3, 0.3)):
+        cameras = tuple(
+            replace(c, translation=replace(c.translation, value=c.translation.value + [0.0, by, 0.0]))
+            for c, by in zip(rig.cameras, moved, strict=True)
+        )
+        result = calibrate_measurements(replace(rig, cameras=cameras), simulation.measurements)
+        assert not any("mixed up" in w for w in result.warnings)
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_a_lens_of_another_camera_that_is_fixed(simulation, stated):
+    """Corners fit worse than they are measured: than the rig file states, or than any are."""
+    rig = rig_for(simulation.scenario, intrinsics="fixed", distortion="fixed")
+    first, second = rig.cameras
+    off = [1.0, 1.0] if stated else [0.8, 1.0]
+    lens = replace(second.distortion, value=first.distortion.value * [*off, 1.0, 1.0] * (1.05 if stated else 1.0))
+    cameras = (replace(first, distortion=lens, corner_noise_px=first.corner_noise_px if stated else None), second)
+    result = calibrate_measurements(replace(rig, cameras=cameras), simulation.measurements)
+    expected = "as its corner_noise in the rig file says" if stated else "while detectors are good to a tenth of that"
+    said = [w for w in result.warnings if w.startswith("the corners of cam0")]
+    assert any(expected in w for w in said), (result.warnings, [f.rms for f in result.fits])
