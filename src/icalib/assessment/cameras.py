@@ -42,7 +42,7 @@ def camera_warnings(
             yield (
                 f"the corners of {f.sensor} fit to {f.rms:.1f} px only, while detectors are good to a tenth of that: "
                 "its camera model, intrinsics that are fixed, its topic, or the target in the rig file may be wrong, "
-                "or its images blurred."
+                "its clock have jumped, or its images be blurred."
             )
 
 
