@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,13 +12,20 @@ from scipy.stats import chi2
 
 from icalib.calibration import Calibration, joint_covariance, load_calibration
 from icalib.errors import EstimationError, RecordingError
+from icalib.geometry.targets import NoTarget
 from icalib.outputs import write_outputs
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter, Rig
-from icalib.simulation import Scenario, Simulation, rig_for, simulate
+from icalib.simulation import Scenario, SimPoses, Simulation, load_scenario, rig_for, simulate
 
+PAPER = Path(__file__).parents[2] / "examples" / "paper"
+T_IMU_MOCAP = np.array([[0.0, -1.0, 0.0, 0.1], [1.0, 0.0, 0.0, 0.05], [0.0, 0.0, 1.0, 0.3], [0.0, 0.0, 0.0, 1.0]])
 KINDS = {"c": "cameras", "l": "lidars", "w": "wheels"}
 SET_BACK_S = {"c": 37.123, "l": -512.3, "w": 1234.567}
+
+
+def mocap() -> SimPoses:
+    return SimPoses("mocap0", T_IMU_MOCAP, rotation_noise=1e-3, position_noise=5e-4, time_offset_s=0.004)
 
 
 def reset(scenario: Scenario, parts: str) -> Scenario:
@@ -148,3 +156,34 @@ def test_a_recording_with_nothing_of_a_sensor_is_named(robot):
     blind = replace(blind, name="second")
     with pytest.raises(RecordingError, match="second: there is nothing of cam0"):
         calibrate_measurements(open_rig(scenario, ""), [simulate(scenario, 1).measurements, blind])
+
+
+def test_cameras_that_follow_points(robot):
+    """Without a target: tracks of both recordings, the second camera's clock set back between them."""
+    scenario = replace(load_scenario(PAPER / "table2-3d.yaml"), lidars=(), wheels=(), duration_s=8.0)
+    first, second, third = scenario.cameras
+    later = replace(second, clock_origin_ns=second.clock_origin_ns - round(1e9 * SET_BACK_S["c"]))
+    simulations = simulate(scenario, 1), simulate(replace(scenario, cameras=(first, later, third)), 2)
+    rig = rig_for(scenario, intrinsics="start", distortion="start")
+    cameras = tuple(replace(c, track_noise_px=1.0, clock_restarts=c.name == second.name) for c in rig.cameras)
+    result = joint(simulations, replace(rig, target=NoTarget(), cameras=cameras))
+    assert result.converged, result.status
+    group = result.group(second.name, "time_offset")
+    errors = group.value - [s.truth.time_offset[second.name] for s in simulations]
+    assert np.abs(errors / group.std).max() < 4.0 and np.abs(errors).max() < 1e-3
+    assert len(result.group(first.name, "time_offset").value) == 1
+
+
+@pytest.mark.parametrize("parts", ["c", ""])
+def test_a_pose_sensor(robot, parts):
+    """Beside a camera, and as what shows the motion."""
+    scenario = replace(robot("3d", 14.0, parts), poses=(mocap(),))
+    later = replace(mocap(), clock_origin_ns=mocap().clock_origin_ns + 77 * 10**9)
+    simulations = simulate(scenario, 1), simulate(replace(scenario, duration_s=12.0, poses=(later,)), 2)
+    rig, free = rig_for(scenario), Parameter()
+    poses = (replace(rig.poses[0], rotation=free, translation=free, time_offset=free, clock_restarts=True),)
+    result = joint(simulations, replace(rig, poses=poses))
+    assert result.converged, result.status
+    group = result.group("mocap0", "time_offset")
+    errors = group.value - [s.truth.time_offset["mocap0"] for s in simulations]
+    assert np.abs(errors / group.std).max() < 4.0 and np.abs(errors).max() < 1e-3
