@@ -98,6 +98,15 @@ def test_a_print_that_was_fitted_to_the_page_is_a_warning():
     assert not notes
 
 
+@pytest.mark.parametrize(("said", "certain"), [(0.97, False), (0.9, True)])
+def test_what_no_accelerometer_could_be_is_wrong(said, certain):
+    """Accelerometers are off by 3 % at most."""
+    scenario = handheld(SECONDS, exact=False)
+    result = calibrate_measurements(of_size(rig_for(scenario), said), simulate(scenario, 0).measurements)
+    assert "by the accelerometer the target is" in result.warnings[0]
+    assert result.wrong == (result.warnings[:1] if certain else ())
+
+
 def test_the_right_size_is_a_note():
     warnings, notes = sentences(1.0)
     assert not warnings

@@ -64,7 +64,8 @@ GUESSES = [
 def test_cameras_that_are_mixed_up_are_named(simulation, modes):
     rig = rig_for(simulation.scenario, distortion="free", **modes)
     words = "cam0 and cam1 seem to be mixed up"
-    assert any(w.startswith(words) for w in calibrate_measurements(rig, swapped(simulation)).warnings)
+    result = calibrate_measurements(rig, swapped(simulation))
+    assert len(result.wrong) == 1 and result.wrong[0].startswith(words) and result.warnings[0] == result.wrong[0]
     assert not any(words in w for w in calibrate_measurements(rig, simulation.measurements).warnings)
 
 

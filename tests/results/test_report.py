@@ -241,6 +241,11 @@ def test_trust_is_the_worst_that_is_known(calibration: Calibration):
     assert trust(sound) == "good"
     assert trust(dataclasses.replace(sound, warnings=("mind.",))) == "care"
     assert trust(calibration) == "bad"
+    mistaken = dataclasses.replace(sound, warnings=("it is too large.", "mind."), wrong=("it is too large.",))
+    assert trust(mistaken) == "wrong"
+    page = report_html(mistaken)
+    assert page.index('<ul class="bad"><li>it is too large.') < page.index('<ul class="care"><li>mind.')
+    assert page.count("it is too large.") == 1 and "No. Something in the rig file must be wrong" in page
     assert trust(dataclasses.replace(sound, converged=False)) == "failed"
 
 

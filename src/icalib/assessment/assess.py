@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from icalib.assessment.cameras import camera_warnings
+from icalib.assessment.cameras import camera_warnings, mixed_up
 from icalib.assessment.excess import dof_known, excess, times
 from icalib.assessment.held_out import held_out
 from icalib.assessment.notes import notes
@@ -19,7 +19,7 @@ from icalib.assessment.robot import (
     robot_warnings,
     wheel_residuals,
 )
-from icalib.assessment.size import felt_size, size_words
+from icalib.assessment.size import felt_size, is_certain, size_words
 from icalib.calibration import (
     Calibration,
     CornerResiduals,
@@ -82,7 +82,9 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
     held = held_out(parts, [s for s in (inputs.rig.body,) if _is_assumed(inputs, s)])
     timeline = Timeline.of(inputs.parts, image_times(inputs, outcome.state.values))
     factors = _factors(inputs, groups)
-    wrong_size, size_notes = size_words(inputs, felt_size(found, factors.max(initial=1.0)))
+    size = felt_size(found, factors.max(initial=1.0))
+    wrong_size, size_notes = size_words(inputs, size)
+    mixed = tuple(mixed_up(inputs.rig.cameras, groups))
     trajectory, poses = _trajectory(inputs, outcome.state, timeline), pose_residuals(inputs, found, timeline)
     return Calibration(
         groups=groups,
@@ -98,6 +100,7 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
         status=outcome.status,
         warnings=(
             *wrong_size,  # first: what others complain of may come of it
+            *mixed,
             *_warnings(inputs, found, groups, judged, poses),
             *_factor_warnings(factors, parts is not None, held),
         ),
@@ -112,6 +115,7 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
         planes=planes(inputs, outcome.state),
         pose_residuals=poses,
         held_out=held,
+        wrong=(*(wrong_size if is_certain(size) else ()), *mixed),
     )
 
 
@@ -303,7 +307,7 @@ def _warnings(
     for f in judged:
         if f.kind in ("gyroscope", "accelerometer"):
             yield from _imu_noise_warnings(f)
-    yield from camera_warnings(inputs.rig.cameras, groups, judged)
+    yield from camera_warnings(inputs.rig.cameras, judged)
     yield from robot_warnings(inputs.rig, judged)
     yield from pose_warnings(poses, inputs.rig)
     yield from lidar_warnings(inputs, found) if inputs.clouds.count else ()

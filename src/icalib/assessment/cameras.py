@@ -20,11 +20,8 @@ POOR_FIT_PX = 1.0  # RMS: detectors are off by a tenth of that, blurred images b
 MANY_REJECTED = 0.05
 
 
-def camera_warnings(
-    cameras: Sequence[Camera], groups: Sequence[ParameterGroup], judged: Sequence[SensorFit]
-) -> Iterator[str]:
-    """One sentence each."""
-    yield from _mixed_up(cameras, {(g.sensor, g.name): g.value for g in groups})
+def camera_warnings(cameras: Sequence[Camera], judged: Sequence[SensorFit]) -> Iterator[str]:
+    """What corners leave, one sentence each."""
     stated = {c.name for c in cameras if c.corner_noise_px is not None}
     for f in judged:
         if f.kind in ("corners", "features") and f.rejected > MANY_REJECTED * 0.5 * f.count:
@@ -46,8 +43,9 @@ def camera_warnings(
             )
 
 
-def _mixed_up(cameras: Sequence[Camera], found: dict[tuple[str, str], np.ndarray]) -> Iterator[str]:
+def mixed_up(cameras: Sequence[Camera], groups: Sequence[ParameterGroup]) -> Iterator[str]:
     """Pairs of which each is found about where the rig file has the other, and far from where it should be."""
+    found = {(g.sensor, g.name): g.value for g in groups}
     for a, b in combinations(cameras, 2):
         own = _away(a, found, a.name), _away(b, found, b.name)
         crossed = _away(a, found, b.name), _away(b, found, a.name)

@@ -10,6 +10,7 @@ from icalib.estimation.estimate import Estimate
 from icalib.estimation.target_size import TargetSize, target_size
 
 WRONG = 0.02  # of the size: more than a ruler or a good accelerometer is off by
+BEYOND = 0.05  # accelerometers are off by 3 % at most
 CLEARLY = 5.0  # standard deviations
 
 
@@ -23,6 +24,11 @@ def felt_size(found: Estimate, factor: float) -> TargetSize | None:
     except EstimationError:  # the way to another size leads off the map
         return None
     return None if size is None else TargetSize(size.ratio, factor * size.std)
+
+
+def is_certain(size: TargetSize | None) -> bool:
+    """Whether no accelerometer could be as wrong as the size that it shows."""
+    return size is not None and abs(size.ratio - 1.0) > max(BEYOND, CLEARLY * size.std)
 
 
 def size_words(inputs: Inputs, size: TargetSize | None) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -157,6 +157,7 @@ class Calibration:
     planes: tuple[Plane, ...] = ()  # that LiDARs see
     pose_residuals: tuple[PoseResiduals, ...] = ()
     held_out: HeldOut | None = None  # None where the recording could not be split
+    wrong: tuple[str, ...] = ()  # those of `warnings` by which something in the rig file must be wrong
 
     @property
     def failure(self) -> str:

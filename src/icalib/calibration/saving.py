@@ -30,7 +30,7 @@ from icalib.errors import CalibrationError
 from icalib.result_files import read_file
 
 FORMAT, FORMAT_VERSION = "icalib result", 1
-_TEXTS = ("undetermined", "warnings", "notes")
+_TEXTS = ("undetermined", "warnings", "notes", "wrong")
 _PLAIN = ("status", "converged", "rig", "rates", "inputs", "settings", "versions", "timings")
 _MALFORMED = (KeyError, TypeError, ValueError, AttributeError, IndexError)
 
@@ -179,7 +179,7 @@ def _build(plain: dict[str, Any], arrays: dict[str, np.ndarray]) -> Calibration:
         trajectory=Trajectory(**of(Trajectory, "trajectory")),
         recordings=tuple(RecordingSpan(**r) for r in plain.get("recordings", [])),
         iterations=tuple(Iteration(*step) for step in zip(*steps, strict=True)),
-        **{name: tuple(plain[name]) for name in _TEXTS},
+        **{name: tuple(plain.get(name, []) if name == "wrong" else plain[name]) for name in _TEXTS},
         **{name: plain[name] for name in _PLAIN},
     )
 

@@ -24,7 +24,6 @@ from icalib.report.plot import Figure
 from icalib.report.tables import Html, element
 
 _NO_UNDETERMINED = "None: the motion determines every direction."
-_NO_WARNINGS = "None."
 _NOT_HELD_OUT = (
     "Nothing was held out: the recording is too short to be split, or splits are off in the rig file, or its halves "
     "have no parameter in common that both know."
@@ -52,7 +51,7 @@ def report_html(calibration: Calibration) -> str:
         "trust": trust,
         "cards": tables.sensor_cards(c),
         "undetermined": tables.sentences(c.undetermined, "bad", _NO_UNDETERMINED),
-        "warnings": tables.sentences(c.warnings, "care", _NO_WARNINGS),
+        "warnings": tables.warnings(c),
         "notes": tables.sentences(c.notes, "", "None."),
         "fits": tables.fits(c),
         "parameters": tables.parameters(c),

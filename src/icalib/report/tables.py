@@ -13,6 +13,7 @@ from icalib.report.quantities import SHOWN_UNITS, chi2_words, rms_words, rows, r
 TRUST = {
     "good": "Yes. The solver converged, the motion determines every parameter, and nothing calls for attention.",
     "care": "Mostly. Read what stands below before using the numbers marked weak or warned about.",
+    "wrong": "No. Something in the rig file must be wrong: correct it as the first warning says, and calibrate again.",
     "bad": "Not as a whole. Do not use what is marked undetermined: it is the guess, not a result.",
     "failed": "No. The solver did not converge; the numbers are where it stopped.",
 }
@@ -53,6 +54,13 @@ def sentences(items: Sequence[str], css: str, nothing: str) -> Html:
     return element("ul", [element("li", item) for item in items], css)
 
 
+def warnings(c: Calibration) -> Html:
+    """What to know before trusting the numbers; first, in red, what must be wrong."""
+    rest = [sentence for sentence in c.warnings if sentence not in c.wrong]
+    found = [sentences(c.wrong, "bad", "")] if c.wrong else []
+    return html([*found, sentences(rest, "care", "None.")] if rest or not found else found)
+
+
 def badge(verdict: str) -> Html:
     return element("span", verdict, f"badge {verdict}")
 
@@ -62,6 +70,8 @@ def trust(c: Calibration) -> str:
     verdicts = {v for g in c.groups for v in g.verdict}
     if not c.converged:
         return "failed"
+    if c.wrong:
+        return "wrong"
     if c.undetermined or "undetermined" in verdicts:
         return "bad"
     return "care" if c.warnings or "weak" in verdicts else "good"
