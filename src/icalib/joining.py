@@ -15,6 +15,7 @@ from icalib.measurements import (
     LidarStream,
     Measurements,
     PoseStream,
+    Stream,
     TrackStream,
     WheelPoses,
     WheelStream,
@@ -62,9 +63,7 @@ def join(
     return (_joined(recordings, shifts) if len(recordings) > 1 else recordings[0]), parts
 
 
-def _streams(
-    measurements: Measurements,
-) -> list[ImuStream | CornerStream | LidarStream | WheelStream | WheelPoses | PoseStream]:
+def _streams(measurements: Measurements) -> list[ImuStream | Stream]:
     imus = [] if measurements.imu is None else [measurements.imu]
     return [*imus, *measurements.cameras, *measurements.lidars, *measurements.wheels, *measurements.poses]
 
@@ -179,8 +178,6 @@ def join_poses(streams: list[tuple[PoseStream, int]]) -> PoseStream:
     return PoseStream(streams[0][0].name, stamps, rotation, position, joins_ns=_joins(streams))
 
 
-def _joins(
-    streams: Sequence[tuple[CornerStream | LidarStream | WheelStream | WheelPoses | PoseStream, int]],
-) -> tuple[int, ...]:
+def _joins(streams: Sequence[tuple[Stream, int]]) -> tuple[int, ...]:
     """The first stamp of each recording but the first."""
     return tuple(int(s.stamps_ns[0]) + shift for s, shift in streams[1:])

@@ -264,6 +264,9 @@ class PoseStream:
         return seconds_since(self.stamps_ns, self.origin_ns)
 
 
+Stream = CornerStream | LidarStream | WheelStream | WheelPoses | PoseStream
+
+
 @dataclass(frozen=True)
 class Measurements:
     """Everything one recording holds that the rig asks for."""

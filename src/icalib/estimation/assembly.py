@@ -12,7 +12,7 @@ from icalib.estimation import pages
 from icalib.estimation.arrowhead import NOTHING, chain_cuts
 from icalib.estimation.board import SHAPE_LABELS, SHAPE_SIGMA_M, bloom_direction, board_in
 from icalib.estimation.bodies import Bodies, choose_bodies, restrict
-from icalib.estimation.clocks import Stream, instants
+from icalib.estimation.clocks import instants
 from icalib.estimation.corner_factor import CornerFactor, CornerNoise
 from icalib.estimation.feature_factor import FeatureFactor
 from icalib.estimation.free_nodes import FreeNodes
@@ -32,7 +32,7 @@ from icalib.estimation.tolerances import Tolerances
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets.base import BOARD
 from icalib.joining import Part, join
-from icalib.measurements import Measurements, WheelPoses
+from icalib.measurements import Measurements, Stream, WheelPoses
 from icalib.rig import Camera, Lidar, Parameter, PoseSensor, Rig, Scheme, Wheels
 
 BLOOM_SIGMA_PX = 1.0

@@ -11,11 +11,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from icalib.estimation.state import Key, Layout, State
-from icalib.measurements import CornerStream, LidarStream, PoseStream, WheelPoses, WheelStream
+from icalib.measurements import Stream, WheelPoses
 
 EARLY_S = 5.0  # by which what a stamp stands for may come before it; recordings are further apart
-MOUNTED = ("rotation", "translation", "time_offset")
-Stream = CornerStream | LidarStream | WheelStream | WheelPoses | PoseStream
 
 
 def instants(stream: Stream, values: dict[Key, np.ndarray], seconds: np.ndarray | None = None) -> np.ndarray:
@@ -23,24 +21,22 @@ def instants(stream: Stream, values: dict[Key, np.ndarray], seconds: np.ndarray 
     own, offset = stream.seconds if seconds is None else seconds, values[stream.name, "time_offset"]
     if len(offset) == 1:
         return own + offset[0]
-    joins = np.array([1e-9 * (ns - stream.origin_ns) for ns in _joins(stream)]) - EARLY_S
+    assert not isinstance(stream, WheelPoses)  # which are of one recording
+    joins = np.array([1e-9 * (ns - stream.origin_ns) for ns in stream.joins_ns]) - EARLY_S
     assert len(joins) == len(offset) - 1
     return own + offset[np.searchsorted(joins, own, side="right")]
 
 
-def _joins(stream: Stream) -> tuple[int, ...]:
-    return () if isinstance(stream, WheelPoses) else stream.joins_ns
-
-
-def recording_of(state: State, node: np.ndarray) -> np.ndarray:
-    """(n,) the recording that each `node` (n,) belongs to."""
+def clock_of(state: State, name: str, node: np.ndarray) -> np.ndarray:
+    """(n,) number of the time offset that a sensor's measurements which hang on `node` (n,) go by."""
+    if len(state.values[name, "time_offset"]) == 1:
+        return np.zeros(len(node), dtype=np.int64)
     return np.searchsorted(state.starts, node, side="right") - 1
 
 
 def offset_at(state: State, name: str, node: np.ndarray) -> np.ndarray:
-    """Time offset (1,) or (n,) of a sensor's measurements that hang on `node` (n,)."""
-    offset = state.values[name, "time_offset"]
-    return offset if len(offset) == 1 else offset[recording_of(state, node)]
+    """(n,) time offset of a sensor's measurements that hang on `node` (n,)."""
+    return state.values[name, "time_offset"][clock_of(state, name, node)]
 
 
 def by_clock(state: State, name: str, node: np.ndarray) -> Iterator[tuple[int, slice]]:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from icalib.estimation.arrowhead import Piece
-from icalib.estimation.clocks import mounted_columns, recording_of
+from icalib.estimation.clocks import clock_of, mounted_columns
 from icalib.estimation.corner_factor import LOSSES, CornerFactor
 from icalib.estimation.corner_kernels import Motion
 from icalib.estimation.feature_kernels import (
@@ -252,7 +252,7 @@ class FeatureFactor:
             imu = self.layout.columns(camera.imu.name, "intrinsics")
         clocks = range(len(state.values[camera.name, "time_offset"]))
         own = np.array([mounted_columns(self.layout, camera.name, k) for k in clocks])
-        of_image = own[recording_of(state, camera.node[i0:i1]) if len(own) > 1 else np.zeros(i1 - i0, dtype=np.int64)]
+        of_image = own[clock_of(state, camera.name, camera.node[i0:i1])]
         rest = np.concatenate([np.full(2, -1), imu[imu >= 0]])
         return np.concatenate([of_image, np.tile(rest, (i1 - i0, 1))], axis=1).astype(np.int64)
 

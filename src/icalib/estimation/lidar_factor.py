@@ -72,11 +72,6 @@ class LidarFactor:
         """(P, 3) border columns of each plane."""
         return np.array([self.layout.block(*p).columns for p in self.planes])
 
-    def _through_pose(self, clock: int) -> np.ndarray:
-        """(c,) border columns that act through the pose."""
-        imu = self.layout.columns(self.imu.name, "intrinsics")
-        return np.concatenate([mounted_columns(self.layout, self.name, clock), imu[imu >= 0]])
-
     @property
     def kinds(self) -> dict[str, slice]:
         """See `SensorFactor`."""
@@ -119,22 +114,24 @@ class LidarFactor:
         p_il = state.values[self.name, "translation"]
         imu_free = self.layout.is_free(self.imu.name, "intrinsics")
         m = self.moments
-        for clock, a, b in self._stretches(state, b0, b1):
+        for through_pose, a, b in self._stretches(state, b0, b1):
             node = self.node[a:b]
             times = m.seconds[a:b] + offset_at(state, self.name, node)
             poses = poses_at(self.scheme, times, node, state, self.imu, self.gravity, imu_free)
             R_lw = np.ascontiguousarray((poses.rotation @ R_il).transpose(0, 2, 1))
             motion = Motion(
                 R_il, p_il, R_lw, poses.position + poses.rotation @ p_il, poses.rate, poses.velocity,
-                poses.by_node, poses.by_next, poses.by_imu, self._through_pose(clock),
+                poses.by_node, poses.by_next, poses.by_imu, through_pose,
             )  # fmt: skip
             yield Bins(node, m.start[a : b + 1], m.plane, m.root, m.slant), motion, planes
 
-    def _stretches(self, state: State, b0: int, b1: int) -> Iterator[tuple[int, int, int]]:
-        """Bins b0..b1 by the chunk, each with the number of their time offset."""
+    def _stretches(self, state: State, b0: int, b1: int) -> Iterator[tuple[np.ndarray, int, int]]:
+        """Bins b0..b1 by the chunk, each with its border columns that act through the pose (c,)."""
+        imu = self.layout.columns(self.imu.name, "intrinsics")
         for clock, own in by_clock(state, self.name, self.node[b0:b1]):
+            through_pose = np.concatenate([mounted_columns(self.layout, self.name, clock), imu[imu >= 0]])
             for a in range(b0 + own.start, b0 + own.stop, CHUNK):
-                yield clock, a, min(a + CHUNK, b0 + own.stop)
+                yield through_pose, a, min(a + CHUNK, b0 + own.stop)
 
     def _bins_of(self, piece: Piece) -> tuple[int, int]:
         """The bins that belong to `piece`: nodes from first to before last, the chain's very last node included."""

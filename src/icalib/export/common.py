@@ -99,13 +99,17 @@ def no_place_for(program: str, things: Sequence[str]) -> tuple[str, ...]:
 
 def time_offset(c: Calibration, name: str) -> float:
     """Seconds. Raises CalibrationError where the sensor's clock restarts: what it will be next time nobody knows."""
-    value = c.group(name, "time_offset").value
-    if len(value) > 1:
+    if restarts(c, name):
         raise CalibrationError(
             f"the clock of {name} restarts, and each recording has a time offset of its own, while this format needs "
             "the one that will be; export to ros2-static, camera-info, urdf or json, or calibrate one recording alone."
         )
-    return float(value[0])
+    return float(c.group(name, "time_offset").value[0])
+
+
+def restarts(c: Calibration, name: str) -> bool:
+    """Whether the sensor's clock restarts: each recording has a time offset of its own."""
+    return len(c.group(name, "time_offset").value) > 1
 
 
 def time_offsets(c: Calibration, names: Sequence[str]) -> list[str]:

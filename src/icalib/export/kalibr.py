@@ -12,7 +12,7 @@ import yaml
 
 from icalib.calibration import Calibration, CornerResiduals
 from icalib.errors import CalibrationError
-from icalib.export.common import inverse, time_offset
+from icalib.export.common import inverse, restarts, time_offset
 from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.cameras.convert import fit_model
@@ -51,7 +51,7 @@ def camchain(calibration: Calibration) -> str:
     restarting = [
         f"# cam{i} has no timeshift_cam_imu: its clock restarts, and each recording has one of its own."
         for i, name in enumerate(c.cameras)
-        if _restarts(c, name)
+        if restarts(c, name)
     ]
     return _text([comment, *_renamed("cam", c.cameras), *restarting, *fits], data)
 
@@ -82,10 +82,6 @@ def imu_yaml(calibration: Calibration) -> str:
     return _text([comment, *_renamed("imu", (c.imu,))], {"imu0": data | _intrinsics(c)})
 
 
-def _restarts(c: Calibration, camera: str) -> bool:
-    return len(c.group(camera, "time_offset").value) > 1
-
-
 def _camera(c: Calibration, index: int, overlaps: np.ndarray) -> dict[str, Any]:
     name = c.cameras[index]
     T_cam_imu = inverse(c.T_imu_sensor(name))
@@ -98,7 +94,7 @@ def _camera(c: Calibration, index: int, overlaps: np.ndarray) -> dict[str, Any]:
         **lens,
         "resolution": [int(side) for side in c.rig["sensors"][name]["resolution"]],
         "rostopic": f"/{name}/image_raw",
-        **({} if c.imu is None or _restarts(c, name) else {"timeshift_cam_imu": time_offset(c, name)}),
+        **({} if c.imu is None or restarts(c, name) else {"timeshift_cam_imu": time_offset(c, name)}),
     }
 
 

@@ -11,9 +11,10 @@ import numpy as np
 from icalib.estimation.assembly import Inputs, origin_difference
 from icalib.estimation.imu_data import imu_data
 from icalib.estimation.state import Key, State
+from icalib.first_guess.lidar import Held
 from icalib.measurements import LidarStream
 from icalib.recordings.several import naming
-from icalib.rig import Camera, Lidar, PoseSensor, Wheels
+from icalib.rig import Lidar, PoseSensor
 
 
 def alone(inputs: Inputs, k: int) -> Inputs:
@@ -57,31 +58,42 @@ def other_clocks(offset: float, sensor: str, before: Inputs, now: Inputs) -> flo
     return offset + next(shifts) - next(shifts)
 
 
-def own_offset(state: State, sensor: str, before: Inputs, now: Inputs) -> float:
-    """The time offset that `state` of one recording, `before`, has of a clock that runs on, in another one."""
+def from_the_best(
+    inputs: Inputs, sensor: Lidar | PoseSensor, best: int, state_of: Callable[[Inputs, Held | None], State]
+) -> State:
+    """All recordings' states, each by itself: of the `best` from nothing, and of the others as it has shown how the
+    `sensor` stands, and how its clock goes, if that runs on."""
+    recordings = [alone(inputs, k) for k in range(len(inputs.parts))]
+    with naming_recording(inputs, best):
+        states = {best: state_of(recordings[best], None)}
+    values, name = dict(states[best].values), sensor.name
+    for k, own in enumerate(recordings):
+        if k != best:
+            there = None if sensor.clock_restarts else _own_offset(states[best], name, recordings[best], own)
+            with naming_recording(inputs, k):
+                states[k] = state_of(own, Held(values[name, "rotation"], values[name, "translation"], there))
+    clocks = range(len(recordings)) if sensor.clock_restarts else (best,)
+    offsets = [_own_offset(states[k], name, recordings[k], inputs) for k in clocks]
+    values[name, "time_offset"] = np.array(offsets)
+    return one_after_another(inputs, [states[k] for k in range(len(recordings))], values)
+
+
+def _own_offset(state: State, sensor: str, before: Inputs, now: Inputs) -> float:
+    """The time offset that `state` of one recording, `before`, has, as one of `now`."""
     return other_clocks(float(state.values[sensor, "time_offset"][0]), sensor, before, now)
 
 
-def joined_offsets(
-    inputs: Inputs,
-    sensor: Camera | Lidar | Wheels | PoseSensor,
-    recordings: Sequence[Inputs],
-    states: Mapping[int, State],
-    best: int,
+def each_clock(
+    inputs: Inputs, sensor: str, find: Callable[[int], float], known: Mapping[int, float] | None = None
 ) -> np.ndarray:
-    """A sensor's time offsets in `inputs`: those of each recording's own state, or that of the `best` where its clock
-    runs on."""
-    used = range(len(recordings)) if sensor.clock_restarts else (best,)
-    return np.array([own_offset(states[k], sensor.name, recordings[k], inputs) for k in used])
-
-
-def each_clock(inputs: Inputs, sensor: str, find: Callable[[int], float]) -> np.ndarray:
-    """(R,) time offsets of a clock that restarts; `find`: that of a recording alone, given by its number."""
-    found = []
+    """(R,) time offsets of a clock that restarts; `find`: that of a recording alone, given by its number, where it is
+    not among the `known` ones."""
+    found = dict(known or {})
     for k in range(len(inputs.parts)):
-        with naming_recording(inputs, k):
-            found.append(other_clocks(find(k), sensor, alone(inputs, k), inputs))
-    return np.array(found)
+        if k not in found:
+            with naming_recording(inputs, k):
+                found[k] = find(k)
+    return np.array([other_clocks(found[k], sensor, alone(inputs, k), inputs) for k in range(len(inputs.parts))])
 
 
 def most_points(inputs: Inputs, lidar: int) -> int:

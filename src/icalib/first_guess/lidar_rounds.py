@@ -33,13 +33,11 @@ from icalib.first_guess.align_camera import trusted
 from icalib.first_guess.by_recording import (
     alone,
     each_clock,
-    joined_offsets,
+    from_the_best,
     most_points,
     motion_alone,
     naming_recording,
-    one_after_another,
     other_clocks,
-    own_offset,
     points_by_recording,
     with_points,
 )
@@ -74,18 +72,12 @@ def state_from_lidar(inputs: Inputs) -> State:
 
     Raises EstimationError where they do not.
     """
-    recordings = [alone(inputs, k) for k in range(len(inputs.parts))]
-    best, name = most_points(inputs, 0), inputs.rig.lidars[0].name
-    with naming_recording(inputs, best), naming_sight(recordings[best].measurements.lidars[:1]):
-        states = {best: _state_of_one(recordings[best])}
-    values, restarts = dict(states[best].values), inputs.rig.lidars[0].clock_restarts
-    for k, own in enumerate(recordings):
-        if k != best:
-            there = None if restarts else own_offset(states[best], name, recordings[best], own)
-            with naming_recording(inputs, k), naming_sight(own.measurements.lidars[:1]):
-                states[k] = _state_of_one(own, Held(values[name, "rotation"], values[name, "translation"], there))
-    values[name, "time_offset"] = joined_offsets(inputs, inputs.rig.lidars[0], recordings, states, best)
-    return one_after_another(inputs, [states[k] for k in range(len(recordings))], values)
+
+    def state_of(own: Inputs, held: Held | None) -> State:
+        with naming_sight(own.measurements.lidars[:1]):
+            return _state_of_one(own, held)
+
+    return from_the_best(inputs, inputs.rig.lidars[0], most_points(inputs, 0), state_of)
 
 
 def _state_of_one(inputs: Inputs, held: Held | None = None) -> State:
@@ -242,7 +234,8 @@ def lidar_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
             offsets = np.array([other_clocks(found.offset, lidar.name, own, inputs)])
             if lidar.clock_restarts:
                 held = Held(found.rotation, found.position)
-                offsets = each_clock(inputs, lidar.name, partial(_offset_on_motion, inputs, state, i, held))
+                others = partial(_offset_on_motion, inputs, state, i, held)
+                offsets = each_clock(inputs, lidar.name, others, {k: found.offset})
             known = found.values(lidar.name) | {(lidar.name, "time_offset"): offsets} | known
         out |= known
     return out

@@ -21,11 +21,9 @@ from icalib.estimation.state import Key, State
 from icalib.first_guess.by_recording import (
     alone,
     each_clock,
-    joined_offsets,
+    from_the_best,
     motion_alone,
     naming_recording,
-    one_after_another,
-    own_offset,
 )
 from icalib.first_guess.clocks import LEAST_CORRELATION, LONGEST_STEP_S, Alignment, CameraRates
 from icalib.first_guess.gyro import GyroRotation
@@ -83,23 +81,24 @@ def _placed(inputs: Inputs, state: State, sensor: PoseSensor, stream: PoseStream
     held = held_of(inputs, sensor)
     if not sensor.clock_restarts:
         return placed(stream, partial(_on_motion, inputs.imu, known=state, held=held)).values(sensor.name)
-    i = inputs.rig.poses.index(sensor)
-    recordings = [alone(inputs, k) for k in range(len(inputs.parts))]
-    k = int(np.argmax([len(own.measurements.poses[i].stamps_ns) for own in recordings]))
-    own = recordings[k]
-    assert own.imu is not None
+    streams = [_alone(inputs, k, sensor.name) for k in range(len(inputs.parts))]
+    k = int(np.argmax([len(own.stamps_ns) for _, own in streams]))
+    imu, own = streams[k]
     with naming_recording(inputs, k):
-        place = partial(_on_motion, own.imu, known=motion_alone(inputs, k, state), held=held)
-        found = placed(own.measurements.poses[i], place)
+        found = placed(own, partial(_on_motion, imu, known=motion_alone(inputs, k, state), held=held))
 
     def offset(recording: int) -> float:
-        if recording == k:
-            return found.offset
-        other = recordings[recording]
-        assert other.imu is not None
-        return _aligned(other.imu, other.measurements.poses[i], Held(found.rotation))[0].offset
+        return _aligned(*streams[recording], Held(found.rotation))[0].offset
 
-    return found.values(sensor.name) | {(sensor.name, "time_offset"): each_clock(inputs, sensor.name, offset)}
+    offsets = each_clock(inputs, sensor.name, offset, {k: found.offset})
+    return found.values(sensor.name) | {(sensor.name, "time_offset"): offsets}
+
+
+def _alone(inputs: Inputs, recording: int, sensor: str) -> tuple[ImuData, PoseStream]:
+    own = alone(inputs, recording)
+    stream = own.stream(sensor)
+    assert own.imu is not None and isinstance(stream, PoseStream)
+    return own.imu, stream
 
 
 def state_from_poses(inputs: Inputs) -> State:
@@ -108,19 +107,8 @@ def state_from_poses(inputs: Inputs) -> State:
 
     Raises EstimationError where they do not.
     """
-    name = inputs.rig.poses[0].name
-    recordings = [alone(inputs, k) for k in range(len(inputs.parts))]
-    best = int(np.argmax([len(own.measurements.poses[0].stamps_ns) for own in recordings]))
-    with naming_recording(inputs, best):
-        states = {best: _state_of_one(recordings[best], None)}
-    values, restarts = dict(states[best].values), inputs.rig.poses[0].clock_restarts
-    for k, own in enumerate(recordings):
-        if k != best:
-            there = None if restarts else own_offset(states[best], name, recordings[best], own)
-            with naming_recording(inputs, k):
-                states[k] = _state_of_one(own, Held(values[name, "rotation"], values[name, "translation"], there))
-    values[name, "time_offset"] = joined_offsets(inputs, inputs.rig.poses[0], recordings, states, best)
-    return one_after_another(inputs, [states[k] for k in range(len(recordings))], values)
+    best = int(np.argmax([len(part.measurements.poses[0].stamps_ns) for part in inputs.parts]))
+    return from_the_best(inputs, inputs.rig.poses[0], best, _state_of_one)
 
 
 def _state_of_one(inputs: Inputs, held: Held | None) -> State:

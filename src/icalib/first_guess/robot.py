@@ -103,7 +103,7 @@ def _turning(
     """Of wheels that turn, or report what a vehicle does. Raises EstimationError where the motion does not show it."""
     assert inputs.imu is not None
     name = stream.name
-    if offset is None and _wheels_of(inputs, name).clock_restarts:
+    if offset is None and inputs.sensor(name).clock_restarts:
         offset = each_clock(inputs, name, partial(_offset_alone, inputs, name, up))
     elif offset is None:
         offset = np.array([wheel_offset(inputs.imu, up, name, rates)])
@@ -115,16 +115,11 @@ def _turning(
     return {(name, group): value for group, value in found.items()}
 
 
-def _wheels_of(inputs: Inputs, name: str) -> Wheels:
-    return next(w for w in inputs.rig.wheels if w.name == name)
-
-
 def _offset_alone(inputs: Inputs, name: str, up: np.ndarray, recording: int) -> float:
     """Of wheels in one recording, between its own first stamps; `up` (3,) in the IMU's axes."""
     own = alone(inputs, recording)
-    assert own.imu is not None
-    (stream,) = (s for s in own.measurements.wheels if s.name == name)
-    assert isinstance(stream, WheelStream)
+    stream = own.stream(name)
+    assert own.imu is not None and isinstance(stream, WheelStream)
     return wheel_offset(own.imu, up, name, wheel_rates(name, stream.seconds, integrals_of(stream), stream.kind))
 
 

@@ -57,8 +57,9 @@ def sentences(items: Sequence[str], css: str, nothing: str) -> Html:
 def warnings(c: Calibration) -> Html:
     """What to know before trusting the numbers; first, in red, what must be wrong."""
     rest = [sentence for sentence in c.warnings if sentence not in c.wrong]
-    found = [sentences(c.wrong, "bad", "")] if c.wrong else []
-    return html([*found, sentences(rest, "care", "None.")] if rest or not found else found)
+    if not c.wrong:
+        return sentences(rest, "care", "None.")
+    return html([sentences(c.wrong, "bad", ""), *([sentences(rest, "care", "")] if rest else [])])
 
 
 def badge(verdict: str) -> Html:
