@@ -292,3 +292,14 @@ def test_examples_of_the_page_are_right(tmp_path):
             found = [row.split("|")[2] for row in rows if f"`{name}`" in row.split("|")[1]]
             shown = field.default if isinstance(field.default, str) else f"{field.default:g}"
             assert any(shown in default for default in found), name
+
+
+def test_points_on_planes_need_a_lidar_and_tracks(tmp_path):
+    followed = "  cam0: {type: camera, model: pinhole-radtan, resolution: [640, 480], tracks: cam0.csv}\n"
+    wanted = "settings: {points_on_planes_m: 0.01}\n"
+    imu, lidar = "sensors:\n  imu0: {type: imu}\n", "  lidar0: {type: lidar}\n"
+    assert load(tmp_path, imu + lidar + followed + wanted).settings.points_on_planes_m == 0.01
+    for text in (imu + lidar + wanted, imu + followed + wanted):
+        words = complaint(tmp_path, text)
+        assert "settings.points_on_planes_m: needs a LiDAR that sees planes, and a camera with tracks" in words
+    assert "must be 0 or above" in complaint(tmp_path, imu + lidar + followed + wanted.replace("0.01", "-1"))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -167,6 +167,14 @@ class LidarStream:
     def seconds(self) -> np.ndarray:
         """(S,) seconds since this clock's own first stamp."""
         return seconds_since(self.stamps_ns, self.origin_ns)
+
+    def some(self, kept: np.ndarray) -> LidarStream:
+        """The points in `kept` (N,) bool; all scans stay, if empty."""
+        if kept.all():
+            return self
+        start = np.concatenate([[0], np.cumsum(kept)])[self.start].astype(np.int64)
+        columns = {name: getattr(self, name)[kept] for name in ("offset_s", "xyz", "plane")}
+        return replace(self, start=start, **columns)
 
 
 @dataclass(frozen=True)

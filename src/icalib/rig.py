@@ -241,6 +241,8 @@ class Settings:
     splits: int = 8  # segments for the empirical factor, 0: none
     max_gap_s: float = 0.5  # IMU gaps up to this are bridged; longer ones split the recording
     node_spacing_s: float = 0.05  # no two nodes further apart
+    # Points that cameras follow lie on the planes that LiDARs see, to within this; 0: nothing is said of that.
+    points_on_planes_m: float = 0.0
     # What is known to better than these is determined.
     rotation_tolerance_deg: float = 0.1
     translation_tolerance_m: float = 5e-3

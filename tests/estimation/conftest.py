@@ -26,6 +26,7 @@ from icalib.estimation.nodes import place_nodes
 from icalib.estimation.poses import assign_nodes
 from icalib.estimation.problem import Problem
 from icalib.estimation.state import NODE, Layout, State, make_layout
+from icalib.estimation.surfaces import OnPlanes, Surfaces
 from icalib.estimation.tolerances import Tolerances
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.planes import plane_of
@@ -213,6 +214,27 @@ def make_features(
     return FeatureFactor.build(cameras, streams, (0.8, 1.1), tuple(keep), loss, setup.state, cuts)
 
 
+def make_features_on_planes(setup: Setup, *arguments, **options) -> tuple[Setup, FeatureFactor]:
+    """The setup with two planes, about where the features are and 2 deg from there, and its features, of which two of
+    three are on one of them, known to lie there to 3 to 8 mm."""
+    factor = make_features(setup, *arguments, **options)
+    views, n = factor._views(setup.state, 0, factor.n_nodes), factor.tracks.count
+    points = factor._from_anchors(views, slice(0, n), factor.tracks.start)
+    centre = points.mean(axis=0)
+    across, _, normal = np.linalg.svd(points - centre, full_matrices=False)[2]
+    both = [plane_of(normal, centre + 0.004 * normal), plane_of(normal + 0.03 * across, centre)]
+    keys = tuple((f"plane {k}", "plane") for k in range(2))
+    entries = [(b.sensor, b.name, b.kind, b.size, b.start is not None) for b in setup.layout.blocks]
+    layout = make_layout([*entries, *((*key, "plane", 3, True) for key in keys)])
+    values = setup.state.values | dict(zip(keys, both, strict=True))
+    setup = replace(setup, layout=layout, state=replace(setup.state, values=values))
+    rng = np.random.default_rng(21)
+    surfaces = Surfaces(keys, np.array(both), np.zeros(2, dtype=np.int64), np.zeros(0, dtype=np.int64), 0.005)
+    on = OnPlanes(rng.integers(-1, 2, n), rng.uniform(0.003, 0.008, n), np.ones(n))
+    cameras = tuple(replace(c, layout=layout) for c in factor.cameras)
+    return setup, replace(factor, layout=layout, cameras=cameras, surfaces=surfaces, on=on)
+
+
 def make_problem(setup: Setup, start: State | None = None, scheme: str = "inertial") -> Problem:
     columns = setup.layout.columns("imu0", "intrinsics")
     imu = ImuFactor.build(setup.imu, start or setup.state, 9.81, columns[columns >= 0])
@@ -381,6 +403,11 @@ def features_of() -> Callable[..., FeatureFactor]:
 @pytest.fixture(scope="session")
 def problem_of() -> Callable[..., Problem]:
     return make_problem
+
+
+@pytest.fixture(scope="session")
+def features_on_planes() -> Callable[..., tuple[Setup, FeatureFactor]]:
+    return make_features_on_planes
 
 
 @pytest.fixture(scope="session")

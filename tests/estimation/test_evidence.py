@@ -140,6 +140,19 @@ def test_degrees_of_freedom_of_features(followed, setup, dense):
     assert min(cameras) > 0.2 * sum(cameras)
 
 
+def test_degrees_of_freedom_of_features_on_planes(setup, problem_of, features_on_planes, dense):
+    """Their rows for that pay for a share of the points, and for what the border has of them."""
+    setup, factor = features_on_planes(setup, noise_px=0.5)
+    problem, state = replace(problem_of(setup), features=factor), setup.state
+    outcome = outcome_of(problem, state)
+    found = spent(problem, outcome)
+    own = paid(problem, state, dense, lambda p: factor.accumulate(state, p, factor.output(), curved=True))
+    on = {c.name: found[c.name, "points on planes"] for c in factor.cameras}
+    assert near(sum(found[c.name, "features"] + on[c.name] for c in factor.cameras) - 3 * factor.tracks.count, own)
+    rows = int((factor.on.plane >= 0).sum())
+    assert 0.1 * rows < sum(on.values()) < rows
+
+
 def test_degrees_of_freedom_of_points_on_planes(scanned, dense):
     problem, state = scanned
     found = spent(problem, outcome_of(problem, state))

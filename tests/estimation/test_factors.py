@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 import icalib.estimation
 from icalib.estimation.arrowhead import Piece, make_pieces
@@ -167,13 +168,26 @@ def corner_sample(
 
 
 def feature_sample(
-    unlike, setup_of, features_of, scheme="inertial", loss="none", imu_free=False, curved=False, restarts=False
+    unlike,
+    setup_of,
+    makers,
+    scheme="inertial",
+    loss="none",
+    imu_free=False,
+    curved=False,
+    restarts=False,
+    on_planes=False,
 ):
-    """Points are held where the cost is least at the sample's state; the weights take them out."""
+    """Points are held where the cost is least at the sample's state; the weights take them out. `on_planes`: many of
+    them have a row for the plane that they lie on, too."""
+    features_of, features_on_planes = makers
     setup = setup_of(unlike, imu_free=imu_free)
     setup = with_two_clocks(setup) if restarts else setup
     rng = np.random.default_rng(4)
-    factor = features_of(setup, scheme, (loss, LOSS_SCALE), 1.0)
+    if on_planes:
+        setup, factor = features_on_planes(setup, scheme, (loss, LOSS_SCALE), 1.0)
+    else:
+        factor = features_of(setup, scheme, (loss, LOSS_SCALE), 1.0)
     state = setup.perturbed(rng, 0.02)
     at_optimum = factor.output()
     for piece in make_pieces(len(state.seconds), setup.layout.size):
@@ -182,6 +196,15 @@ def feature_sample(
     world = factor._from_anchors(views, slice(0, factor.tracks.count), at_optimum.points)
     used = [root > 0 for root in at_optimum.root]
     track = np.concatenate([t[u] for t, u in zip(factor.tracks.track, used, strict=True)])
+    on = np.flatnonzero(factor.on.plane >= 0)
+
+    def planes(at):
+        found = np.array([at.values[factor.surfaces.keys[q]] for q in factor.on.plane[on]]).reshape(-1, 6)
+        return found[:, :3], found[:, 3:]
+
+    def off(at, points):
+        normal, point = planes(at)
+        return np.einsum("na,na->n", normal, points[on] - point)
 
     def errors(at, points):
         found = []
@@ -194,10 +217,10 @@ def feature_sample(
         return np.concatenate(found)
 
     def residual(at):
-        return errors(at, world).ravel()
+        return np.concatenate([errors(at, world).ravel(), off(at, world)])
 
     def weights(at):
-        e = errors(at, world)
+        e, d = errors(at, world), off(at, world)
         root = np.concatenate([r[u] for r, u in zip(at_optimum.root, used, strict=True)])
         sigma = np.repeat(factor.sigma, [u.sum() for u in used])
         size = np.linalg.norm(e, axis=1)
@@ -207,13 +230,17 @@ def feature_sample(
         blocks = (root**2)[:, None, None] * (np.eye(2) + (bend - 1.0)[:, None, None] * along)
         W[np.arange(len(e)), :, np.arange(len(e))] = blocks
         W = W.reshape(2 * len(e), 2 * len(e))
-        F, h = np.zeros((2 * len(e), 3 * factor.tracks.count)), 1e-5
+        bent = slope_along(loss if curved else "none", np.abs(d) / factor.on.sigma[on])
+        W = block_diag(W, np.diag(at_optimum.off.root[on] ** 2 * bent))
+        F, h = np.zeros((len(W), 3 * factor.tracks.count)), 1e-5
         for k in range(3):
             step = h * np.eye(3)[k]
             slope = (errors(at, world + step) - errors(at, world - step)) / (2 * h)
             for r in range(2):
                 F[2 * np.arange(len(e)) + r, 3 * track + k] = slope[:, r]
-        y = (root[:, None] ** 2 * e).ravel()
+        for k in range(len(on)):
+            F[2 * len(e) + k, 3 * on[k] : 3 * on[k] + 3] = planes(at)[0][k]
+        y = np.concatenate([(root[:, None] ** 2 * e).ravel(), at_optimum.off.root[on] ** 2 * d])
         return y, W - W @ F @ np.linalg.solve(F.T @ W @ F, F.T @ W)
 
     def accumulate(at, piece, sums):
@@ -477,6 +504,15 @@ SAMPLES = {
         lambda u, s, f: feature_sample(u, s, f, "kinematic", imu_free=True),
     ),
     "features, pose": ("FeatureFactor", lambda u, s, f: feature_sample(u, s, f, "pose")),
+    "features on planes": ("FeatureFactor", lambda u, s, f: feature_sample(u, s, f, on_planes=True)),
+    "features on planes, intrinsics, huber, curved": (
+        "FeatureFactor",
+        lambda u, s, f: feature_sample(u, s, f, loss="huber", imu_free=True, curved=True, on_planes=True),
+    ),
+    "features on planes, cauchy, curved, pose": (
+        "FeatureFactor",
+        lambda u, s, f: feature_sample(u, s, f, "pose", "cauchy", curved=True, on_planes=True),
+    ),
     "features, huber": ("FeatureFactor", lambda u, s, f: feature_sample(u, s, f, loss="huber")),
     "features, cauchy, curved, pose": (
         "FeatureFactor",
@@ -602,10 +638,10 @@ def scales(sample):
 
 
 @pytest.fixture(scope="module", params=SAMPLES)
-def sample(request, unlike, setup_of, factor_of, features_of, sparse_room, room_of):
+def sample(request, unlike, setup_of, factor_of, features_of, features_on_planes, sparse_room, room_of):
     name, make = SAMPLES[request.param]
     in_room = name == "LidarFactor"
-    factors = features_of if name == "FeatureFactor" else factor_of
+    factors = (features_of, features_on_planes) if name == "FeatureFactor" else factor_of
     made = make(unlike, (sparse_room, room_of) if in_room else setup_of, factors)
     assert made.factor == name
     return made

@@ -67,13 +67,14 @@ def test_planes_and_points_are_those_of_the_faces(robot):
     # Seen from the middle, walls, floor and ceiling show their front.
     middle = np.array([0.0, 0.0, 1.5])
     assert (planes[:6, :3] @ middle > planes[:6, 3]).all()
-    points = robot.room.points(3000, np.random.default_rng(1))
+    points, normals = robot.room.points(3000, np.random.default_rng(1))
     gap = np.abs(points @ planes[:, :3].T - planes[:, 3])
     assert gap.min(axis=1).max() < 1e-12
+    np.testing.assert_allclose(normals, planes[gap.argmin(axis=1), :3], atol=1e-12)
     floor = np.abs(points[:, 2]) < 1e-12
     share = 120.0 / (120.0 + 120.0 + 2 * 3.2 * 22.0 + 25.0)  # 25 m^2 or so of blocks
     assert floor.mean() == pytest.approx(share, abs=0.03)
     hilly = replace(robot.room, hills=hills_of_slope(12.0))
-    points = hilly.points(2000, np.random.default_rng(1))
+    points, _ = hilly.points(2000, np.random.default_rng(1))
     on_hills = np.abs(points[:, 2] - hilly.hills.height(points[:, :2])) < 1e-12
     assert 0.2 < on_hills.mean() < 0.5

@@ -307,7 +307,7 @@ def _warnings(
     for f in judged:
         if f.kind in ("gyroscope", "accelerometer"):
             yield from _imu_noise_warnings(f)
-    yield from camera_warnings(inputs.rig.cameras, judged)
+    yield from camera_warnings(inputs.rig, judged)
     yield from robot_warnings(inputs.rig, judged)
     yield from pose_warnings(poses, inputs.rig)
     yield from lidar_warnings(inputs, found) if inputs.clouds.count else ()

@@ -9,9 +9,10 @@ import numpy as np
 
 from icalib.assessment.excess import excess, times
 from icalib.calibration import ParameterGroup, SensorFit
+from icalib.estimation.surfaces import ON_PLANES
 from icalib.estimation.tolerances import GUESS_SIGMA
 from icalib.geometry import so3
-from icalib.rig import Camera
+from icalib.rig import Camera, Rig
 
 GIVEN = ("rotation", "translation", "intrinsics")
 FAR = 0.5  # of what guesses are worth: 5 cm, 3 deg, 8 px
@@ -20,13 +21,23 @@ POOR_FIT_PX = 1.0  # RMS: detectors are off by a tenth of that, blurred images b
 MANY_REJECTED = 0.05
 
 
-def camera_warnings(cameras: Sequence[Camera], judged: Sequence[SensorFit]) -> Iterator[str]:
-    """What corners leave, one sentence each."""
-    stated = {c.name for c in cameras if c.corner_noise_px is not None}
+def camera_warnings(rig: Rig, judged: Sequence[SensorFit]) -> Iterator[str]:
+    """What corners leave, and points on planes, one sentence each."""
+    if rig.settings.points_on_planes_m > 0.0 and not any(f.kind == ON_PLANES for f in judged):
+        yield (
+            "no points that cameras follow lie on planes of the LiDARs, so points_on_planes_m in the rig file counts "
+            "for nothing; make it larger, or take it out where little is flat."
+        )
+    stated = {c.name for c in rig.cameras if c.corner_noise_px is not None}
     for f in judged:
         if f.kind in ("corners", "features") and f.rejected > MANY_REJECTED * 0.5 * f.count:
             share = f.rejected / (f.rejected + 0.5 * f.count)
             yield f"{share:.0%} of the {f.kind} of {f.sensor} were set aside; look at its residuals in the report."
+        if f.kind == ON_PLANES and excess(f) > 1.0:
+            yield (
+                f"points that {f.sensor} follows lie {times(f)} as far from planes of the LiDARs as points_on_planes_m "
+                "in the rig file says: make it larger, or take it out where little is flat."
+            )
         if f.kind != "corners":
             continue
         if f.sensor in stated and excess(f) > 1.0:

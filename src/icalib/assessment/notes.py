@@ -44,6 +44,12 @@ def _feature_notes(found: Estimate):
         f"{all_of_them} points of the scene were followed, in {factor.tracks.count} tracks that show where they are; "
         "tracks that do not, for lack of parallax, are left out."
     )
+    if factor.surfaces is not None:
+        plane = factor.on.plane[factor.on.plane >= 0]
+        yield (
+            f"{len(plane)} of the tracks lie on {len(np.unique(plane))} planes that LiDARs see, to within "
+            f"{1e3 * factor.surfaces.noise:.1f} mm, as the rig file has it."
+        )
     for camera, sigma, root, stream in zip(factor.cameras, factor.sigma, out.root, factor.streams, strict=True):
         share = f"{int((root > 0.0).sum())} of {len(stream.uv)}"
         yield f"{camera.name}: track noise {sigma:.3f} px; {share} observations of tracks are in use."

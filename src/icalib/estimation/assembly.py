@@ -28,6 +28,7 @@ from icalib.estimation.problem import ChainFactor, Problem
 from icalib.estimation.robot import NO_CLOUDS, NO_ROBOT, Clouds, RobotNoise, frame_entries, own_entries, robot_factors
 from icalib.estimation.sensors import SensorFactor
 from icalib.estimation.state import Entry, Key, Kind, Layout, State, make_layout
+from icalib.estimation.surfaces import Surfaces
 from icalib.estimation.tolerances import Tolerances
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets.base import BOARD
@@ -333,7 +334,17 @@ def _features(inputs: Inputs, state: State, cameras: tuple[CornerFactor, ...], f
     cuts, seams = chain_cuts(len(state.seconds)), state.starts[1:]
     if following.cut:
         cuts = (*cuts, *(int(k) + 1 for k in np.flatnonzero(np.diff(np.floor(state.seconds / CUT_S)))))
-    return FeatureFactor.build(cameras, streams, following.sigma, tuple(keep), loss, state, cuts, seams)
+    surfaces = _surfaces(inputs, state, following.cut)
+    return FeatureFactor.build(cameras, streams, following.sigma, tuple(keep), loss, state, cuts, seams, surfaces)
+
+
+def _surfaces(inputs: Inputs, state: State, coarse: bool) -> Surfaces | None:
+    """Planes that points of the scene lie on, where the rig says that they do."""
+    clouds, noise = inputs.clouds, inputs.rig.settings.points_on_planes_m
+    if not clouds.count or noise == 0.0:
+        return None
+    seen = list(zip(inputs.measurements.lidars, clouds.plane, strict=True))
+    return Surfaces.seen(clouds.keys, clouds.recording, seen, motion_of(inputs, state), noise, coarse)
 
 
 def _nodes_of(scheme: Scheme, state: State, times: np.ndarray, images: list[slice], forwards: bool) -> np.ndarray:

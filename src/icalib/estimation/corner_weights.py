@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
 LEAST_CURVATURE = 1e-3
+
+
+class Loss(NamedTuple):
+    """Robust loss of whitened rows, where it bends, and whether the sums have its true curvature."""
+
+    kind: int
+    scale: float
+    curved: bool
 
 
 @njit(cache=True, nogil=True)

@@ -21,6 +21,7 @@ from icalib.estimation.parts import Parts
 from icalib.estimation.problem import Problem, Residuals
 from icalib.estimation.solver import Outcome, posterior
 from icalib.estimation.state import State
+from icalib.estimation.surfaces import ON_PLANES
 
 IMAGE_CELLS = (4, 3)  # columns, rows
 TARGET_PARTS = 3  # along each side
@@ -31,8 +32,8 @@ DRAW_STEP = 1e-3  # of a posterior sample: small enough to be linear
 class Fit:
     """chi^2 of one kind of residual, their number, and the degrees of freedom that are left after the fit.
 
-    kind: "gyroscope", "accelerometer", "bias walk", "corners", "features", or "common error 0", 1, ... for the images'
-    own.
+    kind: "gyroscope", "accelerometer", "bias walk", "corners", "features", "points on planes", or "common error 0", 1,
+    ... for the images' own.
     """
 
     sensor: str
@@ -66,10 +67,15 @@ def chi2_by_kind(problem: Problem, at: Residuals) -> dict[tuple[str, str], tuple
         if len(camera.stream.uv):
             found |= {(camera.name, kind): own for kind, own in _corner_chi2(camera, corners).items()}
     if problem.features is not None and at.features is not None:
-        left = at.features
-        for camera, residual, root in zip(problem.features.cameras, left.residual, left.root, strict=True):
+        left, off = at.features, at.features.off
+        for i, (camera, residual, root) in enumerate(
+            zip(problem.features.cameras, left.residual, left.root, strict=True)
+        ):
             chi2 = float(((residual * root[:, None]) ** 2).sum())
             found[camera.name, "features"] = 2 * int((root > 0.0).sum()), chi2
+            if len(own := problem.features.on_planes_of(i)):
+                chi2 = float(((off.residual * off.root)[own] ** 2).sum())
+                found[camera.name, ON_PLANES] = len(own), chi2
     for sensor, rows in zip(problem.sensors, at.sensors, strict=True):
         for kind, r in sensor.kinds.items():
             found[sensor.name, kind] = sensor.count(rows, kind), sensors.chi2(rows, r)
@@ -78,10 +84,12 @@ def chi2_by_kind(problem: Problem, at: Residuals) -> dict[tuple[str, str], tuple
 
 def raw_rms(problem: Problem, out: Residuals, sensor: str, kind: str) -> tuple[float | None, str]:
     """RMS of one kind of residual as it was before whitening, and its unit; None where it has none."""
-    if kind == "features":
+    if kind in ("features", ON_PLANES):
         factor, left = problem.features, out.features
         assert factor is not None and left is not None
         i = [c.name for c in factor.cameras].index(sensor)
+        if kind == ON_PLANES:
+            return float(np.sqrt(np.mean(left.off.residual[factor.on_planes_of(i)] ** 2))), "m"
         return _rms_px(left.residual[i], left.root[i]), "px"
     for camera, corners in zip(problem.cameras, out.corners, strict=True):
         if camera.name == sensor:
@@ -135,8 +143,8 @@ def _residuals(problem: Problem, state: State) -> Residuals:
 
 
 def _spent_by_features(factor: FeatureFactor, at: FeatureOutput, there: FeatureOutput) -> dict[tuple[str, str], float]:
-    """|J x|^2 of each camera's features. Their points follow x, and three degrees of freedom a point are its own, the
-    cameras' shares by the number of observations."""
+    """|J x|^2 of each camera's features. Their points follow x, and three degrees of freedom a point are its own: the
+    plane that it lies on pays for its share, and the cameras by the number of observations."""
     count = np.zeros(factor.tracks.count)
     used = [root > 0.0 for root in at.root]
     for track, u in zip(factor.tracks.track, used, strict=True):
@@ -145,8 +153,14 @@ def _spent_by_features(factor: FeatureFactor, at: FeatureOutput, there: FeatureO
     for i, camera in enumerate(factor.cameras):
         root, u = at.root[i], used[i]
         slope = (there.residual[i] - at.residual[i]) / DRAW_STEP
-        own = float((3.0 / count[factor.tracks.track[i][u]]).sum())
+        own = float(((3.0 - at.off.share) / np.maximum(count, 1))[factor.tracks.track[i][u]].sum())
         spent[camera.name, "features"] = own + float(((slope * root[:, None])[u] ** 2).sum())
+        if len(on := factor.on_planes_of(i)):
+            slope = (there.off.residual - at.off.residual)[on] / DRAW_STEP * at.off.root[on]
+            # Of several on a patch each row weighs less than what it is off by would have it.
+            left, weight = 1.0 - at.off.share[on], factor.on.weight[on]
+            own = float((1.0 - left * (left * weight + at.off.share[on])).sum())
+            spent[camera.name, ON_PLANES] = own + float((slope**2).sum())
     return spent
 
 

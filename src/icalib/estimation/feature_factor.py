@@ -4,12 +4,13 @@ residual = K(R_cam_world (P - p_world_cam)) - uv
 
 Points are no part of the state: at every linearisation each is moved to where the poses and the calibration want it
 (variable projection), so that the cost is the least over all points. Their columns are eliminated with the nodes that
-saw them (`front.py`).
+saw them (`front.py`). Those that lie on planes of the LiDARs have a row for that, too (`surfaces.py`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from icalib.estimation.arrowhead import Piece
 from icalib.estimation.clocks import clock_of, mounted_columns
 from icalib.estimation.corner_factor import LOSSES, CornerFactor
 from icalib.estimation.corner_kernels import Motion
+from icalib.estimation.corner_weights import Loss
 from icalib.estimation.feature_kernels import (
     Points,
     Range,
@@ -32,7 +34,16 @@ from icalib.estimation.feature_kernels import (
 )
 from icalib.estimation.front import Features
 from icalib.estimation.front_plan import FeatureSums, plan
+from icalib.estimation.lidar_kernels import Planes
 from icalib.estimation.state import Layout, State
+from icalib.estimation.surfaces import (
+    NOWHERE,
+    Distances,
+    OnPlanes,
+    Surfaces,
+    add_planes_to_points,
+    add_points_on_planes,
+)
 from icalib.estimation.tracks import NO_TRACKS, Sightings, Tracks
 from icalib.measurements import TrackStream
 
@@ -46,11 +57,12 @@ MOST_UNLIKE = 10.0  # times the residuals of most points: a point that fits wors
 @dataclass(frozen=True)
 class FeatureOutput:
     """By camera: residual (N, 2) px, predicted - measured, and root (N,), square root of its weight over sigma (0 where
-    left out); points (T, 3) in the frames of the cameras that they move with."""
+    left out); points (T, 3) in the frames of the cameras that they move with, and how far each is off its plane."""
 
     residual: tuple[np.ndarray, ...]
     root: tuple[np.ndarray, ...]
     points: np.ndarray
+    off: Distances
 
 
 @dataclass(frozen=True)
@@ -68,7 +80,8 @@ class View:
 @dataclass(frozen=True)
 class FeatureFactor:
     """All features of all cameras. cameras: their poses and models; streams: one per camera, on its images; sigma: px,
-    by camera; keep: (N,) by camera, observations in use; seams: nodes at which further recordings begin."""
+    by camera; keep: (N,) by camera, observations in use; seams: nodes at which further recordings begin; surfaces:
+    planes that points may lie on, and which tracks are on them."""
 
     cameras: tuple[CornerFactor, ...]
     streams: tuple[TrackStream, ...]
@@ -79,6 +92,8 @@ class FeatureFactor:
     tracks: Tracks
     layout: Layout
     seams: tuple[int, ...] = ()
+    surfaces: Surfaces | None = None
+    on: OnPlanes = NOWHERE
 
     @classmethod
     def build(
@@ -91,9 +106,10 @@ class FeatureFactor:
         state: State,
         cuts: tuple[int, ...],
         seams: tuple[int, ...] = (),
+        surfaces: Surfaces | None = None,
     ) -> FeatureFactor:
         """Tracks chosen, and points first looked for, with the poses of `state`; the chain is cut at nodes `cuts`."""
-        factor = cls(cameras, streams, sigma, keep, loss[0], loss[1], NO_TRACKS, cameras[0].layout, seams)
+        factor = cls(cameras, streams, sigma, keep, loss[0], loss[1], NO_TRACKS, cameras[0].layout, seams, surfaces)
         return factor.cut(state, cuts)
 
     @property
@@ -112,23 +128,24 @@ class FeatureFactor:
         edges = np.unique([0, *cuts, *self.seams, self.n_nodes])
         sightings = self._sightings()
         label = sightings.in_order(sightings.labels(state.seconds, edges, LONGEST_GAP_S))
-        factor = replace(self, tracks=sightings.tracks(label, edges))
-        points, good = factor._triangulated(state)
+        tracks = sightings.tracks(label, edges)
+        factor = replace(self, tracks=tracks, on=OnPlanes.none(tracks.count))
+        points, good, on = factor._triangulated(state)
         label = np.where(label >= 0, np.where(np.append(good, False)[label], label, -1), -1)
         number = np.append(np.where(good, np.cumsum(good) - 1, -1), -1)
-        factor = replace(factor, tracks=sightings.tracks(number[label], edges))
-        return replace(factor, tracks=replace(factor.tracks, start=points[good]))
+        tracks = sightings.tracks(number[label], edges)
+        return replace(factor, tracks=replace(tracks, start=points[good]), on=on)
 
-    def _triangulated(self, state: State) -> tuple[np.ndarray, np.ndarray]:
-        """Points (T, 3) in the frames of the cameras that they move with, from the rays with the poses of `state`, and
-        whether each is certain enough."""
+    def _triangulated(self, state: State) -> tuple[np.ndarray, np.ndarray, OnPlanes]:
+        """Points (T, 3) in the frames of the cameras that they move with, from the rays with the poses of `state`;
+        whether each is certain enough; and of those that are, the planes that they lie on."""
         views, n = self._views(state, 0, self.n_nodes), self.tracks.count
         A, b = np.tile(1e-9 * np.eye(3), (n, 1, 1)), np.zeros((n, 3))
         for view in views:
             rays, valid = view.camera.model.unproject(view.params, view.seen.uv)
             motion = view.motion
             add_rays(view.seen, 0, motion.R_cam_world, motion.p_world_cam, rays, valid, A, b)
-        found = self._descend(views, np.linalg.solve(A, b[:, :, None])[:, :, 0], slice(0, n))
+        found = self._descend(views, np.linalg.solve(A, b[:, :, None])[:, :, 0], slice(0, n), None)
         points = self._in_anchors(views, found.xyz, slice(0, n))
         distance = np.linalg.norm(points, axis=1)
         information = np.linalg.eigvalsh(found.A)[:, 0]
@@ -139,14 +156,24 @@ class FeatureFactor:
         square = found.cost / np.maximum(seen, 1)
         fits = square <= MOST_UNLIKE**2 * np.median(square[found.shown == seen] if n else 0.0) + MOST_UNLIKE
         certain = information * (MOST_UNCERTAIN * distance) ** 2 > 1.0
-        return points, np.isfinite(points).all(axis=1) & (found.shown == seen) & fits & certain
+        good = np.isfinite(points).all(axis=1) & (found.shown == seen) & fits & certain
+        if self.surfaces is None:
+            return points, good, OnPlanes.none(int(good.sum()))
+        recording = np.searchsorted(state.starts, self.tracks.stretch_of()[good], side="right") - 1
+        return points, good, self.surfaces.under(found.xyz[good], found.A[good], recording)
+
+    def on_planes_of(self, camera: int) -> np.ndarray:
+        """Those tracks on planes whose points move with camera number `camera`."""
+        return np.flatnonzero((self.on.plane >= 0) & (self.tracks.camera == camera))
 
     def output(self) -> FeatureOutput:
         """Empty arrays for `accumulate` to fill."""
         sizes = [len(s.uv) for s in self.streams]
+        points = self.tracks.count
         return FeatureOutput(
-            tuple(np.zeros((n, 2)) for n in sizes), tuple(np.zeros(n) for n in sizes), np.zeros((self.tracks.count, 3))
-        )
+            tuple(np.zeros((n, 2)) for n in sizes), tuple(np.zeros(n) for n in sizes), np.zeros((points, 3)),
+            Distances.zeros(points),
+        )  # fmt: skip
 
     def settled(self, at: FeatureOutput) -> FeatureFactor:
         """The same features, first looked for where `at` found them: from far off a point may stop short, or end
@@ -178,7 +205,8 @@ class FeatureFactor:
         """
         tracks, pairs = self._within(piece)
         views, base = self._views(state, piece.first, self._stop(piece)), Range(tracks.start, pairs.start)
-        points = self._descend(views, self._from_anchors(views, tracks, self.tracks.start[tracks]), tracks)
+        planes = self._planes(state)
+        points = self._descend(views, self._from_anchors(views, tracks, self.tracks.start[tracks]), tracks, planes)
         out.points[tracks] = self._in_anchors(views, points.xyz, tracks)
         into = piece.sums(sums)
         features = NO_SUMS
@@ -196,9 +224,27 @@ class FeatureFactor:
             total += accumulate(
                 X, view.seen, base, view.motion, seeing, weighing, into, mine, out.residual[i], out.root[i]
             )
+        if planes is not None:
+            loss, off = self._loss(curved), out.off.of(tracks)
+            total += add_points_on_planes(self.on.of(tracks), planes, loss, points, features, piece, off)
         if sums and piece.features is not None:
             piece.border[-1, -1] += held_back(features)
         return total
+
+    def _planes(self, state: State) -> Planes | None:
+        """As `state` has them; None where no point lies on any."""
+        if self.surfaces is None or not (self.on.plane >= 0).any():
+            return None
+        return Planes.of(np.array([state.values[key] for key in self.surfaces.keys]), self._of_planes)
+
+    @cached_property
+    def _of_planes(self) -> np.ndarray:
+        """(P, 3) border columns of each plane."""
+        keys = () if self.surfaces is None else self.surfaces.keys
+        return np.array([self.layout.block(*key).columns for key in keys])
+
+    def _loss(self, curved: bool) -> Loss:
+        return Loss(LOSSES[self.loss], self.loss_scale, curved)
 
     def _within(self, piece: Piece) -> tuple[slice, slice]:
         return self.tracks.within(piece.first, self._stop(piece))
@@ -263,8 +309,8 @@ class FeatureFactor:
         found = view.camera.model.project_with_jacobians(view.params, X)
         return Seeing(int(view.seen.start[0]), *found, pars, columns[pars])
 
-    def _descend(self, views: list[View], xyz: np.ndarray, tracks: slice) -> Points:
-        """The points of `tracks` where their cost is least, from `xyz` (n, 3) on."""
+    def _descend(self, views: list[View], xyz: np.ndarray, tracks: slice, planes: Planes | None) -> Points:
+        """The points of `tracks` where their cost is least, that of their `planes` with it, from `xyz` (n, 3) on."""
         n, eyes = len(xyz), self._from_anchors(views, tracks, np.zeros_like(xyz))
         points = Points(
             eyes, xyz, xyz.copy(), np.zeros(n), np.zeros(n), np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3, 3)),
@@ -274,6 +320,8 @@ class FeatureFactor:
         for step in range(MOST_STEPS):
             for view in views:
                 self._add_to_points(view, tracks.start, points)
+            if planes is not None:
+                add_planes_to_points(self.on.of(tracks), planes, self._loss(False), points)
             if take_trials(points, step == 0) == 0:
                 break
         return points

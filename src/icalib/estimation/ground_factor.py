@@ -37,12 +37,12 @@ HEIGHT_BLOCK = "ground_height"
 N_COLUMNS = 10  # of the border: rotation 3, translation 3, height 1, plane 3
 
 
-def floors(state: State, keys: tuple[Key, ...], points: np.ndarray) -> tuple[Key | None, ...]:
+def floors(state: State, keys: tuple[Key, ...], points: np.ndarray, recording: np.ndarray) -> tuple[Key | None, ...]:
     """The key of the floor in each recording, None where it is not seen; points (P,): how many lie on each of the
-    planes `keys`. Planes of several recordings are called after theirs, see `joined_clouds`."""
-    several, found = len(state.recordings) > 1, []
-    for r, nodes in enumerate(state.recordings, 1):
-        own = [k for k, (name, _) in enumerate(keys) if not several or name.startswith(f"plane {r}.")]
+    planes `keys`, which belong to `recording` (P,)."""
+    found = []
+    for r, nodes in enumerate(state.recordings):
+        own = np.flatnonzero(recording == r)
         middle = state.position[nodes].mean(axis=0)
         seen = [k for k in own if _is_floor(state.values[keys[k]], middle)]
         found.append(keys[max(seen, key=lambda k: points[k])] if seen else None)

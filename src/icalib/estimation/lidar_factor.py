@@ -24,7 +24,6 @@ from icalib.estimation.lidar_sweep import Motion as ImuMotion
 from icalib.estimation.poses import assign_nodes, poses_at
 from icalib.estimation.sensors import Whitened
 from icalib.estimation.state import Key, Layout, State
-from icalib.geometry.planes import tangents
 from icalib.measurements import LidarStream
 from icalib.rig import Scheme
 
@@ -107,9 +106,7 @@ class LidarFactor:
 
     def _chunks(self, state: State, b0: int, b1: int) -> Iterator[tuple[Bins, Motion, Planes]]:
         """Bins b0..b1 by the chunk, with their motion and the planes."""
-        value = np.array([state.values[p] for p in self.planes])
-        across = np.array([tangents(v[:3]) for v in value])
-        planes = Planes(value[:, :3].copy(), across, value[:, 3:].copy(), self._of_planes)
+        planes = Planes.of(np.array([state.values[p] for p in self.planes]), self._of_planes)
         R_il = np.ascontiguousarray(state.values[self.name, "rotation"])
         p_il = state.values[self.name, "translation"]
         imu_free = self.layout.is_free(self.imu.name, "intrinsics")

@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 
 from icalib.estimation.corner_chain import by_imu_pose
+from icalib.geometry.planes import tangents
 
 POSE, PLANE = 6, 3
 ROWS = 4  # whitened residuals of a plane in a bin
@@ -36,6 +37,12 @@ class Planes(NamedTuple):
     tangents: np.ndarray
     point: np.ndarray
     columns: np.ndarray
+
+    @classmethod
+    def of(cls, value: np.ndarray, columns: np.ndarray) -> Planes:
+        """From values (P, 6), see `geometry.planes`."""
+        across = np.array([tangents(v[:3]) for v in value])
+        return cls(value[:, :3].copy(), across, value[:, 3:].copy(), columns)
 
 
 class Motion(NamedTuple):

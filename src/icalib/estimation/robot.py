@@ -59,6 +59,12 @@ class Clouds:
         return tuple((name, "plane") for name in self.names)
 
     @property
+    def recording(self) -> np.ndarray:
+        """(P,) number of the recording that each plane belongs to, see `joined_clouds`."""
+        numbers = (name.removeprefix("plane ").split(".") for name in self.names)
+        return np.array([int(n[0]) - 1 if len(n) > 1 else 0 for n in numbers], dtype=np.int64)
+
+    @property
     def entries(self) -> list[Entry]:
         """The planes as parameters of a layout."""
         return [(*key, "plane", 3, True) for key in self.keys]
@@ -215,7 +221,7 @@ def ground_factors(rig: Rig, clouds: Clouds, motion: Motion, layout: Layout) -> 
             state = motion.state
             floor: tuple[Key | None, ...] = (None,) * len(state.recordings)
             if wheels.ground.plane == "floor" and clouds.count:
-                floor = floors(state, clouds.keys, clouds.points)
+                floor = floors(state, clouds.keys, clouds.points, clouds.recording)
             yield GroundFactor.build(wheels.name, wheels.ground, floor, state, motion.imu, layout)
 
 

@@ -8,10 +8,11 @@ import numpy as np
 
 from icalib.estimation.arrowhead import Piece
 from icalib.estimation.corner_factor import LOSSES
+from icalib.estimation.corner_weights import Loss
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.sensors import Whitened
 from icalib.estimation.state import Layout
-from icalib.estimation.wheel_kernels import Loss, Rows, accumulate_rows
+from icalib.estimation.wheel_kernels import Rows, accumulate_rows
 
 
 class Into(NamedTuple):

@@ -41,6 +41,10 @@ class Tracks:
     def count(self) -> int:
         return len(self.start)
 
+    def stretch_of(self) -> np.ndarray:
+        """(T,) the edge behind which each track lies."""
+        return self.edges[np.searchsorted(self.tracks_from, np.arange(self.count), side="right") - 1]
+
     def within(self, first: int, stop: int) -> tuple[slice, slice]:
         """Tracks and pairs of nodes first..stop, both of them edges."""
         a, b = np.searchsorted(self.edges, [first, stop])

@@ -58,14 +58,6 @@ class Rows(NamedTuple):
         return cls(np.empty((n, m)), np.zeros((k, m, 15)), np.zeros((k, m, 15)), np.zeros((k, m, N_OWN + n_imu)))
 
 
-class Loss(NamedTuple):
-    """Robust loss of the whitened rows, where it bends, and whether the sums have its true curvature."""
-
-    kind: int
-    scale: float
-    curved: bool
-
-
 @njit(cache=True, nogil=True)
 def _cross(a, b):
     return np.array((a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]))

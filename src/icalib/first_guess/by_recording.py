@@ -109,15 +109,6 @@ def points_by_recording(inputs: Inputs) -> list[tuple[LidarStream, ...]]:
     scans = [[len(part.measurements.lidars[i].stamps_ns) for part in inputs.parts] for i in range(len(streams))]
     own = [np.repeat(np.arange(len(n)), n) for n in scans]
     return [
-        tuple(with_points(s, np.repeat(o == r, np.diff(s.start))) for s, o in zip(streams, own, strict=True))
+        tuple(s.some(np.repeat(o == r, np.diff(s.start))) for s, o in zip(streams, own, strict=True))
         for r in range(len(inputs.parts))
     ]
-
-
-def with_points(stream: LidarStream, kept: np.ndarray) -> LidarStream:
-    """The stream with the points in `kept` (N,) bool; its scans stay, if empty."""
-    if kept.all():
-        return stream
-    start = np.concatenate([[0], np.cumsum(kept)])[stream.start].astype(np.int64)
-    columns = {name: getattr(stream, name)[kept] for name in ("offset_s", "xyz", "plane")}
-    return replace(stream, start=start, **columns)

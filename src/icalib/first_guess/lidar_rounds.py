@@ -39,7 +39,6 @@ from icalib.first_guess.by_recording import (
     naming_recording,
     other_clocks,
     points_by_recording,
-    with_points,
 )
 from icalib.first_guess.lidar import Held, lidar_and_motion, lidar_on_motion
 from icalib.first_guess.lidar_planes import ROUNDS, Association, associate, odd_step, round_search
@@ -144,7 +143,7 @@ def _thinned(inputs: Inputs, step: int) -> Inputs:
     """With every `step`th point only, no more than the search for planes looks at: where all is does not depend on
     more, and the last round uses all."""
     streams = inputs.measurements.lidars
-    fewer = tuple(with_points(s, np.arange(len(s.xyz)) % step == 0) for s in streams)
+    fewer = tuple(s.some(np.arange(len(s.xyz)) % step == 0) for s in streams)
     return replace(inputs, measurements=replace(inputs.measurements, lidars=fewer))
 
 
@@ -206,7 +205,7 @@ def while_known(inputs: Inputs, state: State) -> Inputs:
             )
         size2 = np.einsum("na,na->n", stream.xyz, stream.xyz)
         usable = np.isfinite(size2) & (size2 > 0.0)
-        lidars.append(with_points(stream, np.repeat(known, np.diff(stream.start)) & usable))
+        lidars.append(stream.some(np.repeat(known, np.diff(stream.start)) & usable))
     return replace(inputs, measurements=replace(measured, lidars=tuple(lidars), notes=tuple(notes)))
 
 

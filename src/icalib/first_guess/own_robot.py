@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.first_guess.by_recording import with_points
 from icalib.first_guess.lidar_odometry import MOST_MAPPED, LidarPath, lidar_path, scans_of
 from icalib.geometry import so3
 from icalib.measurements import LidarStream, Measurements
@@ -40,7 +39,7 @@ def without_own_robot(recording: Measurements) -> Measurements:
         own = None if (stream.plane >= 0).any() else own_points(stream)
         if own is not None:
             warnings.append(_words(stream, own))
-            stream = with_points(stream, ~own)
+            stream = stream.some(~own)
         lidars.append(stream)
     return replace(recording, lidars=tuple(lidars), warnings=tuple(warnings))
 
@@ -129,7 +128,7 @@ def _path_without(stream: LidarStream, steady: np.ndarray) -> LidarPath | None:
     kept[::step] = True
     kept[steady] = False
     try:
-        return lidar_path(stream.name, scans_of(with_points(stream, kept)))
+        return lidar_path(stream.name, scans_of(stream.some(kept)))
     except EstimationError:
         return None
 

@@ -57,12 +57,18 @@ def _rig(root: YamlValue) -> Rig:
             f"{' and '.join(blind)}."
         )
     _refuse_unseen_ground(found["sensors"], sensors, targeted)
+    settings = _settings(found["settings"]) if "settings" in found else Settings()
+    followed = any(c.tracks is not None for c in sensors.cameras)
+    if settings.points_on_planes_m > 0.0 and not (sensors.lidars and followed):
+        found["settings"].entries()["points_on_planes_m"].fail(
+            "needs a LiDAR that sees planes, and a camera with tracks that follows points on them; take it out."
+        )
     return Rig(
         imu=sensors.imus[0] if sensors.imus else None,
         cameras=tuple(sensors.cameras),
         target=target_or_targets(root) if targeted else NoTarget(),
         gravity=found["gravity"].positive() if "gravity" in found else Rig.gravity,
-        settings=_settings(found["settings"]) if "settings" in found else Settings(),
+        settings=settings,
         lidars=tuple(sensors.lidars),
         wheels=tuple(sensors.wheels),
         poses=tuple(sensors.poses),
@@ -271,7 +277,7 @@ def _settings(value: YamlValue) -> Settings:
     return Settings(**{name: _setting(name, given, kinds[name]) for name, given in found.items()})
 
 
-_MAY_BE_ZERO = ("outlier_std", "outlier_min_px")
+_MAY_BE_ZERO = ("outlier_std", "outlier_min_px", "points_on_planes_m")
 
 
 def _setting(name: str, value: YamlValue, kind: Any) -> Any:

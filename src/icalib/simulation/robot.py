@@ -74,7 +74,8 @@ class Features:
 
     Of `count` points the first `lasting` keep their number for ever; any other has a new number when no camera saw it
     for 1.5 periods of the slowest camera, or after longest_track_s. A camera follows at most per_image points, none
-    further away than range_m. The points are those of `seed`, whatever the seed of the simulation.
+    further away than range_m. The points are those of `seed`, whatever the seed of the simulation; they lie off their
+    surfaces by relief_m (standard deviation).
     """
 
     count: int = 1500
@@ -83,6 +84,7 @@ class Features:
     per_image: int = 100
     range_m: float = 15.0
     seed: int = 0
+    relief_m: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

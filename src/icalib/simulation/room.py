@@ -133,8 +133,9 @@ class Room:
             hills.steepest if self.hills else 0.0,
         )
 
-    def points(self, count: int, rng: np.random.Generator) -> np.ndarray:
-        """(count, 3) points spread over all surfaces by area, hills as if they were flat."""
+    def points(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """(count, 3) points spread over all surfaces by area, hills as if they were flat, and the surfaces' normals
+        there, upwards on hills."""
         u, v, triangle = self.faces[:, 1], self.faces[:, 2], self.faces[:, 3, 0] > 0.0
         area = np.linalg.norm(np.cross(u, v), axis=1) * np.where(triangle, 0.5, 1.0)
         ground = self.size[0] * self.size[1] if self.hills else 0.0
@@ -148,7 +149,7 @@ class Room:
         if self.hills:
             xy = (rng.random((count, 2)) - 0.5) * self.size[:2]
             found[on_ground] = np.column_stack([xy, self.hills.height(xy)])[on_ground]
-        return found
+        return found, np.where(on_ground[:, None], [0.0, 0.0, 1.0], _normals(self.faces)[face])
 
 
 def _normals(faces: np.ndarray) -> np.ndarray:

@@ -248,11 +248,13 @@ def _of_type(value: YamlValue, kind: type) -> Any:
 
 
 def _features(value: YamlValue) -> Features:
-    found = value.record((), ("count", "lasting", "longest_track", "per_image", "range", "seed"))
+    found = value.record((), ("count", "lasting", "longest_track", "per_image", "range", "seed", "relief"))
     least = {"count": 1, "lasting": 0, "per_image": 1, "seed": 0}
     chosen: dict[str, Any] = {key: found[key].whole(n) for key, n in least.items() if key in found}
     named = {"longest_track": "longest_track_s", "range": "range_m"}
     chosen |= {field: found[key].positive() for key, field in named.items() if key in found}
+    if "relief" in found:
+        chosen["relief_m"] = _least(found["relief"], 0.0)
     features = Features(**chosen)
     if features.lasting > features.count:
         value.fail(f"{features.lasting} lasting points are more than all {features.count}; lower lasting.")

@@ -38,7 +38,9 @@ class Followed:
 
 def follow(scenario: Scenario, room: Room, features: Features, trajectory: Trajectory, seed: int) -> Followed:
     """Tracks of all cameras. Images are those of the corners; noise is each camera's `corner_noise_px`."""
-    points = room.points(features.count, np.random.default_rng(features.seed))
+    rng = np.random.default_rng(features.seed)
+    surface, normal = room.points(features.count, rng)
+    points = surface + features.relief_m * rng.standard_normal((len(surface), 1)) * normal
     front_end = _FrontEnd(features, min(c.rate_hz for c in scenario.cameras), np.random.default_rng([seed, 2, 0, 1]))
     images = [image_stamps(scenario, c, np.random.default_rng([seed, 2 + i])) for i, c in enumerate(scenario.cameras)]
     for camera, (stamps, _) in zip(scenario.cameras, images, strict=True):
@@ -48,7 +50,7 @@ def follow(scenario: Scenario, room: Room, features: Features, trajectory: Traje
     poses = [trajectory.pose_at(seconds)[:2] for _, seconds in images]
     for seconds, i, k in due:
         camera, (rotation, position) = scenario.cameras[i], poses[i]
-        seen, uv = _view(camera, room, features, points, rotation[k], position[k])
+        seen, uv = _view(camera, room, features, points, surface, rotation[k], position[k])
         chosen, number = front_end.choose(i, seconds, seen)
         taken[i].append((number, uv[chosen]))
     noise = float(scenario.robot_noise_enabled)
@@ -63,9 +65,16 @@ def follow(scenario: Scenario, room: Room, features: Features, trajectory: Traje
 
 
 def _view(
-    camera: SimCamera, room: Room, features: Features, points: np.ndarray, rotation: np.ndarray, position: np.ndarray
+    camera: SimCamera,
+    room: Room,
+    features: Features,
+    points: np.ndarray,
+    surface: np.ndarray,
+    rotation: np.ndarray,
+    position: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers of the points that are in the picture and not hidden, and the pixels (N, 2) of all points."""
+    """Numbers of the points that are in the picture and not hidden, which is judged where they would be without relief,
+    on the `surface`; and the pixels (N, 2) of all points."""
     eye = position + rotation @ camera.T_imu_cam[:3, 3]
     rays = points - eye
     local = rays @ (rotation @ camera.T_imu_cam[:3, :3])
@@ -75,9 +84,10 @@ def _view(
     uv[near] = project(camera, local[near])
     seen = np.flatnonzero(near)
     seen = seen[visible(camera, local[seen], uv[seen])]
-    met = np.empty(len(seen))
-    distances(room.surfaces, np.broadcast_to(eye, (len(seen), 3)), rays[seen], met)
-    return seen[met * far[seen] > far[seen] - 1e-4], uv
+    met, rays = np.empty(len(seen)), surface[seen] - eye
+    far = np.linalg.norm(rays, axis=1)
+    distances(room.surfaces, np.broadcast_to(eye, (len(seen), 3)), rays, met)
+    return seen[met * far > far - 1e-4], uv
 
 
 class _FrontEnd:

@@ -120,12 +120,12 @@ def test_the_floor_is_the_level_plane_below_with_most_points(world_of, drive_of_
     keys = tuple((name, "plane") for name in planes)
     values = world.state.values | {(name, "plane"): plane for name, plane in planes.items()}
     state = replace(world.state, values=values)
-    assert floors(state, keys, np.array([900, 800, 300, 20])) == (keys[2],)
-    assert floors(state, keys[:2], np.array([900, 800])) == (None,)
+    assert floors(state, keys, np.array([900, 800, 300, 20]), np.zeros(4)) == (keys[2],)
+    assert floors(state, keys[:2], np.array([900, 800]), np.zeros(2)) == (None,)
     second = tuple((f"plane {r}.{k}", "plane") for r in (1, 2) for k in (2, 3))
     two = {key: planes[f"plane {key[0][-1]}"] for key in second}
     half = replace(world.state, values=world.state.values | two, starts=(0, 40))
-    assert floors(half, second, np.array([5, 20, 30, 20])) == (second[1], second[2])
+    assert floors(half, second, np.array([5, 20, 30, 20]), np.array([0, 0, 1, 1])) == (second[1], second[2])
 
 
 def test_recordings_that_do_not_see_the_floor_have_no_part(world_of, drive_of_kind):
