@@ -34,12 +34,16 @@ def test_the_right_noise_is_no_news(simulation):
     assert said(with_noise(simulation, 1.0)) == []
 
 
-@pytest.mark.parametrize("times", [0.2, 0.05, 0.01])
+@pytest.mark.parametrize("times", [0.2, 0.1, 0.05, 0.01])
 def test_noise_that_is_far_too_small_is_said(simulation, times):
     """The motion then follows the IMU, and hardly any degrees of freedom are left to judge it by."""
-    words = said(with_noise(simulation, times))
+    result = with_noise(simulation, times)
+    words = said(result)
     assert any(w.startswith("the gyroscope") and "larger noise density would fit" in w for w in words), words
     assert any(w.startswith("the accelerometer") and "larger noise density would fit" in w for w in words), words
+    # At 0.2 errors are up to 6 standard deviations, at 0.1 up to 12: then no number is to be trusted.
+    assert bool(result.wrong) == (times < 0.2)
+    assert set(result.wrong) <= set(words) and result.warnings[: len(result.wrong)] == result.wrong
 
 
 def test_noise_that_is_far_too_large_is_said(simulation):

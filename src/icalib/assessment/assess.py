@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 
 import numpy as np
 
-from icalib.assessment.cameras import camera_warnings, mixed_up
-from icalib.assessment.excess import dof_known, excess, times
+from icalib.assessment.cameras import mixed_up, plane_warnings
 from icalib.assessment.held_out import held_out
+from icalib.assessment.misfit import far_beyond, misfits
 from icalib.assessment.notes import notes
 from icalib.assessment.robot import (
     lidar_residuals,
@@ -16,7 +17,6 @@ from icalib.assessment.robot import (
     planes,
     pose_residuals,
     pose_warnings,
-    robot_warnings,
     wheel_residuals,
 )
 from icalib.assessment.size import felt_size, is_certain, size_words
@@ -63,7 +63,6 @@ LABELS = {
     "plane": ("turn 1", "turn 2", "distance"),
 }  # fmt: skip
 NUISANCE = ("plane", *FRAME)  # estimated along, in a world of which only gravity's direction means anything
-SMALL_CHI2 = 0.5  # chi^2 per post-fit degree of freedom below this is worth a warning
 LARGE_FACTOR = 3.0
 BEYOND_FACTOR = 1.5  # times the largest factor: what halves say of each other is worth a warning
 LARGE_BLOOM_PX = 0.8  # ink and overexposure move edges by a third of that
@@ -86,6 +85,13 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
     wrong_size, size_notes = size_words(inputs, size)
     mixed = tuple(mixed_up(inputs.rig.cameras, groups))
     trajectory, poses = _trajectory(inputs, outcome.state, timeline), pose_residuals(inputs, found, timeline)
+    # What others complain of may come of a wrong size.
+    wrong = (*(wrong_size if is_certain(size) else ()), *mixed, *far_beyond(inputs.rig, judged))
+    warnings = (
+        *wrong_size,
+        *_warnings(inputs, found, groups, judged, poses),
+        *_factor_warnings(factors, parts is not None, held),
+    )
     return Calibration(
         groups=groups,
         covariance=seen.covariance,
@@ -98,12 +104,7 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
         iterations=tuple(Iteration(n, s.cost, s.predicted_decrease, s.damping, s.accepted) for n, s in found.steps),
         converged=outcome.converged,
         status=outcome.status,
-        warnings=(
-            *wrong_size,  # first: what others complain of may come of it
-            *mixed,
-            *_warnings(inputs, found, groups, judged, poses),
-            *_factor_warnings(factors, parts is not None, held),
-        ),
+        warnings=(*wrong, *(w for w in warnings if w not in wrong)),
         notes=(*notes(inputs, found, timeline), *size_notes),
         rig=rig_to_dict(inputs.asked or inputs.rig),
         settings=dataclasses.asdict(inputs.rig.settings),
@@ -115,7 +116,7 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
         planes=planes(inputs, outcome.state),
         pose_residuals=poses,
         held_out=held,
-        wrong=(*(wrong_size if is_certain(size) else ()), *mixed),
+        wrong=wrong,
     )
 
 
@@ -300,15 +301,12 @@ def _warnings(
     groups: tuple[ParameterGroup, ...],
     judged: list[SensorFit],
     poses: tuple[PoseResiduals, ...],
-):
+) -> Iterator[str]:
     if not found.outcome.converged:
         yield f"the solver did not converge: {found.outcome.status}"
     yield from inputs.measurements.warnings
-    for f in judged:
-        if f.kind in ("gyroscope", "accelerometer"):
-            yield from _imu_noise_warnings(f)
-    yield from camera_warnings(inputs.rig, judged)
-    yield from robot_warnings(inputs.rig, judged)
+    yield from misfits(inputs.rig, judged)
+    yield from plane_warnings(inputs.rig, judged)
     yield from pose_warnings(poses, inputs.rig)
     yield from lidar_warnings(inputs, found) if inputs.clouds.count else ()
     for g in groups:
@@ -318,20 +316,6 @@ def _warnings(
                 f"the corners of {g.sensor} lie {abs(g.value[0]):.1f} px too far {where} on their tags, more than "
                 "light and ink do; check tag_size and tag_spacing (the gap over tag_size) of the target."
             )
-
-
-def _imu_noise_warnings(f: SensorFit):
-    ratio = f.chi2 / max(f.dof, 1.0)
-    if excess(f) > 1.0:
-        size, word = times(f), "larger"
-    elif dof_known(f) and ratio < SMALL_CHI2:
-        size, word = f"{np.sqrt(ratio):.2g} times", "smaller"
-    else:
-        return
-    yield (
-        f"the {f.kind} of {f.sensor} leaves residuals {size} as large as its noise in the rig file says; a {word} "
-        "noise density would fit."
-    )
 
 
 def _factors(inputs: Inputs, groups: tuple[ParameterGroup, ...]) -> np.ndarray:

@@ -21,13 +21,17 @@ POOR_FIT_PX = 1.0  # RMS: detectors are off by a tenth of that, blurred images b
 MANY_REJECTED = 0.05
 
 
-def camera_warnings(rig: Rig, judged: Sequence[SensorFit]) -> Iterator[str]:
-    """What corners leave, and points on planes, one sentence each."""
+def plane_warnings(rig: Rig, judged: Sequence[SensorFit]) -> Iterator[str]:
+    """Where points should lie on planes, and none do."""
     if rig.settings.points_on_planes_m > 0.0 and not any(f.kind == ON_PLANES for f in judged):
         yield (
             "no points that cameras follow lie on planes of the LiDARs, so points_on_planes_m in the rig file counts "
             "for nothing; make it larger, or take it out where little is flat."
         )
+
+
+def camera_warnings(rig: Rig, judged: Sequence[SensorFit]) -> Iterator[str]:
+    """What corners leave, and points on planes, one sentence each."""
     stated = {c.name for c in rig.cameras if c.corner_noise_px is not None}
     for f in judged:
         if f.kind in ("corners", "features") and f.rejected > MANY_REJECTED * 0.5 * f.count:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -303,7 +303,7 @@ def _sight_warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
         )
 
 
-def robot_warnings(rig: Rig, judged: list[SensorFit]) -> Iterator[str]:
+def robot_warnings(rig: Rig, judged: Sequence[SensorFit]) -> Iterator[str]:
     """Where points or wheels leave more than their noise explains."""
     lidars = {x.name: x for x in rig.lidars}
     poses = {x.name: x for x in rig.poses}
