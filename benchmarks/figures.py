@@ -17,8 +17,9 @@ from pathlib import Path
 import numpy as np
 
 import icalib
-from icalib.estimation.assembly import assemble, inputs_for
+from icalib.estimation.assembly import assemble
 from icalib.estimation.corner_noise import first_noise
+from icalib.estimation.inputs import inputs_for
 from icalib.first_guess import initial_guess
 from icalib.first_guess.start import first_state
 from icalib.measurements import CornerStream, ImuStream, Measurements

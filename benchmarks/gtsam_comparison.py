@@ -22,8 +22,8 @@ import gtsam_unstable
 import numpy as np
 from gtsam.symbol_shorthand import B, L, T, V, X
 
-from icalib.estimation.assembly import Inputs, inputs_for
 from icalib.estimation.estimate import Estimate, estimate
+from icalib.estimation.inputs import Inputs, inputs_for
 from icalib.estimation.state import State
 from icalib.first_guess import initial_guess
 from icalib.first_guess.start import first_state

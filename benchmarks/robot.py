@@ -20,9 +20,10 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from icalib.assessment import assess
-from icalib.estimation.assembly import Inputs, motion_of
+from icalib.estimation.assembly import motion_of
 from icalib.estimation.determination import Determined, determine
 from icalib.estimation.estimate import Estimate
+from icalib.estimation.inputs import Inputs
 from icalib.estimation.lidar_binning import Associated, take_moments
 from icalib.estimation.lidar_factor import LidarFactor
 from icalib.first_guess.start import start

@@ -17,8 +17,8 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from icalib.estimation.arrowhead import Piece, solve
-from icalib.estimation.assembly import inputs_for
 from icalib.estimation.estimate import Estimate, estimate
+from icalib.estimation.inputs import inputs_for
 from icalib.first_guess.several import initial_guesses
 from icalib.first_guess.start import first_state
 from icalib.geometry.blas import subtract_gram

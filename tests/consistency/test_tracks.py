@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.estimation.assembly import assemble, image_times, inputs_for, nodes_for, origin_difference, resample
+from icalib.estimation.assembly import assemble, image_times, nodes_for, resample
 from icalib.estimation.corner_noise import first_noise
 from icalib.estimation.feature_noise import first_following
+from icalib.estimation.inputs import inputs_for, origin_difference
 from icalib.estimation.solver import minimise
 from icalib.first_guess.several import initial_guesses
 from icalib.first_guess.start import first_state

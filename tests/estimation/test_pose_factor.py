@@ -9,7 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from icalib.estimation.arrowhead import make_pieces
-from icalib.estimation.assembly import inputs_for, motion_of
+from icalib.estimation.assembly import motion_of
+from icalib.estimation.inputs import inputs_for
 from icalib.estimation.pose_factor import FRAME, PoseNoise, frame_of
 from icalib.estimation.pose_rows import Frame, Mount, absolute_rows, relative_rows
 from icalib.estimation.robot import next_posing, pose_factor

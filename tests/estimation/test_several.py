@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from icalib.errors import RecordingError
-from icalib.estimation.assembly import assemble, inputs_for
+from icalib.estimation.assembly import assemble
 from icalib.estimation.corner_noise import NoiseModel
 from icalib.estimation.imu_factor import ImuFactor
+from icalib.estimation.inputs import inputs_for
 from icalib.estimation.nodes import first_nodes, place_nodes, usable
 from icalib.estimation.parts import segment_ends
 from icalib.estimation.state import NODE, State

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from icalib.errors import EstimationError
-from icalib.estimation.assembly import inputs_for
+from icalib.estimation.inputs import inputs_for
 from icalib.estimation.state import State
 from icalib.first_guess.poses import pose_values, state_from_poses
 from icalib.measurements import PoseStream

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.estimation.assembly import inputs_for
+from icalib.estimation.inputs import inputs_for
 from icalib.estimation.pose_factor import FRAME, frame_of
 from icalib.estimation.state import State
 from icalib.first_guess.poses import pose_rates, pose_values, state_from_poses

@@ -34,13 +34,14 @@ from icalib.calibration import (
     Visited,
 )
 from icalib.estimation.arrowhead import restricted_inverse
-from icalib.estimation.assembly import Inputs, image_times, origin_difference
+from icalib.estimation.assembly import image_times
 from icalib.estimation.board import SHAPE_LABELS
 from icalib.estimation.clocks import instants
 from icalib.estimation.determination import Determined
 from icalib.estimation.estimate import Estimate
 from icalib.estimation.evidence import Fit, fits, place_covariances, raw_rms, split_covariance
 from icalib.estimation.imu_model import LABELS as IMU_LABELS
+from icalib.estimation.inputs import Inputs, origin_difference
 from icalib.estimation.parts import Parts
 from icalib.estimation.pose_factor import FRAME
 from icalib.estimation.problem import Problem

@@ -7,12 +7,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from icalib.assessment.robot import robot_notes
-from icalib.estimation.assembly import Inputs
 from icalib.estimation.bodies import words_on_left_out
 from icalib.estimation.clocks import instants
 from icalib.estimation.corner_noise import NoiseModel
 from icalib.estimation.estimate import Estimate
 from icalib.estimation.imu_data import ImuData
+from icalib.estimation.inputs import Inputs
 from icalib.estimation.nodes import usable
 from icalib.timeline import Timeline
 

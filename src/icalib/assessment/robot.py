@@ -9,10 +9,11 @@ import numpy as np
 
 from icalib.assessment.excess import excess, times
 from icalib.calibration import LidarResiduals, Plane, PoseResiduals, SensorFit, WheelResiduals
-from icalib.estimation.assembly import Inputs, motion_of, origin_difference
+from icalib.estimation.assembly import motion_of
 from icalib.estimation.clocks import instants
 from icalib.estimation.estimate import Estimate
 from icalib.estimation.ground_factor import HEIGHT, TILT, GroundFactor
+from icalib.estimation.inputs import Inputs, origin_difference
 from icalib.estimation.lidar_binning import LidarNoise, in_world
 from icalib.estimation.lidar_factor import LidarFactor
 from icalib.estimation.nodes import usable

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.assembly import Inputs
 from icalib.estimation.estimate import Estimate
+from icalib.estimation.inputs import Inputs
 from icalib.estimation.target_size import TargetSize, target_size
 
 WRONG = 0.02  # of the size: more than a ruler or a good accelerometer is off by

@@ -15,10 +15,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from icalib.estimation.arrowhead import HELD_BELOW, restricted_inverse
-from icalib.estimation.assembly import Inputs, given_priors
+from icalib.estimation.assembly import given_priors
 from icalib.estimation.debias import spurious_information
 from icalib.estimation.estimate import EARLY_DECREASE, Estimate, Judged, OnVisit, estimate
 from icalib.estimation.imu_model import N_INTRINSICS
+from icalib.estimation.inputs import Inputs
 from icalib.estimation.prior_factor import Prior
 from icalib.estimation.problem import Problem
 from icalib.estimation.solver import Step, minimise

@@ -10,7 +10,7 @@ import numpy as np
 
 from icalib.estimation import pages
 from icalib.estimation.arrowhead import NOTHING
-from icalib.estimation.assembly import Following, Inputs, assemble, host_times, nodes_for, resample
+from icalib.estimation.assembly import Following, assemble, host_times, nodes_for, resample
 from icalib.estimation.corner_factor import CornerFactor, CornerNoise, CornerOutput
 from icalib.estimation.corner_noise import (
     COMMON_ERRORS,
@@ -24,6 +24,7 @@ from icalib.estimation.corner_noise import (
 from icalib.estimation.evidence import fits
 from icalib.estimation.feature_noise import first_following, inliers, next_following
 from icalib.estimation.imu_model import N_INTRINSICS
+from icalib.estimation.inputs import Inputs
 from icalib.estimation.lidar_factor import LidarFactor
 from icalib.estimation.prior_factor import Prior
 from icalib.estimation.problem import Problem

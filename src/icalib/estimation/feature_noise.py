@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.estimation.assembly import Following, Inputs
+from icalib.estimation.assembly import Following
 from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput
+from icalib.estimation.inputs import Inputs
 from icalib.estimation.problem import Problem
 from icalib.estimation.solver import Outcome
 from icalib.measurements import CornerStream, TrackStream

@@ -16,8 +16,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.assembly import Inputs, host_times, inputs_for, nodes_for, start_values
+from icalib.estimation.assembly import host_times, nodes_for, start_values
 from icalib.estimation.board import board_in
+from icalib.estimation.inputs import Inputs, inputs_for
 from icalib.estimation.nodes import first_nodes
 from icalib.estimation.pose_factor import FRAME, frame_of
 from icalib.estimation.state import Key, State

@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from icalib.estimation.assembly import Inputs, origin_difference
 from icalib.estimation.imu_data import imu_data
+from icalib.estimation.inputs import Inputs, origin_difference
 from icalib.estimation.state import Key, State
 from icalib.first_guess.lidar import Held
 from icalib.measurements import LidarStream

@@ -13,17 +13,10 @@ from functools import partial
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.assembly import (
-    Inputs,
-    host_times,
-    motion_of,
-    nodes_for,
-    origin_difference,
-    start_values,
-    with_clouds,
-)
+from icalib.estimation.assembly import host_times, motion_of, nodes_for, start_values
 from icalib.estimation.clocks import instants
 from icalib.estimation.estimate import first_pass
+from icalib.estimation.inputs import Inputs, origin_difference, with_clouds
 from icalib.estimation.lidar_binning import Associated, LidarNoise, Moments, take_moments
 from icalib.estimation.lidar_sweep import Motion, sweep
 from icalib.estimation.point_planes import thinned

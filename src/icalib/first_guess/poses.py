@@ -12,9 +12,10 @@ from functools import partial
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.assembly import Inputs, host_times, nodes_for, start_values
+from icalib.estimation.assembly import host_times, nodes_for, start_values
 from icalib.estimation.clocks import instants
 from icalib.estimation.imu_data import ImuData
+from icalib.estimation.inputs import Inputs
 from icalib.estimation.pose_factor import FRAME, frame_of
 from icalib.estimation.robot import MOUNT
 from icalib.estimation.state import Key, State

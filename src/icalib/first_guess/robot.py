@@ -8,9 +8,10 @@ from functools import partial
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.assembly import Inputs, motion_of
+from icalib.estimation.assembly import motion_of
 from icalib.estimation.clocks import instants
 from icalib.estimation.ground_factor import HEIGHT_BLOCK
+from icalib.estimation.inputs import Inputs
 from icalib.estimation.lidar_sweep import Motion
 from icalib.estimation.poses import assign_nodes, poses_at
 from icalib.estimation.robot import MOUNT

@@ -9,9 +9,10 @@ from contextlib import suppress
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.assembly import assemble, image_times, inputs_for, nodes_for, start_values
+from icalib.estimation.assembly import assemble, image_times, nodes_for, start_values
 from icalib.estimation.bodies import Bodies, choose_bodies, restrict
 from icalib.estimation.corner_noise import first_noise
+from icalib.estimation.inputs import inputs_for
 from icalib.estimation.solver import minimise
 from icalib.estimation.state import State
 from icalib.first_guess.intrinsics import camera_params

@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.assembly import Inputs, host_times, inputs_for, nodes_for, resample, start_values, with_clouds
+from icalib.estimation.assembly import host_times, nodes_for, resample, start_values
 from icalib.estimation.board import board_in
 from icalib.estimation.estimate import first_pass
+from icalib.estimation.inputs import Inputs, inputs_for, with_clouds
 from icalib.estimation.nodes import first_nodes
 from icalib.estimation.state import Key, State
 from icalib.first_guess import Guess, initial_trajectory
