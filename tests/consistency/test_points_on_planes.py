@@ -11,6 +11,7 @@ import pytest
 from scipy.stats import chi2
 
 from icalib.calibration import Calibration
+from icalib.measurements import Measurements
 from icalib.montecarlo.one_run import compare
 from icalib.montecarlo.statistics import Sample, nees
 from icalib.pipeline import calibrate_measurements
@@ -84,6 +85,25 @@ def test_where_too_few_points_lie_on_planes_a_warning_says_so():
     result, _ = calibrated(few, 0)
     (warning,) = (w for w in result.warnings if "points_on_planes_m" in w)
     assert warning.startswith("no points that cameras follow lie on planes")
+
+
+def test_planes_are_those_of_the_recording():
+    """Twice through one room, planes being found in the clouds of each: its worlds have nothing to do with another."""
+    scenario = replace(scenario_of("planar", 1), duration_s=8.0)
+    simulations = [simulate(scenario, seed) for seed in (1, 2)]
+    rig = with_drawn_guess(rig_for(scenario), scenario, 1, only=MOUNTS)
+    rig = replace(rig, settings=replace(rig.settings, points_on_planes_m=RELIEF_M))
+    result = calibrate_measurements(rig, [unassociated(s.measurements) for s in simulations])
+    assert result.converged, result.status
+    off, std = between(result, simulations[0])
+    assert std < 2e-3 and abs(off) < 4.0 * std
+    (fit,) = (f for f in result.fits if f.kind == "points on planes")
+    assert fit.count > 100 and 0.5 < fit.chi2_per_dof < 1.6
+
+
+def unassociated(measurements: Measurements) -> Measurements:
+    lidars = tuple(replace(x, plane=np.full(len(x.plane), -1, np.int32)) for x in measurements.lidars)
+    return replace(measurements, lidars=lidars)
 
 
 @pytest.mark.statistical
