@@ -42,6 +42,11 @@ def load_dask() -> Any:
     return _load("dask", "montecarlo", "Many runs need Dask's package distributed")
 
 
+def load_filelock() -> Any:
+    """filelock. Raises RecordingError where it is not installed."""
+    return _load("filelock", "montecarlo", "Many runs need the package filelock")
+
+
 def load_matplotlib() -> Any:
     """matplotlib's figures, drawn without a screen. Raises RecordingError where it is not installed."""
     return _load("matplotlib.figure", "montecarlo", "Figures as PNG need the package matplotlib")

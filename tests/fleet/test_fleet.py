@@ -50,7 +50,7 @@ def test_each_job_leaves_its_whole_result(fleet_folder: Path, workshop, same):
         place = fleet_folder / "out" / "jobs" / name
         assert {"calibration.yaml", "report.html", "fleet-job.json"} <= {f.name for f in place.iterdir()}
         assert same(load_calibration(place).groups, workshop.results[name.split("-")[1]].groups)
-    assert sorted(f.name for f in (fleet_folder / "out").iterdir()) == ["fleet.html", "fleet.sqlite", "jobs"]
+    assert sorted(f.name for f in (fleet_folder / "out").iterdir()) == [".lock", "fleet.html", "fleet.sqlite", "jobs"]
     assert [d.robot for d in found.drifted] == ["anton"] and found.drifted[0].sensors == ("cam1",)
 
 
@@ -282,7 +282,7 @@ def test_a_table_that_cannot_be_written(fleet_folder: Path, workshop):
     (fleet_folder / "out" / "fleet.sqlite").mkdir(parents=True)
     with pytest.raises(CalibrationError, match=r"fleet\.sqlite cannot be written"):
         fleet(fleet_folder)
-    assert sorted(f.name for f in (fleet_folder / "out").iterdir()) == ["fleet.sqlite", "jobs"]
+    assert sorted(f.name for f in (fleet_folder / "out").iterdir()) == [".lock", "fleet.sqlite", "jobs"]
 
 
 def test_a_record_reads_back(workshop, fleet_folder: Path, same):

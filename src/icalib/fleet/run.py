@@ -7,11 +7,11 @@ from contextlib import closing
 from math import isfinite
 from pathlib import Path
 
-from icalib.batch import Crew, Lost, run_all, write_whole
+from icalib.batch import Crew, Lost, alone, run_all, write_whole
 from icalib.errors import CalibrationError
 from icalib.fleet.drift import drift_of
 from icalib.fleet.inputs import Inputs
-from icalib.fleet.jobs import load_jobs
+from icalib.fleet.jobs import Job, load_jobs
 from icalib.fleet.one_job import Task, run
 from icalib.fleet.page import fleet_html
 from icalib.fleet.record import Record
@@ -34,25 +34,33 @@ def run_fleet(
     """Does the jobs of the file at `path` that `output` does not hold yet; writes fleet.sqlite and fleet.html there.
 
     crew: by default a worker for each core. limit: sigmas beyond which a change counts. say: is told what is done
-    again, before it is. Raises RigError where the file is wrong, CalibrationError where the folder cannot be written or
-    no cluster answers; KeyboardInterrupt with a sentence on what was reached.
+    again, before it is. Raises RigError where the file is wrong, CalibrationError where the folder cannot be written,
+    another process is at work in it, or no cluster answers; KeyboardInterrupt with a sentence on what was reached.
     """
     if not (isfinite(limit) and limit > 0.0):
         raise CalibrationError(f"a change counts from a number of sigmas above 0 on, not {limit:g}; the usual is 3.")
     jobs, store = load_jobs(path), Store(Path(output))
+    with alone(store.folder):
+        fleet = _fleet(jobs, store, crew or Crew(), limit, progress, say)
+        write_table(store.folder / "fleet.sqlite", fleet.results)
+        write_whole(store.folder / "fleet.html", fleet_html(fleet, Path(path).name).encode())
+    return fleet
+
+
+def _fleet(
+    jobs: tuple[Job, ...], store: Store, crew: Crew, limit: float, progress: Progress, say: Callable[[str], None]
+) -> Fleet:
+    """Jobs that are missing done, and all compared."""
     inputs = {job.name: Inputs.of(job) for job in jobs}
     done, again = to_do(store, inputs)
     for name, why in again.items():
         say(f"{name} is done again: {why}.")
     tasks = [Task(job, inputs[job.name]) for job in jobs if job.name not in done]
-    records = done | _do(tasks, store, crew or Crew(), len(jobs), progress)
+    records = done | _do(tasks, store, crew, len(jobs), progress)
     results = tuple(JobResult(job, records[job.name]) for job in jobs)
     robots = by_robot(results)
     drifts = tuple(drift_of(robot, [r.job.name for r in own], store.load, limit) for robot, own in robots.items())
-    fleet = Fleet(results, drifts, limit, again)
-    write_table(store.folder / "fleet.sqlite", results)
-    write_whole(store.folder / "fleet.html", fleet_html(fleet, Path(path).name).encode())
-    return fleet
+    return Fleet(results, drifts, limit, again)
 
 
 def _do(tasks: list[Task], store: Store, crew: Crew, total: int, progress: Progress) -> dict[str, Record]:

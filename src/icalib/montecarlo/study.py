@@ -8,7 +8,7 @@ from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from icalib.batch import Crew, write_whole
+from icalib.batch import Crew, alone, write_whole
 from icalib.errors import CalibrationError
 from icalib.montecarlo.one_run import GuessKind, Task
 from icalib.montecarlo.page import study_html
@@ -61,17 +61,19 @@ def run_study(
     """Makes the runs that `output` does not hold yet, and writes consistency.json and consistency.html there.
 
     digest: of all that the scenario is made from. Raises CalibrationError where the folder holds another study's runs,
-    cannot be written, or no cluster answers; KeyboardInterrupt with a sentence on what was reached.
+    cannot be written, another process is at work in it, or no cluster answers; KeyboardInterrupt with a sentence on
+    what was reached.
     """
     store = Store(output, Identity.of(name, digest, plan.guess))
     first = scenario.seed if plan.seed is None else plan.seed
     seeds = range(first, first + plan.runs)
-    lost = _fill(store, scenario, seeds, plan, progress)
-    records = tuple(lost[seed] if seed in lost else store.read(seed) for seed in seeds)
-    study = Study(store.identity, records, summarise(records))
-    about = asdict(store.identity) | {"first_seed": first}
-    write_whole(output / "consistency.json", consistency_json(study.consistency, about))
-    write_whole(output / "consistency.html", study_html(study.consistency, study.identity, records).encode())
+    with alone(output):
+        lost = _fill(store, scenario, seeds, plan, progress)
+        records = tuple(lost[seed] if seed in lost else store.read(seed) for seed in seeds)
+        study = Study(store.identity, records, summarise(records))
+        about = asdict(store.identity) | {"first_seed": first}
+        write_whole(output / "consistency.json", consistency_json(study.consistency, about))
+        write_whole(output / "consistency.html", study_html(study.consistency, study.identity, records).encode())
     return study
 
 
