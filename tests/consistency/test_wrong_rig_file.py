@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from icalib.calibration import Calibration
@@ -97,3 +99,41 @@ def test_a_lens_of_another_camera_that_is_fixed(simulation, stated):
     expected = "as its corner_noise in the rig file says" if stated else "while detectors are good to a tenth of that"
     said = [w for w in result.warnings if w.startswith("the corners of cam0")]
     assert any(expected in w for w in said), (result.warnings, [f.rms for f in result.fits])
+
+
+def with_lens(simulation: Simulation, change: list[float], mode: str = "fixed") -> Calibration:
+    """Of cam0 fx, fy, cx, cy are fixed at so much more than they are [px]; all else is right."""
+    rig = rig_for(simulation.scenario, intrinsics="start", distortion="start")
+    cam0, cam1 = (
+        replace(c, intrinsics=replace(c.intrinsics, mode=mode), distortion=replace(c.distortion, mode=mode))
+        for c in rig.cameras
+    )
+    value = cam0.intrinsics.value + np.array(change)
+    cam0 = replace(cam0, intrinsics=replace(cam0.intrinsics, value=value))
+    return calibrate_measurements(replace(rig, cameras=(cam0, cam1)), simulation.measurements)
+
+
+def test_the_right_lens_is_no_news(simulation):
+    result = with_lens(simulation, [0.0] * 4)
+    assert result.wrong == () and not any("that the rig file fixes" in w for w in result.warnings)
+
+
+def test_a_lens_that_is_nearly_right_is_no_news(simulation):
+    """What the factory says, or last year's calibration."""
+    assert with_lens(simulation, [2.0, 2.0, -3.0, 3.0]).wrong == ()
+
+
+@pytest.mark.parametrize("change", [[0.0, 0.0, 13.0, 7.0], [14.0, 14.0, 0.0, 0.0]])
+def test_another_cameras_lens_is_named_with_what_the_images_want(simulation, change):
+    result, truth = with_lens(simulation, change), simulation.scenario.cameras[0].intrinsics
+    words = result.wrong[0]
+    assert words.startswith("the intrinsics of cam0 that the rig file fixes do not fit its images, which want ")
+    said = {name: (float(a), float(b)) for name, a, b in re.findall(r"(\w+) ([\d.]+) and not ([\d.]+)", words)}
+    wanted = {name: t for name, t, c in zip(("fx", "fy", "cx", "cy"), truth, change, strict=True) if c}
+    assert set(wanted) >= set(said) and said
+    for name, (now, given) in said.items():
+        assert abs(now - wanted[name]) < 0.35 * abs(given - wanted[name])
+
+
+def test_a_lens_that_is_free_is_not_tested(simulation):
+    assert with_lens(simulation, [8.0, 8.0, 0.0, 0.0], "free").wrong == ()

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from icalib.assessment.cameras import mixed_up, plane_warnings
+from icalib.assessment.cameras import mixed_up, other_lens, plane_warnings
 from icalib.assessment.held_out import held_out
 from icalib.assessment.misfit import far_beyond, misfits
 from icalib.assessment.notes import notes
@@ -40,6 +40,7 @@ from icalib.estimation.clocks import instants
 from icalib.estimation.determination import Determined
 from icalib.estimation.estimate import Estimate
 from icalib.estimation.evidence import Fit, fits, place_covariances, raw_rms, split_covariance
+from icalib.estimation.fixed_lens import lens_steps
 from icalib.estimation.imu_model import LABELS as IMU_LABELS
 from icalib.estimation.inputs import Inputs, origin_difference
 from icalib.estimation.parts import Parts
@@ -87,7 +88,8 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
     mixed = tuple(mixed_up(inputs.rig.cameras, groups))
     trajectory, poses = _trajectory(inputs, outcome.state, timeline), pose_residuals(inputs, found, timeline)
     # What others complain of may come of a wrong size.
-    wrong = (*(wrong_size if is_certain(size) else ()), *mixed, *far_beyond(inputs.rig, judged))
+    lenses = other_lens(inputs.rig.cameras, lens_steps(inputs, found), factors.max(initial=1.0))
+    wrong = (*(wrong_size if is_certain(size) else ()), *mixed, *lenses, *far_beyond(inputs.rig, judged))
     warnings = (
         *wrong_size,
         *_warnings(inputs, found, groups, judged, poses),

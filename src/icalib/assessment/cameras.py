@@ -9,6 +9,7 @@ import numpy as np
 
 from icalib.assessment.excess import excess, times
 from icalib.calibration import ParameterGroup, SensorFit
+from icalib.estimation.fixed_lens import LensStep
 from icalib.estimation.surfaces import ON_PLANES
 from icalib.estimation.tolerances import GUESS_SIGMA
 from icalib.geometry import so3
@@ -19,6 +20,8 @@ FAR = 0.5  # of what guesses are worth: 5 cm, 3 deg, 8 px
 MUCH_NEARER = 0.3  # times as far, in all that is given
 POOR_FIT_PX = 1.0  # RMS: detectors are off by a tenth of that, blurred images by half
 MANY_REJECTED = 0.05
+OTHER_LENS, CLEARLY = 0.015, 3.0  # of the focal length; standard deviations
+NEARER = 0.5  # times as far, in fx, fy, cx and cy
 
 
 def plane_warnings(rig: Rig, judged: Sequence[SensorFit]) -> Iterator[str]:
@@ -68,6 +71,30 @@ def mixed_up(cameras: Sequence[Camera], groups: Sequence[ParameterGroup]) -> Ite
             yield (
                 f"{a.name} and {b.name} seem to be mixed up: each is found about where the rig file has the other; "
                 "correct their topics or paths, or the values that the rig file gives."
+            )
+
+
+def other_lens(cameras: Sequence[Camera], steps: Sequence[LensStep], factor: float) -> Iterator[str]:
+    """Cameras whose intrinsics the rig file fixes at what cannot be theirs; `factor`: the largest empirical one."""
+    given = {c.name: c.intrinsics.value for c in cameras}
+    for found in steps:
+        value = given[found.camera]
+        assert value is not None
+        off = np.abs(found.step)
+        clearly = off > np.maximum(OTHER_LENS * value[0], CLEARLY * factor * found.std)
+        if clearly.any():
+            where = ", ".join(
+                f"{name} {old + step:.1f} and not {old:.1f}"
+                for name, old, step, far in zip(("fx", "fy", "cx", "cy"), value, found.step, clearly, strict=True)
+                if far
+            )
+            nearer = [
+                n for n, v in given.items() if v is not None and max(abs(value + found.step - v)) < NEARER * max(off)
+            ]
+            hint = f" Those of {nearer[0]} are nearer." if nearer else ""
+            yield (
+                f"the intrinsics of {found.camera} that the rig file fixes do not fit its images, which want {where}: "
+                f"check that they are this camera's, at this resolution, or leave them free.{hint}"
             )
 
 
