@@ -196,3 +196,13 @@ def test_a_path_that_lost_its_way_goes_on_in_another_map(free_robot):
     assert np.diff(known).max() > 1.0
     with pytest.raises(EstimationError, match="only 50 of 103 scans fit"):
         lidar_path("lidar0", [*scans[:50], *turned[74:]])
+
+
+def test_a_path_begins_later_where_its_first_map_leads_nowhere(free_robot):
+    """The first scans are of elsewhere: half a turn away, and 3 m."""
+    scans = scans_of(free_robot.streams[0])
+    odd = [replace(s, xyz=s.xyz * [-1.0, -1.0, 1.0] + [3.0, 0.0, 1.0]) for s in scans[:3]]
+    path = lidar_path("lidar0", [*odd, *scans[3:]])
+    assert not path.ok[:3].any() and path.ok[8:].mean() > 0.95
+    errors, n = turns_between(free_robot, path, 8, len(path.seconds))
+    assert n > 60 and errors.max() < 0.02

@@ -32,6 +32,7 @@ SCALE = 0.5  # of an edge: of the weights in the first round
 LAST_SCALE, LAST_SCALE_TURNED = 0.2, 0.1
 POINT_SIGMA_M = 0.1  # of a point against what is expected of the motion: points of one plane err together
 MOST_LOST = 5  # scans in a row that do not fit the map, before there is another
+FEW = 10  # scans on a map that is no loss: its first scan may show too little of what the next ones see
 LEAST_NEAR = 0.3  # of a scan's points must lie on the map's planes
 FIRST_ROUNDS = 4  # to find how the LiDAR moved in its first scan, which makes the map
 KEEP, KEEP_TURNED = 0.85, 0.995  # of what a voxel holds, by the scan
@@ -85,7 +86,9 @@ def lidar_path(
 ) -> LidarPath:
     """Of LiDAR `name`. `turning`: how it turned, where that is known, and `moving`: how it moved. Unless it is to be
     `whole`, a path that lost its way goes on in another map: LONGEST_STEP_S lie between what is ok in one and in the
-    next. Raises EstimationError where scans do not fit one another."""
+    next. A whole one is of one map, which begins later where hardly any scan fits that of the first.
+
+    Raises EstimationError where scans do not fit one another."""
     seconds = np.array([s.middle for s in scans])
     known = _Known.of(seconds, turning, moving)
     if turning is not None:
@@ -178,8 +181,11 @@ def _follow(scans: list[Scan], known: _Known, edge_m: float, whole: bool) -> tup
     for k in range(1, len(scans)):
         pose = register(k, poses[-1], last)
         lost = 0 if fits[k] else lost + 1
-        if lost == MOST_LOST and not whole and k + 1 < len(scans):
-            again = scans[k - lost].middle + LONGEST_STEP_S
+        if lost == MOST_LOST and k + 1 < len(scans) and not (whole and np.count_nonzero((fits & ~apart)[:k]) > FEW):
+            if whole:
+                apart[:k] = True
+            else:
+                again = scans[k - lost].middle + LONGEST_STEP_S
             pose, lost = begin(k), 0
         apart[k] = scans[k].middle < again
         poses.append(pose)
