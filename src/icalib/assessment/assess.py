@@ -87,9 +87,10 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
     wrong_size, size_notes = size_words(inputs, size)
     mixed = tuple(mixed_up(inputs.rig.cameras, groups))
     trajectory, poses = _trajectory(inputs, outcome.state, timeline), pose_residuals(inputs, found, timeline)
-    # What others complain of may come of a wrong size.
+    # What others complain of may come of a wrong size, or of an accelerometer's scale: then that is the news.
     lenses = other_lens(inputs.rig.cameras, lens_steps(inputs, found), factors.max(initial=1.0))
-    wrong = (*(wrong_size if is_certain(size) else ()), *mixed, *lenses, *far_beyond(inputs.rig, judged))
+    beyond = () if wrong_size else far_beyond(inputs.rig, judged)
+    wrong = (*(wrong_size if is_certain(size) else ()), *mixed, *lenses, *beyond)
     warnings = (
         *wrong_size,
         *_warnings(inputs, found, groups, judged, poses),
