@@ -88,9 +88,10 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
     mixed = tuple(mixed_up(inputs.rig.cameras, groups))
     trajectory, poses = _trajectory(inputs, outcome.state, timeline), pose_residuals(inputs, found, timeline)
     # What others complain of may come of a wrong size, or of an accelerometer's scale: then that is the news.
-    lenses = other_lens(inputs.rig.cameras, lens_steps(inputs, found), factors.max(initial=1.0))
+    certain = is_certain(size)
+    lenses = () if certain else other_lens(inputs.rig.cameras, lens_steps(inputs, found), factors.max(initial=1.0))
     beyond = () if wrong_size else far_beyond(inputs.rig, judged)
-    wrong = (*(wrong_size if is_certain(size) else ()), *mixed, *lenses, *beyond)
+    wrong = (*(wrong_size if certain else ()), *mixed, *lenses, *beyond)
     warnings = (
         *wrong_size,
         *_warnings(inputs, found, groups, judged, poses),
