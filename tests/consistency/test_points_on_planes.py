@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from tests.consistency.test_robot import unassociated
 
 from icalib.calibration import Calibration
-from icalib.measurements import Measurements
 from icalib.montecarlo.one_run import compare
 from icalib.montecarlo.statistics import Sample, nees
 from icalib.pipeline import calibrate_measurements
@@ -99,11 +99,6 @@ def test_planes_are_those_of_the_recording():
     assert std < 2e-3 and abs(off) < 4.0 * std
     (fit,) = (f for f in result.fits if f.kind == "points on planes")
     assert fit.count > 100 and 0.5 < fit.chi2_per_dof < 1.6
-
-
-def unassociated(measurements: Measurements) -> Measurements:
-    lidars = tuple(replace(x, plane=np.full(len(x.plane), -1, np.int32)) for x in measurements.lidars)
-    return replace(measurements, lidars=lidars)
 
 
 @pytest.mark.statistical

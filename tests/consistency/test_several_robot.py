@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
+from tests.consistency.test_robot import steady, unassociated
 
 from icalib.calibration import Calibration
 from icalib.errors import EstimationError
-from icalib.measurements import Measurements
 from icalib.montecarlo.one_run import compare
 from icalib.pipeline import calibrate_measurements
-from icalib.rig import Rig
 from icalib.simulation import Scenario, Simulation, rig_for, simulate
 
 MONTH_NS = 30 * 86_400 * 10**9 + 123_456_789
@@ -44,15 +43,6 @@ def another_day(scenario: Scenario) -> Scenario:
 def pair(robot, example: str, seconds: tuple[float, float], parts: str, azimuth_steps: int, **changes):
     first, second = (robot(example, s, parts, azimuth_steps, **changes) for s in seconds)
     return simulate(first, 1), simulate(another_day(second), 2)
-
-
-def unassociated(measurements: Measurements) -> Measurements:
-    lidars = (replace(x, plane=np.full(len(x.plane), -1, np.int32)) for x in measurements.lidars)
-    return replace(measurements, lidars=tuple(lidars))
-
-
-def steady(rig: Rig) -> Rig:
-    return replace(rig, wheels=tuple(replace(w, sideways_slip=1e-4, upwards_slip=1e-4) for w in rig.wheels))
 
 
 def check(result: Calibration, simulation: Simulation) -> None:

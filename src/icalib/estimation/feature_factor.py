@@ -235,7 +235,7 @@ class FeatureFactor:
         """As `state` has them; None where no point lies on any."""
         if self.surfaces is None or not (self.on.plane >= 0).any():
             return None
-        return Planes.of(np.array([state.values[key] for key in self.surfaces.keys]), self._of_planes)
+        return Planes.of(self.surfaces.keys, state, self._of_planes)
 
     @cached_property
     def _of_planes(self) -> np.ndarray:

@@ -14,7 +14,7 @@ import numpy as np
 from icalib.errors import EstimationError
 from icalib.estimation.arrowhead import restricted_inverse, solve
 from icalib.estimation.estimate import Estimate
-from icalib.estimation.inputs import Inputs, layout_for
+from icalib.estimation.inputs import Inputs, with_clouds
 from icalib.estimation.state import Layout
 from icalib.rig import Camera, Parameter
 
@@ -37,10 +37,10 @@ def lens_steps(inputs: Inputs, found: Estimate) -> tuple[LensStep, ...]:
     if not fixed or not found.outcome.converged:
         return ()
     rig = replace(inputs.rig, cameras=tuple(_freed(c) if c in fixed else c for c in inputs.rig.cameras))
-    layout = layout_for(rig, inputs.bodies, len(inputs.parts), inputs.clouds)
-    held = _held_in(layout, inputs.layout, found.problem.held)
+    freed = with_clouds(replace(inputs, rig=rig), inputs.clouds)
+    held = _held_in(freed.layout, inputs.layout, found.problem.held)
     try:
-        problem = found.judged.problem(replace(inputs, rig=rig, layout=layout), found.outcome.state, held)
+        problem = found.judged.problem(freed, found.outcome.state, held)
         pieces = problem.pieces()
         problem.linearise(found.outcome.state, pieces, problem.residuals(), curved=True)
         solution = solve(pieces, problem.n_nodes, problem.tolerance, held=held)
@@ -48,7 +48,7 @@ def lens_steps(inputs: Inputs, found: Estimate) -> tuple[LensStep, ...]:
         return ()
     t = problem.tolerance
     variance = np.diag(restricted_inverse(t[:, None] * solution.information * t, held)) * t**2
-    columns = [layout.block(c.name, "intrinsics").columns for c in fixed]
+    columns = [freed.layout.columns(c.name, "intrinsics") for c in fixed]
     return tuple(
         LensStep(c.name, solution.border[k], np.sqrt(variance[k])) for c, k in zip(fixed, columns, strict=True)
     )
@@ -61,7 +61,9 @@ def _freed(camera: Camera) -> Camera:
 
 def _held_in(layout: Layout, before: Layout, held: np.ndarray) -> np.ndarray:
     """Directions of the border `before` in that of `layout`, which has more columns."""
-    out = np.zeros((layout.size, held.shape[1])) if held.size else held
-    for block in before.free if held.size else ():
+    if not held.size:
+        return held
+    out = np.zeros((layout.size, held.shape[1]))
+    for block in before.free:
         out[layout.block(*block.key).columns] = held[block.columns]
     return out

@@ -106,7 +106,7 @@ class LidarFactor:
 
     def _chunks(self, state: State, b0: int, b1: int) -> Iterator[tuple[Bins, Motion, Planes]]:
         """Bins b0..b1 by the chunk, with their motion and the planes."""
-        planes = Planes.of(np.array([state.values[p] for p in self.planes]), self._of_planes)
+        planes = Planes.of(self.planes, state, self._of_planes)
         R_il = np.ascontiguousarray(state.values[self.name, "rotation"])
         p_il = state.values[self.name, "translation"]
         imu_free = self.layout.is_free(self.imu.name, "intrinsics")

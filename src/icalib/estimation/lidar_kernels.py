@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 
 from icalib.estimation.corner_chain import by_imu_pose
+from icalib.estimation.state import Key, State
 from icalib.geometry.planes import tangents
 
 POSE, PLANE = 6, 3
@@ -39,8 +40,9 @@ class Planes(NamedTuple):
     columns: np.ndarray
 
     @classmethod
-    def of(cls, value: np.ndarray, columns: np.ndarray) -> Planes:
-        """From values (P, 6), see `geometry.planes`."""
+    def of(cls, keys: tuple[Key, ...], state: State, columns: np.ndarray) -> Planes:
+        """Those of `keys` as `state` has them."""
+        value = np.array([state.values[key] for key in keys])
         across = np.array([tangents(v[:3]) for v in value])
         return cls(value[:, :3].copy(), across, value[:, 3:].copy(), columns)
 

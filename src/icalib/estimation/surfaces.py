@@ -127,11 +127,11 @@ class Surfaces:
             own = np.flatnonzero(may[:, k])
             lies[own, k] = most_alike(off[own, k], np.sqrt(across[own, k] + self.noise**2))
         plane = np.where(lies.sum(axis=1) == 1, lies.argmax(axis=1), -1)
-        on, weight = np.flatnonzero(plane >= 0), np.ones(len(points))
+        on, part = np.flatnonzero(plane >= 0), np.ones(len(points))
         patches = _codes(self.plane, plane[on], points[on], PATCH_M)
         _, patch, count = np.unique(patches, return_inverse=True, return_counts=True)
-        weight[on] = 1.0 / count[patch]
-        return OnPlanes(plane, self.noise / np.sqrt(weight), weight)
+        part[on] = 1.0 / count[patch]
+        return OnPlanes(plane, self.noise / np.sqrt(part), part)
 
 
 def most_alike(off: np.ndarray, sigma: np.ndarray) -> np.ndarray:
