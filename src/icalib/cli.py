@@ -84,6 +84,8 @@ def _add_montecarlo(commands: argparse._SubParsersAction[argparse.ArgumentParser
     c.add_argument("--output", "-o", type=Path, required=True, help=folder)
     c.add_argument("--seed", type=_whole, metavar="N", help="of the first run; by default the scenario's")
     c.add_argument("--guess", choices=("none", "drawn"), default="none", help="drawn: about the truth; by default none")
+    planes = "that LiDARs see, known as simulated, or found in their clouds; by default known"
+    c.add_argument("--planes", choices=("known", "found"), default="known", help=planes)
     _add_workers(c)
     c.set_defaults(run=_montecarlo)
     r = commands.add_parser("reproduce", help="the paper's simulation again: errors against iterations, and a table")
@@ -229,7 +231,7 @@ def _montecarlo(options: argparse.Namespace) -> None:
     from icalib.montecarlo import Plan, run_file
     from icalib.montecarlo.console import print_study
 
-    plan = Plan(options.runs, options.seed, options.guess, options.workers, options.scheduler)
+    plan = Plan(options.runs, options.seed, options.guess, options.planes, options.workers, options.scheduler)
     with progress_bar(options.quiet) as progress:
         study = run_file(options.scenario, options.output, plan, progress)
     if not options.quiet:

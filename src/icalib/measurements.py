@@ -176,6 +176,10 @@ class LidarStream:
         columns = {name: getattr(self, name)[kept] for name in ("offset_s", "xyz", "plane")}
         return replace(self, start=start, **columns)
 
+    def unassociated(self) -> LidarStream:
+        """The same points, of which nobody knows on what planes they lie."""
+        return replace(self, plane=np.full(len(self.plane), -1, np.int32))
+
 
 @dataclass(frozen=True)
 class WheelStream:

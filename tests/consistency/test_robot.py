@@ -44,11 +44,7 @@ def steady(rig: Rig) -> Rig:
 
 
 def unassociated(measurements: Measurements) -> Measurements:
-    """Nothing is known of which points lie on which plane."""
-    return replace(
-        measurements,
-        lidars=tuple(replace(x, plane=np.full(len(x.plane), -1, np.int32)) for x in measurements.lidars),
-    )
+    return replace(measurements, lidars=tuple(x.unassociated() for x in measurements.lidars))
 
 
 def as_measured(measurements: Measurements) -> Measurements:

@@ -117,6 +117,7 @@ def test_missing_packages_are_named(runs, tmp_path: Path, capsys, monkeypatch, m
         ["montecarlo", "x.yaml", "-o", "out", "--runs", "2", "--workers", "0"],
         ["montecarlo", "x.yaml", "-o", "out", "--runs", "2", "--workers", "2", "--scheduler", "tcp://a:1"],
         ["montecarlo", "x.yaml", "-o", "out", "--runs", "2", "--guess", "truth"],
+        ["montecarlo", "x.yaml", "-o", "out", "--runs", "2", "--planes", "guessed"],
         ["reproduce"],
     ],
 )

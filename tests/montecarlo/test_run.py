@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,14 +11,16 @@ from scipy.spatial.transform import Rotation
 
 from icalib.calibration import Calibration, CornerResiduals, LidarResiduals, Visited, WheelResiduals
 from icalib.errors import RecordingError
+from icalib.measurements import Measurements
 from icalib.montecarlo import one_run
-from icalib.montecarlo.one_run import Task, compare, run
+from icalib.montecarlo.one_run import PlanesKind, Task, compare, run
 from icalib.montecarlo.record import Record
 from icalib.montecarlo.truth import error, true_value
 from icalib.montecarlo.whiteness import whiteness
 from icalib.pipeline import calibrate_measurements
-from icalib.simulation import Motion, Simulation, handheld, rig_for, simulate, with_drawn_guess
+from icalib.simulation import Motion, Simulation, handheld, load_scenario, rig_for, simulate, with_drawn_guess
 
+PAPER = Path(__file__).parents[2] / "examples" / "paper"
 SCENARIO = handheld(6.0)
 
 
@@ -143,6 +146,21 @@ def test_a_run_that_fails_says_why():
     failed = run(Task(still, 0))
     assert failed.failure.endswith(".") and "\n" not in failed.failure
     assert (failed.seed, failed.blocks) == (0, ())
+
+
+@pytest.mark.parametrize(("planes", "told"), [("known", True), ("found", False)])
+def test_planes_are_told_or_not(monkeypatch, planes: PlanesKind, told: bool):
+    seen = list[Measurements]()
+
+    def look(rig, measurements, **_):
+        seen.append(measurements)
+        raise RecordingError("seen.")
+
+    monkeypatch.setattr(one_run, "calibrate_measurements", look)
+    room = replace(load_scenario(PAPER / "table2-ramp.yaml"), duration_s=3.0, cameras=(), features=None)
+    assert run(Task(room, 1, planes=planes)).failure == "seen."
+    (lidar,) = seen[0].lidars
+    assert (lidar.plane >= 0).any() == told and len(lidar.xyz) > 1000
 
 
 @pytest.mark.parametrize(

@@ -131,7 +131,11 @@ def test_more_runs_are_added_by_a_cluster(alone: Path, tmp_path: Path):
 
 @pytest.mark.parametrize(
     ("changed", "why"),
-    [({"digest": "another"}, "the scenario changed"), ({"guess": "drawn"}, "their first guess is another")],
+    [
+        ({"digest": "another"}, "the scenario changed"),
+        ({"guess": "drawn"}, "their first guess is another"),
+        ({"planes": "found"}, "planes are known in one and found in the other"),
+    ],
 )
 def test_runs_of_another_study_are_never_mixed_in(alone: Path, changed: dict, why: str):
     before = (alone / "consistency.json").read_bytes()
@@ -144,7 +148,7 @@ def test_another_icalib_is_another_study(alone: Path, tmp_path: Path, monkeypatc
     monkeypatch.setattr("icalib.montecarlo.store.program", lambda: "another")
     with pytest.raises(CalibrationError, match="icalib changed"):
         study(alone)
-    store = Store(tmp_path, Identity.of("handheld", "digest", "none"))
+    store = Store(tmp_path, Identity.of("handheld", "digest", "none", "known"))
     with pytest.raises(CalibrationError, match="a worker of the cluster runs another version of icalib"):
         store.add(Record(0, "", 1.0, "yet another"))
 
@@ -162,7 +166,7 @@ def fill(folder: Path, records: list[Record], monkeypatch, interrupt: bool = Fal
 
 
 def test_failed_runs_are_kept_and_reported(tmp_path: Path, monkeypatch):
-    good = Record(0, "", 1.0, Identity.of("", "", "none").program)
+    good = Record(0, "", 1.0, Identity.of("", "", "none", "known").program)
     bad = Record(1, "no camera saw the <target>.", 1.0, good.program)
     found = fill(tmp_path, [bad, good], monkeypatch)
     assert [f.sentence for f in found.consistency.failures] == [bad.failure]
@@ -171,7 +175,7 @@ def test_failed_runs_are_kept_and_reported(tmp_path: Path, monkeypatch):
 
 
 def test_a_run_that_killed_its_workers_is_reported_and_tried_again_the_next_time(tmp_path: Path, monkeypatch):
-    good = Record(0, "", 1.0, Identity.of("", "", "none").program)
+    good = Record(0, "", 1.0, Identity.of("", "", "none", "known").program)
     lost = Record(1, "its worker died again and again.", 0.0, "")
     assert fill(tmp_path, [good, lost], monkeypatch).consistency.failures[0].seed == 1
     assert list(written(tmp_path)) == ["000000.json"]
@@ -179,7 +183,7 @@ def test_a_run_that_killed_its_workers_is_reported_and_tried_again_the_next_time
 
 
 def test_an_interrupted_study_says_what_is_there(tmp_path: Path, monkeypatch):
-    good = Record(0, "", 1.0, Identity.of("", "", "none").program)
+    good = Record(0, "", 1.0, Identity.of("", "", "none", "known").program)
     with pytest.raises(KeyboardInterrupt, match="1 of 2 runs are in .*; the same command goes on from there"):
         fill(tmp_path, [good], monkeypatch, interrupt=True)
     assert list(written(tmp_path)) == ["000000.json"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -17,17 +17,19 @@ from icalib.pipeline import calibrate_measurements
 from icalib.simulation import Scenario, Truth, rig_for, simulate, with_drawn_guess
 
 GuessKind = Literal["none", "drawn"]
+PlanesKind = Literal["known", "found"]
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
     """What a run is made from. guess: the program finds its own, or starts from one drawn about the truth. Cameras that
     follow points of the scene have a drawn guess of their intrinsics in either case: points do not show these from
-    nothing."""
+    nothing. planes: the program is told which of them a LiDAR's point lies on, or finds them in the clouds."""
 
     scenario: Scenario
     seed: int
     guess: GuessKind = "none"
+    planes: PlanesKind = "known"
 
 
 def run(task: Task) -> Record:
@@ -40,7 +42,10 @@ def run(task: Task) -> Record:
         if task.guess == "drawn" or not rig.has_target:
             only = None if task.guess == "drawn" else ("intrinsics",)
             rig = with_drawn_guess(rig, task.scenario, task.seed, only=only)
-        result = calibrate_measurements(rig, simulation.measurements, on_visit=visits.append)
+        seen = simulation.measurements
+        if task.planes == "found":
+            seen = replace(seen, lidars=tuple(x.unassociated() for x in seen.lidars))
+        result = calibrate_measurements(rig, seen, on_visit=visits.append)
     except Exception as caught:
         return Record(task.seed, sentence_on(caught), time.perf_counter() - started, program())
     return compare(task.seed, result, simulation.truth, visits, time.perf_counter() - started)

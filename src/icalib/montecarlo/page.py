@@ -97,6 +97,7 @@ def _facts(identity: Identity, records: Sequence[Record]) -> list[tuple[str, obj
         ("scenario", identity.scenario),
         ("sha256", element("code", identity.scenario_sha256)),
         ("first guess", identity.guess),
+        ("planes of LiDARs", identity.planes),
         ("seeds", f"{records[0].seed} to {records[-1].seed}"),
         ("time of a run", f"{seconds:.1f} s (median)"),
         ("program", element("code", identity.program)),

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from icalib.batch import check_worker, program, write_whole
 from icalib.errors import CalibrationError
-from icalib.montecarlo.one_run import GuessKind
+from icalib.montecarlo.one_run import GuessKind, PlanesKind
 from icalib.montecarlo.record import Record, from_json, to_json
 from icalib.provenance import versions
 
@@ -22,18 +22,20 @@ class Identity:
     scenario: str
     scenario_sha256: str
     guess: GuessKind
+    planes: PlanesKind
     program: str
     versions: dict[str, str]
 
     @classmethod
-    def of(cls, scenario: str, scenario_sha256: str, guess: GuessKind) -> Identity:
+    def of(cls, scenario: str, scenario_sha256: str, guess: GuessKind, planes: PlanesKind) -> Identity:
         """With the program that runs now."""
-        return cls(scenario, scenario_sha256, guess, program(), versions())
+        return cls(scenario, scenario_sha256, guess, planes, program(), versions())
 
 
 _CHANGED = {
     "scenario_sha256": "the scenario changed",
     "guess": "their first guess is another",
+    "planes": "planes are known in one and found in the other",
     "program": "icalib changed",
     "versions": "Python or a library changed",
 }

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from icalib.batch import Crew, alone, write_whole
 from icalib.errors import CalibrationError
-from icalib.montecarlo.one_run import GuessKind, Task
+from icalib.montecarlo.one_run import GuessKind, PlanesKind, Task
 from icalib.montecarlo.page import study_html
 from icalib.montecarlo.record import Record
 from icalib.montecarlo.store import Identity, Store
@@ -23,7 +23,8 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class Plan:
-    """How many runs, from which seed on (the scenario's where None), from which guess, and who makes them.
+    """How many runs, from which seed on (the scenario's where None), from which guess, with planes that are known or
+    found, and who makes them.
 
     workers: processes on this machine, one for each core where None; scheduler: address of a Dask cluster instead.
     """
@@ -31,6 +32,7 @@ class Plan:
     runs: int
     seed: int | None = None
     guess: GuessKind = "none"
+    planes: PlanesKind = "known"
     workers: int | None = None
     scheduler: str | None = None
 
@@ -64,7 +66,7 @@ def run_study(
     cannot be written, another process is at work in it, or no cluster answers; KeyboardInterrupt with a sentence on
     what was reached.
     """
-    store = Store(output, Identity.of(name, digest, plan.guess))
+    store = Store(output, Identity.of(name, digest, plan.guess, plan.planes))
     first = scenario.seed if plan.seed is None else plan.seed
     seeds = range(first, first + plan.runs)
     with alone(output):
@@ -93,7 +95,7 @@ def _fill(store: Store, scenario: Scenario, seeds: range, plan: Plan, progress: 
         return lost
     progress(_words(done, seeds), 0.0)
     try:
-        tasks = [Task(scenario, seed, plan.guess) for seed in missing]
+        tasks = [Task(scenario, seed, plan.guess, plan.planes) for seed in missing]
         with closing(run_all(tasks, plan.workers, plan.scheduler)) as records:
             for made, record in enumerate(records, 1):
                 if record.program:
