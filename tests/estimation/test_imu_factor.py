@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from icalib.estimation.arrowhead import make_pieces
 from icalib.estimation.imu_factor import ROWS, ImuFactor
-from icalib.estimation.integration import integrate
+from icalib.estimation.integration import Increment, correction, integrate, readings_of
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 
@@ -67,10 +67,9 @@ def test_residuals_are_whitened_with_the_covariance_of_the_increments(factor, se
     imu, t = setup.imu, setup.state.seconds
     for k, first in enumerate(imu.interval(t[:-1])):
         P, J = np.empty((15, 15)), np.empty((9, 6))
-        integrate(
-            t[k], t[k + 1], first, imu.seconds, imu.gyro, imu.accel, setup.state.bias[k], factor.intrinsics0,
-            imu.variance, imu.walk, False, np.empty((3, 3)), np.empty(3), np.empty(3), J, P,
-        )  # fmt: skip
+        out = Increment(np.empty((3, 3)), np.empty(3), np.empty(3), J, P)
+        by = correction(factor.intrinsics0, 0)
+        integrate(t[k], t[k + 1], first, setup.state.bias[k], readings_of(imu, False), by, out)
         np.testing.assert_allclose(factor.made.W[k] @ P @ factor.made.W[k].T, np.eye(15), rtol=0, atol=1e-9)
         assert (np.triu(factor.made.W[k], 1) == 0).all()
         np.testing.assert_allclose(factor.made.J[k, :, :6], J, rtol=0, atol=1e-15)

@@ -5,7 +5,15 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from icalib.estimation.integration import integrate
+from icalib.estimation.integration import (
+    Increment,
+    Readings,
+    correction,
+    in_order_of_nodes,
+    integrate,
+    integrate_from_node,
+    nothing_carried,
+)
 from icalib.geometry import so3
 
 BIAS = np.array([0.01, -0.02, 0.03, 0.1, -0.2, 0.15])
@@ -16,7 +24,7 @@ UNIT = np.array([0.48, -0.6, 0.64])
 ANGLES = [0.0, 1e-12, 1e-8, 1e-4, 1e-2, 0.0999999, 0.1, 0.1000001, 0.5, 2.0, np.pi - 1e-6, 3.5]
 
 
-class Readings:
+class Irregular:
     """Irregular stamps with random readings, smooth enough to be a motion."""
 
     def __init__(self, n=12, rate_scale=1.0, seed=0):
@@ -37,7 +45,8 @@ def run(r, t0, t1, bias=BIAS, intrinsics=None, first=None, width=6, covariance=F
     P = np.empty((15, 15) if covariance else (0, 0))
     first = r.interval(t0) if first is None else first
     x = np.zeros(24) if intrinsics is None else intrinsics
-    end = integrate(t0, t1, first, r.t, r.gyro, r.accel, bias, x, r.variance, r.walk, linear, R, v, p, J, P)
+    readings = Readings(r.t, r.gyro, r.accel, r.variance, r.walk, linear)
+    end = integrate(t0, t1, first, bias, readings, correction(x, max(width - 6, 0)), Increment(R, v, p, J, P))
     return R, v, p, J, P, end
 
 
@@ -94,7 +103,7 @@ def difference(plus, minus, R, h):
     return np.concatenate([turn, plus[1] - minus[1], plus[2] - minus[2]]) / (2.0 * h)
 
 
-R0 = Readings()
+R0 = Irregular()
 SPANS = {
     "between stamps": (R0.t[1] + 1e-3, R0.t[8] + 2e-3),
     "stamp to stamp": (R0.t[2], R0.t[9]),
@@ -123,7 +132,7 @@ def test_from_stamp_to_stamp_linear_readings_are_the_same_as_means():
 @pytest.mark.parametrize("angle", ANGLES)
 @pytest.mark.parametrize("backwards", [False, True])
 def test_one_step_at_every_angle_with_unit_force(angle, backwards):
-    r = Readings(2)
+    r = Irregular(2)
     r.t, r.gyro, r.accel = np.array([0.0, 1.0]), np.tile(angle * UNIT, (2, 1)), np.tile(UNIT[[1, 2, 0]], (2, 1))
     t0, t1 = (1.0, 0.0) if backwards else (0.0, 1.0)
     zero = np.zeros(6)
@@ -164,6 +173,31 @@ def test_starting_in_either_interval_at_a_stamp_is_the_same(backwards):
         np.testing.assert_allclose(a, b, atol=1e-15)
 
 
+@pytest.mark.parametrize("order", ["of nodes", "of time", "any"])
+@pytest.mark.parametrize("width", [0, 6, 30])
+def test_what_is_carried_on_is_what_starts_anew(order, width):
+    """Bit by bit, whatever the order; instants lie on stamps and nodes, between, and beyond both ends."""
+    rng = np.random.default_rng(3)
+    seconds = np.array([R0.t[2], 0.5 * (R0.t[5] + R0.t[6]), R0.t[9]])
+    times = np.sort(np.concatenate([rng.uniform(R0.t[0] - 0.01, R0.t[-1] + 0.01, 60), R0.t[3:8], seconds]))
+    node = np.clip(np.searchsorted(0.5 * (seconds[1:] + seconds[:-1]), times), 0, 2)
+    ways = {"of nodes": in_order_of_nodes(times, node, seconds), "of time": np.arange(68), "any": rng.permutation(68)}
+    readings = Readings(R0.t, R0.gyro, R0.accel, R0.variance, R0.walk, True)
+    by, carried = correction(INTRINSICS, max(width - 6, 0)), nothing_carried(width)
+    for i in ways[order]:
+        k = node[i]
+        out = Increment(np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((9, width)), np.empty((0, 0)))
+        end = integrate_from_node(k, seconds[k], times[i], R0.interval(seconds[k]), BIAS, readings, by, carried, out)
+        anew = run(R0, seconds[k], times[i], intrinsics=INTRINSICS, width=width, linear=True)
+        for a, b in zip((*out[:4], *end), (*anew[:4], *anew[5]), strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_instants_lead_away_from_their_nodes():
+    times, node = np.array([0.1, 0.4, 0.5, 0.7, 0.9, 1.2]), np.array([0, 0, 0, 1, 1, 1])
+    assert in_order_of_nodes(times, node, np.array([0.5, 1.0])).tolist() == [2, 5, 4, 3, 1, 0]
+
+
 @pytest.mark.parametrize("backwards", [False, True])
 def test_rate_and_force_at_the_end_are_the_last_means_or_interpolated(backwards):
     t0, t1 = SPANS["between stamps"][::-1] if backwards else SPANS["between stamps"]
@@ -194,7 +228,7 @@ def test_jacobians_by_central_differences(span, linear, backwards, intrinsics):
 
 @pytest.mark.parametrize("angle", ANGLES)
 def test_bias_jacobian_of_one_step_at_every_angle(angle):
-    r = Readings(2)
+    r = Irregular(2)
     r.t, r.gyro, r.accel = np.array([0.0, 1.0]), np.tile(angle * UNIT, (2, 1)), np.tile(UNIT[[1, 2, 0]], (2, 1))
     zero, h = np.zeros(6), 1e-5
     R, _, _, J, _, _ = run(r, 0.0, 1.0, zero)
@@ -260,7 +294,7 @@ def test_covariance_against_sampled_readings():
     """Readings at rate f have noise of density times sqrt(f); biases walk from reading to reading."""
     rate, n, samples = 200.0, 100, 4000
     rng = np.random.default_rng(3)
-    r = Readings(n + 1)
+    r = Irregular(n + 1)
     r.t = np.arange(n + 1) / rate
     phase = 2 * np.pi * r.t[:, None] * [1.1, 0.7, 0.9]
     r.gyro, r.accel = np.sin(phase + 1.0), 2.0 * np.cos(phase) + [0.0, 0.0, 9.8]

@@ -11,7 +11,7 @@ from numba import njit
 from icalib.estimation import pages
 from icalib.estimation.arrowhead import Piece, in_parallel
 from icalib.estimation.imu_data import ImuData
-from icalib.estimation.integration import integrate
+from icalib.estimation.integration import Increment, correction, integrate, readings_of
 from icalib.estimation.interval_sums import add_interval
 from icalib.estimation.prior_factor import accumulate_bias_prior
 from icalib.estimation.state import State
@@ -22,14 +22,12 @@ ROWS = 15  # rotation, velocity, position, gyro bias, accelerometer bias
 
 
 @njit(cache=True, nogil=True)
-def _preintegrate(k0, k1, nodes, first, t, gyro, accel, bias, intrinsics, variance, walk, linear, dR, dv, dp, J, W):
+def _preintegrate(k0, k1, nodes, first, readings, bias, intrinsics, dR, dv, dp, J, W):
     """Increments, bias (and intrinsics) Jacobians and inverse Cholesky factor W of the covariance, intervals k0..k1."""
-    P = np.empty((ROWS, ROWS))
+    P, by = np.empty((ROWS, ROWS)), correction(intrinsics, J.shape[2] - 6)
     for k in range(k0, k1):
-        integrate(
-            nodes[k], nodes[k + 1], first[k], t, gyro, accel, bias[k], intrinsics, variance, walk, linear,
-            dR[k], dv[k], dp[k], J[k], P,
-        )  # fmt: skip
+        out = Increment(dR[k], dv[k], dp[k], J[k], P)
+        integrate(nodes[k], nodes[k + 1], first[k], bias[k], readings, by, out)
         inverse_cholesky(P, W[k])
 
 
@@ -232,8 +230,7 @@ class ImuFactor:
         half = n // 2
         in_parallel(
             lambda ks: _preintegrate(
-                ks[0], ks[1], state.seconds, first, imu.seconds, imu.gyro, imu.accel, bias0, intrinsics,
-                imu.variance, imu.walk, False, *arrays,
+                ks[0], ks[1], state.seconds, first, readings_of(imu, False), bias0, intrinsics, *arrays
             ),
             [(0, half), (half, n)],
         )  # fmt: skip

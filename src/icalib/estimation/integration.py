@@ -14,15 +14,14 @@ rotation, velocity, position, gyro bias, accelerometer bias.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
+from icalib.estimation.imu_data import ImuData
 from icalib.estimation.imu_model import correction_matrices, intrinsics_jacobians
 from icalib.geometry import so3
-
-# Work space of one integration: increments and what is known of them.
-#   R (3, 3), v (3,), p (3,): the increments; J (9, 6 or 30): their derivative with respect to gyro bias, accelerometer
-#   bias (and the 24 IMU intrinsics); P (15, 15): covariance, of no size where it is not wanted.
 
 
 @njit(cache=True, nogil=True)
@@ -220,46 +219,155 @@ def _start(R, v, p, J, P):
             P[i, k] = 0.0
 
 
-@njit(cache=True, nogil=True)
-def integrate(t0, t1, first, t, gyro, accel, bias, intrinsics, variance, walk, linear, R, v, p, J, P):
-    """Integrates readings from t0 to t1 (seconds, imu clock; t1 < t0 runs backwards), starting at interval `first`.
+class Readings(NamedTuple):
+    """t (N,) seconds on the IMU's clock; gyro, accel (N, 3); variance (N, 3): see ImuData; walk (2,).
 
-    t (N,), gyro, accel (N, 3): readings; bias (6,); variance (N, 3): see ImuData;
-    walk (2,). R, v, p, J, P are overwritten. Beyond the recording the first or last interval is continued.
-    With `linear`, readings go linearly from stamp to stamp, and a part of an interval takes their mean over that part:
-    whole intervals are the same, but the pose at t1 then has a continuous derivative, the rate at t1.
-    Returns the corrected rate (3,) and specific force (3,) at t1.
+    linear: readings go linearly from stamp to stamp, and a part of an interval takes their mean over that part: whole
+    intervals are the same, but the pose at the end then has a continuous derivative, the rate there.
     """
-    P_t = np.zeros(P.shape)
+
+    t: np.ndarray
+    gyro: np.ndarray
+    accel: np.ndarray
+    variance: np.ndarray
+    walk: np.ndarray
+    linear: bool
+
+
+class Correction(NamedTuple):
+    """How readings are corrected by the IMU intrinsics, see imu_model; derivatives (3, 6) of rate and force by both
+    biases, and room for those by the intrinsics, (3, 24 or 0)."""
+
+    intrinsics: np.ndarray
+    F: np.ndarray
+    G: np.ndarray
+    H: np.ndarray
+    dw_db: np.ndarray
+    df_db: np.ndarray
+    extra_w: np.ndarray
+    extra_f: np.ndarray
+
+
+class Increment(NamedTuple):
+    """R (3, 3), v (3,), p (3,): the increments; J (9, 6 or 30): their derivative with respect to gyro bias,
+    accelerometer bias (and the 24 IMU intrinsics), of no columns where it is not wanted; P (15, 15): covariance, of no
+    size where it is not wanted."""
+
+    R: np.ndarray
+    v: np.ndarray
+    p: np.ndarray
+    J: np.ndarray
+    P: np.ndarray
+
+
+class Carried(NamedTuple):
+    """How far increments were carried from a node, in whole intervals: node and interval (2,), the instant (1,)."""
+
+    at: np.ndarray
+    now: np.ndarray
+    so_far: Increment
+
+
+@njit(cache=True, nogil=True)
+def correction(intrinsics, n_extra):
+    """n_extra: 24 where derivatives by the intrinsics are wanted, else 0."""
     F, G, H = correction_matrices(intrinsics)
     dw_db, df_db = np.zeros((3, 6)), np.zeros((3, 6))
-    _start(R, v, p, J, P)
     for i in range(3):
         for k in range(3):
             dw_db[i, k], dw_db[i, 3 + k], df_db[i, 3 + k] = -G[i, k], -H[i, k], -F[i, k]
-    n_extra = max(J.shape[1] - 6, 0)
-    extra_w, extra_f = np.zeros((3, n_extra)), np.zeros((3, n_extra))
-    rate, force = np.empty(3), np.empty(3)
-    backwards = t1 < t0
-    j, now = first, t0
-    while True:
-        if backwards:
-            last = j == 0 or t[j] <= t1
-            end = t1 if last else t[j]
-        else:
-            last = j == len(t) - 2 or t[j + 1] >= t1
-            end = t1 if last else t[j + 1]
-        span = t[j + 1] - t[j]
-        share = min(max((0.5 * (now + end) - t[j]) / span, 0.0), 1.0) if linear else 0.5
-        _corrected(gyro, accel, j, share, bias, F, G, H, rate, force)
-        if n_extra > 0:
-            intrinsics_jacobians(intrinsics, F, G, force, rate, extra_w, extra_f)
-        if end != now:
-            step(rate, force, end - now, dw_db, df_db, R, v, p, J, extra_w, extra_f, P, P_t, variance[j], walk)
-        if last:
-            if linear:
-                share = min(max((end - t[j]) / span, 0.0), 1.0)
-                _corrected(gyro, accel, j, share, bias, F, G, H, rate, force)
-            return rate, force
+    return Correction(intrinsics, F, G, H, dw_db, df_db, np.zeros((3, n_extra)), np.zeros((3, n_extra)))
+
+
+@njit(cache=True, nogil=True)
+def nothing_carried(width):
+    """J of `width` columns, no covariance."""
+    so_far = Increment(np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((9, width)), np.empty((0, 0)))
+    return Carried(np.full(2, -1), np.empty(1), so_far)
+
+
+@njit(cache=True, nogil=True)
+def _part(j, now, end, bias, readings, by, out, P_t, rate, force):
+    """From `now` to `end` (seconds), both in interval j; rate, force (3,): those of that part."""
+    t = readings.t
+    span = t[j + 1] - t[j]
+    share = min(max((0.5 * (now + end) - t[j]) / span, 0.0), 1.0) if readings.linear else 0.5
+    _corrected(readings.gyro, readings.accel, j, share, bias, by.F, by.G, by.H, rate, force)
+    if by.extra_w.shape[1] > 0:
+        intrinsics_jacobians(by.intrinsics, by.F, by.G, force, rate, by.extra_w, by.extra_f)
+    if end != now:
+        step(
+            rate, force, end - now, by.dw_db, by.df_db, out.R, out.v, out.p, out.J, by.extra_w, by.extra_f, out.P, P_t,
+            readings.variance[j], readings.walk,
+        )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def _whole(t1, backwards, j, now, bias, readings, by, out, P_t, rate, force):
+    """From `now` in interval j through whole intervals to the one that holds t1, or is the last; that one, and where
+    it begins."""
+    t = readings.t
+    while (j > 0 and t[j] > t1) if backwards else (j < len(t) - 2 and t[j + 1] < t1):
+        end = t[j] if backwards else t[j + 1]
+        _part(j, now, end, bias, readings, by, out, P_t, rate, force)
         now = end
         j += -1 if backwards else 1
+    return j, now
+
+
+@njit(cache=True, nogil=True)
+def _to_the_end(t1, j, now, bias, readings, by, out, P_t, rate, force):
+    """From `now` to t1, both in interval j; rate, force (3,): those at t1."""
+    _part(j, now, t1, bias, readings, by, out, P_t, rate, force)
+    if readings.linear:
+        t = readings.t
+        share = min(max((t1 - t[j]) / (t[j + 1] - t[j]), 0.0), 1.0)
+        _corrected(readings.gyro, readings.accel, j, share, bias, by.F, by.G, by.H, rate, force)
+
+
+@njit(cache=True, nogil=True)
+def integrate(t0, t1, first, bias, readings, by, out):
+    """Integrates `readings` from t0 to t1 (seconds, imu clock; t1 < t0 runs backwards), starting at interval `first`.
+
+    bias (6,). `out` is overwritten. Beyond the recording the first or last interval is continued.
+    Returns the corrected rate (3,) and specific force (3,) at t1.
+    """
+    P_t, rate, force = np.zeros(out.P.shape), np.empty(3), np.empty(3)
+    _start(out.R, out.v, out.p, out.J, out.P)
+    j, now = _whole(t1, t1 < t0, first, t0, bias, readings, by, out, P_t, rate, force)
+    _to_the_end(t1, j, now, bias, readings, by, out, P_t, rate, force)
+    return rate, force
+
+
+@njit(cache=True, nogil=True)
+def integrate_from_node(node, t0, t1, first, bias, readings, by, carried, out):
+    """As `integrate`, without a covariance. What was `carried` from the same node in the same direction, and not
+    as far as t1, is carried on, so that many instants (`in_order_of_nodes`) cost little more than the last one."""
+    rate, force, backwards = np.empty(3), np.empty(3), t1 < t0
+    so_far, way = carried.so_far, 2 * node + backwards
+    if carried.at[0] != way or (t1 >= carried.now[0] if backwards else t1 <= carried.now[0]):
+        _start(so_far.R, so_far.v, so_far.p, so_far.J, so_far.P)
+        carried.at[0], carried.at[1], carried.now[0] = way, first, t0
+    j, now = _whole(t1, backwards, carried.at[1], carried.now[0], bias, readings, by, so_far, so_far.P, rate, force)
+    carried.at[1], carried.now[0] = j, now
+    for i in range(3):
+        out.v[i], out.p[i] = so_far.v[i], so_far.p[i]
+        for k in range(3):
+            out.R[i, k] = so_far.R[i, k]
+    for i in range(out.J.shape[0]):
+        for k in range(out.J.shape[1]):
+            out.J[i, k] = so_far.J[i, k]
+    _to_the_end(t1, j, now, bias, readings, by, out, out.P, rate, force)
+    return rate, force
+
+
+def in_order_of_nodes(times: np.ndarray, node: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """(n,) the order in which instants at `times` (n,), in order themselves, lead away from their `node` (n,), which
+    are at `seconds` (K,): first all behind their nodes, then backwards those before."""
+    before = times < seconds[node]
+    return np.concatenate([np.flatnonzero(~before), np.flatnonzero(before)[::-1]])
+
+
+def readings_of(imu: ImuData, linear: bool) -> Readings:
+    """Those of `imu`, with its noise."""
+    return Readings(imu.seconds, imu.gyro, imu.accel, imu.variance, imu.walk, linear)

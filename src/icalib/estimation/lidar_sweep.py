@@ -9,7 +9,14 @@ import numpy as np
 from numba import njit
 
 from icalib.estimation.imu_data import ImuData
-from icalib.estimation.integration import integrate
+from icalib.estimation.integration import (
+    Increment,
+    correction,
+    in_order_of_nodes,
+    integrate_from_node,
+    nothing_carried,
+    readings_of,
+)
 from icalib.estimation.poses import assign_nodes
 from icalib.estimation.state import State
 from icalib.geometry.small import mul3
@@ -35,18 +42,15 @@ class Sweep(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def _imu_at(times, node, first, chain, raw, intrinsics, out_R, out_p, rate, velocity):
+def _imu_at(order, times, node, first, chain, readings, intrinsics, out_R, out_p, rate, velocity):
     """IMU poses at `times` by integration from their nodes, without Jacobians; the rate is the body's."""
     seconds, R, p, v, b, g = chain
-    t, gyro, accel = raw
-    variance, walk = np.zeros((len(t), 3)), np.zeros(2)
-    dR, dv, dp, J, P = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((9, 0)), np.empty((0, 0))
-    for i in range(len(times)):
+    by, carried, dR, dv, dp = correction(intrinsics, 0), nothing_carried(0), np.empty((3, 3)), np.empty(3), np.empty(3)
+    out = Increment(dR, dv, dp, np.empty((9, 0)), np.empty((0, 0)))
+    for i in order:
         k = node[i]
         dt = times[i] - seconds[k]
-        w, _ = integrate(
-            seconds[k], times[i], first[i], t, gyro, accel, b[k], intrinsics, variance, walk, True, dR, dv, dp, J, P
-        )  # fmt: skip
+        w, _ = integrate_from_node(k, seconds[k], times[i], first[i], b[k], readings, by, carried, out)
         turned = mul3(R[k], dR)
         for a in range(3):
             rate[i, a] = w[a]
@@ -90,8 +94,8 @@ def sweep(drive: Motion, name: str, times: np.ndarray, near: np.ndarray | None =
     first = imu.interval(state.seconds[node])
     first -= (times < state.seconds[node]) & (imu.seconds[first] == state.seconds[node]) & (first > 0)
     chain = (state.seconds, state.rotation, state.position, state.velocity, state.bias, drive.gravity)
-    raw = (imu.seconds, imu.gyro, imu.accel)
-    _imu_at(times, node, first, chain, raw, state.values[imu.name, "intrinsics"], R, p, rate, velocity)
+    order, intrinsics = in_order_of_nodes(times, node, state.seconds), state.values[imu.name, "intrinsics"]
+    _imu_at(order, times, node, first, chain, readings_of(imu, True), intrinsics, R, p, rate, velocity)
     R_il, p_il = state.values[name, "rotation"], state.values[name, "translation"]
     _to_lidar(np.ascontiguousarray(R_il), p_il, R, p, rate, velocity)
     return Sweep(R, p, rate, velocity)

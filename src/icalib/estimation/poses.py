@@ -17,7 +17,14 @@ from numba import njit
 
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.imu_model import N_INTRINSICS, correction_matrices, intrinsics_jacobians
-from icalib.estimation.integration import integrate
+from icalib.estimation.integration import (
+    Increment,
+    correction,
+    in_order_of_nodes,
+    integrate_from_node,
+    nothing_carried,
+    readings_of,
+)
 from icalib.estimation.state import NODE, State
 from icalib.geometry import so3
 from icalib.rig import Scheme
@@ -86,19 +93,16 @@ def _velocity(i, R0, R1, g, dv, force, J, moving):
 
 @njit(cache=True, nogil=True)
 def _inertial(
-    times, node, first, nodes, R, p, v, b, g, linear, t, gyro, accel, intrinsics, out_R, out_p, rate, vel, Jn, Jx,
-    moving,
-):  # fmt: skip
-    variance, walk = np.zeros((len(t), 3)), np.zeros(2)
+    order, times, node, first, nodes, R, p, v, b, g, readings, intrinsics, out_R, out_p, rate, vel, Jn, Jx, moving
+):
     width = 6 + Jx.shape[2]
+    by, carried = correction(intrinsics, Jx.shape[2]), nothing_carried(width)
     dR, dv, dp, J = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((9, width))
-    P = np.empty((0, 0))
-    for i in range(len(times)):
+    out = Increment(dR, dv, dp, J, np.empty((0, 0)))
+    for i in order:
         k = node[i]
         dt = times[i] - nodes[k]
-        w, f = integrate(
-            nodes[k], times[i], first[i], t, gyro, accel, b[k], intrinsics, variance, walk, linear, dR, dv, dp, J, P
-        )  # fmt: skip
+        w, f = integrate_from_node(k, nodes[k], times[i], first[i], b[k], readings, by, carried, out)
         rate[i] = w
         for a in range(3):
             out_p[i, a] = p[k, a] + v[k, a] * dt
@@ -251,8 +255,8 @@ def _inertial_poses(
     first = imu.interval(state.seconds[node])
     on_stamp = (times < state.seconds[node]) & (imu.seconds[first] == state.seconds[node]) & (first > 0)
     _inertial(
-        times, node, first - on_stamp, state.seconds, state.rotation, state.position, state.velocity, state.bias,
-        gravity, True, imu.seconds, imu.gyro, imu.accel, state.values[imu.name, "intrinsics"], *out, by_node, by_imu,
-        moving,
+        in_order_of_nodes(times, node, state.seconds), times, node, first - on_stamp, state.seconds, state.rotation,
+        state.position, state.velocity, state.bias, gravity, readings_of(imu, True),
+        state.values[imu.name, "intrinsics"], *out, by_node, by_imu, moving,
     )  # fmt: skip
     return Poses(*out, by_node, np.zeros((0, 6, NODE)), by_imu)
