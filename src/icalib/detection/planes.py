@@ -37,6 +37,7 @@ ACROSS = 0.25  # of a voxel's edge: what spreads less in its own plane is a line
 SAME_TURN = np.deg2rad(4.0)  # between regions of one plane
 MIXED = 1.35  # whitened RMS of a cell that does not hold one plane
 BENT = 0.4  # standard deviations of a point by which a region may bow: flat ones up to 0.32, hills from 0.4 on
+UNEVEN = 0.35  # by which the means of cells may stray, RMS: planes in a cloud 3 cm out of place up to 0.27, hills 0.48
 
 
 @dataclass(frozen=True)
@@ -98,8 +99,8 @@ def find_planes(points: np.ndarray, seen_from: np.ndarray, search: PlaneSearch =
         np.flatnonzero(region == k) for k in np.flatnonzero(np.bincount(region[region >= 0], minlength=count) > 2)
     ]
     patches = _patches(_join(voxels, members), voxels, search)
-    for _ in range(ROUNDS):
-        patches = _refined(patches, points, seen_from, variance, search)
+    for k in range(ROUNDS):
+        patches = _refined(patches, points, seen_from, variance, search, k == ROUNDS - 1)
     return FoundPlanes(_packed(patches, search.voxel_m), sum(p.own > 0 for p in patches))
 
 
@@ -254,9 +255,15 @@ def _associate_at_once(
 
 
 def _refined(
-    patches: list[_Patch], points: np.ndarray, seen_from: np.ndarray, variance: np.ndarray, search: PlaneSearch
+    patches: list[_Patch],
+    points: np.ndarray,
+    seen_from: np.ndarray,
+    variance: np.ndarray,
+    search: PlaneSearch,
+    last: bool,
 ) -> list[_Patch]:
-    """Planes fitted to their own points, without cells that are empty or not flat; small ones own none any more."""
+    """Planes fitted to their own points, without cells that are empty or not flat; small ones own none any more, nor,
+    in the `last` round, those that are uneven."""
     patches = sorted(patches, key=lambda p: -p.own)
     cells = _packed(patches, search.voxel_m)
     plane, cell, distance = _associate_at_once(cells, points, seen_from, variance, search)
@@ -266,8 +273,10 @@ def _refined(
     use = np.where(good, cells.use, np.minimum(cells.use, NEAR))
     refined = []
     for patch, first, sums in zip(patches, cells.first, moments, strict=True):
-        own = use[first : first + patch.use.size].reshape(patch.use.shape)
-        if (own == OWN).sum() * search.voxel_m**2 < search.smallest_m2:
+        mine = slice(first, first + patch.use.size)
+        own = use[mine].reshape(patch.use.shape)
+        uneven = last and _unevenness(stats[mine][use[mine] == OWN]) > UNEVEN
+        if uneven or (own == OWN).sum() * search.voxel_m**2 < search.smallest_m2:
             refined.append(patch.unowned())
             continue
         normal, old, centre = patch.plane[:3].copy(), patch.plane[3:], np.empty(3)
@@ -276,3 +285,13 @@ def _refined(
         at = old + normal * (normal @ (centre - old))
         refined.append(replace(patch, plane=np.append(normal, at), use=own))
     return refined
+
+
+def _unevenness(stats: np.ndarray) -> float:
+    """Standard deviations of a point by which the means of cells (C, 3), see `sum_cells`, depart from their plane, RMS
+    over the points, beyond what noise does. A surface that waves within its noise bends nowhere much as a whole, and
+    there are thousands of points on it."""
+    count, total, _ = stats.T
+    if not len(stats):
+        return 0.0
+    return float(np.sqrt(max((total**2 / count).sum() - len(stats), 0.0) / count.sum()))
