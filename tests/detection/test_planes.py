@@ -101,12 +101,13 @@ def test_what_bends_is_no_plane():
 def test_what_waves_within_its_noise_is_no_plane():
     """Too little for each of its squares, and not in one direction: planes of such hills turned robots by 0.25 deg."""
     rng = np.random.default_rng(5)
-    flat = sheet(rng, 40000, 4.0)
+    flat, wall = sheet(rng, 40000, 4.0), sheet(rng, 60000, 4.0)[:, [2, 0, 1]] + [2.5, 0.0, 2.5]
     waves = 0.03 * np.sin(3.0 * flat[:, 0]) * np.cos(2.0 * flat[:, 1])
-    seen_from = np.full((40000, 3), [0.0, 0.0, 3.0])
+    seen_from = np.full((100000, 3), [0.0, 0.0, 3.0])
     search = PlaneSearch(position_m=1e-3, angle_rad=1e-3)
-    assert len(find_planes(flat, seen_from, search).planes) == 1
-    assert len(find_planes(flat + waves[:, None] * [0.0, 0.0, 1.0], seen_from, search).planes) == 0
+    assert len(find_planes(np.concatenate([flat, wall]), seen_from, search).planes) == 2
+    (left,) = find_planes(np.concatenate([flat + waves[:, None] * [0.0, 0.0, 1.0], wall]), seen_from, search).planes
+    assert abs(left[0]) > 0.99
 
 
 def test_points_near_two_planes_or_in_grazing_beams_belong_to_none():

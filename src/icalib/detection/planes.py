@@ -36,6 +36,8 @@ ROUNDS = 3  # of association and fit
 ACROSS = 0.25  # of a voxel's edge: what spreads less in its own plane is a line
 SAME_TURN = np.deg2rad(4.0)  # between regions of one plane
 MIXED = 1.35  # whitened RMS of a cell that does not hold one plane
+FINE_M = 1e-3  # out of place, or less: before, strays show nothing
+EVEN = 0.1  # what most points lie on strays less, or nothing is said: poses or the times of points are wrong
 BENT = 0.4  # standard deviations of a point by which a region may bow: flat ones up to 0.32, hills from 0.4 on
 UNEVEN = 0.35  # by which the means of cells may stray, RMS: planes in a cloud 3 cm out of place up to 0.27, hills 0.48
 
@@ -263,7 +265,7 @@ def _refined(
     last: bool,
 ) -> list[_Patch]:
     """Planes fitted to their own points, without cells that are empty or not flat; small ones own none any more, nor,
-    in the `last` round, those that are uneven."""
+    in the `last` round and where all is in place, those that are uneven."""
     patches = sorted(patches, key=lambda p: -p.own)
     cells = _packed(patches, search.voxel_m)
     plane, cell, distance = _associate_at_once(cells, points, seen_from, variance, search)
@@ -271,12 +273,16 @@ def _refined(
     sum_cells(points, variance, plane, cell, distance, stats, moments)
     good = (stats[:, 0] >= FEWEST) & (stats[:, 2] < MIXED**2 * stats[:, 0])
     use = np.where(good, cells.use, np.minimum(cells.use, NEAR))
-    refined = []
-    for patch, first, sums in zip(patches, cells.first, moments, strict=True):
-        mine = slice(first, first + patch.use.size)
-        own = use[mine].reshape(patch.use.shape)
-        uneven = last and _unevenness(stats[mine][use[mine] == OWN]) > UNEVEN
-        if uneven or (own == OWN).sum() * search.voxel_m**2 < search.smallest_m2:
+    mine = [slice(a, a + p.use.size) for a, p in zip(cells.first, patches, strict=True)]
+    refined, uneven = (
+        [],
+        _uneven([stats[k][use[k] == OWN] for k in mine])
+        if last and search.position_m <= FINE_M
+        else [False] * len(mine),
+    )
+    for patch, cut, strays, sums in zip(patches, mine, uneven, moments, strict=True):
+        own = use[cut].reshape(patch.use.shape)
+        if strays or (own == OWN).sum() * search.voxel_m**2 < search.smallest_m2:
             refined.append(patch.unowned())
             continue
         normal, old, centre = patch.plane[:3].copy(), patch.plane[3:], np.empty(3)
@@ -287,11 +293,17 @@ def _refined(
     return refined
 
 
+def _uneven(stats: list[np.ndarray]) -> np.ndarray:
+    """(P,) whether planes, of whose cells stats are (C, 3), see `sum_cells`, stray far while most points' do not. A
+    surface that waves within its noise bends nowhere much as a whole, and there are thousands of points on it."""
+    strays = np.array([_unevenness(s) for s in stats])
+    points, order = np.array([s[:, 0].sum() for s in stats]), np.argsort(strays)
+    usual = strays[order[np.searchsorted(np.cumsum(points[order]), 0.5 * points.sum())]] if len(stats) else 0.0
+    return strays > (UNEVEN if usual < EVEN else np.inf)
+
+
 def _unevenness(stats: np.ndarray) -> float:
-    """Standard deviations of a point by which the means of cells (C, 3), see `sum_cells`, depart from their plane, RMS
-    over the points, beyond what noise does. A surface that waves within its noise bends nowhere much as a whole, and
-    there are thousands of points on it."""
+    """Standard deviations of a point by which the means of cells (C, 3) stray from their plane, RMS over the points,
+    beyond what noise does."""
     count, total, _ = stats.T
-    if not len(stats):
-        return 0.0
-    return float(np.sqrt(max((total**2 / count).sum() - len(stats), 0.0) / count.sum()))
+    return float(np.sqrt(max((total**2 / count).sum() - len(stats), 0.0) / count.sum())) if len(stats) else 0.0
