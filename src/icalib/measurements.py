@@ -297,3 +297,7 @@ class Measurements:
     def origin_ns(self) -> int:
         """The first stamp of the body's clock: the IMU's, or without one the first camera's or pose sensor's."""
         return (*self.cameras, *self.poses)[0].origin_ns if self.imu is None else self.imu.origin_ns
+
+    def unassociated(self) -> Measurements:
+        """The same, of whose LiDARs' points nobody knows on what planes they lie."""
+        return replace(self, lidars=tuple(x.unassociated() for x in self.lidars))

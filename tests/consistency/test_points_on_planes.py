@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from tests.consistency.test_robot import unassociated
 
 from icalib.calibration import Calibration
 from icalib.montecarlo.one_run import compare
@@ -93,7 +92,7 @@ def test_planes_are_those_of_the_recording():
     simulations = [simulate(scenario, seed) for seed in (1, 2)]
     rig = with_drawn_guess(rig_for(scenario), scenario, 1, only=MOUNTS)
     rig = replace(rig, settings=replace(rig.settings, points_on_planes_m=RELIEF_M))
-    result = calibrate_measurements(rig, [unassociated(s.measurements) for s in simulations])
+    result = calibrate_measurements(rig, [s.measurements.unassociated() for s in simulations])
     assert result.converged, result.status
     off, std = between(result, simulations[0])
     assert std < 2e-3 and abs(off) < 4.0 * std

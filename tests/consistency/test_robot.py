@@ -43,10 +43,6 @@ def steady(rig: Rig) -> Rig:
     return replace(rig, wheels=tuple(replace(w, sideways_slip=STEADY, upwards_slip=STEADY) for w in rig.wheels))
 
 
-def unassociated(measurements: Measurements) -> Measurements:
-    return replace(measurements, lidars=tuple(x.unassociated() for x in measurements.lidars))
-
-
 def as_measured(measurements: Measurements) -> Measurements:
     return measurements
 
@@ -67,7 +63,9 @@ def test_a_few_recordings_of_a_lidar(consistency, robot):
 
 
 def test_a_recording_of_a_lidar_whose_planes_are_found(consistency, robot):
-    check(consistency, robot, replace(FOUND, seconds=10.0, azimuth_steps=300), range(1), 0.9999, unassociated)
+    check(
+        consistency, robot, replace(FOUND, seconds=10.0, azimuth_steps=300), range(1), 0.9999, Measurements.unassociated
+    )
 
 
 def test_a_recording_of_all_sensors(consistency, robot):
@@ -82,7 +80,7 @@ def test_fifty_recordings(consistency, robot, case: Case):
 
 @pytest.mark.statistical
 def test_fifty_recordings_whose_planes_are_found(consistency, robot):
-    check(consistency, robot, FOUND, range(50), 0.99, unassociated)
+    check(consistency, robot, FOUND, range(50), 0.99, Measurements.unassociated)
 
 
 def test_a_target_far_away_shows_the_lever_arm(robot):
@@ -146,7 +144,7 @@ def test_a_flat_floor_with_no_guess_at_all(robot):
     x, which must know so."""
     scenario = robot("planar", 16.0, "lw", 600)
     simulation = simulate(scenario, 0)
-    result = calibrate_measurements(rig_for(scenario), unassociated(simulation.measurements))
+    result = calibrate_measurements(rig_for(scenario), simulation.measurements.unassociated())
     check_known(result, simulation)
     wheels = result.group("wheel0", "translation")
     off = wheels.value - simulation.truth.T_imu_wheel["wheel0"][:3, 3]
@@ -158,7 +156,7 @@ def test_a_flat_floor_with_no_guess_at_all(robot):
 @pytest.mark.parametrize("seed", range(10))
 @pytest.mark.parametrize("parts", ["cw", "clw", "l"])
 def test_flat_floors(robot, parts: str, seed: int):
-    check_planar(robot("planar", 30.0, parts, 600), seed, unassociated)
+    check_planar(robot("planar", 30.0, parts, 600), seed, Measurements.unassociated)
 
 
 # On a straight line, where gravity's direction hides behind the accelerometer's bias.
@@ -201,7 +199,7 @@ def displaced(measurements: Measurements, seed: int) -> Measurements:
         own, xyz = rng.random(len(x.xyz)) < 0.1, x.xyz.copy()
         xyz[own] *= rng.uniform(0.2, 1.1, (own.sum(), 1)).astype(np.float32)
         damaged.append(replace(x, xyz=xyz))
-    return unassociated(replace(measurements, lidars=tuple(damaged)))
+    return replace(measurements, lidars=tuple(damaged)).unassociated()
 
 
 def passed_by(measurements: Measurements, seed: int) -> Measurements:
@@ -214,7 +212,7 @@ def passed_by(measurements: Measurements, seed: int) -> Measurements:
         hidden = (np.abs(aside) < 0.1 * np.pi) & (far > 2.3)
         near = 2.0 + 0.2 * np.cos(10.0 * aside) + 0.03 * rng.standard_normal(len(far))
         damaged.append(replace(x, xyz=np.where(hidden, near / far, 1.0).astype(np.float32)[:, None] * x.xyz))
-    return unassociated(replace(measurements, lidars=tuple(damaged)))
+    return replace(measurements, lidars=tuple(damaged)).unassociated()
 
 
 def check_outliers(robot, seed: int, damage, case: Case) -> None:

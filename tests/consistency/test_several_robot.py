@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from tests.consistency.test_robot import steady, unassociated
+from tests.consistency.test_robot import steady
 
 from icalib.calibration import Calibration
 from icalib.errors import EstimationError
@@ -61,10 +61,10 @@ def worlds(result: Calibration) -> set[str]:
 def test_a_lidar_alone_finds_the_planes_of_each_recording(robot):
     simulations = pair(robot, "3d", (12.0, 9.0), "l", 300)
     rig = rig_for(simulations[0].scenario)
-    result = calibrate_measurements(rig, [unassociated(s.measurements) for s in simulations])
+    result = calibrate_measurements(rig, [s.measurements.unassociated() for s in simulations])
     check(result, simulations[0])
     assert worlds(result) == {"1", "2"}
-    single = calibrate_measurements(rig, unassociated(simulations[0].measurements))
+    single = calibrate_measurements(rig, simulations[0].measurements.unassociated())
     assert not any("." in p.name for p in single.planes)
     for name in ("rotation", "translation"):
         assert (result.group("lidar0", name).std_formal < single.group("lidar0", name).std_formal).all()
@@ -81,7 +81,7 @@ def test_all_sensors_with_planes_that_are_known(robot):
 def test_a_recording_without_planes_is_named(robot):
     simulations = pair(robot, "3d", (8.0, 8.0), "l", 150)
     rig = rig_for(simulations[0].scenario)
-    good, bad = (replace(unassociated(s.measurements), name=n) for s, n in zip(simulations, ("a", "b"), strict=True))
+    good, bad = (replace(s.measurements.unassociated(), name=n) for s, n in zip(simulations, ("a", "b"), strict=True))
     rng = np.random.default_rng(0)
     scattered = (replace(x, xyz=rng.uniform(-20.0, 20.0, x.xyz.shape).astype(np.float32)) for x in bad.lidars)
     with pytest.raises(EstimationError, match="^b: lidar0"):

@@ -110,6 +110,16 @@ def test_what_waves_within_its_noise_is_no_plane():
     assert abs(left[0]) > 0.99
 
 
+def test_where_all_surfaces_wave_the_planes_stay():
+    """It is not they: poses or the times of points are wrong then, and without planes nobody would say so."""
+    rng = np.random.default_rng(5)
+    flat, wall = sheet(rng, 40000, 4.0), sheet(rng, 60000, 4.0)[:, [2, 0, 1]] + [2.5, 0.0, 2.5]
+    flat[:, 2] += 0.03 * np.sin(3.0 * flat[:, 0]) * np.cos(2.0 * flat[:, 1])
+    wall[:, 0] += 0.03 * np.sin(3.0 * wall[:, 1]) * np.cos(2.0 * wall[:, 2])
+    points, seen_from = np.concatenate([flat, wall]), np.full((100000, 3), [0.0, 0.0, 3.0])
+    assert len(find_planes(points, seen_from, PlaneSearch(position_m=1e-3, angle_rad=1e-3)).planes) == 2
+
+
 def test_points_near_two_planes_or_in_grazing_beams_belong_to_none():
     rng = np.random.default_rng(4)
     floor = sheet(rng, 40000, 4.0)

@@ -5,15 +5,8 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from icalib.estimation.integration import (
-    Increment,
-    Readings,
-    correction,
-    in_order_of_nodes,
-    integrate,
-    integrate_from_node,
-    nothing_carried,
-)
+from icalib.estimation.from_nodes import in_order_of_nodes, integrate_from_node, nothing_carried
+from icalib.estimation.integration import Increment, Readings, correction, integrate
 from icalib.geometry import so3
 
 BIAS = np.array([0.01, -0.02, 0.03, 0.1, -0.2, 0.15])

@@ -274,12 +274,9 @@ def _refined(
     good = (stats[:, 0] >= FEWEST) & (stats[:, 2] < MIXED**2 * stats[:, 0])
     use = np.where(good, cells.use, np.minimum(cells.use, NEAR))
     mine = [slice(a, a + p.use.size) for a, p in zip(cells.first, patches, strict=True)]
-    refined, uneven = (
-        [],
-        _uneven([stats[k][use[k] == OWN] for k in mine])
-        if last and search.position_m <= FINE_M
-        else [False] * len(mine),
-    )
+    in_place = last and search.position_m <= FINE_M
+    uneven = _uneven([stats[k][use[k] == OWN] for k in mine]) if in_place else np.zeros(len(mine), dtype=bool)
+    refined = []
     for patch, cut, strays, sums in zip(patches, mine, uneven, moments, strict=True):
         own = use[cut].reshape(patch.use.shape)
         if strays or (own == OWN).sum() * search.voxel_m**2 < search.smallest_m2:

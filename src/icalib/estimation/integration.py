@@ -205,7 +205,7 @@ def _corrected(gyro, accel, j, s, bias, F, G, H, rate, force):
 
 
 @njit(cache=True, nogil=True)
-def _start(R, v, p, J, P):
+def start(R, v, p, J, P):
     """No motion yet. In loops: array expressions take seconds to compile."""
     for i in range(3):
         v[i] = p[i] = 0.0
@@ -260,14 +260,6 @@ class Increment(NamedTuple):
     P: np.ndarray
 
 
-class Carried(NamedTuple):
-    """How far increments were carried from a node, in whole intervals: node and interval (2,), the instant (1,)."""
-
-    at: np.ndarray
-    now: np.ndarray
-    so_far: Increment
-
-
 @njit(cache=True, nogil=True)
 def correction(intrinsics, n_extra):
     """n_extra: 24 where derivatives by the intrinsics are wanted, else 0."""
@@ -277,13 +269,6 @@ def correction(intrinsics, n_extra):
         for k in range(3):
             dw_db[i, k], dw_db[i, 3 + k], df_db[i, 3 + k] = -G[i, k], -H[i, k], -F[i, k]
     return Correction(intrinsics, F, G, H, dw_db, df_db, np.zeros((3, n_extra)), np.zeros((3, n_extra)))
-
-
-@njit(cache=True, nogil=True)
-def nothing_carried(width):
-    """J of `width` columns, no covariance."""
-    so_far = Increment(np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((9, width)), np.empty((0, 0)))
-    return Carried(np.full(2, -1), np.empty(1), so_far)
 
 
 @njit(cache=True, nogil=True)
@@ -303,7 +288,7 @@ def _part(j, now, end, bias, readings, by, out, P_t, rate, force):
 
 
 @njit(cache=True, nogil=True)
-def _whole(t1, backwards, j, now, bias, readings, by, out, P_t, rate, force):
+def whole(t1, backwards, j, now, bias, readings, by, out, P_t, rate, force):
     """From `now` in interval j through whole intervals to the one that holds t1, or is the last; that one, and where
     it begins."""
     t = readings.t
@@ -316,7 +301,7 @@ def _whole(t1, backwards, j, now, bias, readings, by, out, P_t, rate, force):
 
 
 @njit(cache=True, nogil=True)
-def _to_the_end(t1, j, now, bias, readings, by, out, P_t, rate, force):
+def to_the_end(t1, j, now, bias, readings, by, out, P_t, rate, force):
     """From `now` to t1, both in interval j; rate, force (3,): those at t1."""
     _part(j, now, t1, bias, readings, by, out, P_t, rate, force)
     if readings.linear:
@@ -333,39 +318,10 @@ def integrate(t0, t1, first, bias, readings, by, out):
     Returns the corrected rate (3,) and specific force (3,) at t1.
     """
     P_t, rate, force = np.zeros(out.P.shape), np.empty(3), np.empty(3)
-    _start(out.R, out.v, out.p, out.J, out.P)
-    j, now = _whole(t1, t1 < t0, first, t0, bias, readings, by, out, P_t, rate, force)
-    _to_the_end(t1, j, now, bias, readings, by, out, P_t, rate, force)
+    start(out.R, out.v, out.p, out.J, out.P)
+    j, now = whole(t1, t1 < t0, first, t0, bias, readings, by, out, P_t, rate, force)
+    to_the_end(t1, j, now, bias, readings, by, out, P_t, rate, force)
     return rate, force
-
-
-@njit(cache=True, nogil=True)
-def integrate_from_node(node, t0, t1, first, bias, readings, by, carried, out):
-    """As `integrate`, without a covariance. What was `carried` from the same node in the same direction, and not
-    as far as t1, is carried on, so that many instants (`in_order_of_nodes`) cost little more than the last one."""
-    rate, force, backwards = np.empty(3), np.empty(3), t1 < t0
-    so_far, way = carried.so_far, 2 * node + backwards
-    if carried.at[0] != way or (t1 >= carried.now[0] if backwards else t1 <= carried.now[0]):
-        _start(so_far.R, so_far.v, so_far.p, so_far.J, so_far.P)
-        carried.at[0], carried.at[1], carried.now[0] = way, first, t0
-    j, now = _whole(t1, backwards, carried.at[1], carried.now[0], bias, readings, by, so_far, so_far.P, rate, force)
-    carried.at[1], carried.now[0] = j, now
-    for i in range(3):
-        out.v[i], out.p[i] = so_far.v[i], so_far.p[i]
-        for k in range(3):
-            out.R[i, k] = so_far.R[i, k]
-    for i in range(out.J.shape[0]):
-        for k in range(out.J.shape[1]):
-            out.J[i, k] = so_far.J[i, k]
-    _to_the_end(t1, j, now, bias, readings, by, out, out.P, rate, force)
-    return rate, force
-
-
-def in_order_of_nodes(times: np.ndarray, node: np.ndarray, seconds: np.ndarray) -> np.ndarray:
-    """(n,) the order in which instants at `times` (n,), in order themselves, lead away from their `node` (n,), which
-    are at `seconds` (K,): first all behind their nodes, then backwards those before."""
-    before = times < seconds[node]
-    return np.concatenate([np.flatnonzero(~before), np.flatnonzero(before)[::-1]])
 
 
 def readings_of(imu: ImuData, linear: bool) -> Readings:

@@ -8,15 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from icalib.estimation.from_nodes import Moving, integrate_from_node, nodes_of, nothing_carried, place, ways_from
 from icalib.estimation.imu_data import ImuData
-from icalib.estimation.integration import (
-    Increment,
-    correction,
-    in_order_of_nodes,
-    integrate_from_node,
-    nothing_carried,
-    readings_of,
-)
+from icalib.estimation.integration import Increment, correction, readings_of
 from icalib.estimation.poses import assign_nodes
 from icalib.estimation.state import State
 from icalib.geometry.small import mul3
@@ -42,26 +36,15 @@ class Sweep(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def _imu_at(order, times, node, first, chain, readings, intrinsics, out_R, out_p, rate, velocity):
-    """IMU poses at `times` by integration from their nodes, without Jacobians; the rate is the body's."""
-    seconds, R, p, v, b, g = chain
-    by, carried, dR, dv, dp = correction(intrinsics, 0), nothing_carried(0), np.empty((3, 3)), np.empty(3), np.empty(3)
-    out = Increment(dR, dv, dp, np.empty((9, 0)), np.empty((0, 0)))
-    for i in order:
-        k = node[i]
-        dt = times[i] - seconds[k]
-        w, _ = integrate_from_node(k, seconds[k], times[i], first[i], b[k], readings, by, carried, out)
-        turned = mul3(R[k], dR)
-        for a in range(3):
-            rate[i, a] = w[a]
-            out_p[i, a] = p[k, a] + v[k, a] * dt
-            velocity[i, a] = v[k, a]
-            for c in range(3):
-                out_R[i, a, c] = turned[a, c]
-                out_p[i, a] += R[k, a, c] * dp[c]
-                velocity[i, a] += R[k, a, c] * dv[c]
-        out_p[i, 2] -= 0.5 * g * dt * dt
-        velocity[i, 2] -= g * dt
+def _imu_at(ways, nodes, readings, intrinsics, imu):
+    """Fills `imu`, a `Moving`, by integration from the nodes, without Jacobians."""
+    by, carried = correction(intrinsics, 0), nothing_carried(0)
+    out = Increment(np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((9, 0)), np.empty((0, 0)))
+    for i in ways.order:
+        k, t = ways.node[i], ways.times[i]
+        t0 = nodes.seconds[k]
+        rate, _ = integrate_from_node(k, t0, t, ways.first[i], nodes.bias[k], readings, by, carried, out)
+        place(i, t - t0, k, nodes, out, rate, imu)
 
 
 @njit(cache=True, nogil=True)
@@ -89,13 +72,10 @@ def sweep(drive: Motion, name: str, times: np.ndarray, near: np.ndarray | None =
     """Where LiDAR `name` is and how it moves at `times` (n,) on the IMU's clock, by the IMU's readings from the nodes
     next to them, or next to `near` (n,)."""
     state, imu = drive.state, drive.imu
-    n, node = len(times), assign_nodes("inertial", state.seconds, times if near is None else near)
-    R, p, rate, velocity = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
-    first = imu.interval(state.seconds[node])
-    first -= (times < state.seconds[node]) & (imu.seconds[first] == state.seconds[node]) & (first > 0)
-    chain = (state.seconds, state.rotation, state.position, state.velocity, state.bias, drive.gravity)
-    order, intrinsics = in_order_of_nodes(times, node, state.seconds), state.values[imu.name, "intrinsics"]
-    _imu_at(order, times, node, first, chain, readings_of(imu, True), intrinsics, R, p, rate, velocity)
+    node = assign_nodes("inertial", state.seconds, times if near is None else near)
+    ways, imu_at = ways_from(state, times, node, imu), Moving.empty(len(times))
+    intrinsics = state.values[imu.name, "intrinsics"]
+    _imu_at(ways, nodes_of(state, drive.gravity), readings_of(imu, True), intrinsics, imu_at)
     R_il, p_il = state.values[name, "rotation"], state.values[name, "translation"]
-    _to_lidar(np.ascontiguousarray(R_il), p_il, R, p, rate, velocity)
-    return Sweep(R, p, rate, velocity)
+    _to_lidar(np.ascontiguousarray(R_il), p_il, *imu_at)
+    return Sweep(*imu_at)

@@ -15,16 +15,10 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from icalib.estimation.from_nodes import Moving, integrate_from_node, nodes_of, nothing_carried, place, ways_from
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.imu_model import N_INTRINSICS, correction_matrices, intrinsics_jacobians
-from icalib.estimation.integration import (
-    Increment,
-    correction,
-    in_order_of_nodes,
-    integrate_from_node,
-    nothing_carried,
-    readings_of,
-)
+from icalib.estimation.integration import Increment, correction, readings_of
 from icalib.estimation.state import NODE, State
 from icalib.geometry import so3
 from icalib.rig import Scheme
@@ -92,52 +86,39 @@ def _velocity(i, R0, R1, g, dv, force, J, moving):
 
 
 @njit(cache=True, nogil=True)
-def _inertial(
-    order, times, node, first, nodes, R, p, v, b, g, readings, intrinsics, out_R, out_p, rate, vel, Jn, Jx, moving
-):
+def _by_node(i, dt, R, J, dR, dp, Jn, Jx):
+    """Fills entry i of the Jacobians of a pose: dt, dR, dp and their Jacobian J from the node, which is at R."""
+    turn = so3.hat(dp)
+    for a in range(3):
+        Jn[i, 3 + a, 3 + a] = 1.0
+        Jn[i, 3 + a, 6 + a] = dt
+        for c in range(3):
+            Jn[i, a, c] = dR[c, a]
+            Jn[i, 3 + a, c] = -(R[a, 0] * turn[0, c] + R[a, 1] * turn[1, c] + R[a, 2] * turn[2, c])
+        for c in range(J.shape[1]):
+            s = R[a, 0] * J[6, c] + R[a, 1] * J[7, c] + R[a, 2] * J[8, c]
+            if c < 6:
+                Jn[i, a, 9 + c] = J[a, c]
+                Jn[i, 3 + a, 9 + c] = s
+            else:
+                Jx[i, a, c - 6] = J[a, c]
+                Jx[i, 3 + a, c - 6] = s
+
+
+@njit(cache=True, nogil=True)
+def _inertial(ways, nodes, readings, intrinsics, at, Jn, Jx, moving):
+    """Fills `at`, a `Moving`, the Jacobians, and `moving` where it is not empty."""
     width = 6 + Jx.shape[2]
     by, carried = correction(intrinsics, Jx.shape[2]), nothing_carried(width)
-    dR, dv, dp, J = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((9, width))
-    out = Increment(dR, dv, dp, J, np.empty((0, 0)))
-    for i in order:
-        k = node[i]
-        dt = times[i] - nodes[k]
-        w, f = integrate_from_node(k, nodes[k], times[i], first[i], b[k], readings, by, carried, out)
-        rate[i] = w
-        for a in range(3):
-            out_p[i, a] = p[k, a] + v[k, a] * dt
-            vel[i, a] = v[k, a]
-            for c in range(3):
-                out_p[i, a] += R[k, a, c] * dp[c]
-                vel[i, a] += R[k, a, c] * dv[c]
-                s = 0.0
-                for d in range(3):
-                    s += R[k, a, d] * dR[d, c]
-                out_R[i, a, c] = s
-                Jn[i, a, c] = dR[c, a]
-            Jn[i, 3 + a, 3 + a] = 1.0
-            Jn[i, 3 + a, 6 + a] = dt
-        out_p[i, 2] -= 0.5 * g * dt * dt
-        vel[i, 2] -= g * dt
-        turn = so3.hat(dp)
-        for a in range(3):
-            for c in range(3):
-                s = 0.0
-                for d in range(3):
-                    s -= R[k, a, d] * turn[d, c]
-                Jn[i, 3 + a, c] = s
-            for c in range(width):
-                s = 0.0
-                for d in range(3):
-                    s += R[k, a, d] * J[6 + d, c]
-                if c < 6:
-                    Jn[i, a, 9 + c] = J[a, c]
-                    Jn[i, 3 + a, 9 + c] = s
-                else:
-                    Jx[i, a, c - 6] = J[a, c]
-                    Jx[i, 3 + a, c - 6] = s
+    out = Increment(np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((9, width)), np.empty((0, 0)))
+    for i in ways.order:
+        k, t = ways.node[i], ways.times[i]
+        t0, R = nodes.seconds[k], nodes.rotation[k]
+        rate, force = integrate_from_node(k, t0, t, ways.first[i], nodes.bias[k], readings, by, carried, out)
+        place(i, t - t0, k, nodes, out, rate, at)
+        _by_node(i, t - t0, R, out.J, out.R, out.p, Jn, Jx)
         if len(moving.acceleration):
-            _velocity(i, R[k], out_R[i], g, dv, f, J, moving)
+            _velocity(i, R, at.rotation[i], nodes.gravity, out.v, force, out.J, moving)
 
 
 @njit(cache=True, nogil=True)
@@ -249,14 +230,7 @@ def _inertial_poses(
 ) -> Poses:
     """The `inertial` poses; fills `moving` where it is not empty."""
     n = len(times)
-    out = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
-    by_node, by_imu = np.zeros((n, 6, NODE)), np.zeros((n, 6, N_INTRINSICS if imu_free else 0))
-    # Integration backwards starts in the interval that ends at the node, if the node lies on a stamp.
-    first = imu.interval(state.seconds[node])
-    on_stamp = (times < state.seconds[node]) & (imu.seconds[first] == state.seconds[node]) & (first > 0)
-    _inertial(
-        in_order_of_nodes(times, node, state.seconds), times, node, first - on_stamp, state.seconds, state.rotation,
-        state.position, state.velocity, state.bias, gravity, readings_of(imu, True),
-        state.values[imu.name, "intrinsics"], *out, by_node, by_imu, moving,
-    )  # fmt: skip
-    return Poses(*out, by_node, np.zeros((0, 6, NODE)), by_imu)
+    at, by_node, by_imu = Moving.empty(n), np.zeros((n, 6, NODE)), np.zeros((n, 6, N_INTRINSICS if imu_free else 0))
+    ways, nodes = ways_from(state, times, node, imu), nodes_of(state, gravity)
+    _inertial(ways, nodes, readings_of(imu, True), state.values[imu.name, "intrinsics"], at, by_node, by_imu, moving)
+    return Poses(*at, by_node, np.zeros((0, 6, NODE)), by_imu)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -44,7 +44,7 @@ def run(task: Task) -> Record:
             rig = with_drawn_guess(rig, task.scenario, task.seed, only=only)
         seen = simulation.measurements
         if task.planes == "found":
-            seen = replace(seen, lidars=tuple(x.unassociated() for x in seen.lidars))
+            seen = seen.unassociated()
         result = calibrate_measurements(rig, seen, on_visit=visits.append)
     except Exception as caught:
         return Record(task.seed, sentence_on(caught), time.perf_counter() - started, program())
