@@ -40,6 +40,7 @@ LEAST_LEFT = 0.2  # of the residuals of poses: where the motion takes all, nothi
 EARLY_DECREASE, EARLY_SHARE = 0.5, 1e-6  # an early pass is followed by another
 AGAIN = 2  # further passes, at most, where the last one began too far from its end, or without tracks that it found
 FAR = 1.1  # times the chi^2 at its end: what a pass froze where it began is not what it would freeze at the end
+NEARER = 0.5  # of the way from the end that the pass before had: else two states take turns, and no pass ends it
 ENOUGH = 0.8  # of the observations of tracks take part: no need to see whether more would
 MORE = 1.1  # times as many that would are worth another pass
 FIRST_SHARE = 1e-3  # of half the chi^2: what is made anew after the first pass is worth more
@@ -117,7 +118,7 @@ def estimate(
         judged = Judged.first(inputs)
     else:
         names, state = names[-1:], _on_own_nodes(inputs, state)
-    history: list[tuple[str, Step]] = []
+    history, way = list[tuple[str, Step]](), np.inf
     for k, name in enumerate((*names, *names[-1:] * AGAIN)):
 
         def note(step: Step, name: str = name) -> None:
@@ -129,8 +130,9 @@ def estimate(
         tolerance, share = (CONVERGED_DECREASE, ROUNDING) if last else early
         problem = judged.problem(inputs, state, held)
         outcome = minimise(problem, state, note, tolerance, partial(on_visit, name, problem), share)
-        if last and (k + 1 == len(names) + AGAIN or not _again(inputs, outcome, judged)):
+        if last and (k + 1 == len(names) + AGAIN or not _again(inputs, outcome, judged, way)):
             return Estimate(outcome, judged, tuple(history))
+        way = _way(outcome) if last else np.inf
         judged = judged if last else judged.next(inputs, outcome, name == "first")
         state = _on_own_nodes(inputs, outcome.state)
         del problem, outcome  # before the next ones take as much memory
@@ -138,10 +140,16 @@ def estimate(
     raise AssertionError("pass_names is never empty")
 
 
-def _again(inputs: Inputs, outcome: Outcome, judged: Judged) -> bool:
+def _again(inputs: Inputs, outcome: Outcome, judged: Judged, way_before: float) -> bool:
     """Whether the last pass is to be made anew: what it froze, such as the weights of points on planes, is of a state
-    far from its end, or tracks come back."""
-    return outcome.steps[0].cost > FAR * outcome.cost or _follows_more(inputs, outcome, judged)
+    far from its end, but nearer than in the last pass before, or tracks come back."""
+    way = _way(outcome)
+    return FAR - 1.0 < way < NEARER * way_before or _follows_more(inputs, outcome, judged)
+
+
+def _way(outcome: Outcome) -> float:
+    """From where a pass began to its end, as a share of the chi^2 there; nothing where that is nothing."""
+    return outcome.steps[0].cost / outcome.cost - 1.0 if outcome.cost > 0.0 else 0.0
 
 
 def _follows_more(inputs: Inputs, outcome: Outcome, judged: Judged) -> bool:
