@@ -103,10 +103,9 @@ class _Cells(NamedTuple):
 
 
 class _Weights(NamedTuple):
-    """Variances [m^2] of what is alike in all directions (and 1 over it), and of what is along the beam; the loss."""
+    """Variances [m^2] of what is alike in all directions, and of what is along the beam; the loss."""
 
     alike: float
-    whole: float
     along: float
     loss: int
     scale: float
@@ -153,23 +152,20 @@ def _see_plane(R, p, plane, seen):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _add_point(x, y, z, s, seen, weights, sums):
-    """Adds one weighted point to the sums in row s."""
-    w, robust = weights.whole, 1.0
-    if weights.along > 0.0 or weights.loss:
-        across = seen[s, 1] * x + seen[s, 2] * y + seen[s, 3] * z
-        off, over = seen[s, 0] + across, 0.0
-        if weights.along > 0.0:
-            square = x * x + y * y + z * z
-            over = 1.0 / (weights.alike * square + weights.along * across * across)
-            w = square * over
-        chi2 = off * off * w
-        if weights.loss:
-            robust = weight(weights.loss, weights.scale, chi2)[0]
-            w *= robust
-        turns = robust * chi2 * weights.along * across * over if chi2 < NO_NOISE else 0.0
-        sums[s, 10] -= turns * x
-        sums[s, 11] -= turns * y
-        sums[s, 12] -= turns * z
+    """Adds one weighted point to the sums in row s. All in one stretch: where noise is alike in all directions, asking
+    for it costs more than the division by the same variance."""
+    across = seen[s, 1] * x + seen[s, 2] * y + seen[s, 3] * z
+    off, square = seen[s, 0] + across, x * x + y * y + z * z
+    over = 1.0 / (weights.alike * square + weights.along * across * across)
+    w, robust = square * over, 1.0
+    chi2 = off * off * w
+    if weights.loss:
+        robust = weight(weights.loss, weights.scale, chi2)[0]
+        w *= robust
+    turns = robust * chi2 * weights.along * across * over if chi2 < NO_NOISE else 0.0
+    sums[s, 10] -= turns * x
+    sums[s, 11] -= turns * y
+    sums[s, 12] -= turns * z
     wx, wy, wz = w * x, w * y, w * z
     sums[s, 0] += w
     sums[s, 1] += wx
@@ -328,7 +324,7 @@ def _moments_of(
         np.empty((n // each, 3)),
     )  # fmt: skip
     _to_centres(motion, each, usable(drive.imu, times, drive.max_gap_s), cells)
-    weights = _Weights(noise.sigma**2, noise.sigma**-2, noise.beam_sigma**2, LOSSES[noise.loss], noise.loss_scale)
+    weights = _Weights(noise.sigma**2, noise.beam_sigma**2, LOSSES[noise.loss], noise.loss_scale)
     most = min(len(scans.xyz), len(cells.position) * len(cloud.planes))
     entries = (
         np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64), np.empty((most, MOMENTS)),
