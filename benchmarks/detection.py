@@ -16,9 +16,9 @@ def main(folder: Path) -> None:
     cv2.setNumThreads(1)
     data = [np.frombuffer(path.read_bytes(), dtype=np.uint8) for path in sorted(folder.glob("*.jpg"))]
     detector = AprilGridDetector(rows=6, cols=6, tag_spacing=0.3)
-    detector.detect(cv2.imdecode(data[0], cv2.IMREAD_GRAYSCALE))  # compiles
+    detector.detect(_image(data[0]))  # compiles
     began = time.process_time()
-    images = [cv2.imdecode(one, cv2.IMREAD_GRAYSCALE) for one in data]
+    images = [_image(one) for one in data]
     read = time.process_time()
     found = [detector.detect(image) for image in images]
     ended = time.process_time()
@@ -26,6 +26,12 @@ def main(folder: Path) -> None:
     print(f"reading   {1e3 * (read - began) / len(images):6.2f} ms")
     print(f"detection {1e3 * (ended - read) / len(images):6.2f} ms")
     print(f"corners   {sum(int(one.kept.sum()) for one in found)} kept of {sum(len(one.point) for one in found)}")
+
+
+def _image(data: np.ndarray) -> np.ndarray:
+    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
+    assert image is not None, "not an image"
+    return image
 
 
 if __name__ == "__main__":

@@ -158,6 +158,7 @@ def repeated(measurements: Measurements, n: int) -> Measurements:
         return CornerStream(s.name, stamps(s), start, np.tile(s.point, n), np.tile(s.uv, (n, 1)))
 
     imu = measurements.imu
+    assert imu is not None
     whole_imu = ImuStream(imu.name, stamps(imu), np.tile(imu.gyro, (n, 1)), np.tile(imu.accel, (n, 1)))
     return Measurements(whole_imu, tuple(camera(s) for s in measurements.cameras))
 

@@ -84,7 +84,7 @@ def excerpt(measurements: Measurements, seconds: float) -> Measurements:
     common = common[(common >= imu.stamps_ns[0]) & (common <= imu.stamps_ns[-1])]
     common = common[common <= common[0] + round(seconds * 1e9)]
 
-    def camera(s: CornerStream) -> CornerStream:
+    def some(s: CornerStream) -> CornerStream:
         chosen = np.isin(s.stamps_ns, common)
         corners = np.repeat(chosen, np.diff(s.start))
         start = np.concatenate([[0], np.cumsum(np.diff(s.start)[chosen])])
@@ -93,7 +93,7 @@ def excerpt(measurements: Measurements, seconds: float) -> Measurements:
     i = np.searchsorted(imu.stamps_ns, common[0], "right") - 1
     j = np.searchsorted(imu.stamps_ns, common[-1], "left") + 1
     part = ImuStream(imu.name, imu.stamps_ns[i:j], imu.gyro[i:j], imu.accel[i:j])
-    return Measurements(part, tuple(camera(s) for s in measurements.cameras))
+    return Measurements(part, tuple(some(s) for s in measurements.cameras))
 
 
 def build(inputs: Inputs, state: State, half_turn: bool = False) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
@@ -157,6 +157,7 @@ def _add_camera(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, inputs:
     values.insert(
         T(c), gtsam.Pose3(gtsam.Rot3(state.values[camera.name, "rotation"]), state.values[camera.name, "translation"])
     )
+    assert camera.corner_noise_px is not None
     noise = gtsam.noiseModel.Isotropic.Sigma(2, camera.corner_noise_px)
     times = stream.seconds + state.values[camera.name, "time_offset"][0]
     node = np.searchsorted(state.seconds, times - 1e-3)[stream.image].tolist()
@@ -205,8 +206,8 @@ def _differences(
         pose = theirs.atPose3(T(c))
         turn = gtsam.Rot3.Logmap(gtsam.Rot3(v[camera.name, "rotation"].T @ pose.rotation().matrix()))
         move = pose.translation() - v[camera.name, "translation"]
-        yield f"{variant}{camera.name}_rotation_difference", np.rad2deg(np.linalg.norm(turn)), "deg"
-        yield f"{variant}{camera.name}_translation_difference", 1e3 * np.linalg.norm(move), "mm"
+        yield f"{variant}{camera.name}_rotation_difference", float(np.rad2deg(np.linalg.norm(turn))), "deg"
+        yield f"{variant}{camera.name}_translation_difference", 1e3 * float(np.linalg.norm(move)), "mm"
         columns = np.concatenate([inputs.layout.columns(camera.name, n) for n in ("rotation", "translation")])
         sigma = np.sqrt(np.diag(covariance)[columns])
         in_sigmas = np.abs(np.concatenate([turn, move])) / sigma
