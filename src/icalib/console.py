@@ -12,7 +12,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from icalib.calibration import Calibration
 from icalib.export.kalibr import camchain_name
 from icalib.report.console import bodies_words, relative_words, table
-from icalib.report.quantities import chi2_words, rms_words
+from icalib.report.quantities import chi2_words, dof_words, rms_words
 
 
 @contextmanager
@@ -46,7 +46,7 @@ def print_result(calibration: Calibration, folder: Path) -> None:
         rms = f", {rms_words(f)} RMS" if f.rms is not None else ""
         rms += f", {f.rejected} set aside" if f.unit == "px" else ""
         console.print(
-            f"  {f.sensor} {f.kind}: chi^2 per degree of freedom {chi2_words(f)} ({f.dof:.0f}){rms}", markup=False
+            f"  {f.sensor} {f.kind}: chi^2 per degree of freedom {chi2_words(f)} ({dof_words(f)}){rms}", markup=False
         )
     for title, sentences in (
         ("Undetermined", calibration.undetermined),

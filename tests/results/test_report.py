@@ -17,6 +17,7 @@ from rich.console import Console
 from icalib.calibration import (
     Calibration,
     ProjectionMap,
+    SensorFit,
     joint_covariance,
     projection_uncertainty,
     working_distance,
@@ -25,7 +26,7 @@ from icalib.outputs import check_folder, write_outputs
 from icalib.report import corner_figures, projection_figures, report_html
 from icalib.report.console import table
 from icalib.report.plot import numbers, thin
-from icalib.report.quantities import rows, rpy_deg, shown
+from icalib.report.quantities import dof_words, rows, rpy_deg, shown
 from icalib.report.tables import trust
 
 VOID = {"meta", "link", "br", "img", "hr"}
@@ -271,6 +272,11 @@ def test_rpy_is_that_of_the_rig_file(calibration: Calibration):
 )
 def test_shown(value: float, words: str):
     assert shown(value) == words
+
+
+@pytest.mark.parametrize(("dof", "words"), [(19800.5, "19800"), (0.6, "1"), (-12.3, "0")])
+def test_sampled_degrees_of_freedom_are_never_less_than_none(dof: float, words: str):
+    assert dof_words(SensorFit("imu0", "bias walk", 1794, dof, 0.1)) == words
 
 
 def test_numbers_and_thinning():

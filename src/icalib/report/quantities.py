@@ -68,6 +68,11 @@ def chi2_words(fit: SensorFit) -> str:
     return "no freedom left" if fit.chi2_per_dof is None else shown(fit.chi2_per_dof, 3)
 
 
+def dof_words(fit: SensorFit) -> str:
+    """Degrees of freedom that the fit left over; they are sampled, so that none may come out as less than none."""
+    return f"{max(fit.dof, 0.0):.0f}"
+
+
 def rms_words(fit: SensorFit) -> str:
     """The RMS of what was measured, with its unit; empty where there is none. Angles here are small: mrad."""
     if fit.rms is None:

@@ -8,7 +8,17 @@ from html import escape
 import numpy as np
 
 from icalib.calibration import Calibration, ParameterGroup, relative_poses
-from icalib.report.quantities import SHOWN_UNITS, chi2_words, rms_words, rows, rpy_deg, shown, shown_groups, worst
+from icalib.report.quantities import (
+    SHOWN_UNITS,
+    chi2_words,
+    dof_words,
+    rms_words,
+    rows,
+    rpy_deg,
+    shown,
+    shown_groups,
+    worst,
+)
 
 TRUST = {
     "good": "Yes. The solver converged, the motion determines every parameter, and nothing calls for attention.",
@@ -168,7 +178,7 @@ def relative(c: Calibration) -> Html:
 
 def fits(c: Calibration) -> Html:
     headers = ("sensor", "kind", "residuals", "post-fit dof", "chi2 / dof", "RMS", "rejected")
-    body = [(f.sensor, f.kind, f.count, f"{f.dof:.0f}", chi2_words(f), rms_words(f), f.rejected or "") for f in c.fits]
+    body = [(f.sensor, f.kind, f.count, dof_words(f), chi2_words(f), rms_words(f), f.rejected or "") for f in c.fits]
     return table(headers, body, headers[2:])
 
 
