@@ -42,6 +42,7 @@ from icalib.first_guess.lidar_arm import (
 from icalib.first_guess.lidar_motion import LONGEST_STEP_S, ImuMotion
 from icalib.first_guess.lidar_odometry import LidarPath, Scan, lidar_path, scans_of
 from icalib.geometry import so3
+from icalib.geometry.cubic import hermite
 from icalib.measurements import LidarStream
 
 LEAST_CORRELATION = 0.6  # of turning rates with the IMU's
@@ -180,9 +181,8 @@ def poses_in(known: State, gyro: GyroRotation, t: np.ndarray) -> tuple[np.ndarra
     k = np.clip(np.searchsorted(known.seconds, t, side="right") - 1, 0, len(known.seconds) - 2)
     h = np.diff(known.seconds)[k][:, None]
     s = (t - known.seconds[k])[:, None] / h
-    p0, p1, v0, v1 = known.position[k], known.position[k + 1], known.velocity[k] * h, known.velocity[k + 1] * h
-    p = p0 + s * (v0 + s * (3.0 * (p1 - p0) - 2.0 * v0 - v1 + s * (2.0 * (p0 - p1) + v0 + v1)))
-    return gyro.carry(known.seconds, known.rotation, t), p
+    way = hermite(s, known.position[k + 1] - known.position[k], known.velocity[k] * h, known.velocity[k + 1] * h)
+    return gyro.carry(known.seconds, known.rotation, t), known.position[k] + way
 
 
 def _aligned(imu: ImuData, name: str, scans: list[Scan], held: Held) -> tuple[Alignment, LidarPath, CameraRates]:

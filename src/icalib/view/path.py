@@ -8,6 +8,7 @@ import numpy as np
 
 from icalib.calibration import Calibration
 from icalib.geometry import so3
+from icalib.geometry.cubic import hermite
 
 LONGEST_STEP_S = 0.5  # between nodes; what lies between two that are further apart is not known
 _AT_NODE_S = 1e-6
@@ -56,9 +57,9 @@ class Path:
         # The rate at the far node as a derivative of the rotation vector: the inverse right Jacobian, to second order.
         far = self.rate[k + 1]
         far = far + 0.5 * np.cross(turn, far) + np.cross(turn, np.cross(turn, far)) / 12.0
-        phi = _hermite(s, turn, h[:, None] * self.rate[k], h[:, None] * far)
+        phi = hermite(s, turn, h[:, None] * self.rate[k], h[:, None] * far)
         moved = self.position[k + 1] - self.position[k]
-        way = _hermite(s, moved, h[:, None] * self.slope[k], h[:, None] * self.slope[k + 1])
+        way = hermite(s, moved, h[:, None] * self.slope[k], h[:, None] * self.slope[k + 1])
         R = self.rotation[k] @ so3.exp_many(np.ascontiguousarray(phi))
         return R, self.position[k] + way, inside | at_node
 
@@ -73,10 +74,3 @@ def _slopes(between: np.ndarray, step: np.ndarray, usable: np.ndarray) -> np.nda
     padded[0, 1:], padded[1, :-1] = between, between
     total = np.maximum(weight.sum(axis=0), np.finfo(float).tiny)
     return (weight[:, :, None] * padded).sum(axis=0) / total[:, None]
-
-
-def _hermite(s: np.ndarray, end: np.ndarray, before: np.ndarray, behind: np.ndarray) -> np.ndarray:
-    """The cubic from 0 at s = 0 to `end` at s = 1, with derivatives by s `before` and `behind` there."""
-    s2 = s * s
-    s3 = s2 * s
-    return (3.0 * s2 - 2.0 * s3) * end + (s3 - 2.0 * s2 + s) * before + (s3 - s2) * behind
