@@ -131,7 +131,11 @@ def _reach(q, x, y, z, cells):
 @njit(cache=True, nogil=True)
 def associate(points, seen_from, variance, cells, gate, least_cosine, plane, cell, distance):
     """The plane within `gate` standard deviations of each point, on the side that it was seen from; -1: none, or one
-    more is near. Fills its cell and distance."""
+    more is near. Fills its cell and distance.
+
+    Where on the plane a point lies is asked of its foot, where the beam meets the plane. The point itself is as far
+    along the beam as its noise took it: taken by its own place, those that err one way leave a plane's edge, or come
+    near another plane, more often than those that err the other, and planes of small faces stood 1.5 mm off by it."""
     count = len(cells.planes)
     equation, r = np.empty((4, count)), np.empty(count)  # by rows: the loop over all planes is then a few instructions
     for q in range(count):
@@ -141,22 +145,35 @@ def associate(points, seen_from, variance, cells, gate, least_cosine, plane, cel
     for n in range(len(points)):
         x, y, z = np.float64(points[n, 0]), np.float64(points[n, 1]), np.float64(points[n, 2])
         a, b, c = seen_from[n, 0] - x, seen_from[n, 1] - y, seen_from[n, 2] - z
-        reach, least = gate * np.sqrt(variance[n]), least_cosine * np.sqrt(a * a + b * b + c * c)
-        plane[n], found = -1, 0
+        far = np.sqrt(a * a + b * b + c * c)
+        reach, least = gate * np.sqrt(variance[n]), least_cosine * far
+        found, q_own, k_own, s_own = 0, -1, -1, 0.0
         for q in range(count):
             r[q] = equation[0, q] * x + equation[1, q] * y + equation[2, q] * z - equation[3, q]
         for q in range(count):
-            if abs(r[q]) > APART * reach:
+            if abs(r[q]) > reach:
                 continue
-            if equation[0, q] * a + equation[1, q] * b + equation[2, q] * c < least:
+            facing = equation[0, q] * a + equation[1, q] * b + equation[2, q] * c
+            if facing < least:
                 continue
-            k = _reach(q, x, y, z, cells)
+            s = -r[q] / facing
+            k = _reach(q, x + s * a, y + s * b, z + s * c, cells)
             if k >= 0:
                 found += 1
-                if abs(r[q]) <= reach and cells.use[k] == OWN:
-                    plane[n], cell[n], distance[n] = q, k, r[q]
-        if found > 1:
-            plane[n] = -1
+                q_own, k_own, s_own = q, k, s
+        plane[n] = -1
+        if found == 1 and cells.use[k_own] == OWN:
+            foot = x + s_own * a, y + s_own * b, z + s_own * c
+            near, longest = APART * reach, APART * reach + abs(s_own) * far
+            clear = True
+            for q in range(count):
+                if abs(r[q]) > longest or q == q_own:
+                    continue
+                facing = equation[0, q] * a + equation[1, q] * b + equation[2, q] * c
+                if facing >= least and abs(r[q] + s_own * facing) <= near and _reach(q, *foot, cells) >= 0:
+                    clear = False
+            if clear:
+                plane[n], cell[n], distance[n] = q_own, k_own, r[q_own]
 
 
 @njit(cache=True, nogil=True)
