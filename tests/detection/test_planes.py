@@ -135,6 +135,8 @@ def test_points_near_two_planes_or_in_grazing_beams_belong_to_none():
     low = np.tile([1.9, 0.0, 0.1], (1, 1))
     assert found.of_points(probe[:1], low, PlaneSearch())[0] == -1
     assert found.of_points(probe[:1], eyes[:1] * [1.0, 1.0, -1.0], PlaneSearch())[0] == -1
+    foot = np.array([[-2.0, 0.3, 0.05], [-2.0, 0.3, 0.5]])  # of the wall, and further up
+    assert (found.of_points(foot, np.tile(low, (2, 1)), PlaneSearch()) >= 0).tolist() == [False, True]
 
 
 def test_which_points_belong_to_a_small_face_does_not_depend_on_their_noise():

@@ -131,7 +131,7 @@ def _reach(q, x, y, z, cells):
 @njit(cache=True, nogil=True)
 def associate(points, seen_from, variance, cells, gate, least_cosine, plane, cell, distance):
     """The plane within `gate` standard deviations of each point, on the side that it was seen from; -1: none, or one
-    more is near. Fills its cell and distance.
+    more is near, be it in a grazing beam: a floor is, at the foot of walls far away. Fills its cell and distance.
 
     Where on the plane a point lies is asked of its foot, where the beam meets the plane. The point itself is as far
     along the beam as its noise took it: taken by its own place, those that err one way leave a plane's edge, or come
@@ -170,7 +170,7 @@ def associate(points, seen_from, variance, cells, gate, least_cosine, plane, cel
                 if abs(r[q]) > longest or q == q_own:
                     continue
                 facing = equation[0, q] * a + equation[1, q] * b + equation[2, q] * c
-                if facing >= least and abs(r[q] + s_own * facing) <= near and _reach(q, *foot, cells) >= 0:
+                if facing > 0.0 and abs(r[q] + s_own * facing) <= near and _reach(q, *foot, cells) >= 0:
                     clear = False
             if clear:
                 plane[n], cell[n], distance[n] = q_own, k_own, r[q_own]
