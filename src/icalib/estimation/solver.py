@@ -153,10 +153,10 @@ def _corrected(problem, state, pieces, residuals, damping, curved, cost, least) 
 
     What the data hardly tell, gravity's direction on a straight drive for one, moves far in a step, along a valley that
     is curved: a step along its tangent leaves it by the square of the way, the next ones come back. More damping would
-    make the way so short that the solver creeps.
+    make the way so short that the solver creeps. An excess within rounding is none: it would never be less.
     """
     share = 0.0
-    while cost >= least and share < COMES_BACK:
+    while cost - least >= ROUNDING * least and share < COMES_BACK:
         try:
             solution = solve(pieces, problem.n_nodes, problem.tolerance, max(damping, ACROSS), problem.held)
         except NotDefiniteError:
