@@ -165,14 +165,13 @@ def associate(points, seen_from, variance, cells, gate, least_cosine, plane, cel
         if found == 1 and cells.use[k_own] == OWN:
             foot = x + s_own * a, y + s_own * b, z + s_own * c
             near, longest = APART * reach, APART * reach + abs(s_own) * far
-            clear = True
             for q in range(count):
                 if abs(r[q]) > longest or q == q_own:
                     continue
                 facing = equation[0, q] * a + equation[1, q] * b + equation[2, q] * c
                 if facing > 0.0 and abs(r[q] + s_own * facing) <= near and _reach(q, *foot, cells) >= 0:
-                    clear = False
-            if clear:
+                    break
+            else:
                 plane[n], cell[n], distance[n] = q_own, k_own, r[q_own]
 
 

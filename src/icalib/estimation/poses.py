@@ -197,8 +197,7 @@ def poses_at(
     if scheme == "inertial":
         return _inertial_poses(times, node, state, imu, gravity, imu_free, Velocities.empty(0, 0))
     n = len(times)
-    out = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
-    by_node, by_imu = np.zeros((n, 6, NODE)), np.zeros((n, 6, N_INTRINSICS if imu_free else 0))
+    out, by_node, by_imu = Moving.empty(n), np.zeros((n, 6, NODE)), np.zeros((n, 6, N_INTRINSICS if imu_free else 0))
     by_next = np.zeros((n if scheme == "pose" else 0, 6, NODE))
     if scheme == "pose":
         _between(times, node, state.seconds, state.rotation, state.position, *out, by_node, by_next)
