@@ -16,15 +16,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from icalib.errors import EstimationError
 from icalib.estimation.arrowhead import in_parallel
 from icalib.estimation.clocks import instants
-from icalib.estimation.corner_weights import weight
+from icalib.estimation.lidar_moments import (
+    MOMENTS,
+    Cells,
+    Scans,
+    Weights,
+    bin_scans,
+    move_to_world,
+    step_range,
+    to_centres,
+)
 from icalib.estimation.lidar_sweep import Motion, sweep
 from icalib.estimation.nodes import usable
 from icalib.measurements import LidarStream
@@ -33,11 +40,7 @@ from icalib.rig import Loss
 BIN_S = 3e-3
 STEP_S = 1e-3  # of a longer bin
 POINTS_AT_A_TIME = 150_000  # by one thread: what a chunk needs beside the cloud stays small
-MOMENTS = 10  # of (1, x, y, z), lower triangle row by row
-SUMS = MOMENTS + 3  # and the slant
-NO_NOISE = 16.0  # a point's chi^2 beyond this comes of a poor state, or of an outlier, and has no part in the slant
 LOSSES: dict[Loss, int] = {"none": 0, "huber": 1, "cauchy": 2}
-NO_PIVOT = 1e-13  # of a moment: below this a pivot is rounding
 
 
 @dataclass(frozen=True)
@@ -79,189 +82,6 @@ class Moments:
     slant: np.ndarray
 
 
-class _Scans(NamedTuple):
-    """Points of scans and the steps of time that they fall into: start (S + 1,); first step of each scan, counted from
-    its stamp, and its place among all steps (S + 1,), both a multiple of the steps of a bin."""
-
-    start: np.ndarray
-    offset_s: np.ndarray
-    xyz: np.ndarray
-    plane: np.ndarray
-    low: np.ndarray
-    steps: np.ndarray
-
-
-class _Cells(NamedTuple):
-    """Of each step (n,): its bin, -1 where the LiDAR's motion is not known; where the LiDAR is at its middle, seen from
-    the bin's centre (turn, shift). Of each bin (m,): rotation and position of the LiDAR at its centre."""
-
-    bin: np.ndarray
-    turn: np.ndarray
-    shift: np.ndarray
-    rotation: np.ndarray
-    position: np.ndarray
-
-
-class _Weights(NamedTuple):
-    """Variances [m^2] of what is alike in all directions, and of what is along the beam; the loss."""
-
-    alike: float
-    along: float
-    loss: int
-    scale: float
-
-
-@njit(cache=True, nogil=True)
-def _step_range(start, offset_s, per_s, each, low, count):
-    """First step of each scan, counted from its stamp, and how many there are: whole bins of `each` steps."""
-    for i in range(len(start) - 1):
-        least, most = np.inf, -np.inf
-        for n in range(start[i], start[i + 1]):
-            least, most = min(least, offset_s[n]), max(most, offset_s[n])
-        empty = start[i + 1] == start[i]
-        low[i] = 0 if empty else each * (int(np.floor(np.float64(least) * per_s)) // each)
-        count[i] = 0 if empty else each * ((int(np.floor(np.float64(most) * per_s)) - low[i]) // each + 1)
-
-
-@njit(cache=True, nogil=True)
-def _to_centres(motion, each, ok, cells):
-    """Fills `cells` for bins of `each` steps."""
-    for c in range(len(ok) // each):
-        m = c * each + each // 2
-        R, p = motion.rotation[m], motion.position[m]
-        cells.rotation[c], cells.position[c] = R, p
-        for b in range(c * each, (c + 1) * each):
-            cells.bin[b] = c if ok[b] and ok[m] else -1
-            for i in range(3):
-                cells.shift[b, i] = 0.0
-                for j in range(3):
-                    cells.shift[b, i] += R[j, i] * (motion.position[b, j] - p[j])
-                    cells.turn[b, i, j] = 0.0
-                    for k in range(3):
-                        cells.turn[b, i, j] += R[k, i] * motion.rotation[b, k, j]
-
-
-@njit(cache=True, nogil=True)
-def _see_plane(R, p, plane, seen):
-    """seen (4,): (n . p - d, R^T n), so that seen . (1, x) is the distance of a point x in the LiDAR's frame."""
-    seen[0] = 0.0
-    for a in range(3):
-        seen[0] += plane[a] * (p[a] - plane[3 + a])
-        seen[1 + a] = R[0, a] * plane[0] + R[1, a] * plane[1] + R[2, a] * plane[2]
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def _add_point(x, y, z, s, seen, weights, sums):
-    """Adds one weighted point to the sums in row s. All in one stretch: where noise is alike in all directions, asking
-    for it costs more than the division by the same variance."""
-    across = seen[s, 1] * x + seen[s, 2] * y + seen[s, 3] * z
-    off, square = seen[s, 0] + across, x * x + y * y + z * z
-    over = 1.0 / (weights.alike * square + weights.along * across * across)
-    w, robust = square * over, 1.0
-    chi2 = off * off * w
-    if weights.loss:
-        robust = weight(weights.loss, weights.scale, chi2)[0]
-        w *= robust
-    turns = robust * chi2 * weights.along * across * over if chi2 < NO_NOISE else 0.0
-    sums[s, 10] -= turns * x
-    sums[s, 11] -= turns * y
-    sums[s, 12] -= turns * z
-    wx, wy, wz = w * x, w * y, w * z
-    sums[s, 0] += w
-    sums[s, 1] += wx
-    sums[s, 2] += wx * x
-    sums[s, 3] += wy
-    sums[s, 4] += wy * x
-    sums[s, 5] += wy * y
-    sums[s, 6] += wz
-    sums[s, 7] += wz * x
-    sums[s, 8] += wz * y
-    sums[s, 9] += wz * z
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def _bin_scan(i, scans, motion, cells, planes, weights, per_s, each, slot, seen, sums, count, where):
-    """Moments of scan i in the order in which its bins and planes were met; returns how many. where (m, 2): which."""
-    used, low, first, step_s = 0, scans.low[i], scans.steps[i], 1.0 / per_s
-    begin = first // each
-    slot[: scans.steps[i + 1] // each - begin] = -1
-    # Unsigned indices spare the test of each whether it counts from the end.
-    for n in range(np.uint64(scans.start[i]), np.uint64(scans.start[i + 1])):
-        q = scans.plane[n]
-        if q < 0:
-            continue
-        offset = np.float64(scans.offset_s[n])
-        k = int(np.floor(offset * per_s))
-        b = np.uint64(first + k - low)
-        c = cells.bin[b]
-        if c < 0:
-            continue
-        s = slot[np.uint64(c - begin), np.uint64(q)]
-        if s < 0:
-            s = slot[c - begin, q] = used
-            used += 1
-            _see_plane(cells.rotation[c], cells.position[c], planes[q], seen[s])
-            sums[s] = 0.0
-            count[s] = 0
-            where[s, 0], where[s, 1] = c, q
-        dt = offset - (k + 0.5) * step_s
-        h = 0.5 * dt
-        x, y, z = np.float64(scans.xyz[n, 0]), np.float64(scans.xyz[n, 1]), np.float64(scans.xyz[n, 2])
-        w0, w1, w2 = motion.rate[b, 0], motion.rate[b, 1], motion.rate[b, 2]
-        mx, my, mz = x + h * (w1 * z - w2 * y), y + h * (w2 * x - w0 * z), z + h * (w0 * y - w1 * x)
-        x += dt * (motion.velocity[b, 0] + w1 * mz - w2 * my)
-        y += dt * (motion.velocity[b, 1] + w2 * mx - w0 * mz)
-        z += dt * (motion.velocity[b, 2] + w0 * my - w1 * mx)
-        R, t = cells.turn[b], cells.shift[b]
-        mx = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0]
-        my = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1]
-        mz = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2]
-        _add_point(mx, my, mz, np.uint64(s), seen, weights, sums)
-        count[np.uint64(s)] += 1
-    return used
-
-
-@njit(cache=True, nogil=True)
-def _root_in_place(M):
-    """Moments (10,) -> their lower Cholesky factor; where a pivot is nothing but rounding, its column is 0."""
-    for j in range(4):
-        d = M[j * (j + 1) // 2 + j]
-        least = NO_PIVOT * d
-        for k in range(j):
-            d -= M[j * (j + 1) // 2 + k] ** 2
-        f = 1.0 / np.sqrt(d) if d > least else 0.0
-        M[j * (j + 1) // 2 + j] = d * f
-        for i in range(j + 1, 4):
-            s = M[i * (i + 1) // 2 + j]
-            for k in range(j):
-                s -= M[i * (i + 1) // 2 + k] * M[j * (j + 1) // 2 + k]
-            M[i * (i + 1) // 2 + j] = s * f
-
-
-@njit(cache=True, nogil=True)
-def _bin_scans(scans, motion, cells, planes, weights, per_s, entries):
-    """All scans one after the other: entries' bin, plane, count, root and slant; returns how many."""
-    bins, plane, count, root, slant = entries
-    longest, total, each = 0, 0, max(len(cells.bin) // max(len(cells.position), 1), 1)
-    for i in range(len(scans.start) - 1):
-        longest = max(longest, (scans.steps[i + 1] - scans.steps[i]) // each)
-    n = longest * len(planes)
-    slot, seen = np.empty((longest, len(planes)), np.int32), np.empty((n, 4))
-    sums, number, where = np.empty((n, SUMS)), np.empty(n, np.int64), np.empty((n, 2), np.int64)
-    for i in range(len(scans.start) - 1):
-        used = _bin_scan(i, scans, motion, cells, planes, weights, per_s, each, slot, seen, sums, number, where)
-        for s in range(used):
-            bins[total], plane[total], count[total] = where[s, 0], where[s, 1], number[s]
-            root[total] = sums[s, :MOMENTS]
-            _root_in_place(root[total])
-            slant[total, 0] = 0.0
-            for a in range(3):
-                slant[total, 1 + a] = sums[s, MOMENTS + a]
-                slant[total, 0] -= sums[s, MOMENTS + a] * seen[s, 1 + a]
-            total += 1
-    return total
-
-
 def take_moments(cloud: Associated, drive: Motion, noise: LidarNoise, bin_s: float = BIN_S) -> Moments:
     """Moments of all points that lie on a plane, everything as `drive` has it; weights are those of its residuals.
 
@@ -296,18 +116,18 @@ def _groups(stream: LidarStream) -> Iterator[slice]:
 
 def _laid_out(
     stream: LidarStream, plane: np.ndarray, step_s: float, each: int, own: slice
-) -> tuple[_Scans, np.ndarray, slice]:
+) -> tuple[Scans, np.ndarray, slice]:
     """Some of the scans with their steps, `each` so many a bin; the middles of steps in seconds on the LiDAR's clock;
     which points they are."""
     start = stream.start[own.start : own.stop + 1]
     points = slice(int(start[0]), int(start[-1]))
     start, offset_s = start - start[0], stream.offset_s[points]
     low, width = np.empty(len(start) - 1, np.int64), np.empty(len(start) - 1, np.int64)
-    _step_range(start, offset_s, 1.0 / step_s, each, low, width)
+    step_range(start, offset_s, 1.0 / step_s, each, low, width)
     steps = np.concatenate([[0], np.cumsum(width)])
     within = np.arange(steps[-1]) - np.repeat(steps[:-1] - low, width)
     seconds = np.repeat(stream.seconds[own], width) + (within + 0.5) * step_s
-    return _Scans(start, offset_s, stream.xyz[points], plane[points], low, steps), seconds, points
+    return Scans(start, offset_s, stream.xyz[points], plane[points], low, steps), seconds, points
 
 
 def _moments_of(
@@ -319,43 +139,24 @@ def _moments_of(
     times = instants(cloud.stream, drive.state.values, seconds)
     # All steps of a bin hang on one node: between two nodes a state that has not settled yet may jump.
     motion, n = sweep(drive, cloud.stream.name, times, np.repeat(times[each // 2 :: each], each)), len(times)
-    cells = _Cells(
-        np.empty(n, np.int64), np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n // each, 3, 3)),
+    cells = Cells(
+        np.empty(n, np.bool_), np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n // each, 3, 3)),
         np.empty((n // each, 3)),
     )  # fmt: skip
-    _to_centres(motion, each, usable(drive.imu, times, drive.max_gap_s), cells)
-    weights = _Weights(noise.sigma**2, noise.beam_sigma**2, LOSSES[noise.loss], noise.loss_scale)
+    to_centres(motion, each, usable(drive.imu, times, drive.max_gap_s), cells)
+    weights = Weights(noise.sigma**2, noise.beam_sigma**2, LOSSES[noise.loss], noise.loss_scale)
     most = min(len(scans.xyz), len(cells.position) * len(cloud.planes))
     entries = (
         np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64), np.empty((most, MOMENTS)),
         np.empty((most, 4)),
     )  # fmt: skip
-    k = _bin_scans(scans, motion, cells, cloud.planes, weights, each / bin_s, entries)
+    k = bin_scans(scans, motion, cells, each, cloud.planes, weights, each / bin_s, entries)
     return seconds[each // 2 :: each], *(e[:k].copy() for e in entries)
 
 
 def steps_of(bin_s: float) -> int:
     """Steps of a bin, an odd number: the middle of one is the bin's centre."""
     return max(2 * (int(bin_s / STEP_S + 0.5) // 2) + 1, 1) if bin_s > STEP_S else 1
-
-
-@njit(cache=True, nogil=True)
-def _move_to_world(scans, motion, step_s, points, seen_from):
-    """World coordinates of all points, and where the LiDAR was when it saw them."""
-    for i in range(len(scans.start) - 1):
-        for n in range(scans.start[i], scans.start[i + 1]):
-            offset = np.float64(scans.offset_s[n])
-            k = int(np.floor(offset * (1.0 / step_s)))
-            b, dt = scans.steps[i] + k - scans.low[i], offset - (k + 0.5) * step_s
-            x, v, w = scans.xyz[n], motion.velocity[b], motion.rate[b]
-            for a in range(3):
-                points[n, a] = seen_from[n, a] = motion.position[b, a]
-            for c in range(3):
-                d, e = (c + 1) % 3, (c + 2) % 3
-                turned = x[c] + dt * (w[d] * x[e] - w[e] * x[d])
-                for a in range(3):
-                    points[n, a] += motion.rotation[b, a, c] * (turned + dt * v[c])
-                    seen_from[n, a] += motion.rotation[b, a, c] * dt * v[c]
 
 
 def in_world(drive: Motion, stream: LidarStream) -> tuple[np.ndarray, np.ndarray]:
@@ -366,7 +167,7 @@ def in_world(drive: Motion, stream: LidarStream) -> tuple[np.ndarray, np.ndarray
     def move(own: slice) -> None:
         scans, seconds, ends = _laid_out(stream, stream.plane, STEP_S, 1, own)
         motion = sweep(drive, stream.name, instants(stream, drive.state.values, seconds))
-        _move_to_world(scans, motion, STEP_S, points[ends], seen_from[ends])
+        move_to_world(scans, motion, STEP_S, points[ends], seen_from[ends])
 
     in_parallel(move, _groups(stream))
     return points, seen_from
