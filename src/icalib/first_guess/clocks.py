@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -87,6 +88,18 @@ def align(imu: ImuData, name: str, rates: CameraRates, given_offset: float | Non
     _check_offset(imu, name, alike, found, given_offset is not None)
     _check_scale(imu, name, rates, found)
     return found
+
+
+def rough_alignments(
+    imu: ImuData, name: str, rates: CameraRates, offsets: Sequence[float] | None, guess: float
+) -> list[Alignment]:
+    """Where to search from, whether the rates match or not: at the `offsets`, or if there are none where the angular
+    rates go together best, and at the `guess`."""
+    _check_motion(imu, name, rates)
+    if offsets is None:
+        offsets = [s.samples / GRID_HZ for s in _shifts(imu, rates) if np.isfinite(s.correlation)] + [guess]
+    offsets = [x for x in dict.fromkeys(offsets) if _covered(imu, rates, x).any()]
+    return [_rough(x, *_side_by_side(imu, rates, x)) for x in offsets]
 
 
 def _covered(imu: ImuData, rates: CameraRates, offset: float) -> np.ndarray:
@@ -187,8 +200,7 @@ def _grid(t: np.ndarray, rate: np.ndarray, covered: np.ndarray, count: int) -> t
 def _correlate(imu: ImuData, name: str, rates: CameraRates) -> float:
     """Offset [s] at the peak of the masked, normalised cross-correlation of |w| over all shifts, of rates as they are
     or of their means, whichever is higher: fast motion shows in the ones, slow motion in the others."""
-    shown = [_shift(imu, rates, count) for count in (1, round(AVERAGED_S * GRID_HZ))]
-    found = max(shown, key=lambda s: s.correlation if np.isfinite(s.correlation) else -1.0)
+    found = max(_shifts(imu, rates), key=lambda s: s.correlation if np.isfinite(s.correlation) else -1.0)
     if not found.correlation > rates.least_correlation:
         raise EstimationError(
             f"the motion of {name} does not match that of {imu.name} at any shift of their clocks (best correlation "
@@ -196,6 +208,10 @@ def _correlate(imu: ImuData, name: str, rates: CameraRates) -> float:
             f"and are in rad/s."
         )
     return found.samples / GRID_HZ
+
+
+def _shifts(imu: ImuData, rates: CameraRates) -> list[Shift]:
+    return [_shift(imu, rates, count) for count in (1, round(AVERAGED_S * GRID_HZ))]
 
 
 def _shift(imu: ImuData, rates: CameraRates, count: int) -> Shift:
@@ -285,6 +301,11 @@ def _axes(rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """How rates (n, 3) spread about their axes (3, 3), by rows, the widest first."""
     _, spread, axes = np.linalg.svd(rate - rate.mean(axis=0), full_matrices=False)
     return spread, axes
+
+
+def main_axis(rate: np.ndarray) -> np.ndarray:
+    """(3,) the axis that rates (n, 3) spread about most."""
+    return _axes(rate)[1][0]
 
 
 def check_axes(imu: ImuData, rates: CameraRates, found: Alignment, name: str) -> None:

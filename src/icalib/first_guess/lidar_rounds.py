@@ -33,6 +33,7 @@ from icalib.first_guess.by_recording import (
     other_clocks,
     points_by_recording,
 )
+from icalib.first_guess.known_motion import near_nodes
 from icalib.first_guess.lidar import Held, lidar_and_motion, lidar_on_motion
 from icalib.first_guess.lidar_planes import ROUNDS, Association, associate, odd_step, round_search
 from icalib.first_guess.lidar_sight import naming_sight
@@ -41,7 +42,6 @@ from icalib.measurements import LidarStream
 from icalib.rig import Camera, Lidar, PoseSensor, Wheels
 
 FEW, LOST = 0.2, 0.7  # share of points on planes, and of what there was at first, below which the planes are lost
-NEAR_NODE_S = 0.15  # a scan of a LiDAR alone goes on so long after its node
 NAMES = tuple(name for name, _, _ in MOUNT)
 
 
@@ -200,12 +200,6 @@ def while_known(inputs: Inputs, state: State) -> Inputs:
         usable = np.isfinite(size2) & (size2 > 0.0)
         lidars.append(stream.some(np.repeat(known, np.diff(stream.start)) & usable))
     return replace(inputs, measurements=replace(measured, lidars=tuple(lidars), notes=tuple(notes)))
-
-
-def near_nodes(nodes: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """(n,) whether there is a node near each of the times (n,)."""
-    k = np.clip(np.searchsorted(nodes, times), 1, len(nodes) - 1)
-    return np.minimum(np.abs(times - nodes[k - 1]), np.abs(times - nodes[k])) < NEAR_NODE_S
 
 
 def lidar_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:

@@ -13,13 +13,12 @@ from icalib.estimation.clocks import instants
 from icalib.estimation.ground_factor import HEIGHT_BLOCK
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.lidar_sweep import Motion
-from icalib.estimation.poses import assign_nodes, poses_at
 from icalib.estimation.robot import MOUNT
 from icalib.estimation.state import Key, State
 from icalib.estimation.wheel_angles import integrals_of
 from icalib.first_guess.by_recording import alone, each_clock
-from icalib.first_guess.from_tracks import lens_start
-from icalib.first_guess.lidar_rounds import given, lidar_values, near_nodes, with_lidars
+from icalib.first_guess.known_motion import imu_poses, is_known
+from icalib.first_guess.lidar_rounds import given, lidar_values, with_lidars
 from icalib.first_guess.poses import pose_values
 from icalib.first_guess.wheel_poses import mount_guess, poses_offset
 from icalib.first_guess.wheels import WheelRates, drive_guess, wheel_offset, wheel_rates
@@ -53,18 +52,6 @@ def with_robot(inputs: Inputs, settled: State) -> tuple[Inputs, State, dict[Key,
     if inputs.rig.lidars:
         inputs, state = with_lidars(inputs, state)
     return inputs, state, guess
-
-
-def given_cameras(inputs: Inputs) -> dict[Key, np.ndarray] | None:
-    """What the rig gives of the cameras, if that is a place to start from: pose, clock and intrinsics of all."""
-    out: dict[Key, np.ndarray] = {}
-    for camera in inputs.rig.cameras:
-        names = (*(name for name, _, _ in MOUNT), "intrinsics")
-        known = given(inputs, camera, names)
-        if len(known) < len(names):
-            return None
-        out |= known | {(camera.name, "distortion"): lens_start(camera)[4:]}
-    return out
 
 
 def _wheels(inputs: Inputs, state: State, wheels: Wheels, stream: WheelStream | WheelPoses) -> dict[Key, np.ndarray]:
@@ -142,9 +129,7 @@ def _means(motion: Motion, start: np.ndarray, end: np.ndarray) -> tuple[np.ndarr
 
     Raises EstimationError where the wheels turned while nothing else was recorded.
     """
-    state = motion.state
-    inside = (start >= state.seconds[0]) & (end <= state.seconds[-1])
-    inside &= near_nodes(state.seconds, start) & near_nodes(state.seconds, end)
+    inside = is_known(motion.state.seconds, start) & is_known(motion.state.seconds, end)
     if not inside.any():
         raise EstimationError(
             "no reading of the wheels falls within the recording of the other sensors; check their clocks, or "
@@ -152,8 +137,7 @@ def _means(motion: Motion, start: np.ndarray, end: np.ndarray) -> tuple[np.ndarr
         )
     start, end = start[inside], end[inside]
     times = np.stack([start, 0.5 * (start + end), end], axis=1).ravel()
-    node = assign_nodes("inertial", state.seconds, times)
-    poses = poses_at("inertial", times, node, state, motion.imu, motion.gravity, False)
+    poses = imu_poses(motion, times)
     velocity = np.einsum("nji,nj->ni", poses.rotation, poses.velocity)
     rate, speed = (np.einsum("k,nki->ni", SIMPSON, x.reshape(-1, 3, 3)) for x in (poses.rate, velocity))
     return inside, rate, speed

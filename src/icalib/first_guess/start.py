@@ -20,8 +20,9 @@ from icalib.first_guess.by_recording import each_clock
 from icalib.first_guess.lidar_rounds import state_from_lidar
 from icalib.first_guess.own_robot import without_own_robot
 from icalib.first_guess.poses import pose_values, state_from_poses
-from icalib.first_guess.robot import given_cameras, wheel_values, with_robot
+from icalib.first_guess.robot import wheel_values, with_robot
 from icalib.first_guess.several import initial_guesses
+from icalib.first_guess.tracks_on_motion import track_camera_values
 from icalib.geometry.targets.base import BOARD
 from icalib.measurements import Measurements
 from icalib.rig import Rig
@@ -32,8 +33,8 @@ def start(
 ) -> tuple[Inputs, State, dict[Key, np.ndarray]]:
     """What the estimate is made from, where it starts, and the guess at which stays what the data do not determine.
 
-    A target gives the motion, or else a LiDAR, if nothing is to be found of the cameras, or else points of the scene,
-    or where there is neither camera nor LiDAR a pose sensor; what has no part in it is placed on that motion.
+    A target gives the motion, or else a LiDAR, or if its scans do not show it points of the scene, or where there is
+    neither camera nor LiDAR a pose sensor; what has no part in it is placed on that motion.
     Raises EstimationError where the recordings do not carry it.
     """
     if rig.imu is None and (rig.wheels or rig.poses):
@@ -42,9 +43,16 @@ def start(
         return found
     recordings = [without_own_robot(m) for m in recordings]
     whole = inputs_for(rig, recordings)
-    cameras = given_cameras(whole)
-    if rig.lidars and not rig.has_target and cameras is not None:
-        return _start_from_lidar(whole, recordings, cameras, lap)
+    if rig.lidars and not rig.has_target:
+        alone = _lidars_alone(whole, recordings)
+        try:
+            state = state_from_lidar(alone)
+        except EstimationError:
+            if not rig.cameras:
+                raise
+        else:
+            lap("first guess")
+            return _with_all_but_lidars(whole, alone, state, lap)
     if not rig.cameras and not rig.lidars:
         if not rig.poses:
             raise EstimationError(
@@ -67,16 +75,19 @@ def start(
     return inputs, settled, guess | state.values
 
 
-def _start_from_lidar(
-    whole: Inputs, recordings: Sequence[Measurements], cameras: dict[Key, np.ndarray], lap: Callable[[str], None]
-) -> tuple[Inputs, State, dict[Key, np.ndarray]]:
+def _lidars_alone(whole: Inputs, recordings: Sequence[Measurements]) -> Inputs:
     rig = replace(whole.rig, cameras=(), wheels=(), poses=())
-    alone = inputs_for(rig, [replace(m, cameras=(), tracks=(), wheels=(), poses=()) for m in recordings], whole)
-    state = state_from_lidar(alone)
-    lap("first guess")
+    return inputs_for(rig, [replace(m, cameras=(), tracks=(), wheels=(), poses=()) for m in recordings], whole)
+
+
+def _with_all_but_lidars(
+    whole: Inputs, alone: Inputs, state: State, lap: Callable[[str], None]
+) -> tuple[Inputs, State, dict[Key, np.ndarray]]:
+    """All of `start`, where the first LiDAR has shown the motion: the others are placed on it."""
     alone, state, guess = with_robot(alone, state)
     measured = replace(whole.measurements, lidars=alone.measurements.lidars, notes=alone.measurements.notes)
     inputs = replace(with_clouds(replace(whole, measurements=measured), alone.clouds), guess=alone.guess)
+    cameras = track_camera_values(inputs, state)
     values = start_values(inputs, state.values | cameras)
     state = resample(replace(state, values=values), nodes_for(inputs, host_times(inputs, values)), inputs)
     others = wheel_values(inputs, state) | pose_values(inputs, state)

@@ -15,7 +15,7 @@ import numpy as np
 from icalib.estimation.arrowhead import complement
 from icalib.first_guess.clocks import LEAST_SECOND_AXIS, Alignment, only_axis
 from icalib.first_guess.gyro import GyroRotation
-from icalib.first_guess.track_rotation import FEWEST_COMMON, common, image_pairs, turns_information
+from icalib.first_guess.track_rotation import pairs_sharing, turns_information
 from icalib.geometry import so3
 from icalib.geometry.cameras.base import CameraModel
 from icalib.measurements import TrackStream
@@ -38,14 +38,11 @@ class Pair:
 
 def pairs_of(camera: int, stream: TrackStream, model: CameraModel, params: np.ndarray) -> list[Pair]:
     rays, valid = model.unproject(params, stream.uv)
-    t, found = stream.seconds, []
-    for step in STEPS_S:
-        every = image_pairs(stream, step)
-        for i, j in every[:: max(1, len(every) // MOST_PAIRS)]:
-            p, q = common(stream, valid, i, j)
-            if len(p) >= FEWEST_COMMON:
-                found.append(Pair(camera, float(t[i]), float(t[j]), rays[p], rays[q]))
-    return found
+    t = stream.seconds
+    return [
+        Pair(camera, float(t[i]), float(t[j]), rays[p], rays[q])
+        for i, j, p, q in pairs_sharing(stream, valid, STEPS_S, MOST_PAIRS)
+    ]
 
 
 def align_together(

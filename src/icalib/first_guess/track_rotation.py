@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+
 import numpy as np
 from numba import njit
 
@@ -192,6 +194,19 @@ def image_pairs(stream: TrackStream, step: float) -> list[tuple[int, int]]:
     t = stream.seconds
     after = np.searchsorted(t, t + step - 0.5 * float(np.median(np.diff(t))))
     return [(i, int(j)) for i, j in enumerate(after) if i < j < len(t)]
+
+
+def pairs_sharing(
+    stream: TrackStream, valid: np.ndarray, steps: Iterable[float], most: int
+) -> Iterator[tuple[int, int, np.ndarray, np.ndarray]]:
+    """About `most` pairs of images for each of the `steps` between them that share points enough, and their rows, as
+    `common` has them."""
+    for step in steps:
+        every = image_pairs(stream, step)
+        for i, j in every[:: max(1, len(every) // most)]:
+            p, q = common(stream, valid, i, j)
+            if len(p) >= FEWEST_COMMON:
+                yield i, j, p, q
 
 
 def common(stream: TrackStream, valid: np.ndarray, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,240 @@
+"""Where a camera stands that follows points, once other sensors have shown how the robot moves.
+
+Of a point that two images share, both rays and the way of the camera in between lie in one plane. How the robot moves
+is known, so that only the camera itself is open: rotation, lever arm and time offset, and how it bends rays, a few
+unknowns of thousands of points. Angular rates say where to start, but not where the robot turns about one axis, as on a
+floor: how the camera stands about it is tried all round. No place of a point is sought.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numba import njit
+from scipy.optimize import OptimizeResult, least_squares
+
+from icalib.errors import EstimationError
+from icalib.estimation.lidar_sweep import Motion
+from icalib.estimation.poses import Poses
+from icalib.first_guess.known_motion import imu_poses, is_known
+from icalib.first_guess.track_rotation import pairs_sharing
+from icalib.geometry import so3
+from icalib.geometry.cameras.base import CameraModel
+from icalib.measurements import TrackStream
+
+STEPS_S = (0.5, 1.0)  # between two images
+MOST_PAIRS = 300  # of images a step
+RAY_SIGMA = 3e-3  # rad, of a ray: what a rough lens leaves
+ALIKE = 10.0  # of how many rays of two images a rough lens bends all alike: they count as one
+ARM_SIGMA = 0.5  # m
+LENS_SIGMA = 0.03  # rad, RMS over the rays, of what one coefficient may be off by
+NEAREST_M = 0.2  # of a point
+LENS_STEP = 1e-3  # of a direction
+BENDS = 2.0  # standard deviations, from where on a ray counts less
+ANGLES = 24  # about the axis that the robot turns about most
+FOLLOWED = 4  # starts
+EVERY = 6  # of the pairs that say which start is best
+ROUNDS = 3  # of taking motion and lens anew, where they have come to
+LARGEST_MISS = 0.02  # rad, the median
+LARGEST_SIGMA = np.deg2rad(5.0)  # of the rotation, beyond which it is not shown
+MOUNTED = 7  # unknowns of a mount
+UNITS = np.repeat([0.1, 0.1, 0.01], [3, 3, 1])  # rad, m, s: of what a mount is sought by
+
+
+@dataclass(frozen=True)
+class Mount:
+    """T_imu_cam; offset: t_imu - t_camera, both since their clock's first stamp [s]; lens (P,): intrinsics and
+    distortion."""
+
+    rotation: np.ndarray
+    position: np.ndarray
+    offset: float
+    lens: np.ndarray
+
+    def moved(self, x: np.ndarray, bends: np.ndarray) -> Mount:
+        """By (7 + L,): a turn in the camera's axes, metres, seconds, and so much of each of the `bends` (L, P)."""
+        R, p = self.rotation @ so3.exp(x[:3].copy()), self.position + x[3:6]
+        return Mount(R, p, self.offset + float(x[6]), self.lens + x[7:] @ bends)
+
+
+@dataclass(frozen=True)
+class Followed:
+    """What one camera followed: pairs of images at times (m, 2) on its clock, and the observations (n, 2) of points
+    that they share, those of pair k at begin[k]..begin[k + 1]. bends (L, P): directions in which its lens is open, each
+    as long as it may be off."""
+
+    name: str
+    model: CameraModel
+    uv: np.ndarray
+    times: np.ndarray
+    shared: np.ndarray
+    begin: np.ndarray
+    bends: np.ndarray
+
+    @classmethod
+    def of(cls, stream: TrackStream, model: CameraModel, lens: np.ndarray, directions: np.ndarray) -> Followed:
+        """`directions` (L, P): in which the lens is open."""
+        _, valid = model.unproject(lens, stream.uv)
+        pairs = list(pairs_sharing(stream, valid, STEPS_S, MOST_PAIRS))
+        times = stream.seconds[np.array([(i, j) for i, j, _, _ in pairs], np.int64).reshape(-1, 2)]
+        shared = [np.stack([p, q], axis=1) for _, _, p, q in pairs]
+        begin = np.cumsum([0, *(len(x) for x in shared)])
+        bends = [LENS_SIGMA * d / _effect(model, lens, d, stream.uv) for d in directions]
+        together = np.concatenate([np.zeros((0, 2), np.int64), *shared])
+        return cls(stream.name, model, stream.uv, times, together, begin, np.reshape(bends, directions.shape))
+
+    def some(self, kept: np.ndarray) -> Followed:
+        """The pairs `kept` (m,) bool."""
+        count = np.diff(self.begin)
+        begin = np.cumsum([0, *count[kept]])
+        return replace(self, times=self.times[kept], shared=self.shared[np.repeat(kept, count)], begin=begin)
+
+
+def _effect(model: CameraModel, lens: np.ndarray, direction: np.ndarray, uv: np.ndarray) -> float:
+    """RMS [rad] of what a small part of `direction` does to rays, for all of it."""
+    slope, valid = _slope(model, lens, direction, uv)
+    return float(np.sqrt((slope[valid] ** 2).sum(axis=1).mean()))
+
+
+def _slope(
+    model: CameraModel, lens: np.ndarray, direction: np.ndarray, uv: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives of the rays of uv (n, 2), and whether there are any (n,)."""
+    (up, there), (down, here) = (model.unproject(lens + h * direction, uv) for h in (LENS_STEP, -LENS_STEP))
+    return (up - down) / (2.0 * LENS_STEP), there & here
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _misses(f, h, begin, R, b, e):
+    """e (n,): by how far rays f, turned by R (m, 3, 3), and h of each pair miss each other, rad, where the camera of f
+    stands at b (m, 3), seen from that of h. Rays that would meet nearer than NEAREST_M, or behind a camera, miss by as
+    much of the angle between them, too: else a camera that does not move at all would fit best."""
+    for k in range(len(begin) - 1):
+        size = np.sqrt(b[k, 0] * b[k, 0] + b[k, 1] * b[k, 1] + b[k, 2] * b[k, 2]) + 1e-9
+        t0, t1, t2 = b[k, 0] / size, b[k, 1] / size, b[k, 2] / size
+        for i in range(begin[k], begin[k + 1]):
+            g0 = R[k, 0, 0] * f[i, 0] + R[k, 0, 1] * f[i, 1] + R[k, 0, 2] * f[i, 2]
+            g1 = R[k, 1, 0] * f[i, 0] + R[k, 1, 1] * f[i, 1] + R[k, 1, 2] * f[i, 2]
+            g2 = R[k, 2, 0] * f[i, 0] + R[k, 2, 1] * f[i, 1] + R[k, 2, 2] * f[i, 2]
+            h0, h1, h2 = h[i, 0], h[i, 1], h[i, 2]
+            c0, c1, c2 = g1 * h2 - g2 * h1, g2 * h0 - g0 * h2, g0 * h1 - g1 * h0
+            tg, th = t0 * g0 + t1 * g1 + t2 * g2, t0 * h0 + t1 * h1 + t2 * h2
+            off = (t0 * c0 + t1 * c1 + t2 * c2) / np.sqrt(max(2.0 - tg * tg - th * th, 1e-4))
+            # Of t + d1 g = d2 h the signs of d1 and d2.
+            gh = g0 * h0 + g1 * h1 + g2 * h2
+            behind = tg - th * gh > 0.0 or tg * gh - th > 0.0
+            near = np.sqrt(c0 * c0 + c1 * c1 + c2 * c2) - (0.0 if behind else size / NEAREST_M)
+            e[i] = np.sqrt(off * off + 0.5 * near * near) if near > 0.0 else off
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Pairs of images as the camera `at` sees them: the motion at both (m,), f and h (n, 3) rays of the first and the
+    second image, and their slopes (L, n, 3) by the lens."""
+
+    followed: Followed
+    at: Mount
+    first: Poses
+    second: Poses
+    f: np.ndarray
+    h: np.ndarray
+    f_by: np.ndarray
+    h_by: np.ndarray
+
+    @classmethod
+    def of(cls, followed: Followed, motion: Motion, at: Mount) -> _Seen:
+        t = followed.times + at.offset
+        followed = followed.some(is_known(motion.state.seconds, t[:, 0]) & is_known(motion.state.seconds, t[:, 1]))
+        t1, t2 = (followed.times + at.offset).T
+        p, q = followed.shared.T
+        rays, valid = followed.model.unproject(at.lens, followed.uv)
+        rays = np.where(valid[:, None], rays, 0.0)  # these miss nothing
+        by = np.zeros((len(followed.bends), *rays.shape))
+        for k, bend in enumerate(followed.bends):
+            slope, there = _slope(followed.model, at.lens, bend, followed.uv)
+            by[k] = np.where((valid & there)[:, None], slope, 0.0)
+        return cls(followed, at, imu_poses(motion, t1), imu_poses(motion, t2), rays[p], rays[q], by[:, p], by[:, q])
+
+    def misses(self, x: np.ndarray) -> np.ndarray:
+        """(n,) of all rays, with the camera moved by x (7 + L,)."""
+        mount = self.at.moved(x, self.followed.bends)
+        p = mount.position
+        (R1, at1), (R2, at2) = _after(self.first, x[6]), _after(self.second, x[6])
+        back = mount.rotation.T @ R2.transpose(0, 2, 1)
+        b = np.einsum("nij,nj->ni", back, at1 - at2 + R1 @ p) - mount.rotation.T @ p
+        f, h = self.f + np.tensordot(x[7:], self.f_by, 1), self.h + np.tensordot(x[7:], self.h_by, 1)
+        e = np.empty(len(f))
+        _misses(f, h, self.followed.begin, np.ascontiguousarray(back @ R1 @ mount.rotation), b, e)
+        return e
+
+    def sought(self, held: np.ndarray) -> tuple[Mount, OptimizeResult]:
+        """The best mount near by."""
+        n, sigma = len(self.followed.bends), RAY_SIGMA * np.sqrt(ALIKE)
+        units, free = np.append(UNITS, np.ones(n)), np.flatnonzero(~np.append(held, np.zeros(n, dtype=bool)))
+
+        def step(y: np.ndarray) -> np.ndarray:
+            x = np.zeros(len(units))
+            x[free] = units[free] * y
+            return x
+
+        def residuals(y: np.ndarray) -> np.ndarray:
+            x = step(y)
+            return np.concatenate([self.misses(x) / sigma, (self.at.position + x[3:6]) / ARM_SIGMA, x[7:]])
+
+        start, bends = np.zeros(len(free)), BENDS / np.sqrt(ALIKE)
+        result = least_squares(residuals, start, loss="cauchy", f_scale=bends, max_nfev=20)
+        return self.at.moved(step(result.x), self.followed.bends), result
+
+
+def _after(poses: Poses, dt: float) -> tuple[np.ndarray, np.ndarray]:
+    return poses.rotation @ so3.exp_many(dt * poses.rate), poses.position + dt * poses.velocity
+
+
+def place_on_motion(
+    followed: Followed, motion: Motion, starts: Sequence[Mount], axis: np.ndarray | None, held: np.ndarray
+) -> Mount:
+    """The camera that fits best what it `followed`, sought from each of the `starts`, turned all round about `axis`
+    (3,) of the IMU where there is one. held (7,): what is not sought, as in `Mount.moved`.
+
+    Raises EstimationError where none fits, or the motion does not show how the camera is turned.
+    """
+    angles = np.linspace(0.0, 2.0 * np.pi, ANGLES, endpoint=False)
+    turns = [np.eye(3)] if axis is None else [so3.exp(a * axis) for a in angles]
+    some = followed.some(np.arange(len(followed.times)) % EVERY == 0)
+    once = [s for s in (_Seen.of(some, motion, start) for start in starts) if len(s.f)]
+    seen = [replace(s, at=replace(s.at, rotation=T @ s.at.rotation)) for s in once for T in turns]
+    if not seen:
+        raise EstimationError(
+            f"{followed.name}: none of its images falls within the motion that the other sensors show; check its clock."
+        )
+    found = [s.sought(held) for s in sorted(seen, key=_cost)[:FOLLOWED]]
+    mount, result = min(found, key=lambda x: x[1].cost)
+    for _ in range(ROUNDS):
+        mount, result = _Seen.of(followed, motion, mount).sought(held)
+    _check(_Seen.of(followed, motion, mount), result, held)
+    return mount
+
+
+def _cost(seen: _Seen) -> float:
+    misses = seen.misses(np.zeros(MOUNTED + len(seen.followed.bends)))
+    return float(np.log1p((misses / (BENDS * RAY_SIGMA)) ** 2).mean())
+
+
+def _check(seen: _Seen, result: OptimizeResult, held: np.ndarray) -> None:
+    name = seen.followed.name
+    miss = float(np.median(np.abs(seen.misses(np.zeros(MOUNTED + len(seen.followed.bends))))))
+    if miss > LARGEST_MISS:
+        raise EstimationError(
+            f"{name}: the points that it follows do not move as the other sensors say (rays miss each other by "
+            f"{np.rad2deg(miss):.1f} deg); check that all come from the same recording, and its intrinsics."
+        )
+    if held[0]:
+        return
+    sigma = UNITS[:3] * np.sqrt(np.diag(np.linalg.pinv(result.jac.T @ result.jac)))[:3]
+    if np.linalg.norm(sigma) > LARGEST_SIGMA:
+        raise EstimationError(
+            f"{name}: the motion does not show how it is turned; move the robot about and along more axes, or give "
+            "rotation in the rig file."
+        )

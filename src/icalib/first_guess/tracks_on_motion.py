@@ -1,0 +1,88 @@
+"""Cameras that follow points, placed on a motion that other sensors have shown: see `track_mount`."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+from icalib.estimation.assembly import motion_of
+from icalib.estimation.inputs import Inputs
+from icalib.estimation.robot import MOUNT
+from icalib.estimation.state import Key, State
+from icalib.first_guess.align_camera import trusted
+from icalib.first_guess.by_recording import alone, each_clock, motion_alone, naming_recording, other_clocks
+from icalib.first_guess.clocks import main_axis, rough_alignments
+from icalib.first_guess.from_tracks import lens_start
+from icalib.first_guess.guess import relative_offset
+from icalib.first_guess.lidar_rounds import given
+from icalib.first_guess.track_mount import Followed, Mount, place_on_motion
+from icalib.first_guess.track_rotation import track_rates
+from icalib.geometry.cameras import camera_model
+from icalib.rig import Camera
+
+NAMES = tuple(name for name, _, _ in MOUNT)
+
+
+def track_camera_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
+    """Of all cameras, which follow points, `state` having the motion: what the rig gives, or what their tracks show.
+
+    Raises EstimationError where neither does.
+    """
+    out: dict[Key, np.ndarray] = {}
+    for number, camera in enumerate(inputs.rig.cameras):
+        lens, known = lens_start(camera), given(inputs, camera, NAMES)
+        if len(known) < len(NAMES):
+            known = _placed(inputs, state, number, lens) | known
+        out |= {(camera.name, "intrinsics"): lens[:4], (camera.name, "distortion"): lens[4:]} | known
+    return out
+
+
+def _placed(inputs: Inputs, state: State, number: int, lens: np.ndarray) -> dict[Key, np.ndarray]:
+    """Where a camera stands, and its lens. Of several recordings the one in which it saw most says so."""
+    camera = inputs.rig.cameras[number]
+    best = int(np.argmax([len(part.measurements.tracks[number].feature) for part in inputs.parts]))
+    mount_in = partial(_mount_in, inputs, state, number, lens)
+    with naming_recording(inputs, best):
+        found = mount_in(best, None)
+    if camera.clock_restarts:
+        offset = each_clock(inputs, camera.name, lambda k: mount_in(k, found).offset, {best: found.offset})
+    else:
+        offset = np.array([other_clocks(found.offset, camera.name, alone(inputs, best), inputs)])
+    values = {
+        "rotation": found.rotation, "translation": found.position, "time_offset": offset,
+        "intrinsics": found.lens[:4], "distortion": found.lens[4:],
+    }  # fmt: skip
+    return {(camera.name, name): np.ascontiguousarray(value) for name, value in values.items()}
+
+
+def _mount_in(
+    inputs: Inputs, state: State, number: int, lens: np.ndarray, recording: int, placed: Mount | None
+) -> Mount:
+    """As one recording shows it; `placed`: how the camera stands, where another has shown it."""
+    own, camera = alone(inputs, recording), inputs.rig.cameras[number]
+    assert own.imu is not None
+    stream, model = own.measurements.tracks[number], camera_model(camera.model)
+    known = {name: value for (_, name), value in given(own, camera, NAMES).items()}
+    directions = _open(camera, lens)
+    if placed is not None:
+        known |= {"rotation": placed.rotation, "translation": placed.position}
+        lens, directions = placed.lens, directions[:0]
+    offsets = [float(known["time_offset"][0])] if "time_offset" in known else None
+    same_clock = relative_offset(np.zeros(1), own.measurements.cameras[number], own.measurements)
+    starts = [
+        Mount(known.get("rotation", a.rotation), known.get("translation", np.zeros(3)), a.offset, lens)
+        for a in rough_alignments(own.imu, camera.name, track_rates(stream, model, lens), offsets, same_clock)
+    ]
+    motion = motion_of(own, motion_alone(inputs, recording, state))
+    held = np.repeat([name in known for name in NAMES], [3, 3, 1])
+    axis = None if "rotation" in known else main_axis(own.imu.gyro)
+    return place_on_motion(Followed.of(stream, model, lens, directions), motion, starts, axis, held)
+
+
+def _open(camera: Camera, lens: np.ndarray) -> np.ndarray:
+    """(L, P) directions in which the lens is sought: longer, unless the rig file is sure of it, and another first
+    coefficient of distortion, which bends most, where the rig file has none."""
+    rows = np.zeros((2, len(lens)))
+    rows[0, :2], rows[1, 4] = lens[:2], 1.0
+    return rows[[trusted(camera.intrinsics) is None, camera.distortion.value is None]]

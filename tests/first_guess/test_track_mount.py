@@ -1,0 +1,165 @@
+"""Cameras that follow points, placed on a known motion: against the simulated truth, which shares no code with it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from threadpoolctl import threadpool_limits
+
+from icalib.errors import EstimationError
+from icalib.estimation.imu_data import ImuData
+from icalib.estimation.inputs import inputs_for
+from icalib.estimation.state import State
+from icalib.first_guess.by_recording import one_after_another
+from icalib.first_guess.track_mount import NEAREST_M, _misses
+from icalib.first_guess.tracks_on_motion import track_camera_values
+from icalib.rig import Parameter
+from icalib.simulation import Drive, load_scenario, rig_for, simulate, with_drawn_guess
+
+PAPER = Path(__file__).parents[2] / "examples" / "paper"
+
+
+def drive(example="table2-planar", cameras=1, seed=1, noise_px=0.0, duration_s=20.0, set_back_s=0, **changes):
+    """A recording of cameras alone, their clocks set back, and the state that is its truth."""
+    scenario = load_scenario(PAPER / f"{example}.yaml")
+    own = tuple(
+        replace(c, corner_noise_px=noise_px, clock_origin_ns=c.clock_origin_ns - set_back_s * 10**9)
+        for c in scenario.cameras[:cameras]
+    )
+    scenario = replace(scenario, duration_s=duration_s, cameras=own, lidars=(), wheels=(), **changes)
+    simulation = simulate(scenario, seed)
+    truth = simulation.truth
+    imu = ImuData.build(simulation.measurements.imu, scenario.imu_noise)
+    nodes = np.arange(0.0, imu.seconds[-1], 0.05)
+    bias = np.concatenate([truth.gyro_bias.mean(axis=0), truth.accel_bias.mean(axis=0)])
+    poses = truth.pose_at(nodes + truth.seconds[0])
+    return simulation, State(nodes, *poses, np.tile(bias, (len(nodes), 1)), {("imu0", "intrinsics"): np.zeros(24)})
+
+
+def placed(simulation, state, rig):
+    with threadpool_limits(limits=1, user_api="blas"):  # as in a calibration: on many small matrices threads only wait
+        return track_camera_values(inputs_for(rig, [simulation.measurements]), state)
+
+
+def true_rig(simulation):
+    """All of the lenses known, nothing of where the cameras are."""
+    return rig_for(simulation.scenario)
+
+
+def errors(simulation, values, name):
+    """Rotation [deg] and lever arm [m] in the axes of the IMU, time offset [s]."""
+    truth, measured = simulation.truth, simulation.measurements
+    T, stream = truth.T_imu_cam[name], next(s for s in measured.tracks if s.name == name)
+    turn = Rotation.from_matrix(values[name, "rotation"] @ T[:3, :3].T).as_rotvec(degrees=True)
+    between = 1e-9 * (stream.origin_ns - measured.origin_ns)
+    offset = values[name, "time_offset"][0] - between - truth.time_offset[name]
+    return turn, values[name, "translation"] - T[:3, 3], offset
+
+
+@pytest.mark.parametrize("example", ["table2-3d", "table2-planar", "table2-ramp"])
+def test_a_camera_with_a_known_lens_is_found_where_it_is(example):
+    simulation, state = drive(example)
+    turn, arm, offset = errors(simulation, placed(simulation, state, true_rig(simulation)), "cam0")
+    seen = 2 if example == "table2-planar" else 3  # on a floor nothing shows how high the camera is
+    assert np.abs(turn).max() < 0.005
+    assert np.abs(arm[:seen]).max() < 1e-3
+    assert abs(offset) < 5e-5
+
+
+@pytest.mark.parametrize("example", ["table2-3d", "table2-planar", "table2-ramp"])
+def test_a_rough_lens_is_found_with_the_camera(example):
+    """A focal length guessed to 3 %, no distortion, where it is -0.28; the principal point is not sought."""
+    simulation, state = drive(example, cameras=3, noise_px=1.0)
+    scenario = simulation.scenario
+    guessed = with_drawn_guess(rig_for(scenario, intrinsics="free", distortion="free"), scenario, 3)
+    nothing = Parameter("free")
+    cameras = tuple(replace(c, rotation=nothing, translation=nothing, time_offset=nothing) for c in guessed.cameras)
+    values = placed(simulation, state, replace(guessed, cameras=cameras))
+    for camera in cameras:
+        turn, arm, offset = errors(simulation, values, camera.name)
+        assert np.abs(turn).max() < 2.5
+        assert np.abs(arm[:2]).max() < 0.15
+        assert abs(offset) < 0.01
+        focal = values[camera.name, "intrinsics"][:2] / simulation.truth.intrinsics[camera.name][:2]
+        assert np.abs(focal - 1.0).max() < 0.05
+    assert abs(values["cam0", "distortion"][0] - simulation.truth.distortion["cam0"][0]) < 0.06
+
+
+def test_what_the_rig_gives_stays():
+    simulation, state = drive()
+    rig = true_rig(simulation)
+    T = simulation.truth.T_imu_cam["cam0"]
+    rotation = Parameter("fixed", T[:3, :3] @ Rotation.from_rotvec([0.0, 0.01, 0.0]).as_matrix())
+    arm = Parameter("free", T[:3, 3] + [0.0, 0.0, 0.02])
+    given = replace(rig, cameras=(replace(rig.cameras[0], rotation=rotation, translation=arm),))
+    values = placed(simulation, state, given)
+    np.testing.assert_array_equal(values["cam0", "rotation"], rotation.value)
+    np.testing.assert_array_equal(values["cam0", "translation"], arm.value)
+    assert abs(errors(simulation, values, "cam0")[2]) < 0.02
+
+
+@pytest.mark.parametrize("restarts", [True, False])
+def test_of_several_recordings_one_shows_how_the_camera_stands(restarts):
+    """And each the offset of a clock that was set back between them."""
+    drives = drive(duration_s=12.0), drive(seed=2, set_back_s=37 if restarts else 0)
+    rig = true_rig(drives[0][0])
+    rig = replace(rig, cameras=(replace(rig.cameras[0], clock_restarts=restarts),))
+    inputs = inputs_for(rig, [simulation.measurements for simulation, _ in drives])
+    state = one_after_another(inputs, [s for _, s in drives], drives[0][1].values)
+    values = track_camera_values(inputs, state)
+    T = drives[0][0].truth.T_imu_cam["cam0"]
+    turn = Rotation.from_matrix(values["cam0", "rotation"] @ T[:3, :3].T).magnitude()
+    assert np.rad2deg(turn) < 0.005
+    assert np.abs(values["cam0", "translation"] - T[:3, 3])[:2].max() < 1e-3
+    measured = inputs.measurements
+    offset = values["cam0", "time_offset"] - 1e-9 * (measured.tracks[0].origin_ns - measured.origin_ns)
+    true = [simulation.truth.time_offset["cam0"] for simulation, _ in drives]
+    np.testing.assert_allclose(offset, true if restarts else true[:1], atol=5e-5)
+
+
+def test_tracks_of_another_drive_do_not_fit():
+    simulation, _ = drive()
+    _, other = drive(seed=2)
+    with pytest.raises(EstimationError, match="cam0: the points that it follows do not move as the other sensors say"):
+        placed(simulation, other, true_rig(simulation))
+
+
+def test_a_robot_that_goes_nowhere_does_not_show_how_the_camera_is_turned():
+    simulation, state = drive(motion=Drive("spin"))
+    with pytest.raises(EstimationError, match="cam0: the motion does not show how it is turned"):
+        placed(simulation, state, true_rig(simulation))
+
+
+def test_rays_that_meet_before_both_cameras_miss_nothing():
+    rng = np.random.default_rng(0)
+    R = Rotation.from_rotvec([0.1, -0.2, 0.05]).as_matrix()
+    b = np.array([0.4, -0.1, 0.2])
+    points = rng.normal(size=(50, 3)) + [0.0, 0.0, 4.0]  # seen from the second camera
+    f, h = (points - b) @ R, points / np.linalg.norm(points, axis=1)[:, None]
+    f /= np.linalg.norm(f, axis=1)[:, None]
+    e, begin = np.empty(50), np.array([0, 50])
+    _misses(f, h, begin, R[None], b[None], e)
+    assert np.abs(e).max() < 1e-12
+    _misses(f, h, begin, R[None], -b[None], e)  # the other way they meet behind, and the angle between them counts
+    angle = np.linalg.norm(np.cross(f @ R.T, h), axis=1)
+    np.testing.assert_allclose(e, np.sqrt(0.5) * angle, atol=1e-12)
+    _misses(f, h, begin, R[None], 1e-3 * b[None], e)  # a way a thousandth as long: some meet too near
+    np.testing.assert_allclose(
+        e, np.sqrt(0.5) * np.maximum(angle - 1e-3 * np.linalg.norm(b) / NEAREST_M, 0.0), atol=1e-9
+    )
+
+
+def test_a_ray_misses_by_its_own_error_across_the_plane_of_both():
+    R, b = np.eye(3), np.array([1.0, 0.0, 0.0])
+    point, by = np.array([0.5, 0.0, 3.0]), 1e-3
+    f, h = point - b, point + np.array([0.0, by * np.linalg.norm(point), 0.0])
+    f, h = f / np.linalg.norm(f), h / np.linalg.norm(h)
+    e = np.empty(1)
+    _misses(f[None], h[None], np.array([0, 1]), R[None], b[None], e)
+    # Both rays could be off: of two alike the error is shared, by the root of the sum of what each tells.
+    across = np.sin(np.arccos(f[0])) ** 2 + np.sin(np.arccos(h[0])) ** 2
+    assert abs(abs(e[0]) / by * np.sqrt(across) / np.sin(np.arccos(f[0])) - 1.0) < 1e-3
