@@ -11,10 +11,9 @@ from icalib.first_guess.align_camera import align_camera, trusted
 from icalib.first_guess.clocks import Alignment, camera_rates
 from icalib.first_guess.guess import CameraGuess, Guess, relative_offset
 from icalib.first_guess.gyro import GyroRotation
-from icalib.first_guess.intrinsics import camera_params
 from icalib.first_guess.lever_arm import LeverArm, check_gravity, check_size, lever_arm
 from icalib.first_guess.scene import Placed, scene_poses
-from icalib.first_guess.scene_lens import find_scene
+from icalib.first_guess.scene_lens import find_scene, lens_of
 from icalib.first_guess.target_poses import TargetPoses
 from icalib.first_guess.without_imu import guess_without_imu, trajectory_without_imu
 from icalib.geometry.cameras import camera_model
@@ -35,10 +34,7 @@ def initial_guess(rig: Rig, measurements: Measurements, scene: Placed | None = N
         bodies = choose_bodies(rig.target, [measurements], bent=False)
         measurements = restrict(bodies, measurements)
         scene = find_scene(rig, bodies, [measurements])
-    params = [
-        scene.params[c.name] if c.name in scene.params else camera_params(c, s, rig.target)
-        for c, s in zip(rig.cameras, measurements.cameras, strict=True)
-    ]
+    params = [lens_of(c, s, rig.target, scene) for c, s in zip(rig.cameras, measurements.cameras, strict=True)]
     poses = [
         scene_poses(s, camera_model(c.model), p, scene)
         for c, s, p in zip(rig.cameras, measurements.cameras, params, strict=True)

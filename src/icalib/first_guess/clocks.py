@@ -31,6 +31,10 @@ ROUNDS = 12
 DEGREES = 180.0 / np.pi
 
 
+class OneAxisError(EstimationError):
+    """A camera turned about one axis only, and the turn about it is open."""
+
+
 @dataclass(frozen=True)
 class CameraRates:
     """Mean angular rates between neighbouring images: start, end (n,) camera clock [s]; rate (n, 3) camera axes
@@ -309,9 +313,9 @@ def main_axis(rate: np.ndarray) -> np.ndarray:
 
 
 def check_axes(imu: ImuData, rates: CameraRates, found: Alignment, name: str) -> None:
-    """Raises EstimationError where the camera turned about one axis only."""
+    """Raises OneAxisError where the camera turned about one axis only."""
     if not turns_about_two_axes(imu, rates, found):
-        raise EstimationError(
+        raise OneAxisError(
             f"{name} turned about one axis only, and its rotation about that axis is not determined; turn the rig "
             "about two more axes, or give rotation in the rig file."
         )

@@ -81,12 +81,12 @@ def _placed(inputs: Inputs, state: State, sensor: PoseSensor, stream: PoseStream
     assert inputs.imu is not None
     held = held_of(inputs, sensor)
     if not sensor.clock_restarts:
-        return placed(stream, partial(_on_motion, inputs.imu, known=state, held=held)).values(sensor.name)
+        return placed(stream, partial(on_motion, inputs.imu, known=state, held=held)).values(sensor.name)
     streams = [_alone(inputs, k, sensor.name) for k in range(len(inputs.parts))]
     k = int(np.argmax([len(own.stamps_ns) for _, own in streams]))
     imu, own = streams[k]
     with naming_recording(inputs, k):
-        found = placed(own, partial(_on_motion, imu, known=motion_alone(inputs, k, state), held=held))
+        found = placed(own, partial(on_motion, imu, known=motion_alone(inputs, k, state), held=held))
 
     def offset(recording: int) -> float:
         return _aligned(*streams[recording], Held(found.rotation))[0].offset
@@ -200,7 +200,7 @@ def _check_size(imu: ImuData, name: str, path: LidarPath, aligned: Alignment, fo
         )
 
 
-def _on_motion(imu: ImuData, stream: PoseStream, known: State, held: Held) -> tuple[LidarGuess, float]:
+def on_motion(imu: ImuData, stream: PoseStream, known: State, held: Held) -> tuple[LidarGuess, float]:
     """From the motion of the IMU in `known`, and what is left of the poses. Raises EstimationError as above."""
     aligned, rates = _aligned(imu, stream, held)
     path, t = _path(stream), stream.seconds + aligned.offset

@@ -19,6 +19,7 @@ from icalib.first_guess.intrinsics import camera_params
 from icalib.first_guess.scene import Placed, place_bodies, scene_poses
 from icalib.first_guess.without_imu import guess_without_imu, trajectory_without_imu
 from icalib.geometry.cameras import camera_model
+from icalib.geometry.targets.base import Target
 from icalib.joining import join_corners
 from icalib.measurements import CornerStream, Measurements
 from icalib.rig import Camera, Rig
@@ -40,6 +41,11 @@ def find_scene(rig: Rig, bodies: Bodies, recordings: Sequence[Measurements]) -> 
         for c, s in zip(rig.cameras, streams, strict=True)
     }
     return place_bodies(bodies, streams, [camera_model(c.model) for c in rig.cameras], params)
+
+
+def lens_of(camera: Camera, stream: CornerStream, target: Target, scene: Placed) -> np.ndarray:
+    """(P,) parameters: what the scene has, or else a camera by itself."""
+    return scene.params[camera.name] if camera.name in scene.params else camera_params(camera, stream, target)
 
 
 def refined_params(rig: Rig, camera: Camera, stream: CornerStream, params: np.ndarray) -> np.ndarray:

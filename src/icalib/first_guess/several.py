@@ -11,7 +11,7 @@ from icalib.errors import CalibrationError, EstimationError
 from icalib.estimation.bodies import Bodies
 from icalib.estimation.imu_data import imu_data
 from icalib.first_guess import initial_guess
-from icalib.first_guess.clocks import better_offset, camera_rates
+from icalib.first_guess.clocks import OneAxisError, better_offset, camera_rates
 from icalib.first_guess.from_tracks import guess_from_tracks
 from icalib.first_guess.guess import CameraGuess, Guess
 from icalib.first_guess.scene import Placed, scene_poses
@@ -83,7 +83,8 @@ def _named(rig: Rig, scene: Placed, recording: Measurements) -> Guess:
     try:
         return initial_guess(rig, recording, scene)
     except CalibrationError as error:
-        raise EstimationError(f"{recording.name}: {error}") from error
+        named = OneAxisError if isinstance(error, OneAxisError) else EstimationError
+        raise named(f"{recording.name}: {error}") from error
 
 
 def _held(rig: Rig, guess: Guess, recording: Measurements) -> Rig:

@@ -17,12 +17,15 @@ from icalib.estimation.state import Key, State
 from icalib.first_guess import Guess, initial_trajectory
 from icalib.first_guess.assumed_motion import start_without_imu
 from icalib.first_guess.by_recording import each_clock
+from icalib.first_guess.clocks import OneAxisError
 from icalib.first_guess.lidar_rounds import state_from_lidar
 from icalib.first_guess.own_robot import without_own_robot
 from icalib.first_guess.poses import pose_values, state_from_poses
 from icalib.first_guess.robot import wheel_values, with_robot
 from icalib.first_guess.several import initial_guesses
+from icalib.first_guess.targets_on_motion import with_mounts_guessed
 from icalib.first_guess.tracks_on_motion import track_camera_values
+from icalib.geometry.targets import NoTarget
 from icalib.geometry.targets.base import BOARD
 from icalib.measurements import Measurements
 from icalib.rig import Rig
@@ -64,7 +67,7 @@ def start(
     if rig.wheels or rig.lidars or rig.poses:
         seen = [replace(m, wheels=(), lidars=(), poses=()) for m in recordings]
         bare = inputs_for(replace(rig, wheels=(), lidars=(), poses=()), seen, whole)
-    guesses = initial_guesses(rig, bare.bodies, [m.measurements for m in bare.motions])
+    guesses = _guesses(rig, bare, lambda: _lidars_alone(whole, recordings))
     lap("first guess")
     state = first_state(bare, *guesses)
     lap("first state")
@@ -75,8 +78,24 @@ def start(
     return inputs, settled, guess | state.values
 
 
+def _guesses(rig: Rig, bare: Inputs, lidars_alone: Callable[[], Inputs]) -> tuple[Guess, ...]:
+    """Of the motion, by cameras; how they stand a LiDAR's motion shows where their own does not."""
+    recordings = [m.measurements for m in bare.motions]
+    try:
+        return initial_guesses(rig, bare.bodies, recordings)
+    except OneAxisError as error:
+        if not rig.lidars or not rig.has_target:
+            raise
+        lidars = lidars_alone()
+        try:
+            rig = with_mounts_guessed(rig, bare, lidars, state_from_lidar(lidars))
+        except EstimationError:
+            raise error from None
+        return initial_guesses(rig, bare.bodies, recordings)
+
+
 def _lidars_alone(whole: Inputs, recordings: Sequence[Measurements]) -> Inputs:
-    rig = replace(whole.rig, cameras=(), wheels=(), poses=())
+    rig = replace(whole.rig, cameras=(), wheels=(), poses=(), target=NoTarget())
     return inputs_for(rig, [replace(m, cameras=(), tracks=(), wheels=(), poses=()) for m in recordings], whole)
 
 

@@ -1,0 +1,51 @@
+"""Cameras that see a target from a robot that turns about one axis, as on a floor, placed on a LiDAR's motion.
+
+Their angular rates leave the turn about that axis open, and with it all that follows; the way that their poses go, and
+the robot, shows it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from icalib.estimation.inputs import Inputs
+from icalib.estimation.state import State
+from icalib.first_guess.by_recording import alone, motion_alone, naming_recording
+from icalib.first_guess.lidar import Held
+from icalib.first_guess.poses import on_motion
+from icalib.first_guess.scene import scene_poses
+from icalib.first_guess.scene_lens import find_scene, lens_of
+from icalib.geometry.cameras import camera_model
+from icalib.measurements import PoseStream
+from icalib.rig import Camera, Parameter, Rig
+
+
+def with_mounts_guessed(rig: Rig, seen: Inputs, lidars: Inputs, state: State) -> Rig:
+    """`rig` with a guess of how each camera stands whose rotation it does not give. Of several recordings the one in
+    which it saw most says so. seen: what the cameras are estimated from; lidars: what `state`, which has the motion,
+    is made from.
+
+    Raises EstimationError where the motion does not show it.
+    """
+    recordings = [m.measurements for m in seen.motions]
+    scene = find_scene(rig, seen.bodies, recordings)
+
+    def placed(number: int, camera: Camera) -> Camera:
+        best = int(np.argmax([len(r.cameras[number].uv) for r in recordings]))
+        stream, own = recordings[best].cameras[number], alone(lidars, best)
+        poses = scene_poses(stream, camera_model(camera.model), lens_of(camera, stream, rig.target, scene), scene)
+        path = PoseStream(camera.name, stream.stamps_ns[poses.ok], poses.rotation[poses.ok], poses.position[poses.ok])
+        assert own.imu is not None
+        with naming_recording(lidars, best):
+            found, _ = on_motion(own.imu, path, motion_alone(lidars, best, state), Held())
+        offset = found.offset - 1e-9 * (path.origin_ns - recordings[best].origin_ns)
+        guess = {"rotation": found.rotation, "translation": found.position, "time_offset": np.array([offset])}
+        return replace(
+            camera, **{k: Parameter("free", v) for k, v in guess.items() if getattr(camera, k).value is None}
+        )
+
+    return replace(
+        rig, cameras=tuple(placed(k, c) if c.rotation.value is None else c for k, c in enumerate(rig.cameras))
+    )
