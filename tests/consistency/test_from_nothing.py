@@ -17,7 +17,7 @@ from icalib.errors import EstimationError
 from icalib.first_guess.start import start
 from icalib.montecarlo.one_run import Task, run
 from icalib.montecarlo.statistics import Sample, nees
-from icalib.simulation import Scenario, load_scenario, rig_for, simulate
+from icalib.simulation import Scenario, SimPoses, load_scenario, rig_for, simulate
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
 
@@ -43,6 +43,11 @@ def test_cameras_that_follow_points(example, seed):
 
 def test_a_camera_that_sees_a_target_from_a_flat_floor(robot):
     check(robot("planar", 20.0, "cl", 300), 4, True)
+
+
+def test_motion_capture_shows_it_as_well(robot):
+    mocap = SimPoses("mocap0", np.eye(4), rotation_noise=1e-3, position_noise=5e-4)
+    check(replace(robot("planar", 20.0, "c"), poses=(mocap,)), 4, True)
 
 
 def test_where_the_lidar_shows_nothing_either_the_camera_says_what_is_missing(robot):

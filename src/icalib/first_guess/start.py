@@ -67,7 +67,7 @@ def start(
     if rig.wheels or rig.lidars or rig.poses:
         seen = [replace(m, wheels=(), lidars=(), poses=()) for m in recordings]
         bare = inputs_for(replace(rig, wheels=(), lidars=(), poses=()), seen, whole)
-    guesses = _guesses(rig, bare, lambda: _lidars_alone(whole, recordings))
+    guesses = _guesses(whole, recordings, bare)
     lap("first guess")
     state = first_state(bare, *guesses)
     lap("first state")
@@ -78,25 +78,33 @@ def start(
     return inputs, settled, guess | state.values
 
 
-def _guesses(rig: Rig, bare: Inputs, lidars_alone: Callable[[], Inputs]) -> tuple[Guess, ...]:
-    """Of the motion, by cameras; how they stand a LiDAR's motion shows where their own does not."""
-    recordings = [m.measurements for m in bare.motions]
+def _guesses(whole: Inputs, recordings: Sequence[Measurements], bare: Inputs) -> tuple[Guess, ...]:
+    """Of the motion, by the cameras of `bare`; how these stand, a LiDAR's motion or a pose sensor's shows where their
+    own does not."""
+    rig, seen = whole.rig, [m.measurements for m in bare.motions]
     try:
-        return initial_guesses(rig, bare.bodies, recordings)
+        return initial_guesses(rig, bare.bodies, seen)
     except OneAxisError as error:
-        if not rig.lidars or not rig.has_target:
+        if not rig.has_target or not (rig.lidars or rig.poses):
             raise
-        lidars = lidars_alone()
+        alone = (_lidars_alone if rig.lidars else _pose_sensor_alone)(whole, recordings)
         try:
-            rig = with_mounts_guessed(rig, bare, lidars, state_from_lidar(lidars))
+            state = state_from_lidar(alone) if rig.lidars else state_from_poses(alone)
+            rig = with_mounts_guessed(rig, bare, alone, state)
         except EstimationError:
             raise error from None
-        return initial_guesses(rig, bare.bodies, recordings)
+        return initial_guesses(rig, bare.bodies, seen)
 
 
 def _lidars_alone(whole: Inputs, recordings: Sequence[Measurements]) -> Inputs:
     rig = replace(whole.rig, cameras=(), wheels=(), poses=(), target=NoTarget())
     return inputs_for(rig, [replace(m, cameras=(), tracks=(), wheels=(), poses=()) for m in recordings], whole)
+
+
+def _pose_sensor_alone(whole: Inputs, recordings: Sequence[Measurements]) -> Inputs:
+    rig = replace(whole.rig, cameras=(), lidars=(), wheels=(), poses=whole.rig.poses[:1], target=NoTarget())
+    own = [replace(m, cameras=(), tracks=(), lidars=(), wheels=(), poses=m.poses[:1]) for m in recordings]
+    return inputs_for(rig, own, whole)
 
 
 def _with_all_but_lidars(
@@ -118,8 +126,7 @@ def _start_from_poses(
     whole: Inputs, recordings: Sequence[Measurements], lap: Callable[[str], None]
 ) -> tuple[Inputs, State, dict[Key, np.ndarray]]:
     """The first pose sensor gives the motion; others are placed on it, and so are wheels."""
-    rig = replace(whole.rig, wheels=(), poses=whole.rig.poses[:1])
-    alone = inputs_for(rig, [replace(m, wheels=(), poses=m.poses[:1]) for m in recordings], whole)
+    alone = _pose_sensor_alone(whole, recordings)
     state = state_from_poses(alone)
     lap("first guess")
     state = first_pass(alone, replace(state, values=state.values | pose_values(alone, state)))

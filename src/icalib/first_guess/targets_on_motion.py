@@ -1,4 +1,5 @@
-"""Cameras that see a target from a robot that turns about one axis, as on a floor, placed on a LiDAR's motion.
+"""Cameras that see a target from a robot that turns about one axis, as on a floor, placed on the motion that a LiDAR
+or a pose sensor shows.
 
 Their angular rates leave the turn about that axis open, and with it all that follows; the way that their poses go, and
 the robot, shows it.
@@ -22,9 +23,9 @@ from icalib.measurements import PoseStream
 from icalib.rig import Camera, Parameter, Rig
 
 
-def with_mounts_guessed(rig: Rig, seen: Inputs, lidars: Inputs, state: State) -> Rig:
+def with_mounts_guessed(rig: Rig, seen: Inputs, others: Inputs, state: State) -> Rig:
     """`rig` with a guess of how each camera stands whose rotation it does not give. Of several recordings the one in
-    which it saw most says so. seen: what the cameras are estimated from; lidars: what `state`, which has the motion,
+    which it saw most says so. seen: what the cameras are estimated from; others: what `state`, which has the motion,
     is made from.
 
     Raises EstimationError where the motion does not show it.
@@ -34,12 +35,12 @@ def with_mounts_guessed(rig: Rig, seen: Inputs, lidars: Inputs, state: State) ->
 
     def placed(number: int, camera: Camera) -> Camera:
         best = int(np.argmax([len(r.cameras[number].uv) for r in recordings]))
-        stream, own = recordings[best].cameras[number], alone(lidars, best)
+        stream, own = recordings[best].cameras[number], alone(others, best)
         poses = scene_poses(stream, camera_model(camera.model), lens_of(camera, stream, rig.target, scene), scene)
         path = PoseStream(camera.name, stream.stamps_ns[poses.ok], poses.rotation[poses.ok], poses.position[poses.ok])
         assert own.imu is not None
-        with naming_recording(lidars, best):
-            found, _ = on_motion(own.imu, path, motion_alone(lidars, best, state), Held())
+        with naming_recording(others, best):
+            found, _ = on_motion(own.imu, path, motion_alone(others, best, state), Held())
         offset = found.offset - 1e-9 * (path.origin_ns - recordings[best].origin_ns)
         guess = {"rotation": found.rotation, "translation": found.position, "time_offset": np.array([offset])}
         return replace(
