@@ -128,6 +128,25 @@ def test_tracks_of_another_drive_do_not_fit():
         placed(simulation, other, true_rig(simulation))
 
 
+def test_a_camera_whose_image_stands_still_does_not_fit():
+    simulation, state = drive()
+    stream, measured = simulation.measurements.tracks[0], simulation.measurements
+    _, first, which = np.unique(stream.feature, return_index=True, return_inverse=True)
+    frozen = replace(measured, tracks=(replace(stream, uv=stream.uv[first[which]]),))
+    with pytest.raises(EstimationError, match="do not move as the other sensors say"):
+        placed(replace(simulation, measurements=frozen), state, true_rig(simulation))
+
+
+def test_points_followed_at_random_do_not_fit_a_lens_without_bounds():
+    simulation, state = drive()
+    stream, measured = simulation.measurements.tracks[0], simulation.measurements
+    anywhere = np.random.default_rng(0).uniform([0.0, 0.0], [752.0, 480.0], stream.uv.shape)
+    random = replace(measured, tracks=(replace(stream, uv=anywhere),))
+    rig = rig_for(simulation.scenario, intrinsics="start", distortion="free")
+    with pytest.raises(EstimationError, match="do not move as the other sensors say"):
+        placed(replace(simulation, measurements=random), state, rig)
+
+
 def test_a_robot_that_goes_nowhere_does_not_show_how_the_camera_is_turned():
     simulation, state = drive(motion=Drive("spin"))
     with pytest.raises(EstimationError, match="cam0: the motion does not show how it is turned"):

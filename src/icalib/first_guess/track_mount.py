@@ -30,6 +30,8 @@ RAY_SIGMA = 3e-3  # rad, of a ray: what a rough lens leaves
 ALIKE = 10.0  # of how many rays of two images a rough lens bends all alike: they count as one
 ARM_SIGMA = 0.5  # m
 LENS_SIGMA = 0.03  # rad, RMS over the rays, of what one coefficient may be off by
+MOST_BENT = 3.0  # times that
+LEAST_SEEN = 0.5  # of the pairs of images that can be: a short stretch in which little happens fits anywhere
 NEAREST_M = 0.2  # of a point
 LENS_STEP = 1e-3  # of a direction
 BENDS = 2.0  # standard deviations, from where on a ray counts less
@@ -37,7 +39,8 @@ ANGLES = 24  # about the axis that the robot turns about most
 FOLLOWED = 4  # starts
 EVERY = 6  # of the pairs that say which start is best
 ROUNDS = 3  # of taking motion and lens anew, where they have come to
-LARGEST_MISS = 0.02  # rad, the median
+MOST_RAYS = 0.75  # of which LARGEST_MISS is asked: points that were followed wrongly are fewer
+LARGEST_MISS = 0.01  # rad
 LARGEST_SIGMA = np.deg2rad(5.0)  # of the rotation, beyond which it is not shown
 MOUNTED = 7  # unknowns of a mount
 UNITS = np.repeat([0.1, 0.1, 0.01], [3, 3, 1])  # rad, m, s: of what a mount is sought by
@@ -45,25 +48,25 @@ UNITS = np.repeat([0.1, 0.1, 0.01], [3, 3, 1])  # rad, m, s: of what a mount is 
 
 @dataclass(frozen=True)
 class Mount:
-    """T_imu_cam; offset: t_imu - t_camera, both since their clock's first stamp [s]; lens (P,): intrinsics and
-    distortion."""
+    """T_imu_cam; offset: t_imu - t_camera, both since their clock's first stamp [s]; bent (L,): by how much of each of
+    the directions in which the lens is open it differs from the guess."""
 
     rotation: np.ndarray
     position: np.ndarray
     offset: float
-    lens: np.ndarray
+    bent: np.ndarray
 
-    def moved(self, x: np.ndarray, bends: np.ndarray) -> Mount:
-        """By (7 + L,): a turn in the camera's axes, metres, seconds, and so much of each of the `bends` (L, P)."""
+    def moved(self, x: np.ndarray) -> Mount:
+        """By (7 + L,): a turn in the camera's axes, metres, seconds, and how the lens is bent."""
         R, p = self.rotation @ so3.exp(x[:3].copy()), self.position + x[3:6]
-        return Mount(R, p, self.offset + float(x[6]), self.lens + x[7:] @ bends)
+        return Mount(R, p, self.offset + float(x[6]), self.bent + x[7:])
 
 
 @dataclass(frozen=True)
 class Followed:
     """What one camera followed: pairs of images at times (m, 2) on its clock, and the observations (n, 2) of points
-    that they share, those of pair k at begin[k]..begin[k + 1]. bends (L, P): directions in which its lens is open, each
-    as long as it may be off."""
+    that they share, those of pair k at begin[k]..begin[k + 1]. lens (P,): a guess of its intrinsics and distortion;
+    bends (L, P): directions in which it is open, each as long as it may be off."""
 
     name: str
     model: CameraModel
@@ -71,6 +74,7 @@ class Followed:
     times: np.ndarray
     shared: np.ndarray
     begin: np.ndarray
+    lens: np.ndarray
     bends: np.ndarray
 
     @classmethod
@@ -83,7 +87,11 @@ class Followed:
         begin = np.cumsum([0, *(len(x) for x in shared)])
         bends = [LENS_SIGMA * d / _effect(model, lens, d, stream.uv) for d in directions]
         together = np.concatenate([np.zeros((0, 2), np.int64), *shared])
-        return cls(stream.name, model, stream.uv, times, together, begin, np.reshape(bends, directions.shape))
+        return cls(stream.name, model, stream.uv, times, together, begin, lens, np.reshape(bends, directions.shape))
+
+    def lens_of(self, mount: Mount) -> np.ndarray:
+        """(P,)"""
+        return self.lens + mount.bent @ self.bends
 
     def some(self, kept: np.ndarray) -> Followed:
         """The pairs `kept` (m,) bool."""
@@ -149,17 +157,18 @@ class _Seen:
         followed = followed.some(is_known(motion.state.seconds, t[:, 0]) & is_known(motion.state.seconds, t[:, 1]))
         t1, t2 = (followed.times + at.offset).T
         p, q = followed.shared.T
-        rays, valid = followed.model.unproject(at.lens, followed.uv)
+        lens = followed.lens_of(at)
+        rays, valid = followed.model.unproject(lens, followed.uv)
         rays = np.where(valid[:, None], rays, 0.0)  # these miss nothing
         by = np.zeros((len(followed.bends), *rays.shape))
         for k, bend in enumerate(followed.bends):
-            slope, there = _slope(followed.model, at.lens, bend, followed.uv)
+            slope, there = _slope(followed.model, lens, bend, followed.uv)
             by[k] = np.where((valid & there)[:, None], slope, 0.0)
         return cls(followed, at, imu_poses(motion, t1), imu_poses(motion, t2), rays[p], rays[q], by[:, p], by[:, q])
 
     def misses(self, x: np.ndarray) -> np.ndarray:
         """(n,) of all rays, with the camera moved by x (7 + L,)."""
-        mount = self.at.moved(x, self.followed.bends)
+        mount = self.at.moved(x)
         p = mount.position
         (R1, at1), (R2, at2) = _after(self.first, x[6]), _after(self.second, x[6])
         back = mount.rotation.T @ R2.transpose(0, 2, 1)
@@ -181,11 +190,17 @@ class _Seen:
 
         def residuals(y: np.ndarray) -> np.ndarray:
             x = step(y)
-            return np.concatenate([self.misses(x) / sigma, (self.at.position + x[3:6]) / ARM_SIGMA, x[7:]])
+            mount = self.at.moved(x)
+            return np.concatenate([self.misses(x) / sigma, mount.position / ARM_SIGMA, mount.bent])
 
-        start, bends = np.zeros(len(free)), BENDS / np.sqrt(ALIKE)
-        result = least_squares(residuals, start, loss="cauchy", f_scale=bends, max_nfev=20)
-        return self.at.moved(step(result.x), self.followed.bends), result
+        # Without bounds a lens of infinite length would fit best whatever moves as nothing else does.
+        most = np.append(np.full(len(free) - n, np.inf), np.full(n, MOST_BENT))
+        now = np.append(np.zeros(len(free) - n), np.clip(self.at.bent, -0.99 * MOST_BENT, 0.99 * MOST_BENT))
+        result = least_squares(
+            residuals, np.zeros(len(free)), bounds=(-most - now, most - now), loss="cauchy",
+            f_scale=BENDS / np.sqrt(ALIKE), max_nfev=20,
+        )  # fmt: skip
+        return self.at.moved(step(result.x)), result
 
 
 def _after(poses: Poses, dt: float) -> tuple[np.ndarray, np.ndarray]:
@@ -203,11 +218,13 @@ def place_on_motion(
     angles = np.linspace(0.0, 2.0 * np.pi, ANGLES, endpoint=False)
     turns = [np.eye(3)] if axis is None else [so3.exp(a * axis) for a in angles]
     some = followed.some(np.arange(len(followed.times)) % EVERY == 0)
-    once = [s for s in (_Seen.of(some, motion, start) for start in starts) if len(s.f)]
+    least = LEAST_SEEN * _in_common(some, motion) * len(some.times)
+    once = [s for s in (_Seen.of(some, motion, start) for start in starts) if len(s.followed.times) > least]
     seen = [replace(s, at=replace(s.at, rotation=T @ s.at.rotation)) for s in once for T in turns]
     if not seen:
         raise EstimationError(
-            f"{followed.name}: none of its images falls within the motion that the other sensors show; check its clock."
+            f"{followed.name}: too few of its images fall within the motion that the other sensors show; check its "
+            "clock."
         )
     found = [s.sought(held) for s in sorted(seen, key=_cost)[:FOLLOWED]]
     mount, result = min(found, key=lambda x: x[1].cost)
@@ -217,6 +234,12 @@ def place_on_motion(
     return mount
 
 
+def _in_common(followed: Followed, motion: Motion) -> float:
+    """The share of its pairs of images that a camera can have made while the motion is known, wherever its clock is."""
+    span, known = np.ptp(followed.times), np.ptp(motion.state.seconds)
+    return min(1.0, float(known / span)) if span > 0.0 else 1.0
+
+
 def _cost(seen: _Seen) -> float:
     misses = seen.misses(np.zeros(MOUNTED + len(seen.followed.bends)))
     return float(np.log1p((misses / (BENDS * RAY_SIGMA)) ** 2).mean())
@@ -224,7 +247,7 @@ def _cost(seen: _Seen) -> float:
 
 def _check(seen: _Seen, result: OptimizeResult, held: np.ndarray) -> None:
     name = seen.followed.name
-    miss = float(np.median(np.abs(seen.misses(np.zeros(MOUNTED + len(seen.followed.bends))))))
+    miss = float(np.quantile(np.abs(seen.misses(np.zeros(MOUNTED + len(seen.followed.bends)))), MOST_RAYS))
     if miss > LARGEST_MISS:
         raise EstimationError(
             f"{name}: the points that it follows do not move as the other sensors say (rays miss each other by "

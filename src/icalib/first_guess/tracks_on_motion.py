@@ -32,52 +32,55 @@ def track_camera_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
     out: dict[Key, np.ndarray] = {}
     for number, camera in enumerate(inputs.rig.cameras):
         lens, known = lens_start(camera), given(inputs, camera, NAMES)
+        out |= {(camera.name, "intrinsics"): lens[:4], (camera.name, "distortion"): lens[4:]}
         if len(known) < len(NAMES):
-            known = _placed(inputs, state, number, lens) | known
-        out |= {(camera.name, "intrinsics"): lens[:4], (camera.name, "distortion"): lens[4:]} | known
+            out |= _placed(inputs, state, number)
+        out |= known
     return out
 
 
-def _placed(inputs: Inputs, state: State, number: int, lens: np.ndarray) -> dict[Key, np.ndarray]:
+def _placed(inputs: Inputs, state: State, number: int) -> dict[Key, np.ndarray]:
     """Where a camera stands, and its lens. Of several recordings the one in which it saw most says so."""
     camera = inputs.rig.cameras[number]
     best = int(np.argmax([len(part.measurements.tracks[number].feature) for part in inputs.parts]))
-    mount_in = partial(_mount_in, inputs, state, number, lens)
+    mount_in = partial(_mount_in, inputs, state, number)
     with naming_recording(inputs, best):
-        found = mount_in(best, None)
+        found, lens = mount_in(best)
     if camera.clock_restarts:
-        offset = each_clock(inputs, camera.name, lambda k: mount_in(k, found).offset, {best: found.offset})
+        offset = each_clock(inputs, camera.name, lambda k: mount_in(k, found)[0].offset, {best: found.offset})
     else:
         offset = np.array([other_clocks(found.offset, camera.name, alone(inputs, best), inputs)])
     values = {
         "rotation": found.rotation, "translation": found.position, "time_offset": offset,
-        "intrinsics": found.lens[:4], "distortion": found.lens[4:],
+        "intrinsics": lens[:4], "distortion": lens[4:],
     }  # fmt: skip
     return {(camera.name, name): np.ascontiguousarray(value) for name, value in values.items()}
 
 
 def _mount_in(
-    inputs: Inputs, state: State, number: int, lens: np.ndarray, recording: int, placed: Mount | None
-) -> Mount:
-    """As one recording shows it; `placed`: how the camera stands, where another has shown it."""
+    inputs: Inputs, state: State, number: int, recording: int, placed: Mount | None = None
+) -> tuple[Mount, np.ndarray]:
+    """Mount and lens, as one recording shows them; `placed`: how the camera stands, where another has shown it."""
     own, camera = alone(inputs, recording), inputs.rig.cameras[number]
+    lens = lens_start(camera)
     assert own.imu is not None
     stream, model = own.measurements.tracks[number], camera_model(camera.model)
     known = {name: value for (_, name), value in given(own, camera, NAMES).items()}
-    directions = _open(camera, lens)
     if placed is not None:
         known |= {"rotation": placed.rotation, "translation": placed.position}
-        lens, directions = placed.lens, directions[:0]
     offsets = [float(known["time_offset"][0])] if "time_offset" in known else None
     same_clock = relative_offset(np.zeros(1), own.measurements.cameras[number], own.measurements)
+    followed = Followed.of(stream, model, lens, _open(camera, lens))
+    bent = np.zeros(len(followed.bends))
     starts = [
-        Mount(known.get("rotation", a.rotation), known.get("translation", np.zeros(3)), a.offset, lens)
+        Mount(known.get("rotation", a.rotation), known.get("translation", np.zeros(3)), a.offset, bent)
         for a in rough_alignments(own.imu, camera.name, track_rates(stream, model, lens), offsets, same_clock)
     ]
     motion = motion_of(own, motion_alone(inputs, recording, state))
     held = np.repeat([name in known for name in NAMES], [3, 3, 1])
     axis = None if "rotation" in known else main_axis(own.imu.gyro)
-    return place_on_motion(Followed.of(stream, model, lens, directions), motion, starts, axis, held)
+    found = place_on_motion(followed, motion, starts, axis, held)
+    return found, followed.lens_of(found)
 
 
 def _open(camera: Camera, lens: np.ndarray) -> np.ndarray:
