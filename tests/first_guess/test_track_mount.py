@@ -137,6 +137,15 @@ def test_a_camera_whose_image_stands_still_does_not_fit():
         placed(replace(simulation, measurements=frozen), state, true_rig(simulation))
 
 
+def test_points_that_are_soon_lost_show_too_little():
+    simulation, state = drive()
+    stream, measured = simulation.measurements.tracks[0], simulation.measurements
+    lost = stream.feature * 100 + (stream.seconds / 0.45).astype(np.int64)[stream.image]  # each is another one then
+    short = replace(measured, tracks=(replace(stream, feature=lost),))
+    with pytest.raises(EstimationError, match="cam0: only .* pairs of images 0.5 s or more apart share enough points"):
+        placed(replace(simulation, measurements=short), state, true_rig(simulation))
+
+
 def test_points_followed_at_random_do_not_fit_a_lens_without_bounds():
     simulation, state = drive()
     stream, measured = simulation.measurements.tracks[0], simulation.measurements

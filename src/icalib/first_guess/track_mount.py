@@ -26,6 +26,7 @@ from icalib.measurements import TrackStream
 
 STEPS_S = (0.5, 1.0)  # between two images
 MOST_PAIRS = 300  # of images a step
+FEWEST_PAIRS = 20
 RAY_SIGMA = 3e-3  # rad, of a ray: what a rough lens leaves
 ALIKE = 10.0  # of how many rays of two images a rough lens bends all alike: they count as one
 ARM_SIGMA = 0.5  # m
@@ -79,15 +80,29 @@ class Followed:
 
     @classmethod
     def of(cls, stream: TrackStream, model: CameraModel, lens: np.ndarray, directions: np.ndarray) -> Followed:
-        """`directions` (L, P): in which the lens is open."""
+        """`directions` (L, P): in which the lens is open. Raises EstimationError where hardly any images share enough
+        points."""
         _, valid = model.unproject(lens, stream.uv)
         pairs = list(pairs_sharing(stream, valid, STEPS_S, MOST_PAIRS))
-        times = stream.seconds[np.array([(i, j) for i, j, _, _ in pairs], np.int64).reshape(-1, 2)]
+        if len(pairs) < FEWEST_PAIRS:
+            raise EstimationError(
+                f"{stream.name}: only {len(pairs)} pairs of images {STEPS_S[0]} s or more apart share enough points; "
+                "record for longer, or follow more points for longer."
+            )
+        times = stream.seconds[np.array([(i, j) for i, j, _, _ in pairs])]
         shared = [np.stack([p, q], axis=1) for _, _, p, q in pairs]
         begin = np.cumsum([0, *(len(x) for x in shared)])
         bends = [LENS_SIGMA * d / _effect(model, lens, d, stream.uv) for d in directions]
-        together = np.concatenate([np.zeros((0, 2), np.int64), *shared])
-        return cls(stream.name, model, stream.uv, times, together, begin, lens, np.reshape(bends, directions.shape))
+        return cls(
+            stream.name,
+            model,
+            stream.uv,
+            times,
+            np.concatenate(shared),
+            begin,
+            lens,
+            np.reshape(bends, directions.shape),
+        )
 
     def lens_of(self, mount: Mount) -> np.ndarray:
         """(P,)"""
@@ -226,8 +241,9 @@ def place_on_motion(
             f"{followed.name}: too few of its images fall within the motion that the other sensors show; check its "
             "clock."
         )
-    found = [s.sought(held) for s in sorted(seen, key=_cost)[:FOLLOWED]]
-    mount, result = min(found, key=lambda x: x[1].cost)
+    best = sorted(seen, key=_cost)[:FOLLOWED]
+    found = [(*s.sought(held), len(s.f)) for s in best]
+    mount, result, _ = min(found, key=lambda x: x[1].cost / x[2])  # not all see the same rays
     for _ in range(ROUNDS):
         mount, result = _Seen.of(followed, motion, mount).sought(held)
     _check(_Seen.of(followed, motion, mount), result, held)
