@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -28,8 +29,8 @@ STEPS_S = (0.5, 1.0)  # between two images
 MOST_PAIRS = 300  # of images a step
 FEWEST_PAIRS = 20
 RAY_SIGMA = 3e-3  # rad, of a ray: what a rough lens leaves
-ALIKE = 10.0  # of how many rays of two images a rough lens bends all alike: they count as one
-ARM_SIGMA = 0.5  # m
+ALIKE = 30.0  # of how many rays of two images a rough lens bends all alike: they count as one
+ARM_SIGMA = 0.3  # m
 LENS_SIGMA = 0.03  # rad, RMS over the rays, of what one coefficient may be off by
 MOST_BENT = 3.0  # times that
 LEAST_SEEN = 0.5  # of the pairs of images that can be: a short stretch in which little happens fits anywhere
@@ -208,11 +209,19 @@ class _Seen:
             mount = self.at.moved(x)
             return np.concatenate([self.misses(x) / sigma, mount.position / ARM_SIGMA, mount.bent])
 
+        def robust(z: np.ndarray) -> np.ndarray:
+            """Cauchy's of the misses; what is said of lever arm and lens beforehand must hold however far they are."""
+            s = z[: len(self.f)]
+            rho = np.stack([z, np.ones_like(z), np.zeros_like(z)])
+            rho[:, : len(s)] = np.log1p(s), 1.0 / (1.0 + s), -1.0 / (1.0 + s) ** 2
+            return rho
+
+        loss: Any = robust  # which scipy's types do not know of
         # Without bounds a lens of infinite length would fit best whatever moves as nothing else does.
         most = np.append(np.full(len(free) - n, np.inf), np.full(n, MOST_BENT))
         now = np.append(np.zeros(len(free) - n), np.clip(self.at.bent, -0.99 * MOST_BENT, 0.99 * MOST_BENT))
         result = least_squares(
-            residuals, np.zeros(len(free)), bounds=(-most - now, most - now), loss="cauchy",
+            residuals, np.zeros(len(free)), bounds=(-most - now, most - now), loss=loss,
             f_scale=BENDS / np.sqrt(ALIKE), max_nfev=20,
         )  # fmt: skip
         return self.at.moved(step(result.x)), result
