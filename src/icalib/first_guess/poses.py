@@ -17,7 +17,6 @@ from icalib.estimation.clocks import instants
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.pose_factor import FRAME, frame_of
-from icalib.estimation.robot import MOUNT
 from icalib.estimation.state import Key, State
 from icalib.first_guess.by_recording import (
     alone,
@@ -49,7 +48,7 @@ from icalib.first_guess.lidar_arm import (
     solve,
 )
 from icalib.first_guess.lidar_odometry import LidarPath
-from icalib.first_guess.lidar_rounds import given, held_of
+from icalib.first_guess.lidar_rounds import NAMES, given, held_of
 from icalib.first_guess.pose_ways import placed
 from icalib.geometry import so3
 from icalib.measurements import PoseStream
@@ -59,7 +58,6 @@ WINDOW_S = 0.1  # of a mean rate: long against the noise of poses
 FEWEST_WINDOWS = 20
 APART_S = 0.4  # of poses that show whether they fit: next to each other they differ by little but noise
 G_OTHER_UNITS = 0.5  # of gravity: positions do not make it so wrong
-NAMES = tuple(name for name, _, _ in MOUNT)
 
 
 def pose_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:

@@ -194,6 +194,11 @@ class _Seen:
         _misses(f, h, self.followed.begin, np.ascontiguousarray(back @ R1 @ mount.rotation), b, e)
         return e
 
+    @property
+    def missed(self) -> np.ndarray:
+        """(n,) of all rays, the camera where it is."""
+        return self.misses(np.zeros(MOUNTED + len(self.followed.bends)))
+
     def sought(self, held: np.ndarray) -> tuple[Mount, OptimizeResult]:
         """The best mount near by."""
         n, sigma = len(self.followed.bends), RAY_SIGMA * np.sqrt(ALIKE)
@@ -266,13 +271,12 @@ def _in_common(followed: Followed, motion: Motion) -> float:
 
 
 def _cost(seen: _Seen) -> float:
-    misses = seen.misses(np.zeros(MOUNTED + len(seen.followed.bends)))
-    return float(np.log1p((misses / (BENDS * RAY_SIGMA)) ** 2).mean())
+    return float(np.log1p((seen.missed / (BENDS * RAY_SIGMA)) ** 2).mean())
 
 
 def _check(seen: _Seen, result: OptimizeResult, held: np.ndarray) -> None:
     name = seen.followed.name
-    miss = float(np.quantile(np.abs(seen.misses(np.zeros(MOUNTED + len(seen.followed.bends)))), MOST_RAYS))
+    miss = float(np.quantile(np.abs(seen.missed), MOST_RAYS))
     if miss > LARGEST_MISS:
         raise EstimationError(
             f"{name}: the points that it follows do not move as the other sensors say (rays miss each other by "

@@ -8,20 +8,17 @@ import numpy as np
 
 from icalib.estimation.assembly import motion_of
 from icalib.estimation.inputs import Inputs
-from icalib.estimation.robot import MOUNT
 from icalib.estimation.state import Key, State
 from icalib.first_guess.align_camera import trusted
 from icalib.first_guess.by_recording import alone, each_clock, motion_alone, naming_recording, other_clocks
 from icalib.first_guess.clocks import main_axis, rough_alignments
 from icalib.first_guess.from_tracks import lens_start
 from icalib.first_guess.guess import relative_offset
-from icalib.first_guess.lidar_rounds import given
+from icalib.first_guess.lidar_rounds import NAMES, given
 from icalib.first_guess.track_mount import Followed, Mount, place_on_motion
 from icalib.first_guess.track_rotation import track_rates
 from icalib.geometry.cameras import camera_model
 from icalib.rig import Camera
-
-NAMES = tuple(name for name, _, _ in MOUNT)
 
 
 def track_camera_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
