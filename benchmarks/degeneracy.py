@@ -1,61 +1,120 @@
-"""What each motion leaves open for a robot with cameras, a LiDAR and wheels, and whether the rest is right.
+"""What each motion leaves open for a robot with cameras, a LiDAR and wheels, and whether what is called known is right.
 
-python benchmarks/degeneracy.py [--seconds S] [--seeds N] [MOTION ...]      docs/studies/degeneracy.json
+python benchmarks/degeneracy.py OUTPUT [--runs N] [--workers N] [--motion M ...]     docs/studies/degeneracy.json
+
+Short recordings with few points, so that many can be made; extrinsics, time offsets and lenses estimated from a guess
+drawn about the truth, with the IMU of the data sheet and one ten times noisier. Runs are kept in OUTPUT, and the same
+command goes on from there.
 """
 
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 
-from icalib.errors import CalibrationError
-from icalib.montecarlo.truth import error, true_value
-from icalib.pipeline import calibrate_measurements
-from icalib.simulation import load_scenario, rig_for, simulate, with_drawn_guess
+from icalib.montecarlo import Plan, Record, run_study
+from icalib.simulation import Scenario, load_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
 FOUND = ROOT / "docs" / "studies" / "degeneracy.json"
 MOTIONS = ("table2-planar", "single-axis", "arc", "spin", "straight-line", "constant-velocity", "standing")
+IMUS = {"data sheet": 1.0, "ten times noisier": 10.0}
+SECONDS, AZIMUTH_STEPS, PER_IMAGE = 8.0, 300, 30
+FAR = 4.0  # standard deviations
+KNOWN = ("determined", "weak")
 
 
-def judged(motion: str, seconds: float, seed: int) -> dict:
-    """Verdicts by entry, and the largest error in formal standard deviations among entries of each verdict."""
+def variant(motion: str, noise: float) -> Scenario:
+    """The example's motion and sensors, in a recording that is short and thin."""
     scenario = load_scenario(ROOT / "examples" / "paper" / f"{motion}.yaml")
-    scenario = dataclasses.replace(scenario, duration_s=seconds)
-    simulation = simulate(scenario, seed)
-    rig = with_drawn_guess(rig_for(scenario, intrinsics="fixed", distortion="fixed"), scenario, seed)
-    found = {"motion": motion, "seed": seed, "seconds": seconds}
-    try:
-        result = calibrate_measurements(rig, simulation.measurements)
-    except CalibrationError as refused:
-        return found | {"refused": str(refused)}
-    verdicts, worst = {}, {}
-    for g in result.groups:
-        true = true_value(simulation.truth, g.sensor, g.name)
-        if g.columns is None or true is None:
-            continue
-        off = np.abs(error(g.name, g.value, true) / g.std_formal)
-        for label, verdict, z in zip(g.labels, g.verdict, off, strict=True):
-            verdicts[f"{g.sensor} {g.name} {label}"] = verdict
-            worst[verdict] = max(worst.get(verdict, 0.0), round(float(z), 2))
-    return found | {"converged": result.converged, "worst": worst, "verdicts": verdicts}
+    features, imu = scenario.features, scenario.imu_noise
+    assert features is not None
+    densities = {f.name: noise * getattr(imu, f.name) for f in fields(imu) if isinstance(getattr(imu, f.name), float)}
+    share = PER_IMAGE / features.per_image
+    return replace(
+        scenario,
+        duration_s=SECONDS,
+        imu_noise=replace(imu, **densities),
+        lidars=tuple(replace(x, azimuth_steps=AZIMUTH_STEPS) for x in scenario.lidars),
+        features=replace(
+            features, per_image=PER_IMAGE, count=round(share * features.count), lasting=round(share * features.lasting)
+        ),
+    )
+
+
+def entries(record: Record) -> Iterator[tuple[str, str, float]]:
+    """Name, verdict, and error in standard deviations of every number that was estimated."""
+    z, k = record.error / np.sqrt(np.diag(record.covariance)), 0
+    for block in record.blocks:
+        for label, verdict in zip(block.labels, block.verdict, strict=True):
+            yield f"{block.key} {label}", verdict, float(z[k])
+            k += 1
+
+
+def combinations(record: Record, verdicts: Sequence[str]) -> np.ndarray:
+    """(n,) errors in standard deviations along the principal axes of the correlations among entries so judged."""
+    k = np.array([v in verdicts for _, v, _ in entries(record)], dtype=bool)
+    sigma = np.sqrt(np.diag(record.covariance)[k])
+    values, vectors = np.linalg.eigh(record.covariance[np.ix_(k, k)] / np.outer(sigma, sigma))
+    return vectors.T @ (record.error[k] / sigma) / np.sqrt(np.maximum(values, 1e-12))
+
+
+def summary(motion: str, imu: str, records: Sequence[Record]) -> dict:
+    """What was found over all runs of one motion and one IMU."""
+    good = [r for r in records if not r.failure]
+    verdicts: dict[str, Counter[str]] = {}
+    by_verdict: dict[str, list[tuple[float, int, str]]] = {}
+    for r in good:
+        for name, verdict, z in entries(r):
+            verdicts.setdefault(name, Counter())[verdict] += 1
+            by_verdict.setdefault(verdict, []).append((abs(z), r.seed, name))
+    along = {v: np.abs(np.concatenate([np.empty(0), *(combinations(r, v) for r in good)])) for v in (KNOWN[:1], KNOWN)}
+    return {
+        "motion": motion,
+        "imu": imu,
+        "runs": len(records),
+        "failures": {str(r.seed): r.failure for r in records if r.failure},
+        "errors": {
+            v: {
+                "count": len(found),
+                "largest": round(max(found)[0], 2),
+                "beyond": [f"{name} in seed {seed}: {z:.1f} sigma" for z, seed, name in sorted(found) if z > FAR],
+            }
+            for v, found in sorted(by_verdict.items())
+        },
+        "combinations": {
+            " or ".join(v): {
+                "count": len(z),
+                "largest": round(float(z.max(initial=0.0)), 2),
+                "beyond": int((z > FAR).sum()),
+            }
+            for v, z in along.items()
+        },
+        "verdicts": {name: dict(counts.most_common()) for name, counts in verdicts.items()},
+    }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=15.0)
-    parser.add_argument("--seeds", type=int, default=1)
-    parser.add_argument("motion", nargs="*", default=MOTIONS)
-    a = parser.parse_args()
+    parser.add_argument("output", type=Path)
+    parser.add_argument("--runs", type=int, default=100)
+    parser.add_argument("--workers", type=int)
+    parser.add_argument("--motion", choices=MOTIONS, action="append", help="of these alone; all where none is named")
+    given = parser.parse_args()
     rows = []
-    for motion in a.motion:
-        for seed in range(1, a.seeds + 1):
-            rows.append(judged(motion, a.seconds, seed))
-            print({k: v for k, v in rows[-1].items() if k != "verdicts"}, flush=True)
+    for motion in given.motion or MOTIONS:
+        for imu, noise in IMUS.items():
+            plan = Plan(given.runs, 1, "drawn", workers=given.workers)
+            name = f"{motion}, {imu}"
+            study = run_study(variant(motion, noise), name, name, given.output / name.replace(", ", "-"), plan)
+            rows.append(summary(motion, imu, study.records))
+            print(json.dumps({k: v for k, v in rows[-1].items() if k != "verdicts"}), flush=True)
     FOUND.write_text(json.dumps(rows, indent=1) + "\n")
 
 

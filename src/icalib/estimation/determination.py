@@ -17,21 +17,17 @@ import numpy as np
 from icalib.estimation.arrowhead import HELD_BELOW, restricted_inverse
 from icalib.estimation.assembly import given_priors
 from icalib.estimation.debias import spurious_information
-from icalib.estimation.estimate import EARLY_DECREASE, Estimate, Judged, OnVisit, estimate
-from icalib.estimation.imu_model import N_INTRINSICS
+from icalib.estimation.estimate import Estimate, Judged, OnVisit, estimate
+from icalib.estimation.guess_worth import moved_to_guess, moved_to_worth, owed_to_guess
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.prior_factor import Prior
-from icalib.estimation.problem import Problem
-from icalib.estimation.solver import Step, minimise
+from icalib.estimation.solver import Outcome, Step, looked_at
 from icalib.estimation.state import Key, State
-from icalib.estimation.tolerances import FROM_NOTHING_M, GUESS_SIGMA, OTHER_SIGMA
-from icalib.geometry import planes, so3
 
 SPURIOUS_SHARE = 0.5  # a direction most of whose information is noise is not determined either
-MOST_ROUNDS = 4
-MOVED_BY_HELD = 0.1  # parts of a direction smaller than this do not count as in it
-MOSTLY = 0.5  # of the square of a direction
-NEAR_GUESS = 0.05  # of what the guess is worth
+MOST_ROUNDS, LATE = 4, 3
+DOUBTFUL = 0.25  # information in tolerance units
+ALIKE = 0.7  # cosine of the largest angle between what is held and what is to be: the rest finds its place about it
 
 
 @dataclass(frozen=True)
@@ -40,7 +36,7 @@ class Determined:
 
     data (B, B): information of the data alone in tolerance units, without priors and without what noise makes of it;
     held (B, m): orthonormal directions in tolerance units, those that are undetermined; shifts (m, B): how all moves
-    when one of them moves by what its guess is worth.
+    with each independent error of the guess along them.
     """
 
     estimate: Estimate
@@ -75,24 +71,30 @@ def determine(
 
     Raises EstimationError where the data do not carry an estimate.
     """
-    found = estimate(inputs, start, on_step, on_visit=on_visit)
-    data, undetermined = _judge(inputs, found)
-    for _ in range(MOST_ROUNDS):
-        if undetermined.shape == found.problem.held.shape or not (undetermined.size or found.problem.held.size):
+    wanted = replace(start, values=start.values | (guess or {}))
+    found = estimate(inputs, start, on_step, on_visit=on_visit, doubtful=_is_doubtful)
+    half_way = found.outcome.draws is None
+    data, undetermined = _judge(inputs, looked_at(found.outcome) if half_way else found.outcome)
+    for k in range(MOST_ROUNDS):
+        if _is_settled(undetermined, found.problem.held, k >= LATE) and not half_way:
             break
-        begin, judged = _as_guessed(found, start, guess or {}, undetermined), _worth_keeping(found)
+        # One that did not converge is worth nothing: from the start, then.
+        state = found.outcome.state if found.outcome.converged or half_way else start
+        begin, judged = moved_to_guess(found.problem, state, wanted, undetermined), _worth_keeping(found)
         del found  # before the next one takes as much memory
         found = estimate(inputs, begin, on_step, undetermined, on_visit, judged)
-        data, undetermined = _judge(inputs, found)
+        data, undetermined = _judge(inputs, found.outcome)
+        half_way = False
     for _ in range(MOST_ROUNDS):
-        begin = _as_worth(inputs, found, replace(start, values=start.values | (guess or {})))
+        begin = moved_to_worth(inputs, found.problem, found.outcome.state, wanted)
         if begin is None:
             break
         found = estimate(inputs, begin, on_step, found.problem.held, on_visit, _worth_keeping(found))
-        data, _ = _judge(inputs, found)
-    held = found.problem.held if found.problem.held.size else np.zeros((inputs.layout.size, 0))
-    shifts = np.array([_profile(inputs, found, data, u) for u in held.T]).reshape(-1, inputs.layout.size)
-    return Determined(found, data, held, shifts)
+        data, _ = _judge(inputs, found.outcome)
+    if not found.problem.held.size:
+        return Determined(found, data, np.zeros((inputs.layout.size, 0)), np.zeros((0, inputs.layout.size)))
+    shifts = owed_to_guess(inputs, found.problem, found.outcome.state, data)
+    return Determined(found, data, found.problem.held, shifts)
 
 
 def _worth_keeping(found: Estimate) -> Judged | None:
@@ -100,45 +102,28 @@ def _worth_keeping(found: Estimate) -> Judged | None:
     return found.judged if found.outcome.converged else None
 
 
-def _as_guessed(found: Estimate, start: State, guess: dict[Key, np.ndarray], held: np.ndarray) -> State:
-    """The estimate, or where it did not converge `start`, moved along the directions `held` (B, m) to where `guess` has
-    them."""
-    problem, state = found.problem, found.outcome.state if found.outcome.converged else start
-    way = border_difference(problem, replace(start, values=start.values | guess), state) / problem.tolerance
-    step = problem.tolerance * (held @ (held.T @ way))
-    return state.retract(problem.layout, np.zeros((len(state.seconds), 15)), step)
+def _is_doubtful(outcome: Outcome) -> bool:
+    """Whether something may be open: with what noise adds, all is better known where nothing is."""
+    t = outcome.problem.tolerance
+    return bool(np.linalg.eigvalsh(t[:, None] * outcome.information * t).min(initial=np.inf) < DOUBTFUL)
 
 
-def _as_worth(inputs: Inputs, found: Estimate, guess: State) -> State | None:
-    """The estimate, moved along the held directions to where the guesses of all that they move have it, each by what it
-    is worth; None where the rig file says no guess is worth more than others, or it stands there already.
-
-    Where the data know only how two heights differ, and one was measured, `_as_guessed` would leave both half-way.
-    """
-    problem, state = found.problem, found.outcome.state
-    own = np.concatenate([np.empty(0, dtype=np.int64), *(p.block.columns for p in given_priors(inputs))])
-    if not problem.held.size or not np.any(np.abs(problem.held[own]) > MOVED_BY_HELD):
-        return None
-    sigma, directions = _guess_sigma(inputs), problem.tolerance[:, None] * problem.held
-    way = border_difference(problem, guess, state)
-    # What nobody guessed moves along, but nothing turns: what little a turn moves would be paid for with all of it.
-    for block in (b for b in problem.layout.free if not inputs.is_sensor(b.sensor)):
-        way[block.columns] = 0.0
-        turns = block.columns[:2] if block.kind == "plane" else block.columns
-        if block.kind != "vector":
-            sigma[turns] = GUESS_SIGMA["rotation"]
-    step = directions @ np.linalg.lstsq(directions / sigma[:, None], way / sigma, rcond=None)[0]
-    if np.linalg.norm(step / sigma) < NEAR_GUESS:
-        return None
-    return state.retract(problem.layout, np.zeros((len(state.seconds), 15)), step)
+def _is_settled(undetermined: np.ndarray, held: np.ndarray, late: bool) -> bool:
+    """Whether `held` (B, m) is what is `undetermined` (B, n), both orthonormal; in `late` rounds it may be more: what
+    was found open twice would be, once more."""
+    n, m = (d.shape[1] if d.size else 0 for d in (undetermined, held))
+    if n == 0 or n > m:
+        return n == m or (n == 0 and late)
+    inside = np.linalg.svd(undetermined.T @ held, compute_uv=False).min() > ALIKE
+    return bool(inside and (n == m or late))
 
 
-def _judge(inputs: Inputs, found: Estimate) -> tuple[np.ndarray, np.ndarray]:
+def _judge(inputs: Inputs, outcome: Outcome) -> tuple[np.ndarray, np.ndarray]:
     """Information (B, B) of the data alone, and the directions (B, m) that it leaves open, both in tolerance units.
 
     Nuisances whose priors belong to the model (a target's shape, bloom) are open only where these priors are, too.
     """
-    problem, outcome = found.problem, found.outcome
+    problem = outcome.problem
     t = problem.tolerance
     noise = spurious_information(problem, outcome)
     asked = _without(outcome.information, given_priors(inputs), outcome.state)
@@ -157,49 +142,3 @@ def _without(information: np.ndarray, priors: Sequence[Prior], state: State) -> 
         columns = prior.block.columns
         bare[np.ix_(columns, columns)] -= J.T @ J
     return bare
-
-
-def _profile(inputs: Inputs, found: Estimate, data: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """(B,) how the border moves when the guess moves along `direction` (B,), which is held, by what it is worth.
-
-    A direction that is mostly of what nobody guessed moves by what `data` (B, B) leave open, where that is less: a
-    board turned against gravity by as much as it likes would be turned round and round, with a bias of the
-    accelerometer that nobody believes.
-    """
-    problem, state = found.problem, found.outcome.state
-    step = problem.tolerance * direction
-    inverse = float(np.linalg.norm(step / _guess_sigma(inputs)))
-    guessed = sum(float((direction[b.columns] ** 2).sum()) for b in problem.layout.free if inputs.is_sensor(b.sensor))
-    if guessed < MOSTLY:
-        inverse = max(inverse, float(np.sqrt(np.clip(direction @ data @ direction, 0.0, HELD_BELOW))))
-    step = step / inverse
-    moved = state.retract(problem.layout, np.zeros((len(state.seconds), 15)), step)
-    return border_difference(problem, minimise(problem, moved, tolerance=EARLY_DECREASE).state, state)
-
-
-def _guess_sigma(inputs: Inputs) -> np.ndarray:
-    """(B,) standard deviations of the guess: given ones, or what one without is worth."""
-    sigma, sensors = np.zeros(inputs.layout.size), {s.name: s for s in inputs.sensors}
-    for b in inputs.layout.free:
-        sigma[b.columns] = OTHER_SIGMA if b.size == N_INTRINSICS else GUESS_SIGMA[b.name]
-        if b.name == "translation" and b.sensor in sensors and sensors[b.sensor].translation.value is None:
-            sigma[b.columns] = FROM_NOTHING_M
-    for prior in given_priors(inputs):
-        sigma[prior.block.columns] = prior.sigma
-    return sigma
-
-
-def border_difference(problem: Problem, a: State, b: State) -> np.ndarray:
-    """(B,) the step of the border from `b` to `a`."""
-    out = np.zeros(problem.layout.size)
-    for block in problem.layout.free:
-        x, y = a.values[block.key], b.values[block.key]
-        if block.kind == "rotation":
-            out[block.columns] = so3.log(np.ascontiguousarray(y.T @ x))
-        elif block.kind == "tilt":
-            out[block.columns] = so3.log(np.ascontiguousarray(x @ y.T))[:2]
-        elif block.kind == "plane":
-            out[block.columns] = planes.difference(x, y)
-        else:
-            out[block.columns] = x - y
-    return out

@@ -107,9 +107,11 @@ def estimate(
     held: np.ndarray = NOTHING,
     on_visit: OnVisit = lambda *_: None,
     judged: Judged | None = None,
+    doubtful: Callable[[Outcome], bool] | None = None,
 ) -> Estimate:
     """All passes from a first `state`, directions of the border in `held` (see Problem) left alone; the last one alone
-    where noise and outliers are `judged` already.
+    where noise and outliers are `judged` already. It is left half-way, like the others, where it seems `doubtful` that
+    all is determined: along what is not it would only creep.
 
     Raises EstimationError where the data do not carry an estimate.
     """
@@ -129,7 +131,13 @@ def estimate(
         early = EARLY_DECREASE, FIRST_SHARE if name == "first" else EARLY_SHARE
         tolerance, share = (CONVERGED_DECREASE, ROUNDING) if last else early
         problem = judged.problem(inputs, state, held)
-        outcome = minimise(problem, state, note, tolerance, partial(on_visit, name, problem), share)
+        visit = partial(on_visit, name, problem)
+        if last and doubtful is not None:
+            outcome = minimise(problem, state, note, EARLY_DECREASE, visit, EARLY_SHARE)
+            if doubtful(outcome):
+                return Estimate(outcome, judged, tuple(history))
+            problem, state = outcome.problem, outcome.state
+        outcome = minimise(problem, state, note, tolerance, visit, share)
         if last and (k + 1 == len(names) + AGAIN or not _again(inputs, outcome, judged, way)):
             return Estimate(outcome, judged, tuple(history))
         way = _way(outcome) if last else np.inf

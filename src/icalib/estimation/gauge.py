@@ -11,7 +11,10 @@ import numpy as np
 from icalib.estimation.arrowhead import Piece
 from icalib.estimation.state import State
 
-FRAME = 1e4  # information [1/m^2, 1/rad^2] along what nothing sees: any number does
+# Information [1/m^2, 1/rad^2] along what nothing sees. Any number does where all else is determined. But where a
+# direction of planes and sensors is held, a step could move along it all the same and make up for it by turning the
+# world, planes and all, as far as this lets it: then the solver wandered for as long as it was let.
+FRAME = 1e10
 
 
 def hold_frame(state: State, piece: Piece, node: int, information: float = FRAME) -> None:

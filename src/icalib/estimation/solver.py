@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -50,8 +50,8 @@ class Visit:
 @dataclass(frozen=True)
 class Outcome:
     """Where the solver ended, with a status that is a sentence. problem: the one that was solved, points of the scene
-    looked for where they were; information (B, B): of the border at `state`, the chain marginalised, no damping; empty,
-    and no draws, where another pass follows."""
+    looked for where they were; information (B, B): of the border at `state`, the chain marginalised, no damping. Where
+    another pass follows there are no draws, and it is that of where the last step was looked for from."""
 
     problem: Problem
     state: State
@@ -91,7 +91,7 @@ def minimise(
     """Minimises `problem` from `state` until half the chi^2 can fall by less than `tolerance`, or this share of it.
 
     `on_visit` is told of each state that a step was looked for from, and of the last. Where the tolerance is wide
-    another pass follows, and the end is not linearised once more: the outcome has no information and no draws.
+    another pass follows, and the end is not linearised once more, see Outcome.
     `comes_back`: steps may go as far as the next ones can make good, see `_corrected`.
 
     Raises EstimationError if no step can be computed at all.
@@ -99,13 +99,15 @@ def minimise(
     pieces, residuals, early = problem.pieces(), problem.residuals(), tolerance > STALLED_DECREASE
     cost = problem.linearise(state, pieces, residuals)
     damping, curved, curved_below, stalled, steps = 0.0, False, CURVED_BELOW, 0, []
+    information = NOTHING
     for _ in range(MAX_ITERATIONS):
         if not np.isfinite(cost):
             raise EstimationError(
                 "the first guess predicts no finite measurement; give a better guess in the rig file."
             )
         solution, damping = _solve(problem, state, pieces, residuals, damping, curved)
-        on_visit(Visit(state, solution.information))
+        information = solution.information
+        on_visit(Visit(state, information))
         if not early and curved and damping == 0.0 and solution.decrease < min(ROUNDING * cost, LEAST_DECREASE):
             # Nothing that counts would change: the sums were those of the end already.
             steps.append(Step(cost, solution.decrease, damping, True))
@@ -113,14 +115,16 @@ def minimise(
             return _outcome(problem, state, cost, residuals, solution.decrease, steps, solution)
         candidate = state.retract(problem.layout, solution.chain, solution.border)
         near = solution.decrease < curved_below * cost
-        converged = damping == 0.0 and solution.decrease < max(tolerance, share * cost)
+        enough = max(tolerance, share * cost)
+        converged = damping == 0.0 and solution.decrease < enough
         sums = not (converged and early)
         candidate_cost = problem.linearise(candidate, pieces, residuals, sums, near)
         if comes_back and sums and not (candidate_cost < cost or converged):
             trial = problem, candidate, pieces, residuals, damping, near
             candidate, candidate_cost = _corrected(*trial, candidate_cost, cost)
-        # At the bottom rounding decides whether the cost falls; a step this small is taken anyway.
-        accepted = bool(candidate_cost < cost) or converged
+        # At the bottom rounding decides whether the cost falls; a step that promises this little is taken anyway, but
+        # not where it goes far along what the data hardly tell, and the cost rises.
+        accepted = bool(candidate_cost < cost) or (converged and candidate_cost - cost < enough)
         steps.append(Step(cost, solution.decrease, damping, accepted))
         on_step(steps[-1])
         if accepted:
@@ -129,8 +133,9 @@ def minimise(
             problem = problem.settled(residuals)
             damping = damping * (0.1 if good else 1.0)
             damping = 0.0 if damping < ZERO_DAMPING else damping
-            if converged:
-                break
+        if converged:
+            break
+        if accepted:
             continue
         stalled += solution.decrease < STALLED_DECREASE
         if stalled > MOST_STALLED or (early and solution.decrease < RESTING * max(tolerance, share * cost)):
@@ -143,7 +148,7 @@ def minimise(
             break
         cost = problem.linearise(state, pieces, residuals)
     if early:
-        return _early_end(problem, state, cost, pieces, residuals, steps)
+        return _early_end(problem, state, cost, pieces, residuals, steps, information)
     return _end(problem, state, cost, pieces, residuals, steps, curved, on_visit)
 
 
@@ -167,10 +172,11 @@ def _corrected(problem, state, pieces, residuals, damping, curved, cost, least) 
     return state, cost
 
 
-def _early_end(problem, state, cost, pieces, residuals, steps) -> Outcome:
+def _early_end(problem, state, cost, pieces, residuals, steps, information) -> Outcome:
     if not steps[-1].accepted:  # what was filled last is not that of `state`
         problem.linearise(state, pieces, residuals, sums=False)
-    return _outcome(problem, state, cost, residuals, steps[-1].predicted_decrease, steps)
+    outcome = _outcome(problem, state, cost, residuals, steps[-1].predicted_decrease, steps)
+    return replace(outcome, information=information)
 
 
 def _end(problem, state, cost, pieces, residuals, steps, curved, on_visit) -> Outcome:
@@ -183,9 +189,19 @@ def _end(problem, state, cost, pieces, residuals, steps, curved, on_visit) -> Ou
 
 def posterior(problem: Problem, state: State) -> Draws:
     """Draws from the posterior at `state`. Raises NotDefiniteError."""
+    return Draws.of(_solved(problem, state))
+
+
+def looked_at(outcome: Outcome) -> Outcome:
+    """An outcome without draws, with these and the information at its state. Raises NotDefiniteError."""
+    solution = _solved(outcome.problem, outcome.state)
+    return replace(outcome, information=solution.information, draws=Draws.of(solution))
+
+
+def _solved(problem: Problem, state: State) -> Solution:
     pieces = problem.pieces()
     problem.linearise(state, pieces, problem.residuals(), curved=True)
-    return Draws.of(solve(pieces, problem.n_nodes, problem.tolerance, held=problem.held))
+    return solve(pieces, problem.n_nodes, problem.tolerance, held=problem.held)
 
 
 def _solve(problem, state, pieces, residuals, damping, curved):

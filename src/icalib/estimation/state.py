@@ -103,22 +103,13 @@ class State:
         A tilt of the board turns the whole trajectory of its recording with it, exactly; the nodes' own steps are what
         they have beyond that, and turn too. To first order nothing changes. But where gravity is weakly known the tilt
         is large against the precision of positions relative to the board: moved along the tangent they would leave
-        their circle by tilt^2 / 2, and a step that cancels against one of the lever arm would no longer do so.
+        their circle by tilt^2 / 2, and a step that cancels against one of the lever arm would no longer do so. Without
+        a board it is the first node's turn that planes and trajectory turn by.
         """
-        values, turns = dict(self.values), []
-        for b in layout.free:
-            d, old = border[b.columns], values[b.key]
-            if b.kind == "rotation":
-                values[b.key] = old @ so3.exp(d)
-            elif b.kind == "tilt":
-                turns.append(np.array([d[0], d[1], 0.0]))
-                values[b.key] = so3.exp(turns[-1]) @ old
-            elif b.kind == "plane":
-                values[b.key] = planes.moved(old, d)
-            else:
-                values[b.key] = old + d
+        turns = self._turns(layout, chain, border)
+        values = {b.key: self._moved(b, border[b.columns], turns[0]) for b in layout.free}
         R, p, v = np.empty_like(self.rotation), np.empty_like(self.position), np.empty_like(self.velocity)
-        for turn, k in zip(turns or [np.zeros(3)] * len(self.starts), self.recordings, strict=True):
+        for turn, k in zip(turns, self.recordings, strict=True):
             Q = so3.exp(turn)
             own_rotation = np.ascontiguousarray(chain[k, 0:3] - turn @ self.rotation[k])
             own_position = chain[k, 3:6] - np.cross(turn, self.position[k])
@@ -126,4 +117,22 @@ class State:
             R[k] = Q @ self.rotation[k] @ so3.exp_many(own_rotation)
             p[k] = (self.position[k] + own_position) @ Q.T
             v[k] = (self.velocity[k] + own_velocity) @ Q.T
+        values = self.values | values
         return replace(self, rotation=R, position=p, velocity=v, bias=self.bias + chain[:, 9:15], values=values)
+
+    def _turns(self, layout: Layout, chain: np.ndarray, border: np.ndarray) -> list[np.ndarray]:
+        """(3,) by which each recording's world turns, in world axes. Several without a board share planes."""
+        tilts = [np.append(border[b.columns], 0.0) for b in layout.free if b.kind == "tilt"]
+        if tilts:
+            return tilts
+        alone = len(self.starts) == 1
+        return [self.rotation[0] @ chain[0, 0:3]] if alone else [np.zeros(3)] * len(self.starts)
+
+    def _moved(self, block: Block, d: np.ndarray, turn: np.ndarray) -> np.ndarray:
+        """The value of a block of the border, moved by `d` in a world that turns by `turn`."""
+        old = self.values[block.key]
+        if block.kind == "rotation":
+            return old @ so3.exp(d)
+        if block.kind == "tilt":
+            return so3.exp(np.append(d, 0.0)) @ old
+        return planes.moved_and_turned(old, d, turn) if block.kind == "plane" else old + d

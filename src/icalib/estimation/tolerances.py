@@ -13,11 +13,12 @@ from icalib.rig import Settings
 # and frames of poses and which way the board are: if these moved with a sensor at some worth, little of a direction's
 # would be left to it.
 GUESS_SIGMA = {
-    "rotation": 0.1, "translation": 0.1, "time_offset": 0.01, "intrinsics": 15.0, "distortion": 0.1, "bloom": 1.0,
+    "rotation": 0.1, "translation": 0.1, "time_offset": 0.02, "intrinsics": 15.0, "distortion": 0.3, "bloom": 1.0,
     "shape": 1e-3, "tilt": 10.0, "radii": 0.01, "baseline": 0.05, "plane": 10.0, "radius": 0.01,
     "wheelbase": 0.1, "steering_offset": 0.1, "scales": 0.1, "ground_height": 0.1,
     "frame_rotation": 10.0, "frame_translation": 10.0,
 }  # fmt: skip
+UNGUESSED = 0.03  # rad or m: how well the start knows what nobody guessed, such as which way is up
 FROM_NOTHING_M = 0.5  # what a translation is worth that nobody guessed: where the program took it to be
 OTHER_SIGMA = 0.1  # of IMU intrinsics
 

@@ -13,6 +13,8 @@ from math import cos, sin, sqrt
 import numpy as np
 from numba import njit
 
+from icalib.geometry import so3
+
 
 @njit(cache=True, nogil=True)
 def tangents(normal):
@@ -39,6 +41,16 @@ def moved(plane: np.ndarray, d: np.ndarray) -> np.ndarray:
     towards = d[:2] @ tangents(np.ascontiguousarray(normal))
     turned = cos(angle) * normal + (sin(angle) / angle if angle > 0.0 else 1.0) * towards
     return plane_of(turned, point + d[2] * normal)
+
+
+def moved_and_turned(plane: np.ndarray, d: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """As `moved`, to first order, in a world that turns by `turn` (3,) about its origin, exactly: d (3,) less what the
+    turn makes of it comes first."""
+    normal, point = plane[:3], plane[3:]
+    across = tangents(np.ascontiguousarray(normal))
+    own = d - np.append(across @ np.cross(turn, normal), normal @ np.cross(turn, point))
+    Q, at = so3.exp(turn), moved(plane, own)
+    return np.concatenate([Q @ at[:3], Q @ at[3:]])
 
 
 def difference(to: np.ndarray, plane: np.ndarray) -> np.ndarray:

@@ -1,0 +1,162 @@
+"""What the guess is worth where the data leave directions open: where these are held, and what the rest owes to it.
+
+A held direction stands where the guesses of all that it moves have it. Their errors, taken as independent, say how far
+it may be from the truth; and how far the rest moves with it is found by moving it that far and solving again.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icalib.errors import EstimationError
+from icalib.estimation.arrowhead import HELD_BELOW
+from icalib.estimation.assembly import given_priors
+from icalib.estimation.estimate import EARLY_DECREASE
+from icalib.estimation.imu_model import N_INTRINSICS
+from icalib.estimation.inputs import Inputs
+from icalib.estimation.problem import Problem
+from icalib.estimation.solver import minimise
+from icalib.estimation.state import State
+from icalib.estimation.tolerances import FROM_NOTHING_M, GUESS_SIGMA, OTHER_SIGMA, UNGUESSED
+from icalib.geometry import planes, so3
+
+MOVED_BY_HELD = 0.1  # parts of a direction smaller than this do not count as in it
+MOSTLY = 0.5  # of the square of a direction
+NEAR_GUESS = 0.05  # of what the guess is worth
+HALVINGS = 4  # of a move along which nothing can be solved
+
+
+def moved_to_guess(problem: Problem, state: State, guess: State, held: np.ndarray) -> State:
+    """`state`, moved along the directions `held` (B, m) to where `guess` has them."""
+    way = border_difference(problem, guess, state) / problem.tolerance
+    return _moved(problem, state, held @ (held.T @ way))
+
+
+def moved_to_worth(inputs: Inputs, problem: Problem, state: State, guess: State) -> State | None:
+    """`state`, moved along the held directions to where the guesses of all that they move have it, each by what it is
+    worth; None where the rig file says no guess is worth more than others, or it stands there already.
+
+    Where the data know only how two heights differ, and one was measured, `moved_to_guess` would leave both half-way.
+    """
+    if not _is_weighed(inputs, problem):
+        return None
+    sigma, way = _weights(inputs, problem), border_difference(problem, guess, state)
+    # What nobody guessed moves along, but nothing turns: what little a turn moves would be paid for with all of it.
+    for block in (b for b in problem.layout.free if not inputs.is_sensor(b.sensor)):
+        way[block.columns] = 0.0
+    directions = problem.tolerance[:, None] * problem.held
+    step = directions @ np.linalg.lstsq(directions / sigma[:, None], way / sigma, rcond=None)[0]
+    if np.linalg.norm(step / sigma) < NEAR_GUESS:
+        return None
+    return _moved(problem, state, step / problem.tolerance)
+
+
+def owed_to_guess(inputs: Inputs, problem: Problem, state: State, data: np.ndarray) -> np.ndarray:
+    """(m + 1, B) how the border moves with each of m independent errors of the guess along the held directions, one
+    standard deviation each, and by how much more or less where all of them come together.
+
+    data (B, B): information of the data alone, in tolerance units.
+    """
+    ways = _ways(inputs, problem, data)
+    if _leave_nothing(inputs, problem, ways):
+        return problem.tolerance * ways.T
+    alone = np.array([_answer(problem, state, way) for way in ways.T])
+    signs = np.random.default_rng(0).choice((-1.0, 1.0), ways.shape[1])
+    return np.vstack([alone, _answer(problem, state, ways @ signs) - signs @ alone])
+
+
+def _ways(inputs: Inputs, problem: Problem, data: np.ndarray) -> np.ndarray:
+    """(B, m) in tolerance units: errors of the guess along held directions, independent, one standard deviation each.
+
+    One that is mostly of what nobody guessed is no larger than `data` (B, B) leave open: a board turned against
+    gravity by as much as it likes would be turned round and round, with a bias of the accelerometer that nobody
+    believes.
+    """
+    values, turn = np.linalg.eigh(_held_covariance(inputs, problem))
+    ways = problem.held @ turn
+    width = np.sqrt(np.clip(values, 0.0, None))
+    own = np.concatenate([np.arange(0), *(b.columns for b in problem.layout.free if inputs.is_sensor(b.sensor))])
+    for k, way in enumerate(ways.T):
+        left = float(np.clip(way @ data @ way, 0.0, HELD_BELOW))
+        if float((way[own] ** 2).sum()) < MOSTLY and width[k] ** 2 * left > 1.0:
+            width[k] = 1.0 / np.sqrt(left)
+    return ways * width
+
+
+def _held_covariance(inputs: Inputs, problem: Problem) -> np.ndarray:
+    """(m, m) of the guess along the held directions, in tolerance units: of an orthogonal projection, as
+    `moved_to_guess` makes it, or of a weighted one, as `moved_to_worth` does."""
+    if _is_weighed(inputs, problem):
+        scaled = problem.held * (problem.tolerance / _weights(inputs, problem))[:, None]
+        return np.linalg.inv(scaled.T @ scaled)
+    sigma = guess_sigma(inputs)
+    for block in (b for b in problem.layout.free if not inputs.is_sensor(b.sensor)):
+        sigma[block.columns] = np.minimum(sigma[block.columns], UNGUESSED)
+    scaled = problem.held * (sigma / problem.tolerance)[:, None]
+    return scaled.T @ scaled
+
+
+def _leave_nothing(inputs: Inputs, problem: Problem, ways: np.ndarray) -> bool:
+    """Whether the guess alone leaves every parameter of every sensor open."""
+    owed = (ways**2).sum(axis=1)
+    return all((owed[b.columns] > 1.0 / HELD_BELOW).all() for b in problem.layout.free if inputs.is_sensor(b.sensor))
+
+
+def _answer(problem: Problem, state: State, way: np.ndarray) -> np.ndarray:
+    """(B,) how the border moves when the guess moves along `way` (B,), which is held. Where it moves so far that
+    nothing can be solved, in proportion to a shorter way."""
+    for k in range(HALVINGS):
+        try:
+            there = minimise(problem, _moved(problem, state, way / 2**k), tolerance=EARLY_DECREASE)
+        except EstimationError:
+            continue
+        return 2**k * border_difference(problem, there.state, state)
+    return problem.tolerance * way
+
+
+def _is_weighed(inputs: Inputs, problem: Problem) -> bool:
+    """Whether the rig file says of something that is held what its guess is worth."""
+    own = np.concatenate([np.empty(0, dtype=np.int64), *(p.block.columns for p in given_priors(inputs))])
+    return bool(problem.held.size and np.any(np.abs(problem.held[own]) > MOVED_BY_HELD))
+
+
+def _weights(inputs: Inputs, problem: Problem) -> np.ndarray:
+    """(B,) what guesses are worth against one another; what nobody guessed does not count, but where it turns."""
+    sigma = guess_sigma(inputs)
+    for block in (b for b in problem.layout.free if not inputs.is_sensor(b.sensor)):
+        if block.kind != "vector":
+            sigma[block.columns[:2] if block.kind == "plane" else block.columns] = GUESS_SIGMA["rotation"]
+    return sigma
+
+
+def guess_sigma(inputs: Inputs) -> np.ndarray:
+    """(B,) standard deviations of the guess: given ones, or what one without is worth."""
+    sigma, sensors = np.zeros(inputs.layout.size), {s.name: s for s in inputs.sensors}
+    for b in inputs.layout.free:
+        sigma[b.columns] = OTHER_SIGMA if b.size == N_INTRINSICS else GUESS_SIGMA[b.name]
+        if b.name == "translation" and b.sensor in sensors and sensors[b.sensor].translation.value is None:
+            sigma[b.columns] = FROM_NOTHING_M
+    for prior in given_priors(inputs):
+        sigma[prior.block.columns] = prior.sigma
+    return sigma
+
+
+def _moved(problem: Problem, state: State, way: np.ndarray) -> State:
+    """`state` with the border moved by `way` (B,), in tolerance units."""
+    return state.retract(problem.layout, np.zeros((len(state.seconds), 15)), problem.tolerance * way)
+
+
+def border_difference(problem: Problem, a: State, b: State) -> np.ndarray:
+    """(B,) the step of the border from `b` to `a`."""
+    out = np.zeros(problem.layout.size)
+    for block in problem.layout.free:
+        x, y = a.values[block.key], b.values[block.key]
+        if block.kind == "rotation":
+            out[block.columns] = so3.log(np.ascontiguousarray(y.T @ x))
+        elif block.kind == "tilt":
+            out[block.columns] = so3.log(np.ascontiguousarray(x @ y.T))[:2]
+        elif block.kind == "plane":
+            out[block.columns] = planes.difference(x, y)
+        else:
+            out[block.columns] = x - y
+    return out

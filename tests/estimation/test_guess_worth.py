@@ -1,0 +1,117 @@
+"""Where undetermined directions are held, and how far that may be from the truth, against draws of guesses."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from icalib.estimation import guess_worth
+from icalib.estimation.guess_worth import moved_to_guess, moved_to_worth, owed_to_guess
+from icalib.estimation.state import State, make_layout
+
+TOLERANCE = {"rotation": 2e-3, "translation": 5e-3, "time_offset": 1e-3, "plane": 0.2}
+SIGMA = {"translation": np.array([0.1, 0.2, 0.06]), "time_offset": np.array([0.02])}
+DRAWS = 20000
+
+
+@pytest.fixture
+def given(monkeypatch):
+    """Two sensors; the data leave open a shift of both, and a mixture of height and time of one. What is left is
+    determined exactly: the answer to a move is the move."""
+    entries = [(s, n, "vector", size, True) for s in "ab" for n, size in (("translation", 3), ("time_offset", 1))]
+    layout = make_layout(entries)
+    values = {b.key: np.zeros(b.size) for b in layout.free}
+    zeros = np.zeros((2, 3))
+    state = State(np.arange(2.0), np.stack([np.eye(3)] * 2), zeros, zeros, np.zeros((2, 6)), values)
+    held = np.zeros((8, 2))
+    held[[0, 4], 0] = np.sqrt(0.5)
+    held[[2, 3], 1] = 0.6, 0.8
+    problem = SimpleNamespace(
+        layout=layout, held=held, tolerance=np.concatenate([np.full(b.size, TOLERANCE[b.name]) for b in layout.free])
+    )
+    priors: list = []
+    sigma = np.concatenate([SIGMA[b.name] for b in layout.free])
+    monkeypatch.setattr(guess_worth, "given_priors", lambda _: priors)
+    monkeypatch.setattr(guess_worth, "guess_sigma", lambda _: sigma.copy())
+    monkeypatch.setattr(guess_worth, "minimise", lambda problem, state, tolerance: SimpleNamespace(state=state))
+    inputs = SimpleNamespace(is_sensor=lambda name: name in "ab", layout=layout)
+    return SimpleNamespace(inputs=inputs, problem=problem, state=state, sigma=sigma, priors=priors)
+
+
+def landed(given, rng) -> np.ndarray:
+    """(DRAWS, 8) where what is held stands, for guesses drawn about the truth, which is 0."""
+    out = []
+    for errors in given.sigma * rng.standard_normal((DRAWS // 10, 8)):
+        guess = given.state.retract(given.problem.layout, np.zeros((2, 15)), errors)
+        moved = (
+            moved_to_worth(given.inputs, given.problem, given.state, guess)
+            if given.priors
+            else moved_to_guess(given.problem, given.state, guess, given.problem.held)
+        )
+        moved = given.state if moved is None else moved
+        out.append(np.concatenate([moved.values[b.key] for b in given.problem.layout.free]))
+    return np.array(out)
+
+
+@pytest.mark.parametrize("weighed", [False, True])
+def test_the_shifts_have_the_covariance_of_where_guesses_land(given, weighed: bool):
+    if weighed:
+        given.priors.append(SimpleNamespace(block=given.problem.layout.free[0], sigma=np.array([0.1, 0.2, 0.05])))
+    shifts = owed_to_guess(given.inputs, given.problem, given.state, np.zeros((8, 8)))
+    assert shifts.shape == (3, 8)  # two errors, and what both together make beyond their sum
+    np.testing.assert_allclose(shifts[2], 0.0, atol=1e-12)
+    drawn = np.cov(landed(given, np.random.default_rng(0)).T)
+    expected, scale = shifts.T @ shifts, given.problem.tolerance
+    np.testing.assert_allclose(
+        drawn / np.outer(scale, scale),
+        expected / np.outer(scale, scale),
+        atol=0.1 * (expected.diagonal() / scale**2).max(),
+    )
+    assert expected[0, 0] == pytest.approx(0.5 * 0.1**2, rel=1e-9)  # the mean of two guesses
+    assert expected[0, 4] == pytest.approx(expected[0, 0], rel=1e-9)
+
+
+def test_what_comes_of_two_errors_together_is_owed_too(given, monkeypatch):
+    def bent(problem, state, tolerance):
+        values = {k: v.copy() for k, v in state.values.items()}
+        values["a", "translation"][1] += 7.0 * values["a", "translation"][0] * values["a", "translation"][2]
+        return SimpleNamespace(state=State(*(getattr(state, n) for n in list(State.__dataclass_fields__)[:5]), values))
+
+    monkeypatch.setattr(guess_worth, "minimise", bent)
+    shifts = owed_to_guess(given.inputs, given.problem, given.state, np.zeros((8, 8)))
+    assert np.abs(shifts[:2, 1]).max() < 1e-12  # neither alone moves it
+    assert abs(shifts[2, 1]) > 0.01
+
+
+def test_nothing_is_tried_out_where_the_guess_alone_leaves_all_open(given, monkeypatch):
+    given.problem.held = np.eye(8)
+    monkeypatch.setattr(guess_worth, "minimise", None)
+    shifts = owed_to_guess(given.inputs, given.problem, given.state, np.zeros((8, 8)))
+    np.testing.assert_allclose(np.sqrt((shifts**2).sum(axis=0)), given.sigma)
+
+
+def test_a_way_along_which_nothing_can_be_solved_is_made_shorter(given, monkeypatch):
+    from icalib.errors import EstimationError
+
+    def short_only(problem, state, tolerance):
+        if np.abs(state.values["b", "translation"]).max() > 0.02:
+            raise EstimationError("too far")
+        return SimpleNamespace(state=state)
+
+    expected = owed_to_guess(given.inputs, given.problem, given.state, np.zeros((8, 8)))
+    monkeypatch.setattr(guess_worth, "minimise", short_only)
+    found = owed_to_guess(given.inputs, given.problem, given.state, np.zeros((8, 8)))
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+def test_what_nobody_guessed_moves_no_further_than_the_data_leave_open(given):
+    given.inputs.is_sensor = lambda name: name == "b"
+    data = np.diag(np.full(8, 5e-3))
+    data[0, 0] = 0.0
+    given.problem.held = np.eye(8)[:, [0, 1]]  # of a, which is no sensor now
+    monkey = owed_to_guess(given.inputs, given.problem, given.state, data)
+    width = np.sqrt((monkey**2).sum(axis=0)) / given.problem.tolerance
+    assert width[0] == pytest.approx(guess_worth.UNGUESSED / 5e-3)
+    assert width[1] == pytest.approx(min(guess_worth.UNGUESSED / 5e-3, 1.0 / np.sqrt(5e-3)))

@@ -1,0 +1,86 @@
+"""A step that turns the whole world turns it exactly, where no board says how it stands."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from icalib.estimation.state import make_layout
+from icalib.geometry.planes import moved_and_turned, tangents
+from icalib.simulation import simulate
+
+TURN = np.array([0.2, -0.15, 0.1])  # rad, in world axes
+
+
+@pytest.fixture(scope="module")
+def setup(robot, room_of):
+    return room_of(simulate(robot(3.0), seed=1))
+
+
+def turning(setup, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Chain and border of a turn of all there is about the world's origin, to first order."""
+    state, border = setup.state, np.zeros(setup.layout.size)
+    chain = np.zeros((len(state.seconds), 15))
+    chain[:, 0:3] = np.einsum("kji,j->ki", state.rotation, turn)
+    chain[:, 3:6], chain[:, 6:9] = np.cross(turn, state.position), np.cross(turn, state.velocity)
+    for b in (b for b in setup.layout.free if b.kind == "plane"):
+        normal, point = np.split(state.values[b.key], 2)
+        border[b.columns] = np.append(tangents(normal) @ np.cross(turn, normal), normal @ np.cross(turn, point))
+    return chain, border
+
+
+def test_trajectory_and_planes_turn_exactly(setup):
+    state, Q = setup.state, Rotation.from_rotvec(TURN).as_matrix()
+    turned = state.retract(setup.layout, *turning(setup, TURN))
+    np.testing.assert_allclose(turned.rotation, Q @ state.rotation, atol=1e-12)
+    np.testing.assert_allclose(turned.position, state.position @ Q.T, atol=1e-12)
+    np.testing.assert_allclose(turned.velocity, state.velocity @ Q.T, atol=1e-12)
+    planes = [b.key for b in setup.layout.free if b.kind == "plane"]
+    assert planes
+    for key in planes:
+        np.testing.assert_allclose(turned.values[key][:3], Q @ state.values[key][:3], atol=1e-12)
+        np.testing.assert_allclose(turned.values[key][3:], Q @ state.values[key][3:], atol=1e-12)
+
+
+def test_what_a_lidar_sees_does_not_change(setup):
+    factor, pieces = setup.factor(), setup.problem(setup.state).pieces(sums=False)
+
+    def cost(state) -> float:
+        return sum(factor.accumulate(state, p, factor.output(), sums=False) for p in pieces)
+
+    before, after = cost(setup.state), cost(setup.state.retract(setup.layout, *turning(setup, TURN)))
+    # Between nodes the IMU leads, and gravity has not turned.
+    assert after == pytest.approx(before, rel=1e-5)
+
+
+def test_any_other_step_is_the_same_to_first_order(setup):
+    rng = np.random.default_rng(2)
+    chain = 1e-2 * rng.normal(size=(len(setup.state.seconds), 15))
+    still = chain.copy()
+    still[0, 0:3] = 0.0  # the world does not turn
+
+    def position(step: np.ndarray) -> np.ndarray:
+        return setup.state.retract(setup.layout, step, np.zeros(setup.layout.size)).position[1:]
+
+    plain = setup.state.position[1:] + chain[1:, 3:6]
+    np.testing.assert_allclose(position(still), plain, atol=1e-12)
+    ratio = [np.abs(position(s * chain) - setup.state.position[1:] - s * chain[1:, 3:6]).max() for s in (1.0, 0.1)]
+    assert ratio[0] > 1e-6
+    assert ratio[1] == pytest.approx(1e-2 * ratio[0], rel=0.1)
+
+
+@pytest.mark.parametrize("size", [1.0, 0.1])
+def test_a_plane_that_turns_is_moved_the_same_to_first_order(size: float):
+    plane, d = np.array([0.6, 0.0, 0.8, 2.0, -1.0, 3.0]), size * 1e-3 * np.array([1.0, -2.0, 0.5])
+    from_moved = moved_and_turned(plane, d, np.zeros(3))
+    off = moved_and_turned(plane, d, size * 1e-2 * TURN) - from_moved
+    across = tangents(plane[:3]) @ off[:3]
+    assert max(abs(across).max(), abs(plane[:3] @ off[3:])) < size**2 * 2e-5
+
+
+def test_a_layout_without_planes_turns_its_trajectory(setup):
+    chain, _ = turning(setup, TURN)
+    turned = setup.state.retract(make_layout([]), chain, np.zeros(0))
+    Q = Rotation.from_rotvec(TURN).as_matrix()
+    np.testing.assert_allclose(turned.position, setup.state.position @ Q.T, atol=1e-12)
