@@ -12,7 +12,7 @@ from tests.estimation.test_front import build
 from icalib.estimation.arrowhead import Piece, solve
 from icalib.estimation.debias import spurious_information
 from icalib.estimation.evidence import fits
-from icalib.estimation.solver import Draws, Outcome, looked_at, minimise, posterior
+from icalib.estimation.solver import Draws, Outcome, minimise, posterior
 from icalib.simulation import handheld, simulate
 
 DRAWS = 40
@@ -164,9 +164,7 @@ def test_degrees_of_freedom_of_points_on_planes(scanned, dense):
 def test_an_early_outcome_has_no_draws_and_they_are_made_where_they_are_asked_for(followed, setup):
     start = setup.perturbed(np.random.default_rng(5), 1.0)
     early, late = minimise(followed, start, tolerance=0.5), minimise(followed, start)
-    assert early.draws is None and early.information.shape == late.information.shape
-    seen = looked_at(replace(late, draws=None, information=np.zeros((0, 0))))
-    np.testing.assert_allclose(seen.information, late.information, atol=1e-6 * np.abs(late.information).max())
+    assert early.draws is None and early.information.size == 0
     there = posterior(followed, late.state)
     for a, b in zip((*there.free, *there.still), (*late.draws.free, *late.draws.still), strict=True):
         np.testing.assert_allclose(a.chain, b.chain, atol=1e-6 * np.abs(b.chain).max())

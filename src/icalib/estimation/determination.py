@@ -21,7 +21,8 @@ from icalib.estimation.estimate import Estimate, Judged, OnVisit, estimate
 from icalib.estimation.guess_worth import moved_to_guess, moved_to_worth, owed_to_guess
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.prior_factor import Prior
-from icalib.estimation.solver import Outcome, Step, looked_at
+from icalib.estimation.problem import Problem
+from icalib.estimation.solver import Outcome, Step
 from icalib.estimation.state import Key, State
 
 SPURIOUS_SHARE = 0.5  # a direction most of whose information is noise is not determined either
@@ -73,18 +74,16 @@ def determine(
     """
     wanted = replace(start, values=start.values | (guess or {}))
     found = estimate(inputs, start, on_step, on_visit=on_visit, doubtful=_is_doubtful)
-    half_way = found.outcome.draws is None
-    data, undetermined = _judge(inputs, looked_at(found.outcome) if half_way else found.outcome)
+    data, undetermined = _judge(inputs, found.outcome)
     for k in range(MOST_ROUNDS):
-        if _is_settled(undetermined, found.problem.held, k >= LATE) and not half_way:
+        if _is_settled(undetermined, found.problem.held, k >= LATE) and not found.outcome.half_way:
             break
-        # One that did not converge is worth nothing: from the start, then.
-        state = found.outcome.state if found.outcome.converged or half_way else start
+        # One that failed is worth nothing: from the start, then.
+        state = found.outcome.state if _is_worth_keeping(found.outcome) else start
         begin, judged = moved_to_guess(found.problem, state, wanted, undetermined), _worth_keeping(found)
         del found  # before the next one takes as much memory
         found = estimate(inputs, begin, on_step, undetermined, on_visit, judged)
         data, undetermined = _judge(inputs, found.outcome)
-        half_way = False
     for _ in range(MOST_ROUNDS):
         begin = moved_to_worth(inputs, found.problem, found.outcome.state, wanted)
         if begin is None:
@@ -98,14 +97,18 @@ def determine(
 
 
 def _worth_keeping(found: Estimate) -> Judged | None:
-    """Noise and outliers, where the estimate that judged them converged."""
-    return found.judged if found.outcome.converged else None
+    """Noise and outliers, where the estimate that judged them did not fail."""
+    return found.judged if _is_worth_keeping(found.outcome) else None
 
 
-def _is_doubtful(outcome: Outcome) -> bool:
+def _is_worth_keeping(outcome: Outcome) -> bool:
+    return outcome.converged or outcome.half_way
+
+
+def _is_doubtful(problem: Problem, information: np.ndarray) -> bool:
     """Whether something may be open: with what noise adds, all is better known where nothing is."""
-    t = outcome.problem.tolerance
-    return bool(np.linalg.eigvalsh(t[:, None] * outcome.information * t).min(initial=np.inf) < DOUBTFUL)
+    t = problem.tolerance
+    return bool(np.linalg.eigvalsh(t[:, None] * information * t).min(initial=np.inf) < DOUBTFUL)
 
 
 def _is_settled(undetermined: np.ndarray, held: np.ndarray, late: bool) -> bool:

@@ -107,11 +107,11 @@ def estimate(
     held: np.ndarray = NOTHING,
     on_visit: OnVisit = lambda *_: None,
     judged: Judged | None = None,
-    doubtful: Callable[[Outcome], bool] | None = None,
+    doubtful: Callable[[Problem, np.ndarray], bool] = lambda *_: False,
 ) -> Estimate:
     """All passes from a first `state`, directions of the border in `held` (see Problem) left alone; the last one alone
-    where noise and outliers are `judged` already. It is left half-way, like the others, where it seems `doubtful` that
-    all is determined: along what is not it would only creep.
+    where noise and outliers are `judged` already. It is left half-way where the information of the border (B, B) makes
+    it `doubtful` that all is determined: along what is not it would only creep.
 
     Raises EstimationError where the data do not carry an estimate.
     """
@@ -131,14 +131,12 @@ def estimate(
         early = EARLY_DECREASE, FIRST_SHARE if name == "first" else EARLY_SHARE
         tolerance, share = (CONVERGED_DECREASE, ROUNDING) if last else early
         problem = judged.problem(inputs, state, held)
+        after = k + 1 < len(names) + AGAIN  # whether another pass may follow
+        leaves = _leaves(problem, doubtful, way if after else 0.0) if last else None
         visit = partial(on_visit, name, problem)
-        if last and doubtful is not None:
-            outcome = minimise(problem, state, note, EARLY_DECREASE, visit, EARLY_SHARE)
-            if doubtful(outcome):
-                return Estimate(outcome, judged, tuple(history))
-            problem, state = outcome.problem, outcome.state
-        outcome = minimise(problem, state, note, tolerance, visit, share)
-        if last and (k + 1 == len(names) + AGAIN or not _again(inputs, outcome, judged, way)):
+        outcome: Outcome = minimise(problem, state, note, tolerance, visit, share, leaves=leaves)
+        open_already = outcome.half_way and doubtful(problem, outcome.information)
+        if last and (open_already or not after or not _again(inputs, outcome, judged, way)):
             return Estimate(outcome, judged, tuple(history))
         way = _way(outcome) if last else np.inf
         judged = judged if last else judged.next(inputs, outcome, name == "first")
@@ -148,11 +146,21 @@ def estimate(
     raise AssertionError("pass_names is never empty")
 
 
+def _leaves(
+    problem: Problem, doubtful: Callable[[Problem, np.ndarray], bool], way_before: float
+) -> Callable[[float, np.ndarray], bool]:
+    """Whether a last pass need not go to its end: see `minimise`."""
+    return lambda way, information: doubtful(problem, information) or _is_far(way, way_before)
+
+
 def _again(inputs: Inputs, outcome: Outcome, judged: Judged, way_before: float) -> bool:
     """Whether the last pass is to be made anew: what it froze, such as the weights of points on planes, is of a state
     far from its end, but nearer than in the last pass before, or tracks come back."""
-    way = _way(outcome)
-    return FAR - 1.0 < way < NEARER * way_before or _follows_more(inputs, outcome, judged)
+    return _is_far(_way(outcome), way_before) or _follows_more(inputs, outcome, judged)
+
+
+def _is_far(way: float, way_before: float) -> bool:
+    return FAR - 1.0 < way < NEARER * way_before
 
 
 def _way(outcome: Outcome) -> float:

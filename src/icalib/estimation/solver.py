@@ -17,6 +17,7 @@ MAX_ITERATIONS = 50
 CONVERGED_DECREASE = 5e-4
 ROUNDING = 1e-11  # of the cost: what rounding makes of a sum of 1e6 squares
 CURVED_BELOW = 1e-2  # of the cost: steps that promise less use the true curvature of the robust loss
+HALF_WAY = 0.5  # of half the chi^2: where little more is gained, it can be seen what is open
 STALLED_DECREASE = 0.05  # of half the chi^2: a third of a standard deviation, good enough where smaller steps fail
 MOST_STALLED = 4  # steps this small that fail before the solver rests
 COMES_BACK = 0.25  # of what a step costs too much, where its error is of second order: this much at most is left next
@@ -50,8 +51,8 @@ class Visit:
 @dataclass(frozen=True)
 class Outcome:
     """Where the solver ended, with a status that is a sentence. problem: the one that was solved, points of the scene
-    looked for where they were; information (B, B): of the border at `state`, the chain marginalised, no damping. Where
-    another pass follows there are no draws, and it is that of where the last step was looked for from."""
+    looked for where they were; information (B, B): of the border at `state`, the chain marginalised, no damping; empty,
+    and no draws, where another pass follows. half_way: left before its end, because more seemed of no use."""
 
     problem: Problem
     state: State
@@ -62,6 +63,7 @@ class Outcome:
     converged: bool
     status: str
     draws: Draws | None = None
+    half_way: bool = False
 
 
 @dataclass(frozen=True)
@@ -87,27 +89,34 @@ def minimise(
     on_visit: Callable[[Visit], None] = lambda _: None,
     share: float = ROUNDING,
     comes_back: bool = True,
+    leaves: Callable[[float, np.ndarray], bool] | None = None,
 ) -> Outcome:
     """Minimises `problem` from `state` until half the chi^2 can fall by less than `tolerance`, or this share of it.
 
     `on_visit` is told of each state that a step was looked for from, and of the last. Where the tolerance is wide
-    another pass follows, and the end is not linearised once more, see Outcome.
-    `comes_back`: steps may go as far as the next ones can make good, see `_corrected`.
+    another pass follows, and the end is not linearised once more: the outcome has no information and no draws.
+    `comes_back`: steps may go as far as the next ones can make good, see `_corrected`. `leaves`: asked with
+    how far it has come, as a share of half the chi^2, and the border's information (B, B), whether to end when half the
+    chi^2 can fall by less than HALF_WAY, or a step not far from there fails.
 
     Raises EstimationError if no step can be computed at all.
     """
     pieces, residuals, early = problem.pieces(), problem.residuals(), tolerance > STALLED_DECREASE
     cost = problem.linearise(state, pieces, residuals)
     damping, curved, curved_below, stalled, steps = 0.0, False, CURVED_BELOW, 0, []
-    information = NOTHING
     for _ in range(MAX_ITERATIONS):
         if not np.isfinite(cost):
             raise EstimationError(
                 "the first guess predicts no finite measurement; give a better guess in the rig file."
             )
         solution, damping = _solve(problem, state, pieces, residuals, damping, curved)
-        information = solution.information
-        on_visit(Visit(state, information))
+        on_visit(Visit(state, solution.information))
+        way = (steps[0].cost if steps else cost) / cost - 1.0 if cost > 0.0 else 0.0
+        low = damping == 0.0 and solution.decrease < RESTING * HALF_WAY
+        asked = low and leaves is not None and leaves(way, solution.information)
+        if asked and solution.decrease < HALF_WAY:
+            left = _outcome(problem, state, cost, residuals, solution.decrease, steps, solution)
+            return replace(left, half_way=True)
         if not early and curved and damping == 0.0 and solution.decrease < min(ROUNDING * cost, LEAST_DECREASE):
             # Nothing that counts would change: the sums were those of the end already.
             steps.append(Step(cost, solution.decrease, damping, True))
@@ -137,6 +146,8 @@ def minimise(
             break
         if accepted:
             continue
+        if asked:
+            return replace(_end(problem, state, cost, pieces, residuals, steps, curved, on_visit), half_way=True)
         stalled += solution.decrease < STALLED_DECREASE
         if stalled > MOST_STALLED or (early and solution.decrease < RESTING * max(tolerance, share * cost)):
             break
@@ -148,7 +159,7 @@ def minimise(
             break
         cost = problem.linearise(state, pieces, residuals)
     if early:
-        return _early_end(problem, state, cost, pieces, residuals, steps, information)
+        return _early_end(problem, state, cost, pieces, residuals, steps)
     return _end(problem, state, cost, pieces, residuals, steps, curved, on_visit)
 
 
@@ -172,11 +183,10 @@ def _corrected(problem, state, pieces, residuals, damping, curved, cost, least) 
     return state, cost
 
 
-def _early_end(problem, state, cost, pieces, residuals, steps, information) -> Outcome:
+def _early_end(problem, state, cost, pieces, residuals, steps) -> Outcome:
     if not steps[-1].accepted:  # what was filled last is not that of `state`
         problem.linearise(state, pieces, residuals, sums=False)
-    outcome = _outcome(problem, state, cost, residuals, steps[-1].predicted_decrease, steps)
-    return replace(outcome, information=information)
+    return _outcome(problem, state, cost, residuals, steps[-1].predicted_decrease, steps)
 
 
 def _end(problem, state, cost, pieces, residuals, steps, curved, on_visit) -> Outcome:
@@ -189,19 +199,9 @@ def _end(problem, state, cost, pieces, residuals, steps, curved, on_visit) -> Ou
 
 def posterior(problem: Problem, state: State) -> Draws:
     """Draws from the posterior at `state`. Raises NotDefiniteError."""
-    return Draws.of(_solved(problem, state))
-
-
-def looked_at(outcome: Outcome) -> Outcome:
-    """An outcome without draws, with these and the information at its state. Raises NotDefiniteError."""
-    solution = _solved(outcome.problem, outcome.state)
-    return replace(outcome, information=solution.information, draws=Draws.of(solution))
-
-
-def _solved(problem: Problem, state: State) -> Solution:
     pieces = problem.pieces()
     problem.linearise(state, pieces, problem.residuals(), curved=True)
-    return solve(pieces, problem.n_nodes, problem.tolerance, held=problem.held)
+    return Draws.of(solve(pieces, problem.n_nodes, problem.tolerance, held=problem.held))
 
 
 def _solve(problem, state, pieces, residuals, damping, curved):

@@ -1,0 +1,64 @@
+"""A robot with cameras, a LiDAR and wheels on motion that leaves much open: it converges without creeping, and what is
+called known is right. A hundred recordings of each motion are in `benchmarks/degeneracy.py`."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from tests.consistency.conftest import PAPER
+
+from icalib.calibration import Calibration
+from icalib.montecarlo.one_run import compare
+from icalib.pipeline import calibrate_measurements
+from icalib.simulation import Scenario, Simulation, load_scenario, rig_for, simulate, with_drawn_guess
+
+MOST_STEPS = 40  # of all last passes together; with the world free to undo what is held, one alone took 50
+
+
+def thin(motion: str, noise: float) -> Scenario:
+    """Ten seconds of the example's motion with few points, and an IMU `noise` times as noisy as its data sheet says."""
+    scenario = load_scenario(PAPER / f"{motion}.yaml")
+    imu = scenario.imu_noise
+    densities = {f.name: noise * getattr(imu, f.name) for f in fields(imu) if f.name != "source"}
+    return replace(
+        scenario,
+        duration_s=10.0,
+        imu_noise=replace(imu, **densities),
+        lidars=tuple(replace(x, azimuth_steps=300) for x in scenario.lidars),
+        features=replace(scenario.features, per_image=30, count=450, lasting=60),
+    )
+
+
+def calibrated(motion: str, noise: float, seed: int, lens: str = "fixed") -> tuple[Calibration, Simulation]:
+    scenario = thin(motion, noise)
+    simulation = simulate(scenario, seed)
+    rig = with_drawn_guess(rig_for(scenario, intrinsics=lens, distortion=lens), scenario, seed)
+    return calibrate_measurements(rig, simulation.measurements), simulation
+
+
+def check(result: Calibration, simulation: Simulation) -> None:
+    assert result.converged, result.status
+    record = compare(0, result, simulation.truth, [], 0.0)
+    verdicts = np.concatenate([b.verdict for b in record.blocks])
+    z = record.error / np.sqrt(np.diag(record.covariance))
+    assert np.abs(z[verdicts != "undetermined"]).max(initial=0.0) < 4.0
+    assert sum(i.stage == "final" for i in result.iterations) < MOST_STEPS
+
+
+@pytest.mark.parametrize(
+    ("motion", "noise"),
+    [
+        ("table2-planar", 10.0), ("single-axis", 10.0), ("straight-line", 10.0), ("constant-velocity", 1.0),
+        ("arc", 1.0), ("spin", 10.0), ("standing", 1.0),
+    ],
+)  # fmt: skip
+def test_what_is_known_is_right_and_nothing_creeps(motion: str, noise: float):
+    check(*calibrated(motion, noise, 1))
+
+
+@pytest.mark.parametrize(("motion", "seed"), [("single-axis", 1), ("single-axis", 3), ("standing", 1)])
+def test_lenses_owe_to_the_guess_what_they_follow_it_by(motion: str, seed: int):
+    """Time offsets that are all wrong together, or a robot that stands, moved lenses by up to 9 standard deviations."""
+    check(*calibrated(motion, 10.0, seed, "free"))
