@@ -77,6 +77,11 @@ def make_layout(entries: list[Entry]) -> Layout:
     return Layout(tuple(blocks))
 
 
+FIRST_NODE = (
+    1e-4  # of the weight of planes, or of 1 m^2: where they show nothing, the world turns as the first node does
+)
+
+
 @dataclass(frozen=True)
 class State:
     """One estimate. seconds (K,) node times on the imu clock since its first stamp; world frame z up.
@@ -104,7 +109,7 @@ class State:
         they have beyond that, and turn too. To first order nothing changes. But where gravity is weakly known the tilt
         is large against the precision of positions relative to the board: moved along the tangent they would leave
         their circle by tilt^2 / 2, and a step that cancels against one of the lever arm would no longer do so. Without
-        a board it is the first node's turn that planes and trajectory turn by.
+        a board planes and trajectory turn by what turns them most alike.
         """
         turns = self._turns(layout, chain, border)
         values = {b.key: self._moved(b, border[b.columns], turns[0]) for b in layout.free}
@@ -125,8 +130,22 @@ class State:
         tilts = [np.append(border[b.columns], 0.0) for b in layout.free if b.kind == "tilt"]
         if tilts:
             return tilts
-        alone = len(self.starts) == 1
-        return [self.rotation[0] @ chain[0, 0:3]] if alone else [np.zeros(3)] * len(self.starts)
+        return [self._common_turn(layout, chain, border)] if len(self.starts) == 1 else [np.zeros(3)] * len(self.starts)
+
+    def _common_turn(self, layout: Layout, chain: np.ndarray, border: np.ndarray) -> np.ndarray:
+        """(3,) by which the planes turn, in world axes; without these, by which the positions do, but about a line of
+        them; and what neither shows is that of the first node. On a flat floor all sensors may turn against the IMU:
+        map and path turn then, and no node does."""
+        free = [b for b in layout.free if b.kind == "plane"]
+        if free:
+            x = np.array([self.values[b.key][:3] for b in free])
+            moved = np.array([border[b.columns[:2]] @ planes.tangents(n) for b, n in zip(free, x, strict=True)])
+        else:
+            x, moved = self.position - self.position.mean(axis=0), chain[:, 3:6] - chain[:, 3:6].mean(axis=0)
+        spread = (x.T @ x) / len(x)
+        A = np.trace(spread) * np.eye(3) - spread + FIRST_NODE * np.eye(3)
+        turned = np.cross(x, moved).mean(axis=0)
+        return np.linalg.solve(A, turned + FIRST_NODE * (self.rotation[0] @ chain[0, 0:3]))
 
     def _moved(self, block: Block, d: np.ndarray, turn: np.ndarray) -> np.ndarray:
         """The value of a block of the border, moved by `d` in a world that turns by `turn`."""
