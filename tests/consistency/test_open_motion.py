@@ -44,7 +44,6 @@ def check(result: Calibration, simulation: Simulation) -> None:
     verdicts = np.concatenate([b.verdict for b in record.blocks])
     z = record.error / np.sqrt(np.diag(record.covariance))
     assert np.abs(z[verdicts != "undetermined"]).max(initial=0.0) < 4.0
-    assert sum(i.stage == "final" for i in result.iterations) < MOST_STEPS
 
 
 @pytest.mark.parametrize(
@@ -55,10 +54,15 @@ def check(result: Calibration, simulation: Simulation) -> None:
     ],
 )  # fmt: skip
 def test_what_is_known_is_right_and_nothing_creeps(motion: str, noise: float):
-    check(*calibrated(motion, noise, 1))
+    result, simulation = calibrated(motion, noise, 1)
+    check(result, simulation)
+    assert sum(i.stage == "final" for i in result.iterations) < MOST_STEPS
 
 
-@pytest.mark.parametrize(("motion", "seed"), [("single-axis", 1), ("single-axis", 3), ("standing", 1)])
+@pytest.mark.parametrize(
+    ("motion", "seed"),
+    [("single-axis", 1), ("single-axis", 3), pytest.param("standing", 1, marks=pytest.mark.statistical)],
+)
 def test_lenses_owe_to_the_guess_what_they_follow_it_by(motion: str, seed: int):
     """Time offsets that are all wrong together, or a robot that stands, moved lenses by up to 9 standard deviations."""
     check(*calibrated(motion, 10.0, seed, "free"))
