@@ -13,12 +13,13 @@ import argparse
 import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from icalib.montecarlo import Plan, Record, run_study
+from icalib.montecarlo.study import scenario_digest
 from icalib.simulation import Scenario, load_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -33,14 +34,13 @@ KNOWN = ("determined", "weak")
 def variant(motion: str, noise: float) -> Scenario:
     """The example's motion and sensors, in a recording that is short and thin."""
     scenario = load_scenario(ROOT / "examples" / "paper" / f"{motion}.yaml")
-    features, imu = scenario.features, scenario.imu_noise
+    features = scenario.features
     assert features is not None
-    densities = {f.name: noise * getattr(imu, f.name) for f in fields(imu) if isinstance(getattr(imu, f.name), float)}
     share = PER_IMAGE / features.per_image
     return replace(
         scenario,
         duration_s=SECONDS,
-        imu_noise=replace(imu, **densities),
+        imu_noise=scenario.imu_noise.scaled(noise),
         lidars=tuple(replace(x, azimuth_steps=AZIMUTH_STEPS) for x in scenario.lidars),
         features=replace(
             features, per_image=PER_IMAGE, count=round(share * features.count), lasting=round(share * features.lasting)
@@ -112,7 +112,10 @@ def main() -> None:
         for imu, noise in IMUS.items():
             plan = Plan(given.runs, 1, "drawn", workers=given.workers)
             name = f"{motion}, {imu}"
-            study = run_study(variant(motion, noise), name, name, given.output / name.replace(", ", "-"), plan)
+            size = f"{SECONDS} {AZIMUTH_STEPS} {PER_IMAGE}"
+            scenario = variant(motion, noise)
+            digest = scenario_digest(ROOT / "examples" / "paper" / f"{motion}.yaml", scenario) + f" {noise} {size}"
+            study = run_study(scenario, name, digest, given.output / name.replace(", ", "-"), plan)
             rows.append(summary(motion, imu, study.records))
             print(json.dumps({k: v for k, v in rows[-1].items() if k != "verdicts"}), flush=True)
     FOUND.write_text(json.dumps(rows, indent=1) + "\n")

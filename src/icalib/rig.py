@@ -43,6 +43,11 @@ class ImuNoise:
     accel_walk: float
     source: str = "rig file"  # or "default for a consumer IMU", printed with the result
 
+    def scaled(self, factor: float) -> ImuNoise:
+        """That of an IMU `factor` times as noisy."""
+        four = (self.gyro, self.gyro_walk, self.accel, self.accel_walk)
+        return ImuNoise(*(factor * density for density in four), source=self.source)
+
 
 @dataclass(frozen=True)
 class ImuSensor:

@@ -1,9 +1,9 @@
 """A robot with cameras, a LiDAR and wheels on motion that leaves much open: it converges without creeping, and what is
-called known is right. A hundred recordings of each motion are in `benchmarks/degeneracy.py`."""
+called known is right. `benchmarks/degeneracy.py` makes many recordings of each motion."""
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,12 +20,10 @@ MOST_STEPS = 40  # of all last passes together; with the world free to undo what
 def thin(motion: str, noise: float) -> Scenario:
     """Ten seconds of the example's motion with few points, and an IMU `noise` times as noisy as its data sheet says."""
     scenario = load_scenario(PAPER / f"{motion}.yaml")
-    imu = scenario.imu_noise
-    densities = {f.name: noise * getattr(imu, f.name) for f in fields(imu) if f.name != "source"}
     return replace(
         scenario,
         duration_s=10.0,
-        imu_noise=replace(imu, **densities),
+        imu_noise=scenario.imu_noise.scaled(noise),
         lidars=tuple(replace(x, azimuth_steps=300) for x in scenario.lidars),
         features=replace(scenario.features, per_image=30, count=450, lasting=60),
     )

@@ -7,13 +7,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from icalib.errors import EstimationError
 from icalib.estimation import guess_worth
 from icalib.estimation.guess_worth import moved_to_guess, moved_to_worth, owed_to_guess
 from icalib.estimation.state import State, make_layout
 
-TOLERANCE = {"rotation": 2e-3, "translation": 5e-3, "time_offset": 1e-3, "plane": 0.2}
+TOLERANCE = {"translation": 5e-3, "time_offset": 1e-3}
 SIGMA = {"translation": np.array([0.1, 0.2, 0.06]), "time_offset": np.array([0.02])}
-DRAWS = 20000
+DRAWS = 2000
 
 
 @pytest.fixture
@@ -43,7 +44,7 @@ def given(monkeypatch):
 def landed(given, rng) -> np.ndarray:
     """(DRAWS, 8) where what is held stands, for guesses drawn about the truth, which is 0."""
     out = []
-    for errors in given.sigma * rng.standard_normal((DRAWS // 10, 8)):
+    for errors in given.sigma * rng.standard_normal((DRAWS, 8)):
         guess = given.state.retract(given.problem.layout, np.zeros((2, 15)), errors)
         moved = (
             moved_to_worth(given.inputs, given.problem, given.state, guess)
@@ -93,8 +94,6 @@ def test_nothing_is_tried_out_where_the_guess_alone_leaves_all_open(given, monke
 
 
 def test_a_way_along_which_nothing_can_be_solved_is_made_shorter(given, monkeypatch):
-    from icalib.errors import EstimationError
-
     def short_only(problem, state, tolerance):
         if np.abs(state.values["b", "translation"]).max() > 0.02:
             raise EstimationError("too far")
@@ -111,7 +110,7 @@ def test_what_nobody_guessed_moves_no_further_than_the_data_leave_open(given):
     data = np.diag(np.full(8, 5e-3))
     data[0, 0] = 0.0
     given.problem.held = np.eye(8)[:, [0, 1]]  # of a, which is no sensor now
-    monkey = owed_to_guess(given.inputs, given.problem, given.state, data)
-    width = np.sqrt((monkey**2).sum(axis=0)) / given.problem.tolerance
+    shifts = owed_to_guess(given.inputs, given.problem, given.state, data)
+    width = np.sqrt((shifts**2).sum(axis=0)) / given.problem.tolerance
     assert width[0] == pytest.approx(guess_worth.UNGUESSED / 5e-3)
     assert width[1] == pytest.approx(min(guess_worth.UNGUESSED / 5e-3, 1.0 / np.sqrt(5e-3)))

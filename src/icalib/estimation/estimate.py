@@ -30,7 +30,7 @@ from icalib.estimation.prior_factor import Prior
 from icalib.estimation.problem import Problem
 from icalib.estimation.robot import RobotNoise, next_posing, next_ranging
 from icalib.estimation.sensors import chi2
-from icalib.estimation.solver import CONVERGED_DECREASE, ROUNDING, Outcome, Step, Visit, minimise
+from icalib.estimation.solver import CONVERGED_DECREASE, ROUNDING, Outcome, Step, Visit, minimise, way_come
 from icalib.estimation.state import State
 from icalib.estimation.tolerances import GUESS_SIGMA
 from icalib.rig import PoseSensor, Settings
@@ -138,7 +138,7 @@ def estimate(
         open_already = outcome.half_way and doubtful(problem, outcome.information)
         if last and (open_already or not after or not _again(inputs, outcome, judged, way)):
             return Estimate(outcome, judged, tuple(history))
-        way = _way(outcome) if last else np.inf
+        way = way_come(outcome.steps, outcome.cost) if last else np.inf
         judged = judged if last else judged.next(inputs, outcome, name == "first")
         state = _on_own_nodes(inputs, outcome.state)
         del problem, outcome  # before the next ones take as much memory
@@ -156,16 +156,11 @@ def _leaves(
 def _again(inputs: Inputs, outcome: Outcome, judged: Judged, way_before: float) -> bool:
     """Whether the last pass is to be made anew: what it froze, such as the weights of points on planes, is of a state
     far from its end, but nearer than in the last pass before, or tracks come back."""
-    return _is_far(_way(outcome), way_before) or _follows_more(inputs, outcome, judged)
+    return _is_far(way_come(outcome.steps, outcome.cost), way_before) or _follows_more(inputs, outcome, judged)
 
 
 def _is_far(way: float, way_before: float) -> bool:
     return FAR - 1.0 < way < NEARER * way_before
-
-
-def _way(outcome: Outcome) -> float:
-    """From where a pass began to its end, as a share of the chi^2 there; nothing where that is nothing."""
-    return outcome.steps[0].cost / outcome.cost - 1.0 if outcome.cost > 0.0 else 0.0
 
 
 def _follows_more(inputs: Inputs, outcome: Outcome, judged: Judged) -> bool:

@@ -16,7 +16,7 @@ from icalib.estimation.imu_model import N_INTRINSICS
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.problem import Problem
 from icalib.estimation.solver import minimise
-from icalib.estimation.state import State
+from icalib.estimation.state import Block, State
 from icalib.estimation.tolerances import FROM_NOTHING_M, GUESS_SIGMA, OTHER_SIGMA, UNGUESSED
 from icalib.geometry import planes, so3
 
@@ -42,7 +42,7 @@ def moved_to_worth(inputs: Inputs, problem: Problem, state: State, guess: State)
         return None
     sigma, way = _weights(inputs, problem), border_difference(problem, guess, state)
     # What nobody guessed moves along, but nothing turns: what little a turn moves would be paid for with all of it.
-    for block in (b for b in problem.layout.free if not inputs.is_sensor(b.sensor)):
+    for block in _unguessed(inputs):
         way[block.columns] = 0.0
     directions = problem.tolerance[:, None] * problem.held
     step = directions @ np.linalg.lstsq(directions / sigma[:, None], way / sigma, rcond=None)[0]
@@ -90,7 +90,7 @@ def _held_covariance(inputs: Inputs, problem: Problem) -> np.ndarray:
         scaled = problem.held * (problem.tolerance / _weights(inputs, problem))[:, None]
         return np.linalg.inv(scaled.T @ scaled)
     sigma = guess_sigma(inputs)
-    for block in (b for b in problem.layout.free if not inputs.is_sensor(b.sensor)):
+    for block in _unguessed(inputs):
         sigma[block.columns] = np.minimum(sigma[block.columns], UNGUESSED)
     scaled = problem.held * (sigma / problem.tolerance)[:, None]
     return scaled.T @ scaled
@@ -123,10 +123,15 @@ def _is_weighed(inputs: Inputs, problem: Problem) -> bool:
 def _weights(inputs: Inputs, problem: Problem) -> np.ndarray:
     """(B,) what guesses are worth against one another; what nobody guessed does not count, but where it turns."""
     sigma = guess_sigma(inputs)
-    for block in (b for b in problem.layout.free if not inputs.is_sensor(b.sensor)):
+    for block in _unguessed(inputs):
         if block.kind != "vector":
             sigma[block.columns[:2] if block.kind == "plane" else block.columns] = GUESS_SIGMA["rotation"]
     return sigma
+
+
+def _unguessed(inputs: Inputs) -> list[Block]:
+    """Of no sensor: walls, boards and frames, of which nobody guessed where they are."""
+    return [b for b in inputs.layout.free if not inputs.is_sensor(b.sensor)]
 
 
 def guess_sigma(inputs: Inputs) -> np.ndarray:

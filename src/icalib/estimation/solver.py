@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -81,6 +81,30 @@ class Draws:
         return cls(drawn[:FREE_DRAWS], drawn[FREE_DRAWS:])
 
 
+@dataclass
+class _Care:
+    """How steps are held back: by damping, and by weights alone in place of the true curvature of the loss, which the
+    sums have (`curved`) where a step promises less than `curved_below` of the cost."""
+
+    damping: float = 0.0
+    curved: bool = False
+    curved_below: float = CURVED_BELOW
+
+    def less(self, near: bool, good: bool) -> None:
+        """After a step that was taken, to sums that have the true curvature where `near`."""
+        self.curved = near
+        self.damping *= 0.1 if good else 1.0
+        self.damping = 0.0 if self.damping < ZERO_DAMPING else self.damping
+
+    def more(self) -> None:
+        """After one that failed: too far out for the true curvature, so weights alone, and only then more damping."""
+        if self.curved:
+            self.curved_below *= 0.1
+        else:
+            self.damping = max(self.damping * 10.0, 1e-6)
+        self.curved = False
+
+
 def minimise(
     problem: Problem,
     state: State,
@@ -102,65 +126,66 @@ def minimise(
     Raises EstimationError if no step can be computed at all.
     """
     pieces, residuals, early = problem.pieces(), problem.residuals(), tolerance > STALLED_DECREASE
-    cost = problem.linearise(state, pieces, residuals)
-    damping, curved, curved_below, stalled, steps = 0.0, False, CURVED_BELOW, 0, []
+    cost, care, stalled, steps = problem.linearise(state, pieces, residuals), _Care(), 0, list[Step]()
+
+    def note(decrease: float, accepted: bool) -> None:
+        steps.append(Step(cost, decrease, care.damping, accepted))
+        on_step(steps[-1])
+
     for _ in range(MAX_ITERATIONS):
         if not np.isfinite(cost):
             raise EstimationError(
                 "the first guess predicts no finite measurement; give a better guess in the rig file."
             )
-        solution, damping = _solve(problem, state, pieces, residuals, damping, curved)
+        solution, care.damping = _solve(problem, state, pieces, residuals, care.damping, care.curved)
         on_visit(Visit(state, solution.information))
-        way = (steps[0].cost if steps else cost) / cost - 1.0 if cost > 0.0 else 0.0
-        low = damping == 0.0 and solution.decrease < RESTING * HALF_WAY
-        asked = low and leaves is not None and leaves(way, solution.information)
+        free, enough = care.damping == 0.0, max(tolerance, share * cost)
+        low = free and solution.decrease < RESTING * HALF_WAY
+        asked = low and leaves is not None and leaves(way_come(steps, cost), solution.information)
         if asked and solution.decrease < HALF_WAY:
             left = _outcome(problem, state, cost, residuals, solution.decrease, steps, solution)
             return replace(left, half_way=True)
-        if not early and curved and damping == 0.0 and solution.decrease < min(ROUNDING * cost, LEAST_DECREASE):
+        if not early and care.curved and free and solution.decrease < min(ROUNDING * cost, LEAST_DECREASE):
             # Nothing that counts would change: the sums were those of the end already.
-            steps.append(Step(cost, solution.decrease, damping, True))
-            on_step(steps[-1])
+            note(solution.decrease, True)
             return _outcome(problem, state, cost, residuals, solution.decrease, steps, solution)
         candidate = state.retract(problem.layout, solution.chain, solution.border)
-        near = solution.decrease < curved_below * cost
-        enough = max(tolerance, share * cost)
-        converged = damping == 0.0 and solution.decrease < enough
+        near = solution.decrease < care.curved_below * cost
+        converged = free and solution.decrease < enough
         sums = not (converged and early)
         candidate_cost = problem.linearise(candidate, pieces, residuals, sums, near)
         if comes_back and sums and not (candidate_cost < cost or converged):
-            trial = problem, candidate, pieces, residuals, damping, near
+            trial = problem, candidate, pieces, residuals, care.damping, near
             candidate, candidate_cost = _corrected(*trial, candidate_cost, cost)
         # At the bottom rounding decides whether the cost falls; a step that promises this little is taken anyway, but
         # not where it goes far along what the data hardly tell, and the cost rises.
         accepted = bool(candidate_cost < cost) or (converged and candidate_cost - cost < enough)
-        steps.append(Step(cost, solution.decrease, damping, accepted))
-        on_step(steps[-1])
+        note(solution.decrease, accepted)
         if accepted:
-            good = cost - candidate_cost > 0.25 * solution.decrease
-            state, cost, curved = candidate, candidate_cost, near
-            problem = problem.settled(residuals)
-            damping = damping * (0.1 if good else 1.0)
-            damping = 0.0 if damping < ZERO_DAMPING else damping
+            care.less(near, cost - candidate_cost > 0.25 * solution.decrease)
+            state, cost, problem = candidate, candidate_cost, problem.settled(residuals)
         if converged:
             break
         if accepted:
             continue
         if asked:
-            return replace(_end(problem, state, cost, pieces, residuals, steps, curved, on_visit), half_way=True)
+            return replace(_end(problem, state, cost, pieces, residuals, steps, care.curved, on_visit), half_way=True)
         stalled += solution.decrease < STALLED_DECREASE
-        if stalled > MOST_STALLED or (early and solution.decrease < RESTING * max(tolerance, share * cost)):
+        if stalled > MOST_STALLED or (early and solution.decrease < RESTING * enough):
             break
-        # Too far out for the true curvature of the loss: weights alone, and only then more damping.
-        damping = damping if curved else max(damping * 10.0, 1e-6)
-        curved_below = curved_below * (0.1 if curved else 1.0)
-        curved = False
-        if damping > 1e6:
+        care.more()
+        if care.damping > 1e6:
             break
         cost = problem.linearise(state, pieces, residuals)
     if early:
         return _early_end(problem, state, cost, pieces, residuals, steps)
-    return _end(problem, state, cost, pieces, residuals, steps, curved, on_visit)
+    return _end(problem, state, cost, pieces, residuals, steps, care.curved, on_visit)
+
+
+def way_come(steps: Sequence[Step], cost: float) -> float:
+    """From where the first of `steps` began to half a chi^2 of `cost`, as a share of that; nothing where that is
+    nothing, or there is no step."""
+    return steps[0].cost / cost - 1.0 if steps and cost > 0.0 else 0.0
 
 
 def _corrected(problem, state, pieces, residuals, damping, curved, cost, least) -> tuple[State, float]:

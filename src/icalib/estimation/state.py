@@ -77,9 +77,8 @@ def make_layout(entries: list[Entry]) -> Layout:
     return Layout(tuple(blocks))
 
 
-FIRST_NODE = (
-    1e-4  # of the weight of planes, or of 1 m^2: where they show nothing, the world turns as the first node does
-)
+# Of the weight of planes, or of 1 m^2: where these show nothing, the world turns as the first node does.
+FIRST_NODE = 1e-4
 
 
 @dataclass(frozen=True)
@@ -112,7 +111,7 @@ class State:
         a board planes and trajectory turn by what turns them most alike.
         """
         turns = self._turns(layout, chain, border)
-        values = {b.key: self._moved(b, border[b.columns], turns[0]) for b in layout.free}
+        values = self.values | {b.key: self._moved(b, border[b.columns], turns[0]) for b in layout.free}
         R, p, v = np.empty_like(self.rotation), np.empty_like(self.position), np.empty_like(self.velocity)
         for turn, k in zip(turns, self.recordings, strict=True):
             Q = so3.exp(turn)
@@ -122,7 +121,6 @@ class State:
             R[k] = Q @ self.rotation[k] @ so3.exp_many(own_rotation)
             p[k] = (self.position[k] + own_position) @ Q.T
             v[k] = (self.velocity[k] + own_velocity) @ Q.T
-        values = self.values | values
         return replace(self, rotation=R, position=p, velocity=v, bias=self.bias + chain[:, 9:15], values=values)
 
     def _turns(self, layout: Layout, chain: np.ndarray, border: np.ndarray) -> list[np.ndarray]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -197,10 +197,7 @@ def handheld(
     exact: see `Motion`. noiseless: neither corners nor IMU have noise, though `rig_for` still states the sigmas.
     """
     scale = {"datasheet": 1.0, "noisy": 10.0}[imu]
-    noise = ImuNoise(
-        *(scale * d for d in (ADIS16448.gyro, ADIS16448.gyro_walk, ADIS16448.accel, ADIS16448.accel_walk)),
-        source="simulation",
-    )
+    noise = replace(ADIS16448.scaled(scale), source="simulation")
     epoch_ns = 1_403_715_273_262_142_976
     cam0 = SimCamera(
         "cam0",
