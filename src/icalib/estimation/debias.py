@@ -3,11 +3,17 @@
 A Jacobian that is taken at a noisy trajectory and noisy readings shows motion that was not there: where the truth is no
 information at all, J^T J shows some, which grows with the square of the noise. What noise adds is measured by adding
 it once more: S(x + d) - S(x), its mean over draws +-d of the trajectory's own posterior and of the IMU's noise.
+
+The posterior takes the readings between a node and an image, a sweep or a stamp for true; yet their noise turns the
+trajectory, too. With a noisy IMU it may do so as much as all that the posterior knows of. So where a first draw shows
+that noise counts, the trajectory follows noisier readings as the solver would have it, and what the posterior has of
+their noise already is taken off: with u and v where all measurements, or the factors between nodes alone, send it,
+S(x + d + u) - S(x + v), for draws are independent and what they add is quadratic.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -35,15 +41,45 @@ def spurious_information(problem: Problem, outcome: Outcome, seed: int = 0) -> n
     scaled = t[:, None] * outcome.information * t
     clear = np.linalg.eigvalsh(scaled).min(initial=np.inf) > CLEAR
     samples = (outcome.draws or posterior(problem, outcome.state)).still
-    found, room = [], problem.room()
-    for sample in samples[:1] if clear else samples:
-        imu = _reading_noise(problem.chain.imu, rng)
+    noise, first = _Noise(problem, outcome, problem.room()), _reading_noise(problem.chain.imu, rng)
+    found = noise.added(samples[0].chain, first)
+    if clear or _largest_share(t[:, None] * found * t, scaled) < SLIGHT:
+        return found
+    return np.mean([noise.followed(d.chain, _reading_noise(problem.chain.imu, rng)) for d in samples[1:]], axis=0)
+
+
+@dataclass(frozen=True)
+class _Noise:
+    """What noise adds to the border's information at an outcome; room: see Problem.room."""
+
+    problem: Problem
+    outcome: Outcome
+    room: tuple[Piece, ...] | None
+
+    def added(self, chain: np.ndarray, readings: np.ndarray | None) -> np.ndarray:
+        """(B, B) on average, where the trajectory is off by +-chain (K, 15), and the readings by as often that."""
+        state, n = self.outcome.state, np.zeros(self.problem.layout.size)
+        pair = []
         for sign in (1.0, -1.0):
-            found.append(_information(*_moved(problem, outcome.state, sign * sample.chain, sign * imu), room))
-        noise = np.mean(found, axis=0) - outcome.information
-        if _largest_share(t[:, None] * noise * t, scaled) < SLIGHT:
-            break
-    return np.mean(found, axis=0) - outcome.information
+            there = state.retract(self.problem.layout, sign * chain, n)
+            noisy = self.problem if readings is None else _with_noise(self.problem, there, sign * readings)
+            pair.append(_information(noisy, there, self.room))
+        return np.mean(pair, axis=0) - self.outcome.information
+
+    def followed(self, chain: np.ndarray, readings: np.ndarray) -> np.ndarray:
+        """(B, B), where the trajectory follows noise of the `readings` beside a draw `chain` (K, 15) of its posterior,
+        but that noise once."""
+        everywhere = _with_noise(self.problem, self.outcome.state, readings)
+        between_nodes = replace(self.problem, chain=everywhere.chain)
+        return self.added(chain + self._step(everywhere), readings) - self.added(self._step(between_nodes), None)
+
+    def _step(self, problem: Problem) -> np.ndarray:
+        """(K, 15) where the solver would move the chain alone."""
+        pieces = self.room or problem.pieces()
+        problem.linearise(self.outcome.state, pieces, problem.residuals(), curved=True)
+        factors = solve(pieces, problem.n_nodes, problem.tolerance).factors
+        border = np.append(np.zeros(problem.layout.size), 1.0)[:, None]
+        return factors.back(border, [np.zeros((n, 1)) for n in factors.rows()])[:, :, 0]
 
 
 def _largest_share(noise: np.ndarray, information: np.ndarray) -> float:
@@ -69,14 +105,13 @@ def _reading_noise(imu: ImuData, rng: np.random.Generator) -> np.ndarray:
     return density / np.sqrt(dt) * rng.standard_normal((len(imu.seconds), 6))
 
 
-def _moved(problem: Problem, state: State, chain: np.ndarray, readings: np.ndarray) -> tuple[Problem, State]:
-    """The problem with noisier readings, and the state with its chain moved."""
+def _with_noise(problem: Problem, state: State, readings: np.ndarray) -> Problem:
+    """The problem with noisier readings, everywhere, for the bias of `state`."""
     assert isinstance(problem.chain, ImuFactor)
-    state = state.retract(problem.layout, chain, np.zeros(problem.layout.size))
     old = problem.chain.imu
     imu = replace(old, gyro=old.gyro + readings[:, :3], accel=old.accel + readings[:, 3:])
     factor = ImuFactor.build(imu, state, problem.chain.gravity, problem.chain.columns)
     cameras = tuple(replace(c, imu=imu) for c in problem.cameras)
     features = None if problem.features is None else replace(problem.features, cameras=cameras)
     sensors = tuple(s.with_imu(imu) for s in problem.sensors)
-    return replace(problem, chain=factor, cameras=cameras, features=features, sensors=sensors), state
+    return replace(problem, chain=factor, cameras=cameras, features=features, sensors=sensors)
