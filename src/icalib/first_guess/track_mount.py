@@ -40,6 +40,7 @@ BENDS = 2.0  # standard deviations, from where on a ray counts less
 ANGLES = 24  # about the axis that the robot turns about most
 FOLLOWED = 4  # starts
 EVERY = 6  # of the pairs that say which start is best
+ENOUGH = 1e-4  # of the cost, by which a step still lowers it
 ROUNDS = 3  # of taking motion and lens anew, where they have come to
 MOST_RAYS = 0.75  # of which LARGEST_MISS is asked: points that were followed wrongly are fewer
 LARGEST_MISS = 0.01  # rad
@@ -131,18 +132,21 @@ def _slope(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _misses(f, h, begin, R, b, e):
+def _misses(f, h, f_by, h_by, bent, begin, R, b, e):
     """e (n,): by how far rays f, turned by R (m, 3, 3), and h of each pair miss each other, rad, where the camera of f
-    stands at b (m, 3), seen from that of h. Rays that would meet nearer than NEAREST_M, or behind a camera, miss by as
+    stands at b (m, 3), seen from that of h, and the lens is bent by (L,) of the slopes f_by, h_by (L, n, 3). Rays that would meet nearer than NEAREST_M, or behind a camera, miss by as
     much of the angle between them, too: else a camera that does not move at all would fit best."""
     for k in range(len(begin) - 1):
         size = np.sqrt(b[k, 0] * b[k, 0] + b[k, 1] * b[k, 1] + b[k, 2] * b[k, 2]) + 1e-9
         t0, t1, t2 = b[k, 0] / size, b[k, 1] / size, b[k, 2] / size
         for i in range(begin[k], begin[k + 1]):
-            g0 = R[k, 0, 0] * f[i, 0] + R[k, 0, 1] * f[i, 1] + R[k, 0, 2] * f[i, 2]
-            g1 = R[k, 1, 0] * f[i, 0] + R[k, 1, 1] * f[i, 1] + R[k, 1, 2] * f[i, 2]
-            g2 = R[k, 2, 0] * f[i, 0] + R[k, 2, 1] * f[i, 1] + R[k, 2, 2] * f[i, 2]
-            h0, h1, h2 = h[i, 0], h[i, 1], h[i, 2]
+            f0, f1, f2, h0, h1, h2 = f[i, 0], f[i, 1], f[i, 2], h[i, 0], h[i, 1], h[i, 2]
+            for j in range(len(bent)):
+                f0, f1, f2 = f0 + bent[j] * f_by[j, i, 0], f1 + bent[j] * f_by[j, i, 1], f2 + bent[j] * f_by[j, i, 2]
+                h0, h1, h2 = h0 + bent[j] * h_by[j, i, 0], h1 + bent[j] * h_by[j, i, 1], h2 + bent[j] * h_by[j, i, 2]
+            g0 = R[k, 0, 0] * f0 + R[k, 0, 1] * f1 + R[k, 0, 2] * f2
+            g1 = R[k, 1, 0] * f0 + R[k, 1, 1] * f1 + R[k, 1, 2] * f2
+            g2 = R[k, 2, 0] * f0 + R[k, 2, 1] * f1 + R[k, 2, 2] * f2
             c0, c1, c2 = g1 * h2 - g2 * h1, g2 * h0 - g0 * h2, g0 * h1 - g1 * h0
             tg, th = t0 * g0 + t1 * g1 + t2 * g2, t0 * h0 + t1 * h1 + t2 * h2
             off = (t0 * c0 + t1 * c1 + t2 * c2) / np.sqrt(max(2.0 - tg * tg - th * th, 1e-4))
@@ -189,9 +193,9 @@ class _Seen:
         (R1, at1), (R2, at2) = _after(self.first, x[6]), _after(self.second, x[6])
         back = mount.rotation.T @ R2.transpose(0, 2, 1)
         b = np.einsum("nij,nj->ni", back, at1 - at2 + R1 @ p) - mount.rotation.T @ p
-        f, h = self.f + np.tensordot(x[7:], self.f_by, 1), self.h + np.tensordot(x[7:], self.h_by, 1)
-        e = np.empty(len(f))
-        _misses(f, h, self.followed.begin, np.ascontiguousarray(back @ R1 @ mount.rotation), b, e)
+        R = np.ascontiguousarray(back @ R1 @ mount.rotation)
+        e = np.empty(len(self.f))
+        _misses(self.f, self.h, self.f_by, self.h_by, x[MOUNTED:], self.followed.begin, R, b, e)
         return e
 
     @property
@@ -227,7 +231,7 @@ class _Seen:
         now = np.append(np.zeros(len(free) - n), np.clip(self.at.bent, -0.99 * MOST_BENT, 0.99 * MOST_BENT))
         result = least_squares(
             residuals, np.zeros(len(free)), bounds=(-most - now, most - now), loss=loss,
-            f_scale=BENDS / np.sqrt(ALIKE), max_nfev=20,
+            f_scale=BENDS / np.sqrt(ALIKE), max_nfev=20, ftol=ENOUGH,
         )  # fmt: skip
         return self.at.moved(step(result.x)), result
 

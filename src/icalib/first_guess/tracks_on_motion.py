@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import numpy as np
 
+from icalib.estimation.arrowhead import THREADS
 from icalib.estimation.assembly import motion_of
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.state import Key, State
@@ -26,14 +28,15 @@ def track_camera_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
 
     Raises EstimationError where neither does.
     """
-    out: dict[Key, np.ndarray] = {}
-    for number, camera in enumerate(inputs.rig.cameras):
+
+    def values(number: int) -> dict[Key, np.ndarray]:
+        camera = inputs.rig.cameras[number]
         lens, known = lens_start(camera), given(inputs, camera, NAMES)
-        out |= {(camera.name, "intrinsics"): lens[:4], (camera.name, "distortion"): lens[4:]}
-        if len(known) < len(NAMES):
-            out |= _placed(inputs, state, number)
-        out |= known
-    return out
+        guessed = {(camera.name, "intrinsics"): lens[:4], (camera.name, "distortion"): lens[4:]}
+        return guessed | (_placed(inputs, state, number) if len(known) < len(NAMES) else {}) | known
+
+    with ThreadPoolExecutor(THREADS) as pool:  # its own: what it does may use the solver's
+        return {k: v for own in pool.map(values, range(len(inputs.rig.cameras))) for k, v in own.items()}
 
 
 def _placed(inputs: Inputs, state: State, number: int) -> dict[Key, np.ndarray]:
