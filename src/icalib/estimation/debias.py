@@ -13,10 +13,12 @@ S(x + d + u) - S(x + v), for draws are independent and what they add is quadrati
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from scipy.stats import t as student_t
 
 from icalib.estimation.arrowhead import HELD_BELOW, Piece, solve
 from icalib.estimation.imu_data import ImuData
@@ -27,15 +29,40 @@ from icalib.estimation.state import State
 
 CLEAR = 10.0  # information in tolerance units: where all is known to a third of a tolerance, one pair will do
 SLIGHT = 0.05  # of the information: where one pair finds less noise than this, it will do, too
+FEW = 3  # draws at first
+SURE = 0.999  # probability that noise adds no more than is allowed for
 
 
-def spurious_information(problem: Problem, outcome: Outcome, seed: int = 0) -> np.ndarray:
-    """(B, B) what noise adds to the border's marginal information, on average; zeros where there is no IMU.
+@dataclass(frozen=True)
+class Spurious:
+    """What noise adds to the border's marginal information: of each draw, both signs together (n, B, B)."""
+
+    each: np.ndarray
+
+    @property
+    def mean(self) -> np.ndarray:
+        """(B, B)"""
+        return self.each.mean(axis=0)
+
+    def chance(self, directions: np.ndarray) -> np.ndarray:
+        """(m,) by how much more than the mean noise may have added in this one recording, along directions (B, m);
+        nothing where one draw was enough."""
+        n = len(self.each)
+        if n == 1:
+            return np.zeros(directions.shape[1])
+        along = np.einsum("ik,nij,jk->nk", directions, self.each, directions)
+        return float(student_t.ppf(SURE, n - 1)) * np.sqrt(1.0 + 1.0 / n) * along.std(axis=0, ddof=1)
+
+
+def spurious_information(
+    problem: Problem, outcome: Outcome, enough: Callable[[Spurious], bool] = lambda _: True, seed: int = 0
+) -> Spurious:
+    """What noise adds; zeros where there is no IMU. Where it counts, a few draws, more where these are not `enough`.
 
     Raises arrowhead.NotDefiniteError where the chain is not determined.
     """
     if not isinstance(problem.chain, ImuFactor):
-        return np.zeros_like(outcome.information)
+        return Spurious(np.zeros((1, *outcome.information.shape)))
     rng = np.random.default_rng(seed)
     t = problem.tolerance
     scaled = t[:, None] * outcome.information * t
@@ -44,8 +71,13 @@ def spurious_information(problem: Problem, outcome: Outcome, seed: int = 0) -> n
     noise, first = _Noise(problem, outcome, problem.room()), _reading_noise(problem.chain.imu, rng)
     found = noise.added(samples[0].chain, first)
     if clear or _largest_share(t[:, None] * found * t, scaled) < SLIGHT:
-        return found
-    return np.mean([noise.followed(d.chain, _reading_noise(problem.chain.imu, rng)) for d in samples[1:]], axis=0)
+        return Spurious(found[None])
+    each: list[np.ndarray] = []
+    for some in (samples[1 : 1 + FEW], samples[1 + FEW :]):
+        each += [noise.followed(d.chain, _reading_noise(problem.chain.imu, rng)) for d in some]
+        if enough(Spurious(np.array(each))):
+            break
+    return Spurious(np.array(each))
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
 from icalib.estimation.arrowhead import HELD_BELOW, restricted_inverse
 from icalib.estimation.assembly import given_priors
-from icalib.estimation.debias import spurious_information
+from icalib.estimation.debias import Spurious, spurious_information
 from icalib.estimation.estimate import Estimate, Judged, OnVisit, estimate
 from icalib.estimation.guess_worth import moved_to_guess, moved_to_worth, owed_to_guess
 from icalib.estimation.inputs import Inputs
@@ -25,7 +27,7 @@ from icalib.estimation.problem import Problem
 from icalib.estimation.solver import Outcome, Step
 from icalib.estimation.state import Key, State
 
-SPURIOUS_SHARE = 0.5  # a direction most of whose information is noise is not determined either
+SPURIOUS_SHARE = 0.5  # a direction most of whose information is noise is in doubt: by chance all of it may be
 MOST_ROUNDS, LATE = 4, 3
 DOUBTFUL = 0.25  # information in tolerance units
 ALIKE = 0.7  # cosine of the largest angle between what is held and what is to be: the rest finds its place about it
@@ -35,13 +37,14 @@ ALIKE = 0.7  # cosine of the largest angle between what is held and what is to b
 class Determined:
     """An estimate and what is known of its border.
 
-    data (B, B): information of the data alone in tolerance units, without priors and without what noise makes of it;
-    held (B, m): orthonormal directions in tolerance units, those that are undetermined; shifts (m, B): how all moves
-    with each independent error of the guess along them.
+    data, noise (B, B): information of the data alone in tolerance units, without priors and without what noise makes of
+    it, and that; held (B, m): orthonormal directions in tolerance units, those that are undetermined; shifts (m, B):
+    how all moves with each independent error of the guess along them.
     """
 
     estimate: Estimate
     data: np.ndarray
+    noise: np.ndarray
     held: np.ndarray
     shifts: np.ndarray
 
@@ -49,15 +52,22 @@ class Determined:
     def covariance(self) -> np.ndarray:
         """(B, B), priors included: of what is determined, and how it moves with what is held."""
         t = self.estimate.problem.tolerance
-        return t[:, None] * restricted_inverse(self.estimate.outcome.information * t[:, None] * t, self.held) * t + (
-            self.shifts.T @ self.shifts
-        )
+        known = t[:, None] * self.estimate.outcome.information * t - self.noise
+        return t[:, None] * _scatter(known, self.noise, self.held) * t + self.shifts.T @ self.shifts
 
     @property
     def spread(self) -> np.ndarray:
         """(B,) standard deviations in tolerances that the data alone give."""
         t = self.estimate.problem.tolerance
-        return np.sqrt(np.diag(restricted_inverse(self.data, self.held)) + ((self.shifts / t) ** 2).sum(axis=0))
+        alone = _scatter(self.data, self.noise, self.held)
+        return np.sqrt(np.diag(alone) + ((self.shifts / t) ** 2).sum(axis=0))
+
+
+def _scatter(known: np.ndarray, noise: np.ndarray, held: np.ndarray) -> np.ndarray:
+    """(B, B) covariance where J^T J is `known` + `noise`: J^T r scatters by all of it, but only what is known of it
+    leads back (errors in variables; Fuller, Measurement Error Models, 1987, chapter 1)."""
+    inverse = restricted_inverse(known, held)
+    return inverse @ (known + noise) @ inverse
 
 
 def determine(
@@ -74,7 +84,7 @@ def determine(
     """
     wanted = replace(start, values=start.values | (guess or {}))
     found = estimate(inputs, start, on_step, on_visit=on_visit, doubtful=_is_doubtful)
-    data, undetermined = _judge(inputs, found.outcome)
+    data, noise, undetermined = _judge(inputs, found.outcome)
     for k in range(MOST_ROUNDS):
         if _is_settled(undetermined, found.problem.held, k >= LATE) and not found.outcome.half_way:
             break
@@ -83,17 +93,17 @@ def determine(
         begin, judged = moved_to_guess(found.problem, state, wanted, undetermined), _worth_keeping(found)
         del found  # before the next one takes as much memory
         found = estimate(inputs, begin, on_step, undetermined, on_visit, judged)
-        data, undetermined = _judge(inputs, found.outcome)
+        data, noise, undetermined = _judge(inputs, found.outcome)
     for _ in range(MOST_ROUNDS):
         begin = moved_to_worth(inputs, found.problem, found.outcome.state, wanted)
         if begin is None:
             break
         found = estimate(inputs, begin, on_step, found.problem.held, on_visit, _worth_keeping(found))
-        data, _ = _judge(inputs, found.outcome)
+        data, noise, _ = _judge(inputs, found.outcome)
     if not found.problem.held.size:
-        return Determined(found, data, np.zeros((inputs.layout.size, 0)), np.zeros((0, inputs.layout.size)))
+        return Determined(found, data, noise, np.zeros((inputs.layout.size, 0)), np.zeros((0, inputs.layout.size)))
     shifts = owed_to_guess(inputs, found.problem, found.outcome.state, data)
-    return Determined(found, data, found.problem.held, shifts)
+    return Determined(found, data, noise, found.problem.held, shifts)
 
 
 def _worth_keeping(found: Estimate) -> Judged | None:
@@ -121,21 +131,38 @@ def _is_settled(undetermined: np.ndarray, held: np.ndarray, late: bool) -> bool:
     return bool(inside and (n == m or late))
 
 
-def _judge(inputs: Inputs, outcome: Outcome) -> tuple[np.ndarray, np.ndarray]:
-    """Information (B, B) of the data alone, and the directions (B, m) that it leaves open, both in tolerance units.
+def _judge(inputs: Inputs, outcome: Outcome) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Information (B, B) of the data alone, what noise adds to it, and the directions (B, m) that are left open, all in
+    tolerance units.
 
     Nuisances whose priors belong to the model (a target's shape, bloom) are open only where these priors are, too.
     """
     problem = outcome.problem
     t = problem.tolerance
-    noise = spurious_information(problem, outcome)
     asked = _without(outcome.information, given_priors(inputs), outcome.state)
-    scaled = t[:, None] * asked * t
-    values, vectors = np.linalg.eigh(scaled - t[:, None] * noise * t)
-    raw = np.einsum("ik,ij,jk->k", vectors, scaled, vectors)
-    open_ones = (values < HELD_BELOW) | (values < SPURIOUS_SHARE * raw)
+    shown = partial(_shown, t[:, None] * asked * t, t)
+    spurious = spurious_information(problem, outcome, lambda found: not shown(found).in_doubt.any())
+    seen, noise = shown(spurious), spurious.mean
     data = _without(outcome.information - noise, problem.priors, outcome.state)
-    return t[:, None] * data * t, vectors[:, open_ones]
+    return t[:, None] * data * t, t[:, None] * noise * t, seen.vectors[:, seen.nothing | seen.in_doubt]
+
+
+class _Shown(NamedTuple):
+    """Directions vectors (B, B) in tolerance units, of which the data show `nothing` (B,), or what may be `in_doubt`
+    (B,) noise in all of it."""
+
+    vectors: np.ndarray
+    nothing: np.ndarray
+    in_doubt: np.ndarray
+
+
+def _shown(asked: np.ndarray, tolerance: np.ndarray, spurious: Spurious) -> _Shown:
+    """Of the information asked (B, B), in tolerance units, noise and all."""
+    values, vectors = np.linalg.eigh(asked - tolerance[:, None] * spurious.mean * tolerance)
+    all_of_it = np.einsum("ik,ij,jk->k", vectors, asked, vectors)
+    nothing = values < HELD_BELOW
+    maybe = values < spurious.chance(tolerance[:, None] * vectors)
+    return _Shown(vectors, nothing, ~nothing & maybe & (values < SPURIOUS_SHARE * all_of_it))
 
 
 def _without(information: np.ndarray, priors: Sequence[Prior], state: State) -> np.ndarray:

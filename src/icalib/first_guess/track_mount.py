@@ -134,8 +134,9 @@ def _slope(
 @njit(cache=True, nogil=True, error_model="numpy")
 def _misses(f, h, f_by, h_by, bent, begin, R, b, e):
     """e (n,): by how far rays f, turned by R (m, 3, 3), and h of each pair miss each other, rad, where the camera of f
-    stands at b (m, 3), seen from that of h, and the lens is bent by (L,) of the slopes f_by, h_by (L, n, 3). Rays that would meet nearer than NEAREST_M, or behind a camera, miss by as
-    much of the angle between them, too: else a camera that does not move at all would fit best."""
+    stands at b (m, 3), seen from that of h, and the lens is bent by (L,) of the slopes f_by, h_by (L, n, 3). Rays that
+    would meet nearer than NEAREST_M, or behind a camera, miss by as much of the angle between them, too: else a camera
+    that does not move at all would fit best."""
     for k in range(len(begin) - 1):
         size = np.sqrt(b[k, 0] * b[k, 0] + b[k, 1] * b[k, 1] + b[k, 2] * b[k, 2]) + 1e-9
         t0, t1, t2 = b[k, 0] / size, b[k, 1] / size, b[k, 2] / size
