@@ -19,7 +19,7 @@ from icalib.estimation.imu_factor import ImuFactor
 from icalib.estimation.imu_model import N_INTRINSICS
 from icalib.estimation.inputs import Inputs, origin_difference
 from icalib.estimation.lidar_sweep import Motion
-from icalib.estimation.nodes import MERGED_WITHIN_S, SLACK, distinct, first_nodes, place_nodes, usable
+from icalib.estimation.nodes import MERGED_WITHIN_S, distinct, first_nodes, place_nodes, usable
 from icalib.estimation.poses import assign_nodes, poses_at
 from icalib.estimation.prior_factor import Prior
 from icalib.estimation.problem import ChainFactor, Problem
@@ -28,7 +28,6 @@ from icalib.estimation.sensors import SensorFactor
 from icalib.estimation.state import Key, Layout, State
 from icalib.estimation.surfaces import Surfaces
 from icalib.geometry.cameras import camera_model
-from icalib.measurements import WheelPoses
 from icalib.rig import Camera, Parameter, Rig, Scheme
 
 BLOOM_SIGMA_PX = 1.0
@@ -81,35 +80,14 @@ def image_times(inputs: Inputs, values: dict[Key, np.ndarray]) -> list[np.ndarra
 
 
 def host_times(inputs: Inputs, values: dict[Key, np.ndarray]) -> list[np.ndarray]:
-    """Instants that nodes are placed at, by sensor, seconds on the body's clock since its first stamp: those of wheels
-    that report relative poses, else those of images, or without cameras those of scans, or without either those of
-    poses, as many as are needed."""
-    tight = _ends_of_wheel_poses(inputs, values)
-    if tight is not None:
-        return [tight]
+    """Instants that nodes are placed at, by sensor, seconds on the body's clock since its first stamp: those of images,
+    or without cameras those of scans, or without either those of poses, as many as are needed."""
     if inputs.rig.cameras:
         return image_times(inputs, values)
     if inputs.rig.lidars:
         return [instants(x, values) for x in inputs.measurements.lidars]
     first = inputs.measurements.poses[0]
     return [instants(first, values, thinned(first.seconds, POSE_NODES_S))]
-
-
-def _ends_of_wheel_poses(inputs: Inputs, values: dict[Key, np.ndarray]) -> np.ndarray | None:
-    """Where wheels report relative poses, their stamps, and the images before and after these. Sideways such a pose
-    may be good to 0.01 mm, which is what the IMU loses in 20 ms: at its ends there must be nodes, and none between, as
-    it hangs on neighbours. All else is content with the nearest one. None where no poses are that close together.
-    """
-    settings = inputs.rig.settings
-    if inputs.imu is None or settings.scheme != "inertial" or settings.nodes != "every-image":
-        return None
-    for stream in inputs.measurements.wheels:
-        close = np.median(np.diff(stream.seconds)) <= (1.0 + SLACK) * settings.node_spacing_s
-        if isinstance(stream, WheelPoses) and (stream.name, "time_offset") in values and close:
-            times = instants(stream, values)
-            images = image_times(inputs, values)
-            return np.concatenate([times, *(t[(t < times[0]) | (t > times[-1])] for t in images)])
-    return None
 
 
 def thinned(times: np.ndarray, apart: float) -> np.ndarray:

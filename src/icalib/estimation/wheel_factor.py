@@ -26,6 +26,7 @@ from icalib.estimation.poses import Poses, motion_at, poses_at
 from icalib.estimation.row_sums import Into, Weighing, add_rows
 from icalib.estimation.sensors import Whitened
 from icalib.estimation.state import Layout, State
+from icalib.estimation.wheel_carry import carried_noise
 from icalib.estimation.wheel_drives import KINDS, N_DRIVE, UNITS, Kinds, coefficients
 from icalib.estimation.wheel_intervals import (
     Instants,
@@ -193,10 +194,16 @@ class RelativePoseFactor:
     def of_poses(
         cls, stream: WheelPoses, imu: ImuData, gravity: float, noise: WheelNoise, layout: Layout, state: State
     ) -> RelativePoseFactor:
-        """Of relative poses that were measured as such: they say nothing of radii and baseline."""
-        found = pose_intervals(imu, state.seconds, state.starts, instants(stream, state.values))
-        k = found.first
-        W = np.linalg.inv(np.linalg.cholesky(stream.covariance[k]))
+        """Of relative poses that were measured as such: they say nothing of radii and baseline. What the IMU loses from
+        the nodes to their ends is part of their noise."""
+        times = instants(stream, state.values)
+        found = pose_intervals(imu, state.seconds, state.starts, times)
+        k, ends = found.first, [(found.node, times[found.first]), (found.node + 1, times[found.last])]
+        first, last = (poses_at("inertial", t, node, state, imu, gravity, False) for node, t in ends)
+        away = np.stack([np.abs(t - state.seconds[node]) for node, t in ends], axis=1)
+        wheels = _wheels(stream.name, state, cls.kind)
+        covariance = stream.covariance[k] + carried_noise(first, last, away, wheels.R, wheels.p, imu)
+        W = np.linalg.inv(np.linalg.cholesky(covariance))
         poses = RelativePoses(stream.pose[k], np.zeros((len(k), 3, 3)), W, np.zeros(3))
         return cls(stream.name, stream.seconds, found, poses, imu, gravity, noise, layout)
 
