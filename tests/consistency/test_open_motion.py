@@ -44,6 +44,18 @@ def check(result: Calibration, simulation: Simulation) -> None:
     assert np.abs(z[verdicts != "undetermined"]).max(initial=0.0) < 4.0
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_free_motion_shows_all_clocks_to_a_noisy_imu(seed: int):
+    """Most of the information on the clocks of all sensors against the IMU is noise, yet what is left shows them: held
+    at the guess, 20 ms off, they would turn all else, and the gyroscope's residuals say so."""
+    result, simulation = calibrated("table2-3d", 10.0, seed)
+    check(result, simulation)
+    assert not result.undetermined
+    assert all(g.std_formal.max() < 2e-3 for g in result.groups if g.name == "time_offset")
+    (gyro,) = (f for f in result.fits if f.kind == "gyroscope")
+    assert gyro.chi2 / gyro.dof < 1.5
+
+
 @pytest.mark.parametrize(
     ("motion", "noise"),
     [

@@ -1,0 +1,56 @@
+"""What is in doubt because noise may have made it, and what noise in the Jacobians does to the rest."""
+
+import numpy as np
+import pytest
+
+from icalib.estimation.debias import Spurious
+from icalib.estimation.determination import _scatter, _shown
+
+DIRECTIONS = np.linalg.qr(np.random.default_rng(0).standard_normal((4, 4)))[0]
+TOLERANCE = np.array([1e-3, 0.1, 2.0, 0.5])
+NOTHING = np.zeros((2, 0))
+
+
+def spurious(*scatter: float) -> Spurious:
+    """Seven draws of noise, 6 on average along each of DIRECTIONS, in tolerance units, and with this scatter."""
+    unit = np.linspace(-1.5, 1.5, 7)
+    along = 6.0 + (unit / unit.std(ddof=1))[:, None] * np.array(scatter)
+    return Spurious(np.einsum("ik,nk,jk->nij", DIRECTIONS, along, DIRECTIONS) / np.outer(TOLERANCE, TOLERANCE))
+
+
+def test_only_what_may_be_noise_by_chance_is_in_doubt():
+    """Beside noise of 6 there are 3 that it hardly reaches, 2 that it may, 7 that it may but that are most of it, and
+    next to nothing."""
+    asked = DIRECTIONS @ np.diag([9.0, 8.0, 13.0, 6.001]) @ DIRECTIONS.T
+    seen = _shown(asked, TOLERANCE, spurious(0.1, 2.0, 2.0, 0.1))
+    along = (DIRECTIONS.T @ seen.vectors) ** 2
+    np.testing.assert_allclose(along @ seen.in_doubt, [0.0, 1.0, 0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(along @ seen.nothing, [0.0, 0.0, 0.0, 1.0], atol=1e-9)
+
+
+@pytest.mark.parametrize("n", [3, 7])
+def test_noise_adds_more_than_is_allowed_for_once_in_a_thousand(n: int):
+    rng, more = np.random.default_rng(1), 0
+    for _ in range(20_000):
+        *draws, this = rng.standard_normal(n + 1)
+        found = Spurious(np.reshape(draws, (n, 1, 1)))
+        more += this > found.mean[0, 0] + found.chance(np.eye(1))[0]
+    assert 8 <= more <= 34  # 20 are expected; one study in a thousand has fewer or more
+
+
+def test_one_draw_was_enough_and_allows_for_nothing():
+    np.testing.assert_array_equal(Spurious(np.ones((1, 2, 2))).chance(np.eye(2)), 0.0)
+
+
+def test_the_covariance_is_that_of_a_regression_with_noisy_regressors():
+    """y = X b + noise of 1, X seen with noise: b from what the normal equations have, less the noise of X in them."""
+    rng, n, sigma = np.random.default_rng(2), 5000, np.array([0.5, 1.0])
+    X = rng.standard_normal((n, 2)) @ np.array([[1.0, 0.4], [0.0, 0.6]])
+    known, noise = X.T @ X, n * np.diag(sigma**2)
+    found = []
+    for _ in range(2500):
+        seen = X + sigma * rng.standard_normal((n, 2))
+        found.append(np.linalg.solve(seen.T @ seen - noise, seen.T @ rng.standard_normal(n)))
+    said, formal = _scatter(known, noise, NOTHING), np.linalg.inv(known + noise)
+    np.testing.assert_allclose(np.cov(np.array(found).T), said, rtol=0.12)
+    assert (np.diag(said) > 2.0 * np.diag(formal)).all()
