@@ -23,7 +23,8 @@ MOST_STALLED = 4  # steps this small that fail before the solver rests
 COMES_BACK = 0.25  # of what a step costs too much, where its error is of second order: this much at most is left next
 ACROSS = 1e-6  # damping of a step that comes back: across a valley, not along it
 RESTING = 20.0  # times the tolerance of an early pass: a step that promises less and fails ends it
-FREE_DRAWS, STILL_DRAWS = 2, 8  # from the posterior, for what is made of the outcome
+FREE_DRAWS, STILL_DRAWS = 2, 3  # from the posterior, for what is made of the outcome
+MORE_STILL = 5  # for where these leave doubt; drawn later, so that the first stay what they are
 FIRST_DAMPING = 1e-8
 ZERO_DAMPING = 1e-10  # below this, none: the weak information of a planar drive must not be swamped
 LEAST_DECREASE = 2e-5  # of half the chi^2: a step of 0.006 standard deviations, not worth a relinearisation
@@ -77,7 +78,8 @@ class Draws:
     @classmethod
     def of(cls, solution: Solution) -> Draws:
         """From what was solved last, the pieces as the solve left them."""
-        drawn = solution.factors.draws(np.random.default_rng(0), FREE_DRAWS, STILL_DRAWS)
+        rng, factors = np.random.default_rng(0), solution.factors
+        drawn = factors.draws(rng, FREE_DRAWS, STILL_DRAWS) + factors.draws(rng, 0, MORE_STILL)
         return cls(drawn[:FREE_DRAWS], drawn[FREE_DRAWS:])
 
 
