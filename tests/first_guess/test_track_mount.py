@@ -174,9 +174,8 @@ def test_rays_that_meet_before_both_cameras_miss_nothing():
     e, begin = np.empty(50), np.array([0, 50])
     _misses(f, h, *STIFF, begin, R[None], b[None], e)
     assert np.abs(e).max() < 1e-12
-    _misses(
-        f, h, *STIFF, begin, R[None], -b[None], e
-    )  # the other way they meet behind, and the angle between them counts
+    # The other way they meet behind, and the angle between them counts.
+    _misses(f, h, *STIFF, begin, R[None], -b[None], e)
     angle = np.linalg.norm(np.cross(f @ R.T, h), axis=1)
     np.testing.assert_allclose(e, np.sqrt(0.5) * angle, atol=1e-12)
     _misses(f, h, *STIFF, begin, R[None], 1e-3 * b[None], e)  # a way a thousandth as long: some meet too near

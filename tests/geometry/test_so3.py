@@ -53,6 +53,8 @@ def differences(function: Callable[[np.ndarray], np.ndarray], step: float = 2e-4
 def test_hat_is_the_cross_product() -> None:
     v, w = np.array([0.3, -1.2, 2.0]), np.array([-0.7, 0.4, 1.1])
     np.testing.assert_allclose(so3.hat(v) @ w, np.cross(v, w), rtol=1e-15)
+    many = np.array([[v, w], [w, 2.0 * v]])
+    np.testing.assert_allclose(so3.hat_many(many) @ w, np.cross(many, w), rtol=1e-15, atol=1e-15)
 
 
 @pytest.mark.parametrize("angle", [*ANGLES, 4.0, 2 * pi, 10.0])

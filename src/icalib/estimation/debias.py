@@ -55,7 +55,7 @@ class Spurious:
 
 
 def spurious_information(
-    problem: Problem, outcome: Outcome, enough: Callable[[Spurious], bool] = lambda _: True, seed: int = 0
+    problem: Problem, outcome: Outcome, enough: Callable[[Spurious], bool] = lambda _: True
 ) -> Spurious:
     """What noise adds; zeros where there is no IMU. Where it counts, a few draws, more where these are not `enough`.
 
@@ -63,7 +63,7 @@ def spurious_information(
     """
     if not isinstance(problem.chain, ImuFactor):
         return Spurious(np.zeros((1, *outcome.information.shape)))
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     t = problem.tolerance
     scaled = t[:, None] * outcome.information * t
     clear = np.linalg.eigvalsh(scaled).min(initial=np.inf) > CLEAR

@@ -57,12 +57,12 @@ def absolute_rows(
     x = (p + R @ mount.p - frame.p) @ frame.R
     by_pose, by_mount, by_frame = (np.zeros((n, 6, 6)) for _ in range(3))
     by_pose[:, :3, :3] = J @ mount.R.T
-    by_pose[:, 3:, :3] = -in_frame @ hats(mount.p)
+    by_pose[:, 3:, :3] = -in_frame @ so3.hat_many(mount.p)
     by_pose[:, 3:, 3:] = frame.R.T
     by_mount[:, :3, :3] = J
     by_mount[:, 3:, 3:] = in_frame
     by_frame[:, :3, :3] = -J @ _t(predicted)
-    by_frame[:, 3:, :3] = hats(x)
+    by_frame[:, 3:, :3] = so3.hat_many(x)
     by_frame[:, 3:, 3:] = -frame.R.T
     return PoseRows(np.concatenate([e, x - position], axis=1), (by_pose,), by_mount, by_frame)
 
@@ -88,22 +88,15 @@ def relative_rows(
     x = (way - mount.p) @ mount.R
     before, after, by_mount = (np.zeros((n, 6, 6)) for _ in range(3))
     before[:, :3, :3] = -J @ mount.R.T @ _t(turn)
-    before[:, 3:, :3] = mount.R.T @ hats(way)
+    before[:, 3:, :3] = mount.R.T @ so3.hat_many(way)
     before[:, 3:, 3:] = -mount.R.T @ _t(R[0])
     after[:, :3, :3] = J @ mount.R.T
-    after[:, 3:, :3] = -mount.R.T @ turn @ hats(mount.p)
+    after[:, 3:, :3] = -mount.R.T @ turn @ so3.hat_many(mount.p)
     after[:, 3:, 3:] = mount.R.T @ _t(R[0])
     by_mount[:, :3, :3] = J @ (np.eye(3) - _t(Q))
-    by_mount[:, 3:, :3] = hats(x)
+    by_mount[:, 3:, :3] = so3.hat_many(x)
     by_mount[:, 3:, 3:] = mount.R.T @ (turn - np.eye(3))
     return PoseRows(np.concatenate([e, x - position], axis=1), (before, after), by_mount, np.zeros((n, 6, 0)))
-
-
-def hats(v: np.ndarray) -> np.ndarray:
-    """(..., 3, 3) with hat(v) w = v x w, of v (..., 3)."""
-    m = np.zeros((*v.shape, 3))
-    m[..., 0, 1], m[..., 0, 2], m[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
-    return m - np.swapaxes(m, -1, -2)
 
 
 @njit(cache=True, nogil=True)

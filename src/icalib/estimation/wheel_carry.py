@@ -25,7 +25,7 @@ def carried_noise(
     forth = np.swapaxes(first.rotation, 1, 2)
     between = forth @ last.rotation
     reached = np.einsum("nij,nj->ni", forth, last.position - first.position) + between @ lever
-    turned = rotation.T @ _hats(reached), -rotation.T @ between @ so3.hat(np.ascontiguousarray(lever))
+    turned = rotation.T @ so3.hat_many(reached), -rotation.T @ between @ so3.hat_many(lever)
     yaw = rotation.T[2]
     gyro, accel = np.median(imu.variance[:, :2], axis=0)
     out = np.zeros((len(away), 3, 3))
@@ -34,8 +34,3 @@ def carried_noise(
         out += (gyro * t)[:, None, None] * rows @ np.swapaxes(rows, 1, 2)
         out += (accel * t**3 / 3.0)[:, None, None] * np.diag([0.0, 1.0, 1.0])
     return out
-
-
-def _hats(v: np.ndarray) -> np.ndarray:
-    """(n, 3, 3) of v (n, 3): hat(v) w = v x w."""
-    return np.swapaxes(np.cross(v[:, None, :], np.eye(3)[None]), 1, 2)

@@ -81,7 +81,7 @@ def against_motion(
     """Of a LiDAR at seconds (n,), R_map_lidar and p_map_lidar, while the IMU was at R_imu, p_imu in any world."""
     i, j = _pairs(seconds)
     u = np.einsum("nji,nj->ni", rotation[i], position[j] - position[i])
-    hat_u = _hats(u)
+    hat_u = so3.hat_many(u)
 
     def rows(R_il: np.ndarray, p_il: np.ndarray) -> Rows:
         del p_il
@@ -116,11 +116,11 @@ def against_readings(
         R = carry(at_scans)
         felt = np.einsum("nij,nj->ni", R, imu.accel)
         # R_map_lidar is what is known: with R_imu_lidar Exp(d) what is felt turns by -d in the LiDAR's axes.
-        by_turn = _hats(felt) @ R @ R_il
+        by_turn = so3.hat_many(felt) @ R @ R_il
         x = np.concatenate([felt, R.reshape(-1, 9), by_turn.reshape(-1, 9)], axis=1)
         D = Integrals.of(imu, x).at(seconds)[1]
         A = np.zeros((len(i), 3, 12))
-        A[:, :, :3] = second(rotation @ _hats((R_il.T @ p_il)[None])[0] + D[:, 12:].reshape(-1, 3, 3))
+        A[:, :, :3] = second(rotation @ so3.hat_many((R_il.T @ p_il)[None])[0] + D[:, 12:].reshape(-1, 3, 3))
         A[:, :, 3:6] = second(at_scans)
         A[:, :, 6:9] = 0.5 * (h1 + h2)[:, :, None] * np.eye(3)
         A[:, :, 9:] = -second(D[:, 3:12].reshape(-1, 3, 3))
@@ -180,13 +180,6 @@ def _fit(rows: Rows, prior: Prior, without: int) -> tuple[np.ndarray, float]:
         size = np.linalg.norm(rows.b - A @ x, axis=1)
         weight = (size < 4.0 * np.median(size) + 1e-9).astype(float)
     return np.concatenate([np.zeros(without), x]), float(np.sqrt(np.mean(size[weight > 0.0] ** 2)))
-
-
-def _hats(v: np.ndarray) -> np.ndarray:
-    """(n, 3, 3) with hat(v) w = v x w of v (n, 3)."""
-    m = np.zeros((len(v), 3, 3))
-    m[:, 0, 1], m[:, 0, 2], m[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
-    return m - m.transpose(0, 2, 1)
 
 
 def _pairs(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

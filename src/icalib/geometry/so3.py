@@ -141,6 +141,13 @@ def right_jacobian_inverse(phi):
     return _polynomial(phi, 0.5, _inverse_coefficient(phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]))
 
 
+def hat_many(v: np.ndarray) -> np.ndarray:
+    """(..., 3, 3) with hat(v) w = v x w, of v (..., 3)."""
+    m = np.zeros((*v.shape, 3))
+    m[..., 0, 1], m[..., 0, 2], m[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    return m - np.swapaxes(m, -1, -2)
+
+
 @njit(cache=True, nogil=True)
 def exp_many(phi):
     """(N, 3) -> (N, 3, 3)."""
