@@ -24,7 +24,10 @@ from icalib.simulation import Scenario, load_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
 FOUND = ROOT / "docs" / "studies" / "degeneracy.json"
-MOTIONS = ("table2-planar", "single-axis", "arc", "spin", "straight-line", "constant-velocity", "standing")
+MOTIONS = (
+    "table2-3d", "table2-ramp", "table2-planar", "single-axis", "arc", "spin", "straight-line", "constant-velocity",
+    "standing",
+)  # fmt: skip
 IMUS = {"data sheet": 1.0, "ten times noisier": 10.0}
 SECONDS, AZIMUTH_STEPS, PER_IMAGE = 8.0, 300, 30
 FAR = 4.0  # standard deviations

@@ -19,6 +19,7 @@ from scipy.linalg import block_diag
 import icalib.estimation
 from icalib.estimation.arrowhead import Piece, make_pieces
 from icalib.estimation.board import board_in
+from icalib.estimation.clocks import offset_at
 from icalib.estimation.corner_factor import CornerNoise
 from icalib.estimation.corner_weights import LEAST_CURVATURE
 from icalib.estimation.ground_factor import GroundFactor
@@ -26,6 +27,7 @@ from icalib.estimation.imu_factor import ROWS, ImuFactor
 from icalib.estimation.lidar_binning import LidarNoise
 from icalib.estimation.lidar_sweep import Motion
 from icalib.estimation.pose_factor import AbsolutePoseFactor, PoseNoise, RelativePosesFactor, frame_of
+from icalib.estimation.poses import poses_at
 from icalib.estimation.prior_factor import FIRST_BIAS_SIGMA, Prior, accumulate_bias_prior
 from icalib.estimation.state import NODE, State, make_layout
 from icalib.estimation.wheel_factor import IncrementFactor, RelativePoseFactor, WheelNoise
@@ -252,9 +254,11 @@ def feature_sample(
     return Sample("FeatureFactor", setup, state, accumulate, residual, weights, 5e-6)
 
 
-def lidar_sample(room, room_of, scheme="inertial", loss="none", beam=0.0, imu_free=False, restarts=False):
-    """Its moments taken at another state, as in all but the first linearisation of a pass."""
+def lidar_sample(room, room_of, scheme="inertial", loss="none", beam=0.0, imu_free=False, restarts=False, noisy=1.0):
+    """Its moments taken at another state, as in all but the first linearisation of a pass. noisy: how much more than
+    that of the data sheet the gyroscope's noise is."""
     setup = room_of(room, imu_free=imu_free, spacing=0.05)
+    setup = replace(setup, imu=replace(setup.imu, variance=noisy**2 * setup.imu.variance))
     if restarts:
         stream = replace(setup.stream, joins_ns=(int(setup.stream.stamps_ns[2]),))
         measured = replace(setup.sim.measurements, lidars=(stream,))
@@ -273,11 +277,67 @@ def lidar_sample(room, room_of, scheme="inertial", loss="none", beam=0.0, imu_fr
     def accumulate(at, piece, sums):
         return factor.accumulate(at, piece, factor.output(), sums)
 
-    def turned(at):
-        pieces, r = make_pieces(len(at.seconds), setup.layout.size), residual(at)
-        return sum(accumulate(at, p, False) for p in pieces) - 0.5 * float(r @ r)
+    def weights(at):
+        """Of rows that the gyroscope's noise moves together, on each side of a node; what it explains by slanted beams
+        is part of their slope."""
+        y, W = residual(at), np.eye(residual(at).size)
+        for rows, J, slope in lidar_walks(factor, at):
+            W[np.ix_(rows, rows)] -= J @ np.linalg.solve(np.eye(3) + J.T @ J, J.T)
+            y[rows] -= J @ np.linalg.solve(np.eye(3) + J.T @ J, J.T @ y[rows] + slope)
+        return y, W
 
-    return Sample("LidarFactor", setup, state, accumulate, residual, white(residual), potential=turned)
+    def turned(at):
+        return (
+            factor.moments.slant[:, 0].sum() + lidar_rows_turned(factor, at, np.zeros((len(factor.node), 3)))[1].sum()
+        )
+
+    r, explained, walks = residual(state), 0.0, lidar_walks(factor, state)
+    for rows, J, slope in walks:
+        u = J.T @ r[rows] + slope
+        explained += float(u @ np.linalg.solve(np.eye(3) + J.T @ J, u))
+    cost = sum(accumulate(state, p, False) for p in make_pieces(len(state.seconds), setup.layout.size))
+    assert cost == pytest.approx(0.5 * (float(r @ r) - explained) + turned(state), rel=1e-7)
+    assert (explained > 0.1 * noisy) == (scheme == "inertial")
+    # How the gyroscope's noise moves rows turns with the state, and the cost with it. The gradient leaves that out, as
+    # it must: it would draw to where noise explains more.
+    return Sample("LidarFactor", setup, state, accumulate, residual, weights, 1e-5 * noisy**1.5, turned)
+
+
+def lidar_walks(factor, at):
+    """Of the bins on each side of each node: rows, derivatives (n, 3) by the turn that the gyroscope's noise makes, one
+    standard deviation along the way, and what half the chi^2 changes with it as beams turn (3,)."""
+    m, h = factor.moments, 1e-4
+    bin_of = np.repeat(np.arange(len(m.seconds)), np.diff(m.start))
+    side = 2 * factor.node[bin_of] + (factor.walked[bin_of] > 0.0)
+    slopes = []
+    for axis in h * np.eye(3):
+        there, back = (lidar_rows_turned(factor, at, sign * factor.walked[:, None] * axis) for sign in (1.0, -1.0))
+        slopes.append([(a - b) / (2 * h) for a, b in zip(there, back, strict=True)])
+    by_turn, as_beams_turn = (np.array(x) for x in zip(*slopes, strict=True))
+    found = []
+    for own in np.unique(side[factor.walked[bin_of] != 0.0]):
+        entries = np.flatnonzero(side == own)
+        rows = (4 * entries[:, None] + np.arange(4)).ravel()
+        found.append((rows, by_turn[:, entries].reshape(3, -1).T, as_beams_turn[:, entries].sum(axis=1)))
+    return found
+
+
+def lidar_rows_turned(factor, at, turn):
+    """Rows (E, 4), and what slanted beams add to half the chi^2 (E,), with the IMU turned by `turn` (n, 3) rad at each
+    bin."""
+    m, name = factor.moments, factor.name
+    bin_of = np.repeat(np.arange(len(m.seconds)), np.diff(m.start))
+    times = m.seconds + offset_at(at, name, factor.node)
+    poses = poses_at(factor.scheme, times, factor.node, at, factor.imu, factor.gravity, False)
+    R = poses.rotation @ so3.exp_many(turn)
+    R_lidar, p_lidar = R @ at.values[name, "rotation"], poses.position + R @ at.values[name, "translation"]
+    plane = np.array([at.values[key] for key in factor.planes])[m.plane]
+    normal, point = plane[:, :3], plane[:, 3:]
+    distance = np.einsum("ea,ea->e", normal, p_lidar[bin_of] - point)
+    distance = np.column_stack([distance, np.einsum("eba,eb->ea", R_lidar[bin_of], normal)])
+    L = np.zeros((len(plane), 4, 4))
+    L[:, *np.tril_indices(4)] = m.root
+    return np.einsum("eji,ej->ei", L, distance), np.einsum("ej,ej->e", m.slant[:, 1:], distance[:, 1:])
 
 
 def prior_sample(unlike, setup_of, sensor, name):
@@ -519,6 +579,7 @@ SAMPLES = {
         lambda u, s, f: feature_sample(u, s, f, "pose", "cauchy", curved=True),
     ),
     "lidar": ("LidarFactor", lambda u, s, f: lidar_sample(*s)),
+    "lidar, noisy gyroscope": ("LidarFactor", lambda u, s, f: lidar_sample(*s, beam=0.02, imu_free=True, noisy=30.0)),
     "lidar, huber, beam, kinematic, intrinsics": (
         "LidarFactor",
         lambda u, s, f: lidar_sample(*s, "kinematic", "huber", 0.02, imu_free=True),

@@ -66,6 +66,14 @@ class ImuData:
         """(n,) index of the reading interval that each time lies in, the first or last for times outside."""
         return np.clip(np.searchsorted(self.seconds, seconds, side="right") - 1, 0, len(self.seconds) - 2)
 
+    def turned_by_noise(self, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
+        """(n,) rad by which the gyroscope's noise turns, about each axis, what its readings carry from `begin` to `end`
+        (n,) s, one standard deviation; negative backwards."""
+        dt = np.diff(self.seconds)
+        variance = np.concatenate([[0.0], np.cumsum(self.variance[:, 0] * dt)])
+        a, b = (np.interp(t, self.seconds, variance) for t in (begin, end))
+        return np.copysign(np.sqrt(np.abs(b - a)), end - begin)
+
 
 def imu_data(rig: Rig, measurements: Measurements) -> ImuData | None:
     """The rig's IMU, or None where it has none."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -32,12 +33,13 @@ CHUNK = 512  # bins at a time: what a chunk needs stays in the cache
 
 @dataclass(frozen=True)
 class LidarFactor:
-    """All scans of one LiDAR. node (n,), increasing: the node that each bin of `moments` hangs on; planes: keys of the
-    values that the rows of the moments' planes have in a state."""
+    """All scans of one LiDAR. node (n,), increasing: the node that each bin of `moments` hangs on, walked (n,): see
+    `Bins`; planes: keys of the values that the rows of the moments' planes have in a state."""
 
     name: str
     moments: Moments
     node: np.ndarray
+    walked: np.ndarray
     planes: tuple[Key, ...]
     imu: ImuData
     gravity: float
@@ -64,7 +66,10 @@ class LidarFactor:
         times = instants(stream, motion.state.values, moments.seconds)
         node = assign_nodes(scheme, motion.state.seconds, times)
         n_nodes = len(motion.state.seconds)
-        return cls(stream.name, moments, node, planes, motion.imu, motion.gravity, scheme, layout, n_nodes)
+        walked = motion.imu.turned_by_noise(motion.state.seconds[node], times)
+        if scheme != "inertial":
+            walked[:] = 0.0
+        return cls(stream.name, moments, node, walked, planes, motion.imu, motion.gravity, scheme, layout, n_nodes)
 
     @cached_property
     def _of_planes(self) -> np.ndarray:
@@ -120,15 +125,20 @@ class LidarFactor:
                 R_il, p_il, R_lw, poses.position + poses.rotation @ p_il, poses.rate, poses.velocity,
                 poses.by_node, poses.by_next, poses.by_imu, through_pose,
             )  # fmt: skip
-            yield Bins(node, m.start[a : b + 1], m.plane, m.root, m.slant), motion, planes
+            yield Bins(node, self.walked[a:b], m.start[a : b + 1], m.plane, m.root, m.slant), motion, planes
 
     def _stretches(self, state: State, b0: int, b1: int) -> Iterator[tuple[np.ndarray, int, int]]:
         """Bins b0..b1 by the chunk, each with its border columns that act through the pose (c,)."""
         imu = self.layout.columns(self.imu.name, "intrinsics")
         for clock, own in by_clock(state, self.name, self.node[b0:b1]):
             through_pose = np.concatenate([mounted_columns(self.layout, self.name, clock), imu[imu >= 0]])
-            for a in range(b0 + own.start, b0 + own.stop, CHUNK):
-                yield through_pose, a, min(a + CHUNK, b0 + own.stop)
+            first, last = b0 + own.start, b0 + own.stop
+            # Bins on one side of a node stay together.
+            sides = np.flatnonzero(np.diff(2 * self.node[first:last] + (self.walked[first:last] >= 0.0))) + 1
+            sides = np.append(sides, last - first)
+            ends = sides[np.searchsorted(sides, np.arange(CHUNK, last - first, CHUNK))]
+            for a, b in pairwise(np.unique([0, *ends, last - first])):
+                yield through_pose, first + int(a), first + int(b)
 
     def _bins_of(self, piece: Piece) -> tuple[int, int]:
         """The bins that belong to `piece`: nodes from first to before last, the chain's very last node included."""

@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 
 from icalib.estimation.corner_chain import by_imu_pose
+from icalib.estimation.lidar_walk import add_bin, add_plane, border_of, no_walk, taken_off
 from icalib.estimation.state import Key, State
 from icalib.geometry.planes import tangents
 
@@ -21,10 +22,12 @@ RESIDUAL = POSE + PLANE  # the last column of an entry's Jacobian
 
 
 class Bins(NamedTuple):
-    """Bins of a piece: node (n,); entries of bin i are start[i]:start[i + 1], with plane, root and slant as in
-    `Moments`."""
+    """Bins of a piece: node (n,); walked (n,): by what angle the gyroscope's noise turns the IMU about each axis on the
+    way from the node, one standard deviation [rad], negative before it; entries of bin i are start[i]:start[i + 1],
+    with plane, root and slant as in `Moments`."""
 
     node: np.ndarray
+    walked: np.ndarray
     start: np.ndarray
     plane: np.ndarray
     root: np.ndarray
@@ -65,7 +68,8 @@ class Motion(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _pose_chain(i, motion, T):
-    """T (6, nodes + c): LiDAR pose (right rotation, position in its axes) by the nodes, then by `motion.columns`."""
+    """T (6, nodes + c): LiDAR pose (right rotation, position in its axes) by the nodes, then by `motion.columns`.
+    Returns (6, 6): by the IMU's pose."""
     R_il = motion.R_imu_lidar
     A = by_imu_pose(R_il, motion.p_imu_lidar, motion.R_lidar_world[i])
     n_nodes = T.shape[1] - len(motion.columns)
@@ -89,6 +93,7 @@ def _pose_chain(i, motion, T):
             T[r, o + 7 + j] = 0.0
             for k in range(POSE):
                 T[r, o + 7 + j] += A[r, k] * motion.by_imu[i, k, j]
+    return A
 
 
 @njit(cache=True, nogil=True)
@@ -135,21 +140,27 @@ def _times_root(A, n, root, B):
 
 
 @njit(cache=True, nogil=True)
-def _add_plane(k, B, T, columns, own, sums, G, V):
-    """One plane in one bin: its pose part to G (6, 7), what the plane's columns `own` share in to the sums; V (3, w):
-    work space."""
-    n_b, n_nodes = sums.border.shape[0] - 1, T.shape[1] - len(columns)
+def _add_to_pose(B, A, slant, G):
+    """The pose part of one plane in one bin to G (6, 7), with the gradient of slant . (1, R^T n), which bends too
+    little to count."""
     for i in range(POSE):
         for j in range(POSE + 1):
             c = j if j < POSE else RESIDUAL
             G[i, j] += B[i, 0] * B[c, 0] + B[i, 1] * B[c, 1] + B[i, 2] * B[c, 2] + B[i, 3] * B[c, 3]
-    if own[0] < 0:
-        return
+        G[i, POSE] += A[i, 1] * slant[1] + A[i, 2] * slant[2] + A[i, 3] * slant[3]
+
+
+@njit(cache=True, nogil=True)
+def _add_plane(k, B, T, columns, own, sums, C, V):
+    """What the columns `own` of one plane in one bin share in, to the sums; C (6, 3), what they share with the pose, is
+    filled; V (3, w): work space."""
+    n_b, n_nodes = sums.border.shape[0] - 1, T.shape[1] - len(columns)
     V[:] = 0.0
     for i in range(POSE):
         for t in range(PLANE):
             b = B[POSE + t]
             v = B[i, 0] * b[0] + B[i, 1] * b[1] + B[i, 2] * b[2] + B[i, 3] * b[3]
+            C[i, t] = v
             for j in range(T.shape[1]):
                 V[t, j] += v * T[i, j]
     for h in range(n_nodes // 15):
@@ -172,16 +183,13 @@ def _add_plane(k, B, T, columns, own, sums, G, V):
 
 
 @njit(cache=True, nogil=True)
-def _add_slant(A, slant, own, sums, G):
-    """The gradient of slant . (1, R^T n) by pose and plane; it bends too little to count."""
+def _add_slant(A, slant, own, sums):
+    """The gradient of slant . (1, R^T n) by the plane, to the sums."""
     n_b = sums.border.shape[0] - 1
-    for i in range(POSE + PLANE):
-        s = A[i, 1] * slant[1] + A[i, 2] * slant[2] + A[i, 3] * slant[3]
-        if i < POSE:
-            G[i, POSE] += s
-        elif own[i - POSE] >= 0:
-            sums.border[own[i - POSE], n_b] += s
-            sums.border[n_b, own[i - POSE]] += s
+    for t in range(PLANE):
+        s = A[POSE + t, 1] * slant[1] + A[POSE + t, 2] * slant[2] + A[POSE + t, 3] * slant[3]
+        sums.border[own[t], n_b] += s
+        sums.border[n_b, own[t]] += s
 
 
 @njit(cache=True, nogil=True)
@@ -232,22 +240,45 @@ def _add_pose(k, G, T, columns, sums, F, row):
 
 
 @njit(cache=True, nogil=True)
+def _take_off(k, walk, n_nodes, columns, of_plane, sums):
+    """Ends a walk from node k; returns what it takes off the chi^2."""
+    own, V = border_of(walk, columns, of_plane), taken_off(walk)
+    last = V.shape[1] - 1
+    row = np.empty(last + 1)
+    for i in range(last if len(sums.diagonal) > 0 else 0):
+        if i >= n_nodes and own[i - n_nodes] < 0:
+            continue
+        for j in range(last + 1):
+            row[j] = -(V[0, i] * V[0, j] + V[1, i] * V[1, j] + V[2, i] * V[2, j])
+        _add_row(k, i, n_nodes, row, own, sums)
+    return V[0, last] ** 2 + V[1, last] ** 2 + V[2, last] ** 2
+
+
+@njit(cache=True, nogil=True)
+def _ends_here(i, bins):
+    """Whether bin i is the last on its side of its node."""
+    if i + 1 == len(bins.node) or bins.node[i + 1] != bins.node[i]:
+        return True
+    return (bins.walked[i + 1] < 0.0) != (bins.walked[i] < 0.0)
+
+
+@njit(cache=True, nogil=True)
 def accumulate(bins, motion, planes, sums, rows):
     """Whitened residuals `rows` (E, 4) of all bins, and their normal equations where they are wanted.
 
-    Returns half the chi^2, and what the variances add to it as beams turn.
+    Returns half the chi^2, less what the gyroscope's noise explains, and what the variances add as beams turn.
     """
     wanted = len(sums.diagonal) > 0
     T = np.empty((POSE, (30 if len(motion.by_next) else 15) + len(motion.columns)))
     A, B, m = np.empty((RESIDUAL + 1, ROWS)), np.empty((RESIDUAL + 1, ROWS)), np.empty(ROWS)
-    G, F, chi2 = np.empty((POSE, POSE + 1)), np.empty((POSE, T.shape[1] + 1)), 0.0
-    turned = 0.0
+    G, F, C = np.empty((POSE, POSE + 1)), np.empty((POSE, T.shape[1] + 1)), np.empty((POSE, PLANE))
     row, V = np.empty(T.shape[1] + 1), np.empty((PLANE, T.shape[1]))
+    n_nodes, walk = T.shape[1] - len(motion.columns), no_walk(T.shape[1], len(planes.normal))
+    chi2, turned = 0.0, 0.0
     for i in range(len(bins.node)):
-        k = bins.node[i] - sums.first
-        if wanted:
-            _pose_chain(i, motion, T)
-            G[:] = 0.0
+        k, walked = bins.node[i] - sums.first, bins.walked[i]
+        by_imu = _pose_chain(i, motion, T)
+        G[:] = 0.0
         for e in range(bins.start[i], bins.start[i + 1]):
             q = bins.plane[e]
             _distances(motion.R_lidar_world[i], motion.p_world_lidar[i], q, planes, m)
@@ -258,11 +289,20 @@ def accumulate(bins, motion, planes, sums, rows):
                 chi2 += rows[e, c] ** 2
             for c in range(1, ROWS):
                 turned += bins.slant[e, c] * m[c]
-            if wanted:
-                _jacobian(motion.R_lidar_world[i], motion.p_world_lidar[i], q, planes, m, A)
-                _times_root(A, RESIDUAL + 1, bins.root[e], B)
-                _add_slant(A, bins.slant[e], planes.columns[q], sums, G)
-                _add_plane(k, B, T, motion.columns, planes.columns[q], sums, G, V)
+            if not (wanted or walked):
+                continue
+            _jacobian(motion.R_lidar_world[i], motion.p_world_lidar[i], q, planes, m, A)
+            _times_root(A, RESIDUAL + 1, bins.root[e], B)
+            _add_to_pose(B, A, bins.slant[e], G)
+            if wanted and planes.columns[q, 0] >= 0:
+                _add_plane(k, B, T, motion.columns, planes.columns[q], sums, C, V)
+                _add_slant(A, bins.slant[e], planes.columns[q], sums)
+                if walked:
+                    add_plane(walked, by_imu, C, q, walk)
         if wanted:
             _add_pose(k, G, T, motion.columns, sums, F, row)
+        if walked:
+            add_bin(walked, by_imu, G, T, walk)
+            if _ends_here(i, bins):
+                chi2 -= _take_off(k, walk, n_nodes, motion.columns, planes.columns, sums)
     return 0.5 * chi2 + turned
