@@ -262,47 +262,75 @@ def _ends_here(i, bins):
     return (bins.walked[i + 1] < 0.0) != (bins.walked[i] < 0.0)
 
 
+class _Work(NamedTuple):
+    """Work space of `accumulate`. T: see `_pose_chain`; m: see `_distances`; A, B (10, 4): derivatives of an
+    entry and these times its root; G (6, 7): what a bin's pose shares with itself and the residual; C (6, 3): with a
+    plane; F, V, row: room for sums."""
+
+    T: np.ndarray
+    m: np.ndarray
+    A: np.ndarray
+    B: np.ndarray
+    G: np.ndarray
+    C: np.ndarray
+    F: np.ndarray
+    V: np.ndarray
+    row: np.ndarray
+
+
+@njit(cache=True, nogil=True)
+def _work_space(motion):
+    width = (30 if len(motion.by_next) else 15) + len(motion.columns)
+    return _Work(
+        np.empty((POSE, width)), np.empty(ROWS), np.empty((RESIDUAL + 1, ROWS)), np.empty((RESIDUAL + 1, ROWS)),
+        np.empty((POSE, POSE + 1)), np.empty((POSE, PLANE)), np.empty((POSE, width + 1)), np.empty((PLANE, width)),
+        np.empty(width + 1),
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def _see(e, i, bins, motion, planes, work, rows):
+    """Whitened residuals of entry e, in bin i. Returns half their chi^2 and what their variances add as beams turn."""
+    _distances(motion.R_lidar_world[i], motion.p_world_lidar[i], bins.plane[e], planes, work.m)
+    work.A[0] = work.m
+    _times_root(work.A, 1, bins.root[e], rows[e : e + 1])
+    cost = bins.slant[e, 0]
+    for c in range(ROWS):
+        cost += 0.5 * rows[e, c] ** 2
+        cost += bins.slant[e, c] * work.m[c] if c else 0.0
+    return cost
+
+
 @njit(cache=True, nogil=True)
 def accumulate(bins, motion, planes, sums, rows):
     """Whitened residuals `rows` (E, 4) of all bins, and their normal equations where they are wanted.
 
     Returns half the chi^2, less what the gyroscope's noise explains, and what the variances add as beams turn.
     """
-    wanted = len(sums.diagonal) > 0
-    T = np.empty((POSE, (30 if len(motion.by_next) else 15) + len(motion.columns)))
-    A, B, m = np.empty((RESIDUAL + 1, ROWS)), np.empty((RESIDUAL + 1, ROWS)), np.empty(ROWS)
-    G, F, C = np.empty((POSE, POSE + 1)), np.empty((POSE, T.shape[1] + 1)), np.empty((POSE, PLANE))
-    row, V = np.empty(T.shape[1] + 1), np.empty((PLANE, T.shape[1]))
+    wanted, work, cost = len(sums.diagonal) > 0, _work_space(motion), 0.0
+    T, A, B, G = work.T, work.A, work.B, work.G
     n_nodes, walk = T.shape[1] - len(motion.columns), no_walk(T.shape[1], len(planes.normal))
-    chi2, turned = 0.0, 0.0
     for i in range(len(bins.node)):
         k, walked = bins.node[i] - sums.first, bins.walked[i]
         by_imu = _pose_chain(i, motion, T)
         G[:] = 0.0
         for e in range(bins.start[i], bins.start[i + 1]):
             q = bins.plane[e]
-            _distances(motion.R_lidar_world[i], motion.p_world_lidar[i], q, planes, m)
-            A[0] = m
-            _times_root(A, 1, bins.root[e], rows[e : e + 1])
-            turned += bins.slant[e, 0]
-            for c in range(ROWS):
-                chi2 += rows[e, c] ** 2
-            for c in range(1, ROWS):
-                turned += bins.slant[e, c] * m[c]
+            cost += _see(e, i, bins, motion, planes, work, rows)
             if not (wanted or walked):
                 continue
-            _jacobian(motion.R_lidar_world[i], motion.p_world_lidar[i], q, planes, m, A)
+            _jacobian(motion.R_lidar_world[i], motion.p_world_lidar[i], q, planes, work.m, A)
             _times_root(A, RESIDUAL + 1, bins.root[e], B)
             _add_to_pose(B, A, bins.slant[e], G)
             if wanted and planes.columns[q, 0] >= 0:
-                _add_plane(k, B, T, motion.columns, planes.columns[q], sums, C, V)
+                _add_plane(k, B, T, motion.columns, planes.columns[q], sums, work.C, work.V)
                 _add_slant(A, bins.slant[e], planes.columns[q], sums)
                 if walked:
-                    add_plane(walked, by_imu, C, q, walk)
+                    add_plane(walked, by_imu, work.C, q, walk)
         if wanted:
-            _add_pose(k, G, T, motion.columns, sums, F, row)
+            _add_pose(k, G, T, motion.columns, sums, work.F, work.row)
         if walked:
             add_bin(walked, by_imu, G, T, walk)
             if _ends_here(i, bins):
-                chi2 -= _take_off(k, walk, n_nodes, motion.columns, planes.columns, sums)
-    return 0.5 * chi2 + turned
+                cost -= 0.5 * _take_off(k, walk, n_nodes, motion.columns, planes.columns, sums)
+    return cost
