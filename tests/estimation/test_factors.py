@@ -277,11 +277,13 @@ def lidar_sample(room, room_of, scheme="inertial", loss="none", beam=0.0, imu_fr
     def accumulate(at, piece, sums):
         return factor.accumulate(at, piece, factor.output(), sums)
 
+    walks = lidar_walks(factor, start)
+
     def weights(at):
         """Of rows that the gyroscope's noise moves together, on each side of a node; what it explains by slanted beams
         is part of their slope."""
         y, W = residual(at), np.eye(residual(at).size)
-        for rows, J, slope in lidar_walks(factor, at):
+        for rows, J, slope in walks:
             W[np.ix_(rows, rows)] -= J @ np.linalg.solve(np.eye(3) + J.T @ J, J.T)
             y[rows] -= J @ np.linalg.solve(np.eye(3) + J.T @ J, J.T @ y[rows] + slope)
         return y, W
@@ -291,16 +293,14 @@ def lidar_sample(room, room_of, scheme="inertial", loss="none", beam=0.0, imu_fr
             factor.moments.slant[:, 0].sum() + lidar_rows_turned(factor, at, np.zeros((len(factor.node), 3)))[1].sum()
         )
 
-    r, explained, walks = residual(state), 0.0, lidar_walks(factor, state)
+    r, explained = residual(state), 0.0
     for rows, J, slope in walks:
         u = J.T @ r[rows] + slope
         explained += float(u @ np.linalg.solve(np.eye(3) + J.T @ J, u))
     cost = sum(accumulate(state, p, False) for p in make_pieces(len(state.seconds), setup.layout.size))
     assert cost == pytest.approx(0.5 * (float(r @ r) - explained) + turned(state), rel=1e-7)
     assert (explained > 0.1 * noisy) == (scheme == "inertial")
-    # How the gyroscope's noise moves rows turns with the state, and the cost with it. The gradient leaves that out, as
-    # it must: it would draw to where noise explains more.
-    return Sample("LidarFactor", setup, state, accumulate, residual, weights, 1e-5 * noisy**1.5, turned)
+    return Sample("LidarFactor", setup, state, accumulate, residual, weights, potential=turned)
 
 
 def lidar_walks(factor, at):

@@ -33,13 +33,16 @@ CHUNK = 512  # bins at a time: what a chunk needs stays in the cache
 
 @dataclass(frozen=True)
 class LidarFactor:
-    """All scans of one LiDAR. node (n,), increasing: the node that each bin of `moments` hangs on, walked (n,): see
-    `Bins`; planes: keys of the values that the rows of the moments' planes have in a state."""
+    """All scans of one LiDAR. node (n,), increasing: the node that each bin of `moments` hangs on; walked (n,), turned
+    (E, 3, 4), slope (E, 3): see `Bins`, at the state that the pass starts from; planes: keys of the values that the
+    rows of the moments' planes have in a state."""
 
     name: str
     moments: Moments
     node: np.ndarray
     walked: np.ndarray
+    turned: np.ndarray
+    slope: np.ndarray
     planes: tuple[Key, ...]
     imu: ImuData
     gravity: float
@@ -69,7 +72,14 @@ class LidarFactor:
         walked = motion.imu.turned_by_noise(motion.state.seconds[node], times)
         if scheme != "inertial":
             walked[:] = 0.0
-        return cls(stream.name, moments, node, walked, planes, motion.imu, motion.gravity, scheme, layout, n_nodes)
+        entries = len(moments.plane)
+        factor = cls(
+            stream.name, moments, node, walked, np.zeros((entries, 3, ROWS), np.float32),
+            np.zeros((entries, 3), np.float32), planes, motion.imu, motion.gravity, scheme, layout, n_nodes,
+        )  # fmt: skip
+        for bins, moving, at in factor._chunks(motion.state, 0, len(node)):
+            lidar_kernels.turn_by_noise(bins, moving, at)
+        return factor
 
     @cached_property
     def _of_planes(self) -> np.ndarray:
@@ -125,7 +135,11 @@ class LidarFactor:
                 R_il, p_il, R_lw, poses.position + poses.rotation @ p_il, poses.rate, poses.velocity,
                 poses.by_node, poses.by_next, poses.by_imu, through_pose,
             )  # fmt: skip
-            yield Bins(node, self.walked[a:b], m.start[a : b + 1], m.plane, m.root, m.slant), motion, planes
+            yield (
+                Bins(node, self.walked[a:b], m.start[a : b + 1], m.plane, m.root, m.slant, self.turned, self.slope),
+                motion,
+                planes,
+            )
 
     def _stretches(self, state: State, b0: int, b1: int) -> Iterator[tuple[np.ndarray, int, int]]:
         """Bins b0..b1 by the chunk, each with its border columns that act through the pose (c,)."""

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 
 from icalib.estimation.corner_chain import by_imu_pose
-from icalib.estimation.lidar_walk import add_bin, add_plane, border_of, no_walk, taken_off
+from icalib.estimation.lidar_walk import add_entry, add_plane, add_pose, border_of, no_walk, taken_off
 from icalib.estimation.state import Key, State
 from icalib.geometry.planes import tangents
 
@@ -24,7 +24,8 @@ RESIDUAL = POSE + PLANE  # the last column of an entry's Jacobian
 class Bins(NamedTuple):
     """Bins of a piece: node (n,); walked (n,): by what angle the gyroscope's noise turns the IMU about each axis on the
     way from the node, one standard deviation [rad], negative before it; entries of bin i are start[i]:start[i + 1],
-    with plane, root and slant as in `Moments`."""
+    with plane, root and slant as in `Moments`; turned (E, 3, 4), slope (E, 3): how their residuals, and what slanted
+    beams add to half the chi^2, change with that turn."""
 
     node: np.ndarray
     walked: np.ndarray
@@ -32,6 +33,8 @@ class Bins(NamedTuple):
     plane: np.ndarray
     root: np.ndarray
     slant: np.ndarray
+    turned: np.ndarray
+    slope: np.ndarray
 
 
 class Planes(NamedTuple):
@@ -151,16 +154,14 @@ def _add_to_pose(B, A, slant, G):
 
 
 @njit(cache=True, nogil=True)
-def _add_plane(k, B, T, columns, own, sums, C, V):
-    """What the columns `own` of one plane in one bin share in, to the sums; C (6, 3), what they share with the pose, is
-    filled; V (3, w): work space."""
+def _add_plane(k, B, T, columns, own, sums, V):
+    """What the columns `own` of one plane in one bin share in, to the sums; V (3, w): work space."""
     n_b, n_nodes = sums.border.shape[0] - 1, T.shape[1] - len(columns)
     V[:] = 0.0
     for i in range(POSE):
         for t in range(PLANE):
             b = B[POSE + t]
             v = B[i, 0] * b[0] + B[i, 1] * b[1] + B[i, 2] * b[2] + B[i, 3] * b[3]
-            C[i, t] = v
             for j in range(T.shape[1]):
                 V[t, j] += v * T[i, j]
     for h in range(n_nodes // 15):
@@ -263,16 +264,16 @@ def _ends_here(i, bins):
 
 
 class _Work(NamedTuple):
-    """Work space of `accumulate`. T: see `_pose_chain`; m: see `_distances`; A, B (10, 4): derivatives of an
-    entry and these times its root; G (6, 7): what a bin's pose shares with itself and the residual; C (6, 3): with a
-    plane; F, V, row: room for sums."""
+    """Work space of `accumulate`. T: see `_pose_chain`; m: see `_distances`; A, B (10, 4): derivatives of an entry, and
+    these times its root; G (6, 7), W (3, 6): what a bin's pose shares with itself and the residual, and with the turn
+    that noise makes; F, V, row: room for sums."""
 
     T: np.ndarray
     m: np.ndarray
     A: np.ndarray
     B: np.ndarray
     G: np.ndarray
-    C: np.ndarray
+    W: np.ndarray
     F: np.ndarray
     V: np.ndarray
     row: np.ndarray
@@ -283,7 +284,7 @@ def _work_space(motion):
     width = (30 if len(motion.by_next) else 15) + len(motion.columns)
     return _Work(
         np.empty((POSE, width)), np.empty(ROWS), np.empty((RESIDUAL + 1, ROWS)), np.empty((RESIDUAL + 1, ROWS)),
-        np.empty((POSE, POSE + 1)), np.empty((POSE, PLANE)), np.empty((POSE, width + 1)), np.empty((PLANE, width)),
+        np.empty((POSE, POSE + 1)), np.empty((3, POSE)), np.empty((POSE, width + 1)), np.empty((PLANE, width)),
         np.empty(width + 1),
     )  # fmt: skip
 
@@ -302,35 +303,55 @@ def _see(e, i, bins, motion, planes, work, rows):
 
 
 @njit(cache=True, nogil=True)
+def turn_by_noise(bins, motion, planes):
+    """Fills `turned` and `slope` of the bins, which are empty."""
+    work = _work_space(motion)
+    for i in range(len(bins.node)):
+        by_imu = _pose_chain(i, motion, work.T)
+        for e in range(bins.start[i], bins.start[i + 1]):
+            _distances(motion.R_lidar_world[i], motion.p_world_lidar[i], bins.plane[e], planes, work.m)
+            _jacobian(motion.R_lidar_world[i], motion.p_world_lidar[i], bins.plane[e], planes, work.m, work.A)
+            _times_root(work.A, POSE, bins.root[e], work.B)
+            for a in range(3):
+                for j in range(POSE):
+                    w = bins.walked[i] * by_imu[j, a]
+                    for c in range(ROWS):
+                        bins.turned[e, a, c] += w * work.B[j, c]
+                        bins.slope[e, a] += w * work.A[j, c] * bins.slant[e, c] if c else 0.0
+
+
+@njit(cache=True, nogil=True)
 def accumulate(bins, motion, planes, sums, rows):
     """Whitened residuals `rows` (E, 4) of all bins, and their normal equations where they are wanted.
 
     Returns half the chi^2, less what the gyroscope's noise explains, and what the variances add as beams turn.
     """
     wanted, work, cost = len(sums.diagonal) > 0, _work_space(motion), 0.0
-    T, A, B, G = work.T, work.A, work.B, work.G
+    T, A, B, G, W = work.T, work.A, work.B, work.G, work.W
     n_nodes, walk = T.shape[1] - len(motion.columns), no_walk(T.shape[1], len(planes.normal))
     for i in range(len(bins.node)):
-        k, walked = bins.node[i] - sums.first, bins.walked[i]
-        by_imu = _pose_chain(i, motion, T)
-        G[:] = 0.0
+        k, walks = bins.node[i] - sums.first, bins.walked[i] != 0.0
+        if wanted:
+            _pose_chain(i, motion, T)
+        B[:], G[:], W[:] = 0.0, 0.0, 0.0
         for e in range(bins.start[i], bins.start[i + 1]):
             q = bins.plane[e]
             cost += _see(e, i, bins, motion, planes, work, rows)
-            if not (wanted or walked):
-                continue
-            _jacobian(motion.R_lidar_world[i], motion.p_world_lidar[i], q, planes, work.m, A)
-            _times_root(A, RESIDUAL + 1, bins.root[e], B)
-            _add_to_pose(B, A, bins.slant[e], G)
+            if wanted:
+                _jacobian(motion.R_lidar_world[i], motion.p_world_lidar[i], q, planes, work.m, A)
+                _times_root(A, RESIDUAL + 1, bins.root[e], B)
+                _add_to_pose(B, A, bins.slant[e], G)
+            if walks:
+                add_entry(bins.turned[e], bins.slope[e], rows[e], B, W, walk)
             if wanted and planes.columns[q, 0] >= 0:
-                _add_plane(k, B, T, motion.columns, planes.columns[q], sums, work.C, work.V)
+                _add_plane(k, B, T, motion.columns, planes.columns[q], sums, work.V)
                 _add_slant(A, bins.slant[e], planes.columns[q], sums)
-                if walked:
-                    add_plane(walked, by_imu, work.C, q, walk)
+                if walks:
+                    add_plane(bins.turned[e], B, q, walk)
         if wanted:
             _add_pose(k, G, T, motion.columns, sums, work.F, work.row)
-        if walked:
-            add_bin(walked, by_imu, G, T, walk)
-            if _ends_here(i, bins):
-                cost -= 0.5 * _take_off(k, walk, n_nodes, motion.columns, planes.columns, sums)
+        if wanted and walks:
+            add_pose(W, T, walk)
+        if walks and _ends_here(i, bins):
+            cost -= 0.5 * _take_off(k, walk, n_nodes, motion.columns, planes.columns, sums)
     return cost
