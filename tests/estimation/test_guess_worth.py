@@ -9,7 +9,7 @@ import pytest
 
 from icalib.errors import EstimationError
 from icalib.estimation import guess_worth
-from icalib.estimation.guess_worth import moved_to_guess, moved_to_worth, owed_to_guess
+from icalib.estimation.guess_worth import astray, moved_to_guess, moved_to_worth, owed_to_guess
 from icalib.estimation.state import State, make_layout
 
 TOLERANCE = {"translation": 5e-3, "time_offset": 1e-3}
@@ -47,13 +47,28 @@ def landed(given, rng) -> np.ndarray:
     for errors in given.sigma * rng.standard_normal((DRAWS, 8)):
         guess = given.state.retract(given.problem.layout, np.zeros((2, 15)), errors)
         moved = (
-            moved_to_worth(given.inputs, given.problem, given.state, guess)
+            moved_to_worth(given.inputs, given.problem, given.state, guess, given.problem.held)
             if given.priors
             else moved_to_guess(given.problem, given.state, guess, given.problem.held)
         )
         moved = given.state if moved is None else moved
         out.append(np.concatenate([moved.values[b.key] for b in given.problem.layout.free]))
     return np.array(out)
+
+
+@pytest.mark.parametrize(("pull", "sigmas", "moves"), [(0.1, 1.0, True), (9.0, 1.9, False), (9.0, -2.1, True)])
+def test_only_where_noise_pulls_to_near_the_guess_a_direction_stays(given, pull: float, sigmas: float, moves: bool):
+    """The mixture of height and time, pulled to some standard deviations from the guess; nothing pulls at the shift of
+    both. Which axes the span is given in does not matter."""
+    held, tolerance = given.problem.held, given.problem.tolerance
+    mixture = held[:, 1]
+    worth = np.sqrt(np.square(mixture * given.sigma / tolerance).sum())
+    asked = np.diag(np.full(8, 1e-3)) + pull * np.outer(mixture, mixture)
+    to = given.state.retract(given.problem.layout, np.zeros((2, 15)), sigmas * worth * mixture * tolerance)
+    turned = held @ np.array([[0.6, -0.8], [0.8, 0.6]])
+    found = astray(given.inputs, given.problem, given.state, to, turned, asked)
+    expected = held if moves else held[:, :1]
+    np.testing.assert_allclose(found @ found.T, expected @ expected.T, atol=1e-9)
 
 
 @pytest.mark.parametrize("weighed", [False, True])

@@ -20,7 +20,7 @@ HEADER = """\
 # T_scene_body: poses of a target's bodies, in the frame of that body whose pose is the identity.
 # relative: T_a_b takes coordinates in the frame of b to that of a. Its covariance, from the joint one of both, is of
 #   rotation about the axes of b and translation along those of a; where one is undetermined it is that of the guess.
-# verdict: determined, weak or undetermined by the data, or fixed by the rig file. Undetermined values are guesses.
+# verdict: determined, weak or undetermined by the data, or fixed by the rig file. Undetermined is no more than a guess.
 # The full covariance and all residuals are in result.npz.
 """
 KALIBR = "#   (Kalibr's T_cam_imu is the inverse; see camchain-imucam.yaml.)\n"

@@ -3,28 +3,33 @@
 Broad priors do not make an undetermined direction harmless: the solver wanders along it, and what couples with it at
 second order comes out wrong with a small standard deviation. So the information of the data alone, without what noise
 makes of it, says which directions are open; these are moved to the guess and held there while all else is estimated
-again, until their number stays. How much the rest depends on where they are held is tried out, and is part of the
+again, until their number stays. How much the rest depends on where they are is tried out, and is part of the
 covariance.
+
+Noise in the Jacobians may pull along an open direction as hard as data would, and data may be hidden in it. There the
+solver does not wander, and measurements pay dearly for the guess: such a direction is held where they have it, unless
+that is farther from the guess than the guess may be from the truth.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
+from icalib.errors import EstimationError
 from icalib.estimation.arrowhead import HELD_BELOW, restricted_inverse
 from icalib.estimation.assembly import given_priors
 from icalib.estimation.debias import Spurious, spurious_information
-from icalib.estimation.estimate import Estimate, Judged, OnVisit, estimate
-from icalib.estimation.guess_worth import moved_to_guess, moved_to_worth, owed_to_guess
+from icalib.estimation.estimate import EARLY_DECREASE, EARLY_SHARE, Estimate, Judged, OnVisit, estimate
+from icalib.estimation.guess_worth import astray, moved_to_guess, moved_to_worth, owed_to_guess
 from icalib.estimation.inputs import Inputs
-from icalib.estimation.prior_factor import Prior
+from icalib.estimation.prior_factor import without_priors
 from icalib.estimation.problem import Problem
-from icalib.estimation.solver import Outcome, Step
+from icalib.estimation.solver import Outcome, Step, minimise
 from icalib.estimation.state import Key, State
 
 SPURIOUS_SHARE = 0.5  # a direction most of whose information is noise is in doubt: by chance all of it may be
@@ -78,32 +83,50 @@ def determine(
     guess: dict[Key, np.ndarray] | None = None,
 ) -> Determined:
     """Estimates from `start`, again and again until what is undetermined stays so: at `guess`, or if there is none at
-    `start`.
+    `start`, but where noise pulls hard and not far from there.
 
     Raises EstimationError where the data do not carry an estimate.
     """
     wanted = replace(start, values=start.values | (guess or {}))
     found = estimate(inputs, start, on_step, on_visit=on_visit, doubtful=_is_doubtful)
-    data, noise, undetermined = _judge(inputs, found.outcome)
+    seen = _judge(inputs, found.outcome)
     for k in range(MOST_ROUNDS):
-        if _is_settled(undetermined, found.problem.held, k >= LATE) and not found.outcome.half_way:
+        if _is_settled(seen.undetermined, found.problem.held, k >= LATE) and not found.outcome.half_way:
             break
         # One that failed is worth nothing: from the start, then.
         state = found.outcome.state if _is_worth_keeping(found.outcome) else start
-        begin, judged = moved_to_guess(found.problem, state, wanted, undetermined), _worth_keeping(found)
+        moving = astray(inputs, found.problem, state, wanted, seen.undetermined, seen.asked)
+        begin, judged = moved_to_guess(found.problem, state, wanted, moving), _worth_keeping(found)
+        begin = _followed(found, begin, seen.undetermined)
         del found  # before the next one takes as much memory
-        found = estimate(inputs, begin, on_step, undetermined, on_visit, judged)
-        data, noise, undetermined = _judge(inputs, found.outcome)
+        found = estimate(inputs, begin, on_step, seen.undetermined, on_visit, judged)
+        seen = _judge(inputs, found.outcome)
     for _ in range(MOST_ROUNDS):
-        begin = moved_to_worth(inputs, found.problem, found.outcome.state, wanted)
+        problem, state = found.problem, found.outcome.state
+        moving = astray(inputs, problem, state, wanted, problem.held, seen.asked)
+        begin = moved_to_worth(inputs, problem, state, wanted, moving)
         if begin is None:
             break
+        begin = _followed(found, begin, problem.held)
         found = estimate(inputs, begin, on_step, found.problem.held, on_visit, _worth_keeping(found))
-        data, noise, _ = _judge(inputs, found.outcome)
+        seen = _judge(inputs, found.outcome)
     if not found.problem.held.size:
-        return Determined(found, data, noise, np.zeros((inputs.layout.size, 0)), np.zeros((0, inputs.layout.size)))
-    shifts = owed_to_guess(inputs, found.problem, found.outcome.state, data)
-    return Determined(found, data, noise, found.problem.held, shifts)
+        nothing = np.zeros((inputs.layout.size, 0))
+        return Determined(found, seen.data, seen.noise, nothing, nothing.T)
+    shifts = owed_to_guess(inputs, found.problem, found.outcome.state, seen.data)
+    return Determined(found, seen.data, seen.noise, found.problem.held, shifts)
+
+
+def _followed(found: Estimate, moved: State, held: np.ndarray) -> State:
+    """All else where the measurements want it to follow what `moved` along `held` (B, m), while what `found` froze
+    stands: tracks, and weights of points on planes. Made anew beside where the trajectory belongs, these would be of a
+    state that fits nothing, and the next estimate might end anywhere."""
+    if not _is_worth_keeping(found.outcome):
+        return moved
+    try:
+        return minimise(replace(found.problem, held=held), moved, tolerance=EARLY_DECREASE, share=EARLY_SHARE).state
+    except EstimationError:
+        return moved
 
 
 def _worth_keeping(found: Estimate) -> Judged | None:
@@ -131,20 +154,27 @@ def _is_settled(undetermined: np.ndarray, held: np.ndarray, late: bool) -> bool:
     return bool(inside and (n == m or late))
 
 
-def _judge(inputs: Inputs, outcome: Outcome) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Information (B, B) of the data alone, what noise adds to it, and the directions (B, m) that are left open, all in
-    tolerance units.
+class _Judgement(NamedTuple):
+    """Of an estimate, in tolerance units: information of the `data` alone and what `noise` adds to it (B, B), and the
+    directions (B, m) that are `undetermined`; asked (B, B): data, noise and the model's own priors together."""
 
-    Nuisances whose priors belong to the model (a target's shape, bloom) are open only where these priors are, too.
-    """
+    data: np.ndarray
+    noise: np.ndarray
+    asked: np.ndarray
+    undetermined: np.ndarray
+
+
+def _judge(inputs: Inputs, outcome: Outcome) -> _Judgement:
+    """Nuisances whose priors belong to the model (a target's shape, bloom) are open only where these are, too."""
     problem = outcome.problem
     t = problem.tolerance
-    asked = _without(outcome.information, given_priors(inputs), outcome.state)
-    shown = partial(_shown, t[:, None] * asked * t, t)
+    asked = t[:, None] * without_priors(outcome.information, given_priors(inputs), outcome.state) * t
+    shown = partial(_shown, asked, t)
     spurious = spurious_information(problem, outcome, lambda found: not shown(found).in_doubt.any())
     seen, noise = shown(spurious), spurious.mean
-    data = _without(outcome.information - noise, problem.priors, outcome.state)
-    return t[:, None] * data * t, t[:, None] * noise * t, seen.vectors[:, seen.nothing | seen.in_doubt]
+    data = without_priors(outcome.information - noise, problem.priors, outcome.state)
+    undetermined = seen.vectors[:, seen.nothing | seen.in_doubt]
+    return _Judgement(t[:, None] * data * t, t[:, None] * noise * t, asked, undetermined)
 
 
 class _Shown(NamedTuple):
@@ -163,12 +193,3 @@ def _shown(asked: np.ndarray, tolerance: np.ndarray, spurious: Spurious) -> _Sho
     nothing = values < HELD_BELOW
     maybe = values < spurious.chance(tolerance[:, None] * vectors)
     return _Shown(vectors, nothing, ~nothing & maybe & (values < SPURIOUS_SHARE * all_of_it))
-
-
-def _without(information: np.ndarray, priors: Sequence[Prior], state: State) -> np.ndarray:
-    bare = information.copy()
-    for prior in priors:
-        _, J = prior.residual(state)
-        columns = prior.block.columns
-        bare[np.ix_(columns, columns)] -= J.T @ J
-    return bare

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -23,16 +22,15 @@ from icalib.estimation.corner_noise import (
 )
 from icalib.estimation.evidence import fits
 from icalib.estimation.feature_noise import first_following, inliers, next_following
-from icalib.estimation.imu_model import N_INTRINSICS
+from icalib.estimation.guess_priors import guess_priors
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.lidar_factor import LidarFactor
-from icalib.estimation.prior_factor import Prior
+from icalib.estimation.prior_factor import Prior, without_priors
 from icalib.estimation.problem import Problem
 from icalib.estimation.robot import RobotNoise, next_posing, next_ranging
 from icalib.estimation.sensors import chi2
 from icalib.estimation.solver import CONVERGED_DECREASE, ROUNDING, Outcome, Step, Visit, minimise, way_come
 from icalib.estimation.state import State
-from icalib.estimation.tolerances import GUESS_SIGMA
 from icalib.rig import PoseSensor, Settings
 
 LOOSE = 3.0  # times what a guess is worth
@@ -111,13 +109,14 @@ def estimate(
 ) -> Estimate:
     """All passes from a first `state`, directions of the border in `held` (see Problem) left alone; the last one alone
     where noise and outliers are `judged` already. It is left half-way where the information of the border (B, B) makes
-    it `doubtful` that all is determined: along what is not it would only creep.
+    it `doubtful` that all is determined: along what is not it would only creep. Until that is clear the guess counts
+    for what it is worth, so that what is open does not wander far; where it counted to the end, that is half-way, too.
 
     Raises EstimationError where the data do not carry an estimate.
     """
-    names = pass_names(inputs)
+    names, about = pass_names(inputs), tuple[Prior, ...]()
     if judged is None:
-        judged = Judged.first(inputs)
+        judged, about = Judged.first(inputs), guess_priors(inputs, state)
     else:
         names, state = names[-1:], _on_own_nodes(inputs, state)
     history, way = list[tuple[str, Step]](), np.inf
@@ -130,20 +129,43 @@ def estimate(
         last = k + 1 >= len(names)
         early = EARLY_DECREASE, FIRST_SHARE if name == "first" else EARLY_SHARE
         tolerance, share = (CONVERGED_DECREASE, ROUNDING) if last else early
-        problem = judged.problem(inputs, state, held)
+        problem, seen = _with_priors(judged.problem(inputs, state, held), about), [NOTHING]
+
+        def visit(at: Visit, name: str = name, problem: Problem = problem, seen: list[np.ndarray] = seen) -> None:
+            seen[0] = at.information
+            on_visit(name, problem, at)
+
         after = k + 1 < len(names) + AGAIN  # whether another pass may follow
         leaves = _leaves(problem, doubtful, way if after else 0.0) if last else None
-        visit = partial(on_visit, name, problem)
         outcome: Outcome = minimise(problem, state, note, tolerance, visit, share, leaves=leaves)
-        open_already = outcome.half_way and doubtful(problem, outcome.information)
-        if last and (open_already or not after or not _again(inputs, outcome, judged, way)):
-            return Estimate(outcome, judged, tuple(history))
+        is_open = doubtful(problem, seen[0])
+        if last and ((outcome.half_way and is_open) or not after or not _again(inputs, outcome, judged, way)):
+            return Estimate(_without_priors(outcome, about), judged, tuple(history))
         way = way_come(outcome.steps, outcome.cost) if last else np.inf
+        about = about if is_open else ()
         judged = judged if last else judged.next(inputs, outcome, name == "first")
         state = _on_own_nodes(inputs, outcome.state)
         del problem, outcome  # before the next ones take as much memory
         pages.give_back()
     raise AssertionError("pass_names is never empty")
+
+
+def _with_priors(problem: Problem, more: Sequence[Prior]) -> Problem:
+    return replace(problem, priors=(*problem.priors, *more))
+
+
+def _without_priors(outcome: Outcome, more: Sequence[Prior]) -> Outcome:
+    """The outcome of a problem with `more` priors as one of the problem without, of which it is no more than half-way
+    to the end."""
+    if not more:
+        return outcome
+    problem = outcome.problem
+    return replace(
+        outcome,
+        problem=replace(problem, priors=problem.priors[: -len(more)]),
+        information=without_priors(outcome.information, more, outcome.state),
+        half_way=outcome.half_way or outcome.converged,
+    )
 
 
 def _leaves(
@@ -185,12 +207,7 @@ def first_pass(inputs: Inputs, state: State) -> State:
     Raises EstimationError where the data do not carry an estimate.
     """
     problem = Judged.first(inputs).problem(inputs, state)
-    loose = [
-        Prior(b, state.values[b.key], np.full(b.size, LOOSE * GUESS_SIGMA[b.name]))
-        for b in inputs.layout.free
-        if inputs.is_sensor(b.sensor) and b.size != N_INTRINSICS
-    ]
-    problem = replace(problem, priors=(*problem.priors, *loose))
+    problem = _with_priors(problem, guess_priors(inputs, state, LOOSE))
     return minimise(problem, state, tolerance=EARLY_DECREASE, share=EARLY_SHARE, comes_back=False).state
 
 

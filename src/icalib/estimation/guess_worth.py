@@ -7,23 +7,43 @@ it may be from the truth; and how far the rest moves with it is found by moving 
 from __future__ import annotations
 
 import numpy as np
+from scipy.linalg import eigh
 
 from icalib.errors import EstimationError
 from icalib.estimation.arrowhead import HELD_BELOW
 from icalib.estimation.assembly import given_priors
 from icalib.estimation.estimate import EARLY_DECREASE
-from icalib.estimation.imu_model import N_INTRINSICS
+from icalib.estimation.guess_priors import guess_sigma
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.problem import Problem
 from icalib.estimation.solver import minimise
 from icalib.estimation.state import Block, State
-from icalib.estimation.tolerances import FROM_NOTHING_M, GUESS_SIGMA, OTHER_SIGMA, UNGUESSED
+from icalib.estimation.tolerances import GUESS_SIGMA, UNGUESSED
 from icalib.geometry import planes, so3
 
+PULLED = 0.25  # information in tolerance units, noise and all
+FARTHEST = 2.0  # standard deviations of the guess
 MOVED_BY_HELD = 0.1  # parts of a direction smaller than this do not count as in it
 MOSTLY = 0.5  # of the square of a direction
 NEAR_GUESS = 0.05  # of what the guess is worth
 HALVINGS = 4  # of a move along which nothing can be solved
+
+
+def astray(
+    inputs: Inputs, problem: Problem, state: State, guess: State, open_: np.ndarray, asked: np.ndarray
+) -> np.ndarray:
+    """(B, k) orthonormal directions in the span of `open_` (B, m) along which `state` is to move to `guess`: all but
+    those along which the measurements pull, be it by noise, to a place as near the guess as the truth may be.
+
+    asked (B, B): information in tolerance units, with what noise adds to it. Noise pulls to where it shows least, such
+    as a lever arm of nothing; but where it hides what little the data know, a guess far from there would be paid for
+    by all that is well known.
+    """
+    values, turn = np.linalg.eigh(open_.T @ asked @ open_)
+    axes = open_ @ turn
+    way = axes.T @ (border_difference(problem, guess, state) / problem.tolerance)
+    worth = np.sqrt(np.diag(_guess_covariance(inputs, problem, axes)))
+    return axes[:, (values < PULLED) | (np.abs(way) > FARTHEST * worth)]
 
 
 def moved_to_guess(problem: Problem, state: State, guess: State, held: np.ndarray) -> State:
@@ -32,19 +52,19 @@ def moved_to_guess(problem: Problem, state: State, guess: State, held: np.ndarra
     return _moved(problem, state, held @ (held.T @ way))
 
 
-def moved_to_worth(inputs: Inputs, problem: Problem, state: State, guess: State) -> State | None:
-    """`state`, moved along the held directions to where the guesses of all that they move have it, each by what it is
-    worth; None where the rig file says no guess is worth more than others, or it stands there already.
+def moved_to_worth(inputs: Inputs, problem: Problem, state: State, guess: State, held: np.ndarray) -> State | None:
+    """`state`, moved along the directions `held` (B, m) to where the guesses of all that they move have it, each by
+    what it is worth; None where the rig file says no guess is worth more than others, or it stands there already.
 
     Where the data know only how two heights differ, and one was measured, `moved_to_guess` would leave both half-way.
     """
-    if not _is_weighed(inputs, problem):
+    if not _is_weighed(inputs, held):
         return None
     sigma, way = _weights(inputs, problem), border_difference(problem, guess, state)
     # What nobody guessed moves along, but nothing turns: what little a turn moves would be paid for with all of it.
     for block in _unguessed(inputs):
         way[block.columns] = 0.0
-    directions = problem.tolerance[:, None] * problem.held
+    directions = problem.tolerance[:, None] * held
     step = directions @ np.linalg.lstsq(directions / sigma[:, None], way / sigma, rcond=None)[0]
     if np.linalg.norm(step / sigma) < NEAR_GUESS:
         return None
@@ -72,7 +92,8 @@ def _ways(inputs: Inputs, problem: Problem, data: np.ndarray) -> np.ndarray:
     gravity by as much as it likes would be turned round and round, with a bias of the accelerometer that nobody
     believes.
     """
-    values, turn = np.linalg.eigh(_held_covariance(inputs, problem))
+    # Of so many like variances divide and conquer, NumPy's way, has failed to find the eigenvectors.
+    values, turn = eigh(_guess_covariance(inputs, problem, problem.held), driver="evr")
     ways = problem.held @ turn
     width = np.sqrt(np.clip(values, 0.0, None))
     own = np.concatenate([np.arange(0), *(b.columns for b in problem.layout.free if inputs.is_sensor(b.sensor))])
@@ -83,16 +104,16 @@ def _ways(inputs: Inputs, problem: Problem, data: np.ndarray) -> np.ndarray:
     return ways * width
 
 
-def _held_covariance(inputs: Inputs, problem: Problem) -> np.ndarray:
-    """(m, m) of the guess along the held directions, in tolerance units: of an orthogonal projection, as
+def _guess_covariance(inputs: Inputs, problem: Problem, held: np.ndarray) -> np.ndarray:
+    """(m, m) of the guess along directions `held` (B, m), in tolerance units: of an orthogonal projection, as
     `moved_to_guess` makes it, or of a weighted one, as `moved_to_worth` does."""
-    if _is_weighed(inputs, problem):
-        scaled = problem.held * (problem.tolerance / _weights(inputs, problem))[:, None]
+    if _is_weighed(inputs, held):
+        scaled = held * (problem.tolerance / _weights(inputs, problem))[:, None]
         return np.linalg.inv(scaled.T @ scaled)
     sigma = guess_sigma(inputs)
     for block in _unguessed(inputs):
         sigma[block.columns] = np.minimum(sigma[block.columns], UNGUESSED)
-    scaled = problem.held * (sigma / problem.tolerance)[:, None]
+    scaled = held * (sigma / problem.tolerance)[:, None]
     return scaled.T @ scaled
 
 
@@ -114,10 +135,10 @@ def _answer(problem: Problem, state: State, way: np.ndarray) -> np.ndarray:
     return problem.tolerance * way
 
 
-def _is_weighed(inputs: Inputs, problem: Problem) -> bool:
-    """Whether the rig file says of something that is held what its guess is worth."""
+def _is_weighed(inputs: Inputs, held: np.ndarray) -> bool:
+    """Whether the rig file says of something that the directions `held` (B, m) move what its guess is worth."""
     own = np.concatenate([np.empty(0, dtype=np.int64), *(p.block.columns for p in given_priors(inputs))])
-    return bool(problem.held.size and np.any(np.abs(problem.held[own]) > MOVED_BY_HELD))
+    return bool(held.size and np.any(np.abs(held[own]) > MOVED_BY_HELD))
 
 
 def _weights(inputs: Inputs, problem: Problem) -> np.ndarray:
@@ -132,18 +153,6 @@ def _weights(inputs: Inputs, problem: Problem) -> np.ndarray:
 def _unguessed(inputs: Inputs) -> list[Block]:
     """Of no sensor: walls, boards and frames, of which nobody guessed where they are."""
     return [b for b in inputs.layout.free if not inputs.is_sensor(b.sensor)]
-
-
-def guess_sigma(inputs: Inputs) -> np.ndarray:
-    """(B,) standard deviations of the guess: given ones, or what one without is worth."""
-    sigma, sensors = np.zeros(inputs.layout.size), {s.name: s for s in inputs.sensors}
-    for b in inputs.layout.free:
-        sigma[b.columns] = OTHER_SIGMA if b.size == N_INTRINSICS else GUESS_SIGMA[b.name]
-        if b.name == "translation" and b.sensor in sensors and sensors[b.sensor].translation.value is None:
-            sigma[b.columns] = FROM_NOTHING_M
-    for prior in given_priors(inputs):
-        sigma[prior.block.columns] = prior.sigma
-    return sigma
 
 
 def _moved(problem: Problem, state: State, way: np.ndarray) -> State:

@@ -12,11 +12,10 @@ import numpy as np
 from numba import njit
 
 from icalib.estimation.corner_chain import by_imu_pose
-from icalib.estimation.lidar_walk import add_entry, add_plane, add_pose, border_of, no_walk, taken_off
+from icalib.estimation.lidar_walk import PLANE, POSE, add_entry, add_plane, add_pose, border_of, no_walk, taken_off
 from icalib.estimation.state import Key, State
 from icalib.geometry.planes import tangents
 
-POSE, PLANE = 6, 3
 ROWS = 4  # whitened residuals of a plane in a bin
 RESIDUAL = POSE + PLANE  # the last column of an entry's Jacobian
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,6 +40,16 @@ class Prior:
             piece.border[columns, -1] += J.T @ r
             piece.border[-1, columns] += J.T @ r
         return 0.5 * float(r @ r)
+
+
+def without_priors(information: np.ndarray, priors: Sequence[Prior], state: State) -> np.ndarray:
+    """(B, B) the border's information at `state` less that of `priors`."""
+    bare = information.copy()
+    for prior in priors:
+        _, J = prior.residual(state)
+        columns = prior.block.columns
+        bare[np.ix_(columns, columns)] -= J.T @ J
+    return bare
 
 
 def accumulate_bias_prior(

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.arrowhead import NOTHING, Draw, NotDefiniteError, Solution, solve
+from icalib.estimation.arrowhead import NOTHING, Draw, NotDefiniteError, Piece, Solution, solve
 from icalib.estimation.problem import Problem, Residuals
 from icalib.estimation.state import State
 
@@ -107,6 +107,145 @@ class _Care:
         self.curved = False
 
 
+@dataclass
+class _Descent:
+    """Where the solver stands: `cost` at `state`, of which `pieces` and `residuals` hold the sums; stalled: how many
+    small steps have failed."""
+
+    problem: Problem
+    state: State
+    tolerance: float
+    share: float
+    on_step: Callable[[Step], None]
+    pieces: tuple[Piece, ...]
+    residuals: Residuals
+    cost: float
+    steps: list[Step] = field(default_factory=list)
+    care: _Care = field(default_factory=_Care)
+    stalled: int = 0
+
+    @classmethod
+    def begin(
+        cls, problem: Problem, state: State, tolerance: float, share: float, on_step: Callable[[Step], None]
+    ) -> _Descent:
+        """At `state`, before any step."""
+        pieces, residuals = problem.pieces(), problem.residuals()
+        cost = problem.linearise(state, pieces, residuals)
+        return cls(problem, state, tolerance, share, on_step, pieces, residuals, cost)
+
+    @property
+    def early(self) -> bool:
+        """Whether another pass follows."""
+        return self.tolerance > STALLED_DECREASE
+
+    @property
+    def enough(self) -> float:
+        """A decrease that is not worth a further step."""
+        return max(self.tolerance, self.share * self.cost)
+
+    @property
+    def free(self) -> bool:
+        """Whether steps are not damped."""
+        return self.care.damping == 0.0
+
+    def solution(self) -> Solution:
+        """Of the sums, with the least damping, from that in use up, that makes them definite."""
+        if not np.isfinite(self.cost):
+            raise EstimationError(
+                "the first guess predicts no finite measurement; give a better guess in the rig file."
+            )
+        while True:
+            try:
+                return self._solve(self.care.damping)
+            except NotDefiniteError:
+                self.care.damping = max(10.0 * self.care.damping, FIRST_DAMPING)
+                if self.care.damping > 1e3:
+                    raise
+                self._linearise(self.state, curved=self.care.curved)
+
+    def has_ended(self, solution: Solution) -> bool:
+        """Whether nothing that counts would change: the sums are those of the end already."""
+        counts = min(ROUNDING * self.cost, LEAST_DECREASE)
+        return not self.early and self.care.curved and self.free and solution.decrease < counts
+
+    def note(self, solution: Solution, taken: bool) -> None:
+        """Keeps a record of a step."""
+        self.steps.append(Step(self.cost, solution.decrease, self.care.damping, taken))
+        self.on_step(self.steps[-1])
+
+    def step(self, solution: Solution, comes_back: bool) -> tuple[bool, bool]:
+        """Whether the step is taken, and whether it is the last one."""
+        near = solution.decrease < self.care.curved_below * self.cost
+        converged = self.free and solution.decrease < self.enough
+        sums = not (converged and self.early)
+        there = self.state.retract(self.problem.layout, solution.chain, solution.border)
+        cost = self._linearise(there, sums, near)
+        if comes_back and sums and not (cost < self.cost or converged):
+            there, cost = self._corrected(there, cost, near)
+        # At the bottom rounding decides whether the cost falls; a step that promises this little is taken anyway, but
+        # not where it goes far along what the data hardly tell, and the cost rises.
+        taken = bool(cost < self.cost) or (converged and cost - self.cost < self.enough)
+        self.note(solution, taken)
+        if taken:
+            self.care.less(near, self.cost - cost > 0.25 * solution.decrease)
+            self.state, self.cost, self.problem = there, cost, self.problem.settled(self.residuals)
+        return taken, converged
+
+    def tries_again(self, solution: Solution) -> bool:
+        """After a step that failed: with more care, unless nothing comes of it."""
+        self.stalled += solution.decrease < STALLED_DECREASE
+        if self.stalled > MOST_STALLED or (self.early and solution.decrease < RESTING * self.enough):
+            return False
+        self.care.more()
+        if self.care.damping > 1e6:
+            return False
+        self.cost = self._linearise(self.state)
+        return True
+
+    def end(self, on_visit: Callable[[Visit], None]) -> Outcome:
+        """The outcome here."""
+        last = self.steps[-1]
+        if self.early:
+            if not last.accepted:  # what was filled last is not that of `state`
+                self._linearise(self.state, sums=False)
+            return _outcome(self.problem, self.state, self.cost, self.residuals, last.predicted_decrease, self.steps)
+        if not (self.care.curved and last.accepted):
+            self._linearise(self.state, curved=True)
+        solution = self._solve(0.0)
+        on_visit(Visit(self.state, solution.information))
+        return self.outcome(solution)
+
+    def outcome(self, end: Solution) -> Outcome:
+        """With what was solved here."""
+        return _outcome(self.problem, self.state, self.cost, self.residuals, end.decrease, self.steps, end)
+
+    def _corrected(self, state: State, cost: float, curved: bool) -> tuple[State, float]:
+        """Further steps from a candidate, linearised at `state`, that costs too much, as long as each leaves but a part
+        of the excess; and what that costs.
+
+        What the data hardly tell, gravity's direction on a straight drive for one, moves far in a step, along a valley
+        that is curved: a step along its tangent leaves it by the square of the way, the next ones come back. More
+        damping would make the way so short that the solver creeps. An excess within rounding is none: it would never
+        be less.
+        """
+        share, least = 0.0, self.cost
+        while cost - least >= ROUNDING * least and share < COMES_BACK:
+            try:
+                solution = self._solve(max(self.care.damping, ACROSS))
+            except NotDefiniteError:
+                break
+            state = state.retract(self.problem.layout, solution.chain, solution.border)
+            before, cost = cost, self._linearise(state, True, curved)
+            share = (cost - least) / max(before - least, ROUNDING * least) if np.isfinite(cost) else np.inf
+        return state, cost
+
+    def _linearise(self, state: State, sums: bool = True, curved: bool = False) -> float:
+        return self.problem.linearise(state, self.pieces, self.residuals, sums, curved)
+
+    def _solve(self, damping: float) -> Solution:
+        return solve(self.pieces, self.problem.n_nodes, self.problem.tolerance, damping, self.problem.held)
+
+
 def minimise(
     problem: Problem,
     state: State,
@@ -121,67 +260,33 @@ def minimise(
 
     `on_visit` is told of each state that a step was looked for from, and of the last. Where the tolerance is wide
     another pass follows, and the end is not linearised once more: the outcome has no information and no draws.
-    `comes_back`: steps may go as far as the next ones can make good, see `_corrected`. `leaves`: asked with
+    `comes_back`: steps may go as far as the next ones can make good, see `_Descent`. `leaves`: asked with
     how far it has come, as a share of half the chi^2, and the border's information (B, B), whether to end when half the
     chi^2 can fall by less than HALF_WAY, or a step not far from there fails.
 
     Raises EstimationError if no step can be computed at all.
     """
-    pieces, residuals, early = problem.pieces(), problem.residuals(), tolerance > STALLED_DECREASE
-    cost, care, stalled, steps = problem.linearise(state, pieces, residuals), _Care(), 0, list[Step]()
-
-    def note(decrease: float, accepted: bool) -> None:
-        steps.append(Step(cost, decrease, care.damping, accepted))
-        on_step(steps[-1])
-
+    at = _Descent.begin(problem, state, tolerance, share, on_step)
     for _ in range(MAX_ITERATIONS):
-        if not np.isfinite(cost):
-            raise EstimationError(
-                "the first guess predicts no finite measurement; give a better guess in the rig file."
-            )
-        solution, care.damping = _solve(problem, state, pieces, residuals, care.damping, care.curved)
-        on_visit(Visit(state, solution.information))
-        free, enough = care.damping == 0.0, max(tolerance, share * cost)
-        low = free and solution.decrease < RESTING * HALF_WAY
-        asked = low and leaves is not None and leaves(way_come(steps, cost), solution.information)
+        solution = at.solution()
+        on_visit(Visit(at.state, solution.information))
+        low = at.free and solution.decrease < RESTING * HALF_WAY
+        asked = low and leaves is not None and leaves(way_come(at.steps, at.cost), solution.information)
         if asked and solution.decrease < HALF_WAY:
-            left = _outcome(problem, state, cost, residuals, solution.decrease, steps, solution)
-            return replace(left, half_way=True)
-        if not early and care.curved and free and solution.decrease < min(ROUNDING * cost, LEAST_DECREASE):
-            # Nothing that counts would change: the sums were those of the end already.
-            note(solution.decrease, True)
-            return _outcome(problem, state, cost, residuals, solution.decrease, steps, solution)
-        candidate = state.retract(problem.layout, solution.chain, solution.border)
-        near = solution.decrease < care.curved_below * cost
-        converged = free and solution.decrease < enough
-        sums = not (converged and early)
-        candidate_cost = problem.linearise(candidate, pieces, residuals, sums, near)
-        if comes_back and sums and not (candidate_cost < cost or converged):
-            trial = problem, candidate, pieces, residuals, care.damping, near
-            candidate, candidate_cost = _corrected(*trial, candidate_cost, cost)
-        # At the bottom rounding decides whether the cost falls; a step that promises this little is taken anyway, but
-        # not where it goes far along what the data hardly tell, and the cost rises.
-        accepted = bool(candidate_cost < cost) or (converged and candidate_cost - cost < enough)
-        note(solution.decrease, accepted)
-        if accepted:
-            care.less(near, cost - candidate_cost > 0.25 * solution.decrease)
-            state, cost, problem = candidate, candidate_cost, problem.settled(residuals)
+            return replace(at.outcome(solution), half_way=True)
+        if at.has_ended(solution):
+            at.note(solution, True)
+            return at.outcome(solution)
+        taken, converged = at.step(solution, comes_back)
         if converged:
             break
-        if accepted:
+        if taken:
             continue
         if asked:
-            return replace(_end(problem, state, cost, pieces, residuals, steps, care.curved, on_visit), half_way=True)
-        stalled += solution.decrease < STALLED_DECREASE
-        if stalled > MOST_STALLED or (early and solution.decrease < RESTING * enough):
+            return replace(at.end(on_visit), half_way=True)
+        if not at.tries_again(solution):
             break
-        care.more()
-        if care.damping > 1e6:
-            break
-        cost = problem.linearise(state, pieces, residuals)
-    if early:
-        return _early_end(problem, state, cost, pieces, residuals, steps)
-    return _end(problem, state, cost, pieces, residuals, steps, care.curved, on_visit)
+    return at.end(on_visit)
 
 
 def way_come(steps: Sequence[Step], cost: float) -> float:
@@ -190,57 +295,11 @@ def way_come(steps: Sequence[Step], cost: float) -> float:
     return steps[0].cost / cost - 1.0 if steps and cost > 0.0 else 0.0
 
 
-def _corrected(problem, state, pieces, residuals, damping, curved, cost, least) -> tuple[State, float]:
-    """Further steps from a candidate that was linearised at `state` and costs more than `least`, as long as each leaves
-    but a part of the excess; and what that costs.
-
-    What the data hardly tell, gravity's direction on a straight drive for one, moves far in a step, along a valley that
-    is curved: a step along its tangent leaves it by the square of the way, the next ones come back. More damping would
-    make the way so short that the solver creeps. An excess within rounding is none: it would never be less.
-    """
-    share = 0.0
-    while cost - least >= ROUNDING * least and share < COMES_BACK:
-        try:
-            solution = solve(pieces, problem.n_nodes, problem.tolerance, max(damping, ACROSS), problem.held)
-        except NotDefiniteError:
-            break
-        state = state.retract(problem.layout, solution.chain, solution.border)
-        before, cost = cost, problem.linearise(state, pieces, residuals, True, curved)
-        share = (cost - least) / max(before - least, ROUNDING * least) if np.isfinite(cost) else np.inf
-    return state, cost
-
-
-def _early_end(problem, state, cost, pieces, residuals, steps) -> Outcome:
-    if not steps[-1].accepted:  # what was filled last is not that of `state`
-        problem.linearise(state, pieces, residuals, sums=False)
-    return _outcome(problem, state, cost, residuals, steps[-1].predicted_decrease, steps)
-
-
-def _end(problem, state, cost, pieces, residuals, steps, curved, on_visit) -> Outcome:
-    if not (curved and steps[-1].accepted):
-        problem.linearise(state, pieces, residuals, curved=True)
-    solution = solve(pieces, problem.n_nodes, problem.tolerance, 0.0, problem.held)
-    on_visit(Visit(state, solution.information))
-    return _outcome(problem, state, cost, residuals, solution.decrease, steps, solution)
-
-
 def posterior(problem: Problem, state: State) -> Draws:
     """Draws from the posterior at `state`. Raises NotDefiniteError."""
     pieces = problem.pieces()
     problem.linearise(state, pieces, problem.residuals(), curved=True)
     return Draws.of(solve(pieces, problem.n_nodes, problem.tolerance, held=problem.held))
-
-
-def _solve(problem, state, pieces, residuals, damping, curved):
-    """Solves with the least damping, from `damping` up, that makes the sums definite."""
-    while True:
-        try:
-            return solve(pieces, problem.n_nodes, problem.tolerance, damping, problem.held), damping
-        except NotDefiniteError:
-            damping = max(10.0 * damping, FIRST_DAMPING)
-            if damping > 1e3:
-                raise
-            problem.linearise(state, pieces, residuals, curved=curved)
 
 
 def _outcome(

@@ -24,7 +24,7 @@ TRUST = {
     "good": "Yes. The solver converged, the motion determines every parameter, and nothing calls for attention.",
     "care": "Mostly. Read what stands below before using the numbers marked weak or warned about.",
     "wrong": "No. Something in the rig file must be wrong: correct it as the first warning says, and calibrate again.",
-    "bad": "Not as a whole. Do not use what is marked undetermined: it is the guess, not a result.",
+    "bad": "Not as a whole. Do not use what is marked undetermined: it is no better than the guess.",
     "failed": "No. The solver did not converge; the numbers are where it stopped.",
 }
 WORDS = {"rotation": "rotation", "translation": "position", "time_offset": "time offset"}
