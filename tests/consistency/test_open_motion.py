@@ -91,8 +91,8 @@ def test_what_noise_hides_is_not_forced_to_the_guess():
 
 
 def test_what_is_open_does_not_wander_before_it_is_known_to_be():
-    """A straight line shows little at first, and tracks are few: without what guesses are worth cameras turned by 10 deg
-    before anything was judged, and from there nothing converged."""
+    """A straight line shows little at first, and tracks are few: without what guesses are worth, cameras turned by
+    10 deg before anything was judged, and from there nothing converged."""
     result, simulation = calibrated("straight-line", 1.0, 8, "free", seconds=8.0)
     check(result, simulation)
     assert sum(i.stage == "final" for i in result.iterations) < MOST_STEPS

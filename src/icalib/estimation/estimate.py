@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -121,33 +121,45 @@ def estimate(
         names, state = names[-1:], _on_own_nodes(inputs, state)
     history, way = list[tuple[str, Step]](), np.inf
     for k, name in enumerate((*names, *names[-1:] * AGAIN)):
-
-        def note(step: Step, name: str = name) -> None:
-            history.append((name, step))
-            on_step(name, step)
-
         last = k + 1 >= len(names)
         early = EARLY_DECREASE, FIRST_SHARE if name == "first" else EARLY_SHARE
         tolerance, share = (CONVERGED_DECREASE, ROUNDING) if last else early
-        problem, seen = _with_priors(judged.problem(inputs, state, held), about), [NOTHING]
-
-        def visit(at: Visit, name: str = name, problem: Problem = problem, seen: list[np.ndarray] = seen) -> None:
-            seen[0] = at.information
-            on_visit(name, problem, at)
-
+        problem = _with_priors(judged.problem(inputs, state, held), about)
+        told = _Told(name, problem, on_step, on_visit, history)
         after = k + 1 < len(names) + AGAIN  # whether another pass may follow
         leaves = _leaves(problem, doubtful, way if after else 0.0) if last else None
-        outcome: Outcome = minimise(problem, state, note, tolerance, visit, share, leaves=leaves)
-        is_open = doubtful(problem, seen[0])
+        outcome: Outcome = minimise(problem, state, told.step, tolerance, told.visit, share, leaves=leaves)
+        is_open = doubtful(problem, told.information)
         if last and ((outcome.half_way and is_open) or not after or not _again(inputs, outcome, judged, way)):
             return Estimate(_without_priors(outcome, about), judged, tuple(history))
         way = way_come(outcome.steps, outcome.cost) if last else np.inf
         about = about if is_open else ()
         judged = judged if last else judged.next(inputs, outcome, name == "first")
         state = _on_own_nodes(inputs, outcome.state)
-        del problem, outcome  # before the next ones take as much memory
+        del problem, outcome, told  # before the next ones take as much memory
         pages.give_back()
     raise AssertionError("pass_names is never empty")
+
+
+@dataclass
+class _Told:
+    """Passes on what a pass tells of its way, keeps the steps in a `history` of all passes, and the border's last
+    information (B, B)."""
+
+    name: str
+    problem: Problem
+    on_step: Callable[[str, Step], None]
+    on_visit: OnVisit
+    history: list[tuple[str, Step]]
+    information: np.ndarray = field(default_factory=lambda: NOTHING)
+
+    def step(self, step: Step) -> None:
+        self.history.append((self.name, step))
+        self.on_step(self.name, step)
+
+    def visit(self, at: Visit) -> None:
+        self.information = at.information
+        self.on_visit(self.name, self.problem, at)
 
 
 def _with_priors(problem: Problem, more: Sequence[Prior]) -> Problem:

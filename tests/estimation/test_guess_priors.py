@@ -1,0 +1,81 @@
+"""What guesses are worth while it is not clear yet what the data leave open; afterwards nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from icalib.estimation import estimate as estimates
+from icalib.estimation.arrowhead import solve
+from icalib.estimation.assembly import given_priors
+from icalib.estimation.estimate import Estimate, estimate
+from icalib.estimation.guess_priors import guess_priors
+from icalib.estimation.inputs import Inputs
+from icalib.estimation.state import State
+from icalib.estimation.tolerances import FROM_NOTHING_M, GUESS_SIGMA
+from icalib.first_guess.start import start
+from icalib.rig import Parameter
+from icalib.simulation import handheld, rig_for, simulate
+
+
+@pytest.fixture(scope="module")
+def begun() -> tuple[Inputs, State]:
+    """A camera pair of which the rig file gives one time offset as a prior, and nothing else."""
+    scenario = handheld(4.0)
+    rig = rig_for(scenario)
+    given = Parameter("prior", np.array([0.01]), np.array([0.003]))
+    rig = replace(rig, cameras=(replace(rig.cameras[0], time_offset=given), *rig.cameras[1:]))
+    inputs, state, _ = start(rig, [simulate(scenario, 0).measurements])
+    return inputs, state
+
+
+def test_they_are_as_wide_as_a_guess_is_off_and_never_beside_a_given_one(begun):
+    inputs, state = begun
+    found = {p.block.key: p for p in guess_priors(inputs, state, times=2.0)}
+    camera, other = (c.name for c in inputs.rig.cameras)
+    assert (camera, "time_offset") not in found
+    np.testing.assert_array_equal(found[other, "time_offset"].sigma, 2.0 * GUESS_SIGMA["time_offset"])
+    np.testing.assert_array_equal(found[other, "rotation"].sigma, 2.0 * GUESS_SIGMA["rotation"])
+    np.testing.assert_array_equal(found[other, "translation"].sigma, 2.0 * FROM_NOTHING_M)
+    assert all(inputs.is_sensor(sensor) for sensor, _ in found)
+    for key, prior in found.items():
+        residual, _ = prior.residual(state)
+        np.testing.assert_allclose(residual, 0.0, atol=1e-12, err_msg=str(key))
+
+
+def information_of(found: Estimate) -> np.ndarray:
+    """Of the border where `found` ended, of the problem that it says it is of."""
+    problem = found.problem
+    pieces = problem.pieces()
+    problem.linearise(found.outcome.state, pieces, problem.residuals(), curved=True)
+    return solve(pieces, problem.n_nodes, problem.tolerance).information
+
+
+@pytest.mark.parametrize("doubtful", [False, True])
+def test_where_they_counted_to_the_end_the_estimate_is_half_way_and_without_them(begun, monkeypatch, doubtful: bool):
+    """Guesses are taken to be good to a hundredth, so that they would be missed."""
+    monkeypatch.setattr(estimates, "guess_priors", partial(guess_priors, times=1e-2))
+    inputs, state = begun
+    asked: list[int] = []
+
+    def seems_open(problem, information) -> bool:
+        asked.append(len(problem.priors))
+        return doubtful
+
+    found = estimate(inputs, state, doubtful=seems_open)
+    given = {p.block.key for p in given_priors(inputs)}
+    guessed = {p.block.key for p in guess_priors(inputs, state)}
+    left = {p.block.key for p in found.problem.priors}
+    assert given <= left
+    assert not left & guessed
+    assert asked[0] == len(found.problem.priors) + len(guessed)  # in the first pass they count
+    assert (asked[-1] == asked[0]) == doubtful
+    assert found.outcome.half_way == doubtful
+    expected = information_of(found)
+    scale = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(
+        found.outcome.information / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-9
+    )
