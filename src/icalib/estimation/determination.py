@@ -95,9 +95,10 @@ def determine(
             break
         # One that failed is worth nothing: from the start, then.
         state = found.outcome.state if _is_worth_keeping(found.outcome) else start
+        begin, judged = state, _worth_keeping(found)
         moving = astray(inputs, found.problem, state, wanted, seen.undetermined, seen.asked)
-        begin, judged = moved_to_guess(found.problem, state, wanted, moving), _worth_keeping(found)
-        begin = _followed(found, begin, seen.undetermined)
+        if moving.size:
+            begin = _followed(found, moved_to_guess(found.problem, state, wanted, moving), seen.undetermined)
         del found  # before the next one takes as much memory
         found = estimate(inputs, begin, on_step, seen.undetermined, on_visit, judged)
         seen = _judge(inputs, found.outcome)

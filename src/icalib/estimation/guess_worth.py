@@ -39,6 +39,8 @@ def astray(
     as a lever arm of nothing; but where it hides what little the data know, a guess far from there would be paid for
     by all that is well known.
     """
+    if not open_.size:
+        return open_
     values, turn = np.linalg.eigh(open_.T @ asked @ open_)
     axes = open_ @ turn
     way = axes.T @ (border_difference(problem, guess, state) / problem.tolerance)
