@@ -130,6 +130,10 @@ def estimate(
         leaves = _leaves(problem, doubtful, way if after else 0.0) if last else None
         outcome: Outcome = minimise(problem, state, told.step, tolerance, told.visit, share, leaves=leaves)
         is_open = doubtful(problem, told.information)
+        if last and about and not is_open:
+            problem, about = _fewer_priors(outcome.problem, about), ()
+            rest = minimise(problem, outcome.state, told.step, tolerance, told.visit, share)
+            outcome = replace(rest, steps=(*outcome.steps, *rest.steps))
         if last and ((outcome.half_way and is_open) or not after or not _again(inputs, outcome, judged, way)):
             return Estimate(_without_priors(outcome, about), judged, tuple(history))
         way = way_come(outcome.steps, outcome.cost) if last else np.inf
@@ -166,15 +170,18 @@ def _with_priors(problem: Problem, more: Sequence[Prior]) -> Problem:
     return replace(problem, priors=(*problem.priors, *more))
 
 
+def _fewer_priors(problem: Problem, less: Sequence[Prior]) -> Problem:
+    return replace(problem, priors=problem.priors[: -len(less)])
+
+
 def _without_priors(outcome: Outcome, more: Sequence[Prior]) -> Outcome:
     """The outcome of a problem with `more` priors as one of the problem without, of which it is no more than half-way
     to the end."""
     if not more:
         return outcome
-    problem = outcome.problem
     return replace(
         outcome,
-        problem=replace(problem, priors=problem.priors[: -len(more)]),
+        problem=_fewer_priors(outcome.problem, more),
         information=without_priors(outcome.information, more, outcome.state),
         half_way=outcome.half_way or outcome.converged,
     )
