@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from icalib.estimation.debias import Spurious
-from icalib.estimation.determination import _scatter, _shown
+from icalib.estimation.determination import _are_alike, _scatter, _shown
 
 DIRECTIONS = np.linalg.qr(np.random.default_rng(0).standard_normal((4, 4)))[0]
 TOLERANCE = np.array([1e-3, 0.1, 2.0, 0.5])
@@ -36,6 +36,27 @@ def test_noise_adds_more_than_is_allowed_for_once_in_a_thousand(n: int):
         found = Spurious(np.reshape(draws, (n, 1, 1)))
         more += this > found.mean[0, 0] + found.chance(np.eye(1))[0]
     assert 8 <= more <= 34  # 20 are expected; one study in a thousand has fewer or more
+
+
+def test_noise_never_makes_a_variance_smaller():
+    """Draws may say by chance that it takes something off, even more than there is."""
+    known, noise = np.diag([2.0, -0.3, 5.0]), np.diag([-0.5, -3.0, 1.0])
+    said = np.diag(_scatter(known, noise, np.zeros((3, 0))))
+    np.testing.assert_allclose(said[[0, 2]], [1.0 / 2.0, 1.0 / 5.0 + 1.0 / 25.0])
+    assert said[1] > 1e3
+
+
+def information(*along: float) -> np.ndarray:
+    return DIRECTIONS @ np.diag(along) @ DIRECTIONS.T
+
+
+def test_informations_are_alike_where_they_are_in_what_they_know():
+    """What neither knows may differ by any factor; one that is not definite is like none."""
+    before = information(100.0, 1e4, 1e-3, 1e-6)
+    assert _are_alike(before, information(105.0, 0.95e4, 1.2e-3, 1e-5))
+    assert not _are_alike(before, information(115.0, 1e4, 1e-3, 1e-6))
+    assert not _are_alike(before, information(100.0, 1e4, 1e-2, 1e-6))
+    assert not _are_alike(information(100.0, 1e4, -1.0, 0.0), before)
 
 
 def test_one_draw_was_enough_and_allows_for_nothing():

@@ -51,7 +51,13 @@ def information_of(found: Estimate) -> np.ndarray:
     problem = found.problem
     pieces = problem.pieces()
     problem.linearise(found.outcome.state, pieces, problem.residuals(), curved=True)
-    return solve(pieces, problem.n_nodes, problem.tolerance).information
+    return solve(pieces, problem.n_nodes, problem.tolerance, held=problem.held).information
+
+
+def same_information(found: Estimate) -> None:
+    expected = information_of(found)
+    scale = np.outer(*2 * [np.sqrt(np.diag(expected))])
+    np.testing.assert_allclose(found.outcome.information / scale, expected / scale, atol=1e-9)
 
 
 @pytest.mark.parametrize("doubtful", [False, True])
@@ -65,7 +71,7 @@ def test_where_they_counted_to_the_end_the_estimate_is_half_way_and_without_them
         asked.append(len(problem.priors))
         return doubtful
 
-    found = estimate(inputs, state, doubtful=seems_open)
+    found = estimate(inputs, state, doubtful=seems_open, guess=state)
     given = {p.block.key for p in given_priors(inputs)}
     guessed = {p.block.key for p in guess_priors(inputs, state)}
     left = {p.block.key for p in found.problem.priors}
@@ -74,8 +80,21 @@ def test_where_they_counted_to_the_end_the_estimate_is_half_way_and_without_them
     assert asked[0] == len(found.problem.priors) + len(guessed)  # in the first pass they count
     assert (asked[-1] == asked[0]) == doubtful
     assert found.outcome.half_way == doubtful
-    expected = information_of(found)
-    scale = np.sqrt(np.diag(expected))
-    np.testing.assert_allclose(
-        found.outcome.information / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-9
-    )
+    same_information(found)
+
+
+def test_while_something_is_held_they_count_and_the_estimate_is_half_way(begun, monkeypatch):
+    """What is half-way is judged anew; with no guess given it goes to the end."""
+    monkeypatch.setattr(estimates, "guess_priors", partial(guess_priors, times=1e-3))
+    inputs, state = begun
+    held = np.zeros((inputs.layout.size, 1))
+    held[inputs.layout.columns(inputs.rig.cameras[1].name, "translation")[0]] = 1.0
+    free = estimate(inputs, state, held=held)
+    key = inputs.rig.cameras[1].name, "time_offset"
+    elsewhere = replace(state, values=state.values | {key: free.outcome.state.values[key] + 5e-3})
+    led = estimate(inputs, state, held=held, guess=elsewhere)
+    assert led.outcome.half_way
+    assert not free.outcome.half_way
+    assert len(led.problem.priors) == len(free.problem.priors) == len(given_priors(inputs))
+    same_information(led)
+    assert led.outcome.state.values[key] - free.outcome.state.values[key] > 0.2 * 5e-3

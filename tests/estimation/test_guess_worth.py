@@ -9,7 +9,7 @@ import pytest
 
 from icalib.errors import EstimationError
 from icalib.estimation import guess_worth
-from icalib.estimation.guess_worth import astray, moved_to_guess, moved_to_worth, owed_to_guess
+from icalib.estimation.guess_worth import TOGETHER, astray, moved_to_guess, moved_to_worth, owed_to_guess
 from icalib.estimation.state import State, make_layout
 
 TOLERANCE = {"translation": 5e-3, "time_offset": 1e-3}
@@ -76,8 +76,8 @@ def test_the_shifts_have_the_covariance_of_where_guesses_land(given, weighed: bo
     if weighed:
         given.priors.append(SimpleNamespace(block=given.problem.layout.free[0], sigma=np.array([0.1, 0.2, 0.05])))
     shifts = owed_to_guess(given.inputs, given.problem, given.state, np.zeros((8, 8)))
-    assert shifts.shape == (3, 8)  # two errors, and what both together make beyond their sum
-    np.testing.assert_allclose(shifts[2], 0.0, atol=1e-12)
+    assert shifts.shape == (2 + TOGETHER, 8)  # two errors, and what both together make beyond their sum
+    np.testing.assert_allclose(shifts[2:], 0.0, atol=1e-12)
     drawn = np.cov(landed(given, np.random.default_rng(0)).T)
     expected, scale = shifts.T @ shifts, given.problem.tolerance
     np.testing.assert_allclose(
@@ -98,7 +98,9 @@ def test_what_comes_of_two_errors_together_is_owed_too(given, monkeypatch):
     monkeypatch.setattr(guess_worth, "minimise", bent)
     shifts = owed_to_guess(given.inputs, given.problem, given.state, np.zeros((8, 8)))
     assert np.abs(shifts[:2, 1]).max() < 1e-12  # neither alone moves it
-    assert abs(shifts[2, 1]) > 0.01
+    drawn = landed(given, np.random.default_rng(0))
+    product = 7.0 * drawn[:, 0] * drawn[:, 2]
+    assert (shifts[2:, 1] ** 2).sum() == pytest.approx(np.mean(product**2), rel=0.2)
 
 
 def test_nothing_is_tried_out_where_the_guess_alone_leaves_all_open(given, monkeypatch):

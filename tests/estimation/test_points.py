@@ -63,6 +63,20 @@ def test_a_point_at_infinity_stays_in_its_direction(factor, setup):
     assert np.linalg.norm(out.points[track]) == pytest.approx(FARTHEST_M, rel=1e-6)
 
 
+def test_coarse_noise_is_as_large_as_most_errors_and_no_less_than_stated(factor, setup):
+    """Of one camera errors are drawn; of the others all that is seen fits to rounding."""
+    noisy, sigma = 1, 7.0
+    stream = factor.streams[noisy]
+    errors = np.random.default_rng(0).normal(0.0, sigma, stream.uv.shape)
+    streams = list(factor.streams)
+    streams[noisy] = replace(stream, uv=stream.uv + errors)
+    _, out = outcome(factor, setup.state)
+    found = replace(factor.settled(out), streams=tuple(streams)).coarse(setup.state).sigma
+    n = int((factor.tracks.track[noisy] >= 0).sum())
+    assert found[noisy] == pytest.approx(sigma, rel=3.0 / np.sqrt(n))
+    assert [s for i, s in enumerate(found) if i != noisy] == [s for i, s in enumerate(factor.sigma) if i != noisy]
+
+
 def test_settled_features_are_where_they_were(factor, setup):
     cost, out = outcome(looked_for(factor, 3.0 * factor.tracks.start), setup.state)
     again, there = outcome(factor.settled(out), setup.state)

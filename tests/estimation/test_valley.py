@@ -1,4 +1,5 @@
-"""A step that promises next to nothing along what the data hardly tell is not taken where it costs."""
+"""Steps along what the data hardly tell, of which the sums know little: one that promises next to nothing is not taken
+where it costs, and one that goes twice as far as it should is shortened."""
 
 from __future__ import annotations
 
@@ -11,11 +12,11 @@ from icalib.estimation.solver import minimise
 from icalib.estimation.state import State, make_layout
 
 KEY = ("sensor", "value")
-FAR, WEAK, STEEP = 10.0, 1e-3, 1e3
+FAR, WEAK, STEEP, LARGE = 10.0, 1e-3, 1e3, 100.0
 
 
-class Valley:
-    """Residuals WEAK (y - FAR) and STEEP y^2, of which no linearisation at y = 0 knows; one node that is left alone."""
+class OneNumber:
+    """A problem in one number y, with one node that is left alone."""
 
     layout = make_layout([(*KEY, "vector", 1, True)])
     n_nodes, tolerance, held = 1, np.array([1e3]), NOTHING
@@ -29,9 +30,12 @@ class Valley:
     def settled(self, residuals):
         return self
 
+    def rows(self, y: float) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals and their slopes."""
+        raise NotImplementedError
+
     def linearise(self, state, pieces, residuals, sums=True, curved=False):
-        y = state.values[KEY][0]
-        r, J = np.array([WEAK * (y - FAR), STEEP * y**2]), np.array([WEAK, 2.0 * STEEP * y])
+        r, J = self.rows(state.values[KEY][0])
         if sums:
             (piece,) = pieces
             piece.clear()
@@ -40,15 +44,38 @@ class Valley:
         return float(0.5 * r @ r)
 
 
-def still() -> State:
+class Valley(OneNumber):
+    """Residuals WEAK (y - FAR) and STEEP y^2, of which no linearisation at y = 0 knows."""
+
+    def rows(self, y: float) -> tuple[np.ndarray, np.ndarray]:
+        return np.array([WEAK * (y - FAR), STEEP * y**2]), np.array([WEAK, 2.0 * STEEP * y])
+
+
+class Bowl(OneNumber):
+    """Residuals y and LARGE + y^2 / (2 LARGE): curvature 2 at y = 0, where the squared slopes are 1."""
+
+    def rows(self, y: float) -> tuple[np.ndarray, np.ndarray]:
+        return np.array([y, LARGE + 0.5 * y**2 / LARGE]), np.array([1.0, y / LARGE])
+
+
+def at(y: float) -> State:
     one = np.zeros((1, 3))
-    return State(np.zeros(1), np.eye(3)[None], one, one, np.zeros((1, 6)), {KEY: np.zeros(1)})
+    return State(np.zeros(1), np.eye(3)[None], one, one, np.zeros((1, 6)), {KEY: np.array([y])})
 
 
 def test_it_ends_where_it_is_and_calls_that_converged():
     for tolerance in (0.5, 5e-4):
-        outcome = minimise(Valley(), still(), tolerance=tolerance)
+        outcome = minimise(Valley(), at(0.0), tolerance=tolerance)
         assert outcome.converged, outcome.status
         assert outcome.state.values[KEY][0] == 0.0
         assert not outcome.steps[-1].accepted
         assert outcome.cost < 1e-4
+
+
+def test_steps_from_side_to_side_are_shortened():
+    """Each would go to -y, at the same cost; halved, one goes to the bottom."""
+    outcome = minimise(Bowl(), at(3.0))
+    assert outcome.converged, outcome.status
+    assert abs(outcome.state.values[KEY][0]) < 0.03
+    assert len(outcome.steps) <= 4
+    assert all(s.damping == 0.0 for s in outcome.steps)

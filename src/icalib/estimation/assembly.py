@@ -199,7 +199,8 @@ def _features(inputs: Inputs, state: State, cameras: tuple[CornerFactor, ...], f
     if following.cut:
         cuts = (*cuts, *(int(k) + 1 for k in np.flatnonzero(np.diff(np.floor(state.seconds / CUT_S)))))
     surfaces = _surfaces(inputs, state, following.cut)
-    return FeatureFactor.build(cameras, streams, following.sigma, tuple(keep), loss, state, cuts, seams, surfaces)
+    factor = FeatureFactor.build(cameras, streams, following.sigma, tuple(keep), loss, state, cuts, seams, surfaces)
+    return factor.coarse(state) if following.cut else factor
 
 
 def _surfaces(inputs: Inputs, state: State, coarse: bool) -> Surfaces | None:

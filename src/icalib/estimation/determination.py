@@ -19,12 +19,13 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import LinAlgError, eigh
 
 from icalib.errors import EstimationError
 from icalib.estimation.arrowhead import HELD_BELOW, restricted_inverse
 from icalib.estimation.assembly import given_priors
 from icalib.estimation.debias import Spurious, spurious_information
-from icalib.estimation.estimate import EARLY_DECREASE, EARLY_SHARE, Estimate, Judged, OnVisit, estimate
+from icalib.estimation.estimate import EARLY_DECREASE, EARLY_SHARE, Estimate, OnVisit, estimate
 from icalib.estimation.guess_worth import astray, moved_to_guess, moved_to_worth, owed_to_guess
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.prior_factor import without_priors
@@ -33,8 +34,9 @@ from icalib.estimation.solver import Outcome, Step, minimise
 from icalib.estimation.state import Key, State
 
 SPURIOUS_SHARE = 0.5  # a direction most of whose information is noise is in doubt: by chance all of it may be
-MOST_ROUNDS, LATE = 4, 3
+MOST_ROUNDS, LATE = 6, 4
 DOUBTFUL = 0.25  # information in tolerance units
+UNCHANGED = 0.1  # of the information: less than what a few draws of noise scatter by
 ALIKE = 0.7  # cosine of the largest angle between what is held and what is to be: the rest finds its place about it
 
 
@@ -70,9 +72,12 @@ class Determined:
 
 def _scatter(known: np.ndarray, noise: np.ndarray, held: np.ndarray) -> np.ndarray:
     """(B, B) covariance where J^T J is `known` + `noise`: J^T r scatters by all of it, but only what is known of it
-    leads back (errors in variables; Fuller, Measurement Error Models, 1987, chapter 1)."""
+    leads back (errors in variables; Fuller, Measurement Error Models, 1987, chapter 1). Noise only adds: where its few
+    draws say otherwise, or curvature left less than nothing known, the variance is no less than without it."""
     inverse = restricted_inverse(known, held)
-    return inverse @ (known + noise) @ inverse
+    values, vectors = eigh(noise)
+    more = inverse @ vectors * np.sqrt(np.maximum(values, 0.0))
+    return inverse + more @ more.T
 
 
 def determine(
@@ -88,34 +93,74 @@ def determine(
     Raises EstimationError where the data do not carry an estimate.
     """
     wanted = replace(start, values=start.values | (guess or {}))
-    found = estimate(inputs, start, on_step, on_visit=on_visit, doubtful=_is_doubtful)
-    seen = _judge(inputs, found.outcome)
-    for k in range(MOST_ROUNDS):
-        if _is_settled(seen.undetermined, found.problem.held, k >= LATE) and not found.outcome.half_way:
-            break
-        # One that failed is worth nothing: from the start, then.
-        state = found.outcome.state if _is_worth_keeping(found.outcome) else start
-        begin, judged = state, _worth_keeping(found)
-        moving = astray(inputs, found.problem, state, wanted, seen.undetermined, seen.asked)
-        if moving.size:
-            begin = _followed(found, moved_to_guess(found.problem, state, wanted, moving), seen.undetermined)
-        del found  # before the next one takes as much memory
-        found = estimate(inputs, begin, on_step, seen.undetermined, on_visit, judged)
-        seen = _judge(inputs, found.outcome)
-    for _ in range(MOST_ROUNDS):
-        problem, state = found.problem, found.outcome.state
-        moving = astray(inputs, problem, state, wanted, problem.held, seen.asked)
-        begin = moved_to_worth(inputs, problem, state, wanted, moving)
-        if begin is None:
-            break
-        begin = _followed(found, begin, problem.held)
-        found = estimate(inputs, begin, on_step, found.problem.held, on_visit, _worth_keeping(found))
-        seen = _judge(inputs, found.outcome)
+    search = _Search.begin(inputs, start, wanted, on_step, on_visit)
+    search.settle()
+    search.weigh()
+    found, seen = search.found, search.seen
     if not found.problem.held.size:
         nothing = np.zeros((inputs.layout.size, 0))
         return Determined(found, seen.data, seen.noise, nothing, nothing.T)
     shifts = owed_to_guess(inputs, found.problem, found.outcome.state, seen.data)
     return Determined(found, seen.data, seen.noise, found.problem.held, shifts)
+
+
+@dataclass
+class _Search:
+    """For what is undetermined: the last estimate, `found`, and what is `seen` of it. The first began at `start`."""
+
+    inputs: Inputs
+    start: State
+    guess: State
+    on_step: Callable[[str, Step], None]
+    on_visit: OnVisit
+    found: Estimate
+    seen: _Judgement
+
+    @classmethod
+    def begin(
+        cls, inputs: Inputs, start: State, guess: State, on_step: Callable[[str, Step], None], on_visit: OnVisit
+    ) -> _Search:
+        """Nothing is held yet."""
+        found = estimate(inputs, start, on_step, on_visit=on_visit, doubtful=_is_doubtful, guess=guess)
+        return cls(inputs, start, guess, on_step, on_visit, found, _judge(inputs, found.outcome))
+
+    def settle(self) -> None:
+        """Holds what is undetermined, until that stays; the guess counts for what it is worth till then, but not in the
+        last estimate."""
+        for k in range(MOST_ROUNDS):
+            found, seen = self.found, self.seen
+            settled = _is_settled(seen.undetermined, found.problem.held, k >= LATE)
+            if settled and not found.outcome.half_way:
+                return
+            held = found.problem.held if settled and found.problem.held.size else seen.undetermined
+            # One that failed is worth nothing: from the start, then.
+            state = found.outcome.state if _is_worth_keeping(found.outcome) else self.start
+            moving = astray(self.inputs, found.problem, state, self.guess, held, seen.asked)
+            if moving.size:
+                state = _followed(found, moved_to_guess(found.problem, state, self.guess, moving), held)
+            del found
+            self._estimate(state, held, led=not settled and k + 1 < MOST_ROUNDS)
+
+    def weigh(self) -> None:
+        """Moves what is held to where the guesses have it, each by what it is worth, and all else with it."""
+        for _ in range(MOST_ROUNDS):
+            problem, state = self.found.problem, self.found.outcome.state
+            moving = astray(self.inputs, problem, state, self.guess, problem.held, self.seen.asked)
+            begin = moved_to_worth(self.inputs, problem, state, self.guess, moving)
+            if begin is None:
+                return
+            begin, held = _followed(self.found, begin, problem.held), problem.held
+            del problem
+            self._estimate(begin, held, led=False)
+
+    def _estimate(self, begin: State, held: np.ndarray, led: bool) -> None:
+        """The next estimate, `led` by the guess or not; noise and outliers as the last one judged them, but where it
+        failed."""
+        judged = self.found.judged if _is_worth_keeping(self.found.outcome) else None
+        del self.found  # before the next one takes as much memory
+        guess = self.guess if led else None
+        self.found = estimate(self.inputs, begin, self.on_step, held, self.on_visit, judged, guess=guess)
+        self.seen = _judge(self.inputs, self.found.outcome, None if led else self.seen)
 
 
 def _followed(found: Estimate, moved: State, held: np.ndarray) -> State:
@@ -128,11 +173,6 @@ def _followed(found: Estimate, moved: State, held: np.ndarray) -> State:
         return minimise(replace(found.problem, held=held), moved, tolerance=EARLY_DECREASE, share=EARLY_SHARE).state
     except EstimationError:
         return moved
-
-
-def _worth_keeping(found: Estimate) -> Judged | None:
-    """Noise and outliers, where the estimate that judged them did not fail."""
-    return found.judged if _is_worth_keeping(found.outcome) else None
 
 
 def _is_worth_keeping(outcome: Outcome) -> bool:
@@ -157,25 +197,41 @@ def _is_settled(undetermined: np.ndarray, held: np.ndarray, late: bool) -> bool:
 
 class _Judgement(NamedTuple):
     """Of an estimate, in tolerance units: information of the `data` alone and what `noise` adds to it (B, B), and the
-    directions (B, m) that are `undetermined`; asked (B, B): data, noise and the model's own priors together."""
+    directions (B, m) that are `undetermined`; asked (B, B): data, noise and the model's own priors together. spurious:
+    how the noise was found."""
 
+    spurious: Spurious
     data: np.ndarray
     noise: np.ndarray
     asked: np.ndarray
     undetermined: np.ndarray
 
 
-def _judge(inputs: Inputs, outcome: Outcome) -> _Judgement:
-    """Nuisances whose priors belong to the model (a target's shape, bloom) are open only where these are, too."""
+def _judge(inputs: Inputs, outcome: Outcome, before: _Judgement | None = None) -> _Judgement:
+    """Nuisances whose priors belong to the model (a target's shape, bloom) are open only where these are, too. What
+    noise adds is not looked for again where there is about as much information as in the judgement `before`."""
     problem = outcome.problem
     t = problem.tolerance
     asked = t[:, None] * without_priors(outcome.information, given_priors(inputs), outcome.state) * t
     shown = partial(_shown, asked, t)
-    spurious = spurious_information(problem, outcome, lambda found: not shown(found).in_doubt.any())
+    if before is not None and _are_alike(before.asked, asked):
+        spurious = before.spurious
+    else:
+        spurious = spurious_information(problem, outcome, lambda found: not shown(found).in_doubt.any())
     seen, noise = shown(spurious), spurious.mean
     data = without_priors(outcome.information - noise, problem.priors, outcome.state)
     undetermined = seen.vectors[:, seen.nothing | seen.in_doubt]
-    return _Judgement(t[:, None] * data * t, t[:, None] * noise * t, asked, undetermined)
+    return _Judgement(spurious, t[:, None] * data * t, t[:, None] * noise * t, asked, undetermined)
+
+
+def _are_alike(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether two informations (B, B) in tolerance units are about the same in every direction that they know."""
+    nothing = HELD_BELOW * np.eye(len(a))
+    try:
+        ratios = eigh(b + nothing, a + nothing, eigvals_only=True)
+    except LinAlgError:  # not definite: of a state far from its end
+        return False
+    return bool(np.abs(ratios - 1.0).max(initial=0.0) < UNCHANGED)
 
 
 class _Shown(NamedTuple):

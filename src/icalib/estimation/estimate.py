@@ -29,14 +29,14 @@ from icalib.estimation.prior_factor import Prior, without_priors
 from icalib.estimation.problem import Problem
 from icalib.estimation.robot import RobotNoise, next_posing, next_ranging
 from icalib.estimation.sensors import chi2
-from icalib.estimation.solver import CONVERGED_DECREASE, ROUNDING, Outcome, Step, Visit, minimise, way_come
+from icalib.estimation.solver import Outcome, Step, Visit, minimise, way_come
 from icalib.estimation.state import State
 from icalib.rig import PoseSensor, Settings
 
 LOOSE = 3.0  # times what a guess is worth
 LEAST_LEFT = 0.2  # of the residuals of poses: where the motion takes all, nothing is left to show their noise
 EARLY_DECREASE, EARLY_SHARE = 0.5, 1e-6  # an early pass is followed by another
-AGAIN = 2  # further passes, at most, where the last one began too far from its end, or without tracks that it found
+AGAIN = 4  # further passes, at most, where the last one began too far from its end, or without tracks that it found
 FAR = 1.1  # times the chi^2 at its end: what a pass froze where it began is not what it would freeze at the end
 NEARER = 0.5  # of the way from the end that the pass before had: else two states take turns, and no pass ends it
 ENOUGH = 0.8  # of the observations of tracks take part: no need to see whether more would
@@ -106,38 +106,39 @@ def estimate(
     on_visit: OnVisit = lambda *_: None,
     judged: Judged | None = None,
     doubtful: Callable[[Problem, np.ndarray], bool] = lambda *_: False,
+    guess: State | None = None,
 ) -> Estimate:
     """All passes from a first `state`, directions of the border in `held` (see Problem) left alone; the last one alone
     where noise and outliers are `judged` already. It is left half-way where the information of the border (B, B) makes
-    it `doubtful` that all is determined: along what is not it would only creep. Until that is clear the guess counts
-    for what it is worth, so that what is open does not wander far; where it counted to the end, that is half-way, too.
+    it `doubtful` that all is determined: along what is not it would only creep. Until that is clear, and while anything
+    is held, a `guess` counts for what it is worth, so that what is open does not wander far; where it counted to the
+    end, that is half-way, too.
 
     Raises EstimationError where the data do not carry an estimate.
     """
-    names, about = pass_names(inputs), tuple[Prior, ...]()
+    names, about = pass_names(inputs), () if guess is None else guess_priors(inputs, guess)
     if judged is None:
-        judged, about = Judged.first(inputs), guess_priors(inputs, state)
+        judged = Judged.first(inputs)
     else:
         names, state = names[-1:], _on_own_nodes(inputs, state)
     history, way = list[tuple[str, Step]](), np.inf
     for k, name in enumerate((*names, *names[-1:] * AGAIN)):
         last = k + 1 >= len(names)
-        early = EARLY_DECREASE, FIRST_SHARE if name == "first" else EARLY_SHARE
-        tolerance, share = (CONVERGED_DECREASE, ROUNDING) if last else early
+        after = k + 1 < len(names) + AGAIN  # whether another pass may follow
         problem = _with_priors(judged.problem(inputs, state, held), about)
         told = _Told(name, problem, on_step, on_visit, history)
-        after = k + 1 < len(names) + AGAIN  # whether another pass may follow
-        leaves = _leaves(problem, doubtful, way if after else 0.0) if last else None
-        outcome: Outcome = minimise(problem, state, told.step, tolerance, told.visit, share, leaves=leaves)
-        is_open = doubtful(problem, told.information)
-        if last and about and not is_open:
-            problem, about = _fewer_priors(outcome.problem, about), ()
-            rest = minimise(problem, outcome.state, told.step, tolerance, told.visit, share)
-            outcome = replace(rest, steps=(*outcome.steps, *rest.steps))
-        if last and ((outcome.half_way and is_open) or not after or not _again(inputs, outcome, judged, way)):
+        if last:
+            outcome, is_open = _last_pass(problem, about, state, told, doubtful, way if after else 0.0)
+        else:
+            share = FIRST_SHARE if name == "first" else EARLY_SHARE
+            outcome = minimise(problem, state, told.step, EARLY_DECREASE, told.visit, share)
+            is_open = doubtful(problem, told.information)
+        about = about if is_open or held.size else ()
+        way_before, way = way, np.inf
+        if last and not (outcome.half_way and is_open):
+            way = way_come(outcome.steps, outcome.cost)
+        if last and not (after and _again(inputs, outcome, judged, way, way_before)):
             return Estimate(_without_priors(outcome, about), judged, tuple(history))
-        way = way_come(outcome.steps, outcome.cost) if last else np.inf
-        about = about if is_open else ()
         judged = judged if last else judged.next(inputs, outcome, name == "first")
         state = _on_own_nodes(inputs, outcome.state)
         del problem, outcome, told  # before the next ones take as much memory
@@ -187,17 +188,34 @@ def _without_priors(outcome: Outcome, more: Sequence[Prior]) -> Outcome:
     )
 
 
-def _leaves(
-    problem: Problem, doubtful: Callable[[Problem, np.ndarray], bool], way_before: float
-) -> Callable[[float, np.ndarray], bool]:
-    """Whether a last pass need not go to its end: see `minimise`."""
-    return lambda way, information: doubtful(problem, information) or _is_far(way, way_before)
+def _last_pass(
+    problem: Problem,
+    about: Sequence[Prior],
+    state: State,
+    told: _Told,
+    doubtful: Callable[[Problem, np.ndarray], bool],
+    way_before: float,
+) -> tuple[Outcome, bool]:
+    """To the end, or half-way where something is open, which is said, too, or much is to be frozen anew. Priors `about`
+    the guess lead but half-way; where nothing is open or held, they are let go there."""
+
+    def leaves(way: float, information: np.ndarray) -> bool:
+        return bool(about) or doubtful(problem, information) or _is_far(way, way_before)
+
+    outcome: Outcome = minimise(problem, state, told.step, on_visit=told.visit, leaves=leaves)
+    is_open = doubtful(problem, told.information)
+    is_far = _is_far(way_come(outcome.steps, outcome.cost), way_before)
+    if not about or is_open or problem.held.size or is_far:
+        return outcome, is_open
+    rest = minimise(_fewer_priors(outcome.problem, about), outcome.state, told.step, on_visit=told.visit)
+    return replace(rest, steps=(*outcome.steps, *rest.steps)), False
 
 
-def _again(inputs: Inputs, outcome: Outcome, judged: Judged, way_before: float) -> bool:
+def _again(inputs: Inputs, outcome: Outcome, judged: Judged, way: float, way_before: float) -> bool:
     """Whether the last pass is to be made anew: what it froze, such as the weights of points on planes, is of a state
-    far from its end, but nearer than in the last pass before, or tracks come back."""
-    return _is_far(way_come(outcome.steps, outcome.cost), way_before) or _follows_more(inputs, outcome, judged)
+    far from its end, but nearer than in the last pass before, or tracks come back. way: infinite where the pass was
+    left because something is open; such a state is judged as it is, but with its tracks."""
+    return _is_far(way, way_before) or _follows_more(inputs, outcome, judged)
 
 
 def _is_far(way: float, way_before: float) -> bool:

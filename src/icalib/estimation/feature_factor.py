@@ -51,6 +51,7 @@ MOST_STEPS = 20  # of a point; most settle in three
 WEAK = 1e-6  # information [1/m^2]: keeps a point defined that no image shows any more; steers nothing else
 LONGEST_GAP_S = 1.0  # a feature that was out of sight for longer is a new track
 MOST_UNCERTAIN = 0.1  # of its distance: a point that is less certain is left out
+MEDIAN_OF_SQUARE = 2.0 * np.log(2.0)  # median of chi^2 with two degrees of freedom
 MOST_UNLIKE = 10.0  # times the residuals of most points: a point that fits worse is left out
 
 
@@ -161,6 +162,20 @@ class FeatureFactor:
             return points, good, OnPlanes.none(int(good.sum()))
         recording = np.searchsorted(state.starts, self.tracks.stretch_of()[good], side="right") - 1
         return points, good, self.surfaces.under(found.xyz[good], found.A[good], recording)
+
+    def coarse(self, state: State) -> FeatureFactor:
+        """The same features, their noise as large as most errors with the poses of `state` and a guessed lens. Taken as
+        exact, what fits by chance would draw the lens far from its guess, where other tracks are lost."""
+        views = self._views(state, 0, self.n_nodes)
+        points = self._from_anchors(views, slice(0, self.tracks.count), self.tracks.start)
+        sigma = list(self.sigma)
+        for view in views:
+            uv, valid, *_ = view.camera.model.project_with_jacobians(view.params, _in_camera(view, points, 0))
+            used = valid & (view.seen.track >= 0) & view.seen.keep
+            if used.any():
+                square = np.median(((uv - view.seen.uv)[used] ** 2).sum(axis=1))
+                sigma[view.index] = max(sigma[view.index], float(np.sqrt(square / MEDIAN_OF_SQUARE)))
+        return replace(self, sigma=tuple(sigma))
 
     def on_planes_of(self, camera: int) -> np.ndarray:
         """Those tracks on planes whose points move with camera number `camera`."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from icalib.estimation.assembly import Following
-from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput
+from icalib.estimation.feature_factor import MEDIAN_OF_SQUARE, FeatureFactor, FeatureOutput
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.problem import Problem
 from icalib.estimation.solver import Outcome
@@ -14,7 +14,6 @@ from icalib.rig import Camera, Rig, Settings
 
 FIRST_GUESS_PX = 1.0
 SMALLEST_PX = 0.005
-MEDIAN_OF_SQUARE = 2.0 * np.log(2.0)  # median of chi^2 with two degrees of freedom
 
 
 def first_following(inputs: Inputs) -> Following | None:

@@ -26,6 +26,7 @@ FARTHEST = 2.0  # standard deviations of the guess
 MOVED_BY_HELD = 0.1  # parts of a direction smaller than this do not count as in it
 MOSTLY = 0.5  # of the square of a direction
 NEAR_GUESS = 0.05  # of what the guess is worth
+TOGETHER = 4  # ways in which errors of the guess come together: what one makes beyond the sum is little by chance
 HALVINGS = 4  # of a move along which nothing can be solved
 
 
@@ -74,8 +75,8 @@ def moved_to_worth(inputs: Inputs, problem: Problem, state: State, guess: State,
 
 
 def owed_to_guess(inputs: Inputs, problem: Problem, state: State, data: np.ndarray) -> np.ndarray:
-    """(m + 1, B) how the border moves with each of m independent errors of the guess along the held directions, one
-    standard deviation each, and by how much more or less where all of them come together.
+    """(m + TOGETHER, B) how the border moves with each of m independent errors of the guess along the held directions,
+    one standard deviation each, and by how much more or less where all of them come together.
 
     data (B, B): information of the data alone, in tolerance units.
     """
@@ -83,8 +84,9 @@ def owed_to_guess(inputs: Inputs, problem: Problem, state: State, data: np.ndarr
     if _leave_nothing(inputs, problem, ways):
         return problem.tolerance * ways.T
     alone = np.array([_answer(problem, state, way) for way in ways.T])
-    signs = np.random.default_rng(0).choice((-1.0, 1.0), ways.shape[1])
-    return np.vstack([alone, _answer(problem, state, ways @ signs) - signs @ alone])
+    signs = np.random.default_rng(0).choice((-1.0, 1.0), (TOGETHER, ways.shape[1]))
+    beyond = [_answer(problem, state, ways @ s) - s @ alone for s in signs]
+    return np.vstack([alone, np.array(beyond) / np.sqrt(TOGETHER)])
 
 
 def _ways(inputs: Inputs, problem: Problem, data: np.ndarray) -> np.ndarray:

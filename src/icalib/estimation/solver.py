@@ -21,6 +21,7 @@ HALF_WAY = 0.5  # of half the chi^2: where little more is gained, it can be seen
 STALLED_DECREASE = 0.05  # of half the chi^2: a third of a standard deviation, good enough where smaller steps fail
 MOST_STALLED = 4  # steps this small that fail before the solver rests
 COMES_BACK = 0.25  # of what a step costs too much, where its error is of second order: this much at most is left next
+OVERSHOT = 0.5  # of what a step promises: one that gains or costs less than this is too long
 ACROSS = 1e-6  # damping of a step that comes back: across a valley, not along it
 RESTING = 20.0  # times the tolerance of an early pass: a step that promises less and fails ends it
 FREE_DRAWS, STILL_DRAWS = 2, 3  # from the posterior, for what is made of the outcome
@@ -180,6 +181,8 @@ class _Descent:
         sums = not (converged and self.early)
         there = self.state.retract(self.problem.layout, solution.chain, solution.border)
         cost = self._linearise(there, sums, near)
+        if not (self.early or converged):
+            there, cost = self._shortened(solution, there, cost, near)
         if comes_back and sums and not (cost < self.cost or converged):
             there, cost = self._corrected(there, cost, near)
         # At the bottom rounding decides whether the cost falls; a step that promises this little is taken anyway, but
@@ -218,6 +221,23 @@ class _Descent:
     def outcome(self, end: Solution) -> Outcome:
         """With what was solved here."""
         return _outcome(self.problem, self.state, self.cost, self.residuals, end.decrease, self.steps, end)
+
+    def _shortened(self, solution: Solution, state: State, cost: float, curved: bool) -> tuple[State, float]:
+        """Of a step to `state`, at `cost`, that overshoots, about half, to where a parabola has its least; and what
+        that costs.
+
+        Where little is known, of wheels' clock in a steady turn for one, the sums may have but half of the true
+        curvature: then steps jump from one side of the least to the other.
+        """
+        gain = (self.cost - cost) / solution.decrease if solution.decrease > 0.0 else 1.0
+        if not -OVERSHOT < gain < OVERSHOT:
+            return state, cost
+        share = 1.0 / (2.0 - gain)
+        short = self.state.retract(self.problem.layout, share * solution.chain, share * solution.border)
+        there = self._linearise(short, True, curved)
+        if there < cost:
+            return short, there
+        return state, self._linearise(state, True, curved)
 
     def _corrected(self, state: State, cost: float, curved: bool) -> tuple[State, float]:
         """Further steps from a candidate, linearised at `state`, that costs too much, as long as each leaves but a part
