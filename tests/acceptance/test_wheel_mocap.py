@@ -127,8 +127,9 @@ def test_runs_together_with_an_offset_each(found, wheel_mocap, tmp_path):
         assert abs(offsets.value[k] - alone.value[0]) < 3.0 * np.hypot(offsets.std[k], alone.std[0])
         x, s = drive_of(found[name])
         assert (np.abs(drive - x) < 3.0 * np.hypot(std, s)).all()
-    formal = [found[name].group("wheel0", "baseline").std_formal[0] for name in names]
-    assert together.group("wheel0", "baseline").std_formal[0] < min(formal)
+    # Not so of the baseline: what it owes to the guess of how the wheels are tilted no further run makes less.
+    formal = [found[name].group("wheel0", "radii").std_formal for name in names]
+    assert (together.group("wheel0", "radii").std_formal < np.min(formal, axis=0)).all()
 
 
 @pytest.mark.parametrize("name", ["circular-01", "circular-02"])

@@ -71,11 +71,18 @@ def test_on_a_flat_floor_they_tie_camera_and_lidar():
     assert len(without.undetermined) == 2
 
 
-@pytest.mark.parametrize("relief_m", [0.03, 0.3])
-def test_rough_surfaces_are_told(relief_m):
+@pytest.mark.parametrize(
+    ("relief_m", "says"),
+    [
+        (0.03, "cam0 follows lie .* times as far from planes of the LiDARs"),
+        (0.3, "only .* tracks that cameras follow lie on planes of the LiDARs, so few that it may be chance"),
+    ],
+)
+def test_rough_surfaces_are_told(relief_m: float, says: str):
+    """Of points that are 0.3 m off, a few agree on some plane by chance, and these fit."""
     result, _ = calibrated(scenario_of("3d", 0, relief_m), 0)
     (warning,) = (w for w in result.warnings if "points_on_planes_m" in w)
-    assert re.search("cam0 follows lie .* times as far from planes of the LiDARs", warning)
+    assert re.search(says, warning)
 
 
 def test_where_too_few_points_lie_on_planes_a_warning_says_so():

@@ -311,7 +311,7 @@ def _warnings(
         yield f"the solver did not converge: {found.outcome.status}"
     yield from inputs.measurements.warnings
     yield from misfits(inputs.rig, judged)
-    yield from plane_warnings(inputs.rig, judged)
+    yield from plane_warnings(inputs.rig, found.problem.features)
     yield from pose_warnings(poses, inputs.rig)
     yield from lidar_warnings(inputs, found) if inputs.clouds.count else ()
     for g in groups:

@@ -9,6 +9,7 @@ import numpy as np
 
 from icalib.assessment.excess import excess, times
 from icalib.calibration import ParameterGroup, SensorFit
+from icalib.estimation.feature_factor import FeatureFactor
 from icalib.estimation.fixed_lens import LensStep
 from icalib.estimation.surfaces import ON_PLANES
 from icalib.estimation.tolerances import GUESS_SIGMA
@@ -21,15 +22,24 @@ MUCH_NEARER = 0.3  # times as far, in all that is given
 POOR_FIT_PX = 1.0  # RMS: detectors are off by a tenth of that, blurred images by half
 MANY_REJECTED = 0.05
 OTHER_LENS, CLEARLY = 0.015, 3.0  # of the focal length; standard deviations
+FEW_ON_PLANES = 0.1  # of the tracks: rough walls have as many where they should have two thirds
 NEARER = 0.5  # times as far, in fx, fy, cx and cy
 
 
-def plane_warnings(rig: Rig, judged: Sequence[SensorFit]) -> Iterator[str]:
-    """Where points should lie on planes, and none do."""
-    if rig.settings.points_on_planes_m > 0.0 and not any(f.kind == ON_PLANES for f in judged):
+def plane_warnings(rig: Rig, features: FeatureFactor | None) -> Iterator[str]:
+    """Where points should lie on planes, and none do, or so few that it may be chance."""
+    if rig.settings.points_on_planes_m == 0.0:
+        return
+    on, tracks = (0, 0) if features is None else (int((features.on.plane >= 0).sum()), features.tracks.count)
+    if on == 0:
         yield (
             "no points that cameras follow lie on planes of the LiDARs, so points_on_planes_m in the rig file counts "
             "for nothing; make it larger, or take it out where little is flat."
+        )
+    elif on < FEW_ON_PLANES * tracks:
+        yield (
+            f"only {on} of the {tracks} tracks that cameras follow lie on planes of the LiDARs, so few that it may be "
+            "chance; make points_on_planes_m in the rig file larger, or take it out where little is flat."
         )
 
 
