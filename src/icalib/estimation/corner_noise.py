@@ -15,6 +15,7 @@ import numpy as np
 
 from icalib.estimation.corner_factor import CornerFactor, CornerNoise, CornerOutput
 from icalib.estimation.evidence import Fit
+from icalib.estimation.medians import median_variance
 from icalib.estimation.state import State
 from icalib.measurements import CornerStream
 from icalib.rig import Camera, Settings
@@ -25,7 +26,6 @@ FIRST_TAU_PX = 0.1
 COMMON_ERRORS = 1
 SMALLEST_BASE_PX = 0.005  # no detector does better; keeps weights finite where corners are exact
 BINS = 12  # of image speed
-MEDIAN_OF_SQUARE = 2.0 * np.log(2.0)  # median of chi^2 with two degrees of freedom
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def estimate_noise(
     elif settings.blur_noise:
         base, exposure = _fit_blur(square[used], speed[stream.image][used])
     else:
-        base, exposure = np.sqrt(np.median(square[used]) / MEDIAN_OF_SQUARE), 0.0
+        base, exposure = np.sqrt(median_variance(square[used])), 0.0
     if camera.corner_noise_px is None:
         base = max(base, SMALLEST_BASE_PX)
     return NoiseModel(float(base), float(exposure), tau)
@@ -126,11 +126,11 @@ def _fit_blur(square: np.ndarray, speed: np.ndarray) -> tuple[float, float]:
     which = np.clip(np.searchsorted(edges, speed, side="right") - 1, 0, BINS - 1)
     bins = [k for k in range(BINS) if (which == k).sum() >= 50]
     if len(bins) < 3:
-        return float(np.sqrt(np.median(square) / MEDIAN_OF_SQUARE)), 0.0
-    variance = np.array([np.median(square[which == k]) for k in bins]) / MEDIAN_OF_SQUARE
+        return float(np.sqrt(median_variance(square))), 0.0
+    variance = np.array([median_variance(square[which == k]) for k in bins])
     v2 = np.array([np.mean(speed[which == k] ** 2) for k in bins])
     A = np.stack([1.0 / variance, v2 / variance], axis=1)
     (a, b), *_ = np.linalg.lstsq(A, np.ones(len(bins)), rcond=None)
     if b <= 0.0 or a <= 0.0:
-        return float(np.sqrt(np.median(square) / MEDIAN_OF_SQUARE)), 0.0
+        return float(np.sqrt(median_variance(square))), 0.0
     return float(np.sqrt(a)), float(np.sqrt(b))

@@ -116,34 +116,83 @@ def estimate(
 
     Raises EstimationError where the data do not carry an estimate.
     """
-    names, about = pass_names(inputs), () if guess is None else guess_priors(inputs, guess)
+    *early, final = pass_names(inputs)
+    about = () if guess is None else guess_priors(inputs, guess)
+    passes = _Passes(inputs, held, on_step, on_visit, doubtful, state, judged or Judged.first(inputs), about)
     if judged is None:
-        judged = Judged.first(inputs)
+        for name in early:
+            passes.early(name)
+            pages.give_back()  # before the next one takes as much memory
     else:
-        names, state = names[-1:], _on_own_nodes(inputs, state)
-    history, way = list[tuple[str, Step]](), np.inf
-    for k, name in enumerate((*names, *names[-1:] * AGAIN)):
-        last = k + 1 >= len(names)
-        after = k + 1 < len(names) + AGAIN  # whether another pass may follow
-        problem = _with_priors(judged.problem(inputs, state, held), about)
-        told = _Told(name, problem, on_step, on_visit, history)
-        if last:
-            outcome, is_open = _last_pass(problem, about, state, told, doubtful, way if after else 0.0)
-        else:
-            share = FIRST_SHARE if name == "first" else EARLY_SHARE
-            outcome = minimise(problem, state, told.step, EARLY_DECREASE, told.visit, share)
-            is_open = doubtful(problem, told.information)
-        about = about if is_open or held.size else ()
-        way_before, way = way, np.inf
-        if last and not (outcome.half_way and is_open):
-            way = way_come(outcome.steps, outcome.cost)
-        if last and not (after and _again(inputs, outcome, judged, way, way_before)):
-            return Estimate(_without_priors(outcome, about), judged, tuple(history))
-        judged = judged if last else judged.next(inputs, outcome, name == "first")
-        state = _on_own_nodes(inputs, outcome.state)
-        del problem, outcome, told  # before the next ones take as much memory
+        passes.begin_at(state)
+    way = np.inf
+    for left in reversed(range(1 + AGAIN)):
+        way_before = way if left else 0.0  # nearer than that is not to be had any more
+        outcome, way = passes.final(final, way_before)
+        if not left or not _again(inputs, outcome, passes.judged, way, way_before):
+            return Estimate(_without_priors(outcome, passes.about), passes.judged, tuple(passes.history))
+        passes.begin_at(outcome.state)
+        del outcome
         pages.give_back()
-    raise AssertionError("pass_names is never empty")
+    raise AssertionError("the loop ends where nothing is left")
+
+
+@dataclass
+class _Passes:
+    """Passes of one estimate. The next one begins at `state`, told what is `judged` so far, with priors `about` the
+    guess until it is clear that nothing is open, and nothing is held."""
+
+    inputs: Inputs
+    held: np.ndarray
+    on_step: Callable[[str, Step], None]
+    on_visit: OnVisit
+    doubtful: Callable[[Problem, np.ndarray], bool]
+    state: State
+    judged: Judged
+    about: tuple[Prior, ...]
+    history: list[tuple[str, Step]] = field(default_factory=list)
+
+    def begin_at(self, state: State) -> None:
+        """The next pass: of the same motion, at the nodes that its clocks want."""
+        self.state = _on_own_nodes(self.inputs, state)
+
+    def early(self, name: str) -> None:
+        """One that leads near, and shows what is judged before the next."""
+        first = name == "first"
+        problem, told = self._next(name)
+        share = FIRST_SHARE if first else EARLY_SHARE
+        outcome = minimise(problem, self.state, told.step, EARLY_DECREASE, told.visit, share)
+        self._let_go(self.doubtful(problem, told.information))
+        self.judged = self.judged.next(self.inputs, outcome, first)
+        self.begin_at(outcome.state)
+
+    def final(self, name: str, way_before: float) -> tuple[Outcome, float]:
+        """To the end, or half-way where something is open or much is to be frozen anew; and the way to there, infinite
+        where it was left because something is open. Priors lead but half-way; if they are let go, it is there."""
+        problem, told = self._next(name)
+
+        def leaves(way: float, information: np.ndarray) -> bool:
+            return bool(self.about) or self.doubtful(problem, information) or _is_far(way, way_before)
+
+        outcome = minimise(problem, self.state, told.step, on_visit=told.visit, leaves=leaves)
+        is_open = self.doubtful(problem, told.information)
+        way, gone = way_come(outcome.steps, outcome.cost), self._let_go(is_open)
+        if gone and not _is_far(way, way_before):
+            rest = minimise(_fewer_priors(outcome.problem, gone), outcome.state, told.step, on_visit=told.visit)
+            outcome = replace(rest, steps=(*outcome.steps, *rest.steps))
+            way = way_come(outcome.steps, outcome.cost)
+        return outcome, np.inf if is_open and outcome.half_way else way
+
+    def _next(self, name: str) -> tuple[Problem, _Told]:
+        problem = _with_priors(self.judged.problem(self.inputs, self.state, self.held), self.about)
+        return problem, _Told(name, problem, self.on_step, self.on_visit, self.history)
+
+    def _let_go(self, is_open: bool) -> tuple[Prior, ...]:
+        """Priors that count no more."""
+        if is_open or self.held.size:
+            return ()
+        gone, self.about = self.about, ()
+        return gone
 
 
 @dataclass
@@ -186,29 +235,6 @@ def _without_priors(outcome: Outcome, more: Sequence[Prior]) -> Outcome:
         information=without_priors(outcome.information, more, outcome.state),
         half_way=outcome.half_way or outcome.converged,
     )
-
-
-def _last_pass(
-    problem: Problem,
-    about: Sequence[Prior],
-    state: State,
-    told: _Told,
-    doubtful: Callable[[Problem, np.ndarray], bool],
-    way_before: float,
-) -> tuple[Outcome, bool]:
-    """To the end, or half-way where something is open, which is said, too, or much is to be frozen anew. Priors `about`
-    the guess lead but half-way; where nothing is open or held, they are let go there."""
-
-    def leaves(way: float, information: np.ndarray) -> bool:
-        return bool(about) or doubtful(problem, information) or _is_far(way, way_before)
-
-    outcome: Outcome = minimise(problem, state, told.step, on_visit=told.visit, leaves=leaves)
-    is_open = doubtful(problem, told.information)
-    is_far = _is_far(way_come(outcome.steps, outcome.cost), way_before)
-    if not about or is_open or problem.held.size or is_far:
-        return outcome, is_open
-    rest = minimise(_fewer_priors(outcome.problem, about), outcome.state, told.step, on_visit=told.visit)
-    return replace(rest, steps=(*outcome.steps, *rest.steps)), False
 
 
 def _again(inputs: Inputs, outcome: Outcome, judged: Judged, way: float, way_before: float) -> bool:

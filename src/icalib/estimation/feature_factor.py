@@ -35,6 +35,7 @@ from icalib.estimation.feature_kernels import (
 from icalib.estimation.front import Features
 from icalib.estimation.front_plan import FeatureSums, plan
 from icalib.estimation.lidar_kernels import Planes
+from icalib.estimation.medians import median_variance
 from icalib.estimation.state import Layout, State
 from icalib.estimation.surfaces import (
     NOWHERE,
@@ -51,7 +52,6 @@ MOST_STEPS = 20  # of a point; most settle in three
 WEAK = 1e-6  # information [1/m^2]: keeps a point defined that no image shows any more; steers nothing else
 LONGEST_GAP_S = 1.0  # a feature that was out of sight for longer is a new track
 MOST_UNCERTAIN = 0.1  # of its distance: a point that is less certain is left out
-MEDIAN_OF_SQUARE = 2.0 * np.log(2.0)  # median of chi^2 with two degrees of freedom
 MOST_UNLIKE = 10.0  # times the residuals of most points: a point that fits worse is left out
 
 
@@ -173,8 +173,8 @@ class FeatureFactor:
             uv, valid, *_ = view.camera.model.project_with_jacobians(view.params, _in_camera(view, points, 0))
             used = valid & (view.seen.track >= 0) & view.seen.keep
             if used.any():
-                square = np.median(((uv - view.seen.uv)[used] ** 2).sum(axis=1))
-                sigma[view.index] = max(sigma[view.index], float(np.sqrt(square / MEDIAN_OF_SQUARE)))
+                variance = median_variance(((uv - view.seen.uv)[used] ** 2).sum(axis=1))
+                sigma[view.index] = max(sigma[view.index], float(np.sqrt(variance)))
         return replace(self, sigma=tuple(sigma))
 
     def on_planes_of(self, camera: int) -> np.ndarray:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from icalib.estimation.assembly import Following
-from icalib.estimation.feature_factor import MEDIAN_OF_SQUARE, FeatureFactor, FeatureOutput
+from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput
 from icalib.estimation.inputs import Inputs
+from icalib.estimation.medians import median_variance
 from icalib.estimation.problem import Problem
 from icalib.estimation.solver import Outcome
 from icalib.measurements import CornerStream, TrackStream
@@ -43,8 +44,8 @@ def _sigma(camera: Camera, factor: FeatureFactor, out: FeatureOutput, index: int
     if camera.track_noise_px is not None or not used[index].any():
         return camera.track_noise_px or factor.sigma[index]
     rows, points = 2 * sum(int(u.sum()) for u in used), factor.tracks.count
-    square = np.median((out.residual[index][used[index]] ** 2).sum(axis=1)) / MEDIAN_OF_SQUARE
-    return max(float(np.sqrt(square / max(1.0 - 3.0 * points / rows, 0.1))), SMALLEST_PX)
+    variance = median_variance((out.residual[index][used[index]] ** 2).sum(axis=1))
+    return max(float(np.sqrt(variance / max(1.0 - 3.0 * points / rows, 0.1))), SMALLEST_PX)
 
 
 def _kept(factor: FeatureFactor, out: FeatureOutput, index: int, keep: np.ndarray, settings: Settings) -> np.ndarray:
