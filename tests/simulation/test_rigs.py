@@ -9,9 +9,19 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import icalib.simulation
-from icalib.rig import Parameter, Settings
-from icalib.simulation import ADIS16448, GuessError, handheld, rig_for, settings_for, simulate, with_drawn_guess
+from icalib.rig import Parameter, Settings, Wheels
+from icalib.simulation import (
+    ADIS16448,
+    GuessError,
+    handheld,
+    load_scenario,
+    rig_for,
+    settings_for,
+    simulate,
+    with_drawn_guess,
+)
 
+EXAMPLES = Path(__file__).parents[2] / "examples" / "paper"
 ALLOWED = (
     "icalib.errors",
     "icalib.measurements",
@@ -37,6 +47,14 @@ def test_rig_states_truth_and_noise():
     np.testing.assert_array_equal(cam0.intrinsics.value, truth.intrinsics)
     np.testing.assert_array_equal(cam0.distortion.value, truth.distortion)
     np.testing.assert_array_equal(rig.imu.intrinsics.value, np.zeros(24))
+
+
+def test_a_rig_that_is_told_nothing_of_slip_allows_for_what_real_wheels_may_have():
+    scenario = load_scenario(EXAMPLES / "table2-ramp.yaml")
+    for told, expected in ((None, Wheels.sideways_slip), (1e-4, 1e-4)):
+        wheels = tuple(replace(w, allowed_slip=told) for w in scenario.wheels)
+        (found,) = rig_for(replace(scenario, wheels=wheels)).wheels
+        assert (found.sideways_slip, found.upwards_slip) == (expected, expected)
 
 
 def test_settings_model_what_is_simulated():

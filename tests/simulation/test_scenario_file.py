@@ -54,6 +54,7 @@ sensors:
     baseline: 0.5
     noise: 0.01
     slip: 0.002
+    allowed_slip: 0.003
     reports: rates
     meaning: instant
     poses_every: 5
@@ -109,7 +110,8 @@ def test_every_field_arrives(tmp_path):
     assert camera.intrinsics == (300.0, 301.0, 320.0, 240.0) and camera.distortion == (0.6, 1.1)
     assert (lidar.rings, lidar.azimuth_steps, lidar.elevation_deg) == (4, 100, (-20.0, 10.0))
     assert (lidar.range_m, lidar.range_noise_m) == ((1.0, 30.0), 0.02)
-    assert (wheels.radii, wheels.baseline, wheels.noise, wheels.slip) == ((0.1, 0.11), 0.5, 0.01, 0.002)
+    assert (wheels.radii, wheels.baseline, wheels.noise) == ((0.1, 0.11), 0.5, 0.01)
+    assert (wheels.slip, wheels.allowed_slip) == (0.002, 0.003)
     assert (wheels.reports, wheels.meaning, wheels.poses_every) == ("rates", "instant", 5)
     (mocap,) = s.poses
     assert (mocap.name, mocap.kind, mocap.rate_hz) == ("mocap", "relative", 30.0)
@@ -173,6 +175,8 @@ BAD = {
         ("radii: [0.1]", "must be \\[left, right\\] in metres"),
         ("radii: [0.1, 0]", "radii\\[1\\]: must be above 0"),
     ],
+    " slip: 0.002": [(" slip: -0.002", "axle.slip: must be at least 0")],
+    "allowed_slip: 0.003": [("allowed_slip: 0", "axle.allowed_slip: must be above 0")],
     "meaning: instant": [("meaning: average", "axle.meaning: there is no meaning 'average'; available are mean")],
     "size: [8, 7, 3]": [
         ("size: [8, 7]", "room.size: must be a list of 3 numbers"),

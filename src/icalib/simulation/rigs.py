@@ -122,6 +122,8 @@ class _Treated:
             wheel_noise=sim.noise, speed_noise=sim.speed_noise, yaw_noise=sim.yaw_noise,
             steering_noise=sim.steering_noise, measures=kind, meaning=sim.meaning,
         )  # fmt: skip
+        if sim.allowed_slip is not None:
+            given = replace(given, sideways_slip=sim.allowed_slip, upwards_slip=sim.allowed_slip)
         given = replace(given, **{name: _parameter(self.drive, value) for name, value in sim.drive.items()})
         return self._mounted(given, sim, sim.T_imu_wheel)
 

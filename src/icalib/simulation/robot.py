@@ -114,7 +114,8 @@ class SimWheels:
     """True wheels; their frame is the middle of the axle that is not steered, on the floor, x forwards, z up.
 
     radii (left, right) [m], baseline [m]. noise: density of each wheel's rate [rad/s/sqrt(Hz)]; slip: density of a
-    lateral random path [m/sqrt(s)], in poses only.
+    lateral random path [m/sqrt(s)], in poses only. allowed_slip: density of slip [m/sqrt(s)] that the rig is told;
+    encoders simulated here know none, while a rig that is told nothing allows for what real wheels may have.
 
     rates: what encoders report, by `meaning` as in `WheelStream`: (v_x -+ baseline/2 w_z) / radius. twist: forward
     speed and yaw rate, v_x and w_z over their scales, by `meaning`, too. steering: the rate v_x / radius of a driven
@@ -134,6 +135,7 @@ class SimWheels:
     clock_origin_ns: int = 0
     noise: float = 0.03
     slip: float = 0.0
+    allowed_slip: float | None = None
     reports: Literal["rates", "twist", "steering", "poses"] = "rates"
     meaning: Literal["mean", "instant"] = "mean"
     poses_every: int = 3

@@ -142,10 +142,10 @@ def _lidar(name: str, value: YamlValue, start_ns: int) -> SimLidar:
 
 # What wheels must have, by what they report, and what noise they may have.
 _DRIVES = {
-    "rates": (("radii", "baseline"), ("noise", "slip", "poses_every")),
+    "rates": (("radii", "baseline"), ("noise", "slip", "allowed_slip", "poses_every")),
     "poses": (("radii", "baseline"), ("noise", "slip", "poses_every")),
-    "twist": (("scales",), ("speed_noise", "yaw_noise")),
-    "steering": (("radius", "wheelbase"), ("steering_offset", "noise", "steering_noise")),
+    "twist": (("scales",), ("speed_noise", "yaw_noise", "allowed_slip")),
+    "steering": (("radius", "wheelbase"), ("steering_offset", "noise", "steering_noise", "allowed_slip")),
 }  # fmt: skip
 
 
@@ -173,7 +173,7 @@ def _drive_value(key: str, value: YamlValue) -> Any:
         return value.whole(1)
     if key == "steering_offset":
         return value.number()
-    return _least(value, 0.0) if key.endswith(("noise", "slip")) else value.positive()
+    return _least(value, 0.0) if key == "slip" or key.endswith("noise") else value.positive()
 
 
 def _poses(name: str, value: YamlValue, start_ns: int) -> SimPoses:
