@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from tests.consistency.test_robot import steady
 
 from icalib.calibration import Calibration, load_calibration
 from icalib.errors import EstimationError
@@ -18,7 +19,6 @@ from icalib.rig import Rig
 from icalib.simulation import Drive, Scenario, SimPoses, Simulation, rig_for, simulate
 
 MOUNT = ("rotation", "translation", "time_offset")
-STEADY = 1e-4  # m/sqrt(s)
 T_IMU_MOCAP = np.array([[0.0, -1.0, 0.0, 0.1], [1.0, 0.0, 0.0, 0.05], [0.0, 0.0, 1.0, 0.3], [0.0, 0.0, 0.0, 1.0]])
 
 
@@ -157,9 +157,7 @@ def test_nees_of_a_camera_and_wheels(robot):
     scenario, seen, runs = robot("ramp", 30.0, "cw"), np.array([0, 3, 5, 6, 7, 8, 9]), []
     for seed in range(30):
         rig, measurements, simulation = without_imu(scenario, seed)
-        (wheels,) = rig.wheels
-        steady = replace(rig, wheels=(replace(wheels, sideways_slip=STEADY, upwards_slip=STEADY),))
-        result = calibrate_measurements(steady, measurements)
+        result = calibrate_measurements(steady(rig), measurements)
         assert result.converged, seed
         e, P = normalised(result, simulation)
         runs.append(e[seen] @ np.linalg.solve(P[np.ix_(seen, seen)], e[seen]))

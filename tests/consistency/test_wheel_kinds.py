@@ -6,19 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.consistency.test_robot import steady
 
 from icalib.montecarlo.truth import error, true_value
 from icalib.pipeline import calibrate_measurements
-from icalib.rig import DRIVE_SIZES, Rig
+from icalib.rig import DRIVE_SIZES
 from icalib.simulation import Scenario, rig_for, simulate
 
 MOUNTS = ("rotation", "translation", "time_offset")
-STEADY = 1e-4  # m/sqrt(s): simulated wheels do not slip
 KINDS = {"twist": "twist", "steering": "steered"}
-
-
-def steady(rig: Rig) -> Rig:
-    return replace(rig, wheels=tuple(replace(w, sideways_slip=STEADY, upwards_slip=STEADY) for w in rig.wheels))
 
 
 def reporting(scenario: Scenario, reports: str) -> Scenario:
