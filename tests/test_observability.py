@@ -33,6 +33,18 @@ def test_what_five_share_is_as_open_as_the_guess_is_wide(worth: float, verdict: 
     assert all(s in sentence for s in SENSORS[:4]) and "turn the rig" in sentence
 
 
+def test_names_stand_in_the_order_of_the_rig_and_say_nothing_twice():
+    names = ("left_cam.translation.z", "left_cam.time_offset.time_offset", "wheel0.baseline.baseline")
+    for first, last in ((0.75, 0.65), (0.65, 0.75)):
+        held = np.array([first, 0.1, last])[:, None]
+        found = shared(50.0)
+        found.held, found.spread, found.covariance = held / np.linalg.norm(held), np.full(3, 50.0), np.eye(3)
+        (sentence,) = observe(found, names, ("wheel0",)).undetermined
+        assert sentence.startswith("left_cam translation z with wheel0 baseline: not determined by this motion; ")
+    found.held = np.array([0.0, 1.0, 0.0])[:, None]
+    assert observe(found, names).undetermined[0].startswith("left_cam time offset: ")
+
+
 def test_an_answer_that_did_not_converge_determines_nothing():
     names = tuple(f"{s}.rotation.z" for s in SENSORS) + ("cam0.time_offset.time_offset",)
     assert observe(shared(1.0, converged=False), names).verdicts == ("undetermined",) * 6

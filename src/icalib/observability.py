@@ -13,6 +13,7 @@ from icalib.estimation.determination import Determined
 SPREAD = 10.0  # a parameter known, with what it owes to the guess, to no more tolerances than this is undetermined
 SHARE = 0.25  # a parameter that makes up this much of an undetermined direction is undetermined itself
 NAMED = 0.2  # parts of a direction smaller than this are not named
+MOST_NAMED = 4  # of the largest
 
 # The motion that would determine a parameter which the data leave open.
 MISSING_MOTION = {
@@ -75,8 +76,16 @@ def sparse_basis(directions: np.ndarray, rounds: int = 50) -> np.ndarray:
 
 def _sentence(direction: np.ndarray, names: tuple[str, ...], wheels: Collection[str]) -> str:
     order = np.argsort(-np.abs(direction))
-    parts = [i for i in order if abs(direction[i]) >= NAMED][:4] or [order[0]]
-    words = " with ".join(names[i].replace(".", " ") for i in parts)
-    sensor, kind = names[parts[0]].rsplit(".", 2)[:2]
+    # By the rig, not by size: where all move alike, noise would decide which comes first.
+    parts = sorted(i for i in order[:MOST_NAMED] if abs(direction[i]) >= NAMED) or [order[0]]
+    words = " with ".join(_words(names[i]) for i in parts)
+    sensor, kind, _ = names[order[0]].rsplit(".", 2)
     motions = MISSING_MOTION | (ON_THE_GROUND if sensor in wheels else {})
     return f"{words}: not determined by this motion; {motions.get(kind, 'move the rig more')}."
+
+
+def _words(name: str) -> str:
+    """A parameter's name as people say it; what is one number has no label of its own."""
+    sensor, kind, label = name.rsplit(".", 2)
+    own = kind if label == kind else f"{kind} {label}"
+    return f"{sensor} {own.replace('_', ' ')}"

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from icalib.batch import program
 from icalib.cli import main
 from icalib.montecarlo import study as study_module
+from icalib.montecarlo.console import table
 from icalib.montecarlo.record import Record
 from icalib.montecarlo.reproduce import FOLDER, MOTIONS
+from icalib.montecarlo.summary import summarise
+from icalib.montecarlo.words import block_row
 from icalib.simulation import load_scenario
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
@@ -39,6 +44,22 @@ def test_montecarlo_prints_the_table_and_the_failed_runs(runs, tmp_path: Path, c
     assert sorted(f.stem for f in (tmp_path / "runs").iterdir())[::29] == ["000006", "000035"]
     assert main(["montecarlo", str(SCENARIO), "--runs", "30", "-o", str(tmp_path), "--seed", "6", "--quiet"]) == 0
     assert capsys.readouterr().out == ""
+
+
+def test_the_table_is_whole_in_80_columns(record):
+    def as_wide_as_table_2(found: Record) -> Record:
+        """The longest names, and distortions known to 1e-5."""
+        blocks = tuple(replace(b, sensor=b.sensor.replace("cam0", "wheel0")) for b in found.blocks)
+        return replace(found, blocks=blocks, error=found.error / 30.0, covariance=found.covariance / 900.0)
+
+    found = summarise([as_wide_as_table_2(record(seed)) for seed in range(30)])
+    console = Console(width=80, file=StringIO())
+    console.print(table(found))
+    rows = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    row = next(r for r in rows if "wheel0 distortion" in r)
+    block = next(b for b in found.blocks if b.key == "wheel0.distortion")
+    assert row.split() == " ".join(block_row(block)).split()
+    assert sum("wheel0 " in r for r in rows) == 4 and len(rows) < 17
 
 
 def test_reproduce_leaves_figures_and_tables(runs, tmp_path: Path, capsys):

@@ -11,7 +11,7 @@ import pytest
 
 from icalib.montecarlo.record import Record, Size, from_json, to_json
 from icalib.montecarlo.summary import Consistency, consistency_json, summarise
-from icalib.montecarlo.words import answer, verdict_words
+from icalib.montecarlo.words import answer, undetermined_words, verdict_words
 
 KEYS = ("cam0.rotation", "cam0.time_offset", "cam0.distortion", "cam1.rotation", "cam1.distortion", "wheel0.radii")
 
@@ -75,6 +75,7 @@ def test_undetermined_entries_stay_out(record: Callable[..., Record], judged):
     assert radii.entries[0].runs == 0 and radii.entries[0].rmse is None
     assert radii.entries[0].verdicts == {"undetermined": 30}
     assert found.undetermined == {"wheel0 radii left": 30}
+    assert undetermined_words(found) == ["30 of 30 runs: wheel0 radii left"]
     assert verdict_words(radii) == "left: 30 undetermined; right: 30 weak"
     assert found.whole is not None and found.whole.mean < 2.0
 

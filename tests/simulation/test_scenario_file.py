@@ -208,6 +208,7 @@ def test_a_bad_file_ends_in_a_sentence(tmp_path, good, bad, words):
         loaded(tmp_path, FULL.replace(good, bad, 1))
     text = str(caught.value)
     assert text.startswith(str(tmp_path / "scenario.yaml:")) and "\n" not in text
+    assert text.count("scenario.yaml") == 1
 
 
 def test_no_file_and_no_imu(tmp_path):

@@ -12,9 +12,10 @@ from rich.text import Text
 
 from icalib.montecarlo.study import Study
 from icalib.montecarlo.summary import Consistency
-from icalib.montecarlo.words import HEADERS, NUMBERS, answer, block_row, failures_words, nees_cells
+from icalib.montecarlo.words import HEADERS, NUMBERS, answer, block_row, failures_words, nees_cells, undetermined_words
 
 MOST_FAILURES = 10
+IN_TWO_LINES = ("mean sigma", "sampled / predicted")  # headers that need not stand in one
 
 
 def print_study(study: Study, folder: Path) -> None:
@@ -30,10 +31,14 @@ def print_study(study: Study, folder: Path) -> None:
 
 def table(found: Consistency) -> Table:
     """One row for each block, and one for all together; outside its bounds the NEES is red."""
-    out = Table(title="Consistency", title_justify="left", caption_justify="left", box=SIMPLE_HEAD, padding=0)
+    # All columns fit into 80.
+    out = Table(
+        title="Consistency", title_justify="left", caption_justify="left", box=SIMPLE_HEAD, padding=0, show_edge=False
+    )
     out.caption = "NEES: per degree of freedom, 1 where the covariance is honest. Undetermined entries do not count."
     for header in HEADERS:
-        out.add_column(header, justify="right" if header in NUMBERS else "left", no_wrap=header not in HEADERS[-1:])
+        justify = "right" if header in NUMBERS else "left"
+        out.add_column(header, justify=justify, no_wrap=header not in IN_TWO_LINES, overflow="fold")
     for block in found.blocks:
         cells = [Text(cell) for cell in block_row(block)]
         if block.nees is not None:
@@ -53,4 +58,4 @@ def _failures(found: Consistency) -> list[str]:
 
 
 def _undetermined(found: Consistency) -> list[str]:
-    return [f"Undetermined in {n} runs: {what}" for what, n in found.undetermined.items()]
+    return [f"Undetermined in {line}" for line in undetermined_words(found)]

@@ -20,6 +20,7 @@ from icalib.montecarlo.words import (
     failures_words,
     mean_cells,
     nees_cells,
+    undetermined_words,
     verdict_words,
 )
 from icalib.report.page import document, plot_place, resource
@@ -42,8 +43,7 @@ def study_html(found: Consistency, identity: Identity, records: Sequence[Record]
         element("h2", "Made from"), table(("what", "value"), _facts(identity, records)),
     ]  # fmt: skip
     if found.undetermined:
-        open_ones = [f"{n} runs: {what}" for what, n in found.undetermined.items()]
-        sections[4:4] = [element("h2", "Undetermined"), sentences(open_ones, "care", "None.")]
+        sections[4:4] = [element("h2", "Undetermined"), sentences(undetermined_words(found), "care", "None.")]
     return page(f"Consistency, {identity.scenario}", answer(found), sections, {"nees": nees_figure(found)})
 
 

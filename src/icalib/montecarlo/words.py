@@ -66,3 +66,9 @@ def failures_words(found: Consistency) -> str:
     if not found.failures:
         return f"All {found.runs} runs reached a result."
     return f"{len(found.failures)} of {found.runs} runs failed, and count for nothing else here."
+
+
+def undetermined_words(found: Consistency) -> list[str]:
+    """What was left open, and in how many of the runs that reached a result."""
+    reached = found.runs - len(found.failures)
+    return [f"{n} of {reached} runs: {what}" for what, n in found.undetermined.items()]

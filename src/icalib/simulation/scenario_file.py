@@ -39,23 +39,22 @@ def load_scenario(path: str | Path) -> Scenario:
     board: dict[str, Any] = _board(found["target"]) if "target" in found else {"board": False}
     return _made(
         root,
-        lambda: Scenario(
-            duration_s=found["duration"].positive(),
-            motion=motion,
-            imu_clock_origin_ns=start_ns,
-            room=room,
-            features=features,
-            seed=found["seed"].whole(0) if "seed" in found else 0,
-            **sensors,
-            **board,
-        ),
+        Scenario,
+        duration_s=found["duration"].positive(),
+        motion=motion,
+        imu_clock_origin_ns=start_ns,
+        room=room,
+        features=features,
+        seed=found["seed"].whole(0) if "seed" in found else 0,
+        **sensors,
+        **board,
     )
 
 
-def _made(value: YamlValue, make: Callable[[], Made]) -> Made:
-    """What `make` makes; a RigError is told as one of `value`."""
+def _made(value: YamlValue, kind: Callable[..., Made], /, **fields: Any) -> Made:
+    """A `kind` of these fields; a RigError is told as one of `value`."""
     try:
-        return make()
+        return kind(**fields)
     except RigError as error:
         value.fail(str(error))
 
@@ -196,7 +195,7 @@ def _room(value: YamlValue) -> Room:
         if slope > _STEEPEST_DEG:
             found["slope_deg"].fail(f"must be at most {_STEEPEST_DEG:g} degrees, but is {slope:g}.")
         hills = hills_of_slope(slope)
-    return _made(value, lambda: Room(_triple(found["size"]), blocks, hills))
+    return _made(value, Room, size=_triple(found["size"]), blocks=blocks, hills=hills)
 
 
 def _block(value: YamlValue) -> Block:
@@ -221,7 +220,7 @@ def _motion(value: YamlValue, folder: Path) -> Drive:
         chosen["sideslip_deg"] = _least(found["sideslip_deg"], 0.0)
     if "seed" in found:
         chosen["seed"] = found["seed"].whole(0)
-    return _made(value, lambda: Drive(**chosen))
+    return _made(value, Drive, **chosen)
 
 
 def _board(value: YamlValue) -> dict[str, Any]:
@@ -236,7 +235,7 @@ def _board(value: YamlValue) -> dict[str, Any]:
     found = value.record(("type", "T_world_board", *required), optional)
     types = get_type_hints(kind)
     chosen = {f.name: _of_type(found[f.name], types[f.name]) for f in asked if f.name in found}
-    return {"target": _made(value, lambda: kind(**chosen)), "T_world_board": _pose(found["T_world_board"])}
+    return {"target": _made(value, kind, **chosen), "T_world_board": _pose(found["T_world_board"])}
 
 
 def _of_type(value: YamlValue, kind: type) -> Any:
