@@ -2,10 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+from icalib.estimation import determination
 from icalib.estimation.determination import determine
 from icalib.estimation.solver import Step
 from icalib.first_guess.start import start
 from icalib.simulation import rig_for, simulate, with_drawn_guess
+
+
+def test_of_an_estimate_that_failed_no_answers_are_looked_for(robot, monkeypatch):
+    """Of a motion that was wrong each took 50 iterations to no end, half an hour all together."""
+    estimate = determination.estimate
+
+    def failing(*given, **named):
+        found = estimate(*given, **named)
+        return replace(found, outcome=replace(found.outcome, converged=False, half_way=False))
+
+    monkeypatch.setattr(determination, "estimate", failing)
+    monkeypatch.setattr(determination, "owed_to_guess", None)
+    scenario = robot("planar", 4.0, "lw")
+    rig = with_drawn_guess(rig_for(scenario), scenario, 0)
+    found = determine(*start(rig, [simulate(scenario, 0).measurements])[:2])
+    assert not found.estimate.outcome.converged
+    assert found.held.shape[1] == found.shifts.shape[0] > 0
 
 
 def test_held_directions_are_moved_in_the_estimate_without_them(robot):

@@ -9,7 +9,7 @@ import pytest
 
 from icalib.errors import EstimationError
 from icalib.estimation import guess_worth
-from icalib.estimation.guess_worth import TOGETHER, astray, moved_to_guess, moved_to_worth, owed_to_guess
+from icalib.estimation.guess_worth import TOGETHER, astray, in_proportion, moved_to_guess, moved_to_worth, owed_to_guess
 from icalib.estimation.state import State, make_layout
 
 TOLERANCE = {"translation": 5e-3, "time_offset": 1e-3}
@@ -108,6 +108,13 @@ def test_nothing_is_tried_out_where_the_guess_alone_leaves_all_open(given, monke
     monkeypatch.setattr(guess_worth, "minimise", None)
     shifts = owed_to_guess(given.inputs, given.problem, given.state, np.zeros((8, 8)))
     np.testing.assert_allclose(np.sqrt((shifts**2).sum(axis=0)), given.sigma)
+
+
+def test_in_proportion_only_what_is_held_moves(given, monkeypatch):
+    nothing = np.zeros((8, 8))
+    expected = owed_to_guess(given.inputs, given.problem, given.state, nothing)[:-TOGETHER]
+    monkeypatch.setattr(guess_worth, "minimise", None)
+    np.testing.assert_allclose(in_proportion(given.inputs, given.problem, nothing), expected, atol=1e-12)
 
 
 def test_a_way_along_which_nothing_can_be_solved_is_made_shorter(given, monkeypatch):

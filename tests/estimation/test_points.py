@@ -77,6 +77,14 @@ def test_coarse_noise_is_as_large_as_most_errors_and_no_less_than_stated(factor,
     assert [s for i, s in enumerate(found) if i != noisy] == [s for i, s in enumerate(factor.sigma) if i != noisy]
 
 
+def test_none_is_followed_where_every_other_image_looks_away(factor, setup):
+    """As where a first motion is wrong: no point is seen by all images of its track, and there is no usual misfit."""
+    rotation = setup.state.rotation.copy()
+    rotation[::2] = rotation[::2] @ np.diag([-1.0, 1.0, -1.0])
+    assert factor.followed > 0
+    assert factor.cut(replace(setup.state, rotation=rotation), ()).followed == 0
+
+
 def test_settled_features_are_where_they_were(factor, setup):
     cost, out = outcome(looked_for(factor, 3.0 * factor.tracks.start), setup.state)
     again, there = outcome(factor.settled(out), setup.state)

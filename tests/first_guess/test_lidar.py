@@ -79,6 +79,15 @@ def test_on_a_floor_the_turn_about_its_axis_comes_from_accelerations(robot):
     assert within(r, lidar_and_motion(r.imu, r.streams[0], 9.81)[0], 1.0, 0.05, 1e-3, but=up)
 
 
+@pytest.mark.parametrize(("seconds", "seed"), [(8.0, 96), (12.0, 6), (12.0, 19)])
+def test_a_long_turn_to_one_side_shows_the_clocks(robot, seconds, seed):
+    """About its median such a turn is another motion, which goes best with the LiDAR's seconds away or nowhere."""
+    r = robot(seconds, seed, {"azimuth_steps": 300}, example="table2-planar")
+    held = Held(r.truth().rotation, r.truth().position)
+    found = lidar_and_motion(r.imu, r.streams[0], 9.81, held)[0]
+    assert abs(found.offset - r.truth().offset) < 5e-3
+
+
 @pytest.mark.parametrize("seed", [5, 6, 11, 12])
 def test_on_a_floor_the_turn_about_its_axis_comes_from_the_known_motion(robot, seed):
     """Which way that motion is for the LiDAR must not be taken from the turn that is looked for."""

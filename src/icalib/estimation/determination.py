@@ -26,7 +26,7 @@ from icalib.estimation.arrowhead import HELD_BELOW, restricted_inverse
 from icalib.estimation.assembly import given_priors
 from icalib.estimation.debias import Spurious, spurious_information
 from icalib.estimation.estimate import EARLY_DECREASE, EARLY_SHARE, Estimate, OnVisit, estimate
-from icalib.estimation.guess_worth import astray, moved_to_guess, moved_to_worth, owed_to_guess
+from icalib.estimation.guess_worth import astray, in_proportion, moved_to_guess, moved_to_worth, owed_to_guess
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.prior_factor import without_priors
 from icalib.estimation.problem import Problem
@@ -100,7 +100,10 @@ def determine(
     if not found.problem.held.size:
         nothing = np.zeros((inputs.layout.size, 0))
         return Determined(found, seen.data, seen.noise, nothing, nothing.T)
-    shifts = owed_to_guess(inputs, found.problem, found.outcome.state, seen.data)
+    if _is_worth_keeping(found.outcome):
+        shifts = owed_to_guess(inputs, found.problem, found.outcome.state, seen.data)
+    else:  # Answers would be looked for, each to no end, that nobody is to use.
+        shifts = in_proportion(inputs, found.problem, seen.data)
     return Determined(found, seen.data, seen.noise, found.problem.held, shifts)
 
 

@@ -155,9 +155,10 @@ class FeatureFactor:
             np.zeros(n, dtype=np.int64),
         )
         square = found.cost / np.maximum(seen, 1)
-        fits = square <= MOST_UNLIKE**2 * np.median(square[found.shown == seen] if n else 0.0) + MOST_UNLIKE
+        whole = found.shown == seen
+        fits = square <= MOST_UNLIKE**2 * np.median(square[whole] if whole.any() else 0.0) + MOST_UNLIKE
         certain = information * (MOST_UNCERTAIN * distance) ** 2 > 1.0
-        good = np.isfinite(points).all(axis=1) & (found.shown == seen) & fits & certain
+        good = np.isfinite(points).all(axis=1) & whole & fits & certain
         if self.surfaces is None:
             return points, good, OnPlanes.none(int(good.sum()))
         recording = np.searchsorted(state.starts, self.tracks.stretch_of()[good], side="right") - 1

@@ -82,11 +82,16 @@ def owed_to_guess(inputs: Inputs, problem: Problem, state: State, data: np.ndarr
     """
     ways = _ways(inputs, problem, data)
     if _leave_nothing(inputs, problem, ways):
-        return problem.tolerance * ways.T
+        return in_proportion(inputs, problem, data)
     alone = np.array([_answer(problem, state, way) for way in ways.T])
     signs = np.random.default_rng(0).choice((-1.0, 1.0), (TOGETHER, ways.shape[1]))
     beyond = [_answer(problem, state, ways @ s) - s @ alone for s in signs]
     return np.vstack([alone, np.array(beyond) / np.sqrt(TOGETHER)])
+
+
+def in_proportion(inputs: Inputs, problem: Problem, data: np.ndarray) -> np.ndarray:
+    """(m, B) as `owed_to_guess`, where nothing but what is held moves."""
+    return problem.tolerance * _ways(inputs, problem, data).T
 
 
 def _ways(inputs: Inputs, problem: Problem, data: np.ndarray) -> np.ndarray:

@@ -204,7 +204,7 @@ def _grid(t: np.ndarray, rate: np.ndarray, covered: np.ndarray, count: int) -> t
 def _correlate(imu: ImuData, name: str, rates: CameraRates) -> float:
     """Offset [s] at the peak of the masked, normalised cross-correlation of |w| over all shifts, of rates as they are
     or of their means, whichever is higher: fast motion shows in the ones, slow motion in the others."""
-    found = max(_shifts(imu, rates), key=lambda s: s.correlation if np.isfinite(s.correlation) else -1.0)
+    found = max(_shifts(imu, rates), key=_likeness)
     if not found.correlation > rates.least_correlation:
         raise EstimationError(
             f"the motion of {name} does not match that of {imu.name} at any shift of their clocks (best correlation "
@@ -219,13 +219,19 @@ def _shifts(imu: ImuData, rates: CameraRates) -> list[Shift]:
 
 
 def _shift(imu: ImuData, rates: CameraRates, count: int) -> Shift:
-    """Of the camera's grid against the IMU's; means over `count` points of them."""
+    """Of the camera's grid against the IMU's; means over `count` points of them. The IMU's rates as they are or about
+    their median, whichever is more alike: the one has a bias in it, the other lacks what is steady in a turn."""
     known = ~np.isin(imu.seconds, [start for start, _ in imu.gaps])
-    a, mask_a = _grid(imu.seconds, imu.gyro - np.median(imu.gyro, axis=0), known, count)
     middle = 0.5 * (rates.start + rates.end)
     near = np.diff(middle, append=middle[-1]) < LONGEST_STEP_S
-    b, mask_b = _grid(middle, rates.rate, near, count)
-    return best_shift(a, mask_a, b, mask_b, SHORTEST_OVERLAP_S * GRID_HZ)
+    seen = _grid(middle, rates.rate, near, count)
+    own = (_grid(imu.seconds, imu.gyro - about, known, count) for about in (0.0, np.median(imu.gyro, axis=0)))
+    return max((best_shift(*a, *seen, SHORTEST_OVERLAP_S * GRID_HZ) for a in own), key=_likeness)
+
+
+def _likeness(shift: Shift) -> float:
+    """Its correlation, where there is one."""
+    return shift.correlation if np.isfinite(shift.correlation) else -1.0
 
 
 def _kabsch(w_imu: np.ndarray, w_cam: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
