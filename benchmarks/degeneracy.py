@@ -4,7 +4,7 @@ python benchmarks/degeneracy.py OUTPUT [--runs N] [--workers N] [--motion M ...]
 
 Short recordings with few points, so that many can be made; extrinsics, time offsets and lenses estimated from a guess
 drawn about the truth, with the IMU of the data sheet and one ten times noisier. Runs are kept in OUTPUT, and the same
-command goes on from there.
+command goes on from there; each motion's rows are written as soon as they are known, the others' stay as they were.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ import numpy as np
 from icalib.montecarlo import Plan, Record, run_study
 from icalib.montecarlo.study import scenario_digest
 from icalib.simulation import Scenario, load_scenario
+from icalib.text_files import write_texts
 
 ROOT = Path(__file__).resolve().parent.parent
 FOUND = ROOT / "docs" / "studies" / "degeneracy.json"
@@ -103,6 +105,14 @@ def summary(motion: str, imu: str, records: Sequence[Record]) -> dict:
     }
 
 
+def store(row: dict) -> None:
+    """The row into the table of the docs, in place of the earlier one of its motion and IMU, if there is one."""
+    rows = {(r["motion"], r["imu"]): r for r in json.loads(FOUND.read_text())} if FOUND.exists() else {}
+    rows[row["motion"], row["imu"]] = row
+    in_order = [rows[k] for k in product(MOTIONS, IMUS) if k in rows]
+    write_texts(FOUND.parent, {FOUND.name: json.dumps(in_order, indent=1) + "\n"})
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("output", type=Path)
@@ -110,7 +120,6 @@ def main() -> None:
     parser.add_argument("--workers", type=int)
     parser.add_argument("--motion", choices=MOTIONS, action="append", help="of these alone; all where none is named")
     given = parser.parse_args()
-    rows = []
     for motion in given.motion or MOTIONS:
         for imu, noise in IMUS.items():
             plan = Plan(given.runs, 1, "drawn", workers=given.workers)
@@ -119,9 +128,9 @@ def main() -> None:
             scenario = variant(motion, noise)
             digest = scenario_digest(ROOT / "examples" / "paper" / f"{motion}.yaml", scenario) + f" {noise} {size}"
             study = run_study(scenario, name, digest, given.output / name.replace(", ", "-"), plan)
-            rows.append(summary(motion, imu, study.records))
-            print(json.dumps({k: v for k, v in rows[-1].items() if k != "verdicts"}), flush=True)
-    FOUND.write_text(json.dumps(rows, indent=1) + "\n")
+            row = summary(motion, imu, study.records)
+            store(row)
+            print(json.dumps({k: v for k, v in row.items() if k != "verdicts"}), flush=True)
 
 
 if __name__ == "__main__":
