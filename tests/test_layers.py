@@ -20,6 +20,7 @@ LEVELS = {
     "measurements": 1,
     "rig": 1,
     "joining": 2,
+    "rig_streams": 2,
     "yaml_nodes": 1,
     "result_files": 1,
     "provenance": 2,

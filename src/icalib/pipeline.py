@@ -25,6 +25,7 @@ from icalib.recordings import Recording, read_measurements
 from icalib.recordings.several import Source, naming, open_all
 from icalib.rig import Camera, Rig
 from icalib.rig_file import load_rig
+from icalib.rig_streams import streams_of_rig
 
 READING_SHARE, IMAGES_SHARE = 0.1, 0.8  # of the time, without images and with
 Progress = Callable[[str, float], None]  # what is being done, and how much of the whole is behind, 0 to 1
@@ -84,11 +85,13 @@ def calibrate_measurements(
     on_visit: Callable[[Visited], None] | None = None,
 ) -> Calibration:
     """As `calibrate`, from measurements in memory. Those without a name are called by their number. `on_visit` is told
-    of each state that the solver looked for a step from."""
+    of each state that the solver looked for a step from. Raises CalibrationError as `calibrate` does, and where
+    a sensor of the rig was not measured."""
     given = [measurements] if isinstance(measurements, Measurements) else measurements
     if not given:
         raise RecordingError("no recording was given; give at least one.")
     recordings = [m if m.name else dataclasses.replace(m, name=f"recording {k}") for k, m in enumerate(given, 1)]
+    recordings = [streams_of_rig(rig, m) for m in recordings]
     # The kernels have threads of their own; those of BLAS beside them double the time.
     with threadpool_limits(limits=1, user_api="blas"):
         return _calibrate(rig, recordings, progress, on_visit)

@@ -1,0 +1,64 @@
+"""Measurements in memory that are not those of the rig are refused by name, before anything is estimated from them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from icalib.errors import RecordingError
+from icalib.measurements import ImuStream, LidarStream, Measurements, PoseStream, TrackStream, WheelStream
+from icalib.pipeline import calibrate_measurements
+from icalib.rig import ImuNoise, ImuSensor, Lidar, PoseSensor, Rig, Wheels
+from icalib.rig_streams import streams_of_rig
+
+STAMPS, NONE = np.arange(3), np.zeros(4, np.int64)
+IMU = ImuStream("imu0", STAMPS, np.zeros((3, 3)), np.zeros((3, 3)))
+
+
+def lidar(name: str) -> LidarStream:
+    nothing = np.empty(0, np.float32)
+    return LidarStream(name, STAMPS, NONE, nothing, np.empty((0, 3), np.float32), np.empty(0, np.int32))
+
+
+RIG = Rig(
+    ImuSensor("imu0", "", ImuNoise(1e-4, 1e-5, 1e-3, 1e-4)),
+    (),
+    lidars=(Lidar("front", ""), Lidar("rear", "")),
+    wheels=(Wheels("w", ""),),
+    poses=(PoseSensor("mocap", ""),),
+)
+WHOLE = Measurements(
+    IMU,
+    (),
+    name="drive",
+    lidars=(lidar("rear"), lidar("front")),
+    wheels=(WheelStream("w", STAMPS, np.zeros((3, 2))),),
+    poses=(PoseStream("mocap", STAMPS, np.zeros((3, 3, 3)), np.zeros((3, 3))),),
+)
+TRACKS = TrackStream("cam7", STAMPS, NONE, np.empty(0, np.int64), np.empty((0, 2)))
+
+
+def test_streams_come_in_the_order_of_the_rig():
+    found = streams_of_rig(RIG, WHOLE)
+    assert [s.name for s in found.lidars] == ["front", "rear"]
+    assert (found.imu, found.wheels, found.poses) == (WHOLE.imu, WHOLE.wheels, WHOLE.poses)
+
+
+@pytest.mark.parametrize(
+    ("rig", "changed", "words"),
+    [
+        (RIG, {"imu": None}, "drive has no readings of imu0"),
+        (RIG, {"imu": replace(IMU, name="imu1")}, "a stream called imu1, but the rig has imu0 of its kind"),
+        (replace(RIG, imu=None), {}, "a stream called imu0, but the rig has none of its kind"),
+        (RIG, {"lidars": (lidar("front"),)}, "drive has nothing of rear"),
+        (RIG, {"wheels": (), "poses": ()}, "drive has nothing of w and mocap"),
+        (RIG, {"lidars": (lidar("front"), lidar("rear"), lidar("front"))}, "two streams of front"),
+        (RIG, {"lidars": (lidar("front"), lidar("roof"))}, "a stream called roof, but the rig has front and rear"),
+        (RIG, {"tracks": (TRACKS,)}, "a stream called cam7, but the rig has none of its kind"),
+    ],
+)
+def test_others_are_refused_by_name(rig: Rig, changed: dict, words: str):
+    with pytest.raises(RecordingError, match=words):
+        calibrate_measurements(rig, replace(WHOLE, **changed))
