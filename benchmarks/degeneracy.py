@@ -4,7 +4,8 @@ python benchmarks/degeneracy.py OUTPUT [--runs N] [--workers N] [--motion M ...]
 
 Short recordings with few points, so that many can be made; extrinsics, time offsets and lenses estimated from a guess
 drawn about the truth, with the IMU of the data sheet and one ten times noisier. Runs are kept in OUTPUT, and the same
-command goes on from there; each motion's rows are written as soon as they are known, the others' stay as they were.
+command goes on from there; each motion's rows are written as soon as they are known, the others' stay as they were. The
+table of docs/uncertainty.md is printed at the end.
 """
 
 from __future__ import annotations
@@ -26,14 +27,16 @@ from icalib.text_files import write_texts
 
 ROOT = Path(__file__).resolve().parent.parent
 FOUND = ROOT / "docs" / "studies" / "degeneracy.json"
-MOTIONS = (
-    "table2-3d", "table2-ramp", "table2-planar", "single-axis", "arc", "spin", "straight-line", "constant-velocity",
-    "standing",
-)  # fmt: skip
+MOTIONS = {
+    "table2-3d": "free", "table2-ramp": "ramps", "table2-planar": "planar", "single-axis": "about one axis",
+    "arc": "constant arc", "spin": "spin in place", "straight-line": "straight line, speed varying",
+    "constant-velocity": "constant velocity", "standing": "standing",
+}  # fmt: skip
 IMUS = {"data sheet": 1.0, "ten times noisier": 10.0}
 SECONDS, AZIMUTH_STEPS, PER_IMAGE = 8.0, 300, 30
 FAR = 4.0  # standard deviations
 KNOWN = ("determined", "weak")
+HEADING = "| motion | IMU | converged | determined, largest error | weak, largest error |\n|---|---|---|---|---|"
 
 
 def variant(motion: str, noise: float) -> Scenario:
@@ -105,12 +108,27 @@ def summary(motion: str, imu: str, records: Sequence[Record]) -> dict:
     }
 
 
+def stored() -> dict[tuple[str, str], dict]:
+    """The rows of the docs, by motion and IMU."""
+    return {(r["motion"], r["imu"]): r for r in json.loads(FOUND.read_text())} if FOUND.exists() else {}
+
+
 def store(row: dict) -> None:
-    """The row into the table of the docs, in place of the earlier one of its motion and IMU, if there is one."""
-    rows = {(r["motion"], r["imu"]): r for r in json.loads(FOUND.read_text())} if FOUND.exists() else {}
-    rows[row["motion"], row["imu"]] = row
+    """The row into the docs, in place of the earlier one of its motion and IMU, if there is one."""
+    rows = stored() | {(row["motion"], row["imu"]): row}
     in_order = [rows[k] for k in product(MOTIONS, IMUS) if k in rows]
     write_texts(FOUND.parent, {FOUND.name: json.dumps(in_order, indent=1) + "\n"})
+
+
+def in_words(row: dict) -> str:
+    """The row as one of a Markdown table: how many converged, and the largest error among the numbers of a verdict."""
+
+    def worst(verdict: str) -> str:
+        found = row["errors"].get(verdict)
+        return f"{found['largest']:.1f} of {found['count']}" if found else "none"
+
+    converged = f"{row['runs'] - len(row['failures'])} of {row['runs']}"
+    return f"| {MOTIONS[row['motion']]} | {row['imu']} | {converged} | {worst('determined')} | {worst('weak')} |"
 
 
 def main() -> None:
@@ -128,9 +146,8 @@ def main() -> None:
             scenario = variant(motion, noise)
             digest = scenario_digest(ROOT / "examples" / "paper" / f"{motion}.yaml", scenario) + f" {noise} {size}"
             study = run_study(scenario, name, digest, given.output / name.replace(", ", "-"), plan)
-            row = summary(motion, imu, study.records)
-            store(row)
-            print(json.dumps({k: v for k, v in row.items() if k != "verdicts"}), flush=True)
+            store(summary(motion, imu, study.records))
+    print(HEADING, *(in_words(row) for row in stored().values()), sep="\n")
 
 
 if __name__ == "__main__":
