@@ -46,6 +46,15 @@ def test_noise_never_makes_a_variance_smaller():
     assert said[1] > 1e3
 
 
+def test_what_is_odd_in_noise_hardly_moves_a_variance():
+    """Of two numbers that are known well, but only together, a little that takes off as much as it adds."""
+    known = np.array([[1e6, -1e6 + 1.0], [-1e6 + 1.0, 1e6]])
+    root = np.linalg.cholesky(np.linalg.inv(known))
+    odd = np.linalg.inv(root).T @ (0.01 * np.array([[0.0, 1.0], [1.0, 0.0]])) @ np.linalg.inv(root)
+    said, without = np.diag(_scatter(known, odd, NOTHING)), np.diag(np.linalg.inv(known))
+    assert (said >= without).all() and (said < 1.0101 * without).all()
+
+
 def information(*along: float) -> np.ndarray:
     return DIRECTIONS @ np.diag(along) @ DIRECTIONS.T
 

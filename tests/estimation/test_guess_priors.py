@@ -9,16 +9,20 @@ import numpy as np
 import pytest
 
 from icalib.estimation import estimate as estimates
+from icalib.estimation import solver
 from icalib.estimation.arrowhead import solve
 from icalib.estimation.assembly import given_priors
-from icalib.estimation.estimate import Estimate, estimate
+from icalib.estimation.estimate import Estimate, Judged, estimate
 from icalib.estimation.guess_priors import guess_priors
 from icalib.estimation.inputs import Inputs
+from icalib.estimation.solver import _Descent
 from icalib.estimation.state import State
 from icalib.estimation.tolerances import FROM_NOTHING_M, GUESS_SIGMA
 from icalib.first_guess.start import start
 from icalib.rig import Parameter
 from icalib.simulation import handheld, rig_for, simulate
+
+TURNED = {("cam0", "translation"): np.array([0.05, -0.02, 0.03]), ("cam1", "time_offset"): np.array([2e-3])}
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +66,9 @@ def same_information(found: Estimate) -> None:
 
 @pytest.mark.parametrize("doubtful", [False, True])
 def test_where_they_counted_to_the_end_the_estimate_is_half_way_and_without_them(begun, monkeypatch, doubtful: bool):
-    """Guesses are taken to be good to a hundredth, so that they would be missed."""
+    """Guesses are taken to be good to a hundredth, so that they would be missed. To the last digit: by steps until
+    nothing is left."""
+    monkeypatch.setattr(solver, "SMALL_DECREASE", 0.0)
     monkeypatch.setattr(estimates, "guess_priors", partial(guess_priors, times=1e-2))
     inputs, state = begun
     asked: list[int] = []
@@ -81,6 +87,46 @@ def test_where_they_counted_to_the_end_the_estimate_is_half_way_and_without_them
     assert (asked[-1] == asked[0]) == doubtful
     assert found.outcome.half_way == doubtful
     same_information(found)
+
+
+def test_priors_that_are_let_go_leave_the_step_of_the_problem_without_them(begun):
+    """What is taken off the border's sums is what a solve without the priors does not have."""
+    inputs, state = begun
+    problem = Judged.first(inputs).problem(inputs, state)
+    more = guess_priors(inputs, replace(state, values=state.values | TURNED))
+    led = replace(problem, priors=(*problem.priors, *more))
+    assert led.without(more).priors == problem.priors
+    at = _Descent.begin(led, state, 1e-3, 0.0, lambda _: None)
+    freed = at.let_go(more, at.solution())
+    alone = _Descent.begin(problem, state, 1e-3, 0.0, lambda _: None)
+    expected = alone.solution()
+    assert at.cost == pytest.approx(alone.cost, rel=1e-12)
+    assert freed.decrease == pytest.approx(expected.decrease, rel=1e-9)
+    np.testing.assert_allclose(freed.border, expected.border, rtol=1e-7, atol=1e-12)
+    np.testing.assert_allclose(freed.chain, expected.chain, rtol=1e-6, atol=1e-10)
+    scale = np.sqrt(np.diag(expected.information))
+    np.testing.assert_allclose(
+        freed.information / np.outer(scale, scale), expected.information / np.outer(scale, scale), atol=1e-9
+    )
+
+
+def test_the_last_step_is_taken_with_the_sums_at_hand(begun, monkeypatch):
+    """Letting go of guesses leaves a small step. It ends where more steps would, with one linearisation less, and the
+    information is that of the end."""
+    monkeypatch.setattr(estimates, "guess_priors", partial(guess_priors, times=1e-2))
+    inputs, state = begun
+    short = estimate(inputs, state, guess=state)
+    monkeypatch.setattr(solver, "SMALL_DECREASE", 0.0)
+    long = estimate(inputs, state, guess=state)
+    assert len(short.steps) < len(long.steps)
+    assert short.outcome.converged and short.outcome.cost == pytest.approx(long.outcome.cost, abs=1e-4)
+    sigma = np.sqrt(np.diag(np.linalg.inv(long.outcome.information)))
+    for block in inputs.layout.free:
+        if inputs.is_sensor(block.sensor) and block.kind != "rotation":
+            apart = short.outcome.state.values[block.key] - long.outcome.state.values[block.key]
+            assert np.abs(apart / sigma[block.columns]).max() < 0.01, block.key
+    ratio = np.sqrt(np.diag(np.linalg.inv(short.outcome.information))) / sigma
+    np.testing.assert_allclose(ratio, 1.0, atol=1e-3)
 
 
 def test_while_something_is_held_they_count_and_the_estimate_is_half_way(begun, monkeypatch):

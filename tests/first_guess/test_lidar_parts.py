@@ -14,6 +14,19 @@ from icalib.first_guess.lidar_arm import against_motion, against_readings
 from icalib.first_guess.lidar_map import ScanPose, VoxelMap, insert, moved, sums
 from icalib.first_guess.lidar_motion import ImuMotion, Integrals
 from icalib.first_guess.lidar_odometry import lidar_path, scans_of
+from icalib.first_guess.lidar_registration import (
+    ACCELERATION,
+    ANGULAR_ACCELERATION,
+    GYRO_SIGMA,
+    KNOWN_SIGMA,
+    MOVE_SIGMA,
+    POINT_SIGMA_M,
+    RATE_SIGMA,
+    TURN_SIGMA,
+    Expected,
+    add_expected,
+    expected_pose,
+)
 from icalib.geometry import so3
 
 SCALE = 0.3
@@ -206,3 +219,45 @@ def test_a_path_begins_later_where_its_first_map_leads_nowhere(free_robot):
     assert not path.ok[:3].any() and path.ok[8:].mean() > 0.95
     errors, n = turns_between(free_robot, path, 8, len(path.seconds))
     assert n > 60 and errors.max() < 0.02
+
+
+def expected_rows(e: Expected, pose: ScanPose) -> np.ndarray:
+    """(12,) whitened: how a pose departs from what the scan before says of it, written out."""
+    b, h = e.before, e.step
+    turned = b.rotation.T @ pose.rotation
+    way = b.rotation @ e.way if e.knows_way else b.velocity * h
+    log = Rotation.from_matrix(e.turned.T @ turned if e.knows_turn else turned).as_rotvec()
+    moved = pose.position - b.position
+    return POINT_SIGMA_M * np.concatenate(
+        [
+            log / GYRO_SIGMA if e.knows_turn else (log - 0.5 * h * (b.rate + pose.rate)) / TURN_SIGMA,
+            (moved - way) / KNOWN_SIGMA
+            if e.knows_way
+            else (moved - 0.5 * h * (b.velocity + pose.velocity)) / MOVE_SIGMA,
+            pose.rate / RATE_SIGMA if e.knows_turn else (pose.rate - b.rate) / (ANGULAR_ACCELERATION * h),
+            (pose.velocity - (way / h if e.knows_way else b.velocity)) / (ACCELERATION * h),
+        ]
+    )
+
+
+@pytest.mark.parametrize("knows_way", [False, True])
+@pytest.mark.parametrize("knows_turn", [False, True])
+def test_what_is_expected_of_a_pose_is_in_the_normal_equations(knows_turn: bool, knows_way: bool):
+    rng = np.random.default_rng(3)
+    slow = np.array([1.0, 0.01, 1.0])[:, None]  # turns little: the slope of the logarithm is taken for one
+    before = ScanPose(Rotation.random(random_state=1).as_matrix(), *slow * rng.normal(size=(3, 3)))
+    turned, way = Rotation.from_rotvec([0.03, -0.02, 0.05]).as_matrix(), rng.normal(scale=0.1, size=3)
+    e = Expected.of(before, 0.1, turned if knows_turn else None, way if knows_way else None)
+    predicted = expected_pose(e)
+    np.testing.assert_allclose(expected_rows(e, predicted)[:3], 0.0, atol=1e-9)
+    np.testing.assert_allclose(expected_rows(e, predicted)[9:], 0.0, atol=1e-9)
+    pose = moved(predicted, np.array([1e-5, 2e-5, -1e-5, *rng.normal(scale=0.1, size=9)]))
+    H, g, h = np.zeros((12, 12)), np.zeros(12), 1e-6
+    add_expected(e, pose, H, g)
+    J = np.array(
+        [(expected_rows(e, moved(pose, h * d)) - expected_rows(e, moved(pose, -h * d))) / (2 * h) for d in np.eye(12)]
+    )
+    J, r = J.T, expected_rows(e, pose)
+    scale = np.sqrt(np.diag(J.T @ J))
+    np.testing.assert_allclose(H / np.outer(scale, scale), J.T @ J / np.outer(scale, scale), atol=2e-3)
+    np.testing.assert_allclose(g, J.T @ r, rtol=2e-3, atol=1e-3)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
 from typing import NamedTuple, TypeVar
@@ -176,14 +176,41 @@ class Factors:
 
 @dataclass(frozen=True)
 class Solution:
-    """Step (chain (K, 15), border (B,)), `decrease` of half the chi^2 that the linear model predicts, the
-    `information` (B, B) of the border, the chain marginalised (damping included), and the factors."""
+    """Step (chain (K, 15), border (B,)), `decrease` of half the chi^2 that the linear model predicts, and the factors.
+
+    gradient (B + 1,): of the border, the chain marginalised, and twice what the chain alone takes off half the chi^2.
+    """
 
     chain: np.ndarray
     border: np.ndarray
     decrease: float
-    information: np.ndarray
+    gradient: np.ndarray
     factors: Factors
+
+    @classmethod
+    def of(cls, factors: Factors, gradient: np.ndarray) -> Solution:
+        """The step, where the border's information and `gradient` (B + 1,) are known."""
+        border, decrease = border_step(factors.information, gradient[:-1], factors.tolerance, factors.held)
+        white = [np.zeros((n, 1)) for n in factors.rows()]
+        chain = factors.back(np.append(border, 1.0)[:, None], white)[:, :, 0]
+        return cls(np.ascontiguousarray(chain), border, decrease - 0.5 * float(gradient[-1]), gradient, factors)
+
+    @property
+    def information(self) -> np.ndarray:
+        """(B, B) of the border, the chain marginalised (damping included)."""
+        return self.factors.information
+
+    @property
+    def least(self) -> float:
+        """The least information, in tolerance units, on any direction of the border."""
+        t = self.factors.tolerance
+        return float(np.linalg.eigvalsh(t[:, None] * self.information * t).min(initial=np.inf))
+
+    def less(self, information: np.ndarray, gradient: np.ndarray) -> Solution:
+        """Without what has this information (B, B) and gradient (B,) on the border, before the pieces are filled
+        anew."""
+        factors = replace(self.factors, information=self.information - information)
+        return Solution.of(factors, self.gradient - np.append(gradient, 0.0))
 
 
 BROKEN_DOWN = (
@@ -321,12 +348,17 @@ def complement(held: np.ndarray, n: int) -> np.ndarray:
     return full[:, held.shape[1] :]
 
 
-def restricted_inverse(information: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """(B, B) inverse of the information within the directions that are not held, both in tolerance units."""
+def restricted_root(information: np.ndarray, held: np.ndarray) -> np.ndarray:
+    """(B, n) whose product with its transpose is the `restricted_inverse`."""
     free = complement(held, len(information))
     values, vectors = np.linalg.eigh(free.T @ information @ free)
-    basis = free @ vectors
-    return (basis / np.maximum(values, LEAST)) @ basis.T
+    return free @ vectors / np.sqrt(np.maximum(values, LEAST))
+
+
+def restricted_inverse(information: np.ndarray, held: np.ndarray) -> np.ndarray:
+    """(B, B) inverse of the information within the directions that are not held, both in tolerance units."""
+    root = restricted_root(information, held)
+    return root @ root.T
 
 
 def _border_draws(information: np.ndarray, tolerance: np.ndarray, held: np.ndarray, white: np.ndarray) -> np.ndarray:
@@ -380,8 +412,4 @@ def solve(
         rest -= shared_side.T @ shared_side
     information = rest[:n_border, :n_border]
     factors = Factors(pieces, done, n_nodes, shared, shared_side, information, tolerance, held)
-    border, decrease = border_step(information, rest[:n_border, n_border], tolerance, held)
-    chain = factors.back(np.append(border, 1.0)[:, None], [np.zeros((n, 1)) for n in factors.rows()])[:, :, 0]
-    return Solution(
-        np.ascontiguousarray(chain), border, decrease - 0.5 * float(rest[n_border, n_border]), information, factors
-    )
+    return Solution.of(factors, rest[:, n_border])

@@ -28,6 +28,8 @@ from icalib.estimation.solver import Outcome, posterior
 from icalib.estimation.state import State
 
 CLEAR = 10.0  # information in tolerance units: where all is known to a third of a tolerance, one pair will do
+DETERMINED, NEGLIGIBLE = 1.0, 0.01  # in the same units; of it: where all is determined, and one side shows less noise
+# than this, what is odd in it included, the other need not be looked at
 SLIGHT = 0.05  # of the information: where one pair finds less noise than this, it will do, too
 FEW = 3  # draws at first
 SURE = 0.999  # probability that noise adds no more than is allowed for
@@ -66,11 +68,14 @@ def spurious_information(
     rng = np.random.default_rng(0)
     t = problem.tolerance
     scaled = t[:, None] * outcome.information * t
-    clear = np.linalg.eigvalsh(scaled).min(initial=np.inf) > CLEAR
+    least = np.linalg.eigvalsh(scaled).min(initial=np.inf)
     samples = (outcome.draws or posterior(problem, outcome.state)).still
     noise, first = _Noise(problem, outcome, problem.room()), _reading_noise(problem.chain.imu, rng)
-    found = noise.added(samples[0].chain, first)
-    if clear or _largest_share(t[:, None] * found * t, scaled) < SLIGHT:
+    one_side = noise.there(1.0, samples[0].chain, first)
+    if least > DETERMINED and _largest_share(t[:, None] * one_side * t, scaled) < NEGLIGIBLE:
+        return Spurious(one_side[None])
+    found = 0.5 * (one_side + noise.there(-1.0, samples[0].chain, first))
+    if least > CLEAR or _largest_share(t[:, None] * found * t, scaled) < SLIGHT:
         return Spurious(found[None])
     each: list[np.ndarray] = []
     for some in (samples[1 : 1 + FEW], samples[1 + FEW :]):
@@ -90,13 +95,14 @@ class _Noise:
 
     def added(self, chain: np.ndarray, readings: np.ndarray | None) -> np.ndarray:
         """(B, B) on average, where the trajectory is off by +-chain (K, 15), and the readings by as often that."""
-        state, n = self.outcome.state, np.zeros(self.problem.layout.size)
-        pair = []
-        for sign in (1.0, -1.0):
-            there = state.retract(self.problem.layout, sign * chain, n)
-            noisy = self.problem if readings is None else _with_noise(self.problem, there, sign * readings)
-            pair.append(_information(noisy, there, self.room))
-        return np.mean(pair, axis=0) - self.outcome.information
+        return 0.5 * (self.there(1.0, chain, readings) + self.there(-1.0, chain, readings))
+
+    def there(self, sign: float, chain: np.ndarray, readings: np.ndarray | None) -> np.ndarray:
+        """(B, B), where the trajectory is off by `sign` times chain (K, 15), and the readings by as often that: noise,
+        and what is odd in it."""
+        there = self.outcome.state.retract(self.problem.layout, sign * chain, np.zeros(self.problem.layout.size))
+        noisy = self.problem if readings is None else _with_noise(self.problem, there, sign * readings)
+        return _information(noisy, there, self.room) - self.outcome.information
 
     def followed(self, chain: np.ndarray, readings: np.ndarray) -> np.ndarray:
         """(B, B), where the trajectory follows noise of the `readings` beside a draw `chain` (K, 15) of its posterior,

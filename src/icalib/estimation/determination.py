@@ -22,7 +22,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, eigh
 
 from icalib.errors import EstimationError
-from icalib.estimation.arrowhead import HELD_BELOW, restricted_inverse
+from icalib.estimation.arrowhead import HELD_BELOW, restricted_root
 from icalib.estimation.assembly import given_priors
 from icalib.estimation.debias import Spurious, spurious_information
 from icalib.estimation.estimate import EARLY_DECREASE, EARLY_SHARE, Estimate, OnVisit, estimate
@@ -74,10 +74,10 @@ def _scatter(known: np.ndarray, noise: np.ndarray, held: np.ndarray) -> np.ndarr
     """(B, B) covariance where J^T J is `known` + `noise`: J^T r scatters by all of it, but only what is known of it
     leads back (errors in variables; Fuller, Measurement Error Models, 1987, chapter 1). Noise only adds: where its few
     draws say otherwise, or curvature left less than nothing known, the variance is no less than without it."""
-    inverse = restricted_inverse(known, held)
-    values, vectors = eigh(noise)
-    more = inverse @ vectors * np.sqrt(np.maximum(values, 0.0))
-    return inverse + more @ more.T
+    whitened = restricted_root(known, held)
+    values, vectors = eigh(whitened.T @ noise @ whitened)
+    root = whitened @ vectors * np.sqrt(1.0 + np.maximum(values, 0.0))
+    return root @ root.T
 
 
 def determine(

@@ -174,11 +174,14 @@ class _Passes:
         def leaves(way: float, information: np.ndarray) -> bool:
             return bool(self.about) or self.doubtful(problem, information) or _is_far(way, way_before)
 
-        outcome = minimise(problem, self.state, told.step, on_visit=told.visit, leaves=leaves)
+        def lets_go(way: float, information: np.ndarray) -> tuple[Prior, ...]:
+            return () if _is_far(way, way_before) else self._let_go(self.doubtful(problem, information))
+
+        outcome = minimise(problem, self.state, told.step, on_visit=told.visit, leaves=leaves, lets_go=lets_go)
         is_open = self.doubtful(problem, told.information)
         way, gone = way_come(outcome.steps, outcome.cost), self._let_go(is_open)
         if gone and not _is_far(way, way_before):
-            rest = minimise(_fewer_priors(outcome.problem, gone), outcome.state, told.step, on_visit=told.visit)
+            rest = minimise(outcome.problem.without(gone), outcome.state, told.step, on_visit=told.visit)
             outcome = replace(rest, steps=(*outcome.steps, *rest.steps))
             way = way_come(outcome.steps, outcome.cost)
         return outcome, np.inf if is_open and outcome.half_way else way
@@ -220,10 +223,6 @@ def _with_priors(problem: Problem, more: Sequence[Prior]) -> Problem:
     return replace(problem, priors=(*problem.priors, *more))
 
 
-def _fewer_priors(problem: Problem, less: Sequence[Prior]) -> Problem:
-    return replace(problem, priors=problem.priors[: -len(less)])
-
-
 def _without_priors(outcome: Outcome, more: Sequence[Prior]) -> Outcome:
     """The outcome of a problem with `more` priors as one of the problem without, of which it is no more than half-way
     to the end."""
@@ -231,7 +230,7 @@ def _without_priors(outcome: Outcome, more: Sequence[Prior]) -> Outcome:
         return outcome
     return replace(
         outcome,
-        problem=_fewer_priors(outcome.problem, more),
+        problem=outcome.problem.without(more),
         information=without_priors(outcome.information, more, outcome.state),
         half_way=outcome.half_way or outcome.converged,
     )

@@ -42,6 +42,13 @@ class Prior:
         return 0.5 * float(r @ r)
 
 
+def sums_of_priors(priors: Sequence[Prior], state: State, n_border: int) -> tuple[float, np.ndarray, np.ndarray]:
+    """Half the chi^2 of `priors`, and their gradient (B,) and information (B, B) on the border."""
+    piece = Piece.zeros(0, 0, n_border)
+    cost = sum(p.accumulate(state, piece) for p in priors)
+    return cost, piece.border[:-1, -1], piece.border[:-1, :-1]
+
+
 def without_priors(information: np.ndarray, priors: Sequence[Prior], state: State) -> np.ndarray:
     """(B, B) the border's information at `state` less that of `priors`."""
     bare = information.copy()

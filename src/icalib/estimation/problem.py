@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Protocol
 
@@ -93,6 +93,11 @@ class Problem:
     def with_features(self, piece: Piece, keep: bool = False) -> Piece:
         """The piece with room for the features seen from its nodes; `keep`: another piece shares a node with it."""
         return piece if self.features is None else self.features.attach(piece, keep)
+
+    def without(self, priors: Sequence[Prior]) -> Problem:
+        """The same problem, in which `priors` of it count no more."""
+        gone = {id(p) for p in priors}
+        return replace(self, priors=tuple(p for p in self.priors if id(p) not in gone))
 
     def cut(self, state: State, nodes: np.ndarray) -> Problem:
         """The same problem, in which features end at `nodes`, so that pieces between these can stand alone."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation.arrowhead import NOTHING, Draw, NotDefiniteError, Piece, Solution, solve
+from icalib.estimation.prior_factor import Prior, sums_of_priors
 from icalib.estimation.problem import Problem, Residuals
 from icalib.estimation.state import State
 
@@ -28,6 +29,8 @@ FREE_DRAWS, STILL_DRAWS = 2, 3  # from the posterior, for what is made of the ou
 MORE_STILL = 5  # for where these leave doubt; drawn later, so that the first stay what they are
 FIRST_DAMPING = 1e-8
 ZERO_DAMPING = 1e-10  # below this, none: the weak information of a planar drive must not be swamped
+SMALL_DECREASE = 0.02  # of half the chi^2: a step of a fifth of a standard deviation, all parameters together
+CLEAR = 1.0  # information in tolerance units: all is determined
 LEAST_DECREASE = 2e-5  # of half the chi^2: a step of 0.006 standard deviations, not worth a relinearisation
 
 
@@ -169,6 +172,31 @@ class _Descent:
         counts = min(ROUNDING * self.cost, LEAST_DECREASE)
         return not self.early and self.care.curved and self.free and solution.decrease < counts
 
+    def let_go(self, priors: Sequence[Prior], solution: Solution) -> Solution:
+        """The solution where `priors` count no more: what they add to the border is known, so nothing is solved."""
+        cost, gradient, information = sums_of_priors(priors, self.state, self.problem.layout.size)
+        self.problem, self.cost = self.problem.without(priors), self.cost - cost
+        return solution.less(information, gradient)
+
+    def last_step(self, solution: Solution) -> float | None:
+        """Takes a step after which nothing that counts is left, as steps become less and less, and says how much; None
+        where it is no such step. The sums at hand, of where it began, are those of the end for all but the last digits,
+        so none is taken where something is known so badly that these count."""
+        if self.early or not (self.care.curved and self.free and self.steps) or self.problem.held.size:
+            return None
+        before, now = self.steps[-1], solution.decrease
+        left = now * now / before.predicted_decrease if before.accepted else np.inf
+        if not (left < LEAST_DECREASE and now < SMALL_DECREASE and solution.least > CLEAR):
+            return None
+        there = self.state.retract(self.problem.layout, solution.chain, solution.border)
+        cost = self._linearise(there, sums=False, curved=True)
+        if not cost - self.cost < ROUNDING * self.cost:
+            self.cost = self._linearise(self.state, curved=True)
+            return None
+        self.note(solution, True)
+        self.state, self.cost, self.problem = there, cost, self.problem.settled(self.residuals)
+        return left
+
     def note(self, solution: Solution, taken: bool) -> None:
         """Keeps a record of a step."""
         self.steps.append(Step(self.cost, solution.decrease, self.care.damping, taken))
@@ -218,9 +246,10 @@ class _Descent:
         on_visit(Visit(self.state, solution.information))
         return self.outcome(solution)
 
-    def outcome(self, end: Solution) -> Outcome:
-        """With what was solved here."""
-        return _outcome(self.problem, self.state, self.cost, self.residuals, end.decrease, self.steps, end)
+    def outcome(self, end: Solution, left: float | None = None) -> Outcome:
+        """With what was solved here, or where this is the end of the last step, which leaves so much."""
+        left = end.decrease if left is None else left
+        return _outcome(self.problem, self.state, self.cost, self.residuals, left, self.steps, end)
 
     def _shortened(self, solution: Solution, state: State, cost: float, curved: bool) -> tuple[State, float]:
         """Of a step to `state`, at `cost`, that overshoots, about half, to where a parabola has its least; and what
@@ -275,6 +304,7 @@ def minimise(
     share: float = ROUNDING,
     comes_back: bool = True,
     leaves: Callable[[float, np.ndarray], bool] | None = None,
+    lets_go: Callable[[float, np.ndarray], Sequence[Prior]] = lambda *_: (),
 ) -> Outcome:
     """Minimises `problem` from `state` until half the chi^2 can fall by less than `tolerance`, or this share of it.
 
@@ -282,7 +312,8 @@ def minimise(
     another pass follows, and the end is not linearised once more: the outcome has no information and no draws.
     `comes_back`: steps may go as far as the next ones can make good, see `_Descent`. `leaves`: asked with
     how far it has come, as a share of half the chi^2, and the border's information (B, B), whether to end when half the
-    chi^2 can fall by less than HALF_WAY, or a step not far from there fails.
+    chi^2 can fall by less than HALF_WAY, or a step not far from there fails. `lets_go`: asked before it, with the same,
+    which priors are to count no more from where half the chi^2 can fall by less than HALF_WAY.
 
     Raises EstimationError if no step can be computed at all.
     """
@@ -290,6 +321,9 @@ def minimise(
     for _ in range(MAX_ITERATIONS):
         solution = at.solution()
         on_visit(Visit(at.state, solution.information))
+        if at.free and solution.decrease < HALF_WAY:
+            gone = lets_go(way_come(at.steps, at.cost), solution.information)
+            solution = at.let_go(gone, solution) if gone else solution
         low = at.free and solution.decrease < RESTING * HALF_WAY
         asked = low and leaves is not None and leaves(way_come(at.steps, at.cost), solution.information)
         if asked and solution.decrease < HALF_WAY:
@@ -297,6 +331,8 @@ def minimise(
         if at.has_ended(solution):
             at.note(solution, True)
             return at.outcome(solution)
+        if (left := at.last_step(solution)) is not None:
+            return at.outcome(solution, left)
         taken, converged = at.step(solution, comes_back)
         if converged:
             break

@@ -17,9 +17,10 @@ import numpy as np
 from numba import njit
 
 from icalib.geometry import so3
-from icalib.geometry.small import eigen3
+from icalib.geometry.small import eigen3, mul3
 
 UNKNOWNS = 12  # of a scan: turn, position, rate, velocity
+PRODUCTS = 27  # of a point: upper triangle of its derivatives by the pose with one another, and with its distance
 MOMENTS = 9  # x; y; z; xx; yx, yy; zx, zy, zz about the voxel's middle
 FEWEST = 6  # points of a voxel
 ACROSS = 0.06  # of a voxel's edge: what spreads less in its own plane is a line
@@ -155,7 +156,7 @@ def _fit(voxels, v):
         voxels.normal[v, i] = axes[i, 0]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _voxel_at(voxels, y, around):
     """The flat voxel that y falls into, or with `around` of the 27 there the one with the nearest centre; -1: none."""
     i0, j0, k0 = _index(y[0], voxels), _index(y[1], voxels), _index(y[2], voxels)
@@ -178,25 +179,32 @@ def _voxel_at(voxels, y, around):
 
 
 @njit(cache=True, nogil=True)
-def _derivatives(R, normal, y, tau, J):
-    """J (12,) of a distance; n . (-R [z]x d) = d . (z x R^T n)."""
+def _derivatives(R, normal, y, J):
+    """J (6,) of a distance by turn and position; n . (-R [z]x d) = d . (z x R^T n)."""
     b0 = R[0, 0] * normal[0] + R[1, 0] * normal[1] + R[2, 0] * normal[2]
     b1 = R[0, 1] * normal[0] + R[1, 1] * normal[1] + R[2, 1] * normal[2]
     b2 = R[0, 2] * normal[0] + R[1, 2] * normal[1] + R[2, 2] * normal[2]
     J[0], J[1], J[2] = y[4] * b2 - y[5] * b1, y[5] * b0 - y[3] * b2, y[3] * b1 - y[4] * b0
     for a in range(3):
         J[3 + a] = normal[a]
-    for a in range(6):
-        J[6 + a] = tau * J[a]
+
+
+@njit(cache=True, nogil=True)
+def _add_products(product, tau, by_0, by_1, by_2):
+    """A loop that the compiler makes a few instructions of."""
+    for k in range(PRODUCTS):
+        by_0[k] += product[k]
+        by_1[k] += tau * product[k]
+        by_2[k] += tau * tau * product[k]
 
 
 @njit(cache=True, nogil=True)
 def sums(voxels, pose, xyz, tau, around, scale, H, g):
     """Fills the normal equations H (12, 12), g (12,) of the scan's distances [m] from the map, Geman and McClure's
     weights of `scale` m. Returns how many points met a plane, and how many of these are near it."""
-    y, J, met, near = np.empty(6), np.empty(UNKNOWNS), 0, 0
-    H[:] = 0.0
-    g[:] = 0.0
+    y, J, met, near = np.empty(6), np.empty(7), 0, 0
+    # Derivatives by rates are tau times those by the pose: sums of (J, r) J by 1, tau and tau^2, upper triangles.
+    product, by_0, by_1, by_2 = np.empty(PRODUCTS), np.zeros(PRODUCTS), np.zeros(PRODUCTS), np.zeros(PRODUCTS)
     for n in range(len(xyz)):
         place_point(pose, xyz[n, 0], xyz[n, 1], xyz[n, 2], tau[n], y)
         v = _voxel_at(voxels, y, around)
@@ -207,15 +215,24 @@ def sums(voxels, pose, xyz, tau, around, scale, H, g):
             r += normal[a] * (y[a] - voxels.centre[v, a])
         met += 1
         near += abs(r) < NEAR * voxels.edge_m
-        w = 1.0 / (1.0 + (r / scale) ** 2) ** 2
-        _derivatives(pose.rotation, normal, y, tau[n], J)
-        for a in range(UNKNOWNS):
-            g[a] += w * r * J[a]
-            for b in range(a + 1):
-                H[a, b] += w * J[a] * J[b]
-    for a in range(UNKNOWNS):
-        for b in range(a):
-            H[b, a] = H[a, b]
+        root = 1.0 + (r / scale) ** 2
+        _derivatives(pose.rotation, normal, y, J)
+        J[6] = r
+        k = 0
+        for a in range(6):
+            w = J[a] / (root * root)
+            for b in range(a, 7):
+                product[k] = w * J[b]
+                k += 1
+        _add_products(product, tau[n], by_0, by_1, by_2)
+    k = 0
+    for a in range(6):
+        for b in range(a, 6):
+            for i, j in ((a, b), (b, a)):
+                H[i, j], H[6 + i, j], H[i, 6 + j], H[6 + i, 6 + j] = by_0[k], by_1[k], by_1[k], by_2[k]
+            k += 1
+        g[a], g[6 + a] = by_0[k], by_1[k]
+        k += 1
     return met, near
 
 
@@ -228,7 +245,8 @@ def turn_back(xyz, which, turns):
             xyz[n, a] = R[a, 0] * x + R[a, 1] * y + R[a, 2] * z
 
 
-def moved(pose: ScanPose, d: np.ndarray) -> ScanPose:
+@njit(cache=True, nogil=True)
+def moved(pose, d):
     """The pose corrected by d (12,)."""
-    R = pose.rotation @ so3.exp(d[:3].copy())
+    R = mul3(pose.rotation, so3.exp(d[:3]))
     return ScanPose(R, pose.position + d[3:6], pose.rate + d[6:9], pose.velocity + d[9:])

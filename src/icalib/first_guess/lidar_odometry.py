@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.first_guess.lidar_map import UNKNOWNS, ScanPose, VoxelMap, insert, moved, sums, turn_back
-from icalib.geometry import so3
+from icalib.first_guess.lidar_map import ScanPose, VoxelMap, insert, turn_back
+from icalib.first_guess.lidar_registration import Expected, expected_pose, register
 from icalib.measurements import LidarStream
 
 MOST_MATCHED, MOST_MAPPED = 1500, 6000  # points of a scan
@@ -26,22 +26,12 @@ NEAREST_M = 0.3  # nearer than this is the LiDAR's own housing
 VOXELS_IN_REACH = 8.0  # edges in the median range
 EDGES_M = (0.3, 2.0)
 CAPACITY = 1 << 17
-ROUNDS = 14
-WIDE_ROUNDS = 4  # that look into voxels around
-SCALE = 0.5  # of an edge: of the weights in the first round
 LAST_SCALE, LAST_SCALE_TURNED = 0.2, 0.1
-POINT_SIGMA_M = 0.1  # of a point against what is expected of the motion: points of one plane err together
 MOST_LOST = 5  # scans in a row that do not fit the map, before there is another
 FEW = 10  # scans on a map that is no loss: its first scan may show too little of what the next ones see
 LEAST_NEAR = 0.3  # of a scan's points must lie on the map's planes
 FIRST_ROUNDS = 4  # to find how the LiDAR moved in its first scan, which makes the map
 KEEP, KEEP_TURNED = 0.85, 0.995  # of what a voxel holds, by the scan
-# What a motion may do between scans: change its rates (rad/s^2, m/s^2), and depart from their means (rad, m).
-ANGULAR_ACCELERATION, ACCELERATION = 6.0, 5.0
-TURN_SIGMA, MOVE_SIGMA = 0.02, 0.02
-# Where the gyroscope turns the points: its bias and the alignment may err by this much (rad/s, rad).
-RATE_SIGMA, GYRO_SIGMA = 0.01, 0.004
-KNOWN_SIGMA = 0.03  # m, of a known way between scans: what a lever arm that is not known makes of it
 TURN_STEP_S = 1e-3  # of the gyroscope's turns within a scan
 LONGEST_STEP_S = 1.0
 
@@ -110,6 +100,8 @@ def _scan_of(stream: LidarStream, i: int) -> Scan:
         return Scan(float(stream.seconds[i]), np.empty((0, 3)), np.empty(0))
     middle = 0.5 * (float(offset.min()) + float(offset.max()))
     chosen = spread(len(offset), MOST_MAPPED, i)
+    for part in np.split(chosen, (MOST_WIDE, MOST_MATCHED)):
+        part.sort()  # one after the other they mostly fall into the same voxels, which are at hand then
     points = xyz[chosen].astype(np.float64)
     size2 = (points**2).sum(axis=1)
     good = np.isfinite(size2) & (size2 > NEAREST_M**2)
@@ -156,10 +148,10 @@ def _follow(scans: list[Scan], known: _Known, edge_m: float, whole: bool) -> tup
     """Poses, and whether each fits its map; see `lidar_path`."""
     fits = np.ones(len(scans), dtype=bool)
 
-    def register(k: int, before: ScanPose, scale: float) -> ScanPose:
+    def place(k: int, before: ScanPose, scale: float) -> ScanPose:
         step = scans[k].middle - scans[k - 1].middle
         turned, way = (None if x is None else x[k] for x in (known.turned, known.way))
-        expected = _Expected(before, min(step, LONGEST_STEP_S), turned, way)
+        expected = Expected.of(before, min(step, LONGEST_STEP_S), turned, way)
         pose, fits[k] = _register(voxels, scans[k], expected, scale)
         return pose
 
@@ -169,7 +161,7 @@ def _follow(scans: list[Scan], known: _Known, edge_m: float, whole: bool) -> tup
         for _ in range(FIRST_ROUNDS):
             voxels.clear()
             insert(voxels, pose, scans[k].xyz, scans[k].tau, k, 1.0)
-            after = register(k + 1, pose, LAST_SCALE)
+            after = place(k + 1, pose, LAST_SCALE)
             pose = still._replace(rate=after.rate, velocity=after.velocity)
         return pose
 
@@ -179,7 +171,7 @@ def _follow(scans: list[Scan], known: _Known, edge_m: float, whole: bool) -> tup
     poses, lost = [begin(0)], 0
     apart, again = np.zeros(len(scans), dtype=bool), -np.inf
     for k in range(1, len(scans)):
-        pose = register(k, poses[-1], last)
+        pose = place(k, poses[-1], last)
         lost = 0 if fits[k] else lost + 1
         if lost == MOST_LOST and k + 1 < len(scans) and not (whole and np.count_nonzero((fits & ~apart)[:k]) > FEW):
             if whole:
@@ -194,63 +186,8 @@ def _follow(scans: list[Scan], known: _Known, edge_m: float, whole: bool) -> tup
     return poses, fits & ~apart
 
 
-@dataclass(frozen=True)
-class _Expected:
-    """What the scan before says of a pose: `before` it by `step` s; `turned` (3, 3) and `way` (3,) since, in the axes
-    of the one before, where they are known."""
-
-    before: ScanPose
-    step: float
-    turned: np.ndarray | None
-    way: np.ndarray | None
-
-    @property
-    def pose(self) -> ScanPose:
-        b = self.before
-        turned = so3.exp(b.rate * self.step) if self.turned is None else self.turned
-        way = b.velocity * self.step if self.way is None else b.rotation @ self.way
-        return ScanPose(b.rotation @ turned, b.position + way, b.rate, way / self.step)
-
-    def add(self, pose: ScanPose, H: np.ndarray, g: np.ndarray) -> None:
-        """Adds to the normal equations that rates change little, and poses by the mean of the rates around them."""
-        b, h = self.before, self.step
-        J, r, sigma = np.zeros((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS), np.empty(UNKNOWNS)
-        J[range(UNKNOWNS), range(UNKNOWNS)] = 1.0
-        if self.turned is None:
-            turn = so3.log(np.ascontiguousarray(b.rotation.T @ pose.rotation))
-            r[:3] = turn - 0.5 * h * (b.rate + pose.rate)
-            J[:3, 6:9] = -0.5 * h * np.eye(3)
-            r[6:9] = pose.rate - b.rate
-            sigma[:3], sigma[6:9] = TURN_SIGMA, ANGULAR_ACCELERATION * h
-        else:
-            r[:3] = so3.log(np.ascontiguousarray((b.rotation @ self.turned).T @ pose.rotation))
-            r[6:9] = pose.rate
-            sigma[:3], sigma[6:9] = GYRO_SIGMA, RATE_SIGMA
-        if self.way is None:
-            r[3:6] = pose.position - b.position - 0.5 * h * (b.velocity + pose.velocity)
-            J[3:6, 9:] = -0.5 * h * np.eye(3)
-            r[9:] = pose.velocity - b.velocity
-        else:
-            r[3:6] = pose.position - b.position - b.rotation @ self.way
-            r[9:] = pose.velocity - b.rotation @ self.way / h
-        sigma[3:6], sigma[9:] = MOVE_SIGMA if self.way is None else KNOWN_SIGMA, ACCELERATION * h
-        W = J / sigma[:, None] * POINT_SIGMA_M
-        H += W.T @ W
-        g += W.T @ (r / sigma * POINT_SIGMA_M)
-
-
-def _register(voxels: VoxelMap, scan: Scan, expected: _Expected, last: float) -> tuple[ScanPose, bool]:
+def _register(voxels: VoxelMap, scan: Scan, expected: Expected, last: float) -> tuple[ScanPose, bool]:
     """The scan's pose, and whether it fits the map."""
     xyz, tau = scan.xyz[:MOST_MATCHED], scan.tau[:MOST_MATCHED]
-    H, g, pose, near = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS), expected.pose, 0
-    for k in range(ROUNDS):
-        share, wide = min(k / (WIDE_ROUNDS + 1.0), 1.0), k < WIDE_ROUNDS
-        own = slice(MOST_WIDE if wide else MOST_MATCHED)
-        scale = voxels.edge_m * SCALE ** (1.0 - share) * last**share
-        _, near = sums(voxels, pose, xyz[own], tau[own], int(wide), scale, H, g)
-        expected.add(pose, H, g)
-        d = -np.linalg.solve(H, g)
-        pose = moved(pose, d)
-        if share == 1.0 and np.abs(d[:6]).max() < 1e-4:
-            break
-    return (pose, True) if near > LEAST_NEAR * len(tau) else (expected.pose, False)
+    pose, near = register(voxels, xyz, tau, MOST_WIDE, expected, last)
+    return (pose, True) if near > LEAST_NEAR * len(tau) else (expected_pose(expected), False)

@@ -39,9 +39,9 @@ LENS_STEP = 1e-3  # of a direction
 BENDS = 2.0  # standard deviations, from where on a ray counts less
 ANGLES = 24  # about the axis that the robot turns about most
 FOLLOWED = 4  # starts
-EVERY = 6  # of the pairs that say which start is best
+EVERY = 6  # every so many of the pairs say which start is best
 ENOUGH = 1e-4  # of the cost, by which a step still lowers it
-ROUNDS = 3  # of taking motion and lens anew, where they have come to
+ROUNDS = (3, 3, 1)  # every so many do in rounds of taking motion and lens anew, where they have come to
 MOST_RAYS = 0.75  # of which LARGEST_MISS is asked: points that were followed wrongly are fewer
 LARGEST_MISS = 0.01  # rad
 LARGEST_SIGMA = np.deg2rad(5.0)  # of the rotation, beyond which it is not shown
@@ -67,9 +67,9 @@ class Mount:
 
 @dataclass(frozen=True)
 class Followed:
-    """What one camera followed: pairs of images at times (m, 2) on its clock, and the observations (n, 2) of points
-    that they share, those of pair k at begin[k]..begin[k + 1]. lens (P,): a guess of its intrinsics and distortion;
-    bends (L, P): directions in which it is open, each as long as it may be off."""
+    """What one camera followed: pairs of images at times (m, 2) on its clock, and which of the observations uv (o, 2)
+    are of points that they share, (n, 2), those of pair k at begin[k]..begin[k + 1]. lens (P,): a guess of its
+    intrinsics and distortion; bends (L, P): directions in which it is open, each as long as it may be off."""
 
     name: str
     model: CameraModel
@@ -95,26 +95,29 @@ class Followed:
         shared = [np.stack([p, q], axis=1) for _, _, p, q in pairs]
         begin = np.cumsum([0, *(len(x) for x in shared)])
         bends = [LENS_SIGMA * d / _effect(model, lens, d, stream.uv) for d in directions]
-        return cls(
-            stream.name,
-            model,
-            stream.uv,
-            times,
-            np.concatenate(shared),
-            begin,
-            lens,
-            np.reshape(bends, directions.shape),
-        )
+        uv, used = _used(stream.uv, np.concatenate(shared))
+        return cls(stream.name, model, uv, times, used, begin, lens, np.reshape(bends, directions.shape))
 
     def lens_of(self, mount: Mount) -> np.ndarray:
         """(P,)"""
         return self.lens + mount.bent @ self.bends
 
+    def every(self, n: int) -> Followed:
+        """One of `n` pairs."""
+        return self.some(np.arange(len(self.times)) % n == 0)
+
     def some(self, kept: np.ndarray) -> Followed:
         """The pairs `kept` (m,) bool."""
         count = np.diff(self.begin)
         begin = np.cumsum([0, *count[kept]])
-        return replace(self, times=self.times[kept], shared=self.shared[np.repeat(kept, count)], begin=begin)
+        uv, shared = _used(self.uv, self.shared[np.repeat(kept, count)])
+        return replace(self, uv=uv, times=self.times[kept], shared=shared, begin=begin)
+
+
+def _used(uv: np.ndarray, shared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Those of uv that `shared` names, and what it calls them then: rays of others need not be found."""
+    used, renamed = np.unique(shared, return_inverse=True)
+    return uv[used], renamed.reshape(shared.shape)
 
 
 def _effect(model: CameraModel, lens: np.ndarray, direction: np.ndarray, uv: np.ndarray) -> float:
@@ -251,7 +254,7 @@ def place_on_motion(
     """
     angles = np.linspace(0.0, 2.0 * np.pi, ANGLES, endpoint=False)
     turns = [np.eye(3)] if axis is None else [so3.exp(a * axis) for a in angles]
-    some = followed.some(np.arange(len(followed.times)) % EVERY == 0)
+    some = followed.every(EVERY)
     least = LEAST_SEEN * _in_common(some, motion) * len(some.times)
     once = [s for s in (_Seen.of(some, motion, start) for start in starts) if len(s.followed.times) > least]
     seen = [replace(s, at=replace(s.at, rotation=T @ s.at.rotation)) for s in once for T in turns]
@@ -263,8 +266,8 @@ def place_on_motion(
     best = sorted(seen, key=_cost)[:FOLLOWED]
     found = [(*s.sought(held), len(s.f)) for s in best]
     mount, result, _ = min(found, key=lambda x: x[1].cost / x[2])  # not all see the same rays
-    for _ in range(ROUNDS):
-        mount, result = _Seen.of(followed, motion, mount).sought(held)
+    for every in ROUNDS:
+        mount, result = _Seen.of(followed.every(every), motion, mount).sought(held)
     _check(_Seen.of(followed, motion, mount), result, held)
     return mount
 

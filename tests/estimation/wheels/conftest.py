@@ -262,7 +262,8 @@ class DriveProblem:
 
     def linearise(self, state, pieces, out, sums=True, curved=False):
         def add(piece):
-            piece.clear()
+            if sums:
+                piece.clear()
             cost = self.imu.accumulate(state, piece, out[0], sums) + self.poses.accumulate(state, piece, sums)
             cost += self.wheels.accumulate(state, piece, out[1], sums, curved)
             cost += self.imu.accumulate_bias_prior(state, piece, sums)
