@@ -15,8 +15,9 @@ from icalib.estimation.imu_data import ImuData
 from icalib.estimation.inputs import inputs_for
 from icalib.estimation.state import State
 from icalib.first_guess.by_recording import one_after_another
-from icalib.first_guess.track_mount import NEAREST_M, _misses
+from icalib.first_guess.track_mount import NEAREST_M, _misses, _slopes
 from icalib.first_guess.tracks_on_motion import track_camera_values
+from icalib.geometry.cameras import camera_model
 from icalib.rig import Parameter
 from icalib.simulation import Drive, load_scenario, rig_for, simulate, with_drawn_guess
 
@@ -204,3 +205,22 @@ def test_a_bent_lens_moves_rays_along_their_slopes():
     _misses(f, h, f_by, h_by, bent, begin, R, b, once)
     _misses(f + np.tensordot(bent, f_by, 1), h + np.tensordot(bent, h_by, 1), *STIFF, begin, R, b, other)
     np.testing.assert_allclose(once, other, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "distortion"),
+    [("pinhole-radtan", [-0.28, 0.07, 2e-4, -1e-4]), ("pinhole-equidistant", [-0.01, 0.02, -0.01, 3e-3])],
+)
+def test_slopes_of_rays_are_those_of_the_rays_of_another_lens(name: str, distortion: list[float]):
+    """The last pixel is one that was not seen."""
+    model, lens = camera_model(name), np.array([458.0, 457.0, 367.0, 248.0, *distortion])
+    rng, directions, h = np.random.default_rng(0), np.zeros((2, 8)), 1e-5
+    directions[0, :2], directions[1, 4] = lens[:2], 0.3
+    uv = np.vstack([rng.uniform([100, 60], [640, 430], (200, 2)), [np.nan, np.nan]])
+    rays, valid = model.unproject(lens, uv)
+    assert valid[:-1].all() and not valid[-1]
+    slopes = _slopes(model, lens, directions, np.where(valid[:, None], rays, 0.0))
+    for direction, found in zip(directions, slopes, strict=True):
+        (up, _), (down, _) = (model.unproject(lens + d * direction, uv[:-1]) for d in (h, -h))
+        np.testing.assert_allclose(found[:-1], (up - down) / (2.0 * h), atol=1e-8)
+        np.testing.assert_array_equal(found[-1], 0.0)

@@ -22,16 +22,13 @@ from icalib.estimation.corner_weights import Loss
 from icalib.estimation.feature_kernels import (
     Points,
     Range,
-    Seeing,
     Seen,
     Weighing,
     accumulate,
     add_rays,
-    add_to_points,
-    camera_points,
-    moving_points,
     take_trials,
 )
+from icalib.estimation.feature_views import View
 from icalib.estimation.front import Features
 from icalib.estimation.front_plan import FeatureSums, plan
 from icalib.estimation.lidar_kernels import Planes
@@ -64,18 +61,6 @@ class FeatureOutput:
     root: tuple[np.ndarray, ...]
     points: np.ndarray
     off: Distances
-
-
-@dataclass(frozen=True)
-class View:
-    """One camera in a piece: what it saw, and how it moved."""
-
-    camera: CornerFactor
-    index: int
-    first: int  # of its images
-    params: np.ndarray
-    seen: Seen
-    motion: Motion
 
 
 @dataclass(frozen=True)
@@ -171,7 +156,7 @@ class FeatureFactor:
         points = self._from_anchors(views, slice(0, self.tracks.count), self.tracks.start)
         sigma = list(self.sigma)
         for view in views:
-            uv, valid, *_ = view.camera.model.project_with_jacobians(view.params, _in_camera(view, points, 0))
+            uv, valid, *_ = view.camera.model.project_with_jacobians(view.params, view.in_camera(points, 0))
             used = valid & (view.seen.track >= 0) & view.seen.keep
             if used.any():
                 variance = median_variance(((uv - view.seen.uv)[used] ** 2).sum(axis=1))
@@ -231,15 +216,17 @@ class FeatureFactor:
             features.own[:, range(3), range(3)] += WEAK
         total, begin = 0.0, 0
         for view in views:
-            i, X = view.index, _in_camera(view, points.xyz, tracks.start)
-            seeing = self._seeing(view, X)
-            weighing = self._weighing(i, curved)
-            own = slice(begin, begin + len(view.seen.node))
-            begin = own.stop
-            mine = features._replace(pose=features.pose[own], next_pose=features.next_pose[own])
-            total += accumulate(
-                X, view.seen, base, view.motion, seeing, weighing, into, mine, out.residual[i], out.root[i]
-            )
+            i, weighing = view.index, self._weighing(view.index, curved)
+            lens = self.layout.columns(view.camera.name, "intrinsics", "distortion")
+            for part, images in view.chunks():
+                own = slice(begin + images.start, begin + images.stop)
+                mine = features._replace(pose=features.pose[own], next_pose=features.next_pose[own])
+                X = part.in_camera(points.xyz, tracks.start)
+                total += accumulate(
+                    X, part.seen, base, part.motion, part.seeing(X, lens), weighing, into, mine, out.residual[i],
+                    out.root[i],
+                )  # fmt: skip
+            begin += len(view.seen.node)
         if planes is not None:
             loss, off = self._loss(curved), out.off.of(tracks)
             total += add_points_on_planes(self.on.of(tracks), planes, loss, points, features, piece, off)
@@ -318,13 +305,6 @@ class FeatureFactor:
         rest = np.concatenate([np.full(2, -1), imu[imu >= 0]])
         return np.concatenate([of_image, np.tile(rest, (i1 - i0, 1))], axis=1).astype(np.int64)
 
-    def _seeing(self, view: View, X: np.ndarray) -> Seeing:
-        """Observations of a view, their points at X (n, 3) in the camera."""
-        columns = self.layout.columns(view.camera.name, "intrinsics", "distortion")
-        pars = np.flatnonzero(columns >= 0)
-        found = view.camera.model.project_with_jacobians(view.params, X)
-        return Seeing(int(view.seen.start[0]), *found, pars, columns[pars])
-
     def _descend(self, views: list[View], xyz: np.ndarray, tracks: slice, planes: Planes | None) -> Points:
         """The points of `tracks` where their cost is least, that of their `planes` with it, from `xyz` (n, 3) on."""
         n, eyes = len(xyz), self._from_anchors(views, tracks, np.zeros_like(xyz))
@@ -335,22 +315,12 @@ class FeatureFactor:
         )  # fmt: skip
         for step in range(MOST_STEPS):
             for view in views:
-                self._add_to_points(view, tracks.start, points)
+                view.add_to_points(tracks.start, self._weighing(view.index, False), points)
             if planes is not None:
                 add_planes_to_points(self.on.of(tracks), planes, self._loss(False), points)
             if take_trials(points, step == 0) == 0:
                 break
         return points
-
-    def _add_to_points(self, view: View, first: int, points: Points) -> None:
-        """Adds what a view's observations say of those points that still move."""
-        seen, motion = view.seen, view.motion
-        most = int(seen.start[-1] - seen.start[0])
-        image, which, X = np.empty(most, dtype=np.int64), np.empty(most, dtype=np.int64), np.empty((most, 3))
-        m = moving_points(seen, first, motion.R_cam_world, motion.p_world_cam, points, image, which, X)
-        uv, valid, by_point, _ = view.camera.model.project_with_jacobians(view.params, X[:m])
-        weighing = self._weighing(view.index, False)
-        add_to_points(seen, first, motion.R_cam_world, image[:m], which[:m], uv, valid, by_point, weighing, points)
 
     def _from_anchors(self, views: list[View], tracks: slice, points: np.ndarray) -> np.ndarray:
         """(n, 3) in the world what is at `points` (n, 3) in the frames of the cameras that `tracks` move with."""
@@ -379,14 +349,6 @@ def held_back(features: FeatureSums) -> float:
     # A point at a camera's very centre has no inverse; what is not known of it promises nothing.
     step = np.einsum("nij,nj->ni", np.linalg.pinv(features.own, hermitian=True), gradient)
     return float((gradient * step).sum())
-
-
-def _in_camera(view: View, points: np.ndarray, first: int) -> np.ndarray:
-    """(n, 3) the points of tracks `first` and on, in the camera, for each observation of the view."""
-    seen, motion = view.seen, view.motion
-    X = np.empty((int(seen.start[-1] - seen.start[0]), 3))
-    camera_points(seen, first, motion.R_cam_world, motion.p_world_cam, points, X)
-    return X
 
 
 NO_NUMBERS = np.zeros(0, dtype=np.int64)

@@ -35,7 +35,6 @@ LENS_SIGMA = 0.03  # rad, RMS over the rays, of what one coefficient may be off 
 MOST_BENT = 3.0  # times that
 LEAST_SEEN = 0.5  # of the pairs of images that can be: a short stretch in which little happens fits anywhere
 NEAREST_M = 0.2  # of a point
-LENS_STEP = 1e-3  # of a direction
 BENDS = 2.0  # standard deviations, from where on a ray counts less
 ANGLES = 24  # about the axis that the robot turns about most
 FOLLOWED = 4  # starts
@@ -84,7 +83,7 @@ class Followed:
     def of(cls, stream: TrackStream, model: CameraModel, lens: np.ndarray, directions: np.ndarray) -> Followed:
         """`directions` (L, P): in which the lens is open. Raises EstimationError where hardly any images share enough
         points."""
-        _, valid = model.unproject(lens, stream.uv)
+        rays, valid = model.unproject(lens, stream.uv)
         pairs = list(pairs_sharing(stream, valid, STEPS_S, MOST_PAIRS))
         if len(pairs) < FEWEST_PAIRS:
             raise EstimationError(
@@ -94,9 +93,10 @@ class Followed:
         times = stream.seconds[np.array([(i, j) for i, j, _, _ in pairs])]
         shared = [np.stack([p, q], axis=1) for _, _, p, q in pairs]
         begin = np.cumsum([0, *(len(x) for x in shared)])
-        bends = [LENS_SIGMA * d / _effect(model, lens, d, stream.uv) for d in directions]
+        slopes = _slopes(model, lens, directions, rays[valid])
+        effect = np.sqrt((slopes**2).sum(axis=2).mean(axis=1))  # rad, RMS over the rays
         uv, used = _used(stream.uv, np.concatenate(shared))
-        return cls(stream.name, model, uv, times, used, begin, lens, np.reshape(bends, directions.shape))
+        return cls(stream.name, model, uv, times, used, begin, lens, LENS_SIGMA * directions / effect[:, None])
 
     def lens_of(self, mount: Mount) -> np.ndarray:
         """(P,)"""
@@ -120,18 +120,17 @@ def _used(uv: np.ndarray, shared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return uv[used], renamed.reshape(shared.shape)
 
 
-def _effect(model: CameraModel, lens: np.ndarray, direction: np.ndarray, uv: np.ndarray) -> float:
-    """RMS [rad] of what a small part of `direction` does to rays, for all of it."""
-    slope, valid = _slope(model, lens, direction, uv)
-    return float(np.sqrt((slope[valid] ** 2).sum(axis=1).mean()))
-
-
-def _slope(
-    model: CameraModel, lens: np.ndarray, direction: np.ndarray, uv: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives of the rays of uv (n, 2), and whether there are any (n,)."""
-    (up, there), (down, here) = (model.unproject(lens + h * direction, uv) for h in (LENS_STEP, -LENS_STEP))
-    return (up - down) / (2.0 * LENS_STEP), there & here
+def _slopes(model: CameraModel, lens: np.ndarray, directions: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """(L, n, 3) derivatives of rays (n, 3) of fixed pixels by steps of the lens along `directions` (L, P), nothing
+    where the model cannot see: of K(f, lens) = uv follows df = -K_f^+ K_lens d, at right angles to f."""
+    _, valid, by_ray, by_lens = model.project_with_jacobians(lens, rays)
+    pixels = np.einsum("nrp,lp->lnr", by_lens, directions)
+    a, b, c = (np.einsum("nk,nk->n", by_ray[:, i], by_ray[:, j]) for i, j in ((0, 0), (0, 1), (1, 1)))
+    determinant = np.where(valid, a * c - b * b, 1.0)
+    u = (c * pixels[..., 0] - b * pixels[..., 1]) / determinant
+    v = (a * pixels[..., 1] - b * pixels[..., 0]) / determinant
+    slopes = -(u[..., None] * by_ray[:, 0] + v[..., None] * by_ray[:, 1])
+    return np.where(valid[:, None], slopes, 0.0)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -184,10 +183,7 @@ class _Seen:
         lens = followed.lens_of(at)
         rays, valid = followed.model.unproject(lens, followed.uv)
         rays = np.where(valid[:, None], rays, 0.0)  # these miss nothing
-        by = np.zeros((len(followed.bends), *rays.shape))
-        for k, bend in enumerate(followed.bends):
-            slope, there = _slope(followed.model, lens, bend, followed.uv)
-            by[k] = np.where((valid & there)[:, None], slope, 0.0)
+        by = np.where(valid[:, None], _slopes(followed.model, lens, followed.bends, rays), 0.0)
         return cls(followed, at, imu_poses(motion, t1), imu_poses(motion, t2), rays[p], rays[q], by[:, p], by[:, q])
 
     def misses(self, x: np.ndarray) -> np.ndarray:

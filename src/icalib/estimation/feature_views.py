@@ -1,0 +1,77 @@
+"""What a camera that follows points saw from a stretch of nodes, and how it moved there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from icalib.estimation.corner_factor import CornerFactor
+from icalib.estimation.corner_kernels import Motion
+from icalib.estimation.feature_kernels import (
+    Points,
+    Seeing,
+    Seen,
+    Weighing,
+    add_to_points,
+    camera_points,
+    moving_points,
+)
+
+CHUNK = 4096  # observations at a time: what a chunk needs stays in the cache, in memory that is used again
+
+
+@dataclass(frozen=True)
+class View:
+    """Images of one camera, `first` and on, number `index` of all cameras: what it saw in them, and how it moved."""
+
+    camera: CornerFactor
+    index: int
+    first: int
+    params: np.ndarray
+    seen: Seen
+    motion: Motion
+
+    def chunks(self) -> Iterator[tuple[View, slice]]:
+        """Parts of the view, and which of its images are theirs."""
+        start = self.seen.start
+        cuts = np.searchsorted(start, np.arange(start[0], start[-1], CHUNK), side="left")
+        cuts = np.unique([0, *cuts, len(start) - 1])
+        for a, b in zip(cuts[:-1].tolist(), cuts[1:].tolist(), strict=True):
+            yield self._part(a, b), slice(a, b)
+
+    def _part(self, a: int, b: int) -> View:
+        """Its images a..b."""
+        seen, m, own = self.seen, self.motion, slice(a, b)
+        seen = seen._replace(start=seen.start[a : b + 1], node=seen.node[own])
+        m = m._replace(
+            R_cam_world=m.R_cam_world[own], p_world_cam=m.p_world_cam[own], rate=m.rate[own], velocity=m.velocity[own],
+            by_node=m.by_node[own], by_next=m.by_next[own], by_imu=m.by_imu[own], columns=m.columns[own],
+        )  # fmt: skip
+        return replace(self, first=self.first + a, seen=seen, motion=m)
+
+    def in_camera(self, points: np.ndarray, track: int) -> np.ndarray:
+        """(n, 3) the points of tracks `track` and on, in the camera, for each observation."""
+        seen, motion = self.seen, self.motion
+        X = np.empty((int(seen.start[-1] - seen.start[0]), 3))
+        camera_points(seen, track, motion.R_cam_world, motion.p_world_cam, points, X)
+        return X
+
+    def seeing(self, X: np.ndarray, columns: np.ndarray) -> Seeing:
+        """The observations of points at X (n, 3) in the camera; columns (P,) of its parameters, -1 where fixed."""
+        pars = np.flatnonzero(columns >= 0)
+        found = self.camera.model.project_with_jacobians(self.params, X)
+        return Seeing(int(self.seen.start[0]), *found, pars, columns[pars])
+
+    def add_to_points(self, track: int, weighing: Weighing, points: Points) -> None:
+        """Adds what the observations say of those points, of tracks `track` and on, that still move."""
+        for part, _ in self.chunks():
+            seen, motion = part.seen, part.motion
+            most = int(seen.start[-1] - seen.start[0])
+            image, which, X = np.empty(most, dtype=np.int64), np.empty(most, dtype=np.int64), np.empty((most, 3))
+            m = moving_points(seen, track, motion.R_cam_world, motion.p_world_cam, points, image, which, X)
+            if m:
+                uv, valid, by_point, _ = self.camera.model.project_with_jacobians(self.params, X[:m])
+                R = motion.R_cam_world
+                add_to_points(seen, track, R, image[:m], which[:m], uv, valid, by_point, weighing, points)
