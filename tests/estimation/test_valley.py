@@ -1,5 +1,5 @@
 """Steps along what the data hardly tell, of which the sums know little: one that promises next to nothing is not taken
-where it costs, and one that goes twice as far as it should is shortened."""
+where it costs, and one that goes twice as far as it should is shortened; and steps of which they know all."""
 
 from __future__ import annotations
 
@@ -58,6 +58,20 @@ class Bowl(OneNumber):
         return np.array([y, LARGE + 0.5 * y**2 / LARGE]), np.array([1.0, y / LARGE])
 
 
+class Slope(OneNumber):
+    """Residual 2 (y - 3) + `bend` y^2, and how often sums were asked for."""
+
+    def __init__(self, bend: float):
+        self.bend, self.asked = bend, 0
+
+    def rows(self, y: float) -> tuple[np.ndarray, np.ndarray]:
+        return np.array([2.0 * (y - 3.0) + self.bend * y**2]), np.array([2.0 + 2.0 * self.bend * y])
+
+    def linearise(self, state, pieces, residuals, sums=True, curved=False):
+        self.asked += sums
+        return super().linearise(state, pieces, residuals, sums, curved)
+
+
 def at(y: float) -> State:
     one = np.zeros((1, 3))
     return State(np.zeros(1), np.eye(3)[None], one, one, np.zeros((1, 6)), {KEY: np.array([y])})
@@ -79,3 +93,20 @@ def test_steps_from_side_to_side_are_shortened():
     assert abs(outcome.state.values[KEY][0]) < 0.03
     assert len(outcome.steps) <= 4
     assert all(s.damping == 0.0 for s in outcome.steps)
+
+
+def test_an_early_pass_ends_with_a_step_that_gains_what_was_foretold():
+    """Where nothing bends, the sums that it began with are enough; where something does, they are made anew."""
+    straight, bent = Slope(0.0), Slope(0.2)
+    for slope, most in ((straight, 1), (bent, 3)):
+        outcome = minimise(slope, at(0.0), tolerance=0.5)
+        assert slope.rows(outcome.state.values[KEY][0])[0][0] ** 2 < 2.0 * 0.5
+        assert slope.asked <= most
+    assert bent.asked > 1
+    assert minimise(Slope(0.0), at(0.0)).converged  # the last pass goes to the end all the same
+
+
+def test_the_last_pass_makes_its_sums_anew_after_a_step_that_gained_what_was_foretold():
+    slope = Slope(0.0)
+    minimise(slope, at(0.0))
+    assert slope.asked > 1

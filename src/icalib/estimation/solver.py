@@ -22,6 +22,7 @@ HALF_WAY = 0.5  # of half the chi^2: where little more is gained, it can be seen
 STALLED_DECREASE = 0.05  # of half the chi^2: a third of a standard deviation, good enough where smaller steps fail
 MOST_STALLED = 4  # steps this small that fail before the solver rests
 COMES_BACK = 0.25  # of what a step costs too much, where its error is of second order: this much at most is left next
+STRAIGHT, AS_SAID = 50.0, 0.1  # of half the chi^2; of an early pass's tolerance: how well a larger step may be foretold
 OVERSHOT = 0.5  # of what a step promises: one that gains or costs less than this is too long
 ACROSS = 1e-6  # damping of a step that comes back: across a valley, not along it
 RESTING = 20.0  # times the tolerance of an early pass: a step that promises less and fails ends it
@@ -205,10 +206,11 @@ class _Descent:
     def step(self, solution: Solution, comes_back: bool) -> tuple[bool, bool]:
         """Whether the step is taken, and whether it is the last one."""
         near = solution.decrease < self.care.curved_below * self.cost
-        converged = self.free and solution.decrease < self.enough
-        sums = not (converged and self.early)
         there = self.state.retract(self.problem.layout, solution.chain, solution.border)
-        cost = self._linearise(there, sums, near)
+        straight = self._straight(solution, there, near)
+        converged = straight is not None or (self.free and solution.decrease < self.enough)
+        sums = not (converged and self.early)
+        cost = self._linearise(there, sums, near) if straight is None else straight
         if not (self.early or converged):
             there, cost = self._shortened(solution, there, cost, near)
         if comes_back and sums and not (cost < self.cost or converged):
@@ -250,6 +252,14 @@ class _Descent:
         """With what was solved here, or where this is the end of the last step, which leaves so much."""
         left = end.decrease if left is None else left
         return _outcome(self.problem, self.state, self.cost, self.residuals, left, self.steps, end)
+
+    def _straight(self, solution: Solution, state: State, curved: bool) -> float | None:
+        """What a step to `state` costs, where an early pass may end with it although it is not small: it gains just
+        what the sums say, so that nothing bends on its way, and next to nothing is left behind it. Else None."""
+        if not (self.early and self.free and self.enough < solution.decrease < STRAIGHT):
+            return None
+        cost = self._linearise(state, sums=False, curved=curved)
+        return cost if abs(self.cost - cost - solution.decrease) < AS_SAID * self.tolerance else None
 
     def _shortened(self, solution: Solution, state: State, cost: float, curved: bool) -> tuple[State, float]:
         """Of a step to `state`, at `cost`, that overshoots, about half, to where a parabola has its least; and what
