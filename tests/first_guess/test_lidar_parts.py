@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from icalib.errors import EstimationError
+from icalib.first_guess import lidar_odometry
 from icalib.first_guess.gyro import GyroRotation
 from icalib.first_guess.lidar_arm import against_motion, against_readings
 from icalib.first_guess.lidar_map import ScanPose, VoxelMap, insert, moved, sums
@@ -209,6 +210,24 @@ def test_a_path_that_lost_its_way_goes_on_in_another_map(free_robot):
     assert np.diff(known).max() > 1.0
     with pytest.raises(EstimationError, match="only 50 of 103 scans fit"):
         lidar_path("lidar0", [*scans[:50], *turned[74:]])
+
+
+def test_a_long_path_is_followed_in_two_parts_at_once(free_robot, monkeypatch):
+    """Unless it has to be whole; as good as in one, but for a second between the two maps."""
+    scans = scans_of(free_robot.streams[0])
+    one = lidar_path("lidar0", scans, whole=False)
+    monkeypatch.setattr(lidar_odometry, "MANY", len(scans))
+    two, whole = lidar_path("lidar0", scans, whole=False), lidar_path("lidar0", scans)
+    assert one.ok.all() and whole.ok.all()
+    np.testing.assert_array_equal(whole.rotation, one.rotation)
+    n = len(scans) // 2
+    np.testing.assert_array_equal(two.rotation[:n], one.rotation[:n])
+    np.testing.assert_array_equal(two.rotation[n], np.eye(3))
+    known = two.seconds[two.ok]
+    assert 1.0 < np.diff(known).max() < 1.3 and (~two.ok).sum() < 10
+    for own in (slice(0, n), slice(n, len(scans))):
+        errors, met = turns_between(free_robot, two, own.start, own.stop)
+        assert met > 50 and errors.max() < 0.02
 
 
 def test_a_path_begins_later_where_its_first_map_leads_nowhere(free_robot):

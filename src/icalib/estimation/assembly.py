@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -167,10 +168,14 @@ def assemble(
         )  # fmt: skip
         factors.append(_with_bloom(factor, camera, state, rig) if rig.blooms else factor)
     tolerance = inputs.tolerances.of(layout, None if rig.imu is None else rig.imu.name)
-    features = None if following is None else _features(inputs, state, tuple(factors), following)
+    # Beside one another, in a thread of its own: points of LiDARs use the solver's.
+    with ThreadPoolExecutor(1) as aside:
+        found = None if following is None else aside.submit(_features, inputs, state, tuple(factors), following)
+        others = _others(inputs, state, robot)
+        features = None if found is None else found.result()
     return Problem(
-        layout, _chain(inputs, state), tuple(factors), _priors(inputs), tolerance, held, features,
-        _others(inputs, state, robot), rig.has_target or rig.assumes_motion,
+        layout, _chain(inputs, state), tuple(factors), _priors(inputs), tolerance, held, features, others,
+        rig.has_target or rig.assumes_motion,
     )  # fmt: skip
 
 

@@ -8,6 +8,7 @@ of a scan back to its middle, and says how it stands to the scan before.
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +29,7 @@ EDGES_M = (0.3, 2.0)
 CAPACITY = 1 << 17
 LAST_SCALE, LAST_SCALE_TURNED = 0.2, 0.1
 MOST_LOST = 5  # scans in a row that do not fit the map, before there is another
+MANY = 200  # scans: worth two maps where these need not be one
 FEW = 10  # scans on a map that is no loss: its first scan may show too little of what the next ones see
 LEAST_NEAR = 0.3  # of a scan's points must lie on the map's planes
 FIRST_ROUNDS = 4  # to find how the LiDAR moved in its first scan, which makes the map
@@ -84,7 +86,8 @@ def lidar_path(
     if turning is not None:
         scans = [_turned(s, turning) for s in scans]
     reach = float(np.median([np.median(np.linalg.norm(s.xyz, axis=1)) for s in scans]))
-    poses, ok = _follow(scans, known, float(np.clip(reach / VOXELS_IN_REACH, *EDGES_M)), whole)
+    edge_m = float(np.clip(reach / VOXELS_IN_REACH, *EDGES_M))
+    poses, ok = _follow(scans, known, edge_m, True) if whole else _follow_in_parts(scans, known, edge_m)
     if ok.mean() < 0.5:
         raise EstimationError(
             f"{name}: only {ok.sum()} of {len(scans)} scans fit the surfaces that others show; there may be too "
@@ -142,6 +145,22 @@ class _Known:
         back = np.concatenate([R[:1], R[:-1]]).transpose(0, 2, 1)
         way = None if moving is None else np.diff(p := moving(seconds), axis=0, prepend=p[:1])
         return cls(back @ R, None if way is None else np.einsum("nij,nj->ni", back, way))
+
+    def some(self, own: slice) -> _Known:
+        """Of some of the scans."""
+        return _Known(*(None if x is None else x[own] for x in (self.turned, self.way)))
+
+
+def _follow_in_parts(scans: list[Scan], known: _Known, edge_m: float) -> tuple[list[ScanPose], np.ndarray]:
+    """As `_follow`, in several maps: a long path is two, each on a thread."""
+    n, seconds = len(scans), np.array([s.middle for s in scans])
+    parts = [slice(0, n)] if n < MANY else [slice(0, n // 2), slice(n // 2, n)]
+    with ThreadPoolExecutor(len(parts)) as pool:
+        found = list(pool.map(lambda own: _follow(scans[own], known.some(own), edge_m, False), parts))
+    ok = np.concatenate([fits for _, fits in found])
+    for own in parts[1:]:
+        ok[own] &= seconds[own] > seconds[own.start - 1] + LONGEST_STEP_S
+    return [pose for poses, _ in found for pose in poses], ok
 
 
 def _follow(scans: list[Scan], known: _Known, edge_m: float, whole: bool) -> tuple[list[ScanPose], np.ndarray]:
