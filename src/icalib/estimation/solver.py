@@ -342,6 +342,7 @@ def minimise(
             at.note(solution, True)
             return at.outcome(solution)
         if (left := at.last_step(solution)) is not None:
+            on_visit(Visit(at.state, solution.information))
             return at.outcome(solution, left)
         taken, converged = at.step(solution, comes_back)
         if converged:
