@@ -51,12 +51,7 @@ def sums_of_priors(priors: Sequence[Prior], state: State, n_border: int) -> tupl
 
 def without_priors(information: np.ndarray, priors: Sequence[Prior], state: State) -> np.ndarray:
     """(B, B) the border's information at `state` less that of `priors`."""
-    bare = information.copy()
-    for prior in priors:
-        _, J = prior.residual(state)
-        columns = prior.block.columns
-        bare[np.ix_(columns, columns)] -= J.T @ J
-    return bare
+    return information - sums_of_priors(priors, state, len(information))[2]
 
 
 def accumulate_bias_prior(

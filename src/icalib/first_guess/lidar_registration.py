@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from icalib.first_guess.lidar_map import UNKNOWNS, ScanPose, VoxelMap, moved, sums
+from icalib.first_guess.lidar_map import UNKNOWNS, ScanPose, moved, sums
 from icalib.geometry import so3
 from icalib.geometry.small import mul3, solve_definite, tmul3
 
@@ -99,7 +99,10 @@ def add_expected(e, pose, H, g):
 
 
 @njit(cache=True, nogil=True)
-def _search(voxels, xyz, tau, n_wide, e, last):
+def register(voxels, xyz, tau, n_wide, e, last):
+    """Pose of the scan of points xyz (n, 3) m at tau (n,) s from its middle, as `Expected` e, of which the first n_wide
+    are looked for in voxels around, too; weights end at a scale of `last` edges. And how many points lie on the map's
+    planes."""
     pose, H, g, near = expected_pose(e), np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS), 0
     for k in range(ROUNDS):
         share, wide = min(k / (WIDE_ROUNDS + 1.0), 1.0), k < WIDE_ROUNDS
@@ -113,11 +116,3 @@ def _search(voxels, xyz, tau, n_wide, e, last):
         if share == 1.0 and np.abs(g[:6]).max() < SMALL:
             break
     return pose, near
-
-
-def register(
-    voxels: VoxelMap, xyz: np.ndarray, tau: np.ndarray, n_wide: int, expected: Expected, last: float
-) -> tuple[ScanPose, int]:
-    """Pose of the scan of points xyz (n, 3) m at tau (n,) s from its middle, of which the first n_wide are looked for
-    in voxels around, too; weights end at a scale of `last` edges. And how many points lie on the map's planes."""
-    return _search(voxels, xyz, tau, n_wide, expected, last)
