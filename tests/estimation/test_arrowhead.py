@@ -5,15 +5,14 @@ import pytest
 
 from icalib.estimation import arrowhead
 from icalib.estimation.arrowhead import (
-    HELD_BELOW,
     NotDefiniteError,
     Piece,
-    border_step,
     make_pieces,
     marginalise,
     marginalise_in_segments,
     solve,
 )
+from icalib.estimation.border import HELD_BELOW, border_step
 from icalib.estimation.state import NODE
 
 

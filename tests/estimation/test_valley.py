@@ -7,7 +7,8 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from icalib.estimation.arrowhead import NOTHING, make_pieces
+from icalib.estimation.arrowhead import make_pieces
+from icalib.estimation.border import NOTHING
 from icalib.estimation.solver import minimise
 from icalib.estimation.state import State, make_layout
 

@@ -33,9 +33,9 @@ from icalib.calibration import (
     Verdict,
     Visited,
 )
-from icalib.estimation.arrowhead import restricted_inverse
 from icalib.estimation.assembly import image_times
 from icalib.estimation.board import SHAPE_LABELS
+from icalib.estimation.border import restricted_inverse
 from icalib.estimation.clocks import instants
 from icalib.estimation.determination import Determined
 from icalib.estimation.estimate import Estimate

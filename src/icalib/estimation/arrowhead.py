@@ -21,6 +21,7 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation import pages
+from icalib.estimation.border import NOTHING, border_draws, border_step
 from icalib.estimation.chain_kernels import damp, eliminate_chain, forward_solve, substitute_chain
 from icalib.estimation.front import Eliminated, Features, eliminate
 from icalib.estimation.front_plan import plan
@@ -167,7 +168,7 @@ class Factors:
         directions of the border are held, then `still` ones in which all of it is."""
         m = free + still
         border = np.zeros((len(self.tolerance) + 1, m))
-        border[:-1, :free] = _border_draws(
+        border[:-1, :free] = border_draws(
             self.information, self.tolerance, self.held, rng.standard_normal((len(self.tolerance), free))
         )
         chain = self.back(border, [rng.standard_normal((n, m)) for n in self.rows()])
@@ -199,12 +200,6 @@ class Solution:
     def information(self) -> np.ndarray:
         """(B, B) of the border, the chain marginalised (damping included)."""
         return self.factors.information
-
-    @property
-    def least(self) -> float:
-        """The least information, in tolerance units, on any direction of the border."""
-        t = self.factors.tolerance
-        return float(np.linalg.eigvalsh(t[:, None] * self.information * t).min(initial=np.inf))
 
     def less(self, information: np.ndarray, gradient: np.ndarray) -> Solution:
         """Without what has this information (B, B) and gradient (B,) on the border, before the pieces are filled
@@ -306,67 +301,6 @@ def _onto_last(piece: Piece) -> Piece:
     flat = piece.side[:-1].reshape(-1, piece.side.shape[2])
     last.border[:] = piece.border - flat.T @ flat
     return last
-
-
-HELD_BELOW = 1e-2  # information in tolerance units: a direction known to less than ten tolerances stays where it is
-
-
-LEAST = 1e-4  # of information in tolerance units; keeps variances finite
-NOTHING = np.zeros((0, 0))
-
-
-def border_step(
-    information: np.ndarray, gradient: np.ndarray, tolerance: np.ndarray, held: np.ndarray = NOTHING
-) -> tuple[np.ndarray, float]:
-    """Step (B,) of the border and the decrease of half the chi^2 it promises; undetermined directions are held, and
-    those in the columns of `held` (B, m), orthonormal.
-
-    Directions are those of the information in units of `tolerance` (B,).
-    """
-    free, values, vectors = _directions(information, tolerance, held)
-    projected = vectors.T @ (free.T @ (tolerance * gradient))
-    step = np.where(values > HELD_BELOW, -projected / np.maximum(values, HELD_BELOW), 0.0)
-    return tolerance * (free @ (vectors @ step)), float(-0.5 * projected @ step)
-
-
-def _directions(
-    information: np.ndarray, tolerance: np.ndarray, held: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Columns (B, n) that are free, and the eigenvalues and -vectors of the information among them, in units of
-    `tolerance`."""
-    free = complement(held, len(tolerance))
-    scaled = information * tolerance[:, None] * tolerance
-    values, vectors = np.linalg.eigh(free.T @ scaled @ free)
-    return free, values, vectors
-
-
-def complement(held: np.ndarray, n: int) -> np.ndarray:
-    """(n, n - m) orthonormal columns, all at right angles to those of `held` (n, m)."""
-    if not held.size:
-        return np.eye(n)
-    full, _, _ = np.linalg.svd(held, full_matrices=True)
-    return full[:, held.shape[1] :]
-
-
-def restricted_root(information: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """(B, n) whose product with its transpose is the `restricted_inverse`."""
-    free = complement(held, len(information))
-    values, vectors = np.linalg.eigh(free.T @ information @ free)
-    return free @ vectors / np.sqrt(np.maximum(values, LEAST))
-
-
-def restricted_inverse(information: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """(B, B) inverse of the information within the directions that are not held, both in tolerance units."""
-    root = restricted_root(information, held)
-    return root @ root.T
-
-
-def _border_draws(information: np.ndarray, tolerance: np.ndarray, held: np.ndarray, white: np.ndarray) -> np.ndarray:
-    """(B, m) from white noise (B, m): what has the inverse of the information for its covariance, what `border_step`
-    holds held."""
-    free, values, vectors = _directions(information, tolerance, held)
-    scaled = np.where(values > HELD_BELOW, 1.0 / np.sqrt(np.maximum(values, HELD_BELOW)), 0.0)
-    return tolerance[:, None] * (free @ (vectors @ (scaled[:, None] * white[: len(values)])))
 
 
 def _back(

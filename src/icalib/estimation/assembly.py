@@ -10,8 +10,9 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation import pages
-from icalib.estimation.arrowhead import NOTHING, chain_cuts
+from icalib.estimation.arrowhead import chain_cuts
 from icalib.estimation.board import SHAPE_LABELS, SHAPE_SIGMA_M, bloom_direction
+from icalib.estimation.border import NOTHING
 from icalib.estimation.clocks import instants
 from icalib.estimation.corner_factor import CornerFactor, CornerNoise
 from icalib.estimation.feature_factor import FeatureFactor

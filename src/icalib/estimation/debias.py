@@ -20,7 +20,8 @@ from functools import partial
 import numpy as np
 from scipy.stats import t as student_t
 
-from icalib.estimation.arrowhead import HELD_BELOW, Piece, solve
+from icalib.estimation.arrowhead import Piece, solve
+from icalib.estimation.border import DETERMINED, HELD_BELOW, least_information
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.imu_factor import ImuFactor
 from icalib.estimation.problem import Problem
@@ -28,8 +29,7 @@ from icalib.estimation.solver import Outcome, posterior
 from icalib.estimation.state import State
 
 CLEAR = 10.0  # information in tolerance units: where all is known to a third of a tolerance, one pair will do
-DETERMINED, NEGLIGIBLE = 1.0, 0.01  # in the same units; of it: where all is determined, and one side shows less noise
-# than this, what is odd in it included, the other need not be looked at
+NEGLIGIBLE = 0.01  # of the information: where all is determined and one side shows less, odd parts included, it will do
 SLIGHT = 0.05  # of the information: where one pair finds less noise than this, it will do, too
 FEW = 3  # draws at first
 SURE = 0.999  # probability that noise adds no more than is allowed for
@@ -68,7 +68,7 @@ def spurious_information(
     rng = np.random.default_rng(0)
     t = problem.tolerance
     scaled = t[:, None] * outcome.information * t
-    least = np.linalg.eigvalsh(scaled).min(initial=np.inf)
+    least = least_information(outcome.information, t)
     samples = (outcome.draws or posterior(problem, outcome.state)).still
     noise, first = _Noise(problem, outcome, problem.room()), _reading_noise(problem.chain.imu, rng)
     one_side = noise.there(1.0, samples[0].chain, first)

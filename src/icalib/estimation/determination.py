@@ -22,8 +22,8 @@ import numpy as np
 from scipy.linalg import LinAlgError, eigh
 
 from icalib.errors import EstimationError
-from icalib.estimation.arrowhead import HELD_BELOW, restricted_root
 from icalib.estimation.assembly import given_priors
+from icalib.estimation.border import HELD_BELOW, least_information, restricted_root
 from icalib.estimation.debias import Spurious, spurious_information
 from icalib.estimation.estimate import EARLY_DECREASE, EARLY_SHARE, Estimate, OnVisit, estimate
 from icalib.estimation.guess_worth import astray, in_proportion, moved_to_guess, moved_to_worth, owed_to_guess
@@ -184,8 +184,7 @@ def _is_worth_keeping(outcome: Outcome) -> bool:
 
 def _is_doubtful(problem: Problem, information: np.ndarray) -> bool:
     """Whether something may be open: with what noise adds, all is better known where nothing is."""
-    t = problem.tolerance
-    return bool(np.linalg.eigvalsh(t[:, None] * information * t).min(initial=np.inf) < DOUBTFUL)
+    return least_information(information, problem.tolerance) < DOUBTFUL
 
 
 def _is_settled(undetermined: np.ndarray, held: np.ndarray, late: bool) -> bool:

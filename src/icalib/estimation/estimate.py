@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from icalib.estimation import pages
-from icalib.estimation.arrowhead import NOTHING
 from icalib.estimation.assembly import Following, assemble, host_times, nodes_for, resample
+from icalib.estimation.border import NOTHING
 from icalib.estimation.corner_factor import CornerFactor, CornerNoise, CornerOutput
 from icalib.estimation.corner_noise import (
     COMMON_ERRORS,

@@ -9,12 +9,8 @@ from itertools import pairwise
 import numpy as np
 
 from icalib.estimation import sensors
-from icalib.estimation.arrowhead import (
-    Draw,
-    Piece,
-    in_parallel,
-    restricted_inverse,
-)
+from icalib.estimation.arrowhead import Draw, Piece, in_parallel
+from icalib.estimation.border import restricted_inverse
 from icalib.estimation.corner_factor import CornerFactor, CornerOutput
 from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput
 from icalib.estimation.parts import Parts

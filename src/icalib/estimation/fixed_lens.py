@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.arrowhead import restricted_inverse, solve
+from icalib.estimation.arrowhead import solve
+from icalib.estimation.border import restricted_inverse
 from icalib.estimation.estimate import Estimate
 from icalib.estimation.inputs import Inputs, with_clouds
 from icalib.estimation.state import Layout

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.linalg import eigh
 
 from icalib.errors import EstimationError
-from icalib.estimation.arrowhead import HELD_BELOW
 from icalib.estimation.assembly import given_priors
+from icalib.estimation.border import HELD_BELOW
 from icalib.estimation.estimate import EARLY_DECREASE
 from icalib.estimation.guess_priors import guess_sigma
 from icalib.estimation.inputs import Inputs

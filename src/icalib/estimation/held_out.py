@@ -18,7 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icalib.estimation.arrowhead import HELD_BELOW, Piece, complement, given_border, in_parallel, restricted_inverse
+from icalib.estimation.arrowhead import Piece, given_border, in_parallel
+from icalib.estimation.border import HELD_BELOW, complement, restricted_inverse
 from icalib.estimation.parts import Parts
 from icalib.estimation.problem import Residuals
 

@@ -8,14 +8,8 @@ from typing import ClassVar, Protocol
 
 import numpy as np
 
-from icalib.estimation.arrowhead import (
-    NOTHING,
-    Piece,
-    in_parallel,
-    make_pieces,
-    marginalise,
-    marginalise_in_segments,
-)
+from icalib.estimation.arrowhead import Piece, in_parallel, make_pieces, marginalise, marginalise_in_segments
+from icalib.estimation.border import NOTHING
 from icalib.estimation.corner_factor import CornerFactor, CornerOutput
 from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput
 from icalib.estimation.gauge import hold_frame

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.arrowhead import NOTHING, Draw, NotDefiniteError, Piece, Solution, solve
+from icalib.estimation.arrowhead import Draw, NotDefiniteError, Piece, Solution, solve
+from icalib.estimation.border import DETERMINED, NOTHING, least_information
 from icalib.estimation.prior_factor import Prior, sums_of_priors
 from icalib.estimation.problem import Problem, Residuals
 from icalib.estimation.state import State
@@ -31,7 +32,6 @@ MORE_STILL = 5  # for where these leave doubt; drawn later, so that the first st
 FIRST_DAMPING = 1e-8
 ZERO_DAMPING = 1e-10  # below this, none: the weak information of a planar drive must not be swamped
 SMALL_DECREASE = 0.02  # of half the chi^2: a step of a fifth of a standard deviation, all parameters together
-CLEAR = 1.0  # information in tolerance units: all is determined
 LEAST_DECREASE = 2e-5  # of half the chi^2: a step of 0.006 standard deviations, not worth a relinearisation
 
 
@@ -187,7 +187,11 @@ class _Descent:
             return None
         before, now = self.steps[-1], solution.decrease
         left = now * now / before.predicted_decrease if before.accepted else np.inf
-        if not (left < LEAST_DECREASE and now < SMALL_DECREASE and solution.least > CLEAR):
+        if not (
+            left < LEAST_DECREASE
+            and now < SMALL_DECREASE
+            and least_information(solution.information, self.problem.tolerance) > DETERMINED
+        ):
             return None
         there = self.state.retract(self.problem.layout, solution.chain, solution.border)
         cost = self._linearise(there, sums=False, curved=True)

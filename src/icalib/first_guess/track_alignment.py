@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from icalib.estimation.arrowhead import complement
+from icalib.estimation.border import complement
 from icalib.first_guess.clocks import LEAST_SECOND_AXIS, Alignment, only_axis
 from icalib.first_guess.gyro import GyroRotation
 from icalib.first_guess.track_rotation import pairs_sharing, turns_information

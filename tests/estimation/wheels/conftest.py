@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.estimation.arrowhead import NOTHING, Piece, in_parallel, make_pieces
+from icalib.estimation.arrowhead import Piece, in_parallel, make_pieces
+from icalib.estimation.border import NOTHING
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.imu_factor import ROWS, ImuFactor
 from icalib.estimation.prior_factor import Prior
