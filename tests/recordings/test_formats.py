@@ -6,6 +6,7 @@ import pickle
 import shutil
 import sqlite3
 import tracemalloc
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
 
@@ -69,6 +70,17 @@ def test_streams_are_those_that_were_written(form, tmp_path, truth, write):
     np.testing.assert_allclose(imu.accel, truth.accel, rtol=1e-15)
     assert recording.notes() == ()
     assert checked_imu(imu, recording.where(IMU))[1] == ()
+
+
+@pytest.mark.parametrize("form", FORMS[:-1])
+def test_what_is_left_half_read_is_closed_by_any_thread(form, tmp_path, truth, write):
+    """Garbage is collected in the thread that happens to make some."""
+    recording = open_recording(write.small(form, tmp_path, truth))
+    assert isinstance(recording, BagRecording)
+    messages = recording.messages(recording.image_topic(CAM0), "image")
+    next(messages)
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(messages.close).result()
 
 
 @pytest.mark.parametrize("form", FORMS[:-1])

@@ -89,7 +89,9 @@ class SqliteStorage:
         # Without a write-ahead log nothing needs to be written beside the file, and it may lie on a read-only disk.
         log = self.path.with_name(self.path.name + "-wal")
         options = "mode=ro" if log.exists() and log.stat().st_size else "mode=ro&immutable=1"
-        database = sqlite3.connect(f"{self.path.absolute().as_uri()}?{options}", uri=True)
+        # What is left half-read is closed by whichever thread collects the garbage; no two ever read at once.
+        uri = f"{self.path.absolute().as_uri()}?{options}"
+        database = sqlite3.connect(uri, uri=True, check_same_thread=False)
         database.execute("PRAGMA writable_schema=ON")  # opens a file that is shorter than its header says
         return database
 
