@@ -26,6 +26,7 @@ from icalib.estimation.feature_kernels import (
     Weighing,
     accumulate,
     add_rays,
+    held_back,
     take_trials,
 )
 from icalib.estimation.feature_views import View
@@ -231,7 +232,7 @@ class FeatureFactor:
             loss, off = self._loss(curved), out.off.of(tracks)
             total += add_points_on_planes(self.on.of(tracks), planes, loss, points, features, piece, off)
         if sums and piece.features is not None:
-            piece.border[-1, -1] += held_back(features)
+            piece.border[-1, -1] += held_back(features.own, features.side[:, :, -1])
         return total
 
     def _planes(self, state: State) -> Planes | None:
@@ -340,15 +341,6 @@ class FeatureFactor:
             i = image[tracks][own] - view.first
             out[own] = np.einsum("nij,nj->ni", view.motion.R_cam_world[i], points[own] - view.motion.p_world_cam[i])
         return out
-
-
-def held_back(features: FeatureSums) -> float:
-    """Twice what the points would still take off the cost if they could: those that an image's edge stops. It pulls at
-    poses and calibration as it should, but is no gain of a step."""
-    gradient = features.side[:, :, -1]
-    # A point at a camera's very centre has no inverse; what is not known of it promises nothing.
-    step = np.einsum("nij,nj->ni", np.linalg.pinv(features.own, hermitian=True), gradient)
-    return float((gradient * step).sum())
 
 
 NO_NUMBERS = np.zeros(0, dtype=np.int64)

@@ -15,9 +15,10 @@ from icalib.estimation.corner_chain import add_image, pose_chain
 from icalib.estimation.corner_weights import bend, weight
 from icalib.geometry.blas import subtract_gram
 from icalib.geometry.planes import tangents
-from icalib.geometry.small import solve_definite
+from icalib.geometry.small import eigen3, solve_definite
 
-SETTLED = 1e-12  # of half the chi^2: what another step of a point could still take off
+SETTLED = 1e-5  # of half the chi^2: a point's step that takes off less leaves about the square of it, and is the last
+NO_INVERSE = 1e-15  # of the largest eigenvalue: one that is smaller is nought
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-6, 1e8
 FARTHEST_M, AT_END = 1e5, 1.0 - 1e-6  # of a point from the camera that it moves with
 
@@ -169,7 +170,8 @@ def add_to_points(seen, t0, R_cw, image, which, uv, valid, by_point, weighing, p
 @njit(cache=True, nogil=True)
 def take_trials(points, start):
     """Takes trials that lowered the cost (all, at the `start`), then sets new ones; returns how many points still
-    move. A point must not lower its cost by leaving an image."""
+    move. A point must not lower its cost by leaving an image. A last step is taken untried: cost and sums stay those of
+    where it began."""
     M, d, axes, moving = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), 0
     for t in range(len(points.xyz)):
         if not points.moves[t]:
@@ -193,10 +195,13 @@ def take_trials(points, start):
         for a in range(3):
             for k in range(3):
                 decrease -= 0.5 * d[a] * axes[a, k] * points.b[t, k]
-        if points.damping[t] >= MOST_DAMPING or (points.damping[t] == 0.0 and decrease < SETTLED):
+        if points.damping[t] >= MOST_DAMPING:
             points.moves[t] = False
             continue
         _move(points.seen_from[t], axes, distance, d, points.trial[t])
+        if points.damping[t] == 0.0 and decrease < SETTLED:
+            points.xyz[t], points.moves[t] = points.trial[t], False
+            continue
         moving += 1
         for a in range(3):
             points.trial_b[t, a] = 0.0
@@ -204,6 +209,26 @@ def take_trials(points, start):
                 points.trial_A[t, a, k] = 0.0
         points.trial_cost[t], points.trial_shown[t] = 0.0, 0
     return moving
+
+
+@njit(cache=True, nogil=True)
+def held_back(own, gradient):
+    """Twice what points of sums own (T, 3, 3) and gradient (T, 3) would still take off the cost if they could: those
+    that an image's edge stops. It pulls at poses and calibration as it should, but is no gain of a step.
+
+    A point at a camera's very centre has no inverse; what is not known of it promises nothing.
+    """
+    A, values, vectors, total = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), 0.0
+    for t in range(len(own)):
+        A[:] = own[t]
+        eigen3(A, values, vectors)
+        for k in range(3):
+            if values[k] > NO_INVERSE * values[2]:
+                along = 0.0
+                for a in range(3):
+                    along += vectors[a, k] * gradient[t, a]
+                total += along * along / values[k]
+    return total
 
 
 @njit(cache=True, nogil=True)
