@@ -17,7 +17,9 @@ from icalib.geometry.blas import subtract_gram
 from icalib.geometry.planes import tangents
 from icalib.geometry.small import eigen3, solve_definite
 
-SETTLED = 1e-5  # of half the chi^2: a point's step that takes off less leaves about the square of it, and is the last
+# Of half the chi^2: a point's step that takes off less is its last. What that leaves is the square of it, but where a
+# robust loss bends a part of it; from 1e-8 on gradients show that.
+SETTLED = 1e-9
 NO_INVERSE = 1e-15  # of the largest eigenvalue: one that is smaller is nought
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-6, 1e8
 FARTHEST_M, AT_END = 1e5, 1.0 - 1e-6  # of a point from the camera that it moves with

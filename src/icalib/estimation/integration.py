@@ -23,6 +23,9 @@ from icalib.estimation.imu_data import ImuData
 from icalib.estimation.imu_model import correction_matrices, intrinsics_jacobians
 from icalib.geometry import so3
 
+# Functions between the loop over instants and the innermost ones are inlined: a call counts references to every array
+# that it hands on, and these counts took as long as the sums.
+
 
 @njit(cache=True, nogil=True)
 def _coefficient_slopes(x, s1, s2, s3):
@@ -271,7 +274,7 @@ def correction(intrinsics, n_extra):
     return Correction(intrinsics, F, G, H, dw_db, df_db, np.zeros((3, n_extra)), np.zeros((3, n_extra)))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _part(j, now, end, bias, readings, by, out, P_t, rate, force):
     """From `now` to `end` (seconds), both in interval j; rate, force (3,): those of that part."""
     t = readings.t
@@ -287,7 +290,7 @@ def _part(j, now, end, bias, readings, by, out, P_t, rate, force):
         )  # fmt: skip
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def whole(t1, backwards, j, now, bias, readings, by, out, P_t, rate, force):
     """From `now` in interval j through whole intervals to the one that holds t1, or is the last; that one, and where
     it begins."""
@@ -300,7 +303,7 @@ def whole(t1, backwards, j, now, bias, readings, by, out, P_t, rate, force):
     return j, now
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def to_the_end(t1, j, now, bias, readings, by, out, P_t, rate, force):
     """From `now` to t1, both in interval j; rate, force (3,): those at t1."""
     _part(j, now, t1, bias, readings, by, out, P_t, rate, force)

@@ -13,6 +13,7 @@ import sys
 import numpy as np
 
 LEAST = 1 << 20  # bytes, below which the allocator does better
+LARGE = 1 << 24  # bytes of what comes and goes: smaller arrays are made often, and new pages cost more than they do
 _M_MMAP_THRESHOLD = -3  # of mallopt, in malloc.h
 
 
@@ -34,7 +35,7 @@ def keep_apart() -> None:
 
     It does so at first, but once such an array has been freed, the next ones as large lie between the small ones.
     """
-    _in_glibc("mallopt", _M_MMAP_THRESHOLD, LEAST)
+    _in_glibc("mallopt", _M_MMAP_THRESHOLD, LARGE)
 
 
 def _in_glibc(name: str, *arguments: int) -> None:
