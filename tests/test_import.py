@@ -33,6 +33,12 @@ def test_import_is_silent_light_and_writes_nothing():
     assert (run.returncode, run.stdout, run.stderr) == (0, "", "")
 
 
+def test_the_pipeline_does_without_what_takes_long_to_load():
+    code = "import sys, icalib.pipeline; print({'scipy.stats', 'matplotlib', 'plotly', 'cv2'} & set(sys.modules))"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "set()"
+
+
 @pytest.mark.parametrize("name", icalib.__all__)
 def test_every_public_name_is_there(name: str):
     assert getattr(icalib, name) is not None

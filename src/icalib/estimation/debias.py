@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from scipy.stats import t as student_t
+from scipy.special import stdtrit  # of scipy.stats, whose import takes half a second
 
 from icalib.estimation.arrowhead import Piece, solve
 from icalib.estimation.border import DETERMINED, HELD_BELOW, least_information
@@ -53,7 +53,7 @@ class Spurious:
         if n == 1:
             return np.zeros(directions.shape[1])
         along = np.einsum("ik,nij,jk->nk", directions, self.each, directions)
-        return float(student_t.ppf(SURE, n - 1)) * np.sqrt(1.0 + 1.0 / n) * along.std(axis=0, ddof=1)
+        return float(stdtrit(n - 1, SURE)) * np.sqrt(1.0 + 1.0 / n) * along.std(axis=0, ddof=1)
 
 
 def spurious_information(
