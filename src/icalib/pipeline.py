@@ -14,9 +14,9 @@ from icalib.calibration import Calibration, Visited
 from icalib.detection.streams import find_corners
 from icalib.errors import RecordingError
 from icalib.estimation.determination import determine
+from icalib.estimation.outcome import Visit
 from icalib.estimation.pages import give_back, keep_apart
 from icalib.estimation.problem import Problem
-from icalib.estimation.solver import Visit
 from icalib.first_guess.lidar_sight import naming_sight
 from icalib.first_guess.start import start
 from icalib.measurements import CornerStream, Measurements

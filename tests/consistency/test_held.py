@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from icalib.estimation import determination
 from icalib.estimation.determination import determine
-from icalib.estimation.solver import Step
+from icalib.estimation.outcome import Step
 from icalib.first_guess.start import start
 from icalib.simulation import rig_for, simulate, with_drawn_guess
 

@@ -12,7 +12,8 @@ from tests.estimation.test_front import build
 from icalib.estimation.arrowhead import Piece, solve
 from icalib.estimation.debias import spurious_information
 from icalib.estimation.evidence import fits
-from icalib.estimation.solver import Draws, Outcome, minimise, posterior
+from icalib.estimation.outcome import Draws, Outcome, posterior
+from icalib.estimation.solver import minimise
 from icalib.simulation import handheld, simulate
 
 DRAWS = 40

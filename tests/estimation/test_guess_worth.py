@@ -36,9 +36,10 @@ def given(monkeypatch):
     sigma = np.concatenate([SIGMA[b.name] for b in layout.free])
     monkeypatch.setattr(guess_worth, "given_priors", lambda _: priors)
     monkeypatch.setattr(guess_worth, "guess_sigma", lambda _: sigma.copy())
-    monkeypatch.setattr(guess_worth, "minimise", lambda problem, state, tolerance: SimpleNamespace(state=state))
+    monkeypatch.setattr(guess_worth, "minimise", lambda problem, state, tolerance, room: SimpleNamespace(state=state))
     inputs = SimpleNamespace(is_sensor=lambda name: name in "ab", layout=layout)
-    return SimpleNamespace(inputs=inputs, problem=problem, state=state, sigma=sigma, priors=priors)
+    outcome = SimpleNamespace(problem=problem, state=state, room=None)
+    return SimpleNamespace(inputs=inputs, problem=problem, state=state, sigma=sigma, priors=priors, outcome=outcome)
 
 
 def landed(given, rng) -> np.ndarray:
@@ -75,7 +76,7 @@ def test_only_where_noise_pulls_to_near_the_guess_a_direction_stays(given, pull:
 def test_the_shifts_have_the_covariance_of_where_guesses_land(given, weighed: bool):
     if weighed:
         given.priors.append(SimpleNamespace(block=given.problem.layout.free[0], sigma=np.array([0.1, 0.2, 0.05])))
-    shifts = owed_to_guess(given.inputs, given.problem, given.state, np.zeros((8, 8)))
+    shifts = owed_to_guess(given.inputs, given.outcome, np.zeros((8, 8)))
     assert shifts.shape == (2 + TOGETHER, 8)  # two errors, and what both together make beyond their sum
     np.testing.assert_allclose(shifts[2:], 0.0, atol=1e-12)
     drawn = np.cov(landed(given, np.random.default_rng(0)).T)
@@ -90,13 +91,13 @@ def test_the_shifts_have_the_covariance_of_where_guesses_land(given, weighed: bo
 
 
 def test_what_comes_of_two_errors_together_is_owed_too(given, monkeypatch):
-    def bent(problem, state, tolerance):
+    def bent(problem, state, tolerance, room):
         values = {k: v.copy() for k, v in state.values.items()}
         values["a", "translation"][1] += 7.0 * values["a", "translation"][0] * values["a", "translation"][2]
         return SimpleNamespace(state=State(*(getattr(state, n) for n in list(State.__dataclass_fields__)[:5]), values))
 
     monkeypatch.setattr(guess_worth, "minimise", bent)
-    shifts = owed_to_guess(given.inputs, given.problem, given.state, np.zeros((8, 8)))
+    shifts = owed_to_guess(given.inputs, given.outcome, np.zeros((8, 8)))
     assert np.abs(shifts[:2, 1]).max() < 1e-12  # neither alone moves it
     drawn = landed(given, np.random.default_rng(0))
     product = 7.0 * drawn[:, 0] * drawn[:, 2]
@@ -106,26 +107,26 @@ def test_what_comes_of_two_errors_together_is_owed_too(given, monkeypatch):
 def test_nothing_is_tried_out_where_the_guess_alone_leaves_all_open(given, monkeypatch):
     given.problem.held = np.eye(8)
     monkeypatch.setattr(guess_worth, "minimise", None)
-    shifts = owed_to_guess(given.inputs, given.problem, given.state, np.zeros((8, 8)))
+    shifts = owed_to_guess(given.inputs, given.outcome, np.zeros((8, 8)))
     np.testing.assert_allclose(np.sqrt((shifts**2).sum(axis=0)), given.sigma)
 
 
 def test_in_proportion_only_what_is_held_moves(given, monkeypatch):
     nothing = np.zeros((8, 8))
-    expected = owed_to_guess(given.inputs, given.problem, given.state, nothing)[:-TOGETHER]
+    expected = owed_to_guess(given.inputs, given.outcome, nothing)[:-TOGETHER]
     monkeypatch.setattr(guess_worth, "minimise", None)
-    np.testing.assert_allclose(in_proportion(given.inputs, given.problem, nothing), expected, atol=1e-12)
+    np.testing.assert_allclose(in_proportion(given.inputs, given.outcome, nothing), expected, atol=1e-12)
 
 
 def test_a_way_along_which_nothing_can_be_solved_is_made_shorter(given, monkeypatch):
-    def short_only(problem, state, tolerance):
+    def short_only(problem, state, tolerance, room):
         if np.abs(state.values["b", "translation"]).max() > 0.02:
             raise EstimationError("too far")
         return SimpleNamespace(state=state)
 
-    expected = owed_to_guess(given.inputs, given.problem, given.state, np.zeros((8, 8)))
+    expected = owed_to_guess(given.inputs, given.outcome, np.zeros((8, 8)))
     monkeypatch.setattr(guess_worth, "minimise", short_only)
-    found = owed_to_guess(given.inputs, given.problem, given.state, np.zeros((8, 8)))
+    found = owed_to_guess(given.inputs, given.outcome, np.zeros((8, 8)))
     np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
@@ -134,7 +135,7 @@ def test_what_nobody_guessed_moves_no_further_than_the_data_leave_open(given):
     data = np.diag(np.full(8, 5e-3))
     data[0, 0] = 0.0
     given.problem.held = np.eye(8)[:, [0, 1]]  # of a, which is no sensor now
-    shifts = owed_to_guess(given.inputs, given.problem, given.state, data)
+    shifts = owed_to_guess(given.inputs, given.outcome, data)
     width = np.sqrt((shifts**2).sum(axis=0)) / given.problem.tolerance
     assert width[0] == pytest.approx(guess_worth.UNGUESSED / 5e-3)
     assert width[1] == pytest.approx(min(guess_worth.UNGUESSED / 5e-3, 1.0 / np.sqrt(5e-3)))

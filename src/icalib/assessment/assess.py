@@ -43,10 +43,10 @@ from icalib.estimation.evidence import Fit, fits, place_covariances, raw_rms, sp
 from icalib.estimation.fixed_lens import lens_steps
 from icalib.estimation.imu_model import LABELS as IMU_LABELS
 from icalib.estimation.inputs import Inputs, origin_difference
+from icalib.estimation.outcome import Visit
 from icalib.estimation.parts import Parts
 from icalib.estimation.pose_factor import FRAME
 from icalib.estimation.problem import Problem
-from icalib.estimation.solver import Visit
 from icalib.estimation.state import Block, State
 from icalib.geometry.cameras import camera_model
 from icalib.observability import Observability, observe

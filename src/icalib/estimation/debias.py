@@ -24,8 +24,8 @@ from icalib.estimation.arrowhead import Piece, solve
 from icalib.estimation.border import DETERMINED, HELD_BELOW, least_information
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.imu_factor import ImuFactor
+from icalib.estimation.outcome import Outcome, posterior
 from icalib.estimation.problem import Problem
-from icalib.estimation.solver import Outcome, posterior
 from icalib.estimation.state import State
 
 CLEAR = 10.0  # information in tolerance units: where all is known to a third of a tolerance, one pair will do
@@ -70,7 +70,7 @@ def spurious_information(
     scaled = t[:, None] * outcome.information * t
     least = least_information(outcome.information, t)
     samples = (outcome.draws or posterior(problem, outcome.state)).still
-    noise, first = _Noise(problem, outcome, problem.room()), _reading_noise(problem.chain.imu, rng)
+    noise, first = _Noise(problem, outcome, outcome.room or problem.room()), _reading_noise(problem.chain.imu, rng)
     one_side = noise.there(1.0, samples[0].chain, first)
     if least > DETERMINED and _largest_share(t[:, None] * one_side * t, scaled) < NEGLIGIBLE:
         return Spurious(one_side[None])

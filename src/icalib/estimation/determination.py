@@ -28,9 +28,10 @@ from icalib.estimation.debias import Spurious, spurious_information
 from icalib.estimation.estimate import EARLY_DECREASE, EARLY_SHARE, Estimate, OnVisit, estimate
 from icalib.estimation.guess_worth import astray, in_proportion, moved_to_guess, moved_to_worth, owed_to_guess
 from icalib.estimation.inputs import Inputs
+from icalib.estimation.outcome import Outcome, Step
 from icalib.estimation.prior_factor import without_priors
 from icalib.estimation.problem import Problem
-from icalib.estimation.solver import Outcome, Step, minimise
+from icalib.estimation.solver import minimise
 from icalib.estimation.state import Key, State
 
 SPURIOUS_SHARE = 0.5  # a direction most of whose information is noise is in doubt: by chance all of it may be
@@ -97,14 +98,14 @@ def determine(
     search.settle()
     search.weigh()
     found, seen = search.found, search.seen
-    if not found.problem.held.size:
-        nothing = np.zeros((inputs.layout.size, 0))
-        return Determined(found, seen.data, seen.noise, nothing, nothing.T)
-    if _is_worth_keeping(found.outcome):
-        shifts = owed_to_guess(inputs, found.problem, found.outcome.state, seen.data)
-    else:  # Answers would be looked for, each to no end, that nobody is to use.
-        shifts = in_proportion(inputs, found.problem, seen.data)
-    return Determined(found, seen.data, seen.noise, found.problem.held, shifts)
+    held, shifts = np.zeros((inputs.layout.size, 0)), np.zeros((0, inputs.layout.size))
+    if found.problem.held.size:
+        held = found.problem.held
+        # Of one that failed answers would be looked for, each to no end, that nobody is to use.
+        worth = _is_worth_keeping(found.outcome)
+        shifts = (owed_to_guess if worth else in_proportion)(inputs, found.outcome, seen.data)
+    found = replace(found, outcome=replace(found.outcome, room=None))  # nothing is solved in it any more
+    return Determined(found, seen.data, seen.noise, held, shifts)
 
 
 @dataclass
@@ -172,8 +173,9 @@ def _followed(found: Estimate, moved: State, held: np.ndarray) -> State:
     state that fits nothing, and the next estimate might end anywhere."""
     if not _is_worth_keeping(found.outcome):
         return moved
+    problem, room = replace(found.problem, held=held), found.outcome.room
     try:
-        return minimise(replace(found.problem, held=held), moved, tolerance=EARLY_DECREASE, share=EARLY_SHARE).state
+        return minimise(problem, moved, tolerance=EARLY_DECREASE, share=EARLY_SHARE, room=room).state
     except EstimationError:
         return moved
 

@@ -25,11 +25,12 @@ from icalib.estimation.feature_noise import first_following, inliers, next_follo
 from icalib.estimation.guess_priors import guess_priors
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.lidar_factor import LidarFactor
+from icalib.estimation.outcome import Outcome, Step, Visit, way_come
 from icalib.estimation.prior_factor import Prior, without_priors
 from icalib.estimation.problem import Problem
 from icalib.estimation.robot import RobotNoise, next_posing, next_ranging
 from icalib.estimation.sensors import chi2
-from icalib.estimation.solver import Outcome, Step, Visit, minimise, way_come
+from icalib.estimation.solver import minimise
 from icalib.estimation.state import State
 from icalib.rig import PoseSensor, Settings
 
@@ -181,7 +182,8 @@ class _Passes:
         is_open = self.doubtful(problem, told.information)
         way, gone = way_come(outcome.steps, outcome.cost), self._let_go(is_open)
         if gone and not _is_far(way, way_before):
-            rest = minimise(outcome.problem.without(gone), outcome.state, told.step, on_visit=told.visit)
+            without, room = outcome.problem.without(gone), outcome.room
+            rest = minimise(without, outcome.state, told.step, on_visit=told.visit, room=room)
             outcome = replace(rest, steps=(*outcome.steps, *rest.steps))
             way = way_come(outcome.steps, outcome.cost)
         return outcome, np.inf if is_open and outcome.half_way else way

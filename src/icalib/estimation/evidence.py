@@ -13,9 +13,9 @@ from icalib.estimation.arrowhead import Draw, Piece, in_parallel
 from icalib.estimation.border import restricted_inverse
 from icalib.estimation.corner_factor import CornerFactor, CornerOutput
 from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput
+from icalib.estimation.outcome import Outcome, posterior
 from icalib.estimation.parts import Parts
 from icalib.estimation.problem import Problem, Residuals
-from icalib.estimation.solver import Outcome, posterior
 from icalib.estimation.state import State
 from icalib.estimation.surfaces import ON_PLANES
 

@@ -8,8 +8,8 @@ from icalib.estimation.assembly import Following
 from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.medians import median_variance
+from icalib.estimation.outcome import Outcome
 from icalib.estimation.problem import Problem
-from icalib.estimation.solver import Outcome
 from icalib.measurements import CornerStream, TrackStream
 from icalib.rig import Camera, Rig, Settings
 

@@ -15,6 +15,7 @@ from icalib.estimation.border import HELD_BELOW
 from icalib.estimation.estimate import EARLY_DECREASE
 from icalib.estimation.guess_priors import guess_sigma
 from icalib.estimation.inputs import Inputs
+from icalib.estimation.outcome import Outcome
 from icalib.estimation.problem import Problem
 from icalib.estimation.solver import minimise
 from icalib.estimation.state import Block, State
@@ -74,24 +75,25 @@ def moved_to_worth(inputs: Inputs, problem: Problem, state: State, guess: State,
     return _moved(problem, state, step / problem.tolerance)
 
 
-def owed_to_guess(inputs: Inputs, problem: Problem, state: State, data: np.ndarray) -> np.ndarray:
+def owed_to_guess(inputs: Inputs, outcome: Outcome, data: np.ndarray) -> np.ndarray:
     """(m + TOGETHER, B) how the border moves with each of m independent errors of the guess along the held directions,
     one standard deviation each, and by how much more or less where all of them come together.
 
-    data (B, B): information of the data alone, in tolerance units.
+    data (B, B): information of the data alone, in tolerance units. The room of `outcome` is used.
     """
+    problem = outcome.problem
     ways = _ways(inputs, problem, data)
     if _leave_nothing(inputs, problem, ways):
-        return in_proportion(inputs, problem, data)
-    alone = np.array([_answer(problem, state, way) for way in ways.T])
+        return in_proportion(inputs, outcome, data)
+    alone = np.array([_answer(outcome, way) for way in ways.T])
     signs = np.random.default_rng(0).choice((-1.0, 1.0), (TOGETHER, ways.shape[1]))
-    beyond = [_answer(problem, state, ways @ s) - s @ alone for s in signs]
+    beyond = [_answer(outcome, ways @ s) - s @ alone for s in signs]
     return np.vstack([alone, np.array(beyond) / np.sqrt(TOGETHER)])
 
 
-def in_proportion(inputs: Inputs, problem: Problem, data: np.ndarray) -> np.ndarray:
+def in_proportion(inputs: Inputs, outcome: Outcome, data: np.ndarray) -> np.ndarray:
     """(m, B) as `owed_to_guess`, where nothing but what is held moves."""
-    return problem.tolerance * _ways(inputs, problem, data).T
+    return outcome.problem.tolerance * _ways(inputs, outcome.problem, data).T
 
 
 def _ways(inputs: Inputs, problem: Problem, data: np.ndarray) -> np.ndarray:
@@ -132,12 +134,14 @@ def _leave_nothing(inputs: Inputs, problem: Problem, ways: np.ndarray) -> bool:
     return all((owed[b.columns] > 1.0 / HELD_BELOW).all() for b in problem.layout.free if inputs.is_sensor(b.sensor))
 
 
-def _answer(problem: Problem, state: State, way: np.ndarray) -> np.ndarray:
+def _answer(outcome: Outcome, way: np.ndarray) -> np.ndarray:
     """(B,) how the border moves when the guess moves along `way` (B,), which is held. Where it moves so far that
     nothing can be solved, in proportion to a shorter way."""
+    problem, state = outcome.problem, outcome.state
     for k in range(HALVINGS):
+        moved = _moved(problem, state, way / 2**k)
         try:
-            there = minimise(problem, _moved(problem, state, way / 2**k), tolerance=EARLY_DECREASE)
+            there = minimise(problem, moved, tolerance=EARLY_DECREASE, room=outcome.room)
         except EstimationError:
             continue
         return 2**k * border_difference(problem, there.state, state)

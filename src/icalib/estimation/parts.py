@@ -9,8 +9,8 @@ import numpy as np
 from icalib.errors import EstimationError
 from icalib.estimation.arrowhead import Piece, in_parallel, marginalise
 from icalib.estimation.gauge import hold_frame
+from icalib.estimation.outcome import Outcome
 from icalib.estimation.problem import Problem, Residuals
-from icalib.estimation.solver import Outcome
 from icalib.estimation.state import State
 
 FEWEST_NODES = 3  # between the ends of a part

@@ -8,8 +8,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.arrowhead import Draw, NotDefiniteError, Piece, Solution, solve
-from icalib.estimation.border import DETERMINED, NOTHING, least_information
+from icalib.estimation.arrowhead import NotDefiniteError, Piece, Solution, solve
+from icalib.estimation.border import DETERMINED, least_information
+from icalib.estimation.outcome import STALLED_DECREASE, Outcome, Step, Visit, outcome_of, way_come
 from icalib.estimation.prior_factor import Prior, sums_of_priors
 from icalib.estimation.problem import Problem, Residuals
 from icalib.estimation.state import State
@@ -20,72 +21,16 @@ CONVERGED_DECREASE = 5e-4
 ROUNDING = 1e-11  # of the cost: what rounding makes of a sum of 1e6 squares
 CURVED_BELOW = 1e-2  # of the cost: steps that promise less use the true curvature of the robust loss
 HALF_WAY = 0.5  # of half the chi^2: where little more is gained, it can be seen what is open
-STALLED_DECREASE = 0.05  # of half the chi^2: a third of a standard deviation, good enough where smaller steps fail
 MOST_STALLED = 4  # steps this small that fail before the solver rests
 COMES_BACK = 0.25  # of what a step costs too much, where its error is of second order: this much at most is left next
 STRAIGHT, AS_SAID = 1e3, 0.1  # of half the chi^2; of an early pass's tolerance: how well a larger step may be foretold
 OVERSHOT = 0.5  # of what a step promises: one that gains or costs less than this is too long
 ACROSS = 1e-6  # damping of a step that comes back: across a valley, not along it
 RESTING = 20.0  # times the tolerance of an early pass: a step that promises less and fails ends it
-FREE_DRAWS, STILL_DRAWS = 2, 3  # from the posterior, for what is made of the outcome
-MORE_STILL = 5  # for where these leave doubt; drawn later, so that the first stay what they are
 FIRST_DAMPING = 1e-8
 ZERO_DAMPING = 1e-10  # below this, none: the weak information of a planar drive must not be swamped
 SMALL_DECREASE = 0.02  # of half the chi^2: a step of a fifth of a standard deviation, all parameters together
 LEAST_DECREASE = 2e-5  # of half the chi^2: a step of 0.006 standard deviations, not worth a relinearisation
-
-
-@dataclass(frozen=True)
-class Step:
-    """One iteration: half the robust chi^2 before it, the decrease that the linear model promises, and its fate."""
-
-    cost: float
-    predicted_decrease: float
-    damping: float
-    accepted: bool
-
-
-@dataclass(frozen=True)
-class Visit:
-    """Where the solver stood when it looked for a step: the state, and the border's information (B, B) there, the chain
-    marginalised (damping included)."""
-
-    state: State
-    information: np.ndarray
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """Where the solver ended, with a status that is a sentence. problem: the one that was solved, points of the scene
-    looked for where they were; information (B, B): of the border at `state`, the chain marginalised, no damping; empty,
-    and no draws, where another pass follows. half_way: left before its end, because more seemed of no use."""
-
-    problem: Problem
-    state: State
-    cost: float
-    residuals: Residuals
-    information: np.ndarray
-    steps: tuple[Step, ...]
-    converged: bool
-    status: str
-    draws: Draws | None = None
-    half_way: bool = False
-
-
-@dataclass(frozen=True)
-class Draws:
-    """Steps drawn from the posterior: `free` ones, undetermined directions of the border held, and `still` ones, all of
-    the border held."""
-
-    free: tuple[Draw, ...]
-    still: tuple[Draw, ...]
-
-    @classmethod
-    def of(cls, solution: Solution) -> Draws:
-        """From what was solved last, the pieces as the solve left them."""
-        rng, factors = np.random.default_rng(0), solution.factors
-        drawn = factors.draws(rng, FREE_DRAWS, STILL_DRAWS) + factors.draws(rng, 0, MORE_STILL)
-        return cls(drawn[:FREE_DRAWS], drawn[FREE_DRAWS:])
 
 
 @dataclass
@@ -131,10 +76,16 @@ class _Descent:
 
     @classmethod
     def begin(
-        cls, problem: Problem, state: State, tolerance: float, share: float, on_step: Callable[[Step], None]
+        cls,
+        problem: Problem,
+        state: State,
+        tolerance: float,
+        share: float,
+        on_step: Callable[[Step], None],
+        room: tuple[Piece, ...] | None = None,
     ) -> _Descent:
         """At `state`, before any step."""
-        pieces, residuals = problem.pieces(), problem.residuals()
+        pieces, residuals = room or problem.pieces(), problem.residuals()
         cost = problem.linearise(state, pieces, residuals)
         return cls(problem, state, tolerance, share, on_step, pieces, residuals, cost)
 
@@ -245,7 +196,7 @@ class _Descent:
         if self.early:
             if not last.accepted:  # what was filled last is not that of `state`
                 self._linearise(self.state, sums=False)
-            return _outcome(self.problem, self.state, self.cost, self.residuals, last.predicted_decrease, self.steps)
+            return outcome_of(self.problem, self.state, self.cost, self.residuals, last.predicted_decrease, self.steps)
         if not (self.care.curved and last.accepted):
             self._linearise(self.state, curved=True)
         solution = self._solve(0.0)
@@ -255,7 +206,7 @@ class _Descent:
     def outcome(self, end: Solution, left: float | None = None) -> Outcome:
         """With what was solved here, or where this is the end of the last step, which leaves so much."""
         left = end.decrease if left is None else left
-        return _outcome(self.problem, self.state, self.cost, self.residuals, left, self.steps, end)
+        return outcome_of(self.problem, self.state, self.cost, self.residuals, left, self.steps, end)
 
     def _straight(self, solution: Solution, state: State, curved: bool) -> float | None:
         """What a step to `state` costs, where an early pass may end with it although it is not small: it gains just
@@ -319,6 +270,7 @@ def minimise(
     comes_back: bool = True,
     leaves: Callable[[float, np.ndarray], bool] | None = None,
     lets_go: Callable[[float, np.ndarray], Sequence[Prior]] = lambda *_: (),
+    room: tuple[Piece, ...] | None = None,
 ) -> Outcome:
     """Minimises `problem` from `state` until half the chi^2 can fall by less than `tolerance`, or this share of it.
 
@@ -327,11 +279,12 @@ def minimise(
     `comes_back`: steps may go as far as the next ones can make good, see `_Descent`. `leaves`: asked with
     how far it has come, as a share of half the chi^2, and the border's information (B, B), whether to end when half the
     chi^2 can fall by less than HALF_WAY, or a step not far from there fails. `lets_go`: asked before it, with the same,
-    which priors are to count no more from where half the chi^2 can fall by less than HALF_WAY.
+    which priors are to count no more from where half the chi^2 can fall by less than HALF_WAY. `room`: of an outcome of
+    a problem with the same features, to be used again.
 
     Raises EstimationError if no step can be computed at all.
     """
-    at = _Descent.begin(problem, state, tolerance, share, on_step)
+    at = _Descent.begin(problem, state, tolerance, share, on_step, room)
     for _ in range(MAX_ITERATIONS):
         solution = at.solution()
         on_visit(Visit(at.state, solution.information))
@@ -358,40 +311,3 @@ def minimise(
         if not at.tries_again(solution):
             break
     return at.end(on_visit)
-
-
-def way_come(steps: Sequence[Step], cost: float) -> float:
-    """From where the first of `steps` began to half a chi^2 of `cost`, as a share of that; nothing where that is
-    nothing, or there is no step."""
-    return steps[0].cost / cost - 1.0 if steps and cost > 0.0 else 0.0
-
-
-def posterior(problem: Problem, state: State) -> Draws:
-    """Draws from the posterior at `state`. Raises NotDefiniteError."""
-    pieces = problem.pieces()
-    problem.linearise(state, pieces, problem.residuals(), curved=True)
-    return Draws.of(solve(pieces, problem.n_nodes, problem.tolerance, held=problem.held))
-
-
-def _outcome(
-    problem: Problem,
-    state: State,
-    cost: float,
-    residuals: Residuals,
-    left: float,
-    steps: list[Step],
-    end: Solution | None = None,
-) -> Outcome:
-    """`left`: what half the chi^2 can still fall by; `end`: what was solved there."""
-    converged, n = left < STALLED_DECREASE, len(steps)
-    # Half a chi^2 of d is a step of sqrt(2 d) standard deviations at most.
-    share = max(100.0 * np.sqrt(2.0 * max(left, 0.0)), 1.0)
-    status = (
-        f"converged in {n} iterations: the next step would move no parameter by more than {share:.0f} % of its "
-        "standard deviation."
-        if converged
-        else f"not converged after {n} iterations: the next step would still lower half the chi^2 of {cost:.6g} by "
-        f"{left:.3g}; give a better first guess, or check the noise in the rig file."
-    )
-    information, draws = (NOTHING, None) if end is None else (end.information, Draws.of(end))
-    return Outcome(problem, state, cost, residuals, information, tuple(steps), converged, status, draws)
