@@ -36,6 +36,15 @@ def test_what_is_undetermined_has_the_bound_of_the_result(record, judged):
     assert panel.curves[0].bound == pytest.approx(3e3 * np.sqrt([one.covariance[11, 11]] * 2))
 
 
+def test_what_is_owed_to_the_guess_is_in_every_bound(record):
+    """A camera's x and y follow its height, which nobody knows: in the plane they are off by five formal deviations."""
+    one, formal = record(0), np.zeros((2, 13))
+    formal[:, 12] = np.sqrt(one.covariance[12, 12]) * np.array([0.8, 0.6])
+    path = tuple(replace(w, std=std) for w, std in zip(one.path, formal, strict=True))
+    bound = rows([replace(one, path=path)])[-1].panels[1].curves[0].bound
+    assert bound == pytest.approx(3e3 * np.sqrt(one.covariance[12, 12] * np.array([0.64 + 0.64, 1.0])))
+
+
 def test_figures_hold_a_line_and_a_bound_for_each_run_and_entry(record):
     found = rows([record(seed) for seed in range(3)])
     drawn = plotly_figure(found[0])

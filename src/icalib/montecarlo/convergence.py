@@ -67,12 +67,15 @@ def _row(runs: Sequence[Record], block: Block) -> Row:
 
 
 def _curve(record: Record, column: int, scale: float) -> Curve:
-    """Where a parameter is held at the guess, iterations say nothing of how well it is known: the result does."""
+    """Where a parameter is held at the guess, iterations say nothing of how well it is known: the result does. What any
+    other owes to the guess the result alone says, too, so that is added throughout."""
     verdicts = [v for b in record.blocks for v in b.verdict]
     error = np.array([w.error[column] for w in record.path])
-    sigma = np.array([w.std[column] for w in record.path])
+    sigma, in_the_end = np.array([w.std[column] for w in record.path]), record.covariance[column, column]
     if verdicts[column] == "undetermined":
-        sigma = np.full(len(error), np.sqrt(record.covariance[column, column]))
+        sigma = np.full(len(error), np.sqrt(in_the_end))
+    elif len(sigma):
+        sigma = np.sqrt(sigma**2 + max(in_the_end - sigma[-1] ** 2, 0.0))
     return Curve(record.seed, scale * np.abs(error), scale * SIGMAS * sigma)
 
 
