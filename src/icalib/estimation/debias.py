@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from scipy.special import stdtrit  # of scipy.stats, whose import takes half a second
+from scipy.special import stdtrit  # not scipy.stats, whose import takes 0.4 s
 
 from icalib.estimation.arrowhead import Piece, solve
 from icalib.estimation.border import DETERMINED, HELD_BELOW, least_information
@@ -70,7 +70,7 @@ def spurious_information(
     scaled = t[:, None] * outcome.information * t
     least = least_information(outcome.information, t)
     samples = (outcome.draws or posterior(problem, outcome.state)).still
-    noise, first = _Noise(problem, outcome, outcome.room or problem.room()), _reading_noise(problem.chain.imu, rng)
+    noise, first = _Noise(problem, outcome), _reading_noise(problem.chain.imu, rng)
     one_side = noise.there(1.0, samples[0].chain, first)
     if least > DETERMINED and _largest_share(t[:, None] * one_side * t, scaled) < NEGLIGIBLE:
         return Spurious(one_side[None])
@@ -87,11 +87,10 @@ def spurious_information(
 
 @dataclass(frozen=True)
 class _Noise:
-    """What noise adds to the border's information at an outcome; room: see Problem.room."""
+    """What noise adds to the border's information at an outcome, in the room of which it is found."""
 
     problem: Problem
     outcome: Outcome
-    room: tuple[Piece, ...] | None
 
     def added(self, chain: np.ndarray, readings: np.ndarray | None) -> np.ndarray:
         """(B, B) on average, where the trajectory is off by +-chain (K, 15), and the readings by as often that."""
@@ -102,7 +101,7 @@ class _Noise:
         and what is odd in it."""
         there = self.outcome.state.retract(self.problem.layout, sign * chain, np.zeros(self.problem.layout.size))
         noisy = self.problem if readings is None else _with_noise(self.problem, there, sign * readings)
-        return _information(noisy, there, self.room) - self.outcome.information
+        return _information(noisy, there, self.outcome.room) - self.outcome.information
 
     def followed(self, chain: np.ndarray, readings: np.ndarray) -> np.ndarray:
         """(B, B), where the trajectory follows noise of the `readings` beside a draw `chain` (K, 15) of its posterior,
@@ -113,7 +112,7 @@ class _Noise:
 
     def _step(self, problem: Problem) -> np.ndarray:
         """(K, 15) where the solver would move the chain alone."""
-        pieces = self.room or problem.pieces()
+        pieces = self.outcome.room or problem.pieces()
         problem.linearise(self.outcome.state, pieces, problem.residuals(), curved=True)
         factors = solve(pieces, problem.n_nodes, problem.tolerance).factors
         border = np.append(np.zeros(problem.layout.size), 1.0)[:, None]

@@ -214,26 +214,6 @@ def take_trials(points, start):
 
 
 @njit(cache=True, nogil=True)
-def held_back(own, gradient):
-    """Twice what points of sums own (T, 3, 3) and gradient (T, 3) would still take off the cost if they could: those
-    that an image's edge stops. It pulls at poses and calibration as it should, but is no gain of a step.
-
-    A point at a camera's very centre has no inverse; what is not known of it promises nothing.
-    """
-    A, values, vectors, total = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), 0.0
-    for t in range(len(own)):
-        A[:] = own[t]
-        eigen3(A, values, vectors)
-        for k in range(3):
-            if values[k] > NO_INVERSE * values[2]:
-                along = 0.0
-                for a in range(3):
-                    along += vectors[a, k] * gradient[t, a]
-                total += along * along / values[k]
-    return total
-
-
-@njit(cache=True, nogil=True)
 def _ray_axes(eye, point, axes):
     """axes (3, 3): rows of length one, the last from `eye` to `point`; returns how far it is."""
     x, y, z = point[0] - eye[0], point[1] - eye[1], point[2] - eye[2]
@@ -286,6 +266,26 @@ def _move(eye, axes, distance, d, point):
         size += point[a] * point[a]
     for a in range(3):
         point[a] = eye[a] + point[a] / (np.sqrt(size) * nearness)
+
+
+@njit(cache=True, nogil=True)
+def held_back(own, gradient):
+    """Twice what points of sums own (T, 3, 3) and gradient (T, 3) would still take off the cost if they could: those
+    that an image's edge stops. It pulls at poses and calibration as it should, but is no gain of a step.
+
+    A point at a camera's very centre has no inverse; what is not known of it promises nothing.
+    """
+    A, values, vectors, total = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), 0.0
+    for t in range(len(own)):
+        A[:] = own[t]
+        eigen3(A, values, vectors)
+        for k in range(3):
+            if values[k] > NO_INVERSE * values[2]:
+                along = 0.0
+                for a in range(3):
+                    along += vectors[a, k] * gradient[t, a]
+                total += along * along / values[k]
+    return total
 
 
 @njit(cache=True, nogil=True)

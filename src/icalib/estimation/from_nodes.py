@@ -66,7 +66,7 @@ def nothing_carried(width):
     return Carried(np.full(2, -1), np.empty(1), so_far)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, inline="always")  # as in integration.py
 def integrate_from_node(node, t0, t1, first, bias, readings, by, carried, out):
     """As `integrate`, without a covariance. What was `carried` from the same node in the same direction, and not
     as far as t1, is carried on, so that many instants (`in_order_of_nodes`) cost little more than the last one."""

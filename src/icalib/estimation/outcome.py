@@ -41,7 +41,7 @@ class Outcome:
     """Where the solver ended, with a status that is a sentence. problem: the one that was solved, points of the scene
     looked for where they were; information (B, B): of the border at `state`, the chain marginalised, no damping; empty,
     and no draws, where another pass follows. half_way: left before its end, because more seemed of no use. room: the
-    pieces that it was solved in, to be filled anew, where they are worth keeping (see Problem.room)."""
+    pieces that it was solved in, to be filled anew; None without features, whose fronts alone are worth keeping."""
 
     problem: Problem
     state: State

@@ -80,10 +80,6 @@ class Problem:
         pieces = make_pieces(self.n_nodes, self.layout.size if sums else None)
         return tuple(self.with_features(p, len(pieces) > 1) for p in pieces) if sums else pieces
 
-    def room(self) -> tuple[Piece, ...] | None:
-        """Pieces that are worth keeping from solve to solve: fronts of features are large; None without these."""
-        return None if self.features is None else self.pieces()
-
     def with_features(self, piece: Piece, keep: bool = False) -> Piece:
         """The piece with room for the features seen from its nodes; `keep`: another piece shares a node with it."""
         return piece if self.features is None else self.features.attach(piece, keep)
