@@ -213,13 +213,12 @@ def test_a_path_that_lost_its_way_goes_on_in_another_map(free_robot):
 
 
 def test_a_long_path_is_followed_in_two_parts_at_once(free_robot, monkeypatch):
-    """Unless it has to be whole; as good as in one, but for a second between the two maps."""
+    """As good as in one, but for a second between the two maps."""
     scans = scans_of(free_robot.streams[0])
     one = lidar_path("lidar0", scans, whole=False)
     monkeypatch.setattr(lidar_odometry, "MANY", len(scans))
-    two, whole = lidar_path("lidar0", scans, whole=False), lidar_path("lidar0", scans)
-    assert one.ok.all() and whole.ok.all()
-    np.testing.assert_array_equal(whole.rotation, one.rotation)
+    two = lidar_path("lidar0", scans, whole=False)
+    assert one.ok.all()
     n = len(scans) // 2
     np.testing.assert_array_equal(two.rotation[:n], one.rotation[:n])
     np.testing.assert_array_equal(two.rotation[n], np.eye(3))
@@ -228,6 +227,39 @@ def test_a_long_path_is_followed_in_two_parts_at_once(free_robot, monkeypatch):
     for own in (slice(0, n), slice(n, len(scans))):
         errors, met = turns_between(free_robot, two, own.start, own.stop)
         assert met > 50 and errors.max() < 0.02
+
+
+def poses_in_first(path):
+    """Rotations and positions of all scans seen from the first."""
+    back = path.rotation[0].T
+    return back @ path.rotation, (path.position - path.position[0]) @ back.T
+
+
+def test_parts_of_a_path_that_is_to_be_whole_are_joined(free_robot, monkeypatch):
+    scans = scans_of(free_robot.streams[0])
+    one = lidar_path("lidar0", scans)
+    monkeypatch.setattr(lidar_odometry, "MANY", len(scans))
+    joined = lidar_path("lidar0", scans)
+    assert joined.ok.all() and len(joined.seconds) == len(scans)
+    n = len(scans) // 2 + lidar_odometry.SHARED
+    np.testing.assert_array_equal(joined.rotation[:n], one.rotation[:n])
+    assert not np.array_equal(joined.rotation[n:], one.rotation[n:])  # of another map
+    (R, p), (R_one, p_one) = poses_in_first(joined), poses_in_first(one)
+    apart = so3.log_many(np.ascontiguousarray(R_one.transpose(0, 2, 1) @ R))
+    assert np.linalg.norm(apart, axis=1).max() < np.deg2rad(0.5)
+    assert np.linalg.norm(p - p_one, axis=1).max() < 0.03
+
+
+@pytest.mark.parametrize("many", [1, 10**6])
+def test_parts_that_share_too_little_are_not_joined(free_robot, monkeypatch, many: int):
+    """The scans that both would share are of elsewhere, where the first map ends: the second is worth nothing."""
+    scans = scans_of(free_robot.streams[0])
+    middle = len(scans) // 2
+    away = slice(middle, middle + lidar_odometry.SHARED)
+    scans[away] = [replace(s, xyz=s.xyz * [-1.0, -1.0, 1.0] + [3.0, 0.0, 1.0]) for s in scans[away]]
+    monkeypatch.setattr(lidar_odometry, "MANY", many)
+    with pytest.raises(EstimationError, match=f"only {middle} of {len(scans)} scans fit"):
+        lidar_path("lidar0", scans)
 
 
 def test_a_path_begins_later_where_its_first_map_leads_nowhere(free_robot):

@@ -326,26 +326,26 @@ def _gram(rows, G):
 
 
 @njit(cache=True, nogil=True)
-def _add_feature(A, pair, t, own_side, chained, direct, features):
+def _add_feature(A, pair, t, own_side, chained, direct, features, by_pose):
     """One observation's rows A into the sums of its feature; own_side (6, c): camera pose by the border, its columns
-    `chained` (c,)."""
-    D, n_b, n_d, side = len(A) - 1, features.side.shape[2] - 1, len(direct), features.side[t]
-    block = features.block[pair]
+    `chained` (c,); by_pose (6,): work space."""
+    D, n_b, side, block = len(A) - 1, features.side.shape[2] - 1, features.side[t], features.block[pair]
     for a in range(3):
         f0, f1 = A[D - 3 + a, 0], A[D - 3 + a, 1]
         for k in range(3):
             features.own[t, a, k] += f0 * A[D - 3 + k, 0] + f1 * A[D - 3 + k, 1]
         side[a, n_b] += f0 * A[D, 0] + f1 * A[D, 1]
-        for q in range(n_d):
+        for q in range(len(direct)):
             if direct[q] >= 0:
                 side[a, direct[q]] += f0 * A[6 + q, 0] + f1 * A[6 + q, 1]
         for d in range(6):
-            block[a, d] += f0 * A[d, 0] + f1 * A[d, 1]
+            by_pose[d] = f0 * A[d, 0] + f1 * A[d, 1]
+            block[a, d] += by_pose[d]
         for j in range(len(chained)):
             if chained[j] >= 0:
                 s = 0.0
                 for d in range(6):
-                    s += (f0 * A[d, 0] + f1 * A[d, 1]) * own_side[d, j]
+                    s += by_pose[d] * own_side[d, j]
                 side[a, chained[j]] += s
 
 
@@ -355,7 +355,7 @@ def accumulate(X, seen, base, motion, seeing, weighing, sums, features, residual
     Returns half the robust chi^2."""
     n_d = len(seeing.pars)
     A, G, error = np.zeros((10 + n_d, 2)), np.empty((7 + n_d, 7 + n_d)), np.empty(2)
-    most = 0
+    by_pose, most = np.empty(6), 0
     for i in range(len(seen.start) - 1):
         most = max(most, seen.start[i + 1] - seen.start[i])
     rows = np.empty((2 * most, 7 + n_d))
@@ -384,7 +384,7 @@ def accumulate(X, seen, base, motion, seeing, weighing, sums, features, residual
                     rows[m + r, a] = A[a, r]
                 rows[m + r, 6 + n_d] = A[D, r]
             m += 2
-            _add_feature(A, seen.pair[n] - base.pair, t, Tc, motion.columns[i], seeing.columns, features)
+            _add_feature(A, seen.pair[n] - base.pair, t, Tc, motion.columns[i], seeing.columns, features, by_pose)
         if wanted:
             _gram(rows[:m], G)
             add_image(seen.node[i], G, Tn, Tm, Tc, motion.columns[i], seeing.columns, sums)

@@ -1,4 +1,4 @@
-"""Compiled passes over which plane each point of a LiDAR lies on: tens of millions of numbers."""
+"""Compiled passes over the points of a LiDAR, tens of millions, and over which plane each lies on."""
 
 from __future__ import annotations
 
@@ -7,6 +7,16 @@ from numba import njit
 
 COARSE_POINTS = 3_000_000  # of a LiDAR, where some of its points will do
 FEW = 20_000  # points of a plane that are all looked at
+
+
+@njit(cache=True, nogil=True)
+def are_somewhere(xyz):
+    """(N,) bool which points xyz (N, 3) are anywhere but at the LiDAR itself: finite, and not all zeros."""
+    out = np.empty(len(xyz), np.bool_)
+    for i in range(len(xyz)):
+        size2 = xyz[i, 0] * xyz[i, 0] + xyz[i, 1] * xyz[i, 1] + xyz[i, 2] * xyz[i, 2]
+        out[i] = np.isfinite(size2) and size2 > 0.0
+    return out
 
 
 @njit(cache=True, nogil=True)
@@ -21,9 +31,12 @@ def count_points(plane, n):
 
 @njit(cache=True, nogil=True)
 def _some(plane, step, count, out):
+    due = 0
     for i in range(len(plane)):
         q = plane[i]
-        out[i] = q if i % step == 0 or (q >= 0 and count[q] < FEW) else -1
+        out[i] = q if i == due or (q >= 0 and count[q] < FEW) else -1
+        if i == due:
+            due += step
 
 
 def thinned(plane: np.ndarray) -> np.ndarray:

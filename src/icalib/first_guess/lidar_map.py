@@ -237,6 +237,21 @@ def sums(voxels, pose, xyz, tau, around, scale, H, g):
 
 
 @njit(cache=True, nogil=True)
+def pick(xyz, offset, chosen, middle, nearest, points, tau):
+    """Fills points (n, 3) and tau (n,), offsets from `middle`, with those of `chosen` (n,) that are somewhere, and
+    further than `nearest`; returns how many."""
+    count = 0
+    for i in chosen:
+        x, y, z = np.float64(xyz[i, 0]), np.float64(xyz[i, 1]), np.float64(xyz[i, 2])
+        size2 = x * x + y * y + z * z
+        if np.isfinite(size2) and size2 > nearest * nearest:
+            points[count, 0], points[count, 1], points[count, 2] = x, y, z
+            tau[count] = np.float64(offset[i]) - middle
+            count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
 def turn_back(xyz, which, turns):
     """Points xyz (n, 3) turned by turns[which] each, in place."""
     for n in range(len(xyz)):

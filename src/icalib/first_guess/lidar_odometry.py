@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.first_guess.lidar_map import ScanPose, VoxelMap, insert, turn_back
+from icalib.estimation.arrowhead import THREADS
+from icalib.first_guess.lidar_map import ScanPose, VoxelMap, insert, pick, turn_back
 from icalib.first_guess.lidar_registration import Expected, expected_pose, register
 from icalib.measurements import LidarStream
 
@@ -29,7 +30,8 @@ EDGES_M = (0.3, 2.0)
 CAPACITY = 1 << 17
 LAST_SCALE, LAST_SCALE_TURNED = 0.2, 0.1
 MOST_LOST = 5  # scans in a row that do not fit the map, before there is another
-MANY = 200  # scans: worth two maps where these need not be one
+MANY = 200  # scans: worth two maps
+SHARED, FEWEST_SHARED = 20, 5  # scans that are in both maps, where these are to be one
 FEW = 10  # scans on a map that is no loss: its first scan may show too little of what the next ones see
 LEAST_NEAR = 0.3  # of a scan's points must lie on the map's planes
 FIRST_ROUNDS = 4  # to find how the LiDAR moved in its first scan, which makes the map
@@ -63,7 +65,8 @@ class Scan:
 
 def scans_of(stream: LidarStream) -> list[Scan]:
     """Some points of each scan. Raises EstimationError where scans are too few."""
-    scans = [_scan_of(stream, i) for i in range(len(stream.stamps_ns))]
+    with ThreadPoolExecutor(THREADS) as pool:
+        scans = list(pool.map(lambda i: _scan_of(stream, i), range(len(stream.stamps_ns))))
     scans = [s for s in scans if len(s.tau) >= FEWEST_POINTS]
     if len(scans) < FEWEST_SCANS:
         raise EstimationError(
@@ -87,7 +90,7 @@ def lidar_path(
         scans = [_turned(s, turning) for s in scans]
     reach = float(np.median([np.median(np.linalg.norm(s.xyz, axis=1)) for s in scans]))
     edge_m = float(np.clip(reach / VOXELS_IN_REACH, *EDGES_M))
-    poses, ok = _follow(scans, known, edge_m, True) if whole else _follow_in_parts(scans, known, edge_m)
+    poses, ok = (_follow_joined if whole else _follow_in_parts)(scans, known, edge_m)
     if ok.mean() < 0.5:
         raise EstimationError(
             f"{name}: only {ok.sum()} of {len(scans)} scans fit the surfaces that others show; there may be too "
@@ -105,10 +108,9 @@ def _scan_of(stream: LidarStream, i: int) -> Scan:
     chosen = spread(len(offset), MOST_MAPPED, i)
     for part in np.split(chosen, (MOST_WIDE, MOST_MATCHED)):
         part.sort()  # one after the other they mostly fall into the same voxels, which are at hand then
-    points = xyz[chosen].astype(np.float64)
-    size2 = (points**2).sum(axis=1)
-    good = np.isfinite(size2) & (size2 > NEAREST_M**2)
-    return Scan(float(stream.seconds[i]) + middle, points[good], offset[chosen][good].astype(np.float64) - middle)
+    points, tau = np.empty((len(chosen), 3)), np.empty(len(chosen))
+    n = pick(xyz, offset, chosen, middle, NEAREST_M, points, tau)
+    return Scan(float(stream.seconds[i]) + middle, points[:n], tau[:n])
 
 
 def spread(n: int, most: int, begin: int) -> np.ndarray:
@@ -155,12 +157,42 @@ def _follow_in_parts(scans: list[Scan], known: _Known, edge_m: float) -> tuple[l
     """As `_follow`, in several maps: a long path is two, each on a thread."""
     n, seconds = len(scans), np.array([s.middle for s in scans])
     parts = [slice(0, n)] if n < MANY else [slice(0, n // 2), slice(n // 2, n)]
-    with ThreadPoolExecutor(len(parts)) as pool:
-        found = list(pool.map(lambda own: _follow(scans[own], known.some(own), edge_m, False), parts))
+    found = _follow_at_once(scans, known, edge_m, parts, False)
     ok = np.concatenate([fits for _, fits in found])
     for own in parts[1:]:
         ok[own] &= seconds[own] > seconds[own.start - 1] + LONGEST_STEP_S
     return [pose for poses, _ in found for pose in poses], ok
+
+
+def _follow_joined(scans: list[Scan], known: _Known, edge_m: float) -> tuple[list[ScanPose], np.ndarray]:
+    """As `_follow`, in one map: of a long path two that share some scans are made at once, and joined by these."""
+    middle = len(scans) // 2
+    if len(scans) >= MANY:
+        parts = [slice(0, middle + SHARED), slice(middle, len(scans))]
+        (before, fits), (after, fit_after) = _follow_at_once(scans, known, edge_m, parts, True)
+        both = np.flatnonzero(fits[middle:] & fit_after[:SHARED])
+        if len(both) >= FEWEST_SHARED:
+            joined = _in_map_of([before[middle + k] for k in both], [after[k] for k in both], after[SHARED:])
+            return [*before, *joined], np.concatenate([fits, fit_after[SHARED:]])
+    return _follow(scans, known, edge_m, True)
+
+
+def _follow_at_once(
+    scans: list[Scan], known: _Known, edge_m: float, parts: list[slice], whole: bool
+) -> list[tuple[list[ScanPose], np.ndarray]]:
+    """`_follow` of each of the parts, on a thread of its own."""
+    with ThreadPoolExecutor(len(parts)) as pool:
+        return list(pool.map(lambda own: _follow(scans[own], known.some(own), edge_m, whole), parts))
+
+
+def _in_map_of(here: list[ScanPose], there: list[ScanPose], others: list[ScanPose]) -> list[ScanPose]:
+    """The poses `others` of the map of `there` in that of `here`, which are of the same scans."""
+    u, _, vt = np.linalg.svd(
+        sum((a.rotation @ b.rotation.T for a, b in zip(here, there, strict=True)), np.zeros((3, 3)))
+    )
+    R = u @ vt  # the mean: all are near one another
+    p = np.mean([a.position - R @ b.position for a, b in zip(here, there, strict=True)], axis=0)
+    return [ScanPose(R @ x.rotation, p + R @ x.position, x.rate, R @ x.velocity) for x in others]
 
 
 def _follow(scans: list[Scan], known: _Known, edge_m: float, whole: bool) -> tuple[list[ScanPose], np.ndarray]:

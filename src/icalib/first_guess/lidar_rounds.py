@@ -19,7 +19,7 @@ from icalib.estimation.estimate import first_pass
 from icalib.estimation.inputs import Inputs, origin_difference, with_clouds
 from icalib.estimation.lidar_binning import Associated, LidarNoise, Moments, take_moments
 from icalib.estimation.lidar_sweep import Motion, sweep
-from icalib.estimation.point_planes import thinned
+from icalib.estimation.point_planes import are_somewhere, thinned
 from icalib.estimation.robot import COARSE_BIN_S, FIRST_RANGE_M, MOUNT, Clouds, joined_clouds, known_planes
 from icalib.estimation.state import Key, State
 from icalib.first_guess.align_camera import trusted
@@ -196,9 +196,7 @@ def while_known(inputs: Inputs, state: State) -> Inputs:
                 f"{np.count_nonzero(~known)} of {len(known)} scans of {stream.name} are left out: nothing else shows "
                 "the motion then."
             )
-        size2 = np.einsum("na,na->n", stream.xyz, stream.xyz)
-        usable = np.isfinite(size2) & (size2 > 0.0)
-        lidars.append(stream.some(np.repeat(known, np.diff(stream.start)) & usable))
+        lidars.append(stream.some(np.repeat(known, np.diff(stream.start)) & are_somewhere(stream.xyz)))
     return replace(inputs, measurements=replace(measured, lidars=tuple(lidars), notes=tuple(notes)))
 
 
