@@ -16,7 +16,7 @@ from itertools import pairwise
 import numpy as np
 
 from icalib.estimation import lidar_kernels
-from icalib.estimation.arrowhead import Piece
+from icalib.estimation.arrowhead import Piece, in_parallel
 from icalib.estimation.clocks import by_clock, instants, mounted_columns, offset_at
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.lidar_binning import BIN_S, Associated, LidarNoise, Moments, take_moments
@@ -77,9 +77,18 @@ class LidarFactor:
             stream.name, moments, node, walked, np.zeros((entries, 3, ROWS), np.float32),
             np.zeros((entries, 3), np.float32), planes, motion.imu, motion.gravity, scheme, layout, n_nodes,
         )  # fmt: skip
-        for bins, moving, at in factor._chunks(motion.state, 0, len(node)):
-            lidar_kernels.turn_by_noise(bins, moving, at)
+        factor._turn_by_noise(motion.state)
         return factor
+
+    def _turn_by_noise(self, state: State) -> None:
+        """Fills `turned` and `slope`, on two threads."""
+
+        def turn(ends: tuple[int, int]) -> None:
+            for bins, moving, at in self._chunks(state, *ends):
+                lidar_kernels.turn_by_noise(bins, moving, at)
+
+        middle = len(self.node) // 2
+        in_parallel(turn, [(0, middle), (middle, len(self.node))])
 
     @cached_property
     def _of_planes(self) -> np.ndarray:
