@@ -88,7 +88,7 @@ def lidar_path(
     known = _Known.of(seconds, turning, moving)
     if turning is not None:
         scans = [_turned(s, turning) for s in scans]
-    reach = float(np.median([np.median(np.linalg.norm(s.xyz[:MOST_WIDE], axis=1)) for s in scans]))
+    reach = float(np.median([np.median(np.linalg.norm(s.xyz, axis=1)) for s in scans]))
     edge_m = float(np.clip(reach / VOXELS_IN_REACH, *EDGES_M))
     poses, ok = (_follow_joined if whole else _follow_in_parts)(scans, known, edge_m)
     if ok.mean() < 0.5:
