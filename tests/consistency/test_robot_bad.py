@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from icalib.calibration import Calibration
-from icalib.errors import CalibrationError
+from icalib.errors import CalibrationError, EstimationError
+from icalib.first_guess import lidar_rounds
 from icalib.geometry import so3
 from icalib.measurements import LidarStream, Measurements, WheelStream
 from icalib.pipeline import calibrate_measurements
@@ -159,6 +160,19 @@ def test_a_corridor_is_told(drive, seconds: float, faces: list[int], known: bool
     sure = np.array([v != "undetermined" for v in translation.verdict])
     off = translation.value - simulation.truth.T_imu_lidar["lidar0"][:3, 3]
     assert (np.abs(off) < 4.0 * translation.std)[sure].all()
+
+
+def test_a_corridor_is_told_where_no_plane_is_found_any_more(drive, monkeypatch):
+    """Along a corridor the estimate may lead so far away that walls are no walls in the next round."""
+    simulation = drive("3d", 12.0, "l")
+    corridor = with_scans(simulation.measurements, partial(seeing, [0, 2]))
+
+    def nothing(*_):
+        raise EstimationError("lidar0 saw no flat surface of 0.7 m^2 or more.")
+
+    monkeypatch.setattr(lidar_rounds, "associate", nothing)
+    assert "surfaces that lidar0 sees face two directions only" in refusal(guessed(simulation), corridor)
+    assert "lidar0 saw no flat surface" in refusal(guessed(simulation), simulation.measurements.unassociated())
 
 
 def calibrated(simulation: Simulation, damage: Damage) -> Calibration:

@@ -99,6 +99,12 @@ def with_lidars(inputs: Inputs, state: State) -> tuple[Inputs, State]:
     if any((s.plane >= 0).any() for streams in recordings for s in streams):
         clouds = joined_clouds([known_planes(streams) for streams in recordings])
         return with_clouds(inputs, clouds), replace(state, values=state.values | fitted_planes(inputs, state, clouds))
+    with naming_sight(inputs.measurements.lidars):
+        return _led_by_rounds(inputs, state, recordings)
+
+
+def _led_by_rounds(inputs: Inputs, state: State, recordings: Sequence[tuple[LidarStream, ...]]) -> tuple[Inputs, State]:
+    """See `with_lidars`: all rounds but the last with fewer points."""
     step = odd_step(sum(len(s.xyz) for s in inputs.measurements.lidars))
     fewer = _thinned(inputs, step)
     found: Sequence[Association | None] = [None] * len(recordings)
@@ -106,8 +112,7 @@ def with_lidars(inputs: Inputs, state: State) -> tuple[Inputs, State]:
     for k in range(ROUNDS - 1):
         fewer, state, found = _associated(fewer, state, k, found)
         shares.append(_share(fewer.clouds))
-        with naming_sight(inputs.measurements.lidars):
-            state = first_pass(fewer, state)
+        state = first_pass(fewer, state)
     before = [
         _of_all(a, streams, first, step)
         for a, streams, first in zip(found, recordings, _firsts(recordings), strict=True)
