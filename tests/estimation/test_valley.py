@@ -59,6 +59,13 @@ class Bowl(OneNumber):
         return np.array([y, LARGE + 0.5 * y**2 / LARGE]), np.array([1.0, y / LARGE])
 
 
+class Turn(OneNumber):
+    """Residual LARGE atan(y): from far out a whole step leads further out, on the other side."""
+
+    def rows(self, y: float) -> tuple[np.ndarray, np.ndarray]:
+        return np.array([LARGE * np.arctan(y)]), np.array([LARGE / (1.0 + y * y)])
+
+
 class Slope(OneNumber):
     """Residual 2 (y - 3) + `bend` y^2, and how often sums were asked for."""
 
@@ -111,3 +118,12 @@ def test_the_last_pass_makes_its_sums_anew_after_a_step_that_gained_what_was_for
     slope = Slope(0.0)
     minimise(slope, at(0.0))
     assert slope.asked > 1
+
+
+def test_an_early_pass_finds_the_damping_it_needs_in_few_tries_and_lets_go_of_it_in_few():
+    outcome = minimise(Turn(), at(2.0), tolerance=0.5)
+    assert abs(outcome.state.values[KEY][0]) < 1e-2
+    tries = next(k for k, s in enumerate(outcome.steps) if s.accepted)
+    assert 1 <= tries <= 3
+    assert len(outcome.steps) <= tries + 5
+    assert outcome.steps[-1].damping == 0.0

@@ -34,7 +34,7 @@ NEARLY_A_PERIOD = 0.15  # of the period
 # Of the times of points within a scan: by how much they may look stretched, against 0.0015 where they are right, 0.06
 # and more where they are half or twice as long; and in how many standard deviations it must show.
 STRETCHED, CLEARLY = 0.03, 10.0
-HALF_STEP_S = np.float32(2e-3)  # of a difference of positions
+HALF_STEP_S = np.float32(2e-3)  # of a difference of residuals
 # Correlations of residuals of poses with their neighbours. Of white noise between poses, steps have -0.5.
 CORRELATED, ALTERNATING = 0.5, 0.35
 CLIP = 4.0  # standard deviations
@@ -281,11 +281,12 @@ def _stretch(inputs: Inputs, found: Estimate, index: int) -> tuple[float, float]
     if len(plane) < FEWEST_FITTED:
         return 0.0, np.inf
     later, earlier = (
-        in_world(motion, replace(stream, offset_s=stream.offset_s + step))[0] for step in (HALF_STEP_S, -HALF_STEP_S)
+        _on_planes(*in_world(motion, replace(stream, offset_s=stream.offset_s + step)), values[plane])[0]
+        for step in (HALF_STEP_S, -HALF_STEP_S)
     )
-    speed = np.einsum("na,na->n", values[plane, :3], later - earlier) / (2.0 * float(HALF_STEP_S))
+    speed = (later.astype(np.float64) - earlier) / (2.0 * float(HALF_STEP_S))
     by_stretch = speed * (stream.offset_s - stream.offset_s.mean(dtype=np.float64))
-    residual = _on_planes(*in_world(motion, stream), values[plane])[0].astype(np.float64)
+    residual = 0.5 * (later.astype(np.float64) + earlier)
     information = max(float(by_stretch @ by_stretch), 1e-30)
     return -float(by_stretch @ residual) / information, float(residual.std()) / np.sqrt(information)
 

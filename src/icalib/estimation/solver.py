@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,16 +29,30 @@ OVERSHOT = 0.5  # of what a step promises: one that gains or costs less than thi
 ACROSS = 1e-6  # damping of a step that comes back: across a valley, not along it
 RESTING = 20.0  # times the tolerance of an early pass: a step that promises less and fails ends it
 FIRST_DAMPING = 1e-8
-ZERO_DAMPING = 1e-10  # below this, none: the weak information of a planar drive must not be swamped
-SMALL_DECREASE = 0.02  # of half the chi^2: a step of a fifth of a standard deviation, all parameters together
+SMALL_DECREASE = 0.5  # of half the chi^2: a step of one standard deviation, all parameters together
 LEAST_DECREASE = 2e-5  # of half the chi^2: a step of 0.006 standard deviations, not worth a relinearisation
+
+
+class _Pace(NamedTuple):
+    """Of damping: what it is at first, by what it grows where a step fails and shrinks where one is good, and below
+    what there is none: the weak information of a planar drive must not be swamped."""
+
+    first: float
+    more: float
+    less: float
+    none: float
+
+
+SLOW = _Pace(1e-6, 10.0, 0.1, 1e-10)
+QUICK = _Pace(1e-4, 100.0, 0.01, 2e-6)  # where a pass is only to lead near
 
 
 @dataclass
 class _Care:
-    """How steps are held back: by damping, and by weights alone in place of the true curvature of the loss, which the
-    sums have (`curved`) where a step promises less than `curved_below` of the cost."""
+    """How steps are held back: by damping, at its `pace`, and by weights alone in place of the true curvature of the
+    loss, which the sums have (`curved`) where a step promises less than `curved_below` of the cost."""
 
+    pace: _Pace
     damping: float = 0.0
     curved: bool = False
     curved_below: float = CURVED_BELOW
@@ -45,16 +60,21 @@ class _Care:
     def less(self, near: bool, good: bool) -> None:
         """After a step that was taken, to sums that have the true curvature where `near`."""
         self.curved = near
-        self.damping *= 0.1 if good else 1.0
-        self.damping = 0.0 if self.damping < ZERO_DAMPING else self.damping
+        self.damping *= self.pace.less if good else 1.0
+        self.damping = 0.0 if self.damping < self.pace.none else self.damping
 
     def more(self) -> None:
         """After one that failed: too far out for the true curvature, so weights alone, and only then more damping."""
         if self.curved:
             self.curved_below *= 0.1
         else:
-            self.damping = max(self.damping * 10.0, 1e-6)
+            self.damping = max(self.damping * self.pace.more, self.pace.first)
         self.curved = False
+
+
+def _is_early(tolerance: float) -> bool:
+    """Whether a pass that ends at this tolerance is followed by another."""
+    return tolerance > STALLED_DECREASE
 
 
 @dataclass
@@ -70,8 +90,8 @@ class _Descent:
     pieces: tuple[Piece, ...]
     residuals: Residuals
     cost: float
+    care: _Care
     steps: list[Step] = field(default_factory=list)
-    care: _Care = field(default_factory=_Care)
     stalled: int = 0
 
     @classmethod
@@ -87,12 +107,13 @@ class _Descent:
         """At `state`, before any step."""
         pieces, residuals = room or problem.pieces(), problem.residuals()
         cost = problem.linearise(state, pieces, residuals)
-        return cls(problem, state, tolerance, share, on_step, pieces, residuals, cost)
+        care = _Care(QUICK if _is_early(tolerance) else SLOW)
+        return cls(problem, state, tolerance, share, on_step, pieces, residuals, cost, care)
 
     @property
     def early(self) -> bool:
         """Whether another pass follows."""
-        return self.tolerance > STALLED_DECREASE
+        return _is_early(self.tolerance)
 
     @property
     def enough(self) -> float:

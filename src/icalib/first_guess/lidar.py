@@ -63,11 +63,13 @@ class Held:
 
 @dataclass(frozen=True)
 class LidarGuess:
-    """Of a LiDAR, or whatever else has a path: R_imu_lidar, p_imu_lidar (3,) m; offset: as in `Held`."""
+    """Of a LiDAR, or whatever else has a path: R_imu_lidar, p_imu_lidar (3,) m; offset: as in `Held`; turned: whether
+    it turned about more than one axis, which shows all of its rotation."""
 
     rotation: np.ndarray
     position: np.ndarray
     offset: float
+    turned: bool = False
 
     def values(self, name: str) -> dict[Key, np.ndarray]:
         """As lasting parameters of a state."""
@@ -125,7 +127,8 @@ def motion_of_path(
     level, R_imu = _level(x[6:9]), path.rotation @ R_il.T
     position = (path.position - R_imu @ x[3:6]) @ level.T
     start = ImuMotion(gyro, t, level @ R_imu, position, np.zeros_like(position), aligned.gyro_bias, x[9:12], gravity)
-    guess, left = LidarGuess(R_il, x[3:6], aligned.offset), left_over(system, R_il, x)
+    turned = only_axis(rates.rate, ONE_AXIS) is None
+    guess, left = LidarGuess(R_il, x[3:6], aligned.offset, turned), left_over(system, R_il, x)
     return FromPath(guess, start.smoothed(), float(np.linalg.norm(x[6:9])), level, left)
 
 

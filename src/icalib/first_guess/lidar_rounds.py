@@ -84,7 +84,9 @@ def _state_of_one(inputs: Inputs, held: Held | None = None) -> State:
             raise
         # The motion shows too little; the rig file's guess stands in.
         guess, motion = lidar_and_motion(inputs.imu, stream, inputs.rig.gravity, known)
-    values = start_values(inputs, guess.values(lidar.name) | given(inputs, lidar, NAMES))
+    # What turns show is nearer than a guess, with which planes would be thick, and steps towards them lead astray.
+    names = ("translation", *_trusted(lidar)) if guess.turned else NAMES
+    values = start_values(inputs, guess.values(lidar.name) | given(inputs, lidar, names))
     hosts = {(x.name, "time_offset"): values[lidar.name, "time_offset"] for x in inputs.rig.lidars}
     nodes = nodes_for(inputs, host_times(inputs, hosts)[:1])
     rotation, position, velocity = motion.at(nodes)
@@ -94,7 +96,7 @@ def _state_of_one(inputs: Inputs, held: Held | None = None) -> State:
 def with_lidars(inputs: Inputs, state: State) -> tuple[Inputs, State]:
     """`inputs` with points of the LiDARs on planes, and `state`, which has the motion and a guess of all, with the
     planes, led on by the rounds. Raises EstimationError where there are no planes."""
-    inputs = replace(while_known(inputs, state), guess=state)
+    inputs = while_known(inputs, state)
     recordings = points_by_recording(inputs)
     if any((s.plane >= 0).any() for streams in recordings for s in streams):
         clouds = joined_clouds([known_planes(streams) for streams in recordings])
@@ -206,14 +208,18 @@ def while_known(inputs: Inputs, state: State) -> Inputs:
 
 
 def lidar_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
-    """Of all LiDARs that `state` does not have, which has the motion: what the rig gives, or what their scans show.
+    """Of all LiDARs that `state`, which has the motion, does not have: what the rig gives, or what their scans show; of
+    the others what the rig trusts.
 
     Raises EstimationError where neither does.
     """
     out: dict[Key, np.ndarray] = {}
     for i, lidar in enumerate(inputs.rig.lidars):
+        if (lidar.name, "rotation") in state.values:
+            out |= given(inputs, lidar, _trusted(lidar))
+            continue
         known = given(inputs, lidar, NAMES)
-        if len(known) < len(NAMES) and (lidar.name, "rotation") not in state.values:
+        if len(known) < len(NAMES):
             k = most_points(inputs, i)
             own, motion = alone(inputs, k), motion_alone(inputs, k, state)
             assert own.imu is not None
@@ -239,9 +245,14 @@ def _offset_on_motion(inputs: Inputs, state: State, lidar: int, held: Held, reco
         return lidar_on_motion(own.imu, stream, motion, held).offset
 
 
+def _trusted(sensor: Lidar | PoseSensor) -> list[str]:
+    """What else may rest on of how a sensor stands."""
+    return [name for name in NAMES if trusted(getattr(sensor, name)) is not None]
+
+
 def held_of(inputs: Inputs, lidar: Lidar | PoseSensor, guesses: bool = False) -> Held:
     """What the rig trusts of a LiDAR or a pose sensor, and with `guesses` what it guesses."""
-    known = given(inputs, lidar, [name for name in NAMES if guesses or trusted(getattr(lidar, name)) is not None])
+    known = given(inputs, lidar, NAMES if guesses else _trusted(lidar))
     offset = known.get((lidar.name, "time_offset"))
     return Held(
         known.get((lidar.name, "rotation")),

@@ -18,7 +18,7 @@ from icalib.estimation.state import Key, State
 from icalib.estimation.wheel_angles import integrals_of
 from icalib.first_guess.by_recording import alone, each_clock
 from icalib.first_guess.known_motion import imu_poses, is_known
-from icalib.first_guess.lidar_rounds import given, lidar_values, with_lidars
+from icalib.first_guess.lidar_rounds import NAMES, given, lidar_values, with_lidars
 from icalib.first_guess.poses import pose_values
 from icalib.first_guess.wheel_poses import mount_guess, poses_offset
 from icalib.first_guess.wheels import WheelRates, drive_guess, wheel_offset, wheel_rates
@@ -48,9 +48,10 @@ def with_robot(inputs: Inputs, settled: State) -> tuple[Inputs, State, dict[Key,
     """
     found = lidar_values(inputs, settled) | wheel_values(inputs, settled) | pose_values(inputs, settled)
     state = replace(settled, values=settled.values | found)
-    guess = state.values
+    guess = state.values | {k: v for x in inputs.rig.lidars for k, v in given(inputs, x, NAMES).items()}
     if inputs.rig.lidars:
         inputs, state = with_lidars(inputs, state)
+        inputs = replace(inputs, guess=replace(settled, values=guess))
     return inputs, state, guess
 
 
