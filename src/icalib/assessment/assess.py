@@ -48,6 +48,7 @@ from icalib.estimation.parts import Parts
 from icalib.estimation.pose_factor import FRAME
 from icalib.estimation.problem import Problem
 from icalib.estimation.state import Block, State
+from icalib.estimation.surfaces import ON_PLANES
 from icalib.geometry.cameras import camera_model
 from icalib.observability import Observability, observe
 from icalib.provenance import versions
@@ -310,8 +311,10 @@ def _warnings(
     if not found.outcome.converged:
         yield f"the solver did not converge: {found.outcome.status}"
     yield from inputs.measurements.warnings
-    yield from misfits(inputs.rig, judged)
-    yield from plane_warnings(inputs.rig, found.problem.features)
+    few = tuple(plane_warnings(inputs.rig, found.problem.features))
+    # How far off those are that lie on planes by chance means nothing.
+    yield from misfits(inputs.rig, [f for f in judged if not (few and f.kind == ON_PLANES)])
+    yield from few
     yield from pose_warnings(poses, inputs.rig)
     yield from lidar_warnings(inputs, found) if inputs.clouds.count else ()
     for g in groups:
