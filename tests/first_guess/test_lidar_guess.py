@@ -10,20 +10,20 @@ import pytest
 
 from icalib.first_guess.start import start
 from icalib.geometry import so3
-from icalib.rig import Parameter
+from icalib.rig import Mode, Parameter
 from icalib.simulation import rig_for
 
 TURN_RAD, LATE_S = 0.15, 0.03
 AWAY = so3.exp(np.array([0.0, TURN_RAD, 0.0]))
 
 
-def guessed(robot, mode="free", mode_of_clock="free"):
+def guessed(robot, mode: Mode = "free", mode_of_clock: Mode = "free"):
     """The rig with a LiDAR whose rotation and time offset are off, and what it has of them."""
     rig, true = rig_for(robot.sim.scenario), robot.truth()
     rotation, offset = true.rotation @ AWAY, robot.sim.truth.time_offset["lidar0"] + LATE_S
     lidar = replace(
         rig.lidars[0],
-        rotation=Parameter(mode, rotation, np.deg2rad(10.0) if mode == "prior" else None),
+        rotation=Parameter(mode, rotation),
         translation=Parameter("free", true.position),
         time_offset=Parameter(mode_of_clock, np.array([offset])),
     )
