@@ -281,12 +281,12 @@ def _stretch(inputs: Inputs, found: Estimate, index: int) -> tuple[float, float]
     if len(plane) < FEWEST_FITTED:
         return 0.0, np.inf
     later, earlier = (
-        _on_planes(*in_world(motion, replace(stream, offset_s=stream.offset_s + step)), values[plane])[0]
+        _on_planes(*in_world(motion, replace(stream, offset_s=stream.offset_s + step)), values[plane])[0].astype(float)
         for step in (HALF_STEP_S, -HALF_STEP_S)
     )
-    speed = (later.astype(np.float64) - earlier) / (2.0 * float(HALF_STEP_S))
+    speed = (later - earlier) / (2.0 * float(HALF_STEP_S))
     by_stretch = speed * (stream.offset_s - stream.offset_s.mean(dtype=np.float64))
-    residual = 0.5 * (later.astype(np.float64) + earlier)
+    residual = 0.5 * (later + earlier)
     information = max(float(by_stretch @ by_stretch), 1e-30)
     return -float(by_stretch @ residual) / information, float(residual.std()) / np.sqrt(information)
 

@@ -72,11 +72,6 @@ class _Care:
         self.curved = False
 
 
-def _is_early(tolerance: float) -> bool:
-    """Whether a pass that ends at this tolerance is followed by another."""
-    return tolerance > STALLED_DECREASE
-
-
 @dataclass
 class _Descent:
     """Where the solver stands: `cost` at `state`, of which `pieces` and `residuals` hold the sums; stalled: how many
@@ -90,9 +85,12 @@ class _Descent:
     pieces: tuple[Piece, ...]
     residuals: Residuals
     cost: float
-    care: _Care
     steps: list[Step] = field(default_factory=list)
+    care: _Care = field(init=False)
     stalled: int = 0
+
+    def __post_init__(self) -> None:
+        self.care = _Care(QUICK if self.early else SLOW)
 
     @classmethod
     def begin(
@@ -107,13 +105,12 @@ class _Descent:
         """At `state`, before any step."""
         pieces, residuals = room or problem.pieces(), problem.residuals()
         cost = problem.linearise(state, pieces, residuals)
-        care = _Care(QUICK if _is_early(tolerance) else SLOW)
-        return cls(problem, state, tolerance, share, on_step, pieces, residuals, cost, care)
+        return cls(problem, state, tolerance, share, on_step, pieces, residuals, cost)
 
     @property
     def early(self) -> bool:
         """Whether another pass follows."""
-        return _is_early(self.tolerance)
+        return self.tolerance > STALLED_DECREASE
 
     @property
     def enough(self) -> float:
