@@ -17,8 +17,10 @@ from icalib.estimation.solver import minimise
 from icalib.first_guess.several import initial_guesses
 from icalib.first_guess.start import first_state
 from icalib.geometry.targets import NoTarget
+from icalib.measurements import Measurements, TrackStream
+from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter, Rig
-from icalib.simulation import Scenario, load_scenario, rig_for, simulate
+from icalib.simulation import Scenario, load_scenario, rig_for, simulate, with_drawn_guess
 
 SCENARIO = Path(__file__).parents[2] / "examples" / "paper" / "table2-3d.yaml"
 
@@ -86,6 +88,52 @@ def _is_the_same_in_its_own_room(problem, state, outcome):
 def check(consistency, duration_s: float, seeds: range, probability: float) -> None:
     scenario = table2(duration_s)
     found = consistency(scenario, rig_of(scenario, 1.02), seeds, probability)
+    print({block: (round(c.mean, 3), round(c.low, 3), round(c.high, 3)) for block, c in found.items()})
+    assert {block: c for block, c in found.items() if not c.consistent} == {}
+
+
+def follower(scenario: Scenario, scale: float) -> Rig:
+    """`rig_of`, with what users have by default against outliers; noise is found."""
+    rig = rig_of(scenario, scale)
+    cameras = tuple(replace(c, track_noise_px=None) for c in rig.cameras)
+    return replace(rig, cameras=cameras, settings=replace(rig.settings, loss="huber", outlier_std=4.0))
+
+
+def lost(measurements: Measurements) -> Measurements:
+    """One observation of twenty is of something else, up to 30 px away on each axis."""
+    rng = np.random.default_rng(5)
+    return replace(measurements, tracks=tuple(_lost(t, rng) for t in measurements.tracks))
+
+
+def _lost(stream: TrackStream, rng: np.random.Generator) -> TrackStream:
+    uv, gone = stream.uv.copy(), rng.random(len(stream.uv)) < 0.05
+    uv[gone] += rng.uniform(-30.0, 30.0, (int(gone.sum()), 2))
+    return replace(stream, uv=uv)
+
+
+@pytest.mark.parametrize("stated", [False, True])
+def test_outliers_are_set_aside_and_little_else(stated: bool):
+    scenario = table2(8.0)
+    rig = with_drawn_guess(follower(scenario, 1.0), scenario, 2)
+    if stated:
+        rig = replace(rig, cameras=tuple(replace(c, track_noise_px=1.0) for c in rig.cameras))
+    measured = simulate(scenario, 2).measurements
+    found = calibrate_measurements(rig, lost(measured))
+    assert found.converged
+    for r, true in zip(found.track_residuals, measured.tracks, strict=True):
+        far = np.linalg.norm(r.uv - true.uv, axis=1) > 8.0
+        assert far.sum() > 250
+        assert not (far & r.used).any()
+        good = (r.uv == true.uv).all(axis=1)
+        assert r.used[good].mean() > 0.96
+        fit = next(f for f in found.fits if f.sensor == r.sensor and f.kind == "features")
+        assert r.sigma == pytest.approx(1.0, abs=0.03) and fit.chi2_per_dof == pytest.approx(0.97, abs=0.05)
+
+
+@pytest.mark.statistical
+def test_many_recordings_with_outliers(consistency):
+    scenario = table2(10.0)
+    found = consistency(scenario, follower(scenario, 1.02), range(24), 0.99, seen=lost)
     print({block: (round(c.mean, 3), round(c.low, 3), round(c.high, 3)) for block, c in found.items()})
     assert {block: c for block, c in found.items() if not c.consistent} == {}
 

@@ -7,7 +7,7 @@ import pytest
 from scipy import linalg, stats
 from scipy.spatial.distance import mahalanobis
 
-from icalib.montecarlo.statistics import Sample, nees, spread
+from icalib.montecarlo.statistics import Sample, largest, nees, spread
 
 
 def drawn(runs: int, n: int, optimism: float = 1.0, seed: int = 0) -> list[Sample]:
@@ -80,3 +80,19 @@ def test_no_spread_of_too_few_runs_or_of_unlike_dimensions():
     assert spread(drawn(3, 3)) is None
     assert spread(drawn(4, 3)) is not None
     assert spread([*drawn(9, 3), *drawn(1, 2)]) is None
+
+
+def test_the_largest_error_and_its_chance():
+    found = largest([(1.0, "cam0.rotation x", 1), (-3.5, "cam0.rotation y", 2), (2.0, "cam1.time_offset", 2)])
+    assert (found.sigmas, found.entry, found.seed, found.numbers) == (3.5, "cam0.rotation y", 2, 3)
+    assert found.chance == pytest.approx(1.0 - (1.0 - 2.0 * stats.norm.sf(3.5)) ** 3)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.9])
+def test_chance_reaches_the_largest_as_often_as_is_said_or_less(correlation: float):
+    rng = np.random.default_rng(3)
+    shared = rng.standard_normal((2000, 1))
+    z = np.sqrt(correlation) * shared + np.sqrt(1.0 - correlation) * rng.standard_normal((2000, 50))
+    chances = np.array([largest([(value, "", 0) for value in row]).chance for row in z])
+    below = float(np.mean(chances < 0.1))
+    assert (abs(below - 0.1) < 0.02) if correlation == 0.0 else (below < 0.08)

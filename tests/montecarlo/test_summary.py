@@ -9,9 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from icalib.montecarlo.page import study_html
 from icalib.montecarlo.record import Record, Size, from_json, to_json
+from icalib.montecarlo.store import Identity
 from icalib.montecarlo.summary import Consistency, consistency_json, summarise
-from icalib.montecarlo.words import answer, undetermined_words, verdict_words
+from icalib.montecarlo.words import answer, largest_words, undetermined_words, verdict_words
 
 KEYS = ("cam0.rotation", "cam0.time_offset", "cam0.distortion", "cam1.rotation", "cam1.distortion", "wheel0.radii")
 
@@ -121,3 +123,28 @@ def test_sizes_weigh_runs_by_their_degrees_of_freedom(record):
     few, many = Size("cam0", "corners", 10, 1.0, 4.0), Size("cam0", "corners", 100, 99.0, 96.0)
     runs = [replace(record(seed), sizes=(size,)) for seed, size in enumerate((few, many))]
     assert summarise(runs).sizes[0].mean == pytest.approx(1.0)
+
+
+def test_the_largest_error_is_of_what_counts(record, judged):
+    runs = [record(seed) for seed in range(20)]
+    z = np.array([r.error / np.sqrt(np.diag(r.covariance)) for r in runs])
+    spoilt = [replace(r, error=r.error * np.r_[np.ones(11), 1e6, 1.0]) for r in runs]
+    open_left = [judged(r, "wheel0.radii", ("undetermined", "determined")) for r in spoilt]
+    found = summarise([*open_left, Record(99, "it broke.", 1.0, "digest")])
+    counted = np.abs(np.delete(z, 11, axis=1))
+    assert found.largest is not None and found.largest.sigmas == pytest.approx(counted.max())
+    assert (found.largest.seed, found.largest.numbers) == (int(counted.max(axis=1).argmax()), 20 * 12)
+    assert f"of 240 numbers is {counted.max():.1f} standard deviations ({found.largest.entry}," in largest_words(found)
+    wrong = summarise(
+        [replace(r, error=r.error + 9.0 * np.sqrt(np.diag(r.covariance)) * (np.arange(13) == 3)) for r in runs]
+    )
+    assert wrong.largest is not None and wrong.largest.entry == "cam0.time_offset"
+    assert "less than 1 of 100 studies" in largest_words(wrong)
+    assert summarise([]).largest is None and largest_words(summarise([])) == "No number was determined in any run."
+
+
+def test_on_the_page_each_figure_stands_under_its_heading(record, judged):
+    runs = [judged(record(seed), "wheel0.radii", ("undetermined", "weak")) for seed in range(5)]
+    page = study_html(summarise(runs), Identity("s.yaml", "0", "none", "known", "digest", {}), runs)
+    marks = ["<h2>Blocks", "The largest error of", "<h2>Mean NEES", 'id="nees"', "<h2>Undetermined", "<h2>Failed runs"]
+    assert [page.index(m) for m in marks] == sorted(page.index(m) for m in marks)

@@ -23,7 +23,7 @@ from icalib.calibration import (
     working_distance,
 )
 from icalib.outputs import check_folder, write_outputs
-from icalib.report import corner_figures, projection_figures, report_html
+from icalib.report import image_figures, projection_figures, report_html
 from icalib.report.console import table
 from icalib.report.plot import numbers, thin
 from icalib.report.quantities import dof_words, rows, rpy_deg, shown
@@ -104,8 +104,8 @@ def test_a_long_recording_stays_small(calibration: Calibration):
         name: np.concatenate([getattr(r, name)] * n)
         for name in ("seconds", "point", "uv", "residual", "sigma", "rejected")
     }
-    figure = corner_figures.residuals_over_time(dataclasses.replace(r, start=start, **long))
-    assert all(len(trace["x"]) <= corner_figures.MOST_DOTS for trace in figure["data"])
+    figure = image_figures.residuals_over_time(dataclasses.replace(r, start=start, **long))
+    assert all(len(trace["x"]) <= image_figures.MOST_DOTS for trace in figure["data"])
     assert len(json.dumps(figure)) < 300_000
 
 
@@ -163,7 +163,7 @@ def test_maps_of_projection_say_what_they_show(calibration: Calibration, text: s
     assert drawn[0]["zmax"] <= 6.0 * m.median_seen and drawn[0]["contours"]["size"] <= drawn[0]["zmax"] / 9
     assert drawn[1]["name"] == "corners" and 500 < len(drawn[1]["x"]) <= projection_figures.MOST_DOTS
     size, u, v = m.worst
-    assert f"Known to {shown(m.median_seen)} px where corners were seen (median), to {shown(size)} px" in page.words
+    assert f"Known to {shown(m.median_seen)} px where it saw points (median), to {shown(size)} px" in page.words
     assert f"at pixel ({u:.0f}, {v:.0f})" in page.words
     assert f"cam1: points {shown(distance)} m away" in page.words
 
@@ -179,13 +179,13 @@ def test_a_fixed_lens_has_no_map_but_a_sentence(calibration: Calibration):
     assert "cam0: intrinsics and distortion are fixed by the rig file" in page.words
 
 
-@pytest.mark.parametrize(("seen", "sentence"), [(True, "Move the target there too"), (False, "px over the image")])
+@pytest.mark.parametrize(("seen", "sentence"), [(True, "Let it see points there, too"), (False, "px over the image")])
 def test_what_is_said_of_an_edge_without_data(seen: bool, sentence: str):
     sigma, cells = np.array([[0.1, 0.1, 0.9]]), np.array([[seen, seen, False]])
     m = ProjectionMap("cam0", np.inf, np.array([0.0, 10.0, 20.0]), np.zeros(1), sigma, cells)
     found = projection_figures.words(m)
     assert sentence in found and "0.10 px" in found and "0.90 px at the worst, at pixel (20, 0)" in found
-    assert ("Move" in found) == seen
+    assert ("Let it see" in found) == seen
 
 
 def test_what_halves_say_of_each_other(calibration: Calibration, text: str):

@@ -43,7 +43,7 @@ def test_every_part_of_result_and_recording_is_there(found):
     still |= {f"world/imu0/uncertainty/{name}" for name in ("cam0", "lidar0")}
     over = {"world/imu0", "world/way", "world/target", "world/planes/lidar0", "world/scans/lidar0"}
     over |= {IMAGE, f"{IMAGE}/corners", "readings/imu0/gyro", "readings/imu0/accel", "motion/velocity"}
-    over |= {"residuals/cam0", "residuals/lidar0", "residuals/imu0/rotation", "residuals/imu0/accel_walk"}
+    over |= {"residuals/cam0/corners", "residuals/lidar0", "residuals/imu0/rotation", "residuals/imu0/accel_walk"}
     assert all(np.isnan(found[name].seconds).all() for name in still)
     assert all(np.isfinite(found[name].seconds).any() for name in over)
 
@@ -137,7 +137,7 @@ def test_points_of_scans_lie_where_the_truth_puts_them(found, shown):
 
 def test_lines_hold_what_the_result_holds(found, shown):
     c = shown.calibration
-    r, rows = c.corner_residuals[0], found["residuals/cam0"]
+    r, rows = c.corner_residuals[0], found["residuals/cam0/corners"]
     k = int(np.argmax(np.diff(r.start) > 3))
     own = slice(r.start[k], r.start[k + 1])
     rms = np.sqrt(np.mean(r.residual[own][~r.rejected[own]].astype(np.float64) ** 2))

@@ -9,6 +9,7 @@ import numpy as np
 
 from icalib.assessment.cameras import mixed_up, other_lens, plane_warnings
 from icalib.assessment.held_out import held_out
+from icalib.assessment.images import corner_residuals, track_residuals
 from icalib.assessment.misfit import far_beyond, misfits
 from icalib.assessment.notes import notes
 from icalib.assessment.robot import (
@@ -22,7 +23,6 @@ from icalib.assessment.robot import (
 from icalib.assessment.size import felt_size, is_certain, size_words
 from icalib.calibration import (
     Calibration,
-    CornerResiduals,
     HeldOut,
     ImuResiduals,
     Iteration,
@@ -36,7 +36,6 @@ from icalib.calibration import (
 from icalib.estimation.assembly import image_times
 from icalib.estimation.board import SHAPE_LABELS
 from icalib.estimation.border import restricted_inverse
-from icalib.estimation.clocks import instants
 from icalib.estimation.determination import Determined
 from icalib.estimation.estimate import Estimate
 from icalib.estimation.evidence import Fit, fits, place_covariances, raw_rms, split_covariance
@@ -104,7 +103,7 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
         covariance_names=names,
         undetermined=seen.undetermined,
         fits=tuple(judged),
-        corner_residuals=_corner_residuals(found, timeline),
+        corner_residuals=corner_residuals(found, timeline),
         imu_residuals=_imu_residuals(found, trajectory),
         trajectory=trajectory,
         iterations=tuple(Iteration(n, s.cost, s.predicted_decrease, s.damping, s.accepted) for n, s in found.steps),
@@ -121,6 +120,7 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
         wheel_residuals=wheel_residuals(inputs, found, timeline),
         planes=planes(inputs, outcome.state),
         pose_residuals=poses,
+        track_residuals=track_residuals(found, timeline),
         held_out=held,
         wrong=wrong,
     )
@@ -262,20 +262,6 @@ def _sensor_fit(fit: Fit, found: Estimate) -> SensorFit:
         i = [c.name for c in problem.cameras].index(fit.sensor)
         rejected = int((out.corners[i].root == 0.0).sum())
     return SensorFit(fit.sensor, fit.kind, fit.count, fit.dof, fit.chi2, rms, unit, rejected)
-
-
-def _corner_residuals(found: Estimate, timeline: Timeline) -> tuple[CornerResiduals, ...]:
-    out = []
-    for i, (camera, corners) in enumerate(zip(found.problem.cameras, found.outcome.residuals.corners, strict=True)):
-        stream = camera.stream
-        times = instants(stream, found.outcome.state.values)
-        out.append(
-            CornerResiduals(
-                camera.name, timeline.shown(times, timeline.of_images(i)), stream.start, stream.point, stream.uv,
-                corners.residual, camera.noise.sigma[stream.image], corners.root == 0.0,
-            )
-        )  # fmt: skip
-    return tuple(out)
 
 
 def _trajectory(inputs: Inputs, s: State, timeline: Timeline) -> Trajectory:

@@ -1,11 +1,11 @@
 """The result of a calibration: values with standard deviations and verdicts, saved and loaded whole."""
 
 from icalib.calibration.held_out import HeldOut, PredictedFit
+from icalib.calibration.images import CornerResiduals, ImageResiduals, TrackResiduals
 from icalib.calibration.projection import ProjectionMap, projection_uncertainty, working_distance
 from icalib.calibration.relative import RelativePose, joint_covariance, relative_pose, relative_poses
 from icalib.calibration.result import (
     Calibration,
-    CornerResiduals,
     ImuResiduals,
     Iteration,
     ParameterGroup,
@@ -22,6 +22,7 @@ __all__ = [
     "Calibration",
     "CornerResiduals",
     "HeldOut",
+    "ImageResiduals",
     "ImuResiduals",
     "Iteration",
     "LidarResiduals",
@@ -33,6 +34,7 @@ __all__ = [
     "RecordingSpan",
     "RelativePose",
     "SensorFit",
+    "TrackResiduals",
     "Trajectory",
     "Verdict",
     "Visited",

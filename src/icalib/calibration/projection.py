@@ -36,7 +36,7 @@ class ProjectionMap:
     alone is taken off; else a rotation and a translation).
 
     u (n,), v (m,): middles of cells of the image [px]; sigma (m, n) [px], NaN where the model has no ray; seen (m, n):
-    cells with corners in them. The motion was fitted over the cells that are seen, or over all where none are.
+    cells in which it saw corners or followed points. The motion was fitted over these; over all where there are none.
     """
 
     camera: str
@@ -48,7 +48,7 @@ class ProjectionMap:
 
     @property
     def median_seen(self) -> float:
-        """px, over the cells with corners; over the whole image where there are none."""
+        """px, over the cells that are seen; over the whole image where there are none."""
         own = self.sigma[self.seen & np.isfinite(self.sigma)]
         return float(np.median(own)) if len(own) else float(np.nanmedian(self.sigma))
 
@@ -71,8 +71,8 @@ def projection_uncertainty(c: Calibration, camera: str, range_m: float = np.inf)
     u, v = (np.arange(n) + 0.5) * width / n - 0.5, (np.arange(m) + 0.5) * height / m - 0.5
     uv = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     seen = np.zeros((m, n), dtype=bool)
-    for r in (r for r in c.corner_residuals if r.sensor == camera):
-        cell = ((r.uv[~r.rejected] + 0.5) * [n / width, m / height]).astype(int)
+    for r in (r for r in c.image_residuals if r.sensor == camera):
+        cell = ((r.uv[r.used] + 0.5) * [n / width, m / height]).astype(int)
         seen[np.clip(cell[:, 1], 0, m - 1), np.clip(cell[:, 0], 0, n - 1)] = True
     params = np.concatenate([g.value for g in lens])
     sigma = projection_std(model, params, joint_covariance(c, lens), uv, seen.ravel(), range_m)
@@ -118,10 +118,11 @@ def _moved_by(points: np.ndarray, near: bool) -> np.ndarray:
 
 
 def working_distance(c: Calibration, camera: str) -> float | None:
-    """m: median distance of `camera` from the target's first point while it saw the target; None where it saw none."""
+    """m: median distance of `camera` from the target's first point while it saw the target, else from the points that
+    it followed; None where it saw neither."""
     own = [r for r in c.corner_residuals if r.sensor == camera and len(r.uv)]
     if not own:
-        return None
+        return next((r.distance for r in c.track_residuals if r.sensor == camera), None)
     path = c.trajectory
     seconds = own[0].seconds[np.diff(own[0].start) > 0]
     node = np.clip(np.searchsorted(path.seconds, seconds), 0, len(path.seconds) - 1)

@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from icalib.calibration.held_out import HeldOut
+from icalib.calibration.images import CornerResiduals, ImageResiduals, TrackResiduals
 from icalib.calibration.robot import LidarResiduals, Plane, PoseResiduals, WheelResiduals
 
 Verdict = Literal["determined", "weak", "undetermined", "fixed"]
@@ -54,20 +55,6 @@ class SensorFit:
         """Near 1 where residuals are as large as their noise says. None where the fit leaves next to no freedom: dof
         are sampled, and good to the root of the count."""
         return float(self.chi2 / self.dof) if self.dof > np.sqrt(self.count) else None
-
-
-@dataclass(frozen=True)
-class CornerResiduals:
-    """Residuals (predicted - measured) of one camera's corners, in the recording's order; rejected ones stay."""
-
-    sensor: str
-    seconds: np.ndarray  # (M,) image times, imu clock, s since the first IMU stamp; see RecordingSpan for several
-    start: np.ndarray  # (M + 1,) corners of image i are start[i]:start[i+1]
-    point: np.ndarray  # (N,) index into the target's points
-    uv: np.ndarray  # (N, 2) measured, px
-    residual: np.ndarray  # (N, 2) px
-    sigma: np.ndarray  # (N,) px, standard deviation that the corner was given
-    rejected: np.ndarray  # (N,) bool
 
 
 @dataclass(frozen=True)
@@ -156,8 +143,14 @@ class Calibration:
     wheel_residuals: tuple[WheelResiduals, ...] = ()
     planes: tuple[Plane, ...] = ()  # that LiDARs see
     pose_residuals: tuple[PoseResiduals, ...] = ()
+    track_residuals: tuple[TrackResiduals, ...] = ()
     held_out: HeldOut | None = None  # None where the recording could not be split
     wrong: tuple[str, ...] = ()  # those of `warnings` by which something in the rig file must be wrong
+
+    @property
+    def image_residuals(self) -> tuple[ImageResiduals, ...]:
+        """Of cameras that saw anything: corners of a target, tracks of points of the scene, or both."""
+        return tuple(r for r in (*self.corner_residuals, *self.track_residuals) if len(r.uv))
 
     @property
     def failure(self) -> str:

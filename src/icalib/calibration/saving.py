@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from icalib.calibration.held_out import HeldOut, PredictedFit
+from icalib.calibration.images import CornerResiduals, TrackResiduals
 from icalib.calibration.result import (
     Calibration,
-    CornerResiduals,
     ImuResiduals,
     Iteration,
     ParameterGroup,
@@ -74,6 +74,7 @@ def _plain(c: Calibration, arrays: bytes) -> dict[str, Any]:
         "lidars": [_without_arrays(r) for r in c.lidar_residuals],
         "wheels": [_without_arrays(r) for r in c.wheel_residuals],
         "poses": [_without_arrays(r) for r in c.pose_residuals],
+        "tracks": [_without_arrays(r) for r in c.track_residuals],
         "planes": [_lists(p) for p in c.planes],
         "held_out": None if c.held_out is None else _plain_held_out(c.held_out),
         **{name: list(getattr(c, name)) for name in _TEXTS},
@@ -90,7 +91,9 @@ def _plain_held_out(held: HeldOut) -> dict[str, Any]:
     return _without_arrays(held) | {"fits": [dataclasses.asdict(f) for f in held.fits]}
 
 
-def _without_arrays(residuals: LidarResiduals | WheelResiduals | PoseResiduals | HeldOut) -> dict[str, Any]:
+def _without_arrays(
+    residuals: LidarResiduals | WheelResiduals | PoseResiduals | TrackResiduals | HeldOut,
+) -> dict[str, Any]:
     arrays = _array_names(type(residuals))
     return {f.name: getattr(residuals, f.name) for f in dataclasses.fields(residuals) if f.name not in arrays}
 
@@ -99,7 +102,10 @@ def _npz(c: Calibration) -> bytes:
     arrays = {"covariance": c.covariance, "covariance_names": np.array(c.covariance_names, dtype=np.str_)}
     for r in c.corner_residuals:
         arrays |= {f"corners/{r.sensor}/{name}": getattr(r, name) for name in _array_names(CornerResiduals)}
-    residuals = {"lidars": c.lidar_residuals, "wheels": c.wheel_residuals, "poses": c.pose_residuals}
+    residuals = {
+        "lidars": c.lidar_residuals, "wheels": c.wheel_residuals, "poses": c.pose_residuals,
+        "tracks": c.track_residuals,
+    }  # fmt: skip
     for folder, found in residuals.items():
         for r in found:
             arrays |= {f"{folder}/{r.sensor}/{name}": getattr(r, name) for name in _array_names(type(r))}
@@ -170,6 +176,9 @@ def _build(plain: dict[str, Any], arrays: dict[str, np.ndarray]) -> Calibration:
         ),
         pose_residuals=tuple(
             PoseResiduals(**_tuples(r), **of(PoseResiduals, f"poses/{r['sensor']}")) for r in plain.get("poses", [])
+        ),
+        track_residuals=tuple(
+            TrackResiduals(**r, **of(TrackResiduals, f"tracks/{r['sensor']}")) for r in plain.get("tracks", [])
         ),
         planes=tuple(
             Plane(p["name"], np.array(p["normal"]), np.array(p["point"]), p["count"]) for p in plain.get("planes", [])

@@ -331,8 +331,10 @@ def _noise_is_estimated(inputs: Inputs) -> bool:
 
 
 def pass_names(inputs: Inputs) -> tuple[str, ...]:
-    """The passes: nodes and assignment are made anew once; noise that is estimated takes more."""
-    if not _noise_is_estimated(inputs):
+    """The passes: nodes and assignment are made anew once; noise that is estimated takes more, and outliers of tracks,
+    which show when the lens is found."""
+    judged = bool(inputs.measurements.tracks) and inputs.rig.settings.outlier_std > 0.0
+    if not (judged or _noise_is_estimated(inputs)):
         return ("first", "final")
     twice = inputs.rig.settings.common_error or any(_is_open(x) for x in inputs.rig.poses)
     return ("first", "noise", "noise again", "final") if twice else ("first", "noise", "final")

@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from icalib.estimation.arrowhead import Piece
+from icalib.estimation.arrowhead import Piece, in_parallel, make_pieces
 from icalib.estimation.clocks import clock_of, mounted_columns
 from icalib.estimation.corner_factor import LOSSES, CornerFactor
 from icalib.estimation.corner_kernels import Motion
@@ -181,6 +181,12 @@ class FeatureFactor:
         """The same features, first looked for where `at` found them: from far off a point may stop short, or end
         elsewhere, and the cost would jump from one step to the next."""
         return replace(self, tracks=replace(self.tracks, start=at.points.copy()))
+
+    def look(self, state: State) -> FeatureOutput:
+        """What is left of the features at `state`; the chain is cut where `make_pieces` cuts it."""
+        out = self.output()
+        in_parallel(lambda piece: self.accumulate(state, piece, out, sums=False), make_pieces(self.n_nodes, None))
+        return out
 
     def attach(self, piece: Piece, keep: bool) -> Piece:
         """The piece with room for the features that its nodes saw; `keep`: its end is shared with another piece."""

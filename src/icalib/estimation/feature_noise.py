@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
+from icalib.estimation.arrowhead import chain_cuts
 from icalib.estimation.assembly import Following
 from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput
 from icalib.estimation.inputs import Inputs
-from icalib.estimation.medians import median_variance
+from icalib.estimation.medians import grouped_quantiles, largest_normal, median_variance
 from icalib.estimation.outcome import Outcome
 from icalib.estimation.problem import Problem
-from icalib.measurements import CornerStream, TrackStream
+from icalib.measurements import CornerStream
 from icalib.rig import Camera, Rig, Settings
 
 FIRST_GUESS_PX = 1.0
 SMALLEST_PX = 0.005
+# So many of an image's observations are no outliers. At first a lens that is not found yet leaves large errors at the
+# edges, which are none either.
+GOOD_AT_FIRST, GOOD = 0.9, 0.5
 
 
 def first_following(inputs: Inputs) -> Following | None:
@@ -27,15 +33,18 @@ def first_following(inputs: Inputs) -> Following | None:
 
 
 def next_following(rig: Rig, problem: Problem, outcome: Outcome, now: Following, first: bool) -> Following:
-    """Of the next pass: noise as the residuals show it, where it is not given, and after the `first` pass without
-    outliers."""
+    """Of the next pass: noise as the residuals show it, where it is not given, and none of the outliers that stand out
+    after the `first` pass or another."""
     factor, out = problem.features, outcome.residuals.features
     assert factor is not None and out is not None
     sigma = tuple(_sigma(c, factor, out, i) for i, c in enumerate(rig.cameras))
-    keep = now.keep
-    if first and rig.settings.outlier_std > 0.0:
-        keep = tuple(_kept(factor, out, i, k, rig.settings) for i, k in enumerate(keep))
-    return Following(sigma, keep)
+    if rig.settings.outlier_std <= 0.0:
+        return Following(sigma, now.keep)
+    # The poses that the pass began with left tracks out that those of its end find: these are judged, too.
+    anew = replace(factor, sigma=sigma).cut(outcome.state, chain_cuts(factor.n_nodes))
+    left = anew.look(outcome.state)
+    share = GOOD_AT_FIRST if first else GOOD
+    return Following(sigma, tuple(_kept(anew, left, i, k, rig.settings, share) for i, k in enumerate(now.keep)))
 
 
 def _sigma(camera: Camera, factor: FeatureFactor, out: FeatureOutput, index: int) -> float:
@@ -48,16 +57,25 @@ def _sigma(camera: Camera, factor: FeatureFactor, out: FeatureOutput, index: int
     return max(float(np.sqrt(variance / max(1.0 - 3.0 * points / rows, 0.1))), SMALLEST_PX)
 
 
-def _kept(factor: FeatureFactor, out: FeatureOutput, index: int, keep: np.ndarray, settings: Settings) -> np.ndarray:
-    """Observations without outliers; those whose track was left out this time stay."""
-    used, followed = out.root[index] > 0.0, factor.tracks.track[index] >= 0
-    stands = inliers(factor.streams[index], out.residual[index], used, settings)
-    return keep & (stands | ~followed)
-
-
-def inliers(
-    stream: CornerStream | TrackStream, residual: np.ndarray, used: np.ndarray, settings: Settings
+def _kept(
+    factor: FeatureFactor, out: FeatureOutput, index: int, keep: np.ndarray, settings: Settings, share: float
 ) -> np.ndarray:
+    """Observations without outliers, and without those that the model cannot see; where the track is left out they
+    stay.
+
+    An outlier is `outlier_std` standard deviations above the mean of its image, and above `outlier_min_px`. Both are
+    those of normal errors as large as that `share` of the image's: where few points are followed, one outlier alone
+    would make mean and standard deviation so large that it is none.
+    """
+    stream = factor.streams[index]
+    used, followed = out.root[index] > 0.0, factor.tracks.track[index] >= 0
+    size, image = np.linalg.norm(out.residual[index], axis=1), stream.image
+    most = grouped_quantiles(size[used], image[used], len(stream.stamps_ns), share)
+    limit = np.maximum(largest_normal(settings.outlier_std, share) * most, settings.outlier_min_px)
+    return keep & ~(followed & (~used | (size > limit[image])))
+
+
+def inliers(stream: CornerStream, residual: np.ndarray, used: np.ndarray, settings: Settings) -> np.ndarray:
     """(N,) bool: what stands with the rest of its image.
 
     The rule: what is seen is set aside when its residual (N, 2) is above mean + `outlier_std` standard deviations of

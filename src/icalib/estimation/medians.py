@@ -1,4 +1,4 @@
-"""Noise from medians, so that outliers have no say."""
+"""Noise from medians and other quantiles, so that outliers have no say."""
 
 from __future__ import annotations
 
@@ -10,3 +10,21 @@ MEDIAN_OF_SQUARE = 2.0 * np.log(2.0)  # median of chi^2 with two degrees of free
 def median_variance(square: np.ndarray) -> float:
     """Of either component of normal errors in the image, from their squared lengths (n,), n > 0."""
     return float(np.median(square) / MEDIAN_OF_SQUARE)
+
+
+def largest_normal(deviations: float, share: float) -> float:
+    """Mean plus so many standard deviations of the length of normal errors in the image (Rayleigh's distribution), in
+    units of the length below which `share` of them lie."""
+    mean, deviation = np.sqrt(np.pi / 2.0), np.sqrt(2.0 - np.pi / 2.0)
+    return float((mean + deviations * deviation) / np.sqrt(-2.0 * np.log1p(-share)))
+
+
+def grouped_quantiles(x: np.ndarray, group: np.ndarray, count: int, share: float) -> np.ndarray:
+    """(count,) of x (n,) by group (n,): the largest below which `share` of the rest lies; infinite where there is
+    nothing."""
+    ordered = x[np.lexsort((x, group))]
+    sizes = np.bincount(group, minlength=count)
+    at = np.cumsum(sizes) - sizes + (share * np.maximum(sizes - 1, 0)).astype(np.int64)
+    out = np.full(count, np.inf)
+    out[sizes > 0] = ordered[at[sizes > 0]]
+    return out

@@ -12,7 +12,16 @@ from rich.text import Text
 
 from icalib.montecarlo.study import Study
 from icalib.montecarlo.summary import Consistency
-from icalib.montecarlo.words import HEADERS, NUMBERS, answer, block_row, failures_words, nees_cells, undetermined_words
+from icalib.montecarlo.words import (
+    HEADERS,
+    NUMBERS,
+    answer,
+    block_row,
+    failures_words,
+    largest_words,
+    nees_cells,
+    undetermined_words,
+)
 
 MOST_FAILURES = 10
 IN_TWO_LINES = ("mean sigma", "sampled / predicted")  # headers that need not stand in one
@@ -22,7 +31,7 @@ def print_study(study: Study, folder: Path) -> None:
     """The table of blocks, failed runs, and where the files are, on standard output."""
     console, found = Console(), study.consistency
     console.print(table(found))
-    for line in (answer(found), *_failures(found), *_undetermined(found)):
+    for line in (answer(found), largest_words(found), *_failures(found), *_undetermined(found)):
         console.print(line, markup=False)
     seconds = [r.seconds for r in study.records]
     console.print(f"A run took {np.median(seconds):.1f} s (median).", markup=False)

@@ -18,6 +18,7 @@ from icalib.montecarlo.words import (
     block_row,
     chance_words,
     failures_words,
+    largest_words,
     mean_cells,
     nees_cells,
     undetermined_words,
@@ -36,14 +37,13 @@ def study_html(found: Consistency, identity: Identity, records: Sequence[Record]
         element("h2", "Blocks"), blocks_table(found),
         element("p", "Sampled / predicted: square roots of the least and the largest eigenvalue of the sampled against "
                 "the predicted covariance; by chance: where these lie in 95 of 100 studies of an honest covariance."),
+        element("p", largest_words(found)),
         element("h2", "Mean NEES"), plot_place("nees"),
-        element("h2", "Failed runs"), element("p", failures_words(found)),
-        failures(found),
+        *_undetermined(found),
+        element("h2", "Failed runs"), element("p", failures_words(found)), failures(found),
         element("h2", "Residuals"), _residuals(found),
         element("h2", "Made from"), table(("what", "value"), _facts(identity, records)),
     ]  # fmt: skip
-    if found.undetermined:
-        sections[4:4] = [element("h2", "Undetermined"), sentences(undetermined_words(found), "care", "None.")]
     return page(f"Consistency, {identity.scenario}", answer(found), sections, {"nees": nees_figure(found)})
 
 
@@ -83,6 +83,13 @@ def nees_figure(found: Consistency) -> Figure:
         "name": "mean NEES", "marker": {"color": COLORS[0], "size": 8},
     }  # fmt: skip
     return figure([bounds, means], xaxis=axis("", automargin=True), yaxis=axis("NEES per degree of freedom"))
+
+
+def _undetermined(found: Consistency) -> list[Html]:
+    """What was left open in some run, if anything was."""
+    if not found.undetermined:
+        return []
+    return [element("h2", "Undetermined"), sentences(undetermined_words(found), "care", "None.")]
 
 
 def _residuals(found: Consistency) -> Html:

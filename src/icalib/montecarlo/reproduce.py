@@ -9,7 +9,7 @@ from icalib.batch import write_whole
 from icalib.montecarlo.convergence import plotly_figure, png, rows
 from icalib.montecarlo.page import blocks_table, failures, page
 from icalib.montecarlo.study import Plan, Study, run_study, scenario_digest
-from icalib.montecarlo.words import answer, failures_words
+from icalib.montecarlo.words import answer, failures_words, largest_words
 from icalib.report.page import plot_place
 from icalib.report.plot import Figure
 from icalib.report.tables import Html, element
@@ -46,7 +46,7 @@ def write_figures(output: Path, studies: dict[str, Study]) -> None:
     for motion, study in studies.items():
         found = study.consistency
         sections += [element("h2", MOTIONS[motion]), element("p", answer(found)), blocks_table(found)]
-        sections += [element("p", failures_words(found)), failures(found)]
+        sections += [element("p", largest_words(found)), element("p", failures_words(found)), failures(found)]
         drawn = rows(study.records)
         for row in drawn:
             name = f"{motion}-{row.key}"

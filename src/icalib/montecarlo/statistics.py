@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import gammaincinv
+from scipy.special import erf, gammaincinv
 
 PROBABILITY = 0.95
 LEAST_VARIANCE = 1e-13  # of a scaled covariance: rounding
@@ -48,6 +49,20 @@ class Spread:
     largest_bounds: tuple[float, float]
 
 
+@dataclass(frozen=True)
+class Largest:
+    """The largest of `numbers` errors, in their own standard deviations: which, and in the run of which seed.
+
+    chance: with which honest covariances leave one so large, at most; dependence of the numbers only lessens it.
+    """
+
+    sigmas: float
+    entry: str
+    seed: int
+    numbers: int
+    chance: float
+
+
 def nees(samples: list[Sample], probability: float = PROBABILITY) -> Nees:
     """Of samples that may differ in dimension; the sum over them is chi^2 of the sum of these. `probability` that an
     honest covariance lies within the bounds."""
@@ -57,6 +72,13 @@ def nees(samples: list[Sample], probability: float = PROBABILITY) -> Nees:
     per_dof = each / [len(s.error) for s in samples]
     worst = int(np.argmax(per_dof))
     return Nees(float(each.sum()) / dof, float(low), float(high), samples[worst].seed, float(per_dof[worst]))
+
+
+def largest(errors: Sequence[tuple[float, str, int]]) -> Largest:
+    """Of errors in standard deviations, each with its entry and seed. For normal errors, however they depend on each
+    other, P(all |z| < c) is at least the product of each alone (Sidak, JASA 62, 1967)."""
+    z, entry, seed = max(errors, key=lambda error: abs(error[0]))
+    return Largest(abs(z), entry, seed, len(errors), float(1.0 - erf(abs(z) / np.sqrt(2.0)) ** len(errors)))
 
 
 def _squared(e: np.ndarray, P: np.ndarray) -> float:

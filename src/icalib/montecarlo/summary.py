@@ -10,9 +10,10 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from icalib.montecarlo.record import Block, Record
-from icalib.montecarlo.statistics import Nees, Sample, Spread, nees, spread
+from icalib.montecarlo.statistics import Largest, Nees, Sample, Spread, largest, nees, spread
 
 EVERYTHING = "calibration"  # all blocks together
+LEAST_SIGMA = 1e-100  # an error without any is an enormity, but a number
 
 
 @dataclass(frozen=True)
@@ -71,13 +72,14 @@ class Failure:
 
 @dataclass(frozen=True)
 class Consistency:
-    """runs: of all, of which `failures` do not count below. whole: all blocks together. sizes: chi^2 per post-fit
-    degree of freedom; lag1: correlation of whitened residuals with the next in time. undetermined: how many runs left
-    which combination open."""
+    """runs: of all, of which `failures` do not count below. whole: all blocks together. largest: of all single errors
+    that count. sizes: chi^2 per post-fit degree of freedom; lag1: correlation of whitened residuals with the next in
+    time. undetermined: how many runs left which combination open."""
 
     runs: int
     failures: tuple[Failure, ...]
     whole: Nees | None
+    largest: Largest | None
     blocks: tuple[BlockSummary, ...]
     sizes: tuple[Mean, ...]
     lag1: tuple[Mean, ...]
@@ -93,10 +95,12 @@ def summarise(records: Sequence[Record]) -> Consistency:
         for block in record.blocks:
             first.setdefault(block.key, block)
     whole = _samples(good, tuple(first))
+    errors = [error for r in good for error in _errors(r)]
     return Consistency(
         len(ordered),
         tuple(Failure(r.seed, r.failure) for r in ordered if r.failure),
         nees(whole) if whole else None,
+        largest(errors) if errors else None,
         tuple(_block(good, block) for block in first.values()),
         _means([(s.sensor, s.kind, s.chi2, s.dof) for r in good for s in r.sizes if s.dof > 0.0]),
         _means([(w.sensor, w.kind, w.lag1, 1.0) for r in good for w in r.whiteness]),
@@ -115,6 +119,18 @@ def counting(record: Record, key: str) -> np.ndarray:
     if block is None:
         return np.arange(0)
     return record.columns(key)[[v != "undetermined" for v in block.verdict]]
+
+
+def _errors(record: Record) -> list[tuple[float, str, int]]:
+    """Of all entries that count: error in formal standard deviations, name, seed."""
+    found = []
+    for block in record.blocks:
+        labels = dict(zip(record.columns(block.key), block.labels, strict=True))
+        for k in counting(record, block.key):
+            sigma = max(float(np.sqrt(record.covariance[k, k])), LEAST_SIGMA)
+            name = block.key if labels[k] == block.name else f"{block.key} {labels[k]}"
+            found.append((float(record.error[k]) / sigma, name, record.seed))
+    return found
 
 
 def _samples(records: Sequence[Record], keys: tuple[str, ...]) -> list[Sample]:

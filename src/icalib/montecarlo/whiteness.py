@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.calibration import Calibration, CornerResiduals, LidarResiduals, WheelResiduals
+from icalib.calibration import Calibration, ImageResiduals, LidarResiduals, WheelResiduals
 from icalib.montecarlo.record import Whiteness
 
 SAME_WALL_S = 0.3  # between two points of a plane that are neighbours in time
@@ -13,7 +13,7 @@ IMU_ROWS = ("rotation", "velocity", "position", "gyroscope walk", "accelerometer
 
 def whiteness(result: Calibration) -> tuple[Whiteness, ...]:
     """Of every kind of residual that the result holds."""
-    found = [_of_corners(r) for r in result.corner_residuals]
+    found = [_of_image_points(r) for r in result.image_residuals]
     if result.imu is not None:
         for k, kind in enumerate(IMU_ROWS):
             rows = result.imu_residuals.whitened[:, 3 * k : 3 * k + 3]
@@ -37,14 +37,14 @@ def _of_wheels(r: WheelResiduals) -> list[Whiteness]:
     return [_statistics(r.sensor, name, x, x[:-1], x[1:]) for name, x in zip(r.labels, columns, strict=True)]
 
 
-def _of_corners(r: CornerResiduals) -> Whiteness:
-    """A corner's next one is the same point of the target in the next image."""
-    image = np.repeat(np.arange(len(r.seconds)), np.diff(r.start))
-    order = np.lexsort((image, r.point))
-    order = order[~r.rejected[order]]
-    whitened = r.residual[order] / r.sigma[order, None]
-    follows = (np.diff(r.point[order]) == 0) & (np.diff(image[order]) == 1)
-    return _statistics(r.sensor, "corners", whitened, whitened[:-1][follows], whitened[1:][follows])
+def _of_image_points(r: ImageResiduals) -> Whiteness:
+    """A corner's next one is the same point of the target in the next image, so of a point that is followed."""
+    image, point = r.image, r.point
+    order = np.lexsort((image, point))
+    order = order[r.used[order]]
+    follows = (np.diff(point[order]) == 0) & (np.diff(image[order]) == 1)
+    whitened = r.whitened[order].astype(np.float64)
+    return _statistics(r.sensor, r.kind, whitened, whitened[:-1][follows], whitened[1:][follows])
 
 
 def _statistics(sensor: str, kind: str, values: np.ndarray, first: np.ndarray, second: np.ndarray) -> Whiteness:

@@ -62,6 +62,18 @@ def answer(found: Consistency) -> str:
     return f"{inside}, where chance alone leaves {by_chance:.1f} outside{named}."
 
 
+def largest_words(found: Consistency) -> str:
+    """The largest single error, and whether chance explains it."""
+    one = found.largest
+    if one is None:
+        return "No number was determined in any run."
+    share = "less than 1" if one.chance < 0.01 else f"at most {100 * one.chance:.0f}"
+    return (
+        f"The largest error of {one.numbers} numbers is {one.sigmas:.1f} standard deviations ({one.entry}, seed "
+        f"{one.seed}); chance alone reaches that in {share} of 100 studies like this."
+    )
+
+
 def failures_words(found: Consistency) -> str:
     if not found.failures:
         return f"All {found.runs} runs reached a result."

@@ -8,10 +8,10 @@ from string import Template
 
 import numpy as np
 
-from icalib.calibration import Calibration, CornerResiduals, ProjectionMap
+from icalib.calibration import Calibration, ImageResiduals, ProjectionMap
 from icalib.report import (
-    corner_figures,
     held_out_figures,
+    image_figures,
     motion_figures,
     projection_figures,
     rig_figures,
@@ -43,7 +43,7 @@ def report_html(calibration: Calibration) -> str:
         "status": c.status,
         "answer": tables.TRUST[trust],
         "ellipsoids": _ellipsoid_words(c),
-        "most_dots": corner_figures.MOST_DOTS,
+        "most_dots": image_figures.MOST_DOTS,
         "most_nodes": motion_figures.MOST_NODES,
         "most_points": robot_figures.MOST_IN_SPACE,
     }
@@ -56,8 +56,8 @@ def report_html(calibration: Calibration) -> str:
         "fits": tables.fits(c),
         "parameters": tables.parameters(c),
         "poses": Html(tables.poses(c) + tables.relative(c) + tables.bodies(c)),
-        "corner_figures": _corner_sections(c),
-        "without_corners": "" if _seen(c) else " hidden",
+        "image_figures": _image_sections(c),
+        "without_images": "" if c.image_residuals else " hidden",
         "held_out": _held_out_section(c),
         "projection_figures": _projection_sections(maps),
         "without_cameras": "" if c.cameras else " hidden",
@@ -105,11 +105,11 @@ def _figures(c: Calibration) -> dict[str, Figure]:
     }
     if c.imu is None:
         del found["imu-residuals"], found["motion"]
-    for i, r in enumerate(_seen(c)):
+    for i, r in enumerate(c.image_residuals):
         width, height = c.rig["sensors"][r.sensor]["resolution"]
-        found[f"plane-{i}"] = corner_figures.residual_plane(r)
-        found[f"image-{i}"] = corner_figures.residuals_over_image(r, (width, height))
-        found[f"time-{i}"] = corner_figures.residuals_over_time(r)
+        found[f"plane-{i}"] = image_figures.residual_plane(r)
+        found[f"image-{i}"] = image_figures.residuals_over_image(r, (width, height))
+        found[f"time-{i}"] = image_figures.residuals_over_time(r)
     if c.held_out is not None:
         found["held-out"] = held_out_figures.moved_without_parts(c, c.held_out)
     for i, r in enumerate(c.lidar_residuals):
@@ -122,19 +122,21 @@ def _figures(c: Calibration) -> dict[str, Figure]:
     return found | (robot_figures.plane_maps(c) if c.lidar_residuals else {})
 
 
-def _seen(c: Calibration) -> list[CornerResiduals]:
-    """Of the cameras that saw a target; those that follow points of the scene have no corners."""
-    return [r for r in c.corner_residuals if len(r.uv)]
-
-
-def _corner_sections(c: Calibration) -> Html:
+def _image_sections(c: Calibration) -> Html:
     sections = []
-    for i, r in enumerate(_seen(c)):
-        counts = f"{int((~r.rejected).sum())} corners used, {int(r.rejected.sum())} rejected"
+    for i, r in enumerate(c.image_residuals):
         plots = [plot_place(f"{kind}-{i}", css) for kind, css in (("plane", ""), ("image", ""), ("time", "wide"))]
-        head = element("h3", [tables.html(r.sensor), element("small", f" {counts}")])
+        head = element("h3", [tables.html(r.sensor), element("small", f" {_counts(r)}")])
         sections.append(Html(head + element("div", plots, "pair")))
     return Html("".join(sections))
+
+
+def _counts(r: ImageResiduals) -> str:
+    """How many are in use, and what became of the others."""
+    used, rejected = int(r.used.sum()), int(r.rejected.sum())
+    left_out = len(r.uv) - used - rejected
+    more = f", {left_out} left out with their tracks" if left_out else ""
+    return f"{used} {r.kind} used, {rejected} rejected{more}"
 
 
 def _held_out_section(c: Calibration) -> Html:
@@ -148,11 +150,12 @@ def _held_out_section(c: Calibration) -> Html:
 
 def _projection_figures(c: Calibration, maps: dict[str, list[ProjectionMap]]) -> dict[str, Figure]:
     """The maps of camera i as `projection-i-0`, `projection-i-1`."""
-    seen, found = {r.sensor: r for r in _seen(c)}, {}
+    found = {}
     for i, (name, own) in enumerate(maps.items()):
         size = c.rig["sensors"][name]["resolution"]
         for k, m in enumerate(own):
-            found[f"projection-{i}-{k}"] = projection_figures.projection_figure(m, seen.get(name), size)
+            seen = [r for r in c.image_residuals if r.sensor == name]
+            found[f"projection-{i}-{k}"] = projection_figures.projection_figure(m, seen, size)
     return found
 
 

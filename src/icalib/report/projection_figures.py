@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from icalib.calibration import Calibration, CornerResiduals, ProjectionMap, projection_uncertainty, working_distance
+from icalib.calibration import Calibration, ImageResiduals, ProjectionMap, projection_uncertainty, working_distance
 from icalib.report.plot import Figure, axis, dots, figure, numbers, thin
 from icalib.report.quantities import shown
 
 MOST_DOTS = 1500
-WIDEST = 6.0  # of the scale of colours, in the median where corners are: edges without data would take it all
+WIDEST = 6.0  # of the scale of colours, in the median where points were: edges without data would take it all
 LEVELS = 9  # at least, of contours
-NOT_SEEN = 3.0  # times the median: a region that the target did not reach
+NOT_SEEN = 3.0  # times the median: a region where hardly anything was seen
 
 
 def projection_maps(c: Calibration, camera: str) -> list[ProjectionMap]:
-    """At infinity, and at the target's distance where it was seen; none where the rig file fixes the lens."""
+    """At infinity, and at the distance of what it saw; none where the rig file fixes the lens."""
     if all(c.group(camera, name).columns is None for name in ("intrinsics", "distortion")):
         return []
     ranges = [np.inf, *(x for x in [working_distance(c, camera)] if x is not None)]
@@ -25,8 +26,8 @@ def projection_maps(c: Calibration, camera: str) -> list[ProjectionMap]:
     return [m for m in maps if m is not None]
 
 
-def projection_figure(m: ProjectionMap, corners: CornerResiduals | None, resolution: tuple[int, int]) -> Figure:
-    """Standard deviation over the image with its contours, and where corners were."""
+def projection_figure(m: ProjectionMap, seen: Sequence[ImageResiduals], resolution: tuple[int, int]) -> Figure:
+    """Standard deviation over the image with its contours, and where what the camera saw was."""
     width, height = resolution
     top = float(min(np.nanmax(m.sigma), WIDEST * m.median_seen))
     step = _round(top / LEVELS)
@@ -45,11 +46,11 @@ def projection_figure(m: ProjectionMap, corners: CornerResiduals | None, resolut
     }
     heat["contours"] |= {"coloring": "heatmap", "labelfont": {"size": 10, "color": "#111827"}}
     traces = [heat]
-    if corners is not None:
-        used = corners.uv[~corners.rejected]
+    for r in seen:
+        used = r.uv[r.used]
         used = used[thin(len(used), MOST_DOTS)]
         marker = {"color": "#b45309", "size": 2.5, "opacity": 0.35}
-        traces.append(dots(used[:, 0], used[:, 1], "corners", "", marker=marker, hoverinfo="skip"))
+        traces.append(dots(used[:, 0], used[:, 1], r.kind, "", marker=marker, hoverinfo="skip"))
     return figure(
         traces,
         330,
@@ -68,13 +69,13 @@ def _round(step: float) -> float:
 
 def title(m: ProjectionMap) -> str:
     """What a map is of."""
-    return "Points far away" if np.isinf(m.range_m) else f"Points {shown(m.range_m)} m away, as the target was"
+    return "Points far away" if np.isinf(m.range_m) else f"Points {shown(m.range_m)} m away, like those it saw"
 
 
 def words(m: ProjectionMap) -> str:
     """The median, the worst, and what they mean."""
     size, u, v = m.worst
-    where = "where corners were seen" if m.seen.any() else "over the image"
+    where = "where it saw points" if m.seen.any() else "over the image"
     moved = "turned" if np.isinf(m.range_m) else "turned and moved"
     text = (
         f"Known to {shown(m.median_seen)} px {where} (median), to {shown(size)} px at the worst, at pixel "
@@ -82,4 +83,4 @@ def words(m: ProjectionMap) -> str:
         f"{moved} to fit it best."
     )
     worse = size > NOT_SEEN * m.median_seen and m.seen.any()
-    return text + (" Move the target there too to know the lens there." if worse else "")
+    return text + (" Let it see points there, too, and the lens is known there." if worse else "")

@@ -27,6 +27,7 @@ TRUST = {
     "bad": "Not as a whole. Do not use what is marked undetermined: it is no better than the guess.",
     "failed": "No. The solver did not converge; the numbers are where it stopped.",
 }
+_SEEN = {"corners": "corners", "observations": "observations of points that were followed"}
 WORDS = {"rotation": "rotation", "translation": "position", "time_offset": "time offset"}
 
 
@@ -205,7 +206,9 @@ def size_words(c: Calibration) -> str:
     parts = [f"{several}{span:.1f} s"]
     if c.cameras:
         images = sum(len(r.seconds) for r in c.corner_residuals)
-        parts.append(f"{images} images with {sum(len(r.uv) for r in c.corner_residuals)} corners")
+        counts = {kind: sum(len(r.uv) for r in c.image_residuals if r.kind == kind) for kind in _SEEN}
+        seen = " and ".join(f"{n} {_SEEN[kind]}" for kind, n in counts.items() if n)
+        parts.append(f"{images} images with {seen or 'nothing in them'}")
     if c.lidar_residuals:
         points = sum(r.points_used for r in c.lidar_residuals)
         parts.append(f"{sum(r.scans for r in c.lidar_residuals)} scans with {points} points on {len(c.planes)} planes")

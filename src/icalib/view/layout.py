@@ -36,5 +36,5 @@ def blueprint(rr: Any, c: Calibration, readings: bool) -> Any:
 
 def _measured(c: Calibration) -> list[str]:
     """Sensors of which something is left over time."""
-    residuals = (*c.corner_residuals, *c.lidar_residuals, *c.wheel_residuals, *c.pose_residuals)
+    residuals = (*c.image_residuals, *c.lidar_residuals, *c.wheel_residuals, *c.pose_residuals)
     return list(dict.fromkeys([*(r.sensor for r in residuals), *([c.imu] if c.imu else [])]))

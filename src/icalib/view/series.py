@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from icalib.calibration import Calibration, CornerResiduals, LidarResiduals
+from icalib.calibration import Calibration, ImageResiduals, LidarResiduals
 from icalib.report.motion_figures import BLOCKS
 from icalib.report.plot import AXIS_COLORS, COLORS, REJECTED
 from icalib.view.colors import rgb
@@ -15,16 +15,16 @@ from icalib.view.scene import place
 from icalib.view.stream import Stream
 
 BIN_S = 0.1  # over which points of a LiDAR are taken together
-_CORNER = 3.0  # radius, in points of the screen
-_GOOD = "#22c55e"
+_DOT = 3.0  # radius, in points of the screen
+_GOOD, _LEFT_OUT = "#22c55e", "#9ca3af"
 
 
 def log_residuals(s: Stream, c: Calibration) -> None:
     """Of cameras the RMS of each image [px], of LiDARs that of each tenth of a second [mm], of all else whitened."""
-    for r in c.corner_residuals:
+    for r in c.image_residuals:
         seconds, rms = rms_of_images(r)
-        log_lines(s, f"residuals/{r.sensor}", seconds, rms[:, None], ["RMS [px]"])
-        _log_corners(s, c, r)
+        log_lines(s, f"residuals/{r.sensor}/{r.kind}", seconds, rms[:, None], [f"RMS of {r.kind} [px]"])
+        _log_seen(s, c, r)
     for r in c.lidar_residuals:
         seconds, rms = rms_of_bins(r)
         log_lines(s, f"residuals/{r.sensor}", seconds, 1e3 * rms[:, None], ["RMS [mm]"])
@@ -56,10 +56,9 @@ def log_lines(s: Stream, entity: str, seconds: np.ndarray, values: np.ndarray, n
     s.over(entity, seconds, s.rr.Scalars.columns(scalars=values.reshape(-1)).partition([m] * n))
 
 
-def rms_of_images(r: CornerResiduals) -> tuple[np.ndarray, np.ndarray]:
-    """(m,) seconds and RMS [px] per coordinate of the images in which corners were used."""
-    image = np.repeat(np.arange(len(r.seconds)), np.diff(r.start))
-    used = ~r.rejected
+def rms_of_images(r: ImageResiduals) -> tuple[np.ndarray, np.ndarray]:
+    """(m,) seconds and RMS [px] per coordinate of the images in which something was used."""
+    image, used = r.image, r.used
     count = np.bincount(image[used], minlength=len(r.seconds))
     total = np.bincount(image[used], np.mean(r.residual[used].astype(np.float64) ** 2, axis=1), len(r.seconds))
     some = count > 0
@@ -73,12 +72,11 @@ def rms_of_bins(r: LidarResiduals) -> tuple[np.ndarray, np.ndarray]:
     return BIN_S * (number + 0.5), np.sqrt(total / np.bincount(of, minlength=len(number)))
 
 
-def _log_corners(s: Stream, c: Calibration, r: CornerResiduals) -> None:
-    """Corners as they were measured, in the camera's image; red where they were set aside."""
-    if not len(r.uv):
-        return
-    rr, entity = s.rr, f"{place(c, r.sensor)}/image/corners"
-    s.still(entity, rr.Points2D.from_fields(radii=rr.Radius.ui_points(_CORNER)))
-    colors = rgb(_GOOD, REJECTED)[r.rejected.astype(np.int64)]
+def _log_seen(s: Stream, c: Calibration, r: ImageResiduals) -> None:
+    """Corners, or points that were followed, as they were measured in the camera's image; red where they were
+    rejected, grey where their track is not in use."""
+    rr, entity = s.rr, f"{place(c, r.sensor)}/image/{r.kind}"
+    s.still(entity, rr.Points2D.from_fields(radii=rr.Radius.ui_points(_DOT)))
+    colors = rgb(_LEFT_OUT, _GOOD, REJECTED)[np.where(r.rejected, 2, r.used.astype(np.int64))]
     columns = rr.Points2D.columns(positions=r.uv + 0.5, colors=colors).partition(np.diff(r.start))
     s.over(entity, r.seconds, columns)

@@ -1,4 +1,4 @@
-"""Residuals of one camera's corners (predicted - measured)."""
+"""Residuals of what one camera saw (predicted - measured): corners, or points that it followed."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from icalib.calibration import CornerResiduals
+from icalib.calibration import ImageResiduals
 from icalib.report.plot import REJECTED, Figure, axis, dots, figure, line, numbers, thin
 
 MOST_DOTS = 2500  # of each kind in one figure
@@ -15,9 +15,9 @@ CELL_PX = 40
 FEWEST_IN_CELL = 5
 
 
-def residual_plane(r: CornerResiduals) -> Figure:
-    """Density of the residuals (u, v), rejected corners as crosses."""
-    used = r.residual[~r.rejected]
+def residual_plane(r: ImageResiduals) -> Figure:
+    """Density of the residuals (u, v), rejected ones that have any as crosses."""
+    used = r.residual[r.used]
     reach = 1.3 * float(np.quantile(np.abs(used), 0.999)) if len(used) else 1.0
     edges = np.linspace(-reach, reach, BINS + 1)
     count, _, _ = np.histogram2d(used[:, 1], used[:, 0], bins=[edges, edges])
@@ -28,10 +28,10 @@ def residual_plane(r: CornerResiduals) -> Figure:
         "y": numbers(middle),
         "z": [[value or None for value in row] for row in count.tolist()],
         "colorscale": [[0, "#dbeafe"], [0.5, "#4a86c5"], [1, "#0b2545"]],
-        "colorbar": {"title": {"text": "corners"}, "thickness": 10},
+        "colorbar": {"title": {"text": r.kind}, "thickness": 10},
         "hovertemplate": "u %{x} px, v %{y} px: %{z}<extra></extra>",
     }
-    far = r.residual[r.rejected]
+    far = r.residual[_measured(r)]
     far = far[thin(len(far), MOST_DOTS)]
     cross = {"color": REJECTED, "size": 5, "symbol": "x-thin", "line": {"color": REJECTED, "width": 1}}
     outside = int((np.abs(far) > 2.0 * reach).any(axis=1).sum())
@@ -46,22 +46,21 @@ def residual_plane(r: CornerResiduals) -> Figure:
     )
 
 
-def residuals_over_time(r: CornerResiduals) -> Figure:
+def residuals_over_time(r: ImageResiduals) -> Figure:
     """Size of each residual, and the RMS of each image."""
     size = np.linalg.norm(r.residual, axis=1)
-    image = np.repeat(np.arange(len(r.seconds)), np.diff(r.start))
-    used, gone = np.flatnonzero(~r.rejected), np.flatnonzero(r.rejected)
+    image, used, gone = r.image, np.flatnonzero(r.used), np.flatnonzero(_measured(r))
     some, few = used[thin(len(used), MOST_DOTS)], gone[thin(len(gone), MOST_DOTS)]
     per_image = np.bincount(image[used], minlength=len(r.seconds))
     square = np.bincount(image[used], size[used] ** 2, minlength=len(r.seconds))
     rms = np.sqrt(square / np.where(per_image > 0, 2.0 * per_image, np.nan))
     keep = thin(len(r.seconds), MOST_DOTS)
     top = 1.5 * float(size[used].max(initial=1e-3))
-    seconds = r.seconds[image]
+    seconds, clipped = r.seconds[image], "rejected (clipped to the frame)"
     return figure(
         [
-            dots(seconds[some], size[some], "corners", "#93b7dc"),
-            dots(seconds[few], np.minimum(size[few], top), "rejected (clipped to the frame)", REJECTED, 4),
+            dots(seconds[some], size[some], r.kind, "#93b7dc"),
+            *([dots(seconds[few], np.minimum(size[few], top), clipped, REJECTED, 4)] if len(few) else []),
             line(r.seconds[keep], rms[keep], "RMS of an image, per coordinate", "#0f2f57"),
         ],
         400,
@@ -70,13 +69,13 @@ def residuals_over_time(r: CornerResiduals) -> Figure:
     )
 
 
-def residuals_over_image(r: CornerResiduals, resolution: tuple[int, int]) -> Figure:
+def residuals_over_image(r: ImageResiduals, resolution: tuple[int, int]) -> Figure:
     """RMS in cells of the image, with the mean residual of each cell as an enlarged arrow."""
     width, height = resolution
     nx, ny = max(1, round(width / CELL_PX)), max(1, round(height / CELL_PX))
-    x, y = np.clip(r.uv[~r.rejected], 0, [width - 1, height - 1]).T
+    x, y = np.clip(r.uv[r.used], 0, [width - 1, height - 1]).T
     cell = (y * ny / height).astype(int) * nx + (x * nx / width).astype(int)
-    error = r.residual[~r.rejected]
+    error = r.residual[r.used]
     count = np.bincount(cell, minlength=nx * ny)
     enough = np.where(count >= FEWEST_IN_CELL, count, np.nan)
     mean = np.stack([np.bincount(cell, error[:, i], minlength=nx * ny) / enough for i in range(2)], axis=1)
@@ -103,6 +102,11 @@ def residuals_over_image(r: CornerResiduals, resolution: tuple[int, int]) -> Fig
         xaxis=axis("u [px]", range=[-0.5, width - 0.5], constrain="domain"),
         yaxis=axis("v [px]", range=[height - 0.5, -0.5], scaleanchor="x", constrain="domain"),
     )
+
+
+def _measured(r: ImageResiduals) -> np.ndarray:
+    """(N,) bool: rejected, but with a residual."""
+    return r.rejected & np.isfinite(r.residual[:, 0])
 
 
 def _arrows(at: np.ndarray, mean: np.ndarray) -> list[dict[str, Any]]:

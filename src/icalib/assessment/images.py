@@ -1,0 +1,46 @@
+"""What is left of corners and tracks, on the result's clock."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icalib.calibration import CornerResiduals, TrackResiduals
+from icalib.estimation.clocks import instants
+from icalib.estimation.estimate import Estimate
+from icalib.timeline import Timeline
+
+
+def corner_residuals(found: Estimate, timeline: Timeline) -> tuple[CornerResiduals, ...]:
+    """By camera; those that saw no target have none in any image."""
+    out = []
+    for i, (camera, corners) in enumerate(zip(found.problem.cameras, found.outcome.residuals.corners, strict=True)):
+        stream = camera.stream
+        times = instants(stream, found.outcome.state.values)
+        out.append(
+            CornerResiduals(
+                camera.name, timeline.shown(times, timeline.of_images(i)), stream.start, stream.point, stream.uv,
+                corners.residual, camera.noise.sigma[stream.image], corners.root == 0.0,
+            )
+        )  # fmt: skip
+    return tuple(out)
+
+
+def track_residuals(found: Estimate, timeline: Timeline) -> tuple[TrackResiduals, ...]:
+    """By camera, where any of them follows points."""
+    factor, left = found.problem.features, found.outcome.residuals.features
+    if factor is None or left is None:
+        return ()
+    out = []
+    for i, (camera, stream) in enumerate(zip(factor.cameras, factor.streams, strict=True)):
+        times = instants(camera.stream, found.outcome.state.values)
+        unused = (left.root[i] == 0.0)[:, None]
+        residual = np.where(unused, np.nan, left.residual[i]).astype(np.float32)
+        own = np.linalg.norm(left.points[factor.tracks.camera == i], axis=1)
+        out.append(
+            TrackResiduals(
+                camera.name, factor.sigma[i], float(np.median(own)) if len(own) else None,
+                timeline.shown(times, timeline.of_images(i)), stream.start, stream.feature, stream.uv, residual,
+                ~factor.keep[i],
+            )
+        )  # fmt: skip
+    return tuple(out)
