@@ -3,8 +3,8 @@
 python benchmarks/study_tables.py [NAME=STUDY ...]
 
 With NAME=STUDY the result of the study in the folder STUDY, made anew from its runs, becomes
-docs/studies/NAME.json. Then every table between `<!-- study NAME -->` or `<!-- studies NAME ... -->` and `<!-- end -->` is written anew.
-`tests/test_docs_studies.py` holds the page against the results.
+docs/studies/NAME.json. Then the tables between `<!-- study NAME -->` or `<!-- studies NAME ... -->`
+and `<!-- end -->` are written anew. `tests/test_docs_studies.py` holds the page against the results.
 """
 
 from __future__ import annotations

@@ -7,7 +7,8 @@ import pytest
 
 from icalib.errors import EstimationError
 from icalib.estimation.imu_data import ImuData
-from icalib.first_guess.clocks import CameraRates, align
+from icalib.first_guess.clock_shifts import CameraRates
+from icalib.first_guess.clocks import align
 from icalib.measurements import ImuStream
 from icalib.rig import ImuNoise
 from icalib.simulation.imu import rotation_from_vector
@@ -49,3 +50,31 @@ def test_noise_of_the_images_is_not_taken_for_another_scale(seed: int):
 def test_another_scale_is_named(scale: float, words: str):
     with pytest.raises(EstimationError, match=words):
         align(_imu(scale), "cam0", _camera(0), None)
+
+
+@pytest.mark.parametrize("nearer", [True, False])
+def test_turns_of_the_same_size_about_other_axes_are_another_motion(nearer: bool):
+    """Both 12 s and 24 s into the recording the IMU turns as fast as the camera does; about the same axes at 12 s
+    only, where a little noise makes it less alike."""
+    seconds, half = np.arange(0.0, 40.0, 0.005), 6.0
+    own = _rate(np.arange(0.0, half, 0.005))
+    gyro = 0.3 * _rate(seconds + 100.0)
+    here, there = (np.flatnonzero(seconds >= t)[: len(own)] for t in ((12.0, 24.0) if nearer else (24.0, 12.0)))
+    rng = np.random.default_rng(3)
+    gyro[here] = own * (1.0 + 0.05 * rng.normal(size=(len(own), 1)))
+    gyro[there] = np.linalg.norm(own, axis=1)[:, None] * _turning_axis(len(own))
+    imu = ImuStream("imu0", (1e9 * seconds).astype(np.int64), gyro, np.zeros((len(seconds), 3)))
+    images = np.arange(0.0, half - 0.01, 0.05)
+    rate = _rate(0.5 * (images[:-1] + images[1:])) @ R_IMU_CAM
+    found = align(
+        ImuData.build(imu, ImuNoise(1e-3, 1e-2, 1e-5, 1e-4)), "cam0", CameraRates(images[:-1], images[1:], rate), None
+    )
+    assert found.offset == pytest.approx(12.0 if nearer else 24.0, abs=0.01)
+    assert np.trace(found.rotation.T @ R_IMU_CAM) > 2.999
+
+
+def _turning_axis(count: int) -> np.ndarray:
+    """(count, 3) unit vectors along a spiral."""
+    t = np.linspace(0.0, 1.0, count)
+    z, angle = 2.0 * t - 1.0, 25.0 * t
+    return np.stack([np.sqrt(1.0 - z**2) * np.cos(angle), np.sqrt(1.0 - z**2) * np.sin(angle), z], axis=1)

@@ -6,9 +6,9 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation.imu_data import ImuData
+from icalib.first_guess.clock_shifts import CameraRates
 from icalib.first_guess.clocks import (
     Alignment,
-    CameraRates,
     align,
     as_given,
     better_given,

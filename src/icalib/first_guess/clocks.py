@@ -9,19 +9,22 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation.imu_data import ImuData
-from icalib.first_guess.correlation import Shift, best_shift
+from icalib.first_guess.clock_shifts import (
+    AVERAGED_S,
+    LONGEST_STEP_S,
+    CameraRates,
+    at,
+    best_offsets,
+    likely_offsets,
+    means,
+)
 from icalib.first_guess.target_poses import TargetPoses
 from icalib.geometry import so3
 from icalib.measurements import CornerStream
 
-GRID_HZ = 100.0
-LONGEST_STEP_S = 0.25  # images further apart do not give an angular rate
-SHORTEST_OVERLAP_S = 4.0
-LEAST_CORRELATION = 0.7
 LARGEST_UNEXPLAINED = 0.35  # of the angular rate
 CLOCKS_AGREE_S = 0.01  # of the time offsets that two recordings show
 CLEARLY_BETTER = 0.5  # of what another offset leaves unexplained
-AVERAGED_S = 0.25  # over which the two are compared
 LEAST_ALIKE = 0.3  # share of the camera's rate that goes with the IMU's, below which their ratio says nothing
 STILL_RAD_S = 0.03
 NOISE_ALONE = 1.5  # times what noise makes of the rate
@@ -33,17 +36,6 @@ DEGREES = 180.0 / np.pi
 
 class OneAxisError(EstimationError):
     """A camera turned about one axis only, and the turn about it is open."""
-
-
-@dataclass(frozen=True)
-class CameraRates:
-    """Mean angular rates between neighbouring images: start, end (n,) camera clock [s]; rate (n, 3) camera axes
-    [rad/s]; least_correlation: with the IMU's, below which the two do not match."""
-
-    start: np.ndarray
-    end: np.ndarray
-    rate: np.ndarray
-    least_correlation: float = LEAST_CORRELATION
 
 
 @dataclass(frozen=True)
@@ -80,7 +72,27 @@ def camera_rates(stream: CornerStream, poses: TargetPoses) -> CameraRates:
 def align(imu: ImuData, name: str, rates: CameraRates, given_offset: float | None) -> Alignment:
     """Offset, rotation and gyro bias. Raises EstimationError where the rates do not match at any shift."""
     _check_motion(imu, name, rates)
-    offset = _correlate(imu, name, rates) if given_offset is None else given_offset
+    offsets = likely_offsets(imu, name, rates) if given_offset is None else [given_offset]
+    found = None
+    for offset in offsets:
+        if found is not None and not _covered(imu, rates, offset).any():
+            continue
+        alike, now = _align_near(imu, name, rates, offset, given_offset is not None)
+        found = found or (alike, now)
+        if _unexplained(imu, alike, now) <= LARGEST_UNEXPLAINED:
+            found = alike, now
+            break  # in a short recording the size of the rates may be more alike elsewhere, but not their directions
+    assert found is not None
+    _check_offset(imu, name, *found, given_offset is not None)
+    _check_scale(imu, name, rates, found[1])
+    return found[1]
+
+
+def _align_near(
+    imu: ImuData, name: str, rates: CameraRates, offset: float, keep_offset: bool
+) -> tuple[CameraRates, Alignment]:
+    """From one offset: the rates, as large as the gyroscope's where a guessed lens makes them too large or too small,
+    and how they go together."""
     if not _covered(imu, rates, offset).any():
         raise _no_overlap(imu, name)
     pair = _side_by_side(imu, rates, offset)
@@ -88,10 +100,7 @@ def align(imu: ImuData, name: str, rates: CameraRates, given_offset: float | Non
     rough = _rough(offset, *pair)
     scale = _scale(rough, *pair)
     alike = rates if 0.8 < scale < 1.25 else replace(rates, rate=scale * rates.rate)
-    found = _refine(imu, alike, rough, given_offset is not None)
-    _check_offset(imu, name, alike, found, given_offset is not None)
-    _check_scale(imu, name, rates, found)
-    return found
+    return alike, _refine(imu, alike, rough, keep_offset)
 
 
 def rough_alignments(
@@ -101,7 +110,7 @@ def rough_alignments(
     rates go together best, and at the `guess`."""
     _check_motion(imu, name, rates)
     if offsets is None:
-        offsets = [s.samples / GRID_HZ for s in _shifts(imu, rates) if np.isfinite(s.correlation)] + [guess]
+        offsets = [*best_offsets(imu, rates), guess]
     offsets = [x for x in dict.fromkeys(offsets) if _covered(imu, rates, x).any()]
     return [_rough(x, *_side_by_side(imu, rates, x)) for x in offsets]
 
@@ -140,15 +149,9 @@ def _side_by_side(imu: ImuData, rates: CameraRates, offset: float) -> tuple[np.n
     inside = _covered(imu, rates, offset)
     start, end = rates.start[inside], rates.end[inside]
     angle = _integral(imu)
-    gyro = (_at(imu.seconds, angle, end + offset) - _at(imu.seconds, angle, start + offset)) / (end - start)[:, None]
+    gyro = (at(imu.seconds, angle, end + offset) - at(imu.seconds, angle, start + offset)) / (end - start)[:, None]
     count = min(max(1, round(AVERAGED_S / float(np.median(end - start)))), len(start))
-    return _means(gyro, count), _means(rates.rate[inside], count)
-
-
-def _means(values: np.ndarray, count: int) -> np.ndarray:
-    """(n - count + 1, 3) means over `count` neighbours of (n, 3)."""
-    total = np.concatenate([np.zeros((1, 3)), np.cumsum(values, axis=0)])
-    return (total[count:] - total[:-count]) / count
+    return means(gyro, count), means(rates.rate[inside], count)
 
 
 def better_offset(imu: ImuData, name: str, rates: CameraRates, expected: float) -> float | None:
@@ -172,7 +175,7 @@ def turning(imu: ImuData, rates: CameraRates) -> tuple[float, float]:
     rate = imu.gyro - np.median(imu.gyro, axis=0)
     noise = np.sqrt(3.0 * np.median(imu.variance[:, 0]) / dt)
     if np.sqrt((rate**2).sum(axis=1).mean()) < NOISE_ALONE * noise:
-        rate = _means(rate, min(max(1, round(AVERAGED_S / dt)), len(rate)))
+        rate = means(rate, min(max(1, round(AVERAGED_S / dt)), len(rate)))
     return float(np.sqrt((rate**2).sum(axis=1).mean())), float(np.sqrt(np.median((rates.rate**2).sum(axis=1))))
 
 
@@ -189,49 +192,6 @@ def _check_motion(imu: ImuData, name: str, rates: CameraRates) -> None:
             f"record again "
             "while turning the rig about all axes in front of the target."
         )
-
-
-def _grid(t: np.ndarray, rate: np.ndarray, covered: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Size of rates (n, 3) on a regular grid from 0 to the last of `t`, each a mean over `count` points of the grid,
-    and a mask of where all of these are known."""
-    grid = np.arange(int(t[-1] * GRID_HZ) + 1) / GRID_HZ
-    count = min(count, len(grid))
-    known = np.interp(grid, t, covered.astype(float)) > 0.99
-    fine = _at(t, rate, grid)
-    return np.linalg.norm(_means(fine, count), axis=1), _means(np.tile(known[:, None], 3), count)[:, 0] > 0.99
-
-
-def _correlate(imu: ImuData, name: str, rates: CameraRates) -> float:
-    """Offset [s] at the peak of the masked, normalised cross-correlation of |w| over all shifts, of rates as they are
-    or of their means, whichever is higher: fast motion shows in the ones, slow motion in the others."""
-    found = max(_shifts(imu, rates), key=_likeness)
-    if not found.correlation > rates.least_correlation:
-        raise EstimationError(
-            f"the motion of {name} does not match that of {imu.name} at any shift of their clocks (best correlation "
-            f"{max(found.largest, 0.0):.2f}); check that both come from the same recording, overlap in time, "
-            f"and are in rad/s."
-        )
-    return found.samples / GRID_HZ
-
-
-def _shifts(imu: ImuData, rates: CameraRates) -> list[Shift]:
-    return [_shift(imu, rates, count) for count in (1, round(AVERAGED_S * GRID_HZ))]
-
-
-def _shift(imu: ImuData, rates: CameraRates, count: int) -> Shift:
-    """Of the camera's grid against the IMU's; means over `count` points of them. The IMU's rates as they are or about
-    their median, whichever is more alike: the one has a bias in it, the other lacks what is steady in a turn."""
-    known = ~np.isin(imu.seconds, [start for start, _ in imu.gaps])
-    middle = 0.5 * (rates.start + rates.end)
-    near = np.diff(middle, append=middle[-1]) < LONGEST_STEP_S
-    seen = _grid(middle, rates.rate, near, count)
-    own = (_grid(imu.seconds, imu.gyro - about, known, count) for about in (0.0, np.median(imu.gyro, axis=0)))
-    return max((best_shift(*a, *seen, SHORTEST_OVERLAP_S * GRID_HZ) for a in own), key=_likeness)
-
-
-def _likeness(shift: Shift) -> float:
-    """Its correlation, where there is one."""
-    return shift.correlation if np.isfinite(shift.correlation) else -1.0
 
 
 def _kabsch(w_imu: np.ndarray, w_cam: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -256,11 +216,6 @@ def _integral(imu: ImuData) -> np.ndarray:
     return angle
 
 
-def _at(known: np.ndarray, values: np.ndarray, seconds: np.ndarray) -> np.ndarray:
-    """(n, 3) of values (N, 3) that are `known` (N,) s at some times, at others."""
-    return np.stack([np.interp(seconds, known, values[:, k]) for k in range(3)], axis=1)
-
-
 def _refine(imu: ImuData, rates: CameraRates, rough: Alignment, keep_offset: bool) -> Alignment:
     """Gauss-Newton on the offset, Kabsch on rotation and bias in turn; rates are means over each image interval."""
     angle = _integral(imu)
@@ -269,8 +224,8 @@ def _refine(imu: ImuData, rates: CameraRates, rough: Alignment, keep_offset: boo
         start, end = rates.start + offset, rates.end + offset
         inside = _covered(imu, rates, offset).astype(float)
         span = (end - start)[:, None]
-        mean = (_at(imu.seconds, angle, end) - _at(imu.seconds, angle, start)) / span
-        slope = (_at(imu.seconds, imu.gyro, end) - _at(imu.seconds, imu.gyro, start)) / span
+        mean = (at(imu.seconds, angle, end) - at(imu.seconds, angle, start)) / span
+        slope = (at(imu.seconds, imu.gyro, end) - at(imu.seconds, imu.gyro, start)) / span
         weight = inside
         for _ in range(3):
             residual = mean - rates.rate @ R.T - bias
@@ -290,7 +245,7 @@ def turns_about_two_axes(imu: ImuData, rates: CameraRates, found: Alignment) -> 
     """Whether the camera turned about more than one axis, and the IMU with it: of a target far away a camera alone
     sees turns that are noise. Else its rotation about that axis stays open."""
     middle = (0.5 * (rates.start + rates.end) + found.offset)[_covered(imu, rates, found.offset)]
-    gyro = _at(imu.seconds, imu.gyro, middle)
+    gyro = at(imu.seconds, imu.gyro, middle)
     return all(_second_axis(w) >= LEAST_SECOND_AXIS for w in (rates.rate, gyro))
 
 
@@ -343,7 +298,7 @@ def as_given(imu: ImuData, name: str, rates: CameraRates, offset: float, rotatio
     if not inside.any():
         raise _no_overlap(imu, name)
     middle = (0.5 * (rates.start + rates.end) + offset)[inside]
-    gyro = _at(imu.seconds, imu.gyro, middle)
+    gyro = at(imu.seconds, imu.gyro, middle)
     return Alignment(offset, rotation, np.median(gyro - rates.rate[inside] @ rotation.T, axis=0), given=True)
 
 

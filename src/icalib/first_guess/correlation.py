@@ -18,6 +18,13 @@ class Shift(NamedTuple):
 def best_shift(a: np.ndarray, mask_a: np.ndarray, b: np.ndarray, mask_b: np.ndarray, least: float) -> Shift:
     """Between a (n,) and b (m,) on one regular grid, where both masks hold; at least `least` samples must overlap, or
     half of all there are."""
+    return best_shifts(a, mask_a, b, mask_b, least, 1, 0)[0]
+
+
+def best_shifts(
+    a: np.ndarray, mask_a: np.ndarray, b: np.ndarray, mask_b: np.ndarray, least: float, most: int, apart: int
+) -> list[Shift]:
+    """The `most` best shifts, best first, each more than `apart` samples from those before; see `best_shift`."""
     n = len(a) + len(b) - 1
     size = 1 << (n - 1).bit_length()
 
@@ -38,5 +45,11 @@ def best_shift(a: np.ndarray, mask_a: np.ndarray, b: np.ndarray, mask_b: np.ndar
     floor = 1e-3 * (a[mask_a].var() * b[mask_b].var()) * count**2
     r = np.where(enough, covariance / np.sqrt(variance + floor), 0.0)
     score = np.arctanh(np.clip(r, 0.0, 0.999999)) * np.sqrt(count)
-    k = int(np.argmax(score))
-    return Shift(k - (len(b) - 1), float(r[k]), float(r.max()))
+    found = []
+    for _ in range(most):
+        k = int(np.argmax(score))
+        found.append(Shift(k - (len(b) - 1), float(r[k]), float(r.max())))
+        score[max(k - apart, 0) : k + apart + 1] = -np.inf
+        if not np.isfinite(score).any():
+            break
+    return found

@@ -14,9 +14,9 @@ import numpy as np
 from icalib.errors import EstimationError
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.state import Key, State
+from icalib.first_guess.clock_shifts import CameraRates
 from icalib.first_guess.clocks import (
     Alignment,
-    CameraRates,
     align,
     as_given,
     contradicts,

@@ -25,7 +25,8 @@ from icalib.first_guess.by_recording import (
     motion_alone,
     naming_recording,
 )
-from icalib.first_guess.clocks import LEAST_CORRELATION, LONGEST_STEP_S, Alignment, CameraRates
+from icalib.first_guess.clock_shifts import LEAST_CORRELATION, LONGEST_STEP_S, CameraRates
+from icalib.first_guess.clocks import Alignment
 from icalib.first_guess.gyro import GyroRotation
 from icalib.first_guess.lever_arm import SIZE_TOLERANCE, size_of
 from icalib.first_guess.lidar import (

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from icalib.errors import EstimationError
-from icalib.first_guess.clocks import CameraRates
+from icalib.first_guess.clock_shifts import CameraRates
 from icalib.geometry import so3
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.small import solve_definite

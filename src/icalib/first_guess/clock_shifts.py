@@ -1,0 +1,89 @@
+"""How far a camera's clock may be from the IMU's: where the sizes of their angular rates go together, at any shift."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.errors import EstimationError
+from icalib.estimation.imu_data import ImuData
+from icalib.first_guess.correlation import Shift, best_shifts
+
+GRID_HZ = 100.0
+LONGEST_STEP_S = 0.25  # images further apart do not give an angular rate
+SHORTEST_OVERLAP_S = 4.0
+LEAST_CORRELATION = 0.7
+MOST_PEAKS, PEAKS_APART_S = 5, 0.25  # of the correlation, that are tried
+AVERAGED_S = 0.25  # over which the two are compared
+
+
+@dataclass(frozen=True)
+class CameraRates:
+    """Mean angular rates between neighbouring images: start, end (n,) camera clock [s]; rate (n, 3) camera axes
+    [rad/s]; least_correlation: with the IMU's, below which the two do not match."""
+
+    start: np.ndarray
+    end: np.ndarray
+    rate: np.ndarray
+    least_correlation: float = LEAST_CORRELATION
+
+
+def likely_offsets(imu: ImuData, name: str, rates: CameraRates) -> list[float]:
+    """Offsets [s] at peaks of the masked, normalised cross-correlation of |w| over all shifts, of rates as they are or
+    of their means, whichever is higher at its best: fast motion shows in the ones, slow motion in the others."""
+    peaks = max(_shifts(imu, rates), key=lambda p: _likeness(p[0]))
+    if not peaks[0].correlation > rates.least_correlation:
+        raise EstimationError(
+            f"the motion of {name} does not match that of {imu.name} at any shift of their clocks (best correlation "
+            f"{max(peaks[0].largest, 0.0):.2f}); check that both come from the same recording, overlap in time, "
+            f"and are in rad/s."
+        )
+    return [p.samples / GRID_HZ for p in peaks if p.correlation > rates.least_correlation]
+
+
+def best_offsets(imu: ImuData, rates: CameraRates) -> list[float]:
+    """Offsets [s] at which rates, and means of them, go together best, however little that is."""
+    return [p[0].samples / GRID_HZ for p in _shifts(imu, rates) if np.isfinite(p[0].correlation)]
+
+
+def _shifts(imu: ImuData, rates: CameraRates) -> list[list[Shift]]:
+    return [_peaks(imu, rates, count) for count in (1, round(AVERAGED_S * GRID_HZ))]
+
+
+def _peaks(imu: ImuData, rates: CameraRates, count: int) -> list[Shift]:
+    """Of the camera's grid against the IMU's; means over `count` points of them. The IMU's rates as they are or about
+    their median, whichever is more alike: the one has a bias in it, the other lacks what is steady in a turn."""
+    known = ~np.isin(imu.seconds, [start for start, _ in imu.gaps])
+    middle = 0.5 * (rates.start + rates.end)
+    near = np.diff(middle, append=middle[-1]) < LONGEST_STEP_S
+    seen = _grid(middle, rates.rate, near, count)
+    own = (_grid(imu.seconds, imu.gyro - about, known, count) for about in (0.0, np.median(imu.gyro, axis=0)))
+    least, apart = SHORTEST_OVERLAP_S * GRID_HZ, round(PEAKS_APART_S * GRID_HZ)
+    return max((best_shifts(*a, *seen, least, MOST_PEAKS, apart) for a in own), key=lambda p: _likeness(p[0]))
+
+
+def _grid(t: np.ndarray, rate: np.ndarray, covered: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Size of rates (n, 3) on a regular grid from 0 to the last of `t`, each a mean over `count` points of the grid,
+    and a mask of where all of these are known."""
+    grid = np.arange(int(t[-1] * GRID_HZ) + 1) / GRID_HZ
+    count = min(count, len(grid))
+    known = np.interp(grid, t, covered.astype(float)) > 0.99
+    fine = at(t, rate, grid)
+    return np.linalg.norm(means(fine, count), axis=1), means(np.tile(known[:, None], 3), count)[:, 0] > 0.99
+
+
+def _likeness(shift: Shift) -> float:
+    """Its correlation, where there is one."""
+    return shift.correlation if np.isfinite(shift.correlation) else -1.0
+
+
+def means(values: np.ndarray, count: int) -> np.ndarray:
+    """(n - count + 1, 3) means over `count` neighbours of (n, 3)."""
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(values, axis=0)])
+    return (total[count:] - total[:-count]) / count
+
+
+def at(known: np.ndarray, values: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """(n, 3) of values (N, 3) that are `known` (N,) s at some times, at others."""
+    return np.stack([np.interp(seconds, known, values[:, k]) for k in range(3)], axis=1)
