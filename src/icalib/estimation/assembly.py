@@ -196,17 +196,24 @@ def _others(inputs: Inputs, state: State, noise: RobotNoise) -> tuple[SensorFact
 def _features(inputs: Inputs, state: State, cameras: tuple[CornerFactor, ...], following: Following) -> FeatureFactor:
     """Points of the scene, as tracks that the poses of `state` find."""
     streams, settings = inputs.measurements.tracks, inputs.rig.settings
-    times, keep = image_times(inputs, state.values), []
-    for camera, stream, t, k in zip(cameras, streams, times, following.keep, strict=True):
-        seen = is_seen(inputs, t, state.seconds[camera.node])
-        keep.append(k & np.repeat(seen, np.diff(stream.start)))
+    shown = on_the_chain(inputs, state, cameras)
+    keep = tuple(k & s for k, s in zip(following.keep, shown, strict=True))
     loss = settings.loss, settings.loss_scale
     cuts, seams = chain_cuts(len(state.seconds)), state.starts[1:]
     if following.cut:
         cuts = (*cuts, *(int(k) + 1 for k in np.flatnonzero(np.diff(np.floor(state.seconds / CUT_S)))))
     surfaces = _surfaces(inputs, state, following.cut)
-    factor = FeatureFactor.build(cameras, streams, following.sigma, tuple(keep), loss, state, cuts, seams, surfaces)
+    factor = FeatureFactor.build(cameras, streams, following.sigma, keep, loss, state, cuts, seams, surfaces)
     return factor.coarse(state) if following.cut else factor
+
+
+def on_the_chain(inputs: Inputs, state: State, cameras: tuple[CornerFactor, ...]) -> tuple[np.ndarray, ...]:
+    """By camera, (N,) bool: observations of tracks in images that have a node."""
+    times, streams = image_times(inputs, state.values), inputs.measurements.tracks
+    return tuple(
+        np.repeat(is_seen(inputs, t, state.seconds[camera.node]), np.diff(stream.start))
+        for camera, stream, t in zip(cameras, streams, times, strict=True)
+    )
 
 
 def _surfaces(inputs: Inputs, state: State, coarse: bool) -> Surfaces | None:

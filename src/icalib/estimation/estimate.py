@@ -79,7 +79,7 @@ class Judged:
             pairs = zip(problem.cameras, outcome.residuals.corners, strict=True)
             now = replace(now, keep=tuple(_inliers(f, out, rig.settings) for f, out in pairs))
         if now.following is not None:
-            now = replace(now, following=next_following(rig, problem, outcome, now.following, first))
+            now = replace(now, following=next_following(inputs, outcome, now.following, first))
         if _noise_is_estimated(inputs):
             models, noise = _next_noise(inputs, problem, outcome)
             now = replace(now, models=models, noise=noise, robot=_next_robot(inputs, problem, outcome, now.robot))

@@ -7,14 +7,13 @@ from dataclasses import replace
 import numpy as np
 
 from icalib.estimation.arrowhead import chain_cuts
-from icalib.estimation.assembly import Following
+from icalib.estimation.assembly import Following, on_the_chain
 from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.medians import grouped_quantiles, largest_normal, median_variance
 from icalib.estimation.outcome import Outcome
-from icalib.estimation.problem import Problem
 from icalib.measurements import CornerStream
-from icalib.rig import Camera, Rig, Settings
+from icalib.rig import Camera, Settings
 
 FIRST_GUESS_PX = 1.0
 SMALLEST_PX = 0.005
@@ -32,19 +31,20 @@ def first_following(inputs: Inputs) -> Following | None:
     return Following(sigma, tuple(np.ones(len(t.uv), dtype=bool) for t in inputs.measurements.tracks), True)
 
 
-def next_following(rig: Rig, problem: Problem, outcome: Outcome, now: Following, first: bool) -> Following:
-    """Of the next pass: noise as the residuals show it, where it is not given, and none of the outliers that stand out
-    after the `first` pass or another."""
-    factor, out = problem.features, outcome.residuals.features
+def next_following(inputs: Inputs, outcome: Outcome, now: Following, first: bool) -> Following:
+    """Of the next pass: noise as the residuals show it, where it is not given, and all observations but the outliers
+    that stand out after the `first` pass or another."""
+    rig, factor, out = inputs.rig, outcome.problem.features, outcome.residuals.features
     assert factor is not None and out is not None
     sigma = tuple(_sigma(c, factor, out, i) for i, c in enumerate(rig.cameras))
     if rig.settings.outlier_std <= 0.0:
         return Following(sigma, now.keep)
-    # The poses that the pass began with left tracks out that those of its end find: these are judged, too.
-    anew = replace(factor, sigma=sigma).cut(outcome.state, chain_cuts(factor.n_nodes))
-    left = anew.look(outcome.state)
-    share = GOOD_AT_FIRST if first else GOOD
-    return Following(sigma, tuple(_kept(anew, left, i, k, rig.settings, share) for i, k in enumerate(now.keep)))
+    # All that was seen, with the poses of the pass's end: those of its beginning left tracks out that these find, and
+    # what a lens that was not found yet made an outlier may be none.
+    shown = on_the_chain(inputs, outcome.state, factor.cameras)
+    anew = replace(factor, sigma=sigma, keep=shown).cut(outcome.state, chain_cuts(factor.n_nodes))
+    left, share = anew.look(outcome.state), GOOD_AT_FIRST if first else GOOD
+    return Following(sigma, tuple(_kept(anew, left, i, rig.settings, share) for i in range(len(shown))))
 
 
 def _sigma(camera: Camera, factor: FeatureFactor, out: FeatureOutput, index: int) -> float:
@@ -57,11 +57,8 @@ def _sigma(camera: Camera, factor: FeatureFactor, out: FeatureOutput, index: int
     return max(float(np.sqrt(variance / max(1.0 - 3.0 * points / rows, 0.1))), SMALLEST_PX)
 
 
-def _kept(
-    factor: FeatureFactor, out: FeatureOutput, index: int, keep: np.ndarray, settings: Settings, share: float
-) -> np.ndarray:
-    """Observations without outliers, and without those that the model cannot see; where the track is left out they
-    stay.
+def _kept(factor: FeatureFactor, out: FeatureOutput, index: int, settings: Settings, share: float) -> np.ndarray:
+    """(N,) bool: observations that are no outliers, and that the model can see; where the track is left out they stay.
 
     An outlier is `outlier_std` standard deviations above the mean of its image, and above `outlier_min_px`. Both are
     those of normal errors as large as that `share` of the image's: where few points are followed, one outlier alone
@@ -72,7 +69,7 @@ def _kept(
     size, image = np.linalg.norm(out.residual[index], axis=1), stream.image
     most = grouped_quantiles(size[used], image[used], len(stream.stamps_ns), share)
     limit = np.maximum(largest_normal(settings.outlier_std, share) * most, settings.outlier_min_px)
-    return keep & ~(followed & (~used | (size > limit[image])))
+    return ~(followed & (~used | (size > limit[image])))
 
 
 def inliers(stream: CornerStream, residual: np.ndarray, used: np.ndarray, settings: Settings) -> np.ndarray:

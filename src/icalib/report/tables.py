@@ -147,7 +147,7 @@ def _body_row(c: Calibration, body: str) -> list[object]:
 
 def poses(c: Calibration) -> Html:
     """T_imu_sensor of each sensor, as a matrix to copy."""
-    return element("div", [_matrix(f"T_{c.body}_{name}", c.T_imu_sensor(name)) for name in c.mounted], "grid")
+    return element("div", [_matrix(f"T_{c.body}_{name}", c.T_imu_sensor(name)) for name in c.mounted], "matrices")
 
 
 def _matrix(name: str, T: np.ndarray) -> Html:
@@ -173,7 +173,7 @@ def relative(c: Calibration) -> Html:
         values = [*(1e3 * r.T[:3, 3]), *rpy_deg(r.T[:3, :3])]
         std = [*(1e3 * r.std[3:]), *np.rad2deg(r.std[:3])]
         body.append((r.name, *(f"{x:.3f} ± {shown(s)}" for x, s in zip(values, std, strict=True))))
-    matrices = element("div", [_matrix(r.name, r.T) for r in found], "grid")
+    matrices = element("div", [_matrix(r.name, r.T) for r in found], "matrices")
     return Html(title + words + table(headers, body, headers[1:]) + matrices)
 
 
