@@ -38,12 +38,13 @@ from icalib.estimation.board import SHAPE_LABELS
 from icalib.estimation.border import restricted_inverse
 from icalib.estimation.determination import Determined
 from icalib.estimation.estimate import Estimate
-from icalib.estimation.evidence import Fit, fits, place_covariances, raw_rms, split_covariance
+from icalib.estimation.evidence import Fit, fits, raw_rms, split_covariance
 from icalib.estimation.fixed_lens import lens_steps
 from icalib.estimation.imu_model import LABELS as IMU_LABELS
 from icalib.estimation.inputs import Inputs, origin_difference
 from icalib.estimation.outcome import Visit
 from icalib.estimation.parts import Parts
+from icalib.estimation.places import place_covariances
 from icalib.estimation.pose_factor import FRAME
 from icalib.estimation.problem import Problem
 from icalib.estimation.state import Block, State

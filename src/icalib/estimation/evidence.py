@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
 
 import numpy as np
 
 from icalib.estimation import sensors
-from icalib.estimation.arrowhead import Draw, Piece, in_parallel
+from icalib.estimation.arrowhead import Draw, in_parallel
 from icalib.estimation.border import restricted_inverse
 from icalib.estimation.corner_factor import CornerFactor, CornerOutput
 from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput
@@ -19,8 +18,6 @@ from icalib.estimation.problem import Problem, Residuals
 from icalib.estimation.state import State
 from icalib.estimation.surfaces import ON_PLANES
 
-IMAGE_CELLS = (4, 3)  # columns, rows
-TARGET_PARTS = 3  # along each side
 DRAW_STEP = 1e-3  # of a posterior sample: small enough to be linear
 
 
@@ -192,81 +189,10 @@ def split_covariance(outcome: Outcome, parts: Parts) -> np.ndarray:
     jackknife to first order.
     """
     b, n = parts.sums[:, :-1, -1], parts.count
-    return n / (n - 1.0) * _spread(parts.problem, outcome, b - b.mean(axis=0))
+    return n / (n - 1.0) * spread_covariance(parts.problem, outcome, b - b.mean(axis=0))
 
 
-def place_covariances(problem: Problem, outcome: Outcome) -> list[np.ndarray]:
-    """(B, B) covariances as the spread over places shows them: cells of each image, parts of the target, tag corners.
-
-    Errors that stay with a place (a lens that the model cannot follow, a target that is not as drawn) are the same
-    in all
-    parts of a recording, and splitting it in time does not see them. The corners of a place are a cluster, whose
-    gradient
-    would be zero but for noise; the IMU and all features are one more.
-    """
-    if not any(len(c.stream.uv) for c in problem.cameras):
-        return []
-    kinds = [[by(c, k) for k, c in enumerate(problem.cameras)] for by in (_image_cells, _target_parts, _tag_corners)]
-    gradients = _cluster_gradients(problem, outcome, kinds)
-    return [_spread(problem, outcome, np.vstack([b, -b.sum(axis=0)])) for b in gradients]
-
-
-def _image_cells(camera: CornerFactor, index: int) -> np.ndarray:
-    """(N,) cell of the image, cameras apart."""
-    columns, rows = IMAGE_CELLS
-    uv = camera.stream.uv
-    low, high = uv.min(axis=0, initial=np.inf), uv.max(axis=0, initial=-np.inf) + 1e-9
-    x, y = (((uv[:, k] - low[k]) / (high - low)[k] * IMAGE_CELLS[k]).astype(np.int32) for k in range(2))
-    return (index * rows + y) * columns + x
-
-
-def _target_parts(camera: CornerFactor, index: int) -> np.ndarray:
-    """(N,) part of a body of the target, the same for all cameras; single tags are not divided."""
-    del index
-    target = camera.bodies.target
-    part, parts = np.zeros(len(target.points), dtype=np.int32), 0
-    for k in camera.bodies.used:
-        own = target.body == k
-        xy = target.points[own, :2]
-        low, high = xy.min(axis=0), xy.max(axis=0) + 1e-9
-        sides = TARGET_PARTS if target.bends[k] else 1
-        cell = ((xy - low) / (high - low) * sides).astype(int)
-        part[own] = parts + cell[:, 1] * sides + cell[:, 0]
-        parts += sides**2
-    return part[camera.stream.point]
-
-
-def _tag_corners(camera: CornerFactor, index: int) -> np.ndarray:
-    """(N,) which of its tag's four corners, cameras apart: what a detector does to each."""
-    return 4 * index + (camera.stream.point % 4).astype(np.int32)
-
-
-def _cluster_gradients(problem: Problem, outcome: Outcome, kinds: list[list[np.ndarray]]) -> list[np.ndarray]:
-    """Of each of `kinds` of clusters, which name the cluster of every corner camera by camera: (clusters, B), the
-    gradient of each cluster, the chain marginalised."""
-    counts = [1 + max(int(c.max(initial=-1)) for c in clusters) for clusters in kinds]
-    B, state, at = problem.layout.size, outcome.state, problem.scratch(outcome.residuals)
-    starts = B + np.cumsum([0, *counts])
-
-    def segment(first: int, last: int) -> Piece:
-        piece = Piece.zeros(first, last, int(starts[-1]))
-        narrow = problem.with_features(problem.narrow(piece, B))
-        problem.add_measurements(state, narrow, at)
-        problem.add_bias_prior(state, narrow)
-        piece.side[:, :, :B] = narrow.side[:, :, :B]
-        piece.border[:B, :B] = narrow.border[:B, :B]
-        if narrow.features is not None:
-            piece = replace(piece, features=narrow.features.widened(int(starts[-1])))
-        for clusters, n, column in zip(kinds, counts, starts, strict=False):
-            for camera, corners, cluster in zip(problem.cameras, at.corners, clusters, strict=True):
-                camera.accumulate_clusters(state, piece, corners, cluster, n, int(column))
-        return piece
-
-    rest = problem.marginal(segment)
-    return [rest[:B, a:b].T for a, b in pairwise(starts)]
-
-
-def _spread(problem: Problem, outcome: Outcome, b: np.ndarray) -> np.ndarray:
+def spread_covariance(problem: Problem, outcome: Outcome, b: np.ndarray) -> np.ndarray:
     """S^-1 (sum b_g b_g^T) S^-1 for gradients b (G, B)."""
     t = problem.tolerance
     inverse = restricted_inverse(outcome.information * t[:, None] * t, problem.held)

@@ -19,6 +19,7 @@ from icalib.estimation.clocks import clock_of, mounted_columns
 from icalib.estimation.corner_factor import LOSSES, CornerFactor
 from icalib.estimation.corner_kernels import Motion
 from icalib.estimation.corner_weights import Loss
+from icalib.estimation.feature_clusters import accumulate_clusters
 from icalib.estimation.feature_kernels import (
     Points,
     Range,
@@ -240,6 +241,25 @@ class FeatureFactor:
         if sums and piece.features is not None:
             piece.border[-1, -1] += held_back(features.own, features.side[:, :, -1])
         return total
+
+    def accumulate_clusters(
+        self, state: State, piece: Piece, at: FeatureOutput, cluster: list[np.ndarray], n_clusters: int, column: int
+    ) -> None:
+        """Adds the gradient of each cluster of observations, by camera (N,), to columns of `piece` from `column` on;
+        points are those of `at`."""
+        assert piece.features is not None
+        tracks, pairs = self._within(piece)
+        views, base = self._views(state, piece.first, self._stop(piece)), Range(tracks.start, pairs.start)
+        points, side = self._from_anchors(views, tracks, at.points[tracks]), piece.features.sums.side
+        for view in views:
+            weighing, own = self._weighing(view.index, False), cluster[view.index]
+            lens = self.layout.columns(view.camera.name, "intrinsics", "distortion")
+            for part, _ in view.chunks():
+                X = part.in_camera(points, tracks.start)
+                accumulate_clusters(
+                    X, part.seen, base, part.motion, part.seeing(X, lens), weighing, own, n_clusters, column,
+                    piece.sums(True), side,
+                )  # fmt: skip
 
     def _planes(self, state: State) -> Planes | None:
         """As `state` has them; None where no point lies on any."""

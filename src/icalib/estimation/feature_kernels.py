@@ -289,7 +289,7 @@ def held_back(own, gradient):
 
 
 @njit(cache=True, nogil=True)
-def _rows(i, n, X, seen, seeing, weighing, R_cw, error, A):
+def weighted_rows(i, n, X, seen, seeing, weighing, R_cw, error, A):
     """Weighted rows of observation n, transposed: A (6 + d + 3 + 1, 2): camera pose, parameters, point, residual.
     Returns the square root of the weight over sigma, 0 where left out, and half the robust chi^2."""
     c, D = n - seeing.first, len(A) - 1
@@ -374,7 +374,7 @@ def accumulate(X, seen, base, motion, seeing, weighing, sums, features, residual
             if seen.track[n] < 0:
                 root[n], residual[n, 0], residual[n, 1] = 0.0, 0.0, 0.0
                 continue
-            root[n], cost = _rows(i, n, X, seen, seeing, weighing, motion.R_cam_world, error, A)
+            root[n], cost = weighted_rows(i, n, X, seen, seeing, weighing, motion.R_cam_world, error, A)
             residual[n, 0], residual[n, 1] = error[0], error[1]
             total += cost
             if not wanted or root[n] == 0.0:

@@ -8,14 +8,16 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation.arrowhead import Piece, in_parallel, marginalise
-from icalib.estimation.gauge import hold_frame
+from icalib.estimation.gauge import FRAME, hold_frame
 from icalib.estimation.outcome import Outcome
+from icalib.estimation.pose_factor import FRAME as POSE_FRAME
 from icalib.estimation.problem import Problem, Residuals
 from icalib.estimation.state import State
 
 FEWEST_NODES = 3  # between the ends of a part
-# Information [1/m^2, 1/rad^2] that holds the frame of each part where the world has none. Parts share planes: held
-# firmly, each would seem to say where these are in a world that nobody sees.
+# Information [1/m^2, 1/rad^2] that holds the frame of each part in a world that nobody sees, where parts share planes
+# or the frame of a pose sensor: held firmly, each would seem to say where these are. Where they share nothing of the
+# world so little would be lost in rounding.
 LOOSE_FRAME = 1e-3
 
 
@@ -60,7 +62,8 @@ class Parts:
         problem.add_measurements(state, piece, scratch)
         problem.add_bias_prior(state, piece)
         if not problem.framed:
-            hold_frame(state, piece, first, LOOSE_FRAME)
+            shared = any(b.name in ("plane", *POSE_FRAME) for b in problem.layout.blocks)
+            hold_frame(state, piece, first, LOOSE_FRAME if shared else FRAME)
         # A seam says nothing of the node behind it, and that node's own images are in the next part.
         return piece.without_last() if last in problem.chain.starts else piece
 

@@ -115,7 +115,7 @@ class Problem:
         self.add_bias_prior(state, piece)
         for prior in self.priors if first == 0 else ():
             prior.accumulate(state, piece)
-        self._hold_frames(state, piece)
+        self.hold_frames(state, piece)
         return piece
 
     def residuals(self) -> Residuals:
@@ -148,10 +148,10 @@ class Problem:
         if piece.first == 0:
             cost += sum(p.accumulate(state, piece, sums) for p in self.priors)
         if sums:
-            self._hold_frames(state, piece)
+            self.hold_frames(state, piece)
         return cost
 
-    def _hold_frames(self, state: State, piece: Piece) -> None:
+    def hold_frames(self, state: State, piece: Piece) -> None:
         """Each recording's world stays where it is, if nothing says where that is."""
         for node in self.chain.starts if not self.framed else ():
             if piece.first <= node < piece.last:

@@ -1,0 +1,119 @@
+"""Gradients of what is seen in one place, and what lenses that no model follows make of standard deviations."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from icalib.estimation.assembly import assemble
+from icalib.estimation.corner_noise import first_noise
+from icalib.estimation.feature_noise import first_following
+from icalib.estimation.outcome import Outcome
+from icalib.estimation.places import Clusters, _cluster_gradients, _image_cells
+from icalib.estimation.problem import Problem
+from icalib.estimation.solver import minimise
+from icalib.first_guess.start import start
+from icalib.measurements import Measurements, TrackStream
+from icalib.pipeline import calibrate_measurements
+from icalib.rig import Rig
+from icalib.simulation import Scenario, load_scenario, rig_for, simulate, with_drawn_guess
+
+LITTLE_PX = 1e-3
+EXAMPLE = Path(__file__).parents[2] / "examples" / "paper" / "table2-3d.yaml"
+
+
+def followers(seconds: float) -> Scenario:
+    return replace(load_scenario(EXAMPLE), duration_s=seconds, lidars=(), wheels=())
+
+
+@pytest.fixture(scope="module")
+def solved() -> tuple[Problem, Outcome]:
+    """Without noise, so that residuals are next to nothing."""
+    exact = {"imu_noise_enabled": False, "robot_noise_enabled": False}
+    scenario = replace(followers(5.0), **exact)
+    rig = with_drawn_guess(rig_for(scenario, intrinsics="free", distortion="free"), scenario, 1)
+    inputs, state, _ = start(rig, [simulate(scenario, 1).measurements])
+    streams = inputs.measurements.cameras
+    noise = [first_noise(c).noise(s, c, rig.settings) for c, s in zip(rig.cameras, streams, strict=True)]
+    following = first_following(inputs)
+    assert following is not None
+    whole = replace(following, cut=False)  # points of short tracks are far from known, and move far for little
+    problem = assemble(inputs, state, noise, [np.zeros(0, bool)] * len(streams), following=whole)
+    return problem, minimise(problem, state, tolerance=1e-6)
+
+
+def gradient(problem: Problem, outcome: Outcome) -> np.ndarray:
+    """(B,) of the border, chain and points marginalised."""
+    return problem.marginal(lambda a, b: problem.sums_of(outcome.state, a, b))[:-1, -1]
+
+
+def moved(problem: Problem, by: list[np.ndarray]) -> Problem:
+    """Observations of each camera elsewhere, by (N, 2) px."""
+    assert problem.features is not None
+    streams = tuple(replace(s, uv=s.uv + b) for s, b in zip(problem.features.streams, by, strict=True))
+    return replace(problem, features=replace(problem.features, streams=streams))
+
+
+def test_the_gradient_of_a_cell_is_what_its_residuals_change(solved: tuple[Problem, Outcome]):
+    """With residuals so small that nothing bends, those of one cell twice as large: the gradient of the whole, points
+    being where they then want to be, changes by the cell's own."""
+    exact, outcome = solved
+    cells, rng = _image_cells(exact), np.random.default_rng(0)
+    problem = moved(exact, [LITTLE_PX * rng.normal(size=(len(own), 2)) for own in cells.tracks])
+    assert problem.features is not None
+    (found,) = _cluster_gradients(problem, outcome, [cells])
+    assert found.shape == (cells.count, problem.layout.size) and cells.count == 36
+    residual = problem.features.look(outcome.state).residual
+    before, size = gradient(problem, outcome), np.abs(found).max(axis=0)
+    for cell in (1, 14, 30):
+        twice = moved(problem, [-r * (own == cell)[:, None] for r, own in zip(residual, cells.tracks, strict=True)])
+        change = gradient(twice, outcome) - before
+        np.testing.assert_allclose(change / size, found[cell] / size, atol=1e-3)
+
+
+def test_cells_together_are_all_that_cameras_say(solved: tuple[Problem, Outcome]):
+    problem, outcome = solved
+    cells = _image_cells(problem)
+    whole = Clusters(cells.corners, [np.zeros(len(c), dtype=np.int32) for c in cells.tracks])
+    parts, (one,) = _cluster_gradients(problem, outcome, [cells, whole])
+    np.testing.assert_allclose(parts.sum(axis=0), one, rtol=1e-6, atol=1e-6 * np.abs(parts).max())
+
+
+def bent(measurements: Measurements, scenario: Scenario) -> Measurements:
+    """Through lenses with ripples of 1 px that no model here follows, the same in all images."""
+    return replace(measurements, tracks=tuple(_bent(t, scenario) for t in measurements.tracks))
+
+
+def _bent(stream: TrackStream, scenario: Scenario) -> TrackStream:
+    width, height = next(c.resolution for c in scenario.cameras if c.name == stream.name)
+    x, y = (stream.uv / [width, height]).T * 2.0 * np.pi
+    ripple = np.stack([np.sin(2.0 * x + 1.0) * np.cos(y), np.cos(1.5 * x) * np.sin(2.0 * y + 0.5)], axis=1)
+    return replace(stream, uv=stream.uv + ripple)
+
+
+def errors(rig: Rig, scenario: Scenario, seed: int, seen) -> tuple[np.ndarray, np.ndarray]:
+    """Of lever arms, in formal and in printed standard deviations."""
+    simulation = simulate(scenario, seed)
+    found = calibrate_measurements(rig, seen(simulation.measurements))
+    assert found.converged
+    formal, printed = [], []
+    for camera in scenario.cameras:
+        for name, true in (("translation", camera.T_imu_cam[:3, 3]), ("intrinsics", np.array(camera.intrinsics))):
+            g = found.group(camera.name, name)
+            formal.append((g.value - true) / g.std_formal)
+            printed.append((g.value - true) / g.std)
+    return np.concatenate(formal), np.concatenate(printed)
+
+
+def test_a_lens_that_no_model_follows_is_in_the_standard_deviations():
+    scenario = followers(24.0)
+    rig = with_drawn_guess(rig_for(scenario, intrinsics="free", distortion="free"), scenario, 1)
+    rig = replace(rig, settings=replace(rig.settings, splits=8))
+    rms = [np.sqrt(np.mean(z**2)) for z in errors(rig, scenario, 1, lambda m: bent(m, scenario))]
+    honest = [np.sqrt(np.mean(z**2)) for z in errors(rig, scenario, 1, lambda m: m)]
+    print(rms, honest)
+    assert rms[0] > 5.0 and rms[1] < 2.0
+    assert honest[0] < 1.5 and honest[1] > 0.5 * honest[0]
