@@ -134,3 +134,17 @@ def _fit_blur(square: np.ndarray, speed: np.ndarray) -> tuple[float, float]:
     if b <= 0.0 or a <= 0.0:
         return float(np.sqrt(median_variance(square))), 0.0
     return float(np.sqrt(a)), float(np.sqrt(b))
+
+
+def inliers(stream: CornerStream, residual: np.ndarray, used: np.ndarray, settings: Settings) -> np.ndarray:
+    """(N,) bool: what stands with the rest of its image.
+
+    The rule: what is seen is set aside when its residual (N, 2) is above mean + `outlier_std` standard deviations of
+    those `used` (N,) of its image, and above `outlier_min_px`.
+    """
+    size, n, image = np.linalg.norm(residual, axis=1), len(stream.stamps_ns), stream.image
+    count = np.maximum(np.bincount(image[used], minlength=n), 1)
+    mean = np.bincount(image[used], size[used], minlength=n) / count
+    square = np.bincount(image[used], size[used] ** 2, minlength=n) / count
+    limit = mean + settings.outlier_std * np.sqrt(np.maximum(square - mean**2, 0.0))
+    return used & ((size <= limit[image]) | (size <= settings.outlier_min_px))

@@ -18,10 +18,11 @@ from icalib.estimation.corner_noise import (
     estimate_noise,
     first_noise,
     image_speed,
+    inliers,
     scale_common_errors,
 )
 from icalib.estimation.evidence import fits
-from icalib.estimation.feature_noise import first_following, inliers, next_following
+from icalib.estimation.feature_noise import first_following, next_following
 from icalib.estimation.guess_priors import guess_priors
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.lidar_factor import LidarFactor

@@ -12,7 +12,6 @@ from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.medians import grouped_quantiles, largest_normal, median_variance
 from icalib.estimation.outcome import Outcome
-from icalib.measurements import CornerStream
 from icalib.rig import Camera, Settings
 
 FIRST_GUESS_PX = 1.0
@@ -70,17 +69,3 @@ def _kept(factor: FeatureFactor, out: FeatureOutput, index: int, settings: Setti
     most = grouped_quantiles(size[used], image[used], len(stream.stamps_ns), share)
     limit = np.maximum(largest_normal(settings.outlier_std, share) * most, settings.outlier_min_px)
     return ~(followed & (~used | (size > limit[image])))
-
-
-def inliers(stream: CornerStream, residual: np.ndarray, used: np.ndarray, settings: Settings) -> np.ndarray:
-    """(N,) bool: what stands with the rest of its image.
-
-    The rule: what is seen is set aside when its residual (N, 2) is above mean + `outlier_std` standard deviations of
-    those `used` (N,) of its image, and above `outlier_min_px`.
-    """
-    size, n, image = np.linalg.norm(residual, axis=1), len(stream.stamps_ns), stream.image
-    count = np.maximum(np.bincount(image[used], minlength=n), 1)
-    mean = np.bincount(image[used], size[used], minlength=n) / count
-    square = np.bincount(image[used], size[used] ** 2, minlength=n) / count
-    limit = mean + settings.outlier_std * np.sqrt(np.maximum(square - mean**2, 0.0))
-    return used & ((size <= limit[image]) | (size <= settings.outlier_min_px))
