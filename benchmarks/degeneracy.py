@@ -58,11 +58,8 @@ def variant(motion: str, noise: float) -> Scenario:
 
 def entries(record: Record) -> Iterator[tuple[str, str, float]]:
     """Name, verdict, and error in standard deviations of every number that was estimated."""
-    z, k = record.error / np.sqrt(np.diag(record.covariance)), 0
-    for block in record.blocks:
-        for label, verdict in zip(block.labels, block.verdict, strict=True):
-            yield f"{block.key} {label}", verdict, float(z[k])
-            k += 1
+    for block, label, verdict, z in record.errors():
+        yield f"{block.key} {label}", verdict, z
 
 
 def combinations(record: Record, verdicts: Sequence[str]) -> np.ndarray:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from icalib.montecarlo.record import from_json
+from icalib.montecarlo.statistics import Nees
 from icalib.montecarlo.summary import consistency_json, summarise
 from icalib.report.quantities import SHOWN_UNITS, shown
 from icalib.text_files import write_texts
@@ -40,8 +41,8 @@ def block_table(found: dict[str, Any]) -> str:
         unit, scale = SHOWN_UNITS.get(block["unit"], (block["unit"], 1.0))
         sizes = [f"{shown(scale * block[name], 3)} {unit}".strip() for name in ("rmse", "mean_sigma")]
         name = f"{block['sensor']} {block['name'].replace('_', ' ')}"
-        rows.append(f"| {name} | {' | '.join(sizes)} | {_nees(block['nees'])} |")
-    return "\n".join([*rows, f"| all together | | | {_nees(found['whole'])} |"]) + "\n"
+        rows.append(f"| {name} | {' | '.join(sizes)} | {_nees(Nees(**block['nees']))} |")
+    return "\n".join([*rows, f"| all together | | | {_nees(Nees(**found['whole']))} |"]) + "\n"
 
 
 def overview(names: Sequence[str]) -> str:
@@ -50,12 +51,12 @@ def overview(names: Sequence[str]) -> str:
     for name in names:
         found = result(name)
         study, largest = found["study"], found["largest"]
-        counted = [b["nees"] for b in found["blocks"] if b["nees"] is not None]
-        inside = sum(_inside(n) for n in counted)
+        counted = [Nees(**b["nees"]) for b in found["blocks"] if b["nees"] is not None]
+        inside = sum(n.consistent for n in counted)
         first, runs, failed = study["first_seed"], found["runs"], len(found["failures"])
         cells = (
             f"[{name}](studies/{name}.json)", study["guess"], f"{first} to {first + runs - 1}", f"{failed} of {runs}",
-            _nees(found["whole"]), f"{inside} of {len(counted)}",
+            _nees(Nees(**found["whole"])), f"{inside} of {len(counted)}",
             f"{largest['sigmas']:.1f} sigma of {largest['numbers']}",
         )  # fmt: skip
         rows.append(f"| {' | '.join(cells)} |")
@@ -87,13 +88,9 @@ def take(name: str, folder: Path) -> None:
     write_texts(STUDIES, {f"{name}.json": consistency_json(summarise(records), made_from).decode() + "\n"})
 
 
-def _inside(nees: dict[str, float]) -> bool:
-    return nees["low"] <= nees["mean"] <= nees["high"]
-
-
-def _nees(nees: dict[str, float]) -> str:
-    outside = "" if _inside(nees) else " (outside)"
-    return f"{nees['mean']:.3f}{outside} | {nees['low']:.3f} to {nees['high']:.3f}"
+def _nees(nees: Nees) -> str:
+    outside = "" if nees.consistent else " (outside)"
+    return f"{nees.mean:.3f}{outside} | {nees.low:.3f} to {nees.high:.3f}"
 
 
 def main() -> None:

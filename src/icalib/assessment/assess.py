@@ -40,12 +40,12 @@ from icalib.estimation.determination import Determined
 from icalib.estimation.estimate import Estimate
 from icalib.estimation.evidence import Fit, fits, raw_rms, split_covariance
 from icalib.estimation.fixed_lens import lens_steps
+from icalib.estimation.gauge import IN_THE_WORLD
 from icalib.estimation.imu_model import LABELS as IMU_LABELS
 from icalib.estimation.inputs import Inputs, origin_difference
 from icalib.estimation.outcome import Visit
 from icalib.estimation.parts import Parts
 from icalib.estimation.places import place_covariances
-from icalib.estimation.pose_factor import FRAME
 from icalib.estimation.problem import Problem
 from icalib.estimation.state import Block, State
 from icalib.estimation.surfaces import ON_PLANES
@@ -65,7 +65,6 @@ LABELS = {
     "shape": SHAPE_LABELS, "radii": ("left", "right"), "scales": ("speed", "yaw_rate"),
     "plane": ("turn 1", "turn 2", "distance"),
 }  # fmt: skip
-NUISANCE = ("plane", *FRAME)  # estimated along, in a world of which only gravity's direction means anything
 LARGE_FACTOR = 3.0
 BEYOND_FACTOR = 1.5  # times the largest factor: what halves say of each other is worth a warning
 LARGE_BLOOM_PX = 0.8  # ink and overexposure move edges by a third of that
@@ -174,7 +173,7 @@ def visited(inputs: Inputs, stage: str, problem: Problem, visit: Visit) -> Visit
     t = problem.tolerance
     covariance = restricted_inverse(visit.information * t[:, None] * t, problem.held)
     formal = t * np.sqrt(np.diag(covariance))
-    free = [b for b in inputs.layout.free if b.name not in NUISANCE]
+    free = [b for b in inputs.layout.free if b.name not in IN_THE_WORLD]
     values = {b.key: _raw_value(inputs, visit.state, b) for b in free}
     return Visited(stage, values, {b.key: formal[b.columns] for b in free})
 
@@ -195,7 +194,7 @@ def _groups(
     overall = float(np.sqrt(np.mean(_calibration_only(inputs, ratio) ** 2))) if len(ratio) else 1.0
     groups = []
     for block in inputs.layout.blocks:
-        if block.name in NUISANCE or _unheard_of(inputs, block) or _is_assumed(inputs, block.sensor):
+        if block.name in IN_THE_WORLD or _unheard_of(inputs, block) or _is_assumed(inputs, block.sensor):
             continue
         if block.start is None and block.name in ("shape", "bloom", "tilt"):
             continue

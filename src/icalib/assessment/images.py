@@ -15,10 +15,9 @@ def corner_residuals(found: Estimate, timeline: Timeline) -> tuple[CornerResidua
     out = []
     for i, (camera, corners) in enumerate(zip(found.problem.cameras, found.outcome.residuals.corners, strict=True)):
         stream = camera.stream
-        times = instants(stream, found.outcome.state.values)
         out.append(
             CornerResiduals(
-                camera.name, timeline.shown(times, timeline.of_images(i)), stream.start, stream.point, stream.uv,
+                camera.name, _seconds(found, timeline, i), stream.start, stream.point, stream.uv,
                 corners.residual, camera.noise.sigma[stream.image], corners.root == 0.0,
             )
         )  # fmt: skip
@@ -32,15 +31,20 @@ def track_residuals(found: Estimate, timeline: Timeline) -> tuple[TrackResiduals
         return ()
     out = []
     for i, (camera, stream) in enumerate(zip(factor.cameras, factor.streams, strict=True)):
-        times = instants(camera.stream, found.outcome.state.values)
         unused = (left.root[i] == 0.0)[:, None]
         residual = np.where(unused, np.nan, left.residual[i]).astype(np.float32)
         own = np.linalg.norm(left.points[factor.tracks.camera == i], axis=1)
         out.append(
             TrackResiduals(
                 camera.name, factor.sigma[i], float(np.median(own)) if len(own) else None,
-                timeline.shown(times, timeline.of_images(i)), stream.start, stream.feature, stream.uv, residual,
+                _seconds(found, timeline, i), stream.start, stream.feature, stream.uv, residual,
                 ~factor.keep[i],
             )
         )  # fmt: skip
     return tuple(out)
+
+
+def _seconds(found: Estimate, timeline: Timeline, index: int) -> np.ndarray:
+    """(M,) of the images of a camera."""
+    times = instants(found.problem.cameras[index].stream, found.outcome.state.values)
+    return timeline.shown(times, timeline.of_images(index))

@@ -1,7 +1,7 @@
 """The result of a calibration: values with standard deviations and verdicts, saved and loaded whole."""
 
 from icalib.calibration.held_out import HeldOut, PredictedFit
-from icalib.calibration.images import CornerResiduals, ImageResiduals, TrackResiduals
+from icalib.calibration.images import CornerResiduals, ImageResiduals, TrackResiduals, image_of, rms_of_images
 from icalib.calibration.projection import ProjectionMap, projection_uncertainty, working_distance
 from icalib.calibration.relative import RelativePose, joint_covariance, relative_pose, relative_poses
 from icalib.calibration.result import (
@@ -40,10 +40,12 @@ __all__ = [
     "Visited",
     "WheelResiduals",
     "calibration_files",
+    "image_of",
     "joint_covariance",
     "load_calibration",
     "projection_uncertainty",
     "relative_pose",
     "relative_poses",
+    "rms_of_images",
     "working_distance",
 ]

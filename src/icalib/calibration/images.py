@@ -33,11 +33,6 @@ class CornerResiduals:
         """(N, 2) residuals over their standard deviation."""
         return self.residual / self.sigma[:, None]
 
-    @property
-    def image(self) -> np.ndarray:
-        """(N,) the image that each was seen in."""
-        return np.repeat(np.arange(len(self.seconds)), np.diff(self.start))
-
 
 @dataclass(frozen=True)
 class TrackResiduals:
@@ -71,10 +66,17 @@ class TrackResiduals:
         """(N, 2) residuals over their standard deviation, NaN where there are none."""
         return self.residual / self.sigma
 
-    @property
-    def image(self) -> np.ndarray:
-        """(N,) the image that each was seen in."""
-        return np.repeat(np.arange(len(self.seconds)), np.diff(self.start))
-
 
 ImageResiduals = CornerResiduals | TrackResiduals
+
+
+def image_of(r: ImageResiduals) -> np.ndarray:
+    """(N,) the image that each was seen in."""
+    return np.repeat(np.arange(len(r.seconds)), np.diff(r.start))
+
+
+def rms_of_images(r: ImageResiduals) -> np.ndarray:
+    """(M,) RMS [px] per coordinate of each image, NaN where nothing was used."""
+    image, square = image_of(r)[r.used], (r.residual[r.used].astype(np.float64) ** 2).sum(axis=1)
+    count = np.bincount(image, minlength=len(r.seconds))
+    return np.sqrt(np.bincount(image, square, len(r.seconds)) / np.where(count > 0, 2.0 * count, np.nan))

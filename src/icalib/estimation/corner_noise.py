@@ -136,15 +136,15 @@ def _fit_blur(square: np.ndarray, speed: np.ndarray) -> tuple[float, float]:
     return float(np.sqrt(a)), float(np.sqrt(b))
 
 
-def inliers(stream: CornerStream, residual: np.ndarray, used: np.ndarray, settings: Settings) -> np.ndarray:
-    """(N,) bool: what stands with the rest of its image.
+def inliers(factor: CornerFactor, out: CornerOutput, settings: Settings) -> np.ndarray:
+    """(N,) bool: corners that stand with the rest of their image; those that the model cannot see go too.
 
-    The rule: what is seen is set aside when its residual (N, 2) is above mean + `outlier_std` standard deviations of
-    those `used` (N,) of its image, and above `outlier_min_px`.
+    The rule: what is seen is set aside when its residual is above mean + `outlier_std` standard deviations of those in
+    use of its image, and above `outlier_min_px`.
     """
-    size, n, image = np.linalg.norm(residual, axis=1), len(stream.stamps_ns), stream.image
-    count = np.maximum(np.bincount(image[used], minlength=n), 1)
-    mean = np.bincount(image[used], size[used], minlength=n) / count
-    square = np.bincount(image[used], size[used] ** 2, minlength=n) / count
+    if settings.outlier_std <= 0.0:
+        return np.ones(len(out.root), dtype=bool)
+    stream, used, size = factor.stream, factor.keep & (out.root > 0.0), np.linalg.norm(out.residual, axis=1)
+    mean, square = image_mean(stream, size, used), image_mean(stream, size**2, used)
     limit = mean + settings.outlier_std * np.sqrt(np.maximum(square - mean**2, 0.0))
-    return used & ((size <= limit[image]) | (size <= settings.outlier_min_px))
+    return used & ((size <= limit[stream.image]) | (size <= settings.outlier_min_px))

@@ -10,7 +10,7 @@ import numpy as np
 from icalib.estimation import pages
 from icalib.estimation.assembly import Following, assemble, host_times, nodes_for, resample
 from icalib.estimation.border import NOTHING
-from icalib.estimation.corner_factor import CornerFactor, CornerNoise, CornerOutput
+from icalib.estimation.corner_factor import CornerNoise
 from icalib.estimation.corner_noise import (
     COMMON_ERRORS,
     FIRST_TAU_PX,
@@ -33,7 +33,7 @@ from icalib.estimation.robot import RobotNoise, next_posing, next_ranging
 from icalib.estimation.sensors import chi2
 from icalib.estimation.solver import minimise
 from icalib.estimation.state import State
-from icalib.rig import PoseSensor, Settings
+from icalib.rig import PoseSensor
 
 LOOSE = 3.0  # times what a guess is worth
 LEAST_LEFT = 0.2  # of the residuals of poses: where the motion takes all, nothing is left to show their noise
@@ -78,7 +78,7 @@ class Judged:
         rig, problem, now = inputs.rig, outcome.problem, self
         if first:
             pairs = zip(problem.cameras, outcome.residuals.corners, strict=True)
-            now = replace(now, keep=tuple(_inliers(f, out, rig.settings) for f, out in pairs))
+            now = replace(now, keep=tuple(inliers(f, out, rig.settings) for f, out in pairs))
         if now.following is not None:
             now = replace(now, following=next_following(inputs, outcome, now.following, first))
         if _noise_is_estimated(inputs):
@@ -339,10 +339,3 @@ def pass_names(inputs: Inputs) -> tuple[str, ...]:
         return ("first", "final")
     twice = inputs.rig.settings.common_error or any(_is_open(x) for x in inputs.rig.poses)
     return ("first", "noise", "noise again", "final") if twice else ("first", "noise", "final")
-
-
-def _inliers(factor: CornerFactor, out: CornerOutput, settings: Settings) -> np.ndarray:
-    """(N,) bool: corners that stand with the rest of their image; those that the model cannot see go too."""
-    if settings.outlier_std <= 0.0:
-        return np.ones(len(out.root), dtype=bool)
-    return inliers(factor.stream, out.residual, factor.keep & (out.root > 0.0), settings)

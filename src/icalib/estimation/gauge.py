@@ -9,7 +9,10 @@ from __future__ import annotations
 import numpy as np
 
 from icalib.estimation.arrowhead import Piece
+from icalib.estimation.pose_factor import FRAME as POSE_FRAME
 from icalib.estimation.state import State
+
+IN_THE_WORLD = ("plane", *POSE_FRAME)  # blocks that are estimated along, in a world of which gravity alone is known
 
 # Information [1/m^2, 1/rad^2] along what nothing sees. Any number does where all else is determined. But where a
 # direction of planes and sensors is held, a step could move along it all the same and make up for it by turning the

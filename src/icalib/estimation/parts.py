@@ -8,9 +8,8 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation.arrowhead import Piece, in_parallel, marginalise
-from icalib.estimation.gauge import FRAME, hold_frame
+from icalib.estimation.gauge import FRAME, IN_THE_WORLD, hold_frame
 from icalib.estimation.outcome import Outcome
-from icalib.estimation.pose_factor import FRAME as POSE_FRAME
 from icalib.estimation.problem import Problem, Residuals
 from icalib.estimation.state import State
 
@@ -62,7 +61,7 @@ class Parts:
         problem.add_measurements(state, piece, scratch)
         problem.add_bias_prior(state, piece)
         if not problem.framed:
-            shared = any(b.name in ("plane", *POSE_FRAME) for b in problem.layout.blocks)
+            shared = any(b.name in IN_THE_WORLD for b in problem.layout.blocks)
             hold_frame(state, piece, first, LOOSE_FRAME if shared else FRAME)
         # A seam says nothing of the node behind it, and that node's own images are in the next part.
         return piece.without_last() if last in problem.chain.starts else piece

@@ -49,8 +49,8 @@ def _kinds(problem: Problem) -> Iterator[Clusters]:
     if cornered or problem.features is not None:
         yield _image_cells(problem)
     if cornered:
-        for by in (_target_parts, _tag_corners):
-            yield Clusters([by(c, k) for k, c in enumerate(problem.cameras)], [])
+        yield Clusters([_target_parts(c) for c in problem.cameras], [])
+        yield Clusters([_tag_corners(c, k) for k, c in enumerate(problem.cameras)], [])
 
 
 def _image_cells(problem: Problem) -> Clusters:
@@ -74,9 +74,8 @@ def _cells(uv: np.ndarray, index: int) -> np.ndarray:
     return (index * rows + y) * columns + x
 
 
-def _target_parts(camera: CornerFactor, index: int) -> np.ndarray:
+def _target_parts(camera: CornerFactor) -> np.ndarray:
     """(N,) part of a body of the target, the same for all cameras; single tags are not divided."""
-    del index
     target = camera.bodies.target
     part, parts = np.zeros(len(target.points), dtype=np.int32), 0
     for k in camera.bodies.used:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from icalib.calibration import Calibration, CornerResiduals
+from icalib.calibration import Calibration, CornerResiduals, image_of
 from icalib.errors import CalibrationError
 from icalib.export.common import inverse, restarts, time_offset
 from icalib.geometry import so3
@@ -176,7 +176,7 @@ def _overlap(a: CornerResiduals, b: CornerResiduals) -> bool:
     together = np.abs(a.seconds - b.seconds[nearest]) <= SAME_INSTANT_S
     n_points = 1 + max(a.point.max(initial=0), b.point.max(initial=0))
     seen_a = np.repeat(np.where(together, nearest, -1), np.diff(a.start)) * n_points + a.point
-    seen_b = np.repeat(np.arange(len(b.seconds)), np.diff(b.start)) * n_points + b.point
+    seen_b = image_of(b) * n_points + b.point
     return bool(np.isin(seen_a[seen_a >= 0], seen_b).any())
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 
@@ -72,20 +73,15 @@ def camera_rates(stream: CornerStream, poses: TargetPoses) -> CameraRates:
 def align(imu: ImuData, name: str, rates: CameraRates, given_offset: float | None) -> Alignment:
     """Offset, rotation and gyro bias. Raises EstimationError where the rates do not match at any shift."""
     _check_motion(imu, name, rates)
-    offsets = likely_offsets(imu, name, rates) if given_offset is None else [given_offset]
-    found = None
-    for offset in offsets:
-        if found is not None and not _covered(imu, rates, offset).any():
-            continue
-        alike, now = _align_near(imu, name, rates, offset, given_offset is not None)
-        found = found or (alike, now)
-        if _unexplained(imu, alike, now) <= LARGEST_UNEXPLAINED:
-            found = alike, now
-            break  # in a short recording the size of the rates may be more alike elsewhere, but not their directions
-    assert found is not None
-    _check_offset(imu, name, *found, given_offset is not None)
-    _check_scale(imu, name, rates, found[1])
-    return found[1]
+    keep = given_offset is not None
+    best, *others = likely_offsets(imu, name, rates) if given_offset is None else [given_offset]
+    first = _align_near(imu, name, rates, best, keep)
+    tried = (_align_near(imu, name, rates, x, keep) for x in others if _covered(imu, rates, x).any())
+    # In a short recording the sizes of the rates may be more alike elsewhere, but not their directions.
+    alike, found = next((x for x in chain([first], tried) if _unexplained(imu, *x) <= LARGEST_UNEXPLAINED), first)
+    _check_offset(imu, name, alike, found, keep)
+    _check_scale(imu, name, rates, found)
+    return found
 
 
 def _align_near(

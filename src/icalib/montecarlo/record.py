@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from icalib.batch import plain_record, record_json
 
 FORMAT = 1
+LEAST_SIGMA = 1e-100  # a number, however little
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,14 @@ class Record:
     sizes: tuple[Size, ...] = ()
     whiteness: tuple[Whiteness, ...] = ()
     path: tuple[Waypoint, ...] = ()
+
+    def errors(self) -> Iterator[tuple[Block, str, str, float]]:
+        """Of every number that was estimated: its block, label and verdict, and its error in formal standard
+        deviations, one without any taken for an enormity."""
+        sigma = np.maximum(np.sqrt(np.diag(self.covariance)), LEAST_SIGMA)
+        entries = ((b, label, v) for b in self.blocks for label, v in zip(b.labels, b.verdict, strict=True))
+        for (block, label, verdict), z in zip(entries, (self.error / sigma).tolist(), strict=True):
+            yield block, label, verdict, z
 
     def columns(self, key: str) -> np.ndarray:
         """(m,) entries of the block `key` ("cam0.rotation") in the error; none where the run has no such block."""

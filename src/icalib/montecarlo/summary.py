@@ -13,7 +13,6 @@ from icalib.montecarlo.record import Block, Record
 from icalib.montecarlo.statistics import Largest, Nees, Sample, Spread, largest, nees, spread
 
 EVERYTHING = "calibration"  # all blocks together
-LEAST_SIGMA = 1e-100  # an error without any is an enormity, but a number
 
 
 @dataclass(frozen=True)
@@ -123,14 +122,11 @@ def counting(record: Record, key: str) -> np.ndarray:
 
 def _errors(record: Record) -> list[tuple[float, str, int]]:
     """Of all entries that count: error in formal standard deviations, name, seed."""
-    found = []
-    for block in record.blocks:
-        labels = dict(zip(record.columns(block.key), block.labels, strict=True))
-        for k in counting(record, block.key):
-            sigma = max(float(np.sqrt(record.covariance[k, k])), LEAST_SIGMA)
-            name = block.key if labels[k] == block.name else f"{block.key} {labels[k]}"
-            found.append((float(record.error[k]) / sigma, name, record.seed))
-    return found
+    return [
+        (z, block.key if label == block.name else f"{block.key} {label}", record.seed)
+        for block, label, verdict, z in record.errors()
+        if verdict != "undetermined"
+    ]
 
 
 def _samples(records: Sequence[Record], keys: tuple[str, ...]) -> list[Sample]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.calibration import Calibration, ImageResiduals, LidarResiduals, WheelResiduals
+from icalib.calibration import Calibration, ImageResiduals, LidarResiduals, WheelResiduals, image_of
 from icalib.montecarlo.record import Whiteness
 
 SAME_WALL_S = 0.3  # between two points of a plane that are neighbours in time
@@ -39,7 +39,7 @@ def _of_wheels(r: WheelResiduals) -> list[Whiteness]:
 
 def _of_image_points(r: ImageResiduals) -> Whiteness:
     """A corner's next one is the same point of the target in the next image, so of a point that is followed."""
-    image, point = r.image, r.point
+    image, point = image_of(r), r.point
     order = np.lexsort((image, point))
     order = order[r.used[order]]
     follows = (np.diff(point[order]) == 0) & (np.diff(image[order]) == 1)

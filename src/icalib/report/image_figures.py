@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from icalib.calibration import ImageResiduals
+from icalib.calibration import ImageResiduals, image_of, rms_of_images
 from icalib.report.plot import REJECTED, Figure, axis, dots, figure, line, numbers, thin
 
 MOST_DOTS = 2500  # of each kind in one figure
@@ -49,14 +49,11 @@ def residual_plane(r: ImageResiduals) -> Figure:
 def residuals_over_time(r: ImageResiduals) -> Figure:
     """Size of each residual, and the RMS of each image."""
     size = np.linalg.norm(r.residual, axis=1)
-    image, used, gone = r.image, np.flatnonzero(r.used), np.flatnonzero(_measured(r))
+    used, gone = np.flatnonzero(r.used), np.flatnonzero(_measured(r))
     some, few = used[thin(len(used), MOST_DOTS)], gone[thin(len(gone), MOST_DOTS)]
-    per_image = np.bincount(image[used], minlength=len(r.seconds))
-    square = np.bincount(image[used], size[used] ** 2, minlength=len(r.seconds))
-    rms = np.sqrt(square / np.where(per_image > 0, 2.0 * per_image, np.nan))
-    keep = thin(len(r.seconds), MOST_DOTS)
+    rms, keep = rms_of_images(r), thin(len(r.seconds), MOST_DOTS)
     top = 1.5 * float(size[used].max(initial=1e-3))
-    seconds, clipped = r.seconds[image], "rejected (clipped to the frame)"
+    seconds, clipped = r.seconds[image_of(r)], "rejected (clipped to the frame)"
     return figure(
         [
             dots(seconds[some], size[some], r.kind, "#93b7dc"),

@@ -153,8 +153,8 @@ def _projection_figures(c: Calibration, maps: dict[str, list[ProjectionMap]]) ->
     found = {}
     for i, (name, own) in enumerate(maps.items()):
         size = c.rig["sensors"][name]["resolution"]
+        seen = [r for r in c.image_residuals if r.sensor == name]
         for k, m in enumerate(own):
-            seen = [r for r in c.image_residuals if r.sensor == name]
             found[f"projection-{i}-{k}"] = projection_figures.projection_figure(m, seen, size)
     return found
 

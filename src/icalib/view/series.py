@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from icalib.calibration import Calibration, ImageResiduals, LidarResiduals
+from icalib.calibration import Calibration, ImageResiduals, LidarResiduals, rms_of_images
 from icalib.report.motion_figures import BLOCKS
 from icalib.report.plot import AXIS_COLORS, COLORS, REJECTED
 from icalib.view.colors import rgb
@@ -22,8 +22,9 @@ _GOOD, _LEFT_OUT = "#22c55e", "#9ca3af"
 def log_residuals(s: Stream, c: Calibration) -> None:
     """Of cameras the RMS of each image [px], of LiDARs that of each tenth of a second [mm], of all else whitened."""
     for r in c.image_residuals:
-        seconds, rms = rms_of_images(r)
-        log_lines(s, f"residuals/{r.sensor}/{r.kind}", seconds, rms[:, None], [f"RMS of {r.kind} [px]"])
+        rms = rms_of_images(r)
+        some = np.isfinite(rms)
+        log_lines(s, f"residuals/{r.sensor}/{r.kind}", r.seconds[some], rms[some, None], [f"RMS of {r.kind} [px]"])
         _log_seen(s, c, r)
     for r in c.lidar_residuals:
         seconds, rms = rms_of_bins(r)
@@ -54,15 +55,6 @@ def log_lines(s: Stream, entity: str, seconds: np.ndarray, values: np.ndarray, n
     s.still(entity, s.rr.SeriesLines(names=list(names), colors=rgb(*colors)))
     n, m = values.shape
     s.over(entity, seconds, s.rr.Scalars.columns(scalars=values.reshape(-1)).partition([m] * n))
-
-
-def rms_of_images(r: ImageResiduals) -> tuple[np.ndarray, np.ndarray]:
-    """(m,) seconds and RMS [px] per coordinate of the images in which something was used."""
-    image, used = r.image, r.used
-    count = np.bincount(image[used], minlength=len(r.seconds))
-    total = np.bincount(image[used], np.mean(r.residual[used].astype(np.float64) ** 2, axis=1), len(r.seconds))
-    some = count > 0
-    return r.seconds[some], np.sqrt(total[some] / count[some])
 
 
 def rms_of_bins(r: LidarResiduals) -> tuple[np.ndarray, np.ndarray]:
