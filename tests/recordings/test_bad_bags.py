@@ -204,6 +204,25 @@ class TestDamaged:
         sentence = complaint(lambda: recording.imu(IMU))
         assert f"a.mcap /imu: the message received at {5 * S} ns is damaged" in sentence
 
+    @pytest.mark.parametrize("kind", ["ros1", "ros2"])
+    def test_single_messages_that_are_none_are_left_out(self, kind, tmp_path, truth, write):
+        """As a recorder leaves them that ran out of memory or of disk: bytes of something else."""
+        maker = write.maker(kind)
+        messages = truth.messages(maker)
+        kinds = {topic: message_type for topic, message_type, _, _ in messages}
+        for k, (topic, _, received_ns, _) in enumerate(messages):
+            if k % 20 == 10:
+                messages[k] = (topic, "std_msgs/msg/String", received_ns, maker.make("std_msgs/msg/String", "x" * 17))
+        recording = open_recording(write.mcap(tmp_path / "run.mcap", messages, kind))
+        lost = {topic: [m[2] for m in messages if m[0] == topic and "String" in m[1]] for topic in kinds}
+        assert len(lost["/imu0"]) > 3
+        left = [t for t in truth.imu_stamps if t + write.delay_ns not in lost["/imu0"]]
+        assert recording.imu(IMU).stamps_ns.tolist() == left
+        frames = [f.stamp_ns for f in recording.images("/cam0/image_raw")]
+        assert frames == [t for t in truth.image_stamps if t + write.delay_ns not in lost["/cam0/image_raw"]]
+        counted = f"/imu0: {len(lost['/imu0'])} of 120 messages are damaged and were left out, the first received at "
+        assert any(f"{counted}{lost['/imu0'][0]} ns (" in note for note in recording.notes())
+
 
 class TestNoBag:
     def test_zero_length(self, tmp_path):

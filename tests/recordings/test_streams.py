@@ -140,9 +140,18 @@ def test_points(bag_of, order):
         assert (c.points["t"] == 7).all() and np.abs(c.points["x"]).max() < 6
 
 
-def test_points_cut_off(bag_of):
+def test_a_cloud_that_is_cut_off_is_left_out(bag_of):
     bag = bag_of("sensor_msgs/msg/PointCloud2", lambda make, k, header: cloud(make, k, header, cut=5 * (k == 2)))
-    with pytest.raises(RecordingError, match=f"/t: the points at {STAMPS[2]} ns are cut off"):
+    assert [c.stamp_ns for c in point_clouds(bag, "/t")] == [t for k, t in enumerate(STAMPS) if k != 2]
+    (note,) = bag.notes()
+    assert f"/t: 1 of 5 messages are damaged and were left out, the first received at {STAMPS[2] + 5} ns" in note
+    assert "6 points do not fit" in note
+
+
+def test_points_cut_off(bag_of):
+    bag = bag_of("sensor_msgs/msg/PointCloud2", lambda make, k, header: cloud(make, k, header, cut=5))
+    words = f"/t: the message received at {STAMPS[0] + 5} ns is damaged .* all others"
+    with pytest.raises(RecordingError, match=words):
         list(point_clouds(bag, "/t"))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -167,39 +167,61 @@ class BagRecording:
         damage = (note for storage in self._storages for note in storage.notes)
         return tuple(dict.fromkeys([*self._notes, *damage]))
 
-    def messages(self, topic: str, kind: str) -> Iterator[tuple[int, Any]]:
+    def messages(
+        self, topic: str, kind: str, convert: Callable[[Any], Any] = lambda message: message
+    ) -> Iterator[tuple[int, Any]]:
         """Stamp [ns] and content of each message of `topic`, in the order of the bag; the content has the fields of the
-        ROS type.
+        ROS type, or is what `convert` makes of the message. Messages that cannot be read, or of which `convert` raises
+        ValueError, are damaged: they are left out, and a note counts them after the last message.
 
         Raises RecordingError listing what there is where the topic is missing or not of `kind` (see TopicInfo), and
-        naming the instant where a message cannot be read.
+        naming the first message where all are damaged.
         """
         chosen = choose_topic(str(self.root), self._topics, kind, "", topic)
-        return self._messages(chosen)
+        return self._messages(chosen, convert)
 
-    def _messages(self, topic: TopicInfo) -> Iterator[tuple[int, Any]]:
-        unstamped = 0
+    def _messages(
+        self, topic: TopicInfo, convert: Callable[[Any], Any] = lambda message: message
+    ) -> Iterator[tuple[int, Any]]:
+        total = unstamped = 0
+        damaged: list[tuple[int, ValueError]] = []
         for received_ns, encoding, content in self._contents(topic):
             if encoding not in _stores():
                 raise RecordingError(
                     f"{self.root} {topic.name}: messages in {encoding!r} are not ROS's; convert the bag."
                 )
+            total += 1
             try:
                 message = _deserialise(encoding, content, topic.type)
+                converted = convert(message)
             except ValueError as error:
-                raise RecordingError(
-                    f"{self.root} {topic.name}: the message received at {received_ns} ns is damaged ({error}); "
-                    "copy or record the bag again."
-                ) from error
+                damaged.append((received_ns, error))
+                continue
             stamp = message.header.stamp
             stamp_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
             unstamped += not stamp_ns
-            yield stamp_ns or received_ns, message
+            yield stamp_ns or received_ns, converted
+        if damaged:
+            self._note_damage(topic.name, damaged, total)
         if unstamped:
             self._note(
                 f"{self.root} {topic.name}: {unstamped} messages have no stamp in their header; the times at which "
                 "they were received stand in, which are late and jitter; let the driver stamp them."
             )
+
+    def _note_damage(self, topic: str, damaged: list[tuple[int, ValueError]], total: int) -> None:
+        """`damaged`: when each was received [ns], and what is wrong. Raises RecordingError where these are all."""
+        first_ns, error = damaged[0]
+        if len(damaged) == total:
+            others = ", and so are all others" if total > 1 else ""
+            raise RecordingError(
+                f"{self.root} {topic}: the message received at {first_ns} ns is damaged ({error}){others}; copy or "
+                "record the bag again."
+            ) from error
+        self._note(
+            f"{self.root} {topic}: {len(damaged)} of {total} messages are damaged and were left out, the first "
+            f"received at {first_ns} ns ({error})."
+        )
 
     def _contents(self, topic: TopicInfo) -> Iterator[tuple[int, str, bytes]]:
         """When it was received [ns], encoding and bytes of each message."""

@@ -19,7 +19,7 @@ class HasMessages(Protocol):
 
     root: Path
 
-    def messages(self, topic: str, kind: str) -> Iterator[tuple[int, Any]]: ...
+    def messages(self, topic: str, kind: str, convert: Callable[[Any], Any] = ...) -> Iterator[tuple[int, Any]]: ...
 
 
 @dataclass(frozen=True)
@@ -142,26 +142,34 @@ def read_joints(bag: HasMessages, topic: str) -> JointStream:
 
 
 def point_clouds(bag: HasMessages, topic: str) -> Iterator[PointCloud]:
-    """The PointCloud2, or Livox's CustomMsg, of `topic`, one at a time. Raises RecordingError as
-    `BagRecording.messages`, and for a message shorter than its points."""
-    for stamp_ns, m in bag.messages(topic, "points"):
-        if isinstance(m, LivoxCloud):
-            yield PointCloud(stamp_ns, m.header.frame_id, m.points)
-            continue
-        if len(m.data) < m.row_step * m.height or m.row_step < m.point_step * m.width:
-            raise RecordingError(f"{bag.root} {topic}: the points at {stamp_ns} ns are cut off; record again.")
-        rows = m.data[: m.row_step * m.height].reshape(m.height, m.row_step)[:, : m.point_step * m.width]
-        points = (
-            np.ascontiguousarray(rows).reshape(-1).view(_point_type(m)) if rows.size else np.empty(0, _point_type(m))
-        )
-        yield PointCloud(stamp_ns, m.header.frame_id, points, m.height)
+    """The PointCloud2, or Livox's CustomMsg, of `topic`, one at a time; those shorter than their points are left out as
+    damaged messages. Raises RecordingError as `BagRecording.messages`."""
+    for stamp_ns, (frame, points, height) in bag.messages(topic, "points", _points_of):
+        yield PointCloud(stamp_ns, frame, points, height)
+
+
+def _points_of(message: Any) -> tuple[str, np.ndarray, int]:
+    """Frame, points and rows of a message. Raises ValueError where it is shorter than its points."""
+    m = message
+    if isinstance(m, LivoxCloud):
+        return m.header.frame_id, m.points, 1
+    if len(m.data) < m.row_step * m.height or m.row_step < m.point_step * m.width:
+        raise ValueError(f"{m.width * m.height} points do not fit {len(m.data)} bytes")
+    kind = _point_type(m)
+    rows = m.data[: m.row_step * m.height].reshape(m.height, m.row_step)[:, : m.point_step * m.width]
+    points = np.ascontiguousarray(rows).reshape(-1).view(kind) if rows.size else np.empty(0, kind)
+    return m.header.frame_id, points, m.height
 
 
 _FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # of PointField
 
 
 def _point_type(message: Any) -> np.dtype:
+    """Raises ValueError where the fields do not fit a point."""
     order = ">" if message.is_bigendian else "<"
+    unknown = [f.name for f in message.fields if f.datatype not in _FIELD_TYPES]
+    if unknown or message.point_step < 1:
+        raise ValueError(f"its points have no layout: {', '.join(unknown) or 'they have 0 bytes'}")
     formats = [(order + _FIELD_TYPES[f.datatype], (f.count,) if f.count > 1 else ()) for f in message.fields]
     return np.dtype(
         {
