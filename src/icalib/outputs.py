@@ -8,6 +8,7 @@ from icalib.calibration import Calibration, calibration_files
 from icalib.export.kalibr import camchain, camchain_name, imu_yaml
 from icalib.report import report_html
 from icalib.result_files import check_writable, write_files
+from icalib.text_files import printable
 
 
 def write_outputs(calibration: Calibration, folder: str | Path) -> None:
@@ -22,7 +23,7 @@ def output_files(calibration: Calibration) -> dict[str, bytes]:
         texts[camchain_name(calibration)] = camchain(calibration)
     if calibration.imu is not None:
         texts["imu.yaml"] = imu_yaml(calibration)
-    return calibration_files(calibration) | {name: text.encode() for name, text in texts.items()}
+    return calibration_files(calibration) | {name: printable(text).encode() for name, text in texts.items()}
 
 
 def check_folder(folder: str | Path) -> None:

@@ -11,6 +11,12 @@ from pathlib import Path
 from icalib.errors import CalibrationError
 
 
+def printable(text: str) -> str:
+    """`text` as a file in UTF-8 can hold it. Names of files may have other bytes, which Python keeps as lone
+    surrogates; they become escapes such as \\udcfc, which JSON and YAML in quotes read back as the same name."""
+    return text.encode("utf-8", "backslashreplace").decode("utf-8")
+
+
 def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
     """Writes `texts` (name -> content) into `folder`, which is made where absent: each file is the old one or the new
     one whole, and none is touched before all are written. Raises CalibrationError where that is not possible."""

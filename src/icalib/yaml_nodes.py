@@ -14,7 +14,8 @@ import yaml
 
 from icalib.errors import RigError
 
-_WHOLE = re.compile(r"[-+]?[0-9]{1,18}")
+MOST_WHOLE = 2**63 - 1  # what int64, the type of stamps, holds
+_WHOLE = re.compile(r"[-+]?[0-9]{1,19}")
 
 
 @dataclass(frozen=True)
@@ -124,6 +125,8 @@ class YamlValue:
         text = str(self.node.value)
         if not _WHOLE.fullmatch(text) or int(text) < least:
             self.fail(f"must be a whole number of at least {least}, but is {self.shown()}.")
+        if int(text) > MOST_WHOLE:
+            self.fail(f"must be a whole number below 2^63, but is {self.shown()}.")
         return int(text)
 
     def items(self) -> list[YamlValue]:

@@ -175,6 +175,10 @@ BAD = {
         ("radii: [0.1]", "must be \\[left, right\\] in metres"),
         ("radii: [0.1, 0]", "radii\\[1\\]: must be above 0"),
     ],
+    "start_ns: 5000000000": [
+        ("start_ns: 9223372036854775807", "start_ns: the last stamp would not be below 2\\^63 ns"),
+        ("start_ns: 9999999999999999999", "start_ns: must be a whole number below 2\\^63"),
+    ],
     " slip: 0.002": [(" slip: -0.002", "axle.slip: must be at least 0")],
     "allowed_slip: 0.003": [("allowed_slip: 0", "axle.allowed_slip: must be above 0")],
     "meaning: instant": [("meaning: average", "axle.meaning: there is no meaning 'average'; available are mean")],
@@ -219,3 +223,8 @@ def test_no_file_and_no_imu(tmp_path):
     begin, end = FULL.index("  imu0:"), FULL.index("  left:")
     with pytest.raises(RigError, match="sensors: there must be one sensor of type: imu, not 0"):
         loaded(tmp_path, FULL[:begin] + FULL[end:])
+
+
+def test_stamps_of_today_have_19_digits(tmp_path):
+    s = loaded(tmp_path, FULL.replace("start_ns: 5000000000", "start_ns: 1700000000000000000"))
+    assert s.imu_clock_origin_ns == 1_700_000_000_000_000_000

@@ -8,7 +8,7 @@ from icalib.allan.analysis import ImuNoiseStudy
 from icalib.allan.page import allan_html
 from icalib.allan.words import rig_snippet, study_json
 from icalib.result_files import check_writable
-from icalib.text_files import write_texts
+from icalib.text_files import printable, write_texts
 
 FILES = ("allan.html", "noise.yaml", "allan.json")
 
@@ -20,5 +20,5 @@ def check_folder(folder: Path) -> None:
 
 def write_study(study: ImuNoiseStudy, folder: Path) -> None:
     """Writes allan.html, noise.yaml (fields of a rig file) and allan.json. Raises CalibrationError."""
-    texts = (allan_html(study), rig_snippet(study), study_json(study))
+    texts = map(printable, (allan_html(study), rig_snippet(study), study_json(study)))
     write_texts(folder, dict(zip(FILES, texts, strict=True)))

@@ -28,6 +28,7 @@ from icalib.calibration.robot import LidarResiduals, Plane, PoseResiduals, Wheel
 from icalib.calibration.summary import calibration_yaml
 from icalib.errors import CalibrationError
 from icalib.result_files import read_file
+from icalib.text_files import printable
 
 FORMAT, FORMAT_VERSION = "icalib result", 1
 _TEXTS = ("undetermined", "warnings", "notes", "wrong")
@@ -39,8 +40,8 @@ def calibration_files(calibration: Calibration) -> dict[str, bytes]:
     """calibration.yaml, result.json and result.npz by name."""
     arrays = _npz(calibration)
     return {
-        "calibration.yaml": calibration_yaml(calibration).encode(),
-        "result.json": json.dumps(_plain(calibration, arrays), indent=1, ensure_ascii=False).encode(),
+        "calibration.yaml": printable(calibration_yaml(calibration)).encode(),
+        "result.json": printable(json.dumps(_plain(calibration, arrays), indent=1, ensure_ascii=False)).encode(),
         "result.npz": arrays,
     }
 

@@ -11,6 +11,7 @@ import yaml
 from icalib.calibration import Calibration
 from icalib.calibration.summary import calibration_yaml, pose_key
 from icalib.export.common import Export, body_frame, guesses, quaternion
+from icalib.text_files import printable
 
 
 def plain_json(c: Calibration) -> Export:
@@ -30,4 +31,6 @@ def plain_json(c: Calibration) -> Export:
     for sensor in data["sensors"].values():
         T = np.array(sensor[key])
         sensor |= {"quaternion_xyzw": list(quaternion(T[:3, :3])), "translation": T[:3, 3].tolist()}
-    return Export({"calibration.json": json.dumps(data, indent=1, ensure_ascii=False) + "\n"}, guesses(c, c.mounted))
+    return Export(
+        {"calibration.json": printable(json.dumps(data, indent=1, ensure_ascii=False)) + "\n"}, guesses(c, c.mounted)
+    )

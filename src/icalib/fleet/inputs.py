@@ -43,14 +43,14 @@ def _content(path: Path) -> str:
 
 
 def _sizes(path: Path) -> str:
-    digest = hashlib.sha256(path.name.encode())
+    digest = hashlib.sha256(os.fsencode(path.name))
     found = 0
     for file in sorted(_files(path)):
         try:
             about = file.stat()
         except OSError:  # a link to nowhere, or gone in this moment: the reader will say what it misses
             continue
-        digest.update(f"{os.path.relpath(file, path)}\0{about.st_size}\0{about.st_mtime_ns}\0".encode())
+        digest.update(os.fsencode(f"{os.path.relpath(file, path)}\0{about.st_size}\0{about.st_mtime_ns}\0"))
         found += 1
     return digest.hexdigest() if found else "absent"
 

@@ -18,6 +18,7 @@ from icalib.fleet.record import Record
 from icalib.fleet.result import Fleet, JobResult, by_robot
 from icalib.fleet.store import Store, to_do
 from icalib.fleet.table import write_table
+from icalib.text_files import printable
 
 Progress = Callable[[str, float], None]
 LIMIT = 3.0  # sigmas, as in `icalib compare`
@@ -43,7 +44,7 @@ def run_fleet(
     with alone(store.folder):
         fleet = _fleet(jobs, store, crew or Crew(), limit, progress, say)
         write_table(store.folder / "fleet.sqlite", fleet.results)
-        write_whole(store.folder / "fleet.html", fleet_html(fleet, Path(path).name).encode())
+        write_whole(store.folder / "fleet.html", printable(fleet_html(fleet, Path(path).name)).encode())
     return fleet
 
 

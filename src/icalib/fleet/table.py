@@ -14,6 +14,7 @@ from icalib.errors import CalibrationError
 from icalib.fleet.record import Block
 from icalib.fleet.result import JobResult
 from icalib.report.quantities import rpy_deg
+from icalib.text_files import printable
 
 _COLUMNS = (
     "robot TEXT", "time TEXT", "job TEXT", "status TEXT", "sentence TEXT", "sensor TEXT", "block TEXT", "entry TEXT",
@@ -42,7 +43,13 @@ def write_table(path: Path, results: Iterable[JobResult]) -> None:
 
 def rows(one: JobResult) -> Iterator[tuple[object, ...]]:
     """Of one job, cells as in the table."""
-    about = (one.job.robot, one.time.isoformat() if one.time else None, one.job.name, one.status, one.sentence)
+    about = (
+        one.job.robot,
+        one.time.isoformat() if one.time else None,
+        one.job.name,
+        one.status,
+        printable(one.sentence),
+    )
     if not one.record.blocks:
         yield about + _NOTHING
     for b in one.record.blocks:

@@ -17,6 +17,7 @@ from icalib.montecarlo.store import Identity, Store
 from icalib.montecarlo.summary import Consistency, consistency_json, summarise
 from icalib.montecarlo.workers import run_all
 from icalib.simulation import Drive, Scenario, load_scenario
+from icalib.text_files import printable
 
 Progress = Callable[[str, float], None]
 
@@ -75,7 +76,8 @@ def run_study(
         study = Study(store.identity, records, summarise(records))
         about = asdict(store.identity) | {"first_seed": first}
         write_whole(output / "consistency.json", consistency_json(study.consistency, about))
-        write_whole(output / "consistency.html", study_html(study.consistency, study.identity, records).encode())
+        page = printable(study_html(study.consistency, study.identity, records))
+        write_whole(output / "consistency.html", page.encode())
     return study
 
 

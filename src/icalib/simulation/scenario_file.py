@@ -16,13 +16,14 @@ from icalib.simulation.projection import PARAMETER_COUNTS
 from icalib.simulation.robot import Drive, DriveKind, Features, SimLidar, SimPoses, SimWheels
 from icalib.simulation.room import Block, Room, hills_of_slope
 from icalib.simulation.scenario import MODELS, Scenario, SimCamera, pose_from_rows
-from icalib.yaml_nodes import YamlValue, read_yaml
+from icalib.yaml_nodes import MOST_WHOLE, YamlValue, read_yaml
 
 _SENSOR_TYPES = ("imu", "camera", "lidar", "wheels", "pose")
 _DENSITIES = ("gyro", "gyro_walk", "accel", "accel_walk")
 _CLOCK = ("T_imu_sensor", "rate")
 _CLOCK_OPTIONS = ("time_offset", "phase")
 _START_NS = 1_700_000_000_000_000_000  # of all clocks, where the file gives none
+_MARGIN_S = 3600.0  # by which clocks of sensors may differ
 _STEEPEST_DEG = 45.0
 
 Made = TypeVar("Made")
@@ -33,6 +34,9 @@ def load_scenario(path: str | Path) -> Scenario:
     root = read_yaml(Path(path), "scenario file")
     found = root.record(("duration", "sensors", "room", "motion"), ("features", "target", "seed", "start_ns"))
     start_ns = found["start_ns"].whole(0) if "start_ns" in found else _START_NS
+    duration_s = found["duration"].positive()
+    if start_ns + _MARGIN_S * 1e9 + duration_s * 1e9 > MOST_WHOLE:
+        found["start_ns" if "start_ns" in found else "duration"].fail("the last stamp would not be below 2^63 ns.")
     sensors = _sensors(found["sensors"], start_ns)
     room, motion = _room(found["room"]), _motion(found["motion"], Path(path).parent)
     features = _features(found["features"]) if "features" in found else None
@@ -40,7 +44,7 @@ def load_scenario(path: str | Path) -> Scenario:
     return _made(
         root,
         Scenario,
-        duration_s=found["duration"].positive(),
+        duration_s=duration_s,
         motion=motion,
         imu_clock_origin_ns=start_ns,
         room=room,
