@@ -11,7 +11,7 @@ from icalib.errors import RecordingError
 from icalib.measurements import ImuStream, LidarStream, Measurements, PoseStream, TrackStream, WheelStream
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import ImuNoise, ImuSensor, Lidar, PoseSensor, Rig, Wheels
-from icalib.rig_streams import streams_of_rig
+from icalib.rig_streams import near, streams_of_rig
 
 STAMPS, NONE = np.arange(3), np.zeros(4, np.int64)
 IMU = ImuStream("imu0", STAMPS, np.zeros((3, 3)), np.zeros((3, 3)))
@@ -62,3 +62,17 @@ def test_streams_come_in_the_order_of_the_rig():
 def test_others_are_refused_by_name(rig: Rig, changed: dict, words: str):
     with pytest.raises(RecordingError, match=words):
         calibrate_measurements(rig, replace(WHOLE, **changed))
+
+
+@pytest.mark.parametrize("far", [[465_875.0, 5_248_232.0, 413.0], [-7e6, 0.0, 0.0], [0.0, 50.0, 0.0]])
+def test_far_positions_are_counted_from_among_them(far):
+    """No digit is lost: what is taken off added again is what was written."""
+    position = far + np.random.default_rng(0).normal(size=(9, 3))
+    stream = PoseStream("mocap", np.arange(9), np.zeros((9, 3, 3)), position)
+    counted, notes = near(stream)
+    if np.linalg.norm(far) < 100.0:
+        assert counted is stream and notes == ()
+        return
+    origin = np.round(np.median(position, axis=0))
+    np.testing.assert_array_equal(counted.position + origin, position)
+    assert np.abs(counted.position).max() < 5.0 and f"({origin[0]:.0f}, {origin[1]:.0f}, {origin[2]:.0f}) m" in notes[0]

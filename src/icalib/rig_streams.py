@@ -1,4 +1,5 @@
-"""Whether measurements made in memory are those of the rig; what is read from files is so already."""
+"""Whether measurements made in memory are those of the rig (what is read from files is so already), and positions near
+the origin of their frame."""
 
 from __future__ import annotations
 
@@ -6,8 +7,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Protocol, TypeVar
 
+import numpy as np
+
 from icalib.errors import RecordingError
-from icalib.measurements import Measurements
+from icalib.measurements import Measurements, PoseStream
 from icalib.rig import Rig
 
 
@@ -17,10 +20,12 @@ class _Named(Protocol):
 
 
 T = TypeVar("T", bound=_Named)
+FAR_M = 100.0  # from the origin of a frame; its rotation and its origin are hard to tell apart from further away
 
 
 def streams_of_rig(rig: Rig, measurements: Measurements) -> Measurements:
-    """The same streams in the order of the rig's sensors. A camera has corners or tracks, or both.
+    """The same streams in the order of the rig's sensors. A camera has corners or tracks, or both. Positions of pose
+    sensors that are far from the origin of their frame, as in UTM, are counted from among them; the notes say so.
 
     Raises RecordingError where a sensor of the rig has no stream, or a stream is of no such sensor of the rig.
     """
@@ -32,13 +37,27 @@ def streams_of_rig(rig: Rig, measurements: Measurements) -> Measurements:
     seeing = {s.name for s in (*cameras, *tracks)}
     lidars, wheels = _ordered(rig.lidars, m.lidars, where), _ordered(rig.wheels, m.wheels, where)
     poses = _ordered(rig.poses, m.poses, where)
+    found = [near(s) for s in poses]
+    poses, notes = tuple(s for s, _ in found), sum((words for _, words in found), m.notes)
     given = seeing.union(s.name for s in (*lidars, *wheels, *poses))
     missing = [s.name for s in (*rig.cameras, *rig.lidars, *rig.wheels, *rig.poses) if s.name not in given]
     if missing:
         raise RecordingError(
             f"{where} has nothing of {' and '.join(missing)}; add what was measured, or take it out of the rig."
         )
-    return replace(m, cameras=cameras, tracks=tracks, lidars=lidars, wheels=wheels, poses=poses)
+    return replace(m, cameras=cameras, tracks=tracks, lidars=lidars, wheels=wheels, poses=poses, notes=notes)
+
+
+def near(stream: PoseStream) -> tuple[PoseStream, tuple[str, ...]]:
+    """The poses with positions counted from whole metres among them where they are far from the origin, which loses no
+    digit, and a note on it."""
+    origin = np.round(np.median(stream.position, axis=0)) if len(stream.position) else np.zeros(3)
+    if not np.linalg.norm(origin) > FAR_M:
+        return stream, ()
+    x, y, z = origin
+    return replace(stream, position=stream.position - origin), (
+        f"{stream.name}: positions are counted from ({x:.0f}, {y:.0f}, {z:.0f}) m of its frame, whose origin is far.",
+    )
 
 
 def _ordered(sensors: Sequence[_Named], streams: Sequence[T], where: str) -> tuple[T, ...]:

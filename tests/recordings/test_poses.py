@@ -118,11 +118,106 @@ def test_bad_poses(tmp_path):
     assert "only 2 poses" in refused(tmp_path)
 
 
+def checked(position=POSITION, rotation=None, stamps=STAMPS, sensor=ABSOLUTE):
+    rotation = TURNS.as_matrix() if rotation is None else rotation
+    return checked_poses(PoseReadings("mocap0", stamps, rotation, position), sensor, "here")
+
+
 def test_not_finite():
     position = POSITION.copy()
-    position[7, 1] = np.nan
-    with pytest.raises(RecordingError, match=f"the pose at {STAMPS[7]} ns is not finite"):
-        checked_poses(PoseReadings("mocap0", STAMPS, TURNS.as_matrix(), position), ABSOLUTE, "here")
+    position[7, 1], position[9] = np.nan, 1e300
+    stream, notes = checked(position)
+    assert f"2 of {N} poses are not finite or have no unit quaternion and are left out, the first at" in notes[0]
+    np.testing.assert_array_equal(stream.stamps_ns, np.delete(STAMPS, [7, 9]))
+    position[100:] = np.nan
+    with pytest.raises(RecordingError, match=f"poses are not finite or .*, the first at {STAMPS[7]} ns"):
+        checked(position)
+
+
+def test_a_single_quaternion_that_is_none(tmp_path):
+    xyzw = XYZW.copy()
+    xyzw[20], xyzw[30] = 0.0, 2.0 * xyzw[30]
+    table(tmp_path, xyzw=xyzw)
+    stream, notes = read(tmp_path)
+    np.testing.assert_array_equal(stream.stamps_ns, np.delete(STAMPS, [20, 30]))
+    assert f"2 of {N} poses" in notes[0] and f"the first at {STAMPS[20]} ns" in notes[0]
+
+
+LOST = {
+    "zero for 0.4 s": np.arange(100, 120),
+    "zero once": np.array([50]),
+    "zero at the beginning": np.arange(8),
+    "zero at the end": np.arange(N - 8, N),
+    "zero here and there": np.array([11, 12, 77, 150, 152, 154, 290]),
+}
+
+
+@pytest.mark.parametrize("case", LOST)
+@pytest.mark.parametrize("sensor", [ABSOLUTE, RELATIVE], ids=["absolute", "relative"])
+@pytest.mark.parametrize("far", [[0.0, 0.0, 0.0], [465_000.0, 5_248_000.0, 413.0]], ids=["near", "far"])
+def test_lost_poses_are_left_out(case, sensor, far):
+    """A tracker that is lost reports the origin, or no position and no rotation at all."""
+    lost, rng = LOST[case], np.random.default_rng(0)
+    position, rotation = POSITION + [2.0, 1.0, 1.0] + 1e-3 * rng.normal(size=(N, 3)) + far, TURNS.as_matrix()
+    position[lost], rotation[lost] = 0.0, np.eye(3)
+    stream, notes = checked(position, rotation, sensor=sensor)
+    np.testing.assert_array_equal(stream.stamps_ns, np.delete(STAMPS, lost))
+    assert f"{len(lost)} of {N} poses are off the path" in notes[-1] or "repeat an earlier one" in notes[0]
+
+
+def test_lost_poses_that_scatter_behind_a_gap():
+    """While it is lost for half a second the tracker leaves poses out, too."""
+    rng, lost = np.random.default_rng(1), np.arange(140, 166)
+    position = POSITION + 1e-3 * rng.normal(size=(N, 3))
+    position[lost] += rng.normal(size=(len(lost), 3))
+    there = np.delete(np.arange(N), np.arange(140, 148))
+    stream, notes = checked(position[there], TURNS.as_matrix()[there], STAMPS[there])
+    np.testing.assert_array_equal(stream.stamps_ns, np.delete(STAMPS, lost))
+    assert "the longest time without poses is 0.54 s" in notes[-1]
+
+
+def test_bad_poses_between_jumps_that_stay():
+    """Of an odometry: it closes loops, and single poses are wrong besides."""
+    position = POSITION.copy()
+    position[100:] += [0.4, 0.0, 0.0]
+    position[200:] += [0.0, 0.4, 0.0]
+    position[[50, 150, 250]] += [0.0, 0.0, 0.5]
+    stream, notes = checked(position, sensor=RELATIVE)
+    np.testing.assert_array_equal(stream.stamps_ns, np.delete(STAMPS, [50, 150, 250]))
+    assert "8 jumps" in notes[-1]
+    with pytest.raises(RecordingError, match="they do not come back"):
+        checked(position)
+
+
+@pytest.mark.parametrize("copies", [np.arange(100, 120), np.arange(1, N, 4), np.array([33, 150, 151])])
+def test_poses_that_are_sent_again(copies):
+    """A tracker that freezes, a driver with a faster clock than the tracker, single late copies."""
+    source = np.arange(N)
+    for k in copies:
+        source[k] = source[k - 1]
+    stream, notes = checked(POSITION[source], TURNS.as_matrix()[source])
+    np.testing.assert_array_equal(stream.stamps_ns, np.delete(STAMPS, copies))
+    assert f"{len(copies)} of {N} poses repeat an earlier one exactly while it moves" in notes[0]
+
+
+def test_late_copies():
+    """Each hundredth pose is that of three before."""
+    late = np.arange(60, N, 100)
+    source = np.arange(N)
+    source[late] -= 3
+    stream, _ = checked(POSITION[source], TURNS.as_matrix()[source])
+    np.testing.assert_array_equal(stream.stamps_ns, np.delete(STAMPS, late))
+
+
+def test_an_odometry_that_stands_still_repeats_itself():
+    """It brakes, stands for two seconds without noise, and starts again: nothing is left out."""
+    u = np.clip(T, None, 2.0) + np.clip(T - 4.0, 0.0, None)
+    s = np.where(T < 2.0, 2.0 * u - 0.5 * u**2, 2.0 + 0.5 * np.clip(u - 2.0, 0.0, None) ** 2)
+    position = np.stack([s, 0.0 * s, 0.0 * s], axis=1)
+    rotation = Rotation.from_rotvec(np.stack([0.0 * s, 0.0 * s, 0.5 * s], axis=1)).as_matrix()
+    assert (np.diff(s) == 0.0).sum() > 90
+    stream, notes = checked(position, rotation)
+    assert len(stream.stamps_ns) == N and notes == ()
 
 
 def test_repeated_stamps(tmp_path):

@@ -6,37 +6,99 @@ import numpy as np
 
 from icalib.errors import RecordingError
 from icalib.geometry import so3
-from icalib.measurements import PoseStream
+from icalib.measurements import PoseStream, seconds_since
+from icalib.recordings.bad_poses import are_poses, path_of, stale_copies
 from icalib.recordings.ordered import kept_readings
 from icalib.recordings.poses import PoseReadings
 from icalib.rig import PoseSensor
 
 _RATE_HZ = (2.0, 5000.0)
 _FASTEST_M_S = 100.0
-_JUMP_M, _JUMP_RAD = 0.05, 0.05  # beyond the steps before and after, and
-_JUMP_TIMES = 20.0  # the median of all steps beyond theirs
-_RETURNS = 0.5  # of a jump's length: jumps that add up to less come back
+_BROKEN_SHARE = 0.5  # of all poses: more are no single bad readings
+_LASTING_M, _RETURNS = 0.05, 0.5  # of a jump's length: jumps that add up to less come back
 _STILL_M, _STILL_RAD = 0.02, 0.02  # from pose to pose, farthest from the first
 
 
 def checked_poses(read: PoseReadings, sensor: PoseSensor, where: str) -> tuple[PoseStream, tuple[str, ...]]:
-    """The poses with strictly increasing stamps, and notes on what was dropped or looks odd.
+    """The poses with strictly increasing stamps, without single bad ones, and notes on what was left out or looks odd.
 
-    Raises RecordingError naming `where` and the instant: too few poses, NaN, stamps out of order or repeated with other
-    values, other units of time or length, standing still, and of absolute poses a frame that jumps.
+    Raises RecordingError naming `where` and the instant: too few poses, mostly none, stamps out of order or repeated
+    with other values, other units of time or length, standing still, and of absolute poses a frame that jumps.
     """
     what = f"{where} ({read.name})"
     if len(read.stamps_ns) < 3:
         raise RecordingError(f"{what}: only {len(read.stamps_ns)} poses; a calibration needs the whole recording.")
+    read, broken = _without_broken(read, what)
     values = np.hstack([read.position, read.rotation.reshape(-1, 9)])
     own = "write the sensor's own stamps"
     kept, notes = kept_readings(read.stamps_ns, values, what, _RATE_HZ, "pose", own)
-    if notes:
-        read = PoseReadings(read.name, read.stamps_ns[kept], read.rotation[kept], read.position[kept])
+    read = _some(read, kept)
+    read, copied = _without_copies(read, what)
+    read, jumped = _on_path(read, sensor, what)
     _refuse_stillness(read, what)
     _refuse_units(read, what)
     stream = PoseStream(read.name, read.stamps_ns, np.ascontiguousarray(read.rotation), read.position)
-    return stream, notes + _jumps(stream, sensor, what)
+    return stream, broken + notes + copied + jumped
+
+
+def _some(read: PoseReadings, kept: np.ndarray) -> PoseReadings:
+    if kept.all():
+        return read
+    return PoseReadings(read.name, read.stamps_ns[kept], read.rotation[kept], read.position[kept])
+
+
+def _without_broken(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple[str, ...]]:
+    """Without the few that are no poses."""
+    good = are_poses(read.rotation, read.position)
+    if good.all():
+        return read, ()
+    first, count = read.stamps_ns[np.argmin(good)], int((~good).sum())
+    if count > _BROKEN_SHARE * len(good) or len(good) - count < 3:
+        raise RecordingError(
+            f"{what}: {count} of {len(good)} poses are not finite or have no unit quaternion, the first at {first} ns; "
+            "correct what writes them."
+        )
+    return _some(read, good), (
+        f"{what}: {count} of {len(good)} poses are not finite or have no unit quaternion and are left out, the first "
+        f"at {first} ns.",
+    )
+
+
+def _without_copies(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple[str, ...]]:
+    stale = stale_copies(_seconds(read), read.rotation, read.position)
+    if not stale.any():
+        return read, ()
+    return _some(read, ~stale), (
+        f"{what}: {int(stale.sum())} of {len(stale)} poses repeat an earlier one exactly while it moves, as where a "
+        f"tracker is lost or a driver sends its last pose again; they are left out, the first at "
+        f"{read.stamps_ns[np.argmax(stale)]} ns.",
+    )
+
+
+def _on_path(read: PoseReadings, sensor: PoseSensor, what: str) -> tuple[PoseReadings, tuple[str, ...]]:
+    """Without poses off the path of the others, and a note where poses jump; raises RecordingError where jumps of a
+    frame that stands still do not come back."""
+    path = path_of(_seconds(read), read.rotation, read.position)
+    if not len(path.jumps):
+        return read, ()
+    first, count = read.stamps_ns[path.jumps[0]], int((~path.on).sum())
+    words = f"{what}: {len(path.jumps)} jumps of its poses, the first at {first} ns, by up to {path.size_m:.2g} m"
+    words += f" and {path.size_rad:.2g} rad"
+    if sensor.kind == "absolute" and path.lasting_m > max(_LASTING_M, _RETURNS * path.size_m):
+        raise RecordingError(
+            f"{words}, and they do not come back, as where an odometry closes a loop or loses its track; write kind: "
+            f"relative for {sensor.name} in the rig file, or cut the recording."
+        )
+    if not count:
+        return read, (f"{words}; the robust loss of the settings weighs them down.",)
+    return _some(read, path.on), (
+        f"{words}; {count} of {len(path.on)} poses are off the path of the others, as where a tracker is lost, and "
+        f"are left out; the longest time without poses is {path.longest_s:.2g} s.",
+    )
+
+
+def _seconds(read: PoseReadings) -> np.ndarray:
+    return seconds_since(read.stamps_ns, int(read.stamps_ns[0]))
 
 
 def _refuse_stillness(read: PoseReadings, what: str) -> None:
@@ -59,42 +121,5 @@ def _refuse_units(read: PoseReadings, what: str) -> None:
         )
 
 
-def _jumps(stream: PoseStream, sensor: PoseSensor, what: str) -> tuple[str, ...]:
-    """A note where poses jump; raises RecordingError where those of a frame that stands still do not come back."""
-    way = np.diff(stream.position, axis=0)
-    beyond = _beyond(way)
-    turn = _turn_steps(stream.rotation)
-    jump = (_sizes(beyond) > _limit(beyond, _JUMP_M)) | (_sizes(_beyond(turn)) > _limit(_beyond(turn), _JUMP_RAD))
-    jump &= np.diff(stream.stamps_ns) < 2 * np.median(np.diff(stream.stamps_ns))
-    if not jump.any():
-        return ()
-    i, size = int(np.argmax(jump)), float(_sizes(beyond)[jump].max())
-    first = stream.stamps_ns[i + 1]
-    words = f"{what}: {int(jump.sum())} jumps of its poses, the first at {first} ns, by up to {size:.2g} m"
-    lasting = float(np.linalg.norm(beyond[jump].sum(axis=0)))
-    if sensor.kind == "absolute" and lasting > max(_JUMP_M, _RETURNS * size):
-        raise RecordingError(
-            f"{words}, and they do not come back, as where an odometry closes a loop or loses its track; write kind: "
-            f"relative for {sensor.name} in the rig file, or cut the recording."
-        )
-    return (f"{words}; the robust loss of the settings weighs them down.",)
-
-
-def _beyond(steps: np.ndarray) -> np.ndarray:
-    """Each of steps (n, 3) less the median of it and its neighbours, two on each side."""
-    padded = np.pad(steps, ((2, 2), (0, 0)), mode="edge")
-    near = np.stack([padded[k : k + len(steps)] for k in range(5)])
-    return steps - np.median(near, axis=0)
-
-
-def _limit(beyond: np.ndarray, least: float) -> float:
-    return max(least, _JUMP_TIMES * float(np.median(_sizes(beyond))))
-
-
 def _sizes(vectors: np.ndarray) -> np.ndarray:
     return np.linalg.norm(vectors, axis=1)
-
-
-def _turn_steps(rotation: np.ndarray) -> np.ndarray:
-    """(N - 1, 3) what each pose turned from the one before, about axes of the sensor, rad."""
-    return so3.log_many(np.ascontiguousarray(rotation[:-1].transpose(0, 2, 1) @ rotation[1:]))

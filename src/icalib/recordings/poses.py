@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from icalib.errors import RecordingError
-from icalib.recordings.streams import rotations
+from icalib.recordings.streams import unit_rotations
 from icalib.recordings.table import header_of, read_table
 
 STAMP = ("t [ns]",)
@@ -20,8 +20,8 @@ _UNIT = 1e-2  # of the length of a quaternion: of few digits
 
 @dataclass(frozen=True)
 class PoseReadings:
-    """stamps_ns (N,) int64, which may still repeat or run backwards; R_frame_sensor (N, 3, 3); p_frame_sensor (N, 3)
-    m."""
+    """stamps_ns (N,) int64, which may still repeat or run backwards; R_frame_sensor (N, 3, 3), NaN where there is
+    none; p_frame_sensor (N, 3) m."""
 
     name: str
     stamps_ns: np.ndarray
@@ -37,7 +37,8 @@ def is_tum_text(path: Path) -> bool:
 def read_pose_file(name: str, path: Path) -> PoseReadings:
     """The poses of the sensor `name` in the table at `path`: t [ns], x, y, z, qx, qy, qz, qw, or, where its header
     names the quaternion's w first, as EuRoC's, in that order; a file .tum or .txt is TUM's, t [s] and the same,
-    separated by blanks. Raises RecordingError naming file and line, and the instant of a quaternion that is none."""
+    separated by blanks. Rotations of quaternions that are none are NaN. Raises RecordingError naming file and line, and
+    where most quaternions are none."""
     if is_tum_text(path):
         stamps_ns, values = _read_text(path)
     else:
@@ -48,13 +49,13 @@ def read_pose_file(name: str, path: Path) -> PoseReadings:
     xyzw = values[:, 3:]
     length = np.linalg.norm(xyzw, axis=1)
     wrong = ~(np.abs(length - 1.0) < _UNIT)
-    if wrong.any():
+    if 2 * wrong.sum() > len(wrong):
         i = int(np.argmax(wrong))
         raise RecordingError(
-            f"{path} ({name}): the quaternion at {stamps_ns[i]} ns has length {length[i]:.3g}, not 1; check the order "
-            "of the columns, x, y, z, qx, qy, qz, qw, or remove the pose."
+            f"{path} ({name}): the quaternion at {stamps_ns[i]} ns has length {length[i]:.3g}, not 1, and most are "
+            "no better; check the order of the columns, x, y, z, qx, qy, qz, qw."
         )
-    return PoseReadings(name, stamps_ns, rotations(xyzw / length[:, None]), values[:, :3].copy())
+    return PoseReadings(name, stamps_ns, unit_rotations(xyzw, ~wrong), values[:, :3].copy())
 
 
 def _w_first(header: str) -> bool:

@@ -34,7 +34,8 @@ class CameraInfo:
 
 @dataclass(frozen=True)
 class PoseStream:
-    """Poses T_frame_body: stamps_ns (N,) int64, position (N, 3) m, rotation (N, 3, 3)."""
+    """Poses T_frame_body: stamps_ns (N,) int64, position (N, 3) m, rotation (N, 3, 3), NaN where there is no unit
+    quaternion."""
 
     frame: str
     stamps_ns: np.ndarray
@@ -200,14 +201,19 @@ def _frame(
 def _poses(bag: HasMessages, topic: str, frame: str, stamps_ns: np.ndarray, poses: list[Any]) -> PoseStream:
     position = np.array([_xyz(p.position) for p in poses]).reshape(-1, 3)
     xyzw = np.array([(*_xyz(p.orientation), p.orientation.w) for p in poses]).reshape(-1, 4)
-    length = np.linalg.norm(xyzw, axis=1)
-    wrong = ~(np.abs(length - 1.0) < 1e-3)
-    if wrong.any():
+    good = np.abs(np.linalg.norm(xyzw, axis=1) - 1.0) < 1e-3
+    if 2 * (~good).sum() > len(good):
         raise RecordingError(
-            f"{bag.root} {topic}: the orientation at {stamps_ns[np.argmax(wrong)]} ns is no unit quaternion; "
-            "correct what publishes it."
+            f"{bag.root} {topic}: the orientation at {stamps_ns[np.argmin(good)]} ns is no unit quaternion, and so are "
+            "most; correct what publishes it."
         )
-    return PoseStream(frame, stamps_ns, position, rotations(xyzw / length[:, None]))
+    return PoseStream(frame, stamps_ns, position, unit_rotations(xyzw, good))
+
+
+def unit_rotations(xyzw: np.ndarray, good: np.ndarray) -> np.ndarray:
+    """(N, 3, 3) of quaternions (N, 4) of about unit length; NaN where they are not `good` (N,)."""
+    length = np.where(good, np.linalg.norm(xyzw, axis=1), np.nan)
+    return rotations(xyzw / length[:, None])
 
 
 def rotations(xyzw: np.ndarray) -> np.ndarray:
