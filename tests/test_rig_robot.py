@@ -67,6 +67,18 @@ def complaint(tmp_path: Path, text: str) -> str:
     return sentence.removeprefix(f"{tmp_path}/")
 
 
+def test_the_field_and_the_unit_of_point_times(tmp_path):
+    timed = ROBOT.replace("point_time: azimuth", "point_time_field: laser_usec\n    point_time_unit: us")
+    rig = load(tmp_path, timed)
+    assert (rig.lidars[0].point_time_field, rig.lidars[0].point_time_unit) == ("laser_usec", "us")
+    again = load(tmp_path, yaml.safe_dump(rig_to_dict(rig), sort_keys=False))
+    assert again.lidars[0].point_time_field == "laser_usec" and again.lidars[0].point_time_unit == "us"
+    both = complaint(tmp_path, timed.replace("point_time_unit: us", "point_time: snapshot"))
+    assert "lidar0.point_time_field: point_time: snapshot uses no times of points; leave out point_time_field" in both
+    unit = complaint(tmp_path, timed.replace("point_time_unit: us", "point_time_unit: min"))
+    assert "sensors.lidar0.point_time_unit: there is no such choice as 'min'; available are s, ms, us, ns" in unit
+
+
 def test_lidars_and_wheels_are_read(tmp_path):
     rig = load(tmp_path, ROBOT)
     a, b = rig.lidars

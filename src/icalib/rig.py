@@ -84,13 +84,15 @@ class Camera:
 
 
 PointTime = Literal["auto", "start", "end", "azimuth", "snapshot"]
+TimeUnit = Literal["s", "ms", "us", "ns"]
 
 
 @dataclass(frozen=True)
 class Lidar:
     """One LiDAR. Points nearer than near_m or farther than far_m are left out.
 
-    point_time: what a point's time is counted from; see `recordings.point_times`.
+    point_time: what a point's time is counted from; see `recordings.point_times`. point_time_field, point_time_unit:
+    where the time of a point stands, and in what unit; None: told from the data.
     """
 
     name: str
@@ -104,6 +106,8 @@ class Lidar:
     far_m: float = 100.0
     point_time: PointTime = "auto"
     topic: str | None = None  # of its clouds; None: the one with the LiDAR's name, or the only one
+    point_time_field: str | None = None
+    point_time_unit: TimeUnit | None = None
 
 
 WheelFactor = Literal["increments", "relative-poses"]

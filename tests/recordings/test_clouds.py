@@ -76,7 +76,8 @@ def read(tmp_path, write):
     """Messages at their stamps -> the LiDAR's stream and the notes."""
 
     def build(messages: list[tuple[int, Any]], **fields: Any) -> tuple[LidarStream, tuple[str, ...]]:
-        path = write.ros2(tmp_path / "run", [("/lidar0/points", POINTS, t + 5, m) for t, m in messages])
+        place = tmp_path / f"run{len(list(tmp_path.iterdir()))}"
+        path = write.ros2(place, [("/lidar0/points", POINTS, t + 5, m) for t, m in messages])
         bag, lidar = BagRecording(path), Lidar("lidar0", "", **fields)
         stream, notes = checked_lidar(bag.lidar(lidar), bag.where(lidar))
         return stream, bag.notes() + notes
@@ -227,18 +228,6 @@ def stamped(times: Any, shuffle: bool = False) -> Any:
 
 REFUSED = {
     "no times": (stamped((PLAIN, lambda t, s: {})), {}, "no times (their fields are x, y, z, intensity); record a clo"),
-    "milliseconds": (
-        stamped((VELODYNE, lambda t, s: {"time": (t - s) * 1e-6})), {},
-        "times `time`, read as s, spread over 98.89 s, though scans are 0.1 s apart; they look like another unit; "
-        "divide them by 1000.",
-    ),
-    "microseconds": (
-        stamped((OUSTER, lambda t, s: {"t": (t - s) // 1000})), {},
-        "times `t`, read as ns, spread over 9.889e-05 s, though scans are 0.1 s apart; they look like another unit; "
-        "multiply them by 1000.",
-    ),
-    "seconds as whole numbers": (
-        stamped((OUSTER, lambda t, s: {"t": (t - s) // 10**6})), {}, "multiply them by 1e+06"),
     "no unit": (
         stamped((HESAI, lambda t, s: {"timestamp": t * 3e-8})), {}, "goes on by 3 from scan to scan, which is 0.1 s in"
     ),
@@ -265,6 +254,144 @@ def test_what_would_be_wrong_is_refused(write, read, case):
     assert words in str(error.value) and "/lidar0/points (lidar0)" in str(error.value)
 
 
+OTHER_UNITS = {
+    "milliseconds": (VELODYNE, lambda t, s: {"time": (t - s) * 1e-6}, "`time`, read as s,", "ms", 20),
+    "microseconds": (OUSTER, lambda t, s: {"t": (t - s) // 1000}, "`t`, read as ns,", "us", 1010),
+    "milliseconds as whole numbers": (
+        OUSTER,
+        lambda t, s: {"t": (t - s) // 10**6},
+        "`t`, read as ns,",
+        "ms",
+        1_000_010,
+    ),
+    "nanoseconds as decimals": (VELODYNE, lambda t, s: {"time": (t - s) * 1.0}, "`time`, read as s,", "ns", 20),
+}
+
+
+@pytest.mark.parametrize("case", OTHER_UNITS)
+@pytest.mark.parametrize("given", [False, True])
+def test_the_unit_is_the_one_that_fits(write, read, case, given):
+    """How long scans take leaves one unit, which a note names; the rig file may say it."""
+    dtype, times, words, unit, within_ns = OTHER_UNITS[case]
+    found = scans()
+    stream, notes = read(packed(write.maker(), found, dtype, times), **({"point_time_unit": unit} if given else {}))
+    check(stream, found, within_ns)
+    if given:
+        assert notes == ()
+    else:
+        assert words in notes[0] and f"they are read as {unit}, the only unit that fits" in notes[0]
+
+
+def test_a_unit_that_does_not_fit_is_refused(write, read):
+    messages = packed(write.maker(), scans(), VELODYNE, lambda t, s: {"time": (t - s) * 1e-6})
+    with pytest.raises(RecordingError, match="`time`, read as s, spread .* set point_time_unit of lidar0 to ms in"):
+        read(messages, point_time_unit="s")
+    clock = packed(write.maker(), scans(), LIVOX, lambda t, s: {"timestamp": t * 1.0})
+    with pytest.raises(RecordingError, match="is 0.1 s in ns, not in us; correct point_time_unit of lidar0"):
+        read(clock, point_time_unit="us")
+
+
+def test_a_flash_may_take_as_little_as_it_likes(write, read):
+    """100 us, in a unit that is given."""
+    found = scans()
+    flash = Scans(found.stamps, found.since // 1000, found.xyz, found.ring)
+    messages = packed(write.maker(), flash, OUSTER, lambda t, s: {"t": t - s})
+    stream, notes = read(messages, point_time_unit="ns")
+    check(stream, flash, 10)
+    assert notes == ()
+
+
+AEVA = layout(24, intensity=("f4", 12), time_offset_ns=("i4", 16), velocity=("f4", 20))
+BLICKFELD = layout(24, intensity=("f4", 12), point_id=("u4", 16), point_time_offset=("u4", 20))
+OF_OTHERS = {
+    "aeva": (AEVA, lambda t, s: {"time_offset_ns": t - s, "velocity": np.arange(len(t)) * 0.1}),
+    "blickfeld": (BLICKFELD, lambda t, s: {"point_time_offset": t - s, "point_id": np.arange(len(t))}),
+}
+
+
+@pytest.mark.parametrize("driver", OF_OTHERS)
+def test_fields_of_other_vendors(write, read, driver):
+    found = scans()
+    stream, notes = read(packed(write.maker(), found, *OF_OTHERS[driver]))
+    check(stream, found, 10)
+    assert notes == ()
+
+
+def test_the_rig_file_names_the_field(write, read):
+    """A field of another name, in us; a field that is known but says nothing, beside it."""
+    dtype = layout(28, t=("u4", 12), laser_usec=("u4", 16), laser=("u2", 20))
+    messages = packed(write.maker(), scans(), dtype, lambda t, s: {"laser_usec": (t - s) // 1000})
+    with pytest.raises(RecordingError) as error:
+        read(messages)
+    assert "laser_usec looks like one: set point_time_field: laser_usec of lidar0 in the rig file" in str(error.value)
+    assert "snapshot" not in str(error.value)
+    stream, notes = read(messages, point_time_field="laser_usec", point_time_unit="us")
+    check(stream, scans(), 1010)
+    assert notes == ()
+    with pytest.raises(
+        RecordingError, match=r"no point has a `ts` \(their fields are x, .*correct point_time_field of"
+    ):
+        read(messages, point_time_field="ts")
+    with pytest.raises(
+        RecordingError, match="all points of a scan have the same `t` .*; correct point_time_field of lid"
+    ):
+        read(messages, point_time_field="t")
+
+
+def test_a_field_of_an_unknown_name_may_be_the_time(write, read):
+    dtype = layout(20, intensity=("f4", 12), firing=("u4", 16))
+    with pytest.raises(
+        RecordingError, match="set point_time_field of lidar0 if one of firing is their time; else recor"
+    ):
+        read(packed(write.maker(), scans(), dtype, lambda t, s: {"firing": t - s}))
+
+
+BAD_TIMES = {
+    "ran below zero": (OUSTER, lambda t, s: {"t": t - s}, "t", 2**32 - 40_000),
+    "far off": (VELODYNE, lambda t, s: {"time": (t - s) * 1e-9}, "time", 3e5),
+    "not a number": (VELODYNE, lambda t, s: {"time": (t - s) * 1e-9}, "time", np.nan),
+    "infinite, in us": (VELODYNE, lambda t, s: {"time": (t - s) * 1e-3}, "time", -np.inf),
+    "of another day": (HESAI, lambda t, s: {"timestamp": t // 10**9 + t % 10**9 * 1e-9}, "timestamp", 86400.0),
+    "an hour late": (LIVOX, lambda t, s: {"timestamp": t * 1.0}, "timestamp", float(ORIGIN + 3600 * 10**9)),
+}
+
+
+@pytest.mark.parametrize("case", BAD_TIMES)
+@pytest.mark.parametrize("every", [1, 3, 100])
+def test_single_bad_times_are_left_out(write, read, case, every):
+    """In one scan of three, or in all: one point in a hundred."""
+    dtype, times, field, bad = BAD_TIMES[case]
+    found, rows = scans(), np.arange(3, 360, every)[:4]
+
+    def with_bad(t, s):
+        columns = times(t, s)
+        if every == 100 or (s // PERIOD) % 3 == 0:
+            columns[field] = columns[field].astype(np.float64)
+            columns[field][rows] = bad
+        return columns
+
+    stream, notes = read(packed(write.maker(), found, dtype, with_bad))
+    lost = [k for k in range(SCANS) if every == 100 or ((ORIGIN + k * PERIOD) // PERIOD) % 3 == 0]
+    counts = [len(found.since) - len(rows) * (k in lost) for k in range(SCANS)]
+    assert np.diff(stream.start).tolist() == counts
+    kept = np.array([k not in lost or i not in rows for k in range(SCANS) for i in range(len(found.since))])
+    instants = (found.stamps[:, None] + found.since).ravel()[kept]
+    scan = np.repeat(np.arange(SCANS), counts)
+    assert np.abs(stream.stamps_ns[scan] - instants + 1e9 * stream.offset_s).max() < 150
+    left_out = f"of {kept.size} points {(~kept).sum()} without a time within their scan were left out"
+    assert any(left_out in note for note in notes)
+
+
+def test_empty_clouds_at_first(write, read):
+    """A LiDAR that warms up; its driver sends clouds without fields."""
+    make, found = write.maker(), scans()
+    bare = np.dtype({"names": ["x"], "formats": ["f4"], "offsets": [0], "itemsize": 4})
+    empty = [(t, cloud(make, t, bare, {"x": np.zeros(0)})) for t in range(ORIGIN - 20 * PERIOD, ORIGIN, PERIOD)]
+    stream, notes = read(empty + packed(make, found, VELODYNE, lambda t, s: {"time": (t - s) * 1e-9}))
+    check(stream, found, 10)
+    assert "20 of 32 scans have no usable point and were left out" in notes[0]
+
+
 def test_what_does_not_turn_has_no_azimuth(write, read):
     found = scans()
     azimuth = 0.6 * np.sin(40.0 * found.since / PERIOD)
@@ -276,7 +403,7 @@ def test_what_does_not_turn_has_no_azimuth(write, read):
 def test_empty_clouds(write, read):
     make = write.maker()
     messages = [(t, cloud(make, t, VELODYNE, {"x": np.zeros(0)})) for t in scans().stamps.tolist()]
-    with pytest.raises(RecordingError, match="0 of the first 8 clouds have points"):
+    with pytest.raises(RecordingError, match="0 of 12 clouds have points"):
         read(messages)
 
 

@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import chain, islice
+from itertools import chain
 
 import numpy as np
 
 from icalib.errors import RecordingError
 from icalib.measurements import LidarStream
-from icalib.recordings.lidar_checks import Sieve, refuse_disorder
+from icalib.recordings.lidar_checks import Sieve
 from icalib.recordings.point_times import PointTimes, clock_note, find_point_times
 from icalib.recordings.sweeps import Sweep, find_sweep, sweep_share
 from icalib.rig import Lidar
 
-_AHEAD = 8  # clouds that tell how points are timed
+_AHEAD = 8  # clouds with points that tell how points are timed
 
 
 @dataclass(frozen=True)
@@ -36,35 +36,47 @@ Timing = Callable[
 
 
 def read_clouds(clouds: Iterator[PointCloud], lidar: Lidar, what: str) -> tuple[LidarStream, tuple[str, ...]]:
-    """All points of `clouds` that can be used, and notes on the others and on how they are timed. `what` names the
-    topic in sentences.
+    """All points of `clouds` that can be used, and notes on the others and on how they are timed; a cloud may have
+    none. `what` names the topic in sentences.
 
     Raises RecordingError: fewer than two clouds with points, no coordinates, points whose times are not known.
     """
-    ahead = list(islice(clouds, _AHEAD))
-    filled = [cloud for cloud in ahead if len(cloud.points)]
-    if len(filled) < 2:
-        raise RecordingError(
-            f"{what}: {len(filled)} of the first {len(ahead)} clouds have points; check the driver, and record again."
-        )
-    refuse_disorder(np.array([cloud.stamp_ns for cloud in ahead]), what)
-    timing, notes = _timing(filled, lidar, what)
+    ahead = _first_clouds(clouds, what)
+    timing, notes = _timing([cloud for cloud in ahead if len(cloud.points)], lidar, what)
     sieve = Sieve(lidar.near_m, lidar.far_m)
     stamps: list[int] = []
     parts: list[tuple[np.ndarray, np.ndarray]] = []
     for cloud in chain(ahead, clouds):
-        xyz = coordinates(cloud, what)
-        stamp_ns, offset = timing(cloud, xyz)
+        stamp_ns, xyz, offset = cloud.stamp_ns, np.empty((0, 3), np.float32), np.empty(0, np.float32)
+        if len(cloud.points):  # one without points may have no fields either
+            xyz = coordinates(cloud, what)
+            stamp_ns, offset = timing(cloud, xyz)
         keep = sieve.keep(xyz, offset)
         stamps.append(stamp_ns)
         parts.append((xyz, offset) if keep.all() else (xyz[keep], offset[keep]))
-    del ahead, filled
+    del ahead
     stream = _joined(lidar, np.array(stamps, np.int64), parts)
     if lidar.point_time == "azimuth":
         period_s = float(np.median(np.diff(stream.stamps_ns))) * 1e-9
         np.multiply(stream.offset_s, np.float32(period_s), out=stream.offset_s)
     dropped = sieve.note(what)
     return stream, notes + ((dropped,) if dropped else ())
+
+
+def _first_clouds(clouds: Iterator[PointCloud], what: str) -> list[PointCloud]:
+    """Up to the eighth that has points. Raises RecordingError where there are fewer than two such."""
+    found: list[PointCloud] = []
+    filled = 0
+    for cloud in clouds:
+        found.append(cloud)
+        filled += len(cloud.points) > 0
+        if filled == _AHEAD:
+            return found
+    if filled < 2:
+        raise RecordingError(
+            f"{what}: {filled} of {len(found)} clouds have points; check the driver, and record again."
+        )
+    return found
 
 
 def coordinates(cloud: PointCloud, what: str) -> np.ndarray:
@@ -75,8 +87,9 @@ def coordinates(cloud: PointCloud, what: str) -> np.ndarray:
             f"{what}: the points at {cloud.stamp_ns} ns have no x, y, z, but {', '.join(names)}; choose another topic."
         )
     xyz = np.empty((len(cloud.points), 3), np.float32)
-    for column, axis in enumerate("xyz"):
-        xyz[:, column] = cloud.points[axis]
+    with np.errstate(over="ignore", invalid="ignore"):  # 1e300 m becomes infinite
+        for column, axis in enumerate("xyz"):
+            xyz[:, column] = cloud.points[axis]
     return xyz
 
 
@@ -98,10 +111,11 @@ def _timing(clouds: Sequence[PointCloud], lidar: Lidar, what: str) -> tuple[Timi
             f"{what}: points are timed by their azimuth, {turn} and one turn from cloud to cloud, as point_time says."
         )
         return partial(_by_azimuth, sweep), (note,)
-    times = find_point_times(what, stamps_ns, [cloud.points for cloud in clouds], lidar.point_time)
+    times, notes = find_point_times(what, stamps_ns, [cloud.points for cloud in clouds], lidar)
     first_ns, _ = _by_field(times, clouds[0], clouds[0].points)
-    note = clock_note(what, times, clouds[0].stamp_ns, first_ns)
-    return partial(_by_field, times), (note,) if note else ()
+    if note := clock_note(what, times, clouds[0].stamp_ns, first_ns):
+        notes += (note,)
+    return partial(_by_field, times), notes
 
 
 def _at_the_stamp(cloud: PointCloud, xyz: np.ndarray) -> tuple[int, np.ndarray]:

@@ -18,7 +18,7 @@ from icalib.recordings.images import Frame, Payload
 from icalib.recordings.lidar_checks import Sieve, sifted
 from icalib.recordings.poses import FILES as POSE_FILES
 from icalib.recordings.poses import POSE, PoseReadings, is_tum_text, read_pose_file
-from icalib.recordings.scans import read_scan_stamps, read_scans
+from icalib.recordings.scans import in_seconds, read_scan_stamps, read_scans
 from icalib.recordings.table import columns_of, read_table
 from icalib.recordings.topics import TopicInfo, choose_topic, find_topic
 from icalib.recordings.tracks import read_tracks
@@ -111,10 +111,12 @@ class FolderRecording:
     def lidar(self, sensor: Lidar) -> LidarStream:
         path = self._locate(sensor.path)
         self._remember(path)
-        sieve = Sieve(sensor.near_m, sensor.far_m)
-        stream = sifted(read_scans(sensor.name, path), sieve)
-        if note := sieve.note(f"{path} ({sensor.name})"):
-            self._note(note)
+        sieve, what = Sieve(sensor.near_m, sensor.far_m), f"{path} ({sensor.name})"
+        stream, notes = in_seconds(read_scans(sensor.name, path), sensor, what)
+        stream = sifted(stream, sieve)
+        for note in (*notes, sieve.note(what)):
+            if note:
+                self._note(note)
         return stream
 
     def wheels(self, sensor: Wheels) -> WheelReadings | WheelPoses:

@@ -1,11 +1,14 @@
 """When the points of a cloud were measured, from what drivers write beside their coordinates.
 
-The field is called `time`, `t`, `timestamp`, `time_stamp` or `offset_time`. Its values are
+The field is one of FIELDS, or `point_time_field` of the rig file. Its values are
 
-- relative: seconds where it is a floating-point number, nanoseconds where it is a whole one, from the stamp of the
-  message on (Velodyne's `time`, below zero where the last point is stamped; Ouster's `t`, Livox's `offset_time`);
+- relative: seconds where it is a floating-point number, nanoseconds where it is a whole one or its name ends in _ns,
+  from the stamp of the message on (Velodyne's `time`, below zero where the last point is stamped; Ouster's `t`,
+  Livox's `offset_time`, Aeva's `time_offset_ns`, Blickfeld's `point_time_offset`);
 - or absolute, going on from scan to scan: s, ms, us or ns of a clock (`timestamp` of Hesai and RoboSense in s, of
   Livox in ns). Then this clock, not that of the messages' stamps, is the LiDAR's.
+
+How long scans take tells the unit, for a scan takes 0.02 to 1.7 times what scans are apart: no two units fit.
 
 `point_time` of the rig file says otherwise. start, end: the message is stamped when its first, its last point was
 measured. azimuth: there are no times, and the LiDAR turns at a constant rate, once in a scan. snapshot: all points were
@@ -14,6 +17,7 @@ measured at the stamp.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import floor
@@ -21,75 +25,115 @@ from math import floor
 import numpy as np
 
 from icalib.errors import RecordingError
-from icalib.recordings.lidar_checks import span_sentence
-from icalib.rig import PointTime
+from icalib.rig import Lidar, PointTime, TimeUnit
 
-FIELDS = ("offset_time", "time", "t", "timestamp", "time_stamp")
-_UNITS_NS = (1, 1_000, 1_000_000, 1_000_000_000)
+FIELDS = (
+    "offset_time", "time", "t", "timestamp", "time_stamp", "time_offset_ns", "point_time_offset", "time_offset"
+)  # fmt: skip
+UNIT_NS: dict[TimeUnit, int] = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
+LONGEST_PERIODS = 1.7  # how long a scan may take: up to scans that overlap
+_SHORTEST_PERIODS = 0.02  # a narrow sector of a turn; shorter ones are in another unit, or a flash
 _UNIT_FIT = 1.5  # how far the unit of absolute times may be off what the stamps say
+_BULK = (5.0, 95.0)  # per cent: the times of a scan without the few that may be wrong
+_LIKE_A_TIME = re.compile(r"time|stamp|offset|curvature|(^|_)(t|ts|dt|s|ms|us|ns|[mun]?secs?)\d*(_|$)", re.IGNORECASE)
+_NO_TIMES = {"x", "y", "z", "intensity", "reflectivity", "ring", "line", "tag", "range", "rgb", "rgba"}
 _CHOICES = "set point_time to azimuth (it turns) or snapshot (all points at the stamp) in the rig file"
 
 
 @dataclass(frozen=True)
 class PointTimes:
-    """How the times in `field` are read: nanoseconds in one unit, whether they are absolute, and what the message's
-    stamp means."""
+    """How the times in `field` are read: in `unit`, whether they are absolute, and what the message's stamp means.
+    longest_s: how long a scan may take."""
 
     field: str
-    unit_ns: int
+    unit: TimeUnit
     absolute: bool
     point_time: PointTime
+    longest_s: float
 
     def of(self, stamp_ns: int, values: np.ndarray) -> tuple[int, np.ndarray]:
-        """The stamp of a scan and seconds (N,) float32 from it to each point, NaN where it has no time. stamp_ns: of
-        the message; values (N,): of the field."""
+        """The stamp of a scan and seconds (N,) float32 from it to each point, NaN where it has no time, or one that
+        cannot be its scan's. stamp_ns: of the message; values (N,): of the field."""
+        unit_ns = UNIT_NS[self.unit]
         times = values.astype(np.float64)
         timed = _timed(times, self.absolute)
+        timed[timed] = within_scan(times[timed], self.longest_s * 1e9 / unit_ns)
         if not timed.any():
             return stamp_ns, np.full(len(times), np.nan, np.float32)
         first, last = float(times[timed].min()), float(times[timed].max())
+        times[~timed] = np.nan
         # Differences first: float64 nanoseconds since 1970 step by 256.
-        since_first = (times - first) * (self.unit_ns * 1e-9)
+        since_first = (times - first) * (unit_ns * 1e-9)
         if self.point_time == "end":
-            since_first -= (last - first) * (self.unit_ns * 1e-9)
+            since_first -= (last - first) * (unit_ns * 1e-9)
         elif self.point_time == "auto" and self.absolute:
-            stamp_ns = floor(first) * self.unit_ns + round((first - floor(first)) * self.unit_ns)
+            stamp_ns = floor(first) * unit_ns + round((first - floor(first)) * unit_ns)
         elif self.point_time == "auto":
-            since_first += first * (self.unit_ns * 1e-9)
-        since_first[~timed] = np.nan
+            since_first += first * (unit_ns * 1e-9)
         return stamp_ns, since_first.astype(np.float32)
 
 
-def find_point_times(
-    what: str, stamps_ns: np.ndarray, scans: Sequence[np.ndarray], point_time: PointTime
-) -> PointTimes:
-    """How the points of some scans, structured arrays of messages stamped stamps_ns (S,), are timed.
+def within_scan(times: np.ndarray, longest: float) -> np.ndarray:
+    """(N,) bool: which of the finite `times` (N,) of a scan that lasts no longer than `longest` can be its own."""
+    if not len(times) or times.max() - times.min() <= longest:
+        return np.ones(len(times), bool)
+    near = times[np.abs(times - np.median(times)) <= longest]
+    low, high = np.percentile(near, _BULK) if len(near) else (np.inf, -np.inf)
+    return (times >= high - longest) & (times <= low + longest)
 
-    Raises RecordingError naming `what`: no field with times, or one that says nothing, or is in another unit.
+
+def find_point_times(
+    what: str, stamps_ns: np.ndarray, scans: Sequence[np.ndarray], lidar: Lidar
+) -> tuple[PointTimes, tuple[str, ...]]:
+    """How the points of some scans, structured arrays of messages stamped stamps_ns (S,), are timed; and a note where
+    their unit is not the one that drivers use.
+
+    Raises RecordingError naming `what`: no field with times, or one that says nothing, or fits in no unit.
     """
-    names = scans[0].dtype.names or ()
-    field = next((f for f in FIELDS if f in names and scans[0][f].ndim == 1), None)
-    if field is None:
-        raise RecordingError(
-            f"{what}: the points have no times (their fields are {', '.join(names)}); record a cloud that has them, or "
-            f"{_CHOICES}."
-        )
+    field = _field(what, scans, lidar)
     times = [scan[field].astype(np.float64) for scan in scans]
     used = [t[_timed(t, True)] for t in times if _timed(t, True).any()]
-    firsts, lasts = np.array([t.min() for t in used]), np.array([t.max() for t in used])
-    if not (lasts > firsts).any():
-        raise RecordingError(
-            f"{what}: all points of a scan have the same `{field}`; correct the driver, or {_CHOICES}."
-        )
     period_s = float(np.median(np.diff(stamps_ns))) * 1e-9
-    if len(used) > 1 and np.median(np.diff(lasts)) > 0.5 * np.median(lasts - firsts):
-        return PointTimes(field, _unit_of_clock(what, field, lasts, period_s), True, point_time)
-    unit, unit_ns = ("ns", 1) if scans[0].dtype[field].kind in "iu" else ("s", 1_000_000_000)
-    span_s = float((lasts - firsts).max()) * unit_ns * 1e-9
-    sentence = span_sentence(f"{what}: the times `{field}`, read as {unit},", span_s, period_s)
-    if sentence:
-        raise RecordingError(sentence)
-    return PointTimes(field, unit_ns, False, point_time)
+    if (ends := _of_a_clock(used, period_s)) is not None:
+        unit = _unit_of_clock(what, field, ends, period_s, lidar)
+        return PointTimes(field, unit, True, lidar.point_time, LONGEST_PERIODS * period_s), ()
+    whole: TimeUnit = "ns" if scans[0].dtype[field].kind in "iu" else "s"
+    usual = next((u for u in UNIT_NS if field.endswith(f"_{u}")), whole)
+    unit, notes = unit_of_offsets(f"{what}: the times `{field}`", used, period_s, lidar, usual)
+    return PointTimes(field, unit, False, lidar.point_time, LONGEST_PERIODS * period_s), notes
+
+
+def unit_of_offsets(
+    times: str, used: Sequence[np.ndarray], period_s: float, lidar: Lidar, usual: TimeUnit
+) -> tuple[TimeUnit, tuple[str, ...]]:
+    """The unit of relative times of some scans that are period_s apart: the one in the rig file, else the usual one,
+    else the only one in which scans take as long as they can, with a note. `times` names them in sentences.
+
+    Raises RecordingError where there is none.
+    """
+    bulk = _median([np.ptp(np.percentile(t, _BULK)) for t in used])
+    spans = (bulk, _median([np.ptp(t) for t in used]))
+    first = lidar.point_time_unit or usual
+    fitting: list[TimeUnit] = [unit for span in spans for unit in UNIT_NS if _fits(span, unit, period_s)]
+    given = lidar.point_time_unit is not None and bulk * UNIT_NS[first] * 1e-9 <= LONGEST_PERIODS * period_s
+    if given or first in fitting:
+        return first, ()
+    spread = f"{times}, read as {first}, spread over {bulk * UNIT_NS[first] * 1e-9:.4g} s, though scans are "
+    spread += f"{period_s:.4g} s apart"
+    if not fitting:
+        factor = next((f for f in (1e3, 1e6, 1e9) if _fits(bulk * f, first, period_s)), None)
+        other = (
+            f"they look like another unit; multiply them by {factor:g}, or"
+            if factor
+            else "correct what writes them, or"
+        )
+        raise RecordingError(
+            f"{spread}; {other} set point_time_field of {lidar.name} in the rig file to another field."
+        )
+    if lidar.point_time_unit is not None:
+        raise RecordingError(f"{spread}; set point_time_unit of {lidar.name} to {fitting[0]} in the rig file.")
+    only = f"they are read as {fitting[0]}, the only unit that fits"
+    return fitting[0], (f"{spread}; {only}; point_time_unit of {lidar.name} in the rig file may say otherwise.",)
 
 
 def clock_note(what: str, times: PointTimes, stamp_ns: int, first_ns: int) -> str | None:
@@ -103,18 +147,83 @@ def clock_note(what: str, times: PointTimes, stamp_ns: int, first_ns: int) -> st
     )
 
 
+def _field(what: str, scans: Sequence[np.ndarray], lidar: Lidar) -> str:
+    """The field of the times: the one in the rig file, else the first known one that differs from point to point."""
+    names = [n for n in scans[0].dtype.names or () if scans[0][n].ndim == 1]
+    differs = [n for n in names if np.median([_differ(scan[n]) for scan in scans]) > 0]
+    listed = f"their fields are {', '.join(scans[0].dtype.names or ())}"
+    if (given := lidar.point_time_field) is not None:
+        if given not in differs:
+            wrong = f"all points of a scan have the same `{given}`" if given in names else f"no point has a `{given}`"
+            raise RecordingError(
+                f"{what}: {wrong} ({listed}); correct point_time_field of {lidar.name} in the rig file."
+            )
+        return given
+    known = [f for f in FIELDS if f in names]
+    if found := [f for f in known if f in differs]:
+        return found[0]
+    if likely := [n for n in differs if _LIKE_A_TIME.search(n) and n not in FIELDS]:
+        raise RecordingError(
+            f"{what}: the points have no field of times that icalib knows ({listed}); {likely[0]} looks like one: set "
+            f"point_time_field: {likely[0]} of {lidar.name} in the rig file."
+        )
+    if known:
+        raise RecordingError(
+            f"{what}: all points of a scan have the same `{known[0]}`; correct the driver, or {_CHOICES}."
+        )
+    others = [n for n in differs if n.lower() not in _NO_TIMES]
+    if_any = (
+        f"set point_time_field of {lidar.name} if one of {', '.join(others)} is their time; else " if others else ""
+    )
+    raise RecordingError(
+        f"{what}: the points have no times ({listed}); {if_any}record a cloud that has them, or {_CHOICES}."
+    )
+
+
+def _differ(values: np.ndarray) -> bool:
+    timed = values[_timed(values, True)]
+    return bool(len(timed) and timed.max() > timed.min())
+
+
 def _timed(times: np.ndarray, absolute: bool) -> np.ndarray:
     """(N,) bool: which points have a time; drivers write 0 where no light came back."""
     return np.isfinite(times) & ((times != 0) | (not absolute))
 
 
-def _unit_of_clock(what: str, field: str, lasts: np.ndarray, period_s: float) -> int:
-    """Nanoseconds in a unit of absolute times, from how far scans are apart."""
-    step = float(np.median(np.diff(lasts)))
-    for unit_ns in _UNITS_NS:
-        if 1.0 / _UNIT_FIT < step * unit_ns * 1e-9 / period_s < _UNIT_FIT:
-            return unit_ns
+def _median(values: Sequence[float]) -> float:
+    return float(np.median(values))
+
+
+def _fits(span: float, unit: TimeUnit, period_s: float) -> bool:
+    return _SHORTEST_PERIODS <= span * UNIT_NS[unit] * 1e-9 / period_s <= LONGEST_PERIODS
+
+
+def _of_a_clock(used: Sequence[np.ndarray], period_s: float) -> np.ndarray | None:
+    """(S,) an instant of each scan where its times go on from scan to scan, else None. The last, or where single times
+    are wrong the middle."""
+    if len(used) < 2:
+        return None
+    lasts, middles = np.array([t.max() for t in used]), np.array([np.median(t) for t in used])
+    if np.median(np.diff(lasts)) > 0.5 * np.median(lasts - [t.min() for t in used]):
+        return lasts
+    step, bulk = np.median(np.diff(middles)), _median([np.ptp(np.percentile(t, _BULK)) for t in used])
+    return middles if step > 0.5 * bulk and _clock_units(float(step), period_s) else None
+
+
+def _clock_units(step: float, period_s: float) -> list[TimeUnit]:
+    """Units in which times that go on by `step` from scan to scan fit scans period_s apart: one, or none."""
+    return [u for u, ns in UNIT_NS.items() if 1.0 / _UNIT_FIT < step * ns * 1e-9 / period_s < _UNIT_FIT]
+
+
+def _unit_of_clock(what: str, field: str, ends: np.ndarray, period_s: float, lidar: Lidar) -> TimeUnit:
+    """That of absolute times, from how far scans are apart."""
+    step, given = float(np.median(np.diff(ends))), lidar.point_time_unit
+    fitting = _clock_units(step, period_s)
+    if given in fitting or (fitting and given is None):
+        return given or fitting[0]
+    goes = f"{what}: `{field}` goes on by {step:.4g} from scan to scan, which is {period_s:.4g} s in"
+    if fitting:
+        raise RecordingError(f"{goes} {fitting[0]}, not in {given}; correct point_time_unit of {lidar.name}.")
     raise RecordingError(
-        f"{what}: `{field}` goes on by {step:.4g} from scan to scan, which is {period_s:.4g} s in no unit (s, ms, us, "
-        "ns); correct the driver, or set point_time in the rig file."
+        f"{goes} no unit (s, ms, us, ns); correct the driver, or set point_time_field of {lidar.name} in the rig file."
     )

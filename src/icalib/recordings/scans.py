@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import zipfile
 import zlib
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from icalib.errors import RecordingError
 from icalib.measurements import LidarStream
+from icalib.recordings.point_times import LONGEST_PERIODS, UNIT_NS, unit_of_offsets, within_scan
+from icalib.rig import Lidar
 
 _REQUIRED = {"stamps_ns": np.int64, "start": np.int64, "offset_s": np.float32, "xyz": np.float32}
 _OPTIONAL = {"plane": np.int32}
+_AHEAD = 8  # scans that tell in what unit points are timed
 
 
 def read_scans(name: str, path: Path) -> LidarStream:
@@ -37,6 +41,27 @@ def read_scan_stamps(path: Path) -> np.ndarray:
     if "stamps_ns" not in arrays:
         raise RecordingError(f"{path} has no array stamps_ns; it needs {', '.join(_REQUIRED)}.")
     return _of_kind(path, "stamps_ns", arrays["stamps_ns"], np.int64)
+
+
+def in_seconds(stream: LidarStream, lidar: Lidar, what: str) -> tuple[LidarStream, tuple[str, ...]]:
+    """`stream` with times of points in seconds, NaN where they cannot be their scan's, and a note on the unit; in the
+    arrays of `stream` itself. Raises RecordingError where they fit in no unit."""
+    scans = [stream.offset_s[a:b] for a, b in pairwise(stream.start.tolist()) if b > a]
+    first = [scan[np.isfinite(scan)].astype(np.float64) for scan in scans[:_AHEAD]]
+    first = [times for times in first if len(times) and np.ptp(times) > 0]
+    if not first or len(scans) < 2:  # all points at the stamp
+        return stream, ()
+    period_s = float(np.median(np.diff(stream.stamps_ns))) * 1e-9
+    if not period_s > 0:
+        return stream, ()  # the stamps are refused later
+    unit, notes = unit_of_offsets(f"{what}: the times of a scan's points", first, period_s, lidar, "s")
+    if unit != "s":
+        np.multiply(stream.offset_s, np.float32(1e-9 * UNIT_NS[unit]), out=stream.offset_s)
+    for scan in scans:
+        timed = np.isfinite(scan)
+        timed[timed] = within_scan(scan[timed], LONGEST_PERIODS * period_s)
+        scan[~timed] = np.nan
+    return stream, notes
 
 
 def _arrays(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:

@@ -18,14 +18,14 @@ from icalib.rig import (
     ImuSensor,
     Lidar,
     Parameter,
-    PointTime,
     PoseKind,
     PoseSensor,
     Rig,
     Settings,
     Wheels,
 )
-from icalib.rig_file.fields import MOUNTING, choice_or, groups_to_plain, mounting, path_or, positive_or, topic_or_none
+from icalib.rig_file.fields import MOUNTING, choice_or, groups_to_plain, mounting, path_or, topic_or_none
+from icalib.rig_file.lidar import lidar_to_plain, read_lidar
 from icalib.rig_file.wheels import read_wheels, wheels_to_plain
 from icalib.rig_parameters import imu_intrinsics_parameter, parameter_to_plain, vector_parameter
 from icalib.rig_targets import NAME, target_of, target_or_targets
@@ -89,7 +89,7 @@ def rig_to_dict(rig: Rig) -> dict[str, Any]:
     """`rig` as lists, numbers and text; written as YAML or JSON, it loads back as the same rig."""
     imus = {} if rig.imu is None else {rig.imu.name: _imu_to_plain(rig.imu)}
     sensors = imus | {c.name: _camera_to_plain(c) for c in rig.cameras}
-    sensors |= {s.name: _lidar_to_plain(s) for s in rig.lidars} | {w.name: wheels_to_plain(w) for w in rig.wheels}
+    sensors |= {s.name: lidar_to_plain(s) for s in rig.lidars} | {w.name: wheels_to_plain(w) for w in rig.wheels}
     sensors |= {s.name: _pose_to_plain(s) for s in rig.poses}
     key = "targets" if isinstance(rig.target, Scene) else "target"
     target = {key: rig.target.plain()} if rig.has_target else {}
@@ -124,7 +124,7 @@ def _sensors(value: YamlValue) -> _Sensors:
             case "camera":
                 found.cameras.append(_camera(name, sensor))
             case "lidar":
-                found.lidars.append(_lidar(name, sensor))
+                found.lidars.append(read_lidar(name, sensor))
             case "wheels":
                 found.wheels.append(read_wheels(name, sensor))
             case "pose":
@@ -226,25 +226,6 @@ def _camera(name: str, value: YamlValue) -> Camera:
     )
 
 
-def _lidar(name: str, value: YamlValue) -> Lidar:
-    found = value.record(("type",), ("path", "topic", "range_noise", "near", "far", "point_time", *MOUNTING))
-    near, far = positive_or(found, "near", Lidar.near_m), positive_or(found, "far", Lidar.far_m)
-    if near >= far:
-        found["near" if "near" in found else "far"].fail(
-            f"points from {near:g} to {far:g} m are none; near must be below far."
-        )
-    return Lidar(
-        name=name,
-        path=path_or(found, f"{name}/scans.npz"),
-        range_noise_m=found["range_noise"].positive() if "range_noise" in found else None,
-        near_m=near,
-        far_m=far,
-        point_time=choice_or(found, "point_time", PointTime, Lidar.point_time),
-        topic=topic_or_none(found),
-        **mounting(found),
-    )
-
-
 def _pose(name: str, value: YamlValue) -> PoseSensor:
     found = value.record(("type",), ("path", "topic", "kind", "rotation_noise", "position_noise", *MOUNTING))
     return PoseSensor(
@@ -310,13 +291,6 @@ def _camera_to_plain(camera: Camera) -> dict[str, Any]:
     if camera.track_noise_px is not None:
         plain["track_noise"] = camera.track_noise_px
     return plain | groups_to_plain(camera)
-
-
-def _lidar_to_plain(lidar: Lidar) -> dict[str, Any]:
-    plain: dict[str, Any] = {"type": "lidar", "path": lidar.path, "near": lidar.near_m, "far": lidar.far_m}
-    plain["point_time"] = lidar.point_time
-    given = {"range_noise": lidar.range_noise_m, "topic": lidar.topic}
-    return plain | {name: value for name, value in given.items() if value is not None} | groups_to_plain(lidar)
 
 
 def _pose_to_plain(sensor: PoseSensor) -> dict[str, Any]:

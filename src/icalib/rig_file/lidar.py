@@ -1,0 +1,53 @@
+"""The fields of a LiDAR in a rig file."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from icalib.rig import Lidar, PointTime, TimeUnit
+from icalib.rig_file.fields import MOUNTING, choice_or, groups_to_plain, mounting, path_or, positive_or, topic_or_none
+from icalib.yaml_nodes import YamlValue
+
+_FIELDS = (
+    "path", "topic", "range_noise", "near", "far", "point_time", "point_time_field", "point_time_unit", *MOUNTING
+)  # fmt: skip
+
+
+def read_lidar(name: str, value: YamlValue) -> Lidar:
+    """Raises RigError naming the field."""
+    found = value.record(("type",), _FIELDS)
+    near, far = positive_or(found, "near", Lidar.near_m), positive_or(found, "far", Lidar.far_m)
+    if near >= far:
+        found["near" if "near" in found else "far"].fail(
+            f"points from {near:g} to {far:g} m are none; near must be below far."
+        )
+    return Lidar(
+        name=name,
+        path=path_or(found, f"{name}/scans.npz"),
+        range_noise_m=found["range_noise"].positive() if "range_noise" in found else None,
+        near_m=near,
+        far_m=far,
+        point_time=_point_time(found),
+        point_time_field=found["point_time_field"].text() if "point_time_field" in found else None,
+        point_time_unit=choice_or(found, "point_time_unit", TimeUnit, None),
+        topic=topic_or_none(found),
+        **mounting(found),
+    )
+
+
+def _point_time(found: dict[str, YamlValue]) -> PointTime:
+    """Fails where points would have a time of their own and none."""
+    chosen = choice_or(found, "point_time", PointTime, Lidar.point_time)
+    for name in ("point_time_field", "point_time_unit"):
+        if name in found and chosen in ("azimuth", "snapshot"):
+            found[name].fail(f"point_time: {chosen} uses no times of points; leave out {name}, or point_time.")
+    return chosen
+
+
+def lidar_to_plain(lidar: Lidar) -> dict[str, Any]:
+    """Plain data that `read_lidar` reads back."""
+    plain: dict[str, Any] = {"type": "lidar", "path": lidar.path, "near": lidar.near_m, "far": lidar.far_m}
+    plain["point_time"] = lidar.point_time
+    given = {"range_noise": lidar.range_noise_m, "topic": lidar.topic}
+    given |= {name: getattr(lidar, name) for name in ("point_time_field", "point_time_unit")}
+    return plain | {name: value for name, value in given.items() if value is not None} | groups_to_plain(lidar)
