@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 
 import numpy as np
@@ -95,6 +96,31 @@ def test_lidars_and_wheels_are_read(tmp_path):
     assert ticks.baseline.mode == "free" and np.array_equal(ticks.baseline.value, [0.4])
     assert rates == Wheels("wheel1", "wheel1/rates.csv", meaning="instant")
     assert poses == Wheels("wheel2", "wheel2/poses.csv", measures="poses", factor="relative-poses")
+
+
+SIGNED = """\
+sensors:
+  mocap0: {type: pose}
+  a: {type: wheels, measures: angles, angle_range: 6.283185, signs: [1, -1]}
+  b: {type: wheels, rate_unit: rpm, drive: skid-steer, signs: [1, -1, 1, -1]}
+"""
+
+
+def test_signs_units_and_ranges(tmp_path):
+    a, b = load(tmp_path, SIGNED).wheels
+    assert (a.angle_range, a.signs, a.rate_unit) == (6.283185, (1, -1), "rad/s")
+    assert (b.angle_range, b.signs, b.rate_unit) == (None, (1, -1, 1, -1), "rpm")
+    again = load(tmp_path, yaml.safe_dump(rig_to_dict(load(tmp_path, SIGNED)), sort_keys=False))
+    assert again.wheels == (a, b)
+    for old, new, words in (
+        ("6.283185", "0", "a.angle_range: must be above 0"),
+        ("measures: angles, ", "", "a.angle_range: belongs to wheels that measure angles, not rates"),
+        ("rpm", "rpm, measures: angles", "b.rate_unit: belongs to wheels that measure rates, not angles"),
+        ("rpm", "turns", "b.rate_unit: .* rad/s, deg/s, rpm"),
+        ("[1, -1]}", "[1, 2]}", "a.signs: must be 1 or -1 for each of two joints"),
+        ("[1, -1, 1, -1]", "[1, -1]", "b.signs: must be 1 or -1 for each of four joints"),
+    ):
+        assert re.search(words, complaint(tmp_path, SIGNED.replace(old, new))), words
 
 
 def test_pose_sensors_are_read(tmp_path):

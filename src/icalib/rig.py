@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -113,6 +114,8 @@ class Lidar:
 WheelFactor = Literal["increments", "relative-poses"]
 WheelMeasure = Literal["rates", "angles", "ticks", "poses", "twist"]
 WheelDrive = Literal["differential", "skid-steer", "ackermann"]
+RateUnit = Literal["rad/s", "deg/s", "rpm"]
+RATE_UNITS: dict[RateUnit, float] = {"rad/s": 1.0, "deg/s": math.pi / 180.0, "rpm": math.pi / 30.0}  # in rad/s
 WheelKind = Literal["pair", "steered", "twist"]  # what the two columns of a `WheelStream` are
 
 # The groups of each kind of wheels, with how many numbers they have.
@@ -176,6 +179,9 @@ class Wheels:
     measures: WheelMeasure = "rates"
     meaning: Literal["mean", "instant"] = "mean"
     counts_per_turn: float | None = None  # of ticks, for one turn of the wheel
+    signs: tuple[int, ...] | None = None  # 1 or -1 of each column of its table, or each joint; None: all 1
+    rate_unit: RateUnit = "rad/s"  # of rates
+    angle_range: float | None = None  # angles [rad] start anew after so much; None: never, or where it is plain
     counter_size: int | None = None  # the counters go back to zero after so many ticks; None: never
     topic: str | None = None  # of its messages; None: the one with the wheels' name, or the only one
     joints: tuple[str, ...] | None = None  # in JointState; None: told by "left" and "right" in the names

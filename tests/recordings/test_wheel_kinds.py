@@ -138,6 +138,29 @@ def test_twists_of_bags(bag_of, kind, content):
         bag.wheels(Wheels("wheel0", ""))
 
 
+def test_twists_in_the_axes_of_the_world(bag_of):
+    """Of an odometry that circles to one side, then to the other."""
+    rate = 0.4 * np.sign(np.sin(0.8 * (STAMPS - STAMPS[0]) * 1e-9))
+    heading = 1.0 + np.concatenate([[0.0], np.cumsum(rate[:-1] * np.diff(STAMPS) * 1e-9)])
+
+    def content(turned):
+        def make_one(make, k, t):
+            linear = make.make(
+                "geometry_msgs/msg/Vector3", *(0.7 * np.array([np.cos(turned[k]), np.sin(turned[k]), 0]))
+            )
+            twist = make.make("geometry_msgs/msg/Twist", linear, make.make("geometry_msgs/msg/Vector3", 0, 0, rate[k]))
+            return make.make("geometry_msgs/msg/TwistStamped", make.header(t), twist)
+
+        return make_one
+
+    wheels = Wheels("wheel0", "", measures="twist")
+    bag = bag_of("geometry_msgs/msg/TwistStamped", content(heading))
+    with pytest.raises(
+        RecordingError, match="are in the axes of the world, not of the vehicle: .*type: pose, kind: rel"
+    ):
+        bag.wheels(wheels)
+
+
 def joints(names, position, velocity):
     def make_one(make, k, t):
         make_it = make.make

@@ -12,6 +12,7 @@ from icalib.errors import RecordingError
 from icalib.measurements import WheelStream
 from icalib.recordings import BagRecording, FolderRecording
 from icalib.recordings.wheel_checks import checked_wheels
+from icalib.recordings.wheels import WheelReadings
 from icalib.rig import Wheels
 
 N, STEP, ORIGIN = 400, 20_000_000, 1_700_000_000_000_000_000
@@ -71,7 +72,7 @@ REFUSED = {
     "back": (RATES, np.where(np.arange(N) == 9, STAMPS - 10**9, STAMPS), {}, f"ing at {STAMPS[9] - 10**9} ns comes"),
     "two": (np.insert(RATES, 7, 1.0, axis=0), TWICE, {}, f"two different readings are both stamped {STAMPS[7]} ns"),
     "deg/s": (np.rad2deg(RATES), STAMPS, {}, "(wheel0): the wheels turn at 366.7 rad/s, faster than any robot's"),
-    "degrees": (np.rad2deg(ANGLES), STAMPS, {"measures": "angles"}, "degrees are to be multiplied by pi / 180"),
+    "degrees": (np.rad2deg(ANGLES), STAMPS, {"measures": "angles"}, "set measures of wheel0 to ticks and counts_pe"),
     "counter": (
         np.mod(np.round(ANGLES * 5000), 65536), STAMPS, {"measures": "ticks", "counts_per_turn": 31416.0},
         "as where a counter starts anew; set counter_size of wheel0 in the rig file (65536",
@@ -103,6 +104,96 @@ def test_what_looks_odd_is_noted(tmp_path):
     assert f"the right wheel reports 0 rad/s for 5.98 s from {STAMPS[50]} ns on while the left one" in notes[0]
     stuck[200, 1] = 0.1
     assert from_table(tmp_path, stuck)[1] == ()
+
+
+@pytest.mark.parametrize(("unit", "size"), [("deg/s", np.pi / 180.0), ("rpm", np.pi / 30.0)])
+def test_units_and_signs(tmp_path, unit, size):
+    stream, notes = from_table(tmp_path, RATES / size * [1.0, -1.0], rate_unit=unit, signs=(1, -1))
+    np.testing.assert_allclose(stream.rate, RATES, rtol=1e-14)
+    assert notes == ()
+    with pytest.raises(RecordingError, match="signs of the rig file has 4 entries for 2 columns"):
+        from_table(tmp_path, RATES, signs=(1, -1, 1, -1))
+
+
+@pytest.mark.parametrize(("low", "size"), [(-np.pi, 2 * np.pi), (0.0, 2 * np.pi), (-2 * np.pi, 4 * np.pi)])
+def test_angles_that_wrap(tmp_path, low, size):
+    wrapped = np.mod(ANGLES - low, size) + low
+    whole, _ = from_table(tmp_path, ANGLES, measures="angles")
+    stream, notes = from_table(tmp_path, wrapped, measures="angles")
+    np.testing.assert_allclose(stream.rate, whole.rate, atol=1e-9)
+    assert len(notes) == 1 and f"the angles wrap after {size:.6f} rad and are unwrapped; angle_range" in notes[0]
+    stream, notes = from_table(tmp_path, wrapped, measures="angles", angle_range=size)
+    np.testing.assert_allclose(stream.rate, whole.rate, atol=1e-9)
+    assert notes == ()
+    odd = np.mod(ANGLES, 5.0)
+    stream, _ = from_table(tmp_path, odd, measures="angles", angle_range=5.0)
+    np.testing.assert_allclose(stream.rate, whole.rate, atol=1e-9)
+
+
+WRONG = [30, 31, 120, 200, 299]
+
+
+@pytest.mark.parametrize("size", [3.0, -40.0, 1e12, np.nan])
+def test_single_rates_that_stand_apart(tmp_path, size):
+    rates = RATES + 0.05 * np.random.default_rng(0).normal(size=RATES.shape)
+    bad = rates.copy()
+    bad[WRONG, 1] += size
+    wheels = Wheels("wheel0", "")
+    stream, notes = checked_wheels(WheelReadings("wheel0", STAMPS, bad), wheels, "here")
+    assert isinstance(stream, WheelStream)
+    np.testing.assert_array_equal(stream.stamps_ns, np.delete(STAMPS, WRONG))
+    np.testing.assert_array_equal(stream.rate, np.delete(rates, WRONG, axis=0))
+    words = "are not finite" if np.isnan(size) else "stand apart from those before and after"
+    assert len(notes) == 1 and f"5 of {N} readings {words}" in notes[0] and f"the first at {STAMPS[30]} ns" in notes[0]
+    bad[:] = np.nan
+    with pytest.raises(RecordingError, match=f"here .*: {N} of {N} readings are not finite"):
+        checked_wheels(WheelReadings("wheel0", STAMPS, bad), wheels, "here")
+
+
+@pytest.mark.parametrize("measures", ["angles", "ticks"])
+@pytest.mark.parametrize("wrong", [[30, 31, 120, 200, 299], [1], [N - 1]])
+def test_single_wrong_counts(tmp_path, measures, wrong):
+    """What is turned over the readings that are left is what the wheels turned."""
+    fields: dict[str, Any] = {"counts_per_turn": 4096.0} if measures == "ticks" else {}
+    values = np.floor(ANGLES * 4096.0 / (2 * np.pi)) if measures == "ticks" else ANGLES
+    bad = values.copy()
+    bad[wrong, 0] = 0.0 if measures == "ticks" else -77.0
+    there = np.delete(np.arange(N), wrong)
+    stream, notes = from_table(tmp_path, bad, measures=measures, **fields)
+    np.testing.assert_array_equal(stream.stamps_ns, STAMPS[there])
+    whole, _ = from_table(tmp_path, values[there], STAMPS[there], measures=measures, **fields)
+    np.testing.assert_allclose(stream.rate, whole.rate, atol=1e-9)
+    assert len(notes) == 1 and f"the first at {STAMPS[wrong[0]]} ns" in notes[0]
+
+
+@pytest.mark.parametrize("measures", ["angles", "ticks"])
+def test_a_counter_that_is_set_back(tmp_path, measures):
+    """It goes on from zero: the step there is left out, its neighbours stand in."""
+    fields: dict[str, Any] = {"counts_per_turn": 1000.5} if measures == "ticks" else {}
+    values = np.floor(ANGLES * 1000.5 / (2 * np.pi)) if measures == "ticks" else ANGLES.copy()
+    values[250:] -= values[250]
+    stream, notes = from_table(tmp_path, values, measures=measures, **fields)
+    np.testing.assert_array_equal(stream.stamps_ns, np.delete(STAMPS, 250))
+    assert np.abs(stream.rate - np.delete(RATES, 250, axis=0)).max() < 0.4
+    assert len(notes) == 1 and f"the first at {STAMPS[250]} ns" in notes[0]
+
+
+def test_few_ticks_of_a_slow_wheel_stay(tmp_path):
+    """One tick in eleven readings is no single bad one."""
+    counts = np.stack([np.arange(N) // 11, np.arange(N) // 23], axis=1).astype(float)
+    stream, notes = from_table(tmp_path, counts, measures="ticks", counts_per_turn=40.0)
+    assert len(stream.rate) == N and notes == ()
+
+
+def test_brisk_wheels_are_not_left_out(tmp_path):
+    """Starts and stops within two readings, at 10 and 50 Hz, with noise and without."""
+    for step in (1, 5):
+        stamps = STAMPS[0] + step * (STAMPS - STAMPS[0])
+        for noise in (0.0, 0.25):
+            rates = np.where((np.arange(N) // 7 % 3 == 1)[:, None], [6.0, 5.0], 0.0)
+            rates += noise * np.random.default_rng(2).normal(size=rates.shape)
+            stream, _ = from_table(tmp_path, rates, stamps)
+            assert len(stream.rate) == N
 
 
 def test_the_table_that_is_not_there(tmp_path):
@@ -194,3 +285,20 @@ def test_joints_one_at_a_time(bag_of):
     bag = bag_of(lambda k: ([["left"], ["right"]][k % 2], [], [1.0]))
     with pytest.raises(RecordingError, match=f"the message at {STAMPS[0]} ns has only one of left and right"):
         bag.wheels(Wheels("wheel0", ""))
+
+
+FILLED = {
+    "rates": (lambda k: (["left", "right"], ANGLES[k].tolist(), [0.0, 0.0]), "velocity", "position", "angles"),
+    "angles": (lambda k: (["left", "right"], [0.0, 0.0], RATES[k].tolist()), "position", "velocity", "rates"),
+}
+
+
+@pytest.mark.parametrize("measures", ["rates", "angles"])
+def test_what_a_driver_fills_with_zeros(bag_of, measures):
+    content, zero, other, advice = FILLED[measures]
+    bag = bag_of(content)
+    with pytest.raises(
+        RecordingError, match=f"the {zero} of left and right is always 0, the {other} is not; .* {advice}"
+    ):
+        bag.wheels(Wheels("wheel0", "", measures=measures))  # type: ignore[arg-type]
+    assert isinstance(bag.wheels(Wheels("wheel0", "", measures=advice)), WheelReadings)

@@ -39,11 +39,11 @@ ONE_RATE = 0.5  # spread over mean
 STEERS_RAD = 1.2  # offsets beyond are none
 
 OPPOSITE: dict[WheelKind, str] = {
-    "pair": "its left and right wheels are swapped, or both count backwards; swap their columns or topics, or change "
-    "the sign of both",
-    "twist": "its yaw rate must be positive to the left; change its sign",
+    "pair": "its left and right wheels are swapped, or both count backwards; swap its columns or joints, or set signs "
+    "to [-1, -1] in the rig file",
+    "twist": "its yaw rate must be positive to the left; set signs to [1, -1] in the rig file",
     "steered": "its steering angle must be positive to the left and its wheel turn forwards; change the sign that is "
-    "wrong",
+    "wrong by signs in the rig file, [1, -1] or [-1, 1]",
 }
 
 
@@ -116,7 +116,8 @@ def _check_turning(name: str, rate: np.ndarray, kind: WheelKind) -> None:
     if still:
         raise EstimationError(
             f"{name}: by its readings the {' and the '.join(still)} wheel did not turn; check the encoder, its column "
-            "or joint, and that the vehicle drove."
+            "or joint, and that the vehicle drove; where joints have no velocity but a position, set measures to "
+            "angles."
         )
 
 
@@ -174,18 +175,15 @@ def _pair(name: str, w: np.ndarray, ahead: np.ndarray, rate: np.ndarray) -> tupl
     left, right = (_fit(np.column_stack([ahead, w]), rate[:, k]) for k in range(2))
     if left[0] <= 0.0 or right[0] <= 0.0:
         raise EstimationError(
-            f"{name}: its wheels count in opposite directions; change the sign of the one that falls as the vehicle "
-            "drives forwards."
+            f"{name}: its wheels count in opposite directions; set signs in the rig file, [1, -1] or [-1, 1], "
+            "-1 for the one that falls as the vehicle drives forwards."
         )
     radii = np.array([1.0 / left[0], 1.0 / right[0]])
     _check_radii(name, radii)
     arm_left, arm_right = left[1] * radii[0], right[1] * radii[1]
     baseline = float(arm_right - arm_left)
     if baseline < 0.0:
-        raise EstimationError(
-            f"{name}: its left and right wheels are swapped, or both count backwards; swap their columns or topics, or "
-            "change the sign of both."
-        )
+        raise EstimationError(f"{name}: {OPPOSITE['pair']}.")
     return -0.5 * float(arm_left + arm_right), {"radii": radii, "baseline": np.array([baseline])}
 
 
@@ -222,7 +220,9 @@ def _steered(name: str, w: np.ndarray, ahead: np.ndarray, rate: np.ndarray) -> t
         base, step = _fit(np.column_stack([w * c, -(v * c + base * w * s)]), v * s)
         offset += float(np.arctan(step))
     if base < 0.0:
-        raise EstimationError(f"{name}: its steering angle is positive to the right; change its sign.")
+        raise EstimationError(
+            f"{name}: its steering angle is positive to the right; change its sign by signs in the rig file."
+        )
     if abs(offset) > STEERS_RAD or base == 0.0:
         raise EstimationError(
             f"{name}: its steering angle does not go with how the vehicle turned; check that it is in radians, "
@@ -237,7 +237,7 @@ def _check_radii(name: str, radii: np.ndarray) -> None:
         which = " and ".join(f"{r:.3g}" for r in radii)
         raise EstimationError(
             f"{name}: its wheels would have radii of {which} m; check that it measures radians (not degrees or turns) "
-            "per second, or its counts_per_turn."
+            "per second, or set its rate_unit or counts_per_turn in the rig file."
         )
 
 

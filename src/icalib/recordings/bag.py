@@ -112,12 +112,12 @@ class BagRecording:
 
     def wheels(self, sensor: Wheels) -> WheelReadings | WheelPoses:
         topic = self._wheel_topic(sensor)
+        what = f"{self.root} {topic.name} ({sensor.name})"
         if topic.kind == "odometry":
-            read = read_wheel_twists(sensor, read_odometry_twists(self, topic.name))
+            read = read_wheel_twists(sensor, read_odometry_twists(self, topic.name), what)
         elif topic.kind == "twist":
-            read = read_wheel_twists(sensor, read_twists(self, topic.name))
+            read = read_wheel_twists(sensor, read_twists(self, topic.name), what)
         else:
-            what = f"{self.root} {topic.name} ({sensor.name})"
             read = read_wheel_joints(sensor, read_joints(self, topic.name), what)
         order = self._order(topic.name, read.stamps_ns)
         return WheelReadings(sensor.name, read.stamps_ns[order], read.value[order])

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from icalib.errors import RecordingError
-from icalib.measurements import WheelPoses, WheelStream
+from icalib.measurements import WheelPoses, WheelStream, seconds_since
+from icalib.recordings.bad_wheels import apart, comes_back, counter_of, range_of, without_wraps
 from icalib.recordings.ordered import kept_readings, longest_run
 from icalib.recordings.wheels import WheelReadings
-from icalib.rig import Wheels
+from icalib.rig import RATE_UNITS, Wheels
 
 _RATE_HZ = (1.0, 10_000.0)
 _FASTEST_RAD_S = 200.0  # a wheel of 0.1 m at 72 km/h; slow robots reach it in deg/s
 _FASTEST_M_S, _FASTEST_YAW_RAD_S = 70.0, 15.0  # 250 km/h; a robot that spins in place twice a second
 _STEEPEST_RAD = 1.4
+_ANY_VALUE = 1e18  # of rates, angles and counts of 64 bits: beyond, it is none
 _GAP_STEPS, _GAP_S = 5.0, 0.1  # a gap is longer than either
 _STUCK_S = 5.0
 _TURNING_RAD_S, _DRIVING_M_S, _STEERING_RAD = 0.5, 0.1, 0.05
@@ -22,40 +26,147 @@ _TURNING_RAD_S, _DRIVING_M_S, _STEERING_RAD = 0.5, 0.1, 0.05
 def checked_wheels(
     read: WheelReadings | WheelPoses, wheels: Wheels, where: str
 ) -> tuple[WheelStream | WheelPoses, tuple[str, ...]]:
-    """What a `WheelStream` of their kind has, or their relative poses as they are, and notes on what looks odd.
+    """What a `WheelStream` of their kind has, or their relative poses as they are, and notes on what was left out or
+    looks odd.
 
     Angles and ticks become the mean rates between their stamps, so that rate times period is what the wheel turned; the
     first, whose period is unknown, is that of the second. Raises RecordingError naming `where` and the instant: too few
-    readings, NaN, stamps out of order or repeated with other values, other units of time or rate.
+    readings, mostly NaN, stamps out of order or repeated with other values, other units of time or rate.
     """
     if isinstance(read, WheelPoses):
         return read, ()
     what = f"{where} ({read.name})"
     if len(read.stamps_ns) < 3:
         raise RecordingError(f"{what}: only {len(read.stamps_ns)} readings; a calibration needs the whole recording.")
+    read, broken = _finite(read, what)
     own = "write the encoders' own stamps"
     kept, notes = kept_readings(read.stamps_ns, read.value, what, _RATE_HZ, "reading", own)
-    if notes:
-        read = WheelReadings(read.name, read.stamps_ns[kept], read.value[kept])
-    rate = _combined(read.value if wheels.measures in ("rates", "twist") else _mean_rates(read, wheels), wheels)
+    read = _signed(_some(read, kept), wheels, what)
+    read, apart_notes = (_even_rates if wheels.measures in ("rates", "twist") else _mean_rates)(read, wheels, what)
+    rate = _combined(read.value, wheels)
     _refuse_units(rate, wheels, what)
     meaning = wheels.meaning if wheels.measures in ("rates", "twist") else "mean"
     stream = WheelStream(read.name, read.stamps_ns, np.ascontiguousarray(rate), meaning, wheels.kind)
+    notes = broken + notes + apart_notes
     return stream, notes + _gap_notes(stream, what) + _stuck_notes(stream, what)
 
 
-def _mean_rates(read: WheelReadings, wheels: Wheels) -> np.ndarray:
-    """(N, m) rad/s between the stamps, steering angles as they are. Ticks go on where their counter starts anew: the
-    shorter way round."""
-    n_turning = read.value.shape[1] // (2 if wheels.kind == "steered" else 1)
-    turned = np.diff(read.value[:, :n_turning], axis=0)
+def _some(read: WheelReadings, kept: np.ndarray) -> WheelReadings:
+    return read if kept.all() else WheelReadings(read.name, read.stamps_ns[kept], read.value[kept])
+
+
+def _finite(read: WheelReadings, what: str) -> tuple[WheelReadings, tuple[str, ...]]:
+    """Without the few readings that are not finite."""
+    good = np.logical_and.reduce(np.abs(read.value) < _ANY_VALUE, axis=1)
+    if good.all():
+        return read, ()
+    first, count = read.stamps_ns[np.argmin(good)], int((~good).sum())
+    if 2 * count > len(good) or len(good) - count < 3:
+        raise RecordingError(
+            f"{what}: {count} of {len(good)} readings are not finite, the first at {first} ns; correct what "
+            "writes them."
+        )
+    return _some(read, good), (
+        f"{what}: {count} of {len(good)} readings are not finite and are left out, the first at {first} ns.",
+    )
+
+
+def _signed(read: WheelReadings, wheels: Wheels, what: str) -> WheelReadings:
+    """With the signs of the rig file, and rates in rad/s."""
+    if wheels.signs is None and wheels.rate_unit == "rad/s":
+        return read
+    n, m = read.value.shape
+    signs = np.ones(m) if wheels.signs is None else np.array(wheels.signs, dtype=float)
+    if len(signs) != m:
+        raise RecordingError(f"{what}: signs of the rig file has {len(signs)} entries for {m} columns; write {m}.")
+    turning = np.arange(m) < _turning(read, wheels)
+    return replace(read, value=read.value * signs * np.where(turning, RATE_UNITS[wheels.rate_unit], 1.0))
+
+
+def _turning(read: WheelReadings, wheels: Wheels) -> int:
+    """How many of the columns are wheels; those after them are steering angles."""
+    return read.value.shape[1] // (2 if wheels.kind == "steered" else 1)
+
+
+def _even_rates(read: WheelReadings, wheels: Wheels, what: str) -> tuple[WheelReadings, tuple[str, ...]]:
+    """Rates or velocities without single ones that stand apart."""
+    off, own = apart(read.value, _seconds(read))
+    return _some(read, ~np.logical_or.reduce(own, axis=1)), _apart_note(read, off, own, what)
+
+
+def _mean_rates(read: WheelReadings, wheels: Wheels, what: str) -> tuple[WheelReadings, tuple[str, ...]]:
+    """Rates (N, m) rad/s between the stamps of angles or ticks, steering angles as they are. Single wrong readings are
+    left out first; steps to another count after which it goes on, as of a counter that was set back, then."""
+    size, notes = _range(read, wheels, what)
+    off, own = apart(_steps(read, wheels, size), _seconds(read)[1:])
+    dt = np.diff(_seconds(read))[:, None]
+    wrong = comes_back(off * dt, own)
+    if wrong.any():
+        at = read.stamps_ns[np.argmax(wrong)]
+        notes += (f"{what}: {int(wrong.sum())} single readings are wrong and are left out, the first at {at} ns.",)
+        read = _some(read, ~wrong)
+        off, own = apart(_steps(read, wheels, size), _seconds(read)[1:])
+    if wheels.measures == "ticks" and wheels.counter_size is None and own.any():
+        _refuse_counter(read, wheels, off * np.diff(_seconds(read))[:, None] * own, what)
+    rate, stamps = _steps(read, wheels, size), read.stamps_ns
+    n_turning = _turning(read, wheels)
+    turned = WheelReadings(read.name, stamps[1:], np.concatenate([rate, read.value[1:, n_turning:]], axis=1))
+    notes += _apart_note(turned, off, own, what)
+    turned = _some(turned, ~np.logical_or.reduce(own, axis=1))
+    first = np.concatenate([turned.value[0, :n_turning], read.value[0, n_turning:]])
+    value = np.concatenate([first[None], turned.value])
+    return WheelReadings(read.name, np.concatenate([stamps[:1], turned.stamps_ns]), value), notes
+
+
+def _steps(read: WheelReadings, wheels: Wheels, size: float | None) -> np.ndarray:
+    """(N - 1, m) rad/s between the stamps. Angles and ticks go on where they start anew after `size`."""
+    turned = np.diff(read.value[:, : _turning(read, wheels)], axis=0)
+    if size is not None:
+        turned = without_wraps(turned, size)
     if wheels.measures == "ticks":
         assert wheels.counts_per_turn is not None  # of every rig file
-        if wheels.counter_size is not None:
-            turned -= wheels.counter_size * np.round(turned / wheels.counter_size)
         turned *= 2.0 * np.pi / wheels.counts_per_turn
-    rate = turned / (np.diff(read.stamps_ns)[:, None] * 1e-9)
-    return np.concatenate([np.concatenate([rate[:1], rate]), read.value[:, n_turning:]], axis=1)
+    return turned / (np.diff(read.stamps_ns)[:, None] * 1e-9)
+
+
+def _range(read: WheelReadings, wheels: Wheels, what: str) -> tuple[float | None, tuple[str, ...]]:
+    """After how much angles or ticks start anew, by the rig file or as angles show it, and a note on the latter."""
+    if wheels.measures == "ticks" or wheels.angle_range is not None:
+        return (wheels.counter_size if wheels.measures == "ticks" else wheels.angle_range), ()
+    size = range_of(read.value[:, : _turning(read, wheels)])
+    if size is None:
+        return None, ()
+    return size, (
+        f"{what}: the angles wrap after {size:.6f} rad and are unwrapped; angle_range of {read.name} in the rig file "
+        "says it.",
+    )
+
+
+def _refuse_counter(read: WheelReadings, wheels: Wheels, off: np.ndarray, what: str) -> None:
+    """Where steps off (N - 1, m) rad are as long as the range of a counter."""
+    assert wheels.counts_per_turn is not None  # of every rig file
+    size = counter_of(off * wheels.counts_per_turn / (2.0 * np.pi))
+    if size is not None:
+        raise RecordingError(
+            f"{what}: a wheel's count jumps by {size}, as where a counter starts anew; set counter_size of "
+            f"{wheels.name} in the rig file ({size} for {size.bit_length() - 1} bits)."
+        )
+
+
+def _apart_note(read: WheelReadings, off: np.ndarray, own: np.ndarray, what: str) -> tuple[str, ...]:
+    """On rates `own` (N, m) that are `off` (N, m) from their neighbours."""
+    count = int(own.any(axis=1).sum())
+    if not count:
+        return ()
+    at, most = read.stamps_ns[np.argmax(own.any(axis=1))], np.abs(off[own]).max()
+    return (
+        f"{what}: {count} of {len(own)} readings stand apart from those before and after, by up to {most:.3g}, and are "
+        f"left out, the first at {at} ns.",
+    )
+
+
+def _seconds(read: WheelReadings) -> np.ndarray:
+    return seconds_since(read.stamps_ns, int(read.stamps_ns[0]))
 
 
 def _combined(value: np.ndarray, wheels: Wheels) -> np.ndarray:
@@ -88,15 +199,13 @@ def _refuse_units(rate: np.ndarray, wheels: Wheels, what: str) -> None:
     fast = float(np.percentile(faster, 50 if wheels.measures == "ticks" else 99))
     if fast > _FASTEST_RAD_S:
         advice = {
-            "rates": "deg/s are to be multiplied by pi / 180, turns a minute by pi / 30",
-            "angles": "degrees are to be multiplied by pi / 180, counts of an encoder are `measures: ticks`",
-            "ticks": "correct counts_per_turn",
-        }[wheels.measures]
-        raise RecordingError(f"{what}: the wheels turn at {fast:.4g} rad/s, faster than any robot's; {advice}.")
-    if wheels.measures == "ticks" and faster.max() > _FASTEST_RAD_S:
+            "rates": "if these are not rad/s, set rate_unit of {} to deg/s or rpm",
+            "angles": "for degrees set measures of {} to ticks and counts_per_turn to 360, for counts of an encoder to "
+            "those of a turn; for angles that start anew set angle_range",
+            "ticks": "correct counts_per_turn of {}",
+        }[wheels.measures].format(wheels.name)
         raise RecordingError(
-            f"{what}: a wheel turns at {faster.max():.4g} rad/s for an instant, as where a counter starts anew; set "
-            f"counter_size of {wheels.name} in the rig file (65536 for 16 bits), or remove what is wrong."
+            f"{what}: the wheels turn at {fast:.4g} rad/s, faster than any robot's; {advice} in the rig file."
         )
 
 

@@ -22,6 +22,8 @@ SIDES: dict[WheelDrive, tuple[str, ...]] = {
 UNITS: dict[WheelMeasure, str] = {"rates": "rad/s", "angles": "rad", "ticks": "ticks"}
 TWIST = ("v [m/s]", "w [rad/s]")
 ENDS = ("from [ns]", "to [ns]")
+_LONGEST_STEP_S = 0.5  # over which a yaw rate is taken to last
+_ALIGNED, _SCATTERED = 0.9, 0.7  # of directions: how long their mean is, 1 where all are the same
 POSES = ("yaw [rad]", "x [m]", "y [m]", "yaw yaw", "yaw x", "yaw y", "x x", "x y", "y y")
 
 
@@ -100,10 +102,32 @@ def _read_poses(name: str, path: Path) -> WheelPoses:
     return WheelPoses(name, np.append(begin, end[-1]), table.decimals[:, :3].copy(), covariance)
 
 
-def read_wheel_twists(wheels: Wheels, twists: Twists) -> WheelReadings:
-    """Forward speed and yaw rate."""
+def read_wheel_twists(wheels: Wheels, twists: Twists, what: str) -> WheelReadings:
+    """Forward speed and yaw rate. Raises RecordingError naming the topic (`what`) where velocities are in the axes of
+    the world."""
+    if _in_the_world(twists):
+        raise RecordingError(
+            f"{what}: its linear velocities are in the axes of the world, not of the vehicle: they turn as the vehicle "
+            f"does; take the poses of the same program instead of {wheels.name} (type: pose, kind: relative), or let "
+            "it publish linear.x forwards."
+        )
     value = np.stack([twists.linear[:, 0], twists.angular[:, 2]], axis=1)
     return WheelReadings(wheels.name, twists.stamps_ns, value)
+
+
+def _in_the_world(twists: Twists) -> bool:
+    """Whether velocities keep their direction once turned back by the yaw rate, and do not as they are. Directions are
+    doubled, so that forwards and backwards are one."""
+    across, rate = twists.linear[:, 0] + 1j * twists.linear[:, 1], twists.angular[:, 2]
+    step = np.clip(np.diff(twists.stamps_ns) * 1e-9, 0.0, _LONGEST_STEP_S)
+    good = np.isfinite(across) & np.isfinite(rate)
+    rate, square = np.where(good, rate, 0.0), np.where(good, across, 0.0) ** 2
+    turned = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * step)])
+    whole = np.abs(square).sum()
+    if not whole > 0.0:
+        return False
+    as_they_are, back = (abs((square * np.exp(-2j * a)).sum()) / whole for a in (0.0 * turned, turned))
+    return bool(back > _ALIGNED and as_they_are < _SCATTERED)
 
 
 def read_wheel_joints(wheels: Wheels, joints: Joints, what: str) -> WheelReadings:
@@ -128,6 +152,7 @@ def read_wheel_joints(wheels: Wheels, joints: Joints, what: str) -> WheelReading
         )
         have = "has" if len(missing) == 1 else "have"
         raise RecordingError(f"{what}: {' and '.join(missing)} {have} no {field}; {advice}.")
+    _refuse_zeros(wheels, joints, own, what)
     both = sent.all(axis=1)
     if (sent.any(axis=1) & ~both).any():
         at = joints.stamps_ns[np.argmax(sent.any(axis=1) & ~both)]
@@ -136,6 +161,20 @@ def read_wheel_joints(wheels: Wheels, joints: Joints, what: str) -> WheelReading
             f"{'both' if len(own) == 2 else 'all'} together."
         )
     return WheelReadings(wheels.name, joints.stamps_ns[both], value[both])
+
+
+def _refuse_zeros(wheels: Wheels, joints: Joints, own: tuple[str, ...], what: str) -> None:
+    """Where velocities of the joints `own` are always 0 and positions are not, or the other way round: a driver fills
+    what it does not have."""
+    turning = own[: len(own) // 2] if wheels.drive == "ackermann" else own
+    column = [joints.names.index(name) for name in turning]
+    velocity, position = (np.nan_to_num(x[:, column]).any() for x in (joints.velocity, joints.position))
+    zero, other, advice = ("velocity", "position", "angles") if position else ("position", "velocity", "rates")
+    if velocity != position and (wheels.measures == "rates") == position:
+        raise RecordingError(
+            f"{what}: the {zero} of {' and '.join(turning)} is always 0, the {other} is not; set `measures` of "
+            f"{wheels.name} to {advice} in the rig file."
+        )
 
 
 def _own_joints(wheels: Wheels, names: tuple[str, ...], what: str) -> tuple[str, ...]:

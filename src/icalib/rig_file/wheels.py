@@ -4,12 +4,25 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from icalib.rig import DRIVE_SIZES, Ground, GroundPlane, Parameter, WheelDrive, WheelFactor, WheelMeasure, Wheels
+from icalib.rig import (
+    DRIVE_SIZES,
+    Ground,
+    GroundPlane,
+    Parameter,
+    RateUnit,
+    WheelDrive,
+    WheelFactor,
+    WheelMeasure,
+    Wheels,
+)
 from icalib.rig_file.fields import MOUNTING, choice_or, groups_to_plain, mounting, path_or, positive_or, topic_or_none
 from icalib.rig_parameters import vector_parameter
 from icalib.yaml_nodes import YamlValue
 
-_WORDS = ("path", "topic", "drive", "measures", "meaning", "counts_per_turn", "counter_size", "joints", "factor")
+_WORDS = (
+    "path", "topic", "drive", "measures", "meaning", "counts_per_turn", "counter_size", "angle_range", "rate_unit",
+    "signs", "joints", "factor",
+)  # fmt: skip
 _NOISES = ("wheel_noise", "speed_noise", "yaw_noise", "steering_noise")
 _GROUND = ("tilt_noise", "height", "height_sigma", "bump_noise")
 _SLIP = ("sideways_slip", "upwards_slip")
@@ -18,6 +31,7 @@ _TURNED = ("rates", "angles", "ticks")
 # Fields that go with some of `measures` only.
 _ONLY_OF: dict[str, tuple[str, ...]] = {
     "meaning": ("rates", "twist"), "counts_per_turn": ("ticks",), "counter_size": ("ticks",), "joints": _TURNED,
+    "angle_range": ("angles",), "rate_unit": ("rates",), "signs": (*_TURNED, "twist"),
 }  # fmt: skip
 # And with some kinds of wheels only.
 _ONLY_OF_KIND: dict[str, tuple[str, ...]] = {
@@ -57,6 +71,9 @@ def read_wheels(name: str, value: YamlValue) -> Wheels:
         meaning=choice_or(found, "meaning", Literal["mean", "instant"], Wheels.meaning),
         counts_per_turn=found["counts_per_turn"].positive() if "counts_per_turn" in found else None,
         counter_size=found["counter_size"].whole(2) if "counter_size" in found else None,
+        angle_range=found["angle_range"].positive() if "angle_range" in found else None,
+        rate_unit=choice_or(found, "rate_unit", RateUnit, Wheels.rate_unit),
+        signs=_signs(found["signs"], drive) if "signs" in found else None,
         topic=topic_or_none(found),
         joints=_joints(found["joints"], drive) if "joints" in found else None,
         ground=_ground(found["ground"]) if "ground" in found else None,
@@ -100,6 +117,14 @@ def _refuse_negative_lengths(found: dict[str, YamlValue], groups: dict[str, Para
             found[name].fail(f"{unit} must be above 0; correct it.")
 
 
+def _signs(value: YamlValue, drive: WheelDrive) -> tuple[int, ...]:
+    signs = [item.number() for item in value.items()]
+    counts, words = _JOINTS[drive]
+    if len(signs) not in counts or any(abs(s) != 1.0 for s in signs):
+        value.fail(f"must be 1 or -1 for each of {words}.")
+    return tuple(int(s) for s in signs)
+
+
 def _joints(value: YamlValue, drive: WheelDrive) -> tuple[str, ...]:
     names = tuple(item.text() for item in value.items())
     counts, words = _JOINTS[drive]
@@ -137,6 +162,7 @@ def wheels_to_plain(wheels: Wheels) -> dict[str, Any]:
     plain: dict[str, Any] = {"type": "wheels", **{name: getattr(wheels, name) for name in same}}
     given = {name: getattr(wheels, name) for name, of in _ONLY_OF.items() if wheels.measures in of}
     given["ground"] = None if wheels.ground is None else _ground_to_plain(wheels.ground)
-    given |= {"topic": wheels.topic, "joints": None if wheels.joints is None else list(wheels.joints)}
+    lists = {name: getattr(wheels, name) for name in ("joints", "signs")}
+    given |= {"topic": wheels.topic, **{name: None if x is None else list(x) for name, x in lists.items()}}
     groups = {name: p for name, p in groups_to_plain(wheels).items() if name in (*MOUNTING, *wheels.sizes)}
     return plain | {name: value for name, value in given.items() if value is not None} | groups
