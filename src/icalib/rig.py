@@ -33,6 +33,21 @@ def fixed(value: object) -> Parameter:
     return Parameter("fixed", np.asarray(value, dtype=np.float64))
 
 
+TimeUnit = Literal["s", "ms", "us", "ns"]
+
+
+@dataclass(frozen=True)
+class TableLayout:
+    """How a sensor's table is written. columns: names in its header, or numbers from 1 on, in icalib's order; empty:
+    told by the header, or in that order. time_unit: of its stamps; None: told by their rate."""
+
+    columns: tuple[str, ...] = ()
+    time_unit: TimeUnit | None = None
+
+
+PLAIN_TABLE = TableLayout()
+
+
 @dataclass(frozen=True)
 class ImuNoise:
     """Continuous-time noise: gyro rad/s/sqrt(Hz), gyro_walk rad/s^2/sqrt(Hz), accel m/s^2/sqrt(Hz), accel_walk
@@ -61,6 +76,7 @@ class ImuSensor:
     intrinsics: Parameter = field(default_factory=lambda: Parameter("fixed"))  # 24: see estimation.imu_model
     topic: str | None = None  # in a bag; None: the one with the sensor's name, or the only one
     assumed: bool = False
+    layout: TableLayout = PLAIN_TABLE
 
 
 @dataclass(frozen=True)
@@ -82,6 +98,7 @@ class Camera:
     topic: str | None = None  # of its images; None: the one with the camera's name, or the only one
     tracks: str | None = None  # path of the table of tracks, where it has one
     track_noise_px: float | None = None  # None: estimated from the residuals
+    layout: TableLayout = PLAIN_TABLE  # of its table of tracks, or without one of corners
 
 
 PointTime = Literal["auto", "start", "end", "azimuth", "snapshot"]
@@ -186,6 +203,7 @@ class Wheels:
     topic: str | None = None  # of its messages; None: the one with the wheels' name, or the only one
     joints: tuple[str, ...] | None = None  # in JointState; None: told by "left" and "right" in the names
     ground: Ground | None = None
+    layout: TableLayout = PLAIN_TABLE
 
     @property
     def ground_height(self) -> Parameter:
@@ -231,6 +249,7 @@ class PoseSensor:
     time_offset: Parameter = Parameter()
     clock_restarts: bool = False  # from recording to recording: each has a time offset of its own
     topic: str | None = None  # of its poses; None: the one with the sensor's name, or the only one
+    layout: TableLayout = PLAIN_TABLE
 
 
 Scheme = Literal["inertial", "pose", "kinematic"]

@@ -94,20 +94,20 @@ def test_tums_text(tmp_path):
 def test_a_bad_line_of_tums_text_is_named(tmp_path, line):
     (tmp_path / "mocap0").mkdir()
     (tmp_path / "mocap0" / "poses.txt").write_text(f"0.5 2 3 4 0 0 0 1\n{line}\n")
-    assert "poses.txt:2: the line is not TUM's" in refused(tmp_path, PoseSensor("mocap0", "mocap0/poses.txt"))
+    assert "poses.txt:2: " in refused(tmp_path, PoseSensor("mocap0", "mocap0/poses.txt"))
 
 
 def test_an_empty_text(tmp_path):
     (tmp_path / "mocap0").mkdir()
     (tmp_path / "mocap0" / "poses.txt").write_text("# nothing\n")
-    assert "holds no poses" in refused(tmp_path, PoseSensor("mocap0", "mocap0/poses.txt"))
+    assert "holds no rows" in refused(tmp_path, PoseSensor("mocap0", "mocap0/poses.txt"))
 
 
 def test_bad_poses(tmp_path):
     table(tmp_path, xyzw=1.1 * XYZW)
     assert f"the quaternion at {STAMPS[0]} ns has length 1.1, not 1" in refused(tmp_path)
-    table(tmp_path, stamps=STAMPS // 1_000_000)
-    assert "they look like milliseconds" in refused(tmp_path)
+    table(tmp_path, stamps=STAMPS // 1_000_000_000)
+    assert "poses have the stamp of the one before, as where stamps are cut to whole seconds" in refused(tmp_path)
     table(tmp_path, position=1000.0 * POSITION)
     assert "in millimetres are to be divided by 1000" in refused(tmp_path)
     table(tmp_path, position=0.0 * POSITION, xyzw=np.tile([0.0, 0.0, 0.0, 1.0], (N, 1)))

@@ -159,10 +159,16 @@ class TestImu:
         rows[10][0] = rows[9][0]
         assert f"two different readings are both stamped {ORIGIN + 9 * IMU_STEP} ns" in complaint(tmp_path, imu=rows)
 
-    @pytest.mark.parametrize(("divisor", "unit"), [(1e3, "microseconds"), (1e6, "milliseconds"), (1e9, "seconds")])
+    @pytest.mark.parametrize(("divisor", "unit"), [(1000, "microseconds"), (1_000_000, "milliseconds")])
     def test_other_units_of_time(self, tmp_path, divisor, unit):
-        rows = [[int(r[0] // int(divisor)), *r[1:]] for r in imu_rows()]
-        assert f"they look like {unit}; export them in nanoseconds" in complaint(tmp_path, imu=rows)
+        rows = [[r[0] // divisor, *r[1:]] for r in imu_rows()]
+        m = read(tmp_path, imu=rows)
+        assert m.imu.stamps_ns.tolist() == [r[0] * divisor for r in rows]
+        assert f"the stamps are read as {unit}, as their rate shows" in m.notes[0]
+
+    def test_whole_seconds(self, tmp_path):
+        rows = [[r[0] // 1_000_000_000, *r[1:]] for r in imu_rows()]
+        assert "as where stamps are cut to whole seconds" in complaint(tmp_path, imu=rows)
 
     def test_too_slow(self, tmp_path):
         rows = [[ORIGIN + k * 500_000_000, *r[1:]] for k, r in enumerate(imu_rows())]
@@ -265,7 +271,9 @@ class TestCorners:
 
     def test_microseconds(self, tmp_path):
         rows = [[r[0] // 1000, *r[1:]] for r in corner_rows()]
-        assert "they look like microseconds" in complaint(tmp_path, corners=rows)
+        m = read(tmp_path, corners=rows)
+        assert m.cameras[0].stamps_ns.tolist() == sorted({r[0] * 1000 for r in rows})
+        assert "the stamps are read as microseconds" in m.notes[0]
 
     def test_one_image_is_for_later_stages_to_judge(self, tmp_path):
         assert len(read(tmp_path, corners=corner_rows(images=1)).cameras[0].stamps_ns) == 1

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from icalib.errors import RecordingError
+from icalib.recordings.columns import TableKind
 from icalib.recordings.table import read_table
 
 INTEGERS, DECIMALS = ("t [ns]", "id"), ("u", "v")
@@ -17,7 +18,7 @@ INTEGERS, DECIMALS = ("t [ns]", "id"), ("u", "v")
 def read(tmp_path: Path, content: str | bytes, name: str = "a.csv"):
     path = tmp_path / name
     path.write_bytes(content.encode() if isinstance(content, str) else content)
-    return read_table(path, INTEGERS, DECIMALS)
+    return read_table(path, TableKind(INTEGERS, DECIMALS))
 
 
 def test_integers_are_exact_beyond_float64(tmp_path):

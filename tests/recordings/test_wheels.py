@@ -78,7 +78,7 @@ REFUSED = {
         "as where a counter starts anew; set counter_size of wheel0 in the rig file (65536",
     ),
     "counts": (ANGLES * 1e3, STAMPS, {"measures": "ticks", "counts_per_turn": 1.0}, "s; correct counts_per_turn"),
-    "seconds": (RATES, STAMPS // 10**9, {}, "they look like seconds; export them in nanoseconds"),
+    "seconds": (RATES, STAMPS // 10**9, {}, "as where stamps are cut to whole seconds"),
     "short": (RATES[:2], STAMPS[:2], {}, "only 2 readings"),
 }  # fmt: skip
 

@@ -101,7 +101,7 @@ class BagRecording:
                 f"{camera.name} in the rig file."
             )
         self._tables.append(path)
-        return read_tracks(camera.name, path, camera.resolution)
+        return read_tracks(camera.name, path, camera.resolution, camera.layout, self._note)
 
     def lidar(self, sensor: Lidar) -> LidarStream:
         topic = self._topic(sensor)
@@ -126,7 +126,7 @@ class BagRecording:
         """Of a topic, or a table beside the bag."""
         if (table := self._pose_table(sensor)) is not None:
             self._tables.append(table)
-            return read_pose_file(sensor.name, table)
+            return read_pose_file(sensor.name, table, sensor.layout, self._note)
         topic = self._pose_topic(sensor)
         found = read_odometry(self, topic.name).pose if topic.kind == "odometry" else read_poses(self, topic.name)
         order = self._order(topic.name, found.stamps_ns)

@@ -1,26 +1,49 @@
-"""Stamps whose rate tells that they are not nanoseconds."""
+"""The unit of stamps, told by the rate that it means."""
 
 from __future__ import annotations
 
 import numpy as np
 
-_UNITS = {"microseconds": 1e3, "milliseconds": 1e6, "seconds": 1e9}  # nanoseconds in each
+from icalib.rig import TimeUnit
+
+POWERS_OF_NS: dict[TimeUnit, int] = {"s": 9, "ms": 6, "us": 3, "ns": 0}
+UNIT_WORDS: dict[TimeUnit, str] = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+_BLOCKS = 20
+_DATES_S = (9e8, 4.2e9)  # seconds since 1970 from 1998 to 2103: no two units have them
+_LONGEST_S = 86_400.0  # no recording is longer than a day
+_USUAL_S = (2.0, 2000.0)  # recordings last so long in one of the units, three decades apart
 
 
-def other_unit(median_step: float, slowest_hz: float, fastest_hz: float) -> str | None:
-    """The unit in which a median step between stamps gives a rate inside the bounds, None if there is none."""
-    for unit, ns in _UNITS.items():
-        if median_step > 0 and slowest_hz <= 1e9 / (median_step * ns) <= fastest_hz:
-            return unit
-    return "seconds" if median_step == 0 else None
+def usual_step(stamps: np.ndarray) -> float:
+    """The mean step between stamps (N,) in order, the median of it over blocks: bursts do not make it shorter, nor
+    jumps longer. 0 where stamps do not increase."""
+    edges = np.unique(np.linspace(0, len(stamps) - 1, min(_BLOCKS, len(stamps) - 1) + 1).astype(np.int64))
+    step = np.diff(stamps[edges]) / np.diff(edges)
+    return float(np.median(step[step > 0])) if (step > 0).any() else 0.0
+
+
+def unit_of_stamps(stamps: np.ndarray, slowest_hz: float, fastest_hz: float) -> TimeUnit | None:
+    """The unit in which stamps (N,) have a rate inside the bounds; of several the one that gives a date, or the length
+    of a usual recording. None where that tells none, or several."""
+    step, size = usual_step(stamps), float(np.median(stamps))
+    every: dict[TimeUnit, float] = {unit: 10.0 ** (power - 9) for unit, power in POWERS_OF_NS.items()}
+    seconds: dict[TimeUnit, float] = {u: s for u, s in every.items() if step * len(stamps) * s <= _LONGEST_S}
+    possible = [u for u, s in seconds.items() if step > 0 and slowest_hz <= 1.0 / (step * s) <= fastest_hz]
+    dated = [u for u in possible if _DATES_S[0] <= size * seconds[u] <= _DATES_S[1]]
+    usual = [u for u in possible if _USUAL_S[0] <= step * len(stamps) * seconds[u] < _USUAL_S[1]]
+    return next((found[0] for found in (dated, possible, usual) if len(found) == 1), None)
 
 
 def rate_sentence(what: str, stamps_ns: np.ndarray, slowest_hz: float, fastest_hz: float) -> str | None:
-    """A sentence saying that the median rate of the stamps (N,) lies outside the bounds, None if it lies inside."""
-    step = float(np.median(np.diff(stamps_ns)))
+    """A sentence saying that the usual rate of the stamps (N,) lies outside the bounds, None if it lies inside."""
+    step = usual_step(stamps_ns)
     if step > 0 and slowest_hz <= 1e9 / step <= fastest_hz:
         return None
-    unit = other_unit(step, slowest_hz, fastest_hz)
-    rate = "more than one reading an instant" if step == 0 else f"{1e9 / step:.4g} readings a second"
-    advice = f"they look like {unit}; export them in nanoseconds" if unit else "write the stamps in nanoseconds"
-    return f"{what}: the stamps mean {rate} ({slowest_hz:g} to {fastest_hz:g} expected); {advice}."
+    if step == 0:
+        return f"{what}: the stamps do not increase; write the instant of each reading, by a clock that runs."
+    unit = unit_of_stamps(stamps_ns, slowest_hz, fastest_hz)
+    look = f"they look like {UNIT_WORDS[unit]}; export them in nanoseconds" if unit else "check what writes the stamps"
+    return (
+        f"{what}: the stamps mean {1e9 / step:.4g} readings a second ({slowest_hz:g} to {fastest_hz:g} expected); "
+        f"{look}, or set `time_unit` of a table in the rig file."
+    )

@@ -11,23 +11,33 @@ import numpy as np
 from icalib.errors import RecordingError
 from icalib.geometry.targets import Target
 from icalib.measurements import CornerStream, ImuStream, LidarStream, TrackStream, WheelPoses
+from icalib.recordings.columns import IMU, STAMP, TableKind
 from icalib.recordings.corners import group_corners
 from icalib.recordings.euroc_images import file_payloads, image_files
 from icalib.recordings.image_checks import checked_payloads, frames
 from icalib.recordings.images import Frame, Payload
 from icalib.recordings.lidar_checks import Sieve, sifted
 from icalib.recordings.poses import FILES as POSE_FILES
-from icalib.recordings.poses import POSE, PoseReadings, is_tum_text, read_pose_file
+from icalib.recordings.poses import POSES, PoseReadings, is_tum_text, read_pose_file
 from icalib.recordings.scans import in_seconds, read_scan_stamps, read_scans
-from icalib.recordings.table import columns_of, read_table
+from icalib.recordings.table import holds, read_table
 from icalib.recordings.topics import TopicInfo, choose_topic, find_topic
 from icalib.recordings.tracks import read_tracks
-from icalib.recordings.wheels import ENDS, POSES, STAMP, TWIST, UNITS, WheelReadings, read_wheel_table
-from icalib.rig import Camera, ImuSensor, Lidar, PoseSensor, Wheels
+from icalib.recordings.wheels import RELATIVE_POSES, STAMPS, UNITS, WheelReadings, read_wheel_table
+from icalib.rig import Camera, ImuSensor, Lidar, PoseSensor, TableLayout, Wheels
 
-_IMU_DECIMALS = ("wx [rad/s]", "wy [rad/s]", "wz [rad/s]", "ax [m/s^2]", "ay [m/s^2]", "az [m/s^2]")
-_IMU_STAMP = ("t [ns]",)
-_CORNER_INTEGERS, _CORNER_DECIMALS = ("t [ns]", "tag id", "corner"), ("u [px]", "v [px]")
+_CORNERS = TableKind(
+    ("t [ns]", "tag id", "corner"),
+    ("u [px]", "v [px]"),
+    (
+        STAMP,
+        (r"(tag|marker)(_?id)?|id",),
+        (r"corner(_?(id|index))?",),
+        (r"u(_?px)?|x(_?px)?",),
+        (r"v(_?px)?|y(_?px)?",),
+    ),
+    (1e-3, 1000.0),
+)
 _MAX_LISTED = 12
 
 
@@ -50,11 +60,11 @@ class FolderRecording:
         for folder in sorted(p for base in self._bases() for p in base.iterdir() if p.is_dir()):
             if (images := _images(folder)) is not None:
                 found.append(images)
-            elif (table := _existing(folder, "data.csv")) and columns_of(table) == len(_IMU_STAMP + _IMU_DECIMALS):
-                stamps_ns = read_table(table, _IMU_STAMP, _IMU_DECIMALS).integers[:, 0]
+            elif (table := _existing(folder, "data.csv")) and holds(table, IMU):
+                stamps_ns = read_table(table, IMU).integers[:, 0]
                 found.append(_info(f"{folder.name}/data.csv", "table of readings", "imu", stamps_ns))
             if table := _existing(folder, "corners.csv"):
-                stamps_ns = np.unique(read_table(table, _CORNER_INTEGERS, _CORNER_DECIMALS).integers[:, 0])
+                stamps_ns = np.unique(read_table(table, _CORNERS).integers[:, 0])
                 found.append(_info(f"{folder.name}/corners.csv", "table of corners", "corners", stamps_ns))
             found += [_info(f"{folder.name}/{table.name}", *what, _stamps(table)) for table, what in _robot(folder)]
         return tuple(found)
@@ -65,10 +75,10 @@ class FolderRecording:
             folder = next(p for base in self._bases() if (p := base / chosen.name).is_dir())
             return np.array([stamp_ns for stamp_ns, _ in image_files(folder)], np.int64)
         if chosen.kind == "imu":
-            return read_table(self._locate(chosen.name), _IMU_STAMP, _IMU_DECIMALS).integers[:, 0].copy()
+            return read_table(self._locate(chosen.name), IMU).integers[:, 0].copy()
         if chosen.kind in ("points", "wheels", "pose"):
             return _stamps(self._locate(chosen.name))
-        return np.unique(read_table(self._locate(chosen.name), _CORNER_INTEGERS, _CORNER_DECIMALS).integers[:, 0])
+        return np.unique(read_table(self._locate(chosen.name), _CORNERS).integers[:, 0])
 
     def image_topic(self, camera: Camera) -> str:
         return choose_topic(str(self.root), self._image_topics(), "image", camera.name, camera.topic).name
@@ -84,7 +94,7 @@ class FolderRecording:
         return frames(self.payloads(topic), f"{self.root}/{topic}", self._note)
 
     def imu(self, sensor: ImuSensor) -> ImuStream:
-        table = read_table(self._locate(sensor.path), _IMU_STAMP, _IMU_DECIMALS)
+        table = read_table(self._locate(sensor.path), IMU, sensor.layout, self._note)
         self._remember(table.path)
         stamps_ns, values = table.integers[:, 0].copy(), table.decimals
         return ImuStream(sensor.name, stamps_ns, values[:, :3].copy(), values[:, 3:].copy())
@@ -94,7 +104,8 @@ class FolderRecording:
         return self._find(camera.path) is not None or not self._image_topics()
 
     def corners(self, camera: Camera, target: Target) -> CornerStream:
-        table = read_table(self._locate(camera.path), _CORNER_INTEGERS, _CORNER_DECIMALS)
+        layout = camera.layout if camera.tracks is None else TableLayout(time_unit=camera.layout.time_unit)
+        table = read_table(self._locate(camera.path), _CORNERS, layout, self._note)
         self._remember(table.path)
         stamps, tag, corner = (table.integers[:, k].copy() for k in range(3))
         return group_corners(camera.name, str(table.path), stamps, tag, corner, table.decimals, target)
@@ -106,7 +117,7 @@ class FolderRecording:
         assert camera.tracks is not None
         path = self._locate(camera.tracks, "tracks")
         self._remember(path)
-        return read_tracks(camera.name, path, camera.resolution)
+        return read_tracks(camera.name, path, camera.resolution, camera.layout, self._note)
 
     def lidar(self, sensor: Lidar) -> LidarStream:
         path = self._locate(sensor.path)
@@ -122,12 +133,12 @@ class FolderRecording:
     def wheels(self, sensor: Wheels) -> WheelReadings | WheelPoses:
         path = self._locate(sensor.path)
         self._remember(path)
-        return read_wheel_table(sensor, path)
+        return read_wheel_table(sensor, path, self._note)
 
     def poses(self, sensor: PoseSensor) -> PoseReadings:
         path = self._locate(sensor.path)
         self._remember(path)
-        return read_pose_file(sensor.name, path)
+        return read_pose_file(sensor.name, path, sensor.layout, self._note)
 
     def where(self, sensor: ImuSensor | Camera | Lidar | Wheels | PoseSensor) -> str:
         if isinstance(sensor, Camera) and not self.has_corners(sensor):
@@ -195,7 +206,7 @@ def _robot(folder: Path) -> Iterator[tuple[Path, tuple[str, str]]]:
 
 def _is_poses(table: Path) -> bool:
     """Whether these are poses in a frame, and not relative ones of wheels."""
-    return table.name.startswith("poses.") and (is_tum_text(table) or columns_of(table) == 1 + len(POSE))
+    return table.name.startswith("poses.") and (is_tum_text(table) or holds(table, POSES))
 
 
 def _stamps(table: Path) -> np.ndarray:
@@ -204,10 +215,8 @@ def _stamps(table: Path) -> np.ndarray:
         return read_scan_stamps(table)
     if _is_poses(table):
         return read_pose_file(table.parent.name, table).stamps_ns
-    n = columns_of(table)
-    wheels = tuple(f"value {k}" for k in range(1, max(n, 1 + len(TWIST))))
-    integers, decimals = (ENDS, POSES) if n == len(ENDS + POSES) else (STAMP, wheels)
-    return read_table(table, integers, decimals).integers[:, 0].copy()
+    kind = RELATIVE_POSES if holds(table, RELATIVE_POSES) else STAMPS
+    return read_table(table, kind).integers[:, 0].copy()
 
 
 def _images(folder: Path) -> TopicInfo | None:

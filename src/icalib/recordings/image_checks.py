@@ -13,6 +13,10 @@ Note = Callable[[str], None]
 _LATE_NS = 1_000_000_000  # beyond, images did not overtake each other: the clock was set back
 
 
+def ignore(sentence: str) -> None:
+    """A `Note` that nobody reads."""
+
+
 def checked_payloads(payloads: Iterable[Payload], where: str, note: Note) -> Iterator[Payload]:
     """`payloads` with strictly increasing stamps and one resolution; a note on what was left out, at the end.
 

@@ -7,6 +7,8 @@ import numpy as np
 from icalib.errors import RecordingError
 from icalib.recordings.clocks import rate_sentence
 
+_CUT_SHARE = 0.3  # of readings with the stamp of the one before: more are no single bad ones
+
 
 def kept_readings(
     stamps_ns: np.ndarray, values: np.ndarray, what: str, rate_hz: tuple[float, float], thing: str, own: str
@@ -31,6 +33,11 @@ def kept_readings(
     repeat = np.concatenate([[False], np.diff(stamps_ns) == 0])
     differs = repeat.copy()
     differs[1:] &= (np.diff(values, axis=0) != 0).any(axis=1)
+    if differs.sum() > _CUT_SHARE * len(differs):
+        raise RecordingError(
+            f"{what}: {int(differs.sum())} of {len(differs)} {thing}s have the stamp of the one before, as where "
+            f"stamps are cut to whole seconds or milliseconds; {own}, with all their digits."
+        )
     if differs.any():
         raise RecordingError(
             f"{what}: two different {thing}s are both stamped {stamps_ns[np.argmax(differs)]} ns; {own}, or remove one."

@@ -3,71 +3,105 @@
 from __future__ import annotations
 
 import gzip
+import re
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
 
 import numpy as np
-from numba import njit
 
 from icalib.errors import RecordingError
+from icalib.recordings.clocks import POWERS_OF_NS, UNIT_WORDS, TimeUnit, unit_of_stamps, usual_step
+from icalib.recordings.columns import TableKind, contradicts, places_by_name, places_given
+from icalib.recordings.image_checks import Note, ignore
+from icalib.recordings.table_kernels import LEFT_OUT, POWERS, parse
+from icalib.rig import PLAIN_TABLE, TableLayout
 
 _GZIP_MAGIC = b"\x1f\x8b"
-_POWERS = np.array([float(f"1e{k}") for k in range(309)])
+_SEPARATORS = (",", ";", "\t", None)  # None: blanks
+_MOST_UNREADABLE = 0.1  # share of lines that may be left out; more of them are another format
+_WHOLE_NS = -1  # a power: stamps must be whole nanoseconds
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of a table. integers (N, I) int64, decimals (N, D) float64."""
+    """Rows of a table. integers (N, I) int64, decimals (N, D) float64. notes: sentences on what was left out."""
 
     path: Path
     integers: np.ndarray
     decimals: np.ndarray
+    notes: tuple[str, ...] = ()
 
 
-def read_table(path: Path, integer_columns: tuple[str, ...], decimal_columns: tuple[str, ...]) -> Table:
-    """Read a table whose columns are `integer_columns`, then `decimal_columns`, separated by commas.
+@dataclass(frozen=True)
+class _Text:
+    """The rows of a table, from `line` of its file on, with commas between their `columns`, and the names of these."""
 
-    Blank lines and lines that start with # are skipped, and so is one header line of text. Integers are exact;
-    decimals are within 1 ulp or two of the written number. Raises RecordingError naming file, line and column.
+    path: Path
+    rows: bytes
+    line: int
+    header: tuple[str, ...]
+    columns: int
+
+
+def read_table(path: Path, kind: TableKind, layout: TableLayout = PLAIN_TABLE, note: Note = ignore) -> Table:
+    """Read a table of this kind. Its columns are told by `layout`, the names in its header, or their order; they are
+    separated by commas, semicolons, tabs or blanks. Stamps become ns, from the unit that `layout` or their rate tells.
+
+    Blank lines, those that start with #, and a header are skipped; single lines that cannot be read are left out.
+    `note` is told of these, and of stamps in another unit. Integers are exact; decimals are within 1 ulp or two of the
+    written number. Raises RecordingError naming file, line and column.
     """
+    text = _text_of(path)
+    place = _places(text, kind, layout)
+    table, unit = _in_ns(text, kind, place, layout.time_unit)
+    if unit:
+        note(
+            f"{path}: the stamps are read as {UNIT_WORDS[unit]}, as their rate shows; `time_unit` in the rig file may "
+            "say otherwise."
+        )
+    for sentence in table.notes:
+        note(sentence)
+    return table
+
+
+def _in_ns(text: _Text, kind: TableKind, place: np.ndarray, given: TimeUnit | None) -> tuple[Table, TimeUnit | None]:
+    """The rows, and the unit of their stamps where only the rate tells it."""
+    if given:
+        return _table(text, kind, place, POWERS_OF_NS[given]), None
+    try:
+        table = _table(text, kind, place, _WHOLE_NS if kind.unit == "ns" else POWERS_OF_NS[kind.unit])
+        if kind.rate_hz is None or _is_rate(_instants(kind, table.integers[:, 0]), kind.rate_hz):
+            return table, None
+        unit = _unit(text, kind, place)
+        return (table, None) if unit is None else (_table(text, kind, place, POWERS_OF_NS[unit]), unit)
+    except RecordingError:
+        if (unit := _unit(text, kind, place)) is None:
+            raise
+    return _table(text, kind, place, POWERS_OF_NS[unit]), unit
+
+
+def holds(path: Path, kind: TableKind) -> bool:
+    """Whether a table has the columns of this kind. Raises RecordingError as `read_table`."""
+    text = _text_of(path)
+    return places_by_name(kind, text.header) is not None or text.columns == len(kind.names)
+
+
+def _text_of(path: Path) -> _Text:
     content = _read_bytes(path)
-    begin, first_line = _skip_header(content)
-    buffer = np.frombuffer(content, dtype=np.uint8)
-    n_int, n_dec = len(integer_columns), len(decimal_columns)
-    capacity = content.count(b"\n", begin) + 1
-    integers = np.empty((capacity, n_int), dtype=np.int64)
-    decimals = np.empty((capacity, n_dec))
-    rows, bad_line, bad_column = _parse(buffer, begin, first_line, _POWERS, integers, decimals)
-    if bad_line:
-        names = integer_columns + decimal_columns
-        raise RecordingError(_describe(path, content, bad_line, bad_column, names, n_int))
-    if rows == 0:
-        columns = ", ".join(integer_columns + decimal_columns)
-        raise RecordingError(f"{path} holds no rows; write one line for each reading, with the columns {columns}.")
-    return Table(path, integers[:rows], decimals[:rows])
-
-
-def columns_of(path: Path) -> int:
-    """How many columns the first row of a table has, 0 if there is none. Raises RecordingError as `read_table`."""
-    content = _read_bytes(path)
-    for line in content[_skip_header(content)[0] :].splitlines():
-        if line.strip() and not line.lstrip().startswith(b"#"):
-            return line.count(b",") + 1
-    return 0
-
-
-def header_of(path: Path) -> str:
-    """The last line of column names before the first row, with or without #; empty if there is none. Raises
-    RecordingError as `read_table`."""
-    content, header = _read_bytes(path), ""
-    for line in content.splitlines():
-        text = line.strip()
-        if text and not text.startswith(b"#") and not text[:1].isalpha():
-            break
-        header = text.decode("utf-8", "replace") or header
-    return header
+    begin, line, before = _skip_header(content)
+    rows = content[begin:] if begin else content
+    first = rows[: rows.find(b"\n") if b"\n" in rows else None].strip()
+    if b";" in first:
+        rows = rows.translate(bytes.maketrans(b",;", b".,"))  # decimal commas are often beside them
+    elif b"," not in first and b"\t" in first:
+        rows = rows.replace(b"\t", b",")
+    elif b"," not in first:
+        rows = re.sub(rb"(?<=\S) +(?=\S)", b",", rows)
+    columns = rows[: rows.find(b"\n") if b"\n" in rows else None].count(b",") + 1 if first else 0
+    return _Text(path, rows, line, _names(before, columns), columns)
 
 
 def _read_bytes(path: Path) -> bytes:
@@ -86,18 +120,32 @@ def _read_bytes(path: Path) -> bytes:
     return content.removeprefix(b"\xef\xbb\xbf")
 
 
-def _skip_header(content: bytes) -> tuple[int, int]:
-    """Where the data begin (offset and line): after one line of column names without #, which starts with a letter."""
-    begin, line = 0, 1
+def _skip_header(content: bytes) -> tuple[int, int, list[str]]:
+    """Where the rows begin (offset and line), and the lines before: comments, and one line of column names without #,
+    which starts with a letter."""
+    begin, line, before, named = 0, 1, [], False
     while begin < len(content):
         end = content.find(b"\n", begin)
         end = len(content) if end < 0 else end + 1
         text = content[begin:end].strip()
         if text and not text.startswith(b"#"):
-            is_header = text[:1].isalpha() or text[:1] in b"\"'"
-            return (end, line + 1) if is_header and not _is_number(text.split(b",")[0]) else (begin, line)
+            is_header = text[:1].isalpha() or text[:1] in b"\"'%"
+            if named or not is_header or _is_number(re.split(rb"[,;\s]", text, maxsplit=1)[0]):
+                break
+            named = True
+        before.append(text.decode("utf-8", "replace").lstrip("#% "))
         begin, line = end, line + 1
-    return begin, line
+    return begin, line, before
+
+
+def _names(before: Sequence[str], columns: int) -> tuple[str, ...]:
+    """The names of the columns: the last line with as many as there are columns, and no number among them."""
+    for text in reversed(before):
+        for separator in _SEPARATORS:
+            names = tuple(name.strip().strip("\"'") for name in text.split(separator))
+            if len(names) == columns and not any(_is_number(name.encode()) for name in names):
+                return names
+    return ()
 
 
 def _is_number(text: bytes) -> bool:
@@ -108,128 +156,90 @@ def _is_number(text: bytes) -> bool:
     return True
 
 
-def _describe(path: Path, content: bytes, line: int, column: int, names: tuple[str, ...], n_int: int) -> str:
-    """The sentence for a row that the kernel refused; it is read again here, where speed does not matter."""
-    row = content.split(b"\n")[line - 1].decode("utf-8", "replace").strip()
-    fields = [f.strip() for f in row.split(",")]
-    place = f"{path}:{line}"
-    if len(fields) != len(names):
-        wanted = f"{len(names)} ({', '.join(names)})"
-        return f"{place}: the line has {len(fields)} columns instead of {wanted}; correct or remove it."
-    name, text = names[column], fields[column]
-    shown = text if len(text) <= 40 else text[:40] + "..."
+def _places(text: _Text, kind: TableKind, layout: TableLayout) -> np.ndarray:
+    """(n,) where each column goes, see `parse`. Raises RecordingError where that is not told."""
+    wanted = len(kind.names)
+    if layout.columns:
+        place = places_given(kind, text.header, layout.columns, text.columns)
+        if isinstance(place, str):
+            raise RecordingError(f"{text.path}: `columns` in the rig file {place}; correct it.")
+        return place
+    place = places_by_name(kind, text.header)
+    if place is not None:
+        return place
+    advice = f"say which are {', '.join(kind.names)} by `columns: [...]` of the sensor in the rig file"
+    if text.columns > wanted and text.header and not kind.more:
+        raise RecordingError(f"{text.path}: its columns are {', '.join(text.header)}; {advice}.")
+    if contradicts(kind, text.header):
+        raise RecordingError(f"{text.path}: its header names {', '.join(text.header)}, in another order; {advice}.")
+    place = np.full(max(wanted, text.columns) if kind.more else wanted, LEFT_OUT, np.int64)
+    place[:wanted] = np.arange(wanted)
+    return place
+
+
+def _table(text: _Text, kind: TableKind, place: np.ndarray, power: int) -> Table:
+    """The rows, stamps times 10^power. Raises RecordingError where there are none, or too many cannot be read."""
+    capacity = text.rows.count(b"\n") + 1
+    integers = np.empty((capacity, len(kind.integers)), dtype=np.int64)
+    decimals = np.empty((capacity, len(kind.decimals)))
+    buffer = np.frombuffer(text.rows, dtype=np.uint8)
+    start, stamps = (0, text.line), (kind.stamps, power)
+    rows, bad, line, column = parse(buffer, start, stamps, place, POWERS, integers, decimals)
+    if rows == bad == 0:
+        columns = ", ".join(kind.names)
+        raise RecordingError(f"{text.path} holds no rows; write one line for each reading, with the columns {columns}.")
+    notes = ()
+    if bad:
+        sentence = _describe(text, kind, line, place, column)
+        if bad > _MOST_UNREADABLE * (rows + bad):
+            raise RecordingError(sentence)
+        left = "the line was left out" if bad == 1 else f"{bad} lines of {rows + bad} were left out, this is the first"
+        notes = (f"{sentence.rpartition(';')[0]}; {left}.",)
+    return Table(text.path, integers[:rows], decimals[:rows], notes)
+
+
+def _unit(text: _Text, kind: TableKind, place: np.ndarray) -> TimeUnit | None:
+    """The unit of the stamps by the rate that it means, None where it does not tell."""
+    if kind.rate_hz is None:
+        return None
+    alone = TableKind((), kind.names[:1])
     try:
-        number = float(text)
+        table = _table(text, alone, np.where(place == 0, 0, LEFT_OUT), _WHOLE_NS)
+    except RecordingError:
+        return None
+    stamps = _instants(kind, table.decimals[:, 0])
+    return unit_of_stamps(stamps, *kind.rate_hz) if len(stamps) > 2 else None
+
+
+def _instants(kind: TableKind, stamps: np.ndarray) -> np.ndarray:
+    """The stamps, those of rows of one image once."""
+    if len(kind.integers) == kind.stamps:
+        return stamps
+    return stamps[np.concatenate([[True], np.diff(stamps) != 0])]
+
+
+def _is_rate(stamps_ns: np.ndarray, rate_hz: tuple[float, float]) -> bool:
+    step = usual_step(stamps_ns) if len(stamps_ns) > 1 else 0.0
+    return step == 0.0 or rate_hz[0] <= 1e9 / step <= rate_hz[1]
+
+
+def _describe(text: _Text, kind: TableKind, line: int, place: np.ndarray, column: int) -> str:
+    """The sentence for a row that the kernel refused; it is read again here, where speed does not matter."""
+    row = text.rows.split(b"\n")[line - text.line].decode("utf-8", "replace").strip()
+    fields = [f.strip() for f in row.split(",")]
+    spot = f"{text.path}:{line}"
+    if len(fields) != len(place):
+        wanted = f"{len(place)} ({', '.join(text.header if len(text.header) == len(place) else kind.names)})"
+        return f"{spot}: the line has {len(fields)} columns instead of {wanted}; correct or remove it."
+    name, written = kind.names[place[column]], fields[column]
+    shown = written if len(written) <= 40 else written[:40] + "..."
+    try:
+        number = float(written)
     except ValueError:
-        return f"{place}: {name} is {shown!r}, which is not a number; correct or remove the line."
+        return f"{spot}: {name} is {shown!r}, which is not a number; correct or remove the line."
     if not isfinite(number):
-        return f"{place}: {name} is {shown}, which is not a finite number; remove the line."
-    if column < n_int:
-        hint = " (stamps in seconds must be multiplied by 1e9 when exporting)" if name.endswith("[ns]") else ""
-        return f"{place}: {name} is {shown}, but must be a whole number below 2^63{hint}."
-    return f"{place}: {name} is {shown!r}, which is not written as a plain decimal number; correct the line."
-
-
-@njit(cache=True, nogil=True)
-def _parse(
-    buffer: np.ndarray,
-    begin: int,
-    first_line: int,
-    powers: np.ndarray,
-    integers: np.ndarray,
-    decimals: np.ndarray,
-) -> tuple[int, int, int]:
-    """Fill the rows; returns their number and line and column of the first bad field (line 0: none)."""
-    n, n_int = buffer.size, integers.shape[1]
-    n_columns = n_int + decimals.shape[1]
-    at, line, row = begin, first_line, 0
-    while at < n:
-        at = _skip_blank(buffer, at)
-        if at >= n or buffer[at] == 10 or buffer[at] == 35:  # end, newline, #
-            while at < n and buffer[at] != 10:
-                at += 1
-            at += 1
-            line += 1
-            continue
-        for column in range(n_columns):
-            if column < n_int:
-                at, integers[row, column], ok = _integer(buffer, at)
-            else:
-                at, decimals[row, column - n_int], ok = _decimal(buffer, at, powers)
-            at = _skip_blank(buffer, at)
-            last = column == n_columns - 1
-            ends = at >= n or buffer[at] == 10 if last else at < n and buffer[at] == 44
-            if not (ok and ends):
-                return row, line, column
-            at += 1
-        row += 1
-        line += 1
-    return row, 0, 0
-
-
-@njit(cache=True, nogil=True)
-def _skip_blank(buffer: np.ndarray, at: int) -> int:
-    while at < buffer.size and (buffer[at] == 32 or buffer[at] == 9 or buffer[at] == 13):
-        at += 1
-    return at
-
-
-@njit(cache=True, nogil=True)
-def _sign(buffer: np.ndarray, at: int) -> tuple[int, bool]:
-    if at < buffer.size and (buffer[at] == 43 or buffer[at] == 45):
-        return at + 1, buffer[at] == 45
-    return at, False
-
-
-@njit(cache=True, nogil=True)
-def _integer(buffer: np.ndarray, at: int) -> tuple[int, np.int64, bool]:
-    """Position after the number, its value, and whether it is an int64."""
-    at, negative = _sign(buffer, _skip_blank(buffer, at))
-    value, digits, ok = np.int64(0), 0, True
-    while at < buffer.size and 48 <= buffer[at] <= 57:
-        digit = np.int64(buffer[at]) - 48
-        if value > (9223372036854775807 - digit) // 10:
-            ok = False
-        value = value * 10 + digit
-        digits += 1
-        at += 1
-    return at, -value if negative else value, ok and digits > 0
-
-
-@njit(cache=True, nogil=True)
-def _decimal(buffer: np.ndarray, at: int, powers: np.ndarray) -> tuple[int, float, bool]:
-    """Position after the number, its value, and whether it is a finite number. Digits after the 18th only scale."""
-    at, negative = _sign(buffer, _skip_blank(buffer, at))
-    mantissa, exponent, digits, fraction = np.int64(0), 0, 0, False
-    while at < buffer.size:
-        c = buffer[at]
-        if 48 <= c <= 57:
-            if mantissa < 100000000000000000:
-                mantissa = mantissa * 10 + (np.int64(c) - 48)
-                exponent -= fraction
-            else:
-                exponent += not fraction
-            digits += 1
-        elif c == 46 and not fraction:
-            fraction = True
-        else:
-            break
-        at += 1
-    ok = digits > 0
-    if ok and at < buffer.size and (buffer[at] == 101 or buffer[at] == 69):  # e, E
-        at, power, ok = _integer(buffer, at + 1)
-        exponent += int(min(max(power, -100000), 100000))
-    value = _scale(float(mantissa), exponent, powers)
-    return at, -value if negative else value, ok and np.isfinite(value)
-
-
-@njit(cache=True, nogil=True)
-def _scale(mantissa: float, exponent: int, powers: np.ndarray) -> float:
-    """mantissa * 10^exponent; a division by an exact power rounds once, a product with its inverse twice."""
-    if mantissa == 0.0 or exponent < -616:
-        return 0.0
-    if exponent < -308:
-        return mantissa / powers[308] / powers[-exponent - 308]
-    if exponent < 0:
-        return mantissa / powers[-exponent]
-    return mantissa * powers[exponent] if exponent <= 308 else np.inf
+        return f"{spot}: {name} is {shown}, which is not a finite number; remove the line."
+    if place[column] < len(kind.integers):
+        hint = " (stamps in seconds are `time_unit: s` in the rig file)" if name.endswith("[ns]") else ""
+        return f"{spot}: {name} is {shown}, but must be a whole number below 2^63{hint}."
+    return f"{spot}: {name} is {shown!r}, which is not written as a plain decimal number; correct the line."

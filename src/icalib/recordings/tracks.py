@@ -9,20 +9,33 @@ import numpy as np
 from icalib.errors import RecordingError
 from icalib.measurements import TrackStream
 from icalib.recordings.clocks import rate_sentence
+from icalib.recordings.columns import STAMP, TableKind
+from icalib.recordings.image_checks import Note, ignore
 from icalib.recordings.table import read_table
+from icalib.rig import PLAIN_TABLE, TableLayout
 
-INTEGERS, DECIMALS = ("t [ns]", "feature"), ("u [px]", "v [px]")
 _RATE_HZ = (1e-3, 1000.0)
+_KIND = TableKind(
+    ("t [ns]", "feature"),
+    ("u [px]", "v [px]"),
+    (STAMP, (r"(feature|track|point|landmark)(_?id)?|id",), (r"u(_?px)?|x(_?px)?",), (r"v(_?px)?|y(_?px)?",)),
+    _RATE_HZ,
+)
 _MARGIN_PX = 5.0  # trackers step over the edge by a few times their noise
 
 
-def read_tracks(name: str, path: Path, resolution: tuple[int, int]) -> TrackStream:
-    """The table t [ns], feature, u, v [px] at `path`; `resolution` (width, height) px of the camera.
+def read_tracks(
+    name: str, path: Path, resolution: tuple[int, int], layout: TableLayout = PLAIN_TABLE, note: Note = ignore
+) -> TrackStream:
+    """The table t [ns], feature, u, v [px] at `path`; `resolution` (width, height) px of the camera; `note` is told
+    what was left out.
 
     Raises RecordingError naming file and line or instant: a table that cannot be read, images out of order or at an
     impossible rate, a feature that appears twice in an image or lies outside it, and tracks of one image only.
     """
-    table = read_table(path, INTEGERS, DECIMALS)
+    table = read_table(path, _KIND, layout)
+    for sentence in table.notes:
+        note(sentence)
     stamps_ns, feature, uv = table.integers[:, 0].copy(), table.integers[:, 1].copy(), table.decimals
     what = f"{path} ({name})"
     step = np.diff(stamps_ns)

@@ -10,10 +10,13 @@ import numpy as np
 
 from icalib.errors import RecordingError
 from icalib.measurements import WheelPoses
-from icalib.recordings.table import read_table
+from icalib.recordings.columns import STAMP, TableKind
+from icalib.recordings.image_checks import Note
+from icalib.recordings.table import Table, read_table
 from icalib.rig import WheelDrive, WheelMeasure, Wheels
 
-STAMP = ("t [ns]",)
+RATE_HZ = (1e-2, 10_000.0)
+STAMPS = TableKind(("t [ns]",), known=(STAMP,), rate_hz=RATE_HZ, more=True)
 SIDES: dict[WheelDrive, tuple[str, ...]] = {
     "differential": ("left", "right"),
     "skid-steer": ("front left", "rear left", "front right", "rear right"),
@@ -21,10 +24,24 @@ SIDES: dict[WheelDrive, tuple[str, ...]] = {
 }
 UNITS: dict[WheelMeasure, str] = {"rates": "rad/s", "angles": "rad", "ticks": "ticks"}
 TWIST = ("v [m/s]", "w [rad/s]")
-ENDS = ("from [ns]", "to [ns]")
 _LONGEST_STEP_S = 0.5  # over which a yaw rate is taken to last
 _ALIGNED, _SCATTERED = 0.9, 0.7  # of directions: how long their mean is, 1 where all are the same
-POSES = ("yaw [rad]", "x [m]", "y [m]", "yaw yaw", "yaw x", "yaw y", "x x", "x y", "y y")
+RELATIVE_POSES = TableKind(
+    ("from [ns]", "to [ns]"), ("yaw [rad]", "x [m]", "y [m]", "yaw yaw", "yaw x", "yaw y", "x x", "x y", "y y")
+)
+# What headers call the columns after the stamp.
+_NAMES: dict[str, tuple[str, ...]] = {
+    "left": (r"(.*_)?left(_.*)?|w?l",),
+    "right": (r"(.*_)?right(_.*)?|w?r",),
+    "front left": (r"(.*_)?(front_left|left_front)(_.*)?|fl",),
+    "rear left": (r"(.*_)?((rear|back)_left|left_(rear|back))(_.*)?|rl|bl",),
+    "front right": (r"(.*_)?(front_right|right_front)(_.*)?|fr",),
+    "rear right": (r"(.*_)?((rear|back)_right|right_(rear|back))(_.*)?|rr|br",),
+    "wheel": (r"(.*_)?(wheel|rear|drive|driven|motor)(_.*)?",),
+    "steering": (r"(.*_)?(steering|steer)(_.*)?|delta",),
+    "v [m/s]": (r"v|vx|v_x|speed|(forward_)?velocity|linear(_velocity)?_x",),
+    "w [rad/s]": (r"w|wz|w_z|omega|yaw_?rate|angular(_velocity)?_z",),
+}
 
 
 @dataclass(frozen=True)
@@ -70,17 +87,19 @@ class Joints(Protocol):
     def velocity(self) -> np.ndarray: ...
 
 
-def read_wheel_table(wheels: Wheels, path: Path) -> WheelReadings | WheelPoses:
-    """The table at `path`. Raises RecordingError naming file and line where it cannot be read, and the instant where
-    relative poses do not follow one another."""
+def read_wheel_table(wheels: Wheels, path: Path, note: Note) -> WheelReadings | WheelPoses:
+    """The table at `path`; `note` is told what was left out. Raises RecordingError naming file and line where it cannot
+    be read, and the instant where relative poses do not follow one another."""
     if wheels.measures == "poses":
-        return _read_poses(wheels.name, path)
-    table = read_table(path, STAMP, value_columns(wheels))
+        table = read_table(path, RELATIVE_POSES, wheels.layout, note)
+        return _relative_poses(wheels.name, path, table)
+    columns = value_columns(wheels)
+    known = (STAMP, *(_NAMES[c if wheels.measures == "twist" else c.split(" [")[0]] for c in columns))
+    table = read_table(path, TableKind(("t [ns]",), columns, known, RATE_HZ), wheels.layout, note)
     return WheelReadings(wheels.name, table.integers[:, 0].copy(), table.decimals)
 
 
-def _read_poses(name: str, path: Path) -> WheelPoses:
-    table = read_table(path, ENDS, POSES)
+def _relative_poses(name: str, path: Path, table: Table) -> WheelPoses:
     begin, end = table.integers.T
     wrong = np.concatenate([[False], begin[1:] != end[:-1]]) | (end <= begin)
     if wrong.any():

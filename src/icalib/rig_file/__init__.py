@@ -24,7 +24,17 @@ from icalib.rig import (
     Settings,
     Wheels,
 )
-from icalib.rig_file.fields import MOUNTING, choice_or, groups_to_plain, mounting, path_or, topic_or_none
+from icalib.rig_file.fields import (
+    MOUNTING,
+    TABLE,
+    choice_or,
+    groups_to_plain,
+    layout_to_plain,
+    mounting,
+    path_or,
+    table_layout,
+    topic_or_none,
+)
 from icalib.rig_file.lidar import lidar_to_plain, read_lidar
 from icalib.rig_file.wheels import read_wheels, wheels_to_plain
 from icalib.rig_parameters import imu_intrinsics_parameter, parameter_to_plain, vector_parameter
@@ -182,13 +192,14 @@ def _refuse_unseen_ground(value: YamlValue, found: _Sensors, targeted: bool) -> 
 
 
 def _imu(name: str, value: YamlValue) -> ImuSensor:
-    found = value.record(("type",), ("path", "topic", "noise", "intrinsics"))
+    found = value.record(("type",), ("path", "topic", "noise", "intrinsics", *TABLE))
     return ImuSensor(
         name=name,
         path=path_or(found, f"{name}/data.csv"),
         noise=_noise(found["noise"]) if "noise" in found else class_noise(DEFAULT_CLASS),
         intrinsics=imu_intrinsics_parameter(found["intrinsics"]) if "intrinsics" in found else Parameter("fixed"),
         topic=topic_or_none(found),
+        layout=table_layout(found),
     )
 
 
@@ -203,7 +214,7 @@ def _noise(value: YamlValue) -> ImuNoise:
 def _camera(name: str, value: YamlValue) -> Camera:
     groups = (*MOUNTING, "intrinsics", "distortion", "bloom")
     found = value.record(
-        ("type", "model", "resolution"), ("path", "topic", "corner_noise", "tracks", "track_noise", *groups)
+        ("type", "model", "resolution"), ("path", "topic", "corner_noise", "tracks", "track_noise", *TABLE, *groups)
     )
     model = found["model"].choice("camera model", tuple(CAMERA_MODELS))
     sizes = {"intrinsics": 4, "bloom": 1}
@@ -222,12 +233,13 @@ def _camera(name: str, value: YamlValue) -> Camera:
         topic=topic_or_none(found),
         tracks=found["tracks"].text() if "tracks" in found else None,
         track_noise_px=found["track_noise"].positive() if "track_noise" in found else None,
+        layout=table_layout(found),
         **given,
     )
 
 
 def _pose(name: str, value: YamlValue) -> PoseSensor:
-    found = value.record(("type",), ("path", "topic", "kind", "rotation_noise", "position_noise", *MOUNTING))
+    found = value.record(("type",), ("path", "topic", "kind", "rotation_noise", "position_noise", *TABLE, *MOUNTING))
     return PoseSensor(
         name=name,
         path=path_or(found, f"{name}/poses.csv"),
@@ -235,6 +247,7 @@ def _pose(name: str, value: YamlValue) -> PoseSensor:
         topic=topic_or_none(found),
         rotation_noise=found["rotation_noise"].positive() if "rotation_noise" in found else None,
         position_noise=found["position_noise"].positive() if "position_noise" in found else None,
+        layout=table_layout(found),
         **mounting(found),
     )
 
@@ -273,6 +286,7 @@ def _setting(name: str, value: YamlValue, kind: Any) -> Any:
 
 def _imu_to_plain(imu: ImuSensor) -> dict[str, Any]:
     plain: dict[str, Any] = {"type": "imu", "path": imu.path, "noise": dataclasses.asdict(imu.noise)}
+    plain |= layout_to_plain(imu.layout)
     if imu.topic is not None:
         plain["topic"] = imu.topic
     intrinsics = parameter_to_plain(imu.intrinsics)
@@ -290,10 +304,11 @@ def _camera_to_plain(camera: Camera) -> dict[str, Any]:
         plain["tracks"] = camera.tracks
     if camera.track_noise_px is not None:
         plain["track_noise"] = camera.track_noise_px
-    return plain | groups_to_plain(camera)
+    return plain | layout_to_plain(camera.layout) | groups_to_plain(camera)
 
 
 def _pose_to_plain(sensor: PoseSensor) -> dict[str, Any]:
     plain: dict[str, Any] = {"type": "pose", "path": sensor.path, "kind": sensor.kind}
+    plain |= layout_to_plain(sensor.layout)
     given = {name: getattr(sensor, name) for name in ("rotation_noise", "position_noise", "topic")}
     return plain | {name: value for name, value in given.items() if value is not None} | groups_to_plain(sensor)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, get_args
 
-from icalib.rig import Camera, Lidar, Parameter, PoseSensor, Wheels
+from icalib.rig import PLAIN_TABLE, Camera, Lidar, Parameter, PoseSensor, TableLayout, TimeUnit, Wheels
 from icalib.rig_parameters import parameter_to_plain, rotation_parameter, vector_parameter
 from icalib.yaml_nodes import YamlValue
 
 MOUNTED = ("rotation", "translation", "time_offset")
 MOUNTING = (*MOUNTED, "clock_restarts")
+TABLE = ("columns", "time_unit")
 
 
 def mounting(found: dict[str, YamlValue]) -> dict[str, Any]:
@@ -38,6 +39,21 @@ def choice_or(found: dict[str, YamlValue], name: str, kind: Any, default: Any) -
 
 def path_or(found: dict[str, YamlValue], default: str) -> str:
     return found["path"].text() if "path" in found else default
+
+
+def table_layout(found: dict[str, YamlValue]) -> TableLayout:
+    """How the sensor's table is written, as far as it is said."""
+    if not set(TABLE) & set(found):
+        return PLAIN_TABLE
+    columns = tuple(item.text() for item in found["columns"].items()) if "columns" in found else ()
+    if "columns" in found and len(set(columns)) < max(len(columns), 1):
+        found["columns"].fail("must name columns of the table, each once.")
+    return TableLayout(columns, choice_or(found, "time_unit", TimeUnit, None))
+
+
+def layout_to_plain(layout: TableLayout) -> dict[str, Any]:
+    columns = {"columns": list(layout.columns)} if layout.columns else {}
+    return columns | ({"time_unit": layout.time_unit} if layout.time_unit else {})
 
 
 def topic_or_none(found: dict[str, YamlValue]) -> str | None:

@@ -15,7 +15,18 @@ from icalib.rig import (
     WheelMeasure,
     Wheels,
 )
-from icalib.rig_file.fields import MOUNTING, choice_or, groups_to_plain, mounting, path_or, positive_or, topic_or_none
+from icalib.rig_file.fields import (
+    MOUNTING,
+    TABLE,
+    choice_or,
+    groups_to_plain,
+    layout_to_plain,
+    mounting,
+    path_or,
+    positive_or,
+    table_layout,
+    topic_or_none,
+)
 from icalib.rig_parameters import vector_parameter
 from icalib.yaml_nodes import YamlValue
 
@@ -52,7 +63,8 @@ _JOINTS = {
 def read_wheels(name: str, value: YamlValue) -> Wheels:
     """Raises RigError naming line and field."""
     found = value.record(
-        ("type",), (*_WORDS, "ground", *_NOISES, *_SLIP, *MOUNTING, *(g for s in DRIVE_SIZES.values() for g in s))
+        ("type",),
+        (*_WORDS, "ground", *_NOISES, *_SLIP, *TABLE, *MOUNTING, *(g for s in DRIVE_SIZES.values() for g in s)),
     )
     measures: WheelMeasure = choice_or(found, "measures", WheelMeasure, Wheels.measures)
     drive: WheelDrive = choice_or(found, "drive", WheelDrive, Wheels.drive)
@@ -77,6 +89,7 @@ def read_wheels(name: str, value: YamlValue) -> Wheels:
         topic=topic_or_none(found),
         joints=_joints(found["joints"], drive) if "joints" in found else None,
         ground=_ground(found["ground"]) if "ground" in found else None,
+        layout=table_layout(found),
         **given,
     )
 
@@ -161,6 +174,7 @@ def wheels_to_plain(wheels: Wheels) -> dict[str, Any]:
     same = ("path", "drive", "measures", "factor", *noises, *_SLIP)
     plain: dict[str, Any] = {"type": "wheels", **{name: getattr(wheels, name) for name in same}}
     given = {name: getattr(wheels, name) for name, of in _ONLY_OF.items() if wheels.measures in of}
+    given |= layout_to_plain(wheels.layout)
     given["ground"] = None if wheels.ground is None else _ground_to_plain(wheels.ground)
     lists = {name: getattr(wheels, name) for name in ("joints", "signs")}
     given |= {"topic": wheels.topic, **{name: None if x is None else list(x) for name, x in lists.items()}}
