@@ -102,7 +102,6 @@ class Camera:
 
 
 PointTime = Literal["auto", "start", "end", "azimuth", "snapshot"]
-TimeUnit = Literal["s", "ms", "us", "ns"]
 
 
 @dataclass(frozen=True)

@@ -28,9 +28,11 @@ def unit_of_stamps(stamps: np.ndarray, slowest_hz: float, fastest_hz: float) -> 
     step, size = usual_step(stamps), float(np.median(stamps))
     every: dict[TimeUnit, float] = {unit: 10.0 ** (power - 9) for unit, power in POWERS_OF_NS.items()}
     seconds: dict[TimeUnit, float] = {u: s for u, s in every.items() if step * len(stamps) * s <= _LONGEST_S}
-    possible = [u for u, s in seconds.items() if step > 0 and slowest_hz <= 1.0 / (step * s) <= fastest_hz]
-    dated = [u for u in possible if _DATES_S[0] <= size * seconds[u] <= _DATES_S[1]]
-    usual = [u for u in possible if _USUAL_S[0] <= step * len(stamps) * seconds[u] < _USUAL_S[1]]
+    possible: list[TimeUnit] = [
+        u for u, s in seconds.items() if step > 0 and slowest_hz <= 1.0 / (step * s) <= fastest_hz
+    ]
+    dated: list[TimeUnit] = [u for u in possible if _DATES_S[0] <= size * seconds[u] <= _DATES_S[1]]
+    usual: list[TimeUnit] = [u for u in possible if _USUAL_S[0] <= step * len(stamps) * seconds[u] < _USUAL_S[1]]
     return next((found[0] for found in (dated, possible, usual) if len(found) == 1), None)
 
 

@@ -9,10 +9,9 @@ from icalib.geometry import so3
 from icalib.measurements import PoseStream, seconds_since
 from icalib.recordings.bad_poses import are_poses, path_of, stale_copies
 from icalib.recordings.ordered import kept_readings
-from icalib.recordings.poses import PoseReadings
+from icalib.recordings.poses import RATE_HZ, PoseReadings
 from icalib.rig import PoseSensor
 
-_RATE_HZ = (2.0, 5000.0)
 _FASTEST_M_S = 100.0
 _BROKEN_SHARE = 0.5  # of all poses: more are no single bad readings
 _LASTING_M, _RETURNS = 0.05, 0.5  # of a jump's length: jumps that add up to less come back
@@ -31,7 +30,7 @@ def checked_poses(read: PoseReadings, sensor: PoseSensor, where: str) -> tuple[P
     read, broken = _without_broken(read, what)
     values = np.hstack([read.position, read.rotation.reshape(-1, 9)])
     own = "write the sensor's own stamps"
-    kept, notes = kept_readings(read.stamps_ns, values, what, _RATE_HZ, "pose", own)
+    kept, notes = kept_readings(read.stamps_ns, values, what, RATE_HZ, "pose", own)
     read = _some(read, kept)
     read, copied = _without_copies(read, what)
     read, jumped = _on_path(read, sensor, what)
