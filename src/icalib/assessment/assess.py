@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from icalib.assessment.robot import (
     wheel_residuals,
 )
 from icalib.assessment.size import felt_size, is_certain, size_words
+from icalib.assessment.stated import stated_warnings
 from icalib.calibration import (
     Calibration,
     HeldOut,
@@ -36,6 +37,7 @@ from icalib.calibration import (
 from icalib.estimation.assembly import image_times
 from icalib.estimation.board import SHAPE_LABELS
 from icalib.estimation.border import restricted_inverse
+from icalib.estimation.contradictions import contradictions
 from icalib.estimation.determination import Determined
 from icalib.estimation.estimate import Estimate
 from icalib.estimation.evidence import Fit, fits, raw_rms, split_covariance
@@ -47,6 +49,7 @@ from icalib.estimation.outcome import Visit
 from icalib.estimation.parts import Parts
 from icalib.estimation.places import place_covariances
 from icalib.estimation.problem import Problem
+from icalib.estimation.relaxed import relaxed
 from icalib.estimation.state import Block, State
 from icalib.estimation.surfaces import ON_PLANES
 from icalib.geometry.cameras import camera_model
@@ -89,11 +92,14 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
     trajectory, poses = _trajectory(inputs, outcome.state, timeline), pose_residuals(inputs, found, timeline)
     # What others complain of may come of a wrong size, or of an accelerometer's scale: then that is the news.
     certain = is_certain(size)
-    lenses = () if certain else other_lens(inputs.rig.cameras, lens_steps(inputs, found), factors.max(initial=1.0))
+    stated, factor = None if certain else relaxed(inputs, found), factors.max(initial=1.0)
+    lenses = other_lens(inputs.rig.cameras, lens_steps(inputs, stated), factor)
+    against = contradictions(inputs, found, stated, max(factor, _misfit(judged)))
     beyond = () if wrong_size else far_beyond(inputs.rig, judged)
     wrong = (*(wrong_size if certain else ()), *mixed, *lenses, *beyond)
     warnings = (
         *wrong_size,
+        *stated_warnings(inputs, against, groups),
         *_warnings(inputs, found, groups, judged, poses),
         *_factor_warnings(factors, parts is not None, held),
     )
@@ -124,6 +130,11 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
         held_out=held,
         wrong=wrong,
     )
+
+
+def _misfit(judged: Iterable[SensorFit]) -> float:
+    """Times which the residuals of some sensor are as large as their noise says; at least 1."""
+    return float(np.sqrt(max([1.0, *(f.chi2_per_dof or 1.0 for f in judged)])))
 
 
 def _rates(inputs: Inputs) -> dict[str, float]:

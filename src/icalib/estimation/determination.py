@@ -61,17 +61,17 @@ class Determined:
         """(B, B), priors included: of what is determined, and how it moves with what is held."""
         t = self.estimate.problem.tolerance
         known = t[:, None] * self.estimate.outcome.information * t - self.noise
-        return t[:, None] * _scatter(known, self.noise, self.held) * t + self.shifts.T @ self.shifts
+        return t[:, None] * scatter(known, self.noise, self.held) * t + self.shifts.T @ self.shifts
 
     @property
     def spread(self) -> np.ndarray:
         """(B,) standard deviations in tolerances that the data alone give."""
         t = self.estimate.problem.tolerance
-        alone = _scatter(self.data, self.noise, self.held)
+        alone = scatter(self.data, self.noise, self.held)
         return np.sqrt(np.diag(alone) + ((self.shifts / t) ** 2).sum(axis=0))
 
 
-def _scatter(known: np.ndarray, noise: np.ndarray, held: np.ndarray) -> np.ndarray:
+def scatter(known: np.ndarray, noise: np.ndarray, held: np.ndarray) -> np.ndarray:
     """(B, B) covariance where J^T J is `known` + `noise`: J^T r scatters by all of it, but only what is known of it
     leads back (errors in variables; Fuller, Measurement Error Models, 1987, chapter 1). Noise only adds: where its few
     draws say otherwise, or curvature left less than nothing known, the variance is no less than without it."""
@@ -118,7 +118,7 @@ class _Search:
     on_step: Callable[[str, Step], None]
     on_visit: OnVisit
     found: Estimate
-    seen: _Judgement
+    seen: Judgement
 
     @classmethod
     def begin(
@@ -126,7 +126,7 @@ class _Search:
     ) -> _Search:
         """Nothing is held yet."""
         found = estimate(inputs, start, on_step, on_visit=on_visit, doubtful=_is_doubtful, guess=guess)
-        return cls(inputs, start, guess, on_step, on_visit, found, _judge(inputs, found.outcome))
+        return cls(inputs, start, guess, on_step, on_visit, found, judge(inputs, found.outcome))
 
     def settle(self) -> None:
         """Holds what is undetermined, until that stays; the guess counts for what it is worth till then, but not in the
@@ -164,7 +164,7 @@ class _Search:
         del self.found  # before the next one takes as much memory
         guess = self.guess if led else None
         self.found = estimate(self.inputs, begin, self.on_step, held, self.on_visit, judged, guess=guess)
-        self.seen = _judge(self.inputs, self.found.outcome, None if led else self.seen)
+        self.seen = judge(self.inputs, self.found.outcome, None if led else self.seen)
 
 
 def _followed(found: Estimate, moved: State, held: np.ndarray) -> State:
@@ -199,7 +199,7 @@ def _is_settled(undetermined: np.ndarray, held: np.ndarray, late: bool) -> bool:
     return bool(inside and (n == m or late))
 
 
-class _Judgement(NamedTuple):
+class Judgement(NamedTuple):
     """Of an estimate, in tolerance units: information of the `data` alone and what `noise` adds to it (B, B), and the
     directions (B, m) that are `undetermined`; asked (B, B): data, noise and the model's own priors together. spurious:
     how the noise was found."""
@@ -211,7 +211,7 @@ class _Judgement(NamedTuple):
     undetermined: np.ndarray
 
 
-def _judge(inputs: Inputs, outcome: Outcome, before: _Judgement | None = None) -> _Judgement:
+def judge(inputs: Inputs, outcome: Outcome, before: Judgement | None = None) -> Judgement:
     """Nuisances whose priors belong to the model (a target's shape, bloom) are open only where these are, too. What
     noise adds is not looked for again where there is about as much information as in the judgement `before`."""
     problem = outcome.problem
@@ -225,7 +225,7 @@ def _judge(inputs: Inputs, outcome: Outcome, before: _Judgement | None = None) -
     seen, noise = shown(spurious), spurious.mean
     data = without_priors(outcome.information - noise, problem.priors, outcome.state)
     undetermined = seen.vectors[:, seen.nothing | seen.in_doubt]
-    return _Judgement(spurious, t[:, None] * data * t, t[:, None] * noise * t, asked, undetermined)
+    return Judgement(spurious, t[:, None] * data * t, t[:, None] * noise * t, asked, undetermined)
 
 
 def _are_alike(a: np.ndarray, b: np.ndarray) -> bool:

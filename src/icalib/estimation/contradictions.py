@@ -1,0 +1,127 @@
+"""Values of the rig file, fixed or with a prior, that the data contradict.
+
+Each is tested alone first (`relaxed`), which costs one linearisation. Those that stand out are then free together: what
+is right among them no longer stands out, and directions in which the data show only noise stay fixed. A value that is
+far off moves everything with it; then the calibration is made again without it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.errors import EstimationError
+from icalib.estimation.border import restricted_root
+from icalib.estimation.determination import determine, judge, scatter
+from icalib.estimation.estimate import Estimate
+from icalib.estimation.evidence import fits
+from icalib.estimation.inputs import Inputs, origin_difference
+from icalib.estimation.relaxed import Relaxed, freed_inputs, relinearised, sensors_of
+from icalib.estimation.state import Block, Key, State
+from icalib.estimation.tolerances import GUESS_SIGMA
+from icalib.geometry import so3
+from icalib.rig import Parameter
+
+SIGMAS = 4.0
+FAR = 0.5  # times what a guess is worth: 3 deg, 5 cm, 10 ms; a linear step that long does not end where it says
+
+
+@dataclass(frozen=True)
+class Contradiction:
+    """A group `key` that the rig file states as `parameter` (mode fixed or prior), between raw stamps.
+
+    off (n,): from the stated value to that of the data alone, rotations about the sensor's axes [rad]; sigma (n,): the
+    standard deviation of the latter; found: the latter.
+    """
+
+    key: Key
+    parameter: Parameter
+    found: np.ndarray
+    off: np.ndarray
+    sigma: np.ndarray
+
+    @property
+    def away(self) -> np.ndarray:
+        """(n,) how far off in standard deviations of both together."""
+        stated = 0.0 if self.parameter.sigma is None else self.parameter.sigma
+        return np.abs(self.off) / np.maximum(np.sqrt(self.sigma**2 + stated**2), 1e-300)
+
+    @property
+    def worst(self) -> int:
+        """The entry that is farthest off."""
+        return int(np.argmax(self.away))
+
+
+def contradictions(inputs: Inputs, found: Estimate, stated: Relaxed | None, factor: float) -> tuple[Contradiction, ...]:
+    """What is more than SIGMAS off. `stated`: see `relaxed`; factor: times which formal standard deviations count."""
+    if stated is None:
+        return ()
+    alone = [_shown(inputs, stated.state, stated.layout.block(*k), *stated.step([k]), factor) for k in stated.stated]
+    standing_out = _standing_out(alone)
+    if not standing_out:
+        return ()
+    freed = freed_inputs(inputs, [c.key for c in standing_out])
+    if any(_is_far(c) for c in standing_out):
+        return _standing_out(_estimated(inputs, freed, stated.state, standing_out))
+    return _standing_out(_linear(inputs, freed, found, standing_out, factor))
+
+
+def _standing_out(shown: Sequence[Contradiction]) -> tuple[Contradiction, ...]:
+    return tuple(c for c in shown if c.away.max() > SIGMAS)
+
+
+def _is_far(shown: Contradiction) -> bool:
+    return float(np.abs(shown.off).max()) > FAR * GUESS_SIGMA[shown.key[1]]
+
+
+def _linear(
+    inputs: Inputs, freed: Inputs, found: Estimate, standing_out: Sequence[Contradiction], factor: float
+) -> Sequence[Contradiction]:
+    """One Newton step with all that stand out free, without directions that the data leave open."""
+    there = relinearised(inputs, found, freed, freed.layout)
+    if there is None:
+        return standing_out
+    t, information = there.problem.tolerance, there.solution.information
+    seen = judge(freed, there.outcome())
+    root = restricted_root(t[:, None] * information * t, seen.undetermined)
+    step = -t * (root @ (root.T @ (t * there.solution.gradient[:-1])))
+    variance = np.diag(scatter(t[:, None] * information * t - seen.noise, seen.noise, seen.undetermined))
+    sigma = t * np.sqrt(variance)
+    return [_shown(inputs, there.state, there.layout.block(*c.key), step, sigma, factor) for c in standing_out]
+
+
+def _estimated(
+    inputs: Inputs, freed: Inputs, state: State, standing_out: Sequence[Contradiction]
+) -> Sequence[Contradiction]:
+    """From the calibration without what stands out; as they are where that fails."""
+    try:
+        again = determine(freed, state, guess=state.values)
+    except EstimationError:
+        return standing_out
+    outcome = again.estimate.outcome
+    if not outcome.converged:
+        return standing_out
+    ratios = [f.chi2 / f.dof for f in fits(outcome.problem, outcome) if f.dof > np.sqrt(f.count)]
+    factor = float(np.sqrt(max([1.0, *ratios])))
+    sigma, nothing = np.sqrt(np.diag(again.covariance)), np.zeros(freed.layout.size)
+    return [_shown(inputs, outcome.state, freed.layout.block(*c.key), nothing, sigma, factor) for c in standing_out]
+
+
+def _shown(
+    inputs: Inputs, state: State, block: Block, step: np.ndarray, sigma: np.ndarray, factor: float
+) -> Contradiction:
+    """A stated group against where `step` (B,) leads from `state`."""
+    sensor = next(s for s in sensors_of(inputs.asked or inputs.rig) if s.name == block.sensor)
+    parameter: Parameter = getattr(sensor, block.name)
+    assert parameter.value is not None
+    value, own = state.values[block.key], step[block.columns]
+    if block.kind == "rotation":
+        there = value @ so3.exp(own)
+        off = so3.log(np.ascontiguousarray(parameter.value.T @ there))
+    else:
+        shift = origin_difference(inputs.measurements, inputs.stream(block.sensor))
+        there = value + own - (shift if block.name == "time_offset" else 0.0)
+        off = there - parameter.value
+    return Contradiction(block.key, parameter, there, off, factor * sigma[block.columns])

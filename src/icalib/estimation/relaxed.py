@@ -1,0 +1,150 @@
+"""Normal equations at the solution in which everything is free that the rig file fixes, and priors can be taken off.
+
+Score test (Lagrange multiplier test; Rao 1948): a constraint that the data contradict pulls at the solution. One
+Newton step without the constraint shows where the data alone have the parameter, and how well they know it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+
+from icalib.errors import EstimationError
+from icalib.estimation.arrowhead import Solution, solve
+from icalib.estimation.assembly import given_priors
+from icalib.estimation.border import NOTHING, restricted_root
+from icalib.estimation.estimate import Estimate
+from icalib.estimation.inputs import Inputs, with_clouds
+from icalib.estimation.outcome import Outcome, outcome_of
+from icalib.estimation.prior_factor import sums_of_priors
+from icalib.estimation.problem import Problem, Residuals
+from icalib.estimation.state import Key, Layout, State
+from icalib.rig import Camera, Lidar, Parameter, PoseSensor, Rig, Wheels
+
+Sensor = TypeVar("Sensor", Camera, Lidar, Wheels, PoseSensor)
+
+
+@dataclass(frozen=True)
+class Relaxed:
+    """inputs, problem: with all `stated` groups in the layout; before: the layout of the estimate; gradient (B,) and
+    the solution's information (B, B) are of the calibration parameters at `state`."""
+
+    inputs: Inputs
+    problem: Problem
+    state: State
+    solution: Solution
+    residuals: Residuals
+    before: Layout
+    stated: tuple[Key, ...]
+
+    @property
+    def layout(self) -> Layout:
+        return self.problem.layout
+
+    def fixed_columns(self, freed: Collection[Key]) -> np.ndarray:
+        """Columns that the estimate has fixed, but those of the groups `freed`."""
+        fixed = [b for b in self.layout.free if not self.before.is_free(*b.key) and b.key not in freed]
+        return np.concatenate([np.arange(0), *(b.columns for b in fixed)])
+
+    def step(self, freed: Collection[Key]) -> tuple[np.ndarray, np.ndarray]:
+        """Where the data alone send the calibration parameters, step (B,), with the groups `freed` neither fixed nor
+        with their priors, and all else as the rig file has it; and their standard deviations (B,)."""
+        t, n = self.problem.tolerance, self.layout.size
+        priors = [p for p in given_priors(self.inputs) if p.block.key in freed]
+        _, pull, known = sums_of_priors(priors, self.state, n)
+        fixed = np.eye(n)[:, self.fixed_columns(freed)]
+        held = np.hstack([fixed, self.problem.held]) if self.problem.held.size else fixed
+        root = restricted_root(t[:, None] * (self.solution.information - known) * t, held)
+        step = -root @ (root.T @ (t * (self.solution.gradient[:-1] - pull)))
+        return t * step, t * np.sqrt((root**2).sum(axis=1))
+
+    def outcome(self) -> Outcome:
+        """The solution as an outcome, from which noise in the Jacobians is found."""
+        return outcome_of(self.problem, self.state, 0.0, self.residuals, 0.0, [], self.solution)
+
+
+def relaxed(inputs: Inputs, found: Estimate) -> Relaxed | None:
+    """Of what the rig file fixes or gives a prior; None where it does not, or the solver did not end."""
+    if not found.outcome.converged or not any(_is_stated(inputs.rig, s) for s in sensors_of(inputs.rig)):
+        return None
+    return relinearised(inputs, found, freed_inputs(inputs), inputs.layout)
+
+
+def relinearised(inputs: Inputs, found: Estimate, freed: Inputs, before: Layout) -> Relaxed | None:
+    """At the end of `found`, with the layout of `freed`; None where nothing can be solved there."""
+    held = _held_in(freed.layout, inputs.layout, found.problem.held)
+    state = found.outcome.state
+    try:
+        problem = found.judged.problem(freed, state, held)
+        pieces, residuals = problem.pieces(), problem.residuals()
+        problem.linearise(state, pieces, residuals, curved=True)
+        solution = solve(pieces, problem.n_nodes, problem.tolerance, held=held)
+    except EstimationError:
+        return None
+    return Relaxed(freed, problem, state, solution, residuals, before, tuple(stated_keys(inputs, freed.layout)))
+
+
+def stated_keys(inputs: Inputs, layout: Layout) -> list[Key]:
+    """Groups that the rig file, as it was given, fixes or gives a prior, and that have columns in `layout`."""
+    asked, used = inputs.asked or inputs.rig, {s.name for s in sensors_of(inputs.rig)}
+    body = () if inputs.rig.imu is not None and not inputs.rig.assumes_motion else ("rotation", "translation")
+    if inputs.rig.assumes_motion:
+        body = (*body, "time_offset")
+    return [
+        (s.name, name)
+        for s in sensors_of(asked)
+        for name, parameter in _groups(s).items()
+        if s.name in used and parameter.mode != "free" and parameter.value is not None
+        if not (s.name == asked.body and name in body)
+        if any(b.key == (s.name, name) and b.start is not None for b in layout.blocks)
+    ]
+
+
+def freed_inputs(inputs: Inputs, keys: Collection[Key] | None = None) -> Inputs:
+    """`inputs` with what is fixed at a value free, and with `keys` only these, priors among them."""
+    rig = inputs.rig
+
+    def freed(sensor: Sensor) -> Sensor:
+        own = {k: Parameter("free", p.value) for k, p in _groups(sensor).items() if _is_freed(sensor.name, k, p, keys)}
+        return replace(sensor, **own)
+
+    rig = replace(
+        rig,
+        cameras=tuple(freed(c) for c in rig.cameras),
+        lidars=tuple(freed(x) for x in rig.lidars),
+        wheels=tuple(freed(w) for w in rig.wheels),
+        poses=tuple(freed(p) for p in rig.poses),
+    )
+    return with_clouds(replace(inputs, rig=rig), inputs.clouds)
+
+
+def _is_freed(sensor: str, name: str, parameter: Parameter, keys: Collection[Key] | None) -> bool:
+    if parameter.value is None or parameter.mode == "free":
+        return False
+    return parameter.mode == "fixed" if keys is None else (sensor, name) in keys
+
+
+def _is_stated(rig: Rig, sensor: Camera | Lidar | Wheels | PoseSensor) -> bool:
+    return any(p.mode != "free" and p.value is not None for p in _groups(sensor).values())
+
+
+def sensors_of(rig: Rig) -> tuple[Camera | Lidar | Wheels | PoseSensor, ...]:
+    """All but the IMU."""
+    return (*rig.cameras, *rig.lidars, *rig.wheels, *rig.poses)
+
+
+def _groups(sensor: Camera | Lidar | Wheels | PoseSensor) -> dict[str, Parameter]:
+    return {name: value for name, value in vars(sensor).items() if isinstance(value, Parameter)}
+
+
+def _held_in(layout: Layout, before: Layout, held: np.ndarray) -> np.ndarray:
+    """Directions of the calibration parameters of `before` in those of `layout`, which has more columns."""
+    if not held.size:
+        return NOTHING
+    out = np.zeros((layout.size, held.shape[1]))
+    for block in before.free:
+        out[layout.block(*block.key).columns] = held[block.columns]
+    return out
