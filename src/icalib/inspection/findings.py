@@ -8,6 +8,7 @@ import numpy as np
 
 from icalib.inspection.facts import CameraSource, Finding, ImuFacts, Inspection, TargetView, Timing
 from icalib.inspection.timing import overlap_s
+from icalib.inspection.unread import unread
 from icalib.recordings import TopicInfo
 from icalib.recordings.topics import listing
 
@@ -29,7 +30,15 @@ _ORDER = ("problem", "warning", "hint")
 
 def findings(found: Inspection) -> tuple[Finding, ...]:
     """Problems, then warnings, then hints."""
-    every = [*_missing(found), *_broken(found), *_imu(found), *_clocks(found), *_streams(found), *_target(found)]
+    every = [
+        *_missing(found),
+        *unread(found),
+        *_broken(found),
+        *_imu(found),
+        *_clocks(found),
+        *_streams(found),
+        *_target(found),
+    ]
     return tuple(sorted(every, key=lambda f: _ORDER.index(f.severity)))
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from icalib.errors import RecordingError
 from icalib.recordings.image_checks import Note
 from icalib.recordings.images import Payload, file_payload
+from icalib.recordings.unreadable import HEAD_BYTES, not_data
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 
@@ -31,14 +32,24 @@ def image_files(folder: Path) -> list[tuple[int, Path]]:
 
 
 def file_payloads(files: list[tuple[int, Path]], where: str, note: Note) -> Iterator[Payload]:
-    """The images as files; empty and missing ones are left out, with a note at the end."""
+    """The images as files; empty and missing ones, and pointers of Git LFS, are left out, with a note at the end.
+
+    Raises RecordingError where all are pointers.
+    """
     missing: list[Path] = []
+    pointers: list[str] = []
     for stamp_ns, path in files:
         data = path.read_bytes() if path.is_file() else b""
-        if data:
+        if sentence := not_data(path, data[:HEAD_BYTES]):
+            pointers.append(sentence)
+        elif data:
             yield file_payload(stamp_ns, f"{where} ({path.name})", data)
         else:
             missing.append(path)
+    if pointers:
+        if len(pointers) + len(missing) == len(files):
+            raise RecordingError(pointers[0])
+        note(f"{where}: {len(pointers)} of {len(files)} images cannot be read, the first: {pointers[0]}")
     if missing:
         note(f"{where}: {len(missing)} of {len(files)} images are missing or empty, the first is {missing[0].name}.")
 

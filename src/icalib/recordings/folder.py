@@ -23,6 +23,7 @@ from icalib.recordings.scans import in_seconds, read_scan_stamps, read_scans
 from icalib.recordings.table import holds, read_table
 from icalib.recordings.topics import TopicInfo, choose_topic, find_topic
 from icalib.recordings.tracks import read_tracks
+from icalib.recordings.unreadable import VIDEO_FILE, is_video
 from icalib.recordings.wheels import RELATIVE_POSES, STAMPS, UNITS, WheelReadings, read_wheel_table
 from icalib.rig import Camera, ImuSensor, Lidar, PoseSensor, TableLayout, Wheels
 
@@ -67,7 +68,7 @@ class FolderRecording:
                 stamps_ns = np.unique(read_table(table, _CORNERS).integers[:, 0])
                 found.append(_info(f"{folder.name}/corners.csv", "table of corners", "corners", stamps_ns))
             found += [_info(f"{folder.name}/{table.name}", *what, _stamps(table)) for table, what in _robot(folder)]
-        return tuple(found)
+        return (*found, *self._videos())
 
     def stamps(self, topic: str) -> np.ndarray:
         chosen = find_topic(str(self.root), self.topics(), topic)
@@ -81,7 +82,8 @@ class FolderRecording:
         return np.unique(read_table(self._locate(chosen.name), _CORNERS).integers[:, 0])
 
     def image_topic(self, camera: Camera) -> str:
-        return choose_topic(str(self.root), self._image_topics(), "image", camera.name, camera.topic).name
+        topics = (*self._image_topics(), *self._videos())
+        return choose_topic(str(self.root), topics, "image", camera.name, camera.topic).name
 
     def payloads(self, topic: str) -> Iterator[Payload]:
         name = find_topic(str(self.root), self._image_topics(), topic).name
@@ -101,7 +103,7 @@ class FolderRecording:
 
     def has_corners(self, camera: Camera) -> bool:
         # Where there are neither corners nor images, the sentence on the missing table is the better one.
-        return self._find(camera.path) is not None or not self._image_topics()
+        return self._find(camera.path) is not None or not (self._image_topics() or self._videos())
 
     def corners(self, camera: Camera, target: Target) -> CornerStream:
         layout = camera.layout if camera.tracks is None else TableLayout(time_unit=camera.layout.time_unit)
@@ -161,6 +163,12 @@ class FolderRecording:
     def _image_topics(self) -> tuple[TopicInfo, ...]:
         folders = sorted(p for base in self._bases() for p in base.iterdir() if p.is_dir())
         return tuple(topic for p in folders if (topic := _images(p)) is not None)
+
+    def _videos(self) -> tuple[TopicInfo, ...]:
+        """What is named as videos, which no reader reads."""
+        files = sorted(p for base in self._bases() for pattern in ("*", "*/*") for p in base.glob(pattern))
+        names = [str(p.relative_to(self.root)) for p in files if is_video(p) and p.is_file()]
+        return tuple(TopicInfo(name, VIDEO_FILE, "", 1, None, None) for name in dict.fromkeys(names))
 
     def _remember(self, path: Path) -> None:
         if path not in self._read:

@@ -1,4 +1,5 @@
-"""Livox's own message of points (CustomMsg of livox_ros_driver and livox_ros_driver2), which ROS does not define:
+"""Livox's own message of points (CustomMsg of livox_ros_driver, livox_ros_driver2 and
+livox_ros2_driver), which ROS does not define:
 
 Header header; uint64 timebase; uint32 point_num; uint8 lidar_id; uint8[3] rsvd; CustomPoint[] points
 CustomPoint: uint32 offset_time [ns]; float32 x, y, z [m]; uint8 reflectivity, tag, line
@@ -11,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-TYPES = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
+TYPES = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg", "livox_interfaces/msg/CustomMsg")
 _FIELDS = {"offset_time": "u4", "x": "f4", "y": "f4", "z": "f4", "reflectivity": "u1", "tag": "u1", "line": "u1"}
 _POINT = 19  # bytes; in CDR the next one begins after a multiple of 4
 

@@ -10,6 +10,7 @@ from icalib.recordings.bags.opening import bag_files
 from icalib.recordings.base import Recording
 from icalib.recordings.folder import FolderRecording
 from icalib.recordings.pictures import PictureFolder, has_pictures
+from icalib.recordings.unreadable import HEAD_BYTES, not_data
 
 _MAX_LISTED = 12
 
@@ -23,13 +24,27 @@ def open_recording(path: str | Path) -> Recording:
     if root.is_dir():
         if _holds_bags(root):
             return BagRecording(root)
-        return PictureFolder(root) if has_pictures(root) and not _holds_tables(root) else FolderRecording(root)
+        if _holds_tables(root):
+            return FolderRecording(root)
+        if has_pictures(root):
+            return PictureFolder(root)
+        _refuse_unreadable(root)
+        return FolderRecording(root)
     if root.exists():
         return BagRecording(root)
     parent = root.parent
     beside = sorted(p.name for p in parent.iterdir())[:_MAX_LISTED] if parent.is_dir() else []
     listing = f"{parent} holds {', '.join(beside)}" if beside else f"{parent} is empty or missing"
     raise RecordingError(f"{root} does not exist; {listing}; check the path of the recording.")
+
+
+def _refuse_unreadable(folder: Path) -> None:
+    """Raises RecordingError where a file of `folder` is a video or a pointer of Git LFS."""
+    for path in sorted(p for p in folder.iterdir() if p.is_file()):
+        with path.open("rb") as file:
+            sentence = not_data(path, file.read(HEAD_BYTES))
+        if sentence:
+            raise RecordingError(sentence)
 
 
 def _holds_bags(folder: Path) -> bool:

@@ -97,8 +97,7 @@ def find_point_times(
     if (ends := _of_a_clock(used, period_s)) is not None:
         unit = _unit_of_clock(what, field, ends, period_s, lidar)
         return PointTimes(field, unit, True, lidar.point_time, LONGEST_PERIODS * period_s), ()
-    whole: TimeUnit = "ns" if scans[0].dtype[field].kind in "iu" else "s"
-    usual = next((u for u in UNIT_NS if field.endswith(f"_{u}")), whole)
+    usual = _usual_unit(field, scans[0].dtype[field].kind in "iu")
     unit, notes = unit_of_offsets(f"{what}: the times `{field}`", used, period_s, lidar, usual)
     return PointTimes(field, unit, False, lidar.point_time, LONGEST_PERIODS * period_s), notes
 
@@ -178,6 +177,14 @@ def _field(what: str, scans: Sequence[np.ndarray], lidar: Lidar) -> str:
     raise RecordingError(
         f"{what}: the points have no times ({listed}); {if_any}record a cloud that has them, or {_CHOICES}."
     )
+
+
+def _usual_unit(field: str, whole: bool) -> TimeUnit:
+    """That in its name, else ns of whole numbers and s of others."""
+    for unit in UNIT_NS:
+        if field.endswith(f"_{unit}"):
+            return unit
+    return "ns" if whole else "s"
 
 
 def _differ(values: np.ndarray) -> bool:

@@ -12,6 +12,7 @@ import numpy as np
 from icalib.errors import RecordingError
 from icalib.measurements import LidarStream
 from icalib.recordings.point_times import LONGEST_PERIODS, UNIT_NS, unit_of_offsets, within_scan
+from icalib.recordings.unreadable import HEAD_BYTES, not_data
 from icalib.rig import Lidar
 
 _REQUIRED = {"stamps_ns": np.int64, "start": np.int64, "offset_s": np.float32, "xyz": np.float32}
@@ -66,6 +67,10 @@ def in_seconds(stream: LidarStream, lidar: Lidar, what: str) -> tuple[LidarStrea
 
 def _arrays(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
     try:
+        with path.open("rb") as file:
+            sentence = not_data(path, file.read(HEAD_BYTES))
+        if sentence:
+            raise RecordingError(sentence)
         if not zipfile.is_zipfile(path):
             raise RecordingError(f"{path} is not a file of arrays (npz); write it by numpy.savez.")
         with np.load(path, allow_pickle=False) as found:

@@ -17,6 +17,7 @@ from icalib.recordings.clocks import POWERS_OF_NS, UNIT_WORDS, TimeUnit, unit_of
 from icalib.recordings.columns import TableKind, contradicts, places_by_name, places_given
 from icalib.recordings.image_checks import Note, ignore
 from icalib.recordings.table_kernels import LEFT_OUT, POWERS, parse
+from icalib.recordings.unreadable import HEAD_BYTES, not_data
 from icalib.rig import PLAIN_TABLE, TableLayout
 
 _GZIP_MAGIC = b"\x1f\x8b"
@@ -115,6 +116,8 @@ def _read_bytes(path: Path) -> bytes:
         raise RecordingError(
             f"{path} cannot be read ({error.strerror or error}); check the file and its permissions."
         ) from error
+    if sentence := not_data(path, content[:HEAD_BYTES]):
+        raise RecordingError(sentence)
     if not content.strip():
         raise RecordingError(f"{path} is empty; record or export it again.")
     return content.removeprefix(b"\xef\xbb\xbf")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from icalib.errors import RecordingError
+from icalib.recordings.unreadable import type_not_read
 from icalib.rig import Camera
 
 _MAX_LISTED = 20
@@ -18,6 +19,7 @@ KINDS = {
     "sensor_msgs/msg/PointCloud2": "points",
     "livox_ros_driver/msg/CustomMsg": "points",
     "livox_ros_driver2/msg/CustomMsg": "points",
+    "livox_interfaces/msg/CustomMsg": "points",
     "sensor_msgs/msg/JointState": "joints",
     "nav_msgs/msg/Odometry": "odometry",
     "geometry_msgs/msg/TwistStamped": "twist",
@@ -59,6 +61,7 @@ def choose_topic(where: str, topics: Sequence[TopicInfo], kind: str, sensor: str
     if len(candidates) == 1:
         return candidates[0]
     if not candidates:
+        _refuse_unreadable(f"{where} has no {kind} for {sensor}", topics, kind)
         raise RecordingError(
             f"{where} has no {kind} for {sensor}; {listing(topics)}; record it, or correct the rig file."
         )
@@ -102,9 +105,17 @@ def listing(topics: Sequence[TopicInfo]) -> str:
     return "it holds " + ", ".join(f"{t.name} ({t.type})" for t in topics[:_MAX_LISTED]) + more
 
 
+def _refuse_unreadable(missing: str, topics: Sequence[TopicInfo], kind: str) -> None:
+    """Raises RecordingError where one of `topics` holds what is `missing`, of `kind`, in a form that is not read."""
+    for topic in topics:
+        if (held := type_not_read(topic.type)) and held[0] == kind:
+            raise RecordingError(f"{missing}: {topic.name} ({topic.type}) holds {held[1]}.")
+
+
 def _given(where: str, topics: Sequence[TopicInfo], kind: str, given: str) -> TopicInfo:
     topic = find_topic(where, topics, given)
     if topic.kind != kind:
+        _refuse_unreadable(f"{where} has no {kind} in {given}", [topic], kind)
         raise RecordingError(f"{where}: {given} is {topic.type}, not {kind}; {listing(topics)}; correct `topic`.")
     if not topic.count:
         raise RecordingError(f"{where}: {given} holds no messages; record again with that sensor running.")

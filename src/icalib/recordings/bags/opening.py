@@ -16,6 +16,7 @@ from icalib.recordings.bags.mcap import MCAP_MAGIC, McapStorage
 from icalib.recordings.bags.ros1 import ROS1_MAGIC, Ros1Storage
 from icalib.recordings.bags.sqlite import SQLITE_MAGIC, SqliteStorage
 from icalib.recordings.bags.storage import Storage
+from icalib.recordings.unreadable import HEAD_BYTES, not_data
 
 _READERS = {ROS1_MAGIC: Ros1Storage, MCAP_MAGIC: McapStorage, SQLITE_MAGIC: SqliteStorage}
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
@@ -55,7 +56,7 @@ def open_storage(path: Path, name: Path | None = None) -> Storage:
     name = name or path
     try:
         with path.open("rb") as file:
-            head = file.read(16)
+            head = file.read(HEAD_BYTES)
         if not head:
             raise RecordingError(f"{name} is empty; record or copy it again.")
         for magic, reader in _READERS.items():
@@ -63,6 +64,8 @@ def open_storage(path: Path, name: Path | None = None) -> Storage:
                 return reader(path, name)
         if head.startswith(ZSTD_MAGIC):
             return _open_compressed(path)
+        if sentence := not_data(name, head):
+            raise RecordingError(sentence)
     except OSError as error:
         raise RecordingError(
             f"{name} cannot be read ({error.strerror or error}); check the file and its permissions."

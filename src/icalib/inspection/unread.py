@@ -1,0 +1,15 @@
+"""Topics that look like a sensor's, but hold what icalib does not read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from icalib.inspection.facts import Finding, Inspection
+from icalib.recordings.unreadable import type_not_read
+
+
+def unread(found: Inspection) -> Iterator[Finding]:
+    """Raw packets of LiDARs, and videos."""
+    for stream in found.streams:
+        if stream.topic.count and (held := type_not_read(stream.topic.type)):
+            yield Finding("warning", f"{stream.topic.name} holds {held[1]}.")
