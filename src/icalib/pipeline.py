@@ -22,6 +22,7 @@ from icalib.first_guess.start import start
 from icalib.measurements import CornerStream, Measurements
 from icalib.provenance import provenance
 from icalib.recordings import Recording, read_measurements
+from icalib.recordings.reading import without_jumps
 from icalib.recordings.several import Source, naming, open_all
 from icalib.rig import Camera, Rig
 from icalib.rig_file import load_rig
@@ -91,7 +92,7 @@ def calibrate_measurements(
     if not given:
         raise RecordingError("no recording was given; give at least one.")
     recordings = [m if m.name else dataclasses.replace(m, name=f"recording {k}") for k, m in enumerate(given, 1)]
-    recordings = [streams_of_rig(rig, m) for m in recordings]
+    recordings = [without_jumps(rig, streams_of_rig(rig, m)) for m in recordings]
     # The kernels have threads of their own; those of BLAS beside them double the time.
     with threadpool_limits(limits=1, user_api="blas"):
         return _calibrate(rig, recordings, progress, on_visit)

@@ -33,7 +33,8 @@ class Timing:
 
     rate_hz: of the median interval; jitter_s: RMS of the intervals about their median, gaps left out. A gap is an
     interval longer than 1.5 medians; longest_gap_at_s is seconds after the first stamp. backwards, repeated: how many
-    stamps are before, or the same as, the one in front of them.
+    stamps are before, or the same as, the one in front of them. jumps: how often the clock jumps forward; all else is
+    of the longest part between them.
     """
 
     count: int
@@ -47,6 +48,7 @@ class Timing:
     longest_gap_at_s: float | None
     backwards: int
     repeated: int
+    jumps: int = 0
 
 
 @dataclass(frozen=True)

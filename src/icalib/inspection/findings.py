@@ -203,6 +203,14 @@ def _span(seconds: float) -> str:
 
 
 def _streams(found: Inspection) -> Iterator[Finding]:
+    named = {t.name for t in found.sources.imus.values()}  # whose own notes say it
+    for stream in found.streams:
+        if stream.timing is not None and stream.timing.jumps and stream.topic.name not in named:
+            yield Finding(
+                "warning",
+                f"{stream.topic.name}: the clock jumps forward; the longest part between jumps is used, of "
+                f"{stream.timing.duration_s:.1f} s, unless --from and --to choose another.",
+            )
     imu = _imu_timing(found)
     if imu is not None and imu.rate_hz and imu.duration_s < SHORT_S:
         yield Finding("warning", f"The IMU ran for {imu.duration_s:.1f} s: record for 30 to 90 s.")

@@ -11,6 +11,7 @@ from icalib.inspection.facts import ImuFacts, Vector
 from icalib.measurements import ImuStream
 from icalib.recordings import Recording, TopicInfo
 from icalib.recordings.imu_checks import checked_imu, saturations
+from icalib.recordings.jumps import ClockJumps
 from icalib.rig import ImuSensor
 
 _WINDOW_S, _RATE_HZ = 2.0, 100.0  # over which gravity must stand still; how often it is looked at
@@ -25,9 +26,10 @@ def read_imu(recording: Recording, name: str, topic: TopicInfo) -> tuple[ImuStre
 
 def imu_facts(imu: ImuStream, where: str, frame: str) -> ImuFacts:
     """Figures of `imu`, and in `problem` why it would be refused, if it would."""
-    notes, problem = (), ""
+    notes, problem, jumps = (), "", ClockJumps()
     try:
-        imu, notes = checked_imu(imu, where)
+        imu, notes = checked_imu(jumps.cut(imu, f"{where} ({imu.name})"), where)
+        notes = jumps.notes + notes
     except RecordingError as error:
         problem = str(error)
     fine = np.isfinite(imu.gyro).all(axis=1) & np.isfinite(imu.accel).all(axis=1)

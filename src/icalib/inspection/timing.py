@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from icalib.inspection.facts import Timing
+from icalib.recordings.jumps import longest_part
 
 GAP = 1.5  # medians: halfway between an interval and the one that a lost message leaves
 
@@ -13,6 +14,8 @@ def timing_of(stamps_ns: np.ndarray) -> Timing | None:
     """Figures of the stamps (N,) int64, in the order in which they were recorded; None where there are none."""
     if not len(stamps_ns):
         return None
+    part, jumps = longest_part(stamps_ns)
+    stamps_ns = stamps_ns[part]
     first, last = int(stamps_ns.min()), int(stamps_ns.max())
     steps = np.diff(stamps_ns)
     forward = steps[steps > 0]
@@ -32,6 +35,7 @@ def timing_of(stamps_ns: np.ndarray) -> Timing | None:
         longest_gap_at_s=None if longest is None else int(stamps_ns[longest] - first) * 1e-9,
         backwards=int((steps < 0).sum()),
         repeated=int((steps == 0).sum()),
+        jumps=jumps,
     )
 
 

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from icalib.errors import RecordingError
 from icalib.measurements import CornerStream, Measurements
 from icalib.recordings.base import Recording
 from icalib.recordings.camera_checks import checked_corners
 from icalib.recordings.imu_checks import checked_imu
+from icalib.recordings.jumps import LONGEST_S, ClockJumps
 from icalib.recordings.lidar_checks import checked_lidar
 from icalib.recordings.pose_checks import checked_poses
+from icalib.recordings.sections import S
 from icalib.recordings.topics import image_topics
 from icalib.recordings.wheel_checks import checked_wheels
-from icalib.rig import Camera, Rig
+from icalib.rig import Camera, Lidar, PoseSensor, Rig, Wheels
 
 FindCorners = Callable[[Recording, Camera], tuple[CornerStream, tuple[str, ...]]]
 
@@ -24,29 +27,68 @@ def tables_only(recording: Recording, camera: Camera) -> tuple[CornerStream, tup
 
 
 def read_measurements(recording: Recording, rig: Rig, find: FindCorners = tables_only) -> Measurements:
-    """Read what `rig` asks for from `recording`, and check it; `find` finds corners where there are images.
+    """Read what `rig` asks for from `recording`, and check it; `find` finds corners where there are images. Of a clock
+    that jumps one part is used.
 
     What was dropped or looks odd stands in the notes. Raises RecordingError, one sentence naming the file and the line
     or instant, for data that are missing, unreadable, out of order, in other units, or not of this rig.
     """
-    imu, notes = None, ()
-    tracks = tuple(recording.tracks(c) for c in rig.cameras if c.tracks is not None)
+    imu, notes, jumps = None, (), ClockJumps(LONGEST_S)
     if rig.imu is not None:
-        imu, notes = checked_imu(recording.imu(rig.imu), recording.where(rig.imu))
-    cameras, seen = _corners(recording, rig, find)
-    lidars = [checked_lidar(recording.lidar(s), recording.where(s)) for s in rig.lidars]
-    wheels = [checked_wheels(recording.wheels(w), w, recording.where(w)) for w in rig.wheels]
-    poses = [checked_poses(recording.poses(s), s, recording.where(s)) for s in rig.poses]
+        where = recording.where(rig.imu)
+        imu, notes = checked_imu(jumps.cut(recording.imu(rig.imu), f"{where} ({rig.imu.name})"), where)
+    cut = jumps.cut if is_timed(rig) else _whole
+    tracks = tuple(cut(recording.tracks(c), f"the tracks of {c.name}") for c in rig.cameras if c.tracks is not None)
+    cameras, seen = _corners(recording, rig, find, cut)
+
+    def read(stream: S, sensor: Lidar | Wheels | PoseSensor) -> tuple[S, str]:
+        where = recording.where(sensor)
+        return cut(stream, f"{where} ({sensor.name})"), where
+
+    lidars = [checked_lidar(*read(recording.lidar(s), s)) for s in rig.lidars]
+    wheels = [checked_wheels(stream, w, where) for w in rig.wheels for stream, where in [read(recording.wheels(w), w)]]
+    poses = [checked_poses(stream, s, where) for s in rig.poses for stream, where in [read(recording.poses(s), s)]]
     notes = sum((found for _, found in (*lidars, *wheels, *poses)), notes + seen)
     return Measurements(
-        imu, cameras, recording.notes() + notes, tracks=tracks,
+        imu, cameras, recording.notes() + jumps.notes + notes, tracks=tracks,
         lidars=tuple(stream for stream, _ in lidars), wheels=tuple(stream for stream, _ in wheels),
         poses=tuple(stream for stream, _ in poses),
     )  # fmt: skip
 
 
-def _corners(recording: Recording, rig: Rig, find: FindCorners) -> tuple[tuple[CornerStream, ...], tuple[str, ...]]:
-    """Of each camera that sees the target, from its table or its images, checked; and notes."""
+def is_timed(rig: Rig) -> bool:
+    """Whether clocks count: cameras alone only need to know which images were taken together."""
+    return rig.imu is not None or len(rig.wheels) + len(rig.poses) > 0
+
+
+def without_jumps(rig: Rig, measurements: Measurements) -> Measurements:
+    """The same of measurements in memory. What was read from files has no jumps any more."""
+    m, jumps = measurements, ClockJumps(LONGEST_S)
+    if not is_timed(rig):
+        return m
+
+    def cut(streams: tuple[S, ...]) -> tuple[S, ...]:
+        return tuple(jumps.cut(s, s.name) for s in streams)
+
+    (imu,) = (None,) if m.imu is None else cut((m.imu,))
+    tracks, cameras, lidars, wheels, poses = map(cut, (m.tracks, m.cameras, m.lidars, m.wheels, m.poses))
+    if not jumps.notes:
+        return m
+    return replace(
+        m, imu=imu, tracks=tracks, cameras=cameras, lidars=lidars, wheels=wheels, poses=poses,
+        notes=m.notes + jumps.notes,
+    )  # fmt: skip
+
+
+def _whole(stream: S, what: str) -> S:
+    del what
+    return stream
+
+
+def _corners(
+    recording: Recording, rig: Rig, find: FindCorners, cut: Callable[[CornerStream, str], CornerStream]
+) -> tuple[tuple[CornerStream, ...], tuple[str, ...]]:
+    """Of each camera that sees the target, from its table or its images, cut and checked; and notes."""
     seeing = [c for c in rig.cameras if rig.has_target and (c.tracks is None or recording.sees(c))]
     pictured = [c for c in seeing if not recording.has_corners(c)]
     image_topics(recording, pictured)
@@ -56,7 +98,8 @@ def _corners(recording: Recording, rig: Rig, find: FindCorners) -> tuple[tuple[C
             corners, found = find(recording, camera)
         else:
             corners, found = recording.corners(camera, rig.target), ()
-        corners, dropped = checked_corners(corners, recording.where(camera), camera.resolution)
+        where = recording.where(camera)
+        corners, dropped = checked_corners(cut(corners, f"{where} ({camera.name})"), where, camera.resolution)
         cameras.append(corners)
         notes = notes + found + dropped
     return tuple(cameras), notes

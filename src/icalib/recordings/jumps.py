@@ -1,0 +1,93 @@
+"""Clocks that jump forward: set by GPS or over the network while they run, or counting from 0 until then.
+
+Before and after a jump the stamps are good, but hours lie between. The time offset of a sensor is another one on each
+side, so one side is used; and nothing may be as large as the time between.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from icalib.errors import RecordingError
+from icalib.recordings.clocks import usual_step
+from icalib.recordings.sections import S, Stamped, section
+
+JUMP_S = 600.0  # longer steps are no pause of a recording
+LONGEST_S = 6 * 3600.0  # of a calibration: memory grows with the time between the first stamp and the last
+JUMP_STEPS = 1000.0  # usual steps: so long a pause of a stream of single instants is none
+_FARTHEST_NS = 2**62  # from zero: differences of stamps are int64
+
+
+class ClockJumps:
+    """Cuts the streams of one recording where clocks jump. The first that jumps keeps its longest part; those that jump
+    as often share its clock, and keep the same part. `notes` says what was cut. longest_s: no part may be longer."""
+
+    def __init__(self, longest_s: float = np.inf) -> None:
+        self.notes: tuple[str, ...] = ()
+        self._longest_s = longest_s
+        self._kept: dict[int, int] = {}  # which part, by how many there are
+
+    def cut(self, stream: S, what: str) -> S:
+        """The part between two jumps; `what` names the stream. Raises RecordingError for stamps beyond 2^62 ns, and for
+        a part that is too long."""
+        _refuse_far(stream.stamps_ns, what)
+        cuts = _cuts(stream.stamps_ns)
+        parts = list(pairwise(cuts))
+        if len(parts) < 2:
+            self._refuse_long(stream, what)
+            return stream
+        longest = int(np.argmax([_seconds(stream, *part) for part in parts]))
+        kept = parts[self._kept.setdefault(len(parts), longest)]
+        self.notes += (_note(stream, what, cuts, kept),)
+        stream = section(stream, *kept)
+        self._refuse_long(stream, what)
+        return stream
+
+    def _refuse_long(self, stream: Stamped, what: str) -> None:
+        if len(stream.stamps_ns) and (length := _seconds(stream, 0, len(stream.stamps_ns))) > self._longest_s:
+            raise RecordingError(
+                f"{what}: the stamps run over {length / 3600.0:.4g} h, and a calibration takes up to "
+                f"{self._longest_s / 3600.0:g} h; choose a part by --from and --to."
+            )
+
+
+def longest_part(stamps_ns: np.ndarray) -> tuple[slice, int]:
+    """The longest part between jumps of stamps (N,), and how many jumps there are."""
+    parts = list(pairwise(_cuts(stamps_ns)))
+    best = max(parts, key=lambda part: stamps_ns[part[1] - 1] - stamps_ns[part[0]] if part[1] else 0)
+    return slice(*best), len(parts) - 1
+
+
+def _cuts(stamps_ns: np.ndarray) -> list[int]:
+    """Where parts begin, and the number of stamps."""
+    if len(stamps_ns) < 2:
+        return [0, len(stamps_ns)]
+    limit_ns = max(JUMP_S * 1e9, JUMP_STEPS * usual_step(stamps_ns))
+    return [0, *(np.flatnonzero(np.diff(stamps_ns) > limit_ns) + 1).tolist(), len(stamps_ns)]
+
+
+def _refuse_far(stamps: np.ndarray, what: str) -> None:
+    far = (stamps > _FARTHEST_NS) | (stamps < -_FARTHEST_NS)
+    if far.any():
+        raise RecordingError(
+            f"{what}: the stamp {stamps[np.argmax(far)]} ns is more than a hundred years from 1970; correct the "
+            "clock, or remove it."
+        )
+
+
+def _seconds(stream: Stamped, begin: int, end: int) -> float:
+    return float(stream.stamps_ns[end - 1] - stream.stamps_ns[begin]) * 1e-9
+
+
+def _note(stream: Stamped, what: str, cuts: Sequence[int], kept: tuple[int, int]) -> str:
+    stamps = stream.stamps_ns
+    jump = cuts[1]
+    more = f" (and {len(cuts) - 3} more times)" if len(cuts) > 3 else ""
+    return (
+        f"{what}: the clock jumps forward by {_seconds(stream, jump - 1, jump + 1):.6g} s{more} after the stamp "
+        f"{stamps[jump - 1]} ns, {_seconds(stream, 0, jump):.6g} s from the start; used are the "
+        f"{_seconds(stream, *kept):.6g} s from {stamps[kept[0]]} ns on. --from and --to choose another part."
+    )
