@@ -83,7 +83,7 @@ def test_a_bad_second_recording_is_named(folder: Path, capsys, missing: str):
 
 def test_a_broken_line_of_the_second_recording_is_named(folder: Path, capsys):
     path = folder / "evening" / "cam0" / "corners.csv"
-    path.write_text(path.read_text().replace("\n", "\nnonsense\n", 1))
+    path.write_text(path.read_text().replace("\n", "\nnonsense\n"))
     assert run(folder, *PARTS) == 1
     assert re.fullmatch(r"icalib: .*evening.*corners\.csv.*2.*\n", capsys.readouterr().err)
 

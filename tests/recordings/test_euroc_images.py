@@ -60,3 +60,26 @@ def test_table_that_cannot_be_read(tmp_path, truth, write):
     root = write.euroc(tmp_path, truth)
     (root / "mav0/cam0/data.csv").write_bytes(b"\xff\xfe1,\0")
     assert "cam0/data.csv cannot be read" in complaint(lambda: list(open_recording(root).images("cam0")))
+
+
+def test_names_with_another_ending(tmp_path, truth, write):
+    root = write.euroc(tmp_path, truth)
+    table, data = root / "mav0/cam0/data.csv", root / "mav0/cam0/data"
+    table.write_text(table.read_text().replace(".png", ".jpg"))
+    recording = open_recording(root)
+    assert [f.stamp_ns for f in recording.images("cam0")] == truth.image_stamps
+    assert "12 images were found under the same name with another ending" in recording.notes()[0]
+    table.write_text(table.read_text().replace(",", ",away_"))
+    sentence = complaint(lambda: list(open_recording(root).images("cam0")))
+    assert f"data.csv names away_{truth.image_stamps[0]}.jpg, and " in sentence
+    assert "none of its 12 images is there; correct the names, or copy the images" in sentence
+    assert data.is_dir()
+
+
+@pytest.mark.parametrize("separator", [",", "; ", "\t", " "])
+def test_a_table_in_other_units(tmp_path, truth, write, separator):
+    root = write.euroc(tmp_path, truth)
+    files = sorted((root / "mav0/cam0/data").iterdir())
+    rows = [f"{t // 10**9}.{t % 10**9:09d}{separator}{f.name}" for t, f in zip(truth.image_stamps, files, strict=True)]
+    (root / "mav0/cam0/data.csv").write_text("\n".join(["timestamp filename", *rows]))
+    assert [f.stamp_ns for f in open_recording(root).images("cam0")] == truth.image_stamps

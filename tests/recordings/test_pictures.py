@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from icalib.errors import RecordingError
+from icalib.inspection.sources import find_sources
 from icalib.recordings import FolderRecording, PictureFolder, open_recording
 from icalib.rig import Camera, ImuNoise, ImuSensor
 
@@ -74,6 +75,66 @@ def test_an_imu_needs_a_clock(tmp_path):
     picture(tmp_path / "1.png", 1)
     with pytest.raises(RecordingError, match="take the IMU out of the rig file"):
         open_recording(tmp_path).imu(ImuSensor("imu0", "imu0/data.csv", ImuNoise(1, 1, 1, 1)))
+
+
+STAMPS = [1_700_000_000_123_456_789 + 100_000_000 * k for k in range(4)]
+NAMES = {
+    "ns": [f"{t}" for t in STAMPS],
+    "us": [f"frame_{t // 1000}" for t in STAMPS],
+    "ms": [f"{t // 1_000_000}" for t in STAMPS],
+    "s": [f"left-{t // 10**9}.{t % 10**9:09d}" for t in STAMPS],
+}
+
+
+@pytest.mark.parametrize("unit", NAMES)
+def test_names_that_are_stamps(tmp_path, unit):
+    digits = {"ms": 1_000_000, "us": 1000}.get(unit, 1)
+    for k, name in enumerate(NAMES[unit]):
+        picture(tmp_path / "left" / f"{name}.png", 10 + k)
+        picture(tmp_path / "right" / f"{name}.png", 30 + k)
+    recording = open_recording(tmp_path)
+    for side in ("left", "right"):
+        assert recording.stamps(side).tolist() == [t // digits * digits for t in STAMPS]
+    with pytest.raises(RecordingError, match=r"holds pictures, and no readings of imu0; write imu0\.csv beside"):
+        recording.imu(ImuSensor("imu0", "imu0/data.csv", ImuNoise(1, 1, 1, 1)))
+    picture(tmp_path / "left" / f"x{NAMES[unit][0].removeprefix('left-').removeprefix('frame_')}.png", 1)
+    with pytest.raises(RecordingError, match="have the same stamp, 1"):
+        recording.stamps("left")
+
+
+def test_a_pattern_whose_star_is_a_stamp(tmp_path):
+    for k, t in enumerate(STAMPS):
+        picture(tmp_path / f"{t}_0.png", 10 + k)
+        picture(tmp_path / f"{t}_1.png", 30 + k)
+    assert open_recording(tmp_path).stamps("*_1.png").tolist() == STAMPS
+
+
+def test_dates_of_a_camera_are_no_stamps(tmp_path):
+    for k in range(3):
+        picture(tmp_path / f"IMG_20240131_12345{k}.png", 10 + k)
+    assert open_recording(tmp_path).stamps(".").tolist() == [123450 * 10**9, 123451 * 10**9, 123452 * 10**9]
+
+
+def test_kalibrs_folder(tmp_path):
+    for k, t in enumerate(STAMPS):
+        picture(tmp_path / "cam0" / f"{t}.png", 10 + k)
+    head = "timestamp,omega_x,omega_y,omega_z,alpha_x,alpha_y,alpha_z\n"
+    (tmp_path / "imu0.csv").write_text(head + "".join(f"{t},1,2,3,4,5,6\n" for t in STAMPS))
+    recording = open_recording(tmp_path)
+    assert isinstance(recording, FolderRecording)
+    assert [f.stamp_ns for f in recording.images("cam0")] == STAMPS
+    imu = recording.imu(ImuSensor("imu0", "imu0/data.csv", ImuNoise(1, 1, 1, 1)))
+    assert imu.stamps_ns.tolist() == STAMPS and imu.accel[0].tolist() == [4, 5, 6]
+    assert [(t.name, t.kind, t.count) for t in recording.topics()] == [("cam0", "image", 4), ("imu0.csv", "imu", 4)]
+    assert recording.stamps("imu0.csv").tolist() == STAMPS
+    found = find_sources(recording.topics())
+    assert [c.name for c in found.cameras] == ["cam0"] and list(found.imus) == ["imu0"]
+
+
+def test_a_table_of_something_else_beside_pictures(tmp_path):
+    picture(tmp_path / "left" / "1.png", 1)
+    (tmp_path / "notes.csv").write_text("picture,good\n1,yes\n")
+    assert isinstance(open_recording(tmp_path), PictureFolder)
 
 
 def test_folders_of_tables_and_of_euroc_stay_what_they_are(tmp_path):

@@ -63,7 +63,7 @@ def _by_key(topics: list[TopicInfo]) -> dict[Key, list[TopicInfo]]:
 
 
 def _key(topic: TopicInfo) -> Key:
-    return tuple(p for p in topic.name.split("/") if p and not _WHAT.fullmatch(p))
+    return tuple(p.removesuffix(".csv") for p in topic.name.split("/") if p and not _WHAT.fullmatch(p))
 
 
 def _names(sensors: list[tuple[Key, str]]) -> list[str]:

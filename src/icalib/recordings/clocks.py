@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from fractions import Fraction
+
 import numpy as np
 
 from icalib.rig import TimeUnit
@@ -34,6 +37,19 @@ def unit_of_stamps(stamps: np.ndarray, slowest_hz: float, fastest_hz: float) -> 
     dated: list[TimeUnit] = [u for u in possible if _DATES_S[0] <= size * seconds[u] <= _DATES_S[1]]
     usual: list[TimeUnit] = [u for u in possible if _USUAL_S[0] <= step * len(stamps) * seconds[u] < _USUAL_S[1]]
     return next((found[0] for found in (dated, possible, usual) if len(found) == 1), None)
+
+
+def unit_by_date(numbers: Sequence[float]) -> TimeUnit | None:
+    """The unit in which all are dates since 1998; None where there is none."""
+    for unit, power in POWERS_OF_NS.items():
+        if all(_DATES_S[0] <= number * 10.0 ** (power - 9) <= _DATES_S[1] for number in numbers):
+            return unit
+    return None
+
+
+def nanoseconds(text: str, unit: TimeUnit) -> int:
+    """A plain decimal number of the unit, exactly, and beyond nanoseconds rounded."""
+    return round(Fraction(text) * 10 ** POWERS_OF_NS[unit])
 
 
 def rate_sentence(what: str, stamps_ns: np.ndarray, slowest_hz: float, fastest_hz: float) -> str | None:

@@ -1,34 +1,59 @@
-"""Images in a folder, as EuRoC has them: `cam0/data/*.png`, and `cam0/data.csv` with t [ns], file name."""
+"""Images in a folder, as EuRoC has them: `cam0/data/*.png`, and `cam0/data.csv` with t [ns], file name; or as Kalibr's
+bagcreater takes them: `cam0/STAMP.png`."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from icalib.errors import RecordingError
-from icalib.recordings.image_checks import Note
+from icalib.recordings.clocks import nanoseconds, unit_by_date, unit_of_stamps
+from icalib.recordings.image_checks import Note, ignore
 from icalib.recordings.images import Payload, file_payload
 from icalib.recordings.unreadable import HEAD_BYTES, not_data
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
+_RATE_HZ = (1e-3, 1000.0)
+_STAMPED = re.compile(r"[^0-9]*?(?P<stamp>[0-9]{9,19}(\.[0-9]+)?)")  # of a file's name, behind a word such as left_
 
 
-def image_files(folder: Path) -> list[tuple[int, Path]]:
+def image_files(folder: Path, note: Note = ignore) -> list[tuple[int, Path]]:
     """Stamps [ns] and files of the images of `folder`, in the order of its data.csv; without one, by the files' names.
 
-    Empty where there is no folder `data` of images. Raises RecordingError naming the line that cannot be read.
+    They lie in the folder `data`, or, where their names are dates, in `folder` itself. Empty where there are none.
+    `note` is told where names have another ending. Raises RecordingError naming the line that cannot be read.
     """
     data = folder / "data"
-    there = sorted(p for p in data.iterdir() if p.suffix.lower() in SUFFIXES) if data.is_dir() else []
+    there = pictures_in(data)
     if not there:
-        return []
+        return stamped_by_name(pictures_in(folder)) or []
     table = folder / "data.csv"
     if table.is_file():
-        return _listed(table, data)
+        return _with_other_endings(_listed(table, data), there, table, note)
+    if named := stamped_by_name(there):
+        return named
     unnamed = next((p for p in there if not p.stem.isdecimal()), None)
     if unnamed:
         raise RecordingError(f"{folder} has no data.csv, and {unnamed.name} is no stamp in ns; write t [ns],file name.")
     return sorted((int(p.stem), p) for p in there)
+
+
+def pictures_in(folder: Path) -> list[Path]:
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES) if folder.is_dir() else []
+
+
+def stamped_by_name(files: Sequence[Path], names: Sequence[str] = ()) -> list[tuple[int, Path]] | None:
+    """Stamps [ns] and files, in order, where the names of all are instants since 1970 in one unit; None where not.
+    names: those parts of their names that say it, else what is before their ending."""
+    found = [_STAMPED.fullmatch(name) for name in names or [p.stem for p in files]]
+    texts = [m["stamp"] for m in found if m]
+    unit = unit_by_date([float(text) for text in texts]) if len(texts) == len(files) else None
+    if unit is None or not files:
+        return None
+    return sorted((nanoseconds(text, unit), p) for text, p in zip(texts, files, strict=True))
 
 
 def file_payloads(files: list[tuple[int, Path]], where: str, note: Note) -> Iterator[Payload]:
@@ -55,18 +80,48 @@ def file_payloads(files: list[tuple[int, Path]], where: str, note: Note) -> Iter
 
 
 def _listed(table: Path, data: Path) -> list[tuple[int, Path]]:
-    files: list[tuple[int, Path]] = []
+    """What data.csv says: stamps [ns], of whatever unit, and files."""
+    rows: list[tuple[int, str, str]] = []
     try:
         lines = table.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise RecordingError(f"{table} cannot be read ({error}); copy it again.") from error
     for number, line in enumerate(lines, 1):
-        stamp, comma, name = (part.strip() for part in line.partition(","))
-        if not line.strip() or stamp.startswith("#") or (not files and stamp[:1].isalpha()):
+        stamp, name = (*(part.strip() for part in re.split(r"[,;\s]", line.strip(), maxsplit=1)), "")[:2]
+        if not line.strip() or stamp.startswith("#") or (not rows and stamp[:1].isalpha()):
             continue
-        if not stamp.isdecimal() or not comma or not name:
-            raise RecordingError(f"{table}:{number}: {line.strip()[:60]!r} is not t [ns],file name; correct the line.")
-        files.append((int(stamp), data / name))
-    if not files:
+        if not re.fullmatch(r"[0-9]+(\.[0-9]*)?", stamp) or not name:
+            raise RecordingError(_line_sentence(table, number, line))
+        rows.append((number, stamp, name.strip(",; ")))
+    if not rows:
         raise RecordingError(f"{table} holds no rows; write one line for each image, t [ns],file name.")
-    return files
+    numbers = np.array([float(stamp) for _, stamp, _ in rows])
+    unit = unit_of_stamps(numbers, *_RATE_HZ) if len(rows) > 1 else unit_by_date(numbers.tolist())
+    unit = unit or "ns"
+    if unit == "ns":
+        for number, stamp, _ in rows:
+            if not stamp.isdecimal():
+                raise RecordingError(_line_sentence(table, number, lines[number - 1]))
+    return [(nanoseconds(stamp, unit), data / name) for _, stamp, name in rows]
+
+
+def _line_sentence(table: Path, number: int, line: str) -> str:
+    return f"{table}:{number}: {line.strip()[:60]!r} is not t [ns],file name; correct the line."
+
+
+def _with_other_endings(
+    listed: list[tuple[int, Path]], there: Sequence[Path], table: Path, note: Note
+) -> list[tuple[int, Path]]:
+    """The images under the names that they have, where those of the table differ in their ending."""
+    if any(path.is_file() for _, path in listed):
+        return listed
+    by_stem = {p.stem: p for p in there}
+    found = [(stamp, by_stem.get(path.stem, path)) for stamp, path in listed]
+    same = sum(path.stem in by_stem for _, path in listed)
+    names = f"{table} names {listed[0][1].name}, and {table.parent / 'data'} holds {there[0].name}"
+    if not same:
+        raise RecordingError(
+            f"{names}: none of its {len(listed)} images is there; correct the names, or copy the images."
+        )
+    note(f"{names}: {same} images were found under the same name with another ending.")
+    return found

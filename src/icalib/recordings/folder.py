@@ -20,7 +20,7 @@ from icalib.recordings.lidar_checks import Sieve, sifted
 from icalib.recordings.poses import FILES as POSE_FILES
 from icalib.recordings.poses import POSES, PoseReadings, is_tum_text, read_pose_file
 from icalib.recordings.scans import in_seconds, read_scan_stamps, read_scans
-from icalib.recordings.table import holds, read_table
+from icalib.recordings.table import holds, named, read_table
 from icalib.recordings.topics import TopicInfo, choose_topic, find_topic
 from icalib.recordings.tracks import read_tracks
 from icalib.recordings.unreadable import VIDEO_FILE, is_video
@@ -49,6 +49,7 @@ class FolderRecording:
     IMU: t [ns], wx, wy, wz [rad/s], ax, ay, az [m/s^2], which is also EuRoC's `imu0/data.csv`. Corners: t [ns], tag id,
     corner (as the target names its points), u, v [px]. Scans of a LiDAR: arrays (`scans`). Wheels: tables
     (`wheels`). Poses: tables, TUM's text (`poses`). Images: the folder `data` beside a `data.csv` of t [ns], file name.
+    Kalibr's `cam0/STAMP.png` beside `imu0.csv` is found, too.
     """
 
     def __init__(self, root: Path) -> None:
@@ -68,6 +69,8 @@ class FolderRecording:
                 stamps_ns = np.unique(read_table(table, _CORNERS).integers[:, 0])
                 found.append(_info(f"{folder.name}/corners.csv", "table of corners", "corners", stamps_ns))
             found += [_info(f"{folder.name}/{table.name}", *what, _stamps(table)) for table, what in _robot(folder)]
+        for table in sorted(p for base in self._bases() for p in base.glob("*.csv")):
+            found += _single(table)
         return (*found, *self._videos())
 
     def stamps(self, topic: str) -> np.ndarray:
@@ -90,7 +93,8 @@ class FolderRecording:
         folder = next(p for base in self._bases() if (p := base / name).is_dir())
         if (folder / "data.csv").is_file():
             self._remember(folder / "data.csv")
-        return checked_payloads(file_payloads(image_files(folder), str(folder), self._note), str(folder), self._note)
+        files = image_files(folder, self._note)
+        return checked_payloads(file_payloads(files, str(folder), self._note), str(folder), self._note)
 
     def images(self, topic: str) -> Iterator[Frame]:
         return frames(self.payloads(topic), f"{self.root}/{topic}", self._note)
@@ -177,6 +181,8 @@ class FolderRecording:
     def _find(self, path_hint: str) -> Path | None:
         plain = path_hint.removesuffix(".gz")
         names = (path_hint, plain, plain + ".gz")
+        if len(parts := Path(plain).parts) == 2 and parts[1] != "corners.csv":
+            names += (f"{parts[0]}.csv",)  # as Kalibr's bagcreater takes them
         return next(
             (p for folder in (self.root, self.root / "mav0") for n in names if (p := folder / n).is_file()), None
         )
@@ -198,8 +204,21 @@ class FolderRecording:
         return f"it holds {', '.join(found[:_MAX_LISTED])}{more}"
 
 
+def has_named_table(folder: Path) -> bool:
+    """Whether a table of an IMU or a pose sensor, whose header says so, lies in `folder` itself."""
+    return any(named(p, kind) for p in sorted(folder.glob("*.csv")) for kind in (IMU, POSES))
+
+
 def _existing(folder: Path, name: str) -> Path | None:
     return next((p for p in (folder / name, folder / f"{name}.gz") if p.is_file()), None)
+
+
+def _single(table: Path) -> list[TopicInfo]:
+    """Of an IMU or a pose sensor, where a table beside the folders names their columns."""
+    for kind, what in ((IMU, ("table of readings", "imu")), (POSES, ("table of poses", "pose"))):
+        if named(table, kind):
+            return [_info(table.name, *what, read_table(table, kind).integers[:, 0])]
+    return []
 
 
 def _robot(folder: Path) -> Iterator[tuple[Path, tuple[str, str]]]:

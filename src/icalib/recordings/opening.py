@@ -8,7 +8,7 @@ from icalib.errors import RecordingError
 from icalib.recordings.bag import BagRecording
 from icalib.recordings.bags.opening import bag_files
 from icalib.recordings.base import Recording
-from icalib.recordings.folder import FolderRecording
+from icalib.recordings.folder import FolderRecording, has_named_table
 from icalib.recordings.pictures import PictureFolder, has_pictures
 from icalib.recordings.unreadable import HEAD_BYTES, not_data
 
@@ -53,4 +53,6 @@ def _holds_bags(folder: Path) -> bool:
 
 
 def _holds_tables(folder: Path) -> bool:
-    return any(p for pattern in ("*/*.csv", "*/*.csv.gz", "mav0", "*/data") for p in folder.glob(pattern))
+    if any(p for pattern in ("*/*.csv", "*/*.csv.gz", "mav0", "*/data") for p in folder.glob(pattern)):
+        return True
+    return has_named_table(folder)

@@ -1,6 +1,7 @@
 """Recordings that are folders of pictures without clocks: a phone's, or those of cameras that were triggered by hand.
 
-A picture's number, the last one in its name, says when it was taken: pictures of the same number were taken together.
+A picture's name says when it was taken: by its stamp since 1970, in s, ms, us or ns, or else by the last number in it.
+Pictures of the same stamp or number were taken together.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 from icalib.errors import RecordingError
 from icalib.geometry.targets import Target
 from icalib.measurements import CornerStream, ImuStream, LidarStream, TrackStream, WheelPoses
-from icalib.recordings.euroc_images import SUFFIXES, file_payloads
+from icalib.recordings.euroc_images import SUFFIXES, file_payloads, pictures_in, stamped_by_name
 from icalib.recordings.image_checks import checked_payloads, frames
 from icalib.recordings.images import Frame, Payload
 from icalib.recordings.poses import PoseReadings
@@ -65,8 +66,14 @@ class PictureFolder:
         return frames(self.payloads(topic), f"{self.root}/{topic}", self._note)
 
     def imu(self, sensor: ImuSensor) -> ImuStream:
+        where, (name, *_) = str(self.root), _topics(self.root)
+        if stamped_by_name(pictures_in(self.root / name)):
+            raise RecordingError(
+                f"{where} holds pictures, and no readings of {sensor.name}; write {sensor.name}.csv beside their "
+                "folders, or take the IMU out of the rig file to calibrate the cameras alone."
+            )
         raise RecordingError(
-            f"{self.root} holds pictures without a clock, and {sensor.name} needs one; take the IMU out of the "
+            f"{where} holds pictures without a clock, and {sensor.name} needs one; take the IMU out of the "
             "rig file to calibrate the cameras alone, or give data.csv with the stamps of the images."
         )
 
@@ -112,7 +119,7 @@ class PictureFolder:
         try:
             stamps = [stamp for stamp, _ in self._files(name)]
         except RecordingError:  # a pattern may tell apart what one folder mixes
-            return TopicInfo(name, "pictures", "image", len(_pictures(self.root / name)), None, None)
+            return TopicInfo(name, "pictures", "image", len(pictures_in(self.root / name)), None, None)
         return TopicInfo(name, "pictures", "image", len(stamps), stamps[0], stamps[-1])
 
     def _files(self, topic: str) -> list[tuple[int, Path]]:
@@ -122,33 +129,31 @@ class PictureFolder:
             paths = [p for p in self.root.glob(topic) if p.suffix.lower() in SUFFIXES]
             keys = [str(p.relative_to(self.root))[len(before) : -len(after) or None] for p in paths]
         else:
-            paths = _pictures(self.root / topic)
+            paths = pictures_in(self.root / topic)
             keys = [p.stem for p in paths]
         if not paths:
             raise RecordingError(f"{self.root} has no pictures {topic}; correct `topic` of the camera in the rig file.")
-        found = sorted((_number(key, p), p) for key, p in zip(keys, paths, strict=True))
+        found = stamped_by_name(paths, keys)
+        what = "number" if found is None else "stamp"
+        found = found or sorted((_number(key, p), p) for key, p in zip(keys, paths, strict=True))
         for (a, first), (b, second) in zip(found, found[1:], strict=False):
             if a == b:
                 raise RecordingError(
-                    f"{first} and {second.name} have the same number, {a}; give each picture of a camera its own."
+                    f"{first} and {second.name} have the same {what}, {a}; give each picture of a camera its own."
                 )
-        return [(number * APART_NS, path) for number, path in found]
+        return [(at * (APART_NS if what == "number" else 1), path) for at, path in found]
 
 
 def _topics(root: Path) -> list[str]:
-    folders = sorted(p.name for p in root.iterdir() if p.is_dir() and _pictures(p)) if root.is_dir() else []
-    return [*(["."] if _pictures(root) else []), *folders]
-
-
-def _pictures(folder: Path) -> list[Path]:
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES) if folder.is_dir() else []
+    folders = sorted(p.name for p in root.iterdir() if p.is_dir() and pictures_in(p)) if root.is_dir() else []
+    return [*(["."] if pictures_in(root) else []), *folders]
 
 
 def _number(key: str, path: Path) -> int:
     groups = re.findall(r"\d+", key)
     if not groups or int(groups[-1]) > MOST:
         raise RecordingError(
-            f"{path} has no number in its name that says which picture it is; call pictures 0001.jpg, 0002.jpg, ..., "
-            "the same number for those taken together."
+            f"{path} has no number in its name that says which picture it is, nor a stamp since 1970; call pictures "
+            "0001.jpg, 0002.jpg, ..., the same number for those taken together."
         )
     return int(groups[-1])

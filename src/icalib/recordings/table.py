@@ -90,6 +90,14 @@ def holds(path: Path, kind: TableKind) -> bool:
     return places_by_name(kind, text.header) is not None or text.columns == len(kind.names)
 
 
+def named(path: Path, kind: TableKind) -> bool:
+    """Whether the header of a table names the columns of this kind; not of what is no table at all."""
+    try:
+        return places_by_name(kind, _text_of(path).header) is not None
+    except RecordingError:
+        return False
+
+
 def _text_of(path: Path) -> _Text:
     content = _read_bytes(path)
     begin, line, before = _skip_header(content)
