@@ -240,7 +240,6 @@ BROKEN: list[tuple[Callable[[Tables], None], str]] = [
     (degrees, r"deg/s"),
     (slow_degrees, r"deg/s"),
     (degrees_from_radians, r"imu0 turns 0\.017"),
-    (units_of_g, r"units of g"),
     (tag_size_halved, r"tag_size"),
     (other_focal_length, r"intrinsics|tag_size|focal"),
     (mirrored_images, r"cam0 would see the target from behind.*mirrored"),
@@ -358,6 +357,13 @@ def test_repeated_readings_are_dropped(tables, tmp_path, good):
     found = calibrated(tables, tmp_path)
     assert any("repeated" in n for n in found.notes)
     same(found, good, 1e-6, 1e-8, 1e-9)
+
+
+def test_units_of_g_are_recognised(tables, tmp_path, good):
+    units_of_g(tables)
+    found = calibrated(tables, tmp_path)
+    assert any("accelerometer is in units of g" in n for n in found.notes), found.notes
+    same(found, good, 1e-4, 1e-5, 1e-6)
 
 
 def test_a_short_gap_in_the_imu_is_bridged(tables, tmp_path, good):

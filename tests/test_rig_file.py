@@ -13,8 +13,8 @@ import yaml
 from icalib.errors import CalibrationError, RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard
 from icalib.imu_classes import IMU_CLASSES, class_noise
-from icalib.rig import Rig, Settings
-from icalib.rig_file import load_rig, rig_to_dict
+from icalib.rig import Rig, Settings, TwoSources
+from icalib.rig_file import load_rig, rig_from_dict, rig_to_dict
 
 VALID = """\
 sensors:
@@ -109,6 +109,33 @@ def test_topics_of_a_bag(tmp_path):
     assert rig.cameras[1].path == "cam1/corners.csv"
     again = load(tmp_path, yaml.safe_dump(rig_to_dict(rig)))
     assert (again.imu.topic, [c.topic for c in again.cameras]) == ("/imu/data", [None, "/right/image_raw"])
+
+
+def test_units_axes_and_sources_of_an_imu(tmp_path):
+    extra = """    topic: {gyro: /a, accel: /b}
+    accel_unit: g
+    gyro_unit: deg/s
+    accel_axes: [x, -y, -z]
+    gyro_axes: [z, x, y]
+"""
+    rig = load(tmp_path, edited("    type: imu\n", "    type: imu\n" + extra))
+    assert rig.imu.topic == TwoSources("/a", "/b")
+    assert (rig.imu.accel_unit, rig.imu.gyro_unit) == ("g", "deg/s")
+    assert (rig.imu.accel_axes, rig.imu.gyro_axes) == (("x", "-y", "-z"), ("z", "x", "y"))
+    assert rig_from_dict(rig_to_dict(rig), "again").imu == rig.imu
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("accel_unit: mg", "there is no such unit as 'mg'"),
+        ("gyro_axes: [x, x, z]", "gyro_axes: must name the columns"),
+        ("accel_axes: [x, y]", "accel_axes: must name the columns"),
+        ("topic: {gyro: /a}", "accel is missing"),
+    ],
+)
+def test_wrong_units_axes_and_sources_of_an_imu(tmp_path, line, words):
+    assert words in complaint(tmp_path, edited("    type: imu\n", f"    type: imu\n    {line}\n"))
 
 
 @pytest.mark.parametrize("name", IMU_CLASSES)

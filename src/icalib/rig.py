@@ -66,15 +66,33 @@ class ImuNoise:
 
 
 @dataclass(frozen=True)
+class TwoSources:
+    """Topics or tables of an IMU whose gyroscope and accelerometer report apart."""
+
+    gyro: str
+    accel: str
+
+
+AccelUnit = Literal["m/s^2", "g"]
+GyroUnit = Literal["rad/s", "deg/s"]
+Axes = tuple[str, str, str]  # the columns that become x, y, z, each with its sign: ("x", "-y", "-z")
+
+
+@dataclass(frozen=True)
 class ImuSensor:
-    """The inertial sensor; its frame is the body frame. assumed: there is none, but an assumption of smooth motion in
+    """The inertial sensor; its frame is the body frame. Units and axes: of the readings as they are recorded; None: SI
+    units (g is recognised), and the axes as they are. assumed: there is none, but an assumption of smooth motion in
     its place (see `first_guess.assumed_motion`)."""
 
     name: str
-    path: str
+    path: str | TwoSources
     noise: ImuNoise
     intrinsics: Parameter = field(default_factory=lambda: Parameter("fixed"))  # 24: see estimation.imu_model
-    topic: str | None = None  # in a bag; None: the one with the sensor's name, or the only one
+    topic: str | TwoSources | None = None  # in a bag; None: those with the sensor's name, or the only ones
+    accel_unit: AccelUnit | None = None
+    gyro_unit: GyroUnit | None = None
+    accel_axes: Axes | None = None
+    gyro_axes: Axes | None = None
     assumed: bool = False
     layout: TableLayout = PLAIN_TABLE
 

@@ -176,11 +176,12 @@ class TestImu:
 
     def test_degrees(self, tmp_path):
         rows = [[r[0], *np.rad2deg(r[1:4]), *r[4:]] for r in imu_rows()]
-        assert "looks like deg/s; multiply by pi / 180" in complaint(tmp_path, imu=rows)
+        assert "looks like deg/s; set gyro_unit: deg/s" in complaint(tmp_path, imu=rows)
 
     def test_g(self, tmp_path):
         rows = [[*r[:4], *(np.array(r[4:]) / 9.80665)] for r in imu_rows()]
-        assert "looks like units of g; multiply by 9.80665" in complaint(tmp_path, imu=rows)
+        found = read(tmp_path, imu=rows)
+        assert any("units of g" in note and "times 9.80665 m/s^2" in note for note in found.notes)
 
     @pytest.mark.parametrize("factor", [0.01, 1000.0])
     def test_far_from_gravity(self, tmp_path, factor):

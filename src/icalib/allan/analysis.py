@@ -14,7 +14,7 @@ from icalib.errors import RecordingError
 from icalib.imu_classes import DEFAULT_CLASS, class_noise
 from icalib.measurements import ImuStream
 from icalib.recordings import Recording, TopicInfo, open_recording
-from icalib.recordings.imu_checks import checked_imu
+from icalib.recordings.imu_checks import read_imu
 from icalib.recordings.jumps import ClockJumps
 from icalib.recordings.topics import find_topic, listing
 from icalib.rig import ImuSensor
@@ -70,9 +70,9 @@ def study_recording(path: str | Path, imu: str | None = None) -> ImuNoiseStudy:
     recording: Recording = open_recording(path)
     topic = _imu_topic(str(path), recording.topics(), imu)
     sensor = ImuSensor(topic.name, topic.name, class_noise(DEFAULT_CLASS), topic=topic.name)
-    where, jumps = recording.where(sensor), ClockJumps()
-    stream, notes = checked_imu(jumps.cut(recording.imu(sensor), f"{where} ({sensor.name})"), where)
-    return study_imu(stream, where, recording.notes() + jumps.notes + notes)
+    jumps = ClockJumps()
+    stream, notes = read_imu(recording, sensor, jumps)
+    return study_imu(stream, recording.where(sensor), recording.notes() + jumps.notes + notes)
 
 
 def study_imu(imu: ImuStream, where: str, notes: tuple[str, ...] = ()) -> ImuNoiseStudy:

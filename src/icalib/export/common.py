@@ -143,8 +143,9 @@ def imu_intrinsics(c: Calibration) -> list[str]:
 
 
 def topic(c: Calibration, name: str, default: str) -> str:
-    """The topic of a sensor, as the rig file has it."""
-    return str(c.rig["sensors"][name].get("topic") or default)
+    """The topic of a sensor, as the rig file has it; the default for an IMU on two topics, which others read as one."""
+    given = c.rig["sensors"][name].get("topic")
+    return given if isinstance(given, str) else default
 
 
 def inverse(T: np.ndarray) -> np.ndarray:

@@ -20,6 +20,7 @@ from icalib.inspection.inspect import resolution_of
 from icalib.inspection.kalibr import KalibrImu
 from icalib.inspection.lens import LensStart, lens_start
 from icalib.recordings import TopicInfo
+from icalib.rig import TwoSources
 from icalib.text_files import write_part
 
 _PLAIN = re.compile(r"[A-Za-z0-9_./][A-Za-z0-9_./-]*")
@@ -123,7 +124,9 @@ def _imu(found: Inspection) -> list[str]:
     name = found.imu or next(iter(found.sources.imus))
     topic = found.sources.imus[name]
     facts = found.imus.get(name)
-    lines = [f"  {name}:", "    type: imu", _place(topic.name, topic.type, facts.frame if facts else "")]
+    frame, halves = facts.frame if facts else "", found.sources.halves.get(name)
+    place = _place(topic.name, topic.type, frame) if halves is None else _places(halves, topic.type, frame)
+    lines = [f"  {name}:", "    type: imu", place]
     kalibr = _kalibr_imu(found, topic.name)
     if kalibr is None:
         classes = ", ".join(IMU_CLASSES)
@@ -206,8 +209,21 @@ def _starts(lens: LensStart) -> Iterable[str]:
 def _place(name: str, kind: str, frame: str) -> str:
     """`topic` of a bag or a folder of images; `path` of a table."""
     field = "path" if name.endswith((".csv", ".csv.gz", ".npz", ".tum", ".txt")) else "topic"
-    shown = name if _PLAIN.fullmatch(name) else json.dumps(name)
-    return f"    {field}: {shown}  # {_comment(kind)}" + (f", frame {json.dumps(frame)}" if frame else "")
+    return f"    {field}: {_name(name)}  # {_comment(kind)}" + _in_frame(frame)
+
+
+def _places(halves: TwoSources, kind: str, frame: str) -> str:
+    """`topic` of an IMU on two of them."""
+    shown = f"{{gyro: {_name(halves.gyro)}, accel: {_name(halves.accel)}}}"
+    return f"    topic: {shown}  # {_comment(kind)}" + _in_frame(frame)
+
+
+def _name(name: str) -> str:
+    return name if _PLAIN.fullmatch(name) else json.dumps(name)
+
+
+def _in_frame(frame: str) -> str:
+    return f", frame {json.dumps(frame)}" if frame else ""
 
 
 def _target(found: Inspection) -> str:

@@ -11,6 +11,7 @@ from icalib.inspection.kalibr import KalibrFiles
 from icalib.recordings import TopicInfo
 from icalib.recordings.imu_checks import Saturation
 from icalib.recordings.streams import CameraInfo
+from icalib.rig import TwoSources
 
 Severity = Literal["problem", "warning", "hint"]
 Vector = tuple[float, float, float]
@@ -134,7 +135,8 @@ class CameraSource:
 @dataclass(frozen=True)
 class Sources:
     """The sensors of a recording by name; left_out: topics of images that are no camera's to calibrate, and why.
-    wheels: also joints that may be of anything else; poses: also those that are of no sensor on the robot."""
+    wheels: also joints that may be of anything else; poses: also those that are of no sensor on the robot. halves: both
+    topics of an IMU whose gyroscope and accelerometer report apart; in `imus` stands the gyroscope's."""
 
     cameras: tuple[CameraSource, ...]
     imus: Mapping[str, TopicInfo]
@@ -142,6 +144,7 @@ class Sources:
     lidars: Mapping[str, TopicInfo] = field(default_factory=dict)
     wheels: Mapping[str, TopicInfo] = field(default_factory=dict)
     poses: Mapping[str, TopicInfo] = field(default_factory=dict)
+    halves: Mapping[str, TwoSources] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

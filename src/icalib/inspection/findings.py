@@ -104,7 +104,7 @@ def _imu(found: Inspection) -> Iterator[Finding]:
         yield Finding(
             "problem",
             f"{name}: the angular rates look like deg/s, for so they turn as gravity does in the accelerometer; "
-            "multiply them by pi / 180.",
+            "set gyro_unit: deg/s in the rig file.",
         )
         return
     if radians > CONTRARY * none:

@@ -5,31 +5,34 @@ from __future__ import annotations
 import numpy as np
 
 from icalib.errors import RecordingError
-from icalib.geometry import so3
 from icalib.imu_classes import DEFAULT_CLASS, class_noise
 from icalib.inspection.facts import ImuFacts, Vector
 from icalib.measurements import ImuStream
-from icalib.recordings import Recording, TopicInfo
+from icalib.recordings import Recording
+from icalib.recordings.gravity_turns import gravity_spread
 from icalib.recordings.imu_checks import checked_imu, saturations
+from icalib.recordings.imu_halves import one_stream
 from icalib.recordings.jumps import ClockJumps
-from icalib.rig import ImuSensor
+from icalib.rig import ImuSensor, TwoSources
 
-_WINDOW_S, _RATE_HZ = 2.0, 100.0  # over which gravity must stand still; how often it is looked at
 _DEGREE = np.pi / 180.0
 
 
-def read_imu(recording: Recording, name: str, topic: TopicInfo) -> tuple[ImuStream, str]:
-    """The readings as they were written, and how a sentence names their place. Raises RecordingError."""
-    sensor = ImuSensor(name, topic.name, class_noise(DEFAULT_CLASS), topic=topic.name)
-    return recording.imu(sensor), recording.where(sensor)
+def read_imu(recording: Recording, name: str, topic: str | TwoSources) -> tuple[ImuStream, str, tuple[str, ...]]:
+    """The readings as they were written, how a sentence names their place, and notes where two topics were joined.
+    Raises RecordingError."""
+    sensor = ImuSensor(name, topic, class_noise(DEFAULT_CLASS), topic=topic)
+    where = recording.where(sensor)
+    imu, notes = one_stream(recording.imu(sensor), f"{where} ({name})")
+    return imu, where, notes
 
 
-def imu_facts(imu: ImuStream, where: str, frame: str) -> ImuFacts:
-    """Figures of `imu`, and in `problem` why it would be refused, if it would."""
-    notes, problem, jumps = (), "", ClockJumps()
+def imu_facts(imu: ImuStream, where: str, frame: str, notes: tuple[str, ...] = ()) -> ImuFacts:
+    """Figures of `imu`, and in `problem` why it would be refused, if it would; `notes` come before its own."""
+    problem, jumps = "", ClockJumps()
     try:
-        imu, notes = checked_imu(jumps.cut(imu, f"{where} ({imu.name})"), where)
-        notes = jumps.notes + notes
+        imu, own = checked_imu(jumps.cut(imu, f"{where} ({imu.name})"), where)
+        notes += jumps.notes + own
     except RecordingError as error:
         problem = str(error)
     fine = np.isfinite(imu.gyro).all(axis=1) & np.isfinite(imu.accel).all(axis=1)
@@ -53,32 +56,6 @@ def imu_facts(imu: ImuStream, where: str, frame: str) -> ImuFacts:
         notes=notes,
         problem=problem,
     )
-
-
-def gravity_spread(imu: ImuStream, unit: float) -> float | None:
-    """RMS [m/s^2] of the specific force about its mean over two seconds, seen from axes that do not turn: small where
-    the rates, times `unit` [rad/s], turn as the IMU did. None for less than two seconds.
-    """
-    t = imu.seconds
-    count = int(_WINDOW_S * _RATE_HZ)
-    windows = int(t[-1] / _WINDOW_S)
-    if windows < 1:
-        return None
-    at = np.arange(windows * count) / _RATE_HZ
-    # Of the integral, so that no rotation is lost between the instants.
-    angle = np.zeros((len(t), 3))
-    angle[1:] = np.cumsum(0.5 * unit * (imu.gyro[1:] + imu.gyro[:-1]) * np.diff(t)[:, None], axis=0)
-    turn, force = (
-        np.stack([np.interp(at, t, x[:, k]) for k in range(3)], axis=1).reshape(windows, count, 3)
-        for x in (angle, imu.accel)
-    )
-    R = np.tile(np.eye(3), (windows, 1, 1))
-    level = np.empty_like(force)
-    for k in range(count):
-        level[:, k] = np.einsum("nij,nj->ni", R, force[:, k])
-        if k + 1 < count:
-            R = R @ so3.exp_many(np.ascontiguousarray(turn[:, k + 1] - turn[:, k]))
-    return float(np.sqrt(((level - level.mean(axis=1, keepdims=True)) ** 2).sum(axis=2).mean()))
 
 
 def _spreads(imu: ImuStream) -> Vector | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -26,7 +27,9 @@ from icalib.inspection.sources import find_sources
 from icalib.inspection.timing import timing_of
 from icalib.inspection.views import target_view
 from icalib.recordings import BagRecording, DamagedImageError, Payload, Recording, TopicInfo, decode, open_recording
+from icalib.recordings.imu_halves import pair_of
 from icalib.recordings.streams import CameraInfo, read_camera_info
+from icalib.rig import TwoSources
 
 SAMPLE = 16  # images that are decoded, spread over the recording
 READING_SHARE = 0.3  # of the time, where the target is looked for
@@ -48,7 +51,7 @@ def inspect_recording(
         raise RecordingError(
             f"{path} holds no messages, images or tables; give a bag, or a folder with imu0/data.csv and cam0/data."
         )
-    sources, kalibr = find_sources(topics), find_kalibr_files(Path(path))
+    sources, kalibr = _joined_imu(recording, find_sources(topics)), find_kalibr_files(Path(path))
     target = target or _beside(kalibr)
     share = READING_SHARE if target else 1.0
     streams, images, imus = _read(recording, topics, sources, lambda what, done: progress(what, share * done))
@@ -86,13 +89,25 @@ def _read(
         if topic.name in cameras:
             stream, images[cameras[topic.name]] = _read_images(recording, topic)
         elif topic.name in names and topic.count:
-            stream, facts = _read_imu(recording, topic, names[topic.name])
+            stream, facts = _read_imu(recording, topic, names[topic.name], sources.halves.get(names[topic.name]))
             if facts is not None:
                 imus[names[topic.name]] = facts
         else:
             stream = _read_stamps(recording, topic, topic.name in sources.left_out)
         streams.append(stream)
     return tuple(streams), images, imus
+
+
+def _joined_imu(recording: Recording, sources: Sources) -> Sources:
+    """The same, where two topics are one IMU's, which is then called imu0."""
+    pair = pair_of(recording, tuple(sources.imus.values())) if isinstance(recording, BagRecording) else None
+    if pair is None:
+        return sources
+    gyro = next(t for t in sources.imus.values() if t.name == pair.gyro)
+    others = {name: t for name, t in sources.imus.items() if t.name not in (pair.gyro, pair.accel)}
+    taken = {*others, *(c.name for c in sources.cameras), *sources.lidars, *sources.wheels, *sources.poses}
+    name = next(n for k in itertools.count() if (n := f"imu{k}") not in taken)
+    return dataclasses.replace(sources, imus={name: gyro, **others}, halves={name: pair})
 
 
 def _read_images(recording: Recording, topic: TopicInfo) -> tuple[StreamFacts, ImageFacts]:
@@ -142,12 +157,14 @@ class _Sample:
         self.resolution = self.resolution or (width, height)
 
 
-def _read_imu(recording: Recording, topic: TopicInfo, name: str) -> tuple[StreamFacts, ImuFacts | None]:
+def _read_imu(
+    recording: Recording, topic: TopicInfo, name: str, halves: TwoSources | None
+) -> tuple[StreamFacts, ImuFacts | None]:
     try:
-        imu, where = read_imu(recording, name, topic)
+        imu, where, notes = read_imu(recording, name, halves or topic.name)
     except RecordingError as error:
         return StreamFacts(topic, None, str(error)), None
-    facts = imu_facts(imu, where, _frame(recording, topic))
+    facts = imu_facts(imu, where, _frame(recording, topic), notes)
     return StreamFacts(topic, timing_of(imu.stamps_ns), facts.problem), facts
 
 

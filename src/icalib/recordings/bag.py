@@ -21,6 +21,7 @@ from icalib.recordings.bags.storage import Tally
 from icalib.recordings.clouds import read_clouds
 from icalib.recordings.image_checks import checked_payloads, frames
 from icalib.recordings.images import Frame, Payload, file_payload
+from icalib.recordings.imu_halves import ImuHalves, imu_source, values_of
 from icalib.recordings.poses import PoseReadings, read_pose_file
 from icalib.recordings.streams import (
     point_clouds,
@@ -33,9 +34,8 @@ from icalib.recordings.streams import (
 from icalib.recordings.topics import KINDS, TopicInfo, choose_topic, find_topic
 from icalib.recordings.tracks import read_tracks
 from icalib.recordings.wheels import WheelReadings, read_wheel_joints, read_wheel_twists
-from icalib.rig import Camera, ImuSensor, Lidar, PoseSensor, Wheels
+from icalib.rig import Camera, ImuSensor, Lidar, PoseSensor, TwoSources, Wheels
 
-_KINDS_OF = {ImuSensor: "imu", Lidar: "points"}
 _SWAPPED_NS = 1_000_000_000  # readings overtake each other on the network by less; more is a clock that was set back
 
 
@@ -69,17 +69,25 @@ class BagRecording:
     def images(self, topic: str) -> Iterator[Frame]:
         return frames(self.payloads(topic), f"{self.root} {topic}", self._note)
 
-    def imu(self, sensor: ImuSensor) -> ImuStream:
-        topic = self._topic(sensor)
-        stamps: list[int] = []
-        rows: list[tuple[float, ...]] = []
-        for stamp, message in self.messages(topic, "imu"):
-            w, f = message.angular_velocity, message.linear_acceleration
-            stamps.append(stamp)
-            rows.append((w.x, w.y, w.z, f.x, f.y, f.z))
-        stamps_ns, values = np.array(stamps, np.int64), np.array(rows, np.float64).reshape(-1, 6)
+    def imu(self, sensor: ImuSensor) -> ImuStream | ImuHalves:
+        source = self._imu_source(sensor)
+        if isinstance(source, TwoSources):
+            gyro_ns, gyro = self._readings(source.gyro)
+            accel_ns, accel = self._readings(source.accel)
+            return ImuHalves(sensor.name, gyro_ns, gyro[:, :3].copy(), accel_ns, accel[:, 3:].copy())
+        stamps_ns, values = self._readings(source)
+        return ImuStream(sensor.name, stamps_ns, values[:, :3].copy(), values[:, 3:].copy())
+
+    def _readings(self, topic: str) -> tuple[np.ndarray, np.ndarray]:
+        """(N,) stamps [ns] and (N, 6) readings of sensor_msgs/Imu, by stamp."""
+        found = [(stamp, values_of(message)) for stamp, message in self.messages(topic, "imu")]
+        stamps_ns = np.array([stamp for stamp, _ in found], np.int64)
+        values = np.array([row for _, row in found], np.float64).reshape(-1, 6)
         order = self._order(topic, stamps_ns)
-        return ImuStream(sensor.name, stamps_ns[order], values[order, :3].copy(), values[order, 3:].copy())
+        return stamps_ns[order], values[order]
+
+    def _imu_source(self, sensor: ImuSensor) -> str | TwoSources:
+        return imu_source(str(self.root), self, self._topics, sensor)
 
     def has_corners(self, camera: Camera) -> bool:
         return False
@@ -158,6 +166,10 @@ class BagRecording:
             return f"{self.root} {self._wheel_topic(sensor).name}"
         if isinstance(sensor, PoseSensor):
             return str(self._pose_table(sensor) or f"{self.root} {self._pose_topic(sensor).name}")
+        if isinstance(sensor, ImuSensor):
+            source = self._imu_source(sensor)
+            shown = f"{source.gyro} and {source.accel}" if isinstance(source, TwoSources) else source
+            return f"{self.root} {shown}"
         return f"{self.root} {self._topic(sensor)}"
 
     def files(self) -> list[Path]:
@@ -230,8 +242,8 @@ class BagRecording:
             for key, received_ns, content in storage.messages(wanted):
                 yield received_ns, storage.connections[key].encoding, content
 
-    def _topic(self, sensor: ImuSensor | Lidar) -> str:
-        return choose_topic(str(self.root), self._topics, _KINDS_OF[type(sensor)], sensor.name, sensor.topic).name
+    def _topic(self, sensor: Lidar) -> str:
+        return choose_topic(str(self.root), self._topics, "points", sensor.name, sensor.topic).name
 
     def _order(self, topic: str, stamps_ns: np.ndarray) -> np.ndarray:
         """The order by stamp; as it is where the clock was set back, which the checks refuse."""

@@ -11,6 +11,7 @@ import numpy as np
 from icalib.geometry.targets import Target
 from icalib.measurements import CornerStream, ImuStream, LidarStream, TrackStream, WheelPoses
 from icalib.recordings.images import Frame, Payload
+from icalib.recordings.imu_halves import ImuHalves
 from icalib.recordings.poses import PoseReadings
 from icalib.recordings.topics import TopicInfo
 from icalib.recordings.wheels import WheelReadings
@@ -50,8 +51,9 @@ class Recording(Protocol):
         """The decoded images of `topic`, as `payloads`; damaged ones are left out, too, with a note."""
         ...
 
-    def imu(self, sensor: ImuSensor) -> ImuStream:
-        """All readings of the IMU as they were written: stamps may still repeat or run backwards.
+    def imu(self, sensor: ImuSensor) -> ImuStream | ImuHalves:
+        """All readings of the IMU as they were written, or of its two sensors where they report apart: stamps may still
+        repeat or run backwards.
 
         Raises RecordingError naming file and line, or topic, where the data are missing or cannot be read.
         """

@@ -57,6 +57,16 @@ IMU = TableKind(
     (STAMP, *vector_names(GYRO), *vector_names(ACCEL)),
     (10.0, 20_000.0),
 )
+# Of an IMU whose two sensors have a table each.
+IMU_GYRO, IMU_ACCEL = (
+    TableKind(
+        IMU.integers,
+        decimals,
+        (STAMP, *((*names, axis) for names, axis in zip(known, "xyz", strict=True))),
+        IMU.rate_hz,
+    )
+    for decimals, known in ((IMU.decimals[:3], IMU.known[1:4]), (IMU.decimals[3:], IMU.known[4:]))
+)
 
 
 def places_by_name(kind: TableKind, header: Sequence[str]) -> np.ndarray | None:

@@ -11,11 +11,12 @@ import numpy as np
 from icalib.errors import RecordingError
 from icalib.geometry.targets import Target
 from icalib.measurements import CornerStream, ImuStream, LidarStream, TrackStream, WheelPoses
-from icalib.recordings.columns import IMU, STAMP, TableKind
+from icalib.recordings.columns import IMU, IMU_ACCEL, IMU_GYRO, STAMP, TableKind
 from icalib.recordings.corners import group_corners
 from icalib.recordings.euroc_images import file_payloads, image_files
 from icalib.recordings.image_checks import checked_payloads, frames
 from icalib.recordings.images import Frame, Payload
+from icalib.recordings.imu_halves import ImuHalves
 from icalib.recordings.lidar_checks import Sieve, sifted
 from icalib.recordings.poses import FILES as POSE_FILES
 from icalib.recordings.poses import POSES, PoseReadings, is_tum_text, read_pose_file
@@ -25,7 +26,7 @@ from icalib.recordings.topics import TopicInfo, choose_topic, find_topic
 from icalib.recordings.tracks import read_tracks
 from icalib.recordings.unreadable import VIDEO_FILE, is_video
 from icalib.recordings.wheels import RELATIVE_POSES, STAMPS, UNITS, WheelReadings, read_wheel_table
-from icalib.rig import Camera, ImuSensor, Lidar, PoseSensor, TableLayout, Wheels
+from icalib.rig import Camera, ImuSensor, Lidar, PoseSensor, TableLayout, TwoSources, Wheels
 
 _CORNERS = TableKind(
     ("t [ns]", "tag id", "corner"),
@@ -99,7 +100,15 @@ class FolderRecording:
     def images(self, topic: str) -> Iterator[Frame]:
         return frames(self.payloads(topic), f"{self.root}/{topic}", self._note)
 
-    def imu(self, sensor: ImuSensor) -> ImuStream:
+    def imu(self, sensor: ImuSensor) -> ImuStream | ImuHalves:
+        if isinstance(sensor.path, TwoSources):
+            layout = TableLayout(time_unit=sensor.layout.time_unit)
+            gyro = read_table(self._locate(sensor.path.gyro), IMU_GYRO, layout, self._note)
+            accel = read_table(self._locate(sensor.path.accel), IMU_ACCEL, layout, self._note)
+            self._remember(gyro.path)
+            self._remember(accel.path)
+            stamps = (table.integers[:, 0].copy() for table in (gyro, accel))
+            return ImuHalves(sensor.name, next(stamps), gyro.decimals, next(stamps), accel.decimals)
         table = read_table(self._locate(sensor.path), IMU, sensor.layout, self._note)
         self._remember(table.path)
         stamps_ns, values = table.integers[:, 0].copy(), table.decimals
@@ -149,6 +158,8 @@ class FolderRecording:
     def where(self, sensor: ImuSensor | Camera | Lidar | Wheels | PoseSensor) -> str:
         if isinstance(sensor, Camera) and not self.has_corners(sensor):
             return f"{self.root / self.image_topic(sensor)}"
+        if isinstance(sensor.path, TwoSources):
+            return f"{self._locate(sensor.path.gyro)} and {self._locate(sensor.path.accel)}"
         return str(self._locate(sensor.path))
 
     def files(self) -> list[Path]:

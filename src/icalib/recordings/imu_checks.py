@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from icalib.errors import RecordingError
 from icalib.measurements import ImuStream
+from icalib.recordings.imu_halves import RATE_HZ, ImuHalves, one_stream
+from icalib.recordings.imu_units import in_si, recognised_unit
+from icalib.recordings.jumps import ClockJumps
 from icalib.recordings.ordered import kept_readings, longest_run
+from icalib.rig import ImuSensor
 
-_RATE_HZ = (10.0, 20_000.0)
-_FASTEST_RAD_S = 35.0  # 2000 deg/s, the widest range of common gyroscopes
-_G_UNITS = (0.5, 2.0)  # of the median |accel|: a reading of gravity in units of g
-_GRAVITY_M_S2 = (5.0, 20.0)
 _SATURATED_RUN = 5
 # No sensor's range is narrower (125 deg/s, 2 g); below it, equal readings are coarse quantisation, not saturation.
 _NARROWEST_RANGE = {"gyroscope": 2.0, "accelerometer": 17.0}
@@ -30,8 +31,26 @@ class Saturation:
     stamp_ns: int
 
 
-def checked_imu(imu: ImuStream, where: str) -> tuple[ImuStream, tuple[str, ...]]:
-    """`imu` with strictly increasing stamps, and notes on what was dropped or looks saturated.
+class HasImu(Protocol):
+    """The part of a recording that is needed here."""
+
+    def imu(self, sensor: ImuSensor) -> ImuStream | ImuHalves: ...
+    def where(self, sensor: ImuSensor) -> str: ...
+
+
+def read_imu(recording: HasImu, sensor: ImuSensor, jumps: ClockJumps) -> tuple[ImuStream, tuple[str, ...]]:
+    """All good readings of the IMU in SI units, those of the part of its clock that `jumps` keeps, and notes. Raises
+    RecordingError as the readers, `one_stream` and `checked_imu`."""
+    where = recording.where(sensor)
+    what = f"{where} ({sensor.name})"
+    imu, joined = one_stream(recording.imu(sensor), what)
+    imu, notes = checked_imu(jumps.cut(imu, what), where, sensor)
+    return imu, joined + notes
+
+
+def checked_imu(imu: ImuStream, where: str, sensor: ImuSensor | None = None) -> tuple[ImuStream, tuple[str, ...]]:
+    """`imu` with strictly increasing stamps, in SI units, and notes on what was dropped, converted or looks saturated.
+    `sensor` says what units and axes the rig file gives the readings.
 
     Raises RecordingError naming `where` (the file) and the instant: too few readings, NaN, stamps out of order or
     repeated with other values, a frozen sensor, other units of time, angular rate or acceleration.
@@ -40,34 +59,18 @@ def checked_imu(imu: ImuStream, where: str) -> tuple[ImuStream, tuple[str, ...]]
     if len(imu.stamps_ns) < 2:
         raise RecordingError(f"{what}: only {len(imu.stamps_ns)} reading; a calibration needs the whole recording.")
     values, own = np.hstack([imu.gyro, imu.accel]), "export the IMU's own stamps"
-    kept, notes = kept_readings(imu.stamps_ns, values, what, _RATE_HZ, "reading", own)
+    kept, notes = kept_readings(imu.stamps_ns, values, what, RATE_HZ, "reading", own)
     if notes:
         imu = ImuStream(imu.name, imu.stamps_ns[kept], imu.gyro[kept], imu.accel[kept])
-    _refuse_units(imu, what)
-    return imu, notes + _saturation_notes(imu, what)
+    _refuse_frozen(imu, what)
+    imu, converted = recognised_unit(imu if sensor is None else in_si(imu, sensor), what, sensor)
+    return imu, notes + converted + _saturation_notes(imu, what)
 
 
-def _refuse_units(imu: ImuStream, what: str) -> None:
+def _refuse_frozen(imu: ImuStream, what: str) -> None:
     for kind, values in (("gyroscope", imu.gyro), ("accelerometer", imu.accel)):
         if (values == values[0]).all():
             raise RecordingError(f"{what}: the {kind} gives the same reading from start to end; check its driver.")
-    gravity = float(np.median(np.linalg.norm(imu.accel, axis=1)))
-    if _G_UNITS[0] <= gravity <= _G_UNITS[1]:
-        raise RecordingError(
-            f"{what}: the median |accel| is {gravity:.3g}, which looks like units of g; "
-            "multiply by 9.80665 to get m/s^2."
-        )
-    if not _GRAVITY_M_S2[0] <= gravity <= _GRAVITY_M_S2[1]:
-        raise RecordingError(
-            f"{what}: the median |accel| is {gravity:.3g}, far from gravity, 9.81 m/s^2; the columns must be t [ns], "
-            "gyroscope x, y, z [rad/s], accelerometer x, y, z [m/s^2], gravity included."
-        )
-    fast = float(np.percentile(np.linalg.norm(imu.gyro, axis=1), 99))
-    if fast > _FASTEST_RAD_S:
-        raise RecordingError(
-            f"{what}: the angular rate reaches {fast:.3g}, more than any hand or robot turns in rad/s; "
-            "it looks like deg/s; multiply by pi / 180."
-        )
 
 
 def _saturation_notes(imu: ImuStream, what: str) -> tuple[str, ...]:

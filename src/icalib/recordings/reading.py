@@ -9,7 +9,7 @@ from icalib.errors import RecordingError
 from icalib.measurements import CornerStream, Measurements
 from icalib.recordings.base import Recording
 from icalib.recordings.camera_checks import checked_corners
-from icalib.recordings.imu_checks import checked_imu
+from icalib.recordings.imu_checks import read_imu
 from icalib.recordings.jumps import LONGEST_S, ClockJumps
 from icalib.recordings.lidar_checks import checked_lidar
 from icalib.recordings.pose_checks import checked_poses
@@ -35,8 +35,7 @@ def read_measurements(recording: Recording, rig: Rig, find: FindCorners = tables
     """
     imu, notes, jumps = None, (), ClockJumps(LONGEST_S)
     if rig.imu is not None:
-        where = recording.where(rig.imu)
-        imu, notes = checked_imu(jumps.cut(recording.imu(rig.imu), f"{where} ({rig.imu.name})"), where)
+        imu, notes = read_imu(recording, rig.imu, jumps)
     cut = jumps.cut if is_timed(rig) else _whole
     tracks = tuple(cut(recording.tracks(c), f"the tracks of {c.name}") for c in rig.cameras if c.tracks is not None)
     cameras, seen = _corners(recording, rig, find, cut)

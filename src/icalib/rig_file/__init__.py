@@ -11,10 +11,8 @@ import yaml
 
 from icalib.geometry.cameras import CAMERA_MODELS
 from icalib.geometry.targets import NoTarget, Scene, Target
-from icalib.imu_classes import DEFAULT_CLASS, IMU_CLASSES, class_noise
 from icalib.rig import (
     Camera,
-    ImuNoise,
     ImuSensor,
     Lidar,
     Parameter,
@@ -35,14 +33,14 @@ from icalib.rig_file.fields import (
     table_layout,
     topic_or_none,
 )
+from icalib.rig_file.imu import imu_to_plain, read_imu
 from icalib.rig_file.lidar import lidar_to_plain, read_lidar
 from icalib.rig_file.wheels import read_wheels, wheels_to_plain
-from icalib.rig_parameters import imu_intrinsics_parameter, parameter_to_plain, vector_parameter
+from icalib.rig_parameters import vector_parameter
 from icalib.rig_targets import NAME, target_of, target_or_targets
 from icalib.yaml_nodes import YamlValue, parse_yaml, read_yaml
 
 _SENSOR_TYPES = ("imu", "camera", "lidar", "wheels", "pose")
-_DENSITIES = ("gyro", "gyro_walk", "accel", "accel_walk")
 
 
 def load_rig(path: str | Path) -> Rig:
@@ -97,7 +95,7 @@ def load_target(path: str | Path) -> Target:
 
 def rig_to_dict(rig: Rig) -> dict[str, Any]:
     """`rig` as lists, numbers and text; written as YAML or JSON, it loads back as the same rig."""
-    imus = {} if rig.imu is None else {rig.imu.name: _imu_to_plain(rig.imu)}
+    imus = {} if rig.imu is None else {rig.imu.name: imu_to_plain(rig.imu)}
     sensors = imus | {c.name: _camera_to_plain(c) for c in rig.cameras}
     sensors |= {s.name: lidar_to_plain(s) for s in rig.lidars} | {w.name: wheels_to_plain(w) for w in rig.wheels}
     sensors |= {s.name: _pose_to_plain(s) for s in rig.poses}
@@ -142,7 +140,7 @@ def _sensors(value: YamlValue) -> _Sensors:
             case _ if found.imus:
                 sensor.fail(f"is a second IMU beside {found.imus[0].name}; keep the one that is the body frame.")
             case _:
-                found.imus.append(_imu(name, sensor))
+                found.imus.append(read_imu(name, sensor))
     _refuse_incomplete(value, found)
     return found
 
@@ -189,26 +187,6 @@ def _refuse_unseen_ground(value: YamlValue, found: _Sensors, targeted: bool) -> 
             field["height_sigma"].fail(
                 "heights are counted from the target, and there is none; remove it, or with a LiDAR write plane: floor."
             )
-
-
-def _imu(name: str, value: YamlValue) -> ImuSensor:
-    found = value.record(("type",), ("path", "topic", "noise", "intrinsics", *TABLE))
-    return ImuSensor(
-        name=name,
-        path=path_or(found, f"{name}/data.csv"),
-        noise=_noise(found["noise"]) if "noise" in found else class_noise(DEFAULT_CLASS),
-        intrinsics=imu_intrinsics_parameter(found["intrinsics"]) if "intrinsics" in found else Parameter("fixed"),
-        topic=topic_or_none(found),
-        layout=table_layout(found),
-    )
-
-
-def _noise(value: YamlValue) -> ImuNoise:
-    if not value.is_mapping:
-        return class_noise(value.choice("IMU class", IMU_CLASSES))
-    found = value.record(_DENSITIES, ("source",))
-    densities = {name: found[name].positive() for name in _DENSITIES}
-    return ImuNoise(**densities, source=found["source"].text() if "source" in found else ImuNoise.source)
 
 
 def _camera(name: str, value: YamlValue) -> Camera:
@@ -282,15 +260,6 @@ def _setting(name: str, value: YamlValue, kind: Any) -> Any:
     if kind is int:
         return value.whole(0)
     return value.not_negative() if name in _MAY_BE_ZERO else value.positive()
-
-
-def _imu_to_plain(imu: ImuSensor) -> dict[str, Any]:
-    plain: dict[str, Any] = {"type": "imu", "path": imu.path, "noise": dataclasses.asdict(imu.noise)}
-    plain |= layout_to_plain(imu.layout)
-    if imu.topic is not None:
-        plain["topic"] = imu.topic
-    intrinsics = parameter_to_plain(imu.intrinsics)
-    return plain if intrinsics is None else plain | {"intrinsics": intrinsics}
 
 
 def _camera_to_plain(camera: Camera) -> dict[str, Any]:

@@ -13,6 +13,8 @@ from icalib.calibration import Calibration, RecordingSpan
 from icalib.errors import CalibrationError, RecordingError
 from icalib.measurements import LidarStream
 from icalib.recordings import DamagedImageError, Recording, decode, image_topics
+from icalib.recordings.imu_checks import read_imu
+from icalib.recordings.jumps import ClockJumps
 from icalib.rig import Camera, ImuSensor, Lidar, Rig
 from icalib.view.colors import by_value
 from icalib.view.path import Path
@@ -124,7 +126,7 @@ class Recorded:
         return inside
 
     def _readings(self, s: Stream, sensor: ImuSensor) -> list[str]:
-        imu = self.recording.imu(sensor)
+        imu, _ = read_imu(self.recording, sensor, ClockJumps())
         seconds = self._clock(sensor.name).seconds(imu.stamps_ns)
         inside = self._during(sensor.name, seconds)
         keep = inside[:: _stride(len(inside), MOST_READINGS)]

@@ -1,0 +1,116 @@
+"""An IMU whose gyroscope and accelerometer report apart, each at its own stamps: on two topics, or in two tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any, Protocol
+
+import numpy as np
+
+from icalib.errors import RecordingError
+from icalib.measurements import ImuStream
+from icalib.recordings.ordered import kept_readings
+from icalib.recordings.topics import TopicInfo, choose_topic
+from icalib.rig import ImuSensor, TwoSources
+
+RATE_HZ = (10.0, 20_000.0)
+_LOOKED_AT = 50  # readings that tell which sensor a topic carries; a driver leaves the other at zero or NaN
+_LEAST_COMMON_S = 1.0
+
+
+@dataclass(frozen=True)
+class ImuHalves:
+    """gyro_ns (N,), gyro (N, 3) rad/s, accel_ns (M,), accel (M, 3) m/s^2, as they were written."""
+
+    name: str
+    gyro_ns: np.ndarray
+    gyro: np.ndarray
+    accel_ns: np.ndarray
+    accel: np.ndarray
+
+
+class HasImuMessages(Protocol):
+    """The part of a bag that is needed here."""
+
+    def messages(self, topic: str, kind: str) -> Iterator[tuple[int, Any]]: ...
+
+
+def values_of(message: Any) -> tuple[float, float, float, float, float, float]:
+    """Rates and forces of a sensor_msgs/Imu."""
+    w, f = message.angular_velocity, message.linear_acceleration
+    return w.x, w.y, w.z, f.x, f.y, f.z
+
+
+def imu_source(where: str, bag: HasImuMessages, topics: Sequence[TopicInfo], sensor: ImuSensor) -> str | TwoSources:
+    """The topic of the IMU, or its two where one has the gyroscope's readings only and exactly one other has the
+    accelerometer's. Raises RecordingError as `choose_topic`."""
+    if isinstance(sensor.topic, TwoSources):
+        gyro, accel = (choose_topic(where, topics, "imu", sensor.name, t).name for t in _both(sensor.topic))
+        return TwoSources(gyro, accel)
+    pair = pair_of(bag, topics)
+    if pair is not None and sensor.topic is None and sum(t.kind == "imu" and t.count > 0 for t in topics) == 2:
+        return pair
+    chosen = choose_topic(where, topics, "imu", sensor.name, sensor.topic).name
+    return pair if pair is not None and chosen in _both(pair) else chosen
+
+
+def pair_of(bag: HasImuMessages, topics: Sequence[TopicInfo]) -> TwoSources | None:
+    """The topics of an IMU that reports on two, where exactly one topic has only a gyroscope's readings and exactly one
+    only an accelerometer's."""
+    found = [t.name for t in topics if t.kind == "imu" and t.count]
+    carried = {name: _carried(bag, name) for name in found} if len(found) > 1 else {}
+    gyros, accels = ([name for name, what in carried.items() if what == half] for half in ("gyro", "accel"))
+    return TwoSources(gyros[0], accels[0]) if len(gyros) == len(accels) == 1 else None
+
+
+def _both(pair: TwoSources) -> tuple[str, str]:
+    return pair.gyro, pair.accel
+
+
+def _carried(bag: HasImuMessages, topic: str) -> str:
+    """gyro, accel, or both."""
+    rows = np.array([values_of(m) for _, m in islice(bag.messages(topic, "imu"), _LOOKED_AT)]).reshape(-1, 6)
+    rates, forces = (bool((np.nan_to_num(x) != 0.0).any()) for x in (rows[:, :3], rows[:, 3:]))
+    return "both" if rates == forces else "gyro" if rates else "accel"
+
+
+def one_stream(imu: ImuStream | ImuHalves, what: str) -> tuple[ImuStream, tuple[str, ...]]:
+    """The readings of both sensors together, and notes where they report apart. Raises RecordingError as they do then:
+    readings that are not finite or out of order, and sensors that hardly overlap."""
+    return (imu, ()) if isinstance(imu, ImuStream) else _joined(imu, what)
+
+
+def _joined(halves: ImuHalves, what: str) -> tuple[ImuStream, tuple[str, ...]]:
+    """One stream at the gyroscope's stamps, the accelerometer interpolated to these, where both were running; and
+    notes. Raises RecordingError as `kept_readings`, and where the two do not overlap."""
+    own = "export the IMU's own stamps"
+    notes: tuple[str, ...] = ()
+    streams = []
+    for kind, stamps_ns, values in (
+        ("gyroscope", halves.gyro_ns, halves.gyro),
+        ("accelerometer", halves.accel_ns, halves.accel),
+    ):
+        if len(stamps_ns) < 2:
+            raise RecordingError(
+                f"{what}: the {kind} has only {len(stamps_ns)} readings; record it as long as the rest."
+            )
+        kept, found = kept_readings(stamps_ns, values, f"{what}, {kind}", RATE_HZ, "reading", own)
+        notes += found
+        streams.append((stamps_ns[kept], values[kept]))
+    (gyro_ns, gyro), (accel_ns, accel) = streams
+    common = (gyro_ns >= accel_ns[0]) & (gyro_ns <= accel_ns[-1])
+    if not common.any() or np.ptp(gyro_ns[common]) < 1e9 * _LEAST_COMMON_S:
+        raise RecordingError(
+            f"{what}: gyroscope and accelerometer have less than {_LEAST_COMMON_S:g} s in common (from {gyro_ns[0]} to "
+            f"{gyro_ns[-1]} ns, from {accel_ns[0]} to {accel_ns[-1]} ns); record both at the same time, by one clock."
+        )
+    gyro_ns, gyro = gyro_ns[common], gyro[common]
+    at, known = ((x - accel_ns[0]).astype(np.float64) for x in (gyro_ns, accel_ns))
+    accel = np.stack([np.interp(at, known, accel[:, k]) for k in range(3)], axis=1)
+    notes += (
+        f"{what}: gyroscope and accelerometer report apart; {len(known)} readings of the accelerometer were "
+        f"interpolated to {len(at)} stamps of the gyroscope.",
+    )
+    return ImuStream(halves.name, gyro_ns, gyro, accel), notes

@@ -1,0 +1,98 @@
+"""Readings of an IMU in SI units and one set of axes: as the rig file says, or as gravity shows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from icalib.errors import RecordingError
+from icalib.measurements import ImuStream
+from icalib.recordings.gravity_turns import WINDOW_S, gravity_size
+from icalib.rig import Axes, ImuSensor
+
+G_M_S2 = 9.80665
+DEGREE = np.pi / 180.0
+_FASTEST_RAD_S = 35.0  # 2000 deg/s, the widest range of common gyroscopes
+_GRAVITY_M_S2 = (5.0, 20.0)  # of the median |accel|
+_NEAR_ONE = (0.8, 1.25)  # of gravity in units of g: scales of accelerometers are off by less
+_STEADY = 0.75  # of the upper quartile of gravity over windows is the lower one at least; of accelerations about half
+_MISSING = 0.5  # of the readings' size; gravity below this share of it is not in them
+
+
+def in_si(imu: ImuStream, sensor: ImuSensor) -> ImuStream:
+    """The readings in the units and axes that the rig file says they are recorded in."""
+    accel = G_M_S2 * imu.accel if sensor.accel_unit == "g" else imu.accel
+    gyro = DEGREE * imu.gyro if sensor.gyro_unit == "deg/s" else imu.gyro
+    return replace(imu, gyro=_in_axes(gyro, sensor.gyro_axes), accel=_in_axes(accel, sensor.accel_axes))
+
+
+def _in_axes(values: np.ndarray, axes: Axes | None) -> np.ndarray:
+    if axes is None:
+        return values
+    columns = ["xyz".index(entry[-1]) for entry in axes]
+    return values[:, columns] * [-1.0 if entry.startswith("-") else 1.0 for entry in axes]
+
+
+def recognised_unit(imu: ImuStream, what: str, sensor: ImuSensor | None) -> tuple[ImuStream, tuple[str, ...]]:
+    """The readings in m/s^2, and a note where gravity shows that they are in g.
+
+    Raises RecordingError where gravity is not in the readings, or they are in another unit, of angular rate too.
+    """
+    notes: tuple[str, ...] = ()
+    median = float(np.median(np.linalg.norm(imu.accel, axis=1)))
+    if _is_in_g(imu, median):
+        if sensor is not None and sensor.accel_unit is not None:
+            raise RecordingError(
+                f"{what}: gravity is {median:.3g} in the accelerometer after accel_unit: {sensor.accel_unit}, which "
+                "looks like units of g; correct accel_unit in the rig file."
+            )
+        notes = (f"{what}: the accelerometer is in units of g (its median is {median:.3g}); times {G_M_S2} m/s^2.",)
+        imu = replace(imu, accel=G_M_S2 * imu.accel)
+    elif _lacks_gravity(imu, median):
+        raise RecordingError(
+            f"{what}: gravity is not in the accelerometer's readings (their median is {median:.3g} m/s^2, and their "
+            "mean, turned by the gyroscope, is far below 9.81): they are linear acceleration, of which the driver has "
+            "taken gravity off; record the raw accelerometer."
+        )
+    elif not _GRAVITY_M_S2[0] <= median <= _GRAVITY_M_S2[1]:
+        raise RecordingError(
+            f"{what}: the median |accel| is {median:.3g}, far from gravity, 9.81 m/s^2; the columns must be t [ns], "
+            "gyroscope x, y, z [rad/s], accelerometer x, y, z [m/s^2], gravity included; set accel_unit: g in the rig "
+            "file for units of g."
+        )
+    _refuse_degrees(imu, what)
+    return imu, notes
+
+
+def _is_in_g(imu: ImuStream, median: float) -> bool:
+    """Whether gravity is about 1 in most windows: linear acceleration may have that size, but not all the time."""
+    if not _NEAR_ONE[0] <= median <= 1.5 * _NEAR_ONE[1]:
+        return False
+    sizes = [np.linalg.norm(imu.accel, axis=1)] if imu.seconds[-1] < WINDOW_S else _gravity(imu)
+    quartiles = (np.quantile(size, [0.25, 0.75]) for size in sizes)
+    return any(_NEAR_ONE[0] <= low and high <= _NEAR_ONE[1] for low, high in quartiles)
+
+
+def _lacks_gravity(imu: ImuStream, median: float) -> bool:
+    """Whether the readings are near zero, or their mean in windows is far below their size or another in each window,
+    whatever the rates are."""
+    if median >= _GRAVITY_M_S2[0] or imu.seconds[-1] < WINDOW_S:
+        return False
+    quartiles = (np.quantile(size, [0.25, 0.5, 0.75]) for size in _gravity(imu))
+    steady = any(low > _STEADY * high and middle > _MISSING * median for low, middle, high in quartiles)
+    return median < _MISSING * _NEAR_ONE[0] or not steady
+
+
+def _gravity(imu: ImuStream) -> list[np.ndarray]:
+    """What `gravity_size` sees with rates in rad/s, in deg/s, and none; empty for a recording too short."""
+    return [size for unit in (1.0, DEGREE, 0.0) if (size := gravity_size(imu, unit)) is not None]
+
+
+def _refuse_degrees(imu: ImuStream, what: str) -> None:
+    fast = float(np.percentile(np.linalg.norm(imu.gyro, axis=1), 99))
+    if fast > _FASTEST_RAD_S:
+        raise RecordingError(
+            f"{what}: the angular rate reaches {fast:.3g}, more than any hand or robot turns in rad/s; "
+            "it looks like deg/s; set gyro_unit: deg/s in the rig file."
+        )

@@ -1,0 +1,81 @@
+"""An IMU in the rig file: its noise, units, axes and topics, and back to plain data."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, get_args
+
+from icalib.imu_classes import DEFAULT_CLASS, IMU_CLASSES, class_noise
+from icalib.rig import AccelUnit, Axes, GyroUnit, ImuNoise, ImuSensor, Parameter, TwoSources
+from icalib.rig_file.fields import TABLE, layout_to_plain, table_layout
+from icalib.rig_parameters import imu_intrinsics_parameter, parameter_to_plain
+from icalib.yaml_nodes import YamlValue
+
+_DENSITIES = ("gyro", "gyro_walk", "accel", "accel_walk")
+_FIELDS = ("accel_unit", "gyro_unit", "accel_axes", "gyro_axes")
+
+
+def read_imu(name: str, value: YamlValue) -> ImuSensor:
+    """Raises RigError, one sentence naming file, line and field."""
+    found = value.record(("type",), ("path", "topic", "noise", "intrinsics", *_FIELDS, *TABLE))
+    units: dict[str, Any] = {
+        field: found[field].choice("such unit as", get_args(kind))
+        for field, kind in (("accel_unit", AccelUnit), ("gyro_unit", GyroUnit))
+        if field in found
+    }
+    return ImuSensor(
+        name=name,
+        path=_source(found["path"]) if "path" in found else f"{name}/data.csv",
+        noise=_noise(found["noise"]) if "noise" in found else class_noise(DEFAULT_CLASS),
+        intrinsics=imu_intrinsics_parameter(found["intrinsics"]) if "intrinsics" in found else Parameter("fixed"),
+        topic=_source(found["topic"]) if "topic" in found else None,
+        accel_axes=_axes(found["accel_axes"]) if "accel_axes" in found else None,
+        gyro_axes=_axes(found["gyro_axes"]) if "gyro_axes" in found else None,
+        layout=table_layout(found),
+        **units,
+    )
+
+
+def imu_to_plain(imu: ImuSensor) -> dict[str, Any]:
+    """The fields of `imu` that load back as the same."""
+    plain: dict[str, Any] = {"type": "imu", "path": _plain_source(imu.path), "noise": dataclasses.asdict(imu.noise)}
+    plain |= layout_to_plain(imu.layout)
+    if imu.topic is not None:
+        plain["topic"] = _plain_source(imu.topic)
+    for field in _FIELDS:
+        given = getattr(imu, field)
+        if given is not None:
+            plain[field] = list(given) if isinstance(given, tuple) else given
+    intrinsics = parameter_to_plain(imu.intrinsics)
+    return plain if intrinsics is None else plain | {"intrinsics": intrinsics}
+
+
+def _noise(value: YamlValue) -> ImuNoise:
+    if not value.is_mapping:
+        return class_noise(value.choice("IMU class", IMU_CLASSES))
+    found = value.record(_DENSITIES, ("source",))
+    densities = {name: found[name].positive() for name in _DENSITIES}
+    return ImuNoise(**densities, source=found["source"].text() if "source" in found else ImuNoise.source)
+
+
+def _source(value: YamlValue) -> str | TwoSources:
+    """One name, or one for each of the two sensors."""
+    if not value.is_mapping:
+        return value.text()
+    found = value.record(("gyro", "accel"))
+    return TwoSources(found["gyro"].text(), found["accel"].text())
+
+
+def _plain_source(source: str | TwoSources) -> str | dict[str, str]:
+    return dataclasses.asdict(source) if isinstance(source, TwoSources) else source
+
+
+def _axes(value: YamlValue) -> Axes:
+    """Three columns with their signs, each column once."""
+    entries = [entry.text() for entry in value.items()]
+    if len(entries) != 3 or sorted(e.removeprefix("-") for e in entries) != ["x", "y", "z"]:
+        value.fail(
+            "must name the columns that become x, y and z, each once, with - where a sign is wrong, as in [x, -y, -z]; "
+            "correct it."
+        )
+    return entries[0], entries[1], entries[2]

@@ -1,0 +1,91 @@
+"""An IMU whose gyroscope and accelerometer report apart: found in a bag, drafted, joined."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from icalib.errors import RecordingError
+from icalib.imu_classes import class_noise
+from icalib.inspection import inspect_recording
+from icalib.inspection.draft import draft_rig
+from icalib.measurements import ImuStream
+from icalib.recordings import open_recording
+from icalib.recordings.imu_checks import read_imu
+from icalib.recordings.jumps import ClockJumps
+from icalib.rig import ImuSensor, TwoSources
+
+IMU = ImuSensor("imu0", "imu0/data.csv", class_noise("consumer"))
+HALVES = TwoSources("/d435/gyro/sample", "/d435/accel/sample")
+OFFSET = 1_300_000  # ns between the stamps of the two
+
+
+def apart(imu: ImuStream) -> tuple[ImuStream, ImuStream]:
+    """As RealSense's driver sends them: the accelerometer at half the rate, the other sensor's fields at zero."""
+    gyro = replace(imu, accel=np.zeros_like(imu.accel))
+    stamps = imu.stamps_ns[4:-4:2] + OFFSET
+    t = (stamps - imu.stamps_ns[0]).astype(float)
+    accel = np.stack(
+        [np.interp(t, (imu.stamps_ns - imu.stamps_ns[0]).astype(float), imu.accel[:, k]) for k in range(3)]
+    )
+    return gyro, ImuStream(imu.name, stamps, np.zeros((len(stamps), 3)), accel.T.copy())
+
+
+@pytest.fixture()
+def bag(brief, bags, tmp_path):
+    gyro, accel = apart(brief)
+    messages = bags.imu(HALVES.gyro, gyro) + bags.imu(HALVES.accel, accel) + bags.noise("/cam0/image_raw")
+    return bags.write(tmp_path / "run", messages)
+
+
+def joined(recording, sensor: ImuSensor) -> tuple[ImuStream, tuple[str, ...]]:
+    return read_imu(recording, sensor, ClockJumps())
+
+
+@pytest.mark.parametrize("topic", [None, HALVES, HALVES.gyro, HALVES.accel])
+def test_the_two_topics_are_joined(bag, brief, topic):
+    found, notes = joined(open_recording(bag), replace(IMU, topic=topic))
+    assert "/d435/gyro/sample and /d435/accel/sample (imu0): gyroscope and accelerometer report apart" in notes[0]
+    own = np.isin(brief.stamps_ns, found.stamps_ns)
+    assert own.sum() == len(found.stamps_ns) > 0.97 * len(brief.stamps_ns)
+    np.testing.assert_array_equal(found.gyro, brief.gyro[own])
+    # The accelerometer's noise, and what a straight line over 10 ms leaves of the motion.
+    assert np.sqrt(((found.accel - brief.accel[own]) ** 2).mean()) < 0.06
+
+
+def test_two_whole_imus_are_not_mixed(brief, bags, tmp_path):
+    bag = bags.write(tmp_path / "run", bags.imu("/a/imu", brief) + bags.imu("/b/imu", brief))
+    with pytest.raises(RecordingError, match="imu0 may be any of /a/imu, /b/imu"):
+        open_recording(bag).imu(IMU)
+
+
+def test_inspect_drafts_both_topics(bag):
+    found = inspect_recording(bag)
+    assert not any("same reading" in f.sentence for f in found.findings), found.findings
+    assert list(found.sources.imus) == ["imu0"]
+    assert "topic: {gyro: /d435/gyro/sample, accel: /d435/accel/sample}" in draft_rig(found)
+
+
+def write_tables(folder, imu: ImuStream) -> None:
+    gyro, accel = apart(imu)
+    folder.mkdir()
+    for name, stamps, values in (("gyro", gyro.stamps_ns, gyro.gyro), ("accel", accel.stamps_ns, accel.accel)):
+        lines = [f"{t},{','.join(map(repr, row))}" for t, row in zip(stamps, values.tolist(), strict=True)]
+        (folder / f"{name}.csv").write_text("\n".join(["#t [ns],x,y,z", *lines]))
+
+
+def test_two_tables(tmp_path, brief):
+    write_tables(tmp_path / "phone", brief)
+    found, notes = joined(open_recording(tmp_path), replace(IMU, path=TwoSources("phone/gyro.csv", "phone/accel.csv")))
+    assert len(notes) == 1 and "interpolated" in notes[0]
+    np.testing.assert_allclose(found.gyro, brief.gyro[np.isin(brief.stamps_ns, found.stamps_ns)])
+
+
+def test_clocks_that_have_nothing_in_common(tmp_path, brief):
+    write_tables(tmp_path / "phone", brief)
+    table = tmp_path / "phone/accel.csv"
+    table.write_text("\n".join(line.replace("17000000", "17000001") for line in table.read_text().splitlines()))
+    with pytest.raises(RecordingError, match=r"less than 1 s in common"):
+        joined(open_recording(tmp_path), replace(IMU, path=TwoSources("phone/gyro.csv", "phone/accel.csv")))
