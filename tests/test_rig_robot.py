@@ -134,6 +134,8 @@ def test_pose_sensors_are_read(tmp_path):
     assert (mocap.rotation_noise, mocap.position_noise) == (0.002, 0.001)
     assert (mocap.time_offset.mode, mocap.rotation) == ("prior", Parameter())
     assert odom == PoseSensor("odom0", "other/trajectory.tum", "relative")
+    (tilted,) = load(tmp_path, "sensors:\n  imu0: {type: imu}\n  m: {type: pose, level: false}\n").poses
+    assert mocap.level and not tilted.level
 
 
 def test_an_imu_and_a_pose_sensor_are_enough(tmp_path):

@@ -253,7 +253,8 @@ class PoseSensor:
     """Something that says where it is: motion capture, or another program's odometry.
 
     absolute: in a frame that stands still, whose place in the world is estimated; noise is white, rad and m. relative:
-    only the way from each pose to the next counts; noise is a random walk, rad/sqrt(s) and m/sqrt(s).
+    only the way from each pose to the next counts; noise is a random walk, rad/sqrt(s) and m/sqrt(s). level: z of its
+    frame points up, as far as the motion does not say otherwise; used where neither an IMU nor a target shows it.
     """
 
     name: str
@@ -261,6 +262,7 @@ class PoseSensor:
     kind: PoseKind = "absolute"
     rotation_noise: float | None = None  # of each axis; None: estimated from the residuals
     position_noise: float | None = None
+    level: bool = True
     rotation: Parameter = Parameter()
     translation: Parameter = Parameter()
     time_offset: Parameter = Parameter()

@@ -22,6 +22,7 @@ from icalib.assessment.robot import (
 )
 from icalib.assessment.size import felt_size, is_certain, size_words
 from icalib.assessment.stated import stated_warnings
+from icalib.assessment.upwards import upwards_warnings
 from icalib.calibration import (
     Calibration,
     HeldOut,
@@ -313,6 +314,7 @@ def _warnings(
     yield from misfits(inputs.rig, [f for f in judged if not (few and f.kind == ON_PLANES)])
     yield from few
     yield from pose_warnings(poses, inputs.rig)
+    yield from upwards_warnings(inputs, found)
     yield from lidar_warnings(inputs, found) if inputs.clouds.count else ()
     for g in groups:
         if g.name == "bloom" and abs(g.value[0]) > LARGE_BLOOM_PX:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from icalib.assessment.robot import robot_notes
+from icalib.assessment.upwards import upwards_notes
 from icalib.estimation.bodies import words_on_left_out
 from icalib.estimation.clocks import instants
 from icalib.estimation.corner_noise import NoiseModel
@@ -33,6 +34,7 @@ def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
             yield f"{camera.name}: {_noise_words(model)}."
     yield from _feature_notes(found)
     yield from robot_notes(inputs, found)
+    yield from upwards_notes(inputs, found)
 
 
 def _feature_notes(found: Estimate):

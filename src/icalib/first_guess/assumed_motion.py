@@ -76,7 +76,8 @@ def start_without_imu(rig: Rig, recordings: Sequence[Measurements]) -> tuple[Inp
         for name in ("rotation", "position", "velocity", "rate", "acceleration")
     )
     moving = State(nodes, R, p, v, np.zeros((len(nodes), 6)), values, starts)
-    values = wheel_values(felt, moving) | pose_values(felt, moving) | values
+    placed = pose_values(felt, moving) | values
+    values = wheel_values(felt, replace(moving, values=placed)) | placed
     return inputs, replace(moving, bias=-np.concatenate([rate, force], axis=1), values=values), values
 
 

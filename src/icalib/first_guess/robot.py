@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -13,6 +13,7 @@ from icalib.estimation.clocks import instants
 from icalib.estimation.ground_factor import HEIGHT_BLOCK
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.lidar_sweep import Motion
+from icalib.estimation.pose_factor import FRAME, frame_of
 from icalib.estimation.robot import MOUNT
 from icalib.estimation.state import Key, State
 from icalib.estimation.wheel_angles import integrals_of
@@ -21,10 +22,11 @@ from icalib.first_guess.known_motion import imu_poses, is_known
 from icalib.first_guess.lidar_rounds import NAMES, given, lidar_values, with_lidars
 from icalib.first_guess.poses import pose_values
 from icalib.first_guess.wheel_poses import mount_guess, poses_offset
-from icalib.first_guess.wheels import WheelRates, drive_guess, wheel_offset, wheel_rates
+from icalib.first_guess.wheels import OPPOSITE, WheelRates, drive_guess, wheel_offset, wheel_rates
 from icalib.measurements import WheelPoses, WheelStream
 from icalib.rig import Wheels
 
+LEVEL = 0.7  # cosine of the axis that a vehicle turns about with z of a frame: 45 degrees off, the frame is not level
 SIMPSON = np.array([1.0, 4.0, 1.0]) / 6.0
 
 
@@ -67,23 +69,68 @@ def _wheels(inputs: Inputs, state: State, wheels: Wheels, stream: WheelStream | 
         return _posing(inputs, state, stream, known.get((wheels.name, "time_offset"))) | known
     rates = wheel_rates(wheels.name, stream.seconds, integrals_of(stream), stream.kind)
     offset = known.get((wheels.name, "time_offset"))
+    up = _ways_up(inputs, state)
     failed: list[EstimationError] = []
-    for up in _ways_up(inputs, state):
-        try:
-            return _turning(inputs, state, stream, rates, up, offset) | known
-        except EstimationError as error:
-            failed.append(error)
+    for way in up.ways:
+        found = _try(inputs, state, stream, rates, way, offset)
+        if not isinstance(found, EstimationError):
+            return found | known
+        failed.append(found)
+    if up.level and not isinstance(_try(inputs, state, stream, rates, -up.ways[0], offset), EstimationError):
+        raise EstimationError(
+            f"{wheels.name}: {OPPOSITE[rates.kind]}; unless z of the frame of {up.level} points down: then write "
+            f"level: false for {up.level}."
+        )
     raise failed[0]
 
 
-def _ways_up(inputs: Inputs, state: State) -> tuple[np.ndarray, ...]:
-    """Upwards (3,) in the IMU's axes. Where gravity is not known, the axis that the vehicle turns about most, which may
-    point either way: then a vehicle whose left and right are mixed up is one that drives on the ceiling."""
+def _try(
+    inputs: Inputs, state: State, stream: WheelStream, rates: WheelRates, up: np.ndarray, offset: np.ndarray | None
+) -> dict[Key, np.ndarray] | EstimationError:
+    """As `_turning`, or why not."""
+    try:
+        return _turning(inputs, state, stream, rates, up, offset)
+    except EstimationError as error:
+        return error
+
+
+@dataclass(frozen=True)
+class Upwards:
+    """ways: upwards (3,) in the IMU's axes, the likely one first; level: the pose sensor whose frame says so, if one
+    does."""
+
+    ways: tuple[np.ndarray, ...]
+    level: str | None = None
+
+
+def _ways_up(inputs: Inputs, state: State) -> Upwards:
+    """By gravity. Where it is not known, along the axis that the vehicle turns about most; which way, the level frame
+    of a pose sensor says. Without one it may be either: then a vehicle whose left and right are mixed up is one that
+    drives on the ceiling."""
     if not inputs.rig.assumes_motion:
-        return (np.einsum("nji,j->i", state.rotation, [0.0, 0.0, 1.0]),)
+        return Upwards((np.einsum("nji,j->i", state.rotation, [0.0, 0.0, 1.0]),))
     assert inputs.imu is not None
     axis = np.linalg.svd(inputs.imu.gyro.T @ inputs.imu.gyro)[0][:, 0]
-    return axis, -axis
+    along, level = _level(inputs, state, axis)
+    return Upwards((np.sign(along) * axis,), level) if level else Upwards((axis, -axis))
+
+
+def level_sensor(inputs: Inputs, state: State) -> str | None:
+    """The pose sensor whose frame is level and shows which way is up, where no gravity does."""
+    turns = state.bias[:, :3]  # of an assumed motion: minus the angular rate
+    return _level(inputs, state, np.linalg.svd(turns.T @ turns)[0][:, 0])[1]
+
+
+def _level(inputs: Inputs, state: State, axis: np.ndarray) -> tuple[float, str | None]:
+    """How far upwards the `axis` (3,) points that the body turns about, and the pose sensor whose frame says so."""
+    in_world = np.einsum("nij,j->i", state.rotation, axis) / len(state.rotation)
+    for sensor in inputs.rig.poses:
+        frame = state.values.get((frame_of(sensor.name, 0), FRAME[0]))
+        if sensor.level and sensor.kind == "absolute" and frame is not None:
+            along = float(in_world @ frame[:, 2])
+            if abs(along) > LEVEL:
+                return along, sensor.name
+    return 0.0, None
 
 
 def _turning(

@@ -217,11 +217,13 @@ def _camera(name: str, value: YamlValue) -> Camera:
 
 
 def _pose(name: str, value: YamlValue) -> PoseSensor:
-    found = value.record(("type",), ("path", "topic", "kind", "rotation_noise", "position_noise", *TABLE, *MOUNTING))
+    own = ("path", "topic", "kind", "level", "rotation_noise", "position_noise")
+    found = value.record(("type",), (*own, *TABLE, *MOUNTING))
     return PoseSensor(
         name=name,
         path=path_or(found, f"{name}/poses.csv"),
         kind=choice_or(found, "kind", PoseKind, PoseSensor.kind),
+        level=found["level"].boolean() if "level" in found else PoseSensor.level,
         topic=topic_or_none(found),
         rotation_noise=found["rotation_noise"].positive() if "rotation_noise" in found else None,
         position_noise=found["position_noise"].positive() if "position_noise" in found else None,
@@ -277,7 +279,7 @@ def _camera_to_plain(camera: Camera) -> dict[str, Any]:
 
 
 def _pose_to_plain(sensor: PoseSensor) -> dict[str, Any]:
-    plain: dict[str, Any] = {"type": "pose", "path": sensor.path, "kind": sensor.kind}
+    plain: dict[str, Any] = {"type": "pose", "path": sensor.path, "kind": sensor.kind, "level": sensor.level}
     plain |= layout_to_plain(sensor.layout)
     given = {name: getattr(sensor, name) for name in ("rotation_noise", "position_noise", "topic")}
     return plain | {name: value for name, value in given.items() if value is not None} | groups_to_plain(sensor)

@@ -1,0 +1,70 @@
+"""Wheels without an IMU: a level frame says which way is up, or nothing does. Swapped wheels are named, or both
+readings."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.consistency.test_assumed_motion import check_known, mocap, without_imu
+
+from icalib.calibration import Calibration
+from icalib.errors import EstimationError
+from icalib.measurements import Measurements, WheelStream
+from icalib.pipeline import calibrate_measurements
+from icalib.simulation import SimPoses
+
+LEVEL = np.array([[0.0, 1.0, 0.0, 2.0], [-1.0, 0.0, 0.0, 1.0], [0.0, 0.0, 1.0, 0.5], [0.0, 0.0, 0.0, 1.0]])
+
+
+def swapped(measurements: Measurements) -> Measurements:
+    (wheels,) = measurements.wheels
+    assert isinstance(wheels, WheelStream)
+    return replace(measurements, wheels=(replace(wheels, rate=np.ascontiguousarray(wheels.rate[:, ::-1])),))
+
+
+def level(**others) -> SimPoses:
+    return replace(mocap(**others), T_world_frame=LEVEL)
+
+
+def said(result: Calibration) -> tuple[list[str], list[str]]:
+    notes, warnings = ([w for w in words if "which way is up" in w] for words in (result.notes, result.warnings))
+    return notes, warnings
+
+
+def test_a_level_frame_tells_swapped_wheels(robot):
+    rig, measurements, simulation = without_imu(replace(robot("ramp", 15.0, "w"), poses=(level(),)))
+    result = calibrate_measurements(rig, measurements)
+    check_known(result, simulation, 10)
+    assert said(result) == ([], [])
+    with pytest.raises(
+        EstimationError, match="left and right wheels are swapped.* signs to .-1, -1. .*level: false for m"
+    ):
+        calibrate_measurements(rig, swapped(measurements))
+    tilting = replace(rig, poses=(replace(rig.poses[0], level=False),))
+    notes, warnings = said(calibrate_measurements(tilting, swapped(measurements)))
+    assert notes == [] and len(warnings) == 1
+    words = " ".join(warnings)
+    assert (
+        "-1.00) in the axes of mocap0; if that is down, " in words and "its left and right wheels are swapped" in words
+    )
+
+
+def test_signs_put_swapped_wheels_right(robot):
+    """The frame then looks backwards, and each radius is that of the wheel on the other side."""
+    rig, measurements, simulation = without_imu(replace(robot("ramp", 15.0, "w"), poses=(level(),)))
+    (wheels,) = swapped(measurements).wheels
+    assert isinstance(wheels, WheelStream)
+    result = calibrate_measurements(rig, replace(measurements, wheels=(replace(wheels, rate=-wheels.rate),)))
+    radii, true = result.group("wheel0", "radii"), simulation.truth.drive["wheel0"]["radii"]
+    assert (np.abs(radii.value - true[::-1]) < 4.0 * radii.std).all()
+
+
+def test_with_a_camera_both_readings_are_said(robot):
+    """Of a camera that stands upright in a note."""
+    rig, measurements, _ = without_imu(robot("ramp", 20.0, "cw"))
+    notes, warnings = said(calibrate_measurements(rig, measurements))
+    assert warnings == [] and "nothing but cam0, which then stands upright" in notes[0]
+    notes, warnings = said(calibrate_measurements(rig, swapped(measurements)))
+    assert notes == [] and "Either cam0 stands upside down, or its left and right wheels are swapped" in warnings[0]
