@@ -14,8 +14,8 @@ import pytest
 import yaml
 
 from icalib.allan import allan_deviation, study_imu, study_recording, write_study
-from icalib.allan.deviation import model_variance
-from icalib.allan.fit import NoiseFit, _most_likely, _std, bands_of, fit_noise, pooled
+from icalib.allan.deviation import allan_deviation_of_all, model_variance
+from icalib.allan.fit import NoiseFit, _most_likely, _std, bands_of, bands_of_all, fit_noise, pooled
 from icalib.allan.sampling import still_readings
 from icalib.cli import main
 from icalib.errors import EstimationError, RecordingError
@@ -214,6 +214,119 @@ def test_what_was_moved_is_left_out():
     assert study.seconds == pytest.approx(220.0, abs=2.0)
     assert any("of 300 s the longest stretch without is used, 219 s from 31 s on" in w for w in study.warnings)
     assert study.gyro.together.white == pytest.approx(TRUTH["gyro"], rel=0.05)
+
+
+def touched(imu: ImuStream, at_s: float, tilt: float) -> ImuStream:
+    """A knock that rings for seconds on the table, after which the IMU lies a little otherwise."""
+    readings, t = np.hstack([imu.gyro, imu.accel]), np.arange(len(imu.stamps_ns)) / 100.0 - at_s
+    ring = np.where(t > 0.0, np.exp(-np.maximum(t, 0.0) / 1.2) * np.sin(50.0 * t), 0.0)[:, None]
+    readings += ring * [0.3, 0.2, 0.1, 1.0, 3.0, 0.5]
+    readings[:, 3:5] += tilt * (t > 0.0)[:, None]
+    return with_readings(imu, readings)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_what_was_touched_is_left_out(seed: int):
+    imu = touched(touched(at_rest(60.0, 100.0, seed), 20.3, 0.05), 38.9, -0.02)
+    study = study_imu(imu, "here")
+    assert "imu0 was moved or touched; of 60 s the 3 longest stretches without are used" in study.warnings[0]
+    assert 35.0 < study.seconds < 50.0
+    for sensor, white in ((study.gyro, TRUTH["gyro"]), (study.accel, TRUTH["accel"])):
+        assert abs(sensor.together.white - white) < 4.0 * sensor.together.white_std < 0.15 * white
+        shortest = sensor.deviation.deviation[0] * np.sqrt(0.01)
+        np.testing.assert_allclose(shortest, white, rtol=0.05)
+
+
+@pytest.mark.parametrize("size", [20.0, 1e28])
+def test_glitches_are_left_out(size: float):
+    """One reading in a hundred, on one axis or on all."""
+    imu = at_rest(100.0, 100.0, 2)
+    readings, rng = np.hstack([imu.gyro, imu.accel]), np.random.default_rng(0)
+    at = np.arange(50, 10_000, 100)
+    readings[at, rng.integers(0, 6, len(at))] += size * rng.choice([-1.0, 1.0], len(at))
+    study = study_imu(with_readings(imu, readings), "here")
+    assert study.seconds == pytest.approx(100.0)
+    assert any(
+        "100 readings of imu0 are far off those before and after; they were left out" in w for w in study.warnings
+    )
+    clean = study_imu(imu, "here")
+    for a, b in zip(study.sensors, clean.sensors, strict=True):
+        assert abs(a.together.white - b.together.white) < b.together.white_std
+        assert abs(a.together.walk - b.together.walk) < b.together.walk_std
+
+
+def test_rests_between_motion_are_found():
+    """Two thirds of the recording move, and the IMU rests in three attitudes: noise is the same in all."""
+    imu = at_rest(180.0, 100.0, 4)
+    readings, t = np.hstack([imu.gyro, imu.accel]), np.arange(18_000) / 100.0
+    moving = ((t > 12) & (t < 70)) | ((t > 90) & (t < 160))
+    readings += moving[:, None] * np.sin(np.outer(t, [3.0, 2.2, 1.7, 2.0, 2.5, 1.1])) * [1.0, 1.0, 1.0, 3.0, 3.0, 3.0]
+    readings[t > 80 - 10, 3:] = readings[t > 70, 3:][:, [2, 0, 1]] * [-1.0, 1.0, -1.0]
+    study = study_imu(with_readings(imu, readings), "here")
+    assert study.seconds == pytest.approx(52.0, abs=6.0)
+    assert study.gyro.together.white == pytest.approx(TRUTH["gyro"], rel=0.06)
+    assert study.accel.together.white == pytest.approx(TRUTH["accel"], rel=0.06)
+
+
+def test_stretches_count_together_without_the_steps_between_them():
+    rng = np.random.default_rng(8)
+    parts = [noise(6_000, 0.01, 1e-3, 2e-3, rng) + rng.normal() for _ in range(40)]
+    fit = fit_noise(bands_of_all(parts, 0.01), 0.01)
+    assert abs(fit.white - 1e-3) < 4.0 * fit.white_std < 0.03e-3
+    assert abs(fit.walk - 2e-3) < 4.0 * fit.walk_std < 0.4e-3
+    found = allan_deviation_of_all([part[:, None] for part in parts], 0.01)
+    assert found.tau[-1] == pytest.approx(15.0)
+    model = np.sqrt(model_variance(1e-3, 2e-3, found.tau, 0.01))
+    assert (np.abs(found.deviation[:, 0] / model - 1.0) < 4.0 * found.relative).all() and found.relative[-1] < 0.1
+
+
+def test_one_stretch_alone_is_what_it_was():
+    values = noise(5_000, 0.01, 1e-3, 1e-4, np.random.default_rng(1))
+    for a, b in zip(
+        dataclasses.astuple(bands_of_all([values], 0.01)), dataclasses.astuple(bands_of(values, 0.01)), strict=True
+    ):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("rate", [12.0, 25.0, 400.0])
+def test_noise_that_scatters_is_no_motion(rate: float):
+    """Few readings a second, or many through a filter of 4 Hz: the noise of a second scatters by a fifth."""
+    imu = at_rest(4000.0 if rate < 400.0 else 600.0, rate, 5)
+    if rate == 400.0:
+        kernel = np.exp(-np.arange(400) / 16.0)
+        rows = np.hstack([imu.gyro, imu.accel]) - REST
+        filtered = [np.convolve(x, kernel / kernel.sum(), "valid") for x in rows.T]
+        values = np.stack(filtered, axis=1) + REST
+        imu = ImuStream("imu0", imu.stamps_ns[: len(values)], values[:, :3], values[:, 3:])
+    assert len(still_readings(imu).readings) == len(imu.stamps_ns)
+    assert not any("moved or touched" in w for w in still_readings(imu).warnings)
+
+
+def test_a_long_gap_is_not_filled():
+    imu = at_rest(300.0, 100.0, 8)
+    stamps = imu.stamps_ns.copy()
+    stamps[12_000:] += 3_600_000_000_000
+    still = still_readings(dataclasses.replace(imu, stamps_ns=stamps))
+    assert [len(part) for part in still.stretches] == [12_000, 18_000] and still.period == pytest.approx(0.01)
+    assert (
+        "or has gaps of more than a second; of 300 s the 2 longest stretches without are used, 300 s in all"
+        in (still.warnings[0])
+    )
+
+
+@pytest.mark.parametrize("scale", [0.3, 1.0])
+def test_rates_in_degrees_are_named(scale: float):
+    """A quiet gyroscope and a usual one; the accelerometer as it is."""
+    imu = at_rest(60.0, 100.0, 3)
+    degrees = dataclasses.replace(imu, gyro=imu.gyro * scale * 180.0 / np.pi)
+    (warning,) = [w for w in study_imu(degrees, "here").warnings if "deg/s" in w]
+    assert (
+        f"the angular rates look like deg/s: at rest their noise is {57.3 * scale:.0f} times that of a consumer"
+        in warning
+    )
+    assert not any("deg/s" in w for w in study_imu(imu, "here").warnings)
+    shaken = with_readings(imu, (np.hstack([imu.gyro, imu.accel]) - REST) * 30.0 + REST)
+    assert not any("deg/s" in w for w in study_imu(shaken, "here").warnings)
 
 
 def test_an_imu_in_the_hand_is_refused():

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from icalib.allan.deviation import Deviation, allan_deviation
-from icalib.allan.fit import NoiseFit, bands_of, fit_noise, pooled
+from icalib.allan.deviation import Deviation, allan_deviation_of_all
+from icalib.allan.fit import NoiseFit, bands_of_all, fit_noise, pooled
 from icalib.allan.sampling import still_readings
 from icalib.errors import RecordingError
 from icalib.imu_classes import DEFAULT_CLASS, class_noise
@@ -23,6 +23,9 @@ AXES = ("x", "y", "z")
 _WALK_KNOWN = 1.0  # of NoiseFit.lacking
 _WORSE = 1.5  # times the mean density
 _MISFIT = 0.15
+_NOISIEST_GYRO = 1e-3  # rad/s/sqrt(Hz): more than gyroscopes have that are sold; quiet ones have it in deg/s
+_APART = 5.0  # times as far from its class as the accelerometer, which vibration would disturb as well
+DEGREE = np.pi / 180.0
 _SAMPLE = 200_000  # readings in which the steps of rounding are looked for
 
 
@@ -78,10 +81,10 @@ def study_recording(path: str | Path, imu: str | None = None) -> ImuNoiseStudy:
 def study_imu(imu: ImuStream, where: str, notes: tuple[str, ...] = ()) -> ImuNoiseStudy:
     """Noise densities, bias walks and Allan deviations of `imu`. Raises EstimationError as `still_readings`."""
     still = still_readings(imu)
-    gyro = _sensor_noise("gyroscope", "rad/s", still.readings[:, :3], still.period)
-    accel = _sensor_noise("accelerometer", "m/s^2", still.readings[:, 3:], still.period)
+    gyro = _sensor_noise("gyroscope", "rad/s", [part[:, :3] for part in still.stretches], still.period)
+    accel = _sensor_noise("accelerometer", "m/s^2", [part[:, 3:] for part in still.stretches], still.period)
     rounding = _rounding(gyro.kind, still.readings[:, :3]) + _rounding(accel.kind, still.readings[:, 3:])
-    warnings = still.warnings + rounding
+    warnings = still.warnings + _unit_warnings(gyro.together.white, accel.together.white) + rounding
     for sensor in (gyro, accel):
         warnings += _walk_warnings(sensor, still.seconds) + _shape_warnings(sensor)
     return ImuNoiseStudy(imu.name, where, still.seconds, still.period, gyro, accel, warnings, notes)
@@ -102,9 +105,10 @@ def _imu_topic(where: str, topics: tuple[TopicInfo, ...], given: str | None) -> 
     return found[0]
 
 
-def _sensor_noise(kind: str, unit: str, readings: np.ndarray, period: float) -> SensorNoise:
-    bands = [bands_of(readings[:, k], period) for k in range(3)]
-    deviation = allan_deviation(readings, period)
+def _sensor_noise(kind: str, unit: str, stretches: list[np.ndarray], period: float) -> SensorNoise:
+    """stretches: readings (n, 3) at rest."""
+    bands = [bands_of_all([part[:, k] for part in stretches], period) for k in range(3)]
+    deviation = allan_deviation_of_all(stretches, period)
     instability, tau = deviation.instability()
     ends = deviation.tau[[0, -1]]
     return SensorNoise(
@@ -116,6 +120,19 @@ def _sensor_noise(kind: str, unit: str, readings: np.ndarray, period: float) -> 
         instability=instability,
         instability_tau=tau,
         open=tuple(bool(t in ends) for t in tau),
+    )
+
+
+def _unit_warnings(gyro: float, accel: float) -> tuple[str, ...]:
+    """A warning where the noise of the gyroscope is that of one in deg/s beside the accelerometer's."""
+    usual = class_noise(DEFAULT_CLASS)
+    times_gyro, times_accel = gyro / usual.gyro, accel / usual.accel
+    if gyro < _NOISIEST_GYRO or times_gyro < _APART * times_accel:
+        return ()
+    return (
+        f"the angular rates look like deg/s: at rest their noise is {times_gyro:.0f} times that of a {DEFAULT_CLASS} "
+        f"gyroscope, that of the accelerometer {times_accel:.2g} times; if they are, {gyro:.2g} rad/s/sqrt(Hz) is "
+        f"{DEGREE:.3g} times that, {gyro * DEGREE:.2g}.",
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,19 +29,25 @@ class Deviation:
 
 def allan_deviation(readings: np.ndarray, period: float) -> Deviation:
     """Of readings (n, k), one every `period` seconds; averaging times up to a quarter of the recording."""
-    n = len(readings)
-    longest = max(1, n // 4)
+    return allan_deviation_of_all([readings], period)
+
+
+def allan_deviation_of_all(stretches: Sequence[np.ndarray], period: float) -> Deviation:
+    """Of stretches of readings (n, k), one every `period` seconds: neighbouring means are of one stretch, and all count
+    alike. Averaging times up to a quarter of the longest stretch."""
+    longest = max(1, max(map(len, stretches)) // 4)
     sizes = np.unique(np.round(np.geomspace(1, longest, 1 + round(_PER_DECADE * np.log10(longest)))).astype(np.int64))
-    angle = np.concatenate([np.zeros((1, readings.shape[1])), np.cumsum(readings - readings.mean(axis=0), axis=0)])
-    variance = np.array([_variance(angle, int(m)) for m in sizes])
-    clusters = n / sizes
-    return Deviation(sizes * period, np.sqrt(variance), 1.0 / np.sqrt(2.0 * np.maximum(clusters - 1.0, 1.0)))
+    angles = [np.concatenate([np.zeros((1, r.shape[1])), np.cumsum(r - r.mean(axis=0), axis=0)]) for r in stretches]
+    variance = np.array([_variance(angles, int(m)) for m in sizes])
+    pairs = sum(np.maximum(len(r) / sizes - 1.0, 0.0) for r in stretches)
+    return Deviation(sizes * period, np.sqrt(variance), 1.0 / np.sqrt(2.0 * np.maximum(pairs, 1.0)))
 
 
-def _variance(angle: np.ndarray, m: int) -> np.ndarray:
+def _variance(angles: Sequence[np.ndarray], m: int) -> np.ndarray:
     """(k,) half the mean square of the difference of neighbouring means over m readings."""
     step = max(1, m // _STARTS_PER_CLUSTER)
-    second = angle[2 * m :: step] - 2.0 * angle[m:-m:step] + angle[: -2 * m : step]
+    long = [angle for angle in angles if len(angle) > 2 * m]
+    second = np.concatenate([a[2 * m :: step] - 2.0 * a[m:-m:step] + a[: -2 * m : step] for a in long])
     return (second**2).mean(axis=0) / (2.0 * m**2)
 
 

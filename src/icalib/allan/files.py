@@ -20,5 +20,5 @@ def check_folder(folder: Path) -> None:
 
 def write_study(study: ImuNoiseStudy, folder: Path) -> None:
     """Writes allan.html, noise.yaml (fields of a rig file) and allan.json. Raises CalibrationError."""
-    texts = map(printable, (allan_html(study), rig_snippet(study), study_json(study)))
+    texts = map(printable, (allan_html(study), rig_snippet(study, warned=True), study_json(study)))
     write_texts(folder, dict(zip(FILES, texts, strict=True)))

@@ -11,7 +11,8 @@ Differences only drop the constant bias. Coefficients are averaged in bands; the
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -52,6 +53,13 @@ class NoiseFit:
     resolved: bool
     misfit: float
     lacking: float
+
+
+def bands_of_all(stretches: Sequence[np.ndarray], period: float) -> Bands:
+    """Of stretches of readings, each (n,), one every `period` seconds: their likelihoods multiply, so their bands stand
+    side by side, and no difference is taken from one stretch to the next."""
+    found = [bands_of(part, period) for part in stretches]
+    return Bands(*(np.concatenate([getattr(b, f.name) for b in found]) for f in fields(Bands)))
 
 
 def bands_of(readings: np.ndarray, period: float) -> Bands:

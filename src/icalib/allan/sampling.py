@@ -1,100 +1,181 @@
-"""Readings at an even rate, and the longest stretch of them that stood still."""
+"""Readings at an even rate, and the stretches of them that stood still."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from icalib.errors import EstimationError
 from icalib.measurements import ImuStream
 
 _GAP_PERIODS = 5.0  # a longer step between stamps is a gap; shorter ones are jitter of whoever stamps
 _MOST_FILLED = 0.05  # share of readings; beyond it stamps come in bursts, and say nothing about gaps
-_WINDOW_S = 1.0
-_JUMP = np.repeat([0.02, 0.2], 3)  # rad/s, m/s^2: no bias walks that far from one second to the next,
-_OFF = np.repeat([0.1, 2.0], 3)  # nor that far from its median in hours
-_NOISE_OFF = 5.0  # times the median noise of a window
-_LEAST_S = 10.0
+_WINDOW_S = 1.0  # in which noise is judged; gaps that are longer are not filled
+_LEAST_S = 10.0  # of the longest stretch
+_JUMP = np.repeat([0.02, 0.2], 3)  # rad/s, m/s^2: no bias walks that far from one second to the next
+_SURE = 8.0  # standard deviations of the mean of a window, which a jump of a noisy sensor exceeds too
+_OFF_RAD_S = 0.1  # nor that far from its median in hours
+_LOUDER, _SCATTERS = 1.5, 3.0  # times the quietest noise, and scatters of it (of its logarithm), are moved or touched
+_QUIET = 2.0  # times the quietest noise, below which windows show its scatter
+_SHORTEST = 0.25  # of the longest stretch; shorter ones tell little of slow noise
+_GLITCH, _ALONE = 15.0, 5.0  # times the usual distance from the neighbours' mean, and that of readings near by
+_NEAR = 3  # readings
+_SAMPLE = 200_000  # readings in which the step of rounding is looked for
 
 
 @dataclass(frozen=True)
 class Still:
-    """Readings (n, 6), gyroscope [rad/s] then accelerometer [m/s^2], one every `period` seconds."""
+    """Stretches (n, 6) of readings, gyroscope [rad/s] then accelerometer [m/s^2], one every `period` seconds."""
 
-    readings: np.ndarray
+    stretches: tuple[np.ndarray, ...]
     period: float
     warnings: tuple[str, ...]
 
     @property
+    def readings(self) -> np.ndarray:
+        """(n, 6) of all stretches, one after the other."""
+        return np.concatenate(self.stretches)
+
+    @property
     def seconds(self) -> float:
-        return len(self.readings) * self.period
+        return sum(len(part) for part in self.stretches) * self.period
 
 
 def still_readings(imu: ImuStream) -> Still:
-    """The longest stretch of `imu` that stood still, at an even rate; what was filled or left out stands in warnings.
+    """The longest stretches of `imu` that stood still, at an even rate; what was filled or left out stands in warnings.
 
-    Raises EstimationError where nothing stood still for 10 s.
+    Windows of a second are compared with the noise of the quietest 10 s. Raises EstimationError where nothing stood
+    still for 10 s.
     """
-    readings, period, warnings = _even(imu)
-    first, last = longest_run(~_disturbed(readings, period))
+    readings, glitches = _without_glitches(np.concatenate([imu.gyro, imu.accel], axis=1), imu.name)
+    parts, begins, period, gaps = _even(imu.name, imu.stamps_ns, readings)
+    warnings = glitches + gaps
     window = max(1, round(_WINDOW_S / period))
-    whole = len(readings) // window
-    total, kept = len(readings) * period, (last - first) * window * period
-    if kept < _LEAST_S:
+    runs = [(k, *run) for k, moved in enumerate(_disturbed(parts, window)) for run in _runs(~moved)]
+    longest = max((last - first for _, first, last in runs), default=0)
+    total = sum(len(part) for part in parts) * period
+    if longest * window * period < _LEAST_S:
         raise EstimationError(
             f"{imu.name} did not stand still for {_LEAST_S:g} s anywhere in {total:.0f} s; lay it on a table or the "
             "floor, touch nothing, and record again."
         )
-    if last - first < whole:
-        warnings += (
-            f"{imu.name} was moved or touched; of {total:.0f} s the longest stretch without is used, "
-            f"{kept:.0f} s from {first * window * period:.0f} s on.",
-        )
-        readings = readings[first * window : last * window]
-    return Still(readings, period, warnings)
+    if [(k, 0, len(parts[k]) // window) for k in range(len(parts))] == runs and len(parts) == 1:
+        return Still(tuple(parts), period, warnings)
+    kept = [run for run in runs if run[2] - run[1] >= _SHORTEST * longest]
+    named = [((last - first) * window * period, begins[k] + first * window * period) for k, first, last in kept]
+    stretches = tuple(parts[k][first * window : last * window] for k, first, last in kept)
+    why = "was moved or touched" if len(parts) == 1 else "was moved or touched, or has gaps of more than a second"
+    return Still(stretches, period, (*warnings, f"{imu.name} {why}; {_what_is_used(total, named)}"))
 
 
-def _even(imu: ImuStream) -> tuple[np.ndarray, float, tuple[str, ...]]:
-    """Readings with gaps filled by straight lines, and the period [s]."""
-    readings = np.concatenate([imu.gyro, imu.accel], axis=1)
-    steps = np.diff(imu.stamps_ns) * 1e-9
-    gap = steps > _GAP_PERIODS * np.median(steps)
-    period = float(steps[~gap].mean())
-    missing = np.where(gap, np.maximum(np.round(steps / period) - 1, 0), 0).astype(np.int64)
+def _what_is_used(total_s: float, stretches: list[tuple[float, float]]) -> str:
+    """stretches: how long, and from when on [s]."""
+    if len(stretches) == 1:
+        long, begin = stretches[0]
+        return f"of {total_s:.0f} s the longest stretch without is used, {long:.0f} s from {begin:.0f} s on."
+    listed = ", ".join(f"{long:.0f} s from {begin:.0f} s on" for long, begin in stretches)
+    whole = sum(long for long, _ in stretches)
+    return (
+        f"of {total_s:.0f} s the {len(stretches)} longest stretches without are used, {whole:.0f} s in all: {listed}."
+    )
+
+
+def _without_glitches(readings: np.ndarray, name: str) -> tuple[np.ndarray, tuple[str, ...]]:
+    """`readings` (n, 6), of which single ones far off both neighbours became the mean of these, and a count."""
+    found = np.zeros(readings.shape, bool)
+    step = _rounding_step([readings])
+    for k, values in enumerate(readings.T if len(readings) >= 2 * _NEAR else ()):
+        off = np.abs(values[1:-1] - 0.5 * (values[:-2] + values[2:]))
+        usual = 1.4826 * float(np.median(off)) + step[k]
+        padded = np.pad(off, _NEAR)  # the neighbours' own are half as large as that of a glitch between them
+        near = np.max([padded[_NEAR + j : len(padded) - _NEAR + j] for j in (-3, -2, 2, 3)], axis=0)
+        step_size = np.abs(values[2:] - values[:-2])  # of a tilt; before and after a glitch readings are alike
+        found[1:-1, k] = off > np.maximum(_GLITCH * usual, _ALONE * np.maximum(near, step_size))
+    if not found.any():
+        return readings, ()
+    at, axis = np.nonzero(found)
+    repaired = readings.copy()
+    repaired[at, axis] = 0.5 * (readings[at - 1, axis] + readings[at + 1, axis])
+    return repaired, (
+        f"{int(found.any(axis=1).sum())} readings of {name} are far off those before and after; they were left out.",
+    )
+
+
+def _even(
+    name: str, stamps_ns: np.ndarray, readings: np.ndarray
+) -> tuple[list[np.ndarray], list[float], float, tuple[str, ...]]:
+    """Readings between gaps that are longer than a window, with shorter gaps filled by straight lines; when each part
+    begins [s]; and the period [s]."""
+    steps = np.diff(stamps_ns) * 1e-9
+    longest = max(_WINDOW_S, _GAP_PERIODS * float(np.median(steps)))
+    cuts = np.flatnonzero(steps > longest) + 1
+    begins = [0.0, *((stamps_ns[cuts] - stamps_ns[0]) * 1e-9).tolist()]
+    joined = steps[steps <= longest]
+    gap = joined > _GAP_PERIODS * np.median(steps)
+    period = float(joined[~gap].mean())
+    missing = np.where(gap, np.maximum(np.round(joined / period) - 1, 0), 0).astype(np.int64)
     if missing.sum() > _MOST_FILLED * len(readings):
-        sentence = f"the stamps of {imu.name} come in bursts, or with many gaps; its readings are taken as even."
-        return readings, float(steps.mean()), (sentence,)
+        sentence = f"the stamps of {name} come in bursts, or with many gaps; its readings are taken as even."
+        return np.split(readings, cuts), begins, float(joined.mean()), (sentence,)
     if not missing.any():
-        return readings, period, ()
+        return np.split(readings, cuts), begins, period, ()
+    parts = np.split(readings, cuts)
+    own = np.split(missing, np.cumsum([len(part) - 1 for part in parts])[:-1])
+    filled = [_filled(part, lost) for part, lost in zip(parts, own, strict=True)]
+    sentence = (
+        f"{name} has {int(gap.sum())} gaps, the longest of {joined.max():.3g} s; {int(missing.sum())} of "
+        f"{sum(map(len, filled))} readings are filled by straight lines."
+    )
+    return filled, begins, period, (sentence,)
+
+
+def _filled(readings: np.ndarray, missing: np.ndarray) -> np.ndarray:
+    """With as many readings as are `missing` (n - 1,) behind each, on straight lines."""
     at = np.concatenate([[0], np.cumsum(1 + missing)])
     every = np.arange(at[-1] + 1)
-    filled = np.stack([np.interp(every, at, readings[:, k]) for k in range(6)], axis=1)
-    sentence = (
-        f"{imu.name} has {int(gap.sum())} gaps, the longest of {steps.max():.3g} s; {int(missing.sum())} of "
-        f"{len(filled)} readings are filled by straight lines."
-    )
-    return filled, period, (sentence,)
+    return np.stack([np.interp(every, at, readings[:, k]) for k in range(6)], axis=1)
 
 
-def _disturbed(readings: np.ndarray, period: float) -> np.ndarray:
-    """(m,) whether the IMU moved in each whole window of a second."""
-    window = max(1, round(_WINDOW_S / period))
-    count = len(readings) // window
-    if count == 0:
-        return np.ones(1, dtype=bool)
-    parts = readings[: count * window].reshape(count, window, 6)
-    mean, noise = parts.mean(axis=1), parts.std(axis=1)
-    jump = np.abs(np.diff(mean, axis=0, prepend=mean[:1]))
-    moved = ((jump > _JUMP) | (np.abs(mean - np.median(mean, axis=0)) > _OFF)).any(axis=1)
-    return moved | (noise > _NOISE_OFF * np.median(noise, axis=0) + 1e-12).any(axis=1)
+def _disturbed(parts: list[np.ndarray], window: int) -> list[np.ndarray]:
+    """(m,) of each part: whether the IMU moved in each whole window, or was touched shortly before or after."""
+    windows = [part[: len(part) // window * window].reshape(-1, window, 6) for part in parts]
+    means = [w.mean(axis=1) for w in windows]
+    floor = 0.5 * _rounding_step(parts)
+    noises = [np.hypot(w.std(axis=1), floor) for w in windows]
+    least = round(_LEAST_S / _WINDOW_S)
+    running = [np.median(sliding_window_view(n, least, axis=0), axis=-1) for n in noises if len(n) >= least]
+    if not running:
+        return [np.ones(len(n), bool) for n in noises]
+    quietest = np.concatenate(running).min(axis=0) + 1e-12
+    loudest = quietest * _LOUDER * np.exp(_SCATTERS * _scatter(np.concatenate(noises), quietest))
+    jump = np.maximum(_JUMP, _SURE * quietest / np.sqrt(window))
+    middle = np.nanmedian(np.where(np.concatenate(noises) <= loudest, np.concatenate(means), np.nan), axis=0)[:3]
+    found = []
+    for mean, noise in zip(means, noises, strict=True):
+        loud = (noise > loudest).any(axis=1)
+        loud[1:] |= (near := loud.copy())[:-1]
+        loud[:-1] |= near[1:]
+        moved = (np.abs(np.diff(mean, axis=0, prepend=mean[:1])) > jump).any(axis=1)
+        found.append(loud | moved | (np.abs(mean[:, :3] - middle) > _OFF_RAD_S).any(axis=1))
+    return found
 
 
-def longest_run(flag: np.ndarray) -> tuple[int, int]:
-    """Begin and end of the longest run of True in `flag` (m,)."""
+def _scatter(noises: np.ndarray, quietest: np.ndarray) -> np.ndarray:
+    """(6,) standard deviation of the logarithm of the noise of quiet windows, from its median deviation."""
+    quiet = np.log(np.where(noises <= _QUIET * quietest, noises, np.nan) / quietest)
+    return 1.4826 * np.nanmedian(np.abs(quiet - np.nanmedian(quiet, axis=0)), axis=0)
+
+
+def _rounding_step(parts: list[np.ndarray]) -> np.ndarray:
+    """(6,) the usual step from one value of a reading to the next larger one: noise below it comes and goes."""
+    sample = np.concatenate(parts)[:_SAMPLE]
+    levels = (np.unique(values) for values in sample.T)
+    return np.array([np.median(np.diff(v)) if len(v) > 1 else 0.0 for v in levels])
+
+
+def _runs(flag: np.ndarray) -> list[tuple[int, int]]:
+    """Begin and end of each run of True in `flag` (m,)."""
     edge = np.diff(np.concatenate([[0], flag.astype(np.int8), [0]]))
-    begin, end = np.flatnonzero(edge == 1), np.flatnonzero(edge == -1)
-    if not len(begin):
-        return 0, 0
-    longest = int(np.argmax(end - begin))
-    return int(begin[longest]), int(end[longest])
+    return list(zip(np.flatnonzero(edge == 1).tolist(), np.flatnonzero(edge == -1).tolist(), strict=True))

@@ -24,10 +24,12 @@ def units(sensor: SensorNoise) -> tuple[str, str]:
     return _UNITS[sensor.kind]
 
 
-def rig_snippet(study: ImuNoiseStudy) -> str:
-    """YAML to be pasted below the IMU of a rig file. A walk that was not seen is given as its upper bound."""
+def rig_snippet(study: ImuNoiseStudy, warned: bool = False) -> str:
+    """YAML to be pasted below the IMU of a rig file. A walk that was not seen is given as its upper bound. warned: the
+    warnings stand in it as comments."""
     lines = [
         f"# Noise of {study.name}, from {study.seconds:.0f} s at rest at {1.0 / study.period:.6g} Hz (icalib allan).",
+        *(f"# Warning: {sentence}" for sentence in study.warnings if warned),
         "noise:",
     ]
     for sensor in study.sensors:
