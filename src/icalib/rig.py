@@ -94,6 +94,7 @@ class ImuSensor:
     accel_axes: Axes | None = None
     gyro_axes: Axes | None = None
     assumed: bool = False
+    pose_keyframes_s: float = 0.02  # between keyframes that poses alone place
     layout: TableLayout = PLAIN_TABLE
 
 

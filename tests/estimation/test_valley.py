@@ -6,7 +6,10 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
+from scipy.optimize import minimize
 
+from icalib.estimation.anderson import Accelerator
 from icalib.estimation.arrowhead import make_pieces
 from icalib.estimation.border import NOTHING
 from icalib.estimation.solver import minimise
@@ -80,6 +83,34 @@ class Slope(OneNumber):
         return super().linearise(state, pieces, residuals, sums, curved)
 
 
+class Saddle(OneNumber):
+    """Residuals x - 1, y - 2 and LARGE + c x y / LARGE: curvatures 1 + c and 1 - c, where the squared slopes are 1."""
+
+    layout = make_layout([(*KEY, "vector", 2, True)])
+    tolerance, held = np.array([1.0, 1.0]), NOTHING
+
+    def __init__(self, c: float):
+        self.c = c
+
+    def pieces(self):
+        return make_pieces(1, 2)
+
+    def residual(self, z: np.ndarray) -> np.ndarray:
+        return np.array([z[0] - 1.0, z[1] - 2.0, LARGE + self.c * z[0] * z[1] / LARGE])
+
+    def linearise(self, state, pieces, residuals, sums=True, curved=False):
+        z = state.values[KEY]
+        r, J = self.residual(z), np.array([[1.0, 0.0], [0.0, 1.0], self.c / LARGE * z[::-1]])
+        if sums:
+            (piece,) = pieces
+            piece.clear()
+            piece.diagonal[0] = np.eye(15)
+            A = np.column_stack([J, r])
+            piece.border[:] = A.T @ A
+            piece.border[-1, -1] = 0.0
+        return float(0.5 * r @ r)
+
+
 def at(y: float) -> State:
     one = np.zeros((1, 3))
     return State(np.zeros(1), np.eye(3)[None], one, one, np.zeros((1, 6)), {KEY: np.array([y])})
@@ -127,3 +158,15 @@ def test_an_early_pass_finds_the_damping_it_needs_in_few_tries_and_lets_go_of_it
     assert 1 <= tries <= 3
     assert len(outcome.steps) <= tries + 5
     assert outcome.steps[-1].damping == 0.0
+
+
+@pytest.mark.parametrize("c", [0.7, 0.9, -0.9])
+def test_it_is_quick_where_plain_steps_converge_slowly(c, monkeypatch):
+    problem, one = Saddle(c), np.zeros((1, 3))
+    start = State(np.zeros(1), np.eye(3)[None], one, one, np.zeros((1, 6)), {KEY: np.array([5.0, -3.0])})
+    outcome = minimise(problem, start)
+    assert outcome.converged, outcome.status
+    least = minimize(lambda z: 0.5 * problem.residual(z) @ problem.residual(z), [0.0, 0.0], tol=1e-12).fun
+    assert outcome.cost - least < 5e-3  # a tenth of a standard deviation
+    monkeypatch.setattr(Accelerator, "step", lambda *_: None)
+    assert 3 * len(outcome.steps) < len(minimise(problem, start).steps)

@@ -35,7 +35,6 @@ from icalib.rig import Camera, Parameter, Rig, Scheme
 BLOOM_SIGMA_PX = 1.0
 NO_BLOOM = np.zeros((0, 2), dtype=np.float32)  # single precision: directions as such are near enough
 CUT_S = 0.5
-POSE_NODES_S = 0.02  # between nodes where poses alone place them
 
 
 def _priors(inputs: Inputs) -> tuple[Prior, ...]:
@@ -88,8 +87,9 @@ def host_times(inputs: Inputs, values: dict[Key, np.ndarray]) -> list[np.ndarray
         return image_times(inputs, values)
     if inputs.rig.lidars:
         return [instants(x, values) for x in inputs.measurements.lidars]
-    first = inputs.measurements.poses[0]
-    return [instants(first, values, thinned(first.seconds, POSE_NODES_S))]
+    first, imu = inputs.measurements.poses[0], inputs.rig.imu
+    assert imu is not None
+    return [instants(first, values, thinned(first.seconds, imu.pose_keyframes_s))]
 
 
 def thinned(times: np.ndarray, apart: float) -> np.ndarray:

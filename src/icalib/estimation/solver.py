@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icalib.errors import EstimationError
+from icalib.estimation.anderson import PROMISED, Accelerator
 from icalib.estimation.arrowhead import NotDefiniteError, Piece, Solution, solve
 from icalib.estimation.border import DETERMINED, least_information
 from icalib.estimation.outcome import STALLED_DECREASE, Outcome, Step, Visit, outcome_of, way_come
@@ -88,6 +89,7 @@ class _Descent:
     steps: list[Step] = field(default_factory=list)
     care: _Care = field(init=False)
     stalled: int = 0
+    accelerator: Accelerator = field(default_factory=Accelerator)
 
     def __post_init__(self) -> None:
         self.care = _Care(QUICK if self.early else SLOW)
@@ -179,7 +181,9 @@ class _Descent:
     def step(self, solution: Solution, comes_back: bool) -> tuple[bool, bool]:
         """Whether the step is taken, and whether it is the last one."""
         near = solution.decrease < self.care.curved_below * self.cost
-        there = self.state.retract(self.problem.layout, solution.chain, solution.border)
+        if self._accelerated(solution, near):
+            return True, False
+        whole = there = self.state.retract(self.problem.layout, solution.chain, solution.border)
         straight = self._straight(solution, there, near)
         converged = straight is not None or (self.free and solution.decrease < self.enough)
         sums = not (converged and self.early)
@@ -192,10 +196,32 @@ class _Descent:
         # not where it goes far along what the data hardly tell, and the cost rises.
         taken = bool(cost < self.cost) or (converged and cost - self.cost < self.enough)
         self.note(solution, taken)
+        if taken and there is whole and self.free:
+            plain = solution.chain, solution.border
+            self.accelerator.note(plain, plain, solution.decrease)
+        else:
+            self.accelerator.forget()
         if taken:
             self.care.less(near, self.cost - cost > 0.25 * solution.decrease)
             self.state, self.cost, self.problem = there, cost, self.problem.settled(self.residuals)
         return taken, converged
+
+    def _accelerated(self, solution: Solution, curved: bool) -> bool:
+        """Takes an accelerated step where plain ones converge slowly, and says whether it did."""
+        if not self.free or solution.decrease < self.enough:
+            return False
+        best = self.accelerator.step(solution.chain, solution.border, solution.decrease)
+        if best is None:
+            return False
+        there = self.state.retract(self.problem.layout, *best)
+        cost = self._linearise(there, True, curved)
+        if not cost < self.cost - PROMISED * solution.decrease:
+            self.accelerator.forget()
+            return False
+        self.note(solution, True)
+        self.accelerator.note((solution.chain, solution.border), best, solution.decrease)
+        self.state, self.cost, self.problem = there, cost, self.problem.settled(self.residuals)
+        return True
 
     def tries_again(self, solution: Solution) -> bool:
         """After a step that failed: with more care, unless nothing comes of it."""
@@ -230,6 +256,8 @@ class _Descent:
         """What a step to `state` costs, where an early pass may end with it although it is not small: it gains just
         what the sums say, so that nothing bends on its way, and next to nothing is left behind it. Else None."""
         if not (self.early and self.free and self.enough < solution.decrease < STRAIGHT):
+            return None
+        if self.accelerator.slow(solution.decrease):  # something bends
             return None
         cost = self._linearise(state, sums=False, curved=curved)
         return cost if abs(self.cost - cost - solution.decrease) < AS_SAID * self.tolerance else None

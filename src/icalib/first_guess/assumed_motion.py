@@ -22,6 +22,7 @@ from icalib.estimation.inputs import Inputs, inputs_for
 from icalib.estimation.nodes import first_nodes
 from icalib.estimation.pose_factor import FRAME, frame_of
 from icalib.estimation.state import Key, State
+from icalib.first_guess.keyframe_spacing import keyframe_spacing
 from icalib.first_guess.lidar_rounds import given
 from icalib.first_guess.poses import NAMES, pose_values
 from icalib.first_guess.robot import wheel_values
@@ -61,7 +62,7 @@ def start_without_imu(rig: Rig, recordings: Sequence[Measurements]) -> tuple[Inp
                 f"{where}{rig.body} shows where it is at {len(own.seconds)} instants only; record more."
             )
     paths = [own.at(np.arange(0.0, own.seconds[-1], STEP_S)) for own in shown]  # from the body's first stamp on
-    body = _with_assumption(rig, paths)
+    body = _with_assumption(rig, recordings, paths)
     inputs = replace(inputs_for(body, _readings(recordings, paths, rig.settings.max_gap_s)), asked=rig)
     felt = inputs_for(body, _readings(recordings, paths), inputs)
     assert felt.imu is not None
@@ -99,7 +100,7 @@ def _shown(rig: Rig, recordings: Sequence[Measurements]) -> tuple[list[_Shown], 
     return found, guess.values()
 
 
-def _with_assumption(rig: Rig, paths: Sequence[SmoothPath]) -> Rig:
+def _with_assumption(rig: Rig, recordings: Sequence[Measurements], paths: Sequence[SmoothPath]) -> Rig:
     """The rig with the assumption as its IMU, which is where the body is."""
     turning, jerking = (
         np.sqrt(np.mean(np.concatenate([_changes(p, what) for p in paths]) ** 2) / LAG_S) + LEAST_DENSITY
@@ -110,6 +111,8 @@ def _with_assumption(rig: Rig, paths: Sequence[SmoothPath]) -> Rig:
     imu = ImuSensor(ASSUMPTION, "", noise, assumed=True)
     if rig.cameras:
         return replace(rig, imu=imu, gravity=0.0, cameras=(replace(rig.cameras[0], **here), *rig.cameras[1:]))
+    spacing = keyframe_spacing(rig, recordings, paths, float(turning), float(jerking))
+    imu = replace(imu, pose_keyframes_s=spacing)
     return replace(rig, imu=imu, gravity=0.0, poses=(replace(rig.poses[0], **here), *rig.poses[1:]))
 
 
