@@ -18,6 +18,7 @@ from icalib.calibration import Calibration
 from icalib.cli import main
 from icalib.errors import CalibrationError
 from icalib.geometry import so3
+from icalib.own_files import sealed
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Settings
 from icalib.simulation import handheld, rig_for, simulate
@@ -121,14 +122,14 @@ def refusal(tables: Tables, folder: Path, capsys) -> str:
     """The sentence of a refused run. An earlier result in the folder is untouched."""
     earlier = folder / "out" / "calibration.yaml"
     earlier.parent.mkdir()
-    earlier.write_text("earlier")
+    earlier.write_bytes(sealed(b"earlier"))
     assert run(tables, folder) == 1
     captured = capsys.readouterr()
     assert captured.out == ""
     lines = captured.err.strip().splitlines()
     assert len(lines) == 1 and lines[0].startswith("icalib: "), captured.err
     assert [p.name for p in earlier.parent.iterdir()] == ["calibration.yaml"]
-    assert earlier.read_text() == "earlier"
+    assert earlier.read_bytes() == sealed(b"earlier")
     return lines[0]
 
 
@@ -330,11 +331,11 @@ def test_an_interrupt_leaves_the_earlier_result(tables, tmp_path, capsys, monkey
                 raise KeyboardInterrupt
 
     (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "calibration.yaml").write_text("earlier")
+    (tmp_path / "out" / "calibration.yaml").write_bytes(sealed(b"earlier"))
     monkeypatch.setattr(icalib.console, "progress_bar", Interrupting)
     assert run(tables, tmp_path) == 130
     assert re.fullmatch(r"icalib: interrupted.*\n", capsys.readouterr().err)
-    assert [p.read_text() for p in (tmp_path / "out").iterdir()] == ["earlier"]
+    assert [p.read_bytes() for p in (tmp_path / "out").iterdir()] == [sealed(b"earlier")]
 
 
 # What is odd but usable: the result is still right.

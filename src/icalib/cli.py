@@ -203,7 +203,7 @@ def _calibrate(options: argparse.Namespace) -> None:
     if chosen.get("splits", 0) < 0 or chosen.get("splits") == 1:
         raise CalibrationError("--splits must be 0 (none) or at least 2 segments.")
     rig = dataclasses.replace(rig, settings=dataclasses.replace(rig.settings, **chosen))
-    check_folder(options.output)
+    check_folder(options.output, [options.rig, *options.recording])
     with progress_bar(options.quiet) as progress:
         result = calibrate(rig, options.recording, progress)
         progress("writing", 0.97)
@@ -275,18 +275,22 @@ def _inspect(options: argparse.Namespace) -> None:
     from icalib.console import progress_bar
     from icalib.inspection import draft_rig, inspect_recording, read_target, write_draft
     from icalib.inspection.console import print_inspection
-    from icalib.inspection.draft import check_draft, write_whole
+    from icalib.inspection.draft import check_draft
     from icalib.inspection.figures import figures_json
+    from icalib.own_files import refuse_foreign, sealed_texts
+    from icalib.text_files import write_texts
 
     if options.rig:
         check_draft(options.rig)
+    if options.json:
+        refuse_foreign([options.json], [p for p in (options.recording, options.target) if p], "choose another place")
     target = read_target(options.target) if options.target else None
     with progress_bar(options.quiet) as progress:
         found = inspect_recording(options.recording, target, progress)
     if not options.quiet:
         print_inspection(found)
     if options.json:
-        write_whole(options.json, figures_json(found))
+        write_texts(options.json.parent, sealed_texts({options.json.name: figures_json(found)}))
     if options.rig:
         write_draft(draft_rig(found), options.rig)
         if not options.quiet:

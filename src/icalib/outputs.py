@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from icalib.calibration import Calibration, calibration_files
 from icalib.export.kalibr import camchain, camchain_name, imu_yaml
+from icalib.own_files import sealed
 from icalib.report import report_html
-from icalib.result_files import check_writable, write_files
+from icalib.result_files import check_writable, refuse_foreign_set, write_files
 from icalib.text_files import printable
 
 
 def write_outputs(calibration: Calibration, folder: str | Path) -> None:
-    """Writes `output_files` into `folder`: all or none. Raises CalibrationError where it cannot be written."""
+    """Writes `output_files` into `folder`: all or none.
+
+    Raises CalibrationError where it cannot be written, or has files under their names that icalib did not write.
+    """
+    refuse_foreign_set(Path(folder))
     write_files(Path(folder), output_files(calibration))
 
 
@@ -23,9 +29,14 @@ def output_files(calibration: Calibration) -> dict[str, bytes]:
         texts[camchain_name(calibration)] = camchain(calibration)
     if calibration.imu is not None:
         texts["imu.yaml"] = imu_yaml(calibration)
-    return calibration_files(calibration) | {name: printable(text).encode() for name, text in texts.items()}
+    return calibration_files(calibration) | {name: sealed(printable(text).encode()) for name, text in texts.items()}
 
 
-def check_folder(folder: str | Path) -> None:
-    """Makes `folder` and tries to write in it, before the work starts. Raises CalibrationError."""
+def check_folder(folder: str | Path, inputs: Sequence[Path] = ()) -> None:
+    """Makes `folder` and tries to write in it, before the work starts.
+
+    Raises CalibrationError where that fails, and where a file in it that icalib did not write, or one of `inputs`,
+    would be overwritten.
+    """
     check_writable(Path(folder))
+    refuse_foreign_set(Path(folder), inputs)

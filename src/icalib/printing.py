@@ -10,6 +10,8 @@ from typing import Any
 from icalib.errors import CalibrationError, RigError
 from icalib.geometry.targets import AprilGrid, Markers, Tag, Target
 from icalib.geometry.targets.pattern import Pattern, pattern_of
+from icalib.own_files import refuse_foreign, sealed
+from icalib.staging import staged
 
 # Width and height [mm], upright; smallest first.
 PAPERS = {
@@ -28,10 +30,17 @@ _FONT, _FONT_POINTS = "Helvetica", 7.5
 
 
 def write_target(path: str | Path, target: Target, paper: str = "a4", border_bits: int | None = None) -> None:
-    """Writes `target_pdf` to `path`. Raises as it does, and CalibrationError where the file cannot be written."""
-    data = target_pdf(target, paper, border_bits)
+    """Writes `target_pdf` to `path`.
+
+    Raises as it does, and CalibrationError where the file cannot be written, or is there and not icalib's own.
+    """
+    path = Path(path)
+    refuse_foreign([path], advice="choose another place")
+    data = sealed(target_pdf(target, paper, border_bits))
     try:
-        Path(path).write_bytes(data)
+        with staged(path.parent) as place:
+            (place / path.name).write_bytes(data)
+            (place / path.name).replace(path)
     except OSError as error:
         raise CalibrationError(
             f"{path} cannot be written ({error.strerror or error}); give the path of a file in a folder that exists."

@@ -64,6 +64,8 @@ def _export(options: argparse.Namespace) -> None:
     from icalib.calibration import load_calibration
     from icalib.export.formats import export
     from icalib.export.names import ONE_FILE
+    from icalib.own_files import refuse_foreign, sealed_texts
+    from icalib.result_files import set_of
     from icalib.text_files import write_texts
 
     calibration = load_calibration(options.result)
@@ -71,7 +73,9 @@ def _export(options: argparse.Namespace) -> None:
     files, folder = found.files, options.output
     if options.to in ONE_FILE:
         files, folder = {options.output.name: next(iter(files.values()))}, options.output.parent
-    write_texts(folder, files)
+    inputs = [*set_of(options.result), *([options.urdf] if options.urdf else [])]
+    refuse_foreign((folder / name for name in files), inputs, "choose another place")
+    write_texts(folder, sealed_texts(files))
     if not options.quiet:
         for sentence in found.sentences:
             print(f"Note: {sentence}")
@@ -113,12 +117,17 @@ def _compare(options: argparse.Namespace) -> int:
     from icalib.comparison.compare import Tolerances
     from icalib.comparison.reading import compare_files
     from icalib.comparison.words import comparison_json, lines
+    from icalib.own_files import refuse_foreign, sealed_texts
+    from icalib.result_files import set_of
     from icalib.text_files import write_texts
 
+    if options.json:
+        inputs = [p for side in (options.a, options.b) for p in (side, *set_of(side))]
+        refuse_foreign([options.json], inputs, "choose another place")
     tolerances = Tolerances(**dict(options.tolerance))
     found = compare_files(options.a, options.b, dict(options.frame), tolerances, options.sigma)
     if options.json:
-        write_texts(options.json.parent, {options.json.name: comparison_json(found)})
+        write_texts(options.json.parent, sealed_texts({options.json.name: comparison_json(found)}))
     if not options.quiet:
         print("\n".join(lines(found)))
     return 0 if found.same else 1
@@ -136,8 +145,11 @@ def _add_view(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
 
 def _view(options: argparse.Namespace) -> None:
     from icalib.console import progress_bar
+    from icalib.own_files import refuse_foreign
     from icalib.view import view
 
+    if options.save is not None:
+        refuse_foreign([options.save], [p for p in (options.recording,) if p], "choose another place")
     with progress_bar(options.quiet) as progress:
         notes = view(options.result, options.recording, options.save, progress)
     if not options.quiet:

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import contextlib
 import os
-import shutil
-import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 from icalib.errors import CalibrationError
+from icalib.file_names import below
+from icalib.own_files import refuse_foreign
+from icalib.staging import staged
 
 COMMIT = ".icalib-commit"
 # Every name that icalib writes: a leftover of an earlier result beside a new one would be a silently wrong number.
@@ -32,14 +33,10 @@ def write_files(folder: Path, files: Mapping[str, bytes]) -> None:
     with _errors_named(folder):
         folder.mkdir(parents=True, exist_ok=True)
         _move_in(folder)
-        staging = Path(tempfile.mkdtemp(prefix=".icalib-staging-", dir=folder))
-        try:
+        with staged(folder) as staging:
             for name, content in files.items():
-                _write_through(staging / name, content)
+                _write_through(below(staging, name), content)
             staging.rename(folder / COMMIT)
-        except BaseException:
-            shutil.rmtree(staging, ignore_errors=True)
-            raise
         for name in set(OWN_FILES) - set(files):
             (folder / name).unlink(missing_ok=True)
         _move_in(folder)
@@ -49,7 +46,8 @@ def read_file(folder: Path, name: str) -> bytes:
     """The file `name` of the set that counts. Raises CalibrationError where it is absent or cannot be read."""
     if not folder.is_dir():
         raise CalibrationError(f"{folder} is not a folder; give the folder that a calibration was written to.")
-    for path in (folder / COMMIT / name, folder / name):
+    committed = [] if _commit(folder) is None else [folder / COMMIT / name]
+    for path in (*committed, folder / name):
         with contextlib.suppress(FileNotFoundError), _errors_named(path, "read"):
             return path.read_bytes()
     raise CalibrationError(f"{folder} holds no {name}; give the folder that a calibration was written to.")
@@ -64,11 +62,24 @@ def finish_writing(folder: Path) -> None:
         _move_in(folder)
 
 
+def refuse_foreign_set(folder: Path, inputs: Iterable[Path] = ()) -> None:
+    """Raises CalibrationError where `folder` has a file under a name of a set that icalib did not write, that was
+    changed since, or that is one of `inputs`."""
+    commit = _commit(folder)
+    names = set(OWN_FILES) | ({path.name for path in commit.iterdir()} if commit else set())
+    refuse_foreign((folder / name for name in sorted(names)), inputs)
+
+
+def set_of(folder: Path) -> list[Path]:
+    """The files that a set in `folder` may have."""
+    return [folder / name for name in OWN_FILES]
+
+
 def check_writable(folder: Path) -> None:
     """Makes `folder` and tries to write in it, so that a long run does not fail at its end. Raises CalibrationError."""
     with _errors_named(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
+        with staged(folder):
             pass
 
 
@@ -81,21 +92,27 @@ def _write_through(path: Path, content: bytes) -> None:
 
 def _move_in(folder: Path) -> None:
     """Moves what a commit folder holds into place."""
-    commit = folder / COMMIT
-    if commit.is_dir():
+    commit = _commit(folder)
+    if commit is not None:
         for path in sorted(commit.iterdir()):
             path.replace(folder / path.name)
         commit.rmdir()
+
+
+def _commit(folder: Path) -> Path | None:
+    """The commit folder, where there is one. Raises CalibrationError where it is a link, which icalib never makes."""
+    commit = folder / COMMIT
+    if commit.is_symlink():
+        raise CalibrationError(f"{commit} is a link, and icalib makes none of this name; remove it.")
+    return commit if commit.is_dir() else None
 
 
 @contextlib.contextmanager
 def _errors_named(path: Path, verb: str = "written") -> Iterator[None]:
     try:
         yield
-    except FileNotFoundError:
-        if verb == "read":
-            raise
-        raise CalibrationError(f"{path} cannot be written (its disk went away); choose another folder.") from None
     except OSError as error:
+        if verb == "read" and isinstance(error, FileNotFoundError):
+            raise
         advice = "check its permissions" if verb == "read" else "choose another folder"
         raise CalibrationError(f"{path} cannot be {verb} ({error.strerror or error}); {advice}.") from error

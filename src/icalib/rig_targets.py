@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 
 from icalib.errors import RigError
+from icalib.file_names import NAME, NAME_WORDS
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Markers, Scene, Target
 from icalib.geometry.targets.families import family_name
 from icalib.yaml_nodes import YamlValue
 
-NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")  # of sensors and targets
 # type -> fields that must be there, and those that may
 _FIELDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "aprilgrid": (("rows", "cols", "tag_size", "tag_spacing"), ("border_bits", "squares")),
@@ -37,7 +36,7 @@ def target_or_targets(root: YamlValue) -> Target:
     named = found["targets"].entries()
     for name, value in named.items():
         if not NAME.fullmatch(name):
-            value.fail("a target's name is a letter, then letters, digits, _ or -, as in wall; rename it.")
+            value.fail(f"a target's name is {NAME_WORDS}, as in wall; rename it.")
     if not named:
         found["targets"].fail("there is no target; add one, as in wall: {type: markers, ...}.")
     targets = tuple(target_of(value) for value in named.values())

@@ -176,10 +176,14 @@ def parse_yaml(text: str, path: str, kind: str = "rig file") -> YamlValue:
             f"{place}: this is not valid YAML ({error.problem or error.context}); correct the line."
         ) from error
     except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
-        raise RigError(f"{path} is not valid YAML ({str(error).splitlines()[0]}); correct it.") from error
+        raise RigError(f"{path} is not valid YAML ({_reason(error)}); correct it.") from error
     if root is None:
         raise RigError(f"{path} is empty; give a {kind}.")
     return YamlValue(root, path, "")
+
+
+def _reason(error: Exception) -> str:
+    return next(iter(str(error).splitlines()), "") or type(error).__name__
 
 
 def suggestion(name: str, valid: tuple[str, ...]) -> str:

@@ -7,6 +7,7 @@ from pathlib import Path
 from icalib.allan.analysis import ImuNoiseStudy
 from icalib.allan.page import allan_html
 from icalib.allan.words import rig_snippet, study_json
+from icalib.own_files import refuse_foreign, sealed_texts
 from icalib.result_files import check_writable
 from icalib.text_files import printable, write_texts
 
@@ -14,11 +15,16 @@ FILES = ("allan.html", "noise.yaml", "allan.json")
 
 
 def check_folder(folder: Path) -> None:
-    """Makes `folder` and tries to write in it, before the work starts. Raises CalibrationError."""
+    """Makes `folder` and tries to write in it, before the work starts.
+
+    Raises CalibrationError where that fails, or files of these names that icalib did not write are there.
+    """
     check_writable(folder)
+    refuse_foreign(folder / name for name in FILES)
 
 
 def write_study(study: ImuNoiseStudy, folder: Path) -> None:
     """Writes allan.html, noise.yaml (fields of a rig file) and allan.json. Raises CalibrationError."""
     texts = map(printable, (allan_html(study), rig_snippet(study, warned=True), study_json(study)))
-    write_texts(folder, dict(zip(FILES, texts, strict=True)))
+    refuse_foreign(folder / name for name in FILES)
+    write_texts(folder, sealed_texts(dict(zip(FILES, texts, strict=True))))

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from icalib.errors import CalibrationError
+from icalib.staging import staged
 
 
 def write_whole(path: Path, content: bytes) -> None:
@@ -18,20 +19,18 @@ def write_whole(path: Path, content: bytes) -> None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A place beside `path` to write to, which takes its place at the end, and is removed where anything fails.
+    """A place to write to, which takes the place of `path` at the end, and is removed where anything fails.
 
     Raises CalibrationError where it cannot be written.
     """
-    part = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        yield part
-        with part.open("r+b") as file:
-            os.fsync(file.fileno())
-        part.replace(path)
+        with staged(path.parent) as place:
+            part = place / path.name
+            yield part
+            with part.open("r+b") as file:
+                os.fsync(file.fileno())
+            part.replace(path)
     except OSError as error:
         raise CalibrationError(
             f"{path} cannot be written ({error.strerror or error}); choose another folder."
         ) from error
-    finally:
-        with suppress(OSError):
-            part.unlink()

@@ -223,11 +223,12 @@ class Calibration:
     def save(self, folder: str | Path) -> None:
         """Writes calibration.yaml, result.json and result.npz (docs/files.md) into `folder`, as one set.
 
-        Raises CalibrationError where the folder cannot be written.
+        Raises CalibrationError where the folder cannot be written, or has files of these names that are not icalib's.
         """
         from icalib.calibration.saving import calibration_files
-        from icalib.result_files import write_files
+        from icalib.result_files import refuse_foreign_set, write_files
 
+        refuse_foreign_set(Path(folder))
         write_files(Path(folder), calibration_files(self))
 
     def _of_type(self, kind: str) -> tuple[str, ...]:

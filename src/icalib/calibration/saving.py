@@ -27,6 +27,8 @@ from icalib.calibration.result import (
 from icalib.calibration.robot import LidarResiduals, Plane, PoseResiduals, WheelResiduals
 from icalib.calibration.summary import calibration_yaml
 from icalib.errors import CalibrationError
+from icalib.file_names import NAME
+from icalib.own_files import sealed
 from icalib.result_files import read_file
 from icalib.text_files import printable
 
@@ -40,8 +42,10 @@ def calibration_files(calibration: Calibration) -> dict[str, bytes]:
     """calibration.yaml, result.json and result.npz by name."""
     arrays = _npz(calibration)
     return {
-        "calibration.yaml": printable(calibration_yaml(calibration)).encode(),
-        "result.json": printable(json.dumps(_plain(calibration, arrays), indent=1, ensure_ascii=False)).encode(),
+        "calibration.yaml": sealed(printable(calibration_yaml(calibration)).encode()),
+        "result.json": sealed(
+            printable(json.dumps(_plain(calibration, arrays), indent=1, ensure_ascii=False)).encode()
+        ),
         "result.npz": arrays,
     }
 
@@ -119,7 +123,7 @@ def _npz(c: Calibration) -> bytes:
         arrays[f"iterations/{f.name}"] = np.array([getattr(i, f.name) for i in c.iterations], dtype=kind)
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)
-    return buffer.getvalue()
+    return sealed(buffer.getvalue())
 
 
 def _array_names(kind: type) -> list[str]:
@@ -217,6 +221,9 @@ def _group(plain: dict[str, Any]) -> ParameterGroup:
 def _check(c: Calibration) -> None:
     """Raises ValueError where parts do not fit together."""
     n = len(c.covariance_names)
+    for name in c.rig["sensors"]:
+        if not NAME.fullmatch(name):
+            raise ValueError(f"{name!r} is no name of a sensor")
     if c.covariance.shape != (n, n):
         raise ValueError(f"the covariance has shape {c.covariance.shape}, but {n} names")
     for g in c.groups:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import io
 import os
-import tempfile
 import zipfile
 from collections.abc import Iterable
 from pathlib import Path
@@ -18,6 +17,7 @@ import numpy as np
 
 from icalib.detection.corners import ImageCorners
 from icalib.recordings import Payload
+from icalib.staging import staged
 
 VERSION = 3  # of the detectors and of the format: whatever changes corners changes this
 _FIELDS = ("point", "uv", "sigma", "blur", "verdict")
@@ -63,8 +63,9 @@ def keep_corners(key: str, stamps_ns: np.ndarray, images: list[ImageCorners]) ->
     folder = cache_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=folder, suffix=".part", delete=False) as file:
-            np.savez_compressed(file, **arrays)
-        Path(file.name).replace(folder / f"{key}.npz")
+        with staged(folder) as place:
+            part = place / f"{key}.npz"
+            np.savez_compressed(part, **arrays)
+            part.replace(folder / part.name)
     except OSError:
         return

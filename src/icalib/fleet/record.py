@@ -10,6 +10,7 @@ import numpy as np
 from icalib.batch import plain_record, record_json
 from icalib.calibration import Calibration, ParameterGroup
 from icalib.fleet.inputs import Inputs
+from icalib.own_files import SEAL, sealed
 from icalib.report.quantities import shown_groups
 
 FORMAT = 1
@@ -64,13 +65,14 @@ def _block(g: ParameterGroup) -> Block:
 
 
 def to_json(record: Record) -> bytes:
-    """The record as JSON, numbers in full."""
-    return record_json(record, FORMAT)
+    """The record as JSON, numbers in full, with icalib's seal."""
+    return sealed(record_json(record, FORMAT))
 
 
 def from_json(text: bytes) -> Record:
     """The record that `to_json` was given. Raises ValueError, KeyError or TypeError where `text` is something else."""
     plain = plain_record(text, FORMAT)
+    plain.pop(SEAL, None)
     inputs = plain["inputs"]
     plain["inputs"] = Inputs(inputs["rig"], tuple(inputs["recordings"]), inputs["program"])
     for name in ("undetermined", "warnings"):

@@ -18,9 +18,12 @@ from icalib.fleet.record import Record
 from icalib.fleet.result import Fleet, JobResult, by_robot
 from icalib.fleet.store import Store, to_do
 from icalib.fleet.table import write_table
+from icalib.own_files import refuse_foreign, sealed
+from icalib.result_files import refuse_foreign_set
 from icalib.text_files import printable
 
 Progress = Callable[[str, float], None]
+TABLE, PAGE = "fleet.sqlite", "fleet.html"
 LIMIT = 3.0  # sigmas, as in `icalib compare`
 
 
@@ -35,16 +38,18 @@ def run_fleet(
     """Does the jobs of the file at `path` that `output` does not hold yet; writes fleet.sqlite and fleet.html there.
 
     crew: by default a worker for each core. limit: sigmas beyond which a change counts. say: is told what is done
-    again, before it is. Raises RigError where the file is wrong, CalibrationError where the folder cannot be written,
-    another process is at work in it, or no cluster answers; KeyboardInterrupt with a sentence on what was reached.
+    again, before it is. Raises RigError where the file is wrong, CalibrationError where the folder cannot be written or
+    has files that icalib did not write, another process is at work in it, or no cluster answers; KeyboardInterrupt with
+    a sentence on what was reached.
     """
     if not (isfinite(limit) and limit > 0.0):
         raise CalibrationError(f"a change counts from a number of sigmas above 0 on, not {limit:g}; the usual is 3.")
     jobs, store = load_jobs(path), Store(Path(output))
     with alone(store.folder):
+        refuse_foreign(store.folder / name for name in (TABLE, PAGE))
         fleet = _fleet(jobs, store, crew or Crew(), limit, progress, say)
-        write_table(store.folder / "fleet.sqlite", fleet.results)
-        write_whole(store.folder / "fleet.html", printable(fleet_html(fleet, Path(path).name)).encode())
+        write_table(store.folder / TABLE, fleet.results)
+        write_whole(store.folder / PAGE, sealed(printable(fleet_html(fleet, Path(path).name)).encode()))
     return fleet
 
 
@@ -57,6 +62,8 @@ def _fleet(
     for name, why in again.items():
         say(f"{name} is done again: {why}.")
     tasks = [Task(job, inputs[job.name]) for job in jobs if job.name not in done]
+    for task in tasks:
+        refuse_foreign_set(store.place(task.job.name), [task.job.rig, *task.job.recordings])
     records = done | _do(tasks, store, crew, len(jobs), progress)
     results = tuple(JobResult(job, records[job.name]) for job in jobs)
     robots = by_robot(results)

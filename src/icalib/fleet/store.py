@@ -7,6 +7,7 @@ from pathlib import Path
 from icalib.batch import check_worker, program
 from icalib.calibration import Calibration, load_calibration
 from icalib.errors import CalibrationError
+from icalib.file_names import below
 from icalib.fleet.inputs import Inputs
 from icalib.fleet.one_job import Outcome
 from icalib.fleet.record import Record, from_json, to_json
@@ -24,7 +25,7 @@ class Store:
 
     def place(self, name: str) -> Path:
         """Where the job's files are."""
-        return self.folder / JOBS / name
+        return below(self.folder / JOBS, name)
 
     def find(self, name: str) -> Record | None:
         """None where the job is not done, or its result was taken away.

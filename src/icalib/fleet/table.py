@@ -13,6 +13,7 @@ from icalib.batch import replacing
 from icalib.errors import CalibrationError
 from icalib.fleet.record import Block
 from icalib.fleet.result import JobResult
+from icalib.own_files import DATABASE_ID
 from icalib.report.quantities import rpy_deg
 from icalib.text_files import printable
 
@@ -31,6 +32,7 @@ def write_table(path: Path, results: Iterable[JobResult]) -> None:
     """
     try:
         with replacing(path) as part, closing(sqlite3.connect(part)) as base:
+            base.execute(f"PRAGMA application_id = {DATABASE_ID}")
             base.execute(f"CREATE TABLE results ({', '.join(_COLUMNS)})")
             base.executemany(
                 f"INSERT INTO results VALUES ({', '.join('?' * len(_COLUMNS))})",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
 import os
@@ -21,7 +20,8 @@ from icalib.inspection.kalibr import KalibrImu
 from icalib.inspection.lens import LensStart, lens_start
 from icalib.recordings import TopicInfo
 from icalib.rig import TwoSources
-from icalib.text_files import write_part
+from icalib.staging import staged
+from icalib.text_files import write_text
 
 _PLAIN = re.compile(r"[A-Za-z0-9_./][A-Za-z0-9_./-]*")
 _TEMPLATE = """\
@@ -79,32 +79,17 @@ def check_draft(path: Path) -> None:
 def write_draft(text: str, path: Path) -> None:
     """Writes `text` to `path`, wholly or not at all, and never over another file. Raises CalibrationError."""
     try:
-        write_whole(path, text, replace=False)
+        with staged(path.parent) as place:
+            part = place / path.name
+            write_text(part, text)
+            _link(part, path, text)
     except FileExistsError:
         check_draft(path)
         raise CalibrationError(f"{path} exists; give another name for the draft.") from None
-
-
-def write_whole(path: Path, text: str, replace: bool = True) -> None:
-    """Writes the file so that nobody sees half of it. Raises CalibrationError where that is not possible, and
-    FileExistsError where the file is there and `replace` is False."""
-    part: Path | None = None
-    try:
-        part = write_part(path.parent, text)
-        if replace:
-            part.replace(path)
-        else:
-            _link(part, path, text)
-    except FileExistsError:
-        raise
     except OSError as error:
         raise CalibrationError(
             f"{path} cannot be written ({error.strerror or error}); choose another place."
         ) from error
-    finally:
-        if part is not None:
-            with contextlib.suppress(OSError):
-                part.unlink()
 
 
 def _link(part: Path, path: Path, text: str) -> None:

@@ -10,12 +10,14 @@ from icalib.montecarlo.convergence import plotly_figure, png, rows
 from icalib.montecarlo.page import blocks_table, failures, page
 from icalib.montecarlo.study import Plan, Study, run_study, scenario_digest
 from icalib.montecarlo.words import answer, failures_words, largest_words
+from icalib.own_files import refuse_foreign, sealed
 from icalib.report.page import plot_place
 from icalib.report.plot import Figure
 from icalib.report.tables import Html, element
 from icalib.simulation import load_scenario
 
 MOTIONS = {"3d": "Motion in three dimensions", "planar": "Planar motion"}
+PAGE = "reproduce.html"
 FOLDER = Path(__file__).parent / "paper"
 Progress = Callable[[str, float], None]
 
@@ -25,6 +27,7 @@ def reproduce(output: Path, plan: Plan, progress: Progress = lambda *_: None) ->
 
     Raises what `run_study` raises.
     """
+    refuse_foreign([output / PAGE, *(output / _picture(motion) for motion in MOTIONS)])
     studies = {}
     for k, motion in enumerate(MOTIONS):
 
@@ -53,6 +56,10 @@ def write_figures(output: Path, studies: dict[str, Study]) -> None:
             figures[name] = plotly_figure(row)
             sections.append(plot_place(name))
         if drawn:
-            write_whole(output / f"convergence-{motion}.png", png(drawn, MOTIONS[motion]))
+            write_whole(output / _picture(motion), sealed(png(drawn, MOTIONS[motion])))
     words = "Error (lines) and 3 sigma (dashed) at the solver's iterations, from guesses drawn about the truth."
-    write_whole(output / "reproduce.html", page("Monte-Carlo runs of the paper", words, sections, figures).encode())
+    write_whole(output / PAGE, sealed(page("Monte-Carlo runs of the paper", words, sections, figures).encode()))
+
+
+def _picture(motion: str) -> str:
+    return f"convergence-{motion}.png"

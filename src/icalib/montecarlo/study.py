@@ -16,10 +16,12 @@ from icalib.montecarlo.record import Record
 from icalib.montecarlo.store import Identity, Store
 from icalib.montecarlo.summary import Consistency, consistency_json, summarise
 from icalib.montecarlo.workers import run_all
+from icalib.own_files import refuse_foreign, sealed
 from icalib.simulation import Drive, Scenario, load_scenario
 from icalib.text_files import printable
 
 Progress = Callable[[str, float], None]
+FILES = ("consistency.json", "consistency.html")
 
 
 @dataclass(frozen=True)
@@ -64,9 +66,10 @@ def run_study(
     """Makes the runs that `output` does not hold yet, and writes consistency.json and consistency.html there.
 
     digest: of all that the scenario is made from. Raises CalibrationError where the folder holds another study's runs,
-    cannot be written, another process is at work in it, or no cluster answers; KeyboardInterrupt with a sentence on
-    what was reached.
+    cannot be written, has files that icalib did not write, another process is at work in it, or no cluster answers;
+    KeyboardInterrupt with a sentence on what was reached.
     """
+    refuse_foreign(output / name for name in FILES)
     store = Store(output, Identity.of(name, digest, plan.guess, plan.planes))
     first = scenario.seed if plan.seed is None else plan.seed
     seeds = range(first, first + plan.runs)
@@ -75,9 +78,9 @@ def run_study(
         records = tuple(lost[seed] if seed in lost else store.read(seed) for seed in seeds)
         study = Study(store.identity, records, summarise(records))
         about = asdict(store.identity) | {"first_seed": first}
-        write_whole(output / "consistency.json", consistency_json(study.consistency, about))
-        page = printable(study_html(study.consistency, study.identity, records))
-        write_whole(output / "consistency.html", page.encode())
+        page = printable(study_html(study.consistency, study.identity, records)).encode()
+        for file, content in zip(FILES, (consistency_json(study.consistency, about), page), strict=True):
+            write_whole(output / file, sealed(content))
     return study
 
 

@@ -9,6 +9,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import yaml
 
+from icalib.file_names import NAME, NAME_WORDS
 from icalib.geometry.cameras import CAMERA_MODELS
 from icalib.geometry.targets import NoTarget, Scene, Target
 from icalib.rig import (
@@ -37,7 +38,7 @@ from icalib.rig_file.imu import imu_to_plain, read_imu
 from icalib.rig_file.lidar import lidar_to_plain, read_lidar
 from icalib.rig_file.wheels import read_wheels, wheels_to_plain
 from icalib.rig_parameters import vector_parameter
-from icalib.rig_targets import NAME, target_of, target_or_targets
+from icalib.rig_targets import target_of, target_or_targets
 from icalib.yaml_nodes import YamlValue, parse_yaml, read_yaml
 
 _SENSOR_TYPES = ("imu", "camera", "lidar", "wheels", "pose")
@@ -124,7 +125,7 @@ def _sensors(value: YamlValue) -> _Sensors:
     found = _Sensors()
     for name, sensor in value.entries().items():
         if not NAME.fullmatch(name):
-            sensor.fail("a sensor's name is a letter, then letters, digits, _ or -, as in cam0; rename it.")
+            sensor.fail(f"a sensor's name is {NAME_WORDS}, as in cam0; rename it.")
         fields = sensor.entries()
         if "type" not in fields:
             sensor.fail(f"type is missing; add type: {' or type: '.join(_SENSOR_TYPES)}.")

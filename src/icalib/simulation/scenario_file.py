@@ -10,6 +10,7 @@ from typing import Any, TypeVar, get_args, get_type_hints
 import numpy as np
 
 from icalib.errors import RigError
+from icalib.file_names import NAME, NAME_WORDS
 from icalib.geometry.targets import TARGETS
 from icalib.rig import ImuNoise
 from icalib.simulation.projection import PARAMETER_COUNTS
@@ -71,6 +72,8 @@ def _sensors(value: YamlValue, start_ns: int) -> dict[str, Any]:
     wheels: list[SimWheels] = []
     poses: list[SimPoses] = []
     for name, sensor in value.entries().items():
+        if not NAME.fullmatch(name):
+            sensor.fail(f"a sensor's name is {NAME_WORDS}, as in cam0; rename it.")
         fields = sensor.entries()
         if "type" not in fields:
             sensor.fail(f"type is missing; add type: {' or type: '.join(_SENSOR_TYPES)}.")

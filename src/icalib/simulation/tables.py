@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -14,6 +12,7 @@ import numpy as np
 import yaml
 
 from icalib.errors import RecordingError
+from icalib.file_names import below
 from icalib.measurements import (
     CornerStream,
     ImuStream,
@@ -26,6 +25,7 @@ from icalib.measurements import (
 from icalib.simulation.poses import quaternion
 from icalib.simulation.scenario import Scenario
 from icalib.simulation.simulate import Simulation, Truth
+from icalib.staging import staged
 
 _TRUTH_HEADER = """\
 # Truth of a simulated recording, in SI units: p_imu = T_imu_sensor p_sensor, t_imu = t_sensor + time_offset.
@@ -53,17 +53,12 @@ def whole(path: Path) -> Iterator[Path]:
     check_absent(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        staging = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))
+        with staged(path.parent) as place:
+            yield place / path.name
+            check_absent(path)
+            (place / path.name).rename(path)
     except OSError as error:
         raise RecordingError(f"{path} cannot be written ({error.strerror or error}); choose another folder.") from None
-    try:
-        yield staging / path.name
-        check_absent(path)
-        (staging / path.name).rename(path)
-    except OSError as error:
-        raise RecordingError(f"{path} cannot be written ({error.strerror or error}); choose another folder.") from None
-    finally:
-        shutil.rmtree(staging, ignore_errors=True)
 
 
 def write_tables(
@@ -71,17 +66,18 @@ def write_tables(
 ) -> tuple[str, ...]:
     """Writes the measurements as tables, and the truth beside them, into the new folder `path`: all or nothing.
 
-    Returns sentences on what was left out. Raises RecordingError where `path` exists or cannot be written.
+    Returns sentences on what was left out. Raises RecordingError where `path` exists or cannot be written,
+    CalibrationError where a sensor's name cannot be that of a folder.
     """
     measured = simulation.measurements
     assert measured.imu is not None  # of every scenario
     with whole(path) as folder:
-        steps: list[Callable[[], None]] = [partial(_write_imu, folder / measured.imu.name, measured.imu)]
-        steps += [partial(_write_corners, folder / c.name, c, simulation.scenario) for c in measured.cameras]
-        steps += [partial(_write_tracks, folder / t.name, t) for t in measured.tracks]
-        steps += [partial(_write_scans, folder / s.name, s) for s in measured.lidars]
-        steps += [partial(_write_wheels, folder / w.name, w) for w in measured.wheels]
-        steps += [partial(_write_poses, folder / s.name, s) for s in measured.poses]
+        steps: list[Callable[[], None]] = [partial(_write_imu, below(folder, measured.imu.name), measured.imu)]
+        steps += [partial(_write_corners, below(folder, c.name), c, simulation.scenario) for c in measured.cameras]
+        steps += [partial(_write_tracks, below(folder, t.name), t) for t in measured.tracks]
+        steps += [partial(_write_scans, below(folder, s.name), s) for s in measured.lidars]
+        steps += [partial(_write_wheels, below(folder, w.name), w) for w in measured.wheels]
+        steps += [partial(_write_poses, below(folder, s.name), s) for s in measured.poses]
         steps += [partial(write_truth, simulation, seed, folder)]
         for i, step in enumerate(steps):
             step()

@@ -11,6 +11,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from icalib.errors import RecordingError
+from icalib.file_names import below
 from icalib.simulation.bag_writer import IMAGE, IMU, IMU_TOPIC, BagForm, BagWriter, package
 from icalib.simulation.filming import Film, Shot
 
@@ -105,7 +106,7 @@ class _Folder:
 
     def __enter__(self) -> _Folder:
         for name, header in self._headers.items():
-            (self._root / name / ("" if name == "imu0" else "data")).mkdir(parents=True)
+            (below(self._root, name) / ("" if name == "imu0" else "data")).mkdir(parents=True)
             table = (self._root / name / "data.csv").open("w", encoding="utf-8")
             self._tables[name] = self._stack.enter_context(table)
             table.write(header + "\n")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import uuid
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from icalib.errors import CalibrationError
+from icalib.staging import staged
 
 TIMELINE = "imu clock"
 _PATIENCE_S = 30.0  # until the viewer has taken what it was sent
@@ -55,21 +55,20 @@ def opened(rr: Any, blueprint: Any, save: Path | None) -> Iterator[Stream]:
         with _sentence("Rerun's viewer cannot be started or does not answer", "write a file by --save"):
             rec.flush(timeout_sec=_PATIENCE_S)
         return
-    part = save.parent / f".{save.name}.{uuid.uuid4().hex}.part"
     try:
-        with _sentence(f"{save} cannot be written", "choose another place"):
-            if save.is_dir():
-                raise IsADirectoryError(0, "it is a folder")
-            rec.save(part, default_blueprint=blueprint)
-        yield Stream(rr, rec)
-        with _sentence(f"{save} cannot be written", "choose another place"):
-            rec.flush()
-            rec.disconnect()
-            os.replace(part, save)
+        with contextlib.ExitStack() as stack:
+            with _sentence(f"{save} cannot be written", "choose another place"):
+                if save.is_dir():
+                    raise IsADirectoryError(0, "it is a folder")
+                part = stack.enter_context(staged(save.parent)) / save.name
+                rec.save(part, default_blueprint=blueprint)
+            yield Stream(rr, rec)
+            with _sentence(f"{save} cannot be written", "choose another place"):
+                rec.flush()
+                rec.disconnect()
+                os.replace(part, save)
     finally:
         rec.disconnect()
-        with contextlib.suppress(OSError):
-            part.unlink()
 
 
 @contextlib.contextmanager

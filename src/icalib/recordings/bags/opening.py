@@ -8,15 +8,14 @@ import tempfile
 import weakref
 from pathlib import Path
 
-import yaml
-
-from icalib.errors import RecordingError
+from icalib.errors import RecordingError, RigError
 from icalib.extras import load_zstd
 from icalib.recordings.bags.mcap import MCAP_MAGIC, McapStorage
 from icalib.recordings.bags.ros1 import ROS1_MAGIC, Ros1Storage
 from icalib.recordings.bags.sqlite import SQLITE_MAGIC, SqliteStorage
 from icalib.recordings.bags.storage import Storage
 from icalib.recordings.unreadable import HEAD_BYTES, not_data
+from icalib.yaml_nodes import read_yaml
 
 _READERS = {ROS1_MAGIC: Ros1Storage, MCAP_MAGIC: McapStorage, SQLITE_MAGIC: SqliteStorage}
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
@@ -103,8 +102,9 @@ def _open_compressed(path: Path) -> Storage:
 def _absent(folder: Path) -> list[str]:
     """Files that metadata.yaml names and that are missing. The rest of it is not needed, so it may be damaged."""
     try:
-        listed = yaml.safe_load((folder / "metadata.yaml").read_text(encoding="utf-8"))
-        names = [Path(str(n)).name for n in listed["rosbag2_bagfile_information"]["relative_file_paths"]]
-    except (OSError, ValueError, yaml.YAMLError, KeyError, TypeError):
+        about = read_yaml(folder / "metadata.yaml").entries()["rosbag2_bagfile_information"].entries()
+        names = [Path(item.text()).name for item in about["relative_file_paths"].items()]
+    except (RigError, KeyError):
         return []
-    return [n for n in names if not (folder / n).exists() and not (folder / (n + ".zstd")).exists()]
+    there = {path.name for path in folder.iterdir()}
+    return [n for n in names if not {n, n + ".zstd"} & there]

@@ -1,0 +1,100 @@
+"""How icalib knows a file that it wrote: the file ends in a seal, the sha256 of all that is before it.
+
+A file whose seal is missing or does not fit is the user's, or was changed by the user, and is never replaced or
+deleted. The seal is a comment, or in JSON the last key.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+from icalib.errors import CalibrationError
+
+SEAL = "icalib_sha256"  # the last key of JSON
+_COMMENT = re.compile(rb"(?:# |% |<!-- )icalib sha256 ([0-9a-f]{64})(?: -->)?\n\Z")
+_LAST_KEY = re.compile(rb',\s*"icalib_sha256": "([0-9a-f]{64})"\n\}\Z')
+_ARCHIVE = re.compile(rb"(?s:..)icalib sha256 ([0-9a-f]{64})\n\Z")  # the size of a zip file's comment, and the comment
+_ZIP = b"PK\x03\x04"
+_LONGEST_SEAL = 200  # bytes
+_DATABASE, _DATABASE_ID_AT = b"SQLite format 3\x00", 68
+DATABASE_ID = 0x49434C42  # "ICLB", the application id of databases that icalib writes
+_RERUN = (b"RRF2", b"RRIO", b"RRIX")
+_RERUN_HEAD = 4096  # bytes, in which the name of the program stands
+
+
+def sealed(content: bytes) -> bytes:
+    """`content` with the seal: JSON (an object), XML, HTML, PDF, PNG, npz, or text whose comments begin with #."""
+    content = _COMMENT.sub(b"", content)  # of an input that is written again
+    if content.startswith(_ZIP):  # as numpy writes it, without a comment: its size, 0, stands at the end
+        comment = f"icalib sha256 {hashlib.sha256(content[:-2]).hexdigest()}\n".encode()
+        return content[:-2] + len(comment).to_bytes(2, "little") + comment
+    head = content.removeprefix(b"\xef\xbb\xbf").lstrip()[:1]
+    if head == b"{":
+        body = content.rstrip().removesuffix(b"}").rstrip()
+        return body + f',\n "{SEAL}": "{hashlib.sha256(body).hexdigest()}"\n}}'.encode()
+    body = content if content.endswith(b"\n") else content + b"\n"
+    begin, end = {b"<": ("<!-- ", " -->"), b"%": ("% ", "")}.get(head, ("# ", ""))
+    if head == b"%" and not content.startswith(b"%PDF"):  # YAML as OpenCV writes it
+        begin = "# "
+    return body + f"{begin}icalib sha256 {hashlib.sha256(body).hexdigest()}{end}\n".encode()
+
+
+def sealed_texts(texts: dict[str, str]) -> dict[str, str]:
+    """The texts, by name, each with its seal; bytes that are no UTF-8 stay as they are (surrogateescape)."""
+    return {
+        name: sealed(text.encode("utf-8", "surrogateescape")).decode("utf-8", "surrogateescape")
+        for name, text in texts.items()
+    }
+
+
+def is_ours(path: Path) -> bool:
+    """Whether icalib wrote the file, and nobody changed it since. Raises OSError."""
+    if path.is_symlink() or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        head = file.read(_RERUN_HEAD)
+    if head.startswith(_DATABASE):
+        return int.from_bytes(head[_DATABASE_ID_AT : _DATABASE_ID_AT + 4]) == DATABASE_ID
+    if head.startswith(_RERUN):
+        return b"icalib" in head
+    return _has_seal(path, (_ARCHIVE,) if head.startswith(_ZIP) else (_COMMENT, _LAST_KEY))
+
+
+def refuse_foreign(paths: Iterable[Path], inputs: Iterable[Path] = (), advice: str = "choose another folder") -> None:
+    """Raises CalibrationError where one of `paths` exists and is not icalib's own, or is an input."""
+    given = {path.resolve() for path in inputs}
+    for path in paths:
+        try:
+            if not (path.exists() or path.is_symlink()):
+                continue
+            if path.resolve() in given:
+                raise CalibrationError(f"{path} is an input of this command and would be overwritten; {advice}.")
+            if path.is_dir():
+                raise CalibrationError(f"{path} cannot be written (it is a folder); {advice}.")
+            if not is_ours(path):
+                raise CalibrationError(
+                    f"{path} was not written by icalib, or was changed since, and would be overwritten; move it away, "
+                    f"or {advice}."
+                )
+        except OSError as error:
+            raise CalibrationError(f"{path} cannot be read ({error.strerror or error}); {advice}.") from error
+
+
+def _has_seal(path: Path, kinds: tuple[re.Pattern[bytes], ...]) -> bool:
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        begin = max(0, size - _LONGEST_SEAL)
+        file.seek(begin)
+        tail = file.read()
+        seal = next((found for kind in kinds if (found := kind.search(tail))), None)
+        if seal is None:
+            return False
+        file.seek(0)
+        digest, left = hashlib.sha256(), begin + seal.start()
+        while left and (block := file.read(min(left, 1 << 20))):
+            digest.update(block)
+            left -= len(block)
+    return digest.hexdigest() == seal[1].decode()
