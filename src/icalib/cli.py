@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import io
 import sys
+from math import inf
 from pathlib import Path
 
 from icalib.errors import CalibrationError
@@ -45,6 +46,7 @@ def _parser() -> argparse.ArgumentParser:
     several = "folder of the recording, or bag; several of one rig are solved jointly"
     c.add_argument("recording", type=Path, nargs="+", help=several)
     c.add_argument("--output", "-o", type=Path, required=True, help="folder for the results; made if it does not exist")
+    _add_part(c)
     c.add_argument("--scheme", choices=("inertial", "pose", "kinematic"), help="where sensors are between nodes")
     c.add_argument("--loss", choices=("none", "huber", "cauchy"), help="robust loss on corners")
     c.add_argument("--splits", type=int, metavar="N", help="segments for the empirical factor; 0: none")
@@ -65,8 +67,16 @@ def _add_inspect(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     c.add_argument("--rig", type=Path, metavar="FILE", help="write a draft of the rig file; never over another file")
     c.add_argument("--target", type=Path, metavar="FILE", help="YAML of the target, or a rig file: look for it")
     c.add_argument("--json", type=Path, metavar="FILE", help="write the figures as JSON")
+    _add_part(c)
     c.add_argument("--quiet", "-q", action="store_true", help="no progress bar and no table")
     c.set_defaults(run=_inspect)
+
+
+def _add_part(parser: argparse.ArgumentParser) -> None:
+    """Which part of a recording is used."""
+    start = "use the recording from here on, in seconds from its start; by default all"
+    parser.add_argument("--from", type=float, default=0.0, metavar="SECONDS", dest="start_s", help=start)
+    parser.add_argument("--to", type=float, default=inf, metavar="SECONDS", dest="end_s", help="and up to here")
 
 
 def _add_simulate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -205,7 +215,7 @@ def _calibrate(options: argparse.Namespace) -> None:
     rig = dataclasses.replace(rig, settings=dataclasses.replace(rig.settings, **chosen))
     check_folder(options.output, [options.rig, *options.recording])
     with progress_bar(options.quiet) as progress:
-        result = calibrate(rig, options.recording, progress)
+        result = calibrate(rig, options.recording, progress, start_s=options.start_s, end_s=options.end_s)
         progress("writing", 0.97)
         write_outputs(result, options.output)
     if not options.quiet:
@@ -286,7 +296,7 @@ def _inspect(options: argparse.Namespace) -> None:
         refuse_foreign([options.json], [p for p in (options.recording, options.target) if p], "choose another place")
     target = read_target(options.target) if options.target else None
     with progress_bar(options.quiet) as progress:
-        found = inspect_recording(options.recording, target, progress)
+        found = inspect_recording(options.recording, target, progress, start_s=options.start_s, end_s=options.end_s)
     if not options.quiet:
         print_inspection(found)
     if options.json:

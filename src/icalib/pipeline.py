@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Sequence
+from math import inf
 from pathlib import Path
 
 from threadpoolctl import threadpool_limits
@@ -33,15 +34,21 @@ Progress = Callable[[str, float], None]  # what is being done, and how much of t
 
 
 def calibrate(
-    rig: Rig | str | Path, recording: Source | Sequence[Source], progress: Progress = lambda *_: None
+    rig: Rig | str | Path,
+    recording: Source | Sequence[Source],
+    progress: Progress = lambda *_: None,
+    *,
+    start_s: float = 0.0,
+    end_s: float = inf,
 ) -> Calibration:
     """Calibrates every sensor of `rig` from `recording`, or jointly from several of the same rig.
 
-    All may be paths. Raises CalibrationError, one sentence; where there are several recordings it names the one meant.
+    All may be paths. Of each recording the part from start_s to end_s after its start is used. Raises CalibrationError,
+    one sentence; where there are several recordings it names the one meant.
     """
     rig = rig if isinstance(rig, Rig) else load_rig(rig)
     keep_apart()
-    opened = open_all(recording)
+    opened = open_all(recording, start_s, end_s)
     started = time.perf_counter()
     seeing = rig.cameras if rig.has_target else ()
     pictured = any(not r.has_corners(c) for r in opened.values() for c in seeing)

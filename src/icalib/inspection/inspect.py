@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Callable, Iterator
+from math import inf
 from pathlib import Path
 
 import numpy as np
@@ -37,15 +38,21 @@ Progress = Callable[[str, float], None]  # what is being done, and how much of t
 
 
 def inspect_recording(
-    path: str | Path, target: GivenTarget | None = None, progress: Progress = lambda *_: None
+    path: str | Path,
+    target: GivenTarget | None = None,
+    progress: Progress = lambda *_: None,
+    *,
+    start_s: float = 0.0,
+    end_s: float = inf,
 ) -> Inspection:
-    """Reads the recording at `path` once, and says what is in it and whether it can be calibrated.
+    """Reads the recording at `path` once, and says what is in it and whether it can be calibrated; of its part from
+    start_s to end_s after its start.
 
     The `target`, or one of Kalibr's beside the recording, is looked for in all images; the corners are kept for
     `calibrate`. Raises RecordingError, one sentence, where there is no recording, or nothing in it; what is wrong with
     a single topic stands in the findings.
     """
-    recording = open_recording(path)
+    recording = open_recording(path, start_s, end_s)
     topics = recording.topics()
     if not any(t.count for t in topics):
         raise RecordingError(

@@ -34,6 +34,7 @@ from icalib.recordings.streams import (
 from icalib.recordings.topics import KINDS, TopicInfo, choose_topic, find_topic
 from icalib.recordings.tracks import read_tracks
 from icalib.recordings.wheels import WheelReadings, read_wheel_joints, read_wheel_twists
+from icalib.recordings.window import WHOLE, Span, Window, cut
 from icalib.rig import Camera, ImuSensor, Lidar, PoseSensor, TwoSources, Wheels
 
 _SWAPPED_NS = 1_000_000_000  # readings overtake each other on the network by less; more is a clock that was set back
@@ -43,11 +44,26 @@ _SWAPPED_NS = 1_000_000_000  # readings overtake each other on the network by le
 class BagRecording:
     """A bag. Stamps are those of the messages' headers; where one is zero, when the message was received."""
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, window: Window = WHOLE) -> None:
         self.root = root
         self._storages, self._notes = open_storages(root)
         self._topics = self._list_topics()
+        self._window = window
+        self._received = self._received_ns()
         self._tables: list[Path] = []
+
+    def _received_ns(self) -> Span:
+        """When the messages that are used were received, by the clock of the recorder. Raises RecordingError where
+        nothing was recorded then."""
+        found = self._spans()
+        if self._window.is_all or not found:
+            return -(2**63), 2**63 - 1
+        origin, last = min(first for first, _ in found), max(last for _, last in found)
+        low, high = self._window.bounds(origin)
+        if low > last:
+            raise self._window.refuse(str(self.root), (last - origin) * 1e-9)
+        self._note(self._window.note(str(self.root)))
+        return low, high
 
     def topics(self) -> tuple[TopicInfo, ...]:
         return self._topics
@@ -109,7 +125,8 @@ class BagRecording:
                 f"{camera.name} in the rig file."
             )
         self._tables.append(path)
-        return read_tracks(camera.name, path, camera.resolution, camera.layout, self._note)
+        found = read_tracks(camera.name, path, camera.resolution, camera.layout, self._note)
+        return cut(self._window, found, f"{path} ({camera.name})", self._spans())
 
     def lidar(self, sensor: Lidar) -> LidarStream:
         topic = self._topic(sensor)
@@ -134,11 +151,16 @@ class BagRecording:
         """Of a topic, or a table beside the bag."""
         if (table := self._pose_table(sensor)) is not None:
             self._tables.append(table)
-            return read_pose_file(sensor.name, table, sensor.layout, self._note)
+            found = read_pose_file(sensor.name, table, sensor.layout, self._note)
+            return cut(self._window, found, f"{table} ({sensor.name})", self._spans())
         topic = self._pose_topic(sensor)
         found = read_odometry(self, topic.name).pose if topic.kind == "odometry" else read_poses(self, topic.name)
         order = self._order(topic.name, found.stamps_ns)
         return PoseReadings(sensor.name, found.stamps_ns[order], found.rotation[order], found.position[order])
+
+    def _spans(self) -> list[Span]:
+        """When the messages of each topic were received: tables beside the bag often have the same clock."""
+        return [(t.first_ns, t.last_ns) for t in self._topics if t.first_ns is not None and t.last_ns is not None]
 
     def _pose_table(self, sensor: PoseSensor) -> Path | None:
         table = self.root.parent / sensor.path
@@ -236,11 +258,20 @@ class BagRecording:
         )
 
     def _contents(self, topic: TopicInfo) -> Iterator[tuple[int, str, bytes]]:
-        """When it was received [ns], encoding and bytes of each message."""
+        """When it was received [ns], encoding and bytes of each message in the window; what does not change is often
+        sent once only, and counts always."""
+        low, high = self._received
+        always = topic.kind == "camera info" or topic.name.endswith("tf_static")
+        found = self._window.is_all
         for storage in self._storages:
             wanted = {k for k, c in storage.connections.items() if (c.topic, c.type) == (topic.name, topic.type)}
             for key, received_ns, content in storage.messages(wanted):
-                yield received_ns, storage.connections[key].encoding, content
+                if always or low <= received_ns < high:
+                    found = True
+                    yield received_ns, storage.connections[key].encoding, content
+        if not found and topic.count and topic.first_ns is not None and topic.last_ns is not None:
+            origin = min(first for first, _ in self._spans())
+            raise self._window.refuse(f"{self.root} {topic.name}", (topic.last_ns - origin) * 1e-9)
 
     def _topic(self, sensor: Lidar) -> str:
         return choose_topic(str(self.root), self._topics, "points", sensor.name, sensor.topic).name

@@ -21,11 +21,13 @@ from icalib.recordings.lidar_checks import Sieve, sifted
 from icalib.recordings.poses import FILES as POSE_FILES
 from icalib.recordings.poses import POSES, PoseReadings, is_tum_text, read_pose_file
 from icalib.recordings.scans import in_seconds, read_scan_stamps, read_scans
-from icalib.recordings.table import holds, named, read_table
+from icalib.recordings.sections import S
+from icalib.recordings.table import Table, holds, named, read_table
 from icalib.recordings.topics import TopicInfo, choose_topic, find_topic
 from icalib.recordings.tracks import read_tracks
 from icalib.recordings.unreadable import VIDEO_FILE, is_video
 from icalib.recordings.wheels import RELATIVE_POSES, STAMPS, UNITS, WheelReadings, read_wheel_table
+from icalib.recordings.window import WHOLE, Span, Window, cut, stamps_inside
 from icalib.rig import Camera, ImuSensor, Lidar, PoseSensor, TableLayout, TwoSources, Wheels
 
 _CORNERS = TableKind(
@@ -53,10 +55,11 @@ class FolderRecording:
     Kalibr's `cam0/STAMP.png` beside `imu0.csv` is found, too.
     """
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, window: Window = WHOLE) -> None:
         self.root = root
+        self._window = window
         self._read: list[Path] = []
-        self._notes: list[str] = []
+        self._notes: list[str] = [] if window.is_all else [window.note(str(root))]
 
     def topics(self) -> tuple[TopicInfo, ...]:
         found: list[TopicInfo] = []
@@ -75,6 +78,12 @@ class FolderRecording:
         return (*found, *self._videos())
 
     def stamps(self, topic: str) -> np.ndarray:
+        stamps_ns = self._all_stamps(topic)
+        if self._window.is_all or not len(stamps_ns):
+            return stamps_ns
+        return stamps_ns[stamps_inside(self._window, stamps_ns, f"{self.root}/{topic}", self._spans())]
+
+    def _all_stamps(self, topic: str) -> np.ndarray:
         chosen = find_topic(str(self.root), self.topics(), topic)
         if chosen.kind == "image":
             folder = next(p for base in self._bases() if (p := base / chosen.name).is_dir())
@@ -95,6 +104,10 @@ class FolderRecording:
         if (folder / "data.csv").is_file():
             self._remember(folder / "data.csv")
         files = image_files(folder, self._note)
+        if files and not self._window.is_all:
+            stamps_ns = np.array([stamp_ns for stamp_ns, _ in files], np.int64)
+            inside = stamps_inside(self._window, stamps_ns, str(folder), self._spans())
+            files = [file for file, used in zip(files, inside.tolist(), strict=True) if used]
         return checked_payloads(file_payloads(files, str(folder), self._note), str(folder), self._note)
 
     def images(self, topic: str) -> Iterator[Frame]:
@@ -107,12 +120,12 @@ class FolderRecording:
             accel = read_table(self._locate(sensor.path.accel), IMU_ACCEL, layout, self._note)
             self._remember(gyro.path)
             self._remember(accel.path)
-            stamps = (table.integers[:, 0].copy() for table in (gyro, accel))
-            return ImuHalves(sensor.name, next(stamps), gyro.decimals, next(stamps), accel.decimals)
+            (gyro_ns, rates), (accel_ns, forces) = (self._inside(table) for table in (gyro, accel))
+            return ImuHalves(sensor.name, gyro_ns, rates, accel_ns, forces)
         table = read_table(self._locate(sensor.path), IMU, sensor.layout, self._note)
         self._remember(table.path)
         stamps_ns, values = table.integers[:, 0].copy(), table.decimals
-        return ImuStream(sensor.name, stamps_ns, values[:, :3].copy(), values[:, 3:].copy())
+        return self._part(ImuStream(sensor.name, stamps_ns, values[:, :3].copy(), values[:, 3:].copy()), table.path)
 
     def has_corners(self, camera: Camera) -> bool:
         # Where there are neither corners nor images, the sentence on the missing table is the better one.
@@ -123,7 +136,8 @@ class FolderRecording:
         table = read_table(self._locate(camera.path), _CORNERS, layout, self._note)
         self._remember(table.path)
         stamps, tag, corner = (table.integers[:, k].copy() for k in range(3))
-        return group_corners(camera.name, str(table.path), stamps, tag, corner, table.decimals, target)
+        found = group_corners(camera.name, str(table.path), stamps, tag, corner, table.decimals, target)
+        return self._part(found, table.path)
 
     def sees(self, camera: Camera) -> bool:
         return self._find(camera.path) is not None or len(self._image_topics()) > 0
@@ -132,13 +146,13 @@ class FolderRecording:
         assert camera.tracks is not None
         path = self._locate(camera.tracks, "tracks")
         self._remember(path)
-        return read_tracks(camera.name, path, camera.resolution, camera.layout, self._note)
+        return self._part(read_tracks(camera.name, path, camera.resolution, camera.layout, self._note), path)
 
     def lidar(self, sensor: Lidar) -> LidarStream:
         path = self._locate(sensor.path)
         self._remember(path)
         sieve, what = Sieve(sensor.near_m, sensor.far_m), f"{path} ({sensor.name})"
-        stream, notes = in_seconds(read_scans(sensor.name, path), sensor, what)
+        stream, notes = in_seconds(self._part(read_scans(sensor.name, path), path), sensor, what)
         stream = sifted(stream, sieve)
         for note in (*notes, sieve.note(what)):
             if note:
@@ -148,12 +162,12 @@ class FolderRecording:
     def wheels(self, sensor: Wheels) -> WheelReadings | WheelPoses:
         path = self._locate(sensor.path)
         self._remember(path)
-        return read_wheel_table(sensor, path, self._note)
+        return self._part(read_wheel_table(sensor, path, self._note), path)
 
     def poses(self, sensor: PoseSensor) -> PoseReadings:
         path = self._locate(sensor.path)
         self._remember(path)
-        return read_pose_file(sensor.name, path, sensor.layout, self._note)
+        return self._part(read_pose_file(sensor.name, path, sensor.layout, self._note), path)
 
     def where(self, sensor: ImuSensor | Camera | Lidar | Wheels | PoseSensor) -> str:
         if isinstance(sensor, Camera) and not self.has_corners(sensor):
@@ -171,6 +185,23 @@ class FolderRecording:
     def _note(self, sentence: str) -> None:
         if sentence not in self._notes:
             self._notes.append(sentence)
+
+    def _part(self, stream: S, path: Path) -> S:
+        """What is inside the window."""
+        return stream if self._window.is_all else cut(self._window, stream, f"{path} ({stream.name})", self._spans())
+
+    def _inside(self, table: Table) -> tuple[np.ndarray, np.ndarray]:
+        """Stamps and decimals of the rows inside the window."""
+        stamps_ns = table.integers[:, 0].copy()
+        if self._window.is_all:
+            return stamps_ns, table.decimals
+        inside = stamps_inside(self._window, stamps_ns, str(table.path), self._spans())
+        return stamps_ns[inside], table.decimals[inside]
+
+    def _spans(self) -> list[Span]:
+        """First and last stamp of each topic."""
+        topics = self.topics()
+        return [(t.first_ns, t.last_ns) for t in topics if t.first_ns is not None and t.last_ns is not None]
 
     def _bases(self) -> list[Path]:
         return [p for p in (self.root, self.root / "mav0") if p.is_dir()]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import inf
 from pathlib import Path
 
 from icalib.errors import RecordingError
@@ -11,27 +12,30 @@ from icalib.recordings.base import Recording
 from icalib.recordings.folder import FolderRecording, has_named_table
 from icalib.recordings.pictures import PictureFolder, has_pictures
 from icalib.recordings.unreadable import HEAD_BYTES, not_data
+from icalib.recordings.window import Window
 
 _MAX_LISTED = 12
 
 
-def open_recording(path: str | Path) -> Recording:
-    """Open the recording at `path`: a folder of tables or EuRoC's, a bag, a folder of bags, or of pictures.
+def open_recording(path: str | Path, start_s: float = 0.0, end_s: float = inf) -> Recording:
+    """Open the recording at `path`: a folder of tables or EuRoC's, a bag, a folder of bags, or of pictures. Only what
+    lies from start_s to end_s after its start is read.
 
-    It is told by what is there, not by names. Raises RecordingError where it is missing, empty or none of these.
+    It is told by what is there, not by names. Raises RecordingError where it is missing, empty or none of these, and
+    for a part with nothing in it.
     """
-    root = Path(path)
+    root, window = Path(path), Window(start_s, end_s)
     if root.is_dir():
         if _holds_bags(root):
-            return BagRecording(root)
+            return BagRecording(root, window)
         if _holds_tables(root):
-            return FolderRecording(root)
+            return FolderRecording(root, window)
         if has_pictures(root):
-            return PictureFolder(root)
+            return PictureFolder(root, window)
         _refuse_unreadable(root)
-        return FolderRecording(root)
+        return FolderRecording(root, window)
     if root.exists():
-        return BagRecording(root)
+        return BagRecording(root, window)
     parent = root.parent
     beside = sorted(p.name for p in parent.iterdir())[:_MAX_LISTED] if parent.is_dir() else []
     listing = f"{parent} holds {', '.join(beside)}" if beside else f"{parent} is empty or missing"

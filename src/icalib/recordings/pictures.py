@@ -22,6 +22,7 @@ from icalib.recordings.images import Frame, Payload
 from icalib.recordings.poses import PoseReadings
 from icalib.recordings.topics import TopicInfo, choose_topic
 from icalib.recordings.wheels import WheelReadings
+from icalib.recordings.window import WHOLE, Window, stamps_inside
 from icalib.rig import Camera, ImuSensor, Lidar, PoseSensor, Wheels
 
 APART_NS = 1_000_000_000  # from one number to the next
@@ -41,16 +42,17 @@ class PictureFolder:
     the star is the picture's number.
     """
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, window: Window = WHOLE) -> None:
         self.root = root
+        self._window = window
         self._read: list[Path] = []
-        self._notes: list[str] = []
+        self._notes: list[str] = [] if window.is_all else [window.note(str(root))]
 
     def topics(self) -> tuple[TopicInfo, ...]:
         return tuple(self._info(name) for name in _topics(self.root))
 
     def stamps(self, topic: str) -> np.ndarray:
-        return np.array([stamp for stamp, _ in self._files(topic)], np.int64)
+        return np.array([stamp for stamp, _ in self._inside(topic)], np.int64)
 
     def image_topic(self, camera: Camera) -> str:
         if camera.topic is not None and "*" in camera.topic:
@@ -58,7 +60,7 @@ class PictureFolder:
         return choose_topic(str(self.root), self.topics(), "image", camera.name, camera.topic).name
 
     def payloads(self, topic: str) -> Iterator[Payload]:
-        files, where = self._files(topic), f"{self.root}/{topic}"
+        files, where = self._inside(topic), f"{self.root}/{topic}"
         self._read += [path for _, path in files if path not in self._read]
         return checked_payloads(file_payloads(files, where, self._note), where, self._note)
 
@@ -122,6 +124,16 @@ class PictureFolder:
             return TopicInfo(name, "pictures", "image", len(pictures_in(self.root / name)), None, None)
         return TopicInfo(name, "pictures", "image", len(stamps), stamps[0], stamps[-1])
 
+    def _inside(self, topic: str) -> list[tuple[int, Path]]:
+        """Those of `_files` in the window."""
+        files = self._files(topic)
+        if self._window.is_all:
+            return files
+        stamps_ns = np.array([stamp for stamp, _ in files], np.int64)
+        spans = [(t.first_ns, t.last_ns) for t in self.topics() if t.first_ns is not None and t.last_ns is not None]
+        inside = stamps_inside(self._window, stamps_ns, f"{self.root}/{topic}", spans)
+        return [file for file, used in zip(files, inside.tolist(), strict=True) if used]
+
     def _files(self, topic: str) -> list[tuple[int, Path]]:
         """Stamp and file of each picture, by number. Raises RecordingError where numbers are missing or repeat."""
         if "*" in topic:
@@ -135,6 +147,10 @@ class PictureFolder:
             raise RecordingError(f"{self.root} has no pictures {topic}; correct `topic` of the camera in the rig file.")
         found = stamped_by_name(paths, keys)
         what = "number" if found is None else "stamp"
+        if found is None and not self._window.is_all:
+            raise RecordingError(
+                f"{self.root} holds pictures without a clock, which have no seconds; leave out --from and --to."
+            )
         found = found or sorted((_number(key, p), p) for key, p in zip(keys, paths, strict=True))
         for (a, first), (b, second) in zip(found, found[1:], strict=False):
             if a == b:

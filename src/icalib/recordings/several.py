@@ -6,6 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from math import inf
 from pathlib import Path
 
 from icalib.errors import CalibrationError, RecordingError
@@ -15,11 +16,12 @@ from icalib.recordings.opening import open_recording
 Source = Recording | str | Path
 
 
-def open_all(given: Source | Sequence[Source]) -> dict[str, Recording]:
+def open_all(given: Source | Sequence[Source], start_s: float = 0.0, end_s: float = inf) -> dict[str, Recording]:
     """One recording or several by name: that of the file or folder, the whole path where two share it, or a number
-    for those that are open already.
+    for those that are open already. start_s, end_s: as `open_recording`, of each.
 
-    Raises RecordingError for none, for one that cannot be opened, and for one that is given twice.
+    Raises RecordingError for none, for one that cannot be opened, for one that is given twice, and for a part of one
+    that is open already.
     """
     sources: Sequence[Source] = given if isinstance(given, Sequence) and not isinstance(given, str) else [given]
     if not sources:
@@ -33,7 +35,11 @@ def open_all(given: Source | Sequence[Source]) -> dict[str, Recording]:
     for k, source in enumerate(sources, 1):
         if isinstance(source, (str, Path)):
             path = Path(source).resolve()
-            found[path.name if names[path.name] == 1 else str(path)] = open_recording(source)
+            found[path.name if names[path.name] == 1 else str(path)] = open_recording(source, start_s, end_s)
+        elif (start_s, end_s) != (0.0, inf):
+            raise RecordingError(
+                "a recording that is open already has its part; give start_s and end_s to open_recording."
+            )
         else:
             found[f"recording {k}"] = source
     return found

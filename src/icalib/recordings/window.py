@@ -1,0 +1,89 @@
+"""A part of a recording, in seconds from its start (`--from`, `--to`)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import inf, isnan
+
+import numpy as np
+
+from icalib.errors import RecordingError
+from icalib.recordings.sections import S, section
+
+Span = tuple[int, int]  # first and last stamp, ns
+_LONGEST_NS = 86_400_000_000_000  # a stream over more than a day has a clock that jumps
+
+
+@dataclass(frozen=True)
+class Window:
+    """From start_s on and before end_s, both from the start of the recording. Raises RecordingError where that is no
+    time."""
+
+    start_s: float = 0.0
+    end_s: float = inf
+
+    def __post_init__(self) -> None:
+        if isnan(self.start_s) or not 0.0 <= self.start_s < inf:
+            raise RecordingError(f"--from must be seconds after the start of the recording, not {self.start_s:g}.")
+        if not self.end_s > self.start_s:
+            raise RecordingError(f"--to must be seconds after --from ({self.start_s:g}), not {self.end_s:g}.")
+
+    @property
+    def is_all(self) -> bool:
+        return self.start_s == 0.0 and self.end_s == inf
+
+    def bounds(self, origin_ns: int) -> Span:
+        """The first stamp inside and the first beyond, where the recording starts at origin_ns."""
+        end = origin_ns + round(self.end_s * 1e9) if self.end_s < inf else 2**63 - 1
+        return origin_ns + round(self.start_s * 1e9), min(end, 2**63 - 1)
+
+    def note(self, where: str) -> str:
+        end = f"to {self.end_s:g} s" if self.end_s < inf else "on"
+        return f"{where}: only what was recorded from {self.start_s:g} s after its start {end} is used."
+
+    def refuse(self, what: str, length_s: float) -> RecordingError:
+        """The error of a part with nothing in it; length_s: what there is, from the start of the recording on."""
+        end = "the end" if self.end_s == inf else f"{self.end_s:g}"
+        return RecordingError(
+            f"{what}: nothing was recorded from {self.start_s:g} s to {end}, the whole lasts {length_s:.4g} s; correct "
+            "--from and --to."
+        )
+
+
+WHOLE = Window()
+
+
+def cut(window: Window, stream: S, what: str, spans: Sequence[Span]) -> S:
+    """The part of a stream inside the window. Its seconds count from where the recording starts on its clock, see
+    `start_of`. Raises RecordingError where nothing is inside."""
+    if window.is_all or not len(stream.stamps_ns):
+        return stream
+    inside = np.flatnonzero(stamps_inside(window, stream.stamps_ns, what, spans))
+    return section(stream, int(inside[0]), int(inside[-1]) + 1)
+
+
+def stamps_inside(window: Window, stamps_ns: np.ndarray, what: str, spans: Sequence[Span]) -> np.ndarray:
+    """(N,) bool. Raises RecordingError where none is inside."""
+    own = int(stamps_ns.min()), int(stamps_ns.max())
+    origin = start_of(own, spans)
+    low, high = window.bounds(origin)
+    inside = (stamps_ns >= low) & (stamps_ns < high)
+    if not inside.any():
+        raise window.refuse(what, (own[1] - origin) * 1e-9)
+    return inside
+
+
+def start_of(own: Span, spans: Sequence[Span]) -> int:
+    """The first stamp of all streams whose clocks go with that of one: their spans overlap, directly or by others.
+
+    A stream whose clock jumps, or has another origin, starts at its own first stamp.
+    """
+    first, last = own
+    if last - first > _LONGEST_NS:
+        return first
+    waiting = [s for s in spans if s[1] - s[0] <= _LONGEST_NS]
+    while found := [s for s in waiting if s[0] <= last and s[1] >= first]:
+        first, last = min(first, *(s[0] for s in found)), max(last, *(s[1] for s in found))
+        waiting = [s for s in waiting if s not in found]
+    return first
