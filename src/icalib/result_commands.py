@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import get_args
+
+from icalib.rig import AccelUnit, GyroUnit
 
 
 def add_result_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -18,6 +21,9 @@ def _add_allan(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     c = commands.add_parser("allan", help="noise densities and bias walks of an IMU, from a recording of it at rest")
     c.add_argument("recording", type=Path, help="folder of the recording, or bag: hours of an IMU that stands still")
     c.add_argument("--imu", metavar="TOPIC", help="topic or table of the IMU; by default the only one")
+    c.add_argument("--gyro-unit", choices=get_args(GyroUnit), help="unit of its angular rates; by default rad/s")
+    accel = "unit of its accelerations; by default m/s^2, or g where gravity shows it"
+    c.add_argument("--accel-unit", choices=get_args(AccelUnit), help=accel)
     c.add_argument("--output", "-o", type=Path, required=True, help="folder for plot, figures and rig file fields")
     c.add_argument("--quiet", "-q", action="store_true", help="no table")
     c.set_defaults(run=_allan)
@@ -29,7 +35,7 @@ def _allan(options: argparse.Namespace) -> None:
     from icalib.allan.words import print_study
 
     check_folder(options.output)
-    study = study_recording(options.recording, options.imu)
+    study = study_recording(options.recording, options.imu, options.gyro_unit, options.accel_unit)
     write_study(study, options.output)
     if not options.quiet:
         print_study(study)

@@ -329,6 +329,23 @@ def test_rates_in_degrees_are_named(scale: float):
     assert not any("deg/s" in w for w in study_imu(shaken, "here").warnings)
 
 
+def test_units_of_the_readings_may_be_given(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """g is recognised; deg/s is a warning, in the file too."""
+    imu = at_rest(60.0, 100.0, 7)
+    study = study_imu(imu, "here")
+    other = dataclasses.replace(imu, gyro=imu.gyro * 180.0 / np.pi, accel=imu.accel / 9.80665)
+    recording, out = write(other, tmp_path), tmp_path / "out"
+    assert main(["allan", str(recording), "-o", str(out)]) == 0
+    assert "the accelerometer is in units of g" in re.sub(r"\s+", " ", capsys.readouterr().out)
+    assert "# Warning: the angular rates look like deg/s" in (out / "noise.yaml").read_text()
+    for accel in ([], ["--accel-unit", "g"]):
+        assert main(["allan", str(recording), "-o", str(out), "--gyro-unit", "deg/s", *accel]) == 0
+        assert "deg/s" not in (out / "noise.yaml").read_text()
+        found = json.loads((out / "allan.json").read_text())
+        for kind, sensor in (("gyroscope", study.gyro), ("accelerometer", study.accel)):
+            assert found[kind]["together"]["noise_density"] == pytest.approx(sensor.together.white, rel=1e-6)
+
+
 def test_an_imu_in_the_hand_is_refused():
     imu = at_rest(30.0, 100.0, 6)
     swing = np.sin(np.arange(3000) / 60.0)[:, None]
@@ -438,6 +455,20 @@ def test_several_imus_or_none_are_one_sentence(tmp_path: Path, capsys: pytest.Ca
     assert "has no readings of an IMU; it holds cam0/corners.csv" in capsys.readouterr().err
     assert main(["allan", str(tmp_path / "nowhere"), "-o", str(tmp_path / "out")]) == 1
     assert "nowhere does not exist" in capsys.readouterr().err
+
+
+def test_an_imu_on_two_topics(tmp_path: Path):
+    """As RealSense sends it: what a topic does not carry is zero."""
+    imu = at_rest(40.0, 100.0, 7)
+    bag = tmp_path / "static.bag"
+    topics = ("/camera/accel/sample", "/camera/gyro/sample")
+    with BagWriter("ros1", bag, dict.fromkeys(topics, IMU)) as writer:
+        for t, w, f in zip(imu.stamps_ns.tolist(), imu.gyro.tolist(), imu.accel.tolist(), strict=True):
+            writer.write(topics[0], writer.imu(t, [0.0, 0.0, 0.0, *f]), t)
+            writer.write(topics[1], writer.imu(t, [*w, 0.0, 0.0, 0.0]), t)
+    study, whole = study_recording(bag), study_imu(imu, "here")
+    for found, there in zip(study.sensors, whole.sensors, strict=True):
+        assert found.together.white == pytest.approx(there.together.white, rel=1e-6)
 
 
 def test_a_fit_is_plain_numbers():

@@ -13,11 +13,13 @@ from icalib.allan.sampling import still_readings
 from icalib.errors import RecordingError
 from icalib.imu_classes import DEFAULT_CLASS, class_noise
 from icalib.measurements import ImuStream
-from icalib.recordings import Recording, TopicInfo, open_recording
+from icalib.recordings import BagRecording, Recording, TopicInfo, open_recording
 from icalib.recordings.imu_checks import read_imu
+from icalib.recordings.imu_halves import pair_of
+from icalib.recordings.imu_units import DEGREE
 from icalib.recordings.jumps import ClockJumps
 from icalib.recordings.topics import find_topic, listing
-from icalib.rig import ImuSensor
+from icalib.rig import AccelUnit, GyroUnit, ImuSensor
 
 AXES = ("x", "y", "z")
 _WALK_KNOWN = 1.0  # of NoiseFit.lacking
@@ -25,7 +27,6 @@ _WORSE = 1.5  # times the mean density
 _MISFIT = 0.15
 _NOISIEST_GYRO = 1e-3  # rad/s/sqrt(Hz): more than gyroscopes have that are sold; quiet ones have it in deg/s
 _APART = 5.0  # times as far from its class as the accelerometer, which vibration would disturb as well
-DEGREE = np.pi / 180.0
 _SAMPLE = 200_000  # readings in which the steps of rounding are looked for
 
 
@@ -65,14 +66,19 @@ class ImuNoiseStudy:
         return self.gyro, self.accel
 
 
-def study_recording(path: str | Path, imu: str | None = None) -> ImuNoiseStudy:
-    """Of the IMU at `imu` (topic or table) in the recording; by default the only one.
+def study_recording(
+    path: str | Path, imu: str | None = None, gyro_unit: GyroUnit | None = None, accel_unit: AccelUnit | None = None
+) -> ImuNoiseStudy:
+    """Of the IMU at `imu` (topic or table) in the recording; by default the only one. Units: of the readings as they
+    are recorded; None: SI units, and g is recognised.
 
     Raises RecordingError as the readers do, and EstimationError where nothing stood still for 10 s.
     """
     recording: Recording = open_recording(path)
-    topic = _imu_topic(str(path), recording.topics(), imu)
-    sensor = ImuSensor(topic.name, topic.name, class_noise(DEFAULT_CLASS), topic=topic.name)
+    topic = _imu_topic(str(path), recording, imu)
+    sensor = ImuSensor(
+        topic.name, topic.name, class_noise(DEFAULT_CLASS), topic=topic.name, accel_unit=accel_unit, gyro_unit=gyro_unit
+    )
     jumps = ClockJumps()
     stream, notes = read_imu(recording, sensor, jumps)
     return study_imu(stream, recording.where(sensor), recording.notes() + jumps.notes + notes)
@@ -90,8 +96,10 @@ def study_imu(imu: ImuStream, where: str, notes: tuple[str, ...] = ()) -> ImuNoi
     return ImuNoiseStudy(imu.name, where, still.seconds, still.period, gyro, accel, warnings, notes)
 
 
-def _imu_topic(where: str, topics: tuple[TopicInfo, ...], given: str | None) -> TopicInfo:
-    """The topic or table `given`, else the only one of an IMU. Raises RecordingError listing what there is."""
+def _imu_topic(where: str, recording: Recording, given: str | None) -> TopicInfo:
+    """The topic or table `given`, else the only one of an IMU, or one of its two where its sensors report apart. Raises
+    RecordingError listing what there is."""
+    topics = recording.topics()
     if given is not None:
         topic = find_topic(where, topics, given)
         if topic.kind != "imu" or not topic.count:
@@ -100,7 +108,8 @@ def _imu_topic(where: str, topics: tuple[TopicInfo, ...], given: str | None) -> 
     found = [t for t in topics if t.kind == "imu" and t.count]
     if not found:
         raise RecordingError(f"{where} has no readings of an IMU; {listing(topics)}; record one at rest.")
-    if len(found) > 1:
+    pair = len(found) == 2 and isinstance(recording, BagRecording) and pair_of(recording, topics)
+    if len(found) > 1 and not pair:
         raise RecordingError(f"{where} has several IMUs, {', '.join(t.name for t in found)}; give one as --imu.")
     return found[0]
 
@@ -131,8 +140,8 @@ def _unit_warnings(gyro: float, accel: float) -> tuple[str, ...]:
         return ()
     return (
         f"the angular rates look like deg/s: at rest their noise is {times_gyro:.0f} times that of a {DEFAULT_CLASS} "
-        f"gyroscope, that of the accelerometer {times_accel:.2g} times; if they are, {gyro:.2g} rad/s/sqrt(Hz) is "
-        f"{DEGREE:.3g} times that, {gyro * DEGREE:.2g}.",
+        f"gyroscope, that of the accelerometer {times_accel:.2g} times; if they are, give --gyro-unit deg/s, and the "
+        f"noise is {gyro * DEGREE:.2g} rad/s/sqrt(Hz), not {gyro:.2g}.",
     )
 
 
