@@ -86,11 +86,11 @@ def _shifts(rig: Rig, recordings: Sequence[Measurements]) -> list[int]:
 
 
 def _length_ns(rig: Rig, measurements: Measurements) -> int:
-    """Of the longest stream; without an IMU from the first image of any camera to the last: offsets are known then."""
+    """Of the longest stream; without an IMU from the first stamp of any sensor to the last: offsets are known then."""
     spans = [(int(s.stamps_ns[0]), int(s.stamps_ns[-1])) for s in _streams(measurements)]
     if measurements.imu is not None:
         return max(b - a for a, b in spans)
-    given = [c.time_offset.value for c in rig.cameras]
+    given = [s.time_offset.value for s in (*rig.cameras, *rig.lidars, *rig.wheels, *rig.poses)]
     offsets = [0 if v is None else round(1e9 * float(v[0])) for v in given]
     begins, ends = zip(*((a + d, b + d) for (a, b), d in zip(spans, offsets, strict=True)), strict=True)
     return max(ends) - min(begins)

@@ -270,6 +270,7 @@ class PoseSensor:
     clock_restarts: bool = False  # from recording to recording: each has a time offset of its own
     topic: str | None = None  # of its poses; None: the one with the sensor's name, or the only one
     layout: TableLayout = PLAIN_TABLE
+    inverted: bool = False  # what is recorded is T_sensor_frame
 
 
 Scheme = Literal["inertial", "pose", "kinematic"]

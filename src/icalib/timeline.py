@@ -55,5 +55,6 @@ class Timeline:
 def _extent(part: Part, image_times: list[np.ndarray]) -> tuple[float, float]:
     """The first and the last instant of a recording at which anything was measured, on the joined clock."""
     images = [t[own] for t, own in zip(image_times, part.images, strict=True)]
-    times = np.concatenate([*images, *([part.begin + imu.seconds] if (imu := part.measurements.imu) else [])])
+    body = part.measurements.imu or (None if images else part.measurements.poses[0])
+    times = np.concatenate([*images, *([] if body is None else [part.begin + body.seconds])])
     return float(times.min()), float(times.max())

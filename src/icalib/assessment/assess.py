@@ -282,9 +282,12 @@ def _trajectory(inputs: Inputs, s: State, timeline: Timeline) -> Trajectory:
 
 
 def _node_recordings(inputs: Inputs, state: State, timeline: Timeline) -> np.ndarray:
-    """(K,) the recording of each node; without an IMU, that of the image which is taken there."""
+    """(K,) the recording of each node; without an IMU, that of the image or the pose which is taken
+    there."""
     if inputs.imu is not None:
         return np.repeat(np.arange(len(state.starts)), np.diff((*state.starts, len(state.seconds))))
+    if not inputs.rig.cameras:
+        return timeline.recording_of(state.seconds)
     times = np.concatenate(image_times(inputs, state.values))
     recording = np.concatenate([timeline.of_images(i) for i in range(len(inputs.measurements.cameras))])
     order = np.argsort(times, kind="stable")

@@ -13,7 +13,7 @@ from icalib.estimation import pages
 from icalib.estimation.arrowhead import chain_cuts
 from icalib.estimation.board import SHAPE_LABELS, SHAPE_SIGMA_M, bloom_direction
 from icalib.estimation.border import NOTHING
-from icalib.estimation.clocks import instants
+from icalib.estimation.clocks import EARLY_S, instants
 from icalib.estimation.corner_factor import CornerFactor, CornerNoise
 from icalib.estimation.feature_factor import FeatureFactor
 from icalib.estimation.free_nodes import FreeNodes
@@ -25,7 +25,7 @@ from icalib.estimation.nodes import MERGED_WITHIN_S, distinct, first_nodes, plac
 from icalib.estimation.poses import assign_nodes, poses_at
 from icalib.estimation.prior_factor import Prior
 from icalib.estimation.problem import ChainFactor, Problem
-from icalib.estimation.robot import NO_ROBOT, RobotNoise, robot_factors
+from icalib.estimation.robot import NO_ROBOT, RobotNoise, robot_factors, still_factors
 from icalib.estimation.sensors import SensorFactor
 from icalib.estimation.state import Key, Layout, State
 from icalib.estimation.surfaces import Surfaces
@@ -176,7 +176,7 @@ def assemble(
         features = None if found is None else found.result()
     return Problem(
         layout, _chain(inputs, state), tuple(factors), _priors(inputs), tolerance, held, features, others,
-        rig.has_target or rig.assumes_motion,
+        rig.has_target or rig.imu is None or rig.assumes_motion,
     )  # fmt: skip
 
 
@@ -188,7 +188,9 @@ def motion_of(inputs: Inputs, state: State) -> Motion:
 
 def _others(inputs: Inputs, state: State, noise: RobotNoise) -> tuple[SensorFactor, ...]:
     if inputs.imu is None:
-        return ()
+        begins = [part.begin - EARLY_S for part in inputs.parts[1:]]
+        starts = (0, *(int(k) for k in np.searchsorted(state.seconds, begins)))
+        return still_factors(inputs.rig, inputs.measurements.poses, noise, state, starts, inputs.layout)
     motion = motion_of(inputs, state)
     return robot_factors(inputs.rig, inputs.measurements, inputs.clouds, noise, motion, inputs.layout)
 

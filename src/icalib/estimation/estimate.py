@@ -37,6 +37,9 @@ from icalib.rig import PoseSensor
 
 LOOSE = 3.0  # times what a guess is worth
 LEAST_LEFT = 0.2  # of the residuals of poses: where the motion takes all, nothing is left to show their noise
+# Degrees of freedom off those of poses at rest, of which there may be few: the mean of a variance that chi^2 shows, its
+# logarithm unknown before (Jeffreys' prior); standard deviations are then those of Student's t distribution.
+FEW_DOF = 2.0
 EARLY_DECREASE, EARLY_SHARE = 0.5, 1e-6  # an early pass is followed by another
 AGAIN = 4  # further passes, at most, where the last one began too far from its end, or without tracks that it found
 FAR = 1.1  # times the chi^2 at its end: what a pass froze where it began is not what it would freeze at the end
@@ -308,7 +311,8 @@ def _next_robot(inputs: Inputs, problem: Problem, outcome: Outcome, robot: Robot
     judged = fits(problem, outcome) if any(_is_open(s) for s in inputs.rig.poses) else []
     posing = []
     for sensor, noise in zip(inputs.rig.poses, robot.posing, strict=True):
-        ratios = {f.kind: f.chi2 / f.dof for f in judged if f.sensor == sensor.name and f.dof > LEAST_LEFT * f.count}
+        shown = [f for f in judged if f.sensor == sensor.name and f.dof > LEAST_LEFT * f.count]
+        ratios = {f.kind: f.chi2 / (f.dof if inputs.imu else max(f.dof - FEW_DOF, 1.0)) for f in shown}
         posing.append(next_posing(sensor, noise, ratios))
     return RobotNoise(tuple(ranging), tuple(posing))
 

@@ -8,12 +8,14 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation.arrowhead import Piece, in_parallel, marginalise
+from icalib.estimation.free_nodes import FreeNodes
 from icalib.estimation.gauge import FRAME, IN_THE_WORLD, hold_frame
 from icalib.estimation.outcome import Outcome
 from icalib.estimation.problem import Problem, Residuals
 from icalib.estimation.state import State
 
 FEWEST_NODES = 3  # between the ends of a part
+FEWEST_PARTS = 4  # of poses at rest: the spread of fewer says little
 # Information [1/m^2, 1/rad^2] that holds the frame of each part in a world that nobody sees, where parts share planes
 # or the frame of a pose sensor: held firmly, each would seem to say where these are. Where they share nothing of the
 # world so little would be lost in rounding.
@@ -36,6 +38,9 @@ class Parts:
     def of(cls, problem: Problem, outcome: Outcome, count: int) -> Parts | None:
         """About `count` parts of about one length, which several recordings share, at least one each. None where they
         would be too short, or one does not stand alone."""
+        if isinstance(problem.chain, FreeNodes) and problem.sensors:  # poses at rest, of which there may be few
+            count = min(count, problem.n_nodes // FEWEST_NODES)
+            count = count if count >= FEWEST_PARTS else 0
         if count < 2:
             return None
         ends = segment_ends(problem.chain.starts, problem.n_nodes, count)

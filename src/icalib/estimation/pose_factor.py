@@ -19,9 +19,9 @@ from icalib.estimation.board import board_in
 from icalib.estimation.clocks import by_clock, instants, mounted_columns, offset_at
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.lidar_sweep import Motion
-from icalib.estimation.nodes import usable
+from icalib.estimation.nodes import MERGED_WITHIN_S, usable
 from icalib.estimation.pose_rows import Frame, Mount, PoseRows, absolute_rows, relative_rows
-from icalib.estimation.poses import Poses, assign_nodes, poses_at
+from icalib.estimation.poses import Poses, assign_nodes, poses_at, poses_of_nodes
 from icalib.estimation.row_sums import Into, Weighing, add_rows
 from icalib.estimation.sensors import Whitened
 from icalib.estimation.state import Layout, State
@@ -54,7 +54,7 @@ def frame_of(sensor: str, recording: int) -> str:
 @dataclass(frozen=True)
 class AbsolutePoseFactor:
     """n poses of one sensor in its frame, see `pose_rows.absolute_rows`. node (n,), in order: of each; sigma: of its
-    rotation [rad] and position [m]."""
+    rotation [rad] and position [m]. imu: None where poses were taken at nodes, which nothing ties to each other."""
 
     units: ClassVar[dict[str, str]] = UNITS
 
@@ -65,7 +65,7 @@ class AbsolutePoseFactor:
     node: np.ndarray
     starts: tuple[int, ...]  # the first node of each recording
     n_nodes: int
-    imu: ImuData
+    imu: ImuData | None
     gravity: float
     noise: PoseNoise
     layout: Layout
@@ -82,6 +82,19 @@ class AbsolutePoseFactor:
         return cls(
             stream.name, stream.seconds[k], stream.rotation[k], stream.position[k], node[k], state.starts,
             len(state.seconds), motion.imu, motion.gravity, noise, layout,
+        )  # fmt: skip
+
+    @classmethod
+    def at_nodes(
+        cls, stream: PoseStream, state: State, starts: tuple[int, ...], noise: PoseNoise, layout: Layout
+    ) -> AbsolutePoseFactor:
+        """Of the poses that were taken at a node, without an IMU; starts: the first node of each recording."""
+        times = instants(stream, state.values)
+        node = np.searchsorted(0.5 * (state.seconds[1:] + state.seconds[:-1]), times)
+        k = np.flatnonzero(np.abs(times - state.seconds[node]) <= MERGED_WITHIN_S)
+        return cls(
+            stream.name, stream.seconds[k], stream.rotation[k], stream.position[k], node[k], starts,
+            len(state.seconds), None, 0.0, noise, layout,
         )  # fmt: skip
 
     @property
@@ -247,6 +260,8 @@ def _mount(name: str, state: State) -> Mount:
 
 
 def _poses(factor: PoseFactor, seconds: np.ndarray, node: np.ndarray, state: State) -> Poses:
+    if factor.imu is None:
+        return poses_of_nodes(node, state)
     times = seconds + offset_at(state, factor.name, node)
     imu_free = factor.layout.is_free(factor.imu.name, "intrinsics")
     return poses_at("inertial", times, node, state, factor.imu, factor.gravity, imu_free)

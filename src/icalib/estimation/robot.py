@@ -22,7 +22,7 @@ from icalib.estimation.pose_factor import (
     frame_of,
 )
 from icalib.estimation.sensors import SensorFactor
-from icalib.estimation.state import Entry, Key, Kind, Layout
+from icalib.estimation.state import Entry, Key, Kind, Layout, State
 from icalib.estimation.wheel_angles import integrals_of
 from icalib.estimation.wheel_factor import IncrementFactor, RelativePoseFactor, WheelNoise
 from icalib.measurements import LidarStream, Measurements, PoseStream, WheelPoses, WheelStream
@@ -212,6 +212,14 @@ def robot_factors(
         for sensor, stream, size in zip(rig.poses, measurements.poses, noise.posing, strict=True)
     )
     return (*(lidars if clouds.count else ()), *wheels, *ground_factors(rig, clouds, motion, layout), *poses)
+
+
+def still_factors(
+    rig: Rig, streams: Sequence[PoseStream], noise: RobotNoise, state: State, starts: tuple[int, ...], layout: Layout
+) -> tuple[SensorFactor, ...]:
+    """Of pose sensors without an IMU; starts: the first node of each recording."""
+    sensors = zip(rig.poses, streams, noise.posing, strict=True)
+    return tuple(AbsolutePoseFactor.at_nodes(stream, state, starts, size, layout) for _, stream, size in sensors)
 
 
 def ground_factors(rig: Rig, clouds: Clouds, motion: Motion, layout: Layout) -> Iterator[GroundFactor]:

@@ -28,7 +28,7 @@ class Whitened:
 
 class SensorFactor(Protocol):
     """All measurements of one sensor. kinds: rows of its residuals by name; imu: the readings that carry it from nodes
-    to its own instants."""
+    to its own instants, None where it was measured at nodes."""
 
     @property
     def kinds(self) -> dict[str, slice]: ...
@@ -37,7 +37,7 @@ class SensorFactor(Protocol):
     def name(self) -> str: ...
 
     @property
-    def imu(self) -> ImuData: ...
+    def imu(self) -> ImuData | None: ...
 
     def with_imu(self, imu: ImuData) -> SensorFactor:
         """The same measurements, carried by other readings."""

@@ -11,7 +11,7 @@ The body is the first camera, whose target is the world, or the first pose senso
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,10 +24,11 @@ from icalib.estimation.pose_factor import FRAME, frame_of
 from icalib.estimation.state import Key, State
 from icalib.first_guess.keyframe_spacing import keyframe_spacing
 from icalib.first_guess.lidar_rounds import given
-from icalib.first_guess.poses import NAMES, pose_values
+from icalib.first_guess.poses import NAMES, check_rate, pose_values
 from icalib.first_guess.robot import wheel_values
 from icalib.first_guess.several import initial_guesses
-from icalib.first_guess.smooth_path import FEWEST, SmoothPath, smooth_path
+from icalib.first_guess.smooth_path import FEWEST, BodyPoses, SmoothPath
+from icalib.first_guess.stop_and_go import is_stop_and_go, start_from_pairs
 from icalib.geometry.targets.base import BOARD
 from icalib.measurements import ImuStream, Measurements
 from icalib.rig import ImuNoise, ImuSensor, Rig, fixed
@@ -39,22 +40,18 @@ LAG_S = 0.1  # over which the change of rate and acceleration tells their densit
 LEAST_DENSITY = 1e-3  # rad/s^2/sqrt(Hz), m/s^3/sqrt(Hz): of a body that stood still
 
 
-@dataclass(frozen=True)
-class _Shown:
-    """Poses of the body in one recording, on its clock: seconds (n,), R_world_body, p_world_body."""
-
-    seconds: np.ndarray
-    rotation: np.ndarray
-    position: np.ndarray
-
-    def at(self, seconds: np.ndarray) -> SmoothPath:
-        return smooth_path(self.seconds, self.rotation, self.position, seconds)
-
-
 def start_without_imu(rig: Rig, recordings: Sequence[Measurements]) -> tuple[Inputs, State, dict[Key, np.ndarray]]:
-    """As `start.start`. Raises EstimationError where the body's poses do not show its motion, or where wheels and pose
-    sensors do not show how they stand."""
+    """As `start.start`; where all was taken at rest, nothing is assumed.
+
+    Raises EstimationError where the body's poses do not show its motion, or where wheels and pose sensors do not show
+    how they stand.
+    """
     shown, cameras = _shown(rig, recordings)
+    if is_stop_and_go(rig, recordings, shown):
+        return start_from_pairs(rig, recordings, shown, cameras)
+    for m in recordings:
+        for stream in m.poses:
+            check_rate(stream)
     for own, m in zip(shown, recordings, strict=True):
         if len(own.seconds) < FEWEST:
             where = f"{m.name}: " if len(recordings) > 1 else ""
@@ -82,10 +79,10 @@ def start_without_imu(rig: Rig, recordings: Sequence[Measurements]) -> tuple[Inp
     return inputs, replace(moving, bias=-np.concatenate([rate, force], axis=1), values=values), values
 
 
-def _shown(rig: Rig, recordings: Sequence[Measurements]) -> tuple[list[_Shown], dict[Key, np.ndarray]]:
+def _shown(rig: Rig, recordings: Sequence[Measurements]) -> tuple[list[BodyPoses], dict[Key, np.ndarray]]:
     """The body's poses in each recording, and what was found of the cameras on the way."""
     if not rig.cameras:
-        return [_Shown(s.seconds, s.rotation, s.position) for s in (m.poses[0] for m in recordings)], {}
+        return [BodyPoses(s.seconds, s.rotation, s.position) for s in (m.poses[0] for m in recordings)], {}
     if not rig.has_target:
         raise EstimationError(
             "without an IMU cameras need a target: nothing else says how large the scene is; add one to the rig file."
@@ -96,7 +93,7 @@ def _shown(rig: Rig, recordings: Sequence[Measurements]) -> tuple[list[_Shown], 
     t, R, p = guess.body_poses(alone.measurements)
     begins = [part.begin for part in alone.parts]
     own = np.searchsorted(begins, t, side="right") - 1
-    found = [_Shown(t[own == k] - begin, R[own == k], p[own == k]) for k, begin in enumerate(begins)]
+    found = [BodyPoses(t[own == k] - begin, R[own == k], p[own == k]) for k, begin in enumerate(begins)]
     return found, guess.values()
 
 

@@ -39,7 +39,7 @@ def _with_axis_reversed(axis: int) -> Way:
 
 
 WAYS: tuple[tuple[str, Way], ...] = (
-    ("are inverted: they say where its frame stands, seen from it; write the inverse of each", _inverse),
+    ("are inverted: they say where its frame is, seen from it; write inverted: true for it in the rig file", _inverse),
     ("have inverted rotations; write R_frame_sensor, or turn the sign of the quaternions' x, y and z", _turned_back),
     ("are those of left-handed axes; write them in right-handed ones", _other_handed),
     *((f"have their position's {'xyz'[k]} reversed; turn its sign", _with_axis_reversed(k)) for k in range(3)),

@@ -57,6 +57,7 @@ from icalib.rig import PoseSensor
 
 WINDOW_S = 0.1  # of a mean rate: long against the noise of poses
 FEWEST_WINDOWS = 20
+LEAST_RATE_HZ = 2.0  # of poses of something that moves
 APART_S = 0.4  # of poses that show whether they fit: next to each other they differ by little but noise
 G_OTHER_UNITS = 0.5  # of gravity: positions do not make it so wrong
 
@@ -128,6 +129,7 @@ def _state_of_one(inputs: Inputs, held: Held | None) -> State:
 def pose_rates(stream: PoseStream) -> CameraRates:
     """Mean angular rates over windows of about WINDOW_S, one from each pose. Raises EstimationError where there are
     hardly any."""
+    check_rate(stream)
     t, R = stream.seconds, stream.rotation
     a = np.arange(len(t))
     b = np.searchsorted(t, t + WINDOW_S - 1e-9)
@@ -146,6 +148,17 @@ def pose_rates(stream: PoseStream) -> CameraRates:
             "sensor needs both."
         )
     return CameraRates(t[a], t[b], turn / (t[b] - t[a])[:, None], LEAST_CORRELATION)
+
+
+def check_rate(stream: PoseStream) -> None:
+    """Raises EstimationError where poses are too far apart to show how it moves."""
+    rate = 1.0 / float(np.median(np.diff(stream.seconds)))
+    if rate < LEAST_RATE_HZ:
+        often = f"{rate:.2g} pose{'' if round(rate, 1) == 1.0 else 's'} a second, {LEAST_RATE_HZ:g} are needed"
+        raise EstimationError(
+            f"{stream.name}: {often} while it moves; record more, or without an IMU stand still at each, with an "
+            "image or another pose of the same stamp."
+        )
 
 
 def _path(stream: PoseStream) -> LidarPath:

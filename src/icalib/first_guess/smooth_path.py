@@ -30,6 +30,20 @@ class SmoothPath:
     near: np.ndarray
 
 
+@dataclass(frozen=True)
+class BodyPoses:
+    """Poses of the body in one recording, on its clock since its first stamp: seconds (n,), R_world_body (n, 3, 3),
+    p_world_body (n, 3) m."""
+
+    seconds: np.ndarray
+    rotation: np.ndarray
+    position: np.ndarray
+
+    def at(self, seconds: np.ndarray) -> SmoothPath:
+        """See `smooth_path`."""
+        return smooth_path(self.seconds, self.rotation, self.position, seconds)
+
+
 def smooth_path(t: np.ndarray, R: np.ndarray, p: np.ndarray, at: np.ndarray) -> SmoothPath:
     """Through poses R (n, 3, 3), p (n, 3) at increasing t (n,), n >= FEWEST, looked at at `at` (m,)."""
     half = max(HALF_S, HALF_STEPS * float(np.median(np.diff(t))))

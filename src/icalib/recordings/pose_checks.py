@@ -10,6 +10,7 @@ from icalib.measurements import PoseStream, seconds_since
 from icalib.recordings.bad_poses import are_poses, path_of, stale_copies
 from icalib.recordings.ordered import kept_readings
 from icalib.recordings.poses import RATE_HZ, PoseReadings
+from icalib.recordings.stops import stands_still_between
 from icalib.rig import PoseSensor
 
 _FASTEST_M_S = 100.0
@@ -77,6 +78,8 @@ def _without_copies(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple[
 def _on_path(read: PoseReadings, sensor: PoseSensor, what: str) -> tuple[PoseReadings, tuple[str, ...]]:
     """Without poses off the path of the others, and a note where poses jump; raises RecordingError where jumps of a
     frame that stands still do not come back."""
+    if stands_still_between(_seconds(read), read.rotation, read.position):
+        return read, ()  # what moved while it was not seen did not jump
     path = path_of(_seconds(read), read.rotation, read.position)
     if not len(path.jumps):
         return read, ()

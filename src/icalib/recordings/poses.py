@@ -12,7 +12,7 @@ from icalib.recordings.columns import STAMP, TableKind, vector_names
 from icalib.recordings.image_checks import Note, ignore
 from icalib.recordings.streams import unit_rotations
 from icalib.recordings.table import read_table
-from icalib.rig import PLAIN_TABLE, TableLayout
+from icalib.rig import PLAIN_TABLE, PoseSensor, TableLayout
 
 RATE_HZ = (1e-3, 5000.0)
 POSES = TableKind(
@@ -39,6 +39,14 @@ class PoseReadings:
     stamps_ns: np.ndarray
     rotation: np.ndarray
     position: np.ndarray
+
+
+def as_frame_sensor(read: PoseReadings, sensor: PoseSensor) -> PoseReadings:
+    """The poses as T_frame_sensor, where the rig file says that they are inverted."""
+    if not sensor.inverted:
+        return read
+    R = np.ascontiguousarray(read.rotation.transpose(0, 2, 1))
+    return replace(read, rotation=R, position=-np.einsum("nij,nj->ni", R, read.position))
 
 
 def is_tum_text(path: Path) -> bool:

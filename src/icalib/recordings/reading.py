@@ -13,6 +13,7 @@ from icalib.recordings.imu_checks import read_imu
 from icalib.recordings.jumps import LONGEST_S, ClockJumps
 from icalib.recordings.lidar_checks import checked_lidar
 from icalib.recordings.pose_checks import checked_poses
+from icalib.recordings.poses import as_frame_sensor
 from icalib.recordings.sections import S
 from icalib.recordings.topics import image_topics
 from icalib.recordings.wheel_checks import checked_wheels
@@ -46,7 +47,11 @@ def read_measurements(recording: Recording, rig: Rig, find: FindCorners = tables
 
     lidars = [checked_lidar(*read(recording.lidar(s), s)) for s in rig.lidars]
     wheels = [checked_wheels(stream, w, where) for w in rig.wheels for stream, where in [read(recording.wheels(w), w)]]
-    poses = [checked_poses(stream, s, where) for s in rig.poses for stream, where in [read(recording.poses(s), s)]]
+    poses = [
+        checked_poses(as_frame_sensor(stream, s), s, where)
+        for s in rig.poses
+        for stream, where in [read(recording.poses(s), s)]
+    ]
     notes = sum((found for _, found in (*lidars, *wheels, *poses)), notes + seen)
     return Measurements(
         imu, cameras, recording.notes() + jumps.notes + notes, tracks=tracks,

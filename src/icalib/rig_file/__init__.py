@@ -17,7 +17,6 @@ from icalib.rig import (
     ImuSensor,
     Lidar,
     Parameter,
-    PoseKind,
     PoseSensor,
     Rig,
     Settings,
@@ -26,7 +25,6 @@ from icalib.rig import (
 from icalib.rig_file.fields import (
     MOUNTING,
     TABLE,
-    choice_or,
     groups_to_plain,
     layout_to_plain,
     mounting,
@@ -36,6 +34,7 @@ from icalib.rig_file.fields import (
 )
 from icalib.rig_file.imu import imu_to_plain, read_imu
 from icalib.rig_file.lidar import lidar_to_plain, read_lidar
+from icalib.rig_file.poses import pose_sensor, pose_to_plain
 from icalib.rig_file.wheels import read_wheels, wheels_to_plain
 from icalib.rig_parameters import vector_parameter
 from icalib.rig_targets import target_of, target_or_targets
@@ -99,7 +98,7 @@ def rig_to_dict(rig: Rig) -> dict[str, Any]:
     imus = {} if rig.imu is None else {rig.imu.name: imu_to_plain(rig.imu)}
     sensors = imus | {c.name: _camera_to_plain(c) for c in rig.cameras}
     sensors |= {s.name: lidar_to_plain(s) for s in rig.lidars} | {w.name: wheels_to_plain(w) for w in rig.wheels}
-    sensors |= {s.name: _pose_to_plain(s) for s in rig.poses}
+    sensors |= {s.name: pose_to_plain(s) for s in rig.poses}
     key = "targets" if isinstance(rig.target, Scene) else "target"
     target = {key: rig.target.plain()} if rig.has_target else {}
     return {
@@ -137,7 +136,7 @@ def _sensors(value: YamlValue) -> _Sensors:
             case "wheels":
                 found.wheels.append(read_wheels(name, sensor))
             case "pose":
-                found.poses.append(_pose(name, sensor))
+                found.poses.append(pose_sensor(name, sensor))
             case _ if found.imus:
                 sensor.fail(f"is a second IMU beside {found.imus[0].name}; keep the one that is the body frame.")
             case _:
@@ -217,22 +216,6 @@ def _camera(name: str, value: YamlValue) -> Camera:
     )
 
 
-def _pose(name: str, value: YamlValue) -> PoseSensor:
-    own = ("path", "topic", "kind", "level", "rotation_noise", "position_noise")
-    found = value.record(("type",), (*own, *TABLE, *MOUNTING))
-    return PoseSensor(
-        name=name,
-        path=path_or(found, f"{name}/poses.csv"),
-        kind=choice_or(found, "kind", PoseKind, PoseSensor.kind),
-        level=found["level"].boolean() if "level" in found else PoseSensor.level,
-        topic=topic_or_none(found),
-        rotation_noise=found["rotation_noise"].positive() if "rotation_noise" in found else None,
-        position_noise=found["position_noise"].positive() if "position_noise" in found else None,
-        layout=table_layout(found),
-        **mounting(found),
-    )
-
-
 def _refuse_negative_focal_length(found: dict[str, YamlValue], parameters: dict[str, Parameter]) -> None:
     value = parameters["intrinsics"].value if "intrinsics" in parameters else None
     if value is not None and (value[:2] <= 0).any():
@@ -277,10 +260,3 @@ def _camera_to_plain(camera: Camera) -> dict[str, Any]:
     if camera.track_noise_px is not None:
         plain["track_noise"] = camera.track_noise_px
     return plain | layout_to_plain(camera.layout) | groups_to_plain(camera)
-
-
-def _pose_to_plain(sensor: PoseSensor) -> dict[str, Any]:
-    plain: dict[str, Any] = {"type": "pose", "path": sensor.path, "kind": sensor.kind, "level": sensor.level}
-    plain |= layout_to_plain(sensor.layout)
-    given = {name: getattr(sensor, name) for name in ("rotation_noise", "position_noise", "topic")}
-    return plain | {name: value for name, value in given.items() if value is not None} | groups_to_plain(sensor)

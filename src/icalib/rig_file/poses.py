@@ -1,0 +1,47 @@
+"""Pose sensors of the rig file, and back to plain data."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from icalib.rig import PoseKind, PoseSensor
+from icalib.rig_file.fields import (
+    MOUNTING,
+    TABLE,
+    choice_or,
+    groups_to_plain,
+    layout_to_plain,
+    mounting,
+    path_or,
+    table_layout,
+    topic_or_none,
+)
+from icalib.yaml_nodes import YamlValue
+
+_NOISE = ("rotation_noise", "position_noise")
+
+
+def pose_sensor(name: str, value: YamlValue) -> PoseSensor:
+    """Raises RigError naming file, line and field."""
+    found = value.record(("type",), ("path", "topic", "kind", "level", "inverted", *_NOISE, *TABLE, *MOUNTING))
+    return PoseSensor(
+        name=name,
+        path=path_or(found, f"{name}/poses.csv"),
+        kind=choice_or(found, "kind", PoseKind, PoseSensor.kind),
+        level=found["level"].boolean() if "level" in found else PoseSensor.level,
+        topic=topic_or_none(found),
+        rotation_noise=found["rotation_noise"].positive() if "rotation_noise" in found else None,
+        position_noise=found["position_noise"].positive() if "position_noise" in found else None,
+        inverted="inverted" in found and found["inverted"].boolean(),
+        layout=table_layout(found),
+        **mounting(found),
+    )
+
+
+def pose_to_plain(sensor: PoseSensor) -> dict[str, Any]:
+    """The fields that `pose_sensor` reads."""
+    plain: dict[str, Any] = {"type": "pose", "path": sensor.path, "kind": sensor.kind, "level": sensor.level}
+    plain |= layout_to_plain(sensor.layout)
+    given = {name: getattr(sensor, name) for name in (*_NOISE, "topic")}
+    given |= {"inverted": sensor.inverted or None}
+    return plain | {name: value for name, value in given.items() if value is not None} | groups_to_plain(sensor)
