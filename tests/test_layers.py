@@ -20,6 +20,7 @@ LEVELS = {
     "file_names": 0,
     "own_files": 0,
     "staging": 0,
+    "unpacking": 1,
     "measurements": 1,
     "rig": 1,
     "joining": 2,

@@ -6,7 +6,6 @@ import dataclasses
 import hashlib
 import io
 import json
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -31,6 +30,7 @@ from icalib.file_names import NAME
 from icalib.own_files import sealed
 from icalib.result_files import read_file
 from icalib.text_files import printable
+from icalib.unpacking import load_arrays
 
 FORMAT, FORMAT_VERSION = "icalib result", 1
 _TEXTS = ("undetermined", "warnings", "notes", "wrong")
@@ -154,9 +154,8 @@ def _read_npz(folder: Path, plain: dict[str, Any]) -> dict[str, np.ndarray]:
             f"{path} is truncated, changed, or of another run than the result.json beside it; calibrate again."
         )
     try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except (ValueError, OSError, zipfile.BadZipFile) as error:
+        return load_arrays(content)
+    except ValueError as error:
         raise CalibrationError(f"{path} cannot be read ({error}); calibrate again.") from error
 
 

@@ -6,9 +6,7 @@ The folder is the user's cache folder, or $ICALIB_CACHE. A file that is damaged 
 from __future__ import annotations
 
 import hashlib
-import io
 import os
-import zipfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -18,6 +16,7 @@ import numpy as np
 from icalib.detection.corners import ImageCorners
 from icalib.recordings import Payload
 from icalib.staging import staged
+from icalib.unpacking import load_arrays
 
 VERSION = 3  # of the detectors and of the format: whatever changes corners changes this
 _FIELDS = ("point", "uv", "sigma", "blur", "verdict")
@@ -45,11 +44,12 @@ def load_corners(key: str) -> tuple[np.ndarray, list[ImageCorners]] | None:
     """Stamps (M,) and corners of the images under `key`, or None."""
     try:
         content = (cache_folder() / f"{key}.npz").read_bytes()
-        with np.load(io.BytesIO(content), allow_pickle=False) as file:
-            arrays = {name: file[name] for name in ("stamps_ns", "start", *_FIELDS)}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        arrays = load_arrays(content)
+        start = arrays["start"]
+        if not {"stamps_ns", *_FIELDS} <= arrays.keys():
+            return None
+    except (OSError, ValueError, KeyError):
         return None
-    start = arrays["start"]
     images = [
         ImageCorners(*(arrays[name][a:b] for name in _FIELDS)) for a, b in zip(start[:-1], start[1:], strict=True)
     ]

@@ -36,6 +36,7 @@ from icalib.recordings.tracks import read_tracks
 from icalib.recordings.wheels import WheelReadings, read_wheel_joints, read_wheel_twists
 from icalib.recordings.window import WHOLE, Span, Window, cut
 from icalib.rig import Camera, ImuSensor, Lidar, PoseSensor, TwoSources, Wheels
+from icalib.unpacking import unpacked
 
 _SWAPPED_NS = 1_000_000_000  # readings overtake each other on the network by less; more is a clock that was set back
 
@@ -347,7 +348,7 @@ def _deserialise(encoding: str, content: bytes, kind: str) -> Any:
 def _decompress(content: bytes) -> bytes:
     zstd = load_zstd()
     try:
-        return zstd.decompress(content)
+        return unpacked(zstd.ZstdDecompressor(), content)
     except zstd.ZstdError as error:
         raise ValueError(str(error)) from error
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zipfile
-import zlib
 from itertools import pairwise
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from icalib.measurements import LidarStream
 from icalib.recordings.point_times import LONGEST_PERIODS, UNIT_NS, unit_of_offsets, within_scan
 from icalib.recordings.unreadable import HEAD_BYTES, not_data
 from icalib.rig import Lidar
+from icalib.unpacking import load_arrays
 
 _REQUIRED = {"stamps_ns": np.int64, "start": np.int64, "offset_s": np.float32, "xyz": np.float32}
 _OPTIONAL = {"plane": np.int32}
@@ -28,12 +28,22 @@ def read_scans(name: str, path: Path) -> LidarStream:
         raise RecordingError(f"{path} has no array {missing[0]}; it needs {', '.join(_REQUIRED)}.")
     kinds = _REQUIRED | _OPTIONAL
     found = {n: _of_kind(path, n, array, kinds[n]) for n, array in arrays.items()}
+    if "plane" in found and not _are_planes(arrays["plane"]):
+        raise RecordingError(
+            f"{path}: plane must be -1, or the number of a plane from 0 up and below the number of points; correct "
+            "what writes it."
+        )
     if "plane" not in found:
         found["plane"] = np.full(len(found["xyz"]), -1, np.int32)
     try:
         return LidarStream(name, *(found[n] for n in kinds))
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from error
+
+
+def _are_planes(ids: np.ndarray) -> bool:
+    """No more planes than points: their number sizes arrays."""
+    return not ids.size or bool(ids.min() >= -1 and ids.max() < ids.size)
 
 
 def read_scan_stamps(path: Path) -> np.ndarray:
@@ -73,9 +83,8 @@ def _arrays(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
             raise RecordingError(sentence)
         if not zipfile.is_zipfile(path):
             raise RecordingError(f"{path} is not a file of arrays (npz); write it by numpy.savez.")
-        with np.load(path, allow_pickle=False) as found:
-            return {name: found[name] for name in names if name in found.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        return load_arrays(path, names)
+    except (OSError, ValueError) as error:
         raise RecordingError(f"{path} cannot be read ({error}); copy or write it again.") from error
 
 

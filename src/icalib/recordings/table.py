@@ -19,6 +19,7 @@ from icalib.recordings.image_checks import Note, ignore
 from icalib.recordings.table_kernels import LEFT_OUT, POWERS, parse
 from icalib.recordings.unreadable import HEAD_BYTES, not_data
 from icalib.rig import PLAIN_TABLE, TableLayout
+from icalib.unpacking import TooLargeError, gunzipped
 
 _GZIP_MAGIC = b"\x1f\x8b"
 _SEPARATORS = (",", ";", "\t", None)  # None: blanks
@@ -117,7 +118,9 @@ def _read_bytes(path: Path) -> bytes:
     try:
         content = path.read_bytes()
         if path.suffix == ".gz" or content.startswith(_GZIP_MAGIC):
-            content = gzip.decompress(content)
+            content = gunzipped(content)
+    except TooLargeError as error:
+        raise RecordingError(f"{path} is no table: {error}; unpack it by gunzip, and look at it.") from error
     except (EOFError, gzip.BadGzipFile, zlib.error) as error:
         raise RecordingError(f"{path} is a damaged or truncated gzip file ({error}); copy it again.") from error
     except OSError as error:

@@ -15,6 +15,7 @@ from icalib.recordings.bags.ros1 import ROS1_MAGIC, Ros1Storage
 from icalib.recordings.bags.sqlite import SQLITE_MAGIC, SqliteStorage
 from icalib.recordings.bags.storage import Storage
 from icalib.recordings.unreadable import HEAD_BYTES, not_data
+from icalib.unpacking import TooLargeError, copy_unpacked
 from icalib.yaml_nodes import read_yaml
 
 _READERS = {ROS1_MAGIC: Ros1Storage, MCAP_MAGIC: McapStorage, SQLITE_MAGIC: SqliteStorage}
@@ -82,7 +83,10 @@ def _open_compressed(path: Path) -> Storage:
     copy = Path(folder) / path.stem
     try:
         with zstd.open(path, "rb") as packed, copy.open("wb") as out:
-            shutil.copyfileobj(packed, out)
+            copy_unpacked(packed, out, path.stat().st_size)
+    except TooLargeError as error:
+        shutil.rmtree(folder)
+        raise RecordingError(f"{path}: {error}; unpack it by zstd -d, and look at it.") from error
     except (zstd.ZstdError, EOFError):
         pass  # cut off: the reader of the copy says how much there is
     except OSError:

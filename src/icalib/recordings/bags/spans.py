@@ -13,6 +13,7 @@ from typing import Any, BinaryIO
 from icalib.errors import RecordingError
 from icalib.extras import load_lz4, load_zstd
 from icalib.recordings.bags.storage import Connection, Tally, cut_note
+from icalib.unpacking import TooLargeError, unpacked
 
 
 class _UnknownCompressionError(Exception):
@@ -56,6 +57,8 @@ class SpanStorage(ABC):
                     self._tally_by_walking(file, span)
         if cut is not None:
             self.notes.append(cut_note(name, f"at byte {cut} of {size}", self.tally()))
+        if self.notes and not self.tally():
+            raise RecordingError(self.notes[0])
 
     @abstractmethod
     def _scan(self, file: BinaryIO, size: int) -> None:
@@ -90,8 +93,10 @@ class SpanStorage(ABC):
             raise RecordingError(
                 f"{self.name} is compressed by {str(error)!r}, which icalib cannot read; use zstd, lz4 or none."
             ) from None
-        except DamageError:
-            note = f"{self.name}: the block at byte {span.offset} is damaged; what follows in it was left out."
+        except (DamageError, TooLargeError) as error:
+            large = isinstance(error, TooLargeError)
+            what = f"is left out: {error}." if large else "is damaged; what follows in it was left out."
+            note = f"{self.name}: the block at byte {span.offset} {what}"
             if not span.cut and note not in self.notes:
                 self.notes.append(note)
 
@@ -125,7 +130,9 @@ def _body(file: BinaryIO, span: Span) -> memoryview:
 def _decompress(stored: bytes, compression: str) -> bytes:
     decompressor, errors = _decompressor(compression)
     try:
-        return decompressor.decompress(stored)
+        return unpacked(decompressor, stored)
+    except TooLargeError:
+        raise
     except errors as error:
         raise DamageError from error
 
