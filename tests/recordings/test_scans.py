@@ -154,6 +154,38 @@ def test_a_scan_with_a_wrong_stamp_is_left_out(tmp_path, stamp_ns):
     )
 
 
+@pytest.mark.parametrize("jitter_ns", [0, 10**6])
+@pytest.mark.parametrize("late_ns", [3 * 10**7, -2 * 10**7])
+def test_a_scan_stamped_too_early_or_too_late_is_left_out(tmp_path, jitter_ns, late_ns):
+    arrays = scan_of(np.arange(24))
+    arrays["stamps_ns"] += (jitter_ns * np.random.default_rng(0).normal(size=24)).astype(np.int64)
+    arrays["stamps_ns"][7] += late_ns
+    stream, notes = read(tmp_path, arrays)
+    assert stream.stamps_ns.tolist() == np.delete(arrays["stamps_ns"], 7).tolist()
+    assert "1 of 24 scans are stamped by more than 5% of a period too early or too late between" in notes[0]
+
+
+@pytest.mark.parametrize("case", ["jitter", "lost", "sector", "uneven"])
+def test_stamps_that_are_no_faults(tmp_path, case):
+    """Stamps of a driver that jitters; lost scans; a sector without returns, where a clock of the points begins later;
+    scans at two periods by turns."""
+    arrays = scan_of(np.arange(24))
+    if case == "jitter":
+        arrays["stamps_ns"] += (4e6 * np.random.default_rng(0).normal(size=24)).astype(np.int64)
+    elif case == "lost":
+        arrays = scan_of(np.delete(np.arange(24), [7, 12, 13]))
+    elif case == "sector":
+        kept = np.delete(np.arange(240), range(70, 74))
+        arrays = {**arrays, "start": np.array([10 * k - 4 * (k > 7) for k in range(25)]), "xyz": arrays["xyz"][kept]}
+        arrays["offset_s"] = arrays["offset_s"][kept]
+        arrays["offset_s"][70:76] -= np.float32(0.044)
+        arrays["stamps_ns"][7] += 44_000_000
+    else:
+        arrays["stamps_ns"][1::2] += 30_000_000
+    stream, notes = read(tmp_path, arrays)
+    assert stream.stamps_ns.tolist() == arrays["stamps_ns"].tolist() and notes == ()
+
+
 def test_a_scan_far_from_its_stamp_is_left_out(tmp_path):
     arrays = scan_of(np.arange(24))
     arrays["offset_s"][70:80] += 4.3

@@ -7,7 +7,7 @@ import numpy as np
 from icalib.errors import RecordingError
 from icalib.measurements import LidarStream
 from icalib.recordings.clocks import rate_sentence
-from icalib.recordings.scan_order import in_order, selected, without_repeats
+from icalib.recordings.scan_order import at_even_steps, in_order, selected, without_repeats
 
 _RATE_HZ = (0.1, 1000.0)
 _FARTHEST_PERIODS = 2.0  # of a point from its scan's stamp
@@ -85,7 +85,7 @@ def checked_lidar(stream: LidarStream, where: str) -> tuple[LidarStream, tuple[s
         notes = (f"{what}: {int((~filled).sum())} of {len(filled)} scans have no usable point and were left out.",)
         start = np.append(stream.start[:-1][filled], stream.start[-1])
         stream = LidarStream(stream.name, stream.stamps_ns[filled], start, stream.offset_s, stream.xyz, stream.plane)
-    for check in (without_repeats, in_order):
+    for check in (without_repeats, in_order, at_even_steps):
         stream, found = check(stream, what)
         notes += found
     if len(stream.stamps_ns) < 2:

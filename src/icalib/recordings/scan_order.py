@@ -14,6 +14,8 @@ from icalib.measurements import LidarStream
 _RECENT = 4  # scans among which a copy is looked for: messages overtake each other by few
 _SWAPPED_S = 1.0  # messages overtake each other on the network by less
 _ROOM = 0.5  # of a period, that a scan has to both sides where it belongs
+_FEWEST_EVEN = 10  # scans that show how even stamps are
+_LATE, _SURE = 0.05, 8.0  # of a period, and scatters of the stamps, by which a single one is too early or too late
 _MOST_BAD = 0.1  # share of scans with bad stamps; more of them is a clock that was set back
 
 
@@ -61,6 +63,35 @@ def in_order(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[str, ..
             f"left out, the first at {stamps_ns[bad[0]]} ns.",
         )
     return selected(stream, order), notes
+
+
+def at_even_steps(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[str, ...]]:
+    """`stream` without single scans that are early or late between two that are a double period apart, and a note. All
+    stay where these are many, and where only the first or only the last points of a scan are missing."""
+    stamps_ns = stream.stamps_ns
+    if len(stamps_ns) < _FEWEST_EVEN:
+        return stream, ()
+    period_ns = float(np.median(np.diff(stamps_ns)))
+    ends = (extreme.reduceat(stream.offset_s, stream.start[:-1]) * 1e9 for extreme in (np.minimum, np.maximum))
+    off = np.stack([_off_the_middle(stamps_ns, end) for end in ends])
+    scatter = 1.4826 * np.median(np.abs(off), axis=1, keepdims=True)
+    far = np.abs(off) > np.maximum(_LATE * period_ns, _SURE * scatter)
+    between = np.abs(stamps_ns[2:] - stamps_ns[:-2] - 2.0 * period_ns) < 2.0 * _LATE * period_ns
+    odd = np.zeros(len(stamps_ns), bool)
+    odd[1:-1] = far.all(axis=0) & (off[0] * off[1] > 0.0) & between
+    if not odd.any() or odd.mean() > _MOST_BAD:
+        return stream, ()
+    note = (
+        f"{what}: {int(odd.sum())} of {len(odd)} scans are stamped by more than {_LATE:.0%} of a period too early or "
+        f"too late between their neighbours and were left out, the first at {stamps_ns[odd][0]} ns."
+    )
+    return selected(stream, np.flatnonzero(~odd)), (note,)
+
+
+def _off_the_middle(stamps_ns: np.ndarray, end_ns: np.ndarray) -> np.ndarray:
+    """(S - 2,) ns by which the first or last points of a scan are later than the middle of its neighbours' ones."""
+    at = (stamps_ns - stamps_ns[0]) + end_ns
+    return at[1:-1] - 0.5 * (at[:-2] + at[2:])
 
 
 def selected(stream: LidarStream, scans: np.ndarray) -> LidarStream:
