@@ -136,6 +136,11 @@ def test_pose_sensors_are_read(tmp_path):
     assert odom == PoseSensor("odom0", "other/trajectory.tum", "relative")
     (tilted,) = load(tmp_path, "sensors:\n  imu0: {type: imu}\n  m: {type: pose, level: false}\n").poses
     assert mocap.level and not tilted.level
+    turned = "sensors:\n  imu0: {type: imu}\n  m: {type: pose, position_axes: [x, -z, y]}\n"
+    rig = load(tmp_path, turned)
+    assert rig.poses[0].position_axes == ("x", "-z", "y")
+    assert load(tmp_path, yaml.safe_dump(rig_to_dict(rig))).poses == rig.poses
+    assert "m.position_axes: must name the columns" in complaint(tmp_path, turned.replace("-z", "x"))
 
 
 def test_an_imu_and_a_pose_sensor_are_enough(tmp_path):

@@ -264,6 +264,7 @@ class PoseSensor:
     rotation_noise: float | None = None  # of each axis; None: estimated from the residuals
     position_noise: float | None = None
     level: bool = True
+    position_axes: Axes | None = None  # of positions as recorded, in the order and with the signs of rotations
     rotation: Parameter = Parameter()
     translation: Parameter = Parameter()
     time_offset: Parameter = Parameter()

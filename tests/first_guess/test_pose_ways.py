@@ -38,11 +38,35 @@ def upside_down(x: PoseStream) -> PoseStream:
     return replace(x, position=x.position * [1.0, 1.0, -1.0])
 
 
+def w_first(x: PoseStream) -> PoseStream:
+    """w, x, y, z read as x, y, z, w."""
+    q = Rotation.from_matrix(x.rotation).as_quat()
+    return replace(x, rotation=Rotation.from_quat(q[:, [3, 0, 1, 2]]).as_matrix())
+
+
+def y_up(x: PoseStream) -> PoseStream:
+    """Rotations are those of a frame with y up, positions have z up."""
+    up = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    return replace(x, rotation=up @ x.rotation)
+
+
+def cyclic(x: PoseStream) -> PoseStream:
+    return replace(x, position=x.position[:, [1, 2, 0]])
+
+
+def askew(x: PoseStream) -> PoseStream:
+    return replace(x, position=x.position @ Rotation.from_euler("z", 50.0, degrees=True).as_matrix().T)
+
+
 WRONG = [
     (inverted, "the poses of mocap0 are inverted"),
     (conjugated, "the poses of mocap0 have inverted rotations"),
     (left_handed, "the poses of mocap0 are those of left-handed axes"),
-    (upside_down, "the poses of mocap0 have their position's z reversed"),
+    (upside_down, "the poses of mocap0 have their position's z reversed; set its position_axes to .x, y, -z."),
+    (w_first, "the poses of mocap0 have quaternions with w first"),
+    (y_up, "of mocap0 are in different frames.*set position_axes of mocap0 to .x, z, -y."),
+    (cyclic, "of mocap0 are in different frames.*set position_axes of mocap0 to .z, x, y."),
+    (askew, r"of mocap0 are in different frames.*roll, pitch, yaw of -?\d, -?\d, -5\d deg would fit"),
 ]
 
 

@@ -12,7 +12,7 @@ from icalib.errors import RecordingError
 from icalib.measurements import PoseStream
 from icalib.recordings import BagRecording, FolderRecording
 from icalib.recordings.pose_checks import checked_poses
-from icalib.recordings.poses import PoseReadings
+from icalib.recordings.poses import PoseReadings, as_frame_sensor
 from icalib.rig import PoseSensor
 
 N, STEP, ORIGIN = 300, 20_000_000, 1_700_000_000_123_456_789
@@ -101,6 +101,13 @@ def test_an_empty_text(tmp_path):
     (tmp_path / "mocap0").mkdir()
     (tmp_path / "mocap0" / "poses.txt").write_text("# nothing\n")
     assert "holds no rows" in refused(tmp_path, PoseSensor("mocap0", "mocap0/poses.txt"))
+
+
+def test_positions_in_other_axes(tmp_path):
+    table(tmp_path, position=POSITION[:, [0, 2, 1]] * [1.0, 1.0, -1.0])
+    sensor = PoseSensor("mocap0", "mocap0/poses.csv", position_axes=("x", "-z", "y"))
+    written = FolderRecording(tmp_path).poses(sensor)
+    np.testing.assert_allclose(as_frame_sensor(written, sensor).position, POSITION, rtol=1e-15)
 
 
 def test_bad_poses(tmp_path):

@@ -1,4 +1,5 @@
-"""Poses that are written another way than `PoseStream` has them: the inverse, inverse rotations, left-handed axes.
+"""Poses that are written another way than `PoseStream` has them: the inverse, inverse rotations, left-handed axes,
+quaternions with w first, positions and rotations in different frames.
 
 Each way is tried where the poses as they are do not fit the motion, and named where it fits far better.
 """
@@ -10,8 +11,10 @@ from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from icalib.errors import EstimationError
+from icalib.first_guess.pose_frames import words_for
 from icalib.measurements import PoseStream
 
 Way = Callable[[PoseStream], PoseStream]
@@ -38,16 +41,32 @@ def _with_axis_reversed(axis: int) -> Way:
     return lambda x: replace(x, position=x.position * np.where(np.arange(3) == axis, -1.0, 1.0))
 
 
+def _w_first(x: PoseStream) -> PoseStream:
+    """A product with a permutation: each quaternion may have either sign."""
+    w_x_y_z = Rotation.from_matrix(x.rotation).as_quat()  # as written, taken for x, y, z, w
+    return replace(x, rotation=Rotation.from_quat(w_x_y_z[:, [1, 2, 3, 0]]).as_matrix())
+
+
 WAYS: tuple[tuple[str, Way], ...] = (
     ("are inverted: they say where its frame is, seen from it; write inverted: true for it in the rig file", _inverse),
     ("have inverted rotations; write R_frame_sensor, or turn the sign of the quaternions' x, y and z", _turned_back),
     ("are those of left-handed axes; write them in right-handed ones", _other_handed),
-    *((f"have their position's {'xyz'[k]} reversed; turn its sign", _with_axis_reversed(k)) for k in range(3)),
-)
+    *(
+        (f"have their position's {'xyz'[k]} reversed; set its position_axes to {axes}", _with_axis_reversed(k))
+        for k, axes in enumerate(("[-x, y, z]", "[x, -y, z]", "[x, y, -z]"))
+    ),
+    ("have quaternions with w first; let columns of the rig file name them as x, y, z, w, or correct what writes them",
+     _w_first),
+)  # fmt: skip
 
 
-def placed(stream: PoseStream, place: Callable[[PoseStream], tuple[T, float]]) -> T:
-    """What `place` makes of the poses; it gives, too, what is left of what they showed of the motion.
+def placed(
+    stream: PoseStream,
+    place: Callable[[PoseStream], tuple[T, float]],
+    turn: Callable[[PoseStream], np.ndarray | None] = lambda stream: None,
+) -> T:
+    """What `place` makes of the poses; it gives, too, what is left of what they showed of the motion. `turn` proposes a
+    turn (3, 3) of their positions into the frame of their rotations.
 
     Raises EstimationError as `place` does, or where poses written another way would fit far better.
     """
@@ -59,6 +78,7 @@ def placed(stream: PoseStream, place: Callable[[PoseStream], tuple[T, float]]) -
     except EstimationError as error:
         failed = error
     if left > WELL:
+        _refuse_two_frames(stream, place, turn, BETTER * left)
         for words, way in WAYS:
             if _left(place, way(stream)) < BETTER * left:
                 raise EstimationError(f"the poses of {stream.name} {words}.") from failed
@@ -66,6 +86,31 @@ def placed(stream: PoseStream, place: Callable[[PoseStream], tuple[T, float]]) -
         assert failed is not None
         raise failed
     return found
+
+
+def _refuse_two_frames(
+    stream: PoseStream,
+    place: Callable[[PoseStream], tuple[T, float]],
+    turn: Callable[[PoseStream], np.ndarray | None],
+    left: float,
+) -> None:
+    """Raises EstimationError where less is `left` of poses whose positions are turned."""
+    try:
+        C = turn(stream)
+    except EstimationError:
+        return
+    if C is None or not _left(place, replace(stream, position=stream.position @ C.T)) < left:
+        return
+    axes = words_for(C)
+    degrees = ", ".join(f"{angle:.0f}" for angle in Rotation.from_matrix(C).as_euler("xyz", degrees=True))
+    raise EstimationError(
+        f"the positions and rotations of {stream.name} are in different frames, as where one has z up and the other y "
+        + (
+            f"up; set position_axes of {stream.name} to {axes} in the rig file."
+            if axes
+            else f"up: positions turned by roll, pitch, yaw of {degrees} deg would fit; write both in one frame."
+        )
+    )
 
 
 def _left(place: Callable[[PoseStream], tuple[T, float]], stream: PoseStream) -> float:

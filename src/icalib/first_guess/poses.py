@@ -50,6 +50,7 @@ from icalib.first_guess.lidar_arm import (
 )
 from icalib.first_guess.lidar_odometry import LidarPath
 from icalib.first_guess.lidar_rounds import NAMES, given, held_of
+from icalib.first_guess.pose_frames import turn_of_positions
 from icalib.first_guess.pose_ways import placed
 from icalib.geometry import so3
 from icalib.measurements import PoseStream
@@ -81,12 +82,15 @@ def _placed(inputs: Inputs, state: State, sensor: PoseSensor, stream: PoseStream
     assert inputs.imu is not None
     held = held_of(inputs, sensor)
     if not sensor.clock_restarts:
-        return placed(stream, partial(on_motion, inputs.imu, known=state, held=held)).values(sensor.name)
+        known = {"known": state, "held": held}
+        turn = partial(_turn_on_motion, inputs.imu, **known)
+        return placed(stream, partial(on_motion, inputs.imu, **known), turn).values(sensor.name)
     streams = [_alone(inputs, k, sensor.name) for k in range(len(inputs.parts))]
     k = int(np.argmax([len(own.stamps_ns) for _, own in streams]))
     imu, own = streams[k]
     with naming_recording(inputs, k):
-        found = placed(own, partial(on_motion, imu, known=motion_alone(inputs, k, state), held=held))
+        known = {"known": motion_alone(inputs, k, state), "held": held}
+        found = placed(own, partial(on_motion, imu, **known), partial(_turn_on_motion, imu, **known))
 
     def offset(recording: int) -> float:
         return _aligned(*streams[recording], Held(found.rotation))[0].offset
@@ -117,7 +121,7 @@ def _state_of_one(inputs: Inputs, held: Held | None) -> State:
     assert inputs.imu is not None
     sensor, stream, imu, gravity = inputs.rig.poses[0], inputs.measurements.poses[0], inputs.imu, inputs.rig.gravity
     known = held or held_of(inputs, sensor)
-    found = placed(stream, lambda x: _with_motion(imu, x, gravity, known))
+    found = placed(stream, lambda x: _with_motion(imu, x, gravity, known), lambda x: _turn_alone(imu, x, known))
     own = found.guess.values(sensor.name) | given(inputs, sensor, NAMES)
     values = start_values(inputs, own)
     hosts = {(x.name, "time_offset"): values[sensor.name, "time_offset"] for x in inputs.rig.poses}
@@ -192,6 +196,30 @@ def _with_motion(imu: ImuData, stream: PoseStream, gravity: float, held: Held) -
     step = max(1, round(APART_S / float(np.median(np.diff(path.seconds)))))
     apart = motion_of_path(imu, where(path, np.arange(len(path.seconds)) % step == 0), rates, aligned, gravity, held)
     return found, 0.0 if apart is None else apart.left
+
+
+def _turn_alone(imu: ImuData, stream: PoseStream, held: Held) -> np.ndarray | None:
+    """See `turn_of_positions`: by the IMU's readings."""
+    aligned, _ = _aligned(imu, stream, held)
+    path, t = _path(stream), stream.seconds + aligned.offset
+    path = where(path, (t > imu.seconds[0]) & (t < imu.seconds[-1]))
+    carry = partial(GyroRotation.integrate(imu, aligned.gyro_bias).carry, path.seconds + aligned.offset, to=imu.seconds)
+    system = against_readings(imu, carry, path.seconds + aligned.offset, path.rotation, path.position)
+    return turn_of_positions(system(aligned.rotation, np.zeros(3)))
+
+
+def _turn_on_motion(imu: ImuData, stream: PoseStream, known: State, held: Held) -> np.ndarray | None:
+    """See `turn_of_positions`: by a motion that others showed."""
+    aligned, _ = _aligned(imu, stream, held)
+    path, t = _path(stream), stream.seconds + aligned.offset
+    path = where(path, (t >= known.seconds[0]) & (t <= known.seconds[-1]))
+    t = path.seconds + aligned.offset
+    if not len(t):
+        return None
+    R, p = poses_in(known, GyroRotation.integrate(imu, known.bias[:, :3].mean(axis=0)), t)
+    U, _, Vt = np.linalg.svd((R @ aligned.rotation @ path.rotation.transpose(0, 2, 1)).sum(axis=0))
+    rows = against_motion(R, p, t, path.rotation, path.position)(aligned.rotation, np.zeros(3))
+    return turn_of_positions(rows, U @ Vt)
 
 
 def _check_size(imu: ImuData, name: str, path: LidarPath, aligned: Alignment, found: FromPath) -> None:

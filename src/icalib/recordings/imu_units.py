@@ -8,8 +8,9 @@ import numpy as np
 
 from icalib.errors import RecordingError
 from icalib.measurements import ImuStream
+from icalib.recordings.axes import in_axes
 from icalib.recordings.gravity_turns import WINDOW_S, gravity_size
-from icalib.rig import Axes, ImuSensor
+from icalib.rig import ImuSensor
 
 G_M_S2 = 9.80665
 DEGREE = np.pi / 180.0
@@ -24,14 +25,7 @@ def in_si(imu: ImuStream, sensor: ImuSensor) -> ImuStream:
     """The readings in the units and axes that the rig file says they are recorded in."""
     accel = G_M_S2 * imu.accel if sensor.accel_unit == "g" else imu.accel
     gyro = DEGREE * imu.gyro if sensor.gyro_unit == "deg/s" else imu.gyro
-    return replace(imu, gyro=_in_axes(gyro, sensor.gyro_axes), accel=_in_axes(accel, sensor.accel_axes))
-
-
-def _in_axes(values: np.ndarray, axes: Axes | None) -> np.ndarray:
-    if axes is None:
-        return values
-    columns = ["xyz".index(entry[-1]) for entry in axes]
-    return values[:, columns] * [-1.0 if entry.startswith("-") else 1.0 for entry in axes]
+    return replace(imu, gyro=in_axes(gyro, sensor.gyro_axes), accel=in_axes(accel, sensor.accel_axes))
 
 
 def recognised_unit(imu: ImuStream, what: str, sensor: ImuSensor | None) -> tuple[ImuStream, tuple[str, ...]]:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from icalib.errors import RecordingError
+from icalib.recordings.axes import in_axes
 from icalib.recordings.columns import STAMP, TableKind, vector_names
 from icalib.recordings.image_checks import Note, ignore
 from icalib.recordings.streams import unit_rotations
@@ -42,7 +43,10 @@ class PoseReadings:
 
 
 def as_frame_sensor(read: PoseReadings, sensor: PoseSensor) -> PoseReadings:
-    """The poses as T_frame_sensor, where the rig file says that they are inverted."""
+    """The poses as T_frame_sensor, where the rig file says that they are inverted, or that positions have other axes
+    than rotations."""
+    if sensor.position_axes is not None:
+        read = replace(read, position=in_axes(read.position, sensor.position_axes))
     if not sensor.inverted:
         return read
     R = np.ascontiguousarray(read.rotation.transpose(0, 2, 1))

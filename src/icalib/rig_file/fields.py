@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, get_args
 
-from icalib.rig import PLAIN_TABLE, Camera, Lidar, Parameter, PoseSensor, TableLayout, TimeUnit, Wheels
+from icalib.rig import PLAIN_TABLE, Axes, Camera, Lidar, Parameter, PoseSensor, TableLayout, TimeUnit, Wheels
 from icalib.rig_parameters import parameter_to_plain, rotation_parameter, vector_parameter
 from icalib.yaml_nodes import YamlValue
 
@@ -35,6 +35,19 @@ def positive_or(found: dict[str, YamlValue], name: str, default: float) -> float
 
 def choice_or(found: dict[str, YamlValue], name: str, kind: Any, default: Any) -> Any:
     return found[name].choice("such choice as", get_args(kind)) if name in found else default
+
+
+def axes_or_none(found: dict[str, YamlValue], name: str) -> Axes | None:
+    """Three columns with their signs, each column once."""
+    if name not in found:
+        return None
+    entries = [entry.text() for entry in found[name].items()]
+    if len(entries) != 3 or sorted(e.removeprefix("-") for e in entries) != ["x", "y", "z"]:
+        found[name].fail(
+            "must name the columns that become x, y and z, each once, with - where a sign is wrong, as in [x, -y, -z]; "
+            "correct it."
+        )
+    return entries[0], entries[1], entries[2]
 
 
 def path_or(found: dict[str, YamlValue], default: str) -> str:

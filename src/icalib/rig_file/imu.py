@@ -6,8 +6,8 @@ import dataclasses
 from typing import Any, get_args
 
 from icalib.imu_classes import DEFAULT_CLASS, IMU_CLASSES, class_noise
-from icalib.rig import AccelUnit, Axes, GyroUnit, ImuNoise, ImuSensor, Parameter, TwoSources
-from icalib.rig_file.fields import TABLE, layout_to_plain, table_layout
+from icalib.rig import AccelUnit, GyroUnit, ImuNoise, ImuSensor, Parameter, TwoSources
+from icalib.rig_file.fields import TABLE, axes_or_none, layout_to_plain, table_layout
 from icalib.rig_parameters import imu_intrinsics_parameter, parameter_to_plain
 from icalib.yaml_nodes import YamlValue
 
@@ -29,8 +29,8 @@ def read_imu(name: str, value: YamlValue) -> ImuSensor:
         noise=_noise(found["noise"]) if "noise" in found else class_noise(DEFAULT_CLASS),
         intrinsics=imu_intrinsics_parameter(found["intrinsics"]) if "intrinsics" in found else Parameter("fixed"),
         topic=_source(found["topic"]) if "topic" in found else None,
-        accel_axes=_axes(found["accel_axes"]) if "accel_axes" in found else None,
-        gyro_axes=_axes(found["gyro_axes"]) if "gyro_axes" in found else None,
+        accel_axes=axes_or_none(found, "accel_axes"),
+        gyro_axes=axes_or_none(found, "gyro_axes"),
         layout=table_layout(found),
         **units,
     )
@@ -68,14 +68,3 @@ def _source(value: YamlValue) -> str | TwoSources:
 
 def _plain_source(source: str | TwoSources) -> str | dict[str, str]:
     return dataclasses.asdict(source) if isinstance(source, TwoSources) else source
-
-
-def _axes(value: YamlValue) -> Axes:
-    """Three columns with their signs, each column once."""
-    entries = [entry.text() for entry in value.items()]
-    if len(entries) != 3 or sorted(e.removeprefix("-") for e in entries) != ["x", "y", "z"]:
-        value.fail(
-            "must name the columns that become x, y and z, each once, with - where a sign is wrong, as in [x, -y, -z]; "
-            "correct it."
-        )
-    return entries[0], entries[1], entries[2]

@@ -8,6 +8,7 @@ from icalib.rig import PoseKind, PoseSensor
 from icalib.rig_file.fields import (
     MOUNTING,
     TABLE,
+    axes_or_none,
     choice_or,
     groups_to_plain,
     layout_to_plain,
@@ -18,16 +19,18 @@ from icalib.rig_file.fields import (
 )
 from icalib.yaml_nodes import YamlValue
 
+_FIELDS = ("path", "topic", "kind", "level", "position_axes", "inverted")
 _NOISE = ("rotation_noise", "position_noise")
 
 
 def pose_sensor(name: str, value: YamlValue) -> PoseSensor:
     """Raises RigError naming file, line and field."""
-    found = value.record(("type",), ("path", "topic", "kind", "level", "inverted", *_NOISE, *TABLE, *MOUNTING))
+    found = value.record(("type",), (*_FIELDS, *_NOISE, *TABLE, *MOUNTING))
     return PoseSensor(
         name=name,
         path=path_or(found, f"{name}/poses.csv"),
         kind=choice_or(found, "kind", PoseKind, PoseSensor.kind),
+        position_axes=axes_or_none(found, "position_axes"),
         level=found["level"].boolean() if "level" in found else PoseSensor.level,
         topic=topic_or_none(found),
         rotation_noise=found["rotation_noise"].positive() if "rotation_noise" in found else None,
@@ -43,5 +46,6 @@ def pose_to_plain(sensor: PoseSensor) -> dict[str, Any]:
     plain: dict[str, Any] = {"type": "pose", "path": sensor.path, "kind": sensor.kind, "level": sensor.level}
     plain |= layout_to_plain(sensor.layout)
     given = {name: getattr(sensor, name) for name in (*_NOISE, "topic")}
-    given |= {"inverted": sensor.inverted or None}
+    axes = sensor.position_axes
+    given |= {"inverted": sensor.inverted or None, "position_axes": None if axes is None else list(axes)}
     return plain | {name: value for name, value in given.items() if value is not None} | groups_to_plain(sensor)
