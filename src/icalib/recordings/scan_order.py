@@ -16,6 +16,7 @@ _SWAPPED_S = 1.0  # messages overtake each other on the network by less
 _ROOM = 0.5  # of a period, that a scan has to both sides where it belongs
 _FEWEST_EVEN = 10  # scans that show how even stamps are
 _LATE, _SURE = 0.05, 8.0  # of a period, and scatters of the stamps, by which a single one is too early or too late
+_ENDS = (1.0, 99.0)  # per cent: the first and the last points of a scan, but for single wrong times
 _MOST_BAD = 0.1  # share of scans with bad stamps; more of them is a clock that was set back
 
 
@@ -72,26 +73,28 @@ def at_even_steps(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[st
     if len(stamps_ns) < _FEWEST_EVEN:
         return stream, ()
     period_ns = float(np.median(np.diff(stamps_ns)))
-    ends = (extreme.reduceat(stream.offset_s, stream.start[:-1]) * 1e9 for extreme in (np.minimum, np.maximum))
-    off = np.stack([_off_the_middle(stamps_ns, end) for end in ends])
-    scatter = 1.4826 * np.median(np.abs(off), axis=1, keepdims=True)
-    far = np.abs(off) > np.maximum(_LATE * period_ns, _SURE * scatter)
+    off = stamps_ns[1:-1] - (stamps_ns[:-2] + (stamps_ns[2:] - stamps_ns[:-2]) // 2)
+    late_ns = max(_LATE * period_ns, _SURE * 1.4826 * float(np.median(np.abs(off))))
     between = np.abs(stamps_ns[2:] - stamps_ns[:-2] - 2.0 * period_ns) < 2.0 * _LATE * period_ns
-    odd = np.zeros(len(stamps_ns), bool)
-    odd[1:-1] = far.all(axis=0) & (off[0] * off[1] > 0.0) & between
-    if not odd.any() or odd.mean() > _MOST_BAD:
+    odd = 1 + np.flatnonzero((np.abs(off) > late_ns) & between)
+    odd = odd[[_is_off(stream, i, late_ns) for i in odd.tolist()]] if len(odd) else odd
+    if not len(odd) or len(odd) > _MOST_BAD * len(stamps_ns):
         return stream, ()
     note = (
-        f"{what}: {int(odd.sum())} of {len(odd)} scans are stamped by more than {_LATE:.0%} of a period too early or "
-        f"too late between their neighbours and were left out, the first at {stamps_ns[odd][0]} ns."
+        f"{what}: {len(odd)} of {len(stamps_ns)} scans are stamped by more than {_LATE:.0%} of a period too early or "
+        f"too late between their neighbours and were left out, the first at {stamps_ns[odd[0]]} ns."
     )
-    return selected(stream, np.flatnonzero(~odd)), (note,)
+    return selected(stream, np.setdiff1d(np.arange(len(stamps_ns)), odd)), (note,)
 
 
-def _off_the_middle(stamps_ns: np.ndarray, end_ns: np.ndarray) -> np.ndarray:
-    """(S - 2,) ns by which the first or last points of a scan are later than the middle of its neighbours' ones."""
-    at = (stamps_ns - stamps_ns[0]) + end_ns
-    return at[1:-1] - 0.5 * (at[:-2] + at[2:])
+def _is_off(stream: LidarStream, i: int, late_ns: float) -> bool:
+    """Whether both the first and the last points of scan i are as far off the middle of its neighbours' ones."""
+    around = range(i - 1, i + 2)
+    ends = [np.percentile(stream.offset_s[stream.start[k] : stream.start[k + 1]], _ENDS) for k in around]
+    stamps = stream.stamps_ns[i - 1 : i + 2] - stream.stamps_ns[i]
+    before, own, after = (stamp + 1e9 * end for stamp, end in zip(stamps, ends, strict=True))
+    off = own - 0.5 * (before + after)
+    return bool((off > late_ns).all() or (off < -late_ns).all())
 
 
 def selected(stream: LidarStream, scans: np.ndarray) -> LidarStream:
