@@ -293,6 +293,10 @@ def _inspect(options: argparse.Namespace) -> None:
     if options.rig:
         check_draft(options.rig)
     if options.json:
+        if not options.json.parent.is_dir():
+            raise CalibrationError(
+                f"{options.json} cannot be written (its folder does not exist); choose another place."
+            )
         refuse_foreign([options.json], [p for p in (options.recording, options.target) if p], "choose another place")
     target = read_target(options.target) if options.target else None
     with progress_bar(options.quiet) as progress:

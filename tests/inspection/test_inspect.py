@@ -283,7 +283,7 @@ class TestStreams:
     def test_no_images(self, bags, brief, tmp_path):
         found = self.inspected(bags, tmp_path, bags.imu("/imu0", brief))
         assert found.verdict == "no"
-        assert "There are no images: it holds /imu0 (sensor_msgs/msg/Imu); record" in sentences(found)[0]
+        assert "There is only an IMU: it holds /imu0 (sensor_msgs/msg/Imu); record" in sentences(found)[0]
 
     def test_no_imu(self, bags, tmp_path):
         found = self.inspected(bags, tmp_path, bags.noise("/cam0/image_raw"))

@@ -42,15 +42,17 @@ target:
 
 
 def draft_rig(found: Inspection) -> str:
-    """The text of a rig file. Raises RecordingError where there is nothing to calibrate: no camera, and no LiDAR or
-    poses beside an IMU."""
+    """The text of a rig file. Raises RecordingError where the sensors do not show the motion: no camera, no LiDAR or
+    poses beside an IMU, and no poses beside wheels or other poses."""
     broken = {c.name: problem for c in found.sources.cameras if (problem := found.stream(c.topic).problem)}
     cameras = [c for c in found.sources.cameras if c.name not in broken]
-    beside_imu = found.sources.imus and (found.sources.lidars or found.sources.poses)
-    if not cameras and not beside_imu:
+    sources = found.sources
+    beside_imu = sources.imus and (sources.lidars or sources.poses)
+    beside_poses = sources.poses and len(sources.poses) + len(sources.wheels) > 1
+    if not (cameras or beside_imu or beside_poses):
         raise RecordingError(
-            f"{found.recording} holds no camera that can be read, nor a LiDAR or poses beside an IMU, so there is no "
-            "rig to draft; record one, too."
+            f"{found.recording} holds no camera that can be read, no LiDAR or poses beside an IMU, and no poses beside "
+            "wheels, so there is no rig to draft; record one, too."
         )
     lines = [
         f"# Draft by icalib inspect from {json.dumps(found.recording)}. Check every line (docs/rig-file.md).",
@@ -60,11 +62,11 @@ def draft_rig(found: Inspection) -> str:
     ]
     for camera in cameras:
         lines += _camera(found, camera)
-    if found.sources.imus:
-        lines += _robot(found)
+    lines += _robot(found, shown=not (cameras or (sources.imus and sources.lidars)))
     left_out = {**broken, **found.sources.left_out}
     lines += [f"  # Not used: {_comment(topic)} ({_comment(why)})" for topic, why in left_out.items()]
-    return "\n".join([*lines, _target(found) if cameras else ""])
+    aimed = found.target is not None or any(c.tracks is None for c in cameras)
+    return "\n".join([*lines, _target(found) if cameras and aimed else ""])
 
 
 def check_draft(path: Path) -> None:
@@ -105,7 +107,8 @@ def _link(part: Path, path: Path, text: str) -> None:
 
 def _imu(found: Inspection) -> list[str]:
     if not found.sources.imus:
-        return ["  # No IMU: cameras are calibrated alone, the first one's frame is the body's."]
+        alone = "cameras are calibrated alone, the first one's" if found.sources.cameras else "the first sensor's"
+        return [f"  # No IMU: {alone} frame is the body's."]
     name = found.imu or next(iter(found.sources.imus))
     topic = found.sources.imus[name]
     facts = found.imus.get(name)
@@ -133,20 +136,26 @@ def _imu(found: Inspection) -> list[str]:
     return lines
 
 
-def _robot(found: Inspection) -> Iterable[str]:
-    """LiDARs, and wheels and poses as comments: joints may be an arm's, poses what came of these very sensors."""
-    for name, topic in found.sources.lidars.items():
+def _robot(found: Inspection, shown: bool) -> Iterable[str]:
+    """LiDARs, which need an IMU, wheels and poses. The latter are comments unless they are `shown`, because nothing
+    else shows the motion: joints may be an arm's, poses what came of these very sensors."""
+    for name, topic in found.sources.lidars.items() if found.sources.imus else ():
         yield from (f"  {name}:", "    type: lidar", _place(topic.name, topic.type, ""))
+    mark = "" if shown else "# "
     for name, topic in found.sources.wheels.items():
-        yield "  # Are these wheels? Then take the # away, and say what they measure (docs/rig-file.md#wheels)."
-        lines = [f"  {name}:", "    type: wheels", _place(topic.name, topic.type, "")]
-        for line in lines + (["    measures: twist"] if topic.kind == "twist" or "twist" in topic.type else []):
-            yield f"  # {line.removeprefix('  ')}"
+        if not shown:
+            yield "  # Are these wheels? Then take the # away, and say what they measure (docs/rig-file.md#wheels)."
+        lines = [f"{name}:", "  type: wheels", _place(topic.name, topic.type, "")[2:]]
+        for line in lines + (["  measures: twist"] if topic.kind == "twist" or "twist" in topic.type else []):
+            yield f"  {mark}{line}"
     for name, topic in found.sources.poses.items():
-        yield "  # Poses of something on the robot, and not made from the sensors above? Then take the # away; absolute"
-        yield "  # is motion capture, relative an odometry, which drifts (docs/rig-file.md#pose-sensor)."
-        for line in (f"  {name}:", "    type: pose", _place(topic.name, topic.type, ""), f"    kind: {_kind(topic)}"):
-            yield f"  # {line.removeprefix('  ')}"
+        if not shown:
+            yield "  # Poses of something on the robot, and not made from the sensors above? Then take the # away;"
+            yield "  # absolute is motion capture, relative an odometry, which drifts (docs/rig-file.md#pose-sensor)."
+        # Without an IMU the first pose sensor shows the motion, which must not drift.
+        kind = _kind(topic) if found.sources.imus else "absolute"
+        for line in (f"{name}:", "  type: pose", _place(topic.name, topic.type, "")[2:], f"  kind: {kind}"):
+            yield f"  {mark}{line}"
 
 
 def _kind(topic: TopicInfo) -> str:
@@ -172,6 +181,8 @@ def _camera(found: Inspection, camera: CameraSource) -> list[str]:
         lines.append(_place(camera.corners.name, camera.corners.type, ""))
     if camera.images:
         lines.append(_place(camera.images.name, camera.images.type if camera.corners is None else "images", frame))
+    if camera.tracks:
+        lines.append(f"    tracks: {_name(camera.tracks.name)}  # {_comment(camera.tracks.type)}")
     lines.append(f"    model: {lens.model}  # {_comment(lens.why)}")
     lines.append(
         f"    resolution: [{resolution[0]}, {resolution[1]}]"

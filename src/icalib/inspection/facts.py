@@ -121,8 +121,9 @@ class TargetView:
 
 @dataclass(frozen=True)
 class CameraSource:
-    """One camera: the topics of its images, of its corners (a table) and of its CameraInfo; others: more topics of the
-    same images. topic: the corners where they were recorded, else the images, as `calibrate` takes them."""
+    """One camera: the topics of its images, of its corners and tracks (tables) and of its CameraInfo; others: more
+    topics of the same images. topic: the corners where they were recorded, else the images, as `calibrate` takes them,
+    or the tracks where there is nothing else."""
 
     name: str
     topic: TopicInfo
@@ -130,6 +131,7 @@ class CameraSource:
     corners: TopicInfo | None
     info: TopicInfo | None
     others: tuple[str, ...] = ()
+    tracks: TopicInfo | None = None
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from icalib.inspection.facts import CameraSource, Finding, ImuFacts, Inspection, TargetView, Timing
+from icalib.inspection.sensors import missing_sensors
 from icalib.inspection.timing import overlap_s
 from icalib.inspection.unread import unread
 from icalib.recordings import TopicInfo
-from icalib.recordings.topics import listing
 
 STILL_RAD_S = 0.03  # RMS: below it, nothing moved
 WEAK_RAD_S = 0.1  # RMS about one axis: below it, this axis is hardly determined
@@ -22,7 +22,8 @@ LIKELIER = 0.7  # as much spread of gravity: then this unit it is
 EXPLAINED = 0.95  # as much spread as without any rotation: then it explains something
 CONTRARY = 1.2  # times the spread without any rotation: then the rates are those of another motion
 SHORT_S, LEAST_SEEN = 20.0, 0.3
-FEWEST_IMAGES, SLOWEST_IMAGES_HZ = 21, 4.0  # `calibrate` needs 20 pairs of images no more than 0.25 s apart
+FEWEST_IMAGES, SLOWEST_IMAGES_HZ = 21, 4.0  # beside what moves: 20 pairs of images no more than 0.25 s apart
+FEWEST_STILLS, FEW_STILLS = 2, 10  # of cameras alone: one image does not show a lens, few show it badly
 FLAT_DEG = 15.0
 EMPTY_EDGE = 0.5  # share of empty cells along an edge of the image from which on it counts as empty
 _ORDER = ("problem", "warning", "hint")
@@ -31,30 +32,16 @@ _ORDER = ("problem", "warning", "hint")
 def findings(found: Inspection) -> tuple[Finding, ...]:
     """Problems, then warnings, then hints."""
     every = [
-        *_missing(found),
+        *missing_sensors(found),
         *unread(found),
         *_broken(found),
+        *_few_stills(found),
         *_imu(found),
         *_clocks(found),
         *_streams(found),
         *_target(found),
     ]
     return tuple(sorted(every, key=lambda f: _ORDER.index(f.severity)))
-
-
-def _missing(found: Inspection) -> Iterator[Finding]:
-    topics = [s.topic for s in found.streams]
-    if not found.sources.cameras:
-        yield Finding("problem", f"There are no images: {listing(topics)}; record the images of at least one camera.")
-    if not found.sources.imus:
-        yield Finding(
-            "warning",
-            f"There is no IMU: {listing(topics)}; cameras alone give intrinsics, and extrinsics of those that see the "
-            "target together. For more, record sensor_msgs/Imu, or write imu0/data.csv.",
-        )
-    for topic in topics:
-        if topic.kind in ("image", "imu") and not topic.count:
-            yield Finding("warning", f"{topic.name} holds no messages: check that this sensor was running.")
 
 
 def _broken(found: Inspection) -> Iterator[Finding]:
@@ -84,13 +71,35 @@ def _unfit(found: Inspection, camera: CameraSource) -> str:
         return stream.problem
     if view is not None and view.problem:
         return view.problem
-    if timing.count < FEWEST_IMAGES:
-        return f"{name} has {timing.count} images, too few: record for 30 to 90 s, with 10 to 30 images a second."
+    fewest, advice = _fewest_images(found)
+    if timing.count < fewest:
+        return f"{name} has {timing.count} images, too few: {advice}."
     if found.sources.imus and timing.rate_hz and timing.rate_hz < SLOWEST_IMAGES_HZ:
         return f"{name} takes {timing.rate_hz:.2g} images a second, too few to follow its motion: record 10 to 30."
-    if view is not None and view.seen < FEWEST_IMAGES:
-        return f"{name} sees the target in {view.seen} images, too few: keep it in view for 30 to 90 s."
+    if view is not None and view.seen < fewest:
+        return f"{name} sees the target in {view.seen} images, too few: keep it in view, and {advice}."
     return ""
+
+
+def _fewest_images(found: Inspection) -> tuple[int, str]:
+    """How many images `calibrate` asks of a camera, and how to get them."""
+    if found.sources.imus or found.sources.wheels:
+        return FEWEST_IMAGES, "record for 30 to 90 s, with 10 to 30 images a second"
+    return FEWEST_STILLS, "take 20 to 60 pictures of the target from all sides"
+
+
+def _few_stills(found: Inspection) -> Iterator[Finding]:
+    """Pictures that make a calibration, but no good one."""
+    if _fewest_images(found)[0] != FEWEST_STILLS:
+        return
+    for c in found.sources.cameras:
+        timing, view = found.stream(c.topic).timing, found.views.get(c.name)
+        count = view.seen if view is not None and not view.problem else timing.count if timing else 0
+        if FEWEST_STILLS <= count < FEW_STILLS:
+            yield Finding(
+                "warning",
+                f"{c.name} has few images{' with the target' if view else ''} ({count}): take 20 to 60 from all sides.",
+            )
 
 
 def _imu(found: Inspection) -> Iterator[Finding]:
@@ -119,22 +128,25 @@ def _imu(found: Inspection) -> Iterator[Finding]:
             f"{name} turns at up to {fast:.1f} rad/s ({fast / DEGREE:.0f} deg/s); images blur at such rates: turn the "
             "rig more slowly, or check that the driver sends rad/s.",
         )
-    yield from _motion(name, facts)
+    yield from _motion(found, name, facts)
 
 
-def _motion(name: str, facts: ImuFacts) -> Iterator[Finding]:
+def _motion(found: Inspection, name: str, facts: ImuFacts) -> Iterator[Finding]:
     strongest, second, weakest = facts.principal_rms
     if strongest < STILL_RAD_S:
         yield Finding(
             "problem",
-            f"{name} hardly moves ({strongest:.3f} rad/s RMS): record again while turning the rig about all three axes "
-            "in front of the target.",
+            f"{name} hardly moves ({strongest:.3f} rad/s RMS): record again while turning the rig about all three axes"
+            f"{' in front of the target' if found.sources.cameras else ''}.",
         )
     elif second < SECOND_AXIS * strongest or second < STILL_RAD_S:
+        # Without a guess `calibrate` finds the rotation of cameras from turns alone, that of others from the path, too.
+        alone = not (found.sources.lidars or found.sources.poses)
         yield Finding(
-            "problem",
+            "problem" if alone else "warning",
             f"{name} turns about {_axis(name, facts.principal[0])} only ({strongest:.2f} rad/s RMS; {second:.2f} and "
-            f"{weakest:.2f} about the directions across it): turn the rig about two more axes.",
+            f"{weakest:.2f} about the directions across it), so not all can be determined: "
+            f"{'drive over ramps' if found.sources.wheels else 'turn the rig about two more axes'}.",
         )
     else:
         for rms, direction in zip(facts.principal_rms, facts.principal, strict=True):
@@ -236,6 +248,8 @@ def _imu_timing(found: Inspection) -> Timing | None:
 
 def _target(found: Inspection) -> Iterator[Finding]:
     if found.target is None:
+        if not any(c.images for c in found.sources.cameras):
+            return
         yield Finding("hint", "No target is known, so the images were not searched for it: give --target FILE.")
         return
     for v in found.views.values():

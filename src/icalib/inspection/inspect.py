@@ -221,7 +221,7 @@ def _views(recording: Recording, found: Inspection, progress: Progress) -> dict[
     if found.target is None:
         return {}
     views: dict[str, TargetView] = {}
-    cameras = [c for c in found.sources.cameras if c.corners or not found.stream(c.topic).problem]
+    cameras = [c for c in found.sources.cameras if c.corners or (c.images and not found.stream(c.topic).problem)]
     for k, camera in enumerate(cameras):
         what = f"finding the target in the images of {camera.name}"
 

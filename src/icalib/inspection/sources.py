@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from icalib.inspection.facts import CameraSource, Sources
 from icalib.recordings import TopicInfo
@@ -11,7 +11,7 @@ from icalib.recordings import TopicInfo
 # Parts of a topic's name that say what it carries, not whose it is.
 _WHAT = re.compile(
     r"(image(_(raw|color|mono|rect|rect_raw|rect_color))?|compressed|raw|camera_info|data(_raw)?|sample"
-    r"|(data|corners|rates|angles|ticks|poses)\.csv|poses\.(tum|txt)|scans\.npz|points(_raw)?|joint_states|pose|odom(etry)?)"
+    r"|(data|corners|tracks|rates|angles|ticks|poses)\.csv|poses\.(tum|txt)|scans\.npz|points(_raw)?|joint_states|pose|odom(etry)?)"
 )
 _UNNAMEABLE = re.compile(r"[^A-Za-z0-9_-]+")
 Key = tuple[str, ...]
@@ -21,9 +21,10 @@ def find_sources(topics: Sequence[TopicInfo]) -> Sources:
     """The sensors among `topics` that hold messages, each under a unique name made of its topic."""
     filled = [t for t in topics if t.count]
     depth = [t for t in filled if t.kind == "image" and "depth" in t.name.lower()]
-    images = _by_key([t for t in filled if t.kind == "image" and t not in depth])
-    corners = _by_key([t for t in filled if t.kind == "corners"])
-    infos = _by_key([t for t in filled if t.kind == "camera info"])
+    seen = {
+        kind: _by_key([t for t in filled if t.kind == kind and t not in depth])
+        for kind in ("image", "corners", "tracks", "camera info")
+    }
     others = {
         "imu": ("imu",),
         "lidar": ("points",),
@@ -31,9 +32,9 @@ def find_sources(topics: Sequence[TopicInfo]) -> Sources:
         "pose": ("pose", "odometry"),
     }
     found = [(t, what) for what, kinds in others.items() for t in filled if t.kind in kinds]
-    keys = sorted({*images, *corners})
+    keys = sorted({*seen["image"], *seen["corners"], *seen["tracks"]})
     names = _names([(k, "cam") for k in keys] + [(_key(t), what) for t, what in found])
-    cameras = tuple(_camera(n, k, images, corners, infos) for n, k in zip(names, keys, strict=False))
+    cameras = tuple(_camera(n, k, seen) for n, k in zip(names, keys, strict=False))
     left_out = {t.name: "depth images" for t in depth}
     left_out |= {other: f"the images of {c.name} once more" for c in cameras for other in c.others}
     named = [(name, *of) for name, of in zip(names[len(keys) :], found, strict=True)]
@@ -41,18 +42,14 @@ def find_sources(topics: Sequence[TopicInfo]) -> Sources:
     return Sources(cameras, imus, left_out, lidars, wheels, poses)
 
 
-def _camera(
-    name: str,
-    key: Key,
-    images: dict[Key, list[TopicInfo]],
-    corners: dict[Key, list[TopicInfo]],
-    infos: dict[Key, list[TopicInfo]],
-) -> CameraSource:
+def _camera(name: str, key: Key, seen: Mapping[str, Mapping[Key, list[TopicInfo]]]) -> CameraSource:
     """Of several topics of the same images: the one that is not rectified, has most messages, is not compressed."""
-    same = sorted(images.get(key, []), key=lambda t: ("rect" in t.name, -t.count, len(t.name)))
-    table, info = corners.get(key, [None])[0], infos.get(key, [None])[0]
-    others = tuple(t.name for t in same[1:])
-    return CameraSource(name, table or same[0], same[0] if same else None, table, info, others)
+    same = sorted(seen["image"].get(key, []), key=lambda t: ("rect" in t.name, -t.count, len(t.name)))
+    corners, tracks, info = (seen[kind].get(key, [None])[0] for kind in ("corners", "tracks", "camera info"))
+    images = same[0] if same else None
+    topic = corners or images or tracks
+    assert topic is not None  # the key is of one of them
+    return CameraSource(name, topic, images, corners, info, tuple(t.name for t in same[1:]), tracks)
 
 
 def _by_key(topics: list[TopicInfo]) -> dict[Key, list[TopicInfo]]:

@@ -24,7 +24,7 @@ from icalib.recordings.scans import in_seconds, read_scan_stamps, read_scans
 from icalib.recordings.sections import S
 from icalib.recordings.table import Table, holds, named, read_table
 from icalib.recordings.topics import TopicInfo, choose_topic, find_topic
-from icalib.recordings.tracks import read_tracks
+from icalib.recordings.tracks import read_track_stamps, read_tracks
 from icalib.recordings.unreadable import VIDEO_FILE, is_video
 from icalib.recordings.wheels import RELATIVE_POSES, STAMPS, UNITS, WheelReadings, read_wheel_table
 from icalib.recordings.window import WHOLE, Span, Window, cut, stamps_inside
@@ -72,6 +72,9 @@ class FolderRecording:
             if table := _existing(folder, "corners.csv"):
                 stamps_ns = np.unique(read_table(table, _CORNERS).integers[:, 0])
                 found.append(_info(f"{folder.name}/corners.csv", "table of corners", "corners", stamps_ns))
+            if table := _existing(folder, "tracks.csv"):
+                name = f"{folder.name}/tracks.csv"
+                found.append(_info(name, "table of tracks", "tracks", read_track_stamps(table)))
             found += [_info(f"{folder.name}/{table.name}", *what, _stamps(table)) for table, what in _robot(folder)]
         for table in sorted(p for base in self._bases() for p in base.glob("*.csv")):
             found += _single(table)
@@ -90,6 +93,8 @@ class FolderRecording:
             return np.array([stamp_ns for stamp_ns, _ in image_files(folder)], np.int64)
         if chosen.kind == "imu":
             return read_table(self._locate(chosen.name), IMU).integers[:, 0].copy()
+        if chosen.kind == "tracks":
+            return read_track_stamps(self._locate(chosen.name))
         if chosen.kind in ("points", "wheels", "pose"):
             return _stamps(self._locate(chosen.name))
         return np.unique(read_table(self._locate(chosen.name), _CORNERS).integers[:, 0])

@@ -34,9 +34,9 @@ class TopicInfo:
     """One stream of a recording.
 
     name: what `topic` (of a folder's tables: `path`) of a sensor in the rig file may be. type: of its messages, or what
-    it is in a folder. kind: image, camera info, imu, points, joints, odometry, twist, pose, corners, wheels; empty for
-    what icalib does not read. first_ns, last_ns: when the first and last message were received in a bag, the first and
-    last stamp in a folder; None where there are no messages.
+    it is in a folder. kind: image, camera info, imu, points, joints, odometry, twist, pose, corners, tracks, wheels;
+    empty for what icalib does not read. first_ns, last_ns: when the first and last message were received in a bag, the
+    first and last stamp in a folder; None where there are no messages.
     """
 
     name: str

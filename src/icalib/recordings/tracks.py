@@ -24,6 +24,11 @@ _KIND = TableKind(
 _MARGIN_PX = 5.0  # trackers step over the edge by a few times their noise
 
 
+def read_track_stamps(path: Path) -> np.ndarray:
+    """(M,) int64 ns: one stamp for each image of the table at `path`. Raises RecordingError as `read_table`."""
+    return np.unique(read_table(path, _KIND).integers[:, 0])
+
+
 def read_tracks(
     name: str, path: Path, resolution: tuple[int, int], layout: TableLayout = PLAIN_TABLE, note: Note = ignore
 ) -> TrackStream:

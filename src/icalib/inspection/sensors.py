@@ -1,0 +1,70 @@
+"""Do the sensors that were recorded show the motion together, as `calibrate` asks of a rig?"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from icalib.inspection.facts import Finding, Inspection
+from icalib.recordings.topics import listing
+
+
+def missing_sensors(found: Inspection) -> Iterator[Finding]:
+    """What there is too little of, and topics without messages."""
+    sources, held = found.sources, listing([s.topic for s in found.streams])
+    if sources.imus:
+        yield from _beside_an_imu(found, held)
+    elif sources.cameras:
+        yield _cameras_without_imu(found, held)
+    elif len(sources.poses) + len(sources.wheels) > 1 and sources.poses:
+        yield Finding(
+            "hint",
+            f"There is no IMU: smooth motion is assumed, and all is calibrated beside {next(iter(sources.poses))}.",
+        )
+    else:
+        yield Finding("problem", f"{_alone(found)}: {held}; {_WANTED}.")
+    for stream in found.streams:
+        if stream.topic.kind in ("image", "imu") and not stream.topic.count:
+            yield Finding("warning", f"{stream.topic.name} holds no messages: check that this sensor was running.")
+
+
+_WANTED = "record the images of a camera, or an IMU with a LiDAR, poses or odometry, or poses with wheels"
+
+
+def _beside_an_imu(found: Inspection, held: str) -> Iterator[Finding]:
+    sources = found.sources
+    if sources.cameras or sources.lidars or sources.poses:
+        return
+    if sources.wheels:
+        yield Finding(
+            "problem",
+            f"Wheels and an IMU do not show the motion: {held}; record a camera, a LiDAR or poses, too.",
+        )
+    else:
+        yield Finding(
+            "problem",
+            f"There is only an IMU: {held}; record the images of a camera, a LiDAR, or poses. Of an IMU at rest "
+            "`icalib allan` gives the noise.",
+        )
+
+
+def _cameras_without_imu(found: Inspection, held: str) -> Finding:
+    others = [*found.sources.poses, *found.sources.wheels]
+    if others:
+        return Finding(
+            "hint", f"There is no IMU: smooth motion is assumed, and {' and '.join(others)} are placed on the cameras."
+        )
+    return Finding(
+        "warning",
+        f"There is no IMU: {held}; cameras alone give intrinsics, and extrinsics of those that see the "
+        "target together. For more, record sensor_msgs/Imu, or write imu0/data.csv.",
+    )
+
+
+def _alone(found: Inspection) -> str:
+    if found.sources.lidars:
+        return "A LiDAR without an IMU does not show the motion"
+    if found.sources.poses:
+        return "There are only poses, and nothing to calibrate with them"
+    if found.sources.wheels:
+        return "Wheels alone do not show the motion"
+    return "There is no sensor to calibrate"
