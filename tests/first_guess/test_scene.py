@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from icalib.estimation.bodies import choose_bodies, restrict
 from icalib.estimation.corner_factor import Views
-from icalib.first_guess.scene import body_poses, place_bodies, scene_poses
+from icalib.first_guess.scene import body_poses, scene_poses
+from icalib.first_guess.scene_growth import place_bodies
 from icalib.geometry.cameras import camera_model
 from icalib.simulation import simulate, tag_map
 

@@ -138,6 +138,14 @@ def restrict(bodies: Bodies, recording: Measurements) -> Measurements:
     return replace(recording, cameras=tuple(_restricted(bodies, c) for c in recording.cameras))
 
 
+def without_bodies(target: Target, names: Sequence[str], recording: Measurements) -> Measurements:
+    """The recording without corners of the bodies given by `names`, which a note says."""
+    kept = tuple(k for k, name in enumerate(target.bodies) if name not in names)
+    cameras = tuple(_restricted(Bodies(target, kept), c) for c in recording.cameras)
+    note = f"left out, because no image shows how they stand to the others: {_listed(names)}."
+    return replace(recording, cameras=cameras, notes=(*recording.notes, note))
+
+
 def _restricted(bodies: Bodies, stream: CornerStream) -> CornerStream:
     body = bodies.target.body[stream.point]
     order = np.lexsort((body, stream.image))
@@ -152,8 +160,11 @@ def words_on_left_out(bodies: Bodies) -> str:
     if not bodies.left_out:
         return ""
     names = [bodies.target.bodies[k] for k in bodies.left_out]
-    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
     return (
-        f"left out, because fewer than {FEWEST_TOGETHER} images show them together with the others: "
-        f"{', '.join(names[:MOST_NAMED])}{more}."
+        f"left out, because fewer than {FEWEST_TOGETHER} images show them together with the others: {_listed(names)}."
     )
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    return f"{', '.join(names[:MOST_NAMED])}{more}"

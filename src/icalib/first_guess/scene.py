@@ -1,18 +1,16 @@
-"""How the bodies of a target stand to each other, from the images that show several of them; no guess needed.
+"""Poses of cameras in a scene of several bodies, whose poses are known: image by image, no guess needed.
 
-Each body's pose is found in each image alone. Small flat things far away look the same from two sides; which is meant
-is what most images agree on. Then all are adjusted together, every image free to stand where it likes.
+Each body's pose is found in each image alone. Small flat bodies far away look the same from two sides; all bodies of an
+image tell which is meant.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numba import njit
 
-from icalib.errors import EstimationError
 from icalib.estimation.bodies import Bodies
 from icalib.estimation.corner_factor import Views
 from icalib.estimation.state import Key
@@ -31,15 +29,10 @@ from icalib.first_guess.target_poses import (
     target_poses,
     usable_rays,
 )
-from icalib.geometry import so3
 from icalib.geometry.cameras.base import CameraModel
 from icalib.measurements import CornerStream
 
-VOTES = 40  # images that say how two bodies stand to each other
-ALIKE = 3.0  # a mirrored pose is worth a vote while its error is below so many times the other's
-VOTE_SCALE = 0.2  # rad, or m per m of distance: votes this far apart do not agree
 MIRRORS = 2
-LEAST_RMS_PX = 0.05  # errors below this tell nothing apart
 
 
 @dataclass(frozen=True)
@@ -79,6 +72,11 @@ def scene_poses(stream: CornerStream, model: CameraModel, params: np.ndarray, sc
         poses = target_poses(stream, model, params, Flat(scene.bodies.target.points))
         check_side(stream.name, poses)
         return poses
+    return poses_by_bodies(stream, model, params, scene)
+
+
+def poses_by_bodies(stream: CornerStream, model: CameraModel, params: np.ndarray, scene: Placed) -> TargetPoses:
+    """Poses of the camera in the scene from the bodies of the target that have a pose in it."""
     views = Views.of(stream, scene.bodies.target.body)
     seen = body_poses(stream, views, scene.bodies, model, params)
     R_sb, p_sb = scene.bodies.poses(scene.values)
@@ -127,91 +125,3 @@ def _best_poses(
                 camera_in_target(R, t, rotation[i], position[i])
             else:
                 rms[i] = 1e9
-
-
-def place_bodies(
-    bodies: Bodies, streams: Sequence[CornerStream], models: Sequence[CameraModel], params: dict[str, np.ndarray]
-) -> Placed:
-    """How the bodies stand to each other, as most of the images of all cameras see it; params (P,) by camera.
-
-    Raises EstimationError naming a body that no image ties to the others.
-    """
-    votes = [_Votes.of(bodies, s, m, params[s.name]) for s, m in zip(streams, models, strict=True)]
-    together = np.sum([v.together for v in votes], axis=0)
-    place = {bodies.used[0]: (np.eye(3), np.zeros(3))}
-    while len(place) < len(bodies.used):
-        rest = [k for k in bodies.used if k not in place]
-        ties = together[np.ix_(list(place), rest)]
-        a, b = np.unravel_index(np.argmax(ties), ties.shape)
-        near, far = list(place)[a], rest[b]
-        relative = [pose for v in votes for pose in v.of_pair(near, far)]
-        if not relative:
-            names = bodies.target.bodies
-            raise EstimationError(
-                f"no image shows {names[far]} well enough to tell how it stands to {names[near]}; show both closer, in "
-                "the same image, or take it out of the target."
-            )
-        R, p = _agreed(relative)
-        R0, p0 = place[near]
-        place[far] = R0 @ R, p0 + R0 @ p
-    values: dict[Key, np.ndarray] = {}
-    for k in bodies.used[1:]:
-        values[bodies.target.bodies[k], "rotation"], values[bodies.target.bodies[k], "translation"] = place[k]
-    return Placed(bodies, values, params)
-
-
-@dataclass(frozen=True)
-class _Votes:
-    """What one camera's images say: views sorted by image, the poses of each, and by image the row of each body's view
-    (M, bodies), -1 where it is not seen."""
-
-    poses: TargetPoses
-    row: np.ndarray
-
-    @classmethod
-    def of(cls, bodies: Bodies, stream: CornerStream, model: CameraModel, params: np.ndarray) -> _Votes:
-        views = Views.of(stream, bodies.target.body)
-        poses = body_poses(stream, views, bodies, model, params)
-        row = np.full((len(stream.stamps_ns), len(bodies.target.bodies)), -1)
-        good = np.flatnonzero(poses.ok[:, 0])
-        row[views.image[good], views.body[good]] = good
-        return cls(poses, row)
-
-    @property
-    def together(self) -> np.ndarray:
-        """(bodies, bodies) number of images in which two are seen well."""
-        seen = (self.row >= 0).astype(np.float32)
-        return np.rint(seen.T @ seen).astype(np.int64)
-
-    def of_pair(self, a: int, b: int) -> list[list[tuple[np.ndarray, np.ndarray]]]:
-        """For each image with both, up to `VOTES` of them, what T_a_b may be: one to four poses."""
-        images = np.flatnonzero((self.row[:, a] >= 0) & (self.row[:, b] >= 0))
-        images = images[np.unique(np.linspace(0, len(images) - 1, VOTES).astype(int))] if len(images) else images
-        return [self._pairs(self.row[i, a], self.row[i, b]) for i in images]
-
-    def _pairs(self, va: int, vb: int) -> list[tuple[np.ndarray, np.ndarray]]:
-        pose = self.poses
-        found = []
-        for m in self._sides(va):
-            for n in self._sides(vb):
-                R = pose.rotation[va, m] @ pose.rotation[vb, n].T
-                found.append((R, pose.position[va, m] - R @ pose.position[vb, n]))
-        return found
-
-    def _sides(self, v: int) -> list[int]:
-        rms = self.poses.rms_px[v]
-        return [0, 1] if self.poses.ok[v, 1] and rms[1] < ALIKE * max(rms[0], LEAST_RMS_PX) else [0]
-
-
-def _agreed(votes: list[list[tuple[np.ndarray, np.ndarray]]]) -> tuple[np.ndarray, np.ndarray]:
-    """The pose that the images agree on most: distances to each image's nearest candidate, each bounded, are least."""
-    R = np.array([R for pair in votes for R, _ in pair])
-    p = np.array([p for pair in votes for _, p in pair])
-    turn = so3.log_many(np.ascontiguousarray((R[:, None].swapaxes(-1, -2) @ R[None]).reshape(-1, 3, 3)))
-    scale = np.maximum(np.linalg.norm(p, axis=1), 1e-3)
-    apart = np.linalg.norm(turn, axis=1).reshape(len(R), -1)
-    apart += np.linalg.norm(p[:, None] - p[None], axis=2) / np.maximum(scale[:, None], scale[None])
-    first = np.cumsum([0] + [len(pair) for pair in votes[:-1]])
-    nearest = np.minimum.reduceat(apart, first, axis=1)
-    best = int(np.argmin(np.minimum(nearest, VOTE_SCALE).sum(axis=1)))
-    return R[best], p[best]

@@ -1,45 +1,46 @@
-"""A lens from a scene of several bodies: one flat body alone often leaves it unsure, all together do not."""
+"""Lenses and poses of a target of several bodies: one small tag alone leaves both unsure, all together do not."""
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.assembly import assemble, image_times, nodes_for, start_values
 from icalib.estimation.bodies import Bodies, choose_bodies, restrict
-from icalib.estimation.corner_noise import first_noise
-from icalib.estimation.inputs import inputs_for
-from icalib.estimation.solver import minimise
-from icalib.estimation.state import State
 from icalib.first_guess.intrinsics import camera_params
-from icalib.first_guess.scene import Placed, place_bodies, scene_poses
-from icalib.first_guess.without_imu import guess_without_imu, trajectory_without_imu
+from icalib.first_guess.scene import Placed
+from icalib.first_guess.scene_bundle import Lens
+from icalib.first_guess.scene_growth import grow, place_bodies
 from icalib.geometry.cameras import camera_model
+from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.targets.base import Target
 from icalib.joining import join_corners
 from icalib.measurements import CornerStream, Measurements
 from icalib.rig import Camera, Rig
 
-MOST_IMAGES = 150
-OF_EACH_BODY = 6  # images at least, where there are as many
-APART_NS = 100_000_000  # images are given instants of their own: those of several recordings may share one
-ROUGH_DECREASE = 0.5  # of half the chi^2
+TRIAL_WIDTHS = (0.6, 1.0, 0.35)  # focal lengths to try, in image widths: views of 80, 53 and 110 degrees
+GOOD_RMS_PX = 0.3  # a scene that fits so well needs no other trial: corners are seldom found better
+REGROWN = 4  # times that a start is followed
+WORTH_GROWING = 0.9  # another time is worth it where the error became so many times the one before
+LARGEST_RMS_PX = 2.0  # of the median image in a scene that fits
+CENTRE_SIGMA = 0.1  # of the image's width: the prior on the principal point, about the middle
+DISTORTION_SIGMA = 1.0  # the prior on each, about where it starts
+OFF_CENTRE = 0.25  # of the image's sides, by which a principal point may lie outside the image
+FOCAL_RANGE = (0.05, 20.0)  # image widths; a fisheye's is 0.2, that of a view of 5 degrees 11
+MOST_STRETCHED = 2.0  # fx over fy
+UNSEEN_SHARE = 0.05  # of the corners, that a lens may not be able to see
 
 
 def find_scene(rig: Rig, bodies: Bodies, recordings: Sequence[Measurements]) -> Placed:
     """How the bodies stand to each other, from the images of all recordings, whose streams hold corners of these bodies
-    only. Raises EstimationError where images do not tell."""
+    only. Raises EstimationError where images do not tell; `UntiedBodiesError` where they do not of some."""
     if not bodies.several:
         return Placed(bodies)
     streams = [join_corners([(r.cameras[i], 0) for r in recordings]) for i in range(len(rig.cameras))]
-    params = {
-        c.name: refined_params(rig, c, s, camera_params(c, s, rig.target))
-        for c, s in zip(rig.cameras, streams, strict=True)
-    }
+    params = {c.name: scene_params(rig.target, c, s) for c, s in zip(rig.cameras, streams, strict=True)}
     return place_bodies(bodies, streams, [camera_model(c.model) for c in rig.cameras], params)
 
 
@@ -48,57 +49,92 @@ def lens_of(camera: Camera, stream: CornerStream, target: Target, scene: Placed)
     return scene.params[camera.name] if camera.name in scene.params else camera_params(camera, stream, target)
 
 
-def refined_params(rig: Rig, camera: Camera, stream: CornerStream, params: np.ndarray) -> np.ndarray:
-    """(P,) parameters from bodies and lens adjusted together, every image free to stand where it likes; those that were
-    given stay. As they were where the camera shows one body only, or nothing can be solved."""
+def scene_params(target: Target, camera: Camera, stream: CornerStream) -> np.ndarray:
+    """(P,) what the rig gives, else the lens that fits all bodies together best, among those that growing a scene from
+    several starts leads to. A camera that shows one body only is judged by that.
+
+    Raises EstimationError where no lens explains the bodies together.
+    """
     if camera.intrinsics.value is not None and camera.distortion.value is not None:
-        return params
-    alone = dataclasses.replace(
-        rig,
-        imu=None,
-        cameras=(camera,),
-        settings=dataclasses.replace(rig.settings, loss="huber", bloom=False, board_shape=False, common_error=False),
-    )
-    with suppress(EstimationError):
-        return _adjusted(alone, _spread(stream, rig.target.body), params)
+        return camera_params(camera, stream, target)
+    alone = Measurements(None, (stream,))
+    bodies = choose_bodies(target, [alone], bent=False)
+    if not bodies.several:
+        return camera_params(camera, stream, target)
+    seen = restrict(bodies, alone).cameras[0]
+    rms, params = _best(bodies, camera, seen, _starts(target, camera, seen))
+    if not rms < LARGEST_RMS_PX:
+        error = f"best median error {rms:.1f} px" if np.isfinite(rms) else "what fits best is no lens"
+        raise EstimationError(
+            f"{camera.name}: no lens of model {camera.model} explains the bodies of the target together ({error}); "
+            "check the model, resolution and sizes in the rig file and that no tag is there twice, or give intrinsics."
+        )
     return params
 
 
-def _adjusted(rig: Rig, stream: CornerStream, params: np.ndarray) -> np.ndarray:
-    camera, model = rig.cameras[0], camera_model(rig.cameras[0].model)
-    everything = Measurements(None, (stream,))
-    bodies = choose_bodies(rig.target, [everything], bent=False)
-    if not bodies.several:
-        return params
-    inputs = inputs_for(rig, [restrict(bodies, everything)])
-    seen = inputs.measurements.cameras[0]
-    scene = place_bodies(bodies, [seen], [model], {camera.name: params})
-    guess = guess_without_imu(
-        rig, inputs.measurements, [params], [scene_poses(seen, model, params, scene)], scene.values
-    )  # fmt: skip
-    values = start_values(inputs, guess.values())
-    nodes = nodes_for(inputs, image_times(inputs, values))
-    path = trajectory_without_imu(guess, inputs.measurements, nodes)
-    state = State(nodes, *path, guess.biases(len(nodes)), values)
-    noise = first_noise(camera).noise(seen, camera, rig.settings)
-    found = minimise(
-        assemble(inputs, state, [noise], [np.ones(len(seen.uv), dtype=bool)]), state, tolerance=ROUGH_DECREASE
-    )
-    solved = found.state.values
-    return np.concatenate([solved[camera.name, "intrinsics"], solved[camera.name, "distortion"]])
+def _best(bodies: Bodies, camera: Camera, seen: CornerStream, starts: Iterator[Lens]) -> tuple[float, np.ndarray]:
+    """The median error [px] and the lens (P,) of the scene that fits best, or fits well; each start is followed anew
+    from where it led, as long as that fits better: where bodies stand wrongly, a nearly right lens places them right.
+    Infinite where no scene fits a lens that can be."""
+    best, params = np.inf, np.empty(0)
+    for start in starts:
+        before = np.inf
+        for _ in range(REGROWN):
+            grown = grow(bodies, [seen], [start])
+            lens, rms = grown.state.lenses[0], grown.median_rms
+            if not is_possible(lens.model, lens.params, camera.resolution, seen.uv):
+                break
+            if rms < best:
+                best, params = rms, lens.params
+            if best < GOOD_RMS_PX:
+                return best, params
+            if not rms < WORTH_GROWING * before:
+                break
+            before, start = rms, replace(start, params=lens.params)
+    return best, params
 
 
-def _spread(stream: CornerStream, body: np.ndarray) -> CornerStream:
-    """Images spread over the recording, and of each body (n_points,) those that show it with most corners; each at an
-    instant of its own."""
-    n, m = len(stream.stamps_ns), int(body.max()) + 1
-    chosen = set(np.linspace(0, n - 1, min(n, MOST_IMAGES)).astype(int).tolist())
-    shown, own = np.diff(stream.start), body[stream.point]
-    pairs = np.unique(own * n + stream.image)
-    for k in range(m):
-        images = pairs[(pairs >= k * n) & (pairs < (k + 1) * n)] - k * n
-        chosen.update(images[np.argsort(-shown[images], kind="stable")[:OF_EACH_BODY]].tolist())
-    rows = np.isin(stream.image, sorted(chosen))
-    start = np.concatenate([[0], np.cumsum(shown[sorted(chosen)])])
-    stamps = APART_NS * np.arange(len(chosen), dtype=np.int64)
-    return CornerStream(stream.name, stamps, start, stream.point[rows], stream.uv[rows])
+def is_possible(model: CameraModel, params: np.ndarray, resolution: tuple[int, int], uv: np.ndarray) -> bool:
+    """Whether parameters (P,) are those of a lens: sane focal lengths, a principal point in or near the image, and rays
+    for nearly all corners uv (N, 2), so that the distortion is monotone where it is used."""
+    if not np.isfinite(params).all():
+        return False
+    middle = 0.5 * (np.array(resolution) - 1.0)
+    _, _, j_point, _ = model.project_with_jacobians(params, np.array([[0.0, 0.0, 1.0]]))
+    focal = np.array([j_point[0, 0, 0], j_point[0, 1, 1]])  # pixels per radian in the middle: not fx in every model
+    near = np.abs(params[2:4] - middle) < (0.5 + OFF_CENTRE) * np.array(resolution)
+    in_range = (focal > FOCAL_RANGE[0] * resolution[0]) & (focal < FOCAL_RANGE[1] * resolution[0])
+    if not (near.all() and in_range.all() and 1.0 / MOST_STRETCHED < focal[0] / focal[1] < MOST_STRETCHED):
+        return False
+    _, valid = model.unproject(params, uv)
+    return bool((~valid).mean() < UNSEEN_SHARE)
+
+
+def _starts(target: Target, camera: Camera, stream: CornerStream) -> Iterator[Lens]:
+    """What each body by itself says, if that can be; then each kind of lens of the model at several focal lengths."""
+    model, width = camera_model(camera.model), camera.resolution[0]
+    middle = 0.5 * (np.array(camera.resolution) - 1.0)
+    given = [camera.intrinsics, camera.distortion]
+    n = len(model.parameter_names)
+    free = np.repeat([p.value is None or p.mode == "free" for p in given], [4, n - 4])
+
+    def lens(params: np.ndarray) -> Lens:
+        mean = params.copy()
+        if camera.intrinsics.value is None:
+            mean[2:4] = middle
+        sigma = np.concatenate([params[:2], np.full(2, CENTRE_SIGMA * width), np.full(n - 4, DISTORTION_SIGMA)])
+        return Lens(model, params, mean, sigma, free)
+
+    with suppress(EstimationError):
+        params = camera_params(camera, stream, target)
+        if is_possible(model, params, camera.resolution, stream.uv):
+            yield lens(params)
+    for distortion in model.start_distortions:
+        params = np.array([1.0, 1.0, *middle, *distortion])
+        _, _, j_point, _ = model.project_with_jacobians(params, np.array([[0.0, 0.0, 1.0]]))
+        for widths in TRIAL_WIDTHS if camera.intrinsics.value is None else TRIAL_WIDTHS[:1]:
+            start = np.array([*np.full(2, widths * width / j_point[0, 0, 0]), *middle, *distortion])
+            for part, parameter in zip((slice(0, 4), slice(4, None)), given, strict=True):
+                if parameter.value is not None:
+                    start[part] = parameter.value
+            yield lens(start)

@@ -10,6 +10,7 @@ import numpy as np
 from icalib.errors import EstimationError
 from icalib.estimation.assembly import host_times, nodes_for, resample, start_values
 from icalib.estimation.board import board_in
+from icalib.estimation.bodies import without_bodies
 from icalib.estimation.estimate import first_pass
 from icalib.estimation.inputs import Inputs, inputs_for, with_clouds
 from icalib.estimation.nodes import first_nodes
@@ -22,6 +23,7 @@ from icalib.first_guess.lidar_rounds import state_from_lidar
 from icalib.first_guess.own_robot import without_own_robot
 from icalib.first_guess.poses import pose_values, state_from_poses
 from icalib.first_guess.robot import wheel_values, with_robot
+from icalib.first_guess.scene_growth import UntiedBodiesError
 from icalib.first_guess.several import initial_guesses
 from icalib.first_guess.targets_on_motion import with_mounts_guessed
 from icalib.first_guess.tracks_on_motion import track_camera_values
@@ -37,9 +39,19 @@ def start(
     """What the estimate is made from, where it starts, and the guess at which stays what the data do not determine.
 
     A target gives the motion, or else a LiDAR, or if its scans do not show it points of the scene, or where there is
-    neither camera nor LiDAR a pose sensor; what has no part in it is placed on that motion.
-    Raises EstimationError where the recordings do not carry it.
+    neither camera nor LiDAR a pose sensor; what has no part in it is placed on that motion. Bodies of the target that
+    images do not tie to the others are left out. Raises EstimationError where the recordings do not carry it.
     """
+    while True:
+        try:
+            return _start(rig, recordings, lap)
+        except UntiedBodiesError as untied:
+            recordings = [without_bodies(rig.target, untied.names, m) for m in recordings]
+
+
+def _start(
+    rig: Rig, recordings: Sequence[Measurements], lap: Callable[[str], None]
+) -> tuple[Inputs, State, dict[Key, np.ndarray]]:
     if rig.imu is None and (rig.wheels or rig.poses):
         found = start_without_imu(rig, recordings)
         lap("first guess")

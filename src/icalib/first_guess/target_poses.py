@@ -100,18 +100,20 @@ def _move(turn, g, R, t):
 @njit(cache=True, nogil=True, error_model="numpy")
 def refine(points, seen, R, t, rounds, scale):
     """Gauss-Newton on x / z, y / z, Huber weights beyond `scale`; returns the last RMS error, errors capped at 4
-    scale."""
+    scale. Points behind the camera count as so far off; 1e9 where as few as 3 are in front of it."""
     rms = 1e9
     for _ in range(rounds):
         H, g = np.zeros((6, 6)), np.zeros(6)
         J = np.zeros((2, 6))
-        total = 0.0
+        total, behind = 0.0, 0
         for n in range(len(points)):
             X = np.empty(3)
             for i in range(3):
                 X[i] = R[i, 0] * points[n, 0] + R[i, 1] * points[n, 1] + R[i, 2] * points[n, 2] + t[i]
             if X[2] < 1e-6:
-                return 1e9
+                behind += 1
+                total += 16.0 * scale * scale
+                continue
             iz = 1.0 / X[2]
             r0, r1 = X[0] * iz - seen[n, 0], X[1] * iz - seen[n, 1]
             e = np.sqrt(r0 * r0 + r1 * r1)
@@ -130,6 +132,8 @@ def refine(points, seen, R, t, rounds, scale):
                 for j in range(6):
                     H[i, j] += w * (J[0, i] * J[0, j] + J[1, i] * J[1, j])
         rms = np.sqrt(total / (2 * len(points)))
+        if len(points) - behind < 4:
+            return 1e9
         if not solve_definite(H, g):
             return 1e9
         _move(so3.exp(-g[:3]), g, R, t)
