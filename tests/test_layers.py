@@ -25,6 +25,7 @@ LEVELS = {
     "rig": 1,
     "joining": 2,
     "rig_streams": 2,
+    "rig_complete": 2,
     "yaml_nodes": 1,
     "result_files": 1,
     "provenance": 2,

@@ -26,6 +26,7 @@ from icalib.recordings import Recording, read_measurements
 from icalib.recordings.reading import without_jumps
 from icalib.recordings.several import Source, naming, open_all
 from icalib.rig import Camera, Rig
+from icalib.rig_complete import check_complete
 from icalib.rig_file import load_rig
 from icalib.rig_streams import streams_of_rig
 
@@ -47,6 +48,7 @@ def calibrate(
     one sentence; where there are several recordings it names the one meant.
     """
     rig = rig if isinstance(rig, Rig) else load_rig(rig)
+    check_complete(rig)
     keep_apart()
     opened = open_all(recording, start_s, end_s)
     started = time.perf_counter()
@@ -98,6 +100,7 @@ def calibrate_measurements(
     given = [measurements] if isinstance(measurements, Measurements) else measurements
     if not given:
         raise RecordingError("no recording was given; give at least one.")
+    check_complete(rig)
     recordings = [m if m.name else dataclasses.replace(m, name=f"recording {k}") for k, m in enumerate(given, 1)]
     recordings = [without_jumps(rig, streams_of_rig(rig, m)) for m in recordings]
     # The kernels have threads of their own; those of BLAS beside them double the time.

@@ -69,11 +69,6 @@ def _start(
             lap("first guess")
             return _with_all_but_lidars(whole, alone, state, lap)
     if not rig.cameras and not rig.lidars:
-        if not rig.poses:
-            raise EstimationError(
-                f"{' and '.join(w.name for w in rig.wheels)} and {rig.body} do not show the motion; add a camera, a "
-                "LiDAR or a pose sensor to the rig file."
-            )
         return _start_from_poses(whole, recordings, lap)
     bare = whole
     if rig.wheels or rig.lidars or rig.poses:

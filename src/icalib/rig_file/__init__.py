@@ -22,6 +22,7 @@ from icalib.rig import (
     Settings,
     Wheels,
 )
+from icalib.rig_complete import lack_of
 from icalib.rig_file.fields import (
     MOUNTING,
     TABLE,
@@ -147,20 +148,19 @@ def _sensors(value: YamlValue) -> _Sensors:
 
 def _refuse_incomplete(value: YamlValue, found: _Sensors) -> None:
     """Where the sensors together cannot be calibrated."""
-    if not found.cameras and not found.lidars and not found.poses:
-        value.fail("there is no camera, no LiDAR and no pose sensor; add a sensor of type: camera, lidar or pose.")
-    if found.imus:
-        return
-    if found.lidars:
-        entry = value.entries()[found.lidars[0].name]
-        entry.fail("needs an IMU; add a sensor of type: imu, or remove this one.")
-    for sensor in found.poses[: 0 if found.cameras else 1]:
-        entry = value.entries()[sensor.name]
-        if sensor.kind != "absolute":
-            entry.fail("without camera and IMU it has to show the motion by itself; write kind: absolute, or add one.")
-        if len(found.poses) == 1 and not found.wheels:
-            entry.fail("is alone; add what is to be calibrated with it.")
-    _refuse_clocks_of_nothing(value, found)
+    imu = found.imus[0] if found.imus else None
+    rig = Rig(
+        imu,
+        tuple(found.cameras),
+        lidars=tuple(found.lidars),
+        wheels=tuple(found.wheels),
+        poses=tuple(found.poses),
+    )
+    lack = lack_of(rig)
+    if lack is not None:
+        (value.entries()[lack.sensor] if lack.sensor else value).fail(lack.sentence)
+    if imu is None:
+        _refuse_clocks_of_nothing(value, found)
 
 
 def _refuse_clocks_of_nothing(value: YamlValue, found: _Sensors) -> None:
