@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 
 from icalib.errors import RecordingError
+from icalib.inspection import inspect_recording
+from icalib.inspection.draft import draft_rig
 from icalib.measurements import LidarStream
 from icalib.recordings import BagRecording
 from icalib.recordings.lidar_checks import checked_lidar
 from icalib.rig import Lidar
+from icalib.rig_file import load_rig
 
 POINTS = "sensor_msgs/msg/PointCloud2"
 ORIGIN, PERIOD, SCANS = 1_700_000_000_123_456_789, 100_000_000, 12  # ns
@@ -336,6 +339,38 @@ def test_the_rig_file_names_the_field(write, read):
         RecordingError, match="all points of a scan have the same `t` .*; correct point_time_field of lid"
     ):
         read(messages, point_time_field="t")
+
+
+@pytest.mark.parametrize(
+    ("dtype", "times", "lines"),
+    [
+        (layout(20, laser_usec=("u4", 12)), lambda t, s: {"laser_usec": (t - s) // 1000}, ["laser_usec", "us"]),
+        (VELODYNE, lambda t, s: {"time": (t - s) * 1e-6}, [None, "ms"]),
+        (OUSTER, lambda t, s: {"t": t - s}, [None, None]),
+    ],
+)
+def test_inspect_drafts_what_the_rig_file_must_say(tmp_path, write, dtype, times, lines):
+    make, rng = write.maker(), np.random.default_rng(0)
+    readings = rng.normal(size=(120, 6)) + [0, 0, 0, 0, 0, 9.8]
+    imu = [(ORIGIN + k * 10**7, row) for k, row in enumerate(readings)]
+    messages = [("/imu0", "sensor_msgs/msg/Imu", t, make.imu(t, row[:3], row[3:])) for t, row in imu]
+    messages += [("/lidar0/points", POINTS, t + 5, m) for t, m in packed(make, scans(), dtype, times)]
+    path = write.ros2(tmp_path / "run", sorted(messages, key=lambda m: m[2]))
+    draft = draft_rig(inspect_recording(path))
+    (tmp_path / "rig.yaml").write_text(draft)
+    (lidar,) = load_rig(tmp_path / "rig.yaml").lidars
+    assert [lidar.point_time_field, lidar.point_time_unit] == lines
+    check(BagRecording(path).lidar(lidar), scans(), 1010)
+    assert ("point_time" in draft) == (lines != [None, None])
+
+
+def test_inspect_says_what_calibrate_would(tmp_path, write):
+    """No times at all."""
+    make = write.maker()
+    messages = [("/lidar0/points", POINTS, t + 5, m) for t, m in packed(make, scans(), PLAIN, lambda t, s: {})]
+    found = inspect_recording(write.ros2(tmp_path / "run", messages))
+    (sentence,) = [f.sentence for f in found.findings if "the points have no times" in f.sentence]
+    assert "/lidar0/points (lidar0)" in sentence and found.verdict == "no"
 
 
 def test_a_field_of_an_unknown_name_may_be_the_time(write, read):

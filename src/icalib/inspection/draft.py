@@ -18,6 +18,7 @@ from icalib.inspection.facts import CameraSource, Inspection
 from icalib.inspection.inspect import resolution_of
 from icalib.inspection.kalibr import KalibrImu
 from icalib.inspection.lens import LensStart, lens_start
+from icalib.inspection.lidar import timing_lines
 from icalib.recordings import TopicInfo
 from icalib.rig import TwoSources
 from icalib.staging import staged
@@ -141,6 +142,7 @@ def _robot(found: Inspection, shown: bool) -> Iterable[str]:
     else shows the motion: joints may be an arm's, poses what came of these very sensors."""
     for name, topic in found.sources.lidars.items() if found.sources.imus else ():
         yield from (f"  {name}:", "    type: lidar", _place(topic.name, topic.type, ""))
+        yield from timing_lines(found.lidars.get(name))
     mark = "" if shown else "# "
     for name, topic in found.sources.wheels.items():
         if not shown:

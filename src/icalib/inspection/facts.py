@@ -11,7 +11,7 @@ from icalib.inspection.kalibr import KalibrFiles
 from icalib.recordings import TopicInfo
 from icalib.recordings.imu_checks import Saturation
 from icalib.recordings.streams import CameraInfo
-from icalib.rig import TwoSources
+from icalib.rig import TimeUnit, TwoSources
 
 Severity = Literal["problem", "warning", "hint"]
 Vector = tuple[float, float, float]
@@ -150,6 +150,16 @@ class Sources:
 
 
 @dataclass(frozen=True)
+class LidarFacts:
+    """point_time_field and point_time_unit that the rig file must give, None where the data tell; problem: why
+    `calibrate` would refuse its clouds."""
+
+    field: str | None = None
+    unit: TimeUnit | None = None
+    problem: str = ""
+
+
+@dataclass(frozen=True)
 class GivenTarget:
     """A target and the file that it is from; resolutions: of cameras by name, where the file is a rig file."""
 
@@ -160,7 +170,8 @@ class GivenTarget:
 
 @dataclass(frozen=True)
 class Inspection:
-    """All that was found. images, infos and views are by camera, imus by IMU; imu: the one to calibrate with."""
+    """All that was found. images, infos and views are by camera, imus by IMU, lidars by LiDAR; imu: the one to
+    calibrate with."""
 
     recording: str
     sources: Sources
@@ -174,6 +185,7 @@ class Inspection:
     views: Mapping[str, TargetView] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
+    lidars: Mapping[str, LidarFacts] = field(default_factory=dict)
 
     @property
     def verdict(self) -> Literal["yes", "yes, but", "no"]:

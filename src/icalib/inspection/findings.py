@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from icalib.inspection.facts import CameraSource, Finding, ImuFacts, Inspection, TargetView, Timing
+from icalib.inspection.lidar import untimed
 from icalib.inspection.sensors import missing_sensors
 from icalib.inspection.timing import overlap_s
 from icalib.inspection.unread import unread
@@ -34,6 +35,7 @@ def findings(found: Inspection) -> tuple[Finding, ...]:
     every = [
         *missing_sensors(found),
         *unread(found),
+        *untimed(found),
         *_broken(found),
         *_few_stills(found),
         *_imu(found),

@@ -24,6 +24,7 @@ from icalib.inspection.facts import (
 from icalib.inspection.findings import findings
 from icalib.inspection.imu import imu_facts, read_imu
 from icalib.inspection.kalibr import KalibrFiles, find_kalibr_files
+from icalib.inspection.lidar import lidar_facts
 from icalib.inspection.sources import find_sources
 from icalib.inspection.timing import timing_of
 from icalib.inspection.views import target_view
@@ -64,6 +65,7 @@ def inspect_recording(
     streams, images, imus = _read(recording, topics, sources, lambda what, done: progress(what, share * done))
     infos, imu = _infos(recording, sources), _choose(imus, sources, kalibr)
     found = Inspection(str(path), sources, streams, images, infos, imus, imu, target, kalibr)
+    found = dataclasses.replace(found, lidars=lidar_facts(recording, sources.lidars))
     views = _views(recording, found, lambda what, done: progress(what, share + (1.0 - share) * done))
     found = dataclasses.replace(found, views=views, notes=recording.notes() + kalibr.notes)
     return dataclasses.replace(found, findings=findings(found))

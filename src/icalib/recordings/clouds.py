@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
 
@@ -12,9 +12,9 @@ import numpy as np
 from icalib.errors import RecordingError
 from icalib.measurements import LidarStream
 from icalib.recordings.lidar_checks import Sieve
-from icalib.recordings.point_times import PointTimes, clock_note, find_point_times
+from icalib.recordings.point_times import PointTimes, clock_note, find_point_times, likely_fields
 from icalib.recordings.sweeps import Sweep, find_sweep, sweep_share
-from icalib.rig import Lidar
+from icalib.rig import Lidar, TimeUnit
 
 _AHEAD = 8  # clouds with points that tell how points are timed
 
@@ -61,6 +61,27 @@ def read_clouds(clouds: Iterator[PointCloud], lidar: Lidar, what: str) -> tuple[
         np.multiply(stream.offset_s, np.float32(period_s), out=stream.offset_s)
     dropped = sieve.note(what)
     return stream, notes + ((dropped,) if dropped else ())
+
+
+def timing_fields(clouds: Iterator[PointCloud], lidar: Lidar, what: str) -> tuple[str | None, TimeUnit | None]:
+    """point_time_field and point_time_unit that the rig file should give of a LiDAR with these clouds, of which the
+    first are read; None of what the data tell.
+
+    Raises RecordingError as `read_clouds`, where no field will do.
+    """
+    ahead = [cloud for cloud in _first_clouds(clouds, what) if len(cloud.points)]
+    stamps_ns, scans = np.array([cloud.stamp_ns for cloud in ahead], np.int64), [cloud.points for cloud in ahead]
+    try:
+        times, notes = find_point_times(what, stamps_ns, scans, lidar)
+        return None, times.unit if notes else None
+    except RecordingError:
+        for field in likely_fields(scans):
+            try:
+                times, notes = find_point_times(what, stamps_ns, scans, replace(lidar, point_time_field=field))
+            except RecordingError:
+                continue
+            return field, times.unit
+        raise
 
 
 def _first_clouds(clouds: Iterator[PointCloud], what: str) -> list[PointCloud]:

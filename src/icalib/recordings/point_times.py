@@ -28,7 +28,8 @@ from icalib.errors import RecordingError
 from icalib.rig import Lidar, PointTime, TimeUnit
 
 FIELDS = (
-    "offset_time", "time", "t", "timestamp", "time_stamp", "time_offset_ns", "point_time_offset", "time_offset"
+    "offset_time", "time", "t", "timestamp", "time_stamp", "time_offset_ns", "point_time_offset", "time_offset",
+    "ts", "stamps",
 )  # fmt: skip
 UNIT_NS: dict[TimeUnit, int] = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
 LONGEST_PERIODS = 1.7  # how long a scan may take: up to scans that overlap
@@ -135,6 +136,12 @@ def unit_of_offsets(
     return fitting[0], (f"{spread}; {only}; point_time_unit of {lidar.name} in the rig file may say otherwise.",)
 
 
+def likely_fields(scans: Sequence[np.ndarray]) -> list[str]:
+    """Fields of structured arrays that may hold times by their names, though these are not known, and whose values
+    differ within a scan."""
+    return [n for n in _differing(scans) if _LIKE_A_TIME.search(n) and n not in FIELDS]
+
+
 def clock_note(what: str, times: PointTimes, stamp_ns: int, first_ns: int) -> str | None:
     """A sentence where points are timed on another clock than that of the messages' stamps: one was stamped stamp_ns,
     its first point first_ns."""
@@ -148,8 +155,7 @@ def clock_note(what: str, times: PointTimes, stamp_ns: int, first_ns: int) -> st
 
 def _field(what: str, scans: Sequence[np.ndarray], lidar: Lidar) -> str:
     """The field of the times: the one in the rig file, else the first known one that differs from point to point."""
-    names = [n for n in scans[0].dtype.names or () if scans[0][n].ndim == 1]
-    differs = [n for n in names if np.median([_differ(scan[n]) for scan in scans]) > 0]
+    names, differs = scans[0].dtype.names or (), _differing(scans)
     listed = f"their fields are {', '.join(scans[0].dtype.names or ())}"
     if (given := lidar.point_time_field) is not None:
         if given not in differs:
@@ -161,7 +167,7 @@ def _field(what: str, scans: Sequence[np.ndarray], lidar: Lidar) -> str:
     known = [f for f in FIELDS if f in names]
     if found := [f for f in known if f in differs]:
         return found[0]
-    if likely := [n for n in differs if _LIKE_A_TIME.search(n) and n not in FIELDS]:
+    if likely := likely_fields(scans):
         raise RecordingError(
             f"{what}: the points have no field of times that icalib knows ({listed}); {likely[0]} looks like one: set "
             f"point_time_field: {likely[0]} of {lidar.name} in the rig file."
@@ -185,6 +191,12 @@ def _usual_unit(field: str, whole: bool) -> TimeUnit:
         if field.endswith(f"_{unit}"):
             return unit
     return "ns" if whole else "s"
+
+
+def _differing(scans: Sequence[np.ndarray]) -> list[str]:
+    """Fields of plain numbers that differ from point to point, in most scans."""
+    plain = [n for n in scans[0].dtype.names or () if scans[0][n].ndim == 1]
+    return [n for n in plain if np.median([_differ(scan[n]) for scan in scans]) > 0]
 
 
 def _differ(values: np.ndarray) -> bool:
