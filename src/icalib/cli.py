@@ -24,6 +24,8 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         code = options.run(options)
     except CalibrationError as error:
+        for note in () if getattr(options, "quiet", False) else getattr(error, "__notes__", ()):
+            print(f"Note: {note}")
         print(f"icalib: {error}", file=sys.stderr)
         return getattr(options, "error_code", 1)
     except KeyboardInterrupt as stop:

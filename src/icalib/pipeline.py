@@ -24,7 +24,7 @@ from icalib.measurements import CornerStream, Measurements
 from icalib.provenance import provenance
 from icalib.recordings import Recording, read_measurements
 from icalib.recordings.reading import without_jumps
-from icalib.recordings.several import Source, naming, open_all
+from icalib.recordings.several import Source, naming, noting, open_all
 from icalib.rig import Camera, Rig
 from icalib.rig_complete import check_complete
 from icalib.rig_file import load_rig
@@ -45,7 +45,8 @@ def calibrate(
     """Calibrates every sensor of `rig` from `recording`, or jointly from several of the same rig.
 
     All may be paths. Of each recording the part from start_s to end_s after its start is used. Raises CalibrationError,
-    one sentence; where there are several recordings it names the one meant.
+    one sentence; where there are several recordings it names the one meant. Its `__notes__` say what was left out or
+    repaired before.
     """
     rig = rig if isinstance(rig, Rig) else load_rig(rig)
     check_complete(rig)
@@ -64,9 +65,10 @@ def calibrate(
         with naming(name if len(opened) > 1 else ""):
             measurements.append(dataclasses.replace(_measure(rig, one, show), name=name))
     read = time.perf_counter() - started
-    result = calibrate_measurements(
-        rig, measurements, lambda stage, done: progress(stage, share + (1.0 - share) * done)
-    )
+    with noting(note for m in measurements for note in m.notes):
+        result = calibrate_measurements(
+            rig, measurements, lambda stage, done: progress(stage, share + (1.0 - share) * done)
+        )
     files = [file for r in opened.values() for file in r.files()]
     inputs = provenance([*([rig.path] if rig.path else []), *files])
     timings = {"reading": read} | result.timings | {"all": time.perf_counter() - started}

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from icalib.cli import main
 from icalib.errors import RecordingError
 from icalib.measurements import LidarStream
 from icalib.recordings import FolderRecording, open_recording
@@ -199,6 +200,29 @@ def test_a_lidar_that_froze_is_refused(tmp_path):
     arrays = scan_of(np.zeros(24, np.int64), stamps_ns=MANY["stamps_ns"])
     with pytest.raises(RecordingError, match="all scans are the same; the LiDAR or its driver froze"):
         read(tmp_path, arrays)
+
+
+def test_a_refusal_says_what_was_repaired_before(tmp_path, capsys):
+    """On standard output; the sentence itself stays alone. A rest of few points calibrates nothing."""
+    read(tmp_path, GOOD | {"offset_s": GOOD["offset_s"] * 1e3})
+    (tmp_path / "imu0").mkdir()
+    rows = np.random.default_rng(0).normal(size=(100, 6)) + [0, 0, 0, 0, 0, 9.81]
+    lines = (f"{10**18 + k * 10**7}," + ",".join(f"{v:.6f}" for v in row) for k, row in enumerate(rows))
+    (tmp_path / "imu0" / "data.csv").write_text("\n".join(lines) + "\n")
+    (tmp_path / "rig.yaml").write_text("sensors:\n  imu0: {type: imu}\n  lidar0: {type: lidar}\n")
+    command = [
+        "calibrate",
+        str(tmp_path / "rig.yaml"),
+        str(tmp_path),
+        "-o",
+        str(tmp_path.parent / f"{tmp_path.name}_out"),
+    ]
+    assert main(command) == 1
+    out, error = capsys.readouterr()
+    assert "Note: " in out and "they are read as ms, the only unit that fits" in out
+    assert error.count("\n") == 1 and "scans have 100 points or more" in error
+    assert main([*command, "--quiet"]) == 1
+    assert capsys.readouterr().out == ""
 
 
 def test_files_that_are_none(tmp_path):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from math import inf
 from pathlib import Path
@@ -54,3 +54,15 @@ def naming(name: str) -> Iterator[None]:
         if not name or re.search(rf"(^|[/\\]){re.escape(name)}\b", str(error)):
             raise
         raise type(error)(f"{name}: {error}") from error
+
+
+@contextmanager
+def noting(notes: Iterable[str]) -> Iterator[None]:
+    """Errors raised within carry `notes` on what was left out or repaired before, each once, in `__notes__`: it may
+    be the reason."""
+    try:
+        yield
+    except CalibrationError as error:
+        for note in dict.fromkeys(notes):
+            error.add_note(note)
+        raise
