@@ -12,9 +12,9 @@ from icalib.yaml_nodes import YamlValue
 
 # type -> fields that must be there, and those that may
 _FIELDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "aprilgrid": (("rows", "cols", "tag_size", "tag_spacing"), ("border_bits", "squares")),
-    "charuco": (("squares_x", "squares_y", "square_size", "marker_size", "dictionary"), ()),
-    "checkerboard": (("rows", "cols", "square_size"), ()),
+    "aprilgrid": (("rows", "cols", "tag_size", "tag_spacing"), ("border_bits", "squares", "first_id", "family")),
+    "charuco": (("squares_x", "squares_y", "square_size", "marker_size", "dictionary"), ("legacy", "inverted")),
+    "checkerboard": (("rows", "cols", "square_size"), ("inverted",)),
     "markers": (("family", "size"), ("ids", "border_bits")),
 }
 _LARGEST_TAG_M = 2.0  # nobody prints a larger one; it is in millimetres
@@ -58,17 +58,21 @@ def target_of(value: YamlValue) -> Target:
     size = _edge(found["square_size"], "square")
     if kind == "checkerboard":
         rows, cols = _counts(value, found, "rows", "cols", "corners")
-        return _made(value, lambda: Checkerboard(rows, cols, size))
+        return _made(value, lambda: Checkerboard(rows, cols, size, _yes(found, "inverted")))
     squares = _counts(value, found, "squares_x", "squares_y", "squares")
     marker, dictionary = _edge(found["marker_size"], "tag"), _family(found["dictionary"])
-    return _made(value, lambda: Charuco(*squares, size, marker, dictionary))
+    how = _yes(found, "legacy"), _yes(found, "inverted")
+    return _made(value, lambda: Charuco(*squares, size, marker, dictionary, *how))
 
 
-def _aprilgrid(value: YamlValue, found: dict[str, YamlValue]) -> AprilGrid:
+def _aprilgrid(value: YamlValue, found: dict[str, YamlValue]) -> Target:
     size = _edge(found["tag_size"], "tag")
     rows, cols = _counts(value, found, "rows", "cols", "tags")
     squares = found["squares"].boolean() if "squares" in found else True
-    return AprilGrid(rows, cols, size, found["tag_spacing"].positive(), _border(found, AprilGrid.border_bits), squares)
+    spacing, border = found["tag_spacing"].positive(), _border(found, AprilGrid.border_bits)
+    first = found["first_id"].whole(0) if "first_id" in found else AprilGrid.first_id
+    family = _family(found["family"]) if "family" in found else AprilGrid.family
+    return _made(value, lambda: AprilGrid(rows, cols, size, spacing, border, squares, first, family))
 
 
 def _markers(value: YamlValue, found: dict[str, YamlValue]) -> Target:
@@ -84,6 +88,10 @@ def _family(value: YamlValue) -> str:
         return family_name(value.text())
     except RigError as error:
         value.fail(str(error))
+
+
+def _yes(found: dict[str, YamlValue], name: str) -> bool:
+    return found[name].boolean() if name in found else False
 
 
 def _border(found: dict[str, YamlValue], default: int) -> int:

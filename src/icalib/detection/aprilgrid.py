@@ -36,13 +36,14 @@ class AprilGridDetector:
     family: str = APRILGRID_FAMILY
     border_bits: int = 2
     squares: bool = True
+    first_id: int = 0
 
     def __post_init__(self) -> None:
         n = len(self._family.codes)
-        if self.rows * self.cols > n:
+        if self.first_id + self.rows * self.cols > n:
             raise RecordingError(
                 f"an AprilGrid of {self.rows} x {self.cols} tags needs more ids than {self.family} has ({n}); "
-                "check rows, cols and family."
+                "check rows, cols, first_id and family."
             )
 
     @cached_property
@@ -86,13 +87,14 @@ class AprilGridDetector:
         """(known (n,) bool, quads (n, 4, 2)) of the tags on the board that agree on where it is."""
         n = self.rows * self.cols
         known, quads = np.zeros(n, dtype=bool), np.zeros((n, 4, 2))
-        ids, count = np.unique(tags.ids, return_counts=True)
-        for tag in ids[(count == 1) & (ids < n)]:
-            known[tag], quads[tag] = True, tags.quads[tags.ids == tag][0]
+        place = tags.ids - self.first_id
+        places, count = np.unique(place, return_counts=True)
+        for tag in places[(count == 1) & (places >= 0) & (places < n)]:
+            known[tag], quads[tag] = True, tags.quads[place == tag][0]
         return largest_group(known, quads, self._board), quads
 
     def _corners(self, image: np.ndarray, known: np.ndarray, quads: np.ndarray) -> ImageCorners:
-        patterns = np.ascontiguousarray(self._family.codes[: len(known), 0])
+        patterns = np.ascontiguousarray(self._family.codes[self.first_id : self.first_id + len(known), 0])
         cells = (patterns, self._family.bits, self.border_bits)
         grow(image, known, quads, self._board, self.cols, *cells, self._clear, self.squares)
         tags = np.flatnonzero(known)

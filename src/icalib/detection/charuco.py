@@ -18,6 +18,7 @@ from icalib.detection.squares import square_corners
 from icalib.errors import RecordingError
 
 _NEAREST = 4  # markers that predict a corner
+_LEAST_TO_TELL = 6  # markers that show whether they stand as on this board
 _LEAST_MARKERS = 2  # that agree: small dictionaries are sometimes read where there is nothing
 
 
@@ -75,17 +76,34 @@ class CharucoDetector:
 
     def find(self, view: View) -> ImageCorners:
         """As `detect`."""
+        known, quads = self._seen(view)
+        known = largest_group(known, quads, self._markers / self.marker_ratio)
+        if known.sum() < _LEAST_MARKERS:
+            return no_corners()
+        expected = self._expected(self._markers[known], quads[known])
+        return square_corners(view.image, expected, self._dark, 0.5 * (1.0 - self.marker_ratio))
+
+    def misfit(self, view: View) -> float:
+        """How far the markers' corners are from where one homography puts them, over the markers' size: the median over
+        the image, NaN where too few are seen to tell."""
+        known, quads = self._seen(view)
+        if known.sum() < _LEAST_TO_TELL:
+            return float("nan")
+        xy, uv = self._markers[known].reshape(-1, 2), quads[known].reshape(-1, 2)
+        H = fit_homography(xy, uv, len(xy))
+        placed = np.array([mapped(H, x, y) for x, y in xy])
+        side = np.median(np.linalg.norm(np.diff(quads[known], axis=1), axis=2))
+        return float(np.median(np.linalg.norm(placed - uv, axis=1)) / side)
+
+    def _seen(self, view: View) -> tuple[np.ndarray, np.ndarray]:
+        """Which markers (n,) are seen once, and the corners (n, 4, 2) of these [px]."""
         n = len(self._markers)
         known, quads = np.zeros(n, dtype=bool), np.zeros((n, 4, 2))
         tags = all_tags(view, self._family, 1)
         ids, count = np.unique(tags.ids, return_counts=True)
         for tag in ids[(count == 1) & (ids < n)]:
             known[tag], quads[tag] = True, tags.quads[tags.ids == tag][0]
-        known = largest_group(known, quads, self._markers / self.marker_ratio)
-        if known.sum() < _LEAST_MARKERS:
-            return no_corners()
-        expected = self._expected(self._markers[known], quads[known])
-        return square_corners(view.image, expected, self._dark, 0.5 * (1.0 - self.marker_ratio))
+        return known, quads
 
     def _expected(self, markers: np.ndarray, quads: np.ndarray) -> np.ndarray:
         """(rows + 1, cols + 1, 2) px, the squares' corners where the nearest markers found place them.

@@ -49,15 +49,21 @@ def _finder_of(target: Target) -> _Finder:
     if isinstance(target, Markers):
         return MarkerDetector(target.family, tuple(target.known.tolist()), target.border_bits)
     if isinstance(target, AprilGrid):
-        return AprilGridDetector(
-            target.rows, target.cols, target.tag_spacing, border_bits=target.border_bits, squares=target.squares
-        )
+        of = target.rows, target.cols, target.tag_spacing, target.family, target.border_bits
+        return AprilGridDetector(*of, target.squares, target.first_id)
     if isinstance(target, Charuco):
-        ratio = target.marker_size / target.square_size
-        return CharucoDetector(target.squares_y, target.squares_x, ratio, target.dictionary)
+        return _Inverted(charuco_detector(target)) if target.inverted else charuco_detector(target)
     if isinstance(target, Checkerboard):
-        return _Renumbered(CheckerboardDetector(target.rows, target.cols), _from_the_bottom(target.rows, target.cols))
+        number = _from_the_bottom(target.rows, target.cols)
+        board = _Renumbered(CheckerboardDetector(target.rows, target.cols), number)
+        return _Inverted(board) if target.inverted else board
     raise RigError(f"targets of type {target.type} are not found in images; use corners as a table.")
+
+
+def charuco_detector(board: Charuco) -> CharucoDetector:
+    """That of the board, black on white."""
+    ratio = board.marker_size / board.square_size
+    return CharucoDetector(board.squares_y, board.squares_x, ratio, board.dictionary, board.legacy)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +84,19 @@ class _SceneDetector:
         fields = {f.name: np.concatenate([getattr(one, f.name) for one in found]) for f in dataclasses.fields(found[0])}
         point = np.concatenate([one.point + first for one, first in zip(found, self.first, strict=True)])
         return ImageCorners(**fields | {"point": point})
+
+
+@dataclass(frozen=True, eq=False)
+class _Inverted:
+    """Finds with `detector` what is white on black."""
+
+    detector: _Finder
+
+    def detect(self, image: np.ndarray) -> ImageCorners:
+        return self.find(View(image))
+
+    def find(self, view: View) -> ImageCorners:
+        return self.detector.find(View(255 - view.image))
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice, product
+from typing import Literal
 
 import numpy as np
 
+from icalib.detection.detectors import charuco_detector
 from icalib.detection.families import tag_family
 from icalib.detection.quads import View
 from icalib.detection.tags import tags_at
+from icalib.geometry.targets import Charuco
 from icalib.geometry.targets.families import FAMILIES, TagSet, is_available
 
 _MOST_IMAGES = 5
@@ -22,13 +25,18 @@ _BORDERS = (1, 2)
 _LEAST_TAGS = {4: 4}  # fewer tags of 4 x 4 cells may be chance
 _LEAST_TAGS_USUALLY = 2
 _MANY_MORE = 4  # times the tags with the border that was stated
+_CLEARLY_BETTER = 0.5  # of the misfit in the layout that was stated
+
+
+_How = Literal["", "mirrored", "inverted"]
+_HOWS: tuple[_How, ...] = ("", "mirrored", "inverted")
 
 
 @dataclass(frozen=True)
 class _Seen:
     family: str
     border_bits: int
-    mirrored: bool
+    how: _How
     ids: np.ndarray  # all that were read, repeated ones too
 
 
@@ -66,20 +74,40 @@ def with_other_border(images: Iterable[np.ndarray], tags: TagSet, others: Iterab
     own, swap = (np.concatenate([np.zeros(0, np.int64), *found[t.border_bits]]) for t in (tags, swapped))
     if len(swap) < _MANY_MORE * max(len(own), 1):
         return ""
-    return _sentence(_Seen(tags.family, swapped.border_bits, False, swap), tags.family, tags.border_bits, tags.ids)
+    return _sentence(_Seen(tags.family, swapped.border_bits, "", swap), tags.family, tags.border_bits, tags.ids)
+
+
+def with_other_layout(images: Iterable[np.ndarray], board: Charuco) -> str:
+    """A sentence where the markers in the first images (h, w) uint8 stand as on a board of the other layout; "" where
+    they do not. In the wrong layout the markers of every other row are a square away from where they should be, to the
+    left or to the right, and no homography puts both right."""
+    if board.squares_y % 2:
+        return ""  # both layouts are the same
+    detectors = [charuco_detector(b) for b in (board, replace(board, legacy=not board.legacy))]
+    views = [View(255 - image if board.inverted else image) for image in islice(images, _MOST_IMAGES)]
+    misfits = np.array([[d.misfit(view) for d in detectors] for view in views]).reshape(-1, 2)
+    misfits = misfits[np.isfinite(misfits).all(axis=1)]
+    if not len(misfits) or np.median(misfits[:, 1]) > _CLEARLY_BETTER * np.median(misfits[:, 0]):
+        return ""
+    if board.legacy:
+        return (
+            "the board is of the layout of OpenCV 4.6 and later, its top left square is black; take legacy: true out."
+        )
+    return (
+        "the board is of the old layout, of OpenCV before 4.6 and calib.io, its top left square is white; set "
+        "legacy: true of the target."
+    )
 
 
 def _candidates(images: list[np.ndarray]) -> list[_Seen]:
     """What each family and border finds, where it is more than chance."""
-    found: dict[tuple[str, int, bool], list[np.ndarray]] = {}
+    found: dict[tuple[str, int, _How], list[np.ndarray]] = {}
     tried = [name for name in _TRIED if is_available(name)]
-    for image, mirrored in product(images, (False, True)):
-        view = View(image[:, ::-1] if mirrored else image)
+    for image, how in product(images, _HOWS):
+        view = View({"": image, "mirrored": image[:, ::-1], "inverted": 255 - image}[how])
         quads = np.concatenate([view.quads(window, apart) for window in view.windows for apart in (True, False)])
         for name, border in product(tried, _BORDERS):
-            found.setdefault((name, border, mirrored), []).append(
-                tags_at(view.image, quads, tag_family(name), border).ids
-            )
+            found.setdefault((name, border, how), []).append(tags_at(view.image, quads, tag_family(name), border).ids)
     seen = [_Seen(*key, np.concatenate(ids)) for key, ids in found.items()]
     least = {name: _LEAST_TAGS.get(tag_family(name).bits, _LEAST_TAGS_USUALLY) for name in tried}
     return [one for one in seen if len(one.ids) >= least[one.family]]
@@ -87,14 +115,19 @@ def _candidates(images: list[np.ndarray]) -> list[_Seen]:
 
 def _sentence(seen: _Seen, family: str, border_bits: int, ids: Sequence[int]) -> str:
     what = f"{len(seen.ids)} tags of {_smallest(seen)} (ids {seen.ids.min()} to {seen.ids.max()})"
-    if seen.mirrored:
+    if seen.how == "inverted":
+        return f"the images show {what}, white on black; set inverted: true of a ChArUco board."
+    if seen.how:
         return f"the images are mirrored, they show {what} that way; switch mirroring off in the camera's driver."
     if seen.family != _largest(family):
         return f"the images show {what}, none of {family}; correct the target's family."
     if seen.border_bits != border_bits:
         return f"the images show {what} with border_bits {seen.border_bits}, not {border_bits}; correct border_bits."
     if not np.isin(seen.ids, ids).any():
-        return f"the images show {what}, none of those of the target; correct the target's ids, rows and cols."
+        return (
+            f"the images show {what}, none of those of the target; set first_id: {seen.ids.min()} of an aprilgrid, or "
+            "correct the target's ids, rows and cols."
+        )
     return f"the images show {what}; check that rows, cols and spacing are those of the target."
 
 

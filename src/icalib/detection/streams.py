@@ -18,7 +18,7 @@ import numpy as np
 from icalib.detection.cache import keep_corners, load_corners, stream_key
 from icalib.detection.corners import ImageCorners, corner_stream, packed
 from icalib.detection.detectors import Detector, detector_of
-from icalib.detection.diagnosis import what_is_seen, with_other_border
+from icalib.detection.diagnosis import what_is_seen, with_other_border, with_other_layout
 from icalib.detection.sightings import parts_of, sightings, without_rare_tags
 from icalib.errors import RecordingError
 from icalib.extras import load_cv2
@@ -50,6 +50,8 @@ def find_corners(
         count = _count(recording, topic)
         payloads = _of_resolution(recording.payloads(topic), camera, where)
         found = _search(payloads, detector_of(target), where, lambda n: progress(n / max(count, n)))
+        if wrong := _other_layout(recording, topic, target):
+            raise RecordingError(f"{where}: {wrong}")
         if keep:
             keep_corners(key, *found)
     stamps_ns, images = found
@@ -89,6 +91,14 @@ def _other_border(recording: Recording, topic: str, target: Target, images: list
         others = [other.tags for _, other, _ in parts_of(target) if other.tags]
         if sentence := with_other_border(_spread(recording, topic), part.tags, others):
             return f"{name or 'the target'}: {sentence}"
+    return ""
+
+
+def _other_layout(recording: Recording, topic: str, target: Target) -> str:
+    """Where a ChArUco board is of the other layout: that, and what to do."""
+    for name, part, _ in parts_of(target):
+        if isinstance(part, Charuco) and (wrong := with_other_layout(_spread(recording, topic), part)):
+            return f"{name}: {wrong}" if name else wrong
     return ""
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from icalib.errors import RecordingError
 from icalib.geometry.targets.base import Target
-from icalib.geometry.targets.families import APRILGRID_FAMILY, TagSet
+from icalib.geometry.targets.families import APRILGRID_FAMILY, TagSet, checked_family
 
 UNIT_TAG = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])  # corner 0 to 3
 
@@ -19,13 +19,15 @@ UNIT_TAG = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])  # corner 
 class AprilGrid(Target):
     """Kalibr's AprilGrid: `rows` x `cols` tags of edge `tag_size` [m], gaps of `tag_spacing` * tag_size.
 
-    Board frame: origin at corner 0 of tag 0, x along a row, y along a column, the tags in z = 0. Tag ids run row-major
-    from the bottom left; corner 0 of a tag is at its bottom left, then counterclockwise. border_bits: width of the
-    tags' black border, 2 as Kalibr prints them, or 1; squares: black squares fill the gaps between the tags' corners.
+    Board frame: origin at corner 0 of the first tag, x along a row, y along a column, the tags in z = 0. Tag ids run
+    row-major from the bottom left, the first is `first_id`; corner 0 of a tag is at its bottom left, then
+    counterclockwise. border_bits: width of the tags' black border, 2 as Kalibr prints them, or 1; squares: black
+    squares fill the gaps between the tags' corners. Raises RigError where the family has too few tags.
     """
 
     type: ClassVar[str] = "aprilgrid"
     blooms: ClassVar[bool] = True
+    seldom: ClassVar[tuple[str, ...]] = ("first_id", "family")
 
     rows: int
     cols: int
@@ -33,6 +35,11 @@ class AprilGrid(Target):
     tag_spacing: float
     border_bits: int = 2
     squares: bool = True
+    first_id: int = 0
+    family: str = APRILGRID_FAMILY
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "family", checked_family(self.family, self.first_id + self.rows * self.cols))
 
     @cached_property
     def points(self) -> np.ndarray:
@@ -51,24 +58,24 @@ class AprilGrid(Target):
 
     @property
     def tags(self) -> TagSet:
-        return TagSet(APRILGRID_FAMILY, self.border_bits, tuple(range(self.rows * self.cols)))
+        return TagSet(self.family, self.border_bits, tuple(self.first_id + i for i in range(self.rows * self.cols)))
 
     def point_index(self, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarray:
         """(N,) index into `points`. Raises RecordingError for a tag or corner that this target does not have."""
         tag_id, corner = np.asarray(tag_id, dtype=np.int64), np.asarray(corner, dtype=np.int64)
-        n_tags = self.rows * self.cols
-        bad = (tag_id < 0) | (tag_id >= n_tags)
+        first, last = self.first_id, self.first_id + self.rows * self.cols - 1
+        bad = (tag_id < first) | (tag_id > last)
         if bad.any():
             raise RecordingError(
-                f"tag {tag_id[bad][0]} is not on the target ({self.rows} x {self.cols} tags, ids 0 to {n_tags - 1}); "
-                "check rows and cols in the rig file."
+                f"tag {tag_id[bad][0]} is not on the target ({self.rows} x {self.cols} tags, ids {first} to {last}); "
+                "check rows, cols and first_id in the rig file."
             )
         if ((corner < 0) | (corner > 3)).any():
             raise RecordingError(
                 f"corner {corner[(corner < 0) | (corner > 3)][0]} is not one of a tag's corners 0 to 3."
             )
-        return 4 * tag_id + corner
+        return 4 * (tag_id - first) + corner
 
     def point_identity(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(N,) tag ids and corners of points."""
-        return index // 4, index % 4
+        return self.first_id + index // 4, index % 4

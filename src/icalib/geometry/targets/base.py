@@ -23,11 +23,13 @@ class Target(ABC):
 
     A point is identified by the id of a tag and its corner, or by tag 0 and the number of the corner on targets whose
     points belong to no tag. type: the name in rig files. blooms: the points are corners of tags, which bloom pulls
-    towards the tag's centre; where squares touch corner to corner it moves nothing.
+    towards the tag's centre; where squares touch corner to corner it moves nothing. seldom: fields that `plain` leaves
+    out at their defaults.
     """
 
     type: ClassVar[str]
     blooms: ClassVar[bool]
+    seldom: ClassVar[tuple[str, ...]] = ()
 
     @cached_property
     @abstractmethod
@@ -61,7 +63,9 @@ class Target(ABC):
 
     def plain(self) -> dict[str, Any]:
         """Its fields as a rig file has them: text, numbers, lists; those that list nothing are left out."""
+        usual = {f.name: f.default for f in fields(self) if f.name in self.seldom}
         values = {f.name: getattr(self, f.name) for f in fields(self)}
+        values = {name: value for name, value in values.items() if name not in usual or value != usual[name]}
         lists = {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
         return {"type": self.type} | {name: value for name, value in lists.items() if value != []}
 

@@ -17,7 +17,8 @@ from icalib.geometry.targets.families import TagSet, checked_family
 class Charuco(Target):
     """OpenCV's ChArUco board of `squares_x` x `squares_y` squares of edge `square_size` [m], the one in the top left
     corner black (OpenCV 4.6 and later), with tags of edge `marker_size` [m] of `dictionary` in the white ones, ids row
-    by row from the top.
+    by row from the top. legacy: the layout of OpenCV before 4.6 and of calib.io, whose top left square is white where
+    squares_y is even. inverted: black and white are exchanged.
 
     Points are the inner corners, numbered as OpenCV does: row by row from the top left; point 0 is the origin, so y of
     later rows is negative. Raises RigError where the sizes or the dictionary do not fit.
@@ -25,12 +26,15 @@ class Charuco(Target):
 
     type: ClassVar[str] = "charuco"
     blooms: ClassVar[bool] = False
+    seldom: ClassVar[tuple[str, ...]] = ("legacy", "inverted")
 
     squares_x: int
     squares_y: int
     square_size: float
     marker_size: float
     dictionary: str
+    legacy: bool = False
+    inverted: bool = False
 
     def __post_init__(self) -> None:
         if min(self.squares_x, self.squares_y) < 3:
@@ -44,6 +48,11 @@ class Charuco(Target):
                 "correct marker_size or square_size."
             )
         object.__setattr__(self, "dictionary", checked_family(self.dictionary, self.squares_x * self.squares_y // 2))
+
+    @property
+    def first_white(self) -> int:
+        """Whether the top left square is white (1) or black (0)."""
+        return int(self.legacy and self.squares_y % 2 == 0)
 
     @cached_property
     def points(self) -> np.ndarray:

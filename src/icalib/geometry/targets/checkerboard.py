@@ -15,7 +15,7 @@ from icalib.geometry.targets.base import Target, untagged_index
 @dataclass(frozen=True)
 class Checkerboard(Target):
     """`rows` x `cols` INNER corners between squares of edge `square_size` [m], the bottom left square black, as Kalibr
-    prints it.
+    prints it; `inverted`: white.
 
     Points row by row from the bottom left, row r and column c at index r cols + c. Raises RigError for fewer than two
     rows or columns.
@@ -23,10 +23,12 @@ class Checkerboard(Target):
 
     type: ClassVar[str] = "checkerboard"
     blooms: ClassVar[bool] = False
+    seldom: ClassVar[tuple[str, ...]] = ("inverted",)
 
     rows: int
     cols: int
     square_size: float
+    inverted: bool = False
 
     def __post_init__(self) -> None:
         if min(self.rows, self.cols) < 2:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from icalib.geometry.targets.aprilgrid import AprilGrid
 from icalib.geometry.targets.base import Target
 from icalib.geometry.targets.charuco import Charuco
 from icalib.geometry.targets.checkerboard import Checkerboard
-from icalib.geometry.targets.families import APRILGRID_FAMILY, opencv_bits, tag_bits
+from icalib.geometry.targets.families import opencv_bits, tag_bits
 from icalib.geometry.targets.tag import Tag
 
 _SAME_M = 1e-9  # edges this close are one
@@ -58,13 +58,18 @@ def pattern_of(target: Target, border_bits: int | None = None) -> Pattern:
     if isinstance(target, AprilGrid):
         return _rasterised(_aprilgrid(target, border_bits or target.border_bits))
     if isinstance(target, Charuco):
-        return _rasterised(_charuco(target, border_bits or 1))
+        return _in_colours(_rasterised(_charuco(target, border_bits or 1)), target.inverted)
     if isinstance(target, Checkerboard):
         corner = (-target.square_size, -target.square_size)
-        return _rasterised(_squares(target.cols + 1, target.rows + 1, target.square_size, corner, 0))
+        squares = _squares(target.cols + 1, target.rows + 1, target.square_size, corner, 0)
+        return _in_colours(_rasterised(squares), target.inverted)
     if isinstance(target, Tag):
         return _rasterised(_tag(tag_bits(target.family, target.id), target.size, (0.0, 0.0), border_bits or 1))
     raise RigError(f"there is no print of a target of type {target.type}; choose another.")
+
+
+def _in_colours(pattern: Pattern, inverted: bool) -> Pattern:
+    return replace(pattern, white=~pattern.white) if inverted else pattern
 
 
 def _aprilgrid(grid: AprilGrid, border_bits: int) -> list[_Box]:
@@ -73,7 +78,7 @@ def _aprilgrid(grid: AprilGrid, border_bits: int) -> list[_Box]:
     pitch, boxes = size + gap, []
     for i in range(grid.rows * grid.cols):
         row, col = divmod(i, grid.cols)
-        boxes += _tag(tag_bits(APRILGRID_FAMILY, i), size, (col * pitch, row * pitch), border_bits)
+        boxes += _tag(tag_bits(grid.family, grid.first_id + i), size, (col * pitch, row * pitch), border_bits)
     corners = [(row, col) for row in range(grid.rows + 1) for col in range(grid.cols + 1)] if grid.squares else []
     for row, col in corners:
         left, bottom = col * pitch - gap, row * pitch - gap
@@ -85,9 +90,9 @@ def _charuco(board: Charuco, border_bits: int) -> list[_Box]:
     size, marker = board.square_size, board.marker_size
     left, top = -size, size  # of the board, whose first inner corner is the origin
     nx, ny = board.squares_x, board.squares_y
-    # The top left square is black: the one at the bottom left is, where the number of rows is odd.
-    boxes = _squares(nx, ny, size, (left, top - ny * size), 1 - ny % 2)
-    white = [(row, col) for row in range(ny) for col in range(nx) if (row + col) % 2 == 1]
+    # Where the top left square is black, the one at the bottom left is, too, if the number of rows is odd.
+    boxes = _squares(nx, ny, size, (left, top - ny * size), (1 - ny % 2 + board.first_white) % 2)
+    white = [(row, col) for row in range(ny) for col in range(nx) if (row + col + board.first_white) % 2 == 1]
     inset, bits = 0.5 * (size - marker), opencv_bits(board.dictionary)  # AprilTags on their heads, as OpenCV does
     for tag_id, (row, col) in enumerate(white):
         corner = left + col * size + inset, top - (row + 1) * size + inset

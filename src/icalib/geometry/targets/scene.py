@@ -103,7 +103,8 @@ class Scene(Target):
 def _in_common(one: Target, other: Target) -> str:
     """By what images would take one for the other, and what to do; "" where nothing."""
     if one.tags and other.tags and (ids := one.tags.shared_with(other.tags)):
-        return f"both have tag {ids[0]} of {one.tags.family}; give them other ids or families, or leave one out"
+        advice = "give them other ids or families (first_id and family of an aprilgrid), or leave one out"
+        return f"both have tag {ids[0]} of {one.tags.family}; {advice}"
     boards = [{t.rows, t.cols} for t in (one, other) if isinstance(t, Checkerboard)]
     if len(boards) == 2 and boards[0] == boards[1]:
         return "both are checkerboards with as many corners; take another size, or boards with tags"
