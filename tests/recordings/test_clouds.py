@@ -417,6 +417,27 @@ def test_single_bad_times_are_left_out(write, read, case, every):
     assert any(left_out in note for note in notes)
 
 
+@pytest.mark.parametrize("odd", [0, 1, 7, 11])
+def test_a_cloud_of_other_fields_is_left_out(write, read, odd):
+    make, found = write.maker(), scans()
+    messages = packed(make, found, VELODYNE, lambda t, s: {"time": (t - s) * 1e-9})
+    messages[odd] = packed(make, found, PLAIN, lambda t, s: {})[odd]
+    stream, notes = read(messages)
+    assert stream.stamps_ns.tolist() == np.delete(found.stamps, odd).tolist()
+    assert f"1 clouds lack fields of the others and were left out, the first at {found.stamps[odd]} ns" in notes[0]
+
+
+@pytest.mark.parametrize("point_time", ["auto", "azimuth", "snapshot"])
+def test_clouds_that_are_all_stamped_alike(write, read, point_time):
+    make, found = write.maker(), scans()
+    still = Scans(np.full(SCANS, ORIGIN), found.since, found.xyz, found.ring)
+    messages = packed(make, still, VELODYNE, lambda t, s: {"time": (t - s) * 1e-9})
+    with pytest.raises(
+        RecordingError, match="the stamps of the first clouds do not go on .*; have the driver stamp each"
+    ):
+        read(messages, point_time=point_time)
+
+
 def test_empty_clouds_at_first(write, read):
     """A LiDAR that warms up; its driver sends clouds without fields."""
     make, found = write.maker(), scans()

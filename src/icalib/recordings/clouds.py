@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -42,11 +43,16 @@ def read_clouds(clouds: Iterator[PointCloud], lidar: Lidar, what: str) -> tuple[
     Raises RecordingError: fewer than two clouds with points, no coordinates, points whose times are not known.
     """
     ahead = _first_clouds(clouds, what)
-    timing, notes = _timing([cloud for cloud in ahead if len(cloud.points)], lidar, what)
+    alike, fields = _with_usual_fields(ahead)
+    timing, notes = _timing(alike, lidar, what)
     sieve = Sieve(lidar.near_m, lidar.far_m)
     stamps: list[int] = []
     parts: list[tuple[np.ndarray, np.ndarray]] = []
+    others: list[int] = []
     for cloud in chain(ahead, clouds):
+        if len(cloud.points) and not fields.issubset(cloud.points.dtype.names or ()):
+            others.append(cloud.stamp_ns)
+            continue
         stamp_ns, xyz, offset = cloud.stamp_ns, np.empty((0, 3), np.float32), np.empty(0, np.float32)
         if len(cloud.points):  # one without points may have no fields either
             xyz = coordinates(cloud, what)
@@ -54,11 +60,15 @@ def read_clouds(clouds: Iterator[PointCloud], lidar: Lidar, what: str) -> tuple[
         keep = sieve.keep(xyz, offset)
         stamps.append(stamp_ns)
         parts.append((xyz, offset) if keep.all() else (xyz[keep], offset[keep]))
-    del ahead
+    del ahead, alike
     stream = _joined(lidar, np.array(stamps, np.int64), parts)
     if lidar.point_time == "azimuth":
         period_s = float(np.median(np.diff(stream.stamps_ns))) * 1e-9
         np.multiply(stream.offset_s, np.float32(period_s), out=stream.offset_s)
+    if others:
+        notes += (
+            f"{what}: {len(others)} clouds lack fields of the others and were left out, the first at {others[0]} ns.",
+        )
     dropped = sieve.note(what)
     return stream, notes + ((dropped,) if dropped else ())
 
@@ -69,8 +79,8 @@ def timing_fields(clouds: Iterator[PointCloud], lidar: Lidar, what: str) -> tupl
 
     Raises RecordingError as `read_clouds`, where no field will do.
     """
-    ahead = [cloud for cloud in _first_clouds(clouds, what) if len(cloud.points)]
-    stamps_ns, scans = np.array([cloud.stamp_ns for cloud in ahead], np.int64), [cloud.points for cloud in ahead]
+    ahead, _ = _with_usual_fields(_first_clouds(clouds, what))
+    stamps_ns, scans = _stamps(ahead, what), [cloud.points for cloud in ahead]
     try:
         times, notes = find_point_times(what, stamps_ns, scans, lidar)
         return None, times.unit if notes else None
@@ -100,6 +110,13 @@ def _first_clouds(clouds: Iterator[PointCloud], what: str) -> list[PointCloud]:
     return found
 
 
+def _with_usual_fields(clouds: Sequence[PointCloud]) -> tuple[list[PointCloud], frozenset[str]]:
+    """Those of `clouds` that have points, with the fields that most of these have; and these fields."""
+    filled = [cloud for cloud in clouds if len(cloud.points)]
+    usual = Counter(cloud.points.dtype.names or () for cloud in filled).most_common(1)[0][0]
+    return [cloud for cloud in filled if set(usual).issubset(cloud.points.dtype.names or ())], frozenset(usual)
+
+
 def coordinates(cloud: PointCloud, what: str) -> np.ndarray:
     """(N, 3) float32 m. Raises RecordingError where the cloud has no x, y, z."""
     names = cloud.points.dtype.names or ()
@@ -114,9 +131,20 @@ def coordinates(cloud: PointCloud, what: str) -> np.ndarray:
     return xyz
 
 
+def _stamps(clouds: Sequence[PointCloud], what: str) -> np.ndarray:
+    """(S,) ns. Raises RecordingError where they do not go on."""
+    stamps_ns = np.array([cloud.stamp_ns for cloud in clouds], np.int64)
+    if len(stamps_ns) < 2 or np.median(np.diff(stamps_ns)) <= 0:
+        raise RecordingError(
+            f"{what}: the stamps of the first clouds do not go on ({stamps_ns[0]} ns, then {stamps_ns[-1]} ns); have "
+            "the driver stamp each cloud, and record again."
+        )
+    return stamps_ns
+
+
 def _timing(clouds: Sequence[PointCloud], lidar: Lidar, what: str) -> tuple[Timing, tuple[str, ...]]:
     """How points are timed, told from the first clouds."""
-    stamps_ns = np.array([cloud.stamp_ns for cloud in clouds], np.int64)
+    stamps_ns = _stamps(clouds, what)
     if lidar.point_time == "snapshot":
         note = f"{what}: all points of a cloud are taken at its stamp, as point_time says; motion within it is ignored."
         return _at_the_stamp, (note,)
