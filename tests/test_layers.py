@@ -17,6 +17,7 @@ LEVELS = {
     "errors": 0,
     "extras": 0,
     "geometry": 0,
+    "file_hashes": 0,
     "file_names": 0,
     "own_files": 0,
     "staging": 0,

@@ -28,10 +28,20 @@ def main(arguments: list[str] | None = None) -> int:
             print(f"Note: {note}")
         print(f"icalib: {error}", file=sys.stderr)
         return getattr(options, "error_code", 1)
+    except (OSError, MemoryError) as error:  # what fails outside of the program, and nobody expected there
+        print(f"icalib: {_outside(error)}", file=sys.stderr)
+        return getattr(options, "error_code", 1)
     except KeyboardInterrupt as stop:
         print(f"icalib: interrupted; {str(stop) or 'nothing was written.'}", file=sys.stderr)
         return 130
     return code or 0
+
+
+def _outside(error: OSError | MemoryError) -> str:
+    if isinstance(error, MemoryError):
+        return "the memory of this machine is not enough; use --from and --to, or a machine with more."
+    place = f"{error.filename} cannot be used: " if error.filename else ""
+    return f"{place}{error.strerror or error}; check files, permissions and disks."
 
 
 def _parser() -> argparse.ArgumentParser:

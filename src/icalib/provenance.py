@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import hashlib
 import platform
 from importlib.metadata import version
 from pathlib import Path
+
+from icalib.file_hashes import hash_of
 
 _LIBRARIES = ("numpy", "numba")
 
 
 def provenance(files: list[Path]) -> dict[str, str]:
     """File name -> sha256 of its bytes."""
-    return {str(f): _sha256(f) for f in files}
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:  # a bag may be larger than memory
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    return {str(f): hash_of(f).hexdigest() for f in files}
 
 
 def versions() -> dict[str, str]:

@@ -15,6 +15,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from icalib.file_hashes import HashedFile
+
 FREE_BYTES, RATIO = 16 << 20, 256  # sensors' data shrink to a tenth; images of one colour, and zeros, to less
 LIMIT_WORDS = f"{FREE_BYTES >> 20} MiB and {RATIO} times its size"
 _NOT_ARRAYS = (
@@ -66,7 +68,8 @@ def load_arrays(source: Path | bytes, names: Collection[str] | None = None) -> d
     in_memory = isinstance(source, bytes)
     stored = len(source) if in_memory else source.stat().st_size
     try:
-        with zipfile.ZipFile(io.BytesIO(source) if in_memory else source) as archive:
+        file = io.BytesIO(source) if in_memory else HashedFile(source)
+        with file, zipfile.ZipFile(file) as archive:
             members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
             wanted = [name for name in members if names is None or name in names]
             if sum(members[name].file_size for name in wanted) > most_bytes(stored):

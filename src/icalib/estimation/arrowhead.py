@@ -10,6 +10,7 @@ The number of pieces does not depend on the number of cores, so that the answer 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -36,6 +37,10 @@ SEGMENT = 512  # nodes at a time, where nothing is asked of the chain itself
 @cache
 def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(THREADS, thread_name_prefix="icalib")
+
+
+if hasattr(os, "register_at_fork"):  # its threads do not live on in a process that is forked
+    os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
 def in_parallel(function: Callable[..., T], items: Iterable) -> list[T]:

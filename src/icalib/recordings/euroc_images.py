@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from icalib.errors import RecordingError
+from icalib.file_hashes import hash_of
 from icalib.recordings.clocks import nanoseconds, unit_by_date, unit_of_stamps
 from icalib.recordings.image_checks import Note, ignore
 from icalib.recordings.images import Payload, file_payload
@@ -35,7 +36,7 @@ def image_files(folder: Path, note: Note = ignore) -> list[tuple[int, Path]]:
         return _with_other_endings(_listed(table, data), there, table, note)
     if named := stamped_by_name(there):
         return named
-    unnamed = next((p for p in there if not p.stem.isdecimal()), None)
+    unnamed = next((p for p in there if not (p.stem.isdecimal() and int(p.stem) < 2**63)), None)
     if unnamed:
         raise RecordingError(f"{folder} has no data.csv, and {unnamed.name} is no stamp in ns; write t [ns],file name.")
     return sorted((int(p.stem), p) for p in there)
@@ -65,6 +66,8 @@ def file_payloads(files: list[tuple[int, Path]], where: str, note: Note) -> Iter
     pointers: list[str] = []
     for stamp_ns, path in files:
         data = path.read_bytes() if path.is_file() else b""
+        if data:
+            hash_of(path).saw(0, data)
         if sentence := not_data(path, data[:HEAD_BYTES]):
             pointers.append(sentence)
         elif data:

@@ -7,7 +7,15 @@ from collections.abc import Callable, Iterable, Iterator
 import numpy as np
 
 from icalib.errors import RecordingError
-from icalib.recordings.images import DamagedImageError, Frame, Payload, decode, is_known, unknown_encoding
+from icalib.recordings.images import (
+    NO_PICTURE,
+    DamagedImageError,
+    Frame,
+    Payload,
+    decode,
+    is_known,
+    unknown_encoding,
+)
 
 Note = Callable[[str], None]
 _LATE_NS = 1_000_000_000  # beyond, images did not overtake each other: the clock was set back
@@ -20,9 +28,9 @@ def ignore(sentence: str) -> None:
 def checked_payloads(payloads: Iterable[Payload], where: str, note: Note) -> Iterator[Payload]:
     """`payloads` with strictly increasing stamps and one resolution; a note on what was left out, at the end.
 
-    Left out: images of zeros, exact repetitions of the image before (the camera froze), images that come after a later
-    one. Raises RecordingError naming `where` and the instant: an unknown encoding, two resolutions, a clock that was
-    set back, no usable image.
+    Left out: files that are no pictures, images of zeros, exact repetitions of the image before (the camera froze),
+    images that come after a later one. Raises RecordingError naming `where` and the instant: an unknown encoding, two
+    resolutions, a clock that was set back, no usable image.
     """
     dropped = _Dropped()
     kept = 0
@@ -30,6 +38,9 @@ def checked_payloads(payloads: Iterable[Payload], where: str, note: Note) -> Ite
     for payload in payloads:
         if not np.frombuffer(payload.data, np.uint8).any():
             dropped.add("consist of zeros", payload)
+            continue
+        if payload.encoding == NO_PICTURE:
+            dropped.add("are no pictures", payload, unknown_encoding(payload))
             continue
         if not is_known(payload.encoding):
             raise RecordingError(unknown_encoding(payload))
@@ -44,6 +55,8 @@ def checked_payloads(payloads: Iterable[Payload], where: str, note: Note) -> Ite
         last = payload
         kept += 1
         yield payload
+    if not kept and dropped.first_error:
+        raise RecordingError(dropped.first_error)
     _refuse_too_few(kept, dropped, where)
     dropped.note(where, note)
 

@@ -12,6 +12,7 @@ import numpy as np
 from icalib.errors import RecordingError
 from icalib.extras import load_cv2
 
+NO_PICTURE = "unknown"  # the encoding of a file that is neither JPEG nor PNG
 Convert = Callable[[np.ndarray, Any], np.ndarray]
 
 
@@ -115,7 +116,7 @@ def _file_format(data: bytes, words: list[str]) -> str:
     for name in ("jpeg", "png"):
         if name in words or (name == "jpeg" and "jpg" in words):
             return name
-    return " ".join(words) or "unknown"
+    return " ".join(words) or NO_PICTURE
 
 
 def _decode_file(payload: Payload) -> np.ndarray:

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from icalib.errors import RecordingError
+from icalib.file_hashes import hash_of
 from icalib.recordings.clocks import POWERS_OF_NS, UNIT_WORDS, TimeUnit, unit_of_stamps, usual_step
 from icalib.recordings.columns import TableKind, contradicts, places_by_name, places_given
 from icalib.recordings.image_checks import Note, ignore
@@ -117,6 +118,7 @@ def _text_of(path: Path) -> _Text:
 def _read_bytes(path: Path) -> bytes:
     try:
         content = path.read_bytes()
+        hash_of(path).saw(0, content)
         if path.suffix == ".gz" or content.startswith(_GZIP_MAGIC):
             content = gunzipped(content)
     except TooLargeError as error:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from icalib.errors import RecordingError, RigError
 from icalib.extras import load_zstd
+from icalib.file_hashes import HashedFile
 from icalib.recordings.bags.mcap import MCAP_MAGIC, McapStorage
 from icalib.recordings.bags.ros1 import ROS1_MAGIC, Ros1Storage
 from icalib.recordings.bags.sqlite import SQLITE_MAGIC, SqliteStorage
@@ -82,7 +83,7 @@ def _open_compressed(path: Path) -> Storage:
     folder = tempfile.mkdtemp(prefix="icalib-")
     copy = Path(folder) / path.stem
     try:
-        with zstd.open(path, "rb") as packed, copy.open("wb") as out:
+        with HashedFile(path) as file, zstd.open(file, "rb") as packed, copy.open("wb") as out:
             copy_unpacked(packed, out, path.stat().st_size)
     except TooLargeError as error:
         shutil.rmtree(folder)

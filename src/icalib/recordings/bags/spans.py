@@ -12,6 +12,7 @@ from typing import Any, BinaryIO
 
 from icalib.errors import RecordingError
 from icalib.extras import load_lz4, load_zstd
+from icalib.file_hashes import hash_of
 from icalib.recordings.bags.storage import Connection, Tally, cut_note
 from icalib.unpacking import TooLargeError, unpacked
 
@@ -48,6 +49,7 @@ class SpanStorage(ABC):
         self.name = name
         self.connections: dict[int, Connection] = {}
         self.notes: list[str] = []
+        self._hash = hash_of(path)
         self.spans: list[Span] = []
         with path.open("rb") as file:
             size = path.stat().st_size
@@ -88,7 +90,7 @@ class SpanStorage(ABC):
 
     def _messages_of(self, file: BinaryIO, span: Span) -> Iterator[tuple[int, int, memoryview]]:
         try:
-            yield from self._walk(_body(file, span))
+            yield from self._walk(self._body(file, span))
         except _UnknownCompressionError as error:
             raise RecordingError(
                 f"{self.name} is compressed by {str(error)!r}, which icalib cannot read; use zstd, lz4 or none."
@@ -99,6 +101,16 @@ class SpanStorage(ABC):
             note = f"{self.name}: the block at byte {span.offset} {what}"
             if not span.cut and note not in self.notes:
                 self.notes.append(note)
+
+    def _body(self, file: BinaryIO, span: Span) -> memoryview:
+        """The records of a block; of a block that was cut off, as far as it can be decompressed."""
+        file.seek(span.offset)
+        stored = file.read(span.size)
+        self._hash.saw(span.offset, stored, file)
+        body = stored if span.compression in ("", "none") else _decompress(stored, span.compression)
+        if span.crc and zlib.crc32(body) != span.crc:
+            raise DamageError
+        return memoryview(body)
 
     def _scan_to_the_end(self, file: BinaryIO, size: int) -> int | None:
         """Where the file is cut off, None if it is whole."""
@@ -115,16 +127,6 @@ class SpanStorage(ABC):
         span.tally = {}
         for connection, received_ns, _ in self._messages_of(file, span):
             span.count(connection, received_ns)
-
-
-def _body(file: BinaryIO, span: Span) -> memoryview:
-    """The records of a block; of a block that was cut off, as far as it can be decompressed."""
-    file.seek(span.offset)
-    stored = file.read(span.size)
-    body = stored if span.compression in ("", "none") else _decompress(stored, span.compression)
-    if span.crc and zlib.crc32(body) != span.crc:
-        raise DamageError
-    return memoryview(body)
 
 
 def _decompress(stored: bytes, compression: str) -> bytes:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import final
 
 from icalib.errors import RecordingError
+from icalib.file_hashes import hash_of
 from icalib.recordings.bags.storage import Connection, Tally, cut_note, full_type
 
 SQLITE_MAGIC = b"SQLite format 3\x00"
@@ -45,6 +46,7 @@ class SqliteStorage:
     def messages(self, wanted: Set[int]) -> Iterator[tuple[int, int, bytes]]:
         marks = ",".join("?" * len(wanted))
         query = f"SELECT topic_id, timestamp, data FROM messages WHERE id <= ? AND topic_id IN ({marks}) ORDER BY id"
+        hash_of(self.path).read_beside()
         with closing(self._connect()) as database:
             try:
                 yield from database.execute(query, (self._last_id, *wanted))
