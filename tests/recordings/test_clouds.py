@@ -417,6 +417,23 @@ def test_single_bad_times_are_left_out(write, read, case, every):
     assert any(left_out in note for note in notes)
 
 
+def test_bytes_that_are_no_numbers(write, read):
+    """NaN that signal, where hardware left rubbish: no warning of numpy's. Coordinates beyond float32."""
+
+    def with_rubbish(t, s):
+        time = ((t - s) * 1e-9).astype(np.float32)
+        time.view(np.uint32)[[5, 9]] = 0x7F800001, 0xFF812345
+        return {"time": time}
+
+    wide = np.dtype([("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("time", "<f4")])
+    for dtype in (VELODYNE, wide):
+        found = scans()
+        found.xyz[2, 0] = 3e38
+        stream, notes = read(packed(write.maker(), found, dtype, with_rubbish))
+        assert len(stream.xyz) == found.xyz.shape[0] * found.xyz.shape[1] - 2 * SCANS - 1
+        assert f"1 without numbers, {2 * SCANS} without a time within their scan were left out" in notes[0]
+
+
 @pytest.mark.parametrize("odd", [0, 1, 7, 11])
 def test_a_cloud_of_other_fields_is_left_out(write, read, odd):
     make, found = write.maker(), scans()

@@ -30,6 +30,12 @@ class PointCloud:
     points: np.ndarray
     height: int = 1
 
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Those of a single number for each point."""
+        kind = self.points.dtype
+        return tuple(name for name in kind.names or () if not kind[name].shape)
+
 
 Timing = Callable[
     [PointCloud, np.ndarray], tuple[int, np.ndarray]
@@ -50,7 +56,7 @@ def read_clouds(clouds: Iterator[PointCloud], lidar: Lidar, what: str) -> tuple[
     parts: list[tuple[np.ndarray, np.ndarray]] = []
     others: list[int] = []
     for cloud in chain(ahead, clouds):
-        if len(cloud.points) and not fields.issubset(cloud.points.dtype.names or ()):
+        if len(cloud.points) and not fields.issubset(cloud.fields):
             others.append(cloud.stamp_ns)
             continue
         stamp_ns, xyz, offset = cloud.stamp_ns, np.empty((0, 3), np.float32), np.empty(0, np.float32)
@@ -113,16 +119,16 @@ def _first_clouds(clouds: Iterator[PointCloud], what: str) -> list[PointCloud]:
 def _with_usual_fields(clouds: Sequence[PointCloud]) -> tuple[list[PointCloud], frozenset[str]]:
     """Those of `clouds` that have points, with the fields that most of these have; and these fields."""
     filled = [cloud for cloud in clouds if len(cloud.points)]
-    usual = Counter(cloud.points.dtype.names or () for cloud in filled).most_common(1)[0][0]
-    return [cloud for cloud in filled if set(usual).issubset(cloud.points.dtype.names or ())], frozenset(usual)
+    usual = frozenset(Counter(cloud.fields for cloud in filled).most_common(1)[0][0])
+    return [cloud for cloud in filled if usual.issubset(cloud.fields)], usual
 
 
 def coordinates(cloud: PointCloud, what: str) -> np.ndarray:
     """(N, 3) float32 m. Raises RecordingError where the cloud has no x, y, z."""
-    names = cloud.points.dtype.names or ()
-    if any(axis not in names for axis in "xyz"):
+    if any(axis not in cloud.fields for axis in "xyz"):
+        names = ", ".join(cloud.fields)
         raise RecordingError(
-            f"{what}: the points at {cloud.stamp_ns} ns have no x, y, z, but {', '.join(names)}; choose another topic."
+            f"{what}: the points at {cloud.stamp_ns} ns have no x, y, z, but {names}; choose another topic."
         )
     xyz = np.empty((len(cloud.points), 3), np.float32)
     with np.errstate(over="ignore", invalid="ignore"):  # 1e300 m becomes infinite

@@ -35,6 +35,7 @@ UNIT_NS: dict[TimeUnit, int] = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_00
 LONGEST_PERIODS = 1.7  # how long a scan may take: up to scans that overlap
 _SHORTEST_PERIODS = 0.02  # a narrow sector of a turn; shorter ones are in another unit, or a flash
 _UNIT_FIT = 1.5  # how far the unit of absolute times may be off what the stamps say
+_MOST = 1e25  # ns since 1970 are some 1e18
 _BULK = (5.0, 95.0)  # per cent: the times of a scan without the few that may be wrong
 _LIKE_A_TIME = re.compile(r"time|stamp|offset|curvature|(^|_)(t|ts|dt|s|ms|us|ns|[mun]?secs?)\d*(_|$)", re.IGNORECASE)
 _NO_TIMES = {"x", "y", "z", "intensity", "reflectivity", "ring", "line", "tag", "range", "rgb", "rgba"}
@@ -56,7 +57,7 @@ class PointTimes:
         """The stamp of a scan and seconds (N,) float32 from it to each point, NaN where it has no time, or one that
         cannot be its scan's. stamp_ns: of the message; values (N,): of the field."""
         unit_ns = UNIT_NS[self.unit]
-        times = values.astype(np.float64)
+        times = _decimal(values)
         timed = _timed(times, self.absolute)
         timed[timed] = within_scan(times[timed], self.longest_s * 1e9 / unit_ns)
         if not timed.any():
@@ -92,7 +93,7 @@ def find_point_times(
     Raises RecordingError naming `what`: no field with times, or one that says nothing, or fits in no unit.
     """
     field = _field(what, scans, lidar)
-    times = [scan[field].astype(np.float64) for scan in scans]
+    times = [_decimal(scan[field]) for scan in scans]
     used = [t[_timed(t, True)] for t in times if _timed(t, True).any()]
     period_s = float(np.median(np.diff(stamps_ns))) * 1e-9
     if (ends := _of_a_clock(used, period_s)) is not None:
@@ -196,7 +197,14 @@ def _usual_unit(field: str, whole: bool) -> TimeUnit:
 def _differing(scans: Sequence[np.ndarray]) -> list[str]:
     """Fields of plain numbers that differ from point to point, in most scans."""
     plain = [n for n in scans[0].dtype.names or () if scans[0][n].ndim == 1]
-    return [n for n in plain if np.median([_differ(scan[n]) for scan in scans]) > 0]
+    return [n for n in plain if np.median([_differ(_decimal(scan[n])) for scan in scans]) > 0]
+
+
+def _decimal(values: np.ndarray) -> np.ndarray:
+    """float64, NaN where there is no number or one beyond all clocks."""
+    with np.errstate(invalid="ignore"):  # some bytes are NaN that signal
+        times = values.astype(np.float64)
+        return np.where(np.abs(times) < _MOST, times, np.nan)
 
 
 def _differ(values: np.ndarray) -> bool:
