@@ -9,29 +9,52 @@ import numpy as np
 from icalib.errors import EstimationError
 from icalib.estimation.imu_data import ImuData
 from icalib.first_guess.correlation import Shift, best_shifts
+from icalib.first_guess.slow_rates import slow_offsets
 
 GRID_HZ = 100.0
-LONGEST_STEP_S = 0.25  # images further apart do not give an angular rate
+LONGEST_STEP_S = 0.25  # images further apart do not give an angular rate, unless all are:
+USUAL_STEPS, SLOWEST_STEP_S = 1.5, 2.0  # then this many usual steps are near, up to 2 s; further apart motion is lost
 SHORTEST_OVERLAP_S = 4.0
 LEAST_CORRELATION = 0.7
 MOST_PEAKS, PEAKS_APART_S = 5, 0.25  # of the correlation, that are tried
 AVERAGED_S = 0.25  # over which the two are compared
+MOST_LEFT = 0.5  # of the spread of angles turned in long intervals
 
 
 @dataclass(frozen=True)
 class CameraRates:
     """Mean angular rates between neighbouring images: start, end (n,) camera clock [s]; rate (n, 3) camera axes
-    [rad/s]; least_correlation: with the IMU's, below which the two do not match."""
+    [rad/s]; least_correlation: with the IMU's, below which the two do not match; longest_step_s: between neighbours."""
 
     start: np.ndarray
     end: np.ndarray
     rate: np.ndarray
     least_correlation: float = LEAST_CORRELATION
+    longest_step_s: float = LONGEST_STEP_S
+
+    @property
+    def are_slow(self) -> bool:
+        """Whether their intervals are so long that the rate changes much in them."""
+        return self.longest_step_s > LONGEST_STEP_S
+
+
+def longest_step(name: str, seconds: np.ndarray, what: str, slowest_s: float = SLOWEST_STEP_S) -> float:
+    """How far apart neighbours among instants (n,) [s] may be to give an angular rate: a slow stream is no row of gaps.
+    what: the word for its readings. Raises EstimationError where its usual step is longer than slowest_s."""
+    usual = float(np.median(np.diff(seconds)))
+    if usual > slowest_s:
+        raise EstimationError(
+            f"{name}: {1.0 / usual:.2g} {what} a second, and {1.0 / slowest_s:g} are needed to follow its motion; "
+            "record more often."
+        )
+    return min(max(LONGEST_STEP_S, USUAL_STEPS * usual), slowest_s)
 
 
 def likely_offsets(imu: ImuData, name: str, rates: CameraRates) -> list[float]:
     """Offsets [s] at peaks of the masked, normalised cross-correlation of |w| over all shifts, of rates as they are or
     of their means, whichever is higher at its best: fast motion shows in the ones, slow motion in the others."""
+    if rates.are_slow:
+        return _slow(imu, name, rates)
     peaks = max(_shifts(imu, rates), key=lambda p: _likeness(p[0]))
     if not peaks[0].correlation > rates.least_correlation:
         raise EstimationError(
@@ -42,8 +65,24 @@ def likely_offsets(imu: ImuData, name: str, rates: CameraRates) -> list[float]:
     return [p.samples / GRID_HZ for p in peaks if p.correlation > rates.least_correlation]
 
 
+def _slow(imu: ImuData, name: str, rates: CameraRates) -> list[float]:
+    """The same of slow rates, by how far was turned in each interval."""
+    found = slow_offsets(imu, rates.start, rates.end, rates.rate)
+    alike = [offset for offset, left in found if left < MOST_LEFT]
+    if not alike:
+        left = f"{found[0][1]:.0%} of the angles is left at best" if found else "their clocks do not overlap"
+        raise EstimationError(
+            f"the turns of {name}, {USUAL_STEPS / rates.longest_step_s:.2g} a second, do not match those of {imu.name} "
+            f"at any shift of their clocks ({left}); check that both come from the same recording, overlap, and "
+            "are in rad/s, or record more a second."
+        )
+    return alike
+
+
 def best_offsets(imu: ImuData, rates: CameraRates) -> list[float]:
     """Offsets [s] at which rates, and means of them, go together best, however little that is."""
+    if rates.are_slow:
+        return [offset for offset, _ in slow_offsets(imu, rates.start, rates.end, rates.rate)]
     return [p[0].samples / GRID_HZ for p in _shifts(imu, rates) if np.isfinite(p[0].correlation)]
 
 
@@ -56,7 +95,7 @@ def _peaks(imu: ImuData, rates: CameraRates, count: int) -> list[Shift]:
     their median, whichever is more alike: the one has a bias in it, the other lacks what is steady in a turn."""
     known = ~np.isin(imu.seconds, [start for start, _ in imu.gaps])
     middle = 0.5 * (rates.start + rates.end)
-    near = np.diff(middle, append=middle[-1]) < LONGEST_STEP_S
+    near = np.diff(middle, append=middle[-1]) < rates.longest_step_s
     seen = _grid(middle, rates.rate, near, count)
     own = (_grid(imu.seconds, imu.gyro - about, known, count) for about in (0.0, np.median(imu.gyro, axis=0)))
     least, apart = SHORTEST_OVERLAP_S * GRID_HZ, round(PEAKS_APART_S * GRID_HZ)

@@ -12,17 +12,19 @@ from icalib.errors import EstimationError
 from icalib.estimation.imu_data import ImuData
 from icalib.first_guess.clock_shifts import (
     AVERAGED_S,
-    LONGEST_STEP_S,
     CameraRates,
     at,
     best_offsets,
     likely_offsets,
+    longest_step,
     means,
 )
+from icalib.first_guess.slow_rates import ChainedRates
 from icalib.first_guess.target_poses import TargetPoses
 from icalib.geometry import so3
 from icalib.measurements import CornerStream
 
+FEWEST_PAIRS = 20  # of neighbouring images
 LARGEST_UNEXPLAINED = 0.35  # of the angular rate
 CLOCKS_AGREE_S = 0.01  # of the time offsets that two recordings show
 CLEARLY_BETTER = 0.5  # of what another offset leaves unexplained
@@ -60,14 +62,16 @@ def camera_rates(stream: CornerStream, poses: TargetPoses) -> CameraRates:
             "and the intrinsics in the rig file."
         )
     a, b = index[:-1], index[1:]
-    near = t[b] - t[a] <= LONGEST_STEP_S
+    longest = longest_step(stream.name, t[index], "images of the target")
+    near = t[b] - t[a] <= longest
     a, b = a[near], b[near]
-    if len(a) < 20:
+    if len(a) < FEWEST_PAIRS:
         raise EstimationError(
-            f"{stream.name}: too few neighbouring images show the target; record for at least ten seconds."
+            f"{stream.name}: too few neighbouring images show the target, {len(a)} pairs no more than {longest:.3g} s "
+            f"apart, and {FEWEST_PAIRS} are needed; record for at least ten seconds."
         )
     turn = so3.log_many(np.ascontiguousarray(poses.rotation[a].transpose(0, 2, 1) @ poses.rotation[b]))
-    return CameraRates(t[a], t[b], turn / (t[b] - t[a])[:, None])
+    return CameraRates(t[a], t[b], turn / (t[b] - t[a])[:, None], longest_step_s=longest)
 
 
 def align(imu: ImuData, name: str, rates: CameraRates, given_offset: float | None) -> Alignment:
@@ -144,8 +148,7 @@ def _side_by_side(imu: ImuData, rates: CameraRates, offset: float) -> tuple[np.n
     between neighbours has little but noise where the target is far or the motion slow."""
     inside = _covered(imu, rates, offset)
     start, end = rates.start[inside], rates.end[inside]
-    angle = _integral(imu)
-    gyro = (at(imu.seconds, angle, end + offset) - at(imu.seconds, angle, start + offset)) / (end - start)[:, None]
+    gyro = _interval_rates(imu, rates).over(start + offset, end + offset)
     count = min(max(1, round(AVERAGED_S / float(np.median(end - start)))), len(start))
     return means(gyro, count), means(rates.rate[inside], count)
 
@@ -205,23 +208,44 @@ def _rough(offset: float, gyro: np.ndarray, seen: np.ndarray) -> Alignment:
     return Alignment(offset, *_kabsch(gyro, seen, np.ones(len(gyro))))
 
 
-def _integral(imu: ImuData) -> np.ndarray:
-    """(N, 3) of the angular rate from the first reading to each, rad."""
-    angle = np.zeros((len(imu.seconds), 3))
-    angle[1:] = np.cumsum(0.5 * (imu.gyro[1:] + imu.gyro[:-1]) * np.diff(imu.seconds)[:, None], axis=0)
-    return angle
+@dataclass(frozen=True)
+class _MeanRates:
+    """Mean rates of the gyroscope over intervals, start to end (n,) on its clock [s]; angle (N, 3) rad: the integral of
+    its readings from the first to each."""
+
+    imu: ImuData
+    angle: np.ndarray
+
+    @classmethod
+    def of(cls, imu: ImuData) -> _MeanRates:
+        angle = np.zeros((len(imu.seconds), 3))
+        angle[1:] = np.cumsum(0.5 * (imu.gyro[1:] + imu.gyro[:-1]) * np.diff(imu.seconds)[:, None], axis=0)
+        return cls(imu, angle)
+
+    def over(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+        """(n, 3) rad/s."""
+        t = self.imu.seconds
+        return (at(t, self.angle, end) - at(t, self.angle, start)) / (end - start)[:, None]
+
+    def slope(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+        """(n, 3) rad/s^2: how they change where both ends are later."""
+        t, gyro = self.imu.seconds, self.imu.gyro
+        return (at(t, gyro, end) - at(t, gyro, start)) / (end - start)[:, None]
+
+
+def _interval_rates(imu: ImuData, rates: CameraRates) -> _MeanRates | ChainedRates:
+    """What compares with rates over such intervals."""
+    return ChainedRates.of(imu) if rates.are_slow else _MeanRates.of(imu)
 
 
 def _refine(imu: ImuData, rates: CameraRates, rough: Alignment, keep_offset: bool) -> Alignment:
     """Gauss-Newton on the offset, Kabsch on rotation and bias in turn; rates are means over each image interval."""
-    angle = _integral(imu)
+    measured = _interval_rates(imu, rates)
     offset, R, bias, residual = rough.offset, rough.rotation, rough.gyro_bias, np.zeros_like(rates.rate)
     for _ in range(ROUNDS):
         start, end = rates.start + offset, rates.end + offset
         inside = _covered(imu, rates, offset).astype(float)
-        span = (end - start)[:, None]
-        mean = (at(imu.seconds, angle, end) - at(imu.seconds, angle, start)) / span
-        slope = (at(imu.seconds, imu.gyro, end) - at(imu.seconds, imu.gyro, start)) / span
+        mean, slope = measured.over(start, end), measured.slope(start, end)
         weight = inside
         for _ in range(3):
             residual = mean - rates.rate @ R.T - bias
@@ -293,8 +317,10 @@ def as_given(imu: ImuData, name: str, rates: CameraRates, offset: float, rotatio
     inside = _covered(imu, rates, offset)
     if not inside.any():
         raise _no_overlap(imu, name)
-    middle = (0.5 * (rates.start + rates.end) + offset)[inside]
-    gyro = at(imu.seconds, imu.gyro, middle)
+    if rates.are_slow:
+        gyro = _interval_rates(imu, rates).over(rates.start[inside] + offset, rates.end[inside] + offset)
+    else:
+        gyro = at(imu.seconds, imu.gyro, (0.5 * (rates.start + rates.end) + offset)[inside])
     return Alignment(offset, rotation, np.median(gyro - rates.rate[inside] @ rotation.T, axis=0), given=True)
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation.imu_data import ImuData
+from icalib.first_guess.clock_shifts import USUAL_STEPS
 from icalib.first_guess.gyro import GyroRotation
 from icalib.first_guess.target_poses import TargetPoses
 
@@ -106,13 +107,17 @@ def size_of(rows: np.ndarray, rhs: np.ndarray, felt: np.ndarray) -> tuple[float,
 
 
 def _triples(t: np.ndarray, gaps: tuple[tuple[float, float], ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Images (i, j, k) about STEP_S apart, within a factor of two, and no part of them in a gap of the IMU."""
+    """Images (i, j, k) about STEP_S apart, within a factor of two, or neighbours where most are further apart, and no
+    part of them in a gap of the IMU."""
     i = np.arange(len(t))
     j = np.searchsorted(t, t + STEP_S - 1e-3)
     k = np.searchsorted(t, t + 2 * STEP_S - 1e-3)
+    longest, usual = 2 * STEP_S, float(np.median(np.diff(t))) if len(t) > 1 else 0.0
+    if usual > STEP_S:
+        k, longest = np.maximum(k, j + 1), max(longest, USUAL_STEPS * usual)
     good = (k < len(t)) & (j < k) & (i < j)
     i, j, k = i[good], j[good], k[good]
-    close = (t[j] - t[i] < 2 * STEP_S) & (t[k] - t[j] < 2 * STEP_S)
+    close = (t[j] - t[i] < longest) & (t[k] - t[j] < longest)
     for start, end in gaps:
         close &= (t[k] <= start) | (t[i] >= end)
     return i[close], j[close], k[close]

@@ -25,7 +25,7 @@ from icalib.first_guess.by_recording import (
     motion_alone,
     naming_recording,
 )
-from icalib.first_guess.clock_shifts import LEAST_CORRELATION, LONGEST_STEP_S, CameraRates
+from icalib.first_guess.clock_shifts import LEAST_CORRELATION, CameraRates, longest_step
 from icalib.first_guess.clocks import Alignment
 from icalib.first_guess.gyro import GyroRotation
 from icalib.first_guess.lever_arm import SIZE_TOLERANCE, size_of
@@ -133,17 +133,17 @@ def _state_of_one(inputs: Inputs, held: Held | None) -> State:
 def pose_rates(stream: PoseStream) -> CameraRates:
     """Mean angular rates over windows of about WINDOW_S, one from each pose. Raises EstimationError where there are
     hardly any."""
-    check_rate(stream)
     t, R = stream.seconds, stream.rotation
     a = np.arange(len(t))
     b = np.searchsorted(t, t + WINDOW_S - 1e-9)
     a, b = a[b < len(t)], b[b < len(t)]
-    near = t[b] - t[a] <= LONGEST_STEP_S
+    longest = longest_step(stream.name, t, "poses")
+    near = t[b] - t[a] <= longest
     a, b = a[near], b[near]
     if len(a) < FEWEST_WINDOWS:
         raise EstimationError(
-            f"{stream.name}: hardly any of its {len(t)} poses are closer than {LONGEST_STEP_S} s to the next; check "
-            "its stamps, or record for longer."
+            f"{stream.name}: hardly any of its {len(t)} poses are closer than {longest:.3g} s to the next, "
+            f"{len(a)}, and {FEWEST_WINDOWS} are needed; record for longer."
         )
     turn = so3.log_many(np.ascontiguousarray(R[a].transpose(0, 2, 1) @ R[b]))
     if not np.linalg.norm(turn, axis=1).max() > 0.0:
@@ -151,7 +151,7 @@ def pose_rates(stream: PoseStream) -> CameraRates:
             f"{stream.name}: its rotation is the same in all poses, as where only positions are measured; a pose "
             "sensor needs both."
         )
-    return CameraRates(t[a], t[b], turn / (t[b] - t[a])[:, None], LEAST_CORRELATION)
+    return CameraRates(t[a], t[b], turn / (t[b] - t[a])[:, None], LEAST_CORRELATION, longest)
 
 
 def check_rate(stream: PoseStream) -> None:

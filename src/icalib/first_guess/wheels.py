@@ -17,6 +17,8 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation.imu_data import ImuData
+from icalib.estimation.wheel_intervals import LONGEST_S
+from icalib.first_guess.clock_shifts import LONGEST_STEP_S, longest_step
 from icalib.first_guess.correlation import best_shift
 from icalib.rig import WheelKind
 
@@ -25,7 +27,6 @@ SHORTEST_OVERLAP_S = 4.0
 LEAST_CORRELATION = 0.7
 WINDOW_S = 0.1  # of a mean rate of the wheels: long against the steps of ticks
 LEAST_WINDOWS = 20
-LONGEST_STEP_S = 0.25  # stamps further apart do not give a rate
 LEAST_TURN_RAD_S = 0.03  # RMS
 LEAST_SPEED_M_S = 0.05
 STILL_SHARE = 0.02  # of the other wheel's rate
@@ -56,6 +57,7 @@ class WheelRates:
     end: np.ndarray
     rate: np.ndarray
     kind: WheelKind = "pair"
+    longest_step_s: float = LONGEST_STEP_S
 
     @property
     def turning(self) -> np.ndarray:
@@ -90,17 +92,18 @@ def wheel_rates(name: str, seconds: np.ndarray, integrals: np.ndarray, kind: Whe
     b = np.searchsorted(seconds, seconds + WINDOW_S - 1e-9)
     good = (b < len(seconds)) & (b > a)
     a, b = a[good], b[good]
-    near = seconds[b] - seconds[a] < LONGEST_STEP_S
+    longest = longest_step(name, seconds, "readings", LONGEST_S)
+    near = seconds[b] - seconds[a] <= longest
     a, b = a[near], b[near]
     if len(a) < LEAST_WINDOWS:
         raise EstimationError(
-            f"{name}: hardly any of its {len(seconds)} readings are closer than {LONGEST_STEP_S} s to the next; check "
-            "its stamps, or record for longer."
+            f"{name}: hardly any of its {len(seconds)} readings are closer than {longest:.3g} s to the "
+            f"next, {len(a)}, and {LEAST_WINDOWS} are needed; record for longer."
         )
     span = seconds[b] - seconds[a]
     rate = (integrals[b] - integrals[a]) / span[:, None]
     _check_turning(name, rate, kind)
-    return WheelRates(seconds[a], seconds[b], rate, kind)
+    return WheelRates(seconds[a], seconds[b], rate, kind, longest)
 
 
 def _check_turning(name: str, rate: np.ndarray, kind: WheelKind) -> None:
@@ -299,10 +302,13 @@ def _correlate(imu: ImuData, turn: np.ndarray, name: str, rates: WheelRates) -> 
         known &= (grid <= start) | (grid >= end)
     middle = 0.5 * (rates.start + rates.end)
     wheels = np.arange(int(middle[-1] * GRID_HZ) + 1) / GRID_HZ
-    near = np.diff(middle, append=middle[-1]) < LONGEST_STEP_S
+    near = np.diff(middle, append=middle[-1]) < rates.longest_step_s
     seen = (np.interp(wheels, middle, near.astype(float)) > 0.99) & (wheels >= middle[0])
     turning = np.interp(wheels, middle, rates.turn)
     turned = np.interp(grid, imu.seconds, turn)
+    if rates.longest_step_s > LONGEST_STEP_S:  # over which the wheels' rates are means
+        count = max(1, round(float(np.median(rates.end - rates.start)) * GRID_HZ))
+        turned = np.convolve(turned, np.full(count, 1.0 / count), "same")
     found, opposite = (
         best_shift(sign * turned, known, turning, seen, SHORTEST_OVERLAP_S * GRID_HZ) for sign in (1.0, -1.0)
     )

@@ -9,10 +9,12 @@ import numpy as np
 from icalib.errors import RecordingError
 from icalib.measurements import WheelPoses, WheelStream, seconds_since
 from icalib.recordings.bad_wheels import apart, comes_back, counter_of, range_of, without_wraps
+from icalib.recordings.clocks import usual_step
 from icalib.recordings.ordered import kept_readings, longest_run
 from icalib.recordings.wheels import RATE_HZ, WheelReadings
 from icalib.rig import RATE_UNITS, Wheels
 
+_LEAST_HZ = 2.0  # the motion over longer periods is not followed by the estimate
 _FASTEST_RAD_S = 200.0  # a wheel of 0.1 m at 72 km/h; slow robots reach it in deg/s
 _FASTEST_M_S, _FASTEST_YAW_RAD_S = 70.0, 15.0  # 250 km/h; a robot that spins in place twice a second
 _STEEPEST_RAD = 1.4
@@ -40,6 +42,11 @@ def checked_wheels(
     read, broken = _finite(read, what)
     own = "write the encoders' own stamps"
     kept, notes = kept_readings(read.stamps_ns, read.value, what, RATE_HZ, "reading", own)
+    if (rate_hz := 1e9 / usual_step(read.stamps_ns)) < _LEAST_HZ:
+        raise RecordingError(
+            f"{what}: {rate_hz:.2g} readings a second, and {_LEAST_HZ:g} are needed to follow the wheels; record more "
+            "often."
+        )
     read = _signed(_some(read, kept), wheels, what)
     read, apart_notes = (_even_rates if wheels.measures in ("rates", "twist") else _mean_rates)(read, wheels, what)
     rate = _combined(read.value, wheels)
