@@ -9,6 +9,7 @@ import numpy as np
 
 from icalib.errors import RecordingError
 from icalib.measurements import ImuStream
+from icalib.recordings.imu_cleaning import in_time, without_wrong
 from icalib.recordings.imu_halves import RATE_HZ, ImuHalves, one_stream
 from icalib.recordings.imu_units import in_si, recognised_unit
 from icalib.recordings.jumps import ClockJumps
@@ -52,19 +53,25 @@ def checked_imu(imu: ImuStream, where: str, sensor: ImuSensor | None = None) -> 
     """`imu` with strictly increasing stamps, in SI units, and notes on what was dropped, converted or looks saturated.
     `sensor` says what units and axes the rig file gives the readings.
 
-    Raises RecordingError naming `where` (the file) and the instant: too few readings, NaN, stamps out of order or
-    repeated with other values, a frozen sensor, other units of time, angular rate or acceleration.
+    Single wrong readings and copies are left out; uneven stamps of even readings are made even.
+
+    Raises RecordingError naming `where` (the file) and the instant: too few readings, stamps out of order or repeated
+    with other values, a frozen sensor, other units of time, angular rate or acceleration.
     """
     what = f"{where} ({imu.name})"
     if len(imu.stamps_ns) < 2:
         raise RecordingError(f"{what}: only {len(imu.stamps_ns)} reading; a calibration needs the whole recording.")
+    imu, timed = in_time(imu, what)
+    if len(imu.stamps_ns) < 2:
+        raise RecordingError(f"{what}: no two readings are finite; check the driver, and record again.")
     values, own = np.hstack([imu.gyro, imu.accel]), "export the IMU's own stamps"
     kept, notes = kept_readings(imu.stamps_ns, values, what, RATE_HZ, "reading", own)
     if notes:
         imu = ImuStream(imu.name, imu.stamps_ns[kept], imu.gyro[kept], imu.accel[kept])
     _refuse_frozen(imu, what)
+    imu, rejected = without_wrong(imu, what)
     imu, converted = recognised_unit(imu if sensor is None else in_si(imu, sensor), what, sensor)
-    return imu, notes + converted + _saturation_notes(imu, what)
+    return imu, timed + notes + rejected + converted + _saturation_notes(imu, what)
 
 
 def _refuse_frozen(imu: ImuStream, what: str) -> None:

@@ -1,0 +1,110 @@
+"""Readings of an IMU without those that are wrong, at the instants at which they were measured; and notes on both."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icalib.measurements import ImuStream
+from icalib.recordings.copies import copies, held
+from icalib.recordings.even_stamps import EvenStamps, even_stamps
+from icalib.recordings.spikes import impossible, spikes, stuck
+
+_SENSORS = ("gyroscope", "accelerometer")
+
+
+def in_time(imu: ImuStream, what: str) -> tuple[ImuStream, tuple[str, ...]]:
+    """Finite readings in order where copies alone were out of it, none there twice under different stamps; at even
+    stamps where bursts or jitter hide these."""
+    notes = _Notes(what, imu.stamps_ns)
+    finite = np.all(np.isfinite(np.hstack([imu.gyro, imu.accel])), axis=1)
+    notes.left_out(~finite, "are not finite")
+    imu = _some(imu, finite)
+    if len(imu.stamps_ns) < 2:
+        return imu, notes.sentences
+    order = np.argsort(imu.stamps_ns, kind="stable")
+    ordered = _some(imu, order)
+    again = copies(ordered.stamps_ns, np.hstack([ordered.gyro, ordered.accel]))
+    for values in (ordered.gyro, ordered.accel):
+        if not again.any() and held(values) is None:
+            again = copies(ordered.stamps_ns, values)
+    if again.any():
+        notes.stamps_ns = ordered.stamps_ns
+        notes.left_out(again, "repeat another exactly under a stamp between those of others, as delayed copies do,")
+        imu = _some(ordered, ~again)
+    if (np.diff(imu.stamps_ns) >= 0).all():
+        imu = _without_repeats(imu, notes)
+        values = np.hstack([imu.gyro, imu.accel])
+        if (even := even_stamps(imu.stamps_ns, values)) is not None:
+            notes.sentences += (_even_note(what, even),)
+            imu = ImuStream(imu.name, even.stamps_ns, imu.gyro, imu.accel)
+    return imu, notes.sentences
+
+
+def _without_repeats(imu: ImuStream, notes: _Notes) -> ImuStream:
+    """Without readings that are there twice, under one stamp."""
+    row = np.column_stack([np.diff(imu.stamps_ns), np.diff(imu.gyro, axis=0), np.diff(imu.accel, axis=0)])
+    again = np.concatenate([[False], (row == 0).all(axis=1)])
+    if again.any():
+        first = imu.stamps_ns[np.argmax(again)]
+        notes.sentences += (
+            f"{notes.what}: {int(again.sum())} repeated readings were dropped, the first at {first} ns.",
+        )
+    return _some(imu, ~again)
+
+
+def without_wrong(imu: ImuStream, what: str) -> tuple[ImuStream, tuple[str, ...]]:
+    """Readings without single wrong ones; a sensor that a driver holds between its readings is interpolated."""
+    notes = _Notes(what, imu.stamps_ns)
+    seconds, good = imu.seconds, np.ones(len(imu.stamps_ns), bool)
+    found = []
+    for kind, values in zip(_SENSORS, (imu.gyro, imu.accel), strict=True):
+        if (new := held(values)) is not None:
+            values = _interpolated(seconds, values, new)
+            notes.sentences += (
+                f"{what}: the {kind} is new in {int(new.sum())} of {len(new)} readings and repeated until the next; "
+                "it was interpolated between them.",
+            )
+        bad = impossible(values, kind == "gyroscope") | stuck(values)
+        rest = np.flatnonzero(~bad)
+        bad[rest[spikes(seconds[rest], values[rest])]] = True
+        notes.left_out(bad, f"stand off their neighbours in the {kind}, or repeat it exactly before it jumps,")
+        good &= ~bad
+        found.append(values)
+    if good.sum() < 2 or not notes.sentences:
+        return imu, ()
+    return ImuStream(imu.name, imu.stamps_ns[good], found[0][good], found[1][good]), notes.sentences
+
+
+class _Notes:
+    """Sentences on what was left out of readings at stamps_ns (N,)."""
+
+    def __init__(self, what: str, stamps_ns: np.ndarray) -> None:
+        self.sentences: tuple[str, ...] = ()
+        self.stamps_ns = stamps_ns
+        self.what, self._begin_ns = what, int(stamps_ns.min()) if len(stamps_ns) else 0
+
+    def left_out(self, bad: np.ndarray, why: str) -> None:
+        if not bad.any():
+            return
+        first = int(self.stamps_ns[np.argmax(bad)])
+        self.sentences += (
+            f"{self.what}: {int(bad.sum())} of {len(bad)} readings {why} and were left out, the first "
+            f"{(first - self._begin_ns) * 1e-9:.3f} s from the start, at {first} ns.",
+        )
+
+
+def _some(imu: ImuStream, which: np.ndarray) -> ImuStream:
+    """Those `which`: a mask, or indices in order."""
+    return ImuStream(imu.name, imu.stamps_ns[which], imu.gyro[which], imu.accel[which])
+
+
+def _interpolated(seconds: np.ndarray, values: np.ndarray, new: np.ndarray) -> np.ndarray:
+    return np.stack([np.interp(seconds, seconds[new], values[new, k]) for k in range(3)], axis=1)
+
+
+def _even_note(what: str, even: EvenStamps) -> str:
+    how = f"come in bursts of {even.burst}" if even.burst > 1 else "are uneven"
+    return (
+        f"{what}: the stamps {how}, up to {even.latest_s * 1e3:.3g} ms late, although the readings are even; they were "
+        f"set {even.period_ns * 1e-6:.4g} ms apart, by the earliest; let the driver stamp each reading."
+    )

@@ -1,0 +1,124 @@
+"""Single readings of an IMU that are wrong: spikes, and values that a driver repeats instead of measuring.
+
+A reading is compared with the straight line between its neighbours, in units of the local spread of such differences
+(Hampel's identifier). What an IMU measures is band-limited by its own low-pass filter: a shock spreads over several
+readings, and its neighbours stand off, too. A spike leaves them in line once it is taken out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import combinations
+
+import numpy as np
+
+_FAR = 10.0  # robust standard deviations off its neighbours; white noise comes as far once in 1e22 readings
+_IN_LINE = 5.0  # of the neighbours, once the spike is out
+_HALF = 10  # readings to each side that show the local spread
+_LONGEST = 3  # readings in a row that are single wrong ones by chance
+_ALIKE = 0.5  # cosine between deviations of neighbours: a shock pushes one way, wrong readings in a row do not
+_MANY = 0.2  # of readings that stand off: then these are no single wrong ones
+_IMPOSSIBLE = 100.0  # times the usual size of an accelerometer's readings: no sensor's range
+_IMPOSSIBLE_RATE = 1e4  # in rad/s or deg/s
+_STUCK = 3  # repeats in a row
+_JUMP = 8.0  # usual steps by which a reading differs from the one before, after the sensor was stuck
+_TO_MAD = 1.4826
+
+
+def spikes(seconds: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """(N,) bool: which readings (N, 3) at seconds (N,) are single wrong ones."""
+    bad = np.zeros(len(values), bool)
+    if len(values) < 4 * _HALF:
+        return bad
+    flag = _stands_off(seconds, values, _FAR)
+    flag[1:-1] |= flag[:-2] & flag[2:]  # two wrong ones to opposite sides leave the one between them in line
+    for _ in range(2):  # one found may have hidden another near it
+        good = np.flatnonzero(~bad)
+        for run in _runs(flag[good]):
+            for own in _within(run, len(good)):
+                if _is_wrong(seconds[good], values[good], own):
+                    bad[good[own]] = True
+                    break
+    return bad
+
+
+def impossible(values: np.ndarray, is_gyro: bool) -> np.ndarray:
+    """(N,) bool: readings (N, 3) beyond any sensor's range, or not finite."""
+    size = np.linalg.norm(np.where(np.isfinite(values), values, np.inf), axis=1)
+    limit = _IMPOSSIBLE_RATE if is_gyro else _IMPOSSIBLE * max(float(np.median(size)), 1e-9)
+    return ~(size <= limit)
+
+
+def stuck(values: np.ndarray) -> np.ndarray:
+    """(N,) bool: readings (N, 3) that repeat the one before exactly, several in a row, after which they jump."""
+    step = np.linalg.norm(np.diff(values, axis=0), axis=1)
+    bad = np.zeros(len(values), bool)
+    for begin, end in _runs(np.concatenate([[False], step == 0.0])):
+        if end - begin < _STUCK or end >= len(values):
+            continue
+        around = np.concatenate([step[max(begin - 1 - 2 * _HALF, 0) : begin - 1], step[end : end + 2 * _HALF]])
+        if len(around) and step[end - 1] > _JUMP * np.median(around) > 0.0:
+            bad[begin:end] = True
+    return bad
+
+
+def _stands_off(seconds: np.ndarray, values: np.ndarray, far: float) -> np.ndarray:
+    """(N,) bool: further than `far` local standard deviations off the line between its neighbours, on some axis."""
+    off = _off_line(seconds, values, np.arange(1, len(values) - 1), 1)
+    # Half the spread over all readings at least: where little moves the local one is small by chance.
+    least = _TO_MAD * 0.5 * np.median(off, axis=0) + _digit(values)
+    some = np.flatnonzero((off > far * least).any(axis=1))
+    window = np.clip(some[:, None] + np.arange(-_HALF, _HALF + 1), 0, len(off) - 1)
+    local = _TO_MAD * np.median(off[window], axis=1) + _digit(values)
+    flag = np.zeros(len(values), bool)
+    flag[1 + some] = (off[some] > far * np.maximum(local, least)).any(axis=1)
+    return flag & (flag.mean() < _MANY)
+
+
+def _digit(values: np.ndarray) -> np.ndarray:
+    """(3,) the smallest step between readings (N, 3): the last digit of coarse ones."""
+    step = np.abs(np.diff(values, axis=0))
+    return np.where(step > 0.0, step, np.inf).min(axis=0, initial=1e300)
+
+
+def _off_line(seconds: np.ndarray, values: np.ndarray, at: np.ndarray, reach: int) -> np.ndarray:
+    """(n, 3) distance of readings `at` from the line between those `reach` before and after."""
+    before, after = at - reach, at + reach
+    share = ((seconds[at] - seconds[before]) / np.maximum(seconds[after] - seconds[before], 1e-12))[:, None]
+    return np.abs(values[at] - (1.0 - share) * values[before] - share * values[after])
+
+
+def _runs(flag: np.ndarray) -> list[tuple[int, int]]:
+    """First index and the one after the last of each run of True."""
+    edge = np.diff(np.concatenate([[0], flag.astype(np.int8), [0]]))
+    return list(zip(np.flatnonzero(edge == 1).tolist(), np.flatnonzero(edge == -1).tolist(), strict=True))
+
+
+def _within(run: tuple[int, int], n: int) -> Iterator[np.ndarray]:
+    """Indices of what may be wrong in a run of readings that stand off, as neighbours of a wrong one do, too: one, two
+    near each other, or three in a row."""
+    begin, end = run
+    if end - begin > 2 * _LONGEST + 4:
+        return
+    one = range(max(begin, 2), min(end, n - 2))
+    yield from (np.array([k]) for k in one)
+    yield from (np.array(pair) for pair in combinations(one, 2))
+    yield from (np.array([k, k + 1, k + 2]) for k in one[:-2])
+
+
+def _is_wrong(seconds: np.ndarray, values: np.ndarray, own: np.ndarray) -> bool:
+    """Whether the readings `own` stand off, are no shock, and all around them are in line once they are out."""
+    low, high = max(own[0] - 2 * _HALF, 0), min(own[-1] + 2 * _HALF + 1, len(values))
+    others = np.setdiff1d(np.arange(low, high), own, assume_unique=True)
+    t, x = seconds[others], values[others]
+    off = _off_line(t, x, np.arange(1, len(others) - 1), 1)
+    scale = _TO_MAD * np.median(off, axis=0) + 1e-300
+    away = values[own] - np.stack([np.interp(seconds[own], t, x[:, k]) for k in range(3)], axis=1)
+    if not (np.abs(away) > _FAR * scale).any(axis=1).all():
+        return False
+    edge = own[0] - low
+    if (off[max(edge - 3, 0) : edge + 1 + own[-1] - own[0]] > _IN_LINE * scale).any():
+        return False
+    unit = away / np.linalg.norm(away, axis=1, keepdims=True)
+    alike = (unit[1:] * unit[:-1]).sum(axis=1) > _ALIKE
+    return not (alike & (np.diff(own) == 1)).any()
