@@ -10,16 +10,15 @@ from pathlib import Path
 
 from threadpoolctl import threadpool_limits
 
-from icalib.assessment import assess, visited
+from icalib.assessment import assess, stated_words, visited
 from icalib.calibration import Calibration, Visited
 from icalib.detection.streams import find_corners
-from icalib.errors import RecordingError
-from icalib.estimation.determination import determine
+from icalib.errors import EstimationError, RecordingError
+from icalib.estimation.inputs import Inputs
 from icalib.estimation.outcome import Visit
 from icalib.estimation.pages import give_back, keep_apart
 from icalib.estimation.problem import Problem
-from icalib.first_guess.lidar_sight import naming_sight
-from icalib.first_guess.start import start
+from icalib.first_guess.attempts import attempt
 from icalib.measurements import CornerStream, Measurements
 from icalib.provenance import provenance
 from icalib.recordings import Recording, read_measurements
@@ -117,19 +116,18 @@ def _calibrate(
     progress("finding a first guess", 0.0)
     keep_apart()
     give_back()
-    inputs, state, guess = start(rig, recordings, clock.lap)
-    give_back()
     steps = _StepProgress(progress)
 
-    def tell(stage: str, problem: Problem, visit: Visit) -> None:
+    def tell(inputs: Inputs, stage: str, problem: Problem, visit: Visit) -> None:
         if on_visit is not None:
             on_visit(visited(inputs, stage, problem, visit))
 
-    with naming_sight(() if rig.cameras else inputs.measurements.lidars):
-        found = determine(inputs, state, lambda name, step: steps.note(name), tell, guess)
+    made = attempt(rig, recordings, clock.lap, lambda name, step: steps.note(name), tell)
+    if made.error is not None:
+        raise EstimationError(stated_words(made.inputs, made.against[0])) from made.error
     clock.lap("solving")
     progress("judging the result", 0.9)
-    result = assess(inputs, found)
+    result = assess(made.inputs, made.found, made.against)
     clock.lap("judging")
     return dataclasses.replace(result, timings=clock.laps)
 

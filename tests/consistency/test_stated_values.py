@@ -108,4 +108,4 @@ def test_wheels_that_no_vehicle_has_are_named(driven):
     fast = tuple(replace(s, rate=s.rate * 30.0 / np.pi) for s in driven.measurements.wheels)
     result = calibrate_measurements(rig_for(driven.scenario), replace(driven.measurements, wheels=fast))
     words = [w for w in result.warnings if "which no vehicle has" in w]
-    assert len(words) == 1 and "a radius of 10.6 mm and 420" in words[0] and "in radians" in words[0], words
+    assert len(words) == 1 and "a radius of 10.6 mm and 420" in words[0] and "rate_unit" in words[0], words

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
 from icalib.assessment.cameras import mixed_up, other_lens, plane_warnings
+from icalib.assessment.guesses import guess_notes
 from icalib.assessment.held_out import held_out
 from icalib.assessment.images import corner_residuals, track_residuals
+from icalib.assessment.labels import UNITS, labels_of
 from icalib.assessment.misfit import far_beyond, misfits
 from icalib.assessment.notes import notes
 from icalib.assessment.robot import (
@@ -36,9 +38,8 @@ from icalib.calibration import (
     Visited,
 )
 from icalib.estimation.assembly import image_times
-from icalib.estimation.board import SHAPE_LABELS
 from icalib.estimation.border import restricted_inverse
-from icalib.estimation.contradictions import contradictions
+from icalib.estimation.contradictions import Contradiction, contradictions
 from icalib.estimation.determination import Determined
 from icalib.estimation.estimate import Estimate
 from icalib.estimation.evidence import Fit, fits, raw_rms, split_covariance
@@ -53,29 +54,21 @@ from icalib.estimation.problem import Problem
 from icalib.estimation.relaxed import relaxed
 from icalib.estimation.state import Block, State
 from icalib.estimation.surfaces import ON_PLANES
-from icalib.geometry.cameras import camera_model
 from icalib.observability import Observability, observe
 from icalib.provenance import versions
-from icalib.rig import DRIVE_SIZES, Camera
+from icalib.rig import DRIVE_SIZES
 from icalib.rig_file import rig_to_dict
 from icalib.timeline import Timeline
 
-UNITS = {
-    "rotation": "rad", "translation": "m", "time_offset": "s", "intrinsics": "px", "distortion": "", "bloom": "px",
-    "shape": "m", "tilt": "rad", "radii": "m", "baseline": "m", "radius": "m", "wheelbase": "m",
-    "steering_offset": "rad", "scales": "", "ground_height": "m",
-}  # fmt: skip
-LABELS = {
-    "shape": SHAPE_LABELS, "radii": ("left", "right"), "scales": ("speed", "yaw_rate"),
-    "plane": ("turn 1", "turn 2", "distance"),
-}  # fmt: skip
 LARGE_FACTOR = 3.0
+SEEN = ("corners", "features")
 BEYOND_FACTOR = 1.5  # times the largest factor: what halves say of each other is worth a warning
 LARGE_BLOOM_PX = 0.8  # ink and overexposure move edges by a third of that
 
 
-def assess(inputs: Inputs, determined: Determined) -> Calibration:
-    """The result with everything that says how far to trust it."""
+def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradiction] = ()) -> Calibration:
+    """The result with everything that says how far to trust it. `against`: what the rig file states and the data
+    contradict so much that nothing else that is wrong with the estimate is news."""
     found = determined.estimate
     problem, outcome = found.problem, found.outcome
     names = _column_names(inputs)
@@ -88,20 +81,22 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
     timeline = Timeline.of(inputs.parts, image_times(inputs, outcome.state.values))
     factors = _factors(inputs, groups)
     size = felt_size(found, factors.max(initial=1.0))
-    wrong_size, size_notes = size_words(inputs, size)
+    wrong_size, size_notes = ((), ()) if against else size_words(inputs, size)
     mixed = tuple(mixed_up(inputs.rig.cameras, groups))
     trajectory, poses = _trajectory(inputs, outcome.state, timeline), pose_residuals(inputs, found, timeline)
     # What others complain of may come of a wrong size, or of an accelerometer's scale: then that is the news.
-    certain = is_certain(size)
-    stated, factor = None if certain else relaxed(inputs, found), factors.max(initial=1.0)
+    certain, explained = is_certain(size), bool(against)
+    stated, factor = None if certain or explained else relaxed(inputs, found), factors.max(initial=1.0)
     lenses = other_lens(inputs.rig.cameras, lens_steps(inputs, stated), factor)
-    against = contradictions(inputs, found, stated, max(factor, _misfit(judged)))
-    beyond = () if wrong_size else far_beyond(inputs.rig, judged)
-    wrong = (*(wrong_size if certain else ()), *mixed, *lenses, *beyond)
+    against = against or contradictions(inputs, found, stated, max(factor, _misfit(judged)))
+    beyond = () if wrong_size or explained else far_beyond(inputs.rig, judged)
+    contradicted = tuple(stated_warnings(inputs, against, groups))
+    known = contradicted if explained else wrong_size if certain else ()
+    wrong = (*known, *mixed, *lenses, *beyond)
     warnings = (
         *wrong_size,
-        *stated_warnings(inputs, against, groups),
-        *_warnings(inputs, found, groups, judged, poses),
+        *contradicted,
+        *_warnings(inputs, found, groups, [f for f in judged if not explained or f.kind in SEEN], poses),
         *_factor_warnings(factors, parts is not None, held),
     )
     return Calibration(
@@ -117,7 +112,7 @@ def assess(inputs: Inputs, determined: Determined) -> Calibration:
         converged=outcome.converged,
         status=outcome.status,
         warnings=(*wrong, *(w for w in warnings if w not in wrong)),
-        notes=(*notes(inputs, found, timeline), *size_notes),
+        notes=(*notes(inputs, found, timeline), *guess_notes(inputs, groups), *size_notes),
         rig=rig_to_dict(inputs.asked or inputs.rig),
         settings=dataclasses.asdict(inputs.rig.settings),
         rates=_rates(inputs),
@@ -151,23 +146,8 @@ def _is_assumed(inputs: Inputs, name: str) -> bool:
     return inputs.rig.assumes_motion and name == inputs.rig.body
 
 
-def _labels(inputs: Inputs, block: Block) -> tuple[str, ...]:
-    if inputs.imu is not None and block.sensor == inputs.imu.name:
-        return IMU_LABELS
-    if block.name in ("intrinsics", "distortion"):
-        camera = inputs.sensor(block.sensor)
-        assert isinstance(camera, Camera)
-        model = camera_model(camera.model).parameter_names
-        return model[:4] if block.name == "intrinsics" else model[4:]
-    if block.name in LABELS:
-        return LABELS[block.name]
-    if block.name == "time_offset" and block.size > 1:
-        return tuple(f"in recording {k}" for k in range(1, block.size + 1))
-    return ("x", "y", "z")[: block.size] if block.size > 1 else (block.name,)
-
-
 def _column_names(inputs: Inputs) -> tuple[str, ...]:
-    return tuple(f"{b.sensor}.{b.name}.{label}" for b in inputs.layout.free for label in _labels(inputs, b))
+    return tuple(f"{b.sensor}.{b.name}.{label}" for b in inputs.layout.free for label in labels_of(inputs, b))
 
 
 def _mode(inputs: Inputs, block: Block) -> str:
@@ -210,7 +190,7 @@ def _groups(
             continue
         if block.start is None and block.name in ("shape", "bloom", "tilt"):
             continue
-        labels = _labels(inputs, block)
+        labels = labels_of(inputs, block)
         if block.name == "tilt":
             labels = ("x", "y")
         zeros = np.zeros(block.size)

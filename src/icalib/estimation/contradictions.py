@@ -14,11 +14,12 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation.border import restricted_root
-from icalib.estimation.determination import determine, judge, scatter
+from icalib.estimation.determination import Determined, determine, judge, scatter
 from icalib.estimation.estimate import Estimate
 from icalib.estimation.evidence import fits
+from icalib.estimation.groups import sensors_of
 from icalib.estimation.inputs import Inputs, origin_difference
-from icalib.estimation.relaxed import Relaxed, freed_inputs, relinearised, sensors_of
+from icalib.estimation.relaxed import Relaxed, freed_inputs, relinearised, stated_keys
 from icalib.estimation.state import Block, Key, State
 from icalib.estimation.tolerances import GUESS_SIGMA
 from icalib.geometry import so3
@@ -73,7 +74,12 @@ def _standing_out(shown: Sequence[Contradiction]) -> tuple[Contradiction, ...]:
 
 
 def _is_far(shown: Contradiction) -> bool:
-    return float(np.abs(shown.off).max()) > FAR * GUESS_SIGMA[shown.key[1]]
+    return worst_off(shown.key[1], shown.off) > FAR
+
+
+def worst_off(name: str, off: np.ndarray) -> float:
+    """How far off a group is, in what guesses are worth."""
+    return float(np.abs(off).max()) / GUESS_SIGMA[name]
 
 
 def _linear(
@@ -100,13 +106,24 @@ def _estimated(
         again = determine(freed, state, guess=state.values)
     except EstimationError:
         return standing_out
-    outcome = again.estimate.outcome
-    if not outcome.converged:
-        return standing_out
+    return _by(inputs, again, [c.key for c in standing_out]) if again.estimate.outcome.converged else standing_out
+
+
+def contradicted_by(inputs: Inputs, without: Determined) -> tuple[Contradiction, ...]:
+    """What `inputs`, of the rig as it was given, state and an estimate `without` any of it contradicts, the farthest
+    off first."""
+    layout = without.estimate.problem.layout
+    found = _standing_out(_by(inputs, without, stated_keys(inputs, layout)))
+    return tuple(sorted(found, key=lambda c: -worst_off(c.key[1], c.off)))
+
+
+def _by(inputs: Inputs, without: Determined, keys: Sequence[Key]) -> list[Contradiction]:
+    """The groups `keys` beside an estimate in which they are free."""
+    outcome, layout = without.estimate.outcome, without.estimate.problem.layout
     ratios = [f.chi2 / f.dof for f in fits(outcome.problem, outcome) if f.dof > np.sqrt(f.count)]
     factor = float(np.sqrt(max([1.0, *ratios])))
-    sigma, nothing = np.sqrt(np.diag(again.covariance)), np.zeros(freed.layout.size)
-    return [_shown(inputs, outcome.state, freed.layout.block(*c.key), nothing, sigma, factor) for c in standing_out]
+    sigma, nothing = np.sqrt(np.diag(without.covariance)), np.zeros(layout.size)
+    return [_shown(inputs, outcome.state, layout.block(*key), nothing, sigma, factor) for key in keys]
 
 
 def _shown(

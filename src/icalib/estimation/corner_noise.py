@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from icalib.errors import EstimationError
 from icalib.estimation.corner_factor import CornerFactor, CornerNoise, CornerOutput
 from icalib.estimation.evidence import Fit
 from icalib.estimation.medians import median_variance
@@ -93,8 +94,13 @@ def estimate_noise(
     tau: tuple[float, ...],
 ) -> NoiseModel:
     """The noise that the residuals of a pass show, with `tau` for its common errors. A size given in the rig file
-    is kept."""
+    is kept. Raises EstimationError where the pass led so far away that no corner is in front of the camera."""
     stream, used = factor.stream, out.root > 0.0
+    if not used.any():
+        raise EstimationError(
+            f"the estimate led away: where it ended {camera.name} sees none of its corners; correct what the rig file "
+            "gives of its rotation, translation, time_offset and lens, or leave it out to have it found."
+        )
     square = factor.squared_errors(out)
     if camera.corner_noise_px is not None:
         base, exposure = camera.corner_noise_px, 0.0

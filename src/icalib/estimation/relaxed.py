@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 
@@ -17,14 +16,13 @@ from icalib.estimation.arrowhead import Solution, solve
 from icalib.estimation.assembly import given_priors
 from icalib.estimation.border import NOTHING, restricted_root
 from icalib.estimation.estimate import Estimate
+from icalib.estimation.groups import AnySensor, groups_of, sensors_of, with_groups
 from icalib.estimation.inputs import Inputs, with_clouds
 from icalib.estimation.outcome import Outcome, outcome_of
 from icalib.estimation.prior_factor import sums_of_priors
 from icalib.estimation.problem import Problem, Residuals
 from icalib.estimation.state import Key, Layout, State
-from icalib.rig import Camera, Lidar, Parameter, PoseSensor, Rig, Wheels
-
-Sensor = TypeVar("Sensor", Camera, Lidar, Wheels, PoseSensor)
+from icalib.rig import Parameter
 
 
 @dataclass(frozen=True)
@@ -68,7 +66,7 @@ class Relaxed:
 
 def relaxed(inputs: Inputs, found: Estimate) -> Relaxed | None:
     """Of what the rig file fixes or gives a prior; None where it does not, or the solver did not end."""
-    if not found.outcome.converged or not any(_is_stated(inputs.rig, s) for s in sensors_of(inputs.rig)):
+    if not found.outcome.converged or not any(_is_stated(p) for _, _, p in groups_of(inputs.rig)):
         return None
     return relinearised(inputs, found, freed_inputs(inputs), inputs.layout)
 
@@ -95,9 +93,8 @@ def stated_keys(inputs: Inputs, layout: Layout) -> list[Key]:
         body = (*body, "time_offset")
     return [
         (s.name, name)
-        for s in sensors_of(asked)
-        for name, parameter in _groups(s).items()
-        if s.name in used and parameter.mode != "free" and parameter.value is not None
+        for s, name, parameter in groups_of(asked)
+        if s.name in used and _is_stated(parameter)
         if not (s.name == asked.body and name in body)
         if any(b.key == (s.name, name) and b.start is not None for b in layout.blocks)
     ]
@@ -105,39 +102,16 @@ def stated_keys(inputs: Inputs, layout: Layout) -> list[Key]:
 
 def freed_inputs(inputs: Inputs, keys: Collection[Key] | None = None) -> Inputs:
     """`inputs` with what is fixed at a value free, and with `keys` only these, priors among them."""
-    rig = inputs.rig
 
-    def freed(sensor: Sensor) -> Sensor:
-        own = {k: Parameter("free", p.value) for k, p in _groups(sensor).items() if _is_freed(sensor.name, k, p, keys)}
-        return replace(sensor, **own)
+    def freed(sensor: AnySensor, name: str, p: Parameter) -> Parameter:
+        wanted = p.mode == "fixed" if keys is None else (sensor.name, name) in keys
+        return Parameter("free", p.value) if wanted and p.value is not None else p
 
-    rig = replace(
-        rig,
-        cameras=tuple(freed(c) for c in rig.cameras),
-        lidars=tuple(freed(x) for x in rig.lidars),
-        wheels=tuple(freed(w) for w in rig.wheels),
-        poses=tuple(freed(p) for p in rig.poses),
-    )
-    return with_clouds(replace(inputs, rig=rig), inputs.clouds)
+    return with_clouds(replace(inputs, rig=with_groups(inputs.rig, freed)), inputs.clouds)
 
 
-def _is_freed(sensor: str, name: str, parameter: Parameter, keys: Collection[Key] | None) -> bool:
-    if parameter.value is None or parameter.mode == "free":
-        return False
-    return parameter.mode == "fixed" if keys is None else (sensor, name) in keys
-
-
-def _is_stated(rig: Rig, sensor: Camera | Lidar | Wheels | PoseSensor) -> bool:
-    return any(p.mode != "free" and p.value is not None for p in _groups(sensor).values())
-
-
-def sensors_of(rig: Rig) -> tuple[Camera | Lidar | Wheels | PoseSensor, ...]:
-    """All but the IMU."""
-    return (*rig.cameras, *rig.lidars, *rig.wheels, *rig.poses)
-
-
-def _groups(sensor: Camera | Lidar | Wheels | PoseSensor) -> dict[str, Parameter]:
-    return {name: value for name, value in vars(sensor).items() if isinstance(value, Parameter)}
+def _is_stated(parameter: Parameter) -> bool:
+    return parameter.mode != "free" and parameter.value is not None
 
 
 def _held_in(layout: Layout, before: Layout, held: np.ndarray) -> np.ndarray:

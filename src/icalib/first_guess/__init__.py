@@ -9,6 +9,7 @@ from icalib.estimation.bodies import choose_bodies, restrict
 from icalib.estimation.imu_data import imu_data
 from icalib.first_guess.align_camera import align_camera, trusted
 from icalib.first_guess.clocks import Alignment, camera_rates
+from icalib.first_guess.contradicted import chosen, chosen_along
 from icalib.first_guess.guess import CameraGuess, Guess, relative_offset
 from icalib.first_guess.gyro import GyroRotation
 from icalib.first_guess.lever_arm import LeverArm, check_gravity, check_size, lever_arm
@@ -73,12 +74,15 @@ def _camera_guess(
     poses: TargetPoses,
     measurements: Measurements,
 ) -> CameraGuess:
-    """What was found, and in its place what the rig gives."""
-    offset, R, p = camera.time_offset.value, camera.rotation.value, camera.translation.value
+    """What was found, and in its place what the rig gives, but guesses that it contradicts."""
+    raw, p = camera.time_offset.value, camera.translation.value
+    offset = None if raw is None else np.array([relative_offset(raw, stream, measurements)])
+    if p is not None and camera.translation.mode == "free":
+        p = chosen_along(p, arm.position, arm.covariance)
     return CameraGuess(
         params,
-        aligned.offset if offset is None else relative_offset(offset, stream, measurements),
-        aligned.rotation if R is None else R,
+        float(chosen("time_offset", camera.time_offset, offset, np.array([aligned.offset]))[0]),
+        chosen("rotation", camera.rotation, camera.rotation.value, aligned.rotation),
         arm.position if p is None else p,
         poses,
     )

@@ -14,8 +14,10 @@ from icalib.first_guess.clocks import (
     better_given,
     check_axes,
     contradicts,
+    main_axis,
     turns_about_two_axes,
 )
+from icalib.first_guess.contradicted import nearest_about
 from icalib.first_guess.guess import relative_offset
 from icalib.measurements import CornerStream, Measurements
 from icalib.rig import Camera, Parameter
@@ -50,6 +52,10 @@ def align_camera(
     if rotation is None or (trusted(camera.rotation) is None and turns_about_two_axes(imu, rates, found)):
         return found
     own = as_given(imu, camera.name, rates, found.offset, rotation)
-    if given is None or held is not None:
+    if given is not None and held is None:
+        own = better_given(imu, camera.name, rates, own, relative_offset(given, stream, measurements))
+    if trusted(camera.rotation) is not None or found.given or not contradicts(imu, rates, own):
         return own
-    return better_given(imu, camera.name, rates, own, relative_offset(given, stream, measurements))
+    # The motion shows all of the rotation but the turn about one axis, and for that alone the guess is needed.
+    nearest = nearest_about(main_axis(rates.rate), rotation, found.rotation)
+    return as_given(imu, camera.name, rates, found.offset, nearest)

@@ -12,6 +12,7 @@ from icalib.errors import EstimationError
 from icalib.estimation.imu_data import ImuData, imu_data
 from icalib.first_guess.align_camera import align_camera, trusted
 from icalib.first_guess.clocks import Alignment
+from icalib.first_guess.contradicted import chosen
 from icalib.first_guess.guess import CameraGuess, Guess, relative_offset
 from icalib.first_guess.gyro import GyroRotation
 from icalib.first_guess.target_poses import TargetPoses
@@ -43,9 +44,10 @@ def guess_from_tracks(rig: Rig, measurements: Measurements) -> Guess:
     motion = track_motion(gyro, rays, [a.rotation for a in aligned], arms, rig.gravity)
     cameras = {}
     for k, (camera, stream, found) in enumerate(zip(rig.cameras, measurements.cameras, aligned, strict=True)):
-        given = camera.time_offset.value
-        offset = found.offset if given is None else relative_offset(given, stream, measurements)
-        R = found.rotation if camera.rotation.value is None else camera.rotation.value
+        raw = camera.time_offset.value
+        given = None if raw is None else np.array([relative_offset(raw, stream, measurements)])
+        offset = float(chosen("time_offset", camera.time_offset, given, np.array([found.offset]))[0])
+        R = chosen("rotation", camera.rotation, camera.rotation.value, found.rotation)
         p = motion.arms[k] if camera.translation.value is None else camera.translation.value
         cameras[camera.name] = CameraGuess(params[k], offset, R, p, _poses(motion, stream.seconds + offset, R, p))
     return Guess(cameras, gyro_bias=aligned[0].gyro_bias, accel_bias=motion.accel_bias, R_world_board=np.eye(3))

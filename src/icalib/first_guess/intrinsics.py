@@ -32,15 +32,36 @@ GOOD_RMS_PX = 2.0
 
 
 def camera_params(camera: Camera, stream: CornerStream, target: Target) -> np.ndarray:
-    """(P,) what the rig gives, else from the corners. Raises EstimationError if none are found that explain them."""
+    """(P,) what the rig gives, else from the corners, and so where these contradict a guess of the rig. Raises
+    EstimationError if none are found that explain the corners."""
     model = camera_model(camera.model)
-    given = np.full(len(model.parameter_names), np.nan)
+    given, fixed = _given(camera, guesses=True), _given(camera, guesses=False)
+    if np.array_equal(given, fixed, equal_nan=True):
+        if not np.isnan(given).any():
+            return given
+        return guess_intrinsics(*_one_body_each(stream, target), model, camera.resolution, given)
+    alone, flat = _one_body_each(stream, target)
+    trial = _spread_images(alone, TRIAL_IMAGES)
+    found: list[np.ndarray] = []
+    for known in (given, fixed):
+        with suppress(EstimationError):
+            found.append(
+                known if not np.isnan(known).any() else guess_intrinsics(alone, flat, model, camera.resolution, known)
+            )
+            if _median_rms(trial, model, found[-1], flat) < GOOD_RMS_PX:
+                return found[-1]
+    if not found:
+        return guess_intrinsics(alone, flat, model, camera.resolution, fixed)
+    return min(found, key=lambda params: _median_rms(trial, model, params, flat))
+
+
+def _given(camera: Camera, guesses: bool) -> np.ndarray:
+    """(P,) what the rig fixes, or gives with a prior, and `guesses` too; NaN where it gives nothing."""
+    given = np.full(len(camera_model(camera.model).parameter_names), np.nan)
     for part, parameter in ((slice(0, 4), camera.intrinsics), (slice(4, None), camera.distortion)):
-        if parameter.value is not None:
+        if parameter.value is not None and (guesses or parameter.mode != "free"):
             given[part] = parameter.value
-    if not np.isnan(given).any():
-        return given
-    return guess_intrinsics(*_one_body_each(stream, target), model, camera.resolution, given)
+    return given
 
 
 def _one_body_each(stream: CornerStream, target: Target) -> tuple[CornerStream, Flat]:

@@ -31,10 +31,11 @@ SIZE_TOLERANCE = 0.15  # of the target, as the accelerometer shows it
 
 @dataclass(frozen=True)
 class LeverArm:
-    """p_imu_cam (3,) m; gravity (3,) in board axes, m/s^2; accel_bias (3,) m/s^2; true size of the target over the one
-    given, with its standard deviation."""
+    """p_imu_cam (3,) m, with its covariance (3, 3); gravity (3,) in board axes, m/s^2; accel_bias (3,) m/s^2; true size
+    of the target over the one given, with its standard deviation."""
 
     position: np.ndarray
+    covariance: np.ndarray
     gravity: np.ndarray
     accel_bias: np.ndarray
     size: float
@@ -75,14 +76,16 @@ def lever_arm(
     if given is not None:
         rhs = rhs - rows[:, :, 0:3] @ given
         rows[:, :, 0:3] = 0.0
-    x = _solve(rows, rhs)
-    return LeverArm(x[0:3] if given is None else given, x[3:6], x[6:9], *size_of(rows, rhs, second(D_f)))
+    x, covariance = _solve(rows, rhs)
+    arm = x[0:3] if given is None else given
+    return LeverArm(arm, covariance, x[3:6], x[6:9], *size_of(rows, rhs, second(D_f)))
 
 
-def _solve(rows: np.ndarray, rhs: np.ndarray) -> np.ndarray:
-    """Least squares with a weak prior on lever arm and bias, again without rows that stand far off."""
+def _solve(rows: np.ndarray, rhs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Least squares with a weak prior on lever arm and bias, again without rows that stand far off: x (9,), and the
+    covariance (3, 3) of the lever arm."""
     prior = np.diag(1.0 / np.array([1.0] * 3 + [1e3] * 3 + [BIAS_SIGMA] * 3))
-    weight, sigma, x = np.ones(len(rows)), ROW_SIGMA, np.zeros(9)
+    weight, sigma, x, A = np.ones(len(rows)), ROW_SIGMA, np.zeros(9), np.zeros((0, 9))
     for _ in range(4):
         A = np.concatenate([(rows * weight[:, None, None]).reshape(-1, 9), sigma * prior])
         b = np.concatenate([(rhs * weight[:, None]).ravel(), np.zeros(9)])
@@ -90,7 +93,7 @@ def _solve(rows: np.ndarray, rhs: np.ndarray) -> np.ndarray:
         size = np.linalg.norm(rhs - rows @ x, axis=1)
         weight = (size < 4.0 * np.median(size) + 1e-9).astype(float)
         sigma = max(ROW_SIGMA, SHARED * float(np.median(size)))
-    return x
+    return x, sigma**2 * np.linalg.inv(A.T @ A)[:3, :3]
 
 
 def size_of(rows: np.ndarray, rhs: np.ndarray, felt: np.ndarray) -> tuple[float, float]:

@@ -1,0 +1,61 @@
+"""Notes on guesses of the rig file that the data contradict, with what would explain them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from icalib.assessment.looks_like import looks_like
+from icalib.assessment.stated import SHOWN_UNITS, scaled
+from icalib.calibration import ParameterGroup
+from icalib.estimation.groups import groups_of
+from icalib.estimation.inputs import Inputs
+from icalib.estimation.tolerances import GUESS_SIGMA
+from icalib.first_guess.contradicted import is_contradicted
+from icalib.geometry import so3
+from icalib.geometry.cameras import camera_model
+from icalib.rig import Camera
+
+LENS = ("intrinsics", "distortion")
+GRID = 12  # rays of an image, each way
+
+
+def guess_notes(inputs: Inputs, groups: Sequence[ParameterGroup]) -> Iterator[str]:
+    """One sentence for each group of a sensor whose guess is farther from the result than guesses are worth."""
+    found = {(g.sensor, g.name): g for g in groups}
+    for sensor, name, parameter in groups_of(inputs.asked or inputs.rig):
+        group, guess = found.get((sensor.name, name)), parameter.value
+        if group is None or guess is None or parameter.mode != "free" or "undetermined" in group.verdict:
+            continue
+        if isinstance(sensor, Camera) and name in LENS:
+            far = lens_off(sensor, name, found) > GUESS_SIGMA["intrinsics"]
+        else:
+            far = is_contradicted(name, guess, group.value)
+        if far:
+            rotation = found.get((sensor.name, "rotation"))
+            there = None if rotation is None else rotation.value
+            yield _sentence(group, guess) + looks_like(inputs.rig, (sensor.name, name), guess, group.value, there)
+
+
+def lens_off(camera: Camera, name: str, found: dict[tuple[str, str], ParameterGroup]) -> float:
+    """RMS of the pixels by which the lens that was found moves where its group `name` is as the rig guesses."""
+    model, values = camera_model(camera.model), {own: found[camera.name, own].value for own in LENS}
+    guess = np.concatenate(list((values | {name: getattr(camera, name).value}).values()))
+    sides = [np.linspace(0.0, n - 1.0, GRID) for n in camera.resolution]
+    uv = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
+    rays, seen = model.unproject(np.concatenate(list(values.values())), uv)
+    there, shown = model.project(guess, rays)
+    both = seen & shown
+    return float(np.sqrt(np.mean(((there - uv)[both] ** 2).sum(axis=1)))) if both.any() else np.inf
+
+
+def _sentence(group: ParameterGroup, guess: np.ndarray) -> str:
+    what = f"the guess of {group.name.replace('_', ' ')} of {group.sensor}"
+    if group.name == "rotation":
+        off = np.rad2deg(np.linalg.norm(so3.log(np.ascontiguousarray(guess.T @ group.value))))
+        return f"{what} is {off:.1f} deg from what the data show, which alone count."
+    unit, scale = SHOWN_UNITS.get(group.unit, (group.unit, 1.0))
+    unit = f" {unit}" if unit else ""
+    shown = f"{scaled(group.value, scale)}{unit}"
+    return f"{what}, {scaled(guess, scale)}{unit}, is far from what the data show, {shown}, which alone count."

@@ -1,0 +1,74 @@
+"""What a value of the rig file looks like that the data contradict: an inverse, another frame, another unit."""
+
+from __future__ import annotations
+
+from itertools import permutations, product
+
+import numpy as np
+
+from icalib.geometry import so3
+from icalib.rig import Rig, Wheels
+
+NEAR_RAD = 0.15  # by which a rotation is off that another frame explains
+NEARLY = 0.1  # of a number in another unit
+TURNS = [  # about right angles, and reflections
+    np.array(axes, dtype=np.float64)[list(order)]
+    for order in permutations(range(3))
+    for axes in (np.diag(signs) for signs in product((1.0, -1.0), repeat=3))
+]
+LENGTHS = {1e-3: "millimetres", 1e-2: "centimetres", 0.0254: "inches"}
+RATES = {np.pi / 30.0: "rpm", np.pi / 180.0: "deg/s"}
+ROLLING = ("radii", "radius", "baseline", "wheelbase")
+IMAGE_SIZES = (2.0, 0.5, 4.0, 0.25)
+
+
+def looks_like(
+    rig: Rig, key: tuple[str, str], value: np.ndarray, found: np.ndarray, rotation: np.ndarray | None = None
+) -> str:
+    """A sentence that begins with a space, or nothing. value: that of the rig file; found: by the data, which show the
+    sensor's `rotation` (3, 3), too."""
+    name = key[1]
+    if name == "rotation":
+        return _frames(value, found)
+    if name == "translation" and rotation is not None:
+        inverse = -rotation.T @ found
+        if _is_near(value, inverse) and not _is_near(value, found):
+            return " It looks like that of the inverse: icalib wants p_imu_sensor."
+    for size, unit in (LENGTHS if name in ("translation", *ROLLING) else {}).items():
+        if _is_near(found, size * value):
+            return f" It looks like {unit}: write metres."
+    if name == "time_offset" and _is_near(found, 1e-3 * value):
+        return " It looks like milliseconds: write seconds."
+    if name == "intrinsics":
+        for size in IMAGE_SIZES:
+            if _is_near(found[:2], size * value[:2]):
+                return f" The focal length is {size:g} times that: was it of images of another size?"
+    wheels = next((w for w in rig.wheels if w.name == key[0]), None)
+    return "" if wheels is None or name not in ("radii", "radius") else _rolling(wheels, value, found)
+
+
+def _frames(value: np.ndarray, found: np.ndarray) -> str:
+    if _angle(value.T, found) < NEAR_RAD:
+        return " It looks like the inverse, as in Kalibr's T_cam_imu: icalib wants R_imu_sensor."
+    if min(_angle(value @ turn, found) for turn in TURNS if np.linalg.det(turn) > 0.0) < NEAR_RAD:
+        return " It looks like that of a frame whose axes are named otherwise, as a link's and a camera's are."
+    return ""
+
+
+def _rolling(wheels: Wheels, value: np.ndarray, found: np.ndarray) -> str:
+    if _is_near(found, 0.5 * value):
+        return " It looks like a diameter: write the radius."
+    if wheels.measures == "ticks" and wheels.counts_per_turn is not None:
+        return f" With it counts_per_turn would be {wheels.counts_per_turn * float(np.median(value / found)):.0f}."
+    for size, unit in RATES.items() if wheels.measures == "rates" else ():
+        if _is_near(found, size * value):
+            return f" Its readings look like {unit}: write rate_unit: {unit}."
+    return ""
+
+
+def _is_near(a: np.ndarray, b: np.ndarray) -> bool:
+    return float(np.linalg.norm(a - b)) < NEARLY * float(np.linalg.norm(b))
+
+
+def _angle(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.linalg.norm(so3.log(np.ascontiguousarray(a.T @ b))))

@@ -1,0 +1,149 @@
+"""The estimate, and where it fails or hardly fits, the one without guesses, and without what the rig file states.
+
+Guesses have no weight: an estimate that they spoil is made from nothing. What is fixed or has a prior has weight: where
+it spoils the estimate, the one without says which of it contradicts the data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from icalib.errors import EstimationError
+from icalib.estimation.contradictions import Contradiction, contradicted_by
+from icalib.estimation.determination import Determined, determine
+from icalib.estimation.evidence import chi2_by_kind
+from icalib.estimation.groups import AnySensor, groups_of, with_groups
+from icalib.estimation.inputs import Inputs
+from icalib.estimation.outcome import Step, Visit
+from icalib.estimation.pages import give_back
+from icalib.estimation.problem import Problem
+from icalib.first_guess.contradicted import is_contradicted
+from icalib.first_guess.lidar_sight import naming_sight
+from icalib.first_guess.start import start
+from icalib.measurements import Measurements
+from icalib.rig import Parameter, Rig
+
+POOR_FIT = 4.0  # times as large as their noise are the residuals of some sensor
+CLEARLY = 0.5  # times the misfit of another estimate
+LENS = ("intrinsics", "distortion")
+OnVisit = Callable[[Inputs, str, Problem, Visit], None]
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """An estimate. against: what the rig file states, and another estimate without contradicts; error: why there is no
+    estimate with it, where there is none."""
+
+    inputs: Inputs
+    found: Determined
+    against: tuple[Contradiction, ...] = ()
+    error: EstimationError | None = None
+
+    @property
+    def converged(self) -> bool:
+        return self.found.estimate.outcome.converged
+
+    @property
+    def misfit(self) -> float:
+        """Times as large as their noise the residuals of some sensor are at least; infinite without an end."""
+        outcome = self.found.estimate.outcome
+        shown = chi2_by_kind(outcome.problem, outcome.residuals).values()
+        return max((np.sqrt(chi2 / max(n, 1)) for n, chi2 in shown), default=0.0) if outcome.converged else np.inf
+
+
+def attempt(
+    rig: Rig,
+    recordings: Sequence[Measurements],
+    lap: Callable[[str], None],
+    on_step: Callable[[str, Step], None],
+    on_visit: OnVisit,
+) -> Attempt:
+    """The estimate of `rig`, or where it fails or hardly fits one without guesses that fits better; or else the first,
+    with what contradicts it. Raises EstimationError where the data do not carry an estimate."""
+    make = partial(_made, recordings=recordings, lap=lap, on_step=on_step, on_visit=on_visit)
+    failed: EstimationError | None = None
+    first: Attempt | None = None
+    try:
+        first = make(rig)
+    except EstimationError as error:
+        failed = error
+    misfit = np.inf if first is None else first.misfit
+    if first is not None and misfit < POOR_FIT:
+        return first
+    other = _from_nothing(rig, make)
+    if other is not None and other.misfit < CLEARLY * misfit:
+        return other
+    other = _against(rig, make)
+    if other is not None and other.misfit < CLEARLY * misfit:
+        return replace(other, error=failed) if first is None else replace(first, against=other.against)
+    if first is None:
+        assert failed is not None
+        raise failed
+    return first
+
+
+def _made(
+    rig: Rig,
+    recordings: Sequence[Measurements],
+    lap: Callable[[str], None],
+    on_step: Callable[[str, Step], None],
+    on_visit: OnVisit,
+) -> Attempt:
+    inputs, state, guess = start(rig, recordings, lap)
+    give_back()
+    with naming_sight(() if rig.cameras else inputs.measurements.lidars):
+        found = determine(inputs, state, on_step, partial(on_visit, inputs), guess)
+    return Attempt(inputs, found)
+
+
+def _from_nothing(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt | None:
+    """The estimate without guesses, or with those that it does not contradict where it needs them; None where there are
+    none, or it fails as well."""
+    bare = with_groups(rig, lambda sensor, name, p: _without(rig, name, p) if p.mode == "free" else p)
+    if not _has(rig, "free") or (found := _converged(bare, make)) is None:
+        return None
+    values = found.found.estimate.outcome.state.values
+
+    def agreeing(sensor: AnySensor, name: str, p: Parameter) -> Parameter:
+        if p.mode != "free" or p.value is None or name == "time_offset":
+            return _without(rig, name, p) if p.mode == "free" else p
+        return Parameter() if is_contradicted(name, p.value, values.get((sensor.name, name), p.value)) else p
+
+    kept = with_groups(rig, agreeing)
+    if found.found.held.size and _has(kept, "free") and (other := _converged(kept, make)) is not None:
+        found = other
+    return replace(found, inputs=replace(found.inputs, asked=rig))
+
+
+def _without(rig: Rig, name: str, p: Parameter) -> Parameter:
+    """Free, from nothing, but a lens that nothing but a target shows."""
+    return Parameter("free", p.value) if name in LENS and not rig.has_target else Parameter()
+
+
+def _against(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt | None:
+    """The estimate of all that the rig file states, from nothing, with what it contradicts; None where it fails as well
+    or contradicts nothing."""
+    if not (_has(rig, "fixed") or _has(rig, "prior")):
+        return None
+    found = _converged(with_groups(rig, lambda sensor, name, p: _without(rig, name, p)), make)
+    if found is None:
+        return None
+    against = contradicted_by(replace(found.inputs, asked=rig), found.found)
+    return replace(found, against=against) if against else None
+
+
+def _has(rig: Rig, mode: str) -> bool:
+    """Whether the rig file gives some value in this way."""
+    return any(p.mode == mode and p.value is not None for _, _, p in groups_of(rig))
+
+
+def _converged(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt | None:
+    try:
+        found = make(rig)
+    except EstimationError:
+        return None
+    return found if found.converged else None

@@ -1,0 +1,54 @@
+"""Guesses of the rig file against what the data show: a guess has no weight, and one that is far off is replaced."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icalib.estimation.tolerances import GUESS_SIGMA
+from icalib.geometry import so3
+from icalib.rig import Parameter
+
+SIGMAS = 4.0  # times what a guess is worth
+LENGTHS = ("radii", "radius", "baseline", "wheelbase", "scales")  # guessed to a share of themselves
+SHARE = 0.1  # that such a guess is off by
+
+
+def is_contradicted(name: str, guess: np.ndarray, found: np.ndarray) -> bool:
+    """Whether a guess of the group `name` is farther from what the data show than guesses are worth."""
+    return worst_off(name, guess, found) > SIGMAS
+
+
+def worst_off(name: str, guess: np.ndarray, found: np.ndarray) -> float:
+    """How far a guess is off, in what one is worth; infinite for a length of no size."""
+    if name == "rotation":
+        return float(np.linalg.norm(so3.log(np.ascontiguousarray(guess.T @ found)))) / GUESS_SIGMA[name]
+    if name in LENGTHS:
+        if (guess <= 0.0).any() or (found <= 0.0).any():
+            return np.inf
+        return float(np.abs(np.log(found / guess)).max()) / SHARE
+    return float(np.abs(found - guess).max()) / GUESS_SIGMA[name]
+
+
+def chosen(name: str, parameter: Parameter, given: np.ndarray | None, found: np.ndarray) -> np.ndarray:
+    """Where the solver starts: at the `given` value of the parameter, as a state has it, but at what was `found` where
+    there is none, or a mere guess that this contradicts."""
+    if given is None or (parameter.mode == "free" and is_contradicted(name, given, found)):
+        return found
+    return given
+
+
+def chosen_along(given: np.ndarray, found: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """A guess of a translation (3,), moved to what was `found` along the directions that this knows, with covariance
+    (3, 3), to better than guesses are worth, and that contradict the guess."""
+    variance, axes = np.linalg.eigh(covariance)
+    way = axes.T @ (found - given)
+    worth = GUESS_SIGMA["translation"]
+    return given + axes @ np.where((variance < worth**2) & (np.abs(way) > SIGMAS * worth), way, 0.0)
+
+
+def nearest_about(axis: np.ndarray, guess: np.ndarray, found: np.ndarray) -> np.ndarray:
+    """(3, 3) of the rotations found Exp(t axis), of which the data do not show t, the one nearest to the guess."""
+    turn = guess.T @ found
+    sine = axis @ np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    cosine = np.trace(turn) - axis @ turn @ axis
+    return found @ so3.exp(-np.arctan2(sine, cosine) * axis)
