@@ -191,9 +191,41 @@ def test_bad_poses_between_jumps_that_stay():
     position[[50, 150, 250]] += [0.0, 0.0, 0.5]
     stream, notes = checked(position, sensor=RELATIVE)
     np.testing.assert_array_equal(stream.stamps_ns, np.delete(STAMPS, [50, 150, 250]))
-    assert "8 jumps" in notes[-1]
+    assert f"3 of {N} poses are off the path" in notes[0] and "2 jumps" in notes[-1]
     with pytest.raises(RecordingError, match="they do not come back"):
         checked(position)
+
+
+SMALL = np.array([9, 40, 42, 150, 222, 290])
+
+
+@pytest.mark.parametrize("what", ["3 cm", "3 deg", "50 m"])
+def test_single_wrong_poses(what):
+    """Far below a jump, with noise of 1 mm and 2 mrad."""
+    rng, n = np.random.default_rng(3), len(SMALL)
+    position = POSITION + 1e-3 * rng.normal(size=(N, 3))
+    rotation = (TURNS * Rotation.from_rotvec(2e-3 * rng.normal(size=(N, 3)))).as_matrix()
+    away = rng.normal(size=(n, 3))
+    away /= np.linalg.norm(away, axis=1)[:, None]
+    if what == "3 deg":
+        rotation[SMALL] = rotation[SMALL] @ Rotation.from_rotvec(np.deg2rad(3.0) * away).as_matrix()
+    else:
+        position[SMALL] += {"3 cm": 0.03, "50 m": 50.0}[what] * away
+    stream, notes = checked(position, rotation)
+    np.testing.assert_array_equal(stream.stamps_ns, np.delete(STAMPS, SMALL))
+    assert f"{n} of {N} poses are off the path" in notes[0] and f"the first at {STAMPS[9]} ns" in notes[0]
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-3])
+@pytest.mark.parametrize("every", [1, 5])
+def test_starts_and_stops_are_no_wrong_poses(noise, every):
+    """An odometry that mostly stands still, and starts and stops within one pose, at 50 and 10 Hz."""
+    moving = np.arange(N) % 60 > 45
+    s = np.cumsum(0.02 * every * moving)
+    position = np.stack([s, 0.2 * s, 0.0 * s], axis=1) + noise * np.random.default_rng(1).normal(size=(N, 3))
+    rotation = Rotation.from_rotvec(np.stack([0.0 * s, 0.0 * s, s], axis=1)).as_matrix()
+    stream, _ = checked(position, rotation, STAMPS[0] + every * (STAMPS - STAMPS[0]))
+    assert len(stream.stamps_ns) == N
 
 
 @pytest.mark.parametrize("copies", [np.arange(100, 120), np.arange(1, N, 4), np.array([33, 150, 151])])

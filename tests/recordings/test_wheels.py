@@ -157,7 +157,7 @@ def test_single_wrong_counts(tmp_path, measures, wrong):
     fields: dict[str, Any] = {"counts_per_turn": 4096.0} if measures == "ticks" else {}
     values = np.floor(ANGLES * 4096.0 / (2 * np.pi)) if measures == "ticks" else ANGLES
     bad = values.copy()
-    bad[wrong, 0] = 0.0 if measures == "ticks" else -77.0
+    bad[wrong, 0] = -9999.0 if measures == "ticks" else -77.0
     there = np.delete(np.arange(N), wrong)
     stream, notes = from_table(tmp_path, bad, measures=measures, **fields)
     np.testing.assert_array_equal(stream.stamps_ns, STAMPS[there])

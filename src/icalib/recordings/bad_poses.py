@@ -15,6 +15,7 @@ from icalib.geometry import so3
 
 FARTHEST_M = 1e9  # from the origin of any frame: the Earth's radius is 6e6
 _JUMP_M, _JUMP_RAD = 0.05, 0.05  # beyond the steps before and after, and
+_BRISK = 10.0  # m/s^2, rad/s^2: a motion may change so fast from pose to pose, or
 _JUMP_TIMES = 20.0  # the median of all steps beyond theirs
 _LASTING_SHARE = 0.1  # of all poses: more are not left out for one jump less
 _MOST_PIECES_BACK = 200
@@ -124,7 +125,7 @@ class _Steps:
     def of(cls, change: np.ndarray, step: np.ndarray, least: float) -> _Steps:
         usual = float(np.median(step))
         size = np.linalg.norm(change - _medians(change), axis=1)
-        limit = max(least, _JUMP_TIMES * float(np.median(size)))
+        limit = max(least, _BRISK * usual**2, _JUMP_TIMES * float(np.median(size)))
         gap = step >= _GAP_STEPS * usual
         jump, rate = (size > limit) & ~gap, change / step[:, None]
         steady = np.flatnonzero(~jump & ~gap)

@@ -5,13 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 _NEIGHBOURS = 2  # on each side, of whose median a reading is compared with (the Hampel identifier)
-_TIMES = 20.0  # the median of all distances from it, and
-_SHARE = 0.25  # of the fastest motion; what stands nearer, the robust loss of the estimate weighs down
+_TIMES = 10.0  # the median of all distances from it: about 6 standard deviations, which noise hardly reaches, and
+_BRISK = 95  # the percentile of changes from reading to reading: one in a hundred bad readings leaves it alone
+_BRISK_TIMES = 4.0  # of that change: a brisk motion may be over after one reading
 _QUANTA = 10.0  # of the steps in which rates come: of a slow wheel single ticks stand apart
 _NOTHING = 1e-6  # of the fastest motion
 _ANY_FASTEST = 1e3  # rad/s or m/s: no vehicle's
 _NEAR_S = 0.25  # from the reading before to the one after: over a longer time the motion may have been so
 _MOST = 0.1  # of all readings: more are no single bad ones
+_FASTEST_TIMES = 2.0  # of the fastest motion: from forwards to backwards
 _BACK_WITHIN = 4  # steps: so many after a wrong reading the angle is what it was
 _RETURNS = 0.2  # of a step: what is left of it where it comes back
 _SAME = 0.01  # of the size of a counter
@@ -26,10 +28,12 @@ def apart(rate: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray
     padded = np.pad(rate, ((_NEIGHBOURS, _NEIGHBOURS), (0, 0)), mode="reflect")
     middle = np.median(np.stack([padded[k : k + len(rate)] for k in range(2 * _NEIGHBOURS + 1)]), axis=0)
     off = rate - middle
-    fast = np.percentile(np.abs(middle), 99, axis=0)
-    limit = np.maximum(_TIMES * np.median(np.abs(off), axis=0), _SHARE * fast)
+    brisk = np.percentile(np.abs(np.diff(rate, axis=0)), _BRISK, axis=0)
+    limit = np.maximum(_TIMES * np.median(np.abs(off), axis=0), _BRISK_TIMES * brisk)
     limit = np.maximum(limit, [_coarse(r, o) for r, o in zip(rate.T, off.T, strict=True)])
-    own = np.abs(off) > limit
+    # At the ends the neighbours of one side stand in for both: a start is not one that stands apart.
+    ends = np.isin(np.arange(len(rate)), [0, 1, len(rate) - 2, len(rate) - 1])[:, None]
+    own = np.abs(off) > np.where(ends, np.maximum(limit, _fastest(rate)), limit)
     span = np.diff(seconds, prepend=seconds[0])
     own &= (span + np.append(span[1:], 0.0) < _NEAR_S)[:, None]
     if own.any(axis=1).sum() > _MOST * len(rate):
@@ -42,6 +46,17 @@ def _coarse(rate: np.ndarray, off: np.ndarray) -> float:
     fast = min(float(np.percentile(np.abs(rate), 99)), _ANY_FASTEST)
     size = np.abs(off)[np.abs(off) > _NOTHING * fast]
     return min(_QUANTA * float(np.percentile(size, 10)), 2.0 * fast) if len(size) else 0.0
+
+
+def set_back(rate: np.ndarray, off: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """(N, m) which of the steps `own` of angles are longer than any motion: the angle was set to another. Shorter ones
+    are motion: what was turned is known, and stays."""
+    return own & (np.abs(off) > _fastest(rate))
+
+
+def _fastest(rate: np.ndarray) -> np.ndarray:
+    """(m,) more than motions with rates (N, m) change."""
+    return _FASTEST_TIMES * np.percentile(np.abs(rate), _BRISK, axis=0)
 
 
 def comes_back(off: np.ndarray, own: np.ndarray) -> np.ndarray:

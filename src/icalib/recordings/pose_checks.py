@@ -10,6 +10,7 @@ from icalib.measurements import PoseStream, seconds_since
 from icalib.recordings.bad_poses import are_poses, path_of, stale_copies
 from icalib.recordings.ordered import kept_readings
 from icalib.recordings.poses import RATE_HZ, PoseReadings
+from icalib.recordings.single_poses import single_wrong
 from icalib.recordings.stops import stands_still_between
 from icalib.rig import PoseSensor
 
@@ -34,11 +35,15 @@ def checked_poses(read: PoseReadings, sensor: PoseSensor, where: str) -> tuple[P
     kept, notes = kept_readings(read.stamps_ns, values, what, RATE_HZ, "pose", own)
     read = _some(read, kept)
     read, copied = _without_copies(read, what)
-    read, jumped = _on_path(read, sensor, what)
+    single, jumped = (), ()
+    if not stands_still_between(_seconds(read), read.rotation, read.position):
+        # Where it stands still what moved while it was not seen did not jump.
+        read, single = _without_singles(read, what)
+        read, jumped = _on_path(read, sensor, what)
     _refuse_stillness(read, what)
     _refuse_units(read, what)
     stream = PoseStream(read.name, read.stamps_ns, np.ascontiguousarray(read.rotation), read.position)
-    return stream, broken + notes + copied + jumped
+    return stream, broken + notes + copied + single + jumped
 
 
 def _some(read: PoseReadings, kept: np.ndarray) -> PoseReadings:
@@ -75,11 +80,19 @@ def _without_copies(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple[
     )
 
 
+def _without_singles(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple[str, ...]]:
+    wrong = single_wrong(_seconds(read), read.rotation, read.position)
+    if not wrong.any():
+        return read, ()
+    return _some(read, ~wrong), (
+        f"{what}: {int(wrong.sum())} of {len(wrong)} poses are off the path of the poses before and after and are left "
+        f"out, the first at {read.stamps_ns[np.argmax(wrong)]} ns.",
+    )
+
+
 def _on_path(read: PoseReadings, sensor: PoseSensor, what: str) -> tuple[PoseReadings, tuple[str, ...]]:
     """Without poses off the path of the others, and a note where poses jump; raises RecordingError where jumps of a
     frame that stands still do not come back."""
-    if stands_still_between(_seconds(read), read.rotation, read.position):
-        return read, ()  # what moved while it was not seen did not jump
     path = path_of(_seconds(read), read.rotation, read.position)
     if not len(path.jumps):
         return read, ()

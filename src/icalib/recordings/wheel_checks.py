@@ -8,7 +8,7 @@ import numpy as np
 
 from icalib.errors import RecordingError
 from icalib.measurements import WheelPoses, WheelStream, seconds_since
-from icalib.recordings.bad_wheels import apart, comes_back, counter_of, range_of, without_wraps
+from icalib.recordings.bad_wheels import apart, comes_back, counter_of, range_of, set_back, without_wraps
 from icalib.recordings.clocks import usual_step
 from icalib.recordings.ordered import kept_readings, longest_run
 from icalib.recordings.wheels import RATE_HZ, WheelReadings
@@ -112,6 +112,7 @@ def _mean_rates(read: WheelReadings, wheels: Wheels, what: str) -> tuple[WheelRe
         notes += (f"{what}: {int(wrong.sum())} single readings are wrong and are left out, the first at {at} ns.",)
         read = _some(read, ~wrong)
         off, own = apart(_steps(read, wheels, size), _seconds(read)[1:])
+    own = set_back(_steps(read, wheels, size), off, own)
     if wheels.measures == "ticks" and wheels.counter_size is None and own.any():
         _refuse_counter(read, wheels, off * np.diff(_seconds(read))[:, None] * own, what)
     rate, stamps = _steps(read, wheels, size), read.stamps_ns
