@@ -314,6 +314,17 @@ def test_a_long_gap_is_not_filled():
     )
 
 
+def test_short_pieces_between_gaps_are_left_out():
+    """Half a second, and one and a half, with a knock in it."""
+    imu = at_rest(300.0, 100.0, 8)
+    stamps, readings = imu.stamps_ns.copy(), np.hstack([imu.gyro, imu.accel])
+    for at in (12_000, 12_050, 12_200):
+        stamps[at:] += 5_000_000_000
+    readings[12_100:12_110] += 1.0
+    still = still_readings(with_readings(dataclasses.replace(imu, stamps_ns=stamps), readings))
+    assert [len(part) for part in still.stretches] == [12_000, 17_800]
+
+
 @pytest.mark.parametrize("scale", [0.3, 1.0])
 def test_rates_in_degrees_are_named(scale: float):
     """A quiet gyroscope and a usual one; the accelerometer as it is."""

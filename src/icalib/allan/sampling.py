@@ -144,28 +144,52 @@ def _disturbed(parts: list[np.ndarray], window: int) -> list[np.ndarray]:
     means = [w.mean(axis=1) for w in windows]
     floor = 0.5 * _rounding_step(parts)
     noises = [np.hypot(w.std(axis=1), floor) for w in windows]
-    least = round(_LEAST_S / _WINDOW_S)
-    running = [np.median(sliding_window_view(n, least, axis=0), axis=-1) for n in noises if len(n) >= least]
-    if not running:
+    limits = _limits(windows, noises)
+    if limits is None:
         return [np.ones(len(n), bool) for n in noises]
-    quietest = np.concatenate(running).min(axis=0) + 1e-12
-    loudest = quietest * _LOUDER * np.exp(_SCATTERS * _scatter(np.concatenate(noises), quietest))
+    quietest, loudest = limits
     jump = np.maximum(_JUMP, _SURE * quietest / np.sqrt(window))
     middle = np.nanmedian(np.where(np.concatenate(noises) <= loudest, np.concatenate(means), np.nan), axis=0)[:3]
     found = []
     for mean, noise in zip(means, noises, strict=True):
-        loud = (noise > loudest).any(axis=1)
-        loud[1:] |= (near := loud.copy())[:-1]
-        loud[:-1] |= near[1:]
+        loud = np.pad(np.any(noise > loudest, axis=1), 1)
+        loud = loud[:-2] | loud[1:-1] | loud[2:]  # the windows before and after, too
         moved = (np.abs(np.diff(mean, axis=0, prepend=mean[:1])) > jump).any(axis=1)
         found.append(loud | moved | (np.abs(mean[:, :3] - middle) > _OFF_RAD_S).any(axis=1))
     return found
+
+
+def _limits(windows: list[np.ndarray], noises: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray] | None:
+    """(6,) noise of the quietest 10 s, and the most that a window at rest has; None where no part is that long."""
+    least = round(_LEAST_S / _WINDOW_S)
+    runs = [
+        (np.median(sliding_window_view(noise, least, axis=0), axis=-1), readings)
+        for noise, readings in zip(noises, windows, strict=True)
+        if len(noise) >= least
+    ]
+    if not runs:
+        return None
+    quietest = np.min([noise.min(axis=0) for noise, _ in runs], axis=0) + 1e-12
+    scatter = _scatter(np.concatenate(noises), quietest)
+    for axis in range(6):
+        noise, readings = min(runs, key=lambda run: run[0][:, axis].min())
+        at = int(noise[:, axis].argmin())
+        scatter[axis] = min(scatter[axis], _scatter_of_noise(readings[at : at + least, :, axis]))
+    return quietest, quietest * _LOUDER * np.exp(_SCATTERS * scatter)
 
 
 def _scatter(noises: np.ndarray, quietest: np.ndarray) -> np.ndarray:
     """(6,) standard deviation of the logarithm of the noise of quiet windows, from its median deviation."""
     quiet = np.log(np.where(noises <= _QUIET * quietest, noises, np.nan) / quietest)
     return 1.4826 * np.nanmedian(np.abs(quiet - np.nanmedian(quiet, axis=0)), axis=0)
+
+
+def _scatter_of_noise(windows: np.ndarray) -> float:
+    """The same by Bartlett's formula, from the spectrum of some windows (m, window) at rest: a filter leaves few of a
+    window's readings independent."""
+    power = np.abs(np.fft.rfft(windows.ravel() - windows.mean())[1:]) ** 2
+    squares = 0.5 * len(power) * float((power**2).sum()) / max(float(power.sum()) ** 2, 1e-300)  # of the correlation
+    return float(np.sqrt(0.5 * squares / windows.shape[1]))
 
 
 def _rounding_step(parts: list[np.ndarray]) -> np.ndarray:
