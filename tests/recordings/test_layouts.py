@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from icalib.errors import RecordingError, RigError
-from icalib.recordings import FolderRecording
+from icalib.imu_classes import class_noise
+from icalib.recordings import FolderRecording, read_measurements
 from icalib.recordings.clocks import unit_of_stamps, usual_step
 from icalib.recordings.columns import IMU, TableKind
 from icalib.recordings.table import read_table
-from icalib.rig import Camera, PoseSensor, TableLayout, Wheels
+from icalib.rig import Camera, ImuSensor, PoseSensor, Rig, TableLayout, Wheels
 from icalib.rig_file import load_rig, rig_from_dict, rig_to_dict
 
 ORIGIN, STEP, N = 1_700_000_000_123_456_789, 5_000_000, 60
@@ -260,3 +261,22 @@ def test_the_fields_of_the_rig_file(tmp_path):
         path.write_text(RIG.replace(old, new))
         with pytest.raises(RigError, match=words):
             load_rig(path)
+
+
+def test_huge_numbers_are_single_bad_readings(tmp_path):
+    values = np.tile(VALUES, (10, 1)) * [0.1, 0.1, 0.1, 1, 1, 1]
+    values[100, 2], values[200, 4] = 1e300, -1e308
+    stamps = [str(ORIGIN + STEP * k) for k in range(len(values))]
+    write_table(tmp_path, "imu0/data.csv", rows(stamps=stamps, values=values))
+    quaternions = ["0,0,0,1"] * 600
+    quaternions[50] = "1e300,0,0,1"
+    lines = [f"{t},{0.01 * k},{0.02 * k},0,{q}\n" for k, (t, q) in enumerate(zip(stamps, quaternions, strict=True))]
+    write_table(tmp_path, "mocap0/poses.csv", "".join(lines))
+    rig = Rig(
+        ImuSensor("imu0", "imu0/data.csv", class_noise("consumer")),
+        (),
+        poses=(PoseSensor("mocap0", "mocap0/poses.csv"),),
+    )
+    found = read_measurements(FolderRecording(tmp_path), rig)
+    assert found.imu is not None and len(found.imu.stamps_ns) == 598 and len(found.poses[0].stamps_ns) == 599
+    assert np.abs(found.imu.accel).max() < 1e3

@@ -66,7 +66,7 @@ def read_pose_file(name: str, path: Path, layout: TableLayout = PLAIN_TABLE, not
     table = read_table(path, kind, layout, note)
     stamps_ns, values = table.integers[:, 0].copy(), table.decimals
     xyzw = values[:, 3:]
-    length = np.linalg.norm(xyzw, axis=1)
+    length = np.linalg.norm(np.clip(xyzw, -1e9, 1e9), axis=1)  # squares must not overflow
     wrong = ~(np.abs(length - 1.0) < _UNIT)
     if 2 * wrong.sum() > len(wrong):
         i = int(np.argmax(wrong))

@@ -20,6 +20,7 @@ _ALIKE = 0.5  # cosine between deviations of neighbours: a shock pushes one way,
 _MANY = 0.2  # of readings that stand off: then these are no single wrong ones
 _IMPOSSIBLE = 100.0  # times the usual size of an accelerometer's readings: no sensor's range
 _IMPOSSIBLE_RATE = 1e4  # in rad/s or deg/s
+_LARGEST = 1e150  # whose square is a number, too
 _STUCK = 3  # repeats in a row
 _JUMP = 8.0  # usual steps by which a reading differs from the one before, after the sensor was stuck
 _TO_MAD = 1.4826
@@ -44,14 +45,19 @@ def spikes(seconds: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 def impossible(values: np.ndarray, is_gyro: bool) -> np.ndarray:
     """(N,) bool: readings (N, 3) beyond any sensor's range, or not finite."""
-    size = np.linalg.norm(np.where(np.isfinite(values), values, np.inf), axis=1)
+    size = np.linalg.norm(squarable(np.where(np.isfinite(values), values, np.inf)), axis=1)
     limit = _IMPOSSIBLE_RATE if is_gyro else _IMPOSSIBLE * max(float(np.median(size)), 1e-9)
-    return ~(size <= limit)
+    return ~(size <= limit) | ~np.isfinite(values).all(axis=1)
+
+
+def squarable(values: np.ndarray) -> np.ndarray:
+    """The same, numbers whose squares would overflow made smaller: none of them is a measurement."""
+    return np.clip(values, -_LARGEST, _LARGEST)
 
 
 def stuck(values: np.ndarray) -> np.ndarray:
     """(N,) bool: readings (N, 3) that repeat the one before exactly, several in a row, after which they jump."""
-    step = np.linalg.norm(np.diff(values, axis=0), axis=1)
+    step = np.linalg.norm(np.diff(squarable(values), axis=0), axis=1)
     bad = np.zeros(len(values), bool)
     for begin, end in _runs(np.concatenate([[False], step == 0.0])):
         if end - begin < _STUCK or end >= len(values):

@@ -212,8 +212,8 @@ def _poses(bag: HasMessages, topic: str, frame: str, stamps_ns: np.ndarray, pose
 
 def unit_rotations(xyzw: np.ndarray, good: np.ndarray) -> np.ndarray:
     """(N, 3, 3) of quaternions (N, 4) of about unit length; NaN where they are not `good` (N,)."""
-    length = np.where(good, np.linalg.norm(xyzw, axis=1), np.nan)
-    return rotations(xyzw / length[:, None])
+    xyzw = np.where(good[:, None], xyzw, np.nan)
+    return rotations(xyzw / np.linalg.norm(xyzw, axis=1)[:, None])
 
 
 def rotations(xyzw: np.ndarray) -> np.ndarray:
