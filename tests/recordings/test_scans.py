@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,9 @@ from icalib.errors import RecordingError
 from icalib.measurements import LidarStream
 from icalib.recordings import FolderRecording, open_recording
 from icalib.recordings.lidar_checks import checked_lidar
+from icalib.recordings.reading import read_measurements
 from icalib.rig import Lidar
+from icalib.rig_file import load_rig
 
 LIDAR = Lidar("lidar0", "lidar0/scans.npz")
 RNG = np.random.default_rng(2)
@@ -187,6 +190,39 @@ def test_stamps_that_are_no_faults(tmp_path, case):
     assert stream.stamps_ns.tolist() == arrays["stamps_ns"].tolist() and notes == ()
 
 
+@pytest.mark.parametrize("i", [0, 7, 23])
+@pytest.mark.parametrize("stamp_ns", [0, 10**18 + 10**15, 10**18 - 3 * 10**12])
+def test_a_wrong_stamp_is_no_jump_of_the_clock(tmp_path, i, stamp_ns):
+    """Nor is it at the ends."""
+    arrays = scan_of(np.arange(24))
+    arrays["stamps_ns"][i] = stamp_ns
+    write_imu(tmp_path)
+    read(tmp_path, arrays)
+    (tmp_path / "rig.yaml").write_text("sensors:\n  imu0: {type: imu}\n  lidar0: {type: lidar}\n")
+    found = read_measurements(open_recording(tmp_path), load_rig(tmp_path / "rig.yaml"))
+    expect(found.lidars[0], [k for k in range(24) if k != i])
+    assert any("1 of 24 scans have a stamp that does not fit their neighbours'" in note for note in found.notes)
+
+
+def test_a_clock_of_scans_that_jumps(tmp_path):
+    """The longer part is used."""
+    arrays = scan_of(np.arange(24))
+    arrays["stamps_ns"][9:] += 10**15
+    write_imu(tmp_path)
+    read(tmp_path, arrays)
+    (tmp_path / "rig.yaml").write_text("sensors:\n  imu0: {type: imu}\n  lidar0: {type: lidar}\n")
+    found = read_measurements(open_recording(tmp_path), load_rig(tmp_path / "rig.yaml"))
+    assert found.lidars[0].stamps_ns.tolist() == arrays["stamps_ns"][9:].tolist()
+    assert any("the clock jumps forward" in note for note in found.notes)
+
+
+def write_imu(folder: Path):
+    (folder / "imu0").mkdir()
+    rows = np.random.default_rng(0).normal(size=(100, 6)) + [0, 0, 0, 0, 0, 9.81]
+    lines = (f"{10**18 + k * 10**7}," + ",".join(f"{v:.6f}" for v in row) for k, row in enumerate(rows))
+    (folder / "imu0" / "data.csv").write_text("\n".join(lines) + "\n")
+
+
 def test_a_scan_far_from_its_stamp_is_left_out(tmp_path):
     arrays = scan_of(np.arange(24))
     arrays["offset_s"][70:80] += 4.3
@@ -205,10 +241,7 @@ def test_a_lidar_that_froze_is_refused(tmp_path):
 def test_a_refusal_says_what_was_repaired_before(tmp_path, capsys):
     """On standard output; the sentence itself stays alone. A rest of few points calibrates nothing."""
     read(tmp_path, GOOD | {"offset_s": GOOD["offset_s"] * 1e3})
-    (tmp_path / "imu0").mkdir()
-    rows = np.random.default_rng(0).normal(size=(100, 6)) + [0, 0, 0, 0, 0, 9.81]
-    lines = (f"{10**18 + k * 10**7}," + ",".join(f"{v:.6f}" for v in row) for k, row in enumerate(rows))
-    (tmp_path / "imu0" / "data.csv").write_text("\n".join(lines) + "\n")
+    write_imu(tmp_path)
     (tmp_path / "rig.yaml").write_text("sensors:\n  imu0: {type: imu}\n  lidar0: {type: lidar}\n")
     command = [
         "calibrate",

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from icalib.errors import RecordingError
-from icalib.measurements import CornerStream, Measurements
+from icalib.measurements import CornerStream, LidarStream, Measurements
 from icalib.recordings.base import Recording
 from icalib.recordings.camera_checks import checked_corners
 from icalib.recordings.imu_checks import read_imu
@@ -41,11 +41,11 @@ def read_measurements(recording: Recording, rig: Rig, find: FindCorners = tables
     tracks = tuple(cut(recording.tracks(c), f"the tracks of {c.name}") for c in rig.cameras if c.tracks is not None)
     cameras, seen = _corners(recording, rig, find, cut)
 
-    def read(stream: S, sensor: Lidar | Wheels | PoseSensor) -> tuple[S, str]:
+    def read(stream: S, sensor: Wheels | PoseSensor) -> tuple[S, str]:
         where = recording.where(sensor)
         return cut(stream, f"{where} ({sensor.name})"), where
 
-    lidars = [checked_lidar(*read(recording.lidar(s), s)) for s in rig.lidars]
+    lidars = [_scans(recording, s, cut) for s in rig.lidars]
     wheels = [checked_wheels(stream, w, where) for w in rig.wheels for stream, where in [read(recording.wheels(w), w)]]
     poses = [
         checked_poses(as_frame_sensor(stream, s), s, where)
@@ -58,6 +58,15 @@ def read_measurements(recording: Recording, rig: Rig, find: FindCorners = tables
         lidars=tuple(stream for stream, _ in lidars), wheels=tuple(stream for stream, _ in wheels),
         poses=tuple(stream for stream, _ in poses),
     )  # fmt: skip
+
+
+def _scans(
+    recording: Recording, sensor: Lidar, cut: Callable[[LidarStream, str], LidarStream]
+) -> tuple[LidarStream, tuple[str, ...]]:
+    """Checked before it is cut: a single wrong stamp is no jump of the clock."""
+    where = recording.where(sensor)
+    stream, notes = checked_lidar(recording.lidar(sensor), where)
+    return cut(stream, f"{where} ({sensor.name})"), notes
 
 
 def is_timed(rig: Rig) -> bool:

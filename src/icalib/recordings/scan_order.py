@@ -17,6 +17,7 @@ _ROOM = 0.5  # of a period, that a scan has to both sides where it belongs
 _FEWEST_EVEN = 10  # scans that show how even stamps are
 _LATE, _SURE = 0.05, 8.0  # of a period, and scatters of the stamps, by which a single one is too early or too late
 _ENDS = (1.0, 99.0)  # per cent: the first and the last points of a scan, but for single wrong times
+_LONELY_S = 10.0  # from all other scans
 _MOST_BAD = 0.1  # share of scans with bad stamps; more of them is a clock that was set back
 
 
@@ -43,7 +44,7 @@ def in_order(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[str, ..
     Raises RecordingError naming the instant where these are too many to be errors of single stamps.
     """
     stamps_ns = stream.stamps_ns
-    kept = _longest_increasing(stamps_ns)
+    kept = _without_lonely_ends(stamps_ns, _longest_increasing(stamps_ns))
     if len(kept) == len(stamps_ns):
         return stream, ()
     order, late, bad = _sorted_in(stamps_ns, kept)
@@ -109,6 +110,15 @@ def selected(stream: LidarStream, scans: np.ndarray) -> LidarStream:
 def _same(points: np.ndarray, others: np.ndarray) -> bool:
     """Their first points tell nearly all scans apart."""
     return len(points) == len(others) and (points[:8] == others[:8]).all() and np.array_equal(points, others)
+
+
+def _without_lonely_ends(stamps_ns: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """The scans `kept` (K,) but a first or last one that is far from all others: its stamp may be wrong, and alone it
+    shows nothing."""
+    if len(kept) < _FEWEST_EVEN:
+        return kept
+    first, last = (abs(int(stamps_ns[kept[a]] - stamps_ns[kept[b]])) > _LONELY_S * 1e9 for a, b in ((0, 1), (-1, -2)))
+    return kept[int(first) : len(kept) - int(last)]
 
 
 def _sorted_in(stamps_ns: np.ndarray, kept: np.ndarray) -> tuple[np.ndarray, list[int], list[int]]:
