@@ -75,6 +75,28 @@ def _same(a: Any, b: Any) -> bool:
     return type(a) is type(b) and a == b
 
 
+@pytest.fixture(scope="session", name="tags_on_walls")
+def _tags_on_walls_fixture() -> Callable[[tuple[float, float, float], int], np.ndarray]:
+    return _tags_on_walls
+
+
+def _tags_on_walls(room: tuple[float, float, float], a_wall: int) -> np.ndarray:
+    """(4 a_wall, 4, 4) T_world_body of a row of tags on each wall of a `room` of that size, at different heights and
+    turned in their walls."""
+    rng, poses, up = np.random.default_rng(1), [], np.array([0.0, 0.0, 1.0])
+    for inwards in np.array([[-1.0, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0]]):
+        along = np.cross(up, inwards)
+        middle = -inwards * (0.5 * np.abs(inwards) @ np.array(room) - 0.02)
+        for k in range(a_wall):
+            turn = np.deg2rad(rng.uniform(-30.0, 30.0))
+            x, T = np.cos(turn) * along + np.sin(turn) * up, np.eye(4)
+            T[:3, :3] = np.stack([x, np.cross(inwards, x), inwards], axis=1)
+            place = ((k + 0.5) / a_wall - 0.5) * float(np.abs(along) @ np.array(room))
+            T[:3, 3] = middle + place * along + rng.uniform(0.5, 1.9) * up
+            poses.append(T)
+    return np.stack(poses)
+
+
 @pytest.fixture
 def assert_drawn(tmp_path: Path) -> Callable[[str, set[str]], None]:
     """Fails where a browser finds an error in a report, or leaves one of its figures undrawn."""

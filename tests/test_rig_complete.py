@@ -22,7 +22,7 @@ EMPTY = Measurements(None, ())
         (Rig(IMU, ()), "there is no camera, no LiDAR and no pose sensor"),
         (
             Rig(IMU, (), wheels=(WHEELS,)),
-            "wheel0 and imu0 do not show the motion, and there is no camera, no LiDAR and no pose sensor",
+            "wheel0 and imu0 do not show the motion, and there is no camera",
         ),
         (Rig(None, (), wheels=(WHEELS,)), "there is no camera, no LiDAR and no pose sensor"),
         (Rig(None, (), lidars=(LIDAR,)), "lidar0 needs an IMU"),

@@ -25,23 +25,6 @@ RADTAN = camera_model("pinhole-radtan")
 EUROC = np.array([458.654, 457.296, 367.215, 248.375, -0.28340811, 0.07395907, 0.00019359, 1.76187e-05])
 
 
-def tags_on_walls(size: tuple[float, float, float]) -> np.ndarray:
-    """(tags, 4, 4) T_world_body of a row of tags on each wall, at different heights and turned in their walls."""
-    rng, poses = np.random.default_rng(1), []
-    for inwards in np.array([[-1.0, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0]]):
-        along = np.cross([0.0, 0.0, 1.0], inwards)
-        middle = -inwards * (0.5 * np.abs(inwards) @ np.array(size) - 0.02)
-        length = np.abs(along) @ np.array(size)
-        for k in range(PER_WALL):
-            turn = np.deg2rad(rng.uniform(-30.0, 30.0))
-            x = np.cos(turn) * along + np.sin(turn) * np.array([0.0, 0.0, 1.0])
-            T = np.eye(4)
-            T[:3, :3] = np.stack([x, np.cross(inwards, x), inwards], axis=1)
-            T[:3, 3] = middle + ((k + 0.5) / PER_WALL - 0.5) * length * along + [0.0, 0.0, rng.uniform(0.5, 1.9)]
-            poses.append(T)
-    return np.stack(poses)
-
-
 @pytest.fixture(scope="module", autouse=True)
 def _one_thread():
     """As in the program: threads of BLAS are slower on matrices so small."""
@@ -50,7 +33,7 @@ def _one_thread():
 
 
 @pytest.fixture(scope="module")
-def robot():
+def robot(tags_on_walls):
     """A ground robot of the paper among tags, with the first and the third of its cameras and its wheels."""
     base = load_scenario(PAPER / "table2-ramp.yaml")
     return replace(
@@ -62,7 +45,7 @@ def robot():
         wheels=tuple(replace(w, noise=0.005, allowed_slip=1e-4) for w in base.wheels),
         target=Markers("tag36h11", EDGE_M, tuple(range(4 * PER_WALL))),
         board=True,
-        T_world_bodies=tags_on_walls(base.room.size),
+        T_world_bodies=tags_on_walls(base.room.size, PER_WALL),
     )
 
 

@@ -5,7 +5,6 @@ It is for first guesses: robust, with broad priors on the lenses, which keep a s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -149,61 +148,38 @@ class _Sums:
 
     def step(self, seen: SceneViews, state: SceneState, fixed_image: int, damping: float) -> SceneState | None:
         """The state after one damped step; None where it cannot be solved."""
-        first = 6 * len(state.R_body)
-        begins = [first]
+        begins = [6 * len(state.R_body)]
         for lens in state.lenses:
             begins.append(begins[-1] + len(lens.params))
-        S, g = np.zeros((begins[-1], begins[-1])), np.zeros(begins[-1])
+        S, g, diagonal = np.zeros((begins[-1], begins[-1])), np.zeros(begins[-1]), np.zeros(begins[-1])
         for c, lens in enumerate(state.lenses):
             own = slice(begins[c], begins[c + 1])
-            S[own, own] += np.diag(lens.free / lens.sigma**2)
-            g[own] += lens.free * (lens.params - lens.mean) / lens.sigma**2
-        images, bounds = np.unique(seen.image, return_index=True)
-        eliminated = []
-        for i, a, b in zip(images, bounds, [*bounds[1:], len(seen.image)], strict=True):
-            c = seen.camera[i]
-            lens = np.arange(begins[c], begins[c + 1])
-            columns = np.concatenate([*(6 * seen.body[v] + np.arange(6) for v in range(a, b)), lens])
-            block, slope = _of_image(self.gram[a:b], self.gradient[a:b], len(lens))
-            S[np.ix_(columns, columns)] += block[6:, 6:]
-            g[columns] += slope[6:]
-            if i != fixed_image:
-                own = block[:6, :6] + damping * np.diag(np.diag(block[:6, :6])) + RIDGE * np.eye(6)
-                eliminated.append((i, columns, np.linalg.inv(own), block[:6, 6:], slope[:6]))
-        diagonal = np.diag(S).copy()
-        for _, columns, inverse, coupling, slope in eliminated:
-            S[np.ix_(columns, columns)] -= coupling.T @ inverse @ coupling
-            g[columns] -= coupling.T @ (inverse @ slope)
+            diagonal[own] = lens.free / lens.sigma**2
+            g[own] = lens.free * (lens.params - lens.mean) / lens.sigma**2
+        S[np.diag_indices_from(S)] = diagonal
+        edges = np.flatnonzero(np.diff(seen.image, prepend=-1, append=-1))  # of the views of one image
+        camera, bounds = seen.camera[seen.image[edges[:-1]]], np.array(begins)
+        fixed = seen.image[edges[:-1]] == fixed_image
+        inverse, slope = _eliminate(
+            self.gram, self.gradient, edges, seen.body, camera, bounds, fixed, damping, S, g, diagonal
+        )
         S[np.diag_indices_from(S)] += np.where(diagonal > 0.0, damping * diagonal, 1.0)
         try:
             step = -np.linalg.solve(S, g)
         except np.linalg.LinAlgError:
             return None
-        return _moved(state, step, begins, eliminated) if np.isfinite(step).all() else None
+        if not np.isfinite(step).all():
+            return None
+        turns = _image_steps(self.gram, edges, seen.body, camera, bounds, step, inverse, slope)
+        return _moved(state, step, begins, seen.image[edges[:-1]], turns)
 
 
-def _of_image(gram: np.ndarray, gradient: np.ndarray, n_lens: int) -> tuple[np.ndarray, np.ndarray]:
-    """The normal equations of one image with k views over its pose, its bodies one after another, and its lens."""
-    k = len(gram)
-    n = 6 + 6 * k + n_lens
-    block, slope, lens = np.zeros((n, n)), np.zeros(n), slice(6 + 6 * k, n)
-    own = np.r_[0:6, 12 : 12 + n_lens]
-    shared = np.r_[0:6, 6 + 6 * k : n]
-    block[np.ix_(shared, shared)] = gram.sum(axis=0)[np.ix_(own, own)]
-    slope[shared] = gradient.sum(axis=0)[own]
-    for v in range(k):
-        body = slice(6 + 6 * v, 12 + 6 * v)
-        block[body, body], slope[body] = gram[v, 6:12, 6:12], gradient[v, 6:12]
-        block[:6, body], block[body, :6] = gram[v, :6, 6:12], gram[v, 6:12, :6]
-        block[lens, body], block[body, lens] = gram[v, 12 : 12 + n_lens, 6:12], gram[v, 6:12, 12 : 12 + n_lens]
-    return block, slope
-
-
-def _moved(state: SceneState, step: np.ndarray, begins: list[int], eliminated: Sequence[tuple]) -> SceneState:
+def _moved(
+    state: SceneState, step: np.ndarray, begins: list[int], images: np.ndarray, image_step: np.ndarray
+) -> SceneState:
     R, p = state.R_image.copy(), state.p_image.copy()
-    for i, columns, inverse, coupling, slope in eliminated:
-        d = -inverse @ (slope + coupling @ step[columns])
-        R[i], p[i] = R[i] @ so3.exp(d[:3]), p[i] + R[i] @ d[3:]
+    p[images] += np.einsum("nij,nj->ni", R[images], image_step[:, 3:])
+    R[images] = R[images] @ so3.exp_many(np.ascontiguousarray(image_step[:, :3]))
     body = step[: begins[0]].reshape(-1, 6)
     turn = so3.exp_many(np.ascontiguousarray(body[:, :3]))
     p_body = state.p_body + np.einsum("kij,kj->ki", state.R_body, body[:, 3:])
@@ -212,6 +188,85 @@ def _moved(state: SceneState, step: np.ndarray, begins: list[int], eliminated: S
         for c, lens in enumerate(state.lenses)
     )
     return SceneState(R, p, state.R_body @ turn, p_body, lenses)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _columns(a, b, body, camera, begins, columns, own):
+    """Columns of the border that the views a..b of one image meet, the lens last, and where each view has them."""
+    n = 0
+    for v in range(a, b):
+        for k in range(6):
+            columns[n] = 6 * body[v] + k
+            own[n] = 6 + k
+            n += 1
+    for k in range(begins[camera + 1] - begins[camera]):
+        columns[n] = begins[camera] + k
+        own[n] = 12 + k
+        n += 1
+    return n
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _eliminate(gram, gradient, edges, body, camera, begins, fixed, damping, S, g, diagonal):
+    """Adds all images to the normal equations S (n, n), g (n,) of bodies and lenses, their poses eliminated (Schur
+    complement), and to `diagonal` (n,) without that. Returns (images, 6, 6) inverse blocks and (images, 6) gradients,
+    zero where an image is fixed."""
+    m, most = len(edges) - 1, gram.shape[1] - 12
+    inverse, slope = np.zeros((m, 6, 6)), np.zeros((m, 6))
+    longest = 0
+    for i in range(m):
+        longest = max(longest, edges[i + 1] - edges[i])
+    columns, own = np.empty(6 * longest + most, dtype=np.int64), np.empty(6 * longest + most, dtype=np.int64)
+    for i in range(m):
+        a, b = edges[i], edges[i + 1]
+        n = _columns(a, b, body, camera[i], begins, columns, own)
+        coupling, block = np.zeros((6, n)), RIDGE * np.eye(6)
+        for v in range(a, b):
+            first = 6 * (v - a)
+            for j in range(n):
+                if first <= j < first + 6 or j >= 6 * (b - a):
+                    g[columns[j]] += gradient[v, own[j]]
+                    diagonal[columns[j]] += gram[v, own[j], own[j]]
+                    for k in range(n):
+                        if first <= k < first + 6 or k >= 6 * (b - a):
+                            S[columns[j], columns[k]] += gram[v, own[j], own[k]]
+                    for k in range(6):
+                        coupling[k, j] += gram[v, k, own[j]]
+            for j in range(6):
+                slope[i, j] += gradient[v, j]
+                for k in range(6):
+                    block[j, k] += gram[v, j, k]
+        if fixed[i]:
+            slope[i] = 0.0
+            continue
+        for k in range(6):
+            block[k, k] *= 1.0 + damping
+        inverse[i] = np.linalg.inv(block)
+        solved = inverse[i] @ coupling
+        for j in range(n):
+            for k in range(6):
+                g[columns[j]] -= solved[k, j] * slope[i, k]
+            for k in range(n):
+                for q in range(6):
+                    S[columns[j], columns[k]] -= coupling[q, j] * solved[q, k]
+    return inverse, slope
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _image_steps(gram, edges, body, camera, begins, step, inverse, slope):
+    """(images, 6) steps of the images' poses, from the `step` of bodies and lenses."""
+    m = len(edges) - 1
+    out = np.zeros((m, 6))
+    for i in range(m):
+        right = slope[i].copy()
+        for v in range(edges[i], edges[i + 1]):
+            for k in range(6):
+                for j in range(6):
+                    right[k] += gram[v, k, 6 + j] * step[6 * body[v] + j]
+                for j in range(begins[camera[i] + 1] - begins[camera[i]]):
+                    right[k] += gram[v, k, 12 + j] * step[begins[camera[i]] + j]
+        out[i] = -(inverse[i] @ right)
+    return out
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

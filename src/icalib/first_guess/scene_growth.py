@@ -32,6 +32,7 @@ LEAST_FITTING = 0.25  # of a body's views show it where it is placed, or it is n
 MOST_MISFITS = 0.25  # of the bodies
 ROUNDS = 8  # of the adjustment while the scene grows
 LAST_ROUNDS = 40
+AGAIN = 2  # times that all is placed anew where another place suits better
 LENS_IMAGES = 5  # from so many on, the focal length and the strongest distortion are adjusted
 WHOLE_LENS_IMAGES = 20  # from so many on, all of the lens is
 STRONGEST = np.array([0, 1, 4])  # fx, fy and the strongest distortion
@@ -46,10 +47,9 @@ class Grown:
     placed: np.ndarray
     rms_px: np.ndarray
 
-    @property
-    def median_rms(self) -> float:
-        """px, over images; those that could not be placed count as bad."""
-        return float(np.median(np.nan_to_num(self.rms_px, nan=UNSEEN_PX)))
+    def rms_of(self, share: float) -> float:
+        """px, which this share of the images is below; those that could not be placed count as bad."""
+        return float(np.quantile(np.nan_to_num(self.rms_px, nan=UNSEEN_PX), share))
 
     def in_frame_of(self, reference: int, bodies: Bodies) -> dict[Key, np.ndarray]:
         """Poses in the frame of a body, as in a state."""
@@ -101,6 +101,9 @@ def grow(bodies: Bodies, streams: Sequence[CornerStream], lenses: Sequence[Lens]
     growth = _Growth.begin(bodies, streams, lenses)
     while growth.extend():
         growth.adjust(ROUNDS)
+    for _ in range(AGAIN):  # what was placed wrongly while little was known
+        growth.adjust(ROUNDS)
+        growth.extend()
     growth.adjust(ROUNDS)
     growth.drop_misfits()
     growth.adjust(LAST_ROUNDS)
@@ -270,7 +273,7 @@ def telling_images(stream: CornerStream, body: np.ndarray) -> CornerStream:
     """Images spread over the recording, and `OF_EACH_PAIR` that show both bodies of each pair along which images tie
     bodies best (a maximum spanning forest); body (n_points,)."""
     n, m = len(stream.stamps_ns), int(body.max()) + 1
-    seen = np.zeros((n, m), dtype=np.int32)
+    seen = np.zeros((n, m), dtype=np.float32)
     seen[stream.image, body[stream.point]] = 1
     chosen = np.zeros(n, dtype=bool)
     chosen[np.linspace(0, n - 1, min(n, MOST_IMAGES)).astype(int)] = True

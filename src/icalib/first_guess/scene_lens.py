@@ -22,6 +22,7 @@ from icalib.measurements import CornerStream, Measurements
 from icalib.rig import Camera, Rig
 
 TRIAL_WIDTHS = (0.6, 1.0, 0.35)  # focal lengths to try, in image widths: views of 80, 53 and 110 degrees
+JUDGED_SHARE = 0.9  # of the images tell whether a scene fits: where a part of it stands wrongly, most still do
 GOOD_RMS_PX = 0.3  # a scene that fits so well needs no other trial: corners are seldom found better
 REGROWN = 4  # times that a start is followed
 WORTH_GROWING = 0.9  # another time is worth it where the error became so many times the one before
@@ -76,22 +77,22 @@ def _best(bodies: Bodies, camera: Camera, seen: CornerStream, starts: Iterator[L
     """The median error [px] and the lens (P,) of the scene that fits best, or fits well; each start is followed anew
     from where it led, as long as that fits better: where bodies stand wrongly, a nearly right lens places them right.
     Infinite where no scene fits a lens that can be."""
-    best, params = np.inf, np.empty(0)
+    best, median, params = np.inf, np.inf, np.empty(0)
     for start in starts:
         before = np.inf
         for _ in range(REGROWN):
             grown = grow(bodies, [seen], [start])
-            lens, rms = grown.state.lenses[0], grown.median_rms
+            lens, rms = grown.state.lenses[0], grown.rms_of(JUDGED_SHARE)
             if not is_possible(lens.model, lens.params, camera.resolution, seen.uv):
                 break
             if rms < best:
-                best, params = rms, lens.params
+                best, median, params = rms, grown.rms_of(0.5), lens.params
             if best < GOOD_RMS_PX:
-                return best, params
+                return median, params
             if not rms < WORTH_GROWING * before:
                 break
             before, start = rms, replace(start, params=lens.params)
-    return best, params
+    return median, params
 
 
 def is_possible(model: CameraModel, params: np.ndarray, resolution: tuple[int, int], uv: np.ndarray) -> bool:
