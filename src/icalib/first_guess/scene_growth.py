@@ -30,6 +30,7 @@ TRIAL_VIEWS = 12  # in which a place of a body is tried
 SURER = 0.7  # another place is taken where it has so much of the error
 LEAST_FITTING = 0.25  # of a body's views show it where it is placed, or it is not tied to the others
 MOST_MISFITS = 0.25  # of the bodies
+CLEARER = 0.5  # the error of the median image without misfits, over that with them, or they stay
 ROUNDS = 8  # of the adjustment while the scene grows
 LAST_ROUNDS = 40
 AGAIN = 2  # times that all is placed anew where another place suits better
@@ -105,8 +106,8 @@ def grow(bodies: Bodies, streams: Sequence[CornerStream], lenses: Sequence[Lens]
         growth.adjust(ROUNDS)
         growth.extend()
     growth.adjust(ROUNDS)
-    growth.drop_misfits()
     growth.adjust(LAST_ROUNDS)
+    growth.drop_misfits()
     return Grown(growth.state, growth.placed, growth.image_rms())
 
 
@@ -163,15 +164,20 @@ class _Growth:
         self.state = replace(moved, lenses=back)
 
     def drop_misfits(self) -> None:
-        """Takes back bodies that few of their views show where they are; not where these are many: then it is the
-        scene that is wrong."""
+        """Takes back bodies that few of their views show where they are, if the rest then fits much better; not where
+        these are many: then it is the scene that is wrong."""
         used = self.views.some(self.posed[self.views.image] & self.placed[self.views.body])
         square = np.add.reduceat(errors(used, self.state) ** 2, used.start[:-1]) / (2 * np.diff(used.start))
         b = len(self.placed)
         fits, count = (np.bincount(used.body, x, b) for x in (square < LARGEST_RMS_PX**2, None))
         misfit = self.placed & (fits < LEAST_FITTING * count)
-        if misfit.sum() <= MOST_MISFITS * self.placed.sum():
-            self.placed = self.placed & ~misfit
+        if not misfit.any() or misfit.sum() > MOST_MISFITS * self.placed.sum():
+            return
+        before = self.placed, self.state, float(np.nanmedian(self.image_rms()))
+        self.placed = self.placed & ~misfit
+        self.adjust(LAST_ROUNDS)
+        if not np.nanmedian(self.image_rms()) < CLEARER * before[2]:
+            self.placed, self.state, _ = before
 
     def image_rms(self) -> np.ndarray:
         """(M,) px, NaN where an image has no pose."""
