@@ -90,7 +90,9 @@ def _without_glitches(readings: np.ndarray, name: str) -> tuple[np.ndarray, tupl
         off = np.abs(values[1:-1] - 0.5 * (values[:-2] + values[2:]))
         usual = 1.4826 * float(np.median(off)) + step[k]
         padded = np.pad(off, _NEAR)  # the neighbours' own are half as large as that of a glitch between them
-        near = np.max([padded[_NEAR + j : len(padded) - _NEAR + j] for j in (-3, -2, 2, 3)], axis=0)
+        near = np.zeros(len(off))
+        for j in (-3, -2, 2, 3):
+            np.maximum(near, padded[_NEAR + j : len(padded) - _NEAR + j], out=near)
         step_size = np.abs(values[2:] - values[:-2])  # of a tilt; before and after a glitch readings are alike
         found[1:-1, k] = off > np.maximum(_GLITCH * usual, _ALONE * np.maximum(near, step_size))
     if not found.any():
@@ -194,7 +196,8 @@ def _scatter_of_noise(windows: np.ndarray) -> float:
 
 def _rounding_step(parts: list[np.ndarray]) -> np.ndarray:
     """(6,) the usual step from one value of a reading to the next larger one: noise below it comes and goes."""
-    sample = np.concatenate(parts)[:_SAMPLE]
+    ends = np.cumsum([len(part) for part in parts])
+    sample = np.concatenate([part[:_SAMPLE] for part in parts[: 1 + int(np.searchsorted(ends, _SAMPLE))]])
     levels = (np.unique(values) for values in sample.T)
     return np.array([np.median(np.diff(v)) if len(v) > 1 else 0.0 for v in levels])
 
