@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from icalib.allan import study_recording
-from icalib.errors import RecordingError
+from icalib.errors import EstimationError, RecordingError
 from icalib.inspection import inspect_recording
 from icalib.measurements import (
     CornerStream,
@@ -150,3 +150,28 @@ def test_commands_that_read_an_imu_alone(tmp_path: Path):
     assert stream.timing is not None and stream.timing.jumps == 1 and abs(stream.timing.duration_s - 19.995) < 1e-6
     assert any("the clock jumps forward" in f.sentence for f in found.findings)
     assert isinstance(FolderRecording(tmp_path).stamps("imu0/data.csv"), np.ndarray)
+
+
+@pytest.mark.parametrize("which", ["imu", "cameras"])
+@pytest.mark.parametrize("index", [500, 1400])
+def test_a_clock_that_is_set_by_seconds_is_named(simulation, which, index):
+    m, by = simulation.measurements, 3 * 10**9
+    at = m.imu.stamps_ns[index]
+    if which == "imu":
+        given = dataclasses.replace(m, imu=shifted(m.imu, index, by))
+    else:
+        cameras = tuple(shifted(c, int(np.searchsorted(c.stamps_ns, at)), by) for c in m.cameras)
+        given = dataclasses.replace(m, cameras=cameras)
+    whose = {"imu": "imu0", "cameras": "cam0"}[which]
+    with pytest.raises(
+        EstimationError, match=rf"the clock of {whose} was set forward by 3 s while it ran, .* --from and --to"
+    ):
+        calibrate_measurements(rig_for(simulation.scenario), given)
+
+
+def test_a_gap_is_no_step_of_a_clock(simulation):
+    m = simulation.measurements
+    kept = np.r_[0:600, 800:2000]
+    imu_gap = ImuStream("imu0", m.imu.stamps_ns[kept], m.imu.gyro[kept], m.imu.accel[kept])
+    found = calibrate_measurements(rig_for(simulation.scenario), dataclasses.replace(m, imu=imu_gap))
+    assert abs(found.group("cam0", "time_offset").value[0] - 0.0042) < 1e-4

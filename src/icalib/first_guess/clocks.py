@@ -19,6 +19,7 @@ from icalib.first_guess.clock_shifts import (
     longest_step,
     means,
 )
+from icalib.first_guess.clock_steps import refuse_steps
 from icalib.first_guess.slow_rates import ChainedRates
 from icalib.first_guess.target_poses import TargetPoses
 from icalib.geometry import so3
@@ -83,6 +84,7 @@ def align(imu: ImuData, name: str, rates: CameraRates, given_offset: float | Non
     tried = (_align_near(imu, name, rates, x, keep) for x in others if _covered(imu, rates, x).any())
     # In a short recording the sizes of the rates may be more alike elsewhere, but not their directions.
     alike, found = next((x for x in chain([first], tried) if _unexplained(imu, *x) <= LARGEST_UNEXPLAINED), first)
+    refuse_steps(imu, name, alike, found.offset, lambda part, offset: _left_at(imu, part, found, offset))
     _check_offset(imu, name, alike, found, keep)
     _check_scale(imu, name, rates, found)
     return found
@@ -141,6 +143,12 @@ def _unexplained(imu: ImuData, rates: CameraRates, found: Alignment) -> float:
     gyro, seen = _side_by_side(imu, rates, found.offset)
     gyro, seen = gyro - found.gyro_bias, seen @ found.rotation.T
     return float(np.median(np.linalg.norm(gyro - seen, axis=1)) / np.median(np.linalg.norm(gyro, axis=1)))
+
+
+def _left_at(imu: ImuData, rates: CameraRates, found: Alignment, offset: float) -> float:
+    """What is unexplained of some of the rates at another offset; infinite where the IMU was not running."""
+    there = replace(found, offset=offset)
+    return _unexplained(imu, rates, there) if _covered(imu, rates, offset).any() else np.inf
 
 
 def _side_by_side(imu: ImuData, rates: CameraRates, offset: float) -> tuple[np.ndarray, np.ndarray]:
