@@ -3,15 +3,20 @@ used."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
+from icalib.errors import EstimationError
 from icalib.estimation.bodies import choose_bodies, restrict
-from icalib.estimation.imu_data import imu_data
+from icalib.estimation.imu_data import ImuData, imu_data
+from icalib.estimation.state import Key
 from icalib.first_guess.align_camera import align_camera, trusted
 from icalib.first_guess.clocks import Alignment, camera_rates
 from icalib.first_guess.contradicted import chosen, chosen_along
 from icalib.first_guess.guess import CameraGuess, Guess, relative_offset
 from icalib.first_guess.gyro import GyroRotation
+from icalib.first_guess.imu_ways import refuse_other_axes
 from icalib.first_guess.lever_arm import LeverArm, check_gravity, check_size, lever_arm
 from icalib.first_guess.scene import Placed, scene_poses
 from icalib.first_guess.scene_lens import find_scene, lens_of
@@ -43,26 +48,68 @@ def initial_guess(rig: Rig, measurements: Measurements, scene: Placed | None = N
     imu = imu_data(rig, measurements)
     if imu is None:
         return guess_without_imu(rig, measurements, params, poses, scene.values)
-    aligned = [
-        align_camera(c, s, camera_rates(s, q), imu, measurements)
-        for c, s, q in zip(rig.cameras, measurements.cameras, poses, strict=True)
-    ]
-    best = int(np.argmax([q.ok.sum() for q in poses]))
-    gyro_bias = aligned[best].gyro_bias
-    gyro = GyroRotation.integrate(imu, gyro_bias)
-    arms = [
-        lever_arm(imu, s.seconds + a.offset, q, a.rotation, gyro, trusted(c.translation))
-        for c, s, q, a in zip(rig.cameras, measurements.cameras, poses, aligned, strict=True)
-    ]
-    gravity = arms[best].gravity
-    check_gravity(float(np.linalg.norm(gravity)), rig.gravity, imu.name, aligned[best].given)
-    for c, m, a in zip(rig.cameras, arms, aligned, strict=True):
-        check_size(m, c.name, a.given)
-    cameras = {
-        c.name: _camera_guess(c, s, p, a, m, q, measurements)
-        for c, s, p, a, m, q in zip(rig.cameras, measurements.cameras, params, aligned, arms, poses, strict=True)
-    }
-    return Guess(cameras, gyro_bias, _mean_bias(arms), _level(gravity), scene.values)
+    assert rig.imu is not None
+    seen = _Seen(rig, measurements, params, poses, scene.values)
+    try:
+        guess, unlike = seen.guess(imu)
+    except EstimationError as error:
+        refuse_other_axes(rig.imu, imu, seen.left, error)
+        raise
+    if unlike:
+        refuse_other_axes(rig.imu, imu, seen.left, None)
+    return guess
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What cameras saw of the target: params (P,) and poses of each; scene: poses of the target's bodies."""
+
+    rig: Rig
+    measurements: Measurements
+    params: list[np.ndarray]
+    poses: list[TargetPoses]
+    scene: dict[Key, np.ndarray]
+
+    def guess(self, imu: ImuData) -> tuple[Guess, bool]:
+        """By the IMU's readings; and whether the accelerometer felt another motion than a camera saw."""
+        m, best = self.measurements, self._best
+        aligned = [self._aligned(imu, k) for k in range(len(self.poses))]
+        gyro = GyroRotation.integrate(imu, aligned[best].gyro_bias)
+        arms = [self._arm(imu, k, a, gyro) for k, a in enumerate(aligned)]
+        self._check_gravity(imu, arms[best], aligned[best])
+        for c, arm, a in zip(self.rig.cameras, arms, aligned, strict=True):
+            check_size(arm, c.name, a.given)
+        cameras = {
+            c.name: _camera_guess(c, s, p, a, arm, q, m)
+            for c, s, p, a, arm, q in zip(
+                self.rig.cameras, m.cameras, self.params, aligned, arms, self.poses, strict=True
+            )
+        }
+        guess = Guess(cameras, aligned[best].gyro_bias, _mean_bias(arms), _level(arms[best].gravity), self.scene)
+        return guess, arms[best].unlike
+
+    def left(self, imu: ImuData) -> float:
+        """What readings leave of the acceleration that the camera with most poses saw. Raises EstimationError where
+        they do not fit it at all."""
+        a = self._aligned(imu, self._best)
+        arm = self._arm(imu, self._best, a, GyroRotation.integrate(imu, a.gyro_bias))
+        self._check_gravity(imu, arm, a)
+        return arm.left
+
+    @property
+    def _best(self) -> int:
+        return int(np.argmax([q.ok.sum() for q in self.poses]))
+
+    def _aligned(self, imu: ImuData, k: int) -> Alignment:
+        stream = self.measurements.cameras[k]
+        return align_camera(self.rig.cameras[k], stream, camera_rates(stream, self.poses[k]), imu, self.measurements)
+
+    def _arm(self, imu: ImuData, k: int, aligned: Alignment, gyro: GyroRotation) -> LeverArm:
+        t, known = self.measurements.cameras[k].seconds + aligned.offset, trusted(self.rig.cameras[k].translation)
+        return lever_arm(imu, t, self.poses[k], aligned.rotation, gyro, known)
+
+    def _check_gravity(self, imu: ImuData, arm: LeverArm, aligned: Alignment) -> None:
+        check_gravity(float(np.linalg.norm(arm.gravity)), self.rig.gravity, imu.name, aligned.given)
 
 
 def _camera_guess(

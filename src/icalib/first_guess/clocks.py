@@ -350,8 +350,8 @@ def _check_degrees(imu: ImuData, name: str, gyro: np.ndarray, seen: np.ndarray) 
     ratio = float(np.median(size[0]) / max(np.median(size[1]), 1e-9))
     if 0.8 < ratio / DEGREES < 1.25:
         raise EstimationError(
-            f"{imu.name} turns {ratio:.3g} times as fast as {name}: its angular rate looks like deg/s; convert it to "
-            "rad/s."
+            f"{imu.name} turns {ratio:.3g} times as fast as {name}: its angular rate looks like deg/s; set "
+            f"gyro_unit: deg/s of {imu.name} in the rig file."
         )
 
 

@@ -26,13 +26,15 @@ SHARED = 2.0  # rows share images: the error of their mean falls as if they were
 ROW_SIGMA = 0.05  # m/s, of a row of the system; more where the poses of the target are worse
 G_TOLERANCE = 0.1
 GIVEN_TOLERANCE = 0.5  # of both, where a guess that may be degrees off goes into them
+UNLIKE = 1.2  # times the acceleration that was seen, which is left of it
 SIZE_TOLERANCE = 0.15  # of the target, as the accelerometer shows it
 
 
 @dataclass(frozen=True)
 class LeverArm:
     """p_imu_cam (3,) m, with its covariance (3, 3); gravity (3,) in board axes, m/s^2; accel_bias (3,) m/s^2; true size
-    of the target over the one given, with its standard deviation."""
+    of the target over the one given, with its standard deviation. left: share of the acceleration that the camera saw
+    which is not explained."""
 
     position: np.ndarray
     covariance: np.ndarray
@@ -40,6 +42,12 @@ class LeverArm:
     accel_bias: np.ndarray
     size: float
     size_std: float
+    left: float
+
+    @property
+    def unlike(self) -> bool:
+        """Whether the accelerometer felt another motion than the camera saw; noise alone leaves as much as was seen."""
+        return self.left > UNLIKE
 
 
 def lever_arm(
@@ -78,7 +86,9 @@ def lever_arm(
         rows[:, :, 0:3] = 0.0
     x, covariance = _solve(rows, rhs)
     arm = x[0:3] if given is None else given
-    return LeverArm(arm, covariance, x[3:6], x[6:9], *size_of(rows, rhs, second(D_f)))
+    off, seen = (np.median(np.linalg.norm(r, axis=1)) for r in (rhs - rows @ x, second(p)))
+    left = float(off / max(seen, 1e-12))
+    return LeverArm(arm, covariance, x[3:6], x[6:9], *size_of(rows, rhs, second(D_f)), left)
 
 
 def _solve(rows: np.ndarray, rhs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -169,5 +179,5 @@ def check_gravity(measured: float, expected: float, imu: str, given: bool) -> No
         return
     raise EstimationError(
         f"{imu} and the target together show gravity of {measured:.3g} m/s^2 instead of {expected:.3g}: check that the "
-        "accelerometer is in m/s^2 (not in g), and tag_size or square_size in the rig file."
+        "accelerometer is in m/s^2 (not in g: accel_unit), and tag_size or square_size in the rig file."
     )

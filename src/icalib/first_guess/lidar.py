@@ -257,7 +257,8 @@ def _check_axes(lidar: str, imu: str, mirrored: bool) -> None:
     if mirrored:
         raise EstimationError(
             f"{lidar} turns as {imu} does, but moves the other way: its points are mirrored; one of its axes, or the "
-            "sense in which its azimuth counts, is reversed. Make its axes right-handed."
+            "sense in which its azimuth counts, is reversed. Make its axes right-handed; or the accelerometer is "
+            f"inverted: set accel_axes: [-x, -y, -z] of {imu} in the rig file."
         )
 
 
@@ -265,7 +266,7 @@ def _check_gravity(measured: float, expected: float, imu: str, lidar: str) -> No
     if abs(measured / expected - 1.0) > G_TOLERANCE:
         raise EstimationError(
             f"{imu} and {lidar} together show gravity of {measured:.3g} m/s^2 instead of {expected:.3g}: check that "
-            "the accelerometer is in m/s^2, not in g, and that the LiDAR sees walls in all directions."
+            "the accelerometer is in m/s^2, not in g (accel_unit), and that the LiDAR sees walls in all directions."
         )
 
 

@@ -190,8 +190,8 @@ def _with_motion(imu: ImuData, stream: PoseStream, gravity: float, held: Held) -
     if off > G_TOLERANCE:
         raise EstimationError(
             f"{imu.name} and {stream.name} together show gravity of {found.gravity:.3g} m/s^2 instead of "
-            f"{gravity:.3g}: check that the accelerometer is in m/s^2, not in g, and the positions of {stream.name} "
-            "in metres."
+            f"{gravity:.3g}: check that the accelerometer is in m/s^2, not in g (accel_unit), and the positions of "
+            f"{stream.name} in metres."
         )
     step = max(1, round(APART_S / float(np.median(np.diff(path.seconds)))))
     apart = motion_of_path(imu, where(path, np.arange(len(path.seconds)) % step == 0), rates, aligned, gravity, held)

@@ -1,0 +1,80 @@
+"""IMUs whose readings are inverted, permuted or of left-handed axes: what the sentence asks for undoes it."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from icalib.errors import EstimationError
+from icalib.first_guess import initial_guess
+from icalib.measurements import ImuStream
+from icalib.recordings.imu_units import in_si
+from icalib.rig import Axes, ImuSensor, Rig
+from icalib.simulation import handheld, rig_for, simulate
+
+XYZ: Axes = ("x", "y", "z")
+
+
+@pytest.fixture(scope="module")
+def run():
+    simulation = simulate(handheld(8.0), 4)
+    return rig_for(simulation.scenario), simulation.measurements
+
+
+def recorded(imu: ImuStream, rig: Rig, gyro: Axes, accel: Axes) -> ImuStream:
+    """The readings as an IMU records them whose columns are these axes."""
+    assert rig.imu is not None
+    return in_si(imu, replace(rig.imu, gyro_axes=gyro, accel_axes=accel))
+
+
+def asked_for(sentence: str, sensor: ImuSensor) -> ImuSensor:
+    """The sensor with the first field that the sentence names."""
+    field, entries = re.findall(r"((?:gyro|accel)_axes): \[(.*?)\]", sentence)[0]
+    return replace(sensor, **{field: tuple(entries.split(", "))})
+
+
+@pytest.mark.parametrize(
+    ("gyro", "accel", "words"),
+    [
+        (XYZ, ("-x", "-y", "-z"), "has an inverted accelerometer, which reads -g at rest"),
+        (("x", "-y", "z"), XYZ, "gyroscope of left-handed axes, axis y reversed"),
+        (("x", "y", "-z"), XYZ, "gyroscope of left-handed axes, axis z reversed"),
+        (("-x", "-y", "-z"), XYZ, "gyroscope that turns the other way"),
+        (("y", "x", "z"), XYZ, "gyroscope whose axes x and y are swapped"),
+        (("x", "z", "y"), XYZ, "gyroscope whose axes y and z are swapped"),
+        (("y", "z", "x"), XYZ, "gyroscope of other axes than its accelerometer"),
+        (("-x", "-y", "z"), XYZ, "gyroscope whose axes x and y are reversed"),
+        (XYZ, ("x", "y", "-z"), "accelerometer of left-handed axes, axis z reversed"),
+        (XYZ, ("z", "y", "x"), "accelerometer whose axes x and z are swapped"),
+    ],
+)
+def test_each_way_is_named_and_undone(run, gyro, accel, words):
+    rig, measurements = run
+    wrong = replace(measurements, imu=recorded(measurements.imu, rig, gyro, accel))
+    with pytest.raises(EstimationError) as error:
+        initial_guess(rig, wrong)
+    assert words in str(error.value) and str(error.value).endswith(f"of {rig.imu.name} in the rig file.")
+    right = replace(wrong, imu=in_si(wrong.imu, asked_for(str(error.value), rig.imu)))
+    found, good = initial_guess(rig, right), initial_guess(rig, measurements)
+    assert abs(found.cameras["cam0"].offset - good.cameras["cam0"].offset) < 2e-3
+    np.testing.assert_allclose(np.abs(found.cameras["cam0"].position), np.abs(good.cameras["cam0"].position), atol=0.03)
+
+
+def test_the_field_is_said_on_top_of_what_the_rig_file_says(run):
+    """Of a rig file that swaps two axes already."""
+    rig, measurements = run
+    wrong = replace(measurements, imu=recorded(measurements.imu, rig, ("x", "-y", "z"), XYZ))
+    rig = replace(rig, imu=replace(rig.imu, gyro_axes=("z", "-y", "x")))
+    with pytest.raises(EstimationError, match=r"set gyro_axes: \[z, y, x\] of imu0"):
+        initial_guess(rig, wrong)
+
+
+def test_another_motion_is_no_way(run):
+    rig, measurements = run
+    imu = measurements.imu
+    other = replace(measurements, imu=replace(imu, gyro=imu.gyro[::-1].copy(), accel=imu.accel[::-1].copy()))
+    with pytest.raises(EstimationError, match="does not match"):
+        initial_guess(rig, other)
