@@ -14,6 +14,7 @@ from icalib.cli import main
 from icalib.errors import CalibrationError, RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Markers, Tag, Target
 from icalib.geometry.targets.pattern import pattern_of
+from icalib.own_files import sealed
 from icalib.printing import PAPERS, target_pdf, write_target
 
 pytest.importorskip("reportlab")
@@ -193,7 +194,7 @@ COMMANDS = {
 def test_the_command_prints_each_target(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     path = tmp_path / "board.pdf"
     assert main(["target", *command.split(), "--output", str(path)]) == 0
-    assert path.read_bytes() == target_pdf(*COMMANDS[command])
+    assert path.read_bytes() == sealed(target_pdf(*COMMANDS[command]))
     assert capsys.readouterr().out == f"{path}: print at 100 %, and measure the ruler.\n"
 
 
@@ -201,7 +202,7 @@ def test_the_command_takes_border_bits(tmp_path: Path):
     path = tmp_path / "board.pdf"
     command = "aprilgrid --rows 2 --cols 2 --tag-size 0.05 --tag-spacing 0.3 --border-bits 1 -o"
     assert main(["target", *command.split(), str(path)]) == 0
-    assert path.read_bytes() == target_pdf(AprilGrid(2, 2, 0.05, 0.3), "a4", 1)
+    assert path.read_bytes() == sealed(target_pdf(AprilGrid(2, 2, 0.05, 0.3), "a4", 1))
 
 
 def test_the_command_refuses_in_one_line_and_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

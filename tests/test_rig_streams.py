@@ -51,7 +51,7 @@ def test_streams_come_in_the_order_of_the_rig():
     [
         (RIG, {"imu": None}, "drive has no readings of imu0"),
         (RIG, {"imu": replace(IMU, name="imu1")}, "a stream called imu1, but the rig has imu0 of its kind"),
-        (replace(RIG, imu=None), {}, "a stream called imu0, but the rig has none of its kind"),
+        (replace(RIG, imu=None, lidars=()), {"lidars": ()}, "a stream called imu0, but the rig has none of its kind"),
         (RIG, {"lidars": (lidar("front"),)}, "drive has nothing of rear"),
         (RIG, {"wheels": (), "poses": ()}, "drive has nothing of w and mocap"),
         (RIG, {"lidars": (lidar("front"), lidar("rear"), lidar("front"))}, "two streams of front"),

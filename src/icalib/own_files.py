@@ -14,7 +14,7 @@ from pathlib import Path
 from icalib.errors import CalibrationError
 
 SEAL = "icalib_sha256"  # the last key of JSON
-_COMMENT = re.compile(rb"(?:# |% |<!-- )icalib sha256 ([0-9a-f]{64})(?: -->)?\n\Z")
+_COMMENT = re.compile(rb"(?:# |% |<!-- )icalib sha256 ([0-9a-f]{64})(?: -->)?\r?\n\Z")
 _LAST_KEY = re.compile(rb',\s*"icalib_sha256": "([0-9a-f]{64})"\n\}\Z')
 _ARCHIVE = re.compile(rb"(?s:..)icalib sha256 ([0-9a-f]{64})\n\Z")  # the size of a zip file's comment, and the comment
 _ZIP = b"PK\x03\x04"
@@ -39,7 +39,8 @@ def sealed(content: bytes) -> bytes:
     begin, end = {b"<": ("<!-- ", " -->"), b"%": ("% ", "")}.get(head, ("# ", ""))
     if head == b"%" and not content.startswith(b"%PDF"):  # YAML as OpenCV writes it
         begin = "# "
-    return body + f"{begin}icalib sha256 {hashlib.sha256(body).hexdigest()}{end}\n".encode()
+    line_end = "\r\n" if body.endswith(b"\r\n") else "\n"
+    return body + f"{begin}icalib sha256 {hashlib.sha256(body).hexdigest()}{end}{line_end}".encode()
 
 
 def sealed_texts(texts: dict[str, str]) -> dict[str, str]:

@@ -79,8 +79,10 @@ def _export(options: argparse.Namespace) -> None:
     files, folder = found.files, options.output
     if options.to in ONE_FILE:
         files, folder = {options.output.name: next(iter(files.values()))}, options.output.parent
+    # A URDF that is named as input and output is to be updated in place.
+    in_place = options.urdf is not None and options.output.resolve() == options.urdf.resolve()
     inputs = [*set_of(options.result), *([options.urdf] if options.urdf else [])]
-    refuse_foreign((folder / name for name in files), inputs, "choose another place")
+    refuse_foreign((folder / name for name in files if not in_place), inputs, "choose another place")
     write_texts(folder, sealed_texts(files))
     if not options.quiet:
         for sentence in found.sentences:

@@ -25,6 +25,7 @@ from icalib.export.common import quaternion, rpy
 from icalib.export.formats import export
 from icalib.export.names import FORMATS
 from icalib.geometry.cameras import camera_model
+from icalib.own_files import sealed_texts
 
 
 def by_opencv(text: str, tmp_path: Path) -> cv2.FileStorage:
@@ -447,7 +448,7 @@ def test_the_command(robot: Calibration, tmp_path: Path, capsys: pytest.CaptureF
     printed, found = capsys.readouterr().out, export(robot, to)
     assert all(f"Note: {sentence}\n" in printed for sentence in found.sentences)
     written = [path] if to in ("ros2-static", "urdf", "json") else [path / name for name in found.files]
-    assert [p.read_text() for p in written] == list(found.files.values())
+    assert [p.read_text() for p in written] == list(sealed_texts(found.files).values())
     assert all(str(p) in printed.splitlines()[-1] for p in written)
     assert sorted(p for p in path.parent.rglob("*") if p.is_file()) == sorted(written)
     assert sorted((tmp_path / "out").iterdir()) == before

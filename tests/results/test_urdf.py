@@ -148,7 +148,7 @@ def test_line_ends_and_other_encodings_stay(robot: Calibration, tmp_path: Path):
     arguments = ["export", str(tmp_path / "out"), "--to", "urdf", "-o", str(out), "--urdf", str(file), "-q"]
     assert main([*arguments, "--frame", "cam1=right_eye"]) == 0
     new = out.read_bytes()
-    assert "Der Käfer".encode("latin-1") in new and new.count(b"\r\n") == new.count(b"\n") == old.count(b"\r\n") + 1
+    assert "Der Käfer".encode("latin-1") in new and new.count(b"\r\n") == new.count(b"\n") == old.count(b"\r\n") + 2
     assert file.read_bytes() == old
     np.testing.assert_allclose(T_of(URDF.from_xml_string(new), "imu0", "cam0"), robot.T_imu_sensor("cam0"), atol=1e-12)
     # In place.

@@ -24,10 +24,12 @@ from icalib.simulation import (
 EXAMPLES = Path(__file__).parents[2] / "examples" / "paper"
 ALLOWED = (
     "icalib.errors",
+    "icalib.file_names",
     "icalib.measurements",
     "icalib.rig",
     "icalib.geometry.targets",
     "icalib.simulation",
+    "icalib.staging",
     "icalib.yaml_nodes",
 )
 

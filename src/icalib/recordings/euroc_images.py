@@ -11,10 +11,11 @@ import numpy as np
 
 from icalib.errors import RecordingError
 from icalib.file_hashes import hash_of
-from icalib.recordings.clocks import nanoseconds, unit_by_date, unit_of_stamps
+from icalib.recordings.clocks import nanoseconds, unit_by_date, unit_of_stamps, usual_step
 from icalib.recordings.image_checks import Note, ignore
 from icalib.recordings.images import Payload, file_payload
 from icalib.recordings.unreadable import HEAD_BYTES, not_data
+from icalib.rig import TimeUnit
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 _RATE_HZ = (1e-3, 1000.0)
@@ -98,14 +99,23 @@ def _listed(table: Path, data: Path) -> list[tuple[int, Path]]:
         rows.append((number, stamp, name.strip(",; ")))
     if not rows:
         raise RecordingError(f"{table} holds no rows; write one line for each image, t [ns],file name.")
-    numbers = np.array([float(stamp) for _, stamp, _ in rows])
-    unit = unit_of_stamps(numbers, *_RATE_HZ) if len(rows) > 1 else unit_by_date(numbers.tolist())
-    unit = unit or "ns"
+    unit = _unit([stamp for _, stamp, _ in rows])
     if unit == "ns":
         for number, stamp, _ in rows:
             if not stamp.isdecimal():
                 raise RecordingError(_line_sentence(table, number, lines[number - 1]))
     return [(nanoseconds(stamp, unit), data / name) for _, stamp, name in rows]
+
+
+def _unit(stamps: Sequence[str]) -> TimeUnit:
+    """That in which the stamps are dates; else nanoseconds where these mean a possible rate; else the one that does."""
+    numbers = np.array([float(stamp) for stamp in stamps])
+    if dated := unit_by_date(numbers.tolist()):
+        return dated
+    step = usual_step(numbers) if len(numbers) > 1 else 0.0
+    if all(stamp.isdecimal() for stamp in stamps) and step and _RATE_HZ[0] <= 1e9 / step <= _RATE_HZ[1]:
+        return "ns"
+    return (unit_of_stamps(numbers, *_RATE_HZ) if len(numbers) > 1 else None) or "ns"
 
 
 def _line_sentence(table: Path, number: int, line: str) -> str:
