@@ -9,9 +9,10 @@ import numpy as np
 
 from icalib.joining import Part
 from icalib.measurements import ImuStream, Measurements
+from icalib.recordings.clocks import usual_step
 from icalib.rig import ImuNoise, Rig
 
-GAP = 3.0  # an interval longer than this many median periods is a gap
+GAP_S, GAP = 0.01, 3.0  # an interval longer than both this and so many periods is a gap
 # Within a gap the motion goes on unseen: what is not known of rate and force, their spread over the recording,
 # is taken to stay correlated for this long.
 MOTION_CORRELATION_S = 0.1
@@ -45,7 +46,7 @@ class ImuData:
         t = stream.seconds
         dt = np.diff(t)
         variance = np.tile([noise.gyro**2, noise.accel**2, WITHIN * noise.accel**2], (len(dt), 1))
-        gap = dt > GAP * np.median(dt)
+        gap = dt > max(GAP_S, GAP * _period(t))
         gyro, accel = stream.gyro.var(axis=0).sum() / 3.0, stream.accel.var(axis=0).sum() / 3.0
         variance[gap] += 2.0 * MOTION_CORRELATION_S * np.array([gyro, accel, accel])
         # A step of integration holds biases still; what their walk makes of so long a one is white noise here.
@@ -73,6 +74,12 @@ class ImuData:
         variance = np.concatenate([[0.0], np.cumsum(self.variance[:, 0] * dt)])
         a, b = (np.interp(t, self.seconds, variance) for t in (begin, end))
         return np.copysign(np.sqrt(np.abs(b - a)), end - begin)
+
+
+def _period(seconds: np.ndarray) -> float:
+    """The median step between readings; where these come in bursts, whose steps are far shorter, the usual mean."""
+    median, usual = float(np.median(np.diff(seconds))), usual_step(seconds)
+    return usual if median < 0.5 * usual else median
 
 
 def imu_data(rig: Rig, measurements: Measurements) -> ImuData | None:
