@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from icalib.errors import EstimationError
+from icalib.first_guess.lidar_odometry import lidar_path, scans_of
 from icalib.first_guess.lidar_sight import count_of, directions, facing, naming_sight
 from icalib.measurements import LidarStream
 
@@ -28,6 +31,20 @@ def test_of_parts_of_a_room(free_robot, faces, count):
 @pytest.mark.parametrize("example", ["table2-planar", "table2-ramp", "straight-line"])
 def test_of_whole_rooms(robot, example):
     assert directions(robot(6.0, 1, example=example).streams[0]) == 3
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_rings_that_are_far_apart_show_no_surfaces(robot, seed):
+    """Four rings over 24 degrees, as few as a scanner of obstacles has; and points that are nowhere a surface."""
+    few = robot(4.0, seed, {"rings": 4, "azimuth_steps": 240}).streams[0]
+    with pytest.raises(
+        EstimationError, match="% of a scan's points lie on single rings, 0.* m and more apart, so that"
+    ):
+        lidar_path("lidar0", scans_of(few))
+    rng = np.random.default_rng(seed)
+    cloud = replace(few, xyz=rng.normal(scale=4.0, size=few.xyz.shape).astype(np.float32))
+    with pytest.raises(EstimationError, match="there may be too few flat surfaces in sight, or the point times may be"):
+        lidar_path("lidar0", scans_of(cloud))
 
 
 def test_shares_of_normals():

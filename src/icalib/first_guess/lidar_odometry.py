@@ -33,6 +33,8 @@ MOST_LOST = 5  # scans in a row that do not fit the map, before there is another
 MANY = 200  # scans: worth two maps
 SHARED, FEWEST_SHARED = 20, 5  # scans that are in both maps, where these are to be one
 FEW = 10  # scans on a map that is no loss: its first scan may show too little of what the next ones see
+MOST_ON_LINES = 0.8  # of a scan's points; where more lie on single rings, the scan has no surfaces
+FEWEST_IN_VOXEL, NARROW = 5, 0.25  # points; width of a line, by its length
 LEAST_NEAR = 0.3  # of a scan's points must lie on the map's planes
 FIRST_ROUNDS = 4  # to find how the LiDAR moved in its first scan, which makes the map
 KEEP, KEEP_TURNED = 0.85, 0.995  # of what a voxel holds, by the scan
@@ -92,11 +94,29 @@ def lidar_path(
     edge_m = float(np.clip(reach / VOXELS_IN_REACH, *EDGES_M))
     poses, ok = (_follow_joined if whole else _follow_in_parts)(scans, known, edge_m)
     if ok.mean() < 0.5:
+        why = "there may be too few flat surfaces in sight, or the point times may be wrong"
+        if (share := np.median([_share_on_lines(scan, edge_m) for scan in scans])) > MOST_ON_LINES:
+            why = (
+                f"{share:.0%} of a scan's points lie on single rings, {edge_m:.1g} m and more apart, so that a scan "
+                "shows no surfaces; record at the LiDAR's full resolution, or use one with more rings"
+            )
         raise EstimationError(
-            f"{name}: only {ok.sum()} of {len(scans)} scans fit the surfaces that others show; there may be too "
-            "few flat surfaces in sight, or the point times may be wrong."
+            f"{name}: only {ok.sum()} of {len(scans)} scans fit the surfaces that others show; {why}."
         )
     return LidarPath(seconds, np.array([p.rotation for p in poses]), np.array([p.position for p in poses]), ok)
+
+
+def _share_on_lines(scan: Scan, edge_m: float) -> float:
+    """The share of the points in voxels with some of them whose points are one line: those of a single ring."""
+    _, voxel, count = np.unique(np.floor(scan.xyz / edge_m), axis=0, return_inverse=True, return_counts=True)
+    voxel = voxel.ravel()
+    mean = np.stack([np.bincount(voxel, x) for x in scan.xyz.T], axis=1) / count[:, None]
+    off = scan.xyz - mean[voxel]
+    spread = np.array([[np.bincount(voxel, a * b) for a in off.T] for b in off.T]).transpose(2, 0, 1)
+    size = np.sqrt(np.maximum(np.linalg.eigvalsh(spread), 0.0))
+    used = count >= FEWEST_IN_VOXEL
+    line = used & (size[:, 1] < NARROW * size[:, 2])
+    return float(count[line].sum() / max(count[used].sum(), 1))
 
 
 def _scan_of(stream: LidarStream, i: int) -> Scan:
