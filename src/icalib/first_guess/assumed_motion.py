@@ -24,11 +24,13 @@ from icalib.estimation.pose_factor import FRAME, frame_of
 from icalib.estimation.state import Key, State
 from icalib.first_guess.keyframe_spacing import keyframe_spacing
 from icalib.first_guess.lidar_rounds import given
+from icalib.first_guess.pose_ways import TURNED, WAYS
 from icalib.first_guess.poses import NAMES, check_rate, pose_values
 from icalib.first_guess.robot import wheel_values
 from icalib.first_guess.several import initial_guesses
 from icalib.first_guess.smooth_path import FEWEST, BodyPoses, SmoothPath
 from icalib.first_guess.stop_and_go import is_stop_and_go, start_from_pairs
+from icalib.first_guess.wheels import SidewaysError
 from icalib.geometry.targets.base import BOARD
 from icalib.measurements import ImuStream, Measurements
 from icalib.rig import ImuNoise, ImuSensor, Rig, fixed
@@ -40,12 +42,36 @@ LAG_S = 0.1  # over which the change of rate and acceleration tells their densit
 LEAST_DENSITY = 1e-3  # rad/s^2/sqrt(Hz), m/s^3/sqrt(Hz): of a body that stood still
 
 
-def start_without_imu(rig: Rig, recordings: Sequence[Measurements]) -> tuple[Inputs, State, dict[Key, np.ndarray]]:
+Start = tuple[Inputs, State, dict[Key, np.ndarray]]
+
+
+def start_without_imu(rig: Rig, recordings: Sequence[Measurements]) -> Start:
     """As `start.start`; where all was taken at rest, nothing is assumed.
 
-    Raises EstimationError where the body's poses do not show its motion, or where wheels and pose sensors do not show
-    how they stand.
+    Raises EstimationError where the body's poses do not show its motion, or are written another way than they should
+    be, or where wheels and pose sensors do not show how they stand.
     """
+    try:
+        return _start(rig, recordings)
+    except SidewaysError as error:
+        if not rig.cameras:
+            _refuse_other_ways(rig, recordings, error)
+        raise
+
+
+def _refuse_other_ways(rig: Rig, recordings: Sequence[Measurements], error: EstimationError) -> None:
+    """Raises EstimationError where the wheels fit poses of the body that are written another way."""
+    for words, way in (*WAYS, *TURNED):
+        others = [replace(m, poses=(way(m.poses[0]), *m.poses[1:])) for m in recordings]
+        try:
+            _start(rig, others)
+        except EstimationError:
+            continue
+        raise EstimationError(f"the poses of {rig.poses[0].name} {words}.") from error
+
+
+def _start(rig: Rig, recordings: Sequence[Measurements]) -> Start:
+    """As `start_without_imu`, of poses as they are written."""
     shown, cameras = _shown(rig, recordings)
     if is_stop_and_go(rig, recordings, shown):
         return start_from_pairs(rig, recordings, shown, cameras)

@@ -16,6 +16,8 @@ from scipy.spatial.transform import Rotation
 from icalib.errors import EstimationError
 from icalib.first_guess.pose_frames import words_for
 from icalib.measurements import PoseStream
+from icalib.recordings.axes import in_axes
+from icalib.rig import Axes
 
 Way = Callable[[PoseStream], PoseStream]
 T = TypeVar("T")
@@ -58,6 +60,21 @@ WAYS: tuple[tuple[str, Way], ...] = (
     ("have quaternions with w first; let columns of the rig file name them as x, y, z, w, or correct what writes them",
      _w_first),
 )  # fmt: skip
+
+
+def _with_axes(axes: Axes) -> Way:
+    return lambda x: replace(x, position=in_axes(x.position, axes))
+
+
+# Which of those that agree in which way is up it is does not matter to a vehicle on a floor.
+TURNED: tuple[tuple[str, Way], ...] = tuple(
+    (
+        "have positions and rotations in different frames, as where one has z up and the other y up; set its "
+        f"position_axes to [{', '.join(axes)}]",
+        _with_axes(axes),
+    )
+    for axes in (("x", "z", "-y"), ("x", "-z", "y"), ("y", "z", "x"), ("z", "x", "y"))
+)
 
 
 def placed(

@@ -22,7 +22,7 @@ from icalib.first_guess.known_motion import imu_poses, is_known
 from icalib.first_guess.lidar_rounds import NAMES, given, lidar_values, with_lidars
 from icalib.first_guess.poses import pose_values
 from icalib.first_guess.wheel_poses import mount_guess, poses_offset
-from icalib.first_guess.wheels import OPPOSITE, WheelRates, drive_guess, wheel_offset, wheel_rates
+from icalib.first_guess.wheels import OPPOSITE, SidewaysError, WheelRates, drive_guess, wheel_offset, wheel_rates
 from icalib.measurements import WheelPoses, WheelStream
 from icalib.rig import Wheels
 
@@ -76,12 +76,14 @@ def _wheels(inputs: Inputs, state: State, wheels: Wheels, stream: WheelStream | 
         if not isinstance(found, EstimationError):
             return found | known
         failed.append(found)
-    if up.level and not isinstance(_try(inputs, state, stream, rates, -up.ways[0], offset), EstimationError):
+    other = _try(inputs, state, stream, rates, -up.ways[0], offset) if up.level else failed[0]
+    if not isinstance(other, EstimationError):
         raise EstimationError(
             f"{wheels.name}: {OPPOSITE[rates.kind]}; unless z of the frame of {up.level} points down: then write "
             f"level: false for {up.level}."
         )
-    raise failed[0]
+    # Of a motion that is no vehicle's one way up shows the slip, the other but that it turns the wrong way.
+    raise next((error for error in (*failed, other) if isinstance(error, SidewaysError)), failed[0])
 
 
 def _try(

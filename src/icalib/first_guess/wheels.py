@@ -31,6 +31,7 @@ LEAST_TURN_RAD_S = 0.03  # RMS
 LEAST_SPEED_M_S = 0.05
 STILL_SHARE = 0.02  # of the other wheel's rate
 RADII_M = (0.005, 5.0)
+SIDEWAYS = 0.25  # of the speed: wheels that skid in curves slip less
 LEAST_SHARE = 0.02  # of speed and turning that does not go with the other
 ROUNDS = 8
 SCALES = 0.5, 2.0
@@ -163,6 +164,7 @@ def drive_guess(
     w, u = rate @ axis, velocity @ level.T
     _check_motion(name, w, u)
     e2, l1 = _no_slip(w, u)
+    _check_sideways(name, u @ e2 + l1 * w, u)
     e1 = np.array([e2[1], -e2[0]])
     forwards = wheel_rate[:, :2].sum(axis=1) if kind == "pair" else wheel_rate[:, 0]
     if _fit(np.column_stack([u @ e1, w]), forwards)[0] < 0.0:  # forwards is where the wheels turn forwards
@@ -273,6 +275,20 @@ def _check_motion(name: str, w: np.ndarray, u: np.ndarray) -> None:
         raise EstimationError(
             f"{name}: the vehicle turned at {turn:.3f} rad/s and drove at {speed:.3f} m/s RMS, too little to find its "
             "wheels; record again with curves of both hands, or give its parameters in the rig file."
+        )
+
+
+class SidewaysError(EstimationError):
+    """The vehicle moves as none on wheels does."""
+
+
+def _check_sideways(name: str, slip: np.ndarray, velocity: np.ndarray) -> None:
+    """Raises SidewaysError where no point of the vehicle moves along one axis: slip (n,) m/s across the best one."""
+    share = float(np.sqrt(np.mean(slip**2) / np.mean((velocity**2).sum(axis=1))))
+    if share > SIDEWAYS:
+        raise SidewaysError(
+            f"{name}: the vehicle drives along none of its axes, it would slip sideways by {100 * share:.0f} % of its "
+            "speed; check that what shows its motion is on this vehicle, and how its poses are written."
         )
 
 

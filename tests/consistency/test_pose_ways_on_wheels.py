@@ -1,0 +1,38 @@
+"""Poses written another way, without an IMU: a vehicle would slip sideways, and the way that wheels fit is named."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from tests.consistency.test_assumed_motion import without_imu
+from tests.consistency.test_upwards import level
+from tests.first_guess.test_pose_ways import conjugated, inverted, w_first, y_up
+
+from icalib.errors import EstimationError
+from icalib.first_guess.assumed_motion import start_without_imu
+
+WRONG = [
+    (inverted, "the poses of mocap0 are inverted"),
+    (conjugated, "the poses of mocap0 have inverted rotations"),
+    (w_first, "the poses of mocap0 have quaternions with w first"),
+    (y_up, "mocap0 have positions and rotations in different frames.*set its position_axes to .x, z, -y."),
+]
+
+
+@pytest.fixture(scope="module", params=["planar", "ramp"])
+def recorded(request, robot):
+    return without_imu(replace(robot(request.param, 12.0, "w"), poses=(level(),)))
+
+
+@pytest.mark.parametrize(("way", "words"), WRONG)
+def test_the_way_that_wheels_fit_is_named(recorded, way, words):
+    rig, measurements, _ = recorded
+    written = replace(measurements, poses=tuple(way(x) for x in measurements.poses))
+    with pytest.raises(EstimationError, match=words):
+        start_without_imu(rig, [written])
+
+
+def test_poses_as_they_should_be(recorded):
+    rig, measurements, _ = recorded
+    start_without_imu(rig, [measurements])
