@@ -15,6 +15,7 @@ import signal
 import sys
 import time
 import traceback
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -117,6 +118,7 @@ def _child(work: Path, command: list[str], writable: int, seconds: float) -> Non
         os.dup2(said.fileno(), 2)
         sys.stdout, sys.stderr = nowhere, said
         faulthandler.dump_traceback_later(0.9 * seconds, file=said)  # says where a command hangs
+        warnings.simplefilter("ignore", RuntimeWarning)  # as at a terminal
         try:
             code = main(command)
         except SystemExit as stop:
@@ -133,14 +135,14 @@ def _child(work: Path, command: list[str], writable: int, seconds: float) -> Non
 
 
 def _faults_of_end(code: int, said: str, peak: int) -> list[str]:
-    faults = []
+    faults = ["FAULT OF ICALIB"] if "is a fault of icalib" in said else []
     if code not in (0, 1, 2):
         faults.append("TRACEBACK" if "Traceback" in said else "NO END")
     elif "Traceback" in said or "Warning:" in said:
         faults.append("NOISE")
     elif code and not re.fullmatch(r"icalib: [^\n]*\n|usage: (.|\n)*", said) and (said or code != 1):
         faults.append("NOT ONE SENTENCE")  # compare, and fleets with a failed job, say it on standard output
-    if re.search(r"\bnan\b|best correlation nan", said):
+    if re.search(r"(?<![.'])\bnan\b(?!')", said):
         faults.append("NAN SAID")
     if peak > MOST_BYTES:
         faults.append(f"{peak / 1e9:.1f} GB")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import io
 import sys
+import traceback
+import warnings
 from math import inf
 from pathlib import Path
 
@@ -21,6 +23,8 @@ def main(arguments: list[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):  # names of files may have bytes that no encoding has
             stream.reconfigure(errors="backslashreplace")
     options = _parser().parse_args(arguments)
+    if arguments is None and not sys.warnoptions:
+        warnings.simplefilter("ignore", RuntimeWarning)  # numpy's, of which nobody at a terminal can make anything
     try:
         code = options.run(options)
     except CalibrationError as error:
@@ -30,6 +34,9 @@ def main(arguments: list[str] | None = None) -> int:
         return getattr(options, "error_code", 1)
     except (OSError, MemoryError) as error:  # what fails outside of the program, and nobody expected there
         print(f"icalib: {_outside(error)}", file=sys.stderr)
+        return getattr(options, "error_code", 1)
+    except Exception as error:  # the last resort: a sentence says as much as a traceback does, to whoever reads it
+        print(f"icalib: {_fault(error)}", file=sys.stderr)
         return getattr(options, "error_code", 1)
     except KeyboardInterrupt as stop:
         print(f"icalib: interrupted; {str(stop) or 'nothing was written.'}", file=sys.stderr)
@@ -42,6 +49,15 @@ def _outside(error: OSError | MemoryError) -> str:
         return "the memory of this machine is not enough; use --from and --to, or a machine with more."
     place = f"{error.filename} cannot be used: " if error.filename else ""
     return f"{place}{error.strerror or error}; check files, permissions and disks."
+
+
+def _fault(error: Exception) -> str:
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    what = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+    return (
+        f"failed in {Path(frame.filename).name}, line {frame.lineno} ({what}), which is a fault of icalib; please "
+        "report it with the command."
+    )
 
 
 def _parser() -> argparse.ArgumentParser:

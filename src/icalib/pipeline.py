@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from math import inf
 from pathlib import Path
 
+import numpy as np
 from threadpoolctl import threadpool_limits
 
 from icalib.assessment import assess, stated_words, visited
@@ -30,6 +31,7 @@ from icalib.rig_file import load_rig
 from icalib.rig_streams import streams_of_rig
 
 READING_SHARE, IMAGES_SHARE = 0.1, 0.8  # of the time, without images and with
+SHORTEST_S = 1.0  # of the IMU, below which nothing can be found; clocks need four seconds
 Progress = Callable[[str, float], None]  # what is being done, and how much of the whole is behind, 0 to 1
 
 
@@ -104,9 +106,27 @@ def calibrate_measurements(
     check_complete(rig)
     recordings = [m if m.name else dataclasses.replace(m, name=f"recording {k}") for k, m in enumerate(given, 1)]
     recordings = [without_jumps(rig, streams_of_rig(rig, m)) for m in recordings]
+    for one in recordings:
+        _refuse_short(one)
     # The kernels have threads of their own; those of BLAS beside them double the time.
     with threadpool_limits(limits=1, user_api="blas"):
-        return _calibrate(rig, recordings, progress, on_visit)
+        try:
+            return _calibrate(rig, recordings, progress, on_visit)
+        except (np.linalg.LinAlgError, OverflowError) as error:
+            raise EstimationError(
+                f"the equations have no solution ({error}); a value in the recording or in the rig file is of "
+                "impossible size, or nothing in the recording moves: look at both by icalib inspect."
+            ) from error
+
+
+def _refuse_short(measured: Measurements) -> None:
+    imu = measured.imu
+    lasted_s = 0.0 if imu is None else float(imu.stamps_ns[-1] - imu.stamps_ns[0]) * 1e-9
+    if imu is not None and lasted_s < SHORTEST_S:
+        raise RecordingError(
+            f"{imu.name}: {len(imu.stamps_ns)} readings in {lasted_s:.2f} s are too short a recording; a calibration "
+            "needs some seconds of motion."
+        )
 
 
 def _calibrate(
@@ -128,8 +148,19 @@ def _calibrate(
     clock.lap("solving")
     progress("judging the result", 0.9)
     result = assess(made.inputs, made.found, made.against)
+    _refuse_no_numbers(result)
     clock.lap("judging")
     return dataclasses.replace(result, timings=clock.laps)
+
+
+def _refuse_no_numbers(result: Calibration) -> None:
+    """Values of impossible size overflow somewhere; what comes of it must not pass for a result."""
+    for group in result.groups:
+        if not np.isfinite(group.value).all() or np.isnan(group.std).any():
+            raise EstimationError(
+                f"{group.sensor}: {group.name} came out as no finite number; a value in the recording or in the rig "
+                "file is of impossible size: look at both by icalib inspect."
+            )
 
 
 class _Clock:

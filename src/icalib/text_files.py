@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
+from math import isfinite
 from pathlib import Path
+from typing import Any
 
 from icalib.errors import CalibrationError
 from icalib.file_names import below
@@ -14,6 +17,19 @@ def printable(text: str) -> str:
     """`text` as a file in UTF-8 can hold it. Names of files may have other bytes, which Python keeps as lone
     surrogates; they become escapes such as \\udcfc, which JSON and YAML in quotes read back as the same name."""
     return text.encode("utf-8", "backslashreplace").decode("utf-8")
+
+
+def json_text(plain: Any) -> str:
+    """`plain` as JSON, with null for numbers that are not finite, which JSON does not have."""
+    return json.dumps(_finite(plain), indent=1, ensure_ascii=False, allow_nan=False)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(v) for key, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(v) for v in value]
+    return None if isinstance(value, float) and not isfinite(value) else value
 
 
 def write_texts(folder: Path, texts: Mapping[str, str]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from math import floor, log10
 from typing import Any
@@ -14,6 +13,7 @@ from rich.text import Text
 
 from icalib.allan.analysis import AXES, ImuNoiseStudy, SensorNoise
 from icalib.allan.fit import NoiseFit
+from icalib.text_files import json_text
 
 _UNITS = {"gyroscope": ("rad/s/sqrt(Hz)", "rad/s^2/sqrt(Hz)"), "accelerometer": ("m/s^2/sqrt(Hz)", "m/s^3/sqrt(Hz)")}
 _FIELDS = {"gyroscope": ("gyro", "gyro_walk"), "accelerometer": ("accel", "accel_walk")}
@@ -54,7 +54,7 @@ def study_json(study: ImuNoiseStudy) -> str:
             "allan_tau": sensor.deviation.tau.tolist(),
             "allan_deviation": sensor.deviation.deviation.T.tolist(),
         }
-    return json.dumps(plain, indent=1, allow_nan=False)
+    return json_text(plain)
 
 
 def print_study(study: ImuNoiseStudy) -> None:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from math import floor, log10
 
 import numpy as np
 
 from icalib.comparison.compare import Comparison, Difference
-from icalib.text_files import printable
+from icalib.text_files import json_text, printable
 
 _ALONG = 0.95  # of the whole: then it is about one axis
 _TITLES = {True: "same", False: "DIFFERS"}
@@ -63,7 +62,7 @@ def comparison_json(comparison: Comparison) -> str:
         "differences": [dataclasses.asdict(d) | {"sentence": sentence(d, c)} for d in c.differences],
         "notes": list(c.notes),
     }
-    return printable(json.dumps(plain, indent=1, ensure_ascii=False, allow_nan=False))
+    return printable(json_text(plain))
 
 
 def digits(value: float) -> str:

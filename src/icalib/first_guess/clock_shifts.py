@@ -58,8 +58,8 @@ def likely_offsets(imu: ImuData, name: str, rates: CameraRates) -> list[float]:
     peaks = max(_shifts(imu, rates), key=lambda p: _likeness(p[0]))
     if not peaks[0].correlation > rates.least_correlation:
         raise EstimationError(
-            f"the motion of {name} does not match that of {imu.name} at any shift of their clocks (best correlation "
-            f"{max(peaks[0].largest, 0.0):.2f}); check that both come from the same recording, overlap in time, "
+            f"the motion of {name} does not match that of {imu.name} at any shift of their clocks ("
+            f"{how_alike(peaks[0].largest)}); check that both come from the same recording, overlap in time, "
             f"and are in rad/s."
         )
     return [p.samples / GRID_HZ for p in peaks if p.correlation > rates.least_correlation]
@@ -77,6 +77,13 @@ def _slow(imu: ImuData, name: str, rates: CameraRates) -> list[float]:
             "are in rad/s, or record more a second."
         )
     return alike
+
+
+def how_alike(largest: float) -> str:
+    """The largest correlation at any shift, in words."""
+    if not np.isfinite(largest):
+        return f"nowhere do they overlap for {SHORTEST_OVERLAP_S:g} s without a gap"
+    return f"best correlation {max(largest, 0.0):.2f}"
 
 
 def best_offsets(imu: ImuData, rates: CameraRates) -> list[float]:

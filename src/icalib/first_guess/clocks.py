@@ -339,8 +339,8 @@ def contradicts(imu: ImuData, rates: CameraRates, given: Alignment) -> bool:
 
 def _no_overlap(imu: ImuData, name: str) -> EstimationError:
     return EstimationError(
-        f"with the time_offset in the rig file no image of {name} falls within the recording of {imu.name}; correct "
-        "it, or leave it out to have it found."
+        f"nothing of {name} falls within the recording of {imu.name}; check that both come from the same recording, "
+        "and that a time_offset in the rig file is in seconds, or leave it out to have it found."
     )
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from icalib.errors import EstimationError
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.wheel_intervals import LONGEST_S
-from icalib.first_guess.clock_shifts import LONGEST_STEP_S, longest_step
+from icalib.first_guess.clock_shifts import LONGEST_STEP_S, how_alike, longest_step
 from icalib.first_guess.correlation import best_shift
 from icalib.rig import WheelKind
 
@@ -337,7 +337,7 @@ def _correlate(imu: ImuData, turn: np.ndarray, name: str, rates: WheelRates) -> 
                 "goes; record again with curves of both hands, or give its time_offset in the rig file."
             )
         raise EstimationError(
-            f"the turning of {name} does not match that of {imu.name} at any shift of their clocks (best correlation "
-            f"{max(found.largest, 0.0):.2f}); check that both come from the same recording and overlap in time."
+            f"the turning of {name} does not match that of {imu.name} at any shift of their clocks ("
+            f"{how_alike(found.largest)}); check that both come from the same recording and overlap in time."
         )
     return found.samples / GRID_HZ

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ from icalib.geometry.targets import Scene
 from icalib.inspection.facts import CameraSource, Inspection, StreamFacts
 from icalib.inspection.timing import overlap_s
 from icalib.inspection.views import GRID
+from icalib.text_files import json_text
 
 
 def figures(found: Inspection) -> dict[str, Any]:
@@ -33,7 +33,7 @@ def figures(found: Inspection) -> dict[str, Any]:
 
 def figures_json(found: Inspection) -> str:
     """`figures` as the text of a JSON file."""
-    return json.dumps(figures(found), indent=1, allow_nan=False) + "\n"
+    return json_text(figures(found)) + "\n"
 
 
 def _stream(stream: StreamFacts) -> dict[str, Any]:
