@@ -26,7 +26,7 @@ from icalib.cli import main
 
 MOST_BYTES = 2_000_000_000
 _ADDRESS_SPACE = 12 << 30  # what asks for more has lost its measure
-_NOT_FINITE = re.compile(r"(?<![A-Za-z0-9_.])(\.?nan|-?\.?inf(inity)?)(?![A-Za-z0-9_])", re.IGNORECASE)
+_NOT_FINITE = re.compile(r"(?<![A-Za-z0-9_.])(\.nan|-?\.inf|nan)(?![A-Za-z0-9_])")
 _MADE = ("made", "made.json", "made.yaml", "made.bag", "made.rrd", "made.urdf")
 
 
@@ -74,7 +74,10 @@ def run_case(case: Case, good: Path, place: Path, seconds: float) -> Found:
         how = mutate(work / case.file, case.rng())
         before = _contents(place)
         code, said, peak = _forked(work, list(case.command), seconds)
-        faults = [*_faults_of_end(code, said, peak), *_faults_of_files(before, _contents(place), code)]
+        faults = [*_faults_of_end(code, said, peak), *_faults_of_files(before, _contents(place))]
+        result = work / "made" / "calibration.yaml"
+        if result.is_file() and _NOT_FINITE.search(result.read_text(encoding="utf-8")):
+            faults.append("NO NUMBER IN A RESULT")
         return Found(code, said, how, tuple(faults))
     finally:
         shutil.rmtree(place)
@@ -158,7 +161,7 @@ def _contents(place: Path) -> dict[str, str]:
     return found
 
 
-def _faults_of_files(before: dict[str, str], after: dict[str, str], code: int) -> list[str]:
+def _faults_of_files(before: dict[str, str], after: dict[str, str]) -> list[str]:
     faults = [f"CHANGED {name}" for name in before if after.get(name) != before[name] and "/out/" not in name]
     for name in after.keys() - before.keys():
         top = name.removeprefix("a/b/work/").split("/")[0]
