@@ -63,7 +63,7 @@ def wrong_guesses(camera: Camera) -> dict[str, tuple[dict[str, np.ndarray], str]
     return {
         "inverse": ({"rotation": R.T, "translation": -R.T @ p}, "looks like the inverse, as in Kalibr's T_cam_imu"),
         "link": ({"rotation": R @ OPTICAL.T}, "frame whose axes are named otherwise"),
-        "seconds": ({"time_offset": t - 3.0}, "time offset of cam0, -299"),
+        "seconds": ({"time_offset": t - 3.0}, "time offset of cam0 is 3000 ms from what the data show"),
         "milliseconds": ({"time_offset": 1e3 * t}, "looks like milliseconds"),
         "millimetres": ({"translation": 1e3 * p}, "looks like millimetres"),
         "half": ({"intrinsics": lens * [0.5, 0.5, 1.0, 1.0]}, "focal length is 2 times that"),

@@ -57,5 +57,8 @@ def _sentence(group: ParameterGroup, guess: np.ndarray) -> str:
         return f"{what} is {off:.1f} deg from what the data show, which alone count."
     unit, scale = SHOWN_UNITS.get(group.unit, (group.unit, 1.0))
     unit = f" {unit}" if unit else ""
+    if group.name == "time_offset":
+        off = guess - group.value
+        return f"{what} is {scaled(np.abs(off), scale)}{unit} from what the data show, which alone count."
     shown = f"{scaled(group.value, scale)}{unit}"
     return f"{what}, {scaled(guess, scale)}{unit}, is far from what the data show, {shown}, which alone count."

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from icalib.estimation.state import Key
 from icalib.estimation.tolerances import GUESS_SIGMA
 from icalib.geometry import so3
-from icalib.rig import Parameter
+from icalib.rig import Camera, Lidar, Parameter, PoseSensor, Wheels
 
 SIGMAS = 4.0  # times what a guess is worth
 LENGTHS = ("radii", "radius", "baseline", "wheelbase", "scales")  # guessed to a share of themselves
@@ -35,6 +36,24 @@ def chosen(name: str, parameter: Parameter, given: np.ndarray | None, found: np.
     if given is None or (parameter.mode == "free" and is_contradicted(name, given, found)):
         return found
     return given
+
+
+def settled(
+    sensor: Camera | Lidar | Wheels | PoseSensor, known: dict[Key, np.ndarray], found: dict[Key, np.ndarray]
+) -> dict[Key, np.ndarray]:
+    """What was `found` of a sensor, and in its place what the rig file gives of it, `known`, but guesses that this
+    contradicts."""
+    kept = {
+        key: value
+        for key, value in known.items()
+        if key not in found or getattr(sensor, key[1]).mode != "free" or not is_contradicted(key[1], value, found[key])
+    }
+    return found | kept
+
+
+def has_guesses(sensor: Camera | Lidar | Wheels | PoseSensor, known: dict[Key, np.ndarray]) -> bool:
+    """Whether some of the `known` values are mere guesses."""
+    return any(getattr(sensor, name).mode == "free" for _, name in known)
 
 
 def chosen_along(given: np.ndarray, found: np.ndarray, covariance: np.ndarray) -> np.ndarray:

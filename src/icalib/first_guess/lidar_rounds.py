@@ -33,6 +33,7 @@ from icalib.first_guess.by_recording import (
     other_clocks,
     points_by_recording,
 )
+from icalib.first_guess.contradicted import settled
 from icalib.first_guess.known_motion import near_nodes
 from icalib.first_guess.lidar import Held, lidar_and_motion, lidar_on_motion
 from icalib.first_guess.lidar_planes import ROUNDS, Association, associate, odd_step, round_search
@@ -86,7 +87,8 @@ def _state_of_one(inputs: Inputs, held: Held | None = None) -> State:
         guess, motion = lidar_and_motion(inputs.imu, stream, inputs.rig.gravity, known)
     # What turns show is nearer than a guess, with which planes would be thick, and steps towards them lead astray.
     names = ("translation", *_trusted(lidar)) if guess.turned else NAMES
-    values = start_values(inputs, guess.values(lidar.name) | given(inputs, lidar, names))
+    own, known = guess.values(lidar.name), given(inputs, lidar, names)
+    values = start_values(inputs, settled(lidar, known, own) if guess.turned else own | known)
     hosts = {(x.name, "time_offset"): values[lidar.name, "time_offset"] for x in inputs.rig.lidars}
     nodes = nodes_for(inputs, host_times(inputs, hosts)[:1])
     rotation, position, velocity = motion.at(nodes)

@@ -6,6 +6,7 @@ is known.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 
@@ -27,6 +28,7 @@ from icalib.first_guess.by_recording import (
 )
 from icalib.first_guess.clock_shifts import LEAST_CORRELATION, CameraRates, longest_step
 from icalib.first_guess.clocks import Alignment
+from icalib.first_guess.contradicted import has_guesses, settled
 from icalib.first_guess.gyro import GyroRotation
 from icalib.first_guess.lever_arm import SIZE_TOLERANCE, size_of
 from icalib.first_guess.lidar import (
@@ -71,7 +73,10 @@ def pose_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
     for sensor, stream in zip(inputs.rig.poses, inputs.measurements.poses, strict=True):
         known = given(inputs, sensor, NAMES)
         if len(known) < len(NAMES):
-            known = _placed(inputs, state, sensor, stream) | known
+            known = settled(sensor, known, _placed(inputs, state, sensor, stream))
+        elif has_guesses(sensor, known):
+            with suppress(EstimationError):
+                known = settled(sensor, known, _placed(inputs, state, sensor, stream))
         out |= known | _frames(inputs.imu, sensor, stream, state, known)
     return out
 
@@ -122,7 +127,7 @@ def _state_of_one(inputs: Inputs, held: Held | None) -> State:
     sensor, stream, imu, gravity = inputs.rig.poses[0], inputs.measurements.poses[0], inputs.imu, inputs.rig.gravity
     known = held or held_of(inputs, sensor)
     found = placed(stream, lambda x: _with_motion(imu, x, gravity, known), lambda x: _turn_alone(imu, x, known))
-    own = found.guess.values(sensor.name) | given(inputs, sensor, NAMES)
+    own = settled(sensor, given(inputs, sensor, NAMES), found.guess.values(sensor.name))
     values = start_values(inputs, own)
     hosts = {(x.name, "time_offset"): values[sensor.name, "time_offset"] for x in inputs.rig.poses}
     nodes = nodes_for(inputs, host_times(inputs, hosts))

@@ -18,6 +18,7 @@ from icalib.estimation.robot import MOUNT
 from icalib.estimation.state import Key, State
 from icalib.estimation.wheel_angles import integrals_of
 from icalib.first_guess.by_recording import alone, each_clock
+from icalib.first_guess.contradicted import has_guesses, is_contradicted, settled
 from icalib.first_guess.known_motion import imu_poses, is_known
 from icalib.first_guess.lidar_rounds import NAMES, given, lidar_values, with_lidars
 from icalib.first_guess.poses import pose_values
@@ -62,19 +63,53 @@ def _wheels(inputs: Inputs, state: State, wheels: Wheels, stream: WheelStream | 
     known = given(inputs, wheels, names)
     if isinstance(stream, WheelPoses):
         known |= {(wheels.name, name): np.ones(n) for name, n in wheels.sizes.items()}
-    if len(known) == len(names):
+    complete = len(known) == len(names)
+    if complete and not has_guesses(wheels, given(inputs, wheels, names)):
         return known
+    clock = wheels.name, "time_offset"
+    offset = known.get(clock)
+    try:
+        found = _found(inputs, state, wheels, stream, None if wheels.time_offset.mode == "free" else offset)
+        if not complete and offset is not None and not is_contradicted("time_offset", offset, found[clock]):
+            found = _found(inputs, state, wheels, stream, offset)
+    except EstimationError:
+        if complete:
+            return known
+        if offset is None:
+            raise
+        found = _found(inputs, state, wheels, stream, offset)
+    mount = wheels.name, "translation"
+    if (arm := known.get(mount)) is not None:
+        level = _as_high(inputs, state, arm, found[mount])
+        found[mount] = found[mount] if is_contradicted("translation", arm, level) else arm
+    return settled(wheels, known, found)
+
+
+def _as_high(inputs: Inputs, state: State, arm: np.ndarray, found: np.ndarray) -> np.ndarray:
+    """The lever arm that was `found`, as high as `arm`: on a floor wheels do not show their height."""
+    up = _ways_up(inputs, state).ways[0]
+    up = up / np.linalg.norm(up)
+    return found + up * (up @ (arm - found))
+
+
+def _found(
+    inputs: Inputs,
+    state: State,
+    wheels: Wheels,
+    stream: WheelStream | WheelPoses,
+    offset: np.ndarray | None,
+) -> dict[Key, np.ndarray]:
+    """What the motion shows of wheels, at a time `offset` where it is known."""
     assert inputs.imu is not None
     if isinstance(stream, WheelPoses):
-        return _posing(inputs, state, stream, known.get((wheels.name, "time_offset"))) | known
+        return _posing(inputs, state, stream, offset)
     rates = wheel_rates(wheels.name, stream.seconds, integrals_of(stream), stream.kind)
-    offset = known.get((wheels.name, "time_offset"))
     up = _ways_up(inputs, state)
     failed: list[EstimationError] = []
     for way in up.ways:
         found = _try(inputs, state, stream, rates, way, offset)
         if not isinstance(found, EstimationError):
-            return found | known
+            return found
         failed.append(found)
     other = _try(inputs, state, stream, rates, -up.ways[0], offset) if up.level else failed[0]
     if not isinstance(other, EstimationError):
