@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from icalib.recordings.clocks import usual_step
+
 _BETWEEN = 0.75  # of the period: the step from a copy to its nearest neighbour is shorter
 _LATEST_NS = 1_000_000_000  # between a reading and its copy
 _SHORT = 0.3  # quantile of the steps between readings without a copy that is one period: no step is shorter
@@ -20,6 +22,8 @@ def copies(stamps_ns: np.ndarray, values: np.ndarray) -> np.ndarray:
     earlier ones where neither do.
     """
     bad = np.zeros(len(values), bool)
+    if len(values) < 2 or np.diff(stamps_ns).min() >= _BETWEEN * usual_step(stamps_ns):
+        return bad
     twins = _twins(stamps_ns, values)
     single = np.ones(len(values), bool)
     single[twins.ravel()] = False

@@ -35,9 +35,10 @@ def spikes(seconds: np.ndarray, values: np.ndarray) -> np.ndarray:
     flag[1:-1] |= flag[:-2] & flag[2:]  # two wrong ones to opposite sides leave the one between them in line
     for _ in range(2):  # one found may have hidden another near it
         good = np.flatnonzero(~bad)
+        t, x = seconds[good], values[good]
         for run in _runs(flag[good]):
             for own in _within(run, len(good)):
-                if _is_wrong(seconds[good], values[good], own):
+                if _is_wrong(t, x, own):
                     bad[good[own]] = True
                     break
     return bad
