@@ -22,6 +22,9 @@ MOUNT = ("rotation", "translation", "time_offset")
 T_IMU_MOCAP = np.array([[0.0, -1.0, 0.0, 0.1], [1.0, 0.0, 0.0, 0.05], [0.0, 0.0, 1.0, 0.3], [0.0, 0.0, 0.0, 1.0]])
 
 
+T_OTHER = np.array([[0.0, 0.0, 1.0, -0.2], [1.0, 0.0, 0.0, 0.3], [0.0, 1.0, 0.0, 0.1], [0.0, 0.0, 0.0, 1.0]])
+
+
 def mocap(name: str = "mocap0", T: np.ndarray = T_IMU_MOCAP, **others) -> SimPoses:
     """With a frame that is tilted by a quarter turn: nothing says where up is."""
     tilted = np.array([[1.0, 0.0, 0.0, 2.0], [0.0, 0.0, -1.0, 1.0], [0.0, 1.0, 0.0, 0.5], [0.0, 0.0, 0.0, 1.0]])
@@ -100,8 +103,7 @@ def test_a_target_that_is_out_of_sight_for_long(robot, seed):
 
 def test_two_pose_sensors(robot):
     """What is called hand-eye calibration."""
-    other = np.array([[0.0, 0.0, 1.0, -0.2], [1.0, 0.0, 0.0, 0.3], [0.0, 1.0, 0.0, 0.1], [0.0, 0.0, 0.0, 1.0]])
-    poses = (mocap(), mocap("slam0", other, time_offset_s=-0.02, rate_hz=30.0))
+    poses = (mocap(), mocap("slam0", T_OTHER, time_offset_s=-0.02, rate_hz=30.0))
     scenario = replace(robot("3d", 12.0, ""), poses=poses)
     rig, measurements, simulation = without_imu(scenario)
     result = calibrate_measurements(rig, measurements)
@@ -175,3 +177,12 @@ def test_the_clock_of_wheels_that_say_more_than_the_poses(robot):
         e, P = normalised(calibrate_measurements(rig, measurements), simulation)
         normal.append(e[6] / np.sqrt(P[6, 6]))
     assert abs(np.mean(normal)) < 1.3, normal  # 99 % of the mean of four
+
+
+@pytest.mark.parametrize("first", ["mocap0", "cam0"])
+def test_poses_of_half_a_degree_and_a_centimetre(robot, first):
+    """As a target that is seen from far, and motion capture, whichever is the body."""
+    poor = mocap("cam0", T_OTHER, rotation_noise=0.01, position_noise=0.01, time_offset_s=-0.02, rate_hz=30.0)
+    poses = (mocap(), poor) if first == "mocap0" else (poor, mocap())
+    rig, measurements, simulation = without_imu(replace(robot("3d", 20.0, ""), poses=poses))
+    check_known(calibrate_measurements(rig, measurements), simulation, 7)

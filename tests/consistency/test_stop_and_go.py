@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 from scipy.stats import chi2
-from tests.consistency.test_assumed_motion import mocap
+from tests.consistency.test_assumed_motion import T_OTHER, mocap
 from tests.consistency.test_pose_sensors import pose
 
 from icalib.calibration import Calibration, load_calibration
@@ -190,9 +190,8 @@ def test_what_is_fixed_stays():
 
 
 def test_two_pose_sensors_at_rest(robot):
-    other = np.array([[0.0, 0.0, 1.0, -0.2], [1.0, 0.0, 0.0, 0.3], [0.0, 1.0, 0.0, 0.1], [0.0, 0.0, 0.0, 1.0]])
     same = {"rate_hz": 1.0, "time_offset_s": 0.0, "clock_origin_ns": 0, "phase_s": 0.5}
-    poses = (mocap(**same), mocap("slam0", other, **same))
+    poses = (mocap(**same), mocap("slam0", T_OTHER, **same))
     scenario: Scenario = replace(robot("3d", 25.0, ""), poses=poses, motion=Drive("free"), imu_clock_origin_ns=0)
     sim = simulate(scenario, 0)
     rig = replace(rig_for(scenario), imu=None)

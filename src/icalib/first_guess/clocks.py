@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 
@@ -27,6 +27,7 @@ from icalib.measurements import CornerStream
 
 FEWEST_PAIRS = 20  # of neighbouring images
 LARGEST_UNEXPLAINED = 0.35  # of the angular rate
+LONGER_S = 0.5  # over which noisy rates are compared where over AVERAGED_S they are not alike
 CLOCKS_AGREE_S = 0.01  # of the time offsets that two recordings show
 CLEARLY_BETTER = 0.5  # of what another offset leaves unexplained
 LEAST_ALIKE = 0.3  # share of the camera's rate that goes with the IMU's, below which their ratio says nothing
@@ -83,11 +84,28 @@ def align(imu: ImuData, name: str, rates: CameraRates, given_offset: float | Non
     first = _align_near(imu, name, rates, best, keep)
     tried = (_align_near(imu, name, rates, x, keep) for x in others if _covered(imu, rates, x).any())
     # In a short recording the sizes of the rates may be more alike elsewhere, but not their directions.
-    alike, found = next((x for x in chain([first], tried) if _unexplained(imu, *x) <= LARGEST_UNEXPLAINED), first)
+    (alike, found), averaged = _first_alike(imu, chain([first], tried))
     refuse_steps(imu, name, alike, found.offset, lambda part, offset: _left_at(imu, part, found, offset))
-    _check_offset(imu, name, alike, found, keep)
-    _check_scale(imu, name, rates, found)
+    _check_offset(imu, name, _unexplained(imu, alike, found, averaged), keep)
+    _check_scale(imu, name, rates, found, averaged)
     return found
+
+
+def _first_alike(
+    imu: ImuData, tried: Iterable[tuple[CameraRates, Alignment]]
+) -> tuple[tuple[CameraRates, Alignment], float]:
+    """The first at which the two turn alike, and over how long; or if none does the very first. Over LONGER_S what is
+    noise shrinks with the root of that at least, another motion does not."""
+    known: list[tuple[CameraRates, Alignment]] = []
+    for one in tried:
+        known.append(one)
+        if _unexplained(imu, *one) <= LARGEST_UNEXPLAINED:
+            return one, AVERAGED_S
+    for one in known:
+        share = min(LARGEST_UNEXPLAINED, np.sqrt(AVERAGED_S / LONGER_S) * _unexplained(imu, *one))
+        if _unexplained(imu, *one, LONGER_S) <= share:
+            return one, LONGER_S
+    return known[0], AVERAGED_S
 
 
 def _align_near(
@@ -126,9 +144,8 @@ def _covered(imu: ImuData, rates: CameraRates, offset: float) -> np.ndarray:
     return inside
 
 
-def _check_offset(imu: ImuData, name: str, rates: CameraRates, found: Alignment, given: bool) -> None:
+def _check_offset(imu: ImuData, name: str, unexplained: float, given: bool) -> None:
     """An offset at which the two do not turn alike is wrong, or the recordings do not belong together."""
-    unexplained = _unexplained(imu, rates, found)
     if unexplained > LARGEST_UNEXPLAINED:
         where = "with the time_offset in the rig file" if given else "at any shift of their clocks"
         advice = "correct it, or leave it out to have it found" if given else _SAME_RECORDING
@@ -138,9 +155,9 @@ def _check_offset(imu: ImuData, name: str, rates: CameraRates, found: Alignment,
         )
 
 
-def _unexplained(imu: ImuData, rates: CameraRates, found: Alignment) -> float:
-    """Share of the angular rate that the camera did not see."""
-    gyro, seen = _side_by_side(imu, rates, found.offset)
+def _unexplained(imu: ImuData, rates: CameraRates, found: Alignment, averaged: float = AVERAGED_S) -> float:
+    """Share of the angular rate that the camera did not see, of means over `averaged` seconds."""
+    gyro, seen = _side_by_side(imu, rates, found.offset, averaged)
     gyro, seen = gyro - found.gyro_bias, seen @ found.rotation.T
     return float(np.median(np.linalg.norm(gyro - seen, axis=1)) / np.median(np.linalg.norm(gyro, axis=1)))
 
@@ -151,13 +168,17 @@ def _left_at(imu: ImuData, rates: CameraRates, found: Alignment, offset: float) 
     return _unexplained(imu, rates, there) if _covered(imu, rates, offset).any() else np.inf
 
 
-def _side_by_side(imu: ImuData, rates: CameraRates, offset: float) -> tuple[np.ndarray, np.ndarray]:
+def _side_by_side(
+    imu: ImuData, rates: CameraRates, offset: float, averaged: float = AVERAGED_S
+) -> tuple[np.ndarray, np.ndarray]:
     """(n, 3) each, rad/s in own axes: what the gyroscope and the camera have, both as means over some images: a rate
     between neighbours has little but noise where the target is far or the motion slow."""
     inside = _covered(imu, rates, offset)
     start, end = rates.start[inside], rates.end[inside]
     gyro = _interval_rates(imu, rates).over(start + offset, end + offset)
-    count = min(max(1, round(AVERAGED_S / float(np.median(end - start)))), len(start))
+    # Windows may overlap: so many of them cover `averaged` seconds.
+    step = float(np.median(np.diff(start))) if len(start) > 1 else averaged
+    count = min(max(1, 1 + round((averaged - float(np.median(end - start))) / step)), len(start))
     return means(gyro, count), means(rates.rate[inside], count)
 
 
@@ -334,7 +355,8 @@ def as_given(imu: ImuData, name: str, rates: CameraRates, offset: float, rotatio
 
 def contradicts(imu: ImuData, rates: CameraRates, given: Alignment) -> bool:
     """Whether the two turn, but not alike, even allowing for what a guess is off."""
-    return not is_still(*turning(imu, rates)) and _unexplained(imu, rates, given) > LARGEST_UNEXPLAINED
+    (_, found), averaged = _first_alike(imu, [(rates, given)])
+    return not is_still(*turning(imu, rates)) and _unexplained(imu, rates, found, averaged) > LARGEST_UNEXPLAINED
 
 
 def _no_overlap(imu: ImuData, name: str) -> EstimationError:
@@ -355,9 +377,9 @@ def _check_degrees(imu: ImuData, name: str, gyro: np.ndarray, seen: np.ndarray) 
         )
 
 
-def _check_scale(imu: ImuData, name: str, rates: CameraRates, found: Alignment) -> None:
+def _check_scale(imu: ImuData, name: str, rates: CameraRates, found: Alignment, averaged: float) -> None:
     """The two must turn equally fast."""
-    ratio = _scale(found, *_side_by_side(imu, rates, found.offset))
+    ratio = _scale(found, *_side_by_side(imu, rates, found.offset, averaged))
     if not 0.8 < ratio < 1.25:
         raise EstimationError(
             f"{imu.name} turns {ratio:.3g} times as fast as {name}: check its units, or, where the target is small in "

@@ -54,11 +54,11 @@ from icalib.first_guess.lidar_odometry import LidarPath
 from icalib.first_guess.lidar_rounds import NAMES, given, held_of
 from icalib.first_guess.pose_frames import turn_of_positions
 from icalib.first_guess.pose_ways import placed
-from icalib.geometry import so3
+from icalib.first_guess.rate_windows import rate_window, window_rates
 from icalib.measurements import PoseStream
 from icalib.rig import PoseSensor
 
-WINDOW_S = 0.1  # of a mean rate: long against the noise of poses
+WINDOW_S = 0.1  # of a mean rate, at least
 FEWEST_WINDOWS = 20
 LEAST_RATE_HZ = 2.0  # of poses of something that moves
 APART_S = 0.4  # of poses that show whether they fit: next to each other they differ by little but noise
@@ -136,27 +136,22 @@ def _state_of_one(inputs: Inputs, held: Held | None) -> State:
 
 
 def pose_rates(stream: PoseStream) -> CameraRates:
-    """Mean angular rates over windows of about WINDOW_S, one from each pose. Raises EstimationError where there are
-    hardly any."""
+    """Mean angular rates over windows of WINDOW_S or more, as the poses' noise asks for, one from each pose. Raises
+    EstimationError where there are hardly any."""
     t, R = stream.seconds, stream.rotation
-    a = np.arange(len(t))
-    b = np.searchsorted(t, t + WINDOW_S - 1e-9)
-    a, b = a[b < len(t)], b[b < len(t)]
     longest = longest_step(stream.name, t, "poses")
-    near = t[b] - t[a] <= longest
-    a, b = a[near], b[near]
+    a, b, rate = window_rates(t, R, rate_window(t, R, WINDOW_S, longest), longest)
     if len(a) < FEWEST_WINDOWS:
         raise EstimationError(
             f"{stream.name}: hardly any of its {len(t)} poses are closer than {longest:.3g} s to the next, "
             f"{len(a)}, and {FEWEST_WINDOWS} are needed; record for longer."
         )
-    turn = so3.log_many(np.ascontiguousarray(R[a].transpose(0, 2, 1) @ R[b]))
-    if not np.linalg.norm(turn, axis=1).max() > 0.0:
+    if not np.linalg.norm(rate, axis=1).max() > 0.0:
         raise EstimationError(
             f"{stream.name}: its rotation is the same in all poses, as where only positions are measured; a pose "
             "sensor needs both."
         )
-    return CameraRates(t[a], t[b], turn / (t[b] - t[a])[:, None], LEAST_CORRELATION, longest)
+    return CameraRates(t[a], t[b], rate, LEAST_CORRELATION, longest)
 
 
 def check_rate(stream: PoseStream) -> None:

@@ -7,12 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from icalib.first_guess.rate_windows import rotation_noise
 from icalib.geometry import so3
 from icalib.geometry.small import tmul3
 
 HALF_S = 0.1  # of the window, at least
 HALF_STEPS = 3.2  # and in steps between poses
 FEWEST = 5  # poses under a parabola
+MOST_HALF_S = 0.6  # of the window of very noisy poses
+LEAST_THIRD = 0.3  # rad/s^3, of the motion: what moves less shows little anyway
+SAMPLED = 400  # instants that tell how much it moves
+MEDIAN_CHI2 = 2.366  # of three degrees of freedom
 
 
 @dataclass(frozen=True)
@@ -46,7 +51,7 @@ class BodyPoses:
 
 def smooth_path(t: np.ndarray, R: np.ndarray, p: np.ndarray, at: np.ndarray) -> SmoothPath:
     """Through poses R (n, 3, 3), p (n, 3) at increasing t (n,), n >= FEWEST, looked at at `at` (m,)."""
-    half = max(HALF_S, HALF_STEPS * float(np.median(np.diff(t))))
+    half = _half_window(t, R, p)
     first, last = np.searchsorted(t, at - half), np.searchsorted(t, at + half)
     few = last - first < FEWEST
     middle = np.clip(np.searchsorted(t, at) - FEWEST // 2, 0, len(t) - FEWEST)
@@ -59,6 +64,31 @@ def smooth_path(t: np.ndarray, R: np.ndarray, p: np.ndarray, at: np.ndarray) -> 
     rotation = R[reference] @ so3.exp_many(np.ascontiguousarray(turn))
     acceleration = np.einsum("mji,mj->mi", rotation, fitted[:, 2, 3:])
     return SmoothPath(at, rotation, way, fitted[:, 1, :3], fitted[:, 1, 3:], acceleration, near)
+
+
+def _half_window(t: np.ndarray, R: np.ndarray, p: np.ndarray) -> float:
+    """Half the window [s] at which noise and lost motion together make the least error of the rate, no less than HALF_S
+    and HALF_STEPS. The slope of a parabola over +-h has the variance 1.5 s^2 dt / h^3 by white noise s, and lacks
+    j h^2 / 10 of a third derivative j, which slopes over +-h and +-2 h show: they differ by 0.3 j h^2 and noise."""
+    dt = float(np.median(np.diff(t)))
+    least, h = max(HALF_S, HALF_STEPS * dt), max(2.0 * HALF_S, HALF_STEPS * dt)
+    at = t[(t > t[0] + 2.0 * h) & (t < t[-1] - 2.0 * h)]
+    noise = rotation_noise(R)
+    if len(at) < FEWEST or 112.5 * noise**2 * dt < (least**7) * LEAST_THIRD**2:
+        return least
+    at = at[np.linspace(0, len(at) - 1, min(len(at), SAMPLED)).astype(int)]
+    slopes = []
+    for half in (h, 2.0 * h):
+        first, last = np.searchsorted(t, at - half), np.searchsorted(t, at + half)
+        full = last - first >= FEWEST
+        fitted = np.zeros((len(at), 3, 6))
+        reference = np.clip(np.searchsorted(t, at), 0, len(t) - 1)
+        _parabolas(t, R, p, at, first, np.where(full, last, first + FEWEST), reference, half, fitted)
+        slopes.append(np.where(full[:, None], fitted[:, 1, :3], np.nan))
+    differ = np.nanmedian(((slopes[1] - slopes[0]) ** 2).sum(axis=1)) / MEDIAN_CHI2
+    third = np.sqrt(max(differ - 1.3125 * noise**2 * dt / h**3, 0.0)) / (0.3 * h**2)
+    best = (112.5 * noise**2 * dt / max(third, LEAST_THIRD) ** 2) ** (1.0 / 7.0)
+    return min(max(least, best), max(least, MOST_HALF_S))
 
 
 @njit(cache=True, nogil=True)
