@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -70,6 +70,12 @@ def _slow(imu: ImuData, name: str, rates: CameraRates) -> list[float]:
     found = slow_offsets(imu, rates.start, rates.end, rates.rate)
     alike = [offset for offset, left in found if left < MOST_LEFT]
     if not alike:
+        in_radians = replace(imu, gyro=np.deg2rad(imu.gyro))
+        if any(left < MOST_LEFT for _, left in slow_offsets(in_radians, rates.start, rates.end, rates.rate)):
+            raise EstimationError(
+                f"{imu.name} turns as {name} does where its angular rate is read as deg/s; set gyro_unit: deg/s of "
+                f"{imu.name} in the rig file."
+            )
         left = f"{found[0][1]:.0%} of the angles is left at best" if found else "their clocks do not overlap"
         raise EstimationError(
             f"the turns of {name}, {USUAL_STEPS / rates.longest_step_s:.2g} a second, do not match those of {imu.name} "
