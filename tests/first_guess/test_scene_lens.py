@@ -154,3 +154,13 @@ def test_growth_needs_no_image_that_shows_all(robot):
         near = np.linalg.norm((reference @ true[k])[:3, 3])
         found = scene.values[robot.target.bodies[k], "translation"]
         assert np.linalg.norm(found - (reference @ true[k])[:3, 3]) < 0.05 + 0.05 * near
+
+
+def test_images_that_show_no_body_are_an_error():
+    """Corners are anywhere: that is not said of single tags."""
+    scenario = tag_map(1.5)
+    simulation = simulate(scenario, 0)
+    rng = np.random.default_rng(0)
+    cameras = tuple(replace(c, uv=rng.uniform(0.0, 480.0, c.uv.shape)) for c in simulation.measurements.cameras)
+    with pytest.raises(EstimationError, match=r"of the 12 bodies of the target stand to"):
+        calibrate_measurements(rig_for(scenario), replace(simulation.measurements, cameras=cameras))

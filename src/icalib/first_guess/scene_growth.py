@@ -79,11 +79,16 @@ def place_bodies(
 ) -> Placed:
     """How the bodies stand to each other, as the images of all cameras show it; params (P,) by camera, which are held.
 
-    Raises UntiedBodiesError naming those that no image ties to the others.
+    Raises UntiedBodiesError naming those that no image ties to the others, EstimationError where these are most.
     """
     held = [_held(model, params[s.name]) for s, model in zip(streams, models, strict=True)]
     grown = grow(bodies, streams, held)
     lost = tuple(bodies.target.bodies[k] for k in bodies.used if not grown.placed[k])
+    if 2 * len(lost) > len(bodies.used):
+        raise EstimationError(
+            f"images show how {len(bodies.used) - len(lost)} of the {len(bodies.used)} bodies of the target stand to "
+            "each other, no more; check the resolution and intrinsics of cameras and the sizes of the target."
+        )
     if lost:
         raise UntiedBodiesError(lost)
     values = grown.in_frame_of(bodies.used[0], bodies)
@@ -100,6 +105,8 @@ def grow(bodies: Bodies, streams: Sequence[CornerStream], lenses: Sequence[Lens]
     body by body."""
     streams = [telling_images(s, bodies.target.body) for s in streams]
     growth = _Growth.begin(bodies, streams, lenses)
+    if not growth.placed.any():
+        return Grown(growth.state, growth.placed, np.full(len(growth.posed), np.nan))
     while growth.extend():
         growth.adjust(ROUNDS)
     for _ in range(AGAIN):  # what was placed wrongly while little was known
@@ -132,12 +139,21 @@ class _Growth:
         m, b = int(begins[-1]), len(bodies.target.bodies)
         eye = np.eye(3)
         state = SceneState(np.tile(eye, (m, 1, 1)), np.zeros((m, 3)), np.tile(eye, (b, 1, 1)), np.zeros((b, 3)), ())
-        seed = int(np.argmax(np.bincount(views.image, minlength=m)))
-        posed = np.arange(m) == seed
         found = cls(
-            bodies, streams, views, begins, replace(state, lenses=tuple(lenses)), np.zeros(b, dtype=bool), posed, seed
+            bodies,
+            streams,
+            views,
+            begins,
+            replace(state, lenses=tuple(lenses)),
+            placed=np.zeros(b, dtype=bool),
+            posed=np.zeros(m, dtype=bool),
+            seed=0,
         )
-        found._place_bodies(found._seen_alone())
+        alone = found._seen_alone()
+        good = np.concatenate([q.ok[:, 0] for q in alone])
+        found.seed = int(np.argmax(np.bincount(views.image, good, m)))
+        found.posed[found.seed] = True
+        found._place_bodies(alone)
         return found
 
     def extend(self) -> bool:
