@@ -85,10 +85,14 @@ def lever_arm(
         rhs = rhs - rows[:, :, 0:3] @ given
         rows[:, :, 0:3] = 0.0
     x, covariance = _solve(rows, rhs)
-    arm = x[0:3] if given is None else given
-    off, seen = (np.median(np.linalg.norm(r, axis=1)) for r in (rhs - rows @ x, second(p)))
-    left = float(off / max(seen, 1e-12))
+    arm, left = x[0:3] if given is None else given, _share(rhs - rows @ x, second(p))
     return LeverArm(arm, covariance, x[3:6], x[6:9], *size_of(rows, rhs, second(D_f)), left)
+
+
+def _share(off: np.ndarray, seen: np.ndarray) -> float:
+    """The usual size of vectors (n, 3) over that of others."""
+    size = [float(np.median(np.linalg.norm(x, axis=1))) for x in (off, seen)]
+    return size[0] / max(size[1], 1e-12)
 
 
 def _solve(rows: np.ndarray, rhs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

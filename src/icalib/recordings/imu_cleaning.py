@@ -9,6 +9,7 @@ from icalib.recordings.copies import copies, held
 from icalib.recordings.even_stamps import EvenStamps, even_stamps
 from icalib.recordings.spikes import impossible, spikes, stuck
 
+_BEYOND = 1e12  # in any unit of any sensor; squares of what is below do not overflow
 _SENSORS = ("gyroscope", "accelerometer")
 
 
@@ -16,8 +17,8 @@ def in_time(imu: ImuStream, what: str) -> tuple[ImuStream, tuple[str, ...]]:
     """Finite readings in order where copies alone were out of it, none there twice under different stamps; at even
     stamps where bursts or jitter hide these."""
     notes = _Notes(what, imu.stamps_ns)
-    finite = np.all(np.isfinite(np.hstack([imu.gyro, imu.accel])), axis=1)
-    notes.left_out(~finite, "are not finite")
+    finite = np.all(np.abs(np.hstack([imu.gyro, imu.accel])) < _BEYOND, axis=1)
+    notes.left_out(~finite, f"are not finite, or beyond {_BEYOND:g},")
     imu = _some(imu, finite)
     if len(imu.stamps_ns) < 2:
         return imu, notes.sentences

@@ -92,10 +92,14 @@ def _joined(halves: ImuHalves, what: str) -> tuple[ImuStream, tuple[str, ...]]:
         ("gyroscope", halves.gyro_ns, halves.gyro),
         ("accelerometer", halves.accel_ns, halves.accel),
     ):
-        if len(stamps_ns) < 2:
+        if np.isfinite(values).all(axis=1).sum() < 2:
             raise RecordingError(
                 f"{what}: the {kind} has only {len(stamps_ns)} readings; record it as long as the rest."
             )
+        finite = np.isfinite(values).all(axis=1)
+        if not finite.all():
+            notes += (f"{what}, {kind}: {int((~finite).sum())} readings are not finite and were left out.",)
+            stamps_ns, values = stamps_ns[finite], values[finite]
         kept, found = kept_readings(stamps_ns, values, f"{what}, {kind}", RATE_HZ, "reading", own)
         notes += found
         streams.append((stamps_ns[kept], values[kept]))
