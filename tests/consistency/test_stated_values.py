@@ -9,6 +9,7 @@ import pytest
 
 from icalib.calibration import Calibration
 from icalib.geometry import so3
+from icalib.geometry.targets import AprilGrid
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter, Rig
 from icalib.simulation import Simulation, handheld, rig_for, simulate
@@ -109,3 +110,9 @@ def test_wheels_that_no_vehicle_has_are_named(driven):
     result = calibrate_measurements(rig_for(driven.scenario), replace(driven.measurements, wheels=fast))
     words = [w for w in result.warnings if "which no vehicle has" in w]
     assert len(words) == 1 and "a radius of 10.6 mm and 420" in words[0] and "rate_unit" in words[0], words
+
+
+def test_a_wrong_size_of_the_target_does_not_blame_true_lever_arms(simulation):
+    rig = rig_for(simulation.scenario, **dict.fromkeys(("rotation", "translation", "time_offset"), "fixed"))
+    result = calibrate_measurements(replace(rig, target=AprilGrid(6, 6, 1.08 * 0.088, 0.3)), simulation.measurements)
+    assert said(result) == [] and "times the size that the rig file says" in result.wrong[0]

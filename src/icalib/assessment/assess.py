@@ -39,7 +39,7 @@ from icalib.calibration import (
 )
 from icalib.estimation.assembly import image_times
 from icalib.estimation.border import restricted_inverse
-from icalib.estimation.contradictions import Contradiction, contradictions
+from icalib.estimation.contradictions import Contradiction, contradictions, worst_off
 from icalib.estimation.determination import Determined
 from icalib.estimation.estimate import Estimate
 from icalib.estimation.evidence import Fit, fits, raw_rms, split_covariance
@@ -86,12 +86,14 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
     trajectory, poses = _trajectory(inputs, outcome.state, timeline), pose_residuals(inputs, found, timeline)
     # What others complain of may come of a wrong size, or of an accelerometer's scale: then that is the news.
     certain, explained = is_certain(size), bool(against)
-    stated, factor = None if certain or explained else relaxed(inputs, found), factors.max(initial=1.0)
-    lenses = other_lens(inputs.rig.cameras, lens_steps(inputs, stated), factor)
+    stated, factor = None if explained else relaxed(inputs, found), factors.max(initial=1.0)
+    lenses = () if certain else other_lens(inputs.rig.cameras, lens_steps(inputs, stated), factor)
     against = against or contradictions(inputs, found, stated, max(factor, _misfit(judged)))
+    if certain:  # a wrong size moves lever arms by some of their length
+        against = tuple(c for c in against if worst_off(c.key[1], c.off) > 1.0)
     beyond = () if wrong_size or explained else far_beyond(inputs.rig, judged)
     contradicted = tuple(stated_warnings(inputs, against, groups))
-    known = contradicted if explained else wrong_size if certain else ()
+    known = (*contradicted, *wrong_size) if certain or explained else ()
     wrong = (*known, *mixed, *lenses, *beyond)
     warnings = (
         *wrong_size,
