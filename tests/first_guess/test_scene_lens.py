@@ -38,7 +38,7 @@ def robot(tags_on_walls):
     base = load_scenario(PAPER / "table2-ramp.yaml")
     return replace(
         base,
-        duration_s=8.0,
+        duration_s=10.0,
         features=None,
         lidars=(),
         cameras=tuple(replace(base.cameras[k], corner_noise_px=0.2, rate_hz=10.0) for k in (0, 2)),

@@ -112,7 +112,8 @@ def is_possible(model: CameraModel, params: np.ndarray, resolution: tuple[int, i
 
 
 def _starts(target: Target, camera: Camera, stream: CornerStream) -> Iterator[Lens]:
-    """What each body by itself says, if that can be; then each kind of lens of the model at several focal lengths."""
+    """What each body by itself says, with what the rig gives, if that can be; then each kind of lens of the model at
+    several focal lengths, whatever the guess."""
     model, width = camera_model(camera.model), camera.resolution[0]
     middle = 0.5 * (np.array(camera.resolution) - 1.0)
     given = [camera.intrinsics, camera.distortion]
@@ -133,9 +134,9 @@ def _starts(target: Target, camera: Camera, stream: CornerStream) -> Iterator[Le
     for distortion in model.start_distortions:
         params = np.array([1.0, 1.0, *middle, *distortion])
         _, _, j_point, _ = model.project_with_jacobians(params, np.array([[0.0, 0.0, 1.0]]))
-        for widths in TRIAL_WIDTHS if camera.intrinsics.value is None else TRIAL_WIDTHS[:1]:
+        for widths in TRIAL_WIDTHS if free[0] else TRIAL_WIDTHS[:1]:
             start = np.array([*np.full(2, widths * width / j_point[0, 0, 0]), *middle, *distortion])
             for part, parameter in zip((slice(0, 4), slice(4, None)), given, strict=True):
-                if parameter.value is not None:
+                if parameter.value is not None and parameter.mode != "free":
                     start[part] = parameter.value
             yield lens(start)
