@@ -143,6 +143,16 @@ def test_pose_sensors_are_read(tmp_path):
     assert "m.position_axes: must name the columns" in complaint(tmp_path, turned.replace("-z", "x"))
 
 
+def test_frames_of_a_pose_sensor(tmp_path):
+    lines = "sensors:\n  imu0: {type: imu}\n  arm: {type: pose, topic: /tf, frames: [base, /tool0]}\n"
+    rig = load(tmp_path, lines)
+    assert (rig.poses[0].topic, rig.poses[0].frames) == ("/tf", ("base", "/tool0"))
+    assert load(tmp_path, yaml.safe_dump(rig_to_dict(rig))).poses == rig.poses
+    for wrong in ("[base]", "[base, /base]", "[a, b, c]"):
+        said = complaint(tmp_path, lines.replace("[base, /tool0]", wrong))
+        assert "arm.frames: must name two frames, the parent and the child" in said
+
+
 def test_an_imu_and_a_pose_sensor_are_enough(tmp_path):
     rig = load(tmp_path, "sensors:\n  imu0: {type: imu}\n  mocap0: {type: pose}\n")
     assert (rig.cameras, rig.lidars, [p.name for p in rig.poses]) == ((), (), ["mocap0"])

@@ -272,6 +272,7 @@ class PoseSensor:
     topic: str | None = None  # of its poses; None: the one with the sensor's name, or the only one
     layout: TableLayout = PLAIN_TABLE
     inverted: bool = False  # what is recorded is T_sensor_frame
+    frames: tuple[str, str] | None = None  # parent and child in a topic of transforms; None: it is not one
 
 
 Scheme = Literal["inertial", "pose", "kinematic"]

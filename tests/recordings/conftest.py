@@ -15,7 +15,7 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 ORIGIN = 1_404_733_405_732_800_001
 IMAGE_STEP, IMU_STEP, DELAY = 50_000_000, 5_000_000, 7_000_000  # DELAY: from the stamp to when it is received
@@ -34,6 +34,9 @@ class Maker:
 
     def __post_init__(self) -> None:
         store = get_typestore(Stores.ROS1_NOETIC if self.kind == "ros1" else Stores.ROS2_HUMBLE)
+        if self.kind == "ros1":  # of which rosbags has none
+            for name in ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"):
+                store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms\n", name))
         object.__setattr__(self, "store", store)
 
     def make(self, type_name: str, *values: Any) -> Any:

@@ -28,6 +28,8 @@ def print_inspection(found: Inspection, console: Console | None = None) -> None:
     out.print(streams_table(found))
     if found.imus:
         out.print(imu_table(found))
+    if found.frames:
+        out.print(frames_table(found))
     if found.views:
         out.print(target_table(found))
         for name, view in found.views.items():
@@ -77,6 +79,21 @@ def imu_table(found: Inspection) -> Table:
                 saturated or "no",
             )
             table.add_row(*map(Text, cells), end_section=k == 2)
+    return table
+
+
+def frames_table(found: Inspection) -> Table:
+    """One row for each transform between two frames."""
+    table = _table(
+        "Frames",
+        ("topic", "parent -> child", "count", "rate [Hz]", "moves"),
+        right=2,
+        caption="`frames: [parent, child]` of a pose sensor are any two that these connect.",
+    )
+    for f in found.frames:
+        rate = "" if f.rate_hz is None else f"{f.rate_hz:.1f}"
+        cells = (f.topic, f"{f.parent} -> {f.child}", str(f.count), rate, "yes" if f.moves else "no")
+        table.add_row(*map(Text, cells))
     return table
 
 

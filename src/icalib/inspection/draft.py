@@ -15,6 +15,7 @@ from icalib.geometry.cameras import CAMERA_MODELS
 from icalib.geometry.targets import Scene
 from icalib.imu_classes import DEFAULT_CLASS, IMU_CLASSES
 from icalib.inspection.facts import CameraSource, Inspection
+from icalib.inspection.frames import frame_lines
 from icalib.inspection.inspect import resolution_of
 from icalib.inspection.kalibr import KalibrImu
 from icalib.inspection.lens import LensStart, lens_start
@@ -158,6 +159,7 @@ def _robot(found: Inspection, shown: bool) -> Iterable[str]:
         kind = _kind(topic) if found.sources.imus else "absolute"
         for line in (f"{name}:", "  type: pose", _place(topic.name, topic.type, "")[2:], f"  kind: {kind}"):
             yield f"  {mark}{line}"
+    yield from frame_lines(found.frames)
 
 
 def _kind(topic: TopicInfo) -> str:

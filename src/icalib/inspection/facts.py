@@ -160,6 +160,19 @@ class LidarFacts:
 
 
 @dataclass(frozen=True)
+class FramePair:
+    """A transform between two frames of `topic`: how often it was sent, at what rate (None: once, or a static one), and
+    whether it changes."""
+
+    topic: str
+    parent: str
+    child: str
+    count: int
+    rate_hz: float | None
+    moves: bool
+
+
+@dataclass(frozen=True)
 class GivenTarget:
     """A target and the file that it is from; resolutions: of cameras by name, where the file is a rig file."""
 
@@ -186,6 +199,7 @@ class Inspection:
     notes: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
     lidars: Mapping[str, LidarFacts] = field(default_factory=dict)
+    frames: tuple[FramePair, ...] = ()
 
     @property
     def verdict(self) -> Literal["yes", "yes, but", "no"]:

@@ -25,6 +25,7 @@ def figures(found: Inspection) -> dict[str, Any]:
         "imus": {n: {"topic": t.name} | _plain(found.imus.get(n)) for n, t in found.sources.imus.items()},
         "imu": found.imu,
         "lidars": {n: {"topic": t.name} | _plain(found.lidars.get(n)) for n, t in found.sources.lidars.items()},
+        "frames": [dataclasses.asdict(f) for f in found.frames],
         "left_out": dict(found.sources.left_out),
         "target": _target(found),
         "notes": list(found.notes),

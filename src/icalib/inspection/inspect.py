@@ -22,6 +22,7 @@ from icalib.inspection.facts import (
     TargetView,
 )
 from icalib.inspection.findings import findings
+from icalib.inspection.frames import frame_pairs
 from icalib.inspection.imu import imu_facts, read_imu
 from icalib.inspection.kalibr import KalibrFiles, find_kalibr_files
 from icalib.inspection.lidar import lidar_facts
@@ -31,6 +32,7 @@ from icalib.inspection.views import target_view
 from icalib.recordings import BagRecording, DamagedImageError, Payload, Recording, TopicInfo, decode, open_recording
 from icalib.recordings.imu_halves import pair_of
 from icalib.recordings.streams import CameraInfo, read_camera_info
+from icalib.recordings.transforms import TRANSFORMS
 from icalib.rig import TwoSources
 
 SAMPLE = 16  # images that are decoded, spread over the recording
@@ -66,8 +68,10 @@ def inspect_recording(
     infos, imu = _infos(recording, sources), _choose(imus, sources, kalibr)
     found = Inspection(str(path), sources, streams, images, infos, imus, imu, target, kalibr)
     found = dataclasses.replace(found, lidars=lidar_facts(recording, sources.lidars))
+    frames, unread = frame_pairs(recording)
     views = _views(recording, found, lambda what, done: progress(what, share + (1.0 - share) * done))
-    found = dataclasses.replace(found, views=views, notes=recording.notes() + kalibr.notes)
+    notes = tuple(dict.fromkeys(recording.notes() + unread)) + kalibr.notes
+    found = dataclasses.replace(found, views=views, frames=frames, notes=notes)
     return dataclasses.replace(found, findings=findings(found))
 
 
@@ -178,8 +182,8 @@ def _read_imu(
 
 
 def _read_stamps(recording: Recording, topic: TopicInfo, left_out: bool) -> StreamFacts:
-    """Of messages that icalib does not read, of CameraInfo and of images left out, only what the index says."""
-    if left_out or not topic.count or topic.kind in ("", "camera info"):
+    """Of what icalib does not read, of CameraInfo, transforms and images left out, only what the index says."""
+    if left_out or not topic.count or topic.kind in ("", "camera info", TRANSFORMS):
         return StreamFacts(topic, None)
     try:
         return StreamFacts(topic, timing_of(recording.stamps(topic.name)))

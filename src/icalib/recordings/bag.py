@@ -33,6 +33,14 @@ from icalib.recordings.streams import (
 )
 from icalib.recordings.topics import KINDS, TopicInfo, choose_topic, find_topic
 from icalib.recordings.tracks import read_tracks
+from icalib.recordings.transforms import (
+    DEFAULT_TOPIC,
+    MESSAGE,
+    MESSAGE_TYPE,
+    TRANSFORMS,
+    read_transform_poses,
+    refuse_without_frames,
+)
 from icalib.recordings.wheels import WheelReadings, read_wheel_joints, read_wheel_twists
 from icalib.recordings.window import WHOLE, Span, Window, cut
 from icalib.rig import Camera, ImuSensor, Lidar, PoseSensor, TwoSources, Wheels
@@ -149,7 +157,9 @@ class BagRecording:
         return WheelReadings(sensor.name, read.stamps_ns[order], read.value[order])
 
     def poses(self, sensor: PoseSensor) -> PoseReadings:
-        """Of a topic, or a table beside the bag."""
+        """Of a topic, a chain of transforms, or a table beside the bag."""
+        if sensor.frames is not None:
+            return read_transform_poses(self, sensor, self._note)
         if (table := self._pose_table(sensor)) is not None:
             self._tables.append(table)
             found = read_pose_file(sensor.name, table, sensor.layout, self._note)
@@ -165,10 +175,13 @@ class BagRecording:
 
     def _pose_table(self, sensor: PoseSensor) -> Path | None:
         table = self.root.parent / sensor.path
-        return table if sensor.topic is None and table.is_file() else None
+        return table if sensor.topic is None and sensor.frames is None and table.is_file() else None
 
     def _pose_topic(self, sensor: PoseSensor) -> TopicInfo:
         """An odometry's will do, too."""
+        if sensor.frames is not None:
+            return find_topic(str(self.root), self._topics, sensor.topic or DEFAULT_TOPIC)
+        refuse_without_frames(self.root, self._topics, sensor)
         return self._choose(sensor, "pose", "odometry")
 
     def _wheel_topic(self, sensor: Wheels) -> TopicInfo:
@@ -231,6 +244,9 @@ class BagRecording:
                 converted = convert(message)
             except ValueError as error:
                 damaged.append((received_ns, error))
+                continue
+            if topic.kind == TRANSFORMS:  # of which each has a stamp
+                yield received_ns, converted
                 continue
             stamp = message.header.stamp
             stamp_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
@@ -330,6 +346,7 @@ def _stores() -> dict[str, Any]:
     """How the bytes of each encoding become a message. The types that icalib reads have not changed in any release."""
     typesys = load_typesys()
     ros1, ros2 = (typesys.get_typestore(s) for s in (typesys.Stores.ROS1_NOETIC, typesys.Stores.ROS2_HUMBLE))
+    ros1.register(typesys.get_types_from_msg(MESSAGE, MESSAGE_TYPE))  # which rosbags knows of ROS 2 only
     return {"ros1": ros1.deserialize_ros1, "cdr": ros2.deserialize_cdr}
 
 
@@ -340,7 +357,7 @@ def _deserialise(encoding: str, content: bytes, kind: str) -> Any:
     try:
         if kind in livox.TYPES:
             return (livox.parse_ros1 if encoding == "ros1" else livox.parse_cdr)(content)
-        return _stores()[encoding](content, kind)
+        return _stores()[encoding](content, MESSAGE_TYPE if KINDS.get(kind) == TRANSFORMS else kind)
     except (struct.error, IndexError, *_serde_errors()) as error:
         raise ValueError(str(error)) from error
 

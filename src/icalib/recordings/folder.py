@@ -170,6 +170,11 @@ class FolderRecording:
         return self._part(read_wheel_table(sensor, path, self._note), path)
 
     def poses(self, sensor: PoseSensor) -> PoseReadings:
+        if sensor.frames is not None:
+            raise RecordingError(
+                f"{self.root} is a folder, but `frames` of {sensor.name} are those of transforms (/tf) in a bag; give "
+                "the bag, or take `frames` out of the rig file."
+            )
         path = self._locate(sensor.path)
         self._remember(path)
         return self._part(read_pose_file(sensor.name, path, sensor.layout, self._note), path)

@@ -26,6 +26,8 @@ KINDS = {
     "geometry_msgs/msg/PoseStamped": "pose",
     "geometry_msgs/msg/PoseWithCovarianceStamped": "pose",
     "geometry_msgs/msg/TransformStamped": "pose",
+    "tf2_msgs/msg/TFMessage": "transforms",
+    "tf/msg/tfMessage": "transforms",
 }
 
 
@@ -34,9 +36,9 @@ class TopicInfo:
     """One stream of a recording.
 
     name: what `topic` (of a folder's tables: `path`) of a sensor in the rig file may be. type: of its messages, or what
-    it is in a folder. kind: image, camera info, imu, points, joints, odometry, twist, pose, corners, tracks, wheels;
-    empty for what icalib does not read. first_ns, last_ns: when the first and last message were received in a bag, the
-    first and last stamp in a folder; None where there are no messages.
+    it is in a folder. kind: image, camera info, imu, points, joints, odometry, twist, pose, transforms, corners,
+    tracks, wheels; empty for what icalib does not read. first_ns, last_ns: when the first and last message were
+    received in a bag, the first and last stamp in a folder; None where there are no messages.
     """
 
     name: str

@@ -19,7 +19,7 @@ from icalib.rig_file.fields import (
 )
 from icalib.yaml_nodes import YamlValue
 
-_FIELDS = ("path", "topic", "kind", "level", "position_axes", "inverted")
+_FIELDS = ("path", "topic", "kind", "level", "position_axes", "inverted", "frames")
 _NOISE = ("rotation_noise", "position_noise")
 
 
@@ -37,6 +37,7 @@ def pose_sensor(name: str, value: YamlValue) -> PoseSensor:
         position_noise=found["position_noise"].positive() if "position_noise" in found else None,
         inverted="inverted" in found and found["inverted"].boolean(),
         layout=table_layout(found),
+        frames=_frames(found["frames"]) if "frames" in found else None,
         **mounting(found),
     )
 
@@ -46,6 +47,15 @@ def pose_to_plain(sensor: PoseSensor) -> dict[str, Any]:
     plain: dict[str, Any] = {"type": "pose", "path": sensor.path, "kind": sensor.kind, "level": sensor.level}
     plain |= layout_to_plain(sensor.layout)
     given = {name: getattr(sensor, name) for name in (*_NOISE, "topic")}
-    axes = sensor.position_axes
+    axes, frames = sensor.position_axes, sensor.frames
     given |= {"inverted": sensor.inverted or None, "position_axes": None if axes is None else list(axes)}
+    given["frames"] = None if frames is None else list(frames)
     return plain | {name: value for name, value in given.items() if value is not None} | groups_to_plain(sensor)
+
+
+def _frames(value: YamlValue) -> tuple[str, str]:
+    """Parent and child."""
+    names = [entry.text() for entry in value.items()]
+    if len(names) != 2 or names[0].lstrip("/") == names[1].lstrip("/"):
+        value.fail("must name two frames, the parent and the child, as in [base_link, tool0]; correct it.")
+    return names[0], names[1]

@@ -1,0 +1,274 @@
+"""Poses of one frame in another from a bag's transforms (/tf, /tf_static), through the tree of frames."""
+
+from __future__ import annotations
+
+from array import array
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from icalib.errors import RecordingError
+from icalib.geometry import so3
+from icalib.recordings.image_checks import Note
+from icalib.recordings.poses import PoseReadings
+from icalib.recordings.streams import HasMessages, unit_rotations
+from icalib.recordings.topics import TopicInfo, find_topic
+from icalib.rig import PoseSensor
+
+TRANSFORMS = "transforms"  # the kind of such a topic
+DEFAULT_TOPIC = "/tf"
+MESSAGE_TYPE = "tf2_msgs/msg/TFMessage"  # tf/msg/tfMessage is the same by an older name
+MESSAGE = "geometry_msgs/TransformStamped[] transforms\n"
+_STATIC = "_static"  # a topic of such a name sends what never changes
+_MOST_PERIODS = 3.0  # of an edge's own: over a longer gap it is not interpolated
+_SWAPPED_NS = 1_000_000_000  # stamps of one edge that go back farther are those of a clock that was set back
+_UNIT = 1e-2  # of the length of a quaternion
+_MOST_LISTED = 30
+Pair = tuple[str, str]  # parent, child
+
+
+class HasTopics(HasMessages, Protocol):
+    """The part of a bag that is needed here; see `BagRecording`."""
+
+    def topics(self) -> tuple[TopicInfo, ...]: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Edge:
+    """T_parent_child: stamps_ns (N,) int64, strictly increasing; rotation (N, 3, 3); position (N, 3) m. static: from
+    a topic of static transforms, with one row."""
+
+    parent: str
+    child: str
+    stamps_ns: np.ndarray
+    rotation: np.ndarray
+    position: np.ndarray
+    static: bool
+
+    @property
+    def changes(self) -> bool:
+        """Whether it is not the same all the time."""
+        rows = np.hstack([self.position, self.rotation.reshape(-1, 9)])
+        return bool((rows != rows[0]).any())
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Of the median step between stamps; None where there is none."""
+        if self.static or len(self.stamps_ns) < 2:
+            return None
+        return 1e9 / float(np.median(np.diff(self.stamps_ns)))
+
+
+@dataclass(frozen=True)
+class _Step:
+    """An edge of a chain; inverted: it is gone from child to parent."""
+
+    edge: Edge
+    inverted: bool
+
+
+def transform_topics(topics: Sequence[TopicInfo], given: str = DEFAULT_TOPIC) -> list[TopicInfo]:
+    """The topic `given` of transforms and its static one, as far as there are messages."""
+    stem = given.strip("/").removesuffix(_STATIC)
+    found = [t for t in topics if t.kind == TRANSFORMS and t.count]
+    return [t for t in found if t.name.strip("/") in (stem, stem + _STATIC)]
+
+
+def read_transform_poses(bag: HasTopics, sensor: PoseSensor, note: Note) -> PoseReadings:
+    """T_parent_child of both `frames` of the sensor, at the stamps of the fastest edge between them that moves, the
+    last of several; what else moves is interpolated. `note` is told what was left out.
+
+    Raises RecordingError, one sentence: no such topic, no such frame, frames that are not connected, or nothing
+    between them that moves.
+    """
+    assert sensor.frames is not None
+    topics, name = bag.topics(), sensor.topic or DEFAULT_TOPIC
+    used = transform_topics(topics, name)
+    if not used:
+        topic = find_topic(str(bag.root), topics, name)
+        holds = "no messages" if topic.kind == TRANSFORMS else topic.type
+        raise RecordingError(
+            f"{bag.root}: {topic.name} holds {holds}, but `frames` of {sensor.name} are those of transforms, as of "
+            f"{DEFAULT_TOPIC}; leave out `frames`, or correct `topic`."
+        )
+    where = f"{bag.root} {' and '.join(t.name for t in used)}"
+    edges = read_edges(bag, used, note)
+    parent, child = (frame.lstrip("/") for frame in sensor.frames)
+    steps = _chain(edges, parent, child, f"{where} ({sensor.name})")
+    return _along(steps, sensor, where, note)
+
+
+def refuse_without_frames(root: Path, topics: Sequence[TopicInfo], sensor: PoseSensor) -> None:
+    """Raises RecordingError where the sensor's topic holds transforms, or the bag holds no other poses, and `frames`
+    does not say which ones they are."""
+    if sensor.topic is not None:
+        wanted = any(t.name.strip("/") == sensor.topic.strip("/") and t.kind == TRANSFORMS for t in topics)
+    else:
+        poses = any(t.kind in ("pose", "odometry") and t.count for t in topics)
+        wanted = not poses and bool(transform_topics(topics))
+    if wanted:
+        raise RecordingError(
+            f"{root}: {sensor.topic or DEFAULT_TOPIC} holds transforms of many frames; set `frames: [parent, child]` "
+            f"of {sensor.name} in the rig file (`icalib inspect` lists them)."
+        )
+
+
+def read_edges(bag: HasMessages, topics: Sequence[TopicInfo], note: Note) -> dict[Pair, Edge]:
+    """All edges of `topics` by parent and child; transforms that are sent again with the same stamp count once."""
+    found: dict[Pair, Edge] = {}
+    for topic in sorted(topics, key=lambda t: t.name.endswith(_STATIC)):  # what is static goes before what moves
+        static, where = topic.name.endswith(_STATIC), f"{bag.root} {topic.name}"
+        received = _rows(bag, topic.name)
+        if not static and (unstamped := sum(r.unstamped for r in received.values())):
+            note(
+                f"{where}: {unstamped} transforms have no stamp; the times at which they were received stand in, which "
+                "are late and jitter; let what publishes them stamp them."
+            )
+        for pair, r in received.items():
+            rows = np.array(r.values, np.float64).reshape(-1, 7)
+            found[pair] = _edge(pair, np.array(r.stamps_ns, np.int64), rows, static, where, note)
+    return found
+
+
+@dataclass
+class _Rows:
+    """One edge as it was received: stamps [ns], without one when that was; x, y, z, qx, qy, qz, qw of each."""
+
+    stamps_ns: array[int] = field(default_factory=lambda: array("q"))
+    values: array[float] = field(default_factory=lambda: array("d"))
+    unstamped: int = 0
+
+
+def _rows(bag: HasMessages, topic: str) -> dict[Pair, _Rows]:
+    rows: dict[Pair, _Rows] = defaultdict(_Rows)
+    for received_ns, message in bag.messages(topic, TRANSFORMS):
+        for t in message.transforms:
+            row = rows[t.header.frame_id.lstrip("/"), t.child_frame_id.lstrip("/")]
+            p, q, stamp = t.transform.translation, t.transform.rotation, t.header.stamp
+            stamp_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
+            row.unstamped += not stamp_ns
+            row.stamps_ns.append(stamp_ns or received_ns)
+            row.values.extend((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
+    return rows
+
+
+def _edge(pair: Pair, stamps_ns: np.ndarray, rows: np.ndarray, static: bool, where: str, note: Note) -> Edge:
+    """The edge of rows (N, 7), without those that are no poses and those that were sent again."""
+    shown = f"{pair[0]} -> {pair[1]}"
+    with np.errstate(over="ignore", invalid="ignore"):
+        good = np.isfinite(rows).all(axis=1) & (np.abs(np.linalg.norm(rows[:, 3:], axis=1) - 1.0) < _UNIT)
+    if 2 * good.sum() < len(good):
+        raise RecordingError(
+            f"{where}: the transform {shown} at {stamps_ns[np.argmin(good)]} ns is not finite or has no unit "
+            "quaternion, and so are most; correct what publishes it."
+        )
+    if not good.all():
+        note(
+            f"{where}: {int((~good).sum())} of {len(good)} transforms {shown} are not finite or have no unit "
+            f"quaternion and are left out, the first at {stamps_ns[np.argmin(good)]} ns."
+        )
+    stamps_ns, rows = stamps_ns[good], rows[good]
+    if static:  # the last one holds
+        stamps_ns, rows = stamps_ns[-1:], rows[-1:]
+    else:
+        _, first = np.unique(stamps_ns, return_index=True)
+        received = stamps_ns[np.sort(first)]
+        back_ns = int((np.maximum.accumulate(received) - received).max(initial=0))
+        if back_ns > _SWAPPED_NS:
+            raise RecordingError(
+                f"{where}: the stamps of {shown} go back by {back_ns * 1e-9:.1f} s, so the clock was set back; cut the "
+                "recording there with --from and --to."
+            )
+        stamps_ns, rows = stamps_ns[first], rows[first]
+    rotation = unit_rotations(rows[:, 3:], np.ones(len(rows), dtype=bool))
+    return Edge(*pair, stamps_ns, rotation, rows[:, :3].copy(), static)
+
+
+def _chain(edges: dict[Pair, Edge], parent: str, child: str, what: str) -> list[_Step]:
+    """The fewest edges from `parent` to `child`, whichever way each was published."""
+    frames = sorted({frame for pair in edges for frame in pair})
+    for frame in (parent, child):
+        if frame not in frames:
+            more = f" and {len(frames) - _MOST_LISTED} more" if len(frames) > _MOST_LISTED else ""
+            raise RecordingError(
+                f"{what}: there is no frame {frame}; there are {', '.join(frames[:_MOST_LISTED])}{more}; correct "
+                "`frames`."
+            )
+    steps_to: dict[str, list[_Step]] = {parent: []}
+    queue = [parent]
+    for frame in queue:
+        for (a, b), edge in edges.items():
+            for here, there, inverted in ((a, b, False), (b, a, True)):
+                if here == frame and there not in steps_to:
+                    steps_to[there] = [*steps_to[frame], _Step(edge, inverted)]
+                    queue.append(there)
+    if child not in steps_to:
+        raise RecordingError(
+            f"{what}: no transforms connect {parent} and {child}; {parent} is connected with "
+            f"{', '.join(sorted(f for f in steps_to if f != parent)[:_MOST_LISTED])}; correct `frames`, or record "
+            "/tf_static, too."
+        )
+    return steps_to[child]
+
+
+def _along(steps: Sequence[_Step], sensor: PoseSensor, where: str, note: Note) -> PoseReadings:
+    """The product of the transforms of all steps at the stamps of one that moves."""
+    assert sensor.frames is not None
+    what, shown = f"{where} ({sensor.name})", " -> ".join(sensor.frames)
+    sent = [s.edge for s in steps if len(s.edge.stamps_ns) > 1]
+    moving = [e for e in sent if e.changes] or sent
+    if not moving:
+        raise RecordingError(
+            f"{what}: nothing moves between the frames {shown}; choose `frames` with a joint or a vehicle's motion "
+            "between them."
+        )
+    stamps_ns = _common_stamps(moving, what, shown, note)
+    R, p = np.tile(np.eye(3), (len(stamps_ns), 1, 1)), np.zeros((len(stamps_ns), 3))
+    for step in steps:
+        edge = step.edge
+        own_R, own_p = _at(edge, stamps_ns) if edge in moving else (edge.rotation[:1], edge.position[:1])
+        if step.inverted:
+            own_R = own_R.transpose(0, 2, 1)
+            own_p = -np.einsum("nij,nj->ni", own_R, own_p)
+        R, p = R @ own_R, p + np.einsum("nij,nj->ni", R, np.broadcast_to(own_p, p.shape))
+    return PoseReadings(sensor.name, stamps_ns, np.ascontiguousarray(R), p)
+
+
+def _common_stamps(moving: Sequence[Edge], what: str, shown: str, note: Note) -> np.ndarray:
+    """(N,) stamps of the edge that was sent most often, the last of such, where all others are known, too."""
+    stamps_ns = max(moving[::-1], key=lambda e: len(e.stamps_ns)).stamps_ns
+    known = np.logical_and.reduce([_covered(edge, stamps_ns) for edge in moving])
+    if not known.any():
+        raise RecordingError(
+            f"{what}: the transforms between {shown} have no time in common; check the clocks of what publishes them."
+        )
+    if not known.all():
+        note(
+            f"{what}: {int((~known).sum())} of {len(known)} poses {shown} are left out, the first at "
+            f"{stamps_ns[np.argmin(known)]} ns, because another transform between the two frames is missing there."
+        )
+    return stamps_ns[known]
+
+
+def _covered(edge: Edge, stamps_ns: np.ndarray) -> np.ndarray:
+    """(N,) whether the edge is known at stamps (N,): at its own, and between two that are near each other."""
+    after = np.searchsorted(edge.stamps_ns, stamps_ns)
+    last = len(edge.stamps_ns) - 1
+    own = edge.stamps_ns[np.minimum(after, last)] == stamps_ns
+    gap = edge.stamps_ns[np.minimum(after, last)] - edge.stamps_ns[np.maximum(after - 1, 0)]
+    near = gap <= _MOST_PERIODS * float(np.median(np.diff(edge.stamps_ns)))
+    return own | ((after > 0) & (after <= last) & near)
+
+
+def _at(edge: Edge, stamps_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations (N, 3, 3), along geodesics, and positions (N, 3), along lines, at stamps (N,) that are covered."""
+    i = np.clip(np.searchsorted(edge.stamps_ns, stamps_ns, side="right") - 1, 0, len(edge.stamps_ns) - 2)
+    whole = (edge.stamps_ns[i + 1] - edge.stamps_ns[i]).astype(np.float64)
+    share = ((stamps_ns - edge.stamps_ns[i]) / whole)[:, None]
+    R, p = edge.rotation[i], edge.position[i]
+    turn = so3.log_many(np.ascontiguousarray(R.transpose(0, 2, 1) @ edge.rotation[i + 1]))
+    return R @ so3.exp_many(share * turn), p + share * (edge.position[i + 1] - p)
