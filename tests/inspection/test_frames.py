@@ -40,6 +40,7 @@ def test_frames_are_listed(arm, tmp_path, capsys):
     found = {f"{f.parent} {f.child}": f for f in inspect_recording(arm).frames}
     assert list(found) == ["base upper", "cart base", "flange finger", "flange tool", "upper flange"]
     assert [f.moves for f in found.values()] == [True, False, False, False, True]
+    assert "frames of /arm/tf are placed on the cameras" in inspect_recording(arm).findings[0].sentence
     assert [f.count for f in found.values()] == [50, 1, 50, 1, 50]
     assert (found["base upper"].rate_hz, found["cart base"].rate_hz) == (50.0, None)
     path = tmp_path / "figures.json"
@@ -65,6 +66,18 @@ def test_a_pose_sensor_is_suggested(arm, tmp_path):
     (sensor,) = load_rig(path).poses
     assert (sensor.name, sensor.topic, sensor.frames, sensor.kind) == ("tf0", "/arm/tf", ("base", "flange"), "absolute")
     assert len(open_recording(arm).poses(sensor).stamps_ns) == 50
+
+
+def test_beside_an_imu_frames_are_enough(bags, brief, tmp_path):
+    messages = bags.imu("/imu0", brief)
+    for k in range(100):
+        link = transform(bags, bags.origin_ns + k * STEP, "odom", "base", 0.02 * k)
+        messages.append(("/tf", KIND, bags.origin_ns + k * STEP, bags.make(KIND, [link])))
+    bag, path = bags.write(tmp_path / "run", messages), tmp_path / "rig.yaml"
+    assert not any("only an IMU" in f.sentence for f in inspect_recording(bag).findings)
+    assert main(["inspect", str(bag), "--rig", str(path), "-q"]) == 0
+    (sensor,) = load_rig(path).poses
+    assert (sensor.topic, sensor.frames, sensor.kind) == ("/tf", ("odom", "base"), "relative")
 
 
 def test_transforms_that_cannot_be_read(bags, tmp_path):

@@ -88,7 +88,7 @@ def frames_table(found: Inspection) -> Table:
         "Frames",
         ("topic", "parent -> child", "count", "rate [Hz]", "moves"),
         right=2,
-        caption="`frames: [parent, child]` of a pose sensor are any two that these connect.",
+        caption="frames of a pose sensor: any two that these connect, parent and child.",
     )
     for f in found.frames:
         rate = "" if f.rate_hz is None else f"{f.rate_hz:.1f}"

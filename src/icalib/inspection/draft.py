@@ -49,7 +49,7 @@ def draft_rig(found: Inspection) -> str:
     broken = {c.name: problem for c in found.sources.cameras if (problem := found.stream(c.topic).problem)}
     cameras = [c for c in found.sources.cameras if c.name not in broken]
     sources = found.sources
-    beside_imu = sources.imus and (sources.lidars or sources.poses)
+    beside_imu = sources.imus and (sources.lidars or sources.poses or found.moving_frames)
     beside_poses = sources.poses and len(sources.poses) + len(sources.wheels) > 1
     if not (cameras or beside_imu or beside_poses):
         raise RecordingError(
@@ -159,7 +159,7 @@ def _robot(found: Inspection, shown: bool) -> Iterable[str]:
         kind = _kind(topic) if found.sources.imus else "absolute"
         for line in (f"{name}:", "  type: pose", _place(topic.name, topic.type, "")[2:], f"  kind: {kind}"):
             yield f"  {mark}{line}"
-    yield from frame_lines(found.frames)
+    yield from frame_lines(found.frames, shown and not found.sources.poses)
 
 
 def _kind(topic: TopicInfo) -> str:

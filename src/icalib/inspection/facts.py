@@ -207,5 +207,10 @@ class Inspection:
         found = {f.severity for f in self.findings}
         return "no" if "problem" in found else "yes, but" if "warning" in found else "yes"
 
+    @property
+    def moving_frames(self) -> tuple[str, ...]:
+        """Topics of transforms that change."""
+        return tuple(dict.fromkeys(f.topic for f in self.frames if f.moves))
+
     def stream(self, topic: TopicInfo) -> StreamFacts:
         return next(s for s in self.streams if s.topic == topic)

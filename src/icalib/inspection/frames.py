@@ -29,18 +29,19 @@ def frame_pairs(recording: Recording) -> tuple[tuple[FramePair, ...], tuple[str,
     return tuple(found), tuple(notes)
 
 
-def frame_lines(pairs: Sequence[FramePair]) -> Iterator[str]:
-    """Lines of a rig file, as a comment: a pose sensor of two frames; none where no frame moves."""
+def frame_lines(pairs: Sequence[FramePair], shown: bool) -> Iterator[str]:
+    """Lines of a rig file: a pose sensor of two frames, a comment unless `shown`; none where no frame moves."""
     chain = _most_motion(pairs)
     if not chain:
         return
     topic, frames = chain[0].topic, [chain[0].parent, chain[-1].child]
     kind = "relative" if "odom" in frames[0] else "absolute"
-    yield "  # Poses through the tree of frames, as of a robot arm? Then take the # away; frames are any two of"
-    yield "  # those listed, the one that stands still (base) and the one that moves (docs/rig-file.md#pose-sensor)."
-    for line in ("tf0:", "  type: pose", f"  topic: {json.dumps(topic)}", f"  frames: {json.dumps(frames)}"):
-        yield f"  # {line}"
-    yield f"  #   kind: {kind}"
+    if not shown:
+        yield "  # Poses through the tree of frames, as of a robot arm? Then take the # away. Frames are any two that"
+        yield "  # are listed, the one that stands still (base) and the one that moves (docs/rig-file.md#pose-sensor)."
+    place = (f"  topic: {json.dumps(topic)}", f"  frames: {json.dumps(frames)}")
+    for line in ("tf0:", "  type: pose", *place, f"  kind: {kind}"):
+        yield f"  {'' if shown else '# '}{line}"
 
 
 def _most_motion(pairs: Sequence[FramePair]) -> list[FramePair]:

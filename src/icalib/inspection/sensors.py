@@ -32,7 +32,7 @@ _WANTED = "record the images of a camera, or an IMU with a LiDAR, poses or odome
 
 def _beside_an_imu(found: Inspection, held: str) -> Iterator[Finding]:
     sources = found.sources
-    if sources.cameras or sources.lidars or sources.poses:
+    if sources.cameras or sources.lidars or sources.poses or found.moving_frames:
         return
     if sources.wheels:
         yield Finding(
@@ -48,7 +48,8 @@ def _beside_an_imu(found: Inspection, held: str) -> Iterator[Finding]:
 
 
 def _cameras_without_imu(found: Inspection, held: str) -> Finding:
-    others = [*found.sources.poses, *found.sources.wheels]
+    frames = [f"frames of {topic}" for topic in found.moving_frames]
+    others = [*found.sources.poses, *found.sources.wheels, *frames]
     if others:
         return Finding(
             "hint", f"There is no IMU: smooth motion is assumed, and {' and '.join(others)} are placed on the cameras."
