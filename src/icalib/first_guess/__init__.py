@@ -11,7 +11,7 @@ from icalib.errors import EstimationError
 from icalib.estimation.bodies import choose_bodies, restrict
 from icalib.estimation.imu_data import ImuData, imu_data
 from icalib.estimation.state import Key
-from icalib.first_guess.align_camera import align_camera, trusted
+from icalib.first_guess.align_camera import align_camera, chosen_offset, trusted
 from icalib.first_guess.clocks import Alignment, camera_rates
 from icalib.first_guess.contradicted import chosen, chosen_along
 from icalib.first_guess.guess import CameraGuess, Guess, relative_offset
@@ -23,7 +23,7 @@ from icalib.first_guess.scene_lens import find_scene, lens_of
 from icalib.first_guess.target_poses import TargetPoses
 from icalib.first_guess.without_imu import guess_without_imu, trajectory_without_imu
 from icalib.geometry.cameras import camera_model
-from icalib.measurements import CornerStream, Measurements
+from icalib.measurements import Measurements
 from icalib.rig import Camera, Rig
 
 __all__ = ["CameraGuess", "Guess", "initial_guess", "initial_trajectory"]
@@ -72,7 +72,7 @@ class _Seen:
 
     def guess(self, imu: ImuData) -> tuple[Guess, bool]:
         """By the IMU's readings; and whether the accelerometer felt another motion than a camera saw."""
-        m, best = self.measurements, self._best
+        best = self._best
         aligned = [self._aligned(imu, k) for k in range(len(self.poses))]
         gyro = GyroRotation.integrate(imu, aligned[best].gyro_bias)
         arms = [self._arm(imu, k, a, gyro) for k, a in enumerate(aligned)]
@@ -80,10 +80,8 @@ class _Seen:
         for c, arm, a in zip(self.rig.cameras, arms, aligned, strict=True):
             check_size(arm, c.name, a.given)
         cameras = {
-            c.name: _camera_guess(c, s, p, a, arm, q, m)
-            for c, s, p, a, arm, q in zip(
-                self.rig.cameras, m.cameras, self.params, aligned, arms, self.poses, strict=True
-            )
+            c.name: _camera_guess(c, self._offset(imu, k, a), self.params[k], a, arm, self.poses[k])
+            for k, (c, a, arm) in enumerate(zip(self.rig.cameras, aligned, arms, strict=True))
         }
         guess = Guess(cameras, aligned[best].gyro_bias, _mean_bias(arms), _level(arms[best].gravity), self.scene)
         return guess, arms[best].unlike
@@ -104,6 +102,12 @@ class _Seen:
         stream = self.measurements.cameras[k]
         return align_camera(self.rig.cameras[k], stream, camera_rates(stream, self.poses[k]), imu, self.measurements)
 
+    def _offset(self, imu: ImuData, k: int, found: Alignment) -> float:
+        camera, stream = self.rig.cameras[k], self.measurements.cameras[k]
+        raw = camera.time_offset.value
+        given = None if raw is None else relative_offset(raw, stream, self.measurements)
+        return chosen_offset(camera, camera_rates(stream, self.poses[k]), imu, given, found)
+
     def _arm(self, imu: ImuData, k: int, aligned: Alignment, gyro: GyroRotation) -> LeverArm:
         t, known = self.measurements.cameras[k].seconds + aligned.offset, trusted(self.rig.cameras[k].translation)
         return lever_arm(imu, t, self.poses[k], aligned.rotation, gyro, known)
@@ -113,22 +117,15 @@ class _Seen:
 
 
 def _camera_guess(
-    camera: Camera,
-    stream: CornerStream,
-    params: np.ndarray,
-    aligned: Alignment,
-    arm: LeverArm,
-    poses: TargetPoses,
-    measurements: Measurements,
+    camera: Camera, offset: float, params: np.ndarray, aligned: Alignment, arm: LeverArm, poses: TargetPoses
 ) -> CameraGuess:
     """What was found, and in its place what the rig gives, but guesses that it contradicts."""
-    raw, p = camera.time_offset.value, camera.translation.value
-    offset = None if raw is None else np.array([relative_offset(raw, stream, measurements)])
+    p = camera.translation.value
     if p is not None and camera.translation.mode == "free":
         p = chosen_along(p, arm.position, arm.covariance)
     return CameraGuess(
         params,
-        float(chosen("time_offset", camera.time_offset, offset, np.array([aligned.offset]))[0]),
+        offset,
         chosen("rotation", camera.rotation, camera.rotation.value, aligned.rotation),
         arm.position if p is None else p,
         poses,

@@ -12,12 +12,13 @@ from icalib.first_guess.clocks import (
     align,
     as_given,
     better_given,
+    better_of,
     check_axes,
     contradicts,
     main_axis,
     turns_about_two_axes,
 )
-from icalib.first_guess.contradicted import nearest_about
+from icalib.first_guess.contradicted import is_contradicted, nearest_about
 from icalib.first_guess.guess import relative_offset
 from icalib.measurements import CornerStream, Measurements
 from icalib.rig import Camera, Parameter
@@ -26,6 +27,21 @@ from icalib.rig import Camera, Parameter
 def trusted(parameter: Parameter) -> np.ndarray | None:
     """A value that what else is guessed may rest on; one that is only a place to start from may be far off."""
     return None if parameter.mode == "free" else parameter.value
+
+
+def chosen_offset(camera: Camera, rates: CameraRates, imu: ImuData, given: float | None, found: Alignment) -> float:
+    """What was found, or the guess of the rig file, as an offset between first stamps: a mere guess that is far from
+    what was found goes only where the two do not turn alike at it, for slow motion hardly shows an offset."""
+    if given is None:
+        return found.offset
+    far = is_contradicted("time_offset", np.array([given]), np.array([found.offset]))
+    if trusted(camera.time_offset) is not None or not far:
+        return given
+    try:
+        there = as_given(imu, camera.name, rates, given, found.rotation)
+    except EstimationError:  # the clocks do not overlap
+        return found.offset
+    return found.offset if contradicts(imu, rates, there) else given
 
 
 def align_camera(
@@ -58,4 +74,4 @@ def align_camera(
         return own
     # The motion shows all of the rotation but the turn about one axis, and for that alone the guess is needed.
     nearest = nearest_about(main_axis(rates.rate), rotation, found.rotation)
-    return as_given(imu, camera.name, rates, found.offset, nearest)
+    return better_of(imu, rates, own, as_given(imu, camera.name, rates, found.offset, nearest))

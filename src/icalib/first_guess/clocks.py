@@ -20,6 +20,7 @@ from icalib.first_guess.clock_shifts import (
     means,
 )
 from icalib.first_guess.clock_steps import refuse_steps
+from icalib.first_guess.mean_rates import MeanRates
 from icalib.first_guess.slow_rates import ChainedRates
 from icalib.first_guess.target_poses import TargetPoses
 from icalib.geometry import so3
@@ -237,34 +238,9 @@ def _rough(offset: float, gyro: np.ndarray, seen: np.ndarray) -> Alignment:
     return Alignment(offset, *_kabsch(gyro, seen, np.ones(len(gyro))))
 
 
-@dataclass(frozen=True)
-class _MeanRates:
-    """Mean rates of the gyroscope over intervals, start to end (n,) on its clock [s]; angle (N, 3) rad: the integral of
-    its readings from the first to each."""
-
-    imu: ImuData
-    angle: np.ndarray
-
-    @classmethod
-    def of(cls, imu: ImuData) -> _MeanRates:
-        angle = np.zeros((len(imu.seconds), 3))
-        angle[1:] = np.cumsum(0.5 * (imu.gyro[1:] + imu.gyro[:-1]) * np.diff(imu.seconds)[:, None], axis=0)
-        return cls(imu, angle)
-
-    def over(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """(n, 3) rad/s."""
-        t = self.imu.seconds
-        return (at(t, self.angle, end) - at(t, self.angle, start)) / (end - start)[:, None]
-
-    def slope(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """(n, 3) rad/s^2: how they change where both ends are later."""
-        t, gyro = self.imu.seconds, self.imu.gyro
-        return (at(t, gyro, end) - at(t, gyro, start)) / (end - start)[:, None]
-
-
-def _interval_rates(imu: ImuData, rates: CameraRates) -> _MeanRates | ChainedRates:
+def _interval_rates(imu: ImuData, rates: CameraRates) -> MeanRates | ChainedRates:
     """What compares with rates over such intervals."""
-    return ChainedRates.of(imu) if rates.are_slow else _MeanRates.of(imu)
+    return ChainedRates.of(imu) if rates.are_slow else MeanRates.of(imu)
 
 
 def _refine(imu: ImuData, rates: CameraRates, rough: Alignment, keep_offset: bool) -> Alignment:
@@ -336,7 +312,11 @@ def better_given(imu: ImuData, name: str, rates: CameraRates, found: Alignment, 
     axis fit the other way round, too."""
     if not _covered(imu, rates, offset).any():
         return found
-    other = as_given(imu, name, rates, offset, found.rotation)
+    return better_of(imu, rates, found, as_given(imu, name, rates, offset, found.rotation))
+
+
+def better_of(imu: ImuData, rates: CameraRates, found: Alignment, other: Alignment) -> Alignment:
+    """`found`, or the other where the two turn far more alike there."""
     return other if _unexplained(imu, rates, other) < CLEARLY_BETTER * _unexplained(imu, rates, found) else found
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation.imu_data import ImuData, imu_data
-from icalib.first_guess.align_camera import align_camera, trusted
+from icalib.first_guess.align_camera import align_camera, chosen_offset, trusted
 from icalib.first_guess.clocks import Alignment
 from icalib.first_guess.contradicted import chosen
 from icalib.first_guess.guess import CameraGuess, Guess, relative_offset
@@ -32,9 +32,13 @@ def guess_from_tracks(rig: Rig, measurements: Measurements) -> Guess:
     imu = imu_data(rig, measurements)
     assert imu is not None  # tracks without an IMU are refused before
     params = [lens_start(c) for c in rig.cameras]
+    rates = [
+        track_rates(t, camera_model(c.model), p)
+        for c, t, p in zip(rig.cameras, measurements.tracks, params, strict=True)
+    ]
     aligned = [
-        align_camera(c, s, track_rates(t, camera_model(c.model), p), imu, measurements)
-        for c, s, t, p in zip(rig.cameras, measurements.cameras, measurements.tracks, params, strict=True)
+        align_camera(c, s, r, imu, measurements)
+        for c, s, r in zip(rig.cameras, measurements.cameras, rates, strict=True)
     ]
     aligned = _aligned_together(rig, measurements, imu, params, aligned)
     gyro = GyroRotation.integrate(imu, aligned[0].gyro_bias)
@@ -45,8 +49,8 @@ def guess_from_tracks(rig: Rig, measurements: Measurements) -> Guess:
     cameras = {}
     for k, (camera, stream, found) in enumerate(zip(rig.cameras, measurements.cameras, aligned, strict=True)):
         raw = camera.time_offset.value
-        given = None if raw is None else np.array([relative_offset(raw, stream, measurements)])
-        offset = float(chosen("time_offset", camera.time_offset, given, np.array([found.offset]))[0])
+        given = None if raw is None else relative_offset(raw, stream, measurements)
+        offset = chosen_offset(camera, rates[k], imu, given, found)
         R = chosen("rotation", camera.rotation, camera.rotation.value, found.rotation)
         p = motion.arms[k] if camera.translation.value is None else camera.translation.value
         cameras[camera.name] = CameraGuess(params[k], offset, R, p, _poses(motion, stream.seconds + offset, R, p))
