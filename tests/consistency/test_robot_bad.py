@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
@@ -14,6 +15,7 @@ from icalib.errors import CalibrationError, EstimationError
 from icalib.first_guess import lidar_rounds
 from icalib.geometry import so3
 from icalib.measurements import LidarStream, Measurements, WheelStream
+from icalib.montecarlo.truth import true_value
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Rig
 from icalib.simulation import Simulation, rig_for, simulate, with_drawn_guess
@@ -77,9 +79,17 @@ def test_wheels_that_cannot_be(drive, damage, words: str):
 
 
 def test_wheels_that_never_turned_while_the_camera_looked(drive):
+    """At a stated offset none of their readings can be used; a guess of it is replaced by what the motion shows."""
     simulation = drive("ramp", 16.0, "cw")
     late = with_wheels(simulation.measurements, lambda w: replace(w, stamps_ns=w.stamps_ns + np.int64(10**12)))
-    assert "no reading of the wheels falls within" in refusal(guessed(simulation), late)
+    rig = guessed(simulation)
+    stated = tuple(replace(w, time_offset=replace(w.time_offset, mode="fixed")) for w in rig.wheels)
+    words = refusal(replace(rig, wheels=stated), late)
+    assert re.search(r"fixed value of time offset of wheel0.*-999999\.9", words), words
+    result = calibrate_measurements(rig, late)
+    offset = true_value(simulation.truth, "wheel0", "time_offset")[0] - 1000.0
+    assert result.group("wheel0", "time_offset").value[0] == pytest.approx(offset, abs=2e-3)
+    assert any("guess of time offset of wheel0" in note for note in result.notes)
 
 
 @pytest.mark.parametrize(

@@ -218,7 +218,7 @@ def test_a_clock_of_scans_that_jumps(tmp_path):
 
 def write_imu(folder: Path):
     (folder / "imu0").mkdir()
-    rows = np.random.default_rng(0).normal(size=(100, 6)) + [0, 0, 0, 0, 0, 9.81]
+    rows = np.random.default_rng(0).normal(size=(300, 6)) + [0, 0, 0, 0, 0, 9.81]
     lines = (f"{10**18 + k * 10**7}," + ",".join(f"{v:.6f}" for v in row) for k, row in enumerate(rows))
     (folder / "imu0" / "data.csv").write_text("\n".join(lines) + "\n")
 
