@@ -13,6 +13,7 @@ from functools import partial
 import numpy as np
 
 from icalib.errors import EstimationError
+from icalib.estimation.arrowhead import NotDefiniteError
 from icalib.estimation.contradictions import Contradiction, contradicted_by
 from icalib.estimation.determination import Determined, determine
 from icalib.estimation.evidence import chi2_by_kind
@@ -82,8 +83,23 @@ def attempt(
         return replace(other, error=failed) if first is None else replace(first, against=other.against)
     if first is None:
         assert failed is not None
-        raise failed
+        raise explained(rig, make, failed)
     return first
+
+
+def explained(rig: Rig, make: Callable[[Rig], Attempt], failed: EstimationError) -> EstimationError:
+    """Why an estimate `failed`: where relative poses alone show the motion and it breaks down, whether it does not with
+    the same poses as absolute ones."""
+    alone = rig.poses and rig.poses[0].kind == "relative" and not (rig.cameras or rig.lidars)
+    if not (alone and isinstance(failed, NotDefiniteError)):
+        return failed
+    first, *others = rig.poses
+    if _converged(replace(rig, poses=(replace(first, kind="absolute"), *others)), make) is None:
+        return failed
+    return EstimationError(
+        f"{first.name}: from pose to pose, as kind: relative takes them, its poses are too noisy to hold the motion "
+        "together; as absolute ones they do: write kind: absolute, if they hardly drift over the recording."
+    )
 
 
 def _made(

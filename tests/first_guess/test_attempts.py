@@ -1,0 +1,43 @@
+"""Why an estimate failed: what is said was tried."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+
+from icalib.errors import EstimationError
+from icalib.estimation.arrowhead import BROKEN_DOWN, NotDefiniteError
+from icalib.first_guess.attempts import explained
+from icalib.rig import Camera, ImuNoise, ImuSensor, PoseSensor, Rig
+
+RELATIVE = Rig(ImuSensor("imu0", "", ImuNoise(1e-4, 1e-5, 1e-3, 1e-4)), (), poses=(PoseSensor("odom", "", "relative"),))
+BROKEN = NotDefiniteError(BROKEN_DOWN)
+
+
+def converging(rig: Rig):
+    assert [p.kind for p in rig.poses] == ["absolute"]
+    return SimpleNamespace(converged=True)
+
+
+def failing(rig: Rig):
+    raise EstimationError("no.")
+
+
+def test_relative_poses_that_would_work_as_absolute_ones_are_named():
+    found = explained(RELATIVE, converging, BROKEN)  # pyright: ignore
+    assert str(found).startswith("odom: ") and "write kind: absolute" in str(found)
+
+
+@pytest.mark.parametrize(
+    ("rig", "make", "failed"),
+    [
+        (RELATIVE, failing, BROKEN),
+        (RELATIVE, converging, EstimationError("the motion does not match.")),
+        (replace(RELATIVE, cameras=(Camera("cam0", "", "pinhole-radtan", (640, 480)),)), converging, BROKEN),
+        (replace(RELATIVE, poses=(PoseSensor("odom", ""),)), converging, BROKEN),
+    ],
+)
+def test_what_was_not_tried_or_did_not_work_is_not_said(rig, make, failed):
+    assert explained(rig, make, failed) is failed
