@@ -30,7 +30,7 @@ from icalib.estimation.sensors import SensorFactor
 from icalib.estimation.state import Key, Layout, State
 from icalib.estimation.surfaces import Surfaces
 from icalib.geometry.cameras import camera_model
-from icalib.rig import Camera, Parameter, Rig, Scheme
+from icalib.rig import Camera, ImuSensor, Parameter, Rig, Scheme
 
 BLOOM_SIGMA_PX = 1.0
 NO_BLOOM = np.zeros((0, 2), dtype=np.float32)  # single precision: directions as such are near enough
@@ -87,8 +87,7 @@ def host_times(inputs: Inputs, values: dict[Key, np.ndarray]) -> list[np.ndarray
         return image_times(inputs, values)
     if inputs.rig.lidars:
         return [instants(x, values) for x in inputs.measurements.lidars]
-    first, imu = inputs.measurements.poses[0], inputs.rig.imu
-    assert imu is not None
+    first, imu = inputs.measurements.poses[0], inputs.rig.imu or ImuSensor  # its default
     return [instants(first, values, thinned(first.seconds, imu.pose_keyframes_s))]
 
 
