@@ -84,8 +84,11 @@ def _start(rig: Rig, recordings: Sequence[Measurements]) -> Start:
             raise EstimationError(
                 f"{where}{rig.body} shows where it is at {len(own.seconds)} instants only; record more."
             )
-    paths = [own.at(np.arange(0.0, own.seconds[-1], STEP_S)) for own in shown]  # from the body's first stamp on
-    body = _with_assumption(rig, recordings, paths)
+    grids = [np.arange(0.0, own.seconds[-1], STEP_S) for own in shown]  # from the body's first stamp on
+    paths = [own.at(grid) for own, grid in zip(shown, grids, strict=True)]
+    # Densities come out too large rather than too small: a wide window would take motion from them.
+    narrow = [own.at(grid, narrow=True) for own, grid in zip(shown, grids, strict=True)]
+    body = _with_assumption(rig, recordings, narrow)
     inputs = replace(inputs_for(body, _readings(recordings, paths, rig.settings.max_gap_s)), asked=rig)
     felt = inputs_for(body, _readings(recordings, paths), inputs)
     assert felt.imu is not None

@@ -43,7 +43,7 @@ def pose_noise(streams: Sequence[PoseStream]) -> tuple[float, float]:
     """Of rotation [rad] and position [m], the noisiest axis: scatter of poses about a smooth path through them."""
     turns, offsets = [], []
     for s in streams:
-        path = smooth_path(s.seconds, s.rotation, s.position, s.seconds)
+        path = smooth_path(s.seconds, s.rotation, s.position, s.seconds, narrow=True)
         turns.append(so3.log_many(np.ascontiguousarray(path.rotation.transpose(0, 2, 1) @ s.rotation)))
         offsets.append(s.position - path.position)
     turn, way = (MAD_SIGMA * np.median(np.abs(np.concatenate(x)), axis=0).max() for x in (turns, offsets))

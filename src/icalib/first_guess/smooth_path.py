@@ -44,14 +44,15 @@ class BodyPoses:
     rotation: np.ndarray
     position: np.ndarray
 
-    def at(self, seconds: np.ndarray) -> SmoothPath:
+    def at(self, seconds: np.ndarray, narrow: bool = False) -> SmoothPath:
         """See `smooth_path`."""
-        return smooth_path(self.seconds, self.rotation, self.position, seconds)
+        return smooth_path(self.seconds, self.rotation, self.position, seconds, narrow)
 
 
-def smooth_path(t: np.ndarray, R: np.ndarray, p: np.ndarray, at: np.ndarray) -> SmoothPath:
-    """Through poses R (n, 3, 3), p (n, 3) at increasing t (n,), n >= FEWEST, looked at at `at` (m,)."""
-    half = _half_window(t, R, p)
+def smooth_path(t: np.ndarray, R: np.ndarray, p: np.ndarray, at: np.ndarray, narrow: bool = False) -> SmoothPath:
+    """Through poses R (n, 3, 3), p (n, 3) at increasing t (n,), n >= FEWEST, looked at at `at` (m,). narrow: in the
+    least window, which keeps all of the motion, and more of the noise."""
+    half = _least_half(t) if narrow else _half_window(t, R, p)
     first, last = np.searchsorted(t, at - half), np.searchsorted(t, at + half)
     few = last - first < FEWEST
     middle = np.clip(np.searchsorted(t, at) - FEWEST // 2, 0, len(t) - FEWEST)
@@ -66,12 +67,16 @@ def smooth_path(t: np.ndarray, R: np.ndarray, p: np.ndarray, at: np.ndarray) -> 
     return SmoothPath(at, rotation, way, fitted[:, 1, :3], fitted[:, 1, 3:], acceleration, near)
 
 
+def _least_half(t: np.ndarray) -> float:
+    return max(HALF_S, HALF_STEPS * float(np.median(np.diff(t))))
+
+
 def _half_window(t: np.ndarray, R: np.ndarray, p: np.ndarray) -> float:
     """Half the window [s] at which noise and lost motion together make the least error of the rate, no less than HALF_S
     and HALF_STEPS. The slope of a parabola over +-h has the variance 1.5 s^2 dt / h^3 by white noise s, and lacks
     j h^2 / 10 of a third derivative j, which slopes over +-h and +-2 h show: they differ by 0.3 j h^2 and noise."""
     dt = float(np.median(np.diff(t)))
-    least, h = max(HALF_S, HALF_STEPS * dt), max(2.0 * HALF_S, HALF_STEPS * dt)
+    least, h = _least_half(t), max(2.0 * HALF_S, HALF_STEPS * dt)
     at = t[(t > t[0] + 2.0 * h) & (t < t[-1] - 2.0 * h)]
     noise = rotation_noise(R)
     if len(at) < FEWEST or 112.5 * noise**2 * dt < (least**7) * LEAST_THIRD**2:
