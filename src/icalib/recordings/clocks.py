@@ -25,6 +25,12 @@ def usual_step(stamps: np.ndarray) -> float:
     return float(np.median(step[step > 0])) if (step > 0).any() else 0.0
 
 
+def is_rate(stamps_ns: np.ndarray, slowest_hz: float, fastest_hz: float) -> bool:
+    """Whether stamps (N,), taken for nanoseconds, have a rate inside the bounds, or show none."""
+    step = usual_step(stamps_ns) if len(stamps_ns) > 1 else 0.0
+    return step == 0.0 or slowest_hz <= 1e9 / step <= fastest_hz
+
+
 def unit_of_stamps(stamps: np.ndarray, slowest_hz: float, fastest_hz: float) -> TimeUnit | None:
     """The unit in which stamps (N,) have a rate inside the bounds; of several the one that gives a date, or the length
     of a usual recording. None where that tells none, or several."""

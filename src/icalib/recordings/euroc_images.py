@@ -11,7 +11,7 @@ import numpy as np
 
 from icalib.errors import RecordingError
 from icalib.file_hashes import hash_of
-from icalib.recordings.clocks import nanoseconds, unit_by_date, unit_of_stamps, usual_step
+from icalib.recordings.clocks import is_rate, nanoseconds, unit_by_date, unit_of_stamps
 from icalib.recordings.image_checks import Note, ignore
 from icalib.recordings.images import Payload, file_payload
 from icalib.recordings.unreadable import HEAD_BYTES, not_data
@@ -112,8 +112,7 @@ def _unit(stamps: Sequence[str]) -> TimeUnit:
     numbers = np.array([float(stamp) for stamp in stamps])
     if dated := unit_by_date(numbers.tolist()):
         return dated
-    step = usual_step(numbers) if len(numbers) > 1 else 0.0
-    if all(stamp.isdecimal() for stamp in stamps) and step and _RATE_HZ[0] <= 1e9 / step <= _RATE_HZ[1]:
+    if all(stamp.isdecimal() for stamp in stamps) and is_rate(numbers, *_RATE_HZ):
         return "ns"
     return (unit_of_stamps(numbers, *_RATE_HZ) if len(numbers) > 1 else None) or "ns"
 

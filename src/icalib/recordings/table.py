@@ -14,7 +14,7 @@ import numpy as np
 
 from icalib.errors import RecordingError
 from icalib.file_hashes import hash_of
-from icalib.recordings.clocks import POWERS_OF_NS, UNIT_WORDS, TimeUnit, unit_of_stamps, usual_step
+from icalib.recordings.clocks import POWERS_OF_NS, UNIT_WORDS, TimeUnit, is_rate, unit_of_stamps
 from icalib.recordings.columns import TableKind, contradicts, places_by_name, places_given
 from icalib.recordings.image_checks import Note, ignore
 from icalib.recordings.table_kernels import LEFT_OUT, POWERS, parse
@@ -76,7 +76,7 @@ def _in_ns(text: _Text, kind: TableKind, place: np.ndarray, given: TimeUnit | No
         return _table(text, kind, place, POWERS_OF_NS[given]), None
     try:
         table = _table(text, kind, place, _WHOLE_NS if kind.unit == "ns" else POWERS_OF_NS[kind.unit])
-        if kind.rate_hz is None or _is_rate(_instants(kind, table.integers[:, 0]), kind.rate_hz):
+        if kind.rate_hz is None or is_rate(_instants(kind, table.integers[:, 0]), *kind.rate_hz):
             return table, None
         unit = _unit(text, kind, place)
         return (table, None) if unit is None else (_table(text, kind, place, POWERS_OF_NS[unit]), unit)
@@ -232,11 +232,6 @@ def _instants(kind: TableKind, stamps: np.ndarray) -> np.ndarray:
     if len(kind.integers) == kind.stamps:
         return stamps
     return stamps[np.concatenate([[True], np.diff(stamps) != 0])]
-
-
-def _is_rate(stamps_ns: np.ndarray, rate_hz: tuple[float, float]) -> bool:
-    step = usual_step(stamps_ns) if len(stamps_ns) > 1 else 0.0
-    return step == 0.0 or rate_hz[0] <= 1e9 / step <= rate_hz[1]
 
 
 def _describe(text: _Text, kind: TableKind, line: int, place: np.ndarray, column: int) -> str:
