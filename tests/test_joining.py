@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from icalib.errors import RecordingError
-from icalib.joining import join
-from icalib.measurements import ImuStream, LidarStream, Measurements, WheelPoses, WheelStream
+from icalib.joining import join, join_corners
+from icalib.measurements import CornerStream, ImuStream, LidarStream, Measurements, WheelPoses, WheelStream
 from icalib.rig import ImuNoise, ImuSensor, Lidar, Rig, Wheels
 
 RIG = Rig(
@@ -64,3 +64,18 @@ def test_relative_poses_cannot_be_joined():
     both = [Measurements(one.imu, (), lidars=one.lidars, wheels=(poses,), name=n) for n in "ab"]
     with pytest.raises(RecordingError, match="w measures relative poses, and there is none from one recording to the"):
         join(RIG, both)
+
+
+def corners(seed: int, stated: bool) -> CornerStream:
+    rng, start = np.random.default_rng(seed), np.array([0, 3, 5])
+    sigma = rng.uniform(0.02, 0.1, 5) if stated else np.zeros(0)
+    return CornerStream("cam0", 10**9 * np.arange(2), start, np.arange(5), rng.normal(size=(5, 2)), sigma=sigma)
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_corners_keep_their_sigma_where_all_recordings_state_it(stated):
+    a, b = corners(1, True), corners(2, stated)
+    joined = join_corners([(a, 0), (b, 20 * 10**9)])
+    assert joined.start.tolist() == [0, 3, 5, 8, 10]
+    np.testing.assert_array_equal(joined.uv, np.concatenate([a.uv, b.uv]))
+    np.testing.assert_array_equal(joined.sigma, np.concatenate([a.sigma, b.sigma]) if stated else [])

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from icalib.errors import RecordingError
-from icalib.measurements import LidarStream, TrackStream, WheelPoses, WheelStream
+from icalib.measurements import CornerStream, LidarStream, TrackStream, WheelPoses, WheelStream
 
 STAMPS = np.array([10, 20, 40], dtype=np.int64)
 START = np.array([0, 2, 2, 5], dtype=np.int64)
 GOOD = {
+    CornerStream: {"start": START, "point": np.arange(5), "uv": np.zeros((5, 2)), "sigma": np.ones(5)},
     TrackStream: {"start": START, "feature": np.arange(5), "uv": np.zeros((5, 2))},
     LidarStream: {
         "start": START,
@@ -22,6 +23,8 @@ GOOD = {
     WheelPoses: {"pose": np.zeros((2, 3)), "covariance": np.zeros((2, 3, 3))},
 }
 BAD = [
+    (CornerStream, "sigma", np.ones(4), "sigma must be positive, one for each of the 5 corners or none"),
+    (CornerStream, "sigma", np.array([1.0, 1.0, 0.0, 1.0, 1.0]), "sigma must be positive"),
     (TrackStream, "start", START[1:], "shape \\(4,\\)"),
     (TrackStream, "start", np.array([0, 2, 1, 5]), "run upwards"),
     (TrackStream, "start", np.array([1, 2, 2, 5]), "from 0"),
@@ -54,3 +57,15 @@ def test_what_does_not_belong_together_is_refused(kind, field, value, words):
         kind("a", STAMPS, **GOOD[kind] | {field: value})
     with pytest.raises(RecordingError, match="int64 nanoseconds"):
         kind("a", STAMPS.astype(float), **GOOD[kind])
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_corners_that_are_chosen_keep_their_sigma(stated):
+    sigma = np.array([0.02, 0.03, 0.06, 0.03, 0.1]) if stated else np.zeros(0)
+    uv = np.arange(10.0).reshape(5, 2)
+    stream = CornerStream("cam0", STAMPS, START, np.arange(5), uv, sigma=sigma)
+    np.testing.assert_allclose(stream.relative_sigma, sigma / 0.03 if stated else np.ones(5))
+    chosen = stream.of_rows(np.array([0, 3, 4]), STAMPS[[0, 2]], np.array([1, 2]))
+    assert chosen.start.tolist() == [0, 1, 3] and chosen.point.tolist() == [0, 3, 4]
+    np.testing.assert_array_equal(chosen.uv, uv[[0, 3, 4]])
+    np.testing.assert_array_equal(chosen.sigma, sigma[[0, 3, 4]] if stated else [])

@@ -54,7 +54,8 @@ class CornerStream:
 
     stamps_ns (M,) int64, one per image, strictly increasing; start (M + 1,) int64, corners of image i are
     start[i]:start[i+1]; point (N,) int64, index into the target's points; uv (N, 2) pixels, (0, 0) is the
-    centre of the top-left pixel.
+    centre of the top-left pixel; sigma (N,) pixels, the detector's standard deviation of each corner per axis up to a
+    factor common to all, (0,) where it states none.
     """
 
     name: str
@@ -62,6 +63,7 @@ class CornerStream:
     start: np.ndarray
     point: np.ndarray
     uv: np.ndarray
+    sigma: np.ndarray = field(default_factory=lambda: np.zeros(0), kw_only=True)
     joins_ns: tuple[int, ...] = field(default=(), kw_only=True)  # the first stamp of each further recording joined
 
     def __post_init__(self) -> None:
@@ -71,6 +73,19 @@ class CornerStream:
         _check(int(self.start[-1]) == n, f"{self.name}: start must end at the number of corners, {n}.")
         _check(self.point.shape == (n,), f"{self.name}: point must have shape ({n},), not {self.point.shape}.")
         _check(self.uv.shape == (n, 2), f"{self.name}: uv must have shape ({n}, 2), not {self.uv.shape}.")
+        stated = self.sigma.shape in ((0,), (n,)) and bool((self.sigma > 0.0).all())
+        _check(stated, f"{self.name}: sigma must be positive, one for each of the {n} corners or none.")
+
+    def of_rows(self, rows: np.ndarray, stamps_ns: np.ndarray, count: np.ndarray) -> CornerStream:
+        """The corners of `rows` (indices or a mask), grouped into images at stamps_ns (M,) with count (M,) each."""
+        start = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
+        sigma = self.sigma[rows] if len(self.sigma) else self.sigma
+        return CornerStream(self.name, stamps_ns, start, self.point[rows], self.uv[rows], sigma=sigma)
+
+    @property
+    def relative_sigma(self) -> np.ndarray:
+        """(N,) each corner's standard deviation over that of the median corner; ones where the detector states none."""
+        return self.sigma / np.median(self.sigma) if len(self.sigma) else np.ones(len(self.uv))
 
     @property
     def origin_ns(self) -> int:

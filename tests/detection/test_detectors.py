@@ -207,6 +207,7 @@ def test_only_kept_corners_enter_a_stream():
     assert stream.start.tolist() == [0, 2, 2, 3]
     assert stream.point.tolist() == [3, 9, 1]
     assert stream.uv.tolist() == [[0.0, 1.0], [4.0, 5.0], [0.0, 1.0]]
+    assert stream.sigma.tolist() == [0.03, 0.03, 0.03]
     with pytest.raises(RecordingError, match="cam0: the image at 9 ns does not come after the one at 9 ns; sort"):
         corner_stream("cam0", np.array([9, 9]), [corners([1]), corners([2])])
     with pytest.raises(RecordingError, match="cam0: 1 images have 2 stamps; give one for each"):

@@ -189,7 +189,7 @@ def make_factor(setup: Setup, camera: int, scheme: str = "inertial", **changes) 
         times=stream.seconds,
         node=node,
         keep=np.ones(n, dtype=bool),
-        noise=CornerNoise(np.full(len(node), 0.2), np.zeros(0), np.zeros((n, 0))),
+        noise=CornerNoise(np.full(n, 0.2), np.zeros(0), np.zeros((n, 0))),
         direction=np.zeros((0, 2)),
         bodies=setup.bodies,
         layout=setup.layout,

@@ -120,9 +120,9 @@ def corner_sample(
     setup = with_two_clocks(setup) if restarts else setup
     rng = np.random.default_rng(1)
     stream = setup.streams[camera]
-    n, m = len(stream.uv), len(stream.stamps_ns)
+    n = len(stream.uv)
     # Few corners of each image, some of them far enough off that robust losses bend.
-    sigma = rng.uniform(0.8, 1.2, m)
+    sigma = rng.uniform(0.8, 1.2, n)
     noise = CornerNoise(
         sigma, np.array([0.8, 0.6, 0.4])[:field], rng.normal(size=(n, 3))[:, :field].copy(), loss, LOSS_SCALE
     )
@@ -149,11 +149,11 @@ def corner_sample(
 
     def weights(at):
         out, used = run(at)
-        root, f, image, r = out.root[used], noise.field[used], stream.image[used], out.residual[used]
+        root, f, r = out.root[used], noise.field[used], out.residual[used]
         view = factor.views.of_corners(0, len(factor.views.image))[used]
         e = r + np.einsum("nk,nak->na", f, out.shared[view])
         size = np.linalg.norm(e, axis=1)
-        bend = np.sqrt(slope_along(loss if curved else "none", size / sigma[image]))
+        bend = np.sqrt(slope_along(loss if curved else "none", size / sigma[used]))
         B = np.eye(2) + (bend - 1.0)[:, None, None] * np.einsum("ni,nj->nij", e, e) / (size**2)[:, None, None]
         B = np.block([[np.diag(root * B[:, i, j]) for j in range(2)] for i in range(2)])
         W = np.eye(2 * len(r))

@@ -18,7 +18,7 @@ def corner_residuals(found: Estimate, timeline: Timeline) -> tuple[CornerResidua
         out.append(
             CornerResiduals(
                 camera.name, _seconds(found, timeline, i), stream.start, stream.point, stream.uv,
-                corners.residual, camera.noise.sigma[stream.image], corners.root == 0.0,
+                corners.residual, camera.noise.sigma, corners.root == 0.0,
             )
         )  # fmt: skip
     return tuple(out)

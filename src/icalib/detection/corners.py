@@ -103,7 +103,8 @@ def corner_stream(name: str, stamps_ns: np.ndarray, images: Sequence[ImageCorner
     start = np.concatenate([[0], np.cumsum([int(image.kept.sum()) for image in images])]).astype(np.int64)
     point = np.concatenate([np.zeros(0, dtype=np.int64)] + [image.point[image.kept] for image in images])
     uv = np.concatenate([np.zeros((0, 2))] + [image.uv[image.kept] for image in images])
-    return CornerStream(name, stamps_ns, start, point, uv)
+    sigma = np.concatenate([np.zeros(0)] + [image.sigma[image.kept] for image in images])
+    return CornerStream(name, stamps_ns, start, point, uv, sigma=sigma)
 
 
 def checked_image(image: np.ndarray) -> np.ndarray:

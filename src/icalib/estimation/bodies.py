@@ -151,8 +151,7 @@ def _restricted(bodies: Bodies, stream: CornerStream) -> CornerStream:
     order = np.lexsort((body, stream.image))
     order = order[np.isin(body[order], bodies.used)]
     count = np.bincount(stream.image[order], minlength=len(stream.stamps_ns))
-    start = np.concatenate([[0], np.cumsum(count[count > 0])])
-    return CornerStream(stream.name, stream.stamps_ns[count > 0], start, stream.point[order], stream.uv[order])
+    return stream.of_rows(order, stream.stamps_ns[count > 0], count[count > 0])
 
 
 def words_on_left_out(bodies: Bodies) -> str:

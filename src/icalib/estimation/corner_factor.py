@@ -50,8 +50,8 @@ LOSSES = {"none": 0, "huber": 1, "cauchy": 2}
 
 @dataclass(frozen=True)
 class CornerNoise:
-    """What is known of corner errors: sigma (M,) px per image; tau (m,) px, sizes of the error an image shares, along
-    the functions `field` (N, m) of the corner; the robust loss and where it starts to bend, in sigma."""
+    """What is known of corner errors: sigma (N,) px per axis of each corner; tau (m,) px, sizes of the error an image
+    shares, along the functions `field` (N, m) of the corner; the robust loss and where it starts to bend, in sigma."""
 
     sigma: np.ndarray
     tau: np.ndarray
@@ -270,7 +270,7 @@ class CornerFactor:
         chained, direct, pars = self._columns(recording, body)
         s, n = self.stream, self.noise
         images = Images(self.views.start[v0 : v1 + 1], s.uv, s.point, self.keep, self.node[image])
-        noise = Noise(n.sigma[image], LOSSES[n.loss], n.loss_scale, curved, n.field, 1.0 / n.tau**2)
+        noise = Noise(n.sigma, LOSSES[n.loss], n.loss_scale, curved, n.field, 1.0 / n.tau**2)
         bloom = float(state.values[self.name, "bloom"][0])
         R_ws, R_sb = _scene(state, recording), self.bodies.poses(state.values)[0]
         basis = np.ascontiguousarray(self.bodies.basis @ (R_ws @ R_sb)[self.bodies.target.body].transpose(0, 2, 1))

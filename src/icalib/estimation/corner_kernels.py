@@ -26,7 +26,7 @@ class Images(NamedTuple):
 
 
 class Noise(NamedTuple):
-    """sigma (n,) px; the robust loss, where it bends, and whether the sums have its true curvature; the functions
+    """sigma (N,) px; the robust loss, where it bends, and whether the sums have its true curvature; the functions
     field (N, m) and precision (m,) of the common error."""
 
     sigma: np.ndarray
@@ -128,7 +128,7 @@ def _predict_image(i, images, noise, direct, predicted, res, root, found):
             if len(direct.direction):
                 res[k, r] += direct.bloom * direct.direction[n, r]
     cost = robust_weights(
-        res, ok, noise.field[n0:n1], noise.precision, noise.sigma[i], noise.loss, noise.scale, root, found.shared[i]
+        res, ok, noise.field[n0:n1], noise.precision, noise.sigma[n0:n1], noise.loss, noise.scale, root, found.shared[i]
     )
     for k in range(n1 - n0):
         found.root[f0 + k] = root[k]
@@ -181,7 +181,8 @@ def _fill_rows(i, images, noise, direct, motion, predicted, roots, error, A):
                 A[d + q, at] = a0 * moved[0, q] + a1 * moved[1, q] + a2 * moved[2, q]
             A[D, at] = root * error[k, r]
         if noise.curved and noise.loss > 0 and root > 0.0:
-            square = (error[k, 0] ** 2 + error[k, 1] ** 2) / (noise.sigma[i] * noise.sigma[i])
+            sigma = noise.sigma[n0 + k]
+            square = (error[k, 0] ** 2 + error[k, 1] ** 2) / (sigma * sigma)
             _, _, curvature = weight(noise.loss, noise.scale, square)
             if curvature < 1.0:
                 bend(A, D, k, n, error[k], np.sqrt(curvature))

@@ -1,10 +1,11 @@
 """How large the errors of corners are, judged from what a pass leaves behind.
 
-    sigma_i^2 = base^2 + (exposure v_i)^2      image i, whose corners move at v_i px/s: blur
-    shared    ~ N(0, tau_k^2), u and v apart   an error that the corners of an image have in common: a shift, a tilt
+    sigma_n^2 = (base s_n)^2 + (exposure v_i)^2   corner n of image i, whose corners move at v_i px/s: blur
+    shared    ~ N(0, tau_k^2), u and v apart      an error that the corners of an image have in common: a shift, a tilt
 
-Sizes of single corners come from medians, so that outliers have no say. Those of the common errors come from their
-chi^2 over post-fit degrees of freedom, pass by pass (Foerstner's variance components): the poses soak most of them up.
+s_n is the detector's standard deviation of the corner over that of the median corner, 1 where it states none. Sizes
+of single corners come from medians, so that outliers have no say. Those of the common errors come from their chi^2 over
+post-fit degrees of freedom, pass by pass (Foerstner's variance components): the poses soak most of them up.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ BINS = 12  # of image speed
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """One camera's corner noise: base [px], exposure [s], tau (m,) [px] (empty: images share no error)."""
+    """One camera's corner noise: base [px] of its median corner, exposure [s], tau (m,) [px] (empty: images share no
+    error)."""
 
     base: float
     exposure: float = 0.0
@@ -41,8 +43,8 @@ class NoiseModel:
         self, stream: CornerStream, camera: Camera, settings: Settings, speed: np.ndarray | None = None
     ) -> CornerNoise:
         """What the corner factor needs; speed (M,) px/s of each image."""
-        blur = 0.0 if speed is None else self.exposure * speed
-        sigma = np.hypot(self.base, np.broadcast_to(blur, stream.stamps_ns.shape))
+        blur = 0.0 if speed is None else self.exposure * speed[stream.image]
+        sigma = np.hypot(self.base * stream.relative_sigma, blur)
         field = np.ones((len(stream.uv), len(self.tau)))
         if len(self.tau) > 1:
             half = 0.5 * np.array(camera.resolution)
@@ -101,17 +103,12 @@ def estimate_noise(
             f"the estimate led away: where it ended {camera.name} sees none of its corners; correct what the rig file "
             "gives of its rotation, translation, time_offset and lens, or leave it out to have it found."
         )
-    square = factor.squared_errors(out)
-    if camera.corner_noise_px is not None:
-        base, exposure = camera.corner_noise_px, 0.0
-        if settings.blur_noise:
-            _, exposure = _fit_blur(square[used], speed[stream.image][used])
-    elif settings.blur_noise:
-        base, exposure = _fit_blur(square[used], speed[stream.image][used])
-    else:
-        base, exposure = np.sqrt(median_variance(square[used])), 0.0
-    if camera.corner_noise_px is None:
-        base = max(base, SMALLEST_BASE_PX)
+    relative = stream.relative_sigma[used]
+    square = factor.squared_errors(out)[used] / relative**2
+    base, exposure = np.sqrt(median_variance(square)), 0.0
+    if settings.blur_noise:
+        base, exposure = _fit_blur(square, speed[stream.image][used] / relative)
+    base = max(base, SMALLEST_BASE_PX) if camera.corner_noise_px is None else camera.corner_noise_px
     return NoiseModel(float(base), float(exposure), tau)
 
 
@@ -127,7 +124,8 @@ def scale_common_errors(tau: tuple[float, ...], fits: list[Fit]) -> tuple[float,
 
 
 def _fit_blur(square: np.ndarray, speed: np.ndarray) -> tuple[float, float]:
-    """base, exposure from squared errors (n,) and image speeds (n,), each bin of speeds with relative weight."""
+    """base, exposure from squared errors (n,) and image speeds (n,), both over the corners' relative standard
+    deviations, each bin of speeds with relative weight."""
     edges = np.quantile(speed, np.linspace(0.0, 1.0, BINS + 1))
     which = np.clip(np.searchsorted(edges, speed, side="right") - 1, 0, BINS - 1)
     bins = [k for k in range(BINS) if (which == k).sum() >= 50]

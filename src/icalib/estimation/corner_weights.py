@@ -55,7 +55,8 @@ def _invert_small(M, out):
 
 @njit(cache=True, nogil=True)
 def robust_weights(res, keep, f, precision, sigma, loss, scale, root, shared):
-    """root (n,): square roots of the weights over sigma; shared (2, m): the image's common error. Returns the cost.
+    """root (n,): square roots of the weights over sigma (n,) px; shared (2, m): the image's common error. Returns the
+    cost.
 
     Weights and common error depend on each other; a few rounds settle them, so that the cost is the least one over it.
     """
@@ -75,8 +76,8 @@ def robust_weights(res, keep, f, precision, sigma, loss, scale, root, shared):
             for k in range(m):
                 u += shared[0, k] * f[i, k]
                 v += shared[1, k] * f[i, k]
-            w, c, _ = weight(loss, scale, (u * u + v * v) / (sigma * sigma))
-            root[i] = np.sqrt(w) / sigma
+            w, c, _ = weight(loss, scale, (u * u + v * v) / (sigma[i] * sigma[i]))
+            root[i] = np.sqrt(w) / sigma[i]
             cost += c
         for k in range(m):
             cost += 0.5 * precision[k] * (shared[0, k] ** 2 + shared[1, k] ** 2)

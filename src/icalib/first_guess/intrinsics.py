@@ -73,8 +73,7 @@ def _one_body_each(stream: CornerStream, target: Target) -> tuple[CornerStream, 
     boards = size[views.body] >= FEWEST_CORNERS
     used = np.flatnonzero(boards if boards.any() else ~boards)
     rows = np.isin(views.of_corners(0, len(views.image)), used)
-    start = np.concatenate([[0], np.cumsum(np.diff(views.start)[used])])
-    alone = CornerStream(stream.name, stream.stamps_ns[views.image[used]], start, stream.point[rows], stream.uv[rows])
+    alone = stream.of_rows(rows, stream.stamps_ns[views.image[used]], np.diff(views.start)[used])
     return alone, Flat(target.points, FEWEST_CORNERS if boards.any() else int(size.min()))
 
 
@@ -211,8 +210,7 @@ def _spread_images(stream: CornerStream, wanted: int) -> CornerStream:
     rich = np.flatnonzero(count >= min(np.median(count), 40))
     chosen = rich[np.unique(np.linspace(0, len(rich) - 1, wanted).astype(int))]
     rows = np.concatenate([np.arange(int(stream.start[i]), int(stream.start[i + 1])) for i in chosen])
-    start = np.concatenate([[0], np.cumsum(count[chosen])])
-    return CornerStream(stream.name, stream.stamps_ns[chosen], start, stream.point[rows], stream.uv[rows])
+    return stream.of_rows(rows, stream.stamps_ns[chosen], count[chosen])
 
 
 def _bundle(

@@ -307,8 +307,7 @@ def telling_images(stream: CornerStream, body: np.ndarray) -> CornerStream:
             rest = both[~chosen[both]]
             chosen[rest[np.argsort(-np.diff(stream.start)[rest], kind="stable")[:lacking]]] = True
     rows = chosen[stream.image]
-    start = np.concatenate([[0], np.cumsum(np.diff(stream.start)[chosen])])
-    return CornerStream(stream.name, stream.stamps_ns[chosen], start, stream.point[rows], stream.uv[rows])
+    return stream.of_rows(rows, stream.stamps_ns[chosen], np.diff(stream.start)[chosen])
 
 
 def _views(bodies: Bodies, streams: Sequence[CornerStream], begins: np.ndarray) -> SceneViews:

@@ -54,9 +54,7 @@ def _without_poor_images(corners: CornerStream, what: str) -> tuple[CornerStream
     if not keep.any():
         raise RecordingError(f"{what}: no image has {_MIN_CORNERS} corners or more; check the detector.")
     rows = keep[corners.image]
-    start = np.concatenate([[0], np.cumsum(count[keep])])
     first = corners.stamps_ns[np.argmin(keep)]
     dropped = f"{int((~keep).sum())} images with fewer than {_MIN_CORNERS} corners were dropped"
     note = f"{what}: {dropped}, the first at {first} ns."
-    kept = CornerStream(corners.name, corners.stamps_ns[keep], start, corners.point[rows], corners.uv[rows])
-    return kept, (note,)
+    return corners.of_rows(rows, corners.stamps_ns[keep], count[keep]), (note,)
