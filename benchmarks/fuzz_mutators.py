@@ -6,6 +6,7 @@ import hashlib
 import io
 import json
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,18 @@ _LAUGHS = b"a: &a [x,x,x,x,x,x,x,x,x]\n" + b"".join(
     b"%c: &%c [*%c,*%c,*%c,*%c,*%c,*%c,*%c,*%c,*%c]\n" % ((98 + i, 98 + i) + (97 + i,) * 9) for i in range(12)
 )
 _WORDS = (0, 1, 0x7F, 0x80, 0xFF, 0x7FFF, 0xFFFF, 2**31 - 1, 2**31, 2**32 - 1, 2**63, 2**64 - 1)
+
+
+@dataclass(frozen=True)
+class Step:
+    """One change of a file: in what form it was taken (bytes, text or arrays), and what was done."""
+
+    form: str
+    how: str
+
+    @property
+    def kind(self) -> str:
+        return f"{self.form} {self.how.split()[0]}"
 
 
 def mutated_bytes(content: bytes, rng: np.random.Generator) -> tuple[str, bytes]:
@@ -125,21 +138,27 @@ def mutated_arrays(content: bytes, rng: np.random.Generator) -> tuple[str, bytes
     return f"{kind} {name}", buffer.getvalue()
 
 
-def mutate(path: Path, rng: np.random.Generator) -> str:
-    """Changes the file, once or a few times, and says how. Arrays of a result keep the hash that is beside them."""
-    content, said = path.read_bytes(), list[str]()
+def mutated(path: Path, rng: np.random.Generator) -> tuple[list[Step], bytes]:
+    """How the content of the file is changed, once or a few times, and the content after it."""
+    content, steps = path.read_bytes(), list[Step]()
     for _ in range(int(rng.choice([1, 1, 1, 2, 3]))):
-        if path.suffix == ".npz" and rng.random() < 0.8 and not said:
-            how, content = mutated_arrays(content, rng)
+        if path.suffix == ".npz" and rng.random() < 0.8 and not steps:
+            form, (how, content) = "arrays", mutated_arrays(content, rng)
         elif path.suffix in (".yaml", ".csv", ".json", ".urdf", ".txt") and rng.random() < 0.85:
-            how, content = mutated_text(content, rng)
+            form, (how, content) = "text", mutated_text(content, rng)
         else:
-            how, content = mutated_bytes(content, rng)
-        said.append(how)
+            form, (how, content) = "bytes", mutated_bytes(content, rng)
+        steps.append(Step(form, how))
+    return steps, content
+
+
+def mutate(path: Path, rng: np.random.Generator) -> str:
+    """Changes the file, and says how. Arrays of a result keep the hash that is beside them."""
+    steps, content = mutated(path, rng)
     path.write_bytes(content)
     if path.name == "result.npz":
         plain = path.with_name("result.json")
         text = plain.read_text(encoding="utf-8")
         old = json.loads(text)["npz_sha256"]
         plain.write_text(text.replace(old, hashlib.sha256(content).hexdigest()), encoding="utf-8")
-    return "; ".join(said)
+    return "; ".join(step.how for step in steps)

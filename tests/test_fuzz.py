@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+import yaml
 
 from icalib import cli
 
@@ -17,20 +19,74 @@ BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
 
 @pytest.fixture
-def mutators() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("fuzz_mutators", BENCHMARKS / "fuzz_mutators.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def mutators(monkeypatch) -> ModuleType:
+    return imported("fuzz_mutators", monkeypatch)
+
+
+def imported(name: str, monkeypatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    return importlib.import_module(name)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="processes are forked")
 def test_some_cases():
-    command = [sys.executable, str(BENCHMARKS / "fuzz.py"), "--count", "60", "--seed", "1", "--minutes", "0.5"]
+    command = [sys.executable, str(BENCHMARKS / "fuzz.py"), "--count", "300", "--seed", "1", "--covering"]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
     assert ended.returncode == 0, ended.stdout[-5000:] + ended.stderr[-2000:]
-    assert ": 0 failed" in ended.stdout
+    assert ": 0 failed" in ended.stdout and "; 0 good inputs refused" in ended.stdout
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="processes are forked")
+@pytest.mark.parametrize(
+    ("said", "content", "fault"),
+    [
+        ("icalib: a.yaml:1: must be a mapping, but is 'nan nan nan ...'.\n", b"nan\nnan\nnan\nnan\n", False),
+        ("icalib: a.csv:3: wx [rad/s] is '-inf', which is not a number.\n", b"1,-inf,3\n", False),
+        ("icalib: cam0's offset is '.nan', imu0's is 1.\n", b"offset: .nan\n", False),
+        ("icalib: cam0 is nan px off.\n", b"offset: nan\n", True),
+        ("icalib: cam0 is 'nan' px off.\n", b"offset: 1\n", True),
+        ("icalib: cam0's shift is 0 to inf, imu0's 1.\n", b"inf", True),
+        ("icalib: inference and nanoseconds are words.\n", b"", False),
+    ],
+)
+def test_numbers_that_are_none_may_only_be_quoted(said: str, content: bytes, fault: bool, monkeypatch):
+    assert imported("fuzz_run", monkeypatch).says_no_number(said, content) == fault
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="processes are forked")
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1.0])
+@pytest.mark.parametrize("suffix", [".json", ".yaml"])
+def test_results_may_quote_nan_but_hold_none(value: float, suffix: str, monkeypatch, tmp_path: Path):
+    path = tmp_path / f"made{suffix}"
+    plain = {"notes": ["a.csv:3: wx is '.nan', which is not a number"], "sensors": {"cam0": {"std": [1.0, value]}}}
+    path.write_text(json.dumps(plain) if suffix == ".json" else yaml.safe_dump(plain))
+    assert imported("fuzz_run", monkeypatch).holds_no_number(path) == (value != 1.0)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="processes are forked")
+def test_good_input_that_is_refused_is_told(monkeypatch, capsys, tmp_path: Path):
+    run, cases = imported("fuzz_run", monkeypatch), imported("fuzz_cases", monkeypatch)
+    (tmp_path / "good").mkdir()
+    (tmp_path / "good" / "rig.yaml").write_text("sensors: {}\n")
+    case = cases.Case(0, -1, "rig", "", ("inspect", "nothing", "-q"))
+    assert run.refused_inputs([case], tmp_path / "good", tmp_path / "cases", 60.0) == [case]
+    assert "good input: rig : icalib inspect nothing" in capsys.readouterr().out
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="processes are forked")
+def test_few_cases_cover_all_kinds(monkeypatch, tmp_path: Path):
+    cases, mutators = imported("fuzz_cases", monkeypatch), imported("fuzz_mutators", monkeypatch)
+    names = {name for kind in cases._KINDS for name in kind.files}
+    for name in names:
+        path = tmp_path / name.replace("*", "a.csv" if "run" not in name else "a")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("a: [1, 2.5]\nb: text\n" * 20)
+    np.savez(tmp_path / "rec" / "lidar0" / "scans.npz", xyz=np.ones((4, 3)), stamps_ns=np.arange(4))
+    chosen = cases.covering(3, 400, tmp_path)
+    kinds = {step.kind for c in chosen for step in mutators.mutated(tmp_path / c.file, c.rng())[0]}
+    assert len(chosen) < 40
+    assert {"bytes flip", "text token", "text laughs", "text whole", "arrays drop", "arrays rows"} <= kinds
+    assert {c.kind for c in chosen} == {kind.name for kind in cases._KINDS} - {"jobs", "study"}
 
 
 def test_a_seed_gives_the_same_case_again(mutators: ModuleType, tmp_path: Path):
