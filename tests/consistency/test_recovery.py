@@ -44,6 +44,7 @@ def test_noiseless_recordings_are_recovered_from_nothing(asynchronous: bool):
         ("eucm", (110.0, 109.0, 371.0, 245.0), (0.6, 1.1), 70.0),  # corners up to 101 degrees off the axis
         ("double-sphere", (150.0, 151.0, 371.0, 245.0), (-0.2, 0.59), 0.0),
         ("double-sphere", (220.0, 221.0, 371.0, 245.0), (0.3, 0.7), 40.0),
+        ("pinhole-rational", (330.0, 331.0, 371.0, 245.0), (3.1, 0.9, 2e-4, 1e-4, 0.02, 3.4, 1.9, 0.15), 0.0),
         ("omni-radtan", (300.0, 298.0, 371.0, 245.0), (1.2, -0.1, 0.03, 3e-4, -2e-4), 40.0),
     ],
 )

@@ -28,6 +28,13 @@ SAMPLES = {
         "folds": [700.0, 690.0, 375.0, 241.0, -0.1, -0.1, 0.003, -0.002, -0.15],
         "pincushion that folds": [600.0, 610.0, 370.0, 240.0, 0.2, 0.05, -0.001, 0.002, -0.06],
     },
+    "pinhole-rational": {
+        "kinect": [605.0, 604.0, 372.0, 238.0, 0.53, -2.55, 4e-4, -2e-4, 1.52, 0.41, -2.37, 1.44],
+        "none": [400.0, 410.0, 380.0, 230.0, *[0.0] * 8],
+        "wide": [330.0, 331.0, 370.0, 240.0, 3.1, 0.9, 2e-4, 1e-4, 0.02, 3.4, 1.9, 0.15],
+        "folds": [700.0, 690.0, 375.0, 241.0, -0.1, -0.1, 0.003, -0.002, 0.0, 0.05, 0.05, 0.0],
+        "pole": [600.0, 610.0, 370.0, 240.0, 0.1, 0.0, -0.001, 0.002, 0.0, -0.2, 0.0, 0.0],
+    },
     "pinhole-equidistant": {
         "tum-vi": [191.0, 190.9, 376.0, 239.0, 0.0034823894, 0.0007150348, -0.0020532361, 0.00020293674],
         "none": [150.0, 151.0, 370.0, 235.0, 0.0, 0.0, 0.0, 0.0],
@@ -74,6 +81,14 @@ def obvious_radtan(params: np.ndarray, point: np.ndarray) -> complex:
     return w * (1 + k1 * s + k2 * s**2 + sum(k3) * s**3) + 2 * s * complex(p2, p1) + w**2 * complex(p2, -p1)
 
 
+def obvious_rational(params: np.ndarray, point: np.ndarray) -> complex:
+    k1, k2, p1, p2, k3, k4, k5, k6 = params[4:]
+    w = complex(point[0], point[1]) / point[2]
+    s = abs(w) ** 2
+    radial = (1 + k1 * s + k2 * s**2 + k3 * s**3) / (1 + k4 * s + k5 * s**2 + k6 * s**3)
+    return w * radial + 2 * s * complex(p2, p1) + w**2 * complex(p2, -p1)
+
+
 def obvious_equidistant(params: np.ndarray, point: np.ndarray) -> complex:
     theta = cmath.phase(complex(point[2], hypot(point[0], point[1])))
     theta_d = theta + sum(k * theta ** (2 * i + 3) for i, k in enumerate(params[4:]))
@@ -103,6 +118,7 @@ def obvious_omni(params: np.ndarray, point: np.ndarray) -> complex:
 OBVIOUS = {
     "pinhole-radtan": obvious_radtan,
     "pinhole-radtan5": obvious_radtan,
+    "pinhole-rational": obvious_rational,
     "pinhole-equidistant": obvious_equidistant,
     "eucm": obvious_eucm,
     "double-sphere": obvious_double_sphere,
@@ -113,6 +129,7 @@ OBVIOUS = {
 def radius_without_tangential_terms(name: str, params: np.ndarray, angles: np.ndarray) -> np.ndarray:
     """Of the image of rays at `angles` from the axis, before fx and fy; NaN where the formula has no positive depth."""
     s, c = np.sin(angles), np.cos(angles)
+    below = np.ones_like(angles)
     if name == "eucm":
         alpha, beta = params[4:]
         depth, coefficients = alpha * np.sqrt(beta * s**2 + c**2) + (1 - alpha) * c, []
@@ -120,6 +137,9 @@ def radius_without_tangential_terms(name: str, params: np.ndarray, angles: np.nd
     elif name == "double-sphere":
         (xi, alpha), coefficients = params[4:], []
         depth = alpha * np.sqrt(s**2 + (c + xi) ** 2) + (1 - alpha) * (c + xi)
+    elif name == "pinhole-rational":
+        depth, coefficients = c, params[[4, 5, 8]]
+        below = 1.0 + sum(k * (s / c) ** (2 * i + 2) for i, k in enumerate(params[9:]))
     elif name == "omni-radtan":
         depth, coefficients = c + params[4], params[5:7]
     else:
@@ -127,7 +147,8 @@ def radius_without_tangential_terms(name: str, params: np.ndarray, angles: np.nd
     radii = s / np.where(depth > 0.0, depth, np.nan)
     if name == "pinhole-equidistant":
         radii, coefficients = angles, params[4:]
-    return radii * (1.0 + sum(k * radii ** (2 * i + 2) for i, k in enumerate(coefficients)))
+    above = radii * (1.0 + sum(k * radii ** (2 * i + 2) for i, k in enumerate(coefficients)))
+    return above / np.where(below > 0.0, below, np.nan)
 
 
 def angle_limit(name: str, params: np.ndarray) -> float:
@@ -172,9 +193,7 @@ def test_every_model_has_samples_and_an_obvious_formula() -> None:
 
 
 def test_unknown_model_lists_what_there_is() -> None:
-    with pytest.raises(
-        CalibrationError, match=r"'pinhole-radtam'.*pinhole-radtan, pinhole-radtan5, pinhole-equidistant, eucm, double"
-    ):
+    with pytest.raises(CalibrationError, match=f"'pinhole-radtam'.*{', '.join(CAMERA_MODELS)}"):
         camera_model("pinhole-radtam")
 
 
@@ -213,7 +232,7 @@ def test_jacobian_of_the_parameters(name: str, label: str) -> None:
     points = points[np.arctan2(np.hypot(points[:, 0], points[:, 1]), points[:, 2]) < 0.9 * angle_limit(name, params)]
     _, _, _, j_params = model.project_with_jacobians(params, points)
     assert j_params.shape == (len(points), 2, len(params))
-    # uv is linear in each, so only rounding matters; small, as k4 moves the limit of the valid range.
+    # Small, as k4 moves the limit of the valid range; uv is linear in most, so that only rounding matters.
     step = np.where(np.arange(len(params)) < 4, 1.0, 1e-7)
     numeric = differences(lambda p: model.project(p, points)[0], params, step)
     rounding = 1e-15 / 1e-7 * (1e3 + np.abs(model.project(params, points)[0]).max(axis=1)[:, None, None])
@@ -315,6 +334,32 @@ def test_a_zero_focal_length_or_nan_parameter_is_invalid_and_no_crash(name: str)
     assert not model.unproject(broken, np.array([[300.0, 200.0]]))[1].any()
     params[0] = 0.0
     assert not model.unproject(params, np.array([[300.0, 200.0]]))[1].any()
+
+
+@pytest.mark.parametrize("label", SAMPLES["pinhole-rational"])
+def test_rational_distortion_is_opencvs(label: str) -> None:
+    cv2 = pytest.importorskip("cv2")
+    model, params = sample("pinhole-rational", label)
+    points = points_in_view("pinhole-rational", params)
+    K = np.array([[params[0], 0.0, params[2]], [0.0, params[1], params[3]], [0.0, 0.0, 1.0]])
+    expected, jacobian = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, params[4:])
+    uv, _, _, j_params = model.project_with_jacobians(params, points)
+    np.testing.assert_allclose(uv, expected[:, 0], rtol=1e-11)
+    # OpenCV's columns: rotation, translation, fx, fy, cx, cy, distortion.
+    by_lens = jacobian.reshape(len(points), 2, -1)[:, :, 6:]
+    np.testing.assert_allclose(j_params, by_lens, rtol=1e-9, atol=1e-9 * np.abs(by_lens).max())
+
+
+def test_rational_distortion_without_a_denominator_is_radtan5() -> None:
+    model, params = sample("pinhole-radtan5", "corners")
+    rational, extended = camera_model("pinhole-rational"), np.append(params, [0.0] * 3)
+    points = points_in_view("pinhole-radtan5", params)
+    for before, after in zip(
+        model.project_with_jacobians(params, points), rational.project_with_jacobians(extended, points), strict=True
+    ):
+        np.testing.assert_allclose(
+            after[..., :9] if after.ndim == 3 and after.shape[-1] > 9 else after, before, rtol=1e-12, atol=1e-9
+        )
 
 
 def test_the_fifth_coefficient_at_zero_changes_nothing() -> None:

@@ -287,6 +287,11 @@ def test_ros2_static_transforms_without_an_imu(calibration: Calibration):
     [
         ("pinhole-radtan", [-0.28, 0.07, 2e-4, 1e-5], ("plumb_bob", [-0.28, 0.07, 2e-4, 1e-5, 0.0])),
         ("pinhole-radtan5", [-0.28, 0.07, 2e-4, 1e-5, 3e-3], ("plumb_bob", [-0.28, 0.07, 2e-4, 1e-5, 3e-3])),
+        (
+            "pinhole-rational",
+            [0.5, -2.5, 4e-4, -2e-4, 1.5, 0.4, -2.4, 1.4],
+            ("rational_polynomial", [0.5, -2.5, 4e-4, -2e-4, 1.5, 0.4, -2.4, 1.4]),
+        ),
         ("pinhole-equidistant", [-0.01, 0.02, -0.01, 1e-3], ("equidistant", [-0.01, 0.02, -0.01, 1e-3])),
     ],
 )

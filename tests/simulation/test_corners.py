@@ -16,6 +16,12 @@ FISHEYE = SimCamera(
 EUCM = replace(FISHEYE, model="eucm", intrinsics=(210.0, 211.0, 375.0, 240.0), distortion=(0.62, 1.1))
 SPHERES = replace(EUCM, model="double-sphere", distortion=(-0.2, 0.59))
 MIRROR = replace(EUCM, model="omni-radtan", distortion=(1.2, -0.1, 0.03, 3e-4, -2e-4))
+RATIONAL = replace(
+    EUCM,
+    model="pinhole-rational",
+    intrinsics=(330.0, 331.0, 375.0, 240.0),
+    distortion=(3.1, 0.9, 2e-4, 1e-4, 0.02, 3.4, 1.9, 0.15),
+)
 WIDE = (FISHEYE, EUCM, SPHERES, MIRROR)
 
 
@@ -41,6 +47,11 @@ def project_one(camera, P):
         xd, yd = P[0] / depth, P[1] / depth
     elif "radtan" in camera.model:
         L = 1.0 + d[0] * r**2 + d[1] * r**4
+        xd = x * L + 2.0 * d[2] * x * y + d[3] * (r * r + 2.0 * x * x)
+        yd = y * L + d[2] * (r * r + 2.0 * y * y) + 2.0 * d[3] * x * y
+    elif camera.model == "pinhole-rational":
+        above = 1.0 + d[0] * r**2 + d[1] * r**4 + d[4] * r**6
+        L = above / (1.0 + d[5] * r**2 + d[6] * r**4 + d[7] * r**6)
         xd = x * L + 2.0 * d[2] * x * y + d[3] * (r * r + 2.0 * x * x)
         yd = y * L + d[2] * (r * r + 2.0 * y * y) + 2.0 * d[3] * x * y
     else:
@@ -80,7 +91,7 @@ def test_corners_are_projections_at_sensor_time_plus_offset(index, exact):
     assert np.abs(measured - wrong_sign).max() > 1.0
 
 
-@pytest.mark.parametrize("lens", WIDE, ids=lambda c: c.model)
+@pytest.mark.parametrize("lens", [*WIDE, RATIONAL], ids=lambda c: c.model)
 def test_recordings_of_wide_lenses_are_exact_too(lens):
     scenario = with_camera(
         handheld(duration_s=1.0, noiseless=True),
@@ -93,7 +104,7 @@ def test_recordings_of_wide_lenses_are_exact_too(lens):
     np.testing.assert_allclose(sim.measurements.cameras[0].uv, expected, atol=1e-9)
 
 
-@pytest.mark.parametrize("camera", [handheld().cameras[0], *WIDE], ids=lambda c: c.model)
+@pytest.mark.parametrize("camera", [handheld().cameras[0], RATIONAL, *WIDE], ids=lambda c: c.model)
 def test_projection_and_its_directional_derivative(camera):
     rng = np.random.default_rng(3)
     points = np.concatenate([rng.uniform(-1.0, 1.0, (50, 2)), rng.uniform(0.4, 2.0, (50, 1))], axis=1)

@@ -33,6 +33,7 @@ LENSES = [
     lens("pinhole-equidistant", 90.0, (0.03, -0.01, 0.004, -0.001)),
     lens("eucm", 110.0, (0.62, 1.1)),
     lens("double-sphere", 70.0, (-0.2, 0.59)),
+    lens("pinhole-rational", 100.0, (0.5, 0.1, 0.002, -0.001, 0.02, 0.8, 0.1, 0.01)),
     lens("omni-radtan", 200.0, (1.2, -0.1, 0.03, 3e-4, -2e-4)),
 ]
 SHARP = Imaging(white=1.0, black=0.0, background=0.5, blur_px=0.0)

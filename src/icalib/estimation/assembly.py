@@ -29,6 +29,7 @@ from icalib.estimation.robot import NO_ROBOT, RobotNoise, robot_factors, still_f
 from icalib.estimation.sensors import SensorFactor
 from icalib.estimation.state import Key, Layout, State
 from icalib.estimation.surfaces import Surfaces
+from icalib.estimation.tolerances import distortion_scales
 from icalib.geometry.cameras import camera_model
 from icalib.rig import Camera, ImuSensor, Parameter, Rig, Scheme
 
@@ -167,7 +168,7 @@ def assemble(
             len(state.seconds), tuple(images.start for images in own[1:]),
         )  # fmt: skip
         factors.append(_with_bloom(factor, camera, state, rig) if rig.blooms else factor)
-    tolerance = inputs.tolerances.of(layout, None if rig.imu is None else rig.imu.name)
+    tolerance = inputs.tolerances.of(layout, None if rig.imu is None else rig.imu.name) * distortion_scales(rig, layout)
     # Beside one another, in a thread of its own: points of LiDARs use the solver's.
     with ThreadPoolExecutor(1) as aside:
         found = None if following is None else aside.submit(_features, inputs, state, tuple(factors), following)

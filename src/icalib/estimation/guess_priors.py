@@ -9,7 +9,7 @@ from icalib.estimation.imu_model import N_INTRINSICS
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.prior_factor import Prior
 from icalib.estimation.state import State
-from icalib.estimation.tolerances import FROM_NOTHING_M, GUESS_SIGMA, OTHER_SIGMA
+from icalib.estimation.tolerances import FROM_NOTHING_M, GUESS_SIGMA, OTHER_SIGMA, distortion_scales
 
 
 def guess_sigma(inputs: Inputs) -> np.ndarray:
@@ -19,6 +19,7 @@ def guess_sigma(inputs: Inputs) -> np.ndarray:
         sigma[b.columns] = OTHER_SIGMA if b.size == N_INTRINSICS else GUESS_SIGMA[b.name]
         if b.name == "translation" and b.sensor in sensors and sensors[b.sensor].translation.value is None:
             sigma[b.columns] = FROM_NOTHING_M
+    sigma *= distortion_scales(inputs.rig, inputs.layout)
     for prior in given_priors(inputs):
         sigma[prior.block.columns] = prior.sigma
     return sigma

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.estimation.state import Layout
-from icalib.rig import Settings
+from icalib.geometry.cameras import camera_model
+from icalib.rig import Rig, Settings
 
 # What a guess without a standard deviation is taken to be worth: rad, m, s, px, 1. Nobody guesses where the walls
 # and frames of poses and which way the board are: if these moved with a sensor at some worth, little of a direction's
@@ -67,3 +68,14 @@ class Tolerances:
             name = "imu_intrinsics" if b.sensor == imu else b.name
             out[b.columns] = getattr(self, name)
         return out
+
+
+def distortion_scales(rig: Rig, layout: Layout) -> np.ndarray:
+    """(B,) what tolerances and guesses of each border column are to be multiplied with: `distortion_scale` of the
+    camera's model for its distortion, 1 for all else."""
+    scales = {c.name: camera_model(c.model).distortion_scale for c in rig.cameras}
+    out = np.ones(layout.size)
+    for b in layout.free:
+        if b.name == "distortion":
+            out[b.columns] = scales[b.sensor]
+    return out

@@ -24,6 +24,7 @@ from icalib.export.common import (
 _DISTORTION = {
     "pinhole-radtan": "plumb_bob",
     "pinhole-radtan5": "plumb_bob",
+    "pinhole-rational": "rational_polynomial",
     "pinhole-equidistant": "equidistant",
 }
 _LAUNCH = '''\

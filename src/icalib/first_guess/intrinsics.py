@@ -9,10 +9,11 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation.corner_factor import Views
-from icalib.first_guess.target_poses import FEWEST_CORNERS, Flat, TargetPoses, target_poses
+from icalib.first_guess.target_poses import FEWEST_CORNERS, Flat, TargetPoses, target_poses, usable_rays
 from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.cameras.base import CameraModel
+from icalib.geometry.cameras.convert import fit_rays
 from icalib.geometry.targets import Target
 from icalib.measurements import CornerStream
 from icalib.rig import Camera
@@ -29,6 +30,8 @@ ALIKE = 1.002  # costs that the noise cannot tell apart: the plainer lens is tak
 MOST_TIED = 5  # neighbours of the best, which lead to the same place
 HUBER_PX = 1.5
 GOOD_RMS_PX = 2.0
+WELL_PX = 0.5  # less than what corner noise is presumed to be: the right valley
+STARTS_ANYWHERE = "pinhole-equidistant"  # its start, r = f theta, is near every lens, wide and narrow
 
 
 def camera_params(camera: Camera, stream: CornerStream, target: Target) -> np.ndarray:
@@ -86,6 +89,9 @@ def guess_intrinsics(
     """
     bundle = _spread_images(stream, BUNDLE_IMAGES)
     candidates = _candidates(stream, bundle, model, _starts(model, resolution, given), target, np.isnan(given))
+    if _best_rms(bundle, model, candidates, target) > WELL_PX:
+        starts = _starts_by_another(bundle, model, resolution, given, target)
+        candidates += _candidates(stream, bundle, model, starts, target, np.isnan(given))
     candidates = _near_the_best(bundle, model, candidates, target)
     params = _cheapest(_spread_images(stream, JUDGE_IMAGES), model, candidates, target, np.flatnonzero(np.isnan(given)))
     rms = _median_rms(bundle, model, params, target)
@@ -95,6 +101,36 @@ def guess_intrinsics(
             "check the model, resolution and target in the rig file, or give intrinsics."
         )
     return params
+
+
+def _best_rms(stream: CornerStream, model: CameraModel, found: list[np.ndarray], target: Flat) -> float:
+    """Of the parameters `found`, over the images [px]; infinity where there are none."""
+    return min((_median_rms(stream, model, params, target) for params in found), default=np.inf)
+
+
+def _starts_by_another(
+    stream: CornerStream, model: CameraModel, resolution: tuple[int, int], given: np.ndarray, target: Flat
+) -> Iterator[np.ndarray]:
+    """Parameters (1, P) that project as the lens found in the model `STARTS_ANYWHERE` does, where corners are.
+
+    From no distortion, a bundle adjustment of a polynomial that a wide lens bends far can end in another valley.
+    """
+    other = camera_model(STARTS_ANYWHERE)
+    unknown = np.full(len(other.parameter_names), np.nan)
+    unknown[:4] = given[:4]
+    if model.name == other.name or not np.isnan(given[4:]).any():
+        return
+    found = _candidates(stream, stream, other, _starts(other, resolution, unknown), target, np.isnan(unknown))
+    for params in found:
+        rays, _, usable = usable_rays(stream.uv, other, params)
+        for distortion in model.start_distortions:
+            start = np.array([*params[:4], *distortion])
+            start[:2] *= params[0] / central_scale(model, start)
+            seen = usable & model.project(start, rays)[1]
+            if 2 * seen.sum() > len(start):
+                with suppress(np.linalg.LinAlgError):
+                    fitted = fit_rays(model, start, rays[seen], stream.uv[seen])
+                    yield np.where(np.isnan(given), fitted, given)[None]
 
 
 def _candidates(
@@ -195,13 +231,17 @@ def _starts(model: CameraModel, resolution: tuple[int, int], given: np.ndarray) 
     width, height = resolution
     for distortion in model.start_distortions:
         params = np.array([1.0, 1.0, 0.5 * (width - 1), 0.5 * (height - 1), *distortion])
-        _, _, j_point, _ = model.project_with_jacobians(params, np.array([[0.0, 0.0, 1.0]]))
         starts = np.tile(params, (len(FOCAL_TRIALS), 1))
-        starts[:, :2] = FOCAL_TRIALS[:, None] * width / j_point[0, 0, 0]
+        starts[:, :2] = FOCAL_TRIALS[:, None] * width / central_scale(model, params)
         starts = np.where(np.isnan(given), starts, given)
         yield starts if np.isnan(given[:2]).any() else starts[:1]
         if not np.isnan(given[4:]).any():
             return
+
+
+def central_scale(model: CameraModel, params: np.ndarray) -> float:
+    """Pixels per radian in the image's centre, along u: not fx in every model."""
+    return float(model.project_with_jacobians(params, np.array([[0.0, 0.0, 1.0]]))[2][0, 0, 0])
 
 
 def _spread_images(stream: CornerStream, wanted: int) -> CornerStream:

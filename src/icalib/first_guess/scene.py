@@ -80,27 +80,27 @@ def poses_by_bodies(stream: CornerStream, model: CameraModel, params: np.ndarray
     views = Views.of(stream, scene.bodies.target.body)
     seen = body_poses(stream, views, scene.bodies, model, params)
     R_sb, p_sb = scene.bodies.poses(scene.values)
-    rays, good = usable_rays(stream.uv, model, params)
-    n, focal = len(stream.stamps_ns), float(params[0])
+    rays, density, good = usable_rays(stream.uv, model, params)
+    n = len(stream.stamps_ns)
     rotation, position, rms = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), np.full(n, 1e9)
     first = np.searchsorted(views.image, np.arange(n + 1))
     _best_poses(
-        stream.start, stream.point, rays, good & scene.known[stream.point], scene.points, first, views.body,
-        seen.rotation, seen.position, seen.ok, R_sb, p_sb, focal, rotation, position, rms,
+        stream.start, stream.point, rays, density, good & scene.known[stream.point], scene.points, first,
+        views.body, seen.rotation, seen.position, seen.ok, R_sb, p_sb, rotation, position, rms,
     )  # fmt: skip
     return TargetPoses(rotation, position, rms < LARGEST_RMS_PX, rms)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _best_poses(
-    start, point, rays, good, scene_points, first, body, R_bc, p_bc, ok, R_sb, p_sb, focal, rotation, position, rms
+    start, point, rays, density, good, scene_points, first, body, R_bc, p_bc, ok, R_sb, p_sb, rotation, position, rms
 ):  # fmt: skip
     """Of each image: the pose that one of its views suggests and all its corners like best, refined on all of them."""
-    points, seen = np.empty((MOST_CORNERS, 3)), np.empty((MOST_CORNERS, 2))
+    points, seen = np.empty((MOST_CORNERS, 3)), np.empty((MOST_CORNERS, 3))
     R, t, trial_R, trial_t = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(3)
     R_sc, p_sc = np.empty((3, 3)), np.empty(3)
     for i in range(len(start) - 1):
-        count = chosen_corners(start[i], start[i + 1], point, rays, good, scene_points, points, seen)
+        count = chosen_corners(start[i], start[i + 1], point, rays, density, good, scene_points, points, seen)
         best = 1e9
         for v in range(first[i], first[i + 1]):
             for side in range(R_bc.shape[1]):
@@ -115,12 +115,12 @@ def _best_poses(
                         for c in range(3):
                             R_sc[a, b] += R_sb[k, a, c] * R_bc[v, side, c, b]
                 camera_in_target(R_sc, p_sc, trial_R, trial_t)
-                error = refine(points[:count], seen[:count], trial_R.copy(), trial_t.copy(), 1, 2.0 / focal)
+                error = refine(points[:count], seen[:count], trial_R.copy(), trial_t.copy(), 1)
                 if error < best:
                     best = error
                     R[:], t[:] = trial_R, trial_t
         if best < 1e9:
-            rms[i] = focal * refine(points[:count], seen[:count], R, t, ROUNDS, 2.0 / focal)
+            rms[i] = refine(points[:count], seen[:count], R, t, ROUNDS)
             if rms[i] < 1e9:
                 camera_in_target(R, t, rotation[i], position[i])
             else:

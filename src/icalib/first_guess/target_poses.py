@@ -17,6 +17,7 @@ MOST_CORNERS = 48  # of an image; more do not make a first guess better
 FEWEST_CORNERS = 6  # of a board; fewer lie on a line too easily
 SMALLEST_COSINE = 0.15  # rays closer to the image plane than this have no place in a homography
 LARGEST_RMS_PX = 3.0
+HUBER_PX = 2.0
 ROUNDS = 5
 BLOCK = 512  # poses at a time: what all corners need at once fills the memory
 
@@ -98,9 +99,12 @@ def _move(turn, g, R, t):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def refine(points, seen, R, t, rounds, scale):
-    """Gauss-Newton on x / z, y / z, Huber weights beyond `scale`; returns the last RMS error, errors capped at 4
-    scale. Points behind the camera count as so far off; 1e9 where as few as 3 are in front of it."""
+def refine(points, seen, R, t, rounds):
+    """Gauss-Newton on x / z, y / z in pixels, Huber weights beyond `HUBER_PX`; returns the last RMS error [px], errors
+    capped at 4 times that. Points behind the camera count as so far off; 1e9 where as few as 3 are in front of it.
+
+    seen (n, 3): x / z, y / z, and pixels per unit of these, which on a fisheye fall to a tenth towards the border.
+    """
     rms = 1e9
     for _ in range(rounds):
         H, g = np.zeros((6, 6)), np.zeros(6)
@@ -112,17 +116,17 @@ def refine(points, seen, R, t, rounds, scale):
                 X[i] = R[i, 0] * points[n, 0] + R[i, 1] * points[n, 1] + R[i, 2] * points[n, 2] + t[i]
             if X[2] < 1e-6:
                 behind += 1
-                total += 16.0 * scale * scale
+                total += 16.0 * HUBER_PX * HUBER_PX
                 continue
-            iz = 1.0 / X[2]
-            r0, r1 = X[0] * iz - seen[n, 0], X[1] * iz - seen[n, 1]
+            iz, density = 1.0 / X[2], seen[n, 2]
+            r0, r1 = density * (X[0] * iz - seen[n, 0]), density * (X[1] * iz - seen[n, 1])
             e = np.sqrt(r0 * r0 + r1 * r1)
-            total += min(e, 4.0 * scale) ** 2
-            w = 1.0 if e <= scale else scale / e
+            total += min(e, 4.0 * HUBER_PX) ** 2
+            w = 1.0 if e <= HUBER_PX else HUBER_PX / e
             for k in range(2):
-                a = iz if k == 0 else 0.0
-                b = iz if k == 1 else 0.0
-                c = -X[k] * iz * iz
+                a = density * iz if k == 0 else 0.0
+                b = density * iz if k == 1 else 0.0
+                c = -density * X[k] * iz * iz
                 J[k, 0] = -b * X[2] + c * X[1]
                 J[k, 1] = a * X[2] - c * X[0]
                 J[k, 2] = -a * X[1] + b * X[0]
@@ -141,9 +145,9 @@ def refine(points, seen, R, t, rounds, scale):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def chosen_corners(a, b, point, rays, good, target, points, seen):
-    """Fills points (n, 3) and seen (n, 2), x / z and y / z, with corners a..b that are good, as many as have room,
-    spread; returns their number."""
+def chosen_corners(a, b, point, rays, density, good, target, points, seen):
+    """Fills points (n, 3) and seen (n, 3), as `refine` wants them, with corners a..b that are good, as many as have
+    room, spread; returns their number."""
     most, total = len(points), 0
     for n in range(a, b):
         total += good[n]
@@ -154,6 +158,7 @@ def chosen_corners(a, b, point, rays, good, target, points, seen):
                 for k in range(3):
                     points[count, k] = target[point[n], k]
                 seen[count, 0], seen[count, 1] = rays[n, 0] / rays[n, 2], rays[n, 1] / rays[n, 2]
+                seen[count, 2] = density[n]
                 count += 1
             passed += 1
     return count
@@ -188,13 +193,13 @@ def _mirror(centre, R, t):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _all_poses(start, point, rays, good, target, fewest, rounds, focal, rotation, position, rms):
+def _all_poses(start, point, rays, density, good, target, fewest, rounds, rotation, position, rms):
     """Poses (n, 1 or 2, ...): with two, the mirrored one second."""
     R, t, h, centre = np.empty((3, 3)), np.empty(3), np.empty(9), np.empty(2)
-    points, seen = np.empty((MOST_CORNERS, 3)), np.empty((MOST_CORNERS, 2))
+    points, seen = np.empty((MOST_CORNERS, 3)), np.empty((MOST_CORNERS, 3))
     for i in range(len(start) - 1):
         rms[i] = 1e9
-        count = chosen_corners(start[i], start[i + 1], point, rays, good, target, points, seen)
+        count = chosen_corners(start[i], start[i + 1], point, rays, density, good, target, points, seen)
         if count < fewest[i]:
             continue
         for k in range(2):
@@ -209,7 +214,7 @@ def _all_poses(start, point, rays, good, target, fewest, rounds, focal, rotation
         for turn in range(rms.shape[1]):
             if turn == 1:
                 _mirror(centre, R, t)
-            rms[i, turn] = focal * refine(points[:count], seen[:count], R, t, rounds, 2.0 / focal)
+            rms[i, turn] = refine(points[:count], seen[:count], R, t, rounds)
             if not rms[i, turn] < 1e9:  # corners on a line, or in one point
                 rms[i, turn] = 1e9
                 break
@@ -260,15 +265,20 @@ def flat_poses(
     for a in range(0, n, BLOCK):
         i = slice(a, min(a + BLOCK, n))
         own = slice(int(start[i.start]), int(start[i.stop]))
-        rays, good = usable_rays(stream.uv[own], model, params)
+        rays, density, good = usable_rays(stream.uv[own], model, params)
         _all_poses(
-            start[i.start : i.stop + 1] - own.start, stream.point[own], rays, good, target, fewest[i], ROUNDS,
-            float(params[0]), rotation[i], position[i], rms[i],
+            start[i.start : i.stop + 1] - own.start, stream.point[own], rays, density, good, target, fewest[i],
+            ROUNDS, rotation[i], position[i], rms[i],
         )  # fmt: skip
     return TargetPoses(rotation, position, rms < LARGEST_RMS_PX, rms)
 
 
-def usable_rays(uv: np.ndarray, model: CameraModel, params: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 3) unit rays of corners at uv (N, 2), and (N,) whether one is far enough from the image plane."""
+def usable_rays(uv: np.ndarray, model: CameraModel, params: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(N, 3) unit rays of corners at uv (N, 2), (N,) pixels per unit of x / z and y / z there, the geometric mean over
+    directions, and (N,) whether the ray is far enough from the image plane."""
     rays, valid = model.unproject(params, uv)
-    return rays, valid & (rays[:, 2] > SMALLEST_COSINE)
+    good = valid & (rays[:, 2] > SMALLEST_COSINE)
+    on_plane = rays / np.where(good, rays[:, 2], 1.0)[:, None]
+    J = model.project_with_jacobians(params, on_plane)[2]
+    density = np.sqrt(np.abs(J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]))
+    return rays, density, good & (density > 0.0)

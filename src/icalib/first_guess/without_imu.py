@@ -21,7 +21,14 @@ Pose = tuple[np.ndarray, np.ndarray]  # R (3, 3), p (3,)
 def guess_without_imu(
     rig: Rig, measurements: Measurements, params: list[np.ndarray], poses: list[TargetPoses], scene: Scene
 ) -> Guess:
-    """Raises EstimationError naming a camera that no images taken together tie to the first one."""
+    """Raises EstimationError naming a camera that has a pose in no image, or that no images taken together tie to the
+    first one."""
+    for camera, own in zip(rig.cameras, poses, strict=True):
+        if not own.ok.any():
+            raise EstimationError(
+                f"{camera.name}: its lens explains the corners in none of its {len(own.ok)} images; check its model "
+                "and resolution in the rig file, and leave out intrinsics and distortion to have them found."
+            )
     offsets = [
         relative_offset(np.zeros(1) if c.time_offset.value is None else c.time_offset.value, s, measurements)
         for c, s in zip(rig.cameras, measurements.cameras, strict=True)

@@ -8,11 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
+from icalib.geometry.cameras import camera_model
 from icalib.inspection.facts import CameraSource, Inspection
 from icalib.inspection.kalibr import KalibrCamera
 from icalib.recordings.streams import CameraInfo
 
 DEFAULT_MODEL = "pinhole-radtan"
+_BROWN = ("plumb_bob", "rational_polynomial")
 _FISHEYES = ("equidistant", "fisheye", "kannala_brandt4")
 Values = tuple[float, ...]
 
@@ -67,17 +69,21 @@ def _from_info(
 
 
 def _model(info: CameraInfo) -> str:
+    """The plainest model that holds all coefficients, which OpenCV orders k1, k2, p1, p2, k3, k4, k5, k6, ..."""
     if info.model in _FISHEYES:
         return "pinhole-equidistant"
-    return "pinhole-radtan5" if info.model == "plumb_bob" and len(info.distortion) == 5 else DEFAULT_MODEL
+    if info.model not in _BROWN or len(info.distortion) < 5:
+        return DEFAULT_MODEL
+    return "pinhole-rational" if np.any(info.distortion[5:8]) else "pinhole-radtan5"
 
 
 def _distortion(info: CameraInfo, model: str) -> Values | None:
-    sizes = {"pinhole-equidistant": 4, "pinhole-radtan5": 5, DEFAULT_MODEL: 4}
-    known = info.model in ("plumb_bob", *_FISHEYES)
-    if not known or len(info.distortion) != sizes[model] or not np.isfinite(info.distortion).all():
+    """None where `model` does not hold all coefficients that are not zero."""
+    size = len(camera_model(model).parameter_names) - 4
+    known = info.model in (*_BROWN, *_FISHEYES)
+    if not known or len(info.distortion) < size or np.any(info.distortion[size:]):
         return None
-    return tuple(float(x) for x in info.distortion)
+    return tuple(float(x) for x in info.distortion[:size]) if np.isfinite(info.distortion).all() else None
 
 
 def _kalibr(found: Inspection, camera: CameraSource) -> KalibrCamera | None:

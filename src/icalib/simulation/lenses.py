@@ -12,14 +12,14 @@ from numba import njit
 from icalib.simulation.projection import in_range
 from icalib.simulation.scenario import MODELS, SimCamera
 
-RADTAN, EQUIDISTANT, EUCM, DOUBLE_SPHERE, OMNI = range(5)
-_CODES: dict[str, int] = dict(zip(MODELS, (RADTAN, EQUIDISTANT, EUCM, DOUBLE_SPHERE, OMNI), strict=True))
+RADTAN, EQUIDISTANT, EUCM, DOUBLE_SPHERE, OMNI, RATIONAL = range(6)
+_CODES: dict[str, int] = dict(zip(MODELS, range(6), strict=True))
 _STEPS = 20
 
 
 def lens_of(camera: SimCamera) -> tuple[int, np.ndarray]:
-    """The code of the camera's model, and (9,): fx, fy, cx, cy, then the distortion and zeros."""
-    numbers = np.zeros(9)
+    """The code of the camera's model, and (12,): fx, fy, cx, cy, then the distortion and zeros."""
+    numbers = np.zeros(12)
     numbers[: 4 + len(camera.distortion)] = [*camera.intrinsics, *camera.distortion]
     return _CODES[camera.model], numbers
 
@@ -48,6 +48,9 @@ def ray(code, n, u, v):
     a, b = (u - n[2]) / n[0], (v - n[3]) / n[1]
     if code == RADTAN:
         w = _undistorted(n[4], n[5], n[6], n[7], complex(a, b))
+        return w.real, w.imag, 1.0
+    if code == RATIONAL:
+        w = _undistorted_rational(n, complex(a, b))
         return w.real, w.imag, 1.0
     if code == EQUIDISTANT:
         radius = np.sqrt(a * a + b * b)
@@ -86,6 +89,28 @@ def _undistorted(k1, k2, p1, p2, image):
         error = w * (1.0 + s * (k1 + s * k2)) + 2.0 * s * q + w * w * q.conjugate() - image
         by_w = 1.0 + s * (2.0 * k1 + 3.0 * s * k2) + 2.0 * (w.conjugate() * q + w * q.conjugate())
         by_conj = w * w * (k1 + 2.0 * s * k2) + 2.0 * w * q
+        scale = by_w.real**2 + by_w.imag**2 - by_conj.real**2 - by_conj.imag**2
+        step = (by_conj * error.conjugate() - by_w.conjugate() * error) / scale
+        w += step
+        if abs(step.real) + abs(step.imag) < 1e-13:
+            return w
+    return complex(np.nan, np.nan)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _undistorted_rational(n, image):
+    """As `_undistorted`, with N(s) / D(s) in place of 1 + k1 s + k2 s^2; n: fx, fy, cx, cy, k1, k2, p1, p2, k3 ..."""
+    q = complex(n[7], n[6])
+    w = image
+    for _ in range(_STEPS):
+        s = w.real * w.real + w.imag * w.imag
+        above, below = 1.0 + s * (n[4] + s * (n[5] + s * n[8])), 1.0 + s * (n[9] + s * (n[10] + s * n[11]))
+        radial = above / below
+        slope = (n[4] + s * (2.0 * n[5] + 3.0 * s * n[8])) / below
+        slope -= radial * (n[9] + s * (2.0 * n[10] + 3.0 * s * n[11])) / below
+        error = w * radial + 2.0 * s * q + w * w * q.conjugate() - image
+        by_w = radial + s * slope + 2.0 * (w.conjugate() * q + w * q.conjugate())
+        by_conj = w * w * slope + 2.0 * w * q
         scale = by_w.real**2 + by_w.imag**2 - by_conj.real**2 - by_conj.imag**2
         step = (by_conj * error.conjugate() - by_w.conjugate() * error) / scale
         w += step

@@ -9,7 +9,14 @@ import numpy as np
 
 from icalib.simulation.scenario import SimCamera
 
-PARAMETER_COUNTS = {"pinhole-radtan": 4, "pinhole-equidistant": 4, "eucm": 2, "double-sphere": 2, "omni-radtan": 5}
+PARAMETER_COUNTS = {
+    "pinhole-radtan": 4,
+    "pinhole-rational": 8,
+    "pinhole-equidistant": 4,
+    "eucm": 2,
+    "double-sphere": 2,
+    "omni-radtan": 5,
+}
 _COMPLEX_STEP = 1e-30
 
 
@@ -38,6 +45,8 @@ def in_range(camera: SimCamera, radius: np.ndarray, z: np.ndarray) -> np.ndarray
     d = camera.distortion
     if camera.model == "pinhole-radtan":
         return (z > 0.0) & (radius < _first_extremum(d[:2]) * z)
+    if camera.model == "pinhole-rational":
+        return (z > 0.0) & (radius < _rational_limit(d) * z)
     if camera.model == "pinhole-equidistant":
         return np.arctan2(radius, z) < min(_first_extremum(d), np.pi)
     if camera.model == "eucm":
@@ -65,6 +74,20 @@ def _radtan(
     x, y = X / Z, Y / Z
     r2 = x * x + y * y
     radial = 1.0 + k1 * r2 + k2 * r2**2
+    return (
+        x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+        y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+    )
+
+
+def _rational(
+    distortion: tuple[float, ...], X: np.ndarray, Y: np.ndarray, Z: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """OpenCV's rational model: (k1, k2, p1, p2, k3, k4, k5, k6)."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = distortion
+    x, y = X / Z, Y / Z
+    r2 = x * x + y * y
+    radial = (1.0 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1.0 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
     return (
         x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
         y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
@@ -110,11 +133,24 @@ def _omni(distortion: tuple[float, ...], X: np.ndarray, Y: np.ndarray, Z: np.nda
 
 _PROJECTIONS = {
     "pinhole-radtan": _radtan,
+    "pinhole-rational": _rational,
     "pinhole-equidistant": _equidistant,
     "eucm": _eucm,
     "double-sphere": _double_sphere,
     "omni-radtan": _omni,
 }
+
+
+def _rational_limit(distortion: tuple[float, ...]) -> float:
+    """Smallest positive r where r N(r^2) / D(r^2) stops growing or has a pole, as polynomials in r; infinity if
+    nowhere."""
+    k1, k2, _, _, k3, k4, k5, k6 = distortion
+    above = np.array([k3, 0.0, k2, 0.0, k1, 0.0, 1.0, 0.0])
+    below = np.array([k6, 0.0, k5, 0.0, k4, 0.0, 1.0])
+    slope = np.polysub(np.polymul(np.polyder(above), below), np.polymul(above, np.polyder(below)))
+    roots = np.concatenate([np.roots(slope), np.roots(below)])
+    radii = roots[(np.abs(roots.imag) < 1e-9) & (roots.real > 0.0)].real
+    return float(radii.min()) if len(radii) else np.inf
 
 
 def _first_extremum(coefficients: tuple[float, ...]) -> float:

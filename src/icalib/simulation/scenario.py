@@ -16,7 +16,14 @@ from icalib.simulation.room import Room
 MotionKind = Literal["handheld", "planar", "single_axis", "motionless"]
 Interval = tuple[float, float]  # (start, end) in seconds on the IMU's clock, since its origin
 
-MODELS: tuple[str, ...] = ("pinhole-radtan", "pinhole-equidistant", "eucm", "double-sphere", "omni-radtan")
+MODELS: tuple[str, ...] = (
+    "pinhole-radtan",
+    "pinhole-equidistant",
+    "eucm",
+    "double-sphere",
+    "omni-radtan",
+    "pinhole-rational",
+)
 ADIS16448 = ImuNoise(1.6968e-4, 1.9393e-5, 2.0e-3, 3.0e-3, source="data sheet of the ADIS16448")
 GRAVITY_WORLD = np.array([0.0, 0.0, -9.81])  # m/s^2
 

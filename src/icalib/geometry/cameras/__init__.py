@@ -10,12 +10,14 @@ from icalib.geometry.cameras.eucm import ExtendedUnified
 from icalib.geometry.cameras.omni import OmniRadtan
 from icalib.geometry.cameras.radtan import PinholeRadtan
 from icalib.geometry.cameras.radtan5 import PinholeRadtan5
+from icalib.geometry.cameras.rational import PinholeRational
 
 CAMERA_MODELS: dict[str, CameraModel] = {
     model.name: model
     for model in (
         PinholeRadtan(),
         PinholeRadtan5(),
+        PinholeRational(),
         PinholeEquidistant(),
         ExtendedUnified(),
         DoubleSphere(),

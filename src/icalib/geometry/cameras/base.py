@@ -16,11 +16,14 @@ class CameraModel(ABC):
     but meaningless. Parameters outside the model's domain see less, or nothing, but raise no error.
 
     start_distortions: where to start when nothing is known of the lens; each is all that follows fx, fy, cx, cy.
+    distortion_scale: typical size of its coefficients, over that of a polynomial's; tolerances and guesses scale with
+    it.
     """
 
     name: ClassVar[str]
     parameter_names: ClassVar[tuple[str, ...]]
     start_distortions: ClassVar[tuple[tuple[float, ...], ...]]
+    distortion_scale: ClassVar[float] = 1.0
 
     @abstractmethod
     def project(self, params: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

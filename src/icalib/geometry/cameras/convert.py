@@ -41,7 +41,7 @@ def fit_model(
             f"{target.name} cannot see {unseen} of the {len(rays)} directions that {source.name} sees in this image, "
             "90 degrees or more from the optical axis; choose a fisheye model."
         )
-    fitted = _minimise(target, fitted, rays, uv)
+    fitted = fit_rays(target, fitted, rays, uv)
     distance = np.linalg.norm(target.project(fitted, rays)[0] - uv, axis=1)
     return fitted, float(np.sqrt(np.mean(distance**2))), float(distance.max())
 
@@ -54,8 +54,9 @@ def _rays(source: CameraModel, params: np.ndarray, resolution: tuple[int, int]) 
     return uv[valid], rays[valid]
 
 
-def _minimise(target: CameraModel, params: np.ndarray, rays: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Levenberg-Marquardt from `params`, which can see all rays."""
+def fit_rays(target: CameraModel, params: np.ndarray, rays: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Parameters (P,) of `target` that project rays (N, 3) to uv (N, 2) [px]: Levenberg-Marquardt from `params` (P,),
+    which can see all rays."""
     damping = _LEAST_DAMPING
     for _ in range(_MAX_STEPS):
         projected, _, _, j_params = target.project_with_jacobians(params, rays)

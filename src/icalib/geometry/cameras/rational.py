@@ -1,0 +1,206 @@
+"""Pinhole cameras with OpenCV's rational distortion, ROS's "rational_polynomial" (Azure Kinect, Orbbec, Luxonis)."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numba import njit
+from numpy.polynomial import Polynomial
+
+from icalib.geometry.cameras.closed_form import ClosedForm
+
+_MIN_DEPTH = 1e-6  # m
+_MAX_NEWTON_STEPS = 30
+_MAX_ITERATIONS = 100  # bisection alone halves the bracket to rounding in 60
+
+
+class PinholeRational(ClosedForm):
+    """With a = x / z, b = y / z, s = a^2 + b^2 and
+    d = (1 + k1 s + k2 s^2 + k3 s^3) / (1 + k4 s + k5 s^2 + k6 s^3) (OpenCV, calib3d, CALIB_RATIONAL_MODEL):
+
+        u = fx (a d + 2 p1 a b + p2 (s + 2 a^2)) + cx
+        v = fy (b d + p1 (s + 2 b^2) + 2 p2 a b) + cy
+
+    Parameters: fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6: OpenCV's order. Valid: z > 1 um, and r = sqrt(s) below
+    the first extremum or pole of r d(r^2). The rest is projected to (0, 0) with zero Jacobians.
+    """
+
+    name = "pinhole-rational"
+    parameter_names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    start_distortions = ((0.0,) * 8,)
+    # Those of N and D nearly cancel: lenses that project alike to 0.01 px can have coefficients that differ by 1.
+    distortion_scale = 10.0
+
+    def _fill_image(self, params, points, uv, valid) -> None:
+        _project(params, points, _limit(params), uv, valid)
+
+    def _fill_jacobians(self, params, points, uv, valid, j_point, j_params) -> None:
+        _project_with_jacobians(params, points, _limit(params), uv, valid, j_point, j_params)
+
+    def _fill_rays(self, params, uv, rays, valid) -> None:
+        _unproject(params, uv, _limit(params), rays, valid)
+
+
+def _limit(params: np.ndarray) -> float:
+    return monotonic_limit(tuple(params[[4, 5, 8]].tolist()), tuple(params[9:].tolist()))
+
+
+@lru_cache(maxsize=64)  # asked for chunk by chunk, with the same coefficients
+def monotonic_limit(numerator: tuple[float, ...], denominator: tuple[float, ...]) -> float:
+    """The smallest r > 0 at which r N(r^2) / D(r^2) stops growing or has a pole; inf if there is none.
+
+    N(s) = 1 + n_1 s + ..., D(s) likewise. The slope is (N D + 2 s (N' D - N D')) / D^2. 0 if a coefficient is not
+    finite, or the slope's numerator is not.
+    """
+    N, D = Polynomial([1.0, *numerator]), Polynomial([1.0, *denominator])
+    with np.errstate(over="ignore", invalid="ignore"):
+        slope = N * D + Polynomial([0.0, 2.0]) * (N.deriv() * D - N * D.deriv())
+    if not (np.isfinite(slope.coef).all() and np.isfinite(D.coef).all()):
+        return 0.0
+    squares = [_smallest_root(p.coef) for p in (slope, D)]
+    return float(np.sqrt(min(squares)))
+
+
+def _smallest_root(coefficients: np.ndarray) -> float:
+    """The smallest positive root of 1 + c_1 s + c_2 s^2 + ...; inf if there is none.
+
+    In w = 1 / s the polynomial is monic, so vanishing leading coefficients need no special case.
+    """
+    inverses = np.roots(coefficients)
+    positive = inverses.real[(inverses.imag == 0.0) & (inverses.real > 0.0)]
+    return float(1.0 / positive.max()) if len(positive) else np.inf
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _radial(params, s):
+    """d, 1 / D and d d / d s."""
+    numerator = 1.0 + s * (params[4] + s * (params[5] + s * params[8]))
+    inverse = 1.0 / (1.0 + s * (params[9] + s * (params[10] + s * params[11])))
+    n_slope = params[4] + s * (2.0 * params[5] + s * 3.0 * params[8])
+    d_slope = params[9] + s * (2.0 * params[10] + s * 3.0 * params[11])
+    d = numerator * inverse
+    return d, inverse, (n_slope - d * d_slope) * inverse
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _distort(params, a, b):
+    """Distorted (a, b), d of it / d (a, b) as (aa, ab = ba, bb), d and 1 / D."""
+    p1, p2 = params[6], params[7]
+    s = a * a + b * b
+    d, inverse, slope = _radial(params, s)
+    slope *= 2.0
+    distorted_a = a * d + 2.0 * p1 * a * b + p2 * (s + 2.0 * a * a)
+    distorted_b = b * d + p1 * (s + 2.0 * b * b) + 2.0 * p2 * a * b
+    j_aa = d + a * a * slope + 2.0 * p1 * b + 6.0 * p2 * a
+    j_ab = a * b * slope + 2.0 * p1 * a + 2.0 * p2 * b
+    j_bb = d + b * b * slope + 6.0 * p1 * b + 2.0 * p2 * a
+    return distorted_a, distorted_b, j_aa, j_ab, j_bb, d, inverse
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _on_plane(points, i, limit):
+    """a, b, 1 / z and whether the point is valid."""
+    z = points[i, 2]
+    inverse_z = 1.0 / z if z > _MIN_DEPTH else 0.0
+    a, b = points[i, 0] * inverse_z, points[i, 1] * inverse_z
+    return a, b, inverse_z, z > _MIN_DEPTH and a * a + b * b < limit * limit
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _project(params, points, limit, uv, valid):
+    for i in range(len(points)):
+        a, b, _, valid[i] = _on_plane(points, i, limit)
+        uv[i] = 0.0
+        if valid[i]:
+            distorted_a, distorted_b, _, _, _, _, _ = _distort(params, a, b)
+            uv[i, 0] = params[0] * distorted_a + params[2]
+            uv[i, 1] = params[1] * distorted_b + params[3]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _project_with_jacobians(params, points, limit, uv, valid, j_point, j_params):
+    fx, fy = params[0], params[1]
+    for i in range(len(points)):
+        a, b, inverse_z, valid[i] = _on_plane(points, i, limit)
+        if not valid[i]:
+            uv[i] = 0.0
+            continue
+        distorted_a, distorted_b, j_aa, j_ab, j_bb, d, inverse = _distort(params, a, b)
+        uv[i, 0], uv[i, 1] = fx * distorted_a + params[2], fy * distorted_b + params[3]
+        scale_u, scale_v = fx * inverse_z, fy * inverse_z
+        j_point[i, 0, 0], j_point[i, 0, 1] = scale_u * j_aa, scale_u * j_ab
+        j_point[i, 1, 0], j_point[i, 1, 1] = scale_v * j_ab, scale_v * j_bb
+        j_point[i, 0, 2] = -scale_u * (a * j_aa + b * j_ab)
+        j_point[i, 1, 2] = -scale_v * (a * j_ab + b * j_bb)
+        s = a * a + b * b
+        j_params[i, 0, 0], j_params[i, 0, 2] = distorted_a, 1.0
+        j_params[i, 1, 1], j_params[i, 1, 3] = distorted_b, 1.0
+        j_params[i, 0, 6], j_params[i, 0, 7] = 2.0 * fx * a * b, fx * (s + 2.0 * a * a)
+        j_params[i, 1, 6], j_params[i, 1, 7] = fy * (s + 2.0 * b * b), 2.0 * fy * a * b
+        by_u, by_v = fx * a * inverse, fy * b * inverse  # of a change of N; one of D has -d times that
+        j_params[i, 0, 4], j_params[i, 0, 5], j_params[i, 0, 8] = by_u * s, by_u * s * s, by_u * s * s * s
+        j_params[i, 1, 4], j_params[i, 1, 5], j_params[i, 1, 8] = by_v * s, by_v * s * s, by_v * s * s * s
+        by_u, by_v = -d * by_u, -d * by_v
+        j_params[i, 0, 9], j_params[i, 0, 10], j_params[i, 0, 11] = by_u * s, by_u * s * s, by_u * s * s * s
+        j_params[i, 1, 9], j_params[i, 1, 10], j_params[i, 1, 11] = by_v * s, by_v * s * s, by_v * s * s * s
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _undistorted_radius(params, distorted, limit):
+    """r below `limit` with r d(r^2) = distorted, near the limit where there is none. Newton kept in a bracket."""
+    low, high = 0.0, limit
+    if limit == np.inf:
+        high = 1.0 + distorted
+        while high * _radial(params, high * high)[0] < distorted:
+            high *= 2.0
+    r = min(distorted, 0.5 * (low + high))
+    for _ in range(_MAX_ITERATIONS):
+        d, _, slope = _radial(params, r * r)
+        value = r * d
+        if value < distorted:
+            low = r
+        else:
+            high = r
+        following = r + (distorted - value) / (d + 2.0 * r * r * slope)
+        if not low <= following <= high:
+            following = 0.5 * (low + high)
+        if abs(following - r) <= 2e-16 * r:
+            return following
+        r = following
+    return r
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _undistort(params, limit, distorted_a, distorted_b):
+    """(a, b) and whether Newton converged inside the monotonic range; starts where the radial part alone would be."""
+    distorted_r = np.hypot(distorted_a, distorted_b)
+    # At the limit itself the radial slope is zero; 0.9 leaves room for tangential terms that reach slightly past it.
+    r = min(_undistorted_radius(params, distorted_r, limit), 0.9 * limit)
+    scale = r / distorted_r if distorted_r > 0.0 else 1.0
+    a, b = scale * distorted_a, scale * distorted_b
+    for _ in range(_MAX_NEWTON_STEPS):
+        value_a, value_b, j_aa, j_ab, j_bb, _, _ = _distort(params, a, b)
+        determinant = j_aa * j_bb - j_ab * j_ab
+        if not determinant > 0.0:
+            return a, b, False
+        error_a, error_b = value_a - distorted_a, value_b - distorted_b
+        step_a = (j_bb * error_a - j_ab * error_b) / determinant
+        step_b = (j_aa * error_b - j_ab * error_a) / determinant
+        a, b = a - step_a, b - step_b
+        if abs(step_a) + abs(step_b) <= 1e-14 * (1.0 + abs(a) + abs(b)):
+            return a, b, a * a + b * b < limit * limit
+    return a, b, False
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # a focal length of zero: nothing is valid
+def _unproject(params, uv, limit, rays, valid):
+    for i in range(len(uv)):
+        mx, my = (uv[i, 0] - params[2]) / params[0], (uv[i, 1] - params[3]) / params[1]
+        a, b, valid[i] = 0.0, 0.0, False
+        if np.isfinite(mx) and np.isfinite(my) and limit > 0.0:
+            a, b, valid[i] = _undistort(params, limit, mx, my)
+        if not valid[i]:
+            a, b = 0.0, 0.0
+        norm = np.sqrt(1.0 + a * a + b * b)
+        rays[i, 0], rays[i, 1], rays[i, 2] = a / norm, b / norm, 1.0 / norm
