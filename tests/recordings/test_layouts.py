@@ -12,7 +12,7 @@ from icalib.imu_classes import class_noise
 from icalib.recordings import FolderRecording, read_measurements
 from icalib.recordings.clocks import unit_of_stamps, usual_step
 from icalib.recordings.columns import IMU, TableKind
-from icalib.recordings.table import read_table
+from icalib.recordings.table import holds, named, read_table
 from icalib.rig import Camera, ImuSensor, PoseSensor, Rig, TableLayout, Wheels
 from icalib.rig_file import load_rig, rig_from_dict, rig_to_dict
 
@@ -280,3 +280,80 @@ def test_huge_numbers_are_single_bad_readings(tmp_path):
     found = read_measurements(FolderRecording(tmp_path), rig)
     assert found.imu is not None and len(found.imu.stamps_ns) == 598 and len(found.poses[0].stamps_ns) == 599
     assert np.abs(found.imu.accel).max() < 1e3
+
+
+SPLIT = {
+    "ROS 2": ("header.stamp.sec", "header.stamp.nanosec"),
+    "ROS 1": ("field.header.stamp.secs", "field.header.stamp.nsecs"),
+    "plain": ("sec", "nanosec"),
+    "underscores": ("stamp_sec", "stamp_nsec"),
+    "words": ("Seconds", "Nanoseconds"),
+    "one word": ("timestamp_secs", "timestamp_nsecs"),
+}
+
+
+def split_rows(name: str, stamps: np.ndarray = STAMPS, before: str = "") -> str:
+    """The stamps in two columns, the nanoseconds not first; `before`: a column of each row before these."""
+    sec, nsec = SPLIT[name]
+    head = ",".join([*(["Time"] if before else []), sec, "frame_id", nsec, *NAMES]) + "\n"
+    parts = [divmod(t, 1_000_000_000) for t in stamps.tolist()]
+    return head + "".join(
+        ",".join([*([before] if before else []), str(s), "imu", str(ns), *map(repr, row)]) + "\n"
+        for (s, ns), row in zip(parts, VALUES.tolist(), strict=True)
+    )
+
+
+@pytest.mark.parametrize("name", SPLIT)
+def test_seconds_and_nanoseconds_in_two_columns(tmp_path, name):
+    table, notes = read(tmp_path, split_rows(name))
+    check(table)
+    assert notes == []
+    assert holds(tmp_path / "data.csv", IMU) and named(tmp_path / "data.csv", IMU)
+
+
+def test_the_stamp_in_two_columns_goes_before_when_it_was_received(tmp_path):
+    table, _ = read(tmp_path, split_rows("ROS 1", before="1700000009.5"))
+    check(table)
+
+
+def test_two_columns_of_a_stamp_by_the_rig_file(tmp_path):
+    text = split_rows("ROS 2").replace("wx,wy", "first,second")
+    layout = TableLayout(columns=("header.stamp.sec", "header.stamp.nanosec", "first", "second", *NAMES[2:]))
+    table, _ = read(tmp_path, text, layout)
+    check(table)
+
+
+def test_stamps_before_1970_and_bad_nanoseconds(tmp_path):
+    table, _ = read(tmp_path, split_rows("plain", STAMPS - STAMPS[20]))
+    check(table, STAMPS - STAMPS[20])
+    lines = split_rows("plain").splitlines(keepends=True)
+    for k, nsec in ((10, "1000000000"), (20, "-1"), (30, "x")):
+        cells = lines[k].split(",")
+        lines[k] = ",".join([*cells[:2], nsec, *cells[3:]])
+    table, notes = read(tmp_path, "".join(lines))
+    np.testing.assert_array_equal(table.integers[:, 0], np.delete(STAMPS, [9, 19, 29]))
+    np.testing.assert_array_equal(table.decimals, np.delete(VALUES, [9, 19, 29], axis=0))
+    assert "nanoseconds is 'x', which is not a number; the line was left out" in notes[0]
+    assert "2 of 59 rows have no stamp" in notes[1] and "and 1000000000 in sec and nanosec" in notes[1]
+    wrong = split_rows("plain").replace(",imu,", ",imu,1")
+    assert "nanoseconds are from 0 to 999999999; correct what writes them" in refused(tmp_path, wrong)
+
+
+def test_nanoseconds_alone_are_no_stamp_of_two_columns(tmp_path):
+    table, _ = read(tmp_path, "nsec," + ",".join(NAMES) + "\n" + rows())
+    check(table)
+
+
+def test_poses_and_wheels_with_stamps_in_two_columns(tmp_path):
+    stamps = [f"{s},{ns}" for s, ns in (divmod(t, 10**9) for t in STAMPS.tolist())]
+    (tmp_path / "a").mkdir()
+    line = "0.1,0.2,0.3,0,0,0,1"
+    (tmp_path / "a" / "poses.csv").write_text(
+        "sec,nanosec,x,y,z,qx,qy,qz,qw\n" + "".join(f"{s},{line}\n" for s in stamps)
+    )
+    (tmp_path / "a" / "rates.csv").write_text("secs,nsecs,left,right\n" + "".join(f"{s},1.5,2\n" for s in stamps))
+    recording = FolderRecording(tmp_path)
+    assert recording.poses(PoseSensor("a", "a/poses.csv")).stamps_ns.tolist() == STAMPS.tolist()
+    wheels = recording.wheels(Wheels("a", "a/rates.csv"))
+    assert wheels.stamps_ns.tolist() == STAMPS.tolist() and wheels.value[5].tolist() == [1.5, 2.0]
+    assert {t.name: t.first_ns for t in recording.topics()} == {"a/poses.csv": ORIGIN, "a/rates.csv": ORIGIN}

@@ -114,7 +114,7 @@ def test_bad_poses(tmp_path):
     table(tmp_path, xyzw=1.1 * XYZW)
     assert f"the quaternion at {STAMPS[0]} ns has length 1.1, not 1" in refused(tmp_path)
     table(tmp_path, stamps=STAMPS // 1_000_000_000)
-    assert "poses have the stamp of the one before, as where stamps are cut to whole seconds" in refused(tmp_path)
+    assert "poses have the stamp of another that differs, as where stamps are cut to whole seconds" in refused(tmp_path)
     table(tmp_path, position=1000.0 * POSITION)
     assert "in millimetres are to be divided by 1000" in refused(tmp_path)
     table(tmp_path, position=0.0 * POSITION, xyzw=np.tile([0.0, 0.0, 0.0, 1.0], (N, 1)))
@@ -268,7 +268,24 @@ def test_repeated_stamps(tmp_path):
     stamps = STAMPS.copy()
     stamps[10] = stamps[9]
     table(tmp_path, stamps)
-    assert f"two different poses are both stamped {STAMPS[9]} ns" in refused(tmp_path)
+    stream, notes = read(tmp_path)
+    np.testing.assert_array_equal(stream.stamps_ns, np.delete(STAMPS, [9, 10]))
+    assert "2 poses have the stamp of another that differs, and which one is right is not known" in notes[0]
+    stamps[1::15] = stamps[::15]
+    table(tmp_path, stamps)
+    assert f"42 of {N} poses have the stamp of another that differs, the first {STAMPS[0]} ns" in refused(tmp_path)
+
+
+def test_one_stamp_of_two_among_few_poses_at_rest(tmp_path):
+    stops = np.arange(0, N, 30)
+    stamps = ORIGIN + 2_000_000_000 * np.arange(len(stops))
+    stamps[4] = stamps[3]
+    table(tmp_path, stamps, POSITION[stops], XYZW[stops])
+    stream, notes = read(tmp_path)
+    np.testing.assert_array_equal(stream.stamps_ns, np.delete(stamps, [3, 4]))
+    assert "2 poses have the stamp of another that differs" in notes[0]
+    table(tmp_path, stamps[2:6], POSITION[stops[2:6]], XYZW[stops[2:6]])
+    assert "2 of 4 poses have the stamp of another that differs" in refused(tmp_path)
 
 
 def test_a_frame_that_jumps(tmp_path):

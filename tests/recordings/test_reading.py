@@ -11,8 +11,9 @@ import pytest
 from icalib.errors import RecordingError
 from icalib.geometry.targets import AprilGrid
 from icalib.imu_classes import class_noise
-from icalib.measurements import Measurements
+from icalib.measurements import CornerStream, Measurements
 from icalib.recordings import open_recording, read_measurements
+from icalib.recordings.camera_checks import checked_corners
 from icalib.rig import Camera, ImuSensor, Rig
 
 ORIGIN = 1_404_733_405_732_800_001
@@ -157,7 +158,10 @@ class TestImu:
     def test_different_readings_at_one_instant(self, tmp_path):
         rows = imu_rows()
         rows[10][0] = rows[9][0]
-        assert f"two different readings are both stamped {ORIGIN + 9 * IMU_STEP} ns" in complaint(tmp_path, imu=rows)
+        m = read(tmp_path, imu=rows)
+        assert m.imu.stamps_ns.tolist() == [row[0] for row in rows if row[0] != rows[9][0]]
+        assert "2 readings have the stamp of another that differs" in m.notes[0]
+        assert f"the first at {ORIGIN + 9 * IMU_STEP} ns" in m.notes[0]
 
     @pytest.mark.parametrize(("divisor", "unit"), [(1000, "microseconds"), (1_000_000, "milliseconds")])
     def test_other_units_of_time(self, tmp_path, divisor, unit):
@@ -248,10 +252,20 @@ class TestCorners:
     @pytest.mark.parametrize(("u", "v"), [(-1.6, 0.0), (752.6, 0.0), (0.0, 480.6), (0.0, -1.6)])
     def test_outside_the_image(self, tmp_path, u, v):
         rows = corner_rows()
-        rows[9][3:] = [u, v]
+        for row in rows[9:14]:
+            row[3:] = [u, v]
         sentence = complaint(tmp_path, corners=rows)
-        assert f"corner 1 of tag 0 lies at ({u}, {v}), outside the image of 752 x 480 px" in sentence
+        assert f"corner 1 of tag 0 lies at ({u}, {v}), outside the image of 752 x 480 px; check" in sentence
         assert f"{ORIGIN + IMAGE_STEP} ns" in sentence
+
+    @pytest.mark.parametrize(("u", "v"), [(-1.6, 0.0), (1e9, 200.0), (100.0, -1e300), (-4.2e4, 9e9)])
+    def test_single_corners_outside_the_image_are_left_out(self, tmp_path, u, v):
+        rows = corner_rows()
+        rows[9][3:] = rows[17][3:] = [u, v]
+        m = read(tmp_path, corners=rows)
+        assert m.cameras[0].uv.tolist() == [r[3:] for k, r in enumerate(rows) if k not in (9, 17)]
+        assert np.diff(m.cameras[0].start).tolist() == [8, 7, 7, 8, 8]
+        assert "outside the image of 752 x 480 px; 2 of 40 such points were left out" in m.notes[0]
 
     @pytest.mark.parametrize(("u", "v"), [(-1.4, 0.0), (752.4, 480.4)])
     def test_a_step_over_the_edge_is_kept(self, tmp_path, u, v):
@@ -266,6 +280,17 @@ class TestCorners:
         assert np.diff(cam.start).tolist() == [8, 4, 8]
         assert cam.uv.tolist() == [r[3:] for r in rows[:8] + rows[16:20] + rows[32:]]
         assert f"2 images with fewer than 4 corners were dropped, the first at {ORIGIN + IMAGE_STEP} ns" in m.notes[0]
+
+    def test_standard_deviations_stay_with_their_corners(self):
+        start, uv = np.array([0, 4, 7, 15]), np.arange(30.0).reshape(15, 2)
+        uv[2] = [-40.0, 5.0]
+        sigma = 0.1 + np.arange(15.0)
+        stamps = ORIGIN + IMAGE_STEP * np.arange(3)
+        found = CornerStream("cam0", stamps, start, np.arange(15) % 8, uv, sigma=sigma)
+        corners, notes = checked_corners(found, "here", (752, 480))
+        assert corners.start.tolist() == [0, 8] and corners.stamps_ns.tolist() == [stamps[2]]
+        assert corners.sigma.tolist() == sigma[7:].tolist() and corners.uv.tolist() == uv[7:].tolist()
+        assert len(notes) == 2
 
     def test_only_poor_images(self, tmp_path):
         assert "no image has 4 corners or more" in complaint(tmp_path, corners=corner_rows(corners=3))

@@ -57,6 +57,27 @@ def test_what_is_wrong_is_named(tmp_path, old, new, words):
     assert words in str(error.value) and "\n" not in str(error.value)
 
 
+def test_single_points_outside_the_image_are_left_out(tmp_path):
+    rows = [(10**9 + 50_000_000 * k, n, 10.0 + k, 20.0 + n) for k in range(10) for n in range(3)]
+    for at, uv in ((4, (900.0, 20.0)), (29, (1.0, -1e250))):
+        rows[at] = (*rows[at][:2], *uv)
+    path, notes = tmp_path / "tracks.csv", []
+    path.write_text("".join(f"{t},{n},{u!r},{v!r}\n" for t, n, u, v in rows))
+    stream = read_tracks("cam0", path, (752, 480), note=notes.append)
+    kept = [row for k, row in enumerate(rows) if k not in (4, 29)]
+    assert stream.uv.tolist() == [list(row[2:]) for row in kept]
+    assert stream.stamps_ns[stream.image].tolist() == [row[0] for row in kept]
+    assert len(notes) == 1 and "feature 1 lies at (900.0, 20.0), outside the image of 752 x 480 px; 2 of 30" in notes[0]
+
+
+def test_an_image_whose_only_point_is_outside_is_gone(tmp_path):
+    rows = [(10**9 + 50_000_000 * k, 7, 10.0 + k, 20.0) for k in range(12)]
+    rows[5] = (*rows[5][:2], -99.0, 20.0)
+    stream = read(tmp_path, "".join(f"{t},{n},{u!r},{v!r}\n" for t, n, u, v in rows))
+    assert stream.stamps_ns.tolist() == [row[0] for k, row in enumerate(rows) if k != 5]
+    assert stream.start.tolist() == list(range(12))
+
+
 def test_a_rig_without_a_target(tmp_path):
     path = tmp_path / "rig.yaml"
     path.write_text(RIG)

@@ -70,7 +70,10 @@ def test_ticks(tmp_path, size, sign):
 TWICE = np.insert(STAMPS, 7, STAMPS[7])
 REFUSED = {
     "back": (RATES, np.where(np.arange(N) == 9, STAMPS - 10**9, STAMPS), {}, f"ing at {STAMPS[9] - 10**9} ns comes"),
-    "two": (np.insert(RATES, 7, 1.0, axis=0), TWICE, {}, f"two different readings are both stamped {STAMPS[7]} ns"),
+    "two": (
+        np.insert(RATES, np.arange(0, N, 15), 1.0, axis=0), np.insert(STAMPS, np.arange(0, N, 15), STAMPS[::15]), {},
+        f"readings have the stamp of another that differs, the first {STAMPS[0]} ns",
+    ),
     "deg/s": (np.rad2deg(RATES), STAMPS, {}, "(wheel0): the wheels turn at 366.7 rad/s, faster than any robot's"),
     "degrees": (np.rad2deg(ANGLES), STAMPS, {"measures": "angles"}, "set measures of wheel0 to ticks and counts_pe"),
     "counter": (
@@ -89,6 +92,16 @@ def test_what_would_be_wrong_is_refused(tmp_path, case):
     with pytest.raises(RecordingError) as error:
         from_table(tmp_path, values, stamps, **fields)
     assert words in str(error.value) and str(error.value).startswith(str(tmp_path))
+
+
+@pytest.mark.parametrize("measures", ["rates", "angles"])
+def test_single_stamps_of_two_readings(tmp_path, measures):
+    value = RATES if measures == "rates" else ANGLES
+    twice = np.insert(value, 7, value[7] + [0.3, -0.2], axis=0)
+    stream, notes = from_table(tmp_path, twice, TWICE, measures=measures)
+    np.testing.assert_array_equal(stream.stamps_ns, np.delete(STAMPS, 7))
+    assert "2 readings have the stamp of another that differs, and which one is right is not known" in notes[0]
+    assert f"the first at {STAMPS[7]} ns" in notes[0]
 
 
 def test_what_looks_odd_is_noted(tmp_path):
@@ -285,6 +298,23 @@ def test_joints_one_at_a_time(bag_of):
     bag = bag_of(lambda k: ([["left"], ["right"]][k % 2], [], [1.0]))
     with pytest.raises(RecordingError, match=f"the message at {STAMPS[0]} ns has only one of left and right"):
         bag.wheels(Wheels("wheel0", ""))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e300])
+@pytest.mark.parametrize("measures", ["rates", "angles"])
+@pytest.mark.parametrize("column", [0, 1])
+def test_single_messages_with_one_joint_that_is_none(bag_of, measures, column, bad):
+    def content(k: int) -> tuple[list[str], list[float], list[float]]:
+        value = (RATES if measures == "rates" else ANGLES)[k].copy()
+        if k in (0, 33, 150):
+            value[column] = bad
+        return ["left", "right"], *(([], value.tolist()) if measures == "rates" else (value.tolist(), []))
+
+    wheels = Wheels("wheel0", "", measures=measures)
+    stream, notes = checked_wheels(bag_of(content).wheels(wheels), wheels, "here")
+    np.testing.assert_array_equal(stream.stamps_ns, np.delete(STAMPS, [0, 33, 150]))
+    assert f"3 of {N} readings are not finite and are left out, the first at {STAMPS[0]} ns" in notes[0]
+    assert np.isfinite(stream.rate).all()
 
 
 FILLED = {

@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from icalib.errors import RecordingError
-from icalib.measurements import CornerStream
+from icalib.measurements import CornerStream, TrackStream
 from icalib.recordings.clocks import rate_sentence
 
 _RATE_HZ = (1e-3, 1000.0)
 _MIN_CORNERS = 4  # fewer do not give a pose
 _MARGIN_PX = 1.0  # corner refinement may step over the edge
+_MOST_OUTSIDE = 0.1  # of all points: more are no single bad ones, but of a camera of another resolution
 
 
 def checked_corners(
     corners: CornerStream, where: str, resolution: tuple[int, int]
 ) -> tuple[CornerStream, tuple[str, ...]]:
-    """`corners` without images of fewer than four, and a note on these.
+    """`corners` without single ones outside the image of `resolution` (width, height) px, and without images of fewer
+    than four; and notes on these.
 
-    Raises RecordingError naming `where` (the file) and the instant: no usable images, a corner that is not finite or
-    outside the image of `resolution` (width, height) px, images at an impossible rate.
+    Raises RecordingError naming `where` (the file) and the instant: no usable images, many corners outside the image,
+    images at an impossible rate.
     """
     what = f"{where} ({corners.name})"
     if len(corners.stamps_ns) == 0:
@@ -27,23 +31,48 @@ def checked_corners(
     sentence = rate_sentence(what, corners.stamps_ns, *_RATE_HZ) if len(corners.stamps_ns) > 1 else None
     if sentence:
         raise RecordingError(sentence)
-    _refuse_outside(corners, what, resolution)
-    return _without_poor_images(corners, what)
+    corners, outside = _inside(corners, what, resolution)
+    corners, poor = _without_poor_images(corners, what)
+    return corners, outside + poor
 
 
-def _refuse_outside(corners: CornerStream, what: str, resolution: tuple[int, int]) -> None:
-    low = -0.5 - _MARGIN_PX
-    high = np.array(resolution) - 0.5 + _MARGIN_PX
-    inside = ((corners.uv >= low) & (corners.uv <= high)).all(axis=1)
-    if not inside.all():
-        row = int(np.argmin(inside))
-        u, v = corners.uv[row]
-        tag, corner = divmod(int(corners.point[row]), 4)
-        raise RecordingError(
-            f"{what}: in the image at {corners.stamps_ns[corners.image[row]]} ns, corner {corner} of tag {tag} lies at "
-            f"({u:.1f}, {v:.1f}), outside the image of {resolution[0]} x {resolution[1]} px; "
-            "check the camera's resolution [width, height] in the rig file."
-        )
+def _inside(corners: CornerStream, what: str, resolution: tuple[int, int]) -> tuple[CornerStream, tuple[str, ...]]:
+    """Without the few corners outside the image, and a note on these. Raises RecordingError where they are many."""
+    inside = in_image(corners.uv, resolution, _MARGIN_PX)
+    if inside.all():
+        return corners, ()
+    tag, corner = divmod(int(corners.point[np.argmin(inside)]), 4)
+    note = outside_note(corners, inside, f"corner {corner} of tag {tag}", what, resolution)
+    count = np.bincount(corners.image[inside], minlength=len(corners.stamps_ns))
+    return _some(corners, corners.stamps_ns, count, inside), (note,)
+
+
+def _some(corners: CornerStream, stamps_ns: np.ndarray, count: np.ndarray, kept: np.ndarray) -> CornerStream:
+    """The corners kept (N,), `count` of them in the image at each of the stamps."""
+    start = np.concatenate([[0], np.cumsum(count)])
+    sigma = corners.sigma[kept] if len(corners.sigma) else corners.sigma
+    return replace(
+        corners, stamps_ns=stamps_ns, start=start, point=corners.point[kept], uv=corners.uv[kept], sigma=sigma
+    )
+
+
+def in_image(uv: np.ndarray, resolution: tuple[int, int], margin_px: float) -> np.ndarray:
+    """(N,) bool: which points (N, 2) lie in the image, or so near outside."""
+    return np.logical_and.reduce((uv >= -0.5 - margin_px) & (uv <= np.array(resolution) - 0.5 + margin_px), axis=1)
+
+
+def outside_note(
+    stream: CornerStream | TrackStream, inside: np.ndarray, thing: str, what: str, resolution: tuple[int, int]
+) -> str:
+    """The note on points that are not `inside` (N,) the image, of which the first is `thing`. Raises RecordingError
+    where they are too many to be single bad ones."""
+    first, count = int(np.argmin(inside)), int((~inside).sum())
+    (u, v), (width, height) = stream.uv[first], resolution
+    words = f"{thing} lies at ({u:.1f}, {v:.1f}), outside the image of {width} x {height} px"
+    told = f"{what}: in the image at {stream.stamps_ns[stream.image[first]]} ns, {words}"
+    if count > _MOST_OUTSIDE * len(inside):
+        raise RecordingError(f"{told}; check the camera's resolution [width, height] in the rig file.")
+    return f"{told}; {count} of {len(inside)} such points were left out."
 
 
 def _without_poor_images(corners: CornerStream, what: str) -> tuple[CornerStream, tuple[str, ...]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,6 +18,10 @@ _FROM = re.compile(r"(field|msg|data|imu|imu\d+|odom|pose\d*|transform|twist|sen
 GYRO = r"w|omega|g|gyro|gyr|gyros|gyroscope|angular_(velocity|vel|rate)|ang_?vel|rotation_rate|w_rs_s"
 ACCEL = r"a|acc|accel|acceleration|accelerometer|alpha|linear_(acceleration|accel|acc)|lin_acc|specific_force|f|a_rs_s"
 STAMP = (r"(header_)?stamp(_ns|_nsec)?", r"time_?stamp(_ns|_us|_ms|_s)?", r"(time|t|ts)(_ns|_us|_ms|_s)?")
+# A stamp in two columns, as of messages of ROS: whole seconds, and nanoseconds beyond them.
+_OF_STAMP = r"((header_)?stamp_|time_?stamp_|time_|ros_?time_)?"
+SECONDS = tuple(rf"{of}(secs?|seconds?)" for of in (r"(header_)?stamp_", _OF_STAMP))
+NANOSECONDS = tuple(rf"{of}(n_?secs?|nano_?secs?|nano_?seconds?)" for of in (r"(header_)?stamp_", _OF_STAMP))
 
 
 @dataclass(frozen=True)
@@ -26,7 +30,8 @@ class TableKind:
 
     known: for each of these regular expressions of names that headers give it, the most telling first; none: only the
     order counts. rate_hz: the slowest and the fastest rate of stamps, by which their unit is told where it is not
-    `unit`; None: it is. more: whether further columns may follow that no header names.
+    `unit`; None: it is. more: whether further columns may follow that no header names. split: whether the first two
+    whole numbers are one stamp, its seconds and its nanoseconds.
     """
 
     integers: tuple[str, ...]
@@ -35,6 +40,7 @@ class TableKind:
     rate_hz: tuple[float, float] | None = None
     unit: TimeUnit = "ns"
     more: bool = False
+    split: bool = False
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -42,8 +48,8 @@ class TableKind:
 
     @property
     def stamps(self) -> int:
-        """How many of the integers are stamps."""
-        return sum(name.endswith("[ns]") for name in self.integers)
+        """How many of the integers are stamps, or parts of a split one."""
+        return 2 if self.split else sum(name.endswith("[ns]") for name in self.integers)
 
 
 def vector_names(quantities: str, axes: str = "xyz") -> tuple[tuple[str, ...], ...]:
@@ -85,6 +91,15 @@ def places_by_name(kind: TableKind, header: Sequence[str]) -> np.ndarray | None:
     if missing or len(set(found)) < len(found):
         return None
     return _places(len(header), [at for at in found if at is not None])
+
+
+def split_kind(kind: TableKind, header: Sequence[str]) -> TableKind | None:
+    """The kind with its stamp in two columns, where the header names both; None elsewhere."""
+    words = [_plain(name) for name in header]
+    if not kind.known or None in (_column(words, SECONDS), _column(words, NANOSECONDS)):
+        return None
+    integers, known = ("seconds", "nanoseconds", *kind.integers[1:]), (SECONDS, NANOSECONDS, *kind.known[1:])
+    return replace(kind, integers=integers, known=known, split=True)
 
 
 def places_given(kind: TableKind, header: Sequence[str], columns: Sequence[str], n: int) -> np.ndarray | str:

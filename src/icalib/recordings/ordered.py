@@ -7,16 +7,18 @@ import numpy as np
 from icalib.errors import RecordingError
 from icalib.recordings.clocks import rate_sentence
 
-_CUT_SHARE = 0.3  # of readings with the stamp of the one before: more are no single bad ones
+_CUT_SHARE = 0.3  # of readings with the stamp of another: these are cut stamps
+_MOST_DOUBTFUL, _LEAST_LEFT = 0.1, 3  # of readings, beyond one stamp: more are no single bad ones
 
 
 def kept_readings(
     stamps_ns: np.ndarray, values: np.ndarray, what: str, rate_hz: tuple[float, float], thing: str, own: str
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """(N,) bool: which of the readings (N, m) to keep, each but those that repeat the one before, and a note on these.
+    """(N,) bool: which of the readings (N, m) to keep, and notes on the others: those that repeat the one before, and
+    those that differ although they have one stamp.
 
     what, thing, own: the words for the file, for one reading and for the advice on its stamps. Raises RecordingError
-    naming the instant: NaN, stamps out of order or repeated with other values, a rate outside of `rate_hz`.
+    naming the instant: NaN, stamps out of order or often repeated with other values, a rate outside of `rate_hz`.
     """
     bad = ~np.isfinite(values).all(axis=1)
     if bad.any():
@@ -30,22 +32,42 @@ def kept_readings(
         )
     if sentence := rate_sentence(what, stamps_ns, *rate_hz):
         raise RecordingError(sentence)
-    repeat = np.concatenate([[False], np.diff(stamps_ns) == 0])
-    differs = repeat.copy()
-    differs[1:] &= (np.diff(values, axis=0) != 0).any(axis=1)
-    if differs.sum() > _CUT_SHARE * len(differs):
-        raise RecordingError(
-            f"{what}: {int(differs.sum())} of {len(differs)} {thing}s have the stamp of the one before, as where "
-            f"stamps are cut to whole seconds or milliseconds; {own}, with all their digits."
-        )
+    differs, again = _one_stamp(stamps_ns, values)
+    _refuse_many(differs, stamps_ns, what, thing, own)
+    notes = ()
     if differs.any():
-        raise RecordingError(
-            f"{what}: two different {thing}s are both stamped {stamps_ns[np.argmax(differs)]} ns; {own}, or remove one."
+        notes += (
+            f"{what}: {int(differs.sum())} {thing}s have the stamp of another that differs, and which one is right is "
+            f"not known; they were left out, the first at {stamps_ns[np.argmax(differs)]} ns.",
         )
-    if not repeat.any():
-        return ~repeat, ()
-    first = stamps_ns[np.argmax(repeat)]
-    return ~repeat, (f"{what}: {int(repeat.sum())} repeated {thing}s were dropped, the first at {first} ns.",)
+    if again.any():
+        first = stamps_ns[np.argmax(again)]
+        notes += (f"{what}: {int(again.sum())} repeated {thing}s were dropped, the first at {first} ns.",)
+    return ~(differs | again), notes
+
+
+def _one_stamp(stamps_ns: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) bool each: which of the readings in order have the stamp of one with other values, and which others repeat
+    one before."""
+    same = np.diff(stamps_ns) == 0
+    group = np.concatenate([[0], np.cumsum(~same)])
+    unlike = same & (np.diff(values, axis=0) != 0).any(axis=1)
+    differs = np.isin(group, group[1:][unlike])
+    return differs, np.concatenate([[False], same]) & ~differs
+
+
+def _refuse_many(differs: np.ndarray, stamps_ns: np.ndarray, what: str, thing: str, own: str) -> None:
+    """Raises RecordingError where the readings `differs` (N,) are not single bad ones."""
+    share, n_stamps = differs.mean(), len(np.unique(stamps_ns[differs]))
+    if n_stamps < 2 and (~differs).sum() >= _LEAST_LEFT:
+        return
+    told = f"{what}: {int(differs.sum())} of {len(differs)} {thing}s have the stamp of another that differs"
+    if share > _CUT_SHARE and n_stamps > 1:
+        raise RecordingError(
+            f"{told}, as where stamps are cut to whole seconds or milliseconds; {own}, with all their digits."
+        )
+    if share > _MOST_DOUBTFUL:
+        raise RecordingError(f"{told}, the first {stamps_ns[np.argmax(differs)]} ns; {own}.")
 
 
 def longest_run(flag: np.ndarray) -> tuple[int, int]:

@@ -15,7 +15,7 @@ import numpy as np
 from icalib.errors import RecordingError
 from icalib.file_hashes import hash_of
 from icalib.recordings.clocks import POWERS_OF_NS, UNIT_WORDS, TimeUnit, is_rate, unit_of_stamps
-from icalib.recordings.columns import TableKind, contradicts, places_by_name, places_given
+from icalib.recordings.columns import TableKind, contradicts, places_by_name, places_given, split_kind
 from icalib.recordings.image_checks import Note, ignore
 from icalib.recordings.table_kernels import LEFT_OUT, POWERS, parse
 from icalib.recordings.unreadable import HEAD_BYTES, not_data
@@ -25,6 +25,8 @@ from icalib.unpacking import TooLargeError, gunzipped
 _GZIP_MAGIC = b"\x1f\x8b"
 _SEPARATORS = (",", ";", "\t", None)  # None: blanks
 _MOST_UNREADABLE = 0.1  # share of lines that may be left out; more of them are another format
+_NS = 1_000_000_000
+_MOST_SECONDS = 2**62 // _NS
 _WHOLE_NS = -1  # a power: stamps must be whole nanoseconds
 
 
@@ -53,13 +55,15 @@ def read_table(path: Path, kind: TableKind, layout: TableLayout = PLAIN_TABLE, n
     """Read a table of this kind. Its columns are told by `layout`, the names in its header, or their order; they are
     separated by commas, semicolons, tabs or blanks. Stamps become ns, from the unit that `layout` or their rate tells.
 
-    Blank lines, those that start with #, and a header are skipped; single lines that cannot be read are left out.
+    A stamp in two columns, seconds and nanoseconds, is joined where the header, or `layout`, names both. Blank lines,
+    those that start with #, and a header are skipped; single lines that cannot be read are left out.
     `note` is told of these, and of stamps in another unit. Integers are exact; decimals are within 1 ulp or two of the
     written number. Raises RecordingError naming file, line and column.
     """
     text = _text_of(path)
-    place = _places(text, kind, layout)
-    table, unit = _in_ns(text, kind, place, layout.time_unit)
+    table, unit = _joined(text, kind, layout), None
+    if table is None:
+        table, unit = _in_ns(text, kind, _places(text, kind, layout), layout.time_unit)
     if unit:
         note(
             f"{path}: the stamps are read as {UNIT_WORDS[unit]}, as their rate shows; `time_unit` in the rig file may "
@@ -68,6 +72,33 @@ def read_table(path: Path, kind: TableKind, layout: TableLayout = PLAIN_TABLE, n
     for sentence in table.notes:
         note(sentence)
     return table
+
+
+def _joined(text: _Text, kind: TableKind, layout: TableLayout) -> Table | None:
+    """The rows, where their stamps are seconds and nanoseconds in two columns; None elsewhere."""
+    split = split_kind(kind, layout.columns or text.header)
+    if split is None or (layout.columns and len(layout.columns) == len(kind.names)):
+        return None
+    place = _places(text, split, layout) if layout.columns else places_by_name(split, text.header)
+    if place is None:
+        return None
+    table = _table(text, split, place, 0)
+    seconds, rest = table.integers[:, 0], table.integers[:, 1]
+    good = (seconds > -_MOST_SECONDS) & (seconds < _MOST_SECONDS) & (rest >= 0) & (rest < _NS)
+    notes = table.notes
+    if not good.all():
+        names = [name for name, to in zip(text.header, place.tolist(), strict=False) if to in (0, 1)]
+        first = int(np.argmin(good))
+        sentence = (
+            f"{text.path}: {int((~good).sum())} of {len(good)} rows have no stamp, the first with {seconds[first]} and "
+            f"{rest[first]} in {' and '.join(names)}: nanoseconds are from 0 to {_NS - 1}"
+        )
+        if good.mean() < 1.0 - _MOST_UNREADABLE:
+            raise RecordingError(f"{sentence}; correct what writes them.")
+        notes += (f"{sentence}; they were left out.",)
+    stamps_ns = seconds[good] * _NS + rest[good]
+    integers = np.column_stack([stamps_ns, table.integers[good, 2:]])
+    return Table(text.path, integers, table.decimals[good], notes)
 
 
 def _in_ns(text: _Text, kind: TableKind, place: np.ndarray, given: TimeUnit | None) -> tuple[Table, TimeUnit | None]:
@@ -89,15 +120,19 @@ def _in_ns(text: _Text, kind: TableKind, place: np.ndarray, given: TimeUnit | No
 def holds(path: Path, kind: TableKind) -> bool:
     """Whether a table has the columns of this kind. Raises RecordingError as `read_table`."""
     text = _text_of(path)
-    return places_by_name(kind, text.header) is not None or text.columns == len(kind.names)
+    return _names_all(kind, text.header) or text.columns == len(kind.names)
 
 
 def named(path: Path, kind: TableKind) -> bool:
     """Whether the header of a table names the columns of this kind; not of what is no table at all."""
     try:
-        return places_by_name(kind, _text_of(path).header) is not None
+        return _names_all(kind, _text_of(path).header)
     except RecordingError:
         return False
+
+
+def _names_all(kind: TableKind, header: Sequence[str]) -> bool:
+    return places_by_name(split_kind(kind, header) or kind, header) is not None
 
 
 def _text_of(path: Path) -> _Text:
@@ -249,7 +284,7 @@ def _describe(text: _Text, kind: TableKind, line: int, place: np.ndarray, column
     except ValueError:
         return f"{spot}: {name} is {shown!r}, which is not a number; correct or remove the line."
     if not isfinite(number):
-        return f"{spot}: {name} is {shown}, which is not a finite number; remove the line."
+        return f"{spot}: {name} is {shown!r}, which is not a finite number; remove the line."
     if place[column] < len(kind.integers):
         hint = " (stamps in seconds are `time_unit: s` in the rig file)" if name.endswith("[ns]") else ""
         return f"{spot}: {name} is {shown}, but must be a whole number below 2^63{hint}."

@@ -8,6 +8,7 @@ import numpy as np
 
 from icalib.errors import RecordingError
 from icalib.measurements import TrackStream
+from icalib.recordings.camera_checks import in_image, outside_note
 from icalib.recordings.clocks import rate_sentence
 from icalib.recordings.columns import STAMP, TableKind
 from icalib.recordings.image_checks import Note, ignore
@@ -36,7 +37,7 @@ def read_tracks(
     what was left out.
 
     Raises RecordingError naming file and line or instant: a table that cannot be read, images out of order or at an
-    impossible rate, a feature that appears twice in an image or lies outside it, and tracks of one image only.
+    impossible rate, a feature that appears twice in an image, many outside of it, and tracks of one image only.
     """
     table = read_table(path, _KIND, layout)
     for sentence in table.notes:
@@ -54,11 +55,24 @@ def read_tracks(
     stream = TrackStream(
         name, stamps_ns[first], np.append(first, len(stamps_ns)).astype(np.int64), feature, np.ascontiguousarray(uv)
     )
-    _check(stream, what, resolution)
+    inside = in_image(stream.uv, resolution, _MARGIN_PX)
+    if not inside.all():
+        first = stream.feature[np.argmin(inside)]
+        note(outside_note(stream, inside, f"feature {first}", what, resolution))
+        stream = _those(stream, inside)
+    _check(stream, what)
     return stream
 
 
-def _check(stream: TrackStream, what: str, resolution: tuple[int, int]) -> None:
+def _those(stream: TrackStream, kept: np.ndarray) -> TrackStream:
+    """The observations kept (N,); an image that has none left is gone."""
+    count = np.bincount(stream.image[kept], minlength=len(stream.stamps_ns))
+    seen = count > 0
+    start = np.concatenate([[0], np.cumsum(count[seen])]).astype(np.int64)
+    return TrackStream(stream.name, stream.stamps_ns[seen], start, stream.feature[kept], stream.uv[kept])
+
+
+def _check(stream: TrackStream, what: str) -> None:
     key = np.lexsort((stream.feature, stream.image))
     repeated = key[1:][(np.diff(stream.feature[key]) == 0) & (np.diff(stream.image[key]) == 0)]
     if len(repeated):
@@ -70,16 +84,6 @@ def _check(stream: TrackStream, what: str, resolution: tuple[int, int]) -> None:
     sentence = rate_sentence(what, stream.stamps_ns, *_RATE_HZ) if len(stream.stamps_ns) > 1 else None
     if sentence:
         raise RecordingError(sentence)
-    high = np.array(resolution) - 0.5 + _MARGIN_PX
-    inside = ((stream.uv >= -0.5 - _MARGIN_PX) & (stream.uv <= high)).all(axis=1)
-    if not inside.all():
-        row = int(np.argmin(inside))
-        u, v = stream.uv[row]
-        raise RecordingError(
-            f"{what}: in the image at {stream.stamps_ns[stream.image[row]]} ns, feature {stream.feature[row]} lies at "
-            f"({u:.1f}, {v:.1f}), outside the image of {resolution[0]} x {resolution[1]} px; "
-            "check the camera's resolution [width, height] in the rig file."
-        )
     if np.unique(stream.feature).size == len(stream.feature):
         raise RecordingError(
             f"{what}: no feature is in more than one image; a point keeps its number from image to image."

@@ -25,6 +25,7 @@ SIDES: dict[WheelDrive, tuple[str, ...]] = {
 UNITS: dict[WheelMeasure, str] = {"rates": "rad/s", "angles": "rad", "ticks": "ticks"}
 TWIST = ("v [m/s]", "w [rad/s]")
 _LONGEST_STEP_S = 0.5  # over which a yaw rate is taken to last
+_MOST_PARTIAL = 0.1  # of messages with joints of the wheels, where some are missing: more are a driver's habit
 _ALIGNED, _SCATTERED = 0.9, 0.7  # of directions: how long their mean is, 1 where all are the same
 RELATIVE_POSES = TableKind(
     ("from [ns]", "to [ns]"), ("yaw [rad]", "x [m]", "y [m]", "yaw yaw", "yaw x", "yaw y", "x x", "x y", "y y")
@@ -151,7 +152,8 @@ def _in_the_world(twists: Twists) -> bool:
 
 def read_wheel_joints(wheels: Wheels, joints: Joints, what: str) -> WheelReadings:
     """The wheels' joints. Raises RecordingError naming the topic (`what`): relative poses, which joints do not have,
-    joints that are not there or not sent together, and what they do not say."""
+    joints that are not there or not sent together, and what they do not say. Single messages where
+    some are NaN stay, to be left out with a note."""
     if wheels.measures == "poses":
         raise RecordingError(f"{what}: bags hold no relative poses; set `measures` of {wheels.name} in the rig file.")
     own = _own_joints(wheels, joints.names, what)
@@ -172,14 +174,13 @@ def read_wheel_joints(wheels: Wheels, joints: Joints, what: str) -> WheelReading
         have = "has" if len(missing) == 1 else "have"
         raise RecordingError(f"{what}: {' and '.join(missing)} {have} no {field}; {advice}.")
     _refuse_zeros(wheels, joints, own, what)
-    both = sent.all(axis=1)
-    if (sent.any(axis=1) & ~both).any():
-        at = joints.stamps_ns[np.argmax(sent.any(axis=1) & ~both)]
+    some, all_ = sent.any(axis=1), sent.all(axis=1)
+    if (some & ~all_).sum() > _MOST_PARTIAL * some.sum():
         raise RecordingError(
-            f"{what}: the message at {at} ns has only one of {' and '.join(own)}; let the driver send "
-            f"{'both' if len(own) == 2 else 'all'} together."
+            f"{what}: the message at {joints.stamps_ns[np.argmax(some & ~all_)]} ns has only one of "
+            f"{' and '.join(own)}; let the driver send {'both' if len(own) == 2 else 'all'} together."
         )
-    return WheelReadings(wheels.name, joints.stamps_ns[both], value[both])
+    return WheelReadings(wheels.name, joints.stamps_ns[some], value[some])
 
 
 def _refuse_zeros(wheels: Wheels, joints: Joints, own: tuple[str, ...], what: str) -> None:
