@@ -28,6 +28,7 @@ from icalib.cli import main
 MOST_BYTES = 2_000_000_000
 _ADDRESS_SPACE = 12 << 30  # what asks for more has lost its measure
 _QUOTED = re.compile(r"(?<!\w)'([^'\n]*)'")
+_PLACE = re.compile(r"^icalib: \S+:\d+: [\w.\[\]-]+: ")  # file, line and field
 _NO_NUMBER = re.compile(r"(?<!\w)[-+.]?(nan|inf)(?!\w)", re.IGNORECASE)
 _MADE = ("made", "made.json", "made.yaml", "made.bag", "made.rrd", "made.urdf")
 
@@ -93,13 +94,14 @@ def refused_inputs(unchanged: list[Case], good: Path, place: Path, seconds: floa
 
 
 def says_no_number(said: str, content: bytes) -> bool:
-    """Whether a sentence says nan or inf other than by quoting what the changed file has, its blanks made one."""
+    """Whether a sentence says nan or inf other than as a field's name or by quoting the changed file, its blanks made
+    one."""
     there = " ".join(content.decode(errors="backslashreplace").split())
 
     def rest(match: re.Match[str]) -> str:
         return "" if match[1].removesuffix("...").strip() in there else match[0]
 
-    return _NO_NUMBER.search(_QUOTED.sub(rest, said)) is not None
+    return _NO_NUMBER.search(_QUOTED.sub(rest, _PLACE.sub("", said))) is not None
 
 
 def holds_no_number(path: Path) -> bool:

@@ -43,6 +43,8 @@ def test_some_cases():
         ("icalib: a.yaml:1: must be a mapping, but is 'nan nan nan ...'.\n", b"nan\nnan\nnan\nnan\n", False),
         ("icalib: a.csv:3: wx [rad/s] is '-inf', which is not a number.\n", b"1,-inf,3\n", False),
         ("icalib: cam0's offset is '.nan', imu0's is 1.\n", b"offset: .nan\n", False),
+        ("icalib: cam.yaml:10: sensors.imu0.noise.nan: there is no such field.\n", b"nan: 1", False),
+        ("icalib: cam.yaml:10: sensors.imu0.noise: is nan, but must be above 0.\n", b"noise: nan", True),
         ("icalib: cam0 is nan px off.\n", b"offset: nan\n", True),
         ("icalib: cam0 is 'nan' px off.\n", b"offset: 1\n", True),
         ("icalib: cam0's shift is 0 to inf, imu0's 1.\n", b"inf", True),

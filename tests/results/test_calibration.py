@@ -192,3 +192,39 @@ def test_a_warning_where_halves_disagree_by_more_than_is_printed(calibration: Ca
 def test_group_lists_what_there_is(calibration: Calibration):
     with pytest.raises(KeyError, match="cam0.rotation"):
         calibration.group("cam0", "focus")
+
+
+SPOILT: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "short": lambda a: a[: len(a) // 2],
+    "flat": lambda a: a.ravel(),
+    "long": lambda a: np.concatenate([a, a]),
+    "axis": lambda a: a[..., None],
+    "text": lambda a: a.astype(np.str_),
+    "complex": lambda a: a.astype(complex),
+}
+ARRAYS = ("trajectory/position", "imu_residuals/whitened", "lidars/lidar0/world", "wheels/wheel0/whitened")
+
+
+@pytest.mark.parametrize("how", SPOILT)
+@pytest.mark.parametrize("name", [*ARRAYS, "corners/cam0/uv", "corners/cam0/start", "covariance"])
+def test_arrays_that_do_not_fit_the_others(robot: Calibration, tmp_path: Path, name: str, how: str):
+    robot.save(tmp_path)
+    with np.load(tmp_path / "result.npz") as file:
+        arrays = {key: file[key] for key in file.files}
+    spoilt = SPOILT[how](arrays[name])
+    same = spoilt.shape == arrays[name].shape and spoilt.dtype == arrays[name].dtype  # what is flat stays so
+    np.savez(tmp_path / "result.npz", **(arrays | {name: spoilt}))
+    change(tmp_path, npz_sha256=hashlib.sha256((tmp_path / "result.npz").read_bytes()).hexdigest())
+    if same:
+        load_calibration(tmp_path)
+    else:
+        sentence_of(tmp_path)
+
+
+@pytest.mark.parametrize("at", [0, 3, -1])
+def test_images_that_do_not_divide_their_corners(calibration: Calibration, tmp_path: Path, at: int):
+    r = calibration.corner_residuals[0]
+    start = r.start.copy()
+    start[at] += 10**6
+    dataclasses.replace(calibration, corner_residuals=(dataclasses.replace(r, start=start),)).save(tmp_path)
+    assert "start of cam0 does not divide its points among its images" in sentence_of(tmp_path)

@@ -24,6 +24,7 @@ from icalib.calibration.result import (
     Trajectory,
 )
 from icalib.calibration.robot import LidarResiduals, Plane, PoseResiduals, WheelResiduals
+from icalib.calibration.shapes import check_arrays
 from icalib.calibration.summary import calibration_yaml
 from icalib.errors import CalibrationError
 from icalib.file_names import NAME
@@ -223,6 +224,7 @@ def _check(c: Calibration) -> None:
     for name in c.rig["sensors"]:
         if not NAME.fullmatch(name):
             raise ValueError(f"{name!r} is no name of a sensor")
+    check_arrays(c)
     if c.covariance.shape != (n, n):
         raise ValueError(f"the covariance has shape {c.covariance.shape}, but {n} names")
     for g in c.groups:
