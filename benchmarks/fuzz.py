@@ -80,7 +80,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument(
         "--covering", action="store_true", help="of these cases the fewest of all kinds, without workers"
     )
-    parser.add_argument("--seconds", type=float, default=60.0, help="a command that takes longer hangs")
+    parser.add_argument("--seconds", type=float, default=60.0, help="of CPU time; a command that takes longer hangs")
     parser.add_argument("--minutes", type=float, default=0.0, help="stop after so long; 0: never")
     parser.add_argument("--verbose", action="store_true", help="say what each case ended with")
     return parser.parse_args()

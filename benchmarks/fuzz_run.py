@@ -26,6 +26,7 @@ from fuzz_mutators import mutate
 from icalib.cli import main
 
 MOST_BYTES = 2_000_000_000
+_WAITS = 10.0  # times the limit of CPU time may pass on the clock: other processes run, too
 _ADDRESS_SPACE = 12 << 30  # what asks for more has lost its measure
 _QUOTED = re.compile(r"(?<!\w)'([^'\n]*)'")
 _PLACE = re.compile(r"^icalib: \S+:\d+: [\w.\[\]-]+: ")  # file, line and field
@@ -132,7 +133,7 @@ def _forked(work: Path, command: list[str], seconds: float) -> tuple[int, str, i
         os.close(readable)
         _child(work, command, writable, seconds)
     os.close(writable)
-    ends, text = time.monotonic() + seconds, b""
+    ends, text = time.monotonic() + _WAITS * seconds, b""
     while (left := ends - time.monotonic()) > 0 and select.select([readable], [], [], left)[0]:
         block = os.read(readable, 1 << 16)
         if not block:
@@ -143,8 +144,9 @@ def _forked(work: Path, command: list[str], seconds: float) -> tuple[int, str, i
     if hung:
         os.kill(child, signal.SIGKILL)
     _, status, usage = os.wait4(child, 0)
-    code, said = -1, f"no answer within {seconds:g} s" if hung else f"died: status {status}"
-    if hung:
+    spent = usage.ru_utime + usage.ru_stime
+    code, said = -1, f"no answer within {spent:.0f} s of CPU time" if hung or spent > seconds else f"died: {status}"
+    if not text.endswith(b"\n"):
         said += "\n" + (work.parent.parent.parent / "said").read_text(errors="replace")
     if text.endswith(b"\n"):
         found = json.loads(text)
@@ -161,7 +163,8 @@ def _child(work: Path, command: list[str], writable: int, seconds: float) -> Non
         os.dup2(nowhere.fileno(), 1)
         os.dup2(said.fileno(), 2)
         sys.stdout, sys.stderr = nowhere, said
-        faulthandler.dump_traceback_later(0.9 * seconds, file=said)  # says where a command hangs
+        faulthandler.register(signal.SIGXCPU, file=said, chain=False)  # says where a command hangs
+        resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(seconds), math.ceil(seconds) + 2))
         warnings.simplefilter("ignore", RuntimeWarning)  # as at a terminal
         try:
             code = main(command)
@@ -169,7 +172,6 @@ def _child(work: Path, command: list[str], writable: int, seconds: float) -> Non
             code = stop.code if isinstance(stop.code, int) else -1
         except BaseException:
             traceback.print_exc()
-        faulthandler.cancel_dump_traceback_later()
         said.flush()
         said.seek(0)
         answer = json.dumps({"code": code, "said": said.read()[-20000:]}) + "\n"
