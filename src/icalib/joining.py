@@ -142,10 +142,13 @@ def join_corners(streams: list[tuple[CornerStream, int]]) -> CornerStream:
     stamps = np.concatenate([s.stamps_ns + np.int64(shift) for s, shift in streams])
     start = np.concatenate([[0], np.cumsum(np.concatenate([np.diff(s.start) for s, _ in streams]))])
     point, uv = np.concatenate([s.point for s, _ in streams]), np.concatenate([s.uv for s, _ in streams])
-    stated = all(len(s.sigma) == len(s.uv) for s, _ in streams)
-    sigma = np.concatenate([s.sigma for s, _ in streams]) if stated else np.zeros(0)
-    start, name = start.astype(np.int64), streams[0][0].name
-    return CornerStream(name, stamps, start, point, uv, sigma=sigma, joins_ns=_joins(streams))
+    stated = {
+        field: np.concatenate([getattr(s, field) for s, _ in streams])
+        for field in ("sigma", "edges")
+        if all(len(getattr(s, field)) == len(s.uv) for s, _ in streams)
+    }
+    name, start = streams[0][0].name, start.astype(np.int64)
+    return CornerStream(name, stamps, start, point, uv, joins_ns=_joins(streams), **stated)
 
 
 def join_scans(streams: list[tuple[LidarStream, int]]) -> LidarStream:

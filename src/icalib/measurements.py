@@ -9,6 +9,9 @@ import numpy as np
 
 from icalib.errors import RecordingError
 
+EDGE = 7  # numbers that say how an edge was fitted: see `CornerStream`
+NO_EDGES = np.zeros((0, 2, EDGE), dtype=np.float32)
+
 
 def _check(condition: bool, sentence: str) -> None:
     if not condition:
@@ -56,6 +59,11 @@ class CornerStream:
     start[i]:start[i+1]; point (N,) int64, index into the target's points; uv (N, 2) pixels, (0, 0) is the
     centre of the top-left pixel; sigma (N,) pixels, the detector's standard deviation of each corner per axis up to a
     factor common to all, (0,) where it states none.
+
+    edges (N, 2, EDGE) float32, (0, 2, EDGE) where it states none: the two edges that meet in each corner, as they were
+    fitted. Columns: the piece of the edge that was used, from (2,) and to (2,) px beside the corner; gain (2,) px^2, by
+    how much the corner moves where the piece's curvature is larger than the fitted one; that curvature [1 / px]. The
+    curvature is positive where the piece, as u is to the right and v down, turns to the left on its way.
     """
 
     name: str
@@ -64,6 +72,7 @@ class CornerStream:
     point: np.ndarray
     uv: np.ndarray
     sigma: np.ndarray = field(default_factory=lambda: np.zeros(0), kw_only=True)
+    edges: np.ndarray = field(default_factory=lambda: NO_EDGES, kw_only=True)
     joins_ns: tuple[int, ...] = field(default=(), kw_only=True)  # the first stamp of each further recording joined
 
     def __post_init__(self) -> None:
@@ -75,12 +84,14 @@ class CornerStream:
         _check(self.uv.shape == (n, 2), f"{self.name}: uv must have shape ({n}, 2), not {self.uv.shape}.")
         stated = self.sigma.shape in ((0,), (n,)) and bool((self.sigma > 0.0).all())
         _check(stated, f"{self.name}: sigma must be positive, one for each of the {n} corners or none.")
+        fits = self.edges.shape in (NO_EDGES.shape, (n, 2, EDGE))
+        _check(fits, f"{self.name}: edges must have shape ({n}, 2, {EDGE}), not {self.edges.shape}.")
 
     def of_rows(self, rows: np.ndarray, stamps_ns: np.ndarray, count: np.ndarray) -> CornerStream:
         """The corners of `rows` (indices or a mask), grouped into images at stamps_ns (M,) with count (M,) each."""
         start = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
-        sigma = self.sigma[rows] if len(self.sigma) else self.sigma
-        return CornerStream(self.name, stamps_ns, start, self.point[rows], self.uv[rows], sigma=sigma)
+        sigma, edges = (x[rows] if len(x) else x for x in (self.sigma, self.edges))
+        return CornerStream(self.name, stamps_ns, start, self.point[rows], self.uv[rows], sigma=sigma, edges=edges)
 
     @property
     def relative_sigma(self) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 from scipy.optimize import least_squares
 from scipy.special import erf
 
@@ -72,7 +73,7 @@ def test_fit_step_is_the_least_squares_fit(side):
     middle = np.array([30.0, 31.0])
     image = step_image(normal, normal @ middle, 1.1, size=62, noise=3.0)
     p0, p1 = middle - 0.5 * side * along, middle + 0.5 * side * along
-    place, blur, contrast, variance = fit_step(image, *p0, *p1, 3.0, 3.5)
+    place, blur, contrast, at_ends = fit_step(image, *p0, *p1, 3.0, 3.5)
 
     v, u = np.indices(image.shape)
     t = ((u - middle[0]) * along[0] + (v - middle[1]) * along[1]) / (0.5 * side)
@@ -87,9 +88,18 @@ def test_fit_step_is_the_least_squares_fit(side):
     fit = least_squares(residual, [0.0, 0.0, 1.0, 40.0, 200.0, 0.0], xtol=1e-14, ftol=1e-14, gtol=1e-14)
     np.testing.assert_allclose(place, fit.x[[0, 1, 5]] * [1, 1, bend], atol=1e-4)
     assert (blur, contrast) == pytest.approx((fit.x[2], fit.x[4] - fit.x[3]), rel=1e-4)
-    J = fit.jac if bend else fit.jac[:, :5]
-    ends = np.array([[1.0, s, 0, 0, 0, 1.0][: J.shape[1]] for s in (-1.0, 1.0)])
-    np.testing.assert_allclose(variance, np.diag(ends @ np.linalg.inv(J.T @ J) @ ends.T), rtol=1e-3)
+    J = fit.jac[:, :5]
+    ends = np.array([[1.0, s, 0, 0, 0] for s in (-1.0, 1.0)])
+    np.testing.assert_allclose(at_ends[:, 0], np.diag(ends @ np.linalg.inv(J.T @ J) @ ends.T), rtol=1e-3)
+
+    def with_bend(b):
+        z = lambda p: d[used] - p[0] - p[1] * t[used] - b * t[used] ** 2  # noqa: E731
+        step = lambda p: 0.5 * (1.0 + erf(z(p) / (np.sqrt(2.0) * p[2])))  # noqa: E731
+        fixed = least_squares(lambda p: p[3] + (p[4] - p[3]) * step(p) - image[used], fit.x[:5], xtol=1e-14, gtol=1e-14)
+        return ends @ fixed.x + b
+
+    b = fit.x[5] * bend
+    np.testing.assert_allclose(at_ends[:, 1], (with_bend(b + 1e-2) - with_bend(b - 1e-2)) / 2e-2, atol=3e-3)
 
 
 def test_no_step_where_there_is_none_or_the_image_ends():
@@ -109,7 +119,7 @@ def test_sides_of_a_bent_quad_meet_in_its_corners():
         grey = grey * 0.5 * (1.0 + erf(d / np.sqrt(2.0)))
     image = 200.0 - 160.0 * grey
     quad = np.array([(20.4, 19.7), (80.3, 20.2), (79.8, 80.4), (19.6, 79.9)])
-    corners, sigma, blur = fit_corners(image, quad, 3.0, 4.0)
+    corners, sigma, blur, _ = fit_corners(image, quad, 3.0, 4.0)
     np.testing.assert_allclose(corners, [(20, 20), (80, 20), (80, 80), (20, 80)], atol=0.01)
     np.testing.assert_allclose(blur, 1.0, rtol=0.02)
     assert (sigma > 0.0).all()
@@ -141,7 +151,82 @@ def test_fit_crossing_is_the_least_squares_fit(turned):
     fit = least_squares(lambda p: (model(p) - image)[used], p_true, xtol=1e-14, ftol=1e-14, gtol=1e-14)
     np.testing.assert_allclose(found[:2], fit.x[:2], atol=1e-3)
     sigma = np.sqrt(0.5 * np.trace(np.linalg.inv(fit.jac.T @ fit.jac)[:2, :2]))
-    assert found[2:] == pytest.approx((sigma, 2.0 * fit.x[5]), rel=1e-2)
+    assert found[2:4] == pytest.approx((sigma, 2.0 * fit.x[5]), rel=1e-2)
+
+
+def bent_distance(u, v, corner, along, curvature):
+    """From the edge through the corner along `along`, positive to its left, which bends to the left."""
+    along = along / np.linalg.norm(along)
+    x, y = u - corner[0], v - corner[1]
+    t, d = along[0] * x + along[1] * y, along[1] * x - along[0] * y
+    # The distance from a circle, not from a parabola.
+    return d if curvature == 0.0 else 1.0 / curvature - np.sign(curvature) * np.hypot(t, d - 1.0 / curvature)
+
+
+def covered(distance):
+    """Share of each of the 8 x 8 parts of a pixel that lies at positive distances [px]."""
+    return np.clip(0.5 + 8.0 * distance, 0.0, 1.0)
+
+
+def photographed(dark, blur):
+    """(60, 60) greys of the dark share (480, 480) of 8 x 8 parts of each pixel, blurred."""
+    fine = gaussian_filter(200.0 - 160.0 * dark, 8.0 * blur)
+    return fine.reshape(60, 8, 60, 8).mean(axis=(1, 3))
+
+
+FINE_V, FINE_U = (np.indices((480, 480)) + 0.5) / 8.0 - 0.5
+CURVATURES = [(0.004, 0.0), (0.0, -0.004), (-0.003, 0.005)]  # 1 / px: of a lens that bends much
+
+
+@pytest.mark.parametrize("curvature", CURVATURES)
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_crossing_moves_to_its_place_where_the_curvature_is_known(curvature, turned):
+    ea, eb, corner = np.array([30.0, 6.0]), np.array([-4.0, 28.0]), np.array([30.3, 29.6])
+    la = bent_distance(FINE_U, FINE_V, corner, ea, curvature[0])
+    lb = bent_distance(FINE_U, FINE_V, corner, eb, curvature[1])
+    a, b = covered(la), covered(lb)
+    image = photographed(a * (1.0 - b) + (1.0 - a) * b, 0.9)
+    blur = np.hypot(0.9, np.sqrt(1.0 / 12.0))
+    sides, known = ((eb, ea), curvature[::-1]) if turned else ((ea, eb), curvature)
+    surroundings = np.array([0.5, np.inf, np.inf])
+    u, v, _, _, edges = fit_crossing(image, 30.0, 30.0, *sides, surroundings, blur, blur, 2.0)
+    found = np.array([u, v])
+    assert np.linalg.norm(found - corner) > 0.01
+    assert (edges[:, 6] == 0.0).all()
+    np.testing.assert_allclose(found + np.array(known) @ edges[:, 4:6], corner, atol=0.002)
+    for edge, side in zip(edges, sides, strict=True):
+        np.testing.assert_allclose(edge[2:4], 6.0 * side / np.linalg.norm(side), rtol=0.05)
+        np.testing.assert_array_equal(edge[:2], -edge[2:4])
+
+
+@pytest.mark.parametrize("curvature", CURVATURES)
+@pytest.mark.parametrize("length", [18.0, 36.0])
+def test_corners_of_a_quad_move_to_their_places_where_curvatures_are_known(curvature, length):
+    """Short sides are fitted as straight ones, long ones with a bend, and noise makes the fitted bend another one."""
+    quad = 30.0 + length * (np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]) - 0.5) + 0.2
+    dark = np.ones_like(FINE_U)
+    of_side = (curvature[0], curvature[1], 0.0, 0.0)
+    for k, c in enumerate(of_side):
+        middle, along = 0.5 * (quad[k] + quad[(k + 1) % 4]), quad[(k + 1) % 4] - quad[k]
+        across = np.array([along[1], -along[0]]) / length
+        sagitta = 0.0 if c == 0.0 else 1.0 / c - np.sign(c) * np.sqrt(1.0 / c**2 - 0.25 * length**2)
+        dark *= covered(-bent_distance(FINE_U, FINE_V, middle - sagitta * across, along, c))
+    image = photographed(dark, 0.9)
+    rng, before, after = np.random.default_rng(0), [], []
+    for _ in range(40):
+        corners, sigma, _, edges = fit_corners(image + 2.0 * rng.standard_normal(image.shape), quad, 3.0, 4.0)
+        known = np.array([[of_side[k], of_side[k - 1]] for k in range(4)])
+        moved = corners + ((known - edges[:, :, 6])[:, :, None] * edges[:, :, 4:6]).sum(axis=1)
+        before, after = [*before, corners - quad], [*after, moved - quad]
+        np.testing.assert_allclose(edges[:, 0, 2:4], np.roll(quad, -1, axis=0) - quad)
+        np.testing.assert_allclose(edges[:, 1, :2], np.roll(quad, 1, axis=0) - quad)
+    assert np.abs(np.mean(after, axis=0)).max() < 0.01
+    scatter = np.sqrt(np.var(after, axis=0).mean())
+    assert scatter == pytest.approx(2.0 * np.sqrt((sigma**2).mean()), rel=0.15)
+    if length > 24.0:
+        assert scatter < 0.9 * np.sqrt(np.var(before, axis=0).mean())
+    else:
+        assert np.abs(np.mean(before, axis=0)).max() > 0.03
 
 
 def test_no_crossing_where_there_is_none_or_it_is_too_oblique_or_too_near_the_border():

@@ -102,7 +102,7 @@ class AprilGridDetector:
             uv, quality = refined_crossings(image, quads[tags], np.array([self.tag_spacing, self._border, np.inf]))
         else:
             uv, quality = refined_corners(image, quads[tags], self._clear)
-        uv, quality = uv.reshape(-1, 2), quality.reshape(5, -1)
+        uv, quality = uv.reshape(-1, 2), quality.reshape(len(quality), -1)
         point = (4 * tags[:, None] + APRILTAG_CORNER).ravel()
         consistent = consistent_corners(uv, self._board[tags].reshape(-1, 2), np.isfinite(quality[0]), quality[4])
         return judged(point, uv, quality, consistent)

@@ -18,8 +18,8 @@ from icalib.recordings import Payload
 from icalib.staging import staged
 from icalib.unpacking import load_arrays
 
-VERSION = 3  # of the detectors and of the format: whatever changes corners changes this
-_FIELDS = ("point", "uv", "sigma", "blur", "verdict")
+VERSION = 4  # of the detectors and of the format: whatever changes corners changes this
+_FIELDS = ("point", "uv", "sigma", "blur", "verdict", "edges")
 
 
 def cache_folder() -> Path:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from itertools import pairwise
 
 import numpy as np
 
 from icalib.errors import RecordingError
-from icalib.measurements import CornerStream
+from icalib.measurements import EDGE, NO_EDGES, CornerStream
 
 IMAGE_NOISE = 2.0  # grey levels, assumed of every image: the sigmas are right up to this common factor
 MODEL_SIGMA_PX = 0.02  # what sampling, printing and the lens add to the noise's share
@@ -26,7 +26,8 @@ class ImageCorners:
 
     point (N,) int64, index into the target's points, each at most once; uv (N, 2) px, (0, 0) is the centre of the
     top-left pixel; sigma (N,) px, the expected standard deviation per axis; blur (N,) px, of a Gaussian;
-    verdict (N,) int8, index into `VERDICTS`.
+    verdict (N,) int8, index into `VERDICTS`; edges (N, 2, EDGE) float32, as in `CornerStream`, zeros where they
+    are not given.
     """
 
     point: np.ndarray
@@ -34,6 +35,11 @@ class ImageCorners:
     sigma: np.ndarray
     blur: np.ndarray
     verdict: np.ndarray
+    edges: np.ndarray = field(default_factory=lambda: NO_EDGES)
+
+    def __post_init__(self) -> None:
+        if len(self.edges) != len(self.point):
+            object.__setattr__(self, "edges", np.zeros((len(self.point), *NO_EDGES.shape[1:]), dtype=np.float32))
 
     @property
     def kept(self) -> np.ndarray:
@@ -72,9 +78,10 @@ def judged(
     nearest other feature is less than 1.5 px + 1.5 blurs away (L-corners: 1.5 px + 2.25 blurs; cells of a tag in the
     dark field: 1 px + 1.5 blurs; markers in the white one: 0.5 px + 1.5 blurs). faint: sigma is above 0.25 px.
 
-    point (N,) int64; uv (N, 2) px; quality (5, N) as `refined_crossings` gives it; consistent (N,) bool.
+    point (N,) int64; uv (N, 2) px; quality (5, N), or with edges (5 + 2 EDGE, N), as `refined_crossings` gives it;
+    consistent (N,) bool.
     """
-    unit_sigma, blur, sine, room_px, _ = quality
+    unit_sigma, blur, sine, room_px, _ = quality[:5]
     rows = np.flatnonzero(np.isfinite(unit_sigma))
     rows = rows[np.argsort(point[rows], kind="stable")]
     sigma = np.hypot(IMAGE_NOISE * unit_sigma[rows], MODEL_SIGMA_PX)
@@ -83,7 +90,8 @@ def judged(
     verdict[~(room_px[rows] >= 0.0)] = BLURRED
     verdict[sine[rows] < np.sin(np.radians(LEAST_ANGLE_DEG))] = OBLIQUE
     verdict[~consistent[rows]] = INCONSISTENT
-    return ImageCorners(point[rows].astype(np.int64), uv[rows], sigma, blur[rows], verdict)
+    edges = quality[5:, rows].T.reshape(-1, 2, EDGE).astype(np.float32)
+    return ImageCorners(point[rows].astype(np.int64), uv[rows], sigma, blur[rows], verdict, edges)
 
 
 def corner_stream(name: str, stamps_ns: np.ndarray, images: Sequence[ImageCorners]) -> CornerStream:
@@ -104,7 +112,8 @@ def corner_stream(name: str, stamps_ns: np.ndarray, images: Sequence[ImageCorner
     point = np.concatenate([np.zeros(0, dtype=np.int64)] + [image.point[image.kept] for image in images])
     uv = np.concatenate([np.zeros((0, 2))] + [image.uv[image.kept] for image in images])
     sigma = np.concatenate([np.zeros(0)] + [image.sigma[image.kept] for image in images])
-    return CornerStream(name, stamps_ns, start, point, uv, sigma=sigma)
+    edges = np.concatenate([NO_EDGES] + [image.edges[image.kept] for image in images])
+    return CornerStream(name, stamps_ns, start, point, uv, sigma=sigma, edges=edges)
 
 
 def checked_image(image: np.ndarray) -> np.ndarray:

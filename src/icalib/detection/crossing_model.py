@@ -14,6 +14,7 @@ from numba import njit
 
 from icalib.detection.edge_model import solve_small
 from icalib.detection.saddles import LEAST_SINE, MARGIN_BLURS, room_for, window_bounds, window_frame
+from icalib.measurements import EDGE
 
 _ITERATIONS = 12
 _CONVERGED_PX = 2e-3
@@ -25,25 +26,27 @@ _SIZE = 6  # u, v, two angles, mean, contrast
 
 @njit(cache=True, nogil=True)
 def fit_crossing(image, u, v, ea, eb, surroundings, blur_a, blur_b, most_move):
-    """(u, v, sigma, contrast) of the X-corner near (u, v); sigma is NaN where there is none within `most_move` px.
+    """(u, v, sigma, contrast, edges (2, EDGE)) of the X-corner near (u, v); sigma is NaN where there is none within
+    `most_move` px.
 
     ea, eb (2,) px are the sides of the dark square that meet in the corner, blur_a, blur_b [px] the blur across them.
     `surroundings` (3,), in units of the sides: how far the nearest other feature is across either edge, and how far
     from both edges at once features begin in the dark fields and in the white ones, inf if there are none. sigma [px]
-    is the standard deviation per axis for a noise of one grey level, contrast the grey levels between dark and light.
+    is the standard deviation per axis for a noise of one grey level, contrast the grey levels between dark and light;
+    edges as in `CornerStream`.
     """
-    blur = max(blur_a, blur_b)
+    edges, blur = np.zeros((2, EDGE)), max(blur_a, blur_b)
     most = max(_MOST_WINDOW[0], _MOST_WINDOW[1] * blur)
     sa, sb, sine = window_frame(ea, eb, surroundings[0], blur, LEAST_WINDOW_PX, most)
     room = room_for(image, u, v, ea, eb, sa, sb)
     narrow = min(sa * hypot(ea[0], ea[1]), sb * hypot(eb[0], eb[1])) * sine
     if sine < LEAST_SINE or room * narrow < 0.99 * LEAST_WINDOW_PX:
-        return u, v, np.nan, 0.0
+        return u, v, np.nan, 0.0, edges
     sa, sb = room * sa, room * sb
     margin = MARGIN_BLURS * blur / (sine * hypot(ea[0], ea[1])), MARGIN_BLURS * blur / (sine * hypot(eb[0], eb[1]))
     xs, ys, grey = _window(image, u, v, ea, eb, sa, sb, surroundings, margin)
     if len(grey) < 2 * _SIZE:
-        return u, v, np.nan, 0.0
+        return u, v, np.nan, 0.0, edges
     contrast = 0.5 * (grey.max() - grey.min())
     p = np.array([u, v, atan2(ea[1], ea[0]), atan2(eb[1], eb[0]), grey.mean(), contrast])
     turn = 1.0 if ea[0] * eb[1] - ea[1] * eb[0] > 0.0 else -1.0
@@ -55,10 +58,12 @@ def fit_crossing(image, u, v, ea, eb, surroundings, blur_a, blur_b, most_move):
         scale = min(1.0, _MOST_STEP_PX / max(largest, 1e-12))
         p += scale * step
         if hypot(p[0] - u, p[1] - v) > most_move or p[5] <= 0.0:
-            return u, v, np.nan, 0.0
+            return u, v, np.nan, 0.0, edges
         if largest < _CONVERGED_PX:
-            return p[0], p[1], _sigma(A), 2.0 * p[5]
-    return u, v, np.nan, 0.0
+            gain = _gain(A, p, xs, ys, turn, blur_a, blur_b)
+            _fill_edges(edges, ea, sa, eb, sb, gain)
+            return p[0], p[1], _sigma(A), 2.0 * p[5], edges
+    return u, v, np.nan, 0.0, edges
 
 
 @njit(cache=True, nogil=True)
@@ -80,24 +85,39 @@ def _window(image, u, v, ea, eb, sa, sb, surroundings, margin):
 
 
 @njit(cache=True, nogil=True)
+def _slopes(contrast, trig, x, y, turn, blur_a, blur_b):
+    """(Ea, Eb, da, db) at (x, y) from the point: the two steps, -1 to 1, and the grey's slope by the distance from
+    either edge: from the one along ea towards eb, and from the one along eb towards ea. trig (4,): cosine and sine of
+    either edge's angle."""
+    la, lb = turn * (trig[0] * y - trig[1] * x), turn * (trig[3] * x - trig[2] * y)
+    za, zb = la / (sqrt(2.0) * blur_a), lb / (sqrt(2.0) * blur_b)
+    Ea, Eb = erf(za), erf(zb)
+    da = -contrast * Eb * 2.0 / sqrt(pi) * exp(-za * za) / (sqrt(2.0) * blur_a)
+    db = -contrast * Ea * 2.0 / sqrt(pi) * exp(-zb * zb) / (sqrt(2.0) * blur_b)
+    return Ea, Eb, da, db
+
+
+@njit(cache=True, nogil=True)
+def _jacobian(J, trig, x, y, turn, Ea, Eb, da, db):
+    """Fills J (6,): the grey's derivative by the parameters."""
+    cos_a, sin_a, cos_b, sin_b = trig
+    J[0] = turn * (da * sin_a - db * sin_b)
+    J[1] = turn * (db * cos_b - da * cos_a)
+    J[2] = -turn * da * (sin_a * y + cos_a * x)
+    J[3] = turn * db * (cos_b * x + sin_b * y)
+    J[4], J[5] = 1.0, -Ea * Eb
+
+
+@njit(cache=True, nogil=True)
 def _accumulate(A, p, xs, ys, grey, turn, blur_a, blur_b):
     """Normal equations of the model at p: A is filled, the right side is returned."""
     A[:] = 0.0
     b, J = np.zeros(_SIZE), np.empty(_SIZE)
-    cos_a, sin_a, cos_b, sin_b = cos(p[2]), sin(p[2]), cos(p[3]), sin(p[3])
+    trig = cos(p[2]), sin(p[2]), cos(p[3]), sin(p[3])
     for i in range(len(xs)):
         x, y = xs[i] - p[0], ys[i] - p[1]
-        # Distance from the edge along ea towards eb, and from the one along eb towards ea.
-        la, lb = turn * (cos_a * y - sin_a * x), turn * (sin_b * x - cos_b * y)
-        za, zb = la / (sqrt(2.0) * blur_a), lb / (sqrt(2.0) * blur_b)
-        Ea, Eb = erf(za), erf(zb)
-        da = -p[5] * Eb * 2.0 / sqrt(pi) * exp(-za * za) / (sqrt(2.0) * blur_a)
-        db = -p[5] * Ea * 2.0 / sqrt(pi) * exp(-zb * zb) / (sqrt(2.0) * blur_b)
-        J[0] = turn * (da * sin_a - db * sin_b)
-        J[1] = turn * (db * cos_b - da * cos_a)
-        J[2] = -turn * da * (sin_a * y + cos_a * x)
-        J[3] = turn * db * (cos_b * x + sin_b * y)
-        J[4], J[5] = 1.0, -Ea * Eb
+        Ea, Eb, da, db = _slopes(p[5], trig, x, y, turn, blur_a, blur_b)
+        _jacobian(J, trig, x, y, turn, Ea, Eb, da, db)
         error = grey[i] - p[4] + p[5] * Ea * Eb
         for j in range(_SIZE):
             b[j] += J[j] * error
@@ -106,6 +126,36 @@ def _accumulate(A, p, xs, ys, grey, turn, blur_a, blur_b):
     for j in range(_SIZE):
         A[j, j] *= 1.0 + 1e-9
     return b
+
+
+@njit(cache=True, nogil=True)
+def _gain(A, p, xs, ys, turn, blur_a, blur_b):
+    """(2, 2) px^2: by how much the point moves where the curvature [1 / px] of the edge along ea, or eb, is known.
+
+    An edge with curvature c lies off its tangent by c (t^2 + blur^2) / 2 at a distance t from the corner: blur moves it
+    towards its centre. The fit takes that for a change of grey, and answers as normal equations do.
+    """
+    trig = cos(p[2]), sin(p[2]), cos(p[3]), sin(p[3])
+    by, J, gain = np.zeros((2, _SIZE)), np.empty(_SIZE), np.empty((2, 2))
+    for i in range(len(xs)):
+        x, y = xs[i] - p[0], ys[i] - p[1]
+        Ea, Eb, da, db = _slopes(p[5], trig, x, y, turn, blur_a, blur_b)
+        _jacobian(J, trig, x, y, turn, Ea, Eb, da, db)
+        ta, tb = trig[0] * x + trig[1] * y, trig[2] * x + trig[3] * y
+        for j in range(_SIZE):
+            by[0, j] -= J[j] * 0.5 * da * (ta * ta + blur_a * blur_a)
+            by[1, j] -= J[j] * 0.5 * db * (tb * tb + blur_b * blur_b)
+    # The distance la grows against the normal to the left of ea, lb along that of eb: see `_slopes`.
+    for k in range(2):
+        gain[k] = (turn if k == 0 else -turn) * solve_small(A, by[k])[:2]
+    return gain
+
+
+@njit(cache=True, nogil=True)
+def _fill_edges(edges, ea, sa, eb, sb, gain):
+    for i in range(2):
+        edges[0, i], edges[0, 2 + i], edges[0, 4 + i] = -sa * ea[i], sa * ea[i], gain[0, i]
+        edges[1, i], edges[1, 2 + i], edges[1, 4 + i] = -sb * eb[i], sb * eb[i], gain[1, i]
 
 
 @njit(cache=True, nogil=True)

@@ -11,6 +11,8 @@ from math import erf, exp, hypot, pi, sqrt
 import numpy as np
 from numba import njit
 
+from icalib.measurements import EDGE
+
 _ITERATIONS = 10
 _CONVERGED_PX = 1e-3
 END_PX = 3.0  # left out at both ends of a side, where the corner's blur bends the edge
@@ -51,21 +53,22 @@ def solve_small(A, b):
 
 @njit(cache=True, nogil=True)
 def fit_step(image, u0, v0, u1, v1, end, half):
-    """(place (3,), blur, contrast, variance (2,)) of the edge from (u0, v0) to (u1, v1), bright on its left.
+    """(place (3,), blur, contrast, ends (2, 2)) of the edge from (u0, v0) to (u1, v1), bright on its left.
 
     place are the coefficients of the offset [px] along the outward normal as a polynomial in the way along the side,
-    -1 to 1; the last is zero for short sides. blur [px] is the Gaussian's. Pixels within `half` px of the side are
-    used, but not the last `end` px at both ends. variance [px^2] is that of the offset at both ends for a noise of one
-    grey level, NaN where there is no edge; contrast [grey levels] is zero there.
+    -1 to 1; the last, the bend, is zero for short sides. blur [px] is the Gaussian's. Pixels within `half` px of the
+    side are used, but not the last `end` px at both ends. ends: for each end the variance [px^2] of its offset for a
+    noise of one grey level where the bend is known, and the change of its offset where a bend that differs by 1 px from
+    the fitted one is known. NaN where there is no edge; contrast [grey levels] is zero there.
     """
     # Parameters: offset, slope, blur, low, high and, for a long side, bend.
-    p, variance = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), np.full(2, np.nan)
+    p, ends = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), np.full((2, 2), np.nan)
     length = hypot(u1 - u0, v1 - v0)
     size = 6 if length >= _CURVED_FROM_PX else 5
     way, off, grey = _strip(image, u0, v0, u1, v1, 0.5 * length - min(end, _MOST_END * length), half)
     dark, bright = off < -0.5 * half, off > 0.5 * half
     if len(grey) < 2 * size or not dark.any() or not bright.any():
-        return np.zeros(3), p[2], 0.0, variance
+        return np.zeros(3), p[2], 0.0, ends
     p[3], p[4] = grey[dark].mean(), grey[bright].mean()
     A = np.zeros((size, size))
     for _ in range(_ITERATIONS):
@@ -77,14 +80,24 @@ def fit_step(image, u0, v0, u1, v1, end, half):
             p[k] += step[k] if k == 3 or k == 4 else scale * step[k]
         p[2] = min(max(blur, _BLUR_RANGE[0]), _BLUR_RANGE[1])
         if abs(p[0]) + abs(p[1]) + abs(p[5]) > half + 1.0 or p[4] <= p[3]:
-            return np.zeros(3), p[2], 0.0, variance
+            return np.zeros(3), p[2], 0.0, ends
         if largest < _CONVERGED_PX and abs(step[2]) < 0.01:
             break
+    return np.array([p[0], p[1], p[5]]), p[2], p[4] - p[3], _known_bend(p, way, off, grey)
+
+
+@njit(cache=True, nogil=True)
+def _known_bend(p, way, off, grey):
+    """`ends` of `fit_step`: with the bend fixed, the other parameters follow it as -A^-1 a does."""
+    A, ends = np.zeros((6, 6)), np.empty((2, 2))
+    _accumulate(A, p, way, off, grey)
     for k in range(2):
-        at_end = np.zeros(6)
-        at_end[0], at_end[1], at_end[5] = 1.0, 2.0 * k - 1.0, 1.0
-        variance[k] = (at_end[:size] * solve_small(A, at_end[:size])).sum()
-    return np.array([p[0], p[1], p[5]]), p[2], p[4] - p[3], variance
+        at_end = np.zeros(5)
+        at_end[0], at_end[1] = 1.0, 2.0 * k - 1.0
+        by_rows = solve_small(A[:5, :5], at_end)
+        ends[k, 0] = by_rows[0] + at_end[1] * by_rows[1]
+        ends[k, 1] = 1.0 - (by_rows * A[5, :5]).sum()
+    return ends
 
 
 @njit(cache=True, nogil=True)
@@ -156,25 +169,39 @@ def _sine(quad, k):
 
 
 @njit(cache=True, nogil=True)
+def _edge_row(quad, k, end, place, blur, gain, by_offset):
+    """(EDGE,) of side k of the quad, for the corner at its `end` (0: k, 1: k + 1); by_offset (2,): how the corner moves
+    with the side's offset there."""
+    m, row = (k + 1) % 4, np.zeros(EDGE)
+    eu, ev = quad[m, 0] - quad[k, 0], quad[m, 1] - quad[k, 1]
+    square = eu * eu + ev * ev
+    row[2 * (1 - end)], row[2 * (1 - end) + 1] = (eu, ev) if end == 0 else (-eu, -ev)
+    # Blur moves a bent edge towards its centre of curvature, by blur^2 / 2 times the curvature.
+    moved = gain * square / 8.0 - 0.5 * blur * blur
+    row[4], row[5], row[6] = moved * by_offset[0], moved * by_offset[1], 8.0 * place[2] / square
+    return row
+
+
+@njit(cache=True, nogil=True)
 def fit_corners(image, quad, end, half):
-    """(corners (4, 2), sigma (4,), blur (4,)): the quad's corners where its fitted sides meet.
+    """(corners (4, 2), sigma (4,), blur (4,), edges (4, 2, EDGE)): the quad's corners where its fitted sides meet.
 
     The dark quad's corners run clockwise in the image and are right to about 1 px. Pixels within `half` px of a side
     are used, but those less than `end` px from another side. sigma is the standard deviation [px] per axis for a noise
-    of one grey level, NaN for a corner that was not found; blur [px] is the larger of the two sides'.
+    of one grey level where the sides' bends are known, NaN for a corner that was not found; blur [px] is the larger of
+    the two sides'; edges as in `CornerStream`.
     """
-    place, variance, side_blur = np.empty((4, 3)), np.empty((4, 2)), np.empty(4)
+    place, ends, side_blur = np.empty((4, 3)), np.empty((4, 2, 2)), np.empty(4)
     for k in range(4):
         m = (k + 1) % 4
-        ends = end / max(min(_sine(quad, k), _sine(quad, m)), _LEAST_SINE)
-        place[k], side_blur[k], _, variance[k] = fit_step(
-            image, quad[k, 0], quad[k, 1], quad[m, 0], quad[m, 1], ends, half
-        )
+        away = end / max(min(_sine(quad, k), _sine(quad, m)), _LEAST_SINE)
+        place[k], side_blur[k], _, ends[k] = fit_step(image, quad[k, 0], quad[k, 1], quad[m, 0], quad[m, 1], away, half)
     corners, sigma, blur = quad.copy(), np.full(4, np.nan), np.empty(4)
+    edges = np.zeros((4, 2, EDGE))
     for k in range(4):
         before = (k + 3) % 4
         blur[k] = max(side_blur[before], side_blur[k])
-        det = 1.0
+        det, a0, b0, a1, b1 = 1.0, 0.0, 0.0, 0.0, 0.0
         for _ in range(3):
             a0, b0, c0 = _tangent(quad, before, place[before], corners[k, 0], corners[k, 1])
             a1, b1, c1 = _tangent(quad, k, place[k], corners[k, 0], corners[k, 1])
@@ -183,5 +210,8 @@ def fit_corners(image, quad, end, half):
                 break
             corners[k, 0], corners[k, 1] = (c0 * b1 - c1 * b0) / det, (a0 * c1 - a1 * c0) / det
         if abs(det) > _LEAST_SINE:
-            sigma[k] = sqrt(0.5 * (variance[before, 1] + variance[k, 0])) / abs(det)
-    return corners, sigma, blur
+            sigma[k] = sqrt(0.5 * (ends[before, 1, 0] + ends[k, 0, 0])) / abs(det)
+            own, other = (-b0 / det, a0 / det), (b1 / det, -a1 / det)
+            edges[k, 0] = _edge_row(quad, k, 0, place[k], side_blur[k], ends[k, 0, 1], own)
+            edges[k, 1] = _edge_row(quad, before, 1, place[before], side_blur[before], ends[before, 1, 1], other)
+    return corners, sigma, blur, edges

@@ -69,4 +69,4 @@ class MarkerDetector:
         order = APRILTAG_CORNER if self._family.is_apriltag else ARUCO_CORNER
         place = np.array([self.ids.index(int(tag)) for tag in tags.ids[rows]])
         point = (4 * place[:, None] + order).ravel()
-        return judged(point, uv.reshape(-1, 2), quality.reshape(5, -1), np.ones(len(point), dtype=bool))
+        return judged(point, uv.reshape(-1, 2), quality.reshape(len(quality), -1), np.ones(len(point), dtype=bool))

@@ -12,6 +12,7 @@ from icalib.detection.edge_model import END_PX, fit_corners, fit_step
 from icalib.detection.growth import side_vectors
 from icalib.detection.saddles import MARGIN_BLURS
 from icalib.detection.tags import LEAST_CONTRAST, shortest_side
+from icalib.measurements import EDGE
 
 _MOST_MOVE = (2.0, 0.03)  # px, and of a side: how far a corner may lie from where it was found roughly
 _LEAST_STRIP_PX = 1.5  # fitted on each side of an edge
@@ -21,6 +22,7 @@ _BLUR_STRIP = (2.5, 0.06)  # px, and of a side: fitted on each side of an edge w
 _LEAST_INSET_PX = (1.0, 0.5)  # as LEAST_WINDOW_PX, for features that lie in the dark and in the white fields
 _END_BLURS = 2.4  # left out at the ends of a side
 _USUAL_BLUR = 0.7  # px, before it is measured
+MEASURES = 5  # rows of `quality` before those of the edges
 
 
 @njit(cache=True, nogil=True)
@@ -79,13 +81,14 @@ def _shapes(quads, quality):
 
 @njit(cache=True, nogil=True)
 def refined_crossings(image, quads, surroundings):
-    """(uv (n, 4, 2), quality (5, n, 4)) of the X-corners of the quads (n, 4, 2), `surroundings` as in `fit_crossing`.
+    """(uv (n, 4, 2), quality (5 + 2 EDGE, n, 4)) of the X-corners of the quads (n, 4, 2).
 
+    `surroundings` as in `fit_crossing`.
     quality: sigma [px] per axis for a noise of one grey level, NaN where there is no corner; blur [px]; sine of the
     angle between the edges; by how much the distance to the nearest other feature exceeds what the smallest window
-    needs [px]; shorter side [px].
+    needs [px]; shorter side [px]; what the two edges of the corner are, as in `CornerStream`.
     """
-    uv, quality = np.empty(quads.shape), np.empty((5, len(quads), 4))
+    uv, quality = np.empty(quads.shape), np.empty((MEASURES + 2 * EDGE, len(quads), 4))
     blur = _measured_blurs(image, quads, surroundings.min() * _shapes(quads, quality))
     for i in range(len(quads)):
         quality[1, i] = blur[i].max()
@@ -93,11 +96,12 @@ def refined_crossings(image, quads, surroundings):
             ea, eb = side_vectors(quads[i], k)
             most_move = max(_MOST_MOVE[0], _MOST_MOVE[1] * quality[4, i, k])
             blur_a, blur_b = blur[i, k % 2], blur[i, (k + 1) % 2]
-            u, v, sigma, contrast = fit_crossing(
+            u, v, sigma, contrast, edges = fit_crossing(
                 image, quads[i, k, 0], quads[i, k, 1], ea, eb, surroundings, blur_a, blur_b, most_move
             )
             uv[i, k, 0], uv[i, k, 1] = u, v
             quality[0, i, k] = sigma if contrast >= LEAST_CONTRAST else np.nan
+            quality[MEASURES:, i, k] = edges.ravel()
     room = surroundings[0] * quality[3] - LEAST_WINDOW_PX
     for k in range(2):
         room = np.minimum(room, surroundings[1 + k] * quality[3] - _LEAST_INSET_PX[k])
@@ -111,15 +115,16 @@ def refined_corners(image, quads, clear):
 
     `clear` is the distance of the nearest other feature in units of the quad's sides.
     """
-    uv, quality = np.empty(quads.shape), np.empty((5, len(quads), 4))
+    uv, quality = np.empty(quads.shape), np.empty((MEASURES + 2 * EDGE, len(quads), 4))
     least = clear * _shapes(quads, quality)
     for i in range(len(quads)):
         most = max(_MOST_STRIP[0], _BLUR_STRIP[1] * shortest_side(quads[i]))
-        first, _, blur = fit_corners(image, quads[i], END_PX, _strip(least[i], _USUAL_BLUR, most))
+        first, _, blur, _ = fit_corners(image, quads[i], END_PX, _strip(least[i], _USUAL_BLUR, most))
         half = _strip(least[i], blur.max(), max(_MOST_STRIP[0], _MOST_STRIP[1] * blur.max()))
         end = max(END_PX, _END_BLURS * blur.max())
-        uv[i], quality[0, i], quality[1, i] = fit_corners(image, first, end, half)
+        uv[i], quality[0, i], quality[1, i], edges = fit_corners(image, first, end, half)
         for k in range(4):
+            quality[MEASURES:, i, k] = edges[k].ravel()
             most_move = max(_MOST_MOVE[0], _MOST_MOVE[1] * quality[4, i, k])
             if hypot(uv[i, k, 0] - quads[i, k, 0], uv[i, k, 1] - quads[i, k, 1]) > most_move:
                 quality[0, i, k] = np.nan

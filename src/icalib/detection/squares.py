@@ -45,7 +45,7 @@ def square_corners(image: np.ndarray, expected: np.ndarray, dark: np.ndarray, in
 
 def _judged(uv: np.ndarray, quality: dict, shape: tuple[int, int]) -> ImageCorners:
     where = np.array(sorted(quality), dtype=np.int64).reshape(-1, 2)
-    measures = np.array([quality[tuple(w)] for w in where]).reshape(-1, 5).T
+    measures = np.array([quality[tuple(w)] for w in where]).reshape(len(where), -1).T
     found = uv[where[:, 0], where[:, 1]]
     board = where[:, ::-1].astype(np.float64)
     consistent = consistent_corners(found, board, np.ones(len(where), dtype=bool), measures[4])

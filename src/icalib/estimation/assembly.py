@@ -15,6 +15,7 @@ from icalib.estimation.board import SHAPE_LABELS, SHAPE_SIGMA_M, bloom_direction
 from icalib.estimation.border import NOTHING
 from icalib.estimation.clocks import EARLY_S, instants
 from icalib.estimation.corner_factor import CornerFactor, CornerNoise
+from icalib.estimation.edge_curvature import with_bent_edges
 from icalib.estimation.feature_factor import FeatureFactor
 from icalib.estimation.free_nodes import FreeNodes
 from icalib.estimation.imu_factor import ImuFactor
@@ -149,9 +150,11 @@ def assemble(
     held: np.ndarray = NOTHING,
     following: Following | None = None,
     robot: RobotNoise = NO_ROBOT,
+    straight: bool = False,
 ) -> Problem:
-    """The problem at the nodes of `state`, everything frozen that a pass freezes: nodes, assignment, preintegration.
-    held: directions of the border that stay, see Problem."""
+    """The problem at the nodes of `state`, everything frozen that a pass freezes: nodes, assignment, preintegration,
+    corners on edges bent by its lens, unless they stay on `straight` ones. held: directions of the border that stay,
+    see Problem."""
     rig, layout = inputs.rig, inputs.layout
     factors = []
     scheme = rig.settings.scheme if inputs.imu is not None else "inertial"
@@ -167,6 +170,7 @@ def assemble(
             k & np.repeat(seen, np.diff(stream.start)), n, NO_BLOOM, inputs.bodies, layout,
             len(state.seconds), tuple(images.start for images in own[1:]),
         )  # fmt: skip
+        factor = factor if straight else with_bent_edges(factor, state)
         factors.append(_with_bloom(factor, camera, state, rig) if rig.blooms else factor)
     tolerance = inputs.tolerances.of(layout, None if rig.imu is None else rig.imu.name) * distortion_scales(rig, layout)
     # Beside one another, in a thread of its own: points of LiDARs use the solver's.

@@ -55,13 +55,15 @@ OnVisit = Callable[[str, Problem, Visit], None]  # told of the pass's name, its 
 @dataclass(frozen=True)
 class Judged:
     """What the residuals of a pass say before the next: how each camera's corners err, as a model and as their `noise`,
-    which of them to `keep`; of tracks what is `following`; and the noise of the robot's sensors."""
+    which of them to `keep`; of tracks what is `following`; and the noise of the robot's sensors. straight: the lens is
+    not yet known well enough to say how edges are bent."""
 
     models: tuple[NoiseModel, ...]
     noise: tuple[CornerNoise, ...]
     keep: tuple[np.ndarray, ...]
     following: Following | None
     robot: RobotNoise
+    straight: bool = False
 
     @classmethod
     def first(cls, inputs: Inputs) -> Judged:
@@ -70,11 +72,11 @@ class Judged:
         models = tuple(first_noise(c) for c in rig.cameras)
         noise = tuple(m.noise(s, c, rig.settings) for m, s, c in zip(models, streams, rig.cameras, strict=True))
         keep = tuple(np.ones(len(s.uv), dtype=bool) for s in streams)
-        return cls(models, noise, keep, first_following(inputs), RobotNoise.first(rig))
+        return cls(models, noise, keep, first_following(inputs), RobotNoise.first(rig), True)
 
     def problem(self, inputs: Inputs, state: State, held: np.ndarray = NOTHING) -> Problem:
         """See `assemble`."""
-        return assemble(inputs, state, self.noise, self.keep, held, self.following, self.robot)
+        return assemble(inputs, state, self.noise, self.keep, held, self.following, self.robot, self.straight)
 
     def next(self, inputs: Inputs, outcome: Outcome, first: bool) -> Judged:
         """As what a pass left behind, the `first` or another, shows it."""
@@ -87,7 +89,7 @@ class Judged:
         if _noise_is_estimated(inputs):
             models, noise = _next_noise(inputs, problem, outcome)
             now = replace(now, models=models, noise=noise, robot=_next_robot(inputs, problem, outcome, now.robot))
-        return replace(now, robot=replace(now.robot, coarse=False))
+        return replace(now, robot=replace(now.robot, coarse=False), straight=False)
 
 
 @dataclass(frozen=True)
