@@ -48,6 +48,12 @@ def aprilgrid_images() -> Path:
 
 
 @pytest.fixture(scope="session")
+def camera_lidar_board() -> Path:
+    """A checkerboard of 7 x 5 inner corners in 20 places, by a fisheye camera and a LiDAR."""
+    return _recording("camera_lidar_board")
+
+
+@pytest.fixture(scope="session")
 def odometry_logs() -> Path:
     """Rates, poses of a LiDAR odometry and IMU readings of two rigs, as LI-Init logged them, and its results."""
     return _recording("lidar_imu_odometry")

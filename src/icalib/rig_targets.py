@@ -14,7 +14,7 @@ from icalib.yaml_nodes import YamlValue
 _FIELDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "aprilgrid": (("rows", "cols", "tag_size", "tag_spacing"), ("border_bits", "squares", "first_id", "family")),
     "charuco": (("squares_x", "squares_y", "square_size", "marker_size", "dictionary"), ("legacy", "inverted")),
-    "checkerboard": (("rows", "cols", "square_size"), ("inverted",)),
+    "checkerboard": (("rows", "cols", "square_size"), ("inverted", "upright")),
     "markers": (("family", "size"), ("ids", "border_bits")),
 }
 _LARGEST_TAG_M = 2.0  # nobody prints a larger one; it is in millimetres
@@ -58,7 +58,7 @@ def target_of(value: YamlValue) -> Target:
     size = _edge(found["square_size"], "square")
     if kind == "checkerboard":
         rows, cols = _counts(value, found, "rows", "cols", "corners")
-        return _made(value, lambda: Checkerboard(rows, cols, size, _yes(found, "inverted")))
+        return _made(value, lambda: Checkerboard(rows, cols, size, _yes(found, "inverted"), _yes(found, "upright")))
     squares = _counts(value, found, "squares_x", "squares_y", "squares")
     marker, dictionary = _edge(found["marker_size"], "tag"), _family(found["dictionary"])
     how = _yes(found, "legacy"), _yes(found, "inverted")

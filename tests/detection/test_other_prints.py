@@ -137,6 +137,10 @@ def test_white_on_black(board):
             replace(CHARUCO, legacy=True, inverted=True),
         ),
         ("{type: checkerboard, rows: 6, cols: 7, square_size: 0.04, inverted: true}", Checkerboard(6, 7, 0.04, True)),
+        (
+            "{type: checkerboard, rows: 6, cols: 8, square_size: 0.04, upright: true}",
+            Checkerboard(6, 8, 0.04, upright=True),
+        ),
     ],
 )
 def test_fields_of_the_rig_file(tmp_path, text, target):

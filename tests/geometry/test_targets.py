@@ -86,7 +86,27 @@ def test_symmetry_of_a_checkerboard(rows: int, cols: int, symmetric: bool):
     if symmetric:
         turned = board.points.max(axis=0) - board.points
         np.testing.assert_allclose(turned, board.points[::-1], atol=1e-15)
+        assert not Checkerboard(rows, cols, 0.03, upright=True).symmetric
     assert not CHARUCO.symmetric and not GRID.symmetric
+
+
+@pytest.mark.parametrize(
+    ("rows", "cols", "quarters"), [(6, 8, (0, 2)), (7, 7, (0, 2)), (6, 6, (0, 1, 2, 3)), (6, 7, (0,))]
+)
+def test_turns_of_a_checkerboard_put_points_on_points(rows: int, cols: int, quarters: tuple[int, ...]):
+    """Every turn by a multiple of 90 degrees about the middle that puts black on black, and no other."""
+    board = Checkerboard(rows, cols, 0.03)
+    black = np.indices((rows + 1, cols + 1)).sum(axis=0) % 2 == 0
+    alike = [k for k in range(4) if rows == cols or k % 2 == 0]
+    assert tuple(k for k in alike if np.array_equal(black, np.rot90(black, k))) == quarters
+    assert len(board.turns) == len(quarters)
+    middle = board.points.mean(axis=0)
+    for turn in board.turns:
+        assert sorted(turn) == list(range(rows * cols))
+        own, other = (board.points - middle)[:, :2], (board.points - middle)[turn, :2]
+        R = np.linalg.lstsq(own, other, rcond=None)[0]
+        np.testing.assert_allclose(own @ R, other, atol=1e-12)
+        assert np.linalg.det(R) == pytest.approx(1.0)
 
 
 def test_tag_corners_run_counterclockwise_from_the_bottom_left():

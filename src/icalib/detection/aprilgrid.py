@@ -104,5 +104,6 @@ class AprilGridDetector:
             uv, quality = refined_corners(image, quads[tags], self._clear)
         uv, quality = uv.reshape(-1, 2), quality.reshape(len(quality), -1)
         point = (4 * tags[:, None] + APRILTAG_CORNER).ravel()
-        consistent = consistent_corners(uv, self._board[tags].reshape(-1, 2), np.isfinite(quality[0]), quality[4])
+        board, found = self._board[tags].reshape(-1, 2), np.isfinite(quality[0])
+        consistent = consistent_corners(uv, board, found, quality[4], image.shape)
         return judged(point, uv, quality, consistent)

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.detection.corners import ImageCorners, no_corners
+from icalib.detection.corners import INCONSISTENT, ImageCorners, no_corners
+from icalib.detection.crossings import goes_on, in_rows
 from icalib.detection.quads import View
 from icalib.detection.squares import square_corners
 from icalib.errors import RecordingError
 from icalib.extras import load_cv2
+
+_REDUCED_PX = 1000  # larger images are searched at a fraction of their size first; only the time depends on it
+_LEAST_SEEN = 0.5  # of the corners inside the outermost, seen in rows and columns, for the thorough search
+_LEAST_FOUND = 0.5  # of the corners that a search proposes, and of each side's: others are no checkerboard
 
 
 @dataclass(frozen=True)
@@ -19,23 +25,17 @@ class CheckerboardDetector:
 
     Corners are numbered row by row, x along a row and y from row to row turning with the clock, and the square between
     the first corners of the first two rows is dark. That is unique where rows + cols is odd. Where it is even the board
-    looks the same upside down, and a RecordingError is raised, unless `upright` promises that the board is always held
-    with its rows running to the right, within 90 degrees, or 45 where rows = cols.
+    looks the same after half a turn, and where rows = cols is even, after a quarter: of these orders the one is taken
+    whose rows run most to the right.
     """
 
     rows: int
     cols: int
-    upright: bool = False
 
     def __post_init__(self) -> None:
         if min(self.rows, self.cols) < 3:
             raise RecordingError(
                 f"a checkerboard with {self.rows} x {self.cols} inner corners is too small; use one of 3 x 4 or more."
-            )
-        if (self.rows + self.cols) % 2 == 0 and not self.upright:
-            raise RecordingError(
-                f"a checkerboard with {self.rows} x {self.cols} inner corners looks the same upside down; use one with "
-                "an odd and an even number, or state that it is always held upright."
             )
 
     def detect(self, image: np.ndarray) -> ImageCorners:
@@ -47,25 +47,77 @@ class CheckerboardDetector:
 
     def find(self, view: View) -> ImageCorners:
         """As `detect`."""
-        image = view.image
-        cv2 = load_cv2()
-        found, corners = cv2.findChessboardCornersSB(image, (self.cols, self.rows), flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
-        if not found:
+        for grid in self._proposed(view.image):
+            found = self._corners(view.image, grid)
+            if self._is_whole(found):
+                return found
+        return no_corners()
+
+    def _is_whole(self, found: ImageCorners) -> bool:
+        """Whether enough corners are where a board has them, on each of its four sides, too."""
+        there = np.zeros(self.rows * self.cols, dtype=bool)
+        there[found.point[found.verdict != INCONSISTENT]] = True
+        there = there.reshape(self.rows, self.cols)
+        return min(part.mean() for part in (there, there[0], there[-1], there[:, 0], there[:, -1])) >= _LEAST_FOUND
+
+    def _corners(self, image: np.ndarray, grid: np.ndarray) -> ImageCorners:
+        """The corners of the board at the grid (rows, cols, 2) px; none where it is part of a larger board."""
+        framed = _framed(grid)
+        if goes_on(image, framed):
             return no_corners()
-        grid = self._ordered(image, np.asarray(corners, dtype=np.float64).reshape(self.rows, self.cols, 2))
-        dark = (np.indices((self.rows + 1, self.cols + 1)).sum(axis=0) % 2 == 0) == _is_dark(image, grid, 0, 0)
+        grid = self._ordered(image, grid)
+        dark = (np.indices((self.rows + 1, self.cols + 1)).sum(axis=0) % 2 == 0) == _is_dark(image, grid)
         return square_corners(image, _framed(grid), dark, np.inf)
 
+    def _proposed(self, image: np.ndarray) -> Iterator[np.ndarray]:
+        """Grids (rows, cols, 2) px of OpenCV's detectors, to about a pixel; the quick search first.
+
+        The quick detector sometimes takes parts of other patterns for the board. The thorough one is a hundred times
+        as slow where there is no board, and is asked only about images with enough X-corners in rows and columns.
+        """
+        reduced, factor = _reduced(image)
+        yield from self._quick(reduced, factor)
+        if not in_rows(image, _LEAST_SEEN * (self.rows - 2) * (self.cols - 2)):
+            return
+        cv2 = load_cv2()
+        flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
+        found, corners = cv2.findChessboardCornersSB(image, (self.cols, self.rows), flags=flags)
+        if found:
+            yield self._grid(corners)
+        if factor > 1:
+            yield from self._quick(image, 1)
+
+    def _quick(self, image: np.ndarray, factor: int) -> Iterator[np.ndarray]:
+        """The grid that OpenCV's older detector finds in an image reduced by `factor`, in pixels of the whole one."""
+        cv2 = load_cv2()
+        flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+        found, corners = cv2.findChessboardCorners(image, (self.cols, self.rows), flags=flags)
+        if found:
+            yield factor * (self._grid(corners) + 0.5) - 0.5
+
+    def _grid(self, corners: np.ndarray) -> np.ndarray:
+        return np.asarray(corners, dtype=np.float64).reshape(self.rows, self.cols, 2)
+
     def _ordered(self, image: np.ndarray, grid: np.ndarray) -> np.ndarray:
-        """The corners (rows, cols, 2) px with rows and columns reversed where they must be."""
+        """The corners (rows, cols, 2) px with rows and columns reversed or exchanged where they must be."""
         if _turn(grid) < 0.0:
             grid = grid[:, ::-1]
-        if not self.upright:
-            return grid if _is_dark(image, grid, 0, 0) else grid[::-1, ::-1]
         turns = [grid, grid[::-1, ::-1]]
         if self.rows == self.cols:
             turns += [np.rot90(grid, 1), np.rot90(grid, 3)]
-        return max(turns, key=lambda turned: float((turned[:, -1] - turned[:, 0])[:, 0].sum()))
+        dark = [turn for turn in turns if _is_dark(image, turn)]
+        return max(dark or turns, key=lambda turned: float((turned[:, -1] - turned[:, 0])[:, 0].sum()))
+
+
+def _reduced(image: np.ndarray) -> tuple[np.ndarray, int]:
+    """The image at a fraction of its size where it is large, and by which factor it was reduced."""
+    factor = -(-max(image.shape) // _REDUCED_PX)
+    if factor == 1:
+        return image, 1
+    cv2 = load_cv2()
+    height, width = (side // factor for side in image.shape)
+    whole = image[: height * factor, : width * factor]
+    return cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), factor
 
 
 def _turn(grid: np.ndarray) -> float:
@@ -74,12 +126,12 @@ def _turn(grid: np.ndarray) -> float:
     return float(a[0] * b[1] - a[1] * b[0])
 
 
-def _is_dark(image: np.ndarray, grid: np.ndarray, row: int, col: int) -> bool:
-    """Whether the square between the corners (row, col) and (row + 1, col + 1) is darker than its neighbours."""
+def _is_dark(image: np.ndarray, grid: np.ndarray) -> bool:
+    """Whether the square between the first corners of the first two rows is darker than its neighbours."""
     center = 0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])
     u, v = np.round(center).astype(np.int64).transpose(2, 0, 1)
     grey = image[v.clip(0, image.shape[0] - 1), u.clip(0, image.shape[1] - 1)].astype(np.float64)
-    even = np.indices(grey.shape).sum(axis=0) % 2 == (row + col) % 2
+    even = np.indices(grey.shape).sum(axis=0) % 2 == 0
     return bool(grey[even].mean() < grey[~even].mean())
 
 

@@ -123,10 +123,10 @@ def _apart(uv: np.ndarray, others: np.ndarray) -> bool:
 
 
 def _from_the_bottom(rows: int, cols: int) -> np.ndarray:
-    """(rows cols,) the target's point of each of the detector's corners. One of rows, cols is odd.
+    """(rows cols,) the target's point of each of the detector's corners.
 
-    Both begin where the corner's square is dark; the target's y goes up the sheet, the detector's down. Backwards along
-    the even one, the first square is dark again.
+    The target's y goes up the sheet, the detector's down. Both begin where the corner's square is dark: backwards along
+    an even side, the first square is dark again.
     """
     number = np.arange(rows * cols).reshape(rows, cols)
-    return (number[::-1] if rows % 2 == 0 else number[:, ::-1]).ravel()
+    return (number[:, ::-1] if rows % 2 == 1 and cols % 2 == 0 else number[::-1]).ravel()

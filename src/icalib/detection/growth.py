@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from math import hypot
-
 import numpy as np
 from numba import njit
 
@@ -19,7 +17,6 @@ _WRONG_CELLS = 0.15  # of the cells seen: the pattern is known, so many may be w
 _LEAST_RISE = 4.0  # grey levels over 2 px at an edge
 _MOST_MOVE = 0.12  # of a side: how far a corner may lie from where it is predicted
 _USUAL_BLUR = 0.7  # px, before it is measured
-_GROWTH_BESIDE = 1.5  # of errors with the square of the distance from the neighbours, in units of their spread
 LEAST_SIDE_PX = 6.0
 
 
@@ -142,30 +139,3 @@ def grow(image, known, quads, board, cols, patterns, bits, border, clear, crossi
             found, quad = _fitted(image, quad, clear, crossing)
             if found >= 2 and _is_tag(image, quad, patterns[tag], bits, border):
                 known[tag], quads[tag], changed = True, quad, True
-
-
-@njit(cache=True, nogil=True)
-def distance_from_neighbours(uv, xy, used, n_near):
-    """(n,) px from each corner uv (n, 2) to where the nearest others on the board xy (n, 2) place it.
-
-    Others are the n_near nearest that are `used` (n,) bool; inf where there are fewer than 6. The distance of a corner
-    that lies beside its neighbours, not among them, is divided by how much errors grow on the way there.
-    """
-    out = np.full(len(uv), np.inf)
-    near = np.empty(len(uv))
-    px, pu = np.empty((n_near, 2)), np.empty((n_near, 2))
-    for i in range(len(uv)):
-        for j in range(len(uv)):
-            near[j] = hypot(xy[j, 0] - xy[i, 0], xy[j, 1] - xy[i, 1]) if used[j] and j != i else np.inf
-        order, n = np.argsort(near), 0
-        for j in order[:n_near]:
-            if np.isfinite(near[j]):
-                px[n], pu[n] = xy[j], uv[j]
-                n += 1
-        if n >= 6:
-            u, v = mapped(fit_homography(px, pu, n), xy[i, 0], xy[i, 1])
-            x, y = px[:n, 0].mean(), px[:n, 1].mean()
-            spread = ((px[:n, 0] - x) ** 2 + (px[:n, 1] - y) ** 2).mean()
-            beside = ((xy[i, 0] - x) ** 2 + (xy[i, 1] - y) ** 2) / max(spread, 1e-12)
-            out[i] = hypot(u - uv[i, 0], v - uv[i, 1]) / (1.0 + _GROWTH_BESIDE * beside)
-    return out

@@ -40,16 +40,16 @@ def square_corners(image: np.ndarray, expected: np.ndarray, dark: np.ndarray, in
         where = tuple(at[i, k])
         if not measures[0, i, k] >= sigma[where]:
             uv[where], sigma[where], quality[where] = fine[i, k], measures[0, i, k], measures[:, i, k]
-    return _judged(uv, quality, (rows, cols))
+    return _judged(uv, quality, cols, image.shape)
 
 
-def _judged(uv: np.ndarray, quality: dict, shape: tuple[int, int]) -> ImageCorners:
+def _judged(uv: np.ndarray, quality: dict, cols: int, shape: tuple[int, ...]) -> ImageCorners:
     where = np.array(sorted(quality), dtype=np.int64).reshape(-1, 2)
     measures = np.array([quality[tuple(w)] for w in where]).reshape(len(where), -1).T
     found = uv[where[:, 0], where[:, 1]]
     board = where[:, ::-1].astype(np.float64)
-    consistent = consistent_corners(found, board, np.ones(len(where), dtype=bool), measures[4])
-    point = (where[:, 0] - 1) * (shape[1] - 1) + where[:, 1] - 1
+    consistent = consistent_corners(found, board, np.ones(len(where), dtype=bool), measures[4], shape)
+    point = (where[:, 0] - 1) * (cols - 1) + where[:, 1] - 1
     return judged(point, found, measures, consistent)
 
 

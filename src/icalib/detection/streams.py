@@ -20,6 +20,7 @@ from icalib.detection.corners import ImageCorners, corner_stream, packed
 from icalib.detection.detectors import Detector, detector_of
 from icalib.detection.diagnosis import what_is_seen, with_other_border, with_other_layout
 from icalib.detection.sightings import parts_of, sightings, without_rare_tags
+from icalib.detection.turns import continuous
 from icalib.errors import RecordingError
 from icalib.extras import load_cv2
 from icalib.geometry.targets import Charuco, Markers, Scene, Target
@@ -55,7 +56,7 @@ def find_corners(
         if keep:
             keep_corners(key, *found)
     stamps_ns, images = found
-    images, rare = without_rare_tags(target, images)
+    images, rare = without_rare_tags(target, continuous(target, images))
     seen = sum(bool(i.kept.any()) for i in images)
     if not seen:
         what = f"{where}: {_called(target)} in none of {len(images)} images of {camera.name}; "

@@ -69,10 +69,15 @@ class Target(ABC):
         lists = {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
         return {"type": self.type} | {name: value for name, value in lists.items() if value != []}
 
+    @cached_property
+    def turns(self) -> tuple[np.ndarray, ...]:
+        """Numbers (n,) of the points after each turn of the sheet that no image shows; the first is no turn."""
+        return (np.arange(len(self.points)),)
+
     @property
     def symmetric(self) -> bool:
-        """A half turn maps the target on itself, so that no image can tell point i from point n - 1 - i."""
-        return False
+        """Whether images show the target alike after some turn, so that they cannot tell its points apart."""
+        return len(self.turns) > 1
 
     @abstractmethod
     def point_index(self, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarray:

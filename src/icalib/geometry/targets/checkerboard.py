@@ -15,7 +15,8 @@ from icalib.geometry.targets.base import Target, untagged_index
 @dataclass(frozen=True)
 class Checkerboard(Target):
     """`rows` x `cols` INNER corners between squares of edge `square_size` [m], the bottom left square black, as Kalibr
-    prints it; `inverted`: white.
+    prints it; `inverted`: white. `upright`: of a board that looks the same after half a turn, all images show the
+    rows run to the right, within 90 degrees, or 45 where rows = cols.
 
     Points row by row from the bottom left, row r and column c at index r cols + c. Raises RigError for fewer than two
     rows or columns.
@@ -23,12 +24,13 @@ class Checkerboard(Target):
 
     type: ClassVar[str] = "checkerboard"
     blooms: ClassVar[bool] = False
-    seldom: ClassVar[tuple[str, ...]] = ("inverted",)
+    seldom: ClassVar[tuple[str, ...]] = ("inverted", "upright")
 
     rows: int
     cols: int
     square_size: float
     inverted: bool = False
+    upright: bool = False
 
     def __post_init__(self) -> None:
         if min(self.rows, self.cols) < 2:
@@ -37,10 +39,15 @@ class Checkerboard(Target):
                 "correct rows and cols, which count inner corners."
             )
 
-    @property
-    def symmetric(self) -> bool:
-        """rows and cols both even or both odd: a half turn puts black on black."""
-        return (self.rows + self.cols) % 2 == 0
+    @cached_property
+    def turns(self) -> tuple[np.ndarray, ...]:
+        """Half a turn where it puts black on black, rows and cols both even or both odd; quarters where both are equal
+        and even. None where the board is `upright`."""
+        number = np.arange(self.rows * self.cols).reshape(self.rows, self.cols)
+        if self.upright or (self.rows + self.cols) % 2 == 1:
+            return (number.ravel(),)
+        quarters = range(4) if self.rows == self.cols and self.rows % 2 == 0 else (0, 2)
+        return tuple(np.rot90(number, k).ravel() for k in quarters)
 
     @cached_property
     def points(self) -> np.ndarray:

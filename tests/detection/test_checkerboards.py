@@ -1,0 +1,131 @@
+"""Checkerboards that are hard to find, look like other boards, or look alike after half a turn."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from icalib.detection import CheckerboardDetector
+from icalib.detection import checkerboard as module
+from icalib.detection.corners import ImageCorners
+from icalib.detection.crossings import in_rows
+from icalib.detection.turns import continuous
+from icalib.geometry.targets import AprilGrid, Checkerboard, Scene
+
+
+@pytest.fixture
+def board(rendering):
+    """(grey (h, w) uint8, the true places of the corners) of 6 x 9 corners, tilted."""
+    pattern = rendering.checkerboard(6, 9)
+    H = rendering.homography(pattern, 0.9, 25.0, 40.0, 10.0, (0.0, 0.0), False)
+    return rendering.render(pattern, H), rendering.applied(H, pattern.points)
+
+
+@pytest.mark.parametrize(("rows", "cols"), [(5, 9), (6, 8), (5, 8), (7, 10), (9, 9), (3, 4)])
+def test_a_board_of_another_size_is_not_found(board, rows, cols):
+    assert not len(CheckerboardDetector(rows, cols).detect(board[0]).point)
+
+
+def test_tags_are_no_checkerboard(rendering):
+    pattern = rendering.aprilgrid(6, 6)
+    for tilt in (0.0, 30.0, 50.0):
+        image = rendering.render(pattern, rendering.homography(pattern, 0.9, tilt, 20.0, 5.0, (0.0, 0.0)))
+        assert not in_rows(image, 14)
+        for rows, cols in [(6, 9), (4, 5), (5, 6)]:
+            assert not len(CheckerboardDetector(rows, cols).detect(image).point)
+
+
+def test_each_search_finds_the_board_alike(board, monkeypatch):
+    """The quick search, in a reduced image and in the whole one, and the thorough one: the corners are the same."""
+    image, truth = board
+    cv2_quick, cv2_thorough = cv2.findChessboardCorners, cv2.findChessboardCornersSB
+    usual = CheckerboardDetector(6, 9).detect(image)
+    np.testing.assert_allclose(usual.uv, truth[usual.point], atol=0.06)
+    monkeypatch.setattr(module, "_REDUCED_PX", 400)
+    asked = []
+
+    def quick(image, size, **options):
+        asked.append(image.shape)
+        return cv2_quick(image, size, **options) if allowed(image.shape) else (False, None)
+
+    def thorough(image, size, **options):
+        asked.append("thorough")
+        return cv2_thorough(image, size, **options) if allowed("thorough") else (False, None)
+
+    monkeypatch.setattr(cv2, "findChessboardCorners", quick)
+    monkeypatch.setattr(cv2, "findChessboardCornersSB", thorough)
+    searches = [(240, 376), "thorough", (480, 752)]
+    for k, one in enumerate(searches):
+        asked.clear()
+        allowed = lambda shape, one=one: shape == one  # noqa: E731
+        found = CheckerboardDetector(6, 9).detect(image)
+        assert asked == searches[: k + 1]
+        np.testing.assert_array_equal(found.point, usual.point)
+        np.testing.assert_allclose(found.uv, usual.uv, atol=2e-3)
+        np.testing.assert_allclose(found.sigma, usual.sigma, rtol=1e-2)
+
+
+def test_an_image_without_rows_of_corners_is_not_searched_thoroughly(monkeypatch):
+    noise = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 255, (480, 752), dtype=np.uint8), (0, 0), 4.0)
+    image = np.interp(noise, (noise.min(), noise.max()), (0, 255)).astype(np.uint8)
+    monkeypatch.setattr(cv2, "findChessboardCornersSB", lambda *_, **__: pytest.fail("searched"))
+    assert not len(CheckerboardDetector(6, 9).detect(image).point)
+
+
+@pytest.mark.parametrize("blur", [0.7, 2.0, 4.0])
+def test_a_blurred_board_stands_in_rows(rendering, blur):
+    pattern = rendering.checkerboard(6, 9)
+    H = rendering.homography(pattern, 0.9, 25.0, 40.0, 10.0, (0.0, 0.0), False)
+    assert in_rows(rendering.render(pattern, H, blur=blur), 28)
+
+
+def test_a_board_that_opencvs_plain_search_misses(camera_lidar_board):
+    """One of 20 images by a fisheye camera: CALIB_CB_EXHAUSTIVE finds it, and so does the older detector."""
+    image = cv2.imread(str(camera_lidar_board / "pose14.jpg"), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    found, theirs = cv2.findChessboardCornersSB(image, (5, 7), flags=cv2.CALIB_CB_EXHAUSTIVE)
+    ours = CheckerboardDetector(7, 5).detect(image)
+    assert found and ours.kept.sum() == 35
+    apart = np.linalg.norm(ours.uv[:, None] - np.asarray(theirs).reshape(1, 35, 2), axis=2).min(axis=1)
+    assert np.median(apart) < 0.2
+
+
+def turning(target: Checkerboard, upright: bool) -> list[ImageCorners]:
+    """Corners while the board turns all the way round, 15 degrees from image to image; with `upright` numbered as the
+    detector does. Every eighth image shows nothing."""
+    images, at = [], target.points[:, :2] - target.points[:, :2].mean(axis=0)
+    for k in range(40):
+        angle = np.radians(15.0 * k + 5.0)
+        R = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        uv = 1000.0 * at * (1.0, -1.0) @ R + (400.0 + 3.0 * k, 300.0)
+        number = np.arange(len(uv))
+        if upright:
+            ends = [uv[np.argsort(turn)][[0, target.cols - 1], 0] for turn in target.turns]
+            number = target.turns[int(np.argmax([b - a for a, b in ends]))]
+        order = np.argsort(number)
+        shown = np.random.default_rng(k).random(len(uv)) < 0.8 * (k % 8 != 7)
+        seen = order[shown[order]]
+        one = np.ones(len(seen))
+        images.append(ImageCorners(np.sort(number[seen]), uv[seen], one, one, np.zeros(len(seen), np.int8)))
+    return images
+
+
+@pytest.mark.parametrize("board", [Checkerboard(6, 8, 0.03), Checkerboard(5, 7, 0.03), Checkerboard(6, 6, 0.03)])
+def test_a_board_that_turns_keeps_its_numbers(board):
+    truth, images = turning(board, False), turning(board, True)
+    assert any(not np.array_equal(a.point, b.point) for a, b in zip(truth, images, strict=True))
+    scene = Scene(("grid", "board"), (AprilGrid(2, 2, 0.1, 0.3), board))
+    for target, first in ((board, 0), (scene, 16)):
+        shifted = [ImageCorners(i.point + first, i.uv, i.sigma, i.blur, i.verdict) for i in images]
+        for a, b in zip(truth, continuous(target, shifted), strict=True):
+            np.testing.assert_array_equal(b.point, a.point + first)
+            np.testing.assert_allclose(b.uv, a.uv)
+
+
+def test_an_upright_board_keeps_the_detectors_numbers():
+    images = turning(Checkerboard(6, 8, 0.03), True)
+    kept = continuous(Checkerboard(6, 8, 0.03, upright=True), images)
+    for a, b in zip(images, kept, strict=True):
+        np.testing.assert_array_equal(a.point, b.point)
+        np.testing.assert_array_equal(a.uv, b.uv)
