@@ -257,9 +257,9 @@ def test_a_corner_that_is_off_is_inconsistent_and_no_other(row):
 @pytest.mark.parametrize("focal", [120.0, 200.0, 320.0])
 @pytest.mark.parametrize("row", [0, 14, 77])
 def test_a_fisheye_bends_a_board_without_making_corners_inconsistent(focal, row):
-    """An equidistant lens that sees the board from near, up to 170 degrees of it in the image."""
+    """An equidistant lens that sees the board from near, to 83 degrees from its axis."""
     xy = np.stack(np.meshgrid(np.arange(11.0), np.arange(7.0)), axis=-1).reshape(-1, 2)
-    X = np.column_stack([xy - xy.mean(axis=0), np.full(77, {120.0: 0.9, 200.0: 2.0, 320.0: 3.0}[focal])])
+    X = np.column_stack([xy - xy.mean(axis=0), np.full(77, 2.5)])
     X = X @ np.array([[1.0, 0.0, 0.0], [0.0, np.cos(0.5), -np.sin(0.5)], [0.0, np.sin(0.5), np.cos(0.5)]]).T
     radius = np.hypot(X[:, 0], X[:, 1])
     uv = (focal * np.arctan2(radius, X[:, 2]) / radius)[:, None] * X[:, :2] + (380.0, 235.0)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from math import hypot
+from math import exp, hypot
 
 import numpy as np
 from numba import njit
+from scipy.optimize import minimize_scalar
 
 from icalib.detection.decoding import mapped, unit_homography
 from icalib.detection.growth import fit_homography
@@ -14,7 +15,11 @@ _NEAREST = 12
 _MOST_OFF = (1.0, 0.05)  # px, and of a side: how far a corner may lie from where its neighbours place it
 _OFF = (0.3, 0.01, 6.0)  # px, of a side, and times the median: the same, as far as the other corners agree
 _STRAIGHT = 1e4  # image widths, the focal length of a lens that does not bend
-_BENT = (0.8, 0.57, 0.4, 0.28, 0.2, 0.14)  # the same of lenses that do; those between are near enough to one of them
+_BENT = (0.1, 2.0)  # image widths, the focal lengths of lenses that do
+_SAME_LOG = 0.02  # focal lengths as near to each other leave the same distances
+_UNSURE = 0.2  # of the median distance that a lens's bend explains: how much of it may be left at single corners
+_MOST_ANGLE = 3.0  # rad, from the axis of a lens
+_FAR_PX = 1e9
 _LEAST_DEPTH = 0.1  # cosine of the angle between a corner's ray and a neighbour's
 _GROWTH_BESIDE = 1.5  # of errors with the square of the distance from the neighbours, in units of their spread
 _LINK_OFF = 0.3  # of a tag: how far its centre may lie from where another tag predicts it, per tag of distance
@@ -69,52 +74,69 @@ def consistent_corners(
     """(N,) bool: which corners lie where the 12 nearest others place them, by a homography.
 
     The bound is 6 times the median distance, at least 0.3 px + 0.01 sides and at most 1 px + 0.05 sides. The worst
-    corner is left out first, as long as there is one. Where a straight lens places some elsewhere, so do lenses that
-    bend, and the one counts whose median distance is least. uv (N, 2) px, board (N, 2), found (N,) bool, side (N,) px;
+    corner is left out first, as long as there is one. Where a straight lens places some elsewhere, a
+    lens that bends is tried, and counts where the median distance is smaller; the bound is then at least a fifth of the
+    median distance that it explains. uv (N, 2) px, board (N, 2), found (N,) bool, side (N,) px;
     shape (h, w) of the image, whose middle is taken for the lens's.
     """
-    straight = _agreeing(uv, board, found, side, shape, _STRAIGHT)
+    middle, width = 0.5 * np.array(shape[1::-1]), float(shape[1])
+    straight = _agreeing(_rays(uv - middle, _STRAIGHT * width, False), board, found, side)
     if straight.all():
         return straight
-    usual = [_usual(uv, board, found, shape, focal) for focal in (_STRAIGHT, *_BENT)]
-    best = (_STRAIGHT, *_BENT)[int(np.argmin(usual))]
-    return straight if best == _STRAIGHT else _agreeing(uv, board, found, side, shape, best)
+    bent = _bent_rays(uv - middle, width, board, found)
+    usual = [_usual(rays, board, found) for rays in (_rays(uv - middle, _STRAIGHT * width, False), bent)]
+    return _agreeing(bent, board, found, side, _UNSURE * usual[0]) if usual[1] < usual[0] else straight
 
 
-def _usual(uv: np.ndarray, board: np.ndarray, found: np.ndarray, shape: tuple[int, ...], focal: float) -> float:
-    """The median distance of the corners found; inf where there are too few."""
-    off = distance_from_neighbours(*_on_sphere(uv, shape, focal), board, found, _NEAREST)
+Rays = tuple[np.ndarray, np.ndarray]  # (N, 3) unit rays, (N,) px per radian
+
+
+def _bent_rays(uv: np.ndarray, width: float, board: np.ndarray, found: np.ndarray) -> Rays:
+    """By the lens of two kinds and any focal length through which the corners found are nearest to where neighbours
+    place them. uv (N, 2) px from the middle of the image."""
+    best: tuple[float, Rays] | None = None
+    for equidistant in (False, True):
+
+        def usual(log_focal: float, equidistant: bool = equidistant) -> float:
+            return _usual(_rays(uv, width * exp(log_focal), equidistant), board, found)
+
+        done = minimize_scalar(usual, bounds=np.log(_BENT), method="bounded", options={"xatol": _SAME_LOG})
+        if best is None or done.fun < best[0]:
+            best = done.fun, _rays(uv, width * exp(done.x), equidistant)
+    assert best is not None
+    return best[1]
+
+
+def _usual(rays: Rays, board: np.ndarray, found: np.ndarray) -> float:
+    """The median distance of the corners found; a large one where there are too few."""
+    off = distance_from_neighbours(*rays, board, found, _NEAREST)
     placed = found & np.isfinite(off)
-    return float(np.median(off[placed])) if placed.any() else np.inf
+    return float(np.median(off[placed])) if placed.any() else _FAR_PX
 
 
-def _agreeing(
-    uv: np.ndarray, board: np.ndarray, found: np.ndarray, side: np.ndarray, shape: tuple[int, ...], focal: float
-) -> np.ndarray:
-    """As `consistent_corners`, for one lens."""
-    used, rays = found.copy(), _on_sphere(uv, shape, focal)
-    most = _MOST_OFF[0] + _MOST_OFF[1] * side
+def _agreeing(rays: Rays, board: np.ndarray, found: np.ndarray, side: np.ndarray, unsure: float = 0.0) -> np.ndarray:
+    """As `consistent_corners`, for one lens. `unsure` [px]: the least bound, for what is not known of the lens."""
+    used, most = found.copy(), _MOST_OFF[0] + _MOST_OFF[1] * side
     while True:
         off = distance_from_neighbours(*rays, board, used, _NEAREST)
         placed = used & np.isfinite(off)
         usual = float(np.median(off[placed])) if placed.any() else np.inf
-        bound = np.minimum(most, np.maximum(_OFF[0] + _OFF[1] * side, _OFF[2] * usual))
+        bound = np.minimum(most, np.maximum(_OFF[0] + _OFF[1] * side, max(_OFF[2] * usual, unsure)))
         excess = np.where(placed, off / bound, 0.0)
         if not len(excess) or excess.max() <= 1.0:
             return used | ~found
         used[np.argmax(excess)] = False
 
 
-def _on_sphere(uv: np.ndarray, shape: tuple[int, ...], focal: float) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 3) unit rays of a stereographic lens with a focal length of `focal` image widths, and (N,) px per radian.
-
-    It is the division model of distortion (Fitzgibbon 2001), right to some pixels for every fisheye, and keeps angles,
-    so that the scale is the same in all directions.
-    """
-    f = focal * shape[1]
-    x, y = ((uv - 0.5 * np.array(shape[1::-1])) / (2.0 * f)).T
-    stretch = 1.0 + x * x + y * y
-    return np.stack([2.0 * x, 2.0 * y, 2.0 - stretch], axis=1) / stretch[:, None], f * stretch
+def _rays(uv: np.ndarray, focal: float, equidistant: bool) -> Rays:
+    """Of a lens of focal length `focal` [px], uv (N, 2) px from its middle: a stereographic one, which is the division
+    model of distortion (Fitzgibbon 2001), or an equidistant one, as most fisheyes nearly are."""
+    radius = np.hypot(uv[:, 0], uv[:, 1])
+    r = radius / focal
+    angle = np.minimum(r, _MOST_ANGLE) if equidistant else 2.0 * np.arctan(0.5 * r)
+    across = np.sin(angle) / np.maximum(radius, 1e-12)
+    rays = np.column_stack([across[:, None] * uv, np.cos(angle)])
+    return rays, np.full(len(uv), focal) if equidistant else focal * (1.0 + 0.25 * r * r)
 
 
 @njit(cache=True, nogil=True)
