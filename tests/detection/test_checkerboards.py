@@ -10,8 +10,9 @@ from icalib.detection import CheckerboardDetector
 from icalib.detection import checkerboard as module
 from icalib.detection.corners import ImageCorners
 from icalib.detection.crossings import in_rows
+from icalib.detection.detectors import detector_of
 from icalib.detection.turns import continuous
-from icalib.geometry.targets import AprilGrid, Checkerboard, Scene
+from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Scene
 
 
 @pytest.fixture
@@ -34,6 +35,15 @@ def test_tags_are_no_checkerboard(rendering):
         assert not in_rows(image, 14)
         for rows, cols in [(6, 9), (4, 5), (5, 6)]:
             assert not len(CheckerboardDetector(rows, cols).detect(image).point)
+
+
+def test_a_checkerboard_is_not_seen_in_the_squares_of_a_charuco_board(rendering):
+    pattern = rendering.charuco(5, 6)
+    H = rendering.homography(pattern, 0.7, 20.0, 20.0, 5.0, (0.0, 0.0), False)
+    board, tagged = Checkerboard(4, 5, 0.06), Charuco(6, 5, 0.06, 0.04, "4x4_50")
+    alone = detector_of(board).detect(rendering.render(pattern, H))
+    both = detector_of(Scene(("board", "tagged"), (board, tagged))).detect(rendering.render(pattern, H))
+    assert len(alone.point) == 20 and both.point.tolist() == list(range(20, 40))
 
 
 def test_each_search_finds_the_board_alike(board, monkeypatch):

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from icalib.detection.consistency import consistent_corners
-from icalib.detection.corners import ImageCorners, judged
+from icalib.detection.corners import ImageCorners, judged, no_corners
 from icalib.detection.growth import LEAST_SIDE_PX, side_vectors
 from icalib.detection.refinement import refined_crossings
 from icalib.detection.saddles import crossing_contrast, find_saddle
@@ -44,6 +44,8 @@ def square_corners(image: np.ndarray, expected: np.ndarray, dark: np.ndarray, in
 
 
 def _judged(uv: np.ndarray, quality: dict, cols: int, shape: tuple[int, ...]) -> ImageCorners:
+    if not quality:
+        return no_corners()
     where = np.array(sorted(quality), dtype=np.int64).reshape(-1, 2)
     measures = np.array([quality[tuple(w)] for w in where]).reshape(len(where), -1).T
     found = uv[where[:, 0], where[:, 1]]
