@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from icalib.detection import what_is_seen
+from icalib.detection.board_diagnosis import other_columns, other_size
 from icalib.detection.detectors import detector_of
 from icalib.detection.diagnosis import with_other_layout
 from icalib.errors import RecordingError, RigError
@@ -111,6 +112,38 @@ def test_the_wrong_layout_is_named(legacy):
     assert ("old layout" in sentence and "set legacy: true" in sentence) != ("take legacy: true out" in sentence)
     assert ("old layout" in sentence) == legacy
     assert with_other_layout([image], replace(board, squares_y=7)) == ""  # the layouts are one
+
+
+@pytest.mark.parametrize(
+    ("board", "wrong", "words"),
+    [
+        (
+            CHARUCO,
+            {"squares_x": 8, "squares_y": 6},
+            "squares_y and squares_x are swapped; write squares_y: 8, squares_x: 6",
+        ),
+        (CHARUCO, {"squares_x": 7}, "with squares_x: 6, not 7; correct squares_y and squares_x"),
+        (replace(CHARUCO, legacy=True), {"squares_x": 5, "squares_y": 7}, "with squares_x: 6, not 5"),
+        (replace(CHARUCO, inverted=True), {"squares_x": 8, "squares_y": 6}, "swapped"),
+        (GRID, {"rows": 4, "cols": 3}, "rows and cols are swapped; write rows: 3, cols: 4"),
+        (GRID, {"rows": 3, "cols": 5}, "with cols: 4, not 5; correct rows and cols"),
+    ],
+)
+def test_swapped_and_wrong_rows_of_tags_are_named(board, wrong, words):
+    image = rendered(board)
+    assert other_columns([image], board) == ""
+    assert words in other_columns([image], replace(board, **wrong))
+
+
+@pytest.mark.parametrize(("rows", "cols"), [(6, 9), (9, 6), (5, 7)])
+def test_counted_squares_are_named(rows, cols):
+    image = rendered(Checkerboard(rows, cols, 0.035))
+    sentence = other_size([image], Checkerboard(rows + 1, cols + 1, 0.035))
+    assert f"{rows} x {cols} inner corners is in 1 of 1" in sentence and "not squares" in sentence
+    assert sentence.endswith(f"write rows: {rows}, cols: {cols}.")
+    other = other_size([image], Checkerboard(rows + 3, cols + 1, 0.035))
+    assert other.endswith(f"write rows: {rows}, cols: {cols}.") and "squares" not in other
+    assert other_size([rendered(GRID)], Checkerboard(rows, cols, 0.035)) == ""
 
 
 @pytest.mark.parametrize("board", [CHARUCO, replace(CHARUCO, legacy=True), Checkerboard(6, 7, 0.04)])

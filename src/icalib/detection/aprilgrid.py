@@ -51,10 +51,9 @@ class AprilGridDetector:
         return tag_family(self.family)
 
     @cached_property
-    def _board(self) -> np.ndarray:
-        """(n, 4, 2) corners in OpenCV's order, in tag sizes."""
-        row, col = np.divmod(np.arange(self.rows * self.cols), self.cols)
-        return (1.0 + self.tag_spacing) * np.stack([col, row], axis=1)[:, None, :] + _ON_BOARD
+    def tag_corners(self) -> np.ndarray:
+        """As `grid_tags`."""
+        return grid_tags(self.rows, self.cols, self.tag_spacing)
 
     @property
     def _border(self) -> float:
@@ -91,12 +90,12 @@ class AprilGridDetector:
         places, count = np.unique(place, return_counts=True)
         for tag in places[(count == 1) & (places >= 0) & (places < n)]:
             known[tag], quads[tag] = True, tags.quads[place == tag][0]
-        return largest_group(known, quads, self._board), quads
+        return largest_group(known, quads, self.tag_corners), quads
 
     def _corners(self, image: np.ndarray, known: np.ndarray, quads: np.ndarray) -> ImageCorners:
         patterns = np.ascontiguousarray(self._family.codes[self.first_id : self.first_id + len(known), 0])
         cells = (patterns, self._family.bits, self.border_bits)
-        grow(image, known, quads, self._board, self.cols, *cells, self._clear, self.squares)
+        grow(image, known, quads, self.tag_corners, self.cols, *cells, self._clear, self.squares)
         tags = np.flatnonzero(known)
         if self.squares:
             uv, quality = refined_crossings(image, quads[tags], np.array([self.tag_spacing, self._border, np.inf]))
@@ -104,6 +103,12 @@ class AprilGridDetector:
             uv, quality = refined_corners(image, quads[tags], self._clear)
         uv, quality = uv.reshape(-1, 2), quality.reshape(len(quality), -1)
         point = (4 * tags[:, None] + APRILTAG_CORNER).ravel()
-        board, found = self._board[tags].reshape(-1, 2), np.isfinite(quality[0])
+        board, found = self.tag_corners[tags].reshape(-1, 2), np.isfinite(quality[0])
         consistent = consistent_corners(uv, board, found, quality[4], image.shape)
         return judged(point, uv, quality, consistent)
+
+
+def grid_tags(rows: int, cols: int, tag_spacing: float) -> np.ndarray:
+    """(n, 4, 2) corners of the tags in OpenCV's order, in tag sizes; x to the right, y up."""
+    row, col = np.divmod(np.arange(rows * cols), cols)
+    return (1.0 + tag_spacing) * np.stack([col, row], axis=1)[:, None, :] + _ON_BOARD

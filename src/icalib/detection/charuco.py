@@ -38,7 +38,7 @@ class CharucoDetector:
     legacy: bool = False
 
     def __post_init__(self) -> None:
-        n, has = len(self._markers), len(self._family.codes)
+        n, has = len(self.tag_corners), len(self._family.codes)
         if n > has:
             raise RecordingError(
                 f"a ChArUco board of {self.rows} x {self.cols} squares needs {n} markers and {self.family} has {has}; "
@@ -55,17 +55,12 @@ class CharucoDetector:
 
     @cached_property
     def _dark(self) -> np.ndarray:
-        """(rows, cols) bool."""
-        row, col = np.indices((self.rows, self.cols))
-        return (row + col + int(self.legacy and self.rows % 2 == 0)) % 2 == 0
+        return dark_squares(self.rows, self.cols, self.legacy)
 
     @cached_property
-    def _markers(self) -> np.ndarray:
-        """(n, 4, 2) corners of the markers in squares, clockwise from the top left; x to the right, y down."""
-        row, col = np.nonzero(~self._dark)
-        margin = 0.5 * (1.0 - self.marker_ratio)
-        unit = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
-        return np.stack([col, row], axis=1)[:, None, :] + margin + self.marker_ratio * unit
+    def tag_corners(self) -> np.ndarray:
+        """As `charuco_tags`."""
+        return charuco_tags(self._dark, self.marker_ratio)
 
     def detect(self, image: np.ndarray) -> ImageCorners:
         """The board's inner corners in the image (h, w) uint8, numbered row by row from the top left, as OpenCV does.
@@ -77,10 +72,10 @@ class CharucoDetector:
     def find(self, view: View) -> ImageCorners:
         """As `detect`."""
         known, quads = self._seen(view)
-        known = largest_group(known, quads, self._markers / self.marker_ratio)
+        known = largest_group(known, quads, self.tag_corners / self.marker_ratio)
         if known.sum() < _LEAST_MARKERS:
             return no_corners()
-        expected = self._expected(self._markers[known], quads[known])
+        expected = self._expected(self.tag_corners[known], quads[known])
         return square_corners(view.image, expected, self._dark, 0.5 * (1.0 - self.marker_ratio))
 
     def misfit(self, view: View) -> float:
@@ -89,7 +84,7 @@ class CharucoDetector:
         known, quads = self._seen(view)
         if known.sum() < _LEAST_TO_TELL:
             return float("nan")
-        xy, uv = self._markers[known].reshape(-1, 2), quads[known].reshape(-1, 2)
+        xy, uv = self.tag_corners[known].reshape(-1, 2), quads[known].reshape(-1, 2)
         H = fit_homography(xy, uv, len(xy))
         placed = np.array([mapped(H, x, y) for x, y in xy])
         side = np.median(np.linalg.norm(np.diff(quads[known], axis=1), axis=2))
@@ -97,7 +92,7 @@ class CharucoDetector:
 
     def _seen(self, view: View) -> tuple[np.ndarray, np.ndarray]:
         """Which markers (n,) are seen once, and the corners (n, 4, 2) of these [px]."""
-        n = len(self._markers)
+        n = len(self.tag_corners)
         known, quads = np.zeros(n, dtype=bool), np.zeros((n, 4, 2))
         tags = all_tags(view, self._family, 1)
         ids, count = np.unique(tags.ids, return_counts=True)
@@ -118,3 +113,18 @@ class CharucoDetector:
                 xy, uv = markers[near].reshape(-1, 2), quads[near].reshape(-1, 2)
                 out[row, col] = mapped(fit_homography(xy, uv, len(xy)), float(col), float(row))
         return out
+
+
+def dark_squares(rows: int, cols: int, legacy: bool) -> np.ndarray:
+    """(rows, cols) bool of a ChArUco board, row 0 at the top."""
+    row, col = np.indices((rows, cols))
+    return (row + col + int(legacy and rows % 2 == 0)) % 2 == 0
+
+
+def charuco_tags(dark: np.ndarray, marker_ratio: float) -> np.ndarray:
+    """(n, 4, 2) corners of the markers in the white squares, clockwise from the top left, in squares; x to the right,
+    y down."""
+    row, col = np.nonzero(~dark)
+    margin = 0.5 * (1.0 - marker_ratio)
+    unit = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
+    return np.stack([col, row], axis=1)[:, None, :] + margin + marker_ratio * unit

@@ -40,10 +40,13 @@ class _Seen:
     ids: np.ndarray  # all that were read, repeated ones too
 
 
-def what_is_seen(images: Iterable[np.ndarray], family: str, border_bits: int, ids: Sequence[int]) -> str:
+def what_is_seen(
+    images: Iterable[np.ndarray], family: str, border_bits: int, ids: Sequence[int], field: str = "family"
+) -> str:
     """A sentence on the tags in the first images (h, w) uint8 of a recording, in which no target was found.
 
-    `family`, `border_bits` and `ids` are those of the target. Raises RecordingError for an image that is not grey.
+    `family`, `border_bits` and `ids` are those of the target, `field` is where a rig file names the
+    family. Raises RecordingError for an image that is not grey.
     """
     candidates = _candidates([View(image).image for image in islice(images, _MOST_IMAGES)])
     own_name = _largest(family)
@@ -53,7 +56,7 @@ def what_is_seen(images: Iterable[np.ndarray], family: str, border_bits: int, id
             "the images show no tags of any known family; check that the target is in view, sharp, well lit and larger "
             "than some 20 pixels a tag."
         )
-    return _sentence(candidates[0], family, border_bits, ids)
+    return _sentence(candidates[0], family, border_bits, ids, field)
 
 
 def with_other_border(images: Iterable[np.ndarray], tags: TagSet, others: Iterable[TagSet]) -> str:
@@ -113,14 +116,16 @@ def _candidates(images: list[np.ndarray]) -> list[_Seen]:
     return [one for one in seen if len(one.ids) >= least[one.family]]
 
 
-def _sentence(seen: _Seen, family: str, border_bits: int, ids: Sequence[int]) -> str:
+def _sentence(seen: _Seen, family: str, border_bits: int, ids: Sequence[int], field: str = "family") -> str:
     what = f"{len(seen.ids)} tags of {_smallest(seen)} (ids {seen.ids.min()} to {seen.ids.max()})"
     if seen.how == "inverted":
         return f"the images show {what}, white on black; set inverted: true of a ChArUco board."
     if seen.how:
         return f"the images are mirrored, they show {what} that way; switch mirroring off in the camera's driver."
     if seen.family != _largest(family):
-        return f"the images show {what}, none of {family}; correct the target's family."
+        return (
+            f"the images show {what}, none of {family}; correct the target's {field}: write {field}: {_smallest(seen)}."
+        )
     if seen.border_bits != border_bits:
         return f"the images show {what} with border_bits {seen.border_bits}, not {border_bits}; correct border_bits."
     if not np.isin(seen.ids, ids).any():

@@ -15,6 +15,7 @@ from itertools import islice
 
 import numpy as np
 
+from icalib.detection.board_diagnosis import other_columns, other_size
 from icalib.detection.cache import keep_corners, load_corners, stream_key
 from icalib.detection.corners import ImageCorners, corner_stream, packed
 from icalib.detection.detectors import Detector, detector_of
@@ -23,7 +24,7 @@ from icalib.detection.sightings import parts_of, sightings, without_rare_tags
 from icalib.detection.turns import continuous
 from icalib.errors import RecordingError
 from icalib.extras import load_cv2
-from icalib.geometry.targets import Charuco, Markers, Scene, Target
+from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Markers, Scene, Target
 from icalib.measurements import CornerStream
 from icalib.recordings import DamagedImageError, Payload, Recording, decode
 from icalib.rig import Camera
@@ -73,10 +74,14 @@ def _called(target: Target) -> str:
 
 def _seen_instead(recording: Recording, topic: str, target: Target) -> str:
     """What to do about a target that is never found: by what the images show instead, where it has tags."""
-    tags = next((part.tags for _, part, _ in parts_of(target) if part.tags), None)
-    if tags is None:
+    for _, part, _ in parts_of(target):
+        if isinstance(part, Checkerboard) and (sentence := other_size(_spread(recording, topic), part)):
+            return sentence
+    part = next((part for _, part, _ in parts_of(target) if part.tags), None)
+    if part is None or part.tags is None:
         return "check the target's type and sizes, and that the camera saw it."
-    return what_is_seen(_spread(recording, topic), tags.family, tags.border_bits, tags.ids)
+    field = "dictionary" if isinstance(part, Charuco) else "family"
+    return what_is_seen(_spread(recording, topic), part.tags.family, part.tags.border_bits, part.tags.ids, field)
 
 
 def _other_border(recording: Recording, topic: str, target: Target, images: list[ImageCorners]) -> str:
@@ -96,9 +101,14 @@ def _other_border(recording: Recording, topic: str, target: Target, images: list
 
 
 def _other_layout(recording: Recording, topic: str, target: Target) -> str:
-    """Where a ChArUco board is of the other layout: that, and what to do."""
+    """Where tags stand as on a board of another layout: that, and what to do."""
     for name, part, _ in parts_of(target):
-        if isinstance(part, Charuco) and (wrong := with_other_layout(_spread(recording, topic), part)):
+        wrong = ""
+        if isinstance(part, Charuco | AprilGrid):
+            wrong = other_columns(_spread(recording, topic), part)
+        if isinstance(part, Charuco):
+            wrong = wrong or with_other_layout(_spread(recording, topic), part)
+        if wrong:
             return f"{name}: {wrong}" if name else wrong
     return ""
 
