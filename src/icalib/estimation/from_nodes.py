@@ -70,7 +70,7 @@ def nothing_carried(width):
 def integrate_from_node(node, t0, t1, first, bias, readings, by, carried, out):
     """As `integrate`, without a covariance. What was `carried` from the same node in the same direction, and not
     as far as t1, is carried on, so that many instants (`in_order_of_nodes`) cost little more than the last one."""
-    rate, force, backwards = np.empty(3), np.empty(3), t1 < t0
+    rate, force, backwards = by.room.rate, by.room.force, t1 < t0
     so_far, way = carried.so_far, 2 * node + backwards
     if carried.at[0] != way or (t1 >= carried.now[0] if backwards else t1 <= carried.now[0]):
         start(so_far.R, so_far.v, so_far.p, so_far.J, so_far.P)

@@ -23,6 +23,9 @@ from icalib.estimation.imu_data import ImuData
 from icalib.estimation.imu_model import correction_matrices, intrinsics_jacobians
 from icalib.geometry import so3
 
+_1_12, _1_48, _1_60, _1_99, _1_180, _1_360 = (1.0 / n for n in (12.0, 48.0, 60.0, 99.0, 180.0, 360.0))
+_1_1260, _1_10080, _3_112, _2_135, _2_165 = 1.0 / 1260.0, 1.0 / 10080.0, 3.0 / 112.0, 2.0 / 135.0, 2.0 / 165.0
+
 # Functions between the loop over instants and the innermost ones are inlined: a call counts references to every array
 # that it hands on, and these counts took as long as the sums.
 
@@ -31,15 +34,27 @@ from icalib.geometry import so3
 def _coefficient_slopes(x, s1, s2, s3):
     """Derivatives of the coefficients s1, s2, s3 of so3.jacobian_coefficients with respect to theta, over theta."""
     if x < so3.SERIES_BELOW:
-        d1 = -1.0 / 12.0 + x / 180.0 * (1.0 - x * 3.0 / 112.0 * (1.0 - x * 2.0 / 135.0))
-        d2 = -1.0 / 60.0 + x / 1260.0 * (1.0 - x / 48.0 * (1.0 - x * 2.0 / 165.0))
-        d3 = -1.0 / 360.0 + x / 10080.0 * (1.0 - x / 60.0 * (1.0 - x / 99.0))
+        d1 = -_1_12 + x * _1_180 * (1.0 - x * _3_112 * (1.0 - x * _2_135))
+        d2 = -_1_60 + x * _1_1260 * (1.0 - x * _1_48 * (1.0 - x * _2_165))
+        d3 = -_1_360 + x * _1_10080 * (1.0 - x * _1_60 * (1.0 - x * _1_99))
         return d1, d2, d3
     s0 = 1.0 - x * s2
     d1 = (s0 - 2.0 * s1) / x
     d2 = (s1 - 3.0 * s2) / x
     d3 = (s2 - 4.0 * s3) / x
     return d1, d2, d3
+
+
+@njit(cache=True, nogil=True)
+def _series(phi, c0, c1, c2, out):
+    """out = c0 I + c1 hat(phi) + c2 hat(phi)^2."""
+    x, y, z = phi[0], phi[1], phi[2]
+    out[0, 0] = c0 - c2 * (y * y + z * z)
+    out[1, 1] = c0 - c2 * (x * x + z * z)
+    out[2, 2] = c0 - c2 * (x * x + y * y)
+    out[0, 1], out[1, 0] = c2 * x * y - c1 * z, c2 * x * y + c1 * z
+    out[0, 2], out[2, 0] = c2 * x * z + c1 * y, c2 * x * z - c1 * y
+    out[1, 2], out[2, 1] = c2 * y * z - c1 * x, c2 * y * z + c1 * x
 
 
 @njit(cache=True, nogil=True)
@@ -120,78 +135,83 @@ def _add_noise(P, bias_step, variance, walk, dt):
 
 
 @njit(cache=True, nogil=True)
-def step(rate, force, dt, dw_db, df_db, R, v, p, J, extra_w, extra_f, P, P_t, variance, walk):
+def step(rate, force, dt, dw_db, df_db, R, v, p, J, extra_w, extra_f, P, P_t, variance, n, walk, room):
     """Advances the increments (R, v, p) by dt (either sign) of constant body `rate` and specific `force`.
 
     dw_db, df_db (3, 6): derivatives of rate and force with respect to both biases; extra_w, extra_f (3, 24 or 0): to
-    the IMU intrinsics. variance (3,): see ImuData; walk (2,): squared densities, gyro and accelerometer. All arrays
-    change in place.
+    the IMU intrinsics. variance (N, 3): see ImuData, row n
+    counts; walk (2,): squared densities, gyro and accelerometer; room: a
+    `Workspace`. All arrays change in place.
     """
-    phi = rate * dt
-    x = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
-    _, s1, s2, s3 = so3.jacobian_coefficients(x)
+    w = room
+    x = 0.0
+    for i in range(3):
+        w.phi[i] = rate[i] * dt
+        x += w.phi[i] * w.phi[i]
+    s0, s1, s2, s3 = so3.jacobian_coefficients(x)
     d1, d2, d3 = _coefficient_slopes(x, s1, s2, s3)
-    g1, slope1 = np.empty(3), np.empty((3, 3))
-    g2, slope2 = np.empty(3), np.empty((3, 3))
-    _series_product(phi, force, 1.0, s1, s2, d1, d2, g1, slope1)
-    _series_product(phi, force, 0.5, s2, s3, d2, d3, g2, slope2)
-    E = so3.exp(phi)
+    _series_product(w.phi, force, 1.0, s1, s2, d1, d2, w.g1, w.slope1)
+    _series_product(w.phi, force, 0.5, s2, s3, d2, d3, w.g2, w.slope2)
+    _series(w.phi, 1.0, s0, s1, w.E)
     if J.shape[1] > 0:
-        A, B, by_rate, by_force = _step_jacobians(R, phi, g1, g2, slope1, slope2, s1, s2, s3, dt)
-        bias_step = np.zeros((9, 6))
-        _add_product(bias_step, by_rate, dw_db, 9)
-        _add_product(bias_step, by_force, df_db, 9)
-        _propagate_rows(E, A, B, dt, J)
+        _step_jacobians(R, w, s1, s2, s3, dt)
+        _bias_step(w, dw_db, df_db)
+        _propagate_rows(w.E, w.A, w.B, dt, J)
         for i in range(9):
             for j in range(6):
-                J[i, j] += bias_step[i, j]
+                J[i, j] += w.bias_step[i, j]
         if J.shape[1] > 6:
-            _add_product(J[:, 6:], by_rate, extra_w, 9)
-            _add_product(J[:, 6:], by_force, extra_f, 9)
+            _add_product(J[:, 6:], w.by_rate, extra_w, 9)
+            _add_product(J[:, 6:], w.by_force, extra_f, 9)
         if P.shape[0] > 0:
-            _propagate_covariance(E, A, B, dt, bias_step, P, P_t)
-            _add_noise(P, bias_step, variance, walk, dt)
+            _propagate_covariance(w.E, w.A, w.B, dt, w.bias_step, P, P_t)
+            _add_noise(P, w.bias_step, variance[n], walk, dt)
     for i in range(3):
-        p[i] += v[i] * dt + dt * dt * (R[i, 0] * g2[0] + R[i, 1] * g2[1] + R[i, 2] * g2[2])
+        p[i] += v[i] * dt + dt * dt * (R[i, 0] * w.g2[0] + R[i, 1] * w.g2[1] + R[i, 2] * w.g2[2])
     for i in range(3):
-        v[i] += dt * (R[i, 0] * g1[0] + R[i, 1] * g1[1] + R[i, 2] * g1[2])
+        v[i] += dt * (R[i, 0] * w.g1[0] + R[i, 1] * w.g1[1] + R[i, 2] * w.g1[2])
     for i in range(3):
         a, b, c = R[i, 0], R[i, 1], R[i, 2]
         for j in range(3):
-            R[i, j] = a * E[0, j] + b * E[1, j] + c * E[2, j]
+            R[i, j] = a * w.E[0, j] + b * w.E[1, j] + c * w.E[2, j]
 
 
 @njit(cache=True, nogil=True)
-def _step_jacobians(R, phi, g1, g2, slope1, slope2, s1, s2, s3, dt):
-    """A, B: d v, d p / d rotation error; by_rate, by_force (9, 3): d increments / d rate, / d force of this step."""
-    A, B = np.empty((3, 3)), np.empty((3, 3))
-    by_rate, by_force = np.zeros((9, 3)), np.zeros((9, 3))
-    Jr = so3.right_jacobian(phi)
-    G1 = so3.left_jacobian(phi)
-    H = so3.hat(phi)
-    G2 = np.empty((3, 3))
+def _step_jacobians(R, w, s1, s2, s3, dt):
+    """Fills A, B, by_rate and by_force of the workspace `w`."""
+    _series(w.phi, 1.0, s1, s2, w.G1)
+    _series(w.phi, 0.5, s2, s3, w.G2)
+    g1, g2 = w.g1, w.g2
     for i in range(3):
+        r0, r1, r2 = R[i, 0], R[i, 1], R[i, 2]
+        # R hat(g)
+        w.A[i, 0] = -dt * (r1 * g1[2] - r2 * g1[1])
+        w.A[i, 1] = -dt * (r2 * g1[0] - r0 * g1[2])
+        w.A[i, 2] = -dt * (r0 * g1[1] - r1 * g1[0])
+        w.B[i, 0] = -dt * dt * (r1 * g2[2] - r2 * g2[1])
+        w.B[i, 1] = -dt * dt * (r2 * g2[0] - r0 * g2[2])
+        w.B[i, 2] = -dt * dt * (r0 * g2[1] - r1 * g2[0])
         for j in range(3):
-            hh = H[i, 0] * H[0, j] + H[i, 1] * H[1, j] + H[i, 2] * H[2, j]
-            G2[i, j] = s2 * H[i, j] + s3 * hh
-        G2[i, i] += 0.5
-    h1, h2 = so3.hat(g1), so3.hat(g2)
-    for i in range(3):
-        for j in range(3):
-            a = b = w1 = w2 = f1 = f2 = 0.0
+            w.by_rate[i, j] = dt * w.G1[j, i]  # J_r = J_l^T
+            w.by_rate[3 + i, j] = dt * dt * (r0 * w.slope1[0, j] + r1 * w.slope1[1, j] + r2 * w.slope1[2, j])
+            w.by_rate[6 + i, j] = dt * dt * dt * (r0 * w.slope2[0, j] + r1 * w.slope2[1, j] + r2 * w.slope2[2, j])
+            w.by_force[3 + i, j] = dt * (r0 * w.G1[0, j] + r1 * w.G1[1, j] + r2 * w.G1[2, j])
+            w.by_force[6 + i, j] = dt * dt * (r0 * w.G2[0, j] + r1 * w.G2[1, j] + r2 * w.G2[2, j])
+
+
+@njit(cache=True, nogil=True)
+def _bias_step(w, dw_db, df_db):
+    """Fills bias_step of the workspace `w`: by_rate dw_db + by_force df_db."""
+    for i in range(9):
+        for j in range(6):
+            s = 0.0
             for k in range(3):
-                r = R[i, k]
-                a += r * h1[k, j]
-                b += r * h2[k, j]
-                w1 += r * slope1[k, j]
-                w2 += r * slope2[k, j]
-                f1 += r * G1[k, j]
-                f2 += r * G2[k, j]
-            A[i, j], B[i, j] = -a * dt, -b * dt * dt
-            by_rate[i, j] = Jr[i, j] * dt
-            by_rate[3 + i, j], by_rate[6 + i, j] = w1 * dt * dt, w2 * dt * dt * dt
-            by_force[3 + i, j], by_force[6 + i, j] = f1 * dt, f2 * dt * dt
-    return A, B, by_rate, by_force
+                s += w.by_rate[i, k] * dw_db[k, j]
+            w.bias_step[i, j] = s
+    for i in range(3, 9):
+        for j in range(3, 6):  # the rate alone depends on both biases
+            for k in range(3):
+                w.bias_step[i, j] += w.by_force[i, k] * df_db[k, j]
 
 
 @njit(cache=True, nogil=True)
@@ -249,6 +269,52 @@ class Correction(NamedTuple):
     df_db: np.ndarray
     extra_w: np.ndarray
     extra_f: np.ndarray
+    room: Workspace
+
+
+class Workspace(NamedTuple):
+    """What `step` computes on its way, kept so that no step allocates memory: phi (3,); E (3, 3): Exp(phi); G1, G2
+    (3, 3) and g1, g2 (3,): G_m(phi) and G_m(phi) f; slope1, slope2 (3, 3): of the latter by phi; A, B (3, 3): d v, d p
+    / d rotation error; by_rate, by_force (9, 3) and bias_step (9, 6): d increments / d rate, d force, d biases; rate,
+    force (3,): for callers."""
+
+    phi: np.ndarray
+    E: np.ndarray
+    G1: np.ndarray
+    G2: np.ndarray
+    g1: np.ndarray
+    g2: np.ndarray
+    slope1: np.ndarray
+    slope2: np.ndarray
+    A: np.ndarray
+    B: np.ndarray
+    by_rate: np.ndarray
+    by_force: np.ndarray
+    bias_step: np.ndarray
+    rate: np.ndarray
+    force: np.ndarray
+
+
+@njit(cache=True, nogil=True)
+def workspace():
+    """An empty one; the rotation does not depend on the force."""
+    return Workspace(
+        np.empty(3),
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+        np.empty(3),
+        np.empty(3),
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+        np.empty((9, 3)),
+        np.zeros((9, 3)),
+        np.empty((9, 6)),
+        np.empty(3),
+        np.empty(3),
+    )
 
 
 class Increment(NamedTuple):
@@ -271,7 +337,7 @@ def correction(intrinsics, n_extra):
     for i in range(3):
         for k in range(3):
             dw_db[i, k], dw_db[i, 3 + k], df_db[i, 3 + k] = -G[i, k], -H[i, k], -F[i, k]
-    return Correction(intrinsics, F, G, H, dw_db, df_db, np.zeros((3, n_extra)), np.zeros((3, n_extra)))
+    return Correction(intrinsics, F, G, H, dw_db, df_db, np.zeros((3, n_extra)), np.zeros((3, n_extra)), workspace())
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -286,7 +352,7 @@ def _part(j, now, end, bias, readings, by, out, P_t, rate, force):
     if end != now:
         step(
             rate, force, end - now, by.dw_db, by.df_db, out.R, out.v, out.p, out.J, by.extra_w, by.extra_f, out.P, P_t,
-            readings.variance[j], readings.walk,
+            readings.variance, j, readings.walk, by.room,
         )  # fmt: skip
 
 

@@ -20,11 +20,11 @@ from icalib.estimation.clocks import by_clock, instants, mounted_columns, offset
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.lidar_sweep import Motion
 from icalib.estimation.nodes import MERGED_WITHIN_S, usable
-from icalib.estimation.pose_rows import Frame, Mount, PoseRows, absolute_rows, relative_rows
-from icalib.estimation.poses import Poses, assign_nodes, poses_at, poses_of_nodes
-from icalib.estimation.row_sums import Into, Weighing, add_rows
+from icalib.estimation.pose_rows import Frame, Mount, PoseRows, absolute_rows, add_chain_rule, relative_rows
+from icalib.estimation.poses import Poses, assign_nodes, poses_alone, poses_at, poses_of_nodes
+from icalib.estimation.row_sums import Into, Weighing, add_rows, in_chunks
 from icalib.estimation.sensors import Whitened
-from icalib.estimation.state import Layout, State
+from icalib.estimation.state import NODE, Layout, State
 from icalib.estimation.wheel_intervals import WheelIntervals, choose_intervals
 from icalib.estimation.wheel_kernels import Rows
 from icalib.measurements import PoseStream
@@ -135,8 +135,8 @@ class AbsolutePoseFactor:
         low, high = np.searchsorted(at, [piece.first, piece.last])
         for k in range(len(self.starts)):
             own = slice(max(int(edges[k]), int(low)), min(int(edges[k + 1]), int(high)))
-            if own.start < own.stop:
-                cost += self._of_recording(k, own, at[own], state, Into(piece, out, sums, curved))
+            for some in in_chunks(own):
+                cost += self._of_recording(k, some, at[some], state, Into(piece, out, sums, curved))
         return cost
 
     def _of_recording(self, recording: int, own: slice, at: np.ndarray, state: State, into: Into) -> float:
@@ -144,17 +144,21 @@ class AbsolutePoseFactor:
         frame = frame_of(self.name, recording)
         v, node = state.values, self.node[own]
         found = Frame(v[frame, FRAME[0]], v[frame, FRAME[1]])
-        poses = _poses(self, self.seconds[own], node, state)
+        poses = _poses(self, self.seconds[own], node, state, into.sums)
         rows = absolute_rows(
-            poses.rotation, poses.position, _mount(self.name, state), found, self.rotation[own], self.position[own]
+            poses.rotation,
+            poses.position,
+            _mount(self.name, state),
+            found,
+            self.rotation[own],
+            self.position[own],
+            into.sums,
         )
-        (by_pose,) = rows.by_pose
-        by_node = by_pose @ poses.by_node
-        last = (node > at)[:, None, None]
-        made = Rows(
-            rows.residual, np.where(last, 0.0, by_node), np.where(last, by_node, 0.0),
-            _by_border(rows, by_pose @ _moving(poses), by_pose @ poses.by_imu),
-        )  # fmt: skip
+        made = _chained(rows, (poses,))
+        if into.sums:
+            last = node > at
+            made.by_next[last] = made.by_node[last]
+            made.by_node[last] = 0.0
         columns = np.concatenate(
             [mounted_columns(self.layout, self.name, recording), self.layout.columns(frame, *FRAME)]
         )
@@ -227,24 +231,24 @@ class RelativePosesFactor:
         low, high = (int(k) for k in np.searchsorted(self.intervals.node, [piece.first, piece.last]))
         into, cost = Into(piece, out, sums, curved), 0.0
         for clock, part in by_clock(state, self.name, self.intervals.node[low:high]):
-            cost += self._of_clock(clock, slice(low + part.start, low + part.stop), state, into)
+            for some in in_chunks(slice(low + part.start, low + part.stop)):
+                cost += self._of_clock(clock, some, state, into)
         return cost
 
     def _of_clock(self, clock: int, own: slice, state: State, into: Into) -> float:
         """Adds the ways `own`, which go by one time offset."""
         first, last, node = (x[own] for x in (self.intervals.first, self.intervals.last, self.intervals.node))
-        a = _poses(self, self.seconds[first], node, state)
-        b = _poses(self, self.seconds[last], node + 1, state)
+        a = _poses(self, self.seconds[first], node, state, into.sums)
+        b = _poses(self, self.seconds[last], node + 1, state, into.sums)
         rows = relative_rows(
-            (a.rotation, b.rotation), (a.position, b.position), _mount(self.name, state), self.rotation[own],
+            (a.rotation, b.rotation),
+            (a.position, b.position),
+            _mount(self.name, state),
+            self.rotation[own],
             self.position[own],
-        )  # fmt: skip
-        before, after = rows.by_pose
-        by_time = before @ _moving(a) + after @ _moving(b)
-        made = Rows(
-            rows.residual, before @ a.by_node, after @ b.by_node,
-            _by_border(rows, by_time, before @ a.by_imu + after @ b.by_imu),
-        )  # fmt: skip
+            into.sums,
+        )
+        made = _chained(rows, (a, b))
         return _add(self, own, made, mounted_columns(self.layout, self.name, clock), node, into)
 
 
@@ -259,21 +263,28 @@ def _mount(name: str, state: State) -> Mount:
     return Mount(state.values[name, "rotation"], state.values[name, "translation"])
 
 
-def _poses(factor: PoseFactor, seconds: np.ndarray, node: np.ndarray, state: State) -> Poses:
+def _poses(factor: PoseFactor, seconds: np.ndarray, node: np.ndarray, state: State, jacobians: bool) -> Poses:
     if factor.imu is None:
         return poses_of_nodes(node, state)
     times = seconds + offset_at(state, factor.name, node)
+    if not jacobians:
+        return poses_alone(times, node, state, factor.imu, factor.gravity)
     imu_free = factor.layout.is_free(factor.imu.name, "intrinsics")
     return poses_at("inertial", times, node, state, factor.imu, factor.gravity, imu_free)
 
 
-def _moving(poses: Poses) -> np.ndarray:
-    """(n, 6, 1) derivative of the IMU's rotation and position by time."""
-    return np.concatenate([poses.rate, poses.velocity], axis=1)[:, :, None]
-
-
-def _by_border(rows: PoseRows, by_time: np.ndarray, by_imu: np.ndarray) -> np.ndarray:
-    return np.concatenate([rows.by_mount, by_time, rows.by_frame, by_imu], axis=2)
+def _chained(rows: PoseRows, ends: tuple[Poses, ...]) -> Rows:
+    """The rows by the nodes of each of their `ends`, and by the border: mount, time, frame, IMU intrinsics."""
+    n, own = rows.by_mount.shape[0], rows.by_mount.shape[2]
+    time = slice(own, own + 1)
+    frame = slice(time.stop, time.stop + rows.by_frame.shape[2])
+    by_border = np.zeros((n, 6, frame.stop + ends[0].by_imu.shape[2]))
+    by_border[:, :, :own], by_border[:, :, frame] = rows.by_mount, rows.by_frame
+    by_nodes = np.zeros((2, n, 6, NODE))
+    for by_pose, poses, by_node in zip(rows.by_pose, ends, by_nodes, strict=False):
+        moved = poses.by_node, poses.by_imu, poses.rate, poses.velocity
+        add_chain_rule(by_pose, moved, by_node, by_border[:, :, own], by_border[:, :, frame.stop :])
+    return Rows(rows.residual, by_nodes[0], by_nodes[1], by_border)
 
 
 def _add(factor: PoseFactor, own: slice, rows: Rows, columns: np.ndarray, node: np.ndarray, into: Into) -> float:

@@ -34,16 +34,28 @@ class Frame:
 class PoseRows:
     """n poses of 6 rows, rotation and position, not whitened. residual (n, 6); by_pose (n, 6, 6) by rotation and
     position of the IMU, of relative poses one for each end; by_mount (n, 6, 6) by R_imu_sensor, p_imu_sensor; by_frame
-    (n, 6, 6 or 0) by R_world_frame, p_world_frame."""
+    (n, 6, 6 or 0) by R_world_frame, p_world_frame. Jacobians of length 0 where they are not wanted."""
 
     residual: np.ndarray
     by_pose: tuple[np.ndarray, ...]
     by_mount: np.ndarray
     by_frame: np.ndarray
 
+    @classmethod
+    def alone(cls, residual: np.ndarray) -> PoseRows:
+        """Residuals (n, 6) without Jacobians."""
+        nothing = np.zeros((0, 6, 6))
+        return cls(residual, (nothing, nothing), nothing, nothing)
+
 
 def absolute_rows(
-    R: np.ndarray, p: np.ndarray, mount: Mount, frame: Frame, rotation: np.ndarray, position: np.ndarray
+    R: np.ndarray,
+    p: np.ndarray,
+    mount: Mount,
+    frame: Frame,
+    rotation: np.ndarray,
+    position: np.ndarray,
+    jacobians: bool = True,
 ) -> PoseRows:
     """Of poses R_frame_sensor (n, 3, 3), p_frame_sensor (n, 3), while the IMU was at R (n, 3, 3), p (n, 3):
 
@@ -53,8 +65,11 @@ def absolute_rows(
     in_frame = frame.R.T @ R  # R_frame_imu
     predicted = in_frame @ mount.R
     e = so3.log_many(np.ascontiguousarray(_t(rotation) @ predicted))
-    J = right_jacobians_inverse(e)
     x = (p + R @ mount.p - frame.p) @ frame.R
+    residual = np.concatenate([e, x - position], axis=1)
+    if not jacobians:
+        return PoseRows.alone(residual)
+    J = right_jacobians_inverse(e)
     by_pose, by_mount, by_frame = (np.zeros((n, 6, 6)) for _ in range(3))
     by_pose[:, :3, :3] = J @ mount.R.T
     by_pose[:, 3:, :3] = -in_frame @ so3.hat_many(mount.p)
@@ -64,7 +79,7 @@ def absolute_rows(
     by_frame[:, :3, :3] = -J @ _t(predicted)
     by_frame[:, 3:, :3] = so3.hat_many(x)
     by_frame[:, 3:, 3:] = -frame.R.T
-    return PoseRows(np.concatenate([e, x - position], axis=1), (by_pose,), by_mount, by_frame)
+    return PoseRows(residual, (by_pose,), by_mount, by_frame)
 
 
 def relative_rows(
@@ -73,6 +88,7 @@ def relative_rows(
     mount: Mount,
     rotation: np.ndarray,
     position: np.ndarray,
+    jacobians: bool = True,
 ) -> PoseRows:
     """Of poses (n, 3, 3), (n, 3) of the sensor at the later of two instants, seen from the earlier, while the IMU was
     at R[0], p[0] and R[1], p[1]:
@@ -83,9 +99,12 @@ def relative_rows(
     n, turn = len(R[0]), _t(R[0]) @ R[1]
     Q = mount.R.T @ turn @ mount.R
     e = so3.log_many(np.ascontiguousarray(_t(rotation) @ Q))
-    J = right_jacobians_inverse(e)
     way = np.einsum("nji,nj->ni", R[0], p[1] + R[1] @ mount.p - p[0])
     x = (way - mount.p) @ mount.R
+    residual = np.concatenate([e, x - position], axis=1)
+    if not jacobians:
+        return PoseRows.alone(residual)
+    J = right_jacobians_inverse(e)
     before, after, by_mount = (np.zeros((n, 6, 6)) for _ in range(3))
     before[:, :3, :3] = -J @ mount.R.T @ _t(turn)
     before[:, 3:, :3] = mount.R.T @ so3.hat_many(way)
@@ -96,7 +115,7 @@ def relative_rows(
     by_mount[:, :3, :3] = J @ (np.eye(3) - _t(Q))
     by_mount[:, 3:, :3] = so3.hat_many(x)
     by_mount[:, 3:, 3:] = mount.R.T @ (turn - np.eye(3))
-    return PoseRows(np.concatenate([e, x - position], axis=1), (before, after), by_mount, np.zeros((n, 6, 0)))
+    return PoseRows(residual, (before, after), by_mount, np.zeros((n, 6, 0)))
 
 
 @njit(cache=True, nogil=True)
@@ -106,6 +125,24 @@ def right_jacobians_inverse(e: np.ndarray) -> np.ndarray:
     for i in range(len(e)):
         out[i] = so3.right_jacobian_inverse(e[i])
     return out
+
+
+@njit(cache=True, nogil=True)
+def add_chain_rule(by_pose, at, out_node, out_time, out_imu):
+    """Adds the derivatives of rows through a pose of the IMU, by_pose (n, 6, 6), `at` of which are the `Poses`: by the
+    node to out_node (n, 6, 15), by time to out_time (n, 6), by the IMU intrinsics to out_imu (n, 6, 24 or 0)."""
+    by_node, by_imu, rate, velocity = at
+    for i in range(len(by_pose)):
+        for q in range(6):
+            for k in range(6):
+                f = by_pose[i, q, k]
+                if f == 0.0:
+                    continue
+                out_time[i, q] += f * (rate[i, k] if k < 3 else velocity[i, k - 3])
+                for c in range(15):
+                    out_node[i, q, c] += f * by_node[i, k, c]
+                for c in range(out_imu.shape[2]):
+                    out_imu[i, q, c] += f * by_imu[i, k, c]
 
 
 def _t(R: np.ndarray) -> np.ndarray:

@@ -70,12 +70,13 @@ def assign_nodes(scheme: Scheme, nodes: np.ndarray, times: np.ndarray, forwards:
 @njit(cache=True, nogil=True)
 def _velocity(i, R0, R1, g, dv, force, J, moving):
     """Fills entry i of `moving`: dv, J of the increments from the node (R0), force at the instant (R1)."""
-    turn = so3.hat(dv)
     for a in range(3):
         moving.acceleration[i, a] = R1[a, 0] * force[0] + R1[a, 1] * force[1] + R1[a, 2] * force[2]
         moving.by_node[i, a, 6 + a] = 1.0
-        for c in range(3):
-            moving.by_node[i, a, c] = -(R0[a, 0] * turn[0, c] + R0[a, 1] * turn[1, c] + R0[a, 2] * turn[2, c])
+        # -R_0 hat(dv)
+        moving.by_node[i, a, 0] = R0[a, 2] * dv[1] - R0[a, 1] * dv[2]
+        moving.by_node[i, a, 1] = R0[a, 0] * dv[2] - R0[a, 2] * dv[0]
+        moving.by_node[i, a, 2] = R0[a, 1] * dv[0] - R0[a, 0] * dv[1]
         for c in range(J.shape[1]):
             s = R0[a, 0] * J[3, c] + R0[a, 1] * J[4, c] + R0[a, 2] * J[5, c]
             if c < 6:
@@ -88,13 +89,15 @@ def _velocity(i, R0, R1, g, dv, force, J, moving):
 @njit(cache=True, nogil=True)
 def _by_node(i, dt, R, J, dR, dp, Jn, Jx):
     """Fills entry i of the Jacobians of a pose: dt, dR, dp and their Jacobian J from the node, which is at R."""
-    turn = so3.hat(dp)
     for a in range(3):
         Jn[i, 3 + a, 3 + a] = 1.0
         Jn[i, 3 + a, 6 + a] = dt
+        # -R hat(dp)
+        Jn[i, 3 + a, 0] = R[a, 2] * dp[1] - R[a, 1] * dp[2]
+        Jn[i, 3 + a, 1] = R[a, 0] * dp[2] - R[a, 2] * dp[0]
+        Jn[i, 3 + a, 2] = R[a, 1] * dp[0] - R[a, 0] * dp[1]
         for c in range(3):
             Jn[i, a, c] = dR[c, a]
-            Jn[i, 3 + a, c] = -(R[a, 0] * turn[0, c] + R[a, 1] * turn[1, c] + R[a, 2] * turn[2, c])
         for c in range(J.shape[1]):
             s = R[a, 0] * J[6, c] + R[a, 1] * J[7, c] + R[a, 2] * J[8, c]
             if c < 6:
@@ -107,8 +110,8 @@ def _by_node(i, dt, R, J, dR, dp, Jn, Jx):
 
 @njit(cache=True, nogil=True)
 def _inertial(ways, nodes, readings, intrinsics, at, Jn, Jx, moving):
-    """Fills `at`, a `Moving`, the Jacobians, and `moving` where it is not empty."""
-    width = 6 + Jx.shape[2]
+    """Fills `at`, a `Moving`, and where they are not empty the Jacobians and `moving`."""
+    width = 6 + Jx.shape[2] if len(Jn) else 0
     by, carried = correction(intrinsics, Jx.shape[2]), nothing_carried(width)
     out = Increment(np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((9, width)), np.empty((0, 0)))
     for i in ways.order:
@@ -116,7 +119,8 @@ def _inertial(ways, nodes, readings, intrinsics, at, Jn, Jx, moving):
         t0, R = nodes.seconds[k], nodes.rotation[k]
         rate, force = integrate_from_node(k, t0, t, ways.first[i], nodes.bias[k], readings, by, carried, out)
         place(i, t - t0, k, nodes, out, rate, at)
-        _by_node(i, t - t0, R, out.J, out.R, out.p, Jn, Jx)
+        if len(Jn):
+            _by_node(i, t - t0, R, out.J, out.R, out.p, Jn, Jx)
         if len(moving.acceleration):
             _velocity(i, R, at.rotation[i], nodes.gravity, out.v, force, out.J, moving)
 
@@ -194,9 +198,9 @@ def poses_at(
     scheme: Scheme, times: np.ndarray, node: np.ndarray, state: State, imu: ImuData, gravity: float, imu_free: bool
 ) -> Poses:
     """IMU poses at `times` (n,) seconds on the imu clock, each from its `node` (see `assign_nodes`)."""
-    if scheme == "inertial":
-        return _inertial_poses(times, node, state, imu, gravity, imu_free, Velocities.empty(0, 0))
     n = len(times)
+    if scheme == "inertial":
+        return _carried(_empty(n, n, imu_free), times, node, state, imu, gravity, Velocities.empty(0, 0))
     out, by_node, by_imu = Moving.empty(n), np.zeros((n, 6, NODE)), np.zeros((n, 6, N_INTRINSICS if imu_free else 0))
     by_next = np.zeros((n if scheme == "pose" else 0, 6, NODE))
     if scheme == "pose":
@@ -210,26 +214,32 @@ def poses_at(
     return Poses(*out, by_node, by_next, by_imu)
 
 
+def poses_alone(times: np.ndarray, node: np.ndarray, state: State, imu: ImuData, gravity: float) -> Poses:
+    """The `inertial` poses of `poses_at` with Jacobians of length 0."""
+    return _carried(_empty(len(times), 0, False), times, node, state, imu, gravity, Velocities.empty(0, 0))
+
+
 def motion_at(
     times: np.ndarray, node: np.ndarray, state: State, imu: ImuData, gravity: float, imu_free: bool
 ) -> tuple[Poses, Velocities]:
     """The `inertial` poses of `poses_at`, and how their velocities move."""
-    moving = Velocities.empty(len(times), N_INTRINSICS if imu_free else 0)
-    return _inertial_poses(times, node, state, imu, gravity, imu_free, moving), moving
-
-
-def _inertial_poses(
-    times: np.ndarray,
-    node: np.ndarray,
-    state: State,
-    imu: ImuData,
-    gravity: float,
-    imu_free: bool,
-    moving: Velocities,
-) -> Poses:
-    """The `inertial` poses; fills `moving` where it is not empty."""
     n = len(times)
-    at, by_node, by_imu = Moving.empty(n), np.zeros((n, 6, NODE)), np.zeros((n, 6, N_INTRINSICS if imu_free else 0))
+    moving = Velocities.empty(n, N_INTRINSICS if imu_free else 0)
+    return _carried(_empty(n, n, imu_free), times, node, state, imu, gravity, moving), moving
+
+
+def _empty(n: int, n_jacobians: int, imu_free: bool) -> Poses:
+    """To be filled with n `inertial` poses and the Jacobians of as many, or of none."""
+    by_imu = np.zeros((n_jacobians, 6, N_INTRINSICS if imu_free else 0))
+    return Poses(*Moving.empty(n), np.zeros((n_jacobians, 6, NODE)), np.zeros((0, 6, NODE)), by_imu)
+
+
+def _carried(
+    out: Poses, times: np.ndarray, node: np.ndarray, state: State, imu: ImuData, gravity: float, moving: Velocities
+) -> Poses:
+    """Fills `out` with the `inertial` poses, and `moving` where it is not empty; returns `out`."""
     ways, nodes = ways_from(state, times, node, imu), nodes_of(state, gravity)
-    _inertial(ways, nodes, readings_of(imu, True), state.values[imu.name, "intrinsics"], at, by_node, by_imu, moving)
-    return Poses(*at, by_node, np.zeros((0, 6, NODE)), by_imu)
+    at = Moving(out.rotation, out.position, out.rate, out.velocity)
+    intrinsics = state.values[imu.name, "intrinsics"]
+    _inertial(ways, nodes, readings_of(imu, True), intrinsics, at, out.by_node, out.by_imu, moving)
+    return out

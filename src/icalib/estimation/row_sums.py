@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,9 @@ from icalib.estimation.imu_data import ImuData
 from icalib.estimation.sensors import Whitened
 from icalib.estimation.state import Layout
 from icalib.estimation.wheel_kernels import Rows, accumulate_rows
+
+# Rows of a factor that are made at once: their Jacobians stay in the processor's cache.
+CHUNK = 256
 
 
 class Into(NamedTuple):
@@ -30,6 +34,12 @@ class Weighing(NamedTuple):
     whitening: np.ndarray
     loss: str
     loss_scale: float
+
+
+def in_chunks(own: slice) -> Iterator[slice]:
+    """The rows `own`, CHUNK at a time."""
+    for start in range(own.start, own.stop, CHUNK):
+        yield slice(start, min(start + CHUNK, own.stop))
 
 
 def add_rows(

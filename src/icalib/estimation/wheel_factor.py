@@ -22,8 +22,8 @@ import numpy as np
 from icalib.estimation.arrowhead import Piece
 from icalib.estimation.clocks import by_clock, instants, mounted_columns, offset_at
 from icalib.estimation.imu_data import ImuData
-from icalib.estimation.poses import Poses, motion_at, poses_at
-from icalib.estimation.row_sums import Into, Weighing, add_rows
+from icalib.estimation.poses import Poses, Velocities, motion_at, poses_alone, poses_at
+from icalib.estimation.row_sums import Into, Weighing, add_rows, in_chunks
 from icalib.estimation.sensors import Whitened
 from icalib.estimation.state import Layout, State
 from icalib.estimation.wheel_carry import carried_noise
@@ -148,21 +148,24 @@ class IncrementFactor:
 
         Returns half the robust chi^2. `curved`: J^T J has the true curvature of the robust loss, not its weights alone.
         """
-        own = _in_piece(self.intervals, piece)
+        into = Into(piece, out, sums, curved)
+        return sum(self._added(own, state, into) for own in in_chunks(_in_piece(self.intervals, piece)))
+
+    def _added(self, own: slice, state: State, into: Into) -> float:
+        """Adds the intervals `own`; returns half their robust chi^2."""
         start = self.instants.start[own.start : own.stop + 1]
         seen = slice(int(start[0]), int(start[-1]))
         node = self.instants.node[seen]
         times = self.instants.times[seen] + offset_at(state, self.name, node)
-        free = self.layout.is_free(self.imu.name, "intrinsics")
-        poses, moving = motion_at(times, node, state, self.imu, self.gravity, free)
-        rows = Rows.empty(len(start) - 1, 4, poses.by_imu.shape[2], sums)
+        poses, moving = _motion(self, times, node, state, into.sums)
+        rows = Rows.empty(len(start) - 1, 4, poses.by_imu.shape[2], into.sums)
         wheels = _wheels(self.name, state, self.kind)
         c = coefficients(self.kind, wheels.drive, self.mean[own])
         increment_rows(
             start - start[0], self.instants.weight[seen], _track(node, poses), moving, wheels, c, self.measured[own],
             rows,
         )  # fmt: skip
-        return _add(self, own, rows, self.whitening, state, Into(piece, out, sums, curved))
+        return _add(self, own, rows, self.whitening, state, into)
 
 
 @dataclass(frozen=True)
@@ -253,16 +256,23 @@ class RelativePoseFactor:
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """See IncrementFactor.accumulate."""
-        own = _in_piece(self.intervals, piece)
+        into = Into(piece, out, sums, curved)
+        return sum(self._added(own, state, into) for own in in_chunks(_in_piece(self.intervals, piece)))
+
+    def _added(self, own: slice, state: State, into: Into) -> float:
+        """Adds the intervals `own`; returns half their robust chi^2."""
         i, z = self.intervals, self.poses
         node = np.concatenate([i.node[own], i.node[own] + 1])
         seconds = np.concatenate([self.seconds[i.first[own]], self.seconds[i.last[own]]])
         times = seconds + offset_at(state, self.name, node)
-        free = self.layout.is_free(self.imu.name, "intrinsics")
-        poses = poses_at("inertial", times, node, state, self.imu, self.gravity, free)
-        rows = Rows.empty(len(times) // 2, 3, poses.by_imu.shape[2], sums)
+        if into.sums:
+            free = self.layout.is_free(self.imu.name, "intrinsics")
+            poses = poses_at("inertial", times, node, state, self.imu, self.gravity, free)
+        else:
+            poses = poses_alone(times, node, state, self.imu, self.gravity)
+        rows = Rows.empty(len(times) // 2, 3, poses.by_imu.shape[2], into.sums)
         relative_rows(_track(node, poses), _wheels(self.name, state, self.kind), z.z[own], z.J[own], z.drive0, rows)
-        return _add(self, own, rows, z.W, state, Into(piece, out, sums, curved))
+        return _add(self, own, rows, z.W, state, into)
 
 
 def wheel_intervals(
@@ -301,6 +311,15 @@ def _row_sigma(kind: WheelKind, noise: WheelNoise, dt: np.ndarray, whole: np.nda
 def _wheels(name: str, state: State, kind: WheelKind) -> Wheels:
     rotation = np.ascontiguousarray(state.values[name, "rotation"])
     return Wheels(rotation, state.values[name, "translation"], drive_of(name, state, kind))
+
+
+def _motion(
+    factor: IncrementFactor, times: np.ndarray, node: np.ndarray, state: State, jacobians: bool
+) -> tuple[Poses, Velocities]:
+    if not jacobians:
+        return poses_alone(times, node, state, factor.imu, factor.gravity), Velocities.empty(0, 0)
+    free = factor.layout.is_free(factor.imu.name, "intrinsics")
+    return motion_at(times, node, state, factor.imu, factor.gravity, free)
 
 
 def _track(node: np.ndarray, poses: Poses) -> Track:

@@ -72,10 +72,12 @@ def _add(R, x, scale, sign, out):
 
 
 @njit(cache=True, nogil=True)
-def _turn(a, b, track, M0, M1, Mc):
-    """Theta (3,) between instants a and b; its derivatives by their nodes into rows 3: of M0, M1 (6, 15), by time and
-    the IMU intrinsics into those of Mc (6, 1 + 24 or 0)."""
+def _turn(a, b, track, M0, M1, Mc, wanted):
+    """Theta (3,) between instants a and b; its derivatives, where `wanted`, by their nodes into rows 3: of M0, M1 (6,
+    15), by time and the IMU intrinsics into those of Mc (6, 1 + 24 or 0)."""
     theta = so3.log(tmul3(track.rotation[a], track.rotation[b]))
+    if not wanted:
+        return theta
     before, after = so3.left_jacobian_inverse(theta), so3.right_jacobian_inverse(theta)
     for i in range(3):
         for j in range(3):
@@ -111,18 +113,22 @@ def _add_travel(j, w, track, moving, D, M, Mc, wanted):
 
 
 @njit(cache=True, nogil=True)
-def _shift(a, b, track, p, Y, M0, M1, Mc):
-    """Y = R_a^T (p_b - p_a) + R_a^T R_b p - p for a lever arm p (3,), and its derivatives into the first rows."""
+def _shift(a, b, track, p, Y, M0, M1, Mc, wanted):
+    """Y = R_a^T (p_b - p_a) + R_a^T R_b p - p for a lever arm p (3,), and where `wanted` its derivatives into the first
+    rows."""
     Ra, d = track.rotation[a], track.position[b] - track.position[a]
     R01 = tmul3(Ra, track.rotation[b])
     before, speed = np.zeros(3), np.zeros(3)
     _add(Ra, d, 1.0, -1, before)
     _add(R01, p, 1.0, 1, before)
+    for i in range(3):
+        Y[i] = before[i] - p[i]
+    if not wanted:
+        return
     _add(Ra, track.velocity[b] - track.velocity[a], 1.0, -1, speed)
     A, B = so3.hat(before), np.zeros((3, 3))
     lever = so3.hat(p)
     for i in range(3):
-        Y[i] = before[i] - p[i]
         Mc[i, 0] += speed[i]
         for k in range(3):
             for m in range(3):
@@ -192,7 +198,7 @@ def increment_rows(start, weights, track, moving, wheels, c, measured, rows):
             _add_travel(
                 j, weights[j], track, moving, D, M0 if track.node[j] == track.node[a] else M1, Mc, wanted
             )  # fmt: skip
-        theta = _turn(a, b, track, M0, M1, Mc)
+        theta = _turn(a, b, track, M0, M1, Mc, wanted)
         Y = D + _cross(theta, wheels.p)
         _add(wheels.R, Y, 1.0, -1, X)
         _add(wheels.R, theta, 1.0, -1, T)
@@ -224,8 +230,8 @@ def relative_rows(track, wheels, z, J, drive0, rows):
     X, T, none, axes = np.empty(3), np.empty(3), np.zeros(3), np.eye(3)
     for i in range(n):
         M0[:], M1[:], Mc[:], X[:], T[:] = 0.0, 0.0, 0.0, 0.0, 0.0
-        theta = _turn(i, n + i, track, M0, M1, Mc)
-        _shift(i, n + i, track, wheels.p, Y, M0, M1, Mc)
+        theta = _turn(i, n + i, track, M0, M1, Mc, wanted)
+        _shift(i, n + i, track, wheels.p, Y, M0, M1, Mc, wanted)
         _add(wheels.R, Y, 1.0, -1, X)
         _add(wheels.R, theta, 1.0, -1, T)
         R01 = tmul3(track.rotation[i], track.rotation[n + i])
