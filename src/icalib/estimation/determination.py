@@ -164,7 +164,7 @@ class _Search:
         del self.found  # before the next one takes as much memory
         guess = self.guess if led else None
         self.found = estimate(self.inputs, begin, self.on_step, held, self.on_visit, judged, guess=guess)
-        self.seen = judge(self.inputs, self.found.outcome, None if led else self.seen)
+        self.seen = judge(self.inputs, self.found.outcome, self.seen)
 
 
 def _followed(found: Estimate, moved: State, held: np.ndarray) -> State:

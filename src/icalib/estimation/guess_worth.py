@@ -76,8 +76,8 @@ def moved_to_worth(inputs: Inputs, problem: Problem, state: State, guess: State,
 
 
 def owed_to_guess(inputs: Inputs, outcome: Outcome, data: np.ndarray) -> np.ndarray:
-    """(m + TOGETHER, B) how the border moves with each of m independent errors of the guess along the held directions,
-    one standard deviation each, and by how much more or less where all of them come together.
+    """(m + TOGETHER or fewer, B) how the border moves with each of m independent errors of the guess along the held
+    directions, one standard deviation each, and by how much more or less where all of them come together.
 
     data (B, B): information of the data alone, in tolerance units. The room of `outcome` is used.
     """
@@ -87,8 +87,10 @@ def owed_to_guess(inputs: Inputs, outcome: Outcome, data: np.ndarray) -> np.ndar
         return in_proportion(inputs, outcome, data)
     alone = np.array([_answer(outcome, way) for way in ways.T])
     signs = np.random.default_rng(0).choice((-1.0, 1.0), (TOGETHER, ways.shape[1]))
-    beyond = [_answer(outcome, ways @ s) - s @ alone for s in signs]
-    return np.vstack([alone, np.array(beyond) / np.sqrt(TOGETHER)])
+    # Of few errors the signs repeat: each combination is solved once.
+    own, times = np.unique(signs, axis=0, return_counts=True)
+    beyond = np.array([_answer(outcome, ways @ s) - s @ alone for s in own])
+    return np.vstack([alone, np.sqrt(times / TOGETHER)[:, None] * beyond])
 
 
 def in_proportion(inputs: Inputs, outcome: Outcome, data: np.ndarray) -> np.ndarray:
