@@ -28,6 +28,7 @@ COMES_BACK = 0.25  # of what a step costs too much, where its error is of second
 STRAIGHT, AS_SAID = 1e3, 0.1  # of half the chi^2; of an early pass's tolerance: how well a larger step may be foretold
 OVERSHOT = 0.5  # of what a step promises: one that gains or costs less than this is too long
 ACROSS = 1e-6  # damping of a step that comes back: across a valley, not along it
+CREEPING = 2  # steps
 RESTING = 20.0  # times the tolerance of an early pass: a step that promises less and fails ends it
 FIRST_DAMPING = 1e-8
 SMALL_DECREASE = 0.5  # of half the chi^2: a step of one standard deviation, all parameters together
@@ -143,6 +144,12 @@ class _Descent:
         """Whether nothing that counts would change: the sums are those of the end already."""
         counts = min(ROUNDING * self.cost, LEAST_DECREASE)
         return not self.early and self.care.curved and self.free and solution.decrease < counts
+
+    def creeps(self, solution: Solution) -> bool:
+        """Whether steps have ceased to promise less and less: Gauss and Newton's do where the measurements determine
+        all, and wander where noise leads."""
+        before = [step.predicted_decrease for step in self.steps[-CREEPING:]]
+        return len(before) == CREEPING and solution.decrease > 0.5 * min(before)
 
     def let_go(self, priors: Sequence[Prior], solution: Solution) -> Solution:
         """The solution where `priors` count no more: what they add to the border is known, so nothing is solved."""
@@ -324,9 +331,9 @@ def minimise(
     another pass follows, and the end is not linearised once more: the outcome has no information and no draws.
     `comes_back`: steps may go as far as the next ones can make good, see `_Descent`. `leaves`: asked with
     how far it has come, as a share of half the chi^2, and the border's information (B, B), whether to end when half the
-    chi^2 can fall by less than HALF_WAY, or a step not far from there fails. `lets_go`: asked before it, with the same,
-    which priors are to count no more from where half the chi^2 can fall by less than HALF_WAY. `room`: of an outcome of
-    a problem with the same features, to be used again.
+    chi^2 can fall by less than HALF_WAY, or a step not far from there fails, or steps creep. `lets_go`: asked before
+    it, with the same, which priors are to count no more from where half the chi^2 can fall by less than HALF_WAY.
+    `room`: of an outcome of a problem with the same features, to be used again.
 
     Raises EstimationError if no step can be computed at all.
     """
@@ -337,10 +344,11 @@ def minimise(
         if at.free and solution.decrease < HALF_WAY:
             gone = lets_go(way_come(at.steps, at.cost), solution.information)
             solution = at.let_go(gone, solution) if gone else solution
-        low = at.free and solution.decrease < RESTING * HALF_WAY
+        creeps = at.creeps(solution)
+        low = creeps or (at.free and solution.decrease < RESTING * HALF_WAY)
         asked = low and leaves is not None and leaves(way_come(at.steps, at.cost), solution.information)
-        if asked and solution.decrease < HALF_WAY:
-            return replace(at.outcome(solution), half_way=True)
+        if asked and (creeps or solution.decrease < HALF_WAY) and (at.free or at.early):
+            return replace(at.outcome(solution) if at.free else at.end(on_visit), half_way=True)
         if at.has_ended(solution):
             at.note(solution, True)
             return at.outcome(solution)
