@@ -51,3 +51,8 @@ def test_the_corners_in_the_image_are_more_than_two_radial_coefficients_follow(f
     assert abs(np.linalg.norm(T[:3, 3]) - BASELINE_M) < 0.3e-3
     assert std[0] > 0.2e-3
     assert min(f.rms or 0.0 for f in result.fits) > SHIPPED_RMS_PX
+    # No corner is rejected for its place near the border, and the plainest model that follows the lenses is named.
+    assert all(r.rejected.sum() <= 3 for r in result.corner_residuals)
+    for camera in ("cam0", "cam1"):
+        (words,) = [w for w in result.warnings if w.startswith(f"the corners of {camera} are off")]
+        assert words.endswith("write `model: eucm`.")

@@ -12,6 +12,7 @@ from icalib.assessment.guesses import guess_notes
 from icalib.assessment.held_out import held_out
 from icalib.assessment.images import corner_residuals, track_residuals
 from icalib.assessment.labels import UNITS, labels_of
+from icalib.assessment.lens_models import lens_warnings
 from icalib.assessment.misfit import far_beyond, misfits
 from icalib.assessment.notes import notes
 from icalib.assessment.robot import (
@@ -298,6 +299,7 @@ def _warnings(
     # How far off those are that lie on planes by chance means nothing.
     yield from misfits(inputs.rig, [f for f in judged if not (few and f.kind == ON_PLANES)])
     yield from few
+    yield from lens_warnings(inputs.rig, found)
     yield from pose_warnings(poses, inputs.rig)
     yield from upwards_warnings(inputs, found)
     yield from lidar_warnings(inputs, found) if inputs.clouds.count else ()

@@ -32,6 +32,8 @@ def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
     for camera, factor, model in zip(inputs.rig.cameras, found.problem.cameras, found.judged.models, strict=True):
         if len(factor.stream.uv):
             yield f"{camera.name}: {_noise_words(model)}."
+            if words := _rejected_words(factor.keep):
+                yield f"{camera.name}: {words}"
     yield from _feature_notes(found)
     yield from robot_notes(inputs, found)
     yield from upwards_notes(inputs, found)
@@ -80,8 +82,19 @@ def _imu_notes(inputs: Inputs, imu: ImuData, found: Estimate, timeline: Timeline
             yield f"{left_out} images of {camera.name} are left out: {imu.name} was not running then."
 
 
+def _rejected_words(keep: np.ndarray) -> str:
+    """`keep` (N,) bool: corners in use."""
+    count = int((~keep).sum())
+    if not count:
+        return ""
+    share = f"{count} of {len(keep)} corners ({100.0 * count / len(keep):.2g} %)"
+    return f"{share} are rejected as outliers: they stand out of their images, and apart from corners near them."
+
+
 def _noise_words(model: NoiseModel) -> str:
     words = f"corner noise {model.base:.3f} px"
+    if model.misfit > 0.0:
+        words += f", {model.misfit:.2g} px that the lens model does not follow"
     if model.exposure > 0.0:
         words += f", {1e3 * model.exposure:.2f} px more (in squares) per 1000 px/s of image speed"
     if model.tau:

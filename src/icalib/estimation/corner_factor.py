@@ -195,14 +195,18 @@ class CornerFactor:
         """Empty arrays for `accumulate` to fill. Its sums do not depend on `dtype`."""
         return CornerOutput.empty(len(self.stream.uv), len(self.views.image), len(self.noise.tau), dtype)
 
-    def squared_errors(self, out: CornerOutput) -> np.ndarray:
-        """(N,) px^2, of the residuals with their images' common errors in them."""
-        square = np.empty(len(out.root))
+    def errors(self, out: CornerOutput) -> np.ndarray:
+        """(N, 2) px, the residuals with their images' common errors in them."""
+        error = np.empty((len(out.root), 2))
         for v0, v1 in self.blocks():
             own = self.corners_of(v0, v1)
             shared = self.noise.field[own, None, :] * out.shared[self.views.of_corners(v0, v1)]
-            square[own] = ((out.residual[own] + shared.sum(axis=2)) ** 2).sum(axis=1)
-        return square
+            error[own] = out.residual[own] + shared.sum(axis=2)
+        return error
+
+    def squared_errors(self, out: CornerOutput) -> np.ndarray:
+        """(N,) px^2, of `errors`."""
+        return (self.errors(out) ** 2).sum(axis=1)
 
     def with_direction(self, direction: np.ndarray) -> CornerFactor:
         """The same factor with bloom along `direction` (N, 2)."""

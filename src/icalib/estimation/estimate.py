@@ -14,13 +14,14 @@ from icalib.estimation.corner_factor import CornerNoise
 from icalib.estimation.corner_noise import (
     COMMON_ERRORS,
     FIRST_TAU_PX,
+    LARGE_MISFIT,
     NoiseModel,
     estimate_noise,
     first_noise,
     image_speed,
-    inliers,
     scale_common_errors,
 )
+from icalib.estimation.corner_outliers import inliers
 from icalib.estimation.evidence import fits
 from icalib.estimation.feature_noise import first_following, next_following
 from icalib.estimation.guess_priors import guess_priors
@@ -81,9 +82,8 @@ class Judged:
     def next(self, inputs: Inputs, outcome: Outcome, first: bool) -> Judged:
         """As what a pass left behind, the `first` or another, shows it."""
         rig, problem, now = inputs.rig, outcome.problem, self
-        if first:
-            pairs = zip(problem.cameras, outcome.residuals.corners, strict=True)
-            now = replace(now, keep=tuple(inliers(f, out, rig.settings) for f, out in pairs))
+        pairs = zip(problem.cameras, outcome.residuals.corners, strict=True)
+        now = replace(now, keep=tuple(inliers(f, out, rig.settings) for f, out in pairs))
         if now.following is not None:
             now = replace(now, following=next_following(inputs, outcome, now.following, first))
         if _noise_is_estimated(inputs):
@@ -300,9 +300,15 @@ def _next_noise(
         tau = (FIRST_TAU_PX,) * COMMON_ERRORS if settings.common_error else ()
         if len(factor.noise.tau):
             tau = scale_common_errors(tuple(factor.noise.tau), [f for f in common if f.sensor == camera.name])
-        models.append(estimate_noise(camera, settings, factor, out, speed, tau))
+        model = estimate_noise(camera, settings, factor, out, speed, tau)
+        large = model.misfit > LARGE_MISFIT * model.base
+        models.append(replace(model, later=large and _has_cameras_alone(inputs)))
         noise.append(models[-1].noise(factor.stream, camera, settings, speed))
     return tuple(models), tuple(noise)
+
+
+def _has_cameras_alone(inputs: Inputs) -> bool:
+    return inputs.imu is None and len(inputs.sensors) == len(inputs.rig.cameras)
 
 
 def _next_robot(inputs: Inputs, problem: Problem, outcome: Outcome, robot: RobotNoise) -> RobotNoise:

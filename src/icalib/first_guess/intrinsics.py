@@ -125,7 +125,7 @@ def _starts_by_another(
         rays, _, usable = usable_rays(stream.uv, other, params)
         for distortion in model.start_distortions:
             start = np.array([*params[:4], *distortion])
-            start[:2] *= params[0] / central_scale(model, start)
+            start[:2] *= other.central_scale(params) / model.central_scale(start)
             seen = usable & model.project(start, rays)[1]
             if 2 * seen.sum() > len(start):
                 with suppress(np.linalg.LinAlgError):
@@ -232,16 +232,11 @@ def _starts(model: CameraModel, resolution: tuple[int, int], given: np.ndarray) 
     for distortion in model.start_distortions:
         params = np.array([1.0, 1.0, 0.5 * (width - 1), 0.5 * (height - 1), *distortion])
         starts = np.tile(params, (len(FOCAL_TRIALS), 1))
-        starts[:, :2] = FOCAL_TRIALS[:, None] * width / central_scale(model, params)
+        starts[:, :2] = FOCAL_TRIALS[:, None] * width / model.central_scale(params)
         starts = np.where(np.isnan(given), starts, given)
         yield starts if np.isnan(given[:2]).any() else starts[:1]
         if not np.isnan(given[4:]).any():
             return
-
-
-def central_scale(model: CameraModel, params: np.ndarray) -> float:
-    """Pixels per radian in the image's centre, along u: not fx in every model."""
-    return float(model.project_with_jacobians(params, np.array([[0.0, 0.0, 1.0]]))[2][0, 0, 0])
 
 
 def _spread_images(stream: CornerStream, wanted: int) -> CornerStream:

@@ -35,6 +35,10 @@ class CameraModel(ABC):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """uv and valid as `project`, then d uv / d point (N, 2, 3) and d uv / d params (N, 2, P)."""
 
+    def central_scale(self, params: np.ndarray) -> float:
+        """Pixels per radian in the image's centre, along u: not fx in every model."""
+        return float(self.project_with_jacobians(params, np.array([[0.0, 0.0, 1.0]]))[2][0, 0, 0])
+
     @abstractmethod
     def unproject(self, params: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """uv (N, 2) [px] -> unit rays (N, 3) in the camera frame, valid (N,) bool (inside the model's range)."""

@@ -1,0 +1,84 @@
+"""Rigs whose camera model does not follow the lens: its place rejects no corner, and a better model is named."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from icalib.calibration import Calibration
+from icalib.measurements import CornerStream, Measurements
+from icalib.pipeline import calibrate_measurements
+from icalib.rig import Rig
+from icalib.simulation import handheld, rig_for, simulate
+
+WIDE = ("eucm", (430.0, 429.0, 371.0, 245.0), (0.62, 1.09))
+NARROW = ("pinhole-radtan", (458.7, 457.3, 367.2, 248.4), (-0.28, 0.07, 2e-4, 2e-5))
+
+
+def stills(lens: tuple, model: str, seed: int, outliers: float = 0.0) -> tuple[Rig, Measurements, np.ndarray]:
+    """A camera with `lens` alone before a board, 40 images, noise of 0.2 px; a rig file with `model`. The last: which
+    corners are gross outliers."""
+    scenario = handheld(20.0)
+    camera = dataclasses.replace(scenario.cameras[0], model=lens[0], intrinsics=lens[1], distortion=lens[2])
+    motion = dataclasses.replace(scenario.motion, distance_m=0.4)
+    simulation = simulate(dataclasses.replace(scenario, cameras=(camera,), motion=motion), seed)
+    rig = rig_for(simulation.scenario, intrinsics="free", distortion="free")
+    own = dataclasses.replace(rig.cameras[0], model=model, corner_noise_px=None)
+    settings = dataclasses.replace(rig.settings, loss="huber", outlier_std=4.0)
+    whole = simulation.measurements.cameras[0]
+    kept = np.linspace(0, len(whole.stamps_ns) - 1, 40).astype(int)
+    rows = np.isin(whole.image, kept)
+    uv, rng = whole.uv[rows], np.random.default_rng(seed)
+    wrong = rng.random(len(uv)) < outliers
+    angle, size = rng.uniform(0.0, 2.0 * np.pi, int(wrong.sum())), rng.uniform(4.0, 40.0, int(wrong.sum()))
+    uv[wrong] += size[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    start = np.concatenate([[0], np.cumsum(np.diff(whole.start)[kept])])
+    stream = CornerStream("cam0", whole.stamps_ns[kept], start, whole.point[rows], uv)
+    rig = dataclasses.replace(rig, imu=None, cameras=(own,), settings=settings)
+    return rig, Measurements(None, (stream,)), wrong
+
+
+def pattern_of(result: Calibration) -> list[str]:
+    return [w for w in result.warnings if "alike wherever in the image" in w]
+
+
+def test_where_the_model_does_not_follow_the_lens_another_is_named():
+    rig, measurements, _ = stills(WIDE, "pinhole-radtan", 1)
+    result = calibrate_measurements(rig, measurements)
+    (words,) = pattern_of(result)
+    assert "write `model: eucm`" in words and "pinhole-radtan does not follow this lens" in words
+    (residuals,) = result.corner_residuals
+    size = np.linalg.norm(residuals.residual, axis=1)
+    assert (size > 1.0).sum() > 400  # five times the noise and more, and yet:
+    assert residuals.rejected.sum() <= 5
+    # The model that is named leaves the noise, and then there is nothing to say.
+    named = dataclasses.replace(rig, cameras=(dataclasses.replace(rig.cameras[0], model="eucm"),))
+    better = calibrate_measurements(named, measurements)
+    assert not pattern_of(better)
+    assert better.fits[-1].rms == pytest.approx(0.2, rel=0.05)
+
+
+@pytest.mark.parametrize(("lens", "model"), [(NARROW, "pinhole-radtan"), (WIDE, "eucm")])
+def test_gross_outliers_are_rejected_with_a_note(lens: tuple, model: str):
+    rig, measurements, wrong = stills(lens, model, 2, outliers=0.02)
+    result = calibrate_measurements(rig, measurements)
+    (residuals,) = result.corner_residuals
+    assert (wrong & ~residuals.rejected).sum() == 0
+    assert (residuals.rejected & ~wrong).sum() <= 2
+    count = int(residuals.rejected.sum())
+    assert any(f"cam0: {count} of {len(wrong)} corners" in n and "rejected as outliers" in n for n in result.notes)
+    for name, truth in (("intrinsics", lens[1]), ("distortion", lens[2])):
+        group = result.group("cam0", name)
+        assert np.abs((group.value - np.array(truth)) / group.std_formal).max() < 4.0
+    assert not pattern_of(result)
+
+
+def test_outliers_beside_an_error_of_the_lens_are_rejected_and_the_rest_is_not():
+    rig, measurements, wrong = stills(WIDE, "pinhole-radtan", 3, outliers=0.02)
+    result = calibrate_measurements(rig, measurements)
+    (residuals,) = result.corner_residuals
+    assert (residuals.rejected & ~wrong).sum() <= 5
+    assert (wrong & ~residuals.rejected).sum() <= 0.06 * wrong.sum()
+    assert "write `model: eucm`" in pattern_of(result)[0]
