@@ -144,7 +144,7 @@ def _calibrate(
 
     made = attempt(rig, recordings, clock.lap, lambda name, step: steps.note(name), tell)
     if made.error is not None:
-        raise EstimationError(stated_words(made.inputs, made.against[0])) from made.error
+        raise EstimationError(" Besides, ".join(stated_words(made.inputs, c) for c in made.against)) from made.error
     clock.lap("solving")
     progress("judging the result", 0.9)
     result = assess(made.inputs, made.found, made.against)

@@ -22,7 +22,7 @@ from icalib.estimation.inputs import Inputs
 from icalib.estimation.outcome import Step, Visit
 from icalib.estimation.pages import give_back
 from icalib.estimation.problem import Problem
-from icalib.first_guess.contradicted import is_contradicted
+from icalib.first_guess.contradicted import FarOffError, is_contradicted, refusing_far_off
 from icalib.first_guess.lidar_sight import naming_sight
 from icalib.first_guess.start import start
 from icalib.measurements import Measurements
@@ -66,12 +66,13 @@ def attempt(
     """The estimate of `rig`, or where it fails or hardly fits one without guesses that fits better; or else the first,
     with what contradicts it. Raises EstimationError where the data do not carry an estimate."""
     make = partial(_made, recordings=recordings, lap=lap, on_step=on_step, on_visit=on_visit)
-    failed: EstimationError | None = None
-    first: Attempt | None = None
     try:
-        first = make(rig)
-    except EstimationError as error:
-        failed = error
+        with refusing_far_off():
+            first, failed = _or_error(rig, make)
+    except FarOffError as error:
+        if (other := _against(rig, make)) is not None:
+            return replace(other, error=error)
+        first, failed = _or_error(rig, make)
     misfit = np.inf if first is None else first.misfit
     if first is not None and misfit < POOR_FIT:
         return first
@@ -85,6 +86,16 @@ def attempt(
         assert failed is not None
         raise explained(rig, make, failed)
     return first
+
+
+def _or_error(rig: Rig, make: Callable[[Rig], Attempt]) -> tuple[Attempt, None] | tuple[None, EstimationError]:
+    """The estimate, or why there is none. Raises FarOffError."""
+    try:
+        return make(rig), None
+    except FarOffError:
+        raise
+    except EstimationError as error:
+        return None, error
 
 
 def explained(rig: Rig, make: Callable[[Rig], Attempt], failed: EstimationError) -> EstimationError:

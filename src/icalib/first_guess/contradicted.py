@@ -1,9 +1,17 @@
-"""Guesses of the rig file against what the data show: a guess has no weight, and one that is far off is replaced."""
+"""What the rig file says against what the data show: a guess has no weight, and one that is far off is replaced.
+
+What is fixed has weight. Where it is far off the solver does not come to an end, so that it is told beforehand.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
 import numpy as np
 
+from icalib.errors import EstimationError
 from icalib.estimation.state import Key
 from icalib.estimation.tolerances import GUESS_SIGMA
 from icalib.geometry import so3
@@ -12,6 +20,7 @@ from icalib.rig import Camera, Lidar, Parameter, PoseSensor, Wheels
 SIGMAS = 4.0  # times what a guess is worth
 LENGTHS = ("radii", "radius", "baseline", "wheelbase", "scales")  # guessed to a share of themselves
 SHARE = 0.1  # that such a guess is off by
+_CHECKED = (*LENGTHS, "translation")
 
 
 def is_contradicted(name: str, guess: np.ndarray, found: np.ndarray) -> bool:
@@ -38,17 +47,49 @@ def chosen(name: str, parameter: Parameter, given: np.ndarray | None, found: np.
     return given
 
 
+_REFUSING = ContextVar("_REFUSING", default=False)
+
+
+class FarOffError(EstimationError):
+    """A length or a lever arm that the rig file fixes is far from what the first guess finds."""
+
+
+@contextmanager
+def refusing_far_off() -> Iterator[None]:
+    """Within, `refuse_far_off` refuses."""
+    token = _REFUSING.set(True)
+    try:
+        yield
+    finally:
+        _REFUSING.reset(token)
+
+
+def refuse_far_off(wheels: Wheels, found: dict[Key, np.ndarray]) -> None:
+    """Raises FarOffError where a length or a lever arm that is fixed is farther from what was `found` than first
+    guesses are off."""
+    for (sensor, name), value in found.items() if _REFUSING.get() else ():
+        stated = getattr(wheels, name)
+        if name in _CHECKED and stated.mode == "fixed" and is_contradicted(name, stated.value, value):
+            raise FarOffError(f"{sensor}: {name} of the rig file is far from what the data show.")
+
+
 def settled(
     sensor: Camera | Lidar | Wheels | PoseSensor, known: dict[Key, np.ndarray], found: dict[Key, np.ndarray]
 ) -> dict[Key, np.ndarray]:
-    """What was `found` of a sensor, and in its place what the rig file gives of it, `known`, but guesses that this
-    contradicts."""
+    """Where the solver starts with a sensor: at what the rig file gives of it, `known`, and else at what was `found`;
+    there, too, where this contradicts a guess, or a prior of a length, from which the solver may not come back."""
     kept = {
         key: value
         for key, value in known.items()
-        if key not in found or getattr(sensor, key[1]).mode != "free" or not is_contradicted(key[1], value, found[key])
+        if key not in found or not _gives_way(sensor, key[1]) or not is_contradicted(key[1], value, found[key])
     }
     return found | kept
+
+
+def _gives_way(sensor: Camera | Lidar | Wheels | PoseSensor, name: str) -> bool:
+    """Whether what the rig file gives of a group may be left for what the data show."""
+    mode = getattr(sensor, name).mode
+    return mode == "free" or (mode == "prior" and name in LENGTHS)
 
 
 def has_guesses(sensor: Camera | Lidar | Wheels | PoseSensor, known: dict[Key, np.ndarray]) -> bool:

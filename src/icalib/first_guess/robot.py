@@ -18,7 +18,7 @@ from icalib.estimation.robot import MOUNT
 from icalib.estimation.state import Key, State
 from icalib.estimation.wheel_angles import integrals_of
 from icalib.first_guess.by_recording import alone, each_clock
-from icalib.first_guess.contradicted import has_guesses, is_contradicted, settled
+from icalib.first_guess.contradicted import has_guesses, is_contradicted, refuse_far_off, settled
 from icalib.first_guess.known_motion import imu_poses, is_known
 from icalib.first_guess.lidar_rounds import NAMES, given, lidar_values, with_lidars
 from icalib.first_guess.poses import pose_values
@@ -64,7 +64,7 @@ def _wheels(inputs: Inputs, state: State, wheels: Wheels, stream: WheelStream | 
     if isinstance(stream, WheelPoses):
         known |= {(wheels.name, name): np.ones(n) for name, n in wheels.sizes.items()}
     complete = len(known) == len(names)
-    if complete and not has_guesses(wheels, given(inputs, wheels, names)):
+    if complete and isinstance(stream, WheelPoses) and not has_guesses(wheels, given(inputs, wheels, names)):
         return known
     clock = wheels.name, "time_offset"
     offset = known.get(clock)
@@ -79,9 +79,11 @@ def _wheels(inputs: Inputs, state: State, wheels: Wheels, stream: WheelStream | 
             raise
         found = _found(inputs, state, wheels, stream, offset)
     mount = wheels.name, "translation"
-    if (arm := known.get(mount)) is not None:
-        level = _as_high(inputs, state, arm, found[mount])
-        found[mount] = found[mount] if is_contradicted("translation", arm, level) else arm
+    arm = known.get(mount)
+    level = found[mount] if arm is None else _as_high(inputs, state, arm, found[mount])
+    refuse_far_off(wheels, found | {mount: level})
+    if arm is not None and not is_contradicted("translation", arm, level):
+        found[mount] = arm
     return settled(wheels, known, found)
 
 
