@@ -10,10 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from icalib.errors import RecordingError
 from icalib.measurements import PoseStream
-from icalib.recordings import BagRecording, FolderRecording
+from icalib.recordings import BagRecording, FolderRecording, open_recording, read_measurements
 from icalib.recordings.pose_checks import checked_poses
 from icalib.recordings.poses import PoseReadings, as_frame_sensor
 from icalib.rig import PoseSensor
+from icalib.rig_file import rig_from_dict, rig_to_dict
 
 N, STEP, ORIGIN = 300, 20_000_000, 1_700_000_000_123_456_789
 STAMPS = ORIGIN + STEP * np.arange(N)
@@ -101,6 +102,31 @@ def test_an_empty_text(tmp_path):
     (tmp_path / "mocap0").mkdir()
     (tmp_path / "mocap0" / "poses.txt").write_text("# nothing\n")
     assert "holds no rows" in refused(tmp_path, PoseSensor("mocap0", "mocap0/poses.txt"))
+
+
+def test_inverted_poses_by_the_rig_file(tmp_path):
+    """A table of T_sensor_frame, as of a camera that sees a board which the robot carries."""
+    back = TURNS.inv()
+    table(tmp_path, position=-back.apply(POSITION), xyzw=back.as_quat())
+    sensors = {"mocap0": {"type": "pose", "inverted": True}, "slam0": {"type": "pose", "path": "mocap0/poses.csv"}}
+    rig = rig_from_dict({"sensors": sensors}, "rig.yaml")
+    inverted, plain = read_measurements(open_recording(tmp_path), rig).poses
+    np.testing.assert_allclose(inverted.position, POSITION, atol=1e-14)
+    np.testing.assert_allclose(inverted.rotation, TURNS.as_matrix(), atol=1e-14)
+    np.testing.assert_allclose(plain.rotation, back.as_matrix(), atol=1e-14)
+    np.testing.assert_allclose(plain.position, -back.apply(POSITION), atol=1e-14)
+    assert rig_to_dict(rig)["sensors"]["mocap0"]["inverted"] is True
+
+
+def test_inverted_and_in_other_axes(tmp_path):
+    """Axes of the positions are those in the file, before these are inverted."""
+    back = TURNS.inv()
+    written = -back.apply(POSITION)
+    table(tmp_path, position=written[:, [1, 0, 2]] * [-1.0, 1.0, 1.0], xyzw=back.as_quat())
+    sensor = PoseSensor("mocap0", "mocap0/poses.csv", inverted=True, position_axes=("y", "-x", "z"))
+    found = as_frame_sensor(FolderRecording(tmp_path).poses(sensor), sensor)
+    np.testing.assert_allclose(found.position, POSITION, atol=1e-14)
+    np.testing.assert_allclose(found.rotation, TURNS.as_matrix(), atol=1e-14)
 
 
 def test_positions_in_other_axes(tmp_path):

@@ -9,9 +9,11 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from icalib.errors import RecordingError
+from icalib.pipeline import calibrate
 from icalib.recordings import BagRecording
 from icalib.recordings.folder import FolderRecording
 from icalib.rig import PoseSensor
+from icalib.rig_file import rig_from_dict
 
 START, STEP, COUNT = 1_700_000_000_123_456_789, 20_000_000, 40
 SECONDS = np.arange(COUNT) * STEP * 1e-9
@@ -188,3 +190,46 @@ def test_frames_of_other_topics(one_bag, tmp_path):
     (tmp_path / "folder/arm/poses.csv").write_text("#t [ns],x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n")
     with pytest.raises(RecordingError, match="is a folder, but `frames` of arm are those of transforms"):
         FolderRecording(tmp_path / "folder").poses(sensor("base", "flange"))
+
+
+MOUNTED = matrix(Rotation.from_euler("xyz", [0.4, -0.3, 0.9]), np.array([0.05, -0.02, 0.1]))[0]  # tool -> tracked body
+LAB = matrix(Rotation.from_euler("xyz", [0.02, -0.03, 2.0]), np.array([1.0, -2.0, 0.3]))[0]  # frame of the tracker
+
+
+def stops(seed: int, count: int) -> tuple[Rotation, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return Rotation.from_rotvec(0.6 * rng.standard_normal((count, 3))), 0.3 * rng.standard_normal((count, 3))
+
+
+def at_stops(parent, child, poses, stamps):
+    """Each stamp between k and k + 0.5 s has the pose of stop k."""
+    at = [(t - START) // 10**9 for t in stamps]
+    return [(t, parent, child, poses[0][k], poses[1][k]) for t, k in zip(stamps, at, strict=True)]
+
+
+@pytest.mark.parametrize("streamed", [False, True])
+@pytest.mark.parametrize("inverted", [False, True])
+def test_poses_at_rest_through_transforms(one_bag, streamed, inverted):
+    """A robot's arm stops for half a second at each of some places, and a tracker sees its hand: hand-eye."""
+    count, make = 12, one_bag.write.maker("ros2")
+    each = range(0, 500_000_000, 20_000_000) if streamed else [250_000_000]
+    stamps = [START + k * 10**9 + own for k in range(count) for own in each]
+    shoulder, wrist = stops(1, count), stops(2, count)
+    moving = at_stops("base", "shoulder", shoulder, stamps) + at_stops("shoulder", "flange", wrist, stamps)
+    seen, others = LAB @ matrix(*MOUNT) @ matrix(*shoulder) @ matrix(*wrist) @ matrix(*TOOL) @ MOUNTED, []
+    for k, T in enumerate(seen):
+        t, q = START + k * 10**9 + 250_000_000, Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
+        pose = make.make(
+            "geometry_msgs/msg/Pose", make.vector(T[:3, 3], "Point"), make.make("geometry_msgs/msg/Quaternion", *q)
+        )
+        message = make.make("geometry_msgs/msg/PoseStamped", make.header(t, "lab"), pose)
+        others.append(("/tracker", "geometry_msgs/msg/PoseStamped", t + 5, message))
+    bag = one_bag(sorted(moving, key=lambda m: m[0]), STATIC, others)
+    frames = ["/tool", "world"] if inverted else ["world", "tool"]
+    noise = {"rotation_noise": 1e-3, "position_noise": 1e-3}
+    arm = {"type": "pose", "frames": frames, "inverted": inverted} | noise
+    rig = rig_from_dict({"sensors": {"tracker": {"type": "pose", "topic": "/tracker"} | noise, "arm": arm}}, "rig.yaml")
+    result = calibrate(rig, bag)
+    assert result.converged, result.status
+    np.testing.assert_allclose(result.T_imu_sensor("arm"), np.linalg.inv(MOUNTED), atol=1e-6)
+    assert any(f"{count} poses of arm were taken at rest" in words for words in result.notes), result.notes

@@ -14,10 +14,11 @@ from icalib.measurements import CornerStream, ImuStream, LidarStream, TrackStrea
 from icalib.recordings.columns import IMU, IMU_ACCEL, IMU_GYRO, STAMP, TableKind
 from icalib.recordings.corners import group_corners
 from icalib.recordings.euroc_images import file_payloads, image_files
-from icalib.recordings.image_checks import checked_payloads, frames
+from icalib.recordings.image_checks import Note, checked_payloads, frames, ignore
 from icalib.recordings.images import Frame, Payload
 from icalib.recordings.imu_halves import ImuHalves
 from icalib.recordings.lidar_checks import Sieve, sifted
+from icalib.recordings.numbered import numbered_pictures, stamped_by_rows
 from icalib.recordings.poses import FILES as POSE_FILES
 from icalib.recordings.poses import POSES, PoseReadings, is_tum_text, read_pose_file
 from icalib.recordings.scans import in_seconds, read_scan_stamps, read_scans
@@ -64,7 +65,7 @@ class FolderRecording:
     def topics(self) -> tuple[TopicInfo, ...]:
         found: list[TopicInfo] = []
         for folder in sorted(p for base in self._bases() for p in base.iterdir() if p.is_dir()):
-            if (images := _images(folder)) is not None:
+            if (images := self._images(folder)) is not None:
                 found.append(images)
             elif (table := _existing(folder, "data.csv")) and holds(table, IMU):
                 stamps_ns = read_table(table, IMU).integers[:, 0]
@@ -90,7 +91,7 @@ class FolderRecording:
         chosen = find_topic(str(self.root), self.topics(), topic)
         if chosen.kind == "image":
             folder = next(p for base in self._bases() if (p := base / chosen.name).is_dir())
-            return np.array([stamp_ns for stamp_ns, _ in image_files(folder)], np.int64)
+            return np.array([stamp_ns for stamp_ns, _ in self._pictures(folder)], np.int64)
         if chosen.kind == "imu":
             return read_table(self._locate(chosen.name), IMU).integers[:, 0].copy()
         if chosen.kind == "tracks":
@@ -108,7 +109,7 @@ class FolderRecording:
         folder = next(p for base in self._bases() if (p := base / name).is_dir())
         if (folder / "data.csv").is_file():
             self._remember(folder / "data.csv")
-        files = image_files(folder, self._note)
+        files = self._pictures(folder, self._note)
         if files and not self._window.is_all:
             stamps_ns = np.array([stamp_ns for stamp_ns, _ in files], np.int64)
             inside = stamps_inside(self._window, stamps_ns, str(folder), self._spans())
@@ -218,7 +219,25 @@ class FolderRecording:
 
     def _image_topics(self) -> tuple[TopicInfo, ...]:
         folders = sorted(p for base in self._bases() for p in base.iterdir() if p.is_dir())
-        return tuple(topic for p in folders if (topic := _images(p)) is not None)
+        return tuple(topic for p in folders if (topic := self._images(p)) is not None)
+
+    def _images(self, folder: Path) -> TopicInfo | None:
+        stamps = [stamp for stamp, _ in self._pictures(folder)]
+        return _info(folder.name, "images", "image", np.array(stamps, np.int64)) if stamps else None
+
+    def _pictures(self, folder: Path, note: Note = ignore) -> list[tuple[int, Path]]:
+        """Stamps [ns] and files of the images of a folder. Pictures that have but numbers have the stamps of the only
+        table of poses."""
+        if numbered := numbered_pictures(folder):
+            tables = self._pose_tables()
+            if len(tables) == 1:
+                return stamped_by_rows(numbered, tables[0], note)
+        return image_files(folder, note)
+
+    def _pose_tables(self) -> list[Path]:
+        folders = [p for base in self._bases() for p in sorted(base.iterdir()) if p.is_dir()]
+        found = [table for p in folders for table, (_, kind) in _robot(p) if kind == "pose"]
+        return found + [p for base in self._bases() for p in sorted(base.glob("*.csv")) if named(p, POSES)]
 
     def _videos(self) -> tuple[TopicInfo, ...]:
         """What is named as videos, which no reader reads."""
@@ -296,11 +315,6 @@ def _stamps(table: Path) -> np.ndarray:
         return read_pose_file(table.parent.name, table).stamps_ns
     kind = RELATIVE_POSES if holds(table, RELATIVE_POSES) else STAMPS
     return read_table(table, kind).integers[:, 0].copy()
-
-
-def _images(folder: Path) -> TopicInfo | None:
-    stamps = [stamp for stamp, _ in image_files(folder)]
-    return _info(folder.name, "images", "image", np.array(stamps, np.int64)) if stamps else None
 
 
 def _info(name: str, kind_of_file: str, kind: str, stamps_ns: np.ndarray) -> TopicInfo:

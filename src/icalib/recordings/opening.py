@@ -11,10 +11,12 @@ from icalib.recordings.bags.opening import bag_files
 from icalib.recordings.base import Recording
 from icalib.recordings.folder import FolderRecording, has_named_table
 from icalib.recordings.pictures import PictureFolder, has_pictures
+from icalib.recordings.poses import FILES as POSE_FILES
 from icalib.recordings.unreadable import HEAD_BYTES, not_data
 from icalib.recordings.window import Window
 
 _MAX_LISTED = 12
+_OF_TABLES = ("*/*.csv", "*/*.csv.gz", "mav0", "*/data", *(f"*/{name}" for name in POSE_FILES))
 
 
 def open_recording(path: str | Path, start_s: float = 0.0, end_s: float = inf) -> Recording:
@@ -57,6 +59,6 @@ def _holds_bags(folder: Path) -> bool:
 
 
 def _holds_tables(folder: Path) -> bool:
-    if any(p for pattern in ("*/*.csv", "*/*.csv.gz", "mav0", "*/data") for p in folder.glob(pattern)):
+    if any(p for pattern in _OF_TABLES for p in folder.glob(pattern)):
         return True
     return has_named_table(folder)

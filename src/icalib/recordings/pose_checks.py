@@ -34,8 +34,10 @@ def checked_poses(read: PoseReadings, sensor: PoseSensor, where: str) -> tuple[P
     own = "write the sensor's own stamps"
     kept, notes = kept_readings(read.stamps_ns, values, what, RATE_HZ, "pose", own)
     read = _some(read, kept)
-    read, copied = _without_copies(read, what)
-    single, jumped = (), ()
+    copied, single, jumped = (), (), ()
+    if not stands_still_between(_seconds(read), read.rotation, read.position):
+        # Of a robot that stands still the controller repeats its pose in every digit.
+        read, copied = _without_copies(read, what)
     if not stands_still_between(_seconds(read), read.rotation, read.position):
         # Where it stands still what moved while it was not seen did not jump.
         read, single = _without_singles(read, what)
