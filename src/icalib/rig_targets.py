@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from icalib.errors import RigError
 from icalib.file_names import NAME, NAME_WORDS
-from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Markers, Scene, Target
+from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles, Markers, Scene, Target
 from icalib.geometry.targets.families import family_name
 from icalib.yaml_nodes import YamlValue
 
@@ -15,6 +15,7 @@ _FIELDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "aprilgrid": (("rows", "cols", "tag_size", "tag_spacing"), ("border_bits", "squares", "first_id", "family")),
     "charuco": (("squares_x", "squares_y", "square_size", "marker_size", "dictionary"), ("legacy", "inverted")),
     "checkerboard": (("rows", "cols", "square_size"), ("inverted", "upright")),
+    "circles": (("rows", "cols", "spacing", "diameter"), ("asymmetric",)),
     "markers": (("family", "size"), ("ids", "border_bits")),
 }
 _LARGEST_TAG_M = 2.0  # nobody prints a larger one; it is in millimetres
@@ -55,6 +56,10 @@ def target_of(value: YamlValue) -> Target:
         return _aprilgrid(value, found)
     if kind == "markers":
         return _markers(value, found)
+    if kind == "circles":
+        counts, spacing = _counts(value, found, "rows", "cols", "circles"), _edge(found["spacing"], "spacing")
+        diameter = _edge(found["diameter"], "circle")
+        return _made(value, lambda: Circles(*counts, spacing, diameter, _yes(found, "asymmetric")))
     size = _edge(found["square_size"], "square")
     if kind == "checkerboard":
         rows, cols = _counts(value, found, "rows", "cols", "corners")

@@ -121,7 +121,12 @@ def test_checkerboard(tmp_path):
             "{target_type: checkerboard, targetRows: 6, targetCols: 7, rowSpacingMeters: 0.06, colSpacingMeters: 0.05}",
             r"board\.yaml: rowSpacingMeters and colSpacingMeters differ",
         ),
-        ("grid", APRILGRID.replace("aprilgrid'", "circlegrid'"), r"does not know the target_type 'circlegrid'"),
+        ("grid", APRILGRID.replace("aprilgrid'", "starfield'"), r"does not know the target_type 'starfield'"),
+        (
+            "grid",
+            "{target_type: circlegrid, targetRows: 6, targetCols: 7, spacingMeters: 0.06, asymmetricGrid: false}",
+            r"how large the circles are.*\{type: circles, rows: 6, cols: 7, spacing: 0.06, diameter: ...\}",
+        ),
     ],
 )
 def test_what_cannot_be_used_is_noted(name, text, words, tmp_path):

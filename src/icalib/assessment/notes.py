@@ -9,6 +9,7 @@ import numpy as np
 from icalib.assessment.robot import robot_notes
 from icalib.assessment.upwards import upwards_notes
 from icalib.estimation.bodies import words_on_left_out
+from icalib.estimation.circle_centres import centre_shifts
 from icalib.estimation.clocks import instants
 from icalib.estimation.corner_noise import NoiseModel
 from icalib.estimation.estimate import Estimate
@@ -34,6 +35,12 @@ def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
             yield f"{camera.name}: {_noise_words(model)}."
             if words := _rejected_words(factor.keep):
                 yield f"{camera.name}: {words}"
+        if factor.bodies.target.radii.any() and len(factor.stream.uv):
+            size = np.linalg.norm(centre_shifts(factor, found.outcome.state), axis=1)
+            yield (
+                f"{camera.name}: ellipses have their centres {np.sqrt((size**2).mean()):.3f} px (RMS, {size.max():.2f} "
+                "px at most) beside the projected centres of their circles; the estimate takes it into account."
+            )
     yield from _feature_notes(found)
     yield from robot_notes(inputs, found)
     yield from upwards_notes(inputs, found)

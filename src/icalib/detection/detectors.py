@@ -11,11 +11,12 @@ import numpy as np
 from icalib.detection.aprilgrid import AprilGridDetector
 from icalib.detection.charuco import CharucoDetector
 from icalib.detection.checkerboard import CheckerboardDetector
+from icalib.detection.circles import CirclesDetector
 from icalib.detection.corners import ImageCorners, no_corners
 from icalib.detection.markers import MarkerDetector
 from icalib.detection.quads import View
 from icalib.errors import RigError
-from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Markers, Scene, Target
+from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles, Markers, Scene, Target
 
 _SAME_PX = 3.0  # corners this close are one
 
@@ -57,6 +58,8 @@ def _finder_of(target: Target) -> _Finder:
         number = _from_the_bottom(target.rows, target.cols)
         board = _Renumbered(CheckerboardDetector(target.rows, target.cols), number)
         return _Inverted(board) if target.inverted else board
+    if isinstance(target, Circles):
+        return CirclesDetector(target)
     raise RigError(f"targets of type {target.type} are not found in images; use corners as a table.")
 
 

@@ -13,6 +13,7 @@ from icalib.estimation import pages
 from icalib.estimation.arrowhead import chain_cuts
 from icalib.estimation.board import SHAPE_LABELS, SHAPE_SIGMA_M, bloom_direction
 from icalib.estimation.border import NOTHING
+from icalib.estimation.circle_centres import with_circle_centres
 from icalib.estimation.clocks import EARLY_S, instants
 from icalib.estimation.corner_factor import CornerFactor, CornerNoise
 from icalib.estimation.edge_curvature import with_bent_edges
@@ -170,7 +171,7 @@ def assemble(
             k & np.repeat(seen, np.diff(stream.start)), n, NO_BLOOM, inputs.bodies, layout,
             len(state.seconds), tuple(images.start for images in own[1:]),
         )  # fmt: skip
-        factor = factor if straight else with_bent_edges(factor, state)
+        factor = factor if straight else with_circle_centres(with_bent_edges(factor, state), state)
         factors.append(_with_bloom(factor, camera, state, rig) if rig.blooms else factor)
     tolerance = inputs.tolerances.of(layout, None if rig.imu is None else rig.imu.name) * distortion_scales(rig, layout)
     # Beside one another, in a thread of its own: points of LiDARs use the solver's.

@@ -103,7 +103,22 @@ def kalibr_target(data: dict[str, Any], file: str) -> Target:
         if size != other:
             raise RigError(f"{file}: rowSpacingMeters and colSpacingMeters differ; icalib needs square squares.")
         return Checkerboard(rows, cols, size)
-    raise RigError(f"{file}: icalib does not know the target_type {kind!r}; use an aprilgrid or a checkerboard.")
+    if kind == "circlegrid":
+        raise RigError(f"{file}: {_circles(data, file)}")
+    raise RigError(
+        f"{file}: icalib does not know the target_type {kind!r}; use an aprilgrid, a checkerboard or a circlegrid."
+    )
+
+
+def _circles(data: dict[str, Any], file: str) -> str:
+    """What to write for a circlegrid, whose circles' size Kalibr's file does not say."""
+    rows, cols = (_whole(data, name, file) for name in ("targetRows", "targetCols"))
+    spacing = _positive(data, "spacingMeters", file)
+    asymmetric = ", asymmetric: true" if data.get("asymmetricGrid") else ""
+    return (
+        "Kalibr does not say how large the circles are, and centres of ellipses depend on it; measure it and write "
+        f"target: {{type: circles, rows: {rows}, cols: {cols}, spacing: {spacing:g}, diameter: ...{asymmetric}}}."
+    )
 
 
 def _yaml_files(recording: Path) -> list[Path]:

@@ -16,6 +16,7 @@ from icalib.simulation.scenario import Scenario, SimCamera
 _MIN_CORNERS = 6
 _LEAD_S = 0.05  # images start and end this far inside the IMU's readings
 _DIFFERENCE_S = 1e-4
+_RIM = 64  # points on the rim of a circle
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +67,7 @@ def see_corners(
     stamps, seconds, points, uv, seen = stamps[kept], seconds[kept], points[kept], uv[kept], seen[kept]
 
     uv = uv + camera.bloom_px * _towards_tag_center(scenario, camera, trajectory, seconds, points)
+    uv = uv + _to_ellipse_centres(scenario, camera, trajectory, seconds, uv)
     sigma = _corner_sigma(scenario, camera, trajectory, seconds, seen)
     image, point = np.nonzero(seen)
     true = uv[seen]
@@ -119,6 +121,31 @@ def _towards_tag_center(
     surface = board_surface(scenario.target, scenario.bow, scenario.target.tag_centers)
     direction = image_velocity(camera, points, _in_camera(scenario, camera, trajectory, seconds, surface) - points)
     return direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+
+
+def _to_ellipse_centres(
+    scenario: Scenario, camera: SimCamera, trajectory: Trajectory, seconds: np.ndarray, uv: np.ndarray
+) -> np.ndarray:
+    """(M, N, 2) px from uv, the image of each circle's centre, to the centroid of the circle's image; zero on targets
+    without circles."""
+    target = scenario.target
+    if not target.radii.any():
+        return np.zeros_like(uv)
+    surface = board_surface(target, scenario.bow, target.points)
+
+    def rim(k: int) -> np.ndarray:
+        angle = 2.0 * np.pi * k / _RIM
+        beside = target.radii[:, None] * np.array([np.cos(angle), np.sin(angle), 0.0])
+        return project(camera, _in_camera(scenario, camera, trajectory, seconds, surface + beside)) - uv
+
+    area, moment, a = np.zeros(uv.shape[:2]), np.zeros_like(uv), rim(0)
+    for k in range(1, _RIM + 1):
+        b = rim(k)
+        cross = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+        area += 0.5 * cross
+        moment += (a + b) * cross[..., None] / 6.0
+        a = b
+    return np.where(target.radii[:, None] > 0.0, moment / np.where(area == 0.0, 1.0, area)[..., None], 0.0)
 
 
 def _corner_sigma(

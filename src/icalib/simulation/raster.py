@@ -57,6 +57,40 @@ def paint(rays, by_u, by_v, bends, s, R, C, x_edges, y_edges, grey_of, fine):
                     fine[row * s + a, col * s + b] = old * (1.0 - covered) + grey
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def paint_discs(rays, by_u, by_v, bends, s, R, C, discs, black, fine):
+    """Paints discs (n, 3), centre and radius on the sheet, over the greys in `fine`, as `paint` does rectangles.
+
+    Within a cell, a quarter of a pixel, a disc's edge is taken for straight.
+    """
+    for row in range(rays.shape[0]):
+        for col in range(rays.shape[1]):
+            X, Y, Xu, Yu, Xv, Yv, hits = _on_sheet(rays[row, col], by_u[row, col], by_v[row, col], R, C)
+            if not hits:
+                continue
+            reach = 0.5 * _SLACK * (np.hypot(Xu, Yu) + np.hypot(Xv, Yv))
+            k = -1
+            for i in range(len(discs)):
+                if np.hypot(X - discs[i, 0], Y - discs[i, 1]) < discs[i, 2] + reach:
+                    k = i
+            if k < 0:
+                continue
+            for a in range(s):
+                for b in range(s):
+                    du, dv = (b + 0.5) / s - 0.5, (a + 0.5) / s - 0.5
+                    d = np.array(_ray(rays[row, col], by_u[row, col], by_v[row, col], bends[:, row, col], du, dv))
+                    x, y, xu, yu, xv, yv, hits = _on_sheet(d, by_u[row, col], by_v[row, col], R, C)
+                    x, y = x - discs[k, 0], y - discs[k, 1]
+                    far = np.hypot(x, y)
+                    if not hits or far == 0.0:
+                        share = 1.0 if hits else 0.0
+                    else:
+                        across_u, across_v = (x * xu + y * yu) / far / s, (x * xv + y * yv) / far / s
+                        share = _below(discs[k, 2] - far, across_u, across_v)
+                    cell = row * s + a, col * s + b
+                    fine[cell] += share * (black - fine[cell])
+
+
 @njit(cache=True, nogil=True)
 def _ray(d, d_u, d_v, bend, du, dv):
     """The ray du, dv pixels beside the one that is d."""

@@ -18,7 +18,7 @@ from icalib.geometry.targets.pattern import Pattern, pattern_of
 from icalib.simulation.lenses import unproject
 from icalib.simulation.motion import Trajectory
 from icalib.simulation.projection import project, visible
-from icalib.simulation.raster import paint, pixel_kernel, shrink
+from icalib.simulation.raster import paint, paint_discs, pixel_kernel, shrink
 from icalib.simulation.scenario import SimCamera
 
 _CELLS = 4  # a pixel, along each axis
@@ -154,6 +154,10 @@ class Renderer:
             front = C[2] > 0.0  # the back of the paper is white
             grey_of = np.where(pattern.white | (not front), self.imaging.white, self.imaging.black)
             paint(*self._rays, _CELLS, R, C, pattern.x, pattern.y, grey_of, fine)
+            round_ = sheet.target.radii > 0.0
+            if front and round_.any():
+                discs = np.column_stack([sheet.target.points[round_, :2], sheet.target.radii[round_]])
+                paint_discs(*self._rays, _CELLS, R, C, discs, self.imaging.black, fine)
         return fine
 
     def _truth(self, sheet: Sheet, poses: np.ndarray) -> SheetTruth:

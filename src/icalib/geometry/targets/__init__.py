@@ -8,6 +8,7 @@ from icalib.geometry.targets.aprilgrid import AprilGrid
 from icalib.geometry.targets.base import Target
 from icalib.geometry.targets.charuco import Charuco
 from icalib.geometry.targets.checkerboard import Checkerboard
+from icalib.geometry.targets.circles import Circles
 from icalib.geometry.targets.markers import Markers
 from icalib.geometry.targets.nothing import NoTarget
 from icalib.geometry.targets.scene import Scene
@@ -18,6 +19,7 @@ __all__ = [
     "AprilGrid",
     "Charuco",
     "Checkerboard",
+    "Circles",
     "Markers",
     "NoTarget",
     "Scene",
@@ -26,7 +28,9 @@ __all__ = [
     "target_from_plain",
 ]
 
-TARGETS: dict[str, type[Target]] = {kind.type: kind for kind in (AprilGrid, Charuco, Checkerboard, Markers, Tag)}
+TARGETS: dict[str, type[Target]] = {
+    kind.type: kind for kind in (AprilGrid, Charuco, Checkerboard, Circles, Markers, Tag)
+}
 
 
 def target_from_plain(rig: dict[str, Any]) -> Target | None:

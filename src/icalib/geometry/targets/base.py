@@ -42,6 +42,11 @@ class Target(ABC):
         return self.points
 
     @cached_property
+    def radii(self) -> np.ndarray:
+        """(n,) in metres: of the circle whose centre each point is; 0 of points that are no circle's."""
+        return np.zeros(len(self.points))
+
+    @cached_property
     def bodies(self) -> tuple[str, ...]:
         """Name of each rigid body. How several stand to each other is unknown, and estimated."""
         return (BOARD,)

@@ -11,6 +11,7 @@ from icalib.geometry.targets.aprilgrid import AprilGrid
 from icalib.geometry.targets.base import Target
 from icalib.geometry.targets.charuco import Charuco
 from icalib.geometry.targets.checkerboard import Checkerboard
+from icalib.geometry.targets.circles import Circles
 from icalib.geometry.targets.families import opencv_bits, tag_bits
 from icalib.geometry.targets.tag import Tag
 
@@ -63,9 +64,18 @@ def pattern_of(target: Target, border_bits: int | None = None) -> Pattern:
         corner = (-target.square_size, -target.square_size)
         squares = _squares(target.cols + 1, target.rows + 1, target.square_size, corner, 0)
         return _in_colours(_rasterised(squares), target.inverted)
+    if isinstance(target, Circles):
+        return _paper(target)
     if isinstance(target, Tag):
         return _rasterised(_tag(tag_bits(target.family, target.id), target.size, (0.0, 0.0), border_bits or 1))
     raise RigError(f"there is no print of a target of type {target.type}; choose another.")
+
+
+def _paper(grid: Circles) -> Pattern:
+    """White, as far as the circles reach: they are no rectangles."""
+    radius = 0.5 * grid.diameter
+    x, y = (np.array([a.min() - radius, a.max() + radius]) for a in grid.points[:, :2].T)
+    return Pattern(x, y, np.ones((1, 1), dtype=bool))
 
 
 def _in_colours(pattern: Pattern, inverted: bool) -> Pattern:

@@ -12,6 +12,7 @@ import numpy as np
 from icalib.errors import RecordingError, RigError
 from icalib.geometry.targets.base import Target
 from icalib.geometry.targets.checkerboard import Checkerboard
+from icalib.geometry.targets.circles import Circles
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,10 @@ class Scene(Target):
     @cached_property
     def tag_centers(self) -> np.ndarray:
         return np.concatenate([t.tag_centers for t in self.targets])
+
+    @cached_property
+    def radii(self) -> np.ndarray:
+        return np.concatenate([t.radii for t in self.targets])
 
     @cached_property
     def bodies(self) -> tuple[str, ...]:
@@ -105,6 +110,8 @@ def _in_common(one: Target, other: Target) -> str:
     if one.tags and other.tags and (ids := one.tags.shared_with(other.tags)):
         advice = "give them other ids or families (first_id and family of an aprilgrid), or leave one out"
         return f"both have tag {ids[0]} of {one.tags.family}; {advice}"
+    if isinstance(one, Circles) and isinstance(other, Circles):
+        return "both are grids of circles; leave one out, or take a board with tags"
     boards = [{t.rows, t.cols} for t in (one, other) if isinstance(t, Checkerboard)]
     if len(boards) == 2 and boards[0] == boards[1]:
         return "both are checkerboards with as many corners; take another size, or boards with tags"

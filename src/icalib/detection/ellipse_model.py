@@ -1,0 +1,174 @@
+"""Kernel that places the image of a circle: a blurred ellipse is fitted to the pixels about its edge.
+
+The model is point symmetric about the ellipse's centre, as the image of an ellipse is under blur and any response to
+light, so that these do not bias the centre.
+"""
+
+from __future__ import annotations
+
+from math import erf, exp, hypot, pi, sqrt
+
+import numpy as np
+from numba import njit
+
+from icalib.detection.edge_model import solve_small
+from icalib.detection.tags import LEAST_CONTRAST
+
+_SIZE = 8  # centre, three of the shape, blur, low, high
+_ITERATIONS = 20
+_CONVERGED_PX = 1e-3
+_MOST_STEP_PX = 1.0
+_HALF_STRIP = (2.0, 3.0)  # px, and blurs: fitted on each side of the edge
+_MOST_STRIP = 0.6  # of the smaller half axis
+_USUAL_BLUR = 0.8  # px, at first
+_BLUR_RANGE = (0.35, 6.0)
+_MOST_MOVE = 0.5  # of the smaller half axis: from where a circle is expected
+LEAST_HALF_AXIS_PX = 2.5
+
+
+@njit(cache=True, nogil=True)
+def fit_ellipses(image, uv, axes):
+    """(uv (n, 2), quality (5, n)) of the ellipses near uv (n, 2) px, the images of two radii being axes (n, 2, 2) px.
+
+    quality as `refined_crossings` gives it: sigma [px] per axis of the centre for a noise of one grey level, NaN where
+    there is no ellipse; blur [px]; ratio of the axes; by how much the smaller half axis exceeds the least [px]; the
+    larger diameter [px].
+    """
+    out, quality = uv.copy(), np.full((5, len(uv)), np.nan)
+    for i in range(len(uv)):
+        u, v, sigma, blur, a, b = _fit(image, uv[i, 0], uv[i, 1], axes[i])
+        out[i, 0], out[i, 1] = u, v
+        quality[0, i], quality[1, i] = sigma, blur
+        quality[2, i], quality[3, i], quality[4, i] = b / max(a, 1e-12), b - LEAST_HALF_AXIS_PX - blur, 2.0 * a
+    return out, quality
+
+
+@njit(cache=True, nogil=True)
+def _half_axes(W):
+    """The larger and the smaller half axis of the ellipse |W (u - centre)| = 1."""
+    a = W[0, 0] ** 2 + W[1, 0] ** 2
+    b = W[0, 0] * W[0, 1] + W[1, 0] * W[1, 1]
+    c = W[0, 1] ** 2 + W[1, 1] ** 2
+    mean, apart = 0.5 * (a + c), hypot(0.5 * (a - c), b)
+    return 1.0 / sqrt(max(mean - apart, 1e-12)), 1.0 / sqrt(mean + apart)
+
+
+@njit(cache=True, nogil=True)
+def _fit(image, u0, v0, axes):
+    """(u, v, sigma, blur, larger and smaller half axis); sigma is NaN where no ellipse fits."""
+    det = axes[0, 0] * axes[1, 1] - axes[0, 1] * axes[1, 0]
+    if not abs(det) > 1e-9:
+        return u0, v0, np.nan, 0.0, 0.0, 0.0
+    # Rows of axes are the images of two radii: the ellipse is centre + axes^T (unit vector).
+    W = np.array([[axes[1, 1], -axes[1, 0]], [-axes[0, 1], axes[0, 0]]]) / det
+    p = np.array([u0, v0, _USUAL_BLUR, 0.0, 0.0])  # centre, blur, low, high
+    A = np.zeros((_SIZE, _SIZE))
+    done = False
+    for iteration in range(_ITERATIONS):
+        large, small = _half_axes(W)
+        if small < 0.5 * LEAST_HALF_AXIS_PX or hypot(p[0] - u0, p[1] - v0) > _MOST_MOVE * small + 1.0:
+            return u0, v0, np.nan, 0.0, large, small
+        half = min(max(_HALF_STRIP[0], _HALF_STRIP[1] * p[2]), _MOST_STRIP * small)
+        if not _inside(image, p, large + half):
+            return u0, v0, np.nan, p[2], large, small
+        b, n = _accumulate(A, image, p, W, half, iteration == 0)
+        if n < 2 * _SIZE or not p[4] - p[3] >= LEAST_CONTRAST:
+            return u0, v0, np.nan, p[2], large, small
+        step = solve_small(A, b)
+        moved = max(hypot(step[0], step[1]), large * max(abs(step[2]), abs(step[3]), abs(step[4])))
+        scale = min(1.0, _MOST_STEP_PX / max(moved, 1e-12))
+        p[0] += scale * step[0]
+        p[1] += scale * step[1]
+        C = scale * np.array([[step[2], step[4]], [step[4], step[3]]])
+        changed = np.empty((2, 2))
+        for i in range(2):
+            for j in range(2):
+                changed[i, j] = W[i, j] + C[i, 0] * W[0, j] + C[i, 1] * W[1, j]
+        W = changed
+        p[2] = min(max(p[2] + scale * min(max(step[5], -0.5 * p[2]), p[2]), _BLUR_RANGE[0]), _BLUR_RANGE[1])
+        p[3] += step[6]
+        p[4] += step[7]
+        if moved < _CONVERGED_PX:
+            done = True
+            break
+    large, small = _half_axes(W)
+    variance = 0.0
+    for k in range(2):
+        unit = np.zeros(_SIZE)
+        unit[k] = 1.0
+        variance += 0.5 * solve_small(A, unit)[k]
+    return p[0], p[1], sqrt(variance) if done and variance > 0.0 else np.nan, p[2], large, small
+
+
+@njit(cache=True, nogil=True)
+def _inside(image, p, reach):
+    return (
+        p[0] - reach >= 0.0
+        and p[1] - reach >= 0.0
+        and p[0] + reach <= image.shape[1] - 1.0
+        and p[1] + reach <= image.shape[0] - 1.0
+    )
+
+
+@njit(cache=True, nogil=True)
+def _accumulate(A, image, p, W, half, levels):
+    """Normal equations of the pixels within `half` px of the edge: A is filled, the right side and the number of pixels
+    are returned. With `levels` the grey levels p[3], p[4] are first set to the means inside and outside."""
+    large, _ = _half_axes(W)
+    x0, x1 = int(np.ceil(p[0] - large - half)), int(p[0] + large + half)
+    y0, y1 = int(np.ceil(p[1] - large - half)), int(p[1] + large + half)
+    if levels:
+        _set_levels(image, p, W, half, x0, x1, y0, y1)
+    A[:] = 0.0
+    b, J, n = np.zeros(_SIZE), np.empty(_SIZE), 0
+    contrast, blur = p[4] - p[3], p[2]
+    for y in range(y0, y1 + 1):
+        for x in range(x0, x1 + 1):
+            d, t0, t1, s0, s1, steep, radius = _distance(W, x - p[0], y - p[1])
+            if not abs(d) <= half:
+                continue
+            z = d / blur
+            share = 0.5 * (1.0 + erf(z / sqrt(2.0)))
+            slope = contrast * exp(-0.5 * z * z) / (sqrt(2.0 * pi) * blur)
+            J[0], J[1] = -slope * s0 / steep, -slope * s1 / steep
+            J[2], J[3] = slope * radius * t0 * t0 / steep, slope * radius * t1 * t1 / steep
+            J[4] = slope * 2.0 * radius * t0 * t1 / steep
+            J[5], J[6], J[7] = -slope * z, 1.0 - share, share
+            error = image[y, x] - p[3] - contrast * share
+            n += 1
+            for i in range(_SIZE):
+                b[i] += J[i] * error
+                for j in range(i + 1):
+                    A[i, j] += J[i] * J[j]
+    for i in range(_SIZE):
+        for j in range(i):
+            A[j, i] = A[i, j]
+        A[i, i] *= 1.0 + 1e-9
+    return b, n
+
+
+@njit(cache=True, nogil=True)
+def _distance(W, x, y):
+    """Distance [px] of a pixel from the ellipse |W u| = 1, positive outside, to first order; the unit vector
+    W u / |W u|, the slope of |W u| by u, its length, and |W u|."""
+    a, b = W[0, 0] * x + W[0, 1] * y, W[1, 0] * x + W[1, 1] * y
+    radius = max(hypot(a, b), 1e-9)
+    t0, t1 = a / radius, b / radius
+    s0, s1 = t0 * W[0, 0] + t1 * W[1, 0], t0 * W[0, 1] + t1 * W[1, 1]
+    steep = hypot(s0, s1)
+    return (radius - 1.0) / steep, t0, t1, s0, s1, steep, radius
+
+
+@njit(cache=True, nogil=True)
+def _set_levels(image, p, W, half, x0, x1, y0, y1):
+    low, n_low, high, n_high = 0.0, 0, 0.0, 0
+    for y in range(y0, y1 + 1):
+        for x in range(x0, x1 + 1):
+            d = _distance(W, x - p[0], y - p[1])[0]
+            if -half <= d <= -0.5 * half:
+                low += image[y, x]
+                n_low += 1
+            elif 0.5 * half <= d <= half:
+                high += image[y, x]
+                n_high += 1
+    p[3], p[4] = low / max(n_low, 1), high / max(n_high, 1)

@@ -1,0 +1,70 @@
+"""Grids of circles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+
+from icalib.errors import RigError
+from icalib.geometry.targets.base import Target, untagged_index
+
+
+@dataclass(frozen=True)
+class Circles(Target):
+    """`rows` x `cols` black circles of `diameter` [m] on white, `spacing` [m] apart. `asymmetric`: every other row is
+    moved by one spacing to the right, circles of a row are two spacings apart, rows are one apart, as OpenCV and Kalibr
+    have it.
+
+    Points are the centres of the circles, numbered as OpenCV does: row by row from the top left; point 0 is the origin,
+    so y of later rows is negative. Raises RigError where circles would touch or are too few.
+    """
+
+    type: ClassVar[str] = "circles"
+    blooms: ClassVar[bool] = False
+    seldom: ClassVar[tuple[str, ...]] = ("asymmetric",)
+
+    rows: int
+    cols: int
+    spacing: float
+    diameter: float
+    asymmetric: bool = False
+
+    def __post_init__(self) -> None:
+        if min(self.rows, self.cols) < 2 or self.rows * self.cols < 6:
+            raise RigError(f"a grid of {self.rows} x {self.cols} circles has too few; it needs 2 x 3 at least.")
+        nearest = self.spacing * (np.sqrt(2.0) if self.asymmetric else 1.0)
+        if not self.diameter < nearest:
+            raise RigError(
+                f"circles of diameter {self.diameter:g} m, {nearest:g} m apart, touch; correct diameter or spacing."
+            )
+
+    @cached_property
+    def points(self) -> np.ndarray:
+        """(rows cols, 3) centres in metres."""
+        row, col = np.divmod(np.arange(self.rows * self.cols), self.cols)
+        across = 2 * col + row % 2 if self.asymmetric else col
+        return self.spacing * np.stack([across, -row, 0 * row], axis=1)
+
+    @cached_property
+    def radii(self) -> np.ndarray:
+        """(rows cols,) in metres."""
+        return np.full(self.rows * self.cols, 0.5 * self.diameter)
+
+    @cached_property
+    def turns(self) -> tuple[np.ndarray, ...]:
+        """Half a turn, and quarters where rows = cols; of asymmetric grids half a turn where rows are even, or none."""
+        number = np.arange(self.rows * self.cols).reshape(self.rows, self.cols)
+        if self.asymmetric:
+            quarters = (0, 2) if self.rows % 2 == 0 else (0,)
+        else:
+            quarters = range(4) if self.rows == self.cols else (0, 2)
+        return tuple(np.rot90(number, k).ravel() for k in quarters)
+
+    def point_index(self, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarray:
+        return untagged_index(tag_id, corner, len(self.points), "rows and cols")
+
+    def point_identity(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros_like(index), index

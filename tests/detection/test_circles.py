@@ -1,0 +1,140 @@
+"""Grids of circles: found, numbered, and calibrated without the bias of their centres."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from icalib.detection.corners import corner_stream
+from icalib.detection.detectors import detector_of
+from icalib.errors import RigError
+from icalib.estimation.circle_centres import ellipse_shift
+from icalib.geometry.cameras import camera_model
+from icalib.geometry.targets import Checkerboard, Circles, Scene
+from icalib.inspection import read_target
+from icalib.measurements import Measurements
+from icalib.pipeline import calibrate_measurements
+from icalib.rig_file import load_rig, load_target
+from icalib.simulation import Imaging, Renderer, Sheet
+from icalib.simulation.scenario import SimCamera
+
+SYMMETRIC, ASYMMETRIC = Circles(7, 8, 0.04, 0.024), Circles(11, 4, 0.03, 0.026, asymmetric=True)
+PINHOLE = SimCamera(
+    "cam0", "pinhole-radtan", (752, 480), (460.0, 459.0, 375.0, 240.0), (-0.28, 0.07, 2e-4, 2e-5), np.eye(4)
+)
+FISHEYE = SimCamera(
+    "cam0", "pinhole-equidistant", (752, 480), (230.0, 229.5, 372.2, 241.4), (0.0035, 7e-4, -0.0021, 2e-4), np.eye(4)
+)
+DISTANCE = {PINHOLE.model: 0.45, FISHEYE.model: 0.22}
+
+
+def pose(target: Circles, distance: float, tilt: float, turn: float, roll: float) -> np.ndarray:
+    """T_target_cam that looks at the middle; tilt, turn and roll in degrees."""
+    a, b, c = np.radians([tilt, turn, roll])
+    z = np.array([np.sin(a) * np.cos(b), np.sin(a) * np.sin(b), -np.cos(a)])
+    x = np.array([np.cos(c), np.sin(c), 0.0])
+    x -= (x @ z) * z
+    x /= np.linalg.norm(x)
+    T = np.eye(4)
+    T[:3, :3] = np.column_stack([x, np.cross(z, x), z])
+    T[:3, 3] = target.points.mean(axis=0) - distance * z
+    return T
+
+
+def poses(target: Circles, camera: SimCamera, seed: int, count: int) -> list[np.ndarray]:
+    rng, far = np.random.default_rng(seed), DISTANCE[camera.model]
+    views = []
+    for _ in range(count):
+        how = far * rng.uniform(0.9, 1.2), rng.uniform(5.0, 40.0), rng.uniform(0.0, 360.0), rng.uniform(-60.0, 60.0)
+        views.append(pose(target, *how))
+    return views
+
+
+@pytest.mark.parametrize("camera", [PINHOLE, FISHEYE], ids=lambda c: c.model)
+@pytest.mark.parametrize("target", [SYMMETRIC, ASYMMETRIC], ids=["symmetric", "asymmetric"])
+def test_centres_are_those_of_the_projected_circles(camera, target):
+    """Each under its number, and away from the projection of its centre as perspective and lens say."""
+    renderer, detector = Renderer(camera, Imaging(blur_px=0.8, noise=2.0)), detector_of(target)
+    model = camera_model(camera.model)
+    params, errors, shifts = np.array([*camera.intrinsics, *camera.distortion]), [], []
+    for k, T in enumerate(poses(target, camera, 0, 6)):
+        picture = renderer.picture([Sheet(target)], T, np.random.default_rng(k))
+        found = detector.detect(picture.pixels)
+        X = (target.points - T[:3, 3]) @ T[:3, :3]
+        plane = np.tile(T[:3, :3].T[:, :2], (len(X), 1, 1))
+        shift = ellipse_shift(model, params, X, plane, target.radii)
+        errors.append((found.uv - picture.sheets[0].uv[found.point])[found.kept])
+        shifts.append(shift[found.point][found.kept])
+    error, shift = np.concatenate(errors), np.concatenate(shifts)
+    assert len(error) > 0.8 * 6 * len(target.points)
+    assert np.sqrt((shift**2).mean()) > 0.05  # what is left out otherwise
+    assert np.abs(((error - shift) * shift).sum() / (shift**2).sum()) < 0.01
+    assert np.sqrt(((error - shift) ** 2).mean()) < 0.006
+
+
+def test_the_shift_under_perspective_is_that_of_the_conic():
+    """Of a pinhole camera the ellipse is known in closed form: that of the circle's conic under the homography."""
+    camera = camera_model("pinhole-radtan")
+    params, radius = np.array([500.0, 480.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0]), 0.05
+    K = np.array([[500.0, 0.0, 320.0], [0.0, 480.0, 240.0], [0.0, 0.0, 1.0]])
+    T = pose(SYMMETRIC, 0.4, 50.0, 30.0, 20.0)
+    R, centre = T[:3, :3].T, T[:3, :3].T @ (np.array([0.1, 0.02, 0.0]) - T[:3, 3])
+    H = K @ np.column_stack([R[:, :2], centre])
+    C = np.linalg.inv(H).T @ np.diag([1.0, 1.0, -(radius**2)]) @ np.linalg.inv(H)
+    expected = np.linalg.solve(C[:2, :2], -C[:2, 2]) - (H[:2, 2] / H[2, 2])
+    shift = ellipse_shift(camera, params, centre[None], R[None, :, :2], np.array([radius]))
+    assert np.linalg.norm(expected) > 1.0
+    np.testing.assert_allclose(shift[0], expected, atol=2e-3 * np.linalg.norm(expected))
+
+
+@pytest.mark.parametrize(
+    ("camera", "target"), [(PINHOLE, SYMMETRIC), (FISHEYE, ASYMMETRIC)], ids=["pinhole", "fisheye"]
+)
+def test_the_lens_comes_out_without_bias(tmp_path, camera, target):
+    renderer, detector = Renderer(camera, Imaging(blur_px=0.8, noise=2.0)), detector_of(target)
+    views = poses(target, camera, 1, 14)
+    rng = np.random.default_rng(3)
+    found = [detector.detect(renderer.picture([Sheet(target)], T, rng).pixels) for T in views]
+    stream = corner_stream("cam0", np.arange(len(found)) * 10**9, found)
+    fields = ", ".join(f"{name}: {str(value).lower()}" for name, value in target.plain().items())
+    text = f"{{type: camera, model: {camera.model}, resolution: [752, 480]}}\ntarget: {{{fields}}}\n"
+    (tmp_path / "rig.yaml").write_text(f"sensors:\n  cam0: {text}settings: {{board_shape: false}}\n")
+    result = calibrate_measurements(load_rig(tmp_path / "rig.yaml"), Measurements(None, (stream,)))
+    for name, truth in (("intrinsics", camera.intrinsics), ("distortion", camera.distortion)):
+        group = result.group("cam0", name)
+        assert np.abs((group.value - truth) / group.std).max() < 3.5, name
+    assert result.group("cam0", "intrinsics").std[0] < 2e-4 * camera.intrinsics[0]
+
+
+@pytest.mark.parametrize(
+    ("target", "turns"),
+    [(SYMMETRIC, 2), (Circles(6, 6, 0.04, 0.02), 4), (ASYMMETRIC, 1), (Circles(4, 5, 0.03, 0.02, True), 2)],
+)
+def test_turns_put_circles_on_circles(target, turns):
+    assert len(target.turns) == turns
+    at = target.points[:, :2] - target.points[:, :2].mean(axis=0)
+    rotations = [np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]) for a in 0.5 * np.pi * np.arange(4)]
+    alike = sum(all(np.abs(at - p).sum(axis=1).min() < 1e-9 for p in at @ R) for R in rotations)
+    assert alike == turns
+    for turn in target.turns:
+        R = np.linalg.lstsq(at, at[turn], rcond=None)[0]
+        np.testing.assert_allclose(at @ R, at[turn], atol=1e-12)
+        assert np.linalg.det(R) == pytest.approx(1.0)
+
+
+def test_rig_files_and_kalibrs(tmp_path):
+    for target in (SYMMETRIC, ASYMMETRIC):
+        plain = ", ".join(f"{name}: {str(value).lower()}" for name, value in target.plain().items())
+        (tmp_path / "target.yaml").write_text(f"{{{plain}}}")
+        assert load_target(tmp_path / "target.yaml") == target
+    (tmp_path / "target.yaml").write_text("{type: circles, rows: 4, cols: 5, spacing: 0.02, diameter: 0.03}")
+    with pytest.raises(RigError, match="touch; correct diameter or spacing"):
+        load_target(tmp_path / "target.yaml")
+    text = "target_type: circlegrid\ntargetRows: 4\ntargetCols: 11\nspacingMeters: 0.02\nasymmetricGrid: true\n"
+    (tmp_path / "kalibr.yaml").write_text(text)
+    words = r"type: circles, rows: 4, cols: 11, spacing: 0.02, diameter: ..., asymmetric: true"
+    with pytest.raises(RigError, match=words):
+        read_target(tmp_path / "kalibr.yaml")
+    with pytest.raises(RigError, match="both are grids of circles"):
+        Scene(("a", "b"), (SYMMETRIC, ASYMMETRIC))
+    assert Scene(("a", "b"), (SYMMETRIC, Checkerboard(4, 5, 0.1))).radii.tolist() == [0.012] * 56 + [0.0] * 20
