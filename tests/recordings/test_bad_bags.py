@@ -342,9 +342,19 @@ class TestImages:
 
     def test_two_resolutions(self, tmp_path, write):
         images = self.pictures()
-        images[5] = np.ones((8, 6), np.uint8)
+        for k in (4, 5, 7):
+            images[k] = np.full((8, 6), k, np.uint8)
         sentence = complaint(lambda: list(self.bag(tmp_path, write, images).images("/cam")))
-        assert f"/cam: the image at {T[5]} ns has 6 x 8 px, the one at {T[4]} ns 8 x 6 px" in sentence
+        assert f"/cam: the image at {T[7]} ns has 6 x 8 px, others have 8 x 6 px" in sentence
+
+    @pytest.mark.parametrize("odd", [0, 1, 5])
+    def test_single_images_of_another_size_are_left_out(self, tmp_path, write, odd):
+        images = self.pictures()
+        images[odd] = np.ones((8, 6), np.uint8)
+        bag = self.bag(tmp_path, write, images)
+        assert [f.stamp_ns for f in bag.images("/cam")] == [T[k] for k in range(8) if k != odd]
+        words = f"1 images that have another size than 8 x 6 px were left out, the first at {T[odd]} ns"
+        assert words in bag.notes()[0]
 
     def test_unknown_encoding(self, tmp_path, write):
         bag = self.bag(tmp_path, write, self.pictures(), encoding="32FC1")

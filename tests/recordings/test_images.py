@@ -47,12 +47,38 @@ def test_colour_is_luma(encoding, channels, padding):
 
 @pytest.mark.parametrize("big_endian", [False, True])
 @pytest.mark.parametrize("padding", [0, 4])
-@pytest.mark.parametrize(("brightest", "shift"), [(200, 0), (255, 0), (256, 1), (1023, 2), (4095, 4), (65535, 8)])
-def test_sixteen_bits(brightest, shift, padding, big_endian):
-    pixels = RNG.integers(0, brightest + 1, (H, W)).astype(np.uint16)
-    pixels[2, 3] = brightest
+@pytest.mark.parametrize(("darkest", "brightest"), [(0, 200), (0, 1023), (0, 65535), (29_000, 29_300)])
+def test_sixteen_bits_are_stretched(darkest, brightest, padding, big_endian):
+    pixels = RNG.integers(darkest, brightest + 1, (H, W)).astype(np.uint16)
+    pixels[2, 3], pixels[0, 1] = brightest, darkest
     payload = raw("mono16", pixels.astype(">u2" if big_endian else "<u2"), padding, big_endian)
-    np.testing.assert_array_equal(decode(payload), pixels >> shift)
+    expected = 255.0 * (pixels.astype(float) - darkest) / (brightest - darkest)
+    np.testing.assert_allclose(decode(payload), expected, atol=3.0)
+
+
+@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
+def test_single_hot_and_dead_pixels_take_no_grey_levels(dtype):
+    ramp = np.tile(np.linspace(30_000.0, 30_400.0, 200), (100, 1)).astype(dtype)
+    pixels = ramp.copy()
+    pixels[3, 4], pixels[70, 9] = 65_535, 0
+    found = decode(file_payload(5, "x", cv2.imencode(".tiff", pixels)[1].tobytes()))
+    assert (found[3, 4], found[70, 9]) == (255, 0)
+    others = np.ones(pixels.shape, dtype=bool)
+    others[[3, 70], [4, 9]] = False
+    np.testing.assert_allclose(found[others], 255.0 * (ramp[others] - 30_000.0) / 400.0, atol=2.0)
+    assert not decode(file_payload(5, "x", cv2.imencode(".tiff", np.full_like(pixels, 7))[1].tobytes())).any()
+
+
+@pytest.mark.parametrize(
+    ("ending", "encoding"), [(".bmp", "bmp"), (".tif", "tiff"), (".pgm", "pnm"), (".ppm", "pnm"), (".webp", "webp")]
+)
+def test_other_files(ending, encoding):
+    image = COLOUR[..., ::-1] if ending != ".pgm" else LUMA.round().astype(np.uint8)
+    options = [cv2.IMWRITE_WEBP_QUALITY, 101] if ending == ".webp" else []
+    payload = file_payload(5, "x", cv2.imencode(ending, image, options)[1].tobytes())
+    assert payload.encoding == encoding
+    assert (payload.width, payload.height) == (W, H)
+    np.testing.assert_allclose(decode(payload), LUMA, atol=1.5)
 
 
 @pytest.mark.parametrize("order", ["rggb", "bggr", "gbrg", "grbg"])
@@ -106,7 +132,7 @@ def test_png_of_sixteen_bits():
     pixels = RNG.integers(0, 4096, (H, W)).astype(np.uint16)
     pixels[0, 0] = 4095
     payload = file_payload(5, "x", cv2.imencode(".png", pixels)[1].tobytes(), "mono16; png compressed mono16")
-    np.testing.assert_array_equal(decode(payload), pixels >> 4)
+    np.testing.assert_allclose(decode(payload), pixels / 4095.0 * 255.0, atol=6.0)
 
 
 @pytest.mark.parametrize("encoding", ["32FC1", "", "h264", "compresseddepth"])

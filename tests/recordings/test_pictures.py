@@ -71,6 +71,46 @@ def test_wrong_names_are_said(tmp_path):
         next(iter(PictureFolder(tmp_path).payloads("b/*.png")))
 
 
+@pytest.mark.parametrize(
+    ("left", "right", "names"),
+    [
+        ("left{}.png", "right{}.png", ("left", "right")),
+        ("left-{:04d}.bmp", "right-{:04d}.bmp", ("cam0", "cam1")),
+        ("{:03d}_cam0.pgm", "{:03d}_cam1.pgm", None),
+    ],
+)
+@pytest.mark.parametrize("folder", ["", "images"])
+def test_pictures_of_two_cameras_in_one_folder(tmp_path, left, right, names, folder):
+    for i in range(9, 13):
+        picture(tmp_path / folder / left.format(i), 10 + i)
+        picture(tmp_path / folder / right.format(i), 30 + i)
+    recording = open_recording(tmp_path)
+    topics = [t.name for t in recording.topics()]
+    assert len(topics) == 2 and all("*" in t for t in topics)
+    first, second = [(n, None) for n in names] if names else [("a", topics[0]), ("b", topics[1])]
+    assert greys(recording, *first) == [(i, 10 + i) for i in range(9, 13)]
+    assert greys(recording, *second) == [(i, 30 + i) for i in range(9, 13)]
+
+
+def test_names_of_one_camera_that_differ_are_one_folder(tmp_path):
+    for i, name in enumerate(["IMG_0001.png", "IMG_0002.png", "DSC_0003.png", "IMG_0004.png"]):
+        picture(tmp_path / name, 10 + i)
+    assert [t.name for t in open_recording(tmp_path).topics()] == ["."]
+
+
+def test_single_pictures_that_are_odd_are_left_out_and_named(tmp_path):
+    for i in range(12):
+        picture(tmp_path / f"p{i}.png", 10 + i)
+    cv2.imwrite(str(tmp_path / "p3.png"), np.full((20, 30), 9, np.uint8))
+    (tmp_path / "p5.png").write_text("not an image\n")
+    (tmp_path / "p7.png").write_bytes((tmp_path / "p7.png").read_bytes()[:40])
+    recording = open_recording(tmp_path)
+    assert [n for n, _ in greys(recording, "cam0")] == [i for i in range(12) if i not in (3, 5, 7)]
+    notes = " ".join(recording.notes())
+    for reason, name in (("another size than 8 x 6 px", "p3"), ("are no pictures", "p5"), ("are damaged", "p7")):
+        assert f"{reason} were left out, the first {name}.png." in notes
+
+
 def test_an_imu_needs_a_clock(tmp_path):
     picture(tmp_path / "1.png", 1)
     with pytest.raises(RecordingError, match="take the IMU out of the rig file"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from icalib.recordings.images import Payload, file_payload
 from icalib.recordings.unreadable import HEAD_BYTES, not_data
 from icalib.rig import TimeUnit
 
-SUFFIXES = (".png", ".jpg", ".jpeg")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
 _RATE_HZ = (1e-3, 1000.0)
 _STAMPED = re.compile(r"[^0-9]*?(?P<stamp>[0-9]{9,19}(\.[0-9]+)?)")  # of a file's name, behind a word such as left_
 
@@ -72,7 +73,7 @@ def file_payloads(files: list[tuple[int, Path]], where: str, note: Note) -> Iter
         if sentence := not_data(path, data[:HEAD_BYTES]):
             pointers.append(sentence)
         elif data:
-            yield file_payload(stamp_ns, f"{where} ({path.name})", data)
+            yield replace(file_payload(stamp_ns, where, data), name=path.name)
         else:
             missing.append(path)
     if pointers:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
+from itertools import chain, islice
 
 import numpy as np
 
@@ -18,6 +20,8 @@ from icalib.recordings.images import (
 )
 
 Note = Callable[[str], None]
+LOOK_AHEAD = 5  # images: what most of them have is the resolution
+ODD, ODD_SHARE = 2, 0.1  # images of another resolution, and of all before: more are of another camera
 _LATE_NS = 1_000_000_000  # beyond, images did not overtake each other: the clock was set back
 
 
@@ -29,13 +33,15 @@ def checked_payloads(payloads: Iterable[Payload], where: str, note: Note) -> Ite
     """`payloads` with strictly increasing stamps and one resolution; a note on what was left out, at the end.
 
     Left out: files that are no pictures, images of zeros, exact repetitions of the image before (the camera froze),
-    images that come after a later one. Raises RecordingError naming `where` and the instant: an unknown encoding, two
-    resolutions, a clock that was set back, no usable image.
+    images that come after a later one, single ones of another resolution than most of the first. Raises RecordingError
+    naming `where` and the image: an unknown encoding, many of another resolution, a clock that was set back, no usable
+    image.
     """
     dropped = _Dropped()
-    kept = 0
+    kept, odd = 0, 0
     last: Payload | None = None
-    for payload in payloads:
+    size, ahead = _usual_size(payloads)
+    for payload in ahead:
         if not np.frombuffer(payload.data, np.uint8).any():
             dropped.add("consist of zeros", payload)
             continue
@@ -44,8 +50,15 @@ def checked_payloads(payloads: Iterable[Payload], where: str, note: Note) -> Ite
             continue
         if not is_known(payload.encoding):
             raise RecordingError(unknown_encoding(payload))
+        if size and payload.width and (payload.width, payload.height) != size:
+            odd += 1
+            error = _other_size(payload, size, where)
+            if odd > max(ODD, ODD_SHARE * kept):
+                raise RecordingError(error)
+            dropped.add(f"have another size than {size[0]} x {size[1]} px", payload, error)
+            continue
         if last is not None:
-            _refuse_other_camera(last, payload, where)
+            _refuse_other_clock(last, payload, where)
             if payload.stamp_ns <= last.stamp_ns:
                 dropped.add("are not later than the one before", payload)
                 continue
@@ -86,25 +99,35 @@ class _Dropped:
 
     def __init__(self) -> None:
         self.count: dict[str, int] = {}
-        self._first_ns: dict[str, int] = {}
+        self._first: dict[str, str] = {}
         self.first_error = ""
 
     def add(self, reason: str, payload: Payload, error: str = "") -> None:
         self.count[reason] = self.count.get(reason, 0) + 1
-        self._first_ns.setdefault(reason, payload.stamp_ns)
+        self._first.setdefault(reason, payload.which)
         self.first_error = self.first_error or error
 
     def note(self, where: str, note: Note) -> None:
         for reason, count in self.count.items():
-            note(f"{where}: {count} images that {reason} were left out, the first at {self._first_ns[reason]} ns.")
+            note(f"{where}: {count} images that {reason} were left out, the first {self._first[reason]}.")
 
 
-def _refuse_other_camera(last: Payload, payload: Payload, where: str) -> None:
-    if (payload.width, payload.height) != (last.width, last.height) and payload.width and last.width:
-        raise RecordingError(
-            f"{where}: the image at {payload.stamp_ns} ns has {payload.width} x {payload.height} px, the one at "
-            f"{last.stamp_ns} ns {last.width} x {last.height} px; record each resolution under its own name."
-        )
+def _usual_size(payloads: Iterable[Payload]) -> tuple[tuple[int, int], Iterator[Payload]]:
+    """Width and height [px] of most of the first images, (0, 0) where none tells; and all payloads."""
+    rest = iter(payloads)
+    first = list(islice(rest, LOOK_AHEAD))
+    sizes = Counter((p.width, p.height) for p in first if p.width)
+    return sizes.most_common(1)[0][0] if sizes else (0, 0), chain(first, rest)
+
+
+def _other_size(payload: Payload, size: tuple[int, int], where: str) -> str:
+    return (
+        f"{where}: the image {payload.which} has {payload.width} x {payload.height} px, others have "
+        f"{size[0]} x {size[1]} px; record each resolution under its own name."
+    )
+
+
+def _refuse_other_clock(last: Payload, payload: Payload, where: str) -> None:
     if payload.stamp_ns < last.stamp_ns - _LATE_NS:
         raise RecordingError(
             f"{where}: the image at {payload.stamp_ns} ns comes after the one at {last.stamp_ns} ns; "

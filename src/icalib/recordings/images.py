@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +13,10 @@ import numpy as np
 from icalib.errors import RecordingError
 from icalib.extras import load_cv2
 
-NO_PICTURE = "unknown"  # the encoding of a file that is neither JPEG nor PNG
+NO_PICTURE = "unknown"  # the encoding of a file that is no image
+FILE_FORMATS = ("jpeg", "png", "bmp", "tiff", "pnm", "webp")  # all that OpenCV decodes
+DARKEST, BRIGHTEST = 0.1, 99.9  # percentiles of more than 8 bits that become 0 and 255: hot and dead pixels are fewer
+PERCENTILE_PIXELS = 100_000  # of an image that percentiles are taken of
 Convert = Callable[[np.ndarray, Any], np.ndarray]
 
 
@@ -32,9 +36,9 @@ class Frame:
 class Payload:
     """One image as it was recorded, undecoded; it can be sent to another process.
 
-    source names the stream in sentences. encoding: that of sensor_msgs/Image, or of a file, jpeg or png, then after
-    a blank the pixels' if these are a Bayer mosaic. width, height [px]: 0 where the file does not tell. step: bytes
-    in a row, 0 for files.
+    source names the stream in sentences. encoding: that of sensor_msgs/Image, or of a file, one of `FILE_FORMATS`, then
+    after a blank the pixels' if these are a Bayer mosaic. width, height [px]: 0 where the file does not tell. step:
+    bytes in a row, 0 for files. name: of the file in a folder, else nothing.
     """
 
     stamp_ns: int
@@ -45,10 +49,16 @@ class Payload:
     height: int
     step: int = 0
     big_endian: bool = False
+    name: str = ""
+
+    @property
+    def which(self) -> str:
+        """Tells the image from others of its stream, in sentences."""
+        return self.name or f"at {self.stamp_ns} ns"
 
 
 def decode(payload: Payload) -> np.ndarray:
-    """The image (height, width) uint8, grey. 16 bits are shifted so that the brightest pixel fits 8.
+    """The image (height, width) uint8, grey. More than 8 bits are scaled: 0.1 % of the pixels are 0, and 0.1 % 255.
 
     Raises RecordingError naming the stream and the instant for an unknown encoding, DamagedImageError for data that are
     too short or damaged.
@@ -69,14 +79,14 @@ def is_known(encoding: str) -> bool:
 
 def is_file(encoding: str) -> bool:
     """Whether the data are those of an image file."""
-    return encoding.split(" ")[0] in ("jpeg", "png")
+    return encoding.split(" ")[0] in FILE_FORMATS
 
 
 def unknown_encoding(payload: Payload) -> str:
     """The sentence for an encoding that `decode` does not know."""
     known = ", ".join(sorted(_ENCODINGS))
     return (
-        f"{payload.source}: the image at {payload.stamp_ns} ns has the encoding {payload.encoding!r}, which icalib "
+        f"{payload.source}: the image {payload.which} has the encoding {payload.encoding!r}, which icalib "
         f"does not read; record jpeg, png, or one of {known}."
     )
 
@@ -85,16 +95,22 @@ def file_payload(stamp_ns: int, source: str, data: bytes, described: str = "") -
     """The payload of an image file; its format is told by its content, or else as `described` by the recorder."""
     words = described.replace(";", " ").lower().split()
     encoding = _file_format(data, words)
-    if encoding in ("jpeg", "png") and words and words[-1] in _BAYER:
+    if encoding in FILE_FORMATS and words and words[-1] in _BAYER:
         encoding = f"{encoding} {words[-1]}"
     width, height = file_size(data)
+    if encoding in ("tiff", "pnm", "webp"):  # recorded by few cameras: not worth readers of their headers
+        image = _decoded(data)
+        height, width = (0, 0) if image is None else image.shape[:2]
     return Payload(stamp_ns, source, encoding, data, width, height)
 
 
 def file_size(data: bytes) -> tuple[int, int]:
-    """Width and height [px] by the header of a JPEG or PNG file, (0, 0) where it does not tell."""
+    """Width and height [px] by the header of a JPEG, PNG or BMP file, (0, 0) where it does not tell."""
     if data.startswith(_PNG) and len(data) >= 24:
         return struct.unpack_from(">II", data, 16)
+    if data.startswith(b"BM") and len(data) >= 26:
+        width, height = struct.unpack_from("<ii", data, 18)
+        return width, abs(height)
     at = 2 if data.startswith(_JPEG) else len(data)
     while at + 9 <= len(data) and data[at] == 0xFF:
         marker, length = data[at + 1], int.from_bytes(data[at + 2 : at + 4])
@@ -113,6 +129,14 @@ def _file_format(data: bytes, words: list[str]) -> str:
         return "jpeg"
     if data.startswith(_PNG):
         return "png"
+    if data.startswith((b"II*\0", b"MM\0*")):
+        return "tiff"
+    if data.startswith(b"RIFF") and data[8:12] == b"WEBP":
+        return "webp"
+    if data.startswith(b"BM") and int.from_bytes(data[2:6], "little") == len(data):
+        return "bmp"
+    if re.match(rb"P[1-6]\s", data):
+        return "pnm"
     for name in ("jpeg", "png"):
         if name in words or (name == "jpeg" and "jpg" in words):
             return name
@@ -120,17 +144,22 @@ def _file_format(data: bytes, words: list[str]) -> str:
 
 
 def _decode_file(payload: Payload) -> np.ndarray:
-    cv2 = load_cv2()
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    try:
-        image = cv2.imdecode(np.frombuffer(payload.data, np.uint8), flags)
-    except cv2.error:
-        image = None
+    image = _decoded(payload.data)
     if image is None:
-        raise DamagedImageError(f"{payload.source}: the image at {payload.stamp_ns} ns is damaged; leave it out.")
+        raise DamagedImageError(f"{payload.source}: the image {payload.which} is damaged; leave it out.")
     image = _to_8_bits(image)
     mosaic = payload.encoding.partition(" ")[2]
     return _demosaic(mosaic)(image, payload) if mosaic else image
+
+
+def _decoded(data: bytes) -> np.ndarray | None:
+    """Grey, as many bits as there are; None where it is damaged."""
+    cv2 = load_cv2()
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:
+        return None
 
 
 def _rows(payload: Payload, pixel_bytes: int) -> np.ndarray:
@@ -139,7 +168,7 @@ def _rows(payload: Payload, pixel_bytes: int) -> np.ndarray:
     step = payload.step or wanted
     if step < wanted or len(payload.data) < step * payload.height or not wanted * payload.height:
         raise DamagedImageError(
-            f"{payload.source}: the image at {payload.stamp_ns} ns has {len(payload.data)} bytes, too few for "
+            f"{payload.source}: the image {payload.which} has {len(payload.data)} bytes, too few for "
             f"{payload.width} x {payload.height} px of {payload.encoding} in rows of {step} bytes; leave it out."
         )
     rows = np.frombuffer(payload.data, np.uint8, step * payload.height).reshape(payload.height, step)
@@ -147,10 +176,14 @@ def _rows(payload: Payload, pixel_bytes: int) -> np.ndarray:
 
 
 def _to_8_bits(image: np.ndarray) -> np.ndarray:
-    """Cameras of 10 or 12 bits fill only part of 16: the brightest pixel tells how far to shift."""
+    """Cameras of 10 or 12 bits fill only part of 16, thermal ones a few hundred levels, and a hot pixel all of it."""
     if image.dtype == np.uint8:
         return image
-    return (image >> max(0, int(image.max()).bit_length() - 8)).astype(np.uint8)
+    few = image.ravel()[:: max(image.size // PERCENTILE_PIXELS, 1)]
+    finite = few[np.isfinite(few)]
+    low, high = np.percentile(finite, (DARKEST, BRIGHTEST)) if len(finite) else (0.0, 0.0)
+    scale = 255.0 / (high - low) if high > low else 0.0
+    return np.clip(np.rint((np.nan_to_num(image.astype(np.float32)) - low) * scale), 0.0, 255.0).astype(np.uint8)
 
 
 def _sixteen_bits(rows: np.ndarray, payload: Payload) -> np.ndarray:

@@ -27,6 +27,8 @@ from icalib.rig import Camera, ImuSensor, Lidar, PoseSensor, Wheels
 
 APART_NS = 1_000_000_000  # from one number to the next
 MOST = 9_000_000_000  # beyond, nanoseconds do not fit
+MIXED = 0.75  # of the pictures have a number of their own: fewer are of several cameras
+_SIDES = {"0": "left", "1": "right"}  # by the end of a camera's name
 
 
 def has_pictures(root: Path) -> bool:
@@ -39,7 +41,8 @@ class PictureFolder:
     """A folder of pictures, or of one folder of pictures for each camera.
 
     A topic is the name of such a folder, `.` for the root itself, or a pattern of files as `images/*_0.jpg`, in which
-    the star is the picture's number.
+    the star is the picture's number. A folder with several pictures of one number, left1.png and right1.png, is a topic
+    for each pattern.
     """
 
     def __init__(self, root: Path, window: Window = WHOLE) -> None:
@@ -57,7 +60,13 @@ class PictureFolder:
     def image_topic(self, camera: Camera) -> str:
         if camera.topic is not None and "*" in camera.topic:
             return camera.topic
-        return choose_topic(str(self.root), self.topics(), "image", camera.name, camera.topic).name
+        topics = self.topics()
+        patterns = [t.name for t in topics if "*" in t.name] if camera.topic is None else []
+        for word in (camera.name, _SIDES.get(camera.name[-1:], camera.name)):  # cam0 where files say left
+            named = [name for name in patterns if word in name.lower()]
+            if len(named) == 1:
+                return named[0]
+        return choose_topic(str(self.root), topics, "image", camera.name, camera.topic).name
 
     def payloads(self, topic: str) -> Iterator[Payload]:
         files, where = self._inside(topic), f"{self.root}/{topic}"
@@ -162,7 +171,33 @@ class PictureFolder:
 
 def _topics(root: Path) -> list[str]:
     folders = sorted(p.name for p in root.iterdir() if p.is_dir() and pictures_in(p)) if root.is_dir() else []
-    return [*(["."] if pictures_in(root) else []), *folders]
+    return [name for folder in (".", *folders) for name in _mixed(root, folder)]
+
+
+def _mixed(root: Path, folder: str) -> list[str]:
+    """Patterns of the pictures of `folder` where several of them share their numbers; else the folder, or nothing."""
+    paths = pictures_in(root / folder)
+    # The number may be the last in the names or the one before: that which leaves fewer patterns.
+    own = min((_patterns(paths, place) for place in (-1, -2)), key=len)
+    numbers = [number for found in own.values() for number in found]
+    # Of two cameras nearly all numbers come twice; names of one camera that differ share hardly any.
+    alike = len(own) > 1 and min(map(len, own.values())) > 1
+    if alike and sum(map(len, own.values())) == len(paths) and len(set(numbers)) < MIXED * len(numbers):
+        return sorted(pattern if folder == "." else f"{folder}/{pattern}" for pattern in own)
+    return [folder] if paths else []
+
+
+def _patterns(paths: list[Path], place: int) -> dict[str, set[int]]:
+    """Numbers of pictures by pattern, the star in place of that number of their names."""
+    own: dict[str, set[int]] = {}
+    for path in paths:
+        found = [*re.finditer(r"\d+", path.stem)]
+        if len(found) >= -place:
+            a, b = found[place].span()
+            own.setdefault(f"{path.stem[:a]}*{path.stem[b:]}{path.suffix}", set()).add(int(path.stem[a:b]))
+        else:
+            own.setdefault(path.name, set()).add(0)
+    return own
 
 
 def _number(key: str, path: Path) -> int:
