@@ -228,3 +228,27 @@ def test_no_file_and_no_imu(tmp_path):
 def test_stamps_of_today_have_19_digits(tmp_path):
     s = loaded(tmp_path, FULL.replace("start_ns: 5000000000", "start_ns: 1700000000000000000"))
     assert s.imu_clock_origin_ns == 1_700_000_000_000_000_000
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("duration: 3", "duration: 1000000", "imu0 would measure 2e+08 readings, and 5e+06 are the most"),
+        ("    rate: 200\n", "    rate: 100000000\n", "imu0 would measure"),
+        ("    rate: 20\n", "    rate: 1000000\n", "left would measure"),
+    ],
+)
+def test_what_would_not_fit_in_memory(tmp_path, old, new, words):
+    path = tmp_path / "scenario.yaml"
+    assert FULL.count(old) == 1
+    path.write_text(FULL.replace(old, new))
+    with pytest.raises(RigError, match=r"scenario.yaml:1: duration: ") as error:
+        load_scenario(path)
+    assert words in str(error.value) and "lower its rate, or the duration" in str(error.value)
+
+
+def test_a_lidar_of_too_many_points(tmp_path):
+    text = (PAPER / "table2-3d.yaml").read_text().replace("rings: 16", "rings: 16000")
+    (tmp_path / "scenario.yaml").write_text(text)
+    with pytest.raises(RigError, match="would measure 1.4e.10 points, and 1e.08 are the most"):
+        load_scenario(tmp_path / "scenario.yaml")

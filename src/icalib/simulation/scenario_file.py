@@ -17,6 +17,7 @@ from icalib.simulation.projection import PARAMETER_COUNTS
 from icalib.simulation.robot import Drive, DriveKind, Features, SimLidar, SimPoses, SimWheels
 from icalib.simulation.room import Block, Room, hills_of_slope
 from icalib.simulation.scenario import MODELS, Scenario, SimCamera, pose_from_rows
+from icalib.simulation.size import refuse_large
 from icalib.yaml_nodes import MOST_WHOLE, YamlValue, read_yaml
 
 _SENSOR_TYPES = ("imu", "camera", "lidar", "wheels", "pose")
@@ -42,7 +43,7 @@ def load_scenario(path: str | Path) -> Scenario:
     room, motion = _room(found["room"]), _motion(found["motion"], Path(path).parent)
     features = _features(found["features"]) if "features" in found else None
     board: dict[str, Any] = _board(found["target"]) if "target" in found else {"board": False}
-    return _made(
+    scenario = _made(
         root,
         Scenario,
         duration_s=duration_s,
@@ -54,6 +55,11 @@ def load_scenario(path: str | Path) -> Scenario:
         **sensors,
         **board,
     )
+    try:
+        refuse_large(scenario)
+    except RigError as error:
+        found["duration"].fail(str(error))
+    return scenario
 
 
 def _made(value: YamlValue, kind: Callable[..., Made], /, **fields: Any) -> Made:
