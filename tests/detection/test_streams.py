@@ -50,7 +50,7 @@ class FakeDetector:
         self.seen: list[int] = []
         self.fail_at = -1
 
-    def detect(self, image: np.ndarray) -> ImageCorners:
+    def detect(self, image: np.ndarray, before=()) -> ImageCorners:
         i = int(image[0, 0])
         if i == self.fail_at:
             raise KeyboardInterrupt
@@ -128,20 +128,41 @@ def test_nothing_is_kept_where_that_is_switched_off_or_cannot_be(detector, tmp_p
 
 
 def test_few_images_wait_in_memory(detector, monkeypatch):
-    """The reader never runs ahead of the detectors by more than the bound."""
+    """The reader never runs ahead of the detectors by more than the bound: turns that wait, one that is made, and those
+    that are searched."""
     monkeypatch.setattr(streams, "_workers", lambda: 2)
+    monkeypatch.setattr(streams, "IN_TURN", 4)
     recording, ahead = FakeRecording(60), []
     plain = detector.detect
     gate = threading.Semaphore(0)
 
-    def slow(image: np.ndarray) -> ImageCorners:
+    def slow(image: np.ndarray, before=()) -> ImageCorners:
         ahead.append(recording.read - len(detector.seen))
         gate.acquire(timeout=0.01)
-        return plain(image)
+        return plain(image, before)
 
     monkeypatch.setattr(detector, "detect", slow)
     streams.find_corners(recording, CAMERA, GRID, keep=False)
-    assert max(ahead) <= 2 * streams.PER_WORKER + 2 + 2
+    assert max(ahead) <= (2 + 2) * 4
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+@pytest.mark.parametrize(("most", "images"), [(1 << 20, 6), (3 * 48, 3), (1, 1)])
+def test_what_leads_the_search_does_not_depend_on_the_number_of_threads(detector, monkeypatch, workers, most, images):
+    """Each image is searched after those of its turn, in order: 6 images, or as many as have `most` bytes."""
+    monkeypatch.setattr(streams, "_workers", lambda: workers)
+    monkeypatch.setattr(streams, "IN_TURN", 6)
+    monkeypatch.setattr(streams, "BYTES_IN_TURN", most)
+    led, plain = {}, detector.detect
+
+    def noted(image: np.ndarray, before=()) -> ImageCorners:
+        led[int(image[0, 0])] = [one.uv[:, 0].tolist() for one in before]
+        return plain(image, before)
+
+    monkeypatch.setattr(detector, "detect", noted)
+    streams.find_corners(FakeRecording(), CAMERA, GRID, keep=False)
+    seen = [[float(i)] if i % 5 != 4 else [] for i in range(20)]
+    assert led == {i: seen[max(i - 3, i - i % images) : i] for i in range(20)}
 
 
 def test_an_interrupted_search_keeps_nothing(detector, tmp_path):

@@ -10,8 +10,9 @@ import numpy as np
 from icalib.detection.consistency import consistent_corners, largest_group
 from icalib.detection.corners import ImageCorners, judged, no_corners
 from icalib.detection.families import Family, tag_family
-from icalib.detection.growth import grow
+from icalib.detection.growth import confirm, grow
 from icalib.detection.markers import APRILTAG_CORNER
+from icalib.detection.prediction import Expected
 from icalib.detection.quads import View
 from icalib.detection.refinement import refined_corners, refined_crossings
 from icalib.detection.tags import Tags, find_tags
@@ -79,8 +80,33 @@ class AprilGridDetector:
                 tags = find_tags(view, self._family, self.border_bits, window, separate)
                 known, quads = self._seeds(tags)
                 if known.any():
+                    # From here on, nothing depends on how the tags were found.
+                    confirm(view.image, known, quads, *self._cells, self._clear, self.squares)
                     return self._corners(view.image, known, quads)
         return no_corners()
+
+    def find_near(self, view: View, expected: Expected) -> ImageCorners | None:
+        """As `find`, from where corners are expected; None where some that should be in the image are not there."""
+        n = self.rows * self.cols
+        uv, seen = np.zeros((4 * n, 2)), np.zeros(4 * n, dtype=bool)
+        uv[expected.point], seen[expected.point] = expected.uv, True
+        of_tag = 4 * np.arange(n)[:, None] + APRILTAG_CORNER
+        known, quads = seen[of_tag].all(axis=1), uv[of_tag]
+        known = largest_group(
+            confirm(view.image, known, quads, *self._cells, self._clear, self.squares), quads, self.tag_corners
+        )
+        if not known.any():
+            return None
+        # A tag that the image cuts is sometimes found and sometimes not.
+        side = float(np.linalg.norm(quads[known, 1] - quads[known, 0], axis=1).max())
+        found = self._corners(view.image, known, quads)
+        return found if expected.are_found(view.image, found, side) else None
+
+    @cached_property
+    def _cells(self) -> tuple[np.ndarray, int, int]:
+        """Patterns (n,) uint64 of the board's tags, cells along a side of them, and width of their border."""
+        last = self.first_id + self.rows * self.cols
+        return np.ascontiguousarray(self._family.codes[self.first_id : last, 0]), self._family.bits, self.border_bits
 
     def _seeds(self, tags: Tags) -> tuple[np.ndarray, np.ndarray]:
         """(known (n,) bool, quads (n, 4, 2)) of the tags on the board that agree on where it is."""
@@ -93,9 +119,7 @@ class AprilGridDetector:
         return largest_group(known, quads, self.tag_corners), quads
 
     def _corners(self, image: np.ndarray, known: np.ndarray, quads: np.ndarray) -> ImageCorners:
-        patterns = np.ascontiguousarray(self._family.codes[self.first_id : self.first_id + len(known), 0])
-        cells = (patterns, self._family.bits, self.border_bits)
-        grow(image, known, quads, self.tag_corners, self.cols, *cells, self._clear, self.squares)
+        grow(image, known, quads, self.tag_corners, self.cols, *self._cells, self._clear, self.squares)
         tags = np.flatnonzero(known)
         if self.squares:
             uv, quality = refined_crossings(image, quads[tags], np.array([self.tag_spacing, self._border, np.inf]))

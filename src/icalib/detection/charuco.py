@@ -11,8 +11,9 @@ from icalib.detection.consistency import largest_group
 from icalib.detection.corners import ImageCorners, no_corners
 from icalib.detection.decoding import mapped
 from icalib.detection.families import Family, tag_family
-from icalib.detection.growth import fit_homography
+from icalib.detection.growth import fit_homography, markers_there
 from icalib.detection.markers import all_tags
+from icalib.detection.prediction import Expected, expected_nodes
 from icalib.detection.quads import View
 from icalib.detection.squares import square_corners
 from icalib.errors import RecordingError
@@ -78,6 +79,24 @@ class CharucoDetector:
         expected = self._expected(self.tag_corners[known], quads[known])
         return square_corners(view.image, expected, self._dark, 0.5 * (1.0 - self.marker_ratio))
 
+    def find_near(self, view: View, expected: Expected) -> ImageCorners | None:
+        """As `find`, from where corners are expected; None where some that should be in the image are not there, or not
+        half of the markers."""
+        nodes = self._nodes(expected)
+        found = square_corners(view.image, nodes, self._dark, 0.5 * (1.0 - self.marker_ratio))
+        if not len(found.point) or not expected.are_found(view.image, found):
+            return None
+        quads = _in_squares(self._nodes(Expected(found.point, found.uv)), self.tag_corners)
+        inside = ((quads > 0.0) & (quads < np.array(view.image.shape[::-1]) - 1.0)).all(axis=(1, 2))
+        patterns = np.ascontiguousarray(self._family.codes[: len(quads), 0])
+        there = int(markers_there(view.image, quads[inside], patterns[inside], self._family.bits, 1).sum())
+        return found if there >= max(_LEAST_MARKERS, 0.5 * inside.sum()) else None
+
+    def _nodes(self, corners: Expected) -> np.ndarray:
+        """(rows + 1, cols + 1, 2) px: the squares' corners, where the inner ones place them."""
+        at = np.stack(np.divmod(corners.point, self.cols - 1), axis=1) + 1
+        return expected_nodes(at, corners.uv, self.rows + 1, self.cols + 1)
+
     def misfit(self, view: View) -> float:
         """How far the markers' corners are from where one homography puts them, over the markers' size: the median over
         the image, NaN where too few are seen to tell."""
@@ -128,3 +147,13 @@ def charuco_tags(dark: np.ndarray, marker_ratio: float) -> np.ndarray:
     margin = 0.5 * (1.0 - marker_ratio)
     unit = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
     return np.stack([col, row], axis=1)[:, None, :] + margin + marker_ratio * unit
+
+
+def _in_squares(nodes: np.ndarray, markers: np.ndarray) -> np.ndarray:
+    """(n, 4, 2) px: the markers (n, 4, 2), in squares, between the nodes (rows + 1, cols + 1, 2) px of the board."""
+    col, row = np.floor(markers.mean(axis=1)).astype(np.int64).T
+    s, t = (markers - np.stack([col, row], axis=1)[:, None, :]).transpose(2, 0, 1)[..., None]
+    a, b, c, d = (
+        x[:, None, :] for x in (nodes[row, col], nodes[row, col + 1], nodes[row + 1, col + 1], nodes[row + 1, col])
+    )
+    return (1.0 - t) * ((1.0 - s) * a + s * b) + t * ((1.0 - s) * d + s * c)

@@ -9,6 +9,7 @@ import numpy as np
 
 from icalib.detection.corners import INCONSISTENT, ImageCorners, no_corners
 from icalib.detection.crossings import goes_on, in_rows
+from icalib.detection.prediction import Expected, expected_nodes
 from icalib.detection.quads import View
 from icalib.detection.squares import square_corners
 from icalib.errors import RecordingError
@@ -52,6 +53,13 @@ class CheckerboardDetector:
             if self._is_whole(found):
                 return found
         return no_corners()
+
+    def find_near(self, view: View, expected: Expected) -> ImageCorners | None:
+        """As `find`, from where corners are expected; None where some that should be in the image are not there. What
+        moved on by two squares looks the same but at its border."""
+        at = np.stack(np.divmod(expected.point, self.cols), axis=1)
+        found = self._corners(view.image, expected_nodes(at, expected.uv, self.rows, self.cols))
+        return found if self._is_whole(found) and expected.are_found(view.image, found) else None
 
     def _is_whole(self, found: ImageCorners) -> bool:
         """Whether enough corners are where a board has them, on each of its four sides, too."""

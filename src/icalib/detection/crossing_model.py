@@ -7,12 +7,12 @@ alone would not do: where the window is not much wider than the blur, they point
 
 from __future__ import annotations
 
-from math import atan2, cos, erf, exp, hypot, pi, sin, sqrt
+from math import atan2, cos, hypot, sin, sqrt
 
 import numpy as np
 from numba import njit
 
-from icalib.detection.edge_model import solve_small
+from icalib.detection.edge_model import error_function, normal_equations, row_product, solve_small
 from icalib.detection.saddles import LEAST_SINE, MARGIN_BLURS, room_for, window_bounds, window_frame
 from icalib.measurements import EDGE
 
@@ -50,18 +50,17 @@ def fit_crossing(image, u, v, ea, eb, surroundings, blur_a, blur_b, most_move):
     contrast = 0.5 * (grey.max() - grey.min())
     p = np.array([u, v, atan2(ea[1], ea[0]), atan2(eb[1], eb[0]), grey.mean(), contrast])
     turn = 1.0 if ea[0] * eb[1] - ea[1] * eb[0] > 0.0 else -1.0
-    A = np.zeros((_SIZE, _SIZE))
+    A, rows = np.zeros((_SIZE, _SIZE)), np.empty((_SIZE + 3, len(grey)))
     for _ in range(_ITERATIONS):
-        b = _accumulate(A, p, xs, ys, grey, turn, blur_a, blur_b)
-        step = solve_small(A, b)
+        _fill_rows(rows, p, xs, ys, grey, turn, blur_a, blur_b)
+        step = solve_small(A, normal_equations(A, rows, rows[_SIZE]))
         largest = hypot(step[0], step[1])
         scale = min(1.0, _MOST_STEP_PX / max(largest, 1e-12))
         p += scale * step
         if hypot(p[0] - u, p[1] - v) > most_move or p[5] <= 0.0:
             return u, v, np.nan, 0.0, edges
         if largest < _CONVERGED_PX:
-            gain = _gain(A, p, xs, ys, turn, blur_a, blur_b)
-            _fill_edges(edges, ea, sa, eb, sb, gain)
+            _fill_edges(edges, ea, sa, eb, sb, _gain(A, rows))
             return p[0], p[1], _sigma(A), 2.0 * p[5], edges
     return u, v, np.nan, 0.0, edges
 
@@ -85,69 +84,41 @@ def _window(image, u, v, ea, eb, sa, sb, surroundings, margin):
 
 
 @njit(cache=True, nogil=True)
-def _slopes(contrast, trig, x, y, turn, blur_a, blur_b):
-    """(Ea, Eb, da, db) at (x, y) from the point: the two steps, -1 to 1, and the grey's slope by the distance from
-    either edge: from the one along ea towards eb, and from the one along eb towards ea. trig (4,): cosine and sine of
-    either edge's angle."""
-    la, lb = turn * (trig[0] * y - trig[1] * x), turn * (trig[3] * x - trig[2] * y)
-    za, zb = la / (sqrt(2.0) * blur_a), lb / (sqrt(2.0) * blur_b)
-    Ea, Eb = erf(za), erf(zb)
-    da = -contrast * Eb * 2.0 / sqrt(pi) * exp(-za * za) / (sqrt(2.0) * blur_a)
-    db = -contrast * Ea * 2.0 / sqrt(pi) * exp(-zb * zb) / (sqrt(2.0) * blur_b)
-    return Ea, Eb, da, db
-
-
-@njit(cache=True, nogil=True)
-def _jacobian(J, trig, x, y, turn, Ea, Eb, da, db):
-    """Fills J (6,): the grey's derivative by the parameters."""
-    cos_a, sin_a, cos_b, sin_b = trig
-    J[0] = turn * (da * sin_a - db * sin_b)
-    J[1] = turn * (db * cos_b - da * cos_a)
-    J[2] = -turn * da * (sin_a * y + cos_a * x)
-    J[3] = turn * db * (cos_b * x + sin_b * y)
-    J[4], J[5] = 1.0, -Ea * Eb
-
-
-@njit(cache=True, nogil=True)
-def _accumulate(A, p, xs, ys, grey, turn, blur_a, blur_b):
-    """Normal equations of the model at p: A is filled, the right side is returned."""
-    A[:] = 0.0
-    b, J = np.zeros(_SIZE), np.empty(_SIZE)
-    trig = cos(p[2]), sin(p[2]), cos(p[3]), sin(p[3])
-    for i in range(len(xs)):
-        x, y = xs[i] - p[0], ys[i] - p[1]
-        Ea, Eb, da, db = _slopes(p[5], trig, x, y, turn, blur_a, blur_b)
-        _jacobian(J, trig, x, y, turn, Ea, Eb, da, db)
-        error = grey[i] - p[4] + p[5] * Ea * Eb
-        for j in range(_SIZE):
-            b[j] += J[j] * error
-            for k in range(j + 1):
-                A[j, k] += J[j] * J[k]
-    for j in range(_SIZE):
-        A[j, j] *= 1.0 + 1e-9
-    return b
-
-
-@njit(cache=True, nogil=True)
-def _gain(A, p, xs, ys, turn, blur_a, blur_b):
-    """(2, 2) px^2: by how much the point moves where the curvature [1 / px] of the edge along ea, or eb, is known.
+def _fill_rows(rows, p, xs, ys, grey, turn, blur_a, blur_b):
+    """rows (9, n): the grey's derivatives by the parameters p (6,), its error, and by how much it changes with the
+    curvature [1 / px] of the edge along ea and of that along eb.
 
     An edge with curvature c lies off its tangent by c (t^2 + blur^2) / 2 at a distance t from the corner: blur moves it
-    towards its centre. The fit takes that for a change of grey, and answers as normal equations do.
+    towards its centre.
     """
-    trig = cos(p[2]), sin(p[2]), cos(p[3]), sin(p[3])
-    by, J, gain = np.zeros((2, _SIZE)), np.empty(_SIZE), np.empty((2, 2))
+    cos_a, sin_a, cos_b, sin_b = cos(p[2]), sin(p[2]), cos(p[3]), sin(p[3])
+    scale_a, scale_b = 1.0 / (sqrt(2.0) * blur_a), 1.0 / (sqrt(2.0) * blur_b)
     for i in range(len(xs)):
         x, y = xs[i] - p[0], ys[i] - p[1]
-        Ea, Eb, da, db = _slopes(p[5], trig, x, y, turn, blur_a, blur_b)
-        _jacobian(J, trig, x, y, turn, Ea, Eb, da, db)
-        ta, tb = trig[0] * x + trig[1] * y, trig[2] * x + trig[3] * y
-        for j in range(_SIZE):
-            by[0, j] -= J[j] * 0.5 * da * (ta * ta + blur_a * blur_a)
-            by[1, j] -= J[j] * 0.5 * db * (tb * tb + blur_b * blur_b)
-    # The distance la grows against the normal to the left of ea, lb along that of eb: see `_slopes`.
+        # Distance from the edge along ea towards eb, and from the one along eb towards ea; ways along both.
+        la, lb = turn * (cos_a * y - sin_a * x), turn * (sin_b * x - cos_b * y)
+        ta, tb = cos_a * x + sin_a * y, cos_b * x + sin_b * y
+        Ea, da = error_function(la * scale_a)
+        Eb, db = error_function(lb * scale_b)
+        da, db = -p[5] * Eb * da * scale_a, -p[5] * Ea * db * scale_b
+        rows[0, i], rows[1, i] = turn * (da * sin_a - db * sin_b), turn * (db * cos_b - da * cos_a)
+        rows[2, i], rows[3, i] = -turn * da * ta, turn * db * tb
+        rows[4, i], rows[5, i] = 1.0, -Ea * Eb
+        rows[6, i] = grey[i] - p[4] + p[5] * Ea * Eb
+        # The curvature turns to the left, as la grows with `turn` 1, and lb with -1.
+        rows[7, i] = turn * 0.5 * da * (ta * ta + blur_a * blur_a)
+        rows[8, i] = -turn * 0.5 * db * (tb * tb + blur_b * blur_b)
+
+
+@njit(cache=True, nogil=True)
+def _gain(A, rows):
+    """(2, 2) px^2: by how much the point moves where the curvature [1 / px] of the edge along ea, or eb, is known: the
+    fit takes a curvature for a change of grey, and answers as normal equations do."""
+    gain, by = np.empty((2, 2)), np.empty(_SIZE)
     for k in range(2):
-        gain[k] = (turn if k == 0 else -turn) * solve_small(A, by[k])[:2]
+        for j in range(_SIZE):
+            by[j] = -row_product(rows[j], rows[_SIZE + 1 + k])
+        gain[k] = solve_small(A, by)[:2]
     return gain
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from icalib.detection.checkerboard import CheckerboardDetector
 from icalib.detection.circles import CirclesDetector
 from icalib.detection.corners import ImageCorners, no_corners
 from icalib.detection.markers import MarkerDetector
+from icalib.detection.prediction import Expected, expected_next
 from icalib.detection.quads import View
 from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles, Markers, Scene, Target
@@ -24,20 +26,44 @@ _SAME_PX = 3.0  # corners this close are one
 class Detector(Protocol):
     """Finds one target in images."""
 
-    def detect(self, image: np.ndarray) -> ImageCorners:
-        """Corners in the image (h, w) uint8, indices into the target's points."""
+    def detect(self, image: np.ndarray, before: Sequence[ImageCorners] = ()) -> ImageCorners:
+        """Corners in the image (h, w) uint8, indices into the target's points; faster where the last images
+        `before` show how the target moves."""
         ...
 
 
-class _Finder(Detector, Protocol):
+class _Finder(Protocol):
     def find(self, view: View) -> ImageCorners:
-        """As `detect`."""
+        """Corners in the whole image, indices into the target's points."""
+        ...
+
+
+@runtime_checkable
+class _Follower(_Finder, Protocol):
+    def find_near(self, view: View, expected: Expected) -> ImageCorners | None:
+        """As `find`, where corners are expected; None where the whole image is to be searched."""
         ...
 
 
 def detector_of(target: Target) -> Detector:
     """The detector that finds `target`. Raises RigError for one that none finds in images."""
-    return _finder_of(target)
+    return _Detector(_finder_of(target))
+
+
+@dataclass(frozen=True, eq=False)
+class _Detector:
+    """Looks where motion leads `finder` to expect the target, and in the whole image where it is not there."""
+
+    finder: _Finder
+
+    def detect(self, image: np.ndarray, before: Sequence[ImageCorners] = ()) -> ImageCorners:
+        view = View(image)
+        expected = expected_next(before) if isinstance(self.finder, _Follower) else None
+        if expected is not None and isinstance(self.finder, _Follower):
+            found = self.finder.find_near(view, expected)
+            if found is not None:
+                return found
+        return self.finder.find(view)
 
 
 def _finder_of(target: Target) -> _Finder:
@@ -77,9 +103,6 @@ class _SceneDetector:
     first: np.ndarray
     tagged: tuple[bool, ...]  # whether tags tell a member from others
 
-    def detect(self, image: np.ndarray) -> ImageCorners:
-        return self.find(View(image))
-
     def find(self, view: View) -> ImageCorners:
         found = [member.find(view) for member in self.members]
         of_tags = np.concatenate([np.zeros((0, 2))] + [f.uv for f, t in zip(found, self.tagged, strict=True) if t])
@@ -93,13 +116,13 @@ class _SceneDetector:
 class _Inverted:
     """Finds with `detector` what is white on black."""
 
-    detector: _Finder
-
-    def detect(self, image: np.ndarray) -> ImageCorners:
-        return self.find(View(image))
+    detector: CharucoDetector | _Renumbered
 
     def find(self, view: View) -> ImageCorners:
         return self.detector.find(View(255 - view.image))
+
+    def find_near(self, view: View, expected: Expected) -> ImageCorners | None:
+        return self.detector.find_near(View(255 - view.image), expected)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,11 +132,14 @@ class _Renumbered:
     detector: CheckerboardDetector
     number: np.ndarray
 
-    def detect(self, image: np.ndarray) -> ImageCorners:
-        return self.find(View(image))
-
     def find(self, view: View) -> ImageCorners:
-        found = self.detector.find(view)
+        return self._renumbered(self.detector.find(view))
+
+    def find_near(self, view: View, expected: Expected) -> ImageCorners | None:
+        found = self.detector.find_near(view, Expected(np.argsort(self.number)[expected.point], expected.uv))
+        return None if found is None else self._renumbered(found)
+
+    def _renumbered(self, found: ImageCorners) -> ImageCorners:
         point = self.number[found.point]
         order = np.argsort(point)
         fields = {f.name: getattr(found, f.name)[order] for f in dataclasses.fields(found)}

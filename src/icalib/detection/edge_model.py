@@ -6,7 +6,7 @@ ends is symmetric under blur, so its place is not biased, and neither is the poi
 
 from __future__ import annotations
 
-from math import erf, exp, hypot, pi, sqrt
+from math import erf, hypot, pi, sqrt
 
 import numpy as np
 from numba import njit
@@ -19,7 +19,22 @@ END_PX = 3.0  # left out at both ends of a side, where the corner's blur bends t
 _MOST_END = 0.25  # of the side
 _CURVED_FROM_PX = 24.0  # sides as long as that may be bent by the lens
 _BLUR_RANGE = (0.35, 6.0)
+_PER_UNIT = 128  # entries of the table of the error function: interpolated linearly, it is right to 2e-5
+_TABLE = np.array([(erf(k / _PER_UNIT), 2.0 / sqrt(pi) * np.exp(-((k / _PER_UNIT) ** 2))) for k in range(514)])
 _LEAST_SINE = 0.17  # of the angle between two sides: 10 degrees
+
+
+@njit(cache=True, nogil=True, inline="always")
+def error_function(z):
+    """(erf(z), its derivative), from a table: most of the time of a fit goes into them."""
+    at = abs(z) * _PER_UNIT
+    if at >= 512.0:
+        return (1.0 if z > 0.0 else -1.0), 0.0
+    i = int(at)
+    f = at - i
+    value = _TABLE[i, 0] + f * (_TABLE[i + 1, 0] - _TABLE[i, 0])
+    slope = _TABLE[i, 1] + f * (_TABLE[i + 1, 1] - _TABLE[i, 1])
+    return (value if z > 0.0 else -value), slope
 
 
 @njit(cache=True, nogil=True)
@@ -61,18 +76,38 @@ def fit_step(image, u0, v0, u1, v1, end, half):
     noise of one grey level where the bend is known, and the change of its offset where a bend that differs by 1 px from
     the fitted one is known. NaN where there is no edge; contrast [grey levels] is zero there.
     """
-    # Parameters: offset, slope, blur, low, high and, for a long side, bend.
-    p, ends = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), np.full((2, 2), np.nan)
+    p, contrast, rows = _fitted_step(image, u0, v0, u1, v1, end, half)
+    if contrast == 0.0:
+        return np.zeros(3), p[2], 0.0, np.full((2, 2), np.nan)
+    return np.array([p[0], p[1], p[5]]), p[2], contrast, _known_bend(rows)
+
+
+@njit(cache=True, nogil=True)
+def step_blur(image, u0, v0, u1, v1, end, half):
+    """(blur, contrast) of `fit_step`."""
+    p, contrast, _ = _fitted_step(image, u0, v0, u1, v1, end, half)
+    return p[2], contrast
+
+
+@njit(cache=True, nogil=True)
+def _fitted_step(image, u0, v0, u1, v1, end, half):
+    """(p (6,), contrast, rows (7, n)) of `fit_step`: parameters and, where they were fitted, the rows of the fit.
+
+    Parameters: offset, slope, blur, low, high and, for a long side, bend.
+    """
+    p = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
     length = hypot(u1 - u0, v1 - v0)
     size = 6 if length >= _CURVED_FROM_PX else 5
     way, off, grey = _strip(image, u0, v0, u1, v1, 0.5 * length - min(end, _MOST_END * length), half)
     dark, bright = off < -0.5 * half, off > 0.5 * half
+    rows = np.empty((7, len(grey)))
     if len(grey) < 2 * size or not dark.any() or not bright.any():
-        return np.zeros(3), p[2], 0.0, ends
+        return p, 0.0, rows
     p[3], p[4] = grey[dark].mean(), grey[bright].mean()
     A = np.zeros((size, size))
     for _ in range(_ITERATIONS):
-        step = solve_small(A, _accumulate(A, p, way, off, grey))
+        _fill_rows(rows, p, way, off, grey)
+        step = solve_small(A, normal_equations(A, rows, rows[6]))
         largest = max(abs(step[0]), abs(step[1]))
         scale = min(1.0, 1.0 / max(largest, 1e-12))
         blur = p[2] + scale * min(max(step[2], -0.5 * p[2]), p[2])
@@ -80,23 +115,25 @@ def fit_step(image, u0, v0, u1, v1, end, half):
             p[k] += step[k] if k == 3 or k == 4 else scale * step[k]
         p[2] = min(max(blur, _BLUR_RANGE[0]), _BLUR_RANGE[1])
         if abs(p[0]) + abs(p[1]) + abs(p[5]) > half + 1.0 or p[4] <= p[3]:
-            return np.zeros(3), p[2], 0.0, ends
+            return p, 0.0, rows
         if largest < _CONVERGED_PX and abs(step[2]) < 0.01:
             break
-    return np.array([p[0], p[1], p[5]]), p[2], p[4] - p[3], _known_bend(p, way, off, grey)
+    return p, p[4] - p[3], rows
 
 
 @njit(cache=True, nogil=True)
-def _known_bend(p, way, off, grey):
-    """`ends` of `fit_step`: with the bend fixed, the other parameters follow it as -A^-1 a does."""
-    A, ends = np.zeros((6, 6)), np.empty((2, 2))
-    _accumulate(A, p, way, off, grey)
+def _known_bend(rows):
+    """`ends` of `fit_step` from the rows of its fit: with the bend fixed, the other parameters follow it as -A^-1 a."""
+    A, a, ends = np.zeros((5, 5)), np.empty(5), np.empty((2, 2))
+    normal_equations(A, rows, rows[6])
+    for j in range(5):
+        a[j] = row_product(rows[j], rows[5])
     for k in range(2):
         at_end = np.zeros(5)
         at_end[0], at_end[1] = 1.0, 2.0 * k - 1.0
-        by_rows = solve_small(A[:5, :5], at_end)
+        by_rows = solve_small(A, at_end)
         ends[k, 0] = by_rows[0] + at_end[1] * by_rows[1]
-        ends[k, 1] = 1.0 - (by_rows * A[5, :5]).sum()
+        ends[k, 1] = 1.0 - (by_rows * a).sum()
     return ends
 
 
@@ -125,23 +162,37 @@ def _strip(image, u0, v0, u1, v1, reach, half):
 
 
 @njit(cache=True, nogil=True)
-def _accumulate(A, p, way, off, grey):
-    """Normal equations of the step at its parameters p (6,): A (5, 5) or (6, 6) is filled, the right side returned."""
-    size, contrast, blur = len(A), p[4] - p[3], p[2]
-    b, J = np.zeros(size), np.empty(6)
-    A[:] = 0.0
+def _fill_rows(rows, p, way, off, grey):
+    """rows (7, n): the grey's derivatives by the six parameters of the step at p (6,), and its error."""
+    contrast, blur = p[4] - p[3], p[2]
     for i in range(len(grey)):
         z = (off[i] - p[0] - way[i] * (p[1] + way[i] * p[5])) / blur
-        share = 0.5 * (1.0 + erf(z / sqrt(2.0)))
-        slope = contrast * exp(-0.5 * z * z) / (sqrt(2.0 * pi) * blur)
-        J[0], J[1], J[2] = -slope, -slope * way[i], -slope * z
-        J[3], J[4], J[5] = 1.0 - share, share, -slope * way[i] * way[i]
-        error = grey[i] - p[3] - contrast * share
-        for j in range(size):
-            b[j] += J[j] * error
-            for k in range(j + 1):
-                A[j, k] += J[j] * J[k]
-    for j in range(size):
+        value, by_z = error_function(z / sqrt(2.0))
+        share = 0.5 * (1.0 + value)
+        slope = contrast * by_z / (2.0 * sqrt(2.0) * blur)
+        rows[0, i], rows[1, i], rows[2, i] = -slope, -slope * way[i], -slope * z
+        rows[3, i], rows[4, i], rows[5, i] = 1.0 - share, share, -slope * way[i] * way[i]
+        rows[6, i] = grey[i] - p[3] - contrast * share
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def row_product(a, b):
+    """a . b of (n,) each. The sum may be reordered: it is vectorised."""
+    s = 0.0
+    for i in range(len(a)):
+        s += a[i] * b[i]
+    return s
+
+
+@njit(cache=True, nogil=True)
+def normal_equations(A, rows, error):
+    """A (m, m) is filled from the first m of the rows (., n), the right side (m,) for the error (n,) returned."""
+    m = len(A)
+    b = np.empty(m)
+    for j in range(m):
+        b[j] = row_product(rows[j], error)
+        for k in range(j + 1):
+            A[j, k] = row_product(rows[j], rows[k])
         A[j, j] *= 1.0 + 1e-9
     return b
 

@@ -36,7 +36,7 @@ def fit_homography(xy, uv, n):
             J[6], J[7] = -x * value, -y * value
             for p in range(8):
                 b[p] += J[p] * value
-                for q in range(8):
+                for q in range(p + 1):
                     A[p, q] += J[p] * J[q]
     h = solve_small(A, b)
     H = np.array([[h[0], h[1], h[2]], [h[3], h[4], h[5]], [h[6], h[7], 1.0]])
@@ -87,16 +87,21 @@ def side_vectors(quad, k):
 
 @njit(cache=True, nogil=True)
 def _fitted(image, quad, clear, crossing):
-    """(number of corners found, quad) near a predicted quad."""
+    """(number of corners found, quad) near a predicted quad. Corners that are not found move on with the others."""
     side = shortest_side(quad)
     if crossing:
         most, corners, n_found = _MOST_MOVE * side + 1.0, quad.copy(), 0
+        there, moved = np.zeros(4, dtype=np.bool_), np.zeros(2)
         for k in range(4):
             ea, eb = side_vectors(quad, k)
             found, u, v = find_saddle(image, quad[k, 0], quad[k, 1], ea, eb, clear, _USUAL_BLUR, most)
             if found and crossing_contrast(image, u, v, ea, eb, clear, _USUAL_BLUR) >= LEAST_CONTRAST:
-                corners[k, 0], corners[k, 1] = u, v
+                corners[k, 0], corners[k, 1], there[k] = u, v, True
+                moved += corners[k] - quad[k]
                 n_found += 1
+        for k in range(4):
+            if n_found > 0 and not there[k]:
+                corners[k] += moved / n_found
         return n_found, corners
     fits, corners = fit_quad(image, quad, min(max(1.5, 0.1 * side), 6.0), _LEAST_RISE)
     return 4 if fits else 0, corners
@@ -114,6 +119,30 @@ def _is_tag(image, quad, pattern, bits, border):
     seen = seen_cells(grey, border)
     n_seen = popcount(seen)
     return n_seen >= _LEAST_SEEN and wrong + popcount((code ^ pattern) & seen) <= _WRONG_CELLS * n_seen
+
+
+@njit(cache=True, nogil=True)
+def confirm(image, known, quads, patterns, bits, border, clear, crossing):
+    """(n,) bool: which of the `known` tags are where their quads (n, 4, 2) px, right to some pixels, expect them.
+
+    The quads of these are moved to what was found. The other arguments are those of `grow`.
+    """
+    there = np.zeros(len(known), dtype=np.bool_)
+    for tag in range(len(known)):
+        if known[tag] and shortest_side(quads[tag]) >= LEAST_SIDE_PX:
+            found, quad = _fitted(image, quads[tag], clear, crossing)
+            if found >= 2 and _is_tag(image, quad, patterns[tag], bits, border):
+                quads[tag], there[tag] = quad, True
+    return there
+
+
+@njit(cache=True, nogil=True)
+def markers_there(image, quads, patterns, bits, border):
+    """(n,) bool: at which of the quads (n, 4, 2) px the image shows the pattern (n,) uint64."""
+    there = np.zeros(len(quads), dtype=np.bool_)
+    for i in range(len(quads)):
+        there[i] = _is_tag(image, quads[i], patterns[i], bits, border)
+    return there
 
 
 @njit(cache=True, nogil=True)

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from icalib.detection.crossing_model import LEAST_WINDOW_PX, fit_crossing
-from icalib.detection.edge_model import END_PX, fit_corners, fit_step
+from icalib.detection.edge_model import END_PX, fit_corners, step_blur
 from icalib.detection.growth import side_vectors
 from icalib.detection.saddles import MARGIN_BLURS
 from icalib.detection.tags import LEAST_CONTRAST, shortest_side
@@ -46,7 +46,7 @@ def _measured_blur(image, quad, k, least):
     most = max(_BLUR_STRIP[0], _BLUR_STRIP[1] * shortest_side(quad))
     for m in (k, k + 2):
         u0, v0, u1, v1 = quad[m, 0], quad[m, 1], quad[(m + 1) % 4, 0], quad[(m + 1) % 4, 1]
-        _, blur, contrast, _ = fit_step(image, u0, v0, u1, v1, END_PX, _strip(least, _USUAL_BLUR, most))
+        blur, contrast = step_blur(image, u0, v0, u1, v1, END_PX, _strip(least, _USUAL_BLUR, most))
         if contrast > 0.0:
             return blur
     return np.nan

@@ -10,12 +10,15 @@ from numba import njit
 from icalib.detection.consistency import consistent_corners
 from icalib.detection.corners import ImageCorners, judged, no_corners
 from icalib.detection.growth import LEAST_SIDE_PX, side_vectors
+from icalib.detection.prediction import expected_nodes
 from icalib.detection.refinement import refined_crossings
 from icalib.detection.saddles import crossing_contrast, find_saddle
 from icalib.detection.tags import LEAST_CONTRAST, shortest_side
 
 _MOST_MOVE = 0.15  # of a side: how far a corner may lie from where it is expected
 _CLEAR = 0.5  # squares, from a corner to the nearest other feature: the next corner is as far from the same place
+_LEAST_CORNERS = 24  # found as corners of dark squares, two for most corners, that place the rest of the board
+_LEAST_CLEAR_PX = 3.0  # to the nearest other feature; nearer ones leave windows of the least size, whatever the sides
 _USUAL_BLUR = 0.7  # px, before it is measured
 
 
@@ -30,17 +33,26 @@ def square_corners(image: np.ndarray, expected: np.ndarray, dark: np.ndarray, in
     uv, sigma, quality = np.zeros((rows + 1, cols + 1, 2)), np.full((rows + 1, cols + 1), np.nan), {}
     row, col = np.nonzero(dark)
     at = np.stack([[row, col], [row, col + 1], [row + 1, col + 1], [row + 1, col]], axis=0).transpose(2, 0, 1)
-    quads = expected[at[:, :, 0], at[:, :, 1]]
-    usable = np.array([shortest_side(quad) >= LEAST_SIDE_PX for quad in quads], dtype=bool)
-    at, quads = at[usable], quads[usable]
     inner = ((at >= 1) & (at < [rows, cols])).all(axis=2)
-    quads, found = _roughly(image, quads, inner, min(inset, _CLEAR))
+    clear = min(inset, _CLEAR)
+    quads, found = _roughly(image, expected[at[:, :, 0], at[:, :, 1]], inner, clear)
+    if found.sum() >= _LEAST_CORNERS and clear * _usual_side(quads) >= _LEAST_CLEAR_PX:
+        # Once more from where the corners are, so that nothing depends on where they were expected.
+        expected = expected_nodes(at[found], quads[found], rows + 1, cols + 1)
+        quads, found = _roughly(image, expected[at[:, :, 0], at[:, :, 1]], inner, clear)
+    usable = np.array([shortest_side(quad) >= LEAST_SIDE_PX for quad in quads], dtype=bool)
+    at, quads, found = at[usable], quads[usable], found[usable]
     fine, measures = refined_crossings(image, quads, np.array([_CLEAR, np.inf, inset]))
     for i, k in zip(*np.nonzero(found & np.isfinite(measures[0])), strict=True):
         where = tuple(at[i, k])
         if not measures[0, i, k] >= sigma[where]:
             uv[where], sigma[where], quality[where] = fine[i, k], measures[0, i, k], measures[:, i, k]
     return _judged(uv, quality, cols, image.shape)
+
+
+def _usual_side(quads: np.ndarray) -> float:
+    """The median side [px] of the quads (n, 4, 2)."""
+    return float(np.median(np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=2)))
 
 
 def _judged(uv: np.ndarray, quality: dict, cols: int, shape: tuple[int, ...]) -> ImageCorners:
@@ -61,7 +73,7 @@ def _roughly(image, quads, inner, clear):
     out, found = quads.copy(), np.zeros(inner.shape, dtype=np.bool_)
     for i in range(len(quads)):
         for k in range(4):
-            if not inner[i, k]:
+            if not inner[i, k] or shortest_side(quads[i]) < LEAST_SIDE_PX:
                 continue
             ea, eb = side_vectors(quads[i], k)
             most = _MOST_MOVE * min(hypot(ea[0], ea[1]), hypot(eb[0], eb[1])) + 1.0

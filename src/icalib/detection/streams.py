@@ -20,6 +20,7 @@ from icalib.detection.cache import keep_corners, load_corners, stream_key
 from icalib.detection.corners import ImageCorners, corner_stream, packed
 from icalib.detection.detectors import Detector, detector_of
 from icalib.detection.diagnosis import what_is_seen, with_other_border, with_other_layout
+from icalib.detection.prediction import IMAGES
 from icalib.detection.sightings import parts_of, sightings, without_rare_tags
 from icalib.detection.turns import continuous
 from icalib.errors import RecordingError
@@ -32,7 +33,10 @@ from icalib.rig import Camera
 DIAGNOSED = 5  # images in which tags are looked for that are not the target's
 # Of a target's points, and of free tags' corners, an image on average: with fewer the border may be another one.
 POOR_SHARE, POOR_CORNERS = 0.5, 8
-PER_WORKER = 4  # images in memory for each thread
+# Images that a thread searches in turn, each where the ones before lead to expect the target. The first two are
+# searched wholly: a tag that appears apart from the others is missed for this long at most. Fewer of large images,
+# which wait in memory. Turns do not depend on the number of threads, and so neither does what is found.
+IN_TURN, BYTES_IN_TURN = 24, 32 << 20
 PACKED = 256  # images whose corners are put together
 Progress = Callable[[float], None]  # the share of the images that is done, 0 to 1
 
@@ -144,24 +148,21 @@ def _search(
     images: list[ImageCorners] = []
     damaged = ""
     with _one_thread_in_opencv(), _pool() as pool:
-        waiting: deque[tuple[int, Future[ImageCorners]]] = deque()
+        waiting: deque[Future[tuple[list[int], list[ImageCorners], str]]] = deque()
 
         def take() -> str:
-            stamp, future = waiting.popleft()
-            try:
-                found = future.result()
-            except DamagedImageError as error:
-                return str(error)
-            stamps.append(stamp)
-            images.append(found)
-            if len(images) % PACKED == 0:
-                images[-PACKED:] = packed(images[-PACKED:])
+            own, found, error = waiting.popleft().result()
+            for stamp, one in zip(own, found, strict=True):
+                stamps.append(stamp)
+                images.append(one)
+                if len(images) % PACKED == 0:
+                    images[-PACKED:] = packed(images[-PACKED:])
             done(len(images))
-            return ""
+            return error
 
-        for p in payloads:
-            waiting.append((p.stamp_ns, pool.submit(_one, p, detector)))
-            if len(waiting) > PER_WORKER * _workers():
+        for turn in _turns(payloads):
+            waiting.append(pool.submit(_in_turn, turn, detector))
+            if len(waiting) > _workers():
                 damaged = take() or damaged
         while waiting:
             damaged = take() or damaged
@@ -170,8 +171,32 @@ def _search(
     return np.array(stamps, dtype=np.int64), images
 
 
-def _one(payload: Payload, detector: Detector) -> ImageCorners:
-    return detector.detect(decode(payload))
+def _turns(payloads: Iterable[Payload]) -> Iterator[list[Payload]]:
+    """Images that are searched in turn."""
+    turn: list[Payload] = []
+    for p in payloads:
+        turn.append(p)
+        if len(turn) == IN_TURN or sum(len(one.data) for one in turn) >= BYTES_IN_TURN:
+            yield turn
+            turn = []
+    if turn:
+        yield turn
+
+
+def _in_turn(payloads: list[Payload], detector: Detector) -> tuple[list[int], list[ImageCorners], str]:
+    """Stamps and corners of those images that can be decoded, and why the last that cannot be cannot."""
+    stamps: list[int] = []
+    found: list[ImageCorners] = []
+    damaged = ""
+    for p in payloads:
+        try:
+            image = decode(p)
+        except DamagedImageError as error:
+            damaged = str(error)
+            continue
+        stamps.append(p.stamp_ns)
+        found.append(detector.detect(image, found[-IMAGES:]))
+    return stamps, found, damaged
 
 
 def _workers() -> int:

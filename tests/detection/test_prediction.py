@@ -1,0 +1,121 @@
+"""Targets are searched where the images before lead to expect them; what is found is that of a search of all."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from icalib.detection.corners import ImageCorners, no_corners
+from icalib.detection.decoding import mapped
+from icalib.detection.detectors import detector_of
+from icalib.detection.prediction import Expected, expected_next, expected_nodes
+from icalib.detection.quads import View
+from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard
+from icalib.simulation import Motion, film, handheld
+
+pytest.importorskip("cv2")
+
+TARGETS = {
+    "grid": AprilGrid(6, 6, 0.088, 0.3),
+    "plain grid": AprilGrid(5, 5, 0.1, 0.4, border_bits=2, squares=False, first_id=7),
+    "charuco": Charuco(8, 6, 0.08, 0.06, "5x5_100"),
+    "inverted charuco": Charuco(7, 5, 0.09, 0.07, "4x4_50", inverted=True),
+    "checkerboard": Checkerboard(6, 9, 0.06),
+    "checkerboard from the side": Checkerboard(7, 6, 0.06),
+}
+
+
+def corners(point, uv) -> ImageCorners:
+    n = len(point)
+    return ImageCorners(np.array(point), np.array(uv, float), np.full(n, 0.03), np.ones(n), np.zeros(n, np.int8))
+
+
+def test_corners_move_on_with_their_acceleration():
+    start = np.random.default_rng(0).uniform(50.0, 400.0, (6, 2))
+    at = [start + np.array([7.0, -3.0]) * t + np.array([-1.5, 0.5]) * t**2 for t in range(4)]
+    points = [[2, 3, 5, 6, 8, 9], [1, 2, 3, 5, 6, 8], [2, 3, 5, 6, 8, 20]]
+    # Point 20 is new; it stands where point 9 stood, nearest to point 8.
+    rows = [range(6), [0, 0, 1, 2, 3, 4], [0, 1, 2, 3, 4, 4]]
+    images = [corners(p, at[t][list(r)]) for t, (p, r) in enumerate(zip(points, rows, strict=True))]
+    expected = expected_next(images)
+    assert expected is not None
+    np.testing.assert_array_equal(expected.point, points[2])
+    np.testing.assert_allclose(expected.uv, at[3][list(rows[2])])
+    # Two images show their speed alone.
+    expected = expected_next(images[1:])
+    assert expected is not None
+    np.testing.assert_allclose(expected.uv[:5], (2.0 * at[2] - at[1])[:5])
+    # So do three, of which the first shows nothing in common.
+    expected = expected_next([corners([30, 31], start[:2]), *images[1:]])
+    assert expected is not None
+    np.testing.assert_allclose(expected.uv[:5], (2.0 * at[2] - at[1])[:5])
+
+
+@pytest.mark.parametrize("n", [0, 1])
+def test_without_two_images_that_show_the_target_nothing_is_expected(n):
+    one = corners(range(5), np.zeros((5, 2)))
+    assert expected_next([one] * n) is None
+    assert expected_next([one, no_corners()]) is None
+    assert expected_next([no_corners(), one]) is None
+    assert expected_next([one, one, corners([7, 8, 9, 10], np.zeros((4, 2)))]) is None
+
+
+def test_nodes_that_were_not_seen_lie_on_the_board():
+    H = np.array([[30.0, 4.0, 100.0], [-3.0, 28.0, 80.0], [0.01, -0.02, 1.0]])
+    every = np.stack(np.indices((5, 7)), axis=-1).reshape(-1, 2)
+    true = np.array([mapped(H, float(row), float(col)) for row, col in every])
+    seen = ((every >= 1) & (every < [4, 6])).all(axis=1) & (np.arange(35) % 4 > 0)
+    np.testing.assert_allclose(expected_nodes(every[seen], true[seen], 5, 7).reshape(-1, 2), true, atol=1e-6)
+
+
+def filmed(target, count):
+    base = handheld(count / 20.0 + 0.3)
+    motion = Motion(rotation_scale=0.5, translation_scale=0.5, seed=1)
+    run = film(replace(base, target=target, motion=motion, cameras=(base.cameras[0],)), 0)
+    return [shot.pixels for shot in run.shots()][:count]
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_what_is_found_near_is_what_a_search_of_the_whole_image_finds(name, monkeypatch):
+    detector, images = detector_of(TARGETS[name]), filmed(TARGETS[name], 7)
+    whole = [detector.detect(image) for image in images]
+    searched, plain = [], type(detector.finder).find
+    monkeypatch.setattr(type(detector.finder), "find", lambda self, view: searched.append(view) or plain(self, view))
+    found: list[ImageCorners] = []
+    for image in images:
+        found.append(detector.detect(image, found[-3:]))
+    # The third image may be found by speed alone, and from there on the acceleration is known.
+    assert 2 <= len(searched) <= 3
+    for a, b in zip(whole, found, strict=True):
+        assert len(a.point) > 20
+        common, i, j = np.intersect1d(a.point[a.kept], b.point[b.kept], return_indices=True)
+        assert len(common) >= a.kept.sum() - 1
+        apart = np.abs(a.uv[a.kept][i] - b.uv[b.kept][j])
+        assert np.sqrt((apart**2).mean()) < 2e-4 and np.quantile(apart, 0.99) < 1e-3
+
+
+@pytest.mark.parametrize("name", ["grid", "charuco", "checkerboard"])
+def test_a_target_that_jumped_is_searched_for(name):
+    detector, images = detector_of(TARGETS[name]), filmed(TARGETS[name], 3)
+    before = [detector.detect(image) for image in images[:2]]
+    for moved in (np.roll(images[2], 60, axis=1), np.full_like(images[2], 128)):
+        a, b = detector.detect(moved), detector.detect(moved, before)
+        np.testing.assert_array_equal(a.point, b.point)
+        np.testing.assert_array_equal(a.uv, b.uv)
+
+
+@pytest.mark.parametrize("name", ["charuco", "checkerboard"])
+@pytest.mark.parametrize("squares", [(2, 0), (0, 2), (1, 1)])
+def test_a_board_is_not_taken_for_one_that_is_some_squares_away(name, squares):
+    """Where it is expected, its squares look right."""
+    detector, (image,) = detector_of(TARGETS[name]), filmed(TARGETS[name], 1)
+    found, cols = detector.detect(image), {"charuco": 5, "checkerboard": 9}[name]
+    at = np.stack(np.divmod(found.point, cols), axis=1)
+    rows = at.max(axis=0)[0] + 1
+    shifted = expected_nodes(at + 2, found.uv, rows + 4, cols + 4)[
+        2 + squares[0] : 2 + squares[0] + rows, 2 + squares[1] : 2 + squares[1] + cols
+    ]
+    expected = Expected(np.arange(rows * cols), shifted.reshape(-1, 2))
+    assert detector.finder.find_near(View(image), expected) is None
