@@ -94,12 +94,20 @@ def test_errors_that_stay_for_a_second_show():
     assert found.optimistic and found.excess > 2.0 * found.expected
 
 
-def test_a_recording_too_short_to_be_split_says_so():
+def test_a_short_recording_is_split_into_as_many_parts_as_it_has():
     scenario = handheld(3.0)
     rig = rig_for(scenario, settings=replace(PLAIN, splits=25), intrinsics="free", distortion="free")
     result = calibrate_measurements(rig, simulate(scenario, 0).measurements)
+    assert result.held_out is not None and 10 < result.held_out.parts < 25
+    assert not any("too short to be split" in w for w in result.warnings)
+
+
+def test_a_recording_that_is_not_split_says_so():
+    scenario = handheld(3.0)
+    rig = rig_for(scenario, settings=replace(PLAIN, splits=1), intrinsics="free", distortion="free")
+    result = calibrate_measurements(rig, simulate(scenario, 0).measurements)
     assert result.held_out is None
-    assert any("too short to be split" in w for w in result.warnings)
+    assert any("too short to be split" in w and "white noise alone" in w for w in result.warnings)
 
 
 def as_noise_makes_it(found: HeldOut) -> bool:

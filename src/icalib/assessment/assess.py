@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
+from scipy.special import ndtr, stdtrit
 
 from icalib.assessment.cameras import mixed_up, other_lens, plane_warnings
 from icalib.assessment.guesses import guess_notes
@@ -43,7 +44,7 @@ from icalib.estimation.border import restricted_inverse
 from icalib.estimation.contradictions import Contradiction, contradictions, worst_off
 from icalib.estimation.determination import Determined
 from icalib.estimation.estimate import Estimate
-from icalib.estimation.evidence import Fit, fits, raw_rms, split_covariance
+from icalib.estimation.evidence import Fit, fits, raw_rms, split_covariance, split_expectation
 from icalib.estimation.fixed_lens import lens_steps
 from icalib.estimation.gauge import IN_THE_WORLD
 from icalib.estimation.imu_model import LABELS as IMU_LABELS
@@ -62,6 +63,8 @@ from icalib.rig_file import rig_to_dict
 from icalib.timeline import Timeline
 
 LARGE_FACTOR = 3.0
+MOST_LEVERAGE = 4.0  # of the variance: one part knows nearly all beyond, and the spread of the others nothing
+ENOUGH_PARTS = 8  # from so many on, t differs from the normal distribution by 8 % at most
 SEEN = ("corners", "features")
 BEYOND_FACTOR = 1.5  # times the largest factor: what halves say of each other is worth a warning
 LARGE_BLOOM_PX = 0.8  # ink and overexposure move edges by a third of that
@@ -115,7 +118,7 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
         converged=outcome.converged,
         status=outcome.status,
         warnings=(*wrong, *(w for w in warnings if w not in wrong)),
-        notes=(*notes(inputs, found, timeline), *guess_notes(inputs, groups), *size_notes),
+        notes=(*notes(inputs, found, timeline), *guess_notes(inputs, groups), *size_notes, *_few_notes(parts)),
         rig=rig_to_dict(inputs.asked or inputs.rig),
         settings=dataclasses.asdict(inputs.rig.settings),
         rates=_rates(inputs),
@@ -236,7 +239,23 @@ def _empirical_variance(found: Estimate, parts: Parts | None, formal: np.ndarray
     if parts is None:
         return None
     excess = [np.maximum(np.diag(V) - formal, 0.0) for V in place_covariances(found.problem, found.outcome)]
-    return np.diag(split_covariance(found.outcome, parts)) + sum(excess)
+    spread, expected = np.diag(split_covariance(found.outcome, parts)), split_expectation(found.outcome, parts)
+    leverage = np.clip(formal / np.maximum(expected, 1e-300), 1.0, MOST_LEVERAGE)
+    return few_factor(parts.count) ** 2 * leverage * spread + sum(excess)
+
+
+def _few_notes(parts: Parts | None) -> Iterator[str]:
+    if parts is not None and parts.count < ENOUGH_PARTS:
+        yield (
+            f"standard deviations rest on the spread of {parts.count} parts of the recording, by Student's t "
+            f"distribution {few_factor(parts.count):.2f} times as large as those of many; record more images."
+        )
+
+
+def few_factor(parts: int) -> float:
+    """By how much a standard deviation from the spread of few parts is to be larger, so that 68 % lie within: Student's
+    t distribution with parts - 1 degrees of freedom."""
+    return float(stdtrit(parts - 1, ndtr(1.0))) if parts < ENOUGH_PARTS else 1.0
 
 
 def _calibration_only(inputs: Inputs, per_column: np.ndarray) -> np.ndarray:
@@ -333,5 +352,6 @@ def _factor_warnings(factors: np.ndarray, split: bool, held: HeldOut | None):
         )
     if not split:
         yield (
-            "the recording is too short to be split (or splits are off): standard deviations are formal, and too small."
+            "the recording is too short to be split (or splits are off): standard deviations are formal and too small, "
+            "for they include white noise alone, and no errors that an image, a time or a place shares."
         )

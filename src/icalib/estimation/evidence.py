@@ -192,6 +192,19 @@ def split_covariance(outcome: Outcome, parts: Parts) -> np.ndarray:
     return n / (n - 1.0) * spread_covariance(parts.problem, outcome, b - b.mean(axis=0))
 
 
+def split_expectation(outcome: Outcome, parts: Parts) -> np.ndarray:
+    """(B,) variances that `split_covariance` has on average where noise is white.
+
+    At the joint optimum the gradient of part g has the covariance S_g - S_g S^-1 S_g: a part that knows much pulls the
+    optimum to itself (as the leverages in Bell and McCaffrey 2002). Of equal parts it is the formal variance.
+    """
+    t, n = parts.problem.tolerance, parts.count
+    inverse = restricted_inverse(outcome.information * t[:, None] * t, parts.problem.held)
+    known = parts.sums[:, :-1, :-1] * t[:, None] * t
+    left = (known - known @ inverse @ known).sum(axis=0)
+    return t**2 * n / (n - 1.0) * np.diag(inverse @ left @ inverse)
+
+
 def spread_covariance(problem: Problem, outcome: Outcome, b: np.ndarray) -> np.ndarray:
     """S^-1 (sum b_g b_g^T) S^-1 for gradients b (G, B)."""
     t = problem.tolerance

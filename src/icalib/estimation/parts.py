@@ -38,13 +38,11 @@ class Parts:
     def of(cls, problem: Problem, outcome: Outcome, count: int) -> Parts | None:
         """About `count` parts of about one length, which several recordings share, at least one each. None where they
         would be too short, or one does not stand alone."""
-        if isinstance(problem.chain, FreeNodes) and problem.sensors:  # poses at rest, of which there may be few
-            count = min(count, problem.n_nodes // FEWEST_NODES)
-            count = count if count >= FEWEST_PARTS else 0
+        count, fewest = _as_many_as_stand_alone(problem, count)
         if count < 2:
             return None
         ends = segment_ends(problem.chain.starts, problem.n_nodes, count)
-        if len(ends) < 3 or np.diff(ends).min() < FEWEST_NODES:
+        if len(ends) < 3 or np.diff(ends).min() < fewest:
             return None
         parts = cls(problem.cut(outcome.state, ends[:-1]), outcome.state, ends, np.zeros(0))
         scratch = parts.problem.scratch(outcome.residuals)
@@ -77,6 +75,20 @@ class Parts:
         return self.problem.add_measurements(state, piece, out, sums=False) + self.problem.add_bias_prior(
             state, piece, sums=False
         )
+
+
+def _as_many_as_stand_alone(problem: Problem, count: int) -> tuple[int, int]:
+    """How many of `count` parts there may be, and how many nodes each needs.
+
+    Images that nothing ties to each other stand alone: where there are few, each but the last is a part.
+    """
+    if not isinstance(problem.chain, FreeNodes):
+        return min(count, (problem.n_nodes - 1) // FEWEST_NODES), FEWEST_NODES
+    if problem.sensors:  # poses at rest, of which there may be few
+        fewer = min(count, problem.n_nodes // FEWEST_NODES)
+        return fewer if fewer >= FEWEST_PARTS else 0, FEWEST_NODES
+    few = count > 0 and problem.n_nodes <= FEWEST_NODES * count
+    return problem.n_nodes - 1 if few else count, 1
 
 
 def segment_ends(starts: tuple[int, ...], n_nodes: int, segments: int) -> np.ndarray:

@@ -1,0 +1,77 @@
+"""Short recordings: the printed standard deviations cover errors that an image's corners share, from few images too."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from icalib.assessment.assess import few_factor
+from icalib.calibration import Calibration
+from icalib.measurements import CornerStream, Measurements
+from icalib.pipeline import calibrate_measurements
+from icalib.simulation import handheld, rig_for, simulate
+
+LENS = {"intrinsics": (458.7, 457.3, 367.2, 248.4), "distortion": (-0.28, 0.07, 2e-4, 2e-5)}
+
+
+def stills(count: int, seed: int, shared_px: float) -> Calibration:
+    """One camera alone, `count` images, corners with noise of 0.2 px and an error that those of an image share: linear
+    and quadratic in the image, no pose makes up for it."""
+    scenario = handheld(20.0)
+    camera = dataclasses.replace(scenario.cameras[0], **LENS)
+    simulation = simulate(dataclasses.replace(scenario, cameras=(camera,)), seed)
+    whole, rng = simulation.measurements.cameras[0], np.random.default_rng(seed)
+    kept = np.sort(rng.choice(len(whole.stamps_ns), count, replace=False))
+    rows = np.isin(whole.image, kept)
+    start = np.concatenate([[0], np.cumsum(np.diff(whole.start)[kept])])
+    x, y = (2.0 * whole.uv[rows] / np.array([752.0, 480.0]) - 1.0).T
+    field = np.stack([x, y, x * x, x * y, y * y], axis=1)
+    sizes = shared_px * rng.normal(size=(count, 5, 2))[np.repeat(np.arange(count), np.diff(start))]
+    uv = whole.uv[rows] + np.einsum("nk,nkj->nj", field, sizes)
+    rig = rig_for(simulation.scenario, intrinsics="free", distortion="free")
+    own = dataclasses.replace(rig.cameras[0], corner_noise_px=None)
+    rig = dataclasses.replace(rig, imu=None, cameras=(own,), settings=dataclasses.replace(rig.settings, splits=8))
+    stream = CornerStream("cam0", whole.stamps_ns[kept], start, whole.point[rows], uv)
+    return calibrate_measurements(rig, Measurements(None, (stream,)))
+
+
+def in_deviations(result: Calibration, formal: bool) -> list[float]:
+    out: list[float] = []
+    for name, truth in LENS.items():
+        group = result.group("cam0", name)
+        out += ((group.value - np.array(truth)) / (group.std_formal if formal else group.std)).tolist()
+    return out
+
+
+def rms(values: list[list[float]]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+@pytest.mark.parametrize("count", [5, 9, 16])
+def test_errors_that_an_image_shares_are_covered(count: int):
+    results = [stills(count, seed, 0.15) for seed in range(6)]
+    assert rms([in_deviations(r, formal=True) for r in results]) > 1.7
+    assert rms([in_deviations(r, formal=False) for r in results]) < 1.5
+    assert not any("too short to be split" in w for r in results for w in r.warnings)
+
+
+@pytest.mark.parametrize("count", [5, 9, 16])
+def test_white_noise_costs_little_more_than_students_t(count: int):
+    results = [stills(count, seed, 0.0) for seed in range(6)]
+    factors = [float(r.group("cam0", "intrinsics").factor[0]) for r in results]
+    assert 1.0 <= np.mean(factors) < 1.25 * few_factor(count - 1)
+    assert 0.6 < rms([in_deviations(r, formal=False) for r in results]) < 1.4
+
+
+def test_few_images_say_how_much_their_spread_can_tell():
+    result = stills(6, 1, 0.1)
+    assert any("5 parts" in n and "Student" in n for n in result.notes)
+    assert not any("Student" in n for n in stills(40, 1, 0.1).notes)
+
+
+def test_the_factor_of_few_parts_is_students():
+    """Tables of Student's distribution: 68.27 % lie within 1.84, 1.32, 1.20 and 1.09 standard deviations."""
+    assert [few_factor(n) for n in (2, 3, 4, 7)] == pytest.approx([1.837, 1.321, 1.197, 1.091], abs=1e-3)
+    assert few_factor(8) == few_factor(50) == 1.0
