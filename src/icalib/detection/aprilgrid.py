@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from icalib.detection.consistency import consistent_corners, largest_group
-from icalib.detection.corners import ImageCorners, judged, no_corners
+from icalib.detection.corners import CROWDED, ImageCorners, judged, no_corners
 from icalib.detection.families import Family, tag_family
 from icalib.detection.growth import confirm, grow
 from icalib.detection.markers import APRILTAG_CORNER
@@ -129,7 +129,7 @@ class AprilGridDetector:
         point = (4 * tags[:, None] + APRILTAG_CORNER).ravel()
         board, found = self.tag_corners[tags].reshape(-1, 2), np.isfinite(quality[0])
         consistent = consistent_corners(uv, board, found, quality[4], image.shape)
-        return judged(point, uv, quality, consistent)
+        return judged(point, uv, quality, consistent, np.inf if self.squares else CROWDED)
 
 
 def grid_tags(rows: int, cols: int, tag_spacing: float) -> np.ndarray:

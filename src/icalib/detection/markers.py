@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from icalib.detection.corners import ImageCorners, judged, no_corners
+from icalib.detection.corners import CROWDED, ImageCorners, judged, no_corners
 from icalib.detection.families import Family, tag_family
 from icalib.detection.quads import View
 from icalib.detection.refinement import refined_corners
@@ -69,4 +69,5 @@ class MarkerDetector:
         order = APRILTAG_CORNER if self._family.is_apriltag else ARUCO_CORNER
         place = np.array([self.ids.index(int(tag)) for tag in tags.ids[rows]])
         point = (4 * place[:, None] + order).ravel()
-        return judged(point, uv.reshape(-1, 2), quality.reshape(len(quality), -1), np.ones(len(point), dtype=bool))
+        consistent = np.ones(len(point), dtype=bool)
+        return judged(point, uv.reshape(-1, 2), quality.reshape(len(quality), -1), consistent, CROWDED)
