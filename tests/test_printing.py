@@ -12,7 +12,7 @@ import yaml
 
 from icalib.cli import main
 from icalib.errors import CalibrationError, RigError
-from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Markers, Tag, Target
+from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles, Markers, Tag, Target
 from icalib.geometry.targets.pattern import pattern_of
 from icalib.own_files import sealed
 from icalib.printing import PAPERS, target_pdf, write_target
@@ -231,3 +231,14 @@ def test_wrong_usage_is_named(arguments: str, words: str, capsys: pytest.Capture
     with pytest.raises(SystemExit) as caught:
         main(["target", *arguments.split()])
     assert caught.value.code == 2 and words in capsys.readouterr().err
+
+
+def test_circles_are_printed_at_true_scale():
+    """Each circle of the PDF is four curves; its place is that of the point, its size that of the diameter."""
+    target = Circles(4, 5, 0.03, 0.02, asymmetric=True)
+    text = stream(target_pdf(target, "a3"))
+    right = 25.4 / 72.0 * rows(rf"\nn {NUMBER} {NUMBER} m\b", text.replace("\nn\n", "\nn "))[:20]
+    left = 25.4 / 72.0 * rows(rf"{NUMBER} {NUMBER} c\n", text)[1:80:4]
+    expected = 1e3 * target.points[:, :2]
+    np.testing.assert_allclose(right - right[0], expected - expected[0], atol=0.02)
+    np.testing.assert_allclose(right[:, 0] - left[:, 0], 20.0, atol=0.02)

@@ -64,6 +64,7 @@ def target_pdf(target: Target, paper: str = "a4", border_bits: int | None = None
     page.setTitle(f"{target.type} target, print at 100 %")
     for name, pattern in patterns.items():
         _draw(page, pattern, width, height)
+        _draw_circles(page, target, pattern, width, height)
         _foot(page, target, name, border_bits)
         page.showPage()
     return page.getpdfdata()
@@ -79,14 +80,28 @@ def _patterns(target: Target, border_bits: int | None) -> dict[str, Pattern]:
 
 def _draw(page: Any, pattern: Pattern, width: float, height: float) -> None:
     """The pattern in the middle of the page [mm], above its foot."""
-    size_x, size_y = _size_mm(pattern)
-    left, bottom = 0.5 * (width - size_x), EDGE_MM + FOOT_MM + 0.5 * (height - 2.0 * EDGE_MM - FOOT_MM - size_y)
+    left, bottom = _lower_left_mm(pattern, width, height)
     # One path: edges that boxes share would show as hairlines between several.
     path = page.beginPath()
     for x0, y0, x1, y1 in 1e3 * pattern.black_boxes():
         x, y = left + x0 - 1e3 * pattern.x[0], bottom + y0 - 1e3 * pattern.y[0]
         path.rect(*(_POINTS * side for side in (x, y, x1 - x0, y1 - y0)))
     page.drawPath(path, stroke=0, fill=1, fillMode=1)  # non-zero: rounded edges that overlap stay black
+
+
+def _draw_circles(page: Any, target: Target, pattern: Pattern, width: float, height: float) -> None:
+    """The circles of the target, black, where `_draw` has the paper around them."""
+    left, bottom = _lower_left_mm(pattern, width, height)
+    for point, radius in zip(1e3 * target.points, 1e3 * target.radii, strict=True):
+        if radius > 0.0:
+            x, y = left + point[0] - 1e3 * pattern.x[0], bottom + point[1] - 1e3 * pattern.y[0]
+            page.circle(*(_POINTS * side for side in (x, y, radius)), stroke=0, fill=1)
+
+
+def _lower_left_mm(pattern: Pattern, width: float, height: float) -> tuple[float, float]:
+    """Where the pattern begins on the page [mm]: in its middle, above its foot."""
+    size_x, size_y = _size_mm(pattern)
+    return 0.5 * (width - size_x), EDGE_MM + FOOT_MM + 0.5 * (height - 2.0 * EDGE_MM - FOOT_MM - size_y)
 
 
 def page_mm(pattern: Pattern, paper: str) -> tuple[float, float]:

@@ -135,7 +135,7 @@ def test_an_image_is_thresholded_once_for_all_targets(shots: list[Shot], monkeyp
 def test_sentences_on_a_scene(shots: list[Shot]):
     images = [shot.pixels for shot in shots[:8]]
     found, notes = found_in(images, Scene(("wall", "grid"), (TAGS, AprilGrid(3, 3, 0.1, 0.3))))
-    assert notes[0].startswith(f"shown.bag /cam0: wall is in 8, grid is in 8 of 8 images, {len(found.uv)} corners;")
+    assert notes[0] == f"shown.bag /cam0: wall is in 8, grid is in 8 of 8 images, {len(found.uv)} corners."
     assert len(notes) == 1 and (np.diff(found.start) > 20).all()
     board = Checkerboard(5, 6, 0.1)
     _, notes = found_in(images, Scene(("wall", "board"), (TAGS, board)))
