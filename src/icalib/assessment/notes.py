@@ -18,6 +18,8 @@ from icalib.estimation.inputs import Inputs
 from icalib.estimation.nodes import usable
 from icalib.timeline import Timeline
 
+MOST_NAMED = 10  # images
+
 
 def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
     """Of the recordings, then of each kind of sensor."""
@@ -41,6 +43,8 @@ def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
                 f"{camera.name}: ellipses have their centres {np.sqrt((size**2).mean()):.3f} px (RMS, {size.max():.2f} "
                 "px at most) beside the projected centres of their circles; the estimate takes it into account."
             )
+    if inputs.imu is None and len(found.problem.cameras) > 1:
+        yield from _pair_notes(found)
     yield from _feature_notes(found)
     yield from robot_notes(inputs, found)
     yield from upwards_notes(inputs, found)
@@ -87,6 +91,20 @@ def _imu_notes(inputs: Inputs, imu: ImuData, found: Estimate, timeline: Timeline
         left_out = int((~usable(imu, t, most)).sum())
         if left_out:
             yield f"{left_out} images of {camera.name} are left out: {imu.name} was not running then."
+
+
+def _pair_notes(found: Estimate) -> Iterator[str]:
+    """Of images of several cameras that were rejected as a whole, at the same nodes."""
+    cameras = [c for c in found.problem.cameras if len(c.stream.uv)]
+    lost = [set(c.node[np.setdiff1d(c.stream.image, c.stream.image[c.keep])].tolist()) for c in cameras]
+    nodes = sorted(n for n in set().union(*lost) if sum(n in own for own in lost) > 1)
+    if nodes:
+        names, first = " and ".join(c.name for c in cameras), cameras[0]
+        at = ", ".join(str(s) for s in first.stream.stamps_ns[np.isin(first.node, nodes[:MOST_NAMED])])
+        yield (
+            f"{len(nodes)} sets of images of {names} were not exposed together, or the rig moved between, and are left "
+            f"out; their stamps (for pictures without a clock, the numbers in their names times 10^9): {at}."
+        )
 
 
 def _rejected_words(keep: np.ndarray) -> str:

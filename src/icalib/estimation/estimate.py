@@ -25,6 +25,7 @@ from icalib.estimation.corner_outliers import inliers
 from icalib.estimation.evidence import fits
 from icalib.estimation.feature_noise import first_following, next_following
 from icalib.estimation.guess_priors import guess_priors
+from icalib.estimation.image_pairs import moved_between
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.lidar_factor import LidarFactor
 from icalib.estimation.outcome import Outcome, Step, Visit, way_come
@@ -81,9 +82,7 @@ class Judged:
 
     def next(self, inputs: Inputs, outcome: Outcome, first: bool) -> Judged:
         """As what a pass left behind, the `first` or another, shows it."""
-        rig, problem, now = inputs.rig, outcome.problem, self
-        pairs = zip(problem.cameras, outcome.residuals.corners, strict=True)
-        now = replace(now, keep=tuple(inliers(f, out, rig.settings) for f, out in pairs))
+        problem, now = outcome.problem, replace(self, keep=_kept(inputs, outcome))
         if now.following is not None:
             now = replace(now, following=next_following(inputs, outcome, now.following, first))
         if _noise_is_estimated(inputs):
@@ -305,6 +304,16 @@ def _next_noise(
         models.append(replace(model, later=large and _has_cameras_alone(inputs)))
         noise.append(models[-1].noise(factor.stream, camera, settings, speed))
     return tuple(models), tuple(noise)
+
+
+def _kept(inputs: Inputs, outcome: Outcome) -> tuple[np.ndarray, ...]:
+    """By camera (N,) bool: corners that are not rejected, nor all those of an image."""
+    cameras, outputs, settings = outcome.problem.cameras, outcome.residuals.corners, inputs.rig.settings
+    keep = [inliers(f, out, settings) for f, out in zip(cameras, outputs, strict=True)]
+    if len(cameras) > 1 and _has_cameras_alone(inputs) and settings.outlier_std > 0.0:
+        apart = moved_between(cameras, outputs, settings)
+        keep = [k & ~bad[c.stream.image] for k, bad, c in zip(keep, apart, cameras, strict=True)]
+    return tuple(keep)
 
 
 def _has_cameras_alone(inputs: Inputs) -> bool:
