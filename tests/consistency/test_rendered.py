@@ -112,7 +112,8 @@ def test_every_format_gives_the_same(form: Form, rig: Rig, recordings: dict[Form
         a, b = (g.value[2] if g.name == "tilt" else g.value for g in (theirs, ours))
         np.testing.assert_allclose(a, b, rtol=0.0, atol=1e-9, err_msg=f"{ours.sensor} {ours.name}")
     for ours, theirs in zip(result.corner_residuals, other.corner_residuals, strict=True):
-        np.testing.assert_array_equal(theirs.uv, ours.uv)
+        # Corners lie on edges as bent as the estimate says, which is equal to rounding.
+        np.testing.assert_allclose(theirs.uv, ours.uv, rtol=0.0, atol=1e-11)
         np.testing.assert_array_equal(theirs.point, ours.point)
 
 

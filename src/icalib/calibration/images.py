@@ -18,7 +18,7 @@ class CornerResiduals:
     seconds: np.ndarray  # (M,) image times, imu clock, s since the first IMU stamp; see RecordingSpan for several
     start: np.ndarray  # (M + 1,) corners of image i are start[i]:start[i+1]
     point: np.ndarray  # (N,) index into the target's points
-    uv: np.ndarray  # (N, 2) measured, px
+    uv: np.ndarray  # (N, 2) measured, px; on edges as bent as the estimate says, where icalib found them in images
     residual: np.ndarray  # (N, 2) px
     sigma: np.ndarray  # (N,) px, standard deviation that the corner was given
     rejected: np.ndarray  # (N,) bool
