@@ -84,7 +84,7 @@ def test_the_shift_under_perspective_is_that_of_the_conic():
     expected = np.linalg.solve(C[:2, :2], -C[:2, 2]) - (H[:2, 2] / H[2, 2])
     shift = ellipse_shift(camera, params, centre[None], R[None, :, :2], np.array([radius]))
     assert np.linalg.norm(expected) > 1.0
-    np.testing.assert_allclose(shift[0], expected, atol=2e-3 * np.linalg.norm(expected))
+    np.testing.assert_allclose(shift[0], expected, atol=2e-3 * float(np.linalg.norm(expected)))
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import exp, hypot
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -100,7 +101,7 @@ def _bent_rays(uv: np.ndarray, width: float, board: np.ndarray, found: np.ndarra
         def usual(log_focal: float, equidistant: bool = equidistant) -> float:
             return _usual(_rays(uv, width * exp(log_focal), equidistant), board, found)
 
-        done = minimize_scalar(usual, bounds=np.log(_BENT), method="bounded", options={"xatol": _SAME_LOG})
+        done: Any = minimize_scalar(usual, bounds=np.log(_BENT), method="bounded", options={"xatol": _SAME_LOG})
         if best is None or done.fun < best[0]:
             best = done.fun, _rays(uv, width * exp(done.x), equidistant)
     assert best is not None
