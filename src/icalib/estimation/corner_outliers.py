@@ -38,7 +38,10 @@ def inliers(factor: CornerFactor, out: CornerOutput, settings: Settings) -> np.n
     limit = np.maximum(largest_normal(settings.outlier_std, 0.5) * usual, settings.outlier_min_px)
     found_in = image * (1 + stream.point.max(initial=0) // FOUND_TOGETHER) + stream.point[used] // FOUND_TOGETHER
     kept = np.zeros(len(out.root), dtype=bool)
-    kept[used[~stand_alone(stream.uv[used], residual, size > limit, found_in)]] = True
+    # Without a robust loss nothing bounds what a kept corner pulls.
+    suspect = size > limit
+    alone = suspect if settings.loss == "none" else stand_alone(stream.uv[used], residual, suspect, found_in)
+    kept[used[~alone]] = True
     return kept
 
 
