@@ -183,6 +183,11 @@ COMMANDS = {
         TARGETS["charuco"]
     ),
     "checkerboard --rows 6 --cols 9 --square-size 0.035 --paper a3": TARGETS["checkerboard"],
+    "circles --rows 4 --cols 5 --spacing 0.03 --diameter 0.02": (Circles(4, 5, 0.03, 0.02), "a4"),
+    "circles --rows 5 --cols 4 --spacing 0.02 --diameter 0.015 --asymmetric": (
+        Circles(5, 4, 0.02, 0.015, asymmetric=True),
+        "a4",
+    ),
     "tag --family tag36h11 --id 3 --size 0.15": TARGETS["tag"],
     "tag --family apriltag_36h11 --id 3 --size 0.15": TARGETS["tag"],
     "markers --family tag36h11 --size 0.15 --ids 0-2,9": (Markers("tag36h11", 0.15, (0, 1, 2, 9)), "a4"),

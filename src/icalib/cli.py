@@ -166,6 +166,7 @@ def _add_target(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
             "squares_x": _count, "squares_y": _count, "square_size": _metres, "marker_size": _metres, "dictionary": str
         },
         "checkerboard": {"rows": _count, "cols": _count, "square_size": _metres},
+        "circles": {"rows": _count, "cols": _count, "spacing": _metres, "diameter": _metres},
         "markers": {"family": str, "size": _metres, "ids": _ids},
         "tag": {"family": str, "id": _whole, "size": _metres},
     }  # fmt: skip
@@ -177,9 +178,12 @@ def _add_target(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
                 f"--{field.replace('_', '-')}",
                 type=kind,
                 required=True,
-                metavar="RATIO" if "spacing" in field else unit,
+                metavar="RATIO" if field == "tag_spacing" else unit,
             )
-        if name != "checkerboard":
+        if name == "circles":
+            one.add_argument("--asymmetric", action="store_true", help="every other row moved by one spacing")
+            options = options | {"asymmetric": bool}
+        elif name != "checkerboard":
             one.add_argument("--border-bits", type=_count, metavar="N", help="width of the tags' black border")
         one.add_argument("--paper", choices=tuple(PAPERS), default="a4")
         one.add_argument("--output", "-o", type=Path, required=True, metavar="FILE.pdf")
