@@ -9,9 +9,9 @@ import pytest
 from icalib.detection import CheckerboardDetector
 from icalib.detection import checkerboard as module
 from icalib.detection.corners import ImageCorners
-from icalib.detection.crossings import in_rows
+from icalib.detection.crossings import shows_grid
 from icalib.detection.detectors import detector_of
-from icalib.detection.turns import continuous
+from icalib.detection.turns import number_continuously
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Scene
 
 
@@ -32,7 +32,7 @@ def test_tags_are_no_checkerboard(rendering):
     pattern = rendering.aprilgrid(6, 6)
     for tilt in (0.0, 30.0, 50.0):
         image = rendering.render(pattern, rendering.homography(pattern, 0.9, tilt, 20.0, 5.0, (0.0, 0.0)))
-        assert not in_rows(image, 14)
+        assert not shows_grid(image, 14)
         for rows, cols in [(6, 9), (4, 5), (5, 6)]:
             assert not len(CheckerboardDetector(rows, cols).detect(image).point)
 
@@ -87,7 +87,7 @@ def test_an_image_without_rows_of_corners_is_not_searched_thoroughly(monkeypatch
 def test_a_blurred_board_stands_in_rows(rendering, blur):
     pattern = rendering.checkerboard(6, 9)
     H = rendering.homography(pattern, 0.9, 25.0, 40.0, 10.0, (0.0, 0.0), False)
-    assert in_rows(rendering.render(pattern, H, blur=blur), 28)
+    assert shows_grid(rendering.render(pattern, H, blur=blur), 28)
 
 
 def test_a_board_that_opencvs_plain_search_misses(camera_lidar_board):
@@ -128,14 +128,14 @@ def test_a_board_that_turns_keeps_its_numbers(board):
     scene = Scene(("grid", "board"), (AprilGrid(2, 2, 0.1, 0.3), board))
     for target, first in ((board, 0), (scene, 16)):
         shifted = [ImageCorners(i.point + first, i.uv, i.sigma, i.blur, i.verdict) for i in images]
-        for a, b in zip(truth, continuous(target, shifted), strict=True):
+        for a, b in zip(truth, number_continuously(target, shifted), strict=True):
             np.testing.assert_array_equal(b.point, a.point + first)
             np.testing.assert_allclose(b.uv, a.uv)
 
 
 def test_an_upright_board_keeps_the_detectors_numbers():
     images = turning(Checkerboard(6, 8, 0.03), True)
-    kept = continuous(Checkerboard(6, 8, 0.03, upright=True), images)
+    kept = number_continuously(Checkerboard(6, 8, 0.03, upright=True), images)
     for a, b in zip(images, kept, strict=True):
         np.testing.assert_array_equal(a.point, b.point)
         np.testing.assert_array_equal(a.uv, b.uv)

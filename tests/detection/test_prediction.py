@@ -10,7 +10,7 @@ import pytest
 from icalib.detection.corners import ImageCorners, no_corners
 from icalib.detection.decoding import mapped
 from icalib.detection.detectors import detector_of
-from icalib.detection.prediction import Expected, expected_next, expected_nodes
+from icalib.detection.prediction import PredictedCorners, predict_corners, predict_nodes
 from icalib.detection.quads import View
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard
 from icalib.simulation import Motion, film, handheld
@@ -39,16 +39,16 @@ def test_corners_move_on_with_their_acceleration():
     # Point 20 is new; it stands where point 9 stood, nearest to point 8.
     rows = [range(6), [0, 0, 1, 2, 3, 4], [0, 1, 2, 3, 4, 4]]
     images = [corners(p, at[t][list(r)]) for t, (p, r) in enumerate(zip(points, rows, strict=True))]
-    expected = expected_next(images)
+    expected = predict_corners(images)
     assert expected is not None
     np.testing.assert_array_equal(expected.point, points[2])
     np.testing.assert_allclose(expected.uv, at[3][list(rows[2])])
     # Two images show their speed alone.
-    expected = expected_next(images[1:])
+    expected = predict_corners(images[1:])
     assert expected is not None
     np.testing.assert_allclose(expected.uv[:5], (2.0 * at[2] - at[1])[:5])
     # So do three, of which the first shows nothing in common.
-    expected = expected_next([corners([30, 31], start[:2]), *images[1:]])
+    expected = predict_corners([corners([30, 31], start[:2]), *images[1:]])
     assert expected is not None
     np.testing.assert_allclose(expected.uv[:5], (2.0 * at[2] - at[1])[:5])
 
@@ -56,10 +56,10 @@ def test_corners_move_on_with_their_acceleration():
 @pytest.mark.parametrize("n", [0, 1])
 def test_without_two_images_that_show_the_target_nothing_is_expected(n):
     one = corners(range(5), np.zeros((5, 2)))
-    assert expected_next([one] * n) is None
-    assert expected_next([one, no_corners()]) is None
-    assert expected_next([no_corners(), one]) is None
-    assert expected_next([one, one, corners([7, 8, 9, 10], np.zeros((4, 2)))]) is None
+    assert predict_corners([one] * n) is None
+    assert predict_corners([one, no_corners()]) is None
+    assert predict_corners([no_corners(), one]) is None
+    assert predict_corners([one, one, corners([7, 8, 9, 10], np.zeros((4, 2)))]) is None
 
 
 def test_nodes_that_were_not_seen_lie_on_the_board():
@@ -67,7 +67,7 @@ def test_nodes_that_were_not_seen_lie_on_the_board():
     every = np.stack(np.indices((5, 7)), axis=-1).reshape(-1, 2)
     true = np.array([mapped(H, float(row), float(col)) for row, col in every])
     seen = ((every >= 1) & (every < [4, 6])).all(axis=1) & (np.arange(35) % 4 > 0)
-    np.testing.assert_allclose(expected_nodes(every[seen], true[seen], 5, 7).reshape(-1, 2), true, atol=1e-6)
+    np.testing.assert_allclose(predict_nodes(every[seen], true[seen], 5, 7).reshape(-1, 2), true, atol=1e-6)
 
 
 def filmed(target, count):
@@ -114,8 +114,8 @@ def test_a_board_is_not_taken_for_one_that_is_some_squares_away(name, squares):
     found, cols = detector.detect(image), {"charuco": 5, "checkerboard": 9}[name]
     at = np.stack(np.divmod(found.point, cols), axis=1)
     rows = at.max(axis=0)[0] + 1
-    shifted = expected_nodes(at + 2, found.uv, rows + 4, cols + 4)[
+    shifted = predict_nodes(at + 2, found.uv, rows + 4, cols + 4)[
         2 + squares[0] : 2 + squares[0] + rows, 2 + squares[1] : 2 + squares[1] + cols
     ]
-    expected = Expected(np.arange(rows * cols), shifted.reshape(-1, 2))
+    expected = PredictedCorners(np.arange(rows * cols), shifted.reshape(-1, 2))
     assert detector.finder.find_near(View(image), expected) is None

@@ -12,7 +12,7 @@ from icalib.detection.corners import CROWDED, ImageCorners, judged, no_corners
 from icalib.detection.families import Family, tag_family
 from icalib.detection.growth import confirm, grow
 from icalib.detection.markers import APRILTAG_CORNER
-from icalib.detection.prediction import Expected
+from icalib.detection.prediction import PredictedCorners
 from icalib.detection.quads import View
 from icalib.detection.refinement import refined_corners, refined_crossings
 from icalib.detection.tags import Tags, find_tags
@@ -85,7 +85,7 @@ class AprilGridDetector:
                     return self._corners(view.image, known, quads)
         return no_corners()
 
-    def find_near(self, view: View, expected: Expected) -> ImageCorners | None:
+    def find_near(self, view: View, expected: PredictedCorners) -> ImageCorners | None:
         """As `find`, from where corners are expected; None where some that should be in the image are not there."""
         n = self.rows * self.cols
         uv, seen = np.zeros((4 * n, 2)), np.zeros(4 * n, dtype=bool)
@@ -100,7 +100,7 @@ class AprilGridDetector:
         # A tag that the image cuts is sometimes found and sometimes not.
         side = float(np.linalg.norm(quads[known, 1] - quads[known, 0], axis=1).max())
         found = self._corners(view.image, known, quads)
-        return found if expected.are_found(view.image, found, side) else None
+        return found if expected.all_found(view.image, found, side) else None
 
     @cached_property
     def _cells(self) -> tuple[np.ndarray, int, int]:

@@ -13,7 +13,7 @@ from icalib.detection.decoding import mapped
 from icalib.detection.families import Family, tag_family
 from icalib.detection.growth import fit_homography, markers_there
 from icalib.detection.markers import all_tags
-from icalib.detection.prediction import Expected, expected_nodes
+from icalib.detection.prediction import PredictedCorners, predict_nodes
 from icalib.detection.quads import View
 from icalib.detection.squares import square_corners
 from icalib.errors import RecordingError
@@ -79,23 +79,23 @@ class CharucoDetector:
         expected = self._expected(self.tag_corners[known], quads[known])
         return square_corners(view.image, expected, self._dark, 0.5 * (1.0 - self.marker_ratio))
 
-    def find_near(self, view: View, expected: Expected) -> ImageCorners | None:
+    def find_near(self, view: View, expected: PredictedCorners) -> ImageCorners | None:
         """As `find`, from where corners are expected; None where some that should be in the image are not there, or not
         half of the markers."""
         nodes = self._nodes(expected)
         found = square_corners(view.image, nodes, self._dark, 0.5 * (1.0 - self.marker_ratio))
-        if not len(found.point) or not expected.are_found(view.image, found):
+        if not len(found.point) or not expected.all_found(view.image, found):
             return None
-        quads = _in_squares(self._nodes(Expected(found.point, found.uv)), self.tag_corners)
+        quads = _in_squares(self._nodes(PredictedCorners(found.point, found.uv)), self.tag_corners)
         inside = ((quads > 0.0) & (quads < np.array(view.image.shape[::-1]) - 1.0)).all(axis=(1, 2))
         patterns = np.ascontiguousarray(self._family.codes[: len(quads), 0])
         there = int(markers_there(view.image, quads[inside], patterns[inside], self._family.bits, 1).sum())
         return found if there >= max(_LEAST_MARKERS, 0.5 * inside.sum()) else None
 
-    def _nodes(self, corners: Expected) -> np.ndarray:
+    def _nodes(self, corners: PredictedCorners) -> np.ndarray:
         """(rows + 1, cols + 1, 2) px: the squares' corners, where the inner ones place them."""
         at = np.stack(np.divmod(corners.point, self.cols - 1), axis=1) + 1
-        return expected_nodes(at, corners.uv, self.rows + 1, self.cols + 1)
+        return predict_nodes(at, corners.uv, self.rows + 1, self.cols + 1)
 
     def misfit(self, view: View) -> float:
         """How far the markers' corners are from where one homography puts them, over the markers' size: the median over

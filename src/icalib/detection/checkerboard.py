@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.detection.corners import INCONSISTENT, ImageCorners, no_corners
-from icalib.detection.crossings import goes_on, in_rows
-from icalib.detection.prediction import Expected, expected_nodes
+from icalib.detection.crossings import continues_beyond, shows_grid
+from icalib.detection.prediction import PredictedCorners, predict_nodes
 from icalib.detection.quads import View
 from icalib.detection.squares import square_corners
 from icalib.errors import RecordingError
@@ -54,12 +54,12 @@ class CheckerboardDetector:
                 return found
         return no_corners()
 
-    def find_near(self, view: View, expected: Expected) -> ImageCorners | None:
+    def find_near(self, view: View, expected: PredictedCorners) -> ImageCorners | None:
         """As `find`, from where corners are expected; None where some that should be in the image are not there. What
         moved on by two squares looks the same but at its border."""
         at = np.stack(np.divmod(expected.point, self.cols), axis=1)
-        found = self._corners(view.image, expected_nodes(at, expected.uv, self.rows, self.cols))
-        return found if self._is_whole(found) and expected.are_found(view.image, found) else None
+        found = self._corners(view.image, predict_nodes(at, expected.uv, self.rows, self.cols))
+        return found if self._is_whole(found) and expected.all_found(view.image, found) else None
 
     def _is_whole(self, found: ImageCorners) -> bool:
         """Whether enough corners are where a board has them, on each of its four sides, too."""
@@ -71,7 +71,7 @@ class CheckerboardDetector:
     def _corners(self, image: np.ndarray, grid: np.ndarray) -> ImageCorners:
         """The corners of the board at the grid (rows, cols, 2) px; none where it is part of a larger board."""
         framed = _framed(grid)
-        if goes_on(image, framed):
+        if continues_beyond(image, framed):
             return no_corners()
         grid = self._ordered(image, grid)
         dark = (np.indices((self.rows + 1, self.cols + 1)).sum(axis=0) % 2 == 0) == _is_dark(image, grid)
@@ -85,7 +85,7 @@ class CheckerboardDetector:
         """
         reduced, factor = _reduced(image)
         yield from self._quick(reduced, factor)
-        if not in_rows(image, _LEAST_SEEN * (self.rows - 2) * (self.cols - 2)):
+        if not shows_grid(image, _LEAST_SEEN * (self.rows - 2) * (self.cols - 2)):
             return
         cv2 = load_cv2()
         flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE

@@ -1,4 +1,7 @@
-"""X-corners that belong to no known board: whether an image shows a grid of them, and whether a board goes on."""
+"""X-corners of any pattern: whether an image shows a grid of them, and whether a grid continues beyond a board.
+
+X-corners are found by the ChESS response (Bennett and Lasenby, Computer Vision and Image Understanding 118, 2014).
+"""
 
 from __future__ import annotations
 
@@ -12,28 +15,32 @@ from icalib.detection.saddles import crossing_contrast, find_saddle
 from icalib.detection.tags import LEAST_CONTRAST
 from icalib.extras import load_cv2
 
-# Of ChESS (Bennett and Lasenby, Computer Vision and Image Understanding 118, 2014): 16 places at 5 px from a pixel.
+# Half of the 16 samples of ChESS, (u, v) px from a pixel; the other half lies opposite.
 _RING = ((0, -5), (2, -5), (3, -3), (5, -2), (5, 0), (5, 2), (3, 3), (2, 5))
 _RING_PX = 5
-_SCALES = 3  # the image itself, and twice at half the size of the one before
-_LEAST_RESPONSE = 4 * LEAST_CONTRAST  # of ChESS: four sums of two greys, of which noise and blur take a part
-_APART_PX = 7  # between two corners
-_MOST_PEAKS = 500  # of an image, the strongest
-_NEAREST = 8  # places among which a corner's neighbours are looked for
-_OPPOSITE = 0.25  # of the distance: how far the middle of two opposite neighbours may be from the corner, twice
-_LEAST_SINE = 0.3  # of the angle between rows and columns
-_MOST_MOVE = 0.2  # of a side: how far a corner may lie from where the rows of a board lead
-_CLEAR = 0.5  # squares, to the nearest other feature
-_USUAL_BLUR = 0.7  # px
-_GOES_ON = 0.5  # of the places along one side of a board that are X-corners
+_SCALES = 3  # levels of the image pyramid; one more finds boards that are twice as blurred
+# Grey levels. A sharp corner of contrast c has up to 8 c. Doubled, a blurred board of the least contrast is missed.
+_LEAST_RESPONSE = 4 * LEAST_CONTRAST
+_PEAK_WINDOW_PX = 7  # width of the non-maximum suppression; corners less than 4 px apart merge
+_MOST_PEAKS = 500  # strongest of an image that are kept; the time grows with the square of it
+_NEAREST = 8  # peaks among which a corner's grid neighbours are looked for: four, and four diagonal ones
+# |p + q| of two opposite neighbours, at p and q from the corner, over the shorter of them: 0 but for perspective and
+# lens. Larger, peaks of random texture have opposite neighbours by chance.
+_OPPOSITE = 0.25
+_LEAST_SINE = 0.3  # of the angle between rows and columns in the image: 17 degrees
+_MOST_MOVE = 0.2  # of a square's side, between a corner and its extrapolated place
+_CLEAR = 0.5  # of a square's side: the fitted window reaches no further
+_USUAL_BLUR = 0.7  # px, standard deviation of a Gaussian; it only sets the window
+_CONTINUED_SHARE = 0.5  # of the places beside one side of a board: with more X-corners there, the board is larger
 
 
-def in_rows(image: np.ndarray, enough: float) -> bool:
-    """Whether the image (h, w) uint8 shows `enough` X-corners that stand in rows and columns, at any of three sizes."""
+def shows_grid(image: np.ndarray, enough: float) -> bool:
+    """Whether the image (h, w) uint8, at full, half or quarter size, has a grid of `enough` connected X-corners."""
     cv2 = load_cv2()
     for _ in range(_SCALES):
-        response = _response(image)
-        peak = (response == cv2.dilate(response, np.ones((_APART_PX, _APART_PX)))) & (response > _LEAST_RESPONSE)
+        response = _chess_response(image)
+        largest_near = cv2.dilate(response, np.ones((_PEAK_WINDOW_PX, _PEAK_WINDOW_PX)))
+        peak = (response == largest_near) & (response > _LEAST_RESPONSE)
         at = np.argwhere(peak)
         strongest = np.argsort(-response[peak], kind="stable")[:_MOST_PEAKS]
         if _largest_grid(at[strongest].astype(np.float64)) >= enough:
@@ -45,11 +52,10 @@ def in_rows(image: np.ndarray, enough: float) -> bool:
 
 
 def _largest_grid(at: np.ndarray) -> int:
-    """Most of the points at (n, 2) px that hang together by links, each between two that have neighbours opposite to
-    each other in two directions."""
+    """How many of the points at (n, 2) px are in the largest connected part of the graph of `_grid_links`."""
     if len(at) <= _NEAREST:
         return 0
-    links = _links(at)
+    links = _grid_links(at)
     inner = links.any(axis=1)
     links = links[np.ix_(inner, inner)]
     _, group = connected_components(links | links.T, directed=False)
@@ -57,36 +63,43 @@ def _largest_grid(at: np.ndarray) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _links(at):
-    """(n, n) bool: from each point with two pairs of opposite neighbours, not in one line, to these."""
+def _grid_links(at):
+    """(n, n) bool: [i, j] where point i of at (n, 2) px has j as a neighbour in a grid.
+
+    A point of a grid has two pairs of opposite neighbours, in two directions. Points without have no links of theirs.
+    """
     n = len(at)
-    links, far = np.zeros((n, n), dtype=np.bool_), np.empty(n)
+    links, distance = np.zeros((n, n), dtype=np.bool_), np.empty(n)
     for i in range(n):
         for j in range(n):
-            far[j] = hypot(at[j, 0] - at[i, 0], at[j, 1] - at[i, 1])
-        near = np.argsort(far)[1 : _NEAREST + 1]
+            distance[j] = hypot(at[j, 0] - at[i, 0], at[j, 1] - at[i, 1])
+        near = np.argsort(distance)[1 : _NEAREST + 1]
         first = -1
         for a in range(_NEAREST):
             for b in range(a + 1, _NEAREST):
                 p, q = at[near[a]] - at[i], at[near[b]] - at[i]
-                if hypot(p[0] + q[0], p[1] + q[1]) > _OPPOSITE * min(far[near[a]], far[near[b]]):
+                if hypot(p[0] + q[0], p[1] + q[1]) > _OPPOSITE * min(distance[near[a]], distance[near[b]]):
                     continue
                 links[i, near[a]] = links[i, near[b]] = True
                 if first < 0:
                     first = near[a]
-        other = False
+        second_direction = False
         for j in near:
             if links[i, j]:
                 p, q = at[j] - at[i], at[first] - at[i]
-                other |= abs(p[0] * q[1] - p[1] * q[0]) > _LEAST_SINE * far[j] * far[first]
-        if not other:
+                cross = abs(p[0] * q[1] - p[1] * q[0])
+                second_direction |= cross > _LEAST_SINE * distance[j] * distance[first]
+        if not second_direction:
             links[i] = False
     return links
 
 
-def _response(image: np.ndarray) -> np.ndarray:
-    """(h - 10, w - 10) float32, ChESS: opposite places alike, those a quarter turn away different, the mean as in the
-    middle."""
+def _chess_response(image: np.ndarray) -> np.ndarray:
+    """(h - 10, w - 10) float32: the ChESS response [grey levels] of the image (h, w) without its border of 5 px.
+
+    At an X-corner opposite samples are alike, those a quarter turn away differ, and the mean of the ring is that of the
+    middle: the response is the sum response less the difference and mean responses.
+    """
     grey = load_cv2().GaussianBlur(image, (0, 0), 1.0).astype(np.int16)
     h, w = grey.shape
 
@@ -102,22 +115,23 @@ def _response(image: np.ndarray) -> np.ndarray:
     return (crossed - unlike - off).astype(np.float32)
 
 
-def goes_on(image: np.ndarray, framed: np.ndarray) -> bool:
-    """Whether a board goes on beyond one of its sides: half of the places beside it are X-corners, too.
+def continues_beyond(image: np.ndarray, framed: np.ndarray) -> bool:
+    """Whether the pattern continues beyond a side of the board: X-corners are at more than half of the places there.
 
-    framed (rows + 2, cols + 2, 2) px: the inner corners with one more row and column on each side.
+    framed (rows + 2, cols + 2, 2) px: the inner corners, and a row or column extrapolated beyond each side. A search
+    for a small board must not take a part of a larger one for it.
     """
     for turned in (framed, framed[::-1], framed.swapaxes(0, 1), framed.swapaxes(0, 1)[::-1]):
         beside, inner = turned[0], turned[1, 1:-1]
         along = 0.5 * (beside[2:] - beside[:-2])
-        if _crossings(image, beside[1:-1].copy(), along, inner - beside[1:-1]) > _GOES_ON * len(inner):
+        if _crossings(image, beside[1:-1].copy(), along, inner - beside[1:-1]) > _CONTINUED_SHARE * len(inner):
             return True
     return False
 
 
 @njit(cache=True, nogil=True)
 def _crossings(image, at, ea, eb):
-    """How many X-corners there are near the places at (n, 2) px, from which edges lead along ea and eb (n, 2) px."""
+    """How many X-corners are near the places at (n, 2) px; ea and eb (n, 2) px: along their edges, a square long."""
     count = 0
     for i in range(len(at)):
         most = _MOST_MOVE * min(hypot(ea[i, 0], ea[i, 1]), hypot(eb[i, 0], eb[i, 1])) + 1.0

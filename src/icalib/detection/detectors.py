@@ -15,7 +15,7 @@ from icalib.detection.checkerboard import CheckerboardDetector
 from icalib.detection.circles import CirclesDetector
 from icalib.detection.corners import ImageCorners, no_corners
 from icalib.detection.markers import MarkerDetector
-from icalib.detection.prediction import Expected, expected_next
+from icalib.detection.prediction import PredictedCorners, predict_corners
 from icalib.detection.quads import View
 from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles, Markers, Scene, Target
@@ -40,7 +40,7 @@ class _Finder(Protocol):
 
 @runtime_checkable
 class _Follower(_Finder, Protocol):
-    def find_near(self, view: View, expected: Expected) -> ImageCorners | None:
+    def find_near(self, view: View, expected: PredictedCorners) -> ImageCorners | None:
         """As `find`, where corners are expected; None where the whole image is to be searched."""
         ...
 
@@ -58,7 +58,7 @@ class _Detector:
 
     def detect(self, image: np.ndarray, before: Sequence[ImageCorners] = ()) -> ImageCorners:
         view = View(image)
-        expected = expected_next(before) if isinstance(self.finder, _Follower) else None
+        expected = predict_corners(before) if isinstance(self.finder, _Follower) else None
         if expected is not None and isinstance(self.finder, _Follower):
             found = self.finder.find_near(view, expected)
             if found is not None:
@@ -121,7 +121,7 @@ class _Inverted:
     def find(self, view: View) -> ImageCorners:
         return self.detector.find(View(255 - view.image))
 
-    def find_near(self, view: View, expected: Expected) -> ImageCorners | None:
+    def find_near(self, view: View, expected: PredictedCorners) -> ImageCorners | None:
         return self.detector.find_near(View(255 - view.image), expected)
 
 
@@ -135,8 +135,8 @@ class _Renumbered:
     def find(self, view: View) -> ImageCorners:
         return self._renumbered(self.detector.find(view))
 
-    def find_near(self, view: View, expected: Expected) -> ImageCorners | None:
-        found = self.detector.find_near(view, Expected(np.argsort(self.number)[expected.point], expected.uv))
+    def find_near(self, view: View, expected: PredictedCorners) -> ImageCorners | None:
+        found = self.detector.find_near(view, PredictedCorners(np.argsort(self.number)[expected.point], expected.uv))
         return None if found is None else self._renumbered(found)
 
     def _renumbered(self, found: ImageCorners) -> ImageCorners:

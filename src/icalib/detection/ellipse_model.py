@@ -1,7 +1,13 @@
-"""Kernel that places the image of a circle: a blurred ellipse is fitted to the pixels about its edge.
+"""Kernel that fits a blurred ellipse to the pixels about its edge, by Gauss-Newton with limited steps.
 
-The model is point symmetric about the ellipse's centre, as the image of an ellipse is under blur and any response to
-light, so that these do not bias the centre.
+    grey(u) = inside + (outside - inside) Phi(d(u) / blur),  d(u) = (|W (u - c)| - 1) / |gradient of |W (u - c)||
+
+c (2,) px is the centre, W (2, 2) 1/px maps the ellipse to the unit circle, Phi is the normal distribution function, and
+d is the distance from the ellipse to first order (Sampson). The model is point symmetric about c. So is the image of an
+ellipse under blur and any response to light, which therefore do not bias the centre.
+
+Parameters are c (2), the symmetric S of W <- (I + S) W (S_00, S_11, S_01), blur [px], and the grey levels inside and
+outside. S is symmetric because a rotation of W's unit circle does not change the ellipse.
 """
 
 from __future__ import annotations
@@ -14,25 +20,27 @@ from numba import njit
 from icalib.detection.edge_model import solve_small
 from icalib.detection.tags import LEAST_CONTRAST
 
-_SIZE = 8  # centre, three of the shape, blur, low, high
-_ITERATIONS = 20
-_CONVERGED_PX = 1e-3
-_MOST_STEP_PX = 1.0
-_HALF_STRIP = (2.0, 3.0)  # px, and blurs: fitted on each side of the edge
-_MOST_STRIP = 0.6  # of the smaller half axis
-_USUAL_BLUR = 0.8  # px, at first
-_BLUR_RANGE = (0.35, 6.0)
-_MOST_MOVE = 0.5  # of the smaller half axis: from where a circle is expected
-LEAST_HALF_AXIS_PX = 2.5
+_SIZE = 8  # number of parameters
+_ITERATIONS = 20  # at most; a fit that needs more counts as failed
+_CONVERGED_PX = 1e-3  # largest motion of the edge in the last step; far below the noise of a centre
+_MOST_STEP_PX = 1.0  # largest motion of the edge in one step: the model is linear about a blur's width
+_HALF_STRIP = (2.0, 3.0)  # px, and blurs, whichever is larger: half the width of the strip of pixels that is fitted
+_MOST_STRIP = 0.6  # of the smaller half axis: the same, at most. More would take in the other side of the edge
+_USUAL_BLUR = 0.8  # px, start of the fit
+_BLUR_RANGE = (0.35, 6.0)  # px; below, the pixel's own width is the blur
+_MOST_MOVE = 0.5  # of the smaller half axis, and 1 px: from the start of the fit. Doubled, it may reach a neighbour
+LEAST_HALF_AXIS_PX = 2.5  # beside the blur; smaller ellipses have no plateau inside, and are called blurred
 
 
 @njit(cache=True, nogil=True)
 def fit_ellipses(image, uv, axes):
-    """(uv (n, 2), quality (5, n)) of the ellipses near uv (n, 2) px, the images of two radii being axes (n, 2, 2) px.
+    """(uv (n, 2) px, quality (5, n)) of the ellipses in the image (h, w) that start at uv (n, 2) px with `axes`.
 
-    quality as `refined_crossings` gives it: sigma [px] per axis of the centre for a noise of one grey level, NaN where
-    there is no ellipse; blur [px]; ratio of the axes; by how much the smaller half axis exceeds the least [px]; the
-    larger diameter [px].
+    axes (n, 2, 2) px: in its rows, the images of two perpendicular radii of a circle. uv stays where no ellipse fits.
+
+    The rows of quality are those of `refined_crossings`: sigma [px] of the centre per axis for image noise of one grey
+    level, NaN where no ellipse fits; blur [px]; smaller over larger axis (in place of the sine between edges); by how
+    much the smaller half axis exceeds the least plus the blur [px] (the room); the larger diameter [px].
     """
     out, quality = uv.copy(), np.full((5, len(uv)), np.nan)
     for i in range(len(uv)):
@@ -45,23 +53,26 @@ def fit_ellipses(image, uv, axes):
 
 @njit(cache=True, nogil=True)
 def _half_axes(W):
-    """The larger and the smaller half axis of the ellipse |W (u - centre)| = 1."""
+    """The larger and the smaller half axis [px] of the ellipse |W (u - c)| = 1: from the eigenvalues of W^T W."""
     a = W[0, 0] ** 2 + W[1, 0] ** 2
     b = W[0, 0] * W[0, 1] + W[1, 0] * W[1, 1]
     c = W[0, 1] ** 2 + W[1, 1] ** 2
-    mean, apart = 0.5 * (a + c), hypot(0.5 * (a - c), b)
-    return 1.0 / sqrt(max(mean - apart, 1e-12)), 1.0 / sqrt(mean + apart)
+    mean, half_gap = 0.5 * (a + c), hypot(0.5 * (a - c), b)
+    return 1.0 / sqrt(max(mean - half_gap, 1e-12)), 1.0 / sqrt(mean + half_gap)
 
 
 @njit(cache=True, nogil=True)
 def _fit(image, u0, v0, axes):
-    """(u, v, sigma, blur, larger and smaller half axis); sigma is NaN where no ellipse fits."""
+    """(u, v, sigma, blur, larger and smaller half axis) [px], from (u0, v0); sigma is NaN where no ellipse fits.
+
+    sigma is for image noise of one grey level, and the mean of both axes.
+    """
     det = axes[0, 0] * axes[1, 1] - axes[0, 1] * axes[1, 0]
     if not abs(det) > 1e-9:
         return u0, v0, np.nan, 0.0, 0.0, 0.0
     # Rows of axes are the images of two radii: the ellipse is centre + axes^T (unit vector).
     W = np.array([[axes[1, 1], -axes[1, 0]], [-axes[0, 1], axes[0, 0]]]) / det
-    p = np.array([u0, v0, _USUAL_BLUR, 0.0, 0.0])  # centre, blur, low, high
+    p = np.array([u0, v0, _USUAL_BLUR, 0.0, 0.0])  # centre, blur, grey inside, grey outside; W holds the shape
     A = np.zeros((_SIZE, _SIZE))
     done = False
     for iteration in range(_ITERATIONS):
@@ -79,13 +90,14 @@ def _fit(image, u0, v0, axes):
         scale = min(1.0, _MOST_STEP_PX / max(moved, 1e-12))
         p[0] += scale * step[0]
         p[1] += scale * step[1]
-        C = scale * np.array([[step[2], step[4]], [step[4], step[3]]])
+        S = scale * np.array([[step[2], step[4]], [step[4], step[3]]])
         changed = np.empty((2, 2))
         for i in range(2):
             for j in range(2):
-                changed[i, j] = W[i, j] + C[i, 0] * W[0, j] + C[i, 1] * W[1, j]
+                changed[i, j] = W[i, j] + S[i, 0] * W[0, j] + S[i, 1] * W[1, j]
         W = changed
         p[2] = min(max(p[2] + scale * min(max(step[5], -0.5 * p[2]), p[2]), _BLUR_RANGE[0]), _BLUR_RANGE[1])
+        # Grey levels enter linearly: their step needs no limit.
         p[3] += step[6]
         p[4] += step[7]
         if moved < _CONVERGED_PX:
@@ -102,6 +114,7 @@ def _fit(image, u0, v0, axes):
 
 @njit(cache=True, nogil=True)
 def _inside(image, p, reach):
+    """Whether the image holds all pixels within `reach` px of the centre."""
     return (
         p[0] - reach >= 0.0
         and p[1] - reach >= 0.0
@@ -111,28 +124,30 @@ def _inside(image, p, reach):
 
 
 @njit(cache=True, nogil=True)
-def _accumulate(A, image, p, W, half, levels):
-    """Normal equations of the pixels within `half` px of the edge: A is filled, the right side and the number of pixels
-    are returned. With `levels` the grey levels p[3], p[4] are first set to the means inside and outside."""
+def _accumulate(A, image, p, W, half, set_levels):
+    """Fills A (8, 8) with J^T J of the pixels within `half` px of the edge; returns J^T error (8,) and their number.
+
+    With `set_levels` the grey levels p[3], p[4] are first set to the means inside and outside.
+    """
     large, _ = _half_axes(W)
     x0, x1 = int(np.ceil(p[0] - large - half)), int(p[0] + large + half)
     y0, y1 = int(np.ceil(p[1] - large - half)), int(p[1] + large + half)
-    if levels:
+    if set_levels:
         _set_levels(image, p, W, half, x0, x1, y0, y1)
     A[:] = 0.0
     b, J, n = np.zeros(_SIZE), np.empty(_SIZE), 0
     contrast, blur = p[4] - p[3], p[2]
     for y in range(y0, y1 + 1):
         for x in range(x0, x1 + 1):
-            d, t0, t1, s0, s1, steep, radius = _distance(W, x - p[0], y - p[1])
+            d, t0, t1, s0, s1, gradient, radius = _distance(W, x - p[0], y - p[1])
             if not abs(d) <= half:
                 continue
             z = d / blur
             share = 0.5 * (1.0 + erf(z / sqrt(2.0)))
             slope = contrast * exp(-0.5 * z * z) / (sqrt(2.0 * pi) * blur)
-            J[0], J[1] = -slope * s0 / steep, -slope * s1 / steep
-            J[2], J[3] = slope * radius * t0 * t0 / steep, slope * radius * t1 * t1 / steep
-            J[4] = slope * 2.0 * radius * t0 * t1 / steep
+            J[0], J[1] = -slope * s0 / gradient, -slope * s1 / gradient
+            J[2], J[3] = slope * radius * t0 * t0 / gradient, slope * radius * t1 * t1 / gradient
+            J[4] = slope * 2.0 * radius * t0 * t1 / gradient
             J[5], J[6], J[7] = -slope * z, 1.0 - share, share
             error = image[y, x] - p[3] - contrast * share
             n += 1
@@ -143,32 +158,35 @@ def _accumulate(A, image, p, W, half, levels):
     for i in range(_SIZE):
         for j in range(i):
             A[j, i] = A[i, j]
-        A[i, i] *= 1.0 + 1e-9
+        A[i, i] *= 1.0 + 1e-9  # keeps A positive definite to rounding
     return b, n
 
 
 @njit(cache=True, nogil=True)
 def _distance(W, x, y):
-    """Distance [px] of a pixel from the ellipse |W u| = 1, positive outside, to first order; the unit vector
-    W u / |W u|, the slope of |W u| by u, its length, and |W u|."""
+    """Sampson distance [px] of the pixel u = (x, y) from the ellipse |W u| = 1, positive outside, and its terms.
+
+    The terms: the unit vector W u / |W u| (2), the gradient of |W u| [1/px] (2), its length, and |W u|.
+    """
     a, b = W[0, 0] * x + W[0, 1] * y, W[1, 0] * x + W[1, 1] * y
     radius = max(hypot(a, b), 1e-9)
     t0, t1 = a / radius, b / radius
     s0, s1 = t0 * W[0, 0] + t1 * W[1, 0], t0 * W[0, 1] + t1 * W[1, 1]
-    steep = hypot(s0, s1)
-    return (radius - 1.0) / steep, t0, t1, s0, s1, steep, radius
+    gradient = hypot(s0, s1)
+    return (radius - 1.0) / gradient, t0, t1, s0, s1, gradient, radius
 
 
 @njit(cache=True, nogil=True)
 def _set_levels(image, p, W, half, x0, x1, y0, y1):
-    low, n_low, high, n_high = 0.0, 0, 0.0, 0
+    """Sets p[3], p[4] to the mean grey inside and outside, of the pixels of the strip furthest from the edge."""
+    inside, n_inside, outside, n_outside = 0.0, 0, 0.0, 0
     for y in range(y0, y1 + 1):
         for x in range(x0, x1 + 1):
             d = _distance(W, x - p[0], y - p[1])[0]
             if -half <= d <= -0.5 * half:
-                low += image[y, x]
-                n_low += 1
+                inside += image[y, x]
+                n_inside += 1
             elif 0.5 * half <= d <= half:
-                high += image[y, x]
-                n_high += 1
-    p[3], p[4] = low / max(n_low, 1), high / max(n_high, 1)
+                outside += image[y, x]
+                n_outside += 1
+    p[3], p[4] = inside / max(n_inside, 1), outside / max(n_outside, 1)

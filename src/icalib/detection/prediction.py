@@ -1,7 +1,7 @@
-"""Where the corners of one image are to be expected in the next, and kernels that expect the rest of a board there.
+"""Predicts where the corners of the next image are, and kernels that fill in the other nodes of a board.
 
-Corners move on with the acceleration [px / image^2] that they had in the last three images, or with the speed that they
-had in the last two.
+Corners are extrapolated image by image: with constant acceleration [px / image^2] from three images, with constant
+velocity [px / image] from two.
 """
 
 from __future__ import annotations
@@ -16,55 +16,64 @@ from icalib.detection.corners import ImageCorners
 from icalib.detection.decoding import mapped
 from icalib.detection.growth import fit_homography
 
-_LEAST_COMMON = 4  # corners that two images must share to show how the target moves
-_NEAREST = 12  # corners that place a node of a board that was not seen before
-_MARGIN_PX = 8.0  # a corner further inside the image than that must be found again
-IMAGES = 3  # that show how corners move
+_LEAST_COMMON = 4  # corners that the images must share; with fewer the motion of the target is not known
+_NEAREST = 12  # known nodes whose homography predicts an unknown one; with more, distortion matters
+_MARGIN_PX = 8.0  # corners closer to the border may be missing; doubled, a target that leaves the image is lost later
+MOTION_IMAGES = 3  # latest images that the extrapolation uses: the acceleration needs three
 
 
-class Expected(NamedTuple):
-    """Corners that are to be seen: point (n,) int64, uv (n, 2) px."""
+class PredictedCorners(NamedTuple):
+    """Where corners are expected: point (n,) int64, index into the target's points; uv (n, 2) px."""
 
     point: np.ndarray
     uv: np.ndarray
 
-    def are_found(self, image: np.ndarray, found: ImageCorners, margin_px: float = _MARGIN_PX) -> bool:
-        """Whether all that lie further inside the image (h, w) than the margin were found."""
+    def all_found(self, image: np.ndarray, found: ImageCorners, margin_px: float = _MARGIN_PX) -> bool:
+        """Whether `found` has every predicted corner that is more than `margin_px` inside the image (h, w)."""
         high = np.array(image.shape[::-1]) - 1.0 - margin_px
         inside = ((self.uv >= margin_px) & (self.uv <= high)).all(axis=1)
         return bool(np.isin(self.point[inside], found.point).all())
 
 
-def expected_next(before: Sequence[ImageCorners]) -> Expected | None:
-    """The corners of the last of the images `before`, in order, where they should be in the next one; None where two
-    images do not show how they move. A corner that not all images have moves as the nearest one that they have."""
+def predict_corners(before: Sequence[ImageCorners]) -> PredictedCorners | None:
+    """The corners of the last image of `before` (oldest first), moved to where the next image should show them.
+
+    The step of a corner needs its place in the last three images. A corner that one of them lacks takes the step of
+    the nearest corner that has one. Where three images share fewer than four corners, the last two are used. None
+    where these share fewer than four, too, or there are fewer than two images.
+    """
     if len(before) < 2:
         return None
-    last, recent = before[-1], before[-IMAGES:]
-    at = np.full((len(recent), 1 + max(int(image.point.max(initial=-1)) for image in recent)), -1, dtype=np.int64)
-    for row, image in zip(at, recent, strict=True):
-        row[image.point] = np.arange(len(image.point))
-    common = np.flatnonzero((at >= 0).all(axis=0))
+    last, recent = before[-1], before[-MOTION_IMAGES:]
+    # row_of[i, p]: row of point p in image i, -1 where the image lacks it.
+    n_points = 1 + max(int(image.point.max(initial=-1)) for image in recent)
+    row_of = np.full((len(recent), n_points), -1, dtype=np.int64)
+    for rows, image in zip(row_of, recent, strict=True):
+        rows[image.point] = np.arange(len(image.point))
+    common = np.flatnonzero((row_of >= 0).all(axis=0))
     if len(common) < _LEAST_COMMON:
-        return expected_next(before[-2:]) if len(recent) > 2 else None
-    places = [image.uv[row[common]] for row, image in zip(at, recent, strict=True)]
-    step = places[-1] - places[-2]
-    if len(recent) == IMAGES:
-        step = 2.0 * step - (places[-2] - places[-3])
-    like = np.full(len(last.point), -1)
-    like[at[-1, common]] = np.arange(len(common))
-    fresh = np.flatnonzero(like < 0)
-    apart = ((last.uv[fresh, None, :] - places[-1]) ** 2).sum(axis=2)
-    like[fresh] = np.argmin(apart, axis=1)
-    return Expected(last.point, last.uv + step[like])
+        return predict_corners(before[-2:]) if len(recent) > 2 else None
+    uv = [image.uv[rows[common]] for rows, image in zip(row_of, recent, strict=True)]
+    step = uv[-1] - uv[-2]
+    if len(recent) == MOTION_IMAGES:
+        step = 2.0 * step - (uv[-2] - uv[-3])
+    step_of = np.full(len(last.point), -1)
+    step_of[row_of[-1, common]] = np.arange(len(common))
+    without = np.flatnonzero(step_of < 0)
+    squared_distance = ((last.uv[without, None, :] - uv[-1]) ** 2).sum(axis=2)
+    step_of[without] = np.argmin(squared_distance, axis=1)
+    return PredictedCorners(last.point, last.uv + step[step_of])
 
 
 @njit(cache=True, nogil=True)
-def expected_nodes(at, uv, rows, cols):
-    """(rows, cols, 2) px: the nodes of a board, from those that are expected at (n, 2) int64 (row, column) at uv (n, 2)
-    px. The others lie where the homography of the nearest ones puts them."""
+def predict_nodes(at, uv, rows, cols):
+    """(rows, cols, 2) px: where all nodes of a board are, from the known ones.
+
+    at (n, 2) int64: row and column of the known nodes; uv (n, 2) px: where these are, which is kept. Each other node is
+    placed by the homography of the known nodes nearest to it on the board.
+    """
     out, known = np.empty((rows, cols, 2)), np.zeros((rows, cols), dtype=np.bool_)
-    xy = at.astype(np.float64)
+    on_board = at.astype(np.float64)
     for i in range(len(at)):
         out[at[i, 0], at[i, 1]], known[at[i, 0], at[i, 1]] = uv[i], True
     n = min(_NEAREST, len(at))
@@ -72,7 +81,7 @@ def expected_nodes(at, uv, rows, cols):
         for col in range(cols):
             if known[row, col]:
                 continue
-            apart = (xy[:, 0] - row) ** 2 + (xy[:, 1] - col) ** 2
-            near = np.argsort(apart, kind="mergesort")[:n]
-            out[row, col] = mapped(fit_homography(xy[near], uv[near], n), float(row), float(col))
+            squared_distance = (on_board[:, 0] - row) ** 2 + (on_board[:, 1] - col) ** 2
+            near = np.argsort(squared_distance, kind="mergesort")[:n]  # stable, so that ties do not change the result
+            out[row, col] = mapped(fit_homography(on_board[near], uv[near], n), float(row), float(col))
     return out

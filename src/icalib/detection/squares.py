@@ -10,7 +10,7 @@ from numba import njit
 from icalib.detection.consistency import consistent_corners
 from icalib.detection.corners import ImageCorners, judged, no_corners
 from icalib.detection.growth import LEAST_SIDE_PX, side_vectors
-from icalib.detection.prediction import expected_nodes
+from icalib.detection.prediction import predict_nodes
 from icalib.detection.refinement import refined_crossings
 from icalib.detection.saddles import crossing_contrast, find_saddle
 from icalib.detection.tags import LEAST_CONTRAST, shortest_side
@@ -38,7 +38,7 @@ def square_corners(image: np.ndarray, expected: np.ndarray, dark: np.ndarray, in
     quads, found = _roughly(image, expected[at[:, :, 0], at[:, :, 1]], inner, clear)
     if found.sum() >= _LEAST_CORNERS and clear * _usual_side(quads) >= _LEAST_CLEAR_PX:
         # Once more from where the corners are, so that nothing depends on where they were expected.
-        expected = expected_nodes(at[found], quads[found], rows + 1, cols + 1)
+        expected = predict_nodes(at[found], quads[found], rows + 1, cols + 1)
         quads, found = _roughly(image, expected[at[:, :, 0], at[:, :, 1]], inner, clear)
     usable = np.array([shortest_side(quad) >= LEAST_SIDE_PX for quad in quads], dtype=bool)
     at, quads, found = at[usable], quads[usable], found[usable]

@@ -20,9 +20,9 @@ from icalib.detection.cache import keep_corners, load_corners, stream_key
 from icalib.detection.corners import ImageCorners, corner_stream, packed
 from icalib.detection.detectors import Detector, detector_of
 from icalib.detection.diagnosis import what_is_seen, with_other_border, with_other_layout
-from icalib.detection.prediction import IMAGES
+from icalib.detection.prediction import MOTION_IMAGES
 from icalib.detection.sightings import parts_of, sightings, without_rare_tags
-from icalib.detection.turns import continuous
+from icalib.detection.turns import number_continuously
 from icalib.errors import RecordingError
 from icalib.extras import load_cv2
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Markers, Scene, Target
@@ -61,7 +61,7 @@ def find_corners(
         if keep:
             keep_corners(key, *found)
     stamps_ns, images = found
-    images, rare = without_rare_tags(target, continuous(target, images))
+    images, rare = without_rare_tags(target, number_continuously(target, images))
     seen = sum(bool(i.kept.any()) for i in images)
     if not seen:
         what = f"{where}: {_called(target)} in none of {len(images)} images of {camera.name}; "
@@ -195,7 +195,7 @@ def _in_turn(payloads: list[Payload], detector: Detector) -> tuple[list[int], li
             damaged = str(error)
             continue
         stamps.append(p.stamp_ns)
-        found.append(detector.detect(image, found[-IMAGES:]))
+        found.append(detector.detect(image, found[-MOTION_IMAGES:]))
     return stamps, found, damaged
 
 
