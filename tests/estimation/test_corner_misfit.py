@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from icalib.estimation.corner_misfit import misfit
+from icalib.estimation.corner_misfit import lens_misfit
 from icalib.measurements import CornerStream
 
 SIZE = np.array([752.0, 480.0])
@@ -30,7 +30,7 @@ def test_noise_and_what_single_images_share_are_no_misfit(images: int):
         stream = stream_of(rng, images)
         shift = rng.normal(scale=0.3, size=(images, 2))[stream.image]
         residual = shift + rng.normal(scale=0.2, size=stream.uv.shape)
-        found = misfit(stream, residual, np.ones(len(residual), dtype=bool))
+        found = lens_misfit(stream, residual, np.ones(len(residual), dtype=bool))
         assert found.rms == 0.0 and not found.field.any()
 
 
@@ -42,7 +42,7 @@ def test_an_error_that_stays_with_the_place_in_the_image_is_told_in_pixels(image
     used = rng.random(len(error)) < 0.9
     residual = error + rng.normal(scale=0.2, size=error.shape)
     residual[~used] = 1e3
-    found = misfit(stream, residual, used)
+    found = lens_misfit(stream, residual, used)
     # A cell's mean is a little less than the error: that bends within the cell.
     assert found.rms == pytest.approx(0.3, rel=0.1)
     left = (residual - found.field)[used]
@@ -51,5 +51,5 @@ def test_an_error_that_stays_with_the_place_in_the_image_is_told_in_pixels(image
 
 def test_no_corners_show_nothing():
     stream = stream_of(np.random.default_rng(0), 3)
-    found = misfit(stream, np.zeros((len(stream.uv), 2)), np.zeros(len(stream.uv), dtype=bool))
+    found = lens_misfit(stream, np.zeros((len(stream.uv), 2)), np.zeros(len(stream.uv), dtype=bool))
     assert found.rms == 0.0 and found.field.shape == (len(stream.uv), 2)

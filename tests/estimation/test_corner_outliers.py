@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.estimation.corner_outliers import stand_alone
+from icalib.estimation.corner_outliers import isolated
 
 SIZE = np.array([900.0, 600.0])
 NOISE_PX = 0.15
@@ -32,13 +32,13 @@ def test_an_error_of_the_lens_is_kept_and_gross_ones_are_not():
     kept, count = 0, 0
     for seed in range(4):
         rng = np.random.default_rng(seed)
-        uv, found_in = corners(rng)
+        uv, tag = corners(rng)
         residual = lens_error(uv) + NOISE_PX * rng.normal(size=uv.shape)
         wrong = rng.random(len(uv)) < 0.02
         residual[wrong] += gross(rng, int(wrong.sum()), 4.0, 40.0)
         suspect = np.linalg.norm(residual, axis=1) > 1.0
         assert (suspect & ~wrong).sum() > 100  # without neighbours these would be rejected
-        alone = stand_alone(uv, residual, suspect, found_in)
+        alone = isolated(uv, residual, suspect, tag)
         assert not (alone & ~suspect).any()
         assert (alone & ~wrong).sum() <= 0.02 * (suspect & ~wrong).sum()
         kept, count = kept + (wrong & ~alone).sum(), count + wrong.sum()
@@ -48,15 +48,15 @@ def test_an_error_of_the_lens_is_kept_and_gross_ones_are_not():
 def test_corners_that_were_found_together_say_nothing_for_one_another():
     """A tag that was taken for another one is off by the same in all its corners."""
     rng = np.random.default_rng(5)
-    uv, found_in = corners(rng)
+    uv, tag = corners(rng)
     residual = NOISE_PX * rng.normal(size=uv.shape)
-    residual[found_in == 7] += [3.0, 2.0]
+    residual[tag == 7] += [3.0, 2.0]
     suspect = np.linalg.norm(residual, axis=1) > 1.0
-    np.testing.assert_array_equal(stand_alone(uv, residual, suspect, found_in), found_in == 7)
+    np.testing.assert_array_equal(isolated(uv, residual, suspect, tag), tag == 7)
 
 
 def test_few_corners_or_none_suspect():
     uv, residual = np.array([[1.0, 2.0], [30.0, 4.0], [7.0, 90.0]]), np.array([[0.1, 0.0], [9.0, 0.0], [0.0, 0.1]])
     none = np.zeros(3, dtype=bool)
-    assert not stand_alone(uv, residual, none, np.arange(3)).any()
-    np.testing.assert_array_equal(stand_alone(uv, residual, residual[:, 0] > 1.0, np.arange(3)), [False, True, False])
+    assert not isolated(uv, residual, none, np.arange(3)).any()
+    np.testing.assert_array_equal(isolated(uv, residual, residual[:, 0] > 1.0, np.arange(3)), [False, True, False])

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.estimation.corner_factor import CornerFactor, CornerOutput
-from icalib.estimation.corner_misfit import misfit
+from icalib.estimation.corner_misfit import lens_misfit
 from icalib.estimation.corner_noise import LARGE_MISFIT
 from icalib.estimation.estimate import Estimate
 from icalib.estimation.medians import median_variance
@@ -51,7 +51,7 @@ def lens_warnings(rig: Rig, found: Estimate) -> Iterator[str]:
         if camera.distortion.mode == "fixed" or not used.any():
             continue
         error = factor.errors(out)
-        shown = misfit(factor.stream, error, used)
+        shown = lens_misfit(factor.stream, error, used)
         noise = np.sqrt(median_variance(((error - shown.field)[used] ** 2).sum(axis=1)))
         if not shown.rms > LARGE_MISFIT * noise:
             continue

@@ -1,9 +1,9 @@
-"""Errors that corners share wherever in the image they are seen: what the model of a lens cannot follow.
+"""Misfit of the lens model: the part of the corner residuals that depends on the place in the image alone.
 
-The residuals of a camera are averaged over cells of the image, in groups of consecutive images. Where there is no
-misfit, the means of two groups have nothing in common: the mean product of different groups is that of the misfit with
-itself (a U-statistic; Hoeffding 1948). Its variance under noise is twice the sum of the squared products, whatever the
-cells of one group share, as an error of the pose.
+The residuals of a camera are averaged over cells of the image, in groups of consecutive images. Without misfit the
+means of two groups are independent, with mean zero. So the mean product over pairs of different groups estimates the
+squared misfit without bias (a U-statistic; Hoeffding 1948). Without misfit its variance is twice the sum of the squared
+products over ordered pairs. That holds even if cells of one group share an error, such as one of the pose.
 """
 
 from __future__ import annotations
@@ -14,53 +14,63 @@ import numpy as np
 
 from icalib.measurements import CornerStream
 
-CELLS = (12, 8)  # columns, rows of the part of the image that shows corners
-GROUPS = 200  # of images, at most: consecutive ones of a video share errors
-FEWEST_GROUPS = 3  # of a cell: fewer show nothing
-SIGNIFICANT = 5.0  # standard deviations
+CELLS = (
+    12,
+    8,
+)  # columns, rows of the rectangle that holds all corners; smaller ones follow a finer misfit, with more noise each
+GROUPS = 200  # at most; consecutive images of a video share errors, which must stay within a group
+FEWEST_GROUPS = 3  # with corners in a cell; cells with fewer are left out
+SIGNIFICANT = 5.0  # standard deviations under noise; a smaller misfit counts as none
 
 
 @dataclass(frozen=True)
-class Misfit:
-    """rms: of either component over all corners [px], 0 where noise explains it; field (N, 2): the mean of each
-    corner's cell [px], 0 where the cell shows none."""
+class LensMisfit:
+    """rms [px]: of either component over all corners, 0 where noise explains it; field (N, 2) [px]: the mean residual
+    in each corner's cell, 0 where too few groups have corners in it.
+
+    Residuals are predicted - measured, and so is the field.
+    """
 
     rms: float
     field: np.ndarray
 
 
-def misfit(stream: CornerStream, residual: np.ndarray, used: np.ndarray) -> Misfit:
-    """What residuals (N, 2) [px] of a camera's corners show of its lens, by those that are `used` (N,) bool."""
-    nothing = Misfit(0.0, np.zeros((len(used), 2)))
+def lens_misfit(stream: CornerStream, residual: np.ndarray, used: np.ndarray) -> LensMisfit:
+    """The misfit of one camera, from the residuals (N, 2) [px] of the corners that are `used` (N,) bool.
+
+    Zero where none is used, or the misfit is not significant.
+    """
+    nothing = LensMisfit(0.0, np.zeros((len(used), 2)))
     if not used.any():
         return nothing
     cell, n, images = _cells(stream.uv, used), CELLS[0] * CELLS[1], len(stream.stamps_ns)
     group = stream.image[used] * min(images, GROUPS) // images
-    key, of, count = np.unique(group * n + cell[used], return_inverse=True, return_counts=True)
-    means = _summed(residual[used].astype(np.float64), of, len(key)) / count[:, None]
+    key, row, count = np.unique(group * n + cell[used], return_inverse=True, return_counts=True)
+    means = _sums(residual[used].astype(np.float64), row, len(key)) / count[:, None]  # by group and cell
     groups = np.bincount(key % n, minlength=n)
-    told = groups >= FEWEST_GROUPS
-    share = np.where(told, np.bincount(cell[used], minlength=n), 0.0)
-    # Mean products of different groups' means of a cell, weighted by its corners: noise leaves 0 of each.
+    enough = groups >= FEWEST_GROUPS
+    share = np.where(enough, np.bincount(cell[used], minlength=n), 0.0)
+    # products[a, b]: over all cells, weighted by their corners, the products of the means of groups a and b, over the
+    # number of pairs. Without misfit those off the diagonal have mean zero; the diagonal holds the noise.
     scaled = np.zeros((int(group.max()) + 1, n, 2))
     root = np.sqrt(share / max(share.sum(), 1.0) / np.maximum(groups * (groups - 1.0), 1.0))
     scaled[key // n, key % n] = root[key % n, None] * means
     products = np.einsum("acx,bcx->ab", scaled, scaled, optimize=True)
     np.fill_diagonal(products, 0.0)
-    beyond = float(products.sum())
-    if not beyond > SIGNIFICANT * np.sqrt(2.0 * float((products**2).sum())):
+    square = float(products.sum())  # of both components together
+    if not square > SIGNIFICANT * np.sqrt(2.0 * float((products**2).sum())):
         return nothing
-    mean = _summed(means, key % n, n) / np.maximum(groups, 1)[:, None]
-    return Misfit(float(np.sqrt(0.5 * beyond)), np.where(told[:, None], mean, 0.0)[cell])
+    mean = _sums(means, key % n, n) / np.maximum(groups, 1)[:, None]
+    return LensMisfit(float(np.sqrt(0.5 * square)), np.where(enough[:, None], mean, 0.0)[cell])
 
 
-def _summed(values: np.ndarray, group: np.ndarray, n: int) -> np.ndarray:
-    """(n, 2) sums of values (N, 2) by group (N,)."""
+def _sums(values: np.ndarray, group: np.ndarray, n: int) -> np.ndarray:
+    """(n, 2): the sum of values (N, 2) in each group; group (N,) int, 0 to n - 1."""
     return np.stack([np.bincount(group, values[:, k], n) for k in range(2)], axis=1)
 
 
 def _cells(uv: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """(N,) cell of each corner, of the part of the image that shows those `used`."""
+    """(N,) int: the cell of each corner at uv (N, 2) px, in the rectangle that holds the `used` ones."""
     low, size = uv[used].min(axis=0), np.ptp(uv[used], axis=0) + 1e-9
     column, row = (np.clip((uv[:, k] - low[k]) / size[k] * CELLS[k], 0, CELLS[k] - 1).astype(int) for k in range(2))
     return row * CELLS[0] + column

@@ -20,7 +20,7 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation.corner_factor import CornerFactor, CornerNoise, CornerOutput
-from icalib.estimation.corner_misfit import misfit
+from icalib.estimation.corner_misfit import lens_misfit
 from icalib.estimation.evidence import Fit
 from icalib.estimation.medians import median_variance
 from icalib.estimation.state import State
@@ -116,7 +116,7 @@ def estimate_noise(
             "gives of its rotation, translation, time_offset and lens, or leave it out to have it found."
         )
     relative, error = stream.relative_sigma[used], factor.errors(out)
-    lens = misfit(stream, error, used)
+    lens = lens_misfit(stream, error, used)
     square = ((error - lens.field)[used] ** 2).sum(axis=1) / relative**2
     base, exposure = np.sqrt(median_variance(square)), 0.0
     if settings.blur_noise:

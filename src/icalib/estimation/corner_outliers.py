@@ -1,9 +1,9 @@
-"""Corners that are rejected: those that stand out of their image, and apart from all that is seen near them.
+"""Rejects corners with large residuals, unless their neighbours in the image plane have similar ones.
 
-A lens that its model cannot follow makes large errors near the border of the image, but similar ones in neighbouring
-corners of all images, smaller ones further in. A gross outlier stands alone. So a corner that stands out of its image
-is kept where a chain of neighbours in the image plane, each with an error like the one before, leads to a corner that
-does not stand out.
+A lens that its model cannot follow makes large residuals near the border of the image. Neighbouring corners of all
+images have similar ones, and they decrease towards the middle. A gross outlier is isolated. So a suspect corner, one
+with a large residual, is kept where a chain of neighbours with similar residuals leads from it to a corner that is not
+suspect.
 """
 
 from __future__ import annotations
@@ -17,53 +17,58 @@ from icalib.estimation.corner_factor import CornerFactor, CornerOutput
 from icalib.estimation.medians import grouped_quantiles, largest_normal
 from icalib.rig import Settings
 
-NEIGHBOURS = 12  # with twice as many, small outliers near the border find one that is alike by chance
-FOUND_TOGETHER = 4  # consecutive points of one image, which a detector finds (and misses) together: a tag's corners
-ALIKE = 0.7  # of a residual: how far its neighbour's may be from it
+NEIGHBOURS = 12  # with twice as many, small outliers near the border find a similar residual by chance
+# Consecutive points of one image that are no neighbours, in any target: a tag that is taken for another is off alike in
+# all of its corners.
+TAG_CORNERS = 4
+SIMILAR = 0.7  # of a residual's length: its largest distance from a similar one; at 1 zero would be similar
 
 
 def inliers(factor: CornerFactor, out: CornerOutput, settings: Settings) -> np.ndarray:
-    """(N,) bool: corners that are not rejected; those that the model cannot see go too.
+    """(N,) bool: corners that are not rejected. Corners outside the range of the lens model are rejected, too.
 
-    A corner stands out when its residual is larger than `outlier_min_px` and than the mean of normal errors plus
-    `outlier_std` standard deviations, by the median of its image or of all, whichever is larger.
+    A corner is suspect when its residual is larger than `outlier_min_px`, and larger than the mean of normal errors
+    plus `outlier_std` standard deviations. Both follow from the median of its image or that of all images, whichever is
+    larger (lengths of normal errors have Rayleigh's distribution). All are kept if `outlier_std` is 0.
     """
     if settings.outlier_std <= 0.0:
         return np.ones(len(out.root), dtype=bool)
-    used = np.flatnonzero((out.root > 0.0) | ~factor.keep)  # what was rejected may fit better now
+    used = np.flatnonzero((out.root > 0.0) | ~factor.keep)  # rejected corners are tested again: they may fit now
     residual, stream = out.residual[used].astype(np.float64), factor.stream
     size, image = np.linalg.norm(residual, axis=1), stream.image[used]
     median = grouped_quantiles(size, image, len(stream.stamps_ns), 0.5)[image]
     usual = np.maximum(median, np.median(size)) if len(size) else median
     limit = np.maximum(largest_normal(settings.outlier_std, 0.5) * usual, settings.outlier_min_px)
-    found_in = image * (1 + stream.point.max(initial=0) // FOUND_TOGETHER) + stream.point[used] // FOUND_TOGETHER
+    tag = image * (1 + stream.point.max(initial=0) // TAG_CORNERS) + stream.point[used] // TAG_CORNERS
     kept = np.zeros(len(out.root), dtype=bool)
-    # Without a robust loss nothing bounds what a kept corner pulls.
+    # Without a robust loss the influence of a kept corner is not bounded.
     suspect = size > limit
-    alone = suspect if settings.loss == "none" else stand_alone(stream.uv[used], residual, suspect, found_in)
-    kept[used[~alone]] = True
+    rejected = suspect if settings.loss == "none" else isolated(stream.uv[used], residual, suspect, tag)
+    kept[used[~rejected]] = True
     return kept
 
 
-def stand_alone(uv: np.ndarray, residual: np.ndarray, suspect: np.ndarray, found_in: np.ndarray) -> np.ndarray:
-    """(N,) bool: which `suspect` (N,) corners no chain of neighbours joins to one that is not suspect.
+def isolated(uv: np.ndarray, residual: np.ndarray, suspect: np.ndarray, tag: np.ndarray) -> np.ndarray:
+    """(N,) bool: the `suspect` (N,) corners that no chain of similar neighbours joins to one that is not suspect.
 
-    Corners at uv (N, 2) [px] with residuals (N, 2) [px]. Those with the same number `found_in` (N,) say nothing for
-    one another.
+    uv (N, 2) [px] and residual (N, 2) [px] are those of the corners of all images together. Corners with the same
+    number `tag` (N,) int, a tag in one image, are no neighbours: they share errors. Neighbours are the nearest in the
+    image plane.
     """
     own = np.flatnonzero(suspect)
     if not len(own):
         return np.zeros(len(uv), dtype=bool)
-    near = KDTree(uv).query(uv[own], min(NEIGHBOURS + FOUND_TOGETHER, len(uv)))[1].reshape(len(own), -1)
-    off = np.linalg.norm(residual[near] - residual[own, None], axis=2)
-    alike = (off < ALIKE * np.linalg.norm(residual[own], axis=1)[:, None]) & (found_in[near] != found_in[own, None])
-    # Node 0 stands for all corners that are not suspect.
+    near = KDTree(uv).query(uv[own], min(NEIGHBOURS + TAG_CORNERS, len(uv)))[1].reshape(len(own), -1)
+    difference = np.linalg.norm(residual[near] - residual[own, None], axis=2)
+    similar = difference < SIMILAR * np.linalg.norm(residual[own], axis=1)[:, None]
+    similar &= tag[near] != tag[own, None]
+    # A graph with a node for each suspect corner; node 0 stands for all corners that are not suspect.
     node = np.zeros(len(uv), dtype=np.int64)
     node[own] = 1 + np.arange(len(own))
-    row, column = np.nonzero(alike)
+    row, column = np.nonzero(similar)
     ends = node[own][row], node[near[row, column]]
     graph = coo_array((np.ones(len(row)), ends), shape=(len(own) + 1, len(own) + 1))
-    part = connected_components(graph, directed=False)[1]
-    alone = np.zeros(len(uv), dtype=bool)
-    alone[own[part[1:] != part[0]]] = True
-    return alone
+    component = connected_components(graph, directed=False)[1]
+    out = np.zeros(len(uv), dtype=bool)
+    out[own[component[1:] != component[0]]] = True
+    return out

@@ -1,12 +1,13 @@
-"""Corners moved to where they lie on edges that are bent as the lens bends them.
+"""Corrects corners for the curvature that the lens gives to the edges of squares and tags.
 
-A detector fits the two edges of a corner over some length, as straight ones or with a curvature of its own, and says by
-how much the corner moves with each edge's curvature. Once lens and pose are known, so is the curvature:
+A detector fits the two edges of a corner over some length, straight or with a free curvature (zero, if straight). It
+states the derivative of the corner by each edge's curvature, the gain [px^2]. Once lens and pose are known, so is the
+curvature:
 
     uv += gain (predicted curvature - fitted curvature)
 
-To first order that is the corner of a fit in which the curvature is fixed. The bias without it is that of straight
-edges in a distorted image; it grows with the square of the length that was fitted.
+To first order that is the corner of a fit with known curvature. Without the correction straight edges in a distorted
+image give biased corners; the bias grows with the square of the fitted length.
 """
 
 from __future__ import annotations
@@ -19,11 +20,13 @@ from icalib.estimation.corner_factor import CornerFactor
 from icalib.estimation.state import State
 from icalib.geometry.cameras.base import CameraModel
 
-LEAST_AREA = 1e-6  # of the square of the focal length: a plane seen from its edge has no image
+# Image of a unit area of the target at unit depth, over fx^2: 0 where the plane is seen edge-on. Below, the affine map
+# to the image is not inverted, and the corner stays where it is.
+LEAST_AREA = 1e-6
 
 
 def with_bent_edges(factor: CornerFactor, state: State) -> CornerFactor:
-    """The factor with its corners moved to where they lie as lens and poses of `state` bend their edges."""
+    """The factor with corrected corners, by lens and poses of `state`. Unchanged where the stream has no edges."""
     if not len(factor.stream.edges):
         return factor
     uv = factor.stream.uv.copy()
@@ -42,25 +45,30 @@ def with_bent_edges(factor: CornerFactor, state: State) -> CornerFactor:
 def predicted_curvature(
     model: CameraModel, params: np.ndarray, X: np.ndarray, plane: np.ndarray, piece: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) curvature [1 / px] of a straight piece of the target in the image, and whether (n,) it is known.
+    """(n,) curvature [1 / px] in the image of a straight piece of the target, and (n,) bool whether it is known.
 
-    X (n, 3) m: the corners in the camera's frame; plane (n, 3, 2): the body's axes x and y there; piece (n, 2, 2) px:
-    from and to, beside the corner. It is the second difference over both ends and the middle.
+    X (n, 3) m: the corners in the camera frame; plane (n, 3, 2): the body's unit axes x and y in the camera frame;
+    piece (n, 2, 2) px: its two ends, relative to the corner. The sign is that of `CornerStream.edges`. Not known where
+    a point is outside the range of the lens model, or the plane is seen edge-on.
+
+    The ends and the middle of the piece are mapped to the target by the affine map at the corner, and projected. The
+    curvature is the component of their second difference across the chord, over a quarter of the chord's squared
+    length.
     """
     _, valid, J_point, _ = model.project_with_jacobians(params, X)
-    A = J_point @ plane
+    A = J_point @ plane  # px/m, from the target's plane to the image
     area = np.linalg.det(A)
     known = valid & (np.abs(area * X[:, 2] ** 2) > LEAST_AREA * params[0] ** 2)
     inverse = np.linalg.inv(np.where(known[:, None, None], A, np.eye(2)))
     uv = []
-    for beside in (piece[:, 0], piece.mean(axis=1), piece[:, 1]):
-        point = X + np.einsum("nij,njk,nk->ni", plane, inverse, beside)
-        place, valid = model.project(params, point)
+    for offset in (piece[:, 0], piece.mean(axis=1), piece[:, 1]):
+        point = X + np.einsum("nij,njk,nk->ni", plane, inverse, offset)
+        projected, valid = model.project(params, point)
         known &= valid
-        uv.append(place)
+        uv.append(projected)
     chord = uv[2] - uv[0]
-    bend = uv[0] + uv[2] - 2.0 * uv[1]
+    second_difference = uv[0] + uv[2] - 2.0 * uv[1]
     square = (chord**2).sum(axis=1)
     known &= square > 0.0
-    across = chord[:, 1] * bend[:, 0] - chord[:, 0] * bend[:, 1]
+    across = chord[:, 1] * second_difference[:, 0] - chord[:, 0] * second_difference[:, 1]
     return across / np.where(known, 0.25 * square**1.5, 1.0), known

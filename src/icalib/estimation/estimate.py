@@ -25,7 +25,7 @@ from icalib.estimation.corner_outliers import inliers
 from icalib.estimation.evidence import fits
 from icalib.estimation.feature_noise import first_following, next_following
 from icalib.estimation.guess_priors import guess_priors
-from icalib.estimation.image_pairs import moved_between
+from icalib.estimation.image_pairs import not_simultaneous
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.lidar_factor import LidarFactor
 from icalib.estimation.outcome import Outcome, Step, Visit, way_come
@@ -311,7 +311,7 @@ def _kept(inputs: Inputs, outcome: Outcome) -> tuple[np.ndarray, ...]:
     cameras, outputs, settings = outcome.problem.cameras, outcome.residuals.corners, inputs.rig.settings
     keep = [inliers(f, out, settings) for f, out in zip(cameras, outputs, strict=True)]
     if len(cameras) > 1 and _has_cameras_alone(inputs) and settings.outlier_std > 0.0:
-        apart = moved_between(cameras, outputs, settings)
+        apart = not_simultaneous(cameras, outputs, settings)
         keep = [k & ~bad[c.stream.image] for k, bad, c in zip(keep, apart, cameras, strict=True)]
     return tuple(keep)
 

@@ -1,7 +1,8 @@
-"""Images that hang on one node but were not taken from there: the rig moved between, or one was exposed later.
+"""Rejects sets of images that count as simultaneous but are not: the rig moved in between, or one was exposed later.
 
-The corners of such images are off as a whole, however well each image alone fits the target. Their medians stand out
-of those of the other images of the camera.
+Without an IMU, simultaneous images of several cameras share a keyframe (node), and so a pose of the rig. If the rig
+moved in between, no pose fits all of them, however well each image alone fits the target. The median residual of an
+image then is far above that of the camera's other images.
 """
 
 from __future__ import annotations
@@ -14,14 +15,18 @@ from icalib.estimation.corner_factor import CornerFactor, CornerOutput
 from icalib.estimation.medians import grouped_quantiles
 from icalib.rig import Settings
 
-STANDS_OUT = 8.0  # times the median of the images' medians: lenses and blur make a few times that
-MOST_SHARE = 0.2  # of the pairs: where more do not fit, no single pair is to blame
+MEDIAN_RATIO = 8.0  # of an image's median to the median of all images' medians; lenses and blur reach a few times that
+MOST_SHARE = 0.2  # of the shared keyframes: where more do not fit, no single set is to blame, and none is rejected
 
 
-def moved_between(
+def not_simultaneous(
     cameras: Sequence[CornerFactor], outputs: Sequence[CornerOutput], settings: Settings
 ) -> list[np.ndarray]:
-    """By camera (M,) bool: images that share their node with one of another camera, where either stands out."""
+    """For each camera (M,) bool: its images at keyframes that several cameras share and where an image does not fit.
+
+    An image does not fit where its median residual is above `outlier_min_px` and `MEDIAN_RATIO` times the usual one.
+    All images of its keyframe are rejected: which of them was late is not known.
+    """
     shared = _shared_nodes(cameras)
     bad = np.zeros(len(shared), dtype=bool)
     for camera, out in zip(cameras, outputs, strict=True):
@@ -29,7 +34,7 @@ def moved_between(
         medians = grouped_quantiles(size, camera.stream.image, len(camera.node), 0.5)
         own = shared[camera.node] & np.isfinite(medians)
         if own.any():
-            limit = max(STANDS_OUT * float(np.median(medians[own])), settings.outlier_min_px)
+            limit = max(MEDIAN_RATIO * float(np.median(medians[own])), settings.outlier_min_px)
             bad[camera.node[own & (medians > limit)]] = True
     if bad.sum() > MOST_SHARE * shared.sum():
         bad[:] = False
@@ -37,7 +42,7 @@ def moved_between(
 
 
 def _shared_nodes(cameras: Sequence[CornerFactor]) -> np.ndarray:
-    """(K,) bool: nodes with images of two cameras and more."""
+    """(K,) bool: keyframes with images of two or more cameras; K is one more than the last that has an image."""
     count = np.zeros(1 + max(int(c.node.max(initial=-1)) for c in cameras), dtype=np.int64)
     for camera in cameras:
         count[np.unique(camera.node)] += 1
