@@ -7,7 +7,7 @@ import pytest
 
 from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
-from icalib.geometry.lens_bundle import ImagePoints, _linearised, adjust, started
+from icalib.geometry.lens_bundle import ImagePoints, _linearised, adjust, initial_parameters
 
 RADTAN = np.array([460.0, 458.0, 371.0, 245.0, -0.28, 0.07, 2e-4, -1e-4])
 NEAR = (0.14, 0.2)
@@ -75,7 +75,7 @@ def test_what_is_held_back_is_left_with_the_noise_by_the_right_model_and_with_mo
     rms = {}
     for name in ("pinhole-equidistant", "pinhole-radtan"):
         model = camera_model(name)
-        (start,) = started(model, camera_model("pinhole-equidistant"), FISHEYE, fitted)
+        (start,) = initial_parameters(model, camera_model("pinhole-equidistant"), FISHEYE, fitted)
         params, shape, _ = adjust(model, start, fitted)
         again, same, square = adjust(model, params, held_back, shape)
         np.testing.assert_array_equal(again, params)

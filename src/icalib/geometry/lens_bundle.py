@@ -1,5 +1,8 @@
-"""A lens, the shape of the target and the poses of images together, by least squares over corners that are about in
-place already."""
+"""Bundle adjustment of one lens, the shape of the target and the poses of images, from a good initial guess.
+
+Levenberg-Marquardt; the poses are eliminated image by image (Schur complement). Points are kept in the camera frame: a
+pose changes by a small rotation and translation of its image's points.
+"""
 
 from __future__ import annotations
 
@@ -13,17 +16,21 @@ from icalib.geometry import so3
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.cameras.convert import fit_rays
 
-UNSEEN_PX = 20.0  # what a corner that the model cannot see is taken to be off by, or it would learn to look away
-MOST_ROUNDS, MOST_DAMPING = 40, 1e8
-SETTLED = 1e-5  # of the sum of squares
-START_CORNERS = 1500  # to start from; more do not make a start better
+UNSEEN_PX = 20.0  # residual of a point outside the model's range; zero would reward a lens that sees fewer points
+MOST_ROUNDS = 40  # steps, accepted or not
+MOST_DAMPING = 1e8  # of the normal equations with unit diagonal; beyond it a step is down to rounding
+SETTLED = 1e-5  # relative decrease of the sum of squares in an accepted step, below which it is the last
+START_CORNERS = 1500  # about as many are used for initial parameters; the adjustment uses all
 
 
 @dataclass(frozen=True)
 class ImagePoints:
-    """Points (N, 3) [m] in the camera frame, where an estimate has them, seen at uv (N, 2) [px]; those of image i are
-    start[i]:start[i + 1], at least one each. basis (N, 3, s): how they move with what the shape of the target differs
-    from that of the estimate by."""
+    """Points of the target in M images of one camera.
+
+    points (N, 3) [m]: in the camera frame, by an estimate; uv (N, 2) [px]: where they were measured. Those of image i
+    are start[i]:start[i + 1]; start (M + 1,) int, at least one point an image. basis (N, 3, s): derivative of the
+    points by the shape parameters, in the camera frame. The shape is relative to that of the estimate.
+    """
 
     points: np.ndarray
     uv: np.ndarray
@@ -32,23 +39,31 @@ class ImagePoints:
 
     @property
     def image(self) -> np.ndarray:
-        """(N,) the image of each point."""
+        """(N,) int: the image of each point."""
         return np.repeat(np.arange(len(self.start) - 1), np.diff(self.start))
 
     def moved(self, motion: np.ndarray, shape: np.ndarray) -> ImagePoints:
-        """With another `shape` (s,), after each image's turn and shift (M, 6)."""
-        turn = np.array([so3.exp(np.ascontiguousarray(m[:3])) for m in motion])[self.image]
-        points = np.einsum("nij,nj->ni", turn, self.points + self.basis @ shape) + motion[self.image, 3:]
-        return ImagePoints(points, self.uv, self.start, turn @ self.basis)
+        """The points after a change of `shape` (s,) and a motion (M, 6) of each image's points in the camera frame.
 
-    def total(self, values: np.ndarray) -> np.ndarray:
-        """(M, ...) sums of values (N, ...) by image."""
+        A motion is a rotation vector [rad] and a translation [m].
+        """
+        R = np.array([so3.exp(np.ascontiguousarray(m[:3])) for m in motion])[self.image]
+        points = np.einsum("nij,nj->ni", R, self.points + self.basis @ shape) + motion[self.image, 3:]
+        return ImagePoints(points, self.uv, self.start, R @ self.basis)
+
+    def sum_by_image(self, values: np.ndarray) -> np.ndarray:
+        """(M, ...): the sum of values (N, ...) over the points of each image."""
         return np.add.reduceat(values, self.start[:-1], axis=0)
 
 
-def started(model: CameraModel, other: CameraModel, params: np.ndarray, seen: ImagePoints) -> Iterator[np.ndarray]:
-    """Parameters of `model` from each of its starts that project the points as near as may be to where they are seen.
-    The scale in the middle is that of `other` with `params`."""
+def initial_parameters(
+    model: CameraModel, other: CameraModel, params: np.ndarray, seen: ImagePoints
+) -> Iterator[np.ndarray]:
+    """Parameters (P,) of `model` for a lens that is known as `other` with `params`: one set from each of its starts.
+
+    They minimise the distance between projected and measured points, the points being fixed. A start that sees no more
+    than half of the points is left out. fx and fy start so that the scale in the image's centre is that of `other`.
+    """
     few = slice(None, None, max(len(seen.uv) // START_CORNERS, 1))
     points, uv = seen.points[few], seen.uv[few]
     for distortion in model.start_distortions:
@@ -63,11 +78,12 @@ def started(model: CameraModel, other: CameraModel, params: np.ndarray, seen: Im
 def adjust(
     model: CameraModel, params: np.ndarray, seen: ImagePoints, fixed: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Parameters (P,), a change of the target's shape (s,), and the squared error (M,) [px^2] that each image is left
-    with. Levenberg-Marquardt over these and a motion of each image's points, which is eliminated. With a `fixed` shape
-    (s,) the poses alone are fitted, and the parameters stay.
+    """Parameters (P,), change of the target's shape (s,), and sum of the squared residuals (M,) [px^2] of each image.
 
-    Raises numpy.linalg.LinAlgError where an image's corners do not tell its pose.
+    Minimises the squared residuals over parameters, shape and poses, from `params` (P,). With a `fixed` shape (s,) only
+    the poses are fitted, and `params` and `fixed` are returned as they are.
+
+    Raises numpy.linalg.LinAlgError where the points of an image do not determine its pose.
     """
     shape, n = np.zeros(seen.basis.shape[2]), len(params)
     if fixed is not None:
@@ -89,25 +105,32 @@ def adjust(
             damping *= 10.0
             if damping > MOST_DAMPING:
                 break
-    return params, shape, seen.total((here[0] ** 2).sum(axis=1))
+    return params, shape, seen.sum_by_image((here[0] ** 2).sum(axis=1))
 
 
 def _linearised(
-    model: CameraModel, params: np.ndarray, seen: ImagePoints, whole: bool
+    model: CameraModel, params: np.ndarray, seen: ImagePoints, with_lens: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (N, 2) [px], and their derivatives (N, 2, 6 + P + s) by a small turn and shift of the points in the
-    camera frame, and on the `whole` by parameters and shape."""
+    """Residuals (N, 2) [px], predicted - measured, and their Jacobian (N, 2, 6 + P + s).
+
+    Columns: rotation and translation of the image's points, in the camera frame; then, `with_lens`, parameters and
+    shape.
+    """
     projected, valid, J_point, J_params = model.project_with_jacobians(params, seen.points)
     residual = np.where(valid[:, None], projected - seen.uv, np.sqrt(0.5) * UNSEEN_PX)
-    J_turn = np.cross(seen.points[:, None, :], J_point)
-    return residual, np.concatenate([J_turn, J_point, *((J_params, J_point @ seen.basis) if whole else ())], axis=2)
+    J_rotation = np.cross(seen.points[:, None, :], J_point)
+    J_shared = (J_params, J_point @ seen.basis) if with_lens else ()
+    return residual, np.concatenate([J_rotation, J_point, *J_shared], axis=2)
 
 
 def _step(residual: np.ndarray, J: np.ndarray, seen: ImagePoints, damping: float) -> tuple[np.ndarray, np.ndarray]:
-    """Of what all images share (n,), and of each image's turn and shift (M, 6)."""
+    """Steps of the shared parameters, lens and shape (n,), and of the images' poses (M, 6), by the Schur complement.
+
+    Both diagonals are damped, relative to themselves. J (N, 2, 6 + n) as `_linearised` gives it.
+    """
     A, B = J[:, :, :6], J[:, :, 6:]
-    H, C = (seen.total(np.einsum("nki,nkj->nij", A, x)) for x in (A, B))
-    g = seen.total(np.einsum("nki,nk->ni", A, residual))
+    H, C = (seen.sum_by_image(np.einsum("nki,nkj->nij", A, x)) for x in (A, B))
+    g = seen.sum_by_image(np.einsum("nki,nk->ni", A, residual))
     diagonal = np.einsum("mii->mi", H)
     diagonal *= 1.0 + damping
     diagonal += 1e-12 * diagonal.max(axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""How much a scenario measures: everything is held in memory at once."""
+"""Refuses scenarios that measure more than fits in memory: the simulator holds all readings at once."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from collections.abc import Iterator
 from icalib.errors import RigError
 from icalib.simulation.scenario import Scenario
 
-# Numbers of a sensor that are held: 1 GB or so with what is made on the way. Doubled, so is the memory.
-MOST_INSTANTS = 5_000_000  # an IMU at 200 Hz for 7 h
-MOST_POINTS = 100_000_000  # a LiDAR of 16 rings and 1800 steps at 8 Hz for 7 min
-_OFTEN = 1e18  # beyond, numbers are no counts any more
+# Of each sensor. Either takes about 1 GB with intermediate arrays; twice the number takes twice the memory.
+MOST_INSTANTS = 5_000_000  # readings, images or scans: an IMU at 200 Hz for 7 h
+MOST_POINTS = 100_000_000  # corners, tracked points or LiDAR points: 16 rings of 1800 steps at 8 Hz for 7 min
+_LARGEST_COUNT = 1e18  # larger ones are cut to it, so that products stay finite
 
 
 def refuse_large(scenario: Scenario) -> None:
-    """Raises RigError where a sensor measures more than is to be held in memory."""
-    for name, what, rate_hz, each in _rates(scenario):
-        instants = min(rate_hz * scenario.duration_s, _OFTEN)
-        if instants > MOST_INSTANTS or instants * each > MOST_POINTS:
-            count, most = (instants * each, MOST_POINTS) if each > 1 else (instants, MOST_INSTANTS)
+    """Raises RigError, naming the sensor, where one measures more than `MOST_INSTANTS` or `MOST_POINTS`."""
+    for name, what, rate_hz, points in _rates(scenario):
+        instants = min(rate_hz * scenario.duration_s, _LARGEST_COUNT)
+        if instants > MOST_INSTANTS or instants * points > MOST_POINTS:
+            count, most = (instants * points, MOST_POINTS) if points > 1 else (instants, MOST_INSTANTS)
             raise RigError(
                 f"{name} would measure {count:.2g} {what}, and {most:.0e} are the most that are simulated; lower its "
                 "rate, or the duration."
@@ -26,7 +26,7 @@ def refuse_large(scenario: Scenario) -> None:
 
 
 def _rates(scenario: Scenario) -> Iterator[tuple[str, str, float, int]]:
-    """Of each sensor its name, what it measures, how often [Hz], and how many of these at once."""
+    """For each sensor: its name, what it measures, its rate [Hz], and how many points it measures at an instant."""
     yield "imu0", "readings", scenario.imu_rate_hz, 1
     corners = len(scenario.target.points) if scenario.board else 1
     for camera in scenario.cameras:

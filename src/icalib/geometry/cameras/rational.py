@@ -1,4 +1,4 @@
-"""Pinhole cameras with OpenCV's rational distortion, ROS's "rational_polynomial" (Azure Kinect, Orbbec, Luxonis)."""
+"""Pinhole cameras with OpenCV's rational distortion, which ROS calls "rational_polynomial" (Azure Kinect, Luxonis)."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from numpy.polynomial import Polynomial
 
 from icalib.geometry.cameras.closed_form import ClosedForm
 
-_MIN_DEPTH = 1e-6  # m
-_MAX_NEWTON_STEPS = 30
-_MAX_ITERATIONS = 100  # bisection alone halves the bracket to rounding in 60
+_MIN_DEPTH = 1e-6  # m; nearer points have no image
+_MAX_NEWTON_STEPS = 30  # of the unprojection; a point that needs more counts as not valid
+_MAX_ITERATIONS = 100  # of the radius; bisection alone halves the bracket to rounding in 60
 
 
 class PinholeRational(ClosedForm):
@@ -29,7 +29,7 @@ class PinholeRational(ClosedForm):
     name = "pinhole-rational"
     parameter_names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
     start_distortions = ((0.0,) * 8,)
-    # Those of N and D nearly cancel: lenses that project alike to 0.01 px can have coefficients that differ by 1.
+    # Numerator and denominator nearly cancel: two sets of coefficients that project alike to 0.01 px can differ by 1.
     distortion_scale = 10.0
 
     def _fill_image(self, params, points, uv, valid) -> None:
@@ -43,15 +43,17 @@ class PinholeRational(ClosedForm):
 
 
 def _limit(params: np.ndarray) -> float:
+    """`monotonic_limit` of the model's parameters (12,)."""
     return monotonic_limit(tuple(params[[4, 5, 8]].tolist()), tuple(params[9:].tolist()))
 
 
-@lru_cache(maxsize=64)  # asked for chunk by chunk, with the same coefficients
+@lru_cache(maxsize=64)  # called once for each chunk of points, with the same coefficients
 def monotonic_limit(numerator: tuple[float, ...], denominator: tuple[float, ...]) -> float:
     """The smallest r > 0 at which r N(r^2) / D(r^2) stops growing or has a pole; inf if there is none.
 
-    N(s) = 1 + n_1 s + ..., D(s) likewise. The slope is (N D + 2 s (N' D - N D')) / D^2. 0 if a coefficient is not
-    finite, or the slope's numerator is not.
+    r = tan of the angle to the optical axis. numerator (n_1, n_2, ...): N(s) = 1 + n_1 s + n_2 s^2 + ...; denominator
+    likewise. The derivative is (N D + 2 s (N' D - N D')) / D^2 at s = r^2. Returns 0 if a coefficient, or one of the
+    derivative's numerator, is not finite.
     """
     N, D = Polynomial([1.0, *numerator]), Polynomial([1.0, *denominator])
     with np.errstate(over="ignore", invalid="ignore"):
@@ -63,9 +65,10 @@ def monotonic_limit(numerator: tuple[float, ...], denominator: tuple[float, ...]
 
 
 def _smallest_root(coefficients: np.ndarray) -> float:
-    """The smallest positive root of 1 + c_1 s + c_2 s^2 + ...; inf if there is none.
+    """The smallest positive root of 1 + c_1 s + c_2 s^2 + ..., coefficients (1, c_1, c_2, ...); inf if there is none.
 
-    In w = 1 / s the polynomial is monic, so vanishing leading coefficients need no special case.
+    numpy.roots takes the highest power first, and so returns the roots in w = 1 / s. There the polynomial is monic, and
+    vanishing leading coefficients need no special case.
     """
     inverses = np.roots(coefficients)
     positive = inverses.real[(inverses.imag == 0.0) & (inverses.real > 0.0)]
@@ -74,7 +77,7 @@ def _smallest_root(coefficients: np.ndarray) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _radial(params, s):
-    """d, 1 / D and d d / d s."""
+    """d = N / D, 1 / D, and the derivative of d by s, at s = r^2."""
     numerator = 1.0 + s * (params[4] + s * (params[5] + s * params[8]))
     inverse = 1.0 / (1.0 + s * (params[9] + s * (params[10] + s * params[11])))
     n_slope = params[4] + s * (2.0 * params[5] + s * 3.0 * params[8])
@@ -85,7 +88,7 @@ def _radial(params, s):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _distort(params, a, b):
-    """Distorted (a, b), d of it / d (a, b) as (aa, ab = ba, bb), d and 1 / D."""
+    """Distorted (a, b); its derivatives by (a, b) as aa, ab (= ba), bb; d = N / D; and 1 / D."""
     p1, p2 = params[6], params[7]
     s = a * a + b * b
     d, inverse, slope = _radial(params, s)
@@ -100,7 +103,7 @@ def _distort(params, a, b):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _on_plane(points, i, limit):
-    """a, b, 1 / z and whether the point is valid."""
+    """a = x / z, b = y / z, 1 / z of point i, and whether it is valid."""
     z = points[i, 2]
     inverse_z = 1.0 / z if z > _MIN_DEPTH else 0.0
     a, b = points[i, 0] * inverse_z, points[i, 1] * inverse_z
@@ -138,7 +141,7 @@ def _project_with_jacobians(params, points, limit, uv, valid, j_point, j_params)
         j_params[i, 1, 1], j_params[i, 1, 3] = distorted_b, 1.0
         j_params[i, 0, 6], j_params[i, 0, 7] = 2.0 * fx * a * b, fx * (s + 2.0 * a * a)
         j_params[i, 1, 6], j_params[i, 1, 7] = fy * (s + 2.0 * b * b), 2.0 * fy * a * b
-        by_u, by_v = fx * a * inverse, fy * b * inverse  # of a change of N; one of D has -d times that
+        by_u, by_v = fx * a * inverse, fy * b * inverse  # d (u, v) / d N; by D it is -d times that
         j_params[i, 0, 4], j_params[i, 0, 5], j_params[i, 0, 8] = by_u * s, by_u * s * s, by_u * s * s * s
         j_params[i, 1, 4], j_params[i, 1, 5], j_params[i, 1, 8] = by_v * s, by_v * s * s, by_v * s * s * s
         by_u, by_v = -d * by_u, -d * by_v
@@ -148,7 +151,7 @@ def _project_with_jacobians(params, points, limit, uv, valid, j_point, j_params)
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _undistorted_radius(params, distorted, limit):
-    """r below `limit` with r d(r^2) = distorted, near the limit where there is none. Newton kept in a bracket."""
+    """The r below `limit` with r d(r^2) = distorted; near the limit where there is none. Newton within a bracket."""
     low, high = 0.0, limit
     if limit == np.inf:
         high = 1.0 + distorted
@@ -173,7 +176,10 @@ def _undistorted_radius(params, distorted, limit):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _undistort(params, limit, distorted_a, distorted_b):
-    """(a, b) and whether Newton converged inside the monotonic range; starts where the radial part alone would be."""
+    """The undistorted (a, b), and whether Newton converged to it inside the monotonic range.
+
+    It starts from the solution without tangential distortion.
+    """
     distorted_r = np.hypot(distorted_a, distorted_b)
     # At the limit itself the radial slope is zero; 0.9 leaves room for tangential terms that reach slightly past it.
     r = min(_undistorted_radius(params, distorted_r, limit), 0.9 * limit)

@@ -1,4 +1,4 @@
-"""Grids of circles."""
+"""Grids of circles, symmetric and asymmetric, as OpenCV and Kalibr define them."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ from icalib.geometry.targets.base import Target, untagged_index
 
 @dataclass(frozen=True)
 class Circles(Target):
-    """`rows` x `cols` black circles of `diameter` [m] on white, `spacing` [m] apart. `asymmetric`: every other row is
-    moved by one spacing to the right, circles of a row are two spacings apart, rows are one apart, as OpenCV and Kalibr
-    have it.
+    """`rows` x `cols` black circles of `diameter` [m] on white.
 
-    Points are the centres of the circles, numbered as OpenCV does: row by row from the top left; point 0 is the origin,
-    so y of later rows is negative. Raises RigError where circles would touch or are too few.
+    In a symmetric grid neighbouring centres are `spacing` [m] apart. If `asymmetric`, rows are one spacing apart,
+    circles of a row two, and every other row, from the second on, is moved by one spacing to the right.
+
+    Points are the centres, numbered row by row from the top left. Point 0 is the origin, and y is up: y of later rows
+    is negative. Raises RigError where circles would touch, or there are too few to be a grid.
     """
 
     type: ClassVar[str] = "circles"
@@ -43,19 +44,23 @@ class Circles(Target):
 
     @cached_property
     def points(self) -> np.ndarray:
-        """(rows cols, 3) centres in metres."""
+        """(rows * cols, 3) centres [m]; z = 0."""
         row, col = np.divmod(np.arange(self.rows * self.cols), self.cols)
         across = 2 * col + row % 2 if self.asymmetric else col
         return self.spacing * np.stack([across, -row, 0 * row], axis=1)
 
     @cached_property
     def radii(self) -> np.ndarray:
-        """(rows cols,) in metres."""
+        """(rows * cols,) radii [m]."""
         return np.full(self.rows * self.cols, 0.5 * self.diameter)
 
     @cached_property
     def turns(self) -> tuple[np.ndarray, ...]:
-        """Half a turn, and quarters where rows = cols; of asymmetric grids half a turn where rows are even, or none."""
+        """Rotations that map the grid to itself, as `Target.turns`.
+
+        Symmetric grids: half a turn, and quarter turns where rows = cols. Asymmetric ones: half a turn where rows are
+        even, none where they are odd.
+        """
         number = np.arange(self.rows * self.cols).reshape(self.rows, self.cols)
         if self.asymmetric:
             quarters = (0, 2) if self.rows % 2 == 0 else (0,)
