@@ -16,14 +16,15 @@ _MAX_ITERATIONS = 100  # of the radius; bisection alone halves the bracket to ro
 
 
 class PinholeRational(ClosedForm):
-    """With a = x / z, b = y / z, s = a^2 + b^2 and
-    d = (1 + k1 s + k2 s^2 + k3 s^3) / (1 + k4 s + k5 s^2 + k6 s^3) (OpenCV, calib3d, CALIB_RATIONAL_MODEL):
+    """OpenCV's CALIB_RATIONAL_MODEL (calib3d). With a = x / z, b = y / z, s = a^2 + b^2 and
+
+        d = N / D = (1 + k1 s + k2 s^2 + k3 s^3) / (1 + k4 s + k5 s^2 + k6 s^3)
 
         u = fx (a d + 2 p1 a b + p2 (s + 2 a^2)) + cx
         v = fy (b d + p1 (s + 2 b^2) + 2 p2 a b) + cy
 
-    Parameters: fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6: OpenCV's order. Valid: z > 1 um, and r = sqrt(s) below
-    the first extremum or pole of r d(r^2). The rest is projected to (0, 0) with zero Jacobians.
+    Parameters, in OpenCV's order: fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6. A point is valid if z > 1 um, and
+    r = sqrt(s) is below the first extremum or pole of r d(r^2). Others are projected to (0, 0) with zero Jacobians.
     """
 
     name = "pinhole-rational"

@@ -16,8 +16,8 @@ from icalib.geometry.targets.base import Target, untagged_index
 class Circles(Target):
     """`rows` x `cols` black circles of `diameter` [m] on white.
 
-    In a symmetric grid neighbouring centres are `spacing` [m] apart. If `asymmetric`, rows are one spacing apart,
-    circles of a row two, and every other row, from the second on, is moved by one spacing to the right.
+    In a symmetric grid neighbouring centres are `spacing` [m] apart. If `asymmetric`, rows are one spacing apart, and
+    circles of a row two. Every other row, from the second on, is moved by one spacing to the right.
 
     Points are the centres, numbered row by row from the top left. Point 0 is the origin, and y is up: y of later rows
     is negative. Raises RigError where circles would touch, or there are too few to be a grid.
