@@ -2,12 +2,12 @@
 
     grey(u) = inside + (outside - inside) Phi(d(u) / blur),  d(u) = (|W (u - c)| - 1) / |gradient of |W (u - c)||
 
-c (2,) px is the centre; W (2, 2) 1/px maps the ellipse to the unit circle; Phi is the normal distribution function; d is
-the distance from the ellipse to first order (Sampson). The model is point symmetric about c. So is the image of an
+c (2,) px is the centre; W (2, 2) 1/px maps the ellipse to the unit circle; Phi is the normal distribution function; d
+is the distance from the ellipse to first order (Sampson). The model is point symmetric about c. So is the image of an
 ellipse under blur and any response to light, which therefore do not bias the centre.
 
-The eight parameters are c (2), the shape S (S_00, S_11, S_01), blur [px], and the grey levels inside and outside. A step
-of the shape is W <- (I + S) W. S is symmetric because a rotation of the unit circle does not change the ellipse.
+The eight parameters are c (2), the shape S (S_00, S_11, S_01), blur [px], and the grey levels inside and outside. A
+step of the shape is W <- (I + S) W. S is symmetric because a rotation of the unit circle does not change the ellipse.
 """
 
 from __future__ import annotations

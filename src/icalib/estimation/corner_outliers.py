@@ -1,9 +1,9 @@
 """Rejects corners with large residuals, unless their neighbours in the image plane have similar ones.
 
 A lens that its model cannot follow makes large residuals near the border of the image. Neighbouring corners of all
-images have similar ones, and they decrease towards the middle. A gross outlier is isolated. A corner
-with a large residual is suspect. It is kept where a chain of neighbours with similar residuals leads from it to a
-corner that is not suspect.
+images have similar ones, and they decrease towards the middle. A gross outlier is isolated. A corner with a large
+residual is suspect. It is kept where a chain of neighbours with similar residuals leads from it to a corner that is
+not suspect.
 """
 
 from __future__ import annotations
