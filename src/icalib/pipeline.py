@@ -54,6 +54,8 @@ def calibrate(
     keep_apart()
     opened = open_all(recording, start_s, end_s)
     started = time.perf_counter()
+    for one in opened.values():
+        one.use_layouts(rig.poses)
     seeing = rig.cameras if rig.has_target else ()
     pictured = any(not r.has_corners(c) for r in opened.values() for c in seeing)
     share = IMAGES_SHARE if pictured else READING_SHARE

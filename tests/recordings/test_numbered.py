@@ -10,7 +10,7 @@ import pytest
 
 from icalib.errors import RecordingError
 from icalib.recordings import open_recording
-from icalib.rig import Camera, PoseSensor
+from icalib.rig import Camera, PoseSensor, TableLayout
 
 START, STEP = 1_700_000_000_500_000_000, 2_000_000_000
 HAND = PoseSensor("hand", "hand/poses.csv")
@@ -88,6 +88,66 @@ def test_a_row_that_is_no_pose_counts_as_one(tmp_path):
     path.write_text("\n".join(lines) + "\n")
     assert row_of_each(tmp_path) == list(range(20))
     assert len(open_recording(tmp_path).poses(HAND).stamps_ns) == 19
+
+
+@pytest.mark.parametrize("kept", [range(12), [0, 1, 2, 5, 8, 9, 11]])
+@pytest.mark.parametrize("bad", [0, 5, 11])
+@pytest.mark.parametrize("stamp", ["", "x17", "nan", "9" * 25])
+def test_a_row_whose_stamp_cannot_be_read_leaves_its_picture_alone(tmp_path, kept, bad, stamp):
+    """All other pictures keep their rows, paired in order or by number."""
+    pictures(tmp_path / "cam0", [f"{k}.png" for k in kept])
+    path = tmp_path / "hand" / "poses.csv"
+    poses(path, 12)
+    lines = path.read_text().splitlines()
+    lines[1 + bad] = stamp + lines[1 + bad][lines[1 + bad].index(",") :]
+    path.write_text("\n".join(lines) + "\n")
+    recording = open_recording(tmp_path)
+    seen = {kept[int(f.image[0, 0]) - 20]: (f.stamp_ns - START) // STEP for f in recording.images("cam0")}
+    assert seen == {row: row for row in kept if row != bad}
+    notes = " ".join(recording.notes())
+    assert f"poses.csv:{2 + bad}: " in notes
+    assert (f"1 of {len(kept)} pictures are left out, the first is {bad}.png" in notes) == (bad in kept)
+
+
+def test_many_rows_without_a_stamp_are_refused(tmp_path):
+    pictures(tmp_path / "cam0", [f"{k}.png" for k in range(6)])
+    path = tmp_path / "hand" / "poses.csv"
+    poses(path, 6)
+    path.write_text(path.read_text().replace(str(START + 2 * STEP), "?"))
+    with pytest.raises(RecordingError, match=r"poses\.csv:4: t \[ns\] is '\?', which is not a number"):
+        row_of_each(tmp_path)
+
+
+def test_parts_of_a_stamp_that_cannot_be_read(tmp_path):
+    """Seconds and nanoseconds are joined after the rows are read, and rows are left out there, too."""
+    pictures(tmp_path / "cam0", [f"{k}.png" for k in range(12)])
+    stamps = [divmod(START + k * STEP, 10**9) for k in range(12)]
+    lines = [f"{s},{ns if k != 4 else 3 * 10**9},{0.1 * k},0,0.3,0,0,0,1" for k, (s, ns) in enumerate(stamps)]
+    (tmp_path / "hand").mkdir()
+    (tmp_path / "hand" / "poses.csv").write_text("\n".join(["secs,nsecs,x,y,z,qx,qy,qz,qw", *lines]) + "\n")
+    found = [(f.stamp_ns - START) // STEP for f in open_recording(tmp_path).images("cam0")]
+    assert found == [k for k in range(12) if k != 4]
+
+
+@pytest.mark.parametrize("unit", ["ms", "us", "s"])
+@pytest.mark.parametrize("place", ["hand/poses.csv", "arm/flange.csv"])
+@pytest.mark.parametrize("split", [False, True])
+def test_stamps_are_read_as_the_rig_file_describes_the_poses(tmp_path, unit, place, split):
+    """The stamp is not the first column, no name of it is known, and its rate would be one in nanoseconds, too."""
+    pictures(tmp_path / "cam0", [f"{k}.png" for k in range(8)])
+    names = ["x", "y", "z", "qx", "qy", "qz", "qw", "extra", *(["secs", "nsecs"] if split else ["when"])]
+    stamps = [f"{1_000 + 2 * k},5" if split else str(10**9 + 1_000_000 * k) for k in range(8)]
+    rows = [f"{0.1 * k},0,0.3,0,0,0,1,7,{stamp}" for k, stamp in enumerate(stamps)]
+    path = tmp_path / place
+    path.parent.mkdir()
+    path.write_text("\n".join([",".join(names), *rows]) + "\n")
+    hand = PoseSensor("hand", place, layout=TableLayout((*names[8:], *names[:7]), None if split else unit))
+    recording = open_recording(tmp_path)
+    recording.use_layouts([hand])
+    found = recording.stamps(recording.image_topic(CAMERA))
+    np.testing.assert_array_equal(found, recording.poses(hand).stamps_ns)
+    scale = {"s": 10**9, "ms": 10**6, "us": 10**3}[unit]
+    assert np.diff(found).tolist() == [2 * 10**9 if split else scale * 1_000_000] * 7
 
 
 def test_stamps_as_names_stay_stamps(tmp_path):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -113,6 +113,9 @@ class BagRecording:
 
     def _imu_source(self, sensor: ImuSensor) -> str | TwoSources:
         return imu_source(str(self.root), self, self._topics, sensor)
+
+    def use_layouts(self, sensors: Sequence[PoseSensor]) -> None:
+        """Nothing here is a table."""
 
     def has_corners(self, camera: Camera) -> bool:
         return False

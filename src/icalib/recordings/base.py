@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -30,6 +30,11 @@ class Recording(Protocol):
 
         Raises RecordingError where there is no such topic, icalib does not read its kind, or a message is damaged.
         """
+        ...
+
+    def use_layouts(self, sensors: Sequence[PoseSensor]) -> None:
+        """Take the rig file's word for how tables of poses are written: images without stamps may have theirs. Call
+        this before images or stamps are read."""
         ...
 
     def image_topic(self, camera: Camera) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import final
 
@@ -29,7 +29,7 @@ from icalib.recordings.tracks import read_track_stamps, read_tracks
 from icalib.recordings.unreadable import VIDEO_FILE, is_video
 from icalib.recordings.wheels import RELATIVE_POSES, STAMPS, UNITS, WheelReadings, read_wheel_table
 from icalib.recordings.window import WHOLE, Span, Window, cut, stamps_inside
-from icalib.rig import Camera, ImuSensor, Lidar, PoseSensor, TableLayout, TwoSources, Wheels
+from icalib.rig import PLAIN_TABLE, Camera, ImuSensor, Lidar, PoseSensor, TableLayout, TwoSources, Wheels
 
 _CORNERS = TableKind(
     ("t [ns]", "tag id", "corner"),
@@ -61,6 +61,10 @@ class FolderRecording:
         self._window = window
         self._read: list[Path] = []
         self._notes: list[str] = [] if window.is_all else [window.note(str(root))]
+        self._pose_sensors: tuple[PoseSensor, ...] = ()
+
+    def use_layouts(self, sensors: Sequence[PoseSensor]) -> None:
+        self._pose_sensors = tuple(sensors)
 
     def topics(self) -> tuple[TopicInfo, ...]:
         found: list[TopicInfo] = []
@@ -76,9 +80,9 @@ class FolderRecording:
             if table := _existing(folder, "tracks.csv"):
                 name = f"{folder.name}/tracks.csv"
                 found.append(_info(name, "table of tracks", "tracks", read_track_stamps(table)))
-            found += [_info(f"{folder.name}/{table.name}", *what, _stamps(table)) for table, what in _robot(folder)]
+            found += [_info(f"{folder.name}/{p.name}", *what, self._stamps_of(p)) for p, what in _robot(folder)]
         for table in sorted(p for base in self._bases() for p in base.glob("*.csv")):
-            found += _single(table)
+            found += _single(table, self._layouts().get(table, PLAIN_TABLE))
         return (*found, *self._videos())
 
     def stamps(self, topic: str) -> np.ndarray:
@@ -97,7 +101,7 @@ class FolderRecording:
         if chosen.kind == "tracks":
             return read_track_stamps(self._locate(chosen.name))
         if chosen.kind in ("points", "wheels", "pose"):
-            return _stamps(self._locate(chosen.name))
+            return self._stamps_of(self._locate(chosen.name))
         return np.unique(read_table(self._locate(chosen.name), _CORNERS).integers[:, 0])
 
     def image_topic(self, camera: Camera) -> str:
@@ -231,13 +235,27 @@ class FolderRecording:
         if numbered := numbered_pictures(folder):
             tables = self._pose_tables()
             if len(tables) == 1:
-                return stamped_by_rows(numbered, tables[0], note)
+                (table,) = tables
+                return stamped_by_rows(numbered, table, self._layouts().get(table, PLAIN_TABLE), note)
         return image_files(folder, note)
 
-    def _pose_tables(self) -> list[Path]:
-        folders = [p for base in self._bases() for p in sorted(base.iterdir()) if p.is_dir()]
-        found = [table for p in folders for table, (_, kind) in _robot(p) if kind == "pose"]
-        return found + [p for base in self._bases() for p in sorted(base.glob("*.csv")) if named(p, POSES)]
+    def _pose_tables(self) -> set[Path]:
+        """Those that are told by what they hold, and those of the rig file's pose sensors."""
+        folders = [p for base in self._bases() for p in base.iterdir() if p.is_dir()]
+        found = {table for p in folders for table, (_, kind) in _robot(p) if kind == "pose"}
+        found |= {p for base in self._bases() for p in base.glob("*.csv") if named(p, POSES)}
+        return found | self._layouts().keys()
+
+    def _layouts(self) -> dict[Path, TableLayout]:
+        """That of each table of the rig file's pose sensors."""
+        found = [(self._find(s.path), s.layout) for s in self._pose_sensors if s.frames is None]
+        return {path: layout for path, layout in found if path is not None}
+
+    def _stamps_of(self, table: Path) -> np.ndarray:
+        """(N,) int64 ns of scans, wheels or poses."""
+        if (layout := self._layouts().get(table)) is not None:
+            return read_pose_file(table.parent.name, table, layout).stamps_ns
+        return _stamps(table)
 
     def _videos(self) -> tuple[TopicInfo, ...]:
         """What is named as videos, which no reader reads."""
@@ -284,11 +302,11 @@ def _existing(folder: Path, name: str) -> Path | None:
     return next((p for p in (folder / name, folder / f"{name}.gz") if p.is_file()), None)
 
 
-def _single(table: Path) -> list[TopicInfo]:
+def _single(table: Path, layout: TableLayout) -> list[TopicInfo]:
     """Of an IMU or a pose sensor, where a table beside the folders names their columns."""
     for kind, what in ((IMU, ("table of readings", "imu")), (POSES, ("table of poses", "pose"))):
         if named(table, kind):
-            return [_info(table.name, *what, read_table(table, kind).integers[:, 0])]
+            return [_info(table.name, *what, read_table(table, kind, layout).integers[:, 0])]
     return []
 
 

@@ -13,11 +13,12 @@ import numpy as np
 
 from icalib.errors import RecordingError
 from icalib.recordings.clocks import is_rate
-from icalib.recordings.columns import STAMP, TableKind
+from icalib.recordings.columns import STAMP, TableKind, split_kind
 from icalib.recordings.euroc_images import pictures_in, stamped_by_name
 from icalib.recordings.image_checks import Note
-from icalib.recordings.poses import RATE_HZ, is_tum_text
+from icalib.recordings.poses import POSES, RATE_HZ, is_tum_text
 from icalib.recordings.table import read_table
+from icalib.rig import TableLayout
 
 _IMAGE_RATE_HZ = (1e-3, 1000.0)  # names are stamps only if they make an image rate within this range
 # The stamps alone: a row whose pose cannot be read keeps its place in the order.
@@ -43,12 +44,15 @@ def numbered_pictures(folder: Path) -> list[tuple[int, Path]]:
     return [] if stamps and is_rate(numbers.astype(np.int64), *_IMAGE_RATE_HZ) else found
 
 
-def stamped_by_rows(found: list[tuple[int, Path]], table: Path, note: Note) -> list[tuple[int, Path]]:
+def stamped_by_rows(
+    found: list[tuple[int, Path]], table: Path, layout: TableLayout, note: Note
+) -> list[tuple[int, Path]]:
     """Stamp [ns] and file of each picture in `found`, as `numbered_pictures` gives them: that of its row of `table`.
 
     With as many pictures as rows, they belong together in order. Otherwise the number of a picture is its row, counted
-    from 0 if there is a picture 0, else from 1. `note` is told which. Raises RecordingError where two pictures have the
-    same number, or one has no row.
+    from 0 if there is a picture 0, else from 1. `note` is told which. Rows that cannot be read are counted, and their
+    pictures are left out with a note. `layout` is that of a table of poses. Raises RecordingError where two pictures
+    have the same number, where one has no row, and where many rows cannot be read.
     """
     folder, numbers = found[0][1].parent, [number for number, _ in found]
     twice = next((k for k in range(1, len(numbers)) if numbers[k] == numbers[k - 1]), None)
@@ -57,19 +61,33 @@ def stamped_by_rows(found: list[tuple[int, Path]], table: Path, note: Note) -> l
             f"{found[twice - 1][1]} and {found[twice][1].name} have the same number, {numbers[twice]}; give each "
             "picture its own, that of the row of its pose."
         )
-    kind = replace(_STAMPS, unit="s") if is_tum_text(table) else _STAMPS
-    stamps_ns = read_table(table, kind).integers[:, 0]
-    in_order = len(numbers) == len(stamps_ns)
+    stamp_of, count = _stamps_by_row(table, layout, note)
+    in_order = len(numbers) == count
     first = min(1, numbers[0])  # the number of the first row
     rows = list(range(len(numbers))) if in_order else [n - first for n in numbers]
-    if rows[-1] >= len(stamps_ns):
+    if rows[-1] >= count:
         raise RecordingError(
             f"{folder} holds {len(found)} pictures without stamps, up to number {numbers[-1]}, and {table} "
-            f"{len(stamps_ns)} rows; number each picture as the row of its pose, or give pictures stamps as names."
+            f"{count} rows; number each picture as the row of its pose, or give pictures stamps as names."
         )
     how = "in order" if in_order else f"by number, {first} being that of the first row"
     note(
         f"{folder}: {len(found)} pictures have no stamps; each has that of its row of {table}, {how}: picture "
         f"{found[0][1].name} belongs to row {rows[0] + 1}."
     )
-    return [(int(stamps_ns[row]), path) for row, (_, path) in zip(rows, found, strict=True)]
+    own = [path for _, path in found]
+    lost = [path for row, path in zip(rows, own, strict=True) if row not in stamp_of]
+    if lost:
+        note(
+            f"{folder}: {len(lost)} of {len(found)} pictures are left out, the first is {lost[0].name}: the row of "
+            f"its pose in {table} cannot be read."
+        )
+    return [(stamp_of[row], path) for row, path in zip(rows, own, strict=True) if row in stamp_of]
+
+
+def _stamps_by_row(table: Path, layout: TableLayout, note: Note) -> tuple[dict[int, int], int]:
+    """The stamp [ns] of each row that can be read, by the row's number from 0 on, and how many rows there are."""
+    kind = replace(_STAMPS, unit="s") if is_tum_text(table) else _STAMPS
+    stamps = 1 if split_kind(POSES, layout.columns) is None else 2  # the first columns of a pose
+    read = read_table(table, kind, replace(layout, columns=layout.columns[:stamps]), note)
+    return dict(zip(read.numbers.tolist(), read.integers[:, 0].tolist(), strict=True)), read.written

@@ -7,7 +7,7 @@ Pictures of the same stamp or number were taken together.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import final
 
@@ -87,6 +87,9 @@ class PictureFolder:
             f"{where} holds pictures without a clock, and {sensor.name} needs one; take the IMU out of the "
             "rig file to calibrate the cameras alone, or give data.csv with the stamps of the images."
         )
+
+    def use_layouts(self, sensors: Sequence[PoseSensor]) -> None:
+        """Nothing here is a table."""
 
     def has_corners(self, camera: Camera) -> bool:
         return False

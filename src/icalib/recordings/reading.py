@@ -34,6 +34,7 @@ def read_measurements(recording: Recording, rig: Rig, find: FindCorners = tables
     What was dropped or looks odd stands in the notes. Raises RecordingError, one sentence naming the file and the line
     or instant, for data that are missing, unreadable, out of order, in other units, or not of this rig.
     """
+    recording.use_layouts(rig.poses)
     imu, notes, jumps = None, (), ClockJumps(LONGEST_S)
     if rig.imu is not None:
         imu, notes = read_imu(recording, rig.imu, jumps)

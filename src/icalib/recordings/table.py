@@ -32,11 +32,17 @@ _WHOLE_NS = -1  # a power: stamps must be whole nanoseconds
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of a table. integers (N, I) int64, decimals (N, D) float64. notes: sentences on what was left out."""
+    """Rows of a table. integers (N, I) int64, decimals (N, D) float64. notes: sentences on what was left out.
+
+    numbers (N,) int64: each row's number in the file, from 0 on. `written` is how many rows the file has. Both count
+    rows that were left out; neither counts the header, comments and blank lines.
+    """
 
     path: Path
     integers: np.ndarray
     decimals: np.ndarray
+    numbers: np.ndarray
+    written: int
     notes: tuple[str, ...] = ()
 
 
@@ -98,7 +104,7 @@ def _joined(text: _Text, kind: TableKind, layout: TableLayout) -> Table | None:
         notes += (f"{sentence}; they were left out.",)
     stamps_ns = seconds[good] * _NS + rest[good]
     integers = np.column_stack([stamps_ns, table.integers[good, 2:]])
-    return Table(text.path, integers, table.decimals[good], notes)
+    return Table(text.path, integers, table.decimals[good], table.numbers[good], table.written, notes)
 
 
 def _in_ns(text: _Text, kind: TableKind, place: np.ndarray, given: TimeUnit | None) -> tuple[Table, TimeUnit | None]:
@@ -232,10 +238,10 @@ def _table(text: _Text, kind: TableKind, place: np.ndarray, power: int) -> Table
     """The rows, stamps times 10^power. Raises RecordingError where there are none, or too many cannot be read."""
     capacity = text.rows.count(b"\n") + 1
     integers = np.empty((capacity, len(kind.integers)), dtype=np.int64)
-    decimals = np.empty((capacity, len(kind.decimals)))
+    decimals, numbers = np.empty((capacity, len(kind.decimals))), np.empty(capacity, dtype=np.int64)
     buffer = np.frombuffer(text.rows, dtype=np.uint8)
     start, stamps = (0, text.line), (kind.stamps, power)
-    rows, bad, line, column = parse(buffer, start, stamps, place, POWERS, integers, decimals)
+    rows, bad, line, column = parse(buffer, start, stamps, place, POWERS, integers, decimals, numbers)
     if rows == bad == 0:
         columns = ", ".join(kind.names)
         raise RecordingError(f"{text.path} holds no rows; write one line for each reading, with the columns {columns}.")
@@ -246,7 +252,7 @@ def _table(text: _Text, kind: TableKind, place: np.ndarray, power: int) -> Table
             raise RecordingError(sentence)
         left = "the line was left out" if bad == 1 else f"{bad} lines of {rows + bad} were left out, this is the first"
         notes = (f"{sentence.rpartition(';')[0]}; {left}.",)
-    return Table(text.path, integers[:rows], decimals[:rows], notes)
+    return Table(text.path, integers[:rows], decimals[:rows], numbers[:rows], rows + bad, notes)
 
 
 def _unit(text: _Text, kind: TableKind, place: np.ndarray) -> TimeUnit | None:
@@ -287,5 +293,5 @@ def _describe(text: _Text, kind: TableKind, line: int, place: np.ndarray, column
         return f"{spot}: {name} is {shown!r}, which is not a finite number; remove the line."
     if place[column] < len(kind.integers):
         hint = " (stamps in seconds are `time_unit: s` in the rig file)" if name.endswith("[ns]") else ""
-        return f"{spot}: {name} is {shown}, but must be a whole number below 2^63{hint}."
+        return f"{spot}: {name} is {shown}, but must be a whole number below 2^63{hint}; correct the line."
     return f"{spot}: {name} is {shown!r}, which is not written as a plain decimal number; correct the line."

@@ -18,10 +18,12 @@ def parse(
     powers: np.ndarray,
     integers: np.ndarray,
     decimals: np.ndarray,
+    numbers: np.ndarray,
 ) -> tuple[int, int, int, int]:
     """Fill the rows from byte and line `start`. place (n_columns,): where each column of the file goes, first all
     integers, then all decimals, or LEFT_OUT. stamps: how many of the integers are stamps, and the power of ten to
-    multiply these by; whole numbers only where it is negative.
+    multiply these by; whole numbers only where it is negative. numbers (n,) int64: filled with each row's number in the
+    file, from 0 on; lines that cannot be read are counted.
 
     Returns the number of rows, and of lines that cannot be read, with line and column of the first (line 0: none).
     """
@@ -34,6 +36,7 @@ def parse(
         else:
             at, column = _row(buffer, at, row, stamps, place, powers, integers, decimals)
             if column == place.size:
+                numbers[row] = row + bad
                 row += 1
             elif bad == 0:
                 bad, bad_line, bad_column = 1, line, column
