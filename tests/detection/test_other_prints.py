@@ -135,6 +135,31 @@ def test_swapped_and_wrong_rows_of_tags_are_named(board, wrong, words):
     assert words in other_columns([image], replace(board, **wrong))
 
 
+@pytest.mark.parametrize(
+    ("board", "wrong"),
+    [
+        (AprilGrid(2, 30, 0.05, 0.3), {"cols": 29}),
+        (AprilGrid(2, 30, 0.05, 0.3), {"cols": 15, "rows": 4}),
+        (AprilGrid(30, 2, 0.05, 0.3), {"cols": 3}),
+        (Charuco(24, 4, 0.05, 0.037, "4x4_50"), {"squares_x": 23}),
+    ],
+)
+def test_a_long_board_of_which_a_part_is_seen(board, wrong):
+    """The image shows about half of the grids' tags."""
+    image = rendered(board)
+    assert len(found(board, image)[0]) < 0.8 * len(board.points)
+    assert other_columns([image], board) == ""
+    across = "cols" if isinstance(board, AprilGrid) else "squares_x"
+    right, said = getattr(board, across), wrong[across]
+    assert f"with {across}: {right}, not {said}" in other_columns([image], replace(board, **wrong))
+
+
+def test_no_layout_is_named_that_the_tags_in_sight_do_not_tell_from_others():
+    image = rendered(AprilGrid(1, 30, 0.05, 0.3))
+    sentence = other_columns([image], AprilGrid(6, 5, 0.05, 0.3))
+    assert sentence == "the tags do not stand as on a board with cols: 5; correct rows and cols."
+
+
 @pytest.mark.parametrize(("rows", "cols"), [(6, 9), (9, 6), (5, 7)])
 def test_counted_squares_are_named(rows, cols):
     image = rendered(Checkerboard(rows, cols, 0.035))

@@ -83,6 +83,18 @@ def test_every_image_is_searched_once_and_stands_in_order(detector, monkeypatch,
     assert notes == ("fake.bag /cam0: the target is in 16 of 20 images, 16 corners.",)
 
 
+@pytest.mark.parametrize("found", [100, 40])
+def test_another_layout_is_looked_for_where_little_of_a_grid_is_found(detector, monkeypatch, found):
+    point, one = np.arange(found), np.ones(found)
+    whole = ImageCorners(point, np.zeros((found, 2)), 0.1 * one, one, np.zeros(found, np.int8))
+    monkeypatch.setattr(detector, "detect", lambda image, before=(): whole)
+    asked = []
+    monkeypatch.setattr(streams, "other_columns", lambda images, part: asked.append(part) or "")
+    monkeypatch.setattr(streams, "with_other_border", lambda images, tags, others: "")
+    streams.find_corners(FakeRecording(), CAMERA, GRID)
+    assert asked == ([GRID] if found < 0.5 * len(GRID.points) else [])
+
+
 def test_a_second_run_looks_at_nothing(detector):
     first = streams.find_corners(FakeRecording(), CAMERA, GRID)
     detector.seen.clear()

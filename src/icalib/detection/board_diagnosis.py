@@ -10,9 +10,8 @@ import numpy as np
 from icalib.detection.aprilgrid import grid_tags
 from icalib.detection.charuco import charuco_tags, dark_squares
 from icalib.detection.checkerboard import CheckerboardDetector
-from icalib.detection.decoding import mapped
 from icalib.detection.families import tag_family
-from icalib.detection.growth import fit_homography
+from icalib.detection.growth import homography_misfit
 from icalib.detection.markers import all_tags
 from icalib.detection.quads import View
 from icalib.detection.tags import find_tags
@@ -21,9 +20,8 @@ from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard
 
 _MOST_IMAGES = 5  # that are searched; the time grows with it
 _LEAST_SIDE = 3  # inner corners along a side; the detector takes no smaller board
-_MOST_COLUMNS = 20  # tags or squares in a row of the layouts that are tried
 _LEAST_TAGS = 6  # in an image; fewer may fit several layouts
-# Misfits of `_misfit`, in sides of a tag. In a right layout it comes from lens and noise; in a wrong one
+# Misfits, in sides of a tag. In a right layout it comes from lens and noise; in a wrong one
 # tags are a whole row or column off.
 _MOST_RIGHT = 0.1  # at most: the stated layout is right, and no other is looked at
 _MOST_BEST = 0.3  # at most: the best layout may be the right one; a lens that bends the board much needs room
@@ -68,61 +66,71 @@ def other_columns(images: Iterable[np.ndarray], board: AprilGrid | Charuco) -> s
     """A sentence where the tags in the images (h, w) uint8 stand as on a board with another number of columns.
 
     "" where the first five images show the stated layout, or too few tags to tell. Each number of columns gives every
-    id a place on the board; the layout with the least misfit to a homography wins.
+    id a place on the board; the layout with the least misfit to a homography wins. Several win where the tags that are
+    seen do not tell them apart, as those of a single row; then the sentence names none.
     """
     across, down = ("cols", "rows") if isinstance(board, AprilGrid) else ("squares_x", "squares_y")
-    seen = [_tags_of(View(image), board) for image in islice(images, _MOST_IMAGES)]
     stated, other = getattr(board, across), getattr(board, down)
-    misfit = {n: min(_misfit(seen, c) for c in _with_columns(board, n)) for n in range(3, _MOST_COLUMNS + 1)}
-    best = min(misfit, key=lambda n: misfit[n])
-    wrong = misfit.get(stated, np.inf) > max(_MOST_RIGHT, misfit[best] / _MOST_RATIO)
-    if not (wrong and misfit[best] < _MOST_BEST):
+    tags = _number_of_tags(board)
+    seen = _enough(_tags_of(View(image), board, tags) for image in islice(images, _MOST_IMAGES))
+    misfit = {stated: _misfit_of_columns(seen, board, stated, tags)}
+    if not seen or misfit[stated] <= _MOST_RIGHT:
         return ""
-    if best == other:
+    for n in range(1, tags + 1):  # with more columns, all tags are in the first row
+        misfit[n] = _misfit_of_columns(seen, board, n, tags)
+    least = min(misfit.values())
+    if least > _MOST_BEST or misfit[stated] <= least / _MOST_RATIO:
+        return ""
+    best = [n for n in misfit if misfit[n] < max(_MOST_RIGHT, least / _MOST_RATIO)]
+    if len(best) > 1:
+        return f"the tags do not stand as on a board with {across}: {stated}; correct {down} and {across}."
+    if best[0] == other:
         return f"{down} and {across} are swapped; write {down}: {stated}, {across}: {other}."
-    return f"the tags stand as on a board with {across}: {best}, not {stated}; correct {down} and {across}."
+    return f"the tags stand as on a board with {across}: {best[0]}, not {stated}; correct {down} and {across}."
 
 
-def _with_columns(board: AprilGrid | Charuco, n: int) -> list[np.ndarray]:
-    """The boards that have n tags (AprilGrid) or squares (ChArUco) in a row: (tags, 4, 2) corners of their tags.
+def _number_of_tags(board: AprilGrid | Charuco) -> int:
+    if isinstance(board, AprilGrid):
+        return board.rows * board.cols
+    return int((~dark_squares(board.squares_y, board.squares_x, board.legacy)).sum())
+
+
+def _with_columns(board: AprilGrid | Charuco, n: int, tags: int) -> list[np.ndarray]:
+    """The boards that have n tags (AprilGrid) or squares (ChArUco) in a row: (., 4, 2) corners of at least `tags` tags.
 
     The unit is the tag's side or the square's. A ChArUco board has two layouts, OpenCV's today and its older one.
     """
     if isinstance(board, AprilGrid):
-        return [grid_tags(-(-board.rows * board.cols // n), n, board.tag_spacing)]
-    dark, ratio = dark_squares(max(board.squares_x, board.squares_y), n, False), board.marker_size / board.square_size
+        return [grid_tags(-(-tags // n), n, board.tag_spacing)]
+    rows, ratio = -(-2 * tags // n) + 1, board.marker_size / board.square_size
+    dark = dark_squares(rows, n, False)
     return [charuco_tags(dark, ratio), charuco_tags(~dark, ratio)]
 
 
-def _tags_of(view: View, board: AprilGrid | Charuco) -> tuple[np.ndarray, np.ndarray]:
-    """Ids (m,), from the board's first on, of the tags that the image shows once, and their corners (m, 4, 2) px."""
+def _tags_of(view: View, board: AprilGrid | Charuco, tags: int) -> tuple[np.ndarray, np.ndarray]:
+    """Ids (m,), from the board's first on, of its `tags` tags that the image shows once; corners (m, 4, 2) px."""
     if isinstance(board, AprilGrid):
-        tags = find_tags(view, tag_family(board.family), board.border_bits, view.windows[0], board.squares)
-        place = tags.ids - board.first_id
+        found = find_tags(view, tag_family(board.family), board.border_bits, view.windows[0], board.squares)
+        place = found.ids - board.first_id
     else:
         view = View(255 - view.image) if board.inverted else view
-        tags = all_tags(view, tag_family(board.dictionary), 1)
-        place = tags.ids
+        found = all_tags(view, tag_family(board.dictionary), 1)
+        place = found.ids
     _, index, count = np.unique(place, return_index=True, return_counts=True)
     rows = index[count == 1]
-    rows = rows[place[rows] >= 0]
-    return place[rows], tags.quads[rows]
+    rows = rows[(place[rows] >= 0) & (place[rows] < tags)]
+    return place[rows], found.quads[rows]
 
 
-def _misfit(seen: list[tuple[np.ndarray, np.ndarray]], corners: np.ndarray) -> float:
-    """Distance of the tags' corners from where one homography of the layout puts them, in sides of a tag in the image.
+def _enough(images: Iterable[tuple[np.ndarray, np.ndarray]]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Those of the images, each as `_tags_of` gives it, that show six tags."""
+    return [(place, quads) for place, quads in images if len(place) >= _LEAST_TAGS]
 
-    seen: of each image what `_tags_of` gives; corners (tags, 4, 2): the layout. It is the median over images of the
-    median over an image; inf where no image shows six tags of the layout.
-    """
-    found = []
-    for place, quads in seen:
-        on = place < len(corners)
-        if on.sum() < _LEAST_TAGS:
-            continue
-        xy, uv = corners[place[on]].reshape(-1, 2), quads[on].reshape(-1, 2)
-        H = fit_homography(xy, uv, len(xy))
-        placed = np.array([mapped(H, x, y) for x, y in xy])
-        side = np.median(np.linalg.norm(np.diff(quads[on], axis=1), axis=2))
-        found.append(float(np.median(np.linalg.norm(placed - uv, axis=1)) / side))
-    return float(np.median(found)) if found else np.inf
+
+def _misfit_of_columns(
+    seen: list[tuple[np.ndarray, np.ndarray]], board: AprilGrid | Charuco, n: int, tags: int
+) -> float:
+    """The least median over images of `homography_misfit`, of the layouts with n columns; inf without images."""
+    layouts = _with_columns(board, n, tags) if seen else []
+    medians = [np.median([homography_misfit(corners[place], quads) for place, quads in seen]) for corners in layouts]
+    return float(min(medians, default=np.inf))

@@ -11,7 +11,7 @@ from icalib.detection.consistency import largest_group
 from icalib.detection.corners import ImageCorners, no_corners
 from icalib.detection.decoding import mapped
 from icalib.detection.families import Family, tag_family
-from icalib.detection.growth import fit_homography, markers_there
+from icalib.detection.growth import fit_homography, homography_misfit, markers_there
 from icalib.detection.markers import all_tags
 from icalib.detection.prediction import PredictedCorners, predict_nodes
 from icalib.detection.quads import View
@@ -103,11 +103,7 @@ class CharucoDetector:
         known, quads = self._seen(view)
         if known.sum() < _LEAST_TO_TELL:
             return float("nan")
-        xy, uv = self.tag_corners[known].reshape(-1, 2), quads[known].reshape(-1, 2)
-        H = fit_homography(xy, uv, len(xy))
-        placed = np.array([mapped(H, x, y) for x, y in xy])
-        side = np.median(np.linalg.norm(np.diff(quads[known], axis=1), axis=2))
-        return float(np.median(np.linalg.norm(placed - uv, axis=1)) / side)
+        return homography_misfit(self.tag_corners[known], quads[known])
 
     def _seen(self, view: View) -> tuple[np.ndarray, np.ndarray]:
         """Which markers (n,) are seen once, and the corners (n, 4, 2) of these [px]."""

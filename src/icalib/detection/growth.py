@@ -45,6 +45,20 @@ def fit_homography(xy, uv, n):
     return _product(from_uv, _product(H, to_xy))
 
 
+def homography_misfit(corners: np.ndarray, quads: np.ndarray) -> float:
+    """Median distance of the quads (m, 4, 2) px from where one homography puts the tags' corners (m, 4, 2) of a board.
+
+    It is in sides of a tag in the image. The homography is the least-squares one of all corners. A corner that it sees
+    from behind counts as infinitely far.
+    """
+    xy, uv = np.ascontiguousarray(corners.reshape(-1, 2)), np.ascontiguousarray(quads.reshape(-1, 2))
+    placed = np.concatenate([xy, np.ones((len(xy), 1))], axis=1) @ fit_homography(xy, uv, len(xy)).T
+    depth = np.where(placed[:, 2:] > 1e-9, placed[:, 2:], np.nan)
+    distance = np.linalg.norm(placed[:, :2] / depth - uv, axis=1)
+    side = np.median(np.linalg.norm(np.diff(quads, axis=1), axis=2))
+    return float(np.median(np.where(np.isnan(distance), np.inf, distance)) / side)
+
+
 @njit(cache=True, nogil=True)
 def _product(A, B):
     C = np.zeros((3, 3))

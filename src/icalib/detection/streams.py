@@ -56,7 +56,7 @@ def find_corners(
         count = _count(recording, topic)
         payloads = _of_resolution(recording.payloads(topic), camera, where)
         found = _search(payloads, detector_of(target), where, lambda n: progress(n / max(count, n)))
-        if wrong := _other_layout(recording, topic, target):
+        if wrong := _other_layout(recording, topic, target, found[1]):
             raise RecordingError(f"{where}: {wrong}")
         if keep:
             keep_corners(key, *found)
@@ -92,11 +92,7 @@ def _other_border(recording: Recording, topic: str, target: Target, images: list
     """Where a part of the target is poorly seen, but in the images with the other width of border: what, and what to
     do."""
     for name, part, first in parts_of(target):
-        if not part.tags or isinstance(part, Charuco):
-            continue
-        usual = POOR_CORNERS if isinstance(part, Markers) else POOR_SHARE * len(part.points)
-        own = [i.kept & (i.point >= first) & (i.point < first + len(part.points)) for i in images]
-        if not sum(int(o.sum()) for o in own) < usual * len(images):
+        if not part.tags or isinstance(part, Charuco) or not _poorly_seen(part, first, images):
             continue
         others = [other.tags for _, other, _ in parts_of(target) if other.tags]
         if sentence := with_other_border(_spread(recording, topic), part.tags, others):
@@ -104,17 +100,31 @@ def _other_border(recording: Recording, topic: str, target: Target, images: list
     return ""
 
 
-def _other_layout(recording: Recording, topic: str, target: Target) -> str:
-    """Where tags stand as on a board of another layout: that, and what to do."""
-    for name, part, _ in parts_of(target):
+def _other_layout(recording: Recording, topic: str, target: Target, images: list[ImageCorners]) -> str:
+    """Where tags stand as on a board of another layout: that, and what to do.
+
+    AprilGrids of which enough is seen are not looked at: in a wrong layout no more than a row or two of tags agree. The
+    corners of a small ChArUco board are nearly all found in a wrong layout, too.
+    """
+    for name, part, first in parts_of(target):
         wrong = ""
-        if isinstance(part, Charuco | AprilGrid):
+        if isinstance(part, Charuco) or (isinstance(part, AprilGrid) and _poorly_seen(part, first, images)):
             wrong = other_columns(_spread(recording, topic), part)
         if isinstance(part, Charuco):
             wrong = wrong or with_other_layout(_spread(recording, topic), part)
         if wrong:
             return f"{name}: {wrong}" if name else wrong
     return ""
+
+
+def _poorly_seen(part: Target, first: int, images: list[ImageCorners]) -> bool:
+    """Whether the images show, on average, less of the part than half its points (free tags: two tags).
+
+    The part's points are numbered from `first` on.
+    """
+    usual = POOR_CORNERS if isinstance(part, Markers) else POOR_SHARE * len(part.points)
+    own = [i.kept & (i.point >= first) & (i.point < first + len(part.points)) for i in images]
+    return sum(int(o.sum()) for o in own) < usual * len(images)
 
 
 def _spread(recording: Recording, topic: str) -> Iterator[np.ndarray]:
