@@ -12,7 +12,7 @@ from icalib.detection.corners import ImageCorners
 from icalib.detection.crossings import shows_grid
 from icalib.detection.detectors import detector_of
 from icalib.detection.turns import number_continuously
-from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Scene
+from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles, Scene
 
 
 @pytest.fixture
@@ -131,6 +131,43 @@ def test_a_board_that_turns_keeps_its_numbers(board):
         for a, b in zip(truth, number_continuously(target, shifted), strict=True):
             np.testing.assert_array_equal(b.point, a.point + first)
             np.testing.assert_allclose(b.uv, a.uv)
+
+
+def partial_views(target: Checkerboard | Circles, shown: list[np.ndarray]) -> list[ImageCorners]:
+    """A tilted board that turns by 10 degrees from image to image, seen by a pinhole camera; image k shows shown[k]."""
+    images, at = [], target.points[:, :2] - target.points[:, :2].mean(axis=0)
+    size = np.ptp(at, axis=0).max()
+    for k, point in enumerate(shown):
+        angle = np.radians(10.0 * k)
+        x, y = (at @ [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]).T / size
+        tilt = np.radians(45.0)
+        uv = 500.0 * np.stack([x, y * np.cos(tilt)], axis=1) / (1.3 + y * np.sin(tilt))[:, None] + (320.0 + k, 240.0)
+        one = np.ones(len(point))
+        images.append(ImageCorners(np.sort(point), uv[np.sort(point)], one, one, np.zeros(len(point), np.int8)))
+    return images
+
+
+@pytest.mark.parametrize(
+    "target", [Checkerboard(6, 8, 0.03), Checkerboard(5, 9, 0.03), Checkerboard(6, 6, 0.03), Circles(7, 7, 0.04, 0.02)]
+)
+def test_images_that_show_different_parts_of_a_board_are_numbered_alike(target):
+    """In the right turn some images share no point with the one before; a wrong turn shares many."""
+    row, col = np.divmod(np.arange(len(target.points)), target.cols)
+    half = target.cols // 2
+    left, right, line = col < half, col >= target.cols - half, row == 0
+    parts = [left, right, left, line, right, (col < 2), (col >= target.cols - 2), row < 3, row >= target.rows - 3, left]
+    truth = partial_views(target, [part.nonzero()[0] for part in parts])
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        given = [truth[0]]
+        for image in truth[1:]:
+            number = target.turns[rng.integers(len(target.turns))][image.point]
+            order = np.argsort(number)
+            one = np.ones(len(order))
+            given.append(ImageCorners(number[order], image.uv[order], one, one, np.zeros(len(order), np.int8)))
+        for a, b in zip(truth, number_continuously(target, given), strict=True):
+            np.testing.assert_array_equal(b.point, a.point)
+            np.testing.assert_array_equal(b.uv, a.uv)
 
 
 def test_an_upright_board_keeps_the_detectors_numbers():

@@ -20,32 +20,49 @@ def number_continuously(target: Target, images: Sequence[ImageCorners]) -> list[
     """The images, with the points of each symmetric target renumbered.
 
     `images` are those of one camera in temporal order. In each the turn is chosen that moves the points least from the
-    last image that shows the target. The first image keeps its numbers: no turn of it is more right than another.
+    last image that shows where the whole target is. The first image keeps its numbers: no turn of it is more right
+    than another.
     """
     images = list(images)
     for _, part, first in parts_of(target):
         if part.symmetric:
-            previous_uv = np.full((len(part.points), 2), np.nan)
+            previous_uv = None
             for k, image in enumerate(images):
                 own = (image.point >= first) & (image.point < first + len(part.points))
                 if own.any():
                     turn = _nearest_turn(part.turns, previous_uv, image.point[own] - first, image.uv[own])
                     images[k] = _renumbered(image, own, first, turn)
-                    previous_uv = np.full_like(previous_uv, np.nan)
-                    previous_uv[turn[image.point[own] - first]] = image.uv[own]
+                    completed = _completed(part.points[:, :2], turn[image.point[own] - first], image.uv[own])
+                    previous_uv = previous_uv if completed is None else completed
     return images
 
 
 def _nearest_turn(
-    turns: Sequence[np.ndarray], previous_uv: np.ndarray, point: np.ndarray, uv: np.ndarray
+    turns: Sequence[np.ndarray], previous_uv: np.ndarray | None, point: np.ndarray, uv: np.ndarray
 ) -> np.ndarray:
     """The turn (n,) that moves points (m,) at uv (m, 2) px least, by the mean distance from where they were.
 
-    previous_uv (n, 2) px, NaN of points that were not seen. The first turn where no point was seen before.
+    previous_uv (n, 2) px: where all points of the target were, so that turns are compared by the same points. The first
+    turn where it is None.
     """
-    distances = [np.linalg.norm(previous_uv[turn[point]] - uv, axis=1) for turn in turns]
-    mean = [float(np.nanmean(d)) if np.isfinite(d).any() else np.inf for d in distances]
-    return turns[int(np.argmin(mean))]
+    if previous_uv is None:
+        return turns[0]
+    return min(turns, key=lambda turn: float(np.linalg.norm(previous_uv[turn[point]] - uv, axis=1).mean()))
+
+
+def _completed(board: np.ndarray, point: np.ndarray, uv: np.ndarray) -> np.ndarray | None:
+    """(n, 2) px: the points (m,) at uv (m, 2), and the other points of the board (n, 2) where they lead to expect them.
+
+    The affine map of least squares places them. Its error under perspective is a small part of the board, and a wrong
+    turn is off by half of it. None where the points are on one line.
+    """
+    plane = np.concatenate([board - board.mean(axis=0), np.full((len(board), 1), np.ptp(board))], axis=1)
+    affine, _, rank, _ = np.linalg.lstsq(plane[point], uv, rcond=1e-6)
+    if rank < 3:
+        return None
+    completed = plane @ affine
+    completed[point] = uv
+    return completed
 
 
 def _renumbered(image: ImageCorners, own: np.ndarray, first: int, turn: np.ndarray) -> ImageCorners:
