@@ -17,6 +17,7 @@ from icalib.extras import load_cv2
 
 _REDUCED_PX = 1000  # larger images are searched at a fraction of their size first; only the time depends on it
 _LEAST_SEEN = 0.5  # of the corners inside the outermost, seen in rows and columns, for the thorough search
+_LEAST_SQUARE_PX = 4  # corners that are closer merge in the detectors' filters
 _LEAST_FOUND = 0.5  # of the corners that a search proposes, and of each side's: others are no checkerboard
 
 
@@ -83,6 +84,8 @@ class CheckerboardDetector:
         The quick detector sometimes takes parts of other patterns for the board. The thorough one is a hundred times
         as slow where there is no board, and is asked only about images with enough X-corners in rows and columns.
         """
+        if not self._fits(image.shape):
+            return
         reduced, factor = _reduced(image)
         yield from self._quick(reduced, factor)
         if not shows_grid(image, _LEAST_SEEN * (self.rows - 2) * (self.cols - 2)):
@@ -97,11 +100,20 @@ class CheckerboardDetector:
 
     def _quick(self, image: np.ndarray, factor: int) -> Iterator[np.ndarray]:
         """The grid that OpenCV's older detector finds in an image reduced by `factor`, in pixels of the whole one."""
+        if not self._fits(image.shape):
+            return
         cv2 = load_cv2()
         flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
         found, corners = cv2.findChessboardCorners(image, (self.cols, self.rows), flags=flags)
         if found:
             yield factor * (self._grid(corners) + 0.5) - 0.5
+
+    def _fits(self, shape: tuple[int, ...]) -> bool:
+        """Whether the squares along the board's shorter side can be told apart in an image of `shape` (h, w).
+
+        The smallest that fits is 16 px wide; OpenCV's older detector raises an error below 15 px.
+        """
+        return min(shape) >= _LEAST_SQUARE_PX * (min(self.rows, self.cols) + 1)
 
     def _grid(self, corners: np.ndarray) -> np.ndarray:
         return np.asarray(corners, dtype=np.float64).reshape(self.rows, self.cols, 2)
@@ -123,7 +135,7 @@ def _reduced(image: np.ndarray) -> tuple[np.ndarray, int]:
     if factor == 1:
         return image, 1
     cv2 = load_cv2()
-    height, width = (side // factor for side in image.shape)
+    height, width = (max(1, side // factor) for side in image.shape)
     whole = image[: height * factor, : width * factor]
     return cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), factor
 

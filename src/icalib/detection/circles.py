@@ -55,6 +55,8 @@ class CirclesDetector:
 
     def _proposed(self, image: np.ndarray) -> np.ndarray | None:
         """(rows, cols, 2) px of OpenCV's detector, to about a pixel; None where it finds none."""
+        if _MOST_DIAMETER * min(image.shape) < _LEAST_DIAMETER_PX:
+            return None  # too small for any circle; OpenCV refuses the contradicting limits
         cv2 = load_cv2()
         size = (self.target.cols, self.target.rows)
         kind = cv2.CALIB_CB_ASYMMETRIC_GRID if self.target.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID

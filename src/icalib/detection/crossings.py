@@ -38,6 +38,8 @@ def shows_grid(image: np.ndarray, enough: float) -> bool:
     """Whether the image (h, w) uint8, at full, half or quarter size, has a grid of `enough` connected X-corners."""
     cv2 = load_cv2()
     for _ in range(_SCALES):
+        if min(image.shape) <= 2 * _RING_PX:
+            break  # no pixel has a whole ring
         response = _chess_response(image)
         largest_near = cv2.dilate(response, np.ones((_PEAK_WINDOW_PX, _PEAK_WINDOW_PX)))
         peak = (response == largest_near) & (response > _LEAST_RESPONSE)
