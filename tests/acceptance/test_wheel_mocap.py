@@ -76,7 +76,7 @@ def test_runs_agree(found):
     assert all(result.converged for result in found.values())
     for value, std in drives.values():
         assert np.abs(value / NOMINAL - 1.0).max() < 0.015
-        assert (std < [2e-4, 2e-4, 4e-3]).all()
+        assert (std < [2e-4, 2e-4, 4.5e-3]).all()
     names = list(drives)
     for a, b in zip(names, names[1:] + names[:1], strict=True):
         (x, s), (y, t) = drives[a], drives[b]
