@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from icalib.assessment.upwards import upwards_notes
 from icalib.estimation.bodies import words_on_left_out
 from icalib.estimation.circle_centres import centre_shifts
 from icalib.estimation.clocks import instants
+from icalib.estimation.corner_factor import CornerFactor
 from icalib.estimation.corner_noise import NoiseModel
 from icalib.estimation.estimate import Estimate
 from icalib.estimation.imu_data import ImuData
@@ -32,10 +33,12 @@ def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
         yield words
     if inputs.imu is not None:
         yield from _imu_notes(inputs, inputs.imu, found, timeline)
-    for camera, factor, model in zip(inputs.rig.cameras, found.problem.cameras, found.judged.models, strict=True):
+    apart = found.judged.apart or tuple(np.zeros(len(c.node), dtype=bool) for c in found.problem.cameras)
+    cameras = zip(inputs.rig.cameras, found.problem.cameras, found.judged.models, apart, strict=True)
+    for camera, factor, model, late in cameras:
         if len(factor.stream.uv):
             yield f"{camera.name}: {_noise_words(model)}."
-            if words := _rejected_words(factor.keep):
+            if words := _rejected_words(factor.keep[~late[factor.stream.image]]):
                 yield f"{camera.name}: {words}"
         if factor.bodies.target.radii.any() and len(factor.stream.uv):
             size = np.linalg.norm(centre_shifts(factor, found.outcome.state), axis=1)
@@ -43,8 +46,8 @@ def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
                 f"{camera.name}: ellipses have their centres {np.sqrt((size**2).mean()):.3f} px (RMS, {size.max():.2f} "
                 "px at most) beside the projected centres of their circles; the estimate takes it into account."
             )
-    if inputs.imu is None and len(found.problem.cameras) > 1:
-        yield from _pair_notes(found)
+    if words := late_words(found.problem.cameras, apart):
+        yield words
     yield from _feature_notes(found)
     yield from robot_notes(inputs, found)
     yield from upwards_notes(inputs, found)
@@ -93,22 +96,30 @@ def _imu_notes(inputs: Inputs, imu: ImuData, found: Estimate, timeline: Timeline
             yield f"{left_out} images of {camera.name} are left out: {imu.name} was not running then."
 
 
-def _pair_notes(found: Estimate) -> Iterator[str]:
-    """Of images of several cameras that were rejected as a whole, at the same nodes."""
-    cameras = [c for c in found.problem.cameras if len(c.stream.uv)]
-    lost = [set(c.node[np.setdiff1d(c.stream.image, c.stream.image[c.keep])].tolist()) for c in cameras]
-    nodes = sorted(n for n in set().union(*lost) if sum(n in own for own in lost) > 1)
-    if nodes:
-        names, first = " and ".join(c.name for c in cameras), cameras[0]
-        at = ", ".join(str(s) for s in first.stream.stamps_ns[np.isin(first.node, nodes[:MOST_NAMED])])
-        yield (
-            f"{len(nodes)} sets of images of {names} were not exposed together, or the rig moved between, and are left "
-            f"out; their stamps (for pictures without a clock, the numbers in their names times 10^9): {at}."
-        )
+def late_words(cameras: Sequence[CornerFactor], apart: Sequence[np.ndarray]) -> str:
+    """A sentence on the images that were rejected because they are not simultaneous; "" if there are none.
+
+    apart: by camera (M,) bool. The images at one keyframe are a set, and the stamp of a set is that of its first image.
+    """
+    stamp_of, names = {}, []
+    for camera, late in zip(cameras, apart, strict=True):
+        if late.any():
+            names.append(camera.name)
+        for node, stamp in zip(camera.node[late].tolist(), camera.stream.stamps_ns[late].tolist(), strict=True):
+            stamp_of.setdefault(node, stamp)
+    if not stamp_of:
+        return ""
+    at = ", ".join(str(stamp_of[node]) for node in sorted(stamp_of)[:MOST_NAMED])
+    which = f", the first {MOST_NAMED}" if len(stamp_of) > MOST_NAMED else ""
+    return (
+        f"{len(stamp_of)} sets of images of {' and '.join(names)} were not exposed together, or the rig moved between, "
+        "and are left out; their stamps (for images without timestamps, the numbers in their names times "
+        f"10^9){which}: {at}."
+    )
 
 
 def _rejected_words(keep: np.ndarray) -> str:
-    """`keep` (N,) bool: corners in use."""
+    """`keep` (N,) bool: corners in use, of images that are not rejected as a whole."""
     count = int((~keep).sum())
     if not count:
         return ""

@@ -58,7 +58,8 @@ OnVisit = Callable[[str, Problem, Visit], None]  # told of the pass's name, its 
 class Judged:
     """What the residuals of a pass say before the next: how each camera's corners err, as a model and as their `noise`,
     which of them to `keep`; of tracks what is `following`; and the noise of the robot's sensors. straight: the lens is
-    not yet known well enough to say how edges are bent."""
+    not yet known well enough to say how edges are bent. apart: by camera (M,) bool, images that are rejected because
+    they are not simultaneous with others of their keyframe; empty where that is not tested."""
 
     models: tuple[NoiseModel, ...]
     noise: tuple[CornerNoise, ...]
@@ -66,6 +67,7 @@ class Judged:
     following: Following | None
     robot: RobotNoise
     straight: bool = False
+    apart: tuple[np.ndarray, ...] = ()
 
     @classmethod
     def first(cls, inputs: Inputs) -> Judged:
@@ -82,7 +84,8 @@ class Judged:
 
     def next(self, inputs: Inputs, outcome: Outcome, first: bool) -> Judged:
         """As what a pass left behind, the `first` or another, shows it."""
-        problem, now = outcome.problem, replace(self, keep=_kept(inputs, outcome))
+        problem, apart = outcome.problem, _apart(inputs, outcome)
+        now = replace(self, keep=_kept(inputs, outcome, apart), apart=apart)
         if now.following is not None:
             now = replace(now, following=next_following(inputs, outcome, now.following, first))
         if _noise_is_estimated(inputs):
@@ -306,14 +309,21 @@ def _next_noise(
     return tuple(models), tuple(noise)
 
 
-def _kept(inputs: Inputs, outcome: Outcome) -> tuple[np.ndarray, ...]:
-    """By camera (N,) bool: corners that are not rejected, nor all those of an image."""
-    cameras, outputs, settings = outcome.problem.cameras, outcome.residuals.corners, inputs.rig.settings
-    keep = [inliers(f, out, settings) for f, out in zip(cameras, outputs, strict=True)]
-    if len(cameras) > 1 and _has_cameras_alone(inputs) and settings.outlier_std > 0.0:
-        apart = not_simultaneous(cameras, outputs, settings)
+def _kept(inputs: Inputs, outcome: Outcome, apart: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
+    """By camera (N,) bool: corners that are not rejected, nor all those of an image, which is `apart`."""
+    cameras, outputs = outcome.problem.cameras, outcome.residuals.corners
+    keep = [inliers(f, out, inputs.rig.settings) for f, out in zip(cameras, outputs, strict=True)]
+    if apart:
         keep = [k & ~bad[c.stream.image] for k, bad, c in zip(keep, apart, cameras, strict=True)]
     return tuple(keep)
+
+
+def _apart(inputs: Inputs, outcome: Outcome) -> tuple[np.ndarray, ...]:
+    """By camera (M,) bool: images that are not simultaneous with others of their keyframe; empty if not tested."""
+    cameras, settings = outcome.problem.cameras, inputs.rig.settings
+    if len(cameras) < 2 or not _has_cameras_alone(inputs) or settings.outlier_std <= 0.0:
+        return ()
+    return tuple(not_simultaneous(cameras, outcome.residuals.corners, settings))
 
 
 def _has_cameras_alone(inputs: Inputs) -> bool:

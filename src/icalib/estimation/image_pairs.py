@@ -30,7 +30,7 @@ def not_simultaneous(
     shared = _shared_nodes(cameras)
     bad = np.zeros(len(shared), dtype=bool)
     for camera, out in zip(cameras, outputs, strict=True):
-        size = np.linalg.norm(out.residual, axis=1)
+        size = np.linalg.norm(camera.errors(out), axis=1)  # an image that is late errs in common
         medians = grouped_quantiles(size, camera.stream.image, len(camera.node), 0.5)
         own = shared[camera.node] & np.isfinite(medians)
         if own.any():

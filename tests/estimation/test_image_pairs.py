@@ -1,0 +1,60 @@
+"""Sets of images that count as simultaneous but are not: which are rejected, and what is said of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from icalib.assessment.notes import late_words
+from icalib.estimation.corner_factor import CornerFactor, CornerNoise, CornerOutput
+from icalib.estimation.image_pairs import not_simultaneous
+from icalib.rig import Settings
+
+NOISE_PX = 0.1
+
+
+@pytest.fixture
+def cameras(unlike, setup_of, factor_of) -> list[CornerFactor]:
+    """Three cameras with an image each at every keyframe, and different stamps."""
+    first = factor_of(setup_of(unlike), 0)
+    node = np.arange(len(first.node))
+    streams = [replace(first.stream, name=f"cam{k}", stamps_ns=first.stream.stamps_ns + k) for k in range(3)]
+    return [replace(first, stream=stream, node=node) for stream in streams]
+
+
+def output(camera: CornerFactor, late: tuple[int, ...], common: bool) -> tuple[CornerFactor, CornerOutput]:
+    """Normal errors, and 5 px more in `late` images, as a common error or as part of the residuals."""
+    n, rng = len(camera.stream.uv), np.random.default_rng(3)
+    camera = replace(camera, noise=CornerNoise(np.full(n, 0.2), np.ones(1), np.ones((n, 1))))
+    out = camera.output(np.float64)
+    out.root[:] = 1.0
+    out.residual[:] = NOISE_PX * rng.standard_normal((n, 2))
+    if common:
+        out.shared[np.isin(camera.views.image, late), 0] = 5.0
+    else:
+        out.residual[np.isin(camera.stream.image, late), 0] += 5.0
+    return camera, out
+
+
+@pytest.mark.parametrize("common", [False, True])
+@pytest.mark.parametrize("late", [(), (0,), (5,)])
+def test_late_images_are_found_whether_or_not_a_common_error_takes_them_up(cameras, late, common):
+    pairs = [output(camera, late if k == 2 else (), common) for k, camera in enumerate(cameras)]
+    apart = not_simultaneous([c for c, _ in pairs], [out for _, out in pairs], Settings())
+    assert [np.flatnonzero(bad).tolist() for bad in apart] == [list(late)] * 3
+
+
+def test_the_sentence_names_the_cameras_and_stamps_of_the_rejected_sets(cameras):
+    """Also of sets without an image of the first camera."""
+    node = cameras[0].node
+    cameras[0] = replace(cameras[0], node=node + (node >= 2))  # none at keyframe 2
+    late = [np.isin(camera.node, [2]) for camera in cameras]
+    first, stamps = cameras[0].stream.stamps_ns, cameras[1].stream.stamps_ns
+    words = late_words(cameras, late)
+    assert words.startswith("1 sets of images of cam1 and cam2 ") and words.endswith(f": {stamps[2]}.")
+    words = late_words(cameras, [np.isin(camera.node, [2, 4]) for camera in cameras])
+    assert words.startswith("2 sets of images of cam0 and cam1 and cam2 ")
+    assert words.endswith(f": {stamps[2]}, {first[3]}.")
+    assert late_words(cameras, [np.zeros(len(camera.node), dtype=bool) for camera in cameras]) == ""
