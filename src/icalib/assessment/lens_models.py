@@ -13,10 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.estimation.corner_factor import CornerFactor, CornerOutput
-from icalib.estimation.corner_misfit import lens_misfit
-from icalib.estimation.corner_noise import LARGE_MISFIT
+from icalib.estimation.corner_noise import image_speed, residual_noise
 from icalib.estimation.estimate import Estimate
-from icalib.estimation.medians import median_variance
 from icalib.estimation.state import State
 from icalib.geometry.cameras import CAMERA_MODELS, camera_model
 from icalib.geometry.cameras.base import CameraModel
@@ -47,31 +45,28 @@ class _HeldOut:
 
 
 def lens_warnings(rig: Rig, estimate: Estimate) -> Iterator[str]:
-    """A sentence for each camera whose estimated lens leaves a misfit larger than half the noise (`LARGE_MISFIT`).
+    """A sentence for each camera whose estimated lens leaves a large misfit (`ResidualNoise`).
 
     It names a better model. Where none is clearly better, a sentence appears only if the misfit exceeds the noise.
     """
-    outputs = estimate.outcome.residuals.corners
+    outputs, state = estimate.outcome.residuals.corners, estimate.outcome.state
     for camera, factor, out in zip(rig.cameras, estimate.problem.cameras, outputs, strict=True):
-        used = factor.keep & (out.root > 0.0)
-        if camera.distortion.mode == "fixed" or not used.any():
+        if camera.distortion.mode == "fixed" or not (out.root > 0.0).any():
             continue
-        error = factor.errors(out)
-        misfit = lens_misfit(factor.stream, error, used)
-        noise = np.sqrt(median_variance(((error - misfit.field)[used] ** 2).sum(axis=1)))  # px, of either component
-        if not misfit.rms > LARGE_MISFIT * noise:
+        noise = residual_noise(factor, out, rig.settings, image_speed(factor, state))
+        if not noise.lens_misfit_is_large:
             continue
-        most = float(np.linalg.norm(misfit.field, axis=1).max())
+        most = float(np.linalg.norm(noise.lens.field, axis=1).max())
         pattern = (
             f"the corners of {camera.name} are off by up to {most:.2g} px, alike wherever in the image they are seen"
         )
-        own, best = compare_models(factor, out, estimate.outcome.state)
+        own, best = compare_models(factor, out, state)
         if best is not None and own is not None:
             yield (
                 f"{pattern}: {own.model.name} does not follow this lens. In images that had no part in the fit it "
                 f"leaves {own.rms:.2g} px, {best.model.name} {best.rms:.2g} px; write `model: {best.model.name}`."
             )
-        elif misfit.rms > noise:
+        elif noise.lens.rms > noise.base:
             yield (
                 f"{pattern}, and no other camera model follows them clearly better; check that the images are as the "
                 "camera took them, and that the target is as the rig file says."

@@ -20,7 +20,7 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation.corner_factor import CornerFactor, CornerNoise, CornerOutput
-from icalib.estimation.corner_misfit import lens_misfit
+from icalib.estimation.corner_misfit import LensMisfit, lens_misfit
 from icalib.estimation.evidence import Fit
 from icalib.estimation.medians import median_variance
 from icalib.estimation.state import State
@@ -99,6 +99,36 @@ def image_mean(stream: CornerStream, x: np.ndarray, keep: np.ndarray) -> np.ndar
     return np.bincount(image, x[keep], minlength=n) / np.maximum(count, 1)
 
 
+@dataclass(frozen=True)
+class ResidualNoise:
+    """What the residuals of one camera show: base [px] of its median corner and exposure [s] as in `NoiseModel`, and
+    the misfit of the lens."""
+
+    base: float
+    exposure: float
+    lens: LensMisfit
+
+    @property
+    def lens_misfit_is_large(self) -> bool:
+        """The one test for the later robust loss and for the warning that names another camera model."""
+        return self.lens.rms > LARGE_MISFIT * self.base
+
+
+def residual_noise(factor: CornerFactor, out: CornerOutput, settings: Settings, speed: np.ndarray) -> ResidualNoise:
+    """The noise and misfit that the residuals of a pass show; speed (M,) px/s as of `image_speed`.
+
+    Only corners that take part count; there must be one.
+    """
+    stream, used = factor.stream, out.root > 0.0
+    relative, error = stream.relative_sigma[used], factor.errors(out)
+    lens = lens_misfit(stream, error, used)
+    square = ((error - lens.field)[used] ** 2).sum(axis=1) / relative**2
+    base, exposure = float(np.sqrt(median_variance(square))), 0.0
+    if settings.blur_noise:
+        base, exposure = _fit_blur(square, speed[stream.image][used] / relative)
+    return ResidualNoise(max(base, SMALLEST_BASE_PX), exposure, lens)
+
+
 def estimate_noise(
     camera: Camera,
     settings: Settings,
@@ -106,24 +136,21 @@ def estimate_noise(
     out: CornerOutput,
     speed: np.ndarray,
     tau: tuple[float, ...],
-) -> NoiseModel:
-    """The noise that the residuals of a pass show, with `tau` for its common errors. A size given in the rig file
-    is kept. Raises EstimationError where the pass led so far away that no corner is in front of the camera."""
-    stream, used = factor.stream, out.root > 0.0
-    if not used.any():
+) -> tuple[NoiseModel, bool]:
+    """The noise that the residuals of a pass show, with `tau` for its common errors; whether the lens misfit is large.
+
+    A size given in the rig file is kept. Raises EstimationError where the pass led so far away that no corner is in
+    front of the camera.
+    """
+    if not (out.root > 0.0).any():
         raise EstimationError(
             f"the estimate led away: where it ended {camera.name} sees none of its corners; correct what the rig file "
             "gives of its rotation, translation, time_offset and lens, or leave it out to have it found."
         )
-    relative, error = stream.relative_sigma[used], factor.errors(out)
-    lens = lens_misfit(stream, error, used)
-    square = ((error - lens.field)[used] ** 2).sum(axis=1) / relative**2
-    base, exposure = np.sqrt(median_variance(square)), 0.0
-    if settings.blur_noise:
-        base, exposure = _fit_blur(square, speed[stream.image][used] / relative)
+    shown = residual_noise(factor, out, settings, speed)
     if camera.corner_noise_px is not None:
-        return NoiseModel(camera.corner_noise_px, float(exposure), tau)
-    return NoiseModel(max(float(base), SMALLEST_BASE_PX), float(exposure), tau, lens.rms)
+        return NoiseModel(camera.corner_noise_px, shown.exposure, tau), shown.lens_misfit_is_large
+    return NoiseModel(shown.base, shown.exposure, tau, shown.lens.rms), shown.lens_misfit_is_large
 
 
 def scale_common_errors(tau: tuple[float, ...], fits: list[Fit]) -> tuple[float, ...]:

@@ -14,7 +14,6 @@ from icalib.estimation.corner_factor import CornerNoise
 from icalib.estimation.corner_noise import (
     COMMON_ERRORS,
     FIRST_TAU_PX,
-    LARGE_MISFIT,
     NoiseModel,
     estimate_noise,
     first_noise,
@@ -302,8 +301,7 @@ def _next_noise(
         tau = (FIRST_TAU_PX,) * COMMON_ERRORS if settings.common_error else ()
         if len(factor.noise.tau):
             tau = scale_common_errors(tuple(factor.noise.tau), [f for f in common if f.sensor == camera.name])
-        model = estimate_noise(camera, settings, factor, out, speed, tau)
-        large = model.misfit > LARGE_MISFIT * model.base
+        model, large = estimate_noise(camera, settings, factor, out, speed, tau)
         models.append(replace(model, later=large and _has_cameras_alone(inputs)))
         noise.append(models[-1].noise(factor.stream, camera, settings, speed))
     return tuple(models), tuple(noise)
