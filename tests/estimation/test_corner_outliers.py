@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from icalib.estimation.corner_outliers import isolated
+from icalib.estimation.bodies import Bodies
+from icalib.estimation.corner_outliers import inliers, isolated
+from icalib.geometry.targets import AprilGrid, Checkerboard, Scene
+from icalib.rig import Settings
 
 SIZE = np.array([900.0, 600.0])
 NOISE_PX = 0.15
@@ -39,20 +44,44 @@ def test_an_error_of_the_lens_is_kept_and_gross_ones_are_not():
         suspect = np.linalg.norm(residual, axis=1) > 1.0
         assert (suspect & ~wrong).sum() > 100  # without neighbours these would be rejected
         alone = isolated(uv, residual, suspect, tag)
-        assert not (alone & ~suspect).any()
         assert (alone & ~wrong).sum() <= 0.02 * (suspect & ~wrong).sum()
         kept, count = kept + (wrong & ~alone).sum(), count + wrong.sum()
     assert kept <= 0.05 * count  # those of the size of the lens's error beside them
 
 
 def test_corners_that_were_found_together_say_nothing_for_one_another():
-    """A tag that was taken for another one is off by the same in all its corners."""
+    """A tag that was taken for another is off by about the same in all its corners. Those just below the limit do not
+    speak for those above it."""
     rng = np.random.default_rng(5)
     uv, tag = corners(rng)
     residual = NOISE_PX * rng.normal(size=uv.shape)
-    residual[tag == 7] += [3.0, 2.0]
-    suspect = np.linalg.norm(residual, axis=1) > 1.0
-    np.testing.assert_array_equal(isolated(uv, residual, suspect, tag), tag == 7)
+    own = np.flatnonzero(tag == 7)
+    residual[own] = np.array([3.3, 2.9, 2.9, 3.3])[:, None] * [0.8, 0.6]
+    suspect = np.linalg.norm(residual, axis=1) > 3.1
+    assert np.flatnonzero(isolated(uv, residual, suspect, tag)).tolist() == own[[0, 3]].tolist()
+    assert not isolated(uv, residual, suspect, np.arange(len(uv))).any()  # as corners of different tags they would
+
+
+def test_tags_are_told_apart_in_a_scene_whose_boards_have_any_number_of_corners(unlike, setup_of, factor_of):
+    """All of a tag's corners are off by about the same, and only one corner is above the limit."""
+    board, grid = Checkerboard(5, 7, 0.03), AprilGrid(6, 6, 0.088, 0.3)
+    factor = factor_of(setup_of(unlike), 0)
+    scene = Scene(("board", "grid"), (board, grid))
+    apart = 1e4 * factor.stream.image[:, None]  # px: only corners of the same image are neighbours
+    stream = replace(factor.stream, point=factor.stream.point + len(board.points), uv=factor.stream.uv + apart)
+    factor = replace(factor, stream=stream, bodies=Bodies(scene, (1,), (), False))
+    out = factor.output(np.float64)
+    out.root[:] = 1.0
+    out.residual[:] = 0.1 * np.random.default_rng(2).standard_normal((len(stream.uv), 2))
+    first, point = stream.start[3], factor.stream.point
+    tags = (point - len(board.points)) // 4
+    own = first + np.flatnonzero(tags[first:] == tags[first + 9])[:4]
+    assert (stream.image[own] == 3).all()
+    for k in range(4):
+        out.residual[own] = [1.2, 1.2]
+        out.residual[own[k]] = [1.6, 1.6]  # 2.26 px
+        kept = inliers(factor, out, Settings(outlier_min_px=2.0))
+        assert np.flatnonzero(~kept).tolist() == [own[k]]
 
 
 def test_few_corners_or_none_suspect():

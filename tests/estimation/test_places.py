@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 
 from icalib.estimation.assembly import assemble
+from icalib.estimation.bodies import Bodies
 from icalib.estimation.corner_noise import first_noise
 from icalib.estimation.feature_noise import first_following
 from icalib.estimation.outcome import Outcome
-from icalib.estimation.places import Clusters, _cluster_gradients, _image_cells
+from icalib.estimation.places import Clusters, _cluster_gradients, _image_cells, _tag_corners
 from icalib.estimation.problem import Problem
 from icalib.estimation.solver import minimise
 from icalib.first_guess.start import start
+from icalib.geometry.targets import AprilGrid, Checkerboard, Scene
 from icalib.measurements import Measurements, TrackStream
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Rig
@@ -117,3 +119,11 @@ def test_a_lens_that_no_model_follows_is_in_the_standard_deviations():
     print(rms, honest)
     assert rms[0] > 5.0 and rms[1] < 2.0
     assert honest[0] < 1.5 and honest[1] > 0.5 * honest[0]
+
+
+def test_a_tags_corners_are_told_apart_beside_a_board_with_an_odd_number_of_corners(unlike, setup_of, factor_of):
+    alone = factor_of(setup_of(unlike), 0)
+    board, grid = Checkerboard(5, 7, 0.03), AprilGrid(6, 6, 0.088, 0.3)
+    stream = replace(alone.stream, point=alone.stream.point + len(board.points))
+    beside = replace(alone, stream=stream, bodies=Bodies(Scene(("board", "grid"), (board, grid)), (1,)))
+    np.testing.assert_array_equal(_tag_corners(beside, 1), _tag_corners(alone, 1))

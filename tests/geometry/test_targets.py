@@ -65,6 +65,19 @@ def test_identities_and_indices_are_inverse_and_the_origin_is_point_0(target: Ta
     assert (target.tag_centers != target.points).any() == target.blooms
 
 
+@pytest.mark.parametrize("target", [GRID, CHARUCO, BOARD, TAG, TAGS], ids=lambda t: t.type)
+@pytest.mark.parametrize("rows", [5, 7])
+def test_corners_of_a_tag_have_its_number_alone_and_in_a_scene(target: Target, rows: int):
+    tag, _ = target.point_identity(np.arange(len(target.points)))
+    expected = tag if target.type in ("aprilgrid", "tag", "markers") else np.arange(len(tag))
+    same = target.tag_number[:, None] == target.tag_number
+    np.testing.assert_array_equal(same, expected[:, None] == expected)
+    other = Checkerboard(rows, 5, 0.03)
+    n, both = len(other.points), Scene(("board", "target"), (other, target)).tag_number
+    np.testing.assert_array_equal(both[n:, None] == both[n:], same)
+    assert len(np.unique(both[:n])) == n and not set(both[:n]) & set(both[n:])
+
+
 def test_charuco_corners_are_opencvs():
     """Its corners run from the top left downwards, in a frame with y down whose origin is the board's own corner."""
     aruco = pytest.importorskip("cv2").aruco

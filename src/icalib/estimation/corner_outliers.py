@@ -18,9 +18,7 @@ from icalib.estimation.medians import grouped_quantiles, largest_normal
 from icalib.rig import Settings
 
 NEIGHBOURS = 12  # with twice as many, small outliers near the border find a similar residual by chance
-# Consecutive points of one image that are no neighbours, in any target: a tag that is taken for another is off alike in
-# all of its corners.
-TAG_CORNERS = 4
+TAG_CORNERS = 4  # of one image, that are no neighbours: a tag that is taken for another is off alike in all of them
 SIMILAR = 0.7  # of a residual's length: its largest distance from a similar one; at 1 zero would be similar
 
 
@@ -39,7 +37,8 @@ def inliers(factor: CornerFactor, out: CornerOutput, settings: Settings) -> np.n
     median = grouped_quantiles(size, image, len(stream.stamps_ns), 0.5)[image]
     usual = np.maximum(median, np.median(size)) if len(size) else median
     limit = np.maximum(largest_normal(settings.outlier_std, 0.5) * usual, settings.outlier_min_px)
-    tag = image * (1 + stream.point.max(initial=0) // TAG_CORNERS) + stream.point[used] // TAG_CORNERS
+    number = factor.bodies.target.tag_number
+    tag = image * (1 + number.max(initial=0)) + number[stream.point[used]]
     kept = np.zeros(len(out.root), dtype=bool)
     # Without a robust loss the influence of a kept corner is not bounded.
     suspect = size > limit

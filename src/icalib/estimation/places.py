@@ -91,7 +91,8 @@ def _target_parts(camera: CornerFactor) -> np.ndarray:
 
 def _tag_corners(camera: CornerFactor, index: int) -> np.ndarray:
     """(N,) which of its tag's four corners, cameras apart: what a detector does to each."""
-    return 4 * index + (camera.stream.point % 4).astype(np.int32)
+    corner = camera.bodies.target.point_identity(camera.stream.point)[1]
+    return 4 * index + (corner % 4).astype(np.int32)
 
 
 def _cluster_gradients(problem: Problem, outcome: Outcome, kinds: list[Clusters]) -> list[np.ndarray]:

@@ -60,6 +60,10 @@ class AprilGrid(Target):
     def tags(self) -> TagSet:
         return TagSet(self.family, self.border_bits, tuple(self.first_id + i for i in range(self.rows * self.cols)))
 
+    @cached_property
+    def tag_number(self) -> np.ndarray:
+        return np.arange(len(self.points)) // 4
+
     def point_index(self, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarray:
         """(N,) index into `points`. Raises RecordingError for a tag or corner that this target does not have."""
         tag_id, corner = np.asarray(tag_id, dtype=np.int64), np.asarray(corner, dtype=np.int64)

@@ -57,6 +57,12 @@ class Target(ABC):
         return np.zeros(len(self.points), dtype=np.int64)
 
     @cached_property
+    def tag_number(self) -> np.ndarray:
+        """(n,) int64: the same for all corners of one tag, which are found together; corners without a tag have a
+        number each."""
+        return np.arange(len(self.points))
+
+    @cached_property
     def bends(self) -> np.ndarray:
         """(bodies,) bool: whether a body is large enough to bend."""
         return np.ones(len(self.bodies), dtype=bool)

@@ -67,6 +67,10 @@ class Markers(Target):
     def tags(self) -> TagSet:
         return TagSet(self.family, self.border_bits, tuple(self.known.tolist()))
 
+    @cached_property
+    def tag_number(self) -> np.ndarray:
+        return np.arange(len(self.points)) // 4
+
     def point_index(self, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarray:
         tag_id, corner = np.asarray(tag_id, dtype=np.int64), np.asarray(corner, dtype=np.int64)
         place = np.minimum(np.searchsorted(self.known, tag_id), len(self.known) - 1)

@@ -67,6 +67,11 @@ class Scene(Target):
         return np.concatenate([t.body + k for t, k in zip(self.targets, first[:-1], strict=True)])
 
     @cached_property
+    def tag_number(self) -> np.ndarray:
+        pairs = zip(self.targets, self.first_points[:-1], strict=True)
+        return np.concatenate([t.tag_number + first for t, first in pairs])
+
+    @cached_property
     def bends(self) -> np.ndarray:
         return np.concatenate([t.bends for t in self.targets])
 

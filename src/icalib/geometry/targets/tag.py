@@ -40,6 +40,10 @@ class Tag(Target):
     def tag_centers(self) -> np.ndarray:
         return np.tile([0.5 * self.size, 0.5 * self.size, 0.0], (4, 1))
 
+    @cached_property
+    def tag_number(self) -> np.ndarray:
+        return np.arange(len(self.points)) // 4
+
     def point_index(self, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarray:
         tag_id, corner = np.asarray(tag_id, dtype=np.int64), np.asarray(corner, dtype=np.int64)
         if (tag_id != self.id).any():
