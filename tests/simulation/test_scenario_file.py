@@ -233,9 +233,20 @@ def test_stamps_of_today_have_19_digits(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("duration: 3", "duration: 1000000", "imu0 would measure 2e+08 readings, and 5e+06 are the most"),
+        ("duration: 3", "duration: 1000000", "imu0 would measure 200,000,000 readings, and 5,000,000 are the most"),
         ("    rate: 200\n", "    rate: 100000000\n", "imu0 would measure"),
-        ("    rate: 20\n", "    rate: 1000000\n", "left would measure"),
+        (
+            "    rate: 20\n",
+            "    rate: 1000000\n",
+            "left would measure 234,000,000 corners and points, and 100,000,000 are",
+        ),
+        ("    rate: 20\n", "    rate: 1000000000\n", "left would measure 3e+09 images, and 5,000,000 are the most"),
+        ("    rate: 10\n", "    rate: 2000000\n", "top would measure 6,000,000 scans, and 5,000,000 are the most"),
+        (
+            "    rate: 200\n",
+            "    rate: 1666666.7\n",
+            "imu0 would measure 5,000,001 readings, and 5,000,000 are the most",
+        ),
     ],
 )
 def test_what_would_not_fit_in_memory(tmp_path, old, new, words):
@@ -247,8 +258,27 @@ def test_what_would_not_fit_in_memory(tmp_path, old, new, words):
     assert words in str(error.value) and "lower its rate, or the duration" in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("rates", "words"),
+    [
+        (
+            {200: 900_000, 50: 800_000},
+            "5,100,180 readings, images and scans together, imu0 2,700,000 of them, and 5,000,000",
+        ),
+        ({20: 100_000, 10: 70_000}, "107,400,000 corners and points together, top 84,000,000 of them, and 100,000,000"),
+    ],
+)
+def test_what_only_all_sensors_together_would_not_fit_in_memory(tmp_path, rates, words):
+    text = FULL
+    for old, new in rates.items():
+        assert text.count(f"    rate: {old}\n") == 1
+        text = text.replace(f"    rate: {old}\n", f"    rate: {new}\n")
+    with pytest.raises(RigError, match=f"the sensors would measure {words} are the most"):
+        loaded(tmp_path, text)
+
+
 def test_a_lidar_of_too_many_points(tmp_path):
     text = (PAPER / "table2-3d.yaml").read_text().replace("rings: 16", "rings: 16000")
     (tmp_path / "scenario.yaml").write_text(text)
-    with pytest.raises(RigError, match="would measure 1.4e.10 points, and 1e.08 are the most"):
+    with pytest.raises(RigError, match="would measure 1.4e.10 points, and 100,000,000 are the most"):
         load_scenario(tmp_path / "scenario.yaml")

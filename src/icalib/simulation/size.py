@@ -3,36 +3,63 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
+from math import ceil
 
 from icalib.errors import RigError
 from icalib.simulation.scenario import Scenario
 
-# Of each sensor. Either takes about 1 GB with intermediate arrays; twice the number takes twice the memory.
-MOST_INSTANTS = 5_000_000  # readings, images or scans: an IMU at 200 Hz for 7 h
-MOST_POINTS = 100_000_000  # corners, tracked points or LiDAR points: 16 rings of 1800 steps at 8 Hz for 7 min
+# Of all sensors together. Either takes about 1 GB with intermediate arrays; twice the number takes twice the memory.
+MOST_INSTANTS = 5_000_000  # readings, images and scans: an IMU at 200 Hz for 7 h
+MOST_POINTS = 100_000_000  # corners, tracked points and LiDAR points: 16 rings of 1800 steps at 8 Hz for 7 min
 _LARGEST_COUNT = 1e18  # larger ones are cut to it, so that products stay finite
 
 
+@dataclass(frozen=True)
+class _Rate:
+    """How often a sensor measures, and how many points each time; `instants` and `points` are what these are called."""
+
+    name: str
+    rate_hz: float
+    instants: str
+    count: int = 0
+    points: str = "points"
+
+
 def refuse_large(scenario: Scenario) -> None:
-    """Raises RigError, naming the sensor, where one measures more than `MOST_INSTANTS` or `MOST_POINTS`."""
-    for name, what, rate_hz, points in _rates(scenario):
-        instants = min(rate_hz * scenario.duration_s, _LARGEST_COUNT)
-        if instants > MOST_INSTANTS or instants * points > MOST_POINTS:
-            count, most = (instants * points, MOST_POINTS) if points > 1 else (instants, MOST_INSTANTS)
-            raise RigError(
-                f"{name} would measure {count:.2g} {what}, and {most:.0e} are the most that are simulated; lower its "
-                "rate, or the duration."
-            )
+    """Raises RigError, naming the largest sensor, if all together exceed `MOST_INSTANTS` or `MOST_POINTS`."""
+    rates = list(_rates(scenario))
+    instants = [min(r.rate_hz * scenario.duration_s, _LARGEST_COUNT) for r in rates]
+    points = [n * r.count for n, r in zip(instants, rates, strict=True)]
+    _refuse(instants, [(r.name, r.instants) for r in rates], "readings, images and scans", MOST_INSTANTS)
+    _refuse(points, [(r.name, r.points) for r in rates], "corners and points", MOST_POINTS)
 
 
-def _rates(scenario: Scenario) -> Iterator[tuple[str, str, float, int]]:
-    """For each sensor: its name, what it measures, its rate [Hz], and how many points it measures at an instant."""
-    yield "imu0", "readings", scenario.imu_rate_hz, 1
-    corners = len(scenario.target.points) if scenario.board else 1
+def _refuse(counts: list[float], names: list[tuple[str, str]], of_all: str, most: int) -> None:
+    """counts: of each sensor; names: its name, and what it measures."""
+    total = sum(counts)
+    if total <= most:
+        return
+    count, (name, what) = max(zip(counts, names, strict=True))
+    if count > most:
+        sentence = f"{name} would measure {_words(count)} {what}"
+    else:
+        sentence = f"the sensors would measure {_words(total)} {of_all} together, {name} {_words(count)} of them"
+    raise RigError(f"{sentence}, and {most:,} are the most that are simulated; lower its rate, or the duration.")
+
+
+def _words(count: float) -> str:
+    """All digits of counts near the limits: rounded ones would look as large as the limits."""
+    return f"{ceil(count):,}" if count < 1e9 else f"{count:.2g}"
+
+
+def _rates(scenario: Scenario) -> Iterator[_Rate]:
+    yield _Rate("imu0", scenario.imu_rate_hz, "readings")
+    corners = len(scenario.target.points) if scenario.board else 0
+    tracked = scenario.features.per_image if scenario.features else 0
     for camera in scenario.cameras:
-        tracked = scenario.features.per_image if scenario.features else 1
-        yield camera.name, "corners and points", camera.rate_hz, max(corners, tracked)
+        yield _Rate(camera.name, camera.rate_hz, "images", corners + tracked, "corners and points")
     for lidar in scenario.lidars:
-        yield lidar.name, "points", lidar.rate_hz, lidar.rings * lidar.azimuth_steps
+        yield _Rate(lidar.name, lidar.rate_hz, "scans", lidar.rings * lidar.azimuth_steps)
     for sensor in (*scenario.wheels, *scenario.poses):
-        yield sensor.name, "readings", sensor.rate_hz, 1
+        yield _Rate(sensor.name, sensor.rate_hz, "readings")
