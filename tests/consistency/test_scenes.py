@@ -12,10 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from icalib.calibration import Calibration
 from icalib.errors import EstimationError
+from icalib.estimation.bodies import Bodies, choose_bodies, restrict
+from icalib.first_guess.scene_changes import check_scene, scene_changes
+from icalib.first_guess.scene_lens import find_scene
 from icalib.geometry.targets import Scene
 from icalib.measurements import CornerStream, Measurements
 from icalib.pipeline import calibrate_measurements
-from icalib.rig import Rig
+from icalib.rig import Parameter, Rig
 from icalib.simulation import Scenario, Simulation, rig_for, simulate, tag_map
 
 
@@ -93,16 +96,72 @@ def test_recordings_that_show_different_tags_share_one_scene():
     assert max(camera_errors(result, simulations[0], "cam0")) < 1e-7
 
 
-def test_a_scene_that_was_changed_between_recordings_is_named():
-    simulations = [simulate(tag_map(12.0, noiseless=True), seed) for seed in (0, 1)]
-    moved = simulations[1].scenario.T_world_bodies.copy()
-    moved[::2, :3, 3] += [0.02, -0.05, 0.1]
+def moved_between(step: list[float], noiseless: bool) -> tuple[Rig, list[Measurements]]:
+    """Two recordings; in the second every other tag is moved by `step` [m]."""
+    simulations = [simulate(tag_map(12.0, noiseless=noiseless), seed) for seed in (0, 1)]
+    poses = simulations[1].scenario.T_world_bodies
+    assert poses is not None
+    moved = poses.copy()
+    moved[::2, :3, 3] += step
     other = simulate(dataclasses.replace(simulations[1].scenario, T_world_bodies=moved), 1)
-    recordings = [
-        dataclasses.replace(s.measurements, name=name) for s, name in ((simulations[0], "old"), (other, "new"))
-    ]
+    pairs = (simulations[0], "old"), (other, "new")
+    return rig_for(simulations[0].scenario), [dataclasses.replace(s.measurements, name=name) for s, name in pairs]
+
+
+def test_a_scene_that_was_changed_between_recordings_is_named():
+    rig, recordings = moved_between([0.02, -0.05, 0.1], noiseless=True)
     with pytest.raises(EstimationError, match="^(new|old): the targets do not stand to each other as in the other"):
-        calibrate_measurements(rig_for(simulations[0].scenario), recordings)
+        calibrate_measurements(rig, recordings)
+
+
+def test_a_small_change_is_named_beside_noise():
+    rig, pair = moved_between([0.0, 0.01, 0.02], noiseless=False)
+    bodies, recordings = chosen(rig, pair)
+    with pytest.raises(EstimationError, match="^(new|old): the targets do not stand"):
+        check_scene(rig, find_scene(rig, bodies, recordings), recordings)
+
+
+def images(recording: Measurements, count: int) -> Measurements:
+    """The first images of each camera."""
+    cameras = (c.of_rows(c.image < count, c.stamps_ns[:count], np.diff(c.start)[:count]) for c in recording.cameras)
+    return dataclasses.replace(recording, cameras=tuple(cameras))
+
+
+def chosen(rig: Rig, recordings: list[Measurements]) -> tuple[Bodies, list[Measurements]]:
+    bodies = choose_bodies(rig.target, recordings, bent=False)
+    return bodies, [restrict(bodies, r) for r in recordings]
+
+
+@pytest.mark.parametrize("count", [1, 4, 200])
+def test_a_scene_that_stayed_is_no_change(count: int):
+    """However few images one of the recordings has: in a scene of its own they fit better by chance."""
+    rig, (first, second) = moved_between([0.0, 0.0, 0.0], noiseless=False)
+    bodies, recordings = chosen(rig, [first, images(second, count)])
+    scene = find_scene(rig, bodies, recordings)
+    check_scene(rig, scene, recordings)
+    np.testing.assert_allclose(scene_changes(rig, scene, recordings), 1.0, atol=0.15)
+
+
+def test_a_wrong_lens_is_no_change_of_the_scene():
+    """Ten images alike hide it in a scene of their own."""
+    rig, (first, second) = moved_between([0.0, 0.0, 0.0], noiseless=False)
+
+    def wrong(p: Parameter) -> Parameter:
+        assert p.value is not None
+        return dataclasses.replace(p, value=0.8 * p.value)
+
+    cameras = tuple(dataclasses.replace(c, distortion=wrong(c.distortion)) for c in rig.cameras)
+    rig = dataclasses.replace(rig, cameras=cameras)
+    bodies, recordings = chosen(rig, [first, images(second, 10)])
+    check_scene(rig, find_scene(rig, bodies, recordings), recordings)
+
+
+def test_of_three_recordings_the_one_that_was_changed_is_named():
+    rig, (old, new) = moved_between([0.0, 0.02, 0.03], noiseless=False)
+    third = dataclasses.replace(simulate(tag_map(12.0), 2).measurements, name="third")
+    bodies, recordings = chosen(rig, [old, new, third])
+    with pytest.raises(EstimationError, match="^new: the targets do not stand"):
+        check_scene(rig, find_scene(rig, bodies, recordings), recordings)
 
 
 def test_tags_that_no_image_ties_to_the_others_are_left_out_and_named():

@@ -81,7 +81,7 @@ def place_bodies(
 
     Raises UntiedBodiesError naming those that no image ties to the others, EstimationError where these are most.
     """
-    held = [_held(model, params[s.name]) for s, model in zip(streams, models, strict=True)]
+    held = [fixed_lens(model, params[s.name]) for s, model in zip(streams, models, strict=True)]
     grown = grow(bodies, streams, held)
     lost = tuple(bodies.target.bodies[k] for k in bodies.used if not grown.placed[k])
     if 2 * len(lost) > len(bodies.used):
@@ -96,7 +96,8 @@ def place_bodies(
     return Placed(bodies, {key: value for key, value in values.items() if key[0] != reference}, params)
 
 
-def _held(model: CameraModel, params: np.ndarray) -> Lens:
+def fixed_lens(model: CameraModel, params: np.ndarray) -> Lens:
+    """A lens with parameters (P,) that are not adjusted."""
     return Lens(model, params, params, np.ones(len(params)), np.zeros(len(params), dtype=bool))
 
 

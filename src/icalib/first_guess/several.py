@@ -15,12 +15,11 @@ from icalib.first_guess.clocks import OneAxisError, better_offset, camera_rates
 from icalib.first_guess.from_tracks import guess_from_tracks
 from icalib.first_guess.guess import CameraGuess, Guess
 from icalib.first_guess.scene import Placed, scene_poses
+from icalib.first_guess.scene_changes import check_scene
 from icalib.first_guess.scene_lens import find_scene
 from icalib.geometry.cameras import camera_model
 from icalib.measurements import Measurements
 from icalib.rig import Camera, Rig, fixed
-
-LEAST_FIT = 0.5  # of the images must fit the scene
 
 
 def initial_guesses(rig: Rig, bodies: Bodies, recordings: Sequence[Measurements]) -> tuple[Guess, ...]:
@@ -34,7 +33,7 @@ def initial_guesses(rig: Rig, bodies: Bodies, recordings: Sequence[Measurements]
     scene = find_scene(rig, bodies, recordings)
     if len(recordings) == 1:
         return (initial_guess(rig, recordings[0], scene),)
-    _check_scene(rig, scene, recordings)
+    check_scene(rig, scene, recordings)
     order = sorted(range(len(recordings)), key=lambda k: -sum(len(c.stamps_ns) for c in recordings[k].cameras))
     best, guess = _first_that_works(rig, scene, [(k, recordings[k]) for k in order])
     held = _held(rig, guess, recordings[best])
@@ -54,18 +53,6 @@ def _guesses_from_tracks(rig: Rig, recordings: Sequence[Measurements]) -> tuple[
     guess = guess_from_tracks(rig, best)
     held = _held(rig, guess, best)
     return tuple(guess if r is best else guess_from_tracks(held, r) for r in recordings)
-
-
-def _check_scene(rig: Rig, scene: Placed, recordings: Sequence[Measurements]) -> None:
-    """Raises EstimationError naming a recording in which the bodies stand to each other otherwise."""
-    for recording in recordings if scene.bodies.several else ():
-        pairs = list(zip(rig.cameras, recording.cameras, strict=True))
-        fits = [scene_poses(s, camera_model(c.model), scene.params[c.name], scene).ok.mean() for c, s in pairs]
-        if max(fits) < LEAST_FIT:
-            raise EstimationError(
-                f"{recording.name}: the targets do not stand to each other as in the other recordings; calibrate it "
-                "alone, or leave out the targets that were moved."
-            )
 
 
 def _first_that_works(rig: Rig, scene: Placed, recordings: list[tuple[int, Measurements]]) -> tuple[int, Guess]:

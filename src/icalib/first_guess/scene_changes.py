@@ -1,0 +1,75 @@
+"""Whether the bodies of a target stand to each other alike in all recordings.
+
+Each recording's error in the common scene is compared with the errors in scenes of single recordings. Errors of the
+lens and of the target are in all of them. Bodies that were moved between recordings raise the first alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from icalib.errors import EstimationError
+from icalib.estimation.bodies import restrict
+from icalib.estimation.corner_noise import SMALLEST_BASE_PX
+from icalib.first_guess.scene import Placed, poses_by_bodies
+from icalib.first_guess.scene_growth import fixed_lens, grow
+from icalib.geometry.cameras import camera_model
+from icalib.measurements import Measurements
+from icalib.rig import Rig
+
+# Ratio of the errors of median images. At 1.5 the movement adds as much again to the errors that single recordings
+# leave. At twice that, movements by two standard deviations of the corners would pass.
+CHANGED = 1.5
+
+
+def check_scene(rig: Rig, scene: Placed, recordings: Sequence[Measurements]) -> None:
+    """Raises EstimationError naming the recording that differs most from the `scene` of all, if it differs clearly."""
+    if not scene.bodies.several:
+        return
+    changes = scene_changes(rig, scene, recordings)
+    most = int(np.argmax(changes))
+    if changes[most] > CHANGED:
+        raise EstimationError(
+            f"{recordings[most].name}: the targets do not stand to each other as in the other recordings; calibrate it "
+            "alone, or leave out the targets that were moved."
+        )
+
+
+def scene_changes(rig: Rig, scene: Placed, recordings: Sequence[Measurements]) -> np.ndarray:
+    """(n,) RMS error of each recording's median image in the `scene` of all, over the largest in scenes of their own.
+
+    The largest, because few images alike in a scene of their own hide the errors of a wrong lens.
+    """
+    common, own = np.array([_median_errors(rig, scene, r) for r in recordings]).T
+    return common / max(float(own.max()), SMALLEST_BASE_PX)
+
+
+def _median_errors(rig: Rig, scene: Placed, recording: Measurements) -> tuple[float, float]:
+    """RMS errors [px] of the recording's median image in the `scene`, and in a scene of its own.
+
+    The latter is corrected for the degrees of freedom that its bodies take. Zeros where the recording is too short to
+    show a scene of its own.
+    """
+    models = [camera_model(c.model) for c in rig.cameras]
+    params = [scene.params[c.name] for c in rig.cameras]
+    lenses = [fixed_lens(m, p) for m, p in zip(models, params, strict=True)]
+    grown = grow(scene.bodies, recording.cameras, lenses)
+    placed = tuple(int(k) for k in np.flatnonzero(grown.placed))
+    if len(placed) < 2:
+        return 0.0, 0.0
+    bodies = replace(scene.bodies, used=placed)
+    own = Placed(bodies, grown.in_frame_of(placed[0], bodies), scene.params)
+    streams = restrict(bodies, recording).cameras
+    free = 2 * sum(len(s.uv) for s in streams) - 6 * sum(len(s.stamps_ns) for s in streams)
+    left = free - 6 * (len(placed) - 1)
+    if left <= 0:
+        return 0.0, 0.0
+    seen = list(zip(streams, models, params, strict=True))
+
+    def median(placing: Placed) -> float:
+        return float(np.median(np.concatenate([poses_by_bodies(*s, placing).rms_px for s in seen])))
+
+    return median(scene), median(own) * float(np.sqrt(free / left))
