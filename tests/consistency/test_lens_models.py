@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from icalib.assessment import lens_models
 from icalib.calibration import Calibration
 from icalib.measurements import CornerStream, Measurements
 from icalib.pipeline import calibrate_measurements
@@ -17,8 +18,10 @@ WIDE = ("eucm", (430.0, 429.0, 371.0, 245.0), (0.62, 1.09))
 NARROW = ("pinhole-radtan", (458.7, 457.3, 367.2, 248.4), (-0.28, 0.07, 2e-4, 2e-5))
 
 
-def stills(lens: tuple, model: str, seed: int, outliers: float = 0.0) -> tuple[Rig, Measurements, np.ndarray]:
-    """A camera with `lens` alone before a board, 40 images, noise of 0.2 px; a rig file with `model`. The last: which
+def stills(
+    lens: tuple, model: str, seed: int, outliers: float = 0.0, images: int = 40
+) -> tuple[Rig, Measurements, np.ndarray]:
+    """A camera with `lens` alone before a board, some images, noise of 0.2 px; a rig file with `model`. The last: which
     corners are gross outliers."""
     scenario = handheld(20.0)
     camera = dataclasses.replace(scenario.cameras[0], model=lens[0], intrinsics=lens[1], distortion=lens[2])
@@ -28,7 +31,7 @@ def stills(lens: tuple, model: str, seed: int, outliers: float = 0.0) -> tuple[R
     own = dataclasses.replace(rig.cameras[0], model=model, corner_noise_px=None)
     settings = dataclasses.replace(rig.settings, loss="huber", outlier_std=4.0)
     whole = simulation.measurements.cameras[0]
-    kept = np.linspace(0, len(whole.stamps_ns) - 1, 40).astype(int)
+    kept = np.linspace(0, len(whole.stamps_ns) - 1, images).astype(int)
     rows = np.isin(whole.image, kept)
     uv, rng = whole.uv[rows], np.random.default_rng(seed)
     wrong = rng.random(len(uv)) < outliers
@@ -82,3 +85,31 @@ def test_outliers_beside_an_error_of_the_lens_are_rejected_and_the_rest_is_not()
     assert (residuals.rejected & ~wrong).sum() <= 5
     assert (wrong & ~residuals.rejected).sum() <= 0.06 * wrong.sum()
     assert "write `model: eucm`" in pattern_of(result)[0]
+
+
+def test_models_are_compared_by_the_corners_of_the_detector(monkeypatch):
+    """Neither the correction of bent edges by the own lens nor the corners that it rejects favour the own model."""
+    rig, measurements, wrong = stills(WIDE, "pinhole-radtan", 4, outliers=0.01, images=24)
+    (stream,) = measurements.cameras
+    edges = np.tile(np.array([-30.0, 0.0, 30.0, 0.0, 0.0, 60.0, 0.0], dtype=np.float32), (len(stream.uv), 2, 1))
+    measurements = Measurements(None, (dataclasses.replace(stream, edges=edges),))
+    given = []
+    monkeypatch.setattr(lens_models, "compare_models", lambda *args: given.append(args) or (None, None))
+    result = calibrate_measurements(rig, measurements)
+    ((factor, out, state, settings),) = given
+    np.testing.assert_array_equal(factor.stream.uv, stream.uv)
+    monkeypatch.undo()
+    all_own, all_best = lens_models.compare_models(factor, out, state, settings)
+    assert all_own is not None and all_best is not None
+    (residuals,) = result.corner_residuals
+    size = np.linalg.norm(residuals.residual, axis=1)
+    large = size > np.quantile(size, 0.8)  # as if the own model had rejected what it cannot follow
+    root = np.where(large, 0.0, out.root)
+    own, best = lens_models.compare_models(factor, dataclasses.replace(out, root=root), state, settings)
+    for fewer, whole in ((own, all_own), (best, all_best)):
+        assert fewer is not None
+        assert fewer.model is whole.model
+        assert fewer.rms == pytest.approx(whole.rms, rel=0.02)
+        assert fewer.corners >= 0.995 * whole.corners
+    assert all_own.corners <= len(wrong) - 0.9 * wrong.sum()
+    assert all_best.model.name == "eucm" and all_best.rms == pytest.approx(0.2, rel=0.1)

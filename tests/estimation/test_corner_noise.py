@@ -10,7 +10,8 @@ import pytest
 from icalib.assessment import lens_models
 from icalib.estimation.corner_noise import NoiseModel, estimate_noise, image_speed
 from icalib.estimation.estimate import Estimate
-from icalib.rig import Camera, Rig, Settings
+from icalib.estimation.inputs import Inputs
+from icalib.rig import Camera, Settings
 
 BASE, EXPOSURE_S = 0.08, 4e-4
 
@@ -67,4 +68,5 @@ def test_a_large_misfit_is_large_for_the_loss_and_for_the_warning(
     outcome = SimpleNamespace(residuals=residuals, state=setup.state)
     found = SimpleNamespace(outcome=outcome, problem=SimpleNamespace(cameras=(factor,)))
     rig = SimpleNamespace(cameras=(camera,), settings=settings)
-    assert len(list(lens_models.lens_warnings(cast(Rig, rig), cast(Estimate, found)))) == large
+    inputs = SimpleNamespace(rig=rig, measurements=SimpleNamespace(cameras=(factor.stream,)))
+    assert len(list(lens_models.lens_warnings(cast(Inputs, inputs), cast(Estimate, found)))) == large

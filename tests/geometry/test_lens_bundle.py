@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -36,7 +38,9 @@ def images_of(
     points, basis = np.concatenate(points), np.concatenate(basis)
     uv, valid = camera_model(name).project(params, points)
     assert valid.all()
-    return ImagePoints(points, uv + noise * rng.normal(size=uv.shape), 48 * np.arange(count + 1), basis)
+    return ImagePoints(
+        points, uv + noise * rng.normal(size=uv.shape), 48 * np.arange(count + 1), basis, np.ones(len(uv), dtype=bool)
+    )
 
 
 def disturbed(seen: ImagePoints, seed: int) -> ImagePoints:
@@ -63,10 +67,10 @@ def test_derivatives_are_those_of_differences():
 @pytest.mark.parametrize(("name", "params"), [("pinhole-radtan", RADTAN), ("pinhole-equidistant", FISHEYE)])
 def test_a_lens_is_recovered_with_poses_and_shape(name: str, params: np.ndarray):
     model, seen = camera_model(name), disturbed(images_of(name, params, 8), 1)
-    found, shape, square = adjust(model, params + 0.01 * np.abs(params), seen)
+    found, shape, residual = adjust(model, params + 0.01 * np.abs(params), seen)
     np.testing.assert_allclose(found, params, rtol=1e-3, atol=1e-4)
     assert shape[0] == pytest.approx(-1e-3, abs=1e-5)
-    assert square.max() < 1e-4
+    assert np.abs(residual).max() < 1e-3
 
 
 def test_what_is_held_back_is_left_with_the_noise_by_the_right_model_and_with_more_by_another():
@@ -77,9 +81,18 @@ def test_what_is_held_back_is_left_with_the_noise_by_the_right_model_and_with_mo
         model = camera_model(name)
         (start,) = initial_parameters(model, camera_model("pinhole-equidistant"), FISHEYE, fitted)
         params, shape, _ = adjust(model, start, fitted)
-        again, same, square = adjust(model, params, held_back, shape)
+        again, same, residual = adjust(model, params, held_back, shape)
         np.testing.assert_array_equal(again, params)
         np.testing.assert_array_equal(same, shape)
-        rms[name] = np.sqrt(0.5 * square.sum() / len(held_back.uv))
+        rms[name] = np.sqrt((residual**2).mean())
     assert rms["pinhole-equidistant"] == pytest.approx(0.1, rel=0.1)
     assert rms["pinhole-radtan"] > 1.3 * rms["pinhole-equidistant"]
+
+
+def test_points_that_are_not_used_have_residuals_and_no_influence():
+    model, seen = camera_model("pinhole-radtan"), disturbed(images_of("pinhole-radtan", RADTAN, 8), 1)
+    used = np.random.default_rng(0).random(len(seen.uv)) < 0.8
+    uv = seen.uv + np.where(used, 0.0, 30.0)[:, None]
+    found, _, residual = adjust(model, RADTAN + 0.01 * np.abs(RADTAN), replace(seen, uv=uv, used=used))
+    np.testing.assert_allclose(found, RADTAN, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(residual[~used], -30.0, atol=1e-2)

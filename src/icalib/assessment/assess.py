@@ -318,7 +318,7 @@ def _warnings(
     # How far off those are that lie on planes by chance means nothing.
     yield from misfits(inputs.rig, [f for f in judged if not (few and f.kind == ON_PLANES)])
     yield from few
-    yield from lens_warnings(inputs.rig, found)
+    yield from lens_warnings(inputs, found)
     yield from pose_warnings(poses, inputs.rig)
     yield from upwards_warnings(inputs, found)
     yield from lidar_warnings(inputs, found) if inputs.clouds.count else ()

@@ -1,25 +1,29 @@
 """Warns where the camera model of the rig file does not follow the lens, and names a model that does.
 
 Models are compared on held-out images. Each is fitted to every other image, with poses and board shape free. It is
-judged by the residuals in the images between, where only poses are fitted.
+judged by the residuals in the images between, where only poses are fitted. All models are given the same corners, as
+the detector found them: a corner is left out only where no model explains it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from icalib.estimation.circle_centres import with_circle_centres
 from icalib.estimation.corner_factor import CornerFactor, CornerOutput
 from icalib.estimation.corner_noise import image_speed, residual_noise
+from icalib.estimation.corner_outliers import rejected
 from icalib.estimation.estimate import Estimate
+from icalib.estimation.inputs import Inputs
 from icalib.estimation.state import State
 from icalib.geometry.cameras import CAMERA_MODELS, camera_model
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.lens_bundle import ImagePoints, adjust, initial_parameters
-from icalib.rig import Rig
+from icalib.rig import Settings
 
 MOST_IMAGES = 80  # that are compared, half of them held out; the time is proportional to it
 FEWEST_IMAGES = 4  # in each half; with fewer no model is fitted
@@ -31,10 +35,15 @@ SIGN_TEST_SIGMAS = 3.0  # of the number of images that another model fits better
 
 @dataclass(frozen=True)
 class _HeldOut:
-    """What a fitted model leaves in the M held-out images: squared_error (M,) px^2, the sum over the corners of each
-    image; corners: their number in all images."""
+    """What a fitted model with `params` (P,) leaves in the M held-out images.
+
+    squared_error (M,) px^2: the sum over the used corners of each image; corners: their number in all images; residuals
+    (N, 2) px: those of all corners, of the fitted and then of the held-out images.
+    """
 
     model: CameraModel
+    params: np.ndarray
+    residuals: np.ndarray
     squared_error: np.ndarray
     corners: int
 
@@ -44,23 +53,24 @@ class _HeldOut:
         return float(np.sqrt(0.5 * self.squared_error.sum() / self.corners))
 
 
-def lens_warnings(rig: Rig, estimate: Estimate) -> Iterator[str]:
+def lens_warnings(inputs: Inputs, estimate: Estimate) -> Iterator[str]:
     """A sentence for each camera whose estimated lens leaves a large misfit (`ResidualNoise`).
 
     It names a better model. Where none is clearly better, a sentence appears only if the misfit exceeds the noise.
     """
     outputs, state = estimate.outcome.residuals.corners, estimate.outcome.state
-    for camera, factor, out in zip(rig.cameras, estimate.problem.cameras, outputs, strict=True):
+    factors, streams = estimate.problem.cameras, inputs.measurements.cameras
+    for camera, factor, out, stream in zip(inputs.rig.cameras, factors, outputs, streams, strict=True):
         if camera.distortion.mode == "fixed" or not (out.root > 0.0).any():
             continue
-        noise = residual_noise(factor, out, rig.settings, image_speed(factor, state))
+        noise = residual_noise(factor, out, inputs.rig.settings, image_speed(factor, state))
         if not noise.lens_misfit_is_large:
             continue
         most = float(np.linalg.norm(noise.lens.field, axis=1).max())
         pattern = (
             f"the corners of {camera.name} are off by up to {most:.2g} px, alike wherever in the image they are seen"
         )
-        own, best = compare_models(factor, out, state)
+        own, best = compare_models(replace(factor, stream=stream), out, state, inputs.rig.settings)
         if best is not None and own is not None:
             yield (
                 f"{pattern}: {own.model.name} does not follow this lens. In images that had no part in the fit it "
@@ -73,31 +83,53 @@ def lens_warnings(rig: Rig, estimate: Estimate) -> Iterator[str]:
             )
 
 
-def compare_models(factor: CornerFactor, out: CornerOutput, state: State) -> tuple[_HeldOut | None, _HeldOut | None]:
-    """The camera's own model, and the plainest one that is clearly better.
+def compare_models(
+    factor: CornerFactor, out: CornerOutput, state: State, settings: Settings
+) -> tuple[_HeldOut | None, _HeldOut | None]:
+    """The camera's own model, and the plainest one that is clearly better. The factor's corners are the detector's.
 
     The first is None where there are too few images, or the own model cannot be fitted to them. The second is None
     where no model is clearly better: by a tenth in RMS, and in more images than chance explains (sign test).
     """
-    fitted, held_out = _halves(factor, out, state)
-    if fitted is None or held_out is None:
+    halves = _halves(with_circle_centres(factor, state), out, state)
+    if halves is None:
         return None, None
+    rows, fitted, held_out = halves
     params = np.concatenate([state.values[factor.name, "intrinsics"], state.values[factor.name, "distortion"]])
-    own = _cross_validated(factor.model, [params], fitted, held_out)
-    others = []
-    for model in (camera_model(name) for name in CAMERA_MODELS if name != factor.model.name):
-        starts = list(initial_parameters(model, factor.model, params, fitted))
-        if (other := _cross_validated(model, starts, fitted, held_out)) is not None:
-            others.append(other)
-    if own is None or not others:
-        return own, None
+    models = [factor.model, *(camera_model(name) for name in CAMERA_MODELS if name != factor.model.name)]
+    starts = {m.name: list(initial_parameters(m, factor.model, params, fitted)) for m in models[1:]}
+    first = _fits(models, starts | {factor.model.name: [params]}, fitted, held_out)
+    if not first:
+        return None, None
+    # Corners that the own model rejects may be those that another explains.
+    residuals = np.array([fit.residuals for fit in first])
+    nearest = np.argmin((residuals**2).sum(axis=2), axis=0)
+    used = ~rejected(factor, rows, residuals[nearest, np.arange(len(rows))], settings)
+    fitted, held_out = replace(fitted, used=used[: len(fitted.uv)]), replace(held_out, used=used[len(fitted.uv) :])
+    second = _fits([fit.model for fit in first], {f.model.name: [f.params] for f in first}, fitted, held_out)
+    own = next((fit for fit in second if fit.model is factor.model), None)
+    return own, None if own is None else _clearly_better(own, [fit for fit in second if fit is not own])
+
+
+def _fits(
+    models: list[CameraModel], starts: dict[str, list[np.ndarray]], fitted: ImagePoints, held_out: ImagePoints
+) -> list[_HeldOut]:
+    """Those of the models that can be fitted, each from its starts."""
+    found = [_cross_validated(model, starts[model.name], fitted, held_out) for model in models]
+    return [fit for fit in found if fit is not None]
+
+
+def _clearly_better(own: _HeldOut, others: list[_HeldOut]) -> _HeldOut | None:
+    """The plainest of the others that are about as good as the best, if it is clearly better than the own model."""
+    if not others:
+        return None
     least = min(o.rms for o in others)
     best = min((o for o in others if o.rms <= EQUAL * least), key=lambda o: len(o.model.parameter_names))
     better, n = int((best.squared_error < own.squared_error).sum()), len(own.squared_error)
     # Sign test: `better` has mean n / 2 and standard deviation sqrt(n) / 2 if the models are equally good. The RMS
     # alone may come from a few images.
     by_chance = better - 0.5 * n < 0.5 * SIGN_TEST_SIGMAS * np.sqrt(n)
-    return own, best if best.rms < BETTER * own.rms and not by_chance else None
+    return best if best.rms < BETTER * own.rms and not by_chance else None
 
 
 def _cross_validated(
@@ -113,23 +145,27 @@ def _cross_validated(
             fits.append(adjust(model, params, fitted))
     if not fits:
         return None
-    params, shape, _ = min(fits, key=lambda fit: fit[2].sum())
+    params, shape, residual = min(fits, key=lambda fit: (fit[2][fitted.used] ** 2).sum())
     with suppress(np.linalg.LinAlgError):
-        return _HeldOut(model, adjust(model, params, held_out, shape)[2], len(held_out.uv))
+        _, _, left = adjust(model, params, held_out, shape)
+        square = held_out.sum_by_image(np.where(held_out.used, (left**2).sum(axis=1), 0.0))
+        return _HeldOut(model, params, np.concatenate([residual, left]), square, int(held_out.used.sum()))
     return None
 
 
-def _halves(factor: CornerFactor, out: CornerOutput, state: State) -> tuple[ImagePoints | None, ImagePoints | None]:
-    """The used corners of at most `MOST_IMAGES` images, spread over the recording: every other image, and the rest.
+def _halves(
+    factor: CornerFactor, out: CornerOutput, state: State
+) -> tuple[np.ndarray, ImagePoints, ImagePoints] | None:
+    """At most `MOST_IMAGES` images, spread over the recording: every other one to be fitted, the rest held out.
 
-    Points are in the camera frame, by lens and poses of `state`; uv is corrected for bloom. None, None where too few
-    images have enough corners.
+    Returns the corners' rows (N,) int in the stream, and the points of both. All corners of the images are in them;
+    those of the estimate are used. Points are in the camera frame, by lens and poses of `state`; uv is corrected for
+    bloom. None where too few images have enough corners.
     """
     stream, used = factor.stream, factor.keep & (out.root > 0.0)
-    count = np.bincount(stream.image[used], minlength=len(stream.stamps_ns))
-    rich = np.flatnonzero(count >= FEWEST_CORNERS)
+    rich = np.flatnonzero(np.bincount(stream.image[used], minlength=len(stream.stamps_ns)) >= FEWEST_CORNERS)
     if len(rich) < 2 * FEWEST_IMAGES:
-        return None, None
+        return None
     chosen = rich[np.unique(np.linspace(0, len(rich) - 1, MOST_IMAGES).astype(int))]
     points, R_cam_body = np.empty((len(stream.uv), 3)), np.empty((len(stream.uv), 3, 3))
     for v0, v1 in factor.blocks():
@@ -139,9 +175,10 @@ def _halves(factor: CornerFactor, out: CornerOutput, state: State) -> tuple[Imag
     uv = stream.uv
     if len(factor.direction):
         uv = uv - state.values[factor.name, "bloom"] * factor.direction
+    rows = [np.flatnonzero(np.isin(stream.image, own)) for own in (chosen[::2], chosen[1::2])]
     halves = []
-    for own in (chosen[::2], chosen[1::2]):
-        rows = np.flatnonzero(used & np.isin(stream.image, own))
-        basis = R_cam_body[rows] @ factor.bodies.basis[stream.point[rows]].transpose(0, 2, 1)
-        halves.append(ImagePoints(points[rows], uv[rows], np.concatenate([[0], np.cumsum(count[own])]), basis))
-    return halves[0], halves[1]
+    for own in rows:
+        start = np.append(np.flatnonzero(np.diff(stream.image[own], prepend=-1)), len(own))
+        basis = R_cam_body[own] @ factor.bodies.basis[stream.point[own]].transpose(0, 2, 1)
+        halves.append(ImagePoints(points[own], uv[own], start, basis, used[own]))
+    return np.concatenate(rows), halves[0], halves[1]

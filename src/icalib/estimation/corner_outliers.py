@@ -32,19 +32,25 @@ def inliers(factor: CornerFactor, out: CornerOutput, settings: Settings) -> np.n
     if settings.outlier_std <= 0.0:
         return np.ones(len(out.root), dtype=bool)
     used = np.flatnonzero((out.root > 0.0) | ~factor.keep)  # rejected corners are tested again: they may fit now
-    residual, stream = out.residual[used].astype(np.float64), factor.stream
-    size, image = np.linalg.norm(residual, axis=1), stream.image[used]
+    kept = np.zeros(len(out.root), dtype=bool)
+    kept[used] = ~rejected(factor, used, out.residual[used].astype(np.float64), settings)
+    return kept
+
+
+def rejected(factor: CornerFactor, rows: np.ndarray, residual: np.ndarray, settings: Settings) -> np.ndarray:
+    """(n,) bool: the corners `rows` (n,) int of the stream that their residuals (n, 2) [px] reject, as of `inliers`."""
+    if settings.outlier_std <= 0.0:
+        return np.zeros(len(rows), dtype=bool)
+    stream, size = factor.stream, np.linalg.norm(residual, axis=1)
+    image = stream.image[rows]
     median = grouped_quantiles(size, image, len(stream.stamps_ns), 0.5)[image]
     usual = np.maximum(median, np.median(size)) if len(size) else median
     limit = np.maximum(largest_normal(settings.outlier_std, 0.5) * usual, settings.outlier_min_px)
     number = factor.bodies.target.tag_number
-    tag = image * (1 + number.max(initial=0)) + number[stream.point[used]]
-    kept = np.zeros(len(out.root), dtype=bool)
+    tag = image * (1 + number.max(initial=0)) + number[stream.point[rows]]
     # Without a robust loss the influence of a kept corner is not bounded.
     suspect = size > limit
-    rejected = suspect if settings.loss == "none" else isolated(stream.uv[used], residual, suspect, tag)
-    kept[used[~rejected]] = True
-    return kept
+    return suspect if settings.loss == "none" else isolated(stream.uv[rows], residual, suspect, tag)
 
 
 def isolated(uv: np.ndarray, residual: np.ndarray, suspect: np.ndarray, tag: np.ndarray) -> np.ndarray:

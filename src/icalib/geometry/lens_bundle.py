@@ -29,13 +29,15 @@ class ImagePoints:
 
     points (N, 3) [m]: in the camera frame, by an estimate; uv (N, 2) [px]: where they were measured. Those of image i
     are start[i]:start[i + 1]; start (M + 1,) int, at least one point an image. basis (N, 3, s): derivative of the
-    points by the shape parameters, in the camera frame. The shape is relative to that of the estimate.
+    points by the shape parameters, in the camera frame. The shape is relative to that of the estimate. used (N,) bool:
+    the points that are fitted.
     """
 
     points: np.ndarray
     uv: np.ndarray
     start: np.ndarray
     basis: np.ndarray
+    used: np.ndarray
 
     @property
     def image(self) -> np.ndarray:
@@ -49,7 +51,7 @@ class ImagePoints:
         """
         R = np.array([so3.exp(np.ascontiguousarray(m[:3])) for m in motion])[self.image]
         points = np.einsum("nij,nj->ni", R, self.points + self.basis @ shape) + motion[self.image, 3:]
-        return ImagePoints(points, self.uv, self.start, R @ self.basis)
+        return ImagePoints(points, self.uv, self.start, R @ self.basis, self.used)
 
     def sum_by_image(self, values: np.ndarray) -> np.ndarray:
         """(M, ...): the sum of values (N, ...) over the points of each image."""
@@ -64,7 +66,7 @@ def initial_parameters(
     They minimise the distance between projected and measured points, the points being fixed. A start that sees no more
     than half of the points is left out. fx and fy start so that the scale in the image's centre is that of `other`.
     """
-    few = slice(None, None, max(len(seen.uv) // START_CORNERS, 1))
+    few = np.flatnonzero(seen.used)[:: max(int(seen.used.sum()) // START_CORNERS, 1)]
     points, uv = seen.points[few], seen.uv[few]
     for distortion in model.start_distortions:
         start = np.array([*params[:4], *distortion])
@@ -78,10 +80,10 @@ def initial_parameters(
 def adjust(
     model: CameraModel, params: np.ndarray, seen: ImagePoints, fixed: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Parameters (P,), change of the target's shape (s,), and sum of the squared residuals (M,) [px^2] of each image.
+    """Parameters (P,), change of the target's shape (s,), and residuals (N, 2) [px] of all points, used or not.
 
-    Minimises the squared residuals over parameters, shape and poses, from `params` (P,). With a `fixed` shape (s,) only
-    the poses are fitted, and `params` and `fixed` are returned as they are.
+    Minimises the squared residuals of the used points over parameters, shape and poses, from `params` (P,). With a
+    `fixed` shape (s,) only the poses are fitted, and `params` and `fixed` are returned as they are.
 
     Raises numpy.linalg.LinAlgError where the points of an image do not determine its pose.
     """
@@ -94,7 +96,7 @@ def adjust(
         trial = params + step[:n] if n else params
         moved = seen.moved(motion, step[n:] if n else np.zeros(len(shape)))
         there = _linearised(model, trial, moved, fixed is None)
-        before, after = (float((r**2).sum()) for r, _ in (here, there))
+        before, after = (float((r[seen.used] ** 2).sum()) for r, _ in (here, there))
         if after < before:
             params, seen, here = trial, moved, there
             shape = shape + step[n:] if n else shape
@@ -105,7 +107,7 @@ def adjust(
             damping *= 10.0
             if damping > MOST_DAMPING:
                 break
-    return params, shape, seen.sum_by_image((here[0] ** 2).sum(axis=1))
+    return params, shape, here[0]
 
 
 def _linearised(
@@ -128,6 +130,7 @@ def _step(residual: np.ndarray, J: np.ndarray, seen: ImagePoints, damping: float
 
     Both diagonals are damped, relative to themselves. J (N, 2, 6 + n) as `_linearised` gives it.
     """
+    J = J * seen.used[:, None, None]
     A, B = J[:, :, :6], J[:, :, 6:]
     H, C = (seen.sum_by_image(np.einsum("nki,nkj->nij", A, x)) for x in (A, B))
     g = seen.sum_by_image(np.einsum("nki,nk->ni", A, residual))
