@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from icalib.assessment.assess import few_factor
+from icalib.assessment.assess import few_factor, few_parts_notes
 from icalib.calibration import Calibration
 from icalib.measurements import CornerStream, Measurements
 from icalib.pipeline import calibrate_measurements
@@ -67,8 +68,24 @@ def test_white_noise_costs_little_more_than_students_t(count: int):
 
 def test_few_images_say_how_much_their_spread_can_tell():
     result = stills(6, 1, 0.1)
-    assert any("5 parts" in n and "Student" in n for n in result.notes)
+    assert any("5 parts" in n and "Student" in n and n.endswith("record more images.") for n in result.notes)
     assert not any("Student" in n for n in stills(40, 1, 0.1).notes)
+
+
+@pytest.mark.parametrize(
+    ("imu", "cameras", "words"),
+    [
+        ("imu0", ("cam0",), "record longer, and leave `splits` at 8 or more."),
+        ("imu0", (), "record longer, and leave `splits` at 8 or more."),
+        (None, ("cam0",), "record more images."),
+        (None, (), "record more poses."),
+    ],
+)
+def test_the_advice_for_few_parts_is_about_what_the_rig_has(imu, cameras, words):
+    inputs = SimpleNamespace(imu=imu, rig=SimpleNamespace(cameras=cameras))
+    (note,) = few_parts_notes(inputs, SimpleNamespace(count=5))  # pyright: ignore[reportArgumentType]
+    assert note.endswith(words)
+    assert not list(few_parts_notes(inputs, SimpleNamespace(count=8)))  # pyright: ignore[reportArgumentType]
 
 
 def test_the_factor_of_few_parts_is_students():

@@ -118,7 +118,12 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
         converged=outcome.converged,
         status=outcome.status,
         warnings=(*wrong, *(w for w in warnings if w not in wrong)),
-        notes=(*notes(inputs, found, timeline), *guess_notes(inputs, groups), *size_notes, *_few_notes(parts)),
+        notes=(
+            *notes(inputs, found, timeline),
+            *guess_notes(inputs, groups),
+            *size_notes,
+            *few_parts_notes(inputs, parts),
+        ),
         rig=rig_to_dict(inputs.asked or inputs.rig),
         settings=dataclasses.asdict(inputs.rig.settings),
         rates=_rates(inputs),
@@ -244,11 +249,16 @@ def _empirical_variance(found: Estimate, parts: Parts | None, formal: np.ndarray
     return few_factor(parts.count) ** 2 * leverage * spread + sum(excess)
 
 
-def _few_notes(parts: Parts | None) -> Iterator[str]:
+def few_parts_notes(inputs: Inputs, parts: Parts | None) -> Iterator[str]:
+    """How far the standard deviations rest on few parts, and what makes them more."""
+    if inputs.imu is not None:
+        more = "record longer, and leave `splits` at 8 or more"
+    else:
+        more = "record more images" if inputs.rig.cameras else "record more poses"
     if parts is not None and parts.count < ENOUGH_PARTS:
         yield (
             f"standard deviations rest on the spread of {parts.count} parts of the recording, by Student's t "
-            f"distribution {few_factor(parts.count):.2f} times as large as those of many; record more images."
+            f"distribution {few_factor(parts.count):.2f} times as large as those of many; {more}."
         )
 
 
@@ -353,5 +363,5 @@ def _factor_warnings(factors: np.ndarray, split: bool, held: HeldOut | None):
     if not split:
         yield (
             "the recording is too short to be split (or splits are off): standard deviations are formal and too small, "
-            "for they include white noise alone, and no errors that an image, a time or a place shares."
+            "for they include white noise alone, and no errors that measurements of one time or place share."
         )
