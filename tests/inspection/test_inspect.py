@@ -113,7 +113,13 @@ class TestTarget:
         ("text", "words"),
         [
             ("{type: aprilgrid, rows: 3}", r"target\.yaml:1: cols, tag_size, tag_spacing are missing"),
-            ("{target_type: circlegrid}", r"target\.yaml: icalib does not know the target_type 'circlegrid'"),
+            ("{target_type: starfield}", r"target\.yaml: icalib does not know the target_type 'starfield'"),
+            ("{target_type: circlegrid}", r"target\.yaml: targetRows must be a number above 0"),
+            (
+                "{target_type: circlegrid, targetRows: 5, targetCols: 4, spacingMeters: 0.05, asymmetricGrid: true}",
+                r"target\.yaml: Kalibr's file lacks the diameter of the circles, .*; measure it and write `target: "
+                r"\{type: circles, rows: 5, cols: 4, spacing: 0\.05, diameter: ..., asymmetric: true\}` in the rig",
+            ),
             ("- 1", r"target\.yaml:1: must be a mapping"),
             (None, r"target\.yaml does not exist; check the path"),
         ],

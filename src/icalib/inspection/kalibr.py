@@ -111,13 +111,14 @@ def kalibr_target(data: dict[str, Any], file: str) -> Target:
 
 
 def _circles(data: dict[str, Any], file: str) -> str:
-    """What to write for a circlegrid, whose circles' size Kalibr's file does not say."""
+    """What to write for a circlegrid; Kalibr's file lacks the diameter of its circles."""
     rows, cols = (_whole(data, name, file) for name in ("targetRows", "targetCols"))
     spacing = _positive(data, "spacingMeters", file)
     asymmetric = ", asymmetric: true" if data.get("asymmetricGrid") else ""
+    target = f"{{type: circles, rows: {rows}, cols: {cols}, spacing: {spacing:g}, diameter: ...{asymmetric}}}"
     return (
-        "Kalibr does not say how large the circles are, and centres of ellipses depend on it; measure it and write "
-        f"target: {{type: circles, rows: {rows}, cols: {cols}, spacing: {spacing:g}, diameter: ...{asymmetric}}}."
+        "Kalibr's file lacks the diameter of the circles, which the centres of their images depend on; measure it and "
+        f"write `target: {target}` in the rig file."
     )
 
 
