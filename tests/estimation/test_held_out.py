@@ -13,7 +13,7 @@ from tests.estimation.test_arrowhead import random_pieces
 from icalib.estimation.arrowhead import NODE, given_border
 from icalib.estimation.evidence import chi2_by_kind
 from icalib.estimation.held_out import Half, excess, halves_of, predict, shifts
-from icalib.estimation.parts import Parts
+from icalib.estimation.parts import FEWEST_NODES, Parts
 from icalib.estimation.prior_factor import Prior
 from icalib.estimation.solver import minimise
 from icalib.simulation import handheld, simulate
@@ -174,8 +174,21 @@ def solution(sums):
     return -inverse @ sums[:-1, -1], inverse
 
 
-def test_a_part_too_short_is_no_part(solved):
+def test_parts_are_as_many_as_asked_for_and_long_enough(solved):
     problem, outcome, _ = solved
+    assert Parts.of(problem, outcome, 0) is None
     assert Parts.of(problem, outcome, 1) is None
-    assert Parts.of(problem, outcome, problem.n_nodes // 2) is None
-    assert Parts.of(problem, outcome, 2) is not None
+    two, many = Parts.of(problem, outcome, 2), Parts.of(problem, outcome, problem.n_nodes // 2)
+    assert two is not None and two.count == 2
+    assert many is not None and many.count == (problem.n_nodes - 1) // FEWEST_NODES
+    assert np.diff(many.ends).min() >= FEWEST_NODES
+
+
+@pytest.mark.parametrize(("duration", "nodes", "parts"), [(0.35, 5, None), (0.45, 8, 2)])
+def test_a_recording_too_short_for_two_parts_has_none(duration, nodes, parts, setup_of, problem_of):
+    """Three keyframes a part and one at the end: two parts need seven."""
+    setup = setup_of(simulate(handheld(duration), seed=5))
+    problem = problem_of(setup)
+    found = Parts.of(problem, minimise(problem, setup.state), 8)
+    assert problem.n_nodes == nodes
+    assert (None if found is None else found.count) == parts
