@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from icalib.calibration import Calibration
 from icalib.detection.corners import corner_stream
 from icalib.detection.detectors import detector_of
 from icalib.errors import RigError
@@ -12,7 +16,7 @@ from icalib.estimation.circle_centres import ellipse_shift
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets import Checkerboard, Circles, Scene
 from icalib.inspection import read_target
-from icalib.measurements import Measurements
+from icalib.measurements import CornerStream, Measurements
 from icalib.pipeline import calibrate_measurements
 from icalib.rig_file import load_rig, load_target
 from icalib.simulation import Imaging, Renderer, Sheet
@@ -88,22 +92,34 @@ def test_the_shift_under_perspective_is_that_of_the_conic():
 
 
 @pytest.mark.parametrize(
-    ("camera", "target"), [(PINHOLE, SYMMETRIC), (FISHEYE, ASYMMETRIC)], ids=["pinhole", "fisheye"]
+    ("camera", "target", "moved"),
+    [(PINHOLE, SYMMETRIC, 3.0), (FISHEYE, ASYMMETRIC, 20.0)],
+    ids=["pinhole", "fisheye"],
 )
-def test_the_lens_comes_out_without_bias(tmp_path, camera, target):
+def test_the_lens_comes_out_without_bias(tmp_path, camera, target, moved):
+    """Without the correction, intrinsics are wrong by more than `moved` standard deviations."""
     renderer, detector = Renderer(camera, Imaging(blur_px=0.8, noise=2.0)), detector_of(target)
     views = poses(target, camera, 1, 14)
     rng = np.random.default_rng(3)
     found = [detector.detect(renderer.picture([Sheet(target)], T, rng).pixels) for T in views]
     stream = corner_stream("cam0", np.arange(len(found)) * 10**9, found)
-    fields = ", ".join(f"{name}: {str(value).lower()}" for name, value in target.plain().items())
-    text = f"{{type: camera, model: {camera.model}, resolution: [752, 480]}}\ntarget: {{{fields}}}\n"
-    (tmp_path / "rig.yaml").write_text(f"sensors:\n  cam0: {text}settings: {{board_shape: false}}\n")
-    result = calibrate_measurements(load_rig(tmp_path / "rig.yaml"), Measurements(None, (stream,)))
+    result = calibrated(target, camera, stream, tmp_path)
     for name, truth in (("intrinsics", camera.intrinsics), ("distortion", camera.distortion)):
         group = result.group("cam0", name)
         assert np.abs((group.value - truth) / group.std).max() < 3.5, name
     assert result.group("cam0", "intrinsics").std[0] < 2e-4 * camera.intrinsics[0]
+    # Circles of no size have no shift: without the correction the lens is wrong.
+    without = calibrated(replace(target, diameter=1e-6), camera, stream, tmp_path).group("cam0", "intrinsics")
+    group = result.group("cam0", "intrinsics")
+    assert np.abs((without.value - group.value) / group.std).max() > moved
+
+
+def calibrated(target: Circles, camera: SimCamera, stream: CornerStream, folder: Path) -> Calibration:
+    """A calibration of the camera, from nothing but its model and the target."""
+    fields = ", ".join(f"{name}: {str(value).lower()}" for name, value in target.plain().items())
+    text = f"{{type: camera, model: {camera.model}, resolution: [752, 480]}}\ntarget: {{{fields}}}\n"
+    (folder / "rig.yaml").write_text(f"sensors:\n  cam0: {text}settings: {{board_shape: false}}\n")
+    return calibrate_measurements(load_rig(folder / "rig.yaml"), Measurements(None, (stream,)))
 
 
 @pytest.mark.parametrize(
