@@ -327,6 +327,7 @@ def test_exit_codes(folders: tuple[Path, Path], capsys: pytest.CaptureFixture[st
         (["few.urdf", "none.urdf"], "few.urdf and none.urdf share no link"),
         (["a", "chain.yaml"], "chain.yaml:1: cam0.T_cam_imu: a transform has 4 rows of 4 numbers, but this has 3"),
         (["a", "turned.yaml"], "turned.yaml:1: cam0.T_cam_imu: is not a transform"),
+        (["a", "lens.yaml"], "lens.yaml:1: cam0.distortion_model: needs distortion_coeffs beside it"),
         (["a", "lone.yaml"], "have nothing in common to compare"),
         (
             ["a", "imu.yaml"],
@@ -357,6 +358,8 @@ def test_bad_input_is_one_sentence_and_code_2(
         "chain.yaml": "cam0: {camera_model: pinhole, T_cam_imu: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}",
         "turned.yaml": "cam0: {camera_model: pinhole, T_cam_imu: "
         "[[1, 0, 0, 0], [0, 2, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}",
+        "lens.yaml": "cam0: {camera_model: pinhole, distortion_model: radtan, intrinsics: [400, 400, 300, 200], "
+        "resolution: [752, 480]}",
         "lone.yaml": "eye: {camera_model: pinhole}",
         "imu.yaml": "gyroscope_noise_density: 1.0e-3",
     }

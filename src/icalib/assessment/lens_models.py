@@ -25,7 +25,7 @@ from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.lens_bundle import ImagePoints, adjust, initial_parameters
 from icalib.rig import Settings
 
-MOST_IMAGES = 80  # that are compared, half of them held out; the time is proportional to it
+MOST_IMAGES = 40  # that are compared, half of them held out; the time is proportional to it
 FEWEST_IMAGES = 4  # in each half; with fewer no model is fitted
 FEWEST_CORNERS = 8  # in an image; its pose takes up six of their 16 coordinates
 BETTER = 0.9  # of the own model's RMS: another that leaves more is not named
@@ -167,18 +167,31 @@ def _halves(
     if len(rich) < 2 * FEWEST_IMAGES:
         return None
     chosen = rich[np.unique(np.linspace(0, len(rich) - 1, MOST_IMAGES).astype(int))]
-    points, R_cam_body = np.empty((len(stream.uv), 3)), np.empty((len(stream.uv), 3, 3))
+    row, points, R_cam_body = _in_camera(factor, state, chosen)
+    rows, halves = [], []
+    for images in (chosen[::2], chosen[1::2]):
+        part = np.isin(stream.image[row], images)
+        own = row[part]
+        uv = stream.uv[own]
+        if len(factor.direction):
+            uv = uv - state.values[factor.name, "bloom"] * factor.direction[own]
+        start = np.append(np.flatnonzero(np.diff(stream.image[own], prepend=-1)), len(own))
+        basis = R_cam_body[part] @ factor.bodies.basis[stream.point[own]].transpose(0, 2, 1)
+        rows.append(own)
+        halves.append(ImagePoints(points[part], uv, start, basis, used[own]))
+    return np.concatenate(rows), halves[0], halves[1]
+
+
+def _in_camera(factor: CornerFactor, state: State, images: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows (n,) int in the stream of all corners of the `images` (m,), their points (n, 3) [m] in the camera frame, and
+    R_camera_body (n, 3, 3) of each."""
+    rows, points, rotations = [], [], []
     for v0, v1 in factor.blocks():
         own = factor.corners_of(v0, v1)
-        points[own], of_view = factor.points_in_camera(state, v0, v1)
-        R_cam_body[own] = of_view[factor.views.of_corners(v0, v1) - v0]
-    uv = stream.uv
-    if len(factor.direction):
-        uv = uv - state.values[factor.name, "bloom"] * factor.direction
-    rows = [np.flatnonzero(np.isin(stream.image, own)) for own in (chosen[::2], chosen[1::2])]
-    halves = []
-    for own in rows:
-        start = np.append(np.flatnonzero(np.diff(stream.image[own], prepend=-1)), len(own))
-        basis = R_cam_body[own] @ factor.bodies.basis[stream.point[own]].transpose(0, 2, 1)
-        halves.append(ImagePoints(points[own], uv[own], start, basis, used[own]))
-    return np.concatenate(rows), halves[0], halves[1]
+        wanted = np.isin(factor.stream.image[own], images)
+        if wanted.any():
+            X, R = factor.points_in_camera(state, v0, v1)
+            rows.append(np.arange(own.start, own.stop)[wanted])
+            points.append(X[wanted])
+            rotations.append(R[(factor.views.of_corners(v0, v1) - v0)[wanted]])
+    return np.concatenate(rows), np.concatenate(points), np.concatenate(rotations)

@@ -85,7 +85,9 @@ def _lens(found: dict[str, YamlValue]) -> LensSide | None:
         return None
     model, before = MODELS[kind]
     values = found["intrinsics"].vector(before + 4)
-    more = found["distortion_coeffs"].vector(4) if distortion != "none" and "distortion_coeffs" in found else []
+    if distortion != "none" and "distortion_coeffs" not in found:
+        found["distortion_model"].fail("needs distortion_coeffs beside it; add them.")
+    more = found["distortion_coeffs"].vector(4) if distortion != "none" else []
     width, height = (side.whole(1) for side in found["resolution"].items()[:2])
     params = np.concatenate([values[before:], values[:before], more])
     return LensSide(model, (width, height), params, unknown(len(params)))

@@ -197,7 +197,7 @@ class CornerFactor:
 
     def errors(self, out: CornerOutput) -> np.ndarray:
         """(N, 2) px, the residuals with their images' common errors in them."""
-        error = np.empty((len(out.root), 2))
+        error = np.empty((len(out.root), 2), np.float32)
         for v0, v1 in self.blocks():
             own = self.corners_of(v0, v1)
             shared = self.noise.field[own, None, :] * out.shared[self.views.of_corners(v0, v1)]

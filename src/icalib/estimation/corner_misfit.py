@@ -40,37 +40,36 @@ def lens_misfit(stream: CornerStream, residual: np.ndarray, used: np.ndarray) ->
 
     Zero where none is used, or the misfit is not significant.
     """
-    nothing = LensMisfit(0.0, np.zeros((len(used), 2)))
+    nothing = LensMisfit(0.0, np.zeros((len(used), 2), np.float32))
     if not used.any():
         return nothing
     cell, n, images = _cells(stream.uv, used), CELLS[0] * CELLS[1], len(stream.stamps_ns)
-    group = stream.image[used] * min(images, GROUPS) // images
-    key, row, count = np.unique(group * n + cell[used], return_inverse=True, return_counts=True)
-    means = _sums(residual[used].astype(np.float64), row, len(key)) / count[:, None]  # by group and cell
-    groups = np.bincount(key % n, minlength=n)
+    group_of_image = np.arange(images) * min(images, GROUPS) // images
+    n_groups = int(group_of_image[-1]) + 1
+    key = (group_of_image * n).astype(np.int32)[stream.image[used]] + cell[used]
+    count = np.bincount(key, minlength=n_groups * n).reshape(n_groups, n)
+    means = np.stack([np.bincount(key, residual[used, k], n_groups * n) for k in range(2)], axis=1)
+    means = means.reshape(n_groups, n, 2) / np.maximum(count, 1)[:, :, None]
+    groups = (count > 0).sum(axis=0)
     enough = groups >= FEWEST_GROUPS
-    share = np.where(enough, np.bincount(cell[used], minlength=n), 0.0)
+    share = np.where(enough, count.sum(axis=0), 0.0)
     # products[a, b]: over all cells, weighted by their corners, the products of the means of groups a and b, over the
     # number of pairs. Without misfit those off the diagonal have mean zero; the diagonal holds the noise.
-    scaled = np.zeros((int(group.max()) + 1, n, 2))
     root = np.sqrt(share / max(share.sum(), 1.0) / np.maximum(groups * (groups - 1.0), 1.0))
-    scaled[key // n, key % n] = root[key % n, None] * means
+    scaled = root[:, None] * means
     products = np.einsum("acx,bcx->ab", scaled, scaled, optimize=True)
     np.fill_diagonal(products, 0.0)
     square = float(products.sum())  # of both components together
     if not square > SIGNIFICANT * np.sqrt(2.0 * float((products**2).sum())):
         return nothing
-    mean = _sums(means, key % n, n) / np.maximum(groups, 1)[:, None]
-    return LensMisfit(float(np.sqrt(0.5 * square)), np.where(enough[:, None], mean, 0.0)[cell])
-
-
-def _sums(values: np.ndarray, group: np.ndarray, n: int) -> np.ndarray:
-    """(n, 2): the sum of values (N, 2) in each group; group (N,) int, 0 to n - 1."""
-    return np.stack([np.bincount(group, values[:, k], n) for k in range(2)], axis=1)
+    mean = np.where(enough[:, None], means.sum(axis=0) / np.maximum(groups, 1)[:, None], 0.0)
+    return LensMisfit(float(np.sqrt(0.5 * square)), mean.astype(np.float32)[cell])
 
 
 def _cells(uv: np.ndarray, used: np.ndarray) -> np.ndarray:
     """(N,) int: the cell of each corner at uv (N, 2) px, in the rectangle that holds the `used` ones."""
     low, size = uv[used].min(axis=0), np.ptp(uv[used], axis=0) + 1e-9
-    column, row = (np.clip((uv[:, k] - low[k]) / size[k] * CELLS[k], 0, CELLS[k] - 1).astype(int) for k in range(2))
-    return row * CELLS[0] + column
+    column, row = (
+        np.clip((uv[:, k] - low[k]) / size[k] * CELLS[k], 0, CELLS[k] - 1).astype(np.int16) for k in range(2)
+    )
+    return row * np.int16(CELLS[0]) + column

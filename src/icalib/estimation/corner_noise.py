@@ -120,9 +120,11 @@ def residual_noise(factor: CornerFactor, out: CornerOutput, settings: Settings, 
     Only corners that take part count; there must be one.
     """
     stream, used = factor.stream, out.root > 0.0
-    relative, error = stream.relative_sigma[used], factor.errors(out)
+    error = factor.errors(out)
     lens = lens_misfit(stream, error, used)
-    square = ((error - lens.field)[used] ** 2).sum(axis=1) / relative**2
+    error -= lens.field
+    relative = stream.relative_sigma[used].astype(np.float32)
+    square = (error[used] ** 2).sum(axis=1) / relative**2
     base, exposure = float(np.sqrt(median_variance(square))), 0.0
     if settings.blur_noise:
         base, exposure = _fit_blur(square, speed[stream.image][used] / relative)

@@ -18,6 +18,9 @@ from icalib.estimation.medians import grouped_quantiles, largest_normal
 from icalib.rig import Settings
 
 NEIGHBOURS = 12  # with twice as many, small outliers near the border find a similar residual by chance
+# Corners that are not suspect, among which neighbours are looked for: in images of 752 x 480 px one for each 4 px in
+# either direction. With fewer neighbours are further away; more take time and memory.
+MOST_OTHERS = 20_000
 TAG_CORNERS = 4  # of one image, that are no neighbours: a tag that is taken for another is off alike in all of them
 SIMILAR = 0.7  # of a residual's length: its largest distance from a similar one; at 1 zero would be similar
 
@@ -33,7 +36,7 @@ def inliers(factor: CornerFactor, out: CornerOutput, settings: Settings) -> np.n
         return np.ones(len(out.root), dtype=bool)
     used = np.flatnonzero((out.root > 0.0) | ~factor.keep)  # rejected corners are tested again: they may fit now
     kept = np.zeros(len(out.root), dtype=bool)
-    kept[used] = ~rejected(factor, used, out.residual[used].astype(np.float64), settings)
+    kept[used] = ~rejected(factor, used, out.residual[used], settings)
     return kept
 
 
@@ -43,14 +46,23 @@ def rejected(factor: CornerFactor, rows: np.ndarray, residual: np.ndarray, setti
         return np.zeros(len(rows), dtype=bool)
     stream, size = factor.stream, np.linalg.norm(residual, axis=1)
     image = stream.image[rows]
-    median = grouped_quantiles(size, image, len(stream.stamps_ns), 0.5)[image]
-    usual = np.maximum(median, np.median(size)) if len(size) else median
+    usual = grouped_quantiles(size, image, len(stream.stamps_ns), 0.5)
+    if len(size):
+        usual = np.maximum(usual, np.median(size))
     limit = np.maximum(largest_normal(settings.outlier_std, 0.5) * usual, settings.outlier_min_px)
-    number = factor.bodies.target.tag_number
-    tag = image * (1 + number.max(initial=0)) + number[stream.point[rows]]
-    # Without a robust loss the influence of a kept corner is not bounded.
-    suspect = size > limit
-    return suspect if settings.loss == "none" else isolated(stream.uv[rows], residual, suspect, tag)
+    suspect = size > limit[image]
+    if settings.loss == "none" or not suspect.any():  # the influence of a kept corner would not be bounded
+        return suspect
+    some, number = _with_neighbours(suspect), factor.bodies.target.tag_number
+    tag = image[some] * (1 + number.max(initial=0)) + number[stream.point[rows[some]]]
+    suspect[some] = isolated(stream.uv[rows[some]], residual[some], suspect[some], tag)
+    return suspect
+
+
+def _with_neighbours(suspect: np.ndarray) -> np.ndarray:
+    """(n,) int, in order: all `suspect` (N,) corners, and of the others MOST_OTHERS at most, evenly drawn."""
+    others = np.flatnonzero(~suspect)
+    return np.union1d(np.flatnonzero(suspect), others[:: 1 + len(others) // MOST_OTHERS])
 
 
 def isolated(uv: np.ndarray, residual: np.ndarray, suspect: np.ndarray, tag: np.ndarray) -> np.ndarray:

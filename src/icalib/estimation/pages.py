@@ -16,7 +16,7 @@ LEAST = 1 << 20  # bytes, below which the allocator does better
 LARGE = 1 << 24  # bytes of what comes and goes: smaller arrays are made often, and new pages cost more than they do
 # Bytes of freed memory at the end of the heap that stay there. By default 128 kB do: arrays of a few megabytes that are
 # made again and again would get new pages each time. More holds more memory than is in use.
-KEPT = 1 << 24
+KEPT = 1 << 23
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of mallopt, in malloc.h
 
 
