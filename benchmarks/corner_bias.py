@@ -54,7 +54,8 @@ def _errors(run: Film):
     T_target_world, detector = np.linalg.inv(run.scenario.body_poses[0]), detector_of(target)
     for shot in run.shots(workers=1):
         found = detector.detect(shot.pixels)
-        uv, point, edges = (x[found.kept] for x in (found.uv, found.point, found.edges.astype(np.float64)))
+        kept = found.kept
+        uv, point, edges = found.uv[kept], found.point[kept], found.edges[kept].astype(np.float64)
         T = T_target_world @ exposure_poses(camera, run.truth.trajectory, shot.seconds, 0.0, 1)[0]
         X, plane = (target.points[point] - T[:3, 3]) @ T[:3, :3], np.tile(T[:3, :3].T[:, :2], (len(point), 1, 1))
         bent = uv.copy()

@@ -19,7 +19,7 @@ import numpy as np
 
 from icalib.detection.corners import ImageCorners
 from icalib.detection.detectors import Detector, detector_of
-from icalib.detection.prediction import IMAGES
+from icalib.detection.prediction import MOTION_IMAGES
 from icalib.detection.streams import IN_TURN
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Scene, Target
 from icalib.simulation import Motion, film, handheld, tag_map
@@ -60,7 +60,7 @@ def in_turn(detector: Detector, images: list[np.ndarray]) -> list[ImageCorners]:
     """As `find_corners` searches a recording."""
     found: list[ImageCorners] = []
     for k, image in enumerate(images):
-        found.append(detector.detect(image, found[k - min(k % IN_TURN, IMAGES) :]))
+        found.append(detector.detect(image, found[k - min(k % IN_TURN, MOTION_IMAGES) :]))
     return found
 
 
