@@ -41,7 +41,7 @@ LEAST_LEFT = 0.2  # of the residuals of poses: where the motion takes all, nothi
 # Degrees of freedom off those of poses at rest, of which there may be few: the mean of a variance that chi^2 shows, its
 # logarithm unknown before (Jeffreys' prior); standard deviations are then those of Student's t distribution.
 FEW_DOF = 2.0
-EARLY_DECREASE, EARLY_SHARE = 0.5, 1e-4  # an early pass is followed by another
+EARLY_DECREASE, EARLY_SHARE = 0.5, 1e-6  # an early pass is followed by another
 AGAIN = 4  # further passes, at most, where the last one began too far from its end, or without tracks that it found
 FAR = 1.1  # times the chi^2 at its end: what a pass froze where it began is not what it would freeze at the end
 NEARER = 0.5  # of the way from the end that the pass before had: else two states take turns, and no pass ends it
