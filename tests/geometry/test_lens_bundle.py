@@ -1,4 +1,4 @@
-"""A lens fitted to corners that are about in place: derivatives, recovery, and what is held back."""
+"""A lens fitted to corners that are about in place: derivatives, recovery, and what is held out."""
 
 from __future__ import annotations
 

@@ -95,7 +95,7 @@ def compare_models(
     if halves is None:
         return None, None
     rows, fitted, held_out = halves
-    params = np.concatenate([state.values[factor.name, "intrinsics"], state.values[factor.name, "distortion"]])
+    params = factor.lens(state)
     models = [factor.model, *(camera_model(name) for name in CAMERA_MODELS if name != factor.model.name)]
     starts = {m.name: list(initial_parameters(m, factor.model, params, fitted)) for m in models[1:]}
     first = _fits(models, starts | {factor.model.name: [params]}, fitted, held_out)
@@ -186,12 +186,9 @@ def _in_camera(factor: CornerFactor, state: State, images: np.ndarray) -> tuple[
     """Rows (n,) int in the stream of all corners of the `images` (m,), their points (n, 3) [m] in the camera frame, and
     R_camera_body (n, 3, 3) of each."""
     rows, points, rotations = [], [], []
-    for v0, v1 in factor.blocks():
-        own = factor.corners_of(v0, v1)
+    for own, X, R in factor.in_camera(state):
         wanted = np.isin(factor.stream.image[own], images)
-        if wanted.any():
-            X, R = factor.points_in_camera(state, v0, v1)
-            rows.append(np.arange(own.start, own.stop)[wanted])
-            points.append(X[wanted])
-            rotations.append(R[(factor.views.of_corners(v0, v1) - v0)[wanted]])
+        rows.append(np.arange(own.start, own.stop)[wanted])
+        points.append(X[wanted])
+        rotations.append(R[wanted])
     return np.concatenate(rows), np.concatenate(points), np.concatenate(rotations)

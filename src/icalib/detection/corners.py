@@ -49,6 +49,12 @@ class ImageCorners:
         """(N,) bool."""
         return self.verdict == KEPT
 
+    def renumbered(self, point: np.ndarray) -> ImageCorners:
+        """The same corners as points (N,) of the target, in their order."""
+        order = np.argsort(point)
+        values = {f.name: getattr(self, f.name)[order] for f in fields(self)}
+        return ImageCorners(**values | {"point": point[order]})
+
     def counts(self) -> dict[str, int]:
         """How many corners have each verdict of `VERDICTS`."""
         return {name: int((self.verdict == k).sum()) for k, name in enumerate(VERDICTS)}

@@ -133,17 +133,12 @@ class _Renumbered:
     number: np.ndarray
 
     def find(self, view: View) -> ImageCorners:
-        return self._renumbered(self.detector.find(view))
+        found = self.detector.find(view)
+        return found.renumbered(self.number[found.point])
 
     def find_near(self, view: View, expected: PredictedCorners) -> ImageCorners | None:
         found = self.detector.find_near(view, PredictedCorners(np.argsort(self.number)[expected.point], expected.uv))
-        return None if found is None else self._renumbered(found)
-
-    def _renumbered(self, found: ImageCorners) -> ImageCorners:
-        point = self.number[found.point]
-        order = np.argsort(point)
-        fields = {f.name: getattr(found, f.name)[order] for f in dataclasses.fields(found)}
-        return ImageCorners(**fields | {"point": point[order]})
+        return None if found is None else found.renumbered(self.number[found.point])
 
 
 def _apart(uv: np.ndarray, others: np.ndarray) -> bool:

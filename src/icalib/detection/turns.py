@@ -6,7 +6,6 @@ little in between.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -31,8 +30,10 @@ def number_continuously(target: Target, images: Sequence[ImageCorners]) -> list[
                 own = (image.point >= first) & (image.point < first + len(part.points))
                 if own.any():
                     turn = _nearest_turn(part.turns, previous_uv, image.point[own] - first, image.uv[own])
-                    images[k] = _renumbered(image, own, first, turn)
-                    completed = _completed(part.points[:, :2], turn[image.point[own] - first], image.uv[own])
+                    point = image.point.copy()
+                    point[own] = first + turn[point[own] - first]
+                    images[k] = image.renumbered(point)
+                    completed = _completed(part.points[:, :2], point[own] - first, image.uv[own])
                     previous_uv = previous_uv if completed is None else completed
     return images
 
@@ -63,12 +64,3 @@ def _completed(board: np.ndarray, point: np.ndarray, uv: np.ndarray) -> np.ndarr
     completed = plane @ affine
     completed[point] = uv
     return completed
-
-
-def _renumbered(image: ImageCorners, own: np.ndarray, first: int, turn: np.ndarray) -> ImageCorners:
-    """The image with the points `own` (N,) bool of the part from `first` on turned; all are sorted by number again."""
-    point = image.point.copy()
-    point[own] = first + turn[point[own] - first]
-    order = np.argsort(point)
-    fields = {f.name: getattr(image, f.name)[order] for f in dataclasses.fields(image)}
-    return ImageCorners(**fields | {"point": point[order]})

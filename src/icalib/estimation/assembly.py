@@ -256,12 +256,10 @@ def is_seen(inputs: Inputs, times: np.ndarray, nodes: np.ndarray) -> np.ndarray:
 def _with_bloom(factor: CornerFactor, camera: Camera, state: State, rig: Rig) -> CornerFactor:
     """The factor with the directions in which its corners bloom, frozen at `state`."""
     inwards = rig.target.tag_centers - rig.target.points
-    params = np.concatenate([state.values[camera.name, "intrinsics"], state.values[camera.name, "distortion"]])
+    params = factor.lens(state)
     direction = pages.zeros(factor.stream.uv.shape, np.float32)
-    for v0, v1 in factor.blocks():
-        own, (X, R_cb) = factor.corners_of(v0, v1), factor.points_in_camera(state, v0, v1)
-        view = factor.views.of_corners(v0, v1) - v0
-        towards = np.einsum("nij,nj->ni", R_cb[view], inwards[factor.stream.point[own]])
+    for own, X, R_cb in factor.in_camera(state):
+        towards = np.einsum("nij,nj->ni", R_cb, inwards[factor.stream.point[own]])
         direction[own] = bloom_direction(factor.model, params, X, towards)
     return factor.with_direction(direction)
 

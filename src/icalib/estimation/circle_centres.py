@@ -38,12 +38,10 @@ def centre_shifts(factor: CornerFactor, state: State) -> np.ndarray:
     Zero for points that are no centres of circles, and where a part of the circle has no image.
     """
     shift, radii = np.zeros((len(factor.stream.uv), 2)), factor.bodies.target.radii
-    params = np.concatenate([state.values[factor.name, "intrinsics"], state.values[factor.name, "distortion"]])
-    for v0, v1 in factor.blocks():
-        own = factor.corners_of(v0, v1)
-        X, R_cam_body = factor.points_in_camera(state, v0, v1)
-        plane = R_cam_body[factor.views.of_corners(v0, v1) - v0, :, :2]
-        shift[own] = ellipse_shift(factor.model, params, X, plane, radii[factor.stream.point[own]])
+    params = factor.lens(state)
+    for own, X, R_cam_body in factor.in_camera(state):
+        radius = radii[factor.stream.point[own]]
+        shift[own] = ellipse_shift(factor.model, params, X, R_cam_body[:, :, :2], radius)
     return shift
 
 

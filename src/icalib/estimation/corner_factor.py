@@ -184,10 +184,20 @@ class CornerFactor:
             R_cb[a:b] = R_cw[a:b] @ _scene(state, recording) @ R_sb[body[a:b]]
         return X, R_cb
 
+    def in_camera(self, state: State) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
+        """A few images at a time, which corners; X (n, 3) m, each one's point, and R_cam_body (n, 3, 3)."""
+        for v0, v1 in self.blocks():
+            X, R_cam_body = self.points_in_camera(state, v0, v1)
+            yield self.corners_of(v0, v1), X, R_cam_body[self.views.of_corners(v0, v1) - v0]
+
+    def lens(self, state: State) -> np.ndarray:
+        """(P,) parameters of the camera model."""
+        return np.concatenate([state.values[self.name, "intrinsics"], state.values[self.name, "distortion"]])
+
     def residual(self, state: State, v0: int, v1: int) -> np.ndarray:
         """(n, 2) px, predicted - measured, of the corners of views v0..v1."""
         own, (X, _) = self.corners_of(v0, v1), self.points_in_camera(state, v0, v1)
-        params = np.concatenate([state.values[self.name, "intrinsics"], state.values[self.name, "distortion"]])
+        params = self.lens(state)
         uv = self.model.project(params, X)[0] - self.stream.uv[own]
         return uv + state.values[self.name, "bloom"] * self.direction[own] if len(self.direction) else uv
 
@@ -300,7 +310,7 @@ class CornerFactor:
         self, state: State, images: Images, motion: Motion, recording: int, jacobians: bool
     ) -> Iterator[tuple[int, int, Predicted]]:
         """Views a..b by the chunk, and what the model makes of them."""
-        params = np.concatenate([state.values[self.name, "intrinsics"], state.values[self.name, "distortion"]])
+        params = self.lens(state)
         world, start = self.world_points(state, recording), images.start
         for a in range(0, len(images.node), CHUNK):
             b = min(a + CHUNK, len(images.node))

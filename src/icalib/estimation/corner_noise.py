@@ -87,7 +87,7 @@ def _squared_flow(factor: CornerFactor, state: State, v0: int, v1: int) -> np.nd
     rate = poses.rate @ R_ic
     velocity = (np.einsum("nji,nj->ni", poses.rotation, poses.velocity) + np.cross(poses.rate, p_ic)) @ R_ic
     of_corner = np.repeat(image - image[0], np.diff(factor.views.start[v0 : v1 + 1]))
-    params = np.concatenate([state.values[factor.name, "intrinsics"], state.values[factor.name, "distortion"]])
+    params = factor.lens(state)
     _, _, J, _ = factor.model.project_with_jacobians(params, X)
     return (np.einsum("nij,nj->ni", J, -np.cross(rate[of_corner], X) - velocity[of_corner]) ** 2).sum(axis=1)
 

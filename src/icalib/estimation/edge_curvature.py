@@ -30,11 +30,9 @@ def with_bent_edges(factor: CornerFactor, state: State) -> CornerFactor:
     if not len(factor.stream.edges):
         return factor
     uv = factor.stream.uv.copy()
-    params = np.concatenate([state.values[factor.name, "intrinsics"], state.values[factor.name, "distortion"]])
-    for v0, v1 in factor.blocks():
-        own = factor.corners_of(v0, v1)
-        X, R_cam_body = factor.points_in_camera(state, v0, v1)
-        plane = R_cam_body[factor.views.of_corners(v0, v1) - v0, :, :2]
+    params = factor.lens(state)
+    for own, X, R_cam_body in factor.in_camera(state):
+        plane = R_cam_body[:, :, :2]
         for edge in factor.stream.edges[own].transpose(1, 0, 2):
             fitted = edge.astype(np.float64)
             curvature, known = predicted_curvature(factor.model, params, X, plane, fitted[:, :4].reshape(-1, 2, 2))

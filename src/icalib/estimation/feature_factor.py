@@ -317,7 +317,7 @@ class FeatureFactor:
             R_cw, p_wc, poses.rate, poses.velocity, poses.by_node, poses.by_next, poses.by_imu,
             np.eye(3), np.zeros((0, 3, 3)), np.zeros((0, 3)), self._chained(camera, state, i0, i1),
         )  # fmt: skip
-        params = np.concatenate([state.values[camera.name, "intrinsics"], state.values[camera.name, "distortion"]])
+        params = camera.lens(state)
         return View(camera, index, i0, params, seen, motion)
 
     def _chained(self, camera: CornerFactor, state: State, i0: int, i1: int) -> np.ndarray:

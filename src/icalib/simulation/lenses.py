@@ -15,6 +15,7 @@ from icalib.simulation.scenario import MODELS, SimCamera
 RADTAN, EQUIDISTANT, EUCM, DOUBLE_SPHERE, OMNI, RATIONAL = range(6)
 _CODES: dict[str, int] = dict(zip(MODELS, range(6), strict=True))
 _STEPS = 20
+_NONE = (0.0, 0.0, 0.0)
 
 
 def lens_of(camera: SimCamera) -> tuple[int, np.ndarray]:
@@ -46,11 +47,8 @@ def _rays(code, numbers, uv, rays):
 def ray(code, n, u, v):
     """Direction of a pixel, of any length; NaN, or a point beyond the model's range, where there is none."""
     a, b = (u - n[2]) / n[0], (v - n[3]) / n[1]
-    if code == RADTAN:
-        w = _undistorted(n[4], n[5], n[6], n[7], complex(a, b))
-        return w.real, w.imag, 1.0
-    if code == RATIONAL:
-        w = _undistorted_rational(n, complex(a, b))
+    if code in (RADTAN, RATIONAL):  # zeros are left after radtan's coefficients
+        w = _undistorted((n[4], n[5], n[8]), (n[9], n[10], n[11]), n[6], n[7], complex(a, b))
         return w.real, w.imag, 1.0
     if code == EQUIDISTANT:
         radius = np.sqrt(a * a + b * b)
@@ -65,7 +63,7 @@ def ray(code, n, u, v):
     if code == DOUBLE_SPHERE:
         x, y, z = _from_behind(n[5] / (1.0 - n[5]), a * (1.0 - n[5]), b * (1.0 - n[5]), 1.0)
         return _from_behind(n[4], x, y, z)
-    w = _undistorted(n[5], n[6], n[7], n[8], complex(a, b))
+    w = _undistorted((n[5], n[6], 0.0), _NONE, n[7], n[8], complex(a, b))
     return _from_behind(n[4], w.real, w.imag, 1.0)
 
 
@@ -79,35 +77,18 @@ def _from_behind(shift, x, y, z):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _undistorted(k1, k2, p1, p2, image):
-    """w with w (1 + k1 s + k2 s^2) + 2 s q + w^2 conj(q) = image, s = |w|^2, q = p2 + i p1: Brown's model in one
-    complex number, by Newton's method in w and conj(w)."""
+def _undistorted(above, below, p1, p2, image):
+    """w with w N(s) / D(s) + 2 s q + w^2 conj(q) = image, s = |w|^2, q = p2 + i p1: Brown's model in one complex
+    number, by Newton's method in w and conj(w). N, D: 1 + a s + b s^2 + c s^3 for above, below (a, b, c)."""
     q = complex(p2, p1)
     w = image
     for _ in range(_STEPS):
         s = w.real * w.real + w.imag * w.imag
-        error = w * (1.0 + s * (k1 + s * k2)) + 2.0 * s * q + w * w * q.conjugate() - image
-        by_w = 1.0 + s * (2.0 * k1 + 3.0 * s * k2) + 2.0 * (w.conjugate() * q + w * q.conjugate())
-        by_conj = w * w * (k1 + 2.0 * s * k2) + 2.0 * w * q
-        scale = by_w.real**2 + by_w.imag**2 - by_conj.real**2 - by_conj.imag**2
-        step = (by_conj * error.conjugate() - by_w.conjugate() * error) / scale
-        w += step
-        if abs(step.real) + abs(step.imag) < 1e-13:
-            return w
-    return complex(np.nan, np.nan)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _undistorted_rational(n, image):
-    """As `_undistorted`, with N(s) / D(s) in place of 1 + k1 s + k2 s^2; n: fx, fy, cx, cy, k1, k2, p1, p2, k3 ..."""
-    q = complex(n[7], n[6])
-    w = image
-    for _ in range(_STEPS):
-        s = w.real * w.real + w.imag * w.imag
-        above, below = 1.0 + s * (n[4] + s * (n[5] + s * n[8])), 1.0 + s * (n[9] + s * (n[10] + s * n[11]))
-        radial = above / below
-        slope = (n[4] + s * (2.0 * n[5] + 3.0 * s * n[8])) / below
-        slope -= radial * (n[9] + s * (2.0 * n[10] + 3.0 * s * n[11])) / below
+        N = 1.0 + s * (above[0] + s * (above[1] + s * above[2]))
+        D = 1.0 + s * (below[0] + s * (below[1] + s * below[2]))
+        radial = N / D
+        slope = (above[0] + s * (2.0 * above[1] + 3.0 * s * above[2])) / D
+        slope -= radial * (below[0] + s * (2.0 * below[1] + 3.0 * s * below[2])) / D
         error = w * radial + 2.0 * s * q + w * w * q.conjugate() - image
         by_w = radial + s * slope + 2.0 * (w.conjugate() * q + w * q.conjugate())
         by_conj = w * w * slope + 2.0 * w * q

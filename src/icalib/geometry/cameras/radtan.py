@@ -128,6 +128,15 @@ def _project_with_jacobians(params, points, limit, uv, valid, j_point, j_params)
             j_params[i, 0, 8], j_params[i, 1, 8] = fx * a * s * s * s, fy * b * s * s * s
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def newton_step(error_a, error_b, j_aa, j_ab, j_bb):
+    """Whether the symmetric Jacobian turns the plane over, or is singular; and what (a, b) is to be lessened by."""
+    determinant = j_aa * j_bb - j_ab * j_ab
+    step_a = (j_bb * error_a - j_ab * error_b) / determinant
+    step_b = (j_aa * error_b - j_ab * error_a) / determinant
+    return not determinant > 0.0, step_a, step_b
+
+
 @njit(cache=True, nogil=True)
 def undistort(params, coefficients, limit, distorted_a, distorted_b):
     """(a, b) and whether Newton converged inside the monotonic range; starts where the radial part alone would be."""
@@ -139,12 +148,9 @@ def undistort(params, coefficients, limit, distorted_a, distorted_b):
     k3 = _third_coefficient(params)
     for _ in range(_MAX_NEWTON_STEPS):
         value_a, value_b, j_aa, j_ab, j_bb = distort(params, k3, a, b)
-        determinant = j_aa * j_bb - j_ab * j_ab
-        if not determinant > 0.0:
+        turned_over, step_a, step_b = newton_step(value_a - distorted_a, value_b - distorted_b, j_aa, j_ab, j_bb)
+        if turned_over:
             return a, b, False
-        error_a, error_b = value_a - distorted_a, value_b - distorted_b
-        step_a = (j_bb * error_a - j_ab * error_b) / determinant
-        step_b = (j_aa * error_b - j_ab * error_a) / determinant
         a, b = a - step_a, b - step_b
         if abs(step_a) + abs(step_b) <= 1e-14 * (1.0 + abs(a) + abs(b)):
             return a, b, a * a + b * b < limit * limit

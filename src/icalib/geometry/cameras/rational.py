@@ -9,6 +9,7 @@ from numba import njit
 from numpy.polynomial import Polynomial
 
 from icalib.geometry.cameras.closed_form import ClosedForm
+from icalib.geometry.cameras.radtan import newton_step
 
 _MIN_DEPTH = 1e-6  # m; nearer points have no image
 _MAX_NEWTON_STEPS = 30  # of the unprojection; a point that needs more counts as not valid
@@ -188,12 +189,9 @@ def _undistort(params, limit, distorted_a, distorted_b):
     a, b = scale * distorted_a, scale * distorted_b
     for _ in range(_MAX_NEWTON_STEPS):
         value_a, value_b, j_aa, j_ab, j_bb, _, _ = _distort(params, a, b)
-        determinant = j_aa * j_bb - j_ab * j_ab
-        if not determinant > 0.0:
+        turned_over, step_a, step_b = newton_step(value_a - distorted_a, value_b - distorted_b, j_aa, j_ab, j_bb)
+        if turned_over:
             return a, b, False
-        error_a, error_b = value_a - distorted_a, value_b - distorted_b
-        step_a = (j_bb * error_a - j_ab * error_b) / determinant
-        step_b = (j_aa * error_b - j_ab * error_a) / determinant
         a, b = a - step_a, b - step_b
         if abs(step_a) + abs(step_b) <= 1e-14 * (1.0 + abs(a) + abs(b)):
             return a, b, a * a + b * b < limit * limit
