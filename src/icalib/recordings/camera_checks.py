@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from icalib.errors import RecordingError
@@ -44,16 +42,7 @@ def _inside(corners: CornerStream, what: str, resolution: tuple[int, int]) -> tu
     tag, corner = divmod(int(corners.point[np.argmin(inside)]), 4)
     note = outside_note(corners, inside, f"corner {corner} of tag {tag}", what, resolution)
     count = np.bincount(corners.image[inside], minlength=len(corners.stamps_ns))
-    return _some(corners, corners.stamps_ns, count, inside), (note,)
-
-
-def _some(corners: CornerStream, stamps_ns: np.ndarray, count: np.ndarray, kept: np.ndarray) -> CornerStream:
-    """The corners kept (N,), `count` of them in the image at each of the stamps."""
-    start = np.concatenate([[0], np.cumsum(count)])
-    sigma = corners.sigma[kept] if len(corners.sigma) else corners.sigma
-    return replace(
-        corners, stamps_ns=stamps_ns, start=start, point=corners.point[kept], uv=corners.uv[kept], sigma=sigma
-    )
+    return corners.of_rows(inside, corners.stamps_ns, count), (note,)
 
 
 def in_image(uv: np.ndarray, resolution: tuple[int, int], margin_px: float) -> np.ndarray:
