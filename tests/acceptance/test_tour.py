@@ -2,90 +2,30 @@
 
 from __future__ import annotations
 
-import os
+import importlib.util
 import re
-import shutil
-import subprocess
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
-PAGE = ROOT / "docs" / "tour.md"
-BLOCK = re.compile(r"(?:<!-- exits (\d+) -->\n)?```bash\n(.*?)```\n(?:\n```text\n(.*?)```\n)?", re.DOTALL)
-NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")  # but not that of cam0
-SHARE, UNITS = 0.03, 2.0  # that a number may be off by: of itself, and of its last digit on the page
-
-
-@dataclass(frozen=True)
-class Block:
-    """A command of the page, its exit code, and what it prints: pieces with something left out between them."""
-
-    command: str
-    code: int
-    pieces: tuple[str, ...]
-
-
-def blocks(page: str) -> list[Block]:
-    return [
-        Block(command, int(code or 0), tuple(p for p in re.split(r"^\.\.\.$", text, flags=re.M) if p.strip()))
-        for code, command, text in BLOCK.findall(page)
-    ]
-
-
-def says(output: str, pieces: tuple[str, ...]) -> str:
-    """The first of `pieces` that `output` does not hold after those before it, or nothing. Where lines end is all the
-    same; numbers may be off by a little, for machines round in different ways."""
-    words, position = output.split(), 0
-    for piece in pieces:
-        sought = piece.split()
-        starts = range(position, len(words) - len(sought) + 1)
-        found = next((i for i in starts if all(map(alike, sought, words[i : i + len(sought)]))), None)
-        if found is None:
-            return piece
-        position = found + len(sought)
-    return ""
-
-
-def alike(expected: str, word: str) -> bool:
-    if NUMBER.sub("#", expected) != NUMBER.sub("#", word):
-        return False
-    return all(map(near, NUMBER.findall(expected), NUMBER.findall(word)))
-
-
-def near(expected: str, number: str) -> bool:
-    mantissa, _, power = expected.lower().partition("e")
-    unit = 10.0 ** (int(power or 0) - len(mantissa.partition(".")[2]))
-    return abs(float(expected) - float(number)) <= max(SHARE * abs(float(expected)), UNITS * unit) * 1.0001
-
-
-@pytest.fixture
-def checkout(tmp_path: Path) -> Path:
-    """A folder with the examples, and with the commands of the page as if they were installed in it."""
-    shutil.copytree(ROOT / "examples", tmp_path / "examples")
-    programs = tmp_path / ".venv" / "bin"
-    programs.mkdir(parents=True)
-    main = '-c "import sys; from icalib.cli import main; sys.exit(main())"'
-    for name, arguments in (("icalib", main), ("python", "")):
-        (programs / name).write_text(f'#!/bin/sh\nexec "{sys.executable}" {arguments} "$@"\n')
-        (programs / name).chmod(0o755)
-    return tmp_path
+FILE = Path(__file__).parents[2] / "benchmarks" / "tour_page.py"
+SPEC = importlib.util.spec_from_file_location("tour_page", FILE)
+assert SPEC is not None and SPEC.loader is not None
+tour_page = importlib.util.module_from_spec(SPEC)
+sys.modules["tour_page"] = tour_page
+SPEC.loader.exec_module(tour_page)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="the page is for a Unix shell")
-def test_the_commands_of_the_page_do_what_it_says(checkout: Path):
-    environment = os.environ | {"COLUMNS": "120"}
-    found = blocks(PAGE.read_text(encoding="utf-8"))
-    assert len(found) == PAGE.read_text(encoding="utf-8").count("```bash")
+def test_the_commands_of_the_page_do_what_it_says(tmp_path: Path):
+    page = tour_page.PAGE.read_text(encoding="utf-8")
+    found, folder = tour_page.blocks(page), tour_page.checkout(tmp_path)
+    assert len(found) == page.count("```bash")
     for block in found:
-        command = ["bash", "-euo", "pipefail", "-c", block.command]
-        run = subprocess.run(
-            command, cwd=checkout, env=environment, encoding="utf-8", stdout=subprocess.PIPE, stderr=subprocess.STDOUT
-        )
+        run = tour_page.run(block, folder)
         assert run.returncode == block.code, f"{block.command}\n{run.stdout}"
-        missing = says(run.stdout, block.pieces)
+        missing = tour_page.says(run.stdout, block.pieces)
         assert not missing, f"{block.command}\ndid not print\n{missing}\nin its place in\n{run.stdout}"
 
 
@@ -106,15 +46,25 @@ OUTPUT = "cam0 turned by 0.21 deg, 1.8 sigma\nWarning: residuals 3.3 times\n  as
     ],
 )
 def test_the_check_finds_what_is_not_so(pieces: tuple[str, ...], missing: str):
-    assert says(OUTPUT, pieces) == missing
+    assert tour_page.says(OUTPUT, pieces) == missing
 
 
 def test_blocks_are_read_with_their_exit_codes_and_output():
     page = "<!-- exits 1 -->\n```bash\nfalse\n```\n\n```text\na\n...\nb\n```\n\n```bash\ntrue\n```\n\ntext\n"
-    assert blocks(page) == [Block("false\n", 1, ("a\n", "\nb\n")), Block("true\n", 0, ())]
+    Block = tour_page.Block
+    assert tour_page.blocks(page) == [Block("false\n", 1, "a\n...\nb\n"), Block("true\n", 0, "")]
+    assert tour_page.blocks(page)[0].pieces == ("a\n", "\nb\n")
 
 
 def test_every_figure_is_there_and_small():
-    figures = re.findall(r"!\[.*?\]\((tour/.*?)\)", PAGE.read_text(encoding="utf-8"))
-    assert sorted(figures) == sorted(f"tour/{p.name}" for p in (PAGE.parent / "tour").iterdir())
-    assert all((PAGE.parent / figure).stat().st_size < 150_000 for figure in figures)
+    figures = re.findall(r"!\[.*?\]\((tour/.*?)\)", tour_page.PAGE.read_text(encoding="utf-8"))
+    assert sorted(figures) == sorted(f"tour/{p.name}" for p in (tour_page.PAGE.parent / "tour").iterdir())
+    assert all((tour_page.PAGE.parent / figure).stat().st_size < 150_000 for figure in figures)
+
+
+def test_numbers_of_the_page_are_brought_up_to_date():
+    text = "cam0 turned by  0.25 deg,\n1.9 sigma\n...\nresiduals 3 times as\nlarge (7)\n"
+    expected = "cam0 turned by  0.21 deg,\n1.8 sigma\n...\nresiduals 3.3 times as\nlarge (929)\n"
+    assert tour_page.refreshed(text, OUTPUT) == expected
+    with pytest.raises(ValueError, match="is not printed"):
+        tour_page.refreshed("cam1 turned", OUTPUT)

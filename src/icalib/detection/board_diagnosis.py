@@ -19,6 +19,7 @@ from icalib.extras import load_cv2
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard
 
 _MOST_IMAGES = 5  # that are searched; the time grows with it
+_LEAST_IMAGES = 2  # that show a board of another size, of several; the cells of a tag may look like a board in one
 _LEAST_SIDE = 3  # inner corners along a side; the detector takes no smaller board
 _LEAST_TAGS = 6  # in an image; fewer may fit several layouts
 # Misfits, in sides of a tag. In a right layout it comes from lens and noise; in a wrong one
@@ -39,7 +40,7 @@ def other_size(images: Iterable[np.ndarray], board: Checkerboard) -> str:
     by_squares = (stated[0] - 1, stated[1] - 1)  # the true size where squares were counted
     sizes = ({by_squares} | {size for image in grey for size in _largest(image)}) - {stated}
     seen = {size: _count(grey, size) for size in sorted(sizes) if size[0] >= _LEAST_SIDE}
-    if not any(seen.values()):
+    if max(seen.values(), default=0) < min(_LEAST_IMAGES, len(grey)):
         return ""
     rows, cols = max(seen, key=lambda size: (seen[size], size == by_squares, size))
     turned = (cols, rows) if board.rows > board.cols else (rows, cols)

@@ -214,9 +214,10 @@ class CornerFactor:
             error[own] = out.residual[own] + shared.sum(axis=2)
         return error
 
-    def squared_errors(self, out: CornerOutput) -> np.ndarray:
-        """(N,) px^2, of `errors`."""
-        return (self.errors(out) ** 2).sum(axis=1)
+    def chi2(self, out: CornerOutput) -> float:
+        """Of the corners that have weight. The others may lie anywhere, those of images without a pose at 1e20 px."""
+        used = out.root > 0.0
+        return float(((self.errors(out)[used] * out.root[used, None]) ** 2).sum(dtype=np.float64))
 
     def with_direction(self, direction: np.ndarray) -> CornerFactor:
         """The same factor with bloom along `direction` (N, 2)."""

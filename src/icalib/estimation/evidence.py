@@ -100,8 +100,7 @@ def _rms_px(residual: np.ndarray, root: np.ndarray) -> float | None:
 
 def _corner_chi2(camera: CornerFactor, out: CornerOutput) -> dict[str, tuple[int, float]]:
     """Number and chi^2 of one camera's corner rows and of each kind of common error's rows."""
-    chi2 = np.einsum("i,i,i->", camera.squared_errors(out), out.root, out.root)
-    found = {"corners": (2 * int(np.count_nonzero(out.root)), float(chi2))}
+    found = {"corners": (2 * int(np.count_nonzero(out.root)), camera.chi2(out))}
     for k, tau in enumerate(camera.noise.tau):
         rows = out.shared[:, :, k] / tau
         found[f"common error {k}"] = (rows.size, float((rows**2).sum()))
