@@ -14,7 +14,10 @@ import numpy as np
 
 LEAST = 1 << 20  # bytes, below which the allocator does better
 LARGE = 1 << 24  # bytes of what comes and goes: smaller arrays are made often, and new pages cost more than they do
-_M_MMAP_THRESHOLD = -3  # of mallopt, in malloc.h
+# Bytes of freed memory at the end of the heap that stay there. By default 128 kB do: arrays of a few megabytes that are
+# made again and again would get new pages each time. More holds more memory than is in use.
+KEPT = 1 << 22
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of mallopt, in malloc.h
 
 
 def zeros(shape: tuple[int, ...], dtype: type = np.float64) -> np.ndarray:
@@ -36,6 +39,7 @@ def keep_apart() -> None:
     It does so at first, but once such an array has been freed, the next ones as large lie between the small ones.
     """
     _in_glibc("mallopt", _M_MMAP_THRESHOLD, LARGE)
+    _in_glibc("mallopt", _M_TRIM_THRESHOLD, KEPT)
 
 
 def _in_glibc(name: str, *arguments: int) -> None:
