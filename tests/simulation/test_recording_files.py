@@ -105,8 +105,9 @@ def test_the_truth_is_beside_the_tables(simulation, folder):
 
 
 @pytest.mark.parametrize("name", ["run", "run.bag"])
-def test_bags_hold_what_the_drivers_send(simulation, tmp_path, name):
+def test_bags_hold_what_the_drivers_send(simulation, tmp_path, name, monkeypatch):
     pytest.importorskip("cv2")
+    monkeypatch.setattr("icalib.simulation.sensor_bag._AT_A_TIME", 70)
     write_sensors(simulation, 3, tmp_path / name)
     bag, measured = BagRecording(tmp_path / name), simulation.measurements
     imu = bag.imu(ImuSensor("imu0", "", ADIS16448))

@@ -137,3 +137,15 @@ def test_noise_of_relative_poses_has_their_covariance(robot):
     whitened = np.linalg.solve(np.linalg.cholesky(stream.covariance), error[..., None])[..., 0]
     n = len(whitened)
     np.testing.assert_allclose(whitened.T @ whitened / n, np.eye(3), atol=4.0 * np.sqrt(2.0 / n))
+
+
+@pytest.mark.parametrize("reports", ["rates", "poses"])
+def test_readings_do_not_depend_on_how_many_are_made_at_a_time(robot, reports, monkeypatch):
+    scenario = alone(robot) if reports == "poses" else alone(on_ground(robot, "planar"))
+    scenario = replace(scenario, robot_noise_enabled=False)
+    assert scenario.wheels[0].reports == reports
+    whole = simulate(scenario, 9).measurements.wheels[0]
+    monkeypatch.setattr("icalib.simulation.wheels._AT_A_TIME", 177)
+    parts = simulate(scenario, 9).measurements.wheels[0]
+    same = "rate" if reports == "rates" else "pose"
+    np.testing.assert_array_equal(getattr(parts, same), getattr(whole, same))

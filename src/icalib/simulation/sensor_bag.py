@@ -20,6 +20,7 @@ from icalib.simulation.tables import whole, write_truth
 
 Event = tuple[int, str, Callable[[BagWriter], Any]]  # when on the IMU's clock [ns], topic, what makes the message
 _EXPOSURE_S = 0.004
+_AT_A_TIME = 10_000  # readings as Python numbers, which take ten times the memory
 _JOINTS = {"pair": ["left_wheel", "right_wheel"], "steered": ["wheel", "steering"]}
 
 
@@ -82,9 +83,11 @@ def _streams(simulation: Simulation, seed: int) -> tuple[dict[str, str], list[It
 
 
 def _readings(imu: ImuStream) -> Iterator[Event]:
-    values = np.concatenate([imu.gyro, imu.accel], axis=1).tolist()
-    for stamp_ns, row in zip(imu.stamps_ns.tolist(), values, strict=True):
-        yield stamp_ns, IMU_TOPIC, lambda bag, stamp_ns=stamp_ns, row=row: bag.imu(stamp_ns, row)
+    for first in range(0, len(imu.stamps_ns), _AT_A_TIME):
+        some = slice(first, first + _AT_A_TIME)
+        values = np.concatenate([imu.gyro[some], imu.accel[some]], axis=1).tolist()
+        for stamp_ns, row in zip(imu.stamps_ns[some].tolist(), values, strict=True):
+            yield stamp_ns, IMU_TOPIC, lambda bag, stamp_ns=stamp_ns, row=row: bag.imu(stamp_ns, row)
 
 
 def _images(simulation: Simulation, seed: int) -> Iterator[Event]:

@@ -18,6 +18,7 @@ _GAUSS = np.polynomial.legendre.leggauss(3)
 _STEEPEST_RAD = 1.3
 _KINDS: dict[str, Literal["pair", "steered", "twist"]] = {"rates": "pair", "steering": "steered", "twist": "twist"}
 _SUBSTEPS = 12  # of an interval of (27), for its noise
+_AT_A_TIME = 100_000  # instants: motion and its derivatives take 2 kB each
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +59,11 @@ def read_wheels(
 
 def reported(wheels: SimWheels, trajectory: Trajectory, seconds: np.ndarray) -> np.ndarray:
     """(N, 2) at each instant, without noise, as in `WheelStream`. Of rates (v_x -+ baseline/2 w_z) / radius."""
+    some = np.split(seconds, range(_AT_A_TIME, len(seconds), _AT_A_TIME))
+    return np.concatenate([_reported(wheels, trajectory, s) for s in some])
+
+
+def _reported(wheels: SimWheels, trajectory: Trajectory, seconds: np.ndarray) -> np.ndarray:
     velocity, rate = wheel_velocity(wheels.T_imu_wheel, trajectory, seconds)
     ahead, turning = velocity[:, 0], rate[:, 2]
     if wheels.reports == "twist":
@@ -108,6 +114,13 @@ def relative_poses(wheels: SimWheels, trajectory: Trajectory, seconds: np.ndarra
     """(K, 3) yaw, x, y between consecutive instants (K + 1,) by the paper's (27), without noise, and (K, 3, 3) the
     covariance that integrating noisy readings would give them: yaw = e3 . Log(R_W(k)_W(k+1)), x and y of p_W(k)_W(k+1).
     """
+    each = _AT_A_TIME // (2 * _SUBSTEPS + 1)
+    some = [seconds[k : k + each + 1] for k in range(0, len(seconds) - 1, each)]
+    poses, covariances = zip(*(_relative_poses(wheels, trajectory, s) for s in some), strict=True)
+    return np.concatenate(poses), np.concatenate(covariances)
+
+
+def _relative_poses(wheels: SimWheels, trajectory: Trajectory, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     parts = np.linspace(seconds[:-1], seconds[1:], 2 * _SUBSTEPS + 1, axis=1)
     rotation, position = _frames(wheels, trajectory, parts.ravel())
     rotation, position = rotation.reshape(*parts.shape, 3, 3), position.reshape(*parts.shape, 3)
