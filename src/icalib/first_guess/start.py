@@ -17,6 +17,7 @@ from icalib.estimation.nodes import first_nodes
 from icalib.estimation.state import Key, State
 from icalib.first_guess import Guess, initial_trajectory
 from icalib.first_guess.assumed_motion import start_without_imu
+from icalib.first_guess.board_turns import number_alike
 from icalib.first_guess.by_recording import each_clock
 from icalib.first_guess.clocks import OneAxisError
 from icalib.first_guess.lidar_rounds import state_from_lidar
@@ -42,6 +43,7 @@ def start(
     neither camera nor LiDAR a pose sensor; what has no part in it is placed on that motion. Bodies of the target that
     images do not tie to the others are left out. Raises EstimationError where the recordings do not carry it.
     """
+    recordings = number_alike(rig, recordings)
     while True:
         try:
             return _start(rig, recordings, lap)
