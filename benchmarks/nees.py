@@ -1,0 +1,170 @@
+"""Are standard deviations as large as errors? NEES of many short simulated recordings, by kind of sensor.
+
+python benchmarks/nees.py [--first-seed N] [--rounds N]
+
+A round is what tests/consistency/test_sigmas.py runs, with other seeds. The mean normalised estimation error squared
+(NEES) per degree of freedom is printed, and the bounds within which it is where standard deviations are honest.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from icalib.montecarlo.one_run import compare
+from icalib.montecarlo.record import Record
+from icalib.montecarlo.statistics import Nees, Sample, nees
+from icalib.pipeline import calibrate_measurements
+from icalib.rig import Rig
+from icalib.simulation import Drive, Room, Scenario, SimPoses, handheld, load_scenario, rig_for, simulate
+
+PAPER = Path(__file__).resolve().parent.parent / "examples" / "paper"
+FALSE_ALARMS = 1e-3  # in a round, where standard deviations are honest
+TOGETHER = "all"
+LEAST_DOF = 400  # for sigmas 1.3 times too small or too large to be beyond chance
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """Recordings that differ by their seed, and the rig that they are calibrated with. All sensors have at least
+    LEAST_DOF together; of several, each of `kinds`, names without numbers, is judged alone, too, by what it has."""
+
+    scenario: Scenario
+    rig: Rig
+    recordings: int
+    kinds: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Judged:
+    """NEES of one kind of sensor, by the covariance and by the printed standard deviations."""
+
+    kind: str
+    dof: int
+    by_covariance: Nees
+    by_printed: Nees
+
+    @property
+    def consistent(self) -> bool:
+        return self.by_covariance.consistent and self.by_printed.consistent
+
+    def __str__(self) -> str:
+        covariance, printed = self.by_covariance, self.by_printed
+        bounds = f"bounds {covariance.low:.3f} to {covariance.high:.3f}"
+        return f"{self.kind:6s} NEES {covariance.mean:.3f}, printed {printed.mean:.3f}, {bounds}, {self.dof} dof"
+
+
+def _pose(turn: float, position: list[float]) -> np.ndarray:
+    """Turned about the vertical by `turn` rad."""
+    T = np.eye(4)
+    T[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    T[:3, 3] = position
+    return T
+
+
+def _mocap() -> SimPoses:
+    return SimPoses("mocap0", _pose(0.3, [0.1, -0.2, 0.15]), "absolute", _pose(2.0, [3.0, -1.0, 0.5]), 0.0123)
+
+
+def _unstated(rig: Rig) -> Rig:
+    """The rig of a user who states the noise of IMU and encoders; all other is found from residuals. Simulated wheels
+    do not slip."""
+    return replace(
+        rig,
+        cameras=tuple(replace(c, corner_noise_px=None, track_noise_px=None) for c in rig.cameras),
+        lidars=tuple(replace(x, range_noise_m=None) for x in rig.lidars),
+        wheels=tuple(replace(w, sideways_slip=1e-4, upwards_slip=1e-4) for w in rig.wheels),
+        poses=tuple(replace(p, rotation_noise=None, position_noise=None) for p in rig.poses),
+    )
+
+
+def _board() -> Case:
+    """Two cameras in front of a target, from nothing."""
+    scenario = handheld(3.0)
+    scenario = replace(scenario, cameras=tuple(replace(c, rate_hz=10.0) for c in scenario.cameras))
+    return Case(scenario, _unstated(rig_for(scenario, intrinsics="free", distortion="free")), 16)
+
+
+def _tracks() -> Case:
+    """A camera that follows points of a room."""
+    scenario = load_scenario(PAPER / "table2-3d.yaml")
+    assert scenario.features is not None
+    features = replace(scenario.features, per_image=40, count=600, lasting=80)
+    alone = {"cameras": scenario.cameras[:1], "lidars": (), "wheels": ()}
+    scenario = replace(scenario, duration_s=5.0, features=features, **alone)
+    return Case(scenario, _unstated(rig_for(scenario, intrinsics="start", distortion="start")), 30)
+
+
+def _drive() -> Case:
+    """A robot on hills with a LiDAR, wheels and motion capture."""
+    scenario = load_scenario(PAPER / "table2-ramp.yaml")
+    scenario = replace(
+        scenario, duration_s=6.0, cameras=(), features=None, poses=(_mocap(),),
+        lidars=tuple(replace(x, azimuth_steps=200) for x in scenario.lidars),
+        wheels=tuple(replace(w, noise=0.005) for w in scenario.wheels),
+    )  # fmt: skip
+    return Case(scenario, _unstated(rig_for(scenario)), 20, ("lidar", "wheel", "mocap"))
+
+
+def _poses() -> Case:
+    """Motion capture, and another program's odometry, which drifts."""
+    odometry = replace(_mocap(), name="odom0", kind="relative", rotation_noise=5e-3, position_noise=1e-2)
+    room, motion = Room((8.0, 6.0, 3.0)), Drive("free", exact=True)
+    scenario = Scenario((), duration_s=5.0, motion=motion, board=False, room=room, poses=(_mocap(), odometry))
+    return Case(scenario, _unstated(rig_for(scenario)), 30, ("mocap", "odom"))
+
+
+CASES = {"board": _board, "tracks": _tracks, "drive": _drive, "poses": _poses}
+CHECKS = sum(len(make().kinds) + 1 for make in CASES.values())
+
+
+def judge(case: Case, first_seed: int) -> list[Judged]:
+    """Calibrates the case's recordings, with seeds from `first_seed` on."""
+    seeds = range(first_seed, first_seed + case.recordings)
+    runs = [_run(case, seed) for seed in seeds]
+    return [_judged(kind, runs) for kind in (TOGETHER, *case.kinds)]
+
+
+def _run(case: Case, seed: int) -> tuple[Record, np.ndarray]:
+    """Errors and covariance of one recording; and the standard deviations that are printed, of the same numbers."""
+    simulation = simulate(case.scenario, seed)
+    result = calibrate_measurements(case.rig, simulation.measurements)
+    record = compare(seed, result, simulation.truth, [], 0.0)
+    return record, np.concatenate([result.group(b.sensor, b.name).std for b in record.blocks])
+
+
+def _judged(kind: str, runs: list[tuple[Record, np.ndarray]]) -> Judged:
+    by_covariance, by_printed = [], []
+    for record, printed in runs:
+        own = [b for b in record.blocks if kind in (TOGETHER, b.sensor.rstrip("0123456789"))]
+        k = np.concatenate([record.columns(b.key) for b in own])
+        covariance = record.covariance[np.ix_(k, k)]
+        scale = printed[k] / np.sqrt(np.diag(covariance))
+        by_covariance.append(Sample(record.seed, record.error[k], covariance))
+        by_printed.append(Sample(record.seed, record.error[k], scale[:, None] * covariance * scale))
+    probability = 1.0 - FALSE_ALARMS / CHECKS
+    dof = sum(len(s.error) for s in by_covariance)
+    return Judged(kind, dof, nees(by_covariance, probability), nees(by_printed, probability))
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--first-seed", type=int, default=1000)
+    parser.add_argument("--rounds", type=int, default=1)
+    asked = parser.parse_args()
+    failed = 0
+    for round_ in range(asked.rounds):
+        for name, make in CASES.items():
+            case = make()
+            for found in judge(case, asked.first_seed + round_ * case.recordings):
+                print(f"round {round_}  {name:8s} {found}{'' if found.consistent else '  FAILS'}", flush=True)
+                failed += not found.consistent
+    return min(failed, 1)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
