@@ -14,6 +14,19 @@ from typing import Any
 import numpy as np
 import pytest
 
+WHOLE_RUNS = ("acceptance", "consistency")  # folders of tests that calibrate from measurements to the result
+
+
+@pytest.hookimpl(tryfirst=True)  # before `-m` selects by marker
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Marks whole runs and studies as slow. Files with slow tests come first: workers take file after file, and a long
+    one at the end would leave the others idle."""
+    for item in items:
+        if item.path.parent.name in WHOLE_RUNS or item.get_closest_marker("statistical"):
+            item.add_marker(pytest.mark.slow)
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)
+
 
 @pytest.fixture(scope="session", autouse=True)
 def _own_cache(tmp_path_factory) -> Iterator[None]:
