@@ -76,6 +76,37 @@ def test_centres_are_those_of_the_projected_circles(camera, target):
     assert np.sqrt(((error - shift) ** 2).mean()) < 0.006
 
 
+NEAR = [
+    (PINHOLE, Circles(4, 5, 0.05, 0.03, True), (0.25, 0.0, 0.0, 0.0)),
+    (PINHOLE, Circles(4, 5, 0.05, 0.03, True), (0.45, 55.0, 200.0, 0.0)),
+    (PINHOLE, ASYMMETRIC, (0.45, 55.0, 200.0, 0.0)),
+    (FISHEYE, ASYMMETRIC, (0.14, 45.0, 45.0, 60.0)),
+    (FISHEYE, SYMMETRIC, (0.1, 0.0, 0.0, 0.0)),
+]
+
+
+@pytest.mark.parametrize(("camera", "target", "view"), NEAR)
+def test_a_grid_is_found_from_very_near(camera, target, view):
+    """Neighbouring circles differ in size by up to a half, and the grid fills up to 140 degrees."""
+    picture = Renderer(camera, Imaging(blur_px=0.8, noise=2.0)).picture(
+        [Sheet(target)], pose(target, *view), np.random.default_rng(0)
+    )
+    found, truth = detector_of(target).detect(picture.pixels), picture.sheets[0].uv
+    assert found.kept.sum() > 0.85 * len(truth)
+    # No image shows which turn of the grid it is.
+    apart = min(float(np.abs(found.uv - truth[turn[found.point]]).max()) for turn in target.turns)
+    assert apart < 2.5  # centres of ellipses are not the projected centres
+
+
+def test_a_grid_that_the_image_cuts_is_not_found():
+    """What lies between the paper and the border of the image is no circle."""
+    target = Circles(7, 3, 0.05, 0.06, True)
+    picture = Renderer(PINHOLE, Imaging(blur_px=0.8, noise=2.0)).picture(
+        [Sheet(target)], pose(target, 0.35, 55.0, 200.0, 0.0), np.random.default_rng(0)
+    )
+    assert not len(detector_of(target).detect(picture.pixels).point)
+
+
 def test_the_shift_under_perspective_is_that_of_the_conic():
     """Of a pinhole camera the ellipse is known in closed form: that of the circle's conic under the homography."""
     camera = camera_model("pinhole-radtan")

@@ -12,7 +12,7 @@ from icalib.detection.decoding import mapped
 from icalib.detection.detectors import detector_of
 from icalib.detection.prediction import PredictedCorners, predict_corners, predict_nodes
 from icalib.detection.quads import View
-from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard
+from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles
 from icalib.simulation import Motion, film, handheld
 
 pytest.importorskip("cv2")
@@ -24,6 +24,7 @@ TARGETS = {
     "inverted charuco": Charuco(7, 5, 0.09, 0.07, "4x4_50", inverted=True),
     "checkerboard": Checkerboard(6, 9, 0.06),
     "checkerboard from the side": Checkerboard(7, 6, 0.06),
+    "circles": Circles(11, 4, 0.03, 0.026, asymmetric=True),
 }
 
 

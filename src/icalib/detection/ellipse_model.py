@@ -172,7 +172,7 @@ def _distance(W, x, y):
     radius = max(hypot(a, b), 1e-9)
     t0, t1 = a / radius, b / radius
     s0, s1 = t0 * W[0, 0] + t1 * W[1, 0], t0 * W[0, 1] + t1 * W[1, 1]
-    gradient = hypot(s0, s1)
+    gradient = max(hypot(s0, s1), 1e-12)  # zero at the very centre
     return (radius - 1.0) / gradient, t0, t1, s0, s1, gradient, radius
 
 

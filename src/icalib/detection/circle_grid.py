@@ -1,0 +1,196 @@
+"""Finds which dark ellipses of an image are the circles of a grid.
+
+Each ellipse shows the affine map between target and image about its circle, up to a rotation. Its neighbours in the
+grid are therefore recognised in its own coordinates, however strong the perspective. From one circle and two neighbours
+the grid grows: each further circle is looked for where those nearest to it place it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.detection.decoding import mapped
+from icalib.detection.ellipse_model import LEAST_HALF_AXIS_PX
+from icalib.detection.growth import fit_homography
+from icalib.detection.tags import LEAST_CONTRAST
+from icalib.extras import load_cv2
+from icalib.geometry.targets import Circles
+
+_LEAST_DIAMETER_PX = 2.0 * LEAST_HALF_AXIS_PX  # no centre of a smaller one is kept
+_CONTRAST = 0.5 * LEAST_CONTRAST  # grey levels below the local mean
+_MOST_OBLIQUE = 0.17  # least ratio of the axes: that of a circle seen at 80 degrees
+_LIKE_ELLIPSE = 0.1  # relative error of the area of an ellipse with the same second moments; a triangle is 0.2 off
+_OUTSIDE_PX, _AROUND = 3.0, 12  # how far from the edge, and in how many directions, the white around a circle is seen
+_NEIGHBOUR = (0.5, 1.8)  # of the step of the grid, in the coordinates of an ellipse: perspective changes it so much
+_RIGHT_ANGLE = 0.45  # of the step: how far the second neighbour may be from a quarter turn of the first
+_MOST_OFF = 0.4  # of the step in the image, between a circle and where others place it; half a step is in between
+_NEAREST = 6  # known circles that place the next one; more reach where perspective and lens are others
+_LEAST_FOR_PERSPECTIVE = 5  # fewer place it by an affine map
+
+Node = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Ellipses:
+    """Dark regions like ellipses: centre (m, 2) px; unit (m, 2, 2) 1/px, which maps each to the unit circle."""
+
+    centre: np.ndarray
+    unit: np.ndarray
+
+
+def dark_ellipses(image: np.ndarray, window: int, step: float) -> Ellipses:
+    """Of the image (h, w) uint8; dark is what is darker than the mean of `window` x `window` px.
+
+    `step` is the distance of the nearest other circle, in radii.
+    """
+    cv2 = load_cv2()
+    dark = cv2.adaptiveThreshold(image, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, window, _CONTRAST)
+    contours, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    centre, unit = [], []
+    least_area = 0.25 * np.pi * _LEAST_DIAMETER_PX**2 * _MOST_OBLIQUE
+    for contour in contours:
+        if len(contour) < _LEAST_DIAMETER_PX or cv2.contourArea(contour, True) >= 0.0:
+            continue  # the border of a hole
+        m = cv2.moments(contour)
+        if m["m00"] < least_area:
+            continue
+        covariance = np.array([[m["mu20"], m["mu11"]], [m["mu11"], m["mu02"]]]) / m["m00"]
+        variance, axes = np.linalg.eigh(covariance)
+        half = 2.0 * np.sqrt(np.maximum(variance, 0.0))
+        area = np.pi * half[0] * half[1]
+        # A contour runs through the centres of the outermost pixels.
+        if 2.0 * half[1] + 1.0 < _LEAST_DIAMETER_PX or half[0] < _MOST_OBLIQUE * half[1]:
+            continue
+        if abs(m["m00"] / area - 1.0) < _LIKE_ELLIPSE:
+            centre.append((m["m10"] / m["m00"], m["m01"] / m["m00"]))
+            unit.append(axes / (half + 0.5) @ axes.T)
+    return _on_white(image, Ellipses(np.array(centre).reshape(-1, 2), np.array(unit).reshape(-1, 2, 2)), step)
+
+
+def _on_white(image: np.ndarray, found: Ellipses, step: float) -> Ellipses:
+    """Those of the ellipses that are darker than what surrounds them, on all sides, half-way to the next at most."""
+    angle = 2.0 * np.pi * np.arange(_AROUND) / _AROUND
+    to_edge = np.linalg.inv(found.unit) @ np.stack([np.cos(angle), np.sin(angle)])  # (m, 2, directions)
+    outside = to_edge * np.minimum(1.0 + _OUTSIDE_PX / np.linalg.norm(to_edge, axis=1, keepdims=True), 0.5 * step)
+    around = _grey(image, found.centre[:, None] + outside.swapaxes(1, 2))
+    keep = (around - _grey(image, found.centre)[:, None] >= LEAST_CONTRAST).all(axis=1)
+    return Ellipses(found.centre[keep], found.unit[keep])
+
+
+def _grey(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Of the pixels nearest to uv (..., 2) px, or the image's border."""
+    u, v = np.moveaxis(np.rint(uv).astype(np.int64), -1, 0)
+    return image[v.clip(0, image.shape[0] - 1), u.clip(0, image.shape[1] - 1)].astype(np.float64)
+
+
+def find_grids(target: Circles, found: Ellipses) -> list[np.ndarray]:
+    """Centres (n, 2) px of the target's circles, once for each of its turns that no image shows.
+
+    None where the ellipses do not hold the whole grid, or where the grid is a part of a larger one.
+    """
+    step = step_of(target)
+    wanted = _nodes_of(target)
+    tried = np.zeros(len(found.centre), dtype=bool)
+    for seed in range(len(found.centre)):
+        if not tried[seed]:
+            known = _grown(found, seed, step)
+            tried[list(known.values())] = True
+            grids = [found.centre[rows] for turn in range(4) if len(rows := _matched(known, _turned(wanted, turn)))]
+            if grids:
+                return grids
+    return []
+
+
+def step_of(target: Circles) -> float:
+    """Distance of nearest centres, in radii of the circles."""
+    return float(target.spacing * (np.sqrt(2.0) if target.asymmetric else 1.0) / (0.5 * target.diameter))
+
+
+def _nodes_of(target: Circles) -> np.ndarray:
+    """(n, 2) int64: place of each circle in the grid of nearest neighbours.
+
+    The second axis is a quarter turn from the first with the clock, as v is from u.
+    """
+    x, y = np.rint(target.points[:, 0] / target.spacing), np.rint(-target.points[:, 1] / target.spacing)
+    nodes = np.stack([x + y, y - x], axis=1) / 2.0 if target.asymmetric else np.stack([x, y], axis=1)
+    return nodes.astype(np.int64)
+
+
+def _turned(nodes: np.ndarray, quarters: int) -> np.ndarray:
+    for _ in range(quarters):
+        nodes = np.stack([-nodes[:, 1], nodes[:, 0]], axis=1)
+    return nodes
+
+
+def _matched(known: dict[Node, int], wanted: np.ndarray) -> list[int]:
+    """The ellipses at the nodes `wanted` (n, 2), moved to the one place where all of them are known.
+
+    [] where there is none, or several.
+    """
+    matches = []
+    for a, b in known:
+        moved = wanted - wanted[0] + (a, b)
+        if len(known) >= len(wanted) and all((int(p), int(q)) in known for p, q in moved):
+            matches.append([known[int(p), int(q)] for p, q in moved])
+    return matches[0] if len(matches) == 1 else []
+
+
+def _grown(found: Ellipses, seed: int, step: float) -> dict[Node, int]:
+    """Ellipses by their node, from `seed` outwards; the seed alone where it has no two neighbours."""
+    known: dict[Node, int] = {(0, 0): seed}
+    neighbours = _two_neighbours(found, seed, step)
+    if neighbours is None:
+        return known
+    known[1, 0], known[0, 1] = neighbours
+    free = np.ones(len(found.centre), dtype=bool)
+    free[list(known.values())] = False
+    changed = True
+    while changed and free.any():
+        changed = False
+        for node, beside in _frontier(known).items():
+            row = _nearest_ellipse(found.centre, free, known, node, beside)
+            if row >= 0:
+                known[node], free[row], changed = row, False, True
+    return known
+
+
+def _two_neighbours(found: Ellipses, seed: int, step: float) -> tuple[int, int] | None:
+    """The nearest ellipse in the coordinates of the seed, and the one a quarter turn from it."""
+    v = (found.centre - found.centre[seed]) @ found.unit[seed].T
+    distance = np.linalg.norm(v, axis=1)
+    distance[seed] = np.inf
+    first = int(np.argmin(distance))
+    if not _NEIGHBOUR[0] * step < distance[first] < _NEIGHBOUR[1] * step:
+        return None
+    off = np.linalg.norm(v - (-v[first, 1], v[first, 0]), axis=1)
+    off[[seed, first]] = np.inf
+    second = int(np.argmin(off))
+    return (first, second) if off[second] < _RIGHT_ANGLE * distance[first] else None
+
+
+def _frontier(known: dict[Node, int]) -> dict[Node, Node]:
+    """Unknown nodes beside known ones, each with one of these."""
+    beside = {}
+    for a, b in known:
+        for node in ((a + 1, b), (a, b + 1), (a - 1, b), (a, b - 1)):
+            if node not in known:
+                beside[node] = (a, b)
+    return beside
+
+
+def _nearest_ellipse(centre: np.ndarray, free: np.ndarray, known: dict[Node, int], node: Node, beside: Node) -> int:
+    """The free ellipse where the nearest known ones place a node, -1 where there is none."""
+    nodes, rows = np.array(list(known)), np.array(list(known.values()))
+    squared = ((nodes - node) ** 2).sum(axis=1)
+    near = np.argsort(squared, kind="stable")[:_NEAREST]
+    at, uv = nodes[near].astype(np.float64), centre[rows[near]]
+    if len(near) >= _LEAST_FOR_PERSPECTIVE:
+        place = np.array(mapped(fit_homography(at, uv, len(at)), float(node[0]), float(node[1])))
+    else:
+        affine = np.linalg.lstsq(np.column_stack([at, np.ones(len(at))]), uv, rcond=None)[0]
+        place = np.array([*node, 1.0]) @ affine
+    off = np.where(free, np.linalg.norm(centre - place, axis=1), np.inf)
+    best = int(np.argmin(off))
+    return best if off[best] < _MOST_OFF * np.linalg.norm(place - centre[known[beside]]) else -1
