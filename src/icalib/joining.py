@@ -148,7 +148,8 @@ def join_corners(streams: list[tuple[CornerStream, int]]) -> CornerStream:
         if all(len(getattr(s, field)) == len(s.uv) for s, _ in streams)
     }
     name, start = streams[0][0].name, start.astype(np.int64)
-    return CornerStream(name, stamps, start, point, uv, joins_ns=_joins(streams), **stated)
+    files = {stamp + shift: file for s, shift in streams for stamp, file in s.files.items()}
+    return CornerStream(name, stamps, start, point, uv, joins_ns=_joins(streams), files=files, **stated)
 
 
 def join_scans(streams: list[tuple[LidarStream, int]]) -> LidarStream:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -64,6 +65,8 @@ class CornerStream:
     fitted. Columns: the piece of the edge that was used, from (2,) and to (2,) px beside the corner; gain (2,) px^2, by
     how much the corner moves where the piece's curvature is larger than the fitted one; that curvature [1 / px]. The
     curvature is positive where the piece, as u is to the right and v down, turns to the left on its way.
+
+    files: names of the files that images come from, by stamp, "" for those of no file; also of images without corners.
     """
 
     name: str
@@ -74,6 +77,7 @@ class CornerStream:
     sigma: np.ndarray = field(default_factory=lambda: np.zeros(0), kw_only=True)
     edges: np.ndarray = field(default_factory=lambda: NO_EDGES, kw_only=True)
     joins_ns: tuple[int, ...] = field(default=(), kw_only=True)  # the first stamp of each further recording joined
+    files: Mapping[int, str] = field(default_factory=dict, kw_only=True)
 
     def __post_init__(self) -> None:
         n, m = len(self.uv), len(self.stamps_ns)
@@ -91,7 +95,12 @@ class CornerStream:
         """The corners of `rows` (indices or a mask), grouped into images at stamps_ns (M,) with count (M,) each."""
         start = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
         sigma, edges = (x[rows] if len(x) else x for x in (self.sigma, self.edges))
-        return CornerStream(self.name, stamps_ns, start, self.point[rows], self.uv[rows], sigma=sigma, edges=edges)
+        point, uv, files = self.point[rows], self.uv[rows], self.files
+        return CornerStream(self.name, stamps_ns, start, point, uv, sigma=sigma, edges=edges, files=files)
+
+    def which(self, stamp_ns: int) -> str:
+        """Tells the image with this stamp from others, in sentences: by its file, or else by its stamp."""
+        return self.files.get(stamp_ns) or f"at {stamp_ns} ns"
 
     @property
     def relative_sigma(self) -> np.ndarray:

@@ -23,8 +23,9 @@ CAMERA = Camera("cam0", "cam0/corners.csv", "pinhole-radtan", (8, 6))
 class FakeRecording:
     """Images of 6 x 8 px; the first pixel counts them."""
 
-    def __init__(self, n: int = 20, width: int = 8, size: int = 48) -> None:
-        self.n, self.width, self.size = n, width, size
+    def __init__(self, n: int = 20, width: int = 8, size: int = 48, damaged: tuple[int, ...] = ()) -> None:
+        self.n, self.width, self.size, self.damaged = n, width, size, damaged
+        self.files = False
         self.read = 0
 
     def image_topic(self, camera: Camera) -> str:
@@ -40,7 +41,13 @@ class FakeRecording:
         for i in range(self.n):
             self.read += 1
             data = bytes([i]) + bytes([100]) * (self.size - 1)
-            yield Payload(1000 + i, "fake.bag /cam0", "mono8", data, self.width, 6, self.width)
+            if i not in self.damaged:
+                yield Payload(1000 + i, "fake.bag /cam0", "mono8", data, self.width, 6, self.width, name=self.named(i))
+            else:
+                yield Payload(1000 + i, "fake.bag /cam0", "png", data, 0, 0, name=self.named(i))
+
+    def named(self, i: int) -> str:
+        return f"left{i}.png" if self.files else ""
 
 
 class FakeDetector:
@@ -187,6 +194,19 @@ def test_an_interrupted_search_keeps_nothing(detector, tmp_path):
 def test_images_of_another_size_are_refused(detector):
     with pytest.raises(RecordingError, match="images have 6 x 6 px, but cam0 8 x 6; correct its resolution"):
         streams.find_corners(FakeRecording(width=6), CAMERA, GRID)
+
+
+@pytest.mark.parametrize("files", [False, True])
+def test_damaged_images_are_named(detector, files):
+    """Also where their corners were found by an earlier run."""
+    recording = FakeRecording(damaged=(7, 11))
+    recording.files = files
+    for _ in range(2):
+        found, notes = streams.find_corners(recording, CAMERA, GRID)
+        assert len(found.stamps_ns) == 18
+        which = "left7.png" if files else "at 1007 ns"
+        assert notes[-1] == f"fake.bag /cam0: 2 images that are damaged were left out, the first {which}."
+        assert found.which(1003) == ("left3.png" if files else "at 1003 ns")
 
 
 def test_damaged_images_are_left_out_and_all_damaged_are_refused(detector):

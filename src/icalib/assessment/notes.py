@@ -99,22 +99,21 @@ def _imu_notes(inputs: Inputs, imu: ImuData, found: Estimate, timeline: Timeline
 def late_words(cameras: Sequence[CornerFactor], apart: Sequence[np.ndarray]) -> str:
     """A sentence on the images that were rejected because they are not simultaneous; "" if there are none.
 
-    apart: by camera (M,) bool. The images at one keyframe are a set, and the stamp of a set is that of its first image.
+    apart: by camera (M,) bool. The images at one keyframe are a set, which is named by its first image.
     """
-    stamp_of, names = {}, []
+    first_of, names = {}, []
     for camera, late in zip(cameras, apart, strict=True):
         if late.any():
             names.append(camera.name)
         for node, stamp in zip(camera.node[late].tolist(), camera.stream.stamps_ns[late].tolist(), strict=True):
-            stamp_of.setdefault(node, stamp)
-    if not stamp_of:
+            first_of.setdefault(node, camera.stream.which(stamp))
+    if not first_of:
         return ""
-    at = ", ".join(str(stamp_of[node]) for node in sorted(stamp_of)[:MOST_NAMED])
-    which = f", the first {MOST_NAMED}" if len(stamp_of) > MOST_NAMED else ""
+    named = ", ".join(first_of[node] for node in sorted(first_of)[:MOST_NAMED])
+    which = f", the first {MOST_NAMED}" if len(first_of) > MOST_NAMED else ""
     return (
-        f"{len(stamp_of)} sets of images of {' and '.join(names)} were not exposed together, or the rig moved between, "
-        "and are left out; their stamps (for images without timestamps, the numbers in their names times "
-        f"10^9){which}: {at}."
+        f"{len(first_of)} sets of images of {' and '.join(names)} were not exposed together, or the rig moved between, "
+        f"and are left out{which}: {named}."
     )
 
 

@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from itertools import islice
 
 import numpy as np
@@ -50,11 +51,15 @@ def find_corners(
     where there are no images of the camera, they are not of its resolution, cannot be read, or the target is in none.
     """
     topic, where = recording.image_topic(camera), recording.where(camera)
-    key = stream_key(_of_resolution(recording.payloads(topic), camera, where), repr(target)) if keep else ""
+    files: dict[int, str] = {}
+
+    def read() -> Iterator[Payload]:
+        return _noting_files(_of_resolution(recording.payloads(topic), camera, where), files)
+
+    key = stream_key(read(), repr(target)) if keep else ""
     found = load_corners(key) if keep else None
     if found is None:
-        count = _count(recording, topic)
-        payloads = _of_resolution(recording.payloads(topic), camera, where)
+        count, payloads = _count(recording, topic), read()
         found = _search(payloads, detector_of(target), where, lambda n: progress(n / max(count, n)))
         if wrong := _other_layout(recording, topic, target, found[1]):
             raise RecordingError(f"{where}: {wrong}")
@@ -62,14 +67,22 @@ def find_corners(
             keep_corners(key, *found)
     stamps_ns, images = found
     images, rare = without_rare_tags(target, number_continuously(target, images))
-    seen = sum(bool(i.kept.any()) for i in images)
-    if not seen:
+    if not any(i.kept.any() for i in images):
         what = f"{where}: {_called(target)} in none of {len(images)} images of {camera.name}; "
         raise RecordingError(what + _seen_instead(recording, topic, target))
     if wrong := _other_border(recording, topic, target, images):
         raise RecordingError(f"{where}: hardly anything is seen of {wrong}")
-    notes = tuple(f"{where}: {note}" for note in (*sightings(target, images), *rare))
-    return corner_stream(camera.name, stamps_ns, images), notes
+    corners = replace(corner_stream(camera.name, stamps_ns, images), files=files)
+    notes = (*sightings(target, images), *rare, *_words_on_damaged(corners))
+    return corners, tuple(f"{where}: {note}" for note in notes)
+
+
+def _words_on_damaged(corners: CornerStream) -> tuple[str, ...]:
+    """A sentence on the images whose stamps are among the files, but that could not be decoded; none without any."""
+    damaged = sorted(corners.files.keys() - set(corners.stamps_ns.tolist()))
+    if not damaged:
+        return ()
+    return (f"{len(damaged)} images that are damaged were left out, the first {corners.which(damaged[0])}.",)
 
 
 def _called(target: Target) -> str:
@@ -147,6 +160,13 @@ def _of_resolution(payloads: Iterable[Payload], camera: Camera, where: str) -> I
                 f"{where}: images have {p.width} x {p.height} px, but {camera.name} {camera.resolution[0]} x "
                 f"{camera.resolution[1]}; correct its resolution in the rig file."
             )
+        yield p
+
+
+def _noting_files(payloads: Iterable[Payload], files: dict[int, str]) -> Iterator[Payload]:
+    """The payloads; `files` gets the name of each by its stamp, "" of those that are no file."""
+    for p in payloads:
+        files[p.stamp_ns] = p.name
         yield p
 
 

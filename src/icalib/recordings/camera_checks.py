@@ -57,8 +57,10 @@ def outside_note(
     where they are too many to be single bad ones."""
     first, count = int(np.argmin(inside)), int((~inside).sum())
     (u, v), (width, height) = stream.uv[first], resolution
+    stamp_ns = int(stream.stamps_ns[stream.image[first]])
+    which = stream.which(stamp_ns) if isinstance(stream, CornerStream) else f"at {stamp_ns} ns"
     words = f"{thing} lies at ({u:.1f}, {v:.1f}), outside the image of {width} x {height} px"
-    told = f"{what}: in the image at {stream.stamps_ns[stream.image[first]]} ns, {words}"
+    told = f"{what}: in the image {which}, {words}"
     if count > _MOST_OUTSIDE * len(inside):
         raise RecordingError(f"{told}; check the camera's resolution [width, height] in the rig file.")
     return f"{told}; {count} of {len(inside)} such points were left out."
@@ -72,7 +74,7 @@ def _without_poor_images(corners: CornerStream, what: str) -> tuple[CornerStream
     if not keep.any():
         raise RecordingError(f"{what}: no image has {_MIN_CORNERS} corners or more; check the detector.")
     rows = keep[corners.image]
-    first = corners.stamps_ns[np.argmin(keep)]
+    first = int(corners.stamps_ns[np.argmin(keep)])
     dropped = f"{int((~keep).sum())} images with fewer than {_MIN_CORNERS} corners were dropped"
-    note = f"{what}: {dropped}, the first at {first} ns."
+    note = f"{what}: {dropped}, the first {corners.which(first)}."
     return corners.of_rows(rows, corners.stamps_ns[keep], count[keep]), (note,)

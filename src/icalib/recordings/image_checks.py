@@ -130,7 +130,7 @@ def _other_size(payload: Payload, size: tuple[int, int], where: str) -> str:
 def _refuse_other_clock(last: Payload, payload: Payload, where: str) -> None:
     if payload.stamp_ns < last.stamp_ns - _LATE_NS:
         raise RecordingError(
-            f"{where}: the image at {payload.stamp_ns} ns comes after the one at {last.stamp_ns} ns; "
+            f"{where}: the image {payload.which} comes after the one {last.which}; "
             "the camera's clock was set back: record again, or cut the recording there."
         )
 
