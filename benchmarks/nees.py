@@ -83,10 +83,10 @@ def _unstated(rig: Rig) -> Rig:
 
 
 def _board() -> Case:
-    """Two cameras in front of a target, from nothing."""
+    """Two cameras in front of a target."""
     scenario = handheld(3.0)
     scenario = replace(scenario, cameras=tuple(replace(c, rate_hz=10.0) for c in scenario.cameras))
-    return Case(scenario, _unstated(rig_for(scenario, intrinsics="free", distortion="free")), 16)
+    return Case(scenario, _unstated(rig_for(scenario, intrinsics="start", distortion="start")), 16)
 
 
 def _tracks() -> Case:

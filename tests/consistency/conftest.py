@@ -37,7 +37,7 @@ def mean_nees(
     blocks: tuple[str, ...] = BLOCKS,
     seen: Callable[[Measurements], Measurements] = _as_measured,
 ) -> dict[str, Nees]:
-    """Calibrates what is `seen` of one simulated recording for each seed, from nothing. A block is that of all sensors
+    """Calibrates what is `seen` of one simulated recording for each seed. A block is that of all sensors
     together."""
     records = [_record(scenario, rig, seed, seen) for seed in seeds]
     return {name: nees([_together(r, name) for r in records], probability) for name in blocks}

@@ -38,7 +38,7 @@ def mirrored(exact, noisy):
 @pytest.fixture(scope="module")
 def both():
     """By group: half the sum of the errors under both noises, and the standard deviation."""
-    scenario = replace(load_scenario(SCENARIO), duration_s=20.0)
+    scenario = replace(load_scenario(SCENARIO), duration_s=12.0)
     noisy = simulate(scenario, 0)
     exact = simulate(replace(scenario, imu_noise_enabled=False, robot_noise_enabled=False), 0).measurements
     rig = with_drawn_guess(rig_for(scenario, intrinsics="free", distortion="free"), scenario, 0, only=("intrinsics",))

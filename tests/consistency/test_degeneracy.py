@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from icalib.calibration import Calibration
 from icalib.errors import EstimationError
+from icalib.measurements import Measurements
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter, Rig
 from icalib.simulation import Scenario, Simulation, handheld, rig_for, simulate
@@ -132,6 +133,14 @@ def test_without_a_guess_a_single_axis_is_refused_with_the_missing_motion():
         calibrate_measurements(rig_for(simulation.scenario), simulation.measurements)
 
 
+@pytest.fixture(scope="module")
+def usual() -> tuple[Rig, Measurements, Calibration]:
+    """A recording that determines everything, at the default tolerances."""
+    simulation = simulate(handheld(10.0), 0)
+    rig = rig_for(simulation.scenario, intrinsics="start")
+    return rig, simulation.measurements, calibrate_measurements(rig, simulation.measurements)
+
+
 @pytest.mark.parametrize(
     ("setting", "group", "unit"),
     [
@@ -141,14 +150,14 @@ def test_without_a_guess_a_single_axis_is_refused_with_the_missing_motion():
         ("pixel_tolerance", "intrinsics", 1.0),
     ],
 )
-def test_a_tighter_tolerance_makes_a_parameter_weak(setting: str, group: str, unit: float):
-    simulation = simulate(handheld(10.0), 0)
-    rig = rig_for(simulation.scenario, intrinsics="free")
-    usual = calibrate_measurements(rig, simulation.measurements)
-    std = usual.group("cam0", group).std_formal
+def test_a_tighter_tolerance_makes_a_parameter_weak(
+    usual: tuple[Rig, Measurements, Calibration], setting: str, group: str, unit: float
+):
+    rig, measurements, known = usual
+    std = known.group("cam0", group).std_formal
     settings = dataclasses.replace(rig.settings, **{setting: unit * 0.4 * float(std.max())})
-    strict = calibrate_measurements(dataclasses.replace(rig, settings=settings), simulation.measurements)
+    strict = calibrate_measurements(dataclasses.replace(rig, settings=settings), measurements)
     for name in ("rotation", "translation", "time_offset", "intrinsics"):
-        assert set(usual.group("cam0", name).verdict) == {"determined"}
+        assert set(known.group("cam0", name).verdict) == {"determined"}
         assert ("weak" in strict.group("cam0", name).verdict) == (name == group)
     np.testing.assert_allclose(strict.group("cam0", group).std_formal, std, rtol=0.02)

@@ -31,7 +31,7 @@ def stills(count: int, seed: int, shared_px: float) -> Calibration:
     field = np.stack([x, y, x * x, x * y, y * y], axis=1)
     sizes = shared_px * rng.normal(size=(count, 5, 2))[np.repeat(np.arange(count), np.diff(start))]
     uv = whole.uv[rows] + np.einsum("nk,nkj->nj", field, sizes)
-    rig = rig_for(simulation.scenario, intrinsics="free", distortion="free")
+    rig = rig_for(simulation.scenario, intrinsics="start", distortion="start")
     own = dataclasses.replace(rig.cameras[0], corner_noise_px=None)
     rig = dataclasses.replace(rig, imu=None, cameras=(own,), settings=dataclasses.replace(rig.settings, splits=8))
     stream = CornerStream("cam0", whole.stamps_ns[kept], start, whole.point[rows], uv)

@@ -24,7 +24,7 @@ def run(
     scenario: Scenario, seed: int, changed: Callable[[Measurements], Measurements] = lambda m: m, **camera: float | None
 ) -> Calibration:
     """With intrinsics found too; `camera`: changes of the cameras in the rig file."""
-    rig = rig_for(scenario, settings=PLAIN, intrinsics="free", distortion="free")
+    rig = rig_for(scenario, settings=PLAIN, intrinsics="start", distortion="start")
     rig = replace(rig, cameras=tuple(replace(c, **camera) for c in rig.cameras))
     return calibrate_measurements(rig, changed(simulate(scenario, seed).measurements))
 
@@ -96,7 +96,7 @@ def test_errors_that_stay_for_a_second_show():
 
 def test_a_short_recording_is_split_into_as_many_parts_as_it_has():
     scenario = handheld(3.0)
-    rig = rig_for(scenario, settings=replace(PLAIN, splits=25), intrinsics="free", distortion="free")
+    rig = rig_for(scenario, settings=replace(PLAIN, splits=25), intrinsics="start", distortion="start")
     result = calibrate_measurements(rig, simulate(scenario, 0).measurements)
     assert result.held_out is not None and 10 < result.held_out.parts < 25
     assert not any("too short to be split" in w for w in result.warnings)
@@ -104,7 +104,7 @@ def test_a_short_recording_is_split_into_as_many_parts_as_it_has():
 
 def test_a_recording_that_is_not_split_says_so():
     scenario = handheld(3.0)
-    rig = rig_for(scenario, settings=replace(PLAIN, splits=1), intrinsics="free", distortion="free")
+    rig = rig_for(scenario, settings=replace(PLAIN, splits=1), intrinsics="start", distortion="start")
     result = calibrate_measurements(rig, simulate(scenario, 0).measurements)
     assert result.held_out is None
     assert any("too short to be split" in w and "white noise alone" in w for w in result.warnings)
@@ -117,7 +117,7 @@ def as_noise_makes_it(found: HeldOut) -> bool:
 def test_of_two_recordings_each_finds_how_its_board_leans():
     """A part each: each half has a tilt of its own, of which the other knows nothing."""
     simulations = pair(1)
-    rig = rig_for(simulations[0].scenario, settings=replace(PLAIN, splits=2), intrinsics="free", distortion="free")
+    rig = rig_for(simulations[0].scenario, settings=replace(PLAIN, splits=2), intrinsics="start", distortion="start")
     result = calibrate_measurements(rig, [s.measurements for s in simulations])
     found = held(result)
     assert (found.parts, found.directions) == (2, len(result.covariance) - 4)
@@ -150,7 +150,7 @@ def test_where_planes_are_in_the_world_is_nothing_to_predict(robot: Callable[...
 def test_with_all_that_is_on_by_default_and_noise_alone():
     """The robust loss and noise found from residuals leave it near 1."""
     scenario = handheld(12.0)
-    rig: Rig = replace(rig_for(scenario, intrinsics="free", distortion="free"), settings=Settings())
+    rig: Rig = replace(rig_for(scenario, intrinsics="start", distortion="start"), settings=Settings())
     rig = replace(rig, cameras=tuple(_unstated(c) for c in rig.cameras))
     found = [held(calibrate_measurements(rig, simulate(scenario, seed).measurements)) for seed in range(20)]
     excess, expected = (sum(getattr(h, name) for h in found) for name in ("excess", "expected"))

@@ -11,7 +11,7 @@ CONFIGURATIONS = [(a, i) for a in (False, True) for i in ("datasheet", "noisy")]
 
 def check(consistency, asynchronous: bool, imu: str, seeds: range, probability: float) -> None:
     scenario = handheld(12.0, asynchronous=asynchronous, imu=imu)
-    rig = rig_for(scenario, intrinsics="free", distortion="free")
+    rig = rig_for(scenario, intrinsics="start", distortion="start")
     found = consistency(scenario, rig, seeds, probability)
     print({block: (round(c.mean, 3), round(c.low, 3), round(c.high, 3)) for block, c in found.items()})
     assert {block: c for block, c in found.items() if not c.consistent} == {}

@@ -28,7 +28,7 @@ def test_pairs_that_were_not_exposed_together_are_left_out_and_told(late: tuple[
     chosen = np.linspace(10, 380, 30).astype(int)
     other = chosen.copy()
     other[list(late)] += 3  # 0.15 s later
-    rig = rig_for(simulation.scenario, intrinsics="free", distortion="free")
+    rig = rig_for(simulation.scenario, intrinsics="start", distortion="start")
     cameras = tuple(dataclasses.replace(c, corner_noise_px=None) for c in rig.cameras)
     settings = dataclasses.replace(rig.settings, loss="huber", outlier_std=4.0)
     rig = dataclasses.replace(rig, imu=None, cameras=cameras, settings=settings)

@@ -183,7 +183,7 @@ def straight(robot, parts: str, seed: int, seconds: float) -> tuple[Calibration,
 def test_the_solver_does_not_creep_along_a_straight_line(robot, parts: str, seed: int):
     """Gravity's direction, of which the data say next to nothing, lies in a valley that is curved: in steps of damping
     it crept for 50 of them, or rested where the points' chi^2 was twice what it should be."""
-    result, simulation = straight(robot, parts, seed, 30.0)
+    result, simulation = straight(robot, parts, seed, 20.0)
     check_known(result, simulation)
     assert sum(i.stage == "final" for i in result.iterations) < 25
     points = next(fit for fit in result.fits if fit.kind == "points")
