@@ -105,14 +105,21 @@ def camera_points(i0, i1, start, point, R_cw, p_wc, world_points, X):
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def _gram(A, D, n, out):
-    """out (D, D) = A[:D, :n] A[:D, :n]^T, upper triangle mirrored. Sums may be reordered: they are vectorised."""
-    for i in range(D):
-        for j in range(i, D):
-            s = 0.0
+    """out (D, D) = A[:D, :n] A[:D, :n]^T, upper triangle mirrored. Sums may be reordered: they are vectorised, four at
+    a time, so that each number loaded is used twice."""
+    for i in range(0, D, 2):
+        i1 = min(i + 1, D - 1)
+        for j in range(i, D, 2):
+            j1 = min(j + 1, D - 1)
+            s, t, u, v = 0.0, 0.0, 0.0, 0.0
             for k in range(n):
-                s += A[i, k] * A[j, k]
-            out[i, j] = s
-            out[j, i] = s
+                a, b, c, d = A[i, k], A[i1, k], A[j, k], A[j1, k]
+                s += a * c
+                t += a * d
+                u += b * c
+                v += b * d
+            out[i, j], out[i, j1], out[i1, j], out[i1, j1] = s, t, u, v
+            out[j, i], out[j1, i], out[j, i1], out[j1, i1] = s, t, u, v
 
 
 @njit(cache=True, nogil=True)
@@ -158,11 +165,11 @@ def _fill_rows(i, images, noise, direct, motion, predicted, roots, error, A):
     n, ns, n_pars = n1 - n0, direct.basis.shape[1], len(direct.pars)
     has_bloom = len(direct.direction) > 0
     D = 6 + n_pars + has_bloom + ns
-    moved = np.empty((3, ns))
+    R = motion.R_cam_world[i]
     for k in range(n):
         c, root = n0 + k - predicted.first, roots[k]
         x, y, z = predicted.X[c, 0], predicted.X[c, 1], predicted.X[c, 2]
-        _turn(motion.R_cam_world[i], direct.basis[images.point[n0 + k]], moved)
+        basis = direct.basis[images.point[n0 + k]]
         for r in range(2):
             at = r * n + k
             a0, a1 = root * predicted.by_point[c, r, 0], root * predicted.by_point[c, r, 1]
@@ -177,8 +184,11 @@ def _fill_rows(i, images, noise, direct, motion, predicted, roots, error, A):
             if has_bloom:
                 A[d, at] = root * direct.direction[n0 + k, r]
                 d += 1
+            w0 = a0 * R[0, 0] + a1 * R[1, 0] + a2 * R[2, 0]
+            w1 = a0 * R[0, 1] + a1 * R[1, 1] + a2 * R[2, 1]
+            w2 = a0 * R[0, 2] + a1 * R[1, 2] + a2 * R[2, 2]
             for q in range(ns):
-                A[d + q, at] = a0 * moved[0, q] + a1 * moved[1, q] + a2 * moved[2, q]
+                A[d + q, at] = w0 * basis[q, 0] + w1 * basis[q, 1] + w2 * basis[q, 2]
             A[D, at] = root * error[k, r]
         if noise.curved and noise.loss > 0 and root > 0.0:
             sigma = noise.sigma[n0 + k]
@@ -186,14 +196,6 @@ def _fill_rows(i, images, noise, direct, motion, predicted, roots, error, A):
             _, _, curvature = weight(noise.loss, noise.scale, square)
             if curvature < 1.0:
                 bend(A, D, k, n, error[k], np.sqrt(curvature))
-
-
-@njit(cache=True, nogil=True)
-def _turn(R, b, out):
-    """out (3, s) = R b^T for b (s, 3)."""
-    for r in range(3):
-        for s in range(len(b)):
-            out[r, s] = R[r, 0] * b[s, 0] + R[r, 1] * b[s, 1] + R[r, 2] * b[s, 2]
 
 
 @njit(cache=True, nogil=True)
