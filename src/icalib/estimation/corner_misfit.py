@@ -68,8 +68,12 @@ def lens_misfit(stream: CornerStream, residual: np.ndarray, used: np.ndarray) ->
 
 def _cells(uv: np.ndarray, used: np.ndarray) -> np.ndarray:
     """(N,) int: the cell of each corner at uv (N, 2) px, in the rectangle that holds the `used` ones."""
-    low, size = uv[used].min(axis=0), np.ptp(uv[used], axis=0) + 1e-9
-    column, row = (
-        np.clip((uv[:, k] - low[k]) / size[k] * CELLS[k], 0, CELLS[k] - 1).astype(np.int16) for k in range(2)
-    )
+    column, row = (_strips(uv[:, k], used, CELLS[k]) for k in range(2))
     return row * np.int16(CELLS[0]) + column
+
+
+def _strips(x: np.ndarray, used: np.ndarray, count: int) -> np.ndarray:
+    """(N,) int16 from 0 to `count` - 1: where each x (N,) lies in the range of the `used` ones."""
+    own = x[used]
+    low, size = own.min(), np.ptp(own) + 1e-9
+    return np.clip((x - low) / size * count, 0, count - 1).astype(np.int16)

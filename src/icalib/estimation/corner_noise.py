@@ -124,7 +124,7 @@ def residual_noise(factor: CornerFactor, out: CornerOutput, settings: Settings, 
     lens = lens_misfit(stream, error, used)
     error -= lens.field
     relative = stream.relative_sigma[used].astype(np.float32)
-    square = (error[used] ** 2).sum(axis=1) / relative**2
+    square = np.einsum("ni,ni->n", error, error)[used] / relative**2
     base, exposure = float(np.sqrt(median_variance(square))), 0.0
     if settings.blur_noise:
         base, exposure = _fit_blur(square, speed[stream.image][used] / relative)

@@ -22,9 +22,10 @@ def largest_normal(deviations: float, share: float) -> float:
 def grouped_quantiles(x: np.ndarray, group: np.ndarray, count: int, share: float) -> np.ndarray:
     """(count,) of x (n,) by group (n,): the largest below which `share` of the rest lies; infinite where there is
     nothing."""
-    ordered = x[np.lexsort((x, group))]
-    sizes = np.bincount(group, minlength=count)
-    at = np.cumsum(sizes) - sizes + (share * np.maximum(sizes - 1, 0)).astype(np.int64)
     out = np.full(count, np.inf)
-    out[sizes > 0] = ordered[at[sizes > 0]]
+    ends = np.cumsum(np.bincount(group, minlength=count))
+    for k, own in enumerate(np.split(x[np.argsort(group, kind="stable")], ends[:-1])):
+        if len(own):
+            at = int(share * (len(own) - 1))
+            out[k] = np.partition(own, at)[at]
     return out

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 
 from icalib.estimation.imu_data import ImuData
@@ -20,16 +18,22 @@ def place_nodes(imu: ImuData, image_times: list[np.ndarray], spacing: float, max
     times = np.sort(np.concatenate(image_times))
     own = distinct(times[usable(imu, times, max_gap)])
     long_gaps = [(a, b) for a, b in imu.gaps if b - a > max_gap]
-    pieces = []
-    for recorded in np.split(own, first_nodes(imu, own)[1:]):
-        pieces.append(recorded[:1])
-        for a, b in pairwise(recorded):
-            n = max(int(np.ceil((b - a) / spacing - SLACK)), 1)
-            between = np.linspace(a, b, n + 1)[1:]
-            for start, end in long_gaps:
-                between = between[~((between > start) & (between < end))]
-            pieces.append(between)
-    return np.concatenate(pieces)
+    parts = [_filled(recorded, spacing) for recorded in np.split(own, first_nodes(imu, own)[1:])]
+    nodes = np.concatenate(parts)
+    for start, end in long_gaps:
+        nodes = nodes[(nodes <= start) | (nodes >= end)]
+    return nodes
+
+
+def _filled(times: np.ndarray, spacing: float) -> np.ndarray:
+    """Sorted `times` (n,), and instants evenly in between where they are further apart than 1.1 `spacing`."""
+    apart = np.diff(times)
+    steps = np.maximum(np.ceil(apart / spacing - SLACK), 1.0).astype(np.int64)
+    last = np.cumsum(steps)
+    k = np.arange(1, steps.sum() + 1) - np.repeat(last - steps, steps)
+    filled = np.append(times[:1], np.repeat(times[:-1], steps) + k * np.repeat(apart / steps, steps))
+    filled[last] = times[1:]
+    return filled
 
 
 def first_nodes(imu: ImuData | None, nodes: np.ndarray) -> tuple[int, ...]:
