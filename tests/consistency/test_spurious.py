@@ -30,7 +30,7 @@ def first_judged(monkeypatch):
     def to_its_end(*args, doubtful, guess, **kwargs):
         return estimate(*args, **kwargs)
 
-    def spy(problem, outcome, enough):
+    def spy(problem, outcome, *_):
         seen.append((problem, outcome))
         raise EnoughError
 

@@ -92,7 +92,7 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
     certain, explained = is_certain(size), bool(against)
     stated, factor = None if explained else relaxed(inputs, found), factors.max(initial=1.0)
     lenses = () if certain else other_lens(inputs.rig.cameras, lens_steps(inputs, stated), factor)
-    against = against or contradictions(inputs, found, stated, max(factor, _misfit(judged)))
+    against = against or contradictions(inputs, stated, max(factor, _misfit(judged)))
     if certain:  # a wrong size moves lever arms by some of their length
         against = tuple(c for c in against if worst_off(c.key[1], c.off) > 1.0)
     beyond = () if wrong_size or explained else far_beyond(inputs.rig, judged)

@@ -15,11 +15,10 @@ import numpy as np
 from icalib.errors import EstimationError
 from icalib.estimation.border import restricted_root
 from icalib.estimation.determination import Determined, determine, judge, scatter
-from icalib.estimation.estimate import Estimate
 from icalib.estimation.evidence import fits
 from icalib.estimation.groups import sensors_of
 from icalib.estimation.inputs import Inputs, origin_difference
-from icalib.estimation.relaxed import Relaxed, freed_inputs, relinearised, stated_keys
+from icalib.estimation.relaxed import Relaxed, freed_inputs, stated_keys
 from icalib.estimation.state import Block, Key, State
 from icalib.estimation.tolerances import GUESS_SIGMA
 from icalib.geometry import so3
@@ -55,7 +54,7 @@ class Contradiction:
         return int(np.argmax(self.away))
 
 
-def contradictions(inputs: Inputs, found: Estimate, stated: Relaxed | None, factor: float) -> tuple[Contradiction, ...]:
+def contradictions(inputs: Inputs, stated: Relaxed | None, factor: float) -> tuple[Contradiction, ...]:
     """What is more than SIGMAS off. `stated`: see `relaxed`; factor: times which formal standard deviations count."""
     if stated is None:
         return ()
@@ -63,10 +62,9 @@ def contradictions(inputs: Inputs, found: Estimate, stated: Relaxed | None, fact
     standing_out = _standing_out(alone)
     if not standing_out:
         return ()
-    freed = freed_inputs(inputs, [c.key for c in standing_out])
     if any(_is_far(c) for c in standing_out):
-        return _standing_out(_estimated(inputs, freed, stated.state, standing_out))
-    return _standing_out(_linear(inputs, freed, found, standing_out, factor))
+        return _standing_out(_estimated(inputs, stated.state, standing_out))
+    return _standing_out(_linear(inputs, stated, standing_out, factor))
 
 
 def _standing_out(shown: Sequence[Contradiction]) -> tuple[Contradiction, ...]:
@@ -83,25 +81,25 @@ def worst_off(name: str, off: np.ndarray) -> float:
 
 
 def _linear(
-    inputs: Inputs, freed: Inputs, found: Estimate, standing_out: Sequence[Contradiction], factor: float
+    inputs: Inputs, stated: Relaxed, standing_out: Sequence[Contradiction], factor: float
 ) -> Sequence[Contradiction]:
     """One Newton step with all that stand out free, without directions that the data leave open."""
-    there = relinearised(inputs, found, freed, freed.layout)
-    if there is None:
-        return standing_out
-    t, information = there.problem.tolerance, there.solution.information
-    seen = judge(freed, there.outcome())
-    root = restricted_root(t[:, None] * information * t, seen.undetermined)
-    step = -t * (root @ (root.T @ (t * there.solution.gradient[:-1])))
-    variance = np.diag(scatter(t[:, None] * information * t - seen.noise, seen.noise, seen.undetermined))
-    sigma = t * np.sqrt(variance)
-    return [_shown(inputs, there.state, there.layout.block(*c.key), step, sigma, factor) for c in standing_out]
+    keys, n = [c.key for c in standing_out], stated.layout.size
+    columns = np.setdiff1d(np.arange(n), stated.fixed_columns(keys))
+    outcome, gradient = stated.without(keys)
+    seen = judge(stated.inputs, outcome, columns=columns)
+    t = stated.problem.tolerance[columns]
+    information = t[:, None] * outcome.information[np.ix_(columns, columns)] * t
+    root = restricted_root(information, seen.undetermined)
+    step, sigma = np.zeros(n), np.zeros(n)
+    step[columns] = -t * (root @ (root.T @ (t * gradient[columns])))
+    sigma[columns] = t * np.sqrt(np.diag(scatter(information - seen.noise, seen.noise, seen.undetermined)))
+    return [_shown(inputs, stated.state, stated.layout.block(*c.key), step, sigma, factor) for c in standing_out]
 
 
-def _estimated(
-    inputs: Inputs, freed: Inputs, state: State, standing_out: Sequence[Contradiction]
-) -> Sequence[Contradiction]:
+def _estimated(inputs: Inputs, state: State, standing_out: Sequence[Contradiction]) -> Sequence[Contradiction]:
     """From the calibration without what stands out; as they are where that fails."""
+    freed = freed_inputs(inputs, [c.key for c in standing_out])
     try:
         again = determine(freed, state, guess=state.values)
     except EstimationError:

@@ -57,20 +57,26 @@ class Spurious:
 
 
 def spurious_information(
-    problem: Problem, outcome: Outcome, enough: Callable[[Spurious], bool] = lambda _: True
+    problem: Problem,
+    outcome: Outcome,
+    enough: Callable[[Spurious], bool] = lambda _: True,
+    columns: np.ndarray | None = None,
 ) -> Spurious:
-    """What noise adds; zeros where there is no IMU. Where it counts, a few draws, more where these are not `enough`.
+    """What noise adds to the information on `columns` (B,) of the border, by default all, the others fixed; zeros where
+    there is no IMU. Where it counts, a few draws, more where these are not `enough`.
 
     Raises arrowhead.NotDefiniteError where the chain is not determined.
     """
+    columns = np.arange(problem.layout.size) if columns is None else columns
+    among = np.ix_(columns, columns)
     if not isinstance(problem.chain, ImuFactor):
-        return Spurious(np.zeros((1, *outcome.information.shape)))
+        return Spurious(np.zeros((1, len(columns), len(columns))))
     rng = np.random.default_rng(0)
-    t = problem.tolerance
-    scaled = t[:, None] * outcome.information * t
-    least = least_information(outcome.information, t)
+    t, information = problem.tolerance[columns], outcome.information[among]
+    scaled = t[:, None] * information * t
+    least = least_information(information, t)
     samples = (outcome.draws or posterior(problem, outcome.state)).still
-    noise, first = _Noise(problem, outcome), _reading_noise(problem.chain.imu, rng)
+    noise, first = _Noise(problem, outcome, among), _reading_noise(problem.chain.imu, rng)
     one_side = noise.there(1.0, samples[0].chain, first)
     if least > DETERMINED and _largest_share(t[:, None] * one_side * t, scaled) < NEGLIGIBLE:
         return Spurious(one_side[None])
@@ -87,10 +93,12 @@ def spurious_information(
 
 @dataclass(frozen=True)
 class _Noise:
-    """What noise adds to the border's information at an outcome, in the room of which it is found."""
+    """What noise adds to the border's information at an outcome, in the room of which it is found; `among` columns
+    (B,) alone, as numpy.ix_ gives them."""
 
     problem: Problem
     outcome: Outcome
+    among: tuple[np.ndarray, ...]
 
     def added(self, chain: np.ndarray, readings: np.ndarray | None) -> np.ndarray:
         """(B, B) on average, where the trajectory is off by +-chain (K, 15), and the readings by as often that."""
@@ -101,7 +109,7 @@ class _Noise:
         and what is odd in it."""
         there = self.outcome.state.retract(self.problem.layout, sign * chain, np.zeros(self.problem.layout.size))
         noisy = self.problem if readings is None else _with_noise(self.problem, there, sign * readings)
-        return _information(noisy, there, self.outcome.room) - self.outcome.information
+        return (_information(noisy, there, self.outcome.room) - self.outcome.information)[self.among]
 
     def followed(self, chain: np.ndarray, readings: np.ndarray) -> np.ndarray:
         """(B, B), where the trajectory follows noise of the `readings` beside a draw `chain` (K, 15) of its posterior,

@@ -211,19 +211,27 @@ class Judgement(NamedTuple):
     undetermined: np.ndarray
 
 
-def judge(inputs: Inputs, outcome: Outcome, before: Judgement | None = None) -> Judgement:
-    """Nuisances whose priors belong to the model (a target's shape, bloom) are open only where these are, too. What
-    noise adds is not looked for again where there is about as much information as in the judgement `before`."""
-    problem = outcome.problem
-    t = problem.tolerance
-    asked = t[:, None] * without_priors(outcome.information, given_priors(inputs), outcome.state) * t
+def judge(
+    inputs: Inputs, outcome: Outcome, before: Judgement | None = None, columns: np.ndarray | None = None
+) -> Judgement:
+    """Of `columns` (B,) of the border, the others fixed; of all by default.
+
+    Nuisances whose priors belong to the model (a target's shape, bloom) are open only where these are, too. What noise
+    adds is not looked for again where there is about as much information as in the judgement `before`.
+    """
+    problem, information, state = outcome.problem, outcome.information, outcome.state
+    columns = np.arange(len(information)) if columns is None else columns
+    among, t = np.ix_(columns, columns), problem.tolerance[columns]
+    counted = {p.block.key for p in problem.priors}
+    given = [p for p in given_priors(inputs) if p.block.key in counted]
+    asked = t[:, None] * without_priors(information, given, state)[among] * t
     shown = partial(_shown, asked, t)
     if before is not None and _are_alike(before.asked, asked):
         spurious = before.spurious
     else:
-        spurious = spurious_information(problem, outcome, lambda found: not shown(found).in_doubt.any())
+        spurious = spurious_information(problem, outcome, lambda found: not shown(found).in_doubt.any(), columns)
     seen, noise = shown(spurious), spurious.mean
-    data = without_priors(outcome.information - noise, problem.priors, outcome.state)
+    data = without_priors(information, problem.priors, state)[among] - noise
     undetermined = seen.vectors[:, seen.nothing | seen.in_doubt]
     return Judgement(spurious, t[:, None] * data * t, t[:, None] * noise * t, asked, undetermined)
 

@@ -51,28 +51,33 @@ class Relaxed:
         """Where the data alone send the calibration parameters, step (B,), with the groups `freed` neither fixed nor
         with their priors, and all else as the rig file has it; and their standard deviations (B,)."""
         t, n = self.problem.tolerance, self.layout.size
-        priors = [p for p in given_priors(self.inputs) if p.block.key in freed]
-        _, pull, known = sums_of_priors(priors, self.state, n)
+        pull, known = self._priors_of(freed)
         fixed = np.eye(n)[:, self.fixed_columns(freed)]
         held = np.hstack([fixed, self.problem.held]) if self.problem.held.size else fixed
         root = restricted_root(t[:, None] * (self.solution.information - known) * t, held)
         step = -root @ (root.T @ (t * (self.solution.gradient[:-1] - pull)))
         return t * step, t * np.sqrt((root**2).sum(axis=1))
 
-    def outcome(self) -> Outcome:
-        """The solution as an outcome, from which noise in the Jacobians is found."""
-        return outcome_of(self.problem, self.state, 0.0, self.residuals, 0.0, [], self.solution)
+    def without(self, freed: Collection[Key]) -> tuple[Outcome, np.ndarray]:
+        """The solution without priors on the groups `freed`, as an outcome from which noise in the Jacobians is found;
+        and the gradient (B,) of the calibration parameters."""
+        pull, known = self._priors_of(freed)
+        problem = self.problem.without([p for p in self.problem.priors if p.block.key in freed])
+        found = outcome_of(problem, self.state, 0.0, self.residuals, 0.0, [], self.solution)
+        return replace(found, information=found.information - known), self.solution.gradient[:-1] - pull
+
+    def _priors_of(self, freed: Collection[Key]) -> tuple[np.ndarray, np.ndarray]:
+        """Gradient (B,) and information (B, B) of the priors on the groups `freed`."""
+        priors = [p for p in given_priors(self.inputs) if p.block.key in freed]
+        return sums_of_priors(priors, self.state, self.layout.size)[1:]
 
 
 def relaxed(inputs: Inputs, found: Estimate) -> Relaxed | None:
-    """Of what the rig file fixes or gives a prior; None where it does not, or the solver did not end."""
+    """Of what the rig file fixes or gives a prior, at the end of `found`; None where it does not, the solver did not
+    end, or nothing can be solved there."""
     if not found.outcome.converged or not any(_is_stated(p) for _, _, p in groups_of(inputs.rig)):
         return None
-    return relinearised(inputs, found, freed_inputs(inputs), inputs.layout)
-
-
-def relinearised(inputs: Inputs, found: Estimate, freed: Inputs, before: Layout) -> Relaxed | None:
-    """At the end of `found`, with the layout of `freed`; None where nothing can be solved there."""
+    freed = freed_inputs(inputs)
     held = _held_in(freed.layout, inputs.layout, found.problem.held)
     state = found.outcome.state
     try:
@@ -82,7 +87,7 @@ def relinearised(inputs: Inputs, found: Estimate, freed: Inputs, before: Layout)
         solution = solve(pieces, problem.n_nodes, problem.tolerance, held=held)
     except EstimationError:
         return None
-    return Relaxed(freed, problem, state, solution, residuals, before, tuple(stated_keys(inputs, freed.layout)))
+    return Relaxed(freed, problem, state, solution, residuals, inputs.layout, tuple(stated_keys(inputs, freed.layout)))
 
 
 def stated_keys(inputs: Inputs, layout: Layout) -> list[Key]:
