@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from icalib.errors import CalibrationError
-from icalib.geometry.cameras import CAMERA_MODELS, camera_model
+from icalib.geometry.cameras import CAMERA_MODELS, camera_model, rational
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.cameras.radial import monotonic_limit
 
@@ -402,3 +402,15 @@ def test_no_points_and_integer_or_strided_points(name: str) -> None:
 )
 def test_monotonic_limit(coefficients: list[float], expected: float) -> None:
     assert monotonic_limit(np.array(coefficients)) == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_monotonic_limit_of_a_rational_function(seed: int) -> None:
+    """The first radius beyond which r N(r^2) / D(r^2) does not grow, or changes its sign at a pole."""
+    numerator, denominator = np.random.default_rng(seed).normal(scale=0.5, size=(2, 3))
+    r = np.linspace(0.0, 3.0, 300_001)[1:]
+    s = r * r
+    growing = np.diff(r * np.polyval([*numerator[::-1], 1.0], s) / np.polyval([*denominator[::-1], 1.0], s)) > 0.0
+    found = rational.monotonic_limit(tuple(numerator), tuple(denominator))
+    first = r[np.argmin(growing)] if not growing.all() else np.inf
+    assert found == pytest.approx(first, abs=2e-5) or min(found, first) > 2.9

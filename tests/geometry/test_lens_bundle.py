@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.geometry import so3
+from icalib.geometry import lens_bundle, so3
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.lens_bundle import ImagePoints, _linearised, adjust, initial_parameters
 
@@ -67,7 +67,7 @@ def test_derivatives_are_those_of_differences():
 @pytest.mark.parametrize(("name", "params"), [("pinhole-radtan", RADTAN), ("pinhole-equidistant", FISHEYE)])
 def test_a_lens_is_recovered_with_poses_and_shape(name: str, params: np.ndarray):
     model, seen = camera_model(name), disturbed(images_of(name, params, 8), 1)
-    found, shape, residual = adjust(model, params + 0.01 * np.abs(params), seen)
+    found, shape, residual, _ = adjust(model, params + 0.01 * np.abs(params), seen)
     np.testing.assert_allclose(found, params, rtol=1e-3, atol=1e-4)
     assert shape[0] == pytest.approx(-1e-3, abs=1e-5)
     assert np.abs(residual).max() < 1e-3
@@ -79,9 +79,10 @@ def test_what_is_held_back_is_left_with_the_noise_by_the_right_model_and_with_mo
     rms = {}
     for name in ("pinhole-equidistant", "pinhole-radtan"):
         model = camera_model(name)
-        (start,) = initial_parameters(model, camera_model("pinhole-equidistant"), FISHEYE, fitted)
-        params, shape, _ = adjust(model, start, fitted)
-        again, same, residual = adjust(model, params, held_back, shape)
+        start = initial_parameters(model, camera_model("pinhole-equidistant"), FISHEYE, fitted)
+        assert start is not None
+        params, shape, *_ = adjust(model, start, fitted)
+        again, same, residual, _ = adjust(model, params, held_back, shape)
         np.testing.assert_array_equal(again, params)
         np.testing.assert_array_equal(same, shape)
         rms[name] = np.sqrt((residual**2).mean())
@@ -89,10 +90,34 @@ def test_what_is_held_back_is_left_with_the_noise_by_the_right_model_and_with_mo
     assert rms["pinhole-radtan"] > 1.3 * rms["pinhole-equidistant"]
 
 
+def test_of_several_starts_the_one_that_fits_best_is_taken(monkeypatch: pytest.MonkeyPatch):
+    model, seen = camera_model("pinhole-equidistant"), images_of("pinhole-equidistant", FISHEYE, 8, 0.1, 2, NEAR)
+    monkeypatch.setattr(lens_bundle, "fit_rays", lambda model, start, *_: start)  # each its own minimum
+    poor, good = (0.1, 0.0, 0.0, 0.0), tuple(FISHEYE[4:])
+    for starts in ((poor, good), (good, poor)):
+        monkeypatch.setattr(type(model), "start_distortions", starts)
+        np.testing.assert_array_equal(initial_parameters(model, model, FISHEYE, seen), FISHEYE)
+    monkeypatch.setattr(type(model), "start_distortions", ())
+    assert initial_parameters(model, model, FISHEYE, seen) is None
+
+
+def test_an_adjustment_goes_on_where_the_last_one_ended(monkeypatch: pytest.MonkeyPatch):
+    model, seen = camera_model("pinhole-radtan"), disturbed(images_of("pinhole-radtan", RADTAN, 8, 0.1), 1)
+    first, steps = adjust(model, RADTAN + 0.01 * np.abs(RADTAN), seen), []
+    step = lens_bundle._step
+    monkeypatch.setattr(lens_bundle, "_step", lambda *args: steps.append(None) or step(*args))
+    second = adjust(model, first.params, first.seen)
+    assert len(steps) <= 2
+    assert np.abs(second.shape).max() < 1e-5
+    np.testing.assert_allclose(second.residual, first.residual, atol=1e-3)
+    there = model.project(first.params, first.seen.points)[0] - seen.uv
+    np.testing.assert_allclose(there, first.residual, atol=1e-9)
+
+
 def test_points_that_are_not_used_have_residuals_and_no_influence():
     model, seen = camera_model("pinhole-radtan"), disturbed(images_of("pinhole-radtan", RADTAN, 8), 1)
     used = np.random.default_rng(0).random(len(seen.uv)) < 0.8
     uv = seen.uv + np.where(used, 0.0, 30.0)[:, None]
-    found, _, residual = adjust(model, RADTAN + 0.01 * np.abs(RADTAN), replace(seen, uv=uv, used=used))
+    found, _, residual, _ = adjust(model, RADTAN + 0.01 * np.abs(RADTAN), replace(seen, uv=uv, used=used))
     np.testing.assert_allclose(found, RADTAN, rtol=1e-3, atol=1e-4)
     np.testing.assert_allclose(residual[~used], -30.0, atol=1e-2)

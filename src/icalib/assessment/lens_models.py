@@ -7,7 +7,7 @@ the detector found them: a corner is left out only where no model explains it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -22,7 +22,7 @@ from icalib.estimation.inputs import Inputs
 from icalib.estimation.state import State
 from icalib.geometry.cameras import CAMERA_MODELS, camera_model
 from icalib.geometry.cameras.base import CameraModel
-from icalib.geometry.lens_bundle import ImagePoints, adjust, initial_parameters
+from icalib.geometry.lens_bundle import Adjusted, ImagePoints, adjust, initial_parameters
 from icalib.rig import Settings
 
 MOST_IMAGES = 40  # that are compared, half of them held out; the time is proportional to it
@@ -35,17 +35,27 @@ SIGN_TEST_SIGMAS = 3.0  # of the number of images that another model fits better
 
 @dataclass(frozen=True)
 class _HeldOut:
-    """What a fitted model with `params` (P,) leaves in the M held-out images.
-
-    squared_error (M,) px^2: the sum over the used corners of each image; corners: their number in all images; residuals
-    (N, 2) px: those of all corners, of the fitted and then of the held-out images.
-    """
+    """A model as adjusted to the `fitted` images, and what it leaves in the M `held_out` images."""
 
     model: CameraModel
-    params: np.ndarray
-    residuals: np.ndarray
-    squared_error: np.ndarray
-    corners: int
+    fitted: Adjusted
+    held_out: Adjusted
+
+    @property
+    def residuals(self) -> np.ndarray:
+        """(N, 2) px: those of all corners, of the fitted and then of the held-out images."""
+        return np.concatenate([self.fitted.residual, self.held_out.residual])
+
+    @property
+    def squared_error(self) -> np.ndarray:
+        """(M,) px^2: the sum over the used corners of each held-out image."""
+        seen, square = self.held_out.seen, (self.held_out.residual**2).sum(axis=1)
+        return seen.sum_by_image(np.where(seen.used, square, 0.0))
+
+    @property
+    def corners(self) -> int:
+        """The number of used corners in all held-out images."""
+        return int(self.held_out.seen.used.sum())
 
     @property
     def rms(self) -> float:
@@ -97,26 +107,22 @@ def compare_models(
     rows, fitted, held_out = halves
     params = factor.lens(state)
     models = [factor.model, *(camera_model(name) for name in CAMERA_MODELS if name != factor.model.name)]
-    starts = {m.name: list(initial_parameters(m, factor.model, params, fitted)) for m in models[1:]}
-    first = _fits(models, starts | {factor.model.name: [params]}, fitted, held_out)
+    starts = [params, *(initial_parameters(m, factor.model, params, fitted) for m in models[1:])]
+    pairs = [(m, start) for m, start in zip(models, starts, strict=True) if start is not None]
+    first = _found(_cross_validated(model, start, fitted, held_out) for model, start in pairs)
     if not first:
         return None, None
     # Corners that the own model rejects may be those that another explains.
     residuals = np.array([fit.residuals for fit in first])
     nearest = np.argmin((residuals**2).sum(axis=2), axis=0)
     used = ~rejected(factor, rows, residuals[nearest, np.arange(len(rows))], settings)
-    fitted, held_out = replace(fitted, used=used[: len(fitted.uv)]), replace(held_out, used=used[len(fitted.uv) :])
-    second = _fits([fit.model for fit in first], {f.model.name: [f.params] for f in first}, fitted, held_out)
+    second = _found(_again(fit, used) for fit in first)
     own = next((fit for fit in second if fit.model is factor.model), None)
     return own, None if own is None else _clearly_better(own, [fit for fit in second if fit is not own])
 
 
-def _fits(
-    models: list[CameraModel], starts: dict[str, list[np.ndarray]], fitted: ImagePoints, held_out: ImagePoints
-) -> list[_HeldOut]:
-    """Those of the models that can be fitted, each from its starts."""
-    found = [_cross_validated(model, starts[model.name], fitted, held_out) for model in models]
-    return [fit for fit in found if fit is not None]
+def _found(fits: Iterable[_HeldOut | None]) -> list[_HeldOut]:
+    return [fit for fit in fits if fit is not None]
 
 
 def _clearly_better(own: _HeldOut, others: list[_HeldOut]) -> _HeldOut | None:
@@ -133,24 +139,23 @@ def _clearly_better(own: _HeldOut, others: list[_HeldOut]) -> _HeldOut | None:
 
 
 def _cross_validated(
-    model: CameraModel, starts: list[np.ndarray], fitted: ImagePoints, held_out: ImagePoints
+    model: CameraModel, params: np.ndarray, fitted: ImagePoints, held_out: ImagePoints
 ) -> _HeldOut | None:
-    """The model, fitted to the images `fitted` from the best of `starts` (P,), in the images `held_out`.
+    """The model, adjusted from `params` (P,) to the images `fitted`, in the images `held_out`.
 
-    None where no start leads to a fit, or a held-out image does not determine its pose.
+    None where an image does not determine its pose.
     """
-    fits = []
-    for params in starts:
-        with suppress(np.linalg.LinAlgError):
-            fits.append(adjust(model, params, fitted))
-    if not fits:
-        return None
-    params, shape, residual = min(fits, key=lambda fit: (fit[2][fitted.used] ** 2).sum())
     with suppress(np.linalg.LinAlgError):
-        _, _, left = adjust(model, params, held_out, shape)
-        square = held_out.sum_by_image(np.where(held_out.used, (left**2).sum(axis=1), 0.0))
-        return _HeldOut(model, params, np.concatenate([residual, left]), square, int(held_out.used.sum()))
+        fit = adjust(model, params, fitted)
+        return _HeldOut(model, fit, adjust(model, fit.params, held_out, fit.shape))
     return None
+
+
+def _again(fit: _HeldOut, used: np.ndarray) -> _HeldOut | None:
+    """The fit to the corners `used` (N,) bool of both halves, from where it is."""
+    n = len(fit.fitted.residual)
+    fitted, held_out = replace(fit.fitted.seen, used=used[:n]), replace(fit.held_out.seen, used=used[n:])
+    return _cross_validated(fit.model, fit.fitted.params, fitted, held_out)
 
 
 def _halves(

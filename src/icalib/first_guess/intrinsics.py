@@ -15,6 +15,7 @@ from icalib.geometry.cameras import camera_model
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.cameras.convert import fit_rays
 from icalib.geometry.targets import Target
+from icalib.geometry.vectors import cross
 from icalib.measurements import CornerStream
 from icalib.rig import Camera
 
@@ -302,7 +303,7 @@ def _sums(stream, model, params, target, free, R, p, used):
         cost += float(np.where(size > HUBER_PX, HUBER_PX * (size - 0.5 * HUBER_PX), 0.5 * size**2).sum())
         # Corners that the model cannot see cost as much as bad ones, or it would learn to look away.
         cost += float((~valid).sum()) * HUBER_PX * 20.0
-        turn = np.cross(Jx, X[:, None, :])
+        turn = cross(Jx, X[:, None, :])
         A = np.concatenate([turn, -Jx], axis=2).reshape(-1, 6)
         B = Jp[:, :, free].reshape(-1, n)
         w2 = np.repeat(w, 2)[:, None]

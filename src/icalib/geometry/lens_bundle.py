@@ -6,21 +6,24 @@ pose changes by a small rotation and translation of its image's points.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
 from icalib.geometry import so3
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.cameras.convert import fit_rays
+from icalib.geometry.vectors import cross
 
 UNSEEN_PX = 20.0  # residual of a point outside the model's range; zero would reward a lens that sees fewer points
 MOST_ROUNDS = 40  # steps, accepted or not
 MOST_DAMPING = 1e8  # of the normal equations with unit diagonal; beyond it a step is down to rounding
 SETTLED = 1e-5  # relative decrease of the sum of squares in an accepted step, below which it is the last
 START_CORNERS = 1500  # about as many are used for initial parameters; the adjustment uses all
+START_PX = 0.01  # a step to initial parameters that moves no point further is the last: the adjustment goes on
 
 
 @dataclass(frozen=True)
@@ -49,7 +52,7 @@ class ImagePoints:
 
         A motion is a rotation vector [rad] and a translation [m].
         """
-        R = np.array([so3.exp(np.ascontiguousarray(m[:3])) for m in motion])[self.image]
+        R = so3.exp_many(np.ascontiguousarray(motion[:, :3]))[self.image]
         points = np.einsum("nij,nj->ni", R, self.points + self.basis @ shape) + motion[self.image, 3:]
         return ImagePoints(points, self.uv, self.start, R @ self.basis, self.used)
 
@@ -58,32 +61,43 @@ class ImagePoints:
         return np.add.reduceat(values, self.start[:-1], axis=0)
 
 
+class Adjusted(NamedTuple):
+    """A lens with `params` (P,) and what it leaves. shape (s,): the change of the target's shape; residual (N, 2) [px]:
+    of all points, used or not; seen: the points with that shape, where the fitted poses have them.
+    """
+
+    params: np.ndarray
+    shape: np.ndarray
+    residual: np.ndarray
+    seen: ImagePoints
+
+
 def initial_parameters(
     model: CameraModel, other: CameraModel, params: np.ndarray, seen: ImagePoints
-) -> Iterator[np.ndarray]:
-    """Parameters (P,) of `model` for a lens that is known as `other` with `params`: one set from each of its starts.
+) -> np.ndarray | None:
+    """Parameters (P,) of `model` for a lens that is known as `other` with `params`: from the best of its starts.
 
     They minimise the distance between projected and measured points, the points being fixed. A start that sees no more
-    than half of the points is left out. fx and fy start so that the scale in the image's centre is that of `other`.
+    than half of the points is left out; None if all do. fx and fy start so that the scale in the image's centre is that
+    of `other`.
     """
     few = np.flatnonzero(seen.used)[:: max(int(seen.used.sum()) // START_CORNERS, 1)]
     points, uv = seen.points[few], seen.uv[few]
+    found = []
     for distortion in model.start_distortions:
         start = np.array([*params[:4], *distortion])
         start[:2] *= other.central_scale(params) / model.central_scale(start)
         visible = model.project(start, points)[1]
         if 2 * visible.sum() > len(uv):
             with suppress(np.linalg.LinAlgError):
-                yield fit_rays(model, start, points[visible], uv[visible])
+                found.append(fit_rays(model, start, points[visible], uv[visible], START_PX))
+    return min(found, key=lambda p: float((_residual(uv, *model.project(p, points)) ** 2).sum()), default=None)
 
 
-def adjust(
-    model: CameraModel, params: np.ndarray, seen: ImagePoints, fixed: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Parameters (P,), change of the target's shape (s,), and residuals (N, 2) [px] of all points, used or not.
+def adjust(model: CameraModel, params: np.ndarray, seen: ImagePoints, fixed: np.ndarray | None = None) -> Adjusted:
+    """Minimises the squared residuals of the used points over parameters, shape and poses, from `params` (P,).
 
-    Minimises the squared residuals of the used points over parameters, shape and poses, from `params` (P,). With a
-    `fixed` shape (s,) only the poses are fitted, and `params` and `fixed` are returned as they are.
+    With a `fixed` shape (s,) only the poses are fitted, and `params` and `fixed` are returned as they are.
 
     Raises numpy.linalg.LinAlgError where the points of an image do not determine its pose.
     """
@@ -107,7 +121,7 @@ def adjust(
             damping *= 10.0
             if damping > MOST_DAMPING:
                 break
-    return params, shape, here[0]
+    return Adjusted(params, shape, here[0], seen)
 
 
 def _linearised(
@@ -119,10 +133,14 @@ def _linearised(
     shape.
     """
     projected, valid, J_point, J_params = model.project_with_jacobians(params, seen.points)
-    residual = np.where(valid[:, None], projected - seen.uv, np.sqrt(0.5) * UNSEEN_PX)
-    J_rotation = np.cross(seen.points[:, None, :], J_point)
     J_shared = (J_params, J_point @ seen.basis) if with_lens else ()
-    return residual, np.concatenate([J_rotation, J_point, *J_shared], axis=2)
+    J = np.concatenate([cross(seen.points[:, None, :], J_point), J_point, *J_shared], axis=2)
+    return _residual(seen.uv, projected, valid), J
+
+
+def _residual(uv: np.ndarray, projected: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """(N, 2) [px] projected - measured, `UNSEEN_PX` long where the model sees no point."""
+    return np.where(valid[:, None], projected - uv, np.sqrt(0.5) * UNSEEN_PX)
 
 
 def _step(residual: np.ndarray, J: np.ndarray, seen: ImagePoints, damping: float) -> tuple[np.ndarray, np.ndarray]:
@@ -130,17 +148,19 @@ def _step(residual: np.ndarray, J: np.ndarray, seen: ImagePoints, damping: float
 
     Both diagonals are damped, relative to themselves. J (N, 2, 6 + n) as `_linearised` gives it.
     """
-    J = J * seen.used[:, None, None]
-    A, B = J[:, :, :6], J[:, :, 6:]
-    H, C = (seen.sum_by_image(np.einsum("nki,nkj->nij", A, x)) for x in (A, B))
-    g = seen.sum_by_image(np.einsum("nki,nk->ni", A, residual))
+    rows = np.concatenate([J, residual[:, :, None]], axis=2)
+    rows[~seen.used] = 0.0
+    images = (rows[a:b].reshape(-1, rows.shape[2]) for a, b in pairwise(seen.start))
+    grams = np.array([own.T @ own for own in images])
+    whole = grams[:, 6:, 6:].sum(axis=0)
+    H, C, g = grams[:, :6, :6], grams[:, :6, 6:-1], grams[:, :6, -1]
     diagonal = np.einsum("mii->mi", H)
     diagonal *= 1.0 + damping
     diagonal += 1e-12 * diagonal.max(axis=1, keepdims=True)
     solved = np.linalg.solve(H, np.concatenate([C, g[:, :, None]], axis=2))
-    S = np.einsum("nki,nkj->ij", B, B) - np.einsum("mki,mkj->ij", C, solved[:, :, :-1])
-    b = np.einsum("nki,nk->i", B, residual) - np.einsum("mki,mk->i", C, solved[:, :, -1])
-    scale = np.sqrt(np.maximum(np.einsum("nki,nki->i", B, B), 1e-300))
+    S = whole[:-1, :-1] - np.einsum("mki,mkj->ij", C, solved[:, :, :-1])
+    b = whole[:-1, -1] - np.einsum("mki,mk->i", C, solved[:, :, -1])
+    scale = np.sqrt(np.maximum(np.diag(whole)[:-1], 1e-300))
     scaled = S / scale[:, None] / scale + damping * np.eye(len(b))
     step = -np.linalg.lstsq(scaled, b / scale, rcond=1e-13)[0] / scale
     return step, -solved[:, :, -1] - np.einsum("mij,j->mi", solved[:, :, :-1], step)

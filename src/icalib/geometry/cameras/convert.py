@@ -10,7 +10,7 @@ from icalib.geometry.cameras.base import CameraModel
 _GRID = (48, 32)  # pixels across and down, the image's borders included
 _MAX_STEPS = 200  # ten are plenty, unless the best fit lies beyond the range of the model
 _LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e8  # of the normal equations with unit diagonal
-_SETTLED_PX = 1e-9  # a step that moves no pixel further than this is the last
+_SETTLED_PX = 1e-9
 
 
 def fit_model(
@@ -54,9 +54,11 @@ def _rays(source: CameraModel, params: np.ndarray, resolution: tuple[int, int]) 
     return uv[valid], rays[valid]
 
 
-def fit_rays(target: CameraModel, params: np.ndarray, rays: np.ndarray, uv: np.ndarray) -> np.ndarray:
+def fit_rays(
+    target: CameraModel, params: np.ndarray, rays: np.ndarray, uv: np.ndarray, settled_px: float = _SETTLED_PX
+) -> np.ndarray:
     """Parameters (P,) of `target` that project rays (N, 3) to uv (N, 2) [px]: Levenberg-Marquardt from `params` (P,),
-    which can see all rays."""
+    which can see all rays. A step that moves no pixel further than `settled_px` is the last."""
     damping = _LEAST_DAMPING
     for _ in range(_MAX_STEPS):
         projected, _, _, j_params = target.project_with_jacobians(params, rays)
@@ -73,6 +75,6 @@ def fit_rays(target: CameraModel, params: np.ndarray, rays: np.ndarray, uv: np.n
             if damping > _MOST_DAMPING:  # the step is down to rounding: as good as it gets
                 return params
         params, damping = params + step, max(0.1 * damping, _LEAST_DAMPING)
-        if np.abs(J @ step).max() < _SETTLED_PX:
+        if np.abs(J @ step).max() < settled_px:
             return params
     return params

@@ -6,7 +6,6 @@ from functools import lru_cache
 
 import numpy as np
 from numba import njit
-from numpy.polynomial import Polynomial
 
 from icalib.geometry.cameras.closed_form import ClosedForm
 from icalib.geometry.cameras.radtan import newton_step
@@ -57,13 +56,18 @@ def monotonic_limit(numerator: tuple[float, ...], denominator: tuple[float, ...]
     likewise. The derivative is (N D + 2 s (N' D - N D')) / D^2 at s = r^2. Returns 0 if a coefficient, or one of the
     derivative's numerator, is not finite.
     """
-    N, D = Polynomial([1.0, *numerator]), Polynomial([1.0, *denominator])
+    N, D = np.array([1.0, *numerator]), np.array([1.0, *denominator])
     with np.errstate(over="ignore", invalid="ignore"):
-        slope = N * D + Polynomial([0.0, 2.0]) * (N.deriv() * D - N * D.deriv())
-    if not (np.isfinite(slope.coef).all() and np.isfinite(D.coef).all()):
+        slope = np.convolve(N, D)
+        slope[1:] += 2.0 * (np.convolve(_derivative(N), D) - np.convolve(N, _derivative(D)))
+    if not (np.isfinite(slope).all() and np.isfinite(D).all()):
         return 0.0
-    squares = [_smallest_root(p.coef) for p in (slope, D)]
-    return float(np.sqrt(min(squares)))
+    return float(np.sqrt(min(_smallest_root(slope), _smallest_root(D))))
+
+
+def _derivative(coefficients: np.ndarray) -> np.ndarray:
+    """(n - 1,) coefficients of a polynomial's derivative, lowest power first as those (n,) of the polynomial."""
+    return np.arange(1, len(coefficients)) * coefficients[1:]
 
 
 def _smallest_root(coefficients: np.ndarray) -> float:
