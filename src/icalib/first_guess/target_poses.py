@@ -278,7 +278,7 @@ def usable_rays(uv: np.ndarray, model: CameraModel, params: np.ndarray) -> tuple
     directions, and (N,) whether the ray is far enough from the image plane."""
     rays, valid = model.unproject(params, uv)
     good = valid & (rays[:, 2] > SMALLEST_COSINE)
-    on_plane = rays / np.where(good, rays[:, 2], 1.0)[:, None]
-    J = model.project_with_jacobians(params, on_plane)[2]
-    density = np.sqrt(np.abs(J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]))
+    J = model.project_with_jacobians(params, rays)[2]
+    # Derivatives by x / z are z times those by x.
+    density = np.abs(rays[:, 2]) * np.sqrt(np.abs(J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]))
     return rays, density, good & (density > 0.0)
