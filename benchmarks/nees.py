@@ -70,9 +70,13 @@ def _mocap() -> SimPoses:
     return SimPoses("mocap0", _pose(0.3, [0.1, -0.2, 0.15]), "absolute", _pose(2.0, [3.0, -1.0, 0.5]), 0.0123)
 
 
-def _unstated(rig: Rig) -> Rig:
-    """The rig of a user who states the noise of IMU and encoders; all other is found from residuals. Simulated wheels
-    do not slip."""
+def _rig(scenario: Scenario) -> Rig:
+    """All is estimated, from the truth on: whether a first guess is found is another question. The noise of IMU and
+    encoders is stated, all other is found from residuals. Simulated wheels do not slip."""
+    rig = rig_for(
+        scenario, rotation="start", translation="start", time_offset="start", intrinsics="start", distortion="start",
+        drive="start",
+    )  # fmt: skip
     return replace(
         rig,
         cameras=tuple(replace(c, corner_noise_px=None, track_noise_px=None) for c in rig.cameras),
@@ -86,7 +90,7 @@ def _board() -> Case:
     """Two cameras in front of a target."""
     scenario = handheld(3.0)
     scenario = replace(scenario, cameras=tuple(replace(c, rate_hz=10.0) for c in scenario.cameras))
-    return Case(scenario, _unstated(rig_for(scenario, intrinsics="start", distortion="start")), 16)
+    return Case(scenario, _rig(scenario), 16)
 
 
 def _tracks() -> Case:
@@ -96,7 +100,7 @@ def _tracks() -> Case:
     features = replace(scenario.features, per_image=40, count=600, lasting=80)
     alone = {"cameras": scenario.cameras[:1], "lidars": (), "wheels": ()}
     scenario = replace(scenario, duration_s=5.0, features=features, **alone)
-    return Case(scenario, _unstated(rig_for(scenario, intrinsics="start", distortion="start")), 30)
+    return Case(scenario, _rig(scenario), 30)
 
 
 def _drive() -> Case:
@@ -107,7 +111,7 @@ def _drive() -> Case:
         lidars=tuple(replace(x, azimuth_steps=200) for x in scenario.lidars),
         wheels=tuple(replace(w, noise=0.005) for w in scenario.wheels),
     )  # fmt: skip
-    return Case(scenario, _unstated(rig_for(scenario)), 20, ("lidar", "wheel", "mocap"))
+    return Case(scenario, _rig(scenario), 20, ("lidar", "wheel", "mocap"))
 
 
 def _poses() -> Case:
@@ -115,7 +119,7 @@ def _poses() -> Case:
     odometry = replace(_mocap(), name="odom0", kind="relative", rotation_noise=5e-3, position_noise=1e-2)
     room, motion = Room((8.0, 6.0, 3.0)), Drive("free", exact=True)
     scenario = Scenario((), duration_s=5.0, motion=motion, board=False, room=room, poses=(_mocap(), odometry))
-    return Case(scenario, _unstated(rig_for(scenario)), 30, ("mocap", "odom"))
+    return Case(scenario, _rig(scenario), 30, ("mocap", "odom"))
 
 
 CASES = {"board": _board, "tracks": _tracks, "drive": _drive, "poses": _poses}
