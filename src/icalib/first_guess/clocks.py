@@ -85,23 +85,23 @@ def align(imu: ImuData, name: str, rates: CameraRates, given_offset: float | Non
     first = _align_near(imu, name, rates, best, keep)
     tried = (_align_near(imu, name, rates, x, keep) for x in others if _covered(imu, rates, x).any())
     # In a short recording the sizes of the rates may be more alike elsewhere, but not their directions.
-    (alike, found), averaged = _first_alike(imu, chain([first], tried))
+    (alike, found), averaged = _alike(imu, chain([first], tried))
     refuse_steps(imu, name, alike, found.offset, lambda part, offset: _left_at(imu, part, found, offset))
     _check_offset(imu, name, _unexplained(imu, alike, found, averaged), keep)
     _check_scale(imu, name, rates, found, averaged)
     return found
 
 
-def _first_alike(
-    imu: ImuData, tried: Iterable[tuple[CameraRates, Alignment]]
-) -> tuple[tuple[CameraRates, Alignment], float]:
-    """The first at which the two turn alike, and over how long; or if none does the very first. Over LONGER_S what is
-    noise shrinks with the root of that at least, another motion does not."""
-    known: list[tuple[CameraRates, Alignment]] = []
-    for one in tried:
-        known.append(one)
-        if _unexplained(imu, *one) <= LARGEST_UNEXPLAINED:
-            return one, AVERAGED_S
+def _alike(imu: ImuData, tried: Iterable[tuple[CameraRates, Alignment]]) -> tuple[tuple[CameraRates, Alignment], float]:
+    """The first at which the two turn alike, but a later one where they turn far more alike, and over how long; or if
+    they do nowhere the very first. Over LONGER_S what is noise shrinks with the root of that at least, another motion
+    does not."""
+    known = list(tried)
+    left = [_unexplained(imu, *one) for one in known]
+    alike = [k for k, share in enumerate(left) if share <= LARGEST_UNEXPLAINED]
+    if alike:
+        best = int(np.argmin(left))
+        return known[best if left[best] < CLEARLY_BETTER * left[alike[0]] else alike[0]], AVERAGED_S
     for one in known:
         share = min(LARGEST_UNEXPLAINED, np.sqrt(AVERAGED_S / LONGER_S) * _unexplained(imu, *one))
         if _unexplained(imu, *one, LONGER_S) <= share:
@@ -335,7 +335,7 @@ def as_given(imu: ImuData, name: str, rates: CameraRates, offset: float, rotatio
 
 def contradicts(imu: ImuData, rates: CameraRates, given: Alignment) -> bool:
     """Whether the two turn, but not alike, even allowing for what a guess is off."""
-    (_, found), averaged = _first_alike(imu, [(rates, given)])
+    (_, found), averaged = _alike(imu, [(rates, given)])
     return not is_still(*turning(imu, rates)) and _unexplained(imu, rates, found, averaged) > LARGEST_UNEXPLAINED
 
 
