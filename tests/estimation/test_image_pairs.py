@@ -53,8 +53,8 @@ def test_the_sentence_names_the_cameras_and_stamps_of_the_rejected_sets(cameras)
     late = [np.isin(camera.node, [2]) for camera in cameras]
     first, stamps = cameras[0].stream.stamps_ns, cameras[1].stream.stamps_ns
     words = late_words(cameras, late)
-    assert words.startswith("1 sets of images of cam1 and cam2 ") and words.endswith(f": {stamps[2]}.")
+    assert words.startswith("1 sets of images of cam1 and cam2 ") and words.endswith(f": at {stamps[2]} ns.")
     words = late_words(cameras, [np.isin(camera.node, [2, 4]) for camera in cameras])
     assert words.startswith("2 sets of images of cam0 and cam1 and cam2 ")
-    assert words.endswith(f": {stamps[2]}, {first[3]}.")
+    assert words.endswith(f": at {stamps[2]} ns, at {first[3]} ns.")
     assert late_words(cameras, [np.zeros(len(camera.node), dtype=bool) for camera in cameras]) == ""
