@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import os
 import re
 import shutil
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 WHOLE_RUNS = ("acceptance", "consistency")  # folders of tests that calibrate from measurements to the result
 
 
@@ -34,6 +37,18 @@ def _own_cache(tmp_path_factory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ICALIB_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
+
+
+@pytest.fixture(scope="session")
+def benchmark_program() -> Callable[[str], ModuleType]:
+    """Imports a program of benchmarks/, none of which is a part of the package."""
+
+    def imported(name: str) -> ModuleType:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.syspath_prepend(str(BENCHMARKS))
+            return importlib.import_module(name)
+
+    return imported
 
 
 def _recording(name: str) -> Path:

@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
-
 
 @pytest.fixture(scope="module")
-def tables() -> ModuleType:
-    """The program that writes them, which is no part of the package."""
-    spec = importlib.util.spec_from_file_location("study_tables", ROOT / "benchmarks" / "study_tables.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def tables(benchmark_program: Callable[[str], ModuleType]) -> ModuleType:
+    """The program that writes them."""
+    return benchmark_program("study_tables")
 
 
 def test_tables_are_those_of_the_results(tables: ModuleType):

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
@@ -19,13 +19,8 @@ BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
 
 @pytest.fixture
-def mutators(monkeypatch) -> ModuleType:
-    return imported("fuzz_mutators", monkeypatch)
-
-
-def imported(name: str, monkeypatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    return importlib.import_module(name)
+def mutators(benchmark_program: Callable[[str], ModuleType]) -> ModuleType:
+    return benchmark_program("fuzz_mutators")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="processes are forked")
@@ -51,23 +46,23 @@ def test_some_cases():
         ("icalib: inference and nanoseconds are words.\n", b"", False),
     ],
 )
-def test_numbers_that_are_none_may_only_be_quoted(said: str, content: bytes, fault: bool, monkeypatch):
-    assert imported("fuzz_run", monkeypatch).says_no_number(said, content) == fault
+def test_numbers_that_are_none_may_only_be_quoted(said: str, content: bytes, fault: bool, benchmark_program):
+    assert benchmark_program("fuzz_run").says_no_number(said, content) == fault
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="processes are forked")
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 1.0])
 @pytest.mark.parametrize("suffix", [".json", ".yaml"])
-def test_results_may_quote_nan_but_hold_none(value: float, suffix: str, monkeypatch, tmp_path: Path):
+def test_results_may_quote_nan_but_hold_none(value: float, suffix: str, benchmark_program, tmp_path: Path):
     path = tmp_path / f"made{suffix}"
     plain = {"notes": ["a.csv:3: wx is '.nan', which is not a number"], "sensors": {"cam0": {"std": [1.0, value]}}}
     path.write_text(json.dumps(plain) if suffix == ".json" else yaml.safe_dump(plain))
-    assert imported("fuzz_run", monkeypatch).holds_no_number(path) == (value != 1.0)
+    assert benchmark_program("fuzz_run").holds_no_number(path) == (value != 1.0)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="processes are forked")
-def test_good_input_that_is_refused_is_told(monkeypatch, capsys, tmp_path: Path):
-    run, cases = imported("fuzz_run", monkeypatch), imported("fuzz_cases", monkeypatch)
+def test_good_input_that_is_refused_is_told(benchmark_program, capsys, tmp_path: Path):
+    run, cases = benchmark_program("fuzz_run"), benchmark_program("fuzz_cases")
     (tmp_path / "good").mkdir()
     (tmp_path / "good" / "rig.yaml").write_text("sensors: {}\n")
     case = cases.Case(0, -1, "rig", "", ("inspect", "nothing", "-q"))
@@ -76,8 +71,8 @@ def test_good_input_that_is_refused_is_told(monkeypatch, capsys, tmp_path: Path)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="processes are forked")
-def test_few_cases_cover_all_kinds(monkeypatch, tmp_path: Path):
-    cases, mutators = imported("fuzz_cases", monkeypatch), imported("fuzz_mutators", monkeypatch)
+def test_few_cases_cover_all_kinds(benchmark_program, tmp_path: Path):
+    cases, mutators = benchmark_program("fuzz_cases"), benchmark_program("fuzz_mutators")
     names = {name for kind in cases._KINDS for name in kind.files}
     for name in names:
         path = tmp_path / name.replace("*", "a.csv" if "run" not in name else "a")

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
-FILE = Path(__file__).parents[2] / "benchmarks" / "tour_page.py"
-SPEC = importlib.util.spec_from_file_location("tour_page", FILE)
-assert SPEC is not None and SPEC.loader is not None
-tour_page = importlib.util.module_from_spec(SPEC)
-sys.modules["tour_page"] = tour_page
-SPEC.loader.exec_module(tour_page)
+
+@pytest.fixture(scope="module")
+def tour_page(benchmark_program: Callable[[str], ModuleType]) -> ModuleType:
+    """The program that runs the commands of the page."""
+    return benchmark_program("tour_page")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="the page is for a Unix shell")
-def test_the_commands_of_the_page_do_what_it_says(tmp_path: Path):
+def test_the_commands_of_the_page_do_what_it_says(tour_page: ModuleType, tmp_path: Path):
     page = tour_page.PAGE.read_text(encoding="utf-8")
     found, folder = tour_page.blocks(page), tour_page.checkout(tmp_path)
     assert len(found) == page.count("```bash")
@@ -45,24 +45,24 @@ OUTPUT = "cam0 turned by 0.21 deg, 1.8 sigma\nWarning: residuals 3.3 times\n  as
         (("residuals 3.3 as",), "residuals 3.3 as"),
     ],
 )
-def test_the_check_finds_what_is_not_so(pieces: tuple[str, ...], missing: str):
+def test_the_check_finds_what_is_not_so(tour_page: ModuleType, pieces: tuple[str, ...], missing: str):
     assert tour_page.says(OUTPUT, pieces) == missing
 
 
-def test_blocks_are_read_with_their_exit_codes_and_output():
+def test_blocks_are_read_with_their_exit_codes_and_output(tour_page: ModuleType):
     page = "<!-- exits 1 -->\n```bash\nfalse\n```\n\n```text\na\n...\nb\n```\n\n```bash\ntrue\n```\n\ntext\n"
     Block = tour_page.Block
     assert tour_page.blocks(page) == [Block("false\n", 1, "a\n...\nb\n"), Block("true\n", 0, "")]
     assert tour_page.blocks(page)[0].pieces == ("a\n", "\nb\n")
 
 
-def test_every_figure_is_there_and_small():
+def test_every_figure_is_there_and_small(tour_page: ModuleType):
     figures = re.findall(r"!\[.*?\]\((tour/.*?)\)", tour_page.PAGE.read_text(encoding="utf-8"))
     assert sorted(figures) == sorted(f"tour/{p.name}" for p in (tour_page.PAGE.parent / "tour").iterdir())
     assert all((tour_page.PAGE.parent / figure).stat().st_size < 150_000 for figure in figures)
 
 
-def test_numbers_of_the_page_are_brought_up_to_date():
+def test_numbers_of_the_page_are_brought_up_to_date(tour_page: ModuleType):
     text = "cam0 turned by  0.25 deg,\n1.9 sigma\n...\nresiduals 3 times as\nlarge (7)\n"
     expected = "cam0 turned by  0.21 deg,\n1.8 sigma\n...\nresiduals 3.3 times as\nlarge (929)\n"
     assert tour_page.refreshed(text, OUTPUT) == expected

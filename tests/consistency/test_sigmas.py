@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-from pathlib import Path
+from collections.abc import Callable
 from types import ModuleType
 
 import pytest
 
-PROGRAM = Path(__file__).parents[2] / "benchmarks" / "nees.py"
 FIRST_SEED = 1000
 
 
 @pytest.fixture(scope="module")
-def program() -> ModuleType:
+def program(benchmark_program: Callable[[str], ModuleType]) -> ModuleType:
     """It makes as many rounds of the same as one likes, with other seeds."""
-    spec = importlib.util.spec_from_file_location("nees_of_short_recordings", PROGRAM)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
+    return benchmark_program("nees")
 
 
 @pytest.mark.parametrize("name", ["board", "tracks", "drive", "poses"])
