@@ -24,6 +24,11 @@ def seconds_since(stamps_ns: np.ndarray, origin_ns: int) -> np.ndarray:
     return (stamps_ns - np.int64(origin_ns)).astype(np.float64) * 1e-9
 
 
+def which_image(file: str, stamp_ns: int) -> str:
+    """Tells an image from others of its stream, in sentences: by its file, or else by its stamp."""
+    return file or f"at {stamp_ns} ns"
+
+
 @dataclass(frozen=True)
 class ImuStream:
     """Readings of one IMU.
@@ -99,8 +104,8 @@ class CornerStream:
         return CornerStream(self.name, stamps_ns, start, point, uv, sigma=sigma, edges=edges, files=files)
 
     def which(self, stamp_ns: int) -> str:
-        """Tells the image with this stamp from others, in sentences: by its file, or else by its stamp."""
-        return self.files.get(stamp_ns) or f"at {stamp_ns} ns"
+        """Tells the image with this stamp from others, in sentences."""
+        return which_image(self.files.get(stamp_ns, ""), stamp_ns)
 
     @property
     def relative_sigma(self) -> np.ndarray:
@@ -153,6 +158,10 @@ class TrackStream:
         _check_groups(self.name, self.stamps_ns, self.start, "observations", counts)
         _check(self.feature.dtype == np.int64, f"{self.name}: feature must be int64.")
         _check(self.uv.shape[1:] == (2,), f"{self.name}: uv must have shape (N, 2), not {self.uv.shape}.")
+
+    def which(self, stamp_ns: int) -> str:
+        """Tells the image with this stamp from others, in sentences."""
+        return which_image("", stamp_ns)
 
     @property
     def origin_ns(self) -> int:

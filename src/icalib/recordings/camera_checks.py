@@ -57,8 +57,7 @@ def outside_note(
     where they are too many to be single bad ones."""
     first, count = int(np.argmin(inside)), int((~inside).sum())
     (u, v), (width, height) = stream.uv[first], resolution
-    stamp_ns = int(stream.stamps_ns[stream.image[first]])
-    which = stream.which(stamp_ns) if isinstance(stream, CornerStream) else f"at {stamp_ns} ns"
+    which = stream.which(int(stream.stamps_ns[stream.image[first]]))
     words = f"{thing} lies at ({u:.1f}, {v:.1f}), outside the image of {width} x {height} px"
     told = f"{what}: in the image {which}, {words}"
     if count > _MOST_OUTSIDE * len(inside):

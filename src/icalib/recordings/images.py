@@ -12,6 +12,7 @@ import numpy as np
 
 from icalib.errors import RecordingError
 from icalib.extras import load_cv2
+from icalib.measurements import which_image
 
 NO_PICTURE = "unknown"  # the encoding of a file that is no image
 FILE_FORMATS = ("jpeg", "png", "bmp", "tiff", "pnm", "webp")  # all that OpenCV decodes
@@ -54,7 +55,7 @@ class Payload:
     @property
     def which(self) -> str:
         """Tells the image from others of its stream, in sentences."""
-        return self.name or f"at {self.stamp_ns} ns"
+        return which_image(self.name, self.stamp_ns)
 
 
 def decode(payload: Payload) -> np.ndarray:
