@@ -9,6 +9,7 @@ import numpy as np
 
 from icalib.detection.corners import INCONSISTENT, ImageCorners, no_corners
 from icalib.detection.crossings import continues_beyond, shows_grid
+from icalib.detection.decoding import nearest_greys
 from icalib.detection.prediction import PredictedCorners, predict_nodes
 from icalib.detection.quads import View
 from icalib.detection.squares import square_corners
@@ -149,8 +150,7 @@ def _turn(grid: np.ndarray) -> float:
 def _is_dark(image: np.ndarray, grid: np.ndarray) -> bool:
     """Whether the square between the first corners of the first two rows is darker than its neighbours."""
     center = 0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])
-    u, v = np.round(center).astype(np.int64).transpose(2, 0, 1)
-    grey = image[v.clip(0, image.shape[0] - 1), u.clip(0, image.shape[1] - 1)].astype(np.float64)
+    grey = nearest_greys(image, center)
     even = np.indices(grey.shape).sum(axis=0) % 2 == 0
     return bool(grey[even].mean() < grey[~even].mean())
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.detection.decoding import mapped
+from icalib.detection.decoding import mapped, nearest_greys
 from icalib.detection.ellipse_model import LEAST_HALF_AXIS_PX
 from icalib.detection.growth import fit_homography
 from icalib.detection.tags import LEAST_CONTRAST
@@ -74,15 +74,9 @@ def _on_white(image: np.ndarray, found: Ellipses, step: float) -> Ellipses:
     angle = 2.0 * np.pi * np.arange(_AROUND) / _AROUND
     to_edge = np.linalg.inv(found.unit) @ np.stack([np.cos(angle), np.sin(angle)])  # (m, 2, directions)
     outside = to_edge * np.minimum(1.0 + _OUTSIDE_PX / np.linalg.norm(to_edge, axis=1, keepdims=True), 0.5 * step)
-    around = _grey(image, found.centre[:, None] + outside.swapaxes(1, 2))
-    keep = (around - _grey(image, found.centre)[:, None] >= LEAST_CONTRAST).all(axis=1)
+    around = nearest_greys(image, found.centre[:, None] + outside.swapaxes(1, 2))
+    keep = (around - nearest_greys(image, found.centre)[:, None] >= LEAST_CONTRAST).all(axis=1)
     return Ellipses(found.centre[keep], found.unit[keep])
-
-
-def _grey(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Of the pixels nearest to uv (..., 2) px, or the image's border."""
-    u, v = np.moveaxis(np.rint(uv).astype(np.int64), -1, 0)
-    return image[v.clip(0, image.shape[0] - 1), u.clip(0, image.shape[1] - 1)].astype(np.float64)
 
 
 def find_grids(target: Circles, found: Ellipses) -> list[np.ndarray]:

@@ -55,6 +55,12 @@ def bilinear(image, u, v):
     return (1.0 - b) * top + b * low
 
 
+def nearest_greys(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """(...) float64: grey levels of the image (h, w) in the pixels nearest to uv (..., 2) px, or its border's."""
+    u, v = np.moveaxis(np.rint(uv).astype(np.int64), -1, 0)
+    return image[v.clip(0, image.shape[0] - 1), u.clip(0, image.shape[1] - 1)].astype(np.float64)
+
+
 @njit(cache=True, nogil=True)
 def unit_homography(quad):
     """(3, 3) H from the unit square (0,0), (1,0), (1,1), (0,1) to the quad (4, 2)."""
