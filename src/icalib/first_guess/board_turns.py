@@ -127,7 +127,7 @@ def _chosen_turns(rig: Rig, measured: Measurements, views: list[_Views], turns: 
     across its gaps, or unchanged where there is none.
     """
     imu = imu_data(rig, measured)
-    seen = [k for k, own in enumerate(views) if own.poses.ok.any()]
+    seen = sorted((k for k, v in enumerate(views) if v.poses.ok.any()), key=lambda k: -views[k].poses.ok.sum())
     gyro = None
     if imu is None:
         mounts = _mounts_beside(measured, views, seen, turns)
@@ -173,9 +173,10 @@ def _turned(gyro: GyroRotation | None, t: np.ndarray) -> tuple[np.ndarray, np.nd
 def _mounts_by_imu(
     imu: ImuData, measured: Measurements, views: list[_Views], seen: list[int]
 ) -> tuple[dict[int, _Mount], GyroRotation | None]:
-    """Of the cameras `seen` that turn as the IMU does, and how that turned, without the bias that most images show."""
+    """Of the cameras `seen`, those with most poses first, that turn as the IMU does; and how that turned, without the
+    bias that the first shows."""
     aligned = {}
-    for k in sorted(seen, key=lambda k: -views[k].poses.ok.sum()):
+    for k in seen:
         own = views[k]
         with suppress(EstimationError):
             aligned[k] = align_camera(own.camera, own.images, camera_rates(own.images, own.poses), imu, measured)
@@ -185,21 +186,17 @@ def _mounts_by_imu(
 
 
 def _mounts_beside(measured: Measurements, views: list[_Views], seen: list[int], turns: _Turns) -> dict[int, _Mount]:
-    """Of the cameras `seen` that images taken together tie to the one with most images, which is the body. None where
-    there is no other: a camera alone does not show how the target turned between its images."""
+    """Of the cameras `seen` that images taken together tie to the first, which is the body. None where there is no
+    other: a camera alone does not show how the target turned between its images."""
     given = [own.camera.time_offset.value for own in views]
     offsets = [
         relative_offset(np.zeros(1) if g is None else g, own.images, measured)
         for g, own in zip(given, views, strict=True)
     ]
-    order = sorted(seen, key=lambda k: -views[k].poses.ok.sum())
-    found = {k: np.eye(3) for k in order[:1]}
-    while len(found) < len(order):
+    found = {k: np.eye(3) for k in seen[:1]}
+    while len(found) < len(seen):
         pairs = {
-            (a, b): _together(views[a], offsets[a], views[b], offsets[b])
-            for a in found
-            for b in order
-            if b not in found
+            (a, b): _together(views[a], offsets[a], views[b], offsets[b]) for a in found for b in seen if b not in found
         }
         (a, b), together = max(pairs.items(), key=lambda item: len(item[1]))
         if not len(together):

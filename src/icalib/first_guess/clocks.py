@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
 
 import numpy as np
 
@@ -82,31 +81,29 @@ def align(imu: ImuData, name: str, rates: CameraRates, given_offset: float | Non
     _check_motion(imu, name, rates)
     keep = given_offset is not None
     best, *others = likely_offsets(imu, name, rates) if given_offset is None else [given_offset]
-    first = _align_near(imu, name, rates, best, keep)
-    tried = (_align_near(imu, name, rates, x, keep) for x in others if _covered(imu, rates, x).any())
+    offsets = [best, *(x for x in others if _covered(imu, rates, x).any())]
     # In a short recording the sizes of the rates may be more alike elsewhere, but not their directions.
-    (alike, found), averaged = _alike(imu, chain([first], tried))
+    (alike, found), averaged = _alike(imu, [_align_near(imu, name, rates, x, keep) for x in offsets])
     refuse_steps(imu, name, alike, found.offset, lambda part, offset: _left_at(imu, part, found, offset))
     _check_offset(imu, name, _unexplained(imu, alike, found, averaged), keep)
     _check_scale(imu, name, rates, found, averaged)
     return found
 
 
-def _alike(imu: ImuData, tried: Iterable[tuple[CameraRates, Alignment]]) -> tuple[tuple[CameraRates, Alignment], float]:
+def _alike(imu: ImuData, tried: Sequence[tuple[CameraRates, Alignment]]) -> tuple[tuple[CameraRates, Alignment], float]:
     """The first at which the two turn alike, but a later one where they turn far more alike, and over how long; or if
     they do nowhere the very first. Over LONGER_S what is noise shrinks with the root of that at least, another motion
     does not."""
-    known = list(tried)
-    left = [_unexplained(imu, *one) for one in known]
+    left = [_unexplained(imu, *one) for one in tried]
     alike = [k for k, share in enumerate(left) if share <= LARGEST_UNEXPLAINED]
     if alike:
         best = int(np.argmin(left))
-        return known[best if left[best] < CLEARLY_BETTER * left[alike[0]] else alike[0]], AVERAGED_S
-    for one in known:
+        return tried[best if left[best] < CLEARLY_BETTER * left[alike[0]] else alike[0]], AVERAGED_S
+    for one in tried:
         share = min(LARGEST_UNEXPLAINED, np.sqrt(AVERAGED_S / LONGER_S) * _unexplained(imu, *one))
         if _unexplained(imu, *one, LONGER_S) <= share:
             return one, LONGER_S
-    return known[0], AVERAGED_S
+    return tried[0], AVERAGED_S
 
 
 def _align_near(
