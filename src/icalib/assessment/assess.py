@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtr, stdtrit
@@ -84,25 +85,12 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
     held = held_out(parts, [s for s in (inputs.rig.body,) if _is_assumed(inputs, s)])
     timeline = Timeline.of(inputs.parts, image_times(inputs, outcome.state.values))
     factors = _factors(inputs, groups)
-    size = felt_size(found, factors.max(initial=1.0))
-    wrong_size, size_notes = ((), ()) if against else size_words(inputs, size)
-    mixed = tuple(mixed_up(inputs.rig.cameras, groups))
+    stated = _about_stated(found, groups, judged, factors.max(initial=1.0), inputs, against)
     trajectory, poses = _trajectory(inputs, outcome.state, timeline), pose_residuals(inputs, found, timeline)
-    # What others complain of may come of a wrong size, or of an accelerometer's scale: then that is the news.
-    certain, explained = is_certain(size), bool(against)
-    stated, factor = None if explained else relaxed(inputs, found), factors.max(initial=1.0)
-    lenses = () if certain else other_lens(inputs.rig.cameras, lens_steps(inputs, stated), factor)
-    against = against or contradictions(inputs, stated, max(factor, _misfit(judged)))
-    if certain:  # a wrong size moves lever arms by some of their length
-        against = tuple(c for c in against if worst_off(c.key[1], c.off) > 1.0)
-    beyond = () if wrong_size or explained else far_beyond(inputs.rig, judged)
-    contradicted = tuple(stated_warnings(inputs, against, groups))
-    known = (*contradicted, *wrong_size) if certain or explained else ()
-    wrong = (*known, *mixed, *lenses, *beyond)
     warnings = (
-        *wrong_size,
-        *contradicted,
-        *_warnings(inputs, found, groups, [f for f in judged if not explained or f.kind in SEEN], poses),
+        *stated.size,
+        *stated.contradicted,
+        *_warnings(inputs, found, groups, [f for f in judged if not against or f.kind in SEEN], poses),
         *_factor_warnings(factors, parts is not None, held),
     )
     return Calibration(
@@ -117,11 +105,11 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
         iterations=tuple(Iteration(n, s.cost, s.predicted_decrease, s.damping, s.accepted) for n, s in found.steps),
         converged=outcome.converged,
         status=outcome.status,
-        warnings=(*wrong, *(w for w in warnings if w not in wrong)),
+        warnings=(*stated.wrong, *(w for w in warnings if w not in stated.wrong)),
         notes=(
             *notes(inputs, found, timeline),
             *guess_notes(inputs, groups),
-            *size_notes,
+            *stated.size_notes,
             *few_parts_notes(inputs, parts),
         ),
         rig=rig_to_dict(inputs.asked or inputs.rig),
@@ -135,8 +123,43 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
         pose_residuals=poses,
         track_residuals=track_residuals(found, timeline),
         held_out=held,
-        wrong=wrong,
+        wrong=stated.wrong,
     )
+
+
+class _AboutStated(NamedTuple):
+    """Sentences on what the rig file states. wrong: what says that a result is not to be used; warnings of the target's
+    size, and of what is contradicted; size_notes."""
+
+    wrong: tuple[str, ...]
+    size: tuple[str, ...]
+    contradicted: tuple[str, ...]
+    size_notes: tuple[str, ...]
+
+
+def _about_stated(
+    found: Estimate,
+    groups: tuple[ParameterGroup, ...],
+    judged: Sequence[SensorFit],
+    factor: float,
+    inputs: Inputs,
+    against: Sequence[Contradiction],
+) -> _AboutStated:
+    """factor: times which formal standard deviations count; against: as of `assess`."""
+    size = felt_size(found, factor)
+    wrong_size, size_notes = ((), ()) if against else size_words(inputs, size)
+    mixed = mixed_up(inputs.rig.cameras, groups)
+    # What others complain of may come of a wrong size, or of an accelerometer's scale: then that is the news.
+    certain, explained = is_certain(size), bool(against)
+    stated = None if explained else relaxed(inputs, found)
+    lenses = () if certain else other_lens(inputs.rig.cameras, lens_steps(inputs, stated), factor)
+    against = against or contradictions(inputs, stated, max(factor, _misfit(judged)))
+    if certain:  # a wrong size moves lever arms by some of their length
+        against = tuple(c for c in against if worst_off(c.key[1], c.off) > 1.0)
+    beyond = () if wrong_size or explained else far_beyond(inputs.rig, judged)
+    contradicted = tuple(stated_warnings(inputs, against, groups))
+    known = (*contradicted, *wrong_size) if certain or explained else ()
+    return _AboutStated((*known, *mixed, *lenses, *beyond), wrong_size, contradicted, size_notes)
 
 
 def _misfit(judged: Iterable[SensorFit]) -> float:
