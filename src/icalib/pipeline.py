@@ -14,13 +14,14 @@ from threadpoolctl import threadpool_limits
 from icalib.assessment import assess, stated_words, visited
 from icalib.calibration import Calibration, Visited
 from icalib.detection.streams import find_corners
+from icalib.detection.tracking.streams import find_tracks
 from icalib.errors import EstimationError, RecordingError
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.outcome import Visit
 from icalib.estimation.pages import give_back, keep_apart
 from icalib.estimation.problem import Problem
 from icalib.first_guess.attempts import attempt
-from icalib.measurements import CornerStream, Measurements
+from icalib.measurements import CornerStream, Measurements, TrackStream
 from icalib.provenance import provenance
 from icalib.recordings import Recording, read_measurements
 from icalib.recordings.reading import without_jumps
@@ -58,6 +59,7 @@ def calibrate(
         one.use_layouts(rig.poses)
     seeing = rig.cameras if rig.has_target else ()
     pictured = any(not r.has_corners(c) for r in opened.values() for c in seeing)
+    pictured = pictured or any(c.tracks_images for c in rig.cameras)
     share = IMAGES_SHARE if pictured else READING_SHARE
     measurements = []
     for k, (name, one) in enumerate(opened.items()):
@@ -79,18 +81,22 @@ def calibrate(
 
 
 def _measure(rig: Rig, recording: Recording, progress: Progress) -> Measurements:
-    """What the recording holds of each sensor; corners are found in images where it holds these."""
+    """What the recording holds of each sensor; corners and feature tracks are found in images where it holds these."""
     names = [c.name for c in rig.cameras]
     progress("reading", 0.0)
 
-    def find(recording: Recording, camera: Camera) -> tuple[CornerStream, tuple[str, ...]]:
-        def show(done: float) -> None:
-            share = (names.index(camera.name) + done) / len(names)
-            progress(f"finding the target in the images of {camera.name}", share)
+    def showing(what: str, camera: Camera) -> Callable[[float], None]:
+        stage = f"{what} in the images of {camera.name}"
+        return lambda done: progress(stage, (names.index(camera.name) + done) / len(names))
 
+    def find(recording: Recording, camera: Camera) -> tuple[CornerStream, tuple[str, ...]]:
+        show = showing("finding the target", camera)
         return find_corners(recording, camera, rig.target, rig.settings.keep_corners, show)
 
-    return read_measurements(recording, rig, find)
+    def follow(recording: Recording, camera: Camera) -> tuple[TrackStream, tuple[str, ...]]:
+        return find_tracks(recording, camera, rig.settings.keep_corners, showing("tracking features", camera))
+
+    return read_measurements(recording, rig, find, follow)
 
 
 def calibrate_measurements(

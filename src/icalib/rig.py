@@ -98,6 +98,9 @@ class ImuSensor:
     layout: TableLayout = PLAIN_TABLE
 
 
+TRACK_IMAGES = "images"  # `tracks` of a camera whose feature tracks are found in its images
+
+
 @dataclass(frozen=True)
 class Camera:
     """One camera. Intrinsics are (fx, fy, cx, cy) in pixels, distortion the model's coefficients."""
@@ -115,9 +118,14 @@ class Camera:
     distortion: Parameter = Parameter()
     bloom: Parameter = Parameter()
     topic: str | None = None  # of its images; None: the one with the camera's name, or the only one
-    tracks: str | None = None  # path of the table of tracks, where it has one
+    tracks: str | None = None  # path of a table of feature tracks, or TRACK_IMAGES
     track_noise_px: float | None = None  # None: estimated from the residuals
     layout: TableLayout = PLAIN_TABLE  # of its table of tracks, or without one of corners
+
+    @property
+    def tracks_images(self) -> bool:
+        """Whether its feature tracks are found in its images."""
+        return self.tracks == TRACK_IMAGES
 
 
 PointTime = Literal["auto", "start", "end", "azimuth", "snapshot"]

@@ -28,6 +28,7 @@ from icalib.estimation.problem import Problem
 from icalib.estimation.state import NODE, Layout, State, make_layout
 from icalib.estimation.surfaces import OnPlanes, Surfaces
 from icalib.estimation.tolerances import Tolerances
+from icalib.estimation.tracks import TrackNoise
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.planes import plane_of
 from icalib.geometry.targets import AprilGrid
@@ -201,17 +202,20 @@ def make_factor(setup: Setup, camera: int, scheme: str = "inertial", **changes) 
 def make_features(
     setup: Setup, scheme: str = "inertial", loss: tuple[str, float] = ("none", 2.5), noise_px: float = 0.0
 ) -> FeatureFactor:
-    """The corners of both cameras as features of unknown position, sigma 0.8 and 1.1 px; of every third image of the
-    first camera some are not in use."""
+    """The corners of both cameras as features of unknown position, sigma 0.8 and 1.1 px, that of the second camera
+    growing with the number of views; of every third image of the first camera some are not in use."""
     rng = np.random.default_rng(11)
     streams = tuple(
         TrackStream(s.name, s.stamps_ns, s.start, s.point, s.uv + noise_px * rng.normal(size=s.uv.shape))
         for s in setup.streams
     )
+    views = rng.integers(0, 20, len(streams[1].uv))
+    streams = (streams[0], replace(streams[1], views=views))
     cameras = tuple(make_factor(setup, i, scheme) for i in range(len(streams)))
     keep = [rng.random(len(s.uv)) < 0.9 for s in streams]
     cuts = tuple(p.first for p in make_pieces(len(setup.state.seconds), 0)[1:])
-    return FeatureFactor.build(cameras, streams, (0.8, 1.1), tuple(keep), loss, setup.state, cuts)
+    noise = (TrackNoise(0.8), TrackNoise(1.1, 0.3))
+    return FeatureFactor.build(cameras, streams, noise, tuple(keep), loss, setup.state, cuts)
 
 
 def make_features_on_planes(setup: Setup, *arguments, **options) -> tuple[Setup, FeatureFactor]:

@@ -224,7 +224,7 @@ def feature_sample(
     def weights(at):
         e, d = errors(at, world), off(at, world)
         root = np.concatenate([r[u] for r, u in zip(at_optimum.root, used, strict=True)])
-        sigma = np.repeat(factor.sigma, [u.sum() for u in used])
+        sigma = np.concatenate([s[u] for s, u in zip(factor.sigmas, used, strict=True)])
         size = np.linalg.norm(e, axis=1)
         bend = slope_along(loss if curved else "none", size / sigma)
         W = np.zeros((len(e), 2, len(e), 2))

@@ -71,10 +71,10 @@ def test_coarse_noise_is_as_large_as_most_errors_and_no_less_than_stated(factor,
     streams = list(factor.streams)
     streams[noisy] = replace(stream, uv=stream.uv + errors)
     _, out = outcome(factor, setup.state)
-    found = replace(factor.settled(out), streams=tuple(streams)).coarse(setup.state).sigma
+    found = replace(factor.settled(out), streams=tuple(streams)).coarse(setup.state).noise
     n = int((factor.tracks.track[noisy] >= 0).sum())
-    assert found[noisy] == pytest.approx(sigma, rel=3.0 / np.sqrt(n))
-    assert [s for i, s in enumerate(found) if i != noisy] == [s for i, s in enumerate(factor.sigma) if i != noisy]
+    assert found[noisy].sigma == pytest.approx(sigma, rel=3.0 / np.sqrt(n))
+    assert [s for i, s in enumerate(found) if i != noisy] == [s for i, s in enumerate(factor.noise) if i != noisy]
 
 
 def test_none_is_followed_where_every_other_image_looks_away(factor, setup):

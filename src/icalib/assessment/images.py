@@ -36,9 +36,8 @@ def track_residuals(found: Estimate, timeline: Timeline) -> tuple[TrackResiduals
         own = np.linalg.norm(left.points[factor.tracks.camera == i], axis=1)
         out.append(
             TrackResiduals(
-                camera.name, factor.sigma[i], float(np.median(own)) if len(own) else None,
-                _seconds(found, timeline, i), stream.start, stream.feature, stream.uv, residual,
-                ~factor.keep[i],
+                camera.name, float(np.median(own)) if len(own) else None, _seconds(found, timeline, i), stream.start,
+                stream.feature, stream.uv, residual, factor.sigmas[i].astype(np.float32), ~factor.keep[i],
             )
         )  # fmt: skip
     return tuple(out)

@@ -20,6 +20,7 @@ from icalib.estimation.nodes import usable
 from icalib.timeline import Timeline
 
 MOST_NAMED = 10  # images
+GROWN_VIEWS = 10  # after which the noise of tracks is told once more
 
 
 def notes(inputs: Inputs, found: Estimate, timeline: Timeline) -> Iterator[str]:
@@ -68,9 +69,13 @@ def _feature_notes(found: Estimate):
             f"{len(plane)} of the tracks lie on {len(np.unique(plane))} planes that LiDARs see, to within "
             f"{1e3 * factor.surfaces.noise:.1f} mm, as the rig file has it."
         )
-    for camera, sigma, root, stream in zip(factor.cameras, factor.sigma, out.root, factor.streams, strict=True):
+    for camera, noise, root, stream in zip(factor.cameras, factor.noise, out.root, factor.streams, strict=True):
         share = f"{int((root > 0.0).sum())} of {len(stream.uv)}"
-        yield f"{camera.name}: track noise {sigma:.3f} px; {share} observations of tracks are in use."
+        grows = ""
+        if noise.growth > 0.0:
+            last = float(noise.sigma * np.sqrt(1.0 + noise.growth * GROWN_VIEWS))
+            grows = f" in the first view, {last:.3f} px after {GROWN_VIEWS} more"
+        yield f"{camera.name}: track noise {noise.sigma:.3f} px{grows}; {share} observations of tracks are in use."
 
 
 def _imu_notes(inputs: Inputs, imu: ImuData, found: Estimate, timeline: Timeline):

@@ -40,20 +40,20 @@ class TrackResiduals:
     each point being where all its images want it. What is not in use has none, NaN: observations that were rejected,
     and tracks that are too short, whose point is uncertain, or that fit far worse than most.
 
-    sigma: px, standard deviation that each observation was given. distance: m, median of the points in use from the
+    distance: m, median of the points in use from the
     camera; None where there are none.
     """
 
     kind: ClassVar[str] = "observations"
 
     sensor: str
-    sigma: float
     distance: float | None
     seconds: np.ndarray  # (M,) image times, imu clock, s since the first IMU stamp; see RecordingSpan for several
     start: np.ndarray  # (M + 1,) observations of image i are start[i]:start[i+1]
     point: np.ndarray  # (N,) number of the point of the scene, the same in all cameras
     uv: np.ndarray  # (N, 2) measured, px
     residual: np.ndarray  # (N, 2) float32 px
+    sigma: np.ndarray  # (N,) px, standard deviation that the observation was given
     rejected: np.ndarray  # (N,) bool
 
     @property
@@ -64,7 +64,7 @@ class TrackResiduals:
     @property
     def whitened(self) -> np.ndarray:
         """(N, 2) residuals over their standard deviation, NaN where there are none."""
-        return self.residual / self.sigma
+        return self.residual / self.sigma[:, None]
 
 
 ImageResiduals = CornerResiduals | TrackResiduals

@@ -26,7 +26,7 @@ _IMAGES: _Shapes = {
 _ROWS: _Shapes = {"seconds": (_FLOAT, "n"), "residual": (_FLOAT, "n", "labels"), "whitened": (_FLOAT, "n", "labels")}
 _SHAPES: dict[type, _Shapes] = {
     CornerResiduals: _IMAGES | {"sigma": (_FLOAT, "n")},
-    TrackResiduals: _IMAGES,
+    TrackResiduals: _IMAGES | {"sigma": (_FLOAT, "n")},
     WheelResiduals: _ROWS,
     PoseResiduals: _ROWS,
     LidarResiduals: {

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -42,14 +42,10 @@ def stream_key(payloads: Iterable[Payload], settings: str) -> str:
 
 def load_corners(key: str) -> tuple[np.ndarray, list[ImageCorners]] | None:
     """Stamps (M,) and corners of the images under `key`, or None."""
-    try:
-        content = (cache_folder() / f"{key}.npz").read_bytes()
-        arrays = load_arrays(content)
-        start = arrays["start"]
-        if not {"stamps_ns", *_FIELDS} <= arrays.keys():
-            return None
-    except (OSError, ValueError, KeyError):
+    arrays = load_kept(key, ("stamps_ns", "start", *_FIELDS))
+    if arrays is None:
         return None
+    start = arrays["start"]
     images = [
         ImageCorners(*(arrays[name][a:b] for name in _FIELDS)) for a, b in zip(start[:-1], start[1:], strict=True)
     ]
@@ -57,9 +53,23 @@ def load_corners(key: str) -> tuple[np.ndarray, list[ImageCorners]] | None:
 
 
 def keep_corners(key: str, stamps_ns: np.ndarray, images: list[ImageCorners]) -> None:
-    """Keeps what was found under `key`. A folder that cannot be written keeps nothing: the next run looks again."""
+    """Keeps what was found under `key`."""
     arrays: dict[str, Any] = {name: np.concatenate([getattr(i, name) for i in images]) for name in _FIELDS}
     arrays |= {"stamps_ns": stamps_ns, "start": np.concatenate([[0], np.cumsum([len(i.point) for i in images])])}
+    keep_arrays(key, arrays)
+
+
+def load_kept(key: str, names: Iterable[str]) -> dict[str, np.ndarray] | None:
+    """The arrays kept under `key`, `names` among them, or None."""
+    try:
+        arrays = load_arrays((cache_folder() / f"{key}.npz").read_bytes())
+    except (OSError, ValueError, KeyError):
+        return None
+    return dict(arrays) if set(names) <= arrays.keys() else None
+
+
+def keep_arrays(key: str, arrays: Mapping[str, np.ndarray]) -> None:
+    """Keeps arrays under `key`. A folder that cannot be written keeps nothing: the next run looks again."""
     folder = cache_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -6,12 +6,10 @@ nothing is kept under it. Only a few are in memory at a time.
 
 from __future__ import annotations
 
-import os
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 
 import numpy as np
@@ -21,11 +19,18 @@ from icalib.detection.cache import keep_corners, load_corners, stream_key
 from icalib.detection.corners import ImageCorners, corner_stream, packed
 from icalib.detection.detectors import Detector, detector_of
 from icalib.detection.diagnosis import what_is_seen, with_other_border, with_other_layout
+from icalib.detection.image_work import (
+    Progress,
+    image_count,
+    noting_files,
+    of_resolution,
+    on_all_cores,
+    turns_of,
+)
 from icalib.detection.prediction import MOTION_IMAGES
 from icalib.detection.sightings import parts_of, sightings, without_rare_tags
 from icalib.detection.turns import number_continuously
 from icalib.errors import RecordingError
-from icalib.extras import load_cv2
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Markers, Scene, Target
 from icalib.measurements import CornerStream
 from icalib.recordings import DamagedImageError, Payload, Recording, decode
@@ -39,7 +44,6 @@ POOR_SHARE, POOR_CORNERS = 0.5, 8
 # which wait in memory. Turns do not depend on the number of threads, and so neither does what is found.
 IN_TURN, BYTES_IN_TURN = 24, 32 << 20
 PACKED = 256  # images whose corners are put together
-Progress = Callable[[float], None]  # the share of the images that is done, 0 to 1
 
 
 def find_corners(
@@ -54,12 +58,12 @@ def find_corners(
     files: dict[int, str] = {}
 
     def read() -> Iterator[Payload]:
-        return _noting_files(_of_resolution(recording.payloads(topic), camera, where), files)
+        return noting_files(of_resolution(recording.payloads(topic), camera, where), files)
 
     key = stream_key(read(), repr(target)) if keep else ""
     found = load_corners(key) if keep else None
     if found is None:
-        count, payloads = _count(recording, topic), read()
+        count, payloads = image_count(recording, topic), read()
         found = _search(payloads, detector_of(target), where, lambda n: progress(n / max(count, n)))
         if wrong := _other_layout(recording, topic, target, found[1]):
             raise RecordingError(f"{where}: {wrong}")
@@ -142,32 +146,10 @@ def _poorly_seen(part: Target, first: int, images: list[ImageCorners]) -> bool:
 
 def _spread(recording: Recording, topic: str) -> Iterator[np.ndarray]:
     """A few images, spread over the recording."""
-    every = max(_count(recording, topic) // DIAGNOSED, 1)
+    every = max(image_count(recording, topic) // DIAGNOSED, 1)
     for payload in islice(recording.payloads(topic), 0, None, every):
         with suppress(DamagedImageError):
             yield decode(payload)
-
-
-def _count(recording: Recording, topic: str) -> int:
-    """How many images there are about; 0 where that is not known."""
-    return next((t.count for t in recording.topics() if t.name == topic), 0)
-
-
-def _of_resolution(payloads: Iterable[Payload], camera: Camera, where: str) -> Iterator[Payload]:
-    for p in payloads:
-        if p.width and (p.width, p.height) != camera.resolution:
-            raise RecordingError(
-                f"{where}: images have {p.width} x {p.height} px, but {camera.name} {camera.resolution[0]} x "
-                f"{camera.resolution[1]}; correct its resolution in the rig file."
-            )
-        yield p
-
-
-def _noting_files(payloads: Iterable[Payload], files: dict[int, str]) -> Iterator[Payload]:
-    """The payloads; `files` gets the name of each by its stamp, "" of those that are no file."""
-    for p in payloads:
-        files[p.stamp_ns] = p.name
-        yield p
 
 
 def _search(
@@ -177,40 +159,18 @@ def _search(
     stamps: list[int] = []
     images: list[ImageCorners] = []
     damaged = ""
-    with _one_thread_in_opencv(), _pool() as pool:
-        waiting: deque[Future[tuple[list[int], list[ImageCorners], str]]] = deque()
-
-        def take() -> str:
-            own, found, error = waiting.popleft().result()
-            for stamp, one in zip(own, found, strict=True):
-                stamps.append(stamp)
-                images.append(one)
-                if len(images) % PACKED == 0:
-                    images[-PACKED:] = packed(images[-PACKED:])
-            done(len(images))
-            return error
-
-        for turn in _turns(payloads):
-            waiting.append(pool.submit(_in_turn, turn, detector))
-            if len(waiting) > _workers():
-                damaged = take() or damaged
-        while waiting:
-            damaged = take() or damaged
+    turns = turns_of(payloads, IN_TURN, BYTES_IN_TURN)
+    for own, found, error in on_all_cores(turns, partial(_in_turn, detector=detector)):
+        for stamp, one in zip(own, found, strict=True):
+            stamps.append(stamp)
+            images.append(one)
+            if len(images) % PACKED == 0:
+                images[-PACKED:] = packed(images[-PACKED:])
+        done(len(images))
+        damaged = error or damaged
     if not images:
         raise RecordingError(damaged or f"{where}: there are no images; check that the camera was running.")
     return np.array(stamps, dtype=np.int64), images
-
-
-def _turns(payloads: Iterable[Payload]) -> Iterator[list[Payload]]:
-    """Images that are searched in turn."""
-    turn: list[Payload] = []
-    for p in payloads:
-        turn.append(p)
-        if len(turn) == IN_TURN or sum(len(one.data) for one in turn) >= BYTES_IN_TURN:
-            yield turn
-            turn = []
-    if turn:
-        yield turn
 
 
 def _in_turn(payloads: list[Payload], detector: Detector) -> tuple[list[int], list[ImageCorners], str]:
@@ -227,29 +187,3 @@ def _in_turn(payloads: list[Payload], detector: Detector) -> tuple[list[int], li
         stamps.append(p.stamp_ns)
         found.append(detector.detect(image, found[-MOTION_IMAGES:]))
     return stamps, found, damaged
-
-
-def _workers() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-@contextmanager
-def _pool() -> Iterator[ThreadPoolExecutor]:
-    """Threads: OpenCV and compiled code let each other run. When interrupted, what has not begun is dropped."""
-    pool = ThreadPoolExecutor(_workers(), thread_name_prefix="icalib-images")
-    try:
-        yield pool
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-
-
-@contextmanager
-def _one_thread_in_opencv() -> Iterator[None]:
-    """Threads of OpenCV's own beside ours get into each other's way."""
-    cv2 = load_cv2()
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(before)

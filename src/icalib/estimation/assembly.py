@@ -32,6 +32,7 @@ from icalib.estimation.sensors import SensorFactor
 from icalib.estimation.state import Key, Layout, State
 from icalib.estimation.surfaces import Surfaces
 from icalib.estimation.tolerances import distortion_scales
+from icalib.estimation.tracks import TrackNoise
 from icalib.geometry.cameras import camera_model
 from icalib.rig import Camera, ImuSensor, Parameter, Rig, Scheme
 
@@ -136,9 +137,9 @@ def _hosts(rig: Rig) -> str:
 
 @dataclass(frozen=True)
 class Following:
-    """Of tracks, by camera: sigma px, and keep (N,), observations in use. cut: whether tracks are cut short."""
+    """Of tracks, by camera: their noise, and keep (N,), observations in use. cut: whether tracks are cut short."""
 
-    sigma: tuple[float, ...]
+    noise: tuple[TrackNoise, ...]
     keep: tuple[np.ndarray, ...]
     cut: bool = False
 
@@ -210,7 +211,7 @@ def _features(inputs: Inputs, state: State, cameras: tuple[CornerFactor, ...], f
     if following.cut:
         cuts = (*cuts, *(int(k) + 1 for k in np.flatnonzero(np.diff(np.floor(state.seconds / CUT_S)))))
     surfaces = _surfaces(inputs, state, following.cut)
-    factor = FeatureFactor.build(cameras, streams, following.sigma, keep, loss, state, cuts, seams, surfaces)
+    factor = FeatureFactor.build(cameras, streams, following.noise, keep, loss, state, cuts, seams, surfaces)
     return factor.coarse(state) if following.cut else factor
 
 

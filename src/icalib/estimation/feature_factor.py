@@ -44,7 +44,7 @@ from icalib.estimation.surfaces import (
     add_planes_to_points,
     add_points_on_planes,
 )
-from icalib.estimation.tracks import NO_TRACKS, Sightings, Tracks
+from icalib.estimation.tracks import NO_TRACKS, Sightings, TrackNoise, Tracks
 from icalib.measurements import TrackStream
 
 MOST_STEPS = 20  # of a point; most settle in three
@@ -67,13 +67,13 @@ class FeatureOutput:
 
 @dataclass(frozen=True)
 class FeatureFactor:
-    """All features of all cameras. cameras: their poses and models; streams: one per camera, on its images; sigma: px,
-    by camera; keep: (N,) by camera, observations in use; seams: nodes at which further recordings begin; surfaces:
-    planes that points may lie on, and which tracks are on them."""
+    """All features of all cameras. cameras: their poses and models; streams: one per camera, on its images; noise: of
+    each camera's observations; keep: (N,) by camera, observations in use; seams: nodes at which further recordings
+    begin; surfaces: planes that points may lie on, and which tracks are on them."""
 
     cameras: tuple[CornerFactor, ...]
     streams: tuple[TrackStream, ...]
-    sigma: tuple[float, ...]
+    noise: tuple[TrackNoise, ...]
     keep: tuple[np.ndarray, ...]
     loss: str
     loss_scale: float
@@ -88,7 +88,7 @@ class FeatureFactor:
         cls,
         cameras: tuple[CornerFactor, ...],
         streams: tuple[TrackStream, ...],
-        sigma: tuple[float, ...],
+        noise: tuple[TrackNoise, ...],
         keep: tuple[np.ndarray, ...],
         loss: tuple[str, float],
         state: State,
@@ -97,8 +97,13 @@ class FeatureFactor:
         surfaces: Surfaces | None = None,
     ) -> FeatureFactor:
         """Tracks chosen, and points first looked for, with the poses of `state`; the chain is cut at nodes `cuts`."""
-        factor = cls(cameras, streams, sigma, keep, loss[0], loss[1], NO_TRACKS, cameras[0].layout, seams, surfaces)
+        factor = cls(cameras, streams, noise, keep, loss[0], loss[1], NO_TRACKS, cameras[0].layout, seams, surfaces)
         return factor.cut(state, cuts)
+
+    @cached_property
+    def sigmas(self) -> tuple[np.ndarray, ...]:
+        """(N,) px, by camera: of each observation, per axis."""
+        return tuple(noise.of(stream) for noise, stream in zip(self.noise, self.streams, strict=True))
 
     @property
     def n_nodes(self) -> int:
@@ -156,14 +161,15 @@ class FeatureFactor:
         exact, what fits by chance would draw the lens far from its guess, where other tracks are lost."""
         views = self._views(state, 0, self.n_nodes)
         points = self._from_anchors(views, slice(0, self.tracks.count), self.tracks.start)
-        sigma = list(self.sigma)
+        noise = list(self.noise)
         for view in views:
             uv, valid, *_ = view.camera.model.project_with_jacobians(view.params, view.in_camera(points, 0))
             used = valid & (view.seen.track >= 0) & view.seen.keep
             if used.any():
                 variance = median_variance(((uv - view.seen.uv)[used] ** 2).sum(axis=1))
-                sigma[view.index] = max(sigma[view.index], float(np.sqrt(variance)))
-        return replace(self, sigma=tuple(sigma))
+                if variance > noise[view.index].sigma ** 2:
+                    noise[view.index] = TrackNoise(float(np.sqrt(variance)))
+        return replace(self, noise=tuple(noise))
 
     def on_planes_of(self, camera: int) -> np.ndarray:
         """Those tracks on planes whose points move with camera number `camera`."""
@@ -224,7 +230,7 @@ class FeatureFactor:
             features.own[:, range(3), range(3)] += WEAK
         total, begin = 0.0, 0
         for view in views:
-            i, weighing = view.index, self._weighing(view.index, curved)
+            i, weighing = view.index, self._weighing(curved)
             lens = self.layout.columns(view.camera.name, "intrinsics", "distortion")
             for part, images in view.chunks():
                 own = slice(begin + images.start, begin + images.stop)
@@ -252,7 +258,7 @@ class FeatureFactor:
         views, base = self._views(state, piece.first, self._stop(piece)), Range(tracks.start, pairs.start)
         points, side = self._from_anchors(views, tracks, at.points[tracks]), piece.features.sums.side
         for view in views:
-            weighing, own = self._weighing(view.index, False), cluster[view.index]
+            weighing, own = self._weighing(False), cluster[view.index]
             lens = self.layout.columns(view.camera.name, "intrinsics", "distortion")
             for part, _ in view.chunks():
                 X = part.in_camera(points, tracks.start)
@@ -297,8 +303,8 @@ class FeatureFactor:
             tuple(len(s.feature) for s in self.streams),
         )
 
-    def _weighing(self, camera: int, curved: bool) -> Weighing:
-        return Weighing(self.sigma[camera], LOSSES[self.loss], self.loss_scale, curved)
+    def _weighing(self, curved: bool) -> Weighing:
+        return Weighing(LOSSES[self.loss], self.loss_scale, curved)
 
     def _views(self, state: State, first: int, stop: int) -> list[View]:
         """What hangs on nodes first..stop."""
@@ -310,7 +316,7 @@ class FeatureFactor:
         poses, R_cw, p_wc = camera.camera_poses(state, i0, i1)
         seen = Seen(
             stream.start[i0 : i1 + 1], stream.uv, self.keep[index], tracks.track[index], tracks.pair[index],
-            camera.node[i0:i1] - first,
+            camera.node[i0:i1] - first, self.sigmas[index],
         )  # fmt: skip
         motion = Motion(
             np.ascontiguousarray(state.values[camera.name, "rotation"]), state.values[camera.name, "translation"],
@@ -342,7 +348,7 @@ class FeatureFactor:
         )  # fmt: skip
         for step in range(MOST_STEPS):
             for view in views:
-                view.add_to_points(tracks.start, self._weighing(view.index, False), points)
+                view.add_to_points(tracks.start, self._weighing(False), points)
             if planes is not None:
                 add_planes_to_points(self.on.of(tracks), planes, self._loss(False), points)
             if take_trials(points, step == 0) == 0:

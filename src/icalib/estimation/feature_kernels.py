@@ -27,7 +27,7 @@ FARTHEST_M, AT_END = 1e5, 1.0 - 1e-6  # of a point from the camera that it moves
 
 class Seen(NamedTuple):
     """What one camera saw: observations of image i are start[i]:start[i + 1]; uv (N, 2), keep (N,), track (N,) -1 where
-    left out; pair (N,) of feature and image (-1: none); node (n,), counted from the piece's first."""
+    left out; pair (N,) of feature and image (-1: none); node (n,), counted from the piece's first; sigma (N,) px."""
 
     start: np.ndarray
     uv: np.ndarray
@@ -35,12 +35,12 @@ class Seen(NamedTuple):
     track: np.ndarray
     pair: np.ndarray
     node: np.ndarray
+    sigma: np.ndarray
 
 
 class Weighing(NamedTuple):
-    """sigma px; the robust loss, where it bends, and whether the sums have its true curvature."""
+    """The robust loss, where it bends, and whether the sums have its true curvature."""
 
-    sigma: float
     loss: int
     scale: float
     curved: bool
@@ -155,9 +155,10 @@ def add_to_points(seen, t0, R_cw, image, which, uv, valid, by_point, weighing, p
             e[r] = uv[m, r] - seen.uv[n, r]
             for k in range(3):
                 J[r, k] = by_point[m, r, 0] * R[0, k] + by_point[m, r, 1] * R[1, k] + by_point[m, r, 2] * R[2, k]
-        square = (e[0] * e[0] + e[1] * e[1]) / (weighing.sigma * weighing.sigma)
+        variance = seen.sigma[n] * seen.sigma[n]
+        square = (e[0] * e[0] + e[1] * e[1]) / variance
         w, cost, curvature = weight(weighing.loss, weighing.scale, square)
-        w /= weighing.sigma * weighing.sigma
+        w /= variance
         less = (1.0 - curvature) / (e[0] * e[0] + e[1] * e[1]) if curvature < 1.0 else 0.0
         points.trial_cost[t] += cost
         points.trial_shown[t] += 1
@@ -297,9 +298,9 @@ def weighted_rows(i, n, X, seen, seeing, weighing, R_cw, error, A):
         error[r] = seeing.uv[c, r] - seen.uv[n, r]
     if not (seen.keep[n] and seeing.valid[c]):
         return 0.0, 0.0
-    square = (error[0] ** 2 + error[1] ** 2) / (weighing.sigma * weighing.sigma)
+    square = (error[0] ** 2 + error[1] ** 2) / (seen.sigma[n] * seen.sigma[n])
     w, cost, curvature = weight(weighing.loss, weighing.scale, square)
-    root = np.sqrt(w) / weighing.sigma
+    root = np.sqrt(w) / seen.sigma[n]
     x, y, z = X[c, 0], X[c, 1], X[c, 2]
     for r in range(2):
         a0, a1, a2 = root * seeing.by_point[c, r, 0], root * seeing.by_point[c, r, 1], root * seeing.by_point[c, r, 2]

@@ -12,6 +12,7 @@ from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.medians import grouped_quantiles, largest_normal, median_variance
 from icalib.estimation.outcome import Outcome
+from icalib.estimation.tracks import TrackNoise
 from icalib.rig import Camera, Settings
 
 FIRST_GUESS_PX = 1.0
@@ -19,6 +20,7 @@ SMALLEST_PX = 0.005
 # So many of an image's observations are no outliers. At first a lens that is not found yet leaves large errors at the
 # edges, which are none either.
 GOOD_AT_FIRST, GOOD = 0.9, 0.5
+FEWEST_IN_GROUP = 50  # observations, for their median variance to be known to a fifth
 
 
 def first_following(inputs: Inputs) -> Following | None:
@@ -26,8 +28,8 @@ def first_following(inputs: Inputs) -> Following | None:
     little and leads near. None where there are no tracks."""
     if not inputs.measurements.tracks:
         return None
-    sigma = tuple(c.track_noise_px or FIRST_GUESS_PX for c in inputs.rig.cameras)
-    return Following(sigma, tuple(np.ones(len(t.uv), dtype=bool) for t in inputs.measurements.tracks), True)
+    noise = tuple(TrackNoise(c.track_noise_px or FIRST_GUESS_PX) for c in inputs.rig.cameras)
+    return Following(noise, tuple(np.ones(len(t.uv), dtype=bool) for t in inputs.measurements.tracks), True)
 
 
 def next_following(inputs: Inputs, outcome: Outcome, now: Following, first: bool) -> Following:
@@ -35,25 +37,52 @@ def next_following(inputs: Inputs, outcome: Outcome, now: Following, first: bool
     that stand out after the `first` pass or another."""
     rig, factor, out = inputs.rig, outcome.problem.features, outcome.residuals.features
     assert factor is not None and out is not None
-    sigma = tuple(_sigma(c, factor, out, i) for i, c in enumerate(rig.cameras))
+    noise = tuple(_noise(c, factor, out, i) for i, c in enumerate(rig.cameras))
     if rig.settings.outlier_std <= 0.0:
-        return Following(sigma, now.keep)
+        return Following(noise, now.keep)
     # All that was seen, with the poses of the pass's end: those of its beginning left tracks out that these find, and
     # what a lens that was not found yet made an outlier may be none.
     shown = on_the_chain(inputs, outcome.state, factor.cameras)
-    anew = replace(factor, sigma=sigma, keep=shown).cut(outcome.state, chain_cuts(factor.n_nodes))
+    anew = replace(factor, noise=noise, keep=shown).cut(outcome.state, chain_cuts(factor.n_nodes))
     left, share = anew.look(outcome.state), GOOD_AT_FIRST if first else GOOD
-    return Following(sigma, tuple(_kept(anew, left, i, rig.settings, share) for i in range(len(shown))))
+    return Following(noise, tuple(_kept(anew, left, i, rig.settings, share) for i in range(len(shown))))
 
 
-def _sigma(camera: Camera, factor: FeatureFactor, out: FeatureOutput, index: int) -> float:
-    """From the median, so that outliers have no say; each point takes three of its observations' rows."""
+def _noise(camera: Camera, factor: FeatureFactor, out: FeatureOutput, index: int) -> TrackNoise:
+    """As the rig file has it, or as medians show it, so that outliers have no say; each point takes three of its
+    observations' rows."""
     used = [root > 0.0 for root in out.root]
-    if camera.track_noise_px is not None or not used[index].any():
-        return camera.track_noise_px or factor.sigma[index]
+    if camera.track_noise_px is not None:
+        return TrackNoise(camera.track_noise_px)
+    if not used[index].any():
+        return factor.noise[index]
+    square = (out.residual[index][used[index]] ** 2).sum(axis=1)
+    views = factor.streams[index].views
+    growth = variance_growth(square, views[used[index]]) if len(views) else 0.0
+    if growth > 0.0:
+        square = square / (1.0 + growth * views[used[index]])
     rows, points = 2 * sum(int(u.sum()) for u in used), factor.tracks.count
-    variance = median_variance((out.residual[index][used[index]] ** 2).sum(axis=1))
-    return max(float(np.sqrt(variance / max(1.0 - 3.0 * points / rows, 0.1))), SMALLEST_PX)
+    sigma = float(np.sqrt(median_variance(square) / max(1.0 - 3.0 * points / rows, 0.1)))
+    return TrackNoise(max(sigma, SMALLEST_PX), growth)
+
+
+def variance_growth(square: np.ndarray, views: np.ndarray) -> float:
+    """By how much the variance of observations grows with each view, over that of a first view.
+
+    square (n,) px^2: squared residuals; views (n,). A line through the median variances of groups of views, each with
+    its number of observations as weight; 0 where they do not grow.
+    """
+    group = np.floor(np.log2(views + 1.0)).astype(int)
+    rows = []
+    for k in np.unique(group):
+        own = group == k
+        if own.sum() >= FEWEST_IN_GROUP:
+            rows.append((float(views[own].mean()), median_variance(square[own]), float(own.sum())))
+    if len(rows) < 2:
+        return 0.0
+    v, variance, count = np.array(rows).T
+    slope, first = np.polyfit(v, variance, 1, w=np.sqrt(count) / variance)
+    return float(max(slope, 0.0) / max(first, 0.1 * variance.min()))
 
 
 def _kept(factor: FeatureFactor, out: FeatureOutput, index: int, settings: Settings, share: float) -> np.ndarray:
@@ -66,6 +95,7 @@ def _kept(factor: FeatureFactor, out: FeatureOutput, index: int, settings: Setti
     stream = factor.streams[index]
     used, followed = out.root[index] > 0.0, factor.tracks.track[index] >= 0
     size, image = np.linalg.norm(out.residual[index], axis=1), stream.image
-    most = grouped_quantiles(size[used], image[used], len(stream.stamps_ns), share)
-    limit = np.maximum(largest_normal(settings.outlier_std, share) * most, settings.outlier_min_px)
-    return ~(followed & (~used | (size > limit[image])))
+    relative = factor.sigmas[index] / factor.noise[index].sigma
+    most = grouped_quantiles((size / relative)[used], image[used], len(stream.stamps_ns), share)
+    limit = largest_normal(settings.outlier_std, share) * most[image] * relative
+    return ~(followed & (~used | (size > np.maximum(limit, settings.outlier_min_px))))

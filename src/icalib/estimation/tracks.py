@@ -11,7 +11,25 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from icalib.measurements import TrackStream
+
 FEWEST = 3  # observations of a track; two images of one point are met by almost any pose
+
+
+@dataclass(frozen=True)
+class TrackNoise:
+    """Noise of one camera's tracks: sigma [px] per axis of a feature's first view, and by how much its variance grows
+    with each further view, over that of the first: sigma_n^2 = sigma^2 (1 + growth n)."""
+
+    sigma: float
+    growth: float = 0.0
+
+    def of(self, stream: TrackStream) -> np.ndarray:
+        """(N,) px: standard deviation of each observation per axis. It is the same for all where the tracker does not
+        say how often it had seen a feature."""
+        if not len(stream.views):
+            return np.full(len(stream.uv), self.sigma)
+        return self.sigma * np.sqrt(1.0 + self.growth * stream.views)
 
 
 @dataclass(frozen=True)

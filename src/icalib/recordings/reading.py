@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from icalib.errors import RecordingError
-from icalib.measurements import CornerStream, LidarStream, Measurements
+from icalib.measurements import CornerStream, LidarStream, Measurements, TrackStream
 from icalib.recordings.base import Recording
 from icalib.recordings.camera_checks import checked_corners
 from icalib.recordings.imu_checks import read_imu
@@ -20,6 +20,7 @@ from icalib.recordings.wheel_checks import checked_wheels
 from icalib.rig import Camera, Lidar, PoseSensor, Rig, Wheels
 
 FindCorners = Callable[[Recording, Camera], tuple[CornerStream, tuple[str, ...]]]
+FindTracks = Callable[[Recording, Camera], tuple[TrackStream, tuple[str, ...]]]
 
 
 def tables_only(recording: Recording, camera: Camera) -> tuple[CornerStream, tuple[str, ...]]:
@@ -27,9 +28,16 @@ def tables_only(recording: Recording, camera: Camera) -> tuple[CornerStream, tup
     raise RecordingError(f"{recording.where(camera)} holds images, not corners; nothing here looks for the target.")
 
 
-def read_measurements(recording: Recording, rig: Rig, find: FindCorners = tables_only) -> Measurements:
-    """Read what `rig` asks for from `recording`, and check it; `find` finds corners where there are images. Of a clock
-    that jumps one part is used.
+def track_tables_only(recording: Recording, camera: Camera) -> tuple[TrackStream, tuple[str, ...]]:
+    """For recordings without images. Raises RecordingError."""
+    raise RecordingError(f"{recording.where(camera)} holds images, not tracks; nothing here follows points in them.")
+
+
+def read_measurements(
+    recording: Recording, rig: Rig, find: FindCorners = tables_only, follow: FindTracks = track_tables_only
+) -> Measurements:
+    """Read what `rig` asks for from `recording`, and check it; `find` finds corners, and `follow` feature tracks, in
+    images. Of a clock that jumps one part is used.
 
     What was dropped or looks odd stands in the notes. Raises RecordingError, one sentence naming the file and the line
     or instant, for data that are missing, unreadable, out of order, in other units, or not of this rig.
@@ -39,7 +47,7 @@ def read_measurements(recording: Recording, rig: Rig, find: FindCorners = tables
     if rig.imu is not None:
         imu, notes = read_imu(recording, rig.imu, jumps)
     cut = jumps.cut if is_timed(rig) else _whole
-    tracks = tuple(cut(recording.tracks(c), f"the tracks of {c.name}") for c in rig.cameras if c.tracks is not None)
+    tracks, followed = _tracks(recording, rig, follow, cut)
     cameras, seen = _corners(recording, rig, find, cut)
 
     def read(stream: S, sensor: Wheels | PoseSensor) -> tuple[S, str]:
@@ -53,7 +61,7 @@ def read_measurements(recording: Recording, rig: Rig, find: FindCorners = tables
         for s in rig.poses
         for stream, where in [read(recording.poses(s), s)]
     ]
-    notes = sum((found for _, found in (*lidars, *wheels, *poses)), notes + seen)
+    notes = sum((found for _, found in (*lidars, *wheels, *poses)), notes + followed + seen)
     return Measurements(
         imu, cameras, recording.notes() + jumps.notes + notes, tracks=tracks,
         lidars=tuple(stream for stream, _ in lidars), wheels=tuple(stream for stream, _ in wheels),
@@ -97,6 +105,17 @@ def without_jumps(rig: Rig, measurements: Measurements) -> Measurements:
 def _whole(stream: S, what: str) -> S:
     del what
     return stream
+
+
+def _tracks(
+    recording: Recording, rig: Rig, follow: FindTracks, cut: Callable[[TrackStream, str], TrackStream]
+) -> tuple[tuple[TrackStream, ...], tuple[str, ...]]:
+    """Feature tracks of each camera that has some, from its table or its images, and notes."""
+    tracked = [c for c in rig.cameras if c.tracks is not None]
+    image_topics(recording, [c for c in tracked if c.tracks_images])
+    found = [follow(recording, c) if c.tracks_images else (recording.tracks(c), ()) for c in tracked]
+    tracks = tuple(cut(stream, f"the tracks of {stream.name}") for stream, _ in found)
+    return tracks, sum((notes for _, notes in found), ())
 
 
 def _corners(

@@ -1,0 +1,92 @@
+"""Work on all images of a stream: on all cores, in order, with few images in memory at a time."""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import TypeVar
+
+from icalib.errors import RecordingError
+from icalib.extras import load_cv2
+from icalib.recordings import Payload, Recording
+from icalib.rig import Camera
+
+T, R = TypeVar("T"), TypeVar("R")
+Progress = Callable[[float], None]  # the share of the images that is done, 0 to 1
+
+
+def on_all_cores(turns: Iterable[T], work: Callable[[T], R]) -> Iterator[R]:
+    """work(turn) of each turn, in order, on threads: OpenCV and compiled code let each other run. At most one turn for
+    each core waits."""
+    with _one_thread_in_opencv(), _pool() as pool:
+        waiting: deque[Future[R]] = deque()
+        for turn in turns:
+            waiting.append(pool.submit(work, turn))
+            if len(waiting) > _workers():
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+
+
+def turns_of(payloads: Iterable[Payload], images: int, most_bytes: int) -> Iterator[list[Payload]]:
+    """The images in groups of `images`, or of fewer where these have `most_bytes`."""
+    turn: list[Payload] = []
+    for p in payloads:
+        turn.append(p)
+        if len(turn) == images or sum(len(one.data) for one in turn) >= most_bytes:
+            yield turn
+            turn = []
+    if turn:
+        yield turn
+
+
+def image_count(recording: Recording, topic: str) -> int:
+    """How many images there are about; 0 where that is not known."""
+    return next((t.count for t in recording.topics() if t.name == topic), 0)
+
+
+def of_resolution(payloads: Iterable[Payload], camera: Camera, where: str) -> Iterator[Payload]:
+    """The images. Raises RecordingError at the first that has not the camera's resolution."""
+    for p in payloads:
+        if p.width and (p.width, p.height) != camera.resolution:
+            raise RecordingError(
+                f"{where}: images have {p.width} x {p.height} px, but {camera.name} {camera.resolution[0]} x "
+                f"{camera.resolution[1]}; correct its resolution in the rig file."
+            )
+        yield p
+
+
+def noting_files(payloads: Iterable[Payload], files: dict[int, str]) -> Iterator[Payload]:
+    """The payloads; `files` gets the name of each by its stamp, "" of those that are no file."""
+    for p in payloads:
+        files[p.stamp_ns] = p.name
+        yield p
+
+
+def _workers() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def _pool() -> Iterator[ThreadPoolExecutor]:
+    """When interrupted, what has not begun is dropped."""
+    pool = ThreadPoolExecutor(_workers(), thread_name_prefix="icalib-images")
+    try:
+        yield pool
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+@contextmanager
+def _one_thread_in_opencv() -> Iterator[None]:
+    """Threads of OpenCV's own beside ours get into each other's way."""
+    cv2 = load_cv2()
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)

@@ -1,0 +1,161 @@
+"""From a recording's images to feature tracks: decoded and followed on all cores, and kept for the next run.
+
+Images are followed in stretches, each on one core; tracks end where a stretch ends. Stretches depend on the recording
+only, so that the tracks do not depend on the number of cores.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from icalib.detection.cache import keep_arrays, load_kept, stream_key
+from icalib.detection.image_work import (
+    Progress,
+    image_count,
+    noting_files,
+    of_resolution,
+    on_all_cores,
+    turns_of,
+)
+from icalib.detection.tracking.lens import rough_lens
+from icalib.detection.tracking.tracker import Tracker
+from icalib.errors import RecordingError
+from icalib.geometry.cameras import camera_model
+from icalib.measurements import TrackStream
+from icalib.recordings import DamagedImageError, Payload, Recording, decode
+from icalib.rig import Camera
+
+VERSION = 1  # of the tracker: whatever changes tracks changes this
+STRETCH, STRETCH_BYTES = 120, 64 << 20  # images, and their bytes, that are followed in one go
+FEWEST_VIEWS = 3  # of a track; two images of one point are met by almost any pose
+FEWEST_POINTS = 12  # in an image, below which it says little of the camera's motion
+MOVING_SHARE = 0.1  # of the tracks; more are worth a note
+_COLUMNS = ("stamps_ns", "start", "feature", "uv", "views", "moving")
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Tracks of some images: stamps_ns (M,), start (M + 1,), feature, views (N,) and uv (N, 2); moving: how many
+    features do not fit the motion of the camera; damaged: why the last image that cannot be decoded cannot."""
+
+    stamps_ns: np.ndarray
+    start: np.ndarray
+    feature: np.ndarray
+    uv: np.ndarray
+    views: np.ndarray
+    moving: int
+    damaged: str = ""
+
+
+def find_tracks(
+    recording: Recording, camera: Camera, keep: bool = True, progress: Progress = lambda _: None
+) -> tuple[TrackStream, tuple[str, ...]]:
+    """Feature tracks of all images of `camera`, and sentences on what was left out.
+
+    With `keep`, what an earlier run found is used, and what is found is kept. Raises RecordingError, one sentence,
+    where there are no images of the camera, they are not of its resolution, cannot be read, or show nothing to follow.
+    """
+    topic, where = recording.image_topic(camera), recording.where(camera)
+    files: dict[int, str] = {}
+    lens = rough_lens(camera)
+
+    def read() -> Iterator[Payload]:
+        return noting_files(of_resolution(recording.payloads(topic), camera, where), files)
+
+    key = stream_key(read(), f"tracks {VERSION} {camera.model} {lens.tolist()}") if keep else ""
+    kept = load_kept(key, _COLUMNS) if keep else None
+    if kept is not None:
+        found = _Found(**{name: kept[name] for name in _COLUMNS} | {"moving": int(kept["moving"])})
+    else:
+        count, payloads = image_count(recording, topic), read()
+        found = _follow(payloads, camera, lens, lambda n: progress(n / max(count, n)))
+        if not len(found.stamps_ns):
+            raise RecordingError(found.damaged or f"{where}: there are no images; check that the camera was running.")
+        if keep:
+            keep_arrays(key, {name: np.asarray(getattr(found, name)) for name in _COLUMNS})
+    stream = _stream(camera.name, found, where)
+    return stream, tuple(f"{where}: {note}" for note in _notes(found, files))
+
+
+def _follow(payloads: Iterator[Payload], camera: Camera, lens: np.ndarray, done: Callable[[int], None]) -> _Found:
+    parts: list[_Found] = []
+    stretches = turns_of(payloads, STRETCH, STRETCH_BYTES)
+    for part in on_all_cores(stretches, partial(_in_stretch, camera=camera, lens=lens)):
+        parts.append(part)
+        done(sum(len(p.stamps_ns) for p in parts))
+    return _joined(parts)
+
+
+def _in_stretch(payloads: list[Payload], camera: Camera, lens: np.ndarray) -> _Found:
+    """Tracks of images that are followed in one go; those that moved, or were seen too rarely, are left out."""
+    tracker, damaged = Tracker(camera_model(camera.model), lens), ""
+    stamps, seen = [], []
+    for p in payloads:
+        try:
+            image = decode(p)
+        except DamagedImageError as error:
+            damaged = str(error)
+            continue
+        stamps.append(p.stamp_ns)
+        seen.append(tracker.add(image))
+    count = [len(s.feature) for s in seen]
+    whole = _Found(
+        np.array(stamps, np.int64), np.cumsum([0, *count]).astype(np.int64),
+        np.concatenate([np.zeros(0, np.int64), *(s.feature for s in seen)]),
+        np.concatenate([np.zeros((0, 2)), *(s.uv for s in seen)]),
+        np.concatenate([np.zeros(0, np.int64), *(s.views for s in seen)]),
+        len(tracker.moved), damaged,
+    )  # fmt: skip
+    often = np.bincount(whole.feature, minlength=1) >= FEWEST_VIEWS
+    often[list(tracker.moved)] = False
+    return _some(whole, often[whole.feature])
+
+
+def _some(found: _Found, kept: np.ndarray) -> _Found:
+    """The observations kept (N,)."""
+    start = np.concatenate([[0], np.cumsum(kept)])[found.start].astype(np.int64)
+    return replace(found, start=start, feature=found.feature[kept], uv=found.uv[kept], views=found.views[kept])
+
+
+def _joined(parts: Sequence[_Found]) -> _Found:
+    """One after another; features are numbered on."""
+    none = np.zeros(0, np.int64)
+    first = np.cumsum([0, *(int(p.feature.max(initial=-1)) + 1 for p in parts)])
+    begin = np.cumsum([0, *(len(p.feature) for p in parts)])
+    return _Found(
+        np.concatenate([none, *(p.stamps_ns for p in parts)]),
+        np.concatenate([none, *(b + p.start[:-1] for b, p in zip(begin, parts, strict=False)), begin[-1:]]),
+        np.concatenate([none, *(f + p.feature for f, p in zip(first, parts, strict=False))]),
+        np.concatenate([np.zeros((0, 2)), *(p.uv for p in parts)]),
+        np.concatenate([none, *(p.views for p in parts)]),
+        sum(p.moving for p in parts),
+        next((p.damaged for p in reversed(parts) if p.damaged), ""),
+    )  # fmt: skip
+
+
+def _stream(name: str, found: _Found, where: str) -> TrackStream:
+    """Images without any observation are left out. Raises RecordingError where hardly anything was followed."""
+    count = np.diff(found.start)
+    enough = int((count >= FEWEST_POINTS).sum())
+    if 2 * enough < len(count):
+        raise RecordingError(
+            f"{where}: only {enough} of {len(count)} images show {FEWEST_POINTS} points or more that can be followed; "
+            f"record where there is texture and light, or let {name} see a target."
+        )
+    kept = count > 0
+    start = np.concatenate([[0], np.cumsum(count[kept])]).astype(np.int64)
+    return TrackStream(name, found.stamps_ns[kept], start, found.feature, found.uv, views=found.views)
+
+
+def _notes(found: _Found, files: dict[int, str]) -> Iterator[str]:
+    damaged = sorted(files.keys() - set(found.stamps_ns.tolist()))
+    if damaged:
+        first = files[damaged[0]] or f"at {damaged[0]} ns"
+        yield f"{len(damaged)} images that are damaged were left out, the first {first}."
+    tracks = len(np.unique(found.feature)) + found.moving
+    if found.moving > MOVING_SHARE * tracks:
+        yield f"{found.moving} of {tracks} points do not fit one motion of the camera and were left out."

@@ -1,0 +1,195 @@
+"""One camera's tracker: corners of the scene, followed through its images in order.
+
+Each image: contrast equalisation, pyramidal Lucas-Kanade forward and backward, alignment with the first view of each
+track, a check against the epipolar geometry, new corners in empty cells.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+
+from icalib.detection.tracking.epipolar import fits_one_motion
+from icalib.detection.tracking.patches import RADIUS, Templates, align, cut_templates, no_templates
+from icalib.extras import load_cv2
+from icalib.geometry.cameras.base import CameraModel
+
+CELLS = 100  # of an image; each begins one track at a time
+MOST_VIEWS = 30  # of a track; later views differ too much from the first, and long tracks cost the estimator time
+WINDOW_PX, LEVELS = 21, 3  # of Lucas-Kanade: motions of up to 80 px between images
+CLIP, TILES = 3.0, (8, 8)  # of the equalisation (CLAHE)
+BLUR_PX = 0.8  # before alignment: grey levels between pixels are then linear enough
+BACK_PX = 0.7  # forward and backward must meet
+ALIGNED_PX = 2.0  # of Lucas-Kanade's place: alignment goes no further
+LEAST_ALIKE = 0.8  # correlation with the first view
+LEAST_QUALITY = 5e-4  # smallest eigenvalue of a corner (OpenCV's, grey levels of 0 to 1)
+NEAR_PX = 3  # of a corner found at half the resolution
+EARLIER = (1, 4)  # images ago: the epipolar geometry is checked with these
+
+
+@dataclass(frozen=True)
+class Followed:
+    """Observations of one image: feature (n,) int64, uv (n, 2) px, views (n,) int64: how many images showed the feature
+    before."""
+
+    feature: np.ndarray
+    uv: np.ndarray
+    views: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Tracks:
+    """Tracks alive, n of each: feature (n,); uv (n, 2) px; flow (n, 2) px: the last motion, NaN in the first view; A
+    (n, 2, 2): affine map of the first view; views (n,): images that showed the feature before; and the first views."""
+
+    feature: np.ndarray
+    uv: np.ndarray
+    flow: np.ndarray
+    A: np.ndarray
+    views: np.ndarray
+    first: Templates
+
+    @classmethod
+    def begun(cls, feature: np.ndarray, uv: np.ndarray, first: Templates) -> _Tracks:
+        n = len(feature)
+        A = np.tile(np.eye(2), (n, 1, 1))
+        return cls(feature, uv.astype(np.float64), np.full((n, 2), np.nan), A, np.zeros(n, np.int64), first)
+
+    def some(self, kept: np.ndarray) -> _Tracks:
+        return _Tracks(*(getattr(self, f.name)[kept] for f in fields(self)[:-1]), self.first.some(kept))
+
+    def joined(self, other: _Tracks) -> _Tracks:
+        columns = [np.concatenate([getattr(t, f.name) for t in (self, other)]) for f in fields(self)[:-1]]
+        return _Tracks(*columns, self.first.joined(other.first))
+
+
+class Tracker:
+    """Follows corners of the scene through the images of one camera.
+
+    model, params: the lens as far as it is known; it serves only to reject what does not fit the epipolar geometry.
+    """
+
+    def __init__(self, model: CameraModel, params: np.ndarray) -> None:
+        self._model, self._params = model, params
+        self._cv2: Any = load_cv2()
+        self._clahe = self._cv2.createCLAHE(CLIP, TILES)
+        self._before = np.zeros((0, 0), np.uint8)
+        self._earlier: deque[Followed] = deque(maxlen=max(EARLIER))
+        self._alive = _Tracks.begun(np.zeros(0, np.int64), np.zeros((0, 2)), no_templates())
+        self._begun = 0
+        self._images = 0
+        self.moved: set[int] = set()  # features that do not fit the motion of the camera
+
+    def add(self, image: np.ndarray) -> Followed:
+        """What the next image (h, w) uint8 shows."""
+        cv2 = self._cv2
+        even = self._clahe.apply(image)
+        smooth = cv2.GaussianBlur(image, (0, 0), BLUR_PX).astype(np.float32)
+        if len(self._alive.feature):
+            self._follow(even, smooth)
+        self._before = even
+        self._alive = self._alive.some(self._alive.views < _most_views(self._alive.feature))
+        self._reject_moving()
+        self._begin(even, smooth)
+        self._images += 1
+        alive = self._alive
+        seen = Followed(alive.feature.copy(), alive.uv.copy(), alive.views.copy())
+        self._earlier.append(seen)
+        self._alive = replace(alive, views=alive.views + 1)
+        return seen
+
+    def _follow(self, even: np.ndarray, smooth: np.ndarray) -> None:
+        """Moves the tracks to the next image; those that are lost end."""
+        cv2, alive = self._cv2, self._alive
+        before = alive.uv.astype(np.float32)
+        size = (WINDOW_PX, WINDOW_PX)
+        after, found, _ = cv2.calcOpticalFlowPyrLK(
+            self._before, even, before, before + self._predicted(), winSize=size, maxLevel=LEVELS,
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        )  # fmt: skip
+        back, returned, _ = cv2.calcOpticalFlowPyrLK(
+            even, self._before, after, before.copy(), winSize=size, maxLevel=0,
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        )  # fmt: skip
+        good = (found.ravel() > 0) & (returned.ravel() > 0) & (np.linalg.norm(back - before, axis=1) < BACK_PX)
+        uv, A, alike = after.astype(np.float64), alive.A.copy(), np.full(len(before), -1.0)
+        align(smooth, alive.first, uv, A, alike)
+        good &= (alike > LEAST_ALIKE) & (np.linalg.norm(uv - after, axis=1) < ALIGNED_PX)
+        self._alive = replace(alive, uv=uv, flow=uv - before, A=A).some(good)
+
+    def _predicted(self) -> np.ndarray:
+        """(n, 2) px float32: how far each track moves if it moves on as the image did: its own last motion, or the
+        median motion of all where it has just begun."""
+        flow = self._alive.flow
+        known = np.isfinite(flow[:, 0])
+        median = np.median(flow[known], axis=0) if known.any() else np.zeros(2)
+        return np.where(known[:, None], flow, median).astype(np.float32)
+
+    def _reject_moving(self) -> None:
+        """Ends tracks that do not fit one motion of the camera since an earlier image."""
+        for ago in EARLIER:
+            if len(self._earlier) < ago:
+                continue
+            alive, then = self._alive, self._earlier[-ago]
+            _, now, old = np.intersect1d(alive.feature, then.feature, return_indices=True)
+            f, seen = self._model.unproject(self._params, then.uv[old])
+            h, seen_now = self._model.unproject(self._params, alive.uv[now])
+            usable = seen & seen_now
+            fits = fits_one_motion(f[usable], h[usable], self._px_per_rad(), self._images)
+            wrong = now[usable][~fits]
+            self.moved.update(alive.feature[wrong].tolist())
+            kept = np.ones(len(alive.feature), dtype=bool)
+            kept[wrong] = False
+            self._alive = alive.some(kept)
+
+    def _px_per_rad(self) -> float:
+        return self._model.central_scale(self._params)
+
+    def _begin(self, even: np.ndarray, smooth: np.ndarray) -> None:
+        """New tracks at the strongest corner of each cell that has none."""
+        uv = self._corners(even)
+        first, good = cut_templates(smooth, uv)
+        feature = self._begun + np.arange(int(good.sum()))
+        self._begun += len(feature)
+        self._alive = self._alive.joined(_Tracks.begun(feature, uv[good], first.some(good)))
+
+    def _corners(self, even: np.ndarray) -> np.ndarray:
+        """(n, 2) whole pixels: the strongest corner of each empty cell, apart from tracks. Corners are sought at half
+        the resolution, which takes a quarter of the time, and then around the place found."""
+        cv2 = self._cv2
+        half = cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        (h, w), at = half.shape, np.rint(0.5 * self._alive.uv).astype(int)
+        side = int(np.ceil(np.sqrt(h * w / CELLS)))
+        rows, cols = -(-h // side), -(-w // side)
+        free = np.ones((rows, cols), dtype=bool)
+        free[np.clip(at[:, 1] // side, 0, rows - 1), np.clip(at[:, 0] // side, 0, cols - 1)] = False
+        quality = np.zeros((rows * side, cols * side), np.float32)
+        quality[:h, :w] = cv2.cornerMinEigenVal(half, 3, ksize=3)
+        edge = (RADIUS + NEAR_PX) // 2 + 2
+        for rim in (quality[:edge], quality[h - edge :], quality[:, :edge], quality[:, w - edge :]):
+            rim[:] = 0.0
+        for x, y in at.tolist():
+            quality[max(y - RADIUS, 0) : y + RADIUS + 1, max(x - RADIUS, 0) : x + RADIUS + 1] = 0.0
+        cells = quality.reshape(rows, side, cols, side).transpose(0, 2, 1, 3)[free].reshape(-1, side * side)
+        best = cells.argmax(axis=1)
+        strong = cells[np.arange(len(cells)), best] > LEAST_QUALITY
+        (row, col), (y, x) = np.nonzero(free), np.divmod(best, side)
+        found = 2 * np.column_stack([col * side + x, row * side + y])[strong]
+        return np.array([self._strongest_near(even, x, y) for x, y in found.tolist()]).reshape(-1, 2)
+
+    def _strongest_near(self, even: np.ndarray, x: int, y: int) -> tuple[int, int]:
+        """The strongest corner NEAR_PX around a pixel that lies RADIUS inside."""
+        part = even[y - RADIUS : y + RADIUS + 1, x - RADIUS : x + RADIUS + 1]
+        inner = slice(RADIUS - NEAR_PX, RADIUS + NEAR_PX + 1)
+        dy, dx = np.divmod(self._cv2.cornerMinEigenVal(part, 5, ksize=3)[inner, inner].argmax(), 2 * NEAR_PX + 1)
+        return x + int(dx) - NEAR_PX, y + int(dy) - NEAR_PX
+
+
+def _most_views(feature: np.ndarray) -> np.ndarray:
+    """(n,) views of each feature at most, half to all of MOST_VIEWS: tracks that began together must not all end in one
+    image."""
+    half = MOST_VIEWS // 2
+    return half + feature % (half + 1)
