@@ -22,6 +22,7 @@ from icalib.detection.image_work import (
     turns_of,
 )
 from icalib.detection.tracking.lens import rough_lens
+from icalib.detection.tracking.robot_parts import stay_in_place
 from icalib.detection.tracking.tracker import Tracker
 from icalib.errors import RecordingError
 from icalib.geometry.cameras import camera_model
@@ -33,14 +34,16 @@ VERSION = 1  # of the tracker: whatever changes tracks changes this
 STRETCH, STRETCH_BYTES = 120, 64 << 20  # images, and their bytes, that are followed in one go
 FEWEST_VIEWS = 3  # of a track; two images of one point are met by almost any pose
 FEWEST_POINTS = 12  # in an image, below which it says little of the camera's motion
-MOVING_SHARE = 0.1  # of the tracks; more are worth a note
-_COLUMNS = ("stamps_ns", "start", "feature", "uv", "views", "moving")
+NOTED = 0.05  # of the tracks; fewer that are left out are not worth a note
+_COLUMNS = ("stamps_ns", "start", "feature", "uv", "views")
+_COUNTS = ("moving", "in_place")
 
 
 @dataclass(frozen=True)
 class _Found:
     """Tracks of some images: stamps_ns (M,), start (M + 1,), feature, views (N,) and uv (N, 2); moving: how many
-    features do not fit the motion of the camera; damaged: why the last image that cannot be decoded cannot."""
+    features do not fit the motion of the camera; in_place: how many stay in place; damaged: why the last image that
+    cannot be decoded cannot."""
 
     stamps_ns: np.ndarray
     start: np.ndarray
@@ -48,6 +51,7 @@ class _Found:
     uv: np.ndarray
     views: np.ndarray
     moving: int
+    in_place: int
     damaged: str = ""
 
 
@@ -67,16 +71,16 @@ def find_tracks(
         return noting_files(of_resolution(recording.payloads(topic), camera, where), files)
 
     key = stream_key(read(), f"tracks {VERSION} {camera.model} {lens.tolist()}") if keep else ""
-    kept = load_kept(key, _COLUMNS) if keep else None
+    kept = load_kept(key, (*_COLUMNS, *_COUNTS)) if keep else None
     if kept is not None:
-        found = _Found(**{name: kept[name] for name in _COLUMNS} | {"moving": int(kept["moving"])})
+        found = _Found(*(kept[name] for name in _COLUMNS), *(int(kept[name]) for name in _COUNTS))
     else:
         count, payloads = image_count(recording, topic), read()
         found = _follow(payloads, camera, lens, lambda n: progress(n / max(count, n)))
         if not len(found.stamps_ns):
             raise RecordingError(found.damaged or f"{where}: there are no images; check that the camera was running.")
         if keep:
-            keep_arrays(key, {name: np.asarray(getattr(found, name)) for name in _COLUMNS})
+            keep_arrays(key, {name: np.asarray(getattr(found, name)) for name in (*_COLUMNS, *_COUNTS)})
     stream = _stream(camera.name, found, where)
     return stream, tuple(f"{where}: {note}" for note in _notes(found, files))
 
@@ -91,7 +95,8 @@ def _follow(payloads: Iterator[Payload], camera: Camera, lens: np.ndarray, done:
 
 
 def _in_stretch(payloads: list[Payload], camera: Camera, lens: np.ndarray) -> _Found:
-    """Tracks of images that are followed in one go; those that moved, or were seen too rarely, are left out."""
+    """Tracks of images that are followed in one go. Features that moved, stayed in place, or were seen too rarely, are
+    left out."""
     tracker, damaged = Tracker(camera_model(camera.model), lens), ""
     stamps, seen = [], []
     for p in payloads:
@@ -108,11 +113,13 @@ def _in_stretch(payloads: list[Payload], camera: Camera, lens: np.ndarray) -> _F
         np.concatenate([np.zeros(0, np.int64), *(s.feature for s in seen)]),
         np.concatenate([np.zeros((0, 2)), *(s.uv for s in seen)]),
         np.concatenate([np.zeros(0, np.int64), *(s.views for s in seen)]),
-        len(tracker.moved), damaged,
+        0, 0, damaged,
     )  # fmt: skip
-    often = np.bincount(whole.feature, minlength=1) >= FEWEST_VIEWS
-    often[list(tracker.moved)] = False
-    return _some(whole, often[whole.feature])
+    good = np.bincount(whole.feature) >= FEWEST_VIEWS
+    in_place, moving = stay_in_place(whole.start, whole.feature, whole.uv), np.zeros(len(good), dtype=bool)
+    moving[list(tracker.moved)] = True
+    kept = _some(whole, (good & ~in_place & ~moving)[whole.feature])
+    return replace(kept, moving=int((moving & ~in_place).sum()), in_place=int((in_place & (good | moving)).sum()))
 
 
 def _some(found: _Found, kept: np.ndarray) -> _Found:
@@ -132,7 +139,7 @@ def _joined(parts: Sequence[_Found]) -> _Found:
         np.concatenate([none, *(f + p.feature for f, p in zip(first, parts, strict=False))]),
         np.concatenate([np.zeros((0, 2)), *(p.uv for p in parts)]),
         np.concatenate([none, *(p.views for p in parts)]),
-        sum(p.moving for p in parts),
+        sum(p.moving for p in parts), sum(p.in_place for p in parts),
         next((p.damaged for p in reversed(parts) if p.damaged), ""),
     )  # fmt: skip
 
@@ -156,6 +163,11 @@ def _notes(found: _Found, files: dict[int, str]) -> Iterator[str]:
     if damaged:
         first = files[damaged[0]] or f"at {damaged[0]} ns"
         yield f"{len(damaged)} images that are damaged were left out, the first {first}."
-    tracks = len(np.unique(found.feature)) + found.moving
-    if found.moving > MOVING_SHARE * tracks:
+    tracks = len(np.unique(found.feature)) + found.moving + found.in_place
+    if found.moving > NOTED * tracks:
         yield f"{found.moving} of {tracks} points do not fit one motion of the camera and were left out."
+    if found.in_place > NOTED * tracks:
+        yield (
+            f"{found.in_place} of {tracks} points stay in place while the camera turns, as on a part of the robot or a "
+            "dirty lens; they were left out."
+        )
