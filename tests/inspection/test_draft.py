@@ -60,8 +60,31 @@ def fill(path: Path) -> None:
     path.write_text(text)
 
 
+def tagged_images(bags, topic: str, frame: str):
+    """Images of 240 x 120 px with two tags."""
+    cv2 = pytest.importorskip("cv2")
+    family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    pixels = np.full((120, 240), 200, np.uint8)
+    for i in (0, 1):
+        pixels[20:100, 20 + 120 * i : 100 + 120 * i] = cv2.aruco.generateImageMarker(family, i, 80)
+    return [bags.image(topic, bags.origin_ns + k * 50_000_000, pixels + k, frame=frame) for k in range(20)]
+
+
+def test_cameras_that_see_no_target_track_points_of_the_scene(draft, bags):
+    text, path = draft(bags.noise("/cam0/image_raw", SIZE) + bags.noise("/cam1/image_raw", (40, 30)))
+    rig = load_rig(path)
+    assert not rig.has_target and all(c.tracks_images for c in rig.cameras)
+    assert "target:" not in text
+
+
+def test_without_an_imu_a_target_is_asked_for(bags, tmp_path):
+    bag, path = bags.write(tmp_path / "run", bags.noise("/cam0/image_raw", SIZE)), tmp_path / "rig.yaml"
+    assert main(["inspect", str(bag), "--rig", str(path), "-q"]) == 0
+    assert "tracks: images" not in path.read_text().split("target:")[0] and "target:" in path.read_text()
+
+
 def test_a_draft_loads_once_the_target_is_filled_in(draft, bags):
-    messages = bags.noise("/cam0/image_raw", SIZE, frame="left: eye") + bags.noise("/cam1/image_raw", (40, 30))
+    messages = tagged_images(bags, "/cam0/image_raw", "left: eye") + bags.noise("/cam1/image_raw", (40, 30))
     text, path = draft(messages)
     with pytest.raises(RigError, match=r"rig\.yaml:\d+: target\.tag_size: must be a number, but is empty"):
         load_rig(path)
@@ -69,7 +92,7 @@ def test_a_draft_loads_once_the_target_is_filled_in(draft, bags):
     rig = load_rig(path)
     assert rig.target == AprilGrid(7, 6, 0.088, 0.3)
     assert [(c.name, c.topic, c.model, c.resolution) for c in rig.cameras] == [
-        ("cam0", "/cam0/image_raw", "pinhole-radtan", SIZE),
+        ("cam0", "/cam0/image_raw", "pinhole-radtan", (240, 120)),
         ("cam1", "/cam1/image_raw", "pinhole-radtan", (40, 30)),
     ]
     assert all(c.intrinsics.value is None for c in rig.cameras)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from itertools import islice
 
 import numpy as np
@@ -47,6 +47,16 @@ def other_size(images: Iterable[np.ndarray], board: Checkerboard) -> str:
     what = f"a checkerboard of {turned[0]} x {turned[1]} inner corners is in {seen[rows, cols]} of {len(grey)} of them"
     why = "rows and cols count INNER corners, not squares; " if (rows, cols) == by_squares else ""
     return f"{what}; {why}write rows: {turned[0]}, cols: {turned[1]}."
+
+
+def checkerboard_in(images: Sequence[np.ndarray]) -> str:
+    """The largest checkerboard that at least two of the images (h, w) uint8 show, in words; "" for none."""
+    sizes = [size for image in images for size in _largest(image)]
+    seen = {size: sizes.count(size) for size in set(sizes)}
+    if max(seen.values(), default=0) < _LEAST_IMAGES:
+        return ""
+    rows, cols = max(seen, key=lambda size: (seen[size], size))
+    return f"a checkerboard of {rows} x {cols} inner corners"
 
 
 def _largest(image: np.ndarray) -> list[tuple[int, int]]:

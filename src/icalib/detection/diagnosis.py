@@ -59,6 +59,12 @@ def what_is_seen(
     return _sentence(candidates[0], family, border_bits, ids, field)
 
 
+def tags_in(images: Sequence[np.ndarray]) -> str:
+    """The tags of any known family that images (h, w) uint8 show, in words; "" for none."""
+    seen = max(_candidates([View(i).image for i in images]), key=lambda one: len(one.ids), default=None)
+    return "" if seen is None else _words(seen)
+
+
 def with_other_border(images: Iterable[np.ndarray], tags: TagSet, others: Iterable[TagSet]) -> str:
     """A sentence where the first images (h, w) uint8 show the target's `tags` with a border of the other width, and
     hardly any with their own; "" otherwise. `others` are tags that may stand beside them.
@@ -117,7 +123,7 @@ def _candidates(images: list[np.ndarray]) -> list[_Seen]:
 
 
 def _sentence(seen: _Seen, family: str, border_bits: int, ids: Sequence[int], field: str = "family") -> str:
-    what = f"{len(seen.ids)} tags of {_smallest(seen)} (ids {seen.ids.min()} to {seen.ids.max()})"
+    what = _words(seen)
     if seen.how == "inverted":
         return f"the images show {what}, white on black; set inverted: true of a ChArUco board."
     if seen.how:
@@ -134,6 +140,10 @@ def _sentence(seen: _Seen, family: str, border_bits: int, ids: Sequence[int], fi
             "correct the target's ids, rows and cols."
         )
     return f"the images show {what}; check that rows, cols and spacing are those of the target."
+
+
+def _words(seen: _Seen) -> str:
+    return f"{len(seen.ids)} tags of {_smallest(seen)} (ids {seen.ids.min()} to {seen.ids.max()})"
 
 
 def _largest(family: str) -> str:

@@ -6,15 +6,19 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from itertools import islice
 from typing import TypeVar
+
+import numpy as np
 
 from icalib.errors import RecordingError
 from icalib.extras import load_cv2
-from icalib.recordings import Payload, Recording
+from icalib.recordings import DamagedImageError, Payload, Recording, decode
 from icalib.rig import Camera
 
 T, R = TypeVar("T"), TypeVar("R")
+SPREAD = 5  # images that stand for a recording where all would take too long
 Progress = Callable[[float], None]  # the share of the images that is done, 0 to 1
 
 
@@ -46,6 +50,14 @@ def turns_of(payloads: Iterable[Payload], images: int, most_bytes: int) -> Itera
 def image_count(recording: Recording, topic: str) -> int:
     """How many images there are about; 0 where that is not known."""
     return next((t.count for t in recording.topics() if t.name == topic), 0)
+
+
+def spread_images(recording: Recording, topic: str) -> Iterator[np.ndarray]:
+    """A few images, spread over the recording."""
+    every = max(image_count(recording, topic) // SPREAD, 1)
+    for payload in islice(recording.payloads(topic), 0, None, every):
+        with suppress(DamagedImageError):
+            yield decode(payload)
 
 
 def of_resolution(payloads: Iterable[Payload], camera: Camera, where: str) -> Iterator[Payload]:

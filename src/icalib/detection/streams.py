@@ -7,10 +7,8 @@ nothing is kept under it. Only a few are in memory at a time.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from itertools import islice
 
 import numpy as np
 
@@ -25,6 +23,7 @@ from icalib.detection.image_work import (
     noting_files,
     of_resolution,
     on_all_cores,
+    spread_images,
     turns_of,
 )
 from icalib.detection.prediction import MOTION_IMAGES
@@ -36,7 +35,6 @@ from icalib.measurements import CornerStream
 from icalib.recordings import DamagedImageError, Payload, Recording, decode
 from icalib.rig import Camera
 
-DIAGNOSED = 5  # images in which tags are looked for that are not the target's
 # Of a target's points, and of free tags' corners, an image on average: with fewer the border may be another one.
 POOR_SHARE, POOR_CORNERS = 0.5, 8
 # Images that a thread searches in turn, each where the ones before lead to expect the target. The first two are
@@ -96,13 +94,13 @@ def _called(target: Target) -> str:
 def _seen_instead(recording: Recording, topic: str, target: Target) -> str:
     """What to do about a target that is never found: by what the images show instead, where it has tags."""
     for _, part, _ in parts_of(target):
-        if isinstance(part, Checkerboard) and (sentence := other_size(_spread(recording, topic), part)):
+        if isinstance(part, Checkerboard) and (sentence := other_size(spread_images(recording, topic), part)):
             return sentence
     part = next((part for _, part, _ in parts_of(target) if part.tags), None)
     if part is None or part.tags is None:
         return "check the target's type and sizes, and that the camera saw it."
     field = "dictionary" if isinstance(part, Charuco) else "family"
-    return what_is_seen(_spread(recording, topic), part.tags.family, part.tags.border_bits, part.tags.ids, field)
+    return what_is_seen(spread_images(recording, topic), part.tags.family, part.tags.border_bits, part.tags.ids, field)
 
 
 def _other_border(recording: Recording, topic: str, target: Target, images: list[ImageCorners]) -> str:
@@ -112,7 +110,7 @@ def _other_border(recording: Recording, topic: str, target: Target, images: list
         if not part.tags or isinstance(part, Charuco) or not _poorly_seen(part, first, images):
             continue
         others = [other.tags for _, other, _ in parts_of(target) if other.tags]
-        if sentence := with_other_border(_spread(recording, topic), part.tags, others):
+        if sentence := with_other_border(spread_images(recording, topic), part.tags, others):
             return f"{name or 'the target'}: {sentence}"
     return ""
 
@@ -126,9 +124,9 @@ def _other_layout(recording: Recording, topic: str, target: Target, images: list
     for name, part, first in parts_of(target):
         wrong = ""
         if isinstance(part, Charuco) or (isinstance(part, AprilGrid) and _poorly_seen(part, first, images)):
-            wrong = other_columns(_spread(recording, topic), part)
+            wrong = other_columns(spread_images(recording, topic), part)
         if isinstance(part, Charuco):
-            wrong = wrong or with_other_layout(_spread(recording, topic), part)
+            wrong = wrong or with_other_layout(spread_images(recording, topic), part)
         if wrong:
             return f"{name}: {wrong}" if name else wrong
     return ""
@@ -142,14 +140,6 @@ def _poorly_seen(part: Target, first: int, images: list[ImageCorners]) -> bool:
     usual = POOR_CORNERS if isinstance(part, Markers) else POOR_SHARE * len(part.points)
     own = [i.kept & (i.point >= first) & (i.point < first + len(part.points)) for i in images]
     return sum(int(o.sum()) for o in own) < usual * len(images)
-
-
-def _spread(recording: Recording, topic: str) -> Iterator[np.ndarray]:
-    """A few images, spread over the recording."""
-    every = max(image_count(recording, topic) // DIAGNOSED, 1)
-    for payload in islice(recording.payloads(topic), 0, None, every):
-        with suppress(DamagedImageError):
-            yield decode(payload)
 
 
 def _search(

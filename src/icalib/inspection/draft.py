@@ -39,6 +39,7 @@ target:
 #   target: {type: charuco, squares_x: , squares_y: , square_size: , marker_size: , dictionary: 5x5_100}
 #   target: {type: checkerboard, rows: , cols: , square_size: }  # rows and cols of INNER corners
 #   target: {type: markers, family: tag36h11, size: , ids: []}  # free tags, each stuck anywhere
+#   none: with an IMU, write `tracks: images` in every camera, and delete `target`; points of the scene are tracked
 # Several at once: targets: {NAME: {type: ...}, NAME: {type: ...}}
 """
 
@@ -67,7 +68,8 @@ def draft_rig(found: Inspection) -> str:
     lines += _robot(found, shown=not (cameras or (sources.imus and sources.lidars)))
     left_out = {**broken, **found.sources.left_out}
     lines += [f"  # Not used: {_comment(topic)} ({_comment(why)})" for topic, why in left_out.items()]
-    aimed = found.target is not None or any(c.tracks is None for c in cameras)
+    blind = any(c.tracks is None and not (found.without_target and c.images) for c in cameras)
+    aimed = found.target is not None or blind
     return "\n".join([*lines, _target(found) if cameras and aimed else ""])
 
 
@@ -187,6 +189,8 @@ def _camera(found: Inspection, camera: CameraSource) -> list[str]:
         lines.append(_place(camera.images.name, camera.images.type if camera.corners is None else "images", frame))
     if camera.tracks:
         lines.append(f"    tracks: {_name(camera.tracks.name)}  # {_comment(camera.tracks.type)}")
+    elif found.without_target and camera.images:
+        lines.append("    tracks: images  # points of the scene; a few images show no tags and no checkerboard")
     lines.append(f"    model: {lens.model}  # {_comment(lens.why)}")
     lines.append(
         f"    resolution: [{resolution[0]}, {resolution[1]}]"

@@ -184,7 +184,8 @@ class GivenTarget:
 @dataclass(frozen=True)
 class Inspection:
     """All that was found. images, infos and views are by camera, imus by IMU, lidars by LiDAR; imu: the one to
-    calibrate with."""
+    calibrate with. shown: where no target is known, the tags or the board that a few images of each camera show, in
+    words, "" for neither."""
 
     recording: str
     sources: Sources
@@ -200,6 +201,12 @@ class Inspection:
     findings: tuple[Finding, ...] = ()
     lidars: Mapping[str, LidarFacts] = field(default_factory=dict)
     frames: tuple[FramePair, ...] = ()
+    shown: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def without_target(self) -> bool:
+        """Whether the cameras see no target, so that they can only track points of the scene, which takes an IMU."""
+        return bool(self.imus and self.shown) and not any(self.shown.values())
 
     @property
     def verdict(self) -> Literal["yes", "yes, but", "no"]:

@@ -252,11 +252,26 @@ def _target(found: Inspection) -> Iterator[Finding]:
     if found.target is None:
         if not any(c.images for c in found.sources.cameras):
             return
-        yield Finding("hint", "No target is known, so the images were not searched for it: give --target FILE.")
+        yield from _unknown_target(found)
         return
     for v in found.views.values():
         if not v.problem:
             yield from _view(v)
+
+
+def _unknown_target(found: Inspection) -> Iterator[Finding]:
+    """What to do where no target is known."""
+    if found.without_target:
+        yield Finding(
+            "hint",
+            "A few images of each camera show no tags and no checkerboard, so the draft tracks points of the scene "
+            "(tracks: images). If there is a target, give it with --target FILE.",
+        )
+        return
+    for camera, words in found.shown.items():
+        if words:
+            yield Finding("hint", f"A few images of {camera} show {words}.")
+    yield Finding("hint", "No target is known, so the images were not searched for it: give --target FILE.")
 
 
 def _view(v: TargetView) -> Iterator[Finding]:

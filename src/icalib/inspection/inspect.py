@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from icalib.detection.image_work import spread_images
 from icalib.errors import RecordingError
 from icalib.inspection.facts import (
     CameraSource,
@@ -28,7 +29,7 @@ from icalib.inspection.kalibr import KalibrFiles, find_kalibr_files
 from icalib.inspection.lidar import lidar_facts
 from icalib.inspection.sources import find_sources
 from icalib.inspection.timing import timing_of
-from icalib.inspection.views import target_view
+from icalib.inspection.views import target_in, target_view
 from icalib.recordings import BagRecording, DamagedImageError, Payload, Recording, TopicInfo, decode, open_recording
 from icalib.recordings.imu_halves import pair_of
 from icalib.recordings.streams import CameraInfo, read_camera_info
@@ -71,7 +72,7 @@ def inspect_recording(
     frames, unread = frame_pairs(recording)
     views = _views(recording, found, lambda what, done: progress(what, share + (1.0 - share) * done))
     notes = tuple(dict.fromkeys(recording.notes() + unread)) + kalibr.notes
-    found = dataclasses.replace(found, views=views, frames=frames, notes=notes)
+    found = dataclasses.replace(found, views=views, frames=frames, notes=notes, shown=_shown(recording, found))
     return dataclasses.replace(found, findings=findings(found))
 
 
@@ -220,6 +221,14 @@ def _choose(imus: dict[str, ImuFacts], sources: Sources, kalibr: KalibrFiles) ->
     named = {k.topic.strip("/") for k in kalibr.imus}
     order = sorted(imus, key=lambda n: (bool(imus[n].problem), sources.imus[n].name.strip("/") not in named))
     return order[0] if order else None
+
+
+def _shown(recording: Recording, found: Inspection) -> dict[str, str]:
+    """What of a target a few images of each camera show, where none is known."""
+    if found.target is not None:
+        return {}
+    cameras = [c for c in found.sources.cameras if c.images and not (c.corners or found.stream(c.topic).problem)]
+    return {c.name: target_in(spread_images(recording, c.images.name)) for c in cameras if c.images}
 
 
 def _views(recording: Recording, found: Inspection, progress: Progress) -> dict[str, TargetView]:

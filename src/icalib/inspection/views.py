@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
+from icalib.detection.board_diagnosis import checkerboard_in
+from icalib.detection.diagnosis import tags_in
 from icalib.detection.streams import find_corners
 from icalib.errors import RecordingError
 from icalib.geometry.targets import Target
@@ -51,6 +53,12 @@ def target_view(
         distance_ratio=ratio,
         notes=notes,
     )
+
+
+def target_in(images: Iterable[np.ndarray]) -> str:
+    """The tags or the checkerboard that images (h, w) uint8 show, in words; "" for neither."""
+    grey = list(images)
+    return tags_in(grey) or checkerboard_in(grey)
 
 
 def coverage(uv: np.ndarray, resolution: tuple[int, int]) -> tuple[tuple[int, ...], ...]:
