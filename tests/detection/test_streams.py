@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icalib.detection import streams
+from icalib.detection import image_work, streams
 from icalib.detection.corners import ImageCorners, no_corners
 from icalib.errors import RecordingError
 from icalib.geometry.targets import AprilGrid
@@ -149,7 +149,7 @@ def test_nothing_is_kept_where_that_is_switched_off_or_cannot_be(detector, tmp_p
 def test_few_images_wait_in_memory(detector, monkeypatch):
     """The reader never runs ahead of the detectors by more than the bound: turns that wait, one that is made, and those
     that are searched."""
-    monkeypatch.setattr(streams, "_workers", lambda: 2)
+    monkeypatch.setattr(image_work, "core_count", lambda: 2)
     monkeypatch.setattr(streams, "IN_TURN", 4)
     recording, ahead = FakeRecording(60), []
     plain = detector.detect
@@ -169,7 +169,7 @@ def test_few_images_wait_in_memory(detector, monkeypatch):
 @pytest.mark.parametrize(("most", "images"), [(1 << 20, 6), (3 * 48, 3), (1, 1)])
 def test_what_leads_the_search_does_not_depend_on_the_number_of_threads(detector, monkeypatch, workers, most, images):
     """Each image is searched after those of its turn, in order: 6 images, or as many as have `most` bytes."""
-    monkeypatch.setattr(streams, "_workers", lambda: workers)
+    monkeypatch.setattr(image_work, "core_count", lambda: workers)
     monkeypatch.setattr(streams, "IN_TURN", 6)
     monkeypatch.setattr(streams, "BYTES_IN_TURN", most)
     led, plain = {}, detector.detect

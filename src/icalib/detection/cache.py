@@ -75,7 +75,7 @@ def keep_arrays(key: str, arrays: Mapping[str, np.ndarray]) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         with staged(folder) as place:
             part = place / f"{key}.npz"
-            np.savez_compressed(part, **arrays)
+            np.savez_compressed(part, **dict[str, Any](arrays))
             part.replace(folder / part.name)
     except OSError:
         return

@@ -17,7 +17,8 @@ from icalib.extras import load_cv2
 from icalib.recordings import DamagedImageError, Payload, Recording, decode
 from icalib.rig import Camera
 
-T, R = TypeVar("T"), TypeVar("R")
+T = TypeVar("T")
+R = TypeVar("R")
 SPREAD = 5  # images that stand for a recording where all would take too long
 Progress = Callable[[float], None]  # the share of the images that is done, 0 to 1
 
@@ -29,7 +30,7 @@ def on_all_cores(turns: Iterable[T], work: Callable[[T], R]) -> Iterator[R]:
         waiting: deque[Future[R]] = deque()
         for turn in turns:
             waiting.append(pool.submit(work, turn))
-            if len(waiting) > _workers():
+            if len(waiting) > core_count():
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
@@ -78,14 +79,14 @@ def noting_files(payloads: Iterable[Payload], files: dict[int, str]) -> Iterator
         yield p
 
 
-def _workers() -> int:
+def core_count() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextmanager
 def _pool() -> Iterator[ThreadPoolExecutor]:
     """When interrupted, what has not begun is dropped."""
-    pool = ThreadPoolExecutor(_workers(), thread_name_prefix="icalib-images")
+    pool = ThreadPoolExecutor(core_count(), thread_name_prefix="icalib-images")
     try:
         yield pool
     finally:

@@ -62,7 +62,7 @@ def _rig(root: YamlValue) -> Rig:
     targeted = "target" in found or "targets" in found
     if blind and not targeted:
         root.fail(
-            "target is missing; add target, targets for several by name, or tracks (a table of followed points) to "
+            "target is missing; add target, targets for several by name, or tracks (images, or a table of tracks) to "
             f"{' and '.join(blind)}."
         )
     _refuse_unseen_ground(found["sensors"], sensors, targeted)

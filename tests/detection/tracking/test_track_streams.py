@@ -65,7 +65,7 @@ def test_tracks_do_not_depend_on_the_number_of_cores(scene, monkeypatch):
     monkeypatch.setattr(streams, "STRETCH", 8)
     found = []
     for cores in (1, 3):
-        monkeypatch.setattr(image_work, "_workers", lambda cores=cores: cores)
+        monkeypatch.setattr(image_work, "core_count", lambda cores=cores: cores)
         found.append(find_tracks(Images(scene.images), CAMERA, keep=False)[0])
     np.testing.assert_array_equal(found[0].feature, found[1].feature)
     np.testing.assert_array_equal(found[0].uv, found[1].uv)

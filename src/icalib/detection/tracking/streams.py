@@ -73,7 +73,9 @@ def find_tracks(
     key = stream_key(read(), f"tracks {VERSION} {camera.model} {lens.tolist()}") if keep else ""
     kept = load_kept(key, (*_COLUMNS, *_COUNTS)) if keep else None
     if kept is not None:
-        found = _Found(*(kept[name] for name in _COLUMNS), *(int(kept[name]) for name in _COUNTS))
+        stamps_ns, start, feature, uv, views = (kept[name] for name in _COLUMNS)
+        moving, in_place = (int(kept[name]) for name in _COUNTS)
+        found = _Found(stamps_ns, start, feature, uv, views, moving, in_place)
     else:
         count, payloads = image_count(recording, topic), read()
         found = _follow(payloads, camera, lens, lambda n: progress(n / max(count, n)))

@@ -7,7 +7,7 @@ track, a check against the epipolar geometry, new corners in empty cells.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -40,6 +40,9 @@ class Followed:
     views: np.ndarray
 
 
+_COLUMNS = ("feature", "uv", "flow", "A", "views")
+
+
 @dataclass(frozen=True)
 class _Tracks:
     """Tracks alive, n of each: feature (n,); uv (n, 2) px; flow (n, 2) px: the last motion, NaN in the first view; A
@@ -59,11 +62,12 @@ class _Tracks:
         return cls(feature, uv.astype(np.float64), np.full((n, 2), np.nan), A, np.zeros(n, np.int64), first)
 
     def some(self, kept: np.ndarray) -> _Tracks:
-        return _Tracks(*(getattr(self, f.name)[kept] for f in fields(self)[:-1]), self.first.some(kept))
+        columns = {name: getattr(self, name)[kept] for name in _COLUMNS}
+        return replace(self, first=self.first.some(kept), **columns)
 
     def joined(self, other: _Tracks) -> _Tracks:
-        columns = [np.concatenate([getattr(t, f.name) for t in (self, other)]) for f in fields(self)[:-1]]
-        return _Tracks(*columns, self.first.joined(other.first))
+        columns = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in _COLUMNS}
+        return replace(self, first=self.first.joined(other.first), **columns)
 
 
 class Tracker:
