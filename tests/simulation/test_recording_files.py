@@ -15,7 +15,7 @@ from icalib.recordings import open_recording
 from icalib.recordings.bag import BagRecording
 from icalib.recordings.streams import point_clouds, read_joints
 from icalib.rig import ImuSensor
-from icalib.simulation import ADIS16448, rig_for, simulate, write_sensors, write_tables
+from icalib.simulation import ADIS16448, handheld, rig_for, simulate, write_sensors, write_tables
 
 from .conftest import on_ground, pose
 
@@ -131,11 +131,25 @@ def test_bags_hold_what_the_drivers_send(simulation, tmp_path, name, monkeypatch
     assert (tmp_path / name / "truth.yaml").exists() == (name == "run")
 
 
+def test_a_bag_without_a_target_shows_the_room(robot, tmp_path):
+    (camera, *_), (lidar,) = robot.cameras, robot.lidars
+    camera = replace(camera, resolution=(80, 60), intrinsics=(50.0, 50.0, 39.5, 29.5))
+    lidar = replace(lidar, azimuth_steps=36)
+    hilly = replace(on_ground(robot, "ramps"), duration_s=0.5, cameras=(camera,), lidars=(lidar,))
+    assert write_sensors(simulate(hilly, 1), 1, tmp_path / "run") == ()
+    bag = BagRecording(tmp_path / "run")
+    images = [image.image for image in bag.images("/cam0/image_raw")]
+    assert len(images) == 9 and min(image.std() for image in images) > 10
+    assert len(list(point_clouds(bag, "/lidar0/points"))) and len(read_joints(bag, "/wheel0/joint_states").stamps_ns)
+
+
 def test_what_no_sensor_sends_is_said(robot, tmp_path):
-    sim = simulate(replace(robot, duration_s=0.5, lidars=(), features=None), 1)
-    notes = write_sensors(sim, 1, tmp_path / "run")
-    assert len(notes) == 2 and "wheel0 reports relative poses" in notes[0] and "no images" in notes[1]
-    instant = replace(on_ground(robot, "planar"), duration_s=0.5, lidars=(), features=None)
+    sim = simulate(replace(robot, duration_s=0.5, lidars=(), features=None, cameras=()), 1)
+    (note,) = write_sensors(sim, 1, tmp_path / "run")
+    assert "wheel0 reports relative poses" in note
+    (note,) = write_sensors(simulate(replace(handheld(0.5), board=False), 1), 1, tmp_path / "dark")
+    assert "there are no images" in note
+    instant = replace(on_ground(robot, "planar"), duration_s=0.5, lidars=(), features=None, cameras=())
     instant = replace(instant, wheels=(replace(instant.wheels[0], meaning="instant"),))
     write_sensors(simulate(instant, 1), 1, tmp_path / "instant")
     assert np.isnan(read_joints(BagRecording(tmp_path / "instant"), "/wheel0/joint_states").position).all()

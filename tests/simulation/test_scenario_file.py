@@ -10,7 +10,7 @@ import pytest
 
 from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid
-from icalib.simulation import Drive, Features, load_scenario, simulate
+from icalib.simulation import Drive, Features, ImageFaults, Texture, load_scenario, simulate
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
 POSE = "[[0, -1, 0, 0.1], [1, 0, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]]"
@@ -36,6 +36,7 @@ sensors:
     intrinsics: [300, 301, 320, 240]
     distortion: [0.6, 1.1]
     noise_px: 0.5
+    dropouts: [[0.4, 0.5], [2, 2.1]]
     T_imu_sensor: {POSE}
   top:
     type: lidar
@@ -72,6 +73,8 @@ room:
   blocks:
     - {{center: [3, 2], size: [1, 1.5, 0.5], yaw_deg: 30, ramp: true}}
     - {{center: [-3, 2], size: [0.5, 0.5, 1]}}
+  texture: {{seed: 2, share: 0.3, contrast: 0.8}}
+images: {{people: 2, gain_steps: [[1, 0.5], [2, 1.5]], frozen: [[1.2, 1.4]], robot_part: 0.1, dirt: 3}}
 features: {{count: 300, lasting: 20, longest_track: 2, per_image: 30, range: 9, seed: 3}}
 target:
   type: aprilgrid
@@ -121,6 +124,8 @@ def test_every_field_arrives(tmp_path):
     assert s.room.size == (8.0, 7.0, 3.0) and s.room.hills is None
     assert (ramp.center, ramp.size, ramp.ramp) == ((3.0, 2.0), (1.0, 1.5, 0.5), True)
     assert ramp.yaw_rad == pytest.approx(np.pi / 6) and (box.yaw_rad, box.ramp) == (0.0, False)
+    assert s.room.texture == Texture(2, 0.3, 0.8) and camera.dropouts == ((0.4, 0.5), (2.0, 2.1))
+    assert s.image_faults == ImageFaults(2, ((1.0, 0.5), (2.0, 1.5)), ((1.2, 1.4),), 0.1, 3)
     assert s.features == Features(300, 20, 2.0, 30, 9.0, 3)
     assert s.board and s.target == AprilGrid(3, 4, 0.1, 0.3, squares=False)
     np.testing.assert_allclose(s.T_world_board, T, atol=1e-12)
@@ -188,6 +193,8 @@ BAD = {
         ("size: [8, 7, 3]\n  slope_deg: 10", "the motion planar is on a flat floor"),
         ("size: [8, 7, 3]\n  slope_deg: 60", "room.slope_deg: must be at most 45 degrees, but is 60"),
     ],
+    "share: 0.3": [("share: 1.3", "room.texture.share: must be at most 1, but is 1.3")],
+    "[1, 0.5]": [("[1, 0]", "images.gain_steps: each is \\[instant, gain\\], with a gain above 0")],
     "lasting: 20": [("lasting: 400", "features: 400 lasting points are more than all 300")],
     "  type: aprilgrid": [
         ("  type: aprilgird", "target.type: there is no target type 'aprilgird', did you mean 'aprilgrid'"),

@@ -2,6 +2,7 @@
 
 from icalib.simulation.corners import CornerTruth
 from icalib.simulation.filming import Film, Shot, film, sheets_of
+from icalib.simulation.image_faults import ImageFaults
 from icalib.simulation.motion import Trajectory
 from icalib.simulation.poses import PoseTruth
 from icalib.simulation.rendering import Imaging, Picture, Renderer, Sheet, SheetTruth, exposure_poses
@@ -14,6 +15,7 @@ from icalib.simulation.sensor_bag import write_sensors
 from icalib.simulation.simulate import Simulation, Truth, simulate
 from icalib.simulation.tables import write_tables
 from icalib.simulation.tag_map import tag_map
+from icalib.simulation.texture import Texture
 from icalib.simulation.tracks import TrackTruth
 from icalib.simulation.wheels import WheelTruth
 from icalib.simulation.writing import write_film
@@ -27,6 +29,7 @@ __all__ = [
     "Film",
     "GuessError",
     "Hills",
+    "ImageFaults",
     "Imaging",
     "Motion",
     "Picture",
@@ -42,6 +45,7 @@ __all__ = [
     "SimPoses",
     "SimWheels",
     "Simulation",
+    "Texture",
     "TrackTruth",
     "Trajectory",
     "Truth",

@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -17,7 +18,11 @@ from icalib.errors import RigError
 from icalib.geometry.targets import Markers, Scene, Tag, Target
 from icalib.measurements import ImuStream
 from icalib.simulation.corners import image_stamps
-from icalib.simulation.rendering import Imaging, Renderer, Sheet, SheetTruth, exposure_poses
+from icalib.simulation.image_faults import faults_of
+from icalib.simulation.imu import inside
+from icalib.simulation.interior import INSTANTS, Interior, RoomRenderer
+from icalib.simulation.people import standing, walking
+from icalib.simulation.rendering import Imaging, Picture, Renderer, Sheet, SheetTruth, exposure_poses
 from icalib.simulation.scenario import Scenario
 from icalib.simulation.simulate import Truth, simulate
 
@@ -50,13 +55,12 @@ class Film:
 
     def shots(self, workers: int | None = None) -> Iterator[Shot]:
         """All images of all cameras in the order in which they are taken. workers: threads; None: all cores."""
-        renderers = [Renderer(camera, self.imaging) for camera in self.scenario.cameras]
-        sheets = sheets_of(self.scenario.target, self.scenario.body_poses)
+        take = self._taker()
         workers = workers or _cores()
         waiting: deque[Future[Shot]] = deque()
         with ThreadPoolExecutor(workers, thread_name_prefix="icalib-render") as pool:
-            for seconds, camera, image, stamp_ns in self._schedule():
-                waiting.append(pool.submit(self._shot, renderers[camera], sheets, (camera, image), stamp_ns, seconds))
+            for frame in self._schedule():
+                waiting.append(pool.submit(self._shot, take, frame))
                 if len(waiting) > _AHEAD * workers:
                     yield waiting.popleft().result()
             while waiting:
@@ -66,24 +70,90 @@ class Film:
         """How many images there are."""
         return len(self._schedule())
 
-    def _schedule(self) -> list[tuple[float, int, int, int]]:
-        """Instant, camera, number of the image and stamp of each image, in time; stamps are those of `simulate`."""
-        due: list[tuple[float, int, int, int]] = []
+    def _schedule(self) -> list[_Frame]:
+        """All images in time; stamps are those of `simulate`."""
+        due: list[_Frame] = []
         for i, camera in enumerate(self.scenario.cameras):
             stamps, seconds = image_stamps(self.scenario, camera, np.random.default_rng([self.seed, 2 + i]))
-            due += [(s, i, k, t) for k, (s, t) in enumerate(zip(seconds.tolist(), stamps.tolist(), strict=True))]
+            shown = _shown(seconds, self.scenario.image_faults.frozen)
+            times = zip(seconds.tolist(), stamps.tolist(), shown.tolist(), strict=True)
+            due += [_Frame(s, i, stamp, int(k), float(seconds[k])) for s, stamp, k in times]
         return sorted(due)
 
-    def _shot(
-        self, renderer: Renderer, sheets: list[Sheet], number: tuple[int, int], stamp_ns: int, seconds: float
-    ) -> Shot:
-        camera, image = number
-        count = 5 if self.exposure_s > 0.0 else 1
-        poses = exposure_poses(renderer.camera, self.truth.trajectory, seconds, self.exposure_s, count)
-        rng = np.random.default_rng([self.seed, 2 + camera, 1 + image])
-        picture = renderer.picture(sheets, poses, rng)
-        uv, seen = (np.concatenate([getattr(sheet, name) for sheet in picture.sheets]) for name in ("uv", "seen"))
-        return Shot(renderer.camera.name, stamp_ns, seconds, picture.pixels, SheetTruth(uv, seen))
+    def _taker(self) -> _Taker:
+        return _Sheets(self) if self.scenario.board else _Room(self)
+
+    def _shot(self, take: _Taker, frame: _Frame) -> Shot:
+        camera = self.scenario.cameras[frame.camera]
+        count = take.instants if self.exposure_s > 0.0 else 1
+        poses = exposure_poses(camera, self.truth.trajectory, frame.taken_s, self.exposure_s, count)
+        picture = take.picture(frame, poses, np.random.default_rng([self.seed, 2 + frame.camera, 1 + frame.shown]))
+        uv = np.concatenate([np.empty((0, 2)), *(sheet.uv for sheet in picture.sheets)])
+        seen = np.concatenate([np.empty(0, dtype=bool), *(sheet.seen for sheet in picture.sheets)])
+        return Shot(camera.name, frame.stamp_ns, frame.seconds, picture.pixels, SheetTruth(uv, seen))
+
+
+class _Frame(NamedTuple):
+    """One image: its instant, number of the camera and stamp; number and instant of the image that it shows, which is
+    an earlier one where the camera is frozen."""
+
+    seconds: float
+    camera: int
+    stamp_ns: int
+    shown: int
+    taken_s: float
+
+
+class _Taker(Protocol):
+    """Takes the pictures of a film."""
+
+    @property
+    def instants(self) -> int:
+        """Poses of an exposure."""
+        ...
+
+    def picture(self, frame: _Frame, poses: np.ndarray, rng: np.random.Generator) -> Picture: ...
+
+
+class _Sheets:
+    """Of printed targets."""
+
+    instants = 5
+
+    def __init__(self, film: Film) -> None:
+        self._renderers = [Renderer(camera, film.imaging) for camera in film.scenario.cameras]
+        self._sheets = sheets_of(film.scenario.target, film.scenario.body_poses)
+
+    def picture(self, frame: _Frame, poses: np.ndarray, rng: np.random.Generator) -> Picture:
+        return self._renderers[frame.camera].picture(self._sheets, poses, rng)
+
+
+class _Room:
+    """Of a room without targets."""
+
+    instants = INSTANTS
+
+    def __init__(self, film: Film) -> None:
+        scenario = film.scenario
+        assert scenario.room is not None
+        self._film, self._people = film, scenario.image_faults.people
+        self._interior = Interior(scenario.room, standing(self._people))
+        self._renderers = [
+            RoomRenderer(camera, film.imaging, faults_of(scenario.image_faults, camera.resolution, i))
+            for i, camera in enumerate(scenario.cameras)
+        ]
+
+    def picture(self, frame: _Frame, poses: np.ndarray, rng: np.random.Generator) -> Picture:
+        scenario, trajectory = self._film.scenario, self._film.truth.trajectory
+        people = walking(self._people, scenario.cameras[0], trajectory, frame.taken_s)
+        gain = scenario.image_faults.gain_at(frame.taken_s)
+        return Picture(self._renderers[frame.camera].grey(self._interior.view(people), poses, gain, rng), ())
+
+
+def _shown(seconds: np.ndarray, frozen: tuple[tuple[float, float], ...]) -> np.ndarray:
+    """(M,) number of the image that each image (M,) shows: itself, or the last before a time in which it is frozen."""
+    fresh = ~inside(frozen, seconds)
+    return np.maximum(np.maximum.accumulate(np.where(fresh, np.arange(len(seconds)), -1)), 0)
 
 
 def sheets_of(target: Target, T_world_bodies: np.ndarray) -> list[Sheet]:
@@ -102,10 +172,13 @@ def sheets_of(target: Target, T_world_bodies: np.ndarray) -> list[Sheet]:
 def film(scenario: Scenario, seed: int, imaging: Imaging | None = None, exposure_s: float = 0.0) -> Film:
     """The scenario as its sensors record it: motion, IMU readings and stamps are those of `simulate`.
 
-    imaging: by default a lens blur of 0.8 px and a noise of 2 grey levels. exposure_s: about the stamp, 5 poses; 0: an
-    instant. What the scenario says of corners (noise, bloom, outliers) has no part in images. Raises RigError for a
-    board that is not flat.
+    A scenario with a room and no target is filmed as the room from the inside, its surfaces textured. imaging: by
+    default a lens blur of 0.8 px and a noise of 2 grey levels. exposure_s: about the stamp, 5 poses, or 4 in a room; 0:
+    an instant. What the scenario says of corners (noise, bloom, outliers) has no part in images. Raises RigError for a
+    board that is not flat, and where there is neither target nor room.
     """
+    if not scenario.board and scenario.room is None:
+        raise RigError("there is nothing to film; give the scenario a target or a room.")
     if any(scenario.bow):
         raise RigError("boards are rendered flat; set the scenario's bow to zero.")
     simulation = simulate(scenario, seed)

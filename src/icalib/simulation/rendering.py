@@ -83,6 +83,48 @@ class Picture:
 
 
 @dataclass(frozen=True, eq=False)
+class Optics:
+    """What a camera makes of the light in `cells` x `cells` cells of each pixel."""
+
+    camera: SimCamera
+    imaging: Imaging
+    cells: int
+
+    @property
+    def pad(self) -> int:
+        """Pixels around the image whose light the blur brings in."""
+        return int(np.ceil(_REACH * self.imaging.blur_px))
+
+    @property
+    def fine_shape(self) -> tuple[int, int]:
+        width, height = self.camera.resolution
+        return (height + 2 * self.pad) * self.cells, (width + 2 * self.pad) * self.cells
+
+    @cached_property
+    def falloff(self) -> np.ndarray:
+        """(H, W) share of the light that arrives."""
+        width, height = self.camera.resolution
+        u, v = np.arange(width) - 0.5 * (width - 1), np.arange(height) - 0.5 * (height - 1)
+        square = u[None] ** 2 + v[:, None] ** 2
+        return 1.0 - self.imaging.vignetting * square / square.max()
+
+    def grey(self, fine: np.ndarray) -> np.ndarray:
+        """(H, W) without noise, of the cells' greys."""
+        width, height = self.camera.resolution
+        grey = np.empty((height, width))
+        shrink(fine, pixel_kernel(self.imaging.blur_px, self.cells, self.pad), self.cells, grey)
+        return grey * (self.imaging.gain * self.falloff)
+
+    def with_noise(self, grey: np.ndarray, rng: np.random.Generator | None) -> np.ndarray:
+        """Raises RigError where noise is wanted without a generator."""
+        if self.imaging.noise <= 0.0:
+            return grey
+        if rng is None:
+            raise RigError("a noisy picture needs a generator of random numbers; give rng.")
+        return grey + self.imaging.noise * rng.standard_normal(grey.shape)
+
+
+@dataclass(frozen=True, eq=False)
 class Renderer:
     """Takes pictures with one camera. What the lens does to the rays is worked out once, at the first picture."""
 
@@ -97,37 +139,23 @@ class Renderer:
         rng: where noise is wanted. Raises RigError where noise is wanted without one.
         """
         poses = np.asarray(T_world_cam, dtype=np.float64).reshape(-1, 4, 4)
-        fine = np.zeros(self._fine_shape, dtype=np.float32)
+        fine = np.zeros(self._optics.fine_shape, dtype=np.float32)
         for pose in poses:
             fine += self._instant(sheets, pose)
-        width, height = self.camera.resolution
-        grey = np.empty((height, width))
-        shrink(fine, pixel_kernel(self.imaging.blur_px, _CELLS, self._pad), _CELLS, grey)
-        grey *= self.imaging.gain * self._falloff / len(poses)
-        if self.imaging.noise > 0.0:
-            if rng is None:
-                raise RigError("a noisy picture needs a generator of random numbers; give rng.")
-            grey += self.imaging.noise * rng.standard_normal(grey.shape)
+        grey = self._optics.with_noise(self._optics.grey(fine) / len(poses), rng)
         return Picture(grey, tuple(self._truth(sheet, poses) for sheet in sheets))
 
-    @property
-    def _pad(self) -> int:
-        """Pixels around the image whose light the blur brings in."""
-        return int(np.ceil(_REACH * self.imaging.blur_px))
-
-    @property
-    def _fine_shape(self) -> tuple[int, int]:
-        width, height = self.camera.resolution
-        return (height + 2 * self._pad) * _CELLS, (width + 2 * self._pad) * _CELLS
+    @cached_property
+    def _optics(self) -> Optics:
+        return Optics(self.camera, self.imaging, _CELLS)
 
     @cached_property
     def _rays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Rays (h, w, 3) through the centres of the pixels and of those around the image, their derivatives by u and
         by v, and (3, h, w, 3) the second ones, by uu, uv and vv."""
         width, height = self.camera.resolution
-        u, v = np.meshgrid(
-            np.arange(-self._pad - 1.0, width + self._pad + 1.0), np.arange(-self._pad - 1.0, height + self._pad + 1.0)
-        )
+        pad = self._optics.pad
+        u, v = np.meshgrid(np.arange(-pad - 1.0, width + pad + 1.0), np.arange(-pad - 1.0, height + pad + 1.0))
         rays = unproject(self.camera, np.stack([u, v], axis=-1))
         by_u, by_v = 0.5 * (rays[1:-1, 2:] - rays[1:-1, :-2]), 0.5 * (rays[2:, 1:-1] - rays[:-2, 1:-1])
         middle = np.ascontiguousarray(rays[1:-1, 1:-1])
@@ -137,17 +165,9 @@ class Renderer:
         by_uv = 0.25 * (rays[2:, 2:] + rays[:-2, :-2] - rays[2:, :-2] - rays[:-2, 2:])
         return middle, by_u, by_v, np.stack([by_uu, by_uv, by_vv])
 
-    @cached_property
-    def _falloff(self) -> np.ndarray:
-        """(H, W) share of the light that arrives."""
-        width, height = self.camera.resolution
-        u, v = np.arange(width) - 0.5 * (width - 1), np.arange(height) - 0.5 * (height - 1)
-        square = u[None] ** 2 + v[:, None] ** 2
-        return 1.0 - self.imaging.vignetting * square / square.max()
-
     def _instant(self, sheets: Sequence[Sheet], T_world_cam: np.ndarray) -> np.ndarray:
         """(H s, W s) greys from one pose, before blur, the border included."""
-        fine = np.full(self._fine_shape, self.imaging.background, dtype=np.float32)
+        fine = np.full(self._optics.fine_shape, self.imaging.background, dtype=np.float32)
         seen_from = [(sheet, np.linalg.inv(sheet.T_world_target) @ T_world_cam) for sheet in sheets]
         for sheet, T_sheet_cam in sorted(seen_from, key=lambda s: -_distance(*s)):
             pattern, R, C = sheet.pattern, T_sheet_cam[:3, :3], T_sheet_cam[:3, 3]

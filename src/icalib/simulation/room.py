@@ -5,6 +5,7 @@ World frame: z up, the origin in the middle of the floor.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -14,6 +15,7 @@ import numpy as np
 from numba import njit
 
 from icalib.errors import RigError
+from icalib.simulation.texture import Texture
 
 _STEPS = 1000  # of a ray's march over hills; one that grazes them for longer meets nothing
 _CLOSE_M = 1e-9  # to the ground, where the march ends
@@ -74,16 +76,17 @@ class Surfaces(NamedTuple):
     amplitude: np.ndarray  # (W,), W = 0: no hills
     wave: np.ndarray  # (W, 2)
     phase: np.ndarray  # (W,)
-    steepest: float
 
 
 @dataclass(frozen=True)
 class Room:
-    """size (x, y, z) [m]. With hills there is no flat floor, and all else reaches down below them."""
+    """size (x, y, z) [m]. With hills there is no flat floor, and all else reaches down below them. texture: what images
+    show of it."""
 
     size: tuple[float, float, float] = (12.0, 10.0, 3.2)
     blocks: tuple[Block, ...] = ()
     hills: Hills | None = None
+    texture: Texture = Texture()
 
     def __post_init__(self) -> None:
         half = np.array(self.size[:2]) / 2.0
@@ -106,10 +109,7 @@ class Room:
         ex, ey, ez = np.diag([x, y, z - self.base])
         flat = [] if self.hills else [(low, ex, ey)]
         shell = [(low + ez, ey, ex), (low, ey, ez), (low + ex, ez, ey), (low, ez, ex), (low + ey, ex, ez)]
-        found = [(*face, np.zeros(3)) for face in flat + shell]
-        for block in self.blocks:
-            found += _ramp(block, self.base) if block.ramp else _box(block, self.base)
-        return np.array(found)
+        return np.concatenate([[(*face, np.zeros(3)) for face in flat + shell], self.faces_of(self.blocks)])
 
     @property
     def planes(self) -> np.ndarray:
@@ -118,20 +118,29 @@ class Room:
 
     @cached_property
     def surfaces(self) -> Surfaces:
-        origin, u, v, mark = np.moveaxis(self.faces, 1, 0)
-        normal = _normals(self.faces)
+        return self.surfaces_with(np.empty((0, 4, 3)))
+
+    def surfaces_with(self, others: np.ndarray) -> Surfaces:
+        """The room's, and faces (n, 4, 3) of what else is in it."""
+        faces = np.concatenate([self.faces, others])
+        origin, u, v, mark = np.moveaxis(faces, 1, 0)
+        normal = _normals(faces)
         area = np.sum(normal * np.cross(u, v), axis=1)[:, None]
         hills = self.hills or Hills((), (), ())
         return Surfaces(
-            self.planes,
+            _with_offset(normal, origin),
             _with_offset(np.cross(v, normal) / area, origin),
             _with_offset(np.cross(normal, u) / area, origin),
             mark[:, 0] > 0.0,
             np.array(hills.amplitude, dtype=np.float64),
             np.array(hills.wave, dtype=np.float64).reshape(-1, 2),
             np.array(hills.phase, dtype=np.float64),
-            hills.steepest if self.hills else 0.0,
         )
+
+    def faces_of(self, blocks: Sequence[Block]) -> np.ndarray:
+        """(n, 4, 3), as `faces`, of blocks that stand in it."""
+        found = [face for b in blocks for face in (_ramp if b.ramp else _box)(b, self.base)]
+        return np.array(found).reshape(-1, 4, 3)
 
     def points(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """(count, 3) points spread over all surfaces by area, hills as if they were flat, and the surfaces' normals
@@ -208,29 +217,38 @@ def nearest(surfaces, px, py, pz, dx, dy, dz):
         if u >= 0.0 and v >= 0.0 and u <= 1.0 and v <= 1.0 and not (surfaces.triangle[f] and u + v > 1.0):
             best, hit = t, f
     if len(surfaces.amplitude):
-        t = _ground(surfaces, px, py, pz, dx, dy, dz, best)
+        t = ground(surfaces, px, py, pz, dx, dy, dz, best)
         if not t >= best:
             return t, -1
     return best, hit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _ground(surfaces, px, py, pz, dx, dy, dz, limit):
-    """Where the ray meets the hills before `limit`, else inf: steps that can never pass through the ground.
-    NaN where they are too many."""
-    t = 0.0
-    closing = surfaces.steepest * np.sqrt(dx * dx + dy * dy) - dz  # how fast the ray can near the ground at most
-    if closing <= 0.0:
+def ground(surfaces, px, py, pz, dx, dy, dz, limit):
+    """t at which the ray meets the hills before `limit`, else inf; NaN where it takes too many steps.
+
+    The height above the ground has a second derivative of at most `bend` along the ray. Each step ends where a parabola
+    of that curvature would meet the ground first: it never passes through, and near the end it is Newton's.
+    """
+    bend, highest = 0.0, 0.0
+    for w in range(len(surfaces.amplitude)):
+        turn = surfaces.wave[w, 0] * dx + surfaces.wave[w, 1] * dy
+        bend += abs(surfaces.amplitude[w]) * turn * turn
+        highest += abs(surfaces.amplitude[w])
+    t = max((highest - pz) / dz, 0.0) if dz < 0.0 else 0.0
+    if (pz > highest and dz >= 0.0) or t >= limit:
         return np.inf
     for _ in range(_STEPS):
-        gap = pz + t * dz
+        gap, slope = pz + t * dz, dz
         for w in range(len(surfaces.amplitude)):
-            k = surfaces.wave[w]
-            angle = k[0] * (px + t * dx) + k[1] * (py + t * dy) + surfaces.phase[w]
-            gap -= surfaces.amplitude[w] * np.sin(angle)
+            kx, ky, amplitude = surfaces.wave[w, 0], surfaces.wave[w, 1], surfaces.amplitude[w]
+            angle = kx * (px + t * dx) + ky * (py + t * dy) + surfaces.phase[w]
+            gap -= amplitude * np.sin(angle)
+            slope -= amplitude * np.cos(angle) * (kx * dx + ky * dy)
         if gap < _CLOSE_M:
             return t
-        t += gap / closing
+        root = np.sqrt(slope * slope + 2.0 * bend * gap)
+        t += (slope + root) / bend if slope > 0.0 else 2.0 * gap / (root - slope)
         if t >= limit:
             return np.inf
     return np.nan

@@ -10,6 +10,7 @@ import numpy as np
 from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Target
 from icalib.rig import ImuNoise
+from icalib.simulation.image_faults import ImageFaults
 from icalib.simulation.robot import Drive, Features, SimLidar, SimPoses, SimWheels
 from icalib.simulation.room import Room
 
@@ -156,6 +157,7 @@ class Scenario:
     lidars: tuple[SimLidar, ...] = ()
     wheels: tuple[SimWheels, ...] = ()
     poses: tuple[SimPoses, ...] = ()
+    image_faults: ImageFaults = ImageFaults()
     robot_noise_enabled: bool = True  # of tracks, LiDARs, wheels and pose sensors
     seed: int = 0  # where none is asked for
 

@@ -13,11 +13,13 @@ from icalib.errors import RigError
 from icalib.file_names import NAME, NAME_WORDS
 from icalib.geometry.targets import TARGETS
 from icalib.rig import ImuNoise
+from icalib.simulation.image_faults import ImageFaults
 from icalib.simulation.projection import PARAMETER_COUNTS
 from icalib.simulation.robot import Drive, DriveKind, Features, SimLidar, SimPoses, SimWheels
 from icalib.simulation.room import Block, Room, hills_of_slope
 from icalib.simulation.scenario import MODELS, Scenario, SimCamera, pose_from_rows
 from icalib.simulation.size import refuse_large
+from icalib.simulation.texture import Texture
 from icalib.yaml_nodes import MOST_WHOLE, YamlValue, read_yaml
 
 _SENSOR_TYPES = ("imu", "camera", "lidar", "wheels", "pose")
@@ -34,7 +36,7 @@ Made = TypeVar("Made")
 def load_scenario(path: str | Path) -> Scenario:
     """Read a scenario file. Raises RigError, one sentence naming file, line, field, what is wrong and what to do."""
     root = read_yaml(Path(path), "scenario file")
-    found = root.record(("duration", "sensors", "room", "motion"), ("features", "target", "seed", "start_ns"))
+    found = root.record(("duration", "sensors", "room", "motion"), ("features", "target", "images", "seed", "start_ns"))
     start_ns = found["start_ns"].whole(0) if "start_ns" in found else _START_NS
     duration_s = found["duration"].positive()
     if start_ns + _MARGIN_S * 1e9 + duration_s * 1e9 > MOST_WHOLE:
@@ -52,6 +54,7 @@ def load_scenario(path: str | Path) -> Scenario:
         room=room,
         features=features,
         seed=found["seed"].whole(0) if "seed" in found else 0,
+        image_faults=_image_faults(found["images"]) if "images" in found else ImageFaults(),
         **sensors,
         **board,
     )
@@ -122,7 +125,7 @@ def _clock(found: dict[str, YamlValue], start_ns: int) -> dict[str, Any]:
 
 def _camera(name: str, value: YamlValue, start_ns: int) -> SimCamera:
     required = ("type", *_CLOCK, "model", "resolution", "intrinsics", "distortion", "noise_px")
-    found = value.record(required, _CLOCK_OPTIONS)
+    found = value.record(required, (*_CLOCK_OPTIONS, "dropouts"))
     model = found["model"].choice("camera model", MODELS)
     sides = found["resolution"].items()
     if len(sides) != 2:
@@ -135,6 +138,7 @@ def _camera(name: str, value: YamlValue, start_ns: int) -> SimCamera:
         tuple(found["distortion"].vector(PARAMETER_COUNTS[model]).tolist()),
         _pose(found["T_imu_sensor"]),
         corner_noise_px=_least(found["noise_px"], 0.0),
+        dropouts=_intervals(found["dropouts"]) if "dropouts" in found else (),
         **_clock(found, start_ns),
     )
 
@@ -200,7 +204,7 @@ def _poses(name: str, value: YamlValue, start_ns: int) -> SimPoses:
 
 
 def _room(value: YamlValue) -> Room:
-    found = value.record(("size",), ("blocks", "slope_deg"))
+    found = value.record(("size",), ("blocks", "slope_deg", "texture"))
     blocks = tuple(_block(block) for block in found["blocks"].items()) if "blocks" in found else ()
     hills = None
     if "slope_deg" in found:
@@ -208,7 +212,31 @@ def _room(value: YamlValue) -> Room:
         if slope > _STEEPEST_DEG:
             found["slope_deg"].fail(f"must be at most {_STEEPEST_DEG:g} degrees, but is {slope:g}.")
         hills = hills_of_slope(slope)
-    return _made(value, Room, size=_triple(found["size"]), blocks=blocks, hills=hills)
+    texture = _texture(found["texture"]) if "texture" in found else Texture()
+    return _made(value, Room, size=_triple(found["size"]), blocks=blocks, hills=hills, texture=texture)
+
+
+def _texture(value: YamlValue) -> Texture:
+    found = value.record((), ("seed", "share", "contrast"))
+    chosen: dict[str, Any] = {key: _share(found[key]) for key in ("share", "contrast") if key in found}
+    if "seed" in found:
+        chosen["seed"] = found["seed"].whole(0)
+    return Texture(**chosen)
+
+
+def _image_faults(value: YamlValue) -> ImageFaults:
+    found = value.record((), ("people", "gain_steps", "frozen", "robot_part", "dirt"))
+    chosen: dict[str, Any] = {key: found[key].whole(0) for key in ("people", "dirt") if key in found}
+    if "gain_steps" in found:
+        steps = [step.vector(2).tolist() for step in found["gain_steps"].items()]
+        if any(gain <= 0.0 for _, gain in steps):
+            found["gain_steps"].fail("each is [instant, gain], with a gain above 0; correct it.")
+        chosen["gain_steps"] = tuple(map(tuple, steps))
+    if "frozen" in found:
+        chosen["frozen"] = _intervals(found["frozen"])
+    if "robot_part" in found:
+        chosen["robot_part"] = _share(found["robot_part"])
+    return ImageFaults(**chosen)
 
 
 def _block(value: YamlValue) -> Block:
@@ -278,6 +306,17 @@ def _least(value: YamlValue, least: float) -> float:
     if number < least:
         value.fail(f"must be at least {least:g}, but is {number:g}.")
     return number
+
+
+def _share(value: YamlValue) -> float:
+    share = _least(value, 0.0)
+    if share > 1.0:
+        value.fail(f"must be at most 1, but is {share:g}.")
+    return share
+
+
+def _intervals(value: YamlValue) -> tuple[tuple[float, float], ...]:
+    return tuple(_interval(item) for item in value.items())
 
 
 def _interval(value: YamlValue) -> tuple[float, float]:

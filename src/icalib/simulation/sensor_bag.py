@@ -31,8 +31,8 @@ def write_sensors(
     bag of ROS 1, and has no truth.
 
     Topics are /imu0 (Imu), /NAME/points (PointCloud2: x, y, z and `time` [s] from the stamp), /NAME/joint_states
-    (JointState) or /NAME/twist (TwistStamped), /NAME/pose (PoseStamped) and, where a target stands in the scene,
-    /NAME/image_raw (Image, mono8).
+    (JointState) or /NAME/twist (TwistStamped), /NAME/pose (PoseStamped) and /NAME/image_raw (Image, mono8) of the
+    target, or without one of the room.
     Returns sentences on what was left out. Raises RecordingError where `path` exists or cannot be written,
     CalibrationError where a package is missing, RigError for a board that is not flat.
     """
@@ -74,11 +74,11 @@ def _streams(simulation: Simulation, seed: int) -> tuple[dict[str, str], list[It
     for poses in measured.poses:
         topics[f"/{poses.name}/pose"] = POSE
         streams.append(_poses(poses, round(truth.time_offset[poses.name] * 1e9)))
-    if simulation.scenario.board:
+    if simulation.scenario.board or simulation.scenario.room:
         topics |= {f"/{camera.name}/image_raw": IMAGE for camera in simulation.scenario.cameras}
         streams.append(_images(simulation, seed))
     elif simulation.scenario.cameras:
-        notes.append("images show nothing but targets; the scenario has none, and so there are no images.")
+        notes.append("images show targets or a room; the scenario has neither, and so there are no images.")
     return topics, streams, tuple(notes)
 
 

@@ -1,0 +1,247 @@
+"""Compiled: the light that each cell of a grid finer than the pixels receives from the surfaces of a room.
+
+Each cell has the ray of its own middle. Tiles of the image are told first which faces they can see at all, by the
+planes of the pyramid through the tile; a cell then takes the nearest of these. Its light is that of the parallelogram
+that it covers on the surface: samples along the longer axis of its footprint, each from the two levels of the pyramid
+of averages whose texels are as large as the shorter axis (Heckbert 1989, McCormack et al. 1999).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from icalib.simulation.room import Surfaces, ground
+from icalib.simulation.texture import Atlas
+
+CELLS = 2  # a pixel, along each axis
+TILE = 16  # pixels
+_MOST_SAMPLES = 8  # of a cell, along its footprint's longer axis
+
+
+class Lens(NamedTuple):
+    """rays (h s, w s, 3) of the cells of h x w pixels, any length, NaN: none; by_u, by_v (h, w, 3): derivatives by a
+    pixel; sides (tiles down, tiles across, 4, 3): normals of each tile's pyramid, into it; zeros: it has no rays."""
+
+    rays: np.ndarray
+    by_u: np.ndarray
+    by_v: np.ndarray
+    sides: np.ndarray
+
+
+class Tone(NamedTuple):
+    """Greys of texture 0 and 1, and of where nothing is seen."""
+
+    black: float
+    white: float
+    background: float
+
+
+class View(NamedTuple):
+    """What is seen. faces (F, 15): plane n, d; a, a0, b, b0 of the place on the texture, X = a . p - a0, Y = b . p - b0
+    [texels]; its width and height; 1.0: a triangle. vertices (F, 4, 3), the last of a triangle twice. ground (4,):
+    X = g0 x + g1, Y = g2 y + g3 on the hills, whose texture is the last. surfaces: of the hills."""
+
+    faces: np.ndarray
+    vertices: np.ndarray
+    ground: np.ndarray
+    surfaces: Surfaces
+    atlas: Atlas
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def light(view, lens, tone, R, C, fine):
+    """Fills fine (h s, w s) with greys. R (s s, 3, 3), C (s s, 3): rotation and place of the camera in the world at the
+    instant at which cell (a, b) of each pixel, a s + b, takes its light."""
+    chosen = np.empty(len(view.vertices), dtype=np.int64)
+    for row in range(lens.sides.shape[0]):
+        for col in range(lens.sides.shape[1]):
+            count = _faces_of_tile(view, lens.sides[row, col], R, C, chosen)
+            for i in range(row * TILE, min((row + 1) * TILE, lens.by_u.shape[0])):
+                for j in range(col * TILE, min((col + 1) * TILE, lens.by_u.shape[1])):
+                    _pixel(view, lens, tone, R, C, chosen[:count], i, j, fine)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _faces_of_tile(view, sides, R, C, chosen):
+    """Fills `chosen` with the faces that the tile may see from any of the poses; how many they are."""
+    count = 0
+    plane = view.faces
+    for f in range(len(plane)):
+        for k in range(len(R)):
+            c = C[k]
+            if plane[f, 0] * c[0] + plane[f, 1] * c[1] + plane[f, 2] * c[2] <= plane[f, 3]:
+                continue
+            if _reaches(view.vertices[f], sides, R[k], c):
+                chosen[count] = f
+                count += 1
+                break
+    return count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _reaches(vertices, sides, R, c):
+    """False where all vertices are on the outer side of one of the pyramid's planes."""
+    for k in range(4):
+        x = R[0, 0] * sides[k, 0] + R[0, 1] * sides[k, 1] + R[0, 2] * sides[k, 2]
+        y = R[1, 0] * sides[k, 0] + R[1, 1] * sides[k, 1] + R[1, 2] * sides[k, 2]
+        z = R[2, 0] * sides[k, 0] + R[2, 1] * sides[k, 1] + R[2, 2] * sides[k, 2]
+        outside = True
+        for v in range(4):
+            if x * (vertices[v, 0] - c[0]) + y * (vertices[v, 1] - c[1]) + z * (vertices[v, 2] - c[2]) > 0.0:
+                outside = False
+        if outside:
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _pixel(view, lens, tone, R, C, chosen, i, j, fine):
+    """The cells of one pixel; their footprint is worked out once for each face that they see."""
+    last, plan = -2, (0.0, 0.0, 0.0, 1)
+    for a in range(CELLS):
+        for b in range(CELLS):
+            k, m, n = a * CELLS + b, i * CELLS + a, j * CELLS + b
+            d = _turned(R, k, lens.rays[m, n, 0], lens.rays[m, n, 1], lens.rays[m, n, 2])
+            c = C[k, 0], C[k, 1], C[k, 2]
+            t, face, X, Y = _nearest(view.faces, chosen, c, d)
+            if len(view.surfaces.amplitude):
+                on_ground = ground(view.surfaces, c[0], c[1], c[2], d[0], d[1], d[2], t)
+                if not on_ground >= t:
+                    t, face = on_ground, -1
+                    X = view.ground[0] * (c[0] + t * d[0]) + view.ground[1]
+                    Y = view.ground[2] * (c[1] + t * d[1]) + view.ground[3]
+            if not t < np.inf:
+                fine[m, n] = tone.background
+                continue
+            if face != last:
+                u = _turned(R, k, lens.by_u[i, j, 0], lens.by_u[i, j, 1], lens.by_u[i, j, 2])
+                v = _turned(R, k, lens.by_v[i, j, 0], lens.by_v[i, j, 1], lens.by_v[i, j, 2])
+                scale = _scale(view, face, c[0] + t * d[0], c[1] + t * d[1])
+                plan = _plan(scale, d, u, v, t / CELLS)
+                last = face
+            share = _mean(view.atlas, face, X, Y, plan)
+            fine[m, n] = tone.black + share * (tone.white - tone.black)
+
+
+@njit(cache=True, nogil=True)
+def _turned(R, k, x, y, z):
+    return (
+        R[k, 0, 0] * x + R[k, 0, 1] * y + R[k, 0, 2] * z,
+        R[k, 1, 0] * x + R[k, 1, 1] * y + R[k, 1, 2] * z,
+        R[k, 2, 0] * x + R[k, 2, 1] * y + R[k, 2, 2] * z,
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _nearest(faces, chosen, c, d):
+    """Distance in units of d to the nearest of the chosen faces, its number, and the place on its texture [texels]; the
+    distance is infinite where there is none."""
+    best, hit, X, Y = np.inf, -1, 0.0, 0.0
+    for m in range(len(chosen)):
+        f = chosen[m]
+        towards = faces[f, 0] * d[0] + faces[f, 1] * d[1] + faces[f, 2] * d[2]
+        if not towards < 0.0:
+            continue
+        t = (faces[f, 3] - faces[f, 0] * c[0] - faces[f, 1] * c[1] - faces[f, 2] * c[2]) / towards
+        if t <= 0.0 or t >= best:
+            continue
+        x, y, z = c[0] + t * d[0], c[1] + t * d[1], c[2] + t * d[2]
+        u = faces[f, 4] * x + faces[f, 5] * y + faces[f, 6] * z - faces[f, 7]
+        v = faces[f, 8] * x + faces[f, 9] * y + faces[f, 10] * z - faces[f, 11]
+        W, H = faces[f, 12], faces[f, 13]
+        if u >= 0.0 and v >= 0.0 and u <= W and v <= H and not (faces[f, 14] > 0.0 and u * H + v * W > W * H):
+            best, hit, X, Y = t, f, u, v
+    return best, hit, X, Y
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _scale(view, face, x, y):
+    """The gradients of X and Y [texels/m], and the normal, of any length, at x, y."""
+    if face >= 0:
+        f = view.faces
+        return (
+            (f[face, 4], f[face, 5], f[face, 6]),
+            (f[face, 8], f[face, 9], f[face, 10]),
+            (f[face, 0], f[face, 1], f[face, 2]),
+        )
+    s, nx, ny = view.surfaces, 0.0, 0.0
+    for w in range(len(s.amplitude)):
+        rise = s.amplitude[w] * np.cos(s.wave[w, 0] * x + s.wave[w, 1] * y + s.phase[w])
+        nx -= rise * s.wave[w, 0]
+        ny -= rise * s.wave[w, 1]
+    return (view.ground[0], 0.0, 0.0), (0.0, view.ground[2], 0.0), (nx, ny, 1.0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _plan(scale, d, d_u, d_v, length):
+    """The longer axis of a cell's footprint (x, y) [texels], the level of the pyramid, and how many samples.
+
+    length: distance times the cell's width [px]. The footprint is the image of a square; its axes are the singular
+    values of the derivative.
+    """
+    A, B, n = scale
+    along = n[0] * d[0] + n[1] * d[1] + n[2] * d[2]
+    q_u = (n[0] * d_u[0] + n[1] * d_u[1] + n[2] * d_u[2]) / along
+    q_v = (n[0] * d_v[0] + n[1] * d_v[1] + n[2] * d_v[2]) / along
+    d_A = A[0] * d[0] + A[1] * d[1] + A[2] * d[2]
+    d_B = B[0] * d[0] + B[1] * d[1] + B[2] * d[2]
+    Xu = length * (A[0] * d_u[0] + A[1] * d_u[1] + A[2] * d_u[2] - q_u * d_A)
+    Yu = length * (B[0] * d_u[0] + B[1] * d_u[1] + B[2] * d_u[2] - q_u * d_B)
+    Xv = length * (A[0] * d_v[0] + A[1] * d_v[1] + A[2] * d_v[2] - q_v * d_A)
+    Yv = length * (B[0] * d_v[0] + B[1] * d_v[1] + B[2] * d_v[2] - q_v * d_B)
+    xx, yy, xy = Xu * Xu + Xv * Xv, Yu * Yu + Yv * Yv, Xu * Yu + Xv * Yv
+    half = 0.5 * (xx - yy)
+    apart = np.sqrt(half * half + xy * xy)
+    long = 0.5 * (xx + yy) + apart
+    longer, shorter = np.sqrt(long), np.sqrt(max(long - 2.0 * apart, 0.0))
+    count = min(int(np.ceil(longer / max(shorter, 1.0))), _MOST_SAMPLES)
+    x, y = (apart + half, xy) if half > 0.0 else (xy, apart - half)  # along the longer axis
+    norm = np.sqrt(x * x + y * y)
+    if norm > 0.0:
+        x, y = x / norm, y / norm
+    return longer * x, longer * y, _level(max(shorter, longer / count)), count
+
+
+@njit(cache=True, nogil=True)
+def _level(width):
+    """Binary logarithm of a width above 1, straight between powers of 2; 0 of any below."""
+    level = 0.0
+    while width >= 2.0:
+        width *= 0.5
+        level += 1.0
+    return level + max(width - 1.0, 0.0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _mean(atlas, face, X, Y, plan):
+    """The mean over the footprint about X, Y [texels of level 0]."""
+    x, y, level, count = plan
+    low = min(int(level), atlas.first.shape[1] - 1)
+    high = min(low + 1, atlas.first.shape[1] - 1)
+    share, total = level - low, 0.0
+    for k in range(count):
+        step = (k + 0.5) / count - 0.5
+        grey = _between(atlas, face, low, X + step * x, Y + step * y)
+        if share > 0.0:
+            grey += share * (_between(atlas, face, high, X + step * x, Y + step * y) - grey)
+        total += grey
+    return total / (count * 65535.0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _between(atlas, face, level, X, Y):
+    """Bilinear among the four texels around X, Y [texels of level 0]."""
+    W, H, first = atlas.width[face, level], atlas.height[face, level], atlas.first[face, level]
+    shrunk = 1.0 / (1 << level)
+    x, y = min(max(X * shrunk - 0.5, 0.0), W - 1.0), min(max(Y * shrunk - 0.5, 0.0), H - 1.0)
+    i, j = int(x), int(y)
+    fx, fy = x - i, y - j
+    below, right = first + j * W + i, 1 if i + 1 < W else 0
+    above = below + (W if j + 1 < H else 0)
+    g = atlas.texels
+    return (1.0 - fy) * ((1.0 - fx) * g[below] + fx * g[below + right]) + fy * (
+        (1.0 - fx) * g[above] + fx * g[above + right]
+    )
