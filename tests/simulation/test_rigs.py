@@ -51,6 +51,13 @@ def test_rig_states_truth_and_noise():
     np.testing.assert_array_equal(rig.imu.intrinsics.value, np.zeros(24))
 
 
+def test_cameras_of_a_room_track_images_where_there_are_no_tables_of_tracks():
+    scenario = load_scenario(EXAMPLES / "table2-3d.yaml")
+    assert rig_for(scenario).cameras[0].tracks == "cam0/tracks.csv"
+    assert {c.tracks for c in rig_for(replace(scenario, features=None)).cameras} == {"images"}
+    assert rig_for(replace(scenario, features=None, board=True)).cameras[0].tracks is None
+
+
 def test_a_rig_that_is_told_nothing_of_slip_allows_for_what_real_wheels_may_have():
     scenario = load_scenario(EXAMPLES / "table2-ramp.yaml")
     for told, expected in ((None, Wheels.sideways_slip), (1e-4, 1e-4)):

@@ -8,7 +8,7 @@ from typing import Literal, TypeVar
 import numpy as np
 
 from icalib.geometry.targets import NoTarget
-from icalib.rig import Camera, ImuSensor, Lidar, Parameter, PoseSensor, Rig, Settings, Wheels
+from icalib.rig import TRACK_IMAGES, Camera, ImuSensor, Lidar, Parameter, PoseSensor, Rig, Settings, Wheels
 from icalib.simulation.imu import rotation_from_vector
 from icalib.simulation.robot import SimLidar, SimPoses, SimWheels
 from icalib.simulation.scenario import GRAVITY_WORLD, Scenario, SimCamera
@@ -59,8 +59,9 @@ def rig_for(
 ) -> Rig:
     """The scenario's rig, noise as simulated (as stated by the scenario, where its noise is switched off).
 
-    Each group of parameters, of all cameras alike: "free" (no guess), "start" (free, from the truth), "fixed" (at the
-    truth), or a Parameter. settings: by default those of `settings_for`.
+    Cameras in a room without target and without `features` track its images. Each group of parameters, of all cameras
+    alike: "free" (no guess), "start" (free, from the truth), "fixed" (at the truth), or a Parameter. settings: by
+    default those of `settings_for`.
     """
 
     treated = _Treated(scenario, rotation, translation, time_offset, intrinsics, distortion, bloom, drive)
@@ -90,6 +91,11 @@ class _Treated:
     bloom: Treatment
     drive: Treatment
 
+    def _tracks(self, sim: SimCamera) -> str | None:
+        if self.scenario.features is not None:
+            return f"{sim.name}/tracks.csv"
+        return None if self.scenario.board or self.scenario.room is None else TRACK_IMAGES
+
     def camera(self, sim: SimCamera) -> Camera:
         return Camera(
             sim.name,
@@ -97,7 +103,7 @@ class _Treated:
             sim.model,
             sim.resolution,
             corner_noise_px=sim.corner_noise_px,
-            tracks=None if self.scenario.features is None else f"{sim.name}/tracks.csv",
+            tracks=self._tracks(sim),
             track_noise_px=None if self.scenario.features is None else sim.corner_noise_px,
             rotation=_parameter(self.rotation, sim.T_imu_cam[:3, :3]),
             translation=_parameter(self.translation, sim.T_imu_cam[:3, 3]),
