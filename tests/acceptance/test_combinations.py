@@ -55,8 +55,6 @@ def refusal(sees: str, imu: bool, others: str, known: str) -> str:
         return "mocap0 is alone"
     if not imu and sees == "tracks":
         return "how large the scene is"
-    if sees == "tracks" and known == "nothing":
-        return "do not show its intrinsics from nothing; give a guess of intrinsics"
     return ""
 
 

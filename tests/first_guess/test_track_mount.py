@@ -15,7 +15,7 @@ from icalib.estimation.imu_data import ImuData
 from icalib.estimation.inputs import inputs_for
 from icalib.estimation.state import State
 from icalib.first_guess.by_recording import one_after_another
-from icalib.first_guess.track_mount import NEAREST_M, _misses, _slopes
+from icalib.first_guess.track_mount import NEAREST_M, _misses, lens_slopes
 from icalib.first_guess.tracks_on_motion import track_camera_values
 from icalib.geometry.cameras import camera_model
 from icalib.rig import Parameter
@@ -219,7 +219,7 @@ def test_slopes_of_rays_are_those_of_the_rays_of_another_lens(name: str, distort
     uv = np.vstack([rng.uniform([100, 60], [640, 430], (200, 2)), [np.nan, np.nan]])
     rays, valid = model.unproject(lens, uv)
     assert valid[:-1].all() and not valid[-1]
-    slopes = _slopes(model, lens, directions, np.where(valid[:, None], rays, 0.0))
+    slopes = lens_slopes(model, lens, directions, np.where(valid[:, None], rays, 0.0))
     for direction, found in zip(directions, slopes, strict=True):
         (up, _), (down, _) = (model.unproject(lens + d * direction, uv[:-1]) for d in (h, -h))
         np.testing.assert_allclose(found[:-1], (up - down) / (2.0 * h), atol=1e-8)

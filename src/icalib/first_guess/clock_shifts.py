@@ -24,13 +24,17 @@ MOST_LEFT = 0.5  # of the spread of angles turned in long intervals
 @dataclass(frozen=True)
 class CameraRates:
     """Mean angular rates between neighbouring images: start, end (n,) camera clock [s]; rate (n, 3) camera axes
-    [rad/s]; least_correlation: with the IMU's, below which the two do not match; longest_step_s: between neighbours."""
+    [rad/s]; least_correlation: with the IMU's, below which the two do not match; longest_step_s: between neighbours.
+    noise: standard deviation [rad/s] about each axis, where it is known; offsets [s]: at which they go with the IMU's
+    by regression, best first, where this was sought."""
 
     start: np.ndarray
     end: np.ndarray
     rate: np.ndarray
     least_correlation: float = LEAST_CORRELATION
     longest_step_s: float = LONGEST_STEP_S
+    noise: float = 0.0
+    offsets: tuple[float, ...] | None = None
 
     @property
     def are_slow(self) -> bool:
@@ -52,9 +56,12 @@ def longest_step(name: str, seconds: np.ndarray, what: str, slowest_s: float = S
 
 def likely_offsets(imu: ImuData, name: str, rates: CameraRates) -> list[float]:
     """Offsets [s] at peaks of the masked, normalised cross-correlation of |w| over all shifts, of rates as they are or
-    of their means, whichever is higher at its best: fast motion shows in the ones, slow motion in the others."""
+    of their means, whichever is higher at its best: fast motion shows in the ones, slow motion in the others. Where
+    they were sought by regression, these."""
     if rates.are_slow:
         return _slow(imu, name, rates)
+    if rates.offsets:
+        return list(rates.offsets)
     peaks = max(_shifts(imu, rates), key=lambda p: _likeness(p[0]))
     if not peaks[0].correlation > rates.least_correlation:
         raise EstimationError(
@@ -94,6 +101,8 @@ def how_alike(largest: float) -> str:
 
 def best_offsets(imu: ImuData, rates: CameraRates) -> list[float]:
     """Offsets [s] at which rates, and means of them, go together best, however little that is."""
+    if rates.offsets:
+        return list(rates.offsets)
     if rates.are_slow:
         return [offset for offset, _ in slow_offsets(imu, rates.start, rates.end, rates.rate)]
     return [p[0].samples / GRID_HZ for p in _shifts(imu, rates) if np.isfinite(p[0].correlation)]

@@ -20,6 +20,7 @@ from icalib.first_guess.clock_shifts import (
 )
 from icalib.first_guess.clock_steps import refuse_steps
 from icalib.first_guess.mean_rates import MeanRates
+from icalib.first_guess.rate_shifts import NORM_MEDIAN, noise_beside, unlike
 from icalib.first_guess.slow_rates import ChainedRates
 from icalib.first_guess.target_poses import TargetPoses
 from icalib.geometry import so3
@@ -80,8 +81,10 @@ def align(imu: ImuData, name: str, rates: CameraRates, given_offset: float | Non
     """Offset, rotation and gyro bias. Raises EstimationError where the rates do not match at any shift."""
     _check_motion(imu, name, rates)
     keep = given_offset is not None
+    if rates.offsets == () and not keep:
+        raise unlike(imu, name, rates)
     best, *others = likely_offsets(imu, name, rates) if given_offset is None else [given_offset]
-    offsets = [best, *(x for x in others if _covered(imu, rates, x).any())]
+    offsets = [best, *(x for x in others if covered(imu, rates, x).any())]
     # In a short recording the sizes of the rates may be more alike elsewhere, but not their directions.
     (alike, found), averaged = _alike(imu, [_align_near(imu, name, rates, x, keep) for x in offsets])
     refuse_steps(imu, name, alike, found.offset, lambda part, offset: _left_at(imu, part, found, offset))
@@ -111,8 +114,8 @@ def _align_near(
 ) -> tuple[CameraRates, Alignment]:
     """From one offset: the rates, as large as the gyroscope's where a guessed lens makes them too large or too small,
     and how they go together."""
-    if not _covered(imu, rates, offset).any():
-        raise _no_overlap(imu, name)
+    if not covered(imu, rates, offset).any():
+        raise no_overlap(imu, name)
     pair = _side_by_side(imu, rates, offset)
     _check_degrees(imu, name, *pair)
     rough = _rough(offset, *pair)
@@ -129,11 +132,11 @@ def rough_alignments(
     _check_motion(imu, name, rates)
     if offsets is None:
         offsets = [*best_offsets(imu, rates), guess]
-    offsets = [x for x in dict.fromkeys(offsets) if _covered(imu, rates, x).any()]
+    offsets = [x for x in dict.fromkeys(offsets) if covered(imu, rates, x).any()]
     return [_rough(x, *_side_by_side(imu, rates, x)) for x in offsets]
 
 
-def _covered(imu: ImuData, rates: CameraRates, offset: float) -> np.ndarray:
+def covered(imu: ImuData, rates: CameraRates, offset: float) -> np.ndarray:
     """(n,) bool: image intervals within the IMU's recording and none of its gaps."""
     start, end = rates.start + offset, rates.end + offset
     inside = (start >= imu.seconds[0]) & (end <= imu.seconds[-1])
@@ -154,16 +157,19 @@ def _check_offset(imu: ImuData, name: str, unexplained: float, given: bool) -> N
 
 
 def _unexplained(imu: ImuData, rates: CameraRates, found: Alignment, averaged: float = AVERAGED_S) -> float:
-    """Share of the angular rate that the camera did not see, of means over `averaged` seconds."""
+    """Share of the angular rate that the camera did not see, of means over `averaged` seconds, beyond the noise of the
+    camera's rates, where it is known."""
     gyro, seen = _side_by_side(imu, rates, found.offset, averaged)
     gyro, seen = gyro - found.gyro_bias, seen @ found.rotation.T
-    return float(np.median(np.linalg.norm(gyro - seen, axis=1)) / np.median(np.linalg.norm(gyro, axis=1)))
+    left = float(np.median(np.linalg.norm(gyro - seen, axis=1)))
+    left = np.sqrt(max(left**2 - (NORM_MEDIAN * noise_beside(imu, rates, averaged)) ** 2, 0.0))
+    return float(left / np.median(np.linalg.norm(gyro, axis=1)))
 
 
 def _left_at(imu: ImuData, rates: CameraRates, found: Alignment, offset: float) -> float:
     """What is unexplained of some of the rates at another offset; infinite where the IMU was not running."""
     there = replace(found, offset=offset)
-    return _unexplained(imu, rates, there) if _covered(imu, rates, offset).any() else np.inf
+    return _unexplained(imu, rates, there) if covered(imu, rates, offset).any() else np.inf
 
 
 def _side_by_side(
@@ -171,7 +177,7 @@ def _side_by_side(
 ) -> tuple[np.ndarray, np.ndarray]:
     """(n, 3) each, rad/s in own axes: what the gyroscope and the camera have, both as means over some images: a rate
     between neighbours has little but noise where the target is far or the motion slow."""
-    inside = _covered(imu, rates, offset)
+    inside = covered(imu, rates, offset)
     start, end = rates.start[inside], rates.end[inside]
     gyro = _interval_rates(imu, rates).over(start + offset, end + offset)
     # Windows may overlap: so many of them cover `averaged` seconds.
@@ -188,7 +194,7 @@ def better_offset(imu: ImuData, name: str, rates: CameraRates, expected: float) 
         return None  # the motion does not show it
     if abs(own.offset - expected) < CLOCKS_AGREE_S:
         return None
-    if not _covered(imu, rates, expected).any():
+    if not covered(imu, rates, expected).any():
         return own.offset
     there = _unexplained(imu, rates, _rough(expected, *_side_by_side(imu, rates, expected)))
     return own.offset if _unexplained(imu, rates, own) < CLEARLY_BETTER * there else None
@@ -220,7 +226,7 @@ def _check_motion(imu: ImuData, name: str, rates: CameraRates) -> None:
         )
 
 
-def _kabsch(w_imu: np.ndarray, w_cam: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def kabsch(w_imu: np.ndarray, w_cam: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """R and bias with w_imu = R w_cam + bias: means removed, then an SVD."""
     total = weight.sum()
     mi, mc = weight @ w_imu / total, weight @ w_cam / total
@@ -232,7 +238,7 @@ def _kabsch(w_imu: np.ndarray, w_cam: np.ndarray, weight: np.ndarray) -> tuple[n
 
 def _rough(offset: float, gyro: np.ndarray, seen: np.ndarray) -> Alignment:
     """At this offset, from means over some images: a pose that flips to its mirror image and back cancels in them."""
-    return Alignment(offset, *_kabsch(gyro, seen, np.ones(len(gyro))))
+    return Alignment(offset, *kabsch(gyro, seen, np.ones(len(gyro))))
 
 
 def _interval_rates(imu: ImuData, rates: CameraRates) -> MeanRates | ChainedRates:
@@ -246,14 +252,14 @@ def _refine(imu: ImuData, rates: CameraRates, rough: Alignment, keep_offset: boo
     offset, R, bias, residual = rough.offset, rough.rotation, rough.gyro_bias, np.zeros_like(rates.rate)
     for _ in range(ROUNDS):
         start, end = rates.start + offset, rates.end + offset
-        inside = _covered(imu, rates, offset).astype(float)
+        inside = covered(imu, rates, offset).astype(float)
         mean, slope = measured.over(start, end), measured.slope(start, end)
         weight = inside
         for _ in range(3):
             residual = mean - rates.rate @ R.T - bias
             size = np.linalg.norm(residual, axis=1)
             weight = inside * (size < 5.0 * np.median(size[inside > 0.0]) + 1e-9)
-            R, bias = _kabsch(mean, rates.rate, weight)
+            R, bias = kabsch(mean, rates.rate, weight)
         if keep_offset:
             break
         step = -float((weight @ (slope * residual)).sum() / (weight @ slope**2).sum())
@@ -266,7 +272,7 @@ def _refine(imu: ImuData, rates: CameraRates, rough: Alignment, keep_offset: boo
 def turns_about_two_axes(imu: ImuData, rates: CameraRates, found: Alignment) -> bool:
     """Whether the camera turned about more than one axis, and the IMU with it: of a target far away a camera alone
     sees turns that are noise. Else its rotation about that axis stays open."""
-    middle = (0.5 * (rates.start + rates.end) + found.offset)[_covered(imu, rates, found.offset)]
+    middle = (0.5 * (rates.start + rates.end) + found.offset)[covered(imu, rates, found.offset)]
     gyro = at(imu.seconds, imu.gyro, middle)
     return all(_second_axis(w) >= LEAST_SECOND_AXIS for w in (rates.rate, gyro))
 
@@ -307,7 +313,7 @@ def check_axes(imu: ImuData, rates: CameraRates, found: Alignment, name: str) ->
 def better_given(imu: ImuData, name: str, rates: CameraRates, found: Alignment, offset: float) -> Alignment:
     """`found`, or what a guess of the `offset` makes of it where the two turn alike there far better: rates about one
     axis fit the other way round, too."""
-    if not _covered(imu, rates, offset).any():
+    if not covered(imu, rates, offset).any():
         return found
     return better_of(imu, rates, found, as_given(imu, name, rates, offset, found.rotation))
 
@@ -320,9 +326,9 @@ def better_of(imu: ImuData, rates: CameraRates, found: Alignment, other: Alignme
 def as_given(imu: ImuData, name: str, rates: CameraRates, offset: float, rotation: np.ndarray) -> Alignment:
     """An alignment with this offset and rotation, whatever the motion: only the gyro bias is found. Raises
     EstimationError where clocks do not overlap."""
-    inside = _covered(imu, rates, offset)
+    inside = covered(imu, rates, offset)
     if not inside.any():
-        raise _no_overlap(imu, name)
+        raise no_overlap(imu, name)
     if rates.are_slow:
         gyro = _interval_rates(imu, rates).over(rates.start[inside] + offset, rates.end[inside] + offset)
     else:
@@ -336,7 +342,7 @@ def contradicts(imu: ImuData, rates: CameraRates, given: Alignment) -> bool:
     return not is_still(*turning(imu, rates)) and _unexplained(imu, rates, found, averaged) > LARGEST_UNEXPLAINED
 
 
-def _no_overlap(imu: ImuData, name: str) -> EstimationError:
+def no_overlap(imu: ImuData, name: str) -> EstimationError:
     return EstimationError(
         f"nothing of {name} falls within the recording of {imu.name}; check that both come from the same recording, "
         "and that a time_offset in the rig file is in seconds, or leave it out to have it found."

@@ -15,12 +15,13 @@ from icalib.first_guess.clocks import Alignment
 from icalib.first_guess.contradicted import chosen
 from icalib.first_guess.guess import CameraGuess, Guess, relative_offset
 from icalib.first_guess.gyro import GyroRotation
+from icalib.first_guess.rate_shifts import telling_rates
 from icalib.first_guess.target_poses import TargetPoses
 from icalib.first_guess.track_alignment import align_together, pairs_of
+from icalib.first_guess.track_lens import find_lens
 from icalib.first_guess.track_motion import Motion, Rays, track_motion
-from icalib.first_guess.track_rotation import track_rates
 from icalib.geometry.cameras import camera_model
-from icalib.measurements import Measurements
+from icalib.measurements import Measurements, TrackStream
 from icalib.rig import Camera, Rig
 
 APART_S = 0.15
@@ -28,12 +29,12 @@ LEAST_FELT = 0.7  # of gravity; half the time a rig is not thrown about
 
 
 def guess_from_tracks(rig: Rig, measurements: Measurements) -> Guess:
-    """Raises EstimationError, one sentence, where the tracks do not carry a guess, or intrinsics are not given."""
+    """Raises EstimationError, one sentence, where the tracks do not carry a guess, or do not show the lens."""
     imu = imu_data(rig, measurements)
     assert imu is not None  # tracks without an IMU are refused before
-    params = [lens_start(c) for c in rig.cameras]
+    params = [lens_start(c, t, imu, measurements) for c, t in zip(rig.cameras, measurements.tracks, strict=True)]
     rates = [
-        track_rates(t, camera_model(c.model), p)
+        telling_rates(imu, t, camera_model(c.model), p)
         for c, t, p in zip(rig.cameras, measurements.tracks, params, strict=True)
     ]
     aligned = [
@@ -77,13 +78,12 @@ def _check_units(imu: ImuData, gravity: float) -> None:
         )
 
 
-def lens_start(camera: Camera) -> np.ndarray:
-    """Intrinsics and distortion as the rig file gives them; a lens without a guess starts where its model does."""
+def lens_start(camera: Camera, stream: TrackStream, imu: ImuData, measurements: Measurements) -> np.ndarray:
+    """(P,) intrinsics and distortion as the rig file gives them, or as the tracks show them where it does not; beside
+    intrinsics that are given, distortion starts where its model does. Raises EstimationError as `find_lens` does."""
     if camera.intrinsics.value is None:
-        raise EstimationError(
-            f"{camera.name} follows points of the scene, which do not show its intrinsics from nothing; give a guess "
-            "of intrinsics: [fx, fy, cx, cy] in the rig file."
-        )
+        held = trusted(camera.time_offset)
+        return find_lens(camera, stream, imu, None if held is None else relative_offset(held, stream, measurements))
     distortion = camera.distortion.value
     if distortion is None:
         distortion = np.array(camera_model(camera.model).start_distortions[0])

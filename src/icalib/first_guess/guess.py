@@ -9,7 +9,7 @@ import numpy as np
 from icalib.estimation.state import Key
 from icalib.first_guess.target_poses import TargetPoses
 from icalib.geometry.targets.base import BOARD
-from icalib.measurements import CornerStream, Measurements
+from icalib.measurements import CornerStream, Measurements, TrackStream
 
 
 @dataclass(frozen=True)
@@ -65,6 +65,6 @@ class Guess:
         return t[order], np.concatenate(rotations)[order], np.concatenate(positions)[order]
 
 
-def relative_offset(value: np.ndarray, stream: CornerStream, measurements: Measurements) -> float:
+def relative_offset(value: np.ndarray, stream: CornerStream | TrackStream, measurements: Measurements) -> float:
     """A raw time offset (1,) as one between clocks that each start at their first stamp."""
     return float(value[0]) + (stream.origin_ns - measurements.origin_ns) * 1e-9

@@ -54,7 +54,9 @@ def align_together(
     held = np.array([x for r, t in fixed for x in (r, r, r, t)] + [False] * 3)
     for _ in range(ROUNDS):
         gyro = GyroRotation.integrate(imu, bias)
-        own, D, swept, turned = _gyro_turns(gyro, pairs, start)
+        offset = np.array([start[p.camera].offset for p in pairs])
+        t1, t2 = np.array([p.t1 for p in pairs]) + offset, np.array([p.t2 for p in pairs]) + offset
+        own, D, swept, turned = gyro_turns(gyro, t1, t2)
         N, r = _normal([pairs[i] for i in own], start, D, swept, turned)
         x = _solve(N, r, held, _open(start, so3.log_many(D)))
         bias = bias + x[n:]
@@ -87,16 +89,15 @@ def _solve(N: np.ndarray, r: np.ndarray, held: np.ndarray, still: np.ndarray) ->
 def _normal(
     pairs: list[Pair], start: list[Alignment], D: np.ndarray, swept: np.ndarray, turned: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Normal matrix and right-hand side of all alignments and the bias; see `_gyro_turns`."""
+    """Normal matrix and right-hand side of all alignments and the bias; see `gyro_turns`."""
     n, m, camera = 4 * len(start), len(pairs), np.array([p.camera for p in pairs], dtype=np.int64)
     R_ci = np.array([a.rotation.T for a in start])[camera]
     R = np.ascontiguousarray(R_ci @ D @ R_ci.transpose(0, 2, 1))
     H, g, J = np.empty((m, 3, 3)), np.empty((m, 3)), np.zeros((m, 3, n + 3))
-    begin = np.cumsum([0] + [len(p.f) for p in pairs])
-    empty = [np.zeros((0, 3))]
-    turns_information(
-        np.concatenate([p.f for p in pairs] or empty), np.concatenate([p.h for p in pairs] or empty), begin, R, H, g
-    )
+    begin, empty = np.cumsum([0] + [len(p.f) for p in pairs]), [np.zeros((0, 3))]
+    f, h = (np.concatenate([getattr(p, side) for p in pairs] or empty) for side in ("f", "h"))
+    stiff = np.zeros((len(f), 0, 3))
+    turns_information(f, h, stiff, stiff, begin, R, H, g, np.empty(m))
     for c in range(len(start)):
         own = camera == c
         J[own, :, 4 * c : 4 * c + 3] = R[own] - np.eye(3)
@@ -106,14 +107,12 @@ def _normal(
     return flat.T @ (H @ J).reshape(3 * m, n + 3), flat.T @ g.ravel()
 
 
-def _gyro_turns(
-    gyro: GyroRotation, pairs: list[Pair], start: list[Alignment]
+def gyro_turns(
+    gyro: GyroRotation, t1: np.ndarray, t2: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Which pairs the gyroscope covers (m,); of each R_i2_i1 (m, 3, 3), R_i2_i1 w_1 - w_2 (m, 3), and the integral of
-    R_i2_i in between (m, 3, 3)."""
+    """Which intervals t1 to t2 (n,) [s, imu clock] the gyroscope covers, indices (m,); of each R_i2_i1 (m, 3, 3),
+    R_i2_i1 w_1 - w_2 (m, 3), and the integral of R_i2_i in between (m, 3, 3)."""
     imu = gyro.imu
-    offset = np.array([start[p.camera].offset for p in pairs])
-    t1, t2 = np.array([p.t1 for p in pairs]) + offset, np.array([p.t2 for p in pairs]) + offset
     h = np.diff(imu.seconds)[:, None]
     flat = gyro.rotation.reshape(-1, 9)
     whole = np.concatenate([np.zeros((1, 9)), np.cumsum(0.5 * h * (flat[1:] + flat[:-1]), axis=0)])

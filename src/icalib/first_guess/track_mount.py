@@ -93,7 +93,7 @@ class Followed:
         times = stream.seconds[np.array([(i, j) for i, j, _, _ in pairs])]
         shared = [np.stack([p, q], axis=1) for _, _, p, q in pairs]
         begin = np.cumsum([0, *(len(x) for x in shared)])
-        slopes = _slopes(model, lens, directions, rays[valid])
+        slopes = lens_slopes(model, lens, directions, rays[valid])
         effect = np.sqrt((slopes**2).sum(axis=2).mean(axis=1))  # rad, RMS over the rays
         uv, used = _used(stream.uv, np.concatenate(shared))
         return cls(stream.name, model, uv, times, used, begin, lens, LENS_SIGMA * directions / effect[:, None])
@@ -120,7 +120,7 @@ def _used(uv: np.ndarray, shared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return uv[used], renamed.reshape(shared.shape)
 
 
-def _slopes(model: CameraModel, lens: np.ndarray, directions: np.ndarray, rays: np.ndarray) -> np.ndarray:
+def lens_slopes(model: CameraModel, lens: np.ndarray, directions: np.ndarray, rays: np.ndarray) -> np.ndarray:
     """(L, n, 3) derivatives of rays (n, 3) of fixed pixels by steps of the lens along `directions` (L, P), nothing
     where the model cannot see: of K(f, lens) = uv follows df = -K_f^+ K_lens d, at right angles to f."""
     _, valid, by_ray, by_lens = model.project_with_jacobians(lens, rays)
@@ -183,7 +183,7 @@ class _Seen:
         lens = followed.lens_of(at)
         rays, valid = followed.model.unproject(lens, followed.uv)
         rays = np.where(valid[:, None], rays, 0.0)  # these miss nothing
-        by = np.where(valid[:, None], _slopes(followed.model, lens, followed.bends, rays), 0.0)
+        by = np.where(valid[:, None], lens_slopes(followed.model, lens, followed.bends, rays), 0.0)
         return cls(followed, at, imu_poses(motion, t1), imu_poses(motion, t2), rays[p], rays[q], by[:, p], by[:, q])
 
     def misses(self, x: np.ndarray) -> np.ndarray:

@@ -20,6 +20,8 @@ LEAST_CORRELATION = 0.5  # with the IMU's rates; these here are noisy
 ROUNDS = 10
 DIRECTION_ROUNDS = 4
 STEP_S = 0.4  # between images: over less, turning and moving sideways look alike
+MOST_SHARED = 0.3  # of an interval that the next one begins later, at most: those between say little more
+NOISE_EVERY = 5  # so many rates, the noise of one
 DAMPING = 1e-9  # of the mean diagonal: a camera that does not move has no direction of motion
 
 
@@ -42,11 +44,12 @@ def _across(t, a, b):
 
 
 @njit(cache=True, nogil=True)
-def _epipolar_sums(f, h, R, t, a, b, A, x):
-    """A (5, 5) and x (5,): normal equations of a left turn of R, and of t along a and b, for e = t . (R f x h) by its
-    own standard deviation, Cauchy's weights of the median error."""
-    n = len(f)
-    g, c, e, spread, row = np.empty((n, 3)), np.empty((n, 3)), np.empty(n), np.empty(n), np.empty(5)
+def _epipolar_sums(f, h, f_by, h_by, R, t, a, b, A, x):
+    """A (5 + L, 5 + L) and x (5 + L,): normal equations of a left turn of R, of t along a and b, and of the lens along
+    its L slopes f_by and h_by (n, L, 3) of the rays, for e = t . (R f x h) by its own standard deviation, Cauchy's
+    weights of the median error. Returns the sum of the weighted squares of the errors [rad^2]."""
+    n, m = len(f), f_by.shape[1]
+    g, c, e, spread, row = np.empty((n, 3)), np.empty((n, 3)), np.empty(n), np.empty(n), np.empty(5 + m)
     for i in range(n):
         for r in range(3):
             g[i, r] = R[r, 0] * f[i, 0] + R[r, 1] * f[i, 1] + R[r, 2] * f[i, 2]
@@ -57,7 +60,7 @@ def _epipolar_sums(f, h, R, t, a, b, A, x):
         th = t[0] * h[i, 0] + t[1] * h[i, 1] + t[2] * h[i, 2]
         spread[i] = np.sqrt(max(2.0 - tg * tg - th * th, 1e-4))
         e[i] = (t[0] * c[i, 0] + t[1] * c[i, 1] + t[2] * c[i, 2]) / spread[i]
-    scale = 3.0 * np.median(np.abs(e)) + 1e-12
+    scale, left = 3.0 * np.median(np.abs(e)) + 1e-12, 0.0
     _across(t, a, b)
     A[:] = 0.0
     x[:] = 0.0
@@ -68,15 +71,25 @@ def _epipolar_sums(f, h, R, t, a, b, A, x):
         row[2] = g[i, 0] * m1 - g[i, 1] * m0
         row[3] = a[0] * c[i, 0] + a[1] * c[i, 1] + a[2] * c[i, 2]
         row[4] = b[0] * c[i, 0] + b[1] * c[i, 1] + b[2] * c[i, 2]
+        for j in range(m):
+            # t . (R f_by x h + R f x h_by), with m = h x t and t x R f.
+            row[5 + j] = 0.0
+            for r in range(3):
+                by = R[r, 0] * f_by[i, j, 0] + R[r, 1] * f_by[i, j, 1] + R[r, 2] * f_by[i, j, 2]
+                row[5 + j] += by * (m0 if r == 0 else m1 if r == 1 else m2)
+                p, q = (r + 1) % 3, (r + 2) % 3
+                row[5 + j] += h_by[i, j, r] * (t[p] * g[i, q] - t[q] * g[i, p])
         w = 1.0 / (1.0 + (e[i] / scale) ** 2)
-        for r in range(5):
+        left += w * e[i] ** 2
+        for r in range(5 + m):
             row[r] /= spread[i]
             x[r] -= w * row[r] * e[i]
             for k in range(r + 1):
                 A[r, k] += w * row[r] * row[k]
-    for r in range(5):
+    for r in range(5 + m):
         for k in range(r):
             A[k, r] = A[r, k]
+    return left
 
 
 @njit(cache=True, nogil=True)
@@ -95,9 +108,9 @@ def _move_direction(t, a, b, da, db):
 def turn_between(f, h, R, t):
     """R and t (unit), improved: rays f (n, 3) and h (n, 3) of the same points in two images lie in planes with t,
     h ~ R f + s t. False where that is singular."""
-    a, b, A, x = np.empty(3), np.empty(3), np.empty((5, 5)), np.empty(5)
+    a, b, A, x, stiff = np.empty(3), np.empty(3), np.empty((5, 5)), np.empty(5), np.empty((len(f), 0, 3))
     for _ in range(ROUNDS):
-        _epipolar_sums(f, h, R, t, a, b, A, x)
+        _epipolar_sums(f, h, stiff, stiff, R, t, a, b, A, x)
         mean = DAMPING * (A[0, 0] + A[1, 1] + A[2, 2])
         for r in range(5):
             A[r, r] += mean
@@ -118,20 +131,26 @@ def _direction_step(A, x, y):
 
 
 @njit(cache=True, nogil=True)
-def turn_information(f, h, R, t, H, g):
-    """H (3, 3) and g (3,): what two images say of a left turn of R, and what step they ask for, H step = g; the
-    direction of motion t is found on the way."""
-    a, b, A, x = np.empty(3), np.empty(3), np.empty((5, 5)), np.empty(5)
+def turn_information(f, h, f_by, h_by, R, t, H, g):
+    """H (3 + L, 3 + L) and g (3 + L,): what two images say of a left turn of R and of the lens, and what step they ask
+    for, H step = g; the direction of motion t is found on the way. Returns the sum of the weighted squares of the
+    errors [rad^2]."""
+    a, b, A, x, stiff = np.empty(3), np.empty(3), np.empty((5, 5)), np.empty(5), np.empty((len(f), 0, 3))
     for _ in range(DIRECTION_ROUNDS):
-        _epipolar_sums(f, h, R, t, a, b, A, x)
+        _epipolar_sums(f, h, stiff, stiff, R, t, a, b, A, x)
         u, v = _direction_step(A, x[3], x[4])
         _move_direction(t, a, b, u, v)
-    _epipolar_sums(f, h, R, t, a, b, A, x)
-    for i in range(3):
-        u, v = _direction_step(A, A[3, i], A[4, i])
-        g[i] = x[i] - u * x[3] - v * x[4]
-        for k in range(3):
-            H[i, k] = A[i, k] - u * A[3, k] - v * A[4, k]
+    n = 5 + f_by.shape[1]
+    A, x = np.empty((n, n)), np.empty(n)
+    left = _epipolar_sums(f, h, f_by, h_by, R, t, a, b, A, x)
+    for i in range(n - 2):
+        r = i if i < 3 else i + 2
+        u, v = _direction_step(A, A[3, r], A[4, r])
+        g[i] = x[r] - u * x[3] - v * x[4]
+        for k in range(n - 2):
+            c = k if k < 3 else k + 2
+            H[i, k] = A[r, c] - u * A[3, c] - v * A[4, c]
+    return left
 
 
 @njit(cache=True, nogil=True)
@@ -151,13 +170,13 @@ def start_direction(f, h, R):
 
 
 @njit(cache=True, nogil=True)
-def turns_information(f, h, begin, R, H, g):
-    """H (M, 3, 3) and g (M, 3) of `turn_information` for pairs of images with turns R (M, 3, 3); rays of pair i are
-    begin[i]..begin[i + 1] of f and h."""
+def turns_information(f, h, f_by, h_by, begin, R, H, g, left):
+    """H (M, 3 + L, 3 + L), g (M, 3 + L) and left (M,) of `turn_information` for pairs of images with turns
+    R (M, 3, 3); rays of pair i are begin[i]..begin[i + 1] of f and h (n, 3), and of their slopes (n, L, 3)."""
     for i in range(len(R)):
         own = slice(begin[i], begin[i + 1])
         t = start_direction(f[own], h[own], R[i])
-        turn_information(f[own], h[own], R[i], t, H[i], g[i])
+        left[i] = turn_information(f[own], h[own], f_by[own], h_by[own], R[i], t, H[i], g[i])
 
 
 def _start(f: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -167,12 +186,13 @@ def _start(f: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.ascontiguousarray(R), start_direction(f, h, R)
 
 
-def track_rates(stream: TrackStream, model: CameraModel, params: np.ndarray) -> CameraRates:
-    """Mean angular rates from each image to the one about STEP_S later. Raises EstimationError where hardly any images
-    share enough points."""
+def track_rates(stream: TrackStream, model: CameraModel, params: np.ndarray, step: float = STEP_S) -> CameraRates:
+    """Mean angular rates from images to the ones about `step` s later, with their noise, from how far rays miss their
+    epipolar planes. Raises EstimationError where hardly any images share enough points."""
     rays, valid = model.unproject(params, stream.uv)
-    t, found = stream.seconds, []
-    for i, j in image_pairs(stream, STEP_S):
+    t, found, noise = stream.seconds, [], []
+    thinned = max(1, int(MOST_SHARED * step / float(np.median(np.diff(t)))))
+    for i, j in image_pairs(stream, step)[::thinned]:
         p, q = common(stream, valid, i, j)
         if len(p) < FEWEST_COMMON:
             continue
@@ -180,13 +200,24 @@ def track_rates(stream: TrackStream, model: CameraModel, params: np.ndarray) -> 
         R, direction = _start(f, h)
         if turn_between(f, h, R, direction):
             found.append((t[i], t[j], *(-so3.log(R) / (t[j] - t[i]))))
+            if len(found) % NOISE_EVERY == 0:
+                noise.append(_turn_sigma(f, h, R, direction) / (t[j] - t[i]))
     if len(found) < FEWEST_RATES:
         raise EstimationError(
-            f"{stream.name}: only {len(found)} pairs of images {STEP_S} s apart share {FEWEST_COMMON} points or more; "
-            "record for longer, or follow more points for longer."
+            f"{stream.name}: only {len(found)} pairs of images {step:.2g} s apart share {FEWEST_COMMON} points or "
+            "more; record for longer, or follow more points for longer."
         )
     rows = np.array(found)
-    return CameraRates(rows[:, 0].copy(), rows[:, 1].copy(), rows[:, 2:].copy(), LEAST_CORRELATION)
+    start, end, rate = rows[:, 0].copy(), rows[:, 1].copy(), rows[:, 2:].copy()
+    return CameraRates(start, end, rate, LEAST_CORRELATION, noise=float(np.median(noise)))
+
+
+def _turn_sigma(f: np.ndarray, h: np.ndarray, R: np.ndarray, t: np.ndarray) -> float:
+    """Standard deviation [rad] of a turn about each axis, RMS over the axes."""
+    H, g, stiff = np.empty((3, 3)), np.empty(3), np.empty((len(f), 0, 3))
+    left = turn_information(f, h, stiff, stiff, R, t.copy(), H, g)
+    H[range(3), range(3)] += DAMPING * np.trace(H)
+    return float(np.sqrt(left / len(f) * np.trace(np.linalg.inv(H)) / 3.0))
 
 
 def image_pairs(stream: TrackStream, step: float) -> list[tuple[int, int]]:

@@ -17,8 +17,8 @@ from icalib.first_guess.clocks import main_axis, rough_alignments
 from icalib.first_guess.from_tracks import lens_start
 from icalib.first_guess.guess import relative_offset
 from icalib.first_guess.lidar_rounds import NAMES, given
+from icalib.first_guess.rate_shifts import telling_rates
 from icalib.first_guess.track_mount import Followed, Mount, place_on_motion
-from icalib.first_guess.track_rotation import track_rates
 from icalib.geometry.cameras import camera_model
 from icalib.rig import Camera
 
@@ -30,20 +30,34 @@ def track_camera_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
     """
 
     def values(number: int) -> dict[Key, np.ndarray]:
-        camera = inputs.rig.cameras[number]
-        lens, known = lens_start(camera), given(inputs, camera, NAMES)
+        camera, best = inputs.rig.cameras[number], _most_seen(inputs, number)
+        with naming_recording(inputs, best):
+            lens = _lens(inputs, number, best)
+        known = given(inputs, camera, NAMES)
         guessed = {(camera.name, "intrinsics"): lens[:4], (camera.name, "distortion"): lens[4:]}
-        return guessed | (_placed(inputs, state, number) if len(known) < len(NAMES) else {}) | known
+        return guessed | (_placed(inputs, state, number, lens) if len(known) < len(NAMES) else {}) | known
 
     with ThreadPoolExecutor(THREADS) as pool:  # its own: what it does may use the solver's
         return {k: v for own in pool.map(values, range(len(inputs.rig.cameras))) for k, v in own.items()}
 
 
-def _placed(inputs: Inputs, state: State, number: int) -> dict[Key, np.ndarray]:
-    """Where a camera stands, and its lens. Of several recordings the one in which it saw most says so."""
-    camera = inputs.rig.cameras[number]
-    best = int(np.argmax([len(part.measurements.tracks[number].feature) for part in inputs.parts]))
-    mount_in = partial(_mount_in, inputs, state, number)
+def _most_seen(inputs: Inputs, number: int) -> int:
+    """The recording in which a camera saw most."""
+    return int(np.argmax([len(part.measurements.tracks[number].feature) for part in inputs.parts]))
+
+
+def _lens(inputs: Inputs, number: int, recording: int) -> np.ndarray:
+    """(P,) where a lens is sought from."""
+    own = alone(inputs, recording)
+    assert own.imu is not None
+    return lens_start(inputs.rig.cameras[number], own.measurements.tracks[number], own.imu, own.measurements)
+
+
+def _placed(inputs: Inputs, state: State, number: int, lens: np.ndarray) -> dict[Key, np.ndarray]:
+    """Where a camera stands, and its lens, sought from `lens` (P,). Of several recordings the one in which it saw most
+    says so."""
+    camera, best = inputs.rig.cameras[number], _most_seen(inputs, number)
+    mount_in = partial(_mount_in, inputs, state, number, lens)
     with naming_recording(inputs, best):
         found, lens = mount_in(best)
     if camera.clock_restarts:
@@ -58,11 +72,10 @@ def _placed(inputs: Inputs, state: State, number: int) -> dict[Key, np.ndarray]:
 
 
 def _mount_in(
-    inputs: Inputs, state: State, number: int, recording: int, placed: Mount | None = None
+    inputs: Inputs, state: State, number: int, lens: np.ndarray, recording: int, placed: Mount | None = None
 ) -> tuple[Mount, np.ndarray]:
     """Mount and lens, as one recording shows them; `placed`: how the camera stands, where another has shown it."""
     own, camera = alone(inputs, recording), inputs.rig.cameras[number]
-    lens = lens_start(camera)
     assert own.imu is not None
     stream, model = own.measurements.tracks[number], camera_model(camera.model)
     known = {name: value for (_, name), value in given(own, camera, NAMES).items()}
@@ -74,7 +87,9 @@ def _mount_in(
     bent = np.zeros(len(followed.bends))
     starts = [
         Mount(known.get("rotation", a.rotation), known.get("translation", np.zeros(3)), a.offset, bent)
-        for a in rough_alignments(own.imu, camera.name, track_rates(stream, model, lens), offsets, same_clock)
+        for a in rough_alignments(
+            own.imu, camera.name, telling_rates(own.imu, stream, model, lens), offsets, same_clock
+        )
     ]
     motion = motion_of(own, motion_alone(inputs, recording, state))
     held = np.repeat([name in known for name in NAMES], [3, 3, 1])

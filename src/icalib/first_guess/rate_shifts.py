@@ -1,0 +1,159 @@
+"""By how much a camera's clock is apart from the IMU's: where the gyroscope's rates regress best on the camera's.
+
+    w_imu = M w_cam + b
+
+With M free the rotation between both need not be known, nor how long the lens is, and a bias has no say. Of all shifts
+the one is taken at which the regression explains most, by the logarithm of the likelihood ratio -n/2 log(1 - R^2).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from icalib.errors import EstimationError
+from icalib.estimation.imu_data import ImuData
+from icalib.first_guess.clock_shifts import MOST_PEAKS, PEAKS_APART_S, SHORTEST_OVERLAP_S, CameraRates
+from icalib.first_guess.mean_rates import MeanRates
+from icalib.first_guess.track_rotation import STEP_S, track_rates
+from icalib.geometry.cameras.base import CameraModel
+from icalib.measurements import TrackStream
+
+STEPS_S = (STEP_S, 0.2, 0.1, 0.05)  # between images
+SHORTEST_STEP = 0.75  # times the period of the images
+# Of the logarithm of the likelihood ratio of three times three coefficients, twice which is chi^2 of nine degrees of
+# freedom: by chance less than once in 1000, at any of some hundred shifts.
+LEAST_SCORE = 15.0
+SLOW = 3.0  # times the noise of rates: those that vary by less may not show
+NORM_MEDIAN = 1.538  # of three standard normal components
+POINTS = 10  # of the grid in an interval: shifts are found to a twentieth of it
+LEAST_SPREAD = 1e-3  # of the mean square, that rates count with about each axis: about one axis there may be none
+
+
+@dataclass(frozen=True)
+class Regression:
+    """offset: t_imu - t_camera, both since their clock's first stamp [s]; score: half the logarithm of the likelihood
+    ratio, with as many samples as intervals fit side by side."""
+
+    offset: float
+    score: float
+
+
+def best_regressions(imu: ImuData, rates: CameraRates) -> list[Regression]:
+    """At the best shifts, best first; empty where the two overlap at none. What lies in gaps does not count."""
+    length = float(np.median(rates.end - rates.start))
+    step = length / POINTS
+    middle = 0.5 * (rates.start + rates.end)
+    seen, seen_known = _on_grid(middle - middle[0], rates.rate, np.diff(middle) < rates.longest_step_s, step)
+    start = np.arange(0.0, imu.seconds[-1] - length, step)
+    felt, felt_known = MeanRates.of(imu).over(start, start + length), np.ones(len(start), dtype=bool)
+    for a, b in imu.gaps:
+        felt_known &= (start + length <= a) | (start >= b)
+    if not felt_known.any() or not seen_known.any():
+        return []
+    explained, count = _explained(felt, felt_known, seen, seen_known)
+    enough = count > min(SHORTEST_OVERLAP_S / step, 0.5 * min(felt_known.sum(), seen_known.sum()))
+    score = np.where(enough, -0.5 * count / POINTS * np.log(1.0 - np.minimum(explained, 1.0 - 1e-9)), -np.inf)
+    found: list[Regression] = []
+    apart = round(PEAKS_APART_S / step)
+    while len(found) < MOST_PEAKS and np.isfinite(score).any():
+        k = int(np.argmax(score))
+        found.append(Regression((k - (len(seen) - 1)) * step + 0.5 * length - float(middle[0]), float(score[k])))
+        score[max(k - apart, 0) : k + apart + 1] = -np.inf
+    return found
+
+
+def telling_rates(imu: ImuData, stream: TrackStream, model: CameraModel, lens: np.ndarray) -> CameraRates:
+    """Rates over the longest of STEPS_S at which they go with the gyroscope's by more than chance, with the offsets at
+    which they do: over less, turning and moving sideways look alike; over more, a rig that only shakes does not turn.
+    Where they do at none, those that go with it best, and no offsets.
+
+    Raises EstimationError as `track_rates` does at the first.
+    """
+    period = float(np.median(np.diff(stream.seconds)))
+    steps = [s for s in STEPS_S if s > SHORTEST_STEP * period] or [period]
+    failed: EstimationError | None = None
+    found: list[tuple[float, CameraRates]] = []
+    for step in steps:
+        try:
+            rates = track_rates(stream, model, lens, step)
+        except EstimationError as error:
+            failed = failed or error
+            continue
+        shifts = best_regressions(imu, rates)
+        likely = tuple(s.offset for s in shifts if s.score > LEAST_SCORE)
+        found.append((max((s.score for s in shifts), default=-np.inf), replace(rates, offsets=likely)))
+        if likely:
+            break
+    if not found:
+        assert failed is not None
+        raise failed
+    return max(found, key=lambda x: x[0])[1]
+
+
+def noise_beside(imu: ImuData, rates: CameraRates, averaged: float = 0.0) -> float:
+    """Standard deviation [rad/s] of how the rates of camera and gyroscope differ about each axis, as means over
+    `averaged` s where that is longer than an interval; zero where that of the camera is not known."""
+    if not rates.noise:
+        return 0.0
+    length = float(np.median(rates.end - rates.start))
+    variance = rates.noise**2 + float(np.median(imu.variance[:, 0])) / length
+    return float(np.sqrt(variance * min(1.0, length / averaged if averaged else 1.0)))
+
+
+def unlike(imu: ImuData, name: str, rates: CameraRates) -> EstimationError:
+    """Why rates go with those of the IMU at no shift by more than chance."""
+    length = float(np.median(rates.end - rates.start))
+    start = np.arange(0.0, imu.seconds[-1] - length, length / POINTS)
+    gyro = MeanRates.of(imu).over(start, start + length)
+    turned = float(np.median(np.linalg.norm(gyro - np.median(gyro, axis=0), axis=1))) / NORM_MEDIAN
+    if turned < SLOW * noise_beside(imu, rates):
+        return EstimationError(
+            f"{imu.name} and {name} turn too slowly or too steadily to be compared: the angular rate varies by "
+            f"{np.rad2deg(turned):.2g} deg/s, and the images show it to {np.rad2deg(rates.noise):.2g} deg/s; turn the "
+            "rig faster, to and fro about all axes, or give rotation and time_offset in the rig file."
+        )
+    return EstimationError(
+        f"the motion of {name} does not match that of {imu.name} at any shift of their clocks; check that both come "
+        "from the same recording, overlap in time, and are in rad/s."
+    )
+
+
+def _on_grid(t: np.ndarray, rate: np.ndarray, near: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+    """Rates (n, 3) on a regular grid of `step` s from 0 to the last of `t`; and where they are known: between
+    neighbours that are `near` (n - 1,)."""
+    grid = np.arange(int(t[-1] / step) + 1) * step
+    known = near[np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(near) - 1)]
+    return np.stack([np.interp(grid, t, rate[:, k]) for k in range(3)], axis=1), known
+
+
+def _explained(a: np.ndarray, known_a: np.ndarray, b: np.ndarray, known_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(n + m - 1,) the share of the spread of a (n, 3) that a regression on b (m, 3) explains, where both are known, b
+    shifted by -(m - 1) to n - 1 samples; and the number of these."""
+    n = len(a) + len(b) - 1
+    size = 1 << (n - 1).bit_length()
+
+    def transformed(x: np.ndarray) -> np.ndarray:
+        return np.fft.rfft(x, size, axis=0)
+
+    def correlated(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        product = np.fft.irfft(x * np.conj(y), size)
+        return np.concatenate([product[size - (len(b) - 1) :], product[: len(a)]])
+
+    a, b = a * known_a[:, None], b * known_b[:, None]
+    ma, mb, fa, fb = (transformed(x) for x in (known_a.astype(float), known_b.astype(float), a, b))
+    count = np.maximum(correlated(ma, mb), 1e-9)
+    sa, sb = (np.stack([correlated(*p) for p in pairs], axis=1) for pairs in (
+        [(fa[:, k], mb) for k in range(3)], [(ma, fb[:, k]) for k in range(3)]
+    ))  # fmt: skip
+    across, own = np.empty((n, 3, 3)), np.empty((n, 3, 3))
+    for i in range(3):
+        for j in range(3):
+            across[:, i, j] = correlated(fa[:, i], fb[:, j]) - sa[:, i] * sb[:, j] / count
+            own[:, i, j] = correlated(ma, transformed(b[:, i] * b[:, j])) - sb[:, i] * sb[:, j] / count
+    spread = correlated(transformed((a**2).sum(axis=1)), mb) - (sa**2).sum(axis=1) / count
+    least = LEAST_SPREAD * count * float((b**2).sum(axis=1).mean()) + 1e-12
+    slope = np.linalg.solve(own + least[:, None, None] * np.eye(3), across.transpose(0, 2, 1))
+    spread = spread + LEAST_SPREAD * count * float((a**2).sum(axis=1).mean()) + 1e-12
+    return np.clip(np.einsum("nij,nji->n", across, slope) / spread, 0.0, 1.0), count
