@@ -26,7 +26,7 @@ def failing(rig: Rig):
 
 
 def test_relative_poses_that_would_work_as_absolute_ones_are_named():
-    found = explained(RELATIVE, converging, BROKEN)  # pyright: ignore
+    found = explained(RELATIVE, [], converging, BROKEN)  # pyright: ignore
     assert str(found).startswith("odom: ") and "write kind: absolute" in str(found)
 
 
@@ -40,4 +40,4 @@ def test_relative_poses_that_would_work_as_absolute_ones_are_named():
     ],
 )
 def test_what_was_not_tried_or_did_not_work_is_not_said(rig, make, failed):
-    assert explained(rig, make, failed) is failed
+    assert explained(rig, [], make, failed) is failed

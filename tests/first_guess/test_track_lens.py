@@ -138,3 +138,30 @@ def test_slopes_by_the_lens_are_those_of_the_epipolar_errors():
     H, g = np.empty((5, 5)), np.empty(5)
     turn_information(bent_f, bent_h, f_by, h_by, turned, start_direction(bent_f, bent_h, turned), H, g)
     np.testing.assert_allclose(np.linalg.solve(H, g), [*turn, *bend], atol=3e-6)
+
+
+def test_points_without_parallax_are_named():
+    """As far away as stars they show how the rig turns, and nothing else."""
+    simulation = drive(noise_px=0.3, duration_s=8.0)
+    stream, truth, camera = simulation.measurements.tracks[0], simulation.truth, camera_of(simulation)
+    rng, T = np.random.default_rng(0), truth.T_imu_cam["cam0"]
+    far = rng.normal(size=(400, 3))
+    rotation = truth.pose_at(truth.seconds[0] + stream.seconds + _between(simulation))[0]
+    lens = np.append(truth.intrinsics["cam0"], truth.distortion["cam0"])
+    uv, feature = [], []
+    for R in rotation:
+        pixels, valid = camera_model(camera.model).project(lens, far @ R @ T[:3, :3])
+        seen = np.flatnonzero(valid & (pixels > 0.0).all(axis=1) & (pixels < camera.resolution).all(axis=1))
+        uv.append(pixels[seen] + rng.normal(scale=0.3, size=(len(seen), 2)))
+        feature.append(seen)
+    start = np.cumsum([0, *(len(x) for x in feature)])
+    stars = replace(stream, start=start, feature=np.concatenate(feature), uv=np.concatenate(uv))
+    rig = replace(rig_for(simulation.scenario, intrinsics="start", distortion="start"), target=NoTarget())
+    with pytest.raises(EstimationError, match="cam0: the tracked points move as if the rig only rotated"):
+        calibrate_measurements(rig, replace(simulation.measurements, tracks=(stars,)))
+
+
+def _between(simulation: Simulation) -> float:
+    """t_imu - t_cam0 of the first stamps [s]."""
+    measured = simulation.measurements
+    return (measured.tracks[0].origin_ns - measured.origin_ns) * 1e-9 + simulation.truth.time_offset["cam0"]

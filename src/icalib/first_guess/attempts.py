@@ -24,6 +24,7 @@ from icalib.estimation.pages import give_back
 from icalib.estimation.problem import Problem
 from icalib.first_guess.contradicted import FarOffError, is_contradicted, refusing_far_off
 from icalib.first_guess.lidar_sight import naming_sight
+from icalib.first_guess.parallax import no_parallax
 from icalib.first_guess.start import start
 from icalib.measurements import Measurements
 from icalib.rig import Parameter, Rig
@@ -84,7 +85,7 @@ def attempt(
         return replace(other, error=failed) if first is None else replace(first, against=other.against)
     if first is None:
         assert failed is not None
-        raise explained(rig, make, failed)
+        raise explained(rig, recordings, make, failed)
     return first
 
 
@@ -98,9 +99,13 @@ def _or_error(rig: Rig, make: Callable[[Rig], Attempt]) -> tuple[Attempt, None] 
         return None, error
 
 
-def explained(rig: Rig, make: Callable[[Rig], Attempt], failed: EstimationError) -> EstimationError:
-    """Why an estimate `failed`: where relative poses alone show the motion and it breaks down, whether it does not with
-    the same poses as absolute ones."""
+def explained(
+    rig: Rig, recordings: Sequence[Measurements], make: Callable[[Rig], Attempt], failed: EstimationError
+) -> EstimationError:
+    """Why an estimate `failed`: where points alone show the motion and it breaks down, whether these move at all beside
+    rotation; where relative poses do, whether it does not with the same poses as absolute ones."""
+    if isinstance(failed, NotDefiniteError) and rig.cameras and not (rig.has_target or rig.lidars):
+        return no_parallax(rig, recordings) or failed
     alone = rig.poses and rig.poses[0].kind == "relative" and not (rig.cameras or rig.lidars)
     if not (alone and isinstance(failed, NotDefiniteError)):
         return failed

@@ -179,7 +179,7 @@ def turns_information(f, h, f_by, h_by, begin, R, H, g, left):
         left[i] = turn_information(f[own], h[own], f_by[own], h_by[own], R[i], t, H[i], g[i])
 
 
-def _start(f: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def start_turn(f: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The turn that brings rays f nearest to h, and the direction of motion that is left."""
     U, _, Vt = np.linalg.svd(h.T @ f)
     R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
@@ -197,11 +197,11 @@ def track_rates(stream: TrackStream, model: CameraModel, params: np.ndarray, ste
         if len(p) < FEWEST_COMMON:
             continue
         f, h = rays[p], rays[q]
-        R, direction = _start(f, h)
+        R, direction = start_turn(f, h)
         if turn_between(f, h, R, direction):
             found.append((t[i], t[j], *(-so3.log(R) / (t[j] - t[i]))))
             if len(found) % NOISE_EVERY == 0:
-                noise.append(_turn_sigma(f, h, R, direction) / (t[j] - t[i]))
+                noise.append(turn_error(f, h, R, direction)[0] / (t[j] - t[i]))
     if len(found) < FEWEST_RATES:
         raise EstimationError(
             f"{stream.name}: only {len(found)} pairs of images {step:.2g} s apart share {FEWEST_COMMON} points or "
@@ -212,12 +212,12 @@ def track_rates(stream: TrackStream, model: CameraModel, params: np.ndarray, ste
     return CameraRates(start, end, rate, LEAST_CORRELATION, noise=float(np.median(noise)))
 
 
-def _turn_sigma(f: np.ndarray, h: np.ndarray, R: np.ndarray, t: np.ndarray) -> float:
-    """Standard deviation [rad] of a turn about each axis, RMS over the axes."""
+def turn_error(f: np.ndarray, h: np.ndarray, R: np.ndarray, t: np.ndarray) -> tuple[float, float]:
+    """Standard deviation [rad] of a turn about each axis, RMS over the axes, and of a ray across its epipolar plane."""
     H, g, stiff = np.empty((3, 3)), np.empty(3), np.empty((len(f), 0, 3))
     left = turn_information(f, h, stiff, stiff, R, t.copy(), H, g)
     H[range(3), range(3)] += DAMPING * np.trace(H)
-    return float(np.sqrt(left / len(f) * np.trace(np.linalg.inv(H)) / 3.0))
+    return float(np.sqrt(left / len(f) * np.trace(np.linalg.inv(H)) / 3.0)), float(np.sqrt(left / len(f)))
 
 
 def image_pairs(stream: TrackStream, step: float) -> list[tuple[int, int]]:

@@ -1,0 +1,56 @@
+"""Whether tracked points move as they would if the rig only rotated: then nothing shows how far away they are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from icalib.errors import EstimationError
+from icalib.estimation.imu_data import imu_data
+from icalib.first_guess.from_tracks import lens_start
+from icalib.first_guess.track_alignment import Pair, pairs_of
+from icalib.first_guess.track_rotation import start_turn, turn_between, turn_error
+from icalib.geometry.cameras import camera_model
+from icalib.measurements import Measurements
+from icalib.rig import Rig
+
+# Times the error of rays: what is left of two images by rotation alone is two errors on two axes, and that by epipolar
+# geometry one on one axis, so that noise alone makes up to 2.3.
+NO_MORE_THAN_NOISE = 3.0
+
+
+def no_parallax(rig: Rig, recordings: Sequence[Measurements]) -> EstimationError | None:
+    """The sentence about the camera that sees most parallax, where even that is no more than noise; else None."""
+    found = []
+    for m in recordings:
+        imu = imu_data(rig, m)
+        for k, (camera, stream) in enumerate(zip(rig.cameras, m.tracks, strict=True)):
+            if imu is None:
+                return None
+            try:
+                lens = lens_start(camera, stream, imu, m)
+            except EstimationError:
+                return None
+            shown = [_parallax(pair) for pair in pairs_of(k, stream, camera_model(camera.model), lens)]
+            if shown:
+                found.append((*np.median(shown, axis=0).tolist(), camera.name))
+    if not found:
+        return None
+    parallax, error, name = max(found, key=lambda x: x[0] / x[1])
+    if parallax > NO_MORE_THAN_NOISE * error:
+        return None
+    return EstimationError(
+        f"{name}: the tracked points move as if the rig only rotated (parallax of {np.rad2deg(parallax):.2g} deg, "
+        f"noise of {np.rad2deg(error):.2g} deg), so that nothing shows the motion of the rig; move it by a tenth of "
+        "the distance to the scene or more, and turn it about all axes."
+    )
+
+
+def _parallax(pair: Pair) -> tuple[float, float]:
+    """By how much the rays of two images differ beside a rotation, and by how much they miss their epipolar planes
+    [rad]."""
+    R, t = start_turn(pair.f, pair.h)
+    beside = float(np.median(np.linalg.norm(pair.f @ R.T - pair.h, axis=1)))
+    turn_between(pair.f, pair.h, R, t)
+    return beside, turn_error(pair.f, pair.h, R, t)[1] + 1e-12
