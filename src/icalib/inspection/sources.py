@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from pathlib import PurePosixPath
 
 from icalib.inspection.facts import CameraSource, Sources
 from icalib.recordings import TopicInfo
+from icalib.recordings.unreadable import VIDEO_FILE
 
 # Parts of a topic's name that say what it carries, not whose it is.
 _WHAT = re.compile(
@@ -60,7 +62,8 @@ def _by_key(topics: list[TopicInfo]) -> dict[Key, list[TopicInfo]]:
 
 
 def _key(topic: TopicInfo) -> Key:
-    return tuple(p.removesuffix(".csv") for p in topic.name.split("/") if p and not _WHAT.fullmatch(p))
+    ending = PurePosixPath(topic.name).suffix if topic.type == VIDEO_FILE else ".csv"
+    return tuple(p.removesuffix(ending) for p in topic.name.split("/") if p and not _WHAT.fullmatch(p))
 
 
 def _names(sensors: list[tuple[Key, str]]) -> list[str]:

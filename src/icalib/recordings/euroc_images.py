@@ -100,7 +100,7 @@ def _listed(table: Path, data: Path) -> list[tuple[int, Path]]:
         rows.append((number, stamp, name.strip(",; ")))
     if not rows:
         raise RecordingError(f"{table} holds no rows; write one line for each image, t [ns],file name.")
-    unit = _unit([stamp for _, stamp, _ in rows])
+    unit = unit_of_texts([stamp for _, stamp, _ in rows])
     if unit == "ns":
         for number, stamp, _ in rows:
             if not stamp.isdecimal():
@@ -108,7 +108,7 @@ def _listed(table: Path, data: Path) -> list[tuple[int, Path]]:
     return [(nanoseconds(stamp, unit), data / name) for _, stamp, name in rows]
 
 
-def _unit(stamps: Sequence[str]) -> TimeUnit:
+def unit_of_texts(stamps: Sequence[str]) -> TimeUnit:
     """That in which the stamps are dates; else nanoseconds where these mean a possible rate; else the one that does."""
     numbers = np.array([float(stamp) for stamp in stamps])
     if dated := unit_by_date(numbers.tolist()):

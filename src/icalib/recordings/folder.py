@@ -26,7 +26,8 @@ from icalib.recordings.sections import S
 from icalib.recordings.table import Table, holds, named, read_table
 from icalib.recordings.topics import TopicInfo, choose_topic, find_topic
 from icalib.recordings.tracks import read_track_stamps, read_tracks
-from icalib.recordings.unreadable import VIDEO_FILE, is_video
+from icalib.recordings.unreadable import VIDEO_FILE
+from icalib.recordings.videos import video_payloads, video_stamps, video_topic, videos_in
 from icalib.recordings.wheels import RELATIVE_POSES, STAMPS, UNITS, WheelReadings, read_wheel_table
 from icalib.recordings.window import WHOLE, Span, Window, cut, stamps_inside
 from icalib.rig import PLAIN_TABLE, Camera, ImuSensor, Lidar, PoseSensor, TableLayout, TwoSources, Wheels
@@ -93,6 +94,8 @@ class FolderRecording:
 
     def _all_stamps(self, topic: str) -> np.ndarray:
         chosen = find_topic(str(self.root), self.topics(), topic)
+        if chosen.type == VIDEO_FILE:
+            return video_stamps(self.root / chosen.name)
         if chosen.kind == "image":
             folder = next(p for base in self._bases() if (p := base / chosen.name).is_dir())
             return np.array([stamp_ns for stamp_ns, _ in self._pictures(folder)], np.int64)
@@ -105,11 +108,13 @@ class FolderRecording:
         return np.unique(read_table(self._locate(chosen.name), _CORNERS).integers[:, 0])
 
     def image_topic(self, camera: Camera) -> str:
-        topics = (*self._image_topics(), *self._videos())
-        return choose_topic(str(self.root), topics, "image", camera.name, camera.topic).name
+        return choose_topic(str(self.root), self._seen(), "image", camera.name, camera.topic).name
 
     def payloads(self, topic: str) -> Iterator[Payload]:
-        name = find_topic(str(self.root), self._image_topics(), topic).name
+        chosen = find_topic(str(self.root), self._seen(), topic)
+        if chosen.type == VIDEO_FILE:
+            return self._frames(self.root / chosen.name)
+        name = chosen.name
         folder = next(p for base in self._bases() if (p := base / name).is_dir())
         if (folder / "data.csv").is_file():
             self._remember(folder / "data.csv")
@@ -119,6 +124,17 @@ class FolderRecording:
             inside = stamps_inside(self._window, stamps_ns, str(folder), self._spans())
             files = [file for file, used in zip(files, inside.tolist(), strict=True) if used]
         return checked_payloads(file_payloads(files, str(folder), self._note), str(folder), self._note)
+
+    def _frames(self, video: Path) -> Iterator[Payload]:
+        """Those of a video in the window."""
+        self._remember(video)
+        found = video_payloads(video, str(video))
+        if not self._window.is_all:
+            stamps_ns = video_stamps(video)
+            inside = stamps_inside(self._window, stamps_ns, str(video), self._spans())
+            used = set(stamps_ns[inside].tolist())
+            found = (p for p in found if p.stamp_ns in used)
+        return checked_payloads(found, str(video), self._note)
 
     def images(self, topic: str) -> Iterator[Frame]:
         return frames(self.payloads(topic), f"{self.root}/{topic}", self._note)
@@ -139,7 +155,7 @@ class FolderRecording:
 
     def has_corners(self, camera: Camera) -> bool:
         # Where there are neither corners nor images, the sentence on the missing table is the better one.
-        return self._find(camera.path) is not None or not (self._image_topics() or self._videos())
+        return self._find(camera.path) is not None or not self._seen()
 
     def corners(self, camera: Camera, target: Target) -> CornerStream:
         layout = camera.layout if camera.tracks is None else TableLayout(time_unit=camera.layout.time_unit)
@@ -150,7 +166,7 @@ class FolderRecording:
         return self._part(found, table.path)
 
     def sees(self, camera: Camera) -> bool:
-        return self._find(camera.path) is not None or len(self._image_topics()) > 0
+        return self._find(camera.path) is not None or len(self._seen()) > 0
 
     def tracks(self, camera: Camera) -> TrackStream:
         assert camera.tracks is not None
@@ -258,10 +274,12 @@ class FolderRecording:
         return _stamps(table)
 
     def _videos(self) -> tuple[TopicInfo, ...]:
-        """What is named as videos, which no reader reads."""
-        files = sorted(p for base in self._bases() for pattern in ("*", "*/*") for p in base.glob(pattern))
-        names = [str(p.relative_to(self.root)) for p in files if is_video(p) and p.is_file()]
-        return tuple(TopicInfo(name, VIDEO_FILE, "", 1, None, None) for name in dict.fromkeys(names))
+        files = {p: None for base in self._bases() for p in videos_in(base)}
+        return tuple(video_topic(p, str(p.relative_to(self.root))) for p in files)
+
+    def _seen(self) -> tuple[TopicInfo, ...]:
+        """Images in folders and videos."""
+        return (*self._image_topics(), *self._videos())
 
     def _remember(self, path: Path) -> None:
         if path not in self._read:

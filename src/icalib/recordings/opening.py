@@ -12,7 +12,7 @@ from icalib.recordings.base import Recording
 from icalib.recordings.folder import FolderRecording, has_named_table
 from icalib.recordings.pictures import PictureFolder, has_pictures
 from icalib.recordings.poses import FILES as POSE_FILES
-from icalib.recordings.unreadable import HEAD_BYTES, not_data
+from icalib.recordings.unreadable import HEAD_BYTES, is_video, not_data
 from icalib.recordings.window import Window
 
 _MAX_LISTED = 12
@@ -45,8 +45,8 @@ def open_recording(path: str | Path, start_s: float = 0.0, end_s: float = inf) -
 
 
 def _refuse_unreadable(folder: Path) -> None:
-    """Raises RecordingError where a file of `folder` is a video or a pointer of Git LFS."""
-    for path in sorted(p for p in folder.iterdir() if p.is_file()):
+    """Raises RecordingError where a file of `folder` is a pointer of Git LFS or git-annex."""
+    for path in sorted(p for p in folder.iterdir() if p.is_file() and not is_video(p)):
         with path.open("rb") as file:
             sentence = not_data(path, file.read(HEAD_BYTES))
         if sentence:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import PurePosixPath
 from typing import Protocol
 
 from icalib.errors import RecordingError
@@ -58,7 +59,7 @@ def choose_topic(where: str, topics: Sequence[TopicInfo], kind: str, sensor: str
     if given is not None:
         return _given(where, topics, kind, given)
     found = [t for t in topics if t.kind == kind and t.count]
-    named = [t for t in found if sensor in t.name.split("/")]
+    named = [t for t in found if sensor in (*t.name.split("/"), PurePosixPath(t.name).stem)]
     candidates = named or found
     if len(candidates) == 1:
         return candidates[0]

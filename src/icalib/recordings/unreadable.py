@@ -6,10 +6,6 @@ import re
 from pathlib import Path
 
 VIDEO_FILE = "video file"  # the type of a topic
-VIDEO_ADVICE = (
-    "write its images to a folder (`ffmpeg -i VIDEO FOLDER/%06d.png`), which calibrates cameras alone, and with an IMU "
-    "give data.csv with the stamp of each"
-)
 HEAD_BYTES = 64  # that `not_data` needs
 VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".h264", ".h265", ".mjpeg", ".insv", ".360")
 _POINTERS = {b"version https://git-lfs.github.com/spec": "git lfs pull", b"/annex/objects/": "git annex get"}
@@ -28,7 +24,7 @@ def not_data(path: Path, head: bytes) -> str | None:
         if head.startswith(magic):
             return f"{path} is a pointer to a file that was not downloaded; run `{command}` where it comes from."
     if any(head[at : at + len(magic)] == magic for at, magic in _CONTAINERS):
-        return f"{path} is a video, which icalib does not read; {VIDEO_ADVICE}."
+        return f"{path} is a video; give the folder that it lies in as the recording."
     return None
 
 
@@ -47,4 +43,4 @@ def type_not_read(kind: str) -> tuple[str, str] | None:
         )
     if _VIDEO.fullmatch(kind):
         return "image", "compressed video; decode it by its image transport, and record sensor_msgs/Image"
-    return ("image", f"a video; {VIDEO_ADVICE}") if kind == VIDEO_FILE else None
+    return None

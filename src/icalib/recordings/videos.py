@@ -1,0 +1,114 @@
+"""Video files as recordings of one camera: frames in order, with the stamps of a table beside them, or their own."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from icalib.errors import RecordingError
+from icalib.extras import load_cv2
+from icalib.recordings.clocks import nanoseconds
+from icalib.recordings.euroc_images import unit_of_texts
+from icalib.recordings.images import Payload
+from icalib.recordings.topics import TopicInfo
+from icalib.recordings.unreadable import VIDEO_FILE, is_video
+
+_TABLES = (".csv", ".txt")
+_STAMP = re.compile(r"[0-9]+(\.[0-9]*)?")
+
+
+def videos_in(folder: Path) -> list[Path]:
+    """The video files in `folder` and in the folders in it, by name."""
+    return sorted(p for pattern in ("*", "*/*") for p in folder.glob(pattern) if is_video(p) and p.is_file())
+
+
+def video_topic(path: Path, name: str) -> TopicInfo:
+    """What is known of a video without decoding it; the count is the container's, and may be off by a few frames. A
+    file that cannot be opened has no frames."""
+    times = frame_times(path)
+    if times is not None:
+        return TopicInfo(name, VIDEO_FILE, "image", len(times), int(times[0]), int(times[-1]))
+    try:
+        with _opened(path) as video:
+            count, rate = (float(video.get(what)) for what in (_property("FRAME_COUNT"), _property("FPS")))
+    except RecordingError:
+        return TopicInfo(name, VIDEO_FILE, "image", 1, None, None)
+    frames = max(int(count), 1) if np.isfinite(count) else 1
+    return TopicInfo(name, VIDEO_FILE, "image", frames, 0, int(1e9 * (frames - 1) / rate) if rate > 0.0 else None)
+
+
+def frame_times(path: Path) -> np.ndarray | None:
+    """(N,) int64 ns: stamps of the frames, from the table of the video's name beside it (`cam0.csv` or `cam0.txt` of
+    `cam0.mp4`), whose first column they are; None where there is none. Raises RecordingError naming the line."""
+    table = next((p for ending in _TABLES if (p := path.with_suffix(ending)).is_file()), None)
+    if table is None:
+        return None
+    texts = []
+    for number, line in enumerate(table.read_text(encoding="utf-8-sig", errors="replace").splitlines(), 1):
+        first = re.split(r"[,;\s]", line.strip(), maxsplit=1)[0]
+        if not first or first.startswith("#") or (not texts and first[:1].isalpha()):
+            continue
+        if not _STAMP.fullmatch(first):
+            raise RecordingError(f"{table}:{number}: {line.strip()[:60]!r} does not begin with a stamp; correct it.")
+        texts.append(first)
+    if not texts:
+        raise RecordingError(f"{table} holds no stamps; write one line for each frame of {path.name}, or remove it.")
+    unit = unit_of_texts(texts)
+    return np.array([nanoseconds(text, unit) for text in texts], np.int64)
+
+
+def video_stamps(path: Path) -> np.ndarray:
+    """(N,) int64 ns of all frames. Raises RecordingError as `video_payloads`."""
+    times = frame_times(path)
+    return np.array([p.stamp_ns for p in video_payloads(path, str(path))], np.int64) if times is None else times
+
+
+def video_payloads(path: Path, where: str) -> Iterator[Payload]:
+    """The frames, grey, one at a time. Without a table of stamps they have those of the video, from 0 on.
+
+    Raises RecordingError for a file that cannot be decoded, and where the table has more or fewer stamps than there
+    are frames.
+    """
+    cv2, times, n = load_cv2(), frame_times(path), 0
+    with _opened(path) as video:
+        while True:
+            good, image = video.read()
+            own_ns = round(1e6 * float(video.get(_property("POS_MSEC"))))
+            if not good or (times is not None and n >= len(times)):
+                break
+            grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+            height, width = grey.shape
+            stamp_ns = own_ns if times is None else int(times[n])
+            yield Payload(stamp_ns, where, "mono8", grey.tobytes(), width, height, width, name=f"frame {n}")
+            n += 1
+    if not n:
+        raise RecordingError(f"{path} has no frames that can be decoded; copy it again, or convert it to H.264.")
+    if times is not None and (good or n != len(times)):
+        frames = "more" if good else str(n)
+        raise RecordingError(
+            f"{path} has {frames} frames, and its table {len(times)} stamps; give one for each frame, or remove the "
+            "table to use the video's own."
+        )
+
+
+def _property(name: str) -> int:
+    return getattr(load_cv2(), f"CAP_PROP_{name}")
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """The video, upright as the sensor read it. Raises RecordingError where it is none."""
+    cv2 = load_cv2()
+    video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    try:
+        if not video.isOpened():
+            raise RecordingError(f"{path} is no video that can be decoded; copy it again, or convert it to H.264.")
+        video.set(_property("ORIENTATION_AUTO"), 0)
+        yield video
+    finally:
+        video.release()

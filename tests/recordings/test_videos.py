@@ -1,0 +1,100 @@
+"""Video files: their frames are images, with the stamps of a table beside them, or their own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from icalib.errors import RecordingError
+from icalib.inspection import inspect_recording
+from icalib.recordings import decode, open_recording
+from icalib.rig import Camera
+
+cv2 = pytest.importorskip("cv2")
+SIZE, FRAMES, RATE = (64, 48), 12, 20.0
+ORIGIN_NS = 1_700_000_000_000_000_000
+CAMERA = Camera("cam0", "cam0/corners.csv", "pinhole-radtan", SIZE)
+
+
+def write_video(path: Path, frames: int = FRAMES) -> Path:
+    """Each frame is brighter than the one before."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    code = cv2.VideoWriter_fourcc(*("MJPG" if path.suffix == ".avi" else "mp4v"))
+    video = cv2.VideoWriter(str(path), code, RATE, SIZE)
+    assert video.isOpened()
+    for k in range(frames):
+        video.write(np.full((SIZE[1], SIZE[0], 3), 20 + 15 * k, np.uint8))
+    video.release()
+    return path
+
+
+def times(path: Path, n: int, header: str = "") -> np.ndarray:
+    """Stamps at an uneven rate in a table beside the video."""
+    stamps = ORIGIN_NS + 50_000_000 * np.arange(n) + 3_000_000 * (np.arange(n) % 3)
+    path.write_text(header + "".join(f"{t},{k}\n" for k, t in enumerate(stamps.tolist())))
+    return stamps
+
+
+@pytest.mark.parametrize("name", ["cam0.mp4", "cam0.avi", "cam0/video.mp4", "mav0/cam0.mp4"])
+def test_frames_are_images_with_the_stamps_of_the_video(tmp_path, name):
+    write_video(tmp_path / name)
+    recording = open_recording(tmp_path)
+    topic = recording.image_topic(CAMERA)
+    assert topic == name
+    found = list(recording.payloads(topic))
+    np.testing.assert_allclose([p.stamp_ns for p in found], 5e7 * np.arange(FRAMES), atol=1e6)
+    grey = [float(decode(p).mean()) for p in found]
+    np.testing.assert_allclose(grey, 20 + 15 * np.arange(FRAMES), atol=3.0)
+    assert recording.files() == [tmp_path / name]
+
+
+@pytest.mark.parametrize("ending", [".csv", ".txt"])
+def test_a_table_beside_the_video_has_the_stamps(tmp_path, ending):
+    write_video(tmp_path / "cam0.mp4")
+    stamps = times(tmp_path / f"cam0{ending}", FRAMES, "#timestamp [ns],frame\n")
+    recording = open_recording(tmp_path)
+    assert [p.stamp_ns for p in recording.payloads("cam0.mp4")] == stamps.tolist()
+    assert recording.stamps("cam0.mp4").tolist() == stamps.tolist()
+    (topic,) = [t for t in recording.topics() if t.kind == "image"]
+    assert (topic.count, topic.first_ns, topic.last_ns) == (FRAMES, stamps[0], stamps[-1])
+
+
+def test_a_part_of_the_video(tmp_path):
+    write_video(tmp_path / "cam0.mp4")
+    times(tmp_path / "cam0.csv", FRAMES)
+    part = list(open_recording(tmp_path, 0.2, 0.41).payloads("cam0.mp4"))
+    assert [p.name for p in part] == [f"frame {k}" for k in range(4, 9)]
+
+
+@pytest.mark.parametrize(("rows", "words"), [(FRAMES - 2, "has more frames"), (FRAMES + 1, f"has {FRAMES} frames")])
+def test_a_table_of_another_length_is_refused(tmp_path, rows, words):
+    write_video(tmp_path / "cam0.mp4")
+    times(tmp_path / "cam0.csv", rows)
+    with pytest.raises(RecordingError, match=f"{words}, and its table {rows} stamps"):
+        list(open_recording(tmp_path).payloads("cam0.mp4"))
+
+
+def test_a_line_that_is_no_stamp_is_named(tmp_path):
+    write_video(tmp_path / "cam0.mp4")
+    (tmp_path / "cam0.csv").write_text("100\n150\nlate\n")
+    with pytest.raises(RecordingError, match=r"cam0\.csv:3: 'late' does not begin with a stamp"):
+        open_recording(tmp_path).topics()
+
+
+def test_a_file_that_is_no_video_is_refused(tmp_path):
+    (tmp_path / "cam0.mp4").write_bytes(b"\0\0\0 ftypisom" + bytes(100))
+    recording = open_recording(tmp_path)
+    with pytest.raises(RecordingError, match=r"cam0\.mp4 is no video that can be decoded; copy it again"):
+        list(recording.payloads("cam0.mp4"))
+    assert any("is no video that can be decoded" in f.sentence for f in inspect_recording(tmp_path).findings)
+
+
+def test_two_videos_are_told_by_their_names(tmp_path):
+    for name in ("cam0.mp4", "cam1.mp4"):
+        write_video(tmp_path / name)
+    recording = open_recording(tmp_path)
+    assert recording.image_topic(CAMERA) == "cam0.mp4"
+    found = inspect_recording(tmp_path)
+    assert [c.name for c in found.sources.cameras] == ["cam0", "cam1"]
