@@ -10,7 +10,6 @@ import numpy as np
 
 from icalib.errors import RecordingError
 from icalib.measurements import (
-    NO_VIEWS,
     CornerStream,
     ImuStream,
     LidarStream,
@@ -129,11 +128,12 @@ def _joined_tracks(recordings: list[tuple[Measurements, int]]) -> tuple[TrackStr
         stamps = [s.stamps_ns + np.int64(shift) for s, (_, shift) in zip(streams, recordings, strict=True)]
         numbers = [s.feature - low + at for s, low, at in zip(streams, least, sizes, strict=False)]
         start = np.concatenate([[0], np.cumsum(np.concatenate([np.diff(s.start) for s in streams]))])
-        uv, views = (np.concatenate([getattr(s, name) for s in streams]) for name in ("uv", "views"))
+        uv = np.concatenate([s.uv for s in streams])
+        stated = {name: np.concatenate([getattr(s, name) for s in streams]) for name in ("views", "spread")}
         joined.append(
             TrackStream(
                 one.name, np.concatenate(stamps), start.astype(np.int64), np.concatenate(numbers), uv,
-                views=views if len(views) == len(uv) else NO_VIEWS,
+                **{name: values for name, values in stated.items() if len(values) == len(uv)},
             )
         )  # fmt: skip
     return tuple(joined)

@@ -146,7 +146,8 @@ class TrackStream:
     stamps_ns (M,) int64, one per image, strictly increasing; start (M + 1,) int64, observations of image i are
     start[i]:start[i+1]; feature (N,) int64, the same number is the same point of the scene, in all cameras; uv (N, 2)
     pixels, (0, 0) is the centre of the top-left pixel; views (N,) int64, how many images the tracker had seen the
-    feature in before, (0,) where it does not say.
+    feature in before, (0,) where it does not say; spread (N,) px^2, second moment of the patch that was aligned, along
+    each axis, as the alignment weighs its points, (0,) where it does not say.
     """
 
     name: str
@@ -155,11 +156,11 @@ class TrackStream:
     feature: np.ndarray
     uv: np.ndarray
     views: np.ndarray = field(default_factory=lambda: NO_VIEWS, kw_only=True)
+    spread: np.ndarray = field(default_factory=lambda: np.zeros(0), kw_only=True)
 
     def __post_init__(self) -> None:
         counts = {"feature": len(self.feature), "uv": len(self.uv)}
-        if len(self.views):
-            counts["views"] = len(self.views)
+        counts |= {name: n for name in ("views", "spread") if (n := len(getattr(self, name)))}
         _check_groups(self.name, self.stamps_ns, self.start, "observations", counts)
         _check(self.feature.dtype == np.int64, f"{self.name}: feature must be int64.")
         _check(self.uv.shape[1:] == (2,), f"{self.name}: uv must have shape (N, 2), not {self.uv.shape}.")

@@ -24,6 +24,7 @@ from icalib.estimation.imu_model import N_INTRINSICS
 from icalib.estimation.inputs import Inputs, origin_difference
 from icalib.estimation.lidar_sweep import Motion
 from icalib.estimation.nodes import MERGED_WITHIN_S, distinct, first_nodes, place_nodes, usable
+from icalib.estimation.patch_curvature import with_curved_patches
 from icalib.estimation.poses import assign_nodes, poses_at
 from icalib.estimation.prior_factor import Prior
 from icalib.estimation.problem import ChainFactor, Problem
@@ -203,7 +204,10 @@ def _others(inputs: Inputs, state: State, noise: RobotNoise) -> tuple[SensorFact
 
 def _features(inputs: Inputs, state: State, cameras: tuple[CornerFactor, ...], following: Following) -> FeatureFactor:
     """Points of the scene, as tracks that the poses of `state` find."""
-    streams, settings = inputs.measurements.tracks, inputs.rig.settings
+    settings = inputs.rig.settings
+    streams = tuple(
+        with_curved_patches(t, c.model, c.lens(state)) for t, c in zip(inputs.measurements.tracks, cameras, strict=True)
+    )
     shown = on_the_chain(inputs, state, cameras)
     keep = tuple(k & s for k, s in zip(following.keep, shown, strict=True))
     loss = settings.loss, settings.loss_scale

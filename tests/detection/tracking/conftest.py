@@ -9,7 +9,6 @@ import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 SIZE = (320, 240)
-LENS = np.array([250.0, 250.0, 159.5, 119.5, 0.0, 0.0, 0.0, 0.0])
 IMAGES = 20
 _K = np.array([[250.0, 0.0, 159.5], [0.0, 250.0, 119.5], [0.0, 0.0, 1.0]])
 

@@ -44,6 +44,25 @@ def test_a_known_map_is_found_whatever_the_exposure(A, shift, gain, offset):
     np.testing.assert_allclose(found[0], A, atol=0.02)
 
 
+def test_the_spread_is_what_moves_the_alignment_where_the_map_is_curved():
+    """Displacements of curvature x^2 / 2 along both axes and in both directions."""
+    centre, curvature = np.array([48.0, 48.0]), 2e-3
+    first, _ = cut_templates(_image(np.eye(2), np.zeros(2), centre), centre[None])
+    v, u = np.mgrid[:SIZE, :SIZE].astype(np.float64)
+    shifts = []
+    for along in (u, v):
+        for component in range(2):
+            moved = 0.5 * curvature * (along - 48.0) ** 2
+            at = [u - moved, v] if component == 0 else [u, v - moved]
+            seen = _grey(*at).astype(np.float32)
+            uv, alike = centre[None].copy(), np.empty(1)
+            for _ in range(3):
+                align(seen, first, uv, np.eye(2)[None].copy(), alike)
+            shifts.append(uv[0, component] - 48.0)
+    assert np.mean(shifts) == pytest.approx(0.5 * curvature * first.spread[0], rel=0.1)
+    assert 0.2 * 56.0 / 3.0 < first.spread[0] < 56.0 / 3.0  # of an even patch of 15 px
+
+
 def test_another_pattern_is_not_alike():
     centre = np.array([48.0, 48.0])
     first, _ = cut_templates(_image(np.eye(2), np.zeros(2), centre), centre[None])

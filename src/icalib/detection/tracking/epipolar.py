@@ -1,9 +1,10 @@
-"""Points that do not fit the motion of the camera between two images: least median of squares, compiled.
+"""The epipolar geometry of two images through a lens that is not known, compiled.
 
-Rays f, h of a point that stands still satisfy h . E f = 0 in two images. E comes from eight points (Longuet-Higgins
-1981) drawn at random; of many draws the one with the least median error counts, and what is far above that median does
-not fit (Rousseeuw 1984; Zhang 1995). The median needs no threshold, so that a lens that is only roughly known, whose
-errors are larger, rejects no more.
+A pixel at (x, y) from the image's centre has the ray (x, y, 1 + bend (x^2 + y^2)): the division model of Fitzgibbon
+(Simultaneous linear estimation of multiple view geometry and lens distortion, 2001). Rays f, h of a point that stands
+still satisfy h . F f = 0. F comes from eight points drawn at random; of many draws the one with the least median error
+counts (least median of squares, Rousseeuw 1984; Zhang 1995). F absorbs the focal length, so that `bend` is all that
+must be known of the lens.
 """
 
 from __future__ import annotations
@@ -14,38 +15,37 @@ from numba import njit
 DRAWS = 60  # with 30 % of outliers, chance misses every clean sample once in 35 pairs of images; with 20 %, never
 REFITS, FITS_TIMES = 2, 4.0  # with all points whose errors are within so many medians
 FEWEST = 16  # points; of fewer the median says little
-TIMES_SIGMA = 3.0
-LEAST_PX = 1.0  # no point is rejected for a smaller error
 
 
-def fits_one_motion(f: np.ndarray, h: np.ndarray, px_per_rad: float, seed: int) -> np.ndarray:
-    """(n,) bool: whether rays f and h (n, 3) of each point in two images fit one motion of the camera; all, where there
-    are too few to tell."""
-    if len(f) < FEWEST:
-        return np.ones(len(f), dtype=bool)
+def epipolar_errors(p: np.ndarray, q: np.ndarray, bend: float, seed: int) -> tuple[np.ndarray, float]:
+    """(n,) first-order distances of points p and q (n, 2) in two images from the epipolar geometry of most, and their
+    standard deviation by the median. n is FEWEST at least; units are those of p and q, from the images' centre."""
     rng = np.random.default_rng(seed)
-    draws = rng.permuted(np.tile(np.arange(len(f)), (DRAWS, 1)), axis=1)[:, :8].copy()
-    error = np.empty(len(f))
-    median = _least_median(f, h, draws, error)
-    # Rousseeuw's correction for few points.
-    sigma = 1.4826 * (1.0 + 5.0 / (len(f) - 8)) * median
-    return error <= max(TIMES_SIGMA * sigma, LEAST_PX / px_per_rad)
+    draws = rng.permuted(np.tile(np.arange(len(p)), (DRAWS, 1)), axis=1)[:, :8].copy()
+    error = np.empty(len(p))
+    median = _least_median(np.ascontiguousarray(p), np.ascontiguousarray(q), bend, draws, error)
+    return error, 1.4826 * (1.0 + 5.0 / (len(p) - 8)) * median  # Rousseeuw's correction for few points
 
 
 @njit(cache=True, nogil=True)
-def _least_median(f, h, draws, least):
-    """The least median of errors [rad] over all draws (m, 8), and over what all points that fit then give; least (n,):
-    the errors of that one."""
-    best, error, fits = np.inf, np.empty(len(f)), np.empty(len(f), dtype=np.bool_)
+def _least_median(p, q, bend, draws, least):
+    """The least median of errors over all draws (m, 8), and over what all points that fit then give; least (n,): the
+    errors of that one."""
+    n = len(p)
+    f, h, error, used = np.empty((n, 3)), np.empty((n, 3)), np.empty(n), np.empty(n, dtype=np.bool_)
+    for i in range(n):
+        f[i, 0], f[i, 1], f[i, 2] = p[i, 0], p[i, 1], 1.0 + bend * (p[i, 0] ** 2 + p[i, 1] ** 2)
+        h[i, 0], h[i, 1], h[i, 2] = q[i, 0], q[i, 1], 1.0 + bend * (q[i, 0] ** 2 + q[i, 1] ** 2)
+    best = np.inf
     for k in range(len(draws) + REFITS):
         if k < len(draws):
-            fits[:] = False
+            used[:] = False
             for i in draws[k]:
-                fits[i] = True
+                used[i] = True
         else:
-            for i in range(len(f)):
-                fits[i] = least[i] <= FITS_TIMES * best
-        _errors(f, h, _essential(f, h, fits), error)
+            for i in range(n):
+                used[i] = least[i] <= FITS_TIMES * best
+        _errors(f, h, bend, _fundamental(f, h, used), error)
         median = np.median(error)
         if median < best:
             best = median
@@ -54,15 +54,15 @@ def _least_median(f, h, draws, least):
 
 
 @njit(cache=True, nogil=True)
-def _essential(f, h, used):
-    """E (3, 3), h . E f = 0 in least squares over the rays that are `used` (n,)."""
+def _fundamental(f, h, used):
+    """F (3, 3), h . F f = 0 in least squares over the rays that are `used` (n,)."""
     A, row = np.zeros((9, 9)), np.empty(9)
-    for k in range(len(f)):
-        if not used[k]:
+    for i in range(len(f)):
+        if not used[i]:
             continue
         for a in range(3):
             for b in range(3):
-                row[3 * a + b] = h[k, a] * f[k, b]
+                row[3 * a + b] = h[i, a] * f[i, b]
         for a in range(9):
             for b in range(9):
                 A[a, b] += row[a] * row[b]
@@ -70,14 +70,16 @@ def _essential(f, h, used):
 
 
 @njit(cache=True, nogil=True)
-def _errors(f, h, E, error):
-    """error (n,) [rad]: first-order distance of each pair of rays from h . E f = 0 (Sampson's, on the sphere)."""
-    for n in range(len(f)):
+def _errors(f, h, bend, F, error):
+    """error (n,): Sampson's distance |h . F f| over the norm of its derivatives by the four pixel coordinates."""
+    for i in range(len(f)):
         value, size = 0.0, 0.0
-        for a in range(3):
-            by_h = E[a, 0] * f[n, 0] + E[a, 1] * f[n, 1] + E[a, 2] * f[n, 2]
-            by_f = E[0, a] * h[n, 0] + E[1, a] * h[n, 1] + E[2, a] * h[n, 2]
-            value += h[n, a] * by_h
-            size += by_h * by_h + by_f * by_f
-        # Rays move on the sphere only: the part of each derivative along its ray, which is `value`, does not count.
-        error[n] = abs(value) / np.sqrt(max(size - 2.0 * value * value, 1e-18))
+        l0, l1, l2 = 0.0, 0.0, 0.0  # F f
+        m0, m1, m2 = 0.0, 0.0, 0.0  # F^T h
+        for b in range(3):
+            l0, l1, l2 = l0 + F[0, b] * f[i, b], l1 + F[1, b] * f[i, b], l2 + F[2, b] * f[i, b]
+            m0, m1, m2 = m0 + F[b, 0] * h[i, b], m1 + F[b, 1] * h[i, b], m2 + F[b, 2] * h[i, b]
+        value = h[i, 0] * l0 + h[i, 1] * l1 + h[i, 2] * l2
+        size += (l0 + 2.0 * bend * h[i, 0] * l2) ** 2 + (l1 + 2.0 * bend * h[i, 1] * l2) ** 2
+        size += (m0 + 2.0 * bend * f[i, 0] * m2) ** 2 + (m1 + 2.0 * bend * f[i, 1] * m2) ** 2
+        error[i] = abs(value) / np.sqrt(max(size, 1e-30))

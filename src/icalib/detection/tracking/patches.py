@@ -24,16 +24,18 @@ class Templates(NamedTuple):
     """First views of n tracks.
 
     grey (n, SIDE, SIDE) float32: grey levels, mean 0 and standard deviation 1; slope (n, SIDE, SIDE, 2) float32: their
-    derivatives by x and y, per px; inverse (n, 6, 6): inverse of the normal matrix of the affine map.
+    derivatives by x and y, per px; inverse (n, 6, 6): inverse of the normal matrix of the affine map; spread (n,) px^2:
+    second moment of the patch along each axis, as the affine map weighs its points.
     """
 
     grey: np.ndarray
     slope: np.ndarray
     inverse: np.ndarray
+    spread: np.ndarray
 
     def some(self, kept: np.ndarray) -> Templates:
         """Those in `kept`, indices or a mask."""
-        return Templates(self.grey[kept], self.slope[kept], self.inverse[kept])
+        return Templates(*(column[kept] for column in self))
 
     def joined(self, other: Templates) -> Templates:
         return Templates(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
@@ -41,7 +43,10 @@ class Templates(NamedTuple):
 
 def no_templates() -> Templates:
     return Templates(
-        np.zeros((0, SIDE, SIDE), np.float32), np.zeros((0, SIDE, SIDE, 2), np.float32), np.zeros((0, 6, 6))
+        np.zeros((0, SIDE, SIDE), np.float32),
+        np.zeros((0, SIDE, SIDE, 2), np.float32),
+        np.zeros((0, 6, 6)),
+        np.zeros(0),
     )
 
 
@@ -55,7 +60,20 @@ def cut_templates(image: np.ndarray, uv: np.ndarray) -> tuple[Templates, np.ndar
     normal[:, range(6), range(6)] += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None] + 1e-12
     good = (contrast > LEAST_CONTRAST) & (np.linalg.cond(normal) < 1e8)
     normal[~good] = np.eye(6)
-    return Templates(grey, slope, np.linalg.inv(normal)), good
+    inverse = np.linalg.inv(normal)
+    return Templates(grey, slope, inverse, _spread(slope, inverse)), good
+
+
+def _spread(slope: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+    """(n,) px^2: by how much the affine map's shift answers to a displacement q(x) = x_a^2 of the patch, in the mean
+    over both axes a and both components of q: the second moment that is left of the patch's own."""
+    y, x = np.mgrid[-RADIUS : RADIUS + 1, -RADIUS : RADIUS + 1].astype(np.float64)
+    by_x, by_y = slope[..., 0], slope[..., 1]
+    rows = np.stack([by_x * x, by_x * y, by_y * x, by_y * y, by_x, by_y], axis=-1)
+    square = np.stack([x * x, y * y])
+    seen = np.einsum("nija,nijk,qij->nkqa", rows, slope, square, optimize=True)
+    shift = np.einsum("nka,nkqa->nkq", inverse[:, 4:], seen)
+    return np.clip(shift.mean(axis=(1, 2)), 0.0, None)
 
 
 @njit(cache=True, nogil=True)

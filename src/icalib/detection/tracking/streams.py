@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -21,11 +20,10 @@ from icalib.detection.image_work import (
     on_all_cores,
     turns_of,
 )
-from icalib.detection.tracking.lens import rough_lens
+from icalib.detection.tracking.moving import moving_features
 from icalib.detection.tracking.robot_parts import stay_in_place
 from icalib.detection.tracking.tracker import Tracker
 from icalib.errors import RecordingError
-from icalib.geometry.cameras import camera_model
 from icalib.measurements import TrackStream
 from icalib.recordings import DamagedImageError, Payload, Recording, decode
 from icalib.rig import Camera
@@ -35,21 +33,23 @@ STRETCH, STRETCH_BYTES = 120, 64 << 20  # images, and their bytes, that are foll
 FEWEST_VIEWS = 3  # of a track; two images of one point are met by almost any pose
 FEWEST_POINTS = 12  # in an image, below which it says little of the camera's motion
 NOTED = 0.05  # of the tracks; fewer that are left out are not worth a note
-_COLUMNS = ("stamps_ns", "start", "feature", "uv", "views")
+_COLUMNS = ("stamps_ns", "start", "feature", "uv", "views", "spread")
 _COUNTS = ("moving", "in_place")
 
 
 @dataclass(frozen=True)
 class _Found:
-    """Tracks of some images: stamps_ns (M,), start (M + 1,), feature, views (N,) and uv (N, 2); moving: how many
-    features do not fit the motion of the camera; in_place: how many stay in place; damaged: why the last image that
-    cannot be decoded cannot."""
+    """Tracks of some images: stamps_ns (M,), start (M + 1,), feature, views, spread (N,) and uv (N, 2).
+
+    moving: how many features do not fit the motion of the camera; in_place: how many stay in place; damaged: why the
+    last image that cannot be decoded cannot."""
 
     stamps_ns: np.ndarray
     start: np.ndarray
     feature: np.ndarray
     uv: np.ndarray
     views: np.ndarray
+    spread: np.ndarray
     moving: int
     in_place: int
     damaged: str = ""
@@ -65,20 +65,19 @@ def find_tracks(
     """
     topic, where = recording.image_topic(camera), recording.where(camera)
     files: dict[int, str] = {}
-    lens = rough_lens(camera)
 
     def read() -> Iterator[Payload]:
         return noting_files(of_resolution(recording.payloads(topic), camera, where), files)
 
-    key = stream_key(read(), f"tracks {VERSION} {camera.model} {lens.tolist()}") if keep else ""
+    key = stream_key(read(), f"tracks {VERSION}") if keep else ""
     kept = load_kept(key, (*_COLUMNS, *_COUNTS)) if keep else None
     if kept is not None:
-        stamps_ns, start, feature, uv, views = (kept[name] for name in _COLUMNS)
+        stamps_ns, start, feature, uv, views, spread = (kept[name] for name in _COLUMNS)
         moving, in_place = (int(kept[name]) for name in _COUNTS)
-        found = _Found(stamps_ns, start, feature, uv, views, moving, in_place)
+        found = _Found(stamps_ns, start, feature, uv, views, spread, moving, in_place)
     else:
         count, payloads = image_count(recording, topic), read()
-        found = _follow(payloads, camera, lens, lambda n: progress(n / max(count, n)))
+        found = _follow(payloads, lambda n: progress(n / max(count, n)))
         if not len(found.stamps_ns):
             raise RecordingError(found.damaged or f"{where}: there are no images; check that the camera was running.")
         if keep:
@@ -87,19 +86,19 @@ def find_tracks(
     return stream, tuple(f"{where}: {note}" for note in _notes(found, files))
 
 
-def _follow(payloads: Iterator[Payload], camera: Camera, lens: np.ndarray, done: Callable[[int], None]) -> _Found:
+def _follow(payloads: Iterator[Payload], done: Callable[[int], None]) -> _Found:
     parts: list[_Found] = []
     stretches = turns_of(payloads, STRETCH, STRETCH_BYTES)
-    for part in on_all_cores(stretches, partial(_in_stretch, camera=camera, lens=lens)):
+    for part in on_all_cores(stretches, _in_stretch):
         parts.append(part)
         done(sum(len(p.stamps_ns) for p in parts))
     return _joined(parts)
 
 
-def _in_stretch(payloads: list[Payload], camera: Camera, lens: np.ndarray) -> _Found:
+def _in_stretch(payloads: list[Payload]) -> _Found:
     """Tracks of images that are followed in one go. Features that moved, stayed in place, or were seen too rarely, are
     left out."""
-    tracker, damaged = Tracker(camera_model(camera.model), lens), ""
+    tracker, damaged, size = Tracker(), "", (1, 1)
     stamps, seen = [], []
     for p in payloads:
         try:
@@ -107,6 +106,7 @@ def _in_stretch(payloads: list[Payload], camera: Camera, lens: np.ndarray) -> _F
         except DamagedImageError as error:
             damaged = str(error)
             continue
+        size = image.shape[1], image.shape[0]
         stamps.append(p.stamp_ns)
         seen.append(tracker.add(image))
     count = [len(s.feature) for s in seen]
@@ -115,11 +115,12 @@ def _in_stretch(payloads: list[Payload], camera: Camera, lens: np.ndarray) -> _F
         np.concatenate([np.zeros(0, np.int64), *(s.feature for s in seen)]),
         np.concatenate([np.zeros((0, 2)), *(s.uv for s in seen)]),
         np.concatenate([np.zeros(0, np.int64), *(s.views for s in seen)]),
+        np.concatenate([np.zeros(0), *(s.spread for s in seen)]),
         0, 0, damaged,
     )  # fmt: skip
     good = np.bincount(whole.feature) >= FEWEST_VIEWS
-    in_place, moving = stay_in_place(whole.start, whole.feature, whole.uv), np.zeros(len(good), dtype=bool)
-    moving[list(tracker.moved)] = True
+    in_place = stay_in_place(whole.start, whole.feature, whole.uv)
+    moving = moving_features(whole.start, whole.feature, whole.uv, size)
     kept = _some(whole, (good & ~in_place & ~moving)[whole.feature])
     return replace(kept, moving=int((moving & ~in_place).sum()), in_place=int((in_place & (good | moving)).sum()))
 
@@ -127,7 +128,8 @@ def _in_stretch(payloads: list[Payload], camera: Camera, lens: np.ndarray) -> _F
 def _some(found: _Found, kept: np.ndarray) -> _Found:
     """The observations kept (N,)."""
     start = np.concatenate([[0], np.cumsum(kept)])[found.start].astype(np.int64)
-    return replace(found, start=start, feature=found.feature[kept], uv=found.uv[kept], views=found.views[kept])
+    columns = {name: getattr(found, name)[kept] for name in ("feature", "uv", "views", "spread")}
+    return replace(found, start=start, **columns)
 
 
 def _joined(parts: Sequence[_Found]) -> _Found:
@@ -141,6 +143,7 @@ def _joined(parts: Sequence[_Found]) -> _Found:
         np.concatenate([none, *(f + p.feature for f, p in zip(first, parts, strict=False))]),
         np.concatenate([np.zeros((0, 2)), *(p.uv for p in parts)]),
         np.concatenate([none, *(p.views for p in parts)]),
+        np.concatenate([np.zeros(0), *(p.spread for p in parts)]),
         sum(p.moving for p in parts), sum(p.in_place for p in parts),
         next((p.damaged for p in reversed(parts) if p.damaged), ""),
     )  # fmt: skip
@@ -157,7 +160,9 @@ def _stream(name: str, found: _Found, where: str) -> TrackStream:
         )
     kept = count > 0
     start = np.concatenate([[0], np.cumsum(count[kept])]).astype(np.int64)
-    return TrackStream(name, found.stamps_ns[kept], start, found.feature, found.uv, views=found.views)
+    return TrackStream(
+        name, found.stamps_ns[kept], start, found.feature, found.uv, views=found.views, spread=found.spread
+    )
 
 
 def _notes(found: _Found, files: dict[int, str]) -> Iterator[str]:

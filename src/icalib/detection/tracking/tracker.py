@@ -1,21 +1,18 @@
 """One camera's tracker: corners of the scene, followed through its images in order.
 
 Each image: contrast equalisation, pyramidal Lucas-Kanade forward and backward, alignment with the first view of each
-track, a check against the epipolar geometry, new corners in empty cells.
+track, new corners in empty cells.
 """
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from icalib.detection.tracking.epipolar import fits_one_motion
 from icalib.detection.tracking.patches import RADIUS, Templates, align, cut_templates, no_templates
 from icalib.extras import load_cv2
-from icalib.geometry.cameras.base import CameraModel
 
 CELLS = 100  # of an image; each begins one track at a time
 MOST_VIEWS = 30  # of a track; later views differ too much from the first, and long tracks cost the estimator time
@@ -27,17 +24,17 @@ ALIGNED_PX = 2.0  # of Lucas-Kanade's place: alignment goes no further
 LEAST_ALIKE = 0.8  # correlation with the first view
 LEAST_QUALITY = 5e-4  # smallest eigenvalue of a corner (OpenCV's, grey levels of 0 to 1)
 NEAR_PX = 3  # of a corner found at half the resolution
-EARLIER = (1, 4)  # images ago: the epipolar geometry is checked with these
 
 
 @dataclass(frozen=True)
 class Followed:
     """Observations of one image: feature (n,) int64, uv (n, 2) px, views (n,) int64: how many images showed the feature
-    before."""
+    before; spread (n,) px^2: as `TrackStream` has it."""
 
     feature: np.ndarray
     uv: np.ndarray
     views: np.ndarray
+    spread: np.ndarray
 
 
 _COLUMNS = ("feature", "uv", "flow", "A", "views")
@@ -71,21 +68,14 @@ class _Tracks:
 
 
 class Tracker:
-    """Follows corners of the scene through the images of one camera.
+    """Follows corners of the scene through the images of one camera."""
 
-    model, params: the lens as far as it is known; it serves only to reject what does not fit the epipolar geometry.
-    """
-
-    def __init__(self, model: CameraModel, params: np.ndarray) -> None:
-        self._model, self._params = model, params
+    def __init__(self) -> None:
         self._cv2: Any = load_cv2()
         self._clahe = self._cv2.createCLAHE(CLIP, TILES)
         self._before = np.zeros((0, 0), np.uint8)
-        self._earlier: deque[Followed] = deque(maxlen=max(EARLIER))
         self._alive = _Tracks.begun(np.zeros(0, np.int64), np.zeros((0, 2)), no_templates())
         self._begun = 0
-        self._images = 0
-        self.moved: set[int] = set()  # features that do not fit the motion of the camera
 
     def add(self, image: np.ndarray) -> Followed:
         """What the next image (h, w) uint8 shows."""
@@ -96,12 +86,10 @@ class Tracker:
             self._follow(even, smooth)
         self._before = even
         self._alive = self._alive.some(self._alive.views < _most_views(self._alive.feature))
-        self._reject_moving()
         self._begin(even, smooth)
-        self._images += 1
         alive = self._alive
-        seen = Followed(alive.feature.copy(), alive.uv.copy(), alive.views.copy())
-        self._earlier.append(seen)
+        spread = alive.first.spread * np.abs(np.linalg.det(alive.A))
+        seen = Followed(alive.feature.copy(), alive.uv.copy(), alive.views.copy(), spread)
         self._alive = replace(alive, views=alive.views + 1)
         return seen
 
@@ -131,26 +119,6 @@ class Tracker:
         known = np.isfinite(flow[:, 0])
         median = np.median(flow[known], axis=0) if known.any() else np.zeros(2)
         return np.where(known[:, None], flow, median).astype(np.float32)
-
-    def _reject_moving(self) -> None:
-        """Ends tracks that do not fit one motion of the camera since an earlier image."""
-        for ago in EARLIER:
-            if len(self._earlier) < ago:
-                continue
-            alive, then = self._alive, self._earlier[-ago]
-            _, now, old = np.intersect1d(alive.feature, then.feature, return_indices=True)
-            f, seen = self._model.unproject(self._params, then.uv[old])
-            h, seen_now = self._model.unproject(self._params, alive.uv[now])
-            usable = seen & seen_now
-            fits = fits_one_motion(f[usable], h[usable], self._px_per_rad(), self._images)
-            wrong = now[usable][~fits]
-            self.moved.update(alive.feature[wrong].tolist())
-            kept = np.ones(len(alive.feature), dtype=bool)
-            kept[wrong] = False
-            self._alive = alive.some(kept)
-
-    def _px_per_rad(self) -> float:
-        return self._model.central_scale(self._params)
 
     def _begin(self, even: np.ndarray, smooth: np.ndarray) -> None:
         """New tracks at the strongest corner of each cell that has none."""

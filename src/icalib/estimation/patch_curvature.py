@@ -1,0 +1,39 @@
+"""Corrects observations of feature tracks for the curvature that the lens gives to their patches.
+
+A tracker aligns the patch around a feature's first view with the image under an affine map. A lens maps a patch
+affinely to first order only. Its second-order terms move the point that the alignment reports away from the image of
+the patch's mean ray, by
+
+    b = 1/2 spread (d^2 pi / da^2 + d^2 pi / db^2)
+
+with pi the projection, a and b at right angles on the sphere of rays, scaled to one pixel, and `spread` [px^2] the
+second moment of the patch as the alignment weighs it. It grows towards the image's border, and would bend the
+calibrated distortion. The observation is replaced by the image of the mean ray.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from icalib.geometry.cameras.base import CameraModel
+from icalib.measurements import TrackStream
+
+_AROUND = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+
+
+def with_curved_patches(stream: TrackStream, model: CameraModel, params: np.ndarray) -> TrackStream:
+    """The stream with corrected observations, by lens `params` (P,). Unchanged where it states no spread; observations
+    whose surroundings the model cannot see stay."""
+    if not len(stream.spread):
+        return stream
+    # Four points at this distance have the second moment of the patch.
+    reach = np.sqrt(2.0 * stream.spread)[:, None]
+    mean, seen = np.zeros((len(stream.uv), 3)), np.ones(len(stream.uv), dtype=bool)
+    for direction in _AROUND:
+        ray, valid = model.unproject(params, stream.uv + reach * direction)
+        mean += ray
+        seen &= valid
+    uv, valid = model.project(params, np.where(seen[:, None], mean, [0.0, 0.0, 1.0]))
+    return replace(stream, uv=np.where((seen & valid)[:, None], uv, stream.uv))
