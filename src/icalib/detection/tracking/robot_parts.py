@@ -6,7 +6,7 @@ import numpy as np
 
 SCENE_MOVES_PX = 10.0  # over a track's life, all points alike, as they do where the camera turns
 STAYS_PX = 1.0  # what a point in place moves at most, by noise and vibration
-PLACE_PX, PLACE_POINTS = 32, 3  # with so many points in place, all that do not move in a square of this size are
+PLACE_PX = 32  # in a square of this size with a point in place, all that do not move are in place
 
 
 def stay_in_place(start: np.ndarray, feature: np.ndarray, uv: np.ndarray) -> np.ndarray:
@@ -35,8 +35,7 @@ def stay_in_place(start: np.ndarray, feature: np.ndarray, uv: np.ndarray) -> np.
     stays = np.linalg.norm(np.where(np.isfinite(high), high - low, np.inf), axis=1) < STAYS_PX
     in_place = stays & (moved > SCENE_MOVES_PX)
     place = np.floor(np.where(stays[:, None], low, 0.0) / PLACE_PX).astype(np.int64) @ [1 << 20, 1]
-    places, count = np.unique(place[in_place], return_counts=True)
-    return in_place | (stays & np.isin(place, places[count >= PLACE_POINTS]))
+    return in_place | (stays & np.isin(place, place[in_place]))
 
 
 def _ends(feature: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
