@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import KDTree
 
 SCENE_MOVES_PX = 10.0  # over a track's life, all points alike, as they do where the camera turns
 STAYS_PX = 1.0  # what a point in place moves at most, by noise and vibration
-PLACE_PX = 32  # in a square of this size with a point in place, all that do not move are in place
+NEAR_PX = 64.0  # a track that does not move so near to a point in place is in place, too
 
 
 def stay_in_place(start: np.ndarray, feature: np.ndarray, uv: np.ndarray) -> np.ndarray:
@@ -34,8 +35,11 @@ def stay_in_place(start: np.ndarray, feature: np.ndarray, uv: np.ndarray) -> np.
     np.maximum.at(high, feature, uv)
     stays = np.linalg.norm(np.where(np.isfinite(high), high - low, np.inf), axis=1) < STAYS_PX
     in_place = stays & (moved > SCENE_MOVES_PX)
-    place = np.floor(np.where(stays[:, None], low, 0.0) / PLACE_PX).astype(np.int64) @ [1 << 20, 1]
-    return in_place | (stays & np.isin(place, place[in_place]))
+    if in_place.any():
+        still = np.flatnonzero(stays)
+        distance, _ = KDTree(low[in_place]).query(low[still])
+        in_place[still[distance < NEAR_PX]] = True
+    return in_place
 
 
 def _ends(feature: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
