@@ -179,7 +179,7 @@ def test_clocks_that_restart(tmp_path):
     fixed = complaint(tmp_path, lines.replace("{guess: 0.1}", "{fixed: 0.1}"))
     assert "wheel0.clock_restarts: each recording has a time offset of its own, but time_offset is fixed" in fixed
     first = "sensors:\n  mocap0: {type: pose, clock_restarts: true}\n  wheel0: {type: wheels}\n"
-    assert "mocap0.clock_restarts: without an IMU the clock of the first sensor" in complaint(tmp_path, first)
+    assert "mocap0.clock_restarts: without an IMU the clock of mocap0" in complaint(tmp_path, first)
     camera = "cam0: {type: camera, model: pinhole-radtan, resolution: [752, 480], clock_restarts: true}"
     target = "target: {type: aprilgrid, rows: 6, cols: 6, tag_size: 0.088, tag_spacing: 0.3}\n"
     said = complaint(tmp_path, f"sensors:\n  {camera}\n{target}")

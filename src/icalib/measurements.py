@@ -345,8 +345,15 @@ class Measurements:
 
     @property
     def origin_ns(self) -> int:
-        """The first stamp of the body's clock: the IMU's, or without one the first camera's or pose sensor's."""
-        return (*self.cameras, *self.poses)[0].origin_ns if self.imu is None else self.imu.origin_ns
+        """The first stamp of the body's clock: the IMU's, or without one that of `body`."""
+        return self.body.origin_ns if self.imu is None else self.imu.origin_ns
+
+    @property
+    def body(self) -> CornerStream | PoseStream:
+        """Without an IMU, of the sensor whose frame and clock are the body's: the first camera, or where cameras follow
+        points alone the first pose sensor."""
+        follow = bool(self.tracks) and not any(len(c.uv) for c in self.cameras)
+        return (*self.poses, *self.cameras)[0] if follow else (*self.cameras, *self.poses)[0]
 
     def unassociated(self) -> Measurements:
         """The same, of whose LiDARs' points nobody knows on what planes they lie."""

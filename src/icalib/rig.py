@@ -317,9 +317,9 @@ class Settings:
 
 @dataclass(frozen=True)
 class Rig:
-    """The whole robot. Without an IMU the first camera's frame is the body frame, or that of the first pose sensor. If
-    cameras are all there is, time stands still: images taken at the same stamp are taken together, nothing ties one
-    instant to the next; else the motion is assumed to be smooth. There may be no camera beside a pose sensor, or beside
+    """The whole robot. Without an IMU the frame of the first camera that sees a target is the body frame, or that of
+    the first pose sensor. If cameras are all there is, time stands still: images taken at the same stamp are taken
+    together, nothing ties one instant to the next; else the motion is assumed to be smooth. There may be no camera beside a pose sensor, or beside
     an IMU and a LiDAR."""
 
     imu: ImuSensor | None
@@ -345,7 +345,17 @@ class Rig:
     @property
     def body(self) -> str:
         """Name of the sensor whose frame is the body frame."""
-        return (*self.cameras, *self.poses)[0].name if self.imu is None else self.imu.name
+        return self.first_seeing if self.imu is None else self.imu.name
+
+    @property
+    def first_seeing(self) -> str:
+        """Name of the sensor that is the body where there is no IMU."""
+        return (*self.poses, *self.cameras)[0].name if self.moves_by_poses else (*self.cameras, *self.poses)[0].name
+
+    @property
+    def moves_by_poses(self) -> bool:
+        """Whether without an IMU the first pose sensor shows the motion: no camera sees a target."""
+        return bool(self.poses) and not (self.cameras and self.has_target)
 
     @property
     def assumes_motion(self) -> bool:

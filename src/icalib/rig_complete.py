@@ -26,14 +26,16 @@ def lack_of(rig: Rig) -> Lack | None:
         return None
     if rig.lidars:
         return Lack(rig.lidars[0].name, "needs an IMU; add a sensor of type: imu, or remove this one.")
-    if rig.cameras:
+    if not rig.moves_by_poses:
         return None
     first = rig.poses[0]
     if first.kind != "absolute":
         return Lack(
             first.name, "without camera and IMU it has to show the motion by itself; write kind: absolute, or add one."
-        )
-    if len(rig.poses) == 1 and not rig.wheels:
+            if not rig.cameras else
+            "without target and IMU it has to show the motion by itself; write kind: absolute, or add one."
+        )  # fmt: skip
+    if len(rig.poses) == 1 and not (rig.wheels or rig.cameras):
         return Lack(first.name, "is alone; add what is to be calibrated with it.")
     return None
 

@@ -53,7 +53,7 @@ def refusal(sees: str, imu: bool, others: str, known: str) -> str:
         return "lidar0 needs an IMU"
     if not imu and not sees and others == "pose":
         return "mocap0 is alone"
-    if not imu and sees == "tracks":
+    if not imu and sees == "tracks" and "pose" not in others:
         return "how large the scene is"
     return ""
 

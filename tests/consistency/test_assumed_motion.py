@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,8 +17,9 @@ from icalib.montecarlo.truth import error, true_value
 from icalib.outputs import write_outputs
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Rig
-from icalib.simulation import Drive, Scenario, SimPoses, Simulation, rig_for, simulate
+from icalib.simulation import Drive, Scenario, SimPoses, Simulation, load_scenario, rig_for, simulate
 
+PAPER = Path(__file__).parents[2] / "examples" / "paper"
 MOUNT = ("rotation", "translation", "time_offset")
 T_IMU_MOCAP = np.array([[0.0, -1.0, 0.0, 0.1], [1.0, 0.0, 0.0, 0.05], [0.0, 0.0, 1.0, 0.3], [0.0, 0.0, 0.0, 1.0]])
 
@@ -121,6 +123,18 @@ def test_on_a_flat_floor_height_and_roll_remain_open(robot):
     e, P = normalised(result, simulation)
     known = [k for k, v in enumerate(sum((g.verdict for g in result.groups if g.columns), ())) if v != "undetermined"]
     assert np.abs(e / np.sqrt(np.diag(P)))[known].max() < 4.0
+
+
+def test_cameras_that_follow_points_and_motion_capture_from_nothing(robot):
+    """Of the camera there is no guess, lens included; the body is the motion capture's."""
+    scenario = load_scenario(PAPER / "table2-3d.yaml")
+    camera = replace(scenario.cameras[0], corner_noise_px=0.3)
+    scenario = replace(scenario, duration_s=12.0, cameras=(camera,), lidars=(), wheels=(), poses=(mocap(),))
+    simulation = simulate(replace(scenario, imu_noise_enabled=False), 0)
+    rig = replace(rig_for(scenario, intrinsics="free", distortion="free"), imu=None)
+    result = calibrate_measurements(rig, replace(simulation.measurements, imu=None))
+    assert result.body == "mocap0"
+    check_known(result, simulation, 7 + 8)
 
 
 def test_one_arc_all_the_time_is_refused(robot):

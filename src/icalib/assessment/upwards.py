@@ -17,7 +17,7 @@ UPRIGHT = 0.5  # cosine of the image's downward axis with the vehicle's: 60 degr
 def upwards_notes(inputs: Inputs, found: Estimate) -> Iterator[str]:
     """Where a camera that stands upright is all that speaks for the wheels as they are."""
     for wheels, up in _open(inputs, found):
-        if inputs.rig.cameras and _stance(up) is None:
+        if not inputs.rig.moves_by_poses and _stance(up) is None:
             yield (
                 f"{wheels}: nothing but {_body(inputs)}, which then stands upright, shows which way is up; if it is "
                 f"upside down, {_opposite(inputs, wheels)}."
@@ -28,7 +28,7 @@ def upwards_warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
     """Both readings of wheels that stand on the ground only if the first camera does not stand upright, or with a pose
     sensor whose frame is not level."""
     for wheels, up in _open(inputs, found):
-        if not inputs.rig.cameras:
+        if inputs.rig.moves_by_poses:
             x, y, z = up
             yield (
                 f"{wheels}: nothing shows which way is up: no frame of a pose sensor is level. Here up is ({x:.2f}, "
@@ -63,7 +63,7 @@ def _stance(up: np.ndarray) -> str | None:
 
 
 def _body(inputs: Inputs) -> str:
-    return (*inputs.rig.cameras, *inputs.rig.poses)[0].name
+    return inputs.rig.first_seeing
 
 
 def _opposite(inputs: Inputs, name: str) -> str:

@@ -192,8 +192,13 @@ class Calibration:
 
     @property
     def body(self) -> str:
-        """Name of the sensor whose frame is the body frame: the IMU, or without one the first camera or pose sensor."""
-        return self.imu or (*self.cameras, *self._of_type("pose"))[0]
+        """Name of the sensor whose frame is the body frame: the IMU, or without one the first camera that sees a
+        target, or the first pose sensor."""
+        if self.imu:
+            return self.imu
+        poses = self._of_type("pose")
+        follow = not ({"target", "targets"} & set(self.rig))
+        return (*poses, *self.cameras)[0] if follow else (*self.cameras, *poses)[0]
 
     @property
     def cameras(self) -> tuple[str, ...]:

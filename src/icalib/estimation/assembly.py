@@ -87,13 +87,16 @@ def image_times(inputs: Inputs, values: dict[Key, np.ndarray]) -> list[np.ndarra
 
 def host_times(inputs: Inputs, values: dict[Key, np.ndarray]) -> list[np.ndarray]:
     """Instants that nodes are placed at, by sensor, seconds on the body's clock since its first stamp: those of images,
-    or without cameras those of scans, or without either those of poses, as many as are needed."""
-    if inputs.rig.cameras:
-        return image_times(inputs, values)
+    or without cameras those of scans, or without either those of poses, as many as are needed; both where motion is
+    assumed that poses show."""
+    assumed = inputs.rig.assumes_motion and inputs.rig.moves_by_poses
+    images = image_times(inputs, values) if inputs.rig.cameras else []
+    if images and not assumed:
+        return images
     if inputs.rig.lidars:
         return [instants(x, values) for x in inputs.measurements.lidars]
     first, imu = inputs.measurements.poses[0], inputs.rig.imu or ImuSensor  # its default
-    return [instants(first, values, thinned(first.seconds, imu.pose_keyframes_s))]
+    return [*images, instants(first, values, thinned(first.seconds, imu.pose_keyframes_s))]
 
 
 def thinned(times: np.ndarray, apart: float) -> np.ndarray:

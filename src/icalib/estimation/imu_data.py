@@ -91,8 +91,7 @@ def imu_data(rig: Rig, measurements: Measurements) -> ImuData | None:
 
 def _is_dense(measurements: Measurements) -> bool:
     """Whether the body's poses, where there is no IMU, come so fast that rates may jump at nodes."""
-    body = (*measurements.cameras, *measurements.poses)[0]
-    return float(np.median(np.diff(body.seconds))) <= DENSE_S
+    return float(np.median(np.diff(measurements.body.seconds))) <= DENSE_S
 
 
 def joined_imu_data(rig: Rig, parts: Sequence[Part], joined: Measurements) -> ImuData | None:

@@ -114,7 +114,7 @@ def layout_for(rig: Rig, bodies: Bodies, n_recordings: int = 1, clouds: Clouds =
     for sensor in (*(rig.lidars if clouds.count else ()), *rig.wheels, *rig.poses):
         entries += own_entries(sensor, n_recordings)
     for k, sensor in enumerate(rig.poses):
-        is_world = (imu is None or rig.assumes_motion) and not rig.cameras and k == 0
+        is_world = (imu is None or rig.assumes_motion) and rig.moves_by_poses and k == 0
         entries += frame_entries(sensor, n_recordings, not is_world)
     return make_layout(entries + bodies.pose_entries() + clouds.entries)
 

@@ -5,7 +5,8 @@ and minus its acceleration, in the axes of the body, and their random walk is wh
 jerk: a motion prior, by which nodes are tied, and sensors carried from nodes to their own instants. Its densities are
 those of the motion itself, as the poses of the body show it; they are the only thing that is taken from these twice.
 
-The body is the first camera, whose target is the world, or the first pose sensor, whose frame is.
+The body is the first camera, whose target is the world, or the first pose sensor, whose frame is. Cameras that follow
+points are placed on the motion of the pose sensor.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from icalib.first_guess.robot import wheel_values
 from icalib.first_guess.several import initial_guesses
 from icalib.first_guess.smooth_path import FEWEST, BodyPoses, SmoothPath
 from icalib.first_guess.stop_and_go import is_stop_and_go, start_from_pairs
+from icalib.first_guess.tracks_on_motion import track_camera_values
 from icalib.first_guess.wheels import SidewaysError
 from icalib.geometry.targets.base import BOARD
 from icalib.measurements import ImuStream, Measurements
@@ -54,7 +56,7 @@ def start_without_imu(rig: Rig, recordings: Sequence[Measurements]) -> Start:
     try:
         return _start(rig, recordings)
     except SidewaysError as error:
-        if not rig.cameras:
+        if rig.moves_by_poses:
             _refuse_other_ways(rig, recordings, error)
         raise
 
@@ -90,9 +92,27 @@ def _start(rig: Rig, recordings: Sequence[Measurements]) -> Start:
     narrow = [own.at(grid, narrow=True) for own, grid in zip(shown, grids, strict=True)]
     body = _with_assumption(rig, recordings, narrow)
     inputs = replace(inputs_for(body, _readings(recordings, paths, rig.settings.max_gap_s)), asked=rig)
-    felt = inputs_for(body, _readings(recordings, paths), inputs)
+    felt = _felt(body, recordings, paths, inputs)
+    if body.cameras and body.moves_by_poses:
+        blind = replace(body, cameras=())
+        unseen = [replace(m, cameras=(), tracks=()) for m in recordings]
+        alone = _felt(blind, unseen, paths, inputs_for(blind, _readings(unseen, paths)))
+        cameras = track_camera_values(felt, _moving(alone, shown, {})[0])
+    moving, turned = _moving(inputs, shown, cameras)
+    placed = pose_values(felt, moving) | moving.values
+    values = wheel_values(felt, replace(moving, values=placed)) | placed
+    return inputs, replace(moving, bias=-turned, values=values), values
+
+
+def _felt(rig: Rig, recordings: Sequence[Measurements], paths: Sequence[SmoothPath], like: Inputs) -> Inputs:
+    """Of the readings that an IMU in the body would have."""
+    felt = inputs_for(rig, _readings(recordings, paths), like)
     assert felt.imu is not None
-    felt = replace(felt, imu=replace(felt.imu, forwards=False))
+    return replace(felt, imu=replace(felt.imu, forwards=False))
+
+
+def _moving(inputs: Inputs, shown: Sequence[BodyPoses], cameras: dict[Key, np.ndarray]) -> tuple[State, np.ndarray]:
+    """The body's motion without biases, and its angular rate and acceleration (K, 6) at the nodes."""
     values = start_values(inputs, cameras | _identity(inputs))
     nodes = nodes_for(inputs, host_times(inputs, values))
     starts = first_nodes(inputs.imu, nodes)
@@ -102,19 +122,18 @@ def _start(rig: Rig, recordings: Sequence[Measurements]) -> Start:
         np.concatenate([getattr(w, name) for w in ways])
         for name in ("rotation", "position", "velocity", "rate", "acceleration")
     )
-    moving = State(nodes, R, p, v, np.zeros((len(nodes), 6)), values, starts)
-    placed = pose_values(felt, moving) | values
-    values = wheel_values(felt, replace(moving, values=placed)) | placed
-    return inputs, replace(moving, bias=-np.concatenate([rate, force], axis=1), values=values), values
+    still = np.zeros((len(nodes), 6))
+    return State(nodes, R, p, v, still, values, starts), np.concatenate([rate, force], axis=1)
 
 
 def _shown(rig: Rig, recordings: Sequence[Measurements]) -> tuple[list[BodyPoses], dict[Key, np.ndarray]]:
     """The body's poses in each recording, and what was found of the cameras on the way."""
-    if not rig.cameras:
+    if rig.moves_by_poses:
         return [BodyPoses(s.seconds, s.rotation, s.position) for s in (m.poses[0] for m in recordings)], {}
     if not rig.has_target:
         raise EstimationError(
-            "without an IMU cameras need a target: nothing else says how large the scene is; add one to the rig file."
+            "without an IMU cameras need a target or a pose sensor: nothing else says how large the scene is; add one "
+            "to the rig file."
         )
     seen = [replace(m, wheels=(), poses=()) for m in recordings]
     alone = inputs_for(replace(rig, wheels=(), poses=()), seen)
@@ -135,7 +154,7 @@ def _with_assumption(rig: Rig, recordings: Sequence[Measurements], paths: Sequen
     noise = ImuNoise(WHITE_STEP_S * turning, turning, WHITE_STEP_S * jerking, jerking, ASSUMPTION)
     here = {"rotation": fixed(np.eye(3)), "translation": fixed(np.zeros(3)), "time_offset": fixed(np.zeros(1))}
     imu = ImuSensor(ASSUMPTION, "", noise, assumed=True)
-    if rig.cameras:
+    if not rig.moves_by_poses:
         return replace(rig, imu=imu, gravity=0.0, cameras=(replace(rig.cameras[0], **here), *rig.cameras[1:]))
     spacing = keyframe_spacing(rig, recordings, paths, float(turning), float(jerking))
     imu = replace(imu, pose_keyframes_s=spacing)
@@ -178,9 +197,9 @@ def _bridged(path: SmoothPath, max_gap_s: float) -> np.ndarray:
 def _identity(inputs: Inputs) -> dict[Key, np.ndarray]:
     """The body is where the assumed IMU is, and its target or its frame is the world."""
     rig, n = inputs.rig, len(inputs.parts)
-    sensor = (*rig.cameras, *rig.poses)[0]
+    sensor = (rig.poses if rig.moves_by_poses else rig.cameras)[0]
     out = given(inputs, sensor, NAMES)
-    if rig.cameras:
+    if not rig.moves_by_poses:
         return out | {(board_in(BOARD, k), "tilt"): np.eye(3) for k in range(n)}
     for k in range(n):
         frame = frame_of(sensor.name, k)

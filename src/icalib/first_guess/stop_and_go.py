@@ -41,7 +41,7 @@ HOW = (
 def is_stop_and_go(rig: Rig, recordings: Sequence[Measurements], shown: Sequence[BodyPoses]) -> bool:
     """Whether the body, or one of the pose sensors, moved only while it was not seen, and only pose sensors are beside
     the body."""
-    if rig.wheels or rig.lidars:
+    if rig.wheels or rig.lidars or (rig.cameras and rig.moves_by_poses):
         return False
     each = [list(shown), *(list(own) for own in zip(*(m.poses for m in recordings), strict=True))]
     return any(all(stands_still_between(s.seconds, s.rotation, s.position) for s in own) for own in each)

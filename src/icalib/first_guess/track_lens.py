@@ -98,7 +98,7 @@ def _rough(
     stream: TrackStream, imu: ImuData, model: CameraModel, starts: list[np.ndarray], offset: float | None
 ) -> _Fit:
     """The focal length by the regression of rates. Raises EstimationError where they do not match."""
-    rates, best = [track_rates(stream, model, lens) for lens in starts], -1
+    rates, best = [track_rates(stream, model, lens, thinned=True) for lens in starts], -1
     if offset is None:
         shifts = [(x, k) for k, r in enumerate(rates) for x in best_regressions(imu, r)[:1]]
         if not shifts:
@@ -111,7 +111,7 @@ def _rough(
         lens = np.concatenate([lens[:2] / scale, lens[2:]])
         if abs(np.log(scale)) < SCALED_ENOUGH:
             break
-        aligned, scale, unexplained = _scaled(imu, track_rates(stream, model, lens), offset, stream.name)
+        aligned, scale, unexplained = _scaled(imu, track_rates(stream, model, lens, thinned=True), offset, stream.name)
     if unexplained > LARGEST_UNEXPLAINED:
         raise EstimationError(
             f"the motion of {stream.name} does not match that of {imu.name} at any shift of their clocks, whatever its "

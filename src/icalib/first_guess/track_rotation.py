@@ -186,13 +186,16 @@ def start_turn(f: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.ascontiguousarray(R), start_direction(f, h, R)
 
 
-def track_rates(stream: TrackStream, model: CameraModel, params: np.ndarray, step: float = STEP_S) -> CameraRates:
+def track_rates(
+    stream: TrackStream, model: CameraModel, params: np.ndarray, step: float = STEP_S, thinned: bool = False
+) -> CameraRates:
     """Mean angular rates from images to the ones about `step` s later, with their noise, from how far rays miss their
-    epipolar planes. Raises EstimationError where hardly any images share enough points."""
+    epipolar planes; `thinned`: not from every image, where intervals overlap much. Raises EstimationError where hardly
+    any images share enough points."""
     rays, valid = model.unproject(params, stream.uv)
     t, found, noise = stream.seconds, [], []
-    thinned = max(1, int(MOST_SHARED * step / float(np.median(np.diff(t)))))
-    for i, j in image_pairs(stream, step)[::thinned]:
+    every = max(1, int(MOST_SHARED * step / float(np.median(np.diff(t))))) if thinned else 1
+    for i, j in image_pairs(stream, step)[::every]:
         p, q = common(stream, valid, i, j)
         if len(p) < FEWEST_COMMON:
             continue

@@ -160,16 +160,16 @@ def _refuse_incomplete(value: YamlValue, found: _Sensors) -> None:
     if lack is not None:
         (value.entries()[lack.sensor] if lack.sensor else value).fail(lack.sentence)
     if imu is None:
-        _refuse_clocks_of_nothing(value, found)
+        _refuse_clocks_of_nothing(value, found, rig.first_seeing)
 
 
-def _refuse_clocks_of_nothing(value: YamlValue, found: _Sensors) -> None:
-    """Clocks said to restart, without an IMU, that have no time offset."""
+def _refuse_clocks_of_nothing(value: YamlValue, found: _Sensors, body: str) -> None:
+    """Clocks said to restart, without an IMU, that have no time offset; `body`: the sensor whose clock is the rig's."""
     timed = found.wheels or found.poses
-    for k, sensor in enumerate((*found.cameras, *found.poses)):
-        if sensor.clock_restarts and (k == 0 or not timed):
+    for sensor in (*found.cameras, *found.poses):
+        if sensor.clock_restarts and (sensor.name == body or not timed):
             value.entries()[sensor.name].entries()["clock_restarts"].fail(
-                "without an IMU the clock of the first sensor is that of all others; say it of those, or write false."
+                f"without an IMU the clock of {body} is that of all others; say it of those, or write false."
                 if timed
                 else "cameras alone have no time offsets; remove it, or add a sensor of type: imu."
             )
