@@ -319,8 +319,8 @@ class Settings:
 class Rig:
     """The whole robot. Without an IMU the frame of the first camera that sees a target is the body frame, or that of
     the first pose sensor. If cameras are all there is, time stands still: images taken at the same stamp are taken
-    together, nothing ties one instant to the next; else the motion is assumed to be smooth. There may be no camera beside a pose sensor, or beside
-    an IMU and a LiDAR."""
+    together, nothing ties one instant to the next; else the motion is assumed to be smooth. There may be no camera
+    beside a pose sensor, or beside an IMU and a LiDAR."""
 
     imu: ImuSensor | None
     cameras: tuple[Camera, ...]
