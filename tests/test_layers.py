@@ -15,6 +15,7 @@ SOURCE = Path(icalib.__file__).parent
 # Units are the modules and packages right below icalib; inside a package imports are free.
 LEVELS = {
     "errors": 0,
+    "compiled": 0,
     "extras": 0,
     "geometry": 0,
     "file_hashes": 0,
@@ -62,7 +63,11 @@ LEVELS = {
     "__main__": 11,
     "__init__": 11,
 }
-EVERYWHERE = {"errors", "extras"}  # so geometry, on the same level, may raise errors, and ask OpenCV for tags
+EVERYWHERE = {
+    "compiled",
+    "errors",
+    "extras",
+}  # so geometry, on the same level, may raise errors, and ask OpenCV for tags
 NEVER = {("estimation", "simulation")}  # a lower level, but a wrong sign must not cancel against itself
 ROOT_NAMES = {"__version__"}  # of icalib/__init__.py, which any module may ask for
 

@@ -6,9 +6,9 @@ from math import exp, hypot
 from typing import Any
 
 import numpy as np
-from numba import njit
 from scipy.optimize import minimize_scalar
 
+from icalib.compiled import njit
 from icalib.detection.decoding import mapped, unit_homography
 from icalib.detection.growth import fit_homography
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 from math import atan2, cos, hypot, sin, sqrt
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.detection.edge_model import error_function, normal_equations, row_product, solve_small
 from icalib.detection.saddles import LEAST_SINE, MARGIN_BLURS, room_for, window_bounds, window_frame
 from icalib.measurements import EDGE

@@ -8,9 +8,9 @@ from __future__ import annotations
 from math import hypot
 
 import numpy as np
-from numba import njit
 from scipy.sparse.csgraph import connected_components
 
+from icalib.compiled import njit
 from icalib.detection.saddles import crossing_contrast, find_saddle
 from icalib.detection.tags import LEAST_CONTRAST
 from icalib.extras import load_cv2

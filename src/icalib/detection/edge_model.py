@@ -9,8 +9,8 @@ from __future__ import annotations
 from math import erf, hypot, pi, sqrt
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.measurements import EDGE
 
 _ITERATIONS = 10

@@ -5,8 +5,8 @@ from __future__ import annotations
 from math import hypot
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.detection.decoding import bilinear
 
 _FROM_CORNER = 0.15  # of the side, left out at both ends of it

@@ -15,8 +15,8 @@ from __future__ import annotations
 from math import erf, exp, hypot, pi, sqrt
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.detection.edge_model import solve_small
 from icalib.detection.tags import LEAST_CONTRAST
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.detection.decoding import cell_greys, levels, mapped, popcount, read_cells, seen_cells, unit_homography
 from icalib.detection.edge_model import solve_small
 from icalib.detection.edges import fit_quad

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from icalib.compiled import njit
 
 MOMENTS = 10  # 1; x, xx; y, yx, yy; z, zx, zy, zz
 LARGEST_TURN = 0.26  # rad between the normal of a voxel and its region: those of voxels are rough
@@ -96,16 +97,18 @@ def grow(voxels, seeds, region):
         if region[s] >= 0 or not voxels.flat[s]:
             continue
         region[s], queue[0], size, done, refit = count, s, 1, 0, 2
-        total[:] = voxels.moments[s]
-        normal[:] = voxels.normal[s]
-        centre[:] = voxels.centre[s]
+        for i in range(MOMENTS):  # in loops: array expressions take seconds to compile
+            total[i] = voxels.moments[s, i]
+        for i in range(3):
+            normal[i], centre[i] = voxels.normal[s, i], voxels.centre[s, i]
         while done < size:
             for v in voxels.neighbour[queue[done]]:
                 if v < 0 or region[v] >= 0 or not voxels.flat[v] or not _fits(v, voxels, normal, centre):
                     continue
                 region[v], queue[size] = count, v
                 size += 1
-                total += voxels.moments[v]
+                for i in range(MOMENTS):
+                    total[i] += voxels.moments[v, i]
                 if size >= refit:
                     fit(total, normal, centre)
                     refit = size + 1 + size // 8

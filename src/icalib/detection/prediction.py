@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.detection.corners import ImageCorners
 from icalib.detection.decoding import mapped
 from icalib.detection.growth import fit_homography

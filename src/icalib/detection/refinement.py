@@ -5,8 +5,8 @@ from __future__ import annotations
 from math import hypot
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.detection.crossing_model import LEAST_WINDOW_PX, fit_crossing
 from icalib.detection.edge_model import END_PX, fit_corners, step_blur
 from icalib.detection.growth import side_vectors

@@ -5,8 +5,8 @@ from __future__ import annotations
 from math import hypot
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.detection.decoding import bilinear
 
 _LEAST_HALF_PX = 2.0  # half the width of the window of `find_saddle`

@@ -5,8 +5,8 @@ from __future__ import annotations
 from math import hypot
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.detection.consistency import consistent_corners
 from icalib.detection.corners import ImageCorners, judged, no_corners
 from icalib.detection.growth import LEAST_SIDE_PX, side_vectors

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.detection.decoding import cell_greys, dark_in_ring, levels, lookup, read_cells, unit_homography
 from icalib.detection.edges import fit_quad
 from icalib.detection.families import Family

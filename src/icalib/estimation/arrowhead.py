@@ -318,7 +318,7 @@ def _back(
         return
     for k in range(border.shape[1]):
         one, known = np.ascontiguousarray(own[:, :, k]), np.ascontiguousarray(border[:, k])
-        noise, forwards = white[:, k].reshape(-1, NODE), piece.first == 0 or not keep
+        noise, forwards = np.ascontiguousarray(white[:, k]).reshape(-1, NODE), piece.first == 0 or not keep
         substitute_chain(piece.diagonal, piece.upper, piece.side, forwards, keep, known, noise, one)
         # The shared node is given, and both pieces write their own nodes alone.
         inner = slice(None) if not keep else slice(None, -1) if piece.first == 0 else slice(1, None)

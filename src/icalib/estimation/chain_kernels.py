@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from numba import njit
-
+from icalib.compiled import njit
 from icalib.geometry.small import cholesky
 
 
@@ -32,6 +31,14 @@ def _subtract_product(A, B, X):
 
 
 @njit(cache=True, nogil=True)
+def _transpose(A):
+    """A (n, n) <- A^T."""
+    for i in range(A.shape[0]):
+        for j in range(i):
+            A[i, j], A[j, i] = A[j, i], A[i, j]
+
+
+@njit(cache=True, nogil=True)
 def eliminate_chain(diagonal, upper, side, forwards, keep):
     """Factorises in place from one end to the other; with `keep`, the last node is only updated. False: not definite.
 
@@ -47,10 +54,10 @@ def eliminate_chain(diagonal, upper, side, forwards, keep):
         forward_solve(diagonal[k], side[k])
         if step < n - 1:
             after = k + 1 if forwards else k - 1
-            link = upper[k] if forwards else upper[k - 1].T.copy()
-            forward_solve(diagonal[k], link)
+            link = upper[k] if forwards else upper[k - 1]
             if not forwards:
-                upper[k - 1] = link
+                _transpose(link)
+            forward_solve(diagonal[k], link)
             _subtract_product(link, link, diagonal[after])
             _subtract_product(link, side[k], side[after])
     return True

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.geometry import so3
 
 
@@ -23,14 +23,15 @@ def by_imu_pose(R_ic, p_ic, R_cw):
 
 
 @njit(cache=True, nogil=True)
-def _product(A, J, out, column):
-    """out[:, column:] = A J for A (6, 6)."""
+def _product(A, J, out):
+    """out = A J for A (6, 6): all of it, or the columns from 9 on where J has fewer, those of the IMU intrinsics."""
+    o = 9 if out.shape[1] > J.shape[1] else 0
     for i in range(6):
         for j in range(J.shape[1]):
             s = 0.0
             for k in range(6):
                 s += A[i, k] * J[k, j]
-            out[i, column + j] = s
+            out[i, o + j] = s
 
 
 @njit(cache=True, nogil=True)
@@ -42,10 +43,10 @@ def pose_chain(i, motion, Tn, Tm, Tc):
     """
     R_ic, R_cw, p_wc = motion.R_imu_cam, motion.R_cam_world[i], motion.p_world_cam[i]
     A = by_imu_pose(R_ic, motion.p_imu_cam, R_cw)
-    _product(A, motion.by_node[i], Tn, 0)
+    _product(A, motion.by_node[i], Tn)
     if len(motion.by_next):
-        _product(A, motion.by_next[i], Tm, 0)
-    _product(A, motion.by_imu[i], Tc, 9)
+        _product(A, motion.by_next[i], Tm)
+    _product(A, motion.by_imu[i], Tc)
     for r in range(6):
         Tc[r, 6] = 0.0
         for k in range(3):
@@ -64,7 +65,7 @@ def pose_chain(i, motion, Tn, Tm, Tc):
         _by_body(i, motion, Tc)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _by_body(i, motion, Tc):
     """The last 6 columns of Tc: moving the body is moving the camera the other way, turning about the body's origin."""
     R_cw, R_wb, o = motion.R_cam_world[i], motion.R_world_body[i], Tc.shape[1] - 6
@@ -115,7 +116,7 @@ def _add_side(T, G, D, Tc, cols_c, cols_d, side):
                 side[i, n_b] += f * G[k, D]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _add_border(G, D, Tc, cols_c, cols_d, border):
     n_b = border.shape[0] - 1
     nc, nd = len(cols_c), len(cols_d)

@@ -8,8 +8,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.estimation.corner_chain import add_clusters, add_image, pose_chain
 from icalib.estimation.corner_weights import bend, marginalise_shared, robust_weights, weight, whole_error
 
@@ -122,7 +122,7 @@ def _gram(A, D, n, out):
             out[j, i], out[j1, i], out[j, i1], out[j1, i1] = s, t, u, v
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _predict_image(i, images, noise, direct, predicted, res, root, found):
     """Residuals res (n, 2), weights root (n,) and common error of image i; returns its half robust chi^2."""
     n0, n1, o, f0 = images.start[i], images.start[i + 1], predicted.first, images.start[i] - found.first
@@ -144,7 +144,7 @@ def _predict_image(i, images, noise, direct, predicted, res, root, found):
     return cost
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _recall_image(i, images, found, res, root):
     """What `_predict_image` left of image i."""
     n0, f0 = images.start[i], images.start[i] - found.first

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from icalib.compiled import njit
 
 LEAST_CURVATURE = 1e-3
 
@@ -53,7 +54,7 @@ def _invert_small(M, out):
                     out[k, j] -= f * out[i, j]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def robust_weights(res, keep, f, precision, sigma, loss, scale, root, shared):
     """root (n,): square roots of the weights over sigma (n,) px; shared (2, m): the image's common error. Returns the
     cost.
@@ -87,7 +88,7 @@ def robust_weights(res, keep, f, precision, sigma, loss, scale, root, shared):
     return cost
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _common_error(res, root, f, precision, M, inv, rhs, shared):
     """The image's common error (2, m) at given weights: ridge regression of -res on its functions."""
     m = f.shape[1]
@@ -132,7 +133,7 @@ def bend(A, D, i, n, r, factor):
         A[k, n + i] += change * v
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def marginalise_shared(A, D, n, root, f, precision, G):
     """Takes the image's common error out of the Gram matrix G (D + 1, D + 1).
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.integration import Increment, start, to_the_end, whole
 from icalib.estimation.state import State

@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.geometry.blas import factorise, solve_transposed, solve_upper, subtract_gram, subtract_product
 
 NODE, POSE = 15, 6

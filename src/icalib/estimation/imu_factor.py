@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.estimation import pages
 from icalib.estimation.arrowhead import Piece, in_parallel
 from icalib.estimation.imu_data import ImuData
@@ -54,14 +54,7 @@ class Increments(NamedTuple):
     bias0: np.ndarray
 
 
-@njit(cache=True, nogil=True)
-def _put(J, row, col, sign, M):
-    for i in range(3):
-        for j in range(3):
-            J[row + i, col + j] = sign * M[i, j]
-
-
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _correction(k, chain, made, dx, change):
     """change (9,): the increments' by biases and intrinsics `dx` other than those that they were made with."""
     for i in range(9):
@@ -72,7 +65,7 @@ def _correction(k, chain, made, dx, change):
             change[i] += made.J[k, i, 6 + j] * dx[j]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _motion(k, chain):
     """R_k^T R_k+1, and velocity and position gained without gravity, in the axes of node k."""
     R0, dt, g = chain.R[k], chain.seconds[k + 1] - chain.seconds[k], chain.gravity
@@ -88,7 +81,7 @@ def _motion(k, chain):
     return tmul3(R0, chain.R[k + 1]), hv, hp
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _residual(k, chain, made, change, R01, hv, hp, r):
     """r (15,) = predicted - measured of interval k, not whitened."""
     error = so3.log(tmul3(so3.exp(change[:3]), tmul3(made.dR[k], R01)))
@@ -100,25 +93,21 @@ def _residual(k, chain, made, change, R01, hv, hp, r):
         r[9 + i] = chain.b[k + 1, i] - chain.b[k, i]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _jacobians(k, chain, made, change, R01, hv, hp, r, J0, J1, Jc):
     """Fills d r / d node k, d r / d node k + 1 (15, 15) and d r / d intrinsics (15, 24 or 0)."""
-    Jr_inv = so3.right_jacobian_inverse(r[:3])
-    R0t, R10 = np.ascontiguousarray(chain.R[k].T), np.ascontiguousarray(R01.T)
-    _put(J0, 0, 0, -1.0, mul3(Jr_inv, R10))
-    _put(J1, 0, 0, 1.0, Jr_inv)
-    _put(J0, 3, 0, 1.0, so3.hat(hv))
-    _put(J0, 3, 6, -1.0, R0t)
-    _put(J1, 3, 6, 1.0, R0t)
-    _put(J0, 6, 0, 1.0, so3.hat(hp))
-    _put(J0, 6, 3, -1.0, R0t)
-    _put(J0, 6, 6, chain.seconds[k] - chain.seconds[k + 1], R0t)
-    _put(J1, 6, 3, 1.0, R0t)
+    Jr_inv, R0 = so3.right_jacobian_inverse(r[:3]), chain.R[k]
+    turned, by_v, by_p = mul3(Jr_inv, tmul3(chain.R[k + 1], R0)), so3.hat(hv), so3.hat(hp)
+    for i in range(3):
+        for j in range(3):
+            J0[i, j], J0[3 + i, j], J0[6 + i, j] = -turned[i, j], by_v[i, j], by_p[i, j]
+            J0[3 + i, 6 + j], J0[6 + i, 3 + j] = -R0[j, i], -R0[j, i]
+            J0[6 + i, 6 + j] = (chain.seconds[k] - chain.seconds[k + 1]) * R0[j, i]
+            J1[i, j], J1[3 + i, 6 + j], J1[6 + i, 3 + j] = Jr_inv[i, j], R0[j, i], R0[j, i]
     for i in range(6):
         J0[9 + i, 9 + i] = -1.0
         J1[9 + i, 9 + i] = 1.0
-    back = np.ascontiguousarray(so3.exp(r[:3]).T)
-    by_turn = mul3(Jr_inv, mul3(back, so3.right_jacobian(change[:3])))
+    by_turn = mul3(Jr_inv, tmul3(so3.exp(r[:3]), so3.right_jacobian(change[:3])))
     for i in range(3):
         for j in range(6 + Jc.shape[1]):
             turn = 0.0

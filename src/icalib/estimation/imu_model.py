@@ -9,8 +9,8 @@ Intrinsics are 24 numbers, zero for an ideal IMU: M_a - I (xx yx yy zx zy zz), M
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.geometry import so3
 from icalib.geometry.small import mul3, tmul3
 

@@ -17,8 +17,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.imu_model import correction_matrices, intrinsics_jacobians
 from icalib.geometry import so3
@@ -30,7 +30,7 @@ _1_1260, _1_10080, _3_112, _2_135, _2_165 = 1.0 / 1260.0, 1.0 / 10080.0, 3.0 / 1
 # that it hands on, and these counts took as long as the sums.
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _coefficient_slopes(x, s1, s2, s3):
     """Derivatives of the coefficients s1, s2, s3 of so3.jacobian_coefficients with respect to theta, over theta."""
     if x < so3.SERIES_BELOW:
@@ -95,29 +95,30 @@ def _propagate_rows(E, A, B, dt, X):
 
 
 @njit(cache=True, nogil=True)
-def _add_product(X, A, B, rows):
-    """X[:rows] += A[:rows] B."""
-    for i in range(rows):
+def _add_product(X, A, B):
+    """The last columns of X (9, n) += A (9, k) B (k, m <= n)."""
+    o = X.shape[1] - B.shape[1]
+    for i in range(9):
         for k in range(A.shape[1]):
             a = A[i, k]
             if a != 0.0:
                 for j in range(B.shape[1]):
-                    X[i, j] += a * B[k, j]
+                    X[i, o + j] += a * B[k, j]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _propagate_covariance(E, A, B, dt, bias_step, P, P_t):
     """P <- F15 P F15^T, both halves through the same row operation."""
     for half in range(2):
         source, target = (P, P_t) if half == 0 else (P_t, P)
         _propagate_rows(E, A, B, dt, source[:9])
-        _add_product(source[:9], bias_step, source[9:], 9)
+        _add_product(source[:9], bias_step, source[9:])
         for i in range(15):
             for j in range(15):
                 target[i, j] = source[j, i]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _add_noise(P, bias_step, variance, walk, dt):
     """Adds white noise of the readings (density^2 / dt through the bias columns) and the biases' random walk."""
     for i in range(9):
@@ -161,8 +162,8 @@ def step(rate, force, dt, dw_db, df_db, R, v, p, J, extra_w, extra_f, P, P_t, va
             for j in range(6):
                 J[i, j] += w.bias_step[i, j]
         if J.shape[1] > 6:
-            _add_product(J[:, 6:], w.by_rate, extra_w, 9)
-            _add_product(J[:, 6:], w.by_force, extra_f, 9)
+            _add_product(J, w.by_rate, extra_w)
+            _add_product(J, w.by_force, extra_f)
         if P.shape[0] > 0:
             _propagate_covariance(w.E, w.A, w.B, dt, w.bias_step, P, P_t)
             _add_noise(P, w.bias_step, variance[n], walk, dt)
@@ -176,7 +177,7 @@ def step(rate, force, dt, dw_db, df_db, R, v, p, J, extra_w, extra_f, P, P_t, va
             R[i, j] = a * w.E[0, j] + b * w.E[1, j] + c * w.E[2, j]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _step_jacobians(R, w, s1, s2, s3, dt):
     """Fills A, B, by_rate and by_force of the workspace `w`."""
     _series(w.phi, 1.0, s1, s2, w.G1)
@@ -199,7 +200,7 @@ def _step_jacobians(R, w, s1, s2, s3, dt):
             w.by_force[6 + i, j] = dt * dt * (r0 * w.G2[0, j] + r1 * w.G2[1, j] + r2 * w.G2[2, j])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _bias_step(w, dw_db, df_db):
     """Fills bias_step of the workspace `w`: by_rate dw_db + by_force df_db."""
     for i in range(9):
@@ -295,7 +296,7 @@ class Workspace(NamedTuple):
     force: np.ndarray
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def workspace():
     """An empty one; the rotation does not depend on the force."""
     return Workspace(

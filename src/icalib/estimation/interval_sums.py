@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from numba import njit
+from icalib.compiled import njit
 
 
 @njit(cache=True, nogil=True)
@@ -44,7 +44,7 @@ def _scatter(A, Ac, cols, n_b, side):
                 side[i, n_b] += f * Ac[k, len(cols)]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _scatter_border(Ac, cols, n_b, border):
     for k in range(Ac.shape[0]):
         for i in range(len(cols)):

@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.estimation.corner_chain import by_imu_pose
 from icalib.estimation.lidar_walk import PLANE, POSE, add_entry, add_plane, add_pose, border_of, no_walk, taken_off
 from icalib.estimation.state import Key, State
@@ -132,9 +132,9 @@ def _jacobian(R_lw, p_wl, q, planes, m, A):
 
 
 @njit(cache=True, nogil=True)
-def _times_root(A, n, root, B):
-    """B (n, 4) = A L with L the lower triangle `root` (10,), row by row."""
-    for i in range(n):
+def _times_root(A, root, B):
+    """B (n, 4) = A[:n] L with L the lower triangle `root` (10,), row by row."""
+    for i in range(len(B)):
         B[i, 0] = A[i, 0] * root[0] + A[i, 1] * root[1] + A[i, 2] * root[3] + A[i, 3] * root[6]
         B[i, 1] = A[i, 1] * root[2] + A[i, 2] * root[4] + A[i, 3] * root[7]
         B[i, 2] = A[i, 2] * root[5] + A[i, 3] * root[8]
@@ -292,8 +292,9 @@ def _work_space(motion):
 def _see(e, i, bins, motion, planes, work, rows):
     """Whitened residuals of entry e, in bin i. Returns half their chi^2 and what their variances add as beams turn."""
     _distances(motion.R_lidar_world[i], motion.p_world_lidar[i], bins.plane[e], planes, work.m)
-    work.A[0] = work.m
-    _times_root(work.A, 1, bins.root[e], rows[e : e + 1])
+    for c in range(ROWS):
+        work.A[0, c] = work.m[c]
+    _times_root(work.A, bins.root[e], rows[e : e + 1])
     cost = bins.slant[e, 0]
     for c in range(ROWS):
         cost += 0.5 * rows[e, c] ** 2
@@ -310,7 +311,7 @@ def turn_by_noise(bins, motion, planes):
         for e in range(bins.start[i], bins.start[i + 1]):
             _distances(motion.R_lidar_world[i], motion.p_world_lidar[i], bins.plane[e], planes, work.m)
             _jacobian(motion.R_lidar_world[i], motion.p_world_lidar[i], bins.plane[e], planes, work.m, work.A)
-            _times_root(work.A, POSE, bins.root[e], work.B)
+            _times_root(work.A, bins.root[e], work.B[:POSE])
             for a in range(3):
                 for j in range(POSE):
                     w = bins.walked[i] * by_imu[j, a]
@@ -338,7 +339,7 @@ def accumulate(bins, motion, planes, sums, rows):
             cost += _see(e, i, bins, motion, planes, work, rows)
             if wanted:
                 _jacobian(motion.R_lidar_world[i], motion.p_world_lidar[i], q, planes, work.m, A)
-                _times_root(A, RESIDUAL + 1, bins.root[e], B)
+                _times_root(A, bins.root[e], B)
                 _add_to_pose(B, A, bins.slant[e], G)
             if walks:
                 add_entry(bins.turned[e], bins.slope[e], rows[e], B, W, walk)

@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.estimation.corner_weights import weight
 
 MOMENTS = 10  # of (1, x, y, z), lower triangle row by row
@@ -69,7 +69,10 @@ def to_centres(motion, each, ok, cells):
     for c in range(len(ok) // each):
         m = c * each + each // 2
         R, p = motion.rotation[m], motion.position[m]
-        cells.rotation[c], cells.position[c] = R, p
+        for i in range(3):
+            cells.position[c, i] = p[i]
+            for j in range(3):
+                cells.rotation[c, i, j] = R[i, j]
         for b in range(c * each, (c + 1) * each):
             cells.known[b] = ok[b] and ok[m]
             for i in range(3):
@@ -191,15 +194,18 @@ def _bin_scan(i, scans, motion, cells, each, planes, weights, sorted_points, ent
                     continue
                 if number == 0:
                     _see_plane(cells.rotation[c], cells.position[c], planes[q], seen)
-                    sums[:] = 0.0
+                    for k in range(SUMS):
+                        sums[k] = 0.0
                 turn, shift, rate, velocity = cells.turn[b], cells.shift[b], motion.rate[b], motion.velocity[b]
                 _add_points(points, begin, end, turn, shift, rate, velocity, seen, weights, sums)
                 number += end - begin
             if number:
                 bins[total], plane[total], count[total] = c, q, number
-                root[total] = sums[:MOMENTS]
+                for k in range(MOMENTS):
+                    root[total, k] = sums[k]
                 _root_in_place(root[total])
-                slant[total, 1:] = sums[MOMENTS:]
+                for k in range(3):
+                    slant[total, 1 + k] = sums[MOMENTS + k]
                 slant[total, 0] = -(sums[10] * seen[1] + sums[11] * seen[2] + sums[12] * seen[3])
                 total += 1
     return total
@@ -217,7 +223,8 @@ def bin_scans(scans, motion, cells, each, planes, weights, per_s, entries):
     for i in range(len(scans.start) - 1):
         own = ends[: (scans.steps[i + 1] - scans.steps[i]) * len(planes)]
         _sort_scan(i, scans, per_s, len(planes), own, points)
-        total = _bin_scan(i, scans, motion, cells, each, planes, weights, (own, points), entries, total)
+        # int: the literal 0 would be a type of its own, for which all is compiled once more
+        total = _bin_scan(i, scans, motion, cells, each, planes, weights, (own, points), entries, int(total))
     return total
 
 

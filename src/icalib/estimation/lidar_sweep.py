@@ -6,14 +6,16 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.estimation.from_nodes import Moving, integrate_from_node, nodes_of, nothing_carried, place, ways_from
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.integration import Increment, correction, readings_of
 from icalib.estimation.poses import assign_nodes
 from icalib.estimation.state import State
 from icalib.geometry.small import mul3
+
+NO_COLUMNS = np.int64(0)  # of Jacobians; the literal 0 would be a type of its own, for which all is compiled once more
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ class Sweep(NamedTuple):
 @njit(cache=True, nogil=True)
 def _imu_at(ways, nodes, readings, intrinsics, imu):
     """Fills `imu`, a `Moving`, by integration from the nodes, without Jacobians."""
-    by, carried = correction(intrinsics, 0), nothing_carried(0)
+    by, carried = correction(intrinsics, NO_COLUMNS), nothing_carried(NO_COLUMNS)
     out = Increment(np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((9, 0)), np.empty((0, 0)))
     for i in ways.order:
         k, t = ways.node[i], ways.times[i]

@@ -15,8 +15,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.geometry.small import cholesky
 
 POSE, PLANE = 6, 3
@@ -89,9 +89,11 @@ def border_of(walk, columns, of_plane):
     of_plane (P, 3)."""
     n_c, n = len(columns), walk.n_met[0]
     own = np.empty(n_c + PLANE * n, np.int64)
-    own[:n_c] = columns
+    for j in range(n_c):  # in loops: copies of arrays take seconds to compile
+        own[j] = columns[j]
     for i in range(n):
-        own[n_c + PLANE * i : n_c + PLANE * (i + 1)] = of_plane[walk.met[i]]
+        for t in range(PLANE):
+            own[n_c + PLANE * i + t] = of_plane[walk.met[i], t]
     return own
 
 
@@ -103,9 +105,12 @@ def taken_off(walk):
     last = width + PLANE * n
     V = np.empty((3, last + 1))
     for a in range(3):
-        V[a, :width], V[a, last] = walk.by_pose[a, :width], walk.by_pose[a, width]
+        for j in range(width):
+            V[a, j] = walk.by_pose[a, j]
+        V[a, last] = walk.by_pose[a, width]
         for i in range(n):
-            V[a, width + PLANE * i : width + PLANE * (i + 1)] = walk.by_plane[walk.met[i], a]
+            for t in range(PLANE):
+                V[a, width + PLANE * i + t] = walk.by_plane[walk.met[i], a, t]
         L[a, a] += 1.0
     cholesky(L)
     for a in range(3):

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from icalib.compiled import njit
 
 COARSE_POINTS = 3_000_000  # of a LiDAR, where some of its points will do
 FEW = 20_000  # points of a plane that are all looked at

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.estimation.from_nodes import Moving, integrate_from_node, nodes_of, nothing_carried, place, ways_from
 from icalib.estimation.imu_data import ImuData
 from icalib.estimation.imu_model import N_INTRINSICS, correction_matrices, intrinsics_jacobians
@@ -67,7 +67,7 @@ def assign_nodes(scheme: Scheme, nodes: np.ndarray, times: np.ndarray, forwards:
     return after - (times - nodes[after - 1] < nodes[after] - times)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _velocity(i, R0, R1, g, dv, force, J, moving):
     """Fills entry i of `moving`: dv, J of the increments from the node (R0), force at the instant (R1)."""
     for a in range(3):
@@ -86,7 +86,7 @@ def _velocity(i, R0, R1, g, dv, force, J, moving):
     moving.acceleration[i, 2] -= g
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _by_node(i, dt, R, J, dR, dp, Jn, Jx):
     """Fills entry i of the Jacobians of a pose: dt, dR, dp and their Jacobian J from the node, which is at R."""
     for a in range(3):

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.estimation.arrowhead import Piece
 from icalib.estimation.corner_weights import Loss, weight
 from icalib.estimation.feature_kernels import Points

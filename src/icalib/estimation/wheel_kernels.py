@@ -12,8 +12,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.estimation.corner_weights import weight
 from icalib.estimation.interval_sums import add_interval
 from icalib.geometry import so3

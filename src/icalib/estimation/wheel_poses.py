@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from math import cos, sin
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.estimation.wheel_intervals import WheelIntervals
 from icalib.geometry.small import inverse_cholesky
 

@@ -14,8 +14,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.geometry import so3
 from icalib.geometry.small import eigen3, mul3
 
@@ -263,5 +263,8 @@ def turn_back(xyz, which, turns):
 @njit(cache=True, nogil=True)
 def moved(pose, d):
     """The pose corrected by d (12,)."""
-    R = mul3(pose.rotation, so3.exp(d[:3]))
-    return ScanPose(R, pose.position + d[3:6], pose.rate + d[6:9], pose.velocity + d[9:])
+    position, rate, velocity = np.empty(3), np.empty(3), np.empty(3)
+    for i in range(3):
+        position[i], rate[i] = pose.position[i] + d[3 + i], pose.rate[i] + d[6 + i]
+        velocity[i] = pose.velocity[i] + d[9 + i]
+    return ScanPose(mul3(pose.rotation, so3.exp(d[:3])), position, rate, velocity)

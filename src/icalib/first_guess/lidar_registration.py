@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.first_guess.lidar_map import UNKNOWNS, ScanPose, moved, sums
 from icalib.geometry import so3
 from icalib.geometry.small import mul3, solve_definite, tmul3
@@ -58,9 +58,12 @@ def _way(e):
 @njit(cache=True, nogil=True)
 def expected_pose(e):
     """Where the scan is looked for."""
-    turned = e.turned if e.knows_turn else so3.exp(e.before.rate * e.step)
-    way = _way(e)
-    return ScanPose(mul3(e.before.rotation, turned), e.before.position + way, e.before.rate.copy(), way / e.step)
+    b, way = e.before, _way(e)
+    turn, position, rate, velocity = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for i in range(3):  # in loops: array expressions take seconds to compile
+        turn[i], rate[i] = b.rate[i] * e.step, b.rate[i]
+        position[i], velocity[i] = b.position[i] + way[i], way[i] / e.step
+    return ScanPose(mul3(b.rotation, e.turned if e.knows_turn else so3.exp(turn)), position, rate, velocity)
 
 
 @njit(cache=True, nogil=True)
@@ -112,7 +115,11 @@ def register(voxels, xyz, tau, n_wide, e, last):
         add_expected(e, pose, H, g)
         if not solve_definite(H, g):
             break
-        pose = moved(pose, -g)
-        if share == 1.0 and np.abs(g[:6]).max() < SMALL:
+        small = share == 1.0
+        for i in range(UNKNOWNS):
+            g[i] = -g[i]
+            small = small and (i >= 6 or abs(g[i]) < SMALL)
+        pose = moved(pose, g)
+        if small:
             break
     return pose, near

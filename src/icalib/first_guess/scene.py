@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.estimation.bodies import Bodies
 from icalib.estimation.corner_factor import Views
 from icalib.estimation.state import Key

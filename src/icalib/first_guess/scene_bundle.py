@@ -8,8 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.geometry import so3
 from icalib.geometry.cameras.base import CameraModel
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.first_guess.rate_windows import rotation_noise
 from icalib.geometry import so3
 from icalib.geometry.small import tmul3

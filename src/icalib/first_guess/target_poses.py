@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.errors import EstimationError
 from icalib.geometry import so3
 from icalib.geometry.cameras.base import CameraModel
@@ -32,7 +32,7 @@ class TargetPoses:
     rms_px: np.ndarray
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _homography(points, seen, centre, h):
     """H (9,) with seen ~ H (point - centre, 1), h33 = 1, by linear least squares. False where it is singular."""
     A, b, row = np.zeros((8, 8)), np.zeros(8), np.empty(8)
@@ -57,7 +57,7 @@ def _homography(points, seen, centre, h):
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _pose_from_homography(h, R, t):
     """R_cam_board and the position of the homography's centre in the camera, from columns of equal length."""
     n1 = np.sqrt(h[0] ** 2 + h[3] ** 2 + h[6] ** 2)
@@ -173,7 +173,7 @@ def camera_in_target(R, t, rotation, position):
             rotation[a, b] = R[b, a]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _mirror(centre, R, t):
     """The other pose from which a flat target looks nearly alike: its depths mirrored about its middle (Schweighofer
     and Pinz 2006)."""

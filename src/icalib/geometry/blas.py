@@ -9,8 +9,10 @@ from typing import Any
 
 import llvmlite.binding as llvm
 import numpy as np
-from numba import njit, types
+from numba import types
 from numba.extending import get_cython_function_address
+
+from icalib.compiled import njit
 
 _TEXT, _INT, _REAL = types.CPointer(types.uint8), types.CPointer(types.int32), types.CPointer(types.float64)
 

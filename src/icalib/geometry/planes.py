@@ -11,8 +11,8 @@ from __future__ import annotations
 from math import cos, sin, sqrt
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.geometry import so3
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from math import sqrt
 
 import numpy as np
-from numba import njit
+
+from icalib.compiled import njit
 
 SWEEPS = 12  # of rotations at most; five are usual
 # Loops throughout: array expressions compile ten times as slowly, and are no faster on matrices this small.

@@ -9,7 +9,8 @@ from __future__ import annotations
 from math import atan2, cos, sin, sqrt
 
 import numpy as np
-from numba import njit
+
+from icalib.compiled import njit
 
 # Below this angle squared, series in theta^2 are used. Four terms leave a relative error under 1e-16 at the border,
 # where (theta - sin theta) / theta^3 still has 13 digits in closed form.
@@ -70,7 +71,7 @@ def exp(phi):
     return _polynomial(phi, s0, s1)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _quaternion(R):
     """Rotation matrix -> unit quaternion (w, x, y, z), w >= 0, through its largest component (Shepperd)."""
     q = np.empty(4)

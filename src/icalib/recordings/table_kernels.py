@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from icalib.compiled import njit
 
 POWERS = np.array([float(f"1e{k}") for k in range(309)])
 LEFT_OUT = -1  # of a column's place
@@ -34,7 +35,8 @@ def parse(
         if at >= buffer.size or buffer[at] == 10 or buffer[at] == 35:  # end, newline, #
             at = _next_line(buffer, at)
         else:
-            at, column = _row(buffer, at, row, stamps, place, powers, integers, decimals)
+            # int: the literal 0 would be a type of its own, for which all is compiled once more
+            at, column = _row(buffer, at, int(row), stamps, place, powers, integers, decimals)
             if column == place.size:
                 numbers[row] = row + bad
                 row += 1
@@ -85,7 +87,7 @@ def _next_line(buffer: np.ndarray, at: int) -> int:
     return at + 1
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _skip_field(buffer: np.ndarray, at: int) -> int:
     while at < buffer.size and buffer[at] != 44 and buffer[at] != 10:
         at += 1
@@ -121,7 +123,7 @@ def _integer(buffer: np.ndarray, at: int) -> tuple[int, np.int64, bool]:
     return at, -value if negative else value, ok and digits > 0
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _stamp(buffer: np.ndarray, at: int, power: int) -> tuple[int, np.int64, bool | np.bool_]:
     """Position after the number, the number times 10^power, rounded, and whether that is an int64. Digits of its
     fraction that do not fit are left out."""
@@ -151,7 +153,7 @@ def _stamp(buffer: np.ndarray, at: int, power: int) -> tuple[int, np.int64, bool
     return at, -value if negative else value, ok and fits and digits > 0
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _shifted(value: np.int64, power: int) -> tuple[np.int64, bool]:
     """value * 10^power of a value from 0 up, rounded, and whether it fits."""
     while power > 0 and value > 0:

@@ -11,7 +11,8 @@ lens.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from icalib.compiled import njit
 
 DRAWS = 60  # with 30 % of outliers, chance misses every clean sample once in 35 pairs of images; with 20 %, never
 QUANTILE, SIGMAS = 0.65, 0.9346  # up to 35 % of the points may move; where that quantile of normal errors lies

@@ -11,7 +11,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from icalib.compiled import njit
 
 RADIUS = 7  # px; a patch has 15 x 15 px
 SIDE = 2 * RADIUS + 1

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.geometry.cameras import radial
 from icalib.geometry.cameras.closed_form import MIN_DISTANCE, ClosedForm
 from icalib.geometry.cameras.radtan import distort, undistort

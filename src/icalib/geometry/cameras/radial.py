@@ -5,7 +5,8 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
+
+from icalib.compiled import njit
 
 _MAX_ITERATIONS = 100  # bisection alone halves the bracket to rounding in 60
 

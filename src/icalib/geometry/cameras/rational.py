@@ -5,8 +5,8 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.geometry.cameras.closed_form import ClosedForm
 from icalib.geometry.cameras.radtan import newton_step
 
