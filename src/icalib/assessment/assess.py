@@ -304,7 +304,7 @@ def _sensor_fit(fit: Fit, found: Estimate) -> SensorFit:
     if fit.kind == "features":
         assert problem.features is not None
         i = [c.name for c in problem.features.cameras].index(fit.sensor)
-        rejected = int((~problem.features.keep[i]).sum())
+        rejected = int(problem.features.outliers[i].sum())
     elif unit == "px":
         i = [c.name for c in problem.cameras].index(fit.sensor)
         rejected = int((out.corners[i].root == 0.0).sum())

@@ -37,7 +37,7 @@ def track_residuals(found: Estimate, timeline: Timeline) -> tuple[TrackResiduals
         out.append(
             TrackResiduals(
                 camera.name, float(np.median(own)) if len(own) else None, _seconds(found, timeline, i), stream.start,
-                stream.feature, stream.uv, residual, factor.sigmas[i].astype(np.float32), ~factor.keep[i],
+                stream.feature, stream.uv, residual, factor.sigmas[i].astype(np.float32), factor.outliers[i],
             )
         )  # fmt: skip
     return tuple(out)

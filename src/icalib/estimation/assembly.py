@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -141,10 +141,12 @@ def _hosts(rig: Rig) -> str:
 
 @dataclass(frozen=True)
 class Following:
-    """Of tracks, by camera: their noise, and keep (N,), observations in use. cut: whether tracks are cut short."""
+    """Of tracks, by camera: their noise; keep (N,), observations in use; outliers (N,), those not in use because they
+    stand out. cut: whether tracks are cut short."""
 
     noise: tuple[TrackNoise, ...]
     keep: tuple[np.ndarray, ...]
+    outliers: tuple[np.ndarray, ...]
     cut: bool = False
 
 
@@ -219,6 +221,7 @@ def _features(inputs: Inputs, state: State, cameras: tuple[CornerFactor, ...], f
         cuts = (*cuts, *(int(k) + 1 for k in np.flatnonzero(np.diff(np.floor(state.seconds / CUT_S)))))
     surfaces = _surfaces(inputs, state, following.cut)
     factor = FeatureFactor.build(cameras, streams, following.noise, keep, loss, state, cuts, seams, surfaces)
+    factor = replace(factor, outliers=following.outliers)
     return factor.coarse(state) if following.cut else factor
 
 

@@ -82,6 +82,7 @@ class FeatureFactor:
     seams: tuple[int, ...] = ()
     surfaces: Surfaces | None = None
     on: OnPlanes = NOWHERE
+    outliers: tuple[np.ndarray, ...] = ()  # (N,) bool by camera; () before any were judged
 
     @classmethod
     def build(

@@ -29,7 +29,8 @@ def first_following(inputs: Inputs) -> Following | None:
     if not inputs.measurements.tracks:
         return None
     noise = tuple(TrackNoise(c.track_noise_px or FIRST_GUESS_PX) for c in inputs.rig.cameras)
-    return Following(noise, tuple(np.ones(len(t.uv), dtype=bool) for t in inputs.measurements.tracks), True)
+    none = tuple(np.zeros(len(t.uv), dtype=bool) for t in inputs.measurements.tracks)
+    return Following(noise, tuple(~x for x in none), none, True)
 
 
 def next_following(inputs: Inputs, outcome: Outcome, now: Following, first: bool) -> Following:
@@ -39,13 +40,15 @@ def next_following(inputs: Inputs, outcome: Outcome, now: Following, first: bool
     assert factor is not None and out is not None
     noise = tuple(_noise(c, factor, out, i) for i, c in enumerate(rig.cameras))
     if rig.settings.outlier_std <= 0.0:
-        return Following(noise, now.keep)
+        return Following(noise, now.keep, now.outliers)
     # All that was seen, with the poses of the pass's end: those of its beginning left tracks out that these find, and
     # what a lens that was not found yet made an outlier may be none.
     shown = on_the_chain(inputs, outcome.state, factor.cameras)
     anew = replace(factor, noise=noise, keep=shown).cut(outcome.state, chain_cuts(factor.n_nodes))
     left, share = anew.look(outcome.state), GOOD_AT_FIRST if first else GOOD
-    return Following(noise, tuple(_kept(anew, left, i, rig.settings, share) for i in range(len(shown))))
+    # The next pass uses no observation that was not judged, as those of tracks that the poses do not find.
+    judged = [_judged(anew, left, i, rig.settings, share) for i in range(len(shown))]
+    return Following(noise, tuple(good for good, _ in judged), tuple(outliers for _, outliers in judged))
 
 
 def _noise(camera: Camera, factor: FeatureFactor, out: FeatureOutput, index: int) -> TrackNoise:
@@ -85,8 +88,11 @@ def variance_growth(square: np.ndarray, views: np.ndarray) -> float:
     return float(max(slope, 0.0) / max(first, 0.1 * variance.min()))
 
 
-def _kept(factor: FeatureFactor, out: FeatureOutput, index: int, settings: Settings, share: float) -> np.ndarray:
-    """(N,) bool: observations that are no outliers, and that the model can see; where the track is left out they stay.
+def _judged(
+    factor: FeatureFactor, out: FeatureOutput, index: int, settings: Settings, share: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) bool: observations of tracks in use that are no outliers and that the model can see; and those that are
+    outliers, or that it cannot see.
 
     An outlier is `outlier_std` standard deviations above the mean of its image, and above `outlier_min_px`. Both are
     those of normal errors as large as that `share` of the image's: where few points are followed, one outlier alone
@@ -98,4 +104,5 @@ def _kept(factor: FeatureFactor, out: FeatureOutput, index: int, settings: Setti
     relative = factor.sigmas[index] / factor.noise[index].sigma
     most = grouped_quantiles((size / relative)[used], image[used], len(stream.stamps_ns), share)
     limit = largest_normal(settings.outlier_std, share) * most[image] * relative
-    return ~(followed & (~used | (size > np.maximum(limit, settings.outlier_min_px))))
+    good = followed & used & (size <= np.maximum(limit, settings.outlier_min_px))
+    return good, followed & ~good
