@@ -349,11 +349,11 @@ class Measurements:
         return self.body.origin_ns if self.imu is None else self.imu.origin_ns
 
     @property
-    def body(self) -> CornerStream | PoseStream:
+    def body(self) -> CornerStream | TrackStream | PoseStream:
         """Without an IMU, of the sensor whose frame and clock are the body's: the first camera, or where cameras follow
         points alone the first pose sensor."""
         follow = bool(self.tracks) and not any(len(c.uv) for c in self.cameras)
-        return (*self.poses, *self.cameras)[0] if follow else (*self.cameras, *self.poses)[0]
+        return (*self.poses, *self.tracks)[0] if follow else (*self.cameras, *self.poses)[0]
 
     def unassociated(self) -> Measurements:
         """The same, of whose LiDARs' points nobody knows on what planes they lie."""

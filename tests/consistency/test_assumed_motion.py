@@ -145,10 +145,34 @@ def test_one_arc_all_the_time_is_refused(robot):
         calibrate_measurements(rig, measurements)
 
 
-def test_cameras_need_a_target(robot):
-    rig, measurements, _ = without_imu(replace(robot("ramp", 8.0, "cw")))
-    rig = replace(rig, target=type(rig_for(robot("ramp", 8.0, "w")).target)())
-    with pytest.raises(EstimationError, match="cameras need a target"):
+def followed_by_wheels(example: str, seed: int, drive: str) -> tuple[Rig, Measurements, Simulation]:
+    """A camera that follows points, wheels, and nothing else; of the camera nothing is known."""
+    scenario = load_scenario(PAPER / f"table2-{example}.yaml")
+    cameras = tuple(replace(c, corner_noise_px=0.5) for c in scenario.cameras[:1])
+    scenario = replace(scenario, duration_s=15.0, cameras=cameras, lidars=())
+    simulation = simulate(scenario, seed)
+    rig = rig_for(scenario, intrinsics="free", distortion="free", drive=drive)  # pyright: ignore
+    return replace(rig, imu=None), replace(simulation.measurements, imu=None), simulation
+
+
+@pytest.mark.parametrize(("seed", "drive"), [(1, "start"), (2, "fixed")])
+def test_cameras_that_follow_points_and_wheels_on_a_floor(seed, drive):
+    """The size of the scene is as the rig file has the wheels'."""
+    rig, measurements, simulation = followed_by_wheels("planar", seed, drive)
+    result = calibrate_measurements(rig, measurements)
+    assert result.body == "cam0" and result.converged
+    e, P = normalised(result, simulation)
+    assert np.abs(e / np.sqrt(np.diag(P))).max() < 4.0
+    assert set(result.group("cam0", "intrinsics").verdict) == {"determined"}
+    assert set(result.group("wheel0", "radii").verdict) == {"undetermined" if drive == "start" else "fixed"}
+
+
+@pytest.mark.parametrize(("example", "drive", "words"), [
+    ("ramp", "start", "shows the motion on a flat floor only"), ("planar", "free", "give its radii and baseline"),
+])  # fmt: skip
+def test_what_wheels_do_not_show_to_cameras_that_follow_points(example, drive, words):
+    rig, measurements, _ = followed_by_wheels(example, 1, drive)
+    with pytest.raises(EstimationError, match=words):
         calibrate_measurements(rig, measurements)
 
 

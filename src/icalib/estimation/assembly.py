@@ -188,7 +188,7 @@ def assemble(
         features = None if found is None else found.result()
     return Problem(
         layout, _chain(inputs, state), tuple(factors), _priors(inputs), tolerance, held, features, others,
-        rig.has_target or rig.imu is None or rig.assumes_motion,
+        rig.has_target or rig.imu is None or (rig.assumes_motion and rig.moves_by_poses), not rig.assumes_motion,
     )  # fmt: skip
 
 

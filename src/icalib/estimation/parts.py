@@ -65,7 +65,7 @@ class Parts:
         problem.add_bias_prior(state, piece)
         if not problem.framed:
             shared = any(b.name in IN_THE_WORLD for b in problem.layout.blocks)
-            hold_frame(state, piece, first, LOOSE_FRAME if shared else FRAME)
+            hold_frame(state, piece, first, problem.levelled, LOOSE_FRAME if shared else FRAME)
         # A seam says nothing of the node behind it, and that node's own images are in the next part.
         return piece.without_last() if last in problem.chain.starts else piece
 

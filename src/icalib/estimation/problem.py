@@ -70,6 +70,7 @@ class Problem:
     features: FeatureFactor | None = None
     sensors: tuple[SensorFactor, ...] = ()  # but for the cameras
     framed: bool = True  # a target says where the world's origin is; else nothing does, and it stays where it is
+    levelled: bool = True  # gravity says which way is up
 
     @property
     def n_nodes(self) -> int:
@@ -155,7 +156,7 @@ class Problem:
         """Each recording's world stays where it is, if nothing says where that is."""
         for node in self.chain.starts if not self.framed else ():
             if piece.first <= node < piece.last:
-                hold_frame(state, piece, node)
+                hold_frame(state, piece, node, self.levelled)
 
     def add_measurements(
         self, state: State, piece: Piece, out: Residuals, sums: bool = True, curved: bool = False

@@ -32,6 +32,14 @@ from icalib.first_guess.several import initial_guesses
 from icalib.first_guess.smooth_path import FEWEST, BodyPoses, SmoothPath
 from icalib.first_guess.stop_and_go import is_stop_and_go, start_from_pairs
 from icalib.first_guess.tracks_on_motion import track_camera_values
+from icalib.first_guess.wheel_path import (
+    as_given,
+    camera_paths,
+    in_place_of_wheels,
+    pose_stream,
+    seen_from_first,
+    wheel_path,
+)
 from icalib.first_guess.wheels import SidewaysError
 from icalib.geometry.targets.base import BOARD
 from icalib.measurements import ImuStream, Measurements
@@ -94,14 +102,42 @@ def _start(rig: Rig, recordings: Sequence[Measurements]) -> Start:
     inputs = replace(inputs_for(body, _readings(recordings, paths, rig.settings.max_gap_s)), asked=rig)
     felt = _felt(body, recordings, paths, inputs)
     if body.cameras and body.moves_by_poses:
-        blind = replace(body, cameras=())
-        unseen = [replace(m, cameras=(), tracks=()) for m in recordings]
-        alone = _felt(blind, unseen, paths, inputs_for(blind, _readings(unseen, paths)))
-        cameras = track_camera_values(felt, _moving(alone, shown, {})[0])
+        cameras = _cameras_on_poses(body, recordings, shown, paths)
+    elif not (rig.has_target or rig.moves_by_poses):
+        cameras = as_given(inputs, cameras)
     moving, turned = _moving(inputs, shown, cameras)
     placed = pose_values(felt, moving) | moving.values
-    values = wheel_values(felt, replace(moving, values=placed)) | placed
+    known = all((w.name, "rotation") in placed for w in rig.wheels)
+    values = placed if known else wheel_values(felt, replace(moving, values=placed)) | placed
     return inputs, replace(moving, bias=-turned, values=values), values
+
+
+def _cameras_on_poses(
+    body: Rig, recordings: Sequence[Measurements], shown: Sequence[BodyPoses], paths: Sequence[SmoothPath]
+) -> dict[Key, np.ndarray]:
+    """Cameras that follow points, placed on the motion that the first pose sensor of `body` shows."""
+    blind, unseen = replace(body, cameras=()), [replace(m, cameras=(), tracks=()) for m in recordings]
+    alone = _felt(blind, unseen, paths, inputs_for(blind, _readings(unseen, paths)))
+    felt = _felt(body, recordings, paths, inputs_for(body, _readings(recordings, paths)))
+    return track_camera_values(felt, _moving(alone, shown, {})[0])
+
+
+def _cameras_on_wheels(rig: Rig, recordings: Sequence[Measurements]) -> tuple[list[BodyPoses], dict[Key, np.ndarray]]:
+    """As `_shown`, where cameras follow points and the first wheels show the motion, on a floor."""
+    wheels, streams = rig.wheels[0], [m.wheels[0] for m in recordings]
+    shown = [wheel_path(wheels, s) for s in streams]
+    blank, posed = in_place_of_wheels(rig, wheels), []
+    for m, stream, path in zip(recordings, streams, shown, strict=True):
+        posed.append(replace(m, wheels=(), poses=(pose_stream(stream, path),)))
+    paths = [own.at(np.arange(0.0, own.seconds[-1], STEP_S)) for own in shown]
+    try:
+        values = _cameras_on_poses(_with_assumption(blank, posed, paths), posed, shown, paths)
+    except EstimationError as error:
+        said = str(error).rstrip(".")
+        raise EstimationError(
+            f"{said}; without IMU, target and pose sensor {wheels.name} shows the motion on a flat floor only."
+        ) from error
+    return camera_paths(rig, recordings, shown, values), seen_from_first(rig, values)
 
 
 def _felt(rig: Rig, recordings: Sequence[Measurements], paths: Sequence[SmoothPath], like: Inputs) -> Inputs:
@@ -131,10 +167,7 @@ def _shown(rig: Rig, recordings: Sequence[Measurements]) -> tuple[list[BodyPoses
     if rig.moves_by_poses:
         return [BodyPoses(s.seconds, s.rotation, s.position) for s in (m.poses[0] for m in recordings)], {}
     if not rig.has_target:
-        raise EstimationError(
-            "without an IMU cameras need a target or a pose sensor: nothing else says how large the scene is; add one "
-            "to the rig file."
-        )
+        return _cameras_on_wheels(rig, recordings)
     seen = [replace(m, wheels=(), poses=()) for m in recordings]
     alone = inputs_for(replace(rig, wheels=(), poses=()), seen)
     (guess,) = initial_guesses(alone.rig, alone.bodies, [m.measurements for m in alone.motions])
@@ -200,7 +233,7 @@ def _identity(inputs: Inputs) -> dict[Key, np.ndarray]:
     sensor = (rig.poses if rig.moves_by_poses else rig.cameras)[0]
     out = given(inputs, sensor, NAMES)
     if not rig.moves_by_poses:
-        return out | {(board_in(BOARD, k), "tilt"): np.eye(3) for k in range(n)}
+        return out | {(board_in(BOARD, k), "tilt"): np.eye(3) for k in range(n) if rig.has_target}
     for k in range(n):
         frame = frame_of(sensor.name, k)
         out |= {(frame, FRAME[0]): np.eye(3), (frame, FRAME[1]): np.zeros(3)}
