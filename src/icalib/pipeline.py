@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 from icalib.assessment import assess, stated_words, visited
 from icalib.calibration import Calibration, Visited
 from icalib.detection.streams import find_corners
-from icalib.detection.tracking.streams import find_tracks
+from icalib.detection.tracking.streams import find_all_tracks
 from icalib.errors import EstimationError, RecordingError
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.outcome import Visit
@@ -85,16 +85,16 @@ def _measure(rig: Rig, recording: Recording, progress: Progress) -> Measurements
     names = [c.name for c in rig.cameras]
     progress("reading", 0.0)
 
-    def showing(what: str, camera: Camera) -> Callable[[float], None]:
-        stage = f"{what} in the images of {camera.name}"
-        return lambda done: progress(stage, (names.index(camera.name) + done) / len(names))
-
     def find(recording: Recording, camera: Camera) -> tuple[CornerStream, tuple[str, ...]]:
-        show = showing("finding the target", camera)
+        def show(done: float) -> None:
+            share = (names.index(camera.name) + done) / len(names)
+            progress(f"finding the target in the images of {camera.name}", share)
+
         return find_corners(recording, camera, rig.target, rig.settings.keep_corners, show)
 
-    def follow(recording: Recording, camera: Camera) -> tuple[TrackStream, tuple[str, ...]]:
-        return find_tracks(recording, camera, rig.settings.keep_corners, showing("tracking features", camera))
+    def follow(recording: Recording, cameras: Sequence[Camera]) -> Sequence[tuple[TrackStream, tuple[str, ...]]]:
+        what = f"tracking features in the images of {' and '.join(c.name for c in cameras)}"
+        return find_all_tracks(recording, cameras, rig.settings.keep_corners, lambda done: progress(what, done))
 
     return read_measurements(recording, rig, find, follow)
 

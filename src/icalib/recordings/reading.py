@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from icalib.errors import RecordingError
@@ -20,7 +20,7 @@ from icalib.recordings.wheel_checks import checked_wheels
 from icalib.rig import Camera, Lidar, PoseSensor, Rig, Wheels
 
 FindCorners = Callable[[Recording, Camera], tuple[CornerStream, tuple[str, ...]]]
-FindTracks = Callable[[Recording, Camera], tuple[TrackStream, tuple[str, ...]]]
+FindTracks = Callable[[Recording, Sequence[Camera]], Sequence[tuple[TrackStream, tuple[str, ...]]]]
 
 
 def tables_only(recording: Recording, camera: Camera) -> tuple[CornerStream, tuple[str, ...]]:
@@ -28,9 +28,9 @@ def tables_only(recording: Recording, camera: Camera) -> tuple[CornerStream, tup
     raise RecordingError(f"{recording.where(camera)} holds images, not corners; nothing here looks for the target.")
 
 
-def track_tables_only(recording: Recording, camera: Camera) -> tuple[TrackStream, tuple[str, ...]]:
+def track_tables_only(recording: Recording, cameras: Sequence[Camera]) -> Sequence[tuple[TrackStream, tuple[str, ...]]]:
     """For recordings without images. Raises RecordingError."""
-    raise RecordingError(f"{recording.where(camera)} holds images, not tracks; nothing here follows points in them.")
+    raise RecordingError(f"{recording.where(cameras[0])} holds images; nothing here tracks features in them.")
 
 
 def read_measurements(
@@ -111,9 +111,14 @@ def _tracks(
     recording: Recording, rig: Rig, follow: FindTracks, cut: Callable[[TrackStream, str], TrackStream]
 ) -> tuple[tuple[TrackStream, ...], tuple[str, ...]]:
     """Feature tracks of each camera that has some, from its table or its images, and notes."""
-    tracked = [c for c in rig.cameras if c.tracks is not None]
-    image_topics(recording, [c for c in tracked if c.tracks_images])
-    found = [follow(recording, c) if c.tracks_images else (recording.tracks(c), ()) for c in tracked]
+    pictured = [c for c in rig.cameras if c.tracks_images]
+    tables = {c.name: recording.tracks(c) for c in rig.cameras if c.tracks is not None and not c.tracks_images}
+    image_topics(recording, pictured)
+    above = 1 + max((int(t.feature.max(initial=-1)) for t in tables.values()), default=-1)
+    seen = follow(recording, pictured) if pictured else ()
+    of_images = {stream.name: (replace(stream, feature=stream.feature + above), notes) for stream, notes in seen}
+    by_name = {name: (stream, ()) for name, stream in tables.items()} | of_images
+    found = [by_name[c.name] for c in rig.cameras if c.name in by_name]
     tracks = tuple(cut(stream, f"the tracks of {stream.name}") for stream, _ in found)
     return tracks, sum((notes for _, notes in found), ())
 

@@ -26,9 +26,10 @@ class Turning:
         return p[:, :2] / p[:, 2:]
 
 
-def turning(texture: np.ndarray, noise: float = 1.0) -> Turning:
-    """Turns of up to 1.5 deg an image about all axes, seen through the texture of a far wall."""
-    rng = np.random.default_rng(5)
+def turning(texture: np.ndarray, beside: np.ndarray = np.eye(3), seed: int = 5) -> Turning:
+    """Turns of up to 1.5 deg an image about all axes, seen through the texture of a far wall; the second of two cameras
+    sees at `beside` (3, 3) times its pixel what the first sees there."""
+    rng = np.random.default_rng(seed)
     v, u = np.mgrid[: SIZE[1], : SIZE[0]].astype(np.float64)
     pixels = np.stack([u, v, np.ones_like(u)]).reshape(3, -1)
     images, homographies = [], []
@@ -37,18 +38,19 @@ def turning(texture: np.ndarray, noise: float = 1.0) -> Turning:
         # Exponential of a small turn by its series: an obvious formula, and not the program's.
         W = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
         R = sum((np.linalg.matrix_power(W, n) / float(np.prod(np.arange(1, n + 1))) for n in range(1, 10)), np.eye(3))
-        H = _K @ R @ np.linalg.inv(_K)
+        H = beside @ _K @ R @ np.linalg.inv(_K)
         at = np.linalg.inv(H) @ pixels
         grey = map_coordinates(texture, [at[1] / at[2] + 200.0, at[0] / at[2] + 200.0], order=3, mode="nearest")
-        images.append(
-            np.clip(np.rint(grey + noise * rng.normal(size=grey.shape)), 0, 255).reshape(v.shape).astype(np.uint8)
-        )
+        images.append(np.clip(np.rint(grey + rng.normal(size=grey.shape)), 0, 255).reshape(v.shape).astype(np.uint8))
         homographies.append(H)
     return Turning(images, homographies)
 
 
+def wall(seed: int) -> np.ndarray:
+    texture = gaussian_filter(np.random.default_rng(seed).normal(size=(700, 800)), 2.5)
+    return 128.0 + 30.0 * texture / texture.std()
+
+
 @pytest.fixture(scope="package")
 def scene() -> Turning:
-    rng = np.random.default_rng(3)
-    texture = gaussian_filter(rng.normal(size=(700, 800)), 2.5)
-    return turning(128.0 + 30.0 * texture / texture.std())
+    return turning(wall(3))

@@ -29,22 +29,30 @@ def moving_features(start: np.ndarray, feature: np.ndarray, uv: np.ndarray, reso
             before, after = _common(start, feature, k - apart, k)
             if len(before) < FEWEST:
                 continue
-            error, sigma = epipolar_errors(xy[before], xy[after], bend, k)
-            wrong = error > max(TIMES_SIGMA * sigma, LEAST_PX / half_px)
+            wrong = misfits(xy[before], xy[after], bend, half_px, k)
             tried[feature[before]] += 1
             failed[feature[before[wrong]]] += 1
     return failed > MOST_MISFITS * tried
+
+
+def misfits(p: np.ndarray, q: np.ndarray, bend: float, half_px: float, seed: int) -> np.ndarray:
+    """(n,) bool: points p and q (n, 2) in two images that do not fit the epipolar geometry of most. Units are half the
+    image's diagonal, half_px px, from its centre."""
+    error, sigma = epipolar_errors(p, q, bend, seed)
+    return error > max(TIMES_SIGMA * sigma, LEAST_PX / half_px)
 
 
 def _bend(start: np.ndarray, feature: np.ndarray, xy: np.ndarray) -> float:
     """The bend of the lens with which most points fit best, in the mean over pairs of images."""
     firsts = np.unique(np.linspace(0, max(len(start) - 2 - LENS_APART, 0), LENS_PAIRS).astype(int))
     pairs = [_common(start, feature, int(k), int(k) + LENS_APART) for k in firsts if k + LENS_APART < len(start) - 1]
-    pairs = [pair for pair in pairs if len(pair[0]) >= FEWEST]
-    if not pairs:
-        return 0.0
-    size = [np.mean([epipolar_errors(xy[p], xy[q], bend, 0)[1] for p, q in pairs]) for bend in BENDS]
-    return BENDS[int(np.argmin(size))]
+    return best_bend([(xy[p], xy[q]) for p, q in pairs if len(p) >= FEWEST])
+
+
+def best_bend(pairs: list[tuple[np.ndarray, np.ndarray]]) -> float:
+    """The bend with the least error in the mean over pairs of images, of points (n, 2) in each; 0 without pairs."""
+    size = [sum(epipolar_errors(p, q, bend, 0)[1] for p, q in pairs) for bend in BENDS]
+    return BENDS[int(np.argmin(size))] if pairs else 0.0
 
 
 def _common(start: np.ndarray, feature: np.ndarray, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:

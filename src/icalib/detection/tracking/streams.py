@@ -22,6 +22,7 @@ from icalib.detection.image_work import (
 )
 from icalib.detection.tracking.moving import moving_features
 from icalib.detection.tracking.robot_parts import stay_in_place
+from icalib.detection.tracking.stereo import matched
 from icalib.detection.tracking.tracker import Tracker
 from icalib.errors import RecordingError
 from icalib.measurements import TrackStream
@@ -55,10 +56,23 @@ class _Found:
     damaged: str = ""
 
 
+def find_all_tracks(
+    recording: Recording, cameras: Sequence[Camera], keep: bool = True, progress: Progress = lambda _: None
+) -> list[tuple[TrackStream, tuple[str, ...]]]:
+    """Feature tracks of each of the cameras, and sentences on what was left out. The same number is the same point in
+    all of them; cameras that look the same way share some. Raises RecordingError as `find_tracks`."""
+    found = []
+    for k, camera in enumerate(cameras):
+        found.append(find_tracks(recording, camera, keep, lambda done, k=k: progress((k + done) / len(cameras))))
+    first = np.cumsum([0, *(int(stream.feature.max(initial=-1)) + 1 for stream, _ in found)])
+    apart = [replace(stream, feature=stream.feature + n) for n, (stream, _) in zip(first, found, strict=False)]
+    return list(zip(matched(recording, cameras, apart), (notes for _, notes in found), strict=True))
+
+
 def find_tracks(
     recording: Recording, camera: Camera, keep: bool = True, progress: Progress = lambda _: None
 ) -> tuple[TrackStream, tuple[str, ...]]:
-    """Feature tracks of all images of `camera`, and sentences on what was left out.
+    """Feature tracks of all images of `camera`, numbered from 0, and sentences on what was left out.
 
     With `keep`, what an earlier run found is used, and what is found is kept. Raises RecordingError, one sentence,
     where there are no images of the camera, they are not of its resolution, cannot be read, or show nothing to follow.

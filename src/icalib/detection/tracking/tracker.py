@@ -67,12 +67,16 @@ class _Tracks:
         return replace(self, first=self.first.joined(other.first), **columns)
 
 
+def equalised(image: np.ndarray) -> np.ndarray:
+    """The image (h, w) uint8 with its contrast equalised by regions."""
+    return load_cv2().createCLAHE(CLIP, TILES).apply(image)
+
+
 class Tracker:
     """Follows corners of the scene through the images of one camera."""
 
     def __init__(self) -> None:
         self._cv2: Any = load_cv2()
-        self._clahe = self._cv2.createCLAHE(CLIP, TILES)
         self._before = np.zeros((0, 0), np.uint8)
         self._alive = _Tracks.begun(np.zeros(0, np.int64), np.zeros((0, 2)), no_templates())
         self._begun = 0
@@ -80,7 +84,7 @@ class Tracker:
     def add(self, image: np.ndarray) -> Followed:
         """What the next image (h, w) uint8 shows."""
         cv2 = self._cv2
-        even = self._clahe.apply(image)
+        even = equalised(image)
         smooth = cv2.GaussianBlur(image, (0, 0), BLUR_PX).astype(np.float32)
         if len(self._alive.feature):
             self._follow(even, smooth)

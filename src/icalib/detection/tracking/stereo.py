@@ -1,0 +1,160 @@
+"""Features that two cameras see at about the same time: each becomes one feature of both.
+
+Lucas-Kanade leads from one image to the other, from the same pixel on, and back; the patch is then aligned as from
+image to image. This finds pairs of cameras that look the same way. What does not fit the epipolar geometry of the pair,
+which is the same in all images, is left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from icalib.detection.image_work import on_all_cores
+from icalib.detection.tracking.epipolar import FEWEST
+from icalib.detection.tracking.moving import best_bend, misfits
+from icalib.detection.tracking.patches import RADIUS, align, cut_templates
+from icalib.detection.tracking.tracker import ALIGNED_PX, BACK_PX, BLUR_PX, LEAST_ALIKE, WINDOW_PX, equalised
+from icalib.extras import load_cv2
+from icalib.measurements import TrackStream
+from icalib.recordings import DamagedImageError, Payload, Recording, decode
+from icalib.rig import Camera
+
+EVERY_S = 0.25  # between images that are matched; features live about a second
+APART_S = 0.05  # between both images at most
+LEVELS = 4  # of the pyramid: disparities of up to 160 px
+FEWEST_MATCHES = 100  # in a recording; fewer may be chance
+LEAST_SHARE = 0.1  # of the features that were tried
+
+
+@dataclass(frozen=True)
+class _Matches:
+    """Rows of the first camera's stream, images of the second's, and uv (N, 2) px there; tried: how many rows."""
+
+    row: np.ndarray
+    image: np.ndarray
+    uv: np.ndarray
+    tried: int
+
+
+def matched(recording: Recording, cameras: Sequence[Camera], streams: Sequence[TrackStream]) -> tuple[TrackStream, ...]:
+    """The streams, whose features are numbered apart, with what else each camera saw of the others' features.
+
+    Pairs of cameras of one resolution are tried; those that share hardly any features gain none.
+    """
+    found = list(streams)
+    for i, j in combinations(range(len(cameras)), 2):
+        if cameras[i].resolution == cameras[j].resolution:
+            found[j] = _with_features_of(recording, (cameras[i], cameras[j]), (streams[i], streams[j]), found[j])
+    return tuple(found)
+
+
+def _with_features_of(
+    recording: Recording, cameras: tuple[Camera, Camera], streams: tuple[TrackStream, TrackStream], into: TrackStream
+) -> TrackStream:
+    pairs = _pairs(*streams)
+    payloads = _payload_pairs(recording, cameras, streams, pairs)
+    parts = list(on_all_cores(payloads, lambda job: _match(*job, streams[0])))
+    if not parts:
+        return into
+    row, image = (np.concatenate([getattr(p, name) for p in parts]) for name in ("row", "image"))
+    uv, tried = np.concatenate([p.uv for p in parts]), sum(p.tried for p in parts)
+    good = _consistent(streams[0].uv[row], uv, cameras[0].resolution)
+    if good.sum() < max(FEWEST_MATCHES, LEAST_SHARE * tried):
+        return into
+    return _inserted(into, image[good], streams[0].feature[row[good]], uv[good], streams[0], row[good])
+
+
+def _pairs(first: TrackStream, second: TrackStream) -> list[tuple[int, int]]:
+    """Images of both cameras that are near in time, one pair each EVERY_S."""
+    at = first.stamps_ns
+    j = np.clip(np.searchsorted(second.stamps_ns, at), 1, max(len(second.stamps_ns) - 1, 1))
+    j = np.where(np.abs(second.stamps_ns[j - 1] - at) <= np.abs(second.stamps_ns[j] - at), j - 1, j)
+    near = np.abs(second.stamps_ns[j] - at) <= APART_S * 1e9
+    slot = np.floor((at - at[0]) * 1e-9 / EVERY_S).astype(np.int64)
+    chosen = np.flatnonzero(near)
+    chosen = chosen[np.unique(slot[chosen], return_index=True)[1]]
+    return [(int(i), int(j[i])) for i in chosen]
+
+
+def _payload_pairs(
+    recording: Recording,
+    cameras: tuple[Camera, Camera],
+    streams: tuple[TrackStream, TrackStream],
+    pairs: list[tuple[int, int]],
+) -> Iterator[tuple[Payload, Payload, int, int]]:
+    """The images of the pairs, and their numbers."""
+    first, second = (
+        _with_stamps(recording, camera, {int(stream.stamps_ns[pair[k]]) for pair in pairs})
+        for k, (camera, stream) in enumerate(zip(cameras, streams, strict=True))
+    )
+    # The same image may be nearest to two of the other camera; each is read once.
+    held: Payload | None = None
+    for i, j in pairs:
+        a, stamp_ns = next(first), int(streams[1].stamps_ns[j])
+        while held is None or held.stamp_ns != stamp_ns:
+            held = next(second)
+        yield a, held, i, j
+
+
+def _with_stamps(recording: Recording, camera: Camera, stamps_ns: set[int]) -> Iterator[Payload]:
+    return (p for p in recording.payloads(recording.image_topic(camera)) if p.stamp_ns in stamps_ns)
+
+
+def _match(a: Payload, b: Payload, i: int, j: int, stream: TrackStream) -> _Matches:
+    """Features of image i of `stream`, which is `a`, found in `b`, image j of the other camera."""
+    cv2: Any = load_cv2()
+    rows = np.arange(stream.start[i], stream.start[i + 1])
+    none = _Matches(rows[:0], rows[:0], np.zeros((0, 2)), len(rows))
+    try:
+        first, second = decode(a), decode(b)
+    except DamagedImageError:
+        return none
+    edge = RADIUS + 2
+    inside = ((stream.uv[rows] > edge) & (stream.uv[rows] < np.array(first.shape[::-1]) - edge - 1)).all(axis=1)
+    rows = rows[inside]
+    if not len(rows):
+        return none
+    even = [equalised(image) for image in (first, second)]
+    before = stream.uv[rows].astype(np.float32)
+    size = (WINDOW_PX, WINDOW_PX)
+    after, there, _ = cv2.calcOpticalFlowPyrLK(even[0], even[1], before, None, winSize=size, maxLevel=LEVELS)
+    back, returned, _ = cv2.calcOpticalFlowPyrLK(even[1], even[0], after, None, winSize=size, maxLevel=LEVELS)
+    good = (there.ravel() > 0) & (returned.ravel() > 0) & (np.linalg.norm(back - before, axis=1) < BACK_PX)
+    smooth = [cv2.GaussianBlur(image, (0, 0), BLUR_PX).astype(np.float32) for image in (first, second)]
+    whole = np.rint(stream.uv[rows])
+    templates, textured = cut_templates(smooth[0], whole)
+    A, alike = np.tile(np.eye(2), (len(rows), 1, 1)), np.full(len(rows), -1.0)
+    uv = after.astype(np.float64) + whole - stream.uv[rows]
+    align(smooth[1], templates, uv, A, alike)
+    uv = uv + np.einsum("nij,nj->ni", A, stream.uv[rows] - whole)
+    good &= textured & (alike > LEAST_ALIKE) & (np.linalg.norm(uv - after, axis=1) < ALIGNED_PX)
+    return _Matches(rows[good], np.full(int(good.sum()), j), uv[good], len(rows))
+
+
+def _consistent(p: np.ndarray, q: np.ndarray, resolution: tuple[int, int]) -> np.ndarray:
+    """(n,) bool: matches that fit the one epipolar geometry of the pair of cameras."""
+    if len(p) < FEWEST:
+        return np.zeros(len(p), dtype=bool)
+    half_px = 0.5 * float(np.hypot(*resolution))
+    middle = 0.5 * (np.array(resolution) - 1.0)
+    x, y = (p - middle) / half_px, (q - middle) / half_px
+    return ~misfits(x, y, best_bend([(x, y)]), half_px, 0)
+
+
+def _inserted(
+    stream: TrackStream, image: np.ndarray, feature: np.ndarray, uv: np.ndarray, source: TrackStream, row: np.ndarray
+) -> TrackStream:
+    """The stream with further observations; views and spread are those of the camera that tracked the features."""
+    images = np.concatenate([stream.image, image])
+    order = np.argsort(images, kind="stable")
+    start = np.concatenate([[0], np.cumsum(np.bincount(images, minlength=len(stream.stamps_ns)))]).astype(np.int64)
+    return replace(
+        stream, start=start, feature=np.concatenate([stream.feature, feature])[order],
+        uv=np.concatenate([stream.uv, uv])[order], views=np.concatenate([stream.views, source.views[row]])[order],
+        spread=np.concatenate([stream.spread, source.spread[row]])[order],
+    )  # fmt: skip
