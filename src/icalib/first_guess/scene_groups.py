@@ -1,0 +1,134 @@
+"""Bodies that no image shows together, but that different cameras of a rig see at once: how they stand to each other.
+
+Two cameras a, b on a rig see bodies A, B that stand still. At every instant
+
+    T_A_a(i) T_a_b = T_A_B T_B_b(i),
+
+which is AX = YB, as robot-world and hand-eye calibration have it (Zhuang, Roth, Sudhakar 1994; Shah 2013).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import permutations
+
+import numpy as np
+
+from icalib.errors import EstimationError
+from icalib.estimation.bodies import FEWEST_TOGETHER, Bodies, camera_times, restrict, taken_at_once, tied_by_images
+from icalib.estimation.pose_rows import Frame, Mount
+from icalib.estimation.state import Key
+from icalib.first_guess.hand_eye import LARGEST_LEFT, PosePairs, hand_eye, left_over
+from icalib.first_guess.scene import Placed, scene_poses
+from icalib.first_guess.scene_growth import UntiedBodiesError, place_bodies
+from icalib.first_guess.target_poses import TargetPoses
+from icalib.geometry.cameras import camera_model
+from icalib.joining import join_corners
+from icalib.measurements import Measurements
+from icalib.rig import Camera, Rig
+
+
+def place_groups(rig: Rig, bodies: Bodies, recordings: Sequence[Measurements], params: dict[str, np.ndarray]) -> Placed:
+    """How the bodies stand to each other: those that images tie by these, groups of them by what cameras see at once.
+
+    params: (P,) by camera, which are held. Raises UntiedBodiesError naming bodies that nothing ties to the others,
+    EstimationError where images are mirrored, or cameras do not move alike.
+    """
+    used = tied_by_images(bodies, recordings)
+    groups = [_Group.of(rig, replace(bodies, used=own), recordings, params) for own in used]
+    values, frames = dict(groups[0].scene.values), {0: Frame(np.eye(3), np.zeros(3))}
+    while len(frames) < len(groups):
+        tied = [(g, h, _tied(groups[g], groups[h])) for g in frames for h in range(len(groups)) if h not in frames]
+        g, h, best = max(tied, key=lambda item: len(item[2].pairs.p_body))
+        if len(best.pairs.p_body) < FEWEST_TOGETHER:
+            lost = [x.scene.bodies.names for k, x in enumerate(groups) if k not in frames]
+            raise UntiedBodiesError(tuple(name for names in lost for name in names))
+        found = _solved(best, rig.cameras)
+        frames[h] = Frame(frames[g].R @ found.R, frames[g].p + frames[g].R @ found.p)
+        values |= groups[h].values_at(frames[h])
+    return Placed(bodies, values, params)
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Bodies that images tie, in the frame of their first; by recording and camera the instants [s] of images that show
+    them, and poses in that frame."""
+
+    scene: Placed
+    times: list[list[np.ndarray]]
+    poses: list[list[TargetPoses]]
+
+    @classmethod
+    def of(cls, rig: Rig, bodies: Bodies, recordings: Sequence[Measurements], params: dict[str, np.ndarray]) -> _Group:
+        own = [restrict(bodies, r) for r in recordings]
+        models = [camera_model(c.model) for c in rig.cameras]
+        scene = Placed(bodies)
+        if bodies.several:
+            seeing = [i for i in range(len(models)) if any(len(r.cameras[i].point) for r in own)]
+            streams = [join_corners([(r.cameras[i], 0) for r in own]) for i in seeing]
+            scene = place_bodies(bodies, streams, [models[i] for i in seeing], params)
+        times = [camera_times(rig, r, whole.origin_ns) for r, whole in zip(own, recordings, strict=True)]
+        poses = [
+            [scene_poses(s, m, params[s.name], scene) for s, m in zip(r.cameras, models, strict=True)] for r in own
+        ]
+        return cls(scene, times, poses)
+
+    def values_at(self, frame: Frame) -> dict[Key, np.ndarray]:
+        """Poses of its bodies, as in a state, where it stands at `frame`."""
+        R, p = self.scene.bodies.poses(self.scene.values)
+        found: dict[Key, np.ndarray] = {}
+        for k, name in zip(self.scene.bodies.used, self.scene.bodies.names, strict=True):
+            found[name, "rotation"], found[name, "translation"] = frame.R @ R[k], frame.R @ p[k] + frame.p
+        return found
+
+
+@dataclass(frozen=True)
+class _Tied:
+    """Poses of camera `a` in one group, and of `b` in another, at the same instants."""
+
+    a: int
+    b: int
+    pairs: PosePairs
+
+
+def _tied(g: _Group, h: _Group) -> _Tied:
+    """By the two cameras that see most at once."""
+    cameras = permutations(range(len(g.poses[0])), 2)
+    return max((_Tied(a, b, _pairs(g, h, a, b)) for a, b in cameras), key=lambda t: len(t.pairs.p_body))
+
+
+def _pairs(g: _Group, h: _Group, a: int, b: int) -> PosePairs:
+    found = []
+    for times_g, poses_g, times_h, poses_h in zip(g.times, g.poses, h.times, h.poses, strict=True):
+        i, j = taken_at_once(times_g[a], times_h[b])
+        good = poses_g[a].ok[i] & poses_h[b].ok[j]
+        i, j = i[good], j[good]
+        found.append((poses_g[a].rotation[i], poses_g[a].position[i], poses_h[b].rotation[j], poses_h[b].position[j]))
+    return PosePairs(*(np.concatenate(x) for x in zip(*found, strict=True)))
+
+
+def _solved(tied: _Tied, cameras: Sequence[Camera]) -> Frame:
+    """Where the second group stands in the first. Raises EstimationError where the cameras do not move alike."""
+    a, b = cameras[tied.a], cameras[tied.b]
+    found = hand_eye(tied.pairs, _given(a, b, tied.a == 0, tied.b == 0), (False, False))
+    if (left := left_over(tied.pairs, found)) > LARGEST_LEFT:
+        raise EstimationError(
+            f"{a.name} and {b.name} see different bodies of the target and do not move alike: {left:.0%} of the motion "
+            "stays unexplained; check that the bodies stand still, and that one clock stamps both cameras."
+        )
+    return found.frame
+
+
+def _given(a: Camera, b: Camera, a_is_body: bool, b_is_body: bool) -> Mount | None:
+    """T_a_b where the rig file gives it."""
+    mounts = []
+    for camera, is_body in ((a, a_is_body), (b, b_is_body)):
+        R, p = camera.rotation.value, camera.translation.value
+        if is_body:
+            R, p = np.eye(3), np.zeros(3)
+        if R is None or p is None:
+            return None
+        mounts.append(Mount(R, p))
+    one, other = mounts
+    return Mount(one.R.T @ other.R, one.R.T @ (other.p - one.p))
