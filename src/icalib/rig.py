@@ -358,6 +358,11 @@ class Rig:
         return bool(self.poses) and not (self.cameras and self.has_target)
 
     @property
+    def cameras_alone(self) -> bool:
+        """Whether there are cameras and no other sensor."""
+        return self.imu is None and not (self.lidars or self.wheels or self.poses)
+
+    @property
     def assumes_motion(self) -> bool:
         """Whether an assumption stands in for the IMU."""
         return self.imu is not None and self.imu.assumed

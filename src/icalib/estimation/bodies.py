@@ -8,14 +8,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import permutations
 
 import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.estimation.board import SHAPE_LABELS, shape_basis
+from icalib.estimation.nodes import MERGED_WITHIN_S
 from icalib.estimation.state import Entry, Key, Layout
 from icalib.geometry.targets import Target
 from icalib.measurements import CornerStream, Measurements
+from icalib.rig import Rig
 
 FEWEST_TOGETHER = 3  # images with both of two bodies that tie them to each other
 MOST_NAMED = 8  # bodies in a sentence
@@ -100,11 +103,11 @@ class Bodies:
         return np.einsum("nij,nj->ni", R[body], points) + p[body]
 
 
-def choose_bodies(target: Target, recordings: Sequence[Measurements], bent: bool) -> Bodies:
+def choose_bodies(target: Target, recordings: Sequence[Measurements], bent: bool, rig: Rig | None = None) -> Bodies:
     """The bodies that images tie to each other, directly or through others, in whichever recording; the one with most
-    corners is the reference.
+    corners is the reference. Of a `rig` of cameras alone, images that different cameras take at once tie bodies, too.
 
-    Raises EstimationError where no corner was seen.
+    Raises EstimationError where no corner was seen, or a camera saw bodies only that nothing ties to the others.
     """
     streams = [c for m in recordings for c in m.cameras]
     n = len(target.bodies)
@@ -113,13 +116,53 @@ def choose_bodies(target: Target, recordings: Sequence[Measurements], bent: bool
     count = sum((np.bincount(target.body[s.point], minlength=n) for s in streams), np.zeros(n, dtype=np.int64))
     if not count.any():
         raise EstimationError("no camera saw the target; check the target in the rig file.")
-    reached = [int(np.argmax(count))]
-    if n > 1:
-        together = sum((_together(target.body, s, n) for s in streams), np.zeros((n, n), dtype=np.int64))
-        for k in reached:
-            reached += [int(j) for j in np.flatnonzero(together[k] >= FEWEST_TOGETHER) if j not in reached]
+    together = _in_images(target.body, recordings, n)
+    if rig is not None and rig.cameras_alone:
+        together += sum(_at_once(target.body, rig, m, n) for m in recordings)
+    reached = _tied_to(int(np.argmax(count)), together)
     lost = tuple(int(k) for k in np.flatnonzero(count) if k not in reached)
-    return Bodies(target, (reached[0], *sorted(reached[1:])), lost, bent)
+    _check_cameras(target, streams, reached, rig is not None and rig.imu is not None)
+    return Bodies(target, reached, lost, bent)
+
+
+def tied_by_images(bodies: Bodies, recordings: Sequence[Measurements]) -> list[tuple[int, ...]]:
+    """The bodies in use, in groups that images tie, directly or through others; the reference is the first."""
+    together = _in_images(bodies.target.body, recordings, len(bodies.target.bodies))
+    left, groups = list(bodies.used), []
+    while left:
+        groups.append(_tied_to(left[0], together))
+        left = [k for k in left if k not in groups[-1]]
+    return groups
+
+
+def _tied_to(first: int, together: np.ndarray) -> tuple[int, ...]:
+    """`first`, and then in order all bodies that are tied to it; together (n, n): how often two were seen together."""
+    reached = [first]
+    for k in reached:
+        reached += [int(j) for j in np.flatnonzero(together[k] >= FEWEST_TOGETHER) if j not in reached]
+    return (first, *sorted(reached[1:]))
+
+
+def _in_images(body: np.ndarray, recordings: Sequence[Measurements], n: int) -> np.ndarray:
+    """(n, n) number of images that show two bodies."""
+    return sum((_together(body, c, n) for m in recordings for c in m.cameras), np.zeros((n, n), dtype=np.int64))
+
+
+def _check_cameras(target: Target, streams: Sequence[CornerStream], used: Sequence[int], imu: bool) -> None:
+    """Raises EstimationError naming a camera that saw none of the bodies in use; imu: whether the rig has one."""
+    for name in dict.fromkeys(s.name for s in streams):
+        seen = np.unique(np.concatenate([target.body[s.point] for s in streams if s.name == name]))
+        if len(seen) and not np.isin(seen, used).any():
+            how = (
+                "calibrate the cameras without the IMU, whose images may tell by being taken at once"
+                if imu
+                else ("take images of all cameras at the same instants")
+            )
+            own, first = _listed([target.bodies[k] for k in seen]), target.bodies[used[0]]
+            raise EstimationError(
+                f"{name} sees {own} only, and fewer than {FEWEST_TOGETHER} images tell how it stands to {first}; show "
+                f"both in the same images, or {how}."
+            )
 
 
 def _together(body: np.ndarray, stream: CornerStream, n: int) -> np.ndarray:
@@ -129,6 +172,35 @@ def _together(body: np.ndarray, stream: CornerStream, n: int) -> np.ndarray:
     seen = np.zeros((len(stream.stamps_ns), n), dtype=np.float32)
     seen[image, which] = 1.0
     return np.rint(seen.T @ seen).astype(np.int64)
+
+
+def _at_once(body: np.ndarray, rig: Rig, recording: Measurements, n: int) -> np.ndarray:
+    """(n, n) number of instants at which one camera sees one body, and another camera another body."""
+    found, seen = np.zeros((n, n), dtype=np.int64), []
+    for stream in recording.cameras:
+        rows = np.zeros((len(stream.stamps_ns), n), dtype=np.int64)
+        rows[stream.image, body[stream.point]] = 1
+        seen.append(rows)
+    times = camera_times(rig, recording, recording.origin_ns)
+    for a, b in permutations(range(len(seen)), 2):
+        i, j = taken_at_once(times[a], times[b])
+        found += seen[a][i].T @ seen[b][j]
+    return found
+
+
+def camera_times(rig: Rig, recording: Measurements, origin_ns: int) -> list[np.ndarray]:
+    """(M,) s since `origin_ns` of the images of each camera, by the time offsets that the rig gives or none."""
+    given = [c.time_offset.value for c in rig.cameras]
+    offsets_ns = [0 if v is None else round(float(v[0]) * 1e9) for v in given]
+    pairs = zip(recording.cameras, offsets_ns, strict=True)
+    return [(s.stamps_ns - origin_ns + offset_ns) * 1e-9 for s, offset_ns in pairs]
+
+
+def taken_at_once(ta: np.ndarray, tb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of images at ta and tb [s], the indices of those that two cameras took at the same instant."""
+    j = np.clip(np.searchsorted(tb, ta - MERGED_WITHIN_S), 0, len(tb) - 1)
+    i = np.flatnonzero(np.abs(tb[j] - ta) <= MERGED_WITHIN_S)
+    return i, j[i]
 
 
 def restrict(bodies: Bodies, recording: Measurements) -> Measurements:

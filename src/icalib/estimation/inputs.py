@@ -81,7 +81,7 @@ class Inputs:
 
 def inputs_for(rig: Rig, recordings: Sequence[Measurements], whole: Inputs | None = None) -> Inputs:
     """Of one recording or several, joined; on the clock of `whole`, where these are some of its streams."""
-    bodies = choose_bodies(rig.target, recordings, rig.settings.board_shape)
+    bodies = choose_bodies(rig.target, recordings, rig.settings.board_shape, rig)
     shifts = None if whole is None else [part.shift_ns for part in whole.parts]
     joined, parts = join(rig, [on_common_images(rig, restrict(bodies, r)) for r in recordings], shifts)
     layout = layout_for(rig, bodies, len(parts))

@@ -37,7 +37,7 @@ def initial_guess(rig: Rig, measurements: Measurements, scene: Placed | None = N
     Raises EstimationError, one sentence, where the recording does not carry a guess.
     """
     if scene is None:
-        bodies = choose_bodies(rig.target, [measurements], bent=False)
+        bodies = choose_bodies(rig.target, [measurements], bent=False, rig=rig)
         measurements = restrict(bodies, measurements)
         scene = find_scene(rig, bodies, [measurements])
     params = [lens_of(c, s, rig.target, scene) for c, s in zip(rig.cameras, measurements.cameras, strict=True)]

@@ -16,8 +16,8 @@ import numpy as np
 
 from icalib.detection.sightings import Part, parts_of
 from icalib.errors import EstimationError
+from icalib.estimation.bodies import taken_at_once
 from icalib.estimation.imu_data import ImuData, imu_data
-from icalib.estimation.nodes import MERGED_WITHIN_S
 from icalib.first_guess.align_camera import align_camera
 from icalib.first_guess.clocks import camera_rates
 from icalib.first_guess.guess import relative_offset
@@ -208,10 +208,9 @@ def _mounts_beside(measured: Measurements, views: list[_Views], seen: list[int],
 def _together(a: _Views, offset_a: float, b: _Views, offset_b: float) -> np.ndarray:
     """(n, 2) images of two cameras that were taken at the same instant, spread over the recording, with poses."""
     ta, tb = a.images.seconds + offset_a, b.images.seconds + offset_b
-    at = np.clip(np.searchsorted(tb, ta - MERGED_WITHIN_S), 0, len(tb) - 1)
-    i = np.flatnonzero((np.abs(tb[at] - ta) <= MERGED_WITHIN_S) & a.poses.ok & b.poses.ok[at])
-    i = i[np.linspace(0, len(i) - 1, MOST_PAIRS).astype(int)] if len(i) > MOST_PAIRS else i
-    return np.stack([i, at[i]], axis=1)
+    pairs = np.column_stack(taken_at_once(ta, tb))
+    pairs = pairs[a.poses.ok[pairs[:, 0]] & b.poses.ok[pairs[:, 1]]]
+    return pairs[np.linspace(0, len(pairs) - 1, MOST_PAIRS).astype(int)] if len(pairs) > MOST_PAIRS else pairs
 
 
 def _common_rotation(a: TargetPoses, b: TargetPoses, together: np.ndarray, turns: _Turns) -> np.ndarray:

@@ -29,6 +29,7 @@ NORM_MEDIAN = 1.538  # of three standard normal components
 BEND = 3.0  # Cauchy's loss, in standard deviations
 STANDS_OUT = 6.0  # standard deviations, of a pair that is rejected
 MOST_REJECTED = 0.3  # of all pairs
+LARGEST_LEFT = 0.35  # of the motion between instants: poses of which so much is left do not belong together
 LEAST_TURN, LEAST_WAY = 0.02, 0.01  # rad, m: between instants; residuals are compared with no less
 
 

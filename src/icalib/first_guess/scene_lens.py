@@ -9,10 +9,11 @@ from dataclasses import replace
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.bodies import Bodies, choose_bodies, restrict
+from icalib.estimation.bodies import Bodies, choose_bodies, restrict, tied_by_images
 from icalib.first_guess.intrinsics import camera_params
 from icalib.first_guess.scene import Placed
 from icalib.first_guess.scene_bundle import Lens
+from icalib.first_guess.scene_groups import place_groups
 from icalib.first_guess.scene_growth import grow, place_bodies
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.cameras.base import CameraModel
@@ -42,6 +43,8 @@ def find_scene(rig: Rig, bodies: Bodies, recordings: Sequence[Measurements]) -> 
         return Placed(bodies)
     streams = [join_corners([(r.cameras[i], 0) for r in recordings]) for i in range(len(rig.cameras))]
     params = {c.name: scene_params(rig.target, c, s) for c, s in zip(rig.cameras, streams, strict=True)}
+    if rig.cameras_alone and len(tied_by_images(bodies, recordings)) > 1:
+        return place_groups(rig, bodies, recordings, params)
     return place_bodies(bodies, streams, [camera_model(c.model) for c in rig.cameras], params)
 
 

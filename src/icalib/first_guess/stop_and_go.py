@@ -18,7 +18,7 @@ from icalib.estimation.inputs import Inputs, inputs_for
 from icalib.estimation.pose_factor import FRAME, frame_of
 from icalib.estimation.pose_rows import Mount
 from icalib.estimation.state import Key, State
-from icalib.first_guess.hand_eye import HandEye, PosePairs, hand_eye, left_over, outliers, turns_of
+from icalib.first_guess.hand_eye import LARGEST_LEFT, HandEye, PosePairs, hand_eye, left_over, outliers, turns_of
 from icalib.first_guess.lidar_rounds import NAMES, given
 from icalib.first_guess.pose_pairs import partners
 from icalib.first_guess.pose_ways import placed
@@ -30,7 +30,6 @@ from icalib.recordings.stops import stands_still_between
 from icalib.rig import PoseSensor, Rig, fixed
 
 FEWEST_PAIRS = 3  # of one recording
-LARGEST_LEFT = 0.35  # of the motion between instants: poses of which so much is left do not belong together
 NO_TURN_DEG = 1e-3  # between poses, which has no noise even: of a sensor without rotations
 HOW = (
     "give both the same stamps where they belong together, stand still for half a second around each, or record while "

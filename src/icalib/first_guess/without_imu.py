@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.nodes import MERGED_WITHIN_S
+from icalib.estimation.bodies import taken_at_once
 from icalib.estimation.state import Key
 from icalib.first_guess.guess import CameraGuess, Guess, relative_offset
 from icalib.first_guess.target_poses import TargetPoses
@@ -70,13 +70,11 @@ def _places(rig: Rig, times: list[np.ndarray], poses: list[TargetPoses]) -> list
 
 def _beside(ta: np.ndarray, a: TargetPoses, tb: np.ndarray, b: TargetPoses) -> list[Pose]:
     """T_a_b of each pair of images taken together."""
-    at = np.clip(np.searchsorted(tb, ta - MERGED_WITHIN_S), 0, len(tb) - 1)
-    together = np.flatnonzero((np.abs(tb[at] - ta) <= MERGED_WITHIN_S) & a.ok & b.ok[at])
+    together = np.column_stack(taken_at_once(ta, tb))
+    together = together[a.ok[together[:, 0]] & b.ok[together[:, 1]]]
     if len(together) > MOST_PAIRS:
         together = together[np.linspace(0, len(together) - 1, MOST_PAIRS).astype(int)]
-    return [
-        (a.rotation[i].T @ b.rotation[at[i]], a.rotation[i].T @ (b.position[at[i]] - a.position[i])) for i in together
-    ]
+    return [(a.rotation[i].T @ b.rotation[j], a.rotation[i].T @ (b.position[j] - a.position[i])) for i, j in together]
 
 
 def _middle(poses: list[Pose]) -> Pose:
