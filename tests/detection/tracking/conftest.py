@@ -26,7 +26,7 @@ class Turning:
         return p[:, :2] / p[:, 2:]
 
 
-def turning(texture: np.ndarray, beside: np.ndarray = np.eye(3), seed: int = 5) -> Turning:
+def turning(texture: np.ndarray, beside: np.ndarray | None = None, seed: int = 5) -> Turning:
     """Turns of up to 1.5 deg an image about all axes, seen through the texture of a far wall; the second of two cameras
     sees at `beside` (3, 3) times its pixel what the first sees there."""
     rng = np.random.default_rng(seed)
@@ -38,7 +38,8 @@ def turning(texture: np.ndarray, beside: np.ndarray = np.eye(3), seed: int = 5) 
         # Exponential of a small turn by its series: an obvious formula, and not the program's.
         W = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
         R = sum((np.linalg.matrix_power(W, n) / float(np.prod(np.arange(1, n + 1))) for n in range(1, 10)), np.eye(3))
-        H = beside @ _K @ R @ np.linalg.inv(_K)
+        H = _K @ R @ np.linalg.inv(_K)
+        H = H if beside is None else beside @ H
         at = np.linalg.inv(H) @ pixels
         grey = map_coordinates(texture, [at[1] / at[2] + 200.0, at[0] / at[2] + 200.0], order=3, mode="nearest")
         images.append(np.clip(np.rint(grey + rng.normal(size=grey.shape)), 0, 255).reshape(v.shape).astype(np.uint8))
