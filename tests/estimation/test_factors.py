@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from scipy.linalg import block_diag
+from scipy import sparse
+from scipy.sparse.linalg import LinearOperator
 
 import icalib.estimation
 from icalib.estimation.arrowhead import Piece, make_pieces
@@ -40,7 +41,7 @@ from icalib.rig import Ground
 @dataclass(frozen=True)
 class Sample:
     """factor: its name in the source. accumulate(state, piece, sums) -> cost; residual(state) -> r (n,);
-    weights(state) -> y (n,), W (n, n); potential(state): what the cost has beside the residuals."""
+    weights(state) -> y (n,), W (n, n) or an operator; potential(state): what the cost has beside the residuals."""
 
     factor: str
     setup: object
@@ -227,14 +228,11 @@ def feature_sample(
         sigma = np.concatenate([s[u] for s, u in zip(factor.sigmas, used, strict=True)])
         size = np.linalg.norm(e, axis=1)
         bend = slope_along(loss if curved else "none", size / sigma)
-        W = np.zeros((len(e), 2, len(e), 2))
         along = np.einsum("ni,nj->nij", e, e) / (size**2)[:, None, None]
         blocks = (root**2)[:, None, None] * (np.eye(2) + (bend - 1.0)[:, None, None] * along)
-        W[np.arange(len(e)), :, np.arange(len(e))] = blocks
-        W = W.reshape(2 * len(e), 2 * len(e))
         bent = slope_along(loss if curved else "none", np.abs(d) / factor.on.sigma[on])
-        W = block_diag(W, np.diag(at_optimum.off.root[on] ** 2 * bent))
-        F, h = np.zeros((len(W), 3 * factor.tracks.count)), 1e-5
+        W = sparse.block_diag([*blocks, sparse.diags(at_optimum.off.root[on] ** 2 * bent)], format="csr")
+        F, h = sparse.lil_array((W.shape[0], 3 * factor.tracks.count)), 1e-5
         for k in range(3):
             step = h * np.eye(3)[k]
             slope = (errors(at, world + step) - errors(at, world - step)) / (2 * h)
@@ -242,8 +240,14 @@ def feature_sample(
                 F[2 * np.arange(len(e)) + r, 3 * track + k] = slope[:, r]
         for k in range(len(on)):
             F[2 * len(e) + k, 3 * on[k] : 3 * on[k] + 3] = planes(at)[0][k]
+        WF = (W @ F.tocsr()).tocsr()
+        known = (F.T @ WF).toarray()
         y = np.concatenate([(root[:, None] ** 2 * e).ravel(), at_optimum.off.root[on] ** 2 * d])
-        return y, W - W @ F @ np.linalg.solve(F.T @ W @ F, F.T @ W)
+
+        def times(J):
+            return W @ J - WF @ np.linalg.solve(known, WF.T @ J)
+
+        return y, LinearOperator(W.shape, matvec=times, matmat=times, dtype=float)
 
     def accumulate(at, piece, sums):
         if sums:
@@ -720,7 +724,7 @@ def test_sums_are_those_of_numeric_derivatives(sample, dense):
         J[:, n] = (sample.residual(up) - sample.residual(down)) / (2 * h)
         slope[n] = (sample.potential(up) - sample.potential(down)) / (2 * h)
     H, g = H * np.outer(scale, scale), g * scale
-    numeric_H, numeric_g = J.T @ W @ J, J.T @ y + slope
+    numeric_H, numeric_g = J.T @ (W @ J), J.T @ y + slope
     size = np.sqrt(np.maximum(np.diag(numeric_H), 1e-9 * np.diag(numeric_H).max()))
     assert np.abs(numeric_g).max() > 0
     np.testing.assert_allclose(H / np.outer(size, size), numeric_H / np.outer(size, size), rtol=0, atol=2e-6)
