@@ -14,7 +14,8 @@ import numpy as np
 
 from icalib.compiled import njit
 
-DRAWS = 60  # with 30 % of outliers, chance misses every clean sample once in 35 pairs of images; with 20 %, never
+DRAWS = 60  # at most; with 30 % of outliers, chance misses every clean sample once in 35 pairs of images
+FEWEST_DRAWS, MISSED = 12, 0.01  # drawing ends where chance has missed every clean sample with that probability
 QUANTILE, SIGMAS = 0.65, 0.9346  # up to 35 % of the points may move; where that quantile of normal errors lies
 REFITS, FITS_TIMES = 2, 3.0  # with all points whose errors are within so many quantiles
 FEWEST = 16  # points; of fewer a quantile says little
@@ -39,21 +40,34 @@ def _least_quantile(p, q, bend, draws, least):
     for i in range(n):
         f[i, 0], f[i, 1], f[i, 2] = p[i, 0], p[i, 1], 1.0 + bend * (p[i, 0] ** 2 + p[i, 1] ** 2)
         h[i, 0], h[i, 1], h[i, 2] = q[i, 0], q[i, 1], 1.0 + bend * (q[i, 0] ** 2 + q[i, 1] ** 2)
-    best = np.inf
-    for k in range(len(draws) + REFITS):
-        if k < len(draws):
+    best, k, last = np.inf, 0, len(draws)
+    while k < last + REFITS:
+        if k < last:
             used[:] = False
             for i in draws[k]:
                 used[i] = True
         else:
             for i in range(n):
                 used[i] = least[i] <= FITS_TIMES * best
+        k += 1
         _errors(f, h, bend, _fundamental(f, h, used), error)
         quantile = np.partition(error, int(QUANTILE * n))[int(QUANTILE * n)]
         if quantile < best:
             best = quantile
             least[:] = error
+            if k < last:
+                last = max(min(last, _draws_needed(least, best)), k)
     return best
+
+
+@njit(cache=True, nogil=True)
+def _draws_needed(error, quantile):
+    """How many draws miss every sample of eight points that fit with probability MISSED."""
+    fits = 0
+    for e in error:
+        fits += e <= FITS_TIMES * quantile
+    clean = (fits / len(error)) ** 8
+    return FEWEST_DRAWS if clean > 0.99 else max(FEWEST_DRAWS, int(np.log(MISSED) / np.log(1.0 - clean)) + 1)
 
 
 @njit(cache=True, nogil=True)
