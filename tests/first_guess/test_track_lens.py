@@ -123,6 +123,20 @@ def test_calibration_from_nothing(lens: str, seed: int):
         assert (np.abs(error(g.name, g.value, true)) < 3.5 * np.ravel(g.std)).all(), g.name
 
 
+@pytest.mark.parametrize("mode", ["free", "fixed"])
+def test_a_guess_of_half_the_focal_length_is_replaced_and_a_fixed_value_is_named(mode):
+    simulation = drive(noise_px=0.3, duration_s=12.0)
+    true = simulation.truth.intrinsics["cam0"]
+    half = Parameter(mode, true * [0.5, 0.5, 1.0, 1.0])
+    rig = rig_for(simulation.scenario, intrinsics=half, distortion="free")
+    if mode == "fixed":
+        with pytest.raises(EstimationError, match="fixed value of intrinsics fx of cam0"):
+            calibrate_measurements(rig, simulation.measurements)
+        return
+    found = calibrate_measurements(rig, simulation.measurements).group("cam0", "intrinsics")
+    assert (np.abs(found.value - true) < 3.5 * found.std).all()
+
+
 def test_slopes_by_the_lens_are_those_of_the_epipolar_errors():
     """H step = g is the Gauss-Newton step: the turn and the bend that were put in are found, the smaller the better."""
     rng = np.random.default_rng(0)

@@ -135,14 +135,14 @@ def _made(
 def _from_nothing(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt | None:
     """The estimate without guesses, or with those that it does not contradict where it needs them; None where there are
     none, or it fails as well."""
-    bare = with_groups(rig, lambda sensor, name, p: _without(rig, name, p) if p.mode == "free" else p)
-    if not _has(rig, "free") or (found := _converged(bare, make)) is None:
+    found = _first_converged(rig, make, lambda p: p.mode == "free") if _has(rig, "free") else None
+    if found is None:
         return None
     values = found.found.estimate.outcome.state.values
 
     def agreeing(sensor: AnySensor, name: str, p: Parameter) -> Parameter:
         if p.mode != "free" or p.value is None or name == "time_offset":
-            return _without(rig, name, p) if p.mode == "free" else p
+            return Parameter() if p.mode == "free" else p
         return Parameter() if is_contradicted(name, p.value, values.get((sensor.name, name), p.value)) else p
 
     kept = with_groups(rig, agreeing)
@@ -151,9 +151,20 @@ def _from_nothing(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt | None:
     return replace(found, inputs=replace(found.inputs, asked=rig))
 
 
-def _without(rig: Rig, name: str, p: Parameter) -> Parameter:
-    """Free, from nothing, but a lens that nothing but a target shows."""
-    return Parameter("free", p.value) if name in LENS and not rig.has_target else Parameter()
+def _first_converged(rig: Rig, make: Callable[[Rig], Attempt], dropped: Callable[[Parameter], bool]) -> Attempt | None:
+    """The estimate without the values that are `dropped`; of cameras that follow points, where it fails, with those of
+    lenses as mere guesses: not every motion shows a lens from nothing."""
+
+    def bare(lens: bool) -> Rig:
+        return with_groups(
+            rig,
+            lambda sensor, name, p: (
+                p if not dropped(p) else Parameter("free", p.value if lens and name in LENS else None)
+            ),
+        )
+
+    found = _converged(bare(False), make)
+    return found if found is not None or rig.has_target else _converged(bare(True), make)
 
 
 def _against(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt | None:
@@ -161,7 +172,7 @@ def _against(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt | None:
     or contradicts nothing."""
     if not (_has(rig, "fixed") or _has(rig, "prior")):
         return None
-    found = _converged(with_groups(rig, lambda sensor, name, p: _without(rig, name, p)), make)
+    found = _first_converged(rig, make, lambda p: True)
     if found is None:
         return None
     against = contradicted_by(replace(found.inputs, asked=rig), found.found)
