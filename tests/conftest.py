@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 import importlib
 import os
 import re
@@ -18,17 +19,34 @@ import pytest
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 WHOLE_RUNS = ("acceptance", "consistency")  # folders of tests that calibrate from measurements to the result
+IMAGES = "detection"  # folder of tests that find targets, by kernels of their own
 
 
 @pytest.hookimpl(tryfirst=True)  # before `-m` selects by marker
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Marks whole runs and studies as slow. Files with slow tests come first: workers take file after file, and a long
-    one at the end would leave the others idle."""
+    """Marks whole runs and studies as slow, and brings files in the order in which workers are to take them."""
     for item in items:
         if item.path.parent.name in WHOLE_RUNS or item.get_closest_marker("statistical"):
             item.add_marker(pytest.mark.slow)
     slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: item.path not in slow)
+    place = {path: k for k, path in enumerate(_in_order(list(dict.fromkeys(item.path for item in items)), slow))}
+    items.sort(key=lambda item: place[item.path])
+
+
+def _in_order(files: list[Path], slow: set[Path]) -> list[Path]:
+    """Files with slow tests come first: a long one at the end would leave other workers idle. Of two workers, which are
+    handed files in turns, one begins with calibrations, the other with images: else both compile the same kernels."""
+    files = sorted(files, key=lambda path: path not in slow)
+    images = [path for path in files if path in slow and path.parent.name == IMAGES]
+    others = [path for path in files if path not in images]
+    begin = [path for pair in zip(others, images, strict=False) for path in pair]
+    return begin + [path for path in files if path not in begin]
+
+
+def pytest_collection_finish() -> None:
+    """What was collected stays to the end: the garbage collector need not look through it again and again."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -15,6 +15,8 @@ import yaml
 
 from icalib import cli
 
+pytestmark = pytest.mark.slow
+
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
 

@@ -7,6 +7,8 @@ import pytest
 
 from icalib.detection import AprilGridDetector, CharucoDetector, CheckerboardDetector, MarkerDetector
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("cv2")
 
 # distance [m], tilt, turn, roll [deg], offset [px]

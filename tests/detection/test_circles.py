@@ -22,6 +22,8 @@ from icalib.rig_file import load_rig, load_target
 from icalib.simulation import Imaging, Renderer, Sheet
 from icalib.simulation.scenario import SimCamera
 
+pytestmark = pytest.mark.slow
+
 SYMMETRIC, ASYMMETRIC = Circles(7, 8, 0.04, 0.024), Circles(11, 4, 0.03, 0.026, asymmetric=True)
 PINHOLE = SimCamera(
     "cam0", "pinhole-radtan", (752, 480), (460.0, 459.0, 375.0, 240.0), (-0.28, 0.07, 2e-4, 2e-5), np.eye(4)

@@ -16,6 +16,8 @@ from icalib.estimation.outcome import Draws, Outcome, posterior
 from icalib.estimation.solver import minimise
 from icalib.simulation import handheld, simulate
 
+pytestmark = pytest.mark.slow
+
 DRAWS = 40
 
 

@@ -15,6 +15,8 @@ from icalib.estimation.state import make_layout
 from icalib.geometry import so3
 from icalib.simulation import simulate
 
+pytestmark = pytest.mark.slow
+
 PARTS = {"rotation": slice(0, 3), "translation": slice(3, 6), "time_offset": slice(6, 7)}
 BEAM = LidarNoise(1e-3, 0.03)  # as simulated, and a little of what the model lacks where beams graze a plane
 

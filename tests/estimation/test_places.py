@@ -23,6 +23,8 @@ from icalib.pipeline import calibrate_measurements
 from icalib.rig import Rig
 from icalib.simulation import Scenario, load_scenario, rig_for, simulate, with_drawn_guess
 
+pytestmark = pytest.mark.slow
+
 LITTLE_PX = 1e-3
 EXAMPLE = Path(__file__).parents[2] / "examples" / "paper" / "table2-3d.yaml"
 

@@ -13,6 +13,8 @@ from icalib.geometry import so3
 from icalib.pipeline import calibrate_measurements
 from icalib.simulation import handheld, rig_for, simulate
 
+pytestmark = pytest.mark.slow
+
 EXACT = 1e-8  # rad, m, s; relative for intrinsics
 
 

@@ -15,6 +15,8 @@ from icalib.measurements import CornerStream, Measurements
 from icalib.rig import Rig
 from icalib.simulation import Motion, Simulation, handheld, rig_for, simulate
 
+pytestmark = pytest.mark.slow
+
 BOARDS = {
     "halves": Checkerboard(6, 8, 0.08),
     "quarters": Checkerboard(6, 6, 0.09),

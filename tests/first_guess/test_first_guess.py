@@ -16,6 +16,8 @@ from icalib.measurements import CornerStream, ImuStream, Measurements
 from icalib.rig import Parameter, Rig
 from icalib.simulation import Motion, Simulation, handheld, rig_for, simulate
 
+pytestmark = pytest.mark.slow
+
 
 def angle_deg(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.rad2deg(np.arccos(np.clip((np.trace(a.T @ b) - 1.0) / 2.0, -1.0, 1.0))))

@@ -15,6 +15,8 @@ from icalib.recordings.imu_units import in_si
 from icalib.rig import Axes, ImuSensor, Rig
 from icalib.simulation import handheld, rig_for, simulate
 
+pytestmark = pytest.mark.slow
+
 XYZ: Axes = ("x", "y", "z")
 
 

@@ -12,6 +12,8 @@ from icalib.errors import EstimationError
 from icalib.first_guess.lidar import Held, lidar_and_motion, lidar_on_motion
 from icalib.geometry import so3
 
+pytestmark = pytest.mark.slow
+
 NODE_S = 0.05
 
 

@@ -22,6 +22,8 @@ from icalib.first_guess.lidar import LidarGuess, lidar_and_motion, lidar_on_moti
 from icalib.first_guess.lidar_planes import ROUNDS, associate, round_search
 from icalib.first_guess.lidar_rounds import check_shares
 
+pytestmark = pytest.mark.slow
+
 NOISE = LidarNoise(0.03, loss="huber")
 FREE = (("rotation", "rotation", 3), ("translation", "vector", 3), ("time_offset", "vector", 1))
 

@@ -15,6 +15,8 @@ from icalib.measurements import LidarStream, Measurements
 from icalib.pipeline import calibrate_measurements
 from icalib.simulation import rig_for
 
+pytestmark = pytest.mark.slow
+
 
 def empty(n: int) -> LidarStream:
     return LidarStream(

@@ -11,6 +11,8 @@ from icalib.first_guess import own_robot
 from icalib.first_guess.own_robot import _Near, own_points, without_own_robot
 from icalib.measurements import LidarStream, Measurements
 
+pytestmark = pytest.mark.slow
+
 NOISE_M = 0.03
 
 

@@ -15,6 +15,8 @@ from icalib.first_guess.poses import pose_values, state_from_poses
 from icalib.measurements import PoseStream
 from icalib.simulation import Drive, Room, Scenario, SimPoses, rig_for, simulate
 
+pytestmark = pytest.mark.slow
+
 
 def inverted(x: PoseStream) -> PoseStream:
     T = np.tile(np.eye(4), (len(x.stamps_ns), 1, 1))

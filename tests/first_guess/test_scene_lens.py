@@ -19,6 +19,8 @@ from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter
 from icalib.simulation import load_scenario, rig_for, simulate, tag_map
 
+pytestmark = pytest.mark.slow
+
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
 EDGE_M, PER_WALL = 0.25, 12
 RADTAN = camera_model("pinhole-radtan")

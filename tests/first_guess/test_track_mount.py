@@ -21,6 +21,8 @@ from icalib.geometry.cameras import camera_model
 from icalib.rig import Parameter
 from icalib.simulation import Drive, load_scenario, rig_for, simulate, with_drawn_guess
 
+pytestmark = pytest.mark.slow
+
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
 STIFF = np.zeros((0, 1, 3)), np.zeros((0, 1, 3)), np.zeros(0)  # a lens that nothing bends
 

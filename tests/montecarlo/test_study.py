@@ -22,6 +22,8 @@ from icalib.montecarlo.store import Identity, Store
 from icalib.montecarlo.workers import run_all
 from icalib.simulation import Scenario, handheld
 
+pytestmark = pytest.mark.slow
+
 RUNS = 3
 _SCRIPT = """
 import sys

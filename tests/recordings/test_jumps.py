@@ -27,6 +27,8 @@ from icalib.recordings.jumps import ClockJumps, longest_part
 from icalib.recordings.sections import section
 from icalib.simulation import handheld, rig_for, simulate
 
+pytestmark = pytest.mark.slow
+
 YEARS = 1_700_000_000_000_000_000
 STEP = 5_000_000
 

@@ -12,6 +12,8 @@ from icalib.estimation.solver import minimise
 from icalib.estimation.wheel_factor import IncrementFactor, RelativePoseFactor, WheelNoise
 from icalib.geometry import so3
 
+pytestmark = pytest.mark.slow
+
 NOISE = WheelNoise(0.01, 5e-3, 5e-3)
 POSE_SIGMA = 2e-3, 3e-3  # rad, m
 PITCH, YAW, X, Y, Z = 1, 2, 3, 4, 5  # of the errors
