@@ -110,9 +110,15 @@ def test_tracks_of_another_drive_do_not_match():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("lens", "seed"), [("radtan", 1), ("radtan", 2), ("fisheye", 3), ("double sphere", 4)])
-def test_calibration_from_nothing(lens: str, seed: int):
-    simulation = drive(lens, noise_px=0.3, duration_s=12.0, seed=seed)
+@pytest.mark.parametrize(("lens", "seed", "longest_s"), [
+    ("radtan", 1, 5.0), ("radtan", 2, 0.25), ("fisheye", 3, 0.5), ("double sphere", 4, 5.0),
+])  # fmt: skip
+def test_calibration_from_nothing(lens: str, seed: int, longest_s: float):
+    """Also where points are lost after five or ten images."""
+    features = load_scenario(PAPER / "table2-3d.yaml").features
+    assert features is not None
+    features = replace(features, longest_track_s=longest_s, lasting=0)
+    simulation = drive(lens, noise_px=0.3, duration_s=12.0, seed=seed, features=features)
     rig = replace(rig_for(simulation.scenario, intrinsics="free", distortion="free"), target=NoTarget())
     result = calibrate_measurements(rig, simulation.measurements)
     assert result.converged

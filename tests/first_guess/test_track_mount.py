@@ -142,13 +142,25 @@ def test_a_camera_whose_image_stands_still_does_not_fit():
         placed(replace(simulation, measurements=frozen), state, true_rig(simulation))
 
 
-def test_points_that_are_soon_lost_show_too_little():
-    simulation, state = drive()
+def lost_after(simulation, seconds):
+    """Each point is another one then."""
     stream, measured = simulation.measurements.tracks[0], simulation.measurements
-    lost = stream.feature * 100 + (stream.seconds / 0.45).astype(np.int64)[stream.image]  # each is another one then
-    short = replace(measured, tracks=(replace(stream, feature=lost),))
+    lost = stream.feature * 1000 + (stream.seconds / seconds).astype(np.int64)[stream.image]
+    return replace(simulation, measurements=replace(measured, tracks=(replace(stream, feature=lost),)))
+
+
+def test_points_that_are_soon_lost_show_the_camera_over_shorter_steps():
+    simulation, state = drive()
+    turn, arm, offset = errors(simulation, placed(lost_after(simulation, 0.45), state, true_rig(simulation)), "cam0")
+    assert np.abs(turn).max() < 0.02
+    assert np.abs(arm[:2]).max() < 3e-3
+    assert abs(offset) < 2e-4
+
+
+def test_points_that_are_lost_after_an_image_show_nothing():
+    simulation, state = drive()
     with pytest.raises(EstimationError, match="cam0: only .* pairs of images 0.5 s or more apart share enough points"):
-        placed(replace(simulation, measurements=short), state, true_rig(simulation))
+        placed(lost_after(simulation, 0.05), state, true_rig(simulation))
 
 
 def test_points_followed_at_random_do_not_fit_a_lens_without_bounds():

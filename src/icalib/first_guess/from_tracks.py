@@ -24,7 +24,7 @@ from icalib.geometry.cameras import camera_model
 from icalib.measurements import Measurements, TrackStream
 from icalib.rig import Camera, Rig
 
-APART_S = 0.15
+APART_S, FEWEST_SEEN = 0.15, 3
 LEAST_FELT = 0.7  # of gravity; half the time a rig is not thrown about
 
 
@@ -91,19 +91,27 @@ def lens_start(camera: Camera, stream: TrackStream, imu: ImuData, measurements: 
 
 
 def _rays(rig: Rig, measurements: Measurements, imu: ImuData, params: list[np.ndarray], offsets: list[float]) -> Rays:
-    """What was seen while the IMU was running, in images APART_S or more apart: those between say little more."""
+    """What was seen while the IMU was running, in images some way apart: those between say little more."""
     parts = []
     for k, (camera, stream) in enumerate(zip(rig.cameras, measurements.tracks, strict=True)):
         direction, valid = camera_model(camera.model).unproject(params[k], stream.uv)
         t = (stream.seconds + offsets[k])[stream.image]
-        own = valid & (t >= imu.seconds[0]) & (t <= imu.seconds[-1]) & _apart(stream.seconds)[stream.image]
+        own = valid & (t >= imu.seconds[0]) & (t <= imu.seconds[-1]) & _apart(stream)[stream.image]
         parts.append((t[own], np.full(int(own.sum()), k), stream.feature[own], direction[own]))
     return Rays(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def _apart(seconds: np.ndarray) -> np.ndarray:
-    """(n,) whether images at `seconds` are used: the first of each stretch of APART_S that has any."""
-    return np.diff(np.floor((seconds - seconds[0]) / APART_S + 1e-6), prepend=-1.0) > 0.0
+def _apart(stream: TrackStream) -> np.ndarray:
+    """(n,) whether images are used: the first of each stretch of APART_S that has any, or of less where most points
+    are seen too shortly for FEWEST_SEEN of these."""
+    t = stream.seconds
+    numbers, track = np.unique(stream.feature, return_inverse=True)
+    first, last = np.full(len(numbers), np.inf), np.full(len(numbers), -np.inf)
+    np.minimum.at(first, track, t[stream.image])
+    np.maximum.at(last, track, t[stream.image])
+    lasted = float(np.median((last - first)[track]))  # by observation, of which short tracks have few
+    apart = min(APART_S, lasted / FEWEST_SEEN)
+    return np.diff(np.floor((t - t[0]) / max(apart, 1e-3) + 1e-6), prepend=-1.0) > 0.0
 
 
 def _poses(motion: Motion, times: np.ndarray, R_imu_cam: np.ndarray, p_imu_cam: np.ndarray) -> TargetPoses:

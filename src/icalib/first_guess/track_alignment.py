@@ -57,6 +57,8 @@ def align_together(
         offset = np.array([start[p.camera].offset for p in pairs])
         t1, t2 = np.array([p.t1 for p in pairs]) + offset, np.array([p.t2 for p in pairs]) + offset
         own, D, swept, turned = gyro_turns(gyro, t1, t2)
+        if not len(own):
+            return start
         N, r = _normal([pairs[i] for i in own], start, D, swept, turned)
         x = _solve(N, r, held, _open(start, so3.log_many(D)))
         bias = bias + x[n:]

@@ -25,7 +25,7 @@ from icalib.first_guess.clock_shifts import CameraRates
 from icalib.first_guess.clocks import Alignment, covered, kabsch, no_overlap
 from icalib.first_guess.gyro import GyroRotation
 from icalib.first_guess.mean_rates import MeanRates
-from icalib.first_guess.rate_shifts import best_regressions
+from icalib.first_guess.rate_shifts import best_regressions, telling_rates
 from icalib.first_guess.track_alignment import gyro_turns
 from icalib.first_guess.track_mount import Followed, lens_slopes
 from icalib.first_guess.track_rotation import track_rates, turns_information
@@ -37,7 +37,7 @@ from icalib.measurements import TrackStream
 from icalib.rig import Camera
 
 ANY_LENS = "pinhole-equidistant"  # its start, r = f theta, is near every lens, wide and narrow
-STARTS = (0.35, 1.0)  # of the image width: near a fisheye lens, and a usual one
+STARTS = (1.0, 0.35)  # of the image width: near a usual lens, and a fisheye one
 SCALES = np.geomspace(0.1, 10.0, 100)  # 5 % apart
 SCALED_ROUNDS, SCALED_ENOUGH = 4, 0.05
 BENDS_FROM = 3.0  # medians, of what rates differ by, from where on they count less
@@ -98,7 +98,9 @@ def _rough(
     stream: TrackStream, imu: ImuData, model: CameraModel, starts: list[np.ndarray], offset: float | None
 ) -> _Fit:
     """The focal length by the regression of rates. Raises EstimationError where they do not match."""
-    rates, best = [track_rates(stream, model, lens, thinned=True) for lens in starts], -1
+    rates, best = [telling_rates(imu, stream, model, starts[0])], 0
+    step = float(np.median(rates[0].end - rates[0].start))
+    rates += [track_rates(stream, model, lens, step, thinned=True) for lens in starts[1:]]
     if offset is None:
         shifts = [(x, k) for k, r in enumerate(rates) for x in best_regressions(imu, r)[:1]]
         if not shifts:
@@ -111,7 +113,8 @@ def _rough(
         lens = np.concatenate([lens[:2] / scale, lens[2:]])
         if abs(np.log(scale)) < SCALED_ENOUGH:
             break
-        aligned, scale, unexplained = _scaled(imu, track_rates(stream, model, lens, thinned=True), offset, stream.name)
+        own = track_rates(stream, model, lens, step, thinned=True)
+        aligned, scale, unexplained = _scaled(imu, own, offset, stream.name)
     if unexplained > LARGEST_UNEXPLAINED:
         raise EstimationError(
             f"the motion of {stream.name} does not match that of {imu.name} at any shift of their clocks, whatever its "

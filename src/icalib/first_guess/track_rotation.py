@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numba import njit
@@ -16,6 +16,7 @@ from icalib.measurements import TrackStream
 
 FEWEST_COMMON = 12  # points in two images
 FEWEST_RATES = 20
+SOME_PAIRS = 30  # that tell how long points are followed
 LEAST_CORRELATION = 0.5  # with the IMU's rates; these here are noisy
 ROUNDS = 10
 DIRECTION_ROUNDS = 4
@@ -231,16 +232,28 @@ def image_pairs(stream: TrackStream, step: float) -> list[tuple[int, int]]:
 
 
 def pairs_sharing(
-    stream: TrackStream, valid: np.ndarray, steps: Iterable[float], most: int
+    stream: TrackStream, valid: np.ndarray, steps: Sequence[float], most: int
 ) -> Iterator[tuple[int, int, np.ndarray, np.ndarray]]:
     """About `most` pairs of images for each of the `steps` between them that share points enough, and their rows, as
-    `common` has them."""
-    for step in steps:
+    `common` has them. Where points are lost before the first of the steps, all are halved until they are not."""
+    for step in _shortened(stream, valid, steps):
         every = image_pairs(stream, step)
         for i, j in every[:: max(1, len(every) // most)]:
             p, q = common(stream, valid, i, j)
             if len(p) >= FEWEST_COMMON:
                 yield i, j, p, q
+
+
+def _shortened(stream: TrackStream, valid: np.ndarray, steps: Sequence[float]) -> Sequence[float]:
+    """The steps, or a half, a quarter or an eighth of them: the longest of which half of the pairs share points enough
+    at the first."""
+    for shorter in (1.0, 0.5, 0.25, 0.125):
+        every = image_pairs(stream, shorter * steps[0])
+        some = every[:: max(1, len(every) // SOME_PAIRS)]
+        enough = sum(len(common(stream, valid, i, j)[0]) >= FEWEST_COMMON for i, j in some)
+        if 2 * enough > len(some):
+            return [shorter * step for step in steps]
+    return steps
 
 
 def common(stream: TrackStream, valid: np.ndarray, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
