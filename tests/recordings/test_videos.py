@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from icalib.detection.streams import find_corners
 from icalib.errors import RecordingError
+from icalib.geometry.targets import Markers
 from icalib.inspection import inspect_recording
 from icalib.recordings import decode, open_recording
 from icalib.rig import Camera
@@ -89,6 +91,22 @@ def test_a_file_that_is_no_video_is_refused(tmp_path):
     with pytest.raises(RecordingError, match=r"cam0\.mp4 is no video that can be decoded; copy it again"):
         list(recording.payloads("cam0.mp4"))
     assert any("is no video that can be decoded" in f.sentence for f in inspect_recording(tmp_path).findings)
+
+
+def test_a_target_is_found_in_a_video(tmp_path, monkeypatch):
+    monkeypatch.setenv("ICALIB_CACHE", str(tmp_path / "cache"))
+    family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    video = cv2.VideoWriter(str(tmp_path / "cam0.avi"), cv2.VideoWriter_fourcc(*"MJPG"), RATE, (240, 160))
+    for k in range(4):
+        image = np.full((160, 240), 200, np.uint8)
+        image[30:110, 40 + 5 * k : 120 + 5 * k] = cv2.aruco.generateImageMarker(family, 3, 80)
+        video.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+    video.release()
+    camera = Camera("cam0", "", "pinhole-radtan", (240, 160))
+    corners, _ = find_corners(open_recording(tmp_path), camera, Markers("tag36h11", 0.1, (3,)))
+    assert np.diff(corners.start).tolist() == [4] * 4
+    moved = corners.uv.reshape(4, 4, 2)[1:] - corners.uv.reshape(4, 4, 2)[:-1]
+    np.testing.assert_allclose(moved, np.broadcast_to([5.0, 0.0], moved.shape), atol=0.2)
 
 
 def test_two_videos_are_told_by_their_names(tmp_path):
