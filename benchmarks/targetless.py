@@ -42,7 +42,8 @@ def main() -> int:
     rows: dict[str, list[np.ndarray]] = {camera.name: [] for camera in scenario.cameras}
     whole: list[Sample] = []
     head = "".join(f"{unit:>10}{'/ sigma':>9}" for unit in UNITS)
-    print(f"{'seed camera':<14}{head}{'NEES':>8}{'cpu s':>8}{'s':>7}   converged", flush=True)
+    if not options.tracks:
+        print(f"{'seed camera':<14}{head}{'NEES':>8}{'cpu s':>8}{'s':>7}   converged", flush=True)
     for seed in range(options.first, options.first + options.seeds):
         simulation = simulate(scenario, seed)
         path = _rendered(options, simulation, seed)
