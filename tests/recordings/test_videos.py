@@ -70,7 +70,9 @@ def test_a_part_of_the_video(tmp_path):
     assert [p.name for p in part] == [f"frame {k}" for k in range(4, 9)]
 
 
-@pytest.mark.parametrize(("rows", "words"), [(FRAMES - 2, "has more frames"), (FRAMES + 1, f"has {FRAMES} frames")])
+@pytest.mark.parametrize(
+    ("rows", "words"), [(FRAMES - 2, f"has more than {FRAMES - 2} frames"), (FRAMES + 1, f"has {FRAMES} frames")]
+)
 def test_a_table_of_another_length_is_refused(tmp_path, rows, words):
     write_video(tmp_path / "cam0.mp4")
     times(tmp_path / "cam0.csv", rows)
@@ -78,11 +80,29 @@ def test_a_table_of_another_length_is_refused(tmp_path, rows, words):
         list(open_recording(tmp_path).payloads("cam0.mp4"))
 
 
-def test_a_line_that_is_no_stamp_is_named(tmp_path):
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ("100\n150\nlate\n", r"cam0\.csv:3: 'late' has no stamp"),
+        ("frame\n" + "\n".join(map(str, range(FRAMES))), r"cam0\.csv counts frames and has no stamps"),
+        ("notes on this video\n", r"cam0\.csv holds no stamps"),
+    ],
+)
+def test_a_table_that_holds_no_stamps_is_named_when_it_is_read(tmp_path, table, words):
     write_video(tmp_path / "cam0.mp4")
-    (tmp_path / "cam0.csv").write_text("100\n150\nlate\n")
-    with pytest.raises(RecordingError, match=r"cam0\.csv:3: 'late' does not begin with a stamp"):
-        open_recording(tmp_path).topics()
+    (tmp_path / "cam0.csv").write_text(table)
+    recording = open_recording(tmp_path)
+    assert [t.count for t in recording.topics() if t.kind == "image"] == [1]
+    with pytest.raises(RecordingError, match=words):
+        list(recording.payloads("cam0.mp4"))
+
+
+def test_the_header_names_the_column_of_the_stamps(tmp_path):
+    write_video(tmp_path / "cam0.mp4")
+    rows = "".join(f"{k},{ORIGIN_NS + 50_000_000 * k}\n" for k in range(FRAMES))
+    (tmp_path / "cam0.csv").write_text("frame,timestamp_ns\n" + rows)
+    stamps = open_recording(tmp_path).stamps("cam0.mp4")
+    assert stamps.tolist() == [ORIGIN_NS + 50_000_000 * k for k in range(FRAMES)]
 
 
 def test_a_file_that_is_no_video_is_refused(tmp_path):

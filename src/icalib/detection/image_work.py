@@ -1,4 +1,4 @@
-"""Work on all images of a stream: on all cores, in order, with few images in memory at a time."""
+"""Work on all images of a stream: on all cores, in order, a few batches in memory at a time."""
 
 from __future__ import annotations
 
@@ -23,29 +23,29 @@ SPREAD = 5  # images that stand for a recording where all would take too long
 Progress = Callable[[float], None]  # the share of the images that is done, 0 to 1
 
 
-def on_all_cores(turns: Iterable[T], work: Callable[[T], R]) -> Iterator[R]:
-    """work(turn) of each turn, in order, on threads: OpenCV and compiled code let each other run. At most one turn for
-    each core waits."""
+def on_all_cores(batches: Iterable[T], work: Callable[[T], R]) -> Iterator[R]:
+    """work(batch) of each batch, in order, on threads: OpenCV and compiled code let each other run. One batch more than
+    there are cores is in memory at most."""
     with _one_thread_in_opencv(), _pool() as pool:
         waiting: deque[Future[R]] = deque()
-        for turn in turns:
-            waiting.append(pool.submit(work, turn))
+        for batch in batches:
+            waiting.append(pool.submit(work, batch))
             if len(waiting) > core_count():
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
 
 
-def turns_of(payloads: Iterable[Payload], images: int, most_bytes: int) -> Iterator[list[Payload]]:
+def batches_of(payloads: Iterable[Payload], images: int, most_bytes: int) -> Iterator[list[Payload]]:
     """The images in groups of `images`, or of fewer where these have `most_bytes`."""
-    turn: list[Payload] = []
+    batch: list[Payload] = []
     for p in payloads:
-        turn.append(p)
-        if len(turn) == images or sum(len(one.data) for one in turn) >= most_bytes:
-            yield turn
-            turn = []
-    if turn:
-        yield turn
+        batch.append(p)
+        if len(batch) == images or sum(len(one.data) for one in batch) >= most_bytes:
+            yield batch
+            batch = []
+    if batch:
+        yield batch
 
 
 def image_count(recording: Recording, topic: str) -> int:
@@ -54,14 +54,14 @@ def image_count(recording: Recording, topic: str) -> int:
 
 
 def spread_images(recording: Recording, topic: str) -> Iterator[np.ndarray]:
-    """A few images, spread over the recording."""
+    """A few images, spread over the recording as far as its number of images is known."""
     every = max(image_count(recording, topic) // SPREAD, 1)
-    for payload in islice(recording.payloads(topic), 0, None, every):
+    for payload in islice(recording.payloads(topic), 0, 2 * SPREAD * every, every):
         with suppress(DamagedImageError):
             yield decode(payload)
 
 
-def of_resolution(payloads: Iterable[Payload], camera: Camera, where: str) -> Iterator[Payload]:
+def with_resolution(payloads: Iterable[Payload], camera: Camera, where: str) -> Iterator[Payload]:
     """The images. Raises RecordingError at the first that has not the camera's resolution."""
     for p in payloads:
         if p.width and (p.width, p.height) != camera.resolution:
@@ -72,7 +72,7 @@ def of_resolution(payloads: Iterable[Payload], camera: Camera, where: str) -> It
         yield p
 
 
-def noting_files(payloads: Iterable[Payload], files: dict[int, str]) -> Iterator[Payload]:
+def recording_names(payloads: Iterable[Payload], files: dict[int, str]) -> Iterator[Payload]:
     """The payloads; `files` gets the name of each by its stamp, "" of those that are no file."""
     for p in payloads:
         files[p.stamp_ns] = p.name

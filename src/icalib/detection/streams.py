@@ -19,12 +19,12 @@ from icalib.detection.detectors import Detector, detector_of
 from icalib.detection.diagnosis import what_is_seen, with_other_border, with_other_layout
 from icalib.detection.image_work import (
     Progress,
+    batches_of,
     image_count,
-    noting_files,
-    of_resolution,
     on_all_cores,
+    recording_names,
     spread_images,
-    turns_of,
+    with_resolution,
 )
 from icalib.detection.prediction import MOTION_IMAGES
 from icalib.detection.sightings import parts_of, sightings, without_rare_tags
@@ -56,7 +56,7 @@ def find_corners(
     files: dict[int, str] = {}
 
     def read() -> Iterator[Payload]:
-        return noting_files(of_resolution(recording.payloads(topic), camera, where), files)
+        return recording_names(with_resolution(recording.payloads(topic), camera, where), files)
 
     key = stream_key(read(), repr(target)) if keep else ""
     found = load_corners(key) if keep else None
@@ -149,8 +149,8 @@ def _search(
     stamps: list[int] = []
     images: list[ImageCorners] = []
     damaged = ""
-    turns = turns_of(payloads, IN_TURN, BYTES_IN_TURN)
-    for own, found, error in on_all_cores(turns, partial(_in_turn, detector=detector)):
+    batches = batches_of(payloads, IN_TURN, BYTES_IN_TURN)
+    for own, found, error in on_all_cores(batches, partial(_in_turn, detector=detector)):
         for stamp, one in zip(own, found, strict=True):
             stamps.append(stamp)
             images.append(one)

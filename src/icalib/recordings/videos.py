@@ -20,6 +20,7 @@ from icalib.recordings.unreadable import VIDEO_FILE, is_video
 
 _TABLES = (".csv", ".txt")
 _STAMP = re.compile(r"[0-9]+(\.[0-9]*)?")
+_TIME = re.compile(r"time|stamp|^t$|^t[_ ]?\[?(ns|us|ms|s)\]?$", re.IGNORECASE)
 
 
 def videos_in(folder: Path) -> list[Path]:
@@ -29,11 +30,10 @@ def videos_in(folder: Path) -> list[Path]:
 
 def video_topic(path: Path, name: str) -> TopicInfo:
     """What is known of a video without decoding it; the count is the container's, and may be off by a few frames. A
-    file that cannot be opened has no frames."""
-    times = frame_times(path)
-    if times is not None:
-        return TopicInfo(name, VIDEO_FILE, "image", len(times), int(times[0]), int(times[-1]))
+    file or a table that cannot be read counts as one frame: reading the video says what is wrong."""
     try:
+        if (times := frame_times(path)) is not None:
+            return TopicInfo(name, VIDEO_FILE, "image", len(times), int(times[0]), int(times[-1]))
         with _opened(path) as video:
             count, rate = (float(video.get(what)) for what in (_property("FRAME_COUNT"), _property("FPS")))
     except RecordingError:
@@ -44,20 +44,28 @@ def video_topic(path: Path, name: str) -> TopicInfo:
 
 def frame_times(path: Path) -> np.ndarray | None:
     """(N,) int64 ns: stamps of the frames, from the table of the video's name beside it (`cam0.csv` or `cam0.txt` of
-    `cam0.mp4`), whose first column they are; None where there is none. Raises RecordingError naming the line."""
+    `cam0.mp4`): the column that its header calls a time or a stamp, or the first. None where there is no table. Raises
+    RecordingError naming the line."""
     table = next((p for ending in _TABLES if (p := path.with_suffix(ending)).is_file()), None)
     if table is None:
         return None
-    texts = []
+    texts, column = [], 0
     for number, line in enumerate(table.read_text(encoding="utf-8-sig", errors="replace").splitlines(), 1):
-        first = re.split(r"[,;\s]", line.strip(), maxsplit=1)[0]
-        if not first or first.startswith("#") or (not texts and first[:1].isalpha()):
+        cells = [cell.strip() for cell in re.split(r"[,;\t]\s*|\s+", line.strip().lstrip("#"))]
+        if not texts and not _STAMP.fullmatch(cells[min(column, len(cells) - 1)]):
+            column = next((k for k, cell in enumerate(cells) if _TIME.search(cell)), column)
             continue
-        if not _STAMP.fullmatch(first):
-            raise RecordingError(f"{table}:{number}: {line.strip()[:60]!r} does not begin with a stamp; correct it.")
-        texts.append(first)
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        if len(cells) <= column or not _STAMP.fullmatch(cells[column]):
+            raise RecordingError(f"{table}:{number}: {line.strip()[:60]!r} has no stamp; correct the line.")
+        texts.append(cells[column])
     if not texts:
         raise RecordingError(f"{table} holds no stamps; write one line for each frame of {path.name}, or remove it.")
+    if len(texts) > 2 and texts in ([str(k + first) for k in range(len(texts))] for first in (0, 1)):
+        raise RecordingError(
+            f"{table} counts frames and has no stamps; write stamps in its first column, or remove it."
+        )
     unit = unit_of_texts(texts)
     return np.array([nanoseconds(text, unit) for text in texts], np.int64)
 
@@ -89,7 +97,7 @@ def video_payloads(path: Path, where: str) -> Iterator[Payload]:
     if not n:
         raise RecordingError(f"{path} has no frames that can be decoded; copy it again, or convert it to H.264.")
     if times is not None and (good or n != len(times)):
-        frames = "more" if good else str(n)
+        frames = f"more than {n}" if good else str(n)
         raise RecordingError(
             f"{path} has {frames} frames, and its table {len(times)} stamps; give one for each frame, or remove the "
             "table to use the video's own."
@@ -102,7 +110,7 @@ def _property(name: str) -> int:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """The video, upright as the sensor read it. Raises RecordingError where it is none."""
+    """The video, its frames not rotated: as the sensor read them. Raises RecordingError where it is none."""
     cv2 = load_cv2()
     video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     try:

@@ -37,9 +37,9 @@ def test_a_known_map_is_found_whatever_the_exposure(A, shift, gain, offset):
     first, good = cut_templates(_image(np.eye(2), np.zeros(2), centre), centre[None])
     assert good.all()
     seen = (gain * _image(A, np.array(shift), centre) + offset).astype(np.float32)
-    uv, found, alike = centre[None].copy(), np.eye(2)[None].copy(), np.empty(1)
-    align(seen, first, uv, found, alike)
-    assert alike[0] > 0.995
+    uv, found, ncc = centre[None].copy(), np.eye(2)[None].copy(), np.empty(1)
+    align(seen, first, uv, found, ncc)
+    assert ncc[0] > 0.995
     np.testing.assert_allclose(uv[0] - centre, shift, atol=0.035)  # linear interpolation of waves of 15 px
     np.testing.assert_allclose(found[0], A, atol=0.02)
 
@@ -55,9 +55,9 @@ def test_the_spread_is_what_moves_the_alignment_where_the_map_is_curved():
             moved = 0.5 * curvature * (along - 48.0) ** 2
             at = [u - moved, v] if component == 0 else [u, v - moved]
             seen = _grey(*at).astype(np.float32)
-            uv, alike = centre[None].copy(), np.empty(1)
+            uv, ncc = centre[None].copy(), np.empty(1)
             for _ in range(3):
-                align(seen, first, uv, np.eye(2)[None].copy(), alike)
+                align(seen, first, uv, np.eye(2)[None].copy(), ncc)
             shifts.append(uv[0, component] - 48.0)
     assert np.mean(shifts) == pytest.approx(0.5 * curvature * first.spread[0], rel=0.1)
     assert 0.2 * 56.0 / 3.0 < first.spread[0] < 56.0 / 3.0  # of an even patch of 15 px
@@ -67,18 +67,18 @@ def test_another_pattern_is_not_alike():
     centre = np.array([48.0, 48.0])
     first, _ = cut_templates(_image(np.eye(2), np.zeros(2), centre), centre[None])
     noise = np.random.default_rng(0).normal(120.0, 25.0, (SIZE, SIZE)).astype(np.float32)
-    alike = np.empty(1)
-    align(noise, first, centre[None].copy(), np.eye(2)[None].copy(), alike)
-    assert alike[0] < 0.5
+    ncc = np.empty(1)
+    align(noise, first, centre[None].copy(), np.eye(2)[None].copy(), ncc)
+    assert ncc[0] < 0.5
 
 
 def test_a_patch_that_leaves_the_image_is_not_alike():
     centre = np.array([48.0, 48.0])
     image = _image(np.eye(2), np.zeros(2), centre)
     first, _ = cut_templates(image, centre[None])
-    alike = np.empty(1)
-    align(image, first, np.array([[RADIUS - 1.0, 48.0]]), np.eye(2)[None].copy(), alike)
-    assert alike[0] == -1.0
+    ncc = np.empty(1)
+    align(image, first, np.array([[RADIUS - 1.0, 48.0]]), np.eye(2)[None].copy(), ncc)
+    assert ncc[0] == -1.0
 
 
 def test_an_even_patch_and_an_edge_have_no_template():

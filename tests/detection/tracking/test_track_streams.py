@@ -23,8 +23,8 @@ PERIOD_NS = 50_000_000
 class Images:
     """A recording of one camera; `damaged`: numbers of images that cannot be decoded."""
 
-    def __init__(self, images: list[np.ndarray], damaged: tuple[int, ...] = ()) -> None:
-        self.images, self.damaged = images, damaged
+    def __init__(self, images: list[np.ndarray], damaged: tuple[int, ...] = (), period_ns: int = PERIOD_NS) -> None:
+        self.images, self.damaged, self.period_ns = images, damaged, period_ns
 
     def image_topic(self, camera: Camera) -> str:
         return "cam0"
@@ -33,14 +33,16 @@ class Images:
         return "rec/cam0"
 
     def topics(self) -> tuple[TopicInfo, ...]:
-        return (TopicInfo("cam0", "images", "image", len(self.images), 0, len(self.images) * PERIOD_NS),)
+        return (TopicInfo("cam0", "images", "image", len(self.images), 0, len(self.images) * self.period_ns),)
 
     def payloads(self, topic: str) -> Iterator[Payload]:
         for k, image in enumerate(self.images):
             if k in self.damaged:
-                yield Payload(k * PERIOD_NS, "rec/cam0", "png", b"nothing", 0, 0, name=f"{k}.png")
+                yield Payload(k * self.period_ns, "rec/cam0", "png", b"nothing", 0, 0, name=f"{k}.png")
             else:
-                yield Payload(k * PERIOD_NS, "rec/cam0", "mono8", image.tobytes(), *image.shape[::-1], name=f"{k}.png")
+                yield Payload(
+                    k * self.period_ns, "rec/cam0", "mono8", image.tobytes(), *image.shape[::-1], name=f"{k}.png"
+                )
 
 
 @pytest.fixture(autouse=True)
@@ -48,8 +50,8 @@ def cache(tmp_path, monkeypatch):
     monkeypatch.setenv("ICALIB_CACHE", str(tmp_path / "cache"))
 
 
-def test_every_track_has_three_observations_and_stretches_share_none(scene, monkeypatch):
-    monkeypatch.setattr(streams, "STRETCH", 8)
+def test_every_track_has_three_observations_and_segments_share_none(scene, monkeypatch):
+    monkeypatch.setattr(streams, "SEGMENT", 8)
     found, notes = find_tracks(Images(scene.images), CAMERA)
     assert notes == ()
     assert found.stamps_ns.tolist() == [k * PERIOD_NS for k in range(len(scene.images))]
@@ -60,7 +62,7 @@ def test_every_track_has_three_observations_and_stretches_share_none(scene, monk
 
 
 def test_tracks_do_not_depend_on_the_number_of_cores(scene, monkeypatch):
-    monkeypatch.setattr(streams, "STRETCH", 8)
+    monkeypatch.setattr(streams, "SEGMENT", 8)
     found = []
     for cores in (1, 3):
         monkeypatch.setattr(image_work, "core_count", lambda cores=cores: cores)
@@ -78,6 +80,21 @@ def test_what_was_found_is_kept_until_the_images_change(scene, monkeypatch):
     np.testing.assert_array_equal(first.spread, again.spread)
     with pytest.raises(TypeError):
         find_tracks(Images(scene.images[1:]), CAMERA)
+
+
+def test_images_at_a_high_rate_are_tracked_and_thinned(scene):
+    """At 60 Hz every third counts as a view, so that tracks last long enough for the motion to show."""
+    found, notes = find_tracks(Images(scene.images, period_ns=16_666_667), CAMERA)
+    assert notes == () and len(found.stamps_ns) == 7
+    assert np.diff(found.stamps_ns).tolist() == [50_000_001] * 6
+
+
+def test_images_too_large_to_wait_give_the_same_tracks(scene, monkeypatch):
+    small, _ = find_tracks(Images(scene.images), CAMERA, keep=False)
+    monkeypatch.setattr(streams, "SEGMENT_BYTES", 1000)
+    large, _ = find_tracks(Images(scene.images), CAMERA, keep=False)
+    np.testing.assert_array_equal(small.uv, large.uv)
+    np.testing.assert_array_equal(small.feature, large.feature)
 
 
 def test_a_damaged_image_is_left_out_with_a_note(scene):

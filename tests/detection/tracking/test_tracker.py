@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from icalib.detection.tracking.tracker import MOST_VIEWS, Followed, Tracker
+from icalib.detection.tracking.tracker import MOST_VIEWS, Observations, Tracker
 
 from .conftest import SIZE, Turning
 
 
-def track(images: list[np.ndarray]) -> list[Followed]:
+def track(images: list[np.ndarray]) -> list[Observations]:
     tracker = Tracker()
     return [tracker.add(image) for image in images]
 
 
-def errors(seen: list[Followed], scene: Turning) -> np.ndarray:
+def errors(seen: list[Observations], scene: Turning) -> np.ndarray:
     """(n, 2) px: from where the first view of each feature lies on the scene, of all later views."""
     places: dict[int, np.ndarray] = {}
     out = []
@@ -46,6 +46,19 @@ def test_views_count_the_images_that_showed_a_feature(scene):
             assert views == shown.get(feature, 0)
             shown[feature] = views + 1
     assert max(shown.values()) <= MOST_VIEWS
+
+
+def test_an_image_that_is_passed_over_counts_as_no_view(scene):
+    """Every other image, as at a high rate."""
+    tracker, seen = Tracker(), []
+    for k, image in enumerate(scene.images):
+        if k % 2:
+            tracker.pass_over(image)
+        else:
+            seen.append(tracker.add(image))
+    assert max(int(one.views.max()) for one in seen) == len(seen) - 1
+    half = Turning(scene.images[::2], scene.homographies[::2])
+    assert np.median(np.linalg.norm(errors(seen, half), axis=1)) < 0.05
 
 
 def test_tracks_that_begin_together_do_not_end_together(scene):

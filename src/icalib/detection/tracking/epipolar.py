@@ -1,11 +1,11 @@
 """The epipolar geometry of two images through a lens that is not known, compiled.
 
-A pixel at (x, y) from the image's centre has the ray (x, y, 1 + bend (x^2 + y^2)): the division model of Fitzgibbon
+A pixel at (x, y) from the image's centre has the ray (x, y, 1 + lam (x^2 + y^2)): the division model of Fitzgibbon
 (Simultaneous linear estimation of multiple view geometry and lens distortion, 2001). Rays f, h of a point that stands
 still satisfy h . F f = 0. F comes from eight points drawn at random; of many draws the one counts whose errors have the
 least quantile (least quantile of squares, Rousseeuw 1984). With the median, F has freedom enough to fit a body that
-moves beside less than half of the scene. F absorbs the focal length, so that `bend` is all that must be known of the
-lens.
+moves beside less than half of the scene. F absorbs the focal length, so that the distortion
+`lam` is all that must be known of the lens.
 """
 
 from __future__ import annotations
@@ -16,30 +16,30 @@ from icalib.compiled import njit
 
 DRAWS = 60  # at most; with 30 % of outliers, chance misses every clean sample once in 35 pairs of images
 FEWEST_DRAWS, MISSED = 12, 0.01  # drawing ends where chance has missed every clean sample with that probability
-QUANTILE, SIGMAS = 0.65, 0.9346  # up to 35 % of the points may move; where that quantile of normal errors lies
+QUANTILE, QUANTILE_OF_NORMAL = 0.65, 0.9346  # up to 35 % of the points may move; that quantile of |normal| errors
 REFITS, FITS_TIMES = 2, 3.0  # with all points whose errors are within so many quantiles
 FEWEST = 16  # points; of fewer a quantile says little
 
 
-def epipolar_errors(p: np.ndarray, q: np.ndarray, bend: float, seed: int) -> tuple[np.ndarray, float]:
+def epipolar_errors(p: np.ndarray, q: np.ndarray, lam: float, seed: int) -> tuple[np.ndarray, float]:
     """(n,) first-order distances of points p and q (n, 2) in two images from the epipolar geometry of most, and their
     standard deviation by the quantile. n is FEWEST at least; units are those of p and q, from the images' centre."""
     rng = np.random.default_rng(seed)
     draws = rng.permuted(np.tile(np.arange(len(p)), (DRAWS, 1)), axis=1)[:, :8].copy()
     error = np.empty(len(p))
-    quantile = _least_quantile(np.ascontiguousarray(p), np.ascontiguousarray(q), bend, draws, error)
-    return error, (1.0 + 5.0 / (len(p) - 8)) / SIGMAS * quantile  # Rousseeuw's correction for few points
+    quantile = _least_quantile(np.ascontiguousarray(p), np.ascontiguousarray(q), lam, draws, error)
+    return error, (1.0 + 5.0 / (len(p) - 8)) / QUANTILE_OF_NORMAL * quantile  # Rousseeuw's correction for few points
 
 
 @njit(cache=True, nogil=True)
-def _least_quantile(p, q, bend, draws, least):
+def _least_quantile(p, q, lam, draws, least):
     """The least quantile of errors over all draws (m, 8), and over what all points that fit then give; least (n,): the
     errors of that one."""
     n = len(p)
     f, h, error, used = np.empty((n, 3)), np.empty((n, 3)), np.empty(n), np.empty(n, dtype=np.bool_)
     for i in range(n):
-        f[i, 0], f[i, 1], f[i, 2] = p[i, 0], p[i, 1], 1.0 + bend * (p[i, 0] ** 2 + p[i, 1] ** 2)
-        h[i, 0], h[i, 1], h[i, 2] = q[i, 0], q[i, 1], 1.0 + bend * (q[i, 0] ** 2 + q[i, 1] ** 2)
+        f[i, 0], f[i, 1], f[i, 2] = p[i, 0], p[i, 1], 1.0 + lam * (p[i, 0] ** 2 + p[i, 1] ** 2)
+        h[i, 0], h[i, 1], h[i, 2] = q[i, 0], q[i, 1], 1.0 + lam * (q[i, 0] ** 2 + q[i, 1] ** 2)
     best, k, last = np.inf, 0, len(draws)
     while k < last + REFITS:
         if k < last:
@@ -50,7 +50,7 @@ def _least_quantile(p, q, bend, draws, least):
             for i in range(n):
                 used[i] = least[i] <= FITS_TIMES * best
         k += 1
-        _errors(f, h, bend, _fundamental(f, h, used), error)
+        _errors(f, h, lam, _fundamental(f, h, used), error)
         quantile = np.partition(error, int(QUANTILE * n))[int(QUANTILE * n)]
         if quantile < best:
             best = quantile
@@ -87,7 +87,7 @@ def _fundamental(f, h, used):
 
 
 @njit(cache=True, nogil=True)
-def _errors(f, h, bend, F, error):
+def _errors(f, h, lam, F, error):
     """error (n,): Sampson's distance |h . F f| over the norm of its derivatives by the four pixel coordinates."""
     for i in range(len(f)):
         value, size = 0.0, 0.0
@@ -97,6 +97,6 @@ def _errors(f, h, bend, F, error):
             l0, l1, l2 = l0 + F[0, b] * f[i, b], l1 + F[1, b] * f[i, b], l2 + F[2, b] * f[i, b]
             m0, m1, m2 = m0 + F[b, 0] * h[i, b], m1 + F[b, 1] * h[i, b], m2 + F[b, 2] * h[i, b]
         value = h[i, 0] * l0 + h[i, 1] * l1 + h[i, 2] * l2
-        size += (l0 + 2.0 * bend * h[i, 0] * l2) ** 2 + (l1 + 2.0 * bend * h[i, 1] * l2) ** 2
-        size += (m0 + 2.0 * bend * f[i, 0] * m2) ** 2 + (m1 + 2.0 * bend * f[i, 1] * m2) ** 2
+        size += (l0 + 2.0 * lam * h[i, 0] * l2) ** 2 + (l1 + 2.0 * lam * h[i, 1] * l2) ** 2
+        size += (m0 + 2.0 * lam * f[i, 0] * m2) ** 2 + (m1 + 2.0 * lam * f[i, 1] * m2) ** 2
         error[i] = abs(value) / np.sqrt(max(size, 1e-30))

@@ -16,7 +16,7 @@ from icalib.compiled import njit
 
 RADIUS = 7  # px; a patch has 15 x 15 px
 SIDE = 2 * RADIUS + 1
-LARGEST_STEP_PX = 0.02  # of the last step
+CONVERGED_PX = 0.02  # of the last step
 MOST_STEPS = 12
 LEAST_CONTRAST = 1.0  # grey levels (standard deviation) of a patch; less is noise
 
@@ -115,13 +115,13 @@ def _affine_row(slope, dy, dx, row):
 
 
 @njit(cache=True, nogil=True)
-def align(image, templates, uv, A, alike):
+def align(image, templates, uv, A, ncc):
     """Moves uv (n, 2) and A (n, 2, 2) to where the image (h, w) float32 shows each first view: uv + A x shows what
-    the first view has at x. alike (n,): correlation of both, -1 where the patch leaves the image or the steps diverge.
+    the first view has at x. ncc (n,): correlation of both, -1 where the patch leaves the image or the steps diverge.
     """
     seen, row, b, step = np.empty((SIDE, SIDE)), np.empty(6), np.empty(6), np.empty(6)
     for n in range(len(uv)):
-        alike[n] = -1.0
+        ncc[n] = -1.0
         for _ in range(MOST_STEPS):
             correlation = _sample(image, uv[n], A[n], templates.grey[n], seen)
             if correlation < 0.0:
@@ -140,8 +140,8 @@ def align(image, templates, uv, A, alike):
             moved = _compose(uv[n], A[n], step)
             if moved < 0.0:
                 break
-            if moved < LARGEST_STEP_PX:
-                alike[n] = correlation
+            if moved < CONVERGED_PX:
+                ncc[n] = correlation
                 break
 
 

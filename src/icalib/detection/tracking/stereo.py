@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from icalib.detection.image_work import on_all_cores
-from icalib.detection.tracking.epipolar import FEWEST
-from icalib.detection.tracking.moving import best_bend, misfits
+from icalib.detection.tracking.epipolar import FEWEST, epipolar_errors
+from icalib.detection.tracking.moving import LEAST_PX, TIMES_SIGMA, best_lambda
 from icalib.detection.tracking.patches import RADIUS, align, cut_templates
-from icalib.detection.tracking.tracker import ALIGNED_PX, BACK_PX, BLUR_PX, LEAST_ALIKE, WINDOW_PX, equalised
+from icalib.detection.tracking.tracker import ALIGNED_PX, BACK_PX, BLUR_PX, MIN_NCC, WINDOW_PX, equalised
 from icalib.extras import load_cv2
 from icalib.measurements import TrackStream
 from icalib.recordings import DamagedImageError, Payload, Recording, decode
@@ -26,9 +26,10 @@ from icalib.rig import Camera
 
 EVERY_S = 0.25  # between images that are matched; features live about a second
 APART_S = 0.05  # between both images at most
-LEVELS = 4  # of the pyramid: disparities of up to 160 px
+MAX_LEVEL = 4  # of the pyramid: disparities of up to 160 px
 FEWEST_MATCHES = 100  # in a recording; fewer may be chance
 LEAST_SHARE = 0.1  # of the features that were tried
+MOST_SIGMA_PX = 1.0  # of matches from their epipolar lines; more are wrong matches, or two lenses of different kinds
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,7 @@ def _pairs(first: TrackStream, second: TrackStream) -> list[tuple[int, int]]:
     slot = np.floor((at - at[0]) * 1e-9 / EVERY_S).astype(np.int64)
     chosen = np.flatnonzero(near)
     chosen = chosen[np.unique(slot[chosen], return_index=True)[1]]
+    chosen = chosen[np.unique(j[chosen], return_index=True)[1]]  # a feature is in an image once
     return [(int(i), int(j[i])) for i in chosen]
 
 
@@ -92,13 +94,8 @@ def _payload_pairs(
         _with_stamps(recording, camera, {int(stream.stamps_ns[pair[k]]) for pair in pairs})
         for k, (camera, stream) in enumerate(zip(cameras, streams, strict=True))
     )
-    # The same image may be nearest to two of the other camera; each is read once.
-    held: Payload | None = None
-    for i, j in pairs:
-        a, stamp_ns = next(first), int(streams[1].stamps_ns[j])
-        while held is None or held.stamp_ns != stamp_ns:
-            held = next(second)
-        yield a, held, i, j
+    for (i, j), a, b in zip(pairs, first, second, strict=True):
+        yield a, b, i, j
 
 
 def _with_stamps(recording: Recording, camera: Camera, stamps_ns: set[int]) -> Iterator[Payload]:
@@ -122,17 +119,17 @@ def _match(a: Payload, b: Payload, i: int, j: int, stream: TrackStream) -> _Matc
     even = [equalised(image) for image in (first, second)]
     before = stream.uv[rows].astype(np.float32)
     size = (WINDOW_PX, WINDOW_PX)
-    after, there, _ = cv2.calcOpticalFlowPyrLK(even[0], even[1], before, None, winSize=size, maxLevel=LEVELS)
-    back, returned, _ = cv2.calcOpticalFlowPyrLK(even[1], even[0], after, None, winSize=size, maxLevel=LEVELS)
+    after, there, _ = cv2.calcOpticalFlowPyrLK(even[0], even[1], before, None, winSize=size, maxLevel=MAX_LEVEL)
+    back, returned, _ = cv2.calcOpticalFlowPyrLK(even[1], even[0], after, None, winSize=size, maxLevel=MAX_LEVEL)
     good = (there.ravel() > 0) & (returned.ravel() > 0) & (np.linalg.norm(back - before, axis=1) < BACK_PX)
     smooth = [cv2.GaussianBlur(image, (0, 0), BLUR_PX).astype(np.float32) for image in (first, second)]
     whole = np.rint(stream.uv[rows])
     templates, textured = cut_templates(smooth[0], whole)
-    A, alike = np.tile(np.eye(2), (len(rows), 1, 1)), np.full(len(rows), -1.0)
+    A, ncc = np.tile(np.eye(2), (len(rows), 1, 1)), np.full(len(rows), -1.0)
     uv = after.astype(np.float64) + whole - stream.uv[rows]
-    align(smooth[1], templates, uv, A, alike)
+    align(smooth[1], templates, uv, A, ncc)
     uv = uv + np.einsum("nij,nj->ni", A, stream.uv[rows] - whole)
-    good &= textured & (alike > LEAST_ALIKE) & (np.linalg.norm(uv - after, axis=1) < ALIGNED_PX)
+    good &= textured & (ncc > MIN_NCC) & (np.linalg.norm(uv - after, axis=1) < ALIGNED_PX)
     return _Matches(rows[good], np.full(int(good.sum()), j), uv[good], len(rows))
 
 
@@ -143,7 +140,11 @@ def _consistent(p: np.ndarray, q: np.ndarray, resolution: tuple[int, int]) -> np
     half_px = 0.5 * float(np.hypot(*resolution))
     middle = 0.5 * (np.array(resolution) - 1.0)
     x, y = (p - middle) / half_px, (q - middle) / half_px
-    return ~misfits(x, y, best_bend([(x, y)]), half_px, 0)
+    lam = best_lambda([(x, y)])
+    error, sigma = epipolar_errors(x, y, lam, 0)
+    if sigma * half_px > MOST_SIGMA_PX:
+        return np.zeros(len(p), dtype=bool)
+    return error * half_px <= max(TIMES_SIGMA * sigma * half_px, LEAST_PX)
 
 
 def _inserted(

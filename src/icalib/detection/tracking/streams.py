@@ -1,24 +1,25 @@
 """From a recording's images to feature tracks: decoded and followed on all cores, and kept for the next run.
 
-Images are followed in stretches, each on one core; tracks end where a stretch ends. Stretches depend on the recording
+Images are tracked in segments, each on one core; tracks end where a segment ends. Segments depend on the recording
 only, so that the tracks do not depend on the number of cores.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain, islice
 
 import numpy as np
 
 from icalib.detection.cache import keep_arrays, load_kept, stream_key
 from icalib.detection.image_work import (
     Progress,
+    batches_of,
     image_count,
-    noting_files,
-    of_resolution,
     on_all_cores,
-    turns_of,
+    recording_names,
+    with_resolution,
 )
 from icalib.detection.tracking.moving import moving_features
 from icalib.detection.tracking.robot_parts import stay_in_place
@@ -29,12 +30,13 @@ from icalib.measurements import TrackStream
 from icalib.recordings import DamagedImageError, Payload, Recording, decode
 from icalib.rig import Camera
 
-VERSION = 1  # of the tracker: whatever changes tracks changes this
-STRETCH, STRETCH_BYTES = 120, 64 << 20  # images, and their bytes, that are followed in one go
+VERSION = 2  # of the tracker: whatever changes tracks changes this
+SEGMENT, SEGMENT_BYTES = 120, 128 << 20  # images that are tracked in one go; of larger ones none wait in memory
+LEAST_APART_NS = 35_000_000  # between images with observations; those between serve to track, and add little
 FEWEST_VIEWS = 3  # of a track; two images of one point are met by almost any pose
 FEWEST_POINTS = 12  # in an image, below which it says little of the camera's motion
 NOTED = 0.05  # of the tracks; fewer that are left out are not worth a note
-_COLUMNS = ("stamps_ns", "start", "feature", "uv", "views", "spread")
+_COLUMNS = ("stamps_ns", "start", "feature", "uv", "views", "spread", "damaged_ns")
 _COUNTS = ("moving", "in_place")
 
 
@@ -42,8 +44,9 @@ _COUNTS = ("moving", "in_place")
 class _Found:
     """Tracks of some images: stamps_ns (M,), start (M + 1,), feature, views, spread (N,) and uv (N, 2).
 
-    moving: how many features do not fit the motion of the camera; in_place: how many stay in place; damaged: why the
-    last image that cannot be decoded cannot."""
+    moving: how many features do not fit the motion of the camera; in_place: how many stay in place; damaged_ns (D,):
+    stamps of images that cannot be decoded; error: why the last of them cannot, or "".
+    """
 
     stamps_ns: np.ndarray
     start: np.ndarray
@@ -53,7 +56,8 @@ class _Found:
     spread: np.ndarray
     moving: int
     in_place: int
-    damaged: str = ""
+    damaged_ns: np.ndarray
+    error: str = ""
 
 
 def find_all_tracks(
@@ -81,46 +85,63 @@ def find_tracks(
     files: dict[int, str] = {}
 
     def read() -> Iterator[Payload]:
-        return noting_files(of_resolution(recording.payloads(topic), camera, where), files)
+        return recording_names(with_resolution(recording.payloads(topic), camera, where), files)
 
     key = stream_key(read(), f"tracks {VERSION}") if keep else ""
     kept = load_kept(key, (*_COLUMNS, *_COUNTS)) if keep else None
     if kept is not None:
-        stamps_ns, start, feature, uv, views, spread = (kept[name] for name in _COLUMNS)
+        stamps_ns, start, feature, uv, views, spread, damaged_ns = (kept[name] for name in _COLUMNS)
         moving, in_place = (int(kept[name]) for name in _COUNTS)
-        found = _Found(stamps_ns, start, feature, uv, views, spread, moving, in_place)
+        found = _Found(stamps_ns, start, feature, uv, views, spread, moving, in_place, damaged_ns)
     else:
         count, payloads = image_count(recording, topic), read()
-        found = _follow(payloads, lambda n: progress(n / max(count, n)))
+        found = _track(payloads, lambda n: progress(n / max(count, n)))
         if not len(found.stamps_ns):
-            raise RecordingError(found.damaged or f"{where}: there are no images; check that the camera was running.")
+            raise RecordingError(found.error or f"{where}: there are no images; check that the camera was running.")
         if keep:
             keep_arrays(key, {name: np.asarray(getattr(found, name)) for name in (*_COLUMNS, *_COUNTS)})
     stream = _stream(camera.name, found, where)
     return stream, tuple(f"{where}: {note}" for note in _notes(found, files))
 
 
-def _follow(payloads: Iterator[Payload], done: Callable[[int], None]) -> _Found:
+def _track(payloads: Iterator[Payload], done: Callable[[int], None]) -> _Found:
     parts: list[_Found] = []
-    stretches = turns_of(payloads, STRETCH, STRETCH_BYTES)
-    for part in on_all_cores(stretches, _in_stretch):
+    first = next(payloads, None)
+    if first is None:
+        return _joined(parts)
+    payloads = chain([first], payloads)
+    if len(first.data) * SEGMENT <= SEGMENT_BYTES:
+        segments = on_all_cores(batches_of(payloads, SEGMENT, SEGMENT_BYTES), _track_segment)
+    else:
+        segments = _as_they_are_read(payloads)
+    for part in segments:
         parts.append(part)
         done(sum(len(p.stamps_ns) for p in parts))
     return _joined(parts)
 
 
-def _in_stretch(payloads: list[Payload]) -> _Found:
-    """Tracks of images that are followed in one go. Features that moved, stayed in place, or were seen too rarely, are
+def _as_they_are_read(payloads: Iterator[Payload]) -> Iterator[_Found]:
+    """Segments of images that are too large to wait in memory, on one core."""
+    for first in payloads:
+        yield _track_segment(chain([first], islice(payloads, SEGMENT - 1)))
+
+
+def _track_segment(payloads: Iterable[Payload]) -> _Found:
+    """Tracks of images that are tracked in one go. Features that moved, stayed in place, or were seen too rarely, are
     left out."""
-    tracker, damaged, size = Tracker(), "", (1, 1)
-    stamps, seen = [], []
+    tracker, error, size = Tracker(), "", (1, 1)
+    stamps, seen, damaged = [], [], []
     for p in payloads:
         try:
             image = decode(p)
-        except DamagedImageError as error:
-            damaged = str(error)
+        except DamagedImageError as reason:
+            damaged.append(p.stamp_ns)
+            error = str(reason)
             continue
         size = image.shape[1], image.shape[0]
+        if stamps and p.stamp_ns - stamps[-1] < LEAST_APART_NS:
+            tracker.pass_over(image)
+            continue
         stamps.append(p.stamp_ns)
         seen.append(tracker.add(image))
     count = [len(s.feature) for s in seen]
@@ -130,13 +151,13 @@ def _in_stretch(payloads: list[Payload]) -> _Found:
         np.concatenate([np.zeros((0, 2)), *(s.uv for s in seen)]),
         np.concatenate([np.zeros(0, np.int64), *(s.views for s in seen)]),
         np.concatenate([np.zeros(0), *(s.spread for s in seen)]),
-        0, 0, damaged,
+        0, 0, np.array(damaged, np.int64), error,
     )  # fmt: skip
     good = np.bincount(whole.feature) >= FEWEST_VIEWS
-    in_place = stay_in_place(whole.start, whole.feature, whole.uv)
-    moving = moving_features(whole.start, whole.feature, whole.uv, size)
+    in_place = good & stay_in_place(whole.start, whole.feature, whole.uv)
+    moving = good & ~in_place & moving_features(whole.start, whole.feature, whole.uv, size)
     kept = _some(whole, (good & ~in_place & ~moving)[whole.feature])
-    return replace(kept, moving=int((moving & ~in_place).sum()), in_place=int((in_place & (good | moving)).sum()))
+    return replace(kept, moving=int(moving.sum()), in_place=int(in_place.sum()))
 
 
 def _some(found: _Found, kept: np.ndarray) -> _Found:
@@ -159,7 +180,7 @@ def _joined(parts: Sequence[_Found]) -> _Found:
         np.concatenate([none, *(p.views for p in parts)]),
         np.concatenate([np.zeros(0), *(p.spread for p in parts)]),
         sum(p.moving for p in parts), sum(p.in_place for p in parts),
-        next((p.damaged for p in reversed(parts) if p.damaged), ""),
+        np.concatenate([none, *(p.damaged_ns for p in parts)]), next((p.error for p in reversed(parts) if p.error), ""),
     )  # fmt: skip
 
 
@@ -180,10 +201,10 @@ def _stream(name: str, found: _Found, where: str) -> TrackStream:
 
 
 def _notes(found: _Found, files: dict[int, str]) -> Iterator[str]:
-    damaged = sorted(files.keys() - set(found.stamps_ns.tolist()))
-    if damaged:
-        first = files[damaged[0]] or f"at {damaged[0]} ns"
-        yield f"{len(damaged)} images that are damaged were left out, the first {first}."
+    if len(found.damaged_ns):
+        stamp_ns = int(found.damaged_ns[0])
+        first = files.get(stamp_ns) or f"at {stamp_ns} ns"
+        yield f"{len(found.damaged_ns)} images that are damaged were left out, the first {first}."
     tracks = len(np.unique(found.feature)) + found.moving + found.in_place
     if found.moving > NOTED * tracks:
         yield f"{found.moving} of {tracks} points do not fit one motion of the camera and were left out."

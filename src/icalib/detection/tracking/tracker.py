@@ -1,4 +1,4 @@
-"""One camera's tracker: corners of the scene, followed through its images in order.
+"""One camera's tracker: corners of the scene, tracked through its images in order.
 
 Each image: contrast equalisation, pyramidal Lucas-Kanade forward and backward, alignment with the first view of each
 track, new corners in empty cells.
@@ -16,18 +16,18 @@ from icalib.extras import load_cv2
 
 CELLS = 100  # of an image; each begins one track at a time
 MOST_VIEWS = 30  # of a track; later views differ too much from the first, and long tracks cost the estimator time
-WINDOW_PX, LEVELS = 21, 3  # of Lucas-Kanade: motions of up to 80 px between images
+WINDOW_PX, MAX_LEVEL = 21, 3  # of Lucas-Kanade: motions of up to 80 px between images
 CLIP, TILES = 3.0, (8, 8)  # of the equalisation (CLAHE)
 BLUR_PX = 0.8  # before alignment: grey levels between pixels are then linear enough
 BACK_PX = 0.7  # forward and backward must meet
 ALIGNED_PX = 2.0  # of Lucas-Kanade's place: alignment goes no further
-LEAST_ALIKE = 0.8  # correlation with the first view
+MIN_NCC = 0.8  # correlation with the first view
 LEAST_QUALITY = 5e-4  # smallest eigenvalue of a corner (OpenCV's, grey levels of 0 to 1)
 NEAR_PX = 3  # of a corner found at half the resolution
 
 
 @dataclass(frozen=True)
-class Followed:
+class Observations:
     """Observations of one image: feature (n,) int64, uv (n, 2) px, views (n,) int64: how many images showed the feature
     before; spread (n,) px^2: as `TrackStream` has it."""
 
@@ -53,7 +53,7 @@ class _Tracks:
     first: Templates
 
     @classmethod
-    def begun(cls, feature: np.ndarray, uv: np.ndarray, first: Templates) -> _Tracks:
+    def new(cls, feature: np.ndarray, uv: np.ndarray, first: Templates) -> _Tracks:
         n = len(feature)
         A = np.tile(np.eye(2), (n, 1, 1))
         return cls(feature, uv.astype(np.float64), np.full((n, 2), np.nan), A, np.zeros(n, np.int64), first)
@@ -73,37 +73,45 @@ def equalised(image: np.ndarray) -> np.ndarray:
 
 
 class Tracker:
-    """Follows corners of the scene through the images of one camera."""
+    """Tracks corners of the scene through the images of one camera."""
 
     def __init__(self) -> None:
         self._cv2: Any = load_cv2()
         self._before = np.zeros((0, 0), np.uint8)
-        self._alive = _Tracks.begun(np.zeros(0, np.int64), np.zeros((0, 2)), no_templates())
-        self._begun = 0
+        self._alive = _Tracks.new(np.zeros(0, np.int64), np.zeros((0, 2)), no_templates())
+        self._next_id = 0
 
-    def add(self, image: np.ndarray) -> Followed:
+    def pass_over(self, image: np.ndarray) -> None:
+        """Leads the tracks through the next image (h, w) uint8, which counts as no view of them."""
+        self._advance(image)
+
+    def add(self, image: np.ndarray) -> Observations:
         """What the next image (h, w) uint8 shows."""
-        cv2 = self._cv2
-        even = equalised(image)
-        smooth = cv2.GaussianBlur(image, (0, 0), BLUR_PX).astype(np.float32)
-        if len(self._alive.feature):
-            self._follow(even, smooth)
-        self._before = even
+        even, smooth = self._advance(image)
         self._alive = self._alive.some(self._alive.views < _most_views(self._alive.feature))
-        self._begin(even, smooth)
+        self._add_features(even, smooth)
         alive = self._alive
         spread = alive.first.spread * np.abs(np.linalg.det(alive.A))
-        seen = Followed(alive.feature.copy(), alive.uv.copy(), alive.views.copy(), spread)
+        seen = Observations(alive.feature.copy(), alive.uv.copy(), alive.views.copy(), spread)
         self._alive = replace(alive, views=alive.views + 1)
         return seen
 
-    def _follow(self, even: np.ndarray, smooth: np.ndarray) -> None:
-        """Moves the tracks to the next image; those that are lost end."""
+    def _advance(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Moves the tracks to the next image; returns it with even contrast (uint8), and smoothed (float32)."""
+        even = equalised(image)
+        smooth = self._cv2.GaussianBlur(image, (0, 0), BLUR_PX).astype(np.float32)
+        if len(self._alive.feature):
+            self._move_tracks(even, smooth)
+        self._before = even
+        return even, smooth
+
+    def _move_tracks(self, even: np.ndarray, smooth: np.ndarray) -> None:
+        """Lucas-Kanade and alignment with the first views; tracks that are lost end."""
         cv2, alive = self._cv2, self._alive
         before = alive.uv.astype(np.float32)
         size = (WINDOW_PX, WINDOW_PX)
         after, found, _ = cv2.calcOpticalFlowPyrLK(
-            self._before, even, before, before + self._predicted(), winSize=size, maxLevel=LEVELS,
+            self._before, even, before, before + self._predicted(), winSize=size, maxLevel=MAX_LEVEL,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         )  # fmt: skip
         back, returned, _ = cv2.calcOpticalFlowPyrLK(
@@ -111,9 +119,9 @@ class Tracker:
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         )  # fmt: skip
         good = (found.ravel() > 0) & (returned.ravel() > 0) & (np.linalg.norm(back - before, axis=1) < BACK_PX)
-        uv, A, alike = after.astype(np.float64), alive.A.copy(), np.full(len(before), -1.0)
-        align(smooth, alive.first, uv, A, alike)
-        good &= (alike > LEAST_ALIKE) & (np.linalg.norm(uv - after, axis=1) < ALIGNED_PX)
+        uv, A, ncc = after.astype(np.float64), alive.A.copy(), np.full(len(before), -1.0)
+        align(smooth, alive.first, uv, A, ncc)
+        good &= (ncc > MIN_NCC) & (np.linalg.norm(uv - after, axis=1) < ALIGNED_PX)
         self._alive = replace(alive, uv=uv, flow=uv - before, A=A).some(good)
 
     def _predicted(self) -> np.ndarray:
@@ -124,13 +132,13 @@ class Tracker:
         median = np.median(flow[known], axis=0) if known.any() else np.zeros(2)
         return np.where(known[:, None], flow, median).astype(np.float32)
 
-    def _begin(self, even: np.ndarray, smooth: np.ndarray) -> None:
+    def _add_features(self, even: np.ndarray, smooth: np.ndarray) -> None:
         """New tracks at the strongest corner of each cell that has none."""
         uv = self._corners(even)
         first, good = cut_templates(smooth, uv)
-        feature = self._begun + np.arange(int(good.sum()))
-        self._begun += len(feature)
-        self._alive = self._alive.joined(_Tracks.begun(feature, uv[good], first.some(good)))
+        feature = self._next_id + np.arange(int(good.sum()))
+        self._next_id += len(feature)
+        self._alive = self._alive.joined(_Tracks.new(feature, uv[good], first.some(good)))
 
     def _corners(self, even: np.ndarray) -> np.ndarray:
         """(n, 2) whole pixels: the strongest corner of each empty cell, apart from tracks. Corners are sought at half
