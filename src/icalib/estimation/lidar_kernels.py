@@ -141,7 +141,7 @@ def _times_root(A, root, B):
         B[i, 3] = A[i, 3] * root[9]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _add_to_pose(B, A, slant, G):
     """The pose part of one plane in one bin to G (6, 7), with the gradient of slant . (1, R^T n), which bends too
     little to count."""
@@ -152,7 +152,7 @@ def _add_to_pose(B, A, slant, G):
         G[i, POSE] += A[i, 1] * slant[1] + A[i, 2] * slant[2] + A[i, 3] * slant[3]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _add_plane(k, B, T, columns, own, sums, V):
     """What the columns `own` of one plane in one bin share in, to the sums; V (3, w): work space."""
     n_b, n_nodes = sums.border.shape[0] - 1, T.shape[1] - len(columns)
@@ -182,7 +182,7 @@ def _add_plane(k, B, T, columns, own, sums, V):
                 sums.border[n_b, own[t]] += s
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _add_slant(A, slant, own, sums):
     """The gradient of slant . (1, R^T n) by the plane, to the sums."""
     n_b = sums.border.shape[0] - 1
@@ -239,7 +239,7 @@ def _add_pose(k, G, T, columns, sums, F, row):
         _add_row(k, i, n_nodes, row, columns, sums)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _take_off(k, walk, n_nodes, columns, of_plane, sums):
     """Ends a walk from node k; returns what it takes off the chi^2."""
     own, V = border_of(walk, columns, of_plane), taken_off(walk)
@@ -254,7 +254,7 @@ def _take_off(k, walk, n_nodes, columns, of_plane, sums):
     return V[0, last] ** 2 + V[1, last] ** 2 + V[2, last] ** 2
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _ends_here(i, bins):
     """Whether bin i is the last on its side of its node."""
     if i + 1 == len(bins.node) or bins.node[i + 1] != bins.node[i]:
@@ -288,7 +288,7 @@ def _work_space(motion):
     )  # fmt: skip
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _see(e, i, bins, motion, planes, work, rows):
     """Whitened residuals of entry e, in bin i. Returns half their chi^2 and what their variances add as beams turn."""
     _distances(motion.R_lidar_world[i], motion.p_world_lidar[i], bins.plane[e], planes, work.m)

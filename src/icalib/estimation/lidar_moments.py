@@ -84,7 +84,7 @@ def to_centres(motion, each, ok, cells):
                         cells.turn[b, i, j] += R[k, i] * motion.rotation[b, k, j]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _see_plane(R, p, plane, seen):
     """seen (4,): (n . p - d, R^T n), so that seen . (1, x) is the distance of a point x in the LiDAR's frame."""
     seen[0] = 0.0
@@ -161,7 +161,7 @@ def _add_points(points, begin, end, turn, shift, rate, velocity, seen, weights, 
         sums[k] += own[k]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _root_in_place(M):
     """Moments (10,) -> their lower Cholesky factor; where a pivot is nothing but rounding, its column is 0."""
     for j in range(4):
@@ -178,7 +178,7 @@ def _root_in_place(M):
             M[i * (i + 1) // 2 + j] = s * f
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _bin_scan(i, scans, motion, cells, each, planes, weights, sorted_points, entries, total):
     """Entries of scan i, from `total` on, in the order of bins and planes; returns how many there are then."""
     bins, plane, count, root, slant = entries

@@ -34,7 +34,7 @@ class Walk(NamedTuple):
     n_met: np.ndarray
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def no_walk(width, n_planes):
     """No bin yet."""
     nothing = np.zeros((n_planes, 3, PLANE))
@@ -43,7 +43,7 @@ def no_walk(width, n_planes):
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def add_entry(turned, slope, row, B, by_pose, walk):
     """One plane in a bin: turned (3, 4), slope (3,) as in `Bins`; row (4,) its whitened residuals; B (>= 6, 4) their
     derivatives by the bin's pose first, of which by_pose (3, 6) gathers what they share with the turn."""
@@ -59,7 +59,7 @@ def add_entry(turned, slope, row, B, by_pose, walk):
                 by_pose[a, j] += d * B[j, c]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def add_pose(by_pose, T, walk):
     """What a bin's entries gathered, T (6, w) its pose by nodes and columns."""
     for a in range(3):
@@ -68,7 +68,7 @@ def add_pose(by_pose, T, walk):
                 walk.by_pose[a, i] += by_pose[a, j] * T[j, i]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def add_plane(turned, B, q, walk):
     """Plane q in a bin, B (10, 4) with the derivatives by the plane after those by the pose."""
     known = False
@@ -83,7 +83,7 @@ def add_plane(turned, B, q, walk):
                 walk.by_plane[q, a, t] += turned[a, c] * B[POSE + t, c]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def border_of(walk, columns, of_plane):
     """(m,) border columns of what was summed: `columns` (c,), which act through the pose, then those of the planes,
     of_plane (P, 3)."""
@@ -97,7 +97,7 @@ def border_of(walk, columns, of_plane):
     return own
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def taken_off(walk):
     """V (3, w + m + 1), V^T V what is taken off the sums of nodes, border and residual, the border in the order of
     `border_of`. The walk is empty again."""

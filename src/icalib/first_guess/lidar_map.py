@@ -178,7 +178,7 @@ def _voxel_at(voxels, y, around):
     return found
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _derivatives(R, normal, y, J):
     """J (6,) of a distance by turn and position; n . (-R [z]x d) = d . (z x R^T n)."""
     b0 = R[0, 0] * normal[0] + R[1, 0] * normal[1] + R[2, 0] * normal[2]
@@ -189,7 +189,7 @@ def _derivatives(R, normal, y, J):
         J[3 + a] = normal[a]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _add_products(product, tau, by_0, by_1, by_2):
     """A loop that the compiler makes a few instructions of."""
     for k in range(PRODUCTS):

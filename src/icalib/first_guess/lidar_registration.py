@@ -79,7 +79,7 @@ def _add_row(i, r, sigma, mean, H, g):
         g[j] -= w * mean * r
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def add_expected(e, pose, H, g):
     """Adds to the normal equations (12, 12), (12,) that rates change little, and poses by the mean of the rates around
     them, in units of POINT_SIGMA_M."""
