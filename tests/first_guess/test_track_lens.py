@@ -11,7 +11,7 @@ import pytest
 from icalib.errors import EstimationError
 from icalib.estimation.imu_data import ImuData
 from icalib.first_guess.track_lens import find_lens
-from icalib.first_guess.track_rotation import start_direction, turn_information
+from icalib.first_guess.track_rotation import start_direction, track_rates, turn_information
 from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets import NoTarget
@@ -73,10 +73,10 @@ def off_px(simulation: Simulation, lens: np.ndarray) -> float:
 
 @pytest.mark.parametrize("lens", LENSES)
 def test_every_model_is_found(lens: str):
-    """To 2.5 mrad: half a pixel of a fisheye lens, two of a long one."""
+    """To 3 mrad: half a pixel of a fisheye lens, two of a long one."""
     simulation = drive(lens)
     found, model = found_lens(simulation), camera_model(LENSES[lens][0])
-    assert off_px(simulation, found) < 2.5e-3 * model.central_scale(found)
+    assert off_px(simulation, found) < 3e-3 * model.central_scale(found)
 
 
 @pytest.mark.parametrize(("example", "noise_px", "most_px"), [
@@ -141,6 +141,20 @@ def test_a_guess_of_half_the_focal_length_is_replaced_and_a_fixed_value_is_named
         return
     found = calibrate_measurements(rig, simulation.measurements).group("cam0", "intrinsics")
     assert (np.abs(found.value - true) < 3.5 * found.std).all()
+
+
+def test_turns_of_a_camera_that_moves_sideways_end_in_no_local_minimum():
+    """From the turn that fits best without motion one in four ends 3 to 10 degrees off."""
+    scenario = load_scenario(PAPER / "table2-3d.yaml")
+    camera = replace(scenario.cameras[1], corner_noise_px=0.5)
+    simulation = simulate(replace(scenario, duration_s=20.0, cameras=(camera,), lidars=(), wheels=()), 2)
+    stream, truth, measured = simulation.measurements.tracks[0], simulation.truth, simulation.measurements
+    lens = np.append(truth.intrinsics["cam1"], truth.distortion["cam1"])
+    rates = track_rates(stream, camera_model(camera.model), lens, chained=True)
+    later = (stream.origin_ns - measured.origin_ns) * 1e-9 + truth.time_offset["cam1"] + truth.seconds[0]
+    a, b = (truth.pose_at(t + later)[0] @ truth.T_imu_cam["cam1"][:3, :3] for t in (rates.start, rates.end))
+    off = so3.log_many(np.ascontiguousarray(a.transpose(0, 2, 1) @ b)) - rates.rate * 0.4
+    assert np.rad2deg(np.linalg.norm(off, axis=1)).max() < 2.5
 
 
 def test_slopes_by_the_lens_are_those_of_the_epipolar_errors():

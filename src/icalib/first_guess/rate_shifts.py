@@ -25,6 +25,7 @@ SHORTEST_STEP = 0.75  # times the period of the images
 # Of the logarithm of the likelihood ratio of three times three coefficients, twice which is chi^2 of nine degrees of
 # freedom: by chance less than once in 1000, at any of some hundred shifts.
 LEAST_SCORE = 15.0
+CLEARLY_BETTER = 1.3  # times the score
 SLOW = 3.0  # times the noise of rates: those that vary by less may not show
 NORM_MEDIAN = 1.538  # of three standard normal components
 POINTS = 10  # of the grid in an interval: shifts are found to a twentieth of it
@@ -77,19 +78,32 @@ def telling_rates(imu: ImuData, stream: TrackStream, model: CameraModel, lens: n
     found: list[tuple[float, CameraRates]] = []
     for step in steps:
         try:
-            rates = track_rates(stream, model, lens, step)
+            found += _scored(imu, stream, model, lens, step)
         except EstimationError as error:
             failed = failed or error
             continue
-        shifts = best_regressions(imu, rates)
-        likely = tuple(s.offset for s in shifts if s.score > LEAST_SCORE)
-        found.append((max((s.score for s in shifts), default=-np.inf), replace(rates, offsets=likely)))
-        if likely:
+        if found[-1][1].offsets:
             break
     if not found:
         assert failed is not None
         raise failed
     return max(found, key=lambda x: x[0])[1]
+
+
+def _scored(
+    imu: ImuData, stream: TrackStream, model: CameraModel, lens: np.ndarray, step: float
+) -> list[tuple[float, CameraRates]]:
+    """Rates, and how well they go with the gyroscope's. Where a camera moves far sideways, the turn that fits best
+    without any motion often leads to a local minimum, and that of the interval before does not; with a guessed lens it
+    may be the other way round: the gyroscope tells."""
+    found = []
+    for chained in (False, True):
+        rates = track_rates(stream, model, lens, step, chained=chained)
+        shifts = best_regressions(imu, rates)
+        likely = tuple(s.offset for s in shifts if s.score > LEAST_SCORE)
+        found.append((max((s.score for s in shifts), default=-np.inf), replace(rates, offsets=likely)))
+    (plain, _), (score, _) = found
+    return found[1:] if score > CLEARLY_BETTER * plain else found[:1]
 
 
 def noise_beside(imu: ImuData, rates: CameraRates, averaged: float = 0.0) -> float:

@@ -108,18 +108,20 @@ def _move_direction(t, a, b, da, db):
 @njit(cache=True, nogil=True)
 def turn_between(f, h, R, t):
     """R and t (unit), improved: rays f (n, 3) and h (n, 3) of the same points in two images lie in planes with t,
-    h ~ R f + s t. False where that is singular."""
+    h ~ R f + s t. Returns the sum of the weighted squares of the errors [rad^2] before the last step, infinite where
+    that is singular."""
     a, b, A, x, stiff = np.empty(3), np.empty(3), np.empty((5, 5)), np.empty(5), np.empty((len(f), 0, 3))
+    left = np.inf
     for _ in range(ROUNDS):
-        _epipolar_sums(f, h, stiff, stiff, R, t, a, b, A, x)
+        left = _epipolar_sums(f, h, stiff, stiff, R, t, a, b, A, x)
         mean = DAMPING * (A[0, 0] + A[1, 1] + A[2, 2])
         for r in range(5):
             A[r, r] += mean
         if not solve_definite(A, x):
-            return False
+            return np.inf
         R[:] = so3.exp(x[:3].copy()) @ R
         _move_direction(t, a, b, x[3], x[4])
-    return True
+    return left
 
 
 @njit(cache=True, nogil=True)
@@ -188,21 +190,27 @@ def start_turn(f: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def track_rates(
-    stream: TrackStream, model: CameraModel, params: np.ndarray, step: float = STEP_S, thinned: bool = False
+    stream: TrackStream,
+    model: CameraModel,
+    params: np.ndarray,
+    step: float = STEP_S,
+    thinned: bool = False,
+    chained: bool = False,
 ) -> CameraRates:
     """Mean angular rates from images to the ones about `step` s later, with their noise, from how far rays miss their
-    epipolar planes; `thinned`: not from every image, where intervals overlap much. Raises EstimationError where hardly
-    any images share enough points."""
+    epipolar planes; `thinned`: not from every image, where intervals overlap much; `chained`: sought from the turn of
+    the interval before, too. Raises EstimationError where hardly any images share enough points."""
     rays, valid = model.unproject(params, stream.uv)
-    t, found, noise = stream.seconds, [], []
+    t, found, noise, before = stream.seconds, [], [], None
     every = max(1, int(MOST_SHARED * step / float(np.median(np.diff(t))))) if thinned else 1
     for i, j in image_pairs(stream, step)[::every]:
         p, q = common(stream, valid, i, j)
         if len(p) < FEWEST_COMMON:
             continue
         f, h = rays[p], rays[q]
-        R, direction = start_turn(f, h)
-        if turn_between(f, h, R, direction):
+        left, R, direction = _best_turn(f, h, before)
+        if np.isfinite(left):
+            before = (R, direction) if chained else None
             found.append((t[i], t[j], *(-so3.log(R) / (t[j] - t[i]))))
             if len(found) % NOISE_EVERY == 0:
                 noise.append(turn_error(f, h, R, direction)[0] / (t[j] - t[i]))
@@ -214,6 +222,19 @@ def track_rates(
     rows = np.array(found)
     start, end, rate = rows[:, 0].copy(), rows[:, 1].copy(), rows[:, 2:].copy()
     return CameraRates(start, end, rate, LEAST_CORRELATION, noise=float(np.median(noise)))
+
+
+def _best_turn(
+    f: np.ndarray, h: np.ndarray, before: tuple[np.ndarray, np.ndarray] | None
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """What is left, and turn and direction of two images, from the turn that fits best without any motion, or where
+    there are some from those of the two images `before`, whichever leaves less."""
+    found = []
+    for start in (start_turn(f, h), before):
+        if start is not None:
+            R, t = start[0].copy(), start[1].copy()
+            found.append((turn_between(f, h, R, t), R, t))
+    return min(found, key=lambda x: x[0])
 
 
 def turn_error(f: np.ndarray, h: np.ndarray, R: np.ndarray, t: np.ndarray) -> tuple[float, float]:
