@@ -55,6 +55,7 @@ def write(imu: ImuStream, folder: Path) -> Path:
     return folder / "recording"
 
 
+@pytest.mark.slow
 def test_three_hours_give_densities_and_walks():
     """The bounds of the task: 5 % and 20 %, at 200 and at 100 Hz; the standard deviations say far less."""
     for rate, seed in ((200.0, 1), (100.0, 2)):

@@ -19,6 +19,8 @@ from icalib.rig_file import load_target
 from icalib.simulation import Imaging, Renderer, Sheet
 from icalib.simulation.scenario import SimCamera
 
+pytestmark = pytest.mark.slow
+
 SIZE = (752, 480)
 CHARUCO = Charuco(6, 8, 0.035, 0.026, "4x4_50")
 GRID = AprilGrid(3, 4, 0.05, 0.3, first_id=36, family="tag36h10")

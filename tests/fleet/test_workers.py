@@ -17,6 +17,8 @@ from icalib.errors import CalibrationError
 from icalib.fleet import Crew, run_fleet
 from icalib.fleet.jobs import load_jobs
 
+pytestmark = pytest.mark.slow
+
 NAMES = ["anton-r0", "anton-turned", "berta-r0", "berta-r1"]
 _FLEET = """
 import sys

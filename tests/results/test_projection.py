@@ -15,6 +15,8 @@ from icalib.calibration import Calibration, projection_uncertainty
 from icalib.calibration.projection import projection_std, working_distance
 from icalib.geometry.cameras import CAMERA_MODELS, camera_model
 
+pytestmark = pytest.mark.slow
+
 DRAWS = 1200
 LENSES = {
     "pinhole-radtan": [458.0, 457.0, 367.0, 248.0, -0.28, 0.074, 2e-4, 2e-5],

@@ -22,6 +22,8 @@ from icalib.pipeline import calibrate_measurements
 from icalib.report import report_html
 from icalib.simulation import Scenario, load_scenario, rig_for, simulate, with_drawn_guess
 
+pytestmark = pytest.mark.slow
+
 EXAMPLE = Path(__file__).parents[2] / "examples" / "paper" / "table2-3d.yaml"
 MOVED_PX, EVERY = 40.0, 211  # of some observations
 

@@ -70,7 +70,7 @@ def test_relative_poses(robot, tmp_path):
 @pytest.mark.parametrize("name", ["run", "run.bag"])
 @pytest.mark.parametrize("measures", ["rates", "angles"])
 def test_bags(simulation, tmp_path, name, measures):
-    bare = replace(simulation, scenario=replace(simulation.scenario, board=False))
+    bare = replace(simulation, scenario=replace(simulation.scenario, board=False, cameras=()))  # images take long
     write_sensors(bare, 3, tmp_path / name)
     found = read_measurements(open_recording(tmp_path / name), rig(tmp_path, measures))
     same_scans(found.lidars[0], simulation.measurements.lidars[0], with_planes=False)
