@@ -45,6 +45,22 @@ def test_names_stand_in_the_order_of_the_rig_and_say_nothing_twice():
     assert observe(found, names).undetermined[0].startswith("left_cam time offset: ")
 
 
+@pytest.mark.parametrize(
+    ("parameter", "wheels", "tracking", "advice"),
+    [
+        ("cam0.distortion.k1", (), (), "show the target in the corners of the image"),
+        ("cam0.distortion.k1", (), ("cam0",), "points of the scene pass through the corners of the image"),
+        ("cam0.translation.x", (), ("cam0",), "turn the rig about two more axes"),
+        ("wheel0.translation.z", ("wheel0",), ("cam0",), "turn, and drive over ramps"),
+    ],
+)
+def test_the_missing_motion_is_that_of_the_sensor(parameter, wheels, tracking, advice):
+    found = shared(50.0)
+    found.held, found.spread, found.covariance = np.ones((1, 1)), np.full(1, 50.0), np.eye(1)
+    (sentence,) = observe(found, (parameter,), wheels, tracking).undetermined
+    assert advice in sentence
+
+
 def test_an_answer_that_did_not_converge_determines_nothing():
     names = tuple(f"{s}.rotation.z" for s in SENSORS) + ("cam0.time_offset.time_offset",)
     assert observe(shared(1.0, converged=False), names).verdicts == ("undetermined",) * 6

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,6 +38,11 @@ ON_THE_GROUND = {
     "rotation": "drive over ramps: on a flat floor wheels do not show how they are tilted",
     "time_offset": "speed up, brake and turn more",
 }
+# Of cameras without a target, which track points of the scene.
+WITHOUT_TARGET = {
+    "intrinsics": "turn and move the rig so that near and far points of the scene cross the whole image",
+    "distortion": "turn the rig so that points of the scene pass through the corners of the image",
+}
 
 
 @dataclass(frozen=True)
@@ -49,16 +54,20 @@ class Observability:
     undetermined: tuple[str, ...]
 
 
-def observe(found: Determined, names: tuple[str, ...], wheels: Collection[str] = ()) -> Observability:
+def observe(
+    found: Determined, names: tuple[str, ...], wheels: Collection[str] = (), tracking: Collection[str] = ()
+) -> Observability:
     """Verdicts by what the data alone say: determined where they know a parameter to a tolerance, nothing where the
-    solver did not converge. `names` (B,) as in "cam0.translation.x"; `wheels`: which sensors are wheels."""
+    solver did not converge. `names` (B,) as in "cam0.translation.x"; `wheels`: which sensors are wheels; `tracking`:
+    which are cameras without a target."""
     directions = sparse_basis(found.held)
     share = (directions**2).sum(axis=1)
     verdicts: list[Verdict] = []
     for part, spread in zip(share, found.spread, strict=True):
         is_open = part > SHARE or spread > SPREAD or not found.estimate.outcome.converged
         verdicts.append("undetermined" if is_open else "determined" if spread <= 1.0 else "weak")
-    sentences = tuple(_sentence(u, names, wheels) for u in directions.T)
+    advice = dict.fromkeys(wheels, ON_THE_GROUND) | dict.fromkeys(tracking, WITHOUT_TARGET)
+    sentences = tuple(_sentence(u, names, advice) for u in directions.T)
     return Observability(found.covariance, tuple(verdicts), sentences)
 
 
@@ -74,14 +83,15 @@ def sparse_basis(directions: np.ndarray, rounds: int = 50) -> np.ndarray:
     return directions @ turn if m else np.zeros((n, 0))
 
 
-def _sentence(direction: np.ndarray, names: tuple[str, ...], wheels: Collection[str]) -> str:
+def _sentence(direction: np.ndarray, names: tuple[str, ...], advice: Mapping[str, Mapping[str, str]]) -> str:
+    """advice: by sensor and kind of parameter, where it is another than that of MISSING_MOTION."""
     order = np.argsort(-np.abs(direction))
     # By the rig, not by size: where all move alike, noise would decide which comes first.
     parts = sorted(i for i in order[:MOST_NAMED] if abs(direction[i]) >= NAMED) or [order[0]]
     words = " with ".join(_words(names[i]) for i in parts)
     sensor, kind, _ = names[order[0]].rsplit(".", 2)
-    motions = MISSING_MOTION | (ON_THE_GROUND if sensor in wheels else {})
-    return f"{words}: not determined by this motion; {motions.get(kind, 'move the rig more')}."
+    motion = advice.get(sensor, {}).get(kind) or MISSING_MOTION.get(kind, "move the rig more")
+    return f"{words}: not determined by this motion; {motion}."
 
 
 def _words(name: str) -> str:

@@ -77,7 +77,8 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
     found = determined.estimate
     problem, outcome = found.problem, found.outcome
     names = _column_names(inputs)
-    seen = observe(determined, names, [w.name for w in inputs.rig.wheels])
+    tracking = [] if inputs.rig.has_target else [c.name for c in inputs.rig.cameras]
+    seen = observe(determined, names, [w.name for w in inputs.rig.wheels], tracking)
     parts = Parts.of(problem, outcome, inputs.rig.settings.splits)
     empirical = _empirical_variance(found, parts, np.diag(seen.covariance))
     groups = _groups(inputs, found, seen, empirical)
