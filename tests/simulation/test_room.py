@@ -58,6 +58,20 @@ def test_rays_meet_hills_where_they_pass_below_them(robot, rays):
     assert 11.0 < np.rad2deg(np.arctan(slope.max())) <= 12.0
 
 
+def test_a_ray_from_the_ground_leaves_it(robot):
+    """As those of a sensor whose frame is that of the wheels, on the ground."""
+    hills = hills_of_slope(12.0)
+    room = replace(robot.room, hills=hills)
+    xy = np.random.default_rng(1).uniform(-2.0, 2.0, (50, 2))
+    origins = np.column_stack([xy, hills.height(xy)])
+    upwards, downwards = (np.tile([0.1, 0.05, z], (50, 1)) for z in (0.5, -0.5))
+    found = np.empty(50)
+    distances(room.surfaces, origins, upwards, found)
+    np.testing.assert_allclose(found, [met(room, o, d) for o, d in zip(origins, upwards, strict=True)], rtol=1e-10)
+    distances(room.surfaces, origins, downwards, found)
+    np.testing.assert_allclose(found, 0.0, atol=1e-8)
+
+
 def test_planes_and_points_are_those_of_the_faces(robot):
     planes, faces = robot.room.planes, robot.room.faces
     for (nx, ny, nz, d), (o, u, v, _) in zip(planes, faces, strict=True):

@@ -228,7 +228,8 @@ def ground(surfaces, px, py, pz, dx, dy, dz, limit):
     """t at which the ray meets the hills before `limit`, else inf; NaN where it takes too many steps.
 
     The height above the ground has a second derivative of at most `bend` along the ray. Each step ends where a parabola
-    of that curvature would meet the ground first: it never passes through, and near the end it is Newton's.
+    of that curvature would meet the ground first: it never passes through, and near the end it is Newton's. A ray that
+    leaves from the ground does not meet it there.
     """
     bend, highest = 0.0, 0.0
     for w in range(len(surfaces.amplitude)):
@@ -245,8 +246,9 @@ def ground(surfaces, px, py, pz, dx, dy, dz, limit):
             angle = kx * (px + t * dx) + ky * (py + t * dy) + surfaces.phase[w]
             gap -= amplitude * np.sin(angle)
             slope -= amplitude * np.cos(angle) * (kx * dx + ky * dy)
-        if gap < _CLOSE_M:
+        if gap < _CLOSE_M and slope < 0.0:
             return t
+        gap = max(gap, 0.0)
         root = np.sqrt(slope * slope + 2.0 * bend * gap)
         t += (slope + root) / bend if slope > 0.0 else 2.0 * gap / (root - slope)
         if t >= limit:
