@@ -30,6 +30,7 @@ from icalib.simulation import (
 from icalib.simulation.bag_writer import IMU, IMU_TOPIC, BagForm, BagWriter
 
 _AT = "[[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
+_ABOVE = "[[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 1.5], [0, 0, 0, 1]]"
 _AHEAD = "[[0, 0, 1, 0.1], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]"
 _SCENARIO = f"""\
 duration: %g
@@ -49,12 +50,12 @@ sensors:
     distortion: [0, 0, 0, 0]
     noise_px: 0.3
     T_imu_sensor: {_AHEAD}
-  lidar0: {{type: lidar, rate: 5, rings: 16, azimuth_steps: 90, noise: 0.02, T_imu_sensor: {_AT}}}
+  lidar0: {{type: lidar, rate: 5, rings: 16, azimuth_steps: 90, noise: 0.02, T_imu_sensor: {_ABOVE}}}
   pose0: {{type: pose, rate: 20, rotation_noise: 0.002, position_noise: 0.002, T_imu_sensor: {_AT}}}
   wheel0: {{type: wheels, rate: 20, radii: [0.1, 0.1], baseline: 0.4, noise: 0.03, T_imu_sensor: {_AT}}}
 room:
   size: [8, 6, 3]
-  slope_deg: 5
+  slope_deg: 2
 target: {{type: aprilgrid, rows: 6, cols: 6, tag_size: 0.3, tag_spacing: 0.3, T_world_board: {_AT}}}
 """
 QUIET = ("--splits", "0", "-q")
