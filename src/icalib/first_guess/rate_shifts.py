@@ -34,7 +34,7 @@ LEAST_SPREAD = 1e-3  # of the mean square, that rates count with about each axis
 
 @dataclass(frozen=True)
 class Regression:
-    """offset: t_imu - t_camera, both since their clock's first stamp [s]; score: half the logarithm of the likelihood
+    """offset: t_imu - t_camera, both since their clock's first stamp [s]; score: the logarithm of the likelihood
     ratio, with as many samples as intervals fit side by side."""
 
     offset: float

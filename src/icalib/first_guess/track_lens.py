@@ -134,7 +134,7 @@ def _scaled(imu: ImuData, rates: CameraRates, offset: float, name: str) -> tuple
     found = [(*_turned(gyro, rates.rate[inside] * [scale, scale, 1.0]), float(scale)) for scale in SCALES]
     left, R, bias, scale = min(found, key=lambda x: x[0])
     spread = float(np.median(np.linalg.norm(gyro - np.median(gyro, axis=0), axis=1)))
-    return Alignment(offset, R, bias), scale, left / spread
+    return Alignment(offset, R, bias), scale, left / max(spread, 1e-9)
 
 
 def _turned(gyro: np.ndarray, seen: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:

@@ -105,7 +105,7 @@ class RoomRenderer:
 
 
 def _sides(rays: np.ndarray) -> np.ndarray:
-    """`Lens.sides` of rays (h s, w s, 3): the smallest pyramid of rectangular base about a tile's mean ray."""
+    """`Lens.sides` of rays (h s, w s, 3): a pyramid of rectangular base about a tile's mean ray that holds the tile."""
     step = TILE * CELLS
     down, across = (-(-n // step) for n in rays.shape[:2])
     sides = np.zeros((down, across, 4, 3))

@@ -117,7 +117,8 @@ def _affine_row(slope, dy, dx, row):
 @njit(cache=True, nogil=True)
 def align(image, templates, uv, A, ncc):
     """Moves uv (n, 2) and A (n, 2, 2) to where the image (h, w) float32 shows each first view: uv + A x shows what
-    the first view has at x. ncc (n,): correlation of both, -1 where the patch leaves the image or the steps diverge.
+    the first view has at x. ncc (n,): correlation of both, -1 where the patch leaves the image, has too
+    little contrast, or the steps do not converge.
     """
     seen, row, b, step = np.empty((SIDE, SIDE)), np.empty(6), np.empty(6), np.empty(6)
     for n in range(len(uv)):

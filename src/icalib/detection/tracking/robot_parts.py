@@ -11,7 +11,8 @@ NEAR_PX = 64.0  # a track that does not move so near to a point in place is in p
 
 
 def stay_in_place(start: np.ndarray, feature: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """(F,) bool, by number of the feature: whether it stays in place over its life while the image moves.
+    """(F,) bool, by number of the feature: whether it stays in place while the image moves from the feature's first view
+    to its last.
 
     start (M + 1,), feature (N,) and uv (N, 2) as in `TrackStream`, features numbered from 0. The image moves by the
     median motion of its points, each component by itself: a turn of the camera moves all points alike, while a camera
