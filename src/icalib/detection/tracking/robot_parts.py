@@ -11,7 +11,7 @@ NEAR_PX = 64.0  # a track that does not move so near to a point in place is in p
 
 
 def stay_in_place(start: np.ndarray, feature: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """(F,) bool, by number of the feature: whether it stays in place while the image moves from the feature's first view
+    """(F,) bool, by number of the feature: whether it stays in place while the image moves, from its first view
     to its last.
 
     start (M + 1,), feature (N,) and uv (N, 2) as in `TrackStream`, features numbered from 0. The image moves by the
