@@ -63,6 +63,7 @@ def _largest(image: np.ndarray) -> list[tuple[int, int]]:
     """Inner corners of the sides, the shorter first, of the largest checkerboard that OpenCV finds; [] if none."""
     cv2 = load_cv2()
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
+    cv2.setRNGSeed(0)  # the search draws at random
     found, _, meta = cv2.findChessboardCornersSBWithMeta(image, (_LEAST_SIDE, _LEAST_SIDE), flags)
     return [(min(meta.shape), max(meta.shape))] if found else []
 

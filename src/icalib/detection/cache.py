@@ -18,7 +18,7 @@ from icalib.recordings import Payload
 from icalib.staging import staged
 from icalib.unpacking import load_arrays
 
-VERSION = 7  # of the detectors and of the format: whatever changes corners changes this
+VERSION = 8  # of the detectors and of the format: whatever changes corners changes this
 _FIELDS = ("point", "uv", "sigma", "blur", "verdict", "edges")
 
 

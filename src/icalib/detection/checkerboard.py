@@ -93,6 +93,7 @@ class CheckerboardDetector:
             return
         cv2 = load_cv2()
         flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
+        cv2.setRNGSeed(0)  # the search draws at random: what an image shows must not depend on those before it
         found, corners = cv2.findChessboardCornersSB(image, (self.cols, self.rows), flags=flags)
         if found:
             yield self._grid(corners)
@@ -105,6 +106,7 @@ class CheckerboardDetector:
             return
         cv2 = load_cv2()
         flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+        cv2.setRNGSeed(0)
         found, corners = cv2.findChessboardCorners(image, (self.cols, self.rows), flags=flags)
         if found:
             yield factor * (self._grid(corners) + 0.5) - 0.5
