@@ -30,7 +30,7 @@ from icalib.measurements import TrackStream
 from icalib.recordings import DamagedImageError, Payload, Recording, decode
 from icalib.rig import Camera
 
-VERSION = 2  # of the tracker: whatever changes tracks changes this
+VERSION = 3  # of the tracker: whatever changes tracks changes this
 SEGMENT, SEGMENT_BYTES = 120, 128 << 20  # images that are tracked in one go; of larger ones none wait in memory
 LEAST_APART_NS = 35_000_000  # between images with observations; those between serve to track, and add little
 FEWEST_VIEWS = 3  # of a track; two images of one point are met by almost any pose

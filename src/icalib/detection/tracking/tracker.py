@@ -17,6 +17,7 @@ from icalib.extras import load_cv2
 CELLS = 100  # of an image; each begins one track at a time
 MOST_VIEWS = 30  # of a track; later views differ too much from the first, and long tracks cost the estimator time
 WINDOW_PX, MAX_LEVEL = 21, 3  # of Lucas-Kanade: motions of up to 80 px between images
+LK_ENDS = 10, 0.05  # steps, and px of the last: the alignment that follows is finer
 CLIP, TILES = 3.0, (8, 8)  # of the equalisation (CLAHE)
 BLUR_PX = 0.8  # before alignment: grey levels between pixels are then linear enough
 BACK_PX = 0.7  # forward and backward must meet
@@ -109,14 +110,14 @@ class Tracker:
         """Lucas-Kanade and alignment with the first views; tracks that are lost end."""
         cv2, alive = self._cv2, self._alive
         before = alive.uv.astype(np.float32)
-        size = (WINDOW_PX, WINDOW_PX)
+        size, end = (WINDOW_PX, WINDOW_PX), (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, *LK_ENDS)
         after, found, _ = cv2.calcOpticalFlowPyrLK(
             self._before, even, before, before + self._predicted(), winSize=size, maxLevel=MAX_LEVEL,
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+            criteria=end, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         )  # fmt: skip
         back, returned, _ = cv2.calcOpticalFlowPyrLK(
             even, self._before, after, before.copy(), winSize=size, maxLevel=0,
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+            criteria=end, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         )  # fmt: skip
         good = (found.ravel() > 0) & (returned.ravel() > 0) & (np.linalg.norm(back - before, axis=1) < BACK_PX)
         uv, A, ncc = after.astype(np.float64), alive.A.copy(), np.full(len(before), -1.0)
