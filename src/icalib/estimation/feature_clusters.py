@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.estimation.corner_chain import add_clusters, pose_chain
 from icalib.estimation.feature_kernels import weighted_rows
 

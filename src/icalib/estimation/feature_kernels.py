@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.estimation.corner_chain import add_image, pose_chain
 from icalib.estimation.corner_weights import bend, weight
 from icalib.geometry.blas import subtract_gram

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numba import njit
 from scipy.optimize import OptimizeResult, least_squares
 
+from icalib.compiled import njit
 from icalib.errors import EstimationError
 from icalib.estimation.lidar_sweep import Motion
 from icalib.estimation.poses import Poses

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numba import njit
 
+from icalib.compiled import njit
 from icalib.errors import EstimationError
 from icalib.first_guess.clock_shifts import CameraRates
 from icalib.geometry import so3
