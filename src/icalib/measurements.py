@@ -184,6 +184,14 @@ class TrackStream:
         return np.repeat(np.arange(len(self.stamps_ns)), np.diff(self.start))
 
 
+def shared_rows(start: np.ndarray, feature: np.ndarray, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of the features that images i and j share, as i and as j saw them; start (M + 1,), feature (N,) as in
+    `TrackStream`."""
+    own, other = feature[start[i] : start[i + 1]], feature[start[j] : start[j + 1]]
+    _, p, q = np.intersect1d(own, other, return_indices=True)
+    return p + start[i], q + start[j]
+
+
 @dataclass(frozen=True)
 class LidarStream:
     """Points of one LiDAR, scan by scan.

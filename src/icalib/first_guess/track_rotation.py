@@ -12,7 +12,7 @@ from icalib.first_guess.clock_shifts import CameraRates
 from icalib.geometry import so3
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.small import solve_definite
-from icalib.measurements import TrackStream
+from icalib.measurements import TrackStream, shared_rows
 
 FEWEST_COMMON = 12  # points in two images
 FEWEST_RATES = 20
@@ -279,8 +279,6 @@ def _shortened(stream: TrackStream, valid: np.ndarray, steps: Sequence[float]) -
 
 def common(stream: TrackStream, valid: np.ndarray, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
     """Rows of the points that images i and j share, as i and as j saw them."""
-    own, after = (slice(stream.start[k], stream.start[k + 1]) for k in (i, j))
-    _, p, q = np.intersect1d(stream.feature[own], stream.feature[after], return_indices=True)
-    p, q = p + own.start, q + after.start
+    p, q = shared_rows(stream.start, stream.feature, i, j)
     seen = valid[p] & valid[q]
     return p[seen], q[seen]

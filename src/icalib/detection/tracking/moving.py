@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from icalib.detection.tracking.epipolar import FEWEST, epipolar_errors
+from icalib.measurements import shared_rows
 
 APART = (1, 4)  # images: each is compared with these before it
 LENS_APART, LENS_PAIRS = 6, 8  # pairs of images that show how the lens distorts
@@ -26,7 +27,7 @@ def moving_features(start: np.ndarray, feature: np.ndarray, uv: np.ndarray, reso
     tried, failed = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
     for apart in APART:
         for k in range(apart, len(start) - 1):
-            before, after = _common(start, feature, k - apart, k)
+            before, after = shared_rows(start, feature, k - apart, k)
             if len(before) < FEWEST:
                 continue
             error, sigma = epipolar_errors(xy[before], xy[after], lam, k)
@@ -39,7 +40,9 @@ def moving_features(start: np.ndarray, feature: np.ndarray, uv: np.ndarray, reso
 def _lambda(start: np.ndarray, feature: np.ndarray, xy: np.ndarray) -> float:
     """The distortion (lambda of the division model) with which most points fit, in the mean over pairs of images."""
     firsts = np.unique(np.linspace(0, max(len(start) - 2 - LENS_APART, 0), LENS_PAIRS).astype(int))
-    pairs = [_common(start, feature, int(k), int(k) + LENS_APART) for k in firsts if k + LENS_APART < len(start) - 1]
+    pairs = [
+        shared_rows(start, feature, int(k), int(k) + LENS_APART) for k in firsts if k + LENS_APART < len(start) - 1
+    ]
     return best_lambda([(xy[p], xy[q]) for p, q in pairs if len(p) >= FEWEST])
 
 
@@ -47,10 +50,3 @@ def best_lambda(pairs: list[tuple[np.ndarray, np.ndarray]]) -> float:
     """The distortion with the least mean error over pairs of images, of points (n, 2) in each; 0 without pairs."""
     size = [sum(epipolar_errors(p, q, lam, 0)[1] for p, q in pairs) for lam in LAMBDAS]
     return LAMBDAS[int(np.argmin(size))] if pairs else 0.0
-
-
-def _common(start: np.ndarray, feature: np.ndarray, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of the features that images i and j share, as each saw them."""
-    own, other = feature[start[i] : start[i + 1]], feature[start[j] : start[j + 1]]
-    _, p, q = np.intersect1d(own, other, assume_unique=True, return_indices=True)
-    return p + start[i], q + start[j]
