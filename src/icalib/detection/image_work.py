@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from itertools import islice
@@ -14,6 +14,7 @@ import numpy as np
 
 from icalib.errors import RecordingError
 from icalib.extras import load_cv2
+from icalib.measurements import which_image
 from icalib.recordings import DamagedImageError, Payload, Recording, decode
 from icalib.rig import Camera
 
@@ -77,6 +78,14 @@ def recording_names(payloads: Iterable[Payload], files: dict[int, str]) -> Itera
     for p in payloads:
         files[p.stamp_ns] = p.name
         yield p
+
+
+def words_on_damaged(damaged_ns: Sequence[int], files: Mapping[int, str]) -> tuple[str, ...]:
+    """A sentence on images with these stamps, which could not be decoded; none without any. files: names by stamp."""
+    if not len(damaged_ns):
+        return ()
+    first = which_image(files.get(damaged_ns[0], ""), damaged_ns[0])
+    return (f"{len(damaged_ns)} images that are damaged were left out, the first {first}.",)
 
 
 def core_count() -> int:

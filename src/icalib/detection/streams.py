@@ -25,6 +25,7 @@ from icalib.detection.image_work import (
     recording_names,
     spread_images,
     with_resolution,
+    words_on_damaged,
 )
 from icalib.detection.prediction import MOTION_IMAGES
 from icalib.detection.sightings import parts_of, sightings, without_rare_tags
@@ -75,16 +76,9 @@ def find_corners(
     if wrong := _other_border(recording, topic, target, images):
         raise RecordingError(f"{where}: hardly anything is seen of {wrong}")
     corners = replace(corner_stream(camera.name, stamps_ns, images), files=files)
-    notes = (*sightings(target, images), *rare, *_words_on_damaged(corners))
+    damaged = sorted(files.keys() - set(stamps_ns.tolist()))
+    notes = (*sightings(target, images), *rare, *words_on_damaged(damaged, files))
     return corners, tuple(f"{where}: {note}" for note in notes)
-
-
-def _words_on_damaged(corners: CornerStream) -> tuple[str, ...]:
-    """A sentence on the images whose stamps are among the files, but that could not be decoded; none without any."""
-    damaged = sorted(corners.files.keys() - set(corners.stamps_ns.tolist()))
-    if not damaged:
-        return ()
-    return (f"{len(damaged)} images that are damaged were left out, the first {corners.which(damaged[0])}.",)
 
 
 def _called(target: Target) -> str:

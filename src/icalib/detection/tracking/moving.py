@@ -21,8 +21,7 @@ def moving_features(start: np.ndarray, feature: np.ndarray, uv: np.ndarray, reso
     start (M + 1,), feature (N,), uv (N, 2) px as in `TrackStream`, features from 0 on; resolution (width, height).
     """
     n = int(feature.max(initial=-1)) + 1
-    half_px = 0.5 * float(np.hypot(*resolution))
-    xy = (uv - 0.5 * (np.array(resolution) - 1.0)) / half_px
+    xy, half_px = from_centre(uv, resolution)
     lam = _lambda(start, feature, xy)
     tried, failed = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
     for apart in APART:
@@ -30,11 +29,23 @@ def moving_features(start: np.ndarray, feature: np.ndarray, uv: np.ndarray, reso
             before, after = shared_rows(start, feature, k - apart, k)
             if len(before) < FEWEST:
                 continue
-            error, sigma = epipolar_errors(xy[before], xy[after], lam, k)
-            wrong = error > max(TIMES_SIGMA * sigma, LEAST_PX / half_px)
+            wrong, _ = misfits(xy[before], xy[after], lam, half_px, k)
             tried[feature[before]] += 1
             failed[feature[before[wrong]]] += 1
     return failed > MOST_MISFITS * tried
+
+
+def from_centre(uv: np.ndarray, resolution: tuple[int, int]) -> tuple[np.ndarray, float]:
+    """Pixels uv (n, 2) from the image's centre, in units of half its diagonal; and that unit [px]."""
+    half_px = 0.5 * float(np.hypot(*resolution))
+    return (uv - 0.5 * (np.array(resolution) - 1.0)) / half_px, half_px
+
+
+def misfits(p: np.ndarray, q: np.ndarray, lam: float, half_px: float, seed: int) -> tuple[np.ndarray, float]:
+    """(n,) bool: points p and q (n, 2), as `from_centre` gives them, that do not fit the epipolar geometry of most; and
+    the standard deviation [px] of those that do."""
+    error, sigma = epipolar_errors(p, q, lam, seed)
+    return error > max(TIMES_SIGMA * sigma, LEAST_PX / half_px), sigma * half_px
 
 
 def _lambda(start: np.ndarray, feature: np.ndarray, xy: np.ndarray) -> float:

@@ -24,10 +24,9 @@ def stay_in_place(start: np.ndarray, feature: np.ndarray, uv: np.ndarray) -> np.
     order = np.lexsort((image, feature))
     follows = (np.diff(feature[order]) == 0) & (np.diff(image[order]) == 1)
     before, after = order[:-1][follows], order[1:][follows]
-    travelled = np.zeros((len(start) - 1, 2))
-    for k in np.unique(image[after]):
-        own = image[after] == k
-        travelled[k] = np.median((uv[after] - uv[before])[own], axis=0)
+    travelled, flow, into = np.zeros((len(start) - 1, 2)), uv[after] - uv[before], image[after]
+    for k in np.unique(into):
+        travelled[k] = np.median(flow[into == k], axis=0)
     travelled = np.cumsum(travelled, axis=0)
     first, last = _ends(feature[order], n)
     moved = np.linalg.norm((travelled[image[order[last]]] - travelled[image[order[first]]]), axis=1)

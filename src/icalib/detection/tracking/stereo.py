@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from icalib.detection.image_work import on_all_cores
-from icalib.detection.tracking.epipolar import FEWEST, epipolar_errors
-from icalib.detection.tracking.moving import LEAST_PX, TIMES_SIGMA, best_lambda
+from icalib.detection.tracking.epipolar import FEWEST
+from icalib.detection.tracking.moving import best_lambda, from_centre, misfits
 from icalib.detection.tracking.patches import RADIUS, align, cut_templates
-from icalib.detection.tracking.tracker import ALIGNED_PX, BACK_PX, BLUR_PX, MIN_NCC, WINDOW_PX, equalised
+from icalib.detection.tracking.tracker import ALIGNED_PX, BACK_PX, MIN_NCC, WINDOW_PX, prepared
 from icalib.extras import load_cv2
 from icalib.measurements import TrackStream
 from icalib.recordings import DamagedImageError, Payload, Recording, decode
@@ -116,13 +116,12 @@ def _match(a: Payload, b: Payload, i: int, j: int, stream: TrackStream) -> _Matc
     rows = rows[inside]
     if not len(rows):
         return none
-    even = [equalised(image) for image in (first, second)]
+    even, smooth = zip(prepared(first), prepared(second), strict=True)
     before = stream.uv[rows].astype(np.float32)
     size = (WINDOW_PX, WINDOW_PX)
     after, there, _ = cv2.calcOpticalFlowPyrLK(even[0], even[1], before, None, winSize=size, maxLevel=MAX_LEVEL)
     back, returned, _ = cv2.calcOpticalFlowPyrLK(even[1], even[0], after, None, winSize=size, maxLevel=MAX_LEVEL)
     good = (there.ravel() > 0) & (returned.ravel() > 0) & (np.linalg.norm(back - before, axis=1) < BACK_PX)
-    smooth = [cv2.GaussianBlur(image, (0, 0), BLUR_PX).astype(np.float32) for image in (first, second)]
     whole = np.rint(stream.uv[rows])
     templates, textured = cut_templates(smooth[0], whole)
     A, ncc = np.tile(np.eye(2), (len(rows), 1, 1)), np.full(len(rows), -1.0)
@@ -137,14 +136,9 @@ def _consistent(p: np.ndarray, q: np.ndarray, resolution: tuple[int, int]) -> np
     """(n,) bool: matches that fit the one epipolar geometry of the pair of cameras."""
     if len(p) < FEWEST:
         return np.zeros(len(p), dtype=bool)
-    half_px = 0.5 * float(np.hypot(*resolution))
-    middle = 0.5 * (np.array(resolution) - 1.0)
-    x, y = (p - middle) / half_px, (q - middle) / half_px
-    lam = best_lambda([(x, y)])
-    error, sigma = epipolar_errors(x, y, lam, 0)
-    if sigma * half_px > MOST_SIGMA_PX:
-        return np.zeros(len(p), dtype=bool)
-    return error * half_px <= max(TIMES_SIGMA * sigma * half_px, LEAST_PX)
+    (x, half_px), (y, _) = from_centre(p, resolution), from_centre(q, resolution)
+    wrong, sigma_px = misfits(x, y, best_lambda([(x, y)]), half_px, 0)
+    return ~wrong & (sigma_px <= MOST_SIGMA_PX)
 
 
 def _inserted(

@@ -20,6 +20,7 @@ from icalib.detection.image_work import (
     on_all_cores,
     recording_names,
     with_resolution,
+    words_on_damaged,
 )
 from icalib.detection.tracking.moving import moving_features
 from icalib.detection.tracking.robot_parts import stay_in_place
@@ -201,10 +202,7 @@ def _stream(name: str, found: _Found, where: str) -> TrackStream:
 
 
 def _notes(found: _Found, files: dict[int, str]) -> Iterator[str]:
-    if len(found.damaged_ns):
-        stamp_ns = int(found.damaged_ns[0])
-        first = files.get(stamp_ns) or f"at {stamp_ns} ns"
-        yield f"{len(found.damaged_ns)} images that are damaged were left out, the first {first}."
+    yield from words_on_damaged(found.damaged_ns.tolist(), files)
     tracks = len(np.unique(found.feature)) + found.moving + found.in_place
     if found.moving > NOTED * tracks:
         yield f"{found.moving} of {tracks} points do not fit one motion of the camera and were left out."

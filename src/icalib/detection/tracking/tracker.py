@@ -68,9 +68,12 @@ class _Tracks:
         return replace(self, first=self.first.joined(other.first), **columns)
 
 
-def equalised(image: np.ndarray) -> np.ndarray:
-    """The image (h, w) uint8 with its contrast equalised by regions."""
-    return load_cv2().createCLAHE(CLIP, TILES).apply(image)
+def prepared(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The image (h, w) uint8 with its contrast equalised by regions, uint8, for Lucas-Kanade and new corners; and
+    smoothed, float32, for alignment."""
+    cv2 = load_cv2()
+    even = cv2.createCLAHE(CLIP, TILES).apply(image)
+    return even, cv2.GaussianBlur(image, (0, 0), BLUR_PX).astype(np.float32)
 
 
 class Tracker:
@@ -93,14 +96,12 @@ class Tracker:
         self._add_features(even, smooth)
         alive = self._alive
         spread = alive.first.spread * np.abs(np.linalg.det(alive.A))
-        seen = Observations(alive.feature.copy(), alive.uv.copy(), alive.views.copy(), spread)
         self._alive = replace(alive, views=alive.views + 1)
-        return seen
+        return Observations(alive.feature, alive.uv, alive.views, spread)
 
     def _advance(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Moves the tracks to the next image; returns it with even contrast (uint8), and smoothed (float32)."""
-        even = equalised(image)
-        smooth = self._cv2.GaussianBlur(image, (0, 0), BLUR_PX).astype(np.float32)
+        """Moves the tracks to the next image; returns what `prepared` makes of it."""
+        even, smooth = prepared(image)
         if len(self._alive.feature):
             self._move_tracks(even, smooth)
         self._before = even
