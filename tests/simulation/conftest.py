@@ -12,6 +12,23 @@ from icalib.simulation import Block, Drive, Features, Room, Scenario, SimCamera,
 CAMERA_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # R_imu_cam of one that looks ahead
 
 
+def lens(model: str, f: float, distortion: tuple[float, ...], resolution: tuple[int, int] = (160, 120)) -> SimCamera:
+    """A camera of about that focal length [px], its axis nearly in the middle of a small image."""
+    width, height = resolution
+    middle = 0.5 * width + 0.3, 0.5 * height - 0.4
+    return SimCamera("cam0", model, resolution, (f, 1.01 * f, *middle), distortion, np.eye(4))
+
+
+DISTORTED = [
+    lens("pinhole-radtan", 110.0, (-0.28, 0.07, 0.002, -0.001)),
+    lens("pinhole-equidistant", 90.0, (0.03, -0.01, 0.004, -0.001)),
+    lens("eucm", 110.0, (0.62, 1.1)),
+    lens("double-sphere", 70.0, (-0.2, 0.59)),
+    lens("pinhole-rational", 100.0, (0.5, 0.1, 0.002, -0.001, 0.02, 0.8, 0.1, 0.01)),
+    lens("omni-radtan", 200.0, (1.2, -0.1, 0.03, 3e-4, -2e-4)),
+]
+
+
 def turn(axis: np.ndarray | list[float], angle: float) -> np.ndarray:
     """Rotation about an axis, by the power series of its cross matrix."""
     x, y, z = angle * np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)

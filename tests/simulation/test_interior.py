@@ -28,24 +28,12 @@ from icalib.simulation.raster import pixel_kernel, shrink
 from icalib.simulation.room import distances
 from icalib.simulation.texture import atlas_of, leaves
 
+from .conftest import DISTORTED
+
 TEXEL_M = 0.004
 SIZE = (4.0, 3.0, 2.5)
 BLOCKS = (Block((0.9, 0.6), (0.5, 0.4, 1.2), 0.4), Block((0.6, -0.4), (0.8, 0.6, 0.7), -0.3, ramp=True))
 WHITE = Imaging(white=1.0, black=0.0, background=0.5, blur_px=0.8)
-
-
-def lens(model: str, f: float, distortion: tuple[float, ...]) -> SimCamera:
-    return SimCamera("cam0", model, (160, 120), (f, 1.01 * f, 80.3, 59.6), distortion, np.eye(4))
-
-
-LENSES = [
-    lens("pinhole-radtan", 110.0, (-0.28, 0.07, 0.002, -0.001)),
-    lens("pinhole-equidistant", 90.0, (0.03, -0.01, 0.004, -0.001)),
-    lens("eucm", 110.0, (0.62, 1.1)),
-    lens("double-sphere", 70.0, (-0.2, 0.59)),
-    lens("pinhole-rational", 100.0, (0.5, 0.1, 0.002, -0.001, 0.02, 0.8, 0.1, 0.01)),
-    lens("omni-radtan", 200.0, (1.2, -0.1, 0.03, 3e-4, -2e-4)),
-]
 
 
 def looking(eye: np.ndarray, at: np.ndarray, roll: float) -> np.ndarray:
@@ -107,7 +95,7 @@ def eye_before(room: Room, face: int, spot: np.ndarray, rng: np.random.Generator
             return eye
 
 
-@pytest.mark.parametrize("camera", LENSES, ids=lambda c: c.model)
+@pytest.mark.parametrize("camera", DISTORTED, ids=lambda c: c.model)
 def test_marks_of_the_texture_are_where_their_surface_is(camera: SimCamera):
     """A spot on each face of a dark room, seen from all sides: its centroid, by the simulator's own projection."""
     room, sigma, rng = Room(SIZE, BLOCKS), 0.016, np.random.default_rng(5)
@@ -129,7 +117,7 @@ def test_marks_of_the_texture_are_where_their_surface_is(camera: SimCamera):
 @pytest.mark.parametrize("hills", [None, hills_of_slope(25.0)])
 def test_what_is_nearer_hides_what_is_behind_it_in_every_cell(hills):
     """Faces of one grey each: pixels are the means of what four rays meet."""
-    room, camera = Room(SIZE, BLOCKS, hills), LENSES[1]
+    room, camera = Room(SIZE, BLOCKS, hills), DISTORTED[1]
     greys = np.linspace(0.0, 1.0, len(room.faces) + bool(hills))
     interior = Interior(room, atlas=atlas_of([np.full((40, 30), g, dtype=np.float32) for g in greys]))
     for seed in range(3):
@@ -148,7 +136,7 @@ def test_surfaces_do_not_alias():
     """As by 64 rays a pixel on the finest texture: no shift of the pattern, and little difference."""
     room = Room(SIZE, BLOCKS)
     canvases = [leaves((n * 0.001, m * 0.001), 0.001, Texture(share=1.0), k) for k, (n, m) in enumerate(sides(room))]
-    camera = replace(LENSES[0], resolution=(96, 72), intrinsics=(48.0, 48.0, 47.5, 35.5))
+    camera = replace(DISTORTED[0], resolution=(96, 72), intrinsics=(48.0, 48.0, 47.5, 35.5))
     T = looking(np.array([-1.8, -1.2, 0.8]), np.array([1.9, 1.0, 0.9]), 0.2)
     grey = RoomRenderer(camera, WHITE).grey(Interior(room, atlas=atlas_of(canvases)).view(), T, 1.0, None)
     fine, pad = 8, 4
@@ -170,7 +158,7 @@ def test_surfaces_do_not_alias():
 
 def test_an_exposure_takes_each_cell_at_its_own_instant():
     """The centroid of a spot is the mean over the poses."""
-    room, camera, st, sigma = Room(SIZE), LENSES[0], np.array([0.5, 0.5]), 0.02
+    room, camera, st, sigma = Room(SIZE), DISTORTED[0], np.array([0.5, 0.5]), 0.02
     canvases = [np.zeros(side[::-1], dtype=np.float32) for side in sides(room)]
     x, y = ((np.arange(n) + 0.5) / n - 0.5 for n in sides(room)[0])
     canvases[0] = np.exp(-0.5 * ((x * SIZE[0]) ** 2 + (y[:, None] * SIZE[1]) ** 2) / sigma**2)
@@ -198,7 +186,7 @@ def scenario() -> Scenario:
     axes = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     T = np.eye(4)
     T[:3, :3] = axes
-    camera = replace(LENSES[0], T_imu_cam=T, rate_hz=10.0)
+    camera = replace(DISTORTED[0], T_imu_cam=T, rate_hz=10.0)
     room = Room((6.0, 5.0, 2.5), texture=Texture(share=1.0))
     return Scenario((camera,), duration_s=2.0, motion=Drive("free"), board=False, room=room)
 
@@ -231,4 +219,4 @@ def test_what_goes_wrong_with_images(scenario: Scenario):
 
 def test_nothing_to_film_is_said():
     with pytest.raises(RigError, match="give the scenario a target or a room"):
-        film(Scenario((LENSES[0],), board=False), 0)
+        film(Scenario((DISTORTED[0],), board=False), 0)

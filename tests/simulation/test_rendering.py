@@ -17,25 +17,10 @@ from icalib.simulation.projection import project
 from icalib.simulation.rendering import Imaging, Picture, Renderer, Sheet, exposure_poses
 from icalib.simulation.scenario import SimCamera
 
-SMALL = (160, 120)
-
-
-def lens(model: str, f: float, distortion: tuple[float, ...], resolution: tuple[int, int] = SMALL) -> SimCamera:
-    width, height = resolution
-    middle = 0.5 * width + 0.3, 0.5 * height - 0.4
-    return SimCamera("cam0", model, resolution, (f, 1.01 * f, *middle), distortion, np.eye(4))
-
+from .conftest import DISTORTED, lens
 
 PINHOLE = lens("pinhole-radtan", 150.0, (0.0, 0.0, 0.0, 0.0))
-LENSES = [
-    PINHOLE,
-    lens("pinhole-radtan", 110.0, (-0.28, 0.07, 0.002, -0.001)),
-    lens("pinhole-equidistant", 90.0, (0.03, -0.01, 0.004, -0.001)),
-    lens("eucm", 110.0, (0.62, 1.1)),
-    lens("double-sphere", 70.0, (-0.2, 0.59)),
-    lens("pinhole-rational", 100.0, (0.5, 0.1, 0.002, -0.001, 0.02, 0.8, 0.1, 0.01)),
-    lens("omni-radtan", 200.0, (1.2, -0.1, 0.03, 3e-4, -2e-4)),
-]
+LENSES = [PINHOLE, *DISTORTED]
 SHARP = Imaging(white=1.0, black=0.0, background=0.5, blur_px=0.0)
 
 
