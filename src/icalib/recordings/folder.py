@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import final
 
@@ -84,7 +85,7 @@ class FolderRecording:
             found += [_info(f"{folder.name}/{p.name}", *what, self._stamps_of(p)) for p, what in _robot(folder)]
         for table in sorted(p for base in self._bases() for p in base.glob("*.csv")):
             found += _single(table, self._layouts().get(table, PLAIN_TABLE))
-        return (*found, *self._videos())
+        return (*found, *self._videos)
 
     def stamps(self, topic: str) -> np.ndarray:
         stamps_ns = self._all_stamps(topic)
@@ -273,13 +274,14 @@ class FolderRecording:
             return read_pose_file(table.parent.name, table, layout).stamps_ns
         return _stamps(table)
 
+    @cached_property
     def _videos(self) -> tuple[TopicInfo, ...]:
         files = {p: None for base in self._bases() for p in videos_in(base)}
         return tuple(video_topic(p, str(p.relative_to(self.root))) for p in files)
 
     def _seen(self) -> tuple[TopicInfo, ...]:
         """Images in folders and videos."""
-        return (*self._image_topics(), *self._videos())
+        return (*self._image_topics(), *self._videos)
 
     def _remember(self, path: Path) -> None:
         if path not in self._read:
