@@ -85,7 +85,7 @@ def faults(page: str) -> list[str]:
 
 
 UNREVISED = {  # pages that are still to be revised; the list only shrinks
-    "allan.md", "api.md", "architecture.md", "benchmarks.md", "compare.md", "detection.md", "estimator.md", "export.md",
+    "allan.md", "api.md", "benchmarks.md", "compare.md", "detection.md", "estimator.md", 
     "faq.md", "files.md", "fleet.md", "inspect.md", "montecarlo.md", "record.md", "recordings.md", "rig-file.md",
     "schemes.md", "simulation.md", "targets.md", "tour.md", "tracking.md", "uncertainty.md", "view.md",
 }  # fmt: skip
@@ -98,7 +98,7 @@ def test_pages_are_in_standard_terms_and_short_sentences():
 
 
 def test_faults_are_found():
-    long = "This sentence " + "goes on and on " * 10 + "until it ends."
+    long = "This sentence " + "goes on and on " * 12 + "until it ends."
     assert len(faults(f"# Page\n\n{long}\n\nNodes are set aside.\n\nOf wheels nothing is known.\n")) == 5
     assert not faults("# Page\n\nKeyframes are 50 ms apart.\n\n```text\nnodes are set aside\n```\n\n| a | `nodes` |\n")
 
