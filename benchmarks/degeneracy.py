@@ -5,7 +5,7 @@ python benchmarks/degeneracy.py OUTPUT [--runs N] [--workers N] [--motion M ...]
 Short recordings with few points, so that many can be made; extrinsics, time offsets and lenses estimated from a guess
 drawn about the truth, with the IMU of the data sheet and one ten times noisier. Runs are kept in OUTPUT, and the same
 command goes on from there; each motion's rows are written as soon as they are known, the others' stay as they were. The
-table of docs/uncertainty.md is printed at the end.
+table of docs/studies/degeneracy.md is printed at the end.
 """
 
 from __future__ import annotations
