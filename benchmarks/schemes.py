@@ -77,7 +77,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=20)
     n = parser.parse_args().seeds
-    print("| cameras | nodes at | scheme | rotation | position | time offset | offset error | position error |")
+    print("| cameras | keyframes at | scheme | rotation | position | time offset | offset error | position error |")
     print("|---|---|---|---|---|---|---|---|")
     with ProcessPoolExecutor(2) as pool:
         for case in cases():
