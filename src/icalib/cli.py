@@ -78,7 +78,9 @@ def _parser() -> argparse.ArgumentParser:
     c.add_argument("--scheme", choices=("inertial", "pose", "kinematic"), help="where sensors are between nodes")
     c.add_argument("--loss", choices=("none", "huber", "cauchy"), help="robust loss on corners")
     c.add_argument("--splits", type=int, metavar="N", help="segments for the empirical factor; 0: none")
-    c.add_argument("--quiet", "-q", action="store_true", help="no progress bar and no table")
+    strict = "exit code 3: usable with care, 4: partly usable, 5: not usable; by default 0 for all that was written"
+    c.add_argument("--strict", action="store_true", help=strict)
+    c.add_argument("--quiet", "-q", action="store_true", help="no progress bar and no table; warnings go to stderr")
     c.set_defaults(run=_calibrate)
     _add_inspect(commands)
     _add_target(commands)
@@ -232,10 +234,11 @@ def _print_target(options: argparse.Namespace) -> None:
     print(f"{options.output}: print at 100 %, and measure the ruler.")
 
 
-def _calibrate(options: argparse.Namespace) -> None:
+def _calibrate(options: argparse.Namespace) -> int:
     import dataclasses
 
-    from icalib.console import print_result, progress_bar
+    from icalib.calibration.verdict import EXIT_CODES
+    from icalib.console import print_result, print_warnings, progress_bar
     from icalib.outputs import check_folder, write_outputs
     from icalib.pipeline import calibrate
     from icalib.rig_file import load_rig
@@ -250,8 +253,11 @@ def _calibrate(options: argparse.Namespace) -> None:
         result = calibrate(rig, options.recording, progress, start_s=options.start_s, end_s=options.end_s)
         progress("writing", 0.97)
         write_outputs(result, options.output)
-    if not options.quiet:
+    if options.quiet:
+        print_warnings(result)
+    else:
         print_result(result, options.output)
+    return EXIT_CODES[result.verdict] if options.strict else 0
 
 
 def _simulate(options: argparse.Namespace) -> None:

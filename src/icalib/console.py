@@ -8,11 +8,20 @@ from pathlib import Path
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.text import Text
 
 from icalib.calibration import Calibration
+from icalib.calibration.verdict import NEXT, Usability
 from icalib.export.kalibr import camchain_name
 from icalib.report.console import bodies_words, relative_words, table
 from icalib.report.quantities import chi2_words, dof_words, rms_words
+
+VERDICT_STYLES: dict[Usability, str] = {
+    "usable": "bold green",
+    "usable with care": "bold yellow",
+    "partly usable": "bold red",
+    "not usable": "bold red",
+}
 
 
 @contextmanager
@@ -44,18 +53,29 @@ def print_result(calibration: Calibration, folder: Path) -> None:
         console.print(f"  {sentence}", markup=False)
     for f in calibration.fits:
         rms = f", {rms_words(f)} RMS" if f.rms is not None else ""
-        rms += f", {f.rejected} set aside" if f.unit == "px" else ""
+        rms += f", {f.rejected} rejected" if f.unit == "px" else ""
         console.print(
             f"  {f.sensor} {f.kind}: chi^2 per degree of freedom {chi2_words(f)} ({dof_words(f)}){rms}", markup=False
         )
-    for title, sentences in (
-        ("Undetermined", calibration.undetermined),
-        ("Warning", calibration.warnings),
-        ("Note", calibration.notes),
-    ):
-        for sentence in sentences:
-            console.print(f"{title}: {sentence}", markup=False)
-    console.print(f"Status: {calibration.status}", markup=False)
+    for sentence in calibration.notes:
+        console.print(f"Note: {sentence}", markup=False)
+    console.print(f"Solver: {calibration.status}", markup=False)
     chain = [camchain_name(calibration)] if calibration.cameras else []
     written = [*chain, *(["imu.yaml"] if calibration.imu else []), "report.html"]
     console.print(f"Wrote {folder / 'calibration.yaml'}, {', '.join(written)}.", markup=False)
+    print_verdict(calibration, console)
+
+
+def print_verdict(calibration: Calibration, console: Console) -> None:
+    """The reasons, numbered, and as the last line the verdict with what to do next."""
+    for k, sentence in enumerate(calibration.reasons, 1):
+        console.print(f"Reason {k}: {sentence}", markup=False, highlight=False)
+    verdict = calibration.verdict
+    line = Text.assemble("Verdict: ", (verdict, VERDICT_STYLES[verdict]), f". {NEXT[verdict]}")
+    console.print(line)
+
+
+def print_warnings(calibration: Calibration) -> None:
+    """What `--quiet` leaves of it, on standard error: nothing where the result is usable."""
+    if calibration.reasons:
+        print_verdict(calibration, Console(stderr=True))

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.calibration import Verdict
+from icalib.calibration.verdict import by_size
 from icalib.estimation.determination import Determined
 
-SPREAD = 10.0  # a parameter known, with what it owes to the guess, to no more tolerances than this is undetermined
 SHARE = 0.25  # a parameter that makes up this much of an undetermined direction is undetermined itself
 NAMED = 0.2  # parts of a direction smaller than this are not named
 MOST_NAMED = 4  # of the largest
@@ -47,11 +47,15 @@ WITHOUT_TARGET = {
 
 @dataclass(frozen=True)
 class Observability:
-    """Covariance (B, B) formal; verdicts by border column; undetermined combinations as sentences."""
+    """Covariance (B, B) formal; verdicts by border column; undetermined combinations as sentences.
+
+    spread (B,): standard deviations in tolerances that the data alone give, consider covariance included.
+    """
 
     covariance: np.ndarray
     verdicts: tuple[Verdict, ...]
     undetermined: tuple[str, ...]
+    spread: np.ndarray
 
 
 def observe(
@@ -64,11 +68,11 @@ def observe(
     share = (directions**2).sum(axis=1)
     verdicts: list[Verdict] = []
     for part, spread in zip(share, found.spread, strict=True):
-        is_open = part > SHARE or spread > SPREAD or not found.estimate.outcome.converged
-        verdicts.append("undetermined" if is_open else "determined" if spread <= 1.0 else "weak")
+        is_open = part > SHARE or not found.estimate.outcome.converged
+        verdicts.append("undetermined" if is_open else by_size(spread))
     advice = dict.fromkeys(wheels, ON_THE_GROUND) | dict.fromkeys(tracking, WITHOUT_TARGET)
     sentences = tuple(_sentence(u, names, advice) for u in directions.T)
-    return Observability(found.covariance, tuple(verdicts), sentences)
+    return Observability(found.covariance, tuple(verdicts), sentences, found.spread)
 
 
 def sparse_basis(directions: np.ndarray, rounds: int = 50) -> np.ndarray:

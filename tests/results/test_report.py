@@ -27,7 +27,6 @@ from icalib.report import image_figures, projection_figures, report_html
 from icalib.report.console import table
 from icalib.report.plot import numbers, thin
 from icalib.report.quantities import dof_words, rows, rpy_deg, shown
-from icalib.report.tables import trust
 
 VOID = {"meta", "link", "br", "img", "hr"}
 FIGURES = {"rig", "histogram", "imu-residuals", "trajectory", "motion", "convergence", "correlation", "held-out"} | {
@@ -92,8 +91,10 @@ def test_trust_comes_first(text: str):
     page = Page(text)
     assert page.ids[0] == "trust"
     top = page.words.split("The rig")[0]
-    for words in ("y undetermined, z weak", "turn the rig about a second axis", "Warnings", "roll", "deg"):
+    for words in ("Partly usable", "turn the rig about a second axis", "Reasons", "rotation x (roll)", "deg"):
         assert words in top
+    rows = dict(re.findall(r"<td>(translation .)</td>.*?badge (\w+)", text))
+    assert rows == {"translation x": "determined", "translation y": "undetermined", "translation z": "weak"}
 
 
 def test_a_long_recording_stays_small(calibration: Calibration):
@@ -114,7 +115,7 @@ def test_all_text_is_escaped(calibration: Calibration):
         calibration,
         status=NASTY,
         undetermined=(NASTY,),
-        warnings=(NASTY,),
+        warnings=(f"{NASTY} again",),
         notes=(NASTY,),
         inputs={NASTY: NASTY},
         settings={NASTY: NASTY},
@@ -229,25 +230,30 @@ def test_nothing_seen_and_nothing_iterated(calibration: Calibration):
         warnings=(),
         groups=tuple(dataclasses.replace(g, verdict=("determined",) * len(g.verdict)) for g in calibration.groups),
     )
-    assert "the motion determines every direction" in Page(report_html(none)).words
+    assert "None: every check passed." in Page(report_html(none)).words
 
 
-def test_trust_is_the_worst_that_is_known(calibration: Calibration):
-    sound = dataclasses.replace(
-        calibration,
-        undetermined=(),
-        warnings=(),
-        groups=tuple(dataclasses.replace(g, verdict=("determined",) * len(g.verdict)) for g in calibration.groups),
-    )
-    assert trust(sound) == "good"
-    assert trust(dataclasses.replace(sound, warnings=("mind.",))) == "care"
-    assert trust(calibration) == "bad"
-    mistaken = dataclasses.replace(sound, warnings=("it is too large.", "mind."), wrong=("it is too large.",))
-    assert trust(mistaken) == "wrong"
+def test_reasons_stand_in_their_order_and_once(calibration: Calibration):
+    groups = tuple(dataclasses.replace(g, verdict=("determined",) * len(g.verdict)) for g in calibration.groups)
+    words = {"warnings": ("mind.", "it is too large."), "wrong": ("it is too large.",)}
+    mistaken = dataclasses.replace(calibration, undetermined=(), groups=groups, **words)
     page = report_html(mistaken)
-    assert page.index('<ul class="bad"><li>it is too large.') < page.index('<ul class="care"><li>mind.')
-    assert page.count("it is too large.") == 1 and "No. Something in the rig file must be wrong" in page
-    assert trust(dataclasses.replace(sound, converged=False)) == "failed"
+    assert page.index('<li class="bad">it is too large.') < page.index('<li class="care">mind.')
+    assert page.count("it is too large.") == 1 and "Not usable. Act on the first reason" in page
+
+
+def test_a_poor_fit_colours_the_card(calibration: Calibration):
+    """Residuals twice and five times as large as stated, of a camera whose parameters are determined."""
+    groups = tuple(dataclasses.replace(g, verdict=("determined",) * len(g.verdict)) for g in calibration.groups)
+
+    def page(chi2_per_dof: float) -> str:
+        fits = (dataclasses.replace(calibration.fits[0], chi2=chi2_per_dof * calibration.fits[0].dof),)
+        return report_html(dataclasses.replace(calibration, groups=groups, fits=(*fits, *calibration.fits[1:])))
+
+    assert page(1.0).count('<article class="card determined">') == 3
+    for size, css in ((2.0, "weak"), (5.0, "undetermined")):
+        assert f'<article class="card {css}"><h3>cam0' in page(size**2)
+        assert f"residuals {size:.2g} times the stated noise" in page(size**2)
 
 
 def test_rows_are_in_units_that_people_read(calibration: Calibration):

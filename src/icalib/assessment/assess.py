@@ -40,6 +40,7 @@ from icalib.calibration import (
     Verdict,
     Visited,
 )
+from icalib.calibration.verdict import by_size
 from icalib.estimation.assembly import image_times
 from icalib.estimation.border import restricted_inverse
 from icalib.estimation.contradictions import Contradiction, contradictions, worst_off
@@ -237,8 +238,8 @@ def _groups(
             own = float(np.sqrt(np.mean(ratio[k] ** 2)))
             factor = np.full(block.size, max(1.0, own, overall))
             std = formal[k]
-            loose = std * factor > found.problem.tolerance[k]
-            verdict = tuple(_with_factor(seen.verdicts[i], w) for i, w in zip(k, loose, strict=True))
+            sizes = factor * np.maximum(seen.spread[k], std / found.problem.tolerance[k])
+            verdict = tuple(_final_verdict(seen.verdicts[i], size) for i, size in zip(k, sizes.tolist(), strict=True))
         unit = "" if labels == IMU_LABELS else UNITS[block.name]
         groups.append(
             ParameterGroup(
@@ -257,9 +258,9 @@ def _unheard_of(inputs: Inputs, block: Block) -> bool:
     return block.sensor in wheels and block.name in DRIVE_SIZES["pair"]
 
 
-def _with_factor(formal: Verdict, loose: bool) -> Verdict:
-    """What the formal information calls determined is weak where the printed deviation exceeds the tolerance."""
-    return "weak" if formal == "determined" and loose else formal
+def _final_verdict(formal: Verdict, size: float) -> Verdict:
+    """By the printed standard deviation, `size` tolerances; a direction that the data leave open stays undetermined."""
+    return formal if formal == "undetermined" else by_size(size)
 
 
 def _empirical_variance(found: Estimate, parts: Parts | None, formal: np.ndarray) -> np.ndarray | None:

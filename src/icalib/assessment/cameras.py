@@ -7,8 +7,8 @@ from itertools import combinations
 
 import numpy as np
 
-from icalib.assessment.excess import excess, times
 from icalib.calibration import ParameterGroup, SensorFit
+from icalib.calibration.excess import excess, times
 from icalib.estimation.feature_factor import FeatureFactor
 from icalib.estimation.fixed_lens import LensStep
 from icalib.estimation.surfaces import ON_PLANES

@@ -7,8 +7,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from icalib.assessment.looks_like import looks_like
-from icalib.assessment.stated import SHOWN_UNITS, scaled
+from icalib.assessment.stated import scaled
 from icalib.calibration import ParameterGroup
+from icalib.calibration.units import SHOWN_UNITS
 from icalib.estimation.groups import groups_of
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.tolerances import GUESS_SIGMA

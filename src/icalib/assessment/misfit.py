@@ -7,9 +7,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from icalib.assessment.cameras import camera_warnings
-from icalib.assessment.excess import dof_known, excess, times
 from icalib.assessment.robot import robot_warnings
 from icalib.calibration import SensorFit
+from icalib.calibration.excess import dof_known, excess, times
 from icalib.rig import Rig
 
 SMALL_CHI2 = 0.5  # per post-fit degree of freedom: below this it is worth a warning

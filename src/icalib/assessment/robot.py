@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from icalib.assessment.excess import excess, times
 from icalib.calibration import LidarResiduals, Plane, PoseResiduals, SensorFit, WheelResiduals
+from icalib.calibration.excess import excess, times
 from icalib.estimation.assembly import motion_of
 from icalib.estimation.clocks import instants
 from icalib.estimation.estimate import Estimate

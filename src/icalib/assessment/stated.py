@@ -9,11 +9,11 @@ import numpy as np
 from icalib.assessment.labels import UNITS, labels_of
 from icalib.assessment.looks_like import looks_like
 from icalib.calibration import ParameterGroup
+from icalib.calibration.units import SHOWN_UNITS
 from icalib.estimation.contradictions import Contradiction
 from icalib.estimation.inputs import Inputs
 from icalib.rig import Wheels
 
-SHOWN_UNITS = {"rad": ("deg", 180.0 / np.pi), "m": ("mm", 1e3), "s": ("ms", 1e3)}
 # Radii over baseline: from 1/15 of a floor robot to 1 of a toy; rates in rpm make 1/3 a 1/30.
 SMALLEST_SHARE, LARGEST_SHARE = 1.0 / 25.0, 4.0
 

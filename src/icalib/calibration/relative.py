@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,11 +32,26 @@ class RelativePose:
         """(6,) rotation, translation."""
         return np.sqrt(np.diag(self.covariance))
 
+    @property
+    def distance(self) -> float:
+        """m, between the origins of both: the baseline of a pair of cameras."""
+        return float(np.linalg.norm(self.T[:3, 3]))
+
+    @property
+    def distance_std(self) -> float:
+        """m, to first order; the largest of any direction where both are at one place."""
+        covariance = self.covariance[3:, 3:]
+        if self.distance == 0.0:
+            return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+        along = self.T[:3, 3] / self.distance
+        return float(np.sqrt(along @ covariance @ along))
+
 
 def relative_poses(c: Calibration) -> tuple[RelativePose, ...]:
-    """Of each LiDAR, each set of wheels and each pose sensor as seen from each camera, of the latter two as seen from
-    each LiDAR, and of pose sensors as seen from wheels."""
-    pairs = [(frame, sensor) for frame in c.cameras for sensor in (*c.lidars, *c.wheels, *c.pose_sensors)]
+    """Of every pair of sensors other than the IMU, as seen from the first of both: cameras, LiDARs, wheels, pose
+    sensors; several of one kind are pairs among cameras only."""
+    pairs = list(combinations(c.cameras, 2))
+    pairs += [(frame, sensor) for frame in c.cameras for sensor in (*c.lidars, *c.wheels, *c.pose_sensors)]
     pairs += [(frame, sensor) for frame in c.lidars for sensor in (*c.wheels, *c.pose_sensors)]
     pairs += [(frame, sensor) for frame in c.wheels for sensor in c.pose_sensors]
     return tuple(relative_pose(c, frame, sensor) for frame, sensor in pairs)

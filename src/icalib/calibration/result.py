@@ -12,6 +12,7 @@ import numpy as np
 from icalib.calibration.held_out import HeldOut
 from icalib.calibration.images import CornerResiduals, ImageResiduals, TrackResiduals
 from icalib.calibration.robot import LidarResiduals, Plane, PoseResiduals, WheelResiduals
+from icalib.calibration.verdict import Usability, reasons, usability
 
 Verdict = Literal["determined", "weak", "undetermined", "fixed"]
 
@@ -151,6 +152,16 @@ class Calibration:
     def image_residuals(self) -> tuple[ImageResiduals, ...]:
         """Of cameras that saw anything: corners of a target, tracks of points of the scene, or both."""
         return tuple(r for r in (*self.corner_residuals, *self.track_residuals) if len(r.uv))
+
+    @property
+    def verdict(self) -> Usability:
+        """Whether the result can be used; see `icalib.calibration.verdict`."""
+        return usability(self)
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Sentences on why it is not simply usable, the most important first; none where it is."""
+        return reasons(self)
 
     @property
     def failure(self) -> str:

@@ -83,6 +83,8 @@ def _plain(c: Calibration, arrays: bytes) -> dict[str, Any]:
         "tracks": [_without_arrays(r) for r in c.track_residuals],
         "planes": [_lists(p) for p in c.planes],
         "held_out": None if c.held_out is None else _plain_held_out(c.held_out),
+        "verdict": c.verdict,
+        "reasons": list(c.reasons),
         **{name: list(getattr(c, name)) for name in _TEXTS},
         **{name: getattr(c, name) for name in _PLAIN},
     }

@@ -20,7 +20,9 @@ HEADER = """\
 # T_scene_body: poses of a target's bodies, in the frame of that body whose pose is the identity.
 # relative: T_a_b takes coordinates in the frame of b to that of a. Its covariance, from the joint one of both, is of
 #   rotation about the axes of b and translation along those of a; where one is undetermined it is that of the guess.
-# verdict: determined, weak or undetermined by the data, or fixed by the rig file. Undetermined is no more than a guess.
+# verdict of the whole: usable, usable with care, partly usable or not usable; reasons: why, the most important first.
+# verdict of a component: determined (std within its tolerance), weak (up to 10 tolerances), undetermined (no better
+#   than its initial guess), or fixed by the rig file.
 # The full covariance and all residuals are in result.npz.
 """
 KALIBR = "#   (Kalibr's T_cam_imu is the inverse; see camchain-imucam.yaml.)\n"
@@ -36,6 +38,8 @@ def calibration_yaml(calibration: Calibration) -> str:
     data = {
         "status": c.status,
         "converged": bool(c.converged),
+        "verdict": c.verdict,
+        "reasons": list(c.reasons),
         "sensors": sensors,
         "targets": targets,
         "relative": {r.name: _relative(r) for r in relative_poses(c)},

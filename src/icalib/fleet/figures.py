@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from icalib.calibration.units import SHOWN_UNITS
 from icalib.fleet.record import Block
 from icalib.fleet.result import JobResult
 from icalib.geometry import so3
 from icalib.report.plot import AXIS_COLORS, COLORS, Figure, figure, numbers, stacked_axes, y_of
-from icalib.report.quantities import SHOWN_UNITS
 from icalib.report.tables import WORDS
 
 _PANEL_PX, _EDGE_PX, _GAPS = 170, 90, 0.2

@@ -41,13 +41,16 @@ def bodies_words(calibration: Calibration) -> str:
 
 
 def relative_words(calibration: Calibration) -> list[str]:
-    """Where LiDARs and wheels are as seen from cameras and LiDARs, a line each."""
+    """Every pair of sensors, a line each: pose of the second as seen from the first; the baseline of two cameras."""
     lines = []
     for r in relative_poses(calibration):
         turn, move = np.rad2deg(r.std[:3]), 1e3 * r.std[3:]
         x, y, z = (f"{v:.1f} +- {shown(s)}" for v, s in zip(1e3 * r.T[:3, 3], move, strict=True))
         a, b, c = (f"{v:.3f} +- {shown(s)}" for v, s in zip(rpy_deg(r.T[:3, :3]), turn, strict=True))
-        lines.append(f"{r.name}: x, y, z {x}, {y}, {z} mm; roll, pitch, yaw {a}, {b}, {c} deg")
+        baseline = ""
+        if {r.frame, r.sensor} <= set(calibration.cameras):
+            baseline = f"baseline {1e3 * r.distance:.2f} +- {shown(1e3 * r.distance_std)} mm; "
+        lines.append(f"{r.name}: {baseline}x, y, z {x}, {y}, {z} mm; roll, pitch, yaw {a}, {b}, {c} deg")
     return lines
 
 

@@ -9,6 +9,7 @@ from string import Template
 import numpy as np
 
 from icalib.calibration import Calibration, ImageResiduals, ProjectionMap
+from icalib.calibration.verdict import NEXT
 from icalib.report import (
     held_out_figures,
     image_figures,
@@ -18,12 +19,12 @@ from icalib.report import (
     robot_figures,
     tables,
 )
+from icalib.report.cards import sensor_cards
 from icalib.report.ellipsoids import SIGMAS, ellipsoids, magnification
 from icalib.report.histogram import normalised_histogram
 from icalib.report.plot import Figure
 from icalib.report.tables import Html, element
 
-_NO_UNDETERMINED = "None: the motion determines every direction."
 _NOT_HELD_OUT = (
     "Nothing was held out: the recording is too short to be split, or splits are off in the rig file, or its halves "
     "have no parameter in common that both know."
@@ -34,24 +35,22 @@ _MAPS = (("As the first guess had them", "map-before"), ("As calibrated", "map-a
 def report_html(calibration: Calibration) -> str:
     """The whole report as one HTML document, plotly.js included."""
     c = calibration
-    trust = tables.trust(c)
     maps = {name: projection_figures.projection_maps(c, name) for name in c.cameras}
     words = {
         "sensors": " + ".join((*(() if c.imu is None else (c.imu,)), *c.mounted)),
         "size": tables.size_words(c),
         "body": "imu" if c.imu else c.body,
         "status": c.status,
-        "answer": tables.TRUST[trust],
+        "answer": f"{c.verdict[0].upper()}{c.verdict[1:]}. {NEXT[c.verdict]}",
         "ellipsoids": _ellipsoid_words(c),
         "most_dots": image_figures.MOST_DOTS,
         "most_nodes": motion_figures.MOST_NODES,
         "most_points": robot_figures.MOST_IN_SPACE,
     }
     parts = {
-        "trust": trust,
-        "cards": tables.sensor_cards(c),
-        "undetermined": tables.sentences(c.undetermined, "bad", _NO_UNDETERMINED),
-        "warnings": tables.warnings(c),
+        "trust": tables.trust(c),
+        "cards": sensor_cards(c),
+        "reasons": tables.reasons(c),
         "notes": tables.sentences(c.notes, "", "None."),
         "fits": tables.fits(c),
         "parameters": tables.parameters(c),

@@ -8,10 +8,9 @@ from math import asin, atan2, floor, isfinite, log10
 import numpy as np
 
 from icalib.calibration import Calibration, ParameterGroup, SensorFit, Verdict
+from icalib.calibration.units import SHOWN_UNITS
 
-SHOWN_UNITS = {"rad": ("deg", 180.0 / np.pi), "m": ("mm", 1e3), "s": ("ms", 1e3)}
 TURNS = ("roll", "pitch", "yaw")
-WORST_FIRST: tuple[Verdict, ...] = ("undetermined", "weak", "determined", "fixed")
 
 
 @dataclass(frozen=True)
@@ -48,12 +47,6 @@ def rpy_deg(R: np.ndarray) -> np.ndarray:
     return np.rad2deg([atan2(R[2, 1], R[2, 2]), pitch, atan2(R[1, 0], R[0, 0])])
 
 
-def worst(verdicts: tuple[Verdict, ...]) -> Verdict:
-    """The verdict that a whole group deserves."""
-    order = {verdict: i for i, verdict in enumerate(WORST_FIRST)}
-    return min((*verdicts, WORST_FIRST[-1]), key=lambda verdict: order[verdict])
-
-
 def shown(value: float, digits: int = 2) -> str:
     """A positive number with `digits` significant digits, without an exponent where that is readable."""
     if not isfinite(value):
@@ -65,7 +58,7 @@ def shown(value: float, digits: int = 2) -> str:
 
 def chi2_words(fit: SensorFit) -> str:
     """chi^2 over the degrees of freedom that the fit left over."""
-    return "no freedom left" if fit.chi2_per_dof is None else shown(fit.chi2_per_dof, 3)
+    return "n/a (no redundancy)" if fit.chi2_per_dof is None else shown(fit.chi2_per_dof, 3)
 
 
 def dof_words(fit: SensorFit) -> str:

@@ -7,25 +7,22 @@ from html import escape
 
 import numpy as np
 
-from icalib.calibration import Calibration, ParameterGroup, relative_poses
+from icalib.calibration import Calibration, relative_poses
+from icalib.calibration.verdict import Usability, worst
 from icalib.report.quantities import (
-    SHOWN_UNITS,
     chi2_words,
     dof_words,
     rms_words,
     rows,
     rpy_deg,
     shown,
-    shown_groups,
-    worst,
 )
 
-TRUST = {
-    "good": "Yes. The solver converged, the motion determines every parameter, and nothing calls for attention.",
-    "care": "Mostly. Read what stands below before using the numbers marked weak or warned about.",
-    "wrong": "No. Something in the rig file must be wrong: correct it as the first warning says, and calibrate again.",
-    "bad": "Not as a whole. Do not use what is marked undetermined: it is no better than the guess.",
-    "failed": "No. The solver did not converge; the numbers are where it stopped.",
+TRUST: dict[Usability, str] = {
+    "usable": "good",
+    "usable with care": "care",
+    "partly usable": "bad",
+    "not usable": "wrong",
 }
 _SEEN = {"corners": "corners", "observations": "observations of points that were followed"}
 WORDS = {"rotation": "rotation", "translation": "position", "time_offset": "time offset"}
@@ -65,12 +62,13 @@ def sentences(items: Sequence[str], css: str, nothing: str) -> Html:
     return element("ul", [element("li", item) for item in items], css)
 
 
-def warnings(c: Calibration) -> Html:
-    """What to know before trusting the numbers; first, in red, what must be wrong."""
-    rest = [sentence for sentence in c.warnings if sentence not in c.wrong]
-    if not c.wrong:
-        return sentences(rest, "care", "None.")
-    return html([sentences(c.wrong, "bad", ""), *([sentences(rest, "care", "")] if rest else [])])
+def reasons(c: Calibration) -> Html:
+    """Why the result is not simply usable, numbered, the most important first."""
+    if not c.reasons:
+        return element("p", "None: every check passed.", "quiet")
+    grave = {c.failure, *c.wrong, *c.undetermined}
+    items = [element("li", sentence, "bad" if sentence in grave else "care") for sentence in c.reasons]
+    return element("ol", items, "reasons")
 
 
 def badge(verdict: str) -> Html:
@@ -78,45 +76,8 @@ def badge(verdict: str) -> Html:
 
 
 def trust(c: Calibration) -> str:
-    """Key of TRUST: how far the whole can be trusted."""
-    verdicts = {v for g in c.groups for v in g.verdict}
-    if not c.converged:
-        return "failed"
-    if c.wrong:
-        return "wrong"
-    if c.undetermined or "undetermined" in verdicts:
-        return "bad"
-    return "care" if c.warnings or "weak" in verdicts else "good"
-
-
-def sensor_cards(c: Calibration) -> Html:
-    """What is known of each sensor, in words."""
-    names = [n for n in dict.fromkeys(g.sensor for g in shown_groups(c)) if n not in c.bodies]
-    return Html("".join(_card(c, name) for name in names))
-
-
-def _card(c: Calibration, sensor: str) -> Html:
-    groups = [g for g in shown_groups(c) if g.sensor == sensor]
-    verdict = worst(tuple(v for g in groups for v in g.verdict))
-    lines = [element("li", _group_words(g)) for g in groups]
-    kind = c.rig["sensors"].get(sensor, {}).get("type", "target")
-    head = element("h3", [html(sensor), element("small", f" {kind} "), badge(verdict)])
-    return element("article", [head, element("ul", lines)], f"card {verdict}")
-
-
-def _group_words(g: ParameterGroup) -> list[object]:
-    name = element("b", WORDS.get(g.name, g.name.replace("_", " ")))
-    if g.columns is None:
-        return [name, " fixed by the rig file"]
-    unit, scale = SHOWN_UNITS.get(g.unit, (g.unit, 1.0))
-    known = [s for s, v in zip(g.std.tolist(), g.verdict, strict=True) if v != "undetermined"]
-    size = f" to {shown(scale * max(known))} {unit}".rstrip() if known else ""
-    odd = [f"{n} {v}" for n, v in zip(g.labels, g.verdict, strict=True) if v in ("weak", "undetermined")]
-    if not odd:
-        return [name, f" determined{size}"]
-    if len(set(g.verdict)) == 1:
-        return [name, f" {g.verdict[0]}{size}"]
-    return [name, f": {', '.join(odd)}; the rest determined{f', all known{size}' if size else ''}"]
+    """The class in page.css of the verdict on the whole."""
+    return TRUST[c.verdict]
 
 
 def parameters(c: Calibration) -> Html:
@@ -156,22 +117,22 @@ def _matrix(name: str, T: np.ndarray) -> Html:
 
 
 def relative(c: Calibration) -> Html:
-    """Where LiDARs and wheels are as seen from cameras and LiDARs; empty where there are none."""
+    """Every pair of sensors, and the baselines of cameras; empty where there is one sensor only."""
     found = relative_poses(c)
     if not found:
         return Html("")
     title = element("h3", "One sensor seen from another")
     words = element(
         "p",
-        "From the joint covariance of both, empirical factors included; the whole of it is in calibration.yaml. "
-        "T_a_b takes coordinates in the frame of b to that of a. Turns have their standard deviation about the axes of "
-        "b, positions along those of a; where one of the two is undetermined it is that of the guess.",
+        "Standard deviations come from the joint covariance of both sensors, empirical factors included. All of it is "
+        "in calibration.yaml. T_a_b takes coordinates in the frame of b to that of a. Rotation: std about the axes of "
+        "b; position: std along the axes of a. An undetermined component has the uncertainty of its initial guess.",
     )
-    headers = ("", "x [mm]", "y [mm]", "z [mm]", "roll [deg]", "pitch [deg]", "yaw [deg]")
+    headers = ("", "distance [mm]", "x [mm]", "y [mm]", "z [mm]", "roll [deg]", "pitch [deg]", "yaw [deg]")
     body = []
     for r in found:
-        values = [*(1e3 * r.T[:3, 3]), *rpy_deg(r.T[:3, :3])]
-        std = [*(1e3 * r.std[3:]), *np.rad2deg(r.std[:3])]
+        values = [1e3 * r.distance, *(1e3 * r.T[:3, 3]), *rpy_deg(r.T[:3, :3])]
+        std = [1e3 * r.distance_std, *(1e3 * r.std[3:]), *np.rad2deg(r.std[:3])]
         body.append((r.name, *(f"{x:.3f} ± {shown(s)}" for x, s in zip(values, std, strict=True))))
     matrices = element("div", [_matrix(r.name, r.T) for r in found], "matrices")
     return Html(title + words + table(headers, body, headers[1:]) + matrices)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.calibration import SensorFit
+from icalib.calibration.result import SensorFit
 
 LARGE_CHI2 = 2.0  # per post-fit degree of freedom: above this it is worth a warning
 SAMPLED_DOF = 3.0  # times the square root of the number of residuals: how far off degrees of freedom may be

@@ -1,0 +1,137 @@
+"""Whether a result can be used, and why not. This module alone decides it.
+
+Console, report, calibration.yaml, result.json and the exit code of `--strict` show what it says. Four verdicts, the
+worst that applies:
+
+not usable        the solver did not converge, or a check says that the rig file or the recording is wrong
+partly usable     the data leave components undetermined; all others can be used
+usable with care  a warning, or a component whose standard deviation exceeds its tolerance
+usable            none of these
+
+A lens is judged by its projection uncertainty where the camera saw points, and not by single coefficients: these trade
+with each other. Components with a prior that the data do not improve are as good as the prior says, which is no fault
+of the result. Nuisance parameters (edge bloom, board shape and tilt) do not count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Literal
+
+from icalib.calibration.projection import projection_uncertainty
+from icalib.calibration.units import SHOWN_UNITS
+
+if TYPE_CHECKING:
+    from icalib.calibration.result import Calibration, ParameterGroup, Verdict
+
+Usability = Literal["usable", "usable with care", "partly usable", "not usable"]
+
+EXIT_CODES: dict[Usability, int] = {"usable": 0, "usable with care": 3, "partly usable": 4, "not usable": 5}
+NEXT: dict[Usability, str] = {
+    "usable": "The solver converged, the data determine every parameter, and no check failed.",
+    "usable with care": "Read the reasons before you use the numbers.",
+    "partly usable": (
+        "Use no component that is marked undetermined: it is no better than its initial guess. Act on the reasons to "
+        "determine it."
+    ),
+    "not usable": "Act on the first reason, then calibrate again.",
+}
+LENS = ("intrinsics", "distortion")
+NUISANCE = ("bloom", "shape", "tilt")
+WORST_FIRST: tuple[Verdict, ...] = ("undetermined", "weak", "determined", "fixed")
+UNDETERMINED = 10.0  # tolerances: a standard deviation above this says no more than a guess does
+MOST_NAMED = 6  # components in one sentence
+
+
+def usability(c: Calibration) -> Usability:
+    """The verdict on the whole result."""
+    if not c.converged or c.wrong:
+        return "not usable"
+    found = {v for g in c.groups for v in _counted(c, g)}
+    if "undetermined" in found:
+        return "partly usable"
+    return "usable with care" if c.warnings or "weak" in found else "usable"
+
+
+def reasons(c: Calibration) -> tuple[str, ...]:
+    """Sentences on why the result is not simply usable, the most important first; none where it is."""
+    if not c.converged:
+        return tuple(dict.fromkeys([*c.wrong, c.failure, *c.warnings]))
+    counted = {v for g in c.groups for v in _counted(c, g)} & {"undetermined", "weak"}
+    open_ones = [*c.undetermined, *_unexplained(c)] if counted else []
+    weak = list(_weak(c))
+    rest = [w for w in c.warnings if w not in c.wrong]
+    return tuple(dict.fromkeys([*c.wrong, *open_ones, *rest, *weak]))
+
+
+def by_size(tolerances: float) -> Verdict:
+    """The verdict on a component whose standard deviation is so many times its tolerance."""
+    return "undetermined" if not tolerances <= UNDETERMINED else "determined" if tolerances <= 1.0 else "weak"
+
+
+def worst(verdicts: tuple[Verdict, ...]) -> Verdict:
+    """The verdict that a group deserves as a whole."""
+    return min((*verdicts, WORST_FIRST[-1]), key=WORST_FIRST.index)
+
+
+def lens_projection_px(c: Calibration, camera: str) -> float | None:
+    """Median standard deviation of the projection where `camera` saw points [px]; None where its lens is fixed, or has
+    no ray in the image."""
+    groups = [g for g in c.groups if g.sensor == camera and g.name in LENS]
+    if len(groups) < len(LENS) or all(g.columns is None for g in groups):
+        return None
+    found = projection_uncertainty(c, camera)
+    return None if found is None else found.median_seen
+
+
+def lens_verdict(c: Calibration, camera: str) -> Verdict:
+    """By the projection uncertainty of the lens, against the tolerance in pixels of the rig file's settings."""
+    sigma = lens_projection_px(c, camera)
+    return "fixed" if sigma is None else by_size(sigma / float(c.settings.get("pixel_tolerance", 1.0)))
+
+
+def _counted(c: Calibration, g: ParameterGroup) -> tuple[Verdict, ...]:
+    """Verdicts of a group that count for the whole; those of a lens as one."""
+    if g.name in NUISANCE:
+        return ()
+    if g.name in LENS and g.sensor in c.cameras:
+        return (lens_verdict(c, g.sensor),) if {"weak", "undetermined"} & set(g.verdict) else ()
+    return () if g.mode == "prior" else g.verdict
+
+
+def _unexplained(c: Calibration) -> Iterator[str]:
+    """A sentence on undetermined components where no direction is named."""
+    names = [name for name, verdict in _components(c) if verdict == "undetermined"]
+    if names and not c.undetermined:
+        yield (
+            f"{_listed(names)}: undetermined, for the standard deviation exceeds {UNDETERMINED:.0f} tolerances; record "
+            "longer, with more motion about every axis and more of the target in view."
+        )
+
+
+def _weak(c: Calibration) -> Iterator[str]:
+    names = [name for name, verdict in _components(c) if verdict == "weak"]
+    if names:
+        yield (
+            f"{_listed(names)}: weakly determined, the standard deviation exceeds the tolerance; record longer with "
+            "more motion, or accept that size."
+        )
+
+
+def _components(c: Calibration) -> Iterator[tuple[str, Verdict]]:
+    """Name with standard deviation, and verdict, of every component that counts."""
+    for g in c.groups:
+        verdicts = _counted(c, g)
+        if g.name in LENS and g.sensor in c.cameras:
+            if verdicts and g.name == LENS[0]:
+                yield f"{g.sensor} lens (projection {lens_projection_px(c, g.sensor):.2g} px)", verdicts[0]
+            continue
+        unit, scale = SHOWN_UNITS.get(g.unit, (g.unit, 1.0))
+        for label, verdict, std in zip(g.labels, verdicts, g.std.tolist(), strict=False):
+            own = g.name if label in (g.name, "") else f"{g.name} {label}"
+            yield f"{g.sensor} {own.replace('_', ' ')} (std {scale * std:.2g} {unit})".replace(" )", ")"), verdict
+
+
+def _listed(names: list[str]) -> str:
+    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    return ", ".join(names[:MOST_NAMED]) + more

@@ -1,0 +1,131 @@
+"""The verdict: the worst that applies, one for console, report, files and exit code."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from icalib.calibration import Calibration, load_calibration, relative_pose
+from icalib.calibration.verdict import EXIT_CODES, NEXT, by_size, lens_projection_px
+from icalib.console import print_result, print_warnings
+from icalib.report import report_html
+
+
+def with_verdicts(c: Calibration, verdict: str, where: tuple[str, ...] = ()) -> Calibration:
+    """All components determined, but those of the groups named `where`."""
+    groups = tuple(
+        dataclasses.replace(g, verdict=(verdict if g.name in where else "determined",) * len(g.verdict))
+        if g.columns
+        else g
+        for g in c.groups
+    )
+    return dataclasses.replace(c, undetermined=(), warnings=(), groups=groups)
+
+
+@pytest.fixture(scope="module")
+def cases(calibration: Calibration) -> dict[str, Calibration]:
+    """By name; each name begins with the verdict."""
+    sound = with_verdicts(calibration, "determined")
+    wrong = {"warnings": ("mind.", "it is too large."), "wrong": ("it is too large.",)}
+    return {
+        "usable": sound,
+        "usable: coefficients trade, the projection is known": with_verdicts(calibration, "weak", ("distortion",)),
+        "usable: nuisances": with_verdicts(calibration, "undetermined", ("bloom", "shape", "tilt")),
+        "usable with care: weak": with_verdicts(calibration, "weak", ("translation",)),
+        "usable with care: warned": dataclasses.replace(sound, warnings=("mind.",)),
+        "partly usable: open": with_verdicts(calibration, "undetermined", ("translation",)),
+        "partly usable": calibration,
+        "not usable: wrong": dataclasses.replace(sound, **wrong),
+        "not usable: wrong and open": dataclasses.replace(calibration, **wrong),
+        "not usable: failed": dataclasses.replace(calibration, converged=False),
+    }
+
+
+def console_of(c: Calibration) -> str:
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out):
+        print_result(c, Path("out"))
+    return " ".join(out.getvalue().split())
+
+
+def test_the_worst_that_applies_is_the_verdict(cases: dict[str, Calibration]):
+    assert {name: c.verdict for name, c in cases.items()} == {name: name.split(":")[0] for name in cases}
+    assert {c.verdict for c in cases.values()} == set(EXIT_CODES) == set(NEXT)
+
+
+def test_every_place_says_the_same(cases: dict[str, Calibration], tmp_path: Path):
+    for name, c in cases.items():
+        folder = tmp_path / str(len(name))
+        c.save(folder)
+        for file, load in (("calibration.yaml", yaml.safe_load), ("result.json", json.loads)):
+            data = load((folder / file).read_text())
+            assert (data["verdict"], tuple(data["reasons"])) == (c.verdict, c.reasons)
+        again = load_calibration(folder)
+        assert (again.verdict, again.reasons) == (c.verdict, c.reasons)
+        assert console_of(c).endswith(f"Verdict: {c.verdict}. {NEXT[c.verdict]}")
+        assert f"{c.verdict.capitalize()}. {NEXT[c.verdict]}" in report_html(c)
+
+
+def test_what_must_be_wrong_is_the_first_reason(cases: dict[str, Calibration]):
+    assert cases["not usable: wrong"].reasons == ("it is too large.", "mind.")
+    words = cases["not usable: wrong and open"]
+    assert words.reasons[:2] == ("it is too large.", words.undetermined[0]) and "mind." in words.reasons
+    assert cases["not usable: failed"].reasons[0].startswith("the solver did not converge")
+    assert (cases["usable"].reasons, cases["usable: nuisances"].reasons) == ((), ())
+
+
+def test_components_are_named_where_no_direction_is(cases: dict[str, Calibration]):
+    (weak,) = cases["usable with care: weak"].reasons
+    assert weak.startswith("cam0 translation x (std 1.1 mm), cam0 translation y (std 1.2 mm)")
+    (open_one,) = cases["partly usable: open"].reasons
+    assert "cam1 translation z" in open_one and "undetermined" in open_one
+
+
+def test_a_lens_is_judged_by_its_projection(calibration: Calibration):
+    """Coefficients that are called weak do not count while the projection is known; with a tolerance below its
+    uncertainty they do."""
+    sigma = lens_projection_px(calibration, "cam0")
+    found = with_verdicts(calibration, "weak", ("intrinsics",))
+    assert sigma is not None and found.verdict == "usable"
+    strict = dataclasses.replace(found, settings=found.settings | {"pixel_tolerance": 0.5 * sigma})
+    assert strict.verdict == "usable with care"
+    assert f"cam0 lens (projection {sigma:.2g} px)" in strict.reasons[0]
+
+
+def test_a_prior_that_the_data_do_not_improve_is_no_reason(calibration: Calibration):
+    found = with_verdicts(calibration, "undetermined", ("time_offset",))
+    assert found.verdict == "partly usable"
+    groups = tuple(dataclasses.replace(g, mode="prior") if g.name == "time_offset" else g for g in found.groups)
+    assert dataclasses.replace(found, groups=groups).verdict == "usable"
+
+
+def test_quiet_leaves_warnings_on_standard_error(cases: dict[str, Calibration], capsys: pytest.CaptureFixture[str]):
+    print_warnings(cases["usable with care: warned"])
+    out, err = capsys.readouterr()
+    assert out == "" and err.startswith("Reason 1: mind.\nVerdict: usable with care.")
+    print_warnings(cases["usable"])
+    assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("size", "verdict"),
+    [(1.0, "determined"), (1.01, "weak"), (10.0, "weak"), (95.0, "undetermined"), (np.nan, "undetermined")],
+)
+def test_a_component_is_judged_by_its_printed_size(size: float, verdict: str):
+    assert by_size(size) == verdict
+
+
+def test_the_baseline_is_that_of_samples(calibration: Calibration):
+    """Distances between translations drawn from the relative pose's covariance."""
+    r = relative_pose(calibration, "cam0", "cam1")
+    drawn = np.random.default_rng(4).multivariate_normal(r.T[:3, 3], r.covariance[3:, 3:], 20_000)
+    assert r.distance == pytest.approx(np.linalg.norm(r.T[:3, 3]))
+    assert r.distance_std == pytest.approx(np.linalg.norm(drawn, axis=1).std(), rel=0.03)
+    assert f"baseline {1e3 * r.distance:.2f} +- " in console_of(calibration)
