@@ -51,7 +51,10 @@ def variant(motion: str, noise: float) -> Scenario:
         imu_noise=scenario.imu_noise.scaled(noise),
         lidars=tuple(replace(x, azimuth_steps=AZIMUTH_STEPS) for x in scenario.lidars),
         features=replace(
-            features, per_image=PER_IMAGE, count=round(share * features.count), lasting=round(share * features.lasting)
+            features,
+            per_image=PER_IMAGE,
+            count=round(share * features.count),
+            persistent=round(share * features.persistent),
         ),
     )
 

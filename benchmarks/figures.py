@@ -63,7 +63,7 @@ def measure(group: str, recording: Path) -> list[Figure]:
 def plain(rig: Rig) -> Rig:
     """`rig` with the plain model: every corner as good as any other, no bloom, a flat board, no splits."""
     settings = dataclasses.replace(
-        rig.settings, bloom=False, board_shape=False, blur_noise=False, common_error=False, splits=0, loss="huber"
+        rig.settings, bloom=False, board_shape=False, blur_noise=False, common_error=False, segments=0, loss="huber"
     )
     cameras = tuple(dataclasses.replace(c, corner_noise_px=PLAIN_CORNER_NOISE_PX) for c in rig.cameras)
     return dataclasses.replace(rig, cameras=cameras, settings=settings)

@@ -58,7 +58,7 @@ room:
   slope_deg: 2
 target: {{type: aprilgrid, rows: 6, cols: 6, tag_size: 0.3, tag_spacing: 0.3, T_world_board: {_AT}}}
 """
-QUIET = ("--splits", "0", "-q")
+QUIET = ("--segments", "0", "-q")
 _DRIVE = {"pose": ("imu0", "pose0"), "lidar": ("imu0", "lidar0", "wheel0"), "mocap": ("pose0", "wheel0")}
 _BOARD = {"cam": ("imu0", "cam0")}
 _STOPS = {"hand": ("cam0", "pose0")}

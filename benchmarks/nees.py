@@ -81,7 +81,7 @@ def _rig(scenario: Scenario) -> Rig:
         rig,
         cameras=tuple(replace(c, corner_noise_px=None, track_noise_px=None) for c in rig.cameras),
         lidars=tuple(replace(x, range_noise_m=None) for x in rig.lidars),
-        wheels=tuple(replace(w, sideways_slip=1e-4, upwards_slip=1e-4) for w in rig.wheels),
+        wheels=tuple(replace(w, lateral_slip=1e-4, vertical_slip=1e-4) for w in rig.wheels),
         poses=tuple(replace(p, rotation_noise=None, position_noise=None) for p in rig.poses),
     )
 
@@ -97,7 +97,7 @@ def _tracks() -> Case:
     """A camera that follows points of a room."""
     scenario = load_scenario(PAPER / "table2-3d.yaml")
     assert scenario.features is not None
-    features = replace(scenario.features, per_image=40, count=600, lasting=80)
+    features = replace(scenario.features, per_image=40, count=600, persistent=80)
     alone = {"cameras": scenario.cameras[:1], "lidars": (), "wheels": ()}
     scenario = replace(scenario, duration_s=5.0, features=features, **alone)
     return Case(scenario, _rig(scenario), 30)

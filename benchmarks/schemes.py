@@ -27,9 +27,9 @@ class Case:
 
     title: str
     scenario: Scenario
-    nodes: str
+    keyframes: str
     scheme: str
-    spacing_s: float = 0.05  # between nodes, at most
+    spacing_s: float = 0.05  # between keyframes, at most
 
 
 def cases() -> list[Case]:
@@ -39,9 +39,9 @@ def cases() -> list[Case]:
     )
     scenarios = {"together": together, "half a period apart": apart, "half a period apart, slow": slow}
     return [
-        Case(title, scenario, nodes, scheme)
+        Case(title, scenario, keyframes, scheme)
         for title, scenario in scenarios.items()
-        for nodes in PLACES
+        for keyframes in PLACES
         for scheme in ("inertial", "kinematic", "pose")
     ]
 
@@ -51,7 +51,7 @@ def run(case: Case, seed: int) -> tuple[dict[str, float], float, float]:
     simulated = simulate(case.scenario, seed)
     rig = rig_for(case.scenario, intrinsics="fixed", distortion="fixed")
     settings = dataclasses.replace(
-        rig.settings, nodes=case.nodes, scheme=case.scheme, splits=0, node_spacing_s=case.spacing_s
+        rig.settings, keyframes=case.keyframes, scheme=case.scheme, segments=0, keyframe_spacing_s=case.spacing_s
     )
     found = calibrate_measurements(dataclasses.replace(rig, settings=settings), simulated.measurements)
     errors = {b: _errors(found, simulated.truth, b) for b in BLOCKS}
@@ -85,7 +85,7 @@ def main() -> None:
             mean = [np.mean([k[b] for k in nees]) for b in BLOCKS]
             offset, position = (float(np.sqrt(np.mean(np.square(x)))) for x in (offsets, positions))
             print(
-                f"| {case.title} | {PLACES[case.nodes]} | {case.scheme} | "
+                f"| {case.title} | {PLACES[case.keyframes]} | {case.scheme} | "
                 + " | ".join(f"{m:.3g}" for m in mean)
                 + f" | {1e6 * offset:.0f} us | {1e3 * position:.2f} mm |",
                 flush=True,

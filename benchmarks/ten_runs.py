@@ -43,7 +43,9 @@ class Run:
     cause: str
 
 
-def recorded(scenario: Scenario, seed: int = 1, lens: Literal["fixed", "start", "free"] = "fixed") -> tuple[Rig, Measurements]:
+def recorded(
+    scenario: Scenario, seed: int = 1, lens: Literal["fixed", "start", "free"] = "fixed"
+) -> tuple[Rig, Measurements]:
     """The rig of the scenario, its lenses known from before or to be found, and what was measured."""
     rig = rig_for(scenario, settings=SETTINGS, intrinsics=lens, distortion=lens)
     return rig, simulate(scenario, seed).measurements

@@ -95,7 +95,7 @@ sensors:
     intrinsics: {fixed: [458.654, 457.296, 367.215, 248.375]}
     distortion: {fixed: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]}
 target: {type: aprilgrid, rows: 6, cols: 6, tag_size: 0.088, tag_spacing: 0.3}
-settings: {board_shape: false, splits: 0}
+settings: {board_shape: false, segments: 0}
 """
 
 
@@ -271,7 +271,7 @@ WRONG_RIGS = [
     ("0.088", "eighty-eight", r":11:.*tag_size"),
     ("pinhole-radtan", "fisheye", r":7:.*fisheye"),
     ("fixed: [458.654,", "fixd: [458.654,", r":9:.*fixd"),
-    ("splits: 0", "split: 0", r":12:.*split"),
+    ("segments: 0", "split: 0", r":12:.*split"),
     ("sensors:", "sensors: [", r"line"),
 ]
 
@@ -309,8 +309,8 @@ def test_output_that_is_a_file(tables, tmp_path, capsys):
 
 
 def test_splits_of_one(tables, tmp_path, capsys):
-    assert run(tables, tmp_path, "--splits", "1") == 1
-    assert "--splits" in capsys.readouterr().err
+    assert run(tables, tmp_path, "--segments", "1") == 1
+    assert "--segments" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("stage", ["finding a first guess", "solving (final pass)", "writing"])
@@ -418,7 +418,7 @@ def test_the_error_class_of_all_these_is_one(tables, tmp_path):
 
 def test_a_wrong_tag_spacing_is_warned_about():
     simulation = simulate(handheld(8.0), 1)
-    rig = rig_for(simulation.scenario, settings=Settings(splits=0))
+    rig = rig_for(simulation.scenario, settings=Settings(segments=0))
     target = dataclasses.replace(rig.target, tag_spacing=0.25, tag_size=rig.target.tag_size * 1.3 / 1.25)
     found = calibrate_measurements(dataclasses.replace(rig, target=target), simulation.measurements)
     assert [w for w in found.warnings if "check tag_size and tag_spacing" in w]

@@ -39,7 +39,7 @@ sensors:
     resolution: [640, 480]
 target: {type: aprilgrid, rows: 6, cols: 7, tag_size: 0.088, tag_spacing: 0.3}
 gravity: 9.80665
-settings: {scheme: pose, loss: cauchy, splits: 0, bloom: false}
+settings: {scheme: pose, loss: cauchy, segments: 0, bloom: false}
 """
 
 
@@ -91,7 +91,7 @@ def test_everything_is_read(tmp_path):
     )
     assert (rig.target.cols, rig.target.tag_size, rig.gravity) == (7, 0.088, 9.80665)
     s = rig.settings
-    assert (s.scheme, s.loss, s.splits, s.bloom, s.outlier_std) == ("pose", "cauchy", 0, False, 4.0)
+    assert (s.scheme, s.loss, s.segments, s.bloom, s.outlier_std) == ("pose", "cauchy", 0, False, 4.0)
     assert rig.path == tmp_path / "rig.yaml"
 
 
@@ -324,7 +324,9 @@ CHARUCO = "{type: charuco, squares_x: 7, squares_y: 5, square_size: 0.04, marker
             "rig.yaml:22: gravty: there is no such field, did you mean 'gravity'; available are sensors",
         ),
         ("scheme: pose", "scheme: poses", "settings.scheme: there is no such choice as 'poses', did you mean 'pose'"),
-        ("splits: 0", "splits: -1", "settings.splits: must be a whole number of at least 0"),
+        ("segments: 0", "splits: 0", "settings.splits: this field is now called segments; rename it."),
+        ("segments: 0", "nodes: every-image", "settings.nodes: this field is now called keyframes; rename it."),
+        ("segments: 0", "segments: -1", "settings.segments: must be a whole number of at least 0"),
         ("bloom: false", "bloom: 0", "settings.bloom: must be true or false, but is '0'"),
         ("bloom: false", "loss_scale: 0", "settings.loss_scale: must be above 0"),
         ("bloom: false", "outlier_std: -1", "settings.outlier_std: must be 0 or above, but is -1"),

@@ -22,8 +22,8 @@ sensors:
     range_noise: 0.02
     translation: {guess: [0.1, 0, 0.3]}
     time_offset: {fixed: 0.01}
-    near: 1
-    far: 60
+    min_range: 1
+    max_range: 60
     point_time: azimuth
     topic: /lidar/points
   lidar1: {type: lidar, path: top/scans.npz}
@@ -34,15 +34,15 @@ sensors:
     radii: {prior: [0.1, 0.11], sigma: 0.01}
     baseline: {guess: 0.4}
     wheel_noise: 0.01
-    sideways_slip: 0.002
-    upwards_slip: 0.003
+    lateral_slip: 0.002
+    vertical_slip: 0.003
     factor: relative-poses
     measures: ticks
     counts_per_turn: 4096.5
     counter_size: 65536
     topic: /joints
     joints: [l, r]
-  wheel1: {type: wheels, meaning: instant}
+  wheel1: {type: wheels, sampling: instantaneous}
   wheel2: {type: wheels, measures: poses}
   mocap0:
     type: pose
@@ -83,18 +83,24 @@ def test_the_field_and_the_unit_of_point_times(tmp_path):
 def test_lidars_and_wheels_are_read(tmp_path):
     rig = load(tmp_path, ROBOT)
     a, b = rig.lidars
-    assert (a.name, a.path, a.range_noise_m, a.near_m, a.far_m) == ("lidar0", "lidar0/scans.npz", 0.02, 1.0, 60.0)
+    assert (a.name, a.path, a.range_noise_m, a.min_range_m, a.max_range_m) == (
+        "lidar0",
+        "lidar0/scans.npz",
+        0.02,
+        1.0,
+        60.0,
+    )
     assert (a.point_time, a.topic, a.time_offset.mode) == ("azimuth", "/lidar/points", "fixed")
     assert a.rotation == Parameter() and np.array_equal(a.translation.value, [0.1, 0, 0.3])
     assert b == Lidar("lidar1", "top/scans.npz") and (rig.cameras, rig.body) == ((), "imu0")
     ticks, rates, poses = rig.wheels
     assert (ticks.measures, ticks.counts_per_turn, ticks.counter_size) == ("ticks", 4096.5, 65536)
     assert (ticks.path, ticks.topic, ticks.joints) == ("wheel0/ticks.csv", "/joints", ("l", "r"))
-    assert (ticks.wheel_noise, ticks.sideways_slip, ticks.upwards_slip) == (0.01, 0.002, 0.003)
+    assert (ticks.wheel_noise, ticks.lateral_slip, ticks.vertical_slip) == (0.01, 0.002, 0.003)
     assert ticks.factor == "relative-poses" and np.array_equal(ticks.radii.value, [0.1, 0.11])
     assert ticks.rotation.mode == "prior" and np.allclose(ticks.rotation.value @ [1, 0, 0], [0, 1, 0])
     assert ticks.baseline.mode == "free" and np.array_equal(ticks.baseline.value, [0.4])
-    assert rates == Wheels("wheel1", "wheel1/rates.csv", meaning="instant")
+    assert rates == Wheels("wheel1", "wheel1/rates.csv", sampling="instantaneous")
     assert poses == Wheels("wheel2", "wheel2/poses.csv", measures="poses", factor="relative-poses")
 
 
@@ -203,13 +209,17 @@ def test_plain_lidars_and_wheels_load_back(tmp_path):
     ("old", "new", "words"),
     [
         ("range_noise: 0.02", "range_noise: 0", "rig.yaml:5: sensors.lidar0.range_noise: must be above 0"),
-        ("near: 1", "near: 70", "rig.yaml:8: sensors.lidar0.near: points from 70 to 60 m are none; near must be"),
+        ("min_range: 1", "near: 1", "lidar0.near: this field is now called min_range; rename it."),
+        ("max_range: 60", "far: 60", "lidar0.far: this field is now called max_range; rename it."),
+        ("drive: differential", "sideways_slip: 0.1", "wheel0.sideways_slip: this field is now called lateral_slip"),
+        ("drive: differential", "meaning: mean", "called sampling; rename it, and write interval-mean for mean"),
+        ("min_range: 1", "min_range: 70", "lidar0.min_range: the range from 70 to 60 m is empty; min_range must be"),
         (
             "azimuth",
             "guess",
             "sensors.lidar0.point_time: there is no such choice as 'guess'; available are auto, start",
         ),
-        ("    near: 1", "    nera: 1", "sensors.lidar0.nera: there is no such field, did you mean 'near'"),
+        ("    min_range: 1", "    min_rnage: 1", "lidar0.min_rnage: there is no such field, did you mean 'min_range'"),
         ("drive: differential", "drive: tracks", "wheel0.drive: there is no such choice as 'tracks'"),
         ("drive: differential", "drive: ackermann", "radii: belongs to wheels with a left and a right side"),
         (
@@ -224,7 +234,11 @@ def test_plain_lidars_and_wheels_load_back(tmp_path):
         ("wheel_noise: 0.01", "wheel_noise: -1", "sensors.wheel0.wheel_noise: must be above 0"),
         ("    counts_per_turn: 4096.5\n", "", "rig.yaml:14: sensors.wheel0: counts_per_turn is missing; add how many"),
         ("measures: ticks", "measures: angles", "wheel0.counts_per_turn: belongs to wheels that measure ticks, not an"),
-        ("measures: ticks", "meaning: mean\n    measures: ticks", "wheel0.meaning: belongs to wheels that measure rat"),
+        (
+            "measures: ticks",
+            "sampling: interval-mean\n    measures: ticks",
+            "wheel0.sampling: belongs to wheels that measure rat",
+        ),
         ("65536", "1.5", "sensors.wheel0.counter_size: must be a whole number of at least 2"),
         ("[l, r]", "[l]", "sensors.wheel0.joints: must be the names of two joints, [left, right]"),
         ("[l, r]", "[l, l]", "sensors.wheel0.joints: must be the names of two joints, [left, right]"),
@@ -255,7 +269,7 @@ sensors:
   twist0:
     type: wheels
     measures: twist
-    meaning: instant
+    sampling: instantaneous
     scales: {prior: [1, 1], sigma: 0.1}
     speed_noise: 0.01
     yaw_noise: 0.02
@@ -278,9 +292,9 @@ sensors:
 def test_kinds_of_wheels_are_read_and_load_back(tmp_path):
     twist, car, skid = load(tmp_path, KINDS).wheels
     assert [w.kind for w in (twist, car, skid)] == ["twist", "steered", "pair"]
-    assert (twist.path, twist.meaning, twist.speed_noise, twist.yaw_noise) == (
+    assert (twist.path, twist.sampling, twist.speed_noise, twist.yaw_noise) == (
         "twist0/twist.csv",
-        "instant",
+        "instantaneous",
         0.01,
         0.02,
     )
@@ -300,13 +314,25 @@ def test_kinds_of_wheels_are_read_and_load_back(tmp_path):
     ("old", "new", "words"),
     [
         (
-            "meaning: instant",
+            "sampling: instantaneous",
             "joints: [a, b]",
             "twist0.joints: belongs to wheels that measure rates or angles or ticks",
         ),
-        ("meaning: instant", "drive: skid-steer", "twist0.drive: goes with wheels that measure rates or angles or tic"),
-        ("meaning: instant", "factor: relative-poses", "factor: the paper's relative-poses are of a left and a right"),
-        ("meaning: instant", "wheel_noise: 0.1", "wheel_noise: belongs to wheels with a left and a right side or driv"),
+        (
+            "sampling: instantaneous",
+            "drive: skid-steer",
+            "twist0.drive: goes with wheels that measure rates or angles or tic",
+        ),
+        (
+            "sampling: instantaneous",
+            "factor: relative-poses",
+            "factor: the paper's relative-poses are of a left and a right",
+        ),
+        (
+            "sampling: instantaneous",
+            "wheel_noise: 0.1",
+            "wheel_noise: belongs to wheels with a left and a right side or driv",
+        ),
         ("scales: {prior: [1, 1]", "scales: {prior: [1, -1]", "twist0.scales: are factors and must be above 0"),
         ("{guess: 0.3}", "{guess: -0.3}", "car0.radius: is in metres and must be above 0"),
         (

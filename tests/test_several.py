@@ -27,7 +27,7 @@ sensors:
     intrinsics: {fixed: [458.654, 457.296, 367.215, 248.375]}
     distortion: {fixed: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]}
 target: {type: aprilgrid, rows: 6, cols: 6, tag_size: 0.088, tag_spacing: 0.3}
-settings: {board_shape: false, splits: 0}
+settings: {board_shape: false, segments: 0}
 """
 PARTS = {"morning": (0, 9, 0), "evening": (20, 29, 3_600)}  # seconds of the excerpt; how much later its clocks were
 

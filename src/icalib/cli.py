@@ -77,7 +77,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_part(c)
     c.add_argument("--scheme", choices=("inertial", "pose", "kinematic"), help="where sensors are between nodes")
     c.add_argument("--loss", choices=("none", "huber", "cauchy"), help="robust loss on corners")
-    c.add_argument("--splits", type=int, metavar="N", help="segments for the empirical factor; 0: none")
+    c.add_argument("--segments", type=int, metavar="N", help="segments for the empirical factor; 0: none")
     strict = "exit code 3: usable with care, 4: partly usable, 5: not usable; by default 0 for all that was written"
     c.add_argument("--strict", action="store_true", help=strict)
     c.add_argument("--quiet", "-q", action="store_true", help="no progress bar and no table; warnings go to stderr")
@@ -244,9 +244,9 @@ def _calibrate(options: argparse.Namespace) -> int:
     from icalib.rig_file import load_rig
 
     rig = load_rig(options.rig)
-    chosen = {k: getattr(options, k) for k in ("scheme", "loss", "splits") if getattr(options, k) is not None}
-    if chosen.get("splits", 0) < 0 or chosen.get("splits") == 1:
-        raise CalibrationError("--splits must be 0 (none) or at least 2 segments.")
+    chosen = {k: getattr(options, k) for k in ("scheme", "loss", "segments") if getattr(options, k) is not None}
+    if chosen.get("segments", 0) < 0 or chosen.get("segments") == 1:
+        raise CalibrationError("--segments must be 0 (none) or at least 2 segments.")
     rig = dataclasses.replace(rig, settings=dataclasses.replace(rig.settings, **chosen))
     check_folder(options.output, [options.rig, *options.recording])
     with progress_bar(options.quiet) as progress:

@@ -177,7 +177,7 @@ def join_wheels(streams: list[tuple[WheelStream | WheelPoses, int]]) -> WheelStr
     first = streams[0][0]
     assert isinstance(first, WheelStream)  # see above
     stamps, rates = np.concatenate(stamps), np.concatenate(rates)
-    return WheelStream(first.name, stamps, rates, first.meaning, first.kind, joins_ns=_joins(streams))
+    return WheelStream(first.name, stamps, rates, first.sampling, first.kind, joins_ns=_joins(streams))
 
 
 def join_poses(streams: list[tuple[PoseStream, int]]) -> PoseStream:

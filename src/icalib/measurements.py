@@ -245,16 +245,16 @@ class WheelStream:
 
     stamps_ns (N,) int64, strictly increasing; rate (N, 2), by kind: "pair", rates of the left and the right wheel
     [rad/s], positive forwards; "steered", rate of the driven wheel [rad/s] and steering angle [rad], positive to the
-    left; "twist", forward speed [m/s] and yaw rate [rad/s], positive to the left. meaning "mean": reading i is the
-    mean over the period from stamp i-1 to stamp i, so rate x period is the angle turned (what a difference of encoder
-    counts gives; the first reading's period began one unknown stamp earlier). "instant": the rate at the stamp, as
-    steering angles always are.
+    left; "twist", forward speed [m/s] and yaw rate [rad/s], positive to the left. sampling "interval-mean":
+    reading i is the mean over the period from stamp i-1 to stamp i, so rate x period is the angle turned (what a
+    difference of encoder counts gives; the first reading's period began one unknown stamp earlier). "instantaneous":
+    the rate at the stamp, as steering angles always are.
     """
 
     name: str
     stamps_ns: np.ndarray
     rate: np.ndarray
-    meaning: Literal["mean", "instant"] = "mean"
+    sampling: Literal["interval-mean", "instantaneous"] = "interval-mean"
     kind: Literal["pair", "steered", "twist"] = "pair"
     joins_ns: tuple[int, ...] = field(default=(), kw_only=True)  # the first stamp of each further recording joined
 

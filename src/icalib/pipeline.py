@@ -90,11 +90,11 @@ def _measure(rig: Rig, recording: Recording, progress: Progress) -> Measurements
             share = (names.index(camera.name) + done) / len(names)
             progress(f"finding the target in the images of {camera.name}", share)
 
-        return find_corners(recording, camera, rig.target, rig.settings.keep_corners, show)
+        return find_corners(recording, camera, rig.target, rig.settings.cache_corners, show)
 
     def follow(recording: Recording, cameras: Sequence[Camera]) -> Sequence[tuple[TrackStream, tuple[str, ...]]]:
         what = f"tracking features in the images of {' and '.join(c.name for c in cameras)}"
-        return find_all_tracks(recording, cameras, rig.settings.keep_corners, lambda done: progress(what, done))
+        return find_all_tracks(recording, cameras, rig.settings.cache_corners, lambda done: progress(what, done))
 
     return read_measurements(recording, rig, find, follow)
 

@@ -133,7 +133,7 @@ PointTime = Literal["auto", "start", "end", "azimuth", "snapshot"]
 
 @dataclass(frozen=True)
 class Lidar:
-    """One LiDAR. Points nearer than near_m or farther than far_m are left out.
+    """One LiDAR. Points nearer than min_range_m or farther than max_range_m are left out.
 
     point_time: what a point's time is counted from; see `recordings.point_times`. point_time_field, point_time_unit:
     where the time of a point stands, and in what unit; None: told from the data.
@@ -146,8 +146,8 @@ class Lidar:
     translation: Parameter = Parameter()
     time_offset: Parameter = Parameter()
     clock_restarts: bool = False  # from recording to recording: each has a time offset of its own
-    near_m: float = 0.5
-    far_m: float = 100.0
+    min_range_m: float = 0.5
+    max_range_m: float = 100.0
     point_time: PointTime = "auto"
     topic: str | None = None  # of its clouds; None: the one with the LiDAR's name, or the only one
     point_time_field: str | None = None
@@ -195,7 +195,7 @@ class Wheels:
 
     drive: differential, two driven wheels of one axle; skid-steer, two pairs of which each turns alike; ackermann, the
     front wheels steer. measures: rates [rad/s], angles turned [rad], counts of encoders (ticks), relative planar poses
-    (tables only), or twist, forward speed [m/s] and yaw rate [rad/s]. meaning: of rates and twist, as in `WheelStream`.
+    (tables only), or twist, forward speed [m/s] and yaw rate [rad/s]. sampling: of rates and twist; see `WheelStream`.
     Densities: of each wheel's angle, of speed and yaw rate, of the steering angle, and of slip.
     """
 
@@ -216,11 +216,11 @@ class Wheels:
     speed_noise: float = 2e-3  # m/sqrt(s)
     yaw_noise: float = 1e-2  # rad/sqrt(s)
     steering_noise: float = 1e-3  # rad/sqrt(Hz): of angles at 70 Hz half a degree each
-    sideways_slip: float = 5e-3  # m/sqrt(s)
-    upwards_slip: float = 5e-3  # m/sqrt(s), off the ground
+    lateral_slip: float = 5e-3  # m/sqrt(s)
+    vertical_slip: float = 5e-3  # m/sqrt(s), off the ground
     factor: WheelFactor = "increments"  # relative-poses: the paper's (27)
     measures: WheelMeasure = "rates"
-    meaning: Literal["mean", "instant"] = "mean"
+    sampling: Literal["interval-mean", "instantaneous"] = "interval-mean"
     counts_per_turn: float | None = None  # of ticks, for one turn of the wheel
     signs: tuple[int, ...] | None = None  # 1 or -1 of each column of its table, or each joint; None: all 1
     rate_unit: RateUnit = "rad/s"  # of rates
@@ -285,7 +285,7 @@ class PoseSensor:
 
 Scheme = Literal["inertial", "pose", "kinematic"]
 Loss = Literal["none", "huber", "cauchy"]
-Nodes = Literal["every-image", "first-camera"]
+Keyframes = Literal["every-image", "first-camera"]
 
 
 @dataclass(frozen=True)
@@ -293,7 +293,7 @@ class Settings:
     """How the estimate is made; every field has a default that just works."""
 
     scheme: Scheme = "inertial"  # where a sensor was between nodes
-    nodes: Nodes = "every-image"  # whose images have a node of their own; the paper's: the first camera's alone
+    keyframes: Keyframes = "every-image"  # images that have a keyframe of their own; the paper: the first camera's
     loss: Loss = "huber"  # robust loss on corners
     loss_scale: float = 2.5  # in standard deviations, where the loss starts to bend
     outlier_std: float = 4.0  # drop corners this many standard deviations beyond their image's mean error; 0: none
@@ -302,10 +302,10 @@ class Settings:
     board_shape: bool = True  # the target is not flat: estimate how it bends
     blur_noise: bool = True  # corners of fast images weigh less
     common_error: bool = False  # corners of one image share an error: a shift, its size estimated
-    keep_corners: bool = True  # corners found in images are kept in the user's cache folder for the next run
-    splits: int = 8  # segments for the empirical factor, 0: none
+    cache_corners: bool = True  # keep detected corners in the user's cache folder for the next run
+    segments: int = 8  # segments of the block jackknife (empirical factor), 0: none
     max_gap_s: float = 0.5  # IMU gaps up to this are bridged; longer ones split the recording
-    node_spacing_s: float = 0.05  # no two nodes further apart
+    keyframe_spacing_s: float = 0.05  # largest distance of neighbouring keyframes
     # Points that cameras follow lie on the planes that LiDARs see, to within this; 0: nothing is said of that.
     points_on_planes_m: float = 0.0
     # What is known to better than these is determined.

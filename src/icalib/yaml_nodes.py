@@ -17,6 +17,13 @@ MOST_WHOLE = 2**63 - 1  # what int64, the type of stamps, holds
 _LARGEST = 1e20  # nothing that is measured is larger, and powers of it are still finite
 _WHOLE = re.compile(r"[-+]?[0-9]{1,19}")
 
+# Former names of fields, for the error that names the new one.
+RENAMED = {
+    "far": "max_range", "keep_corners": "cache_corners", "lasting": "persistent", "meaning": "sampling",
+    "near": "min_range", "node_spacing_s": "keyframe_spacing_s", "nodes": "keyframes", "sideways_slip": "lateral_slip",
+    "splits": "segments", "upwards_slip": "vertical_slip",
+}  # fmt: skip
+
 
 @dataclass(frozen=True)
 class YamlValue:
@@ -67,6 +74,8 @@ class YamlValue:
         """The mapping's values by key, where only these keys may stand and the required ones must."""
         found, valid = self.entries(), required + optional
         for name, value in found.items():
+            if name not in valid and RENAMED.get(name) in valid:
+                value.fail(f"this field is now called {RENAMED[name]}; rename it{_new_values(name)}.")
             if name not in valid:
                 value.fail(f"there is no such field{suggestion(name, valid)}; available are {', '.join(valid)}.")
         missing = [name for name in required if name not in found]
@@ -184,6 +193,11 @@ def parse_yaml(text: str, path: str, kind: str = "rig file") -> YamlValue:
 
 def _reason(error: Exception) -> str:
     return next(iter(str(error).splitlines()), "") or type(error).__name__
+
+
+def _new_values(former: str) -> str:
+    """What else changed with the name of a field."""
+    return ", and write interval-mean for mean, instantaneous for instant" if former == "meaning" else ""
 
 
 def suggestion(name: str, valid: tuple[str, ...]) -> str:

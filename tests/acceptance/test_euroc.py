@@ -17,7 +17,7 @@ from icalib.rig import ImuNoise, Parameter
 
 CAMERAS = ("cam0", "cam1")
 BASELINE_M = 0.11008
-HONEST_OFF = {"bloom": False, "board_shape": False, "blur_noise": False, "common_error": False, "splits": 0}
+HONEST_OFF = {"bloom": False, "board_shape": False, "blur_noise": False, "common_error": False, "segments": 0}
 
 
 def turn(R: np.ndarray, S: np.ndarray) -> np.ndarray:
@@ -145,14 +145,14 @@ def test_the_halves_as_two_recordings_give_the_whole(rig, whole, whole_fixed, cu
 
 @pytest.fixture(scope="module")
 def unshifted(rig, whole) -> Calibration:
-    return calibrate_measurements(with_settings(rig, splits=0), whole)
+    return calibrate_measurements(with_settings(rig, segments=0), whole)
 
 
 @pytest.mark.parametrize("shift_ns", [37_000_000, 1_000_037_000_000, -5_000_000_000])
 def test_a_shift_of_the_imu_clock_is_recovered(rig, whole, unshifted, shift_ns):
     imu = whole.imu
     shifted = Measurements(ImuStream(imu.name, imu.stamps_ns + shift_ns, imu.gyro, imu.accel), whole.cameras)
-    found = calibrate_measurements(with_settings(rig, splits=0), shifted)
+    found = calibrate_measurements(with_settings(rig, segments=0), shifted)
     for camera in CAMERAS:
         recovered = found.group(camera, "time_offset").value[0] - unshifted.group(camera, "time_offset").value[0]
         assert abs(recovered - 1e-9 * shift_ns) < 1e-6
@@ -180,7 +180,7 @@ def test_a_wrong_guess_of_everything_changes_nothing(rig, whole, unshifted):
         )
         for c in rig.cameras
     )
-    found = calibrate_measurements(with_settings(dataclasses.replace(rig, cameras=cameras), splits=0), whole)
+    found = calibrate_measurements(with_settings(dataclasses.replace(rig, cameras=cameras), segments=0), whole)
     for camera in CAMERAS:
         angle, distance = distances(found.T_imu_sensor(camera), unshifted.T_imu_sensor(camera))
         assert angle < 1e-3

@@ -26,7 +26,7 @@ STEP = {
 SETTINGS = {
     "scheme pose": {"scheme": "pose"},
     "scheme kinematic": {"scheme": "kinematic"},
-    "nodes at the first camera": {"nodes": "first-camera"},
+    "keyframes at the first camera": {"keyframes": "first-camera"},
     "loss none": {"loss": "none"},
     "loss cauchy": {"loss": "cauchy"},
     "tight loss": {"loss_scale": 1.5},
@@ -36,8 +36,8 @@ SETTINGS = {
     "flat board": {"board_shape": False},
     "no blur": {"blur_noise": False},
     "common error": {"common_error": True},
-    "split": {"splits": 4},
-    "dense nodes": {"node_spacing_s": 0.025},
+    "split": {"segments": 4},
+    "dense keyframes": {"keyframe_spacing_s": 0.025},
     "no bridging": {"max_gap_s": 0.02},
 }
 
@@ -49,7 +49,7 @@ def short(excerpt, cut):
 
 @pytest.fixture(scope="module")
 def base(rig) -> Rig:
-    return dataclasses.replace(rig, settings=dataclasses.replace(rig.settings, splits=0))
+    return dataclasses.replace(rig, settings=dataclasses.replace(rig.settings, segments=0))
 
 
 @pytest.fixture(scope="module")

@@ -44,7 +44,7 @@ def calibrated(simulation: Simulation, lidar: LidarStream) -> tuple[Calibration,
     """From what a reader makes of the scans, of which nobody knows what lies on which plane."""
     sensor = Lidar("lidar0", "")
     stream, _ = in_seconds(lidar.unassociated(), sensor, "here")
-    stream, notes = checked_lidar(sifted(stream, Sieve(sensor.near_m, sensor.far_m)), "here")
+    stream, notes = checked_lidar(sifted(stream, Sieve(sensor.min_range_m, sensor.max_range_m)), "here")
     measurements = replace(simulation.measurements, lidars=(stream,))
     return calibrate_measurements(rig_for(simulation.scenario), measurements), notes
 

@@ -33,7 +33,7 @@ def stills(count: int, seed: int, shared_px: float) -> Calibration:
     uv = whole.uv[rows] + np.einsum("nk,nkj->nj", field, sizes)
     rig = rig_for(simulation.scenario, intrinsics="start", distortion="start")
     own = dataclasses.replace(rig.cameras[0], corner_noise_px=None)
-    rig = dataclasses.replace(rig, imu=None, cameras=(own,), settings=dataclasses.replace(rig.settings, splits=8))
+    rig = dataclasses.replace(rig, imu=None, cameras=(own,), settings=dataclasses.replace(rig.settings, segments=8))
     stream = CornerStream("cam0", whole.stamps_ns[kept], start, whole.point[rows], uv)
     return calibrate_measurements(rig, Measurements(None, (stream,)))
 
@@ -75,8 +75,8 @@ def test_few_images_say_how_much_their_spread_can_tell():
 @pytest.mark.parametrize(
     ("imu", "cameras", "words"),
     [
-        ("imu0", ("cam0",), "record longer, and leave `splits` at 8 or more."),
-        ("imu0", (), "record longer, and leave `splits` at 8 or more."),
+        ("imu0", ("cam0",), "record longer, and leave `segments` at 8 or more."),
+        ("imu0", (), "record longer, and leave `segments` at 8 or more."),
         (None, ("cam0",), "record more images."),
         (None, (), "record more poses."),
     ],

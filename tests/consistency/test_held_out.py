@@ -10,7 +10,7 @@ import pytest
 from tests.consistency.test_several import pair
 from tests.consistency.test_without_imu import alone, stereo
 
-from icalib.calibration import Calibration, HeldOut
+from icalib.calibration import Calibration, CrossValidation
 from icalib.measurements import Measurements
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Camera, Rig, Settings
@@ -29,17 +29,17 @@ def run(
     return calibrate_measurements(rig, changed(simulate(scenario, seed).measurements))
 
 
-def held(c: Calibration) -> HeldOut:
-    assert c.held_out is not None
-    return c.held_out
+def held(c: Calibration) -> CrossValidation:
+    assert c.cross_validation is not None
+    return c.cross_validation
 
 
 @pytest.fixture(scope="module")
-def honest() -> list[HeldOut]:
+def honest() -> list[CrossValidation]:
     return [held(run(handheld(12.0), seed)) for seed in SEEDS]
 
 
-def test_where_noise_is_all_there_is_it_is_as_expected(honest: list[HeldOut]):
+def test_where_noise_is_all_there_is_it_is_as_expected(honest: list[CrossValidation]):
     """Over all seeds within 3 standard deviations, each within 4; and neither by being too wide."""
     excess, expected = (sum(getattr(h, name) for h in honest) for name in ("excess", "expected"))
     spread = float(np.sqrt(sum(h.spread**2 for h in honest)))
@@ -49,14 +49,14 @@ def test_where_noise_is_all_there_is_it_is_as_expected(honest: list[HeldOut]):
     assert all(0.5 < h.factor < 1.5 for h in honest)
 
 
-def test_what_moves_without_a_part_is_as_allowed(honest: list[HeldOut]):
+def test_what_moves_without_a_part_is_as_allowed(honest: list[CrossValidation]):
     """Without each of 8 parts, 32 parameters that correlate: the mean square over 6 seeds has about 6 x 7 x 10 free."""
     z = np.concatenate([h.whitened for h in honest])
     assert np.isfinite(z).all()
     assert np.mean(z**2) == pytest.approx(1.0, abs=0.3)
 
 
-def test_residuals_that_took_part_are_smaller_than_predicted_ones(honest: list[HeldOut]):
+def test_residuals_that_took_part_are_smaller_than_predicted_ones(honest: list[CrossValidation]):
     """Of corners, which carry most of it; RMS and chi^2 tell the same."""
     for h in honest:
         corners = [f for f in h.fits if f.kind == "corners"]
@@ -96,28 +96,28 @@ def test_errors_that_stay_for_a_second_show():
 
 def test_a_short_recording_is_split_into_as_many_parts_as_it_has():
     scenario = handheld(3.0)
-    rig = rig_for(scenario, settings=replace(PLAIN, splits=25), intrinsics="start", distortion="start")
+    rig = rig_for(scenario, settings=replace(PLAIN, segments=25), intrinsics="start", distortion="start")
     result = calibrate_measurements(rig, simulate(scenario, 0).measurements)
-    assert result.held_out is not None and 10 < result.held_out.parts < 25
+    assert result.cross_validation is not None and 10 < result.cross_validation.segments < 25
     assert not any("too short to be split" in w for w in result.warnings)
 
 
 def test_a_recording_that_is_not_split_says_so():
     scenario = handheld(3.0)
-    rig = rig_for(scenario, settings=replace(PLAIN, splits=1), intrinsics="start", distortion="start")
+    rig = rig_for(scenario, settings=replace(PLAIN, segments=1), intrinsics="start", distortion="start")
     result = calibrate_measurements(rig, simulate(scenario, 0).measurements)
-    assert result.held_out is None
+    assert result.cross_validation is None
     assert any("too short to be split" in w and "white noise alone" in w for w in result.warnings)
 
 
-def as_noise_makes_it(found: HeldOut) -> bool:
+def as_noise_makes_it(found: CrossValidation) -> bool:
     return abs(found.excess - found.expected) < 4.0 * found.spread
 
 
 def test_of_two_recordings_each_finds_how_its_board_leans():
     """A part each: each half has a tilt of its own, of which the other knows nothing."""
     simulations = pair(1)
-    rig = rig_for(simulations[0].scenario, settings=replace(PLAIN, splits=2), intrinsics="start", distortion="start")
+    rig = rig_for(simulations[0].scenario, settings=replace(PLAIN, segments=2), intrinsics="start", distortion="start")
     result = calibrate_measurements(rig, [s.measurements for s in simulations])
     found = held(result)
     assert (found.parts, found.directions) == (2, len(result.covariance) - 4)
@@ -127,7 +127,7 @@ def test_of_two_recordings_each_finds_how_its_board_leans():
 def test_without_an_imu_parts_are_runs_of_images():
     simulation = simulate(stereo(), 2)
     rig, measurements = alone(simulation)
-    result = calibrate_measurements(replace(rig, settings=replace(PLAIN, splits=4)), measurements)
+    result = calibrate_measurements(replace(rig, settings=replace(PLAIN, segments=4)), measurements)
     found = held(result)
     assert (found.parts, found.directions) == (4, len(result.covariance))
     assert [f.kind for f in found.fits] == ["corners", "corners"]
@@ -137,7 +137,7 @@ def test_without_an_imu_parts_are_runs_of_images():
 def test_where_planes_are_in_the_world_is_nothing_to_predict(robot: Callable[..., Scenario]):
     """A LiDAR and an IMU: nobody sees where the world's origin is, nor which way it faces."""
     scenario = robot("3d", 15.0, "l")
-    rig = rig_for(scenario, settings=replace(PLAIN, splits=8))
+    rig = rig_for(scenario, settings=replace(PLAIN, segments=8))
     result = calibrate_measurements(rig, simulate(scenario, 0).measurements)
     found = held(result)
     assert found.directions == len(result.covariance) - 4

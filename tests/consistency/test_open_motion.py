@@ -27,7 +27,7 @@ def thin(motion: str, noise: float, seconds: float = SECONDS) -> Scenario:
         duration_s=seconds,
         imu_noise=scenario.imu_noise.scaled(noise),
         lidars=tuple(replace(x, azimuth_steps=300) for x in scenario.lidars),
-        features=replace(scenario.features, per_image=30, count=450, lasting=60),
+        features=replace(scenario.features, per_image=30, count=450, persistent=60),
     )
 
 

@@ -49,7 +49,7 @@ def recordings(filmed: Film, tmp_path_factory: pytest.TempPathFactory) -> dict[F
 
 def rig_from_nothing(scenario: Scenario) -> Rig:
     """As a user would write it: nothing known of the camera but its model and resolution."""
-    settings = Settings(keep_corners=False)
+    settings = Settings(cache_corners=False)
     rig = rig_for(scenario, intrinsics="free", distortion="free", settings=settings)
     return dataclasses.replace(rig, cameras=(dataclasses.replace(rig.cameras[0], corner_noise_px=None),))
 
@@ -141,7 +141,7 @@ def test_a_room_with_tags_and_a_grid(tmp_path: Path):
     room = dataclasses.replace(room, cameras=(camera,))
     filmed = film(room, seed=0)
     write_film(filmed, {"mcap": tmp_path / "room"})
-    rig = rig_for(room, settings=Settings(keep_corners=False))
+    rig = rig_for(room, settings=Settings(cache_corners=False))
     result = icalib.calibrate(rig, tmp_path / "room")
     assert result.converged
     assert set(result.bodies) == set(room.target.bodies)

@@ -46,7 +46,7 @@ def open_rig(scenario: Scenario, restarting: str) -> Rig:
     for part, kind in KINDS.items():
         changes = {"rotation": free, "translation": free, "time_offset": free, "clock_restarts": part in restarting}
         if kind == "wheels":
-            changes |= {"radii": free, "baseline": free, "sideways_slip": 1e-4, "upwards_slip": 1e-4}
+            changes |= {"radii": free, "baseline": free, "lateral_slip": 1e-4, "vertical_slip": 1e-4}
         rig = replace(rig, **{kind: tuple(replace(s, **changes) for s in getattr(rig, kind))})
     return rig
 

@@ -79,7 +79,7 @@ def noisy() -> tuple[Simulation, Simulation]:
 @pytest.fixture(scope="module")
 def noisy_joint(noisy) -> Calibration:
     rig = rig_of(noisy[0])
-    return joint(noisy, dataclasses.replace(rig, settings=dataclasses.replace(rig.settings, splits=4)))
+    return joint(noisy, dataclasses.replace(rig, settings=dataclasses.replace(rig.settings, segments=4)))
 
 
 @pytest.mark.parametrize("asynchronous", [False, True])
@@ -209,7 +209,7 @@ def test_gaps_and_other_schemes(noisy):
     imu = ImuStream(other.imu.name, other.imu.stamps_ns[kept], other.imu.gyro[kept], other.imu.accel[kept])
     rig = rig_of(noisy[0])
     for scheme in ("pose", "kinematic"):
-        settings = dataclasses.replace(rig.settings, scheme=scheme, nodes="first-camera")
+        settings = dataclasses.replace(rig.settings, scheme=scheme, keyframes="first-camera")
         result = calibrate_measurements(
             dataclasses.replace(rig, settings=settings), [first, dataclasses.replace(other, imu=imu)]
         )
@@ -302,7 +302,7 @@ def test_three_recordings_share_bloom_and_bow():
         simulations.append(simulate(dataclasses.replace(scenario, cameras=cameras, bow=bow, blur_s=3e-4), 20 + k))
     rig = rig_of(simulations[0])
     cameras = tuple(dataclasses.replace(c, corner_noise_px=None) for c in rig.cameras)
-    settings = dataclasses.replace(rig.settings, splits=6, common_error=True)
+    settings = dataclasses.replace(rig.settings, segments=6, common_error=True)
     result = joint(tuple(simulations), dataclasses.replace(rig, cameras=cameras, settings=settings))
     assert result.converged, result.status
     shape = result.group("board0", "shape")

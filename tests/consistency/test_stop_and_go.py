@@ -105,7 +105,7 @@ def test_degrees_of_freedom_of_few_pairs(count):
 
 def test_the_spread_over_parts_counts():
     x = stills(26)
-    rig = replace(x.rig, settings=replace(x.rig.settings, splits=8))
+    rig = replace(x.rig, settings=replace(x.rig.settings, segments=8))
     result = calibrate_measurements(rig, x.measurements)
     factor = result.group("flange", "rotation").factor
     assert factor is not None and 1.0 < factor.max() < 2.5

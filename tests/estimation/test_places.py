@@ -115,7 +115,7 @@ def errors(rig: Rig, scenario: Scenario, seed: int, seen) -> tuple[np.ndarray, n
 def test_a_lens_that_no_model_follows_is_in_the_standard_deviations():
     scenario = followers(24.0)
     rig = with_drawn_guess(rig_for(scenario, intrinsics="free", distortion="free"), scenario, 1)
-    rig = replace(rig, settings=replace(rig.settings, splits=8))
+    rig = replace(rig, settings=replace(rig.settings, segments=8))
     rms = [np.sqrt(np.mean(z**2)) for z in errors(rig, scenario, 1, lambda m: bent(m, scenario))]
     honest = [np.sqrt(np.mean(z**2)) for z in errors(rig, scenario, 1, lambda m: m)]
     print(rms, honest)

@@ -56,12 +56,12 @@ def test_poses_alone_limit_the_spacing_by_what_motion_does_in_half_of_it():
     hidden = (DENSITIES[0] * np.sqrt(half**3 / 3.0) < 0.25 * turn) & (
         DENSITIES[1] * np.sqrt(half**5 / 20.0) < 0.25 * way
     )
-    assert spacing(None, node_spacing_s=2.0) == pytest.approx(tried[hidden][-1], abs=2e-4)
+    assert spacing(None, keyframe_spacing_s=2.0) == pytest.approx(tried[hidden][-1], abs=2e-4)
     assert spacing(None) == 0.05  # what the rig file allows
 
 
 def test_good_encoders_ask_for_closer_keyframes():
     noise, densities = 0.1, (0.3, 0.2)
     yaw = noise * np.sqrt(2.0) * RADIUS / BASELINE
-    assert spacing(noise, densities, node_spacing_s=2.0) == pytest.approx(np.sqrt(3.0) * 0.25 * yaw / 0.3, rel=0.05)
+    assert spacing(noise, densities, keyframe_spacing_s=2.0) == pytest.approx(np.sqrt(3.0) * 0.25 * yaw / 0.3, rel=0.05)
     assert spacing(0.1 * noise, densities) == LEAST_S

@@ -117,7 +117,7 @@ def test_calibration_from_nothing(lens: str, seed: int, longest_s: float):
     """Also where points are lost after five or ten images."""
     features = load_scenario(PAPER / "table2-3d.yaml").features
     assert features is not None
-    features = replace(features, longest_track_s=longest_s, lasting=0)
+    features = replace(features, longest_track_s=longest_s, persistent=0)
     simulation = drive(lens, noise_px=0.3, duration_s=12.0, seed=seed, features=features)
     rig = replace(rig_for(simulation.scenario, intrinsics="free", distortion="free"), target=NoTarget())
     result = calibrate_measurements(rig, simulation.measurements)

@@ -213,8 +213,8 @@ def test_rows_of_wheels_are_compared_apart(result: Calibration):
     n = 20000
     rng = np.random.default_rng(4)
     whitened = np.stack([_steps(rng, n, 0.0), 2.0 * _steps(rng, n, 0.7)], axis=1)
-    wheels = WheelResiduals("wheel0", ("left", "sideways"), ("rad", "m"), np.arange(n) * 0.02, whitened, whitened)
+    wheels = WheelResiduals("wheel0", ("left", "lateral"), ("rad", "m"), np.arange(n) * 0.02, whitened, whitened)
     own = {w.kind: w for w in whiteness(replace(result, wheel_residuals=(wheels,)))}
     assert own["left"].lag1 == pytest.approx(0.0, abs=0.03)
-    assert own["sideways"].lag1 == pytest.approx(0.7, abs=0.03)
-    assert own["sideways"].mean_square == pytest.approx(4.0, rel=0.1)
+    assert own["lateral"].lag1 == pytest.approx(0.7, abs=0.03)
+    assert own["lateral"].mean_square == pytest.approx(4.0, rel=0.1)

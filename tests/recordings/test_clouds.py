@@ -203,7 +203,7 @@ def test_points_that_cannot_be_used_are_counted(write, read):
     found.xyz[4] = 0.0
     found.xyz[5, 9] = [0.6, 0.0, 0.0]
     messages = packed(write.maker(), found, VELODYNE, lambda t, s: {"time": (t - s) * 1e-9})
-    stream, notes = read(messages, near_m=0.5, far_m=150.0)
+    stream, notes = read(messages, min_range_m=0.5, max_range_m=150.0)
     n = len(found.since)
     assert (
         f"of {SCANS * n} points 2 without numbers, {3 + n} at zero, 1 nearer than 0.5 m, 4 farther than 150 m"
@@ -244,7 +244,8 @@ REFUSED = {
         f"the scan at {ORIGIN} ns comes after the one at {ORIGIN + 11 * PERIOD} ns",
     ),
     "all too far": (
-        stamped((VELODYNE, lambda t, s: {"time": (t - s) * 1e-9})), {"near_m": 50.0}, "0 of 12 scans have usable points"
+        stamped((VELODYNE, lambda t, s: {"time": (t - s) * 1e-9})), {"min_range_m": 50.0},
+        "0 of 12 scans have usable points",
     ),
 }  # fmt: skip
 

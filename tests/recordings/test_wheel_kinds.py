@@ -32,10 +32,10 @@ def from_table(tmp_path, values: np.ndarray, **fields: Any) -> tuple[WheelStream
     return stream, notes
 
 
-@pytest.mark.parametrize("meaning", ["mean", "instant"])
-def test_speed_and_yaw_rate(tmp_path, meaning):
-    stream, notes = from_table(tmp_path, TWIST, measures="twist", meaning=meaning)
-    assert (stream.kind, stream.meaning, notes) == ("twist", meaning, ())
+@pytest.mark.parametrize("sampling", ["interval-mean", "instantaneous"])
+def test_speed_and_yaw_rate(tmp_path, sampling):
+    stream, notes = from_table(tmp_path, TWIST, measures="twist", sampling=sampling)
+    assert (stream.kind, stream.sampling, notes) == ("twist", sampling, ())
     np.testing.assert_allclose(stream.rate, TWIST, rtol=1e-15)
 
 

@@ -39,19 +39,19 @@ def from_table(
     return stream, notes
 
 
-@pytest.mark.parametrize("meaning", ["mean", "instant"])
-def test_rates(tmp_path, meaning):
-    stream, notes = from_table(tmp_path, RATES, meaning=meaning)
+@pytest.mark.parametrize("sampling", ["interval-mean", "instantaneous"])
+def test_rates(tmp_path, sampling):
+    stream, notes = from_table(tmp_path, RATES, sampling=sampling)
     np.testing.assert_array_equal(stream.stamps_ns, STAMPS)
     np.testing.assert_allclose(stream.rate, RATES, rtol=1e-15)
-    assert (stream.meaning, notes) == (meaning, ())
+    assert (stream.sampling, notes) == (sampling, ())
 
 
 def test_angles(tmp_path):
     stream, notes = from_table(tmp_path, ANGLES, measures="angles")
     np.testing.assert_allclose(stream.rate[1:], MEAN, atol=1e-11)
     np.testing.assert_array_equal(stream.rate[0], stream.rate[1])
-    assert (stream.meaning, notes) == ("mean", ())
+    assert (stream.sampling, notes) == ("interval-mean", ())
 
 
 @pytest.mark.parametrize("size", [None, 256, 65536])

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from icalib.calibration import (
     Calibration,
     CornerResiduals,
-    HeldOut,
+    CrossValidation,
     ImuResiduals,
     Iteration,
     LidarResiduals,
@@ -78,11 +78,11 @@ def calibration() -> Calibration:
         settings=dataclasses.asdict(rig.settings),
         versions={"icalib": "0.1.0", "python": "3.11.2", "numpy": "2.0.0"},
         timings={"reading": 0.41, "first guess": 0.25, "solving": 1.3},
-        held_out=_held_out(groups),
+        cross_validation=_held_out(groups),
     )
 
 
-def _held_out(groups: tuple[ParameterGroup, ...]) -> HeldOut:
+def _held_out(groups: tuple[ParameterGroup, ...]) -> CrossValidation:
     """Eight parts, what moves without each three times what is allowed."""
     fits = (
         PredictedFit("cam0", "corners", 20_000, 19_500.0, 19_900.0, 0.2, 0.20204, "px"),
@@ -90,7 +90,7 @@ def _held_out(groups: tuple[ParameterGroup, ...]) -> HeldOut:
     )
     std = np.concatenate([g.std_formal for g in groups if g.columns])
     moved = 1.2 * std * np.random.default_rng(9).normal(size=(8, len(std)))
-    return HeldOut(8, len(std), 900.0, 100.0, 25.0, fits, moved, np.tile(0.4 * std, (8, 1)))
+    return CrossValidation(8, len(std), 900.0, 100.0, 25.0, fits, moved, np.tile(0.4 * std, (8, 1)))
 
 
 def _rig() -> Rig:
@@ -220,15 +220,15 @@ def robot(calibration: Calibration) -> Calibration:
     names = tuple(f"{g.sensor}.{g.name}.{n}" for g in groups if g.columns for n in g.labels)
     seconds = 0.05 * np.arange(NODES - 1)
     whitened = rng.normal(size=(len(seconds), 4))
-    labels, units = ("left", "right", "sideways", "upwards"), ("rad", "rad", "m", "m")
+    labels, units = ("left", "right", "lateral", "vertical"), ("rad", "rad", "m", "m")
     fits = (SensorFit("lidar0", "points", 40000, 39900.0, 40100.0, 0.03, "m"),)
-    fits += (SensorFit("wheel0", "sideways slip", 299, 297.0, 310.0, 1.1e-3, "m"),)
+    fits += (SensorFit("wheel0", "lateral slip", 299, 297.0, 310.0, 1.1e-3, "m"),)
     return dataclasses.replace(
         calibration,
         groups=tuple(groups),
         covariance=_covariance(tuple(groups), rng),
         covariance_names=names,
-        held_out=_held_out(tuple(groups)),
+        cross_validation=_held_out(tuple(groups)),
         rig=rig_to_dict(rig),
         fits=(*calibration.fits, *fits),
         lidar_residuals=(_points(rng),),
@@ -256,7 +256,7 @@ def without_cameras(robot: Calibration) -> Calibration:
         corner_residuals=(),
         undetermined=(),
         rig=rig,
-        held_out=None,
+        cross_validation=None,
     )
 
 

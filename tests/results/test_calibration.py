@@ -135,7 +135,7 @@ def test_arrays_that_would_run_code(saved: Path):
 @pytest.mark.parametrize(
     "changes",
     [
-        {"format_version": 2},
+        {"format_version": 1},
         {"groups": 3},
         {"groups": [{}]},
         {"groups": [{"sensor": "cam0"}]},
@@ -144,8 +144,8 @@ def test_arrays_that_would_run_code(saved: Path):
         {"rig": {}},
         {"rig": {"sensors": {}}},
         {"rig": []},
-        {"held_out": {"parts": 8}},
-        {"held_out": 3},
+        {"cross_validation": {"segments": 8}},
+        {"cross_validation": 3},
     ],
 )
 def test_changed_json(saved: Path, changes: dict[str, Any]):
@@ -154,17 +154,9 @@ def test_changed_json(saved: Path, changes: dict[str, Any]):
 
 
 def test_parts_that_do_not_fit_the_covariance(saved: Path):
-    plain = json.loads((saved / "result.json").read_text())["held_out"]
-    change(saved, held_out=plain | {"parts": 7})
-    assert "of 7 parts" in sentence_of(saved)
-
-
-def test_a_result_of_before_halves_were_held_out(calibration: Calibration, saved: Path):
-    plain = json.loads((saved / "result.json").read_text())
-    del plain["held_out"]
-    (saved / "result.json").write_text(json.dumps(plain))
-    found = load_calibration(saved)
-    assert found.held_out is None and found.fits == calibration.fits
+    plain = json.loads((saved / "result.json").read_text())["cross_validation"]
+    change(saved, cross_validation=plain | {"segments": 7})
+    assert "7 segments" in sentence_of(saved)
 
 
 @pytest.mark.parametrize(
@@ -179,7 +171,7 @@ def test_changed_group(saved: Path, field: str, value: Any):
 
 def test_a_warning_where_halves_disagree_by_more_than_is_printed(calibration: Calibration):
     """Excess 900 for 100: the factor is 3, and 1.9 would do."""
-    held = calibration.held_out
+    held = calibration.cross_validation
     assert held is not None and held.optimistic and held.factor == pytest.approx(3.0)
     (sentence,) = _factor_warnings(np.array([1.5, 1.9]), True, held)
     assert "predicts the other 3.0 times worse" in sentence and "only 1.9 times" in sentence

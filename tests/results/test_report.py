@@ -190,7 +190,7 @@ def test_what_is_said_of_an_edge_without_data(seen: bool, sentence: str):
 
 
 def test_what_halves_say_of_each_other(calibration: Calibration, text: str):
-    held, page = calibration.held_out, Page(text)
+    held, page = calibration.cross_validation, Page(text)
     assert held is not None
     assert "the formal standard deviations are too small by a factor of about 3.0." in page.words
     assert "chi^2 is 900 higher" in page.words and "would make that 100 ± 25" in page.words
@@ -199,7 +199,7 @@ def test_what_halves_say_of_each_other(calibration: Calibration, text: str):
         assert f'<td class="number">{cell}</td>' in text
     factor, allowed, moved = json.loads(page.scripts[0])["held-out"]["data"]
     assert (factor["x"][:2], allowed["x"][:2]) == ([-2.7, 2.7], [-1.0, 1.0])
-    np.testing.assert_allclose(np.reshape(moved["x"], (8, -1)), held.moved / held.allowed, rtol=1e-4)
+    np.testing.assert_allclose(np.reshape(moved["x"], (8, -1)), held.shift / held.shift_sigma, rtol=1e-4)
     rows = json.loads(page.scripts[0])["held-out"]["layout"]["yaxis"]["ticktext"]
     assert rows[6:8] == ["cam0 time offset", "cam0 intrinsics fx"] and len(rows) == held.directions
     assert moved["text"][len(rows) + 7] == "cam0 intrinsics fx, without part 2"
@@ -210,12 +210,12 @@ def test_what_halves_say_of_each_other(calibration: Calibration, text: str):
     [(170.0, "That is chance"), (176.0, "too small by a factor of about 1.3"), (20.0, "if anything, too large")],
 )
 def test_the_verdict_of_halves_leaves_room_for_chance(calibration: Calibration, excess: float, sentence: str):
-    held = dataclasses.replace(calibration.held_out, excess=excess)  # pyright: ignore
-    assert sentence in Page(report_html(dataclasses.replace(calibration, held_out=held))).words
+    held = dataclasses.replace(calibration.cross_validation, excess=excess)  # pyright: ignore
+    assert sentence in Page(report_html(dataclasses.replace(calibration, cross_validation=held))).words
 
 
 def test_where_nothing_was_held_out_it_says_so(calibration: Calibration):
-    page = Page(report_html(dataclasses.replace(calibration, held_out=None)))
+    page = Page(report_html(dataclasses.replace(calibration, cross_validation=None)))
     assert "Nothing was held out: the recording is too short to be split" in page.words
     assert set(json.loads(page.scripts[0])) == FIGURES - {"held-out"}
 

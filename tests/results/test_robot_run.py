@@ -92,7 +92,7 @@ def test_planes_are_where_the_room_has_them(found: Calibration):
 
 def test_wheels_are_whitened_by_their_densities(found: Calibration):
     (r,) = found.wheel_residuals
-    assert r.labels == ("left", "right", "sideways", "upwards") and r.units == ("rad", "rad", "m", "m")
+    assert r.labels == ("left", "right", "lateral", "vertical") and r.units == ("rad", "rad", "m", "m")
     root_dt = np.sqrt(np.append(np.diff(r.seconds), np.nan))
     density = r.residual / r.whitened / root_dt[:, None]
     np.testing.assert_allclose(np.nanmedian(density, axis=0), [0.03, 0.03, 5e-3, 5e-3], rtol=1e-6)

@@ -62,9 +62,9 @@ def test_parameters_are_named_and_right(run):
         assert abs(own["parameters"][name] - true) < 4.0 * own["std"]["parameters"][name], name
     found = load_calibration(folder / "out")
     rows = {"twist": ("speed", "yaw"), "steering": ("wheel", "steering")}[reports]
-    assert found.wheel_residuals[0].labels == (*rows, "sideways", "upwards")
+    assert found.wheel_residuals[0].labels == (*rows, "lateral", "vertical")
     kinds = [f.kind for f in found.fits if f.sensor == "wheel0"]
-    assert kinds == [*rows, "sideways slip", "upwards slip", "ground tilt", "ground height"]
+    assert kinds == [*rows, "lateral slip", "vertical slip", "ground tilt", "ground height"]
 
 
 def test_the_report_is_drawn(run, assert_drawn: Callable[[str, set[str]], None]):

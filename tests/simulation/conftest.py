@@ -95,7 +95,7 @@ def robot() -> Scenario:
         imu_noise_enabled=False,
         board=False,
         room=Room(blocks=blocks),
-        features=Features(count=800, lasting=100),
+        features=Features(count=800, persistent=100),
         lidars=(lidar,),
         wheels=(wheels,),
     )

@@ -17,7 +17,7 @@ from .conftest import on_ground
 RIG = """\
 sensors:
   imu0: {type: imu}
-  lidar0: {type: lidar, near: 0.1, far: 200}
+  lidar0: {type: lidar, min_range: 0.1, max_range: 200}
   wheel0: {type: wheels, measures: MEASURES}
 """
 
@@ -44,7 +44,7 @@ def test_tables(simulation, tmp_path):
     found = read_measurements(open_recording(tmp_path / "run"), rig(tmp_path))
     same_scans(found.lidars[0], simulation.measurements.lidars[0], with_planes=True)
     (wheels,), (written,) = found.wheels, simulation.measurements.wheels
-    assert isinstance(wheels, WheelStream) and (wheels.meaning, found.notes) == ("mean", ())
+    assert isinstance(wheels, WheelStream) and (wheels.sampling, found.notes) == ("interval-mean", ())
     np.testing.assert_array_equal(wheels.stamps_ns, written.stamps_ns)
     np.testing.assert_allclose(wheels.rate, written.rate, rtol=1e-15)
     topics = {t.name: (t.type, t.kind, t.count) for t in open_recording(tmp_path / "run").topics()}

@@ -150,7 +150,7 @@ def test_what_no_sensor_sends_is_said(robot, tmp_path):
     (note,) = write_sensors(simulate(replace(handheld(0.5), board=False), 1), 1, tmp_path / "dark")
     assert "there are no images" in note
     instant = replace(on_ground(robot, "planar"), duration_s=0.5, lidars=(), features=None, cameras=())
-    instant = replace(instant, wheels=(replace(instant.wheels[0], meaning="instant"),))
+    instant = replace(instant, wheels=(replace(instant.wheels[0], sampling="instantaneous"),))
     write_sensors(simulate(instant, 1), 1, tmp_path / "instant")
     assert np.isnan(read_joints(BagRecording(tmp_path / "instant"), "/wheel0/joint_states").position).all()
 

@@ -60,10 +60,10 @@ def test_cameras_of_a_room_track_images_where_there_are_no_tables_of_tracks():
 
 def test_a_rig_that_is_told_nothing_of_slip_allows_for_what_real_wheels_may_have():
     scenario = load_scenario(EXAMPLES / "table2-ramp.yaml")
-    for told, expected in ((None, Wheels.sideways_slip), (1e-4, 1e-4)):
+    for told, expected in ((None, Wheels.lateral_slip), (1e-4, 1e-4)):
         wheels = tuple(replace(w, allowed_slip=told) for w in scenario.wheels)
         (found,) = rig_for(replace(scenario, wheels=wheels)).wheels
-        assert (found.sideways_slip, found.upwards_slip) == (expected, expected)
+        assert (found.lateral_slip, found.vertical_slip) == (expected, expected)
 
 
 def test_settings_model_what_is_simulated():

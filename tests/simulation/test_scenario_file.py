@@ -57,7 +57,7 @@ sensors:
     slip: 0.002
     allowed_slip: 0.003
     reports: rates
-    meaning: instant
+    sampling: instantaneous
     poses_every: 5
     T_imu_sensor: {POSE}
   mocap:
@@ -75,7 +75,7 @@ room:
     - {{center: [-3, 2], size: [0.5, 0.5, 1]}}
   texture: {{seed: 2, share: 0.3, contrast: 0.8}}
 images: {{people: 2, gain_steps: [[1, 0.5], [2, 1.5]], frozen: [[1.2, 1.4]], robot_part: 0.1, dirt: 3}}
-features: {{count: 300, lasting: 20, longest_track: 2, per_image: 30, range: 9, seed: 3}}
+features: {{count: 300, persistent: 20, longest_track: 2, per_image: 30, range: 9, seed: 3}}
 target:
   type: aprilgrid
   rows: 3
@@ -115,7 +115,7 @@ def test_every_field_arrives(tmp_path):
     assert (lidar.range_m, lidar.range_noise_m) == ((1.0, 30.0), 0.02)
     assert (wheels.radii, wheels.baseline, wheels.noise) == ((0.1, 0.11), 0.5, 0.01)
     assert (wheels.slip, wheels.allowed_slip) == (0.002, 0.003)
-    assert (wheels.reports, wheels.meaning, wheels.poses_every) == ("rates", "instant", 5)
+    assert (wheels.reports, wheels.sampling, wheels.poses_every) == ("rates", "instantaneous", 5)
     (mocap,) = s.poses
     assert (mocap.name, mocap.kind, mocap.rate_hz) == ("mocap", "relative", 30.0)
     assert (mocap.rotation_noise, mocap.position_noise) == (0.003, 0.004)
@@ -186,7 +186,10 @@ BAD = {
     ],
     " slip: 0.002": [(" slip: -0.002", "axle.slip: must be at least 0")],
     "allowed_slip: 0.003": [("allowed_slip: 0", "axle.allowed_slip: must be above 0")],
-    "meaning: instant": [("meaning: average", "axle.meaning: there is no meaning 'average'; available are mean")],
+    "sampling: instantaneous": [
+        ("sampling: average", "axle.sampling: there is no sampling 'average'; available are interval-mean"),
+        ("meaning: instant", "axle.meaning: this field is now called sampling"),
+    ],
     "size: [8, 7, 3]": [
         ("size: [8, 7]", "room.size: must be a list of 3 numbers"),
         ("size: [2, 2, 3]", "room: block 0 does not fit into the room"),
@@ -195,7 +198,7 @@ BAD = {
     ],
     "share: 0.3": [("share: 1.3", "room.texture.share: must be at most 1, but is 1.3")],
     "[1, 0.5]": [("[1, 0]", "images.gain_steps: each is \\[instant, gain\\], with a gain above 0")],
-    "lasting: 20": [("lasting: 400", "features: 400 lasting points are more than all 300")],
+    "persistent: 20": [("persistent: 400", "features: 400 persistent points are more than all 300")],
     "  type: aprilgrid": [
         ("  type: aprilgird", "target.type: there is no target type 'aprilgird', did you mean 'aprilgrid'"),
         ("  rows_: 3", "target: type is missing"),

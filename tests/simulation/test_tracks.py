@@ -80,7 +80,7 @@ def sightings(sim):
 
 
 def test_a_lost_track_has_a_new_number_and_landmarks_keep_theirs(robot):
-    features = Features(count=800, lasting=100, longest_track_s=2.0)
+    features = Features(count=800, persistent=100, longest_track_s=2.0)
     sim = simulate(replace(alone(robot), duration_s=30.0, features=features), 3)
     seen = sightings(sim)
     gaps = {feature: np.diff(times).max(initial=0.0) for feature, times in seen.items()}
@@ -101,7 +101,7 @@ def test_overlapping_cameras_share_numbers(quiet):
 
 def test_none_lasts_and_all_last(robot):
     for lasting, longest in ((0, 1.0), (800, 1.0)):
-        chosen = Features(count=800, lasting=lasting, longest_track_s=longest)
+        chosen = Features(count=800, persistent=lasting, longest_track_s=longest)
         sim = simulate(replace(alone(robot), features=chosen), 3)
         spans = [times[-1] - times[0] for times in sightings(sim).values()]
         assert (max(spans) <= 1.0) == (lasting == 0)

@@ -19,10 +19,10 @@ from .conftest import alone, on_ground, wheel_path
 SCALES, OFFSET, BASE, RADIUS = (1.1, 0.9), 0.05, 0.6, 0.12
 
 
-def reporting(robot, reports, meaning="mean", kind="planar", **changes):
+def reporting(robot, reports, sampling="interval-mean", kind="planar", **changes):
     scenario = alone(on_ground(robot, kind))
     wheels = replace(
-        scenario.wheels[0], reports=reports, meaning=meaning, scales=SCALES, radius=RADIUS, wheelbase=BASE,
+        scenario.wheels[0], reports=reports, sampling=sampling, scales=SCALES, radius=RADIUS, wheelbase=BASE,
         steering_offset=OFFSET, **changes,
     )  # fmt: skip
     return replace(scenario, cameras=(), wheels=(wheels,))
@@ -44,27 +44,27 @@ def moved(sim, begin, end, parts=400):
 
 
 @pytest.mark.parametrize("kind", ["planar", "ramps"])
-@pytest.mark.parametrize("meaning", ["mean", "instant"])
-def test_speed_and_yaw_rate_are_those_of_the_path_over_their_scales(robot, kind, meaning):
-    sim = simulate(replace(reporting(robot, "twist", meaning, kind), robot_noise_enabled=False), 3)
+@pytest.mark.parametrize("sampling", ["interval-mean", "instantaneous"])
+def test_speed_and_yaw_rate_are_those_of_the_path_over_their_scales(robot, kind, sampling):
+    sim = simulate(replace(reporting(robot, "twist", sampling, kind), robot_noise_enabled=False), 3)
     stream, t = sim.measurements.wheels[0], instants(sim)
-    assert (stream.kind, stream.meaning) == ("twist", meaning)
+    assert (stream.kind, stream.sampling) == ("twist", sampling)
     for i in (1, 80, 200):
-        a, b = (t[i - 1], t[i]) if meaning == "mean" else (t[i] - 1e-4, t[i] + 1e-4)
+        a, b = (t[i - 1], t[i]) if sampling == "interval-mean" else (t[i] - 1e-4, t[i] + 1e-4)
         np.testing.assert_allclose(stream.rate[i], moved(sim, a, b) / (b - a) / SCALES, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("meaning", ["mean", "instant"])
-def test_a_point_ahead_moves_where_the_front_wheels_point(robot, meaning):
-    sim = simulate(replace(reporting(robot, "steering", meaning), robot_noise_enabled=False), 3)
+@pytest.mark.parametrize("sampling", ["interval-mean", "instantaneous"])
+def test_a_point_ahead_moves_where_the_front_wheels_point(robot, sampling):
+    sim = simulate(replace(reporting(robot, "steering", sampling), robot_noise_enabled=False), 3)
     stream, t = sim.measurements.wheels[0], instants(sim)
-    assert (stream.kind, stream.meaning) == ("steered", meaning) and np.ptp(stream.rate[:, 1]) > 0.2
+    assert (stream.kind, stream.sampling) == ("steered", sampling) and np.ptp(stream.rate[:, 1]) > 0.2
     for i in (1, 80, 200):
         R, p = wheel_path(sim.truth, sim.scenario.wheels[0].T_imu_wheel, t[i] + np.array([-1e-4, 0.0, 1e-4]))
         front = p + BASE * R[:, :, 0]
         ahead, left, _ = R[1].T @ (front[2] - front[0])
         assert stream.rate[i, 1] + OFFSET == pytest.approx(np.arctan(left / ahead), abs=1e-5)
-        a, b = (t[i - 1], t[i]) if meaning == "mean" else (t[i] - 1e-4, t[i] + 1e-4)
+        a, b = (t[i - 1], t[i]) if sampling == "interval-mean" else (t[i] - 1e-4, t[i] + 1e-4)
         assert stream.rate[i, 0] == pytest.approx(moved(sim, a, b)[0] / (b - a) / RADIUS, rel=1e-4)
 
 
@@ -100,7 +100,7 @@ def test_what_is_written_is_read_again(tmp_path, robot, write, reports, what):
     (tmp_path / "rig.yaml").write_text(RIG.replace("WHAT", what))
     rig = replace(load_rig(tmp_path / "rig.yaml"), poses=())
     (found,), (written,) = read_measurements(open_recording(tmp_path / "run"), rig).wheels, sim.measurements.wheels
-    assert (found.kind, found.meaning) == (written.kind, "mean")
+    assert (found.kind, found.sampling) == (written.kind, "interval-mean")
     np.testing.assert_array_equal(found.stamps_ns, written.stamps_ns)
     np.testing.assert_allclose(found.rate, written.rate, rtol=1e-15)
     topics = {t.name: t.kind for t in open_recording(tmp_path / "run").topics()}

@@ -46,10 +46,10 @@ def test_mean_rates_are_the_angles_turned_since_the_stamp_before(robot, kind, ex
 
 def test_instant_rates_are_those_at_the_stamp(robot):
     scenario = replace(alone(on_ground(robot, "planar")), robot_noise_enabled=False)
-    instant = replace(scenario, wheels=(replace(scenario.wheels[0], meaning="instant"),))
+    instant = replace(scenario, wheels=(replace(scenario.wheels[0], sampling="instantaneous"),))
     sim, mean = simulate(instant, 6), simulate(scenario, 6)
     stream, t = sim.measurements.wheels[0], instants(sim)
-    assert stream.meaning == "instant" and mean.measurements.wheels[0].meaning == "mean"
+    assert stream.sampling == "instantaneous" and mean.measurements.wheels[0].sampling == "interval-mean"
     np.testing.assert_array_equal(stream.stamps_ns, mean.measurements.wheels[0].stamps_ns)
     for i in (0, 50, 200):
         np.testing.assert_allclose(stream.rate[i], turned(sim, t[i] - 1e-4, t[i] + 1e-4, 2) / 2e-4, atol=1e-5)

@@ -238,13 +238,13 @@ def test_wheels_are_drawn_and_their_residuals_too(shown, read, tmp_path):
     groups = tuple(_fixed("wheel0", name, np.array(value, np.float64)) for name, value in values.items())
     rig = c.rig | {"sensors": c.rig["sensors"] | {"wheel0": {"type": "wheels", "path": "wheel0/rates.csv"}}}
     rows = np.arange(12.0).reshape(6, 2)
-    wheels = WheelResiduals("wheel0", ("left", "sideways slip"), ("rad", "m"), np.arange(6.0), rows, 2.0 * rows)
+    wheels = WheelResiduals("wheel0", ("left", "lateral slip"), ("rad", "m"), np.arange(6.0), rows, 2.0 * rows)
     result = _saved(c, tmp_path / "out", rig=rig, groups=(*c.groups, *groups), wheel_residuals=(wheels,))
     view(result, save=tmp_path / "a.rrd")
     found = read(tmp_path / "a.rrd")
     rims = [s for s in found["world/imu0/wheel0/shape"].values["LineStrips3D:strips"][0] if len(s) == 41]
     assert [np.ptp(np.array(rim)[:, 2]) for rim in rims] == pytest.approx([0.2, 0.22], abs=1e-3)
-    lines = found["residuals/wheel0/sideways_slip"].values["Scalars:scalars"]
+    lines = found["residuals/wheel0/lateral_slip"].values["Scalars:scalars"]
     assert lines == [[x] for x in (2.0 * rows[:, 1]).tolist()]
     assert "world/imu0/uncertainty/wheel0" not in found  # what is fixed is known
 

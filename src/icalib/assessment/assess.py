@@ -30,7 +30,7 @@ from icalib.assessment.stated import stated_warnings
 from icalib.assessment.upwards import upwards_warnings
 from icalib.calibration import (
     Calibration,
-    HeldOut,
+    CrossValidation,
     ImuResiduals,
     Iteration,
     ParameterGroup,
@@ -80,7 +80,7 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
     names = _column_names(inputs)
     tracking = [] if inputs.rig.has_target else [c.name for c in inputs.rig.cameras]
     seen = observe(determined, names, [w.name for w in inputs.rig.wheels], tracking)
-    parts = Parts.of(problem, outcome, inputs.rig.settings.splits)
+    parts = Parts.of(problem, outcome, inputs.rig.settings.segments)
     empirical = _empirical_variance(found, parts, np.diag(seen.covariance))
     groups = _groups(inputs, found, seen, empirical)
     judged = [_sensor_fit(f, found) for f in fits(problem, outcome) if not _is_assumed(inputs, f.sensor)]
@@ -124,7 +124,7 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
         planes=planes(inputs, outcome.state),
         pose_residuals=poses,
         track_residuals=track_residuals(found, timeline),
-        held_out=held,
+        cross_validation=held,
         wrong=stated.wrong,
     )
 
@@ -277,7 +277,7 @@ def _empirical_variance(found: Estimate, parts: Parts | None, formal: np.ndarray
 def few_parts_notes(inputs: Inputs, parts: Parts | None) -> Iterator[str]:
     """How far the standard deviations rest on few parts, and what makes them more."""
     if inputs.imu is not None:
-        more = "record longer, and leave `splits` at 8 or more"
+        more = "record longer, and leave `segments` at 8 or more"
     else:
         more = "record more images" if inputs.rig.cameras else "record more poses"
     if parts is not None and parts.count < ENOUGH_PARTS:
@@ -372,7 +372,7 @@ def _factors(inputs: Inputs, groups: tuple[ParameterGroup, ...]) -> np.ndarray:
     return np.concatenate([np.ones(0), *(g.factor for g in own if g.factor is not None)])
 
 
-def _factor_warnings(factors: np.ndarray, split: bool, held: HeldOut | None):
+def _factor_warnings(factors: np.ndarray, split: bool, held: CrossValidation | None):
     """`factors`: of what users take away; `split`: whether they are from parts of the recording."""
     if len(factors) and factors.max() > LARGE_FACTOR:
         yield (

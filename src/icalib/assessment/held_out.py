@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from icalib.calibration import HeldOut, PredictedFit
+from icalib.calibration import CrossValidation, PredictedFit
 from icalib.estimation.evidence import chi2_by_kind, raw_rms
 from icalib.estimation.held_out import Prediction, predict, shifts
 from icalib.estimation.parts import Parts
 from icalib.estimation.problem import Problem
 
 
-def held_out(parts: Parts | None, assumed: Collection[str]) -> HeldOut | None:
+def held_out(parts: Parts | None, assumed: Collection[str]) -> CrossValidation | None:
     """None where the recording cannot be split, or its halves share nothing that both know. Sensors that are `assumed`
     have no fits."""
     found = None if parts is None else predict(parts)
@@ -19,7 +19,7 @@ def held_out(parts: Parts | None, assumed: Collection[str]) -> HeldOut | None:
         return None
     fits = tuple(f for f in _fits(parts.problem, found) if f.sensor not in assumed)
     spread = shifts(parts)
-    return HeldOut(
+    return CrossValidation(
         parts.count, found.directions, found.excess, found.expected, found.spread, fits, spread.moved, spread.expected
     )
 

@@ -38,8 +38,8 @@ HALF_STEP_S = np.float32(2e-3)  # of a difference of residuals
 # Correlations of residuals of poses with their neighbours. Of white noise between poses, steps have -0.5.
 CORRELATED, ALTERNATING = 0.5, 0.35
 CLIP = 4.0  # standard deviations
-LABELS = {"wheels": ("left", "right"), "sideways slip": ("sideways",), "upwards slip": ("upwards",)} | {
-    "yaw": ("yaw",), "path": ("forward", "sideways"), "speed": ("speed",), "wheel": ("wheel",),
+LABELS = {"wheels": ("left", "right"), "lateral slip": ("lateral",), "vertical slip": ("vertical",)} | {
+    "yaw": ("yaw",), "path": ("forward", "lateral"), "speed": ("speed",), "wheel": ("wheel",),
     "steering": ("steering",),
 }  # fmt: skip
 
@@ -330,7 +330,7 @@ _ROWS = {
     "wheel": ("angles that the wheel of {} turned leave", "wheel_noise", "rad/sqrt(s)", ", if it does not slip"),
     "speed": ("speeds of {} leave", "speed_noise", "m/sqrt(s)", ""),
     "yaw": ("yaw rates of {} leave", "yaw_noise", "rad/sqrt(s)", ""),
-    "steering": ("steering angles of {} leave", "steering_noise", "rad/sqrt(Hz)", ", or more sideways_slip"),
+    "steering": ("steering angles of {} leave", "steering_noise", "rad/sqrt(Hz)", ", or more lateral_slip"),
 }
 
 
@@ -342,15 +342,15 @@ def _wheel_words(kind: str, wheels: Wheels, times: str, root: float) -> str:
             f"{wheels.name} is {what} its ground by {times} as much as {field} in the rig file says, as where it "
             "drives over ramps or the ground is another plane; take ground out, or part of it."
         )
-    if kind == "sideways slip":
+    if kind == "lateral slip":
         return (
-            f"{wheels.name} slips sideways {times} as much as its sideways_slip in the rig file allows, so yaw and "
-            f"position look better known than they are; {root * wheels.sideways_slip:.2g} m/sqrt(s) would fit."
+            f"{wheels.name} slips sideways {times} as much as its lateral_slip in the rig file allows, so yaw and "
+            f"position look better known than they are; {root * wheels.lateral_slip:.2g} m/sqrt(s) would fit."
         )
-    if kind == "upwards slip":
+    if kind == "vertical slip":
         return (
-            f"{wheels.name} leaves the ground {times} as much as its upwards_slip in the rig file allows, so pitch "
-            f"looks better known than it is; {root * wheels.upwards_slip:.2g} m/sqrt(s) would fit."
+            f"{wheels.name} leaves the ground {times} as much as its vertical_slip in the rig file allows, so pitch "
+            f"looks better known than it is; {root * wheels.vertical_slip:.2g} m/sqrt(s) would fit."
         )
     if kind in _ROWS and (kind, wheels.kind) != ("yaw", "pair"):  # the paper's relative poses have a yaw, too
         what, field, unit, unless = _ROWS[kind]
@@ -360,5 +360,5 @@ def _wheel_words(kind: str, wheels: Wheels, times: str, root: float) -> str:
         )
     return (
         f"the {kind} of {wheels.name} leaves residuals {times} as large as its noise says; larger wheel_noise or "
-        "sideways_slip would fit, or the increments factor."
+        "lateral_slip would fit, or the increments factor."
     )

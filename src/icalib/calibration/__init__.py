@@ -1,6 +1,6 @@
 """The result of a calibration: values with standard deviations and verdicts, saved and loaded whole."""
 
-from icalib.calibration.held_out import HeldOut, PredictedFit
+from icalib.calibration.cross_validation import CrossValidation, PredictedFit
 from icalib.calibration.images import CornerResiduals, ImageResiduals, TrackResiduals, image_of, rms_of_images
 from icalib.calibration.projection import ProjectionMap, projection_uncertainty, working_distance
 from icalib.calibration.relative import RelativePose, joint_covariance, relative_pose, relative_poses
@@ -21,7 +21,7 @@ from icalib.calibration.saving import calibration_files, load_calibration
 __all__ = [
     "Calibration",
     "CornerResiduals",
-    "HeldOut",
+    "CrossValidation",
     "ImageResiduals",
     "ImuResiduals",
     "Iteration",

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from icalib.calibration.held_out import HeldOut
+from icalib.calibration.cross_validation import CrossValidation
 from icalib.calibration.images import CornerResiduals, ImageResiduals, TrackResiduals
 from icalib.calibration.robot import LidarResiduals, Plane, PoseResiduals, WheelResiduals
 from icalib.calibration.verdict import Usability, reasons, usability
@@ -43,7 +43,7 @@ class SensorFit:
     """How well one kind of measurement is explained: chi^2 over post-fit degrees of freedom."""
 
     sensor: str
-    kind: str  # "corners", "gyroscope", "accelerometer", "bias walk", "points", "wheels", "sideways slip", ...
+    kind: str  # "corners", "gyroscope", "accelerometer", "bias walk", "points", "wheels", "lateral slip", ...
     count: int  # scalar residuals used
     dof: float  # post-fit degrees of freedom
     chi2: float
@@ -145,7 +145,7 @@ class Calibration:
     planes: tuple[Plane, ...] = ()  # that LiDARs see
     pose_residuals: tuple[PoseResiduals, ...] = ()
     track_residuals: tuple[TrackResiduals, ...] = ()
-    held_out: HeldOut | None = None  # None where the recording could not be split
+    cross_validation: CrossValidation | None = None  # None where the recording could not be split
     wrong: tuple[str, ...] = ()  # those of `warnings` by which something in the rig file must be wrong
 
     @property

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from icalib.calibration.held_out import HeldOut, PredictedFit
+from icalib.calibration.cross_validation import CrossValidation, PredictedFit
 from icalib.calibration.images import CornerResiduals, TrackResiduals
 from icalib.calibration.result import (
     Calibration,
@@ -33,7 +33,7 @@ from icalib.result_files import read_file
 from icalib.text_files import printable
 from icalib.unpacking import load_arrays
 
-FORMAT, FORMAT_VERSION = "icalib result", 1
+FORMAT, FORMAT_VERSION = "icalib result", 2
 _TEXTS = ("undetermined", "warnings", "notes", "wrong")
 _PLAIN = ("status", "converged", "rig", "rates", "inputs", "settings", "versions", "timings")
 _MALFORMED = (KeyError, TypeError, ValueError, AttributeError, IndexError)
@@ -82,7 +82,7 @@ def _plain(c: Calibration, arrays: bytes) -> dict[str, Any]:
         "poses": [_without_arrays(r) for r in c.pose_residuals],
         "tracks": [_without_arrays(r) for r in c.track_residuals],
         "planes": [_lists(p) for p in c.planes],
-        "held_out": None if c.held_out is None else _plain_held_out(c.held_out),
+        "cross_validation": None if c.cross_validation is None else _plain_cross_validation(c.cross_validation),
         "verdict": c.verdict,
         "reasons": list(c.reasons),
         **{name: list(getattr(c, name)) for name in _TEXTS},
@@ -95,12 +95,12 @@ def _lists(group: ParameterGroup | Plane) -> dict[str, Any]:
     return {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in plain.items()}
 
 
-def _plain_held_out(held: HeldOut) -> dict[str, Any]:
+def _plain_cross_validation(held: CrossValidation) -> dict[str, Any]:
     return _without_arrays(held) | {"fits": [dataclasses.asdict(f) for f in held.fits]}
 
 
 def _without_arrays(
-    residuals: LidarResiduals | WheelResiduals | PoseResiduals | TrackResiduals | HeldOut,
+    residuals: LidarResiduals | WheelResiduals | PoseResiduals | TrackResiduals | CrossValidation,
 ) -> dict[str, Any]:
     arrays = _array_names(type(residuals))
     return {f.name: getattr(residuals, f.name) for f in dataclasses.fields(residuals) if f.name not in arrays}
@@ -117,8 +117,10 @@ def _npz(c: Calibration) -> bytes:
     for folder, found in residuals.items():
         for r in found:
             arrays |= {f"{folder}/{r.sensor}/{name}": getattr(r, name) for name in _array_names(type(r))}
-    if c.held_out is not None:
-        arrays |= {f"held_out/{name}": getattr(c.held_out, name) for name in _array_names(HeldOut)}
+    if c.cross_validation is not None:
+        arrays |= {
+            f"cross_validation/{name}": getattr(c.cross_validation, name) for name in _array_names(CrossValidation)
+        }
     arrays |= {f"imu_residuals/{name}": getattr(c.imu_residuals, name) for name in _array_names(ImuResiduals)}
     arrays |= {f"trajectory/{name}": getattr(c.trajectory, name) for name in _array_names(Trajectory)}
     for f in dataclasses.fields(Iteration):
@@ -176,35 +178,37 @@ def _build(plain: dict[str, Any], arrays: dict[str, np.ndarray]) -> Calibration:
             CornerResiduals(sensor=s, **of(CornerResiduals, f"corners/{s}")) for s in plain["corner_sensors"]
         ),
         lidar_residuals=tuple(
-            LidarResiduals(**r, **of(LidarResiduals, f"lidars/{r['sensor']}")) for r in plain.get("lidars", [])
+            LidarResiduals(**r, **of(LidarResiduals, f"lidars/{r['sensor']}")) for r in plain["lidars"]
         ),
         wheel_residuals=tuple(
-            WheelResiduals(**_tuples(r), **of(WheelResiduals, f"wheels/{r['sensor']}")) for r in plain.get("wheels", [])
+            WheelResiduals(**_tuples(r), **of(WheelResiduals, f"wheels/{r['sensor']}")) for r in plain["wheels"]
         ),
         pose_residuals=tuple(
-            PoseResiduals(**_tuples(r), **of(PoseResiduals, f"poses/{r['sensor']}")) for r in plain.get("poses", [])
+            PoseResiduals(**_tuples(r), **of(PoseResiduals, f"poses/{r['sensor']}")) for r in plain["poses"]
         ),
         track_residuals=tuple(
-            TrackResiduals(**r, **of(TrackResiduals, f"tracks/{r['sensor']}")) for r in plain.get("tracks", [])
+            TrackResiduals(**r, **of(TrackResiduals, f"tracks/{r['sensor']}")) for r in plain["tracks"]
         ),
         planes=tuple(
-            Plane(p["name"], np.array(p["normal"]), np.array(p["point"]), p["count"]) for p in plain.get("planes", [])
+            Plane(p["name"], np.array(p["normal"]), np.array(p["point"]), p["count"]) for p in plain["planes"]
         ),
-        held_out=_held_out(plain.get("held_out"), of),
+        cross_validation=_cross_validation(plain["cross_validation"], of),
         imu_residuals=ImuResiduals(**of(ImuResiduals, "imu_residuals")),
         trajectory=Trajectory(**of(Trajectory, "trajectory")),
-        recordings=tuple(RecordingSpan(**r) for r in plain.get("recordings", [])),
+        recordings=tuple(RecordingSpan(**r) for r in plain["recordings"]),
         iterations=tuple(Iteration(*step) for step in zip(*steps, strict=True)),
-        **{name: tuple(plain.get(name, []) if name == "wrong" else plain[name]) for name in _TEXTS},
+        **{name: tuple(plain[name]) for name in _TEXTS},
         **{name: plain[name] for name in _PLAIN},
     )
 
 
-def _held_out(plain: dict[str, Any] | None, of: Callable[[type, str], dict[str, Any]]) -> HeldOut | None:
+def _cross_validation(
+    plain: dict[str, Any] | None, of: Callable[[type, str], dict[str, Any]]
+) -> CrossValidation | None:
     if plain is None:
         return None
     fits = tuple(PredictedFit(**f) for f in plain["fits"])
-    return HeldOut(**(plain | {"fits": fits}), **of(HeldOut, "held_out"))
+    return CrossValidation(**(plain | {"fits": fits}), **of(CrossValidation, "cross_validation"))
 
 
 def _tuples(plain: dict[str, Any]) -> dict[str, Any]:
@@ -237,8 +241,13 @@ def _check(c: Calibration) -> None:
             raise ValueError(f"{g.sensor}.{g.name} does not have {size} entries throughout")
     if not any(s.get("type") in ("imu", "camera", "pose") for s in c.rig["sensors"].values()):
         raise ValueError("the rig has neither IMU nor camera nor pose sensor")
-    if c.held_out is not None and not c.held_out.moved.shape == c.held_out.allowed.shape == (c.held_out.parts, n):
-        raise ValueError(f"what parts make of one another is not of {c.held_out.parts} parts and {n} parameters")
+    if (
+        c.cross_validation is not None
+        and not c.cross_validation.shift.shape
+        == c.cross_validation.shift_sigma.shape
+        == (c.cross_validation.segments, n)
+    ):
+        raise ValueError(f"cross_validation has not {c.cross_validation.segments} segments and {n} parameters")
     for r in c.lidar_residuals:
         if len(r.plane) and not 0 <= r.plane.min() <= r.plane.max() < len(c.planes):
             raise ValueError(f"{r.sensor} has points on planes that are not there")

@@ -120,8 +120,8 @@ def nodes_for(inputs: Inputs, times: list[np.ndarray]) -> np.ndarray:
     settings = inputs.rig.settings
     if inputs.imu is None:
         return distinct(np.sort(np.concatenate(times)))
-    hosts = times[:1] if settings.nodes == "first-camera" else times
-    nodes = place_nodes(inputs.imu, hosts, settings.node_spacing_s, settings.max_gap_s)
+    hosts = times[:1] if settings.keyframes == "first-camera" else times
+    nodes = place_nodes(inputs.imu, hosts, settings.keyframe_spacing_s, settings.max_gap_s)
     counts = np.diff((*first_nodes(inputs.imu, nodes), len(nodes)))
     if counts.min() < 3:
         where = f"{inputs.parts[int(np.argmin(counts))].name}: " if len(inputs.parts) > 1 else ""

@@ -242,7 +242,7 @@ def wheel_factor(
     wheels: Wheels, settings: Settings, stream: WheelStream | WheelPoses, motion: Motion, layout: Layout
 ) -> IncrementFactor | RelativePoseFactor:
     noise = WheelNoise(
-        wheels.wheel_noise, wheels.sideways_slip, wheels.upwards_slip, settings.loss, settings.loss_scale,
+        wheels.wheel_noise, wheels.lateral_slip, wheels.vertical_slip, settings.loss, settings.loss_scale,
         wheels.speed_noise, wheels.yaw_noise, wheels.steering_noise,
     )  # fmt: skip
     if isinstance(stream, WheelPoses):

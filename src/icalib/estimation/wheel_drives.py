@@ -25,15 +25,15 @@ from icalib.rig import WheelKind
 N_DRIVE = 3  # the most parameters of a kind
 LEFT, RIGHT = -0.5, 0.5
 Kinds = dict[str, slice]
-SLIP: Kinds = {"sideways slip": slice(2, 3), "upwards slip": slice(3, 4)}
+SLIP: Kinds = {"lateral slip": slice(2, 3), "vertical slip": slice(3, 4)}
 KINDS: dict[WheelKind, Kinds] = {
     "pair": {"wheels": slice(0, 2), **SLIP},
     "twist": {"speed": slice(0, 1), "yaw": slice(1, 2), **SLIP},
     "steered": {"wheel": slice(0, 1), "steering": slice(1, 2), **SLIP},
 }
 UNITS = {
-    "wheels": "rad", "speed": "m", "yaw": "rad", "wheel": "rad", "steering": "m", "sideways slip": "m",
-    "upwards slip": "m",
+    "wheels": "rad", "speed": "m", "yaw": "rad", "wheel": "rad", "steering": "m", "lateral slip": "m",
+    "vertical slip": "m",
 }  # fmt: skip
 
 

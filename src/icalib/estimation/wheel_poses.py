@@ -107,7 +107,7 @@ def preintegrated(
 ) -> RelativePoses:
     """Poses from wheel angles (N, 2) rad at stamps seconds (N,), with the radii and baseline `drive` (3,) m.
 
-    wheel_noise: density of each wheel's angle, rad/sqrt(s); slip_noise: of sideways slip, m/sqrt(s). Both above zero:
+    wheel_noise: density of each wheel's angle, rad/sqrt(s); slip_noise: of lateral slip, m/sqrt(s). Both above zero:
     without slip the covariance of a short interval is singular, and of a long one it claims what no vehicle does.
     """
     n = len(intervals.node)

@@ -26,7 +26,7 @@ MAD_SIGMA = 1.4826  # standard deviation of normal noise over its median absolut
 def keyframe_spacing(
     rig: Rig, recordings: Sequence[Measurements], paths: Sequence[SmoothPath], turning: float, jerking: float
 ) -> float:
-    """Seconds, from LEAST_S to the rig's `node_spacing_s`; the body's smooth `paths` are those of its first pose
+    """Seconds, from LEAST_S to the rig's `keyframe_spacing_s`; the body's smooth `paths` are those of its first pose
     sensor."""
     turn, way = pose_noise([m.poses[0] for m in recordings])
     limits = [
@@ -36,7 +36,7 @@ def keyframe_spacing(
     for k, wheels in enumerate(rig.wheels):
         way, turn = _wheel_noise(wheels, [m.wheels[k] for m in recordings], paths)
         limits += [np.sqrt(3.0) * UNSEEN * turn / turning, (20.0 * (UNSEEN * way / jerking) ** 2) ** 0.25]
-    return float(np.clip(min(limits), LEAST_S, max(rig.settings.node_spacing_s, LEAST_S)))
+    return float(np.clip(min(limits), LEAST_S, max(rig.settings.keyframe_spacing_s, LEAST_S)))
 
 
 def pose_noise(streams: Sequence[PoseStream]) -> tuple[float, float]:

@@ -51,7 +51,7 @@ def read_clouds(clouds: Iterator[PointCloud], lidar: Lidar, what: str) -> tuple[
     ahead = _first_clouds(clouds, what)
     alike, fields = _with_usual_fields(ahead)
     timing, notes = _timing(alike, lidar, what)
-    sieve = Sieve(lidar.near_m, lidar.far_m)
+    sieve = Sieve(lidar.min_range_m, lidar.max_range_m)
     stamps: list[int] = []
     parts: list[tuple[np.ndarray, np.ndarray]] = []
     others: list[int] = []

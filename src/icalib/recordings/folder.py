@@ -178,7 +178,7 @@ class FolderRecording:
     def lidar(self, sensor: Lidar) -> LidarStream:
         path = self._locate(sensor.path)
         self._remember(path)
-        sieve, what = Sieve(sensor.near_m, sensor.far_m), f"{path} ({sensor.name})"
+        sieve, what = Sieve(sensor.min_range_m, sensor.max_range_m), f"{path} ({sensor.name})"
         stream, notes = in_seconds(self._part(read_scans(sensor.name, path), path), sensor, what)
         stream = sifted(stream, sieve)
         for note in (*notes, sieve.note(what)):

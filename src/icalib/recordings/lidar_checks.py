@@ -16,10 +16,10 @@ _BATCH = 1_000_000  # points at a time
 
 
 class Sieve:
-    """Keeps the points from near_m to far_m, and counts the others."""
+    """Keeps the points from min_range_m to max_range_m, and counts the others."""
 
-    def __init__(self, near_m: float, far_m: float) -> None:
-        self._near_m, self._far_m = near_m, far_m
+    def __init__(self, min_range_m: float, max_range_m: float) -> None:
+        self._near_m, self._far_m = min_range_m, max_range_m
         self._total = 0
         self._dropped = np.zeros(5, np.int64)
 

@@ -51,8 +51,8 @@ def checked_wheels(
     read, apart_notes = (_even_rates if wheels.measures in ("rates", "twist") else _mean_rates)(read, wheels, what)
     rate = _combined(read.value, wheels)
     _refuse_units(rate, wheels, what)
-    meaning = wheels.meaning if wheels.measures in ("rates", "twist") else "mean"
-    stream = WheelStream(read.name, read.stamps_ns, np.ascontiguousarray(rate), meaning, wheels.kind)
+    sampling = wheels.sampling if wheels.measures in ("rates", "twist") else "interval-mean"
+    stream = WheelStream(read.name, read.stamps_ns, np.ascontiguousarray(rate), sampling, wheels.kind)
     notes = broken + notes + apart_notes
     return stream, notes + _gap_notes(stream, what) + _stuck_notes(stream, what)
 

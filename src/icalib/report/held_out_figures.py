@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from icalib.calibration import Calibration, HeldOut, ParameterGroup, PredictedFit
+from icalib.calibration import Calibration, CrossValidation, ParameterGroup, PredictedFit
 from icalib.report.plot import Figure, axis, dots, figure, line
 from icalib.report.quantities import shown, shown_groups
 from icalib.report.tables import Html, table
@@ -16,7 +16,7 @@ _ALLOWED = "#94a3b8"
 _PRINTED = "#fde2b3"
 
 
-def moved_without_parts(c: Calibration, held: HeldOut) -> Figure:
+def moved_without_parts(c: Calibration, held: CrossValidation) -> Figure:
     """Of each parameter a row: a dot for each part, how far the answer moves without it in units of what noise allows;
     grey what noise allows, orange the same times the factor that the printed standard deviation includes."""
     groups = [g for g in shown_groups(c) if g.columns is not None]
@@ -27,7 +27,7 @@ def moved_without_parts(c: Calibration, held: HeldOut) -> Figure:
     traces = [
         _bars(factors, row, "the same, times the printed factor", _PRINTED, 5),
         _bars(np.ones(len(row)), row, "what noise allows, one standard deviation", _ALLOWED, 9),
-        dots(z.ravel(), np.tile(row, held.parts), "without one part", "#14304f", 5, text=_which(held, names)),
+        dots(z.ravel(), np.tile(row, held.segments), "without one part", "#14304f", 5, text=_which(held, names)),
     ]
     traces[-1] |= {"hovertemplate": "%{text}: %{x}<extra></extra>"}
     rows: dict[str, Any] = {"tickvals": row.tolist(), "ticktext": names, "automargin": True, "showgrid": False}
@@ -46,11 +46,11 @@ def _bars(half: np.ndarray, row: np.ndarray, name: str, color: str, width: int) 
     return line(x, np.repeat(row, 3), name, color, line={"color": color, "width": width}, hoverinfo="skip")
 
 
-def _which(held: HeldOut, names: list[str]) -> list[str]:
-    return [f"{name}, without part {g + 1}" for g in range(held.parts) for name in names]
+def _which(held: CrossValidation, names: list[str]) -> list[str]:
+    return [f"{name}, without part {g + 1}" for g in range(held.segments) for name in names]
 
 
-def predicted_fits(held: HeldOut) -> Html:
+def predicted_fits(held: CrossValidation) -> Html:
     """Each kind of residual where it took part, and where the other half predicts it."""
     whitened, raw = "whitened RMS, took part", "RMS, took part"
     headers = ("sensor", "kind", "residuals", whitened, "predicted", raw, "predicted", "more chi2")
@@ -71,7 +71,7 @@ def _raw(rms: float | None, unit: str) -> str:
     return "" if rms is None else f"{scale * rms:.4g} {name}"
 
 
-def words(c: Calibration, held: HeldOut) -> list[str]:
+def words(c: Calibration, held: CrossValidation) -> list[str]:
     """What was found, and by which factor the formal standard deviations are too small."""
     expected, spread = f"{held.expected:.0f}", f"{held.spread:.0f}"
     rise = (
@@ -80,7 +80,7 @@ def words(c: Calibration, held: HeldOut) -> list[str]:
         "halves know."
     )
     moved = float(np.sqrt(np.nanmean(held.whitened[:, _columns(c)] ** 2))) if len(_columns(c)) else 1.0
-    parts = f"By what moves without each of {held.parts} parts it is {shown(moved)} on average"
+    parts = f"By what moves without each of {held.segments} parts it is {shown(moved)} on average"
     if held.optimistic:
         verdict = (
             f"On these data the formal standard deviations are too small by a factor of about {shown(held.factor)}."

@@ -57,7 +57,7 @@ def report_html(calibration: Calibration) -> str:
         "poses": Html(tables.poses(c) + tables.relative(c) + tables.bodies(c)),
         "image_figures": _image_sections(c),
         "without_images": "" if c.image_residuals else " hidden",
-        "held_out": _held_out_section(c),
+        "cross_validation": _held_out_section(c),
         "projection_figures": _projection_sections(maps),
         "without_cameras": "" if c.cameras else " hidden",
         "lidar_figures": _lidar_sections(c),
@@ -109,8 +109,8 @@ def _figures(c: Calibration) -> dict[str, Figure]:
         found[f"plane-{i}"] = image_figures.residual_plane(r)
         found[f"image-{i}"] = image_figures.residuals_over_image(r, (width, height))
         found[f"time-{i}"] = image_figures.residuals_over_time(r)
-    if c.held_out is not None:
-        found["held-out"] = held_out_figures.moved_without_parts(c, c.held_out)
+    if c.cross_validation is not None:
+        found["held-out"] = held_out_figures.moved_without_parts(c, c.cross_validation)
     for i, r in enumerate(c.lidar_residuals):
         found[f"points-{i}"] = robot_figures.residuals_over_time(r)
         found[f"distance-{i}"] = robot_figures.residuals_over_distance(r)
@@ -139,7 +139,7 @@ def _counts(r: ImageResiduals) -> str:
 
 
 def _held_out_section(c: Calibration) -> Html:
-    held = c.held_out
+    held = c.cross_validation
     if held is None:
         return element("p", _NOT_HELD_OUT, "quiet")
     rise, verdict, parts = held_out_figures.words(c, held)

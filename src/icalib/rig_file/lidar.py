@@ -9,24 +9,26 @@ from icalib.rig_file.fields import MOUNTING, choice_or, groups_to_plain, mountin
 from icalib.yaml_nodes import YamlValue
 
 _FIELDS = (
-    "path", "topic", "range_noise", "near", "far", "point_time", "point_time_field", "point_time_unit", *MOUNTING
+    "path", "topic", "range_noise", "min_range", "max_range", "point_time", "point_time_field", "point_time_unit",
+    *MOUNTING,
 )  # fmt: skip
 
 
 def read_lidar(name: str, value: YamlValue) -> Lidar:
     """Raises RigError naming the field."""
     found = value.record(("type",), _FIELDS)
-    near, far = positive_or(found, "near", Lidar.near_m), positive_or(found, "far", Lidar.far_m)
-    if near >= far:
-        found["near" if "near" in found else "far"].fail(
-            f"points from {near:g} to {far:g} m are none; near must be below far."
+    low = positive_or(found, "min_range", Lidar.min_range_m)
+    high = positive_or(found, "max_range", Lidar.max_range_m)
+    if low >= high:
+        found["min_range" if "min_range" in found else "max_range"].fail(
+            f"the range from {low:g} to {high:g} m is empty; min_range must be below max_range."
         )
     return Lidar(
         name=name,
         path=path_or(found, f"{name}/scans.npz"),
         range_noise_m=found["range_noise"].positive() if "range_noise" in found else None,
-        near_m=near,
-        far_m=far,
+        min_range_m=low,
+        max_range_m=high,
         point_time=_point_time(found),
         point_time_field=found["point_time_field"].text() if "point_time_field" in found else None,
         point_time_unit=choice_or(found, "point_time_unit", TimeUnit, None),
@@ -46,8 +48,8 @@ def _point_time(found: dict[str, YamlValue]) -> PointTime:
 
 def lidar_to_plain(lidar: Lidar) -> dict[str, Any]:
     """Plain data that `read_lidar` reads back."""
-    plain: dict[str, Any] = {"type": "lidar", "path": lidar.path, "near": lidar.near_m, "far": lidar.far_m}
-    plain["point_time"] = lidar.point_time
+    plain: dict[str, Any] = {"type": "lidar", "path": lidar.path, "min_range": lidar.min_range_m}
+    plain |= {"max_range": lidar.max_range_m, "point_time": lidar.point_time}
     given = {"range_noise": lidar.range_noise_m, "topic": lidar.topic}
     given |= {name: getattr(lidar, name) for name in ("point_time_field", "point_time_unit")}
     return plain | {name: value for name, value in given.items() if value is not None} | groups_to_plain(lidar)

@@ -31,17 +31,17 @@ from icalib.rig_parameters import vector_parameter
 from icalib.yaml_nodes import YamlValue
 
 _WORDS = (
-    "path", "topic", "drive", "measures", "meaning", "counts_per_turn", "counter_size", "angle_range", "rate_unit",
+    "path", "topic", "drive", "measures", "sampling", "counts_per_turn", "counter_size", "angle_range", "rate_unit",
     "signs", "joints", "factor",
 )  # fmt: skip
 _NOISES = ("wheel_noise", "speed_noise", "yaw_noise", "steering_noise")
 _GROUND = ("tilt_noise", "height", "height_sigma", "bump_noise")
-_SLIP = ("sideways_slip", "upwards_slip")
+_SLIP = ("lateral_slip", "vertical_slip")
 _LENGTHS = ("radii", "baseline", "radius", "wheelbase")
 _TURNED = ("rates", "angles", "ticks")
 # Fields that go with some of `measures` only.
 _ONLY_OF: dict[str, tuple[str, ...]] = {
-    "meaning": ("rates", "twist"), "counts_per_turn": ("ticks",), "counter_size": ("ticks",), "joints": _TURNED,
+    "sampling": ("rates", "twist"), "counts_per_turn": ("ticks",), "counter_size": ("ticks",), "joints": _TURNED,
     "angle_range": ("angles",), "rate_unit": ("rates",), "signs": (*_TURNED, "twist"),
 }  # fmt: skip
 # And with some kinds of wheels only.
@@ -80,7 +80,7 @@ def read_wheels(name: str, value: YamlValue) -> Wheels:
         drive=drive,
         factor=choice_or(found, "factor", WheelFactor, "relative-poses" if measures == "poses" else Wheels.factor),
         measures=measures,
-        meaning=choice_or(found, "meaning", Literal["mean", "instant"], Wheels.meaning),
+        sampling=choice_or(found, "sampling", Literal["interval-mean", "instantaneous"], Wheels.sampling),
         counts_per_turn=found["counts_per_turn"].positive() if "counts_per_turn" in found else None,
         counter_size=found["counter_size"].whole(2) if "counter_size" in found else None,
         angle_range=found["angle_range"].positive() if "angle_range" in found else None,

@@ -40,7 +40,7 @@ def settings_for(scenario: Scenario) -> Settings:
         board_shape=any(b != 0.0 for b in scenario.bow),
         blur_noise=scenario.blur_s > 0.0,
         common_error=scenario.shift_px > 0.0,
-        splits=0,
+        segments=0,
     )
 
 
@@ -126,16 +126,16 @@ class _Treated:
         given = Wheels(
             sim.name, f"{sim.name}/{kind}.csv", "ackermann" if sim.reports == "steering" else "differential",
             wheel_noise=sim.noise, speed_noise=sim.speed_noise, yaw_noise=sim.yaw_noise,
-            steering_noise=sim.steering_noise, measures=kind, meaning=sim.meaning,
+            steering_noise=sim.steering_noise, measures=kind, sampling=sim.sampling,
         )  # fmt: skip
         if sim.allowed_slip is not None:
-            given = replace(given, sideways_slip=sim.allowed_slip, upwards_slip=sim.allowed_slip)
+            given = replace(given, lateral_slip=sim.allowed_slip, vertical_slip=sim.allowed_slip)
         given = replace(given, **{name: _parameter(self.drive, value) for name, value in sim.drive.items()})
         return self._mounted(given, sim, sim.T_imu_wheel)
 
     def lidar(self, sim: SimLidar) -> Lidar:
         near, far = sim.range_m
-        given = Lidar(sim.name, f"{sim.name}/scans.npz", sim.range_noise_m, near_m=near, far_m=far)
+        given = Lidar(sim.name, f"{sim.name}/scans.npz", sim.range_noise_m, min_range_m=near, max_range_m=far)
         return self._mounted(given, sim, sim.T_imu_lidar)
 
     def poses(self, sim: SimPoses) -> PoseSensor:

@@ -72,14 +72,14 @@ class Drive:
 class Features:
     """Points on the room's surfaces, and the front end that follows them.
 
-    Of `count` points the first `lasting` keep their number for ever; any other has a new number when no camera saw it
+    The first `persistent` of `count` points keep their number; any other has a new number when no camera saw it
     for 1.5 periods of the slowest camera, or after longest_track_s. A camera follows at most per_image points, none
     further away than range_m. The points are those of `seed`, whatever the seed of the simulation; they lie off their
     surfaces by relief_m (standard deviation).
     """
 
     count: int = 1500
-    lasting: int = 0
+    persistent: int = 0
     longest_track_s: float = 5.0
     per_image: int = 100
     range_m: float = 15.0
@@ -117,8 +117,8 @@ class SimWheels:
     lateral random path [m/sqrt(s)], in poses only. allowed_slip: density of slip [m/sqrt(s)] that the rig is told;
     encoders simulated here know none, while a rig that is told nothing allows for what real wheels may have.
 
-    rates: what encoders report, by `meaning` as in `WheelStream`: (v_x -+ baseline/2 w_z) / radius. twist: forward
-    speed and yaw rate, v_x and w_z over their scales, by `meaning`, too. steering: the rate v_x / radius of a driven
+    rates: what encoders report, by `sampling` as in `WheelStream`: (v_x -+ baseline/2 w_z) / radius. twist: forward
+    speed and yaw rate, v_x and w_z over their scales, by `sampling`, too. steering: the rate v_x / radius of a driven
     wheel, and the angle by which front wheels a wheelbase ahead point to where they move, less steering_offset [rad].
     Raised as RigError by `Scenario` where the motion is not a wheel frame's. poses: relative poses as the paper's (27)
     predicts them from the truth, one for every `poses_every` readings, with the noise that integrating the readings
@@ -137,7 +137,7 @@ class SimWheels:
     slip: float = 0.0
     allowed_slip: float | None = None
     reports: Literal["rates", "twist", "steering", "poses"] = "rates"
-    meaning: Literal["mean", "instant"] = "mean"
+    sampling: Literal["interval-mean", "instantaneous"] = "interval-mean"
     poses_every: int = 3
     scales: tuple[float, float] = (1.0, 1.0)
     speed_noise: float = 2e-3  # m/s/sqrt(Hz)

@@ -169,12 +169,12 @@ def _wheels(name: str, value: YamlValue, start_ns: int) -> SimWheels:
     fields = value.entries()
     reports = fields["reports"].choice("reports", tuple(_DRIVES)) if "reports" in fields else SimWheels.reports
     required, options = _DRIVES[reports]
-    found = value.record(("type", *_CLOCK, *required), (*_CLOCK_OPTIONS, *options, "reports", "meaning"))
+    found = value.record(("type", *_CLOCK, *required), (*_CLOCK_OPTIONS, *options, "reports", "sampling"))
     chosen: dict[str, Any] = {"reports": reports}
     for key in found.keys() & {*required, *options}:
         chosen[key] = _drive_value(key, found[key])
-    if "meaning" in found:
-        chosen["meaning"] = found["meaning"].choice("meaning", ("mean", "instant"))
+    if "sampling" in found:
+        chosen["sampling"] = found["sampling"].choice("sampling", ("interval-mean", "instantaneous"))
     return SimWheels(name, _pose(found["T_imu_sensor"]), **chosen, **_clock(found, start_ns))
 
 
@@ -288,16 +288,16 @@ def _of_type(value: YamlValue, kind: type) -> Any:
 
 
 def _features(value: YamlValue) -> Features:
-    found = value.record((), ("count", "lasting", "longest_track", "per_image", "range", "seed", "relief"))
-    least = {"count": 1, "lasting": 0, "per_image": 1, "seed": 0}
+    found = value.record((), ("count", "persistent", "longest_track", "per_image", "range", "seed", "relief"))
+    least = {"count": 1, "persistent": 0, "per_image": 1, "seed": 0}
     chosen: dict[str, Any] = {key: found[key].whole(n) for key, n in least.items() if key in found}
     named = {"longest_track": "longest_track_s", "range": "range_m"}
     chosen |= {field: found[key].positive() for key, field in named.items() if key in found}
     if "relief" in found:
         chosen["relief_m"] = _least(found["relief"], 0.0)
     features = Features(**chosen)
-    if features.lasting > features.count:
-        value.fail(f"{features.lasting} lasting points are more than all {features.count}; lower lasting.")
+    if features.persistent > features.count:
+        value.fail(f"{features.persistent} persistent points are more than all {features.count}; lower persistent.")
     return features
 
 

@@ -119,12 +119,12 @@ def _joints(wheels: WheelStream, offset_ns: int) -> Iterator[Event]:
     """Positions are the angles turned since the first stamp, where the readings are means; else there are none, but
     steering angles, which have no velocity."""
     angles, rates = np.full(wheels.rate.shape, np.nan), wheels.rate.copy()
-    if wheels.meaning == "mean":
+    if wheels.sampling == "interval-mean":
         turned = wheels.rate[1:] * np.diff(wheels.stamps_ns)[:, None] * 1e-9
         angles = np.concatenate([np.zeros((1, 2)), np.cumsum(turned, axis=0)])
     if wheels.kind == "steered":
         angles[:, 1], rates[:, 1] = wheels.rate[:, 1], np.nan
-    elif wheels.meaning == "instant":
+    elif wheels.sampling == "instantaneous":
         angles = np.empty((len(rates), 0))
     for stamp_ns, angle, rate in zip(wheels.stamps_ns.tolist(), angles, rates, strict=True):
         yield (

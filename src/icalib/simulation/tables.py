@@ -35,7 +35,7 @@ _WHEEL_COLUMNS = {
     "pair": ("rates", "left [rad/s],right [rad/s]"), "steered": ("rates", "wheel [rad/s],steering [rad]"),
     "twist": ("twist", "v [m/s],w [rad/s]"),
 }  # fmt: skip
-_WHEEL_MEANING = {"mean": "means since the stamp before", "instant": "values at the stamp"}
+_WHEEL_SAMPLING = {"interval-mean": "means since the stamp before", "instantaneous": "values at the stamp"}
 
 
 def check_absent(path: Path) -> None:
@@ -159,7 +159,7 @@ def _write_scans(folder: Path, lidar: LidarStream) -> None:
 def _write_wheels(folder: Path, wheels: WheelStream | WheelPoses) -> None:
     if isinstance(wheels, WheelStream):
         name, columns = _WHEEL_COLUMNS[wheels.kind]
-        header = f"t [ns],{columns}; {_WHEEL_MEANING[wheels.meaning]}"
+        header = f"t [ns],{columns}; {_WHEEL_SAMPLING[wheels.sampling]}"
         _write_table(folder / f"{name}.csv", header, wheels.stamps_ns, wheels.rate)
         return
     header = "from [ns],to [ns],yaw [rad],x [m],y [m],covariance: yaw yaw,yaw x,yaw y,x x,x y,y y"

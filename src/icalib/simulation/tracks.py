@@ -97,10 +97,10 @@ class _FrontEnd:
         self._features, self._rng = features, rng
         self._lost_after = _LOST_PERIODS / slowest_hz
         self._number = np.full(features.count, -1)
-        self._number[: features.lasting] = np.arange(features.lasting)
+        self._number[: features.persistent] = np.arange(features.persistent)
         self._born = np.full(features.count, -np.inf)
         self._last = np.full(features.count, -np.inf)
-        self._points = list(range(features.lasting))
+        self._points = list(range(features.persistent))
         self._tracked: dict[int, np.ndarray] = {}
 
     def choose(self, camera: int, seconds: float, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -124,7 +124,7 @@ class _FrontEnd:
         """Whether each point's number still holds."""
         held = seconds - self._last[points] <= self._lost_after
         young = seconds - self._born[points] <= self._features.longest_track_s
-        return (points < self._features.lasting) | (held & young)
+        return (points < self._features.persistent) | (held & young)
 
     def point_of(self) -> np.ndarray:
         """(F,) the point behind each number."""

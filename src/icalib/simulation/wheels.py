@@ -41,7 +41,7 @@ def read_wheels(
         true, covariance = relative_poses(wheels, trajectory, seconds)
         measured = true + _drawn(covariance, rng) * float(noisy)
         return WheelPoses(wheels.name, stamps, measured, covariance), WheelTruth(seconds, true)
-    if wheels.meaning == "instant":
+    if wheels.sampling == "instantaneous":
         stamps, seconds = stamps[1:], seconds[1:]
         true = reported(wheels, trajectory, seconds)
     else:
@@ -53,7 +53,7 @@ def read_wheels(
     density = np.array(densities.get(wheels.reports, [wheels.noise, wheels.noise]))
     noise = density * np.sqrt(wheels.rate_hz) * rng.standard_normal(true.shape)
     measured = true + noise * float(noisy)
-    stream = WheelStream(wheels.name, stamps, measured, wheels.meaning, _KINDS[wheels.reports])
+    stream = WheelStream(wheels.name, stamps, measured, wheels.sampling, _KINDS[wheels.reports])
     return stream, WheelTruth(seconds, true)
 
 

@@ -107,20 +107,22 @@ def turned(t):
 def test_mean_rates_add_up_to_what_was_turned():
     rates = np.zeros((200, 2))
     rates[1:] = np.diff(turned(T), axis=0) / np.diff(T)[:, None]
-    np.testing.assert_allclose(angles_from_rates(T, rates, "mean"), turned(T) - turned(T[0]), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        angles_from_rates(T, rates, "interval-mean"), turned(T) - turned(T[0]), rtol=0, atol=1e-12
+    )
 
 
 def test_instant_rates_are_integrated_by_trapezoids():
     rates = np.stack([2.0 + 1.3 * np.cos(1.3 * T), 1.5 + 0.8 * np.sin(2.0 * T)], axis=-1)
-    got, want = angles_from_rates(T, rates, "instant"), turned(T) - turned(T[0])
+    got, want = angles_from_rates(T, rates, "instantaneous"), turned(T) - turned(T[0])
     np.testing.assert_allclose(got, want, rtol=0, atol=5e-4)
     # Read as means they are late: angle(t) of what was turned half a period earlier.
-    late = angles_from_rates(T, rates, "mean") - want
+    late = angles_from_rates(T, rates, "interval-mean") - want
     assert np.abs(late).max() > 5e-3
 
 
 def test_the_two_readings_of_a_driver_differ_by_half_a_period():
     t = np.arange(0.0, 4.0, 0.02)
     rates = np.stack([np.cos(t), np.sin(2.0 * t)], axis=-1)
-    shift = angles_from_rates(t, rates, "mean") - angles_from_rates(t, rates, "instant")
+    shift = angles_from_rates(t, rates, "interval-mean") - angles_from_rates(t, rates, "instantaneous")
     np.testing.assert_allclose(shift, 0.01 * (rates - rates[0]), rtol=0, atol=1e-12)

@@ -61,7 +61,7 @@ def test_derivatives_by_radii_and_baseline_are_central_differences(kind):
 
 
 def test_covariance_is_that_of_samples():
-    """Every step with its own noise of either wheel and of sideways slip; 4000 samples."""
+    """Every step with its own noise of either wheel and of lateral slip; 4000 samples."""
     wheel, slip, n = 0.05, 8e-3, 4000
     angles, dt, rng = steps("turning"), np.diff(SECONDS), np.random.default_rng(8)
     one = WheelIntervals(np.array([20]), np.array([40]), np.array([0]))

@@ -1,5 +1,4 @@
-"""What parts of a recording make of one another: half of it predicted by the other half, and the answer without each
-part."""
+"""Two-fold cross-validation of a calibration, and how far it shifts without each segment of the recording."""
 
 from __future__ import annotations
 
@@ -26,23 +25,23 @@ class PredictedFit:
 
 
 @dataclass(frozen=True)
-class HeldOut:
-    """Every other of `parts` parts of the recording makes one half; each half is predicted by the other.
+class CrossValidation:
+    """Two-fold cross-validation: every other of `segments` segments of the recording makes one half (fold).
 
-    directions: of the calibration that both halves know; excess: by how much chi^2 of both halves is higher where they
-    are predicted than where they took part; expected, spread: its mean and standard deviation for noise of the
-    stated sizes. moved (G, B): how far the answer moves without each of the G parts [SI]; allowed (G, B): the formal
-    standard deviation of that.
+    directions: of the calibration, that both halves determine. excess: chi^2 of both halves with the calibration of the
+    other half, minus that with the calibration of both. expected, spread: mean and standard deviation of `excess` for
+    noise of the stated sizes. shift (G, B): change of the calibration without each of the G segments [SI]; shift_sigma
+    (G, B): its formal standard deviation.
     """
 
-    parts: int
+    segments: int
     directions: int
     excess: float
     expected: float
     spread: float
     fits: tuple[PredictedFit, ...]
-    moved: np.ndarray
-    allowed: np.ndarray
+    shift: np.ndarray
+    shift_sigma: np.ndarray
 
     @property
     def factor(self) -> float:
@@ -61,6 +60,5 @@ class HeldOut:
 
     @property
     def whitened(self) -> np.ndarray:
-        """(G, B) `moved` in units of `allowed`, each like a standard normal number where noise is all there is; NaN
-        where nothing is allowed."""
-        return self.moved / np.where(self.allowed > 0.0, self.allowed, np.nan)
+        """(G, B) `shift` over `shift_sigma`: standard normal if noise is the only error; NaN where the sigma is 0."""
+        return self.shift / np.where(self.shift_sigma > 0.0, self.shift_sigma, np.nan)
