@@ -28,7 +28,8 @@ from icalib.estimation.state import State
 from icalib.first_guess import initial_guess
 from icalib.first_guess.start import first_state
 from icalib.measurements import CornerStream, ImuStream, Measurements
-from icalib.rig import Rig, fixed
+from icalib.parameter import fixed
+from icalib.rig import Rig
 
 SECONDS = 20.0  # of the recording, from its first image on
 POINT_SIGMA_M = 1e-6

@@ -18,6 +18,7 @@ LEVELS = {
     "compiled": 0,
     "extras": 0,
     "geometry": 0,
+    "parameter": 0,
     "file_hashes": 0,
     "file_names": 0,
     "own_files": 0,

@@ -6,21 +6,43 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from icalib.calibration import Calibration
+    from icalib.calibration import Calibration, load_calibration
     from icalib.errors import CalibrationError
-    from icalib.pipeline import calibrate
+    from icalib.parameter import Parameter, fixed, free, guess, prior
+    from icalib.pipeline import calibrate, calibrate_measurements
     from icalib.recordings import open_recording
     from icalib.rig_file import load_rig
 
 __version__ = "0.1.0"
-__all__ = ["Calibration", "CalibrationError", "__version__", "calibrate", "load_rig", "open_recording"]
+__all__ = [
+    "Calibration",
+    "CalibrationError",
+    "Parameter",
+    "__version__",
+    "calibrate",
+    "calibrate_measurements",
+    "fixed",
+    "free",
+    "guess",
+    "load_calibration",
+    "load_rig",
+    "open_recording",
+    "prior",
+]
 
 _HOME = {
     "Calibration": "icalib.calibration",
     "CalibrationError": "icalib.errors",
+    "Parameter": "icalib.parameter",
     "calibrate": "icalib.pipeline",
+    "calibrate_measurements": "icalib.pipeline",
+    "fixed": "icalib.parameter",
+    "free": "icalib.parameter",
+    "guess": "icalib.parameter",
+    "load_calibration": "icalib.calibration",
     "load_rig": "icalib.rig_file",
     "open_recording": "icalib.recordings",
+    "prior": "icalib.parameter",
 }
 
 

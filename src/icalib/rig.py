@@ -2,36 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
+import difflib
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
+from icalib.errors import RigError
+from icalib.geometry.cameras import CAMERA_MODELS
 from icalib.geometry.targets import NoTarget, Target
-
-Mode = Literal["free", "fixed", "prior"]
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """How one group of parameters is treated.
-
-    free: estimated, `value` (if given) is where the solver starts. fixed: held at `value`. prior: estimated, with a
-    Gaussian prior of mean `value` and standard deviation `sigma`. value None: the program finds its own start.
-    Rotations are 3x3 matrices R_imu_sensor with sigma (3,) in rad about the sensor's axes (right perturbation); all
-    else are vectors with sigma of the same shape.
-    """
-
-    mode: Mode = "free"
-    value: np.ndarray | None = None
-    sigma: np.ndarray | None = None
-
-
-def fixed(value: object) -> Parameter:
-    return Parameter("fixed", np.asarray(value, dtype=np.float64))
-
+from icalib.parameter import Parameter, check_sizes
 
 TimeUnit = Literal["s", "ms", "us", "ns"]
 
@@ -97,7 +80,11 @@ class ImuSensor:
     pose_keyframes_s: float = 0.02  # between keyframes that poses alone place
     layout: TableLayout = PLAIN_TABLE
 
+    def __post_init__(self) -> None:
+        check_sizes(self, {"intrinsics": 24})
 
+
+MOUNTED = {"translation": 3, "time_offset": 1}  # numbers of a sensor's extrinsics beside its rotation
 TRACK_IMAGES = "images"  # `tracks` of a camera whose feature tracks are found in its images
 
 
@@ -121,6 +108,11 @@ class Camera:
     tracks: str | None = None  # path of a table of feature tracks, or TRACK_IMAGES
     track_noise_px: float | None = None  # None: estimated from the residuals
     layout: TableLayout = PLAIN_TABLE  # of its table of tracks, or without one of corners
+
+    def __post_init__(self) -> None:
+        model = CAMERA_MODELS.get(self.model)  # an unknown one is named where it is used
+        distortion = {} if model is None else {"distortion": len(model.parameter_names) - 4}
+        check_sizes(self, MOUNTED | {"intrinsics": 4, "bloom": 1} | distortion)
 
     @property
     def tracks_images(self) -> bool:
@@ -152,6 +144,9 @@ class Lidar:
     topic: str | None = None  # of its clouds; None: the one with the LiDAR's name, or the only one
     point_time_field: str | None = None
     point_time_unit: TimeUnit | None = None
+
+    def __post_init__(self) -> None:
+        check_sizes(self, MOUNTED)
 
 
 WheelFactor = Literal["increments", "relative-poses"]
@@ -231,6 +226,9 @@ class Wheels:
     ground: Ground | None = None
     layout: TableLayout = PLAIN_TABLE
 
+    def __post_init__(self) -> None:
+        check_sizes(self, MOUNTED | {group: n for sizes in DRIVE_SIZES.values() for group, n in sizes.items()})
+
     @property
     def ground_height(self) -> Parameter:
         """What the height over the ground starts from, where it is estimated."""
@@ -281,6 +279,9 @@ class PoseSensor:
     layout: TableLayout = PLAIN_TABLE
     inverted: bool = False  # what is recorded is T_sensor_frame
     frames: tuple[str, str] | None = None  # parent and child in a topic of transforms; None: it is not one
+
+    def __post_init__(self) -> None:
+        check_sizes(self, MOUNTED)
 
 
 Scheme = Literal["inertial", "pose", "kinematic"]
@@ -366,3 +367,29 @@ class Rig:
     def assumes_motion(self) -> bool:
         """Whether an assumption stands in for the IMU."""
         return self.imu is not None and self.imu.assumed
+
+    def with_(self, part: str = "", /, **fields: Any) -> Rig:
+        """The same rig with some `fields` changed: of the sensor called `part`, of "settings", or of the rig itself.
+
+        For example rig.with_("cam0", intrinsics=icalib.fixed([458, 457, 367, 248])). Raises RigError where there is
+        no such sensor or field.
+        """
+        places = {"": (None, self), "settings": ("settings", self.settings)}
+        imus = {} if self.imu is None else {self.imu.name: ("imu", self.imu)}
+        kinds = ("cameras", "lidars", "wheels", "poses")
+        places |= imus | {s.name: (kind, s) for kind in kinds for s in getattr(self, kind)}
+        if part not in places:
+            raise RigError(f"there is no sensor {part}; the rig has {', '.join(filter(None, places))}.")
+        kind, old = places[part]
+        known = [f.name for f in dataclasses.fields(old)]
+        for name in fields:
+            if name not in known:
+                near = difflib.get_close_matches(name, known, 1)
+                hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}."
+                raise RigError(f"{part or 'the rig'} has no field {name}; {hint}")
+        new = dataclasses.replace(old, **fields)
+        if kind is None:
+            return new
+        same = getattr(self, kind)
+        changed = tuple(new if s is old else s for s in same) if isinstance(same, tuple) else new
+        return dataclasses.replace(self, **{kind: changed})

@@ -7,13 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from icalib.rig import Parameter
+from icalib.errors import RigError
+from icalib.parameter import ROUNDING, Parameter, nearest_rotation
 from icalib.yaml_nodes import YamlValue
 
 _FORMS = "write free, {guess: VALUE}, {fixed: VALUE} or {prior: VALUE, sigma: SIGMA}"
 _ROTATION_FORMS = "a 3x3 matrix, {xyzw: [x, y, z, w]} or {rpy_deg: [roll, pitch, yaw]}"
-_ROUNDING = 1e-3  # published rotations have few digits; beyond it a value is a mistake
-_EXACT = 1e-12
 
 # Broad priors of the IMU intrinsics (order as in estimation.imu_model): scale and misalignment of the accelerometer (6)
 # and the gyroscope (6), rotation between them [rad] (3), g-sensitivity [rad/s per m/s^2] (9).
@@ -112,21 +111,16 @@ def _matrix(value: YamlValue) -> np.ndarray:
     if len(rows) != 3:
         value.fail(f"a rotation matrix has 3 rows of 3 numbers, but this has {len(rows)}; write {_ROTATION_FORMS}.")
     matrix = np.array([row.vector(3) for row in rows])
-    error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
-    if error > _ROUNDING:
-        value.fail(f"is not a rotation matrix (R R^T is off the identity by {error:.2g}); write {_ROTATION_FORMS}.")
-    if np.linalg.det(matrix) < 0:
-        value.fail("is a reflection (its determinant is -1), not a rotation; turn the sign of one axis.")
-    if error <= _EXACT:
-        return matrix
-    u, _, vt = np.linalg.svd(matrix)
-    return u @ vt
+    try:
+        return nearest_rotation(matrix)
+    except RigError as error:
+        value.fail(f"{error}; write {_ROTATION_FORMS}.")
 
 
 def _from_quaternion(value: YamlValue) -> np.ndarray:
     q = value.vector(4)
     norm = float(np.linalg.norm(q))
-    if abs(norm - 1) > _ROUNDING:
+    if abs(norm - 1) > ROUNDING:
         value.fail(f"a unit quaternion [x, y, z, w] has norm 1, but this has {norm:.4g}; normalise it.")
     x, y, z, w = q / norm
     return np.array(

@@ -17,8 +17,9 @@ from icalib.errors import EstimationError
 from icalib.measurements import Measurements, PoseStream
 from icalib.montecarlo.truth import error
 from icalib.outputs import write_outputs
+from icalib.parameter import fixed
 from icalib.pipeline import calibrate_measurements
-from icalib.rig import Rig, fixed
+from icalib.rig import Rig
 from icalib.simulation import Drive, Scenario, SimPoses, handheld, rig_for, simulate
 
 MOUNT, FRAME = pose([0.3, -0.5, 1.0], [0.1, -0.2, 0.15]), pose([0.2, 0.1, 2.0], [3.0, -1.0, 0.5])

@@ -13,8 +13,9 @@ from icalib.calibration import Calibration, load_calibration
 from icalib.errors import EstimationError
 from icalib.measurements import Measurements
 from icalib.outputs import write_outputs
+from icalib.parameter import fixed
 from icalib.pipeline import calibrate_measurements
-from icalib.rig import Rig, fixed
+from icalib.rig import Rig
 from icalib.simulation import Scenario, Simulation, handheld, rig_for, simulate
 
 EXACT = 1e-8

@@ -20,8 +20,9 @@ from icalib.first_guess.start import first_state
 from icalib.geometry import so3
 from icalib.joining import PAUSE_NS, join
 from icalib.measurements import Measurements
+from icalib.parameter import fixed
 from icalib.recordings.several import naming, open_all
-from icalib.rig import Rig, fixed
+from icalib.rig import Rig
 from icalib.simulation import handheld, rig_for, simulate
 
 DAY_NS = 86_400 * 10**9

@@ -11,7 +11,7 @@ import pytest
 from icalib.first_guess.lidar import LidarGuess
 from icalib.first_guess.start import start
 from icalib.geometry import so3
-from icalib.rig import Mode, Parameter
+from icalib.parameter import Mode, Parameter
 from icalib.simulation import rig_for
 
 TURN_RAD, LATE_S = 0.15, 0.03

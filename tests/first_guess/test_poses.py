@@ -12,7 +12,7 @@ from icalib.estimation.inputs import inputs_for
 from icalib.estimation.pose_factor import FRAME, frame_of
 from icalib.estimation.state import State
 from icalib.first_guess.poses import pose_rates, pose_values, state_from_poses
-from icalib.rig import Parameter, fixed
+from icalib.parameter import Parameter, fixed
 from icalib.simulation import Drive, Room, Scenario, SimPoses, rig_for, simulate
 
 # Twice the worst of five seeds: rotation [deg], translation [m], time offset [s].

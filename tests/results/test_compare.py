@@ -22,7 +22,7 @@ from icalib.comparison.results import side_of_result
 from icalib.comparison.significance import chi2_above, sigmas
 from icalib.comparison.words import lines, sentence
 from icalib.export.formats import export
-from icalib.rig import fixed
+from icalib.parameter import fixed
 from icalib.rig_parameters import parameter_to_plain
 
 NOISE = {"gyro": 1.6e-4, "gyro_walk": 2.2e-5, "accel": 2.8e-3, "accel_walk": 8.6e-4}

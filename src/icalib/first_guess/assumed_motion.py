@@ -43,7 +43,8 @@ from icalib.first_guess.wheel_path import (
 from icalib.first_guess.wheels import SidewaysError
 from icalib.geometry.targets.base import BOARD
 from icalib.measurements import ImuStream, Measurements
-from icalib.rig import ImuNoise, ImuSensor, Rig, fixed
+from icalib.parameter import fixed
+from icalib.rig import ImuNoise, ImuSensor, Rig
 
 ASSUMPTION = "assumed motion"  # no sensor is called so
 STEP_S = 0.01  # between readings

@@ -19,7 +19,8 @@ from icalib.first_guess.scene_changes import check_scene
 from icalib.first_guess.scene_lens import find_scene
 from icalib.geometry.cameras import camera_model
 from icalib.measurements import Measurements
-from icalib.rig import Camera, Rig, fixed
+from icalib.parameter import fixed
+from icalib.rig import Camera, Rig
 
 
 def initial_guesses(rig: Rig, bodies: Bodies, recordings: Sequence[Measurements]) -> tuple[Guess, ...]:

@@ -25,9 +25,10 @@ from icalib.first_guess.pose_ways import placed
 from icalib.first_guess.smooth_path import BodyPoses
 from icalib.geometry.targets.base import BOARD
 from icalib.measurements import Measurements, PoseStream
+from icalib.parameter import fixed
 from icalib.recordings.several import naming
 from icalib.recordings.stops import stands_still_between
-from icalib.rig import PoseSensor, Rig, fixed
+from icalib.rig import PoseSensor, Rig
 
 FEWEST_PAIRS = 3  # of one recording
 NO_TURN_DEG = 1e-3  # between poses, which has no noise even: of a sensor without rotations

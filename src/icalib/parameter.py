@@ -1,0 +1,139 @@
+"""One group of parameters of a sensor, and how it is treated: free, a guess, fixed or a prior."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from icalib.errors import RigError
+
+Mode = Literal["free", "fixed", "prior"]
+ROUNDING = 1e-3  # published rotations have few digits; an error of R R^T beyond it is a mistake
+_EXACT = 1e-12  # below, a rotation stays bit by bit as it is
+_ANY_VECTOR = "a vector of numbers, or a 3x3 rotation matrix"
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """How one group of parameters is treated. Made by `icalib.free`, `icalib.guess`, `icalib.fixed`, `icalib.prior`.
+
+    free: estimated, `value` (if given) is where the solver starts. fixed: kept at `value`. prior: estimated, with a
+    Gaussian prior of mean `value` and standard deviation `sigma`. value None: the program finds its own start.
+    Rotations are 3x3 matrices R_imu_sensor with sigma (3,) in rad about the sensor's axes (right perturbation); all
+    else are vectors with sigma of the same shape. Raises RigError where the value or sigma makes no sense.
+    """
+
+    mode: Mode = "free"
+    value: np.ndarray | None = None
+    sigma: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        if self.mode not in get_args(Mode):
+            raise RigError(f"a parameter is {', '.join(get_args(Mode))}, not {self.mode!r}; use one of these.")
+        if self.value is not None:
+            object.__setattr__(self, "value", _checked_value(self.value))
+        if self.mode == "prior":
+            if self.value is None or self.sigma is None:
+                raise RigError("a prior needs a value and its sigma; give both, or use a guess.")
+            object.__setattr__(self, "sigma", _checked_sigma(self.sigma, self.size))
+        elif self.sigma is not None:
+            raise RigError(f"sigma belongs to a prior, and this parameter is {self.mode}; use icalib.prior.")
+
+    @property
+    def size(self) -> int:
+        """Degrees of freedom of the value: 3 of a rotation; 0 without a value."""
+        return 0 if self.value is None else 3 if self.value.ndim == 2 else len(self.value)
+
+
+def free() -> Parameter:
+    """Estimated; the program finds its own start."""
+    return Parameter("free")
+
+
+def guess(value: Any) -> Parameter:
+    """Estimated, starting at `value`: a number, a vector, a 3x3 rotation matrix or a scipy Rotation."""
+    return Parameter("free", _array(value))
+
+
+def fixed(value: Any) -> Parameter:
+    """Kept at `value`: a number, a vector, a 3x3 rotation matrix or a scipy Rotation."""
+    return Parameter("fixed", _array(value))
+
+
+def prior(value: Any, sigma: Any) -> Parameter:
+    """Estimated, with a Gaussian prior of mean `value` and standard deviation `sigma`, in the unit of the value.
+
+    sigma: one number for all entries, or one for each; of a rotation in rad about the sensor's axes.
+    """
+    return Parameter("prior", _array(value), _array(sigma))
+
+
+def check_sizes(sensor: Any, sizes: dict[str, int]) -> None:
+    """Raises RigError where a group of `sensor` has a value of another size. sizes: by group; rotations are not in it,
+    as they are recognised by their name."""
+    for group, size in (sizes | {"rotation": 9}).items():
+        p = getattr(sensor, group, None)
+        if p is None or p.value is None:
+            continue
+        shape = (3, 3) if group == "rotation" else (size,)
+        if p.value.shape != shape:
+            wanted = "a 3x3 rotation matrix" if group == "rotation" else f"{size} number{'s' * (size > 1)}"
+            raise RigError(
+                f"{sensor.name}: {group} needs {wanted}, but the value has shape {p.value.shape}; correct the value."
+            )
+
+
+def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
+    """(3, 3) `matrix` itself where it is a rotation to the last digits, else the nearest one.
+
+    Raises RigError where it is no rotation."""
+    error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
+    if not error <= ROUNDING:
+        raise RigError(f"is not a rotation matrix (R R^T differs from the identity by {error:.2g})")
+    if np.linalg.det(matrix) < 0:
+        raise RigError("is a reflection (its determinant is -1), not a rotation")
+    if error <= _EXACT:
+        return matrix
+    u, _, vt = np.linalg.svd(matrix)
+    return u @ vt
+
+
+def _array(value: Any) -> np.ndarray:
+    """As float64; of a number a vector of one; of a scipy Rotation its matrix. Raises RigError."""
+    value = value.as_matrix() if hasattr(value, "as_matrix") else value
+    try:
+        return np.atleast_1d(np.asarray(value, dtype=np.float64))
+    except (TypeError, ValueError) as error:
+        raise RigError(f"a parameter's value is {_ANY_VECTOR}, not {value!r:.60}; correct the value.") from error
+
+
+def _checked_value(value: Any) -> np.ndarray:
+    found = _array(value)
+    if found.shape != (3, 3) and (found.ndim != 1 or not len(found)):
+        raise RigError(f"a parameter's value is {_ANY_VECTOR}, but it has shape {found.shape}; correct the value.")
+    if not np.isfinite(found).all():
+        raise RigError("a parameter's value has entries that are NaN or infinite; leave the value out, or correct it.")
+    if found.ndim == 1:
+        return found
+    try:
+        return nearest_rotation(found)
+    except RigError as error:
+        raise RigError(f"a parameter's 3x3 value {error}; correct the matrix.") from None
+
+
+def _checked_sigma(sigma: Any, size: int) -> np.ndarray:
+    found = _array(sigma)
+    if found.shape not in ((1,), (size,)):
+        raise RigError(f"a prior's sigma needs 1 or {size} numbers, but it has shape {found.shape}; correct sigma.")
+    if not (np.isfinite(found) & (found > 0.0)).all():
+        raise RigError(
+            f"a prior's sigma must be above 0 and finite, but one entry is {_worst(found):g}; for an exact value use "
+            "icalib.fixed, for an unknown one icalib.guess."
+        )
+    return np.broadcast_to(found, (size,)).copy() if len(found) != size else found
+
+
+def _worst(sigma: np.ndarray) -> float:
+    return float(next(s for s in sigma if not (np.isfinite(s) and s > 0.0)))
