@@ -15,7 +15,7 @@ from icalib.errors import CalibrationError
 
 SEAL = "icalib_sha256"  # the last key of JSON
 _COMMENT = re.compile(rb"(?:# |% |<!-- )icalib sha256 ([0-9a-f]{64})(?: -->)?\r?\n\Z")
-_LAST_KEY = re.compile(rb',\s*"icalib_sha256": "([0-9a-f]{64})"\n\}\Z')
+_LAST_KEY = re.compile(rb',\s*"icalib_sha256": "([0-9a-f]{64})"\n\}\]?\Z')
 _ARCHIVE = re.compile(rb"(?s:..)icalib sha256 ([0-9a-f]{64})\n\Z")  # the size of a zip file's comment, and the comment
 _ZIP = b"PK\x03\x04"
 _LONGEST_SEAL = 200  # bytes
@@ -26,15 +26,17 @@ _RERUN_HEAD = 4096  # bytes, in which the name of the program stands
 
 
 def sealed(content: bytes) -> bytes:
-    """`content` with the seal: JSON (an object), XML, HTML, PDF, PNG, npz, or text whose comments begin with #."""
+    """`content` with the seal: JSON (an object, or a list that ends with one), XML, HTML, PDF, PNG, npz, or
+    text whose comments begin with #."""
     content = _COMMENT.sub(b"", content)  # of an input that is written again
     if content.startswith(_ZIP):  # as numpy writes it, without a comment: its size, 0, stands at the end
         comment = f"icalib sha256 {hashlib.sha256(content[:-2]).hexdigest()}\n".encode()
         return content[:-2] + len(comment).to_bytes(2, "little") + comment
     head = content.removeprefix(b"\xef\xbb\xbf").lstrip()[:1]
-    if head == b"{":
-        body = content.rstrip().removesuffix(b"}").rstrip()
-        return body + f',\n "{SEAL}": "{hashlib.sha256(body).hexdigest()}"\n}}'.encode()
+    if head in (b"{", b"["):
+        end = "]" if head == b"[" else ""
+        body = content.rstrip().removesuffix(end.encode()).rstrip().removesuffix(b"}").rstrip()
+        return body + f',\n "{SEAL}": "{hashlib.sha256(body).hexdigest()}"\n}}{end}'.encode()
     body = content if content.endswith(b"\n") else content + b"\n"
     begin, end = {b"<": ("<!-- ", " -->"), b"%": ("% ", "")}.get(head, ("# ", ""))
     if head == b"%" and not content.startswith(b"%PDF"):  # YAML as OpenCV writes it

@@ -43,7 +43,7 @@ def _allan(options: argparse.Namespace) -> None:
 
 
 def _add_export(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    from icalib.export.names import FORMATS, ONE_FILE
+    from icalib.export.names import FORMATS, FRAMED, ONE_FILE
 
     c = commands.add_parser("export", help="a result as files of other programs")
     c.add_argument("result", type=Path, help="folder that a calibration was written to")
@@ -51,7 +51,7 @@ def _add_export(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     where = f"folder for the files; for {', '.join(ONE_FILE)} the file itself"
     c.add_argument("--output", "-o", type=Path, required=True, metavar="PATH", help=where)
     c.add_argument("--urdf", type=Path, metavar="FILE", help="existing URDF: set the origins of its joints")
-    frame = "name of a sensor's frame or link, where it is not the sensor's (ros2-static, urdf); may be repeated"
+    frame = f"name of a sensor's frame or link, where it is not the sensor's ({', '.join(FRAMED)}); may be repeated"
     c.add_argument("--frame", type=_pair, action="append", default=[], metavar="SENSOR=FRAME", help=frame)
     joint = "joint to set in --urdf, by default the one right above the sensor's link; may be repeated"
     c.add_argument("--joint", type=_pair, action="append", default=[], metavar="SENSOR=JOINT", help=joint)

@@ -85,6 +85,8 @@ def test_every_format_says_which_way_its_transform_goes(robot: Calibration, to: 
     said = {"kalibr": "takes coordinates in", "camera-info": "no pose", "json": "p_imu = T_imu_sensor p_sensor"}
     said |= {"fast-lio": "p_imu = extrinsic_R p_lidar + extrinsic_T", "mins": "p_imu = T_imu_cam p_cam"}
     said |= {"openvins": "p_imu = T_imu_cam p_cam", "vins-fusion": "p_imu = body_T_cam p_cam"}
+    said |= {"orb-slam3": "p_imu = T_b_c1 p_c1", "lio-sam": "p_lidar = extrinsicRot p_imu + extrinsicTrans"}
+    said |= {"fast-livo2": "p_cam = Rcl p_lidar + Pcl", "colmap": "p_cam = T p_rig"}
     found = export(robot, to)
     assert any(said.get(to, "p_parent = T p_child") in text for text in found.files.values())
     # What is printed stands in the files, too: in one of them at least.
@@ -92,10 +94,12 @@ def test_every_format_says_which_way_its_transform_goes(robot: Calibration, to: 
     guessed = "cam1: translation y was not determined by the data; what stands here is the guess."
     for sentence in found.sentences:
         assert sentence in texts or to == "json"
-    assert (guessed in found.sentences) == (to not in ("camera-info", "fast-lio"))
+    assert (guessed in found.sentences) == (to not in ("camera-info", "fast-lio", "fast-livo2", "lio-sam"))
 
 
-@pytest.mark.parametrize("to", ["kalibr", "openvins", "vins-fusion", "camera-info", "mins", "fast-lio"])
+@pytest.mark.parametrize(
+    "to", ["kalibr", "openvins", "vins-fusion", "orb-slam3", "camera-info", "mins", "fast-lio", "lio-sam", "colmap"]
+)
 def test_a_pose_sensor_is_said_to_have_no_place(robot: Calibration, to: str):
     sensors = robot.rig["sensors"] | {"mocap0": {"type": "pose"}}
     sentences = export(dataclasses.replace(robot, rig=robot.rig | {"sensors": sensors}), to).sentences
@@ -359,7 +363,7 @@ def test_a_clock_that_restarts_has_no_offset_to_give(robot: Calibration, to: str
         )
         groups = (*(g for g in restarting.groups if (g.sensor, g.name) != (name, "time_offset")), group)
         restarting = dataclasses.replace(restarting, groups=groups)
-    if to in ("openvins", "vins-fusion", "mins", "fast-lio"):
+    if to in ("openvins", "vins-fusion", "mins", "fast-lio", "fast-livo2"):
         with pytest.raises(CalibrationError, match="the clock of (cam0|lidar0) restarts, and each recording has a"):
             export(restarting, to)
         return
@@ -370,12 +374,13 @@ def test_a_clock_that_restarts_has_no_offset_to_give(robot: Calibration, to: str
     elif to == "json":
         assert json.loads(texts)["sensors"]["cam0"]["time_offset"] == [0.01, -3.2]
     else:
-        assert "the time offsets of cam0 (one for each recording)" in texts
+        sensor = "lidar0" if to == "lio-sam" else "cam0"
+        assert f"the time offsets of {sensor} (one for each recording)" in texts
 
 
 def test_imu_intrinsics_that_have_no_place_are_said(robot: Calibration):
     c = with_imu_intrinsics(robot, np.full(24, 0.01))
-    for to in ("vins-fusion", "mins", "fast-lio", "ros2-static", "camera-info", "urdf"):
+    for to in ("vins-fusion", "mins", "fast-lio", "lio-sam", "orb-slam3", "ros2-static", "camera-info", "urdf"):
         assert any("scale and misalignment of imu0" in s for s in export(c, to).sentences)
     for to in ("kalibr", "openvins"):
         assert not any("scale and misalignment" in s for s in export(c, to).sentences)
@@ -434,7 +439,7 @@ def test_a_lidar_and_a_rate_that_are_not_there(calibration: Calibration):
 def test_options_of_other_formats(calibration: Calibration, tmp_path: Path):
     with pytest.raises(CalibrationError, match="there is no format kalibur; available are kalibr, openvins"):
         export(calibration, "kalibur")
-    with pytest.raises(CalibrationError, match="--frame belongs to ros2-static and urdf; json names no frames"):
+    with pytest.raises(CalibrationError, match="--frame belongs to ros2-static, urdf, autoware; json names no frames"):
         export(calibration, "json", {"cam0": "left"})
     with pytest.raises(CalibrationError, match="--urdf belongs to --to urdf, not to json"):
         export(calibration, "json", existing_urdf=tmp_path / "robot.urdf")

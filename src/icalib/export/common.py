@@ -113,7 +113,7 @@ def restarts(c: Calibration, name: str) -> bool:
 
 
 def time_offsets(c: Calibration, names: Sequence[str]) -> list[str]:
-    """Words for the time offsets of sensors that have one."""
+    """Words for the time offsets of sensors that have one other than zero."""
     found = {g.sensor: g.value for g in c.groups if g.name == "time_offset" and g.value.any()}
     return [_time_offset_words(name, found[name]) for name in names if name in found]
 
@@ -174,6 +174,13 @@ def quaternion(R: np.ndarray) -> tuple[float, float, float, float]:
     x, y, z, w = np.linalg.eigh(K)[1][:, -1].tolist()
     sign = -1.0 if w < 0 else 1.0
     return sign * x, sign * y, sign * z, sign * w
+
+
+def opencv_matrix(name: str, T: np.ndarray, kind: str = "d") -> list[str]:
+    """Lines of a 4x4 matrix as OpenCV reads it; kind: d (double) or f (float), as the program expects it."""
+    rows = [", ".join(repr(float(x)) for x in row) for row in T]
+    head = [f"{name}: !!opencv-matrix", "   rows: 4", "   cols: 4", f"   dt: {kind}"]
+    return [*head, f"   data: [{rows[0]},", *(f"      {row}," for row in rows[1:3]), f"      {rows[3]}]"]
 
 
 def yaml_text(comments: Sequence[str], data: Mapping[str, Any], head: str = "") -> str:

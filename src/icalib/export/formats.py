@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from icalib.calibration import Calibration
 from icalib.errors import CalibrationError
+from icalib.export.autoware import autoware
+from icalib.export.colmap import colmap
 from icalib.export.common import Export, guesses, no_place_for
 from icalib.export.kalibr import camchain, camchain_name, imu_yaml
-from icalib.export.lidar_programs import fast_lio, mins
-from icalib.export.names import FORMATS
+from icalib.export.lidar_odometry import fast_lio, fast_livo2, lio_sam
+from icalib.export.mins import mins
+from icalib.export.names import FORMATS, FRAMED
 from icalib.export.openvins import openvins
+from icalib.export.orb_slam3 import orb_slam3
 from icalib.export.plain import plain_json
 from icalib.export.ros import camera_info, ros2_static
 from icalib.export.urdf import updated_urdf, urdf
 from icalib.export.vins_fusion import vins_fusion
-
-_FRAMED = ("ros2-static", "urdf")
 
 
 def export(
@@ -29,31 +31,21 @@ def export(
 ) -> Export:
     """`c` in the format `to`, one of FORMATS.
 
-    frames: sensor -> frame or link, where the two differ (ros2-static, urdf). existing_urdf: the file to be updated,
+    frames: sensor -> frame or link, where the two differ (one of FRAMED). existing_urdf: the file to be updated,
     and joints: sensor -> joint of it to be set, by default the one above the sensor's link.
     Raises CalibrationError where the format needs what is not there, or an option belongs to another format.
     """
     frames, joints = frames or {}, joints or {}
     _check(c, to, frames, joints, existing_urdf)
     match to:
-        case "kalibr":
-            return kalibr(c)
-        case "openvins":
-            return openvins(c)
-        case "vins-fusion":
-            return vins_fusion(c)
         case "ros2-static":
             return ros2_static(c, frames)
-        case "camera-info":
-            return camera_info(c)
         case "urdf":
             return urdf(c, frames) if existing_urdf is None else updated_urdf(c, existing_urdf, frames, joints)
-        case "mins":
-            return mins(c)
-        case "fast-lio":
-            return fast_lio(c)
+        case "autoware":
+            return autoware(c, frames)
         case _:
-            return plain_json(c)
+            return _PLAIN[to](c)
 
 
 def kalibr(c: Calibration) -> Export:
@@ -71,8 +63,8 @@ def _check(
 ) -> None:
     if to not in FORMATS:
         raise CalibrationError(f"there is no format {to}; available are {', '.join(FORMATS)}.")
-    if frames and to not in _FRAMED:
-        raise CalibrationError(f"--frame belongs to {' and '.join(_FRAMED)}; {to} names no frames, so leave it out.")
+    if frames and to not in FRAMED:
+        raise CalibrationError(f"--frame belongs to {', '.join(FRAMED)}; {to} names no frames, so leave it out.")
     if existing is not None and to != "urdf":
         raise CalibrationError(f"--urdf belongs to --to urdf, not to {to}; leave it out.")
     if joints and existing is None:
@@ -81,3 +73,18 @@ def _check(
     for sensor in (*frames, *joints):
         if sensor not in known:
             raise CalibrationError(f"there is no sensor {sensor}; this calibration has {', '.join(known)}.")
+
+
+_PLAIN: dict[str, Callable[[Calibration], Export]] = {
+    "kalibr": kalibr,
+    "openvins": openvins,
+    "vins-fusion": vins_fusion,
+    "orb-slam3": orb_slam3,
+    "camera-info": camera_info,
+    "mins": mins,
+    "fast-lio": fast_lio,
+    "fast-livo2": fast_livo2,
+    "lio-sam": lio_sam,
+    "colmap": colmap,
+    "json": plain_json,
+}

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from math import sqrt
 
-import numpy as np
-
 from icalib.calibration import Calibration
 from icalib.errors import CalibrationError
 from icalib.export.common import (
@@ -17,6 +15,7 @@ from icalib.export.common import (
     need,
     need_imu,
     no_place_for,
+    opencv_matrix,
     time_offset,
     topic,
 )
@@ -62,7 +61,7 @@ def _main(c: Calibration, imu: str, names: tuple[str, ...], lenses: list[Lens], 
         lines += [f'image{i}_topic: "{topic(c, name, f"/{name}/image_raw")}"', f'cam{i}_calib: "cam{i}.yaml"']
     lines += [f"image_width: {width}", f"image_height: {height}", "estimate_extrinsic: 0"]
     for i, name in enumerate(names):
-        lines += _matrix(f"body_T_cam{i}", c.T_imu_sensor(name))
+        lines += opencv_matrix(f"body_T_cam{i}", c.T_imu_sensor(name))
     lines += _noise(c, imu)
     lines += [f"g_norm: {float(c.rig['gravity'])!r}", "estimate_td: 0"]
     lines.append("# What to add to an image's stamp to have the IMU's clock [s].")
@@ -77,12 +76,6 @@ def _noise(c: Calibration, imu: str) -> list[str]:
     names = {"acc_n": "accel", "gyr_n": "gyro", "acc_w": "accel_walk", "gyr_w": "gyro_walk"}
     head = f"# Of single readings: densities times the root of the rate, {c.rates[imu]:.6g} Hz; larger ones are usual."
     return [head, *(f"{theirs}: {float(noise[ours]) * root!r}" for theirs, ours in names.items())]
-
-
-def _matrix(name: str, T: np.ndarray) -> list[str]:
-    rows = [", ".join(repr(float(x)) for x in row) for row in T]
-    head = [f"{name}: !!opencv-matrix", "   rows: 4", "   cols: 4", "   dt: d"]
-    return [*head, f"   data: [{rows[0]},", *(f"      {row}," for row in rows[1:3]), f"      {rows[3]}]"]
 
 
 def _camera(name: str, lens: Lens) -> str:

@@ -1,4 +1,4 @@
-"""MINS and FAST-LIO: the calibrated fields of their configuration."""
+"""MINS: the calibrated fields of its configuration."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from icalib.export.common import (
     guesses,
     imu_intrinsics,
     lens_of,
-    need,
     need_imu,
     no_place_for,
     time_offset,
@@ -56,28 +55,6 @@ def mins(c: Calibration) -> Export:
         files["config_lidar.yaml"] = _file(_said("lidar", "LiDAR", c.lidars), lidars, sentences)
     if pairs:
         files["config_wheel.yaml"] = _wheels(c, pairs[0], sentences)
-    return Export(files, sentences)
-
-
-def fast_lio(c: Calibration) -> Export:
-    """A file for each LiDAR. Raises CalibrationError without an IMU or a LiDAR."""
-    imu = need_imu(c, "FAST-LIO")
-    need(c.lidars, "LiDAR", "FAST-LIO")
-    away = [*c.cameras, *c.wheels, *c.pose_sensors, *imu_intrinsics(c)]
-    sentences = no_place_for("FAST-LIO", away) + guesses(c, c.lidars)
-    comments = [
-        "For FAST-LIO, by icalib: put these fields into its own configuration, which has others besides.",
-        "extrinsic_R (row by row) and extrinsic_T [m] place the LiDAR in the imu frame:",
-        "p_imu = extrinsic_R p_lidar + extrinsic_T. t_imu = t_lidar + time_offset_lidar_to_imu [s].",
-    ]
-    files = {}
-    for name in c.lidars:
-        T = c.T_imu_sensor(name)
-        offset = time_offset(c, name)
-        common = {"lid_topic": topic(c, name, f"/{name}"), "imu_topic": topic(c, imu, f"/{imu}")}
-        common |= {"time_sync_en": False, "time_offset_lidar_to_imu": offset}
-        place = {"extrinsic_est_en": False, "extrinsic_T": T[:3, 3].tolist(), "extrinsic_R": T[:3, :3].ravel().tolist()}
-        files[f"{name}.yaml"] = yaml_text([*comments, *sentences], {"common": common, "mapping": place})
     return Export(files, sentences)
 
 

@@ -1,0 +1,75 @@
+"""Autoware: `sensor_kit_calibration.yaml`, and `sensors_calibration.yaml` where wheels show the vehicle's base_link."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from icalib.calibration import Calibration
+from icalib.export.common import (
+    Export,
+    drives,
+    guesses,
+    imu_intrinsics,
+    inverse,
+    no_place_for,
+    rpy,
+    time_offsets,
+    yaml_text,
+)
+
+KIT = "sensor_kit_base_link"
+# Axes of a camera's body frame (x forward, y left, z up; REP 103) in its optical frame (z forward, x right, y down).
+_OPTICAL_BODY = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+
+
+def autoware(c: Calibration, frames: Mapping[str, str]) -> Export:
+    """Poses of all sensors but wheels on the sensor kit, whose frame is the body's. frames: sensor -> frame."""
+    names = [name for name in (c.body, *c.mounted) if name not in c.wheels]
+    names = list(dict.fromkeys(names))
+    away = [*drives(c), *imu_intrinsics(c), *time_offsets(c, c.mounted), *c.wheels[1:]]
+    sentences = no_place_for("Autoware", [*away, *(f"the lens of {camera}" for camera in c.cameras)])
+    sentences += guesses(c, c.mounted)
+    comments = [
+        f"For Autoware, by icalib. {KIT} is the frame of {c.body}.",
+        "Each entry places a frame on it: p_parent = T p_child, T = Rz(yaw) Ry(pitch) Rx(roll), m and rad.",
+        "Frames of cameras are camera_link: x forward, y left, z up. Those of LiDARs are the frames of their points.",
+    ]
+    kit = {frames.get(name, _frame(c, name)): _entry(_pose(c, name)) for name in names}
+    files = {"sensor_kit_calibration.yaml": yaml_text([*comments, *sentences], {KIT: kit})}
+    if c.wheels:
+        files["sensors_calibration.yaml"] = _vehicle(c, c.wheels[0], sentences)
+    return Export(files, sentences)
+
+
+def _vehicle(c: Calibration, wheels: str, sentences: tuple[str, ...]) -> str:
+    """The kit on base_link, which lies on the ground below the axle that is not steered."""
+    radius = [g.value.mean() for g in c.groups if g.sensor == wheels and g.name in ("radii", "radius")]
+    T = inverse(c.T_imu_sensor(wheels))
+    T[2, 3] += radius[0] if radius else 0.0
+    height = (
+        f"one wheel radius below the axle of {wheels}"
+        if radius
+        else f"at the axle of {wheels}, whose height is not known"
+    )
+    comments = [
+        "For Autoware, by icalib: p_parent = T p_child.",
+        f"base_link is {height}; its axes are those of {wheels}.",
+    ]
+    return yaml_text([*comments, *sentences], {"base_link": {KIT: _entry(T)}})
+
+
+def _frame(c: Calibration, name: str) -> str:
+    return f"{name}/camera_link" if name in c.cameras else f"{name}_link" if name == c.imu else f"{name}_base_link"
+
+
+def _pose(c: Calibration, name: str) -> np.ndarray:
+    T = np.eye(4) if name == c.body else np.array(c.T_imu_sensor(name))
+    if name in c.cameras:
+        T[:3, :3] = T[:3, :3] @ _OPTICAL_BODY
+    return T
+
+
+def _entry(T: np.ndarray) -> dict[str, float]:
+    return dict(zip(("x", "y", "z", "roll", "pitch", "yaw"), [*T[:3, 3].tolist(), *rpy(T[:3, :3])], strict=True))
