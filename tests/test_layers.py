@@ -47,6 +47,7 @@ LEVELS = {
     "calibration": 5,
     "assessment": 7,
     "timeline": 6,
+    "result_rig": 6,
     "report": 7,
     "export": 7,
     "text_files": 1,

@@ -12,6 +12,7 @@ from icalib.rig import AccelUnit, GyroUnit
 def add_result_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Adds the parsers to those of the other commands."""
     _add_allan(commands)
+    _add_rig(commands)
     _add_export(commands)
     _add_compare(commands)
     _add_view(commands)
@@ -88,6 +89,34 @@ def _export(options: argparse.Namespace) -> None:
         for sentence in found.sentences:
             print(f"Note: {sentence}")
         print(f"Wrote {', '.join(str(folder / name) for name in files)}.")
+
+
+def _add_rig(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    c = commands.add_parser("rig", help="the rig file of a result, with its values fixed, as priors or as guesses")
+    c.add_argument("result", type=Path, help="folder that a calibration was written to")
+    how = "fixed at their values, priors with the sigma of the result, or guesses to start from"
+    c.add_argument("--as", dest="treatment", required=True, choices=("fixed", "prior", "guess"), help=how)
+    c.add_argument("--output", "-o", type=Path, required=True, metavar="FILE", help="rig file to write")
+    c.add_argument("--quiet", "-q", action="store_true", help="do not say what could not be taken as asked")
+    c.set_defaults(run=_rig)
+
+
+def _rig(options: argparse.Namespace) -> None:
+    from icalib.calibration import load_calibration
+    from icalib.own_files import refuse_foreign, sealed_texts
+    from icalib.result_files import set_of
+    from icalib.result_rig import rig_text
+    from icalib.text_files import write_texts
+
+    calibration = load_calibration(options.result)
+    inputs = [*set_of(options.result), *(Path(name) for name in calibration.inputs)]
+    refuse_foreign([options.output], inputs, "choose another name")
+    text, sentences = rig_text(calibration, options.treatment)
+    write_texts(options.output.parent, sealed_texts({options.output.name: text}))
+    if not options.quiet:
+        for sentence in sentences:
+            print(f"Note: {sentence}")
+        print(f"Wrote {options.output}.")
 
 
 def _add_compare(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

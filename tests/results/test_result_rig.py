@@ -1,0 +1,91 @@
+"""A result's rig: loads back, with its values fixed, as priors or as guesses, and never over a file of the user."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from icalib.calibration import Calibration
+from icalib.cli import main
+from icalib.errors import RigError
+from icalib.parameter import Parameter
+from icalib.result_rig import TREATMENTS, Treatment, rig_of_result
+from icalib.rig_file import load_rig, rig_from_dict, rig_to_dict
+
+ESTIMATED = [("cam0", "rotation"), ("cam0", "intrinsics"), ("lidar0", "translation"), ("wheel0", "radii")]
+
+
+def parameter(rig: Any, sensor: str, name: str) -> Parameter:
+    (found,) = (s for s in (*rig.cameras, *rig.lidars, *rig.wheels) if s.name == sensor)
+    return getattr(found, name)
+
+
+@pytest.mark.parametrize("treatment", TREATMENTS)
+def test_the_file_loads_back(robot: Calibration, tmp_path: Path, treatment: Treatment):
+    robot.save(tmp_path / "out")
+    file = tmp_path / "rig.yaml"
+    for _ in range(2):  # a file of its own is replaced
+        assert main(["rig", str(tmp_path / "out"), "--as", treatment, "-o", str(file), "-q"]) == 0
+    loaded = load_rig(file)
+    assert rig_to_dict(loaded) == rig_to_dict(rig_of_result(robot, treatment)[0])
+    for sensor, name in ESTIMATED:
+        p, g = parameter(loaded, sensor, name), robot.group(sensor, name)
+        assert p.mode == {"guess": "free"}.get(treatment, treatment)
+        np.testing.assert_array_equal(p.value, g.value)
+        assert p.sigma is None if treatment != "prior" else (p.sigma == g.std).all()
+    assert parameter(loaded, "cam0", "distortion").mode == "fixed"  # as in the rig file of the result
+    same = rig_from_dict(robot.rig, "the rig")
+    assert (loaded.target, loaded.settings, loaded.gravity) == (same.target, same.settings, same.gravity)
+
+
+def test_what_is_undetermined_is_never_fixed(robot: Calibration, capsys: pytest.CaptureFixture[str], tmp_path: Path):
+    rig, sentences = rig_of_result(robot, "fixed")
+    assert sentences == ("cam1: translation y was not determined by the data, so translation is not fixed.",)
+    assert parameter(rig, "cam1", "translation").mode == "free" and parameter(rig, "cam1", "rotation").mode == "fixed"
+    robot.save(tmp_path / "out")
+    assert main(["rig", str(tmp_path / "out"), "--as", "fixed", "-o", str(tmp_path / "rig.yaml")]) == 0
+    assert f"Note: {sentences[0]}\nWrote {tmp_path / 'rig.yaml'}.\n" == capsys.readouterr().out
+    assert f"# {sentences[0]}\n" in (tmp_path / "rig.yaml").read_text()
+
+
+def test_priors_of_the_rig_file_stay_beside_guesses(robot: Calibration):
+    prior = {"prior": [0.1, 0.1], "sigma": [1e-3, 1e-3]}
+    sensors = robot.rig["sensors"]
+    stated = robot.rig | {"sensors": sensors | {"wheel0": sensors["wheel0"] | {"radii": prior}}}
+    c = dataclasses.replace(robot, rig=stated)
+    kept = parameter(rig_of_result(c, "guess")[0], "wheel0", "radii")
+    assert kept.mode == "prior" and kept.sigma is not None and kept.sigma.tolist() == [1e-3, 1e-3]
+    taken = parameter(rig_of_result(c, "prior")[0], "wheel0", "radii")
+    assert taken.sigma is not None and (taken.sigma == robot.group("wheel0", "radii").std).all()
+
+
+def test_clocks_that_restart_and_unknown_uncertainty(robot: Calibration):
+    offsets = dataclasses.replace(
+        robot.group("cam0", "time_offset"), labels=("1", "2"), value=np.zeros(2), verdict=("determined",) * 2
+    )
+    endless = dataclasses.replace(robot.group("cam1", "rotation"), std=np.full(3, np.inf))
+    changed = {("cam0", "time_offset"): offsets, ("cam1", "rotation"): endless}
+    c = dataclasses.replace(robot, groups=tuple(changed.get((g.sensor, g.name), g) for g in robot.groups))
+    rig, sentences = rig_of_result(c, "prior")
+    assert parameter(rig, "cam0", "time_offset") == Parameter()
+    assert parameter(rig, "cam1", "rotation").mode == "free"
+    assert sentences == (
+        "cam0: each recording has a time offset of its own, so time_offset stays free.",
+        "cam1: rotation has no finite standard deviation, so it is a guess.",
+    )
+    with pytest.raises(RigError, match="become fixed, prior, guess, not 'free'"):
+        rig_of_result(robot, "free")  # pyright: ignore[reportArgumentType]
+
+
+def test_a_file_of_the_user_stays(robot: Calibration, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    robot.save(tmp_path / "out")
+    file = tmp_path / "rig.yaml"
+    file.write_text("sensors: {}\n")
+    assert main(["rig", str(tmp_path / "out"), "--as", "guess", "-o", str(file)]) == 1
+    assert "was not written by icalib" in capsys.readouterr().err and file.read_text() == "sensors: {}\n"
+    assert main(["rig", str(tmp_path / "no"), "--as", "guess", "-o", str(file)]) == 1
+    assert capsys.readouterr().err.count("\n") == 1
