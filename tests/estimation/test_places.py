@@ -10,10 +10,12 @@ import pytest
 
 from icalib.estimation.assembly import assemble
 from icalib.estimation.bodies import Bodies
+from icalib.estimation.border import restricted_inverse
 from icalib.estimation.corner_noise import first_noise
+from icalib.estimation.estimate import estimate
 from icalib.estimation.feature_noise import first_following
 from icalib.estimation.outcome import Outcome
-from icalib.estimation.places import Clusters, _cluster_gradients, _image_cells, _tag_corners
+from icalib.estimation.places import Clusters, _cluster_gradients, _image_cells, _tag_corners, cluster_covariances
 from icalib.estimation.problem import Problem
 from icalib.estimation.solver import minimise
 from icalib.first_guess.start import start
@@ -121,6 +123,44 @@ def test_a_lens_that_no_model_follows_is_in_the_standard_deviations():
     print(rms, honest)
     assert rms[0] > 5.0 and rms[1] < 2.0
     assert honest[0] < 1.5 and honest[1] > 0.5 * honest[0]
+
+
+def drifting(stream: TrackStream, sigma: float, rng: np.random.Generator) -> TrackStream:
+    """With errors of `sigma` [px] that correlate by 0.9 from one view of a track to the next."""
+    order = np.argsort(stream.feature, kind="stable")
+    error, new = rng.normal(0.0, sigma, (len(order), 2)), np.diff(stream.feature[order], prepend=-1) != 0
+    for i in np.flatnonzero(~new):
+        error[i] = 0.9 * error[i - 1] + np.sqrt(1.0 - 0.9**2) * error[i]
+    uv = stream.uv.copy()
+    uv[order] += error
+    return replace(stream, uv=uv)
+
+
+def track_spread(measurements: Measurements, rig: Rig) -> float:
+    """Mean over the intrinsics of the standard deviations by feature tracks, over the formal ones."""
+    inputs, state, _ = start(rig, [measurements])
+    found = estimate(inputs, state)
+    V = cluster_covariances(found.problem, found.outcome).tracks
+    assert V is not None
+    k = np.concatenate([b.columns for b in found.problem.layout.free if b.name == "intrinsics"])
+    t = found.problem.tolerance
+    formal = t**2 * np.diag(restricted_inverse(found.outcome.information * t[:, None] * t, found.problem.held))
+    return float(np.sqrt(np.mean(np.diag(V)[k] / formal[k])))
+
+
+def test_errors_that_stay_along_a_track_are_in_the_standard_deviations():
+    scenario = replace(followers(12.0), robot_noise_enabled=False)
+    scenario = replace(scenario, cameras=scenario.cameras[:1])
+    rig = with_drawn_guess(rig_for(scenario, intrinsics="free", distortion="free"), scenario, 1)
+    clean, rng = simulate(scenario, 1).measurements, np.random.default_rng(1)
+    sigma = rig.cameras[0].track_noise_px
+    assert sigma is not None
+    white = tuple(replace(t, uv=t.uv + rng.normal(0.0, sigma, t.uv.shape)) for t in clean.tracks)
+    alike = tuple(drifting(t, sigma, rng) for t in clean.tracks)
+    of_white, of_alike = (track_spread(replace(clean, tracks=tracks), rig) for tracks in (white, alike))
+    print(of_white, of_alike)
+    assert 0.7 < of_white < 1.3
+    assert of_alike > 1.5 * of_white
 
 
 def test_a_tags_corners_are_told_apart_beside_a_board_with_an_odd_number_of_corners(unlike, setup_of, factor_of):

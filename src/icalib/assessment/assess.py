@@ -53,7 +53,7 @@ from icalib.estimation.imu_model import LABELS as IMU_LABELS
 from icalib.estimation.inputs import Inputs, origin_difference
 from icalib.estimation.outcome import Visit
 from icalib.estimation.parts import Parts
-from icalib.estimation.places import place_covariances
+from icalib.estimation.places import cluster_covariances
 from icalib.estimation.problem import Problem
 from icalib.estimation.relaxed import relaxed
 from icalib.estimation.state import Block, State
@@ -264,14 +264,18 @@ def _final_verdict(formal: Verdict, size: float) -> Verdict:
 
 
 def _empirical_variance(found: Estimate, parts: Parts | None, formal: np.ndarray) -> np.ndarray | None:
-    """(B,) variances as the spread over parts of the recording shows them, plus what places in the image and on the
-    target show beyond white noise; None where the recording cannot be split."""
-    if parts is None:
+    """(B,) variances as the spread over parts of the recording shows them, or over feature tracks where it is larger,
+    plus what places in the image and on the target show beyond white noise; None where there is nothing to split."""
+    if parts is None and found.problem.features is None:
         return None
-    excess = [np.maximum(np.diag(V) - formal, 0.0) for V in place_covariances(found.problem, found.outcome)]
-    spread, expected = np.diag(split_covariance(found.outcome, parts)), split_expectation(found.outcome, parts)
-    leverage = np.clip(formal / np.maximum(expected, 1e-300), 1.0, MOST_LEVERAGE)
-    return few_factor(parts.count) ** 2 * leverage * spread + sum(excess)
+    clusters = cluster_covariances(found.problem, found.outcome)
+    spread = formal if clusters.tracks is None else np.diag(clusters.tracks)
+    if parts is not None:
+        over_parts, expected = np.diag(split_covariance(found.outcome, parts)), split_expectation(found.outcome, parts)
+        leverage = np.clip(formal / np.maximum(expected, 1e-300), 1.0, MOST_LEVERAGE)
+        over_parts = few_factor(parts.count) ** 2 * leverage * over_parts
+        spread = over_parts if clusters.tracks is None else np.maximum(spread, over_parts)
+    return spread + sum(np.maximum(np.diag(V) - formal, 0.0) for V in clusters.places)
 
 
 def few_parts_notes(inputs: Inputs, parts: Parts | None) -> Iterator[str]:

@@ -2,7 +2,8 @@
 
 A lens that the model cannot follow and a target that is not as drawn make the same errors in all parts of a recording,
 and splitting it in time does not see them. What is seen in a place is a cluster, whose gradient would be zero but for
-noise; the IMU and all other sensors are one more.
+noise; the IMU and all other sensors are one more. Errors of one feature track are correlated as well: its views are
+aligned with the same first one. Groups of whole tracks are clusters, too (Liang and Zeger 1986).
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from icalib.estimation.problem import Problem
 
 IMAGE_CELLS = (4, 3)  # columns, rows
 TARGET_PARTS = 3  # along each side
+TRACK_GROUPS = 24  # their spread knows a variance to 1 / sqrt(12); twice as many, to 1 / sqrt(24) at twice the cost
 
 
 @dataclass(frozen=True)
@@ -35,13 +37,29 @@ class Clusters:
         return 1 + max(int(c.max(initial=-1)) for c in (*self.corners, *self.tracks))
 
 
-def place_covariances(problem: Problem, outcome: Outcome) -> list[np.ndarray]:
-    """(B, B) covariances as the spread over places has them: image cells, parts of the target, corners of tags."""
-    kinds = list(_kinds(problem))
+@dataclass(frozen=True)
+class ClusterCovariances:
+    """(B, B) covariances that allow for correlated errors: of `places`, which are image cells, parts of the target and
+    corners of tags, one each; and of feature `tracks`, None where there are none."""
+
+    places: list[np.ndarray]
+    tracks: np.ndarray | None
+
+
+def cluster_covariances(problem: Problem, outcome: Outcome) -> ClusterCovariances:
+    """Cluster-robust (sandwich) covariances of the calibration parameters."""
+    kinds, tracked = list(_kinds(problem)), problem.features is not None
     if not kinds:
-        return []
+        return ClusterCovariances([], None)
+    if tracked:
+        kinds.append(_track_groups(problem))
     gradients = _cluster_gradients(problem, outcome, kinds)
-    return [spread_covariance(problem, outcome, np.vstack([b, -b.sum(axis=0)])) for b in gradients]
+    places = gradients[:-1] if tracked else gradients
+    places = [spread_covariance(problem, outcome, np.vstack([b, -b.sum(axis=0)])) for b in places]
+    if not tracked:
+        return ClusterCovariances(places, None)
+    b = gradients[-1] - gradients[-1].mean(axis=0)
+    return ClusterCovariances(places, len(b) / (len(b) - 1.0) * spread_covariance(problem, outcome, b))
 
 
 def _kinds(problem: Problem) -> Iterator[Clusters]:
@@ -64,6 +82,13 @@ def _image_cells(problem: Problem) -> Clusters:
         corners.append(cells[: len(camera.stream.uv)])
         tracks.append(cells[len(camera.stream.uv) :])
     return Clusters(corners, tracks if problem.features is not None else [])
+
+
+def _track_groups(problem: Problem) -> Clusters:
+    """Features by number, so that all views of one, by all cameras, are in one group; corners in none of their own."""
+    assert problem.features is not None
+    corners = [np.zeros(len(c.stream.uv), dtype=np.int32) for c in problem.cameras]
+    return Clusters(corners, [(s.feature % TRACK_GROUPS).astype(np.int32) for s in problem.features.streams])
 
 
 def _cells(uv: np.ndarray, index: int) -> np.ndarray:
