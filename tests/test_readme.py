@@ -83,3 +83,8 @@ def test_files_that_are_linked_exist():
     links = re.findall(r"\]\((?!https?:)([^)#]+)[^)]*\)", README)
     assert len(links) > 20
     assert not [link for link in links if not (ROOT / link).exists()]
+
+
+def test_no_page_installs_icalib_from_an_index():
+    pages = {page.name: page.read_text(encoding="utf-8") for page in (ROOT / "docs").glob("*.md")}
+    assert not [name for name, text in pages.items() if re.search(r"pip install [\"']?icalib|`icalib\[", text)]
