@@ -60,10 +60,11 @@ LEVELS = {
     "batch": 1,
     "montecarlo": 9,
     "fleet": 9,
-    "result_commands": 9,
-    "cli": 10,
-    "__main__": 11,
-    "__init__": 11,
+    "check": 9,
+    "result_commands": 10,
+    "cli": 11,
+    "__main__": 12,
+    "__init__": 12,
 }
 EVERYWHERE = {
     "compiled",

@@ -18,7 +18,7 @@ _MOST_IDS = 10_000  # more than any family has
 
 def main(arguments: list[str] | None = None) -> int:
     """Entry point of the `icalib` command. Returns the exit code: 0 good, 1 an error, 2 wrong usage, 130 interrupted;
-    of `compare` 1 where something differs, 2 an error."""
+    of `compare` 1 where something differs, 2 an error; of `check` 1 changed, 2 an error, 3 cannot say."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # names of files may have bytes that no encoding has
             stream.reconfigure(errors="backslashreplace")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from math import inf
 from pathlib import Path
 
@@ -55,20 +55,8 @@ def calibrate(
     keep_apart()
     opened = open_all(recording, start_s, end_s)
     started = time.perf_counter()
-    for one in opened.values():
-        one.use_layouts(rig.poses)
-    seeing = rig.cameras if rig.has_target else ()
-    pictured = any(not r.has_corners(c) for r in opened.values() for c in seeing)
-    pictured = pictured or any(c.tracks_images for c in rig.cameras)
-    share = IMAGES_SHARE if pictured else READING_SHARE
-    measurements = []
-    for k, (name, one) in enumerate(opened.items()):
-
-        def show(stage: str, done: float, k: int = k) -> None:
-            progress(stage, share * (k + done) / len(opened))
-
-        with naming(name if len(opened) > 1 else ""):
-            measurements.append(dataclasses.replace(_measure(rig, one, show), name=name))
+    share = _reading_share(rig, opened)
+    measurements = _measure_all(rig, opened, lambda stage, done: progress(stage, share * done))
     read = time.perf_counter() - started
     with noting(note for m in measurements for note in m.notes):
         result = calibrate_measurements(
@@ -78,6 +66,40 @@ def calibrate(
     inputs = provenance([*([rig.path] if rig.path else []), *files])
     timings = {"reading": read} | result.timings | {"all": time.perf_counter() - started}
     return dataclasses.replace(result, inputs=inputs, timings=timings)
+
+
+def measure(
+    rig: Rig,
+    recording: Source | Sequence[Source],
+    progress: Progress = lambda *_: None,
+    *,
+    start_s: float = 0.0,
+    end_s: float = inf,
+) -> list[Measurements]:
+    """What each recording holds of the sensors of `rig`, for `calibrate_measurements`. Raises as `calibrate` does."""
+    check_complete(rig)
+    return _measure_all(rig, open_all(recording, start_s, end_s), progress)
+
+
+def _reading_share(rig: Rig, opened: Mapping[str, Recording]) -> float:
+    """Of the time of a calibration, what reading takes."""
+    seeing = rig.cameras if rig.has_target else ()
+    pictured = any(not r.has_corners(c) for r in opened.values() for c in seeing)
+    return IMAGES_SHARE if pictured or any(c.tracks_images for c in rig.cameras) else READING_SHARE
+
+
+def _measure_all(rig: Rig, opened: Mapping[str, Recording], progress: Progress) -> list[Measurements]:
+    measurements = []
+    for one in opened.values():
+        one.use_layouts(rig.poses)
+    for k, (name, one) in enumerate(opened.items()):
+
+        def show(stage: str, done: float, k: int = k) -> None:
+            progress(stage, (k + done) / len(opened))
+
+        with naming(name if len(opened) > 1 else ""):
+            measurements.append(dataclasses.replace(_measure(rig, one, show), name=name))
+    return measurements
 
 
 def _measure(rig: Rig, recording: Recording, progress: Progress) -> Measurements:
@@ -131,9 +153,9 @@ def _refuse_short(measured: Measurements) -> None:
     imu = measured.imu
     lasted_s = 0.0 if imu is None else float(imu.stamps_ns[-1] - imu.stamps_ns[0]) * 1e-9
     if imu is not None and lasted_s < SHORTEST_S:
-        raise RecordingError(
-            f"{imu.name}: {len(imu.stamps_ns)} readings in {lasted_s:.2f} s are too short a recording; a calibration "
-            "needs some seconds of motion."
+        raise EstimationError(
+            f"{imu.name}: the recording is too short ({len(imu.stamps_ns)} readings in {lasted_s:.2f} s); record some "
+            "seconds of motion."
         )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from math import inf
 from pathlib import Path
 from typing import get_args
 
@@ -12,6 +13,7 @@ from icalib.rig import AccelUnit, GyroUnit
 def add_result_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Adds the parsers to those of the other commands."""
     _add_allan(commands)
+    _add_check(commands)
     _add_rig(commands)
     _add_export(commands)
     _add_compare(commands)
@@ -89,6 +91,44 @@ def _export(options: argparse.Namespace) -> None:
         for sentence in found.sentences:
             print(f"Note: {sentence}")
         print(f"Wrote {', '.join(str(folder / name) for name in files)}.")
+
+
+def _add_check(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    about = "whether a calibration is still valid on a new recording; exit code 0: valid, 1: changed, 2: an error, 3: "
+    about += "the new recording is too poor to say"
+    c = commands.add_parser("check", help=about, description=about[0].upper() + about[1:] + ".")
+    c.add_argument("result", type=Path, help="folder that a calibration was written to")
+    c.add_argument("recording", type=Path, nargs="+", help="folder of a new recording of the same rig, or bag")
+    part = "use each recording from here on, in seconds from its start; by default all"
+    c.add_argument("--from", type=float, default=0.0, metavar="SECONDS", dest="start_s", help=part)
+    c.add_argument("--to", type=float, default=inf, metavar="SECONDS", dest="end_s", help="and up to here")
+    sigma = "changes that chance makes as rarely as N sigma do not count; by default 3"
+    c.add_argument("--sigma", type=float, default=3.0, metavar="N", help=sigma)
+    c.add_argument("--json", type=Path, metavar="FILE", help="write residuals, drifts and verdict as JSON")
+    c.add_argument("--quiet", "-q", action="store_true", help="print nothing; the exit code says it")
+    c.set_defaults(run=_check, error_code=2)
+
+
+def _check(options: argparse.Namespace) -> int:
+    from icalib.calibration import load_calibration
+    from icalib.check import check_calibration
+    from icalib.check.words import check_json, lines
+    from icalib.console import progress_bar
+    from icalib.own_files import refuse_foreign, sealed_texts
+    from icalib.result_files import set_of
+    from icalib.text_files import write_texts
+
+    if options.json:
+        refuse_foreign([options.json], [*set_of(options.result), *options.recording], "choose another place")
+    calibration = load_calibration(options.result)
+    with progress_bar(options.quiet) as progress:
+        part = {"start_s": options.start_s, "end_s": options.end_s}
+        found = check_calibration(calibration, options.recording, progress, sigma=options.sigma, **part)
+    if options.json:
+        write_texts(options.json.parent, sealed_texts({options.json.name: check_json(found)}))
+    if not options.quiet:
+        print("\n".join(lines(found)))
+    return found.exit_code
 
 
 def _add_rig(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

@@ -1,0 +1,180 @@
+"""A calibration against a new recording.
+
+The new recording is calibrated on its own, from the old values as guesses, which have no weight. Both results have
+covariances, so each block (pose, time offset, lens, ...) is tested by its Mahalanobis distance. The significance is
+that of N sigma for all blocks together (Bonferroni), so that many blocks raise no false alarm. A second solve with the
+old values fixed gives the residuals of the old calibration on the new data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import inf
+from statistics import NormalDist
+from typing import Literal
+
+import numpy as np
+
+from icalib.calibration import Calibration, ParameterGroup, SensorFit, joint_covariance
+from icalib.calibration.verdict import LENS, NUISANCE, lens_verdict
+from icalib.comparison.compare import Comparison, Difference, compare_sides
+from icalib.comparison.results import side_of_result
+from icalib.comparison.significance import sigmas
+from icalib.errors import EstimationError
+from icalib.geometry import so3
+from icalib.measurements import Measurements
+from icalib.pipeline import Progress, calibrate_measurements, measure
+from icalib.recordings.several import Source
+from icalib.result_rig import rig_of_result
+from icalib.rig import Rig
+
+Validity = Literal["valid", "changed", "cannot say"]
+EXIT_CODES: dict[Validity, int] = {"valid": 0, "changed": 1, "cannot say": 3}
+READING_SHARE, SOLVED_SHARE = 0.5, 0.8  # of the time: the end of reading, and of the first solve
+
+
+@dataclass(frozen=True)
+class Drift:
+    """One group that both results estimate, new minus old.
+
+    change (n,): rotations as a rotation vector about the sensor's axes; SI units. std (n,): of both results together.
+    sigmas: the whole group's, from its joint covariance.
+    """
+
+    sensor: str
+    name: str
+    labels: tuple[str, ...]
+    unit: str
+    change: tuple[float, ...]
+    std: tuple[float, ...]
+    sigmas: float | None
+
+
+@dataclass(frozen=True)
+class Check:
+    """Whether a calibration still holds.
+
+    limit: sigma above which one block counts as changed. tested: the blocks that both results estimate; changed: those
+    beyond the limit. unknown: parameters, as "cam0 translation", that the calibration knows and the new recording does
+    not determine. reason: why nothing can be said, else empty. fits: of the calibration's own recording; with its
+    values fixed on the new one; of the new one alone.
+    """
+
+    validity: Validity
+    reason: str
+    limit: float
+    tested: tuple[Difference, ...]
+    changed: tuple[Difference, ...]
+    unknown: tuple[str, ...]
+    comparison: Comparison | None
+    drifts: tuple[Drift, ...]
+    fits: tuple[tuple[SensorFit, ...], tuple[SensorFit, ...], tuple[SensorFit, ...]]
+    new: Calibration | None
+
+    @property
+    def exit_code(self) -> int:
+        return EXIT_CODES[self.validity]
+
+
+def check_calibration(
+    calibration: Calibration,
+    recording: Source | Sequence[Source],
+    progress: Progress = lambda *_: None,
+    *,
+    sigma: float = 3.0,
+    start_s: float = 0.0,
+    end_s: float = inf,
+) -> Check:
+    """Checks `calibration` on `recording`, or on several together. Of each the part from start_s to end_s is used.
+
+    sigma: a change counts where chance makes one as large as rarely as N sigma. Raises CalibrationError, one sentence,
+    where the recording is not of the rig of the calibration.
+    """
+    rig = rig_of_result(calibration, "guess")[0]
+    read = measure(rig, recording, lambda s, done: progress(s, READING_SHARE * done), start_s=start_s, end_s=end_s)
+    return check_measurements(
+        calibration, read, lambda s, done: progress(s, READING_SHARE + (1.0 - READING_SHARE) * done), sigma=sigma
+    )
+
+
+def check_measurements(
+    calibration: Calibration,
+    measurements: Measurements | Sequence[Measurements],
+    progress: Progress = lambda *_: None,
+    *,
+    sigma: float = 3.0,
+) -> Check:
+    """As `check_calibration`, from measurements in memory."""
+    rig = rig_of_result(calibration, "guess")[0]
+    old = calibration.fits
+    try:
+        new = calibrate_measurements(rig, measurements, lambda s, done: progress(s, SOLVED_SHARE * done))
+    except EstimationError as error:
+        return Check("cannot say", str(error), sigma, (), (), (), None, (), (old, (), ()), None)
+    fixed = _fits_of_fixed(rig_of_result(calibration, "fixed")[0], measurements, progress)
+    comparison = compare_sides(
+        side_of_result(calibration, "the calibration"), side_of_result(new, "the new recording"), limit=sigma
+    )
+    tested = [(d, d.sigmas) for d in comparison.differences if d.sigmas is not None]  # else fixed on both sides
+    limit = joint_limit(sigma, len(tested))
+    changed = tuple(d for d, count in tested if count > limit)
+    unknown = tuple(name for name in _undetermined(new) if name not in _undetermined(calibration))
+    reason = new.reasons[0] if new.verdict == "not usable" else ""
+    validity: Validity = "cannot say" if reason else "changed" if changed else "cannot say" if unknown else "valid"
+    drifts = tuple(_drifts(calibration, new))
+    blocks = tuple(d for d, _ in tested)
+    return Check(validity, reason, limit, blocks, changed, unknown, comparison, drifts, (old, fixed, new.fits), new)
+
+
+def joint_limit(sigma: float, tests: int) -> float:
+    """Sigma of each of `tests` tests, so that all together are as rarely wrong as one at `sigma` (Bonferroni)."""
+    normal = NormalDist()
+    tail = (1.0 - normal.cdf(sigma)) / max(tests, 1)
+    return max(sigma, -normal.inv_cdf(tail)) if tail > 0.0 else sigma
+
+
+def _fits_of_fixed(
+    rig: Rig, measurements: Measurements | Sequence[Measurements], progress: Progress
+) -> tuple[SensorFit, ...]:
+    """Residuals of the old calibration; none where the data contradict it so far that there is no solution."""
+    rest = 1.0 - SOLVED_SHARE
+    try:
+        return calibrate_measurements(rig, measurements, lambda s, done: progress(s, SOLVED_SHARE + rest * done)).fits
+    except EstimationError:
+        return ()
+
+
+def _undetermined(c: Calibration) -> list[str]:
+    """Names of groups that the data do not determine; a lens is judged by its projection, as the verdict does."""
+    found = []
+    for g in c.groups:
+        if g.columns is None or g.name in NUISANCE or g.sensor not in c.rig["sensors"] or g.mode == "prior":
+            continue
+        lens = g.name in LENS and g.sensor in c.cameras
+        if (lens_verdict(c, g.sensor) == "undetermined") if lens else ("undetermined" in g.verdict):
+            found.append(f"{g.sensor} {'lens' if lens else g.name.replace('_', ' ')}")
+    return list(dict.fromkeys(found))
+
+
+def _drifts(old: Calibration, new: Calibration) -> list[Drift]:
+    found = []
+    before = {(g.sensor, g.name): g for g in old.groups if g.columns is not None}
+    for g in new.groups:
+        o = before.get((g.sensor, g.name))
+        if o is None or g.columns is None or o.value.shape != g.value.shape or g.sensor not in new.rig["sensors"]:
+            continue
+        change, total = _change(o, g), joint_covariance(old, [o]) + joint_covariance(new, [g])
+        std = np.sqrt(np.diag(total))
+        found.append(
+            Drift(
+                g.sensor, g.name, g.labels, g.unit, tuple(change.tolist()), tuple(std.tolist()), sigmas(change, total)
+            )
+        )
+    return found
+
+
+def _change(old: ParameterGroup, new: ParameterGroup) -> np.ndarray:
+    if old.value.ndim == 2:
+        return so3.log(np.ascontiguousarray(old.value.T @ new.value))
+    return new.value - old.value

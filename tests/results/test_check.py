@@ -1,0 +1,172 @@
+"""Whether a calibration still holds: on simulated recordings of the same rig, of a changed one, and of poor motion."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+from scipy.stats import norm
+
+from icalib.calibration import Calibration
+from icalib.check import Check, check_measurements
+from icalib.check.check import joint_limit
+from icalib.check.words import lines, verdict
+from icalib.cli import main
+from icalib.errors import RecordingError
+from icalib.measurements import Measurements
+from icalib.pipeline import calibrate_measurements
+from icalib.rig_file import rig_to_dict
+from icalib.simulation import Scenario, handheld, rig_for, simulate, write_tables
+
+pytestmark = pytest.mark.slow
+SECONDS = 8.0
+TURN_DEG = 0.3  # ten and more sigma of such a recording
+
+
+@pytest.fixture(scope="module")
+def scenario() -> Scenario:
+    return handheld(SECONDS)
+
+
+@pytest.fixture(scope="module")
+def known(scenario: Scenario) -> Calibration:
+    rig = rig_for(scenario, intrinsics="start", distortion="start")
+    return calibrate_measurements(rig, simulate(scenario, 1).measurements)
+
+
+def turned(scenario: Scenario, names: tuple[str, ...], from_left: bool = False) -> Scenario:
+    """The scenario with cameras turned about their own x axes, or with the IMU's frame turned below them."""
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("x", TURN_DEG, degrees=True).as_matrix()
+    cameras = tuple(
+        replace(c, T_imu_cam=turn @ c.T_imu_cam if from_left else c.T_imu_cam @ turn) if c.name in names else c
+        for c in scenario.cameras
+    )
+    return replace(scenario, cameras=cameras)
+
+
+@pytest.mark.parametrize("seed", [2, 3, 4, 5])
+def test_the_same_rig_is_valid(known: Calibration, scenario: Scenario, seed: int):
+    found = check_measurements(known, simulate(scenario, seed).measurements)
+    assert (found.validity, found.exit_code, found.unknown) == ("valid", 0, ())
+    assert verdict(found) == f"Valid: no parameter changed by more than {found.limit:.1f} sigma."
+    assert found.fits[1] and all(f.chi2_per_dof is None or f.chi2_per_dof < 1.5 for f in found.fits[1])
+
+
+def moved_camera(scenario: Scenario) -> Scenario:
+    return turned(scenario, ("cam1",))
+
+
+def moved_imu(scenario: Scenario) -> Scenario:
+    return turned(scenario, ("cam0", "cam1"), from_left=True)
+
+
+@pytest.mark.parametrize(("change", "name"), [(moved_camera, "cam1"), (moved_imu, "imu0")])
+def test_a_sensor_that_moved_is_named(
+    known: Calibration, scenario: Scenario, change: Callable[[Scenario], Scenario], name: str
+):
+    found = check_measurements(known, simulate(change(scenario), 6).measurements)
+    assert (found.validity, found.exit_code) == ("changed", 1)
+    words = lines(found)
+    assert words[-1].startswith(f"Changed: the pose of {name} (") and words[-1].endswith(" sigma). Calibrate again.")
+    assert any(re.match(r"  CHANGED  cam1 turned by -?0\.(29|30|31) deg about", line) for line in words)
+    (drift,) = (d for d in found.drifts if (d.sensor, d.name) == ("cam1", "rotation"))
+    true = np.array([np.deg2rad(TURN_DEG), 0.0, 0.0])
+    if name == "imu0":  # about the x axis of the IMU
+        true = scenario.cameras[1].T_imu_cam[:3, :3].T @ true
+    assert (np.abs(np.array(drift.change) - true) < 4.0 * np.array(drift.std)).all()
+    assert drift.sigmas is not None and drift.sigmas > found.limit
+    # The old values do not fit the new data, which the new ones do.
+    worst = [max(f.chi2_per_dof or 0.0 for f in fits if f.kind == "corners") for fits in found.fits]
+    assert worst[1] > 2.0 > worst[2] and worst[0] < 2.0
+
+
+def test_motion_that_does_not_determine_everything(known: Calibration, scenario: Scenario):
+    planar = replace(scenario, motion=replace(scenario.motion, kind="planar"))
+    found = check_measurements(known, simulate(planar, 4).measurements)
+    assert (found.validity, found.exit_code) == ("cannot say", 3)
+    assert found.unknown == ("cam0 translation", "cam1 translation") and not found.changed
+    assert "does not determine cam0 translation, cam1 translation; all else is unchanged" in verdict(found)
+
+
+def first(measurements: Measurements, seconds: float) -> Measurements:
+    assert measurements.imu is not None
+    imu = measurements.imu
+    n = int(np.searchsorted(imu.seconds, seconds))
+    return replace(measurements, imu=replace(imu, stamps_ns=imu.stamps_ns[:n], gyro=imu.gyro[:n], accel=imu.accel[:n]))
+
+
+def test_a_recording_that_is_too_short_and_one_of_another_rig(known: Calibration, scenario: Scenario):
+    measured = simulate(scenario, 7).measurements
+    found = check_measurements(known, first(measured, 0.5))
+    assert (found.validity, found.exit_code, found.new) == ("cannot say", 3, None)
+    assert lines(found) == [f"Cannot say: {found.reason}"] and "the recording is too short" in found.reason
+    with pytest.raises(RecordingError, match="cam1"):
+        check_measurements(known, replace(measured, cameras=measured.cameras[:1]))
+
+
+def test_the_limit_of_many_tests_is_that_of_one():
+    for sigma in (2.0, 3.0, 5.0):
+        for tests in (1, 7, 40):
+            joint = tests * 2.0 * norm.sf(joint_limit(sigma, tests))
+            assert joint == pytest.approx(2.0 * norm.sf(sigma), rel=1e-6)
+    assert joint_limit(3.0, 0) == pytest.approx(3.0)
+    assert joint_limit(40.0, 5) == 40.0  # beyond what doubles can tell
+
+
+@pytest.fixture(scope="module")
+def folders(known: Calibration, scenario: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A result, a recording of the same rig, and one without its second camera."""
+    folder = tmp_path_factory.mktemp("check")
+    known.save(folder / "out")
+    simulation = simulate(scenario, 8)
+    write_tables(simulation, 8, folder / "same")
+    write_tables(simulation, 8, folder / "other")
+    for file in sorted((folder / "other").rglob("*")):
+        if "cam1" in str(file.relative_to(folder)) and file.is_file():
+            file.unlink()
+    (folder / "rig.yaml").write_text(yaml.safe_dump(rig_to_dict(rig_for(scenario))))
+    return folder
+
+
+def test_the_command(folders: Path, capsys: pytest.CaptureFixture[str]):
+    file = folders / "check.json"
+    arguments = ["check", str(folders / "out"), str(folders / "same"), "--json", str(file)]
+    assert main(arguments) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[0].startswith("Residuals on the new recording") and printed[-1].startswith("Valid: ")
+    plain = json.loads(file.read_text())
+    assert (plain["validity"], plain["sentence"], plain["changed"]) == ("valid", printed[-1], [])
+    names = {(d["sensor"], d["name"]) for d in plain["drifts"]}
+    assert {("cam0", "rotation"), ("cam1", "time_offset"), ("cam1", "distortion")} <= names
+    assert {f["kind"] for f in plain["residuals"]["fixed"]} >= {"corners", "gyroscope"}
+    assert main([*arguments, "--quiet", "--from", "1", "--to", "6"]) == 0 and capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize(
+    ("result", "recording", "words"),
+    [("out", "other", "cam1"), ("out", "nowhere", "nowhere"), ("same", "same", "result.json")],
+)
+def test_errors_are_one_sentence(
+    folders: Path, capsys: pytest.CaptureFixture[str], result: str, recording: str, words: str
+):
+    assert main(["check", str(folders / result), str(folders / recording)]) == 2
+    error = capsys.readouterr().err
+    assert words in error and error.count("\n") == 1 and "Traceback" not in error
+
+
+def test_what_changed_is_named_in_a_few_words(known: Calibration, scenario: Scenario):
+    """Several sensors at once, and a clock: `named` lists pairs."""
+    both = turned(turned(scenario, ("cam1",)), ("cam0",), from_left=True)
+    cameras = tuple(replace(c, time_offset_s=c.time_offset_s + 5e-3 * (c.name == "cam0")) for c in both.cameras)
+    found: Check = check_measurements(known, simulate(replace(both, cameras=cameras), 9).measurements)
+    assert found.validity == "changed"
+    for words in ("the pose of cam0 relative to imu0 (", "cam1 relative to cam0 (", "the time offset of cam0 ("):
+        assert words in verdict(found), verdict(found)
