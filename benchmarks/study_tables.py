@@ -16,10 +16,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from icalib.calibration.quantities import SHOWN_UNITS, shown
 from icalib.montecarlo.record import from_json
 from icalib.montecarlo.statistics import Nees
 from icalib.montecarlo.summary import consistency_json, summarise
-from icalib.report.quantities import SHOWN_UNITS, shown
 from icalib.text_files import write_texts
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"

@@ -11,10 +11,10 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.text import Text
 
 from icalib.calibration import Calibration
+from icalib.calibration.quantities import chi2_words, dof_words, rms_words
 from icalib.calibration.verdict import NEXT, Usability
 from icalib.export.kalibr import camchain_name
 from icalib.report.console import bodies_words, relative_words, table
-from icalib.report.quantities import chi2_words, dof_words, rms_words
 
 VERDICT_STYLES: dict[Usability, str] = {
     "usable": "bold green",

@@ -17,11 +17,11 @@ from scipy.spatial.transform import Rotation
 
 from icalib.assessment.robot import robot_warnings
 from icalib.calibration import Calibration, RecordingSpan, SensorFit, load_calibration, relative_pose, relative_poses
+from icalib.calibration.quantities import rows
 from icalib.console import print_result
 from icalib.errors import CalibrationError
 from icalib.outputs import write_outputs
 from icalib.report import report_html, robot_figures
-from icalib.report.quantities import rows
 from icalib.rig import ImuNoise, ImuSensor, Lidar, Rig, Wheels
 
 ROBOT_FIGURES = {"points-0", "distance-0", "wheels-0", "map-before", "map-after"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,12 +16,15 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class RelativePose:
     """T_frame_sensor (4, 4): p_frame = T p_sensor. covariance (6, 6): rotation [rad] about the sensor's axes (right
-    perturbation), translation [m] along the frame's, empirical factors included."""
+    perturbation), translation [m] along the frame's, empirical factors included. As an array it is T."""
 
     frame: str
     sensor: str
     T: np.ndarray
     covariance: np.ndarray
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.array(self.T, dtype=dtype)
 
     @property
     def name(self) -> str:
@@ -58,13 +61,13 @@ def relative_poses(c: Calibration) -> tuple[RelativePose, ...]:
 
 
 def relative_pose(c: Calibration, frame: str, sensor: str) -> RelativePose:
-    """Pose of `sensor` in the frame of another sensor, or of the IMU. Raises KeyError where one was not calibrated.
+    """Pose of `sensor` in the frame of another sensor; either may be the IMU. Raises KeyError naming what there is.
 
     With T_imu_frame = (R, p), T_imu_sensor = (Q, q) and the relative pose (S, s) = (R^T Q, R^T (q - p)), perturbations
     dR, dQ on the right, dp and dq give dS = dQ - S^T dR on the right and ds = R^T (dq - dp) + s x dR.
     """
-    T_imu_frame = np.eye(4) if frame == c.imu else c.T_imu_sensor(frame)
-    T = np.linalg.inv(T_imu_frame) @ c.T_imu_sensor(sensor)
+    T_imu_frame, T_imu_sensor = (np.eye(4) if name == c.imu else c.T_imu_sensor(name) for name in (frame, sensor))
+    T = np.linalg.inv(T_imu_frame) @ T_imu_sensor
     R, S, s = T_imu_frame[:3, :3], T[:3, :3], T[:3, 3]
     J = np.zeros((6, 12))
     J[:3, :3], J[:3, 6:9] = -S.T, np.eye(3)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from icalib.calibration.cross_validation import CrossValidation
 from icalib.calibration.images import CornerResiduals, ImageResiduals, TrackResiduals
 from icalib.calibration.robot import LidarResiduals, Plane, PoseResiduals, WheelResiduals
 from icalib.calibration.verdict import Usability, reasons, usability
+
+if TYPE_CHECKING:
+    from icalib.calibration.relative import RelativePose
 
 Verdict = Literal["determined", "weak", "undetermined", "fixed"]
 
@@ -235,6 +238,43 @@ class Calibration:
     def mounted(self) -> tuple[str, ...]:
         """Names of all that have a pose on the body: cameras, LiDARs, wheels, pose sensors."""
         return (*self.cameras, *self.lidars, *self.wheels, *self.pose_sensors)
+
+    def value(self, sensor: str, name: str) -> np.ndarray:
+        """Value of the group `name` of `sensor`, SI: (3, 3) of a rotation R_imu_sensor, else (n,)."""
+        return self.group(sensor, name).value
+
+    def std(self, sensor: str, name: str) -> np.ndarray:
+        """(n,) standard deviations of it, SI, empirical factors included; rotations about the sensor's axes [rad]."""
+        return self.group(sensor, name).std
+
+    def T(self, frame: str, sensor: str) -> RelativePose:
+        """T_frame_sensor, which takes coordinates of `sensor` to `frame`, with its (6, 6) covariance.
+
+        Either may be the IMU. As an array it is the 4x4 matrix. Raises KeyError naming the sensors there are.
+        """
+        from icalib.calibration.relative import relative_pose
+
+        known = list(dict.fromkeys([self.body, *self.mounted]))
+        for name in (frame, sensor):
+            if name not in known:
+                raise KeyError(f"no sensor {name}; there are {', '.join(known)}")
+        return relative_pose(self, frame, sensor)
+
+    def summary(self) -> str:
+        """Verdict, reasons, and a table of all parameters with standard deviations and verdicts, as text."""
+        from icalib.calibration.text import summary_text
+
+        return summary_text(self)
+
+    def __repr__(self) -> str:
+        from icalib.calibration.text import one_line
+
+        return one_line(self)
+
+    def _repr_html_(self) -> str:
+        from icalib.calibration.text import summary_html
+
+        return summary_html(self)
 
     def save(self, folder: str | Path) -> None:
         """Writes calibration.yaml, result.json and result.npz (docs/files.md) into `folder`, as one set.

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from typing import Any
 
 from icalib.calibration import SensorFit
+from icalib.calibration.quantities import chi2_words, rms_words
 from icalib.check.check import Check
 from icalib.comparison.compare import Difference
 from icalib.comparison.words import sentence
-from icalib.report.quantities import chi2_words, rms_words
 from icalib.text_files import json_text, printable
 
 _EXTRINSICS = ("rotation", "translation")

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from icalib.batch import replacing
+from icalib.calibration.quantities import rpy_deg
 from icalib.errors import CalibrationError
 from icalib.fleet.record import Block
 from icalib.fleet.result import JobResult
 from icalib.own_files import DATABASE_ID
-from icalib.report.quantities import rpy_deg
 from icalib.text_files import printable
 
 _COLUMNS = (

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from icalib.calibration import Calibration, SensorFit, Verdict
 from icalib.calibration.excess import excess, times
+from icalib.calibration.quantities import Row, chi2_words, rms_words, rows, shown, shown_groups
 from icalib.calibration.verdict import LENS, lens_projection_px, lens_verdict, worst
-from icalib.report.quantities import Row, chi2_words, rms_words, rows, shown, shown_groups
 from icalib.report.tables import Html, badge, element, html, table
 
 FAR_BEYOND = 4.0  # times the stated noise: then standard deviations mean nothing

@@ -7,7 +7,7 @@ from rich.table import Table
 from rich.text import Text
 
 from icalib.calibration import Calibration, relative_poses
-from icalib.report.quantities import rows, rpy_deg, shown
+from icalib.calibration.quantities import rows, rpy_deg, shown
 
 STYLES = {"determined": "green", "weak": "yellow", "undetermined": "bold red", "fixed": "dim"}
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from icalib.calibration import Calibration, CrossValidation, ParameterGroup, PredictedFit
+from icalib.calibration.quantities import shown, shown_groups
 from icalib.report.plot import Figure, axis, dots, figure, line
-from icalib.report.quantities import shown, shown_groups
 from icalib.report.tables import Html, table
 
 ROW_PX = 17

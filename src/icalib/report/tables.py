@@ -8,8 +8,7 @@ from html import escape
 import numpy as np
 
 from icalib.calibration import Calibration, relative_poses
-from icalib.calibration.verdict import Usability, worst
-from icalib.report.quantities import (
+from icalib.calibration.quantities import (
     chi2_words,
     dof_words,
     rms_words,
@@ -17,6 +16,7 @@ from icalib.report.quantities import (
     rpy_deg,
     shown,
 )
+from icalib.calibration.verdict import Usability, worst
 
 TRUST: dict[Usability, str] = {
     "usable": "good",

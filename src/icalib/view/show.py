@@ -6,10 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from icalib.calibration import Calibration, load_calibration
+from icalib.calibration.quantities import rows
 from icalib.extras import load_rerun
 from icalib.recordings import open_recording
 from icalib.report.ellipsoids import SIGMAS, magnification
-from icalib.report.quantities import rows
 from icalib.rig_file import rig_from_dict
 from icalib.view.layout import blueprint
 from icalib.view.recorded import Recorded, span_of

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import asin, atan2, floor, isfinite, log10
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from icalib.calibration import Calibration, ParameterGroup, SensorFit, Verdict
 from icalib.calibration.units import SHOWN_UNITS
+
+if TYPE_CHECKING:
+    from icalib.calibration.result import Calibration, ParameterGroup, SensorFit, Verdict
 
 TURNS = ("roll", "pitch", "yaw")
 

@@ -1,0 +1,104 @@
+"""A calibration at Python's prompt: short repr, summary, HTML, values, and poses between any two sensors."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import icalib
+from icalib.calibration import Calibration, relative_pose
+from icalib.geometry import so3
+
+
+def test_the_repr_is_one_short_line(robot: Calibration):
+    assert (
+        repr(robot) == f"<Calibration of imu0, cam0, cam1, lidar0, wheel0: {robot.verdict}, 3 reasons; see .summary()>"
+    )
+    good = dataclasses.replace(robot, warnings=(), undetermined=(), groups=robot.groups[:1])
+    assert repr(good) == "<Calibration of imu0, cam0, cam1, lidar0, wheel0: usable; see .summary()>"
+
+
+def test_the_summary_has_verdict_reasons_and_every_parameter(robot: Calibration):
+    lines = robot.summary().splitlines()
+    assert lines[0] == f"Verdict: {robot.verdict}"
+    assert lines[1 : 1 + len(robot.reasons)] == [f"Reason {k}: {r}" for k, r in enumerate(robot.reasons, 1)]
+    table = lines[2 + len(robot.reasons) :]
+    assert table[0].split() == ["sensor", "parameter", "value", "std", "unit", "verdict"]
+    group = robot.group("cam1", "translation")
+    (row,) = (line.split() for line in table if re.match(r"cam1 +translation y ", line))
+    assert row[-1] == "undetermined" and row[-2] == "mm"
+    assert float(row[-4]) == pytest.approx(1e3 * group.value[1], abs=0.05)
+    assert float(row[-3]) == pytest.approx(1e3 * group.std[1], rel=0.05)
+    assert max(map(len, table)) < 100
+
+
+class Cells(HTMLParser):
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.texts: list[str] = []
+        self.open: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: object) -> None:
+        self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.texts.append(data)
+
+
+def test_notebooks_show_the_same_as_html(robot: Calibration):
+    sharp = dataclasses.replace(robot, warnings=("cam0 < cam1 & more.",))
+    found = Cells(sharp._repr_html_())
+    assert found.open == [] and found.texts[0] == f"Verdict: {sharp.verdict}"
+    assert "cam0 < cam1 & more." in found.texts and "undetermined" in found.texts
+    words = " ".join(sharp.summary().split("\n\n")[1].split())
+    assert " ".join(" ".join(t.split()) for t in found.texts[1 + len(sharp.reasons) :] if t) == words
+
+
+def test_values_and_standard_deviations(robot: Calibration):
+    assert robot.value("wheel0", "radii").tolist() == [0.1, 0.102]
+    np.testing.assert_array_equal(robot.std("cam0", "rotation"), robot.group("cam0", "rotation").std)
+    with pytest.raises(KeyError, match="no radius of wheel0; there are .*wheel0.radii"):
+        robot.std("wheel0", "radius")
+
+
+def test_the_pose_of_any_sensor_in_any_other(robot: Calibration):
+    T = robot.T("cam0", "lidar0")
+    np.testing.assert_array_equal(np.asarray(T), T.T)
+    np.testing.assert_allclose(np.asarray(robot.T("lidar0", "cam0")) @ T, np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(robot.T("imu0", "cam1"), robot.T_imu_sensor("cam1"), atol=1e-15)
+    np.testing.assert_allclose(robot.T("cam1", "imu0"), np.linalg.inv(robot.T_imu_sensor("cam1")), atol=1e-12)
+    np.testing.assert_allclose(robot.T("cam0", "cam0").covariance, np.zeros((6, 6)), atol=1e-16)
+    assert robot.T("cam0", "lidar0").std.tolist() == relative_pose(robot, "cam0", "lidar0").std.tolist()
+    with pytest.raises(KeyError, match="no sensor lidar1; there are imu0, cam0, cam1, lidar0, wheel0"):
+        robot.T("cam0", "lidar1")
+
+
+def test_the_covariance_of_the_imu_in_a_camera(robot: Calibration):
+    """By draws of the camera's pose: T_cam_imu is the inverse of T_imu_cam."""
+    rng, R, p = np.random.default_rng(1), robot.value("cam1", "rotation"), robot.value("cam1", "translation")
+    columns = [k for name in ("rotation", "translation") for k in robot.group("cam1", name).columns or ()]
+    factor = np.concatenate([robot.group("cam1", name).factor for name in ("rotation", "translation")])  # type: ignore[arg-type]
+    covariance = robot.covariance[np.ix_(columns, columns)] * np.outer(factor, factor)
+    draws = rng.multivariate_normal(np.zeros(6), covariance, 20_000)
+    found = robot.T("cam1", "imu0")
+    off = np.empty((len(draws), 6))
+    turned = R @ Rotation.from_rotvec(draws[:, :3]).as_matrix()
+    for k, (Q, q) in enumerate(zip(turned, p + draws[:, 3:], strict=True)):
+        off[k, :3] = so3.log(np.ascontiguousarray(found.T[:3, :3].T @ Q.T))
+        off[k, 3:] = -Q.T @ q - found.T[:3, 3]
+    np.testing.assert_allclose(np.cov(off.T), found.covariance, atol=0.03 * found.covariance.diagonal().max())
+    np.testing.assert_allclose(off.std(axis=0), found.std, rtol=0.03)
+
+
+def test_load_calibration_is_at_hand(robot: Calibration, tmp_path):
+    robot.save(tmp_path)
+    assert repr(icalib.load_calibration(tmp_path)) == repr(robot)
