@@ -13,7 +13,7 @@ from icalib.estimation import solver
 from icalib.estimation.arrowhead import solve
 from icalib.estimation.assembly import given_priors
 from icalib.estimation.estimate import Estimate, Judged, estimate
-from icalib.estimation.guess_priors import guess_priors
+from icalib.estimation.guess_priors import guess_priors, guess_sigma
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.solver import _Descent
 from icalib.estimation.state import State
@@ -48,6 +48,24 @@ def test_they_are_as_wide_as_a_guess_is_off_and_never_beside_a_given_one(begun):
     for key, prior in found.items():
         residual, _ = prior.residual(state)
         np.testing.assert_allclose(residual, 0.0, atol=1e-12, err_msg=str(key))
+
+
+def test_the_focal_length_of_a_sphere_model_is_as_uncertain_as_its_xi():
+    """Of omni-radtan fx / (1 + xi) is the scale in the image's centre: with it known, fx follows xi."""
+    scenario = handheld(4.0)
+    lens = {
+        "model": "omni-radtan",
+        "intrinsics": (450.0, 451.0, 325.0, 238.0),
+        "distortion": (1.0, -0.1, 0.02, 0.0, 0.0),
+    }
+    scenario = replace(scenario, cameras=(replace(scenario.cameras[0], **lens),))
+    rig = rig_for(scenario, intrinsics="free", distortion="free")
+    inputs, state, _ = start(rig, [simulate(scenario, 0).measurements])
+    fx, xi = state.values["cam0", "intrinsics"][0], state.values["cam0", "distortion"][0]
+    sigma = guess_sigma(inputs, state)[inputs.layout.columns("cam0", "intrinsics", "distortion")]
+    expected = np.hypot(GUESS_SIGMA["intrinsics"], fx / (1.0 + xi) * GUESS_SIGMA["distortion"])
+    np.testing.assert_allclose(sigma[:2], expected, rtol=1e-3)
+    np.testing.assert_allclose(sigma[2:4], GUESS_SIGMA["intrinsics"])
 
 
 def information_of(found: Estimate) -> np.ndarray:

@@ -35,7 +35,7 @@ def given(monkeypatch):
     priors: list = []
     sigma = np.concatenate([SIGMA[b.name] for b in layout.free])
     monkeypatch.setattr(guess_worth, "given_priors", lambda _: priors)
-    monkeypatch.setattr(guess_worth, "guess_sigma", lambda _: sigma.copy())
+    monkeypatch.setattr(guess_worth, "guess_sigma", lambda *_: sigma.copy())
     monkeypatch.setattr(guess_worth, "minimise", lambda problem, state, tolerance, room: SimpleNamespace(state=state))
     inputs = SimpleNamespace(is_sensor=lambda name: name in "ab", layout=layout)
     outcome = SimpleNamespace(problem=problem, state=state, room=None)

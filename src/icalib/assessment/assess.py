@@ -27,6 +27,7 @@ from icalib.assessment.robot import (
 )
 from icalib.assessment.size import felt_size, is_certain, size_words
 from icalib.assessment.stated import stated_warnings
+from icalib.assessment.twin_lenses import twin_lens_notes
 from icalib.assessment.upwards import upwards_warnings
 from icalib.calibration import (
     Calibration,
@@ -110,6 +111,7 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
         warnings=(*stated.wrong, *(w for w in warnings if w not in stated.wrong)),
         notes=(
             *notes(inputs, found, timeline),
+            *twin_lens_notes(inputs, found, judged),
             *guess_notes(inputs, groups),
             *stated.size_notes,
             *few_parts_notes(inputs, parts),

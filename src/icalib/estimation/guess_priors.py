@@ -10,16 +10,24 @@ from icalib.estimation.inputs import Inputs
 from icalib.estimation.prior_factor import Prior
 from icalib.estimation.state import State
 from icalib.estimation.tolerances import FROM_NOTHING_M, GUESS_SIGMA, OTHER_SIGMA, distortion_scales
+from icalib.geometry.cameras import camera_model
+from icalib.rig import Camera
+
+RATIO_STEP = 1e-4  # of a coefficient, for a difference quotient
 
 
-def guess_sigma(inputs: Inputs) -> np.ndarray:
-    """(B,) standard deviations of the guess: given ones, or what one without is worth."""
+def guess_sigma(inputs: Inputs, state: State) -> np.ndarray:
+    """(B,) standard deviations of the guess: given ones, or the default ones. `state` has the lenses."""
     sigma, sensors = np.zeros(inputs.layout.size), {s.name: s for s in inputs.sensors}
     for b in inputs.layout.free:
         sigma[b.columns] = OTHER_SIGMA if b.size == N_INTRINSICS else GUESS_SIGMA[b.name]
         if b.name == "translation" and b.sensor in sensors and sensors[b.sensor].translation.value is None:
             sigma[b.columns] = FROM_NOTHING_M
     sigma *= distortion_scales(inputs.rig, inputs.layout)
+    for camera in inputs.rig.cameras:
+        columns = inputs.layout.columns(camera.name, "intrinsics", "distortion")
+        if (columns >= 0).all():
+            sigma[columns[:2]] = np.hypot(sigma[columns[:2]], _focal_sigma(camera, state, sigma[columns[4:]]))
     for prior in given_priors(inputs):
         sigma[prior.block.columns] = prior.sigma
     return sigma
@@ -28,6 +36,19 @@ def guess_sigma(inputs: Inputs) -> np.ndarray:
 def guess_priors(inputs: Inputs, guess: State, times: float = 1.0) -> tuple[Prior, ...]:
     """Priors about `guess` on everything of the sensors that the rig file gives none for, this many `times` as wide as
     a guess is off."""
-    sigma, given = times * guess_sigma(inputs), {p.block.key for p in given_priors(inputs)}
+    sigma, given = times * guess_sigma(inputs, guess), {p.block.key for p in given_priors(inputs)}
     own = (b for b in inputs.layout.free if inputs.is_sensor(b.sensor) and b.key not in given)
     return tuple(Prior(b, guess.values[b.key], sigma[b.columns]) for b in own)
+
+
+def _focal_sigma(camera: Camera, state: State, sigma: np.ndarray) -> float:
+    """px: how far fx may be off because the coefficients, of standard deviations `sigma`, are.
+
+    A guess knows the scale in the image's centre. In some models it depends on a coefficient, too: it is fx / (1 + xi)
+    where a sphere is seen from xi behind its centre. fx then follows the error of xi.
+    """
+    model, fx = camera_model(camera.model), state.values[camera.name, "intrinsics"][0]
+    lens = np.concatenate([state.values[camera.name, name] for name in ("intrinsics", "distortion")])
+    steps = lens + RATIO_STEP * np.eye(len(lens))[4:]
+    slope = (np.array([model.central_scale(p) for p in steps]) / model.central_scale(lens) - 1.0) / RATIO_STEP
+    return float(fx * np.sqrt(((slope * sigma) ** 2).sum()))

@@ -46,7 +46,7 @@ def astray(
     values, turn = np.linalg.eigh(open_.T @ asked @ open_)
     axes = open_ @ turn
     way = axes.T @ (border_difference(problem, guess, state) / problem.tolerance)
-    worth = np.sqrt(np.diag(_guess_covariance(inputs, problem, axes)))
+    worth = np.sqrt(np.diag(_guess_covariance(inputs, problem, state, axes)))
     return axes[:, (values < PULLED) | (np.abs(way) > FARTHEST * worth)]
 
 
@@ -64,7 +64,7 @@ def moved_to_worth(inputs: Inputs, problem: Problem, state: State, guess: State,
     """
     if not _is_weighed(inputs, held):
         return None
-    sigma, way = _weights(inputs, problem), border_difference(problem, guess, state)
+    sigma, way = _weights(inputs, state), border_difference(problem, guess, state)
     # What nobody guessed moves along, but nothing turns: what little a turn moves would be paid for with all of it.
     for block in _unguessed(inputs):
         way[block.columns] = 0.0
@@ -82,7 +82,7 @@ def owed_to_guess(inputs: Inputs, outcome: Outcome, data: np.ndarray) -> np.ndar
     data (B, B): information of the data alone, in tolerance units. The room of `outcome` is used.
     """
     problem = outcome.problem
-    ways = _ways(inputs, problem, data)
+    ways = _ways(inputs, outcome, data)
     if _leave_nothing(inputs, problem, ways):
         return in_proportion(inputs, outcome, data)
     alone = np.array([_answer(outcome, way) for way in ways.T])
@@ -95,18 +95,19 @@ def owed_to_guess(inputs: Inputs, outcome: Outcome, data: np.ndarray) -> np.ndar
 
 def in_proportion(inputs: Inputs, outcome: Outcome, data: np.ndarray) -> np.ndarray:
     """(m, B) as `owed_to_guess`, where nothing but what is held moves."""
-    return outcome.problem.tolerance * _ways(inputs, outcome.problem, data).T
+    return outcome.problem.tolerance * _ways(inputs, outcome, data).T
 
 
-def _ways(inputs: Inputs, problem: Problem, data: np.ndarray) -> np.ndarray:
+def _ways(inputs: Inputs, outcome: Outcome, data: np.ndarray) -> np.ndarray:
     """(B, m) in tolerance units: errors of the guess along held directions, independent, one standard deviation each.
 
     One that is mostly of what nobody guessed is no larger than `data` (B, B) leave open: a board turned against
     gravity by as much as it likes would be turned round and round, with a bias of the accelerometer that nobody
     believes.
     """
+    problem = outcome.problem
     # Of so many like variances divide and conquer, NumPy's way, has failed to find the eigenvectors.
-    values, turn = eigh(_guess_covariance(inputs, problem, problem.held), driver="evr")
+    values, turn = eigh(_guess_covariance(inputs, problem, outcome.state, problem.held), driver="evr")
     ways = problem.held @ turn
     width = np.sqrt(np.clip(values, 0.0, None))
     own = np.concatenate([np.arange(0), *(b.columns for b in problem.layout.free if inputs.is_sensor(b.sensor))])
@@ -117,13 +118,13 @@ def _ways(inputs: Inputs, problem: Problem, data: np.ndarray) -> np.ndarray:
     return ways * width
 
 
-def _guess_covariance(inputs: Inputs, problem: Problem, held: np.ndarray) -> np.ndarray:
+def _guess_covariance(inputs: Inputs, problem: Problem, state: State, held: np.ndarray) -> np.ndarray:
     """(m, m) of the guess along directions `held` (B, m), in tolerance units: of an orthogonal projection, as
     `moved_to_guess` makes it, or of a weighted one, as `moved_to_worth` does."""
     if _is_weighed(inputs, held):
-        scaled = held * (problem.tolerance / _weights(inputs, problem))[:, None]
+        scaled = held * (problem.tolerance / _weights(inputs, state))[:, None]
         return np.linalg.inv(scaled.T @ scaled)
-    sigma = guess_sigma(inputs)
+    sigma = guess_sigma(inputs, state)
     for block in _unguessed(inputs):
         sigma[block.columns] = np.minimum(sigma[block.columns], UNGUESSED)
     scaled = held * (sigma / problem.tolerance)[:, None]
@@ -156,9 +157,9 @@ def _is_weighed(inputs: Inputs, held: np.ndarray) -> bool:
     return bool(held.size and np.any(np.abs(held[own]) > MOVED_BY_HELD))
 
 
-def _weights(inputs: Inputs, problem: Problem) -> np.ndarray:
+def _weights(inputs: Inputs, state: State) -> np.ndarray:
     """(B,) what guesses are worth against one another; what nobody guessed does not count, but where it turns."""
-    sigma = guess_sigma(inputs)
+    sigma = guess_sigma(inputs, state)
     for block in _unguessed(inputs):
         if block.kind != "vector":
             sigma[block.columns[:2] if block.kind == "plane" else block.columns] = GUESS_SIGMA["rotation"]
