@@ -116,7 +116,7 @@ def wrong_strings(module: Path) -> list[str]:
     return found
 
 
-UNREVISED = {"api.md"}  # pages that are still to be revised; the list only shrinks
+UNREVISED: set[str] = set()  # pages that are still to be revised; the list only shrinks
 UNREVISED_MESSAGES = {  # modules whose messages are; the list only shrinks
     "assessment/assess.py", "assessment/cameras.py", "assessment/notes.py", "assessment/robot.py",
     "calibration/summary.py", "cli.py", "first_guess/own_robot.py", "first_guess/parallax.py",
