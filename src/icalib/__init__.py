@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from icalib.errors import CalibrationError
     from icalib.parameter import Parameter, fixed, free, guess, prior
     from icalib.pipeline import calibrate, calibrate_measurements
+    from icalib.progress import progress_bar
     from icalib.recordings import open_recording
     from icalib.rig_file import load_rig
 
@@ -28,6 +29,7 @@ __all__ = [
     "load_rig",
     "open_recording",
     "prior",
+    "progress_bar",
 ]
 
 _HOME = {
@@ -43,6 +45,7 @@ _HOME = {
     "load_rig": "icalib.rig_file",
     "open_recording": "icalib.recordings",
     "prior": "icalib.parameter",
+    "progress_bar": "icalib.progress",
 }
 
 

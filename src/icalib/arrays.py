@@ -1,0 +1,135 @@
+"""Measurements from numpy arrays, for `icalib.calibrate_measurements`.
+
+Each function makes the stream of one sensor, which must have the sensor's name in the rig. Stamps are seconds (float)
+or nanoseconds (integers) of the sensor's own clock, strictly increasing. Integers keep all digits of a clock that
+counts from 1970; float seconds have a resolution of 0.2 us there. All functions raise RecordingError, one sentence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+
+from icalib.errors import RecordingError
+from icalib.measurements import (
+    CornerStream,
+    ImuStream,
+    LidarStream,
+    Measurements,
+    PoseStream,
+    TrackStream,
+    WheelPoses,
+    WheelStream,
+)
+
+AnyStream = ImuStream | CornerStream | TrackStream | LidarStream | WheelStream | WheelPoses | PoseStream
+
+
+def measurements(*streams: AnyStream, name: str = "") -> Measurements:
+    """What one recording holds: the streams of all its sensors, in any order. name: of the recording, for messages."""
+    imus = [s for s in streams if isinstance(s, ImuStream)]
+    if len(imus) > 1:
+        raise RecordingError(f"{imus[1].name} is a second IMU beside {imus[0].name}; give one.")
+    return Measurements(
+        imu=imus[0] if imus else None,
+        cameras=tuple(s for s in streams if isinstance(s, CornerStream)),
+        tracks=tuple(s for s in streams if isinstance(s, TrackStream)),
+        lidars=tuple(s for s in streams if isinstance(s, LidarStream)),
+        wheels=tuple(s for s in streams if isinstance(s, WheelStream | WheelPoses)),
+        poses=tuple(s for s in streams if isinstance(s, PoseStream)),
+        name=name,
+    )
+
+
+def imu(name: str, stamps: Any, gyro: Any, accel: Any) -> ImuStream:
+    """stamps (N,); gyro (N, 3) rad/s; accel (N, 3) m/s^2, with gravity (specific force), in the frame of the IMU."""
+    return ImuStream(name, _stamps(name, stamps), _floats(name, "gyro", gyro), _floats(name, "accel", accel))
+
+
+def corners(name: str, stamps: Any, points: Sequence[Any], pixels: Sequence[Any]) -> CornerStream:
+    """Corners of the target that a camera saw. stamps (M,); for each image points (n,), indices into `target.points`,
+    and pixels (n, 2), of which (0, 0) is the centre of the top-left pixel."""
+    start, index, uv = _grouped(name, stamps, points, pixels, 2)
+    return CornerStream(name, _stamps(name, stamps), start, index, uv)
+
+
+def tracks(name: str, stamps: Any, features: Sequence[Any], pixels: Sequence[Any]) -> TrackStream:
+    """Points of the scene that a camera tracked. stamps (M,); for each image features (n,), numbers that are the same
+    for the same point in all images and cameras, and pixels (n, 2) as for `corners`."""
+    start, index, uv = _grouped(name, stamps, features, pixels, 2)
+    return TrackStream(name, _stamps(name, stamps), start, index, uv)
+
+
+def lidar(name: str, stamps: Any, xyz: Sequence[Any], offsets: Sequence[Any]) -> LidarStream:
+    """Scans of a LiDAR. stamps (S,); for each scan xyz (n, 3) m in the frame of the LiDAR at the instant of the point,
+    and offsets (n,) s, the instants of the points from the stamp of their scan."""
+    start, _, points = _grouped(name, stamps, [np.zeros(len(scan), np.int64) for scan in xyz], xyz, 3)
+    seconds = [_floats(name, "offsets", offset) for offset in offsets]
+    offset = np.concatenate([np.zeros(0), *seconds]).astype(np.float32)
+    unknown = np.full(len(points), -1, np.int32)
+    return LidarStream(name, _stamps(name, stamps), start, offset, points.astype(np.float32), unknown)
+
+
+def wheels(
+    name: str,
+    stamps: Any,
+    rate: Any,
+    *,
+    sampling: Literal["interval-mean", "instantaneous"] = "interval-mean",
+    kind: Literal["pair", "steered", "twist"] = "pair",
+) -> WheelStream:
+    """Wheels. stamps (N,); rate (N, 2): of kind "pair" rates of the left and right wheel [rad/s], of "steered" rate and
+    steering angle [rad], of "twist" speed [m/s] and yaw rate [rad/s]."""
+    return WheelStream(name, _stamps(name, stamps), _floats(name, "rate", rate), sampling, kind)
+
+
+def poses(name: str, stamps: Any, rotation: Any, position: Any) -> PoseStream:
+    """Poses in a fixed frame. stamps (N,); rotation (N, 3, 3) R_frame_sensor, or a scipy Rotation; position (N, 3)
+    m."""
+    rotation = rotation.as_matrix() if hasattr(rotation, "as_matrix") else rotation
+    R = _floats(name, "rotation", rotation)
+    if R.shape[1:] == (3, 3) and not (np.abs(R @ R.swapaxes(1, 2) - np.eye(3)) < 1e-3).all():
+        raise RecordingError(f"{name}: rotation has matrices that are no rotations; correct them.")
+    return PoseStream(name, _stamps(name, stamps), R, _floats(name, "position", position))
+
+
+def _stamps(name: str, stamps: Any) -> np.ndarray:
+    """(N,) int64 ns."""
+    found = np.asarray(stamps)
+    if found.ndim != 1 or len(found) == 0 or found.dtype.kind not in "iuf":
+        raise RecordingError(f"{name}: stamps must be a vector of seconds, or of integer nanoseconds.")
+    if found.dtype.kind == "f" and not np.isfinite(found).all():
+        raise RecordingError(f"{name}: stamps have entries that are NaN or infinite; remove these readings.")
+    ns = np.round(found * 1e9).astype(np.int64) if found.dtype.kind == "f" else found.astype(np.int64)
+    if (np.diff(ns) <= 0).any():
+        where = int(np.argmax(np.diff(ns) <= 0)) + 1
+        raise RecordingError(f"{name}: stamps must increase, but entry {where} does not; sort them, without repeats.")
+    return ns
+
+
+def _floats(name: str, what: str, values: Any) -> np.ndarray:
+    try:
+        found = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise RecordingError(f"{name}: {what} must be an array of numbers.") from error
+    if not np.isfinite(found).all():
+        raise RecordingError(f"{name}: {what} has entries that are NaN or infinite; remove these readings.")
+    return found
+
+
+def _grouped(
+    name: str, stamps: Any, index: Sequence[Any], values: Sequence[Any], columns: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """start (M + 1,), index (N,) int64 and values (N, columns) of all groups, one after the other."""
+    if not len(index) == len(values) == len(stamps):
+        raise RecordingError(f"{name}: there are {len(stamps)} stamps, but {len(index)} and {len(values)} groups.")
+    arrays = [_floats(name, "values", v).reshape(-1, columns) for v in values]
+    counts = [len(a) for a in arrays]
+    numbers = [np.asarray(i, dtype=np.int64).ravel() for i in index]
+    wrong = next((k for k, (i, n) in enumerate(zip(numbers, counts, strict=True)) if len(i) != n), None)
+    if wrong is not None:
+        raise RecordingError(f"{name}: group {wrong} has {len(numbers[wrong])} numbers for {counts[wrong]} values.")
+    start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    return start, np.concatenate([np.zeros(0, np.int64), *numbers]), np.concatenate([np.zeros((0, columns)), *arrays])
