@@ -168,7 +168,7 @@ def test_a_target_that_just_fits_fits():
 
 def test_without_reportlab_the_extra_is_named(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "reportlab.pdfgen.canvas", None)
-    with pytest.raises(CalibrationError, match=r"install icalib\[print\]"):
+    with pytest.raises(CalibrationError, match=r"pip install .\.\[print\]"):
         target_pdf(*TARGETS["checkerboard"])
 
 

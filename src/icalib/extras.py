@@ -9,6 +9,11 @@ from typing import Any
 from icalib.errors import RecordingError
 
 
+def install(extra: str) -> str:
+    """The command that installs `extra`, in words."""
+    return f'pip install ".[{extra}]" in the checkout of icalib'
+
+
 def load_cv2() -> Any:
     """OpenCV. Raises RecordingError where it is not installed."""
     return _load("cv2", "images", "Images and tags need OpenCV")
@@ -62,4 +67,4 @@ def _load(module: str, extra: str, need: str) -> ModuleType:
     try:
         return importlib.import_module(module)
     except ImportError:
-        raise RecordingError(f"{need}, which is not installed; run: pip install icalib[{extra}].") from None
+        raise RecordingError(f"{need}, which is not installed; run {install(extra)}.") from None

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from icalib.errors import CalibrationError, RigError
+from icalib.extras import install
 from icalib.geometry.targets import AprilGrid, Markers, Tag, Target
 from icalib.geometry.targets.pattern import Pattern, pattern_of
 from icalib.own_files import refuse_foreign, sealed
@@ -131,7 +132,7 @@ def _canvas(width: float, height: float) -> Any:
     try:
         from reportlab.pdfgen.canvas import Canvas
     except ImportError:
-        raise CalibrationError("PDF is made by reportlab, which is not installed; install icalib[print].") from None
+        raise CalibrationError(f"PDF needs reportlab, which is not installed; run {install('print')}.") from None
     # invariant: no date inside, so that the same target gives the same file.
     return Canvas(BytesIO(), pagesize=(_POINTS * width, _POINTS * height), pageCompression=0, invariant=1)
 

@@ -173,7 +173,7 @@ def test_without_opencv_the_extra_is_named(monkeypatch):
         raise ImportError(name)
 
     monkeypatch.setattr(importlib, "import_module", absent)
-    with pytest.raises(RecordingError, match=r"not installed; run: pip install icalib\[images\]\."):
+    with pytest.raises(RecordingError, match=r"not installed; run pip install .\.\[images\]"):
         load_cv2()
 
 

@@ -126,7 +126,7 @@ def test_missing_packages_are_named(runs, tmp_path: Path, capsys, monkeypatch, m
         monkeypatch.undo()
     monkeypatch.setitem(sys.modules, module, None)
     text = sentence(capsys, "reproduce", "--runs", "3", "-o", str(tmp_path))
-    assert "pip install icalib[montecarlo]" in text
+    assert 'pip install ".[montecarlo]"' in text
 
 
 @pytest.mark.parametrize(

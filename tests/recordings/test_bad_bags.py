@@ -280,7 +280,7 @@ class TestNoBag:
         recording = open_recording(write.small("mcap", tmp_path, truth))
         monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
         bag._stores.cache_clear()
-        assert "need the package rosbags, which is not installed; run: pip install icalib[bags]" in complaint(
+        assert 'need the package rosbags, which is not installed; run pip install ".[bags]"' in complaint(
             lambda: recording.imu(IMU)
         )
 

@@ -115,5 +115,5 @@ def test_what_exists_is_not_overwritten(filmed: Film, tmp_path: Path):
 def test_a_missing_package_is_named(filmed: Film, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
     monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
-    with pytest.raises(CalibrationError, match=r"pip install icalib\[bags\]"):
+    with pytest.raises(CalibrationError, match=r"pip install .\.\[bags\]"):
         write_film(filmed, {"mcap": tmp_path / "new"})

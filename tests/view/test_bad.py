@@ -108,7 +108,7 @@ def test_a_damaged_image_is_left_out_which_is_said(shown, drive, tmp_path):
 
 def test_rerun_is_missing(complaint, shown, monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun.blueprint", None)
-    assert "rerun-sdk, which is not installed; run: pip install icalib[view]." in complaint(shown.result)
+    assert 'rerun-sdk, which is not installed; run pip install ".[view]" in the checkout' in complaint(shown.result)
 
 
 def test_an_output_that_cannot_be_written(complaint, shown, tmp_path):

@@ -1,4 +1,4 @@
-"""Messages of the sensors, and the bags that hold them, by rosbags (`icalib[bags]`)."""
+"""Messages of the sensors, and the bags that hold them, by rosbags (extra `bags`)."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from icalib.errors import CalibrationError
+from icalib.extras import install
 
 BagForm = Literal["ros1", "mcap", "sqlite3"]
 IMU_TOPIC = "/imu0"
@@ -105,5 +106,5 @@ def package(name: str, extra: str) -> Any:
         return importlib.import_module(name)
     except ImportError:
         raise CalibrationError(
-            f"writing recordings needs {name}, which is not installed; run: pip install icalib[{extra}]."
+            f"writing recordings needs {name}, which is not installed; run {install(extra)}."
         ) from None

@@ -1,4 +1,4 @@
-"""Films as files: bags of ROS 1 and ROS 2, written by rosbags, and EuRoC's folder (`icalib[bags,images]`)."""
+"""Films as files: bags of ROS 1 and ROS 2, written by rosbags, and EuRoC's folder (extras `bags`, `images`)."""
 
 from __future__ import annotations
 
