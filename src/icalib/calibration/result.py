@@ -52,7 +52,7 @@ class SensorFit:
     chi2: float
     rms: float | None = None  # of the raw residual, in `unit`
     unit: str = ""
-    rejected: int = 0  # corners set aside
+    rejected: int = 0  # corners
 
     @property
     def chi2_per_dof(self) -> float | None:
@@ -111,8 +111,8 @@ class Iteration:
 
 @dataclass(frozen=True)
 class Visited:
-    """Where the solver stood when it looked for a step: of each group (sensor, name) that is estimated its value and
-    formal standard deviation there, as in `ParameterGroup`. What is held at the guess has none: zeros."""
+    """A state from which the solver took a step: value and formal standard deviation of each estimated group (sensor,
+    name), as in `ParameterGroup`. The standard deviation of groups fixed at the guess is zero."""
 
     stage: str
     values: dict[tuple[str, str], np.ndarray]

@@ -14,8 +14,8 @@ from icalib.detection.refinement import refined_corners
 from icalib.detection.tags import Tags, tags_at
 from icalib.errors import RecordingError
 
-# icalib's number of each of OpenCV's corners: from the lower left of the tag's own picture, against the clock. OpenCV's
-# pictures of AprilTags stand on their heads.
+# icalib's number of each of OpenCV's corners: from the lower left of the tag's own picture, counterclockwise. OpenCV's
+# pictures of AprilTags are rotated by 180 deg.
 APRILTAG_CORNER = np.array([1, 0, 3, 2])
 ARUCO_CORNER = np.array([3, 2, 1, 0])
 

@@ -25,7 +25,7 @@ from icalib.geometry import so3
 from icalib.rig import Parameter
 
 SIGMAS = 4.0
-FAR = 0.5  # times what a guess is worth: 3 deg, 5 cm, 10 ms; a linear step that long does not end where it says
+FAR = 0.5  # times the prior uncertainty: 3 deg, 5 cm, 10 ms; a linear step that long does not end where it says
 
 
 @dataclass(frozen=True)

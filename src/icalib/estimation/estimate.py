@@ -36,7 +36,7 @@ from icalib.estimation.solver import minimise
 from icalib.estimation.state import State
 from icalib.rig import PoseSensor
 
-LOOSE = 3.0  # times what a guess is worth
+LOOSE = 3.0  # times the prior uncertainty of a guess
 LEAST_LEFT = 0.2  # of the residuals of poses: where the motion takes all, nothing is left to show their noise
 # Degrees of freedom off those of poses at rest, of which there may be few: the mean of a variance that chi^2 shows, its
 # logarithm unknown before (Jeffreys' prior); standard deviations are then those of Student's t distribution.
@@ -116,11 +116,12 @@ def estimate(
     doubtful: Callable[[Problem, np.ndarray], bool] = lambda *_: False,
     guess: State | None = None,
 ) -> Estimate:
-    """All passes from a first `state`, directions of the border in `held` (see Problem) left alone; the last one alone
-    where noise and outliers are `judged` already. It is left half-way where the information of the border (B, B) makes
-    it `doubtful` that all is determined: along what is not it would only creep. Until that is clear, and while anything
-    is held, a `guess` counts for what it is worth, so that what is open does not wander far; where it counted to the
-    end, that is half-way, too.
+    """All passes from an initial `state`; the final one alone if noise and outliers are `judged` already.
+
+    Directions of the calibration parameters in `held` (see Problem) are fixed. A pass stops early if the information of
+    the calibration parameters (B, B) may be rank deficient (`doubtful`), because it would converge slowly along an
+    unobservable direction. Until the null space is known, and while directions are fixed, `guess` is a prior, so that
+    unobservable directions do not drift. A pass that ended with that prior counts as stopped early, too.
 
     Raises EstimationError where the data do not carry an estimate.
     """
@@ -147,8 +148,8 @@ def estimate(
 
 @dataclass
 class _Passes:
-    """Passes of one estimate. The next one begins at `state`, told what is `judged` so far, with priors `about` the
-    guess until it is clear that nothing is open, and nothing is held."""
+    """Passes of one estimate. The next one begins at `state`, with the measurement model `judged` so far. Priors
+    `about` the guess apply until every direction is observable and none is fixed."""
 
     inputs: Inputs
     held: np.ndarray
@@ -179,8 +180,8 @@ class _Passes:
         self.begin_at(outcome.state)
 
     def final(self, name: str, way_before: float) -> tuple[Outcome, float]:
-        """To the end, or half-way where something is open or much is to be frozen anew; and the way to there, infinite
-        where it was left because something is open. Priors lead but half-way; if they are let go, it is there."""
+        """Solve the final pass. Returns the outcome and its relative cost decrease; `inf` if it stopped early because
+        the problem is rank deficient. The pass may also stop early to freeze its choices anew, or to drop priors."""
         problem, told = self._next(name)
 
         def leaves(way: float, information: np.ndarray) -> bool:
@@ -251,8 +252,8 @@ def _without_priors(outcome: Outcome, more: Sequence[Prior]) -> Outcome:
 
 def _again(inputs: Inputs, outcome: Outcome, judged: Judged, way: float, way_before: float) -> bool:
     """Whether the last pass is to be made anew: what it froze, such as the weights of points on planes, is of a state
-    far from its end, but nearer than in the last pass before, or tracks come back. way: infinite where the pass was
-    left because something is open; such a state is judged as it is, but with its tracks."""
+    far from its end, but nearer than in the last pass before, or rejected tracks fit again. way: relative cost
+    decrease, infinite if the pass stopped early because the problem is rank deficient."""
     return _is_far(way, way_before) or _follows_more(inputs, outcome, judged)
 
 
@@ -276,8 +277,8 @@ def _on_own_nodes(inputs: Inputs, state: State) -> State:
 
 
 def first_pass(inputs: Inputs, state: State) -> State:
-    """Where the solver is led by all measurements from a first `state`, before any is judged. Calibration stays about
-    where it is, to a few times what a guess is worth: what the motion leaves open does not wander.
+    """The state after a first pass over all measurements from `state`, before outliers are rejected. Priors of a few
+    times the prior uncertainty keep the calibration near its guess, so that unobservable directions do not drift.
 
     Raises EstimationError where the data do not carry an estimate.
     """

@@ -11,7 +11,9 @@ from icalib.estimation.arrowhead import Piece
 from icalib.estimation.state import NODE, State
 
 POSE = 6
-WEAK = 1e-9  # information [1/rad^2, 1/m^2]: keeps a node defined whose corners were all set aside; steers nothing else
+WEAK = (
+    1e-9  # information [1/rad^2, 1/m^2]: keeps a keyframe defined whose corners were all rejected; steers nothing else
+)
 
 
 @dataclass(frozen=True)

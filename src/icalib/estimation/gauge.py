@@ -14,9 +14,9 @@ from icalib.estimation.state import State
 
 IN_THE_WORLD = ("plane", *POSE_FRAME)  # blocks that are estimated along, in a world of which gravity alone is known
 
-# Information [1/m^2, 1/rad^2] along what nothing sees. Any number does where all else is determined. But where a
-# direction of planes and sensors is held, a step could move along it all the same and make up for it by turning the
-# world, planes and all, as far as this lets it: then the solver wandered for as long as it was let.
+# Information [1/m^2, 1/rad^2] along what nothing sees. Any number does if everything else is observable. But a
+# step could move along a fixed direction of planes and sensors all the same, and compensate by a rotation of the world
+# as far as this information allows. With a small one the solver then drifts.
 FRAME = 1e10
 
 

@@ -1,7 +1,8 @@
-"""What the guess is worth where the data leave directions open: where these are held, and what the rest owes to it.
+"""Unobservable directions: the prior mean that they are fixed at, and the consider covariance of everything else.
 
-A held direction stands where the guesses of all that it moves have it. Their errors, taken as independent, say how far
-it may be from the truth; and how far the rest moves with it is found by moving it that far and solving again.
+A fixed direction has the value of the guesses of all parameters that it moves. Independent errors of these guesses give
+its prior covariance. Each principal axis is moved by one standard deviation and everything else is solved again; the
+shift of the other parameters is their sensitivity to the fixed ones.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ PULLED = 0.25  # information in tolerance units, noise and all
 FARTHEST = 2.0  # standard deviations of the guess
 MOVED_BY_HELD = 0.1  # parts of a direction smaller than this do not count as in it
 MOSTLY = 0.5  # of the square of a direction
-NEAR_GUESS = 0.05  # of what the guess is worth
+NEAR_GUESS = 0.05  # of the prior uncertainty of the guess
 TOGETHER = 4  # ways in which errors of the guess come together: what one makes beyond the sum is little by chance
 HALVINGS = 4  # of a move along which nothing can be solved
 
@@ -57,8 +58,8 @@ def moved_to_guess(problem: Problem, state: State, guess: State, held: np.ndarra
 
 
 def moved_to_worth(inputs: Inputs, problem: Problem, state: State, guess: State, held: np.ndarray) -> State | None:
-    """`state`, moved along the directions `held` (B, m) to where the guesses of all that they move have it, each by
-    what it is worth; None where the rig file says no guess is worth more than others, or it stands there already.
+    """`state`, reset along the directions `held` (B, m) to the prior mean of all parameters that they move, weighted by
+    their prior uncertainty; None where the rig file has no priors among them, or the state is there already.
 
     Where the data know only how two heights differ, and one was measured, `moved_to_guess` would leave both half-way.
     """
@@ -94,7 +95,7 @@ def owed_to_guess(inputs: Inputs, outcome: Outcome, data: np.ndarray) -> np.ndar
 
 
 def in_proportion(inputs: Inputs, outcome: Outcome, data: np.ndarray) -> np.ndarray:
-    """(m, B) as `owed_to_guess`, where nothing but what is held moves."""
+    """(m, B) as `owed_to_guess`, if only the fixed directions move."""
     return outcome.problem.tolerance * _ways(inputs, outcome, data).T
 
 
@@ -138,8 +139,8 @@ def _leave_nothing(inputs: Inputs, problem: Problem, ways: np.ndarray) -> bool:
 
 
 def _answer(outcome: Outcome, way: np.ndarray) -> np.ndarray:
-    """(B,) how the border moves when the guess moves along `way` (B,), which is held. Where it moves so far that
-    nothing can be solved, in proportion to a shorter way."""
+    """(B,) shift of the calibration parameters when the guess moves along the fixed direction `way` (B,). If that is
+    too far for a solution, a shorter move is scaled up."""
     problem, state = outcome.problem, outcome.state
     for k in range(HALVINGS):
         moved = _moved(problem, state, way / 2**k)
@@ -152,7 +153,7 @@ def _answer(outcome: Outcome, way: np.ndarray) -> np.ndarray:
 
 
 def _is_weighed(inputs: Inputs, held: np.ndarray) -> bool:
-    """Whether the rig file says of something that the directions `held` (B, m) move what its guess is worth."""
+    """Whether the rig file has a prior on a parameter that the fixed directions `held` (B, m) move."""
     own = np.concatenate([np.empty(0, dtype=np.int64), *(p.block.columns for p in given_priors(inputs))])
     return bool(held.size and np.any(np.abs(held[own]) > MOVED_BY_HELD))
 

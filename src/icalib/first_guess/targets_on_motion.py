@@ -1,8 +1,8 @@
 """Cameras that see a target from a robot that turns about one axis, as on a floor, placed on the motion that a LiDAR
 or a pose sensor shows.
 
-Their angular rates leave the turn about that axis open, and with it all that follows; the way that their poses go, and
-the robot, shows it.
+The rotation about that axis is unobservable from angular rates. The trajectories of the cameras' poses and of the robot
+show it.
 """
 
 from __future__ import annotations

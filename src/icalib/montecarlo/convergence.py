@@ -67,8 +67,8 @@ def _row(runs: Sequence[Record], block: Block) -> Row:
 
 
 def _curve(record: Record, column: int, scale: float) -> Curve:
-    """Where a parameter is held at the guess, iterations say nothing of how well it is known: the result does. What any
-    other owes to the guess the result alone says, too, so that is added throughout."""
+    """Error and bound of one parameter. For one fixed at the guess only the result has a standard deviation. The
+    consider covariance of all others is known of the result only, too, and is added at every iteration."""
     verdicts = [v for b in record.blocks for v in b.verdict]
     error = np.array([w.error[column] for w in record.path])
     sigma, in_the_end = np.array([w.std[column] for w in record.path]), record.covariance[column, column]

@@ -86,7 +86,7 @@ def nees_figure(found: Consistency) -> Figure:
 
 
 def _undetermined(found: Consistency) -> list[Html]:
-    """What was left open in some run, if anything was."""
+    """What was undetermined in some run, if anything was."""
     if not found.undetermined:
         return []
     return [element("h2", "Undetermined"), sentences(undetermined_words(found), "care", "None.")]

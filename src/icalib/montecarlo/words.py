@@ -82,6 +82,6 @@ def failures_words(found: Consistency) -> str:
 
 
 def undetermined_words(found: Consistency) -> list[str]:
-    """What was left open, and in how many of the runs that reached a result."""
+    """What was undetermined, and in how many of the runs that reached a result."""
     reached = found.runs - len(found.failures)
     return [f"{n} of {reached} runs: {what}" for what, n in found.undetermined.items()]

@@ -83,7 +83,7 @@ def is_available(family: str) -> bool:
 @lru_cache(maxsize=32)
 def opencv_bits(family: str) -> np.ndarray:
     """(ids, n, n) bool, True where white: all tags of this family of `FAMILIES` as OpenCV draws them, alone and on its
-    boards; row 0 at the top, without the black border. AprilTags stand on their heads.
+    boards; row 0 at the top, without the black border. AprilTags are rotated by 180 deg.
 
     Raises RecordingError where OpenCV, which knows the bits, is not installed or does not know these.
     """
