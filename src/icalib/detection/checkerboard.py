@@ -1,4 +1,4 @@
-"""Checkerboards: the inner corners, in an order that does not depend on how the board is held."""
+"""Checkerboards: the inner corners, in an order that does not depend on how the board is oriented."""
 
 from __future__ import annotations
 

@@ -215,7 +215,7 @@ def _together(a: _Views, offset_a: float, b: _Views, offset_b: float) -> np.ndar
 
 def _common_rotation(a: TargetPoses, b: TargetPoses, together: np.ndarray, turns: _Turns) -> np.ndarray:
     """R_a_b of two cameras, the same at all instants: of the turns that each pair of images may need, the right ones
-    give poses that are alike, the wrong ones poses that depend on how the target is held.
+    give poses that are alike, the wrong ones poses that depend on how the target is oriented.
 
     The pose with the least median distance to the nearest candidate of each pair is taken. Distances are in radians,
     and in distances from the target.

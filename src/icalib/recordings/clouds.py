@@ -188,7 +188,7 @@ def _by_field(times: PointTimes, cloud: PointCloud, xyz: np.ndarray) -> tuple[in
 
 
 def _joined(lidar: Lidar, stamps_ns: np.ndarray, parts: list[tuple[np.ndarray, np.ndarray]]) -> LidarStream:
-    """Column by column, so that no more than one column is held twice. Empties `parts`."""
+    """Column by column, so that no more than one column is in memory twice. Empties `parts`."""
     start = np.concatenate([[0], np.cumsum([len(offset) for _, offset in parts], dtype=np.int64)])
     offsets = [offset for _, offset in parts]
     points = [xyz for xyz, _ in parts]
