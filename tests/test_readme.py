@@ -88,3 +88,13 @@ def test_files_that_are_linked_exist():
 def test_no_page_installs_icalib_from_an_index():
     pages = {page.name: page.read_text(encoding="utf-8") for page in (ROOT / "docs").glob("*.md")}
     assert not [name for name, text in pages.items() if re.search(r"pip install [\"']?icalib|`icalib\[", text)]
+
+
+def test_programs_that_pages_name_exist():
+    text = "".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs").rglob("*.md"))
+    code = "\n".join(re.findall(r"```.*?```|`[^`\n]+`|^    .*", text, re.DOTALL | re.MULTILINE))
+    named = set(
+        re.findall(r"(?:tests|benchmarks|estimation|first_guess|detection|assessment|geometry)/[\w/]*\.py", code)
+    )
+    assert len(named) > 50
+    assert not [name for name in sorted(named) if not any((ROOT / at / name).exists() for at in ("", "src/icalib"))]

@@ -335,7 +335,7 @@ class Rig:
 
     @property
     def has_target(self) -> bool:
-        """Whether there is a target; else all cameras follow points of the scene."""
+        """Whether there is a target; else all cameras have feature tracks."""
         return len(self.target.bodies) > 0
 
     @property

@@ -36,7 +36,7 @@ class ProjectionMap:
     alone is taken off; else a rotation and a translation).
 
     u (n,), v (m,): middles of cells of the image [px]; sigma (m, n) [px], NaN where the model has no ray; seen (m, n):
-    cells in which it saw corners or followed points. The motion was fitted over these; over all where there are none.
+    cells in which it saw corners or tracked points. The motion was fitted over these; over all where there are none.
     """
 
     camera: str
