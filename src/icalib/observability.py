@@ -17,12 +17,12 @@ MOST_NAMED = 4  # of the largest
 
 # The motion that would determine a parameter which the data leave open.
 MISSING_MOTION = {
-    "translation": "turn the rig about two more axes, briskly: a lever arm is only felt when it turns",
+    "translation": "turn the rig about two more axes, briskly: a lever arm shows only in rotation",
     "rotation": "turn the rig about at least two axes",
-    "time_offset": "turn or shake the rig faster, so that a shift in time can be seen",
+    "time_offset": "turn or shake the rig faster, so that a time shift shows",
     "intrinsics": "show the target at different distances, tilted, and in every part of the image",
     "distortion": "show the target in the corners of the image",
-    "tilt": "turn the rig through larger angles, so that gravity is felt on every axis",
+    "tilt": "turn the rig through larger angles, so that gravity shows on every axis",
     "shape": "show the target from more sides and closer",
     "bloom": "show the target from more distances",
     "radii": "drive further",
@@ -32,16 +32,17 @@ MISSING_MOTION = {
     "steering_offset": "drive further",
     "scales": "drive further, and turn more, both ways",
 }
-# Of wheels, which stay on the ground.
+# Of all sensors of a rig on wheels, which cannot turn about other axes.
 ON_THE_GROUND = {
-    "translation": "turn, and drive over ramps: on a flat floor wheels do not show how high they are",
-    "rotation": "drive over ramps: on a flat floor wheels do not show how they are tilted",
+    "translation": "turn, and drive over ramps: a flat floor does not show heights; or give it as a prior",
+    "rotation": "drive over ramps: a flat floor does not show tilts; or give it as a prior",
     "time_offset": "speed up, brake and turn more",
+    "tilt": "drive over ramps",
 }
 # Of cameras without a target, which track points of the scene.
 WITHOUT_TARGET = {
-    "intrinsics": "turn and move the rig so that near and far points of the scene cross the whole image",
-    "distortion": "turn the rig so that points of the scene pass through the corners of the image",
+    "intrinsics": "move so that near and far points of the scene cross the whole image",
+    "distortion": "turn so that points of the scene pass through the corners of the image",
 }
 
 
@@ -61,17 +62,20 @@ class Observability:
 def observe(
     found: Determined, names: tuple[str, ...], wheels: Collection[str] = (), tracking: Collection[str] = ()
 ) -> Observability:
-    """Verdicts by what the data alone say: determined where they know a parameter to a tolerance, nothing where the
-    solver did not converge. `names` (B,) as in "cam0.translation.x"; `wheels`: which sensors are wheels; `tracking`:
-    which are cameras without a target."""
+    """Verdicts by what the data alone say; undetermined throughout where the solver did not converge.
+
+    `names` (B,) as in "cam0.translation.x"; `wheels`: which sensors are wheels, on which the whole rig drives;
+    `tracking`: which are cameras without a target.
+    """
     directions = sparse_basis(found.held)
     share = (directions**2).sum(axis=1)
     verdicts: list[Verdict] = []
     for part, spread in zip(share, found.spread, strict=True):
         is_open = part > SHARE or not found.estimate.outcome.converged
         verdicts.append("undetermined" if is_open else by_size(spread))
-    advice = dict.fromkeys(wheels, ON_THE_GROUND) | dict.fromkeys(tracking, WITHOUT_TARGET)
-    sentences = tuple(_sentence(u, names, advice) for u in directions.T)
+    rig = MISSING_MOTION | (ON_THE_GROUND if wheels else {})
+    advice = {sensor: rig | WITHOUT_TARGET for sensor in tracking}
+    sentences = tuple(_sentence(u, names, rig, advice) for u in directions.T)
     return Observability(found.covariance, tuple(verdicts), sentences, found.spread)
 
 
@@ -87,14 +91,16 @@ def sparse_basis(directions: np.ndarray, rounds: int = 50) -> np.ndarray:
     return directions @ turn if m else np.zeros((n, 0))
 
 
-def _sentence(direction: np.ndarray, names: tuple[str, ...], advice: Mapping[str, Mapping[str, str]]) -> str:
-    """advice: by sensor and kind of parameter, where it is another than that of MISSING_MOTION."""
+def _sentence(
+    direction: np.ndarray, names: tuple[str, ...], rig: Mapping[str, str], advice: Mapping[str, Mapping[str, str]]
+) -> str:
+    """rig: the missing motion by kind of parameter; advice: the same of sensors that differ."""
     order = np.argsort(-np.abs(direction))
     # By the rig, not by size: where all move alike, noise would decide which comes first.
     parts = sorted(i for i in order[:MOST_NAMED] if abs(direction[i]) >= NAMED) or [order[0]]
     words = " with ".join(_words(names[i]) for i in parts)
     sensor, kind, _ = names[order[0]].rsplit(".", 2)
-    motion = advice.get(sensor, {}).get(kind) or MISSING_MOTION.get(kind, "move the rig more")
+    motion = advice.get(sensor, rig).get(kind, "move the rig more")
     return f"{words}: not determined by this motion; {motion}."
 
 

@@ -110,7 +110,7 @@ def test_the_spread_over_parts_counts():
     result = calibrate_measurements(rig, x.measurements)
     factor = result.group("flange", "rotation").factor
     assert factor is not None and 1.0 < factor.max() < 2.5
-    assert not any("too short to be split" in words for words in result.warnings)
+    assert not any("too short for segments" in words for words in result.warnings)
 
 
 def test_three_pairs_are_few():

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from icalib.calibration import Calibration
 from icalib.measurements import Measurements
@@ -29,7 +30,12 @@ def with_noise(simulation: Simulation, times: float) -> Calibration:
 
 
 def said(result: Calibration) -> list[str]:
-    return [words for words in result.warnings if "of imu0 leaves residuals" in words]
+    return [words for words in result.warnings if "noise of imu0" in words or "stated noise predicts" in words]
+
+
+def advised(words: str) -> dict[str, float]:
+    """The densities that a sentence advises."""
+    return {name: float(value) for name, value in re.findall(r"(\w+): ([\d.e-]+)", words)}
 
 
 def test_the_right_noise_is_no_news(simulation):
@@ -40,17 +46,35 @@ def test_the_right_noise_is_no_news(simulation):
 def test_noise_that_is_far_too_small_is_said(simulation, times):
     """The motion then follows the IMU, and hardly any degrees of freedom are left to judge it by."""
     result = with_noise(simulation, times)
-    words = said(result)
-    assert any(w.startswith("the gyroscope") and "larger noise density would fit" in w for w in words), words
-    assert any(w.startswith("the accelerometer") and "larger noise density would fit" in w for w in words), words
+    (words,) = said(result)
+    assert "the stated noise of imu0 is too small" in words and result.reasons[0] == words
     # At 0.2 errors are up to 6 standard deviations, at 0.1 up to 12: then no number is to be trusted.
-    assert bool(result.wrong) == (times < 0.2)
-    assert set(result.wrong) <= set(words) and result.warnings[: len(result.wrong)] == result.wrong
+    assert result.wrong == ((words,) if times < 0.2 else ())
 
 
-def test_noise_that_is_far_too_large_is_said(simulation):
-    words = said(with_noise(simulation, 20.0))
-    assert any(w.startswith("the gyroscope") and "smaller noise density would fit" in w for w in words), words
+@pytest.mark.parametrize("times", [0.5, 0.1, 10.0])
+def test_the_noise_that_is_advised_is_the_true_one(simulation, times):
+    """To a third, whether far too small or too large is stated; calibrated with it there is nothing left to say."""
+    (words,) = said(with_noise(simulation, times))
+    assert f"too {'small' if times < 1.0 else 'large'}" in words
+    noise, found = rig_for(simulation.scenario).imu.noise, advised(words)
+    assert set(found) == {"gyro", "gyro_walk", "accel", "accel_walk"}
+    for name, value in found.items():
+        assert 0.67 < value / getattr(noise, name) < 1.5, (name, value)
+    rig = rig_for(simulation.scenario)
+    rig = replace(rig, imu=replace(rig.imu, noise=replace(noise, **found)))
+    assert said(calibrate_measurements(rig, simulation.measurements)) == []
+
+
+def test_residuals_that_are_no_noise_get_no_advice_on_the_noise(simulation):
+    """Vibration, correlated over 20 readings: the cause is unknown, and what was checked is told."""
+    m = simulation.measurements
+    shaken = lfilter([1.0], [1.0, -0.95], np.random.default_rng(3).normal(size=m.imu.accel.shape), axis=0)
+    imu = replace(m.imu, accel=m.imu.accel + 0.1 * shaken)
+    result = calibrate_measurements(rig_for(simulation.scenario), replace(m, imu=imu))
+    (words,) = said(result)
+    assert "the cause is unknown" in words and "Checked: " in words and "noise: {" not in words
+    assert result.reasons[0] == words
 
 
 def swapped(simulation: Simulation) -> Measurements:
@@ -69,7 +93,7 @@ GUESSES = [
 @pytest.mark.parametrize("modes", GUESSES)
 def test_cameras_that_are_mixed_up_are_named(simulation, modes):
     rig = rig_for(simulation.scenario, distortion="free", **modes)
-    words = "cam0 and cam1 seem to be mixed up"
+    words = "cam0 and cam1 seem to be swapped"
     result = calibrate_measurements(rig, swapped(simulation))
     assert len(result.wrong) == 1 and result.wrong[0].startswith(words) and result.warnings[0] == result.wrong[0]
     assert not any(words in w for w in calibrate_measurements(rig, simulation.measurements).warnings)
@@ -84,21 +108,33 @@ def test_a_poor_guess_is_not_taken_for_the_other_camera(simulation):
             for c, by in zip(rig.cameras, moved, strict=True)
         )
         result = calibrate_measurements(replace(rig, cameras=cameras), simulation.measurements)
-        assert not any("mixed up" in w for w in result.warnings)
+        assert not any("seem to be swapped" in w for w in result.warnings)
 
 
 @pytest.mark.parametrize("stated", [True, False])
 def test_a_lens_of_another_camera_that_is_fixed(simulation, stated):
-    """Corners fit worse than they are measured: than the rig file states, or than any are."""
+    """The value that is wrong comes first; that corners fit worse than stated follows."""
     rig = rig_for(simulation.scenario, intrinsics="fixed", distortion="fixed")
     first, second = rig.cameras
     off = [1.0, 1.0] if stated else [0.8, 1.0]
     lens = replace(second.distortion, value=first.distortion.value * [*off, 1.0, 1.0] * (1.05 if stated else 1.0))
     cameras = (replace(first, distortion=lens, corner_noise_px=first.corner_noise_px if stated else None), second)
     result = calibrate_measurements(replace(rig, cameras=cameras), simulation.measurements)
-    expected = "as its corner_noise in the rig file says" if stated else "while detectors are good to a tenth of that"
-    said = [w for w in result.warnings if w.startswith("the corners of cam0")]
-    assert any(expected in w for w in said), (result.warnings, [f.rms for f in result.fits])
+    assert result.reasons[0].startswith("the fixed value of distortion k1 of cam0"), result.reasons
+    assert any("corners of cam0" in words for words in result.reasons[1:]) == stated
+    assert not any("the cause is unknown" in words or "noise: {" in words for words in result.reasons)
+
+
+def test_corners_that_are_off_with_no_cause_in_sight(simulation):
+    """Twice as far as stated, and ten times as far as any detector is, white."""
+    first, second = simulation.measurements.cameras
+    rig, rng = rig_for(simulation.scenario), np.random.default_rng(1)
+    for size, noise, words in ((0.5, 0.2, "larger than its corner_noise predicts"), (2.0, None, "ten times the error")):
+        moved = replace(first, uv=first.uv + rng.normal(scale=size, size=first.uv.shape))
+        cameras = (replace(rig.cameras[0], corner_noise_px=noise), rig.cameras[1])
+        measured = replace(simulation.measurements, cameras=(moved, second))
+        result = calibrate_measurements(replace(rig, cameras=cameras), measured)
+        assert words in result.reasons[0] and "the cause is unknown" in result.reasons[0], result.reasons
 
 
 def with_lens(simulation: Simulation, change: list[float], mode: str = "fixed") -> Calibration:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
-from icalib.assessment.assess import _factor_warnings
+from icalib.assessment.misfit import scatter_warnings
 from icalib.calibration import Calibration, load_calibration
 from icalib.errors import CalibrationError
 
@@ -173,12 +173,12 @@ def test_a_warning_where_halves_disagree_by_more_than_is_printed(calibration: Ca
     """Excess 900 for 100: the factor is 3, and 1.9 would do."""
     held = calibration.cross_validation
     assert held is not None and held.optimistic and held.factor == pytest.approx(3.0)
-    (sentence,) = _factor_warnings(np.array([1.5, 1.9]), True, held)
-    assert "predicts the other 3.0 times worse" in sentence and "only 1.9 times" in sentence
+    (sentence,) = scatter_warnings(np.array([1.5, 1.9]), True, held)
+    assert "predicts the other 3.0x worse" in sentence and "only 1.9x the formal ones" in sentence
     by_chance = dataclasses.replace(held, spread=300.0)
     assert not by_chance.optimistic
     for factors, other in ((np.array([1.5, 2.1]), held), (np.array([1.9]), by_chance), (np.array([1.9]), None)):
-        assert not list(_factor_warnings(factors, True, other))
+        assert not list(scatter_warnings(factors, True, other))
 
 
 def test_group_lists_what_there_is(calibration: Calibration):

@@ -216,7 +216,7 @@ def test_the_verdict_of_halves_leaves_room_for_chance(calibration: Calibration, 
 
 def test_where_nothing_was_held_out_it_says_so(calibration: Calibration):
     page = Page(report_html(dataclasses.replace(calibration, cross_validation=None)))
-    assert "Nothing was held out: the recording is too short to be split" in page.words
+    assert "Nothing was held out: the recording is too short for segments" in page.words
     assert set(json.loads(page.scripts[0])) == FIGURES - {"held-out"}
 
 
@@ -253,7 +253,7 @@ def test_a_poor_fit_colours_the_card(calibration: Calibration):
     assert page(1.0).count('<article class="card determined">') == 3
     for size, css in ((2.0, "weak"), (5.0, "undetermined")):
         assert f'<article class="card {css}"><h3>cam0' in page(size**2)
-        assert f"residuals {size:.2g} times the stated noise" in page(size**2)
+        assert f"residuals {size:.2g}x the stated noise" in page(size**2)
 
 
 def test_rows_are_in_units_that_people_read(calibration: Calibration):

@@ -15,7 +15,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from icalib.assessment.robot import robot_warnings
+from icalib.assessment.robot import robot_misfit
 from icalib.calibration import Calibration, RecordingSpan, SensorFit, load_calibration, relative_pose, relative_poses
 from icalib.calibration.quantities import rows
 from icalib.console import print_result
@@ -217,33 +217,46 @@ def test_files_and_words_without_a_camera(
 
 
 def warnings(
-    kind: str, ratio: float, dof: float = 300.0, sensor: str = "wheel0", noise: float | None = 0.02, **wheels: Any
+    kind: str,
+    ratio: float,
+    dof: float = 300.0,
+    sensor: str = "wheel0",
+    noise: float | None = 0.02,
+    white: bool = True,
+    **wheels: Any,
 ) -> str:
     imu = ImuSensor("imu0", "imu0", ImuNoise(1e-4, 1e-5, 1e-3, 1e-4))
     rig = Rig(imu, (), lidars=(Lidar("lidar0", "lidar0", noise),), wheels=(Wheels("wheel0", "wheel0", **wheels),))
-    return " ".join(robot_warnings(rig, [SensorFit(sensor, kind, 400, dof, ratio * dof)]))
+    return robot_misfit(rig, SensorFit(sensor, kind, 400, dof, ratio * dof), white) or ""
 
 
 def test_more_slip_than_allowed_is_warned_of():
     words = warnings("lateral slip", 9.0)
-    assert "wheel0 slips sideways 3 times as much" in words and "0.015 m/sqrt(s) would fit" in words
-    assert "pitch" in warnings("vertical slip", 4.0) and "0.06 rad/sqrt(s)" in warnings("wheels", 4.0)
-    assert "relative" not in warnings("yaw", 4.0) and "the yaw of wheel0" in warnings("yaw", 4.0)
+    assert "lateral slip residuals of wheel0 are 3x larger than lateral_slip predicts" in words
+    assert "write lateral_slip: 0.015 (m/sqrt(s))" in words
+    assert "vertical_slip: 0.01 " in warnings("vertical slip", 4.0) and "wheel_noise: 0.06 " in warnings("wheels", 4.0)
+    assert "use factor: increments" in warnings("yaw", 4.0) and "yaw residuals of wheel0" in warnings("yaw", 4.0)
     assert warnings("lateral slip", 1.9) == "" and warnings("lateral slip", 5.0, dof=30.0) == ""
     # Few degrees of freedom, which are sampled: 30 of 400 rows may as well be 90.
-    assert "slips sideways at least 1.7 times as much" in warnings("lateral slip", 9.0, dof=30.0)
+    assert "at least 1.7x larger" in warnings("lateral slip", 9.0, dof=30.0)
+
+
+@pytest.mark.parametrize("kind", ["lateral slip", "wheels", "yaw"])
+def test_no_other_size_is_advised_where_residuals_are_no_noise(kind: str):
+    words = warnings(kind, 9.0, white=False)
+    assert "no white noise" in words and "write" not in words
 
 
 def test_more_noise_of_other_kinds_of_wheels_is_warned_of():
     yaw = warnings("yaw", 4.0, measures="twist")
-    assert "the yaw rates of wheel0 leave residuals 2 times" in yaw and "0.02 rad/sqrt(s) would fit." in yaw
-    assert "0.004 m/sqrt(s) would fit" in warnings("speed", 4.0, measures="twist")
-    assert "0.002 rad/sqrt(Hz) would fit, or more lateral_slip" in warnings("steering", 4.0, drive="ackermann")
-    assert "the wheel of wheel0 turned" in warnings("wheel", 4.0, drive="ackermann")
-    assert "not parallel to its ground by 2 times as much as tilt_noise" in warnings("ground tilt", 4.0)
-    assert "not at one height over its ground by 3 times as much as bump_noise" in warnings("ground height", 9.0)
+    assert "yaw rates residuals of wheel0 are 2x larger" in yaw and "yaw_noise: 0.02 (rad/sqrt(s))" in yaw
+    assert "speed_noise: 0.004 (m/sqrt(s))" in warnings("speed", 4.0, measures="twist")
+    assert "steering_noise: 0.002 (rad/sqrt(Hz))" in warnings("steering", 4.0, drive="ackermann")
+    assert "wheel angles residuals of wheel0" in warnings("wheel", 4.0, drive="ackermann")
+    assert "tilts against its ground 2x more than tilt_noise predicts" in warnings("ground tilt", 4.0)
+    assert "moves up and down over its ground 3x more than bump_noise" in warnings("ground height", 9.0)
 
 
 def test_more_range_noise_than_given_is_warned_of():
-    assert "2 times as far from their planes" in warnings("points", 4.0, sensor="lidar0")
+    assert "2x larger than its range_noise predicts" in warnings("points", 4.0, sensor="lidar0")
     assert warnings("points", 4.0, sensor="lidar0", noise=None) == ""

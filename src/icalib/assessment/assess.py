@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from scipy.special import ndtr, stdtrit
 
-from icalib.assessment.cameras import mixed_up, other_lens, plane_warnings
+from icalib.assessment.all_causes import Judged, all_causes
+from icalib.assessment.cameras import plane_warnings
 from icalib.assessment.guesses import guess_notes
 from icalib.assessment.held_out import held_out
 from icalib.assessment.images import corner_residuals, track_residuals
 from icalib.assessment.labels import UNITS, labels_of
 from icalib.assessment.lens_models import lens_warnings
-from icalib.assessment.misfit import far_beyond, misfits
+from icalib.assessment.misfit import scatter_warnings
 from icalib.assessment.notes import notes
 from icalib.assessment.robot import (
     lidar_residuals,
@@ -25,13 +25,10 @@ from icalib.assessment.robot import (
     pose_warnings,
     wheel_residuals,
 )
-from icalib.assessment.size import felt_size, is_certain, size_words
-from icalib.assessment.stated import stated_warnings
 from icalib.assessment.twin_lenses import twin_lens_notes
 from icalib.assessment.upwards import upwards_warnings
 from icalib.calibration import (
     Calibration,
-    CrossValidation,
     ImuResiduals,
     Iteration,
     ParameterGroup,
@@ -44,11 +41,10 @@ from icalib.calibration import (
 from icalib.calibration.verdict import by_size
 from icalib.estimation.assembly import image_times
 from icalib.estimation.border import restricted_inverse
-from icalib.estimation.contradictions import Contradiction, contradictions, worst_off
+from icalib.estimation.contradictions import Contradiction
 from icalib.estimation.determination import Determined
 from icalib.estimation.estimate import Estimate
 from icalib.estimation.evidence import Fit, fits, raw_rms, split_covariance, split_expectation
-from icalib.estimation.fixed_lens import lens_steps
 from icalib.estimation.gauge import IN_THE_WORLD
 from icalib.estimation.imu_model import LABELS as IMU_LABELS
 from icalib.estimation.inputs import Inputs, origin_difference
@@ -56,20 +52,15 @@ from icalib.estimation.outcome import Visit
 from icalib.estimation.parts import Parts
 from icalib.estimation.places import cluster_covariances
 from icalib.estimation.problem import Problem
-from icalib.estimation.relaxed import relaxed
 from icalib.estimation.state import Block, State
-from icalib.estimation.surfaces import ON_PLANES
 from icalib.observability import Observability, observe
 from icalib.provenance import versions
 from icalib.rig import DRIVE_SIZES
 from icalib.rig_file import rig_to_dict
 from icalib.timeline import Timeline
 
-LARGE_FACTOR = 3.0
 MOST_LEVERAGE = 4.0  # of the variance: one part knows nearly all beyond, and the spread of the others nothing
 ENOUGH_PARTS = 8  # from so many on, t differs from the normal distribution by 8 % at most
-SEEN = ("corners", "features")
-BEYOND_FACTOR = 1.5  # times the largest factor: what halves say of each other is worth a warning
 LARGE_BLOOM_PX = 0.8  # ink and overexposure move edges by a third of that
 
 
@@ -88,13 +79,15 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
     held = held_out(parts, [s for s in (inputs.rig.body,) if _is_assumed(inputs, s)])
     timeline = Timeline.of(inputs.parts, image_times(inputs, outcome.state.values))
     factors = _factors(inputs, groups)
-    stated = _about_stated(found, groups, judged, factors.max(initial=1.0), inputs, against)
+    factor = factors.max(initial=1.0)
     trajectory, poses = _trajectory(inputs, outcome.state, timeline), pose_residuals(inputs, found, timeline)
+    causes, size_notes = all_causes(Judged(inputs, found, groups, judged, factor, parts, timeline), against)
+    wrong = tuple(c.sentence for c in causes if c.grave)
     warnings = (
-        *stated.size,
-        *stated.contradicted,
-        *_warnings(inputs, found, groups, [f for f in judged if not against or f.kind in SEEN], poses),
-        *_factor_warnings(factors, parts is not None, held),
+        *wrong,
+        *(c.sentence for c in causes if not c.grave),
+        *_warnings(inputs, found, groups, poses),
+        *scatter_warnings(factors, parts is not None, held),
     )
     return Calibration(
         groups=groups,
@@ -108,12 +101,12 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
         iterations=tuple(Iteration(n, s.cost, s.predicted_decrease, s.damping, s.accepted) for n, s in found.steps),
         converged=outcome.converged,
         status=outcome.status,
-        warnings=(*stated.wrong, *(w for w in warnings if w not in stated.wrong)),
+        warnings=tuple(dict.fromkeys(warnings)),
         notes=(
             *notes(inputs, found, timeline),
             *twin_lens_notes(inputs, found, judged),
             *guess_notes(inputs, groups),
-            *stated.size_notes,
+            *size_notes,
             *few_parts_notes(inputs, parts),
         ),
         rig=rig_to_dict(inputs.asked or inputs.rig),
@@ -127,48 +120,8 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
         pose_residuals=poses,
         track_residuals=track_residuals(found, timeline),
         cross_validation=held,
-        wrong=stated.wrong,
+        wrong=wrong,
     )
-
-
-class _AboutStated(NamedTuple):
-    """Sentences on what the rig file states. wrong: what says that a result is not to be used; warnings of the target's
-    size, and of what is contradicted; size_notes."""
-
-    wrong: tuple[str, ...]
-    size: tuple[str, ...]
-    contradicted: tuple[str, ...]
-    size_notes: tuple[str, ...]
-
-
-def _about_stated(
-    found: Estimate,
-    groups: tuple[ParameterGroup, ...],
-    judged: Sequence[SensorFit],
-    factor: float,
-    inputs: Inputs,
-    against: Sequence[Contradiction],
-) -> _AboutStated:
-    """factor: times which formal standard deviations count; against: as of `assess`."""
-    size = felt_size(found, factor)
-    wrong_size, size_notes = ((), ()) if against else size_words(inputs, size)
-    mixed = mixed_up(inputs.rig.cameras, groups)
-    # What others complain of may come of a wrong size, or of an accelerometer's scale: then that is the news.
-    certain, explained = is_certain(size), bool(against)
-    stated = None if explained else relaxed(inputs, found)
-    lenses = () if certain else other_lens(inputs.rig.cameras, lens_steps(inputs, stated), factor)
-    against = against or contradictions(inputs, stated, max(factor, _misfit(judged)))
-    if certain:  # a wrong size moves lever arms by some of their length
-        against = tuple(c for c in against if worst_off(c.key[1], c.off) > 1.0)
-    beyond = () if wrong_size or explained else far_beyond(inputs.rig, judged)
-    contradicted = tuple(stated_warnings(inputs, against, groups))
-    known = (*contradicted, *wrong_size) if certain or explained else ()
-    return _AboutStated((*known, *mixed, *lenses, *beyond), wrong_size, contradicted, size_notes)
-
-
-def _misfit(judged: Iterable[SensorFit]) -> float:
-    """Times which the residuals of some sensor are as large as their noise says; at least 1."""
-    return float(np.sqrt(max([1.0, *(f.chi2_per_dof or 1.0 for f in judged)])))
 
 
 def _rates(inputs: Inputs) -> dict[str, float]:
@@ -346,19 +299,12 @@ def _imu_residuals(found: Estimate, trajectory: Trajectory) -> ImuResiduals:
 
 
 def _warnings(
-    inputs: Inputs,
-    found: Estimate,
-    groups: tuple[ParameterGroup, ...],
-    judged: list[SensorFit],
-    poses: tuple[PoseResiduals, ...],
+    inputs: Inputs, found: Estimate, groups: tuple[ParameterGroup, ...], poses: tuple[PoseResiduals, ...]
 ) -> Iterator[str]:
     if not found.outcome.converged:
         yield f"the solver did not converge: {found.outcome.status}"
     yield from inputs.measurements.warnings
-    few = tuple(plane_warnings(inputs.rig, found.problem.features))
-    # How far off those are that lie on planes by chance means nothing.
-    yield from misfits(inputs.rig, [f for f in judged if not (few and f.kind == ON_PLANES)])
-    yield from few
+    yield from plane_warnings(inputs.rig, found.problem.features)
     yield from lens_warnings(inputs, found)
     yield from pose_warnings(poses, inputs.rig)
     yield from upwards_warnings(inputs, found)
@@ -376,23 +322,3 @@ def _factors(inputs: Inputs, groups: tuple[ParameterGroup, ...]) -> np.ndarray:
     """(n,) empirical factors of what users take away."""
     own = (g for g in groups if g.mode != "fixed" and inputs.is_sensor(g.sensor) and g.name != "bloom")
     return np.concatenate([np.ones(0), *(g.factor for g in own if g.factor is not None)])
-
-
-def _factor_warnings(factors: np.ndarray, split: bool, held: CrossValidation | None):
-    """`factors`: of what users take away; `split`: whether they are from parts of the recording."""
-    if len(factors) and factors.max() > LARGE_FACTOR:
-        yield (
-            f"parts of the recording disagree by up to {factors.max():.1f} times what noise explains; the "
-            "standard deviations here include that factor, those of other programs would not."
-        )
-    if held is not None and len(factors) and held.optimistic and held.factor > BEYOND_FACTOR * factors.max():
-        yield (
-            f"one half of the recording predicts the other {held.factor:.1f} times worse than noise explains, and "
-            f"the standard deviations here are only {factors.max():.1f} times the formal ones: take them for too "
-            "small, and look for what changed while recording."
-        )
-    if not split:
-        yield (
-            "the recording is too short to be split (or splits are off): standard deviations are formal and too small, "
-            "for they include white noise alone, and no errors that measurements of one time or place share."
-        )

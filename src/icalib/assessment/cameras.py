@@ -43,32 +43,36 @@ def plane_warnings(rig: Rig, features: FeatureFactor | None) -> Iterator[str]:
         )
 
 
-def camera_warnings(rig: Rig, judged: Sequence[SensorFit]) -> Iterator[str]:
-    """What corners leave, and points on planes, one sentence each."""
-    stated = {c.name for c in rig.cameras if c.corner_noise_px is not None}
-    for f in judged:
-        if f.kind in ("corners", "features") and f.rejected > MANY_REJECTED * 0.5 * f.count:
-            share = f.rejected / (f.rejected + 0.5 * f.count)
-            yield f"{share:.0%} of the {f.kind} of {f.sensor} were set aside; look at its residuals in the report."
-        if f.kind == ON_PLANES and excess(f) > 1.0:
-            yield (
-                f"points that {f.sensor} follows lie {times(f)} as far from planes of the LiDARs as points_on_planes_m "
-                "in the rig file says: make it larger, or take it out where little is flat."
-            )
-        if f.kind != "corners":
-            continue
-        if f.sensor in stated and excess(f) > 1.0:
-            yield (
-                f"the corners of {f.sensor} are off by {times(f)} as much as its corner_noise in the rig file says: "
-                "its camera model, intrinsics that are fixed or its topic may be wrong; if not, leave corner_noise "
-                "out, and it is estimated."
-            )
-        if f.rms is not None and f.rms > POOR_FIT_PX:
-            yield (
-                f"the corners of {f.sensor} fit to {f.rms:.1f} px only, while detectors are good to a tenth of that: "
-                "its camera model, intrinsics that are fixed, its topic, or the target in the rig file may be wrong, "
-                "its clock have jumped, or its images be blurred."
-            )
+def rejected_words(f: SensorFit) -> str | None:
+    """A sentence where many corners or tracks of a camera are rejected."""
+    if f.kind not in ("corners", "features") or f.rejected <= MANY_REJECTED * 0.5 * f.count:
+        return None
+    share = f.rejected / (f.rejected + 0.5 * f.count)
+    return f"{share:.0%} of the {f.kind} of {f.sensor} are rejected as outliers; look at its residuals in the report."
+
+
+def camera_misfit(rig: Rig, f: SensorFit) -> str | None:
+    """A sentence where corners, or points on planes, leave more than is stated, or than detectors are off by."""
+    if f.kind == ON_PLANES and excess(f) > 1.0:
+        return (
+            f"tracked points of {f.sensor} lie {times(f)} farther from planes of the LiDARs than points_on_planes_m "
+            "predicts; make it larger, or take it out where little is flat."
+        )
+    if f.kind != "corners":
+        return None
+    if f.rms is not None and f.rms > POOR_FIT_PX:
+        return (
+            f"the corners of {f.sensor} fit to {f.rms:.1f} px only, ten times the error of a detector, and the cause "
+            "is unknown. Check its camera model, fixed intrinsics, its topic, the target in the rig file, jumps of its "
+            "clock, and blur of its images."
+        )
+    if excess(f) > 1.0 and f.sensor in {c.name for c in rig.cameras if c.corner_noise_px is not None}:
+        return (
+            f"residuals of the corners of {f.sensor} are {times(f)} larger than its corner_noise predicts, and the "
+            "cause is unknown. Check its camera model, fixed intrinsics and its topic; if all are right, leave "
+            "corner_noise out, and it is estimated."
+        )
+    return None
 
 
 def mixed_up(cameras: Sequence[Camera], groups: Sequence[ParameterGroup]) -> Iterator[str]:
@@ -79,13 +83,14 @@ def mixed_up(cameras: Sequence[Camera], groups: Sequence[ParameterGroup]) -> Ite
         crossed = _away(a, found, b.name), _away(b, found, a.name)
         if max(own) > FAR and max(crossed) < MUCH_NEARER * max(own):
             yield (
-                f"{a.name} and {b.name} seem to be mixed up: each is found about where the rig file has the other; "
-                "correct their topics or paths, or the values that the rig file gives."
+                f"{a.name} and {b.name} seem to be swapped: the pose and lens of each fit what the rig file gives of "
+                "the other. Correct their topics or paths, or the values in the rig file."
             )
 
 
-def other_lens(cameras: Sequence[Camera], steps: Sequence[LensStep], factor: float) -> Iterator[str]:
-    """Cameras whose intrinsics the rig file fixes at what cannot be theirs; `factor`: the largest empirical one."""
+def other_lens(cameras: Sequence[Camera], steps: Sequence[LensStep], factor: float) -> Iterator[tuple[str, float]]:
+    """Cameras whose intrinsics the rig file fixes at what cannot be theirs, and by how much chi^2 falls without that;
+    `factor`: the largest empirical one."""
     given = {c.name: c.intrinsics.value for c in cameras}
     for found in steps:
         value = given[found.camera]
@@ -102,10 +107,11 @@ def other_lens(cameras: Sequence[Camera], steps: Sequence[LensStep], factor: flo
                 n for n, v in given.items() if v is not None and max(abs(value + found.step - v)) < NEARER * max(off)
             ]
             hint = f" Those of {nearer[0]} are nearer." if nearer else ""
-            yield (
+            sentence = (
                 f"the intrinsics of {found.camera} that the rig file fixes do not fit its images, which want {where}: "
                 f"check that they are this camera's, at this resolution, or leave them free.{hint}"
             )
+            yield sentence, float(((found.step / found.std) ** 2).max())
 
 
 def _away(camera: Camera, found: dict[tuple[str, str], np.ndarray], name: str) -> float:

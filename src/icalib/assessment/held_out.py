@@ -13,11 +13,11 @@ from icalib.estimation.problem import Problem
 
 def held_out(parts: Parts | None, assumed: Collection[str]) -> CrossValidation | None:
     """None where the recording cannot be split, or its halves share nothing that both know. Sensors that are `assumed`
-    have no fits."""
+    have no fits; none has, where the solutions of the halves are too far apart for residuals to mean anything."""
     found = None if parts is None else predict(parts)
     if parts is None or found is None:
         return None
-    fits = tuple(f for f in _fits(parts.problem, found) if f.sensor not in assumed)
+    fits = tuple(f for f in _fits(parts.problem, found) if f.sensor not in assumed) if found.linear else ()
     spread = shifts(parts)
     return CrossValidation(
         parts.count, found.directions, found.excess, found.expected, found.spread, fits, spread.moved, spread.expected

@@ -6,41 +6,87 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from icalib.assessment.cameras import camera_warnings
-from icalib.assessment.robot import robot_warnings
-from icalib.calibration import SensorFit
-from icalib.calibration.excess import dof_known, excess, times
-from icalib.rig import Rig
+from icalib.assessment.cameras import camera_misfit, rejected_words
+from icalib.assessment.causes import FAR_BEYOND, INERTIAL, Cause, Misfit, noise_words, unknown_words
+from icalib.assessment.robot import robot_misfit
+from icalib.calibration import CrossValidation, SensorFit
+from icalib.calibration.excess import dof_known, excess
+from icalib.estimation.estimate import Estimate
+from icalib.estimation.inputs import Inputs
+from icalib.estimation.noise_size import are_noise, fitting_noise
 
 SMALL_CHI2 = 0.5  # per post-fit degree of freedom: below this it is worth a warning
-# Times as large as their noise. With IMU noise ten times too small, in simulation, residuals are 3 to 5 times as large,
-# and errors up to 12 standard deviations.
-FAR_BEYOND = 4.0
+LARGE_FACTOR = 3.0
+BEYOND_FACTOR = 1.5  # times the largest factor: what halves say of each other is worth a warning
 
 
-def misfits(rig: Rig, judged: Sequence[SensorFit]) -> Iterator[str]:
-    """What residuals say against the rig file, one sentence each."""
+def misfit_causes(inputs: Inputs, found: Estimate, judged: Sequence[SensorFit], explained: bool) -> Iterator[Cause]:
+    """What is said of the misfit itself: that a cause which is named explains it, that the noise of the IMU is another
+    than stated, which field of the rig file it contradicts, or that the cause is unknown."""
     for f in judged:
-        if f.kind in ("gyroscope", "accelerometer"):
-            yield from _imu_noise_warnings(f)
-    yield from camera_warnings(rig, judged)
-    yield from robot_warnings(rig, judged)
-
-
-def far_beyond(rig: Rig, judged: Sequence[SensorFit]) -> tuple[str, ...]:
-    """Those of `misfits` with which standard deviations mean nothing."""
-    return tuple(misfits(rig, [f for f in judged if excess(f) >= FAR_BEYOND]))
-
-
-def _imu_noise_warnings(f: SensorFit) -> Iterator[str]:
-    ratio = f.chi2 / max(f.dof, 1.0)
-    if excess(f) > 1.0:
-        size, word = times(f), "larger"
-    elif dof_known(f) and ratio < SMALL_CHI2:
-        size, word = f"{np.sqrt(ratio):.2g} times", "smaller"
-    else:
+        if sentence := rejected_words(f):
+            yield Cause(sentence, 0.0)
+    misfit = Misfit.of(judged)
+    if explained:
+        if misfit.fits:
+            yield Cause(f"residuals are larger than the stated noise predicts: {misfit.words}.", 0.0)
         return
-    yield (
-        f"the {f.kind} of {f.sensor} leaves residuals {size} as large as its noise in the rig file says; a {word} "
-        "noise density would fit."
-    )
+    yield from _of_imu(inputs, found, judged, misfit)
+    for f in judged:
+        if sentence := camera_misfit(inputs.rig, f) or robot_misfit(inputs.rig, f, _is_noise(found, f)):
+            yield Cause(sentence, max(f.chi2 - f.dof, 0.0), excess(f) >= FAR_BEYOND)
+
+
+def _of_imu(inputs: Inputs, found: Estimate, judged: Sequence[SensorFit], misfit: Misfit) -> Iterator[Cause]:
+    """Advice on the noise only where it is tested: white residuals, constant over the recording."""
+    own = [f for f in judged if f.kind in INERTIAL]
+    large, small = any(excess(f) > 1.0 for f in own), [f for f in own if _is_small(f)]
+    if not (large or small) or inputs.rig.imu is None:
+        return
+    noise = fitting_noise(inputs, found) if found.outcome.converged else None
+    if large and noise is not None and noise.is_as_stated and noise.explains:
+        return  # another sensor's noise makes the residuals of the IMU large
+    if large and noise is not None and noise.explains:
+        yield Cause(noise_words(inputs, noise), Misfit.of(own).chi2, Misfit.of(own).is_grave)
+    elif large:
+        yield Cause(unknown_words(misfit, noise), misfit.chi2, misfit.is_grave)
+    elif noise is not None and noise.explains:
+        yield Cause(noise_words(inputs, noise), 0.0)
+    else:
+        sizes = " and ".join(f"{f.kind} {np.sqrt(max(f.chi2, 0.0) / f.dof):.2g}x" for f in small)
+        yield Cause(
+            f"residuals of {inputs.rig.imu.name} are smaller than the stated noise predicts ({sizes}); standard "
+            "deviations are too large, if anything.",
+            0.0,
+        )
+
+
+def _is_noise(found: Estimate, f: SensorFit) -> bool:
+    """Whether residuals of wheels or poses are white, and constant over the recording."""
+    for factor, out in zip(found.problem.sensors, found.outcome.residuals.sensors, strict=True):
+        if factor.name == f.sensor and f.kind in factor.kinds:
+            return are_noise((out.residual * out.root)[:, factor.kinds[f.kind]])
+    return False
+
+
+def _is_small(f: SensorFit) -> bool:
+    return dof_known(f) and f.chi2 / max(f.dof, 1.0) < SMALL_CHI2
+
+
+def scatter_warnings(factors: np.ndarray, split: bool, held: CrossValidation | None) -> Iterator[str]:
+    """`factors`: of what users take away; `split`: whether they are from segments of the recording."""
+    if len(factors) and factors.max() > LARGE_FACTOR:
+        yield (
+            f"estimates from segments of the recording scatter {factors.max():.1f}x more than predicted; the printed "
+            "standard deviations are inflated accordingly."
+        )
+    if held is not None and len(factors) and held.optimistic and held.factor > BEYOND_FACTOR * factors.max():
+        yield (
+            f"one half of the recording predicts the other {held.factor:.1f}x worse than noise explains, and the "
+            f"printed standard deviations are only {factors.max():.1f}x the formal ones: they are too small."
+        )
+    if not split:
+        yield (
+            "the recording is too short for segments (or segments are off): standard deviations are formal and too "
+            "small, as they include white noise only. Record longer."
+        )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -305,60 +305,49 @@ def _sight_warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
         )
 
 
-def robot_warnings(rig: Rig, judged: Sequence[SensorFit]) -> Iterator[str]:
-    """Where points or wheels leave more than their noise explains."""
-    lidars = {x.name: x for x in rig.lidars}
-    poses = {x.name: x for x in rig.poses}
+def robot_misfit(rig: Rig, f: SensorFit, is_noise: bool) -> str | None:
+    """A sentence where points, poses or wheels leave more than the rig file states. is_noise: residuals are white, and
+    constant over the recording; only then another size of the noise is advised."""
+    if excess(f) == 1.0:
+        return None
     wheels = {w.name: w for w in rig.wheels}
-    for f in judged:
-        if excess(f) == 1.0:
-            continue
-        if f.sensor in lidars and lidars[f.sensor].range_noise_m is not None:
-            yield (
-                f"the points of {f.sensor} lie {times(f)} as far from their planes as its range_noise in the rig file "
-                "says; leave it out, and it is estimated."
-            )
-        if f.sensor in poses:
-            yield f"the {f.kind} of {f.sensor} leaves residuals {times(f)} as large as its noise in the rig file says."
-        if f.sensor in wheels:
-            yield _wheel_words(f.kind, wheels[f.sensor], times(f), excess(f))
+    if f.sensor in {x.name for x in rig.lidars if x.range_noise_m is not None}:
+        return (
+            f"residuals of the points of {f.sensor} are {times(f)} larger than its range_noise predicts; leave it out, "
+            "and it is estimated."
+        )
+    if f.sensor in {x.name for x in rig.poses}:
+        advice = "leave it out, and it is estimated" if is_noise else UNKNOWN
+        return f"{f.kind} residuals of {f.sensor} are {times(f)} larger than its stated noise predicts; {advice}."
+    return _wheel_words(f, wheels[f.sensor], is_noise) if f.sensor in wheels else None
 
 
+UNKNOWN = "they are no white noise, and the cause is unknown: check its clock and mount, and record again, slower"
 # Of rows of wheels: what they are, the field of the rig file that says how far off they may be, and its unit.
 _ROWS = {
-    "wheels": ("angles that {} turned leave", "wheel_noise", "rad/sqrt(s)", ", if the wheels do not slip forwards"),
-    "wheel": ("angles that the wheel of {} turned leave", "wheel_noise", "rad/sqrt(s)", ", if it does not slip"),
-    "speed": ("speeds of {} leave", "speed_noise", "m/sqrt(s)", ""),
-    "yaw": ("yaw rates of {} leave", "yaw_noise", "rad/sqrt(s)", ""),
-    "steering": ("steering angles of {} leave", "steering_noise", "rad/sqrt(Hz)", ", or more lateral_slip"),
+    "wheels": ("wheel angles", "wheel_noise", "rad/sqrt(s)"),
+    "wheel": ("wheel angles", "wheel_noise", "rad/sqrt(s)"),
+    "speed": ("speeds", "speed_noise", "m/sqrt(s)"),
+    "yaw": ("yaw rates", "yaw_noise", "rad/sqrt(s)"),
+    "steering": ("steering angles", "steering_noise", "rad/sqrt(Hz)"),
+    "lateral slip": ("lateral slip", "lateral_slip", "m/sqrt(s)"),
+    "vertical slip": ("vertical slip", "vertical_slip", "m/sqrt(s)"),
 }
 
 
-def _wheel_words(kind: str, wheels: Wheels, times: str, root: float) -> str:
-    if kind in (TILT, HEIGHT):
-        field = "tilt_noise" if kind == TILT else "bump_noise"
-        what = "not parallel to" if kind == TILT else "not at one height over"
+def _wheel_words(f: SensorFit, wheels: Wheels, is_noise: bool) -> str:
+    if f.kind in (TILT, HEIGHT):
+        field = "tilt_noise" if f.kind == TILT else "bump_noise"
+        what = "tilts against" if f.kind == TILT else "moves up and down over"
         return (
-            f"{wheels.name} is {what} its ground by {times} as much as {field} in the rig file says, as where it "
-            "drives over ramps or the ground is another plane; take ground out, or part of it."
+            f"{wheels.name} {what} its ground {times(f)} more than {field} predicts, as on ramps or where the ground "
+            "is another plane; take ground out, or that part of the recording."
         )
-    if kind == "lateral slip":
-        return (
-            f"{wheels.name} slips sideways {times} as much as its lateral_slip in the rig file allows, so yaw and "
-            f"position look better known than they are; {root * wheels.lateral_slip:.2g} m/sqrt(s) would fit."
-        )
-    if kind == "vertical slip":
-        return (
-            f"{wheels.name} leaves the ground {times} as much as its vertical_slip in the rig file allows, so pitch "
-            f"looks better known than it is; {root * wheels.vertical_slip:.2g} m/sqrt(s) would fit."
-        )
-    if kind in _ROWS and (kind, wheels.kind) != ("yaw", "pair"):  # the paper's relative poses have a yaw, too
-        what, field, unit, unless = _ROWS[kind]
-        return (
-            f"the {what.format(wheels.name)} residuals {times} as large as its {field} in the rig file says; "
-            f"{root * getattr(wheels, field):.2g} {unit} would fit{unless}."
-        )
-    return (
-        f"the {kind} of {wheels.name} leaves residuals {times} as large as its noise says; larger wheel_noise or "
-        "lateral_slip would fit, or the increments factor."
-    )
+    relative = f.kind == "yaw" and wheels.kind == "pair"  # the paper's relative poses have a yaw, too
+    what, field, unit = _ROWS.get("" if relative else f.kind, (f.kind, "", ""))
+    words = f"{what} residuals of {wheels.name} are {times(f)} larger than {field or 'its noise'} predicts"
+    if not is_noise:
+        return f"{words}, and are no white noise, as where wheels skid; take such parts out, or drive slower."
+    if not field:
+        return f"{words}; use factor: increments."
+    return f"{words}; write {field}: {excess(f) * getattr(wheels, field):.2g} ({unit}) and calibrate again."

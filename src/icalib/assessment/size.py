@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from icalib.errors import EstimationError
@@ -47,3 +49,15 @@ def size_words(inputs: Inputs, size: TargetSize | None) -> tuple[tuple[str, ...]
         "the rig file, or if that is right calibrate the accelerometer, whose scale is off."
     )
     return (warning,), ()
+
+
+def scale_notes(inputs: Inputs, size: TargetSize | None) -> Iterator[str]:
+    """What all lengths rest on, where that is one thing only."""
+    rig, source = inputs.rig, None
+    seeing = [c.name for c in rig.cameras]
+    if rig.has_target and seeing and size is None and not (rig.lidars or rig.wheels or rig.poses):
+        source = "the size of the target in the rig file"
+    elif not rig.has_target and rig.assumes_motion and not rig.lidars and (rig.poses or rig.wheels):
+        source = f"the positions of {rig.poses[0].name}" if rig.poses else f"the wheel sizes of {rig.wheels[0].name}"
+    if source is not None:
+        yield f"every length comes from {source} alone: 1 % error there is 1 % in every translation here."

@@ -18,13 +18,9 @@ from icalib.rig import Wheels
 SMALLEST_SHARE, LARGEST_SHARE = 1.0 / 25.0, 4.0
 
 
-def stated_warnings(
-    inputs: Inputs, against: Sequence[Contradiction], groups: Sequence[ParameterGroup]
-) -> Iterator[str]:
-    """One sentence for each group that is contradicted, and for wheels whose size cannot be."""
+def absurd_wheels(inputs: Inputs, against: Sequence[Contradiction], groups: Sequence[ParameterGroup]) -> Iterator[str]:
+    """One sentence for each set of wheels whose size cannot be, where it contradicts no stated value."""
     found = {(g.sensor, g.name): g for g in groups}
-    for c in against:
-        yield stated_words(inputs, c)
     named = {c.key[0] for c in against}
     for wheels in inputs.rig.wheels:
         if wheels.kind == "pair" and wheels.name not in named:

@@ -28,5 +28,5 @@ def excess(fit: SensorFit) -> float:
 
 
 def times(fit: SensorFit) -> str:
-    """The same in words."""
-    return f"{'' if dof_known(fit) else 'at least '}{excess(fit):.2g} times"
+    """The same in words: "3.3x"."""
+    return f"{'' if dof_known(fit) else 'at least '}{excess(fit):.2g}x"

@@ -104,8 +104,7 @@ def _unexplained(c: Calibration) -> Iterator[str]:
     names = [name for name, verdict in _components(c) if verdict == "undetermined"]
     if names and not c.undetermined:
         yield (
-            f"{_listed(names)}: undetermined, for the standard deviation exceeds {UNDETERMINED:.0f} tolerances; record "
-            "longer, with more motion about every axis and more of the target in view."
+            f"{_listed(names)}: undetermined, the standard deviation exceeds {UNDETERMINED:.0f} tolerances; {_more(c)}."
         )
 
 
@@ -113,9 +112,21 @@ def _weak(c: Calibration) -> Iterator[str]:
     names = [name for name, verdict in _components(c) if verdict == "weak"]
     if names:
         yield (
-            f"{_listed(names)}: weakly determined, the standard deviation exceeds the tolerance; record longer with "
-            "more motion, or accept that size."
+            f"{_listed(names)}: weakly determined, the standard deviation exceeds the tolerance; {_more(c)}, or accept "
+            "that size."
         )
+
+
+def _more(c: Calibration) -> str:
+    """What makes standard deviations smaller, for this rig."""
+    if c.wheels:
+        return "drive longer, with turns both ways, and brake and speed up"
+    if c.imu is None and c.cameras:
+        images = sum(len(r.seconds) for r in c.image_residuals)
+        return f"the result rests on {images} images: take more, near and far, tilted, and in every part of the image"
+    if c.imu is None:
+        return "record more poses, turned about more axes"
+    return "record longer, and turn and move about every axis"
 
 
 def _components(c: Calibration) -> Iterator[tuple[str, Verdict]]:

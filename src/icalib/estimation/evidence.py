@@ -111,7 +111,7 @@ def _spent(problem: Problem, outcome: Outcome, draw: Draw) -> dict[tuple[str, st
     """|J_s x|^2 of each sensor for one draw x."""
     state, base = outcome.state, outcome.residuals
     ends = [state.retract(problem.layout, s * draw.chain, s * draw.border) for s in (DRAW_STEP, 0.0)]
-    there = _residuals(problem, ends[0])
+    there = bare_residuals(problem, ends[0])
     along = (there.imu - base.imu) / DRAW_STEP
     spent = {(problem.chain.name, k): float((along[:, r] ** 2).sum()) for k, r in problem.chain.kinds.items()}
     for camera, out in zip(problem.cameras, base.corners, strict=True):
@@ -126,7 +126,7 @@ def _spent(problem: Problem, outcome: Outcome, draw: Draw) -> dict[tuple[str, st
     return spent
 
 
-def _residuals(problem: Problem, state: State) -> Residuals:
+def bare_residuals(problem: Problem, state: State) -> Residuals:
     """Those at `state`, corners aside."""
     bare = replace(problem, cameras=())
     out = bare.residuals()

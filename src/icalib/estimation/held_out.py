@@ -24,6 +24,7 @@ from icalib.estimation.parts import Parts
 from icalib.estimation.problem import Residuals
 
 LEAST_PART = 1e-6  # of a direction: shorter ones are rounding
+LINEAR = 0.1  # of the excess: what it may be off by where the step of the other half is short enough
 
 
 @dataclass(frozen=True)
@@ -31,9 +32,13 @@ class Prediction:
     """How well each half of the parts, every other one, is predicted by the other half.
 
     directions: how many of the border both halves know, the rest being found in each half for itself; excess: by how
-    much chi^2 is higher where they are the other half's than where they are those of both; expected, spread: mean and
-    standard deviation of that for noise of the stated sizes. inside, outside: residuals with the solution of both, and
-    with the other half's.
+    much chi^2 is higher where they are the other half's than where they are those of both, by the quadratic form above;
+    expected, spread: mean and standard deviation of that form for noise of the stated sizes. inside, outside: residuals
+    with the solution of both, and with the other half's; linear: whether these rise as much as the form says.
+
+    Measured residuals are no test statistic: a half that knows a plane or a mount to some tolerances only sends the
+    other one so far that residuals leave the quadratic form, by any amount, with nothing wrong. The form has the mean
+    and the spread that are stated.
     """
 
     directions: int
@@ -42,6 +47,7 @@ class Prediction:
     spread: float
     inside: Residuals
     outside: Residuals
+    linear: bool
 
 
 class Half(NamedTuple):
@@ -78,7 +84,9 @@ def predict(parts: Parts) -> Prediction | None:
         rest = half.rest @ np.vstack([known, np.ones(2)])
         steps.append(free @ (shared @ known + own @ rest))
     costs, inside, outside = _evaluate(parts, steps)
-    return Prediction(shared.shape[1], 2.0 * float(costs[1] - costs[0]), found.mean, found.std, inside, outside)
+    bent = abs(2.0 * float(costs[1] - costs[0]) - found.value)
+    linear = bent < max(found.std, LINEAR * abs(found.value))
+    return Prediction(shared.shape[1], found.value, found.mean, found.std, inside, outside, linear)
 
 
 def halves_of(sums: np.ndarray, free: np.ndarray) -> tuple[list[Half], np.ndarray, np.ndarray]:

@@ -9,7 +9,7 @@ import numpy as np
 from icalib.calibration import Calibration, CrossValidation, ParameterGroup, PredictedFit
 from icalib.calibration.quantities import shown, shown_groups
 from icalib.report.plot import Figure, axis, dots, figure, line
-from icalib.report.tables import Html, table
+from icalib.report.tables import Html, element, table
 
 ROW_PX = 17
 _ALLOWED = "#94a3b8"
@@ -52,6 +52,8 @@ def _which(held: CrossValidation, names: list[str]) -> list[str]:
 
 def predicted_fits(held: CrossValidation) -> Html:
     """Each kind of residual where it took part, and where the other half predicts it."""
+    if not held.fits:
+        return element("p", "Each half alone leaves parameters so loose that its residuals in the other mean nothing.")
     whitened, raw = "whitened RMS, took part", "RMS, took part"
     headers = ("sensor", "kind", "residuals", whitened, "predicted", raw, "predicted", "more chi2")
     body = [_row(f) for f in held.fits if f.count]

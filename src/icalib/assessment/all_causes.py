@@ -1,0 +1,92 @@
+"""All that may be wrong with a result, ranked: what the rig file states, what changes, and the misfit itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.assessment.cameras import mixed_up, other_lens, plane_warnings
+from icalib.assessment.causes import Cause, Misfit, changing, explaining, ranked
+from icalib.assessment.misfit import LARGE_FACTOR, misfit_causes
+from icalib.assessment.size import felt_size, is_certain, scale_notes, size_words
+from icalib.assessment.stated import absurd_wheels, stated_words
+from icalib.calibration import ParameterGroup, SensorFit
+from icalib.estimation.contradictions import Contradiction, contradictions, worst_off
+from icalib.estimation.estimate import Estimate
+from icalib.estimation.fixed_lens import lens_steps
+from icalib.estimation.inputs import Inputs
+from icalib.estimation.parts import Parts
+from icalib.estimation.relaxed import relaxed
+from icalib.estimation.surfaces import ON_PLANES
+from icalib.timeline import Timeline
+
+SEEN = ("corners", "features")
+
+
+@dataclass(frozen=True)
+class Judged:
+    """An estimate, and what is known of it. factor: the largest empirical one, times which formal standard deviations
+    count."""
+
+    inputs: Inputs
+    found: Estimate
+    groups: tuple[ParameterGroup, ...]
+    fits: Sequence[SensorFit]
+    factor: float
+    parts: Parts | None
+    timeline: Timeline
+
+    @property
+    def misfit_factor(self) -> float:
+        """Times which the residuals of some sensor are as large as their noise says; at least 1."""
+        return float(np.sqrt(max([1.0, *(f.chi2_per_dof or 1.0 for f in self.fits)])))
+
+
+def all_causes(judged: Judged, against: Sequence[Contradiction]) -> tuple[list[Cause], tuple[str, ...]]:
+    """The grave ones first, each kind by its gain; and notes on the size of the target. `against`: what the rig file
+    states and the data contradict so much that nothing else that is wrong with the estimate is news."""
+    inputs, found = judged.inputs, judged.found
+    stated, notes = _stated(judged, against)
+    few = any(plane_warnings(inputs.rig, found.problem.features))
+    # How far off those are that lie on planes by chance means nothing.
+    fits = [f for f in judged.fits if (not against or f.kind in SEEN) and not (few and f.kind == ON_PLANES)]
+    misfit = Misfit.of(fits)
+    known = stated
+    if not explaining([c for c in stated if c.gain < np.inf], misfit) and not against:
+        scattering = judged.factor > LARGE_FACTOR
+        known = [*stated, *changing(inputs, found, judged.parts, misfit, scattering, judged.timeline)]
+    explained = explaining(known, misfit) if known else False
+    both = ranked([*known, *misfit_causes(inputs, found, fits, explained)])
+    return [*(c for c in both if c.grave), *(c for c in both if not c.grave)], notes
+
+
+def _stated(judged: Judged, against: Sequence[Contradiction]) -> tuple[list[Cause], tuple[str, ...]]:
+    inputs, factor = judged.inputs, judged.factor
+    size = felt_size(judged.found, factor)
+    wrong_size, notes = ((), ()) if against else size_words(inputs, size)
+    # What others complain of may come of a wrong size, or of an accelerometer's scale: then that is the news.
+    certain, given = is_certain(size), bool(against)
+    stated = None if given else relaxed(inputs, judged.found)
+    lenses = () if certain else other_lens(inputs.rig.cameras, lens_steps(inputs, stated), factor)
+    scale = max(factor, judged.misfit_factor)
+    against = against or contradictions(inputs, stated, scale)
+    if certain:  # a wrong size moves lever arms by some of their length
+        against = tuple(c for c in against if worst_off(c.key[1], c.off) > 1.0)
+    causes = [Cause(sentence, np.inf, True) for sentence in mixed_up(inputs.rig.cameras, judged.groups)]
+    if size is not None:
+        gain = ((size.ratio - 1.0) / (size.std / factor)) ** 2
+        causes += [Cause(sentence, float(gain), certain) for sentence in wrong_size]
+    causes += [Cause(sentence, gain, True) for sentence, gain in lenses]
+    causes += _contradicted(judged, against, scale, certain or given, given)
+    return causes, (*notes, *scale_notes(inputs, size))
+
+
+def _contradicted(
+    judged: Judged, against: Sequence[Contradiction], scale: float, grave: bool, given: bool
+) -> Iterator[Cause]:
+    for c in against:
+        gain = np.inf if given else float(((c.off / (c.sigma / scale)) ** 2).max())
+        yield Cause(stated_words(judged.inputs, c), gain, grave)
+    yield from (Cause(s, 0.0, grave) for s in absurd_wheels(judged.inputs, against, judged.groups))

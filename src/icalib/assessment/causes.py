@@ -1,0 +1,203 @@
+"""What may be wrong, ranked by how much of the misfit it explains.
+
+Each cause is a test with a gain: by how much chi^2 falls where the cause is taken into account. Causes that explain
+nothing of a misfit are not named, however significant they are. Where no cause explains it, the message says so and
+lists what was checked; another noise density is advised only where `fitting_noise` shows that it is all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.assessment.disturbance import Disturbance, Lag, disturbance, lag_between_cameras
+from icalib.calibration import SensorFit
+from icalib.calibration.excess import excess, times
+from icalib.estimation.changes import Change, changes, heterogeneity
+from icalib.estimation.estimate import Estimate
+from icalib.estimation.inputs import Inputs
+from icalib.estimation.noise_size import NoiseFit
+from icalib.estimation.parts import Parts
+from icalib.timeline import Timeline
+
+# Of the misfit. Robust weights, and changes within a segment, hide most of a gain; where a change is not the cause,
+# its gain is below 0.01 of the misfit.
+EXPLAINS = 0.1
+# Times as large as their noise. With IMU noise ten times too small, in simulation, residuals are 3 to 5 times as large,
+# and errors up to 12 standard deviations.
+FAR_BEYOND = 4.0
+ALIKE = 0.8  # of the best gain: a change of this group explains as much, such as focal length for distance
+SIGNIFICANT = 25.0  # chi^2 for each parameter: five standard deviations, for the many boundaries that are tried
+INERTIAL = ("gyroscope", "accelerometer")
+
+
+@dataclass(frozen=True)
+class Cause:
+    """sentence: what is wrong, and what to do; gain: the fall of chi^2; grave: the result is not to be used."""
+
+    sentence: str
+    gain: float
+    grave: bool = False
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """fits: those with residuals larger than the stated noise predicts; chi2: how much all are beyond their degrees of
+    freedom."""
+
+    fits: tuple[SensorFit, ...]
+
+    @classmethod
+    def of(cls, judged: Iterable[SensorFit]) -> Misfit:
+        return cls(tuple(f for f in judged if excess(f) > 1.0))
+
+    @property
+    def chi2(self) -> float:
+        return sum(max(f.chi2 - f.dof, 0.0) for f in self.fits)
+
+    @property
+    def sensors(self) -> set[str]:
+        return {f.sensor for f in self.fits}
+
+    @property
+    def is_grave(self) -> bool:
+        return any(excess(f) >= FAR_BEYOND for f in self.fits)
+
+    @property
+    def words(self) -> str:
+        worst_first = sorted(self.fits, key=lambda f: -excess(f))
+        return ", ".join(f"{f.kind} of {f.sensor} {times(f)}" for f in worst_first)
+
+
+def ranked(causes: Iterable[Cause]) -> list[Cause]:
+    """The largest gain first; equal ones as they come."""
+    return sorted(causes, key=lambda c: -c.gain)
+
+
+def explaining(causes: Iterable[Cause], misfit: Misfit) -> bool:
+    """Whether one of them explains the misfit."""
+    return any(c.gain >= EXPLAINS * misfit.chi2 for c in causes)
+
+
+def changing(
+    inputs: Inputs, found: Estimate, parts: Parts | None, misfit: Misfit, scattering: bool, timeline: Timeline
+) -> Iterator[Cause]:
+    """What changes over the recording, comes at one time, or follows the image speed. scattering: segments disagree
+    by more than noise predicts."""
+    lag = lag_between_cameras(inputs, found)
+    if lag is not None:
+        yield Cause(_lag_words(lag), lag.gain, True)
+    found_causes = []
+    if misfit.fits and (hit := disturbance(found, misfit.chi2, misfit.sensors)) is not None:
+        found_causes.append(Cause(_hit_words(hit, timeline), hit.gain, misfit.is_grave))
+    if parts is not None and (misfit.fits or scattering):
+        whole = misfit.chi2 if misfit.fits else heterogeneity(parts)
+        shown = changes(parts, tuple(s.name for s in inputs.sensors))
+        if shown and shown[0].gain > max(EXPLAINS * whole, SIGNIFICANT * shown[0].count):
+            alike = [c for c in shown if c.key[0] == shown[0].key[0] and c.gain > ALIKE * shown[0].gain]
+            found_causes.append(Cause(_change_words(alike, parts, timeline), shown[0].gain, True))
+    yield from ranked(found_causes)[:1]  # a change leaves residuals where it is largest, which is no disturbance
+
+
+def noise_words(inputs: Inputs, noise: NoiseFit) -> str:
+    """That the stated noise is too small, or too large, and which noise fits."""
+    assert inputs.rig.imu is not None
+    size = "small" if max(noise.scales.values()) > 1.0 else "large"
+    n, scales = noise.noise, ", ".join(f"{kind} {scale:.2g}x" for kind, scale in noise.scales.items())
+    fields = f"gyro: {n.gyro:.2g}, gyro_walk: {n.gyro_walk:.2g}, accel: {n.accel:.2g}, accel_walk: {n.accel_walk:.2g}"
+    return (
+        f"the stated noise of {inputs.rig.imu.name} is too {size}: the noise that its residuals show is, over the "
+        f"stated one, {scales}. With that they are white, and constant over the recording. Write noise: {{{fields}}} "
+        "and calibrate again."
+    )
+
+
+def unknown_words(misfit: Misfit, noise: NoiseFit | None) -> str:
+    """That the model lacks something, and what was checked."""
+    pattern = ""
+    if noise is not None and not noise.is_white:
+        pattern = ", and are no white noise"
+    elif noise is not None and not noise.is_constant:
+        pattern = ", and vary over the recording"
+    return (
+        f"residuals are larger than the stated noise predicts ({misfit.words}){pattern}; the cause is unknown. "
+        "Checked: fixed values and priors, target size, swapped cameras, clocks that drift or jump, mounts and lenses "
+        "that change, disturbances at one time. Do not enlarge the noise: errors would stay larger than the standard "
+        "deviations. Record again, with slower motion and firm mounts, and compare both results by icalib compare."
+    )
+
+
+def _lag_words(lag: Lag) -> str:
+    first, second = (lag.first, lag.second) if lag.seconds > 0.0 else (lag.second, lag.first)
+    return (
+        f"{first} and {second} are not exposed together: residuals follow the image speed, as if {second} were about "
+        f"{1e3 * abs(lag.seconds):.0f} ms late. Trigger the cameras together, hold the rig still for each pair of "
+        "images, or record an IMU too: each camera then has a time offset of its own."
+    )
+
+
+def _hit_words(hit: Disturbance, timeline: Timeline) -> str:
+    names = " and ".join(hit.sensors)
+    part = "leave that part out"
+    if len(timeline.parts) == 1:
+        part = f"leave that part out: --to {hit.start:.1f}, or --from {hit.end:.1f}"
+    return (
+        f"{hit.share:.0%} of the misfit ({names}) comes at one time, near "
+        f"{timeline.words(0.5 * (hit.start + hit.end))}: a shock, or wrong readings or stamps there; {part}."
+    )
+
+
+def _change_words(alike: list[Change], parts: Parts, timeline: Timeline) -> str:
+    """Of the changes of one sensor that explain as much, the best first."""
+    best, sensor = alike[0], alike[0].key[0]
+    when = "over the recording" if best.pattern == "drift" else f"near {timeline.words(best.second)}"
+    if best.key[1] == "time_offset":
+        return _clock_words(best, parts, when, timeline)
+    what = " or ".join(_changed(c, parts) for c in alike if c.key[1] != "time_offset")
+    lens = any(c.key[1] == "intrinsics" for c in alike)
+    off = " Switch off autofocus, zoom and image stabilisation." if lens else ""
+    return (
+        f"{sensor} changes {when}: {what}.{off} Fasten all mounts and record again"
+        f"{_apart(best, timeline, ', or calibrate the recording before or after that alone')}."
+    )
+
+
+def _changed(c: Change, parts: Parts) -> str:
+    over = float(np.ptp(parts.state.seconds[parts.ends])) if c.pattern == "drift" else 1.0
+    if c.key[1] == "intrinsics":
+        return f"its lens by up to {over * np.abs(c.value).max():.2g} px"
+    turn, move = _sizes(parts, c, over)
+    return f"it moves on its mount by {np.rad2deg(turn):.2g} deg and {1e3 * move:.2g} mm"
+
+
+def _clock_words(c: Change, parts: Parts, when: str, timeline: Timeline) -> str:
+    if c.pattern == "drift":
+        span = float(np.ptp(parts.state.seconds[parts.ends]))
+        return (
+            f"the clock of {c.key[0]} drifts against the others by about {1e6 * c.value[0]:+.0f} ppm, "
+            f"{1e3 * span * abs(c.value[0]):.2g} ms {when}. Stamp all sensors by one clock (trigger, PTP), or "
+            "calibrate short parts by --from and --to."
+        )
+    return (
+        f"the time offset of {c.key[0]} changes by about {1e3 * c.value[0]:+.2g} ms {when}: its clock jumped, or "
+        f"stamps are wrong{_apart(c, timeline, '. Calibrate the recording before or after that alone')}."
+    )
+
+
+def _apart(c: Change, timeline: Timeline, words: str) -> str:
+    """How to use the recording before or after a step, which lies within a segment of its `second`."""
+    if c.pattern == "drift" or len(timeline.parts) > 1:
+        return ""
+    return f"{words} (--to or --from, well off {c.second:.1f})"
+
+
+def _sizes(parts: Parts, c: Change, over: float) -> tuple[float, float]:
+    """Angle [rad] and distance [m] of a change of rotation, translation, or both."""
+    layout, n = parts.problem.layout, 0
+    sizes = {"rotation": 0.0, "translation": 0.0}
+    for name in sizes:
+        if layout.is_free(c.key[0], name) and n + 3 <= len(c.value):
+            sizes[name], n = over * float(np.linalg.norm(c.value[n : n + 3])), n + 3
+    return sizes["rotation"], sizes["translation"]

@@ -1,0 +1,120 @@
+"""Misfit that comes at one time, or that follows the image speed of cameras which are not exposed together."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+
+from icalib.estimation.clocks import instants
+from icalib.estimation.estimate import Estimate
+from icalib.estimation.inputs import Inputs
+
+BINS, WINDOW = 64, 3  # of the recording; a shock reaches a few keyframes beyond itself
+AT_ONE_TIME = 0.5  # of the misfit
+LARGE = 3.0  # times the usual chi^2 of a window: the number of measurements varies, too
+FASTEST_GAP_S = 1.0  # between images, beyond which their difference says nothing of image speed
+FOLLOWS_SPEED = 0.25  # of the squared residuals, in each of both cameras
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """start, end: of the window [s, joined clock]; share: of the misfit; gain: chi^2 beyond the usual in it; sensors:
+    those whose residuals are large in it."""
+
+    start: float
+    end: float
+    share: float
+    gain: float
+    sensors: tuple[str, ...]
+
+
+def disturbance(found: Estimate, misfit: float, misfits: Collection[str]) -> Disturbance | None:
+    """The window that holds most of a `misfit` (chi^2 beyond the degrees of freedom) of the sensors `misfits`; None
+    where it is spread out."""
+    state = found.outcome.state
+    rows = {s: r for s, r in _chi2_over_time(found).items() if s in misfits}
+    begin, end = float(state.seconds[0]), float(state.seconds[-1])
+    edges = np.linspace(begin, end, BINS + 1)
+    beyond = {}
+    for sensor, (seconds, chi2) in rows.items():
+        own = np.histogram(seconds, edges, weights=chi2)[0]
+        usual = WINDOW * np.median(own)
+        window = np.convolve(own, np.ones(WINDOW), "valid")
+        beyond[sensor] = np.where(window > LARGE * usual, window - usual, 0.0)
+    if not beyond or misfit <= 0.0:
+        return None
+    total = np.sum(list(beyond.values()), axis=0)
+    k = int(np.argmax(total))
+    share = float(total[k]) / misfit
+    if share < AT_ONE_TIME:
+        return None
+    sensors = tuple(s for s, own in beyond.items() if own[k] > 0.1 * total[k])
+    return Disturbance(float(edges[k]), float(edges[k + WINDOW]), min(share, 1.0), float(total[k]), sensors)
+
+
+def _chi2_over_time(found: Estimate) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """By sensor: seconds (n,) on the joined clock and chi^2 (n,), of the IMU's intervals and of images."""
+    problem, state, out = found.problem, found.outcome.state, found.outcome.residuals
+    rows = {}
+    if out.imu.size:
+        rows[problem.chain.name] = state.seconds[:-1], (out.imu[:, :9] ** 2).sum(axis=1)
+    for camera, corners in zip(problem.cameras, out.corners, strict=True):
+        if len(camera.stream.uv):
+            times = instants(camera.stream, state.values)[camera.stream.image]
+            square = (corners.residual.astype(np.float64) ** 2).sum(axis=1) * corners.root.astype(np.float64) ** 2
+            rows[camera.name] = times, square
+    return rows
+
+
+@dataclass(frozen=True)
+class Lag:
+    """`second` is exposed `seconds` after `first`, by residuals that follow the image speed; share: of the squared
+    residuals that this explains; gain: of chi^2."""
+
+    first: str
+    second: str
+    seconds: float
+    share: float
+    gain: float
+
+
+def lag_between_cameras(inputs: Inputs, found: Estimate) -> Lag | None:
+    """Of the first two cameras of a rig without an IMU, whose images are taken for simultaneous."""
+    cameras = list(zip(found.problem.cameras, found.outcome.residuals.corners, strict=True))
+    if inputs.rig.imu is not None or len(cameras) < 2:
+        return None
+    lags = []
+    for camera, out in cameras[:2]:
+        v, known = _image_velocity(camera.stream.image, camera.stream.point, camera.stream.uv, camera.stream.seconds)
+        known &= out.root > 0.0
+        r, v = out.residual[known].astype(np.float64), v[known]
+        square, along = float((r**2).sum()), float((r * v).sum())
+        if not (known.any() and square > 0.0 and (v**2).sum() > 0.0):
+            return None
+        # Predicted minus measured: what is measured later is farther along.
+        coefficient = along / float((v**2).sum())
+        weight = float((out.root[known].astype(np.float64) ** 2).mean())
+        lags.append((-coefficient, along * coefficient / square, along * coefficient * weight))
+    (a, share_a, gain_a), (b, share_b, gain_b) = lags
+    if a * b >= 0.0 or min(share_a, share_b) < FOLLOWS_SPEED:
+        return None
+    return Lag(cameras[0][0].name, cameras[1][0].name, b - a, min(share_a, share_b), gain_a + gain_b)
+
+
+def _image_velocity(
+    image: np.ndarray, point: np.ndarray, uv: np.ndarray, seconds: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 2) px/s of each corner from the images before and after; (N,) whether both show it."""
+    count = int(point.max(initial=-1)) + 1
+    table = np.full((len(seconds), count, 2), np.nan)
+    table[image, point] = uv
+    speed = np.full_like(table, np.nan)
+    if len(seconds) > 2:
+        step = seconds[2:] - seconds[:-2]
+        speed[1:-1] = (table[2:] - table[:-2]) / step[:, None, None]
+        speed[1:-1][step > 2.0 * FASTEST_GAP_S] = np.nan
+    found = speed[image, point]
+    known = np.asarray(np.isfinite(found).all(axis=1))
+    return np.where(known[:, None], found, 0.0), known

@@ -1,0 +1,116 @@
+"""Parameters that change during the recording: a clock that drifts or jumps, a mount that moved, a lens that refocused.
+
+Test of parameter constancy by score (Nyblom 1989; for a break, Chow 1960). The calibration parameters are constant in
+the estimate. Let those of one group be x + d e in segment g, with d_g its pattern over the segments: linear in time
+(drift), or 0 before and 1 after a boundary (step). Near the optimum chi^2 is a quadratic form of the common step and
+of e, made from the segments' sums, in which the chain is marginalised. One solve of that small form gives e, its
+covariance, and by how much chi^2 falls. What changes within a segment is not seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from icalib.estimation.border import complement
+from icalib.estimation.parts import Parts
+from icalib.estimation.state import Key
+
+# The groups that change together. Board, planes and IMU are what the others are measured by.
+CHANGING = (("time_offset",), ("rotation", "translation"), ("intrinsics",))
+RIDGE = 1e-6  # information in tolerance units: 1000 tolerances; keeps the form definite where nothing is known
+
+
+@dataclass(frozen=True)
+class Change:
+    """key: sensor and the first of its groups that change; pattern; second: of the boundary of a step, else the middle
+    of the recording, on the joined clock; value, sigma (n,): the step, or the drift per second [SI]; gain: the fall of
+    chi^2; count: how many parameters."""
+
+    key: Key
+    pattern: Literal["drift", "step"]
+    second: float
+    value: np.ndarray
+    sigma: np.ndarray
+    gain: float
+
+    @property
+    def count(self) -> int:
+        return len(self.value)
+
+
+def changes(parts: Parts, sensors: tuple[str, ...]) -> tuple[Change, ...]:
+    """The best pattern of each group of the `sensors`, the largest gain first."""
+    found: dict[Key, Change] = {}
+    form = _Form.of(parts)
+    for change in _tested(parts, form, sensors):
+        best = found.get(change.key)
+        if best is None or change.gain > best.gain:
+            found[change.key] = change
+    return tuple(sorted(found.values(), key=lambda c: -c.gain))
+
+
+def _tested(parts: Parts, form: _Form, sensors: tuple[str, ...]) -> Iterator[Change]:
+    ends = parts.state.seconds[parts.ends]
+    middle = 0.5 * (ends[:-1] + ends[1:])
+    centre = 0.5 * (ends[0] + ends[-1])
+    layout = parts.problem.layout
+    free = {b.key for b in layout.free}
+    for sensor in sensors:
+        for names in CHANGING:
+            own = [name for name in names if (sensor, name) in free]
+            if not own:
+                continue
+            columns = np.concatenate([layout.columns(sensor, name) for name in own])
+            key = (sensor, own[0])
+            yield form.change(key, columns, middle - centre, "drift", float(centre))
+            for k in range(1, parts.count):
+                pattern = (np.arange(parts.count) >= k).astype(np.float64)
+                yield form.change(key, columns, pattern, "step", float(ends[k]))
+
+
+@dataclass(frozen=True)
+class _Form:
+    """In tolerance units: information (G, B, B) and gradient (G, B) of the segments; root (B, n): of the inverse of
+    their sum, within what is not fixed."""
+
+    tolerance: np.ndarray
+    information: np.ndarray
+    gradient: np.ndarray
+    root: np.ndarray
+
+    @classmethod
+    def of(cls, parts: Parts) -> _Form:
+        t, B = parts.problem.tolerance, parts.problem.layout.size
+        information = t[:, None] * parts.sums[:, :-1, :-1] * t
+        free = complement(parts.problem.held, B)
+        whole = free.T @ information.sum(axis=0) @ free
+        values, vectors = np.linalg.eigh(whole)
+        return cls(t, information, t * parts.sums[:, :-1, -1], free @ vectors / np.sqrt(np.maximum(values, RIDGE)))
+
+    def change(
+        self, key: Key, columns: np.ndarray, pattern: np.ndarray, kind: Literal["drift", "step"], second: float
+    ) -> Change:
+        """The change of `columns` by `pattern` (G,), all others and a common step free."""
+        own = self.information[:, columns]
+        A = np.einsum("g,gij->ij", pattern**2, own[:, :, columns]) + RIDGE * np.eye(len(columns))
+        cross = np.einsum("g,gij->ij", pattern, own) @ self.root
+        common = self.root.T @ self.gradient.sum(axis=0)
+        g = np.einsum("g,gi->i", pattern, self.gradient[:, columns]) - cross @ common
+        covariance = np.linalg.inv(A - cross @ cross.T)
+        step, t = -covariance @ g, self.tolerance[columns]
+        return Change(key, kind, second, t * step, t * np.sqrt(np.diag(covariance)), float(-g @ step))
+
+
+def heterogeneity(parts: Parts) -> float:
+    """By how much chi^2 falls where each segment has calibration parameters of its own."""
+    t = parts.problem.tolerance
+    free = complement(parts.problem.held, len(t))
+    total = 0.0
+    for sums in parts.sums:
+        S, b = free.T @ (t[:, None] * sums[:-1, :-1] * t) @ free, free.T @ (t * sums[:-1, -1])
+        total += float(b @ np.linalg.solve(S + RIDGE * np.eye(len(S)), b))
+    return total

@@ -1,0 +1,186 @@
+"""Whether another size of the IMU's noise is all that its residuals ask for.
+
+Variance components (Helmert 1924; Foerstner 1979): both densities, and the noise of each camera's corners, are scaled
+by the root of chi^2 over the degrees of freedom after the fit, and the estimate is solved again, until the scales stay.
+If noise is all that was wrong, the residuals that are left are white and as large in every segment. After a fit,
+residuals r of white noise correlate: with a draw x from the posterior, E[r_i r_j] = -E[(J x)_i (J x)_j] for rows i and
+j of different intervals. What is left beside that is correlation that white noise does not have.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from icalib.errors import EstimationError
+from icalib.estimation.estimate import Estimate
+from icalib.estimation.evidence import DRAW_STEP, bare_residuals
+from icalib.estimation.imu_data import joined_imu_data
+from icalib.estimation.imu_factor import ImuFactor
+from icalib.estimation.inputs import Inputs
+from icalib.estimation.outcome import Outcome
+from icalib.estimation.solver import minimise
+from icalib.rig import ImuNoise
+
+ROUNDS = 12  # the scales converge linearly
+SETTLED = 0.05  # of a scale, in logarithms
+LEAST_DOF = 3.0  # times the root of the number of residuals, which is how far off sampled ones may be
+LAGS = 3  # intervals
+WHITE = 0.25  # correlation
+CHANCE = 3.0  # standard deviations
+SEGMENTS = 8
+VARIES = 3.0  # times the mean square of the whole recording
+AS_STATED = 1.25  # times the stated density, or one over that: nobody states noise any better
+LARGEST_STEP = 10.0  # of a scale in one round
+KINDS = ("gyroscope", "accelerometer")
+
+
+@dataclass(frozen=True)
+class NoiseFit:
+    """noise: of the IMU, that fits; scales: of both densities over the stated ones; settled: whether the rounds found
+    them; correlation: of neighbouring residuals beyond what the fit makes, over what chance allows; variation: the
+    largest or smallest mean square of a segment, in logarithms, over what is allowed."""
+
+    noise: ImuNoise
+    scales: dict[str, float]
+    settled: bool
+    correlation: float
+    variation: float
+
+    @property
+    def is_white(self) -> bool:
+        return self.correlation < 1.0
+
+    @property
+    def is_constant(self) -> bool:
+        return self.variation < 1.0
+
+    @property
+    def explains(self) -> bool:
+        return self.settled and self.is_white and self.is_constant
+
+    @property
+    def is_as_stated(self) -> bool:
+        """Whether the IMU's noise fits as it is, once that of the cameras does."""
+        return self.settled and all(abs(np.log(s)) < np.log(AS_STATED) for s in self.scales.values())
+
+
+def fitting_noise(inputs: Inputs, found: Estimate) -> NoiseFit | None:
+    """None without an IMU, or where an estimate with other noise fails."""
+    if inputs.rig.imu is None or inputs.rig.assumes_motion or not isinstance(found.problem.chain, ImuFactor):
+        return None
+    cameras = [c.name for c in found.problem.cameras if len(c.stream.uv)]
+    scales: dict[str, float] = dict.fromkeys([*KINDS, *cameras], 1.0)
+    outcome, settled = found.outcome, False
+    for _ in range(ROUNDS):
+        shown = _Shown.of(outcome)
+        sizes = {kind: shown.size(kind) for kind in KINDS} | _corner_sizes(outcome)
+        steps = {key: float(np.clip(size, 1.0 / LARGEST_STEP, LARGEST_STEP)) for key, size in sizes.items()}
+        settled = all(abs(np.log(step)) < SETTLED for step in steps.values())
+        if settled:
+            break
+        scales = {key: scales[key] * steps[key] for key in scales}
+        try:
+            outcome = _solved(inputs, found, scales)
+        except EstimationError:
+            return None
+    shown = _Shown.of(outcome)
+    correlation = max(shown.correlation(kind) for kind in KINDS)
+    own = {kind: scales[kind] for kind in KINDS}
+    return NoiseFit(_scaled(inputs, scales), own, settled, correlation, max(map(shown.variation, KINDS)))
+
+
+def _scaled(inputs: Inputs, scales: dict[str, float]) -> ImuNoise:
+    assert inputs.rig.imu is not None
+    n, (gyro, accel) = inputs.rig.imu.noise, (scales[kind] for kind in KINDS)
+    return replace(
+        n, gyro=gyro * n.gyro, gyro_walk=gyro * n.gyro_walk, accel=accel * n.accel, accel_walk=accel * n.accel_walk
+    )
+
+
+def _solved(inputs: Inputs, found: Estimate, scales: dict[str, float]) -> Outcome:
+    """The same estimate with noise so many times as large."""
+    assert inputs.rig.imu is not None
+    rig = replace(inputs.rig, imu=replace(inputs.rig.imu, noise=_scaled(inputs, scales)))
+    other = replace(inputs, rig=rig, imu=joined_imu_data(rig, inputs.parts, inputs.measurements))
+    state, judged = found.outcome.state, found.judged
+    pairs = zip(judged.noise, found.problem.cameras, strict=True)
+    noise = tuple(replace(n, sigma=(scales.get(c.name, 1.0) * n.sigma).astype(n.sigma.dtype)) for n, c in pairs)
+    return minimise(replace(judged, noise=noise).problem(other, state, found.problem.held), state)
+
+
+def _corner_sizes(outcome: Outcome) -> dict[str, float]:
+    """By camera, how many times as large as their noise corners are off; nearly all degrees of freedom are left."""
+    sizes = {}
+    for camera, out in zip(outcome.problem.cameras, outcome.residuals.corners, strict=True):
+        if len(camera.stream.uv):
+            sizes[camera.name] = float(np.sqrt(camera.chi2(out) / max(2 * np.count_nonzero(out.root), 1)))
+    return sizes
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """Whitened residuals (K - 1, 15) of the IMU, and J x (K - 1, 15) of some draws x from the posterior."""
+
+    rows: dict[str, slice]
+    residual: np.ndarray
+    along: tuple[np.ndarray, ...]
+
+    @classmethod
+    def of(cls, outcome: Outcome) -> _Shown:
+        problem, state, base = outcome.problem, outcome.state, outcome.residuals
+        assert outcome.draws is not None
+        along = []
+        for x in outcome.draws.free[:4]:
+            there = state.retract(problem.layout, DRAW_STEP * x.chain, DRAW_STEP * x.border)
+            along.append((bare_residuals(problem, there).imu - base.imu) / DRAW_STEP)
+        kinds = {k: r for k, r in problem.chain.kinds.items() if k in KINDS}
+        return cls(kinds, base.imu, tuple(along))
+
+    def _left(self, kind: str, rows: slice = slice(None)) -> tuple[int, float, float]:
+        """Number, degrees of freedom and chi^2 of the intervals `rows`."""
+        r, columns = self.residual[rows, self.rows[kind]], self.rows[kind]
+        spent = np.mean([(a[rows, columns] ** 2).sum() for a in self.along])
+        return r.size, r.size - float(spent), float((r**2).sum())
+
+    def size(self, kind: str) -> float:
+        """How many times as large as its noise, or at least; 1 where that is not known to be more."""
+        count, dof, chi2 = self._left(kind)
+        least = LEAST_DOF * np.sqrt(count)
+        size = float(np.sqrt(chi2 / max(dof, least)))
+        return size if dof > least else max(size, 1.0)
+
+    def correlation(self, kind: str) -> float:
+        """Mean over LAGS, over what is allowed."""
+        columns, (count, dof, chi2) = self.rows[kind], self._left(kind)
+        total = 0.0
+        for lag in range(1, LAGS + 1):
+            r, made = self.residual[:, columns], [a[:, columns] for a in self.along]
+            total += float((r[lag:] * r[:-lag]).sum()) * dof / max(chi2, 1e-300)
+            total += float(np.mean([(a[lag:] * a[:-lag]).sum() for a in made]))
+        dof = max(dof, 1.0)
+        return abs(total) / LAGS / dof / max(WHITE, CHANCE * np.sqrt(count / LAGS) / dof)
+
+    def variation(self, kind: str) -> float:
+        """The segment that departs most from the whole, in logarithms, over what is allowed."""
+        _, dof, chi2 = self._left(kind)
+        worst, whole = 0.0, chi2 / max(dof, 1.0)
+        for own in np.array_split(np.arange(len(self.residual)), SEGMENTS):
+            n, left, size = self._left(kind, slice(int(own[0]), int(own[-1]) + 1) if len(own) else slice(0))
+            if left > LEAST_DOF * np.sqrt(max(n, 1)):
+                allowed = np.log(VARIES) + CHANCE * np.sqrt(2.0 / left)
+                worst = max(worst, abs(np.log(max(size / left / whole, 1e-12))) / allowed)
+        return float(worst)
+
+
+def are_noise(rows: np.ndarray) -> bool:
+    """Whether rows (n, m) of residuals, most of whose degrees of freedom the fit left, are white and constant."""
+    n, square = len(rows), float((rows**2).sum())
+    if n < 2 * SEGMENTS or square == 0.0:
+        return False
+    lags = [float((rows[lag:] * rows[:-lag]).sum()) / square for lag in range(1, LAGS + 1)]
+    white = abs(np.mean(lags)) < max(WHITE, CHANCE / np.sqrt(LAGS * rows.size))
+    sizes = [float(np.mean(own**2)) / (square / rows.size) for own in np.array_split(rows, SEGMENTS)]
+    allowed = np.log(VARIES) + CHANCE * np.sqrt(2.0 * SEGMENTS / rows.size)
+    return bool(white and max(abs(np.log(max(s, 1e-12))) for s in sizes) < allowed)
