@@ -98,3 +98,7 @@ def test_with_changes_one_thing_and_names_what_there_is():
         rig.with_("cam2", intrinsics=kept)
     with pytest.raises(RigError, match=r"cam1 has no field intrinsic; did you mean intrinsics\?"):
         rig.with_("cam1", intrinsic=kept)
+    with pytest.raises(RigError, match=r"cam1: intrinsics must be a parameter; write icalib.guess"):
+        rig.with_("cam1", intrinsics=[1.0, 2.0, 3.0, 4.0])
+    with pytest.raises(RigError, match=r"settings: loss is none, huber, cauchy, not 'cachy'; use one of these\."):
+        rig.with_("settings", loss="cachy")

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from icalib.recordings import open_recording
     from icalib.rig_file import load_rig
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = [
     "Calibration",
     "CalibrationError",

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -83,6 +84,22 @@ def check_sizes(sensor: Any, sizes: dict[str, int]) -> None:
             raise RigError(
                 f"{sensor.name}: {group} needs {wanted}, but the value has shape {p.value.shape}; correct the value."
             )
+
+
+def check_fields(where: str, old: Any, fields: dict[str, Any]) -> None:
+    """Raises RigError where the dataclass `old`, called `where` in sentences, has no field of a name in `fields`, where
+    a value is none of the choices of its field, or where it replaces a `Parameter` and is none."""
+    kinds = get_type_hints(type(old))
+    for name, value in fields.items():
+        if name not in kinds:
+            near = difflib.get_close_matches(name, kinds, 1)
+            hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(kinds)}."
+            raise RigError(f"{where} has no field {name}; {hint}")
+        choices = get_args(kinds[name])
+        if get_origin(kinds[name]) is Literal and value not in choices:
+            raise RigError(f"{where}: {name} is {', '.join(map(str, choices))}, not {value!r}; use one of these.")
+        if kinds[name] is Parameter and not isinstance(value, Parameter):
+            raise RigError(f"{where}: {name} must be a parameter; write icalib.guess(...), fixed(...) or prior(...).")
 
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:

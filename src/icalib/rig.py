@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy as np
 from icalib.errors import RigError
 from icalib.geometry.cameras import CAMERA_MODELS
 from icalib.geometry.targets import NoTarget, Target
-from icalib.parameter import Parameter, check_sizes
+from icalib.parameter import Parameter, check_fields, check_sizes
 
 TimeUnit = Literal["s", "ms", "us", "ns"]
 
@@ -372,7 +371,7 @@ class Rig:
         """The same rig with some `fields` changed: of the sensor called `part`, of "settings", or of the rig itself.
 
         For example rig.with_("cam0", intrinsics=icalib.fixed([458, 457, 367, 248])). Raises RigError where there is
-        no such sensor or field.
+        no such sensor or field, or a value is of another kind.
         """
         places = {"": (None, self), "settings": ("settings", self.settings)}
         imus = {} if self.imu is None else {self.imu.name: ("imu", self.imu)}
@@ -381,12 +380,7 @@ class Rig:
         if part not in places:
             raise RigError(f"there is no sensor {part}; the rig has {', '.join(filter(None, places))}.")
         kind, old = places[part]
-        known = [f.name for f in dataclasses.fields(old)]
-        for name in fields:
-            if name not in known:
-                near = difflib.get_close_matches(name, known, 1)
-                hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}."
-                raise RigError(f"{part or 'the rig'} has no field {name}; {hint}")
+        check_fields(part or "the rig", old, fields)
         new = dataclasses.replace(old, **fields)
         if kind is None:
             return new

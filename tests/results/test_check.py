@@ -14,6 +14,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
+import icalib
 from icalib.calibration import Calibration
 from icalib.check import Check, check_measurements
 from icalib.check.check import joint_limit
@@ -94,6 +95,17 @@ def test_motion_that_does_not_determine_everything(known: Calibration, scenario:
     assert (found.validity, found.exit_code) == ("cannot say", 3)
     assert found.unknown == ("cam0 translation", "cam1 translation") and not found.changed
     assert "does not determine cam0 translation, cam1 translation; all else is unchanged" in verdict(found)
+
+
+def test_an_imu_whose_scale_changed_is_named(scenario: Scenario):
+    rig = rig_for(scenario).with_("imu0", intrinsics=icalib.prior(np.zeros(24), np.repeat([0.05, 0.01], [15, 9])))
+    known = calibrate_measurements(rig, simulate(scenario, 1).measurements)
+    intrinsics = np.zeros(24)
+    assert check_measurements(known, simulate(scenario, 2).measurements).validity == "valid"
+    intrinsics[8] = 0.02  # scale of the gyroscope's y axis
+    found = check_measurements(known, simulate(replace(scenario, imu_intrinsics=intrinsics), 2).measurements)
+    assert [(d.sensor, d.what) for d in found.changed] == [("imu0", "intrinsics")]
+    assert "the intrinsics of imu0 (" in verdict(found)
 
 
 def first(measurements: Measurements, seconds: float) -> Measurements:

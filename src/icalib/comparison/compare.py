@@ -189,6 +189,8 @@ def _quantities(pair: _Pair) -> Iterator[Difference]:
         change, (Ca, Cb), unit, scale = qb.value - qa.value, (qa.covariance, qb.covariance), "ms", 1e3
         if key == "steering_offset":
             unit, scale = "deg", 180.0 / np.pi
+        elif key == "intrinsics":  # of an IMU, which are parts of one, and zero where it is ideal
+            unit, scale = "percent", 1e2
         elif key != "time_offset":
             relative = np.outer(1.0 / qa.value, 1.0 / qa.value)
             change, Ca, Cb, unit, scale = change / qa.value, Ca * relative, Cb * relative, "percent", 1e2
