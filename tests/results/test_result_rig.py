@@ -13,8 +13,10 @@ from icalib.calibration import Calibration
 from icalib.cli import main
 from icalib.errors import RigError
 from icalib.parameter import Parameter
+from icalib.pipeline import calibrate_measurements
 from icalib.result_rig import TREATMENTS, Treatment, rig_of_result
 from icalib.rig_file import load_rig, rig_from_dict, rig_to_dict
+from icalib.simulation import handheld, rig_for, simulate
 
 ESTIMATED = [("cam0", "rotation"), ("cam0", "intrinsics"), ("lidar0", "translation"), ("wheel0", "radii")]
 
@@ -89,3 +91,16 @@ def test_a_file_of_the_user_stays(robot: Calibration, tmp_path: Path, capsys: py
     assert "was not written by icalib" in capsys.readouterr().err and file.read_text() == "sensors: {}\n"
     assert main(["rig", str(tmp_path / "no"), "--as", "guess", "-o", str(file)]) == 1
     assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_a_second_recording_improves_on_priors_from_the_first():
+    scenario = handheld(8.0)
+    rig = rig_for(scenario, intrinsics="start", distortion="start")
+    first = calibrate_measurements(rig, simulate(scenario, 1).measurements)
+    second = calibrate_measurements(rig_of_result(first, "prior")[0], simulate(scenario, 2).measurements)
+    assert not second.wrong and second.verdict == first.verdict
+    for camera in scenario.cameras:
+        error = second.value(camera.name, "translation") - camera.T_imu_cam[:3, 3]
+        std = second.std(camera.name, "translation")
+        assert (np.abs(error) < 4.0 * std).all() and (std < 0.9 * first.std(camera.name, "translation")).all()
