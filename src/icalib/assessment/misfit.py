@@ -82,7 +82,7 @@ def scatter_warnings(factors: np.ndarray, split: bool, held: CrossValidation | N
         )
     if held is not None and len(factors) and held.optimistic and held.factor > BEYOND_FACTOR * factors.max():
         yield (
-            f"one half of the recording predicts the other {held.factor:.1f}x worse than noise explains, and the "
+            f"one half of the recording predicts the other {held.factor:.1f}x worse than predicted, and the "
             f"printed standard deviations are only {factors.max():.1f}x the formal ones: they are too small."
         )
     if not split:
