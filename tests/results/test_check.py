@@ -21,6 +21,7 @@ from icalib.check.check import joint_limit
 from icalib.check.words import lines, verdict
 from icalib.cli import main
 from icalib.errors import RecordingError
+from icalib.geometry.targets import AprilGrid
 from icalib.measurements import Measurements
 from icalib.pipeline import calibrate_measurements
 from icalib.rig_file import rig_to_dict
@@ -108,6 +109,13 @@ def test_an_imu_whose_scale_changed_is_named(scenario: Scenario):
     assert "the intrinsics of imu0 (" in verdict(found)
 
 
+def test_a_target_of_another_size_is_the_reason_and_not_a_change(known: Calibration, scenario: Scenario):
+    larger = replace(scenario, target=AprilGrid(6, 6, 0.0968, 0.3))
+    found = check_measurements(known, simulate(larger, 2).measurements)
+    assert found.validity == "cannot say" and found.new is not None and found.reason == found.new.reasons[0]
+    assert "the target is 1.10" in verdict(found)
+
+
 def first(measurements: Measurements, seconds: float) -> Measurements:
     assert measurements.imu is not None
     imu = measurements.imu
@@ -156,6 +164,8 @@ def test_the_command(folders: Path, capsys: pytest.CaptureFixture[str]):
     assert printed[0].startswith("Residuals on the new recording") and printed[-1].startswith("Valid: ")
     plain = json.loads(file.read_text())
     assert (plain["validity"], plain["sentence"], plain["changed"]) == ("valid", printed[-1], [])
+    notes = [line.removeprefix("Note on the new recording: ") for line in printed if line.startswith("Note on the")]
+    assert notes == plain["notes"]
     names = {(d["sensor"], d["name"]) for d in plain["drifts"]}
     assert {("cam0", "rotation"), ("cam1", "time_offset"), ("cam1", "distortion")} <= names
     assert {f["kind"] for f in plain["residuals"]["fixed"]} >= {"corners", "gyroscope"}

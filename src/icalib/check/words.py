@@ -17,7 +17,7 @@ _EXTRINSICS = ("rotation", "translation")
 
 
 def lines(check: Check) -> list[str]:
-    """What to print: residuals, changes, and the verdict as the last line."""
+    """What to print: residuals, changes, what limits the new result, and the verdict as the last line."""
     found = []
     if check.fits[1]:
         found.append("Residuals on the new recording with the calibration fixed (in the calibration, calibrated anew):")
@@ -28,7 +28,8 @@ def lines(check: Check) -> list[str]:
         found.append("Changes from the calibration (A) to the new recording (B):")
         for d in sorted(check.tested, key=lambda d: d not in check.changed):
             found.append(f"  {'CHANGED' if d in check.changed else 'same   '}  {sentence(d, check.comparison)}")
-    return [*found, verdict(check)]
+    notes = () if check.new is None else check.new.reasons
+    return [*found, *(f"Note on the new recording: {n}" for n in notes if n != check.reason), verdict(check)]
 
 
 def verdict(check: Check) -> str:
@@ -71,6 +72,7 @@ def check_json(check: Check) -> str:
         "limit_sigma": check.limit,
         "changed": [f"{d.sensor} {d.what}" for d in check.changed],
         "not_determined": list(check.unknown),
+        "notes": [] if check.new is None else list(check.new.reasons),
         "drifts": [dataclasses.asdict(d) for d in check.drifts],
         "differences": [dataclasses.asdict(d) for d in check.tested],
         "residuals": dict(
