@@ -154,9 +154,13 @@ def test_the_right_lens_is_no_news(simulation):
     assert result.wrong == () and not any("that the rig file fixes" in w for w in result.warnings)
 
 
-def test_a_lens_that_is_nearly_right_is_no_news(simulation):
-    """What the factory says, or last year's calibration."""
-    assert with_lens(simulation, [2.0, 2.0, -3.0, 3.0]).wrong == ()
+def test_a_lens_that_is_nearly_right_is_not_taken_for_another(simulation):
+    """What the factory says, or last year's calibration: its principal point is 3 px off, and rotations by 0.37 deg
+    with it, 50 printed standard deviations. That the value is wrong is said, and that it makes the result wrong."""
+    result = with_lens(simulation, [2.0, 2.0, -3.0, 3.0])
+    (words,) = [w for w in result.wrong if "intrinsics" in w]
+    assert "the fixed value of intrinsics" in words and result.verdict == "not usable"
+    assert not any("that the rig file fixes do not fit" in w for w in result.warnings)
 
 
 @pytest.mark.parametrize("change", [[0.0, 0.0, 13.0, 7.0], [14.0, 14.0, 0.0, 0.0]])

@@ -13,12 +13,14 @@ from icalib.assessment.misfit import LARGE_FACTOR, misfit_causes
 from icalib.assessment.size import felt_size, is_certain, scale_notes, size_words
 from icalib.assessment.stated import absurd_wheels, stated_words
 from icalib.calibration import ParameterGroup, SensorFit
-from icalib.estimation.contradictions import Contradiction, contradictions, worst_off
+from icalib.calibration.verdict import NUISANCE
+from icalib.estimation.contradictions import SIGMAS, Contradiction, contradictions, worst_off
 from icalib.estimation.estimate import Estimate
-from icalib.estimation.fixed_lens import lens_steps
+from icalib.estimation.fixed_lens import LENS, lens_steps
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.parts import Parts
-from icalib.estimation.relaxed import relaxed
+from icalib.estimation.relaxed import Relaxed, relaxed
+from icalib.estimation.state import Key
 from icalib.estimation.surfaces import ON_PLANES
 from icalib.timeline import Timeline
 
@@ -69,7 +71,7 @@ def _stated(judged: Judged, against: Sequence[Contradiction]) -> tuple[list[Caus
     # What others complain of may come of a wrong size, or of an accelerometer's scale: then that is the news.
     certain, given = is_certain(size), bool(against)
     stated = None if given else relaxed(inputs, judged.found)
-    lenses = () if certain else other_lens(inputs.rig.cameras, lens_steps(inputs, stated), factor)
+    lenses = () if certain else tuple(other_lens(inputs.rig.cameras, lens_steps(inputs, stated), factor))
     scale = max(factor, judged.misfit_factor)
     against = against or contradictions(inputs, stated, scale)
     if certain:  # a wrong size moves lever arms by some of their length
@@ -78,15 +80,30 @@ def _stated(judged: Judged, against: Sequence[Contradiction]) -> tuple[list[Caus
     if size is not None:
         gain = ((size.ratio - 1.0) / (size.std / factor)) ** 2
         causes += [Cause(sentence, float(gain), certain) for sentence in wrong_size]
-    causes += [Cause(sentence, gain, True) for sentence, gain in lenses]
-    causes += _contradicted(judged, against, scale, certain or given, given)
+    causes += [Cause(sentence, gain, True) for _, sentence, gain in lenses]
+    said = {(camera, name) for camera, *_ in lenses for name in LENS}
+    against = tuple(c for c in against if c.key not in said)
+    causes += _contradicted(judged, against, scale, certain or given, None if given else stated)
     return causes, (*notes, *scale_notes(inputs, size))
 
 
 def _contradicted(
-    judged: Judged, against: Sequence[Contradiction], scale: float, grave: bool, given: bool
+    judged: Judged, against: Sequence[Contradiction], scale: float, grave: bool, stated: Relaxed | None
 ) -> Iterator[Cause]:
     for c in against:
-        gain = np.inf if given else float(((c.off / (c.sigma / scale)) ** 2).max())
-        yield Cause(stated_words(judged.inputs, c), gain, grave)
+        gain = np.inf if stated is None else float(((c.off / (c.sigma / scale)) ** 2).max())
+        moves = stated is not None and _moves_others(judged, stated, c.key)
+        yield Cause(stated_words(judged.inputs, c), gain, grave or moves)
     yield from (Cause(s, 0.0, grave) for s in absurd_wheels(judged.inputs, against, judged.groups))
+
+
+def _moves_others(judged: Judged, stated: Relaxed, key: Key) -> bool:
+    """Whether any other parameter of a sensor moves by more than four printed standard deviations where that group is
+    neither fixed nor has its prior: then what is stated makes the result wrong."""
+    step, _ = stated.step([key])
+    for g in judged.groups:
+        if g.columns is None or (g.sensor, g.name) == key or g.name in NUISANCE:
+            continue
+        if (np.abs(step[stated.layout.columns(g.sensor, g.name)]) > SIGMAS * g.std).any():
+            return True
+    return False

@@ -88,9 +88,9 @@ def mixed_up(cameras: Sequence[Camera], groups: Sequence[ParameterGroup]) -> Ite
             )
 
 
-def other_lens(cameras: Sequence[Camera], steps: Sequence[LensStep], factor: float) -> Iterator[tuple[str, float]]:
-    """Cameras whose intrinsics the rig file fixes at what cannot be theirs, and by how much chi^2 falls without that;
-    `factor`: the largest empirical one."""
+def other_lens(cameras: Sequence[Camera], steps: Sequence[LensStep], factor: float) -> Iterator[tuple[str, str, float]]:
+    """Cameras whose intrinsics the rig file fixes at what cannot be theirs: name, sentence, and by how much chi^2 falls
+    without that. `factor`: the largest empirical one."""
     given = {c.name: c.intrinsics.value for c in cameras}
     for found in steps:
         value = given[found.camera]
@@ -111,7 +111,7 @@ def other_lens(cameras: Sequence[Camera], steps: Sequence[LensStep], factor: flo
                 f"the intrinsics of {found.camera} that the rig file fixes do not fit its images, which want {where}: "
                 f"check that they are this camera's, at this resolution, or leave them free.{hint}"
             )
-            yield sentence, float(((found.step / found.std) ** 2).max())
+            yield found.camera, sentence, float(((found.step / found.std) ** 2).max())
 
 
 def _away(camera: Camera, found: dict[tuple[str, str], np.ndarray], name: str) -> float:

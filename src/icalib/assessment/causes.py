@@ -177,8 +177,8 @@ def _clock_words(c: Change, parts: Parts, when: str, timeline: Timeline) -> str:
         span = float(np.ptp(parts.state.seconds[parts.ends]))
         return (
             f"the clock of {c.key[0]} drifts against the others by about {1e6 * c.value[0]:+.0f} ppm, "
-            f"{1e3 * span * abs(c.value[0]):.2g} ms {when}. Stamp all sensors by one clock (trigger, PTP), or "
-            "calibrate short parts by --from and --to."
+            f"{1e3 * span * abs(c.value[0]):.2g} ms {when}. Stamp all sensors by one clock (hardware trigger, PTP) "
+            "and record again."
         )
     return (
         f"the time offset of {c.key[0]} changes by about {1e3 * c.value[0]:+.2g} ms {when}: its clock jumped, or "

@@ -2,39 +2,78 @@
 
 from __future__ import annotations
 
-from icalib.calibration import Calibration, SensorFit, Verdict
+import re
+
+import numpy as np
+
+from icalib.calibration import Calibration, RelativePose, SensorFit, Verdict, relative_poses
 from icalib.calibration.excess import excess, times
 from icalib.calibration.quantities import Row, chi2_words, rms_words, rows, shown, shown_groups
-from icalib.calibration.verdict import LENS, lens_projection_px, lens_verdict, worst
+from icalib.calibration.verdict import LENS, NUISANCE, by_size, lens_projection_px, lens_verdict, worst
 from icalib.report.tables import Html, badge, element, html, table
 
 FAR_BEYOND = 4.0  # times the stated noise: then standard deviations mean nothing
 
 
 def sensor_cards(c: Calibration) -> Html:
-    """Of all sensors and targets, in the order of the result."""
-    names = [n for n in dict.fromkeys(g.sensor for g in shown_groups(c)) if n not in c.bodies]
+    """Of all sensors that have parameters or residuals, in the order of the rig file, but the IMU last."""
+    known = {g.sensor for g in shown_groups(c)} | {f.sensor for f in c.fits}
+    names = sorted((n for n in c.rig["sensors"] if n in known), key=lambda n: n == c.imu)
     return Html("".join(_card(c, name) for name in names))
 
 
+def camera_pairs(c: Calibration) -> Html:
+    """The baseline of every pair of cameras, and how well their relative rotation is known; empty for one camera."""
+    found = [r for r in relative_poses(c) if {r.frame, r.sensor} <= set(c.cameras)]
+    if not found:
+        return Html("")
+    body = [
+        (
+            f"{r.frame} to {r.sensor}",
+            f"{1e3 * r.distance:.2f} ± {shown(1e3 * r.distance_std)} mm",
+            f"± {shown(float(np.rad2deg(r.std[:3].max())))} deg",
+            badge(_pair_verdict(c, r)),
+        )
+        for r in found
+    ]
+    return table(("camera pair", "baseline", "rotation", "verdict"), body)
+
+
+def _pair_verdict(c: Calibration, r: RelativePose) -> Verdict:
+    """By the largest standard deviation against the tolerances of the rig file's settings."""
+    turn = np.deg2rad(float(c.settings.get("rotation_tolerance_deg", 0.1)))
+    move = float(c.settings.get("translation_tolerance_m", 5e-3))
+    return by_size(float(max(r.std[:3].max() / turn, r.std[3:].max() / move)))
+
+
 def _card(c: Calibration, sensor: str) -> Html:
-    groups = [g for g in shown_groups(c) if g.sensor == sensor]
+    """Red where a component is undetermined, residuals are far beyond the noise, or a reason says that the sensor is
+    wrong; amber where something is weak, or residuals are large."""
     is_camera, own = sensor in c.cameras, [f for f in c.fits if f.sensor == sensor]
+    groups = [g for g in shown_groups(c) if g.sensor == sensor and g.name not in NUISANCE]
     judged: list[Verdict] = [v for g in groups if not (is_camera and g.name in LENS) for v in g.verdict]
     verdict = worst((*judged, *((lens_verdict(c, sensor),) if is_camera else ())))
     fit = max((excess(f) for f in own), default=1.0)
-    css = "undetermined" if fit >= FAR_BEYOND else "weak" if fit > 1.0 and verdict != "undetermined" else verdict
-    kind = c.rig["sensors"].get(sensor, {}).get("type", "target")
-    poor = [" ", element("span", "poor fit", f"badge {css}")] if fit > 1.0 else []
-    head = element("h3", [html(sensor), element("small", f" {kind} "), badge(verdict), *poor])
+    named = any(re.search(rf"(?<!\w){re.escape(sensor)}(?!\w)", sentence) for sentence in c.wrong)
+    css = verdict
+    if named or fit >= FAR_BEYOND:
+        css = "undetermined"
+    elif fit > 1.0 and verdict != "undetermined":
+        css = "weak"
+    marks = [w for w, shown in (("poor fit", fit > 1.0), ("see the reasons", named and fit == 1.0)) if shown]
+    badges = [element("span", mark, f"badge {css}") for mark in marks]
+    kind = c.rig["sensors"][sensor]["type"]
+    head = element("h3", [html(sensor), element("small", f" {kind} "), badge(verdict), *badges])
     lines = [element("li", _fit_words(f), "poor" if excess(f) > 1.0 else "") for f in own]
     fits = [element("ul", lines)] if lines else []
-    return element("article", [head, _components(c, sensor, is_camera), *fits], f"card {css}")
+    table = [_components(c, sensor, is_camera)] if groups else []
+    return element("article", [head, *table, *fits], f"card {css}")
 
 
 def _components(c: Calibration, sensor: str, is_camera: bool) -> Html:
     """One row a component; the coefficients of a lens as one."""
     hidden = {"fx", "fy", "cx", "cy", *_lens_labels(c, sensor)} if is_camera else set()
+    hidden |= set(NUISANCE)
     found = [r for r in rows(c) if r.sensor == sensor and r.name not in hidden]
     body = [(r.name, r.value, _std(r), badge(r.verdict)) for r in found]
     if is_camera:

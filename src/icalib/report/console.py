@@ -17,7 +17,10 @@ def table(calibration: Calibration) -> Table:
     out = Table(title="Calibration", caption=_caption(calibration), caption_justify="left", title_justify="left")
     for header in ("sensor", "parameter", "value", "std", "unit", "verdict"):
         out.add_column(header, justify="right" if header in ("value", "std") else "left", no_wrap=True)
-    found = [row for row in rows(calibration) if row.sensor not in calibration.bodies]
+    sensors = calibration.rig["sensors"]  # first, and the target's nuisance parameters last
+    found = sorted(
+        (r for r in rows(calibration) if r.sensor not in calibration.bodies), key=lambda r: r.sensor not in sensors
+    )
     for i, row in enumerate(found):
         first = i == 0 or found[i - 1].sensor != row.sensor
         last = i + 1 == len(found) or found[i + 1].sensor != row.sensor

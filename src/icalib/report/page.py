@@ -19,7 +19,7 @@ from icalib.report import (
     robot_figures,
     tables,
 )
-from icalib.report.cards import sensor_cards
+from icalib.report.cards import camera_pairs, sensor_cards
 from icalib.report.ellipsoids import SIGMAS, ellipsoids, magnification
 from icalib.report.histogram import normalised_histogram
 from icalib.report.plot import Figure
@@ -50,6 +50,7 @@ def report_html(calibration: Calibration) -> str:
     parts = {
         "trust": tables.trust(c),
         "cards": sensor_cards(c),
+        "pairs": camera_pairs(c),
         "reasons": tables.reasons(c),
         "notes": tables.sentences(c.notes, "", "None."),
         "fits": tables.fits(c),

@@ -82,7 +82,7 @@ def trust(c: Calibration) -> str:
 
 def parameters(c: Calibration) -> Html:
     headers = ("sensor", "parameter", "value", "std", "unit", "formal std", "factor", "verdict")
-    own = [r for r in rows(c) if r.sensor not in c.bodies]
+    own = sorted((r for r in rows(c) if r.sensor not in c.bodies), key=lambda r: r.sensor not in c.rig["sensors"])
     body = [(r.sensor, r.name, r.value, r.std, r.unit, r.formal, r.factor, badge(r.verdict)) for r in own]
     return table(headers, body, ("value", "std", "formal std", "factor"))
 
