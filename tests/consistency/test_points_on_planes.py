@@ -90,7 +90,7 @@ def test_where_too_few_points_lie_on_planes_a_warning_says_so():
     few = replace(scenario, features=replace(scenario.features, per_image=6))
     result, _ = calibrated(few, 0)
     (warning,) = (w for w in result.warnings if "points_on_planes_m" in w)
-    assert warning.startswith("no points that cameras follow lie on planes")
+    assert warning.startswith("no tracked points lie on planes")
 
 
 def test_planes_are_those_of_the_recording():

@@ -216,7 +216,7 @@ def test_the_verdict_of_halves_leaves_room_for_chance(calibration: Calibration, 
 
 def test_where_nothing_was_held_out_it_says_so(calibration: Calibration):
     page = Page(report_html(dataclasses.replace(calibration, cross_validation=None)))
-    assert "Nothing was held out: the recording is too short for segments" in page.words
+    assert "No cross-validation: the recording is too short for segments" in page.words
     assert set(json.loads(page.scripts[0])) == FIGURES - {"held-out"}
 
 

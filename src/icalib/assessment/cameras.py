@@ -33,8 +33,8 @@ def plane_warnings(rig: Rig, features: FeatureFactor | None) -> Iterator[str]:
     on, tracks = (0, 0) if features is None else (int((features.on.plane >= 0).sum()), features.tracks.count)
     if on == 0:
         yield (
-            "no points that cameras follow lie on planes of the LiDARs, so points_on_planes_m in the rig file counts "
-            "for nothing; make it larger, or take it out where little is flat."
+            "no tracked points lie on planes of the LiDARs, so points_on_planes_m in the rig file has no effect; make "
+            "it larger, or remove it if little is flat."
         )
     elif on < FEW_ON_PLANES * tracks:
         yield (

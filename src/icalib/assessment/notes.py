@@ -136,7 +136,7 @@ def _noise_words(model: NoiseModel) -> str:
     if model.misfit > 0.0:
         words += f", {model.misfit:.2g} px that the lens model does not follow"
     if model.exposure > 0.0:
-        words += f", {1e3 * model.exposure:.2f} px more (in squares) per 1000 px/s of image speed"
+        words += f", {1e3 * model.exposure:.2f} px of motion blur at 1000 px/s of image speed"
     if model.tau:
         words += f", {' and '.join(f'{t:.3f}' for t in model.tau)} px common to an image"
     return words

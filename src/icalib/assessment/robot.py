@@ -248,9 +248,9 @@ def lidar_warnings(inputs: Inputs, found: Estimate) -> Iterator[str]:
         stretch, std = _stretch(inputs, found, index)
         if abs(stretch) > max(STRETCHED, CLEARLY * std):
             yield (
-                f"the points of {lidar.name} lie off their planes as if the times of points within a scan were too "
-                f"{'short' if stretch > 0.0 else 'long'}, or in another order than written; check their unit, what "
-                "they count from and which way it turns, or set point_time in the rig file."
+                f"the times of points within a scan of {lidar.name} seem too {'short' if stretch > 0.0 else 'long'}, "
+                "or in the wrong order: points lie off their planes in proportion to the motion. Check their unit, "
+                "their origin and the sense of rotation, or set point_time in the rig file."
             )
         share = _used(found, lidar.name) / max(len(stream.xyz), 1)
         if share < FEW_ON_PLANES:

@@ -16,7 +16,7 @@ HEADER = """\
 # {key} takes coordinates in the sensor's frame to the {body} frame: p_{body} = {key} p_sensor.
 {kalibr}# time_offset: t_{body} = t_sensor + time_offset; a list, one for each recording, where a clock restarts.
 # std: standard deviations, of rotation about the sensor's axes, of translation along the {body} axes. They include
-#   empirical_factor, by which parts of the recording disagree more than their noise explains; formal = std / factor.
+#   empirical_factor: the scatter of segments over the predicted one; formal = std / factor.
 # T_scene_body: poses of a target's bodies, in the frame of that body whose pose is the identity.
 # relative: T_a_b takes coordinates in the frame of b to that of a. Its covariance, from the joint one of both, is of
 #   rotation about the axes of b and translation along those of a; where one is undetermined it is that of the guess.

@@ -26,7 +26,7 @@ from icalib.report.plot import Figure
 from icalib.report.tables import Html, element
 
 _NOT_HELD_OUT = (
-    "Nothing was held out: the recording is too short for segments, or segments are off in the rig file, or its halves "
+    "No cross-validation: the recording is too short for segments, or segments are off in the rig file, or its halves "
     "have no parameter in common that both know."
 )
 _MAPS = (("As the first guess had them", "map-before"), ("As calibrated", "map-after"))

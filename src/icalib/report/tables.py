@@ -175,4 +175,4 @@ def size_words(c: Calibration) -> str:
         parts.append(f"{sum(r.scans for r in c.lidar_residuals)} scans with {points} points on {len(c.planes)} planes")
     if c.wheel_residuals:
         parts.append(f"{sum(len(r.seconds) for r in c.wheel_residuals)} stretches of wheel turns")
-    return ", ".join([*parts, f"{len(c.trajectory.seconds)} nodes"])
+    return ", ".join([*parts, f"{len(c.trajectory.seconds)} keyframes"])
