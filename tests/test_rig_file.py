@@ -13,7 +13,7 @@ import yaml
 from icalib.errors import CalibrationError, RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard
 from icalib.imu_classes import IMU_CLASSES, class_noise
-from icalib.rig import Rig, Settings, TwoSources
+from icalib.rig import Camera, ImuNoise, ImuSensor, Lidar, PoseSensor, Rig, Settings, TwoSources, Wheels
 from icalib.rig_file import load_rig, rig_from_dict, rig_to_dict
 
 VALID = """\
@@ -457,3 +457,18 @@ def test_the_page_about_rig_files_is_right(tmp_path):
     for field in dataclasses.fields(Settings):
         default = str(field.default).lower() if isinstance(field.default, bool) else str(field.default)
         assert f"| `{field.name}` | {default} |" in page.replace(f"`{default}`", default), field.name
+
+
+def test_a_rig_for_arrays_needs_no_paths(tmp_path: Path):
+    rig = Rig(
+        ImuSensor("imu0", "", ImuNoise(1e-3, 1e-4, 1e-2, 1e-3)),
+        (Camera("cam0", "", "eucm", (640, 480)),),
+        AprilGrid(6, 6, 0.088, 0.3),
+        lidars=(Lidar("lidar0", ""),),
+        wheels=(Wheels("wheel0", ""),),
+        poses=(PoseSensor("mocap0", ""),),
+    )
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(rig_to_dict(rig)))
+    loaded = load_rig(tmp_path / "rig.yaml")
+    assert loaded.imu is not None and loaded.imu.path == "imu0/data.csv" and loaded.cameras[0].path
+    assert rig_to_dict(loaded)["sensors"].keys() == rig_to_dict(rig)["sensors"].keys()

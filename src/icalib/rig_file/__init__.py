@@ -95,11 +95,13 @@ def load_target(path: str | Path) -> Target:
 
 
 def rig_to_dict(rig: Rig) -> dict[str, Any]:
-    """`rig` as lists, numbers and text; written as YAML or JSON, it loads back as the same rig."""
+    """`rig` as lists, numbers and text; written as YAML or JSON, it loads back as the same rig. An empty path, as of a
+    rig for arrays, is left out, and loads back as that of the rig file's default."""
     imus = {} if rig.imu is None else {rig.imu.name: imu_to_plain(rig.imu)}
     sensors = imus | {c.name: _camera_to_plain(c) for c in rig.cameras}
     sensors |= {s.name: lidar_to_plain(s) for s in rig.lidars} | {w.name: wheels_to_plain(w) for w in rig.wheels}
     sensors |= {s.name: pose_to_plain(s) for s in rig.poses}
+    sensors = {name: {k: v for k, v in s.items() if (k, v) != ("path", "")} for name, s in sensors.items()}
     key = "targets" if isinstance(rig.target, Scene) else "target"
     target = {key: rig.target.plain()} if rig.has_target else {}
     return {
