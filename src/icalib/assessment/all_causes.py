@@ -9,6 +9,7 @@ import numpy as np
 
 from icalib.assessment.cameras import mixed_up, other_lens, plane_warnings
 from icalib.assessment.causes import Cause, Misfit, changing, explaining, ranked
+from icalib.assessment.lens_models import lens_warnings
 from icalib.assessment.misfit import LARGE_FACTOR, misfit_causes
 from icalib.assessment.size import felt_size, is_certain, scale_notes, size_words
 from icalib.assessment.stated import absurd_wheels, stated_words
@@ -81,6 +82,7 @@ def _stated(judged: Judged, against: Sequence[Contradiction]) -> tuple[list[Caus
         gain = ((size.ratio - 1.0) / (size.std / factor)) ** 2
         causes += [Cause(sentence, float(gain), certain) for sentence in wrong_size]
     causes += [Cause(sentence, gain, True) for _, sentence, gain in lenses]
+    causes += [Cause(sentence, gain) for sentence, gain in lens_warnings(inputs, judged.found)]
     said = {(camera, name) for camera, *_ in lenses for name in LENS}
     against = tuple(c for c in against if c.key not in said)
     causes += _contradicted(judged, against, scale, certain or given, None if given else stated)

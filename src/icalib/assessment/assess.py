@@ -14,7 +14,6 @@ from icalib.assessment.guesses import guess_notes
 from icalib.assessment.held_out import held_out
 from icalib.assessment.images import corner_residuals, track_residuals
 from icalib.assessment.labels import UNITS, labels_of
-from icalib.assessment.lens_models import lens_warnings
 from icalib.assessment.misfit import scatter_warnings
 from icalib.assessment.notes import notes
 from icalib.assessment.robot import (
@@ -305,7 +304,6 @@ def _warnings(
         yield f"the solver did not converge: {found.outcome.status}"
     yield from inputs.measurements.warnings
     yield from plane_warnings(inputs.rig, found.problem.features)
-    yield from lens_warnings(inputs, found)
     yield from pose_warnings(poses, inputs.rig)
     yield from upwards_warnings(inputs, found)
     yield from lidar_warnings(inputs, found) if inputs.clouds.count else ()

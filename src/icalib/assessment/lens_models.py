@@ -63,8 +63,8 @@ class _HeldOut:
         return float(np.sqrt(0.5 * self.squared_error.sum() / self.corners))
 
 
-def lens_warnings(inputs: Inputs, estimate: Estimate) -> Iterator[str]:
-    """A sentence for each camera whose estimated lens leaves a large misfit (`ResidualNoise`).
+def lens_warnings(inputs: Inputs, estimate: Estimate) -> Iterator[tuple[str, float]]:
+    """A sentence for each camera whose estimated lens leaves a large misfit (`ResidualNoise`), and its chi^2.
 
     It names a better model. Where none is clearly better, a sentence appears only if the misfit exceeds the noise.
     """
@@ -81,15 +81,22 @@ def lens_warnings(inputs: Inputs, estimate: Estimate) -> Iterator[str]:
             f"the corners of {camera.name} are off by up to {most:.2g} px, alike wherever in the image they are seen"
         )
         own, best = compare_models(replace(factor, stream=stream), out, state, inputs.rig.settings)
+        gain = 2.0 * float(np.count_nonzero(out.root)) * (noise.lens.rms / noise.base) ** 2
         if best is not None and own is not None:
             yield (
-                f"{pattern}: {own.model.name} does not follow this lens. In images that had no part in the fit it "
-                f"leaves {own.rms:.2g} px, {best.model.name} {best.rms:.2g} px; write `model: {best.model.name}`."
+                (
+                    f"{pattern}: {own.model.name} does not follow this lens. In images that had no part in the fit it "
+                    f"leaves {own.rms:.2g} px, {best.model.name} {best.rms:.2g} px; write `model: {best.model.name}`."
+                ),
+                gain,
             )
         elif noise.lens.rms > noise.base:
             yield (
-                f"{pattern}, and no other camera model follows them clearly better; check that the images are as the "
-                "camera took them, and that the target is as the rig file says."
+                (
+                    f"{pattern}, and no other camera model follows them clearly better; check that the images are as "
+                    "the camera took them, and that the target is as the rig file says."
+                ),
+                gain,
             )
 
 
