@@ -1,4 +1,4 @@
-"""When the solver takes its steps for creeping."""
+"""When the solver takes its steps for creeping, and how it damps them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, cast
 import pytest
 
 from icalib.estimation.outcome import Step
-from icalib.estimation.solver import _Descent
+from icalib.estimation.solver import SLOW, _Care, _Descent
 
 
 @pytest.mark.parametrize(
@@ -20,3 +20,22 @@ def test_steps_that_fail_do_not_creep(promised: tuple[float, ...], accepted: tup
     steps = [Step(1e3, p, 0.0, a) for p, a in zip(promised, accepted, strict=True)]
     descent, solution = (cast(Any, SimpleNamespace(**f)) for f in ({"steps": steps}, {"decrease": 5.0}))
     assert _Descent.creeps(descent, solution) == creeps
+
+
+def test_damping_stays_near_what_the_last_failure_asked_for():
+    """It grows by 2, 4, 8 and shrinks by a third at most, until one good step follows another."""
+    care = _Care(SLOW)
+    grown = []
+    for _ in range(5):
+        care.more()
+        grown.append(care.damping / SLOW.first)
+    assert grown == pytest.approx([1.0, 4.0, 32.0, 512.0, 16384.0])
+    care.less(near=False, gain=1.0)
+    assert care.damping == pytest.approx(grown[-1] * SLOW.first / 3.0)
+    before = care.damping
+    care.less(near=False, gain=1.0)
+    assert care.damping == pytest.approx(SLOW.less * before)
+    care.less(near=False, gain=0.1)
+    assert care.damping == pytest.approx(SLOW.less * before)
+    care.less(near=True, gain=0.5)
+    assert care.curved and care.damping == pytest.approx(SLOW.less * before)

@@ -36,8 +36,9 @@ LEAST_DECREASE = 2e-5  # of half the chi^2: a step of 0.006 standard deviations,
 
 
 class _Pace(NamedTuple):
-    """Of damping: what it is at first, by what it grows where a step fails and shrinks where one is good, and below
-    what there is none: the weak information of a planar drive must not be swamped."""
+    """Of damping: what it is at first; by what it grows with a failure, by its square with the next, ...; by what it
+    shrinks where one good step follows another; and below what there is none: the weak information of a planar drive
+    must not be swamped."""
 
     first: float
     more: float
@@ -45,8 +46,10 @@ class _Pace(NamedTuple):
     none: float
 
 
-SLOW = _Pace(1e-6, 10.0, 0.1, 1e-10)
-QUICK = _Pace(1e-4, 100.0, 0.01, 2e-6)  # where a pass is only to lead near
+SLOW = _Pace(1e-6, 2.0, 0.1, 1e-10)
+QUICK = _Pace(1e-4, 8.0, 0.01, 2e-6)  # where a pass is only to lead near
+LEAST_LESS = 1.0 / 3.0  # Nielsen 1999, "Damping parameter in Marquardt's method": by what it shrinks after a failure
+GOOD_GAIN = 0.25  # of what a step promises: with less, damping does not shrink
 
 
 @dataclass
@@ -58,11 +61,16 @@ class _Care:
     damping: float = 0.0
     curved: bool = False
     curved_below: float = CURVED_BELOW
+    failures: int = 0  # since the last step that was taken
 
-    def less(self, near: bool, good: bool) -> None:
-        """After a step that was taken, to sums that have the true curvature where `near`."""
+    def less(self, near: bool, gain: float) -> None:
+        """After a step that was taken, with its gain over the predicted one, to sums that have the true curvature where
+        `near`. Damping that a failed step asked for shrinks slowly: with much less the next step would fail, too."""
         self.curved = near
-        self.damping *= self.pace.less if good else 1.0
+        if gain > GOOD_GAIN:
+            least = LEAST_LESS if self.failures else self.pace.less
+            self.damping *= max(least, 1.0 - (2.0 * min(gain, 1.0) - 1.0) ** 3)
+        self.failures = 0
         self.damping = 0.0 if self.damping < self.pace.none else self.damping
 
     def more(self) -> None:
@@ -70,7 +78,8 @@ class _Care:
         if self.curved:
             self.curved_below *= 0.1
         else:
-            self.damping = max(self.damping * self.pace.more, self.pace.first)
+            self.failures += 1
+            self.damping = max(self.damping * self.pace.more**self.failures, self.pace.first)
         self.curved = False
 
 
@@ -209,7 +218,7 @@ class _Descent:
         else:
             self.accelerator.forget()
         if taken:
-            self.care.less(near, self.cost - cost > 0.25 * solution.decrease)
+            self.care.less(near, (self.cost - cost) / max(solution.decrease, 1e-300))
             self.state, self.cost, self.problem = there, cost, self.problem.settled(self.residuals)
         return taken, converged
 
