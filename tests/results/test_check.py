@@ -20,7 +20,7 @@ from icalib.check import Check, check_measurements
 from icalib.check.check import joint_limit
 from icalib.check.words import lines, verdict
 from icalib.cli import main
-from icalib.errors import RecordingError
+from icalib.errors import CalibrationError, RecordingError
 from icalib.geometry.targets import AprilGrid
 from icalib.measurements import Measurements
 from icalib.pipeline import calibrate_measurements
@@ -128,6 +128,8 @@ def test_a_recording_that_is_too_short_and_one_of_another_rig(known: Calibration
     found = check_measurements(known, first(measured, 0.5))
     assert (found.validity, found.exit_code, found.new) == ("cannot say", 3, None)
     assert lines(found) == [f"Cannot say: {found.reason}"] and "the recording is too short" in found.reason
+    with pytest.raises(CalibrationError, match="sigma must be a number above 0, but is -1"):
+        check_measurements(known, measured, sigma=-1.0)
     with pytest.raises(RecordingError, match="cam1"):
         check_measurements(known, replace(measured, cameras=measured.cameras[:1]))
 

@@ -21,7 +21,7 @@ from icalib.calibration.verdict import LENS, NUISANCE, lens_verdict
 from icalib.comparison.compare import Comparison, Difference, compare_sides
 from icalib.comparison.results import side_of_result
 from icalib.comparison.significance import sigmas
-from icalib.errors import EstimationError
+from icalib.errors import CalibrationError, EstimationError
 from icalib.geometry import so3
 from icalib.measurements import Measurements
 from icalib.pipeline import Progress, calibrate_measurements, measure
@@ -106,6 +106,8 @@ def check_measurements(
     sigma: float = 3.0,
 ) -> Check:
     """As `check_calibration`, from measurements in memory."""
+    if not 0.0 < sigma < inf:
+        raise CalibrationError(f"sigma must be a number above 0, but is {sigma:g}; 3 is usual.")
     rig = rig_of_result(calibration, "guess")[0]
     old = calibration.fits
     try:
