@@ -47,7 +47,7 @@ def mcap(block: bytes) -> bytes:
 
 def test_a_bag_whose_block_is_too_large_says_so(tmp_path: Path):
     (tmp_path / "run.mcap").write_bytes(mcap(LARGE))
-    with pytest.raises(RecordingError, match=r"the block at byte \d+ is left out: it unpacks to more than 16 MiB"):
+    with pytest.raises(RecordingError, match=r"the block at byte \d+ is ignored: it unpacks to more than 16 MiB"):
         open_recording(tmp_path / "run.mcap")
     (tmp_path / "run.mcap").unlink()
     (tmp_path / "run.db3.zstd").write_bytes(load_zstd().compress(b"SQLite format 3\x00" + LARGE))
@@ -86,5 +86,5 @@ def test_plane_ids_are_below_the_number_of_points(tmp_path: Path, plane: int):
         "xyz": np.ones((4, 3), np.float32), "plane": np.array([0, -1, 1, plane]),
     }  # fmt: skip
     np.savez(tmp_path / "scans.npz", **arrays)
-    with pytest.raises(RecordingError, match="plane must be -1, or the number of a plane"):
+    with pytest.raises(RecordingError, match="plane must be -1 or a plane's number"):
         read_scans("lidar0", tmp_path / "scans.npz")

@@ -57,9 +57,9 @@ def test_no_result_moves_by_a_standard_deviation(drive):
     assert nothing == ()
     assert [n.split("scans ")[1].split(",")[0] for n in notes] == [
         "that repeat an earlier one exactly were dropped",
-        "came after later ones",
-        "have a stamp that does not fit their neighbours' and were left out",
-        "are stamped by more than 5% of a period too early or too late between their neighbours and were left out",
+        "are out of order",
+        "have a stamp that does not fit their neighbours' and were removed",
+        "are stamped more than 5% of a period too early or too late relative to their neighbours and were removed",
     ]
     for a, b in zip(clean.groups, found.groups, strict=True):
         if a.sensor != "lidar0":

@@ -57,7 +57,7 @@ BROKEN = [
     (about(0.001, 0.001, 1), "problem", r"imu0 turns about the z axis of imu0 only .*: turn the rig about two more"),
     (askew, "problem", r"about the direction \(0\.58, 0\.58, 0\.58\) in the axes of imu0 only"),
     (about(0.001, 0.001, 0.001), "problem", r"imu0 hardly moves .*: record again"),
-    (in_g, "warning", r"units of g .*times 9\.80665"),
+    (in_g, "warning", r"units of g .*multiplied by 9\.80665"),
     (degrees, "problem", r"deg/s; set gyro_unit: deg/s"),
     (slow_degrees, "problem", r"deg/s, for so they turn as gravity does"),
     (saturated, "warning", r"gyroscope x looks saturated, .* at 3 from"),

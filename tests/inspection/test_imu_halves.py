@@ -1,4 +1,4 @@
-"""An IMU whose gyroscope and accelerometer report apart: found in a bag, drafted, joined."""
+"""An IMU whose gyroscope and accelerometer have separate stamps: found in a bag, drafted, joined."""
 
 from __future__ import annotations
 
@@ -47,7 +47,9 @@ def joined(recording, sensor: ImuSensor) -> tuple[ImuStream, tuple[str, ...]]:
 @pytest.mark.parametrize("topic", [None, HALVES, HALVES.gyro, HALVES.accel])
 def test_the_two_topics_are_joined(bag, brief, topic):
     found, notes = joined(open_recording(bag), replace(IMU, topic=topic))
-    assert "/d435/gyro/sample and /d435/accel/sample (imu0): gyroscope and accelerometer report apart" in notes[0]
+    assert (
+        "/d435/gyro/sample and /d435/accel/sample (imu0): gyroscope and accelerometer have separate stamps" in notes[0]
+    )
     own = np.isin(brief.stamps_ns, found.stamps_ns)
     assert own.sum() == len(found.stamps_ns) > 0.97 * len(brief.stamps_ns)
     np.testing.assert_array_equal(found.gyro, brief.gyro[own])

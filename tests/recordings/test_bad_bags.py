@@ -67,7 +67,7 @@ class TestCutOff:
 
     def check_beginning(self, recording: Recording, truth) -> int:
         """All that is read is what was written, from the beginning; returns how many messages."""
-        assert any("is cut off or damaged" in note for note in recording.notes())
+        assert any("is truncated or damaged" in note for note in recording.notes())
         images = readings = 0
         kinds = {t.kind for t in recording.topics() if t.count}
         if any(t.name.startswith("/cam0") and t.count for t in recording.topics()):
@@ -94,11 +94,11 @@ class TestCutOff:
         whole = path.read_bytes()
         path.write_bytes(whole[: len(whole) * 2 // 3])
         recording = open_recording(folder)
-        assert len(recording.notes()) == 1 and f"{path} is cut off or damaged" in recording.notes()[0]
+        assert len(recording.notes()) == 1 and f"{path} is truncated or damaged" in recording.notes()[0]
         read = [f.stamp_ns for f in recording.images("/cam")]
         assert 10 < len(read) < 60 and read == stamps[: len(read)]
         path.write_bytes(whole[:1000])
-        assert f"{path} is cut off or damaged before its first message" in complaint(lambda: open_recording(folder))
+        assert f"{path} is truncated or damaged before its first message" in complaint(lambda: open_recording(folder))
 
     def test_bag_that_was_not_closed(self, tmp_path, truth, write):
         """ROS 1 writes the place of its index into the header last."""
@@ -108,7 +108,7 @@ class TestCutOff:
         end = int.from_bytes(whole[at : at + 8], "little")
         path.write_bytes(whole[:at] + bytes(8) + whole[at + 8 : end])
         recording = open_recording(path)
-        assert f"at byte {end} of {end}; what can be read is used: 144 messages, 0.6 s" in recording.notes()[0]
+        assert f"at byte {end} of {end}; the readable part is used: 144 messages, 0.6 s" in recording.notes()[0]
         assert self.check_beginning(recording, truth) == 132
 
     def test_index_of_the_last_block_is_cut_off(self, tmp_path, truth, write):
@@ -162,7 +162,7 @@ class TestCutOff:
         folder = write.small("ros2 mcap", tmp_path, truth)
         file = folder / "metadata.yaml"
         file.write_text(file.read_text().replace("- run.mcap", "- run.mcap\n  - run_1.mcap", 1))
-        assert open_recording(folder).notes() == (f"{folder}: metadata.yaml names run_1.mcap, which is not there.",)
+        assert open_recording(folder).notes() == (f"{folder}: metadata.yaml lists run_1.mcap, which does not exist.",)
 
 
 class TestDamaged:
@@ -193,7 +193,7 @@ class TestDamaged:
         recording = open_recording(path)
         stamps = recording.imu(IMU).stamps_ns.tolist()
         assert set(stamps) < set(truth.imu_stamps) and len(stamps) > 90 and stamps[-1] == truth.imu_stamps[-1]
-        assert "is damaged; what follows in it was left out" in recording.notes()[0]
+        assert "is damaged; the messages after the damage were ignored" in recording.notes()[0]
 
     def test_a_message_that_is_none(self, tmp_path, write):
         maker = write.maker()
@@ -272,7 +272,7 @@ class TestNoBag:
         path = write.mcap(tmp_path / "a.mcap", [("/imu", "sensor_msgs/msg/Imu", 5, imu)], enable_crcs=False)
         path.write_bytes(path.read_bytes().replace(b"\x03\0\0\0cdr", b"\x03\0\0\0xml"))
         sentence = complaint(lambda: open_recording(path).imu(IMU))
-        assert "/imu: messages in 'xml' are not ROS's" in sentence
+        assert "/imu: messages have the encoding 'xml', which is not one of ROS" in sentence
 
     def test_without_rosbags_the_sentence_names_the_extra(self, tmp_path, truth, write, monkeypatch):
         from icalib.recordings import bag
@@ -305,9 +305,7 @@ class TestClocks:
     def test_no_stamp_in_the_header(self, tmp_path, write):
         bag = self.bag(tmp_path, write, [0] * 20)
         assert bag.imu(IMU).stamps_ns.tolist() == [9 * S + k * 5_000_000 for k in range(20)]
-        assert (
-            "/imu: 20 messages have no stamp in their header; the times at which they were received" in bag.notes()[0]
-        )
+        assert "/imu: 20 messages have no stamp in their header. Their receive times are used instead" in bag.notes()[0]
 
     def test_readings_that_overtook_each_other_are_sorted(self, tmp_path, write):
         stamps = [S + k * 5_000_000 for k in range(20)]
@@ -318,7 +316,7 @@ class TestClocks:
         rng = np.random.default_rng(0)
         written = np.array([[rng.normal(size=3), rng.normal(size=3)] for _ in stamps])[:, 0]
         np.testing.assert_array_equal(imu.gyro, written[np.argsort(stamps)])
-        assert "2 readings came after later ones, by up to 10.0 ms; all were sorted by stamp" in bag.notes()[0]
+        assert "2 readings are out of order by up to 10.0 ms; all were sorted by stamp" in bag.notes()[0]
 
     def test_clock_that_was_set_back_is_refused(self, tmp_path, write):
         stamps = [S + k * 5_000_000 for k in range(10)] + [5 + k * 5_000_000 for k in range(10)]
@@ -378,23 +376,27 @@ class TestImages:
     def test_camera_that_freezes(self, tmp_path, write):
         images = self.pictures()
         images[4] = images[5] = images[3]
-        note = f"3 images that repeat the one before exactly (the camera froze) were left out, the first at {T[4]} ns"
+        note = (
+            f"3 images that repeat their predecessor exactly (the camera froze) were left out, the first at {T[4]} ns"
+        )
         images[6] = images[3]
         self.check_left_out(self.bag(tmp_path, write, images), [0, 1, 2, 3, 7], note)
 
     def test_images_out_of_order(self, tmp_path, write):
         bag = self.bag(tmp_path, write, self.pictures(), [*T[:3], T[4], T[3], T[4], *T[6:]])
-        note = f"2 images that are not later than the one before were left out, the first at {T[3]} ns"
+        note = f"2 images that are not later than their predecessor were left out, the first at {T[3]} ns"
         self.check_left_out(bag, [0, 1, 2, 4, 6, 7], note)
 
     def test_clock_that_was_set_back(self, tmp_path, write):
         bag = self.bag(tmp_path, write, self.pictures(), [*T[:4], *(t - 5 * S for t in T[4:])])
         sentence = complaint(lambda: list(bag.images("/cam")))
-        assert f"/cam: the image at {T[4] - 5 * S} ns comes after the one at {T[3]} ns; the camera's clock" in sentence
+        assert (
+            f"/cam: the image at {T[4] - 5 * S} ns comes after the one at {T[3]} ns, so the camera's clock" in sentence
+        )
 
     @pytest.mark.parametrize(
         ("image", "words"),
-        [(0, "of 8 images, 8 consist of zeros"), (1, "of 8 images, 7 repeat the one before exactly")],
+        [(0, "of 8 images, 8 consist of zeros"), (1, "of 8 images, 7 repeat their predecessor exactly")],
     )
     def test_no_usable_image(self, image, words, tmp_path, write):
         bag = self.bag(tmp_path, write, [np.full((6, 8), image, np.uint8)] * 8)

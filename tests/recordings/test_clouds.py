@@ -149,7 +149,7 @@ def test_points_on_a_clock_of_their_own(write, read):
     stream, notes = read(messages)
     moved = Scans(found.stamps - ORIGIN + 77_000_000_000, found.since, found.xyz, found.ring)
     check(stream, moved, 10)
-    assert len(notes) == 1 and "`timestamp` is on another clock than the messages' stamps" in notes[0]
+    assert len(notes) == 1 and "the point times `timestamp` are from another clock than the message stamps" in notes[0]
 
 
 @pytest.mark.parametrize("direction", [1, -1])
@@ -165,7 +165,7 @@ def test_points_are_timed_by_azimuth(write, read, direction, order):
     height = RINGS if order == "organised" else 1
     messages = packed(write.maker(), found, PLAIN, lambda t, s: {}, height=height)
     stream, notes = read(messages, point_time="azimuth")
-    assert "by their azimuth, " + ("against" if direction > 0 else "with") + " the clock" in " ".join(notes)
+    assert "from the azimuth, " + ("counterclockwise" if direction > 0 else "clockwise") in " ".join(notes)
     if order == "organised":
         lost = np.isnan(found.xyz[1, :, 0])
         assert lost.any() and f"{lost.sum()} without numbers" in " ".join(notes)
@@ -232,7 +232,7 @@ def stamped(times: Any, shuffle: bool = False) -> Any:
 REFUSED = {
     "no times": (stamped((PLAIN, lambda t, s: {})), {}, "no times (their fields are x, y, z, intensity); record a clo"),
     "no unit": (
-        stamped((HESAI, lambda t, s: {"timestamp": t * 3e-8})), {}, "goes on by 3 from scan to scan, which is 0.1 s in"
+        stamped((HESAI, lambda t, s: {"timestamp": t * 3e-8})), {}, "increases by 3 from scan to scan, which is 0.1 s"
     ),
     "times of float32": (
         stamped((layout(16, timestamp=("f4", 12)), lambda t, s: {"timestamp": t * 1e-9})), {},
@@ -451,7 +451,7 @@ def test_clouds_that_are_all_stamped_alike(write, read, point_time):
     still = Scans(np.full(SCANS, ORIGIN), found.since, found.xyz, found.ring)
     messages = packed(make, still, VELODYNE, lambda t, s: {"time": (t - s) * 1e-9})
     with pytest.raises(
-        RecordingError, match="the stamps of the first clouds do not go on .*; have the driver stamp each"
+        RecordingError, match="the stamps of the first clouds do not increase .*; have the driver stamp each"
     ):
         read(messages, point_time=point_time)
 
@@ -470,7 +470,7 @@ def test_what_does_not_turn_has_no_azimuth(write, read):
     found = scans()
     azimuth = 0.6 * np.sin(40.0 * found.since / PERIOD)
     found.xyz[...] = 5.0 * np.stack([np.cos(azimuth), np.sin(azimuth), 0.0 * azimuth], axis=1)
-    with pytest.raises(RecordingError, match="the points do not go round"):
+    with pytest.raises(RecordingError, match="the points are not in order of azimuth"):
         read(packed(write.maker(), found, PLAIN, lambda t, s: {}), point_time="azimuth")
 
 

@@ -38,7 +38,7 @@ def test_names_that_are_no_stamps(tmp_path, truth, write):
     (root / "mav0/cam0/data.csv").unlink()
     (root / "mav0/cam0/data/left_1.png").touch()
     sentence = complaint(lambda: list(open_recording(root).images("cam0")))
-    assert "cam0 has no data.csv, and left_1.png is no stamp in ns" in sentence
+    assert "cam0 has no data.csv, and the name of left_1.png is not a stamp in ns" in sentence
 
 
 @pytest.mark.parametrize("line", ["12", "12,", "1.5,a.png", "x,a.png"])

@@ -80,7 +80,7 @@ def test_gravity_taken_off_is_named(waved, size):
     """At any size, that of units of g too."""
     linear = waved.accel - gravity_of(waved)
     linear *= size / np.median(np.linalg.norm(linear, axis=1))
-    with pytest.raises(RecordingError, match="gravity is not in the accelerometer"):
+    with pytest.raises(RecordingError, match="the accelerometer readings contain no gravity"):
         checked_imu(replace(waved, accel=linear), "file", IMU)
 
 

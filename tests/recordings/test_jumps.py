@@ -54,7 +54,7 @@ def test_the_longest_part_is_used_with_a_note():
     assert note.startswith(
         "a.csv (imu0): the clock jumps forward by 3600.01 s (and 1 more times) after the stamp 495000000 ns"
     )
-    assert "0.495 s from the start; used are the 4.495 s from 3600500000000 ns on. --from and --to choose" in note
+    assert "0.495 s from the start. Only the 4.495 s from 3600500000000 ns on are used; choose another part" in note
 
 
 def test_streams_that_jump_alike_keep_the_same_part():
@@ -80,7 +80,7 @@ def test_stamps_that_no_clock_has():
         ClockJumps().cut(imu(np.array([0, 5, 2**63 - 1])), "here")
     hours = imu(500_000_000_000 * np.arange(60))
     with pytest.raises(
-        RecordingError, match=r"here: the stamps run over 8\.194 h, and a calibration takes up to 6 h; choose"
+        RecordingError, match=r"here: the stamps span 8\.194 h, and a calibration takes at most 6 h; choose"
     ):
         ClockJumps(6 * 3600.0).cut(hours, "here")
 

@@ -336,7 +336,7 @@ def test_stamps_before_1970_and_bad_nanoseconds(tmp_path):
     assert "nanoseconds is 'x', which is not a number; the line was left out" in notes[0]
     assert "2 of 59 rows have no stamp" in notes[1] and "and 1000000000 in sec and nanosec" in notes[1]
     wrong = split_rows("plain").replace(",imu,", ",imu,1")
-    assert "nanoseconds are from 0 to 999999999; correct what writes them" in refused(tmp_path, wrong)
+    assert "nanoseconds are from 0 to 999999999; correct the program that writes them" in refused(tmp_path, wrong)
 
 
 def test_nanoseconds_alone_are_no_stamp_of_two_columns(tmp_path):

@@ -60,8 +60,8 @@ def test_as_many_pictures_as_poses(tmp_path, name, place, first):
     recording = open_recording(tmp_path)
     assert recording.poses(HAND).stamps_ns.tolist() == recording.stamps("cam0").tolist()
     list(recording.images("cam0"))
-    (note,) = [n for n in recording.notes() if "have no stamps" in n]
-    assert "12 pictures have no stamps; each has that of its row of" in note and "in order" in note
+    (note,) = [n for n in recording.notes() if "have no timestamps" in n]
+    assert "12 images have no timestamps. Each takes that of its row of" in note and "in order" in note
 
 
 @pytest.mark.parametrize("first", [0, 1])
@@ -106,7 +106,7 @@ def test_a_row_whose_stamp_cannot_be_read_leaves_its_picture_alone(tmp_path, kep
     assert seen == {row: row for row in kept if row != bad}
     notes = " ".join(recording.notes())
     assert f"poses.csv:{2 + bad}: " in notes
-    assert (f"1 of {len(kept)} pictures are left out, the first is {bad}.png" in notes) == (bad in kept)
+    assert (f"1 of {len(kept)} images are ignored, the first is {bad}.png" in notes) == (bad in kept)
 
 
 def test_many_rows_without_a_stamp_are_refused(tmp_path):
@@ -163,8 +163,8 @@ def test_stamps_as_names_stay_stamps(tmp_path):
 @pytest.mark.parametrize(
     ("names", "rows", "words"),
     [
-        (["1.png", "2.png", "9.png"], 5, "up to number 9, and .*poses.csv 5 rows; number each picture as the row"),
-        (["a1.png", "b1.png", "a2.png"], 5, "have the same number, 1; give each picture its own"),
+        (["1.png", "2.png", "9.png"], 5, "up to number 9, and .*poses.csv has 5 rows; number each image as the row"),
+        (["a1.png", "b1.png", "a2.png"], 5, "have the same number, 1; number each image as the row of its pose"),
     ],
 )
 def test_pictures_without_a_row_are_refused(tmp_path, names, rows, words):

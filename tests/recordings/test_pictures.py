@@ -59,7 +59,7 @@ def test_a_pattern_for_each_camera(tmp_path):
 
 def test_wrong_names_are_said(tmp_path):
     picture(tmp_path / "a" / "first.png", 1)
-    with pytest.raises(RecordingError, match=r"first\.png has no number in its name"):
+    with pytest.raises(RecordingError, match=r"the name of .*first\.png has neither a number"):
         list(open_recording(tmp_path).payloads("a"))
     (tmp_path / "a" / "first.png").unlink()
     picture(tmp_path / "a" / "x_1.png", 1)
@@ -67,7 +67,7 @@ def test_wrong_names_are_said(tmp_path):
     with pytest.raises(RecordingError, match="have the same number, 1"):
         list(open_recording(tmp_path).payloads("a"))
     assert [(t.name, t.count, t.first_ns) for t in open_recording(tmp_path).topics()] == [("a", 2, None)]
-    with pytest.raises(RecordingError, match=r"has no pictures b/\*\.png"):
+    with pytest.raises(RecordingError, match=r"has no images b/\*\.png"):
         next(iter(PictureFolder(tmp_path).payloads("b/*.png")))
 
 
@@ -107,13 +107,13 @@ def test_single_pictures_that_are_odd_are_left_out_and_named(tmp_path):
     recording = open_recording(tmp_path)
     assert [n for n, _ in greys(recording, "cam0")] == [i for i in range(12) if i not in (3, 5, 7)]
     notes = " ".join(recording.notes())
-    for reason, name in (("another size than 8 x 6 px", "p3"), ("are no pictures", "p5"), ("are damaged", "p7")):
+    for reason, name in (("another size than 8 x 6 px", "p3"), ("are not images", "p5"), ("are damaged", "p7")):
         assert f"{reason} were left out, the first {name}.png." in notes
 
 
 def test_an_imu_needs_a_clock(tmp_path):
     picture(tmp_path / "1.png", 1)
-    with pytest.raises(RecordingError, match="take the IMU out of the rig file"):
+    with pytest.raises(RecordingError, match="Remove the IMU from the rig file"):
         open_recording(tmp_path).imu(ImuSensor("imu0", "imu0/data.csv", ImuNoise(1, 1, 1, 1)))
 
 
@@ -135,7 +135,7 @@ def test_names_that_are_stamps(tmp_path, unit):
     recording = open_recording(tmp_path)
     for side in ("left", "right"):
         assert recording.stamps(side).tolist() == [t // digits * digits for t in STAMPS]
-    with pytest.raises(RecordingError, match=r"holds pictures, and no readings of imu0; write imu0\.csv beside"):
+    with pytest.raises(RecordingError, match=r"holds images, and no readings of imu0; add imu0\.csv beside"):
         recording.imu(ImuSensor("imu0", "imu0/data.csv", ImuNoise(1, 1, 1, 1)))
     picture(tmp_path / "left" / f"x{NAMES[unit][0].removeprefix('left-').removeprefix('frame_')}.png", 1)
     with pytest.raises(RecordingError, match="have the same stamp, 1"):

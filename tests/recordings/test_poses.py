@@ -140,9 +140,11 @@ def test_bad_poses(tmp_path):
     table(tmp_path, xyzw=1.1 * XYZW)
     assert f"the quaternion at {STAMPS[0]} ns has length 1.1, not 1" in refused(tmp_path)
     table(tmp_path, stamps=STAMPS // 1_000_000_000)
-    assert "poses have the stamp of another that differs, as where stamps are cut to whole seconds" in refused(tmp_path)
+    assert "poses share a stamp with a different pose, as if stamps were truncated to whole seconds" in refused(
+        tmp_path
+    )
     table(tmp_path, position=1000.0 * POSITION)
-    assert "in millimetres are to be divided by 1000" in refused(tmp_path)
+    assert "divide millimetres by 1000" in refused(tmp_path)
     table(tmp_path, position=0.0 * POSITION, xyzw=np.tile([0.0, 0.0, 0.0, 1.0], (N, 1)))
     assert "all poses are the same within 0 m and 0 rad" in refused(tmp_path)
     table(tmp_path, stamps=STAMPS[::-1])
@@ -160,7 +162,7 @@ def test_not_finite():
     position = POSITION.copy()
     position[7, 1], position[9] = np.nan, 1e300
     stream, notes = checked(position)
-    assert f"2 of {N} poses are not finite or have no unit quaternion and are left out, the first at" in notes[0]
+    assert f"2 of {N} poses are not finite or have no unit quaternion and were removed, the first at" in notes[0]
     np.testing.assert_array_equal(stream.stamps_ns, np.delete(STAMPS, [7, 9]))
     position[100:] = np.nan
     with pytest.raises(RecordingError, match=f"poses are not finite or .*, the first at {STAMPS[7]} ns"):
@@ -195,7 +197,9 @@ def test_lost_poses_are_left_out(case, sensor, far):
     position[lost], rotation[lost] = 0.0, np.eye(3)
     stream, notes = checked(position, rotation, sensor=sensor)
     np.testing.assert_array_equal(stream.stamps_ns, np.delete(STAMPS, lost))
-    assert f"{len(lost)} of {N} poses are off the path" in notes[-1] or "repeat an earlier one" in notes[0]
+    assert (
+        f"{len(lost)} of {N} poses are outliers of the trajectory" in notes[-1] or "repeat an earlier one" in notes[0]
+    )
 
 
 def test_lost_poses_that_scatter_behind_a_gap():
@@ -206,7 +210,7 @@ def test_lost_poses_that_scatter_behind_a_gap():
     there = np.delete(np.arange(N), np.arange(140, 148))
     stream, notes = checked(position[there], TURNS.as_matrix()[there], STAMPS[there])
     np.testing.assert_array_equal(stream.stamps_ns, np.delete(STAMPS, lost))
-    assert "the longest time without poses is 0.54 s" in notes[-1]
+    assert "the longest gap is 0.54 s" in notes[-1]
 
 
 def test_bad_poses_between_jumps_that_stay():
@@ -217,8 +221,8 @@ def test_bad_poses_between_jumps_that_stay():
     position[[50, 150, 250]] += [0.0, 0.0, 0.5]
     stream, notes = checked(position, sensor=RELATIVE)
     np.testing.assert_array_equal(stream.stamps_ns, np.delete(STAMPS, [50, 150, 250]))
-    assert f"3 of {N} poses are off the path" in notes[0] and "2 jumps" in notes[-1]
-    with pytest.raises(RecordingError, match="they do not come back"):
+    assert f"3 of {N} poses are outliers of the trajectory" in notes[0] and "2 jumps" in notes[-1]
+    with pytest.raises(RecordingError, match="and do not return"):
         checked(position)
 
 
@@ -239,7 +243,7 @@ def test_single_wrong_poses(what):
         position[SMALL] += {"3 cm": 0.03, "50 m": 50.0}[what] * away
     stream, notes = checked(position, rotation)
     np.testing.assert_array_equal(stream.stamps_ns, np.delete(STAMPS, SMALL))
-    assert f"{n} of {N} poses are off the path" in notes[0] and f"the first at {STAMPS[9]} ns" in notes[0]
+    assert f"{n} of {N} poses are outliers of the trajectory" in notes[0] and f"the first at {STAMPS[9]} ns" in notes[0]
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-3])
@@ -262,7 +266,7 @@ def test_poses_that_are_sent_again(copies):
         source[k] = source[k - 1]
     stream, notes = checked(POSITION[source], TURNS.as_matrix()[source])
     np.testing.assert_array_equal(stream.stamps_ns, np.delete(STAMPS, copies))
-    assert f"{len(copies)} of {N} poses repeat an earlier one exactly while it moves" in notes[0]
+    assert f"{len(copies)} of {N} poses repeat an earlier one exactly during motion" in notes[0]
 
 
 def test_late_copies():
@@ -296,10 +300,10 @@ def test_repeated_stamps(tmp_path):
     table(tmp_path, stamps)
     stream, notes = read(tmp_path)
     np.testing.assert_array_equal(stream.stamps_ns, np.delete(STAMPS, [9, 10]))
-    assert "2 poses have the stamp of another that differs, and which one is right is not known" in notes[0]
+    assert "2 poses share a stamp with a different pose. Which one is right is unknown" in notes[0]
     stamps[1::15] = stamps[::15]
     table(tmp_path, stamps)
-    assert f"42 of {N} poses have the stamp of another that differs, the first {STAMPS[0]} ns" in refused(tmp_path)
+    assert f"42 of {N} poses share a stamp with a different pose, the first {STAMPS[0]} ns" in refused(tmp_path)
 
 
 def test_one_stamp_of_two_among_few_poses_at_rest(tmp_path):
@@ -309,9 +313,9 @@ def test_one_stamp_of_two_among_few_poses_at_rest(tmp_path):
     table(tmp_path, stamps, POSITION[stops], XYZW[stops])
     stream, notes = read(tmp_path)
     np.testing.assert_array_equal(stream.stamps_ns, np.delete(stamps, [3, 4]))
-    assert "2 poses have the stamp of another that differs" in notes[0]
+    assert "2 poses share a stamp with a different pose" in notes[0]
     table(tmp_path, stamps[2:6], POSITION[stops[2:6]], XYZW[stops[2:6]])
-    assert "2 of 4 poses have the stamp of another that differs" in refused(tmp_path)
+    assert "2 of 4 poses share a stamp with a different pose" in refused(tmp_path)
 
 
 def test_a_frame_that_jumps(tmp_path):

@@ -160,7 +160,7 @@ class TestImu:
         rows[10][0] = rows[9][0]
         m = read(tmp_path, imu=rows)
         assert m.imu.stamps_ns.tolist() == [row[0] for row in rows if row[0] != rows[9][0]]
-        assert "2 readings have the stamp of another that differs" in m.notes[0]
+        assert "2 readings share a stamp with a different reading" in m.notes[0]
         assert f"the first at {ORIGIN + 9 * IMU_STEP} ns" in m.notes[0]
 
     @pytest.mark.parametrize(("divisor", "unit"), [(1000, "microseconds"), (1_000_000, "milliseconds")])
@@ -172,11 +172,11 @@ class TestImu:
 
     def test_whole_seconds(self, tmp_path):
         rows = [[r[0] // 1_000_000_000, *r[1:]] for r in imu_rows()]
-        assert "as where stamps are cut to whole seconds" in complaint(tmp_path, imu=rows)
+        assert "as if stamps were truncated to whole seconds" in complaint(tmp_path, imu=rows)
 
     def test_too_slow(self, tmp_path):
         rows = [[ORIGIN + k * 500_000_000, *r[1:]] for k, r in enumerate(imu_rows())]
-        assert "2 readings a second (10 to 20000 expected)" in complaint(tmp_path, imu=rows)
+        assert "a rate of 2 Hz (10 to 20000 Hz expected)" in complaint(tmp_path, imu=rows)
 
     def test_degrees(self, tmp_path):
         rows = [[r[0], *np.rad2deg(r[1:4]), *r[4:]] for r in imu_rows()]
@@ -185,7 +185,7 @@ class TestImu:
     def test_g(self, tmp_path):
         rows = [[*r[:4], *(np.array(r[4:]) / 9.80665)] for r in imu_rows()]
         found = read(tmp_path, imu=rows)
-        assert any("units of g" in note and "times 9.80665 m/s^2" in note for note in found.notes)
+        assert any("units of g" in note and "multiplied by 9.80665 m/s^2" in note for note in found.notes)
 
     @pytest.mark.parametrize("factor", [0.01, 1000.0])
     def test_far_from_gravity(self, tmp_path, factor):
@@ -194,7 +194,7 @@ class TestImu:
 
     def test_accelerometer_before_gyroscope(self, tmp_path):
         rows = [[r[0], *r[4:], 0.1 * r[1], 0.1 * r[2], 0.1 * r[3]] for r in imu_rows()]
-        assert "the columns must be t [ns], gyroscope x, y, z" in complaint(tmp_path, imu=rows)
+        assert "The columns must be t [ns], gyroscope x, y, z" in complaint(tmp_path, imu=rows)
 
     @pytest.mark.parametrize(("columns", "kind"), [(slice(1, 4), "gyroscope"), (slice(4, 7), "accelerometer")])
     def test_frozen(self, tmp_path, columns, kind):

@@ -67,14 +67,14 @@ def test_points_that_cannot_be_used(tmp_path):
     [
         ({"xyz": None}, "has no array xyz; it needs stamps_ns, start, offset_s, xyz"),
         ({"xyz": GOOD["xyz"][:, :2]}, "xyz must have shape"),
-        ({"xyz": GOOD["xyz"].ravel()}, "xyz must be numbers along 2 axes, but is float32 of shape \\(600,\\)"),
-        ({"stamps_ns": GOOD["stamps_ns"] * 1e-9}, "stamps_ns must be whole numbers along 1 axes, but is float64"),
+        ({"xyz": GOOD["xyz"].ravel()}, "xyz must be numbers with 2 axes, but is float32 of shape \\(600,\\)"),
+        ({"stamps_ns": GOOD["stamps_ns"] * 1e-9}, "stamps_ns must be whole numbers with 1 axes, but is float64"),
         ({"start": GOOD["start"][:-1]}, "start must have shape \\(6,\\)"),
         ({"start": GOOD["start"] + 1}, "start must run upwards from 0"),
         ({"start": np.zeros(0, np.int64)}, "start must be whole numbers"),
         ({"offset_s": GOOD["offset_s"][1:]}, "offset_s must have a row for each of the 200 points"),
         ({"offset_s": GOOD["offset_s"] * 1e-3}, "they look like another unit; multiply them by 1000"),
-        ({"offset_s": GOOD["offset_s"] + 5}, "points are 5[.\\d]* to 5.\\d* s from their scan's stamp"),
+        ({"offset_s": GOOD["offset_s"] + 5}, "points are 5[.\\d]* to 5.\\d* s from the stamp of their scan"),
         ({"stamps_ns": GOOD["stamps_ns"][::-1]}, "the scan at \\d* ns comes after the one at \\d* ns"),
         ({"stamps_ns": GOOD["stamps_ns"] // 10**6}, "they look like milliseconds; export them in nanoseconds"),
         ({"xyz": np.array([object()] * 200)}, "cannot be read \\(Object arrays cannot be loaded"),
@@ -143,7 +143,7 @@ def test_scans_that_overtook_each_other_are_sorted(tmp_path):
     order[[4, 5, 11, 12, 13]] = [5, 4, 12, 13, 11]
     stream, notes = read(tmp_path, scan_of(order))
     expect(stream, list(range(24)))
-    assert "scans came after later ones" in notes[0] and len(notes) == 1
+    assert "scans are out of order" in notes[0] and len(notes) == 1
 
 
 @pytest.mark.parametrize("stamp_ns", [0, 10**18 + 5 * 10**10, 10**18 + 12 * 10**8, 10**18 + 3 * 10**8, 2**62])
@@ -153,7 +153,7 @@ def test_a_scan_with_a_wrong_stamp_is_left_out(tmp_path, stamp_ns):
     stream, notes = read(tmp_path, arrays)
     expect(stream, [*range(7), *range(8, 24)])
     assert (
-        f"1 of 24 scans have a stamp that does not fit their neighbours' and were left out, the first at {stamp_ns} ns"
+        f"1 of 24 scans have a stamp that does not fit their neighbours' and were removed, the first at {stamp_ns} ns"
         in (notes[0])
     )
 
@@ -166,7 +166,7 @@ def test_a_scan_stamped_too_early_or_too_late_is_left_out(tmp_path, jitter_ns, l
     arrays["stamps_ns"][7] += late_ns
     stream, notes = read(tmp_path, arrays)
     assert stream.stamps_ns.tolist() == np.delete(arrays["stamps_ns"], 7).tolist()
-    assert "1 of 24 scans are stamped by more than 5% of a period too early or too late between" in notes[0]
+    assert "1 of 24 scans are stamped more than 5% of a period too early or too late relative to" in notes[0]
 
 
 @pytest.mark.parametrize("case", ["jitter", "lost", "sector", "uneven"])
@@ -278,5 +278,5 @@ def test_files_that_are_none(tmp_path):
 
 def test_there_are_no_scans_among_pictures(tmp_path):
     (tmp_path / "0001.png").write_bytes(b"")
-    with pytest.raises(RecordingError, match="holds pictures, and no scans of lidar0"):
+    with pytest.raises(RecordingError, match="holds images, and no scans of lidar0"):
         open_recording(tmp_path).lidar(LIDAR)

@@ -67,7 +67,7 @@ def test_orientations_that_are_mostly_none(bag_of):
     kind = "geometry_msgs/msg/PoseStamped"
     zeros = XYZW * (np.arange(5) < 1)[:, None]
     bag = bag_of(kind, lambda make, k, header: make.make(kind, header, pose(make, k, zeros)))
-    with pytest.raises(RecordingError, match=f"/t: the orientation at {STAMPS[1]} ns is no unit quaternion"):
+    with pytest.raises(RecordingError, match=f"/t: the orientation at {STAMPS[1]} ns is not a unit quaternion"):
         read_poses(bag, "/t")
 
 

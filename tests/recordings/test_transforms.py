@@ -126,7 +126,7 @@ def test_over_gaps_nothing_is_interpolated(one_bag):
     found = bag.poses(sensor("base", "flange"))
     assert found.stamps_ns.tolist() == [START + k * STEP for k in range(COUNT) if k not in (20, 21, 22, 23)]
     (note,) = bag.notes()
-    assert f"4 of {COUNT} poses base -> flange are left out, the first at {START + 20 * STEP} ns" in note
+    assert f"4 of {COUNT} poses base -> flange were removed, the first at {START + 20 * STEP} ns" in note
 
 
 def test_transforms_that_are_sent_again_count_once(one_bag):
@@ -182,13 +182,15 @@ def test_frames_of_other_topics(one_bag, tmp_path):
         kind, make.header(START), make.make("geometry_msgs/msg/Pose", make.vector([0, 0, 0], "Point"), turn)
     )
     bag = one_bag((), (), [("/arm", kind, START, pose)])
-    with pytest.raises(RecordingError, match="/arm holds geometry_msgs/msg/PoseStamped, but `frames` of arm are those"):
+    with pytest.raises(
+        RecordingError, match="/arm holds geometry_msgs/msg/PoseStamped, but `frames` of arm needs transforms"
+    ):
         bag.poses(sensor("base", "flange", topic="/arm"))
     with pytest.raises(RecordingError, match="has no topic /tf; it holds /arm"):
         bag.poses(sensor("base", "flange"))
     (tmp_path / "folder/arm").mkdir(parents=True)
     (tmp_path / "folder/arm/poses.csv").write_text("#t [ns],x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n")
-    with pytest.raises(RecordingError, match="is a folder, but `frames` of arm are those of transforms"):
+    with pytest.raises(RecordingError, match="is a folder, but `frames` of arm needs the transforms"):
         FolderRecording(tmp_path / "folder").poses(sensor("base", "flange"))
 
 

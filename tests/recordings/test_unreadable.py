@@ -142,7 +142,7 @@ def test_a_video_beside_tables(tmp_path, write, truth):
     recording = open_recording(root)
     assert not recording.has_corners(CAMERA)
     assert recording.image_topic(CAMERA) == "mav0/cam0.MP4"
-    words = "mav0/cam0.MP4 is no video that can be decoded"
+    words = "mav0/cam0.MP4 cannot be decoded as a video"
     assert words in complaint(lambda: list(recording.payloads("mav0/cam0.MP4")))
     assert any(words in f.sentence for f in inspect_recording(root).findings)
 

@@ -108,9 +108,9 @@ def test_the_header_names_the_column_of_the_stamps(tmp_path):
 def test_a_file_that_is_no_video_is_refused(tmp_path):
     (tmp_path / "cam0.mp4").write_bytes(b"\0\0\0 ftypisom" + bytes(100))
     recording = open_recording(tmp_path)
-    with pytest.raises(RecordingError, match=r"cam0\.mp4 is no video that can be decoded; copy it again"):
+    with pytest.raises(RecordingError, match=r"cam0\.mp4 cannot be decoded as a video; copy it again"):
         list(recording.payloads("cam0.mp4"))
-    assert any("is no video that can be decoded" in f.sentence for f in inspect_recording(tmp_path).findings)
+    assert any("cannot be decoded as a video" in f.sentence for f in inspect_recording(tmp_path).findings)
 
 
 def test_a_target_is_found_in_a_video(tmp_path, monkeypatch):

@@ -58,8 +58,8 @@ def test_a_driven_wheel_and_a_steering_angle(tmp_path):
 
 
 REFUSED = {
-    "km/h": (TWIST * [100.0, 1.0], {"measures": "twist"}, "km/h are to be multiplied by 1 / 3.6"),
-    "deg/s": (TWIST * [1.0, 57.3], {"measures": "twist"}, "deg/s are to be multiplied by pi / 180"),
+    "km/h": (TWIST * [100.0, 1.0], {"measures": "twist"}, "multiply km/h by 1 / 3.6"),
+    "deg/s": (TWIST * [1.0, 57.3], {"measures": "twist"}, "multiply deg/s by pi / 180"),
     "degrees": (np.rad2deg(STEERING) * [0.01, 1.0], {"drive": "ackermann"}, "steered by 2"),
     "wheel": (STEERING * [30.0, 1.0], {"drive": "ackermann"}, "the wheels turn at 449.9 rad/s"),
     "columns": (FOUR, {}, "4 columns|has 5 columns|columns"),
@@ -155,9 +155,7 @@ def test_twists_in_the_axes_of_the_world(bag_of):
 
     wheels = Wheels("wheel0", "", measures="twist")
     bag = bag_of("geometry_msgs/msg/TwistStamped", content(heading))
-    with pytest.raises(
-        RecordingError, match="are in the axes of the world, not of the vehicle: .*type: pose, kind: rel"
-    ):
+    with pytest.raises(RecordingError, match="is in the world frame, not in the vehicle's. .*type: pose, kind: rel"):
         bag.wheels(wheels)
 
 
@@ -177,7 +175,9 @@ def test_joints_of_four_wheels(bag_of):
     content = joints(names, lambda k: [], lambda k: FOUR[k, [3, 0, 1, 2]])
     bag, wheels = bag_of("sensor_msgs/msg/JointState", content), Wheels("wheel0", "", drive="skid-steer")
     np.testing.assert_array_equal(bag.wheels(wheels).value, FOUR)
-    with pytest.raises(RecordingError, match="which of the joints .* are the wheel, the steering.*joints: .WHEEL, STE"):
+    with pytest.raises(
+        RecordingError, match="the joints .* do not tell which are the wheel, the steering.*joints: .WHEEL, STE"
+    ):
         bag.wheels(Wheels("wheel0", "", drive="ackermann"))
 
 

@@ -72,16 +72,16 @@ REFUSED = {
     "back": (RATES, np.where(np.arange(N) == 9, STAMPS - 10**9, STAMPS), {}, f"ing at {STAMPS[9] - 10**9} ns comes"),
     "two": (
         np.insert(RATES, np.arange(0, N, 15), 1.0, axis=0), np.insert(STAMPS, np.arange(0, N, 15), STAMPS[::15]), {},
-        f"readings have the stamp of another that differs, the first {STAMPS[0]} ns",
+        f"readings share a stamp with a different reading, the first {STAMPS[0]} ns",
     ),
-    "deg/s": (np.rad2deg(RATES), STAMPS, {}, "(wheel0): the wheels turn at 366.7 rad/s, faster than any robot's"),
+    "deg/s": (np.rad2deg(RATES), STAMPS, {}, "(wheel0): the wheels turn at 366.7 rad/s, which is implausible"),
     "degrees": (np.rad2deg(ANGLES), STAMPS, {"measures": "angles"}, "set measures of wheel0 to ticks and counts_pe"),
     "counter": (
         np.mod(np.round(ANGLES * 5000), 65536), STAMPS, {"measures": "ticks", "counts_per_turn": 31416.0},
-        "as where a counter starts anew; set counter_size of wheel0 in the rig file (65536",
+        "which looks like an encoder wrap-around; set counter_size of wheel0 in the rig file (65536",
     ),
-    "counts": (ANGLES * 1e3, STAMPS, {"measures": "ticks", "counts_per_turn": 1.0}, "s; correct counts_per_turn"),
-    "seconds": (RATES, STAMPS // 10**9, {}, "as where stamps are cut to whole seconds"),
+    "counts": (ANGLES * 1e3, STAMPS, {"measures": "ticks", "counts_per_turn": 1.0}, "implausible; correct counts_per_turn"),
+    "seconds": (RATES, STAMPS // 10**9, {}, "as if stamps were truncated to whole seconds"),
     "short": (RATES[:2], STAMPS[:2], {}, "only 2 readings"),
 }  # fmt: skip
 
@@ -100,7 +100,7 @@ def test_single_stamps_of_two_readings(tmp_path, measures):
     twice = np.insert(value, 7, value[7] + [0.3, -0.2], axis=0)
     stream, notes = from_table(tmp_path, twice, TWICE, measures=measures)
     np.testing.assert_array_equal(stream.stamps_ns, np.delete(STAMPS, 7))
-    assert "2 readings have the stamp of another that differs, and which one is right is not known" in notes[0]
+    assert "2 readings share a stamp with a different reading. Which one is right is unknown" in notes[0]
     assert f"the first at {STAMPS[7]} ns" in notes[0]
 
 
@@ -124,7 +124,7 @@ def test_units_and_signs(tmp_path, unit, size):
     stream, notes = from_table(tmp_path, RATES / size * [1.0, -1.0], rate_unit=unit, signs=(1, -1))
     np.testing.assert_allclose(stream.rate, RATES, rtol=1e-14)
     assert notes == ()
-    with pytest.raises(RecordingError, match="signs of the rig file has 4 entries for 2 columns"):
+    with pytest.raises(RecordingError, match="signs in the rig file has 4 entries for 2 columns"):
         from_table(tmp_path, RATES, signs=(1, -1, 1, -1))
 
 
@@ -134,7 +134,9 @@ def test_angles_that_wrap(tmp_path, low, size):
     whole, _ = from_table(tmp_path, ANGLES, measures="angles")
     stream, notes = from_table(tmp_path, wrapped, measures="angles")
     np.testing.assert_allclose(stream.rate, whole.rate, atol=1e-9)
-    assert len(notes) == 1 and f"the angles wrap after {size:.6f} rad and are unwrapped; angle_range" in notes[0]
+    assert (
+        len(notes) == 1 and f"the angles wrap around after {size:.6f} rad and were unwrapped; angle_range" in notes[0]
+    )
     stream, notes = from_table(tmp_path, wrapped, measures="angles", angle_range=size)
     np.testing.assert_allclose(stream.rate, whole.rate, atol=1e-9)
     assert notes == ()
@@ -156,7 +158,7 @@ def test_single_rates_that_stand_apart(tmp_path, size):
     assert isinstance(stream, WheelStream)
     np.testing.assert_array_equal(stream.stamps_ns, np.delete(STAMPS, WRONG))
     np.testing.assert_array_equal(stream.rate, np.delete(rates, WRONG, axis=0))
-    words = "are not finite" if np.isnan(size) else "stand apart from those before and after"
+    words = "are not finite" if np.isnan(size) else "are outliers, off by up to"
     assert len(notes) == 1 and f"5 of {N} readings {words}" in notes[0] and f"the first at {STAMPS[30]} ns" in notes[0]
     bad[:] = np.nan
     with pytest.raises(RecordingError, match=f"here .*: {N} of {N} readings are not finite"):
@@ -222,10 +224,16 @@ POSES = "0,10,0.1,1,0,1e-4,0,0,1e-4,0,1e-4\n"
 @pytest.mark.parametrize(
     ("rows", "words"),
     [
-        (POSES + POSES.replace("0,10,", "11,20,", 1), "the pose from 11 to 20 ns does not go on where the one before"),
-        (POSES.replace("0,10,", "10,10,", 1), "the pose from 10 to 10 ns does not go on"),
-        (POSES.replace("1e-4,0,0,1e-4", "1e-4,2e-4,0,1e-4"), "the covariance of the pose from 0 ns is none"),
-        (POSES.replace("1e-4", "0"), "the covariance of the pose from 0 ns is none"),
+        (
+            POSES + POSES.replace("0,10,", "11,20,", 1),
+            "the pose from 11 to 20 ns does not start where the previous one",
+        ),
+        (POSES.replace("0,10,", "10,10,", 1), "the pose from 10 to 10 ns does not start"),
+        (
+            POSES.replace("1e-4,0,0,1e-4", "1e-4,2e-4,0,1e-4"),
+            "the covariance of the pose from 0 ns is not positive definite",
+        ),
+        (POSES.replace("1e-4", "0"), "the covariance of the pose from 0 ns is not positive definite"),
     ],
 )
 def test_relative_poses_that_are_none(tmp_path, rows, words):
@@ -281,7 +289,7 @@ def test_joints_that_do_not_do(bag_of, tmp_path):
         bag.wheels(wheels)
     with pytest.raises(RecordingError, match="has no joint rear; it has left, right; correct `joints` of wheel0"):
         bag.wheels(replace(wheels, joints=("left", "rear")))
-    with pytest.raises(RecordingError, match="bags hold no relative poses; set `measures`"):
+    with pytest.raises(RecordingError, match="a bag holds no relative planar poses; set another `measures`"):
         bag.wheels(replace(wheels, measures="poses"))
     with pytest.raises(RecordingError, match="has no topic /wheels; it holds /joint_states"):
         bag.wheels(replace(wheels, topic="/wheels"))
@@ -289,7 +297,7 @@ def test_joints_that_do_not_do(bag_of, tmp_path):
 
 def test_joints_without_names_that_tell(bag_of):
     bag = bag_of(lambda k: (["a", "b"], [], [1.0, 2.0]))
-    with pytest.raises(RecordingError, match="which of the joints a, b are the left and the right wheel"):
+    with pytest.raises(RecordingError, match="the joints a, b do not tell which are the left and the right wheel"):
         bag.wheels(Wheels("wheel0", ""))
     assert bag.wheels(Wheels("wheel0", "", joints=("b", "a"))).value[0].tolist() == [2.0, 1.0]
 
@@ -313,7 +321,7 @@ def test_single_messages_with_one_joint_that_is_none(bag_of, measures, column, b
     wheels = Wheels("wheel0", "", measures=measures)
     stream, notes = checked_wheels(bag_of(content).wheels(wheels), wheels, "here")
     np.testing.assert_array_equal(stream.stamps_ns, np.delete(STAMPS, [0, 33, 150]))
-    assert f"3 of {N} readings are not finite and are left out, the first at {STAMPS[0]} ns" in notes[0]
+    assert f"3 of {N} readings are not finite and were removed, the first at {STAMPS[0]} ns" in notes[0]
     assert np.isfinite(stream.rate).all()
 
 

@@ -38,12 +38,12 @@ def test_of_folders_and_bags(form, tmp_path, truth, write):
     topic = recording.image_topic(camera)
     assert [f.stamp_ns for f in recording.images(topic)] == truth.image_stamps[3:7]
     assert recording.stamps(topic).tolist() == truth.image_stamps[3:7]
-    assert f"only what was recorded from {begin:g} s after its start to {end:g} s is used" in recording.notes()[0]
+    assert f"only the part from {begin:g} s after its start to {end:g} s is used" in recording.notes()[0]
     assert open_recording(path).imu(IMU).stamps_ns.tolist() == truth.imu_stamps
     late = open_recording(path, begin).imu(IMU)
     assert late.stamps_ns.tolist() == [t for t in truth.imu_stamps if t >= truth.image_stamps[3]]
     with pytest.raises(
-        RecordingError, match=r"nothing was recorded from 900 s to the end, the whole lasts .* correct --from"
+        RecordingError, match=r"there is nothing from 900 s to the end, the whole lasts .* correct --from"
     ):
         open_recording(path, 900.0).imu(IMU)
 
@@ -110,7 +110,7 @@ def test_pictures(tmp_path):
     for k, path in enumerate(sorted((tmp_path / "left").iterdir())):
         path.rename(path.with_name(f"{k}.png"))
     with pytest.raises(
-        RecordingError, match="pictures without a clock, which have no seconds; leave out --from and --to"
+        RecordingError, match="images without timestamps, so --from and --to cannot be used; leave them out"
     ):
         open_recording(tmp_path, 1.0, 3.0).stamps("left")
 
@@ -140,7 +140,7 @@ def test_the_command_line(tmp_path, truth, write, capsys):
     assert main([*command, "3", "--to", "2"]) == 1
     assert capsys.readouterr().err == "icalib: --to must be seconds after --from (3), not 2.\n"
     assert main([*command, "900"]) == 1
-    assert "run.mcap: nothing was recorded from 900 s to the end" in capsys.readouterr().err
+    assert "run.mcap: there is nothing from 900 s to the end" in capsys.readouterr().err
     found = inspect_recording(path, end_s=0.2)
     counts = [s.timing.count for s in found.streams if s.timing is not None]
     assert counts == [len([t for t in of if t < truth.imu_stamps[0] + S // 5]) for of in

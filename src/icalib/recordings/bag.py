@@ -121,7 +121,9 @@ class BagRecording:
         return False
 
     def corners(self, camera: Camera, target: Target) -> CornerStream:
-        raise RecordingError(f"{self.root} holds images of {camera.name}, not corners; find them in its images.")
+        raise RecordingError(
+            f"{self.root} holds images of {camera.name}, not corners; detect the corners in its images first."
+        )
 
     def sees(self, camera: Camera) -> bool:
         del camera
@@ -133,8 +135,8 @@ class BagRecording:
         path = self.root.parent / camera.tracks
         if not path.is_file():
             raise RecordingError(
-                f"{path} is not there, and bags hold no tracks; write the table beside the bag, or set `tracks` of "
-                f"{camera.name} in the rig file."
+                f"{path} does not exist, and a bag holds no feature tracks; put the table beside the bag, or "
+                f"correct `tracks` of {camera.name} in the rig file."
             )
         self._tables.append(path)
         found = read_tracks(camera.name, path, camera.resolution, camera.layout, self._note)
@@ -239,7 +241,8 @@ class BagRecording:
         for received_ns, encoding, content in self._contents(topic):
             if encoding not in _stores():
                 raise RecordingError(
-                    f"{self.root} {topic.name}: messages in {encoding!r} are not ROS's; convert the bag."
+                    f"{self.root} {topic.name}: messages have the encoding {encoding!r}, which is not one of "
+                    "ROS; convert the bag."
                 )
             total += 1
             try:
@@ -259,8 +262,8 @@ class BagRecording:
             self._note_damage(topic.name, damaged, total)
         if unstamped:
             self._note(
-                f"{self.root} {topic.name}: {unstamped} messages have no stamp in their header; the times at which "
-                "they were received stand in, which are late and jitter; let the driver stamp them."
+                f"{self.root} {topic.name}: {unstamped} messages have no stamp in their header. Their receive "
+                "times are used instead, which are late and jittery; let the driver stamp each message."
             )
 
     def _note_damage(self, topic: str, damaged: list[tuple[int, ValueError]], total: int) -> None:
@@ -303,8 +306,8 @@ class BagRecording:
         if not 0 < late_ns <= _SWAPPED_NS:
             return np.arange(len(stamps_ns))
         self._note(
-            f"{self.root} {topic}: {int(back.sum())} readings came after later ones, by up to {late_ns * 1e-6:.1f} ms; "
-            "all were sorted by stamp."
+            f"{self.root} {topic}: {int(back.sum())} readings are out of order by up to {late_ns * 1e-6:.1f} "
+            "ms; all were sorted by stamp."
         )
         return np.argsort(stamps_ns, kind="stable")
 

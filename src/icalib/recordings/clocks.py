@@ -64,10 +64,10 @@ def rate_sentence(what: str, stamps_ns: np.ndarray, slowest_hz: float, fastest_h
     if step > 0 and slowest_hz <= 1e9 / step <= fastest_hz:
         return None
     if step == 0:
-        return f"{what}: the stamps do not increase; write the instant of each reading, by a clock that runs."
+        return f"{what}: the stamps do not increase; write the time of each reading, from a running clock."
     unit = unit_of_stamps(stamps_ns, slowest_hz, fastest_hz)
     look = f"they look like {UNIT_WORDS[unit]}; export them in nanoseconds" if unit else "check what writes the stamps"
     return (
-        f"{what}: the stamps mean {1e9 / step:.4g} readings a second ({slowest_hz:g} to {fastest_hz:g} expected); "
-        f"{look}, or set `time_unit` of a table in the rig file."
+        f"{what}: the stamps give a rate of {1e9 / step:.4g} Hz ({slowest_hz:g} to {fastest_hz:g} Hz "
+        f"expected); {look}, or set `time_unit` of a table in the rig file."
     )

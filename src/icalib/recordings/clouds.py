@@ -142,8 +142,8 @@ def _stamps(clouds: Sequence[PointCloud], what: str) -> np.ndarray:
     stamps_ns = np.array([cloud.stamp_ns for cloud in clouds], np.int64)
     if len(stamps_ns) < 2 or np.median(np.diff(stamps_ns)) <= 0:
         raise RecordingError(
-            f"{what}: the stamps of the first clouds do not go on ({stamps_ns[0]} ns, then {stamps_ns[-1]} ns); have "
-            "the driver stamp each cloud, and record again."
+            f"{what}: the stamps of the first clouds do not increase ({stamps_ns[0]} ns, then {stamps_ns[-1]} "
+            "ns); have the driver stamp each cloud, and record again."
         )
     return stamps_ns
 
@@ -158,13 +158,11 @@ def _timing(clouds: Sequence[PointCloud], lidar: Lidar, what: str) -> tuple[Timi
         sweep = find_sweep([coordinates(cloud, what) for cloud in clouds])
         if sweep is None:
             raise RecordingError(
-                f"{what}: the points do not go round, so their times cannot be had from their azimuth; set point_time "
-                f"of {lidar.name} to snapshot in the rig file, or record a cloud with times."
+                f"{what}: the points are not in order of azimuth, so their times cannot be computed from it; "
+                f"set point_time of {lidar.name} to snapshot in the rig file, or record a cloud with times."
             )
-        turn = "against the clock" if sweep.direction > 0 else "with the clock"
-        note = (
-            f"{what}: points are timed by their azimuth, {turn} and one turn from cloud to cloud, as point_time says."
-        )
+        turn = "counterclockwise" if sweep.direction > 0 else "clockwise"
+        note = f"{what}: point times are computed from the azimuth, {turn}, one turn per cloud, as point_time says."
         return partial(_by_azimuth, sweep), (note,)
     times, notes = find_point_times(what, stamps_ns, [cloud.points for cloud in clouds], lidar)
     first_ns, _ = _by_field(times, clouds[0], clouds[0].points)

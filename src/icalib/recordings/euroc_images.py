@@ -40,7 +40,10 @@ def image_files(folder: Path, note: Note = ignore) -> list[tuple[int, Path]]:
         return named
     unnamed = next((p for p in there if not (p.stem.isdecimal() and int(p.stem) < 2**63)), None)
     if unnamed:
-        raise RecordingError(f"{folder} has no data.csv, and {unnamed.name} is no stamp in ns; write t [ns],file name.")
+        raise RecordingError(
+            f"{folder} has no data.csv, and the name of {unnamed.name} is not a stamp in ns; write data.csv with "
+            "lines t [ns],file name."
+        )
     return sorted((int(p.stem), p) for p in there)
 
 

@@ -194,8 +194,8 @@ class FolderRecording:
     def poses(self, sensor: PoseSensor) -> PoseReadings:
         if sensor.frames is not None:
             raise RecordingError(
-                f"{self.root} is a folder, but `frames` of {sensor.name} are those of transforms (/tf) in a bag; give "
-                "the bag, or take `frames` out of the rig file."
+                f"{self.root} is a folder, but `frames` of {sensor.name} needs the transforms (/tf) of a bag; "
+                "give the bag, or remove `frames` from the rig file."
             )
         path = self._locate(sensor.path)
         self._remember(path)

@@ -46,7 +46,7 @@ def checked_payloads(payloads: Iterable[Payload], where: str, note: Note) -> Ite
             dropped.add("consist of zeros", payload)
             continue
         if payload.encoding == NO_PICTURE:
-            dropped.add("are no pictures", payload, unknown_encoding(payload))
+            dropped.add("are not images", payload, unknown_encoding(payload))
             continue
         if not is_known(payload.encoding):
             raise RecordingError(unknown_encoding(payload))
@@ -60,10 +60,10 @@ def checked_payloads(payloads: Iterable[Payload], where: str, note: Note) -> Ite
         if last is not None:
             _refuse_other_clock(last, payload, where)
             if payload.stamp_ns <= last.stamp_ns:
-                dropped.add("are not later than the one before", payload)
+                dropped.add("are not later than their predecessor", payload)
                 continue
             if payload.data == last.data:
-                dropped.add("repeat the one before exactly (the camera froze)", payload)
+                dropped.add("repeat their predecessor exactly (the camera froze)", payload)
                 continue
         last = payload
         kept += 1
@@ -130,8 +130,8 @@ def _other_size(payload: Payload, size: tuple[int, int], where: str) -> str:
 def _refuse_other_clock(last: Payload, payload: Payload, where: str) -> None:
     if payload.stamp_ns < last.stamp_ns - _LATE_NS:
         raise RecordingError(
-            f"{where}: the image {payload.which} comes after the one {last.which}; "
-            "the camera's clock was set back: record again, or cut the recording there."
+            f"{where}: the image {payload.which} comes after the one {last.which}, so the camera's clock was "
+            "set back; record again, or cut the recording there with --from and --to."
         )
 
 

@@ -82,8 +82,8 @@ def _refuse_frozen(imu: ImuStream, what: str) -> None:
 
 def _saturation_notes(imu: ImuStream, what: str) -> tuple[str, ...]:
     return tuple(
-        f"{what}: the {s.kind} {s.axis} looks saturated, {s.count} readings in a row at {s.limit:.4g} "
-        f"from {s.stamp_ns} ns on; move less quickly or set a wider range."
+        f"{what}: the {s.kind} {s.axis} looks saturated, {s.count} readings in a row at {s.limit:.4g} from "
+        f"{s.stamp_ns} ns on; move more slowly, or set a wider range."
         for s in saturations(imu)
     )
 

@@ -30,7 +30,7 @@ def in_time(imu: ImuStream, what: str) -> tuple[ImuStream, tuple[str, ...]]:
             again = copies(ordered.stamps_ns, values)
     if again.any():
         notes.stamps_ns = ordered.stamps_ns
-        notes.left_out(again, "repeat another exactly under a stamp between those of others, as delayed copies do,")
+        notes.left_out(again, "are delayed copies of another reading, with a later stamp,")
         imu = _some(ordered, ~again)
     if (np.diff(imu.stamps_ns) >= 0).all():
         imu = _without_repeats(imu, notes)
@@ -62,13 +62,13 @@ def without_wrong(imu: ImuStream, what: str) -> tuple[ImuStream, tuple[str, ...]
         if (new := held(values)) is not None:
             values = _interpolated(seconds, values, new)
             notes.sentences += (
-                f"{what}: the {kind} is new in {int(new.sum())} of {len(new)} readings and repeated until the next; "
-                "it was interpolated between them.",
+                f"{what}: the {kind} has a new value in only {int(new.sum())} of {len(new)} readings and "
+                "repeats it until the next one; the readings between were interpolated.",
             )
         bad = impossible(values, kind == "gyroscope") | stuck(values)
         rest = np.flatnonzero(~bad)
         bad[rest[spikes(seconds[rest], values[rest])]] = True
-        notes.left_out(bad, f"stand off their neighbours in the {kind}, or repeat it exactly before it jumps,")
+        notes.left_out(bad, f"are outliers of the {kind}, or repeat it exactly before a jump,")
         good &= ~bad
         found.append(values)
     if good.sum() < 2 or not notes.sentences:
@@ -106,6 +106,7 @@ def _interpolated(seconds: np.ndarray, values: np.ndarray, new: np.ndarray) -> n
 def _even_note(what: str, even: EvenStamps) -> str:
     how = f"come in bursts of {even.burst}" if even.burst > 1 else "are uneven"
     return (
-        f"{what}: the stamps {how}, up to {even.latest_s * 1e3:.3g} ms late, although the readings are even; they were "
-        f"set {even.period_ns * 1e-6:.4g} ms apart, by the earliest; let the driver stamp each reading."
+        f"{what}: the stamps {how}, up to {even.latest_s * 1e3:.3g} ms late, although the readings are evenly "
+        f"spaced. They were replaced by stamps {even.period_ns * 1e-6:.4g} ms apart, fitted to the earliest "
+        "ones; let the driver stamp each reading."
     )

@@ -114,7 +114,7 @@ def _joined(halves: ImuHalves, what: str) -> tuple[ImuStream, tuple[str, ...]]:
     at, known = ((x - accel_ns[0]).astype(np.float64) for x in (gyro_ns, accel_ns))
     accel = np.stack([np.interp(at, known, accel[:, k]) for k in range(3)], axis=1)
     notes += (
-        f"{what}: gyroscope and accelerometer report apart; {len(known)} readings of the accelerometer were "
-        f"interpolated to {len(at)} stamps of the gyroscope.",
+        f"{what}: gyroscope and accelerometer have separate stamps; {len(known)} readings of the accelerometer "
+        f"were interpolated to {len(at)} stamps of the gyroscope.",
     )
     return ImuStream(halves.name, gyro_ns, gyro, accel), notes

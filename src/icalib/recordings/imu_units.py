@@ -38,22 +38,25 @@ def recognised_unit(imu: ImuStream, what: str, sensor: ImuSensor | None) -> tupl
     if _is_in_g(imu, median):
         if sensor is not None and sensor.accel_unit is not None:
             raise RecordingError(
-                f"{what}: gravity is {median:.3g} in the accelerometer after accel_unit: {sensor.accel_unit}, which "
-                "looks like units of g; correct accel_unit in the rig file."
+                f"{what}: with accel_unit: {sensor.accel_unit} the accelerometer measures gravity as "
+                f"{median:.3g}, which looks like units of g; correct accel_unit in the rig file."
             )
-        notes = (f"{what}: the accelerometer is in units of g (its median is {median:.3g}); times {G_M_S2} m/s^2.",)
+        notes = (
+            f"{what}: the accelerometer is in units of g (its median is {median:.3g}); its readings were "
+            f"multiplied by {G_M_S2} m/s^2.",
+        )
         imu = replace(imu, accel=G_M_S2 * imu.accel)
     elif _lacks_gravity(imu, median):
         raise RecordingError(
-            f"{what}: gravity is not in the accelerometer's readings (their median is {median:.3g} m/s^2, and their "
-            "mean, turned by the gyroscope, is far below 9.81): they are linear acceleration, of which the driver has "
-            "taken gravity off; record the raw accelerometer."
+            f"{what}: the accelerometer readings contain no gravity (median |accel| {median:.3g} m/s^2; their "
+            "mean, rotated by the gyroscope, is far below 9.81). The driver has removed it; record the raw "
+            "accelerometer."
         )
     elif not _GRAVITY_M_S2[0] <= median <= _GRAVITY_M_S2[1]:
         raise RecordingError(
-            f"{what}: the median |accel| is {median:.3g}, far from gravity, 9.81 m/s^2; the columns must be t [ns], "
-            "gyroscope x, y, z [rad/s], accelerometer x, y, z [m/s^2], gravity included; set accel_unit: g in the rig "
-            "file for units of g."
+            f"{what}: the median |accel| is {median:.3g}, far from gravity, 9.81 m/s^2. The columns must be t "
+            "[ns], gyroscope x, y, z [rad/s], accelerometer x, y, z [m/s^2] with gravity. Set accel_unit: g "
+            "in the rig file for units of g."
         )
     _refuse_degrees(imu, what)
     return imu, notes
@@ -87,6 +90,6 @@ def _refuse_degrees(imu: ImuStream, what: str) -> None:
     fast = float(np.percentile(np.linalg.norm(imu.gyro, axis=1), 99))
     if fast > _FASTEST_RAD_S:
         raise RecordingError(
-            f"{what}: the angular rate reaches {fast:.3g}, more than any hand or robot turns in rad/s; "
-            "it looks like deg/s; set gyro_unit: deg/s in the rig file."
+            f"{what}: the angular rate reaches {fast:.3g}, which is implausible in rad/s and looks like deg/s; "
+            "set gyro_unit: deg/s in the rig file."
         )

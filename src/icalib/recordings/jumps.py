@@ -49,8 +49,8 @@ class ClockJumps:
     def _refuse_long(self, stream: Stamped, what: str) -> None:
         if len(stream.stamps_ns) and (length := _seconds(stream, 0, len(stream.stamps_ns))) > self._longest_s:
             raise RecordingError(
-                f"{what}: the stamps run over {length / 3600.0:.4g} h, and a calibration takes up to "
-                f"{self._longest_s / 3600.0:g} h; choose a part by --from and --to."
+                f"{what}: the stamps span {length / 3600.0:.4g} h, and a calibration takes at most "
+                f"{self._longest_s / 3600.0:g} h; choose a part with --from and --to."
             )
 
 
@@ -73,8 +73,8 @@ def _refuse_far(stamps: np.ndarray, what: str) -> None:
     far = (stamps > _FARTHEST_NS) | (stamps < -_FARTHEST_NS)
     if far.any():
         raise RecordingError(
-            f"{what}: the stamp {stamps[np.argmax(far)]} ns is more than a hundred years from 1970; correct the "
-            "clock, or remove it."
+            f"{what}: the stamp {stamps[np.argmax(far)]} ns is more than a hundred years from 1970; correct "
+            "the clock, or remove the row."
         )
 
 
@@ -87,7 +87,8 @@ def _note(stream: Stamped, what: str, cuts: Sequence[int], kept: tuple[int, int]
     jump = cuts[1]
     more = f" (and {len(cuts) - 3} more times)" if len(cuts) > 3 else ""
     return (
-        f"{what}: the clock jumps forward by {_seconds(stream, jump - 1, jump + 1):.6g} s{more} after the stamp "
-        f"{stamps[jump - 1]} ns, {_seconds(stream, 0, jump):.6g} s from the start; used are the "
-        f"{_seconds(stream, *kept):.6g} s from {stamps[kept[0]]} ns on. --from and --to choose another part."
+        f"{what}: the clock jumps forward by {_seconds(stream, jump - 1, jump + 1):.6g} s{more} after the "
+        f"stamp {stamps[jump - 1]} ns, {_seconds(stream, 0, jump):.6g} s from the start. Only the "
+        f"{_seconds(stream, *kept):.6g} s from {stamps[kept[0]]} ns on are used; choose another part with "
+        "--from and --to."
     )

@@ -77,8 +77,8 @@ def checked_lidar(stream: LidarStream, where: str) -> tuple[LidarStream, tuple[s
     filled = np.diff(stream.start) > 0
     if filled.sum() < 2:
         raise RecordingError(
-            f"{what}: {int(filled.sum())} of {len(filled)} scans have usable points; a calibration needs the whole "
-            "recording; check the driver, and near and far in the rig file."
+            f"{what}: {int(filled.sum())} of {len(filled)} scans have usable points; a calibration needs the "
+            "whole recording. Check the driver, and min_range and max_range in the rig file."
         )
     notes = ()
     if not filled.all():
@@ -109,8 +109,8 @@ def _near_their_stamps(stream: LidarStream, what: str) -> tuple[LidarStream, tup
         return stream, ()
     if far.mean() > _MOST_FAR:
         raise RecordingError(
-            f"{what}: points are {low[far].min():.4g} to {high[far].max():.4g} s from their scan's stamp, though scans "
-            f"are {period_s:.4g} s apart; write the times of points from the stamp of their scan."
+            f"{what}: points are {low[far].min():.4g} to {high[far].max():.4g} s from the stamp of their scan, "
+            f"but scans are {period_s:.4g} s apart; write point times relative to the stamp of the scan."
         )
     first = stream.stamps_ns[np.argmax(far)]
     note = (

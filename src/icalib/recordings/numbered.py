@@ -58,8 +58,8 @@ def stamped_by_rows(
     twice = next((k for k in range(1, len(numbers)) if numbers[k] == numbers[k - 1]), None)
     if twice is not None:
         raise RecordingError(
-            f"{found[twice - 1][1]} and {found[twice][1].name} have the same number, {numbers[twice]}; give each "
-            "picture its own, that of the row of its pose."
+            f"{found[twice - 1][1]} and {found[twice][1].name} have the same number, {numbers[twice]}; number "
+            "each image as the row of its pose."
         )
     stamp_of, count = _stamps_by_row(table, layout, note)
     in_order = len(numbers) == count
@@ -67,20 +67,20 @@ def stamped_by_rows(
     rows = list(range(len(numbers))) if in_order else [n - first for n in numbers]
     if rows[-1] >= count:
         raise RecordingError(
-            f"{folder} holds {len(found)} pictures without stamps, up to number {numbers[-1]}, and {table} "
-            f"{count} rows; number each picture as the row of its pose, or give pictures stamps as names."
+            f"{folder} holds {len(found)} images without timestamps, up to number {numbers[-1]}, and {table} "
+            f"has {count} rows; number each image as the row of its pose, or use stamps as file names."
         )
     how = "in order" if in_order else f"by number, {first} being that of the first row"
     note(
-        f"{folder}: {len(found)} pictures have no stamps; each has that of its row of {table}, {how}: picture "
-        f"{found[0][1].name} belongs to row {rows[0] + 1}."
+        f"{folder}: {len(found)} images have no timestamps. Each takes that of its row of {table}, {how}: "
+        f"image {found[0][1].name} belongs to row {rows[0] + 1}."
     )
     own = [path for _, path in found]
     lost = [path for row, path in zip(rows, own, strict=True) if row not in stamp_of]
     if lost:
         note(
-            f"{folder}: {len(lost)} of {len(found)} pictures are left out, the first is {lost[0].name}: the row of "
-            f"its pose in {table} cannot be read."
+            f"{folder}: {len(lost)} of {len(found)} images are ignored, the first is {lost[0].name}: the row "
+            f"of its pose in {table} cannot be read."
         )
     return [(stamp_of[row], path) for row, path in zip(rows, own, strict=True) if row in stamp_of]
 

@@ -37,8 +37,8 @@ def kept_readings(
     notes = ()
     if differs.any():
         notes += (
-            f"{what}: {int(differs.sum())} {thing}s have the stamp of another that differs, and which one is right is "
-            f"not known; they were left out, the first at {stamps_ns[np.argmax(differs)]} ns.",
+            f"{what}: {int(differs.sum())} {thing}s share a stamp with a different {thing}. Which one is right "
+            f"is unknown, so all of them were removed, the first at {stamps_ns[np.argmax(differs)]} ns.",
         )
     if again.any():
         first = stamps_ns[np.argmax(again)]
@@ -61,10 +61,10 @@ def _refuse_many(differs: np.ndarray, stamps_ns: np.ndarray, what: str, thing: s
     share, n_stamps = differs.mean(), len(np.unique(stamps_ns[differs]))
     if n_stamps < 2 and (~differs).sum() >= _LEAST_LEFT:
         return
-    told = f"{what}: {int(differs.sum())} of {len(differs)} {thing}s have the stamp of another that differs"
+    told = f"{what}: {int(differs.sum())} of {len(differs)} {thing}s share a stamp with a different {thing}"
     if share > _CUT_SHARE and n_stamps > 1:
         raise RecordingError(
-            f"{told}, as where stamps are cut to whole seconds or milliseconds; {own}, with all their digits."
+            f"{told}, as if stamps were truncated to whole seconds or milliseconds; {own}, with all digits."
         )
     if share > _MOST_DOUBTFUL:
         raise RecordingError(f"{told}, the first {stamps_ns[np.argmax(differs)]} ns; {own}.")

@@ -80,12 +80,12 @@ class PictureFolder:
         where, (name, *_) = str(self.root), _topics(self.root)
         if stamped_by_name(pictures_in(self.root / name)):
             raise RecordingError(
-                f"{where} holds pictures, and no readings of {sensor.name}; write {sensor.name}.csv beside their "
-                "folders, or take the IMU out of the rig file to calibrate the cameras alone."
+                f"{where} holds images, and no readings of {sensor.name}; add {sensor.name}.csv beside the "
+                "image folders, or remove the IMU from the rig file to calibrate the cameras alone."
             )
         raise RecordingError(
-            f"{where} holds pictures without a clock, and {sensor.name} needs one; take the IMU out of the "
-            "rig file to calibrate the cameras alone, or give data.csv with the stamps of the images."
+            f"{where} holds images without timestamps, and {sensor.name} needs them. Remove the IMU from the "
+            "rig file to calibrate the cameras alone, or add data.csv with the stamps of the images."
         )
 
     def use_layouts(self, sensors: Sequence[PoseSensor]) -> None:
@@ -95,7 +95,9 @@ class PictureFolder:
         return False
 
     def corners(self, camera: Camera, target: Target) -> CornerStream:
-        raise RecordingError(f"{self.root} holds images of {camera.name}, not corners; find them in its images.")
+        raise RecordingError(
+            f"{self.root} holds images of {camera.name}, not corners; detect the corners in its images first."
+        )
 
     def sees(self, camera: Camera) -> bool:
         del camera
@@ -103,18 +105,18 @@ class PictureFolder:
 
     def tracks(self, camera: Camera) -> TrackStream:
         raise RecordingError(
-            f"{self.root} holds pictures without a clock, and the tracks of {camera.name} need one; give data.csv with "
-            "the stamps of the images, or take out `tracks`."
+            f"{self.root} holds images without timestamps, and the tracks of {camera.name} need them; add "
+            "data.csv with the stamps of the images, or remove `tracks`."
         )
 
     def lidar(self, sensor: Lidar) -> LidarStream:
-        raise RecordingError(f"{self.root} holds pictures, and no scans of {sensor.name}; take it out of the rig file.")
+        raise RecordingError(f"{self.root} holds images, and no scans of {sensor.name}; remove it from the rig file.")
 
     def wheels(self, sensor: Wheels) -> WheelReadings | WheelPoses:
-        raise RecordingError(f"{self.root} holds pictures, and nothing of {sensor.name}; take it out of the rig file.")
+        raise RecordingError(f"{self.root} holds images, and no data of {sensor.name}; remove it from the rig file.")
 
     def poses(self, sensor: PoseSensor) -> PoseReadings:
-        raise RecordingError(f"{self.root} holds pictures, and nothing of {sensor.name}; take it out of the rig file.")
+        raise RecordingError(f"{self.root} holds images, and no data of {sensor.name}; remove it from the rig file.")
 
     def where(self, sensor: ImuSensor | Camera | Lidar | Wheels | PoseSensor) -> str:
         return f"{self.root}/{self.image_topic(sensor)}" if isinstance(sensor, Camera) else str(self.root)
@@ -156,18 +158,18 @@ class PictureFolder:
             paths = pictures_in(self.root / topic)
             keys = [p.stem for p in paths]
         if not paths:
-            raise RecordingError(f"{self.root} has no pictures {topic}; correct `topic` of the camera in the rig file.")
+            raise RecordingError(f"{self.root} has no images {topic}; correct `topic` of the camera in the rig file.")
         found = stamped_by_name(paths, keys)
         what = "number" if found is None else "stamp"
         if found is None and not self._window.is_all:
             raise RecordingError(
-                f"{self.root} holds pictures without a clock, which have no seconds; leave out --from and --to."
+                f"{self.root} holds images without timestamps, so --from and --to cannot be used; leave them out."
             )
         found = found or sorted((_number(key, p), p) for key, p in zip(keys, paths, strict=True))
         for (a, first), (b, second) in zip(found, found[1:], strict=False):
             if a == b:
                 raise RecordingError(
-                    f"{first} and {second.name} have the same {what}, {a}; give each picture of a camera its own."
+                    f"{first} and {second.name} have the same {what}, {a}; give each image of a camera its own."
                 )
         return [(at * (APART_NS if what == "number" else 1), path) for at, path in found]
 
@@ -207,7 +209,7 @@ def _number(key: str, path: Path) -> int:
     groups = re.findall(r"\d+", key)
     if not groups or int(groups[-1]) > MOST:
         raise RecordingError(
-            f"{path} has no number in its name that says which picture it is, nor a stamp since 1970; call pictures "
-            "0001.jpg, 0002.jpg, ..., the same number for those taken together."
+            f"the name of {path} has neither a number nor a stamp since 1970; name images 0001.jpg, 0002.jpg, "
+            "..., with the same number for those taken together."
         )
     return int(groups[-1])

@@ -123,11 +123,7 @@ def unit_of_offsets(
     spread += f"{period_s:.4g} s apart"
     if not fitting:
         factor = next((f for f in (1e3, 1e6, 1e9) if _fits(bulk * f, first, period_s)), None)
-        other = (
-            f"they look like another unit; multiply them by {factor:g}, or"
-            if factor
-            else "correct what writes them, or"
-        )
+        other = f"they look like another unit; multiply them by {factor:g}, or" if factor else "correct the driver, or"
         raise RecordingError(
             f"{spread}; {other} set point_time_field of {lidar.name} in the rig file to another field."
         )
@@ -149,8 +145,9 @@ def clock_note(what: str, times: PointTimes, stamp_ns: int, first_ns: int) -> st
     if not times.absolute or times.point_time != "auto" or abs(first_ns - stamp_ns) < 1_000_000_000:
         return None
     return (
-        f"{what}: the points' `{times.field}` is on another clock than the messages' stamps, "
-        f"{(stamp_ns - first_ns) * 1e-9:.3f} s behind; the points' clock is used, and time_offset is from it."
+        f"{what}: the point times `{times.field}` are from another clock than the message stamps, "
+        f"{(stamp_ns - first_ns) * 1e-9:.3f} s behind. The clock of the points is used, and time_offset refers "
+        "to it."
     )
 
 
@@ -248,7 +245,7 @@ def _unit_of_clock(what: str, field: str, ends: np.ndarray, period_s: float, lid
     fitting = _clock_units(step, period_s)
     if given in fitting or (fitting and given is None):
         return given or fitting[0]
-    goes = f"{what}: `{field}` goes on by {step:.4g} from scan to scan, which is {period_s:.4g} s in"
+    goes = f"{what}: `{field}` increases by {step:.4g} from scan to scan, which is {period_s:.4g} s in"
     if fitting:
         raise RecordingError(f"{goes} {fitting[0]}, not in {given}; correct point_time_unit of {lidar.name}.")
     raise RecordingError(

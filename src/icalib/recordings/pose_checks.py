@@ -62,12 +62,12 @@ def _without_broken(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple[
     first, count = read.stamps_ns[np.argmin(good)], int((~good).sum())
     if count > _BROKEN_SHARE * len(good) or len(good) - count < 3:
         raise RecordingError(
-            f"{what}: {count} of {len(good)} poses are not finite or have no unit quaternion, the first at {first} ns; "
-            "correct what writes them."
+            f"{what}: {count} of {len(good)} poses are not finite or have no unit quaternion, the first at "
+            f"{first} ns; correct the program that writes them."
         )
     return _some(read, good), (
-        f"{what}: {count} of {len(good)} poses are not finite or have no unit quaternion and are left out, the first "
-        f"at {first} ns.",
+        f"{what}: {count} of {len(good)} poses are not finite or have no unit quaternion and were removed, the "
+        f"first at {first} ns.",
     )
 
 
@@ -76,8 +76,8 @@ def _without_copies(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple[
     if not stale.any():
         return read, ()
     return _some(read, ~stale), (
-        f"{what}: {int(stale.sum())} of {len(stale)} poses repeat an earlier one exactly while it moves, as where a "
-        f"tracker is lost or a driver sends its last pose again; they are left out, the first at "
+        f"{what}: {int(stale.sum())} of {len(stale)} poses repeat an earlier one exactly during motion, as if "
+        "the tracker was lost or the driver sent its last pose again. They were removed, the first at "
         f"{read.stamps_ns[np.argmax(stale)]} ns.",
     )
 
@@ -87,8 +87,8 @@ def _without_singles(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple
     if not wrong.any():
         return read, ()
     return _some(read, ~wrong), (
-        f"{what}: {int(wrong.sum())} of {len(wrong)} poses are off the path of the poses before and after and are left "
-        f"out, the first at {read.stamps_ns[np.argmax(wrong)]} ns.",
+        f"{what}: {int(wrong.sum())} of {len(wrong)} poses are outliers of the trajectory and were removed, "
+        f"the first at {read.stamps_ns[np.argmax(wrong)]} ns.",
     )
 
 
@@ -103,14 +103,14 @@ def _on_path(read: PoseReadings, sensor: PoseSensor, what: str) -> tuple[PoseRea
     words += f" and {path.size_rad:.2g} rad"
     if sensor.kind == "absolute" and path.lasting_m > max(_LASTING_M, _RETURNS * path.size_m):
         raise RecordingError(
-            f"{words}, and they do not come back, as where an odometry closes a loop or loses its track; write kind: "
-            f"relative for {sensor.name} in the rig file, or cut the recording."
+            f"{words}, and do not return, as if an odometry closed a loop or lost its track. Write kind: "
+            f"relative for {sensor.name} in the rig file, or cut the recording with --from and --to."
         )
     if not count:
-        return read, (f"{words}; the robust loss of the settings weighs them down.",)
+        return read, (f"{words}; the robust loss reduces their weight.",)
     return _some(read, path.on), (
-        f"{words}; {count} of {len(path.on)} poses are off the path of the others, as where a tracker is lost, and "
-        f"are left out; the longest time without poses is {path.longest_s:.2g} s.",
+        f"{words}. {count} of {len(path.on)} poses are off the trajectory of the others, as if the tracker was "
+        f"lost, and were removed; the longest gap is {path.longest_s:.2g} s.",
     )
 
 
@@ -133,8 +133,8 @@ def _refuse_units(read: PoseReadings, what: str) -> None:
     speed = float(np.median(np.linalg.norm(np.diff(read.position, axis=0), axis=1) / step))
     if speed > _FASTEST_M_S:
         raise RecordingError(
-            f"{what}: it moves at {speed:.4g} m/s, faster than any robot; positions in millimetres are to be divided "
-            "by 1000, stamps are in nanoseconds."
+            f"{what}: it moves at {speed:.4g} m/s, which is implausible. Positions must be in metres (divide "
+            "millimetres by 1000), and stamps in nanoseconds."
         )
 
 

@@ -25,12 +25,14 @@ FindTracks = Callable[[Recording, Sequence[Camera]], Sequence[tuple[TrackStream,
 
 def tables_only(recording: Recording, camera: Camera) -> tuple[CornerStream, tuple[str, ...]]:
     """For recordings without images. Raises RecordingError."""
-    raise RecordingError(f"{recording.where(camera)} holds images, not corners; nothing here looks for the target.")
+    raise RecordingError(
+        f"{recording.where(camera)} holds images, not corners; give a function that detects the target."
+    )
 
 
 def track_tables_only(recording: Recording, cameras: Sequence[Camera]) -> Sequence[tuple[TrackStream, tuple[str, ...]]]:
     """For recordings without images. Raises RecordingError."""
-    raise RecordingError(f"{recording.where(cameras[0])} holds images; nothing here tracks features in them.")
+    raise RecordingError(f"{recording.where(cameras[0])} holds images; give a function that tracks features in them.")
 
 
 def read_measurements(

@@ -57,12 +57,13 @@ def in_order(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[str, ..
     notes = ()
     if late:
         notes += (
-            f"{what}: {len(late)} scans came after later ones, the first at {stamps_ns[late[0]]} ns; all were sorted.",
+            f"{what}: {len(late)} scans are out of order, the first at {stamps_ns[late[0]]} ns; all were "
+            "sorted by stamp.",
         )
     if bad:
         notes += (
-            f"{what}: {len(bad)} of {len(stamps_ns)} scans have a stamp that does not fit their neighbours' and were "
-            f"left out, the first at {stamps_ns[bad[0]]} ns.",
+            f"{what}: {len(bad)} of {len(stamps_ns)} scans have a stamp that does not fit their neighbours' "
+            f"and were removed, the first at {stamps_ns[bad[0]]} ns.",
         )
     return selected(stream, order), notes
 
@@ -82,8 +83,8 @@ def at_even_steps(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[st
     if not len(odd) or len(odd) > _MOST_BAD * len(stamps_ns):
         return stream, ()
     note = (
-        f"{what}: {len(odd)} of {len(stamps_ns)} scans are stamped by more than {_LATE:.0%} of a period too early or "
-        f"too late between their neighbours and were left out, the first at {stamps_ns[odd[0]]} ns."
+        f"{what}: {len(odd)} of {len(stamps_ns)} scans are stamped more than {_LATE:.0%} of a period too early "
+        f"or too late relative to their neighbours and were removed, the first at {stamps_ns[odd[0]]} ns."
     )
     return selected(stream, np.setdiff1d(np.arange(len(stamps_ns)), odd)), (note,)
 

@@ -30,8 +30,8 @@ def read_scans(name: str, path: Path) -> LidarStream:
     found = {n: _of_kind(path, n, array, kinds[n]) for n, array in arrays.items()}
     if "plane" in found and not _are_planes(arrays["plane"]):
         raise RecordingError(
-            f"{path}: plane must be -1, or the number of a plane from 0 up and below the number of points; correct "
-            "what writes it."
+            f"{path}: plane must be -1 or a plane's number, from 0 up and below the number of points; correct "
+            "the program that writes it."
         )
     if "plane" not in found:
         found["plane"] = np.full(len(found["xyz"]), -1, np.int32)
@@ -82,7 +82,7 @@ def _arrays(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
         if sentence:
             raise RecordingError(sentence)
         if not zipfile.is_zipfile(path):
-            raise RecordingError(f"{path} is not a file of arrays (npz); write it by numpy.savez.")
+            raise RecordingError(f"{path} is not a file of arrays (npz); write it with numpy.savez.")
         return load_arrays(path, names)
     except (OSError, ValueError) as error:
         raise RecordingError(f"{path} cannot be read ({error}); copy or write it again.") from error
@@ -94,7 +94,7 @@ def _of_kind(path: Path, name: str, array: np.ndarray, kind: type[np.generic]) -
     if array.ndim != axes or array.dtype.kind not in numbers or (name == "start" and not array.size):
         wanted = "whole numbers" if numbers == "iu" else "numbers"
         raise RecordingError(
-            f"{path}: {name} must be {wanted} along {axes} axes, but is {array.dtype} of shape {array.shape}; correct "
-            "what writes it."
+            f"{path}: {name} must be {wanted} with {axes} axes, but is {array.dtype} of shape {array.shape}; "
+            "correct the program that writes it."
         )
     return np.ascontiguousarray(array, dtype=kind)

@@ -170,7 +170,7 @@ def _point_type(message: Any) -> np.dtype:
     order = ">" if message.is_bigendian else "<"
     unknown = [f.name for f in message.fields if f.datatype not in _FIELD_TYPES]
     if unknown or message.point_step < 1:
-        raise ValueError(f"its points have no layout: {', '.join(unknown) or 'they have 0 bytes'}")
+        raise ValueError(f"its point fields cannot be read: {', '.join(unknown) or 'they have 0 bytes'}")
     formats = [(order + _FIELD_TYPES[f.datatype], (f.count,) if f.count > 1 else ()) for f in message.fields]
     return np.dtype(
         {
@@ -204,8 +204,8 @@ def _poses(bag: HasMessages, topic: str, frame: str, stamps_ns: np.ndarray, pose
     good = np.abs(np.linalg.norm(xyzw, axis=1) - 1.0) < 1e-3
     if 2 * (~good).sum() > len(good):
         raise RecordingError(
-            f"{bag.root} {topic}: the orientation at {stamps_ns[np.argmin(good)]} ns is no unit quaternion, and so are "
-            "most; correct what publishes it."
+            f"{bag.root} {topic}: the orientation at {stamps_ns[np.argmin(good)]} ns is not a unit quaternion, "
+            "nor are most others; correct the publisher."
         )
     return PoseStream(frame, stamps_ns, position, unit_rotations(xyzw, good))
 

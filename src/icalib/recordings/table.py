@@ -100,8 +100,8 @@ def _joined(text: _Text, kind: TableKind, layout: TableLayout) -> Table | None:
             f"{rest[first]} in {' and '.join(names)}: nanoseconds are from 0 to {_NS - 1}"
         )
         if good.mean() < 1.0 - _MOST_UNREADABLE:
-            raise RecordingError(f"{sentence}; correct what writes them.")
-        notes += (f"{sentence}; they were left out.",)
+            raise RecordingError(f"{sentence}; correct the program that writes them.")
+        notes += (f"{sentence}; they were ignored.",)
     stamps_ns = seconds[good] * _NS + rest[good]
     integers = np.column_stack([stamps_ns, table.integers[good, 2:]])
     return Table(text.path, integers, table.decimals[good], table.numbers[good], table.written, notes)
@@ -163,7 +163,7 @@ def _read_bytes(path: Path) -> bytes:
         if path.suffix == ".gz" or content.startswith(_GZIP_MAGIC):
             content = gunzipped(content)
     except TooLargeError as error:
-        raise RecordingError(f"{path} is no table: {error}; unpack it by gunzip, and look at it.") from error
+        raise RecordingError(f"{path} is not a table: {error}; unpack it with gunzip and check its content.") from error
     except (EOFError, gzip.BadGzipFile, zlib.error) as error:
         raise RecordingError(f"{path} is a damaged or truncated gzip file ({error}); copy it again.") from error
     except OSError as error:

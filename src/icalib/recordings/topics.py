@@ -86,7 +86,7 @@ def image_topics(recording: HasImages, cameras: Sequence[Camera]) -> dict[str, s
         for other, taken in chosen.items():
             if taken == topic:
                 raise RecordingError(
-                    f"{camera.name} and {other} would both be {topic}; set `topic` of each in the rig file."
+                    f"{camera.name} and {other} both match {topic}; set `topic` of each in the rig file."
                 )
         chosen[camera.name] = topic
     return chosen

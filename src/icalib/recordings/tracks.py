@@ -78,8 +78,8 @@ def _check(stream: TrackStream, what: str) -> None:
     if len(repeated):
         row = int(repeated.min())
         raise RecordingError(
-            f"{what}: the image at {stream.stamps_ns[stream.image[row]]} ns has feature {stream.feature[row]} twice; "
-            "remove one: a number is one point."
+            f"{what}: the image at {stream.stamps_ns[stream.image[row]]} ns has feature {stream.feature[row]} "
+            "twice; remove one, for a feature is one point of the scene."
         )
     sentence = rate_sentence(what, stream.stamps_ns, *_RATE_HZ) if len(stream.stamps_ns) > 1 else None
     if sentence:

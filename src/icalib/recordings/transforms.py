@@ -92,8 +92,8 @@ def read_transform_poses(bag: HasTopics, sensor: PoseSensor, note: Note) -> Pose
         topic = find_topic(str(bag.root), topics, name)
         holds = "no messages" if topic.kind == TRANSFORMS else topic.type
         raise RecordingError(
-            f"{bag.root}: {topic.name} holds {holds}, but `frames` of {sensor.name} are those of transforms, as of "
-            f"{DEFAULT_TOPIC}; leave out `frames`, or correct `topic`."
+            f"{bag.root}: {topic.name} holds {holds}, but `frames` of {sensor.name} needs transforms, as on "
+            f"{DEFAULT_TOPIC}; remove `frames`, or correct `topic`."
         )
     where = f"{bag.root} {' and '.join(t.name for t in used)}"
     edges = read_edges(bag, used, note)
@@ -125,8 +125,8 @@ def read_edges(bag: HasMessages, topics: Sequence[TopicInfo], note: Note) -> dic
         received = _rows(bag, topic.name)
         if not static and (unstamped := sum(r.unstamped for r in received.values())):
             note(
-                f"{where}: {unstamped} transforms have no stamp; the times at which they were received stand in, which "
-                "are late and jitter; let what publishes them stamp them."
+                f"{where}: {unstamped} transforms have no stamp. Their receive times are used instead, which "
+                "are late and jittery; let the publisher stamp them."
             )
         for pair, r in received.items():
             rows = np.array(r.values, np.float64).reshape(-1, 7)
@@ -164,12 +164,12 @@ def _edge(pair: Pair, stamps_ns: np.ndarray, rows: np.ndarray, static: bool, whe
     if 2 * good.sum() < len(good):
         raise RecordingError(
             f"{where}: the transform {shown} at {stamps_ns[np.argmin(good)]} ns is not finite or has no unit "
-            "quaternion, and so are most; correct what publishes it."
+            "quaternion, as are most others; correct the publisher."
         )
     if not good.all():
         note(
             f"{where}: {int((~good).sum())} of {len(good)} transforms {shown} are not finite or have no unit "
-            f"quaternion and are left out, the first at {stamps_ns[np.argmin(good)]} ns."
+            f"quaternion and were removed, the first at {stamps_ns[np.argmin(good)]} ns."
         )
     stamps_ns, rows = stamps_ns[good], rows[good]
     if static:  # the last one holds
@@ -209,8 +209,8 @@ def _chain(edges: dict[Pair, Edge], parent: str, child: str, what: str) -> list[
     if child not in steps_to:
         raise RecordingError(
             f"{what}: no transforms connect {parent} and {child}; {parent} is connected with "
-            f"{', '.join(sorted(f for f in steps_to if f != parent)[:_MOST_LISTED])}; correct `frames`, or record "
-            "/tf_static, too."
+            f"{', '.join(sorted(f for f in steps_to if f != parent)[:_MOST_LISTED])}; correct `frames`, or "
+            "record /tf_static as well."
         )
     return steps_to[child]
 
@@ -223,8 +223,8 @@ def _along(steps: Sequence[_Step], sensor: PoseSensor, where: str, note: Note) -
     moving = [e for e in sent if e.changes] or sent
     if not moving:
         raise RecordingError(
-            f"{what}: nothing moves between the frames {shown}; choose `frames` with a joint or a vehicle's motion "
-            "between them."
+            f"{what}: nothing moves between the frames {shown}; choose `frames` with a joint or the motion of "
+            "a vehicle between them."
         )
     stamps_ns = _common_stamps(moving, what, shown, note)
     R, p = np.tile(np.eye(3), (len(stamps_ns), 1, 1)), np.zeros((len(stamps_ns), 3))
@@ -244,12 +244,13 @@ def _common_stamps(moving: Sequence[Edge], what: str, shown: str, note: Note) ->
     known = np.logical_and.reduce([_covered(edge, stamps_ns) for edge in moving])
     if not known.any():
         raise RecordingError(
-            f"{what}: the transforms between {shown} have no time in common; check the clocks of what publishes them."
+            f"{what}: the transforms between {shown} have no time in common; check the clocks of their publishers."
         )
     if not known.all():
         note(
-            f"{what}: {int((~known).sum())} of {len(known)} poses {shown} are left out, the first at "
-            f"{stamps_ns[np.argmin(known)]} ns, because another transform between the two frames is missing there."
+            f"{what}: {int((~known).sum())} of {len(known)} poses {shown} were removed, the first at "
+            f"{stamps_ns[np.argmin(known)]} ns, because another transform between the two frames is missing "
+            "there."
         )
     return stamps_ns[known]
 

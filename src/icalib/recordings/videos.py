@@ -115,7 +115,7 @@ def _opened(path: Path) -> Iterator[Any]:
     video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     try:
         if not video.isOpened():
-            raise RecordingError(f"{path} is no video that can be decoded; copy it again, or convert it to H.264.")
+            raise RecordingError(f"{path} cannot be decoded as a video; copy it again, or convert it to H.264.")
         video.set(_property("ORIENTATION_AUTO"), 0)
         yield video
     finally:

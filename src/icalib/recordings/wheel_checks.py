@@ -44,8 +44,8 @@ def checked_wheels(
     kept, notes = kept_readings(read.stamps_ns, read.value, what, RATE_HZ, "reading", own)
     if (rate_hz := 1e9 / usual_step(read.stamps_ns)) < _LEAST_HZ:
         raise RecordingError(
-            f"{what}: {rate_hz:.2g} readings a second, and {_LEAST_HZ:g} are needed to follow the wheels; record more "
-            "often."
+            f"{what}: the rate of {rate_hz:.2g} Hz is too low to follow the wheels, at least {_LEAST_HZ:g} Hz "
+            "are needed; record at a higher rate."
         )
     read = _signed(_some(read, kept), wheels, what)
     read, apart_notes = (_even_rates if wheels.measures in ("rates", "twist") else _mean_rates)(read, wheels, what)
@@ -69,11 +69,11 @@ def _finite(read: WheelReadings, what: str) -> tuple[WheelReadings, tuple[str, .
     first, count = read.stamps_ns[np.argmin(good)], int((~good).sum())
     if 2 * count > len(good) or len(good) - count < 3:
         raise RecordingError(
-            f"{what}: {count} of {len(good)} readings are not finite, the first at {first} ns; correct what "
-            "writes them."
+            f"{what}: {count} of {len(good)} readings are not finite, the first at {first} ns; correct the "
+            "program that writes them."
         )
     return _some(read, good), (
-        f"{what}: {count} of {len(good)} readings are not finite and are left out, the first at {first} ns.",
+        f"{what}: {count} of {len(good)} readings are not finite and were removed, the first at {first} ns.",
     )
 
 
@@ -84,7 +84,7 @@ def _signed(read: WheelReadings, wheels: Wheels, what: str) -> WheelReadings:
     n, m = read.value.shape
     signs = np.ones(m) if wheels.signs is None else np.array(wheels.signs, dtype=float)
     if len(signs) != m:
-        raise RecordingError(f"{what}: signs of the rig file has {len(signs)} entries for {m} columns; write {m}.")
+        raise RecordingError(f"{what}: signs in the rig file has {len(signs)} entries for {m} columns; write {m}.")
     turning = np.arange(m) < _turning(read, wheels)
     return replace(read, value=read.value * signs * np.where(turning, RATE_UNITS[wheels.rate_unit], 1.0))
 
@@ -109,7 +109,7 @@ def _mean_rates(read: WheelReadings, wheels: Wheels, what: str) -> tuple[WheelRe
     wrong = comes_back(off * dt, own)
     if wrong.any():
         at = read.stamps_ns[np.argmax(wrong)]
-        notes += (f"{what}: {int(wrong.sum())} single readings are wrong and are left out, the first at {at} ns.",)
+        notes += (f"{what}: {int(wrong.sum())} single readings are outliers and were removed, the first at {at} ns.",)
         read = _some(read, ~wrong)
         off, own = apart(_steps(read, wheels, size), _seconds(read)[1:])
     own = set_back(_steps(read, wheels, size), off, own)
@@ -144,8 +144,8 @@ def _range(read: WheelReadings, wheels: Wheels, what: str) -> tuple[float | None
     if size is None:
         return None, ()
     return size, (
-        f"{what}: the angles wrap after {size:.6f} rad and are unwrapped; angle_range of {read.name} in the rig file "
-        "says it.",
+        f"{what}: the angles wrap around after {size:.6f} rad and were unwrapped; angle_range of {read.name} "
+        "in the rig file sets another range.",
     )
 
 
@@ -155,8 +155,8 @@ def _refuse_counter(read: WheelReadings, wheels: Wheels, off: np.ndarray, what: 
     size = counter_of(off * wheels.counts_per_turn / (2.0 * np.pi))
     if size is not None:
         raise RecordingError(
-            f"{what}: a wheel's count jumps by {size}, as where a counter starts anew; set counter_size of "
-            f"{wheels.name} in the rig file ({size} for {size.bit_length() - 1} bits)."
+            f"{what}: a wheel's count jumps by {size}, which looks like an encoder wrap-around; set "
+            f"counter_size of {wheels.name} in the rig file ({size} for {size.bit_length() - 1} bits)."
         )
 
 
@@ -167,8 +167,8 @@ def _apart_note(read: WheelReadings, off: np.ndarray, own: np.ndarray, what: str
         return ()
     at, most = read.stamps_ns[np.argmax(own.any(axis=1))], np.abs(off[own]).max()
     return (
-        f"{what}: {count} of {len(own)} readings stand apart from those before and after, by up to {most:.3g}, and are "
-        f"left out, the first at {at} ns.",
+        f"{what}: {count} of {len(own)} readings are outliers, off by up to {most:.3g}, and were removed, the "
+        f"first at {at} ns.",
     )
 
 
@@ -199,20 +199,22 @@ def _refuse_units(rate: np.ndarray, wheels: Wheels, what: str) -> None:
         steep = float(np.percentile(np.abs(rate[:, 1]), 99))
         if steep > _STEEPEST_RAD:
             raise RecordingError(
-                f"{what}: the front wheels are steered by {steep:.4g} rad, further than any; degrees are to be "
-                "multiplied by pi / 180, and the angle is that of the front wheels, not of the steering wheel."
+                f"{what}: the front wheels are steered by {steep:.4g} rad, which is implausible. Give the "
+                "angle of the front wheels, not of the steering wheel, in rad (degrees times pi / 180)."
             )
     faster = np.abs(rate if wheels.kind == "pair" else rate[:, :1]).max(axis=1)
     fast = float(np.percentile(faster, 50 if wheels.measures == "ticks" else 99))
     if fast > _FASTEST_RAD_S:
         advice = {
-            "rates": "if these are not rad/s, set rate_unit of {} to deg/s or rpm",
-            "angles": "for degrees set measures of {} to ticks and counts_per_turn to 360, for counts of an encoder to "
-            "those of a turn; for angles that start anew set angle_range",
+            "rates": "unless the rates are in rad/s, set rate_unit of {} to deg/s or rpm",
+            "angles": (
+                "for degrees set measures of {} to ticks and counts_per_turn to 360, for encoder counts to "
+                "those of a turn; for angles that wrap around set angle_range"
+            ),
             "ticks": "correct counts_per_turn of {}",
         }[wheels.measures].format(wheels.name)
         raise RecordingError(
-            f"{what}: the wheels turn at {fast:.4g} rad/s, faster than any robot's; {advice} in the rig file."
+            f"{what}: the wheels turn at {fast:.4g} rad/s, which is implausible; {advice} in the rig file."
         )
 
 
@@ -221,11 +223,11 @@ def _refuse_twist_units(rate: np.ndarray, what: str) -> None:
     speed, yaw = np.percentile(np.abs(rate), 99, axis=0)
     if speed > _FASTEST_M_S:
         raise RecordingError(
-            f"{what}: the vehicle moves at {speed:.4g} m/s, faster than any; km/h are to be multiplied by 1 / 3.6."
+            f"{what}: the vehicle moves at {speed:.4g} m/s, which is implausible; multiply km/h by 1 / 3.6."
         )
     if yaw > _FASTEST_YAW_RAD_S:
         raise RecordingError(
-            f"{what}: the vehicle turns at {yaw:.4g} rad/s, faster than any; deg/s are to be multiplied by pi / 180."
+            f"{what}: the vehicle turns at {yaw:.4g} rad/s, which is implausible; multiply deg/s by pi / 180."
         )
 
 
@@ -236,8 +238,8 @@ def _gap_notes(stream: WheelStream, what: str) -> tuple[str, ...]:
         return ()
     i = int(np.argmax(step))
     return (
-        f"{what}: {int(gap.sum())} gaps in the readings, the longest of {step[i]:.3g} s from {stream.stamps_ns[i]} ns "
-        "on; what the wheels did there is known only on average.",
+        f"{what}: {int(gap.sum())} gaps in the readings, the longest of {step[i]:.3g} s from "
+        f"{stream.stamps_ns[i]} ns on; in a gap only the mean rate is known.",
     )
 
 
@@ -247,8 +249,8 @@ _COLUMNS = {
              ("the right wheel", "the left one turns; check its encoder", _TURNING_RAD_S)),
     "steered": (("the driven wheel", "the wheels are steered; check its encoder", _STEERING_RAD),
                 ("the steering", "the vehicle drives; unless it went straight, check its sensor", _TURNING_RAD_S)),
-    "twist": (("the speed", "the vehicle turns; check what publishes it", _TURNING_RAD_S),
-              ("the yaw rate", "the speed changes; unless it went straight, check what publishes it",
+    "twist": (("the speed", "the vehicle turns; check its publisher", _TURNING_RAD_S),
+              ("the yaw rate", "the speed changes; unless it went straight, check its publisher",
                _DRIVING_M_S)),
 }  # fmt: skip
 _UNITS = {"pair": ("rad/s", "rad/s"), "steered": ("rad/s", "rad"), "twist": ("m/s", "rad/s")}

@@ -106,8 +106,8 @@ def _relative_poses(name: str, path: Path, table: Table) -> WheelPoses:
     if wrong.any():
         i = int(np.argmax(wrong))
         raise RecordingError(
-            f"{path} ({name}): the pose from {begin[i]} to {end[i]} ns does not go on where the one before ends; write "
-            "one pose after the other."
+            f"{path} ({name}): the pose from {begin[i]} to {end[i]} ns does not start where the previous one "
+            "ends; write consecutive poses."
         )
     covariance = np.empty((len(begin), 3, 3))
     row, column = np.triu_indices(3)
@@ -116,8 +116,8 @@ def _relative_poses(name: str, path: Path, table: Table) -> WheelPoses:
     if (size[:, 0] < -1e-9 * size[:, 2]).any() or (size[:, 2] <= 0).any():
         i = int(np.argmax((size[:, 0] < -1e-9 * size[:, 2]) | (size[:, 2] <= 0)))
         raise RecordingError(
-            f"{path} ({name}): the covariance of the pose from {begin[i]} ns is none (it has a negative direction, or "
-            "is zero); correct what writes it."
+            f"{path} ({name}): the covariance of the pose from {begin[i]} ns is not positive definite; correct "
+            "the program that writes it."
         )
     return WheelPoses(name, np.append(begin, end[-1]), table.decimals[:, :3].copy(), covariance)
 
@@ -127,9 +127,9 @@ def read_wheel_twists(wheels: Wheels, twists: Twists, what: str) -> WheelReading
     the world."""
     if _in_the_world(twists):
         raise RecordingError(
-            f"{what}: its linear velocities are in the axes of the world, not of the vehicle: they turn as the vehicle "
-            f"does; take the poses of the same program instead of {wheels.name} (type: pose, kind: relative), or let "
-            "it publish linear.x forwards."
+            f"{what}: its linear velocity is in the world frame, not in the vehicle's. Use the poses of the "
+            f"same program instead of {wheels.name} (type: pose, kind: relative), or publish linear.x along "
+            "the vehicle."
         )
     value = np.stack([twists.linear[:, 0], twists.angular[:, 2]], axis=1)
     return WheelReadings(wheels.name, twists.stamps_ns, value)
@@ -155,7 +155,9 @@ def read_wheel_joints(wheels: Wheels, joints: Joints, what: str) -> WheelReading
     joints that are not there or not sent together, and what they do not say. Single messages where
     some are NaN stay, to be left out with a note."""
     if wheels.measures == "poses":
-        raise RecordingError(f"{what}: bags hold no relative poses; set `measures` of {wheels.name} in the rig file.")
+        raise RecordingError(
+            f"{what}: a bag holds no relative planar poses; set another `measures` of {wheels.name} in the rig file."
+        )
     own = _own_joints(wheels, joints.names, what)
     column = [joints.names.index(name) for name in own]
     value = (joints.velocity if wheels.measures == "rates" else joints.position)[:, column]
@@ -203,8 +205,8 @@ def _own_joints(wheels: Wheels, names: tuple[str, ...], what: str) -> tuple[str,
         missing = [name for name in wheels.joints if name not in names]
         if missing:
             raise RecordingError(
-                f"{what} has no joint {missing[0]}; it has {', '.join(names)}; correct `joints` of {wheels.name} "
-                "in the rig file."
+                f"{what} has no joint {missing[0]}; it has {', '.join(names)}; correct `joints` of "
+                f"{wheels.name} in the rig file."
             )
         return wheels.joints
     sides = SIDES[wheels.drive]
@@ -212,7 +214,7 @@ def _own_joints(wheels: Wheels, names: tuple[str, ...], what: str) -> tuple[str,
     if any(len(own) != 1 for own in found):
         which = "the left and the right wheel" if wheels.drive == "differential" else f"the {', the '.join(sides)}"
         raise RecordingError(
-            f"{what}: which of the joints {', '.join(names)} are {which}? Set `joints: "
+            f"{what}: the names of the joints {', '.join(names)} do not tell which are {which}; set `joints: "
             f"[{', '.join(side.upper() for side in sides)}]` of {wheels.name} in the rig file."
         )
     return tuple(own[0] for own in found)

@@ -40,14 +40,14 @@ class Window:
 
     def note(self, where: str) -> str:
         end = f"to {self.end_s:g} s" if self.end_s < inf else "on"
-        return f"{where}: only what was recorded from {self.start_s:g} s after its start {end} is used."
+        return f"{where}: only the part from {self.start_s:g} s after its start {end} is used."
 
     def refuse(self, what: str, length_s: float) -> RecordingError:
         """The error of a part with nothing in it; length_s: what there is, from the start of the recording on."""
         end = "the end" if self.end_s == inf else f"{self.end_s:g}"
         return RecordingError(
-            f"{what}: nothing was recorded from {self.start_s:g} s to {end}, the whole lasts {length_s:.4g} s; correct "
-            "--from and --to."
+            f"{what}: there is nothing from {self.start_s:g} s to {end}, the whole lasts {length_s:.4g} s; "
+            "correct --from and --to."
         )
 
 

@@ -38,7 +38,7 @@ def open_storages(path: Path) -> tuple[list[Storage], list[str]]:
     if path.is_file():
         return [open_storage(path)], []
     files = bag_files(path)
-    notes = [f"{path}: metadata.yaml names {name}, which is not there." for name in _absent(path)]
+    notes = [f"{path}: metadata.yaml lists {name}, which does not exist." for name in _absent(path)]
     storages: list[Storage] = []
     for file in files:
         try:
@@ -87,7 +87,7 @@ def _open_compressed(path: Path) -> Storage:
             copy_unpacked(packed, out, path.stat().st_size)
     except TooLargeError as error:
         shutil.rmtree(folder)
-        raise RecordingError(f"{path}: {error}; unpack it by zstd -d, and look at it.") from error
+        raise RecordingError(f"{path}: {error}; unpack it with zstd -d and check its content.") from error
     except (zstd.ZstdError, EOFError):
         pass  # cut off: the reader of the copy says how much there is
     except OSError:
@@ -95,7 +95,7 @@ def _open_compressed(path: Path) -> Storage:
         raise
     try:
         if not copy.stat().st_size:
-            raise RecordingError(f"{path} is cut off or damaged before its first message; copy or record it again.")
+            raise RecordingError(f"{path} is truncated or damaged before its first message; copy or record it again.")
         storage = open_storage(copy, path)
     except RecordingError:
         shutil.rmtree(folder)

@@ -97,7 +97,7 @@ class SpanStorage(ABC):
             ) from None
         except (DamageError, TooLargeError) as error:
             large = isinstance(error, TooLargeError)
-            what = f"is left out: {error}." if large else "is damaged; what follows in it was left out."
+            what = f"is ignored: {error}." if large else "is damaged; the messages after the damage were ignored."
             note = f"{self.name}: the block at byte {span.offset} {what}"
             if not span.cut and note not in self.notes:
                 self.notes.append(note)

@@ -51,7 +51,7 @@ class SqliteStorage:
             try:
                 yield from database.execute(query, (self._last_id, *wanted))
             except sqlite3.DatabaseError as error:
-                note = f"{self.name} is damaged ({error}); the messages after the damage were left out."
+                note = f"{self.name} is damaged ({error}); the messages after the damage were ignored."
                 if note not in self.notes:
                     self.notes.append(note)
 

@@ -69,7 +69,7 @@ def cut_note(name: Path, where: str, tally: dict[int, Tally]) -> str:
     count = sum(t.count for t in tally.values())
     if not count:
         raise RecordingError(
-            f"{name} is cut off or damaged {where}, before its first message; copy or record it again."
+            f"{name} is truncated or damaged {where}, before its first message; copy or record it again."
         )
     span = max(t.last_ns for t in tally.values()) - min(t.first_ns for t in tally.values())
-    return f"{name} is cut off or damaged {where}; what can be read is used: {count} messages, {span * 1e-9:.1f} s."
+    return f"{name} is truncated or damaged {where}; the readable part is used: {count} messages, {span * 1e-9:.1f} s."
