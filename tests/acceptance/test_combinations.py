@@ -54,7 +54,7 @@ def refusal(sees: str, imu: bool, others: str, known: str) -> str:
     if not imu and not sees and others == "pose":
         return "mocap0 is alone"
     if not imu and sees == "tracks" and "pose" not in others:
-        return "how large the scene is"
+        return "determines the scale"
     return ""
 
 

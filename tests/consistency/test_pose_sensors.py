@@ -179,16 +179,16 @@ def test_what_cannot_be_calibrated_is_said():
     sim = simulate(scenario, 1)
     rig, (stream,) = rig_for(scenario), sim.measurements.poses
     other = simulate(scenario, 2).measurements.poses[0]
-    with pytest.raises(EstimationError, match="mocap0 does not match that of imu0 at any shift of their clocks"):
+    with pytest.raises(EstimationError, match="mocap0 does not match that of imu0 at any time offset"):
         calibrate_measurements(rig, cut(sim, other))
     still = PoseStream("mocap0", stream.stamps_ns, np.tile(np.eye(3), (len(stream.stamps_ns), 1, 1)), stream.position)
     with pytest.raises(EstimationError, match="its rotation is the same in all poses"):
         calibrate_measurements(rig, cut(sim, still))
     sparse = PoseStream("mocap0", stream.stamps_ns[::100], stream.rotation[::100], stream.position[::100])
-    with pytest.raises(EstimationError, match="hardly any of its 12 poses"):
+    with pytest.raises(EstimationError, match="pairs of its 12 poses"):
         calibrate_measurements(rig, cut(sim, sparse))
     large = PoseStream("mocap0", stream.stamps_ns, stream.rotation, 3.28 * stream.position)
-    with pytest.raises(EstimationError, match=r"its motion is 0\.3\d \+- 0\.0\d times as large as its positions say"):
+    with pytest.raises(EstimationError, match=r"its motion to be 0\.3\d \+- 0\.0\d times as large as its positions"):
         calibrate_measurements(rig, cut(sim, large))
     in_g = replace(sim.measurements.imu, accel=sim.measurements.imu.accel / 9.81)
     with pytest.raises(EstimationError, match=r"show gravity of [\d.]* m/s\^2 instead of 9.81: check that the acc"):

@@ -160,7 +160,7 @@ def test_of_three_recordings_the_one_that_was_changed_is_named():
     rig, (old, new) = moved_between([0.0, 0.02, 0.03], noiseless=False)
     third = dataclasses.replace(simulate(tag_map(12.0), 2).measurements, name="third")
     bodies, recordings = chosen(rig, [old, new, third])
-    with pytest.raises(EstimationError, match="^new: the targets do not stand"):
+    with pytest.raises(EstimationError, match="^new: the poses of the targets relative to each other"):
         check_scene(rig, find_scene(rig, bodies, recordings), recordings)
 
 
@@ -201,7 +201,7 @@ def test_the_size_of_tags_shows_against_the_imu():
     simulation = simulate(tag_map(12.0), 0)
     rig = rig_for(simulation.scenario)
     small = dataclasses.replace(simulation.scenario.target, size=0.12)
-    with pytest.raises(EstimationError, match=r"times the size that the rig file says"):
+    with pytest.raises(EstimationError, match=r"times as large as in the rig file"):
         calibrate_measurements(dataclasses.replace(rig, target=small), simulation.measurements)
 
 

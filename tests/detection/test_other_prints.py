@@ -111,8 +111,8 @@ def test_the_wrong_layout_is_named(legacy):
     assert len(point) > 0.9 * len(board.points)
     assert with_other_layout([image], board) == ""
     sentence = with_other_layout([image], replace(board, legacy=not legacy))
-    assert ("old layout" in sentence and "set legacy: true" in sentence) != ("take legacy: true out" in sentence)
-    assert ("old layout" in sentence) == legacy
+    assert ("before 4.6" in sentence and "set legacy: true" in sentence) != ("remove legacy: true" in sentence)
+    assert ("before 4.6" in sentence) == legacy
     assert with_other_layout([image], replace(board, squares_y=7)) == ""  # the layouts are one
 
 
@@ -153,7 +153,7 @@ def test_a_long_board_of_which_a_part_is_seen(board, wrong):
     assert other_columns([image], board) == ""
     across = "cols" if isinstance(board, AprilGrid) else "squares_x"
     right, said = getattr(board, across), wrong[across]
-    assert f"with {across}: {right}, not {said}" in other_columns([image], replace(board, **wrong))
+    assert f"matches {across}: {right}, not {said}" in other_columns([image], replace(board, **wrong))
 
 
 def test_no_layout_is_named_that_the_tags_in_sight_do_not_tell_from_others():

@@ -177,8 +177,8 @@ def test_tags_that_nobody_listed_are_kept_where_they_are_seen_often():
     kept, notes = without_rare_tags(target, images)
     assert [i.point.tolist() for i in kept] == [[3, often, often + 1]] * 3 + [[]] * 2
     assert notes == (
-        "1 tags of tag16h5 (ids 9) are in fewer than 3 of 5 images and left out; "
-        "list the ids of tags in the rig file if they are there.",
+        "1 tags of tag16h5 (ids 9) are in fewer than 3 of 5 images and were ignored; "
+        "list the ids of tags in the rig file if they exist.",
     )
     # 1 % of 400 images is more than 3 of them.
     kept, notes = without_rare_tags(target, images + [no_corners()] * 395)

@@ -205,7 +205,7 @@ def test_damaged_images_are_named(detector, files):
         found, notes = streams.find_corners(recording, CAMERA, GRID)
         assert len(found.stamps_ns) == 18
         which = "left7.png" if files else "at 1007 ns"
-        assert notes[-1] == f"fake.bag /cam0: 2 images that are damaged were left out, the first {which}."
+        assert notes[-1] == f"fake.bag /cam0: 2 damaged images were ignored, the first {which}."
         assert found.which(1003) == ("left3.png" if files else "at 1003 ns")
 
 

@@ -96,7 +96,7 @@ def test_too_slow_is_said(with_poses, tmp_path):
     ):
         calibrate_measurements(replace(rig, poses=(sensor,)), slow)
     other = replace(m.poses[0], rotation=m.poses[0].rotation[::-1].copy())
-    with pytest.raises(EstimationError, match=r"of mocap0.* not match that.* of imu0 at any shift"):
+    with pytest.raises(EstimationError, match=r"of mocap0.* not match that.* of imu0 at any time offset"):
         calibrate_measurements(replace(rig, poses=(sensor,)), replace(m, poses=(thinned(other, 50),)))
     (tmp_path / "wheel0").mkdir()
     (tmp_path / "wheel0" / "rates.csv").write_text("".join(f"{k * 10**9},1,{1 + k % 3}\n" for k in range(60)))

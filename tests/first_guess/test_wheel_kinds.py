@@ -94,11 +94,11 @@ def test_the_offset_is_found(kind, values, offset):
     [("twist", TWIST * [1.0, -1.0], "its yaw rate must be"), ("steered", STEERED * [1, 1, -1, 1], "its steering ang")],
 )
 def test_what_turns_the_other_way_round_is_named(kind, values, words):
-    with pytest.raises(EstimationError, match=f"wheel0 turns the other way round than imu0: {words}"):
+    with pytest.raises(EstimationError, match=f"wheel0 turns in the opposite direction to imu0: {words}"):
         wheel_offset(imu(), UP, "wheel0", rates_at(kind, values, 1.0))
 
 
 @pytest.mark.parametrize(("kind", "values"), [("twist", TWIST), ("steered", STEERED)])
 def test_a_vehicle_that_stood_still_is_named(kind, values):
-    with pytest.raises(EstimationError, match="wheel0: by its readings the vehicle stood still"):
+    with pytest.raises(EstimationError, match="wheel0: the vehicle stood still according to its readings"):
         rates_at(kind, values * ([0.0, 0.0] if kind == "twist" else [0.0, 1.0, 1.0, 0.0]), 0.0)

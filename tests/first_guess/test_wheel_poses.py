@@ -53,5 +53,5 @@ def test_a_frame_of_another_recording_is_refused(free_motion):
     imu, stream, _ = setting(free_motion)
     rng = np.random.default_rng(0)
     pose = np.column_stack([0.02 * rng.normal(size=len(stream.pose)), stream.pose[:, 1:]])
-    with pytest.raises(EstimationError, match="wheel0 does not match that of imu0 at any shift"):
+    with pytest.raises(EstimationError, match="wheel0 does not match that of imu0 at any time offset"):
         poses_offset(imu, replace(stream, pose=pose))

@@ -59,9 +59,9 @@ BROKEN = [
     (about(0.001, 0.001, 0.001), "problem", r"imu0 hardly moves .*: record again"),
     (in_g, "warning", r"units of g .*multiplied by 9\.80665"),
     (degrees, "problem", r"deg/s; set gyro_unit: deg/s"),
-    (slow_degrees, "problem", r"deg/s, for so they turn as gravity does"),
+    (slow_degrees, "problem", r"deg/s, for gravity rotates accordingly"),
     (saturated, "warning", r"gyroscope x looks saturated, .* at 3 from"),
-    (mirrored, "warning", r"gravity does not turn in the accelerometer as the angular rates say"),
+    (mirrored, "warning", r"the rotation of gravity in the accelerometer contradicts the angular rates"),
 ]
 
 

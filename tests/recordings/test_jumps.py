@@ -165,9 +165,7 @@ def test_a_clock_that_is_set_by_seconds_is_named(simulation, which, index):
         cameras = tuple(shifted(c, int(np.searchsorted(c.stamps_ns, at)), by) for c in m.cameras)
         given = dataclasses.replace(m, cameras=cameras)
     whose = {"imu": "imu0", "cameras": "cam0"}[which]
-    with pytest.raises(
-        EstimationError, match=rf"the clock of {whose} was set forward by 3 s while it ran, .* --from and --to"
-    ):
+    with pytest.raises(EstimationError, match=rf"the clock of {whose} was set forward by 3 s about .* --from and --to"):
         calibrate_measurements(rig_for(simulation.scenario), given)
 
 

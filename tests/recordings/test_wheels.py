@@ -80,7 +80,7 @@ REFUSED = {
         np.mod(np.round(ANGLES * 5000), 65536), STAMPS, {"measures": "ticks", "counts_per_turn": 31416.0},
         "which looks like an encoder wrap-around; set counter_size of wheel0 in the rig file (65536",
     ),
-    "counts": (ANGLES * 1e3, STAMPS, {"measures": "ticks", "counts_per_turn": 1.0}, "implausible; correct counts_per_turn"),
+    "counts": (ANGLES * 1e3, STAMPS, {"measures": "ticks", "counts_per_turn": 1.0}, "; correct counts_per_turn"),
     "seconds": (RATES, STAMPS // 10**9, {}, "as if stamps were truncated to whole seconds"),
     "short": (RATES[:2], STAMPS[:2], {}, "only 2 readings"),
 }  # fmt: skip

@@ -95,10 +95,10 @@ def other_columns(images: Iterable[np.ndarray], board: AprilGrid | Charuco) -> s
         return ""
     best = [n for n in misfit if misfit[n] < max(_MOST_RIGHT, least / _MOST_RATIO)]
     if len(best) > 1:
-        return f"the tags do not stand as on a board with {across}: {stated}; correct {down} and {across}."
+        return f"the layout of the tags does not match {across}: {stated}; correct {down} and {across}."
     if best[0] == other:
         return f"{down} and {across} are swapped; write {down}: {stated}, {across}: {other}."
-    return f"the tags stand as on a board with {across}: {best[0]}, not {stated}; correct {down} and {across}."
+    return f"the layout of the tags matches {across}: {best[0]}, not {stated}; correct {down} and {across}."
 
 
 def _number_of_tags(board: AprilGrid | Charuco) -> int:

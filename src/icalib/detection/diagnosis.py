@@ -53,8 +53,8 @@ def what_is_seen(
     candidates.sort(key=lambda seen: (len(seen.ids), seen.family == own_name), reverse=True)
     if not candidates:
         return (
-            "the images show no tags of any known family; check that the target is in view, sharp, well lit and larger "
-            "than some 20 pixels a tag."
+            "the images show no tags of any known family; check that the target is in view, sharp, well lit, "
+            "and that a tag is larger than about 20 pixels."
         )
     return _sentence(candidates[0], family, border_bits, ids, field)
 
@@ -99,11 +99,9 @@ def with_other_layout(images: Iterable[np.ndarray], board: Charuco) -> str:
     if not len(misfits) or np.median(misfits[:, 1]) > _CLEARLY_BETTER * np.median(misfits[:, 0]):
         return ""
     if board.legacy:
-        return (
-            "the board is of the layout of OpenCV 4.6 and later, its top left square is black; take legacy: true out."
-        )
+        return "the board has the layout of OpenCV 4.6 and later, its top left square is black; remove legacy: true."
     return (
-        "the board is of the old layout, of OpenCV before 4.6 and calib.io, its top left square is white; set "
+        "the board has the layout of OpenCV before 4.6 and of calib.io, its top left square is white; set "
         "legacy: true of the target."
     )
 
@@ -127,7 +125,7 @@ def _sentence(seen: _Seen, family: str, border_bits: int, ids: Sequence[int], fi
     if seen.how == "inverted":
         return f"the images show {what}, white on black; set inverted: true of a ChArUco board."
     if seen.how:
-        return f"the images are mirrored, they show {what} that way; switch mirroring off in the camera's driver."
+        return f"the images are mirrored, they show {what} after flipping; switch off mirroring in the camera's driver."
     if seen.family != _largest(family):
         return (
             f"the images show {what}, none of {family}; correct the target's {field}: write {field}: {_smallest(seen)}."

@@ -85,7 +85,7 @@ def words_on_damaged(damaged_ns: Sequence[int], files: Mapping[int, str]) -> tup
     if not len(damaged_ns):
         return ()
     first = which_image(files.get(damaged_ns[0], ""), damaged_ns[0])
-    return (f"{len(damaged_ns)} images that are damaged were left out, the first {first}.",)
+    return (f"{len(damaged_ns)} damaged images were ignored, the first {first}.",)
 
 
 def core_count() -> int:

@@ -50,8 +50,8 @@ def without_rare_tags(target: Target, images: list[ImageCorners]) -> tuple[list[
         images = [_without(i, first, rare) for i in images]
         ids = ", ".join(str(k) for k in part.known[rare[:_SHOWN]]) + (", ..." if len(rare) > _SHOWN else "")
         notes.append(
-            f"{len(rare)} tags of {part.family} (ids {ids}) are in fewer than {least} of {len(images)} images and left "
-            f"out; list the ids{' of ' + name if name else ''} in the rig file if they are there."
+            f"{len(rare)} tags of {part.family} (ids {ids}) are in fewer than {least} of {len(images)} images "
+            f"and were ignored; list the ids{' of ' + name if name else ''} in the rig file if they exist."
         )
     return images, tuple(notes)
 
@@ -68,7 +68,7 @@ def sightings(target: Target, images: list[ImageCorners]) -> tuple[str, ...]:
     kept = sum(int(i.kept.sum()) for i in images)
     dropped = {name: sum(i.counts()[name] for i in images) for k, name in enumerate(VERDICTS) if k != KEPT}
     reasons = ", ".join(f"{n} {name}" for name, n in dropped.items() if n)
-    tail = f"; corners left out: {reasons}" if reasons else ""
+    tail = f"; corners rejected: {reasons}" if reasons else ""
     counts = {part[0] or "the target": seen_in(images, part) for part in parts_of(target)}
     seen = ", ".join(f"{name} is in {n}" for name, n in counts.items())
     missing = " and ".join(name for name, n in counts.items() if not n)

@@ -74,7 +74,7 @@ def find_corners(
         what = f"{where}: {_called(target)} in none of {len(images)} images of {camera.name}; "
         raise RecordingError(what + _seen_instead(recording, topic, target))
     if wrong := _other_border(recording, topic, target, images):
-        raise RecordingError(f"{where}: hardly anything is seen of {wrong}")
+        raise RecordingError(f"{where}: hardly any detections of {wrong}")
     corners = replace(corner_stream(camera.name, stamps_ns, images), files=files)
     damaged = sorted(files.keys() - set(stamps_ns.tolist()))
     notes = (*sightings(target, images), *rare, *words_on_damaged(damaged, files))

@@ -214,8 +214,8 @@ class Solution:
 
 
 BROKEN_DOWN = (
-    "the estimate broke down: from where it started the measurements do not determine the motion; give rough "
-    "extrinsics, time offsets and intrinsics in the rig file."
+    "the estimate failed, because from its initial guess the measurements do not determine the motion; give "
+    "rough extrinsics, time offsets and intrinsics in the rig file."
 )
 
 

@@ -154,14 +154,14 @@ def _check_cameras(target: Target, streams: Sequence[CornerStream], used: Sequen
         seen = np.unique(np.concatenate([target.body[s.point] for s in streams if s.name == name]))
         if len(seen) and not np.isin(seen, used).any():
             how = (
-                "calibrate the cameras without the IMU, whose images may tell by being taken at once"
+                "calibrate the cameras without the IMU, whose images may be synchronised"
                 if imu
                 else ("take images of all cameras at the same instants")
             )
             own, first = _listed([target.bodies[k] for k in seen]), target.bodies[used[0]]
             raise EstimationError(
-                f"{name} sees {own} only, and fewer than {FEWEST_TOGETHER} images tell how it stands to {first}; show "
-                f"both in the same images, or {how}."
+                f"{name} sees {own} only, and fewer than {FEWEST_TOGETHER} images determine its pose relative "
+                f"to {first}; show both in the same images, or {how}."
             )
 
 
@@ -214,7 +214,7 @@ def without_bodies(target: Target, names: Sequence[str], recording: Measurements
     """The recording without corners of the bodies given by `names`, which a note says."""
     kept = tuple(k for k, name in enumerate(target.bodies) if name not in names)
     cameras = tuple(_restricted(Bodies(target, kept), c) for c in recording.cameras)
-    note = f"left out, because no image shows how they stand to the others: {_listed(names)}."
+    note = f"ignored, because no image determines their poses relative to the others: {_listed(names)}."
     return replace(recording, cameras=cameras, notes=(*recording.notes, note))
 
 
@@ -231,9 +231,7 @@ def words_on_left_out(bodies: Bodies) -> str:
     if not bodies.left_out:
         return ""
     names = [bodies.target.bodies[k] for k in bodies.left_out]
-    return (
-        f"left out, because fewer than {FEWEST_TOGETHER} images show them together with the others: {_listed(names)}."
-    )
+    return f"ignored, because fewer than {FEWEST_TOGETHER} images show them together with the others: {_listed(names)}."
 
 
 def _listed(names: Sequence[str]) -> str:

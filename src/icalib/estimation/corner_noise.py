@@ -146,8 +146,9 @@ def estimate_noise(
     """
     if not (out.root > 0.0).any():
         raise EstimationError(
-            f"the estimate led away: where it ended {camera.name} sees none of its corners; correct what the rig file "
-            "gives of its rotation, translation, time_offset and lens, or leave it out to have it found."
+            f"the estimate diverged, {camera.name} would see none of its corners; correct its rotation, "
+            "translation, time_offset, intrinsics and distortion in the rig file, or remove them so that they "
+            "are estimated."
         )
     shown = residual_noise(factor, out, settings, speed)
     if camera.corner_noise_px is not None:

@@ -23,8 +23,7 @@ def on_common_images(rig: Rig, recording: Measurements) -> Measurements:
         return recording
     if recording.imu is None:
         raise EstimationError(
-            "tracks need an IMU or a pose sensor: nothing else says how large the scene is; add one, or leave out the "
-            "tracks."
+            "tracks need an IMU or a pose sensor, for nothing else determines the scale; add one, or remove the tracks."
         )
     corners, tracks = {c.name: c for c in recording.cameras}, {t.name: t for t in recording.tracks}
     pairs = [_together(c.name, corners.get(c.name), tracks.get(c.name)) for c in rig.cameras]

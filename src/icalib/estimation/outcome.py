@@ -100,8 +100,10 @@ def outcome_of(
         f"converged in {n} iterations: the next step would move no parameter by more than {share:.0f} % of its "
         "standard deviation."
         if converged
-        else f"not converged after {n} iterations: the next step would still lower half the chi^2 of {cost:.6g} by "
-        f"{left:.3g}; give a better first guess, or check the noise in the rig file."
+        else (
+            f"not converged after {n} iterations: the next step would still lower half the chi^2 of {cost:.6g} by "
+            f"{left:.3g}; give a better initial guess, or check the noise in the rig file."
+        )
     )
     begun = Outcome(problem, state, cost, residuals, NOTHING, tuple(steps), converged, status)
     if end is None:

@@ -138,7 +138,7 @@ class _Descent:
         """Of the sums, with the least damping, from that in use up, that makes them definite."""
         if not np.isfinite(self.cost):
             raise EstimationError(
-                "the first guess predicts no finite measurement; give a better guess in the rig file."
+                "the initial guess predicts no finite measurement; give a better guess in the rig file."
             )
         while True:
             try:

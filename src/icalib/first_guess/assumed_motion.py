@@ -92,9 +92,7 @@ def _start(rig: Rig, recordings: Sequence[Measurements]) -> Start:
     for own, m in zip(shown, recordings, strict=True):
         if len(own.seconds) < FEWEST:
             where = f"{m.name}: " if len(recordings) > 1 else ""
-            raise EstimationError(
-                f"{where}{rig.body} shows where it is at {len(own.seconds)} instants only; record more."
-            )
+            raise EstimationError(f"{where}{rig.body} has a pose at only {len(own.seconds)} instants; record more.")
     grids = [np.arange(0.0, own.seconds[-1], STEP_S) for own in shown]  # from the body's first stamp on
     paths = [own.at(grid) for own, grid in zip(shown, grids, strict=True)]
     # Densities come out too large rather than too small: a wide window would take motion from them.
@@ -136,7 +134,7 @@ def _cameras_on_wheels(rig: Rig, recordings: Sequence[Measurements]) -> tuple[li
     except EstimationError as error:
         said = str(error).rstrip(".")
         raise EstimationError(
-            f"{said}; without IMU, target and pose sensor {wheels.name} shows the motion on a flat floor only."
+            f"{said}. Without IMU, target and pose sensor, {wheels.name} determines the motion on a flat floor only."
         ) from error
     return camera_paths(rig, recordings, shown, values), seen_from_first(rig, values)
 

@@ -113,8 +113,8 @@ def explained(
     if _converged(replace(rig, poses=(replace(first, kind="absolute"), *others)), make) is None:
         return failed
     return EstimationError(
-        f"{first.name}: from pose to pose, as kind: relative takes them, its poses are too noisy to hold the motion "
-        "together; as absolute ones they do: write kind: absolute, if they hardly drift over the recording."
+        f"{first.name}: with kind: relative its poses are too noisy to give the motion, with kind: absolute "
+        "they are not; write kind: absolute if they hardly drift over the recording."
     )
 
 

@@ -48,8 +48,8 @@ def longest_step(name: str, seconds: np.ndarray, what: str, slowest_s: float = S
     usual = float(np.median(np.diff(seconds)))
     if usual > slowest_s:
         raise EstimationError(
-            f"{name}: {1.0 / usual:.2g} {what} a second, and {1.0 / slowest_s:g} are needed to follow its motion; "
-            "record more often."
+            f"{name}: the rate of {1.0 / usual:.2g} {what} per second is too low to follow its motion, at "
+            f"least {1.0 / slowest_s:g} are needed; record at a higher rate."
         )
     return min(max(LONGEST_STEP_S, USUAL_STEPS * usual), slowest_s)
 
@@ -65,9 +65,9 @@ def likely_offsets(imu: ImuData, name: str, rates: CameraRates) -> list[float]:
     peaks = max(_shifts(imu, rates), key=lambda p: _likeness(p[0]))
     if not peaks[0].correlation > rates.least_correlation:
         raise EstimationError(
-            f"the motion of {name} does not match that of {imu.name} at any shift of their clocks ("
-            f"{how_alike(peaks[0].largest)}); check that both come from the same recording, overlap in time, "
-            f"and are in rad/s."
+            f"the motion of {name} does not match that of {imu.name} at any time offset "
+            f"({how_alike(peaks[0].largest)}); check that both come from the same recording, overlap in time, "
+            "and are in rad/s."
         )
     return [p.samples / GRID_HZ for p in peaks if p.correlation > rates.least_correlation]
 
@@ -80,14 +80,14 @@ def _slow(imu: ImuData, name: str, rates: CameraRates) -> list[float]:
         in_radians = replace(imu, gyro=np.deg2rad(imu.gyro))
         if any(left < MOST_LEFT for _, left in slow_offsets(in_radians, rates.start, rates.end, rates.rate)):
             raise EstimationError(
-                f"{imu.name} turns as {name} does where its angular rate is read as deg/s; set gyro_unit: deg/s of "
+                f"the angular rate of {imu.name} matches {name} if it is in deg/s; set gyro_unit: deg/s of "
                 f"{imu.name} in the rig file."
             )
-        left = f"{found[0][1]:.0%} of the angles is left at best" if found else "their clocks do not overlap"
+        left = f"at best {found[0][1]:.0%} of the rotation is unexplained" if found else "they do not overlap in time"
         raise EstimationError(
-            f"the turns of {name}, {USUAL_STEPS / rates.longest_step_s:.2g} a second, do not match those of {imu.name} "
-            f"at any shift of their clocks ({left}); check that both come from the same recording, overlap, and "
-            "are in rad/s, or record more a second."
+            f"the rotation of {name}, {USUAL_STEPS / rates.longest_step_s:.2g} poses per second, does not "
+            f"match that of {imu.name} at any time offset ({left}). Check that both come from the same "
+            "recording, overlap in time, and are in rad/s, or record at a higher rate."
         )
     return alike
 
@@ -95,7 +95,7 @@ def _slow(imu: ImuData, name: str, rates: CameraRates) -> list[float]:
 def how_alike(largest: float) -> str:
     """The largest correlation at any shift, in words."""
     if not np.isfinite(largest):
-        return f"nowhere do they overlap for {SHORTEST_OVERLAP_S:g} s without a gap"
+        return f"they never overlap for {SHORTEST_OVERLAP_S:g} s without a gap"
     return f"best correlation {max(largest, 0.0):.2f}"
 
 

@@ -40,8 +40,8 @@ def refuse_steps(imu: ImuData, name: str, rates: CameraRates, offset: float, une
             if unexplained(own, offset + shift) < EXPLAINED and unexplained(other, offset) < EXPLAINED:
                 at = (step.before if shift == -step.growth else step.after) - rates.start[0]
                 raise EstimationError(
-                    f"the clock of {step.whose} was set forward by {step.size:.3g} s while it ran, about {at:.3g} s "
-                    f"after {name} began: before and after it another time offset holds; use one side by --from and "
+                    f"the clock of {step.whose} was set forward by {step.size:.3g} s about {at:.3g} s after "
+                    f"{name} began, so the time offset differs before and after; use one side with --from and "
                     "--to."
                 )
 

@@ -60,9 +60,8 @@ def camera_rates(stream: CornerStream, poses: TargetPoses) -> CameraRates:
     index = np.flatnonzero(poses.ok)
     if len(index) < 2:
         raise EstimationError(
-            f"{stream.name}: the target was located in {len(index)} of {len(t)} images; check the target, the "
-            f"camera model "
-            "and the intrinsics in the rig file."
+            f"{stream.name}: the pose of the target was found in only {len(index)} of {len(t)} images; check "
+            "the target, the camera model and the intrinsics in the rig file."
         )
     a, b = index[:-1], index[1:]
     longest = longest_step(stream.name, t[index], "images of the target")
@@ -70,8 +69,8 @@ def camera_rates(stream: CornerStream, poses: TargetPoses) -> CameraRates:
     a, b = a[near], b[near]
     if len(a) < FEWEST_PAIRS:
         raise EstimationError(
-            f"{stream.name}: too few neighbouring images show the target, {len(a)} pairs no more than {longest:.3g} s "
-            f"apart, and {FEWEST_PAIRS} are needed; record for at least ten seconds."
+            f"{stream.name}: only {len(a)} pairs of consecutive images, at most {longest:.3g} s apart, show "
+            f"the target, and {FEWEST_PAIRS} are needed; record for at least ten seconds."
         )
     turn = so3.log_many(np.ascontiguousarray(poses.rotation[a].transpose(0, 2, 1) @ poses.rotation[b]))
     return CameraRates(t[a], t[b], turn / (t[b] - t[a])[:, None], longest_step_s=longest)
@@ -148,8 +147,8 @@ def covered(imu: ImuData, rates: CameraRates, offset: float) -> np.ndarray:
 def _check_offset(imu: ImuData, name: str, unexplained: float, given: bool) -> None:
     """An offset at which the two do not turn alike is wrong, or the recordings do not belong together."""
     if unexplained > LARGEST_UNEXPLAINED:
-        where = "with the time_offset in the rig file" if given else "at any shift of their clocks"
-        advice = "correct it, or leave it out to have it found" if given else _SAME_RECORDING
+        where = "with the time_offset in the rig file" if given else "at any time offset"
+        advice = "correct it, or remove it so that it is estimated" if given else _SAME_RECORDING
         raise EstimationError(
             f"the motion of {name} does not match that of {imu.name} {where} ({unexplained:.0%} of the angular rate is "
             f"unexplained); {advice}."
@@ -221,8 +220,7 @@ def _check_motion(imu: ImuData, name: str, rates: CameraRates) -> None:
     if is_still(turned, seen):
         raise EstimationError(
             f"the recording is motionless ({imu.name} turns at {turned:.4f} rad/s RMS, {name} at {seen:.4f}); "
-            f"record again "
-            "while turning the rig about all axes in front of the target."
+            "record again while turning the rig about all axes in front of the target."
         )
 
 
@@ -305,7 +303,7 @@ def check_axes(imu: ImuData, rates: CameraRates, found: Alignment, name: str) ->
     """Raises OneAxisError where the camera turned about one axis only."""
     if not turns_about_two_axes(imu, rates, found):
         raise OneAxisError(
-            f"{name} turned about one axis only, and its rotation about that axis is not determined; turn the rig "
+            f"{name} turned about one axis only, so its rotation about that axis is unobservable; turn the rig "
             "about two more axes, or give rotation in the rig file."
         )
 
@@ -344,8 +342,9 @@ def contradicts(imu: ImuData, rates: CameraRates, given: Alignment) -> bool:
 
 def no_overlap(imu: ImuData, name: str) -> EstimationError:
     return EstimationError(
-        f"nothing of {name} falls within the recording of {imu.name}; check that both come from the same recording, "
-        "and that a time_offset in the rig file is in seconds, or leave it out to have it found."
+        f"no data of {name} fall within the recording of {imu.name}. Check that both come from the same "
+        "recording, and that a time_offset in the rig file is in seconds, or remove it so that it is "
+        "estimated."
     )
 
 
@@ -355,7 +354,7 @@ def _check_degrees(imu: ImuData, name: str, gyro: np.ndarray, seen: np.ndarray) 
     ratio = float(np.median(size[0]) / max(np.median(size[1]), 1e-9))
     if 0.8 < ratio / DEGREES < 1.25:
         raise EstimationError(
-            f"{imu.name} turns {ratio:.3g} times as fast as {name}: its angular rate looks like deg/s; set "
+            f"{imu.name} turns {ratio:.3g} times as fast as {name}, so its angular rate is in deg/s; set "
             f"gyro_unit: deg/s of {imu.name} in the rig file."
         )
 
@@ -365,8 +364,8 @@ def _check_scale(imu: ImuData, name: str, rates: CameraRates, found: Alignment, 
     ratio = _scale(found, *_side_by_side(imu, rates, found.offset, averaged))
     if not 0.8 < ratio < 1.25:
         raise EstimationError(
-            f"{imu.name} turns {ratio:.3g} times as fast as {name}: check its units, or, where the target is small in "
-            "the images, give the intrinsics in the rig file."
+            f"{imu.name} turns {ratio:.3g} times as fast as {name}; check its units, or give the intrinsics in "
+            "the rig file if the target is small in the images."
         )
 
 

@@ -70,7 +70,7 @@ def refuse_far_off(wheels: Wheels, found: dict[Key, np.ndarray]) -> None:
     for (sensor, name), value in found.items() if _REFUSING.get() else ():
         stated = getattr(wheels, name)
         if name in _CHECKED and stated.mode == "fixed" and is_contradicted(name, stated.value, value):
-            raise FarOffError(f"{sensor}: {name} of the rig file is far from what the data show.")
+            raise FarOffError(f"{sensor}: {name} in the rig file contradicts the data.")
 
 
 def settled(

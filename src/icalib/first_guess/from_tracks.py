@@ -73,8 +73,8 @@ def _check_units(imu: ImuData, gravity: float) -> None:
     felt = float(np.median(np.linalg.norm(imu.accel, axis=1)))
     if not LEAST_FELT < felt / gravity < 1.0 / LEAST_FELT:
         raise EstimationError(
-            f"{imu.name} feels {felt:.3g} m/s^2 most of the time instead of about {gravity:.3g}; check that the "
-            "accelerometer is in m/s^2, not in g."
+            f"{imu.name} measures {felt:.3g} m/s^2 most of the time instead of about {gravity:.3g}; check that "
+            "the accelerometer is in m/s^2, not in g."
         )
 
 

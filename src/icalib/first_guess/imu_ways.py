@@ -47,10 +47,10 @@ def ways() -> Iterator[ImuWay]:
     """The commonest first. A turn of one sensor's axes against the other's stands as one of the gyroscope's."""
     yield ImuWay(AS_THEY_ARE, ("-x", "-y", "-z"), "has an inverted accelerometer, which reads -g at rest")
     for k, axis in enumerate("xyz"):
-        yield ImuWay(_flipped(k), AS_THEY_ARE, f"has a gyroscope of left-handed axes, axis {axis} reversed")
-    yield ImuWay(("-x", "-y", "-z"), AS_THEY_ARE, "has a gyroscope that turns the other way, all axes reversed")
+        yield ImuWay(_flipped(k), AS_THEY_ARE, f"has a left-handed gyroscope, axis {axis} reversed")
+    yield ImuWay(("-x", "-y", "-z"), AS_THEY_ARE, "has a gyroscope with all axes reversed")
     for k, axis in enumerate("xyz"):
-        yield ImuWay(AS_THEY_ARE, _flipped(k), f"has an accelerometer of left-handed axes, axis {axis} reversed")
+        yield ImuWay(AS_THEY_ARE, _flipped(k), f"has a left-handed accelerometer, axis {axis} reversed")
     for k in range(3):
         others = tuple(j for j in range(3) if j != k)
         names = " and ".join("xyz"[j] for j in others)
@@ -58,7 +58,7 @@ def ways() -> Iterator[ImuWay]:
         yield ImuWay(_swapped(*others), AS_THEY_ARE, f"has a gyroscope whose axes {names} are swapped")
         yield ImuWay(AS_THEY_ARE, _swapped(*others), f"has an accelerometer whose axes {names} are swapped")
     for axes in (("y", "z", "x"), ("z", "x", "y")):
-        yield ImuWay(axes, AS_THEY_ARE, "has a gyroscope of other axes than its accelerometer")
+        yield ImuWay(axes, AS_THEY_ARE, "has a gyroscope whose axes differ from those of its accelerometer")
 
 
 def refuse_other_axes(
@@ -74,7 +74,7 @@ def refuse_other_axes(
     if best < min(WELL, BETTER * now):
         other = f" (or {found[1][2].fields(sensor)}, which fits as well)" if best > _NEXT_BEST * found[1][0] else ""
         raise EstimationError(
-            f"{sensor.name} {way.words}: only so do its readings fit what the cameras saw; set "
+            f"{sensor.name} {way.words}: its readings fit the cameras only then; set "
             f"{way.fields(sensor)}{other} of {sensor.name} in the rig file."
         ) from failed
 

@@ -98,8 +98,8 @@ def guess_intrinsics(
     rms = _median_rms(bundle, model, params, target)
     if not rms < GOOD_RMS_PX:
         raise EstimationError(
-            f"{stream.name}: no intrinsics of model {model.name} explain the corners (best median error {rms:.1f} px); "
-            "check the model, resolution and target in the rig file, or give intrinsics."
+            f"{stream.name}: no intrinsics of model {model.name} explain the corners (best median error "
+            f"{rms:.1f} px); check model, resolution and target in the rig file, or give intrinsics."
         )
     return params
 

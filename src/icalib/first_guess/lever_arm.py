@@ -69,7 +69,7 @@ def lever_arm(
     D_f, D_R = _double_integrals(imu, t, R_bi, gyro)
     i, j, k = _triples(t, imu.gaps)
     if len(i) < 10:
-        raise EstimationError("too few images follow one another closely enough to find gravity; record for longer.")
+        raise EstimationError("too few images are close enough in time to estimate gravity; record for longer.")
     h1, h2 = (t[j] - t[i])[:, None], (t[k] - t[j])[:, None]
 
     def second(x: np.ndarray) -> np.ndarray:
@@ -171,8 +171,9 @@ def check_size(arm: LeverArm, camera: str, given: bool) -> None:
     is a guess, whose error moves it, too."""
     if abs(arm.size - 1.0) > max(GIVEN_TOLERANCE if given else SIZE_TOLERANCE, 5.0 * arm.size_std):
         raise EstimationError(
-            f"{camera}: by the accelerometer the target is {arm.size:.2f} +- {arm.size_std:.2f} times the size that "
-            "the rig file says; check its tag_size or square_size (in metres) and tag_spacing (gap over tag_size)."
+            f"{camera}: the accelerometer shows the target to be {arm.size:.2f} +- {arm.size_std:.2f} times as "
+            "large as in the rig file; check tag_size or square_size (in metres) and tag_spacing (gap over "
+            "tag_size)."
         )
 
 
@@ -182,6 +183,7 @@ def check_gravity(measured: float, expected: float, imu: str, given: bool) -> No
     if abs(measured / expected - 1.0) <= (GIVEN_TOLERANCE if given else G_TOLERANCE):
         return
     raise EstimationError(
-        f"{imu} and the target together show gravity of {measured:.3g} m/s^2 instead of {expected:.3g}: check that the "
-        "accelerometer is in m/s^2 (not in g: accel_unit), and tag_size or square_size in the rig file."
+        f"{imu} and the target together give a gravity of {measured:.3g} m/s^2 instead of {expected:.3g}; "
+        "check that the accelerometer is in m/s^2 (not in g: accel_unit), and tag_size or square_size in the "
+        "rig file."
     )

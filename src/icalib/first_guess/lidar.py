@@ -213,8 +213,8 @@ def align_path(imu: ImuData, name: str, rates: CameraRates, held: Held) -> Align
         found = as_given(imu, name, rates, held.offset, held.rotation)
         if contradicts(imu, rates, found):
             raise EstimationError(
-                f"{name} does not turn as {imu.name} does with the rotation and time_offset in the rig file; correct "
-                "them, or leave them out to have them found."
+                f"{name} does not turn as {imu.name} does with the rotation and time_offset in the rig file; "
+                "correct them, or remove them so that they are estimated."
             )
         return found
     _check_turning(imu, name, rates)
@@ -232,7 +232,7 @@ def _rates(name: str, path: LidarPath) -> CameraRates:
     near = np.diff(t) < LONGEST_STEP_S
     turn = so3.log_many(np.ascontiguousarray(R[:-1].transpose(0, 2, 1) @ R[1:])) / np.diff(t)[:, None]
     if near.sum() < 2:
-        raise EstimationError(f"{name}: its scans are further apart than {LONGEST_STEP_S} s; record with more of them.")
+        raise EstimationError(f"{name}: its scans are more than {LONGEST_STEP_S} s apart; record at a higher rate.")
     return CameraRates(t[:-1][near], t[1:][near], turn[near], LEAST_CORRELATION)
 
 
@@ -241,32 +241,34 @@ def _check_turning(imu: ImuData, name: str, rates: CameraRates) -> None:
     turned, seen = turning(imu, rates)
     if is_still(turned, seen):
         raise EstimationError(
-            f"{name} and {imu.name} hardly turn ({turned:.4f} rad/s RMS), which leaves their clocks and axes open; "
-            "record again with turns about two axes or more, or give its rotation and time_offset in the rig file."
+            f"{name} and {imu.name} hardly turn ({turned:.4f} rad/s RMS), so time offset and rotation are "
+            "unobservable; record again with rotation about two axes or more, or give rotation and "
+            f"time_offset of {name} in the rig file."
         )
 
 
 def _too_short(stream: LidarStream) -> EstimationError:
     return EstimationError(
-        f"{stream.name}: too few of its scans fall within the recording of the IMU to find its lever arm; check that "
-        "both clocks overlap, or record for longer."
+        f"{stream.name}: too few of its scans fall within the recording of the IMU to estimate its lever arm; "
+        "check that both clocks overlap, or record for longer."
     )
 
 
 def _check_axes(lidar: str, imu: str, mirrored: bool) -> None:
     if mirrored:
         raise EstimationError(
-            f"{lidar} turns as {imu} does, but moves the other way: its points are mirrored; one of its axes, or the "
-            "sense in which its azimuth counts, is reversed. Make its axes right-handed; or the accelerometer is "
-            f"inverted: set accel_axes: [-x, -y, -z] of {imu} in the rig file."
+            f"{lidar} turns as {imu} does, but moves the other way: its points are mirrored, for one of its "
+            "axes or the direction of its azimuth is reversed. Make its axes right-handed. Or the "
+            f"accelerometer is inverted: set accel_axes: [-x, -y, -z] of {imu} in the rig file."
         )
 
 
 def _check_gravity(measured: float, expected: float, imu: str, lidar: str) -> None:
     if abs(measured / expected - 1.0) > G_TOLERANCE:
         raise EstimationError(
-            f"{imu} and {lidar} together show gravity of {measured:.3g} m/s^2 instead of {expected:.3g}: check that "
-            "the accelerometer is in m/s^2, not in g (accel_unit), and that the LiDAR sees walls in all directions."
+            f"{imu} and {lidar} together give a gravity of {measured:.3g} m/s^2 instead of {expected:.3g}; "
+            "check that the accelerometer is in m/s^2, not in g (accel_unit), and that the LiDAR sees walls "
+            "in all directions."
         )
 
 

@@ -94,14 +94,15 @@ def lidar_path(
     edge_m = float(np.clip(reach / VOXELS_IN_REACH, *EDGES_M))
     poses, ok = (_follow_joined if whole else _follow_in_parts)(scans, known, edge_m)
     if ok.mean() < 0.5:
-        why = "there may be too few flat surfaces in sight, or the point times may be wrong"
+        why = "there may be too few flat surfaces, or the point times may be wrong"
         if (share := np.median([_share_on_lines(scan, edge_m) for scan in scans])) > MOST_ON_LINES:
             why = (
-                f"{share:.0%} of a scan's points lie on single rings, {edge_m:.1g} m and more apart, so that a scan "
-                "shows no surfaces; record at the LiDAR's full resolution, or use one with more rings"
+                f"{share:.0%} of the points of a scan lie on single rings, {edge_m:.1g} m and more apart, so "
+                "that a scan shows no surfaces; record at the full resolution of the LiDAR, or use one with "
+                "more rings"
             )
         raise EstimationError(
-            f"{name}: only {ok.sum()} of {len(scans)} scans fit the surfaces that others show; {why}."
+            f"{name}: only {ok.sum()} of {len(scans)} scans match the surfaces of other scans; {why}."
         )
     return LidarPath(seconds, np.array([p.rotation for p in poses]), np.array([p.position for p in poses]), ok)
 

@@ -55,8 +55,8 @@ def associate(
     if not found.count:
         names = " and ".join(s.name for s in streams)
         raise EstimationError(
-            f"{names} saw no flat surface of {search.smallest_m2} m^2 or more; record among walls and floors, or check "
-            "the times of the points."
+            f"{names} saw no flat surface of {search.smallest_m2} m^2 or more; record among walls and floors, "
+            "or check the point times."
         )
     plane = tuple(_of_points(found, points, seen_from, search) for points, seen_from in moved)
     clouds = Clouds(_names(found.count, plane, before and before.clouds), plane)

@@ -176,9 +176,9 @@ def check_shares(shares: Sequence[float], names: str) -> None:
     first, last = shares[0], shares[-1]
     if last < FEW and last < LOST * first:
         raise EstimationError(
-            f"ever fewer points of {names} lie on planes as the estimate goes on ({first:.0%}, then {last:.0%}): it "
-            "starts too far off; correct rotation, translation and time_offset in the rig file, or leave them out to "
-            "have them found."
+            f"fewer and fewer points of {names} lie on planes ({first:.0%}, then {last:.0%}), so the initial "
+            "guess is too far off; correct rotation, translation and time_offset in the rig file, or remove "
+            "them so that they are estimated."
         )
 
 
@@ -202,8 +202,8 @@ def while_known(inputs: Inputs, state: State) -> Inputs:
             )
         if not known.all():
             notes.append(
-                f"{np.count_nonzero(~known)} of {len(known)} scans of {stream.name} are left out: nothing else shows "
-                "the motion then."
+                f"{np.count_nonzero(~known)} of {len(known)} scans of {stream.name} are ignored, because no "
+                "other sensor determines the motion at that time."
             )
         lidars.append(stream.some(np.repeat(known, np.diff(stream.start)) & are_somewhere(stream.xyz)))
     return replace(inputs, measurements=replace(measured, lidars=tuple(lidars), notes=tuple(notes)))

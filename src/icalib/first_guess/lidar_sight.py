@@ -18,8 +18,8 @@ CAPACITY = 1 << 13
 FEWEST_SCANS = 5  # with anything flat
 LEAST_SHARE = 0.02  # of all points: 0.2 and more on walls across, 0.002 and less where noise alone tilts voxels
 SEEN = {
-    1: "face one direction only, as a floor, a wall or parallel walls do: how it moved along them",
-    2: "face two directions only, as in a corridor: how it moved along both",
+    1: "face one direction only, such as a floor or parallel walls, so the motion along them is unobservable",
+    2: "face two directions only, as in a corridor, so the motion along both is unobservable",
 }
 
 
@@ -32,8 +32,8 @@ def naming_sight(streams: Sequence[LidarStream]) -> Iterator[None]:
         for stream in streams:
             if (faces := directions(stream)) in SEEN:
                 raise EstimationError(
-                    f"the flat surfaces that {stream.name} sees {SEEN[faces]} cannot be seen; record where walls and "
-                    "floor face three directions, or together with a camera that sees a target."
+                    f"the flat surfaces that {stream.name} sees {SEEN[faces]}; record where walls and floor "
+                    "face three directions, or together with a camera that sees a target."
                 ) from error
         raise
 

@@ -194,7 +194,7 @@ def _words(stream: LidarStream, own: np.ndarray) -> str:
     if np.linalg.norm([x, y, z]) < ALL_ROUND:
         where = "on all sides"
     return (
-        f"{stream.name} sees its own robot: {own.mean():.1%} of its points keep their place in its frame while it "
-        f"moves, {low:.2f} to {high:.2f} m away, {where}. They are left out; to have this done by distance, set near "
-        f"of {stream.name} to {high + 0.1:.1f} in the rig file, or mask them in its driver."
+        f"{stream.name} has self-returns: {own.mean():.1%} of its points move with its frame, {low:.2f} to "
+        f"{high:.2f} m away, {where}. They were removed; to remove them by distance instead, set min_range of "
+        f"{stream.name} to {high + 0.1:.1f} in the rig file, or mask them in its driver."
     )

@@ -41,9 +41,9 @@ def no_parallax(rig: Rig, recordings: Sequence[Measurements]) -> EstimationError
     if parallax > NO_MORE_THAN_NOISE * error:
         return None
     return EstimationError(
-        f"{name}: the tracked points move as if the rig only rotated (parallax of {np.rad2deg(parallax):.2g} deg, "
-        f"noise of {np.rad2deg(error):.2g} deg), so that nothing shows the motion of the rig; move it by a tenth of "
-        "the distance to the scene or more, and turn it about all axes."
+        f"{name}: the tracked points move as in a pure rotation (parallax {np.rad2deg(parallax):.2g} deg, "
+        f"noise {np.rad2deg(error):.2g} deg), so the translation of the rig is unobservable; move it by a "
+        "tenth of the distance to the scene or more, and turn it about all axes."
     )
 
 

@@ -50,14 +50,16 @@ def _w_first(x: PoseStream) -> PoseStream:
 
 
 WAYS: tuple[tuple[str, Way], ...] = (
-    ("are inverted: they say where its frame is, seen from it; write inverted: true for it in the rig file", _inverse),
-    ("have inverted rotations; write R_frame_sensor, or turn the sign of the quaternions' x, y and z", _turned_back),
-    ("are those of left-handed axes; write them in right-handed ones", _other_handed),
+    ("are inverted: they give the pose of the reference frame in the sensor's frame; write inverted: true for "
+     "it in the rig file", _inverse),
+    ("have inverted rotations; write R_frame_sensor, or change the signs of x, y, z of the quaternions", _turned_back),
+    ("are in left-handed axes; write them in right-handed axes", _other_handed),
     *(
-        (f"have their position's {'xyz'[k]} reversed; set its position_axes to {axes}", _with_axis_reversed(k))
+        (f"have the {'xyz'[k]} axis of the position reversed; set its position_axes to {axes}", _with_axis_reversed(k))
         for k, axes in enumerate(("[-x, y, z]", "[x, -y, z]", "[x, y, -z]"))
     ),
-    ("have quaternions with w first; let columns of the rig file name them as x, y, z, w, or correct what writes them",
+    ("have quaternions with w first; name the columns in the rig file as x, y, z, w, or correct the program "
+        "that writes them",
      _w_first),
 )  # fmt: skip
 
@@ -69,8 +71,8 @@ def _with_axes(axes: Axes) -> Way:
 # Which of those that agree in which way is up it is does not matter to a vehicle on a floor.
 TURNED: tuple[tuple[str, Way], ...] = tuple(
     (
-        "have positions and rotations in different frames, as where one has z up and the other y up; set its "
-        f"position_axes to [{', '.join(axes)}]",
+        "have positions and rotations in different frames, for example one with z up and the other with y up; "
+        f"set its position_axes to [{', '.join(axes)}]",
         _with_axes(axes),
     )
     for axes in (("x", "z", "-y"), ("x", "-z", "y"), ("y", "z", "x"), ("z", "x", "y"))
@@ -121,7 +123,8 @@ def _refuse_two_frames(
     axes = words_for(C)
     degrees = ", ".join(f"{angle:.0f}" for angle in Rotation.from_matrix(C).as_euler("xyz", degrees=True))
     raise EstimationError(
-        f"the positions and rotations of {stream.name} are in different frames, as where one has z up and the other y "
+        f"the positions and rotations of {stream.name} are in different frames, for example one with z up and "
+        "the other with y  "
         + (
             f"up; set position_axes of {stream.name} to {axes} in the rig file."
             if axes

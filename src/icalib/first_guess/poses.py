@@ -143,12 +143,12 @@ def pose_rates(stream: PoseStream) -> CameraRates:
     a, b, rate = window_rates(t, R, rate_window(t, R, WINDOW_S, longest), longest)
     if len(a) < FEWEST_WINDOWS:
         raise EstimationError(
-            f"{stream.name}: hardly any of its {len(t)} poses are closer than {longest:.3g} s to the next, "
-            f"{len(a)}, and {FEWEST_WINDOWS} are needed; record for longer."
+            f"{stream.name}: only {len(a)} pairs of its {len(t)} poses are at most {longest:.3g} s apart, and "
+            f"{FEWEST_WINDOWS} are needed; record for longer."
         )
     if not np.linalg.norm(rate, axis=1).max() > 0.0:
         raise EstimationError(
-            f"{stream.name}: its rotation is the same in all poses, as where only positions are measured; a pose "
+            f"{stream.name}: its rotation is the same in all poses, as if only positions were measured; a pose "
             "sensor needs both."
         )
     return CameraRates(t[a], t[b], rate, LEAST_CORRELATION, longest)
@@ -158,10 +158,10 @@ def check_rate(stream: PoseStream) -> None:
     """Raises EstimationError where poses are too far apart to show how it moves."""
     rate = 1.0 / float(np.median(np.diff(stream.seconds)))
     if rate < LEAST_RATE_HZ:
-        often = f"{rate:.2g} pose{'' if round(rate, 1) == 1.0 else 's'} a second, {LEAST_RATE_HZ:g} are needed"
+        often = f"{rate:.2g} pose{'' if round(rate, 1) == 1.0 else 's'} per second, but {LEAST_RATE_HZ:g} are needed"
         raise EstimationError(
-            f"{stream.name}: {often} while it moves; record more, or without an IMU stand still at each, with an "
-            "image or another pose of the same stamp."
+            f"{stream.name}: {often} during motion; record at a higher rate, or without an IMU stand still at "
+            "each pose, with an image or another pose of the same stamp."
         )
 
 
@@ -189,9 +189,9 @@ def _with_motion(imu: ImuData, stream: PoseStream, gravity: float, held: Held) -
         _check_size(imu, stream.name, path, aligned, found)
     if off > G_TOLERANCE:
         raise EstimationError(
-            f"{imu.name} and {stream.name} together show gravity of {found.gravity:.3g} m/s^2 instead of "
-            f"{gravity:.3g}: check that the accelerometer is in m/s^2, not in g (accel_unit), and the positions of "
-            f"{stream.name} in metres."
+            f"{imu.name} and {stream.name} together give a gravity of {found.gravity:.3g} m/s^2 instead of "
+            f"{gravity:.3g}; check that the accelerometer is in m/s^2, not in g (accel_unit), and the "
+            f"positions of {stream.name} in metres."
         )
     step = max(1, round(APART_S / float(np.median(np.diff(path.seconds)))))
     apart = motion_of_path(imu, where(path, np.arange(len(path.seconds)) % step == 0), rates, aligned, gravity, held)
@@ -235,8 +235,8 @@ def _check_size(imu: ImuData, name: str, path: LidarPath, aligned: Alignment, fo
     size, std = size_of(rows.A[:, :, 3:], rows.b, felt)
     if abs(size - 1.0) > max(SIZE_TOLERANCE, 5.0 * std):
         raise EstimationError(
-            f"{name}: by the accelerometer its motion is {size:.2f} +- {std:.2f} times as large as its positions say; "
-            "these must be in metres (an odometry from one camera has no scale of its own)."
+            f"{name}: the accelerometer shows its motion to be {size:.2f} +- {std:.2f} times as large as its "
+            "positions; these must be in metres (an odometry from one camera has no scale)."
         )
 
 
@@ -285,6 +285,6 @@ def _nodes(state: State, own: slice) -> State:
 
 def _too_short(stream: PoseStream) -> EstimationError:
     return EstimationError(
-        f"{stream.name}: too few of its poses fall within the recording of the other sensors to find its lever arm; "
-        "check that the clocks overlap, or record for longer."
+        f"{stream.name}: too few of its poses fall within the recording of the other sensors to estimate its "
+        "lever arm; check that the clocks overlap, or record for longer."
     )

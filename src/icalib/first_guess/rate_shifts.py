@@ -124,12 +124,13 @@ def unlike(imu: ImuData, name: str, rates: CameraRates) -> EstimationError:
     turned = float(np.median(np.linalg.norm(gyro - np.median(gyro, axis=0), axis=1))) / NORM_MEDIAN
     if turned < SLOW * noise_beside(imu, rates):
         return EstimationError(
-            f"{imu.name} and {name} turn too slowly or too steadily to be compared: the angular rate varies by "
-            f"{np.rad2deg(turned):.2g} deg/s, and the images show it to {np.rad2deg(rates.noise):.2g} deg/s; turn the "
-            "rig faster, to and fro about all axes, or give rotation and time_offset in the rig file."
+            f"{imu.name} and {name} turn too slowly or too steadily for a time offset: the angular rate varies "
+            f"by {np.rad2deg(turned):.2g} deg/s, and the images show it to {np.rad2deg(rates.noise):.2g} "
+            "deg/s. Turn the rig faster, back and forth about all axes, or give rotation and time_offset in "
+            "the rig file."
         )
     return EstimationError(
-        f"the motion of {name} does not match that of {imu.name} at any shift of their clocks; check that both come "
+        f"the motion of {name} does not match that of {imu.name} at any time offset; check that both come "
         "from the same recording, overlap in time, and are in rad/s."
     )
 

@@ -116,8 +116,8 @@ def _found(
     other = _try(inputs, state, stream, rates, -up.ways[0], offset) if up.level else failed[0]
     if not isinstance(other, EstimationError):
         raise EstimationError(
-            f"{wheels.name}: {OPPOSITE[rates.kind]}; unless z of the frame of {up.level} points down: then write "
-            f"level: false for {up.level}."
+            f"{wheels.name}: {OPPOSITE[rates.kind]}. If z of the frame of {up.level} points down, write level: "
+            f"false for {up.level} instead."
         )
     # Of a motion that is no vehicle's one way up shows the slip, the other but that it turns the wrong way.
     raise next((error for error in (*failed, other) if isinstance(error, SidewaysError)), failed[0])
@@ -219,7 +219,7 @@ def _means(motion: Motion, start: np.ndarray, end: np.ndarray) -> tuple[np.ndarr
     inside = is_known(motion.state.seconds, start) & is_known(motion.state.seconds, end)
     if not inside.any():
         raise EstimationError(
-            "no reading of the wheels falls within the recording of the other sensors; check their clocks, or "
+            "no reading of the wheels falls within the recording of the other sensors; check the clocks, or "
             "time_offset in the rig file."
         )
     start, end = start[inside], end[inside]

@@ -33,8 +33,8 @@ def check_scene(rig: Rig, scene: Placed, recordings: Sequence[Measurements]) -> 
     most = int(np.argmax(changes))
     if changes[most] > CHANGED:
         raise EstimationError(
-            f"{recordings[most].name}: the targets do not stand to each other as in the other recordings; calibrate it "
-            "alone, or leave out the targets that were moved."
+            f"{recordings[most].name}: the poses of the targets relative to each other differ from the other "
+            "recordings; calibrate it alone, or remove the targets that were moved."
         )
 
 

@@ -114,8 +114,9 @@ def _solved(tied: _Tied, cameras: Sequence[Camera]) -> Frame:
     found = hand_eye(tied.pairs, _given(a, b, tied.a == 0, tied.b == 0), (False, False))
     if (left := left_over(tied.pairs, found)) > LARGEST_LEFT:
         raise EstimationError(
-            f"{a.name} and {b.name} see different bodies of the target and do not move alike: {left:.0%} of the motion "
-            "stays unexplained; check that the bodies stand still, and that one clock stamps both cameras."
+            f"{a.name} and {b.name} see different bodies of the target and do not move alike: {left:.0%} of "
+            "the motion is unexplained; check that the bodies stand still, and that one clock stamps both "
+            "cameras."
         )
     return found.frame
 

@@ -69,8 +69,8 @@ class UntiedBodiesError(EstimationError):
     def __init__(self, names: tuple[str, ...]) -> None:
         self.names = names
         super().__init__(
-            f"no image shows {', '.join(names)} well enough to tell how it stands to the rest of the target; show both "
-            "closer, in the same image, or take it out of the target."
+            f"no image shows {', '.join(names)} well enough to determine its pose relative to the rest of the "
+            "target; show both closer, in the same image, or remove it from the target."
         )
 
 
@@ -86,8 +86,9 @@ def place_bodies(
     lost = tuple(bodies.target.bodies[k] for k in bodies.used if not grown.placed[k])
     if 2 * len(lost) > len(bodies.used):
         raise EstimationError(
-            f"images show how {len(bodies.used) - len(lost)} of the {len(bodies.used)} bodies of the target stand to "
-            "each other, no more; check the resolution and intrinsics of cameras and the sizes of the target."
+            f"images determine the relative poses of only {len(bodies.used) - len(lost)} of the "
+            f"{len(bodies.used)} bodies of the target; check the resolution and intrinsics of cameras and the "
+            "sizes of the target."
         )
     if lost:
         raise UntiedBodiesError(lost)

@@ -68,7 +68,7 @@ def scene_params(target: Target, camera: Camera, stream: CornerStream) -> np.nda
     seen = restrict(bodies, alone).cameras[0]
     rms, params = _best(bodies, camera, seen, _starts(target, camera, seen))
     if not rms < LARGEST_RMS_PX:
-        error = f"best median error {rms:.1f} px" if np.isfinite(rms) else "what fits best is no lens"
+        error = f"best median error {rms:.1f} px" if np.isfinite(rms) else "the best fit is not a valid lens"
         raise EstimationError(
             f"{camera.name}: no lens of model {camera.model} explains the bodies of the target together ({error}); "
             "check the model, resolution and sizes in the rig file and that no tag is there twice, or give intrinsics."

@@ -113,7 +113,7 @@ def _check_clocks(rig: Rig, scene: Placed, guess: Guess, reference: Measurements
         found = better_offset(imu, camera.name, rates, expected)
         if found is not None:
             raise EstimationError(
-                f"{recording.name}: the time offset of {camera.name} is {found - expected:+.3f} s from that in "
-                f"{reference.name}; if a clock was set or restarted between them, write clock_restarts: true for "
-                "the sensor in the rig file, or calibrate this one alone."
+                f"{recording.name}: the time offset of {camera.name} differs by {found - expected:+.3f} s from "
+                f"that in {reference.name}. If a clock was set or restarted in between, write clock_restarts: "
+                "true for the sensor in the rig file; else calibrate this recording alone."
             )

@@ -55,8 +55,8 @@ def start_from_pairs(
     relative = next((s for s in rig.poses if s.kind == "relative"), None)
     if relative is not None:
         raise EstimationError(
-            f"{relative.name}: poses that were taken at rest are compared one by one, which those of kind: relative "
-            "cannot be; write kind: absolute, or record them while moving, at 10 Hz or more."
+            f"{relative.name}: poses taken at rest are compared one by one, which kind: relative does not "
+            "allow; write kind: absolute, or record them during motion, at 10 Hz or more."
         )
     own = len(rig.poses) if not rig.cameras else 0
     still = replace(rig, poses=tuple(_at_rest(s, own > 0 and k == 0) for k, s in enumerate(rig.poses)))
@@ -135,8 +135,8 @@ def _mounted(
 def _notes(rig: Rig, sensor: PoseSensor, own: _Paired, bad: np.ndarray, m: Measurements) -> list[str]:
     n = len(own.stream.stamps_ns)
     words = [
-        f"{n} poses of {sensor.name} were taken at rest, each together with one of the {own.counts[0]} of {rig.body}: "
-        "nothing is assumed of the motion between, and its time_offset is not estimated."
+        f"{n} poses of {sensor.name} were taken at rest, each together with one of the {own.counts[0]} of "
+        f"{rig.body}. No motion is assumed in between, and its time_offset is not estimated."
     ]
     if bad.any():
         seconds = own.stream.stamps_ns[bad][:3] - m.origin_ns
@@ -157,7 +157,7 @@ def _paired(rig: Rig, sensor: PoseSensor, m: Measurements, stream: PoseStream, s
     counts = len(shown.seconds), len(stream.stamps_ns)
     if len(i) < FEWEST_PAIRS:
         raise EstimationError(
-            f"of the {counts[1]} poses of {sensor.name} only {len(i)} were taken together with one of the "
+            f"only {len(i)} of the {counts[1]} poses of {sensor.name} were taken together with one of the "
             f"{counts[0]} of {rig.body}, and {FEWEST_PAIRS} are needed; {HOW}."
         )
     stamps = m.origin_ns + np.round((shown.seconds[i] - offset) * 1e9).astype(np.int64)
@@ -184,12 +184,13 @@ def _solved(rig: Rig, sensor: PoseSensor, own: _Paired) -> HandEye:
         seen, told = (np.rad2deg(np.median(np.linalg.norm(w, axis=1))) for w in (turns.body, turns.sensor))
         if told < NO_TURN_DEG < seen:
             raise EstimationError(
-                f"{sensor.name}: its rotation is the same in all poses, while {rig.body} turns by {seen:.1f} deg "
-                "(median); a pose sensor needs both position and rotation."
+                f"{sensor.name}: its rotation is the same in all poses, although {rig.body} turns by "
+                f"{seen:.1f} deg (median); a pose sensor needs both position and rotation."
             )
         raise EstimationError(
-            f"{rig.body} and {sensor.name} do not move alike: {left:.0%} of the motion between {len(own.pairs.p_body)} "
-            f"pairs of poses stays unexplained (median turns {seen:.1f} and {told:.1f} deg); check that each pose of "
-            f"{sensor.name} belongs to the image with its stamp, and that one of the two is fixed to the other."
+            f"{rig.body} and {sensor.name} do not move alike: {left:.0%} of the motion between "
+            f"{len(own.pairs.p_body)} pairs of poses is unexplained (median rotation {seen:.1f} and {told:.1f} "
+            f"deg). Check that each pose of {sensor.name} belongs to the image with its stamp, and that one of "
+            "the two is fixed to the other."
         )
     return found

@@ -242,8 +242,9 @@ def check_side(camera: str, poses: TargetPoses) -> None:
     behind = poses.position[poses.ok, 2] < 0.0
     if 2 * behind.sum() > len(behind):
         raise EstimationError(
-            f"{camera} would see the target from behind: its images or corners are mirrored; record them as the camera "
-            "takes them, u to the right and v down, and check that the target was not printed mirrored."
+            f"{camera} would see the target from behind, so its images or corners are mirrored; record them as "
+            "the camera takes them, u to the right and v down, and check that the target was not printed "
+            "mirrored."
         )
 
 

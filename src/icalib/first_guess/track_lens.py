@@ -81,8 +81,9 @@ def find_lens(camera: Camera, stream: TrackStream, imu: ImuData, offset: float |
     found = _refined(stream, imu, model, rough, offset is not None, ANY_BENDS if given is None else 0)
     if not found.sigma < LARGEST_SIGMA:
         raise EstimationError(
-            f"{camera.name}: the rotation in the recording does not show its focal length; turn the rig about axes "
-            "across the line of sight of the camera, or give intrinsics: [fx, fy, cx, cy] in the rig file."
+            f"{camera.name}: the rotation in the recording does not determine the focal length; turn the rig "
+            "about axes perpendicular to the optical axis, or give intrinsics: [fx, fy, cx, cy] in the rig "
+            "file."
         )
     return found.lens if given is not None else _in_model(camera, stream, imu, model, found, offset is not None)
 
@@ -117,9 +118,9 @@ def _rough(
         aligned, scale, unexplained = _scaled(imu, own, offset, stream.name)
     if unexplained > LARGEST_UNEXPLAINED:
         raise EstimationError(
-            f"the motion of {stream.name} does not match that of {imu.name} at any shift of their clocks, whatever its "
-            f"focal length ({unexplained:.0%} of the angular rate is unexplained); check that both come from the same "
-            "recording, overlap in time, and are in rad/s, or give intrinsics in the rig file."
+            f"the motion of {stream.name} does not match that of {imu.name} at any time offset and focal "
+            f"length ({unexplained:.0%} of the angular rate is unexplained). Check that both come from the "
+            "same recording, overlap in time, and are in rad/s, or give intrinsics in the rig file."
         )
     return _Fit(lens, aligned)
 

@@ -87,8 +87,8 @@ class Followed:
         pairs = list(pairs_sharing(stream, valid, STEPS_S, MOST_PAIRS))
         if len(pairs) < FEWEST_PAIRS:
             raise EstimationError(
-                f"{stream.name}: only {len(pairs)} pairs of images {STEPS_S[0]} s or more apart share enough points; "
-                "record for longer, or follow more points for longer."
+                f"{stream.name}: only {len(pairs)} pairs of images {STEPS_S[0]} s or more apart share enough "
+                "tracked points; record for longer, or with longer feature tracks."
             )
         times = stream.seconds[np.array([(i, j) for i, j, _, _ in pairs])]
         shared = [np.stack([p, q], axis=1) for _, _, p, q in pairs]
@@ -256,8 +256,7 @@ def place_on_motion(
     seen = [replace(s, at=replace(s.at, rotation=T @ s.at.rotation)) for s in once for T in turns]
     if not seen:
         raise EstimationError(
-            f"{followed.name}: too few of its images fall within the motion that the other sensors show; check its "
-            "clock."
+            f"{followed.name}: too few of its images fall within the trajectory of the other sensors; check its clock."
         )
     best = sorted(seen, key=_cost)[:FOLLOWED]
     found = [(*s.sought(held), len(s.f)) for s in best]
@@ -283,7 +282,7 @@ def _check(seen: _Seen, result: OptimizeResult, held: np.ndarray) -> None:
     miss = float(np.quantile(np.abs(seen.missed), MOST_RAYS))
     if miss > LARGEST_MISS:
         raise EstimationError(
-            f"{name}: the points that it follows do not move as the other sensors say (rays miss each other by "
+            f"{name}: its feature tracks contradict the motion of the other sensors (rays miss each other by "
             f"{np.rad2deg(miss):.1f} deg); check that all come from the same recording, and its intrinsics."
         )
     if held[0]:
@@ -291,6 +290,6 @@ def _check(seen: _Seen, result: OptimizeResult, held: np.ndarray) -> None:
     sigma = UNITS[:3] * np.sqrt(np.diag(np.linalg.pinv(result.jac.T @ result.jac)))[:3]
     if np.linalg.norm(sigma) > LARGEST_SIGMA:
         raise EstimationError(
-            f"{name}: the motion does not show how it is turned; move the robot about and along more axes, or give "
-            "rotation in the rig file."
+            f"{name}: the motion does not determine its rotation; move the robot about and along more axes, or "
+            "give rotation in the rig file."
         )

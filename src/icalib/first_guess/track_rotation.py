@@ -216,8 +216,8 @@ def track_rates(
                 noise.append(turn_error(f, h, R, direction)[0] / (t[j] - t[i]))
     if len(found) < FEWEST_RATES:
         raise EstimationError(
-            f"{stream.name}: only {len(found)} pairs of images {step:.2g} s apart share {FEWEST_COMMON} points or "
-            "more; record for longer, or follow more points for longer."
+            f"{stream.name}: only {len(found)} pairs of images {step:.2g} s apart share {FEWEST_COMMON} "
+            "tracked points or more; record for longer, or with longer feature tracks."
         )
     rows = np.array(found)
     start, end, rate = rows[:, 0].copy(), rows[:, 1].copy(), rows[:, 2:].copy()

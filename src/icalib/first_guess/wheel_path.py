@@ -58,8 +58,8 @@ def _size(wheels: Wheels, name: str) -> np.ndarray:
     value = getattr(wheels, name).value
     if value is None:
         raise EstimationError(
-            f"without IMU, target and pose sensor nothing but {wheels.name} says how large the scene is; give its "
-            f"{' and '.join(wheels.sizes)} in the rig file, or add one of them."
+            f"without IMU, target and pose sensor only {wheels.name} determines the scale; give its "
+            f"{' and '.join(wheels.sizes)} in the rig file, or add one of these sensors."
         )
     return np.asarray(value, dtype=np.float64)
 

@@ -50,8 +50,8 @@ def poses_offset(imu: ImuData, stream: WheelPoses) -> float:
     offset, explained = _best_shift(gyro - gyro.mean(axis=1, keepdims=True), turned - turned.mean())
     if explained < LEAST_EXPLAINED:
         raise EstimationError(
-            f"the turning of {stream.name} does not match that of {imu.name} at any shift of their clocks ("
-            f"{explained:.0%} of it explained); check that both come from the same recording, and turn more."
+            f"the yaw rate of {stream.name} does not match that of {imu.name} at any time offset "
+            f"({explained:.0%} of it explained); check that both come from the same recording, and turn more."
         )
     offset -= own[0]
     angle = np.zeros_like(imu.gyro)

@@ -44,8 +44,10 @@ OPPOSITE: dict[WheelKind, str] = {
     "pair": "its left and right wheels are swapped, or both count backwards; swap its columns or joints, or set signs "
     "to [-1, -1] in the rig file",
     "twist": "its yaw rate must be positive to the left; set signs to [1, -1] in the rig file",
-    "steered": "its steering angle must be positive to the left and its wheel turn forwards; change the sign that is "
-    "wrong by signs in the rig file, [1, -1] or [-1, 1]",
+    "steered": (
+        "its steering angle must be positive to the left and its wheel must turn forwards; correct the wrong sign "
+        "with signs in the rig file, [1, -1] or [-1, 1]"
+    ),
 }
 
 
@@ -98,8 +100,8 @@ def wheel_rates(name: str, seconds: np.ndarray, integrals: np.ndarray, kind: Whe
     a, b = a[near], b[near]
     if len(a) < LEAST_WINDOWS:
         raise EstimationError(
-            f"{name}: hardly any of its {len(seconds)} readings are closer than {longest:.3g} s to the "
-            f"next, {len(a)}, and {LEAST_WINDOWS} are needed; record for longer."
+            f"{name}: only {len(a)} pairs of its {len(seconds)} readings are at most {longest:.3g} s apart, "
+            f"and {LEAST_WINDOWS} are needed; record for longer."
         )
     span = seconds[b] - seconds[a]
     rate = (integrals[b] - integrals[a]) / span[:, None]
@@ -112,16 +114,17 @@ def _check_turning(name: str, rate: np.ndarray, kind: WheelKind) -> None:
     if kind != "pair":
         if not np.abs(rate[:, 0]).max() > 0.0:
             raise EstimationError(
-                f"{name}: by its readings the vehicle stood still; check its topic or table, and that it drove."
+                f"{name}: the vehicle stood still according to its readings; check its topic or table, and "
+                "that it drove."
             )
         return
     size = np.sqrt((rate**2).mean(axis=0))
     still = [which for which, own in zip(("left", "right"), size, strict=True) if own <= STILL_SHARE * size.max()]
     if still:
         raise EstimationError(
-            f"{name}: by its readings the {' and the '.join(still)} wheel did not turn; check the encoder, its column "
-            "or joint, and that the vehicle drove; where joints have no velocity but a position, set measures to "
-            "angles."
+            f"{name}: the {' and the '.join(still)} wheel did not turn according to its readings; check the "
+            "encoder, its column or joint, and that the vehicle drove. If joints have a position but no "
+            "velocity, set measures to angles."
         )
 
 
@@ -181,7 +184,7 @@ def _pair(name: str, w: np.ndarray, ahead: np.ndarray, rate: np.ndarray) -> tupl
     if left[0] <= 0.0 or right[0] <= 0.0:
         raise EstimationError(
             f"{name}: its wheels count in opposite directions; set signs in the rig file, [1, -1] or [-1, 1], "
-            "-1 for the one that falls as the vehicle drives forwards."
+            "with -1 for the wheel that counts down as the vehicle drives forwards."
         )
     radii = np.array([1.0 / left[0], 1.0 / right[0]])
     _check_radii(name, radii)
@@ -206,8 +209,8 @@ def _twist(name: str, w: np.ndarray, ahead: np.ndarray, rate: np.ndarray) -> tup
             raise EstimationError(f"{name}: its {what} must be in {should}.")
         if not SCALES[0] < scale < SCALES[1]:
             raise EstimationError(
-                f"{name}: its {what} would have to be multiplied by {scale:.3g}; check its unit, and that it is of "
-                "this vehicle."
+                f"{name}: its {what} would have to be multiplied by {scale:.3g}; check its unit, and that it "
+                "is from this vehicle."
             )
     return float(-along[1] * scales[0]), {"scales": scales}
 
@@ -226,12 +229,12 @@ def _steered(name: str, w: np.ndarray, ahead: np.ndarray, rate: np.ndarray) -> t
         offset += float(np.arctan(step))
     if base < 0.0:
         raise EstimationError(
-            f"{name}: its steering angle is positive to the right; change its sign by signs in the rig file."
+            f"{name}: its steering angle is positive to the right; change its sign with signs in the rig file."
         )
     if abs(offset) > STEERS_RAD or base == 0.0:
         raise EstimationError(
-            f"{name}: its steering angle does not go with how the vehicle turned; check that it is in radians, "
-            "and of the front wheels, not of the steering wheel."
+            f"{name}: its steering angle does not match the yaw rate of the vehicle; check that it is in "
+            "radians, and that of the front wheels, not of the steering wheel."
         )
     found = {"radius": radius, "wheelbase": np.array([base]), "steering_offset": np.array([offset])}
     return float(-turned[1] * radius[0]), found
@@ -241,8 +244,8 @@ def _check_radii(name: str, radii: np.ndarray) -> None:
     if radii.min() < RADII_M[0] or radii.max() > RADII_M[1]:
         which = " and ".join(f"{r:.3g}" for r in radii)
         raise EstimationError(
-            f"{name}: its wheels would have radii of {which} m; check that it measures radians (not degrees or turns) "
-            "per second, or set its rate_unit or counts_per_turn in the rig file."
+            f"{name}: its wheels would have radii of {which} m; check that it measures radians per second (not "
+            "degrees or revolutions), or set its rate_unit or counts_per_turn in the rig file."
         )
 
 
@@ -273,8 +276,9 @@ def _check_motion(name: str, w: np.ndarray, u: np.ndarray) -> None:
     turn, speed = np.sqrt(np.mean(w**2)), np.sqrt(np.mean((u**2).sum(axis=1)))
     if turn < LEAST_TURN_RAD_S or speed < LEAST_SPEED_M_S:
         raise EstimationError(
-            f"{name}: the vehicle turned at {turn:.3f} rad/s and drove at {speed:.3f} m/s RMS, too little to find its "
-            "wheels; record again with curves of both hands, or give its parameters in the rig file."
+            f"{name}: the vehicle turned at {turn:.3f} rad/s and drove at {speed:.3f} m/s RMS, too little to "
+            "calibrate its wheels; record again with left and right turns, or give its parameters in the rig "
+            "file."
         )
 
 
@@ -287,8 +291,9 @@ def _check_sideways(name: str, slip: np.ndarray, velocity: np.ndarray) -> None:
     share = float(np.sqrt(np.mean(slip**2) / np.mean((velocity**2).sum(axis=1))))
     if share > SIDEWAYS:
         raise SidewaysError(
-            f"{name}: the vehicle drives along none of its axes, it would slip sideways by {100 * share:.0f} % of its "
-            "speed; check that what shows its motion is on this vehicle, and how its poses are written."
+            f"{name}: the vehicle drives along none of its axes, its lateral slip would be {100 * share:.0f} % "
+            "of its speed; check that the sensor that shows its motion is on this vehicle, and how its poses "
+            "are written."
         )
 
 
@@ -297,8 +302,8 @@ def _check_arcs(name: str, w: np.ndarray, ahead: np.ndarray) -> None:
     a, b = ahead / np.linalg.norm(ahead), w / np.linalg.norm(w)
     if 1.0 - abs(a @ b) < LEAST_SHARE:
         raise EstimationError(
-            f"{name}: the vehicle drove one and the same arc all the time, which leaves its wheels open; record again "
-            "with curves of both hands, or give its parameters in the rig file."
+            f"{name}: the vehicle drove a single arc, so the parameters of its wheels are unobservable; record "
+            "again with left and right turns, or give its parameters in the rig file."
         )
 
 
@@ -329,15 +334,15 @@ def _correlate(imu: ImuData, turn: np.ndarray, name: str, rates: WheelRates) -> 
         best_shift(sign * turned, known, turning, seen, SHORTEST_OVERLAP_S * GRID_HZ) for sign in (1.0, -1.0)
     )
     if opposite.correlation > max(found.correlation, LEAST_CORRELATION):
-        raise EstimationError(f"{name} turns the other way round than {imu.name}: {OPPOSITE[rates.kind]}.")
+        raise EstimationError(f"{name} turns in the opposite direction to {imu.name}: {OPPOSITE[rates.kind]}.")
     if not found.correlation > LEAST_CORRELATION:
         if np.std(turned[known]) < ONE_RATE * abs(np.mean(turned[known])):
             raise EstimationError(
-                f"{name}: the vehicle turned at the same rate nearly all the time, which does not show how its clock "
-                "goes; record again with curves of both hands, or give its time_offset in the rig file."
+                f"{name}: the yaw rate was nearly constant, so the time offset is unobservable; record again "
+                "with left and right turns, or give its time_offset in the rig file."
             )
         raise EstimationError(
-            f"the turning of {name} does not match that of {imu.name} at any shift of their clocks ("
-            f"{how_alike(found.largest)}); check that both come from the same recording and overlap in time."
+            f"the yaw rate of {name} does not match that of {imu.name} at any time offset "
+            f"({how_alike(found.largest)}); check that both come from the same recording and overlap in time."
         )
     return found.samples / GRID_HZ

@@ -26,8 +26,9 @@ def guess_without_imu(
     for camera, own in zip(rig.cameras, poses, strict=True):
         if not own.ok.any():
             raise EstimationError(
-                f"{camera.name}: its lens explains the corners in none of its {len(own.ok)} images; check its model "
-                "and resolution in the rig file, and leave out intrinsics and distortion to have them found."
+                f"{camera.name}: its lens explains the corners in none of its {len(own.ok)} images; check its "
+                "model and resolution in the rig file, and remove intrinsics and distortion so that they are "
+                "estimated."
             )
     offsets = [
         relative_offset(np.zeros(1) if c.time_offset.value is None else c.time_offset.value, s, measurements)
@@ -89,6 +90,7 @@ def _nothing_shared(rig: Rig, found: dict[int, Pose]) -> None:
     lost = ", ".join(c.name for i, c in enumerate(rig.cameras) if i not in found)
     known = ", ".join(c.name for i, c in enumerate(rig.cameras) if i in found)
     raise EstimationError(
-        f"{lost} and {known} never saw the target at the same instant, and there is no IMU to tie them; show it to "
-        "both at once with synchronised stamps, add the IMU, or give rotation and translation in the rig file."
+        f"{lost} and {known} never saw the target at the same instant, and there is no IMU to connect them; "
+        "show it to both at once with synchronised stamps, add the IMU, or give rotation and translation in "
+        "the rig file."
     )

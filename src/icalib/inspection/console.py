@@ -14,7 +14,7 @@ _ANSWERS = {
     "yes, but": Text("Yes, but not as well as it could be.", style="bold yellow"),
     "no": Text("No.", style="bold red"),
 }
-_UNSEEN = Text("Yes, as far as can be told without looking for the target.", style="bold green")
+_UNSEEN = Text("Yes, as far as can be told without searching images for the target.", style="bold green")
 
 
 def print_inspection(found: Inspection, console: Console | None = None) -> None:
@@ -103,7 +103,9 @@ def target_table(found: Inspection) -> Table:
         f"Target ({found.target.target.type} of {found.target.file})" if found.target else "",
         ("camera", "images", "with target", "corners", "cells covered", "tilt [deg]", "farthest / nearest"),
         right=1,
-        caption="tilt: 10 to 90 % of the images, and distances: without intrinsics, so roughly.",
+        caption=(
+            "tilt: 10th to 90th percentile of the images; tilt and distances are rough, for the intrinsics are unknown."
+        ),
     )
     for name, v in found.views.items():
         share = f" ({v.seen / v.images:.0%})" if v.images else ""
@@ -152,7 +154,7 @@ def _origin(found: Inspection) -> int | None:
 
 def _caption(found: Inspection) -> str:
     origin = _origin(found)
-    text = "rate: of the median interval; gaps: intervals longer than 1.5 medians"
+    text = "rate: from the median interval; gaps: intervals longer than 1.5 medians"
     return text if origin is None else f"{text}; from, to: stamps after {origin} ns."
 
 

@@ -59,7 +59,7 @@ def draft_rig(found: Inspection) -> str:
         )
     lines = [
         f"# Draft by icalib inspect from {json.dumps(found.recording)}. Check every line (docs/rig-file.md).",
-        "# Start values ({guess: ...}) have no weight; delete such a line to have its value found from nothing.",
+        "# Start values ({guess: ...}) have no weight; delete such a line to estimate the value from scratch.",
         "sensors:",
         *_imu(found),
     ]
@@ -77,8 +77,8 @@ def check_draft(path: Path) -> None:
     """Raises CalibrationError where there is something at `path` already."""
     if os.path.lexists(path):
         raise CalibrationError(
-            f"{path} exists and is left as it is; give another name for the draft, or give it as --target to use the "
-            "target in it."
+            f"{path} exists and was not changed; give another name for the draft, or give it as --target to "
+            "use the target in it."
         )
 
 
@@ -112,7 +112,7 @@ def _link(part: Path, path: Path, text: str) -> None:
 def _imu(found: Inspection) -> list[str]:
     if not found.sources.imus:
         alone = "cameras are calibrated alone, the first one's" if found.sources.cameras else "the first sensor's"
-        return [f"  # No IMU: {alone} frame is the body's."]
+        return [f"  # No IMU: {alone} frame is the body frame."]
     name = found.imu or next(iter(found.sources.imus))
     topic = found.sources.imus[name]
     facts = found.imus.get(name)
@@ -149,13 +149,13 @@ def _robot(found: Inspection, shown: bool) -> Iterable[str]:
     mark = "" if shown else "# "
     for name, topic in found.sources.wheels.items():
         if not shown:
-            yield "  # Are these wheels? Then take the # away, and say what they measure (docs/rig-file.md#wheels)."
+            yield "  # Are these wheels? Then remove the #, and give what they measure (docs/rig-file.md#wheels)."
         lines = [f"{name}:", "  type: wheels", _place(topic.name, topic.type, "")[2:]]
         for line in lines + (["  measures: twist"] if topic.kind == "twist" or "twist" in topic.type else []):
             yield f"  {mark}{line}"
     for name, topic in found.sources.poses.items():
         if not shown:
-            yield "  # Poses of something on the robot, and not made from the sensors above? Then take the # away;"
+            yield "  # Poses of something on the robot, and not computed from the sensors above? Then remove the #;"
             yield "  # absolute is motion capture, relative an odometry, which drifts (docs/rig-file.md#pose-sensor)."
         # Without an IMU the first pose sensor shows the motion, which must not drift.
         kind = _kind(topic) if found.sources.imus else "absolute"

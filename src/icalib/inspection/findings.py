@@ -60,8 +60,8 @@ def _broken(found: Inspection) -> Iterator[Finding]:
         if 0 < images.damaged < images.decoded:
             yield Finding(
                 "warning",
-                f"{name}: {images.damaged} of {images.decoded} images that were looked at cannot be decoded; they are "
-                "left out: check the disk and the network of the recorder.",
+                f"{name}: {images.damaged} of {images.decoded} sampled images cannot be decoded and are "
+                "ignored; check the disk and the network of the recorder.",
             )
 
 
@@ -75,11 +75,11 @@ def _unfit(found: Inspection, camera: CameraSource) -> str:
         return view.problem
     fewest, advice = _fewest_images(found)
     if timing.count < fewest:
-        return f"{name} has {timing.count} images, too few: {advice}."
+        return f"{name} has {timing.count} images, too few; {advice}."
     if found.sources.imus and timing.rate_hz and timing.rate_hz < SLOWEST_IMAGES_HZ:
-        return f"{name} takes {timing.rate_hz:.2g} images a second, too few to follow its motion: record 10 to 30."
+        return f"{name} takes {timing.rate_hz:.2g} images per second, too few to follow its motion; record 10 to 30."
     if view is not None and view.seen < fewest:
-        return f"{name} sees the target in {view.seen} images, too few: keep it in view, and {advice}."
+        return f"{name} sees the target in {view.seen} images, too few; keep it in view, and {advice}."
     return ""
 
 
@@ -87,7 +87,7 @@ def _fewest_images(found: Inspection) -> tuple[int, str]:
     """How many images `calibrate` asks of a camera, and how to get them."""
     if found.sources.imus or found.sources.wheels:
         return FEWEST_IMAGES, "record for 30 to 90 s, with 10 to 30 images a second"
-    return FEWEST_STILLS, "take 20 to 60 pictures of the target from all sides"
+    return FEWEST_STILLS, "take 20 to 60 images of the target from all sides"
 
 
 def _few_stills(found: Inspection) -> Iterator[Finding]:
@@ -100,7 +100,7 @@ def _few_stills(found: Inspection) -> Iterator[Finding]:
         if FEWEST_STILLS <= count < FEW_STILLS:
             yield Finding(
                 "warning",
-                f"{c.name} has few images{' with the target' if view else ''} ({count}): take 20 to 60 from all sides.",
+                f"{c.name} has few images{' with the target' if view else ''} ({count}); take 20 to 60 from all sides.",
             )
 
 
@@ -114,20 +114,20 @@ def _imu(found: Inspection) -> Iterator[Finding]:
     if degrees < LIKELIER * radians and degrees < EXPLAINED * none:
         yield Finding(
             "problem",
-            f"{name}: the angular rates look like deg/s, for so they turn as gravity does in the accelerometer; "
+            f"{name}: the angular rates look like deg/s, for gravity rotates accordingly in the accelerometer; "
             "set gyro_unit: deg/s in the rig file.",
         )
         return
     if radians > CONTRARY * none:
         yield Finding(
             "warning",
-            f"{name}: gravity does not turn in the accelerometer as the angular rates say; check that they are in "
-            "rad/s and that the driver gives both sensors in the same axes.",
+            f"{name}: the rotation of gravity in the accelerometer contradicts the angular rates; check that "
+            "they are in rad/s, and that the driver gives both sensors in the same axes.",
         )
     if fast > FASTEST_RAD_S:
         yield Finding(
             "warning",
-            f"{name} turns at up to {fast:.1f} rad/s ({fast / DEGREE:.0f} deg/s); images blur at such rates: turn the "
+            f"{name} turns at up to {fast:.1f} rad/s ({fast / DEGREE:.0f} deg/s), which blurs images; turn the "
             "rig more slowly, or check that the driver sends rad/s.",
         )
     yield from _motion(found, name, facts)
@@ -138,16 +138,17 @@ def _motion(found: Inspection, name: str, facts: ImuFacts) -> Iterator[Finding]:
     if strongest < STILL_RAD_S:
         yield Finding(
             "problem",
-            f"{name} hardly moves ({strongest:.3f} rad/s RMS): record again while turning the rig about all three axes"
-            f"{' in front of the target' if found.sources.cameras else ''}.",
+            f"{name} hardly moves ({strongest:.3f} rad/s RMS); record again while turning the rig about all "
+            f"three axes{' in front of the target' if found.sources.cameras else ''}.",
         )
     elif second < SECOND_AXIS * strongest or second < STILL_RAD_S:
         # Without a guess `calibrate` finds the rotation of cameras from turns alone, that of others from the path, too.
         alone = not (found.sources.lidars or found.sources.poses)
         yield Finding(
             "problem" if alone else "warning",
-            f"{name} turns about {_axis(name, facts.principal[0])} only ({strongest:.2f} rad/s RMS; {second:.2f} and "
-            f"{weakest:.2f} about the directions across it), so not all can be determined: "
+            f"{name} turns about {_axis(name, facts.principal[0])} only ({strongest:.2f} rad/s RMS; "
+            f"{second:.2f} and {weakest:.2f} about the perpendicular axes), so some parameters are "
+            "unobservable; "
             f"{'drive over ramps' if found.sources.wheels else 'turn the rig about two more axes'}.",
         )
     else:
@@ -155,14 +156,14 @@ def _motion(found: Inspection, name: str, facts: ImuFacts) -> Iterator[Finding]:
             if rms < WEAK_RAD_S:
                 yield Finding(
                     "warning",
-                    f"Hardly any rotation about {_axis(name, direction)} ({rms:.2f} rad/s RMS): turn the rig about it "
-                    "too.",
+                    f"Hardly any rotation about {_axis(name, direction)} ({rms:.2f} rad/s RMS); turn the rig "
+                    "about it as well.",
                 )
     if strongest >= STILL_RAD_S and max(facts.accel_std) < WEAK_M_S2:
         yield Finding(
             "warning",
-            f"Hardly any acceleration of {name} ({max(facts.accel_std):.2f} m/s^2 RMS about the mean): shake the rig "
-            "briskly to and fro, along all three axes.",
+            f"Hardly any acceleration of {name} ({max(facts.accel_std):.2f} m/s^2 RMS about the mean); shake "
+            "the rig briskly back and forth, along all three axes.",
         )
 
 
@@ -189,8 +190,8 @@ def _clocks(found: Inspection) -> Iterator[Finding]:
         elif common < 0.8 * whole:
             yield Finding(
                 "warning",
-                f"{found.imu} was running during {common:.1f} s of the {whole:.1f} s of {c.name}; images without "
-                "readings are left out: start and stop both together.",
+                f"{found.imu} was running during {common:.1f} s of the {whole:.1f} s of {c.name}, and images "
+                "without readings are ignored; start and stop both together.",
             )
 
 
@@ -198,17 +199,17 @@ def _apart(camera: CameraSource, imu: str, topic: TopicInfo, apart_s: float) -> 
     """A bag says when messages were received, by one clock, and so whether the two ran together."""
     spans = [(t.first_ns or 0, t.last_ns or 0) for t in (camera.topic, topic)]
     together = min(last for _, last in spans) > max(first for first, _ in spans)
-    says = f"The clocks of {camera.name} and {imu} do not overlap, they are {_span(apart_s)} apart"
+    says = f"The stamps of {camera.name} and {imu} do not overlap, they are {_span(apart_s)} apart"
     if together:
         return Finding(
             "warning",
-            f"{says}, but the messages were received together: leave time_offset free and it is found, and have both "
-            "drivers stamp with one clock if the stamps are used elsewhere.",
+            f"{says}, but the messages were received together. Leave time_offset free and it is estimated; "
+            "have both drivers stamp with one clock if the stamps are used elsewhere.",
         )
     return Finding(
         "warning",
-        f"{says}: if both recorded the same motion, leave time_offset free and it is found; else record both at "
-        "the same time.",
+        f"{says}. If both recorded the same motion, leave time_offset free and it is estimated; else record "
+        "both at the same time.",
     )
 
 
@@ -222,14 +223,14 @@ def _streams(found: Inspection) -> Iterator[Finding]:
         if stream.timing is not None and stream.timing.jumps and stream.topic.name not in named:
             yield Finding(
                 "warning",
-                f"{stream.topic.name}: the clock jumps forward; the longest part between jumps is used, of "
+                f"{stream.topic.name}: the clock jumps forward; the longest part between jumps is used, "
                 f"{stream.timing.duration_s:.1f} s, unless --from and --to choose another.",
             )
     imu = _imu_timing(found)
     if imu is not None and imu.rate_hz and imu.duration_s < SHORT_S:
-        yield Finding("warning", f"The IMU ran for {imu.duration_s:.1f} s: record for 30 to 90 s.")
+        yield Finding("warning", f"The IMU ran for {imu.duration_s:.1f} s; record for 30 to 90 s.")
     if imu is not None and imu.gaps:
-        yield Finding("warning", f"{found.imu} has {_gaps(imu)}: check the load of the recorder and the bus.")
+        yield Finding("warning", f"{found.imu} has {_gaps(imu)}; check the load of the recorder and the bus.")
     for c in found.sources.cameras:
         timing = found.stream(c.topic).timing
         # Images without the target are no gaps in the camera's work, so tables of corners are not judged.
@@ -271,27 +272,27 @@ def _unknown_target(found: Inspection) -> Iterator[Finding]:
     for camera, words in found.shown.items():
         if words:
             yield Finding("hint", f"A few images of {camera} show {words}.")
-    yield Finding("hint", "No target is known, so the images were not searched for it: give --target FILE.")
+    yield Finding("hint", "No target is known, so the images were not searched for it; give --target FILE.")
 
 
 def _view(v: TargetView) -> Iterator[Finding]:
     if v.images and v.seen < LEAST_SEEN * v.images:
         yield Finding(
             "warning",
-            f"{v.camera} sees the target in {v.seen} of {v.images} images ({v.seen / v.images:.0%}): keep it in view.",
+            f"{v.camera} sees the target in {v.seen} of {v.images} images ({v.seen / v.images:.0%}); keep it in view.",
         )
     empty = empty_borders(v.cells) if v.cells else ()
     if empty:
         yield Finding(
             "warning",
-            f"{v.camera} never sees the target at the {', '.join(empty)} of the image, and the lens is not determined "
-            "there: move the target there, too.",
+            f"{v.camera} never sees the target at the {', '.join(empty)} of the image, so the lens is "
+            "undetermined there; move the target there as well.",
         )
     if v.tilt_deg and v.tilt_deg[2] < FLAT_DEG:
         yield Finding(
             "warning",
-            f"{v.camera} sees the target nearly from the front only (tilts up to about {v.tilt_deg[2]:.0f} deg): tilt "
-            "it by up to 45 deg, or the focal length is weakly determined.",
+            f"{v.camera} sees the target nearly from the front only (tilts up to about {v.tilt_deg[2]:.0f} "
+            "deg); tilt it by up to 45 deg, or the focal length is weakly determined.",
         )
 
 

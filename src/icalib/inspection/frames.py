@@ -37,8 +37,8 @@ def frame_lines(pairs: Sequence[FramePair], shown: bool) -> Iterator[str]:
     topic, frames = chain[0].topic, [chain[0].parent, chain[-1].child]
     kind = "relative" if "odom" in frames[0] else "absolute"
     if not shown:
-        yield "  # Poses through the tree of frames, as of a robot arm? Then take the # away. Frames are any two that"
-        yield "  # are listed, the one that stands still (base) and the one that moves (docs/rig-file.md#pose-sensor)."
+        yield "  # Poses from transforms, as of a robot arm? Then remove the #. Choose any two of the frames"
+        yield "  # listed, the fixed one (base) and the moving one (docs/rig-file.md#pose-sensor)."
     place = (f"  topic: {json.dumps(topic)}", f"  frames: {json.dumps(frames)}")
     for line in ("tf0:", "  type: pose", *place, f"  kind: {kind}"):
         yield f"  {'' if shown else '# '}{line}"

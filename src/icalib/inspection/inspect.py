@@ -136,7 +136,7 @@ def _read_images(recording: Recording, topic: TopicInfo) -> tuple[StreamFacts, I
         problem = str(error)
     if sample.decoded and sample.damaged == sample.decoded:
         problem = problem or (
-            f"{topic.name}: none of {sample.decoded} images that were looked at can be decoded "
+            f"{topic.name}: none of {sample.decoded} sampled images can be decoded "
             f"({sample.error.rstrip('.')}); check the driver, and record again."
         )
     frame = _frame(recording, topic)

@@ -85,7 +85,7 @@ def find_kalibr_files(recording: Path) -> KalibrFiles:
         except RigError as error:
             notes.append(str(error))
     if len(set(map(repr, targets.values()))) > 1:
-        notes.append(f"the targets {', '.join(targets)} beside the recording differ; give the right one as --target.")
+        notes.append(f"the targets {', '.join(targets)} beside the recording differ; give the right one with --target.")
         targets = {}
     file = next(iter(targets), "")
     return KalibrFiles(tuple(cameras), tuple(imus), targets.get(file), Path(file).name, tuple(notes))
@@ -117,8 +117,8 @@ def _circles(data: dict[str, Any], file: str) -> str:
     asymmetric = ", asymmetric: true" if data.get("asymmetricGrid") else ""
     target = f"{{type: circles, rows: {rows}, cols: {cols}, spacing: {spacing:g}, diameter: ...{asymmetric}}}"
     return (
-        "Kalibr's file lacks the diameter of the circles, which the centres of their images depend on; measure it and "
-        f"write `target: {target}` in the rig file."
+        "the circle grid of Kalibr's file has no diameter, on which the centres of the images of circles "
+        f"depend; measure it and write `target: {target}` in the rig file."
     )
 
 
@@ -157,7 +157,7 @@ def _read(
 def _camera(file: str, name: str, data: dict[str, Any]) -> KalibrCamera:
     kind = (str(data["camera_model"]), str(data.get("distortion_model")))
     if kind not in MODELS:
-        raise RigError(f"{file}: {name}: icalib has no {kind[0]}-{kind[1]}; its intrinsics are not used.")
+        raise RigError(f"{file}: {name}: icalib has no {kind[0]}-{kind[1]} model; its intrinsics are not used.")
     model, before = MODELS[kind]
     values = _numbers(data, "intrinsics", before + 4, file)
     coefficients = _numbers(data, "distortion_coeffs", 4 if kind[1] != "none" else None, file)

@@ -55,7 +55,7 @@ def _from_info(
     K = info.K
     intrinsics = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
     if camera.images is not None and "rect" in camera.images.name.lower():
-        notes.append(f"{topic} is of the images before they were rectified and is not used; prefer the raw images")
+        notes.append(f"{topic} is for the unrectified images and is not used; prefer the raw images")
     elif not (np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0):
         notes.append(f"{topic} holds no intrinsics")
     elif info.resolution != resolution:

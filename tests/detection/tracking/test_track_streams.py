@@ -100,7 +100,7 @@ def test_images_too_large_to_wait_give_the_same_tracks(scene, monkeypatch):
 def test_a_damaged_image_is_left_out_with_a_note(scene):
     found, notes = find_tracks(Images(scene.images, damaged=(4,)), CAMERA)
     assert len(found.stamps_ns) == len(scene.images) - 1
-    assert notes == ("rec/cam0: 1 images that are damaged were left out, the first 4.png.",)
+    assert notes == ("rec/cam0: 1 damaged images were ignored, the first 4.png.",)
 
 
 def test_a_part_of_the_robot_in_view_is_left_out_with_a_note(scene):
@@ -111,12 +111,12 @@ def test_a_part_of_the_robot_in_view_is_left_out_with_a_note(scene):
     found, notes = find_tracks(Images(images), CAMERA)
     x, y = found.uv.T
     assert not ((x > 65) & (x < 255) & (y > 175) & (y < 225)).any()
-    assert "points stay in place while the camera turns" in notes[-1]
+    assert "points keep their place in the image while the camera turns" in notes[-1]
 
 
 def test_images_without_texture_are_refused():
     grey = [np.full(SIZE[::-1], 90, np.uint8)] * 5
-    with pytest.raises(RecordingError, match="only 0 of 5 images show 12 points or more"):
+    with pytest.raises(RecordingError, match="only 0 of 5 images have 12 tracked points or more"):
         find_tracks(Images(grey), CAMERA)
 
 

@@ -191,8 +191,8 @@ def _stream(name: str, found: _Found, where: str) -> TrackStream:
     enough = int((count >= FEWEST_POINTS).sum())
     if 2 * enough < len(count):
         raise RecordingError(
-            f"{where}: only {enough} of {len(count)} images show {FEWEST_POINTS} points or more that can be followed; "
-            f"record where there is texture and light, or let {name} see a target."
+            f"{where}: only {enough} of {len(count)} images have {FEWEST_POINTS} tracked points or more; "
+            f"record with texture and light, or let {name} see a target."
         )
     kept = count > 0
     start = np.concatenate([[0], np.cumsum(count[kept])]).astype(np.int64)
@@ -205,9 +205,9 @@ def _notes(found: _Found, files: dict[int, str]) -> Iterator[str]:
     yield from words_on_damaged(found.damaged_ns.tolist(), files)
     tracks = len(np.unique(found.feature)) + found.moving + found.in_place
     if found.moving > NOTED * tracks:
-        yield f"{found.moving} of {tracks} points do not fit one motion of the camera and were left out."
+        yield f"{found.moving} of {tracks} points do not fit a single motion of the camera and were rejected."
     if found.in_place > NOTED * tracks:
         yield (
-            f"{found.in_place} of {tracks} points stay in place while the camera turns, as on a part of the robot or a "
-            "dirty lens; they were left out."
+            f"{found.in_place} of {tracks} points keep their place in the image while the camera turns, as if "
+            "on the robot or on a dirty lens; they were rejected."
         )
