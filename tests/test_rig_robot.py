@@ -168,7 +168,7 @@ def test_without_an_imu_a_pose_sensor_shows_the_motion(tmp_path):
     mocap, wheels = "sensors:\n  mocap0: {type: pose}\n", "  wheel0: {type: wheels}\n"
     assert load(tmp_path, mocap + wheels).body == "mocap0"
     assert load(tmp_path, mocap + "  slam0: {type: pose, kind: relative}\n").imu is None
-    assert "sensors.mocap0: is alone; add what is to be calibrated" in complaint(tmp_path, mocap)
+    assert "sensors.mocap0: is the only sensor; add the sensors to calibrate" in complaint(tmp_path, mocap)
     relative = mocap.replace("pose}", "pose, kind: relative}")
     assert "sensors.mocap0: without camera and IMU it has to show" in complaint(tmp_path, relative + wheels)
 
@@ -242,7 +242,11 @@ def test_plain_lidars_and_wheels_load_back(tmp_path):
         ("65536", "1.5", "sensors.wheel0.counter_size: must be a whole number of at least 2"),
         ("[l, r]", "[l]", "sensors.wheel0.joints: must be the names of two joints, [left, right]"),
         ("[l, r]", "[l, l]", "sensors.wheel0.joints: must be the names of two joints, [left, right]"),
-        ("measures: poses", "measures: poses, factor: increments", "sensors.wheel2.factor: increments cannot be had"),
+        (
+            "measures: poses",
+            "measures: poses, factor: increments",
+            "sensors.wheel2.factor: relative poses have no increments",
+        ),
         (
             "kind: relative",
             "kind: drifting",
@@ -326,7 +330,7 @@ def test_kinds_of_wheels_are_read_and_load_back(tmp_path):
         (
             "sampling: instantaneous",
             "factor: relative-poses",
-            "factor: the paper's relative-poses are of a left and a right",
+            "factor: relative-poses (the paper's factor) needs a left and a right",
         ),
         (
             "sampling: instantaneous",
@@ -341,9 +345,9 @@ def test_kinds_of_wheels_are_read_and_load_back(tmp_path):
             "joints: must be the names of two joints, [driven wheel, steering],",
         ),
         ("[a, b, c, d]", "[a, b]", "skid0.joints: must be the names of four joints, [front left, rear left, front rig"),
-        (", tilt_noise: 0.01}", "}", "twist0.ground: says nothing yet; add tilt_noise (rad), or height and"),
-        ("height_sigma: 0.01, ", "", "car0.ground: says nothing yet"),
-        (", tilt_noise: 0.01}", ", tilt_noise: 0.01, height: 1}", "ground.height: goes with height_sigma"),
+        (", tilt_noise: 0.01}", "}", "twist0.ground: has no effect; add tilt_noise (rad), or height and"),
+        ("height_sigma: 0.01, ", "", "car0.ground: has no effect"),
+        (", tilt_noise: 0.01}", ", tilt_noise: 0.01, height: 1}", "ground.height: needs height_sigma"),
         ("plane: floor, tilt", "plane: ceiling, tilt", "ground.plane: there is no such choice as 'ceiling'; available"),
         ("tilt_noise: 0.01", "tilt_noise: 0", "ground.tilt_noise: must be above 0"),
         ("  lidar0: {type: lidar}\n", "  mocap0: {type: pose}\n", "ground.plane: the floor is what a LiDAR sees, and"),

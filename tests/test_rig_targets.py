@@ -82,7 +82,7 @@ ONE_BIT = GRID.replace("}", ", border_bits: 1}")
     ("text", "words"),
     [
         ("", "rig.yaml:1: target is missing; add target, targets for several by name, or tracks"),
-        (f"target: {GRID}\n" + several(a=TAGS), "targets: stands beside target; put all targets under targets."),
+        (f"target: {GRID}\n" + several(a=TAGS), "targets: conflicts with target; put all targets under targets."),
         ("targets: {}", "targets: there is no target; add one"),
         (several(**{"0a": TAGS}), "targets.0a: a target's name is a letter, then up to 99 letters, digits"),
         (several(a=TAGS, b=BOARD.replace("6", "six")), "targets.b.rows: must be a number, but is 'six'"),

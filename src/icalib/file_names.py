@@ -14,5 +14,5 @@ NAME_WORDS = "a letter, then up to 99 letters, digits, _ or -"
 def below(folder: Path, name: str) -> Path:
     """`folder / name`. Raises CalibrationError where that is not right in `folder`."""
     if name in ("", ".", "..") or any(c in name for c in "/\\\0"):
-        raise CalibrationError(f"{name!r} cannot be the name of a file in {folder}; rename what has this name.")
+        raise CalibrationError(f"{name!r} cannot be the name of a file in {folder}; rename this sensor or target.")
     return folder / name

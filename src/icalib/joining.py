@@ -74,8 +74,8 @@ def _shifts(rig: Rig, recordings: Sequence[Measurements]) -> list[int]:
         empty = [s.name for s in _streams(recording) if not len(s.stamps_ns)]
         if empty:
             raise RecordingError(
-                f"{recording.name}: there is nothing of {' and '.join(empty)} that the others could be joined with "
-                "(of a camera, no image that shows the target); leave this recording out."
+                f"{recording.name}: {' and '.join(empty)} has no data that the other recordings could be "
+                "joined with (a camera: no image that shows the target); leave this recording out."
             )
     shifts = [0]
     for before, after in pairwise(recordings):
@@ -169,7 +169,7 @@ def join_wheels(streams: list[tuple[WheelStream | WheelPoses, int]]) -> WheelStr
     for wheels, shift in streams:
         if isinstance(wheels, WheelPoses):
             raise RecordingError(
-                f"{wheels.name} measures relative poses, and there is none from one recording to the next; give one "
+                f"{wheels.name} measures relative poses, and there is none between two recordings; give one "
                 "recording, or wheels that measure rates, angles or ticks."
             )
         stamps.append(wheels.stamps_ns + np.int64(shift))

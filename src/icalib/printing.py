@@ -114,8 +114,10 @@ def page_mm(pattern: Pattern, paper: str) -> tuple[float, float]:
     larger = [p for p, (w, h) in PAPERS.items() if _fits(size, w, h) or _fits(size, h, w)]
     rooms = [(w - 2.0 * EDGE_MM, h - 2.0 * EDGE_MM - FOOT_MM) for w, h in (PAPERS[paper], PAPERS[paper][::-1])]
     raise RigError(
-        f"the target is {size[0]:.0f} x {size[1]:.0f} mm, and {paper} has room for {rooms[0][0]:.0f} x "
-        f"{rooms[0][1]:.0f} mm, on its side for {rooms[1][0]:.0f} x {rooms[1][1]:.0f} mm; "
+        (
+            f"the target is {size[0]:.0f} x {size[1]:.0f} mm, but {paper} has space for {rooms[0][0]:.0f} x "
+            f"{rooms[0][1]:.0f} mm, or in landscape for {rooms[1][0]:.0f} x {rooms[1][1]:.0f} mm; "
+        )
         + (f"choose {larger[0]}, or make the target smaller." if larger else "make the target smaller.")
     )
 

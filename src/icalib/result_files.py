@@ -50,7 +50,7 @@ def read_file(folder: Path, name: str) -> bytes:
     for path in (*committed, folder / name):
         with contextlib.suppress(FileNotFoundError), _errors_named(path, "read"):
             return path.read_bytes()
-    raise CalibrationError(f"{folder} holds no {name}; give the folder that a calibration was written to.")
+    raise CalibrationError(f"{folder} has no {name}; give the folder that a calibration was written to.")
 
 
 def finish_writing(folder: Path) -> None:
@@ -103,7 +103,7 @@ def _commit(folder: Path) -> Path | None:
     """The commit folder, where there is one. Raises CalibrationError where it is a link, which icalib never makes."""
     commit = folder / COMMIT
     if commit.is_symlink():
-        raise CalibrationError(f"{commit} is a link, and icalib makes none of this name; remove it.")
+        raise CalibrationError(f"{commit} is a link, which icalib never writes; remove it.")
     return commit if commit.is_dir() else None
 
 

@@ -20,7 +20,7 @@ def lack_of(rig: Rig) -> Lack | None:
     """What keeps the sensors of the rig from being calibrated together; None where nothing does."""
     if not rig.cameras and not rig.lidars and not rig.poses:
         there = " and ".join([w.name for w in rig.wheels] + ([rig.imu.name] if rig.imu else []))
-        alone = f"{there} do not show the motion, and " if rig.wheels else ""
+        alone = f"{there} do not determine the motion, and " if rig.wheels else ""
         return Lack("", f"{alone}there is no camera, no LiDAR and no pose sensor; add one of them.")
     if rig.imu is not None:
         return None
@@ -31,12 +31,13 @@ def lack_of(rig: Rig) -> Lack | None:
     first = rig.poses[0]
     if first.kind != "absolute":
         return Lack(
-            first.name, "without camera and IMU it has to show the motion by itself; write kind: absolute, or add one."
+            first.name,
+            "without camera and IMU this sensor must determine the motion; write kind: absolute, or add one."
             if not rig.cameras else
-            "without target and IMU it has to show the motion by itself; write kind: absolute, or add one."
+            "without target and IMU this sensor must determine the motion; write kind: absolute, or add one."
         )  # fmt: skip
     if len(rig.poses) == 1 and not (rig.wheels or rig.cameras):
-        return Lack(first.name, "is alone; add what is to be calibrated with it.")
+        return Lack(first.name, "is the only sensor; add the sensors to calibrate it with.")
     return None
 
 

@@ -88,7 +88,10 @@ def _sigma(value: YamlValue, size: int) -> np.ndarray:
     """(size,) standard deviations; one number stands for all."""
     sigma = value.vector(size) if value.is_list else np.full(size, value.number())
     if (sigma <= 0).any():
-        value.fail(f"a standard deviation must be above 0, but is {sigma.min():g}; to hold the value, write fixed.")
+        value.fail(
+            f"a standard deviation must be above 0, but is {sigma.min():g}; write fixed for a value without "
+            "uncertainty."
+        )
     return sigma
 
 

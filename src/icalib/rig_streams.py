@@ -32,7 +32,7 @@ def streams_of_rig(rig: Rig, measurements: Measurements) -> Measurements:
     m, where = measurements, measurements.name or "the recording"
     _ordered(() if rig.imu is None else (rig.imu,), () if m.imu is None else (m.imu,), where)
     if rig.imu is not None and m.imu is None:
-        raise RecordingError(f"{where} has no readings of {rig.imu.name}; add them, or take it out of the rig.")
+        raise RecordingError(f"{where} has no readings of {rig.imu.name}; add them, or remove it from the rig.")
     cameras, tracks = _ordered(rig.cameras, m.cameras, where), _ordered(rig.cameras, m.tracks, where)
     seeing = {s.name for s in (*cameras, *tracks)}
     lidars, wheels = _ordered(rig.lidars, m.lidars, where), _ordered(rig.wheels, m.wheels, where)
@@ -43,7 +43,7 @@ def streams_of_rig(rig: Rig, measurements: Measurements) -> Measurements:
     missing = [s.name for s in (*rig.cameras, *rig.lidars, *rig.wheels, *rig.poses) if s.name not in given]
     if missing:
         raise RecordingError(
-            f"{where} has nothing of {' and '.join(missing)}; add what was measured, or take it out of the rig."
+            f"{where} has no data of {' and '.join(missing)}; add the measurements, or remove it from the rig."
         )
     return replace(m, cameras=cameras, tracks=tracks, lidars=lidars, wheels=wheels, poses=poses, notes=notes)
 
@@ -56,7 +56,8 @@ def near(stream: PoseStream) -> tuple[PoseStream, tuple[str, ...]]:
         return stream, ()
     x, y, z = origin
     return replace(stream, position=stream.position - origin), (
-        f"{stream.name}: positions are counted from ({x:.0f}, {y:.0f}, {z:.0f}) m of its frame, whose origin is far.",
+        f"{stream.name}: positions are relative to ({x:.0f}, {y:.0f}, {z:.0f}) m of its frame, whose origin is "
+        "far away.",
     )
 
 
@@ -66,8 +67,8 @@ def _ordered(sensors: Sequence[_Named], streams: Sequence[T], where: str) -> tup
     for name in by_name:
         if name not in known:
             raise RecordingError(
-                f"{where} has a stream called {name}, but the rig has {' and '.join(known) or 'none'} of its kind; "
-                "give it the sensor's name, or add the sensor to the rig."
+                f"{where} has a stream called {name}, but the rig has {' and '.join(known) or 'none'} of this "
+                "kind; give it the sensor's name, or add the sensor to the rig."
             )
     if len(by_name) < len(streams):
         twice = next(s.name for k, s in enumerate(streams) if s.name in [t.name for t in streams[:k]])

@@ -33,7 +33,7 @@ def target_or_targets(root: YamlValue) -> Target:
     if "targets" not in found:
         return target_of(found["target"])
     if "target" in found:
-        found["targets"].fail("stands beside target; put all targets under targets.")
+        found["targets"].fail("conflicts with target; put all targets under targets.")
     named = found["targets"].entries()
     for name, value in named.items():
         if not NAME.fullmatch(name):
@@ -84,7 +84,7 @@ def _markers(value: YamlValue, found: dict[str, YamlValue]) -> Target:
     family, size = _family(found["family"]), _edge(found["size"], "tag")
     ids = tuple(entry.whole(0) for entry in found["ids"].items()) if "ids" in found else ()
     if "ids" in found and not ids:
-        found["ids"].fail("there are no ids; list them, or leave ids out to use all that are seen.")
+        found["ids"].fail("the list of ids is empty; list them, or remove ids to use all tags that are seen.")
     return _made(value, lambda: Markers(family, size, ids, _border(found, Markers.border_bits)))
 
 
@@ -105,14 +105,14 @@ def _border(found: dict[str, YamlValue], default: int) -> int:
 
 def _edge(value: YamlValue, what: str) -> float:
     if (size := value.positive()) > _LARGEST_TAG_M:
-        value.fail(f"is in metres, and {size:g} m is no {what}; write 0.088 for 88 mm.")
+        value.fail(f"is in metres, and {size:g} m is too large for a {what}; write 0.088 for 88 mm.")
     return size
 
 
 def _counts(value: YamlValue, found: dict[str, YamlValue], first: str, second: str, what: str) -> tuple[int, int]:
     a, b = found[first].whole(1), found[second].whole(1)
     if a * b > _MOST_TAGS:
-        value.fail(f"{a} x {b} {what} are more than {_MOST_TAGS}; correct {first} and {second}.")
+        value.fail(f"{a} x {b} {what} exceed the limit of {_MOST_TAGS}; correct {first} and {second}.")
     return a, b
 
 

@@ -89,9 +89,9 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
     if dtype.hasobject and version in readers:
         raise ValueError("Object arrays cannot be loaded: they may run programs")
     if dtype.hasobject or any(side < 0 for side in shape):
-        raise ValueError(f"{member.filename} is no array of numbers")
+        raise ValueError(f"{member.filename} is not an array of numbers")
     if math.prod(shape) * dtype.itemsize != left:
-        raise ValueError(f"{member.filename} has not the size that its header says")
+        raise ValueError(f"{member.filename} does not have the size that its header states")
     with archive.open(member) as file:
         return np.lib.format.read_array(file, allow_pickle=False)
 

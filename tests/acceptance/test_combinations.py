@@ -52,7 +52,7 @@ def refusal(sees: str, imu: bool, others: str, known: str) -> str:
     if not imu and "lidar" in others:
         return "lidar0 needs an IMU"
     if not imu and not sees and others == "pose":
-        return "mocap0 is alone"
+        return "mocap0 is the only sensor"
     if not imu and sees == "tracks" and "pose" not in others:
         return "determines the scale"
     return ""

@@ -28,7 +28,7 @@ def held(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
 
 
 def test_a_folder_that_another_process_is_at_work_in_is_refused(tmp_path: Path, held):
-    with pytest.raises(CalibrationError, match=f"another icalib is at work in {tmp_path}; wait"), alone(tmp_path):
+    with pytest.raises(CalibrationError, match=f"another icalib uses {tmp_path}; wait"), alone(tmp_path):
         pass
 
 
@@ -61,4 +61,4 @@ def test_commands_refuse_in_a_sentence(tmp_path: Path, held, capsys, command: st
     jobs.write_text("jobs:\n  - {robot: anton, rig: rig.yaml, recording: monday}\n")
     words = [str(scenario), "--runs", "1"] if command == "montecarlo" else [str(jobs)]
     assert main([command, *words, "--output", str(tmp_path), "--quiet"]) == 1
-    assert f"another icalib is at work in {tmp_path}" in capsys.readouterr().err
+    assert f"another icalib uses {tmp_path}" in capsys.readouterr().err

@@ -18,7 +18,7 @@ def test_a_task_that_kills_its_workers_is_given_up_and_takes_no_other_with_it():
     found = dict(run_all(eval, [killer, "7", "int('x')", "8"], Crew(workers=1)))
     assert (found.pop("7"), found.pop("8")) == (7, 8)
     assert found == {
-        killer: Lost("its worker died again and again, 4 times at this task; give it more memory."),
+        killer: Lost("its worker died 4 times at this task; give it more memory."),
         "int('x')": Lost(
             "its worker cannot do it (ValueError: invalid literal for int() with base 10: 'x'); "
             "install the same icalib everywhere."
@@ -35,7 +35,9 @@ def test_an_answer_that_never_comes_is_a_scheduler_that_went_away(error: BaseExc
         def result(self) -> None:
             raise error
 
-    with pytest.raises(CalibrationError, match="the Dask scheduler went away; what was finished is kept"):
+    with pytest.raises(
+        CalibrationError, match="the connection to the Dask scheduler was lost; finished tasks are kept"
+    ):
         _answer(load_distributed(), Future())
 
 

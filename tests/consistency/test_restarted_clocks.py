@@ -154,7 +154,7 @@ def test_a_recording_with_nothing_of_a_sensor_is_named(robot):
     blind = simulate(replace(scenario, duration_s=12.0), 2).measurements
     assert len(blind.cameras[0].stamps_ns) == 0
     blind = replace(blind, name="second")
-    with pytest.raises(RecordingError, match="second: there is nothing of cam0"):
+    with pytest.raises(RecordingError, match="second: cam0 has no data"):
         calibrate_measurements(open_rig(scenario, ""), [simulate(scenario, 1).measurements, blind])
 
 

@@ -100,7 +100,7 @@ def test_wheels_that_never_turned_while_the_camera_looked(drive):
         ("standing", "cw", "motionless|hardly turn"),
         ("standing", "lw", "hardly turn"),
         ("arc", "lw", "drove a single arc"),
-        ("planar", "w", "wheel0 and imu0 do not show the motion"),
+        ("planar", "w", "wheel0 and imu0 do not determine the motion"),
     ],
 )  # fmt: skip
 def test_drives_that_show_too_little(drive, kind: str, parts: str, words: str):

@@ -44,7 +44,7 @@ def test_a_camera_turned_by_ten_sigma_is_found_and_nothing_else(results: dict[st
     assert found.sensors == ("cam1",)
     own, seen = found.changes
     assert {(c.difference.sensor, c.difference.what) for c in found.changes} == {("cam1", "rotation")}
-    assert (own.at_its_sensor, seen.at_its_sensor) == (True, False) and seen.words.count("as seen from cam0") == 1
+    assert (own.at_its_sensor, seen.at_its_sensor) == (True, False) and seen.words.count("relative to cam0") == 1
     assert own.words.startswith("cam1 turned by 0.0") and "about its x axis" in own.words
     assert own.difference.sigmas is not None and 7.0 < own.difference.sigmas < 13.0
     assert (own.before, own.after) == ("job 0", "job 1")
@@ -53,7 +53,7 @@ def test_a_camera_turned_by_ten_sigma_is_found_and_nothing_else(results: dict[st
 def test_what_did_not_change_is_not_found(results: dict[str, Calibration]):
     found = drift([results["r0"], results["r1"]])
     assert (found.changes, found.unsure, found.notes) == ((), (), ()) and found.sensors == ()
-    assert found.judged == 8  # two cameras' rotation, translation and time offset, and cam1 as seen from cam0
+    assert found.judged == 8  # two cameras' rotation, translation and time offset, and cam1 relative to cam0
 
 
 def test_many_small_steps_are_found_from_the_first_to_the_last(results: dict[str, Calibration]):

@@ -80,7 +80,7 @@ def test_changed_inputs_do_a_job_again_and_say_so(fleet_folder: Path, workshop, 
     shutil.copytree(workshop_recording(fleet_folder), fleet_folder / "r1")
     found = fleet(fleet_folder, say=said.append)
     assert workshop.done[4:] == ["berta-r1"] and found.again == {"berta-r1": "the recording changed"}
-    assert said == ["berta-r1 is done again: the recording changed."]
+    assert said == ["berta-r1 is calibrated again: the recording changed."]
     os.utime(fleet_folder / "r1" / "cam0" / "corners.csv", ns=(1, 1))
     assert fleet(fleet_folder).again == {"berta-r1": "the recording changed"}
     with (fleet_folder / "rig.yaml").open("a") as file:
@@ -119,7 +119,7 @@ def test_a_failed_job_is_kept_with_its_sentence_and_others_go_on(fleet_folder: P
     workshop.results = workshop.results | {"bad": workshop.results["r0"]}
     (fleet_folder / "bad").symlink_to(fleet_folder / "r0")
     assert main(arguments) == 0
-    assert "berta-bad is done again: the recording changed." in capsys.readouterr().out
+    assert "berta-bad is calibrated again: the recording changed." in capsys.readouterr().out
 
 
 def test_a_failure_leaves_no_result_of_before(fleet_folder: Path, workshop):
@@ -176,7 +176,7 @@ def test_interrupted_it_says_what_is_there(fleet_folder: Path, workshop, capsys)
     arguments = ["fleet", str(fleet_folder / "JOBS.yaml"), "-o", str(fleet_folder / "out")]
     assert main(arguments) == 130
     place = fleet_folder / "out"
-    said = f"icalib: interrupted; 3 of 4 jobs are in {place}; the same command goes on from there.\n"
+    said = f"icalib: interrupted; 3 of 4 jobs are in {place}; the same command resumes.\n"
     assert capsys.readouterr().err == said
     workshop.interrupt = None
     assert main(arguments) == 0 and workshop.done == NAMES
@@ -262,12 +262,12 @@ def test_how_many_sigma_count_can_be_chosen(fleet_folder: Path, workshop, capsys
     out = capsys.readouterr().out
     assert ("Changed over time: anton (cam1)." in out) == drifted
     assert ("Nothing changed over time." in out) != drifted
-    assert f"{'2' if drifted else '0'} of 16 comparisons are beyond {sigma} sigma" in out
+    assert f"{'2' if drifted else '0'} of 16 comparisons exceed {sigma} sigma" in out
 
 
 @pytest.mark.parametrize("sigma", [0.0, -1.0, float("nan"), float("inf")])
 def test_sigmas_that_make_no_sense(fleet_folder: Path, sigma: float):
-    with pytest.raises(CalibrationError, match="from a number of sigmas above 0 on"):
+    with pytest.raises(CalibrationError, match="must be above 0 sigma"):
         fleet(fleet_folder, limit=sigma)
 
 

@@ -84,9 +84,9 @@ jobs:
         ),
         (
             "jobs: [{name: a/b, robot: a, rig: rig.yaml, recording: r}]",
-            r"jobs\[0\].name: is the name of a folder: .*, but is 'a/b'; rename it",
+            r"jobs\[0\].name: must be a valid folder name .*, but is 'a/b'; rename it",
         ),
-        ("jobs: [{name: .., robot: a, rig: rig.yaml, recording: r}]", r"jobs\[0\].name: is the name of a folder"),
+        ("jobs: [{name: .., robot: a, rig: rig.yaml, recording: r}]", r"jobs\[0\].name: must be a valid folder name"),
         (
             "defaults: {rig: rig.yaml}\njobs:\n- {robot: a, recording: r}\n- {name: A-R, robot: b, recording: r}",
             r"JOBS.yaml:4: jobs\[1\]: this job and jobs\[0\] are both called A-R; give each a name of its own",

@@ -106,7 +106,9 @@ def test_a_killed_scheduler_is_one_sentence_and_loses_nothing(fleet_folder: Path
             if done > 0.0:
                 os.killpg(process.pid, signal.SIGKILL)
 
-        with pytest.raises(CalibrationError, match="the Dask scheduler went away; what was finished is kept"):
+        with pytest.raises(
+            CalibrationError, match="the connection to the Dask scheduler was lost; finished tasks are kept"
+        ):
             run_fleet(fleet_folder / "JOBS.yaml", fleet_folder / "out", crew, progress=kill)
     finally:
         if process.poll() is None:

@@ -135,7 +135,7 @@ def test_more_runs_are_added_by_a_cluster(alone: Path, tmp_path: Path):
     ("changed", "why"),
     [
         ({"digest": "another"}, "the scenario changed"),
-        ({"guess": "drawn"}, "their first guess is another"),
+        ({"guess": "drawn"}, "their initial guess differs"),
         ({"planes": "found"}, "planes are known in one and found in the other"),
     ],
 )
@@ -186,7 +186,7 @@ def test_a_run_that_killed_its_workers_is_reported_and_tried_again_the_next_time
 
 def test_an_interrupted_study_says_what_is_there(tmp_path: Path, monkeypatch):
     good = Record(0, "", 1.0, Identity.of("", "", "none", "known").program)
-    with pytest.raises(KeyboardInterrupt, match="1 of 2 runs are in .*; the same command goes on from there"):
+    with pytest.raises(KeyboardInterrupt, match="1 of 2 runs are in .*; the same command resumes"):
         fill(tmp_path, [good], monkeypatch, interrupt=True)
     assert list(written(tmp_path)) == ["000000.json"]
 
@@ -206,8 +206,8 @@ def test_damaged_files_are_named(alone: Path, tmp_path: Path):
 @pytest.mark.parametrize(
     ("plan", "sentence"),
     [
-        ({"runs": 0}, "at least 1 run"),
-        ({"runs": 1, "workers": 0}, "at least 1 worker"),
+        ({"runs": 0}, "0 runs were asked for, but a study needs at least 1"),
+        ({"runs": 1, "workers": 0}, "0 workers were asked for, but at least 1 is needed"),
         ({"runs": 1, "workers": 1, "scheduler": "tcp://here:1"}, "not both"),
     ],
 )

@@ -91,5 +91,5 @@ def test_a_rig_without_a_target(tmp_path):
 def test_a_camera_without_tracks_needs_a_target(tmp_path):
     path = tmp_path / "rig.yaml"
     path.write_text(RIG.replace("    tracks: cam0/tracks.csv\n", ""))
-    with pytest.raises(RigError, match="target is missing; add target, targets .*, or tracks .* to cam0"):
+    with pytest.raises(RigError, match="target is missing; add target, targets .*, or tracks .* of cam0"):
         load_rig(path)

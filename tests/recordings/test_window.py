@@ -147,5 +147,5 @@ def test_the_command_line(tmp_path, truth, write, capsys):
                       (truth.image_stamps, truth.image_stamps, truth.imu_stamps)]  # fmt: skip
     assert main(["inspect", str(path), "--to", "0.2", "--quiet"]) == 0
     opened = open_all(path, 0.1, 0.2)
-    with pytest.raises(RecordingError, match="a recording that is open already has its part"):
+    with pytest.raises(RecordingError, match="start_s and end_s do not apply to an opened recording"):
         calibrate(rig, list(opened.values()), start_s=0.1)

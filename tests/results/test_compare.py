@@ -83,7 +83,7 @@ def test_what_changed_is_said_in_words(robot: Calibration):
     found = compared(robot, changed(robot, steps))
     text = "\n".join(lines(found))
     assert re.search(r"DIFFERS  cam1 turned by 0\.30 deg about its x axis, \d+\.\d sigma", text)
-    assert re.search(r"DIFFERS  cam1 turned by 0\.30 deg about its x axis as seen from cam0, \d+\.\d sigma", text)
+    assert re.search(r"DIFFERS  cam1 turned by 0\.30 deg about its x axis relative to cam0, \d+\.\d sigma", text)
     assert re.search(r"DIFFERS  lidar0 moved by -20 mm along y of imu0, \d+\.\d sigma", text)
     assert re.search(r"DIFFERS  the time offset of cam0 changed by \+0\.50 ms, \d+\.\d sigma", text)
     assert re.search(r"DIFFERS  the right radius of wheel0 changed by \+0\.98 %, \d+\.\d sigma", text)
@@ -254,7 +254,7 @@ def test_values_typed_into_a_rig_file(robot: Calibration, tmp_path: Path):
     assert not any((d.sensor, d.what) == ("cam0", "rotation") for d in found.differences)
     assert only(found, "wheel0", "baseline").vector[0] == pytest.approx(100 * (0.5 / 0.42 - 1))
     assert not only(found, "wheel0", "radius").differs
-    assert f"{tmp_path / 'cad.yaml'} does not say all of the pose of cam0, wheel0." in found.notes
+    assert f"{tmp_path / 'cad.yaml'} gives only a part of the pose of cam0, wheel0." in found.notes
 
 
 def test_what_has_no_standard_deviation_is_held_to_the_tolerance(robot: Calibration, tmp_path: Path):

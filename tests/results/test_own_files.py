@@ -118,7 +118,7 @@ def test_a_linked_commit_folder_moves_nothing(tmp_path: Path):
         lambda: read_file(tmp_path / "out", "result.json"),
         lambda: refuse_foreign_set(tmp_path / "out"),
     ):
-        with pytest.raises(CalibrationError, match=r"is a link, and icalib makes none of this name; remove it\."):
+        with pytest.raises(CalibrationError, match=r"is a link, which icalib never writes; remove it\."):
             attempt()
     assert (tmp_path / "mine" / "result.json").read_bytes() == b"mine"
 

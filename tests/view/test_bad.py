@@ -80,7 +80,7 @@ def test_a_recording_of_another_time(complaint, shown, tmp_path):
     later = dataclasses.replace(c.recordings[0], origin_ns=c.recordings[0].origin_ns + 10**12)
     result = _changed(c, tmp_path / "out", recordings=(later,))
     said = complaint(result, shown.recording, "--save", tmp_path / "a.rrd")
-    assert f"{shown.recording} holds nothing of imu0 from the time of the result; give the recording drive" in said
+    assert f"{shown.recording} holds no data of imu0 from the time of the result; give the recording drive" in said
 
 
 def test_a_recording_that_is_none_of_several(complaint, shown, drive, tmp_path):
@@ -88,7 +88,7 @@ def test_a_recording_that_is_none_of_several(complaint, shown, drive, tmp_path):
     spans = tuple(dataclasses.replace(c.recordings[0], name=name) for name in ("monday", "friday"))
     result = _changed(c, tmp_path / "out", recordings=spans)
     said = complaint(result, drive, "--save", tmp_path / "a.rrd")
-    assert f"{drive} is none of the recordings of the result, which are monday, friday; give one of them." in said
+    assert f"{drive} is not a recording of the result, which has monday, friday; give one of them." in said
     renamed = drive.rename(tmp_path / "friday")
     assert main(["view", str(result), str(renamed), "--save", str(tmp_path / "a.rrd"), "--quiet"]) == 0
 
@@ -97,13 +97,13 @@ def test_a_result_that_does_not_know_when_it_was(complaint, shown, tmp_path):
     result = _changed(shown.calibration, tmp_path / "out", recordings=())
     view(result, save=tmp_path / "alone.rrd")
     said = complaint(result, shown.recording, "--save", tmp_path / "a.rrd")
-    assert "does not say when its recording was; calibrate again to see both." in said
+    assert "does not tell the time of its recording; calibrate again to see both." in said
 
 
 def test_a_damaged_image_is_left_out_which_is_said(shown, drive, tmp_path):
     damaged = sorted((drive / "cam0" / "data").iterdir())[3]
     damaged.write_bytes(damaged.read_bytes()[:60])
-    assert view(shown.result, drive, tmp_path / "a.rrd") == ["cam0: 1 images are damaged, and not shown."]
+    assert view(shown.result, drive, tmp_path / "a.rrd") == ["cam0: 1 damaged images are not shown."]
 
 
 def test_rerun_is_missing(complaint, shown, monkeypatch):

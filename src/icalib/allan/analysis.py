@@ -139,9 +139,9 @@ def _unit_warnings(gyro: float, accel: float) -> tuple[str, ...]:
     if gyro < _NOISIEST_GYRO or times_gyro < _APART * times_accel:
         return ()
     return (
-        f"the angular rates look like deg/s: at rest their noise is {times_gyro:.0f} times that of a {DEFAULT_CLASS} "
-        f"gyroscope, that of the accelerometer {times_accel:.2g} times; if they are, give --gyro-unit deg/s, and the "
-        f"noise is {gyro * DEGREE:.2g} rad/s/sqrt(Hz), not {gyro:.2g}.",
+        f"the angular rates look like deg/s: at rest their noise is {times_gyro:.0f} times that of a "
+        f"{DEFAULT_CLASS} gyroscope, that of the accelerometer {times_accel:.2g} times. If they are, give "
+        f"--gyro-unit deg/s; the noise is then {gyro * DEGREE:.2g} rad/s/sqrt(Hz), not {gyro:.2g}.",
     )
 
 
@@ -149,12 +149,12 @@ def _walk_warnings(sensor: SensorNoise, seconds: float) -> tuple[str, ...]:
     fit, unit = sensor.together, f"{sensor.unit[:-2]}/s^2" if sensor.unit == "rad/s" else "m/s^3"
     if fit.lacking <= _WALK_KNOWN:
         return ()
-    known = f"its standard deviation is {fit.walk_std / fit.walk:.0%}" if fit.resolved else "none is seen"
+    known = f"its standard deviation is {fit.walk_std / fit.walk:.0%}" if fit.resolved else "none is visible"
     factor = f"{fit.lacking:.2g}" if fit.lacking < 1e6 else "a million"
     at_least = "" if fit.resolved else "at least "
     return (
         f"{seconds:.0f} s are too short for the bias walk of the {sensor.kind}: {known}, and it may be up to "
-        f"{fit.walk_upper:.2g} {unit}/sqrt(Hz); to know it to 20 % record {at_least}{factor} times as long.",
+        f"{fit.walk_upper:.2g} {unit}/sqrt(Hz). To know it to 20 %, record {at_least}{factor} times as long.",
     )
 
 
@@ -163,12 +163,12 @@ def _shape_warnings(sensor: SensorNoise) -> tuple[str, ...]:
     for axis, fit in zip(AXES, sensor.axes, strict=True):
         if fit.white > _WORSE * sensor.together.white:
             ratio = fit.white / sensor.together.white
-            found += (f"the {sensor.kind} {axis} is {ratio:.1f} times as noisy as the axes together.",)
+            found += (f"the {sensor.kind} {axis} is {ratio:.1f} times as noisy as the mean of the axes.",)
     if sensor.together.misfit > _MISFIT:
         found += (
-            f"the {sensor.kind} is not white noise and a random walk alone: its spectrum departs from their sum by "
-            f"{sensor.together.misfit:.0%}, which the standard deviations allow for; look for a slow drift "
-            "(temperature) or vibration in the plot.",
+            f"the {sensor.kind} has more than white noise and a random walk: its spectrum departs from their "
+            f"sum by {sensor.together.misfit:.0%}, which the standard deviations include; look for a slow "
+            "drift (temperature) or vibration in the plot.",
         )
     return found
 
@@ -182,8 +182,8 @@ def _rounding(kind: str, readings: np.ndarray) -> tuple[str, ...]:
         step = float(np.median(np.diff(levels))) if len(levels) > 1 else 0.0
         if step > noise and len(levels) < _levels_of_noise(values, step):
             return (
-                f"the {kind} {axis} is rounded to {step:.2g}, which is more than its noise from reading to reading; "
-                "its density is that of the rounding: set a narrower range, or read more digits.",
+                f"the {kind} {axis} is quantised in steps of {step:.2g}, more than its noise between readings, "
+                "so its density is that of the quantisation; set a narrower range, or read more digits.",
             )
     return ()
 

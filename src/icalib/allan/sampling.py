@@ -58,8 +58,8 @@ def still_readings(imu: ImuStream) -> Still:
     total = sum(len(part) for part in parts) * period
     if longest * window * period < _LEAST_S:
         raise EstimationError(
-            f"{imu.name} did not stand still for {_LEAST_S:g} s anywhere in {total:.0f} s; lay it on a table or the "
-            "floor, touch nothing, and record again."
+            f"{imu.name} was not at rest for {_LEAST_S:g} s anywhere in {total:.0f} s; put it on a table or "
+            "the floor, touch nothing, and record again."
         )
     if [(k, 0, len(parts[k]) // window) for k in range(len(parts))] == runs and len(parts) == 1:
         return Still(tuple(parts), period, warnings)
@@ -74,11 +74,12 @@ def _what_is_used(total_s: float, stretches: list[tuple[float, float]]) -> str:
     """stretches: how long, and from when on [s]."""
     if len(stretches) == 1:
         long, begin = stretches[0]
-        return f"of {total_s:.0f} s the longest stretch without is used, {long:.0f} s from {begin:.0f} s on."
+        return f"only the longest stretch at rest of {total_s:.0f} s is used, {long:.0f} s from {begin:.0f} s on."
     listed = ", ".join(f"{long:.0f} s from {begin:.0f} s on" for long, begin in stretches)
     whole = sum(long for long, _ in stretches)
     return (
-        f"of {total_s:.0f} s the {len(stretches)} longest stretches without are used, {whole:.0f} s in all: {listed}."
+        f"only the {len(stretches)} longest stretches at rest of {total_s:.0f} s are used, {whole:.0f} s in "
+        f"total: {listed}."
     )
 
 
@@ -100,9 +101,7 @@ def _without_glitches(readings: np.ndarray, name: str) -> tuple[np.ndarray, tupl
     at, axis = np.nonzero(found)
     repaired = readings.copy()
     repaired[at, axis] = 0.5 * (readings[at - 1, axis] + readings[at + 1, axis])
-    return repaired, (
-        f"{int(found.any(axis=1).sum())} readings of {name} are far off those before and after; they were left out.",
-    )
+    return repaired, (f"{int(found.any(axis=1).sum())} readings of {name} are outliers and were removed.",)
 
 
 def _even(
@@ -119,7 +118,7 @@ def _even(
     period = float(joined[~gap].mean())
     missing = np.where(gap, np.maximum(np.round(joined / period) - 1, 0), 0).astype(np.int64)
     if missing.sum() > _MOST_FILLED * len(readings):
-        sentence = f"the stamps of {name} come in bursts, or with many gaps; its readings are taken as even."
+        sentence = f"the stamps of {name} come in bursts, or with many gaps; its readings are treated as evenly spaced."
         return np.split(readings, cuts), begins, float(joined.mean()), (sentence,)
     if not missing.any():
         return np.split(readings, cuts), begins, period, ()
@@ -128,7 +127,7 @@ def _even(
     filled = [_filled(part, lost) for part, lost in zip(parts, own, strict=True)]
     sentence = (
         f"{name} has {int(gap.sum())} gaps, the longest of {joined.max():.3g} s; {int(missing.sum())} of "
-        f"{sum(map(len, filled))} readings are filled by straight lines."
+        f"{sum(map(len, filled))} readings were interpolated linearly."
     )
     return filled, begins, period, (sentence,)
 

@@ -25,7 +25,7 @@ def alone(folder: Path) -> Iterator[None]:
             lock.acquire(blocking=False)
     except filelock.Timeout:
         raise CalibrationError(
-            f"another icalib is at work in {folder}; wait until it is done, stop it, or choose another folder."
+            f"another icalib uses {folder}; wait until it ends, stop it, or choose another folder."
         ) from None
     except OSError as error:
         raise CalibrationError(

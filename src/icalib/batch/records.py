@@ -30,12 +30,13 @@ def sentence_on(caught: Exception) -> str:
     """A fault of the program must not end the work on a thousand tasks, nor be lost in it."""
     if isinstance(caught, CalibrationError):
         return str(caught)
-    return f"the program failed ({type(caught).__name__}: {caught}); this is a fault of icalib."
+    return f"the program failed ({type(caught).__name__}: {caught}), which is a fault of icalib; please report it."
 
 
 def check_worker(by: str, here: str) -> None:
     """Raises CalibrationError where a task was done `by` another program than that of `here`, who asked for it."""
     if by != here:
         raise CalibrationError(
-            "a worker of the cluster runs another version of icalib than this one; install the same everywhere."
+            "a worker of the cluster runs another version of icalib than this machine; install the same "
+            "version everywhere."
         )

@@ -30,9 +30,11 @@ class Crew:
 
     def __post_init__(self) -> None:
         if self.workers is not None and self.workers < 1:
-            raise CalibrationError(f"the work needs at least 1 worker, but {self.workers} were asked for.")
+            raise CalibrationError(
+                f"{self.workers} workers were asked for, but at least 1 is needed; correct --workers."
+            )
         if self.workers is not None and self.scheduler is not None:
-            raise CalibrationError("a cluster has its own number of workers; give workers or a scheduler, not both.")
+            raise CalibrationError("a cluster has its own number of workers; give --workers or --scheduler, not both.")
 
 
 @dataclass(frozen=True)
@@ -80,8 +82,8 @@ def _client(distributed: Any, crew: Crew, stack: ExitStack) -> Any:
         return stack.enter_context(distributed.Client(crew.scheduler, timeout=ANSWER_WITHIN_S))
     except (OSError, ValueError) as error:
         raise CalibrationError(
-            f"no Dask scheduler answers at {crew.scheduler}; start one with dask scheduler, and give the address it "
-            "prints."
+            f"no Dask scheduler answers at {crew.scheduler}; start one with dask scheduler, and give the "
+            "address that it prints."
         ) from error
 
 
@@ -93,9 +95,9 @@ def _answer(distributed: Any, future: Any) -> Any:
             return future.result()
     except (distributed.CancelledError, distributed.TimeoutError, OSError):
         raise CalibrationError(
-            "the Dask scheduler went away; what was finished is kept, and the same command goes on from there."
+            "the connection to the Dask scheduler was lost; finished tasks are kept, and the same command resumes."
         ) from None
     if isinstance(error, distributed.KilledWorker):
         times = error.allowed_failures + 1
-        return Lost(f"its worker died again and again, {times} times at this task; give it more memory.")
-    return Lost(f"its worker cannot do it ({type(error).__name__}: {error}); install the same icalib everywhere.")
+        return Lost(f"its worker died {times} times at this task; give it more memory.")
+    return Lost(f"its worker failed to run it ({type(error).__name__}: {error}); install the same icalib everywhere.")

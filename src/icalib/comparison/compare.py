@@ -125,8 +125,8 @@ def compare_sides(a: Side, b: Side, tolerances: Tolerances | None = None, limit:
     found = tuple(_poses(pair, reference, shared)) + tuple(_quantities(pair)) + tuple(_lenses(pair))
     if not found:
         raise CalibrationError(
-            f"{a.path} ({_names(a)}) and {b.path} ({_names(b)}) have nothing in common to compare; names of sensors "
-            "must match, or be given as --frame SENSOR=NAME."
+            f"{a.path} ({_names(a)}) and {b.path} ({_names(b)}) have nothing in common to compare; the names "
+            "of sensors must match, or give --frame SENSOR=NAME."
         )
     return Comparison(a, b, reference, found, _notes(a, b, shared))
 
@@ -143,9 +143,9 @@ def _notes(a: Side, b: Side, shared: list[str]) -> tuple[str, ...]:
             notes.append(f"only {side.path} has {', '.join(alone)}.")
         missing = [n for n in shared if n in other.poses and np.isnan(side.poses[n]).any()]
         if missing:
-            notes.append(f"{side.path} does not say all of the pose of {', '.join(missing)}.")
+            notes.append(f"{side.path} gives only a part of the pose of {', '.join(missing)}.")
     if a.has_imu != b.has_imu:
-        notes.append("only one side has an IMU, so poses are compared as seen from a sensor that both have.")
+        notes.append("only one side has an IMU, so poses are compared relative to a sensor that both have.")
     return tuple(notes)
 
 

@@ -72,7 +72,9 @@ def _transform(value: YamlValue) -> np.ndarray:
     T = np.array([row.vector(4) for row in rows])
     R = T[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() > _ROUNDING or np.linalg.det(R) < 0 or np.abs(T[3] - [0, 0, 0, 1]).max() > 0:
-        value.fail("is not a transform: its first 3 x 3 must be a rotation, its last row 0, 0, 0, 1; correct it.")
+        value.fail(
+            "is not a transform: its first 3 x 3 entries must be a rotation, its last row 0, 0, 0, 1; correct it."
+        )
     u, _, vt = np.linalg.svd(R)
     T[:3, :3] = u @ vt
     return T

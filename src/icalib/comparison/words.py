@@ -28,10 +28,10 @@ def lines(comparison: Comparison) -> list[str]:
 
 def sentence(d: Difference, c: Comparison) -> str:
     """For example: cam1 turned by 0.12 deg about its x axis, 4.0 sigma."""
-    seen = "" if d.frame in (c.reference, d.sensor) else f" as seen from {d.frame}"
+    seen = "" if d.frame in (c.reference, d.sensor) else f" relative to {d.frame}"
     match d.what:
         case "rotation":
-            turn = _axis(d, "about its {} axis", "about the axis {} of its own")
+            turn = _axis(d, "about its {} axis", "about its axis {}")
             words = f"{d.sensor} turned by {turn}{seen}"
         case "translation":
             along = f"along {{}} of {d.frame}"

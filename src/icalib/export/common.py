@@ -46,8 +46,8 @@ def lens_of(c: Calibration, name: str, program: str, held: Sequence[str]) -> Len
         target = camera_model("pinhole-radtan" if model.startswith("pinhole") else "pinhole-equidistant")
         params, rms, most = fit_model(camera_model(model), params, target, (width, height))
         sentence = (
-            f"{program} has no {model}: {name} is given as the nearest {target.name}, {rms:.2f} px RMS away over the "
-            f"image, {most:.1f} px at most."
+            f"{program} has no {model}: {name} is given as the nearest {target.name}, which differs by "
+            f"{rms:.2f} px RMS over the image, {most:.1f} px at most."
         )
         model = target.name
     return Lens(model, params[:4].tolist(), params[4:].tolist(), (width, height), sentence)
@@ -86,7 +86,7 @@ def guesses(c: Calibration, names: Sequence[str]) -> tuple[str, ...]:
             if verdict == "undetermined"
         ]
         if open_:
-            found.append(f"{name}: {', '.join(open_)} was not determined by the data; what stands here is the guess.")
+            found.append(f"{name}: {', '.join(open_)} was not determined by the data; the file has its initial guess.")
     return tuple(found)
 
 
@@ -101,8 +101,8 @@ def time_offset(c: Calibration, name: str) -> float:
     """Seconds. Raises CalibrationError where the sensor's clock restarts: what it will be next time nobody knows."""
     if restarts(c, name):
         raise CalibrationError(
-            f"the clock of {name} restarts, and each recording has a time offset of its own, while this format needs "
-            "the one that will be; export to ros2-static, camera-info, urdf or json, or calibrate one recording alone."
+            f"the clock of {name} restarts, so each recording has its own time offset, but this format needs "
+            "one. Export to ros2-static, camera-info, urdf or json, or calibrate one recording alone."
         )
     return float(c.group(name, "time_offset").value[0])
 

@@ -42,7 +42,7 @@ def no_parallax(rig: Rig, recordings: Sequence[Measurements]) -> EstimationError
         return None
     return EstimationError(
         f"{name}: the tracked points move as in a pure rotation (parallax {np.rad2deg(parallax):.2g} deg, "
-        f"noise {np.rad2deg(error):.2g} deg), so the translation of the rig is unobservable; move it by a "
+        f"noise {np.rad2deg(error):.2g} deg), so its translation is unobservable. Move the rig by a "
         "tenth of the distance to the scene or more, and turn it about all axes."
     )
 

@@ -124,7 +124,7 @@ def _refuse_two_frames(
     degrees = ", ".join(f"{angle:.0f}" for angle in Rotation.from_matrix(C).as_euler("xyz", degrees=True))
     raise EstimationError(
         f"the positions and rotations of {stream.name} are in different frames, for example one with z up and "
-        "the other with y  "
+        "the other with y "
         + (
             f"up; set position_axes of {stream.name} to {axes} in the rig file."
             if axes

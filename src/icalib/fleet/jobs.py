@@ -68,7 +68,8 @@ def _name(value: YamlValue) -> str:
     text = value.text()
     if not _NAME.fullmatch(text):
         value.fail(
-            f"is the name of a folder: letters, digits, _, - and dots, 100 at most, but is {value.shown()}; rename it."
+            "must be a valid folder name (letters, digits, _, - and dots, 100 at most), but is "
+            f"{value.shown()}; rename it."
         )
     return text
 
@@ -87,6 +88,4 @@ def _refuse_twins(jobs: tuple[Job, ...], values: list[YamlValue]) -> None:
     for k, job in enumerate(jobs):
         first = seen.setdefault(job.name.casefold(), k)
         if first != k:
-            values[k].fail(
-                f"this job and {values[first].field} are both called {job.name}; give each a name of its own."
-            )
+            values[k].fail(f"this job and {values[first].field} are both called {job.name}; give each its own name.")

@@ -43,7 +43,7 @@ def run_fleet(
     a sentence on what was reached.
     """
     if not (isfinite(limit) and limit > 0.0):
-        raise CalibrationError(f"a change counts from a number of sigmas above 0 on, not {limit:g}; the usual is 3.")
+        raise CalibrationError(f"the limit must be above 0 sigma, not {limit:g}; the usual limit is 3.")
     jobs, store = load_jobs(path), Store(Path(output))
     with alone(store.folder):
         refuse_foreign(store.folder / name for name in (TABLE, PAGE))
@@ -60,7 +60,7 @@ def _fleet(
     inputs = {job.name: Inputs.of(job) for job in jobs}
     done, again = to_do(store, inputs)
     for name, why in again.items():
-        say(f"{name} is done again: {why}.")
+        say(f"{name} is calibrated again: {why}.")
     tasks = [Task(job, inputs[job.name]) for job in jobs if job.name not in done]
     for task in tasks:
         refuse_foreign_set(store.place(task.job.name), [task.job.rig, *task.job.recordings])
@@ -90,7 +90,5 @@ def _do(tasks: list[Task], store: Store, crew: Crew, total: int, progress: Progr
                 progress(f"{before + len(found)} of {total} jobs", len(found) / len(tasks))
     except KeyboardInterrupt:
         kept = before + sum(r.inputs is not None for r in found.values())
-        raise KeyboardInterrupt(
-            f"{kept} of {total} jobs are in {store.folder}; the same command goes on from there."
-        ) from None
+        raise KeyboardInterrupt(f"{kept} of {total} jobs are in {store.folder}; the same command resumes.") from None
     return found

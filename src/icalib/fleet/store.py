@@ -41,9 +41,7 @@ class Store:
         try:
             record = from_json(read_file(place, RECORD))
         except (ValueError, KeyError, TypeError) as error:
-            raise CalibrationError(
-                f"{place / RECORD} is damaged; delete it, and the job will be done again."
-            ) from error
+            raise CalibrationError(f"{place / RECORD} is damaged; delete it to run the job again.") from error
         return record if not record.blocks or (place / "result.json").exists() else None
 
     def add(self, outcome: Outcome) -> None:

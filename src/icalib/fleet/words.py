@@ -29,8 +29,8 @@ def chance_words(fleet: Fleet) -> str:
     judged = sum(d.judged for d in fleet.drifts)
     changes = sum(len(d.changes) for d in fleet.drifts)
     return (
-        f"{changes} of {judged} comparisons are beyond {fleet.limit:g} sigma, where chance alone leaves about "
-        f"{digits(fleet.by_chance)}."
+        f"{changes} of {judged} comparisons exceed {fleet.limit:g} sigma; about {digits(fleet.by_chance)} are "
+        "expected by chance."
     )
 
 

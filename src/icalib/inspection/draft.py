@@ -33,8 +33,8 @@ target:
   type: aprilgrid
   rows:         # tags in a column
   cols:         # tags in a row
-  tag_size:     # edge of a tag, from black border to black border, m: 0.088 is 88 mm
-  tag_spacing:  # gap between two tags, divided by tag_size
+  tag_size:     # edge of the black square of a tag, m: 0.088 is 88 mm
+  tag_spacing:  # gap between tags over tag_size
 # Other targets, in place of the lines above:
 #   target: {type: charuco, squares_x: , squares_y: , square_size: , marker_size: , dictionary: 5x5_100}
 #   target: {type: checkerboard, rows: , cols: , square_size: }  # rows and cols of INNER corners

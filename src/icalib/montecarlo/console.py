@@ -44,7 +44,7 @@ def table(found: Consistency) -> Table:
     out = Table(
         title="Consistency", title_justify="left", caption_justify="left", box=SIMPLE_HEAD, padding=0, show_edge=False
     )
-    out.caption = "NEES: per degree of freedom, 1 where the covariance is honest. Undetermined entries do not count."
+    out.caption = "NEES: per degree of freedom, 1 for a consistent covariance. Undetermined entries are excluded."
     for header in HEADERS:
         justify = "right" if header in NUMBERS else "left"
         out.add_column(header, justify=justify, no_wrap=header not in IN_TWO_LINES, overflow="fold")

@@ -35,8 +35,9 @@ def study_html(found: Consistency, identity: Identity, records: Sequence[Record]
     """The whole page; `records` for the NEES of each run."""
     sections = [
         element("h2", "Blocks"), blocks_table(found),
-        element("p", "Sampled / predicted: square roots of the least and the largest eigenvalue of the sampled against "
-                "the predicted covariance; by chance: where these lie in 95 of 100 studies of an honest covariance."),
+        element("p", "Sampled / predicted: square roots of the smallest and the largest eigenvalue of the sampled "
+            "covariance relative to the predicted one; by chance: the range of these in 95 of 100 studies of a "
+            "consistent covariance."),
         element("p", largest_words(found)),
         element("h2", "Mean NEES"), plot_place("nees"),
         *_undetermined(found),
@@ -94,7 +95,7 @@ def _undetermined(found: Consistency) -> list[Html]:
 
 def _residuals(found: Consistency) -> Html:
     sizes = [element("h3", "chi2 per post-fit degree of freedom"), table(MEAN, map(mean_cells, found.sizes))]
-    lags = [element("h3", "Correlation with the next in time"), table(MEAN, map(mean_cells, found.lag1))]
+    lags = [element("h3", "Correlation with the next one in time"), table(MEAN, map(mean_cells, found.lag1))]
     return element("div", [element("section", sizes), element("section", lags)], "grid")
 
 

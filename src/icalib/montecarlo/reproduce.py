@@ -57,7 +57,7 @@ def write_figures(output: Path, studies: dict[str, Study]) -> None:
             sections.append(plot_place(name))
         if drawn:
             write_whole(output / _picture(motion), sealed(png(drawn, MOTIONS[motion])))
-    words = "Error (lines) and 3 sigma (dashed) at the solver's iterations, from guesses drawn about the truth."
+    words = "Error (lines) and 3 sigma (dashed) at the iterations of the solver, from guesses drawn about the truth."
     write_whole(output / PAGE, sealed(page("Monte-Carlo runs of the paper", words, sections, figures).encode()))
 
 

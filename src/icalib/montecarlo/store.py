@@ -34,8 +34,8 @@ class Identity:
 
 _CHANGED = {
     "scenario_sha256": "the scenario changed",
-    "guess": "their first guess is another",
-    "planes": "planes are known in one and found in the other",
+    "guess": "their initial guess differs",
+    "planes": "planes are known in one study and found in the other",
     "program": "icalib changed",
     "versions": "Python or a library changed",
 }
@@ -71,7 +71,7 @@ class Store:
         try:
             return from_json(path.read_bytes())
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise CalibrationError(f"{path} is damaged; delete it, and the run will be made again.") from error
+            raise CalibrationError(f"{path} is damaged; delete it to make the run again.") from error
 
     def _file(self, seed: int) -> Path:
         return self.folder / RUNS / f"{seed:06d}.json"

@@ -41,7 +41,7 @@ class Plan:
 
     def __post_init__(self) -> None:
         if self.runs < 1:
-            raise CalibrationError(f"a study needs at least 1 run, but {self.runs} were asked for.")
+            raise CalibrationError(f"{self.runs} runs were asked for, but a study needs at least 1; correct --runs.")
         Crew(self.workers, self.scheduler)  # refuses what makes no sense
 
 
@@ -110,8 +110,7 @@ def _fill(store: Store, scenario: Scenario, seeds: range, plan: Plan, progress: 
                 progress(_words(done + made, seeds), made / len(missing))
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
-            f"{sum(s in store for s in seeds)} of {len(seeds)} runs are in {store.folder}; the same command "
-            "goes on from there."
+            f"{sum(s in store for s in seeds)} of {len(seeds)} runs are in {store.folder}; the same command resumes."
         ) from None
     return lost
 

@@ -60,7 +60,7 @@ def answer(found: Consistency) -> str:
     by_chance = (1.0 - PROBABILITY) * len(counted)
     inside = f"{len(counted) - len(out)} of {len(counted)} blocks have their mean NEES within its 95 % bounds"
     named = f"; outside: {', '.join(out)}" if out else ""
-    return f"{inside}, where chance alone leaves {by_chance:.1f} outside{named}."
+    return f"{inside}; {by_chance:.1f} are expected outside by chance{named}."
 
 
 def largest_words(found: Consistency) -> str:
@@ -70,15 +70,15 @@ def largest_words(found: Consistency) -> str:
         return "No number was determined in any run."
     share = "less than 1" if one.chance < 0.01 else f"at most {100 * one.chance:.0f}"
     return (
-        f"The largest error of {one.numbers} numbers is {one.sigmas:.1f} standard deviations ({one.entry}, seed "
-        f"{one.seed}); chance alone reaches that in {share} of 100 studies like this."
+        f"The largest error of {one.numbers} numbers is {one.sigmas:.1f} standard deviations ({one.entry}, "
+        f"seed {one.seed}); by chance alone {share} of 100 studies would reach it."
     )
 
 
 def failures_words(found: Consistency) -> str:
     if not found.failures:
         return f"All {found.runs} runs reached a result."
-    return f"{len(found.failures)} of {found.runs} runs failed, and count for nothing else here."
+    return f"{len(found.failures)} of {found.runs} runs failed, and are excluded from the rest of this page."
 
 
 def undetermined_words(found: Consistency) -> list[str]:

@@ -37,9 +37,7 @@ def open_all(given: Source | Sequence[Source], start_s: float = 0.0, end_s: floa
             path = Path(source).resolve()
             found[path.name if names[path.name] == 1 else str(path)] = open_recording(source, start_s, end_s)
         elif (start_s, end_s) != (0.0, inf):
-            raise RecordingError(
-                "a recording that is open already has its part; give start_s and end_s to open_recording."
-            )
+            raise RecordingError("start_s and end_s do not apply to an opened recording; give them to open_recording.")
         else:
             found[f"recording {k}"] = source
     return found

@@ -62,15 +62,15 @@ def _rig(root: YamlValue) -> Rig:
     targeted = "target" in found or "targets" in found
     if blind and not targeted:
         root.fail(
-            "target is missing; add target, targets for several by name, or tracks (images, or a table of tracks) to "
-            f"{' and '.join(blind)}."
+            "target is missing; add target, targets for several by name, or tracks (images, or a table of "
+            f"tracks) of {' and '.join(blind)}."
         )
     _refuse_unseen_ground(found["sensors"], sensors, targeted)
     settings = _settings(found["settings"]) if "settings" in found else Settings()
     followed = any(c.tracks is not None for c in sensors.cameras)
     if settings.points_on_planes_m > 0.0 and not (sensors.lidars and followed):
         found["settings"].entries()["points_on_planes_m"].fail(
-            "needs a LiDAR that sees planes, and a camera with tracks that follows points on them; take it out."
+            "needs a LiDAR that sees planes, and a camera with feature tracks; remove it."
         )
     return Rig(
         imu=sensors.imus[0] if sensors.imus else None,
@@ -171,7 +171,10 @@ def _refuse_clocks_of_nothing(value: YamlValue, found: _Sensors, body: str) -> N
     for sensor in (*found.cameras, *found.poses):
         if sensor.clock_restarts and (sensor.name == body or not timed):
             value.entries()[sensor.name].entries()["clock_restarts"].fail(
-                f"without an IMU the clock of {body} is that of all others; say it of those, or write false."
+                (
+                    f"without an IMU the clock of {body} is the reference clock; set clock_restarts of the other "
+                    "sensors instead, or write false."
+                )
                 if timed
                 else "cameras alone have no time offsets; remove it, or add a sensor of type: imu."
             )
@@ -184,10 +187,11 @@ def _refuse_unseen_ground(value: YamlValue, found: _Sensors, targeted: bool) -> 
             continue
         field = value.entries()[wheels.name].entries()["ground"].entries()
         if wheels.ground.plane == "floor" and not found.lidars:
-            field["plane"].fail("the floor is what a LiDAR sees, and there is none; write level.")
+            field["plane"].fail("a LiDAR determines the floor, and there is none; write level.")
         if wheels.ground.plane == "level" and wheels.knows_height and not targeted:
             field["height_sigma"].fail(
-                "heights are counted from the target, and there is none; remove it, or with a LiDAR write plane: floor."
+                "the height is relative to the target, and there is none; remove it, or with a LiDAR write "
+                "plane: floor."
             )
 
 

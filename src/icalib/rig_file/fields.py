@@ -24,7 +24,7 @@ def mounting(found: dict[str, YamlValue]) -> dict[str, Any]:
         groups["clock_restarts"] = found["clock_restarts"].boolean()
         if groups["clock_restarts"] and "time_offset" in groups and groups["time_offset"].mode == "fixed":
             found["clock_restarts"].fail(
-                "each recording has a time offset of its own, but time_offset is fixed; leave out one of them."
+                "each recording has its own time offset, but time_offset is fixed; remove one of them."
             )
     return groups
 
@@ -44,8 +44,8 @@ def axes_or_none(found: dict[str, YamlValue], name: str) -> Axes | None:
     entries = [entry.text() for entry in found[name].items()]
     if len(entries) != 3 or sorted(e.removeprefix("-") for e in entries) != ["x", "y", "z"]:
         found[name].fail(
-            "must name the columns that become x, y and z, each once, with - where a sign is wrong, as in [x, -y, -z]; "
-            "correct it."
+            "must name the columns that become x, y and z, each once, with - for a reversed sign, as in [x, "
+            "-y, -z]; correct it."
         )
     return entries[0], entries[1], entries[2]
 
@@ -60,7 +60,7 @@ def table_layout(found: dict[str, YamlValue]) -> TableLayout:
         return PLAIN_TABLE
     columns = tuple(item.text() for item in found["columns"].items()) if "columns" in found else ()
     if "columns" in found and len(set(columns)) < max(len(columns), 1):
-        found["columns"].fail("must name columns of the table, each once.")
+        found["columns"].fail("must name columns of the table, each once; correct it.")
     return TableLayout(columns, choice_or(found, "time_unit", TimeUnit, None))
 
 

@@ -42,7 +42,7 @@ def _point_time(found: dict[str, YamlValue]) -> PointTime:
     chosen = choice_or(found, "point_time", PointTime, Lidar.point_time)
     for name in ("point_time_field", "point_time_unit"):
         if name in found and chosen in ("azimuth", "snapshot"):
-            found[name].fail(f"point_time: {chosen} uses no times of points; leave out {name}, or point_time.")
+            found[name].fail(f"point_time: {chosen} uses no point times; remove {name}, or point_time.")
     return chosen
 
 

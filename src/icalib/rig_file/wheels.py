@@ -103,7 +103,9 @@ def _refuse_other_measures(value: YamlValue, found: dict[str, YamlValue], bare: 
                 "measures."
             )
     if bare.measures == "ticks" and "counts_per_turn" not in found:
-        value.fail("counts_per_turn is missing; add how many ticks one turn of the wheel has, gears included.")
+        value.fail(
+            "counts_per_turn is missing; add the number of ticks per turn of the wheel, including the gear ratio."
+        )
     if bare.drive != "differential" and bare.measures not in _TURNED:
         found["drive"].fail(f"goes with wheels that measure {' or '.join(_TURNED)}; remove it, or correct measures.")
     for name, kinds in _ONLY_OF_KIND.items():
@@ -118,9 +120,9 @@ def _refuse_other_measures(value: YamlValue, found: dict[str, YamlValue], bare: 
 def _refuse_factor(found: dict[str, YamlValue], bare: Wheels) -> None:
     given = found["factor"].text() if "factor" in found else None
     if bare.measures == "poses" and given == "increments":
-        found["factor"].fail("increments cannot be had from relative poses; write relative-poses.")
+        found["factor"].fail("relative poses have no increments of wheels; write relative-poses.")
     if bare.kind != "pair" and given == "relative-poses":
-        found["factor"].fail("the paper's relative-poses are of a left and a right wheel; write increments.")
+        found["factor"].fail("relative-poses (the paper's factor) needs a left and a right wheel; write increments.")
 
 
 def _refuse_negative_lengths(found: dict[str, YamlValue], groups: dict[str, Parameter]) -> None:
@@ -134,7 +136,7 @@ def _signs(value: YamlValue, drive: WheelDrive) -> tuple[int, ...]:
     signs = [item.number() for item in value.items()]
     counts, words = _JOINTS[drive]
     if len(signs) not in counts or any(abs(s) != 1.0 for s in signs):
-        value.fail(f"must be 1 or -1 for each of {words}.")
+        value.fail(f"must be 1 or -1 for each of {words}; correct it.")
     return tuple(int(s) for s in signs)
 
 
@@ -142,17 +144,17 @@ def _joints(value: YamlValue, drive: WheelDrive) -> tuple[str, ...]:
     names = tuple(item.text() for item in value.items())
     counts, words = _JOINTS[drive]
     if len(names) not in counts or len(set(names)) < len(names):
-        value.fail(f"must be the names of {words}.")
+        value.fail(f"must be the names of {words}; correct it.")
     return names
 
 
 def _ground(value: YamlValue) -> Ground:
     found = value.record(("plane",), _GROUND)
     if "tilt_noise" not in found and "height_sigma" not in found:
-        value.fail("says nothing yet; add tilt_noise (rad), or height and height_sigma (m), or both.")
+        value.fail("has no effect; add tilt_noise (rad), or height and height_sigma (m), or both.")
     for name in ("height", "bump_noise"):
         if name in found and "height_sigma" not in found:
-            found[name].fail("goes with height_sigma, how well the height is known (m); add it.")
+            found[name].fail("needs height_sigma, the uncertainty of the height (m); add it.")
     return Ground(
         choice_or(found, "plane", GroundPlane, "level"),
         tilt_noise=found["tilt_noise"].positive() if "tilt_noise" in found else None,

@@ -61,13 +61,13 @@ class Clock:
 def span_of(c: Calibration, recording: FilePath) -> RecordingSpan:
     """The recording of the result that lies at a path. Raises CalibrationError where it is none of them."""
     if not c.recordings:
-        raise CalibrationError("the result does not say when its recording was; calibrate again to see both.")
+        raise CalibrationError("the result does not tell the time of its recording; calibrate again to see both.")
     path = recording.resolve()
     named = [span for span in c.recordings if span.name in (path.name, str(path))]
     if len(c.recordings) == 1 or named:
         return (named or c.recordings)[0]
     names = ", ".join(span.name for span in c.recordings)
-    raise CalibrationError(f"{recording} is none of the recordings of the result, which are {names}; give one of them.")
+    raise CalibrationError(f"{recording} is not a recording of the result, which has {names}; give one of them.")
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,9 @@ class Recorded:
         work = [(sensor.name, lambda x=sensor: self._readings(s, x)) for sensor in imus]
         work += [(sensor.name, lambda x=sensor: self._scans(s, x)) for sensor in self.rig.lidars]
         work += [(name, lambda n=name, t=topic: self._images(s, n, t)) for name, topic in topics.items()]
-        notes = [f"{c.name}: the recording holds no images of it." for c in self.rig.cameras if c.name not in topics]
+        notes = [
+            f"{c.name}: the recording holds no images of this camera." for c in self.rig.cameras if c.name not in topics
+        ]
         for k, (name, do) in enumerate(work):
             progress(f"showing {name}", k / len(work))
             notes += do()
@@ -120,8 +122,8 @@ class Recorded:
         inside = np.flatnonzero(self._clock(sensor).within(seconds))
         if not len(inside):
             raise RecordingError(
-                f"{self.where} holds nothing of {sensor} from the time of the result; give the recording "
-                f"{self.span.name}, of which the result is."
+                f"{self.where} holds no data of {sensor} from the time of the result; give the recording "
+                f"{self.span.name}, from which the result was computed."
             )
         return inside
 
@@ -149,7 +151,7 @@ class Recorded:
                 continue
             s.at(f"{place(self.calibration, name)}/image", float(_instant(clock, payload.stamp_ns)[0]), image)
             shown += 1
-        notes = [f"{name}: {damaged} images are damaged, and not shown."] if damaged else []
+        notes = [f"{name}: {damaged} damaged images are not shown."] if damaged else []
         return notes + _thinned(name, count, MOST_IMAGES, "images")
 
     def _scans(self, s: Stream, sensor: Lidar) -> list[str]:
@@ -195,4 +197,4 @@ def _stride(count: int, most: int) -> int:
 
 def _thinned(name: str, count: int, most: int, what: str) -> list[str]:
     stride = _stride(count, most)
-    return [f"{name}: of its {count} {what} one in {stride} is shown."] if stride > 1 else []
+    return [f"{name}: one in {stride} of its {count} {what} is shown."] if stride > 1 else []
