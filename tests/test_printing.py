@@ -150,7 +150,7 @@ def test_the_same_target_gives_the_same_file():
             "713 x 713 mm, but a4 has space for 194 x 265 mm, or in landscape for 281 x 178",
         ),
         (AprilGrid(6, 6, 0.088, 0.3), "a3", "choose a0, or make the target smaller."),
-        (Checkerboard(6, 9, 0.2), "a0", "on its side for 1173 x 809 mm; make the target smaller."),
+        (Checkerboard(6, 9, 0.2), "a0", "in landscape for 1173 x 809 mm; make the target smaller."),
         (Checkerboard(6, 9, 0.02), "a5", "no paper 'a5'; available are a4, letter"),
     ],
 )

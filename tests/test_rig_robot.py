@@ -75,7 +75,7 @@ def test_the_field_and_the_unit_of_point_times(tmp_path):
     again = load(tmp_path, yaml.safe_dump(rig_to_dict(rig), sort_keys=False))
     assert again.lidars[0].point_time_field == "laser_usec" and again.lidars[0].point_time_unit == "us"
     both = complaint(tmp_path, timed.replace("point_time_unit: us", "point_time: snapshot"))
-    assert "lidar0.point_time_field: point_time: snapshot uses no times of points; leave out point_time_field" in both
+    assert "lidar0.point_time_field: point_time: snapshot uses no point times; remove point_time_field" in both
     unit = complaint(tmp_path, timed.replace("point_time_unit: us", "point_time_unit: min"))
     assert "sensors.lidar0.point_time_unit: there is no such choice as 'min'; available are s, ms, us, ns" in unit
 
@@ -170,7 +170,7 @@ def test_without_an_imu_a_pose_sensor_shows_the_motion(tmp_path):
     assert load(tmp_path, mocap + "  slam0: {type: pose, kind: relative}\n").imu is None
     assert "sensors.mocap0: is the only sensor; add the sensors to calibrate" in complaint(tmp_path, mocap)
     relative = mocap.replace("pose}", "pose, kind: relative}")
-    assert "sensors.mocap0: without camera and IMU it has to show" in complaint(tmp_path, relative + wheels)
+    assert "sensors.mocap0: without camera and IMU this sensor must determine" in complaint(tmp_path, relative + wheels)
 
 
 def test_clocks_that_restart(tmp_path):
@@ -183,7 +183,7 @@ def test_clocks_that_restart(tmp_path):
     again = load(tmp_path, yaml.safe_dump(rig_to_dict(rig), sort_keys=False))
     assert [s.clock_restarts for s in (*again.lidars, *again.wheels, *again.poses)] == [True, True, False]
     fixed = complaint(tmp_path, lines.replace("{guess: 0.1}", "{fixed: 0.1}"))
-    assert "wheel0.clock_restarts: each recording has a time offset of its own, but time_offset is fixed" in fixed
+    assert "wheel0.clock_restarts: each recording has its own time offset, but time_offset is fixed" in fixed
     first = "sensors:\n  mocap0: {type: pose, clock_restarts: true}\n  wheel0: {type: wheels}\n"
     assert "mocap0.clock_restarts: without an IMU the clock of mocap0" in complaint(tmp_path, first)
     camera = "cam0: {type: camera, model: pinhole-radtan, resolution: [752, 480], clock_restarts: true}"
@@ -232,7 +232,11 @@ def test_plain_lidars_and_wheels_load_back(tmp_path):
         ("[0.1, 0.11]", "[0.1]", "sensors.wheel0.radii.prior: must be a list of 2 numbers"),
         ("{guess: 0.4}", "{guess: 0}", "sensors.wheel0.baseline: is in metres and must be above 0"),
         ("wheel_noise: 0.01", "wheel_noise: -1", "sensors.wheel0.wheel_noise: must be above 0"),
-        ("    counts_per_turn: 4096.5\n", "", "rig.yaml:14: sensors.wheel0: counts_per_turn is missing; add how many"),
+        (
+            "    counts_per_turn: 4096.5\n",
+            "",
+            "rig.yaml:14: sensors.wheel0: counts_per_turn is missing; add the number of ticks",
+        ),
         ("measures: ticks", "measures: angles", "wheel0.counts_per_turn: belongs to wheels that measure ticks, not an"),
         (
             "measures: ticks",
@@ -350,11 +354,11 @@ def test_kinds_of_wheels_are_read_and_load_back(tmp_path):
         (", tilt_noise: 0.01}", ", tilt_noise: 0.01, height: 1}", "ground.height: needs height_sigma"),
         ("plane: floor, tilt", "plane: ceiling, tilt", "ground.plane: there is no such choice as 'ceiling'; available"),
         ("tilt_noise: 0.01", "tilt_noise: 0", "ground.tilt_noise: must be above 0"),
-        ("  lidar0: {type: lidar}\n", "  mocap0: {type: pose}\n", "ground.plane: the floor is what a LiDAR sees, and"),
+        ("  lidar0: {type: lidar}\n", "  mocap0: {type: pose}\n", "ground.plane: a LiDAR determines the floor, and"),
         (
             "plane: floor, height",
             "plane: level, height",
-            "ground.height_sigma: heights are counted from the target, an",
+            "ground.height_sigma: the height is relative to the target, an",
         ),
     ],
 )
@@ -386,5 +390,5 @@ def test_points_on_planes_need_a_lidar_and_tracks(tmp_path):
     assert load(tmp_path, imu + lidar + followed + wanted).settings.points_on_planes_m == 0.01
     for text in (imu + lidar + wanted, imu + followed + wanted):
         words = complaint(tmp_path, text)
-        assert "settings.points_on_planes_m: needs a LiDAR that sees planes, and a camera with tracks" in words
+        assert "settings.points_on_planes_m: needs a LiDAR that sees planes, and a camera with feature tracks" in words
     assert "must be 0 or above" in complaint(tmp_path, imu + lidar + followed + wanted.replace("0.01", "-1"))

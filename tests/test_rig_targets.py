@@ -89,9 +89,12 @@ ONE_BIT = GRID.replace("}", ", border_bits: 1}")
         (f"target: {TAGS.replace('52', '47')}", "target: tag 47 is listed twice"),
         (f"target: {TAGS.replace('52', '587')}", "target: needs 588 tags, but tag36h11 has 587"),
         (f"target: {TAGS.replace('52', '-1')}", "target.ids[2]: must be a whole number of at least 0"),
-        (f"target: {TAGS.replace('[50, 47, 52]', '[]')}", "target.ids: there are no ids; list them, or leave ids out"),
+        (
+            f"target: {TAGS.replace('[50, 47, 52]', '[]')}",
+            "target.ids: the list of ids is empty; list them, or remove ids",
+        ),
         (f"target: {TAGS.replace('[50, 47, 52]', '50')}", "target.ids: must be a list"),
-        (f"target: {TAGS.replace('0.16', '16')}", "target.size: is in metres, and 16 m is no tag"),
+        (f"target: {TAGS.replace('0.16', '16')}", "target.size: is in metres, and 16 m is too large for a tag"),
         (
             f"target: {TAGS.replace('tag36h11', 'tag36h12')}",
             "target.family: there is no family of tags 'tag36h12'",

@@ -50,7 +50,7 @@ def read_file(folder: Path, name: str) -> bytes:
     for path in (*committed, folder / name):
         with contextlib.suppress(FileNotFoundError), _errors_named(path, "read"):
             return path.read_bytes()
-    raise CalibrationError(f"{folder} has no {name}; give the folder that a calibration was written to.")
+    raise CalibrationError(f"{folder} holds no {name}; give the folder that a calibration was written to.")
 
 
 def finish_writing(folder: Path) -> None:

@@ -67,7 +67,7 @@ def _ordered(sensors: Sequence[_Named], streams: Sequence[T], where: str) -> tup
     for name in by_name:
         if name not in known:
             raise RecordingError(
-                f"{where} has a stream called {name}, but the rig has {' and '.join(known) or 'none'} of this "
+                f"{where} has a stream called {name}, but the rig has {' and '.join(known) or 'none'} of its "
                 "kind; give it the sensor's name, or add the sensor to the rig."
             )
     if len(by_name) < len(streams):

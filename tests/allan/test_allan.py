@@ -230,7 +230,7 @@ def touched(imu: ImuStream, at_s: float, tilt: float) -> ImuStream:
 def test_what_was_touched_is_left_out(seed: int):
     imu = touched(touched(at_rest(60.0, 100.0, seed), 20.3, 0.05), 38.9, -0.02)
     study = study_imu(imu, "here")
-    assert "imu0 was moved or touched; of 60 s the 3 longest stretches without are used" in study.warnings[0]
+    assert "imu0 was moved or touched; only the 3 longest stretches at rest of 60 s are used" in study.warnings[0]
     assert 35.0 < study.seconds < 50.0
     for sensor, white in ((study.gyro, TRUTH["gyro"]), (study.accel, TRUTH["accel"])):
         assert abs(sensor.together.white - white) < 4.0 * sensor.together.white_std < 0.15 * white
@@ -308,7 +308,7 @@ def test_a_long_gap_is_not_filled():
     still = still_readings(dataclasses.replace(imu, stamps_ns=stamps))
     assert [len(part) for part in still.stretches] == [12_000, 18_000] and still.period == pytest.approx(0.01)
     assert (
-        "or has gaps of more than a second; of 300 s the 2 longest stretches without are used, 300 s in all"
+        "or has gaps of more than a second; only the 2 longest stretches at rest of 300 s are used, 300 s in total"
         in (still.warnings[0])
     )
 

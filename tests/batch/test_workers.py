@@ -20,7 +20,7 @@ def test_a_task_that_kills_its_workers_is_given_up_and_takes_no_other_with_it():
     assert found == {
         killer: Lost("its worker died 4 times at this task; give it more memory."),
         "int('x')": Lost(
-            "its worker cannot do it (ValueError: invalid literal for int() with base 10: 'x'); "
+            "its worker failed to run it (ValueError: invalid literal for int() with base 10: 'x'); "
             "install the same icalib everywhere."
         ),
     }

@@ -89,7 +89,7 @@ jobs:
         ("jobs: [{name: .., robot: a, rig: rig.yaml, recording: r}]", r"jobs\[0\].name: must be a valid folder name"),
         (
             "defaults: {rig: rig.yaml}\njobs:\n- {robot: a, recording: r}\n- {name: A-R, robot: b, recording: r}",
-            r"JOBS.yaml:4: jobs\[1\]: this job and jobs\[0\] are both called A-R; give each a name of its own",
+            r"JOBS.yaml:4: jobs\[1\]: this job and jobs\[0\] are both called A-R; give each its own name",
         ),
     ],
 )

@@ -96,9 +96,7 @@ class Recorded:
         work = [(sensor.name, lambda x=sensor: self._readings(s, x)) for sensor in imus]
         work += [(sensor.name, lambda x=sensor: self._scans(s, x)) for sensor in self.rig.lidars]
         work += [(name, lambda n=name, t=topic: self._images(s, n, t)) for name, topic in topics.items()]
-        notes = [
-            f"{c.name}: the recording holds no images of this camera." for c in self.rig.cameras if c.name not in topics
-        ]
+        notes = [f"{c.name}: the recording holds no images of it." for c in self.rig.cameras if c.name not in topics]
         for k, (name, do) in enumerate(work):
             progress(f"showing {name}", k / len(work))
             notes += do()
