@@ -63,6 +63,8 @@ LEVELS = {
     "fleet": 9,
     "check": 9,
     "progress": 9,
+    "command_parser": 2,
+    "target_command": 10,
     "result_commands": 10,
     "cli": 11,
     "__main__": 12,

@@ -229,7 +229,7 @@ def test_the_command_refuses_in_one_line_and_writes_nothing(tmp_path: Path, caps
         ("markers --family tag36h11 --size 0.1 --ids x -o x.pdf", "must be a whole number, but is 'x'"),
         ("markers --family tag36h11 --size 0.1 --ids 5-3 -o x.pdf", "as in 0-11 or 0,3,7, but is '5-3'"),
         ("markers --family tag36h11 --size 0.1 -o x.pdf", "--ids"),
-        ("board", "invalid choice"),
+        ("board", "there is no 'board'; available are aprilgrid"),
     ],
 )
 def test_wrong_usage_is_named(arguments: str, words: str, capsys: pytest.CaptureFixture[str]):

@@ -10,10 +10,10 @@ import warnings
 from math import inf
 from pathlib import Path
 
+from icalib.command_parser import CommandParser, count, examples, sentence, whole
 from icalib.errors import CalibrationError
 from icalib.result_commands import add_result_commands
-
-_MOST_IDS = 10_000  # more than any family has
+from icalib.target_command import add_target_command
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -46,7 +46,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _outside(error: OSError | MemoryError) -> str:
     if isinstance(error, MemoryError):
-        return "the memory of this machine is not enough; use --from and --to, or a machine with more."
+        return "the memory of this machine is not enough; use a part with --from and --to, or a larger machine."
     place = f"{error.filename} cannot be used: " if error.filename else ""
     return f"{place}{error.strerror or error}; check files, permissions and disks."
 
@@ -63,27 +63,50 @@ def _fault(error: Exception) -> str:
 def _parser() -> argparse.ArgumentParser:
     from icalib import __version__
 
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="icalib",
         description="Calibrates cameras, LiDARs, wheels, pose sensors and an IMU jointly, from recordings.",
+        epilog=examples(
+            "icalib inspect run.bag --target aprilgrid.yaml --rig rig.yaml",
+            "icalib calibrate rig.yaml run.bag --output result",
+            "icalib COMMAND --help",
+        ),
     )
     parser.add_argument("--version", action="version", version=f"icalib {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    c = commands.add_parser("calibrate", help="calibrate the sensors of a rig from one recording or several")
+    about = "calibrate the sensors of a rig from one recording or several"
+    epilog = examples(
+        "icalib calibrate rig.yaml run.bag --output result",
+        "icalib calibrate rig.yaml monday.bag friday.bag -o result --from 5 --to 65 --strict",
+    )
+    c = commands.add_parser("calibrate", help=about, description=sentence(about), epilog=epilog)
     c.add_argument("rig", type=Path, help="rig file (rig.yaml)")
-    several = "folder of the recording, or bag; several of one rig are solved jointly"
+    several = "bag or folder of the recording; several of one rig are solved jointly"
     c.add_argument("recording", type=Path, nargs="+", help=several)
-    c.add_argument("--output", "-o", type=Path, required=True, help="folder for the results; made if it does not exist")
+    c.add_argument("--output", "-o", type=Path, required=True, help="folder for the results; created if absent")
     _add_part(c)
-    c.add_argument("--scheme", choices=("inertial", "pose", "kinematic"), help="where sensors are between nodes")
-    c.add_argument("--loss", choices=("none", "huber", "cauchy"), help="robust loss on corners")
-    c.add_argument("--segments", type=int, metavar="N", help="segments for the empirical factor; 0: none")
-    strict = "exit code 3: usable with care, 4: partly usable, 5: not usable; by default 0 for all that was written"
+    c.add_argument(
+        "--scheme",
+        choices=("inertial", "pose", "kinematic"),
+        help="interpolation of poses between keyframes; default: that of the rig file, or inertial",
+    )
+    c.add_argument(
+        "--loss",
+        choices=("none", "huber", "cauchy"),
+        help="robust loss on corners; default: that of the rig file, or huber",
+    )
+    c.add_argument(
+        "--segments",
+        type=int,
+        metavar="N",
+        help="segments for the empirical factor, 0: none; default: those of the rig file, or 8",
+    )
+    strict = "exit code 3: usable with care, 4: partly usable, 5: not usable; default: 0 for every written result"
     c.add_argument("--strict", action="store_true", help=strict)
-    c.add_argument("--quiet", "-q", action="store_true", help="no progress bar and no table; warnings go to stderr")
+    c.add_argument("--quiet", "-q", action="store_true", help="print no progress and no table; warnings go to stderr")
     c.set_defaults(run=_calibrate)
     _add_inspect(commands)
-    _add_target(commands)
+    add_target_command(commands)
     _add_simulate(commands)
     _add_montecarlo(commands)
     _add_fleet(commands)
@@ -91,147 +114,92 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_inspect(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    c = commands.add_parser("inspect", help="say what is in a recording, and whether it can be calibrated")
-    c.add_argument("recording", type=Path, help="folder of the recording, or bag")
-    c.add_argument("--rig", type=Path, metavar="FILE", help="write a draft of the rig file; never over another file")
-    c.add_argument("--target", type=Path, metavar="FILE", help="YAML of the target, or a rig file: look for it")
-    c.add_argument("--json", type=Path, metavar="FILE", help="write the figures as JSON")
+def _add_inspect(commands: argparse._SubParsersAction[CommandParser]) -> None:
+    about = "show what is in a recording, whether it can be calibrated, and draft its rig file"
+    epilog = examples(
+        "icalib inspect run.bag",
+        "icalib inspect run.bag --target aprilgrid.yaml --rig rig.yaml",
+    )
+    c = commands.add_parser("inspect", help=about, description=sentence(about), epilog=epilog)
+    c.add_argument("recording", type=Path, help="bag or folder of the recording")
+    c.add_argument("--rig", type=Path, metavar="FILE", help="write a draft of the rig file; never overwrites a file")
+    target = "YAML of the target, or a rig file: search the images for this target; default: not searched"
+    c.add_argument("--target", type=Path, metavar="FILE", help=target)
+    c.add_argument("--json", type=Path, metavar="FILE", help="write the results of the inspection as JSON")
     _add_part(c)
-    c.add_argument("--quiet", "-q", action="store_true", help="no progress bar and no table")
+    c.add_argument("--quiet", "-q", action="store_true", help="print no progress and no table")
     c.set_defaults(run=_inspect)
 
 
 def _add_part(parser: argparse.ArgumentParser) -> None:
     """Which part of a recording is used."""
-    start = "use the recording from here on, in seconds from its start; by default all"
+    start = "use the recording from here on, in seconds from its start; default: 0"
     parser.add_argument("--from", type=float, default=0.0, metavar="SECONDS", dest="start_s", help=start)
-    parser.add_argument("--to", type=float, default=inf, metavar="SECONDS", dest="end_s", help="and up to here")
+    parser.add_argument(
+        "--to", type=float, default=inf, metavar="SECONDS", dest="end_s", help="use it up to here; default: its end"
+    )
 
 
-def _add_simulate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    c = commands.add_parser("simulate", help="make a recording whose truth is known")
+def _add_simulate(commands: argparse._SubParsersAction[CommandParser]) -> None:
+    about = "simulate a recording with known truth"
+    epilog = examples(
+        "icalib simulate scenario.yaml --output run",
+        "icalib simulate scenario.yaml -o run.bag --level sensor --seed 7",
+    )
+    c = commands.add_parser("simulate", help=about, description=sentence(about), epilog=epilog)
     c.add_argument("scenario", type=Path, help="scenario file (scenario.yaml)")
-    c.add_argument("--output", "-o", type=Path, required=True, help="where the recording goes; must not exist yet")
-    c.add_argument("--seed", type=_whole, metavar="N", help="of motion and noise; by default the scenario's")
-    levels = "data: tables of what is estimated from; sensor: a bag of what drivers send (.bag: ROS 1, else ROS 2)"
+    c.add_argument("--output", "-o", type=Path, required=True, help="path of the recording; must not exist yet")
+    c.add_argument("--seed", type=whole, metavar="N", help="seed of motion and noise; default: that of the scenario")
+    levels = "data (default): tables; sensor: a bag of messages as drivers send them (.bag: ROS 1, else ROS 2)"
     c.add_argument("--level", choices=("data", "sensor"), default="data", help=levels)
-    c.add_argument("--quiet", "-q", action="store_true", help="no progress bar and no last line")
+    c.add_argument("--quiet", "-q", action="store_true", help="print no progress and no summary")
     c.set_defaults(run=_simulate)
 
 
-def _add_montecarlo(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    c = commands.add_parser("montecarlo", help="calibrate many simulated recordings, and judge the standard deviations")
+def _add_montecarlo(commands: argparse._SubParsersAction[CommandParser]) -> None:
+    about = "calibrate many simulated recordings, and compare their errors with the standard deviations"
+    epilog = examples("icalib montecarlo scenario.yaml --runs 100 --output study")
+    c = commands.add_parser("montecarlo", help=about, description=sentence(about), epilog=epilog)
     c.add_argument("scenario", type=Path, help="scenario file (scenario.yaml)")
-    c.add_argument("--runs", type=_count, required=True, metavar="N", help="in all; those that are there already count")
-    folder = "folder for runs and results; a study that was stopped goes on from what it holds"
+    runs = "number of runs in total, including those that the folder already has"
+    c.add_argument("--runs", type=count, required=True, metavar="N", help=runs)
+    folder = "folder for runs and results; the same command resumes an interrupted study"
     c.add_argument("--output", "-o", type=Path, required=True, help=folder)
-    c.add_argument("--seed", type=_whole, metavar="N", help="of the first run; by default the scenario's")
-    c.add_argument("--guess", choices=("none", "drawn"), default="none", help="drawn: about the truth; by default none")
-    planes = "that LiDARs see, known as simulated, or found in their clouds; by default known"
+    c.add_argument("--seed", type=whole, metavar="N", help="seed of the first run; default: that of the scenario")
+    guess = "initial guess: none (default), or drawn about the truth"
+    c.add_argument("--guess", choices=("none", "drawn"), default="none", help=guess)
+    planes = "planes of the LiDARs: known (default) from the simulation, or found in the clouds"
     c.add_argument("--planes", choices=("known", "found"), default="known", help=planes)
     _add_workers(c)
     c.set_defaults(run=_montecarlo)
-    r = commands.add_parser("reproduce", help="the paper's simulation again: errors against iterations, and a table")
-    r.add_argument("--runs", type=_count, default=6, metavar="N", help="of each motion; figures show the first six")
+    about = "reproduce the simulation of the paper: errors over iterations, and a table"
+    epilog = examples("icalib reproduce --output paper")
+    r = commands.add_parser("reproduce", help=about, description=sentence(about), epilog=epilog)
+    runs = "number of runs of each motion, of which figures show the first six; default: 6"
+    r.add_argument("--runs", type=count, default=6, metavar="N", help=runs)
     r.add_argument("--output", "-o", type=Path, required=True, help="folder for runs, figures and table")
     _add_workers(r)
     r.set_defaults(run=_reproduce)
 
 
-def _add_fleet(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    c = commands.add_parser("fleet", help="calibrate many recordings of many robots, and say what changed over time")
-    c.add_argument("jobs", type=Path, help="file of jobs (JOBS.yaml)")
-    folder = "folder for the results; jobs that are there already are not done again unless their inputs changed"
+def _add_fleet(commands: argparse._SubParsersAction[CommandParser]) -> None:
+    about = "calibrate many recordings of many robots, and show what changed over time"
+    epilog = examples("icalib fleet jobs.yaml --output fleet", "icalib fleet jobs.yaml -o fleet --workers 4 --sigma 4")
+    c = commands.add_parser("fleet", help=about, description=sentence(about), epilog=epilog)
+    c.add_argument("jobs", type=Path, help="YAML file of jobs")
+    folder = "folder for the results; finished jobs run again only if their inputs changed"
     c.add_argument("--output", "-o", type=Path, required=True, help=folder)
-    c.add_argument("--sigma", type=float, default=3.0, metavar="N", help="changes up to it do not count; by default 3")
+    sigma = "report changes beyond N sigma; default: 3"
+    c.add_argument("--sigma", type=float, default=3.0, metavar="N", help=sigma)
     _add_workers(c)
     c.set_defaults(run=_fleet)
 
 
 def _add_workers(parser: argparse.ArgumentParser) -> None:
     who = parser.add_mutually_exclusive_group()
-    who.add_argument("--workers", type=_count, metavar="N", help="processes on this machine; by default one a core")
-    who.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster that does the work")
-    parser.add_argument("--quiet", "-q", action="store_true", help="no progress bar and no table")
-
-
-def _add_target(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """`icalib target TYPE`: its options are the fields of the rig file's target."""
-    from icalib.printing import PAPERS
-
-    t = commands.add_parser("target", help="print a target to PDF, at true scale")
-    types = t.add_subparsers(required=True, metavar="TYPE", dest="type")
-    fields = {
-        "aprilgrid": {"rows": _count, "cols": _count, "tag_size": _metres, "tag_spacing": _metres},
-        "charuco": {
-            "squares_x": _count, "squares_y": _count, "square_size": _metres, "marker_size": _metres, "dictionary": str
-        },
-        "checkerboard": {"rows": _count, "cols": _count, "square_size": _metres},
-        "circles": {"rows": _count, "cols": _count, "spacing": _metres, "diameter": _metres},
-        "markers": {"family": str, "size": _metres, "ids": _ids},
-        "tag": {"family": str, "id": _whole, "size": _metres},
-    }  # fmt: skip
-    for name, options in fields.items():
-        one = types.add_parser(name, help=f"{name}, with the fields of the rig file")
-        for field, kind in options.items():
-            unit = {_metres: "METRES", _count: "N", _whole: "N", _ids: "0-11 or 0,3,7"}.get(kind, "NAME")
-            one.add_argument(
-                f"--{field.replace('_', '-')}",
-                type=kind,
-                required=True,
-                metavar="RATIO" if field == "tag_spacing" else unit,
-            )
-        if name == "circles":
-            one.add_argument("--asymmetric", action="store_true", help="every other row moved by one spacing")
-            options = options | {"asymmetric": bool}
-        elif name != "checkerboard":
-            one.add_argument("--border-bits", type=_count, metavar="N", help="width of the tags' black border")
-        one.add_argument("--paper", choices=tuple(PAPERS), default="a4")
-        one.add_argument("--output", "-o", type=Path, required=True, metavar="FILE.pdf")
-        one.set_defaults(run=_print_target, fields=tuple(options))
-
-
-def _whole(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"must be a whole number, but is {text!r}")
-    return int(text)
-
-
-def _count(text: str) -> int:
-    if _whole(text) == 0:
-        raise argparse.ArgumentTypeError("must be at least 1, but is 0")
-    return int(text)
-
-
-def _ids(text: str) -> tuple[int, ...]:
-    """Ids and ranges of ids, separated by commas."""
-    ids: list[int] = []
-    for part in text.split(","):
-        first, _, last = part.partition("-")
-        ids += range(_whole(first), _whole(last or first) + 1)
-    if not ids or len(ids) > _MOST_IDS:
-        raise argparse.ArgumentTypeError(f"must be 1 to {_MOST_IDS} ids, as in 0-11 or 0,3,7, but is {text!r}")
-    return tuple(ids)
-
-
-def _metres(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"must be a number above 0, but is {text!r}")
-    return value
-
-
-def _print_target(options: argparse.Namespace) -> None:
-    from icalib.geometry.targets import TARGETS
-    from icalib.printing import write_target
-
-    target = TARGETS[options.type](**{field: getattr(options, field) for field in options.fields})
-    write_target(options.output, target, options.paper, getattr(options, "border_bits", None))
-    print(f"{options.output}: print at 100 %, and measure the ruler.")
+    who.add_argument("--workers", type=count, metavar="N", help="processes on this machine; default: one per core")
+    who.add_argument("--scheduler", metavar="ADDRESS", help="scheduler of a Dask cluster; default: this machine")
+    parser.add_argument("--quiet", "-q", action="store_true", help="print no progress and no table")
 
 
 def _calibrate(options: argparse.Namespace) -> int:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +18,7 @@ from icalib.calibration.verdict import NEXT, Usability
 from icalib.export.kalibr import camchain_name
 from icalib.report.console import bodies_words, relative_words, table
 
+LINE_EVERY_S = 30.0  # between lines of progress in logs
 VERDICT_STYLES: dict[Usability, str] = {
     "usable": "bold green",
     "usable with care": "bold yellow",
@@ -26,10 +29,13 @@ VERDICT_STYLES: dict[Usability, str] = {
 
 @contextmanager
 def progress_bar(quiet: bool) -> Iterator[Callable[[str, float], None]]:
-    """A bar on standard error with the time left; nothing where that is no terminal, or `quiet`."""
+    """A bar on standard error with the time left; if that is not a terminal, a line every 30 s; nothing if `quiet`."""
     console = Console(stderr=True)
-    if quiet or not console.is_terminal:
+    if quiet:
         yield lambda stage, done: None
+        return
+    if not console.is_terminal:
+        yield progress_lines(time.monotonic)
         return
     columns = (
         TextColumn("{task.description}"),
@@ -41,6 +47,20 @@ def progress_bar(quiet: bool) -> Iterator[Callable[[str, float], None]]:
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("starting", total=1.0)
         yield lambda stage, done: bar.update(task, description=stage, completed=done)
+
+
+def progress_lines(clock: Callable[[], float]) -> Callable[[str, float], None]:
+    """Prints stage and share of the work on standard error, at most every 30 s of `clock` [s], for logs and pipes."""
+    begin = last = clock()
+
+    def show(stage: str, done: float) -> None:
+        nonlocal last
+        now = clock()
+        if now - last >= LINE_EVERY_S:
+            last = now
+            print(f"icalib: {stage}, {done:.0%} after {now - begin:.0f} s", file=sys.stderr, flush=True)
+
+    return show
 
 
 def print_result(calibration: Calibration, folder: Path) -> None:

@@ -7,10 +7,11 @@ from math import inf
 from pathlib import Path
 from typing import get_args
 
+from icalib.command_parser import CommandParser, examples, sentence
 from icalib.rig import AccelUnit, GyroUnit
 
 
-def add_result_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_result_commands(commands: argparse._SubParsersAction[CommandParser]) -> None:
     """Adds the parsers to those of the other commands."""
     _add_allan(commands)
     _add_check(commands)
@@ -20,15 +21,19 @@ def add_result_commands(commands: argparse._SubParsersAction[argparse.ArgumentPa
     _add_view(commands)
 
 
-def _add_allan(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    c = commands.add_parser("allan", help="noise densities and bias walks of an IMU, from a recording of it at rest")
-    c.add_argument("recording", type=Path, help="folder of the recording, or bag: hours of an IMU that stands still")
-    c.add_argument("--imu", metavar="TOPIC", help="topic or table of the IMU; by default the only one")
-    c.add_argument("--gyro-unit", choices=get_args(GyroUnit), help="unit of its angular rates; by default rad/s")
-    accel = "unit of its accelerations; by default m/s^2, or g where gravity shows it"
+def _add_allan(commands: argparse._SubParsersAction[CommandParser]) -> None:
+    about = "estimate noise densities and bias walks of an IMU from a recording at rest"
+    epilog = examples("icalib allan rest.bag --output noise", "icalib allan rest.bag --imu /imu/data -o noise")
+    c = commands.add_parser("allan", help=about, description=sentence(about), epilog=epilog)
+    c.add_argument("recording", type=Path, help="bag or folder of the recording: hours of an IMU at rest")
+    c.add_argument("--imu", metavar="TOPIC", help="topic or table of the IMU; default: the only one")
+    c.add_argument("--gyro-unit", choices=get_args(GyroUnit), help="unit of its angular rates; default: rad/s")
+    accel = "unit of its accelerations; default: m/s^2, or g if gravity shows it"
     c.add_argument("--accel-unit", choices=get_args(AccelUnit), help=accel)
-    c.add_argument("--output", "-o", type=Path, required=True, help="folder for plot, figures and rig file fields")
-    c.add_argument("--quiet", "-q", action="store_true", help="no table")
+    c.add_argument(
+        "--output", "-o", type=Path, required=True, help="folder for plot, figures and the fields of the rig file"
+    )
+    c.add_argument("--quiet", "-q", action="store_true", help="print no table")
     c.set_defaults(run=_allan)
 
 
@@ -45,20 +50,25 @@ def _allan(options: argparse.Namespace) -> None:
         print(f"Wrote {options.output / 'allan.html'}, allan.json and noise.yaml.")
 
 
-def _add_export(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _add_export(commands: argparse._SubParsersAction[CommandParser]) -> None:
     from icalib.export.names import FORMATS, FRAMED, ONE_FILE
 
-    c = commands.add_parser("export", help="a result as files of other programs")
+    about = "write a result as files of other programs"
+    epilog = examples(
+        "icalib export result --to kalibr --output kalibr",
+        "icalib export result --to urdf --urdf robot.urdf -o robot.urdf --frame cam0=camera_link",
+    )
+    c = commands.add_parser("export", help=about, description=sentence(about), epilog=epilog)
     c.add_argument("result", type=Path, help="folder that a calibration was written to")
-    c.add_argument("--to", required=True, choices=FORMATS, help="whose files")
+    c.add_argument("--to", required=True, choices=FORMATS, help="format of the files")
     where = f"folder for the files; for {', '.join(ONE_FILE)} the file itself"
     c.add_argument("--output", "-o", type=Path, required=True, metavar="PATH", help=where)
-    c.add_argument("--urdf", type=Path, metavar="FILE", help="existing URDF: set the origins of its joints")
+    c.add_argument("--urdf", type=Path, metavar="FILE", help="existing URDF, of which to set the origins of joints")
     frame = f"name of a sensor's frame or link, where it is not the sensor's ({', '.join(FRAMED)}); may be repeated"
     c.add_argument("--frame", type=_pair, action="append", default=[], metavar="SENSOR=FRAME", help=frame)
-    joint = "joint to set in --urdf, by default the one right above the sensor's link; may be repeated"
+    joint = "joint to set in --urdf; default: the one directly above the sensor's link; may be repeated"
     c.add_argument("--joint", type=_pair, action="append", default=[], metavar="SENSOR=JOINT", help=joint)
-    c.add_argument("--quiet", "-q", action="store_true", help="do not say what the format cannot hold")
+    c.add_argument("--quiet", "-q", action="store_true", help="do not print what the format cannot hold")
     c.set_defaults(run=_export)
 
 
@@ -93,19 +103,22 @@ def _export(options: argparse.Namespace) -> None:
         print(f"Wrote {', '.join(str(folder / name) for name in files)}.")
 
 
-def _add_check(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    about = "whether a calibration is still valid on a new recording; exit code 0: valid, 1: changed, 2: an error, 3: "
-    about += "the new recording is too poor to say"
-    c = commands.add_parser("check", help=about, description=about[0].upper() + about[1:] + ".")
+def _add_check(commands: argparse._SubParsersAction[CommandParser]) -> None:
+    about = "check whether a calibration is still valid on a new recording"
+    codes = "Exit code 0: valid, 1: changed, 2: an error, 3: the new recording is too poor to decide."
+    epilog = examples("icalib check result new.bag", "icalib check result new.bag --sigma 4 --json check.json")
+    c = commands.add_parser("check", help=about, description=f"{sentence(about)}\n{codes}", epilog=epilog)
     c.add_argument("result", type=Path, help="folder that a calibration was written to")
-    c.add_argument("recording", type=Path, nargs="+", help="folder of a new recording of the same rig, or bag")
-    part = "use each recording from here on, in seconds from its start; by default all"
+    c.add_argument("recording", type=Path, nargs="+", help="bag or folder of a new recording of the same rig")
+    part = "use each recording from here on, in seconds from its start; default: 0"
     c.add_argument("--from", type=float, default=0.0, metavar="SECONDS", dest="start_s", help=part)
-    c.add_argument("--to", type=float, default=inf, metavar="SECONDS", dest="end_s", help="and up to here")
-    sigma = "changes that chance makes as rarely as N sigma do not count; by default 3"
+    c.add_argument(
+        "--to", type=float, default=inf, metavar="SECONDS", dest="end_s", help="use it up to here; default: its end"
+    )
+    sigma = "ignore changes that chance explains up to N sigma; default: 3"
     c.add_argument("--sigma", type=float, default=3.0, metavar="N", help=sigma)
-    c.add_argument("--json", type=Path, metavar="FILE", help="write residuals, drifts and verdict as JSON")
-    c.add_argument("--quiet", "-q", action="store_true", help="print nothing; the exit code says it")
+    c.add_argument("--json", type=Path, metavar="FILE", help="write residuals, drift and verdict as JSON")
+    c.add_argument("--quiet", "-q", action="store_true", help="print nothing; use the exit code")
     c.set_defaults(run=_check, error_code=2)
 
 
@@ -131,13 +144,15 @@ def _check(options: argparse.Namespace) -> int:
     return found.exit_code
 
 
-def _add_rig(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    c = commands.add_parser("rig", help="the rig file of a result, with its values fixed, as priors or as guesses")
+def _add_rig(commands: argparse._SubParsersAction[CommandParser]) -> None:
+    about = "write a result as a rig file, with its values fixed, as priors or as guesses"
+    epilog = examples("icalib rig result --as prior --output rig.yaml")
+    c = commands.add_parser("rig", help=about, description=sentence(about), epilog=epilog)
     c.add_argument("result", type=Path, help="folder that a calibration was written to")
-    how = "fixed at their values, priors with the sigma of the result, or guesses to start from"
+    how = "fixed at the values, priors with the sigma of the result, or guesses to start from"
     c.add_argument("--as", dest="treatment", required=True, choices=("fixed", "prior", "guess"), help=how)
     c.add_argument("--output", "-o", type=Path, required=True, metavar="FILE", help="rig file to write")
-    c.add_argument("--quiet", "-q", action="store_true", help="do not say what could not be taken as asked")
+    c.add_argument("--quiet", "-q", action="store_true", help="do not print which values could not be written as asked")
     c.set_defaults(run=_rig)
 
 
@@ -159,19 +174,23 @@ def _rig(options: argparse.Namespace) -> None:
         print(f"Wrote {options.output}.")
 
 
-def _add_compare(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _add_compare(commands: argparse._SubParsersAction[CommandParser]) -> None:
     kinds = "folder of a result, Kalibr camchain or imu file, URDF, or rig file with typed values"
-    about = "what changed from A to B, in words; exit code 0: the same, 1: something differs, 2: an error"
-    c = commands.add_parser("compare", help=about, description=about[0].upper() + about[1:] + ".")
+    about = "show what changed between two calibrations, or other files of them"
+    codes = "Exit code 0: the same, 1: something differs, 2: an error."
+    epilog = examples(
+        "icalib compare monday friday", "icalib compare cad.urdf result --tolerance mm=2 --tolerance deg=0.2"
+    )
+    c = commands.add_parser("compare", help=about, description=f"{sentence(about)}\n{codes}", epilog=epilog)
     c.add_argument("a", type=Path, metavar="A", help=kinds)
     c.add_argument("b", type=Path, metavar="B", help="the same")
-    tolerance = "differences up to it do not count: deg, mm, ms, px or percent; may be repeated, as in deg=0.1"
+    tolerance = "ignore differences up to this value, in deg, mm, ms, px or percent, as deg=0.1; may be repeated"
     c.add_argument("--tolerance", type=_tolerance, action="append", default=[], metavar="UNIT=VALUE", help=tolerance)
-    c.add_argument("--sigma", type=float, default=3.0, metavar="N", help="nor those up to N sigma; by default 3")
-    frame = "name in B of a sensor of A, or its link in a URDF, where it is another; may be repeated"
+    c.add_argument("--sigma", type=float, default=3.0, metavar="N", help="ignore differences up to N sigma; default: 3")
+    frame = "name in B of a sensor of A (in a URDF its link), if it differs; may be repeated"
     c.add_argument("--frame", type=_pair, action="append", default=[], metavar="SENSOR=NAME", help=frame)
     c.add_argument("--json", type=Path, metavar="FILE", help="write the differences as JSON")
-    c.add_argument("--quiet", "-q", action="store_true", help="print nothing; the exit code says it")
+    c.add_argument("--quiet", "-q", action="store_true", help="print nothing; use the exit code")
     c.set_defaults(run=_compare, error_code=2)
 
 
@@ -210,13 +229,15 @@ def _compare(options: argparse.Namespace) -> int:
     return 0 if found.same else 1
 
 
-def _add_view(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    c = commands.add_parser("view", help="a result, and the recording that it is of, in 3D over time, in Rerun")
+def _add_view(commands: argparse._SubParsersAction[CommandParser]) -> None:
+    about = "show a result and its recording in 3D over time, in Rerun"
+    epilog = examples("icalib view result run.bag", "icalib view result --save result.rrd")
+    c = commands.add_parser("view", help=about, description=sentence(about), epilog=epilog)
     c.add_argument("result", type=Path, help="folder that a calibration was written to, or the result.json in it")
     c.add_argument("recording", type=Path, nargs="?", help="the recording of the result, or one of them")
-    file = "write a file that Rerun opens, instead of starting its viewer"
+    file = "write a file for Rerun; default: start its viewer"
     c.add_argument("--save", type=Path, metavar="FILE.rrd", help=file)
-    c.add_argument("--quiet", "-q", action="store_true", help="no progress bar, and do not say what is left out")
+    c.add_argument("--quiet", "-q", action="store_true", help="print no progress, and not what is left out")
     c.set_defaults(run=_view)
 
 

@@ -124,11 +124,11 @@ def test_the_wrong_layout_is_named(legacy):
             {"squares_x": 8, "squares_y": 6},
             "squares_y and squares_x are swapped; write squares_y: 8, squares_x: 6",
         ),
-        (CHARUCO, {"squares_x": 7}, "with squares_x: 6, not 7; correct squares_y and squares_x"),
-        (replace(CHARUCO, legacy=True), {"squares_x": 5, "squares_y": 7}, "with squares_x: 6, not 5"),
+        (CHARUCO, {"squares_x": 7}, "matches squares_x: 6, not 7; correct squares_y and squares_x"),
+        (replace(CHARUCO, legacy=True), {"squares_x": 5, "squares_y": 7}, "matches squares_x: 6, not 5"),
         (replace(CHARUCO, inverted=True), {"squares_x": 8, "squares_y": 6}, "swapped"),
         (GRID, {"rows": 4, "cols": 3}, "rows and cols are swapped; write rows: 3, cols: 4"),
-        (GRID, {"rows": 3, "cols": 5}, "with cols: 4, not 5; correct rows and cols"),
+        (GRID, {"rows": 3, "cols": 5}, "matches cols: 4, not 5; correct rows and cols"),
     ],
 )
 def test_swapped_and_wrong_rows_of_tags_are_named(board, wrong, words):
@@ -159,7 +159,7 @@ def test_a_long_board_of_which_a_part_is_seen(board, wrong):
 def test_no_layout_is_named_that_the_tags_in_sight_do_not_tell_from_others():
     image = rendered(AprilGrid(1, 30, 0.05, 0.3))
     sentence = other_columns([image], AprilGrid(6, 5, 0.05, 0.3))
-    assert sentence == "the tags do not stand as on a board with cols: 5; correct rows and cols."
+    assert sentence == "the layout of the tags does not match cols: 5; correct rows and cols."
 
 
 @pytest.mark.parametrize(("rows", "cols"), [(6, 9), (9, 6), (5, 7)])

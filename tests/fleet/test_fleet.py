@@ -167,7 +167,7 @@ def test_damaged_files_are_named(fleet_folder: Path, workshop):
     assert "result.npz is truncated" in found.drifts[0].notes[0] and found.drifted == ()
     for content in (b"", b"{}", b'{"format": 1}', b"[]"):
         (place / "fleet-job.json").write_bytes(content)
-        with pytest.raises(CalibrationError, match=r"fleet-job\.json is damaged; delete it, and the job will be done"):
+        with pytest.raises(CalibrationError, match=r"fleet-job\.json is damaged; delete it to run the job again"):
             fleet(fleet_folder)
 
 

@@ -281,7 +281,7 @@ def test_nothing_is_overwritten(made, bags, brief, tmp_path, capsys):
     assert main(["inspect", str(bag), "--rig", str(path)]) == 1
     captured = capsys.readouterr()
     assert captured.out == ""
-    assert captured.err.count("\n") == 1 and "rig.yaml exists and is left as it is; give another name" in captured.err
+    assert captured.err.count("\n") == 1 and "rig.yaml exists and was not changed; give another name" in captured.err
     assert not (tmp_path / "nowhere").exists() and (made == "link" or path.read_text() == "mine")
 
 

@@ -40,7 +40,7 @@ def test_frames_are_listed(arm, tmp_path, capsys):
     found = {f"{f.parent} {f.child}": f for f in inspect_recording(arm).frames}
     assert list(found) == ["base upper", "cart base", "flange finger", "flange tool", "upper flange"]
     assert [f.moves for f in found.values()] == [True, False, False, False, True]
-    assert "frames of /arm/tf are placed on the cameras" in inspect_recording(arm).findings[0].sentence
+    assert "frames of /arm/tf are aligned to the cameras" in inspect_recording(arm).findings[0].sentence
     assert [f.count for f in found.values()] == [50, 1, 50, 1, 50]
     assert (found["base upper"].rate_hz, found["cart base"].rate_hz) == (50.0, None)
     path = tmp_path / "figures.json"

@@ -117,7 +117,7 @@ class TestTarget:
             ("{target_type: circlegrid}", r"target\.yaml: targetRows must be a number above 0"),
             (
                 "{target_type: circlegrid, targetRows: 5, targetCols: 4, spacingMeters: 0.05, asymmetricGrid: true}",
-                r"target\.yaml: Kalibr's file lacks the diameter of the circles, .*; measure it and write `target: "
+                r"target\.yaml: the circle grid of Kalibr's file has no diameter, .*; measure it and write `target: "
                 r"\{type: circles, rows: 5, cols: 4, spacing: 0\.05, diameter: ..., asymmetric: true\}` in the rig",
             ),
             ("- 1", r"target\.yaml:1: must be a mapping"),
@@ -214,7 +214,7 @@ def example() -> Inspection:
     ("change", "words"),
     [
         ({"seen": 20}, "cam1 sees the target in 20 images, too few"),
-        ({"images": 2900}, r"cam1 sees the target in 720 of 2900 images \(25%\): keep it in view"),
+        ({"images": 2900}, r"cam1 sees the target in 720 of 2900 images \(25%\); keep it in view"),
         ({"tilt_deg": (1.0, 2.0, 3.0)}, r"cam1 sees the target nearly from the front only \(tilts up to about 3 deg\)"),
         ({"cells": ((0,) * 8, *((1,) * 8,) * 4)}, "cam1 never sees the target at the top edge of the image"),
         ({"problem": "cam1 is broken."}, "cam1 is broken"),
@@ -246,7 +246,7 @@ class TestStreams:
         assert (camera.rate_hz, imu.rate_hz) == pytest.approx((20.0, 200.0))
         assert camera.first_ns == bags.origin_ns
         assert found.verdict == "yes, but"  # it is short
-        assert any("The IMU ran for 3.0 s: record for 30 to 90 s." in s for s in sentences(found, "warning")), (
+        assert any("The IMU ran for 3.0 s; record for 30 to 90 s." in s for s in sentences(found, "warning")), (
             found.findings
         )
 
@@ -277,7 +277,7 @@ class TestStreams:
         if together:
             messages = [(*m[:2], m[2] + 10**18, m[3]) for m in messages]
         found = self.inspected(bags, tmp_path, bags.noise("/cam0/image_raw") + messages)
-        (sentence,) = (s for s in sentences(found) if "The clocks of cam0 and imu0 do not overlap" in s)
+        (sentence,) = (s for s in sentences(found) if "The stamps of cam0 and imu0 do not overlap" in s)
         assert "11574.1 days apart" in sentence
         assert ("received together" in sentence) == together
 
@@ -326,7 +326,7 @@ class TestStreams:
     def test_slow_and_few_images(self, bags, brief, tmp_path):
         slow = [m for k, m in enumerate(bags.noise("/cam0/image_raw")) if k % 10 == 0]
         found = self.inspected(bags, tmp_path, slow + bags.imu("/imu0", brief))
-        assert any("cam0 has 5 images, too few: record" in s for s in sentences(found, "problem")), found.findings
+        assert any("cam0 has 5 images, too few; record" in s for s in sentences(found, "problem")), found.findings
         pixels = np.random.default_rng(0).integers(0, 255, (30, 4, 4), dtype=np.uint8)
         slow = [bags.image("/c/image", bags.origin_ns + k * 60 * STEP, p) for k, p in enumerate(pixels)]
         found = inspect_recording(bags.write(tmp_path / "slow", slow + bags.imu("/imu0", brief)))

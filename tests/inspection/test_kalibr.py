@@ -125,7 +125,7 @@ def test_checkerboard(tmp_path):
         (
             "grid",
             "{target_type: circlegrid, targetRows: 6, targetCols: 7, spacingMeters: 0.06, asymmetricGrid: false}",
-            r"diameter of the circles.*\{type: circles, rows: 6, cols: 7, spacing: 0.06, diameter: ...\}` in the",
+            r"file has no diameter.*\{type: circles, rows: 6, cols: 7, spacing: 0.06, diameter: ...\}` in the",
         ),
     ],
 )

@@ -11,7 +11,7 @@ from icalib.comparison.other_files import is_kalibr, side_of_kalibr, side_of_urd
 from icalib.comparison.results import side_of_result, side_of_rig
 from icalib.comparison.sides import Side
 from icalib.errors import CalibrationError, RigError
-from icalib.yaml_nodes import read_yaml
+from icalib.yaml_nodes import read_yaml, suggestion
 
 _XML = b"<"
 
@@ -60,7 +60,8 @@ def _renamed(a: Side, b: Side, frames: Mapping[str, str]) -> tuple[Side, Side]:
 
 def _check_known(name: str, side: Side) -> None:
     if name not in side.sensors:
-        raise CalibrationError(f"there is no sensor {name} in {side.path}; it has {', '.join(side.sensors)}.")
+        near = suggestion(name, tuple(side.sensors))
+        raise CalibrationError(f"there is no sensor {name} in {side.path}{near}; it has {', '.join(side.sensors)}.")
 
 
 def _side(path: Path) -> Side:

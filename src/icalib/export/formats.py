@@ -20,6 +20,7 @@ from icalib.export.plain import plain_json
 from icalib.export.ros import camera_info, ros2_static
 from icalib.export.urdf import updated_urdf, urdf
 from icalib.export.vins_fusion import vins_fusion
+from icalib.yaml_nodes import suggestion
 
 
 def export(
@@ -72,7 +73,8 @@ def _check(
     known = list(dict.fromkeys([c.body, *c.mounted]))
     for sensor in (*frames, *joints):
         if sensor not in known:
-            raise CalibrationError(f"there is no sensor {sensor}; this calibration has {', '.join(known)}.")
+            near = suggestion(sensor, tuple(known))
+            raise CalibrationError(f"there is no sensor {sensor}{near}; this calibration has {', '.join(known)}.")
 
 
 _PLAIN: dict[str, Callable[[Calibration], Export]] = {

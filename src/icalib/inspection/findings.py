@@ -86,7 +86,7 @@ def _unfit(found: Inspection, camera: CameraSource) -> str:
 def _fewest_images(found: Inspection) -> tuple[int, str]:
     """How many images `calibrate` asks of a camera, and how to get them."""
     if found.sources.imus or found.sources.wheels:
-        return FEWEST_IMAGES, "record for 30 to 90 s, with 10 to 30 images a second"
+        return FEWEST_IMAGES, "record for 30 to 90 s, with 10 to 30 images per second"
     return FEWEST_STILLS, "take 20 to 60 images of the target from all sides"
 
 
