@@ -330,7 +330,7 @@ class TestStreams:
         pixels = np.random.default_rng(0).integers(0, 255, (30, 4, 4), dtype=np.uint8)
         slow = [bags.image("/c/image", bags.origin_ns + k * 60 * STEP, p) for k, p in enumerate(pixels)]
         found = inspect_recording(bags.write(tmp_path / "slow", slow + bags.imu("/imu0", brief)))
-        assert any("c takes 0.33 images a second, too few" in s for s in sentences(found, "problem"))
+        assert any("c takes 0.33 images per second, too few" in s for s in sentences(found, "problem"))
 
 
 class TestNoRecording:
