@@ -313,7 +313,7 @@ def test_splits_of_one(tables, tmp_path, capsys):
     assert "--segments" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("stage", ["finding a first guess", "solving (final pass)", "writing"])
+@pytest.mark.parametrize("stage", ["estimating the initial guess", "solving (final pass)", "writing"])
 def test_an_interrupt_leaves_the_earlier_result(tables, tmp_path, capsys, monkeypatch, stage):
     import icalib.console
 

@@ -304,7 +304,7 @@ CHARUCO = "{type: charuco, squares_x: 7, squares_y: 5, square_size: 0.04, marker
         ("type: aprilgrid, ", "", "target: type is missing; add type: aprilgrid"),
         (TARGET, "{type: charuco, rows: 5}", "target.rows: there is no such field; available are type, squares_x"),
         (TARGET, CHARUCO.replace("0.03", "0.05"), "target: marker_size 0.05 does not fit a square of 0.04"),
-        (TARGET, CHARUCO.replace("5x5_100", "5x5_101"), "target.dictionary: there is no family of tags '5x5_101', did"),
+        (TARGET, CHARUCO.replace("5x5_100", "5x5_101"), "target.dictionary: there is no tag family '5x5_101', did"),
         (TARGET, CHARUCO.replace("7", "70"), "target: needs 175 tags, but 5x5_100 has 100"),
         (TARGET, CHARUCO.replace("7", "7.5"), "target.squares_x: must be a whole number of at least 1"),
         (TARGET, CHARUCO.replace("0.04", "40"), "target.square_size: is in metres, and 40 m is too large for a square"),

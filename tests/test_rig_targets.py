@@ -97,9 +97,9 @@ ONE_BIT = GRID.replace("}", ", border_bits: 1}")
         (f"target: {TAGS.replace('0.16', '16')}", "target.size: is in metres, and 16 m is too large for a tag"),
         (
             f"target: {TAGS.replace('tag36h11', 'tag36h12')}",
-            "target.family: there is no family of tags 'tag36h12'",
+            "target.family: there is no tag family 'tag36h12'",
         ),
-        (f"target: {TAGS.replace('tag36h11', 'tagStandard41h12')}", "no family of tags 'tagStandard41h12'"),
+        (f"target: {TAGS.replace('tag36h11', 'tagStandard41h12')}", "no tag family 'tagStandard41h12'"),
         (f"target: {TAGS.replace('family', 'dictionary')}", "target.dictionary: there is no such field"),
         (
             several(a=TAGS, b=TAGS.replace("50, 47", "51, 49")),

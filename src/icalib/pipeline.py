@@ -144,8 +144,8 @@ def calibrate_measurements(
             return _calibrate(rig, recordings, progress, on_visit)
         except (np.linalg.LinAlgError, OverflowError) as error:
             raise EstimationError(
-                f"the equations have no solution ({error}); a value in the recording or in the rig file is of "
-                "impossible size, or nothing in the recording moves: look at both by icalib inspect."
+                f"the equations have no solution ({error}). A value in the recording or in the rig file has an "
+                "implausible size, or nothing in the recording moves; check both with icalib inspect."
             ) from error
 
 
@@ -163,7 +163,7 @@ def _calibrate(
     rig: Rig, recordings: Sequence[Measurements], progress: Progress, on_visit: Callable[[Visited], None] | None
 ) -> Calibration:
     clock = _Clock()
-    progress("finding a first guess", 0.0)
+    progress("estimating the initial guess", 0.0)
     keep_apart()
     give_back()
     steps = _StepProgress(progress)
@@ -176,7 +176,7 @@ def _calibrate(
     if made.error is not None:
         raise EstimationError(" Besides, ".join(stated_words(made.inputs, c) for c in made.against)) from made.error
     clock.lap("solving")
-    progress("judging the result", 0.9)
+    progress("assessing the result", 0.9)
     result = assess(made.inputs, made.found, made.against)
     _refuse_no_numbers(result)
     clock.lap("judging")
@@ -188,8 +188,8 @@ def _refuse_no_numbers(result: Calibration) -> None:
     for group in result.groups:
         if not np.isfinite(group.value).all() or np.isnan(group.std).any():
             raise EstimationError(
-                f"{group.sensor}: {group.name} came out as no finite number; a value in the recording or in the rig "
-                "file is of impossible size: look at both by icalib inspect."
+                f"{group.sensor}: the estimate of {group.name} is not finite, because a value in the recording "
+                "or in the rig file has an implausible size; check both with icalib inspect."
             )
 
 

@@ -168,7 +168,7 @@ def test_cameras_that_follow_points_and_wheels_on_a_floor(seed, drive):
 
 
 @pytest.mark.parametrize(("example", "drive", "words"), [
-    ("ramp", "start", "shows the motion on a flat floor only"), ("planar", "free", "give its radii and baseline"),
+    ("ramp", "start", "determines the motion on a flat floor only"), ("planar", "free", "give its radii and baseline"),
 ])  # fmt: skip
 def test_what_wheels_do_not_show_to_cameras_that_follow_points(example, drive, words):
     rig, measurements, _ = followed_by_wheels(example, 1, drive)

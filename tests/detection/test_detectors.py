@@ -152,7 +152,7 @@ def test_a_symmetric_checkerboard_runs_to_the_right(rendering):
         (lambda: AprilGridDetector(30, 30, 0.3), r"30 x 30 tags needs more ids than tag36h11 has \(587\); check rows"),
         (
             lambda: AprilGridDetector(6, 6, 0.3, family="tag37"),
-            "no family of tags 'tag37', did you mean 'tag36h11'",
+            "no tag family 'tag37', did you mean 'tag36h11'",
         ),
         (lambda: CharucoDetector(20, 20, 0.7, "4x4_50"), "needs 200 markers and 4x4_50 has 50; check rows"),
         (lambda: CharucoDetector(5, 5, 1.2, "4x4_50"), "marker_ratio is 1.2; give the marker's edge divided"),

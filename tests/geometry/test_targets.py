@@ -155,7 +155,7 @@ def test_points_that_a_target_lacks(target: Target, tag_id: int, corner: int, wo
         (lambda: Charuco(20, 20, 0.04, 0.03, "5x5_100"), "needs 200 tags, but 5x5_100 has 100"),
         (
             lambda: Charuco(7, 5, 0.04, 0.03, "5x5"),
-            "no family of tags '5x5', did you mean '5x5_50'; available",
+            "no tag family '5x5', did you mean '5x5_50'; available",
         ),
         (lambda: Checkerboard(1, 5, 0.04), "1 x 5 inner corners cannot tell x from y"),
         (lambda: Tag("tag36h11", 587, 0.1), "needs 588 tags, but tag36h11 has 587"),
@@ -200,7 +200,7 @@ def test_spellings_of_one_family(text: str, name: str):
 
 @pytest.mark.parametrize("text", ["tagStandard41h12", "tagCircle21h7", "5x5", "", "36h12", "aruco_36h12"])
 def test_families_that_there_are_not(text: str):
-    with pytest.raises(RigError, match=f"no family of tags '{text}'.*; available are 4x4_50, .*tag36h11"):
+    with pytest.raises(RigError, match=f"no tag family '{text}'.*; available are 4x4_50, .*tag36h11"):
         family_name(text)
 
 

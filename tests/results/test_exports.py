@@ -447,7 +447,9 @@ def test_options_of_other_formats(calibration: Calibration, tmp_path: Path):
         export(calibration, "json", existing_urdf=tmp_path / "robot.urdf")
     with pytest.raises(CalibrationError, match="--joint names joints of an existing file; give it as --to urdf --urdf"):
         export(calibration, "urdf", joints={"cam0": "a"})
-    with pytest.raises(CalibrationError, match="there is no sensor cam9; this calibration has imu0, cam0, cam1."):
+    with pytest.raises(
+        CalibrationError, match="there is no sensor cam9, did you mean 'cam.'; this calibration has imu0, cam0, cam1."
+    ):
         export(calibration, "ros2-static", {"cam9": "left"})
 
 

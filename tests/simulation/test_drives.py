@@ -208,7 +208,7 @@ def test_parts_that_do_not_go_together_are_refused(robot):
     for change, words in (
         ({"room": None}, "need a room"),
         ({"motion": Drive("ramps")}, "needs hills"),
-        ({"motion": Drive("planar"), "room": hilly}, "on a flat floor"),
+        ({"motion": Drive("planar"), "room": hilly}, "needs a flat floor"),
         ({"wheels": rates}, "cannot roll"),
     ):
         with pytest.raises(RigError, match=words):

@@ -335,5 +335,5 @@ def test_an_aprilgrid_has_kalibrs_borders_and_corner_squares():
 
 
 def test_a_target_without_a_print_is_refused():
-    with pytest.raises(RigError, match="no print of a target of type half"):
+    with pytest.raises(RigError, match="cannot print targets of type half"):
         pattern_of(Half())

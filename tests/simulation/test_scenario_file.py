@@ -181,7 +181,7 @@ BAD = {
         ("radii: [0.1, 0]", "radii\\[1\\]: must be above 0"),
     ],
     "start_ns: 5000000000": [
-        ("start_ns: 9223372036854775807", "start_ns: the last stamp would not be below 2\\^63 ns"),
+        ("start_ns: 9223372036854775807", "start_ns: the last stamp would exceed 2\\^63 ns"),
         ("start_ns: 9999999999999999999", "start_ns: must be a whole number below 2\\^63"),
     ],
     " slip: 0.002": [(" slip: -0.002", "axle.slip: must be at least 0")],
@@ -193,11 +193,11 @@ BAD = {
     "size: [8, 7, 3]": [
         ("size: [8, 7]", "room.size: must be a list of 3 numbers"),
         ("size: [2, 2, 3]", "room: block 0 does not fit into the room"),
-        ("size: [8, 7, 3]\n  slope_deg: 10", "the motion planar is on a flat floor"),
+        ("size: [8, 7, 3]\n  slope_deg: 10", "the motion planar needs a flat floor"),
         ("size: [8, 7, 3]\n  slope_deg: 60", "room.slope_deg: must be at most 45 degrees, but is 60"),
     ],
     "share: 0.3": [("share: 1.3", "room.texture.share: must be at most 1, but is 1.3")],
-    "[1, 0.5]": [("[1, 0]", "images.gain_steps: each is \\[instant, gain\\], with a gain above 0")],
+    "[1, 0.5]": [("[1, 0]", "images.gain_steps: each entry is \\[instant, gain\\], with a gain above 0")],
     "persistent: 20": [("persistent: 400", "features: 400 persistent points are more than all 300")],
     "  type: aprilgrid": [
         ("  type: aprilgird", "target.type: there is no target type 'aprilgird', did you mean 'aprilgrid'"),
@@ -205,8 +205,8 @@ BAD = {
     ],
     "  rows: 3": [("", "target: rows is missing"), ("  rows: 0.5", "target.rows: must be a whole number")],
     "[[0, -1, 0, 0.1]": [
-        ("[[0, -2, 0, 0.1]", "T_imu_sensor: is no pose: its first three columns must be a rotation"),
-        ("[[0, 1, 0, 0.1]", "is no pose"),
+        ("[[0, -2, 0, 0.1]", "T_imu_sensor: is not a pose: its first three columns must be a rotation"),
+        ("[[0, 1, 0, 0.1]", "is not a pose"),
         ("[[0, -1, 0]", "T_imu_sensor\\[0\\]: must be a list of 4 numbers, but has 3"),
         ("[[0, -1, 0, 0.1], [0, 0, 0, 0]", "must be 4 rows of 4 numbers, but has 5"),
     ],

@@ -127,6 +127,6 @@ def test_a_sensor_without_time_to_measure_is_named(robot):
         ({"wheels": (replace(robot.wheels[0], rate_hz=0.2),)}, "wheel0"),
         ({"wheels": (replace(robot.wheels[0], poses_every=300),)}, "wheel0"),
     ):
-        with pytest.raises(RigError, match=f"{name} measures less than twice"):
+        with pytest.raises(RigError, match=f"{name} has fewer than two measurements"):
             simulate(replace(robot, **change), 1)
     assert simulate(replace(robot, cameras=(), lidars=()), 1).measurements.tracks == ()

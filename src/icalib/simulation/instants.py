@@ -40,4 +40,6 @@ def stamped(sensor: Clocked, end_s: float) -> tuple[np.ndarray, np.ndarray]:
 def check_enough(name: str, instants: np.ndarray) -> None:
     """Raises RigError where a sensor has fewer than two instants at which it measures."""
     if len(instants) < 2:
-        raise RigError(f"{name} measures less than twice in this time; make the scenario longer, or its rate higher.")
+        raise RigError(
+            f"{name} has fewer than two measurements in this time; make the scenario longer, or its rate higher."
+        )

@@ -91,7 +91,9 @@ class SimCamera:
 
     def __post_init__(self) -> None:
         if self.model not in MODELS:
-            raise RigError(f"{self.name}: no camera model {self.model!r} to simulate; there are {', '.join(MODELS)}.")
+            raise RigError(
+                f"{self.name}: the simulator has no camera model {self.model!r}; available are {', '.join(MODELS)}."
+            )
 
 
 @dataclass(frozen=True)
@@ -184,12 +186,12 @@ def _check_robot(scenario: Scenario) -> None:
     if drive is not None and drive.kind == "ramps" and (scenario.room is None or scenario.room.hills is None):
         raise RigError("the motion ramps needs hills; give the room a slope.")
     if scenario.room and scenario.room.hills and drive is not None and drive.on_ground and drive.kind != "ramps":
-        raise RigError(f"the motion {drive.kind} is on a flat floor; take the slope out of the room.")
+        raise RigError(f"the motion {drive.kind} needs a flat floor; remove the slope from the room.")
     for wheels in scenario.wheels:
         if wheels.reports != "poses" and not (drive is not None and drive.on_ground):
             raise RigError(
-                f"{wheels.name} cannot roll: the motion is not that of wheels on a floor; let it report poses, or "
-                "choose a motion on the ground."
+                f"{wheels.name} cannot roll, because the motion is not that of wheels on a floor; use reports: "
+                "poses, or choose a motion on the ground."
             )
 
 

@@ -40,7 +40,7 @@ def load_scenario(path: str | Path) -> Scenario:
     start_ns = found["start_ns"].whole(0) if "start_ns" in found else _START_NS
     duration_s = found["duration"].positive()
     if start_ns + _MARGIN_S * 1e9 + duration_s * 1e9 > MOST_WHOLE:
-        found["start_ns" if "start_ns" in found else "duration"].fail("the last stamp would not be below 2^63 ns.")
+        found["start_ns" if "start_ns" in found else "duration"].fail("the last stamp would exceed 2^63 ns; lower it.")
     sensors = _sensors(found["sensors"], start_ns)
     room, motion = _room(found["room"]), _motion(found["motion"], Path(path).parent)
     features = _features(found["features"]) if "features" in found else None
@@ -230,7 +230,7 @@ def _image_faults(value: YamlValue) -> ImageFaults:
     if "gain_steps" in found:
         steps = [step.vector(2).tolist() for step in found["gain_steps"].items()]
         if any(gain <= 0.0 for _, gain in steps):
-            found["gain_steps"].fail("each is [instant, gain], with a gain above 0; correct it.")
+            found["gain_steps"].fail("each entry is [instant, gain], with a gain above 0; correct it.")
         chosen["gain_steps"] = tuple(map(tuple, steps))
     if "frozen" in found:
         chosen["frozen"] = _intervals(found["frozen"])
@@ -342,5 +342,5 @@ def _pose(value: YamlValue) -> np.ndarray:
     T = np.array([row.vector(4) for row in rows])
     R = T[:3, :3]
     if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0.0 or (T[3] != [0, 0, 0, 1]).any():
-        value.fail("is no pose: its first three columns must be a rotation, its last row 0, 0, 0, 1; correct it.")
+        value.fail("is not a pose: its first three columns must be a rotation, its last row 0, 0, 0, 1; correct it.")
     return pose_from_rows(T)

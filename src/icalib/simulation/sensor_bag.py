@@ -62,7 +62,7 @@ def _streams(simulation: Simulation, seed: int) -> tuple[dict[str, str], list[It
         streams.append(_clouds(lidar, round(truth.time_offset[lidar.name] * 1e9)))
     for wheels in measured.wheels:
         if isinstance(wheels, WheelPoses):
-            notes.append(f"{wheels.name} reports relative poses, which no sensor does; they are left out.")
+            notes.append(f"{wheels.name} reports relative poses, which no driver sends; they are not written.")
             continue
         offset_ns = round(truth.time_offset[wheels.name] * 1e9)
         if wheels.kind == "twist":
@@ -78,7 +78,7 @@ def _streams(simulation: Simulation, seed: int) -> tuple[dict[str, str], list[It
         topics |= {f"/{camera.name}/image_raw": IMAGE for camera in simulation.scenario.cameras}
         streams.append(_images(simulation, seed))
     elif simulation.scenario.cameras:
-        notes.append("images show targets or a room; the scenario has neither, and so there are no images.")
+        notes.append("images show targets or a room, and the scenario has neither, so no images are written.")
     return topics, streams, tuple(notes)
 
 

@@ -41,7 +41,7 @@ _WHEEL_SAMPLING = {"interval-mean": "means since the stamp before", "instantaneo
 def check_absent(path: Path) -> None:
     """Raises RecordingError where `path` exists: a recording is never written over another."""
     if path.exists():
-        raise RecordingError(f"{path} exists already; remove it, or write elsewhere.")
+        raise RecordingError(f"{path} exists already; remove it, or choose another path.")
 
 
 @contextmanager

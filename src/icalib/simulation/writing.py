@@ -37,7 +37,7 @@ def write_film(film: Film, paths: Mapping[Form, Path], workers: int | None = Non
     """
     for path in paths.values():
         if path.exists():
-            raise RecordingError(f"{path} exists already; remove it, or write elsewhere.")
+            raise RecordingError(f"{path} exists already; remove it, or choose another path.")
     cameras = [camera.name for camera in film.scenario.cameras]
     with ExitStack() as stack:
         sinks = [stack.enter_context(_sink(form, path, cameras)) for form, path in paths.items()]

@@ -58,7 +58,7 @@ def family_name(text: str) -> str:
     if name not in FAMILIES:
         near = difflib.get_close_matches(name, FAMILIES, n=1)
         hint = f", did you mean {near[0]!r}" if near else ""
-        raise RigError(f"there is no family of tags {text!r}{hint}; available are {', '.join(FAMILIES)}.")
+        raise RigError(f"there is no tag family {text!r}{hint}; available are {', '.join(FAMILIES)}.")
     return name
 
 

@@ -68,7 +68,7 @@ def pattern_of(target: Target, border_bits: int | None = None) -> Pattern:
         return _paper(target)
     if isinstance(target, Tag):
         return _rasterised(_tag(tag_bits(target.family, target.id), target.size, (0.0, 0.0), border_bits or 1))
-    raise RigError(f"there is no print of a target of type {target.type}; choose another.")
+    raise RigError(f"icalib cannot print targets of type {target.type}; choose another type.")
 
 
 def _paper(grid: Circles) -> Pattern:
