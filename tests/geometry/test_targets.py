@@ -214,5 +214,5 @@ def test_apriltags_stand_as_their_authors_draw_them():
 def test_without_opencv_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "cv2", None)
     opencv_bits.cache_clear()
-    with pytest.raises(CalibrationError, match=r"install icalib\[images\]"):
+    with pytest.raises(CalibrationError, match=r"pip install .*\[images\]"):
         tag_bits("4x4_50", 0)
