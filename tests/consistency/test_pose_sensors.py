@@ -191,7 +191,7 @@ def test_what_cannot_be_calibrated_is_said():
     with pytest.raises(EstimationError, match=r"its motion to be 0\.3\d \+- 0\.0\d times as large as its positions"):
         calibrate_measurements(rig, cut(sim, large))
     in_g = replace(sim.measurements.imu, accel=sim.measurements.imu.accel / 9.81)
-    with pytest.raises(EstimationError, match=r"show gravity of [\d.]* m/s\^2 instead of 9.81: check that the acc"):
+    with pytest.raises(EstimationError, match=r"give a gravity of [\d.]* m/s\^2 instead of 9.81; check that the acc"):
         calibrate_measurements(rig, replace(sim.measurements, imu=in_g))
     bad = replace(cut(sim, other), name="second")
     with pytest.raises(EstimationError, match="second: .*mocap0 does not turn as imu0 does"):

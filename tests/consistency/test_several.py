@@ -241,7 +241,7 @@ def test_a_recording_that_shows_too_little_is_named(noisy):
     """The first guess needs motion, and a chain needs three images within the recording of the IMU."""
     first, other = (s.measurements for s in noisy)
     short = dataclasses.replace(other, cameras=tuple(only(c, 0, 15) for c in other.cameras), name="short")
-    with pytest.raises(EstimationError, match=r"^short: cam0: too few neighbouring images show the target"):
+    with pytest.raises(EstimationError, match=r"^short: cam0: only \d+ pairs of consecutive images"):
         calibrate_measurements(rig_of(noisy[0]), [first, short])
 
 

@@ -208,7 +208,7 @@ def test_a_path_that_lost_its_way_goes_on_in_another_map(free_robot):
     assert n > 25 and errors.max() < 0.02
     known = path.seconds[path.ok]
     assert np.diff(known).max() > 1.0
-    with pytest.raises(EstimationError, match="only 50 of 103 scans fit"):
+    with pytest.raises(EstimationError, match="only 50 of 103 scans match"):
         lidar_path("lidar0", [*scans[:50], *turned[74:]])
 
 
@@ -258,7 +258,7 @@ def test_parts_that_share_too_little_are_not_joined(free_robot, monkeypatch, man
     away = slice(middle, middle + lidar_odometry.SHARED)
     scans[away] = [replace(s, xyz=s.xyz * [-1.0, -1.0, 1.0] + [3.0, 0.0, 1.0]) for s in scans[away]]
     monkeypatch.setattr(lidar_odometry, "MANY", many)
-    with pytest.raises(EstimationError, match=f"only {middle} of {len(scans)} scans fit"):
+    with pytest.raises(EstimationError, match=f"only {middle} of {len(scans)} scans match"):
         lidar_path("lidar0", scans)
 
 

@@ -63,8 +63,8 @@ def askew(x: PoseStream) -> PoseStream:
 WRONG = [
     (inverted, "the poses of mocap0 are inverted"),
     (conjugated, "the poses of mocap0 have inverted rotations"),
-    (left_handed, "the poses of mocap0 are those of left-handed axes"),
-    (upside_down, "the poses of mocap0 have their position's z reversed; set its position_axes to .x, y, -z."),
+    (left_handed, "the poses of mocap0 are in left-handed axes"),
+    (upside_down, "the poses of mocap0 have the z axis of the position reversed; set its position_axes to .x, y, -z."),
     (w_first, "the poses of mocap0 have quaternions with w first"),
     (y_up, "of mocap0 are in different frames.*set position_axes of mocap0 to .x, z, -y."),
     (cyclic, "of mocap0 are in different frames.*set position_axes of mocap0 to .z, x, y."),

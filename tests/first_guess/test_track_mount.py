@@ -159,7 +159,9 @@ def test_points_that_are_soon_lost_show_the_camera_over_shorter_steps():
 
 def test_points_that_are_lost_after_an_image_show_nothing():
     simulation, state = drive()
-    with pytest.raises(EstimationError, match="cam0: only .* pairs of images 0.5 s or more apart share enough points"):
+    with pytest.raises(
+        EstimationError, match="cam0: only .* pairs of images 0.5 s or more apart share enough tracked points"
+    ):
         placed(lost_after(simulation, 0.05), state, true_rig(simulation))
 
 

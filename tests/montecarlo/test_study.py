@@ -136,7 +136,7 @@ def test_more_runs_are_added_by_a_cluster(alone: Path, tmp_path: Path):
     [
         ({"digest": "another"}, "the scenario changed"),
         ({"guess": "drawn"}, "their initial guess differs"),
-        ({"planes": "found"}, "planes are known in one and found in the other"),
+        ({"planes": "found"}, "planes are known in one study and found in the other"),
     ],
 )
 def test_runs_of_another_study_are_never_mixed_in(alone: Path, changed: dict, why: str):
