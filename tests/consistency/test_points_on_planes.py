@@ -74,7 +74,7 @@ def test_on_a_flat_floor_they_tie_camera_and_lidar():
 @pytest.mark.parametrize(
     ("relief_m", "says"),
     [
-        (0.03, "cam0 follows lie .* times as far from planes of the LiDARs"),
+        (0.03, "tracked points of cam0 lie .*x farther from planes of the LiDARs"),
         (0.3, "only .* tracks that cameras follow lie on planes of the LiDARs, so few that it may be chance"),
     ],
 )
