@@ -75,7 +75,10 @@ def test_the_report_is_drawn(run, assert_drawn: Callable[[str, set[str]], None])
     assert all(word in text for word in words)
 
 
-@pytest.mark.parametrize("to", [name for name in FORMATS if name != "fast-lio"])  # which is of LiDARs
+OF_LIDARS = ("fast-lio", "fast-livo2", "lio-sam")
+
+
+@pytest.mark.parametrize("to", [name for name in FORMATS if name not in OF_LIDARS])
 def test_it_goes_to_other_programs(run, tmp_path, to: str):
     """MINS, which has a place for a left and a right wheel, has none for these."""
     _, folder = run
