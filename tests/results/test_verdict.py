@@ -14,6 +14,7 @@ import yaml
 
 from icalib.calibration import Calibration, load_calibration, relative_pose
 from icalib.calibration.verdict import EXIT_CODES, NEXT, by_size, lens_projection_px
+from icalib.cli import main
 from icalib.console import print_result, print_warnings
 from icalib.report import report_html
 
@@ -129,3 +130,19 @@ def test_the_baseline_is_that_of_samples(calibration: Calibration):
     assert r.distance == pytest.approx(np.linalg.norm(r.T[:3, 3]))
     assert r.distance_std == pytest.approx(np.linalg.norm(drawn, axis=1).std(), rel=0.03)
     assert f"baseline {1e3 * r.distance:.2f} +- " in console_of(calibration)
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_the_exit_code_of_strict(
+    cases: dict[str, Calibration], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quiet: bool
+):
+    """Without --strict 0, whatever the verdict; with it that of the verdict."""
+    rig = tmp_path / "rig.yaml"
+    rig.write_text((Path(__file__).parents[2] / "examples" / "euroc" / "rig.yaml").read_text())
+    monkeypatch.setattr("icalib.outputs.write_outputs", lambda *_: None)
+    command = ["calibrate", str(rig), str(tmp_path / "run"), "-o", str(tmp_path / "out"), *(["-q"] if quiet else [])]
+    for name in ("usable", "usable with care: weak", "partly usable", "not usable: wrong"):
+        monkeypatch.setattr("icalib.pipeline.calibrate", lambda *_, c=cases[name], **__: c)
+        assert main(command) == 0
+        assert main([*command, "--strict"]) == EXIT_CODES[cases[name].verdict]
+    assert list(EXIT_CODES.values()) == [0, 3, 4, 5]
