@@ -11,9 +11,10 @@ import pytest
 import yaml
 
 from icalib.errors import CalibrationError, RigError
+from icalib.estimation.imu_model import LABELS
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard
-from icalib.imu_classes import IMU_CLASSES, class_noise
-from icalib.rig import Camera, ImuNoise, ImuSensor, Lidar, PoseSensor, Rig, Settings, TwoSources, Wheels
+from icalib.imu_classes import IMU_CLASSES, class_imperfections, class_noise
+from icalib.rig import Camera, ImuNoise, ImuSensor, Lidar, Parameter, PoseSensor, Rig, Settings, TwoSources, Wheels
 from icalib.rig_file import load_rig, rig_from_dict, rig_to_dict
 
 VALID = """\
@@ -71,7 +72,7 @@ def test_everything_is_read(tmp_path):
         2e-5,
         "rig file",
     )
-    assert (rig.imu.intrinsics.mode, rig.imu.intrinsics.value) == ("fixed", None)
+    assert rig.imu.intrinsics.mode == "prior"
     assert (cam0.path, cam0.model, cam0.resolution, cam0.corner_noise_px) == (
         "cam0/corners.csv",
         "pinhole-radtan",
@@ -122,7 +123,8 @@ def test_units_axes_and_sources_of_an_imu(tmp_path):
     assert rig.imu.topic == TwoSources("/a", "/b")
     assert (rig.imu.accel_unit, rig.imu.gyro_unit) == ("g", "deg/s")
     assert (rig.imu.accel_axes, rig.imu.gyro_axes) == (("x", "-y", "-z"), ("z", "x", "y"))
-    assert rig_from_dict(rig_to_dict(rig), "again").imu == rig.imu
+    again, ideal = rig_from_dict(rig_to_dict(rig), "again").imu, Parameter("fixed")
+    assert dataclasses.replace(again, intrinsics=ideal) == dataclasses.replace(rig.imu, intrinsics=ideal)
 
 
 @pytest.mark.parametrize(
@@ -177,12 +179,49 @@ def test_rotation_sigma(tmp_path, sigma, expected):
     np.testing.assert_allclose(load(tmp_path, text).cameras[0].rotation.sigma, expected)
 
 
-@pytest.mark.parametrize("value", ["free", "{prior: default}"])
-def test_free_imu_intrinsics_are_broad_priors(tmp_path, value):
-    text = edited("    type: imu\n", f"    type: imu\n    intrinsics: {value}\n")
-    intrinsics = load(tmp_path, text).imu.intrinsics
+NOISE = "{gyro: 1.7e-4, gyro_walk: 2e-5, accel: 2e-3, accel_walk: 3e-3}"
+
+
+def with_intrinsics(tmp_path, value, noise=None):
+    """IMU intrinsics of a rig file that says `value` of them, or nothing."""
+    text = edited("    type: imu\n", "    type: imu\n" + (f"    intrinsics: {value}\n" if value else ""))
+    return load(tmp_path, text.replace(NOISE, noise) if noise else text).imu.intrinsics
+
+
+def test_free_imu_intrinsics_are_broad_priors(tmp_path):
+    intrinsics = with_intrinsics(tmp_path, "free")
     assert intrinsics.mode == "prior" and np.array_equal(intrinsics.value, np.zeros(24))
     assert intrinsics.sigma.tolist() == [0.05] * 15 + [0.01] * 9
+
+
+@pytest.mark.parametrize(
+    ("noise", "name"),
+    [
+        *((name, name) for name in IMU_CLASSES),
+        (NOISE, "consumer"),  # an ADIS16448 in the figures, but a consumer IMU may have the same
+        ("{gyro: 3e-5, gyro_walk: 1e-7, accel: 3e-4, accel_walk: 1e-4}", "tactical"),
+        ("{gyro: 3e-5, gyro_walk: 1e-7, accel: 3e-4, accel_walk: 1e-3}", "consumer"),
+    ],
+)
+def test_by_default_imu_intrinsics_have_the_prior_of_the_class(tmp_path, noise, name):
+    found = with_intrinsics(tmp_path, None, noise)
+    assert found.mode == "prior" and np.array_equal(found.value, np.zeros(24))
+    np.testing.assert_array_equal(found.sigma, with_intrinsics(tmp_path, name).sigma)
+    np.testing.assert_array_equal(found.sigma, class_imperfections(name).sigma)
+
+
+def test_figures_of_a_consumer_imu_as_its_data_sheet_has_them():
+    """MPU-6050: scales 3 % and cross-axis 2 % at two sigma, 0.1 deg/s/g at one."""
+    sigma = dict(zip(LABELS, class_imperfections("consumer").sigma, strict=True))
+    for sensor in ("accel", "gyro"):
+        assert [sigma[f"{sensor}_{a}"] for a in ("xx", "yy", "zz")] == [0.015] * 3
+        assert [sigma[f"{sensor}_{a}"] for a in ("yx", "zx", "zy")] == [0.01] * 3
+    assert sigma["g_sensitivity_xy"] == pytest.approx(np.deg2rad(0.1) / 9.81, rel=0.02)
+
+
+def test_an_ideal_imu_is_fixed(tmp_path):
+    found = with_intrinsics(tmp_path, "fixed")
+    assert found.mode == "fixed" and found.value is None
 
 
 def test_imu_intrinsics_with_own_values(tmp_path):
@@ -194,7 +233,7 @@ def test_imu_intrinsics_with_own_values(tmp_path):
         assert (intrinsics.sigma if sigma is None else intrinsics.sigma.tolist()) == sigma
 
 
-@pytest.mark.parametrize("extra", ["", "    intrinsics: free\n"])
+@pytest.mark.parametrize("extra", ["", "    intrinsics: free\n", "    intrinsics: fixed\n"])
 @pytest.mark.parametrize(
     "noise", ["noise: {gyro: 1.7e-4, gyro_walk: 2e-5, accel: 2e-3, accel_walk: 3e-3}", "path: i.csv"]
 )
@@ -211,7 +250,6 @@ def test_plain_data_load_back_as_the_same_rig(tmp_path, extra, noise):
             assert p.mode == q.mode and np.array_equal(p.value, q.value) and np.array_equal(p.sigma, q.sigma)
 
 
-NOISE = "{gyro: 1.7e-4, gyro_walk: 2e-5, accel: 2e-3, accel_walk: 3e-3}"
 INTRINSICS = "{fixed: [458.654, 457.296, 367.215, 248.375]}"
 PRIOR = "{prior: [-0.02, -0.06, 0.01], sigma: 0.05}"
 TARGET = "{type: aprilgrid, rows: 6, cols: 7, tag_size: 0.088, tag_spacing: 0.3}"
@@ -293,7 +331,7 @@ CHARUCO = "{type: charuco, squares_x: 7, squares_y: 5, square_size: 0.04, marker
         (
             "type: imu",
             "type: imu\n    intrinsics: {prior: wide}",
-            "no prior without sigma 'wide'; available are default",
+            "sensors.imu0.intrinsics: a prior needs exactly one of sigma",
         ),
         (
             "type: aprilgrid",

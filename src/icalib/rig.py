@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,6 +13,7 @@ import numpy as np
 from icalib.errors import RigError
 from icalib.geometry.cameras import CAMERA_MODELS
 from icalib.geometry.targets import NoTarget, Target
+from icalib.imu_classes import FREE, IMU_CLASSES, N_INTRINSICS, ImuNoise, class_imperfections, class_of_noise
 from icalib.parameter import Parameter, check_fields, check_sizes
 
 TimeUnit = Literal["s", "ms", "us", "ns"]
@@ -31,23 +32,6 @@ PLAIN_TABLE = TableLayout()
 
 
 @dataclass(frozen=True)
-class ImuNoise:
-    """Continuous-time noise: gyro rad/s/sqrt(Hz), gyro_walk rad/s^2/sqrt(Hz), accel m/s^2/sqrt(Hz), accel_walk
-    m/s^3/sqrt(Hz)."""
-
-    gyro: float
-    gyro_walk: float
-    accel: float
-    accel_walk: float
-    source: str = "rig file"  # or "default for a consumer IMU", printed with the result
-
-    def scaled(self, factor: float) -> ImuNoise:
-        """That of an IMU `factor` times as noisy."""
-        four = (self.gyro, self.gyro_walk, self.accel, self.accel_walk)
-        return ImuNoise(*(factor * density for density in four), source=self.source)
-
-
-@dataclass(frozen=True)
 class TwoSources:
     """Topics or tables of an IMU whose gyroscope and accelerometer report apart."""
 
@@ -57,6 +41,8 @@ class TwoSources:
 
 AccelUnit = Literal["m/s^2", "g"]
 GyroUnit = Literal["rad/s", "deg/s"]
+BY_CLASS = Parameter("free")  # IMU intrinsics of which nothing is said; `free()` is another
+_CLASS_PRIORS = {n: Parameter("prior", np.zeros(N_INTRINSICS), class_imperfections(n).sigma) for n in IMU_CLASSES}
 Axes = tuple[str, str, str]  # the columns that become x, y, z, each with its sign: ("x", "-y", "-z")
 
 
@@ -64,12 +50,14 @@ Axes = tuple[str, str, str]  # the columns that become x, y, z, each with its si
 class ImuSensor:
     """The inertial sensor; its frame is the body frame. Units and axes: of the readings as they are recorded; None: SI
     units (g is recognised), and the axes as they are. assumed: there is none, but an assumption of smooth motion in
-    its place (see `first_guess.assumed_motion`)."""
+    its place (see `first_guess.assumed_motion`). intrinsics (24,): see `estimation.imu_model`. They always
+    have a prior: by default that of the IMU's class about the ideal IMU, a broad one where they are free, about the
+    guess. What is fixed without a value is the ideal IMU."""
 
     name: str
     path: str | TwoSources
     noise: ImuNoise
-    intrinsics: Parameter = field(default_factory=lambda: Parameter("fixed"))  # 24: see estimation.imu_model
+    intrinsics: Parameter = BY_CLASS
     topic: str | TwoSources | None = None  # in a bag; None: those with the sensor's name, or the only ones
     accel_unit: AccelUnit | None = None
     gyro_unit: GyroUnit | None = None
@@ -80,7 +68,12 @@ class ImuSensor:
     layout: TableLayout = PLAIN_TABLE
 
     def __post_init__(self) -> None:
-        check_sizes(self, {"intrinsics": 24})
+        check_sizes(self, {"intrinsics": N_INTRINSICS})
+        if self.intrinsics is BY_CLASS:
+            object.__setattr__(self, "intrinsics", _CLASS_PRIORS[class_of_noise(self.noise)])
+        elif self.intrinsics.mode == "free":
+            start = np.zeros(N_INTRINSICS) if self.intrinsics.value is None else self.intrinsics.value
+            object.__setattr__(self, "intrinsics", Parameter("prior", start, FREE.sigma))
 
 
 MOUNTED = {"translation": 3, "time_offset": 1}  # numbers of a sensor's extrinsics beside its rotation
@@ -278,6 +271,7 @@ class PoseSensor:
     layout: TableLayout = PLAIN_TABLE
     inverted: bool = False  # what is recorded is T_sensor_frame
     frames: tuple[str, str] | None = None  # parent and child in a topic of transforms; None: it is not one
+    scale_sigma: float = 0.001  # of all its lengths, relative: true over reported ones is about 1; 0: exact
 
     def __post_init__(self) -> None:
         check_sizes(self, MOUNTED)

@@ -8,15 +8,12 @@ from typing import Any
 import numpy as np
 
 from icalib.errors import RigError
+from icalib.imu_classes import IMU_CLASSES, N_INTRINSICS, class_imperfections
 from icalib.parameter import ROUNDING, Parameter, nearest_rotation
 from icalib.yaml_nodes import YamlValue
 
 _FORMS = "write free, {guess: VALUE}, {fixed: VALUE} or {prior: VALUE, sigma: SIGMA}"
 _ROTATION_FORMS = "a 3x3 matrix, {xyzw: [x, y, z, w]} or {rpy_deg: [roll, pitch, yaw]}"
-
-# Broad priors of the IMU intrinsics (order as in estimation.imu_model): scale and misalignment of the accelerometer (6)
-# and the gyroscope (6), rotation between them [rad] (3), g-sensitivity [rad/s per m/s^2] (9).
-IMU_INTRINSICS_SIGMA = np.repeat([0.05, 0.05, 0.05, 0.01], [6, 6, 3, 9])
 
 
 def vector_parameter(value: YamlValue, size: int) -> Parameter:
@@ -44,15 +41,14 @@ def rotation_parameter(value: YamlValue) -> Parameter:
 
 
 def imu_intrinsics_parameter(value: YamlValue) -> Parameter:
-    """24 numbers, zero for an ideal IMU; `free` and `prior: default` are broad priors about the ideal IMU."""
-    if value.is_mapping and list(value.entries()) == ["prior"]:
-        value.entries()["prior"].choice("prior without sigma", ("default",))
-        return Parameter("prior", np.zeros(24), IMU_INTRINSICS_SIGMA.copy())
-    parameter = vector_parameter(value, 24)
-    if parameter.mode == "free":
-        start = np.zeros(24) if parameter.value is None else parameter.value
-        return Parameter("prior", start, IMU_INTRINSICS_SIGMA.copy())
-    return parameter
+    """24 numbers, zero for an ideal IMU. The name of a class is its prior about the ideal IMU, and `fixed` an ideal
+    IMU."""
+    if value.is_mapping or value.is_list or value.text() == "free":
+        return vector_parameter(value, N_INTRINSICS)
+    name = value.choice("treatment of IMU intrinsics", ("free", "fixed", *IMU_CLASSES))
+    if name == "fixed":
+        return Parameter("fixed")
+    return Parameter("prior", np.zeros(N_INTRINSICS), class_imperfections(name).sigma)
 
 
 def parameter_to_plain(parameter: Parameter) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from icalib.errors import RigError
 from icalib.file_names import NAME, NAME_WORDS
@@ -20,6 +21,7 @@ _FIELDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 }
 _LARGEST_TAG_M = 2.0  # nobody prints a larger one; it is in millimetres
 _MOST_TAGS = 10_000
+_LARGEST_SIGMA = 0.2  # of a size that somebody measured; it is in per cent
 
 
 def target_or_targets(root: YamlValue) -> Target:
@@ -51,7 +53,20 @@ def target_of(value: YamlValue) -> Target:
         value.fail(f"type is missing; add type: {', type: '.join(_FIELDS)}.")
     kind = given["type"].choice("target type", tuple(_FIELDS))
     required, optional = _FIELDS[kind]
-    found = value.record(("type", *required), optional)
+    found = value.record(("type", *required), (*optional, "size_sigma"))
+    target = _of_kind(kind, value, found)
+    return replace(target, size_sigma=_size_sigma(found["size_sigma"])) if "size_sigma" in found else target
+
+
+def _size_sigma(value: YamlValue) -> float:
+    if not 0.0 <= (sigma := value.number()) < _LARGEST_SIGMA:
+        value.fail(
+            f"is a share of the size between 0 (exact) and {_LARGEST_SIGMA}, but is {sigma:g}; write 0.002 for 0.2 %."
+        )
+    return sigma
+
+
+def _of_kind(kind: str, value: YamlValue, found: dict[str, YamlValue]) -> Target:
     if kind == "aprilgrid":
         return _aprilgrid(value, found)
     if kind == "markers":

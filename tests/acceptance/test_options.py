@@ -10,6 +10,7 @@ import pytest
 
 from icalib.calibration import Calibration
 from icalib.geometry import so3
+from icalib.imu_classes import class_imperfections
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter, Rig
 
@@ -175,3 +176,15 @@ def huber(residual: np.ndarray, sigma: np.ndarray, bend: float) -> float:
     """Half the robust chi^2 of residuals (n, 2) with standard deviations (n,), linear beyond `bend` of these."""
     size = np.linalg.norm(residual, axis=1) / sigma
     return float(np.where(size < bend, 0.5 * size**2, bend * (size - 0.5 * bend)).sum())
+
+
+def test_what_the_data_do_not_know_of_the_imu_stays_as_its_class_says(rig, excerpt):
+    """Its prior weighs as much as all else errs: the segments of this recording scatter several times more than white
+    noise."""
+    sigma = class_imperfections("industrial").sigma
+    imu = dataclasses.replace(rig.imu, intrinsics=Parameter("prior", np.zeros(24), sigma))
+    found = calibrate_measurements(dataclasses.replace(rig, imu=imu), excerpt)
+    group = found.group("imu0", "intrinsics")
+    assert group.factor.min() > 3.0
+    assert (group.std < 1.3 * sigma).all() and np.abs(group.value / group.std).max() < 4.0
+    assert np.abs(group.value[15:] / sigma[15:]).max() < 1.0  # g-sensitivity

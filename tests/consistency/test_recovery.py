@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from icalib.calibration import Calibration
 from icalib.geometry.targets import Charuco, Checkerboard, Target
+from icalib.imu_classes import FREE
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter, Rig
-from icalib.rig_parameters import IMU_INTRINSICS_SIGMA
 from icalib.simulation import Scenario, Simulation, handheld, rig_for, simulate
 
 
@@ -136,7 +136,7 @@ def test_imu_intrinsics_of_one_percent_are_recovered():
     simulation = simulate(scenario, 1)
     rig = rig_for(scenario)
     rig = dataclasses.replace(
-        rig, imu=dataclasses.replace(rig.imu, intrinsics=Parameter("prior", np.zeros(24), IMU_INTRINSICS_SIGMA))
+        rig, imu=dataclasses.replace(rig.imu, intrinsics=Parameter("prior", np.zeros(24), FREE.sigma))
     )
     result = calibrate_measurements(rig, simulation.measurements)
     found = result.group("imu0", "intrinsics")

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from icalib.estimation.arrowhead import Piece, make_pieces
 from icalib.estimation.board import SHAPE_LABELS
-from icalib.estimation.bodies import Bodies, restrict
+from icalib.estimation.bodies import SIZE, Bodies, restrict
 from icalib.estimation.corner_factor import CornerFactor, CornerNoise
 from icalib.estimation.feature_factor import FeatureFactor
 from icalib.estimation.imu_data import ImuData
@@ -54,9 +54,15 @@ TOLERANCE = {
     "plane": (2e-3, 2e-3, 5e-3),
     "frame_rotation": 2e-3,
     "frame_translation": 5e-3,
+    "size": 1e-2,
+    "scale": 1e-2,
 }
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
 FEWEST_POINTS = 200  # of a plane in a setup
+
+
+def fields_of(target: AprilGrid) -> dict:
+    return {f.name: getattr(target, f.name) for f in dataclasses.fields(target)}
 
 
 @dataclass(frozen=True)
@@ -73,7 +79,7 @@ class SplitGrid(AprilGrid):
 
     @cached_property
     def points(self) -> np.ndarray:
-        on_grid = AprilGrid(*dataclasses.astuple(self)).points
+        on_grid = AprilGrid(**fields_of(self)).points
         own = np.empty_like(on_grid)
         for k in range(3):
             R, p = self.frame(k)
@@ -133,16 +139,18 @@ def make_setup(
     bloom: bool = False,
     spacing: float = 0.05,
     split: bool = False,
+    size: bool = False,
 ) -> Setup:
-    """split: the target is taken as three bodies that stand where they would on the target."""
+    """split: the target is taken as three bodies that stand where they would on the target. size: it is estimated."""
     truth, measurements = sim.truth, sim.measurements
     imu = ImuData.build(measurements.imu, sim.scenario.imu_noise)
     entries = [("imu0", "intrinsics", "vector", 24, imu_free), ("board0", "tilt", "tilt", 2, True)]
-    target = SplitGrid(*dataclasses.astuple(sim.scenario.target)) if split else sim.scenario.target
-    bodies = Bodies(target, (1, 0, 2) if split else (0,), (), shape)
-    entries += bodies.shape_entries() + bodies.pose_entries()
+    target = SplitGrid(**fields_of(sim.scenario.target)) if split else sim.scenario.target
+    bodies = Bodies(target, (1, 0, 2) if split else (0,), (), shape, sized=size)
+    entries += bodies.size_entries() + bodies.shape_entries() + bodies.pose_entries()
     values = {(name, "shape"): np.zeros(len(SHAPE_LABELS)) for name in bodies.bending}
     values["imu0", "intrinsics"] = truth.imu_intrinsics.copy()
+    values[SIZE] = np.array([truth.target_size])
     R_world_grid, origin = truth.T_world_board[:3, :3], truth.T_world_board[:3, 3]
     R_grid_scene, p_grid_scene = target.frame(1) if split else (np.eye(3), np.zeros(3))
     values["board0", "tilt"] = R_world_grid @ R_grid_scene

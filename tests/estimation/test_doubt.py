@@ -22,10 +22,20 @@ def test_only_what_may_be_noise_by_chance_is_in_doubt():
     """Beside noise of 6 there are 3 that it hardly reaches, 2 that it may, 7 that it may but that are most of it, and
     next to nothing."""
     asked = DIRECTIONS @ np.diag([9.0, 8.0, 13.0, 6.001]) @ DIRECTIONS.T
-    seen = _shown(asked, TOLERANCE, spurious(0.1, 2.0, 2.0, 0.1))
+    seen = _shown(asked, TOLERANCE, np.ones(4, dtype=bool), spurious(0.1, 2.0, 2.0, 0.1))
     along = (DIRECTIONS.T @ seen.vectors) ** 2
     np.testing.assert_allclose(along @ seen.in_doubt, [0.0, 1.0, 0.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(along @ seen.nothing, [0.0, 0.0, 0.0, 1.0], atol=1e-9)
+
+
+def test_whether_all_else_is_determined_is_asked_with_nuisance_parameters_known():
+    """One parameter and a nuisance of which only a difference shows: the first is determined, and so is what is open
+    beside them."""
+    asked = np.zeros((3, 3))
+    asked[np.ix_([0, 2], [0, 2])] = 4.0 * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    nothing = Spurious(np.zeros((1, 3, 3)))
+    seen = _shown(asked, TOLERANCE[:3], np.array([True, True, False]), nothing)
+    np.testing.assert_allclose(seen.vectors[:, seen.nothing].T ** 2, [[0.0, 1.0, 0.0]], atol=1e-12)
 
 
 @pytest.mark.parametrize("n", [3, 7])

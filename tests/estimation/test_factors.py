@@ -116,8 +116,9 @@ def corner_sample(
     curved=False,
     split=False,
     restarts=False,
+    size=False,
 ):
-    setup = setup_of(unlike, imu_free=imu_free, shape=True, bloom=True, split=split)
+    setup = setup_of(unlike, imu_free=imu_free, shape=True, bloom=True, split=split, size=size)
     setup = with_two_clocks(setup) if restarts else setup
     rng = np.random.default_rng(1)
     stream = setup.streams[camera]
@@ -475,6 +476,7 @@ def with_poses(setup, starts):
     constant, as in `with_wheels`."""
     rng = np.random.default_rng(6)
     mount = {"rotation": so3.exp(rng.normal(size=3)), "translation": rng.normal(size=3), "time_offset": np.zeros(1)}
+    mount["scale"] = np.array([1.03])
     entries = [(b.sensor, b.name, b.kind, b.size, b.start is not None) for b in setup.layout.blocks]
     entries += [("mocap0", k, "rotation" if k == "rotation" else "vector", len(v), True) for k, v in mount.items()]
     values = setup.state.values | {("mocap0", k): v for k, v in mount.items()}
@@ -549,7 +551,8 @@ SAMPLES = {
         "CornerFactor",
         lambda u, s, f: corner_sample(u, s, f, 1, loss="cauchy", field=1, curved=True),
     ),
-    "three bodies": ("CornerFactor", lambda u, s, f: corner_sample(u, s, f, 0, imu_free=True, split=True)),
+    "size of the target": ("CornerFactor", lambda u, s, f: corner_sample(u, s, f, 1, size=True)),
+    "three bodies": ("CornerFactor", lambda u, s, f: corner_sample(u, s, f, 0, imu_free=True, split=True, size=True)),
     "three bodies, huber, common shift, pose": (
         "CornerFactor",
         lambda u, s, f: corner_sample(u, s, f, 1, "pose", loss="huber", field=1, curved=True, split=True),

@@ -31,7 +31,7 @@ def world(request):
     """Four seconds without noise, nodes every 20 ms at the truth: inputs, state, stream."""
     mocap = SimPoses(
         "mocap0", pose([0.3, -0.5, 1.0], [0.1, -0.2, 0.15]), request.param, pose([0.2, 0.1, 2.0], [3.0, -1.0, 0.5]),
-        time_offset_s=0.0123, clock_origin_ns=777,
+        time_offset_s=0.0123, clock_origin_ns=777, scale=1.02,
     )  # fmt: skip
     drive = Drive("free", exact=True)
     scenario = Scenario(
@@ -44,6 +44,7 @@ def world(request):
     origins_s = (stream.origin_ns - sim.measurements.imu.origin_ns) * 1e-9
     values = {
         ("imu0", "intrinsics"): np.zeros(24),
+        ("mocap0", "scale"): np.array([mocap.scale]),
         ("mocap0", "rotation"): mocap.T_imu_sensor[:3, :3].copy(),
         ("mocap0", "translation"): mocap.T_imu_sensor[:3, 3].copy(),
         ("mocap0", "time_offset"): np.array([truth.time_offset["mocap0"] + origins_s]),

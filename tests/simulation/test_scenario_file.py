@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -292,3 +293,31 @@ def test_a_lidar_of_too_many_points(tmp_path):
     (tmp_path / "scenario.yaml").write_text(text)
     with pytest.raises(RigError, match="would measure 1.4e.10 points, and 100,000,000 are the most"):
         load_scenario(tmp_path / "scenario.yaml")
+
+
+EFFECTS = """effects:
+  imu: {accel_scale: [0.01, 0.02, 0.03], gyro_misalignment: [0.04, 0.05, 0.06], gyro_rotation: [0.07, 0.08, 0.09]}
+  pose_scale: {mocap: 0.99}
+  target_size: 1.01
+"""
+
+
+def test_effects_are_read(tmp_path):
+    scenario = loaded(tmp_path, EFFECTS + FULL)
+    x = np.zeros(24)
+    x[[0, 2, 5, 7, 9, 10, 12, 13, 14]] = 0.01 * np.arange(1, 10)
+    np.testing.assert_allclose(scenario.imu_intrinsics, x)
+    assert [p.scale for p in scenario.poses] == [0.99] and scenario.target_size == 1.01
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("0.03]", "3]", "effects.imu.accel_scale: must be between -0.2 and 0.2: 0.01 is 1 %"),
+        ("mocap: ", "mocap1: ", "effects.pose_scale.mocap1: there is no such field, did you mean 'mocap'"),
+        ("1.01", "0.01", "effects.target_size: is true over stated length"),
+    ],
+)
+def test_bad_effects_end_in_a_sentence(tmp_path, old, new, words):
+    with pytest.raises(RigError, match=re.escape(words)):
+        loaded(tmp_path, EFFECTS.replace(old, new) + FULL)

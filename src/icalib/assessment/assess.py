@@ -43,9 +43,10 @@ from icalib.estimation.border import restricted_inverse
 from icalib.estimation.contradictions import Contradiction
 from icalib.estimation.determination import Determined
 from icalib.estimation.estimate import Estimate
-from icalib.estimation.evidence import Fit, fits, raw_rms, split_covariance, split_expectation
+from icalib.estimation.evidence import Fit, fits, raw_rms
 from icalib.estimation.gauge import IN_THE_WORLD
 from icalib.estimation.imu_model import LABELS as IMU_LABELS
+from icalib.estimation.inflation import calibration_columns, spread_variance, white_variance
 from icalib.estimation.inputs import Inputs, origin_difference
 from icalib.estimation.outcome import Visit
 from icalib.estimation.parts import Parts
@@ -58,7 +59,6 @@ from icalib.rig import DRIVE_SIZES
 from icalib.rig_file import rig_to_dict
 from icalib.timeline import Timeline
 
-MOST_LEVERAGE = 4.0  # of the variance: one part knows nearly all beyond, and the spread of the others nothing
 ENOUGH_PARTS = 8  # from so many on, t differs from the normal distribution by 8 % at most
 LARGE_BLOOM_PX = 0.8  # ink and overexposure move edges by a third of that
 
@@ -72,8 +72,8 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
     tracking = [] if inputs.rig.has_target else [c.name for c in inputs.rig.cameras]
     seen = observe(determined, names, [w.name for w in inputs.rig.wheels], tracking)
     parts = Parts.of(problem, outcome, inputs.rig.settings.segments)
-    empirical = _empirical_variance(found, parts, np.diag(seen.covariance))
-    groups = _groups(inputs, found, seen, empirical)
+    noise = _Noise.of(determined, seen.covariance, parts)
+    groups = _groups(inputs, determined, seen, noise)
     judged = [_sensor_fit(f, found) for f in fits(problem, outcome) if not _is_assumed(inputs, f.sensor)]
     held = held_out(parts, [s for s in (inputs.rig.body,) if _is_assumed(inputs, s)])
     timeline = Timeline.of(inputs.parts, image_times(inputs, outcome.state.values))
@@ -143,10 +143,10 @@ def _column_names(inputs: Inputs) -> tuple[str, ...]:
 def _mode(inputs: Inputs, block: Block) -> str:
     if block.start is None:
         return "fixed"
+    if block.is_nuisance:
+        return "prior"
     if not inputs.is_sensor(block.sensor):
         return "free"
-    if inputs.rig.imu is not None and block.sensor == inputs.rig.imu.name:
-        return inputs.rig.imu.intrinsics.mode
     return getattr(inputs.sensor(block.sensor), block.name).mode
 
 
@@ -168,17 +168,39 @@ def _raw_value(inputs: Inputs, state: State, block: Block) -> np.ndarray:
     return value
 
 
-def _groups(
-    inputs: Inputs, found: Estimate, seen: Observability, empirical: np.ndarray | None
-) -> tuple[ParameterGroup, ...]:
-    formal = np.sqrt(np.diag(seen.covariance))
-    ratio = np.ones(len(formal)) if empirical is None else np.sqrt(empirical) / formal
-    overall = float(np.sqrt(np.mean(_calibration_only(inputs, ratio) ** 2))) if len(ratio) else 1.0
+class _Noise(NamedTuple):
+    """share (B,): of the formal variances that noise of the measurements contributes; ratio (B,): standard deviation
+    that the recording shows over this part. weight: the root of how many times priors on nuisance parameters count;
+    their errors contribute the rest, the same in all parts of a recording."""
+
+    share: np.ndarray
+    ratio: np.ndarray
+    weight: float
+
+    @classmethod
+    def of(cls, determined: Determined, covariance: np.ndarray, parts: Parts | None) -> _Noise:
+        """covariance (B, B): formal."""
+        found = determined.estimate
+        white = white_variance(found.problem, found.outcome, covariance)
+        ratio = np.sqrt(_empirical_variance(found, parts, white) / white)
+        return cls(white / np.diag(covariance), ratio, determined.inflation)
+
+    def factor(self, columns: np.ndarray, overall: float) -> np.ndarray:
+        """(n,) of the standard deviations of a group: by its own ratio or the `overall` one."""
+        own = max(1.0, float(np.sqrt(np.mean(self.ratio[columns] ** 2))), overall)
+        share = self.share[columns]
+        return np.sqrt(own**2 * share + self.weight**2 * (1.0 - share))
+
+
+def _groups(inputs: Inputs, determined: Determined, seen: Observability, noise: _Noise) -> tuple[ParameterGroup, ...]:
+    formal, found = np.sqrt(np.diag(seen.covariance)), determined.estimate
+    own = calibration_columns(inputs)
+    overall = float(np.sqrt(np.mean(noise.ratio[own] ** 2))) if len(own) else 1.0
     groups = []
     for block in inputs.layout.blocks:
         if block.name in IN_THE_WORLD or _unheard_of(inputs, block) or _is_assumed(inputs, block.sensor):
             continue
-        if block.start is None and block.name in ("shape", "bloom", "tilt"):
+        if block.start is None and block.name in ("shape", "bloom", "tilt", "scale"):
             continue
         labels = labels_of(inputs, block)
         if block.name == "tilt":
@@ -189,9 +211,7 @@ def _groups(
             verdict: tuple[Verdict, ...] = ("fixed",) * block.size
         else:
             k = block.columns
-            own = float(np.sqrt(np.mean(ratio[k] ** 2)))
-            factor = np.full(block.size, max(1.0, own, overall))
-            std = formal[k]
+            std, factor = formal[k], noise.factor(k, overall)
             sizes = factor * np.maximum(seen.spread[k], std / found.problem.tolerance[k])
             verdict = tuple(_final_verdict(seen.verdicts[i], size) for i, size in zip(k, sizes.tolist(), strict=True))
         unit = "" if labels == IMU_LABELS else UNITS[block.name]
@@ -217,19 +237,18 @@ def _final_verdict(formal: Verdict, size: float) -> Verdict:
     return formal if formal == "undetermined" else by_size(size)
 
 
-def _empirical_variance(found: Estimate, parts: Parts | None, formal: np.ndarray) -> np.ndarray | None:
+def _empirical_variance(found: Estimate, parts: Parts | None, white: np.ndarray) -> np.ndarray:
     """(B,) variances as the spread over parts of the recording shows them, or over feature tracks where it is larger,
-    plus what places in the image and on the target show beyond white noise; None where there is nothing to split."""
+    plus what places in the image and on the target show beyond `white` noise (B,); this where there is nothing to
+    split."""
     if parts is None and found.problem.features is None:
-        return None
+        return white
     clusters = cluster_covariances(found.problem, found.outcome)
-    spread = formal if clusters.tracks is None else np.diag(clusters.tracks)
+    spread = white if clusters.tracks is None else np.diag(clusters.tracks)
     if parts is not None:
-        over_parts, expected = np.diag(split_covariance(found.outcome, parts)), split_expectation(found.outcome, parts)
-        leverage = np.clip(formal / np.maximum(expected, 1e-300), 1.0, MOST_LEVERAGE)
-        over_parts = few_factor(parts.count) ** 2 * leverage * over_parts
+        over_parts = few_factor(parts.count) ** 2 * spread_variance(found.outcome, parts, white)
         spread = over_parts if clusters.tracks is None else np.maximum(spread, over_parts)
-    return spread + sum(np.maximum(np.diag(V) - formal, 0.0) for V in clusters.places)
+    return spread + sum(np.maximum(np.diag(V) - white, 0.0) for V in clusters.places)
 
 
 def few_parts_notes(inputs: Inputs, parts: Parts | None) -> Iterator[str]:
@@ -249,12 +268,6 @@ def few_factor(parts: int) -> float:
     """By how much a standard deviation from the spread of few parts is to be larger, so that 68 % lie within: Student's
     t distribution with parts - 1 degrees of freedom."""
     return float(stdtrit(parts - 1, ndtr(1.0))) if parts < ENOUGH_PARTS else 1.0
-
-
-def _calibration_only(inputs: Inputs, per_column: np.ndarray) -> np.ndarray:
-    """The columns that users take away: not the board's."""
-    columns = [b.columns for b in inputs.layout.free if inputs.is_sensor(b.sensor) and b.name != "bloom"]
-    return per_column[np.concatenate(columns)] if columns else np.ones(1)
 
 
 def _sensor_fit(fit: Fit, found: Estimate) -> SensorFit:

@@ -12,7 +12,7 @@ from icalib.rig import Camera
 UNITS = {
     "rotation": "rad", "translation": "m", "time_offset": "s", "intrinsics": "px", "distortion": "", "bloom": "px",
     "shape": "m", "tilt": "rad", "radii": "m", "baseline": "m", "radius": "m", "wheelbase": "m",
-    "steering_offset": "rad", "scales": "", "ground_height": "m",
+    "steering_offset": "rad", "scales": "", "ground_height": "m", "size": "", "scale": "",
 }  # fmt: skip
 LABELS = {
     "shape": SHAPE_LABELS, "radii": ("left", "right"), "scales": ("speed", "yaw_rate"),

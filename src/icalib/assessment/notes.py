@@ -15,8 +15,11 @@ from icalib.estimation.corner_factor import CornerFactor
 from icalib.estimation.corner_noise import NoiseModel
 from icalib.estimation.estimate import Estimate
 from icalib.estimation.imu_data import ImuData
+from icalib.estimation.imu_model import LABELS
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.nodes import usable
+from icalib.imu_classes import class_of_sigma
+from icalib.rig import ImuSensor
 from icalib.timeline import Timeline
 
 MOST_NAMED = 10  # images
@@ -91,6 +94,8 @@ def _imu_notes(inputs: Inputs, imu: ImuData, found: Estimate, timeline: Timeline
         f"IMU noise ({n.source}): gyro {n.gyro:.3g} rad/s/sqrt(Hz), walk {n.gyro_walk:.3g}; accelerometer "
         f"{n.accel:.3g} m/s^2/sqrt(Hz), walk {n.accel_walk:.3g}."
     )
+    if words := _intrinsics_words(inputs.rig.imu):
+        yield words
     for a, b in imu.gaps:
         how = "bridged" if b - a <= most else "left out, with the images in it"
         yield f"{imu.name} has a gap of {b - a:.3f} s at {timeline.words(a)}, {how}."
@@ -99,6 +104,20 @@ def _imu_notes(inputs: Inputs, imu: ImuData, found: Estimate, timeline: Timeline
         left_out = int((~usable(imu, t, most)).sum())
         if left_out:
             yield f"{left_out} images of {camera.name} are left out: {imu.name} was not running then."
+
+
+def _intrinsics_words(imu: ImuSensor) -> str:
+    """What was assumed of the IMU's scale and misalignment, where they are estimated; else empty."""
+    if imu.intrinsics.mode != "prior" or imu.intrinsics.sigma is None:
+        return ""
+    sigma = dict(zip(LABELS, imu.intrinsics.sigma.tolist(), strict=True))
+    name = class_of_sigma(imu.intrinsics.sigma)
+    whose = "from the rig file" if name is None else f"of {'an' if name[0] in 'aeiou' else 'a'} {name} IMU"
+    turn = np.rad2deg(sigma["gyro_rotation_x"])
+    return (
+        f"prior of IMU intrinsics {whose}: scale {100.0 * sigma['accel_xx']:.2g} % (accelerometer), "
+        f"{100.0 * sigma['gyro_xx']:.2g} % (gyroscope), rotation between them {turn:.2g} deg (standard deviations)."
+    )
 
 
 def late_words(cameras: Sequence[CornerFactor], apart: Sequence[np.ndarray]) -> str:

@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from icalib.calibration.units import SHOWN_UNITS
+from icalib.calibration.verdict import worst
 
 if TYPE_CHECKING:
     from icalib.calibration.result import Calibration, ParameterGroup, SensorFit, Verdict
 
 TURNS = ("roll", "pitch", "yaw")
+CLEARLY = 0.5  # of the standard deviation of a prior: a recording that shows a parameter so well says something of it
 
 
 @dataclass(frozen=True)
@@ -31,8 +33,26 @@ class Row:
 
 
 def rows(calibration: Calibration) -> list[Row]:
-    """Every parameter of every sensor, in the order of the groups; an IMU taken for ideal has none."""
-    return [row for group in shown_groups(calibration) for row in _rows_of(group)]
+    """Every parameter of every sensor, in the order of the groups. Of IMU intrinsics only what the recording sharpened,
+    and one row for the rest; an IMU taken for ideal has none."""
+    found = []
+    for group in shown_groups(calibration):
+        own = _rows_of(group)
+        sharpened = _sharpened(calibration, group)
+        found += [row for row, shown in zip(own, sharpened, strict=True) if shown]
+        if rest := [row for row, shown in zip(own, sharpened, strict=True) if not shown]:
+            verdict = worst(tuple(row.verdict for row in rest))
+            found.append(Row(group.sensor, f"{len(rest)} more intrinsics", "prior", "", "", "", "", verdict))
+    return found
+
+
+def _sharpened(calibration: Calibration, group: ParameterGroup) -> list[bool]:
+    """Of IMU intrinsics, whether the standard deviation is clearly less than that of the prior; True of all else."""
+    given = calibration.rig.get("sensors", {}).get(group.sensor, {})
+    prior = given.get("intrinsics") if given.get("type") == "imu" else None
+    if group.name != "intrinsics" or not isinstance(prior, dict) or "sigma" not in prior:
+        return [True] * len(group.labels)
+    return (group.std < CLEARLY * np.array(prior["sigma"])).tolist()
 
 
 def shown_groups(calibration: Calibration) -> list[ParameterGroup]:

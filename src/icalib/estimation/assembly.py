@@ -12,6 +12,7 @@ from icalib.errors import EstimationError
 from icalib.estimation import pages
 from icalib.estimation.arrowhead import chain_cuts
 from icalib.estimation.board import SHAPE_LABELS, SHAPE_SIGMA_M, bloom_direction
+from icalib.estimation.bodies import SIZE
 from icalib.estimation.border import NOTHING
 from icalib.estimation.circle_centres import with_circle_centres
 from icalib.estimation.clocks import EARLY_S, instants
@@ -43,7 +44,7 @@ CUT_S = 0.5
 
 
 def _priors(inputs: Inputs) -> tuple[Prior, ...]:
-    """All priors: those that belong to the model, and those that were given."""
+    """All priors: those that belong to the model, those on nuisance parameters, and others that were given."""
     rig, layout = inputs.rig, inputs.layout
     priors = [
         Prior(layout.block(b, "shape"), np.zeros(len(SHAPE_LABELS)), SHAPE_SIGMA_M) for b in inputs.bodies.bending
@@ -51,9 +52,16 @@ def _priors(inputs: Inputs) -> tuple[Prior, ...]:
     for camera in rig.cameras if rig.blooms else ():
         if camera.bloom.mode == "free":
             priors.append(Prior(layout.block(camera.name, "bloom"), np.zeros(1), np.full(1, BLOOM_SIGMA_PX)))
-    if rig.imu is not None:
-        priors += _given(layout, rig.imu.name, "intrinsics", rig.imu.intrinsics)
-    return (*priors, *given_priors(inputs))
+    return (*priors, *nuisance_priors(inputs), *given_priors(inputs))
+
+
+def nuisance_priors(inputs: Inputs) -> tuple[Prior, ...]:
+    """The priors on how imperfect sensors and targets are, whether the rig file gives them or they are the default."""
+    imu, layout, one = inputs.rig.imu, inputs.layout, np.ones(1)
+    priors = [] if imu is None else _given(layout, imu.name, "intrinsics", imu.intrinsics)
+    sigmas = {SIZE: inputs.rig.target.size_sigma} | {(p.name, "scale"): p.scale_sigma for p in inputs.rig.poses}
+    priors += [Prior(b, one, sigmas[b.key] * one) for b in layout.free if b.key in sigmas]
+    return tuple(priors)
 
 
 def given_priors(inputs: Inputs) -> tuple[Prior, ...]:
@@ -61,7 +69,7 @@ def given_priors(inputs: Inputs) -> tuple[Prior, ...]:
     priors = []
     names = {s.name: s for s in inputs.sensors}
     for block in inputs.layout.free:
-        if block.sensor not in names:
+        if block.sensor not in names or block.is_nuisance:
             continue
         difference = origin_difference(inputs.measurements, inputs.stream(block.sensor))
         shift = difference if block.name == "time_offset" else 0.0
@@ -277,7 +285,8 @@ def _with_bloom(factor: CornerFactor, camera: Camera, state: State, rig: Rig) ->
 
 def start_values(inputs: Inputs, guess_values: dict[Key, np.ndarray]) -> dict[Key, np.ndarray]:
     """Values of all blocks: the guess, completed by what starts from zero."""
-    values = dict(guess_values)
+    one = np.ones(1)
+    values = guess_values | {SIZE: one} | {(p.name, "scale"): one for p in inputs.rig.poses}
     for name in inputs.bodies.bending:
         values[name, "shape"] = np.zeros(len(SHAPE_LABELS))
     for reference in inputs.bodies.names[:1]:

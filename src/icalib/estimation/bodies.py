@@ -17,23 +17,27 @@ from icalib.estimation.board import SHAPE_LABELS, shape_basis
 from icalib.estimation.nodes import MERGED_WITHIN_S
 from icalib.estimation.state import Entry, Key, Layout
 from icalib.geometry.targets import Target
+from icalib.geometry.targets.base import BOARD
 from icalib.measurements import CornerStream, Measurements
 from icalib.rig import Rig
 
 FEWEST_TOGETHER = 3  # images with both of two bodies that tie them to each other
 MOST_NAMED = 8  # bodies in a sentence
+SIZE: Key = (BOARD, "size")  # (1,) true lengths over those of the target as stated
 
 
 @dataclass(frozen=True)
 class Bodies:
     """used: indices of the target's bodies that are estimated, the reference first; left_out: those that were seen, but
-    too seldom with others; bent: whether bodies may bend; size: of each body, in what the target says."""
+    too seldom with others; bent: whether bodies may bend; size: of each body, in what the target says. sized: whether
+    the size is a parameter of its own, on which `size` is a factor."""
 
     target: Target
     used: tuple[int, ...]
     left_out: tuple[int, ...] = ()
     bent: bool = False
     size: float = 1.0
+    sized: bool = False
 
     @property
     def several(self) -> bool:
@@ -54,6 +58,16 @@ class Bodies:
         """(n_points, s, 3) displacement of each point by unit of its body's shape parameters, in the body's frame."""
         return shape_basis(self.target, self.bent)
 
+    @cached_property
+    def deformation(self) -> np.ndarray:
+        """(n_points, s or s + 1, 3) `basis`, and after it by unit of the size where it is a parameter."""
+        grown = self.size * self.target.points[:, None, :]
+        return np.concatenate([self.basis, grown], axis=1) if self.sized else self.basis
+
+    def size_entries(self) -> list[Entry]:
+        """The block of a layout for the size of all bodies together."""
+        return [(*SIZE, "vector", 1, True)] if self.sized and self.used else []
+
     def shape_entries(self) -> list[Entry]:
         """Blocks of a layout for how bodies bend."""
         return [(name, "shape", "vector", len(SHAPE_LABELS), True) for name in self.bending]
@@ -67,15 +81,17 @@ class Bodies:
         return entries
 
     def columns(self, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
-        """Border columns of each of the target's bodies: pose (n, 6, or 0 where only one is in use) and shape (n, s),
-        -1 where there are none."""
+        """Border columns of each of the target's bodies: pose (n, 6, or 0 where only one is in use), and shape and size
+        as in `deformation` (n, s or s + 1), -1 where there are none."""
         names, n = self.target.bodies, len(self.target.bodies)
-        pose, shape = np.full((n, 6 if self.several else 0), -1), np.full((n, self.basis.shape[1]), -1)
+        pose, shape = np.full((n, 6 if self.several else 0), -1), np.full((n, self.deformation.shape[1]), -1)
         for k in self.used if self.several else ():
             pose[k] = layout.columns(names[k], "rotation", "translation")
         for k in self.used:
             if names[k] in self.bending:
-                shape[k] = layout.columns(names[k], "shape")
+                shape[k, : self.basis.shape[1]] = layout.columns(names[k], "shape")
+        if self.sized:
+            shape[list(self.used), -1] = layout.columns(*SIZE)
         return pose, shape
 
     def poses(self, values: dict[Key, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -89,8 +105,9 @@ class Bodies:
         return R, p
 
     def points(self, values: dict[Key, np.ndarray]) -> np.ndarray:
-        """(n_points, 3) the target's points in the scene, shapes included."""
-        points, body = self.size * self.target.points, self.target.body
+        """(n_points, 3) the target's points in the scene, shapes included; of the stated size if `values` has none."""
+        size = self.size * values[SIZE][0] if self.sized and SIZE in values else self.size
+        points, body = size * self.target.points, self.target.body
         if self.bending:
             sizes = np.zeros((len(self.target.bodies), self.basis.shape[1]))
             for k in self.used:
@@ -122,7 +139,7 @@ def choose_bodies(target: Target, recordings: Sequence[Measurements], bent: bool
     reached = _tied_to(int(np.argmax(count)), together)
     lost = tuple(int(k) for k in np.flatnonzero(count) if k not in reached)
     _check_cameras(target, streams, reached, rig is not None and rig.imu is not None)
-    return Bodies(target, reached, lost, bent)
+    return Bodies(target, reached, lost, bent, sized=target.size_sigma > 0.0)
 
 
 def tied_by_images(bodies: Bodies, recordings: Sequence[Measurements]) -> list[tuple[int, ...]]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from icalib.estimation.state import Layout
+
 HELD_BELOW = 1e-2  # information in tolerance units: a direction known to less than ten tolerances stays where it is
 DETERMINED = 1.0  # in the same units: known to one tolerance
 LEAST = 1e-4  # of information in tolerance units; keeps variances finite
@@ -39,6 +41,12 @@ def _directions(
 def least_information(information: np.ndarray, tolerance: np.ndarray) -> float:
     """The least of `information` (B, B), in units of `tolerance` (B,), on any direction."""
     return float(np.linalg.eigvalsh(tolerance[:, None] * information * tolerance).min(initial=np.inf))
+
+
+def essential_information(information: np.ndarray, tolerance: np.ndarray, layout: Layout) -> float:
+    """`least_information` where nuisance parameters are known: what their priors bound does not wander."""
+    own = layout.essential
+    return least_information(information[np.ix_(own, own)], tolerance[own])
 
 
 def complement(held: np.ndarray, n: int) -> np.ndarray:

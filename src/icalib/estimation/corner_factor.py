@@ -143,7 +143,7 @@ class CornerFactor:
                 yield a, b, k
 
     def world_points(self, state: State, recording: int) -> np.ndarray:
-        """(n_points, 3) the target's points, shapes included, in the world frame of a recording."""
+        """(n_points, 3) the target's points, shapes and size included, in the world frame of a recording."""
         return self.bodies.points(state.values) @ _scene(state, recording).T
 
     def camera_poses(self, state: State, i0: int = 0, i1: int | None = None) -> tuple[Poses, np.ndarray, np.ndarray]:
@@ -288,7 +288,9 @@ class CornerFactor:
         noise = Noise(n.sigma, LOSSES[n.loss], n.loss_scale, curved, n.field, 1.0 / n.tau**2)
         bloom = float(state.values[self.name, "bloom"][0])
         R_ws, R_sb = _scene(state, recording), self.bodies.poses(state.values)[0]
-        basis = np.ascontiguousarray(self.bodies.basis @ (R_ws @ R_sb)[self.bodies.target.body].transpose(0, 2, 1))
+        basis = np.ascontiguousarray(
+            self.bodies.deformation @ (R_ws @ R_sb)[self.bodies.target.body].transpose(0, 2, 1)
+        )
         motion = self._motion(state, image, body, R_ws, chained)
         return images, noise, Direct(pars, bloom, self.direction, basis, direct), motion
 

@@ -74,7 +74,8 @@ def spurious_information(
     rng = np.random.default_rng(0)
     t, information = problem.tolerance[columns], outcome.information[among]
     scaled = t[:, None] * information * t
-    least = least_information(information, t)
+    own = np.isin(columns, problem.layout.essential)
+    least = least_information(information[np.ix_(own, own)], t[own])
     samples = (outcome.draws or posterior(problem, outcome.state)).still
     noise, first = _Noise(problem, outcome, among), _reading_noise(problem.chain.imu, rng)
     one_side = noise.there(1.0, samples[0].chain, first)

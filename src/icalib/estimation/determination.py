@@ -23,10 +23,11 @@ from scipy.linalg import LinAlgError, eigh
 
 from icalib.errors import EstimationError
 from icalib.estimation.assembly import given_priors
-from icalib.estimation.border import HELD_BELOW, least_information, restricted_root
+from icalib.estimation.border import HELD_BELOW, essential_information, restricted_root
 from icalib.estimation.debias import Spurious, spurious_information
 from icalib.estimation.estimate import EARLY_DECREASE, EARLY_SHARE, Estimate, OnVisit, estimate
 from icalib.estimation.guess_worth import astray, in_proportion, moved_to_guess, moved_to_worth, owed_to_guess
+from icalib.estimation.inflation import LEAST, inflation, with_priors_weighed
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.outcome import Outcome, Step
 from icalib.estimation.prior_factor import without_priors
@@ -45,9 +46,10 @@ ALIKE = 0.7  # cosine of the largest angle between what is held and what is to b
 class Determined:
     """An estimate and what is known of its border.
 
-    data, noise (B, B): information of the data alone in tolerance units, without priors and without what noise makes of
-    it, and that; held (B, m): orthonormal directions in tolerance units, those that are undetermined; shifts (m, B):
-    how all moves with each independent error of the guess along them.
+    data, noise (B, B): information of the data alone in tolerance units, without priors but those on nuisance
+    parameters and without what noise makes of it, and that; held (B, m): orthonormal directions in tolerance units,
+    those that are undetermined; shifts (m, B): how all moves with each independent error of the guess along them.
+    inflation: root of how many times priors on nuisance parameters count, see `estimation.inflation`.
     """
 
     estimate: Estimate
@@ -55,6 +57,7 @@ class Determined:
     noise: np.ndarray
     held: np.ndarray
     shifts: np.ndarray
+    inflation: float = 1.0
 
     @property
     def covariance(self) -> np.ndarray:
@@ -97,6 +100,7 @@ def determine(
     search = _Search.begin(inputs, start, wanted, on_step, on_visit)
     search.settle()
     search.weigh()
+    search.balance()
     found, seen = search.found, search.seen
     held, shifts = np.zeros((inputs.layout.size, 0)), np.zeros((0, inputs.layout.size))
     if found.problem.held.size:
@@ -105,7 +109,7 @@ def determine(
         worth = _is_worth_keeping(found.outcome)
         shifts = (owed_to_guess if worth else in_proportion)(inputs, found.outcome, seen.data)
     found = replace(found, outcome=replace(found.outcome, room=None))  # nothing is solved in it any more
-    return Determined(found, seen.data, seen.noise, held, shifts)
+    return Determined(found, seen.data, seen.noise, held, shifts, search.inflation)
 
 
 @dataclass
@@ -119,6 +123,7 @@ class _Search:
     on_visit: OnVisit
     found: Estimate
     seen: Judgement
+    inflation: float = 1.0
 
     @classmethod
     def begin(
@@ -157,6 +162,17 @@ class _Search:
             del problem
             self._estimate(begin, held, led=False)
 
+    def balance(self) -> None:
+        """Weighs priors on nuisance parameters by how large errors of the measurements are."""
+        outcome = self.found.outcome
+        if not outcome.converged or (factor := inflation(self.inputs, outcome)) < LEAST:
+            return
+        problem = with_priors_weighed(outcome.problem, factor)
+        again = minimise(problem, outcome.state, partial(self.on_step, "last"), room=outcome.room)
+        if again.converged:
+            self.found, self.inflation = replace(self.found, outcome=again), factor
+            self.seen = judge(self.inputs, again, self.seen)
+
     def _estimate(self, begin: State, held: np.ndarray, led: bool) -> None:
         """The next estimate, `led` by the guess or not; noise and outliers as the last one judged them, but where it
         failed."""
@@ -186,7 +202,7 @@ def _is_worth_keeping(outcome: Outcome) -> bool:
 
 def _is_doubtful(problem: Problem, information: np.ndarray) -> bool:
     """Whether something may be open: with what noise adds, all is better known where nothing is."""
-    return least_information(information, problem.tolerance) < DOUBTFUL
+    return essential_information(information, problem.tolerance, problem.layout) < DOUBTFUL
 
 
 def _is_settled(undetermined: np.ndarray, held: np.ndarray, late: bool) -> bool:
@@ -200,9 +216,9 @@ def _is_settled(undetermined: np.ndarray, held: np.ndarray, late: bool) -> bool:
 
 
 class Judgement(NamedTuple):
-    """Of an estimate, in tolerance units: information of the `data` alone and what `noise` adds to it (B, B), and the
-    directions (B, m) that are `undetermined`; asked (B, B): data, noise and the model's own priors together. spurious:
-    how the noise was found."""
+    """Of an estimate, in tolerance units: information of the `data` alone, with priors on nuisance parameters, and what
+    `noise` adds to it (B, B), and the directions (B, m) that are `undetermined`; asked (B, B): data, noise and the
+    model's own priors together. spurious: how the noise was found."""
 
     spurious: Spurious
     data: np.ndarray
@@ -216,8 +232,10 @@ def judge(
 ) -> Judgement:
     """Of `columns` (B,) of the border, the others fixed; of all by default.
 
-    Nuisances whose priors belong to the model (a target's shape, bloom) are open only where these are, too. What noise
-    adds is not looked for again where there is about as much information as in the judgement `before`.
+    Parameters whose priors belong to the model (a target's shape, bloom) are open only where these are, too. Nuisance
+    parameters never are: whether the motion determines all else is asked with these known, and how far all else depends
+    on them is in the covariance. What noise adds is not looked for again where there is about as much information as in
+    the judgement `before`.
     """
     problem, information, state = outcome.problem, outcome.information, outcome.state
     columns = np.arange(len(information)) if columns is None else columns
@@ -225,13 +243,16 @@ def judge(
     counted = {p.block.key for p in problem.priors}
     given = [p for p in given_priors(inputs) if p.block.key in counted]
     asked = t[:, None] * without_priors(information, given, state)[among] * t
-    shown = partial(_shown, asked, t)
-    if before is not None and _are_alike(before.asked, asked):
+    is_essential = np.isin(columns, problem.layout.essential)
+    shown = partial(_shown, asked, t, is_essential)
+    own = np.ix_(is_essential, is_essential)
+    if before is not None and _are_alike(before.asked[own], asked[own]):
         spurious = before.spurious
     else:
         spurious = spurious_information(problem, outcome, lambda found: not shown(found).in_doubt.any(), columns)
     seen, noise = shown(spurious), spurious.mean
-    data = without_priors(information, problem.priors, state)[among] - noise
+    bounded = [p for p in problem.priors if not p.block.is_nuisance]
+    data = without_priors(information, bounded, state)[among] - noise
     undetermined = seen.vectors[:, seen.nothing | seen.in_doubt]
     return Judgement(spurious, t[:, None] * data * t, t[:, None] * noise * t, asked, undetermined)
 
@@ -247,17 +268,20 @@ def _are_alike(a: np.ndarray, b: np.ndarray) -> bool:
 
 
 class _Shown(NamedTuple):
-    """Directions vectors (B, B) in tolerance units, of which the data show `nothing` (B,), or what may be `in_doubt`
-    (B,) noise in all of it."""
+    """Directions vectors (B, n) in tolerance units, of which the data show `nothing` (n,), or what may be `in_doubt`
+    (n,) noise in all of it."""
 
     vectors: np.ndarray
     nothing: np.ndarray
     in_doubt: np.ndarray
 
 
-def _shown(asked: np.ndarray, tolerance: np.ndarray, spurious: Spurious) -> _Shown:
-    """Of the information asked (B, B), in tolerance units, noise and all."""
-    values, vectors = np.linalg.eigh(asked - tolerance[:, None] * spurious.mean * tolerance)
+def _shown(asked: np.ndarray, tolerance: np.ndarray, is_essential: np.ndarray, spurious: Spurious) -> _Shown:
+    """Of the information asked (B, B), in tolerance units, noise and all, on what `is_essential` (B,)."""
+    own = np.flatnonzero(is_essential)
+    known = asked - tolerance[:, None] * spurious.mean * tolerance
+    vectors = np.zeros((len(asked), len(own)))
+    values, vectors[own] = np.linalg.eigh(known[np.ix_(own, own)])
     all_of_it = np.einsum("ik,ij,jk->k", vectors, asked, vectors)
     nothing = values < HELD_BELOW
     maybe = values < spurious.chance(tolerance[:, None] * vectors)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.estimation.assembly import given_priors
-from icalib.estimation.imu_model import N_INTRINSICS
+from icalib.estimation.assembly import given_priors, nuisance_priors
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.prior_factor import Prior
 from icalib.estimation.state import State
@@ -20,7 +19,7 @@ def guess_sigma(inputs: Inputs, state: State) -> np.ndarray:
     """(B,) standard deviations of the guess: given ones, or the default ones. `state` has the lenses."""
     sigma, sensors = np.zeros(inputs.layout.size), {s.name: s for s in inputs.sensors}
     for b in inputs.layout.free:
-        sigma[b.columns] = OTHER_SIGMA if b.size == N_INTRINSICS else GUESS_SIGMA[b.name]
+        sigma[b.columns] = OTHER_SIGMA if b.is_nuisance else GUESS_SIGMA[b.name]
         if b.name == "translation" and b.sensor in sensors and sensors[b.sensor].translation.value is None:
             sigma[b.columns] = FROM_NOTHING_M
     sigma *= distortion_scales(inputs.rig, inputs.layout)
@@ -28,7 +27,7 @@ def guess_sigma(inputs: Inputs, state: State) -> np.ndarray:
         columns = inputs.layout.columns(camera.name, "intrinsics", "distortion")
         if (columns >= 0).all():
             sigma[columns[:2]] = np.hypot(sigma[columns[:2]], _focal_sigma(camera, state, sigma[columns[4:]]))
-    for prior in given_priors(inputs):
+    for prior in (*nuisance_priors(inputs), *given_priors(inputs)):
         sigma[prior.block.columns] = prior.sigma
     return sigma
 
@@ -36,7 +35,8 @@ def guess_sigma(inputs: Inputs, state: State) -> np.ndarray:
 def guess_priors(inputs: Inputs, guess: State, times: float = 1.0) -> tuple[Prior, ...]:
     """Priors about `guess` on everything of the sensors that the rig file gives none for, this many `times` as wide as
     a guess is off."""
-    sigma, given = times * guess_sigma(inputs, guess), {p.block.key for p in given_priors(inputs)}
+    sigma = times * guess_sigma(inputs, guess)
+    given = {p.block.key for p in (*nuisance_priors(inputs), *given_priors(inputs))}
     own = (b for b in inputs.layout.free if inputs.is_sensor(b.sensor) and b.key not in given)
     return tuple(Prior(b, guess.values[b.key], sigma[b.columns]) for b in own)
 

@@ -105,7 +105,7 @@ def layout_for(rig: Rig, bodies: Bodies, n_recordings: int = 1, clouds: Clouds =
     levelled = imu is not None and not rig.assumes_motion
     for k in range(1 if imu is None else n_recordings) if bodies.used else ():
         entries.append((board_in(BOARD, k), "tilt", "tilt", 2, levelled))
-    entries += bodies.shape_entries()
+    entries += bodies.size_entries() + bodies.shape_entries()
     for camera in rig.cameras:
         sizes = SIZES | {"distortion": len(camera_model(camera.model).parameter_names) - 4}
         sizes["time_offset"] = n_recordings if camera.clock_restarts else 1

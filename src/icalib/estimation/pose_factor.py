@@ -3,14 +3,16 @@
 `AbsolutePoseFactor`: each pose at its own instant, in a frame that stands still in the world of each recording.
 `RelativePosesFactor`: the way from one pose to another, about from node to node; their frame may drift.
 
-The sensor's parameters are the blocks rotation, translation (R_imu_sensor, p_imu_sensor) and time_offset. The frame has
-the blocks frame_rotation and frame_translation (R_world_frame, p_world_frame), in each recording its own.
+The sensor's parameters are the blocks rotation, translation (R_imu_sensor, p_imu_sensor), time_offset, and scale (1,),
+true lengths over reported ones. A position is predicted / scale - reported: the noise is that of what is reported, and
+a scale on it would be drawn to where it makes the noise less. The frame has the blocks frame_rotation and
+frame_translation (R_world_frame, p_world_frame), in each recording its own.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -151,16 +153,20 @@ class AbsolutePoseFactor:
             _mount(self.name, state),
             found,
             self.rotation[own],
-            self.position[own],
+            v[self.name, "scale"][0] * self.position[own],
             into.sums,
         )
-        made = _chained(rows, (poses,))
+        made = _chained(rows, _Scaling.of(self, state, own), (poses,))
         if into.sums:
             last = node > at
             made.by_next[last] = made.by_node[last]
             made.by_node[last] = 0.0
         columns = np.concatenate(
-            [mounted_columns(self.layout, self.name, recording), self.layout.columns(frame, *FRAME)]
+            [
+                mounted_columns(self.layout, self.name, recording),
+                self.layout.columns(frame, *FRAME),
+                self.layout.columns(self.name, "scale"),
+            ]
         )
         return _add(self, own, made, columns, at, into)
 
@@ -245,11 +251,12 @@ class RelativePosesFactor:
             (a.position, b.position),
             _mount(self.name, state),
             self.rotation[own],
-            self.position[own],
+            state.values[self.name, "scale"][0] * self.position[own],
             into.sums,
         )
-        made = _chained(rows, (a, b))
-        return _add(self, own, made, mounted_columns(self.layout, self.name, clock), node, into)
+        made = _chained(rows, _Scaling.of(self, state, own), (a, b))
+        columns = np.append(mounted_columns(self.layout, self.name, clock), self.layout.columns(self.name, "scale"))
+        return _add(self, own, made, columns, node, into)
 
 
 PoseFactor = AbsolutePoseFactor | RelativePosesFactor
@@ -273,17 +280,34 @@ def _poses(factor: PoseFactor, seconds: np.ndarray, node: np.ndarray, state: Sta
     return poses_at("inertial", times, node, state, factor.imu, factor.gravity, imu_free)
 
 
-def _chained(rows: PoseRows, ends: tuple[Poses, ...]) -> Rows:
-    """The rows by the nodes of each of their `ends`, and by the border: mount, time, frame, IMU intrinsics."""
+class _Scaling(NamedTuple):
+    """True lengths over reported ones, and the positions (n, 3) m that are reported."""
+
+    scale: float
+    reported: np.ndarray
+
+    @classmethod
+    def of(cls, factor: PoseFactor, state: State, own: slice) -> _Scaling:
+        return cls(float(state.values[factor.name, "scale"][0]), factor.position[own])
+
+
+def _chained(rows: PoseRows, scaling: _Scaling, ends: tuple[Poses, ...]) -> Rows:
+    """The rows, of reported positions times their scale, as rows of reported ones; by the nodes of each of their
+    `ends`, and by the border: mount, time, frame, scale, IMU intrinsics."""
     n, own = rows.by_mount.shape[0], rows.by_mount.shape[2]
     time = slice(own, own + 1)
     frame = slice(time.stop, time.stop + rows.by_frame.shape[2])
-    by_border = np.zeros((n, 6, frame.stop + ends[0].by_imu.shape[2]))
+    imu = slice(frame.stop + 1, frame.stop + 1 + ends[0].by_imu.shape[2])
+    by_border = np.zeros((n, 6, imu.stop))
     by_border[:, :, :own], by_border[:, :, frame] = rows.by_mount, rows.by_frame
     by_nodes = np.zeros((2, n, 6, NODE))
     for by_pose, poses, by_node in zip(rows.by_pose, ends, by_nodes, strict=False):
         moved = poses.by_node, poses.by_imu, poses.rate, poses.velocity
-        add_chain_rule(by_pose, moved, by_node, by_border[:, :, own], by_border[:, :, frame.stop :])
+        add_chain_rule(by_pose, moved, by_node, by_border[:, :, own], by_border[:, :, imu])
+    for x in (rows.residual, *by_nodes, by_border):
+        x[:, 3:] /= scaling.scale
+    if n:
+        by_border[:, 3:, frame.stop] = -(rows.residual[:, 3:] + scaling.reported) / scaling.scale
     return Rows(rows.residual, by_nodes[0], by_nodes[1], by_border)
 
 

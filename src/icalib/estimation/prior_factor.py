@@ -54,6 +54,14 @@ def without_priors(information: np.ndarray, priors: Sequence[Prior], state: Stat
     return information - sums_of_priors(priors, state, len(information))[2]
 
 
+def variance_of_priors(covariance: np.ndarray, priors: Sequence[Prior], state: State) -> np.ndarray:
+    """(B,) what errors of the means of `priors` contribute to the diagonal of `covariance` (B, B), of an estimate in
+    which they count: C W C with their information W. The rest is what noise of the measurements contributes."""
+    information = sums_of_priors(priors, state, len(covariance))[2]
+    own = np.einsum("ij,jk,ki->i", covariance, information, covariance, optimize=True)
+    return np.clip(own, 0.0, np.diag(covariance))
+
+
 def accumulate_bias_prior(
     state: State, piece: Piece, sums: bool = True, centre: np.ndarray | None = None, node: int = 0
 ) -> float:

@@ -99,7 +99,9 @@ def own_entries(sensor: Lidar | Wheels | PoseSensor, n_recordings: int) -> list[
     mounts: list[Entry] = [
         (sensor.name, name, kind, clocks.get(name, n), getattr(sensor, name).mode != "fixed") for name, kind, n in MOUNT
     ]
-    if not isinstance(sensor, Wheels):
+    if isinstance(sensor, PoseSensor):
+        return [*mounts, (sensor.name, "scale", "vector", 1, sensor.scale_sigma > 0.0)]
+    if isinstance(sensor, Lidar):
         return mounts
     heard = sensor.measures != "poses"  # which say nothing of what rolls
     height: list[Entry] = [(sensor.name, HEIGHT_BLOCK, "vector", 1, True)] if sensor.knows_height else []

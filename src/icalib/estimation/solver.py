@@ -11,7 +11,7 @@ import numpy as np
 from icalib.errors import EstimationError
 from icalib.estimation.anderson import PROMISED, Accelerator
 from icalib.estimation.arrowhead import NotDefiniteError, Piece, Solution, solve
-from icalib.estimation.border import DETERMINED, least_information
+from icalib.estimation.border import DETERMINED, essential_information
 from icalib.estimation.outcome import STALLED_DECREASE, Outcome, Step, Visit, outcome_of, way_come
 from icalib.estimation.prior_factor import Prior, sums_of_priors
 from icalib.estimation.problem import Problem, Residuals
@@ -177,7 +177,7 @@ class _Descent:
         if not (
             left < LEAST_DECREASE
             and now < SMALL_DECREASE
-            and least_information(solution.information, self.problem.tolerance) > DETERMINED
+            and essential_information(solution.information, self.problem.tolerance, self.problem.layout) > DETERMINED
         ):
             return None
         there = self.state.retract(self.problem.layout, solution.chain, solution.border)

@@ -11,9 +11,11 @@ from typing import Literal
 
 import numpy as np
 
+from icalib.estimation.imu_model import N_INTRINSICS
 from icalib.geometry import planes, so3
 
 NODE = 15
+NUISANCES = ("size", "scale")  # of a target, of the positions that a sensor reports; and the IMU intrinsics
 Key = tuple[str, str]  # sensor, parameter
 Kind = Literal["vector", "rotation", "tilt", "plane"]
 Entry = tuple[str, str, Kind, int, bool]  # sensor, name, kind, size, whether it is estimated
@@ -42,6 +44,11 @@ class Block:
         """(size,) border columns, -1 where fixed."""
         return np.full(self.size, -1) if self.start is None else np.arange(self.start, self.start + self.size)
 
+    @property
+    def is_nuisance(self) -> bool:
+        """Whether it says how imperfect a sensor or target is: a proper prior bounds it, whatever the data show."""
+        return self.name in NUISANCES or (self.name == "intrinsics" and self.size == N_INTRINSICS)
+
 
 @dataclass(frozen=True)
 class Layout:
@@ -56,6 +63,11 @@ class Layout:
     @property
     def free(self) -> tuple[Block, ...]:
         return tuple(b for b in self.blocks if b.start is not None)
+
+    @property
+    def essential(self) -> np.ndarray:
+        """Columns of all that is estimated but nuisance parameters."""
+        return np.concatenate([np.arange(0), *(b.columns for b in self.free if not b.is_nuisance)])
 
     def block(self, sensor: str, name: str) -> Block:
         return next(b for b in self.blocks if b.key == (sensor, name))

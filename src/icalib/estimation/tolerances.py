@@ -21,7 +21,7 @@ GUESS_SIGMA = {
 }  # fmt: skip
 UNGUESSED = 0.03  # rad or m: how well the start knows what nobody guessed, such as which way is up
 FROM_NOTHING_M = 0.5  # what a translation is worth that nobody guessed: where the program took it to be
-OTHER_SIGMA = 0.1  # of IMU intrinsics
+OTHER_SIGMA = 0.1  # of nuisance parameters without a prior
 
 
 @dataclass(frozen=True)
@@ -48,6 +48,8 @@ class Tolerances:
     # Of where the frame of a pose sensor stands: wide, too.
     frame_rotation: float = np.deg2rad(10.0)
     frame_translation: float = 0.5
+    size: float = 1e-2  # relative
+    scale: float = 1e-2
     imu_intrinsics: float = 1e-2  # scale, misalignment [rad]; g-sensitivity rad/s per m/s^2
 
     @classmethod

@@ -43,7 +43,7 @@ from icalib.first_guess.wheel_path import (
 from icalib.first_guess.wheels import SidewaysError
 from icalib.geometry.targets.base import BOARD
 from icalib.measurements import ImuStream, Measurements
-from icalib.parameter import fixed
+from icalib.parameter import Parameter, fixed
 from icalib.rig import ImuNoise, ImuSensor, Rig
 
 ASSUMPTION = "assumed motion"  # no sensor is called so
@@ -185,7 +185,7 @@ def _with_assumption(rig: Rig, recordings: Sequence[Measurements], paths: Sequen
     )
     noise = ImuNoise(WHITE_STEP_S * turning, turning, WHITE_STEP_S * jerking, jerking, ASSUMPTION)
     here = {"rotation": fixed(np.eye(3)), "translation": fixed(np.zeros(3)), "time_offset": fixed(np.zeros(1))}
-    imu = ImuSensor(ASSUMPTION, "", noise, assumed=True)
+    imu = ImuSensor(ASSUMPTION, "", noise, Parameter("fixed"), assumed=True)
     if not rig.moves_by_poses:
         return replace(rig, imu=imu, gravity=0.0, cameras=(replace(rig.cameras[0], **here), *rig.cameras[1:]))
     spacing = keyframe_spacing(rig, recordings, paths, float(turning), float(jerking))

@@ -77,7 +77,7 @@ def pose_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
         elif has_guesses(sensor, known):
             with suppress(EstimationError):
                 known = settled(sensor, known, _placed(inputs, state, sensor, stream))
-        out |= known | _frames(inputs.imu, sensor, stream, state, known)
+        out |= known | _frames(inputs.imu, sensor, stream, state, known) | {(sensor.name, "scale"): np.ones(1)}
     return out
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from icalib.geometry import so3
+from icalib.geometry.targets.base import BOARD
 from icalib.simulation import Truth
 
 
@@ -12,8 +13,14 @@ def true_value(truth: Truth, sensor: str, name: str) -> np.ndarray | None:
     """The truth of the group `name` of `sensor`, in the form of `ParameterGroup.value`; None where none is stated, as
     of a target's tilt."""
     poses = truth.T_imu_cam | truth.T_imu_lidar | truth.T_imu_wheel | truth.T_imu_pose
+    if (sensor, name) == ("imu0", "intrinsics"):
+        return truth.imu_intrinsics
+    if (sensor, name) == (BOARD, "size"):
+        return np.array([truth.target_size])
     if sensor not in poses:
-        return truth.imu_intrinsics if (sensor, name) == ("imu0", "intrinsics") else None
+        return None
+    if name == "scale":
+        return np.array([truth.pose_scale[sensor]])
     if name == "rotation":
         return poses[sensor][:3, :3]
     if name == "translation":

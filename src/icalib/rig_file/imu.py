@@ -6,7 +6,7 @@ import dataclasses
 from typing import Any, get_args
 
 from icalib.imu_classes import DEFAULT_CLASS, IMU_CLASSES, class_noise
-from icalib.rig import AccelUnit, GyroUnit, ImuNoise, ImuSensor, Parameter, TwoSources
+from icalib.rig import BY_CLASS, AccelUnit, GyroUnit, ImuNoise, ImuSensor, TwoSources
 from icalib.rig_file.fields import TABLE, axes_or_none, layout_to_plain, table_layout
 from icalib.rig_parameters import imu_intrinsics_parameter, parameter_to_plain
 from icalib.yaml_nodes import YamlValue
@@ -27,7 +27,7 @@ def read_imu(name: str, value: YamlValue) -> ImuSensor:
         name=name,
         path=_source(found["path"]) if "path" in found else f"{name}/data.csv",
         noise=_noise(found["noise"]) if "noise" in found else class_noise(DEFAULT_CLASS),
-        intrinsics=imu_intrinsics_parameter(found["intrinsics"]) if "intrinsics" in found else Parameter("fixed"),
+        intrinsics=imu_intrinsics_parameter(found["intrinsics"]) if "intrinsics" in found else BY_CLASS,
         topic=_source(found["topic"]) if "topic" in found else None,
         accel_axes=axes_or_none(found, "accel_axes"),
         gyro_axes=axes_or_none(found, "gyro_axes"),
@@ -46,8 +46,8 @@ def imu_to_plain(imu: ImuSensor) -> dict[str, Any]:
         given = getattr(imu, field)
         if given is not None:
             plain[field] = list(given) if isinstance(given, tuple) else given
-    intrinsics = parameter_to_plain(imu.intrinsics)
-    return plain if intrinsics is None else plain | {"intrinsics": intrinsics}
+    is_ideal = imu.intrinsics.mode == "fixed" and imu.intrinsics.value is None
+    return plain | {"intrinsics": "fixed" if is_ideal else parameter_to_plain(imu.intrinsics)}
 
 
 def _noise(value: YamlValue) -> ImuNoise:

@@ -19,7 +19,7 @@ from icalib.rig_file.fields import (
 )
 from icalib.yaml_nodes import YamlValue
 
-_FIELDS = ("path", "topic", "kind", "level", "position_axes", "inverted", "frames")
+_FIELDS = ("path", "topic", "kind", "level", "position_axes", "inverted", "frames", "scale_sigma")
 _NOISE = ("rotation_noise", "position_noise")
 
 
@@ -37,6 +37,7 @@ def pose_sensor(name: str, value: YamlValue) -> PoseSensor:
         position_noise=found["position_noise"].positive() if "position_noise" in found else None,
         inverted="inverted" in found and found["inverted"].boolean(),
         layout=table_layout(found),
+        scale_sigma=_scale_sigma(found["scale_sigma"]) if "scale_sigma" in found else PoseSensor.scale_sigma,
         frames=_frames(found["frames"]) if "frames" in found else None,
         **mounting(found),
     )
@@ -45,12 +46,19 @@ def pose_sensor(name: str, value: YamlValue) -> PoseSensor:
 def pose_to_plain(sensor: PoseSensor) -> dict[str, Any]:
     """The fields that `pose_sensor` reads."""
     plain: dict[str, Any] = {"type": "pose", "path": sensor.path, "kind": sensor.kind, "level": sensor.level}
+    plain["scale_sigma"] = sensor.scale_sigma
     plain |= layout_to_plain(sensor.layout)
     given = {name: getattr(sensor, name) for name in (*_NOISE, "topic")}
     axes, frames = sensor.position_axes, sensor.frames
     given |= {"inverted": sensor.inverted or None, "position_axes": None if axes is None else list(axes)}
     given["frames"] = None if frames is None else list(frames)
     return plain | {name: value for name, value in given.items() if value is not None} | groups_to_plain(sensor)
+
+
+def _scale_sigma(value: YamlValue) -> float:
+    if not 0.0 <= (sigma := value.number()) < 1.0:
+        value.fail(f"is a share of all lengths between 0 (exact) and 1, but is {sigma:g}; write 0.001 for 0.1 %.")
+    return sigma
 
 
 def _frames(value: YamlValue) -> tuple[str, str]:

@@ -84,10 +84,10 @@ def see_corners(
 def _in_camera(
     scenario: Scenario, camera: SimCamera, trajectory: Trajectory, seconds: np.ndarray, points: np.ndarray
 ) -> np.ndarray:
-    """Points (n, 3), one for each of the target's, in the camera frame at each instant, (M, n, 3)."""
+    """Points (n, 3), one for each of the target's as stated, in the camera frame at each instant, (M, n, 3)."""
     rotation, position, _ = trajectory.pose_at(seconds)
     T_world_body = scenario.body_poses[scenario.target.body]
-    world = np.einsum("nij,nj->ni", T_world_body[:, :3, :3], points) + T_world_body[:, :3, 3]
+    world = np.einsum("nij,nj->ni", T_world_body[:, :3, :3], scenario.target_size * points) + T_world_body[:, :3, 3]
     imu = (world - position[:, None, :]) @ rotation
     return (imu - camera.T_imu_cam[:3, 3]) @ camera.T_imu_cam[:3, :3]
 

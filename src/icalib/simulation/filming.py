@@ -122,6 +122,8 @@ class _Sheets:
 
     def __init__(self, film: Film) -> None:
         self._renderers = [Renderer(camera, film.imaging) for camera in film.scenario.cameras]
+        if film.scenario.target_size != 1.0:
+            raise RigError("images show targets of the stated size only; leave target_size out, or simulate tables.")
         self._sheets = sheets_of(film.scenario.target, film.scenario.body_poses)
 
     def picture(self, frame: _Frame, poses: np.ndarray, rng: np.random.Generator) -> Picture:

@@ -32,6 +32,7 @@ def report_poses(
     T = np.tile(np.eye(4), (len(seconds), 1, 1))
     T[:, :3, :3], T[:, :3, 3] = R, p
     seen = np.linalg.inv(sensor.T_world_frame) @ T @ sensor.T_imu_sensor
+    seen[:, :3, 3] /= sensor.scale
     truth = PoseTruth(seconds, seen[:, :3, :3].copy(), seen[:, :3, 3].copy())
     if noisy:
         seen = _scattered(sensor, seen, rng) if sensor.kind == "absolute" else _drifting(sensor, seen, seconds, rng)

@@ -69,7 +69,7 @@ def rig_for(
     return Rig(
         imu,
         tuple(treated.camera(c) for c in scenario.cameras),
-        scenario.target if scenario.board and scenario.cameras else NoTarget(),
+        replace(scenario.target, size_sigma=0.0) if scenario.board and scenario.cameras else NoTarget(),
         gravity=float(np.linalg.norm(GRAVITY_WORLD)),
         settings=settings_for(scenario) if settings is None else settings,
         lidars=tuple(treated.lidar(s) for s in scenario.lidars),
@@ -139,7 +139,8 @@ class _Treated:
         return self._mounted(given, sim, sim.T_imu_lidar)
 
     def poses(self, sim: SimPoses) -> PoseSensor:
-        given = PoseSensor(sim.name, f"{sim.name}/poses.csv", sim.kind, sim.rotation_noise, sim.position_noise)
+        noise = sim.rotation_noise, sim.position_noise
+        given = PoseSensor(sim.name, f"{sim.name}/poses.csv", sim.kind, *noise, scale_sigma=0.0)
         return self._mounted(given, sim, sim.T_imu_sensor)
 
 

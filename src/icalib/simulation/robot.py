@@ -164,7 +164,8 @@ class SimPoses:
     `SimCamera`.
 
     absolute: each pose has noise of its own, rotation_noise [rad] and position_noise [m] on each axis. relative: each
-    step from pose to pose has, which adds up to a drift: rad/sqrt(s) and m/sqrt(s).
+    step from pose to pose has, which adds up to a drift: rad/sqrt(s) and m/sqrt(s). scale: true lengths over reported
+    ones.
     """
 
     name: str
@@ -177,3 +178,4 @@ class SimPoses:
     clock_origin_ns: int = 0
     rotation_noise: float = 2e-3
     position_noise: float = 1e-3
+    scale: float = 1.0

@@ -127,7 +127,8 @@ class Scenario:
     order M_a, M_g, C_g, A_g. bow (3,) [m]: the points of a body that bends lie at z = a x^2 + b x y + c y^2, with x
     and y from -1 to 1 over its extent. Corner noise has sigma^2 = corner_noise_px^2 + (blur_s * image speed)^2, the
     image speed being the RMS of its corners' in px/s; shift_px is the sigma of a 2D shift that all corners of an
-    image share. Outliers are moved by up to +-outlier_px on each axis.
+    image share. target_size: true lengths of the target over those that it states. Outliers are moved by up to
+    +-outlier_px on each axis.
 
     Raises RigError where bodies have no pose, or its parts do not go together.
     """
@@ -139,6 +140,7 @@ class Scenario:
     T_world_board: np.ndarray = field(default_factory=_standing_board)
     T_world_bodies: np.ndarray | None = None
     bow: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    target_size: float = 1.0
     imu_rate_hz: float = 200.0
     imu_noise: ImuNoise = ADIS16448
     imu_noise_enabled: bool = True  # white noise and bias walk

@@ -13,6 +13,7 @@ from icalib.errors import RigError
 from icalib.file_names import NAME, NAME_WORDS
 from icalib.geometry.targets import TARGETS
 from icalib.rig import ImuNoise
+from icalib.simulation.effects import read_effects
 from icalib.simulation.image_faults import ImageFaults
 from icalib.simulation.projection import PARAMETER_COUNTS
 from icalib.simulation.robot import Drive, DriveKind, Features, SimLidar, SimPoses, SimWheels
@@ -36,7 +37,9 @@ Made = TypeVar("Made")
 def load_scenario(path: str | Path) -> Scenario:
     """Read a scenario file. Raises RigError, one sentence naming file, line, field, what is wrong and what to do."""
     root = read_yaml(Path(path), "scenario file")
-    found = root.record(("duration", "sensors", "room", "motion"), ("features", "target", "images", "seed", "start_ns"))
+    found = root.record(
+        ("duration", "sensors", "room", "motion"), ("effects", "features", "target", "images", "seed", "start_ns")
+    )
     start_ns = found["start_ns"].whole(0) if "start_ns" in found else _START_NS
     duration_s = found["duration"].positive()
     if start_ns + _MARGIN_S * 1e9 + duration_s * 1e9 > MOST_WHOLE:
@@ -44,6 +47,7 @@ def load_scenario(path: str | Path) -> Scenario:
     sensors = _sensors(found["sensors"], start_ns)
     room, motion = _room(found["room"]), _motion(found["motion"], Path(path).parent)
     features = _features(found["features"]) if "features" in found else None
+    effects: dict[str, Any] = read_effects(found["effects"], sensors["poses"]) if "effects" in found else {}
     board: dict[str, Any] = _board(found["target"]) if "target" in found else {"board": False}
     scenario = _made(
         root,
@@ -55,7 +59,7 @@ def load_scenario(path: str | Path) -> Scenario:
         features=features,
         seed=found["seed"].whole(0) if "seed" in found else 0,
         image_faults=_image_faults(found["images"]) if "images" in found else ImageFaults(),
-        **sensors,
+        **(sensors | effects),
         **board,
     )
     try:
@@ -270,7 +274,7 @@ def _board(value: YamlValue) -> dict[str, Any]:
     if "type" not in fields:
         value.fail(f"type is missing; add type: {', type: '.join(TARGETS)}.")
     kind = TARGETS[fields["type"].choice("target type", tuple(TARGETS))]
-    asked = [f for f in dataclasses.fields(kind) if f.init]
+    asked = [f for f in dataclasses.fields(kind) if f.init and f.name != "size_sigma"]
     required = tuple(f.name for f in asked if f.default is dataclasses.MISSING)
     optional = tuple(f.name for f in asked if f.name not in required)
     found = value.record(("type", "T_world_board", *required), optional)

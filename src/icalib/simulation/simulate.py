@@ -48,6 +48,8 @@ class Truth:
     gyro_bias: np.ndarray  # (N, 3) rad/s
     accel_bias: np.ndarray  # (N, 3) m/s^2
     imu_intrinsics: np.ndarray  # (24,)
+    target_size: float
+    pose_scale: dict[str, float]
     gravity: np.ndarray  # (3,) m/s^2, world
     T_world_bodies: np.ndarray  # (bodies, 4, 4), in the order of the target's bodies
     bow: np.ndarray  # (3,) m
@@ -218,6 +220,8 @@ def _rig_truth(scenario: Scenario) -> dict[str, Any]:
     cameras, lidars, wheels, poses = scenario.cameras, scenario.lidars, scenario.wheels, scenario.poses
     return {
         "imu_intrinsics": scenario.imu_intrinsics,
+        "target_size": scenario.target_size,
+        "pose_scale": {s.name: s.scale for s in poses},
         "gravity": GRAVITY_WORLD,
         "T_world_bodies": scenario.body_poses,
         "bow": np.array(scenario.bow),

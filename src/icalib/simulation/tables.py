@@ -113,11 +113,11 @@ def _plain_truth(scenario: Scenario, truth: Truth, seed: int) -> dict[str, Any]:
         sizes = {name: v.tolist() if v.size > 1 else float(v[0]) for name, v in w.drive.items()}
         sensors[w.name] = _mounted(truth, w.name, "wheels", w.T_imu_wheel) | sizes
     for p in scenario.poses:
-        frame = {"kind": p.kind, "T_world_frame": p.T_world_frame.tolist()}
+        frame = {"kind": p.kind, "T_world_frame": p.T_world_frame.tolist(), "scale": p.scale}
         sensors[p.name] = _mounted(truth, p.name, "pose", p.T_imu_sensor) | frame
     plain: dict[str, Any] = {"seed": seed, "gravity": truth.gravity.tolist(), "sensors": sensors}
     if scenario.board:
-        plain["T_world_bodies"] = truth.T_world_bodies.tolist()
+        plain |= {"T_world_bodies": truth.T_world_bodies.tolist(), "target_size": truth.target_size}
     return plain | {"planes": truth.planes.tolist()}
 
 

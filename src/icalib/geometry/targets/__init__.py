@@ -41,5 +41,5 @@ def target_from_plain(rig: dict[str, Any]) -> Target | None:
 
 
 def _one(fields: dict[str, Any]) -> Target:
-    values = {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items() if k != "type"}
+    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items() if k != "type"}
     return TARGETS[fields["type"]](**values)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -13,6 +13,8 @@ from icalib.errors import RecordingError
 from icalib.geometry.targets.families import TagSet
 
 BOARD = "board0"
+# Of a printed size, relative: a ruler reads 0.2 mm of 100 mm, and printers and damp paper are off by as much.
+SIZE_SIGMA = 0.002
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,8 @@ class Target(ABC):
     type: ClassVar[str]
     blooms: ClassVar[bool]
     seldom: ClassVar[tuple[str, ...]] = ()
+
+    size_sigma: float = field(default=SIZE_SIGMA, kw_only=True)  # of all its lengths, relative; 0: exact
 
     @cached_property
     @abstractmethod
@@ -74,7 +78,7 @@ class Target(ABC):
 
     def plain(self) -> dict[str, Any]:
         """Its fields as a rig file has them: text, numbers, lists; those that list nothing are left out."""
-        usual = {f.name: f.default for f in fields(self) if f.name in self.seldom}
+        usual = {f.name: f.default for f in fields(self) if f.name in (*self.seldom, "size_sigma")}
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         values = {name: value for name, value in values.items() if name not in usual or value != usual[name]}
         lists = {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}

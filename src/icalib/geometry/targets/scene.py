@@ -20,7 +20,8 @@ class Scene(Target):
     """Targets that stand still to each other, by name. How they stand is unknown, and estimated.
 
     Points are those of the first, then those of the second, and so on; bodies are called as their target, or as the
-    target and its body where it has several. Raises RigError where images cannot tell two of them apart.
+    target and its body where it has several. Sizes err together, by the largest `size_sigma` of all. Raises RigError
+    where images cannot tell two of them apart.
     """
 
     type: ClassVar[str] = "scene"
@@ -30,6 +31,7 @@ class Scene(Target):
     targets: tuple[Target, ...]
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "size_sigma", max(t.size_sigma for t in self.targets))
         for (name, one), (other_name, other) in combinations(zip(self.names, self.targets, strict=True), 2):
             if common := _in_common(one, other):
                 raise RigError(f"images cannot tell {name} from {other_name}: {common}.")

@@ -1,0 +1,70 @@
+"""Priors on nuisance parameters, weighed against measurements whose errors are larger than their noise says.
+
+Where model and noise are right, least squares weighs priors and measurements by their information. Errors of real
+measurements are correlated over time, and the covariance of the measurements is F^2 times the formal one, with F^2 from
+the block jackknife over parts of the recording. Unweighted, the measurements would move nuisance parameters F times
+further than they know them. So the priors count F^2 times (variance component of the measurements; Koch, Parameter
+Estimation and Hypothesis Testing in Linear Models, 1999, section 3.6), in one more solve. All is then F times as
+uncertain as the formal covariance says, a parameter that its prior alone knows among it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from icalib.estimation.border import restricted_inverse
+from icalib.estimation.evidence import split_covariance, split_expectation
+from icalib.estimation.inputs import Inputs
+from icalib.estimation.outcome import Outcome
+from icalib.estimation.parts import Parts
+from icalib.estimation.prior_factor import variance_of_priors
+from icalib.estimation.problem import Problem
+
+LEAST = 1.5  # below it, another weight of the priors would gain less than a tenth of a standard deviation
+LEAST_WHITE = 1e-9  # of a variance: rounding, where a prior contributes all of it
+MOST_LEVERAGE = 4.0  # of the variance: one part knows nearly all beyond, and the spread of the others nothing
+
+
+def white_variance(problem: Problem, outcome: Outcome, covariance: np.ndarray) -> np.ndarray:
+    """(B,) the part of the diagonal of a formal `covariance` (B, B) that noise of the measurements contributes, and not
+    errors of nuisance parameters."""
+    nuisance = [p for p in problem.priors if p.block.is_nuisance]
+    whole = np.diag(covariance)
+    return np.maximum(whole - variance_of_priors(covariance, nuisance, outcome.state), LEAST_WHITE * whole)
+
+
+def spread_variance(outcome: Outcome, parts: Parts, white: np.ndarray) -> np.ndarray:
+    """(B,) variances by the spread over `parts`, where white noise contributes `white` (B,) to the formal ones."""
+    spread, expected = np.diag(split_covariance(outcome, parts)), split_expectation(outcome, parts)
+    return np.clip(white / np.maximum(expected, 1e-300), 1.0, MOST_LEVERAGE) * spread
+
+
+def calibration_columns(inputs: Inputs) -> np.ndarray:
+    """Columns of what users take away: not the board's, nor nuisance parameters."""
+    own = (b for b in inputs.layout.free if inputs.is_sensor(b.sensor) and not b.is_nuisance)
+    return np.concatenate([np.arange(0), *(b.columns for b in own if b.name != "bloom")])
+
+
+def inflation(inputs: Inputs, outcome: Outcome) -> float:
+    """F, the root mean square over the calibration parameters; 1 where no prior bounds a nuisance parameter, or the
+    recording cannot be split."""
+    problem, columns = outcome.problem, calibration_columns(inputs)
+    if not any(p.block.is_nuisance for p in problem.priors) or not len(columns):
+        return 1.0
+    parts = Parts.of(problem, outcome, inputs.rig.settings.segments)
+    if parts is None:
+        return 1.0
+    t = problem.tolerance
+    scaled = t[:, None] * outcome.information * t
+    covariance = t[:, None] * restricted_inverse(scaled, problem.held) * t
+    white = white_variance(problem, outcome, covariance)
+    ratio = spread_variance(outcome, parts, white) / white
+    return float(np.sqrt(np.mean(ratio[columns])))
+
+
+def with_priors_weighed(problem: Problem, factor: float) -> Problem:
+    """The problem with priors on nuisance parameters that count `factor`^2 times."""
+    priors = (replace(p, sigma=p.sigma / factor) if p.block.is_nuisance else p for p in problem.priors)
+    return replace(problem, priors=tuple(priors))

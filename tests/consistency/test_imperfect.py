@@ -1,0 +1,98 @@
+"""Imperfect sensors and targets: errors within printed standard deviations, which include what nothing shows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from icalib.imu_classes import class_imperfections
+from icalib.pipeline import calibrate_measurements
+from icalib.rig import Parameter
+from icalib.simulation import SimPoses, handheld, rig_for, simulate
+
+
+@pytest.fixture(scope="module")
+def program(benchmark_program: Callable[[str], ModuleType]) -> ModuleType:
+    """Its table has all effects on all kinds of rigs."""
+    return benchmark_program("effects")
+
+
+@pytest.mark.parametrize(
+    ("kind", "effect"),
+    [
+        ("camera + IMU", "accelerometer scale"),
+        ("camera + IMU", "accelerometer misalignment"),
+        ("camera + IMU", "gyroscope scale"),
+        ("camera + IMU", "gyroscope rotation"),
+        ("camera + IMU", "target size"),
+        ("poses + IMU", "gyroscope misalignment"),
+        ("poses + IMU", "g-sensitivity"),
+        ("poses + IMU", "scale of poses"),
+    ],
+)
+def test_effects_of_two_sigma_are_within_four_printed_ones(program: ModuleType, kind: str, effect: str):
+    row = program.row_of(program.KINDS[kind], effect, 2.0, [0])
+    assert (row.converged, row.failures, row.far) == (1, (), False), row
+
+
+def test_taken_for_ideal_such_an_imu_is_far_off(program: ModuleType):
+    """Or the test above could not fail."""
+    kind = program.KINDS["camera + IMU"]
+    scenario = program.with_effect(kind.scenario(), "gyroscope rotation", 2.0, 0)
+    simulation = simulate(scenario, 0)
+    rig = rig_for(scenario, intrinsics="free", distortion="free", imu_intrinsics=Parameter("fixed"))
+    found = calibrate_measurements(rig, simulation.measurements)
+    assert max(off for _, verdict, off in program.errors(found, simulation) if verdict == "determined") > 20.0
+
+
+def test_a_baseline_carries_the_uncertainty_of_the_target():
+    """Cameras alone: what is 0.2 % of the target is 0.2 % of the baseline."""
+    scenario = handheld(6.0)
+    scenario = replace(scenario, cameras=tuple(replace(c, time_offset_s=0.0, rate_hz=4.0) for c in scenario.cameras))
+    measured = replace(simulate(scenario, 1).measurements, imu=None)
+    sizes = {}
+    for sigma in (0.0, 0.002):
+        rig = replace(rig_for(scenario), imu=None, target=replace(scenario.target, size_sigma=sigma))
+        found = calibrate_measurements(rig, measured)
+        group = found.group("cam1", "translation")
+        along = group.value / np.linalg.norm(group.value)
+        covariance = found.covariance[np.ix_(group.columns, group.columns)]
+        sizes[sigma] = float(np.sqrt(along @ covariance @ along)) / float(np.linalg.norm(group.value))
+    assert np.hypot(sizes[0.0], 0.002) == pytest.approx(sizes[0.002], rel=0.02)
+
+
+def test_size_and_scale_are_found_where_an_ideal_imu_shows_them():
+    """Without noise, and with priors so wide that they do not pull."""
+    poses = (SimPoses("mocap0", np.eye(4), rate_hz=50.0, scale=0.99),)
+    scenario = replace(handheld(6.0, noiseless=True), target_size=1.02, poses=poses, robot_noise_enabled=False)
+    scenario = replace(scenario, cameras=tuple(replace(c, rate_hz=10.0) for c in scenario.cameras[:1]))
+    rig = rig_for(scenario)
+    rig = replace(
+        rig,
+        target=replace(scenario.target, size_sigma=0.1),
+        poses=tuple(replace(p, scale_sigma=0.1) for p in rig.poses),
+    )
+    found = calibrate_measurements(rig, simulate(scenario, 1).measurements)
+    assert found.group("board0", "size").value[0] == pytest.approx(1.02, abs=2e-5)
+    assert found.group("mocap0", "scale").value[0] == pytest.approx(0.99, abs=2e-5)
+
+
+def test_what_the_recording_does_not_show_of_an_imu_is_as_the_prior_says():
+    """Nothing of it moves, and other parameters by less than 0.2 of their standard deviations."""
+    scenario = replace(handheld(4.0), cameras=tuple(replace(c, rate_hz=10.0) for c in handheld().cameras))
+    sigma = class_imperfections("tactical").sigma
+    measured = simulate(scenario, 2).measurements
+    ideal = calibrate_measurements(rig_for(scenario), measured)
+    found = calibrate_measurements(rig_for(scenario, imu_intrinsics=Parameter("prior", np.zeros(24), sigma)), measured)
+    group = found.group("imu0", "intrinsics")
+    unknown = group.std > 0.98 * sigma
+    assert unknown.sum() >= 9  # g-sensitivity at least
+    assert np.abs(group.value / sigma)[unknown].max() < 0.2
+    for camera in ("cam0", "cam1"):
+        for name in ("translation", "time_offset"):
+            a, b = found.group(camera, name), ideal.group(camera, name)
+            assert (np.abs(a.value - b.value) < 0.2 * a.std + 3.0 * np.sqrt(np.maximum(a.std**2 - b.std**2, 0.0))).all()
