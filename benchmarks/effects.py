@@ -71,7 +71,7 @@ def tracks_imu() -> Scenario:
     """A camera that follows points of a room, 8 s."""
     scenario = load_scenario(PAPER / "table2-3d.yaml")
     assert scenario.features is not None
-    features = replace(scenario.features, per_image=60, count=900, lasting=120)
+    features = replace(scenario.features, per_image=60, count=900, persistent=120)
     alone = {"cameras": scenario.cameras[:1], "lidars": (), "wheels": ()}
     return replace(scenario, duration_s=8.0, features=features, **alone)
 
