@@ -20,8 +20,8 @@ import numpy as np
 
 import icalib
 from icalib.calibration import Calibration
+from icalib.imu_classes import FREE
 from icalib.rig import Parameter, Rig, Settings
-from icalib.rig_parameters import IMU_INTRINSICS_SIGMA
 from icalib.simulation import Scenario, SimCamera, Truth, film, handheld, rig_for, simulate, tag_map, write_film
 
 KINDS = ("pinhole", "fisheye", "stereo", "tags")
@@ -96,7 +96,7 @@ def imperfect_imu() -> np.ndarray:
 
 def rig_of(scenario: Scenario) -> Rig:
     """As a user would write it who knows the target, the models and the IMU's data sheet, and nothing else."""
-    broad = Parameter("prior", np.zeros(24), IMU_INTRINSICS_SIGMA)  # what `free` means in a rig file
+    broad = Parameter("prior", np.zeros(24), FREE.sigma)  # what `free` means in a rig file
     imu = broad if scenario.imu_intrinsics.any() else Parameter("fixed")
     rig = rig_for(scenario, settings=Settings(), intrinsics="free", distortion="free", imu_intrinsics=imu)
     return dataclasses.replace(rig, cameras=tuple(dataclasses.replace(c, corner_noise_px=None) for c in rig.cameras))

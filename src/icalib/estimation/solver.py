@@ -156,8 +156,9 @@ class _Descent:
 
     def creeps(self, solution: Solution) -> bool:
         """Whether steps have ceased to promise less and less: Gauss and Newton's do where the measurements determine
-        all, and wander where noise leads. One that failed is no step: the next promises about as much as it did."""
-        before = [step.predicted_decrease for step in self.steps[-CREEPING:] if step.accepted]
+        all, and wander where noise leads. One that failed is no step: the next promises about as much as it did. Nor is
+        a damped one: with less damping the next promises more."""
+        before = [step.predicted_decrease for step in self.steps[-CREEPING:] if step.accepted and step.damping == 0.0]
         return len(before) == CREEPING and solution.decrease > 0.5 * min(before)
 
     def let_go(self, priors: Sequence[Prior], solution: Solution) -> Solution:
