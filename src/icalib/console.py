@@ -82,7 +82,8 @@ def print_result(calibration: Calibration, folder: Path) -> None:
     console.print(f"Solver: {calibration.status}", markup=False)
     chain = [camchain_name(calibration)] if calibration.cameras else []
     written = [*chain, *(["imu.yaml"] if calibration.imu else []), "report.html"]
-    console.print(f"Wrote {folder / 'calibration.yaml'}, {', '.join(written)}.", markup=False)
+    unfit = ", with the verdict that it is not usable" if calibration.verdict == "not usable" else ""
+    console.print(f"Wrote {folder / 'calibration.yaml'}{unfit}, {', '.join(written)}.", markup=False)
     print_verdict(calibration, console)
 
 

@@ -98,7 +98,7 @@ def test_costs_of_accepted_steps_fall(noisy_problem):
     costs = [s.cost for s in steps if s.accepted] + [outcome.cost]
     assert all(b < a for a, b in zip(costs[:-2], costs[1:-1], strict=True))
     assert costs[-1] <= costs[-2] * (1.0 + 1e-9)
-    assert outcome.status.startswith(f"converged in {len(steps)} iterations")
+    assert outcome.status.startswith(f"converged in {len(steps)} iterations of the last pass")
     assert steps[-1].damping == 0.0 and steps[-1].predicted_decrease < solver.CONVERGED_DECREASE
 
 
@@ -132,7 +132,7 @@ def test_too_few_iterations_is_said(noisy_problem, monkeypatch):
 def test_a_start_that_predicts_nothing_finite_is_an_error(noisy_problem):
     problem, start = noisy_problem
     bad = replace(start, position=start.position * np.nan)
-    with pytest.raises(EstimationError, match="first guess"):
+    with pytest.raises(EstimationError, match="initial guess"):
         minimise(problem, bad)
 
 

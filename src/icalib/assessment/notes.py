@@ -147,7 +147,10 @@ def _rejected_words(keep: np.ndarray) -> str:
     if not count:
         return ""
     share = f"{count} of {len(keep)} corners ({100.0 * count / len(keep):.2g} %)"
-    return f"{share} are rejected as outliers: they stand out of their images, and apart from corners near them."
+    return (
+        f"{share} are rejected as outliers: their residuals are far larger than those of the same image and of corners "
+        "nearby."
+    )
 
 
 def _noise_words(model: NoiseModel) -> str:

@@ -58,8 +58,10 @@ def reasons(c: Calibration) -> tuple[str, ...]:
     if not c.converged:
         return tuple(dict.fromkeys([*c.wrong, c.failure, *c.warnings]))
     counted = {v for g in c.groups for v in _counted(c, g)} & {"undetermined", "weak"}
-    open_ones = [*c.undetermined, *_unexplained(c)] if counted else []
-    weak = list(_weak(c))
+    # Standard deviations of a wrong model include its misfit: to record longer would not mend them.
+    mended_first = bool(c.wrong)
+    open_ones = [*c.undetermined, *(() if mended_first else _unexplained(c))] if counted else []
+    weak = [] if mended_first else list(_weak(c))
     rest = [w for w in c.warnings if w not in c.wrong]
     return tuple(dict.fromkeys([*c.wrong, *open_ones, *rest, *weak]))
 
@@ -113,7 +115,7 @@ def _weak(c: Calibration) -> Iterator[str]:
     if names:
         yield (
             f"{_listed(names)}: weakly determined, the standard deviation exceeds the tolerance; {_more(c)}, or accept "
-            "that size."
+            "that uncertainty."
         )
 
 

@@ -97,8 +97,8 @@ def outcome_of(
     # Half a chi^2 of d is a step of sqrt(2 d) standard deviations at most.
     share = max(100.0 * np.sqrt(2.0 * max(left, 0.0)), 1.0)
     status = (
-        f"converged in {n} iterations: the next step would move no parameter by more than {share:.0f} % of its "
-        "standard deviation."
+        f"converged in {n} iteration{'s' * (n != 1)} of the last pass: the next step would move no parameter by more "
+        f"than {share:.0f} % of its standard deviation."
         if converged
         else (
             f"not converged after {n} iterations: the next step would still lower half the chi^2 of {cost:.6g} by "

@@ -8,6 +8,7 @@ from rich.text import Text
 
 from icalib.calibration import Calibration, relative_poses
 from icalib.calibration.quantities import rows, rpy_deg, shown
+from icalib.calibration.verdict import UNDETERMINED
 
 STYLES = {"determined": "green", "weak": "yellow", "undetermined": "bold red", "fixed": "dim"}
 
@@ -61,4 +62,12 @@ def _caption(calibration: Calibration) -> str:
     body = "imu" if calibration.imu else calibration.body
     text = f"T_{body}_sensor; rotation: std about the sensor's axes; t_{body} = t_sensor + time offset."
     scaled = any(g.columns is not None and g.factor is not None for g in calibration.groups)
-    return text + (" std includes the empirical factor." if scaled else " std is formal: the recording was not split.")
+    text += " std includes the empirical factor." if scaled else " std is formal: the recording was not split."
+    if {"weak", "undetermined"} & {v for g in calibration.groups for v in g.verdict}:
+        s = calibration.settings
+        text += (
+            f" Tolerances: {s['rotation_tolerance_deg']:g} deg, {1e3 * s['translation_tolerance_m']:g} mm, "
+            f"{1e3 * s['time_tolerance_s']:g} ms, {s['pixel_tolerance']:g} px; std above it is weak, above "
+            f"{UNDETERMINED:g} of it undetermined."
+        )
+    return text
