@@ -88,6 +88,7 @@ sensors:
   imu0:
     type: imu
     noise: {gyro: 1.6968e-4, gyro_walk: 1.9393e-5, accel: 2.0e-3, accel_walk: 3.0e-3}
+    intrinsics: fixed # the simulated IMU is ideal
   cam0:
     type: camera
     model: pinhole-radtan
@@ -268,10 +269,10 @@ def test_what_can_be_mended_is_mended_with_a_note(tables, tmp_path, capsys):
 WRONG_RIGS = [
     ("type: imu", "type: gyroscope", r":3:.*gyroscope"),
     ("    resolution: [752, 480]\n", "", r"cam0.*resolution"),
-    ("0.088", "eighty-eight", r":11:.*tag_size"),
-    ("pinhole-radtan", "fisheye", r":7:.*fisheye"),
-    ("fixed: [458.654,", "fixd: [458.654,", r":9:.*fixd"),
-    ("segments: 0", "split: 0", r":12:.*split"),
+    ("0.088", "eighty-eight", r":12:.*tag_size"),
+    ("pinhole-radtan", "fisheye", r":8:.*fisheye"),
+    ("fixed: [458.654,", "fixd: [458.654,", r":10:.*fixd"),
+    ("segments: 0", "split: 0", r":13:.*split"),
     ("sensors:", "sensors: [", r"line"),
 ]
 

@@ -23,7 +23,7 @@ from icalib.first_guess.clocks import align
 from icalib.first_guess.poses import pose_rates
 from icalib.measurements import ImuStream, Measurements, PoseStream
 from icalib.pipeline import calibrate_measurements
-from icalib.rig import ImuNoise, ImuSensor, PoseSensor, Rig
+from icalib.rig import ImuNoise, ImuSensor, Parameter, PoseSensor, Rig
 
 ALIASED = ImuNoise(3e-3, 2.2e-5, 0.1, 8.6e-4, source="tests")
 FIRST_ROW = {"hkumars": 0, "kangminsu1": 75}  # of the poses, that belongs to the first stamp
@@ -78,7 +78,7 @@ def degrees(R: np.ndarray, S: np.ndarray) -> float:
 
 
 def calibrated(measured: Measurements, kind: str) -> Calibration:
-    imu, lidar = ImuSensor("imu0", "imu0", ALIASED), PoseSensor("lidar0", "lidar0", kind)
+    imu, lidar = ImuSensor("imu0", "imu0", ALIASED, Parameter("fixed")), PoseSensor("lidar0", "lidar0", kind)
     return calibrate_measurements(Rig(imu, (), poses=(lidar,)), measured)
 
 

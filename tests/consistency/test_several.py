@@ -189,7 +189,9 @@ def later(imu: ImuStream, ns: int) -> ImuStream:
 def test_a_clock_that_was_set_between_recordings_is_named(noisy, shift_ns: int):
     first, other = (s.measurements for s in noisy)
     moved = dataclasses.replace(other, imu=later(other.imu, shift_ns), name="evening")
-    with pytest.raises(EstimationError, match=rf"^evening: the time offset of cam0 is \+{shift_ns * 1e-9:.3f} s from"):
+    with pytest.raises(
+        EstimationError, match=rf"^evening: the time offset of cam0 differs by \+{shift_ns * 1e-9:.3f} s from that in"
+    ):
         calibrate_measurements(rig_of(noisy[0]), [first, moved])
 
 

@@ -115,4 +115,4 @@ def test_wheels_that_no_vehicle_has_are_named(driven):
 def test_a_wrong_size_of_the_target_does_not_blame_true_lever_arms(simulation):
     rig = rig_for(simulation.scenario, **dict.fromkeys(("rotation", "translation", "time_offset"), "fixed"))
     result = calibrate_measurements(replace(rig, target=AprilGrid(6, 6, 1.08 * 0.088, 0.3)), simulation.measurements)
-    assert said(result) == [] and "times as large as in the rig file" in result.wrong[0]
+    assert said(result) == [] and "times the size that the rig file says" in result.wrong[0]

@@ -119,7 +119,9 @@ def test_three_pairs_are_few():
     assert np.abs(e / np.sqrt(np.diag(P))).max() < 4.0
     stream = x.measurements.poses[0]
     late = np.where(np.arange(3) == 2, 7 * 10**8, 0)
-    with pytest.raises(EstimationError, match="only 2 were taken together with one of the 3 of cam0"):
+    with pytest.raises(
+        EstimationError, match="only 2 of the 3 poses of flange were taken together with one of the 3 of cam0"
+    ):
         calibrate_measurements(x.rig, changed(x, stamps_ns=stream.stamps_ns + late))
 
 

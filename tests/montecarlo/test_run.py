@@ -168,7 +168,10 @@ def test_planes_are_told_or_not(monkeypatch, planes: PlanesKind, told: bool):
     ("raised", "sentence"),
     [
         (RecordingError("cam0 is empty; record more."), "cam0 is empty; record more."),
-        (ZeroDivisionError("by zero"), "the program failed (ZeroDivisionError: by zero); this is a fault of icalib."),
+        (
+            ZeroDivisionError("by zero"),
+            "the program failed (ZeroDivisionError: by zero), which is a fault of icalib; please report it.",
+        ),
     ],
 )
 def test_errors_of_all_kinds_become_records(monkeypatch, raised: Exception, sentence: str):

@@ -148,7 +148,7 @@ def test_what_no_sensor_sends_is_said(robot, tmp_path):
     (note,) = write_sensors(sim, 1, tmp_path / "run")
     assert "wheel0 reports relative poses" in note
     (note,) = write_sensors(simulate(replace(handheld(0.5), board=False), 1), 1, tmp_path / "dark")
-    assert "there are no images" in note
+    assert "no images are written" in note
     instant = replace(on_ground(robot, "planar"), duration_s=0.5, lidars=(), features=None, cameras=())
     instant = replace(instant, wheels=(replace(instant.wheels[0], sampling="instantaneous"),))
     write_sensors(simulate(instant, 1), 1, tmp_path / "instant")

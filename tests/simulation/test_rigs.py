@@ -24,6 +24,7 @@ from icalib.simulation import (
 EXAMPLES = Path(__file__).parents[2] / "examples" / "paper"
 ALLOWED = (
     "icalib.errors",
+    "icalib.extras",
     "icalib.file_names",
     "icalib.measurements",
     "icalib.rig",

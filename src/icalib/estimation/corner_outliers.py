@@ -44,6 +44,8 @@ def rejected(factor: CornerFactor, rows: np.ndarray, residual: np.ndarray, setti
     """(n,) bool: the corners `rows` (n,) int of the stream that their residuals (n, 2) [px] reject, as of `inliers`."""
     if settings.outlier_std <= 0.0:
         return np.zeros(len(rows), dtype=bool)
+    # In double precision: where the IMU has a gap, poses may project points to 1e20 px, whose squares overflow.
+    residual = residual.astype(np.float64)
     stream, size = factor.stream, np.linalg.norm(residual, axis=1)
     image = stream.image[rows]
     usual = grouped_quantiles(size, image, len(stream.stamps_ns), 0.5)
