@@ -33,6 +33,7 @@ SEGMENTS = 8
 VARIES = 3.0  # times the mean square of the whole recording
 AS_STATED = 1.25  # times the stated density, or one over that: nobody states noise any better
 LARGEST_STEP = 10.0  # of a scale in one round
+SMALLEST = 0.02  # of the stated noise: a sensor with less has none, as in a simulation without noise
 KINDS = ("gyroscope", "accelerometer")
 
 
@@ -67,7 +68,7 @@ class NoiseFit:
 
 
 def fitting_noise(inputs: Inputs, found: Estimate) -> NoiseFit | None:
-    """None without an IMU, or where an estimate with other noise fails."""
+    """None without an IMU, where an estimate with other noise fails, or where a sensor has next to no noise."""
     if inputs.rig.imu is None or inputs.rig.assumes_motion or not isinstance(found.problem.chain, ImuFactor):
         return None
     cameras = [c.name for c in found.problem.cameras if len(c.stream.uv)]
@@ -81,6 +82,8 @@ def fitting_noise(inputs: Inputs, found: Estimate) -> NoiseFit | None:
         if settled:
             break
         scales = {key: scales[key] * steps[key] for key in scales}
+        if min(scales.values()) < SMALLEST:
+            return None
         try:
             outcome = _solved(inputs, found, scales)
         except EstimationError:
