@@ -18,6 +18,7 @@ from icalib.simulation import load_scenario, rig_for, simulate, with_drawn_guess
 
 ROOT = Path(__file__).resolve().parent.parent
 SEED, SECONDS = 1, 20.0
+EPOCH_NS = 1_600_000_000_000_000_000
 Case = Callable[[Path], tuple[Rig, list[Measurements]]]
 
 STILLS = """
@@ -61,18 +62,23 @@ def _stills(data: Path) -> tuple[Rig, list[Measurements]]:
 def _wheel_mocap(data: Path) -> tuple[Rig, list[Measurements]]:
     """Encoder ticks and planar poses of a square, as tables."""
     (path,) = (data / "wheel_mocap").glob("diff/square/*/*_run-01.csv")
-    rows = np.loadtxt(path, delimiter=",")  # t [s], x, y [m], heading [rad], right and left ticks
-    stamps = 1_600_000_000_000_000_000 + np.round(rows[:, 0] * 1e9).astype(np.int64)
+    with tempfile.TemporaryDirectory() as folder:
+        write_wheel_tables(Path(folder), np.loadtxt(path, delimiter=","))
+        return _measured(_written(Path(folder) / "rig.yaml", WHEEL_MOCAP), Path(folder))
+
+
+def write_wheel_tables(folder: Path, rows: np.ndarray) -> None:
+    """Tables of `wheel0` and `mocap0` from rows (n, 6): t [s], x, y [m], heading [rad], right and left ticks since the
+    row before."""
+    stamps = EPOCH_NS + np.round(rows[:, 0] * 1e9).astype(np.int64)
     ticks = np.cumsum(rows[:, 4:], axis=0).astype(np.int64)
     lines = [f"{t},{left},{right}" for t, (right, left) in zip(stamps, ticks, strict=True)]
     poses = [
         f"{t // 10**9}.{t % 10**9:09d} {x} {y} 0 0 0 {np.sin(0.5 * h)} {np.cos(0.5 * h)}"
         for t, (x, y, h) in zip(stamps, rows[:, 1:4], strict=True)
     ]
-    with tempfile.TemporaryDirectory() as folder:
-        _written(Path(folder) / "wheel0" / "ticks.csv", "\n".join(["#timestamp [ns],left,right", *lines]) + "\n")
-        _written(Path(folder) / "mocap0" / "poses.tum", "\n".join(poses) + "\n")
-        return _measured(_written(Path(folder) / "rig.yaml", WHEEL_MOCAP), Path(folder))
+    _written(folder / "wheel0" / "ticks.csv", "\n".join(["#timestamp [ns],left,right", *lines]) + "\n")
+    _written(folder / "mocap0" / "poses.tum", "\n".join(poses) + "\n")
 
 
 def _measured(rig_file: Path, recording: Path) -> tuple[Rig, list[Measurements]]:

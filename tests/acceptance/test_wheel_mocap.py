@@ -6,7 +6,9 @@ recording state wheels of 84 mm and a baseline of 200 mm, "within about 1 %".
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -15,7 +17,6 @@ import icalib
 from icalib.calibration import Calibration, joint_covariance
 from icalib.errors import EstimationError
 
-EPOCH_NS = 1_600_000_000_000_000_000
 NOMINAL = np.array([0.042, 0.042, 0.2])  # left and right radius, baseline
 COUNTS = 64 * 43.7
 RIG = f"""
@@ -32,21 +33,16 @@ def run(folder: Path, name: str) -> np.ndarray:
     return np.loadtxt(path, delimiter=",")
 
 
-def record(folder: Path, rows: np.ndarray) -> Path:
-    """A recording of tables, and its rig file beside it."""
-    (folder / "wheel0").mkdir(parents=True)
-    (folder / "mocap0").mkdir()
-    stamps = EPOCH_NS + np.round(rows[:, 0] * 1e9).astype(np.int64)
-    ticks = np.cumsum(rows[:, 4:], axis=0).astype(np.int64)
-    lines = [f"{t},{left},{right}" for t, (right, left) in zip(stamps, ticks, strict=True)]
-    (folder / "wheel0" / "ticks.csv").write_text("\n".join(["#timestamp [ns],left,right", *lines]) + "\n")
-    poses = [
-        f"{t // 10**9}.{t % 10**9:09d} {x} {y} 0 0 0 {np.sin(0.5 * h)} {np.cos(0.5 * h)}"
-        for t, (x, y, h) in zip(stamps, rows[:, 1:4], strict=True)
-    ]
-    (folder / "mocap0" / "poses.tum").write_text("\n".join(poses) + "\n")
-    (folder / "rig.yaml").write_text(RIG)
-    return folder
+@pytest.fixture(scope="module")
+def record(benchmark_program: Callable[[str], ModuleType]) -> Callable[[Path, np.ndarray], Path]:
+    """Writes a recording of tables, as the golden record has them, and its rig file beside it."""
+
+    def write(folder: Path, rows: np.ndarray) -> Path:
+        benchmark_program("golden_cases").write_wheel_tables(folder, rows)
+        (folder / "rig.yaml").write_text(RIG)
+        return folder
+
+    return write
 
 
 def turned(rows: np.ndarray, drive: np.ndarray) -> float:
@@ -62,7 +58,7 @@ def drive_of(result: Calibration) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def found(wheel_mocap: Path, tmp_path_factory) -> dict[str, Calibration]:
+def found(record, wheel_mocap: Path, tmp_path_factory) -> dict[str, Calibration]:
     """The runs along squares, and the free one."""
     out = {}
     for name in ("square-01", "square-02", "free-01"):
@@ -110,7 +106,7 @@ def test_heading_at_the_end_of_another_run(found, wheel_mocap, made, checked):
     assert abs(ours) < 3.0 * np.sqrt(by_drive @ P @ by_drive)
 
 
-def test_runs_together_with_an_offset_each(found, wheel_mocap, tmp_path):
+def test_runs_together_with_an_offset_each(found, record, wheel_mocap, tmp_path):
     """They were aligned by hand, each by itself. Together they show the drive better than any does, and each the time
     offset that it shows alone."""
     names = ("square-01", "square-02", "free-01")
@@ -133,7 +129,7 @@ def test_runs_together_with_an_offset_each(found, wheel_mocap, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["circular-01", "circular-02"])
-def test_circles_alone_are_refused(wheel_mocap, tmp_path, name):
+def test_circles_alone_are_refused(record, wheel_mocap, tmp_path, name):
     """They show one ratio of radii and baseline."""
     folder = record(tmp_path / "recording", run(wheel_mocap, name))
     with pytest.raises(EstimationError, match="wheel0: the vehicle drove a single arc"):

@@ -29,8 +29,8 @@ def test_only_what_may_be_noise_by_chance_is_in_doubt():
 
 
 def test_whether_all_else_is_determined_is_asked_with_nuisance_parameters_known():
-    """One parameter and a nuisance of which only a difference shows: the first is determined, and so is what is open
-    beside them."""
+    """Data show only the difference of one parameter and a nuisance: the parameter is determined. The third parameter,
+    of which they show nothing, is unobservable."""
     asked = np.zeros((3, 3))
     asked[np.ix_([0, 2], [0, 2])] = 4.0 * np.array([[1.0, -1.0], [-1.0, 1.0]])
     nothing = Spurious(np.zeros((1, 3, 3)))
