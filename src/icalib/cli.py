@@ -7,10 +7,9 @@ import io
 import sys
 import traceback
 import warnings
-from math import inf
 from pathlib import Path
 
-from icalib.command_parser import CommandParser, count, examples, sentence, whole
+from icalib.command_parser import CommandParser, add_command, add_part, count, examples, whole
 from icalib.errors import CalibrationError
 from icalib.result_commands import add_result_commands
 from icalib.target_command import add_target_command
@@ -75,16 +74,18 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"icalib {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     about = "calibrate the sensors of a rig from one recording or several"
-    epilog = examples(
+    c = add_command(
+        commands,
+        "calibrate",
+        about,
         "icalib calibrate rig.yaml run.bag --output result",
         "icalib calibrate rig.yaml monday.bag friday.bag -o result --from 5 --to 65 --strict",
     )
-    c = commands.add_parser("calibrate", help=about, description=sentence(about), epilog=epilog)
     c.add_argument("rig", type=Path, help="rig file (rig.yaml)")
     several = "bag or folder of the recording; several of one rig are solved jointly"
     c.add_argument("recording", type=Path, nargs="+", help=several)
     c.add_argument("--output", "-o", type=Path, required=True, help="folder for the results; created if absent")
-    _add_part(c)
+    add_part(c)
     c.add_argument(
         "--scheme",
         choices=("inertial", "pose", "kinematic"),
@@ -116,37 +117,32 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_inspect(commands: argparse._SubParsersAction[CommandParser]) -> None:
     about = "show what is in a recording, whether it can be calibrated, and draft its rig file"
-    epilog = examples(
+    c = add_command(
+        commands,
+        "inspect",
+        about,
         "icalib inspect run.bag",
         "icalib inspect run.bag --target aprilgrid.yaml --rig rig.yaml",
     )
-    c = commands.add_parser("inspect", help=about, description=sentence(about), epilog=epilog)
     c.add_argument("recording", type=Path, help="bag or folder of the recording")
     c.add_argument("--rig", type=Path, metavar="FILE", help="write a draft of the rig file; never overwrites a file")
     target = "YAML of the target, or a rig file: search the images for this target; default: not searched"
     c.add_argument("--target", type=Path, metavar="FILE", help=target)
     c.add_argument("--json", type=Path, metavar="FILE", help="write the results of the inspection as JSON")
-    _add_part(c)
+    add_part(c)
     c.add_argument("--quiet", "-q", action="store_true", help="print no progress and no table")
     c.set_defaults(run=_inspect)
 
 
-def _add_part(parser: argparse.ArgumentParser) -> None:
-    """Which part of a recording is used."""
-    start = "use the recording from here on, in seconds from its start; default: 0"
-    parser.add_argument("--from", type=float, default=0.0, metavar="SECONDS", dest="start_s", help=start)
-    parser.add_argument(
-        "--to", type=float, default=inf, metavar="SECONDS", dest="end_s", help="use it up to here; default: its end"
-    )
-
-
 def _add_simulate(commands: argparse._SubParsersAction[CommandParser]) -> None:
     about = "simulate a recording with known truth"
-    epilog = examples(
+    c = add_command(
+        commands,
+        "simulate",
+        about,
         "icalib simulate scenario.yaml --output run",
         "icalib simulate scenario.yaml -o run.bag --level sensor --seed 7",
     )
-    c = commands.add_parser("simulate", help=about, description=sentence(about), epilog=epilog)
     c.add_argument("scenario", type=Path, help="scenario file (scenario.yaml)")
     c.add_argument("--output", "-o", type=Path, required=True, help="path of the recording; must not exist yet")
     c.add_argument("--seed", type=whole, metavar="N", help="seed of motion and noise; default: that of the scenario")
@@ -158,8 +154,7 @@ def _add_simulate(commands: argparse._SubParsersAction[CommandParser]) -> None:
 
 def _add_montecarlo(commands: argparse._SubParsersAction[CommandParser]) -> None:
     about = "calibrate many simulated recordings, and compare their errors with the standard deviations"
-    epilog = examples("icalib montecarlo scenario.yaml --runs 100 --output study")
-    c = commands.add_parser("montecarlo", help=about, description=sentence(about), epilog=epilog)
+    c = add_command(commands, "montecarlo", about, "icalib montecarlo scenario.yaml --runs 100 --output study")
     c.add_argument("scenario", type=Path, help="scenario file (scenario.yaml)")
     runs = "number of runs in total, including those that the folder already has"
     c.add_argument("--runs", type=count, required=True, metavar="N", help=runs)
@@ -173,8 +168,7 @@ def _add_montecarlo(commands: argparse._SubParsersAction[CommandParser]) -> None
     _add_workers(c)
     c.set_defaults(run=_montecarlo)
     about = "reproduce the simulation of the paper: errors over iterations, and a table"
-    epilog = examples("icalib reproduce --output paper")
-    r = commands.add_parser("reproduce", help=about, description=sentence(about), epilog=epilog)
+    r = add_command(commands, "reproduce", about, "icalib reproduce --output paper")
     runs = "number of runs of each motion, of which figures show the first six; default: 6"
     r.add_argument("--runs", type=count, default=6, metavar="N", help=runs)
     r.add_argument("--output", "-o", type=Path, required=True, help="folder for runs, figures and table")
@@ -184,8 +178,13 @@ def _add_montecarlo(commands: argparse._SubParsersAction[CommandParser]) -> None
 
 def _add_fleet(commands: argparse._SubParsersAction[CommandParser]) -> None:
     about = "calibrate many recordings of many robots, and show what changed over time"
-    epilog = examples("icalib fleet jobs.yaml --output fleet", "icalib fleet jobs.yaml -o fleet --workers 4 --sigma 4")
-    c = commands.add_parser("fleet", help=about, description=sentence(about), epilog=epilog)
+    c = add_command(
+        commands,
+        "fleet",
+        about,
+        "icalib fleet jobs.yaml --output fleet",
+        "icalib fleet jobs.yaml -o fleet --workers 4 --sigma 4",
+    )
     c.add_argument("jobs", type=Path, help="YAML file of jobs")
     folder = "folder for the results; finished jobs run again only if their inputs changed"
     c.add_argument("--output", "-o", type=Path, required=True, help=folder)
@@ -293,8 +292,8 @@ def _inspect(options: argparse.Namespace) -> None:
     from icalib.inspection.console import print_inspection
     from icalib.inspection.draft import check_draft
     from icalib.inspection.figures import figures_json
-    from icalib.own_files import refuse_foreign, sealed_texts
-    from icalib.text_files import write_texts
+    from icalib.own_files import refuse_foreign
+    from icalib.text_files import write_sealed
 
     if options.rig:
         check_draft(options.rig)
@@ -310,7 +309,7 @@ def _inspect(options: argparse.Namespace) -> None:
     if not options.quiet:
         print_inspection(found)
     if options.json:
-        write_texts(options.json.parent, sealed_texts({options.json.name: figures_json(found)}))
+        write_sealed(options.json, figures_json(found))
     if options.rig:
         write_draft(draft_rig(found), options.rig)
         if not options.quiet:

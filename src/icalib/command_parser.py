@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+from math import inf
 from typing import Any, NoReturn
 
 from icalib.yaml_nodes import suggestion
@@ -11,14 +12,26 @@ from icalib.yaml_nodes import suggestion
 _CHOICES = re.compile(r"invalid choice: (?P<given>'[^']*'|\S+) \(choose from (?P<choices>.*)\)", re.DOTALL)
 
 
-def sentence(about: str) -> str:
-    """The short help of a command as its description."""
-    return f"{about[:1].upper()}{about[1:]}."
-
-
 def examples(*lines: str) -> str:
     """The end of a command's help."""
     return "\n".join(("examples:", *(f"  {line}" for line in lines)))
+
+
+def add_command(
+    commands: argparse._SubParsersAction[CommandParser], name: str, about: str, *lines: str, codes: str = ""
+) -> CommandParser:
+    """The parser of a command. about: its short help; lines: its examples; codes: a line on its exit codes."""
+    description = f"{about[:1].upper()}{about[1:]}." + (f"\n{codes}" if codes else "")
+    return commands.add_parser(name, help=about, description=description, epilog=examples(*lines))
+
+
+def add_part(parser: argparse.ArgumentParser) -> None:
+    """Which part of a recording is used."""
+    start = "use the recording from here on, in seconds from its start; default: 0"
+    parser.add_argument("--from", type=float, default=0.0, metavar="SECONDS", dest="start_s", help=start)
+    parser.add_argument(
+        "--to", type=float, default=inf, metavar="SECONDS", dest="end_s", help="use it up to here; default: its end"
+    )
 
 
 class CommandParser(argparse.ArgumentParser):

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from math import inf
 from pathlib import Path
 from typing import get_args
 
-from icalib.command_parser import CommandParser, examples, sentence
+from icalib.command_parser import CommandParser, add_command, add_part
 from icalib.rig import AccelUnit, GyroUnit
 
 
@@ -23,8 +22,13 @@ def add_result_commands(commands: argparse._SubParsersAction[CommandParser]) -> 
 
 def _add_allan(commands: argparse._SubParsersAction[CommandParser]) -> None:
     about = "estimate noise densities and bias walks of an IMU from a recording at rest"
-    epilog = examples("icalib allan rest.bag --output noise", "icalib allan rest.bag --imu /imu/data -o noise")
-    c = commands.add_parser("allan", help=about, description=sentence(about), epilog=epilog)
+    c = add_command(
+        commands,
+        "allan",
+        about,
+        "icalib allan rest.bag --output noise",
+        "icalib allan rest.bag --imu /imu/data -o noise",
+    )
     c.add_argument("recording", type=Path, help="bag or folder of the recording: hours of an IMU at rest")
     c.add_argument("--imu", metavar="TOPIC", help="topic or table of the IMU; default: the only one")
     c.add_argument("--gyro-unit", choices=get_args(GyroUnit), help="unit of its angular rates; default: rad/s")
@@ -54,11 +58,13 @@ def _add_export(commands: argparse._SubParsersAction[CommandParser]) -> None:
     from icalib.export.names import FORMATS, FRAMED, ONE_FILE
 
     about = "write a result as files of other programs"
-    epilog = examples(
+    c = add_command(
+        commands,
+        "export",
+        about,
         "icalib export result --to kalibr --output kalibr",
         "icalib export result --to urdf --urdf robot.urdf -o robot.urdf --frame cam0=camera_link",
     )
-    c = commands.add_parser("export", help=about, description=sentence(about), epilog=epilog)
     c.add_argument("result", type=Path, help="folder that a calibration was written to")
     c.add_argument("--to", required=True, choices=FORMATS, help="format of the files")
     where = f"folder for the files; for {', '.join(ONE_FILE)} the file itself"
@@ -106,15 +112,17 @@ def _export(options: argparse.Namespace) -> None:
 def _add_check(commands: argparse._SubParsersAction[CommandParser]) -> None:
     about = "check whether a calibration is still valid on a new recording"
     codes = "Exit code 0: valid, 1: changed, 2: an error, 3: the new recording is too poor to decide."
-    epilog = examples("icalib check result new.bag", "icalib check result new.bag --sigma 4 --json check.json")
-    c = commands.add_parser("check", help=about, description=f"{sentence(about)}\n{codes}", epilog=epilog)
+    c = add_command(
+        commands,
+        "check",
+        about,
+        "icalib check result new.bag",
+        "icalib check result new.bag --sigma 4 --json check.json",
+        codes=codes,
+    )
     c.add_argument("result", type=Path, help="folder that a calibration was written to")
     c.add_argument("recording", type=Path, nargs="+", help="bag or folder of a new recording of the same rig")
-    part = "use each recording from here on, in seconds from its start; default: 0"
-    c.add_argument("--from", type=float, default=0.0, metavar="SECONDS", dest="start_s", help=part)
-    c.add_argument(
-        "--to", type=float, default=inf, metavar="SECONDS", dest="end_s", help="use it up to here; default: its end"
-    )
+    add_part(c)
     sigma = "ignore changes that chance explains up to N sigma; default: 3"
     c.add_argument("--sigma", type=float, default=3.0, metavar="N", help=sigma)
     c.add_argument("--json", type=Path, metavar="FILE", help="write residuals, drift and verdict as JSON")
@@ -127,9 +135,9 @@ def _check(options: argparse.Namespace) -> int:
     from icalib.check import check_calibration
     from icalib.check.words import check_json, lines
     from icalib.console import progress_bar
-    from icalib.own_files import refuse_foreign, sealed_texts
+    from icalib.own_files import refuse_foreign
     from icalib.result_files import set_of
-    from icalib.text_files import write_texts
+    from icalib.text_files import write_sealed
 
     if options.json:
         refuse_foreign([options.json], [*set_of(options.result), *options.recording], "choose another place")
@@ -138,7 +146,7 @@ def _check(options: argparse.Namespace) -> int:
         part = {"start_s": options.start_s, "end_s": options.end_s}
         found = check_calibration(calibration, options.recording, progress, sigma=options.sigma, **part)
     if options.json:
-        write_texts(options.json.parent, sealed_texts({options.json.name: check_json(found)}))
+        write_sealed(options.json, check_json(found))
     if not options.quiet:
         print("\n".join(lines(found)))
     return found.exit_code
@@ -146,8 +154,7 @@ def _check(options: argparse.Namespace) -> int:
 
 def _add_rig(commands: argparse._SubParsersAction[CommandParser]) -> None:
     about = "write a result as a rig file, with its values fixed, as priors or as guesses"
-    epilog = examples("icalib rig result --as prior --output rig.yaml")
-    c = commands.add_parser("rig", help=about, description=sentence(about), epilog=epilog)
+    c = add_command(commands, "rig", about, "icalib rig result --as prior --output rig.yaml")
     c.add_argument("result", type=Path, help="folder that a calibration was written to")
     how = "fixed at the values, priors with the sigma of the result, or guesses to start from"
     c.add_argument("--as", dest="treatment", required=True, choices=("fixed", "prior", "guess"), help=how)
@@ -158,16 +165,16 @@ def _add_rig(commands: argparse._SubParsersAction[CommandParser]) -> None:
 
 def _rig(options: argparse.Namespace) -> None:
     from icalib.calibration import load_calibration
-    from icalib.own_files import refuse_foreign, sealed_texts
+    from icalib.own_files import refuse_foreign
     from icalib.result_files import set_of
     from icalib.result_rig import rig_text
-    from icalib.text_files import write_texts
+    from icalib.text_files import write_sealed
 
     calibration = load_calibration(options.result)
     inputs = [*set_of(options.result), *(Path(name) for name in calibration.inputs)]
     refuse_foreign([options.output], inputs, "choose another name")
     text, sentences = rig_text(calibration, options.treatment)
-    write_texts(options.output.parent, sealed_texts({options.output.name: text}))
+    write_sealed(options.output, text)
     if not options.quiet:
         for sentence in sentences:
             print(f"Note: {sentence}")
@@ -178,10 +185,14 @@ def _add_compare(commands: argparse._SubParsersAction[CommandParser]) -> None:
     kinds = "folder of a result, Kalibr camchain or imu file, URDF, or rig file with typed values"
     about = "show what changed between two calibrations, or other files of them"
     codes = "Exit code 0: the same, 1: something differs, 2: an error."
-    epilog = examples(
-        "icalib compare monday friday", "icalib compare cad.urdf result --tolerance mm=2 --tolerance deg=0.2"
+    c = add_command(
+        commands,
+        "compare",
+        about,
+        "icalib compare monday friday",
+        "icalib compare cad.urdf result --tolerance mm=2 --tolerance deg=0.2",
+        codes=codes,
     )
-    c = commands.add_parser("compare", help=about, description=f"{sentence(about)}\n{codes}", epilog=epilog)
     c.add_argument("a", type=Path, metavar="A", help=kinds)
     c.add_argument("b", type=Path, metavar="B", help="the same")
     tolerance = "ignore differences up to this value, in deg, mm, ms, px or percent, as deg=0.1; may be repeated"
@@ -213,9 +224,9 @@ def _compare(options: argparse.Namespace) -> int:
     from icalib.comparison.compare import Tolerances
     from icalib.comparison.reading import compare_files
     from icalib.comparison.words import comparison_json, lines
-    from icalib.own_files import refuse_foreign, sealed_texts
+    from icalib.own_files import refuse_foreign
     from icalib.result_files import set_of
-    from icalib.text_files import write_texts
+    from icalib.text_files import write_sealed
 
     if options.json:
         inputs = [p for side in (options.a, options.b) for p in (side, *set_of(side))]
@@ -223,7 +234,7 @@ def _compare(options: argparse.Namespace) -> int:
     tolerances = Tolerances(**dict(options.tolerance))
     found = compare_files(options.a, options.b, dict(options.frame), tolerances, options.sigma)
     if options.json:
-        write_texts(options.json.parent, sealed_texts({options.json.name: comparison_json(found)}))
+        write_sealed(options.json, comparison_json(found))
     if not options.quiet:
         print("\n".join(lines(found)))
     return 0 if found.same else 1
@@ -231,8 +242,7 @@ def _compare(options: argparse.Namespace) -> int:
 
 def _add_view(commands: argparse._SubParsersAction[CommandParser]) -> None:
     about = "show a result and its recording in 3D over time, in Rerun"
-    epilog = examples("icalib view result run.bag", "icalib view result --save result.rrd")
-    c = commands.add_parser("view", help=about, description=sentence(about), epilog=epilog)
+    c = add_command(commands, "view", about, "icalib view result run.bag", "icalib view result --save result.rrd")
     c.add_argument("result", type=Path, help="folder that a calibration was written to, or the result.json in it")
     c.add_argument("recording", type=Path, nargs="?", help="the recording of the result, or one of them")
     file = "write a file for Rerun; default: start its viewer"

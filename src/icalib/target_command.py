@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from icalib.command_parser import CommandParser, count, examples, sentence, whole
+from icalib.command_parser import CommandParser, add_command, count, examples, whole
 
 _MOST_IDS = 10_000  # more than any family has
 _EXAMPLES = {
@@ -32,8 +32,7 @@ def add_target_command(commands: argparse._SubParsersAction[CommandParser]) -> N
     from icalib.printing import PAPERS
 
     about = "write a target as PDF, to print at true scale"
-    epilog = examples(_EXAMPLES["aprilgrid"], "icalib target aprilgrid --help")
-    t = commands.add_parser("target", help=about, description=sentence(about), epilog=epilog)
+    t = add_command(commands, "target", about, _EXAMPLES["aprilgrid"], "icalib target aprilgrid --help")
     types = t.add_subparsers(required=True, metavar="TYPE", dest="type")
     fields = {
         "aprilgrid": {"rows": count, "cols": count, "tag_size": _metres, "tag_spacing": _metres},

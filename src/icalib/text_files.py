@@ -10,6 +10,7 @@ from typing import Any
 
 from icalib.errors import CalibrationError
 from icalib.file_names import below
+from icalib.own_files import sealed_texts
 from icalib.staging import staged
 
 
@@ -46,6 +47,11 @@ def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
         raise CalibrationError(
             f"{folder} cannot be written ({error.strerror or error}); choose another place."
         ) from error
+
+
+def write_sealed(path: Path, text: str) -> None:
+    """Writes one text with its seal (`own_files`), as `write_texts` does."""
+    write_texts(path.parent, sealed_texts({path.name: text}))
 
 
 def write_text(path: Path, text: str) -> None:
