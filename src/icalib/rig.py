@@ -17,6 +17,7 @@ from icalib.imu_classes import FREE, IMU_CLASSES, N_INTRINSICS, ImuNoise, class_
 from icalib.parameter import Parameter, check_fields, check_sizes
 
 TimeUnit = Literal["s", "ms", "us", "ns"]
+LENS = ("intrinsics", "distortion")  # the groups of a camera that are the parameters of its model
 
 
 @dataclass(frozen=True)

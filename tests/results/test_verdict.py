@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from icalib.calibration import Calibration, load_calibration, relative_pose
+from icalib.calibration import Calibration, load_calibration, relative_pose, verdict
 from icalib.calibration.verdict import EXIT_CODES, NEXT, by_size, lens_projection_px
 from icalib.cli import main
 from icalib.console import print_result, print_warnings
@@ -98,6 +98,15 @@ def test_a_lens_is_judged_by_its_projection(calibration: Calibration):
     strict = dataclasses.replace(found, settings=found.settings | {"pixel_tolerance": 0.5 * sigma})
     assert strict.verdict == "usable with care"
     assert f"cam0 lens (projection {sigma:.2g} px)" in strict.reasons[0]
+
+
+def test_the_projection_of_a_lens_is_found_once(calibration: Calibration, monkeypatch: pytest.MonkeyPatch):
+    asked = []
+    find = verdict.projection_uncertainty
+    monkeypatch.setattr(verdict, "projection_uncertainty", lambda c, camera: asked.append(camera) or find(c, camera))
+    found = with_verdicts(calibration, "weak", ("intrinsics",))
+    assert found.verdict == "usable" and found.reasons == () and report_html(found)
+    assert sorted(asked) == sorted(set(asked)) and "cam0" in asked
 
 
 def test_a_prior_that_the_data_do_not_improve_is_no_reason(calibration: Calibration):

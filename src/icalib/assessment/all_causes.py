@@ -17,12 +17,13 @@ from icalib.calibration import ParameterGroup, SensorFit
 from icalib.calibration.verdict import NUISANCE
 from icalib.estimation.contradictions import SIGMAS, Contradiction, contradictions, worst_off
 from icalib.estimation.estimate import Estimate
-from icalib.estimation.fixed_lens import LENS, lens_steps
+from icalib.estimation.fixed_lens import lens_steps
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.parts import Parts
 from icalib.estimation.relaxed import Relaxed, relaxed
 from icalib.estimation.state import Key
 from icalib.estimation.surfaces import ON_PLANES
+from icalib.rig import LENS
 from icalib.timeline import Timeline
 
 SEEN = ("corners", "features")
@@ -60,8 +61,7 @@ def all_causes(judged: Judged, against: Sequence[Contradiction]) -> tuple[list[C
     if not explaining([c for c in stated if c.gain < np.inf], misfit) and not against:
         scattering = judged.factor > LARGE_FACTOR
         known = [*stated, *changing(inputs, found, judged.parts, misfit, scattering, judged.timeline)]
-    explained = explaining(known, misfit) if known else False
-    both = ranked([*known, *misfit_causes(inputs, found, fits, explained)])
+    both = ranked([*known, *misfit_causes(inputs, found, fits, explaining(known, misfit))])
     return [*(c for c in both if c.grave), *(c for c in both if not c.grave)], notes
 
 

@@ -121,6 +121,6 @@ def _away(camera: Camera, found: dict[tuple[str, str], np.ndarray], name: str) -
         given, value = getattr(camera, group).value, found.get((name, group))
         if given is None or value is None:
             continue
-        off = so3.log(np.ascontiguousarray(given.T @ value)) if group == "rotation" else value - given
+        off = so3.value_change(given, value)
         away = max(away, float(np.linalg.norm(off)) / GUESS_SIGMA[group])
     return away

@@ -14,7 +14,7 @@ import numpy as np
 
 from icalib.assessment.disturbance import Disturbance, Lag, disturbance, lag_between_cameras
 from icalib.calibration import SensorFit
-from icalib.calibration.excess import excess, times
+from icalib.calibration.excess import FAR_BEYOND, excess, times
 from icalib.estimation.changes import Change, changes, heterogeneity
 from icalib.estimation.estimate import Estimate
 from icalib.estimation.inputs import Inputs
@@ -24,9 +24,6 @@ from icalib.timeline import Timeline
 
 # Of the misfit: robust weights hide some of a gain, and what is not the cause gains below 0.01.
 EXPLAINS = 0.1
-# Times as large as their noise. With IMU noise ten times too small, in simulation, residuals are 3 to 5 times as large,
-# and errors up to 12 standard deviations.
-FAR_BEYOND = 4.0
 # Of what separate parameters for each segment gain. In simulation one change reaches 0.36 to 0.99, less the farther it
 # is from a boundary; on EuRoC, where lens and board do not follow the model, the best change reaches 0.04.
 CHANGES = 0.25

@@ -16,9 +16,8 @@ from icalib.estimation.tolerances import GUESS_SIGMA
 from icalib.first_guess.contradicted import is_contradicted
 from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
-from icalib.rig import Camera
+from icalib.rig import LENS, Camera
 
-LENS = ("intrinsics", "distortion")
 GRID = 12  # rays of an image, each way
 
 

@@ -7,17 +7,17 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from icalib.assessment.cameras import camera_misfit, rejected_words
-from icalib.assessment.causes import FAR_BEYOND, INERTIAL, Cause, Misfit, noise_words, unknown_words
+from icalib.assessment.causes import INERTIAL, Cause, Misfit, noise_words, unknown_words
 from icalib.assessment.robot import robot_misfit
 from icalib.calibration import CrossValidation, SensorFit
-from icalib.calibration.excess import dof_known, excess
+from icalib.calibration.excess import FAR_BEYOND, dof_known, excess
 from icalib.estimation.estimate import Estimate
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.noise_size import are_noise, fitting_noise
 
 SMALL_CHI2 = 0.5  # per post-fit degree of freedom: below this it is worth a warning
 LARGE_FACTOR = 3.0
-BEYOND_FACTOR = 1.5  # times the largest factor: what halves say of each other is worth a warning
+BEYOND_FACTOR = 1.5  # times the largest factor: a cross-validation factor above this is a warning
 
 
 def misfit_causes(inputs: Inputs, found: Estimate, judged: Sequence[SensorFit], explained: bool) -> Iterator[Cause]:

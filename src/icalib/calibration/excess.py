@@ -12,6 +12,9 @@ import numpy as np
 from icalib.calibration.result import SensorFit
 
 LARGE_CHI2 = 2.0  # per post-fit degree of freedom: above this it is worth a warning
+# Times as large as their noise: then standard deviations mean nothing. Simulated with IMU noise ten times too small,
+# residuals are 3 to 5 times as large, and errors up to 12 standard deviations.
+FAR_BEYOND = 4.0
 SAMPLED_DOF = 3.0  # times the square root of the number of residuals: how far off degrees of freedom may be
 
 

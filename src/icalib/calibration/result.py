@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -12,7 +13,7 @@ import numpy as np
 from icalib.calibration.cross_validation import CrossValidation
 from icalib.calibration.images import CornerResiduals, ImageResiduals, TrackResiduals
 from icalib.calibration.robot import LidarResiduals, Plane, PoseResiduals, WheelResiduals
-from icalib.calibration.verdict import Usability, reasons, usability
+from icalib.calibration.verdict import Usability, lens_projections_px, reasons, usability
 
 if TYPE_CHECKING:
     from icalib.calibration.relative import RelativePose
@@ -165,6 +166,11 @@ class Calibration:
     def reasons(self) -> tuple[str, ...]:
         """Sentences on why it is not simply usable, the most important first; none where it is."""
         return reasons(self)
+
+    @cached_property
+    def lens_projections_px(self) -> dict[str, float | None]:
+        """By camera: median standard deviation of the projection where it saw points [px], None where it has none."""
+        return lens_projections_px(self)
 
     @property
     def failure(self) -> str:

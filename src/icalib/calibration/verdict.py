@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Literal
 
 from icalib.calibration.projection import projection_uncertainty
 from icalib.calibration.units import SHOWN_UNITS
+from icalib.rig import LENS, Settings
 
 if TYPE_CHECKING:
     from icalib.calibration.result import Calibration, ParameterGroup, Verdict
@@ -36,7 +37,6 @@ NEXT: dict[Usability, str] = {
     ),
     "not usable": "Act on the first reason, then calibrate again.",
 }
-LENS = ("intrinsics", "distortion")
 NUISANCE = ("bloom", "shape", "tilt")
 WORST_FIRST: tuple[Verdict, ...] = ("undetermined", "weak", "determined", "fixed")
 UNDETERMINED = 10.0  # tolerances: a standard deviation above this says no more than a guess does
@@ -76,9 +76,18 @@ def worst(verdicts: tuple[Verdict, ...]) -> Verdict:
     return min((*verdicts, WORST_FIRST[-1]), key=WORST_FIRST.index)
 
 
+def lens_projections_px(c: Calibration) -> dict[str, float | None]:
+    """By camera, as `lens_projection_px`; a result keeps them, as each takes 20 ms and is asked for again and again."""
+    return {camera: _lens_projection_px(c, camera) for camera in c.cameras}
+
+
 def lens_projection_px(c: Calibration, camera: str) -> float | None:
     """Median standard deviation of the projection where `camera` saw points [px]; None where its lens is fixed, or has
     no ray in the image."""
+    return c.lens_projections_px[camera]
+
+
+def _lens_projection_px(c: Calibration, camera: str) -> float | None:
     groups = [g for g in c.groups if g.sensor == camera and g.name in LENS]
     if len(groups) < len(LENS) or all(g.columns is None for g in groups):
         return None
@@ -89,7 +98,12 @@ def lens_projection_px(c: Calibration, camera: str) -> float | None:
 def lens_verdict(c: Calibration, camera: str) -> Verdict:
     """By the projection uncertainty of the lens, against the tolerance in pixels of the rig file's settings."""
     sigma = lens_projection_px(c, camera)
-    return "fixed" if sigma is None else by_size(sigma / float(c.settings.get("pixel_tolerance", 1.0)))
+    return "fixed" if sigma is None else by_size(sigma / tolerance(c, "pixel_tolerance"))
+
+
+def tolerance(c: Calibration, name: str) -> float:
+    """A tolerance of the rig file's settings, by the name of its field; the default if `c` has no settings."""
+    return float(c.settings.get(name, getattr(Settings, name)))
 
 
 def _counted(c: Calibration, g: ParameterGroup) -> tuple[Verdict, ...]:

@@ -16,8 +16,8 @@ from typing import Literal
 
 import numpy as np
 
-from icalib.calibration import Calibration, ParameterGroup, SensorFit, joint_covariance
-from icalib.calibration.verdict import LENS, NUISANCE, lens_verdict
+from icalib.calibration import Calibration, SensorFit, joint_covariance
+from icalib.calibration.verdict import NUISANCE, lens_verdict
 from icalib.comparison.compare import Comparison, Difference, compare_sides
 from icalib.comparison.results import side_of_result
 from icalib.comparison.significance import sigmas
@@ -27,7 +27,7 @@ from icalib.measurements import Measurements
 from icalib.pipeline import Progress, calibrate_measurements, measure
 from icalib.recordings.several import Source
 from icalib.result_rig import rig_of_result
-from icalib.rig import Rig
+from icalib.rig import LENS, Rig
 
 Validity = Literal["valid", "changed", "cannot say"]
 EXIT_CODES: dict[Validity, int] = {"valid": 0, "changed": 1, "cannot say": 3}
@@ -166,7 +166,7 @@ def _drifts(old: Calibration, new: Calibration) -> list[Drift]:
         o = before.get((g.sensor, g.name))
         if o is None or g.columns is None or o.value.shape != g.value.shape or g.sensor not in new.rig["sensors"]:
             continue
-        change, total = _change(o, g), joint_covariance(old, [o]) + joint_covariance(new, [g])
+        change, total = so3.value_change(o.value, g.value), joint_covariance(old, [o]) + joint_covariance(new, [g])
         std = np.sqrt(np.diag(total))
         found.append(
             Drift(
@@ -174,9 +174,3 @@ def _drifts(old: Calibration, new: Calibration) -> list[Drift]:
             )
         )
     return found
-
-
-def _change(old: ParameterGroup, new: ParameterGroup) -> np.ndarray:
-    if old.value.ndim == 2:
-        return so3.log(np.ascontiguousarray(old.value.T @ new.value))
-    return new.value - old.value

@@ -12,8 +12,7 @@ import numpy as np
 
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.relaxed import Relaxed
-
-LENS = ("intrinsics", "distortion")
+from icalib.rig import LENS
 
 
 @dataclass(frozen=True)

@@ -27,11 +27,10 @@ from icalib.first_guess.lidar_sight import naming_sight
 from icalib.first_guess.parallax import no_parallax
 from icalib.first_guess.start import start
 from icalib.measurements import Measurements
-from icalib.rig import Parameter, Rig
+from icalib.rig import LENS, Parameter, Rig
 
 POOR_FIT = 4.0  # times as large as their noise are the residuals of some sensor
 CLEARLY = 0.5  # times the misfit of another estimate
-LENS = ("intrinsics", "distortion")
 OnVisit = Callable[[Inputs, str, Problem, Visit], None]
 
 

@@ -40,14 +40,6 @@ def over_time(results: list[JobResult], sensor: str) -> Figure:
     return figure(_in_legend_once(traces), height=_EDGE_PX + _PANEL_PX * len(names), showlegend=True, **layout)
 
 
-def change(first: Block, now: Block) -> np.ndarray:
-    """(n,) what takes `first` to `now`, as standard deviations are stated: of rotations the vector in the sensor's axes
-    [rad]."""
-    if now.value.ndim == 2:
-        return so3.log(np.ascontiguousarray(first.value.T @ now.value))
-    return now.value - first.value
-
-
 def _places(results: list[JobResult]) -> tuple[dict[str, str], bool]:
     """Where each job stands, by name, and whether that is a time; it is the name where two share a time or lack it."""
     times = {r.job.name: r.time.isoformat() for r in results if r.time is not None}
@@ -65,7 +57,7 @@ def _traces(results: list[JobResult], places: dict[str, str], first: Block, pane
                 at.append(r)
                 blocks.append(b)
     scale = SHOWN_UNITS.get(first.unit, (first.unit, 1.0))[1]
-    values = scale * np.array([change(first, b) for b in blocks])
+    values = scale * np.array([so3.value_change(first.value, b.value) for b in blocks])
     colors = AXIS_COLORS if len(first.labels) == len(AXIS_COLORS) else COLORS
     return [
         {

@@ -184,3 +184,9 @@ def chain(steps, out):
                 for k in range(3):
                     s += out[n, i, k] * steps[n, k, j]
                 out[n + 1, i, j] = s
+
+
+def value_change(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """(n,) what takes the value of a parameter to another, as standard deviations are stated: of rotations (3, 3) the
+    vector in the sensor's axes [rad], of vectors (n,) their difference."""
+    return log(np.ascontiguousarray(before.T @ after)) if after.ndim == 2 else after - before

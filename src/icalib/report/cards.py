@@ -7,12 +7,11 @@ import re
 import numpy as np
 
 from icalib.calibration import Calibration, RelativePose, SensorFit, Verdict, relative_poses
-from icalib.calibration.excess import excess, times
+from icalib.calibration.excess import FAR_BEYOND, excess, times
 from icalib.calibration.quantities import Row, chi2_words, rms_words, rows, shown, shown_groups
-from icalib.calibration.verdict import LENS, NUISANCE, by_size, lens_projection_px, lens_verdict, worst
+from icalib.calibration.verdict import NUISANCE, by_size, lens_projection_px, lens_verdict, tolerance, worst
 from icalib.report.tables import Html, badge, element, html, table
-
-FAR_BEYOND = 4.0  # times the stated noise: then standard deviations mean nothing
+from icalib.rig import LENS
 
 
 def sensor_cards(c: Calibration) -> Html:
@@ -41,8 +40,7 @@ def camera_pairs(c: Calibration) -> Html:
 
 def _pair_verdict(c: Calibration, r: RelativePose) -> Verdict:
     """By the largest standard deviation against the tolerances of the rig file's settings."""
-    turn = np.deg2rad(float(c.settings.get("rotation_tolerance_deg", 0.1)))
-    move = float(c.settings.get("translation_tolerance_m", 5e-3))
+    turn, move = np.deg2rad(tolerance(c, "rotation_tolerance_deg")), tolerance(c, "translation_tolerance_m")
     return by_size(float(max(r.std[:3].max() / turn, r.std[3:].max() / move)))
 
 

@@ -8,8 +8,9 @@ from rich.text import Text
 
 from icalib.calibration import Calibration, relative_poses
 from icalib.calibration.quantities import rows, rpy_deg, shown
-from icalib.calibration.verdict import UNDETERMINED
+from icalib.calibration.verdict import UNDETERMINED, tolerance
 
+TOLERANCES = ("rotation_tolerance_deg", "translation_tolerance_m", "time_tolerance_s", "pixel_tolerance")
 STYLES = {"determined": "green", "weak": "yellow", "undetermined": "bold red", "fixed": "dim"}
 
 
@@ -64,10 +65,9 @@ def _caption(calibration: Calibration) -> str:
     scaled = any(g.columns is not None and g.factor is not None for g in calibration.groups)
     text += " std includes the empirical factor." if scaled else " std is formal: the recording was not split."
     if {"weak", "undetermined"} & {v for g in calibration.groups for v in g.verdict}:
-        s = calibration.settings
+        turn, move, time, pixels = (tolerance(calibration, name) for name in TOLERANCES)
         text += (
-            f" Tolerances: {s['rotation_tolerance_deg']:g} deg, {1e3 * s['translation_tolerance_m']:g} mm, "
-            f"{1e3 * s['time_tolerance_s']:g} ms, {s['pixel_tolerance']:g} px; std above it is weak, above "
-            f"{UNDETERMINED:g} of it undetermined."
+            f" Tolerances: {turn:g} deg, {1e3 * move:g} mm, {1e3 * time:g} ms, {pixels:g} px; std above it is weak, "
+            f"above {UNDETERMINED:g} of it undetermined."
         )
     return text
