@@ -23,6 +23,7 @@ from icalib.measurements import (
     WheelPoses,
     WheelStream,
 )
+from icalib.parameter import ROUNDING
 
 AnyStream = ImuStream | CornerStream | TrackStream | LidarStream | WheelStream | WheelPoses | PoseStream
 
@@ -90,7 +91,7 @@ def poses(name: str, stamps: Any, rotation: Any, position: Any) -> PoseStream:
     m."""
     rotation = rotation.as_matrix() if hasattr(rotation, "as_matrix") else rotation
     R = _floats(name, "rotation", rotation)
-    if R.shape[1:] == (3, 3) and not (np.abs(R @ R.swapaxes(1, 2) - np.eye(3)) < 1e-3).all():
+    if R.shape[1:] == (3, 3) and not (np.abs(R @ R.swapaxes(1, 2) - np.eye(3)) < ROUNDING).all():
         raise RecordingError(f"{name}: rotation has matrices that are no rotations; correct them.")
     return PoseStream(name, _stamps(name, stamps), R, _floats(name, "position", position))
 

@@ -52,10 +52,15 @@ def _priors(inputs: Inputs) -> tuple[Prior, ...]:
     for camera in rig.cameras if rig.blooms else ():
         if camera.bloom.mode == "free":
             priors.append(Prior(layout.block(camera.name, "bloom"), np.zeros(1), np.full(1, BLOOM_SIGMA_PX)))
-    return (*priors, *nuisance_priors(inputs), *given_priors(inputs))
+    return (*priors, *stated_priors(inputs))
 
 
-def nuisance_priors(inputs: Inputs) -> tuple[Prior, ...]:
+def stated_priors(inputs: Inputs) -> tuple[Prior, ...]:
+    """Those on nuisance parameters, and others that the rig file gives."""
+    return (*_nuisance_priors(inputs), *given_priors(inputs))
+
+
+def _nuisance_priors(inputs: Inputs) -> tuple[Prior, ...]:
     """The priors on how imperfect sensors and targets are, whether the rig file gives them or they are the default."""
     imu, layout, one = inputs.rig.imu, inputs.layout, np.ones(1)
     priors = [] if imu is None else _given(layout, imu.name, "intrinsics", imu.intrinsics)

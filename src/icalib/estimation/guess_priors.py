@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.estimation.assembly import given_priors, nuisance_priors
+from icalib.estimation.assembly import stated_priors
 from icalib.estimation.inputs import Inputs
 from icalib.estimation.prior_factor import Prior
 from icalib.estimation.state import State
@@ -27,7 +27,7 @@ def guess_sigma(inputs: Inputs, state: State) -> np.ndarray:
         columns = inputs.layout.columns(camera.name, "intrinsics", "distortion")
         if (columns >= 0).all():
             sigma[columns[:2]] = np.hypot(sigma[columns[:2]], _focal_sigma(camera, state, sigma[columns[4:]]))
-    for prior in (*nuisance_priors(inputs), *given_priors(inputs)):
+    for prior in stated_priors(inputs):
         sigma[prior.block.columns] = prior.sigma
     return sigma
 
@@ -36,7 +36,7 @@ def guess_priors(inputs: Inputs, guess: State, times: float = 1.0) -> tuple[Prio
     """Priors about `guess` on everything of the sensors that the rig file gives none for, this many `times` as wide as
     a guess is off."""
     sigma = times * guess_sigma(inputs, guess)
-    given = {p.block.key for p in (*nuisance_priors(inputs), *given_priors(inputs))}
+    given = {p.block.key for p in stated_priors(inputs)}
     own = (b for b in inputs.layout.free if inputs.is_sensor(b.sensor) and b.key not in given)
     return tuple(Prior(b, guess.values[b.key], sigma[b.columns]) for b in own)
 
