@@ -21,15 +21,15 @@ import numpy as np
 import ten_runs
 from scipy.signal import lfilter
 
-from icalib.calibration import Calibration
+from icalib.data.measurements import Measurements
+from icalib.data.stamps.window import Window, cut
 from icalib.errors import CalibrationError
 from icalib.geometry.targets import AprilGrid, NoTarget
-from icalib.measurements import Measurements
-from icalib.montecarlo.one_run import compare
 from icalib.pipeline import calibrate_measurements
-from icalib.recordings.window import Window, cut
+from icalib.result import Calibration
 from icalib.rig import Parameter, Rig
-from icalib.simulation import Scenario, Simulation, handheld, load_scenario, rig_for, simulate, with_drawn_guess
+from icalib.tools.montecarlo.one_run import compare
+from icalib.tools.simulation import Scenario, Simulation, handheld, load_scenario, rig_for, simulate, with_drawn_guess
 
 SIGMAS = 4.0
 SECONDS = 15.0

@@ -20,10 +20,10 @@ from pathlib import Path
 
 import numpy as np
 
-from icalib.montecarlo import Plan, Record, run_study
-from icalib.montecarlo.study import scenario_digest
-from icalib.simulation import Scenario, load_scenario
-from icalib.text_files import write_texts
+from icalib.base.text_files import write_texts
+from icalib.tools.montecarlo import Plan, Record, run_study
+from icalib.tools.montecarlo.study import scenario_digest
+from icalib.tools.simulation import Scenario, load_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
 FOUND = ROOT / "docs" / "studies" / "degeneracy.json"

@@ -20,15 +20,25 @@ from typing import Literal
 
 import numpy as np
 
-from icalib.calibration import Calibration
 from icalib.errors import CalibrationError
 from icalib.geometry.targets import AprilGrid
 from icalib.geometry.targets.base import SIZE_SIGMA
-from icalib.imu_classes import class_imperfections
-from icalib.montecarlo.truth import error, true_value
 from icalib.pipeline import calibrate_measurements
+from icalib.result import Calibration
 from icalib.rig import Parameter, PoseSensor, Rig
-from icalib.simulation import Drive, Room, Scenario, SimPoses, Simulation, handheld, load_scenario, rig_for, simulate
+from icalib.rig.imu_classes import class_imperfections
+from icalib.tools.montecarlo.truth import error, true_value
+from icalib.tools.simulation import (
+    Drive,
+    Room,
+    Scenario,
+    SimPoses,
+    Simulation,
+    handheld,
+    load_scenario,
+    rig_for,
+    simulate,
+)
 
 PAPER = Path(__file__).resolve().parent.parent / "examples" / "paper"
 FAR = 4.0  # standard deviations

@@ -17,14 +17,14 @@ from pathlib import Path
 import numpy as np
 
 import icalib
-from icalib.estimation.assembly import assemble
-from icalib.estimation.corner_noise import first_noise
-from icalib.estimation.inputs import inputs_for
-from icalib.first_guess import initial_guess
-from icalib.first_guess.start import first_state
-from icalib.measurements import CornerStream, ImuStream, Measurements
+from icalib.data.measurements import CornerStream, ImuStream, Measurements
+from icalib.data.recordings import open_recording, read_measurements
+from icalib.estimate.evidence.corner_noise import first_noise
+from icalib.estimate.problem.assembly import assemble
+from icalib.estimate.problem.inputs import inputs_for
+from icalib.initialize import initial_guess
+from icalib.initialize.start import first_state
 from icalib.pipeline import calibrate_measurements
-from icalib.recordings import open_recording, read_measurements
 from icalib.rig import Rig
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples" / "euroc"

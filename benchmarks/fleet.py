@@ -22,8 +22,8 @@ import numpy as np
 import psutil
 import yaml
 
-from icalib.rig_file import rig_to_dict
-from icalib.simulation import Scenario, handheld, rig_for, simulate, write_tables
+from icalib.rig.file import rig_to_dict
+from icalib.tools.simulation import Scenario, handheld, rig_for, simulate, write_tables
 
 ROBOTS, TIMES = 10, 10
 TURNED = "robot3"

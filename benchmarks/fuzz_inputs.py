@@ -15,8 +15,8 @@ import numpy as np
 import yaml
 
 from icalib.cli import main
-from icalib.rig_file import rig_to_dict
-from icalib.simulation import (
+from icalib.rig.file import rig_to_dict
+from icalib.tools.simulation import (
     Scenario,
     SimPoses,
     Simulation,
@@ -27,7 +27,7 @@ from icalib.simulation import (
     write_sensors,
     write_tables,
 )
-from icalib.simulation.bag_writer import IMU, IMU_TOPIC, BagForm, BagWriter
+from icalib.tools.simulation.bag_writer import IMU, IMU_TOPIC, BagForm, BagWriter
 
 _AT = "[[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
 _ABOVE = "[[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 1.5], [0, 0, 0, 1]]"

@@ -14,7 +14,7 @@ import numpy as np
 from icalib.detection import AprilGridDetector
 from icalib.detection.tracking.tracker import Tracker
 from icalib.geometry.targets import NoTarget
-from icalib.simulation import Scenario, film, handheld, load_scenario
+from icalib.tools.simulation import Scenario, film, handheld, load_scenario
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "docs" / "gallery"

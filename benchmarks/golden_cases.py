@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from icalib.measurements import Measurements
+from icalib.data.measurements import Measurements
+from icalib.data.recordings import open_recording
 from icalib.pipeline import measure
-from icalib.recordings import open_recording
 from icalib.rig import Rig
-from icalib.rig_file import load_rig
-from icalib.simulation import load_scenario, rig_for, simulate, with_drawn_guess
+from icalib.rig.file import load_rig
+from icalib.tools.simulation import load_scenario, rig_for, simulate, with_drawn_guess
 
 ROOT = Path(__file__).resolve().parent.parent
 SEED, SECONDS = 1, 20.0

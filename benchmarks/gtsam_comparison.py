@@ -22,14 +22,14 @@ import gtsam_unstable
 import numpy as np
 from gtsam.symbol_shorthand import B, L, T, V, X
 
-from icalib.estimation.estimate import Estimate, estimate
-from icalib.estimation.inputs import Inputs, inputs_for
-from icalib.estimation.state import State
-from icalib.first_guess import initial_guess
-from icalib.first_guess.start import first_state
-from icalib.measurements import CornerStream, ImuStream, Measurements
-from icalib.parameter import fixed
+from icalib.data.measurements import CornerStream, ImuStream, Measurements
+from icalib.estimate.estimate import Estimate, estimate
+from icalib.estimate.problem.inputs import Inputs, inputs_for
+from icalib.initialize import initial_guess
+from icalib.initialize.start import first_state
+from icalib.optim.state import State
 from icalib.rig import Rig
+from icalib.rig.parameter import fixed
 
 SECONDS = 20.0  # of the recording, from its first image on
 POINT_SIGMA_M = 1e-6

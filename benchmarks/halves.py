@@ -12,13 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from icalib.calibration import Calibration
+from icalib.data.measurements import CornerStream, ImuStream, Measurements
+from icalib.data.recordings import open_recording, read_measurements
 from icalib.geometry import so3
-from icalib.measurements import CornerStream, ImuStream, Measurements
 from icalib.pipeline import calibrate_measurements
-from icalib.recordings import open_recording, read_measurements
+from icalib.result import Calibration
 from icalib.rig import Rig
-from icalib.rig_file import load_rig
+from icalib.rig.file import load_rig
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "euroc"
 PLAIN = {"bloom": False, "board_shape": False, "blur_noise": False, "common_error": False}

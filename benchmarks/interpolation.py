@@ -15,7 +15,7 @@ import matplotlib
 import numpy as np
 from schemes import BLOCKS, Case, run
 
-from icalib.simulation import Scenario, handheld
+from icalib.tools.simulation import Scenario, handheld
 
 STUDIES = Path(__file__).resolve().parent.parent / "docs" / "studies"
 SCHEMES = ("inertial", "kinematic", "pose")

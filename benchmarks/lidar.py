@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
-from icalib.measurements import Measurements
+from icalib.data.measurements import Measurements
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Rig
-from icalib.simulation import Simulation, load_scenario, rig_for, simulate
+from icalib.tools.simulation import Simulation, load_scenario, rig_for, simulate
 
 PAPER = Path(__file__).parents[1] / "examples" / "paper"
 RATE_HZ, AZIMUTH_STEPS = 10.0, 1875  # times 16 rings: 300 000 beams a second

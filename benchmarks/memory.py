@@ -20,15 +20,15 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from icalib.measurements import ImuStream
+from icalib.data.measurements import ImuStream
 from icalib.rig import Settings
-from icalib.rig_file import rig_to_dict
-from icalib.simulation import Scenario, handheld, rig_for, simulate, write_film
-from icalib.simulation.corners import image_stamps
-from icalib.simulation.filming import Film, Shot
-from icalib.simulation.imu import imu_stamps, read_imu
-from icalib.simulation.motion import Waves, reference_motion
-from icalib.simulation.rendering import Imaging
+from icalib.rig.file import rig_to_dict
+from icalib.tools.simulation import Scenario, handheld, rig_for, simulate, write_film
+from icalib.tools.simulation.images.filming import Film, Shot
+from icalib.tools.simulation.images.rendering import Imaging
+from icalib.tools.simulation.sensors.corners import image_stamps
+from icalib.tools.simulation.sensors.imu import imu_stamps, read_imu
+from icalib.tools.simulation.sensors.motion import Waves, reference_motion
 
 PERIOD_S = 20.0
 TARGET_MB = 500.0

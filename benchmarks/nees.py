@@ -15,12 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
-from icalib.montecarlo.one_run import compare
-from icalib.montecarlo.record import Record
-from icalib.montecarlo.statistics import Nees, Sample, nees
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Rig
-from icalib.simulation import Drive, Room, Scenario, SimPoses, handheld, load_scenario, rig_for, simulate
+from icalib.tools.montecarlo.one_run import compare
+from icalib.tools.montecarlo.record import Record
+from icalib.tools.montecarlo.statistics import Nees, Sample, nees
+from icalib.tools.simulation import Drive, Room, Scenario, SimPoses, handheld, load_scenario, rig_for, simulate
 
 PAPER = Path(__file__).resolve().parent.parent / "examples" / "paper"
 FALSE_ALARMS = 1e-3  # in a round, where standard deviations are honest

@@ -19,10 +19,10 @@ from pathlib import Path
 import numpy as np
 
 import icalib
-from icalib.calibration import Calibration
-from icalib.imu_classes import FREE
+from icalib.result import Calibration
 from icalib.rig import Parameter, Rig, Settings
-from icalib.simulation import Scenario, SimCamera, Truth, film, handheld, rig_for, simulate, tag_map, write_film
+from icalib.rig.imu_classes import FREE
+from icalib.tools.simulation import Scenario, SimCamera, Truth, film, handheld, rig_for, simulate, tag_map, write_film
 
 KINDS = ("pinhole", "fisheye", "stereo", "tags")
 UNITS = ("deg", "mm", "us")

@@ -19,17 +19,17 @@ from typing import TypeVar
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from icalib.assessment import assess
-from icalib.estimation.assembly import motion_of
-from icalib.estimation.determination import Determined, determine
-from icalib.estimation.estimate import Estimate
-from icalib.estimation.inputs import Inputs
-from icalib.estimation.lidar_binning import Associated, take_moments
-from icalib.estimation.lidar_factor import LidarFactor
-from icalib.first_guess.start import start
-from icalib.measurements import Measurements
+from icalib.data.measurements import Measurements
+from icalib.estimate.estimate import Estimate
+from icalib.estimate.problem.assembly import motion_of
+from icalib.estimate.problem.inputs import Inputs
+from icalib.initialize.start import start
+from icalib.observability.determination import Determined, determine
 from icalib.rig import Rig
-from icalib.simulation import load_scenario, rig_for, simulate, with_drawn_guess
+from icalib.sensors.lidar.lidar_binning import Associated, take_moments
+from icalib.sensors.lidar.residual import LidarFactor
+from icalib.tools.simulation import load_scenario, rig_for, simulate, with_drawn_guess
+from icalib.validation import assess
 
 PAPER = Path(__file__).parents[1] / "examples" / "paper"
 REPEATS = 3

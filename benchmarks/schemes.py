@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from icalib.calibration import Calibration
 from icalib.pipeline import calibrate_measurements
-from icalib.simulation import Scenario, Truth, handheld, rig_for, simulate
+from icalib.result import Calibration
+from icalib.tools.simulation import Scenario, Truth, handheld, rig_for, simulate
 
 BLOCKS = ("rotation", "translation", "time_offset")
 PLACES = {"every-image": "every image", "first-camera": "cam0's images"}

@@ -20,10 +20,10 @@ from track_errors import print_track_errors
 
 import icalib
 from icalib.errors import CalibrationError
-from icalib.montecarlo.one_run import compare
-from icalib.montecarlo.statistics import Sample, nees
 from icalib.rig import Parameter, Rig, Settings
-from icalib.simulation import ImageFaults, Scenario, Simulation, load_scenario, rig_for, simulate, write_sensors
+from icalib.tools.montecarlo.one_run import compare
+from icalib.tools.montecarlo.statistics import Sample, nees
+from icalib.tools.simulation import ImageFaults, Scenario, Simulation, load_scenario, rig_for, simulate, write_sensors
 
 PAPER = Path(__file__).parents[1] / "examples" / "paper"
 KINDS = ("free", "lidar", "wheels", "stereo")

@@ -19,15 +19,15 @@ from typing import Literal
 
 import numpy as np
 
-from icalib.calibration import Calibration
-from icalib.console import print_result
+from icalib.cli.console import print_result
+from icalib.data.measurements import CornerStream, Measurements
 from icalib.errors import CalibrationError
 from icalib.geometry.targets import AprilGrid
-from icalib.measurements import CornerStream, Measurements
 from icalib.pipeline import calibrate_measurements
 from icalib.report import report_html
+from icalib.result import Calibration
 from icalib.rig import Parameter, Rig, Settings
-from icalib.simulation import Scenario, handheld, rig_for, simulate
+from icalib.tools.simulation import Scenario, handheld, rig_for, simulate
 
 SETTINGS = Settings()  # as a user has them
 UNKNOWN = "the cause is unknown"

@@ -17,12 +17,12 @@ from typing import TypeVar
 import cv2
 import numpy as np
 
-from icalib.detection.corners import ImageCorners
-from icalib.detection.detectors import Detector, detector_of
-from icalib.detection.prediction import MOTION_IMAGES
+from icalib.detection.boards.detectors import Detector, detector_of
+from icalib.detection.primitives.corners import ImageCorners
+from icalib.detection.primitives.prediction import MOTION_IMAGES
 from icalib.detection.streams import IN_TURN
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Scene, Target
-from icalib.simulation import Motion, film, handheld, tag_map
+from icalib.tools.simulation import Motion, film, handheld, tag_map
 
 TARGETS: tuple[Target, ...] = (
     AprilGrid(6, 6, 0.088, 0.3),

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
+from icalib.data.measurements import TrackStream
+from icalib.data.recordings import open_recording
 from icalib.detection.tracking.streams import find_tracks
-from icalib.measurements import TrackStream
-from icalib.recordings import open_recording
 from icalib.rig import Rig
-from icalib.simulation import SimCamera, Simulation
-from icalib.simulation.lenses import unproject
-from icalib.simulation.projection import image_velocity, project, visible
-from icalib.simulation.room import Room, distances
+from icalib.tools.simulation import SimCamera, Simulation
+from icalib.tools.simulation.images.lenses import unproject
+from icalib.tools.simulation.scenario.projection import image_velocity, project, visible
+from icalib.tools.simulation.scenario.room import Room, distances
 
 OUTLIER_PX = 1.0
 _FITS = 5

@@ -16,16 +16,16 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from icalib.estimation.arrowhead import Piece, solve
-from icalib.estimation.estimate import Estimate, estimate
-from icalib.estimation.inputs import inputs_for
-from icalib.first_guess.several import initial_guesses
-from icalib.first_guess.start import first_state
+from icalib.estimate.estimate import Estimate, estimate
+from icalib.estimate.problem.inputs import inputs_for
 from icalib.geometry.blas import subtract_gram
 from icalib.geometry.targets import NoTarget
+from icalib.initialize.several import initial_guesses
+from icalib.initialize.start import first_state
+from icalib.optim.arrowhead import Piece, solve
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter, Rig
-from icalib.simulation import load_scenario, rig_for, simulate
+from icalib.tools.simulation import load_scenario, rig_for, simulate
 
 SCENARIO = Path(__file__).parents[1] / "examples" / "paper" / "table2-3d.yaml"
 REPEATS = 3

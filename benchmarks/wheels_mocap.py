@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 
 import icalib
-from icalib.simulation import load_scenario, simulate, write_tables
+from icalib.tools.simulation import load_scenario, simulate, write_tables
 
 SCENARIO = """
 duration: {seconds}

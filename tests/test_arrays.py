@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib import arrays
+from icalib.data import arrays
 from icalib.errors import RecordingError
-from icalib.simulation import handheld, simulate
+from icalib.tools.simulation import handheld, simulate
 
 T = np.array([10.0, 10.1, 10.25])
 

@@ -14,14 +14,14 @@ import pytest
 import yaml
 
 from icalib import pipeline
-from icalib.calibration import Calibration
+from icalib.base.own_files import sealed
 from icalib.cli import main
 from icalib.errors import CalibrationError
 from icalib.geometry import so3
-from icalib.own_files import sealed
 from icalib.pipeline import calibrate_measurements
+from icalib.result import Calibration
 from icalib.rig import Settings
-from icalib.simulation import handheld, rig_for, simulate
+from icalib.tools.simulation import handheld, rig_for, simulate
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "euroc"
 SECONDS = 10
@@ -316,7 +316,7 @@ def test_splits_of_one(tables, tmp_path, capsys):
 
 @pytest.mark.parametrize("stage", ["estimating the initial guess", "solving (final pass)", "writing"])
 def test_an_interrupt_leaves_the_earlier_result(tables, tmp_path, capsys, monkeypatch, stage):
-    import icalib.console
+    import icalib.cli.console
 
     class Interrupting:
         def __init__(self, _quiet: bool) -> None: ...
@@ -332,7 +332,7 @@ def test_an_interrupt_leaves_the_earlier_result(tables, tmp_path, capsys, monkey
 
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "calibration.yaml").write_bytes(sealed(b"earlier"))
-    monkeypatch.setattr(icalib.console, "progress_bar", Interrupting)
+    monkeypatch.setattr(icalib.cli.console, "progress_bar", Interrupting)
     assert run(tables, tmp_path) == 130
     assert re.fullmatch(r"icalib: interrupted.*\n", capsys.readouterr().err)
     assert [p.read_bytes() for p in (tmp_path / "out").iterdir()] == [sealed(b"earlier")]

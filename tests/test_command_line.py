@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from icalib.cli import _parser, main
-from icalib.console import LINE_EVERY_S, progress_bar, progress_lines
+from icalib.cli.console import LINE_EVERY_S, progress_bar, progress_lines
 
 
 def commands(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
@@ -78,7 +78,7 @@ def test_long_work_prints_a_line_every_30_s(capsys: pytest.CaptureFixture[str]):
 
 
 def test_no_lines_where_it_is_quiet(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("icalib.console.LINE_EVERY_S", 0.0)
+    monkeypatch.setattr("icalib.cli.console.LINE_EVERY_S", 0.0)
     for quiet in (False, True):
         with progress_bar(quiet) as show:
             show("reading", 0.5)

@@ -7,7 +7,7 @@ import gc
 import pytest
 from numba.core import event
 
-from icalib.compiled import njit
+from icalib.base.compiled import njit
 
 
 @pytest.mark.parametrize("enabled", [True, False])

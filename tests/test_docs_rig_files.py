@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from icalib.rig_file import load_rig
+from icalib.rig.file import load_rig
 
 DOCS = Path(__file__).parents[1] / "docs"
 WHOLE = re.compile(r"```yaml\n(sensors:\n.*?)```", re.DOTALL)

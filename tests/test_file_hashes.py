@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icalib.file_hashes import HashedFile, hash_of
-from icalib.provenance import provenance
-from icalib.recordings import open_recording
-from icalib.simulation import handheld, simulate, write_sensors
-from icalib.unpacking import load_arrays
+from icalib.base.file_hashes import HashedFile, hash_of
+from icalib.base.unpacking import load_arrays
+from icalib.data.recordings import open_recording
+from icalib.result.provenance import provenance
+from icalib.tools.simulation import handheld, simulate, write_sensors
 
 CONTENT = np.random.default_rng(0).bytes(10_000)
 

@@ -113,7 +113,7 @@ def test_what_fails_outside_is_one_sentence(error: Exception, words: str, monkey
     def failing(path: Path) -> None:
         raise error
 
-    monkeypatch.setattr("icalib.rig_file.load_rig", failing)
+    monkeypatch.setattr("icalib.rig.file.load_rig", failing)
     assert cli.main(["calibrate", "rig.yaml", "rec", "-o", str(tmp_path)]) == 1
     said = capsys.readouterr().err
     assert words in said and said.count("\n") == 1

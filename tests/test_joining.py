@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from icalib.data.joining import join, join_corners
+from icalib.data.measurements import CornerStream, ImuStream, LidarStream, Measurements, WheelPoses, WheelStream
 from icalib.errors import RecordingError
-from icalib.joining import join, join_corners
-from icalib.measurements import CornerStream, ImuStream, LidarStream, Measurements, WheelPoses, WheelStream
 from icalib.rig import ImuNoise, ImuSensor, Lidar, Rig, Wheels
 
 RIG = Rig(

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from icalib.data.measurements import CornerStream, LidarStream, TrackStream, WheelPoses, WheelStream
 from icalib.errors import RecordingError
-from icalib.measurements import CornerStream, LidarStream, TrackStream, WheelPoses, WheelStream
 
 STAMPS = np.array([10, 20, 40], dtype=np.int64)
 START = np.array([0, 2, 2, 5], dtype=np.int64)

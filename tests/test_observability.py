@@ -8,7 +8,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from icalib.observability import observe
+from icalib.observability.words import observe
 
 SENSORS = ("cam0", "cam1", "cam2", "lidar0", "wheel0")
 

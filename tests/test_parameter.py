@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 import icalib
 from icalib.errors import RigError
-from icalib.parameter import Parameter
 from icalib.rig import Camera, ImuNoise, ImuSensor, Lidar, PoseSensor, Rig, Settings, Wheels
+from icalib.rig.parameter import Parameter
 
 TURN = Rotation.from_euler("xyz", [10.0, -20.0, 80.0], degrees=True)
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import yaml
 
+from icalib.base.own_files import sealed
 from icalib.cli import main
 from icalib.errors import CalibrationError, RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles, Markers, Tag, Target
 from icalib.geometry.targets.pattern import pattern_of
-from icalib.own_files import sealed
-from icalib.printing import PAPERS, target_pdf, write_target
+from icalib.tools.printing import PAPERS, target_pdf, write_target
 
 pytest.importorskip("reportlab")
 pytest.importorskip("cv2")

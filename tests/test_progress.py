@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import icalib
-from icalib import console, progress
+from icalib.cli import console, progress
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from types import ModuleType
 import pytest
 
 from icalib.geometry.targets import AprilGrid
-from icalib.simulation import film, handheld, write_film
+from icalib.tools.simulation import film, handheld, write_film
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

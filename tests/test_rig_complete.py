@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from icalib.data.measurements import Measurements
 from icalib.errors import RigError
-from icalib.measurements import Measurements
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import ImuNoise, ImuSensor, Lidar, PoseSensor, Rig, Wheels
-from icalib.rig_complete import lack_of
+from icalib.rig.complete import lack_of
 
 IMU = ImuSensor("imu0", "", ImuNoise(1e-4, 1e-5, 1e-3, 1e-4))
 LIDAR, WHEELS = Lidar("lidar0", ""), Wheels("wheel0", "", "differential")

@@ -11,11 +11,11 @@ import pytest
 import yaml
 
 from icalib.errors import CalibrationError, RigError
-from icalib.estimation.imu_model import LABELS
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard
-from icalib.imu_classes import IMU_CLASSES, class_imperfections, class_noise
+from icalib.motion.imu_model import LABELS
 from icalib.rig import Camera, ImuNoise, ImuSensor, Lidar, Parameter, PoseSensor, Rig, Settings, TwoSources, Wheels
-from icalib.rig_file import load_rig, rig_from_dict, rig_to_dict
+from icalib.rig.file import load_rig, rig_from_dict, rig_to_dict
+from icalib.rig.imu_classes import IMU_CLASSES, class_imperfections, class_noise
 
 VALID = """\
 sensors:

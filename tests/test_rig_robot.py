@@ -12,7 +12,7 @@ import yaml
 
 from icalib.errors import RigError
 from icalib.rig import Ground, Lidar, Parameter, PoseSensor, Rig, Wheels
-from icalib.rig_file import load_rig, rig_to_dict
+from icalib.rig.file import load_rig, rig_to_dict
 
 ROBOT = """\
 sensors:

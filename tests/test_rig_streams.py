@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from icalib.data.measurements import ImuStream, LidarStream, Measurements, PoseStream, TrackStream, WheelStream
+from icalib.data.same_rig import near, streams_of_rig
 from icalib.errors import RecordingError
-from icalib.measurements import ImuStream, LidarStream, Measurements, PoseStream, TrackStream, WheelStream
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import ImuNoise, ImuSensor, Lidar, PoseSensor, Rig, Wheels
-from icalib.rig_streams import near, streams_of_rig
 
 STAMPS, NONE = np.arange(3), np.zeros(4, np.int64)
 IMU = ImuStream("imu0", STAMPS, np.zeros((3, 3)), np.zeros((3, 3)))

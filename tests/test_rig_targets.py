@@ -9,7 +9,7 @@ import yaml
 
 from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Markers, Scene, Target
-from icalib.rig_file import load_rig, load_target, rig_to_dict
+from icalib.rig.file import load_rig, load_target, rig_to_dict
 
 SENSORS = "sensors:\n  cam0: {type: camera, model: eucm, resolution: [752, 480]}\n"
 GRID = "{type: aprilgrid, rows: 6, cols: 7, tag_size: 0.088, tag_spacing: 0.3}"

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import icalib
-from icalib.calibration import load_calibration
 from icalib.cli import main
 from icalib.errors import RecordingError
+from icalib.result import load_calibration
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "euroc"
 RIG = """\

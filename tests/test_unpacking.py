@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from icalib.base.extras import load_lz4, load_zstd
+from icalib.base.unpacking import FREE_BYTES, TooLargeError, gunzipped, load_arrays, unpacked
+from icalib.data.recordings import open_recording
+from icalib.data.tables.scans import read_scans
 from icalib.errors import RecordingError
-from icalib.extras import load_lz4, load_zstd
-from icalib.recordings import open_recording
-from icalib.recordings.scans import read_scans
-from icalib.unpacking import FREE_BYTES, TooLargeError, gunzipped, load_arrays, unpacked
 
 LARGE = bytes(3 * FREE_BYTES)
 

@@ -6,13 +6,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from icalib.calibration import Calibration, load_calibration
+    from icalib.cli.progress import progress_bar
+    from icalib.data.recordings import open_recording
     from icalib.errors import CalibrationError
-    from icalib.parameter import Parameter, fixed, free, guess, prior
     from icalib.pipeline import calibrate, calibrate_measurements
-    from icalib.progress import progress_bar
-    from icalib.recordings import open_recording
-    from icalib.rig_file import load_rig
+    from icalib.result import Calibration, load_calibration
+    from icalib.rig.file import load_rig
+    from icalib.rig.parameter import Parameter, fixed, free, guess, prior
 
 __version__ = "0.2.0"
 __all__ = [
@@ -33,19 +33,19 @@ __all__ = [
 ]
 
 _HOME = {
-    "Calibration": "icalib.calibration",
+    "Calibration": "icalib.result",
     "CalibrationError": "icalib.errors",
-    "Parameter": "icalib.parameter",
+    "Parameter": "icalib.rig.parameter",
     "calibrate": "icalib.pipeline",
     "calibrate_measurements": "icalib.pipeline",
-    "fixed": "icalib.parameter",
-    "free": "icalib.parameter",
-    "guess": "icalib.parameter",
-    "load_calibration": "icalib.calibration",
-    "load_rig": "icalib.rig_file",
-    "open_recording": "icalib.recordings",
-    "prior": "icalib.parameter",
-    "progress_bar": "icalib.progress",
+    "fixed": "icalib.rig.parameter",
+    "free": "icalib.rig.parameter",
+    "guess": "icalib.rig.parameter",
+    "load_calibration": "icalib.result",
+    "load_rig": "icalib.rig.file",
+    "open_recording": "icalib.data.recordings",
+    "prior": "icalib.rig.parameter",
+    "progress_bar": "icalib.cli.progress",
 }
 
 

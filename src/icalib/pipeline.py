@@ -11,25 +11,25 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from icalib.assessment import assess, stated_words, visited
-from icalib.calibration import Calibration, Visited
+from icalib.data.measurements import CornerStream, Measurements, TrackStream
+from icalib.data.recordings import Recording, read_measurements
+from icalib.data.recordings.reading import without_jumps
+from icalib.data.recordings.several import Source, naming, noting, open_all
+from icalib.data.same_rig import streams_of_rig
 from icalib.detection.streams import find_corners
 from icalib.detection.tracking.streams import find_all_tracks
 from icalib.errors import EstimationError, RecordingError
-from icalib.estimation.inputs import Inputs
-from icalib.estimation.outcome import Visit
-from icalib.estimation.pages import give_back, keep_apart
-from icalib.estimation.problem import Problem
-from icalib.first_guess.attempts import attempt
-from icalib.measurements import CornerStream, Measurements, TrackStream
-from icalib.provenance import provenance
-from icalib.recordings import Recording, read_measurements
-from icalib.recordings.reading import without_jumps
-from icalib.recordings.several import Source, naming, noting, open_all
+from icalib.estimate.problem.inputs import Inputs
+from icalib.estimate.problem.outcome import Visit
+from icalib.estimate.problem.problem import Problem
+from icalib.initialize.attempts import attempt
+from icalib.optim.pages import give_back, keep_apart
+from icalib.result import Calibration, Visited
+from icalib.result.provenance import provenance
 from icalib.rig import Camera, Rig
-from icalib.rig_complete import check_complete
-from icalib.rig_file import load_rig
-from icalib.rig_streams import streams_of_rig
+from icalib.rig.complete import check_complete
+from icalib.rig.file import load_rig
+from icalib.validation import assess, stated_words, visited
 
 READING_SHARE, IMAGES_SHARE = 0.1, 0.8  # of the time, without images and with
 SHORTEST_S = 1.0  # of the IMU, below which nothing can be found; clocks need four seconds

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import yaml
 
-from icalib.calibration import Calibration
-from icalib.measurements import CornerStream, ImuStream, Measurements
+from icalib.data.measurements import CornerStream, ImuStream, Measurements
+from icalib.data.recordings import open_recording, read_measurements
 from icalib.pipeline import calibrate_measurements
-from icalib.recordings import open_recording, read_measurements
+from icalib.result import Calibration
 from icalib.rig import Rig
-from icalib.rig_file import load_rig
+from icalib.rig.file import load_rig
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "euroc"
 

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from icalib.calibration import Calibration
+from icalib.data.measurements import Measurements
 from icalib.errors import CalibrationError
 from icalib.geometry.targets import AprilGrid, Markers, NoTarget
-from icalib.measurements import Measurements
-from icalib.montecarlo.truth import error, true_value
 from icalib.pipeline import calibrate_measurements
+from icalib.result import Calibration
 from icalib.rig import Parameter, Rig
-from icalib.simulation import (
+from icalib.tools.montecarlo.truth import error, true_value
+from icalib.tools.simulation import (
     Features,
     Scenario,
     SimPoses,

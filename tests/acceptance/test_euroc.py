@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import yaml
 
-from icalib.calibration import Calibration
+from icalib.data.measurements import ImuStream, Measurements
 from icalib.geometry import so3
-from icalib.measurements import ImuStream, Measurements
 from icalib.pipeline import calibrate, calibrate_measurements
+from icalib.result import Calibration
 from icalib.rig import ImuNoise, Parameter
 
 CAMERAS = ("cam0", "cam1")

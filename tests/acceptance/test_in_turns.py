@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
+from icalib.data.measurements import Measurements
 from icalib.geometry import so3
-from icalib.measurements import Measurements
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Camera, Rig
-from icalib.rig_file import load_rig
+from icalib.rig.file import load_rig
 
 from .conftest import EXAMPLE
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from icalib.rig import Rig, Settings
-from icalib.simulation import handheld, rig_for, simulate
+from icalib.tools.simulation import handheld, rig_for, simulate
 
 CHILD = """
 import pickle, sys

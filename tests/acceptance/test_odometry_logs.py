@@ -17,12 +17,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.calibration import Calibration
-from icalib.estimation.imu_data import ImuData
-from icalib.first_guess.clocks import align
-from icalib.first_guess.poses import pose_rates
-from icalib.measurements import ImuStream, Measurements, PoseStream
+from icalib.data.measurements import ImuStream, Measurements, PoseStream
+from icalib.initialize.poses.poses import pose_rates
+from icalib.initialize.steps.clocks import align
+from icalib.motion.imu_data import ImuData
 from icalib.pipeline import calibrate_measurements
+from icalib.result import Calibration
 from icalib.rig import ImuNoise, ImuSensor, Parameter, PoseSensor, Rig
 
 ALIASED = ImuNoise(3e-3, 2.2e-5, 0.1, 8.6e-4, source="tests")

@@ -8,11 +8,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from icalib.calibration import Calibration
 from icalib.geometry import so3
-from icalib.imu_classes import class_imperfections
 from icalib.pipeline import calibrate_measurements
+from icalib.result import Calibration
 from icalib.rig import Parameter, Rig
+from icalib.rig.imu_classes import class_imperfections
 
 CAMERAS = ("cam0", "cam1")
 GROUPS = ("rotation", "translation", "time_offset", "intrinsics", "distortion", "bloom")

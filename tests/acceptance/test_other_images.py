@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icalib.calibration import Calibration
 from icalib.pipeline import calibrate_measurements
+from icalib.result import Calibration
 
 
 def _stills_module():

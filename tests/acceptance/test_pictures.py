@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icalib.calibration import Calibration
 from icalib.pipeline import calibrate
-from icalib.rig_file import load_rig
+from icalib.result import Calibration
+from icalib.rig.file import load_rig
 
 SHIPPED_RMS_PX = 0.11  # of the solutions that come with the pictures, on the corners that come with them
 BASELINE_M = 0.1100

@@ -12,7 +12,7 @@ import icalib
 from icalib.geometry import so3
 from icalib.geometry.targets import NoTarget
 from icalib.rig import Parameter, Settings
-from icalib.simulation import film, load_scenario, rig_for, write_film
+from icalib.tools.simulation import film, load_scenario, rig_for, write_film
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
 

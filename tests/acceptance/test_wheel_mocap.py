@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 import icalib
-from icalib.calibration import Calibration, joint_covariance
 from icalib.errors import EstimationError
+from icalib.result import Calibration, joint_covariance
 
 NOMINAL = np.array([0.042, 0.042, 0.2])  # left and right radius, baseline
 COUNTS = 64 * 43.7

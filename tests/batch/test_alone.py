@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from icalib.batch import alone
 from icalib.cli import main
 from icalib.errors import CalibrationError
+from icalib.tools.batch import alone
 
-HOLD = "import sys, time; from pathlib import Path; from icalib.batch import alone\n" + (
+HOLD = "import sys, time; from pathlib import Path; from icalib.tools.batch import alone\n" + (
     "with alone(Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(60)\n"
 )
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from icalib.batch import Crew, Lost, run_all, write_whole
-from icalib.batch.workers import _answer
+from icalib.base.extras import load_distributed
 from icalib.errors import CalibrationError
-from icalib.extras import load_distributed
+from icalib.tools.batch import Crew, Lost, run_all, write_whole
+from icalib.tools.batch.workers import _answer
 
 
 def test_a_task_that_kills_its_workers_is_given_up_and_takes_no_other_with_it():

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from icalib.data.measurements import Measurements
 from icalib.geometry.targets import AprilGrid, NoTarget
-from icalib.measurements import Measurements
-from icalib.montecarlo.one_run import compare
-from icalib.montecarlo.record import Record
-from icalib.montecarlo.statistics import Nees, Sample, nees
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Rig
-from icalib.simulation import Scenario, load_scenario, simulate
+from icalib.tools.montecarlo.one_run import compare
+from icalib.tools.montecarlo.record import Record
+from icalib.tools.montecarlo.statistics import Nees, Sample, nees
+from icalib.tools.simulation import Scenario, load_scenario, simulate
 
 BLOCKS = ("rotation", "translation", "time_offset", "intrinsics", "distortion")
 PAPER = Path(__file__).parents[2] / "examples" / "paper"

@@ -9,12 +9,12 @@ import pytest
 from tests.consistency.test_assumed_motion import mocap, without_imu
 from tests.consistency.test_wheel_kinds import reporting
 
+from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
-from icalib.first_guess import attempts
-from icalib.measurements import Measurements
+from icalib.initialize import attempts
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter, Rig
-from icalib.simulation import Scenario, rig_for, simulate
+from icalib.tools.simulation import Scenario, rig_for, simulate
 
 SECONDS, SEED = 15.0, 1
 

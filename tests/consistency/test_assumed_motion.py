@@ -10,14 +10,14 @@ import pytest
 from scipy.stats import chi2
 from tests.consistency.test_robot import steady
 
-from icalib.calibration import Calibration, load_calibration
+from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
-from icalib.measurements import Measurements
-from icalib.montecarlo.truth import error, true_value
-from icalib.outputs import write_outputs
+from icalib.export.outputs import write_outputs
 from icalib.pipeline import calibrate_measurements
+from icalib.result import Calibration, load_calibration
 from icalib.rig import Rig
-from icalib.simulation import Drive, Scenario, SimPoses, Simulation, load_scenario, rig_for, simulate
+from icalib.tools.montecarlo.truth import error, true_value
+from icalib.tools.simulation import Drive, Scenario, SimPoses, Simulation, load_scenario, rig_for, simulate
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
 MOUNT = ("rotation", "translation", "time_offset")

@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.calibration import Calibration
+from icalib.data.measurements import LidarStream
+from icalib.data.messages.lidar_checks import Sieve, checked_lidar, sifted
+from icalib.data.messages.scan_order import selected
+from icalib.data.tables.scans import in_seconds
 from icalib.geometry import so3
-from icalib.measurements import LidarStream
 from icalib.pipeline import calibrate_measurements
-from icalib.recordings.lidar_checks import Sieve, checked_lidar, sifted
-from icalib.recordings.scan_order import selected
-from icalib.recordings.scans import in_seconds
+from icalib.result import Calibration
 from icalib.rig import Lidar
-from icalib.simulation import Simulation, rig_for, simulate
+from icalib.tools.simulation import Simulation, rig_for, simulate
 
 RNG = np.random.default_rng(0)
 

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icalib.montecarlo.truth import error, true_value
 from icalib.pipeline import calibrate_measurements
-from icalib.simulation import load_scenario, rig_for, simulate, with_drawn_guess
+from icalib.tools.montecarlo.truth import error, true_value
+from icalib.tools.simulation import load_scenario, rig_for, simulate, with_drawn_guess
 
 SCENARIO = Path(__file__).parents[2] / "examples" / "paper" / "table2-3d.yaml"
 NOISY = {"imu": ("gyro", "accel"), "tracks": ("uv",), "lidars": ("xyz",), "wheels": ("pose",)}

@@ -10,11 +10,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from icalib.calibration import Calibration
 from icalib.errors import EstimationError
 from icalib.geometry.targets import AprilGrid, Scene
 from icalib.pipeline import calibrate_measurements
-from icalib.simulation import Scenario, Simulation, handheld, rig_for, simulate
+from icalib.result import Calibration
+from icalib.tools.simulation import Scenario, Simulation, handheld, rig_for, simulate
 
 BACK = np.eye(4)  # T_cam0_cam1: looks nearly the other way
 BACK[:3, :3] = Rotation.from_euler("yx", [170.0, 8.0], degrees=True).as_matrix()

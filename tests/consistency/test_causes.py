@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.calibration import Calibration
-from icalib.measurements import CornerStream, Measurements
+from icalib.data.measurements import CornerStream, Measurements
 from icalib.pipeline import calibrate_measurements
+from icalib.result import Calibration
 from icalib.rig import Settings
-from icalib.simulation import Scenario, Simulation, handheld, rig_for, simulate
+from icalib.tools.simulation import Scenario, Simulation, handheld, rig_for, simulate
 
 SECONDS = 15.0
 

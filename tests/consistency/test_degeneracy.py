@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.calibration import Calibration
+from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
-from icalib.measurements import Measurements
 from icalib.pipeline import calibrate_measurements
+from icalib.result import Calibration
 from icalib.rig import Parameter, Rig
-from icalib.simulation import Scenario, Simulation, handheld, rig_for, simulate
+from icalib.tools.simulation import Scenario, Simulation, handheld, rig_for, simulate
 
 ROTATION_RAD, TRANSLATION_M, OFFSET_S = 0.087, 0.05, 0.02  # of a guess
 MOST_SIGMA = 4.0

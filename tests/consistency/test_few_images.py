@@ -8,11 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from icalib.assessment.assess import few_factor, few_parts_notes
-from icalib.calibration import Calibration
-from icalib.measurements import CornerStream, Measurements
+from icalib.data.measurements import CornerStream, Measurements
 from icalib.pipeline import calibrate_measurements
-from icalib.simulation import handheld, rig_for, simulate
+from icalib.result import Calibration
+from icalib.tools.simulation import handheld, rig_for, simulate
+from icalib.validation.assess import few_factor, few_parts_notes
 
 LENS = {"intrinsics": (458.7, 457.3, 367.2, 248.4), "distortion": (-0.28, 0.07, 2e-4, 2e-5)}
 

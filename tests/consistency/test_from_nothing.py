@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from icalib.errors import EstimationError
-from icalib.first_guess.start import start
-from icalib.montecarlo.one_run import Task, run
-from icalib.montecarlo.statistics import Sample, nees
-from icalib.simulation import Scenario, SimPoses, load_scenario, rig_for, simulate
+from icalib.initialize.start import start
+from icalib.tools.montecarlo.one_run import Task, run
+from icalib.tools.montecarlo.statistics import Sample, nees
+from icalib.tools.simulation import Scenario, SimPoses, load_scenario, rig_for, simulate
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.calibration import Calibration
-from icalib.montecarlo.truth import error, true_value
 from icalib.pipeline import calibrate_measurements
+from icalib.result import Calibration
 from icalib.rig import Ground, Parameter, Rig
-from icalib.simulation import Scenario, Simulation, rig_for, simulate, with_drawn_guess
+from icalib.tools.montecarlo.truth import error, true_value
+from icalib.tools.simulation import Scenario, Simulation, rig_for, simulate, with_drawn_guess
 
 MOUNTS = ("rotation", "translation", "time_offset")
 TILT, HEIGHT = 5e-3, 2e-3  # of each node [rad]; of what was measured [m]

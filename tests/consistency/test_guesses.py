@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.calibration import Calibration
 from icalib.errors import CalibrationError
 from icalib.geometry import so3
 from icalib.pipeline import calibrate_measurements
+from icalib.result import Calibration
 from icalib.rig import Camera, Parameter, Rig
-from icalib.simulation import Simulation, handheld, rig_for, simulate
+from icalib.tools.simulation import Simulation, handheld, rig_for, simulate
 
 OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # R_link_optical
 SIGMAS = 5.0

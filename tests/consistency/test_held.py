@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from icalib.estimation import determination
-from icalib.estimation.determination import determine
-from icalib.estimation.outcome import Step
-from icalib.first_guess.start import start
-from icalib.simulation import rig_for, simulate, with_drawn_guess
+from icalib.estimate.problem.outcome import Step
+from icalib.initialize.start import start
+from icalib.observability import determination
+from icalib.observability.determination import determine
+from icalib.tools.simulation import rig_for, simulate, with_drawn_guess
 
 
 def test_of_an_estimate_that_failed_no_answers_are_looked_for(robot, monkeypatch):

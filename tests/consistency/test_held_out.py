@@ -11,12 +11,12 @@ from tests.consistency.conftest import make_robot
 from tests.consistency.test_several import pair
 from tests.consistency.test_without_imu import alone, stereo
 
-from icalib.calibration import Calibration, CrossValidation
-from icalib.measurements import Measurements
-from icalib.montecarlo.one_run import compare
+from icalib.data.measurements import Measurements
 from icalib.pipeline import calibrate_measurements
+from icalib.result import Calibration, CrossValidation
 from icalib.rig import Camera, Rig, Settings
-from icalib.simulation import Scenario, handheld, rig_for, simulate, with_drawn_guess
+from icalib.tools.montecarlo.one_run import compare
+from icalib.tools.simulation import Scenario, handheld, rig_for, simulate, with_drawn_guess
 
 SEEDS = range(6)
 PLAIN = Settings(loss="none", outlier_std=0.0, bloom=False, board_shape=False, blur_noise=False)

@@ -9,10 +9,10 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from icalib.imu_classes import class_imperfections
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter
-from icalib.simulation import SimPoses, handheld, rig_for, simulate
+from icalib.rig.imu_classes import class_imperfections
+from icalib.tools.simulation import SimPoses, handheld, rig_for, simulate
 
 
 @pytest.fixture(scope="module")

@@ -7,12 +7,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from icalib.assessment import lens_models
-from icalib.calibration import Calibration
-from icalib.measurements import CornerStream, Measurements
+from icalib.data.measurements import CornerStream, Measurements
 from icalib.pipeline import calibrate_measurements
+from icalib.result import Calibration
 from icalib.rig import Rig
-from icalib.simulation import handheld, rig_for, simulate
+from icalib.tools.simulation import handheld, rig_for, simulate
+from icalib.validation import lens_models
 
 WIDE = ("eucm", (430.0, 429.0, 371.0, 245.0), (0.62, 1.09))
 NARROW = ("pinhole-radtan", (458.7, 457.3, 367.2, 248.4), (-0.28, 0.07, 2e-4, 2e-5))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from icalib.simulation import handheld, rig_for
+from icalib.tools.simulation import handheld, rig_for
 
 CONFIGURATIONS = [(a, i) for a in (False, True) for i in ("datasheet", "noisy")]
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from tests.consistency.conftest import PAPER
 
-from icalib.calibration import Calibration
-from icalib.montecarlo.one_run import compare
 from icalib.pipeline import calibrate_measurements
-from icalib.simulation import Scenario, Simulation, load_scenario, rig_for, simulate, with_drawn_guess
+from icalib.result import Calibration
+from icalib.tools.montecarlo.one_run import compare
+from icalib.tools.simulation import Scenario, Simulation, load_scenario, rig_for, simulate, with_drawn_guess
 
 SECONDS = 8.0
 SPIN_SECONDS = 10.0  # after 8 s of noisy spinning the baseline is called known, 19 standard deviations off

@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from icalib.measurements import CornerStream, Measurements
+from icalib.data.measurements import CornerStream, Measurements
 from icalib.pipeline import calibrate_measurements
-from icalib.simulation import handheld, rig_for, simulate
+from icalib.tools.simulation import handheld, rig_for, simulate
 
 
 def some_images(stream: CornerStream, kept: np.ndarray) -> CornerStream:

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from icalib.calibration import Calibration
-from icalib.montecarlo.one_run import compare
-from icalib.montecarlo.statistics import Sample, nees
 from icalib.pipeline import calibrate_measurements
-from icalib.simulation import Scenario, Simulation, load_scenario, rig_for, simulate, with_drawn_guess
+from icalib.result import Calibration
+from icalib.tools.montecarlo.one_run import compare
+from icalib.tools.montecarlo.statistics import Sample, nees
+from icalib.tools.simulation import Scenario, Simulation, load_scenario, rig_for, simulate, with_drawn_guess
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
 MOUNTS = ("rotation", "translation", "time_offset")

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.calibration import relative_poses
+from icalib.data.measurements import PoseStream
 from icalib.errors import EstimationError
-from icalib.measurements import PoseStream
-from icalib.montecarlo.truth import error, true_value
 from icalib.pipeline import calibrate_measurements
-from icalib.simulation import Drive, Room, Scenario, SimPoses, handheld, rig_for, simulate
+from icalib.result import relative_poses
+from icalib.tools.montecarlo.truth import error, true_value
+from icalib.tools.simulation import Drive, Room, Scenario, SimPoses, handheld, rig_for, simulate
 
 ROOM = Room((8.0, 6.0, 3.0))
 NOISE = {"absolute": (2e-3, 1e-3), "relative": (5e-3, 1e-2)}

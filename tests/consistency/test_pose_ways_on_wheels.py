@@ -10,7 +10,7 @@ from tests.consistency.test_upwards import level
 from tests.first_guess.test_pose_ways import conjugated, inverted, w_first, y_up
 
 from icalib.errors import EstimationError
-from icalib.first_guess.assumed_motion import start_without_imu
+from icalib.initialize.assumed_motion import start_without_imu
 
 WRONG = [
     (inverted, "the poses of mocap0 are inverted"),

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.calibration import Calibration
 from icalib.geometry.targets import Charuco, Checkerboard, Target
-from icalib.imu_classes import FREE
 from icalib.pipeline import calibrate_measurements
+from icalib.result import Calibration
 from icalib.rig import Parameter, Rig
-from icalib.simulation import Scenario, Simulation, handheld, rig_for, simulate
+from icalib.rig.imu_classes import FREE
+from icalib.tools.simulation import Scenario, Simulation, handheld, rig_for, simulate
 
 
 def extrinsics_error(result: Calibration, simulation: Simulation, camera: str) -> tuple[float, float, float]:

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.estimation.arrowhead import solve
-from icalib.estimation.determination import determine, judge
-from icalib.estimation.relaxed import freed_inputs, relaxed
-from icalib.first_guess.start import start
+from icalib.initialize.start import start
+from icalib.observability.determination import determine, judge
+from icalib.observability.relaxed import freed_inputs, relaxed
+from icalib.optim.arrowhead import solve
 from icalib.rig import Parameter
-from icalib.simulation import handheld, rig_for, simulate
+from icalib.tools.simulation import handheld, rig_for, simulate
 
 LENS, MOUNT = ("cam0", "distortion"), ("cam0", "translation")
 

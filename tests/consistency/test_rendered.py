@@ -10,12 +10,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import icalib
-from icalib.calibration import Calibration
 from icalib.geometry.targets import Charuco, Checkerboard, Target
+from icalib.result import Calibration
 from icalib.rig import Rig, Settings
-from icalib.simulation import Film, Scenario, Truth, film, handheld, rig_for, tag_map, write_film
-from icalib.simulation.projection import project
-from icalib.simulation.writing import FORMS, Form
+from icalib.tools.simulation import Film, Scenario, Truth, film, handheld, rig_for, tag_map, write_film
+from icalib.tools.simulation.scenario.projection import project
+from icalib.tools.simulation.writing import FORMS, Form
 
 pytest.importorskip("cv2")
 pytest.importorskip("rosbags")

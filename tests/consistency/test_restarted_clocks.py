@@ -10,13 +10,13 @@ import pytest
 import yaml
 from scipy.stats import chi2
 
-from icalib.calibration import Calibration, joint_covariance, load_calibration
 from icalib.errors import EstimationError, RecordingError
+from icalib.export.outputs import write_outputs
 from icalib.geometry.targets import NoTarget
-from icalib.outputs import write_outputs
 from icalib.pipeline import calibrate_measurements
+from icalib.result import Calibration, joint_covariance, load_calibration
 from icalib.rig import Parameter, Rig
-from icalib.simulation import Scenario, SimPoses, Simulation, load_scenario, rig_for, simulate
+from icalib.tools.simulation import Scenario, SimPoses, Simulation, load_scenario, rig_for, simulate
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
 T_IMU_MOCAP = np.array([[0.0, -1.0, 0.0, 0.1], [1.0, 0.0, 0.0, 0.05], [0.0, 0.0, 1.0, 0.3], [0.0, 0.0, 0.0, 1.0]])

@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from icalib.calibration import Calibration
-from icalib.first_guess import initial_guess
-from icalib.measurements import Measurements
-from icalib.montecarlo.truth import error, true_value
+from icalib.data.measurements import Measurements
+from icalib.initialize import initial_guess
 from icalib.pipeline import calibrate_measurements
+from icalib.result import Calibration
 from icalib.rig import Rig
-from icalib.simulation import Scenario, Simulation, rig_for, simulate, with_drawn_guess
+from icalib.tools.montecarlo.truth import error, true_value
+from icalib.tools.simulation import Scenario, Simulation, rig_for, simulate, with_drawn_guess
 
 MOUNTS = ("rotation", "translation", "time_offset")
 DRIVEN = (*MOUNTS, "radii", "baseline")

@@ -10,15 +10,15 @@ from functools import cache, partial
 import numpy as np
 import pytest
 
-from icalib.calibration import Calibration
+from icalib.data.measurements import LidarStream, Measurements, WheelStream
 from icalib.errors import CalibrationError, EstimationError
-from icalib.first_guess import lidar_rounds
 from icalib.geometry import so3
-from icalib.measurements import LidarStream, Measurements, WheelStream
-from icalib.montecarlo.truth import true_value
+from icalib.initialize.lidar import lidar_rounds
 from icalib.pipeline import calibrate_measurements
+from icalib.result import Calibration
 from icalib.rig import Rig
-from icalib.simulation import Simulation, rig_for, simulate, with_drawn_guess
+from icalib.tools.montecarlo.truth import true_value
+from icalib.tools.simulation import Simulation, rig_for, simulate, with_drawn_guess
 
 MOUNTS = ("rotation", "translation", "time_offset")
 SCAN_S = 0.125

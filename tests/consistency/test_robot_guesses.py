@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from icalib.errors import CalibrationError
-from icalib.estimation.inputs import Inputs
-from icalib.estimation.state import State
-from icalib.first_guess.start import start
+from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry import so3
+from icalib.initialize.start import start
+from icalib.optim.state import State
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Camera, Lidar, Parameter, PoseSensor, Rig, Wheels
-from icalib.simulation import Simulation, rig_for, simulate
-from icalib.simulation.robot import SimPoses
+from icalib.tools.simulation import Simulation, rig_for, simulate
+from icalib.tools.simulation.scenario.robot import SimPoses
 
 OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 ON_TOP = np.array([[1.0, 0.0, 0.0, 0.1], [0.0, 0.0, -1.0, 0.2], [0.0, 1.0, 0.0, 0.3], [0.0, 0.0, 0.0, 1.0]])

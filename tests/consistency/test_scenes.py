@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.calibration import Calibration
+from icalib.data.measurements import CornerStream, Measurements
 from icalib.errors import EstimationError
-from icalib.estimation.bodies import Bodies, choose_bodies, restrict
-from icalib.first_guess.scene_changes import check_scene, scene_changes
-from icalib.first_guess.scene_lens import find_scene
 from icalib.geometry.targets import Scene
-from icalib.measurements import CornerStream, Measurements
+from icalib.initialize.boards.scene_changes import check_scene, scene_changes
+from icalib.initialize.boards.scene_lens import find_scene
 from icalib.pipeline import calibrate_measurements
+from icalib.result import Calibration
 from icalib.rig import Parameter, Rig
-from icalib.simulation import Scenario, Simulation, rig_for, simulate, tag_map
+from icalib.sensors.camera.bodies import Bodies, choose_bodies, restrict
+from icalib.tools.simulation import Scenario, Simulation, rig_for, simulate, tag_map
 
 
 def seen_only(recording: Measurements, wanted: Callable[[np.ndarray], np.ndarray]) -> Measurements:

@@ -10,13 +10,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from icalib.calibration import Calibration, load_calibration
+from icalib.data.measurements import CornerStream, ImuStream
 from icalib.errors import EstimationError, RecordingError
-from icalib.measurements import CornerStream, ImuStream
-from icalib.outputs import write_outputs
+from icalib.export.outputs import write_outputs
 from icalib.pipeline import calibrate_measurements
+from icalib.result import Calibration, load_calibration
 from icalib.rig import Rig
-from icalib.simulation import Scenario, Simulation, Truth, handheld, rig_for, simulate
+from icalib.tools.simulation import Scenario, Simulation, Truth, handheld, rig_for, simulate
 
 GROUPS = ("rotation", "translation", "time_offset", "intrinsics", "distortion")
 

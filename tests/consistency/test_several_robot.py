@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from tests.consistency.test_robot import steady
 
-from icalib.calibration import Calibration
 from icalib.errors import EstimationError
-from icalib.montecarlo.one_run import compare
 from icalib.pipeline import calibrate_measurements
-from icalib.simulation import Scenario, Simulation, rig_for, simulate
+from icalib.result import Calibration
+from icalib.tools.montecarlo.one_run import compare
+from icalib.tools.simulation import Scenario, Simulation, rig_for, simulate
 
 MONTH_NS = 30 * 86_400 * 10**9 + 123_456_789
 

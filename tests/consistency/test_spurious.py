@@ -7,11 +7,11 @@ import pytest
 from tests.consistency.test_open_motion import thin
 from threadpoolctl import threadpool_limits
 
-from icalib.estimation import determination
-from icalib.estimation.debias import spurious_information
-from icalib.estimation.estimate import estimate
+from icalib.estimate.estimate import estimate
+from icalib.estimate.evidence.debias import spurious_information
+from icalib.observability import determination
 from icalib.pipeline import calibrate_measurements
-from icalib.simulation import rig_for, simulate, with_drawn_guess
+from icalib.tools.simulation import rig_for, simulate, with_drawn_guess
 
 AXIS = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])  # of examples/paper/single-axis.yaml
 RECORDINGS = 6

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.calibration import Calibration
 from icalib.geometry import so3
 from icalib.geometry.targets import AprilGrid
 from icalib.pipeline import calibrate_measurements
+from icalib.result import Calibration
 from icalib.rig import Parameter, Rig
-from icalib.simulation import Simulation, handheld, rig_for, simulate
+from icalib.tools.simulation import Simulation, handheld, rig_for, simulate
 
 TURN = so3.exp(np.deg2rad([0.0, 1.5, 0.0]))
 

@@ -12,15 +12,15 @@ from scipy.stats import chi2
 from tests.consistency.test_assumed_motion import T_OTHER, mocap
 from tests.consistency.test_pose_sensors import pose
 
-from icalib.calibration import Calibration, load_calibration
+from icalib.data.measurements import Measurements, PoseStream
 from icalib.errors import EstimationError
-from icalib.measurements import Measurements, PoseStream
-from icalib.montecarlo.truth import error
-from icalib.outputs import write_outputs
-from icalib.parameter import fixed
+from icalib.export.outputs import write_outputs
 from icalib.pipeline import calibrate_measurements
+from icalib.result import Calibration, load_calibration
 from icalib.rig import Rig
-from icalib.simulation import Drive, Scenario, SimPoses, handheld, rig_for, simulate
+from icalib.rig.parameter import fixed
+from icalib.tools.montecarlo.truth import error
+from icalib.tools.simulation import Drive, Scenario, SimPoses, handheld, rig_for, simulate
 
 MOUNT, FRAME = pose([0.3, -0.5, 1.0], [0.1, -0.2, 0.15]), pose([0.2, 0.1, 2.0], [3.0, -1.0, 0.5])
 

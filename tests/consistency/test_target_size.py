@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from icalib.estimation.determination import determine
-from icalib.estimation.target_size import TargetSize, target_size
-from icalib.first_guess.start import start
+from icalib.estimate.evidence.target_size import TargetSize, target_size
+from icalib.initialize.start import start
+from icalib.observability.determination import determine
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter, Rig
-from icalib.simulation import handheld, rig_for, simulate, tag_map
+from icalib.tools.simulation import handheld, rig_for, simulate, tag_map
 
 SECONDS = 10.0
 

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.estimation.assembly import assemble, image_times, nodes_for, resample
-from icalib.estimation.corner_noise import first_noise
-from icalib.estimation.feature_noise import first_following
-from icalib.estimation.inputs import inputs_for, origin_difference
-from icalib.estimation.solver import minimise
-from icalib.first_guess.several import initial_guesses
-from icalib.first_guess.start import first_state
+from icalib.data.measurements import Measurements, TrackStream
+from icalib.estimate.evidence.corner_noise import first_noise
+from icalib.estimate.evidence.feature_noise import first_following
+from icalib.estimate.problem.assembly import assemble, image_times, nodes_for, resample
+from icalib.estimate.problem.inputs import inputs_for, origin_difference
+from icalib.estimate.problem.solver import minimise
 from icalib.geometry.targets import NoTarget
-from icalib.measurements import Measurements, TrackStream
+from icalib.initialize.several import initial_guesses
+from icalib.initialize.start import first_state
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter, Rig
-from icalib.simulation import Scenario, load_scenario, rig_for, simulate, with_drawn_guess
+from icalib.tools.simulation import Scenario, load_scenario, rig_for, simulate, with_drawn_guess
 
 SCENARIO = Path(__file__).parents[2] / "examples" / "paper" / "table2-3d.yaml"
 

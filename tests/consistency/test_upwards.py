@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from tests.consistency.test_assumed_motion import check_known, mocap, without_imu
 
-from icalib.calibration import Calibration
+from icalib.data.measurements import Measurements, WheelStream
 from icalib.errors import EstimationError
-from icalib.measurements import Measurements, WheelStream
 from icalib.pipeline import calibrate_measurements
-from icalib.simulation import SimPoses
+from icalib.result import Calibration
+from icalib.tools.simulation import SimPoses
 
 LEVEL = np.array([[0.0, 1.0, 0.0, 2.0], [-1.0, 0.0, 0.0, 1.0], [0.0, 0.0, 1.0, 0.5], [0.0, 0.0, 0.0, 1.0]])
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from tests.consistency.test_robot import steady
 
-from icalib.montecarlo.truth import error, true_value
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import DRIVE_SIZES
-from icalib.simulation import Scenario, rig_for, simulate
+from icalib.tools.montecarlo.truth import error, true_value
+from icalib.tools.simulation import Scenario, rig_for, simulate
 
 MOUNTS = ("rotation", "translation", "time_offset")
 KINDS = {"twist": "twist", "steering": "steered"}

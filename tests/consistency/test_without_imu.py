@@ -9,14 +9,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from icalib.calibration import Calibration, load_calibration
+from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
-from icalib.measurements import Measurements
-from icalib.outputs import write_outputs
-from icalib.parameter import fixed
+from icalib.export.outputs import write_outputs
 from icalib.pipeline import calibrate_measurements
+from icalib.result import Calibration, load_calibration
 from icalib.rig import Rig
-from icalib.simulation import Scenario, Simulation, handheld, rig_for, simulate
+from icalib.rig.parameter import fixed
+from icalib.tools.simulation import Scenario, Simulation, handheld, rig_for, simulate
 
 EXACT = 1e-8
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from icalib.calibration import Calibration
-from icalib.measurements import Measurements
+from icalib.data.measurements import Measurements
 from icalib.pipeline import calibrate_measurements
-from icalib.simulation import Simulation, handheld, rig_for, simulate
+from icalib.result import Calibration
+from icalib.tools.simulation import Simulation, handheld, rig_for, simulate
 
 
 @pytest.fixture(scope="module")

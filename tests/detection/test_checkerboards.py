@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from icalib.detection import CheckerboardDetector
-from icalib.detection import checkerboard as module
-from icalib.detection.corners import ImageCorners
-from icalib.detection.crossings import shows_grid
-from icalib.detection.detectors import detector_of
+from icalib.detection.boards import checkerboard as module
+from icalib.detection.boards.detectors import detector_of
+from icalib.detection.primitives.corners import ImageCorners
+from icalib.detection.primitives.crossings import shows_grid
 from icalib.detection.turns import number_continuously
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles, Scene
 

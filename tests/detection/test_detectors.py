@@ -7,6 +7,7 @@ import importlib
 import numpy as np
 import pytest
 
+from icalib.base.extras import load_cv2
 from icalib.detection import (
     VERDICTS,
     AprilGridDetector,
@@ -16,11 +17,10 @@ from icalib.detection import (
     MarkerDetector,
     corner_stream,
 )
-from icalib.detection.corners import judged
-from icalib.detection.detectors import detector_of
-from icalib.detection.families import tag_family
+from icalib.detection.boards.detectors import detector_of
+from icalib.detection.primitives.corners import judged
+from icalib.detection.primitives.families import tag_family
 from icalib.errors import CalibrationError, RecordingError
-from icalib.extras import load_cv2
 from icalib.geometry.targets import Charuco
 from icalib.geometry.targets.families import FAMILIES, opencv_bits
 from icalib.geometry.targets.pattern import pattern_of

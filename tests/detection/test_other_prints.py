@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from icalib.detection import what_is_seen
-from icalib.detection.board_diagnosis import other_columns, other_size
-from icalib.detection.detectors import detector_of
-from icalib.detection.diagnosis import with_other_layout
+from icalib.detection.boards.board_diagnosis import other_columns, other_size
+from icalib.detection.boards.detectors import detector_of
+from icalib.detection.boards.diagnosis import with_other_layout
 from icalib.errors import RecordingError, RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Scene, Target
 from icalib.geometry.targets.pattern import pattern_of
-from icalib.rig_file import load_target
-from icalib.simulation import Imaging, Renderer, Sheet
-from icalib.simulation.scenario import SimCamera
+from icalib.rig.file import load_target
+from icalib.tools.simulation import Imaging, Renderer, Sheet
+from icalib.tools.simulation.scenario.scenario import SimCamera
 
 pytestmark = pytest.mark.slow
 

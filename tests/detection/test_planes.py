@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.detection.planes import PlaneSearch, find_planes
-from icalib.simulation import load_scenario, simulate
+from icalib.detection.planes.planes import PlaneSearch, find_planes
+from icalib.tools.simulation import load_scenario, simulate
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "paper" / "table2-3d.yaml"
 SEARCH = PlaneSearch(position_m=0.01, angle_rad=np.deg2rad(0.5))

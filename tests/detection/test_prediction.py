@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.detection.corners import ImageCorners, no_corners
-from icalib.detection.decoding import mapped
-from icalib.detection.detectors import detector_of
-from icalib.detection.prediction import PredictedCorners, predict_corners, predict_nodes
-from icalib.detection.quads import View
+from icalib.detection.boards.detectors import detector_of
+from icalib.detection.primitives.corners import ImageCorners, no_corners
+from icalib.detection.primitives.decoding import mapped
+from icalib.detection.primitives.prediction import PredictedCorners, predict_corners, predict_nodes
+from icalib.detection.primitives.quads import View
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles
-from icalib.simulation import Motion, film, handheld
+from icalib.tools.simulation import Motion, film, handheld
 
 pytest.importorskip("cv2")
 

@@ -9,15 +9,16 @@ import cv2
 import numpy as np
 import pytest
 
-from icalib.detection import quads, streams
-from icalib.detection.corners import ImageCorners, no_corners
-from icalib.detection.detectors import detector_of
+from icalib.data.recordings import Payload, TopicInfo
+from icalib.detection import streams
+from icalib.detection.boards.detectors import detector_of
+from icalib.detection.primitives import quads
+from icalib.detection.primitives.corners import ImageCorners, no_corners
 from icalib.detection.sightings import sightings, without_rare_tags
 from icalib.errors import RecordingError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Markers, Scene, Target
-from icalib.recordings import Payload, TopicInfo
 from icalib.rig import Camera
-from icalib.simulation import Imaging, Renderer, Shot, film, handheld, sheets_of, tag_map
+from icalib.tools.simulation import Imaging, Renderer, Shot, film, handheld, sheets_of, tag_map
 
 pytest.importorskip("cv2")
 

@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icalib.detection import image_work, streams
-from icalib.detection.corners import ImageCorners, no_corners
+from icalib.data.recordings import Payload, TopicInfo
+from icalib.detection import streams
+from icalib.detection.images import image_work
+from icalib.detection.primitives.corners import ImageCorners, no_corners
 from icalib.errors import RecordingError
 from icalib.geometry.targets import AprilGrid
-from icalib.recordings import Payload, TopicInfo
 from icalib.rig import Camera
 
 GRID = AprilGrid(6, 6, 0.088, 0.3)

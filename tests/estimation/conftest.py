@@ -12,28 +12,28 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.estimation.arrowhead import Piece, make_pieces
-from icalib.estimation.board import SHAPE_LABELS
-from icalib.estimation.bodies import SIZE, Bodies, restrict
-from icalib.estimation.corner_factor import CornerFactor, CornerNoise
-from icalib.estimation.feature_factor import FeatureFactor
-from icalib.estimation.imu_data import ImuData
-from icalib.estimation.imu_factor import ImuFactor
-from icalib.estimation.lidar_binning import LidarNoise
-from icalib.estimation.lidar_factor import LidarFactor
-from icalib.estimation.lidar_sweep import Motion
-from icalib.estimation.nodes import place_nodes
-from icalib.estimation.poses import assign_nodes
-from icalib.estimation.problem import Problem
-from icalib.estimation.state import NODE, Layout, State, make_layout
-from icalib.estimation.surfaces import OnPlanes, Surfaces
-from icalib.estimation.tolerances import Tolerances
-from icalib.estimation.tracks import TrackNoise
+from icalib.data.measurements import CornerStream, LidarStream, TrackStream
+from icalib.estimate.problem.problem import Problem
+from icalib.estimate.problem.tolerances import Tolerances
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.planes import plane_of
 from icalib.geometry.targets import AprilGrid
-from icalib.measurements import CornerStream, LidarStream, TrackStream
-from icalib.simulation import Scenario, Simulation, handheld, load_scenario, simulate
+from icalib.motion.imu_data import ImuData
+from icalib.motion.nodes import place_nodes
+from icalib.motion.poses import assign_nodes
+from icalib.motion.sweep import Motion
+from icalib.optim.arrowhead import Piece, make_pieces
+from icalib.optim.state import NODE, Layout, State, make_layout
+from icalib.sensors.camera.board import SHAPE_LABELS
+from icalib.sensors.camera.bodies import SIZE, Bodies, restrict
+from icalib.sensors.camera.corner_factor import CornerFactor, CornerNoise
+from icalib.sensors.camera.features.feature_factor import FeatureFactor
+from icalib.sensors.camera.features.surfaces import OnPlanes, Surfaces
+from icalib.sensors.camera.features.tracks import TrackNoise
+from icalib.sensors.imu.residual import ImuFactor
+from icalib.sensors.lidar.lidar_binning import LidarNoise
+from icalib.sensors.lidar.residual import LidarFactor
+from icalib.tools.simulation import Scenario, Simulation, handheld, load_scenario, simulate
 
 TOLERANCE = {
     "rotation": 2e-3,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from icalib.estimation.anderson import Accelerator
+from icalib.optim.anderson import Accelerator
 
 
 @pytest.mark.parametrize("rates", [(0.2, 1.8), (0.3, 0.6), (1.5, 1.7)])

@@ -3,17 +3,10 @@
 import numpy as np
 import pytest
 
-from icalib.estimation import arrowhead
-from icalib.estimation.arrowhead import (
-    NotDefiniteError,
-    Piece,
-    make_pieces,
-    marginalise,
-    marginalise_in_segments,
-    solve,
-)
-from icalib.estimation.border import HELD_BELOW, border_step
-from icalib.estimation.state import NODE
+from icalib.optim import arrowhead
+from icalib.optim.arrowhead import NotDefiniteError, Piece, make_pieces, marginalise, marginalise_in_segments, solve
+from icalib.optim.border import HELD_BELOW, border_step
+from icalib.optim.state import NODE
 
 
 def random_pieces(n_nodes, n_border, seed=0, border_rank=None):

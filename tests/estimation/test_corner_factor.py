@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from icalib.estimation.arrowhead import Piece, make_pieces
-from icalib.estimation.corner_factor import CornerNoise
-from icalib.simulation.projection import project
+from icalib.optim.arrowhead import Piece, make_pieces
+from icalib.sensors.camera.corner_factor import CornerNoise
+from icalib.tools.simulation.scenario.projection import project
 
 
 @pytest.fixture(scope="module")

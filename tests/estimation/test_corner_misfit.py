@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from icalib.estimation.corner_misfit import lens_misfit
-from icalib.measurements import CornerStream
+from icalib.data.measurements import CornerStream
+from icalib.sensors.camera.corner_misfit import lens_misfit
 
 SIZE = np.array([752.0, 480.0])
 

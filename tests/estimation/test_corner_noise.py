@@ -7,11 +7,11 @@ from typing import cast
 import numpy as np
 import pytest
 
-from icalib.assessment import lens_models
-from icalib.estimation.corner_noise import NoiseModel, estimate_noise, image_speed
-from icalib.estimation.estimate import Estimate
-from icalib.estimation.inputs import Inputs
+from icalib.estimate.estimate import Estimate
+from icalib.estimate.evidence.corner_noise import NoiseModel, estimate_noise, image_speed
+from icalib.estimate.problem.inputs import Inputs
 from icalib.rig import Camera, Settings
+from icalib.validation import lens_models
 
 BASE, EXPOSURE_S = 0.08, 4e-4
 

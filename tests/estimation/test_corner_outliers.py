@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from icalib.estimation.bodies import Bodies
-from icalib.estimation.corner_outliers import inliers, isolated
 from icalib.geometry.targets import AprilGrid, Checkerboard, Scene
 from icalib.rig import Settings
+from icalib.sensors.camera.bodies import Bodies
+from icalib.sensors.camera.corner_outliers import inliers, isolated
 
 SIZE = np.array([900.0, 600.0])
 NOISE_PX = 0.15

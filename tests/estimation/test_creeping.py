@@ -7,8 +7,8 @@ from typing import Any, cast
 
 import pytest
 
-from icalib.estimation.outcome import Step
-from icalib.estimation.solver import SLOW, _Care, _Descent
+from icalib.estimate.problem.outcome import Step
+from icalib.estimate.problem.solver import SLOW, _Care, _Descent
 
 
 @pytest.mark.parametrize(

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from icalib.estimation.debias import Spurious
-from icalib.estimation.determination import _are_alike, _shown, scatter
+from icalib.estimate.evidence.debias import Spurious
+from icalib.observability.determination import _are_alike, _shown, scatter
 
 DIRECTIONS = np.linalg.qr(np.random.default_rng(0).standard_normal((4, 4)))[0]
 TOLERANCE = np.array([1e-3, 0.1, 2.0, 0.5])

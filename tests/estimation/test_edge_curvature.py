@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.estimation.edge_curvature import with_bent_edges
-from icalib.simulation.projection import project
+from icalib.sensors.camera.edge_curvature import with_bent_edges
+from icalib.tools.simulation.scenario.projection import project
 
 
 @pytest.fixture(scope="module")

@@ -9,12 +9,12 @@ import pytest
 from tests.estimation.test_arrowhead import random_pieces
 from tests.estimation.test_front import build
 
-from icalib.estimation.arrowhead import Piece, solve
-from icalib.estimation.debias import spurious_information
-from icalib.estimation.evidence import fits
-from icalib.estimation.outcome import Draws, Outcome, posterior
-from icalib.estimation.solver import minimise
-from icalib.simulation import handheld, simulate
+from icalib.estimate.evidence.debias import spurious_information
+from icalib.estimate.evidence.evidence import fits
+from icalib.estimate.problem.outcome import Draws, Outcome, posterior
+from icalib.estimate.problem.solver import minimise
+from icalib.optim.arrowhead import Piece, solve
+from icalib.tools.simulation import handheld, simulate
 
 pytestmark = pytest.mark.slow
 

@@ -17,25 +17,25 @@ import pytest
 from scipy import sparse
 from scipy.sparse.linalg import LinearOperator
 
-import icalib.estimation
-from icalib.estimation.arrowhead import Piece, make_pieces
-from icalib.estimation.board import board_in
-from icalib.estimation.clocks import offset_at
-from icalib.estimation.corner_factor import CornerNoise
-from icalib.estimation.corner_weights import LEAST_CURVATURE
-from icalib.estimation.ground_factor import GroundFactor
-from icalib.estimation.imu_factor import ROWS, ImuFactor
-from icalib.estimation.lidar_binning import LidarNoise
-from icalib.estimation.lidar_sweep import Motion
-from icalib.estimation.pose_factor import AbsolutePoseFactor, PoseNoise, RelativePosesFactor, frame_of
-from icalib.estimation.poses import poses_at
-from icalib.estimation.prior_factor import FIRST_BIAS_SIGMA, Prior, accumulate_bias_prior
-from icalib.estimation.state import NODE, State, make_layout
-from icalib.estimation.wheel_factor import IncrementFactor, RelativePoseFactor, WheelNoise
+import icalib.estimate
+from icalib.data.measurements import PoseStream
 from icalib.geometry import so3
 from icalib.geometry.planes import plane_of
-from icalib.measurements import PoseStream
+from icalib.motion.clocks import offset_at
+from icalib.motion.poses import poses_at
+from icalib.motion.sweep import Motion
+from icalib.optim.arrowhead import Piece, make_pieces
+from icalib.optim.prior_factor import FIRST_BIAS_SIGMA, Prior, accumulate_bias_prior
+from icalib.optim.robust_weights import LEAST_CURVATURE
+from icalib.optim.state import NODE, State, make_layout
 from icalib.rig import Ground
+from icalib.sensors.camera.board import board_in
+from icalib.sensors.camera.corner_factor import CornerNoise
+from icalib.sensors.imu.residual import ROWS, ImuFactor
+from icalib.sensors.lidar.lidar_binning import LidarNoise
+from icalib.sensors.pose.residual import AbsolutePoseFactor, PoseNoise, RelativePosesFactor, frame_of
+from icalib.sensors.wheels.ground_factor import GroundFactor
+from icalib.sensors.wheels.residual import IncrementFactor, RelativePoseFactor, WheelNoise
 
 
 @dataclass(frozen=True)
@@ -668,9 +668,9 @@ SAMPLES = {
 def factors_in_the_source():
     """Whatever adds to the normal equations: classes with `accumulate`, functions named so, of modules *_factor."""
     found = set()
-    for module in pkgutil.iter_modules(icalib.estimation.__path__):
+    for module in pkgutil.iter_modules(icalib.estimate.__path__):
         if module.name.endswith("_factor"):
-            name = f"icalib.estimation.{module.name}"
+            name = f"icalib.estimate.{module.name}"
             for key, thing in vars(importlib.import_module(name)).items():
                 own = getattr(thing, "__module__", None) == name
                 if own and (hasattr(thing, "accumulate") or (key.startswith("accumulate") and callable(thing))):

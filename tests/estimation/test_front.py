@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from icalib.estimation.arrowhead import NotDefiniteError, Piece, make_pieces, marginalise, solve
-from icalib.estimation.front import Features
-from icalib.estimation.front_plan import SIZES, FeatureSums, plan
-from icalib.estimation.state import NODE
+from icalib.optim.arrowhead import NotDefiniteError, Piece, make_pieces, marginalise, solve
+from icalib.optim.front import Features
+from icalib.optim.front_plan import SIZES, FeatureSums, plan
+from icalib.optim.state import NODE
 
 
 def random_images(n, per_node, by_next, rng):

@@ -8,19 +8,19 @@ from functools import partial
 import numpy as np
 import pytest
 
-from icalib.estimation import estimate as estimates
-from icalib.estimation import solver
-from icalib.estimation.arrowhead import solve
-from icalib.estimation.assembly import given_priors
-from icalib.estimation.estimate import Estimate, Judged, estimate
-from icalib.estimation.guess_priors import guess_priors, guess_sigma
-from icalib.estimation.inputs import Inputs
-from icalib.estimation.solver import _Descent
-from icalib.estimation.state import State
-from icalib.estimation.tolerances import FROM_NOTHING_M, GUESS_SIGMA
-from icalib.first_guess.start import start
+from icalib.estimate import estimate as estimates
+from icalib.estimate.estimate import Estimate, Judged, estimate
+from icalib.estimate.problem import solver
+from icalib.estimate.problem.assembly import given_priors
+from icalib.estimate.problem.guess_priors import guess_priors, guess_sigma
+from icalib.estimate.problem.inputs import Inputs
+from icalib.estimate.problem.solver import _Descent
+from icalib.estimate.problem.tolerances import FROM_NOTHING_M, GUESS_SIGMA
+from icalib.initialize.start import start
+from icalib.optim.arrowhead import solve
+from icalib.optim.state import State
 from icalib.rig import Parameter
-from icalib.simulation import handheld, rig_for, simulate
+from icalib.tools.simulation import handheld, rig_for, simulate
 
 TURNED = {("cam0", "translation"): np.array([0.05, -0.02, 0.03]), ("cam1", "time_offset"): np.array([2e-3])}
 

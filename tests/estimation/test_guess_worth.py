@@ -8,9 +8,16 @@ import numpy as np
 import pytest
 
 from icalib.errors import EstimationError
-from icalib.estimation import guess_worth
-from icalib.estimation.guess_worth import TOGETHER, astray, in_proportion, moved_to_guess, moved_to_worth, owed_to_guess
-from icalib.estimation.state import State, make_layout
+from icalib.observability import guess_worth
+from icalib.observability.guess_worth import (
+    TOGETHER,
+    astray,
+    in_proportion,
+    moved_to_guess,
+    moved_to_worth,
+    owed_to_guess,
+)
+from icalib.optim.state import State, make_layout
 
 TOLERANCE = {"translation": 5e-3, "time_offset": 1e-3}
 SIGMA = {"translation": np.array([0.1, 0.2, 0.06]), "time_offset": np.array([0.02])}

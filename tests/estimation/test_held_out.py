@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from tests.estimation.test_arrowhead import random_pieces
 
-from icalib.estimation.arrowhead import NODE, given_border
-from icalib.estimation.evidence import chi2_by_kind
-from icalib.estimation.held_out import Half, excess, halves_of, predict, shifts
-from icalib.estimation.parts import FEWEST_NODES, Parts
-from icalib.estimation.prior_factor import Prior
-from icalib.estimation.solver import minimise
-from icalib.simulation import handheld, simulate
+from icalib.estimate.evidence.evidence import chi2_by_kind
+from icalib.estimate.evidence.held_out import Half, excess, halves_of, predict, shifts
+from icalib.estimate.evidence.parts import FEWEST_NODES, Parts
+from icalib.estimate.problem.solver import minimise
+from icalib.optim.arrowhead import NODE, given_border
+from icalib.optim.prior_factor import Prior
+from icalib.tools.simulation import handheld, simulate
 
 NO_PRIOR = np.zeros((3, 3)), np.zeros(3)
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icalib.estimation.assembly import host_times, image_times, nodes_for
-from icalib.estimation.inputs import inputs_for
-from icalib.simulation import load_scenario, rig_for, simulate
+from icalib.estimate.problem.assembly import host_times, image_times, nodes_for
+from icalib.estimate.problem.inputs import inputs_for
+from icalib.tools.simulation import load_scenario, rig_for, simulate
 
 SCENARIO = Path(__file__).parents[2] / "examples" / "paper" / "table2-3d.yaml"
 

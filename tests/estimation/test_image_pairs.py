@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.assessment.notes import late_words
-from icalib.estimation.corner_factor import CornerFactor, CornerNoise, CornerOutput
-from icalib.estimation.image_pairs import not_simultaneous
 from icalib.rig import Settings
+from icalib.sensors.camera.corner_factor import CornerFactor, CornerNoise, CornerOutput
+from icalib.sensors.camera.image_pairs import not_simultaneous
+from icalib.validation.notes import late_words
 
 NOISE_PX = 0.1
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.estimation.imu_data import GAP, ImuData
-from icalib.measurements import ImuStream
+from icalib.data.measurements import ImuStream
+from icalib.motion.imu_data import GAP, ImuData
 from icalib.rig import ImuNoise
 
 DENSITY = 1e-3  # rad/s/sqrt(Hz)

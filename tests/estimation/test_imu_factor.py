@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.estimation.arrowhead import make_pieces
-from icalib.estimation.imu_factor import ROWS, ImuFactor
-from icalib.estimation.integration import Increment, correction, integrate, readings_of
+from icalib.motion.integration import Increment, correction, integrate, readings_of
+from icalib.optim.arrowhead import make_pieces
+from icalib.sensors.imu.residual import ROWS, ImuFactor
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 

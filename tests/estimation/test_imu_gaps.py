@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from icalib.estimation.imu_data import ImuData
-from icalib.imu_classes import class_noise
-from icalib.measurements import ImuStream
+from icalib.data.measurements import ImuStream
+from icalib.motion.imu_data import ImuData
+from icalib.rig.imu_classes import class_noise
 
 
 def gaps(seconds: np.ndarray) -> int:

@@ -5,9 +5,9 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from icalib.estimation.from_nodes import in_order_of_nodes, integrate_from_node, nothing_carried
-from icalib.estimation.integration import Increment, Readings, correction, integrate
 from icalib.geometry import so3
+from icalib.motion.from_nodes import in_order_of_nodes, integrate_from_node, nothing_carried
+from icalib.motion.integration import Increment, Readings, correction, integrate
 
 BIAS = np.array([0.01, -0.02, 0.03, 0.1, -0.2, 0.15])
 INTRINSICS = np.random.default_rng(5).normal(size=24) * np.repeat([0.01, 0.01, 0.02, 2e-3], [6, 6, 3, 9])

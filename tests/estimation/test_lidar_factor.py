@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from icalib.errors import EstimationError
-from icalib.estimation.arrowhead import make_pieces
-from icalib.estimation.lidar_binning import Associated, LidarNoise, in_world, take_moments
-from icalib.estimation.poses import Poses, assign_nodes, poses_at
-from icalib.estimation.sensors import chi2 as weighted_squares
-from icalib.estimation.state import NODE
 from icalib.geometry.planes import moved
-from icalib.simulation import simulate
+from icalib.motion.factor import chi2 as weighted_squares
+from icalib.motion.poses import Poses, assign_nodes, poses_at
+from icalib.optim.arrowhead import make_pieces
+from icalib.optim.state import NODE
+from icalib.sensors.lidar.lidar_binning import Associated, LidarNoise, in_world, take_moments
+from icalib.tools.simulation import simulate
 
 
 def moments_of(setup, noise=None, state=None, stream=None, plane=None, bin_s=1e-3):

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from icalib.detection.planes import PlaneSearch, find_planes
-from icalib.estimation.lidar_binning import BIN_S, LidarNoise, in_world
-from icalib.estimation.solver import minimise
-from icalib.estimation.state import make_layout
+from icalib.detection.planes.planes import PlaneSearch, find_planes
+from icalib.estimate.problem.solver import minimise
 from icalib.geometry import so3
-from icalib.simulation import simulate
+from icalib.optim.state import make_layout
+from icalib.sensors.lidar.lidar_binning import BIN_S, LidarNoise, in_world
+from icalib.tools.simulation import simulate
 
 pytestmark = pytest.mark.slow
 

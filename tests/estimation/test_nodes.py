@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from icalib.estimation.imu_data import ImuData
-from icalib.estimation.nodes import place_nodes, usable
-from icalib.measurements import ImuStream
+from icalib.data.measurements import ImuStream
+from icalib.motion.imu_data import ImuData
+from icalib.motion.nodes import place_nodes, usable
 from icalib.rig import ImuNoise
 
 

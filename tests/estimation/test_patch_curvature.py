@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from icalib.estimation.patch_curvature import with_curved_patches
+from icalib.data.measurements import TrackStream
 from icalib.geometry.cameras import camera_model
-from icalib.measurements import TrackStream
+from icalib.sensors.camera.features.patch_curvature import with_curved_patches
 
 LENSES = {
     "pinhole-radtan": [458.7, 457.3, 367.2, 248.4, -0.283, 0.074, 2e-4, 2e-5],

@@ -8,22 +8,28 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icalib.estimation.assembly import assemble
-from icalib.estimation.bodies import Bodies
-from icalib.estimation.border import restricted_inverse
-from icalib.estimation.corner_noise import first_noise
-from icalib.estimation.estimate import estimate
-from icalib.estimation.feature_noise import first_following
-from icalib.estimation.outcome import Outcome
-from icalib.estimation.places import Clusters, _cluster_gradients, _image_cells, _tag_corners, cluster_covariances
-from icalib.estimation.problem import Problem
-from icalib.estimation.solver import minimise
-from icalib.first_guess.start import start
+from icalib.data.measurements import Measurements, TrackStream
+from icalib.estimate.estimate import estimate
+from icalib.estimate.evidence.corner_noise import first_noise
+from icalib.estimate.evidence.feature_noise import first_following
+from icalib.estimate.evidence.places import (
+    Clusters,
+    _cluster_gradients,
+    _image_cells,
+    _tag_corners,
+    cluster_covariances,
+)
+from icalib.estimate.problem.assembly import assemble
+from icalib.estimate.problem.outcome import Outcome
+from icalib.estimate.problem.problem import Problem
+from icalib.estimate.problem.solver import minimise
 from icalib.geometry.targets import AprilGrid, Checkerboard, Scene
-from icalib.measurements import Measurements, TrackStream
+from icalib.initialize.start import start
+from icalib.optim.border import restricted_inverse
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Rig
-from icalib.simulation import Scenario, load_scenario, rig_for, simulate, with_drawn_guess
+from icalib.sensors.camera.bodies import Bodies
+from icalib.tools.simulation import Scenario, load_scenario, rig_for, simulate, with_drawn_guess
 
 pytestmark = pytest.mark.slow
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.estimation.arrowhead import make_pieces
-from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput
-from icalib.estimation.feature_kernels import FARTHEST_M
-from icalib.simulation import handheld, simulate
+from icalib.optim.arrowhead import make_pieces
+from icalib.sensors.camera.features.feature_factor import FeatureFactor, FeatureOutput
+from icalib.sensors.camera.features.feature_kernels import FARTHEST_M
+from icalib.tools.simulation import handheld, simulate
 
 
 @pytest.fixture(scope="module")

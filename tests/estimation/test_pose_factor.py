@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.estimation.arrowhead import make_pieces
-from icalib.estimation.assembly import motion_of
-from icalib.estimation.inputs import inputs_for
-from icalib.estimation.pose_factor import FRAME, PoseNoise, frame_of
-from icalib.estimation.pose_rows import Frame, Mount, absolute_rows, relative_rows
-from icalib.estimation.robot import next_posing, pose_factor
-from icalib.estimation.state import State
-from icalib.measurements import PoseStream
+from icalib.data.measurements import PoseStream
+from icalib.estimate.problem.assembly import motion_of
+from icalib.estimate.problem.inputs import inputs_for
+from icalib.motion.pose_rows import Frame, Mount, absolute_rows, relative_rows
+from icalib.optim.arrowhead import make_pieces
+from icalib.optim.state import State
 from icalib.rig import PoseSensor
-from icalib.simulation import Drive, Room, Scenario, SimPoses, rig_for, simulate
+from icalib.sensors.pose.residual import FRAME, PoseNoise, frame_of
+from icalib.sensors.robot import next_posing, pose_factor
+from icalib.tools.simulation import Drive, Room, Scenario, SimPoses, rig_for, simulate
 
 
 def pose(vector, position):

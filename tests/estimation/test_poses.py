@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from icalib.estimation.poses import assign_nodes, motion_at, poses_at
-from icalib.estimation.state import NODE
 from icalib.geometry import so3
+from icalib.motion.poses import assign_nodes, motion_at, poses_at
+from icalib.optim.state import NODE
 
 SCHEMES = ("inertial", "kinematic", "pose")
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from icalib.errors import EstimationError
-from icalib.estimation import solver
-from icalib.estimation.arrowhead import THREADS, solve
-from icalib.estimation.solver import minimise
+from icalib.estimate.problem import solver
+from icalib.estimate.problem.solver import minimise
 from icalib.geometry import so3
+from icalib.optim.arrowhead import THREADS, solve
 from icalib.pipeline import calibrate_measurements
-from icalib.simulation import handheld, rig_for, simulate
+from icalib.tools.simulation import handheld, rig_for, simulate
 
 pytestmark = pytest.mark.slow
 

@@ -7,23 +7,23 @@ import dataclasses
 import numpy as np
 import pytest
 
+from icalib.data.joining import PAUSE_NS, join
+from icalib.data.measurements import Measurements
+from icalib.data.recordings.several import naming, open_all
 from icalib.errors import RecordingError
-from icalib.estimation.assembly import assemble
-from icalib.estimation.corner_noise import NoiseModel
-from icalib.estimation.imu_factor import ImuFactor
-from icalib.estimation.inputs import inputs_for
-from icalib.estimation.nodes import first_nodes, place_nodes, usable
-from icalib.estimation.parts import segment_ends
-from icalib.estimation.state import NODE, State
-from icalib.first_guess.several import initial_guesses
-from icalib.first_guess.start import first_state
+from icalib.estimate.evidence.corner_noise import NoiseModel
+from icalib.estimate.evidence.parts import segment_ends
+from icalib.estimate.problem.assembly import assemble
+from icalib.estimate.problem.inputs import inputs_for
 from icalib.geometry import so3
-from icalib.joining import PAUSE_NS, join
-from icalib.measurements import Measurements
-from icalib.parameter import fixed
-from icalib.recordings.several import naming, open_all
+from icalib.initialize.several import initial_guesses
+from icalib.initialize.start import first_state
+from icalib.motion.nodes import first_nodes, place_nodes, usable
+from icalib.optim.state import NODE, State
 from icalib.rig import Rig
-from icalib.simulation import handheld, rig_for, simulate
+from icalib.rig.parameter import fixed
+from icalib.sensors.imu.residual import ImuFactor
+from icalib.tools.simulation import handheld, rig_for, simulate
 
 DAY_NS = 86_400 * 10**9
 

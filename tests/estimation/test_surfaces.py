@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.estimation.arrowhead import make_pieces
-from icalib.estimation.robot import Clouds
-from icalib.estimation.surfaces import CELL_M, PATCH_M, REACH_M, Surfaces, most_alike
-from icalib.simulation import handheld, simulate
+from icalib.optim.arrowhead import make_pieces
+from icalib.sensors.camera.features.surfaces import CELL_M, PATCH_M, REACH_M, Surfaces, most_alike
+from icalib.sensors.robot import Clouds
+from icalib.tools.simulation import handheld, simulate
 
 NOISE = 0.01
 CERTAIN = np.eye(3) * 1e6  # information: to a millimetre

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.estimation.state import make_layout
 from icalib.geometry.planes import moved_and_turned, tangents
-from icalib.simulation import simulate
+from icalib.optim.state import make_layout
+from icalib.tools.simulation import simulate
 
 TURN = np.array([0.2, -0.15, 0.1])  # rad, in world axes
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from icalib.estimation.anderson import Accelerator
-from icalib.estimation.arrowhead import make_pieces
-from icalib.estimation.border import NOTHING
-from icalib.estimation.solver import minimise
-from icalib.estimation.state import State, make_layout
+from icalib.estimate.problem.solver import minimise
+from icalib.optim.anderson import Accelerator
+from icalib.optim.arrowhead import make_pieces
+from icalib.optim.border import NOTHING
+from icalib.optim.state import State, make_layout
 
 KEY = ("sensor", "value")
 FAR, WEAK, STEEP, LARGE = 10.0, 1e-3, 1e3, 100.0

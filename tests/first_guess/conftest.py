@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icalib.estimation.imu_data import ImuData
-from icalib.estimation.state import State
-from icalib.first_guess.lidar import LidarGuess
+from icalib.data.measurements import LidarStream
 from icalib.geometry import so3
-from icalib.measurements import LidarStream
-from icalib.simulation import Simulation, load_scenario, simulate
+from icalib.initialize.lidar.lidar import LidarGuess
+from icalib.motion.imu_data import ImuData
+from icalib.optim.state import State
+from icalib.tools.simulation import Simulation, load_scenario, simulate
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
 

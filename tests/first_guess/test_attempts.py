@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import pytest
 
 from icalib.errors import EstimationError
-from icalib.estimation.arrowhead import BROKEN_DOWN, NotDefiniteError
-from icalib.first_guess.attempts import explained
+from icalib.initialize.attempts import explained
+from icalib.optim.arrowhead import BROKEN_DOWN, NotDefiniteError
 from icalib.rig import Camera, ImuNoise, ImuSensor, PoseSensor, Rig
 
 RELATIVE = Rig(ImuSensor("imu0", "", ImuNoise(1e-4, 1e-5, 1e-3, 1e-4)), (), poses=(PoseSensor("odom", "", "relative"),))

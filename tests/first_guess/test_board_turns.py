@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.first_guess.board_turns import number_alike
-from icalib.first_guess.start import start
+from icalib.data.measurements import CornerStream, Measurements
 from icalib.geometry import so3
 from icalib.geometry.targets import Checkerboard, Circles, Target
-from icalib.measurements import CornerStream, Measurements
+from icalib.initialize.boards.board_turns import number_alike
+from icalib.initialize.start import start
 from icalib.rig import Rig
-from icalib.simulation import Motion, Simulation, handheld, rig_for, simulate
+from icalib.tools.simulation import Motion, Simulation, handheld, rig_for, simulate
 
 pytestmark = pytest.mark.slow
 

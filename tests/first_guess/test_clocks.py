@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from icalib.data.measurements import ImuStream
 from icalib.errors import EstimationError
-from icalib.estimation.imu_data import ImuData
-from icalib.first_guess.clock_shifts import CameraRates
-from icalib.first_guess.clocks import align
-from icalib.measurements import ImuStream
+from icalib.initialize.steps.clock_shifts import CameraRates
+from icalib.initialize.steps.clocks import align
+from icalib.motion.imu_data import ImuData
 from icalib.rig import ImuNoise
-from icalib.simulation.imu import rotation_from_vector
+from icalib.tools.simulation.sensors.imu import rotation_from_vector
 
 R_IMU_CAM = rotation_from_vector(np.array([0.4, -1.1, 0.7]))
 OFFSET = 0.04

@@ -7,14 +7,14 @@ import dataclasses
 import numpy as np
 import pytest
 
+from icalib.data.measurements import CornerStream, ImuStream, Measurements
 from icalib.errors import EstimationError
-from icalib.first_guess import initial_guess, initial_trajectory
-from icalib.first_guess.intrinsics import guess_intrinsics
-from icalib.first_guess.target_poses import Flat, target_poses
 from icalib.geometry.cameras import camera_model
-from icalib.measurements import CornerStream, ImuStream, Measurements
+from icalib.initialize import initial_guess, initial_trajectory
+from icalib.initialize.boards.intrinsics import guess_intrinsics
+from icalib.initialize.steps.target_poses import Flat, target_poses
 from icalib.rig import Parameter, Rig
-from icalib.simulation import Motion, Simulation, handheld, rig_for, simulate
+from icalib.tools.simulation import Motion, Simulation, handheld, rig_for, simulate
 
 pytestmark = pytest.mark.slow
 

@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from icalib.data.checks.imu_units import in_si
+from icalib.data.measurements import ImuStream
 from icalib.errors import EstimationError
-from icalib.first_guess import initial_guess
-from icalib.measurements import ImuStream
-from icalib.recordings.imu_units import in_si
+from icalib.initialize import initial_guess
 from icalib.rig import Axes, ImuSensor, Rig
-from icalib.simulation import handheld, rig_for, simulate
+from icalib.tools.simulation import handheld, rig_for, simulate
 
 pytestmark = pytest.mark.slow
 

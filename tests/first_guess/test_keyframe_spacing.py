@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.first_guess.keyframe_spacing import LEAST_S, keyframe_spacing, pose_noise
-from icalib.first_guess.smooth_path import smooth_path
+from icalib.data.measurements import Measurements, PoseStream, WheelStream
 from icalib.geometry import so3
-from icalib.measurements import Measurements, PoseStream, WheelStream
+from icalib.initialize.steps.keyframe_spacing import LEAST_S, keyframe_spacing, pose_noise
+from icalib.initialize.steps.smooth_path import smooth_path
 from icalib.rig import PoseSensor, Rig, Settings, Wheels
 
 TURN, WAY = 2e-3, 1e-3

@@ -9,8 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from icalib.errors import EstimationError
-from icalib.first_guess.lidar import Held, lidar_and_motion, lidar_on_motion
 from icalib.geometry import so3
+from icalib.initialize.lidar.lidar import lidar_and_motion, lidar_on_motion
+from icalib.initialize.steps.by_recording import Held
 
 pytestmark = pytest.mark.slow
 

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.first_guess.lidar import LidarGuess
-from icalib.first_guess.start import start
 from icalib.geometry import so3
-from icalib.parameter import Mode, Parameter
-from icalib.simulation import rig_for
+from icalib.initialize.lidar.lidar import LidarGuess
+from icalib.initialize.start import start
+from icalib.rig.parameter import Mode, Parameter
+from icalib.tools.simulation import rig_for
 
 TURN_RAD, LATE_S = 0.15, 0.03
 AWAY = so3.exp(np.array([0.0, TURN_RAD, 0.0]))

@@ -9,13 +9,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from icalib.errors import EstimationError
-from icalib.first_guess import lidar_odometry
-from icalib.first_guess.gyro import GyroRotation
-from icalib.first_guess.lidar_arm import against_motion, against_readings
-from icalib.first_guess.lidar_map import ScanPose, VoxelMap, insert, moved, sums
-from icalib.first_guess.lidar_motion import ImuMotion, Integrals
-from icalib.first_guess.lidar_odometry import lidar_path, scans_of
-from icalib.first_guess.lidar_registration import (
+from icalib.geometry import so3
+from icalib.initialize.lidar import lidar_odometry
+from icalib.initialize.lidar.lidar_arm import against_motion, against_readings
+from icalib.initialize.lidar.lidar_map import ScanPose, VoxelMap, insert, moved, sums
+from icalib.initialize.lidar.lidar_motion import ImuMotion, Integrals
+from icalib.initialize.lidar.lidar_odometry import lidar_path, scans_of
+from icalib.initialize.lidar.lidar_registration import (
     ACCELERATION,
     ANGULAR_ACCELERATION,
     GYRO_SIGMA,
@@ -28,7 +28,7 @@ from icalib.first_guess.lidar_registration import (
     add_expected,
     expected_pose,
 )
-from icalib.geometry import so3
+from icalib.initialize.steps.gyro import GyroRotation
 
 SCALE = 0.3
 

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 
 from icalib.errors import EstimationError
-from icalib.estimation.imu_factor import ImuFactor
-from icalib.estimation.lidar_binning import LidarNoise
-from icalib.estimation.lidar_factor import LidarFactor
-from icalib.estimation.lidar_sweep import Motion
-from icalib.estimation.nodes import place_nodes
-from icalib.estimation.problem import Problem
-from icalib.estimation.solver import minimise
-from icalib.estimation.state import State, make_layout
-from icalib.estimation.tolerances import Tolerances
-from icalib.first_guess.lidar import LidarGuess, lidar_and_motion, lidar_on_motion
-from icalib.first_guess.lidar_planes import ROUNDS, associate, round_search
-from icalib.first_guess.lidar_rounds import check_shares
+from icalib.estimate.problem.problem import Problem
+from icalib.estimate.problem.solver import minimise
+from icalib.estimate.problem.tolerances import Tolerances
+from icalib.initialize.lidar.lidar import LidarGuess, lidar_and_motion, lidar_on_motion
+from icalib.initialize.lidar.lidar_planes import ROUNDS, associate, round_search
+from icalib.initialize.lidar.lidar_rounds import check_shares
+from icalib.motion.nodes import place_nodes
+from icalib.motion.sweep import Motion
+from icalib.optim.state import State, make_layout
+from icalib.sensors.imu.residual import ImuFactor
+from icalib.sensors.lidar.lidar_binning import LidarNoise
+from icalib.sensors.lidar.residual import LidarFactor
 
 pytestmark = pytest.mark.slow
 

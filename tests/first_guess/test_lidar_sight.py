@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from icalib.data.measurements import LidarStream
 from icalib.errors import EstimationError
-from icalib.first_guess.lidar_odometry import lidar_path, scans_of
-from icalib.first_guess.lidar_sight import count_of, directions, facing, naming_sight
-from icalib.measurements import LidarStream
+from icalib.initialize.lidar.lidar_odometry import lidar_path, scans_of
+from icalib.initialize.lidar.lidar_sight import count_of, directions, facing, naming_sight
 
 
 def seeing(stream: LidarStream, faces: list[int]) -> LidarStream:

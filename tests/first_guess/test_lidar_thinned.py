@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.estimation.robot import Clouds
-from icalib.first_guess import lidar_planes, lidar_rounds
-from icalib.first_guess.lidar_planes import Association, odd_step
-from icalib.first_guess.lidar_rounds import _firsts, _of_all
-from icalib.measurements import LidarStream, Measurements
+from icalib.data.measurements import LidarStream, Measurements
+from icalib.initialize.lidar import lidar_planes, lidar_rounds
+from icalib.initialize.lidar.lidar_planes import Association, odd_step
+from icalib.initialize.lidar.lidar_rounds import _firsts, _of_all
 from icalib.pipeline import calibrate_measurements
-from icalib.simulation import rig_for
+from icalib.sensors.robot import Clouds
+from icalib.tools.simulation import rig_for
 
 pytestmark = pytest.mark.slow
 

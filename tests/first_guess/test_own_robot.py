@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.first_guess import own_robot
-from icalib.first_guess.own_robot import _Near, own_points, without_own_robot
-from icalib.measurements import LidarStream, Measurements
+from icalib.data.measurements import LidarStream, Measurements
+from icalib.initialize import own_robot
+from icalib.initialize.own_robot import _Near, own_points, without_own_robot
 
 pytestmark = pytest.mark.slow
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from icalib.data.measurements import PoseStream
 from icalib.errors import EstimationError
-from icalib.estimation.inputs import inputs_for
-from icalib.estimation.state import State
-from icalib.first_guess.poses import pose_values, state_from_poses
-from icalib.measurements import PoseStream
-from icalib.simulation import Drive, Room, Scenario, SimPoses, rig_for, simulate
+from icalib.estimate.problem.inputs import inputs_for
+from icalib.initialize.poses.poses import pose_values, state_from_poses
+from icalib.optim.state import State
+from icalib.tools.simulation import Drive, Room, Scenario, SimPoses, rig_for, simulate
 
 pytestmark = pytest.mark.slow
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.estimation.inputs import inputs_for
-from icalib.estimation.pose_factor import FRAME, frame_of
-from icalib.estimation.state import State
-from icalib.first_guess.poses import pose_rates, pose_values, state_from_poses
-from icalib.parameter import Parameter, fixed
-from icalib.simulation import Drive, Room, Scenario, SimPoses, rig_for, simulate
+from icalib.estimate.problem.inputs import inputs_for
+from icalib.initialize.poses.poses import pose_rates, pose_values, state_from_poses
+from icalib.optim.state import State
+from icalib.rig.parameter import Parameter, fixed
+from icalib.sensors.pose.residual import FRAME, frame_of
+from icalib.tools.simulation import Drive, Room, Scenario, SimPoses, rig_for, simulate
 
 # Twice the worst of five seeds: rotation [deg], translation [m], time offset [s].
 ALONE = {"absolute": (0.16, 8e-3, 6e-4), "relative": (0.8, 0.08, 5e-3)}

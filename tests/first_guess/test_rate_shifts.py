@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.estimation.imu_data import ImuData
-from icalib.first_guess.clock_shifts import CameraRates
-from icalib.first_guess.rate_shifts import LEAST_SCORE, best_regressions, unlike
-from icalib.measurements import ImuStream
+from icalib.data.measurements import ImuStream
+from icalib.initialize.steps.clock_shifts import CameraRates
+from icalib.initialize.steps.rate_shifts import LEAST_SCORE, best_regressions, unlike
+from icalib.motion.imu_data import ImuData
 from icalib.rig import ImuNoise
-from icalib.simulation.imu import rotation_from_vector
+from icalib.tools.simulation.sensors.imu import rotation_from_vector
 
 M = rotation_from_vector(np.array([0.4, -1.1, 0.7])) @ np.diag([0.4, 0.4, 1.0])  # a lens far too long
 OFFSET = 12.3

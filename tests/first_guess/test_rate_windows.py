@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.first_guess.rate_windows import rate_window, rotation_noise, window_rates
-from icalib.first_guess.smooth_path import HALF_S, smooth_path
+from icalib.initialize.steps.rate_windows import rate_window, rotation_noise, window_rates
+from icalib.initialize.steps.smooth_path import HALF_S, smooth_path
 
 
 def turning(hz: float, noise: float, seconds: float = 20.0, seed: int = 0):

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.estimation.bodies import choose_bodies, restrict
-from icalib.estimation.corner_factor import Views
-from icalib.first_guess.scene import body_poses, scene_poses
-from icalib.first_guess.scene_growth import place_bodies
 from icalib.geometry.cameras import camera_model
-from icalib.simulation import simulate, tag_map
+from icalib.initialize.boards.scene import body_poses, scene_poses
+from icalib.initialize.boards.scene_growth import place_bodies
+from icalib.sensors.camera.bodies import choose_bodies, restrict
+from icalib.sensors.camera.corner_factor import Views
+from icalib.tools.simulation import simulate, tag_map
 
 
 @pytest.fixture(scope="module")

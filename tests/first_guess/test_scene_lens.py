@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
+from icalib.data.measurements import CornerStream, Measurements
 from icalib.errors import EstimationError
-from icalib.estimation.bodies import choose_bodies
-from icalib.first_guess.scene_lens import find_scene, is_possible, scene_params
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets import Markers
-from icalib.measurements import CornerStream, Measurements
+from icalib.initialize.boards.scene_lens import find_scene, is_possible, scene_params
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter
-from icalib.simulation import load_scenario, rig_for, simulate, tag_map
+from icalib.sensors.camera.bodies import choose_bodies
+from icalib.tools.simulation import load_scenario, rig_for, simulate, tag_map
 
 pytestmark = pytest.mark.slow
 

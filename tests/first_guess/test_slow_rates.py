@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from icalib.data.measurements import CornerStream, PoseStream
+from icalib.data.recordings import open_recording, read_measurements
 from icalib.errors import EstimationError
-from icalib.estimation.inputs import inputs_for
-from icalib.first_guess.clock_shifts import longest_step
-from icalib.first_guess.slow_rates import ChainedRates, slow_offsets
+from icalib.estimate.problem.inputs import inputs_for
 from icalib.geometry import so3
-from icalib.measurements import CornerStream, PoseStream
+from icalib.initialize.steps.clock_shifts import longest_step
+from icalib.initialize.steps.slow_rates import ChainedRates, slow_offsets
 from icalib.pipeline import calibrate_measurements
-from icalib.recordings import open_recording, read_measurements
 from icalib.rig import Parameter, Wheels
-from icalib.simulation import handheld, load_scenario, rig_for, simulate
-from icalib.simulation.robot import SimPoses
+from icalib.tools.simulation import handheld, load_scenario, rig_for, simulate
+from icalib.tools.simulation.scenario.robot import SimPoses
 
 ORIGIN_NS = 1_700_000_000_000_000_000  # of all clocks of the scenario
 SCENARIO = Path(__file__).parents[2] / "examples" / "paper" / "table2-3d.yaml"

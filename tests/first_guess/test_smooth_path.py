@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.first_guess.smooth_path import smooth_path
+from icalib.initialize.steps.smooth_path import smooth_path
 
 TURN = np.array([0.3, -1.2, 2.0])  # rad/s
 

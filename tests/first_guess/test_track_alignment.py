@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icalib.first_guess import from_tracks
-from icalib.first_guess.start import start
 from icalib.geometry import so3
-from icalib.simulation import load_scenario, rig_for, simulate, with_drawn_guess
+from icalib.initialize.start import start
+from icalib.initialize.tracks import from_tracks
+from icalib.tools.simulation import load_scenario, rig_for, simulate, with_drawn_guess
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "paper"
 

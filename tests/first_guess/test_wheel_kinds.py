@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from icalib.data.measurements import ImuStream
 from icalib.errors import EstimationError
-from icalib.estimation.imu_data import ImuData
-from icalib.first_guess.wheels import drive_guess, wheel_offset, wheel_rates
-from icalib.measurements import ImuStream
+from icalib.initialize.wheels.wheels import drive_guess, wheel_offset, wheel_rates
+from icalib.motion.imu_data import ImuData
 from icalib.rig import ImuNoise
 
 R_IMU_WHEEL = Rotation.from_euler("zyx", [2.2, 0.3, -0.4]).as_matrix()

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from icalib.errors import EstimationError
-from icalib.estimation.imu_data import ImuData
-from icalib.first_guess.wheel_poses import intervals_inside, mount_guess, poses_offset
 from icalib.geometry import so3
-from icalib.simulation import load_scenario, simulate
+from icalib.initialize.wheels.wheel_poses import intervals_inside, mount_guess, poses_offset
+from icalib.motion.imu_data import ImuData
+from icalib.tools.simulation import load_scenario, simulate
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from icalib.data.measurements import ImuStream
 from icalib.errors import EstimationError
-from icalib.estimation.imu_data import ImuData
-from icalib.first_guess.wheels import drive_guess, wheel_offset, wheel_rates
-from icalib.measurements import ImuStream
+from icalib.initialize.wheels.wheels import drive_guess, wheel_offset, wheel_rates
+from icalib.motion.imu_data import ImuData
 from icalib.rig import ImuNoise
 
 RADII, BASELINE, LEVER = np.array([0.1, 0.12]), 0.5, np.array([-0.3, 0.12, -0.1])  # p_imu_wheel in the wheels' axes

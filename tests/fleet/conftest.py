@@ -11,14 +11,14 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from icalib.calibration import Calibration
-from icalib.fleet import run as run_module
-from icalib.fleet.one_job import Outcome, Task
-from icalib.fleet.record import Record
-from icalib.outputs import output_files
+from icalib.export.outputs import output_files
 from icalib.pipeline import calibrate
-from icalib.rig_file import rig_to_dict
-from icalib.simulation import Scenario, handheld, rig_for, simulate, write_tables
+from icalib.result import Calibration
+from icalib.rig.file import rig_to_dict
+from icalib.tools.fleet import run as run_module
+from icalib.tools.fleet.one_job import Outcome, Task
+from icalib.tools.fleet.record import Record
+from icalib.tools.simulation import Scenario, handheld, rig_for, simulate, write_tables
 
 # Of cam1 about its x axis: ten times the standard deviation of the difference of two calibrations from 6 s.
 TURN = 10.0 * np.sqrt(2.0) * 1.03e-4

@@ -12,9 +12,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
-from icalib.calibration import Calibration, Verdict
 from icalib.errors import CalibrationError
-from icalib.fleet.drift import Drift, by_chance, drift_of
+from icalib.result import Calibration, Verdict
+from icalib.tools.fleet.drift import Drift, by_chance, drift_of
 
 
 def drift(calibrations: list[Calibration], limit: float = 3.0) -> Drift:
@@ -113,7 +113,7 @@ def test_chance_is_that_of_a_normal_deviate():
 
 
 def test_results_on_disk_give_the_same(results: dict[str, Calibration], tmp_path: Path):
-    from icalib.calibration import load_calibration
+    from icalib.result import load_calibration
 
     for name in ("r0", "turned"):
         results[name].save(tmp_path / name)

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.fleet.figures import over_time, sensors
-from icalib.fleet.jobs import Job
-from icalib.fleet.record import Block, Record
-from icalib.fleet.result import JobResult
+from icalib.tools.fleet.figures import over_time, sensors
+from icalib.tools.fleet.jobs import Job
+from icalib.tools.fleet.record import Block, Record
+from icalib.tools.fleet.result import JobResult
 
 R0 = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
 XYZ = ("x", "y", "z")

@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icalib.calibration import load_calibration
+from icalib.base.result_files import COMMIT
 from icalib.cli import main
 from icalib.errors import CalibrationError
-from icalib.fleet import Fleet, run_fleet
-from icalib.fleet import run as run_module
-from icalib.fleet.record import from_json, to_json
-from icalib.result_files import COMMIT
+from icalib.result import load_calibration
+from icalib.tools.fleet import Fleet, run_fleet
+from icalib.tools.fleet import run as run_module
+from icalib.tools.fleet.record import from_json, to_json
 
 NAMES = ["anton-r0", "anton-turned", "berta-r0", "berta-r1"]
 BAD = "  - {robot: berta, recording: bad, time: 2026-10-09}\n"
@@ -87,7 +87,7 @@ def test_changed_inputs_do_a_job_again_and_say_so(fleet_folder: Path, workshop, 
         file.write("# by hand\n")
     assert fleet(fleet_folder).again == dict.fromkeys(NAMES, "the rig file changed")
     for module in ("inputs", "store"):
-        monkeypatch.setattr(f"icalib.fleet.{module}.program", lambda: "another")
+        monkeypatch.setattr(f"icalib.tools.fleet.{module}.program", lambda: "another")
     assert fleet(fleet_folder).again == dict.fromkeys(NAMES, "icalib changed")
     assert len(workshop.done) == 4 + 1 + 1 + 4 + 4 and fleet(fleet_folder).again == {}
 
@@ -185,7 +185,7 @@ def test_interrupted_it_says_what_is_there(fleet_folder: Path, workshop, capsys)
 def test_a_job_that_killed_its_workers_is_reported_and_tried_again_the_next_time(
     fleet_folder: Path, workshop, monkeypatch
 ):
-    from icalib.batch import Lost
+    from icalib.tools.batch import Lost
 
     def lose(work, tasks, crew):
         yield from ((task, Lost("its worker died again and again; give it more memory.")) for task in tasks)
@@ -197,7 +197,7 @@ def test_a_job_that_killed_its_workers_is_reported_and_tried_again_the_next_time
 
 
 def test_another_icalib_on_a_worker_is_refused(fleet_folder: Path, workshop, monkeypatch):
-    monkeypatch.setattr("icalib.fleet.inputs.program", lambda: "of the worker")
+    monkeypatch.setattr("icalib.tools.fleet.inputs.program", lambda: "of the worker")
     with pytest.raises(CalibrationError, match="a worker of the cluster runs another version of icalib"):
         fleet(fleet_folder)
 

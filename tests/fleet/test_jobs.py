@@ -9,7 +9,7 @@ import pytest
 
 from icalib.cli import main
 from icalib.errors import RigError
-from icalib.fleet import Job, load_jobs
+from icalib.tools.fleet import Job, load_jobs
 
 
 @pytest.fixture

@@ -12,17 +12,17 @@ from pathlib import Path
 import psutil
 import pytest
 
-from icalib.calibration import load_calibration
 from icalib.errors import CalibrationError
-from icalib.fleet import Crew, run_fleet
-from icalib.fleet.jobs import load_jobs
+from icalib.result import load_calibration
+from icalib.tools.fleet import Crew, run_fleet
+from icalib.tools.fleet.jobs import load_jobs
 
 pytestmark = pytest.mark.slow
 
 NAMES = ["anton-r0", "anton-turned", "berta-r0", "berta-r1"]
 _FLEET = """
 import sys
-from icalib.fleet import Crew, run_fleet
+from icalib.tools.fleet import Crew, run_fleet
 
 if __name__ == "__main__":
     run_fleet(sys.argv[1], sys.argv[2], Crew(workers=1))

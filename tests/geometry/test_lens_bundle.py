@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.geometry import lens_bundle, so3
-from icalib.geometry.cameras import camera_model
-from icalib.geometry.lens_bundle import ImagePoints, _linearised, adjust, initial_parameters
+from icalib.geometry import so3
+from icalib.geometry.cameras import camera_model, lens_bundle
+from icalib.geometry.cameras.lens_bundle import ImagePoints, _linearised, adjust, initial_parameters
 
 RADTAN = np.array([460.0, 458.0, 371.0, 245.0, -0.28, 0.07, 2e-4, -1e-4])
 NEAR = (0.14, 0.2)

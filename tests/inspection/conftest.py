@@ -12,8 +12,8 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from icalib.measurements import ImuStream
-from icalib.simulation import handheld, simulate
+from icalib.data.measurements import ImuStream
+from icalib.tools.simulation import handheld, simulate
 
 ORIGIN = 1_700_000_000_000_000_000
 S = 1_000_000_000

@@ -13,8 +13,8 @@ import pytest
 from icalib.cli import main
 from icalib.errors import CalibrationError, RigError
 from icalib.geometry.targets import AprilGrid
-from icalib.inspection.draft import write_draft
-from icalib.rig_file import load_rig, load_target
+from icalib.rig.file import load_rig, load_target
+from icalib.tools.inspection.draft import write_draft
 
 SIZE = (32, 24)
 K = (40.5, 41.5, 15.25, 11.75)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from icalib.cli import main
-from icalib.inspection import inspect_recording
-from icalib.recordings import open_recording
-from icalib.rig_file import load_rig
+from icalib.data.recordings import open_recording
+from icalib.rig.file import load_rig
+from icalib.tools.inspection import inspect_recording
 
 STEP = 20_000_000
 KIND = "tf2_msgs/msg/TFMessage"

@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.inspection import inspect_recording
-from icalib.inspection.imu import gravity_spread, imu_facts
-from icalib.measurements import ImuStream
-from icalib.simulation import handheld, simulate
+from icalib.data.measurements import ImuStream
+from icalib.tools.inspection import inspect_recording
+from icalib.tools.inspection.imu import gravity_spread, imu_facts
+from icalib.tools.simulation import handheld, simulate
 
 DEGREE = np.pi / 180.0
 

@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from icalib.data.checks.imu_checks import read_imu
+from icalib.data.measurements import ImuStream
+from icalib.data.recordings import open_recording
+from icalib.data.stamps.jumps import ClockJumps
 from icalib.errors import RecordingError
-from icalib.imu_classes import class_noise
-from icalib.inspection import inspect_recording
-from icalib.inspection.draft import draft_rig
-from icalib.measurements import ImuStream
-from icalib.recordings import open_recording
-from icalib.recordings.imu_checks import read_imu
-from icalib.recordings.jumps import ClockJumps
 from icalib.rig import ImuSensor, TwoSources
+from icalib.rig.imu_classes import class_noise
+from icalib.tools.inspection import inspect_recording
+from icalib.tools.inspection.draft import draft_rig
 
 IMU = ImuSensor("imu0", "imu0/data.csv", class_noise("consumer"))
 HALVES = TwoSources("/d435/gyro/sample", "/d435/accel/sample")

@@ -14,16 +14,16 @@ import pytest
 from rich.console import Console
 
 from icalib.cli import main
+from icalib.data.measurements import CornerStream
+from icalib.data.recordings import TopicInfo
 from icalib.geometry.targets import AprilGrid, Markers
-from icalib.inspection import Inspection, inspect_recording, read_target
-from icalib.inspection.console import print_inspection
-from icalib.inspection.facts import CameraSource
-from icalib.inspection.findings import empty_borders, findings
-from icalib.inspection.views import coverage, target_view
-from icalib.measurements import CornerStream
-from icalib.recordings import TopicInfo
-from icalib.simulation import Imaging, Renderer, Sheet
-from icalib.simulation.scenario import SimCamera
+from icalib.tools.inspection import Inspection, inspect_recording, read_target
+from icalib.tools.inspection.console import print_inspection
+from icalib.tools.inspection.facts import CameraSource
+from icalib.tools.inspection.findings import empty_borders, findings
+from icalib.tools.inspection.views import coverage, target_view
+from icalib.tools.simulation import Imaging, Renderer, Sheet
+from icalib.tools.simulation.scenario.scenario import SimCamera
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "euroc"
 SIZE = (320, 240)

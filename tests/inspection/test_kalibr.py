@@ -12,7 +12,7 @@ import yaml
 from icalib.export import kalibr as export
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets import AprilGrid, Checkerboard
-from icalib.inspection.kalibr import MODELS, find_kalibr_files
+from icalib.tools.inspection.kalibr import MODELS, find_kalibr_files
 
 CAMCHAIN = """\
 cam0:

@@ -11,9 +11,9 @@ import pytest
 
 from icalib.cli import main
 from icalib.errors import CalibrationError
-from icalib.inspection import draft_rig, inspect_recording
 from icalib.rig import Rig
-from icalib.rig_file import load_rig
+from icalib.rig.file import load_rig
+from icalib.tools.inspection import draft_rig, inspect_recording
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
 POSE = "  {name}: {{type: pose, rate: 50, T_imu_sensor: {T}, rotation_noise: 0.002, position_noise: 0.001}}\n"

@@ -6,9 +6,9 @@ import re
 
 import pytest
 
-from icalib.inspection.sources import find_sources
-from icalib.recordings import TopicInfo
-from icalib.recordings.topics import KINDS
+from icalib.data.images.topics import KINDS
+from icalib.data.recordings import TopicInfo
+from icalib.tools.inspection.sources import find_sources
 
 
 def topics(*names: str) -> list[TopicInfo]:

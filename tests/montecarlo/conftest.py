@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.montecarlo.record import Block, Record, Size, Waypoint, Whiteness
+from icalib.tools.montecarlo.record import Block, Record, Size, Waypoint, Whiteness
 
 BLOCKS = (
     Block("cam0", "rotation", ("x", "y", "z"), "rad", ("determined",) * 3),

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.calibration import Calibration, CornerResiduals, LidarResiduals, Visited, WheelResiduals
+from icalib.data.measurements import Measurements
 from icalib.errors import RecordingError
-from icalib.measurements import Measurements
-from icalib.montecarlo import one_run
-from icalib.montecarlo.one_run import PlanesKind, Task, compare, run
-from icalib.montecarlo.record import Record
-from icalib.montecarlo.truth import error, true_value
-from icalib.montecarlo.whiteness import whiteness
 from icalib.pipeline import calibrate_measurements
-from icalib.simulation import Motion, Simulation, handheld, load_scenario, rig_for, simulate, with_drawn_guess
+from icalib.result import Calibration, CornerResiduals, LidarResiduals, Visited, WheelResiduals
+from icalib.tools.montecarlo import one_run
+from icalib.tools.montecarlo.one_run import PlanesKind, Task, compare, run
+from icalib.tools.montecarlo.record import Record
+from icalib.tools.montecarlo.truth import error, true_value
+from icalib.tools.montecarlo.whiteness import whiteness
+from icalib.tools.simulation import Motion, Simulation, handheld, load_scenario, rig_for, simulate, with_drawn_guess
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
 SCENARIO = handheld(6.0)

@@ -14,13 +14,13 @@ from pathlib import Path
 import psutil
 import pytest
 
+from icalib.base.extras import load_distributed
 from icalib.errors import CalibrationError
-from icalib.extras import load_distributed
-from icalib.montecarlo import Plan, Record, Study, Task, run_study
-from icalib.montecarlo import study as study_module
-from icalib.montecarlo.store import Identity, Store
-from icalib.montecarlo.workers import run_all
-from icalib.simulation import Scenario, handheld
+from icalib.tools.montecarlo import Plan, Record, Study, Task, run_study
+from icalib.tools.montecarlo import study as study_module
+from icalib.tools.montecarlo.store import Identity, Store
+from icalib.tools.montecarlo.workers import run_all
+from icalib.tools.simulation import Scenario, handheld
 
 pytestmark = pytest.mark.slow
 
@@ -28,8 +28,8 @@ RUNS = 3
 _SCRIPT = """
 import sys
 from pathlib import Path
-from icalib.montecarlo import Plan, run_study
-from icalib.simulation import handheld
+from icalib.tools.montecarlo import Plan, run_study
+from icalib.tools.simulation import handheld
 
 if __name__ == "__main__":
     run_study(handheld(6.0), "handheld", "digest", Path(sys.argv[1]), Plan(int(sys.argv[2]), workers=1))
@@ -147,7 +147,7 @@ def test_runs_of_another_study_are_never_mixed_in(alone: Path, changed: dict, wh
 
 
 def test_another_icalib_is_another_study(alone: Path, tmp_path: Path, monkeypatch):
-    monkeypatch.setattr("icalib.montecarlo.store.program", lambda: "another")
+    monkeypatch.setattr("icalib.tools.montecarlo.store.program", lambda: "another")
     with pytest.raises(CalibrationError, match="icalib changed"):
         study(alone)
     store = Store(tmp_path, Identity.of("handheld", "digest", "none", "known"))
@@ -220,8 +220,8 @@ def test_a_recorded_motion_is_part_of_the_scenario(tmp_path: Path):
     paper = Path(__file__).parents[2] / "examples" / "paper"
     for name in ("recorded.yaml", "trajectory.tum"):
         (tmp_path / name).write_bytes((paper / name).read_bytes())
-    from icalib.montecarlo.study import scenario_digest
-    from icalib.simulation import load_scenario
+    from icalib.tools.montecarlo.study import scenario_digest
+    from icalib.tools.simulation import load_scenario
 
     def digest() -> str:
         scenario: Scenario = load_scenario(tmp_path / "recorded.yaml")

@@ -9,11 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.montecarlo.page import study_html
-from icalib.montecarlo.record import Record, Size, from_json, to_json
-from icalib.montecarlo.store import Identity
-from icalib.montecarlo.summary import Consistency, consistency_json, summarise
-from icalib.montecarlo.words import answer, largest_words, undetermined_words, verdict_words
+from icalib.tools.montecarlo.page import study_html
+from icalib.tools.montecarlo.record import Record, Size, from_json, to_json
+from icalib.tools.montecarlo.store import Identity
+from icalib.tools.montecarlo.summary import Consistency, consistency_json, summarise
+from icalib.tools.montecarlo.words import answer, largest_words, undetermined_words, verdict_words
 
 KEYS = ("cam0.rotation", "cam0.time_offset", "cam0.distortion", "cam1.rotation", "cam1.distortion", "wheel0.radii")
 

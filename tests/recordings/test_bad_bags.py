@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 import pytest
 
+from icalib.data.bags.ros1 import Ros1Storage
+from icalib.data.checks.imu_checks import checked_imu
+from icalib.data.recordings import Recording, open_recording
 from icalib.errors import RecordingError
-from icalib.imu_classes import class_noise
-from icalib.recordings import Recording, open_recording
-from icalib.recordings.bags.ros1 import Ros1Storage
-from icalib.recordings.imu_checks import checked_imu
 from icalib.rig import ImuSensor
+from icalib.rig.imu_classes import class_noise
 
 IMU = ImuSensor("imu0", "imu0/data.csv", class_noise("consumer"))
 S = 1_000_000_000
@@ -275,7 +275,7 @@ class TestNoBag:
         assert "/imu: messages have the encoding 'xml', which is not one of ROS" in sentence
 
     def test_without_rosbags_the_sentence_names_the_extra(self, tmp_path, truth, write, monkeypatch):
-        from icalib.recordings import bag
+        from icalib.data.recordings import bag
 
         recording = open_recording(write.small("mcap", tmp_path, truth))
         monkeypatch.setitem(sys.modules, "rosbags.typesys", None)

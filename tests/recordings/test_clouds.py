@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from icalib.data.measurements import LidarStream
+from icalib.data.messages.lidar_checks import checked_lidar
+from icalib.data.recordings import BagRecording
 from icalib.errors import RecordingError
-from icalib.inspection import inspect_recording
-from icalib.inspection.draft import draft_rig
-from icalib.measurements import LidarStream
-from icalib.recordings import BagRecording
-from icalib.recordings.lidar_checks import checked_lidar
 from icalib.rig import Lidar
-from icalib.rig_file import load_rig
+from icalib.rig.file import load_rig
+from icalib.tools.inspection import inspect_recording
+from icalib.tools.inspection.draft import draft_rig
 
 POINTS = "sensor_msgs/msg/PointCloud2"
 ORIGIN, PERIOD, SCANS = 1_700_000_000_123_456_789, 100_000_000, 12  # ns

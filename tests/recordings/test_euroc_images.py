@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from icalib.data.recordings import open_recording
 from icalib.errors import RecordingError
-from icalib.recordings import open_recording
 
 
 def complaint(call) -> str:

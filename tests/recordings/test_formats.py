@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from icalib.data.bags.opening import bag_files
+from icalib.data.checks.imu_checks import checked_imu
+from icalib.data.recordings import BagRecording, Recording, decode, image_topics, open_recording, read_measurements
 from icalib.errors import RecordingError
 from icalib.geometry.targets import AprilGrid
-from icalib.imu_classes import class_noise
-from icalib.recordings import BagRecording, Recording, decode, image_topics, open_recording, read_measurements
-from icalib.recordings.bags.opening import bag_files
-from icalib.recordings.imu_checks import checked_imu
 from icalib.rig import Camera, ImuSensor, Rig
+from icalib.rig.imu_classes import class_noise
 
 FORMS = [
     "ros1",

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from icalib.data.images.images import file_payload, file_size
+from icalib.data.recordings import DamagedImageError, Payload, decode
 from icalib.errors import RecordingError
-from icalib.recordings import DamagedImageError, Payload, decode
-from icalib.recordings.images import file_payload, file_size
 
 H, W = 6, 10
 RNG = np.random.default_rng(7)

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.measurements import ImuStream
-from icalib.recordings.even_stamps import even_stamps
-from icalib.recordings.imu_checks import checked_imu
-from icalib.simulation import handheld, simulate
+from icalib.data.checks.imu_checks import checked_imu
+from icalib.data.measurements import ImuStream
+from icalib.data.stamps.even_stamps import even_stamps
+from icalib.tools.simulation import handheld, simulate
 
 
 def simulated(seed: int, **options) -> ImuStream:

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from icalib.data.checks.imu_checks import checked_imu
+from icalib.data.measurements import ImuStream
 from icalib.errors import RecordingError
-from icalib.imu_classes import class_noise
-from icalib.measurements import ImuStream
-from icalib.recordings.imu_checks import checked_imu
 from icalib.rig import ImuSensor
-from icalib.simulation import handheld, simulate
+from icalib.rig.imu_classes import class_noise
+from icalib.tools.simulation import handheld, simulate
 
 IMU = ImuSensor("imu0", "imu0/data.csv", class_noise("consumer"))
 G = 9.80665

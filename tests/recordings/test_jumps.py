@@ -8,10 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icalib.allan import study_recording
-from icalib.errors import EstimationError, RecordingError
-from icalib.inspection import inspect_recording
-from icalib.measurements import (
+from icalib.data.measurements import (
     CornerStream,
     ImuStream,
     LidarStream,
@@ -21,11 +18,14 @@ from icalib.measurements import (
     WheelPoses,
     WheelStream,
 )
+from icalib.data.recordings import FolderRecording
+from icalib.data.stamps.jumps import ClockJumps, longest_part
+from icalib.data.stamps.sections import section
+from icalib.errors import EstimationError, RecordingError
 from icalib.pipeline import calibrate_measurements
-from icalib.recordings import FolderRecording
-from icalib.recordings.jumps import ClockJumps, longest_part
-from icalib.recordings.sections import section
-from icalib.simulation import handheld, rig_for, simulate
+from icalib.tools.allan import study_recording
+from icalib.tools.inspection import inspect_recording
+from icalib.tools.simulation import handheld, rig_for, simulate
 
 pytestmark = pytest.mark.slow
 

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from icalib.data.recordings import FolderRecording, read_measurements
+from icalib.data.stamps.clocks import unit_of_stamps, usual_step
+from icalib.data.tables.columns import IMU, TableKind
+from icalib.data.tables.table import holds, named, read_table
 from icalib.errors import RecordingError, RigError
-from icalib.imu_classes import class_noise
-from icalib.recordings import FolderRecording, read_measurements
-from icalib.recordings.clocks import unit_of_stamps, usual_step
-from icalib.recordings.columns import IMU, TableKind
-from icalib.recordings.table import holds, named, read_table
 from icalib.rig import Camera, ImuSensor, PoseSensor, Rig, TableLayout, Wheels
-from icalib.rig_file import load_rig, rig_from_dict, rig_to_dict
+from icalib.rig.file import load_rig, rig_from_dict, rig_to_dict
+from icalib.rig.imu_classes import class_noise
 
 ORIGIN, STEP, N = 1_700_000_000_123_456_789, 5_000_000, 60
 STAMPS = ORIGIN + STEP * np.arange(N)

@@ -11,8 +11,8 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from icalib.data.recordings import BagRecording
 from icalib.errors import RecordingError
-from icalib.recordings import BagRecording
 from icalib.rig import Lidar
 
 CLOUD = (

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
+from icalib.data.recordings import open_recording
 from icalib.errors import RecordingError
-from icalib.recordings import open_recording
 from icalib.rig import Camera, PoseSensor, TableLayout
 
 START, STEP = 1_700_000_000_500_000_000, 2_000_000_000

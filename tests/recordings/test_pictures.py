@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
+from icalib.data.recordings import FolderRecording, PictureFolder, open_recording
 from icalib.errors import RecordingError
-from icalib.inspection.sources import find_sources
-from icalib.recordings import FolderRecording, PictureFolder, open_recording
 from icalib.rig import Camera, ImuNoise, ImuSensor
+from icalib.tools.inspection.sources import find_sources
 
 
 def picture(path: Path, grey: int) -> None:

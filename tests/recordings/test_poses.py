@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from icalib.data.checks.pose_checks import checked_poses
+from icalib.data.measurements import PoseStream
+from icalib.data.recordings import BagRecording, FolderRecording, open_recording, read_measurements
+from icalib.data.tables.poses import PoseReadings, as_frame_sensor
 from icalib.errors import RecordingError
-from icalib.measurements import PoseStream
-from icalib.recordings import BagRecording, FolderRecording, open_recording, read_measurements
-from icalib.recordings.pose_checks import checked_poses
-from icalib.recordings.poses import PoseReadings, as_frame_sensor
 from icalib.rig import PoseSensor
-from icalib.rig_file import rig_from_dict, rig_to_dict
+from icalib.rig.file import rig_from_dict, rig_to_dict
 
 N, STEP, ORIGIN = 300, 20_000_000, 1_700_000_000_123_456_789
 STAMPS = ORIGIN + STEP * np.arange(N)

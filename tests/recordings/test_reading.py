@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from icalib.data.measurements import CornerStream, Measurements
+from icalib.data.recordings import open_recording, read_measurements
+from icalib.data.stamps.camera_checks import checked_corners
 from icalib.errors import RecordingError
 from icalib.geometry.targets import AprilGrid
-from icalib.imu_classes import class_noise
-from icalib.measurements import CornerStream, Measurements
-from icalib.recordings import open_recording, read_measurements
-from icalib.recordings.camera_checks import checked_corners
 from icalib.rig import Camera, ImuSensor, Rig
+from icalib.rig.imu_classes import class_noise
 
 ORIGIN = 1_404_733_405_732_800_001
 IMU_STEP, IMAGE_STEP = 5_000_000, 50_000_000

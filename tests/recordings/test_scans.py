@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from icalib.cli import main
+from icalib.data.measurements import LidarStream
+from icalib.data.messages.lidar_checks import checked_lidar
+from icalib.data.recordings import FolderRecording, open_recording
+from icalib.data.recordings.reading import read_measurements
 from icalib.errors import RecordingError
-from icalib.measurements import LidarStream
-from icalib.recordings import FolderRecording, open_recording
-from icalib.recordings.lidar_checks import checked_lidar
-from icalib.recordings.reading import read_measurements
 from icalib.rig import Lidar
-from icalib.rig_file import load_rig
+from icalib.rig.file import load_rig
 
 LIDAR = Lidar("lidar0", "lidar0/scans.npz")
 RNG = np.random.default_rng(2)

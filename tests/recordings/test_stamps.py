@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from icalib.data.recordings import open_recording
 from icalib.errors import RecordingError
-from icalib.recordings import open_recording
 
 
 @pytest.mark.parametrize("form", ["ros1", "ros2 sqlite3", "mcap"])

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.errors import RecordingError
-from icalib.recordings import BagRecording
-from icalib.recordings.streams import (
+from icalib.data.messages.streams import (
     point_clouds,
     read_camera_info,
     read_joints,
@@ -16,6 +14,8 @@ from icalib.recordings.streams import (
     read_poses,
     read_twists,
 )
+from icalib.data.recordings import BagRecording
+from icalib.errors import RecordingError
 
 RNG = np.random.default_rng(11)
 STAMPS = [1_700_000_000_123_456_789 + k * 10_000_000 for k in range(5)]

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from icalib.data.tables.columns import TableKind
+from icalib.data.tables.table import read_table
 from icalib.errors import RecordingError
-from icalib.recordings.columns import TableKind
-from icalib.recordings.table import read_table
 
 INTEGERS, DECIMALS = ("t [ns]", "id"), ("u", "v")
 

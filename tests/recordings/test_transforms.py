@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
+from icalib.data.recordings import BagRecording
+from icalib.data.recordings.folder import FolderRecording
 from icalib.errors import RecordingError
 from icalib.pipeline import calibrate
-from icalib.recordings import BagRecording
-from icalib.recordings.folder import FolderRecording
 from icalib.rig import PoseSensor
-from icalib.rig_file import rig_from_dict
+from icalib.rig.file import rig_from_dict
 
 START, STEP, COUNT = 1_700_000_000_123_456_789, 20_000_000, 40
 SECONDS = np.arange(COUNT) * STEP * 1e-9

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from mcap.writer import Writer as McapWriter
 
+from icalib.data.images.unreadable import type_not_read
+from icalib.data.recordings import open_recording
 from icalib.errors import RecordingError
-from icalib.imu_classes import class_noise
-from icalib.inspection import inspect_recording
-from icalib.recordings import open_recording
-from icalib.recordings.unreadable import type_not_read
 from icalib.rig import Camera, ImuSensor, Lidar
+from icalib.rig.imu_classes import class_noise
+from icalib.tools.inspection import inspect_recording
 
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n"
 ANNEX = b"/annex/objects/MD5E-s1234--5d4140.bag\n"

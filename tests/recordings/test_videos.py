@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from icalib.data.recordings import decode, open_recording
 from icalib.detection.streams import find_corners
 from icalib.errors import RecordingError
 from icalib.geometry.targets import Markers
-from icalib.inspection import inspect_recording
-from icalib.recordings import decode, open_recording
 from icalib.rig import Camera
+from icalib.tools.inspection import inspect_recording
 
 cv2 = pytest.importorskip("cv2")
 SIZE, FRAMES, RATE = (64, 48), 12, 20.0

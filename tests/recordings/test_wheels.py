@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from icalib.data.checks.wheel_checks import checked_wheels
+from icalib.data.measurements import WheelStream
+from icalib.data.recordings import BagRecording, FolderRecording
+from icalib.data.tables.wheels import WheelReadings
 from icalib.errors import RecordingError
-from icalib.measurements import WheelStream
-from icalib.recordings import BagRecording, FolderRecording
-from icalib.recordings.wheel_checks import checked_wheels
-from icalib.recordings.wheels import WheelReadings
 from icalib.rig import Wheels
 
 N, STEP, ORIGIN = 400, 20_000_000, 1_700_000_000_000_000_000

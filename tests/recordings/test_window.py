@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 
 from icalib.cli import main
+from icalib.data.checks.imu_halves import ImuHalves
+from icalib.data.recordings import open_recording
+from icalib.data.recordings.several import open_all
+from icalib.data.stamps.window import Window, start_of
 from icalib.errors import RecordingError
-from icalib.imu_classes import class_noise
-from icalib.inspection import inspect_recording
 from icalib.pipeline import calibrate
-from icalib.recordings import open_recording
-from icalib.recordings.imu_halves import ImuHalves
-from icalib.recordings.several import open_all
-from icalib.recordings.window import Window, start_of
 from icalib.rig import Camera, ImuSensor, PoseSensor, TwoSources, Wheels
+from icalib.rig.imu_classes import class_noise
+from icalib.tools.inspection import inspect_recording
 
 IMU = ImuSensor("imu0", "imu0/data.csv", class_noise("consumer"))
 S = 1_000_000_000

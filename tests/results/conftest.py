@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.calibration import (
+from icalib.geometry.targets import AprilGrid
+from icalib.result import (
     Calibration,
     CornerResiduals,
     CrossValidation,
@@ -22,9 +23,8 @@ from icalib.calibration import (
     Trajectory,
     WheelResiduals,
 )
-from icalib.geometry.targets import AprilGrid
 from icalib.rig import Camera, ImuNoise, ImuSensor, Lidar, Parameter, Rig, Settings, Wheels
-from icalib.rig_file import rig_to_dict
+from icalib.rig.file import rig_to_dict
 
 NODES, CORNERS_PER_IMAGE = 300, 34
 IMU_LABELS = tuple(f"accel_{n}" for n in ("xx", "yx", "yy", "zx", "zy", "zz"))

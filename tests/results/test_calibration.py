@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import yaml
 
-from icalib.assessment.misfit import scatter_warnings
-from icalib.calibration import Calibration, load_calibration
 from icalib.errors import CalibrationError
+from icalib.result import Calibration, load_calibration
+from icalib.validation.misfit import scatter_warnings
 
 
 @pytest.fixture

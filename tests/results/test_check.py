@@ -15,17 +15,17 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
 import icalib
-from icalib.calibration import Calibration
-from icalib.check import Check, check_measurements
-from icalib.check.check import joint_limit
-from icalib.check.words import lines, verdict
 from icalib.cli import main
+from icalib.data.measurements import Measurements
 from icalib.errors import CalibrationError, RecordingError
 from icalib.geometry.targets import AprilGrid
-from icalib.measurements import Measurements
 from icalib.pipeline import calibrate_measurements
-from icalib.rig_file import rig_to_dict
-from icalib.simulation import Scenario, handheld, rig_for, simulate, write_tables
+from icalib.result import Calibration
+from icalib.rig.file import rig_to_dict
+from icalib.tools.check import Check, check_measurements
+from icalib.tools.check.check import joint_limit
+from icalib.tools.check.words import lines, verdict
+from icalib.tools.simulation import Scenario, handheld, rig_for, simulate, write_tables
 
 pytestmark = pytest.mark.slow
 SECONDS = 8.0

@@ -14,16 +14,16 @@ import yaml
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, norm
 
-from icalib.calibration import Calibration, Verdict, relative_pose
 from icalib.cli import main
-from icalib.comparison.compare import Comparison, Difference, Tolerances, compare_sides
-from icalib.comparison.reading import compare_files
-from icalib.comparison.results import side_of_result
-from icalib.comparison.significance import chi2_above, sigmas
-from icalib.comparison.words import lines, sentence
 from icalib.export.formats import export
-from icalib.parameter import fixed
-from icalib.rig_parameters import parameter_to_plain
+from icalib.result import Calibration, Verdict, relative_pose
+from icalib.rig.file.parameters import parameter_to_plain
+from icalib.rig.parameter import fixed
+from icalib.tools.comparison.compare import Comparison, Difference, Tolerances, compare_sides
+from icalib.tools.comparison.reading import compare_files
+from icalib.tools.comparison.results import side_of_result
+from icalib.tools.comparison.significance import chi2_above, sigmas
+from icalib.tools.comparison.words import lines, sentence
 
 NOISE = {"gyro": 1.6e-4, "gyro_walk": 2.2e-5, "accel": 2.8e-3, "accel_walk": 8.6e-4}
 

@@ -17,15 +17,15 @@ import yaml
 from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 
-from icalib.calibration import Calibration, ParameterGroup
+from icalib.base.own_files import sealed_texts
 from icalib.cli import main
 from icalib.errors import CalibrationError
-from icalib.estimation.imu_model import LABELS, correction_matrices
 from icalib.export.common import quaternion, rpy
 from icalib.export.formats import export
 from icalib.export.names import FORMATS
 from icalib.geometry.cameras import camera_model
-from icalib.own_files import sealed_texts
+from icalib.motion.imu_model import LABELS, correction_matrices
+from icalib.result import Calibration, ParameterGroup
 
 
 def by_opencv(text: str, tmp_path: Path) -> cv2.FileStorage:

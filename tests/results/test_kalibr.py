@@ -10,11 +10,11 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from icalib.calibration import Calibration, ParameterGroup
 from icalib.errors import CalibrationError
-from icalib.estimation.imu_model import LABELS, correction_matrices
 from icalib.export.kalibr import camchain, imu_yaml
 from icalib.geometry.cameras import camera_model
+from icalib.motion.imu_model import LABELS, correction_matrices
+from icalib.result import Calibration, ParameterGroup
 
 
 @pytest.fixture(scope="module")

@@ -10,14 +10,14 @@ from pathlib import Path
 import pytest
 from tests.allan.test_allan import at_rest
 
-from icalib.allan import study_imu, write_study
-from icalib.calibration import Calibration, load_calibration
+from icalib.base.text_files import printable
 from icalib.cli import main
 from icalib.export.formats import export
-from icalib.fleet.inputs import Inputs
-from icalib.fleet.jobs import Job
-from icalib.outputs import write_outputs
-from icalib.text_files import printable
+from icalib.export.outputs import write_outputs
+from icalib.result import Calibration, load_calibration
+from icalib.tools.allan import study_imu, write_study
+from icalib.tools.fleet.inputs import Inputs
+from icalib.tools.fleet.jobs import Job
 
 ODD = os.fsdecode(b"B\xfcro")
 

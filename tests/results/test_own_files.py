@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from icalib.base.file_names import below
+from icalib.base.own_files import is_ours, refuse_foreign, sealed
+from icalib.base.result_files import COMMIT, read_file, refuse_foreign_set, write_files
+from icalib.base.staging import PREFIX, staged
+from icalib.base.text_files import write_texts
 from icalib.cli import main
 from icalib.errors import CalibrationError
-from icalib.file_names import below
-from icalib.own_files import is_ours, refuse_foreign, sealed
-from icalib.result_files import COMMIT, read_file, refuse_foreign_set, write_files
-from icalib.staging import PREFIX, staged
-from icalib.text_files import write_texts
 
 TEXTS = {
     "a.yaml": b"a: 1",
@@ -64,7 +64,7 @@ def test_commands_refuse_before_they_start(command: str, tmp_path: Path, capsys,
     files = kalibr_folder(tmp_path) | {names[command]: b"mine"}
     (tmp_path / names[command]).write_bytes(b"mine")
     rig = Path(__file__).parents[2] / "examples" / "euroc" / "rig.yaml"
-    scenario = Path(__file__).parents[2] / "src/icalib/montecarlo/paper/table2-3d.yaml"
+    scenario = Path(__file__).parents[2] / "src/icalib/tools/montecarlo/paper/table2-3d.yaml"
     (tmp_path / "jobs.yaml").write_text(f"jobs: [{{robot: a, rig: {rig}, recording: b}}]")
     board = ["--rows", "5", "--cols", "4", "--square-size", "0.02"]
     arguments = {
@@ -126,7 +126,7 @@ def test_a_linked_commit_folder_moves_nothing(tmp_path: Path):
 KILLED = """
 import sys, time
 from pathlib import Path
-from icalib.staging import staged
+from icalib.base.staging import staged
 with staged(Path(sys.argv[1])) as place:
     (place / "half").write_bytes(b"half")
     print(place, flush=True)
@@ -162,7 +162,7 @@ def test_a_name_stays_in_its_folder(tmp_path: Path, name: str):
 
 @pytest.mark.parametrize("name", ["../../x", "/tmp/x", "a/b", "..", "x" * 101])
 def test_a_scenario_writes_nowhere_else(tmp_path: Path, capsys, name: str):
-    text = (Path(__file__).parents[2] / "src/icalib/montecarlo/paper/table2-3d.yaml").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[2] / "src/icalib/tools/montecarlo/paper/table2-3d.yaml").read_text(encoding="utf-8")
     (tmp_path / "scenario.yaml").write_text(text.replace("  cam0:", f"  {name}:"), encoding="utf-8")
     assert main(["simulate", str(tmp_path / "scenario.yaml"), "-o", str(tmp_path / "a" / "out"), "-q"]) == 1
     assert "a sensor's name is a letter, then up to 99 letters, digits, _ or -" in capsys.readouterr().err

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import yaml
 
-from icalib.calibration import Calibration, load_calibration
 from icalib.cli import main
-from icalib.comparison.reading import compare_files
 from icalib.export.formats import export
-from icalib.rig_file import rig_to_dict
-from icalib.simulation import Scenario, load_scenario, rig_for
+from icalib.result import Calibration, load_calibration
+from icalib.rig.file import rig_to_dict
+from icalib.tools.comparison.reading import compare_files
+from icalib.tools.simulation import Scenario, load_scenario, rig_for
 
 SCENARIO = """\
 duration: 10

@@ -15,12 +15,12 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from icalib.calibration import Calibration
+from icalib.base.own_files import is_ours, sealed_texts
 from icalib.cli import main
 from icalib.errors import CalibrationError
 from icalib.export.formats import export
 from icalib.geometry.cameras import camera_model
-from icalib.own_files import is_ours, sealed_texts
+from icalib.result import Calibration
 
 POINT = np.array([0.3, -0.2, 1.5, 1.0])
 RAY = np.array([[0.31, -0.22, 1.0]])

@@ -11,9 +11,9 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from icalib.calibration import Calibration, projection_uncertainty
-from icalib.calibration.projection import projection_std, working_distance
 from icalib.geometry.cameras import CAMERA_MODELS, camera_model
+from icalib.result import Calibration, projection_uncertainty
+from icalib.result.projection import projection_std, working_distance
 
 pytestmark = pytest.mark.slow
 

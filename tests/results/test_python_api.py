@@ -11,8 +11,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import icalib
-from icalib.calibration import Calibration, relative_pose
 from icalib.geometry import so3
+from icalib.result import Calibration, relative_pose
 
 
 def test_the_repr_is_one_short_line(robot: Calibration):

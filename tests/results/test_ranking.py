@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.assessment.causes import Cause, Misfit, explaining, ranked
-from icalib.assessment.disturbance import _image_velocity
-from icalib.calibration import SensorFit
-from icalib.estimation.noise_size import are_noise
+from icalib.estimate.noise_size import are_noise
+from icalib.result import SensorFit
+from icalib.validation.causes import Cause, Misfit, explaining, ranked
+from icalib.validation.disturbance import _image_velocity
 
 
 def fits(*ratios: float) -> list[SensorFit]:

@@ -14,7 +14,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from icalib.calibration import (
+from icalib.export.outputs import check_folder, write_outputs
+from icalib.report import image_figures, projection_figures, report_html
+from icalib.report.console import table
+from icalib.report.plot import numbers, thin
+from icalib.result import (
     Calibration,
     ProjectionMap,
     SensorFit,
@@ -22,11 +26,7 @@ from icalib.calibration import (
     projection_uncertainty,
     working_distance,
 )
-from icalib.calibration.quantities import dof_words, rows, rpy_deg, shown
-from icalib.outputs import check_folder, write_outputs
-from icalib.report import image_figures, projection_figures, report_html
-from icalib.report.console import table
-from icalib.report.plot import numbers, thin
+from icalib.result.quantities import dof_words, rows, rpy_deg, shown
 
 VOID = {"meta", "link", "br", "img", "hr"}
 FIGURES = {"rig", "histogram", "imu-residuals", "trajectory", "motion", "convergence", "correlation", "held-out"} | {

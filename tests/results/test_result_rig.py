@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from icalib.calibration import Calibration
 from icalib.cli import main
 from icalib.errors import RigError
-from icalib.parameter import Parameter
 from icalib.pipeline import calibrate_measurements
-from icalib.result_rig import TREATMENTS, Treatment, rig_of_result
-from icalib.rig_file import load_rig, rig_from_dict, rig_to_dict
-from icalib.simulation import handheld, rig_for, simulate
+from icalib.result import Calibration
+from icalib.result.as_rig import TREATMENTS, Treatment, rig_of_result
+from icalib.rig.file import load_rig, rig_from_dict, rig_to_dict
+from icalib.rig.parameter import Parameter
+from icalib.tools.simulation import handheld, rig_for, simulate
 
 ESTIMATED = [("cam0", "rotation"), ("cam0", "intrinsics"), ("lidar0", "translation"), ("wheel0", "radii")]
 

@@ -15,14 +15,14 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from icalib.assessment.robot import robot_misfit
-from icalib.calibration import Calibration, RecordingSpan, SensorFit, load_calibration, relative_pose, relative_poses
-from icalib.calibration.quantities import rows
-from icalib.console import print_result
+from icalib.cli.console import print_result
 from icalib.errors import CalibrationError
-from icalib.outputs import write_outputs
+from icalib.export.outputs import write_outputs
 from icalib.report import report_html, robot_figures
+from icalib.result import Calibration, RecordingSpan, SensorFit, load_calibration, relative_pose, relative_poses
+from icalib.result.quantities import rows
 from icalib.rig import ImuNoise, ImuSensor, Lidar, Rig, Wheels
+from icalib.validation.robot import robot_misfit
 
 ROBOT_FIGURES = {"points-0", "distance-0", "wheels-0", "map-before", "map-after"}
 

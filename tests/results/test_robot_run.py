@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import yaml
 
-from icalib.assessment import robot
-from icalib.calibration import Calibration, load_calibration
 from icalib.cli import main
-from icalib.rig_file import rig_to_dict
-from icalib.simulation import Scenario, load_scenario, rig_for
+from icalib.result import Calibration, load_calibration
+from icalib.rig.file import rig_to_dict
+from icalib.tools.simulation import Scenario, load_scenario, rig_for
+from icalib.validation import robot
 
 RAMP = Path(__file__).parents[2] / "examples" / "paper" / "table2-ramp.yaml"
 MOST = 5000

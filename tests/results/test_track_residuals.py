@@ -9,18 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icalib.calibration import (
-    Calibration,
-    TrackResiduals,
-    load_calibration,
-    projection_uncertainty,
-    working_distance,
-)
-from icalib.measurements import Measurements, TrackStream
-from icalib.montecarlo.whiteness import whiteness
+from icalib.data.measurements import Measurements, TrackStream
 from icalib.pipeline import calibrate_measurements
 from icalib.report import report_html
-from icalib.simulation import Scenario, load_scenario, rig_for, simulate, with_drawn_guess
+from icalib.result import Calibration, TrackResiduals, load_calibration, projection_uncertainty, working_distance
+from icalib.tools.montecarlo.whiteness import whiteness
+from icalib.tools.simulation import Scenario, load_scenario, rig_for, simulate, with_drawn_guess
 
 pytestmark = pytest.mark.slow
 

@@ -13,11 +13,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from urdf_parser_py.urdf import URDF
 
-from icalib.calibration import Calibration
 from icalib.cli import main
 from icalib.errors import CalibrationError
 from icalib.export.formats import export
 from icalib.export.urdf_tree import read_urdf
+from icalib.result import Calibration
 
 ROBOT = """\
 <?xml version="1.0" encoding="utf-8"?>

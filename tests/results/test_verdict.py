@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import yaml
 
-from icalib.calibration import Calibration, load_calibration, relative_pose, verdict
-from icalib.calibration.verdict import EXIT_CODES, NEXT, by_size, lens_projection_px
 from icalib.cli import main
-from icalib.console import print_result, print_warnings
+from icalib.cli.console import print_result, print_warnings
 from icalib.report import report_html
+from icalib.result import Calibration, load_calibration, relative_pose, verdict
+from icalib.result.verdict import EXIT_CODES, NEXT, by_size, lens_projection_px
 
 
 def with_verdicts(c: Calibration, verdict: str, where: tuple[str, ...] = ()) -> Calibration:
@@ -148,7 +148,7 @@ def test_the_exit_code_of_strict(
     """Without --strict 0, whatever the verdict; with it that of the verdict."""
     rig = tmp_path / "rig.yaml"
     rig.write_text((Path(__file__).parents[2] / "examples" / "euroc" / "rig.yaml").read_text())
-    monkeypatch.setattr("icalib.outputs.write_outputs", lambda *_: None)
+    monkeypatch.setattr("icalib.export.outputs.write_outputs", lambda *_: None)
     command = ["calibrate", str(rig), str(tmp_path / "run"), "-o", str(tmp_path / "out"), *(["-q"] if quiet else [])]
     for name in ("usable", "usable with care: weak", "partly usable", "not usable: wrong"):
         monkeypatch.setattr("icalib.pipeline.calibrate", lambda *_, c=cases[name], **__: c)

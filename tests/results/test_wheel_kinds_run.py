@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import yaml
 
-from icalib.calibration import load_calibration
 from icalib.cli import main
 from icalib.export.names import FORMATS
 from icalib.geometry.targets import AprilGrid
+from icalib.result import load_calibration
 from icalib.rig import Ground
-from icalib.rig_file import rig_to_dict
-from icalib.simulation import Scenario, load_scenario, rig_for, simulate
-from icalib.simulation.tables import write_tables
+from icalib.rig.file import rig_to_dict
+from icalib.tools.simulation import Scenario, load_scenario, rig_for, simulate
+from icalib.tools.simulation.tables import write_tables
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
 ON_WALL = np.array([[0.0, 0.0, -1.0, 5.9], [-1.0, 0.0, 0.0, 3.9], [0.0, 1.0, 0.0, 0.1], [0.0, 0.0, 0.0, 1.0]])

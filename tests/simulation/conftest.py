@@ -7,7 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.simulation import Block, Drive, Features, Room, Scenario, SimCamera, SimLidar, SimWheels, hills_of_slope
+from icalib.tools.simulation import (
+    Block,
+    Drive,
+    Features,
+    Room,
+    Scenario,
+    SimCamera,
+    SimLidar,
+    SimWheels,
+    hills_of_slope,
+)
 
 CAMERA_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # R_imu_cam of one that looks ahead
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from icalib.errors import RecordingError, RigError
-from icalib.simulation import Drive, Room, SimWheels, hills_of_slope, simulate
-from icalib.simulation.jets import Jet
+from icalib.tools.simulation import Drive, Room, SimWheels, hills_of_slope, simulate
+from icalib.tools.simulation.scenario.jets import Jet
 
 from .conftest import alone, on_ground, turn, wheel_path
 

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from icalib.data.recordings import open_recording
 from icalib.errors import CalibrationError, RecordingError, RigError
-from icalib.recordings import open_recording
 from icalib.rig import ImuSensor
-from icalib.simulation import ADIS16448, Film, Imaging, Scenario, film, handheld, simulate, write_film
-from icalib.simulation.writing import FORMS, Form
+from icalib.tools.simulation import ADIS16448, Film, Imaging, Scenario, film, handheld, simulate, write_film
+from icalib.tools.simulation.writing import FORMS, Form
 
 pytest.importorskip("cv2")
 

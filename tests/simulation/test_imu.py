@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from icalib.rig import ImuNoise
-from icalib.simulation import handheld, simulate
+from icalib.tools.simulation import handheld, simulate
 
 
 def test_white_noise_has_the_density_and_the_walk_its_own():

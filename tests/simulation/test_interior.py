@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from icalib.errors import RigError
-from icalib.simulation import (
+from icalib.tools.simulation import (
     Block,
     Drive,
     ImageFaults,
@@ -20,13 +20,13 @@ from icalib.simulation import (
     film,
     hills_of_slope,
 )
-from icalib.simulation.image_faults import faults_of
-from icalib.simulation.interior import Interior, RoomRenderer
-from icalib.simulation.lenses import unproject
-from icalib.simulation.projection import project
-from icalib.simulation.raster import pixel_kernel, shrink
-from icalib.simulation.room import distances
-from icalib.simulation.texture import atlas_of, leaves
+from icalib.tools.simulation.images.interior import Interior, RoomRenderer
+from icalib.tools.simulation.images.lenses import unproject
+from icalib.tools.simulation.images.raster import pixel_kernel, shrink
+from icalib.tools.simulation.scenario.image_faults import faults_of
+from icalib.tools.simulation.scenario.projection import project
+from icalib.tools.simulation.scenario.room import distances
+from icalib.tools.simulation.scenario.texture import atlas_of, leaves
 
 from .conftest import DISTORTED
 

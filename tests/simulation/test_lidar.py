@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.simulation import SimLidar, hills_of_slope, simulate
+from icalib.tools.simulation import SimLidar, hills_of_slope, simulate
 
 from .conftest import alone, on_ground
 

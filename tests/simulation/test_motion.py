@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.simulation import handheld, simulate
+from icalib.tools.simulation import handheld, simulate
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 KINDS = ("handheld", "planar", "single_axis", "motionless")

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.recordings import open_recording, read_measurements
-from icalib.rig_file import load_rig
-from icalib.simulation import Drive, Room, Scenario, SimPoses, simulate, write_sensors, write_tables
-from icalib.simulation.poses import quaternion
+from icalib.data.recordings import open_recording, read_measurements
+from icalib.rig.file import load_rig
+from icalib.tools.simulation import Drive, Room, Scenario, SimPoses, simulate, write_sensors, write_tables
+from icalib.tools.simulation.sensors.poses import quaternion
 
 from .conftest import pose, turn
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.measurements import WheelPoses, WheelStream
-from icalib.recordings import open_recording, read_measurements
-from icalib.rig_file import load_rig
-from icalib.simulation import simulate, write_sensors, write_tables
+from icalib.data.measurements import WheelPoses, WheelStream
+from icalib.data.recordings import open_recording, read_measurements
+from icalib.rig.file import load_rig
+from icalib.tools.simulation import simulate, write_sensors, write_tables
 
 from .conftest import on_ground
 

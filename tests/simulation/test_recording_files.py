@@ -9,13 +9,13 @@ import pytest
 import yaml
 
 from icalib.cli import main
+from icalib.data.messages.streams import point_clouds, read_joints
+from icalib.data.recordings import open_recording
+from icalib.data.recordings.bag import BagRecording
 from icalib.errors import RecordingError, RigError
 from icalib.geometry.targets import AprilGrid
-from icalib.recordings import open_recording
-from icalib.recordings.bag import BagRecording
-from icalib.recordings.streams import point_clouds, read_joints
 from icalib.rig import ImuSensor
-from icalib.simulation import ADIS16448, handheld, rig_for, simulate, write_sensors, write_tables
+from icalib.tools.simulation import ADIS16448, handheld, rig_for, simulate, write_sensors, write_tables
 
 from .conftest import on_ground, pose
 
@@ -107,7 +107,7 @@ def test_the_truth_is_beside_the_tables(simulation, folder):
 @pytest.mark.parametrize("name", ["run", "run.bag"])
 def test_bags_hold_what_the_drivers_send(simulation, tmp_path, name, monkeypatch):
     pytest.importorskip("cv2")
-    monkeypatch.setattr("icalib.simulation.sensor_bag._AT_A_TIME", 70)
+    monkeypatch.setattr("icalib.tools.simulation.sensor_bag._AT_A_TIME", 70)
     write_sensors(simulation, 3, tmp_path / name)
     bag, measured = BagRecording(tmp_path / name), simulation.measurements
     imu = bag.imu(ImuSensor("imu0", "", ADIS16448))
@@ -159,7 +159,7 @@ def test_nothing_is_left_of_a_recording_that_fails(simulation, tmp_path, monkeyp
     def full(*_, **__):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("icalib.simulation.tables.np.savez", full)
+    monkeypatch.setattr("icalib.tools.simulation.tables.np.savez", full)
     for write in (write_tables, write_sensors):
         with pytest.raises(RecordingError, match="run cannot be written \\(No space left on device\\)"):
             write(replace(simulation, scenario=replace(simulation.scenario, board=False)), 3, tmp_path / "run")

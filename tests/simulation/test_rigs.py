@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-import icalib.simulation
+import icalib.tools.simulation
 from icalib.rig import Parameter, Settings, Wheels
-from icalib.simulation import (
+from icalib.tools.simulation import (
     ADIS16448,
     GuessError,
     handheld,
@@ -24,14 +24,14 @@ from icalib.simulation import (
 EXAMPLES = Path(__file__).parents[2] / "examples" / "paper"
 ALLOWED = (
     "icalib.errors",
-    "icalib.extras",
-    "icalib.file_names",
-    "icalib.measurements",
+    "icalib.base.extras",
+    "icalib.base.file_names",
+    "icalib.data.measurements",
     "icalib.rig",
     "icalib.geometry.targets",
-    "icalib.simulation",
-    "icalib.staging",
-    "icalib.yaml_nodes",
+    "icalib.tools.simulation",
+    "icalib.base.staging",
+    "icalib.base.yaml_nodes",
 )
 
 
@@ -89,7 +89,7 @@ def test_asynchronous_cameras_are_half_a_period_apart():
 
 
 def test_simulation_imports_nothing_that_it_is_to_check():
-    for path in Path(icalib.simulation.__file__).parent.glob("*.py"):
+    for path in Path(icalib.tools.simulation.__file__).parent.glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []

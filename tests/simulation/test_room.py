@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.simulation import hills_of_slope
-from icalib.simulation.room import distances
+from icalib.tools.simulation import hills_of_slope
+from icalib.tools.simulation.scenario.room import distances
 
 
 def met(room, origin, direction):

@@ -11,7 +11,7 @@ import pytest
 
 from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid
-from icalib.simulation import Drive, Features, ImageFaults, Texture, load_scenario, simulate
+from icalib.tools.simulation import Drive, Features, ImageFaults, Texture, load_scenario, simulate
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
 POSE = "[[0, -1, 0, 0.1], [1, 0, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]]"

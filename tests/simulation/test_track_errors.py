@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from icalib.simulation import simulate
+from icalib.tools.simulation import simulate
 
 
 def test_errors_of_tracks_are_those_that_they_were_given(robot, benchmark_program):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from icalib.errors import RigError
-from icalib.simulation import Features, simulate
+from icalib.tools.simulation import Features, simulate
 
 from .conftest import alone
 from .test_room import met

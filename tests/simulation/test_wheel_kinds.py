@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from icalib.data.recordings import open_recording, read_measurements
 from icalib.errors import RigError
-from icalib.recordings import open_recording, read_measurements
-from icalib.rig_file import load_rig
-from icalib.simulation import simulate
-from icalib.simulation.sensor_bag import write_sensors
-from icalib.simulation.tables import write_tables
+from icalib.rig.file import load_rig
+from icalib.tools.simulation import simulate
+from icalib.tools.simulation.sensor_bag import write_sensors
+from icalib.tools.simulation.tables import write_tables
 
 from .conftest import alone, on_ground, wheel_path
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.simulation import simulate
+from icalib.tools.simulation import simulate
 
 from .conftest import alone, on_ground, wheel_path
 
@@ -145,7 +145,7 @@ def test_readings_do_not_depend_on_how_many_are_made_at_a_time(robot, reports, m
     scenario = replace(scenario, robot_noise_enabled=False)
     assert scenario.wheels[0].reports == reports
     whole = simulate(scenario, 9).measurements.wheels[0]
-    monkeypatch.setattr("icalib.simulation.wheels._AT_A_TIME", 177)
+    monkeypatch.setattr("icalib.tools.simulation.sensors.wheels._AT_A_TIME", 177)
     parts = simulate(scenario, 9).measurements.wheels[0]
     same = "rate" if reports == "rates" else "pose"
     np.testing.assert_array_equal(getattr(parts, same), getattr(whole, same))

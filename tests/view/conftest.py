@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 import yaml
 
-from icalib.calibration import Calibration, load_calibration
+from icalib.base.extras import load_rerun
 from icalib.cli import main
-from icalib.extras import load_rerun
 from icalib.geometry.targets import AprilGrid
-from icalib.rig_file import rig_to_dict
-from icalib.simulation import Simulation, load_scenario, rig_for, simulate, write_tables
+from icalib.result import Calibration, load_calibration
+from icalib.rig.file import rig_to_dict
+from icalib.tools.simulation import Simulation, load_scenario, rig_for, simulate, write_tables
 
 THREE_D = Path(__file__).parents[2] / "examples" / "paper" / "table2-3d.yaml"
 ON_WALL = np.array([[0.0, 0.0, -1.0, 5.9], [-1.0, 0.0, 0.0, 3.9], [0.0, 1.0, 0.0, 0.1], [0.0, 0.0, 0.0, 1.0]])

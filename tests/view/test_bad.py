@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from icalib.calibration import Calibration
+from icalib.base.extras import load_rerun
 from icalib.cli import main
 from icalib.errors import CalibrationError
-from icalib.extras import load_rerun
-from icalib.view import view
+from icalib.result import Calibration
+from icalib.tools.view import view
 
 
 @pytest.fixture

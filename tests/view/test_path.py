@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.view.colors import by_value
-from icalib.view.path import Path
+from icalib.tools.view.colors import by_value
+from icalib.tools.view.path import Path
 
 
 def _pose(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icalib.calibration import TrackResiduals, rms_of_images
 from icalib.cli import main
 from icalib.pipeline import calibrate_measurements
-from icalib.simulation import load_scenario, rig_for, simulate, with_drawn_guess
+from icalib.result import TrackResiduals, rms_of_images
+from icalib.tools.simulation import load_scenario, rig_for, simulate, with_drawn_guess
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "paper" / "table2-3d.yaml"
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.calibration import Calibration, ParameterGroup, WheelResiduals
 from icalib.cli import main
 from icalib.report.ellipsoids import ellipsoids, magnification
-from icalib.view import recorded, view
+from icalib.result import Calibration, ParameterGroup, WheelResiduals
+from icalib.tools.view import recorded, view
 
 IMAGE = "world/imu0/cam0/image"
 MOST_OFF_M = 0.006  # five sigma of the LiDAR's position; 10 ms of time offset are 10 mm, a scan's 0.1 s are 100 mm

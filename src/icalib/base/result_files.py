@@ -12,10 +12,10 @@ import os
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
+from icalib.base.file_names import below
+from icalib.base.own_files import refuse_foreign
+from icalib.base.staging import staged
 from icalib.errors import CalibrationError
-from icalib.file_names import below
-from icalib.own_files import refuse_foreign
-from icalib.staging import staged
 
 COMMIT = ".icalib-commit"
 # Every name that icalib writes: a leftover of an earlier result beside a new one would be a silently wrong number.

@@ -8,10 +8,10 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
+from icalib.base.file_names import below
+from icalib.base.own_files import sealed_texts
+from icalib.base.staging import staged
 from icalib.errors import CalibrationError
-from icalib.file_names import below
-from icalib.own_files import sealed_texts
-from icalib.staging import staged
 
 
 def printable(text: str) -> str:

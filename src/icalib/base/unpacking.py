@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from icalib.file_hashes import HashedFile
+from icalib.base.file_hashes import HashedFile
 
 FREE_BYTES, RATIO = 16 << 20, 256  # sensors' data shrink to a tenth; images of one colour, and zeros, to less
 LIMIT_WORDS = f"{FREE_BYTES >> 20} MiB and {RATIO} times its size"

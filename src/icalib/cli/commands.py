@@ -9,10 +9,10 @@ import traceback
 import warnings
 from pathlib import Path
 
-from icalib.command_parser import CommandParser, add_command, add_part, count, examples, whole
+from icalib.cli.command_parser import CommandParser, add_command, add_part, count, examples, whole
+from icalib.cli.result_commands import add_result_commands
+from icalib.cli.target_command import add_target_command
 from icalib.errors import CalibrationError
-from icalib.result_commands import add_result_commands
-from icalib.target_command import add_target_command
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -204,11 +204,11 @@ def _add_workers(parser: argparse.ArgumentParser) -> None:
 def _calibrate(options: argparse.Namespace) -> int:
     import dataclasses
 
-    from icalib.calibration.verdict import EXIT_CODES
-    from icalib.console import print_result, print_warnings, progress_bar
-    from icalib.outputs import check_folder, write_outputs
+    from icalib.cli.console import print_result, print_warnings, progress_bar
+    from icalib.export.outputs import check_folder, write_outputs
     from icalib.pipeline import calibrate
-    from icalib.rig_file import load_rig
+    from icalib.result.verdict import EXIT_CODES
+    from icalib.rig.file import load_rig
 
     rig = load_rig(options.rig)
     chosen = {k: getattr(options, k) for k in ("scheme", "loss", "segments") if getattr(options, k) is not None}
@@ -228,9 +228,9 @@ def _calibrate(options: argparse.Namespace) -> int:
 
 
 def _simulate(options: argparse.Namespace) -> None:
-    from icalib.console import progress_bar
-    from icalib.simulation import load_scenario, simulate, write_sensors, write_tables
-    from icalib.simulation.tables import check_absent
+    from icalib.cli.console import progress_bar
+    from icalib.tools.simulation import load_scenario, simulate, write_sensors, write_tables
+    from icalib.tools.simulation.tables import check_absent
 
     scenario = load_scenario(options.scenario)
     seed = scenario.seed if options.seed is None else options.seed
@@ -246,9 +246,9 @@ def _simulate(options: argparse.Namespace) -> None:
 
 
 def _montecarlo(options: argparse.Namespace) -> None:
-    from icalib.console import progress_bar
-    from icalib.montecarlo import Plan, run_file
-    from icalib.montecarlo.console import print_study
+    from icalib.cli.console import progress_bar
+    from icalib.tools.montecarlo import Plan, run_file
+    from icalib.tools.montecarlo.console import print_study
 
     plan = Plan(options.runs, options.seed, options.guess, options.planes, options.workers, options.scheduler)
     with progress_bar(options.quiet) as progress:
@@ -258,10 +258,10 @@ def _montecarlo(options: argparse.Namespace) -> None:
 
 
 def _reproduce(options: argparse.Namespace) -> None:
-    from icalib.console import progress_bar
-    from icalib.montecarlo import Plan
-    from icalib.montecarlo.console import print_study
-    from icalib.montecarlo.reproduce import reproduce
+    from icalib.cli.console import progress_bar
+    from icalib.tools.montecarlo import Plan
+    from icalib.tools.montecarlo.console import print_study
+    from icalib.tools.montecarlo.reproduce import reproduce
 
     plan = Plan(options.runs, guess="drawn", workers=options.workers, scheduler=options.scheduler)
     with progress_bar(options.quiet) as progress:
@@ -273,9 +273,9 @@ def _reproduce(options: argparse.Namespace) -> None:
 
 
 def _fleet(options: argparse.Namespace) -> int:
-    from icalib.console import progress_bar
-    from icalib.fleet import Crew, run_fleet
-    from icalib.fleet.console import print_fleet
+    from icalib.cli.console import progress_bar
+    from icalib.tools.fleet import Crew, run_fleet
+    from icalib.tools.fleet.console import print_fleet
 
     crew = Crew(options.workers, options.scheduler)
     say = (lambda sentence: None) if options.quiet else print
@@ -287,13 +287,13 @@ def _fleet(options: argparse.Namespace) -> int:
 
 
 def _inspect(options: argparse.Namespace) -> None:
-    from icalib.console import progress_bar
-    from icalib.inspection import draft_rig, inspect_recording, read_target, write_draft
-    from icalib.inspection.console import print_inspection
-    from icalib.inspection.draft import check_draft
-    from icalib.inspection.figures import figures_json
-    from icalib.own_files import refuse_foreign
-    from icalib.text_files import write_sealed
+    from icalib.base.own_files import refuse_foreign
+    from icalib.base.text_files import write_sealed
+    from icalib.cli.console import progress_bar
+    from icalib.tools.inspection import draft_rig, inspect_recording, read_target, write_draft
+    from icalib.tools.inspection.console import print_inspection
+    from icalib.tools.inspection.draft import check_draft
+    from icalib.tools.inspection.figures import figures_json
 
     if options.rig:
         check_draft(options.rig)

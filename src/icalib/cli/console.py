@@ -12,11 +12,11 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.text import Text
 
-from icalib.calibration import Calibration
-from icalib.calibration.quantities import chi2_words, dof_words, rms_words
-from icalib.calibration.verdict import NEXT, Usability
 from icalib.export.kalibr import camchain_name
 from icalib.report.console import bodies_words, relative_words, table
+from icalib.result import Calibration
+from icalib.result.quantities import chi2_words, dof_words, rms_words
+from icalib.result.verdict import NEXT, Usability
 
 LINE_EVERY_S = 30.0  # between lines of progress in logs
 VERDICT_STYLES: dict[Usability, str] = {

@@ -11,7 +11,7 @@ from importlib import import_module
 from math import inf
 from typing import Any
 
-from icalib import console
+from icalib.cli import console
 
 EVERY_S = 0.2  # at most so often a notebook redraws
 

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import get_args
 
-from icalib.command_parser import CommandParser, add_command, add_part
+from icalib.cli.command_parser import CommandParser, add_command, add_part
 from icalib.rig import AccelUnit, GyroUnit
 
 
@@ -42,9 +42,9 @@ def _add_allan(commands: argparse._SubParsersAction[CommandParser]) -> None:
 
 
 def _allan(options: argparse.Namespace) -> None:
-    from icalib.allan import study_recording, write_study
-    from icalib.allan.files import check_folder
-    from icalib.allan.words import print_study
+    from icalib.tools.allan import study_recording, write_study
+    from icalib.tools.allan.files import check_folder
+    from icalib.tools.allan.words import print_study
 
     check_folder(options.output)
     study = study_recording(options.recording, options.imu, options.gyro_unit, options.accel_unit)
@@ -86,12 +86,12 @@ def _pair(text: str) -> tuple[str, str]:
 
 
 def _export(options: argparse.Namespace) -> None:
-    from icalib.calibration import load_calibration
+    from icalib.base.own_files import refuse_foreign, sealed_texts
+    from icalib.base.result_files import set_of
+    from icalib.base.text_files import write_texts
     from icalib.export.formats import export
     from icalib.export.names import ONE_FILE
-    from icalib.own_files import refuse_foreign, sealed_texts
-    from icalib.result_files import set_of
-    from icalib.text_files import write_texts
+    from icalib.result import load_calibration
 
     calibration = load_calibration(options.result)
     found = export(calibration, options.to, dict(options.frame), options.urdf, dict(options.joint))
@@ -131,13 +131,13 @@ def _add_check(commands: argparse._SubParsersAction[CommandParser]) -> None:
 
 
 def _check(options: argparse.Namespace) -> int:
-    from icalib.calibration import load_calibration
-    from icalib.check import check_calibration
-    from icalib.check.words import check_json, lines
-    from icalib.console import progress_bar
-    from icalib.own_files import refuse_foreign
-    from icalib.result_files import set_of
-    from icalib.text_files import write_sealed
+    from icalib.base.own_files import refuse_foreign
+    from icalib.base.result_files import set_of
+    from icalib.base.text_files import write_sealed
+    from icalib.cli.console import progress_bar
+    from icalib.result import load_calibration
+    from icalib.tools.check import check_calibration
+    from icalib.tools.check.words import check_json, lines
 
     if options.json:
         refuse_foreign([options.json], [*set_of(options.result), *options.recording], "choose another place")
@@ -164,11 +164,11 @@ def _add_rig(commands: argparse._SubParsersAction[CommandParser]) -> None:
 
 
 def _rig(options: argparse.Namespace) -> None:
-    from icalib.calibration import load_calibration
-    from icalib.own_files import refuse_foreign
-    from icalib.result_files import set_of
-    from icalib.result_rig import rig_text
-    from icalib.text_files import write_sealed
+    from icalib.base.own_files import refuse_foreign
+    from icalib.base.result_files import set_of
+    from icalib.base.text_files import write_sealed
+    from icalib.result import load_calibration
+    from icalib.result.as_rig import rig_text
 
     calibration = load_calibration(options.result)
     inputs = [*set_of(options.result), *(Path(name) for name in calibration.inputs)]
@@ -206,7 +206,7 @@ def _add_compare(commands: argparse._SubParsersAction[CommandParser]) -> None:
 
 
 def _tolerance(text: str) -> tuple[str, float]:
-    from icalib.comparison.units import UNITS
+    from icalib.tools.comparison.units import UNITS
 
     unit, _, number = text.partition("=")
     try:
@@ -221,12 +221,12 @@ def _tolerance(text: str) -> tuple[str, float]:
 
 
 def _compare(options: argparse.Namespace) -> int:
-    from icalib.comparison.compare import Tolerances
-    from icalib.comparison.reading import compare_files
-    from icalib.comparison.words import comparison_json, lines
-    from icalib.own_files import refuse_foreign
-    from icalib.result_files import set_of
-    from icalib.text_files import write_sealed
+    from icalib.base.own_files import refuse_foreign
+    from icalib.base.result_files import set_of
+    from icalib.base.text_files import write_sealed
+    from icalib.tools.comparison.compare import Tolerances
+    from icalib.tools.comparison.reading import compare_files
+    from icalib.tools.comparison.words import comparison_json, lines
 
     if options.json:
         inputs = [p for side in (options.a, options.b) for p in (side, *set_of(side))]
@@ -252,9 +252,9 @@ def _add_view(commands: argparse._SubParsersAction[CommandParser]) -> None:
 
 
 def _view(options: argparse.Namespace) -> None:
-    from icalib.console import progress_bar
-    from icalib.own_files import refuse_foreign
-    from icalib.view import view
+    from icalib.base.own_files import refuse_foreign
+    from icalib.cli.console import progress_bar
+    from icalib.tools.view import view
 
     if options.save is not None:
         refuse_foreign([options.save], [p for p in (options.recording,) if p], "choose another place")

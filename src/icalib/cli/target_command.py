@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from icalib.command_parser import CommandParser, add_command, count, examples, whole
+from icalib.cli.command_parser import CommandParser, add_command, count, examples, whole
 
 _MOST_IDS = 10_000  # more than any family has
 _EXAMPLES = {
@@ -29,7 +29,7 @@ _FIELDS = {
 
 def add_target_command(commands: argparse._SubParsersAction[CommandParser]) -> None:
     """`icalib target TYPE`: its options are the fields of the rig file's target."""
-    from icalib.printing import PAPERS
+    from icalib.tools.printing import PAPERS
 
     about = "write a target as PDF, to print at true scale"
     t = add_command(commands, "target", about, _EXAMPLES["aprilgrid"], "icalib target aprilgrid --help")
@@ -88,7 +88,7 @@ def _metres(text: str) -> float:
 
 def _print_target(options: argparse.Namespace) -> None:
     from icalib.geometry.targets import TARGETS
-    from icalib.printing import write_target
+    from icalib.tools.printing import write_target
 
     target = TARGETS[options.type](**{field: getattr(options, field) for field in options.fields})
     write_target(options.output, target, options.paper, getattr(options, "border_bits", None))

@@ -12,8 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from icalib.errors import RecordingError
-from icalib.measurements import (
+from icalib.data.measurements import (
     CornerStream,
     ImuStream,
     LidarStream,
@@ -23,7 +22,8 @@ from icalib.measurements import (
     WheelPoses,
     WheelStream,
 )
-from icalib.parameter import ROUNDING
+from icalib.errors import RecordingError
+from icalib.rig.parameter import ROUNDING
 
 AnyStream = ImuStream | CornerStream | TrackStream | LidarStream | WheelStream | WheelPoses | PoseStream
 

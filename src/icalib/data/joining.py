@@ -8,8 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from icalib.errors import RecordingError
-from icalib.measurements import (
+from icalib.data.measurements import (
     CornerStream,
     ImuStream,
     LidarStream,
@@ -20,6 +19,7 @@ from icalib.measurements import (
     WheelPoses,
     WheelStream,
 )
+from icalib.errors import RecordingError
 from icalib.rig import Rig
 
 PAUSE_NS = 10_000_000_000

@@ -9,8 +9,8 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
+from icalib.data.measurements import Measurements, PoseStream
 from icalib.errors import RecordingError
-from icalib.measurements import Measurements, PoseStream
 from icalib.rig import Rig
 
 

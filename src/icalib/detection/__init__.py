@@ -1,11 +1,11 @@
 """Detection: grey images -> corners of a target."""
 
-from icalib.detection.aprilgrid import AprilGridDetector
-from icalib.detection.charuco import CharucoDetector
-from icalib.detection.checkerboard import CheckerboardDetector
-from icalib.detection.corners import VERDICTS, ImageCorners, corner_stream
-from icalib.detection.diagnosis import what_is_seen
-from icalib.detection.markers import MarkerDetector
+from icalib.detection.boards.aprilgrid import AprilGridDetector
+from icalib.detection.boards.charuco import CharucoDetector
+from icalib.detection.boards.checkerboard import CheckerboardDetector
+from icalib.detection.boards.diagnosis import what_is_seen
+from icalib.detection.boards.markers import MarkerDetector
+from icalib.detection.primitives.corners import VERDICTS, ImageCorners, corner_stream
 
 __all__ = [
     "VERDICTS",

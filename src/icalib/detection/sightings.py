@@ -7,7 +7,7 @@ from math import ceil
 
 import numpy as np
 
-from icalib.detection.corners import KEPT, VERDICTS, ImageCorners
+from icalib.detection.primitives.corners import KEPT, VERDICTS, ImageCorners
 from icalib.geometry.targets import Markers, Scene, Target
 
 LEAST_IMAGES = 3  # with a tag whose id nobody listed; fewer may be chance

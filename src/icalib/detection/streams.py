@@ -12,12 +12,13 @@ from functools import partial
 
 import numpy as np
 
-from icalib.detection.board_diagnosis import other_columns, other_size
-from icalib.detection.cache import keep_corners, load_corners, stream_key
-from icalib.detection.corners import ImageCorners, corner_stream, packed
-from icalib.detection.detectors import Detector, detector_of
-from icalib.detection.diagnosis import what_is_seen, with_other_border, with_other_layout
-from icalib.detection.image_work import (
+from icalib.data.measurements import CornerStream
+from icalib.data.recordings import DamagedImageError, Payload, Recording, decode
+from icalib.detection.boards.board_diagnosis import other_columns, other_size
+from icalib.detection.boards.detectors import Detector, detector_of
+from icalib.detection.boards.diagnosis import what_is_seen, with_other_border, with_other_layout
+from icalib.detection.images.cache import keep_corners, load_corners, stream_key
+from icalib.detection.images.image_work import (
     Progress,
     batches_of,
     image_count,
@@ -27,13 +28,12 @@ from icalib.detection.image_work import (
     with_resolution,
     words_on_damaged,
 )
-from icalib.detection.prediction import MOTION_IMAGES
+from icalib.detection.primitives.corners import ImageCorners, corner_stream, packed
+from icalib.detection.primitives.prediction import MOTION_IMAGES
 from icalib.detection.sightings import parts_of, sightings, without_rare_tags
 from icalib.detection.turns import number_continuously
 from icalib.errors import RecordingError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Markers, Scene, Target
-from icalib.measurements import CornerStream
-from icalib.recordings import DamagedImageError, Payload, Recording, decode
 from icalib.rig import Camera
 
 # Of a target's points, and of free tags' corners, an image on average: with fewer the border may be another one.

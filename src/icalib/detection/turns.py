@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from icalib.detection.corners import ImageCorners
+from icalib.detection.primitives.corners import ImageCorners
 from icalib.detection.sightings import parts_of
 from icalib.geometry.targets import Target
 

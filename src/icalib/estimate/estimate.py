@@ -7,11 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from icalib.estimation import pages
-from icalib.estimation.assembly import Following, assemble, host_times, nodes_for, resample
-from icalib.estimation.border import NOTHING
-from icalib.estimation.corner_factor import CornerNoise
-from icalib.estimation.corner_noise import (
+from icalib.estimate.evidence.corner_noise import (
     COMMON_ERRORS,
     FIRST_TAU_PX,
     NoiseModel,
@@ -20,21 +16,25 @@ from icalib.estimation.corner_noise import (
     image_speed,
     scale_common_errors,
 )
-from icalib.estimation.corner_outliers import inliers
-from icalib.estimation.evidence import fits
-from icalib.estimation.feature_noise import first_following, next_following
-from icalib.estimation.guess_priors import guess_priors
-from icalib.estimation.image_pairs import not_simultaneous
-from icalib.estimation.inputs import Inputs
-from icalib.estimation.lidar_factor import LidarFactor
-from icalib.estimation.outcome import Outcome, Step, Visit, way_come
-from icalib.estimation.prior_factor import Prior, without_priors
-from icalib.estimation.problem import Problem
-from icalib.estimation.robot import RobotNoise, next_posing, next_ranging
-from icalib.estimation.sensors import chi2
-from icalib.estimation.solver import minimise
-from icalib.estimation.state import State
+from icalib.estimate.evidence.evidence import fits
+from icalib.estimate.evidence.feature_noise import first_following, next_following
+from icalib.estimate.problem.assembly import Following, assemble, host_times, nodes_for, resample
+from icalib.estimate.problem.guess_priors import guess_priors
+from icalib.estimate.problem.inputs import Inputs
+from icalib.estimate.problem.outcome import Outcome, Step, Visit, way_come
+from icalib.estimate.problem.problem import Problem
+from icalib.estimate.problem.solver import minimise
+from icalib.motion.factor import chi2
+from icalib.optim import pages
+from icalib.optim.border import NOTHING
+from icalib.optim.prior_factor import Prior, without_priors
+from icalib.optim.state import State
 from icalib.rig import PoseSensor
+from icalib.sensors.camera.corner_factor import CornerNoise
+from icalib.sensors.camera.corner_outliers import inliers
+from icalib.sensors.camera.image_pairs import not_simultaneous
+from icalib.sensors.lidar.residual import LidarFactor
+from icalib.sensors.robot import RobotNoise, next_posing, next_ranging
 
 LOOSE = 3.0  # times the prior uncertainty of a guess
 LEAST_LEFT = 0.2  # of the residuals of poses: where the motion takes all, nothing is left to show their noise

@@ -14,14 +14,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.estimate import Estimate
-from icalib.estimation.evidence import DRAW_STEP, bare_residuals
-from icalib.estimation.imu_data import joined_imu_data
-from icalib.estimation.imu_factor import ImuFactor
-from icalib.estimation.inputs import Inputs
-from icalib.estimation.outcome import Outcome
-from icalib.estimation.solver import minimise
+from icalib.estimate.estimate import Estimate
+from icalib.estimate.evidence.evidence import DRAW_STEP, bare_residuals
+from icalib.estimate.problem.inputs import Inputs
+from icalib.estimate.problem.outcome import Outcome
+from icalib.estimate.problem.solver import minimise
+from icalib.motion.imu_data import joined_imu_data
 from icalib.rig import ImuNoise
+from icalib.sensors.imu.residual import ImuFactor
 
 ROUNDS = 12  # the scales converge linearly
 SETTLED = 0.05  # of a scale, in logarithms

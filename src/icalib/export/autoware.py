@@ -6,7 +6,6 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from icalib.calibration import Calibration
 from icalib.export.common import (
     Export,
     drives,
@@ -18,6 +17,7 @@ from icalib.export.common import (
     time_offsets,
     yaml_text,
 )
+from icalib.result import Calibration
 
 KIT = "sensor_kit_base_link"
 # Axes of a camera's body frame (x forward, y left, z up; REP 103) in its optical frame (z forward, x right, y down).

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from icalib.calibration import Calibration
 from icalib.export.common import Export, Lens, guesses, inverse, lens_of, need, no_place_for, quaternion, time_offsets
+from icalib.result import Calibration
 
 # COLMAP's name of a camera model of ours, and how many coefficients it has; those that we do not have are 0.
 _MODELS = {

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import yaml
 
-from icalib.calibration import Calibration
 from icalib.errors import CalibrationError
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.cameras.convert import fit_model
+from icalib.result import Calibration
 
 
 @dataclass(frozen=True)

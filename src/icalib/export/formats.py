@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from icalib.calibration import Calibration
+from icalib.base.yaml_nodes import suggestion
 from icalib.errors import CalibrationError
 from icalib.export.autoware import autoware
 from icalib.export.colmap import colmap
@@ -20,7 +20,7 @@ from icalib.export.plain import plain_json
 from icalib.export.ros import camera_info, ros2_static
 from icalib.export.urdf import updated_urdf, urdf
 from icalib.export.vins_fusion import vins_fusion
-from icalib.yaml_nodes import suggestion
+from icalib.result import Calibration
 
 
 def export(

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import yaml
 
-from icalib.calibration import Calibration, CornerResiduals, image_of
 from icalib.errors import CalibrationError
 from icalib.export.common import inverse, restarts, time_offset
 from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.cameras.convert import fit_model
+from icalib.result import Calibration, CornerResiduals, image_of
 
 # Our model -> Kalibr's camera and distortion model, and which of our distortion stand before its focal lengths.
 KALIBR_MODELS = {
@@ -130,7 +130,7 @@ def _lens_fields(model: str, params: np.ndarray) -> dict[str, Any]:
 def _intrinsics(c: Calibration) -> dict[str, Any]:
     """Kalibr's scale-misalignment model, gyro = M C_gyro_i w + A C_gyro_i f, where the IMU is not taken for ideal.
 
-    Our g-sensitivity acts on f in the accelerometer's axes (estimation.imu_model), so A = A_ours C_gyro_i^T.
+    Our g-sensitivity acts on f in the accelerometer's axes (motion.imu_model), so A = A_ours C_gyro_i^T.
     """
     groups = [g for g in c.groups if (g.sensor, g.name) == (c.imu, "intrinsics")]
     if not groups or (groups[0].mode == "fixed" and not groups[0].value.any()):

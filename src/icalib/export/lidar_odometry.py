@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from icalib.calibration import Calibration
 from icalib.export.common import (
     Export,
     Lens,
@@ -20,6 +19,7 @@ from icalib.export.common import (
     topic,
     yaml_text,
 )
+from icalib.result import Calibration
 
 _MERGE = "For {0}, by icalib: put these fields into its own configuration, which has others besides."
 # FAST-LIVO2's name of a camera model of ours, and of its coefficients.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from icalib.calibration import Calibration
 from icalib.export.common import (
     Export,
     guesses,
@@ -17,6 +16,7 @@ from icalib.export.common import (
     yaml_text,
 )
 from icalib.export.openvins import HEAD, MODELS
+from icalib.result import Calibration
 
 _MERGE = "Put these fields into MINS's file of the same name; it has others besides, which are not calibrated."
 _TIME = "t_imu = t_{0} + timeoffset [s]."

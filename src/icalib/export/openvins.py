@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from icalib.calibration import Calibration
 from icalib.errors import CalibrationError
 from icalib.export.common import (
     Export,
@@ -22,6 +21,7 @@ from icalib.export.common import (
 )
 from icalib.export.kalibr import cam_overlaps, lower
 from icalib.geometry import so3
+from icalib.result import Calibration
 
 HEAD = "%YAML:1.0\n"
 MODELS = {"pinhole-radtan": "radtan", "pinhole-equidistant": "equidistant"}

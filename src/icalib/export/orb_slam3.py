@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.calibration import Calibration
 from icalib.errors import CalibrationError
 from icalib.export.common import (
     Export,
@@ -19,6 +18,7 @@ from icalib.export.common import (
     time_offsets,
 )
 from icalib.geometry.cameras import camera_model
+from icalib.result import Calibration
 
 # ORB-SLAM3's name of a camera model of ours; of a rig with two cameras both must have the same.
 _TYPES = {

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from icalib.calibration import Calibration, calibration_files
+from icalib.base.own_files import sealed
+from icalib.base.result_files import check_writable, refuse_foreign_set, write_files
+from icalib.base.text_files import printable
 from icalib.export.kalibr import camchain, camchain_name, imu_yaml
-from icalib.own_files import sealed
 from icalib.report import report_html
-from icalib.result_files import check_writable, refuse_foreign_set, write_files
-from icalib.text_files import printable
+from icalib.result import Calibration, calibration_files
 
 
 def write_outputs(calibration: Calibration, folder: str | Path) -> None:

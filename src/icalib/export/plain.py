@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import yaml
 
-from icalib.calibration import Calibration
-from icalib.calibration.summary import calibration_yaml, pose_key
+from icalib.base.text_files import printable
 from icalib.export.common import Export, body_frame, guesses, quaternion
-from icalib.text_files import printable
+from icalib.result import Calibration
+from icalib.result.summary import calibration_yaml, pose_key
 
 
 def plain_json(c: Calibration) -> Export:

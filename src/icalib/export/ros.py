@@ -6,7 +6,6 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from icalib.calibration import Calibration
 from icalib.export.common import (
     Export,
     Lens,
@@ -20,6 +19,7 @@ from icalib.export.common import (
     time_offsets,
     yaml_text,
 )
+from icalib.result import Calibration
 
 _DISTORTION = {
     "pinhole-radtan": "plumb_bob",

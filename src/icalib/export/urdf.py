@@ -10,18 +10,9 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from icalib.calibration import Calibration
-from icalib.export.common import (
-    Export,
-    drives,
-    guesses,
-    imu_intrinsics,
-    inverse,
-    no_place_for,
-    rpy,
-    time_offsets,
-)
+from icalib.export.common import Export, drives, guesses, imu_intrinsics, inverse, no_place_for, rpy, time_offsets
 from icalib.export.urdf_tree import Joint, UrdfTree, read_urdf
+from icalib.result import Calibration
 
 _TOO_DEEP = 1e-12
 

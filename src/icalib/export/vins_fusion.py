@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from math import sqrt
 
-from icalib.calibration import Calibration
 from icalib.errors import CalibrationError
 from icalib.export.common import (
     Export,
@@ -19,6 +18,7 @@ from icalib.export.common import (
     time_offset,
     topic,
 )
+from icalib.result import Calibration
 
 _MODELS = ("pinhole-radtan", "pinhole-equidistant", "omni-radtan")
 _MOST = 2

@@ -12,7 +12,7 @@ import numpy as np
 from numba import types
 from numba.extending import get_cython_function_address
 
-from icalib.compiled import njit
+from icalib.base.compiled import njit
 
 _TEXT, _INT, _REAL = types.CPointer(types.uint8), types.CPointer(types.int32), types.CPointer(types.float64)
 

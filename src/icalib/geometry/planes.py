@@ -12,7 +12,7 @@ from math import cos, sin, sqrt
 
 import numpy as np
 
-from icalib.compiled import njit
+from icalib.base.compiled import njit
 from icalib.geometry import so3
 
 

@@ -6,7 +6,7 @@ from math import sqrt
 
 import numpy as np
 
-from icalib.compiled import njit
+from icalib.base.compiled import njit
 
 SWEEPS = 12  # of rotations at most; five are usual
 # Loops throughout: array expressions compile ten times as slowly, and are no faster on matrices this small.

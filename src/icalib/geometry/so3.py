@@ -10,7 +10,7 @@ from math import atan2, cos, sin, sqrt
 
 import numpy as np
 
-from icalib.compiled import njit
+from icalib.base.compiled import njit
 
 # Below this angle squared, series in theta^2 are used. Four terms leave a relative error under 1e-16 at the border,
 # where (theta - sin theta) / theta^3 still has 13 digits in closed form.

@@ -7,24 +7,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
-from icalib.estimation.bodies import choose_bodies, restrict
-from icalib.estimation.imu_data import ImuData, imu_data
-from icalib.estimation.state import Key
-from icalib.first_guess.align_camera import align_camera, chosen_offset, trusted
-from icalib.first_guess.clocks import Alignment, camera_rates
-from icalib.first_guess.contradicted import chosen, chosen_along
-from icalib.first_guess.guess import CameraGuess, Guess, relative_offset
-from icalib.first_guess.gyro import GyroRotation
-from icalib.first_guess.imu_ways import refuse_other_axes
-from icalib.first_guess.lever_arm import LeverArm, check_gravity, check_size, lever_arm
-from icalib.first_guess.scene import Placed, scene_poses
-from icalib.first_guess.scene_lens import find_scene, lens_of
-from icalib.first_guess.target_poses import TargetPoses
-from icalib.first_guess.without_imu import guess_without_imu, trajectory_without_imu
 from icalib.geometry.cameras import camera_model
-from icalib.measurements import Measurements
+from icalib.initialize.boards.scene import Placed, scene_poses
+from icalib.initialize.boards.scene_lens import find_scene, lens_of
+from icalib.initialize.steps.align_camera import align_camera, chosen_offset, trusted
+from icalib.initialize.steps.clocks import Alignment, camera_rates
+from icalib.initialize.steps.contradicted import chosen, chosen_along
+from icalib.initialize.steps.guess import CameraGuess, Guess, relative_offset
+from icalib.initialize.steps.gyro import GyroRotation
+from icalib.initialize.steps.lever_arm import LeverArm, check_gravity, check_size, lever_arm
+from icalib.initialize.steps.target_poses import TargetPoses
+from icalib.initialize.without_imu import guess_without_imu, trajectory_without_imu
+from icalib.motion.imu_data import ImuData, imu_data
+from icalib.optim.state import Key
 from icalib.rig import Camera, Rig
+from icalib.sensors.camera.bodies import choose_bodies, restrict
+from icalib.sensors.imu.imu_ways import refuse_other_axes
 
 __all__ = ["CameraGuess", "Guess", "initial_guess", "initial_trajectory"]
 

@@ -16,23 +16,21 @@ from dataclasses import replace
 
 import numpy as np
 
+from icalib.data.measurements import ImuStream, Measurements
 from icalib.errors import EstimationError
-from icalib.estimation.assembly import host_times, nodes_for, start_values
-from icalib.estimation.board import board_in
-from icalib.estimation.inputs import Inputs, inputs_for
-from icalib.estimation.nodes import first_nodes
-from icalib.estimation.pose_factor import FRAME, frame_of
-from icalib.estimation.state import Key, State
-from icalib.first_guess.keyframe_spacing import keyframe_spacing
-from icalib.first_guess.lidar_rounds import given
-from icalib.first_guess.pose_ways import TURNED, WAYS
-from icalib.first_guess.poses import NAMES, check_rate, pose_values
-from icalib.first_guess.robot import wheel_values
-from icalib.first_guess.several import initial_guesses
-from icalib.first_guess.smooth_path import FEWEST, BodyPoses, SmoothPath
-from icalib.first_guess.stop_and_go import is_stop_and_go, start_from_pairs
-from icalib.first_guess.tracks_on_motion import track_camera_values
-from icalib.first_guess.wheel_path import (
+from icalib.estimate.problem.assembly import host_times, nodes_for, start_values
+from icalib.estimate.problem.inputs import Inputs, inputs_for
+from icalib.geometry.targets.base import BOARD
+from icalib.initialize.lidar.lidar_rounds import given
+from icalib.initialize.poses.pose_ways import TURNED, WAYS
+from icalib.initialize.poses.poses import NAMES, check_rate, pose_values
+from icalib.initialize.robot import wheel_values
+from icalib.initialize.several import initial_guesses
+from icalib.initialize.steps.keyframe_spacing import keyframe_spacing
+from icalib.initialize.steps.smooth_path import FEWEST, BodyPoses, SmoothPath
+from icalib.initialize.stop_and_go import is_stop_and_go, start_from_pairs
+from icalib.initialize.tracks.tracks_on_motion import track_camera_values
+from icalib.initialize.wheels.wheel_path import (
     as_given,
     camera_paths,
     in_place_of_wheels,
@@ -40,11 +38,13 @@ from icalib.first_guess.wheel_path import (
     seen_from_first,
     wheel_path,
 )
-from icalib.first_guess.wheels import SidewaysError
-from icalib.geometry.targets.base import BOARD
-from icalib.measurements import ImuStream, Measurements
-from icalib.parameter import Parameter, fixed
+from icalib.initialize.wheels.wheels import SidewaysError
+from icalib.motion.nodes import first_nodes
+from icalib.optim.state import Key, State
 from icalib.rig import ImuNoise, ImuSensor, Rig
+from icalib.rig.parameter import Parameter, fixed
+from icalib.sensors.camera.board import board_in
+from icalib.sensors.pose.residual import FRAME, frame_of
 
 ASSUMPTION = "assumed motion"  # no sensor is called so
 STEP_S = 0.01  # between readings

@@ -12,21 +12,21 @@ from functools import partial
 
 import numpy as np
 
+from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
-from icalib.estimation.arrowhead import NotDefiniteError
-from icalib.estimation.contradictions import Contradiction, contradicted_by
-from icalib.estimation.determination import Determined, determine
-from icalib.estimation.evidence import chi2_by_kind
-from icalib.estimation.groups import AnySensor, groups_of, with_groups
-from icalib.estimation.inputs import Inputs
-from icalib.estimation.outcome import Step, Visit
-from icalib.estimation.pages import give_back
-from icalib.estimation.problem import Problem
-from icalib.first_guess.contradicted import FarOffError, is_contradicted, refusing_far_off
-from icalib.first_guess.lidar_sight import naming_sight
-from icalib.first_guess.parallax import no_parallax
-from icalib.first_guess.start import start
-from icalib.measurements import Measurements
+from icalib.estimate.evidence.evidence import chi2_by_kind
+from icalib.estimate.problem.groups import AnySensor, groups_of, with_groups
+from icalib.estimate.problem.inputs import Inputs
+from icalib.estimate.problem.outcome import Step, Visit
+from icalib.estimate.problem.problem import Problem
+from icalib.initialize.lidar.lidar_sight import naming_sight
+from icalib.initialize.parallax import no_parallax
+from icalib.initialize.start import start
+from icalib.initialize.steps.contradicted import FarOffError, is_contradicted, refusing_far_off
+from icalib.observability.contradictions import Contradiction, contradicted_by
+from icalib.observability.determination import Determined, determine
+from icalib.optim.arrowhead import NotDefiniteError
+from icalib.optim.pages import give_back
 from icalib.rig import LENS, Parameter, Rig
 
 POOR_FIT = 4.0  # times as large as their noise are the residuals of some sensor

@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from icalib.data.measurements import LidarStream, Measurements
 from icalib.errors import EstimationError
-from icalib.first_guess.lidar_odometry import MOST_MAPPED, LidarPath, lidar_path, scans_of
 from icalib.geometry import so3
-from icalib.measurements import LidarStream, Measurements
+from icalib.initialize.lidar.lidar_odometry import MOST_MAPPED, LidarPath, lidar_path, scans_of
 
 REACH_M = 2.5  # a robot does not reach further from its LiDAR
 VOXEL_M = 0.1

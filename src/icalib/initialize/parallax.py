@@ -6,13 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
-from icalib.estimation.imu_data import imu_data
-from icalib.first_guess.from_tracks import lens_start
-from icalib.first_guess.track_alignment import Pair, pairs_of
-from icalib.first_guess.track_rotation import start_turn, turn_between, turn_error
 from icalib.geometry.cameras import camera_model
-from icalib.measurements import Measurements
+from icalib.initialize.steps.track_rotation import start_turn, turn_between, turn_error
+from icalib.initialize.tracks.from_tracks import lens_start
+from icalib.initialize.tracks.track_alignment import Pair, pairs_of
+from icalib.motion.imu_data import imu_data
 from icalib.rig import Rig
 
 # Times the error of rays: what is left of two images by rotation alone is two errors on two axes, and that by epipolar

@@ -7,25 +7,25 @@ from functools import partial
 
 import numpy as np
 
+from icalib.data.measurements import WheelPoses, WheelStream
 from icalib.errors import EstimationError
-from icalib.estimation.assembly import motion_of
-from icalib.estimation.clocks import instants
-from icalib.estimation.ground_factor import HEIGHT_BLOCK
-from icalib.estimation.inputs import Inputs
-from icalib.estimation.lidar_sweep import Motion
-from icalib.estimation.pose_factor import FRAME, frame_of
-from icalib.estimation.robot import MOUNT
-from icalib.estimation.state import Key, State
-from icalib.estimation.wheel_angles import integrals_of
-from icalib.first_guess.by_recording import alone, each_clock
-from icalib.first_guess.contradicted import has_guesses, is_contradicted, refuse_far_off, settled
-from icalib.first_guess.known_motion import imu_poses, is_known
-from icalib.first_guess.lidar_rounds import NAMES, given, lidar_values, with_lidars
-from icalib.first_guess.poses import pose_values
-from icalib.first_guess.wheel_poses import mount_guess, poses_offset
-from icalib.first_guess.wheels import OPPOSITE, SidewaysError, WheelRates, drive_guess, wheel_offset, wheel_rates
-from icalib.measurements import WheelPoses, WheelStream
+from icalib.estimate.problem.assembly import motion_of
+from icalib.estimate.problem.inputs import Inputs
+from icalib.initialize.lidar.lidar_rounds import NAMES, given, lidar_values, with_lidars
+from icalib.initialize.poses.poses import pose_values
+from icalib.initialize.steps.by_recording import alone, each_clock
+from icalib.initialize.steps.contradicted import has_guesses, is_contradicted, refuse_far_off, settled
+from icalib.initialize.wheels.wheel_poses import mount_guess, poses_offset
+from icalib.initialize.wheels.wheels import OPPOSITE, SidewaysError, WheelRates, drive_guess, wheel_offset, wheel_rates
+from icalib.motion.clocks import instants
+from icalib.motion.known_motion import imu_poses, is_known
+from icalib.motion.sweep import Motion
+from icalib.optim.state import Key, State
 from icalib.rig import Wheels
+from icalib.sensors.pose.residual import FRAME, frame_of
+from icalib.sensors.robot import MOUNT
+from icalib.sensors.wheels.ground_factor import HEIGHT_BLOCK
+from icalib.sensors.wheels.wheel_angles import integrals_of
 
 LEVEL = 0.7  # cosine of the axis that a vehicle turns about with z of a frame: 45 degrees off, the frame is not level
 SIMPSON = np.array([1.0, 4.0, 1.0]) / 6.0

@@ -7,20 +7,20 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from icalib.data.measurements import Measurements
 from icalib.errors import CalibrationError, EstimationError
-from icalib.estimation.bodies import Bodies
-from icalib.estimation.imu_data import imu_data
-from icalib.first_guess import initial_guess
-from icalib.first_guess.clocks import OneAxisError, better_offset, camera_rates
-from icalib.first_guess.from_tracks import guess_from_tracks
-from icalib.first_guess.guess import CameraGuess, Guess
-from icalib.first_guess.scene import Placed, scene_poses
-from icalib.first_guess.scene_changes import check_scene
-from icalib.first_guess.scene_lens import find_scene
 from icalib.geometry.cameras import camera_model
-from icalib.measurements import Measurements
-from icalib.parameter import fixed
+from icalib.initialize import initial_guess
+from icalib.initialize.boards.scene import Placed, scene_poses
+from icalib.initialize.boards.scene_changes import check_scene
+from icalib.initialize.boards.scene_lens import find_scene
+from icalib.initialize.steps.clocks import OneAxisError, better_offset, camera_rates
+from icalib.initialize.steps.guess import CameraGuess, Guess
+from icalib.initialize.tracks.from_tracks import guess_from_tracks
+from icalib.motion.imu_data import imu_data
 from icalib.rig import Camera, Rig
+from icalib.rig.parameter import fixed
+from icalib.sensors.camera.bodies import Bodies
 
 
 def initial_guesses(rig: Rig, bodies: Bodies, recordings: Sequence[Measurements]) -> tuple[Guess, ...]:

@@ -7,31 +7,31 @@ from dataclasses import replace
 
 import numpy as np
 
+from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
-from icalib.estimation.assembly import host_times, nodes_for, resample, start_values
-from icalib.estimation.board import board_in
-from icalib.estimation.bodies import without_bodies
-from icalib.estimation.estimate import first_pass
-from icalib.estimation.inputs import Inputs, inputs_for, with_clouds
-from icalib.estimation.nodes import first_nodes
-from icalib.estimation.state import Key, State
-from icalib.first_guess import Guess, initial_trajectory
-from icalib.first_guess.assumed_motion import start_without_imu
-from icalib.first_guess.board_turns import number_alike
-from icalib.first_guess.by_recording import each_clock
-from icalib.first_guess.clocks import OneAxisError
-from icalib.first_guess.lidar_rounds import state_from_lidar
-from icalib.first_guess.own_robot import without_own_robot
-from icalib.first_guess.poses import pose_values, state_from_poses
-from icalib.first_guess.robot import wheel_values, with_robot
-from icalib.first_guess.scene_growth import UntiedBodiesError
-from icalib.first_guess.several import initial_guesses
-from icalib.first_guess.targets_on_motion import with_mounts_guessed
-from icalib.first_guess.tracks_on_motion import track_camera_values
+from icalib.estimate.estimate import first_pass
+from icalib.estimate.problem.assembly import host_times, nodes_for, resample, start_values
+from icalib.estimate.problem.inputs import Inputs, inputs_for, with_clouds
 from icalib.geometry.targets import NoTarget
 from icalib.geometry.targets.base import BOARD
-from icalib.measurements import Measurements
+from icalib.initialize import Guess, initial_trajectory
+from icalib.initialize.assumed_motion import start_without_imu
+from icalib.initialize.boards.board_turns import number_alike
+from icalib.initialize.boards.scene_growth import UntiedBodiesError
+from icalib.initialize.boards.targets_on_motion import with_mounts_guessed
+from icalib.initialize.lidar.lidar_rounds import state_from_lidar
+from icalib.initialize.own_robot import without_own_robot
+from icalib.initialize.poses.poses import pose_values, state_from_poses
+from icalib.initialize.robot import wheel_values, with_robot
+from icalib.initialize.several import initial_guesses
+from icalib.initialize.steps.by_recording import each_clock
+from icalib.initialize.steps.clocks import OneAxisError
+from icalib.initialize.tracks.tracks_on_motion import track_camera_values
+from icalib.motion.nodes import first_nodes
+from icalib.optim.state import Key, State
 from icalib.rig import Rig
+from icalib.sensors.camera.board import board_in
+from icalib.sensors.camera.bodies import without_bodies
 
 
 def start(

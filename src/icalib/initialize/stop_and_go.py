@@ -11,24 +11,24 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from icalib.data.checks.stops import stands_still_between
+from icalib.data.measurements import Measurements, PoseStream
+from icalib.data.recordings.several import naming
 from icalib.errors import EstimationError
-from icalib.estimation.assembly import host_times, nodes_for, start_values
-from icalib.estimation.board import board_in
-from icalib.estimation.inputs import Inputs, inputs_for
-from icalib.estimation.pose_factor import FRAME, frame_of
-from icalib.estimation.pose_rows import Mount
-from icalib.estimation.state import Key, State
-from icalib.first_guess.hand_eye import LARGEST_LEFT, HandEye, PosePairs, hand_eye, left_over, outliers, turns_of
-from icalib.first_guess.lidar_rounds import NAMES, given
-from icalib.first_guess.pose_pairs import partners
-from icalib.first_guess.pose_ways import placed
-from icalib.first_guess.smooth_path import BodyPoses
+from icalib.estimate.problem.assembly import host_times, nodes_for, start_values
+from icalib.estimate.problem.inputs import Inputs, inputs_for
 from icalib.geometry.targets.base import BOARD
-from icalib.measurements import Measurements, PoseStream
-from icalib.parameter import fixed
-from icalib.recordings.several import naming
-from icalib.recordings.stops import stands_still_between
+from icalib.initialize.lidar.lidar_rounds import NAMES, given
+from icalib.initialize.poses.pose_pairs import partners
+from icalib.initialize.poses.pose_ways import placed
+from icalib.initialize.steps.hand_eye import LARGEST_LEFT, HandEye, PosePairs, hand_eye, left_over, outliers, turns_of
+from icalib.initialize.steps.smooth_path import BodyPoses
+from icalib.motion.pose_rows import Mount
+from icalib.optim.state import Key, State
 from icalib.rig import PoseSensor, Rig
+from icalib.rig.parameter import fixed
+from icalib.sensors.camera.board import board_in
+from icalib.sensors.pose.residual import FRAME, frame_of
 
 FEWEST_PAIRS = 3  # of one recording
 NO_TURN_DEG = 1e-3  # between poses, which has no noise even: of a sensor without rotations

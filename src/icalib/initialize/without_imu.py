@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
-from icalib.estimation.bodies import taken_at_once
-from icalib.estimation.state import Key
-from icalib.first_guess.guess import CameraGuess, Guess, relative_offset
-from icalib.first_guess.target_poses import TargetPoses
 from icalib.geometry import so3
-from icalib.measurements import Measurements
+from icalib.initialize.steps.guess import CameraGuess, Guess, relative_offset
+from icalib.initialize.steps.target_poses import TargetPoses
+from icalib.optim.state import Key
 from icalib.rig import Rig
+from icalib.sensors.camera.bodies import taken_at_once
 
 MOST_PAIRS = 200  # of images taken together; more do not make a first guess better
 Scene = dict[Key, np.ndarray]

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from icalib.estimation.state import Key, Layout, State
-from icalib.measurements import Stream, WheelPoses
+from icalib.data.measurements import Stream, WheelPoses
+from icalib.optim.state import Key, Layout, State
 
 EARLY_S = 5.0  # by which what a stamp stands for may come before it; recordings are further apart
 

@@ -7,9 +7,9 @@ from typing import Protocol
 
 import numpy as np
 
-from icalib.estimation.arrowhead import Piece
-from icalib.estimation.imu_data import ImuData
-from icalib.estimation.state import State
+from icalib.motion.imu_data import ImuData
+from icalib.optim.arrowhead import Piece
+from icalib.optim.state import State
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icalib.compiled import njit
-from icalib.estimation.imu_data import ImuData
-from icalib.estimation.integration import Increment, start, to_the_end, whole
-from icalib.estimation.state import State
+from icalib.base.compiled import njit
+from icalib.motion.imu_data import ImuData
+from icalib.motion.integration import Increment, start, to_the_end, whole
+from icalib.optim.state import State
 
 
 class Nodes(NamedTuple):

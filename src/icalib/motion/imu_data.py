@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.joining import Part
-from icalib.measurements import ImuStream, Measurements
-from icalib.recordings.clocks import usual_step
+from icalib.data.joining import Part
+from icalib.data.measurements import ImuStream, Measurements
+from icalib.data.stamps.clocks import usual_step
 from icalib.rig import ImuNoise, Rig
 
 GAP_S, GAP = 0.01, 3.0  # an interval longer than both this and so many periods is a gap

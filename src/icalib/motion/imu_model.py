@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.compiled import njit
+from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.geometry.small import mul3, tmul3
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.estimation.lidar_sweep import Motion
-from icalib.estimation.poses import Poses, assign_nodes, poses_at
+from icalib.motion.poses import Poses, assign_nodes, poses_at
+from icalib.motion.sweep import Motion
 
 NEAR_NODE_S = 0.15  # a scan of a LiDAR alone goes on so long after its node
 

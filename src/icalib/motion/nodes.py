@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.estimation.imu_data import ImuData
+from icalib.motion.imu_data import ImuData
 
 MERGED_WITHIN_S = 2e-3  # images closer than this share a node
 SLACK = 0.1  # of the spacing: a camera of 20 Hz whose stamps jitter needs no node in between

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.compiled import njit
+from icalib.base.compiled import njit
 
 COARSE_POINTS = 3_000_000  # of a LiDAR, where some of its points will do
 FEW = 20_000  # points of a plane that are all looked at

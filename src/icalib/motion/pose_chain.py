@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.compiled import njit
+from icalib.base.compiled import njit
 from icalib.geometry import so3
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.compiled import njit
+from icalib.base.compiled import njit
 from icalib.geometry import so3
 
 

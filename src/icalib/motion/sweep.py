@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icalib.compiled import njit
-from icalib.estimation.from_nodes import Moving, integrate_from_node, nodes_of, nothing_carried, place, ways_from
-from icalib.estimation.imu_data import ImuData
-from icalib.estimation.integration import Increment, correction, readings_of
-from icalib.estimation.poses import assign_nodes
-from icalib.estimation.state import State
+from icalib.base.compiled import njit
 from icalib.geometry.small import mul3
+from icalib.motion.from_nodes import Moving, integrate_from_node, nodes_of, nothing_carried, place, ways_from
+from icalib.motion.imu_data import ImuData
+from icalib.motion.integration import Increment, correction, readings_of
+from icalib.motion.poses import assign_nodes
+from icalib.optim.state import State
 
 NO_COLUMNS = np.int64(0)  # of Jacobians; the literal 0 would be a type of its own, for which all is compiled once more
 

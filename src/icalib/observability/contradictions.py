@@ -13,15 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.border import restricted_root
-from icalib.estimation.determination import Determined, determine, judge, scatter
-from icalib.estimation.evidence import fits
-from icalib.estimation.groups import sensors_of
-from icalib.estimation.inputs import Inputs, origin_difference
-from icalib.estimation.relaxed import Relaxed, freed_inputs, stated_keys
-from icalib.estimation.state import Block, Key, State
-from icalib.estimation.tolerances import GUESS_SIGMA
+from icalib.estimate.evidence.evidence import fits
+from icalib.estimate.problem.groups import sensors_of
+from icalib.estimate.problem.inputs import Inputs, origin_difference
+from icalib.estimate.problem.tolerances import GUESS_SIGMA
 from icalib.geometry import so3
+from icalib.observability.determination import Determined, determine, judge, scatter
+from icalib.observability.relaxed import Relaxed, freed_inputs, stated_keys
+from icalib.optim.border import restricted_root
+from icalib.optim.state import Block, Key, State
 from icalib.rig import Parameter
 
 SIGMAS = 4.0

@@ -22,18 +22,18 @@ import numpy as np
 from scipy.linalg import LinAlgError, eigh
 
 from icalib.errors import EstimationError
-from icalib.estimation.assembly import given_priors
-from icalib.estimation.border import HELD_BELOW, essential_information, restricted_root
-from icalib.estimation.debias import Spurious, spurious_information
-from icalib.estimation.estimate import EARLY_DECREASE, EARLY_SHARE, Estimate, OnVisit, estimate
-from icalib.estimation.guess_worth import astray, in_proportion, moved_to_guess, moved_to_worth, owed_to_guess
-from icalib.estimation.inflation import LEAST, inflation, with_priors_weighed
-from icalib.estimation.inputs import Inputs
-from icalib.estimation.outcome import Outcome, Step
-from icalib.estimation.prior_factor import without_priors
-from icalib.estimation.problem import Problem
-from icalib.estimation.solver import minimise
-from icalib.estimation.state import Key, State
+from icalib.estimate.estimate import EARLY_DECREASE, EARLY_SHARE, Estimate, OnVisit, estimate
+from icalib.estimate.evidence.debias import Spurious, spurious_information
+from icalib.estimate.evidence.inflation import LEAST, inflation, with_priors_weighed
+from icalib.estimate.problem.assembly import given_priors
+from icalib.estimate.problem.inputs import Inputs
+from icalib.estimate.problem.outcome import Outcome, Step
+from icalib.estimate.problem.problem import Problem
+from icalib.estimate.problem.solver import minimise
+from icalib.observability.guess_worth import astray, in_proportion, moved_to_guess, moved_to_worth, owed_to_guess
+from icalib.optim.border import HELD_BELOW, essential_information, restricted_root
+from icalib.optim.prior_factor import without_priors
+from icalib.optim.state import Key, State
 
 SPURIOUS_SHARE = 0.5  # a direction most of whose information is noise is in doubt: by chance all of it may be
 MOST_ROUNDS, LATE = 6, 4
@@ -49,7 +49,7 @@ class Determined:
     data, noise (B, B): information of the data alone in tolerance units, without priors but those on nuisance
     parameters and without what noise makes of it, and that; held (B, m): orthonormal directions in tolerance units,
     those that are undetermined; shifts (m, B): how all moves with each independent error of the guess along them.
-    inflation: root of how many times priors on nuisance parameters count, see `estimation.inflation`.
+    inflation: root of how many times priors on nuisance parameters count, see `estimate.evidence.inflation`.
     """
 
     estimate: Estimate

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.estimation.inputs import Inputs
-from icalib.estimation.relaxed import Relaxed
+from icalib.estimate.problem.inputs import Inputs
+from icalib.observability.relaxed import Relaxed
 from icalib.rig import LENS
 
 

@@ -11,17 +11,17 @@ import numpy as np
 from scipy.linalg import eigh
 
 from icalib.errors import EstimationError
-from icalib.estimation.assembly import given_priors
-from icalib.estimation.border import HELD_BELOW
-from icalib.estimation.estimate import EARLY_DECREASE
-from icalib.estimation.guess_priors import guess_sigma
-from icalib.estimation.inputs import Inputs
-from icalib.estimation.outcome import Outcome
-from icalib.estimation.problem import Problem
-from icalib.estimation.solver import minimise
-from icalib.estimation.state import Block, State
-from icalib.estimation.tolerances import GUESS_SIGMA, UNGUESSED
+from icalib.estimate.estimate import EARLY_DECREASE
+from icalib.estimate.problem.assembly import given_priors
+from icalib.estimate.problem.guess_priors import guess_sigma
+from icalib.estimate.problem.inputs import Inputs
+from icalib.estimate.problem.outcome import Outcome
+from icalib.estimate.problem.problem import Problem
+from icalib.estimate.problem.solver import minimise
+from icalib.estimate.problem.tolerances import GUESS_SIGMA, UNGUESSED
 from icalib.geometry import planes, so3
+from icalib.optim.border import HELD_BELOW
+from icalib.optim.state import Block, State
 
 PULLED = 0.25  # information in tolerance units, noise and all
 FARTHEST = 2.0  # standard deviations of the guess
@@ -162,7 +162,7 @@ def _weights(inputs: Inputs, state: State) -> np.ndarray:
     """(B,) what guesses are worth against one another; what nobody guessed does not count, but where it turns."""
     sigma = guess_sigma(inputs, state)
     for block in _unguessed(inputs):
-        if block.kind != "vector":
+        if block.kind not in ("vector", "nuisance"):
             sigma[block.columns[:2] if block.kind == "plane" else block.columns] = GUESS_SIGMA["rotation"]
     return sigma
 

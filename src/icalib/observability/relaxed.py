@@ -12,16 +12,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.arrowhead import Solution, solve
-from icalib.estimation.assembly import given_priors
-from icalib.estimation.border import NOTHING, restricted_root
-from icalib.estimation.estimate import Estimate
-from icalib.estimation.groups import AnySensor, groups_of, sensors_of, with_groups
-from icalib.estimation.inputs import Inputs, with_clouds
-from icalib.estimation.outcome import Outcome, outcome_of
-from icalib.estimation.prior_factor import sums_of_priors
-from icalib.estimation.problem import Problem, Residuals
-from icalib.estimation.state import Key, Layout, State
+from icalib.estimate.estimate import Estimate
+from icalib.estimate.problem.assembly import given_priors
+from icalib.estimate.problem.groups import AnySensor, groups_of, sensors_of, with_groups
+from icalib.estimate.problem.inputs import Inputs, with_clouds
+from icalib.estimate.problem.outcome import Outcome, outcome_of
+from icalib.estimate.problem.problem import Problem, Residuals
+from icalib.optim.arrowhead import Solution, solve
+from icalib.optim.border import NOTHING, restricted_root
+from icalib.optim.prior_factor import sums_of_priors
+from icalib.optim.state import Key, Layout, State
 from icalib.rig import Parameter
 
 

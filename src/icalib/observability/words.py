@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.calibration import Verdict
-from icalib.calibration.verdict import by_size
-from icalib.estimation.determination import Determined
+from icalib.observability.determination import Determined
+from icalib.result import Verdict
+from icalib.result.verdict import by_size
 
 SHARE = 0.25  # a parameter that makes up this much of an undetermined direction is undetermined itself
 NAMED = 0.2  # parts of a direction smaller than this are not named

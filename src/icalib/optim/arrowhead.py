@@ -21,13 +21,13 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation import pages
-from icalib.estimation.border import NOTHING, border_draws, border_step
-from icalib.estimation.chain_kernels import damp, eliminate_chain, forward_solve, substitute_chain
-from icalib.estimation.front import Eliminated, Features, eliminate
-from icalib.estimation.front_plan import plan
-from icalib.estimation.state import NODE
 from icalib.geometry.small import cholesky
+from icalib.optim import pages
+from icalib.optim.border import NOTHING, border_draws, border_step
+from icalib.optim.chain_kernels import damp, eliminate_chain, forward_solve, substitute_chain
+from icalib.optim.front import Eliminated, Features, eliminate
+from icalib.optim.front_plan import plan
+from icalib.optim.state import NODE
 
 T = TypeVar("T")
 THREADS = 2  # pieces of the chain; more would need separators of their own

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.estimation.state import Layout
+from icalib.optim.state import Layout
 
 HELD_BELOW = 1e-2  # information in tolerance units: a direction known to less than ten tolerances stays where it is
 DETERMINED = 1.0  # in the same units: known to one tolerance

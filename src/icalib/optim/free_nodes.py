@@ -7,8 +7,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from icalib.estimation.arrowhead import Piece
-from icalib.estimation.state import NODE, State
+from icalib.optim.arrowhead import Piece
+from icalib.optim.state import NODE, State
 
 POSE = 6
 WEAK = (

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.estimation.front_kernels import Chain, Sizes, eliminate_all, substitute_all, turn_nodes
-from icalib.estimation.front_plan import FeatureSums, Plan
-from icalib.estimation.state import NODE
+from icalib.optim.front_kernels import Chain, Sizes, eliminate_all, substitute_all, turn_nodes
+from icalib.optim.front_plan import FeatureSums, Plan
+from icalib.optim.state import NODE
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icalib.compiled import njit
+from icalib.base.compiled import njit
 from icalib.geometry.blas import factorise, solve_transposed, solve_upper, subtract_gram, subtract_product
 
 NODE, POSE = 15, 6

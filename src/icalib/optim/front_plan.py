@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icalib.estimation.state import NODE
+from icalib.optim.state import NODE
 
 POSE = 6  # of a camera
 SIZES = (4, 8, 12, 16, 24, 32)  # nodes of a group

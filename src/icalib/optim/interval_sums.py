@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from icalib.compiled import njit
+from icalib.base.compiled import njit
 
 
 @njit(cache=True, nogil=True)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.estimation.arrowhead import Piece
-from icalib.estimation.state import Block, State
 from icalib.geometry import so3
+from icalib.optim.arrowhead import Piece
+from icalib.optim.state import Block, State
 
 # Keeps the biases defined where nothing else does (a motionless stretch); far wider than any IMU's turn-on bias.
 FIRST_BIAS_SIGMA = np.array([0.5] * 3 + [3.0] * 3)

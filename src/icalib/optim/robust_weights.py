@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icalib.compiled import njit
+from icalib.base.compiled import njit
 
 LEAST_CURVATURE = 1e-3
 

@@ -11,13 +11,11 @@ from typing import Literal
 
 import numpy as np
 
-from icalib.estimation.imu_model import N_INTRINSICS
 from icalib.geometry import planes, so3
 
 NODE = 15
-NUISANCES = ("size", "scale")  # of a target, of the positions that a sensor reports; and the IMU intrinsics
 Key = tuple[str, str]  # sensor, parameter
-Kind = Literal["vector", "rotation", "tilt", "plane"]
+Kind = Literal["vector", "nuisance", "rotation", "tilt", "plane"]
 Entry = tuple[str, str, Kind, int, bool]  # sensor, name, kind, size, whether it is estimated
 
 
@@ -26,7 +24,7 @@ class Block:
     """One lasting parameter. kind: how it is perturbed; start: its first border column, None where it is fixed.
 
     rotation: R <- R Exp(d). tilt (2 columns): R_world_board <- Exp((d0, d1, 0)) R_world_board; the third turn, about
-    gravity, is the freedom of the world frame. plane (3 columns): see `geometry.planes.moved`.
+    gravity, is the freedom of the world frame. plane (3 columns): see `geometry.planes.moved`. nuisance: a vector.
     """
 
     sensor: str
@@ -47,7 +45,7 @@ class Block:
     @property
     def is_nuisance(self) -> bool:
         """Whether it says how imperfect a sensor or target is: a proper prior bounds it, whatever the data show."""
-        return self.name in NUISANCES or (self.name == "intrinsics" and self.size == N_INTRINSICS)
+        return self.kind == "nuisance"
 
 
 @dataclass(frozen=True)

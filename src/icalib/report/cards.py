@@ -6,11 +6,11 @@ import re
 
 import numpy as np
 
-from icalib.calibration import Calibration, RelativePose, SensorFit, Verdict, relative_poses
-from icalib.calibration.excess import FAR_BEYOND, excess, times
-from icalib.calibration.quantities import Row, chi2_words, rms_words, rows, shown, shown_groups
-from icalib.calibration.verdict import NUISANCE, by_size, lens_projection_px, lens_verdict, tolerance, worst
 from icalib.report.tables import Html, badge, element, html, table
+from icalib.result import Calibration, RelativePose, SensorFit, Verdict, relative_poses
+from icalib.result.excess import FAR_BEYOND, excess, times
+from icalib.result.quantities import Row, chi2_words, rms_words, rows, shown, shown_groups
+from icalib.result.verdict import NUISANCE, by_size, lens_projection_px, lens_verdict, tolerance, worst
 from icalib.rig import LENS
 
 

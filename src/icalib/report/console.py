@@ -6,9 +6,9 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from icalib.calibration import Calibration, relative_poses
-from icalib.calibration.quantities import rows, rpy_deg, shown
-from icalib.calibration.verdict import UNDETERMINED, tolerance
+from icalib.result import Calibration, relative_poses
+from icalib.result.quantities import rows, rpy_deg, shown
+from icalib.result.verdict import UNDETERMINED, tolerance
 
 TOLERANCES = ("rotation_tolerance_deg", "translation_tolerance_m", "time_tolerance_s", "pixel_tolerance")
 STYLES = {"determined": "green", "weak": "yellow", "undetermined": "bold red", "fixed": "dim"}

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.calibration import Calibration, joint_covariance
-from icalib.calibration.verdict import worst
 from icalib.report import rig_shapes
+from icalib.result import Calibration, joint_covariance
+from icalib.result.verdict import worst
 
 SIGMAS = 3.0
 VERDICT_COLORS = {"determined": "#15803d", "weak": "#d97706", "undetermined": "#dc2626"}

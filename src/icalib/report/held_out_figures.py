@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from icalib.calibration import Calibration, CrossValidation, ParameterGroup, PredictedFit
-from icalib.calibration.quantities import shown, shown_groups
 from icalib.report.plot import Figure, axis, dots, figure, line
 from icalib.report.tables import Html, element, table
+from icalib.result import Calibration, CrossValidation, ParameterGroup, PredictedFit
+from icalib.result.quantities import shown, shown_groups
 
 ROW_PX = 17
 _ALLOWED = "#94a3b8"

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.calibration import Calibration
 from icalib.report.plot import COLORS, Figure, axis, figure, line
+from icalib.result import Calibration
 
 REACH = 6.0  # standard deviations
 BINS = 96

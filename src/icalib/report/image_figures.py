@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from icalib.calibration import ImageResiduals, image_of, rms_of_images
 from icalib.report.plot import REJECTED, Figure, axis, dots, figure, line, numbers, thin
+from icalib.result import ImageResiduals, image_of, rms_of_images
 
 MOST_DOTS = 2500  # of each kind in one figure
 BINS = 60

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.calibration import Calibration
 from icalib.geometry import so3
 from icalib.geometry.targets import Target, target_from_plain
 from icalib.report import rig_shapes
@@ -22,6 +21,7 @@ from icalib.report.plot import (
     thin,
     y_of,
 )
+from icalib.result import Calibration
 
 MOST_NODES = 2000
 BLOCKS = ("rotation", "velocity", "position", "gyro walk", "accel walk")

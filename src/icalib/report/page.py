@@ -8,8 +8,6 @@ from string import Template
 
 import numpy as np
 
-from icalib.calibration import Calibration, ImageResiduals, ProjectionMap
-from icalib.calibration.verdict import NEXT
 from icalib.report import (
     held_out_figures,
     image_figures,
@@ -24,6 +22,8 @@ from icalib.report.ellipsoids import SIGMAS, ellipsoids, magnification
 from icalib.report.histogram import normalised_histogram
 from icalib.report.plot import Figure
 from icalib.report.tables import Html, element
+from icalib.result import Calibration, ImageResiduals, ProjectionMap
+from icalib.result.verdict import NEXT
 
 _NOT_HELD_OUT = (
     "No cross-validation: the recording is too short for segments, or segments are off in the rig file, or its halves "

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from icalib.calibration import Calibration, ImageResiduals, ProjectionMap, projection_uncertainty, working_distance
-from icalib.calibration.quantities import shown
 from icalib.report.plot import Figure, axis, dots, figure, numbers, thin
+from icalib.result import Calibration, ImageResiduals, ProjectionMap, projection_uncertainty, working_distance
+from icalib.result.quantities import shown
 
 MOST_DOTS = 1500
 WIDEST = 6.0  # of the scale of colours, in the median where points were: edges without data would take it all

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from icalib.calibration import Calibration
 from icalib.report import rig_shapes
 from icalib.report.ellipsoids import VERDICT_COLORS, Ellipsoid, ellipsoids, magnification, outline
 from icalib.report.plot import AXIS_COLORS, COLORS, VIEW, Figure, axis, figure, numbers, path_3d
 from icalib.report.rig_shapes import PEN_UP
+from icalib.result import Calibration
 
 
 def rig_picture(c: Calibration) -> Figure:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.calibration import Calibration
 from icalib.geometry.targets import Target
+from icalib.result import Calibration
 
 PEN_UP = np.full((1, 3), np.nan)  # a row between two lines
 _ROUND = np.linspace(0.0, 2.0 * np.pi, 41)

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from icalib.calibration import Calibration, LidarResiduals, Plane, PoseResiduals, WheelResiduals
 from icalib.report.plot import (
     COLORS,
     VIEW,
@@ -21,6 +20,7 @@ from icalib.report.plot import (
     thin,
     y_of,
 )
+from icalib.result import Calibration, LidarResiduals, Plane, PoseResiduals, WheelResiduals
 
 MOST_DOTS = 2500  # in a figure of residuals
 MOST_IN_SPACE = 20_000  # points in a picture of the planes

@@ -7,16 +7,9 @@ from html import escape
 
 import numpy as np
 
-from icalib.calibration import Calibration, relative_poses
-from icalib.calibration.quantities import (
-    chi2_words,
-    dof_words,
-    rms_words,
-    rows,
-    rpy_deg,
-    shown,
-)
-from icalib.calibration.verdict import Usability, worst
+from icalib.result import Calibration, relative_poses
+from icalib.result.quantities import chi2_words, dof_words, rms_words, rows, rpy_deg, shown
+from icalib.result.verdict import Usability, worst
 
 TRUST: dict[Usability, str] = {
     "usable": "good",

@@ -1,10 +1,6 @@
 """The result of a calibration: values with standard deviations and verdicts, saved and loaded whole."""
 
-from icalib.calibration.cross_validation import CrossValidation, PredictedFit
-from icalib.calibration.images import CornerResiduals, ImageResiduals, TrackResiduals, image_of, rms_of_images
-from icalib.calibration.projection import ProjectionMap, projection_uncertainty, working_distance
-from icalib.calibration.relative import RelativePose, joint_covariance, relative_pose, relative_poses
-from icalib.calibration.result import (
+from icalib.result.calibration import (
     Calibration,
     ImuResiduals,
     Iteration,
@@ -15,8 +11,12 @@ from icalib.calibration.result import (
     Verdict,
     Visited,
 )
-from icalib.calibration.robot import LidarResiduals, Plane, PoseResiduals, WheelResiduals
-from icalib.calibration.saving import calibration_files, load_calibration
+from icalib.result.cross_validation import CrossValidation, PredictedFit
+from icalib.result.images import CornerResiduals, ImageResiduals, TrackResiduals, image_of, rms_of_images
+from icalib.result.projection import ProjectionMap, projection_uncertainty, working_distance
+from icalib.result.relative import RelativePose, joint_covariance, relative_pose, relative_poses
+from icalib.result.robot import LidarResiduals, Plane, PoseResiduals, WheelResiduals
+from icalib.result.saving import calibration_files, load_calibration
 
 __all__ = [
     "Calibration",

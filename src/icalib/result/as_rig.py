@@ -8,11 +8,11 @@ from typing import Any, Literal
 import numpy as np
 import yaml
 
-from icalib.calibration import Calibration, ParameterGroup
 from icalib.errors import RigError
-from icalib.parameter import Parameter
+from icalib.result import Calibration, ParameterGroup
 from icalib.rig import Rig, Settings
-from icalib.rig_file import rig_from_dict, rig_to_dict
+from icalib.rig.file import rig_from_dict, rig_to_dict
+from icalib.rig.parameter import Parameter
 
 Treatment = Literal["fixed", "prior", "guess"]
 TREATMENTS: tuple[Treatment, ...] = ("fixed", "prior", "guess")

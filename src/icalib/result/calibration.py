@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from icalib.calibration.cross_validation import CrossValidation
-from icalib.calibration.images import CornerResiduals, ImageResiduals, TrackResiduals
-from icalib.calibration.robot import LidarResiduals, Plane, PoseResiduals, WheelResiduals
-from icalib.calibration.verdict import Usability, lens_projections_px, reasons, usability
+from icalib.result.cross_validation import CrossValidation
+from icalib.result.images import CornerResiduals, ImageResiduals, TrackResiduals
+from icalib.result.robot import LidarResiduals, Plane, PoseResiduals, WheelResiduals
+from icalib.result.verdict import Usability, lens_projections_px, reasons, usability
 
 if TYPE_CHECKING:
-    from icalib.calibration.relative import RelativePose
+    from icalib.result.relative import RelativePose
 
 Verdict = Literal["determined", "weak", "undetermined", "fixed"]
 
@@ -159,7 +159,7 @@ class Calibration:
 
     @property
     def verdict(self) -> Usability:
-        """Whether the result can be used; see `icalib.calibration.verdict`."""
+        """Whether the result can be used; see `icalib.result.verdict`."""
         return usability(self)
 
     @property
@@ -258,7 +258,7 @@ class Calibration:
 
         Either may be the IMU. As an array it is the 4x4 matrix. Raises KeyError naming the sensors there are.
         """
-        from icalib.calibration.relative import relative_pose
+        from icalib.result.relative import relative_pose
 
         known = list(dict.fromkeys([self.body, *self.mounted]))
         for name in (frame, sensor):
@@ -268,17 +268,17 @@ class Calibration:
 
     def summary(self) -> str:
         """Verdict, reasons, and a table of all parameters with standard deviations and verdicts, as text."""
-        from icalib.calibration.text import summary_text
+        from icalib.result.text import summary_text
 
         return summary_text(self)
 
     def __repr__(self) -> str:
-        from icalib.calibration.text import one_line
+        from icalib.result.text import one_line
 
         return one_line(self)
 
     def _repr_html_(self) -> str:
-        from icalib.calibration.text import summary_html
+        from icalib.result.text import summary_html
 
         return summary_html(self)
 
@@ -287,8 +287,8 @@ class Calibration:
 
         Raises CalibrationError where the folder cannot be written, or has files of these names that are not icalib's.
         """
-        from icalib.calibration.saving import calibration_files
-        from icalib.result_files import refuse_foreign_set, write_files
+        from icalib.base.result_files import refuse_foreign_set, write_files
+        from icalib.result.saving import calibration_files
 
         refuse_foreign_set(Path(folder))
         write_files(Path(folder), calibration_files(self))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.calibration.result import SensorFit
+from icalib.result.calibration import SensorFit
 
 LARGE_CHI2 = 2.0  # per post-fit degree of freedom: above this it is worth a warning
 # Times as large as their noise: then standard deviations mean nothing. Simulated with IMU noise ten times too small,

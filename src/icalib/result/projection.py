@@ -19,12 +19,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from icalib.calibration.relative import joint_covariance
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.cameras.base import CameraModel
+from icalib.result.relative import joint_covariance
 
 if TYPE_CHECKING:
-    from icalib.calibration.result import Calibration
+    from icalib.result.calibration import Calibration
 
 COLUMNS = 36  # cells across the image
 FEWEST_SEEN = 12  # cells: fewer do not say how the camera moved, and the whole image is used

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from icalib.calibration.units import SHOWN_UNITS
-from icalib.calibration.verdict import worst
+from icalib.result.units import SHOWN_UNITS
+from icalib.result.verdict import worst
 
 if TYPE_CHECKING:
-    from icalib.calibration.result import Calibration, ParameterGroup, SensorFit, Verdict
+    from icalib.result.calibration import Calibration, ParameterGroup, SensorFit, Verdict
 
 TURNS = ("roll", "pitch", "yaw")
 CLEARLY = 0.5  # of the standard deviation of a prior: a recording that shows a parameter so well says something of it

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from icalib.calibration.result import Calibration, ParameterGroup
+    from icalib.result.calibration import Calibration, ParameterGroup
 
 
 @dataclass(frozen=True)

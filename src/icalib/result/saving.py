@@ -12,9 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from icalib.calibration.cross_validation import CrossValidation, PredictedFit
-from icalib.calibration.images import CornerResiduals, TrackResiduals
-from icalib.calibration.result import (
+from icalib.base.file_names import NAME
+from icalib.base.own_files import sealed
+from icalib.base.result_files import read_file
+from icalib.base.text_files import printable
+from icalib.base.unpacking import load_arrays
+from icalib.errors import CalibrationError
+from icalib.result.calibration import (
     Calibration,
     ImuResiduals,
     Iteration,
@@ -23,15 +27,11 @@ from icalib.calibration.result import (
     SensorFit,
     Trajectory,
 )
-from icalib.calibration.robot import LidarResiduals, Plane, PoseResiduals, WheelResiduals
-from icalib.calibration.shapes import check_arrays
-from icalib.calibration.summary import calibration_yaml
-from icalib.errors import CalibrationError
-from icalib.file_names import NAME
-from icalib.own_files import sealed
-from icalib.result_files import read_file
-from icalib.text_files import printable
-from icalib.unpacking import load_arrays
+from icalib.result.cross_validation import CrossValidation, PredictedFit
+from icalib.result.images import CornerResiduals, TrackResiduals
+from icalib.result.robot import LidarResiduals, Plane, PoseResiduals, WheelResiduals
+from icalib.result.shapes import check_arrays
+from icalib.result.summary import calibration_yaml
 
 FORMAT, FORMAT_VERSION = "icalib result", 2
 _TEXTS = ("undetermined", "warnings", "notes", "wrong")

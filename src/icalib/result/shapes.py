@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from icalib.calibration.images import CornerResiduals, TrackResiduals
-from icalib.calibration.result import Calibration, ImuResiduals, Trajectory
-from icalib.calibration.robot import LidarResiduals, PoseResiduals, WheelResiduals
+from icalib.result.calibration import Calibration, ImuResiduals, Trajectory
+from icalib.result.images import CornerResiduals, TrackResiduals
+from icalib.result.robot import LidarResiduals, PoseResiduals, WheelResiduals
 
 _FLOAT, _WHOLE, _BOOL = "f", "iu", "b"  # values of numpy's dtype.kind
 _WORDS = {_FLOAT: "decimal", _WHOLE: "whole", _BOOL: "boolean"}

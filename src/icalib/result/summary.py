@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from icalib.calibration.relative import RelativePose, relative_poses
-from icalib.calibration.result import Calibration, ParameterGroup, SensorFit
+from icalib.result.calibration import Calibration, ParameterGroup, SensorFit
+from icalib.result.relative import RelativePose, relative_poses
 
 HEADER = """\
 # Calibration by icalib {version}. Lengths in m, times in s, angles in rad, image quantities in px.

@@ -5,10 +5,10 @@ from __future__ import annotations
 from html import escape
 from typing import TYPE_CHECKING
 
-from icalib.calibration.quantities import Row, rows
+from icalib.result.quantities import Row, rows
 
 if TYPE_CHECKING:
-    from icalib.calibration.result import Calibration
+    from icalib.result.calibration import Calibration
 
 _HEAD = ("sensor", "parameter", "value", "std", "unit", "verdict")
 _RIGHT = (False, False, True, True, False, False)  # which columns are numbers

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.calibration import RecordingSpan
-from icalib.joining import Part
+from icalib.data.joining import Part
+from icalib.result import RecordingSpan
 
 PAUSE_S = 1.0
 

@@ -18,12 +18,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Literal
 
-from icalib.calibration.projection import projection_uncertainty
-from icalib.calibration.units import SHOWN_UNITS
+from icalib.result.projection import projection_uncertainty
+from icalib.result.units import SHOWN_UNITS
 from icalib.rig import LENS, Settings
 
 if TYPE_CHECKING:
-    from icalib.calibration.result import Calibration, ParameterGroup, Verdict
+    from icalib.result.calibration import Calibration, ParameterGroup, Verdict
 
 Usability = Literal["usable", "usable with care", "partly usable", "not usable"]
 

@@ -31,7 +31,7 @@ class ImuNoise:
 
 @dataclass(frozen=True)
 class Imperfections:
-    """Standard deviations of the parameters of Kalibr's scale-misalignment model (`estimation.imu_model`) about the
+    """Standard deviations of the parameters of Kalibr's scale-misalignment model (`motion.imu_model`) about the
     ideal IMU. Scales are relative; misalignments of an axis and the rotation between gyroscope and accelerometer are in
     rad; g-sensitivity is in rad/s per m/s^2."""
 
@@ -44,7 +44,7 @@ class Imperfections:
 
     @property
     def sigma(self) -> np.ndarray:
-        """(24,) in the order of `estimation.imu_model.LABELS`: diagonal and lower triangle of two matrices, ..."""
+        """(24,) in the order of `motion.imu_model.LABELS`: diagonal and lower triangle of two matrices, ..."""
         lower = (0, 1, 0, 1, 1, 0)  # xx yx yy zx zy zz: 0 on the diagonal
         accel = [(self.accel_scale, self.accel_misalignment)[k] for k in lower]
         gyro = [(self.gyro_scale, self.gyro_misalignment)[k] for k in lower]

@@ -13,8 +13,8 @@ import numpy as np
 from icalib.errors import RigError
 from icalib.geometry.cameras import CAMERA_MODELS
 from icalib.geometry.targets import NoTarget, Target
-from icalib.imu_classes import FREE, IMU_CLASSES, N_INTRINSICS, ImuNoise, class_imperfections, class_of_noise
-from icalib.parameter import Parameter, check_fields, check_sizes
+from icalib.rig.imu_classes import FREE, IMU_CLASSES, N_INTRINSICS, ImuNoise, class_imperfections, class_of_noise
+from icalib.rig.parameter import Parameter, check_fields, check_sizes
 
 TimeUnit = Literal["s", "ms", "us", "ns"]
 LENS = ("intrinsics", "distortion")  # the groups of a camera that are the parameters of its model
@@ -51,7 +51,7 @@ Axes = tuple[str, str, str]  # the columns that become x, y, z, each with its si
 class ImuSensor:
     """The inertial sensor; its frame is the body frame. Units and axes: of the readings as they are recorded; None: SI
     units (g is recognised), and the axes as they are. assumed: there is none, but an assumption of smooth motion in
-    its place (see `first_guess.assumed_motion`). intrinsics (24,): see `estimation.imu_model`. They always
+    its place (see `initialize.assumed_motion`). intrinsics (24,): see `motion.imu_model`. They always
     have a prior: by default that of the IMU's class about the ideal IMU, a broad one where they are free, about the
     guess. What is fixed without a value is the ideal IMU."""
 
@@ -120,7 +120,7 @@ PointTime = Literal["auto", "start", "end", "azimuth", "snapshot"]
 class Lidar:
     """One LiDAR. Points nearer than min_range_m or farther than max_range_m are left out.
 
-    point_time: what a point's time is counted from; see `recordings.point_times`. point_time_field, point_time_unit:
+    point_time: what a point's time is counted from; see `data.messages.point_times`. point_time_field, point_time_unit:
     where the time of a point stands, and in what unit; None: told from the data.
     """
 

@@ -7,26 +7,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.estimation.clocks import instants
-from icalib.estimation.ground_factor import HEIGHT_BLOCK, GroundFactor, floors
-from icalib.estimation.lidar_binning import BIN_S, LidarNoise
-from icalib.estimation.lidar_factor import LidarFactor
-from icalib.estimation.lidar_sweep import Motion
-from icalib.estimation.point_planes import count_points, thinned
-from icalib.estimation.pose_factor import (
-    FRAME,
-    AbsolutePoseFactor,
-    PoseFactor,
-    PoseNoise,
-    RelativePosesFactor,
-    frame_of,
-)
-from icalib.estimation.sensors import SensorFactor
-from icalib.estimation.state import Entry, Key, Kind, Layout, State
-from icalib.estimation.wheel_angles import integrals_of
-from icalib.estimation.wheel_factor import IncrementFactor, RelativePoseFactor, WheelNoise
-from icalib.measurements import LidarStream, Measurements, PoseStream, WheelPoses, WheelStream
+from icalib.data.measurements import LidarStream, Measurements, PoseStream, WheelPoses, WheelStream
+from icalib.motion.clocks import instants
+from icalib.motion.factor import SensorFactor
+from icalib.motion.point_planes import count_points, thinned
+from icalib.motion.sweep import Motion
+from icalib.optim.state import Entry, Key, Kind, Layout, State
 from icalib.rig import Lidar, PoseSensor, Rig, Settings, Wheels
+from icalib.sensors.lidar.lidar_binning import BIN_S, LidarNoise
+from icalib.sensors.lidar.residual import LidarFactor
+from icalib.sensors.pose.residual import FRAME, AbsolutePoseFactor, PoseFactor, PoseNoise, RelativePosesFactor, frame_of
+from icalib.sensors.wheels.ground_factor import HEIGHT_BLOCK, GroundFactor, floors
+from icalib.sensors.wheels.residual import IncrementFactor, RelativePoseFactor, WheelNoise
+from icalib.sensors.wheels.wheel_angles import integrals_of
 
 MOUNT: tuple[tuple[str, Kind, int], ...] = (
     ("rotation", "rotation", 3), ("translation", "vector", 3), ("time_offset", "vector", 1),
@@ -100,7 +93,7 @@ def own_entries(sensor: Lidar | Wheels | PoseSensor, n_recordings: int) -> list[
         (sensor.name, name, kind, clocks.get(name, n), getattr(sensor, name).mode != "fixed") for name, kind, n in MOUNT
     ]
     if isinstance(sensor, PoseSensor):
-        return [*mounts, (sensor.name, "scale", "vector", 1, sensor.scale_sigma > 0.0)]
+        return [*mounts, (sensor.name, "scale", "nuisance", 1, sensor.scale_sigma > 0.0)]
     if isinstance(sensor, Lidar):
         return mounts
     heard = sensor.measures != "poses"  # which say nothing of what rolls

@@ -7,12 +7,12 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+from icalib.base.extras import install
+from icalib.base.own_files import refuse_foreign, sealed
+from icalib.base.staging import staged
 from icalib.errors import CalibrationError, RigError
-from icalib.extras import install
 from icalib.geometry.targets import AprilGrid, Markers, Tag, Target
 from icalib.geometry.targets.pattern import Pattern, pattern_of
-from icalib.own_files import refuse_foreign, sealed
-from icalib.staging import staged
 
 # Width and height [mm], upright; smallest first.
 PAPERS = {

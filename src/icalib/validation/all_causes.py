@@ -7,24 +7,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.assessment.cameras import mixed_up, other_lens, plane_warnings
-from icalib.assessment.causes import Cause, Misfit, changing, explaining, ranked
-from icalib.assessment.lens_models import lens_warnings
-from icalib.assessment.misfit import LARGE_FACTOR, misfit_causes
-from icalib.assessment.size import felt_size, is_certain, scale_notes, size_words
-from icalib.assessment.stated import absurd_wheels, stated_words
-from icalib.calibration import ParameterGroup, SensorFit
-from icalib.calibration.verdict import NUISANCE
-from icalib.estimation.contradictions import SIGMAS, Contradiction, contradictions, worst_off
-from icalib.estimation.estimate import Estimate
-from icalib.estimation.fixed_lens import lens_steps
-from icalib.estimation.inputs import Inputs
-from icalib.estimation.parts import Parts
-from icalib.estimation.relaxed import Relaxed, relaxed
-from icalib.estimation.state import Key
-from icalib.estimation.surfaces import ON_PLANES
+from icalib.estimate.estimate import Estimate
+from icalib.estimate.evidence.parts import Parts
+from icalib.estimate.problem.inputs import Inputs
+from icalib.observability.contradictions import SIGMAS, Contradiction, contradictions, worst_off
+from icalib.observability.fixed_lens import lens_steps
+from icalib.observability.relaxed import Relaxed, relaxed
+from icalib.optim.state import Key
+from icalib.result import ParameterGroup, SensorFit
+from icalib.result.timeline import Timeline
+from icalib.result.verdict import NUISANCE
 from icalib.rig import LENS
-from icalib.timeline import Timeline
+from icalib.sensors.camera.features.surfaces import ON_PLANES
+from icalib.validation.cameras import mixed_up, other_lens, plane_warnings
+from icalib.validation.causes import Cause, Misfit, changing, explaining, ranked
+from icalib.validation.lens_models import lens_warnings
+from icalib.validation.misfit import LARGE_FACTOR, misfit_causes
+from icalib.validation.size import felt_size, is_certain, scale_notes, size_words
+from icalib.validation.stated import absurd_wheels, stated_words
 
 SEEN = ("corners", "features")
 

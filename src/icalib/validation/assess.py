@@ -9,25 +9,23 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtr, stdtrit
 
-from icalib.assessment.all_causes import Judged, all_causes
-from icalib.assessment.cameras import plane_warnings
-from icalib.assessment.guesses import guess_notes
-from icalib.assessment.held_out import held_out
-from icalib.assessment.images import corner_residuals, track_residuals
-from icalib.assessment.labels import UNITS, labels_of
-from icalib.assessment.misfit import scatter_warnings
-from icalib.assessment.notes import notes
-from icalib.assessment.robot import (
-    lidar_residuals,
-    lidar_warnings,
-    planes,
-    pose_residuals,
-    pose_warnings,
-    wheel_residuals,
-)
-from icalib.assessment.twin_lenses import twin_lens_notes
-from icalib.assessment.upwards import upwards_warnings
-from icalib.calibration import (
+from icalib.estimate.estimate import Estimate
+from icalib.estimate.evidence.evidence import Fit, fits, raw_rms
+from icalib.estimate.evidence.inflation import calibration_columns, spread_variance, white_variance
+from icalib.estimate.evidence.parts import Parts
+from icalib.estimate.evidence.places import cluster_covariances
+from icalib.estimate.problem.assembly import image_times
+from icalib.estimate.problem.gauge import IN_THE_WORLD
+from icalib.estimate.problem.inputs import Inputs, origin_difference
+from icalib.estimate.problem.outcome import Visit
+from icalib.estimate.problem.problem import Problem
+from icalib.motion.imu_model import LABELS as IMU_LABELS
+from icalib.observability.contradictions import Contradiction
+from icalib.observability.determination import Determined
+from icalib.observability.words import Observability, observe
+from icalib.optim.border import restricted_inverse
+from icalib.optim.state import Block, State
+from icalib.result import (
     Calibration,
     ImuResiduals,
     Iteration,
@@ -38,27 +36,29 @@ from icalib.calibration import (
     Verdict,
     Visited,
 )
-from icalib.calibration.verdict import by_size
-from icalib.estimation.assembly import image_times
-from icalib.estimation.border import restricted_inverse
-from icalib.estimation.contradictions import Contradiction
-from icalib.estimation.determination import Determined
-from icalib.estimation.estimate import Estimate
-from icalib.estimation.evidence import Fit, fits, raw_rms
-from icalib.estimation.gauge import IN_THE_WORLD
-from icalib.estimation.imu_model import LABELS as IMU_LABELS
-from icalib.estimation.inflation import calibration_columns, spread_variance, white_variance
-from icalib.estimation.inputs import Inputs, origin_difference
-from icalib.estimation.outcome import Visit
-from icalib.estimation.parts import Parts
-from icalib.estimation.places import cluster_covariances
-from icalib.estimation.problem import Problem
-from icalib.estimation.state import Block, State
-from icalib.observability import Observability, observe
-from icalib.provenance import versions
+from icalib.result.provenance import versions
+from icalib.result.timeline import Timeline
+from icalib.result.verdict import by_size
 from icalib.rig import DRIVE_SIZES
-from icalib.rig_file import rig_to_dict
-from icalib.timeline import Timeline
+from icalib.rig.file import rig_to_dict
+from icalib.validation.all_causes import Judged, all_causes
+from icalib.validation.cameras import plane_warnings
+from icalib.validation.guesses import guess_notes
+from icalib.validation.held_out import held_out
+from icalib.validation.images import corner_residuals, track_residuals
+from icalib.validation.labels import UNITS, labels_of
+from icalib.validation.misfit import scatter_warnings
+from icalib.validation.notes import notes
+from icalib.validation.robot import (
+    lidar_residuals,
+    lidar_warnings,
+    planes,
+    pose_residuals,
+    pose_warnings,
+    wheel_residuals,
+)
+from icalib.validation.twin_lenses import twin_lens_notes
+from icalib.validation.upwards import upwards_warnings
 
 ENOUGH_PARTS = 8  # from so many on, t differs from the normal distribution by 8 % at most
 LARGE_BLOOM_PX = 0.8  # ink and overexposure move edges by a third of that

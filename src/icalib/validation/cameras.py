@@ -7,14 +7,14 @@ from itertools import combinations
 
 import numpy as np
 
-from icalib.calibration import ParameterGroup, SensorFit
-from icalib.calibration.excess import excess, times
-from icalib.estimation.feature_factor import FeatureFactor
-from icalib.estimation.fixed_lens import LensStep
-from icalib.estimation.surfaces import ON_PLANES
-from icalib.estimation.tolerances import GUESS_SIGMA
+from icalib.estimate.problem.tolerances import GUESS_SIGMA
 from icalib.geometry import so3
+from icalib.observability.fixed_lens import LensStep
+from icalib.result import ParameterGroup, SensorFit
+from icalib.result.excess import excess, times
 from icalib.rig import Camera, Rig
+from icalib.sensors.camera.features.feature_factor import FeatureFactor
+from icalib.sensors.camera.features.surfaces import ON_PLANES
 
 GIVEN = ("rotation", "translation", "intrinsics")
 FAR = 0.5  # of what guesses are worth: 5 cm, 3 deg, 8 px

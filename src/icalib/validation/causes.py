@@ -12,15 +12,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.assessment.disturbance import Disturbance, Lag, disturbance, lag_between_cameras
-from icalib.calibration import SensorFit
-from icalib.calibration.excess import FAR_BEYOND, excess, times
-from icalib.estimation.changes import Change, changes, heterogeneity
-from icalib.estimation.estimate import Estimate
-from icalib.estimation.inputs import Inputs
-from icalib.estimation.noise_size import NoiseFit
-from icalib.estimation.parts import Parts
-from icalib.timeline import Timeline
+from icalib.estimate.estimate import Estimate
+from icalib.estimate.evidence.changes import Change, changes, heterogeneity
+from icalib.estimate.evidence.parts import Parts
+from icalib.estimate.noise_size import NoiseFit
+from icalib.estimate.problem.inputs import Inputs
+from icalib.result import SensorFit
+from icalib.result.excess import FAR_BEYOND, excess, times
+from icalib.result.timeline import Timeline
+from icalib.validation.disturbance import Disturbance, Lag, disturbance, lag_between_cameras
 
 # Of the misfit: robust weights hide some of a gain, and what is not the cause gains below 0.01.
 EXPLAINS = 0.1

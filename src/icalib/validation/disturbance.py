@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.estimation.clocks import instants
-from icalib.estimation.estimate import Estimate
-from icalib.estimation.inputs import Inputs
+from icalib.estimate.estimate import Estimate
+from icalib.estimate.problem.inputs import Inputs
+from icalib.motion.clocks import instants
 
 BINS, WINDOW = 64, 3  # of the recording; a shock reaches a few keyframes beyond itself
 AT_ONE_TIME = 0.5  # of the misfit

@@ -6,17 +6,17 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from icalib.assessment.looks_like import looks_like
-from icalib.assessment.stated import scaled
-from icalib.calibration import ParameterGroup
-from icalib.calibration.units import SHOWN_UNITS
-from icalib.estimation.groups import groups_of
-from icalib.estimation.inputs import Inputs
-from icalib.estimation.tolerances import GUESS_SIGMA
-from icalib.first_guess.contradicted import is_contradicted
+from icalib.estimate.problem.groups import groups_of
+from icalib.estimate.problem.inputs import Inputs
+from icalib.estimate.problem.tolerances import GUESS_SIGMA
 from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
+from icalib.initialize.steps.contradicted import is_contradicted
+from icalib.result import ParameterGroup
+from icalib.result.units import SHOWN_UNITS
 from icalib.rig import LENS, Camera
+from icalib.validation.looks_like import looks_like
+from icalib.validation.stated import scaled
 
 GRID = 12  # rays of an image, each way
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from icalib.calibration import CrossValidation, PredictedFit
-from icalib.estimation.evidence import chi2_by_kind, raw_rms
-from icalib.estimation.held_out import Prediction, predict, shifts
-from icalib.estimation.parts import Parts
-from icalib.estimation.problem import Problem
+from icalib.estimate.evidence.evidence import chi2_by_kind, raw_rms
+from icalib.estimate.evidence.held_out import Prediction, predict, shifts
+from icalib.estimate.evidence.parts import Parts
+from icalib.estimate.problem.problem import Problem
+from icalib.result import CrossValidation, PredictedFit
 
 
 def held_out(parts: Parts | None, assumed: Collection[str]) -> CrossValidation | None:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.calibration import CornerResiduals, TrackResiduals
-from icalib.estimation.clocks import instants
-from icalib.estimation.estimate import Estimate
-from icalib.timeline import Timeline
+from icalib.estimate.estimate import Estimate
+from icalib.motion.clocks import instants
+from icalib.result import CornerResiduals, TrackResiduals
+from icalib.result.timeline import Timeline
 
 
 def corner_residuals(found: Estimate, timeline: Timeline) -> tuple[CornerResiduals, ...]:

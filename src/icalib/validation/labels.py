@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from icalib.estimation.board import SHAPE_LABELS
-from icalib.estimation.imu_model import LABELS as IMU_LABELS
-from icalib.estimation.inputs import Inputs
-from icalib.estimation.state import Block
+from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry.cameras import camera_model
+from icalib.motion.imu_model import LABELS as IMU_LABELS
+from icalib.optim.state import Block
 from icalib.rig import Camera
+from icalib.sensors.camera.board import SHAPE_LABELS
 
 UNITS = {
     "rotation": "rad", "translation": "m", "time_offset": "s", "intrinsics": "px", "distortion": "", "bloom": "px",

@@ -13,17 +13,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from icalib.estimation.circle_centres import with_circle_centres
-from icalib.estimation.corner_factor import CornerFactor, CornerOutput
-from icalib.estimation.corner_noise import image_speed, residual_noise
-from icalib.estimation.corner_outliers import rejected
-from icalib.estimation.estimate import Estimate
-from icalib.estimation.inputs import Inputs
-from icalib.estimation.state import State
+from icalib.estimate.estimate import Estimate
+from icalib.estimate.evidence.corner_noise import image_speed, residual_noise
+from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry.cameras import CAMERA_MODELS, camera_model
 from icalib.geometry.cameras.base import CameraModel
-from icalib.geometry.lens_bundle import Adjusted, ImagePoints, adjust, initial_parameters
+from icalib.geometry.cameras.lens_bundle import Adjusted, ImagePoints, adjust, initial_parameters
+from icalib.optim.state import State
 from icalib.rig import Settings
+from icalib.sensors.camera.circle_centres import with_circle_centres
+from icalib.sensors.camera.corner_factor import CornerFactor, CornerOutput
+from icalib.sensors.camera.corner_outliers import rejected
 
 MOST_IMAGES = 40  # that are compared, half of them held out; the time is proportional to it
 FEWEST_IMAGES = 4  # in each half; with fewer no model is fitted

@@ -6,14 +6,14 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from icalib.assessment.cameras import camera_misfit, rejected_words
-from icalib.assessment.causes import INERTIAL, Cause, Misfit, noise_words, unknown_words
-from icalib.assessment.robot import robot_misfit
-from icalib.calibration import CrossValidation, SensorFit
-from icalib.calibration.excess import FAR_BEYOND, dof_known, excess
-from icalib.estimation.estimate import Estimate
-from icalib.estimation.inputs import Inputs
-from icalib.estimation.noise_size import are_noise, fitting_noise
+from icalib.estimate.estimate import Estimate
+from icalib.estimate.noise_size import are_noise, fitting_noise
+from icalib.estimate.problem.inputs import Inputs
+from icalib.result import CrossValidation, SensorFit
+from icalib.result.excess import FAR_BEYOND, dof_known, excess
+from icalib.validation.cameras import camera_misfit, rejected_words
+from icalib.validation.causes import INERTIAL, Cause, Misfit, noise_words, unknown_words
+from icalib.validation.robot import robot_misfit
 
 SMALL_CHI2 = 0.5  # per post-fit degree of freedom: below this it is worth a warning
 LARGE_FACTOR = 3.0

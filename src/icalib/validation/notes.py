@@ -6,21 +6,21 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from icalib.assessment.robot import robot_notes
-from icalib.assessment.upwards import upwards_notes
-from icalib.estimation.bodies import words_on_left_out
-from icalib.estimation.circle_centres import centre_shifts
-from icalib.estimation.clocks import instants
-from icalib.estimation.corner_factor import CornerFactor
-from icalib.estimation.corner_noise import NoiseModel
-from icalib.estimation.estimate import Estimate
-from icalib.estimation.imu_data import ImuData
-from icalib.estimation.imu_model import LABELS
-from icalib.estimation.inputs import Inputs
-from icalib.estimation.nodes import usable
-from icalib.imu_classes import class_of_sigma
+from icalib.estimate.estimate import Estimate
+from icalib.estimate.evidence.corner_noise import NoiseModel
+from icalib.estimate.problem.inputs import Inputs
+from icalib.motion.clocks import instants
+from icalib.motion.imu_data import ImuData
+from icalib.motion.imu_model import LABELS
+from icalib.motion.nodes import usable
+from icalib.result.timeline import Timeline
 from icalib.rig import ImuSensor
-from icalib.timeline import Timeline
+from icalib.rig.imu_classes import class_of_sigma
+from icalib.sensors.camera.bodies import words_on_left_out
+from icalib.sensors.camera.circle_centres import centre_shifts
+from icalib.sensors.camera.corner_factor import CornerFactor
+from icalib.validation.robot import robot_notes
+from icalib.validation.upwards import upwards_notes
 
 MOST_NAMED = 10  # images
 GROWN_VIEWS = 10  # after which the noise of tracks is told once more

@@ -7,25 +7,25 @@ from dataclasses import replace
 
 import numpy as np
 
-from icalib.calibration import LidarResiduals, Plane, PoseResiduals, SensorFit, WheelResiduals
-from icalib.calibration.excess import excess, times
-from icalib.estimation.assembly import motion_of
-from icalib.estimation.clocks import instants
-from icalib.estimation.estimate import Estimate
-from icalib.estimation.ground_factor import HEIGHT, TILT, GroundFactor
-from icalib.estimation.inputs import Inputs, origin_difference
-from icalib.estimation.lidar_binning import LidarNoise, in_world
-from icalib.estimation.lidar_factor import LidarFactor
-from icalib.estimation.nodes import usable
-from icalib.estimation.pose_factor import AbsolutePoseFactor, PoseNoise, RelativePosesFactor
-from icalib.estimation.sensors import Whitened
-from icalib.estimation.state import State
-from icalib.estimation.wheel_factor import IncrementFactor, RelativePoseFactor
-from icalib.first_guess.lidar_sight import count_of, facing
+from icalib.data.measurements import LidarStream
+from icalib.estimate.estimate import Estimate
+from icalib.estimate.problem.assembly import motion_of
+from icalib.estimate.problem.inputs import Inputs, origin_difference
 from icalib.geometry.planes import plane_of
-from icalib.measurements import LidarStream
+from icalib.initialize.lidar.lidar_sight import count_of, facing
+from icalib.motion.clocks import instants
+from icalib.motion.factor import Whitened
+from icalib.motion.nodes import usable
+from icalib.optim.state import State
+from icalib.result import LidarResiduals, Plane, PoseResiduals, SensorFit, WheelResiduals
+from icalib.result.excess import excess, times
+from icalib.result.timeline import Timeline
 from icalib.rig import PoseSensor, Rig, Wheels
-from icalib.timeline import Timeline
+from icalib.sensors.lidar.lidar_binning import LidarNoise, in_world
+from icalib.sensors.lidar.residual import LidarFactor
+from icalib.sensors.pose.residual import AbsolutePoseFactor, PoseNoise, RelativePosesFactor
+from icalib.sensors.wheels.ground_factor import HEIGHT, TILT, GroundFactor
+from icalib.sensors.wheels.residual import IncrementFactor, RelativePoseFactor
 
 MOST_POINTS = 200_000  # kept of all LiDARs together
 FEWEST_FITTED = 4

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.estimate import Estimate
-from icalib.estimation.inputs import Inputs
-from icalib.estimation.target_size import TargetSize, target_size
+from icalib.estimate.estimate import Estimate
+from icalib.estimate.evidence.target_size import TargetSize, target_size
+from icalib.estimate.problem.inputs import Inputs
 
 WRONG = 0.02  # of the size: more than a ruler or a good accelerometer is off by
 BEYOND = 0.05  # accelerometers are off by 3 % at most

@@ -6,13 +6,13 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from icalib.assessment.labels import UNITS, labels_of
-from icalib.assessment.looks_like import looks_like
-from icalib.calibration import ParameterGroup
-from icalib.calibration.units import SHOWN_UNITS
-from icalib.estimation.contradictions import Contradiction
-from icalib.estimation.inputs import Inputs
+from icalib.estimate.problem.inputs import Inputs
+from icalib.observability.contradictions import Contradiction
+from icalib.result import ParameterGroup
+from icalib.result.units import SHOWN_UNITS
 from icalib.rig import Wheels
+from icalib.validation.labels import UNITS, labels_of
+from icalib.validation.looks_like import looks_like
 
 # Radii over baseline: from 1/15 of a floor robot to 1 of a toy; rates in rpm make 1/3 a 1/30.
 SMALLEST_SHARE, LARGEST_SHARE = 1.0 / 25.0, 4.0

@@ -11,12 +11,12 @@ from contextlib import suppress
 
 import numpy as np
 
-from icalib.calibration import SensorFit
-from icalib.estimation.corner_factor import CornerFactor
-from icalib.estimation.estimate import Estimate
-from icalib.estimation.inputs import Inputs
+from icalib.estimate.estimate import Estimate
+from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.cameras.convert import fit_rays
+from icalib.result import SensorFit
+from icalib.sensors.camera.corner_factor import CornerFactor
 
 MOST_POINTS = 400  # that lenses are compared at
 OTHER_FOCAL = 0.02  # of the focal length: sets that differ by less are one

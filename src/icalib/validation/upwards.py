@@ -6,10 +6,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from icalib.estimation.estimate import Estimate
-from icalib.estimation.inputs import Inputs
-from icalib.first_guess.robot import level_sensor
-from icalib.first_guess.wheels import OPPOSITE
+from icalib.estimate.estimate import Estimate
+from icalib.estimate.problem.inputs import Inputs
+from icalib.initialize.robot import level_sensor
+from icalib.initialize.wheels.wheels import OPPOSITE
 
 UPRIGHT = 0.5  # cosine of the image's downward axis with the vehicle's: 60 degrees
 

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from icalib.data.recordings import Payload, TopicInfo
 from icalib.detection.tracking.streams import find_all_tracks
-from icalib.recordings import Payload, TopicInfo
 from icalib.rig import Camera
 
 from .conftest import SIZE, Turning, turning, wall

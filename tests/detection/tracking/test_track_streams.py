@@ -7,11 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from icalib.detection import image_work
+from icalib.data.recordings import Payload, TopicInfo
+from icalib.detection.images import image_work
 from icalib.detection.tracking import streams
 from icalib.detection.tracking.streams import find_tracks
 from icalib.errors import RecordingError
-from icalib.recordings import Payload, TopicInfo
 from icalib.rig import Camera
 
 from .conftest import SIZE

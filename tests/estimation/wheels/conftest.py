@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.estimation.arrowhead import Piece, in_parallel, make_pieces
-from icalib.estimation.border import NOTHING
-from icalib.estimation.imu_data import ImuData
-from icalib.estimation.imu_factor import ROWS, ImuFactor
-from icalib.estimation.prior_factor import Prior
-from icalib.estimation.state import Layout, State, make_layout
+from icalib.data.measurements import ImuStream
 from icalib.geometry import so3
-from icalib.measurements import ImuStream
+from icalib.motion.imu_data import ImuData
+from icalib.optim.arrowhead import Piece, in_parallel, make_pieces
+from icalib.optim.border import NOTHING
+from icalib.optim.prior_factor import Prior
+from icalib.optim.state import Layout, State, make_layout
 from icalib.rig import ImuNoise
+from icalib.sensors.imu.residual import ROWS, ImuFactor
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 GRID_S = 2e-3

@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from icalib.estimation.prior_factor import Prior
-from icalib.estimation.solver import minimise
-from icalib.estimation.wheel_factor import IncrementFactor, RelativePoseFactor, WheelNoise
+from icalib.estimate.problem.solver import minimise
 from icalib.geometry import so3
+from icalib.optim.prior_factor import Prior
+from icalib.sensors.wheels.residual import IncrementFactor, RelativePoseFactor, WheelNoise
 
 pytestmark = pytest.mark.slow
 

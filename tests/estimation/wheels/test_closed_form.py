@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from icalib.estimation.wheel_factor import WheelNoise
+from icalib.sensors.wheels.residual import WheelNoise
 
 from .test_calibration import FREE, PINNED, Slipping, away, level_drive, noisy, pinned, solve
 

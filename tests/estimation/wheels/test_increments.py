@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.estimation.arrowhead import make_pieces
-from icalib.estimation.state import make_layout
-from icalib.estimation.wheel_factor import IncrementFactor, WheelNoise
+from icalib.optim.arrowhead import make_pieces
+from icalib.optim.state import make_layout
+from icalib.sensors.wheels.residual import IncrementFactor, WheelNoise
 
 UNIT = WheelNoise(1.0, 1.0, 1.0)
 

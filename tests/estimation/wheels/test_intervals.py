@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.estimation.imu_data import ImuData
-from icalib.estimation.wheel_angles import angles_from_rates
-from icalib.estimation.wheel_intervals import LONGEST_S, PANEL_S, WheelIntervals, choose_intervals, quadrature
-from icalib.measurements import ImuStream
+from icalib.data.measurements import ImuStream
+from icalib.motion.imu_data import ImuData
 from icalib.rig import ImuNoise
+from icalib.sensors.wheels.wheel_angles import angles_from_rates
+from icalib.sensors.wheels.wheel_intervals import LONGEST_S, PANEL_S, WheelIntervals, choose_intervals, quadrature
 
 
 @pytest.fixture(scope="module")

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.estimation.arrowhead import make_pieces
-from icalib.estimation.state import make_layout
-from icalib.estimation.wheel_angles import integrals_of
-from icalib.estimation.wheel_drives import coefficients
-from icalib.estimation.wheel_factor import IncrementFactor, WheelNoise
-from icalib.measurements import WheelStream
+from icalib.data.measurements import WheelStream
+from icalib.optim.arrowhead import make_pieces
+from icalib.optim.state import make_layout
+from icalib.sensors.wheels.residual import IncrementFactor, WheelNoise
+from icalib.sensors.wheels.wheel_angles import integrals_of
+from icalib.sensors.wheels.wheel_drives import coefficients
 
 DRIVES = {
     "twist": {"scales": np.array([1.1, 0.9])},

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.estimation.arrowhead import make_pieces
-from icalib.estimation.wheel_factor import RelativePoseFactor, WheelNoise, drive_of, wheel_intervals
-from icalib.estimation.wheel_intervals import WheelIntervals
-from icalib.estimation.wheel_poses import between_given, preintegrated
+from icalib.optim.arrowhead import make_pieces
+from icalib.sensors.wheels.residual import RelativePoseFactor, WheelNoise, drive_of, wheel_intervals
+from icalib.sensors.wheels.wheel_intervals import WheelIntervals
+from icalib.sensors.wheels.wheel_poses import between_given, preintegrated
 
 RNG = np.random.default_rng(3)
 SECONDS = np.cumsum(RNG.uniform(0.01, 0.02, 60))

@@ -8,16 +8,16 @@ import tempfile
 import weakref
 from pathlib import Path
 
+from icalib.base.extras import load_zstd
+from icalib.base.file_hashes import HashedFile
+from icalib.base.unpacking import TooLargeError, copy_unpacked
+from icalib.base.yaml_nodes import read_yaml
+from icalib.data.bags.mcap import MCAP_MAGIC, McapStorage
+from icalib.data.bags.ros1 import ROS1_MAGIC, Ros1Storage
+from icalib.data.bags.sqlite import SQLITE_MAGIC, SqliteStorage
+from icalib.data.bags.storage import Storage
+from icalib.data.images.unreadable import HEAD_BYTES, not_data
 from icalib.errors import RecordingError, RigError
-from icalib.extras import load_zstd
-from icalib.file_hashes import HashedFile
-from icalib.recordings.bags.mcap import MCAP_MAGIC, McapStorage
-from icalib.recordings.bags.ros1 import ROS1_MAGIC, Ros1Storage
-from icalib.recordings.bags.sqlite import SQLITE_MAGIC, SqliteStorage
-from icalib.recordings.bags.storage import Storage
-from icalib.recordings.unreadable import HEAD_BYTES, not_data
-from icalib.unpacking import TooLargeError, copy_unpacked
-from icalib.yaml_nodes import read_yaml
 
 _READERS = {ROS1_MAGIC: Ros1Storage, MCAP_MAGIC: McapStorage, SQLITE_MAGIC: SqliteStorage}
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"

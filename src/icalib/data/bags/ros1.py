@@ -8,9 +8,9 @@ from typing import BinaryIO, final
 
 import numpy as np
 
+from icalib.data.bags.spans import DamageError, Span, SpanStorage
+from icalib.data.bags.storage import Connection, Tally, full_type
 from icalib.errors import RecordingError
-from icalib.recordings.bags.spans import DamageError, Span, SpanStorage
-from icalib.recordings.bags.storage import Connection, Tally, full_type
 
 ROS1_MAGIC = b"#ROSBAG V"
 _VERSION = b"#ROSBAG V2.0\n"

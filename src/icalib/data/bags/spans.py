@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from icalib.base.extras import load_lz4, load_zstd
+from icalib.base.file_hashes import hash_of
+from icalib.base.unpacking import TooLargeError, unpacked
+from icalib.data.bags.storage import Connection, Tally, cut_note
 from icalib.errors import RecordingError
-from icalib.extras import load_lz4, load_zstd
-from icalib.file_hashes import hash_of
-from icalib.recordings.bags.storage import Connection, Tally, cut_note
-from icalib.unpacking import TooLargeError, unpacked
 
 
 class _UnknownCompressionError(Exception):

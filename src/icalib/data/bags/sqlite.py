@@ -9,9 +9,9 @@ from contextlib import closing
 from pathlib import Path
 from typing import final
 
+from icalib.base.file_hashes import hash_of
+from icalib.data.bags.storage import Connection, Tally, cut_note, full_type
 from icalib.errors import RecordingError
-from icalib.file_hashes import hash_of
-from icalib.recordings.bags.storage import Connection, Tally, cut_note, full_type
 
 SQLITE_MAGIC = b"SQLite format 3\x00"
 # A damaged database may hold anything anywhere.

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from icalib.data.measurements import ImuStream
 from icalib.geometry import so3
-from icalib.measurements import ImuStream
 
 WINDOW_S, _RATE_HZ = 2.0, 100.0  # over which gravity must stand still; how often it is looked at
 _MOST_WINDOWS = 64  # that show the size of gravity, spread over the recording

@@ -7,13 +7,13 @@ from typing import Protocol
 
 import numpy as np
 
+from icalib.data.checks.imu_cleaning import in_time, without_wrong
+from icalib.data.checks.imu_halves import RATE_HZ, ImuHalves, one_stream
+from icalib.data.checks.imu_units import in_si, recognised_unit
+from icalib.data.measurements import ImuStream
+from icalib.data.stamps.jumps import ClockJumps
+from icalib.data.stamps.ordered import kept_readings, longest_run
 from icalib.errors import RecordingError
-from icalib.measurements import ImuStream
-from icalib.recordings.imu_cleaning import in_time, without_wrong
-from icalib.recordings.imu_halves import RATE_HZ, ImuHalves, one_stream
-from icalib.recordings.imu_units import in_si, recognised_unit
-from icalib.recordings.jumps import ClockJumps
-from icalib.recordings.ordered import kept_readings, longest_run
 from icalib.rig import ImuSensor
 
 _SATURATED_RUN = 5

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.measurements import ImuStream
-from icalib.recordings.copies import copies, held
-from icalib.recordings.even_stamps import EvenStamps, even_stamps
-from icalib.recordings.spikes import impossible, spikes, stuck
+from icalib.data.measurements import ImuStream
+from icalib.data.stamps.copies import copies, held
+from icalib.data.stamps.even_stamps import EvenStamps, even_stamps
+from icalib.data.stamps.spikes import impossible, spikes, stuck
 
 _BEYOND = 1e12  # in any unit of any sensor; squares of what is below do not overflow
 _SENSORS = ("gyroscope", "accelerometer")

@@ -9,10 +9,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from icalib.data.images.topics import TopicInfo, choose_topic
+from icalib.data.measurements import ImuStream
+from icalib.data.stamps.ordered import kept_readings
 from icalib.errors import RecordingError
-from icalib.measurements import ImuStream
-from icalib.recordings.ordered import kept_readings
-from icalib.recordings.topics import TopicInfo, choose_topic
 from icalib.rig import ImuSensor, TwoSources
 
 RATE_HZ = (10.0, 20_000.0)

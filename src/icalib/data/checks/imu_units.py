@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from icalib.data.checks.gravity_turns import WINDOW_S, gravity_size
+from icalib.data.measurements import ImuStream
+from icalib.data.tables.axes import in_axes
 from icalib.errors import RecordingError
-from icalib.measurements import ImuStream
-from icalib.recordings.axes import in_axes
-from icalib.recordings.gravity_turns import WINDOW_S, gravity_size
 from icalib.rig import ImuSensor
 
 G_M_S2 = 9.80665

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from icalib.data.checks.bad_poses import are_poses, path_of, stale_copies
+from icalib.data.checks.single_poses import single_wrong
+from icalib.data.checks.stops import stands_still_between
+from icalib.data.measurements import PoseStream, seconds_since
+from icalib.data.stamps.ordered import kept_readings
+from icalib.data.tables.poses import RATE_HZ, PoseReadings
 from icalib.errors import RecordingError
 from icalib.geometry import so3
-from icalib.measurements import PoseStream, seconds_since
-from icalib.recordings.bad_poses import are_poses, path_of, stale_copies
-from icalib.recordings.ordered import kept_readings
-from icalib.recordings.poses import RATE_HZ, PoseReadings
-from icalib.recordings.single_poses import single_wrong
-from icalib.recordings.stops import stands_still_between
 from icalib.rig import PoseSensor
 
 _FASTEST_M_S = 100.0

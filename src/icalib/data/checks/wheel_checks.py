@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from icalib.data.checks.bad_wheels import apart, comes_back, counter_of, range_of, set_back, without_wraps
+from icalib.data.measurements import WheelPoses, WheelStream, seconds_since
+from icalib.data.stamps.clocks import usual_step
+from icalib.data.stamps.ordered import kept_readings, longest_run
+from icalib.data.tables.wheels import RATE_HZ, WheelReadings
 from icalib.errors import RecordingError
-from icalib.measurements import WheelPoses, WheelStream, seconds_since
-from icalib.recordings.bad_wheels import apart, comes_back, counter_of, range_of, set_back, without_wraps
-from icalib.recordings.clocks import usual_step
-from icalib.recordings.ordered import kept_readings, longest_run
-from icalib.recordings.wheels import RATE_HZ, WheelReadings
 from icalib.rig import RATE_UNITS, Wheels
 
 _LEAST_HZ = 2.0  # the motion over longer periods is not followed by the estimate

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
+from icalib.base.file_hashes import hash_of
+from icalib.data.images.image_checks import Note, ignore
+from icalib.data.images.images import Payload, file_payload
+from icalib.data.images.unreadable import HEAD_BYTES, not_data
+from icalib.data.stamps.clocks import is_rate, nanoseconds, unit_by_date, unit_of_stamps
 from icalib.errors import RecordingError
-from icalib.file_hashes import hash_of
-from icalib.recordings.clocks import is_rate, nanoseconds, unit_by_date, unit_of_stamps
-from icalib.recordings.image_checks import Note, ignore
-from icalib.recordings.images import Payload, file_payload
-from icalib.recordings.unreadable import HEAD_BYTES, not_data
 from icalib.rig import TimeUnit
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")

@@ -8,16 +8,8 @@ from itertools import chain, islice
 
 import numpy as np
 
+from icalib.data.images.images import NO_PICTURE, DamagedImageError, Frame, Payload, decode, is_known, unknown_encoding
 from icalib.errors import RecordingError
-from icalib.recordings.images import (
-    NO_PICTURE,
-    DamagedImageError,
-    Frame,
-    Payload,
-    decode,
-    is_known,
-    unknown_encoding,
-)
 
 Note = Callable[[str], None]
 LOOK_AHEAD = 5  # images: what most of them have is the resolution

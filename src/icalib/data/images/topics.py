@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import PurePosixPath
 from typing import Protocol
 
+from icalib.data.images.unreadable import type_not_read
 from icalib.errors import RecordingError
-from icalib.recordings.unreadable import type_not_read
 from icalib.rig import Camera
 
 _MAX_LISTED = 20

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from icalib.base.extras import load_cv2
+from icalib.data.images.euroc_images import unit_of_texts
+from icalib.data.images.images import Payload
+from icalib.data.images.topics import TopicInfo
+from icalib.data.images.unreadable import VIDEO_FILE, is_video
+from icalib.data.stamps.clocks import nanoseconds
 from icalib.errors import RecordingError
-from icalib.extras import load_cv2
-from icalib.recordings.clocks import nanoseconds
-from icalib.recordings.euroc_images import unit_of_texts
-from icalib.recordings.images import Payload
-from icalib.recordings.topics import TopicInfo
-from icalib.recordings.unreadable import VIDEO_FILE, is_video
 
 _TABLES = (".csv", ".txt")
 _STAMP = re.compile(r"[0-9]+(\.[0-9]*)?")

@@ -10,11 +10,11 @@ from itertools import chain
 
 import numpy as np
 
+from icalib.data.measurements import LidarStream
+from icalib.data.messages.lidar_checks import Sieve
+from icalib.data.messages.point_times import PointTimes, clock_note, find_point_times, likely_fields
+from icalib.data.messages.sweeps import Sweep, find_sweep, sweep_share
 from icalib.errors import RecordingError
-from icalib.measurements import LidarStream
-from icalib.recordings.lidar_checks import Sieve
-from icalib.recordings.point_times import PointTimes, clock_note, find_point_times, likely_fields
-from icalib.recordings.sweeps import Sweep, find_sweep, sweep_share
 from icalib.rig import Lidar, TimeUnit
 
 _AHEAD = 8  # clouds with points that tell how points are timed

@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from icalib.data.measurements import LidarStream
 from icalib.errors import RecordingError
-from icalib.measurements import LidarStream
 
 _RECENT = 4  # scans among which a copy is looked for: messages overtake each other by few
 _SWAPPED_S = 1.0  # messages overtake each other on the network by less

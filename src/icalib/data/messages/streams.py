@@ -9,9 +9,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from icalib.data.messages.clouds import PointCloud
+from icalib.data.messages.livox import LivoxCloud
 from icalib.errors import RecordingError
-from icalib.recordings.clouds import PointCloud
-from icalib.recordings.livox import LivoxCloud
 
 
 class HasMessages(Protocol):

@@ -1,13 +1,13 @@
 """Recordings: what was recorded -> images, and checked measurements."""
 
-from icalib.recordings.bag import BagRecording
-from icalib.recordings.base import Recording
-from icalib.recordings.folder import FolderRecording
-from icalib.recordings.images import DamagedImageError, Frame, Payload, decode
-from icalib.recordings.opening import open_recording
-from icalib.recordings.pictures import PictureFolder
-from icalib.recordings.reading import read_measurements
-from icalib.recordings.topics import TopicInfo, image_topics
+from icalib.data.images.images import DamagedImageError, Frame, Payload, decode
+from icalib.data.images.topics import TopicInfo, image_topics
+from icalib.data.recordings.bag import BagRecording
+from icalib.data.recordings.base import Recording
+from icalib.data.recordings.folder import FolderRecording
+from icalib.data.recordings.opening import open_recording
+from icalib.data.recordings.pictures import PictureFolder
+from icalib.data.recordings.reading import read_measurements
 
 __all__ = [
     "BagRecording",

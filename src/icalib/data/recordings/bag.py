@@ -11,19 +11,18 @@ from typing import Any, final
 
 import numpy as np
 
-from icalib.errors import RecordingError
-from icalib.extras import load_typesys, load_zstd
-from icalib.geometry.targets import Target
-from icalib.measurements import CornerStream, ImuStream, LidarStream, TrackStream, WheelPoses
-from icalib.recordings import livox
-from icalib.recordings.bags.opening import ZSTD_MAGIC, open_storages
-from icalib.recordings.bags.storage import Tally
-from icalib.recordings.clouds import read_clouds
-from icalib.recordings.image_checks import checked_payloads, frames
-from icalib.recordings.images import Frame, Payload, file_payload
-from icalib.recordings.imu_halves import ImuHalves, imu_source, values_of
-from icalib.recordings.poses import PoseReadings, read_pose_file
-from icalib.recordings.streams import (
+from icalib.base.extras import load_typesys, load_zstd
+from icalib.base.unpacking import unpacked
+from icalib.data.bags.opening import ZSTD_MAGIC, open_storages
+from icalib.data.bags.storage import Tally
+from icalib.data.checks.imu_halves import ImuHalves, imu_source, values_of
+from icalib.data.images.image_checks import checked_payloads, frames
+from icalib.data.images.images import Frame, Payload, file_payload
+from icalib.data.images.topics import KINDS, TopicInfo, choose_topic, find_topic
+from icalib.data.measurements import CornerStream, ImuStream, LidarStream, TrackStream, WheelPoses
+from icalib.data.messages import livox
+from icalib.data.messages.clouds import read_clouds
+from icalib.data.messages.streams import (
     point_clouds,
     read_joints,
     read_odometry,
@@ -31,9 +30,7 @@ from icalib.recordings.streams import (
     read_poses,
     read_twists,
 )
-from icalib.recordings.topics import KINDS, TopicInfo, choose_topic, find_topic
-from icalib.recordings.tracks import read_tracks
-from icalib.recordings.transforms import (
+from icalib.data.recordings.transforms import (
     DEFAULT_TOPIC,
     MESSAGE,
     MESSAGE_TYPE,
@@ -41,10 +38,13 @@ from icalib.recordings.transforms import (
     read_transform_poses,
     refuse_without_frames,
 )
-from icalib.recordings.wheels import WheelReadings, read_wheel_joints, read_wheel_twists
-from icalib.recordings.window import WHOLE, Span, Window, cut
+from icalib.data.stamps.window import WHOLE, Span, Window, cut
+from icalib.data.tables.poses import PoseReadings, read_pose_file
+from icalib.data.tables.tracks import read_tracks
+from icalib.data.tables.wheels import WheelReadings, read_wheel_joints, read_wheel_twists
+from icalib.errors import RecordingError
+from icalib.geometry.targets import Target
 from icalib.rig import Camera, ImuSensor, Lidar, PoseSensor, TwoSources, Wheels
-from icalib.unpacking import unpacked
 
 _SWAPPED_NS = 1_000_000_000  # readings overtake each other on the network by less; more is a clock that was set back
 

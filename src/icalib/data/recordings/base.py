@@ -8,13 +8,13 @@ from typing import Protocol
 
 import numpy as np
 
+from icalib.data.checks.imu_halves import ImuHalves
+from icalib.data.images.images import Frame, Payload
+from icalib.data.images.topics import TopicInfo
+from icalib.data.measurements import CornerStream, ImuStream, LidarStream, TrackStream, WheelPoses
+from icalib.data.tables.poses import PoseReadings
+from icalib.data.tables.wheels import WheelReadings
 from icalib.geometry.targets import Target
-from icalib.measurements import CornerStream, ImuStream, LidarStream, TrackStream, WheelPoses
-from icalib.recordings.images import Frame, Payload
-from icalib.recordings.imu_halves import ImuHalves
-from icalib.recordings.poses import PoseReadings
-from icalib.recordings.topics import TopicInfo
-from icalib.recordings.wheels import WheelReadings
 from icalib.rig import Camera, ImuSensor, Lidar, PoseSensor, Wheels
 
 

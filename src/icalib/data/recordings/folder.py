@@ -9,28 +9,28 @@ from typing import final
 
 import numpy as np
 
+from icalib.data.checks.imu_halves import ImuHalves
+from icalib.data.images.euroc_images import file_payloads, image_files
+from icalib.data.images.image_checks import Note, checked_payloads, frames, ignore
+from icalib.data.images.images import Frame, Payload
+from icalib.data.images.topics import TopicInfo, choose_topic, find_topic
+from icalib.data.images.unreadable import VIDEO_FILE
+from icalib.data.images.videos import video_payloads, video_stamps, video_topic, videos_in
+from icalib.data.measurements import CornerStream, ImuStream, LidarStream, TrackStream, WheelPoses
+from icalib.data.messages.lidar_checks import Sieve, sifted
+from icalib.data.stamps.sections import S
+from icalib.data.stamps.window import WHOLE, Span, Window, cut, stamps_inside
+from icalib.data.tables.columns import IMU, IMU_ACCEL, IMU_GYRO, STAMP, TableKind
+from icalib.data.tables.corners import group_corners
+from icalib.data.tables.numbered import numbered_pictures, stamped_by_rows
+from icalib.data.tables.poses import FILES as POSE_FILES
+from icalib.data.tables.poses import POSES, PoseReadings, is_tum_text, read_pose_file
+from icalib.data.tables.scans import in_seconds, read_scan_stamps, read_scans
+from icalib.data.tables.table import Table, holds, named, read_table
+from icalib.data.tables.tracks import read_track_stamps, read_tracks
+from icalib.data.tables.wheels import RELATIVE_POSES, STAMPS, UNITS, WheelReadings, read_wheel_table
 from icalib.errors import RecordingError
 from icalib.geometry.targets import Target
-from icalib.measurements import CornerStream, ImuStream, LidarStream, TrackStream, WheelPoses
-from icalib.recordings.columns import IMU, IMU_ACCEL, IMU_GYRO, STAMP, TableKind
-from icalib.recordings.corners import group_corners
-from icalib.recordings.euroc_images import file_payloads, image_files
-from icalib.recordings.image_checks import Note, checked_payloads, frames, ignore
-from icalib.recordings.images import Frame, Payload
-from icalib.recordings.imu_halves import ImuHalves
-from icalib.recordings.lidar_checks import Sieve, sifted
-from icalib.recordings.numbered import numbered_pictures, stamped_by_rows
-from icalib.recordings.poses import FILES as POSE_FILES
-from icalib.recordings.poses import POSES, PoseReadings, is_tum_text, read_pose_file
-from icalib.recordings.scans import in_seconds, read_scan_stamps, read_scans
-from icalib.recordings.sections import S
-from icalib.recordings.table import Table, holds, named, read_table
-from icalib.recordings.topics import TopicInfo, choose_topic, find_topic
-from icalib.recordings.tracks import read_track_stamps, read_tracks
-from icalib.recordings.unreadable import VIDEO_FILE
-from icalib.recordings.videos import video_payloads, video_stamps, video_topic, videos_in
-from icalib.recordings.wheels import RELATIVE_POSES, STAMPS, UNITS, WheelReadings, read_wheel_table
-from icalib.recordings.window import WHOLE, Span, Window, cut, stamps_inside
 from icalib.rig import PLAIN_TABLE, Camera, ImuSensor, Lidar, PoseSensor, TableLayout, TwoSources, Wheels
 
 _CORNERS = TableKind(

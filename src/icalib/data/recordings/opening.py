@@ -5,15 +5,15 @@ from __future__ import annotations
 from math import inf
 from pathlib import Path
 
+from icalib.data.bags.opening import bag_files
+from icalib.data.images.unreadable import HEAD_BYTES, is_video, not_data
+from icalib.data.recordings.bag import BagRecording
+from icalib.data.recordings.base import Recording
+from icalib.data.recordings.folder import FolderRecording, has_named_table
+from icalib.data.recordings.pictures import PictureFolder, has_pictures
+from icalib.data.stamps.window import Window
+from icalib.data.tables.poses import FILES as POSE_FILES
 from icalib.errors import RecordingError
-from icalib.recordings.bag import BagRecording
-from icalib.recordings.bags.opening import bag_files
-from icalib.recordings.base import Recording
-from icalib.recordings.folder import FolderRecording, has_named_table
-from icalib.recordings.pictures import PictureFolder, has_pictures
-from icalib.recordings.poses import FILES as POSE_FILES
-from icalib.recordings.unreadable import HEAD_BYTES, is_video, not_data
-from icalib.recordings.window import Window
 
 _MAX_LISTED = 12
 _OF_TABLES = ("*/*.csv", "*/*.csv.gz", "mav0", "*/data", *(f"*/{name}" for name in POSE_FILES))

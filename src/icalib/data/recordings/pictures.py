@@ -13,16 +13,16 @@ from typing import final
 
 import numpy as np
 
+from icalib.data.images.euroc_images import SUFFIXES, file_payloads, pictures_in, stamped_by_name
+from icalib.data.images.image_checks import checked_payloads, frames
+from icalib.data.images.images import Frame, Payload
+from icalib.data.images.topics import TopicInfo, choose_topic
+from icalib.data.measurements import CornerStream, ImuStream, LidarStream, TrackStream, WheelPoses
+from icalib.data.stamps.window import WHOLE, Window, stamps_inside
+from icalib.data.tables.poses import PoseReadings
+from icalib.data.tables.wheels import WheelReadings
 from icalib.errors import RecordingError
 from icalib.geometry.targets import Target
-from icalib.measurements import CornerStream, ImuStream, LidarStream, TrackStream, WheelPoses
-from icalib.recordings.euroc_images import SUFFIXES, file_payloads, pictures_in, stamped_by_name
-from icalib.recordings.image_checks import checked_payloads, frames
-from icalib.recordings.images import Frame, Payload
-from icalib.recordings.poses import PoseReadings
-from icalib.recordings.topics import TopicInfo, choose_topic
-from icalib.recordings.wheels import WheelReadings
-from icalib.recordings.window import WHOLE, Window, stamps_inside
 from icalib.rig import Camera, ImuSensor, Lidar, PoseSensor, Wheels
 
 APART_NS = 1_000_000_000  # from one number to the next

@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+from icalib.data.checks.imu_checks import read_imu
+from icalib.data.checks.pose_checks import checked_poses
+from icalib.data.checks.wheel_checks import checked_wheels
+from icalib.data.images.topics import image_topics
+from icalib.data.measurements import CornerStream, LidarStream, Measurements, TrackStream
+from icalib.data.messages.lidar_checks import checked_lidar
+from icalib.data.recordings.base import Recording
+from icalib.data.stamps.camera_checks import checked_corners
+from icalib.data.stamps.jumps import LONGEST_S, ClockJumps
+from icalib.data.stamps.sections import S
+from icalib.data.tables.poses import as_frame_sensor
 from icalib.errors import RecordingError
-from icalib.measurements import CornerStream, LidarStream, Measurements, TrackStream
-from icalib.recordings.base import Recording
-from icalib.recordings.camera_checks import checked_corners
-from icalib.recordings.imu_checks import read_imu
-from icalib.recordings.jumps import LONGEST_S, ClockJumps
-from icalib.recordings.lidar_checks import checked_lidar
-from icalib.recordings.pose_checks import checked_poses
-from icalib.recordings.poses import as_frame_sensor
-from icalib.recordings.sections import S
-from icalib.recordings.topics import image_topics
-from icalib.recordings.wheel_checks import checked_wheels
 from icalib.rig import Camera, Lidar, PoseSensor, Rig, Wheels
 
 FindCorners = Callable[[Recording, Camera], tuple[CornerStream, tuple[str, ...]]]

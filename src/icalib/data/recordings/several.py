@@ -9,9 +9,9 @@ from contextlib import contextmanager
 from math import inf
 from pathlib import Path
 
+from icalib.data.recordings.base import Recording
+from icalib.data.recordings.opening import open_recording
 from icalib.errors import CalibrationError, RecordingError
-from icalib.recordings.base import Recording
-from icalib.recordings.opening import open_recording
 
 Source = Recording | str | Path
 

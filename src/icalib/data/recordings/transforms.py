@@ -11,12 +11,12 @@ from typing import Protocol
 
 import numpy as np
 
+from icalib.data.images.image_checks import Note
+from icalib.data.images.topics import TopicInfo, find_topic
+from icalib.data.messages.streams import HasMessages, unit_rotations
+from icalib.data.tables.poses import PoseReadings
 from icalib.errors import RecordingError
 from icalib.geometry import so3
-from icalib.recordings.image_checks import Note
-from icalib.recordings.poses import PoseReadings
-from icalib.recordings.streams import HasMessages, unit_rotations
-from icalib.recordings.topics import TopicInfo, find_topic
 from icalib.rig import PoseSensor
 
 TRANSFORMS = "transforms"  # the kind of such a topic

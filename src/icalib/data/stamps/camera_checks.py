@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from icalib.data.measurements import CornerStream, TrackStream
+from icalib.data.stamps.clocks import rate_sentence
 from icalib.errors import RecordingError
-from icalib.measurements import CornerStream, TrackStream
-from icalib.recordings.clocks import rate_sentence
 
 _RATE_HZ = (1e-3, 1000.0)
 _MIN_CORNERS = 4  # fewer do not give a pose

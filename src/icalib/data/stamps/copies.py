@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.recordings.clocks import usual_step
+from icalib.data.stamps.clocks import usual_step
 
 _BETWEEN = 0.75  # of the period: the step from a copy to its nearest neighbour is shorter
 _LATEST_NS = 1_000_000_000  # between a reading and its copy

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.recordings.clocks import usual_step
+from icalib.data.stamps.clocks import usual_step
 
 _UNEVEN, _UNEVEN_SHARE = 0.2, 0.005  # of the period off; of the steps: fewer are single delays
 _TOGETHER = 0.5  # of the period: readings with shorter steps belong to one burst

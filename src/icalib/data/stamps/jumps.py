@@ -11,9 +11,9 @@ from itertools import pairwise
 
 import numpy as np
 
+from icalib.data.stamps.clocks import usual_step
+from icalib.data.stamps.sections import S, Stamped, section
 from icalib.errors import RecordingError
-from icalib.recordings.clocks import usual_step
-from icalib.recordings.sections import S, Stamped, section
 
 JUMP_S = 600.0  # longer steps are no pause of a recording
 LONGEST_S = 6 * 3600.0  # of a calibration: memory grows with the time between the first stamp and the last

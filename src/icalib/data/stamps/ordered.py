@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from icalib.data.stamps.clocks import rate_sentence
 from icalib.errors import RecordingError
-from icalib.recordings.clocks import rate_sentence
 
 _CUT_SHARE = 0.3  # of readings with the stamp of another: these are cut stamps
 _MOST_DOUBTFUL, _LEAST_LEFT = 0.1, 3  # of readings, beyond one stamp: more are no single bad ones

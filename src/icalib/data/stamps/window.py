@@ -8,8 +8,8 @@ from math import inf, isnan
 
 import numpy as np
 
+from icalib.data.stamps.sections import S, section
 from icalib.errors import RecordingError
-from icalib.recordings.sections import S, section
 
 Span = tuple[int, int]  # first and last stamp, ns
 _LONGEST_NS = 86_400_000_000_000  # a stream over more than a day has a clock that jumps

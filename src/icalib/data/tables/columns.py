@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from icalib.recordings.table_kernels import LEFT_OUT
+from icalib.data.tables.table_kernels import LEFT_OUT
 from icalib.rig import TimeUnit
 
 _UNIT = re.compile(r"\[[^]]*\]|\([^)]*\)")

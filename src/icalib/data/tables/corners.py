@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from icalib.data.measurements import CornerStream
 from icalib.errors import RecordingError
 from icalib.geometry.targets import Target
-from icalib.measurements import CornerStream
 
 
 def group_corners(

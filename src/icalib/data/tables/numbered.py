@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
+from icalib.data.images.euroc_images import pictures_in, stamped_by_name
+from icalib.data.images.image_checks import Note
+from icalib.data.stamps.clocks import is_rate
+from icalib.data.tables.columns import STAMP, TableKind, split_kind
+from icalib.data.tables.poses import POSES, RATE_HZ, is_tum_text
+from icalib.data.tables.table import read_table
 from icalib.errors import RecordingError
-from icalib.recordings.clocks import is_rate
-from icalib.recordings.columns import STAMP, TableKind, split_kind
-from icalib.recordings.euroc_images import pictures_in, stamped_by_name
-from icalib.recordings.image_checks import Note
-from icalib.recordings.poses import POSES, RATE_HZ, is_tum_text
-from icalib.recordings.table import read_table
 from icalib.rig import TableLayout
 
 _IMAGE_RATE_HZ = (1e-3, 1000.0)  # names are stamps only if they make an image rate within this range

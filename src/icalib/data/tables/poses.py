@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from icalib.data.images.image_checks import Note, ignore
+from icalib.data.messages.streams import unit_rotations
+from icalib.data.tables.axes import in_axes
+from icalib.data.tables.columns import STAMP, TableKind, vector_names
+from icalib.data.tables.table import read_table
 from icalib.errors import RecordingError
-from icalib.recordings.axes import in_axes
-from icalib.recordings.columns import STAMP, TableKind, vector_names
-from icalib.recordings.image_checks import Note, ignore
-from icalib.recordings.streams import unit_rotations
-from icalib.recordings.table import read_table
 from icalib.rig import PLAIN_TABLE, PoseSensor, TableLayout
 
 RATE_HZ = (1e-3, 5000.0)

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
+from icalib.base.unpacking import load_arrays
+from icalib.data.images.unreadable import HEAD_BYTES, not_data
+from icalib.data.measurements import LidarStream
+from icalib.data.messages.point_times import LONGEST_PERIODS, UNIT_NS, unit_of_offsets, within_scan
 from icalib.errors import RecordingError
-from icalib.measurements import LidarStream
-from icalib.recordings.point_times import LONGEST_PERIODS, UNIT_NS, unit_of_offsets, within_scan
-from icalib.recordings.unreadable import HEAD_BYTES, not_data
 from icalib.rig import Lidar
-from icalib.unpacking import load_arrays
 
 _REQUIRED = {"stamps_ns": np.int64, "start": np.int64, "offset_s": np.float32, "xyz": np.float32}
 _OPTIONAL = {"plane": np.int32}

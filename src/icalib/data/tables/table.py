@@ -12,15 +12,15 @@ from pathlib import Path
 
 import numpy as np
 
+from icalib.base.file_hashes import hash_of
+from icalib.base.unpacking import TooLargeError, gunzipped
+from icalib.data.images.image_checks import Note, ignore
+from icalib.data.images.unreadable import HEAD_BYTES, not_data
+from icalib.data.stamps.clocks import POWERS_OF_NS, UNIT_WORDS, TimeUnit, is_rate, unit_of_stamps
+from icalib.data.tables.columns import TableKind, contradicts, places_by_name, places_given, split_kind
+from icalib.data.tables.table_kernels import LEFT_OUT, POWERS, parse
 from icalib.errors import RecordingError
-from icalib.file_hashes import hash_of
-from icalib.recordings.clocks import POWERS_OF_NS, UNIT_WORDS, TimeUnit, is_rate, unit_of_stamps
-from icalib.recordings.columns import TableKind, contradicts, places_by_name, places_given, split_kind
-from icalib.recordings.image_checks import Note, ignore
-from icalib.recordings.table_kernels import LEFT_OUT, POWERS, parse
-from icalib.recordings.unreadable import HEAD_BYTES, not_data
 from icalib.rig import PLAIN_TABLE, TableLayout
-from icalib.unpacking import TooLargeError, gunzipped
 
 _GZIP_MAGIC = b"\x1f\x8b"
 _SEPARATORS = (",", ";", "\t", None)  # None: blanks

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.compiled import njit
+from icalib.base.compiled import njit
 
 POWERS = np.array([float(f"1e{k}") for k in range(309)])
 LEFT_OUT = -1  # of a column's place

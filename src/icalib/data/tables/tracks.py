@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
+from icalib.data.images.image_checks import Note, ignore
+from icalib.data.measurements import TrackStream
+from icalib.data.stamps.camera_checks import in_image, outside_note
+from icalib.data.stamps.clocks import rate_sentence
+from icalib.data.tables.columns import STAMP, TableKind
+from icalib.data.tables.table import read_table
 from icalib.errors import RecordingError
-from icalib.measurements import TrackStream
-from icalib.recordings.camera_checks import in_image, outside_note
-from icalib.recordings.clocks import rate_sentence
-from icalib.recordings.columns import STAMP, TableKind
-from icalib.recordings.image_checks import Note, ignore
-from icalib.recordings.table import read_table
 from icalib.rig import PLAIN_TABLE, TableLayout
 
 _RATE_HZ = (1e-3, 1000.0)

@@ -8,11 +8,11 @@ from typing import Protocol
 
 import numpy as np
 
+from icalib.data.images.image_checks import Note
+from icalib.data.measurements import WheelPoses
+from icalib.data.tables.columns import STAMP, TableKind
+from icalib.data.tables.table import Table, read_table
 from icalib.errors import RecordingError
-from icalib.measurements import WheelPoses
-from icalib.recordings.columns import STAMP, TableKind
-from icalib.recordings.image_checks import Note
-from icalib.recordings.table import Table, read_table
 from icalib.rig import WheelDrive, WheelMeasure, Wheels
 
 RATE_HZ = (1e-2, 10_000.0)

@@ -7,15 +7,15 @@ from functools import cached_property
 
 import numpy as np
 
-from icalib.detection.consistency import consistent_corners, largest_group
-from icalib.detection.corners import CROWDED, ImageCorners, judged, no_corners
-from icalib.detection.families import Family, tag_family
-from icalib.detection.growth import confirm, grow
-from icalib.detection.markers import APRILTAG_CORNER
-from icalib.detection.prediction import PredictedCorners
-from icalib.detection.quads import View
-from icalib.detection.refinement import refined_corners, refined_crossings
-from icalib.detection.tags import Tags, find_tags
+from icalib.detection.boards.markers import APRILTAG_CORNER
+from icalib.detection.primitives.consistency import consistent_corners, largest_group
+from icalib.detection.primitives.corners import CROWDED, ImageCorners, judged, no_corners
+from icalib.detection.primitives.families import Family, tag_family
+from icalib.detection.primitives.growth import confirm, grow
+from icalib.detection.primitives.prediction import PredictedCorners
+from icalib.detection.primitives.quads import View
+from icalib.detection.primitives.refinement import refined_corners, refined_crossings
+from icalib.detection.primitives.tags import Tags, find_tags
 from icalib.errors import RecordingError
 from icalib.geometry.targets.families import APRILGRID_FAMILY
 

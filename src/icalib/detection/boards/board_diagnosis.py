@@ -7,15 +7,15 @@ from itertools import islice
 
 import numpy as np
 
-from icalib.detection.aprilgrid import grid_tags
-from icalib.detection.charuco import charuco_tags, dark_squares
-from icalib.detection.checkerboard import CheckerboardDetector
-from icalib.detection.families import tag_family
-from icalib.detection.growth import homography_misfit
-from icalib.detection.markers import all_tags
-from icalib.detection.quads import View
-from icalib.detection.tags import find_tags
-from icalib.extras import load_cv2
+from icalib.base.extras import load_cv2
+from icalib.detection.boards.aprilgrid import grid_tags
+from icalib.detection.boards.charuco import charuco_tags, dark_squares
+from icalib.detection.boards.checkerboard import CheckerboardDetector
+from icalib.detection.boards.markers import all_tags
+from icalib.detection.primitives.families import tag_family
+from icalib.detection.primitives.growth import homography_misfit
+from icalib.detection.primitives.quads import View
+from icalib.detection.primitives.tags import find_tags
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard
 
 _MOST_IMAGES = 5  # that are searched; the time grows with it

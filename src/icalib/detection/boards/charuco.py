@@ -7,15 +7,15 @@ from functools import cached_property
 
 import numpy as np
 
-from icalib.detection.consistency import largest_group
-from icalib.detection.corners import ImageCorners, no_corners
-from icalib.detection.decoding import mapped
-from icalib.detection.families import Family, tag_family
-from icalib.detection.growth import fit_homography, homography_misfit, markers_there
-from icalib.detection.markers import all_tags
-from icalib.detection.prediction import PredictedCorners, predict_nodes
-from icalib.detection.quads import View
-from icalib.detection.squares import square_corners
+from icalib.detection.boards.markers import all_tags
+from icalib.detection.primitives.consistency import largest_group
+from icalib.detection.primitives.corners import ImageCorners, no_corners
+from icalib.detection.primitives.decoding import mapped
+from icalib.detection.primitives.families import Family, tag_family
+from icalib.detection.primitives.growth import fit_homography, homography_misfit, markers_there
+from icalib.detection.primitives.prediction import PredictedCorners, predict_nodes
+from icalib.detection.primitives.quads import View
+from icalib.detection.primitives.squares import square_corners
 from icalib.errors import RecordingError
 
 _NEAREST = 4  # markers that predict a corner

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.detection.corners import INCONSISTENT, ImageCorners, no_corners
-from icalib.detection.crossings import continues_beyond, shows_grid
-from icalib.detection.decoding import nearest_greys
-from icalib.detection.prediction import PredictedCorners, predict_nodes
-from icalib.detection.quads import View
-from icalib.detection.squares import square_corners
+from icalib.base.extras import load_cv2
+from icalib.detection.primitives.corners import INCONSISTENT, ImageCorners, no_corners
+from icalib.detection.primitives.crossings import continues_beyond, shows_grid
+from icalib.detection.primitives.decoding import nearest_greys
+from icalib.detection.primitives.prediction import PredictedCorners, predict_nodes
+from icalib.detection.primitives.quads import View
+from icalib.detection.primitives.squares import square_corners
 from icalib.errors import RecordingError
-from icalib.extras import load_cv2
 
 _REDUCED_PX = 1000  # larger images are searched at a fraction of their size first; only the time depends on it
 _LEAST_SEEN = 0.5  # of the corners inside the outermost, seen in rows and columns, for the thorough search

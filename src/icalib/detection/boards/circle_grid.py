@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.detection.decoding import mapped, nearest_greys
-from icalib.detection.ellipse_model import LEAST_HALF_AXIS_PX
-from icalib.detection.growth import fit_homography
-from icalib.detection.tags import LEAST_CONTRAST
-from icalib.extras import load_cv2
+from icalib.base.extras import load_cv2
+from icalib.detection.primitives.decoding import mapped, nearest_greys
+from icalib.detection.primitives.ellipse_model import LEAST_HALF_AXIS_PX
+from icalib.detection.primitives.growth import fit_homography
+from icalib.detection.primitives.tags import LEAST_CONTRAST
 from icalib.geometry.targets import Circles
 
 _LEAST_DIAMETER_PX = 2.0 * LEAST_HALF_AXIS_PX  # no centre of a smaller one is kept

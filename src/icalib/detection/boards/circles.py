@@ -1,6 +1,6 @@
 """Grids of circles: dark ellipses that stand as in the grid, then a blurred ellipse is fitted to the edge of each.
 
-The centre of that ellipse is not the projected centre of the circle; `estimation/circle_centres.py` corrects it.
+The centre of that ellipse is not the projected centre of the circle; `sensors/camera/circle_centres.py` corrects it.
 """
 
 from __future__ import annotations
@@ -9,12 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.detection.circle_grid import dark_ellipses, find_grids, step_of
-from icalib.detection.consistency import consistent_corners
-from icalib.detection.corners import ImageCorners, judged, no_corners
-from icalib.detection.ellipse_model import fit_ellipses
-from icalib.detection.prediction import PredictedCorners
-from icalib.detection.quads import View
+from icalib.detection.boards.circle_grid import dark_ellipses, find_grids, step_of
+from icalib.detection.primitives.consistency import consistent_corners
+from icalib.detection.primitives.corners import ImageCorners, judged, no_corners
+from icalib.detection.primitives.ellipse_model import fit_ellipses
+from icalib.detection.primitives.prediction import PredictedCorners
+from icalib.detection.primitives.quads import View
 from icalib.geometry.targets import Circles
 
 _LEAST_FOUND = 0.5  # of the circles, with an ellipse at a consistent place: otherwise it is no grid

@@ -9,14 +9,14 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from icalib.detection.aprilgrid import AprilGridDetector
-from icalib.detection.charuco import CharucoDetector
-from icalib.detection.checkerboard import CheckerboardDetector
-from icalib.detection.circles import CirclesDetector
-from icalib.detection.corners import ImageCorners, no_corners
-from icalib.detection.markers import MarkerDetector
-from icalib.detection.prediction import PredictedCorners, predict_corners
-from icalib.detection.quads import View
+from icalib.detection.boards.aprilgrid import AprilGridDetector
+from icalib.detection.boards.charuco import CharucoDetector
+from icalib.detection.boards.checkerboard import CheckerboardDetector
+from icalib.detection.boards.circles import CirclesDetector
+from icalib.detection.boards.markers import MarkerDetector
+from icalib.detection.primitives.corners import ImageCorners, no_corners
+from icalib.detection.primitives.prediction import PredictedCorners, predict_corners
+from icalib.detection.primitives.quads import View
 from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles, Markers, Scene, Target
 

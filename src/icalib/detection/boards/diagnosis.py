@@ -9,10 +9,10 @@ from typing import Literal
 
 import numpy as np
 
-from icalib.detection.detectors import charuco_detector
-from icalib.detection.families import tag_family
-from icalib.detection.quads import View
-from icalib.detection.tags import tags_at
+from icalib.detection.boards.detectors import charuco_detector
+from icalib.detection.primitives.families import tag_family
+from icalib.detection.primitives.quads import View
+from icalib.detection.primitives.tags import tags_at
 from icalib.geometry.targets import Charuco
 from icalib.geometry.targets.families import FAMILIES, TagSet, is_available
 

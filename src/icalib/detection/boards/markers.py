@@ -7,11 +7,11 @@ from functools import cached_property
 
 import numpy as np
 
-from icalib.detection.corners import CROWDED, ImageCorners, judged, no_corners
-from icalib.detection.families import Family, tag_family
-from icalib.detection.quads import View
-from icalib.detection.refinement import refined_corners
-from icalib.detection.tags import Tags, tags_at
+from icalib.detection.primitives.corners import CROWDED, ImageCorners, judged, no_corners
+from icalib.detection.primitives.families import Family, tag_family
+from icalib.detection.primitives.quads import View
+from icalib.detection.primitives.refinement import refined_corners
+from icalib.detection.primitives.tags import Tags, tags_at
 from icalib.errors import RecordingError
 
 # icalib's number of each of OpenCV's corners: from the lower left of the tag's own picture, counterclockwise. OpenCV's

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from icalib.detection.corners import ImageCorners
-from icalib.recordings import Payload
-from icalib.staging import staged
-from icalib.unpacking import load_arrays
+from icalib.base.staging import staged
+from icalib.base.unpacking import load_arrays
+from icalib.data.recordings import Payload
+from icalib.detection.primitives.corners import ImageCorners
 
 VERSION = 8  # of the detectors and of the format: whatever changes corners changes this
 _FIELDS = ("point", "uv", "sigma", "blur", "verdict", "edges")

@@ -12,10 +12,10 @@ from typing import TypeVar
 
 import numpy as np
 
+from icalib.base.extras import load_cv2
+from icalib.data.measurements import which_image
+from icalib.data.recordings import DamagedImageError, Payload, Recording, decode
 from icalib.errors import RecordingError
-from icalib.extras import load_cv2
-from icalib.measurements import which_image
-from icalib.recordings import DamagedImageError, Payload, Recording, decode
 from icalib.rig import Camera
 
 T = TypeVar("T")

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icalib.compiled import njit
+from icalib.base.compiled import njit
 
 MOMENTS = 10  # 1; x, xx; y, yx, yy; z, zx, zy, zz
 LARGEST_TURN = 0.26  # rad between the normal of a voxel and its region: those of voxels are rough

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from icalib.detection.plane_kernels import (
+from icalib.detection.planes.plane_kernels import (
     LARGEST_TURN,
     MOMENTS,
     NEAR,

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from icalib.compiled import njit
-from icalib.detection.decoding import mapped, unit_homography
-from icalib.detection.growth import fit_homography
+from icalib.base.compiled import njit
+from icalib.detection.primitives.decoding import mapped, unit_homography
+from icalib.detection.primitives.growth import fit_homography
 
 _NEAREST = 12
 _MOST_OFF = (1.0, 0.05)  # px, and of a side: how far a corner may lie from where its neighbours place it

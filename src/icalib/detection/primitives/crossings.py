@@ -10,10 +10,10 @@ from math import hypot
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from icalib.compiled import njit
-from icalib.detection.saddles import crossing_contrast, find_saddle
-from icalib.detection.tags import LEAST_CONTRAST
-from icalib.extras import load_cv2
+from icalib.base.compiled import njit
+from icalib.base.extras import load_cv2
+from icalib.detection.primitives.saddles import crossing_contrast, find_saddle
+from icalib.detection.primitives.tags import LEAST_CONTRAST
 
 # Half of the 16 samples of ChESS, (u, v) px from a pixel; the other half lies opposite.
 _RING = ((0, -5), (2, -5), (3, -3), (5, -2), (5, 0), (5, 2), (3, 3), (2, 5))

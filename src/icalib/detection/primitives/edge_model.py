@@ -10,8 +10,8 @@ from math import erf, hypot, pi, sqrt
 
 import numpy as np
 
-from icalib.compiled import njit
-from icalib.measurements import EDGE
+from icalib.base.compiled import njit
+from icalib.data.measurements import EDGE
 
 _ITERATIONS = 10
 _CONVERGED_PX = 1e-3

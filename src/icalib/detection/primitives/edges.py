@@ -6,8 +6,8 @@ from math import hypot
 
 import numpy as np
 
-from icalib.compiled import njit
-from icalib.detection.decoding import bilinear
+from icalib.base.compiled import njit
+from icalib.detection.primitives.decoding import bilinear
 
 _FROM_CORNER = 0.15  # of the side, left out at both ends of it
 _MAX_PROFILES = 24

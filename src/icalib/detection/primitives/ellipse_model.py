@@ -16,9 +16,9 @@ from math import erf, exp, hypot, pi, sqrt
 
 import numpy as np
 
-from icalib.compiled import njit
-from icalib.detection.edge_model import solve_small
-from icalib.detection.tags import LEAST_CONTRAST
+from icalib.base.compiled import njit
+from icalib.detection.primitives.edge_model import solve_small
+from icalib.detection.primitives.tags import LEAST_CONTRAST
 
 _SIZE = 8  # number of parameters
 _ITERATIONS = 20  # at most; a fit that needs more counts as failed

@@ -8,7 +8,7 @@ from math import comb
 
 import numpy as np
 
-from icalib.detection.decoding import least_distance
+from icalib.detection.primitives.decoding import least_distance
 from icalib.geometry.targets.families import family_name, is_apriltag, opencv_bits
 
 _FALSE_ALARMS = 1e-3  # most of all random patterns that may be taken for a tag

@@ -4,12 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.compiled import njit
-from icalib.detection.decoding import cell_greys, levels, mapped, popcount, read_cells, seen_cells, unit_homography
-from icalib.detection.edge_model import solve_small
-from icalib.detection.edges import fit_quad
-from icalib.detection.saddles import crossing_contrast, find_saddle
-from icalib.detection.tags import LEAST_CONTRAST, shortest_side
+from icalib.base.compiled import njit
+from icalib.detection.primitives.decoding import (
+    cell_greys,
+    levels,
+    mapped,
+    popcount,
+    read_cells,
+    seen_cells,
+    unit_homography,
+)
+from icalib.detection.primitives.edge_model import solve_small
+from icalib.detection.primitives.edges import fit_quad
+from icalib.detection.primitives.saddles import crossing_contrast, find_saddle
+from icalib.detection.primitives.tags import LEAST_CONTRAST, shortest_side
 
 _NEIGHBOURS = 3  # tags that predict another, none further than two tags away
 _LEAST_SEEN = 12  # data cells of a tag that the image cuts

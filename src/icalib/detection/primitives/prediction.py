@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icalib.compiled import njit
-from icalib.detection.corners import ImageCorners
-from icalib.detection.decoding import mapped
-from icalib.detection.growth import fit_homography
+from icalib.base.compiled import njit
+from icalib.detection.primitives.corners import ImageCorners
+from icalib.detection.primitives.decoding import mapped
+from icalib.detection.primitives.growth import fit_homography
 
 _LEAST_COMMON = 4  # corners that the images must share; with fewer the motion of the target is not known
 _NEAREST = 12  # known nodes whose homography predicts an unknown one; with more, distortion matters

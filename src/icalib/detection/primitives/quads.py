@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from icalib.detection.corners import checked_image
-from icalib.extras import load_cv2
+from icalib.base.extras import load_cv2
+from icalib.detection.primitives.corners import checked_image
 
 _CONTRAST = 7  # grey levels below the local mean
 _LEAST_SIDE_PX = 7.0

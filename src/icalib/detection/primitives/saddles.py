@@ -6,8 +6,8 @@ from math import hypot
 
 import numpy as np
 
-from icalib.compiled import njit
-from icalib.detection.decoding import bilinear
+from icalib.base.compiled import njit
+from icalib.detection.primitives.decoding import bilinear
 
 _LEAST_HALF_PX = 2.0  # half the width of the window of `find_saddle`
 _MOST_HALF = (6.0, 0.1)  # px, and of a side: half the width of the same window

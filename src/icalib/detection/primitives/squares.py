@@ -6,14 +6,14 @@ from math import hypot
 
 import numpy as np
 
-from icalib.compiled import njit
-from icalib.detection.consistency import consistent_corners
-from icalib.detection.corners import ImageCorners, judged, no_corners
-from icalib.detection.growth import LEAST_SIDE_PX, side_vectors
-from icalib.detection.prediction import predict_nodes
-from icalib.detection.refinement import refined_crossings
-from icalib.detection.saddles import crossing_contrast, find_saddle
-from icalib.detection.tags import LEAST_CONTRAST, shortest_side
+from icalib.base.compiled import njit
+from icalib.detection.primitives.consistency import consistent_corners
+from icalib.detection.primitives.corners import ImageCorners, judged, no_corners
+from icalib.detection.primitives.growth import LEAST_SIDE_PX, side_vectors
+from icalib.detection.primitives.prediction import predict_nodes
+from icalib.detection.primitives.refinement import refined_crossings
+from icalib.detection.primitives.saddles import crossing_contrast, find_saddle
+from icalib.detection.primitives.tags import LEAST_CONTRAST, shortest_side
 
 _MOST_MOVE = 0.15  # of a side: how far a corner may lie from where it is expected
 _CLEAR = 0.5  # squares, from a corner to the nearest other feature: the next corner is as far from the same place

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.compiled import njit
-from icalib.detection.decoding import cell_greys, dark_in_ring, levels, lookup, read_cells, unit_homography
-from icalib.detection.edges import fit_quad
-from icalib.detection.families import Family
-from icalib.detection.quads import View
+from icalib.base.compiled import njit
+from icalib.detection.primitives.decoding import cell_greys, dark_in_ring, levels, lookup, read_cells, unit_homography
+from icalib.detection.primitives.edges import fit_quad
+from icalib.detection.primitives.families import Family
+from icalib.detection.primitives.quads import View
 
 LEAST_CONTRAST = 16.0  # grey levels between black and white of a tag
 _LEAST_RISE = 4.0  # grey levels over 2 px at an edge

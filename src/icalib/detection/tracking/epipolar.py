@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.compiled import njit
+from icalib.base.compiled import njit
 
 DRAWS = 60  # at most; with 30 % of outliers, chance misses every clean sample once in 35 pairs of images
 FEWEST_DRAWS, MISSED = 12, 0.01  # drawing ends where chance has missed every clean sample with that probability

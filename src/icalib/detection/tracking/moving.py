@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from icalib.data.measurements import shared_rows
 from icalib.detection.tracking.epipolar import FEWEST, epipolar_errors
-from icalib.measurements import shared_rows
 
 APART = (1, 4)  # images: each is compared with these before it
 LENS_APART, LENS_PAIRS = 6, 8  # pairs of images that show how the lens distorts

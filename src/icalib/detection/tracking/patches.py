@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icalib.compiled import njit
+from icalib.base.compiled import njit
 
 RADIUS = 7  # px; a patch has 15 x 15 px
 SIDE = 2 * RADIUS + 1

@@ -14,14 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from icalib.detection.image_work import on_all_cores
+from icalib.base.extras import load_cv2
+from icalib.data.measurements import TrackStream
+from icalib.data.recordings import DamagedImageError, Payload, Recording, decode
+from icalib.detection.images.image_work import on_all_cores
 from icalib.detection.tracking.epipolar import FEWEST
 from icalib.detection.tracking.moving import best_lambda, from_centre, misfits
 from icalib.detection.tracking.patches import RADIUS, align, cut_templates
 from icalib.detection.tracking.tracker import ALIGNED_PX, BACK_PX, MIN_NCC, WINDOW_PX, prepared
-from icalib.extras import load_cv2
-from icalib.measurements import TrackStream
-from icalib.recordings import DamagedImageError, Payload, Recording, decode
 from icalib.rig import Camera
 
 EVERY_S = 0.25  # between images that are matched; features live about a second

@@ -12,8 +12,10 @@ from itertools import chain, islice
 
 import numpy as np
 
-from icalib.detection.cache import keep_arrays, load_kept, stream_key
-from icalib.detection.image_work import (
+from icalib.data.measurements import TrackStream
+from icalib.data.recordings import DamagedImageError, Payload, Recording, decode
+from icalib.detection.images.cache import keep_arrays, load_kept, stream_key
+from icalib.detection.images.image_work import (
     Progress,
     batches_of,
     image_count,
@@ -27,8 +29,6 @@ from icalib.detection.tracking.robot_parts import stay_in_place
 from icalib.detection.tracking.stereo import matched
 from icalib.detection.tracking.tracker import Tracker
 from icalib.errors import RecordingError
-from icalib.measurements import TrackStream
-from icalib.recordings import DamagedImageError, Payload, Recording, decode
 from icalib.rig import Camera
 
 VERSION = 3  # of the tracker: whatever changes tracks changes this

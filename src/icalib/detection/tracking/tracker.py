@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from icalib.base.extras import load_cv2
 from icalib.detection.tracking.patches import RADIUS, Templates, align, cut_templates, no_templates
-from icalib.extras import load_cv2
 
 CELLS = 100  # of an image; each begins one track at a time
 MOST_VIEWS = 30  # of a track; later views differ too much from the first, and long tracks cost the estimator time

@@ -15,9 +15,9 @@ from typing import Literal
 
 import numpy as np
 
-from icalib.estimation.border import complement
-from icalib.estimation.parts import Parts
-from icalib.estimation.state import Key
+from icalib.estimate.evidence.parts import Parts
+from icalib.optim.border import complement
+from icalib.optim.state import Key
 
 # The groups that change together. Board, planes and IMU are what the others are measured by.
 CHANGING = (("time_offset",), ("rotation", "translation"), ("intrinsics",))

@@ -18,14 +18,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from icalib.data.measurements import CornerStream
 from icalib.errors import EstimationError
-from icalib.estimation.corner_factor import CornerFactor, CornerNoise, CornerOutput
-from icalib.estimation.corner_misfit import LensMisfit, lens_misfit
-from icalib.estimation.evidence import Fit
-from icalib.estimation.medians import median_variance
-from icalib.estimation.state import State
-from icalib.measurements import CornerStream
+from icalib.estimate.evidence.evidence import Fit
+from icalib.optim.medians import median_variance
+from icalib.optim.state import State
 from icalib.rig import Camera, Settings
+from icalib.sensors.camera.corner_factor import CornerFactor, CornerNoise, CornerOutput
+from icalib.sensors.camera.corner_misfit import LensMisfit, lens_misfit
 
 FIRST_GUESS_PX = 0.5
 SMALLEST_PX, LARGEST_PX = 1e-3, 5.0

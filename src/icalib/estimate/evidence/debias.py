@@ -20,13 +20,13 @@ from functools import partial
 import numpy as np
 from scipy.special import stdtrit  # not scipy.stats, whose import takes 0.4 s
 
-from icalib.estimation.arrowhead import Piece, solve
-from icalib.estimation.border import DETERMINED, HELD_BELOW, least_information
-from icalib.estimation.imu_data import ImuData
-from icalib.estimation.imu_factor import ImuFactor
-from icalib.estimation.outcome import Outcome, posterior
-from icalib.estimation.problem import Problem
-from icalib.estimation.state import State
+from icalib.estimate.problem.outcome import Outcome, posterior
+from icalib.estimate.problem.problem import Problem
+from icalib.motion.imu_data import ImuData
+from icalib.optim.arrowhead import Piece, solve
+from icalib.optim.border import DETERMINED, HELD_BELOW, least_information
+from icalib.optim.state import State
+from icalib.sensors.imu.residual import ImuFactor
 
 CLEAR = 10.0  # information in tolerance units: where all is known to a third of a tolerance, one pair will do
 NEGLIGIBLE = 0.01  # of the information: where all is determined and one side shows less, odd parts included, it will do

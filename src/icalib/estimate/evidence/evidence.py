@@ -7,16 +7,16 @@ from functools import partial
 
 import numpy as np
 
-from icalib.estimation import sensors
-from icalib.estimation.arrowhead import Draw, in_parallel
-from icalib.estimation.border import restricted_inverse
-from icalib.estimation.corner_factor import CornerFactor, CornerOutput
-from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput
-from icalib.estimation.outcome import Outcome, posterior
-from icalib.estimation.parts import Parts
-from icalib.estimation.problem import Problem, Residuals
-from icalib.estimation.state import State
-from icalib.estimation.surfaces import ON_PLANES
+from icalib.estimate.evidence.parts import Parts
+from icalib.estimate.problem.outcome import Outcome, posterior
+from icalib.estimate.problem.problem import Problem, Residuals
+from icalib.motion import factor
+from icalib.optim.arrowhead import Draw, in_parallel
+from icalib.optim.border import restricted_inverse
+from icalib.optim.state import State
+from icalib.sensors.camera.corner_factor import CornerFactor, CornerOutput
+from icalib.sensors.camera.features.feature_factor import FeatureFactor, FeatureOutput
+from icalib.sensors.camera.features.surfaces import ON_PLANES
 
 DRAW_STEP = 1e-3  # of a posterior sample: small enough to be linear
 
@@ -71,7 +71,7 @@ def chi2_by_kind(problem: Problem, at: Residuals) -> dict[tuple[str, str], tuple
                 found[camera.name, ON_PLANES] = len(own), chi2
     for sensor, rows in zip(problem.sensors, at.sensors, strict=True):
         for kind, r in sensor.kinds.items():
-            found[sensor.name, kind] = sensor.count(rows, kind), sensors.chi2(rows, r)
+            found[sensor.name, kind] = sensor.count(rows, kind), factor.chi2(rows, r)
     return found
 
 

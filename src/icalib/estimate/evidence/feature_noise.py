@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from icalib.estimation.arrowhead import chain_cuts
-from icalib.estimation.assembly import Following, on_the_chain
-from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput
-from icalib.estimation.inputs import Inputs
-from icalib.estimation.medians import grouped_quantiles, largest_normal, median_variance
-from icalib.estimation.outcome import Outcome
-from icalib.estimation.tracks import TrackNoise
+from icalib.estimate.problem.assembly import Following, on_the_chain
+from icalib.estimate.problem.inputs import Inputs
+from icalib.estimate.problem.outcome import Outcome
+from icalib.optim.arrowhead import chain_cuts
+from icalib.optim.medians import grouped_quantiles, largest_normal, median_variance
 from icalib.rig import Camera, Settings
+from icalib.sensors.camera.features.feature_factor import FeatureFactor, FeatureOutput
+from icalib.sensors.camera.features.tracks import TrackNoise
 
 FIRST_GUESS_PX = 1.0
 SMALLEST_PX = 0.005

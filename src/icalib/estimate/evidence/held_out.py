@@ -18,10 +18,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icalib.estimation.arrowhead import Piece, given_border, in_parallel
-from icalib.estimation.border import HELD_BELOW, complement, restricted_inverse
-from icalib.estimation.parts import Parts
-from icalib.estimation.problem import Residuals
+from icalib.estimate.evidence.parts import Parts
+from icalib.estimate.problem.problem import Residuals
+from icalib.optim.arrowhead import Piece, given_border, in_parallel
+from icalib.optim.border import HELD_BELOW, complement, restricted_inverse
 
 LEAST_PART = 1e-6  # of a direction: shorter ones are rounding
 LINEAR = 0.1  # of the excess: what it may be off by where the step of the other half is short enough

@@ -14,13 +14,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from icalib.estimation.border import restricted_inverse
-from icalib.estimation.evidence import split_covariance, split_expectation
-from icalib.estimation.inputs import Inputs
-from icalib.estimation.outcome import Outcome
-from icalib.estimation.parts import Parts
-from icalib.estimation.prior_factor import variance_of_priors
-from icalib.estimation.problem import Problem
+from icalib.estimate.evidence.evidence import split_covariance, split_expectation
+from icalib.estimate.evidence.parts import Parts
+from icalib.estimate.problem.inputs import Inputs
+from icalib.estimate.problem.outcome import Outcome
+from icalib.estimate.problem.problem import Problem
+from icalib.optim.border import restricted_inverse
+from icalib.optim.prior_factor import variance_of_priors
 
 LEAST = 1.5  # below it, another weight of the priors would gain less than a tenth of a standard deviation
 LEAST_WHITE = 1e-9  # of a variance: rounding, where a prior contributes all of it

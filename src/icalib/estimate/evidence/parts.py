@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.arrowhead import Piece, in_parallel, marginalise
-from icalib.estimation.free_nodes import FreeNodes
-from icalib.estimation.gauge import FRAME, IN_THE_WORLD, hold_frame
-from icalib.estimation.outcome import Outcome
-from icalib.estimation.problem import Problem, Residuals
-from icalib.estimation.state import State
+from icalib.estimate.problem.gauge import FRAME, IN_THE_WORLD, hold_frame
+from icalib.estimate.problem.outcome import Outcome
+from icalib.estimate.problem.problem import Problem, Residuals
+from icalib.optim.arrowhead import Piece, in_parallel, marginalise
+from icalib.optim.free_nodes import FreeNodes
+from icalib.optim.state import State
 
 FEWEST_NODES = 3  # between the ends of a part
 FEWEST_PARTS = 4  # of poses at rest: the spread of fewer says little

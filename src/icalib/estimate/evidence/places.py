@@ -14,11 +14,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from icalib.estimation.arrowhead import Piece
-from icalib.estimation.corner_factor import CornerFactor
-from icalib.estimation.evidence import spread_covariance
-from icalib.estimation.outcome import Outcome
-from icalib.estimation.problem import Problem
+from icalib.estimate.evidence.evidence import spread_covariance
+from icalib.estimate.problem.outcome import Outcome
+from icalib.estimate.problem.problem import Problem
+from icalib.optim.arrowhead import Piece
+from icalib.sensors.camera.corner_factor import CornerFactor
 
 IMAGE_CELLS = (4, 3)  # columns, rows
 TARGET_PARTS = 3  # along each side

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from icalib.estimation.arrowhead import Piece, solve
-from icalib.estimation.imu_factor import ImuFactor
-from icalib.estimation.problem import Problem, Residuals
-from icalib.estimation.solver import minimise
-from icalib.estimation.state import State
+from icalib.estimate.problem.problem import Problem, Residuals
+from icalib.estimate.problem.solver import minimise
+from icalib.optim.arrowhead import Piece, solve
+from icalib.optim.state import State
+from icalib.sensors.imu.residual import ImuFactor
 
 STEP = 1e-3  # of the size: small against what bends p, large against rounding
 OPEN = 0.05  # a size that is known no better is not known

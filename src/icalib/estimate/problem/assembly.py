@@ -9,34 +9,34 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation import pages
-from icalib.estimation.arrowhead import chain_cuts
-from icalib.estimation.board import SHAPE_LABELS, SHAPE_SIGMA_M, bloom_direction
-from icalib.estimation.bodies import SIZE
-from icalib.estimation.border import NOTHING
-from icalib.estimation.circle_centres import with_circle_centres
-from icalib.estimation.clocks import EARLY_S, instants
-from icalib.estimation.corner_factor import CornerFactor, CornerNoise
-from icalib.estimation.edge_curvature import with_bent_edges
-from icalib.estimation.feature_factor import FeatureFactor
-from icalib.estimation.free_nodes import FreeNodes
-from icalib.estimation.imu_factor import ImuFactor
-from icalib.estimation.imu_model import N_INTRINSICS
-from icalib.estimation.inputs import Inputs, origin_difference
-from icalib.estimation.lidar_sweep import Motion
-from icalib.estimation.nodes import MERGED_WITHIN_S, distinct, first_nodes, place_nodes, usable
-from icalib.estimation.patch_curvature import with_curved_patches
-from icalib.estimation.poses import assign_nodes, poses_at
-from icalib.estimation.prior_factor import Prior
-from icalib.estimation.problem import ChainFactor, Problem
-from icalib.estimation.robot import NO_ROBOT, RobotNoise, robot_factors, still_factors
-from icalib.estimation.sensors import SensorFactor
-from icalib.estimation.state import Key, Layout, State
-from icalib.estimation.surfaces import Surfaces
-from icalib.estimation.tolerances import distortion_scales
-from icalib.estimation.tracks import TrackNoise
+from icalib.estimate.problem.inputs import Inputs, origin_difference
+from icalib.estimate.problem.problem import ChainFactor, Problem
+from icalib.estimate.problem.tolerances import distortion_scales
 from icalib.geometry.cameras import camera_model
+from icalib.motion.clocks import EARLY_S, instants
+from icalib.motion.factor import SensorFactor
+from icalib.motion.imu_model import N_INTRINSICS
+from icalib.motion.nodes import MERGED_WITHIN_S, distinct, first_nodes, place_nodes, usable
+from icalib.motion.poses import assign_nodes, poses_at
+from icalib.motion.sweep import Motion
+from icalib.optim import pages
+from icalib.optim.arrowhead import chain_cuts
+from icalib.optim.border import NOTHING
+from icalib.optim.free_nodes import FreeNodes
+from icalib.optim.prior_factor import Prior
+from icalib.optim.state import Key, Layout, State
 from icalib.rig import Camera, ImuSensor, Parameter, Rig, Scheme
+from icalib.sensors.camera.board import SHAPE_LABELS, SHAPE_SIGMA_M, bloom_direction
+from icalib.sensors.camera.bodies import SIZE
+from icalib.sensors.camera.circle_centres import with_circle_centres
+from icalib.sensors.camera.corner_factor import CornerFactor, CornerNoise
+from icalib.sensors.camera.edge_curvature import with_bent_edges
+from icalib.sensors.camera.features.feature_factor import FeatureFactor
+from icalib.sensors.camera.features.patch_curvature import with_curved_patches
+from icalib.sensors.camera.features.surfaces import Surfaces
+from icalib.sensors.camera.features.tracks import TrackNoise
+from icalib.sensors.imu.residual import ImuFactor
+from icalib.sensors.robot import NO_ROBOT, RobotNoise, robot_factors, still_factors
 
 BLOOM_SIGMA_PX = 1.0
 NO_BLOOM = np.zeros((0, 2), dtype=np.float32)  # single precision: directions as such are near enough

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.estimation.arrowhead import Piece
-from icalib.estimation.pose_factor import FRAME as POSE_FRAME
-from icalib.estimation.state import State
+from icalib.optim.arrowhead import Piece
+from icalib.optim.state import State
+from icalib.sensors.pose.residual import FRAME as POSE_FRAME
 
 IN_THE_WORLD = ("plane", *POSE_FRAME)  # blocks that are estimated along, in a world of which gravity alone is known
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.estimation.assembly import stated_priors
-from icalib.estimation.inputs import Inputs
-from icalib.estimation.prior_factor import Prior
-from icalib.estimation.state import State
-from icalib.estimation.tolerances import FROM_NOTHING_M, GUESS_SIGMA, OTHER_SIGMA, distortion_scales
+from icalib.estimate.problem.assembly import stated_priors
+from icalib.estimate.problem.inputs import Inputs
+from icalib.estimate.problem.tolerances import FROM_NOTHING_M, GUESS_SIGMA, OTHER_SIGMA, distortion_scales
 from icalib.geometry.cameras import camera_model
+from icalib.optim.prior_factor import Prior
+from icalib.optim.state import State
 from icalib.rig import Camera
 
 RATIO_STEP = 1e-4  # of a coefficient, for a difference quotient

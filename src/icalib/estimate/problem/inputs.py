@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from icalib.estimation.board import board_in
-from icalib.estimation.bodies import Bodies, choose_bodies, restrict
-from icalib.estimation.images import on_common_images
-from icalib.estimation.imu_data import ImuData, joined_imu_data
-from icalib.estimation.imu_model import N_INTRINSICS
-from icalib.estimation.robot import NO_CLOUDS, Clouds, frame_entries, own_entries
-from icalib.estimation.state import Entry, Kind, Layout, State, make_layout
-from icalib.estimation.tolerances import Tolerances
+from icalib.data.joining import Part, join
+from icalib.data.measurements import Measurements, Stream
+from icalib.estimate.problem.tolerances import Tolerances
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets.base import BOARD
-from icalib.joining import Part, join
-from icalib.measurements import Measurements, Stream
+from icalib.motion.imu_data import ImuData, joined_imu_data
+from icalib.motion.imu_model import N_INTRINSICS
+from icalib.optim.state import Entry, Kind, Layout, State, make_layout
 from icalib.rig import Camera, Lidar, PoseSensor, Rig, Wheels
+from icalib.sensors.camera.board import board_in
+from icalib.sensors.camera.bodies import Bodies, choose_bodies, restrict
+from icalib.sensors.camera.images import on_common_images
+from icalib.sensors.robot import NO_CLOUDS, Clouds, frame_entries, own_entries
 
 CAMERA_PARAMETERS: tuple[tuple[str, Kind], ...] = (
     ("rotation", "rotation"),
@@ -100,7 +100,7 @@ def layout_for(rig: Rig, bodies: Bodies, n_recordings: int = 1, clouds: Clouds =
     imu = rig.imu
     entries: list[Entry] = []
     if imu is not None:
-        entries.append((imu.name, "intrinsics", "vector", N_INTRINSICS, imu.intrinsics.mode != "fixed"))
+        entries.append((imu.name, "intrinsics", "nuisance", N_INTRINSICS, imu.intrinsics.mode != "fixed"))
     # Without an IMU the scene's frame is the world's, in all recordings.
     levelled = imu is not None and not rig.assumes_motion
     for k in range(1 if imu is None else n_recordings) if bodies.used else ():

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from icalib.estimation.arrowhead import Draw, Piece, Solution, solve
-from icalib.estimation.border import NOTHING
-from icalib.estimation.problem import Problem, Residuals
-from icalib.estimation.state import State
+from icalib.estimate.problem.problem import Problem, Residuals
+from icalib.optim.arrowhead import Draw, Piece, Solution, solve
+from icalib.optim.border import NOTHING
+from icalib.optim.state import State
 
 STALLED_DECREASE = 0.05  # of half the chi^2: a third of a standard deviation, good enough where smaller steps fail
 FREE_DRAWS, STILL_DRAWS = 2, 3  # from the posterior, for what is made of the outcome

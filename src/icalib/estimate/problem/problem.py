@@ -8,15 +8,15 @@ from typing import ClassVar, Protocol
 
 import numpy as np
 
-from icalib.estimation.arrowhead import Piece, in_parallel, make_pieces, marginalise, marginalise_in_segments
-from icalib.estimation.border import NOTHING
-from icalib.estimation.corner_factor import CornerFactor, CornerOutput
-from icalib.estimation.feature_factor import FeatureFactor, FeatureOutput
-from icalib.estimation.gauge import hold_frame
-from icalib.estimation.imu_factor import ROWS
-from icalib.estimation.prior_factor import Prior
-from icalib.estimation.sensors import SensorFactor, Whitened
-from icalib.estimation.state import Layout, State
+from icalib.estimate.problem.gauge import hold_frame
+from icalib.motion.factor import SensorFactor, Whitened
+from icalib.optim.arrowhead import Piece, in_parallel, make_pieces, marginalise, marginalise_in_segments
+from icalib.optim.border import NOTHING
+from icalib.optim.prior_factor import Prior
+from icalib.optim.state import Layout, State
+from icalib.sensors.camera.corner_factor import CornerFactor, CornerOutput
+from icalib.sensors.camera.features.feature_factor import FeatureFactor, FeatureOutput
+from icalib.sensors.imu.residual import ROWS
 
 
 class ChainFactor(Protocol):

@@ -9,13 +9,13 @@ from typing import NamedTuple
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.anderson import PROMISED, Accelerator
-from icalib.estimation.arrowhead import NotDefiniteError, Piece, Solution, solve
-from icalib.estimation.border import DETERMINED, essential_information
-from icalib.estimation.outcome import STALLED_DECREASE, Outcome, Step, Visit, outcome_of, way_come
-from icalib.estimation.prior_factor import Prior, sums_of_priors
-from icalib.estimation.problem import Problem, Residuals
-from icalib.estimation.state import State
+from icalib.estimate.problem.outcome import STALLED_DECREASE, Outcome, Step, Visit, outcome_of, way_come
+from icalib.estimate.problem.problem import Problem, Residuals
+from icalib.optim.anderson import PROMISED, Accelerator
+from icalib.optim.arrowhead import NotDefiniteError, Piece, Solution, solve
+from icalib.optim.border import DETERMINED, essential_information
+from icalib.optim.prior_factor import Prior, sums_of_priors
+from icalib.optim.state import State
 
 MAX_ITERATIONS = 50
 # Half a chi^2 of 5e-4 is a step of 0.03 standard deviations at most, in any direction.

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.estimation.state import Layout
 from icalib.geometry.cameras import camera_model
+from icalib.optim.state import Layout
 from icalib.rig import Rig, Settings
 
 # What a guess without a standard deviation is taken to be worth: rad, m, s, px, 1. Nobody guesses where the walls

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.compiled import njit
+from icalib.base.compiled import njit
 from icalib.geometry.cameras.closed_form import MIN_DISTANCE, ClosedForm
 from icalib.geometry.cameras.eucm import unified_depth
 

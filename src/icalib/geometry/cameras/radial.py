@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from icalib.compiled import njit
+from icalib.base.compiled import njit
 
 _MAX_ITERATIONS = 100  # bisection alone halves the bracket to rounding in 60
 

@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from icalib.compiled import njit
+from icalib.base.compiled import njit
 from icalib.geometry.cameras.closed_form import ClosedForm
 from icalib.geometry.cameras.radtan import newton_step
 

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from icalib.base.extras import load_cv2
 from icalib.errors import RecordingError, RigError
-from icalib.extras import load_cv2
 
 # name -> (bits along a side without the border, number of ids); `original` is that of the ArUco library.
 FAMILIES = {

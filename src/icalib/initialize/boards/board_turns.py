@@ -14,22 +14,22 @@ from typing import NamedTuple
 
 import numpy as np
 
+from icalib.data.joining import join_corners
+from icalib.data.measurements import CornerStream, Measurements
 from icalib.detection.sightings import Part, parts_of
 from icalib.errors import EstimationError
-from icalib.estimation.bodies import taken_at_once
-from icalib.estimation.imu_data import ImuData, imu_data
-from icalib.first_guess.align_camera import align_camera
-from icalib.first_guess.clocks import camera_rates
-from icalib.first_guess.guess import relative_offset
-from icalib.first_guess.gyro import GyroRotation
-from icalib.first_guess.intrinsics import camera_params
-from icalib.first_guess.target_poses import Flat, TargetPoses, target_poses
 from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets import Target
-from icalib.joining import join_corners
-from icalib.measurements import CornerStream, Measurements
+from icalib.initialize.boards.intrinsics import camera_params
+from icalib.initialize.steps.align_camera import align_camera
+from icalib.initialize.steps.clocks import camera_rates
+from icalib.initialize.steps.guess import relative_offset
+from icalib.initialize.steps.gyro import GyroRotation
+from icalib.initialize.steps.target_poses import Flat, TargetPoses, target_poses
+from icalib.motion.imu_data import ImuData, imu_data
 from icalib.rig import Camera, Rig
+from icalib.sensors.camera.bodies import taken_at_once
 
 MOST_PAIRS = 60  # of images taken together; more hardly change how two cameras stand to each other
 

@@ -7,17 +7,17 @@ from contextlib import suppress
 
 import numpy as np
 
+from icalib.data.measurements import CornerStream
 from icalib.errors import EstimationError
-from icalib.estimation.corner_factor import Views
-from icalib.first_guess.target_poses import FEWEST_CORNERS, Flat, TargetPoses, target_poses, usable_rays
 from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.cameras.convert import fit_rays
 from icalib.geometry.targets import Target
 from icalib.geometry.vectors import cross
-from icalib.measurements import CornerStream
+from icalib.initialize.steps.target_poses import FEWEST_CORNERS, Flat, TargetPoses, target_poses, usable_rays
 from icalib.rig import Camera
+from icalib.sensors.camera.corner_factor import Views
 
 TRIAL_IMAGES = 24
 BUNDLE_IMAGES = 48

@@ -10,11 +10,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from icalib.compiled import njit
-from icalib.estimation.bodies import Bodies
-from icalib.estimation.corner_factor import Views
-from icalib.estimation.state import Key
-from icalib.first_guess.target_poses import (
+from icalib.base.compiled import njit
+from icalib.data.measurements import CornerStream
+from icalib.geometry.cameras.base import CameraModel
+from icalib.initialize.steps.target_poses import (
     FEWEST_CORNERS,
     LARGEST_RMS_PX,
     MOST_CORNERS,
@@ -29,8 +28,9 @@ from icalib.first_guess.target_poses import (
     target_poses,
     usable_rays,
 )
-from icalib.geometry.cameras.base import CameraModel
-from icalib.measurements import CornerStream
+from icalib.optim.state import Key
+from icalib.sensors.camera.bodies import Bodies
+from icalib.sensors.camera.corner_factor import Views
 
 MIRRORS = 2
 

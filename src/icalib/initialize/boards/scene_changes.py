@@ -11,14 +11,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
-from icalib.estimation.bodies import restrict
-from icalib.estimation.corner_noise import SMALLEST_BASE_PX
-from icalib.first_guess.scene import Placed, poses_by_bodies
-from icalib.first_guess.scene_growth import fixed_lens, grow
+from icalib.estimate.evidence.corner_noise import SMALLEST_BASE_PX
 from icalib.geometry.cameras import camera_model
-from icalib.measurements import Measurements
+from icalib.initialize.boards.scene import Placed, poses_by_bodies
+from icalib.initialize.boards.scene_growth import fixed_lens, grow
 from icalib.rig import Rig
+from icalib.sensors.camera.bodies import restrict
 
 # Ratio of the errors of median images. At 1.5 the movement adds as much again to the errors that single recordings
 # leave. At twice that, movements by two standard deviations of the corners would pass.

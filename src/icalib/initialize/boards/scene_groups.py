@@ -15,18 +15,18 @@ from itertools import permutations
 
 import numpy as np
 
+from icalib.data.joining import join_corners
+from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
-from icalib.estimation.bodies import FEWEST_TOGETHER, Bodies, camera_times, restrict, taken_at_once, tied_by_images
-from icalib.estimation.pose_rows import Frame, Mount
-from icalib.estimation.state import Key
-from icalib.first_guess.hand_eye import LARGEST_LEFT, PosePairs, hand_eye, left_over
-from icalib.first_guess.scene import Placed, scene_poses
-from icalib.first_guess.scene_growth import UntiedBodiesError, place_bodies
-from icalib.first_guess.target_poses import TargetPoses
 from icalib.geometry.cameras import camera_model
-from icalib.joining import join_corners
-from icalib.measurements import Measurements
+from icalib.initialize.boards.scene import Placed, scene_poses
+from icalib.initialize.boards.scene_growth import UntiedBodiesError, place_bodies
+from icalib.initialize.steps.hand_eye import LARGEST_LEFT, PosePairs, hand_eye, left_over
+from icalib.initialize.steps.target_poses import TargetPoses
+from icalib.motion.pose_rows import Frame, Mount
+from icalib.optim.state import Key
 from icalib.rig import Camera, Rig
+from icalib.sensors.camera.bodies import FEWEST_TOGETHER, Bodies, camera_times, restrict, taken_at_once, tied_by_images
 
 
 def place_groups(rig: Rig, bodies: Bodies, recordings: Sequence[Measurements], params: dict[str, np.ndarray]) -> Placed:

@@ -13,15 +13,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse.csgraph import minimum_spanning_tree
 
+from icalib.data.measurements import CornerStream
 from icalib.errors import EstimationError
-from icalib.estimation.bodies import Bodies
-from icalib.estimation.corner_factor import Views
-from icalib.estimation.state import Key
-from icalib.first_guess.scene import Placed, body_poses, poses_by_bodies
-from icalib.first_guess.scene_bundle import UNSEEN_PX, Lens, SceneState, SceneViews, adjust, errors
-from icalib.first_guess.target_poses import LARGEST_RMS_PX, MOST_CORNERS, TargetPoses
 from icalib.geometry.cameras.base import CameraModel
-from icalib.measurements import CornerStream
+from icalib.initialize.boards.scene import Placed, body_poses, poses_by_bodies
+from icalib.initialize.boards.scene_bundle import UNSEEN_PX, Lens, SceneState, SceneViews, adjust, errors
+from icalib.initialize.steps.target_poses import LARGEST_RMS_PX, MOST_CORNERS, TargetPoses
+from icalib.optim.state import Key
+from icalib.sensors.camera.bodies import Bodies
+from icalib.sensors.camera.corner_factor import Views
 
 MOST_IMAGES = 60  # spread over the recording
 OF_EACH_PAIR = 4  # images that tie two bodies

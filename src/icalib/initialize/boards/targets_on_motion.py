@@ -11,15 +11,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from icalib.estimation.inputs import Inputs
-from icalib.estimation.state import State
-from icalib.first_guess.by_recording import alone, motion_alone, naming_recording
-from icalib.first_guess.lidar import Held
-from icalib.first_guess.poses import on_motion
-from icalib.first_guess.scene import scene_poses
-from icalib.first_guess.scene_lens import find_scene, lens_of
+from icalib.data.measurements import PoseStream
+from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry.cameras import camera_model
-from icalib.measurements import PoseStream
+from icalib.initialize.boards.scene import scene_poses
+from icalib.initialize.boards.scene_lens import find_scene, lens_of
+from icalib.initialize.poses.poses import on_motion
+from icalib.initialize.steps.by_recording import Held, alone, motion_alone, naming_recording
+from icalib.optim.state import State
 from icalib.rig import Camera, Parameter, Rig
 
 

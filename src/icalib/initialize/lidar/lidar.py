@@ -11,21 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from icalib.data.measurements import LidarStream
 from icalib.errors import EstimationError
-from icalib.estimation.imu_data import ImuData
-from icalib.estimation.state import Key, State
-from icalib.first_guess.clock_shifts import CameraRates
-from icalib.first_guess.clocks import (
-    Alignment,
-    align,
-    as_given,
-    contradicts,
-    is_still,
-    only_axis,
-    turning,
-)
-from icalib.first_guess.gyro import GyroRotation
-from icalib.first_guess.lidar_arm import (
+from icalib.geometry import so3
+from icalib.geometry.cubic import hermite
+from icalib.initialize.lidar.lidar_arm import (
     ANY_SIGMA,
     BIAS_SIGMA,
     MIRRORED,
@@ -39,26 +29,19 @@ from icalib.first_guess.lidar_arm import (
     left_over,
     solve,
 )
-from icalib.first_guess.lidar_motion import LONGEST_STEP_S, ImuMotion
-from icalib.first_guess.lidar_odometry import LidarPath, Scan, lidar_path, scans_of
-from icalib.geometry import so3
-from icalib.geometry.cubic import hermite
-from icalib.measurements import LidarStream
+from icalib.initialize.lidar.lidar_motion import LONGEST_STEP_S, ImuMotion
+from icalib.initialize.lidar.lidar_odometry import LidarPath, Scan, lidar_path, scans_of
+from icalib.initialize.steps.by_recording import UNKNOWN, Held
+from icalib.initialize.steps.clock_shifts import CameraRates
+from icalib.initialize.steps.clocks import Alignment, align, as_given, contradicts, is_still, only_axis, turning
+from icalib.initialize.steps.gyro import GyroRotation
+from icalib.motion.imu_data import ImuData
+from icalib.optim.state import Key, State
 
 LEAST_CORRELATION = 0.6  # of turning rates with the IMU's
 G_TOLERANCE = 0.1
 ARM_ROUNDS = 2  # each brings the path nearer to the known motion
 SAME_RAD, SAME_S = 5e-3, 1e-3  # alignments this near turn a scan's points alike, to what the registration allows for
-
-
-@dataclass(frozen=True)
-class Held:
-    """What is known of a LiDAR, or None: R_imu_lidar (3, 3), p_imu_lidar (3,) m, offset: t_imu - t_lidar, both since
-    their clocks' first stamps [s]."""
-
-    rotation: np.ndarray | None = None
-    position: np.ndarray | None = None
-    offset: float | None = None
 
 
 @dataclass(frozen=True)
@@ -81,7 +64,7 @@ class LidarGuess:
 
 
 def lidar_and_motion(
-    imu: ImuData, stream: LidarStream, gravity: float, held: Held = Held()
+    imu: ImuData, stream: LidarStream, gravity: float, held: Held = UNKNOWN
 ) -> tuple[LidarGuess, ImuMotion]:
     """From one LiDAR and the IMU alone; gravity [m/s^2]. Raises EstimationError, one sentence, where the recording does
     not show it."""
@@ -132,7 +115,7 @@ def motion_of_path(
     return FromPath(guess, start.smoothed(), float(np.linalg.norm(x[6:9])), level, left)
 
 
-def lidar_on_motion(imu: ImuData, stream: LidarStream, known: State, held: Held = Held()) -> LidarGuess:
+def lidar_on_motion(imu: ImuData, stream: LidarStream, known: State, held: Held = UNKNOWN) -> LidarGuess:
     """From the motion of the IMU in `known`: nodes no further apart than 50 ms or so. Raises EstimationError, one
     sentence, where the recording does not show it."""
     scans = scans_of(stream)

@@ -21,10 +21,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icalib.estimation.imu_data import ImuData
-from icalib.first_guess.clocks import only_axis
-from icalib.first_guess.lidar_motion import Integrals
 from icalib.geometry import so3
+from icalib.initialize.lidar.lidar_motion import Integrals
+from icalib.initialize.steps.clocks import only_axis
+from icalib.motion.imu_data import ImuData
 
 ARM_SIGMA = 0.5  # m: what the motion leaves open stays small
 BIAS_SIGMA = 0.3  # m/s^2

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icalib.compiled import njit
+from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.geometry.small import eigen3, mul3
 

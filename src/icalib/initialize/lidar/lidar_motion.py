@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.estimation.imu_data import ImuData
-from icalib.first_guess.gyro import GyroRotation
+from icalib.initialize.steps.gyro import GyroRotation
+from icalib.motion.imu_data import ImuData
 
 SEEN_SIGMA, FELT_SIGMA, SPEED_SIGMA = 0.02, 2e-3, 0.02  # m, m, m/s: of what the LiDAR shows, of what the IMU feels
 UNFELT = 1e4  # times as much where the IMU did not run

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from icalib.data.measurements import LidarStream
 from icalib.errors import EstimationError
-from icalib.estimation.arrowhead import THREADS
-from icalib.first_guess.lidar_map import ScanPose, VoxelMap, insert, pick, turn_back
-from icalib.first_guess.lidar_registration import Expected, expected_pose, register
-from icalib.measurements import LidarStream
+from icalib.initialize.lidar.lidar_map import ScanPose, VoxelMap, insert, pick, turn_back
+from icalib.initialize.lidar.lidar_registration import Expected, expected_pose, register
+from icalib.optim.arrowhead import THREADS
 
 MOST_MATCHED, MOST_MAPPED = 1500, 6000  # points of a scan
 MOST_WIDE = 500  # while the pose is rough, and every point looks into many voxels

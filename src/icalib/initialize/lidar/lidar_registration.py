@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icalib.compiled import njit
-from icalib.first_guess.lidar_map import UNKNOWNS, ScanPose, moved, sums
+from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.geometry.small import mul3, solve_definite, tmul3
+from icalib.initialize.lidar.lidar_map import UNKNOWNS, ScanPose, moved, sums
 
 ROUNDS = 14
 WIDE_ROUNDS = 4  # that look into voxels around

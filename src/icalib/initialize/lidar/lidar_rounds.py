@@ -12,18 +12,18 @@ from functools import partial
 
 import numpy as np
 
+from icalib.data.measurements import LidarStream
 from icalib.errors import EstimationError
-from icalib.estimation.assembly import host_times, motion_of, nodes_for, start_values
-from icalib.estimation.clocks import instants
-from icalib.estimation.estimate import first_pass
-from icalib.estimation.inputs import Inputs, origin_difference, with_clouds
-from icalib.estimation.lidar_binning import Associated, LidarNoise, Moments, take_moments
-from icalib.estimation.lidar_sweep import Motion, sweep
-from icalib.estimation.point_planes import are_somewhere, thinned
-from icalib.estimation.robot import COARSE_BIN_S, FIRST_RANGE_M, MOUNT, Clouds, joined_clouds, known_planes
-from icalib.estimation.state import Key, State
-from icalib.first_guess.align_camera import trusted
-from icalib.first_guess.by_recording import (
+from icalib.estimate.estimate import first_pass
+from icalib.estimate.problem.assembly import host_times, motion_of, nodes_for, start_values
+from icalib.estimate.problem.inputs import Inputs, origin_difference, with_clouds
+from icalib.geometry.planes import plane_of
+from icalib.initialize.lidar.lidar import lidar_and_motion, lidar_on_motion
+from icalib.initialize.lidar.lidar_planes import ROUNDS, Association, associate, odd_step, round_search
+from icalib.initialize.lidar.lidar_sight import naming_sight
+from icalib.initialize.steps.align_camera import trusted
+from icalib.initialize.steps.by_recording import (
+    Held,
     alone,
     each_clock,
     from_the_best,
@@ -33,14 +33,15 @@ from icalib.first_guess.by_recording import (
     other_clocks,
     points_by_recording,
 )
-from icalib.first_guess.contradicted import settled
-from icalib.first_guess.known_motion import near_nodes
-from icalib.first_guess.lidar import Held, lidar_and_motion, lidar_on_motion
-from icalib.first_guess.lidar_planes import ROUNDS, Association, associate, odd_step, round_search
-from icalib.first_guess.lidar_sight import naming_sight
-from icalib.geometry.planes import plane_of
-from icalib.measurements import LidarStream
+from icalib.initialize.steps.contradicted import settled
+from icalib.motion.clocks import instants
+from icalib.motion.known_motion import near_nodes
+from icalib.motion.point_planes import are_somewhere, thinned
+from icalib.motion.sweep import Motion, sweep
+from icalib.optim.state import Key, State
 from icalib.rig import Camera, Lidar, PoseSensor, Wheels
+from icalib.sensors.lidar.lidar_binning import Associated, LidarNoise, Moments, take_moments
+from icalib.sensors.robot import COARSE_BIN_S, FIRST_RANGE_M, MOUNT, Clouds, joined_clouds, known_planes
 
 FEW, LOST = 0.2, 0.7  # share of points on planes, and of what there was at first, below which the planes are lost
 NAMES = tuple(name for name, _, _ in MOUNT)

@@ -7,9 +7,9 @@ from contextlib import contextmanager
 
 import numpy as np
 
+from icalib.data.measurements import LidarStream
 from icalib.errors import EstimationError
-from icalib.first_guess.lidar_map import ScanPose, VoxelMap, insert
-from icalib.measurements import LidarStream
+from icalib.initialize.lidar.lidar_map import ScanPose, VoxelMap, insert
 
 SCANS = 20
 MOST_POINTS = 6000  # of a scan

@@ -13,10 +13,10 @@ from typing import TypeVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from icalib.data.measurements import PoseStream
+from icalib.data.tables.axes import in_axes
 from icalib.errors import EstimationError
-from icalib.first_guess.pose_frames import words_for
-from icalib.measurements import PoseStream
-from icalib.recordings.axes import in_axes
+from icalib.initialize.poses.pose_frames import words_for
 from icalib.rig import Axes
 
 Way = Callable[[PoseStream], PoseStream]

@@ -12,26 +12,11 @@ from functools import partial
 
 import numpy as np
 
+from icalib.data.measurements import PoseStream
 from icalib.errors import EstimationError
-from icalib.estimation.assembly import host_times, nodes_for, start_values
-from icalib.estimation.clocks import instants
-from icalib.estimation.imu_data import ImuData
-from icalib.estimation.inputs import Inputs
-from icalib.estimation.pose_factor import FRAME, frame_of
-from icalib.estimation.state import Key, State
-from icalib.first_guess.by_recording import (
-    alone,
-    each_clock,
-    from_the_best,
-    motion_alone,
-    naming_recording,
-)
-from icalib.first_guess.clock_shifts import LEAST_CORRELATION, CameraRates, longest_step
-from icalib.first_guess.clocks import Alignment
-from icalib.first_guess.contradicted import has_guesses, settled
-from icalib.first_guess.gyro import GyroRotation
-from icalib.first_guess.lever_arm import SIZE_TOLERANCE, size_of
-from icalib.first_guess.lidar import (
+from icalib.estimate.problem.assembly import host_times, nodes_for, start_values
+from icalib.estimate.problem.inputs import Inputs
+from icalib.initialize.lidar.lidar import (
     G_TOLERANCE,
     FromPath,
     Held,
@@ -41,7 +26,7 @@ from icalib.first_guess.lidar import (
     poses_in,
     where,
 )
-from icalib.first_guess.lidar_arm import (
+from icalib.initialize.lidar.lidar_arm import (
     WAY_SIGMA,
     Rows,
     against_motion,
@@ -50,13 +35,22 @@ from icalib.first_guess.lidar_arm import (
     left_over,
     solve,
 )
-from icalib.first_guess.lidar_odometry import LidarPath
-from icalib.first_guess.lidar_rounds import NAMES, given, held_of
-from icalib.first_guess.pose_frames import turn_of_positions
-from icalib.first_guess.pose_ways import placed
-from icalib.first_guess.rate_windows import rate_window, window_rates
-from icalib.measurements import PoseStream
+from icalib.initialize.lidar.lidar_odometry import LidarPath
+from icalib.initialize.lidar.lidar_rounds import NAMES, given, held_of
+from icalib.initialize.poses.pose_frames import turn_of_positions
+from icalib.initialize.poses.pose_ways import placed
+from icalib.initialize.steps.by_recording import alone, each_clock, from_the_best, motion_alone, naming_recording
+from icalib.initialize.steps.clock_shifts import LEAST_CORRELATION, CameraRates, longest_step
+from icalib.initialize.steps.clocks import Alignment
+from icalib.initialize.steps.contradicted import has_guesses, settled
+from icalib.initialize.steps.gyro import GyroRotation
+from icalib.initialize.steps.lever_arm import SIZE_TOLERANCE, size_of
+from icalib.initialize.steps.rate_windows import rate_window, window_rates
+from icalib.motion.clocks import instants
+from icalib.motion.imu_data import ImuData
+from icalib.optim.state import Key, State
 from icalib.rig import PoseSensor
+from icalib.sensors.pose.residual import FRAME, frame_of
 
 WINDOW_S = 0.1  # of a mean rate, at least
 FEWEST_WINDOWS = 20

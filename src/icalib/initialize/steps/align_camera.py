@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from icalib.data.measurements import CornerStream, Measurements
 from icalib.errors import EstimationError
-from icalib.estimation.imu_data import ImuData
-from icalib.first_guess.clock_shifts import CameraRates
-from icalib.first_guess.clocks import (
+from icalib.initialize.steps.clock_shifts import CameraRates
+from icalib.initialize.steps.clocks import (
     Alignment,
     align,
     as_given,
@@ -18,9 +18,9 @@ from icalib.first_guess.clocks import (
     main_axis,
     turns_about_two_axes,
 )
-from icalib.first_guess.contradicted import is_contradicted, nearest_about
-from icalib.first_guess.guess import relative_offset
-from icalib.measurements import CornerStream, Measurements
+from icalib.initialize.steps.contradicted import is_contradicted, nearest_about
+from icalib.initialize.steps.guess import relative_offset
+from icalib.motion.imu_data import ImuData
 from icalib.rig import Camera, Parameter
 
 

@@ -4,17 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from icalib.estimation.imu_data import imu_data
-from icalib.estimation.inputs import Inputs, origin_difference
-from icalib.estimation.state import Key, State
-from icalib.first_guess.lidar import Held
-from icalib.measurements import LidarStream
-from icalib.recordings.several import naming
+from icalib.data.measurements import LidarStream
+from icalib.data.recordings.several import naming
+from icalib.estimate.problem.inputs import Inputs, origin_difference
+from icalib.motion.imu_data import imu_data
+from icalib.optim.state import Key, State
 from icalib.rig import Lidar, PoseSensor
+
+
+@dataclass(frozen=True)
+class Held:
+    """What is known of a sensor, or None: R_imu_sensor (3, 3), p_imu_sensor (3,) m, offset: t_imu - t_sensor, both
+    since their clocks' first stamps [s]."""
+
+    rotation: np.ndarray | None = None
+    position: np.ndarray | None = None
+    offset: float | None = None
+
+
+UNKNOWN = Held()
 
 
 def alone(inputs: Inputs, k: int) -> Inputs:

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.imu_data import ImuData
-from icalib.first_guess.correlation import Shift, best_shifts
-from icalib.first_guess.slow_rates import slow_offsets
+from icalib.initialize.steps.correlation import Shift, best_shifts
+from icalib.initialize.steps.slow_rates import slow_offsets
+from icalib.motion.imu_data import ImuData
 
 GRID_HZ = 100.0
 LONGEST_STEP_S = 0.25  # images further apart do not give an angular rate, unless all are:

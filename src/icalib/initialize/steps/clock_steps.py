@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.imu_data import ImuData
-from icalib.first_guess.clock_shifts import CameraRates
+from icalib.initialize.steps.clock_shifts import CameraRates
+from icalib.motion.imu_data import ImuData
 
 LEAST_STEP_S = 0.5  # shorter ones are gaps that are bridged
 FEWEST = 10  # rates on either side, that tell

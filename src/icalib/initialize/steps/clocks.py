@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from icalib.data.measurements import CornerStream
 from icalib.errors import EstimationError
-from icalib.estimation.imu_data import ImuData
-from icalib.first_guess.clock_shifts import (
+from icalib.geometry import so3
+from icalib.initialize.steps.clock_shifts import (
     AVERAGED_S,
     CameraRates,
     at,
@@ -18,13 +19,12 @@ from icalib.first_guess.clock_shifts import (
     longest_step,
     means,
 )
-from icalib.first_guess.clock_steps import refuse_steps
-from icalib.first_guess.mean_rates import MeanRates
-from icalib.first_guess.rate_shifts import NORM_MEDIAN, noise_beside, unlike
-from icalib.first_guess.slow_rates import ChainedRates
-from icalib.first_guess.target_poses import TargetPoses
-from icalib.geometry import so3
-from icalib.measurements import CornerStream
+from icalib.initialize.steps.clock_steps import refuse_steps
+from icalib.initialize.steps.mean_rates import MeanRates
+from icalib.initialize.steps.rate_shifts import NORM_MEDIAN, noise_beside, unlike
+from icalib.initialize.steps.slow_rates import ChainedRates
+from icalib.initialize.steps.target_poses import TargetPoses
+from icalib.motion.imu_data import ImuData
 
 FEWEST_PAIRS = 20  # of neighbouring images
 LARGEST_UNEXPLAINED = 0.35  # of the angular rate

@@ -12,9 +12,9 @@ from contextvars import ContextVar
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.state import Key
-from icalib.estimation.tolerances import GUESS_SIGMA
+from icalib.estimate.problem.tolerances import GUESS_SIGMA
 from icalib.geometry import so3
+from icalib.optim.state import Key
 from icalib.rig import Camera, Lidar, Parameter, PoseSensor, Wheels
 
 SIGMAS = 4.0  # times what a guess is worth

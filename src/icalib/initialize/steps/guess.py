@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from icalib.estimation.state import Key
-from icalib.first_guess.target_poses import TargetPoses
+from icalib.data.measurements import CornerStream, Measurements, TrackStream
 from icalib.geometry.targets.base import BOARD
-from icalib.measurements import CornerStream, Measurements, TrackStream
+from icalib.initialize.steps.target_poses import TargetPoses
+from icalib.optim.state import Key
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.estimation.imu_data import ImuData
 from icalib.geometry import so3
+from icalib.motion.imu_data import ImuData
 
 SMOOTHED_S = 0.5  # to both sides: short against the drift of the gyroscope
 

@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icalib.estimation.pose_rows import Frame, Mount, absolute_rows
 from icalib.geometry import so3
+from icalib.motion.pose_rows import Frame, Mount, absolute_rows
 
 MOST_PAIRS = 2000  # of instants between which turns are compared
 ONE_AXIS = 0.1  # of the turns about the main axis: below, those about a second axis may be noise

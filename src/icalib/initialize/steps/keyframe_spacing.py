@@ -13,9 +13,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from icalib.first_guess.smooth_path import SmoothPath, smooth_path
+from icalib.data.measurements import Measurements, PoseStream, WheelStream
 from icalib.geometry import so3
-from icalib.measurements import Measurements, PoseStream, WheelStream
+from icalib.initialize.steps.smooth_path import SmoothPath, smooth_path
 from icalib.rig import Rig, Wheels
 
 UNSEEN = 0.25  # of the noise: in squares, 6 % of it

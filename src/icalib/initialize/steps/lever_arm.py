@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.imu_data import ImuData
-from icalib.first_guess.clock_shifts import USUAL_STEPS
-from icalib.first_guess.gyro import GyroRotation
-from icalib.first_guess.target_poses import TargetPoses
+from icalib.initialize.steps.clock_shifts import USUAL_STEPS
+from icalib.initialize.steps.gyro import GyroRotation
+from icalib.initialize.steps.target_poses import TargetPoses
+from icalib.motion.imu_data import ImuData
 
 STEP_S = 0.12  # between the images of a triple: long against pose noise, short against the loss of sight
 READINGS = 8192  # of the IMU at a time, whose rotations are made together

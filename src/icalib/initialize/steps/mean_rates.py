@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.estimation.imu_data import ImuData
-from icalib.first_guess.clock_shifts import at
+from icalib.initialize.steps.clock_shifts import at
+from icalib.motion.imu_data import ImuData
 
 
 @dataclass(frozen=True)

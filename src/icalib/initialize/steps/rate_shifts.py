@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from icalib.data.measurements import TrackStream
 from icalib.errors import EstimationError
-from icalib.estimation.imu_data import ImuData
-from icalib.first_guess.clock_shifts import MOST_PEAKS, PEAKS_APART_S, SHORTEST_OVERLAP_S, CameraRates
-from icalib.first_guess.mean_rates import MeanRates
-from icalib.first_guess.track_rotation import STEP_S, track_rates
 from icalib.geometry.cameras.base import CameraModel
-from icalib.measurements import TrackStream
+from icalib.initialize.steps.clock_shifts import MOST_PEAKS, PEAKS_APART_S, SHORTEST_OVERLAP_S, CameraRates
+from icalib.initialize.steps.mean_rates import MeanRates
+from icalib.initialize.steps.track_rotation import STEP_S, track_rates
+from icalib.motion.imu_data import ImuData
 
 STEPS_S = (STEP_S, 0.2, 0.1, 0.05)  # between images
 SHORTEST_STEP = 0.75  # times the period of the images

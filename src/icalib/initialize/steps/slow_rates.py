@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.estimation.imu_data import ImuData
-from icalib.first_guess.gyro import GyroRotation
 from icalib.geometry import so3
+from icalib.initialize.steps.gyro import GyroRotation
+from icalib.motion.imu_data import ImuData
 
 _SHIFT_S = 0.05  # between the offsets that are tried: short against the intervals
 _MOST_INTERVALS = 100  # that are compared at each offset

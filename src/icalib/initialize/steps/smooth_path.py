@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.compiled import njit
-from icalib.first_guess.rate_windows import rotation_noise
+from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.geometry.small import tmul3
+from icalib.initialize.steps.rate_windows import rotation_noise
 
 HALF_S = 0.1  # of the window, at least
 HALF_STEPS = 3.2  # and in steps between poses

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.compiled import njit
+from icalib.base.compiled import njit
+from icalib.data.measurements import CornerStream
 from icalib.errors import EstimationError
 from icalib.geometry import so3
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.small import solve_definite
-from icalib.measurements import CornerStream
 
 MOST_CORNERS = 48  # of an image; more do not make a first guess better
 FEWEST_CORNERS = 6  # of a board; fewer lie on a line too easily

@@ -8,20 +8,20 @@ from __future__ import annotations
 
 import numpy as np
 
+from icalib.data.measurements import Measurements, TrackStream
 from icalib.errors import EstimationError
-from icalib.estimation.imu_data import ImuData, imu_data
-from icalib.first_guess.align_camera import align_camera, chosen_offset, trusted
-from icalib.first_guess.clocks import Alignment
-from icalib.first_guess.contradicted import chosen
-from icalib.first_guess.guess import CameraGuess, Guess, relative_offset
-from icalib.first_guess.gyro import GyroRotation
-from icalib.first_guess.rate_shifts import telling_rates
-from icalib.first_guess.target_poses import TargetPoses
-from icalib.first_guess.track_alignment import align_together, pairs_of
-from icalib.first_guess.track_lens import find_lens
-from icalib.first_guess.track_motion import Motion, Rays, track_motion
 from icalib.geometry.cameras import camera_model
-from icalib.measurements import Measurements, TrackStream
+from icalib.initialize.steps.align_camera import align_camera, chosen_offset, trusted
+from icalib.initialize.steps.clocks import Alignment
+from icalib.initialize.steps.contradicted import chosen
+from icalib.initialize.steps.guess import CameraGuess, Guess, relative_offset
+from icalib.initialize.steps.gyro import GyroRotation
+from icalib.initialize.steps.rate_shifts import telling_rates
+from icalib.initialize.steps.target_poses import TargetPoses
+from icalib.initialize.tracks.track_alignment import align_together, pairs_of
+from icalib.initialize.tracks.track_lens import find_lens
+from icalib.initialize.tracks.track_motion import Motion, Rays, track_motion
+from icalib.motion.imu_data import ImuData, imu_data
 from icalib.rig import Camera, Rig
 
 APART_S, FEWEST_SEEN = 0.15, 3

@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from icalib.estimation.border import complement
-from icalib.first_guess.clocks import LEAST_SECOND_AXIS, Alignment, only_axis
-from icalib.first_guess.gyro import GyroRotation
-from icalib.first_guess.track_rotation import pairs_sharing, turns_information
+from icalib.data.measurements import TrackStream
 from icalib.geometry import so3
 from icalib.geometry.cameras.base import CameraModel
-from icalib.measurements import TrackStream
+from icalib.initialize.steps.clocks import LEAST_SECOND_AXIS, Alignment, only_axis
+from icalib.initialize.steps.gyro import GyroRotation
+from icalib.initialize.steps.track_rotation import pairs_sharing, turns_information
+from icalib.optim.border import complement
 
 STEPS_S = (0.5, 1.0)
 MOST_PAIRS = 400  # of images of a camera and a step

@@ -19,21 +19,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from icalib.data.measurements import TrackStream
 from icalib.errors import EstimationError
-from icalib.estimation.imu_data import ImuData
-from icalib.first_guess.clock_shifts import CameraRates
-from icalib.first_guess.clocks import Alignment, covered, kabsch, no_overlap
-from icalib.first_guess.gyro import GyroRotation
-from icalib.first_guess.mean_rates import MeanRates
-from icalib.first_guess.rate_shifts import best_regressions, telling_rates
-from icalib.first_guess.track_alignment import gyro_turns
-from icalib.first_guess.track_mount import Followed, lens_slopes
-from icalib.first_guess.track_rotation import track_rates, turns_information
 from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.cameras.convert import fit_rays
-from icalib.measurements import TrackStream
+from icalib.initialize.steps.clock_shifts import CameraRates
+from icalib.initialize.steps.clocks import Alignment, covered, kabsch, no_overlap
+from icalib.initialize.steps.gyro import GyroRotation
+from icalib.initialize.steps.mean_rates import MeanRates
+from icalib.initialize.steps.rate_shifts import best_regressions, telling_rates
+from icalib.initialize.steps.track_rotation import track_rates, turns_information
+from icalib.initialize.tracks.track_alignment import gyro_turns
+from icalib.initialize.tracks.track_mount import Followed, lens_slopes
+from icalib.motion.imu_data import ImuData
 from icalib.rig import Camera
 
 ANY_LENS = "pinhole-equidistant"  # its start, r = f theta, is near every lens, wide and narrow

@@ -15,15 +15,15 @@ from typing import Any
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 
-from icalib.compiled import njit
+from icalib.base.compiled import njit
+from icalib.data.measurements import TrackStream
 from icalib.errors import EstimationError
-from icalib.estimation.lidar_sweep import Motion
-from icalib.estimation.poses import Poses
-from icalib.first_guess.known_motion import imu_poses, is_known
-from icalib.first_guess.track_rotation import pairs_sharing
 from icalib.geometry import so3
 from icalib.geometry.cameras.base import CameraModel
-from icalib.measurements import TrackStream
+from icalib.initialize.steps.track_rotation import pairs_sharing
+from icalib.motion.known_motion import imu_poses, is_known
+from icalib.motion.poses import Poses
+from icalib.motion.sweep import Motion
 
 STEPS_S = (0.5, 1.0)  # between two images
 MOST_PAIRS = 300  # of images a step

@@ -7,19 +7,19 @@ from functools import partial
 
 import numpy as np
 
-from icalib.estimation.arrowhead import THREADS
-from icalib.estimation.assembly import motion_of
-from icalib.estimation.inputs import Inputs
-from icalib.estimation.state import Key, State
-from icalib.first_guess.align_camera import trusted
-from icalib.first_guess.by_recording import alone, each_clock, motion_alone, naming_recording, other_clocks
-from icalib.first_guess.clocks import main_axis, rough_alignments
-from icalib.first_guess.from_tracks import lens_start
-from icalib.first_guess.guess import relative_offset
-from icalib.first_guess.lidar_rounds import NAMES, given
-from icalib.first_guess.rate_shifts import telling_rates
-from icalib.first_guess.track_mount import Followed, Mount, place_on_motion
+from icalib.estimate.problem.assembly import motion_of
+from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry.cameras import camera_model
+from icalib.initialize.lidar.lidar_rounds import NAMES, given
+from icalib.initialize.steps.align_camera import trusted
+from icalib.initialize.steps.by_recording import alone, each_clock, motion_alone, naming_recording, other_clocks
+from icalib.initialize.steps.clocks import main_axis, rough_alignments
+from icalib.initialize.steps.guess import relative_offset
+from icalib.initialize.steps.rate_shifts import telling_rates
+from icalib.initialize.tracks.from_tracks import lens_start
+from icalib.initialize.tracks.track_mount import Followed, Mount, place_on_motion
+from icalib.optim.arrowhead import THREADS
+from icalib.optim.state import Key, State
 from icalib.rig import Camera
 
 

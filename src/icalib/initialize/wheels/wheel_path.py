@@ -7,16 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 
+from icalib.data.measurements import Measurements, PoseStream, WheelPoses, WheelStream
 from icalib.errors import EstimationError
-from icalib.estimation.inputs import Inputs
-from icalib.estimation.state import Key
-from icalib.estimation.wheel_angles import integrals_of
-from icalib.first_guess.contradicted import settled
-from icalib.first_guess.lidar_rounds import NAMES, given
-from icalib.first_guess.smooth_path import BodyPoses
+from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry import so3
-from icalib.measurements import Measurements, PoseStream, WheelPoses, WheelStream
+from icalib.initialize.lidar.lidar_rounds import NAMES, given
+from icalib.initialize.steps.contradicted import settled
+from icalib.initialize.steps.smooth_path import BodyPoses
+from icalib.optim.state import Key
 from icalib.rig import Parameter, PoseSensor, Rig, Wheels
+from icalib.sensors.wheels.wheel_angles import integrals_of
 
 
 def wheel_path(wheels: Wheels, stream: WheelStream | WheelPoses) -> BodyPoses:

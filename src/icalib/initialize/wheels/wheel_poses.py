@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from icalib.data.measurements import WheelPoses
 from icalib.errors import EstimationError
-from icalib.estimation.imu_data import ImuData
-from icalib.measurements import WheelPoses
+from icalib.motion.imu_data import ImuData
 
 GRID_HZ = 100.0
 LEAST_EXPLAINED = 0.5  # of the variance of the yaw rate, by the gyroscope

@@ -9,21 +9,13 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import yaml
 
-from icalib.file_names import NAME, NAME_WORDS
+from icalib.base.file_names import NAME, NAME_WORDS
+from icalib.base.yaml_nodes import YamlValue, parse_yaml, read_yaml
 from icalib.geometry.cameras import CAMERA_MODELS
 from icalib.geometry.targets import NoTarget, Scene, Target
-from icalib.rig import (
-    Camera,
-    ImuSensor,
-    Lidar,
-    Parameter,
-    PoseSensor,
-    Rig,
-    Settings,
-    Wheels,
-)
-from icalib.rig_complete import lack_of
-from icalib.rig_file.fields import (
+from icalib.rig import Camera, ImuSensor, Lidar, Parameter, PoseSensor, Rig, Settings, Wheels
+from icalib.rig.complete import lack_of
+from icalib.rig.file.fields import (
     MOUNTING,
     TABLE,
     groups_to_plain,
@@ -33,13 +25,12 @@ from icalib.rig_file.fields import (
     table_layout,
     topic_or_none,
 )
-from icalib.rig_file.imu import imu_to_plain, read_imu
-from icalib.rig_file.lidar import lidar_to_plain, read_lidar
-from icalib.rig_file.poses import pose_sensor, pose_to_plain
-from icalib.rig_file.wheels import read_wheels, wheels_to_plain
-from icalib.rig_parameters import vector_parameter
-from icalib.rig_targets import target_of, target_or_targets
-from icalib.yaml_nodes import YamlValue, parse_yaml, read_yaml
+from icalib.rig.file.imu import imu_to_plain, read_imu
+from icalib.rig.file.lidar import lidar_to_plain, read_lidar
+from icalib.rig.file.parameters import vector_parameter
+from icalib.rig.file.poses import pose_sensor, pose_to_plain
+from icalib.rig.file.targets import target_of, target_or_targets
+from icalib.rig.file.wheels import read_wheels, wheels_to_plain
 
 _SENSOR_TYPES = ("imu", "camera", "lidar", "wheels", "pose")
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, get_args
 
+from icalib.base.yaml_nodes import YamlValue
 from icalib.rig import PLAIN_TABLE, Axes, Camera, Lidar, Parameter, PoseSensor, TableLayout, TimeUnit, Wheels
-from icalib.rig_parameters import parameter_to_plain, rotation_parameter, vector_parameter
-from icalib.yaml_nodes import YamlValue
+from icalib.rig.file.parameters import parameter_to_plain, rotation_parameter, vector_parameter
 
 MOUNTED = ("rotation", "translation", "time_offset")
 MOUNTING = (*MOUNTED, "clock_restarts")

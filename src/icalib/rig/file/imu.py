@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, get_args
 
-from icalib.imu_classes import DEFAULT_CLASS, IMU_CLASSES, class_noise
+from icalib.base.yaml_nodes import YamlValue
 from icalib.rig import BY_CLASS, AccelUnit, GyroUnit, ImuNoise, ImuSensor, TwoSources
-from icalib.rig_file.fields import TABLE, axes_or_none, layout_to_plain, table_layout
-from icalib.rig_parameters import imu_intrinsics_parameter, parameter_to_plain
-from icalib.yaml_nodes import YamlValue
+from icalib.rig.file.fields import TABLE, axes_or_none, layout_to_plain, table_layout
+from icalib.rig.file.parameters import imu_intrinsics_parameter, parameter_to_plain
+from icalib.rig.imu_classes import DEFAULT_CLASS, IMU_CLASSES, class_noise
 
 _DENSITIES = ("gyro", "gyro_walk", "accel", "accel_walk")
 _FIELDS = ("accel_unit", "gyro_unit", "accel_axes", "gyro_axes")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from icalib.base.yaml_nodes import YamlValue
 from icalib.rig import Lidar, PointTime, TimeUnit
-from icalib.rig_file.fields import MOUNTING, choice_or, groups_to_plain, mounting, path_or, positive_or, topic_or_none
-from icalib.yaml_nodes import YamlValue
+from icalib.rig.file.fields import MOUNTING, choice_or, groups_to_plain, mounting, path_or, positive_or, topic_or_none
 
 _FIELDS = (
     "path", "topic", "range_noise", "min_range", "max_range", "point_time", "point_time_field", "point_time_unit",

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from icalib.base.yaml_nodes import YamlValue
 from icalib.errors import RigError
-from icalib.imu_classes import IMU_CLASSES, N_INTRINSICS, class_imperfections
-from icalib.parameter import ROUNDING, Parameter, nearest_rotation
-from icalib.yaml_nodes import YamlValue
+from icalib.rig.imu_classes import IMU_CLASSES, N_INTRINSICS, class_imperfections
+from icalib.rig.parameter import ROUNDING, Parameter, nearest_rotation
 
 _FORMS = "write free, {guess: VALUE}, {fixed: VALUE} or {prior: VALUE, sigma: SIGMA}"
 _ROTATION_FORMS = "a 3x3 matrix, {xyzw: [x, y, z, w]} or {rpy_deg: [roll, pitch, yaw]}"

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from icalib.base.yaml_nodes import YamlValue
 from icalib.rig import PoseKind, PoseSensor
-from icalib.rig_file.fields import (
+from icalib.rig.file.fields import (
     MOUNTING,
     TABLE,
     axes_or_none,
@@ -17,7 +18,6 @@ from icalib.rig_file.fields import (
     table_layout,
     topic_or_none,
 )
-from icalib.yaml_nodes import YamlValue
 
 _FIELDS = ("path", "topic", "kind", "level", "position_axes", "inverted", "frames", "scale_sigma")
 _NOISE = ("rotation_noise", "position_noise")

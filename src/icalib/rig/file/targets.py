@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+from icalib.base.file_names import NAME, NAME_WORDS
+from icalib.base.yaml_nodes import YamlValue
 from icalib.errors import RigError
-from icalib.file_names import NAME, NAME_WORDS
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles, Markers, Scene, Target
 from icalib.geometry.targets.families import family_name
-from icalib.yaml_nodes import YamlValue
 
 # type -> fields that must be there, and those that may
 _FIELDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {

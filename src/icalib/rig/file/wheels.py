@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
+from icalib.base.yaml_nodes import YamlValue
 from icalib.rig import (
     DRIVE_SIZES,
     Ground,
@@ -15,7 +16,7 @@ from icalib.rig import (
     WheelMeasure,
     Wheels,
 )
-from icalib.rig_file.fields import (
+from icalib.rig.file.fields import (
     MOUNTING,
     TABLE,
     choice_or,
@@ -27,8 +28,7 @@ from icalib.rig_file.fields import (
     table_layout,
     topic_or_none,
 )
-from icalib.rig_parameters import vector_parameter
-from icalib.yaml_nodes import YamlValue
+from icalib.rig.file.parameters import vector_parameter
 
 _WORDS = (
     "path", "topic", "drive", "measures", "sampling", "counts_per_turn", "counter_size", "angle_range", "rate_unit",

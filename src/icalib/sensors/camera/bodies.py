@@ -12,14 +12,14 @@ from itertools import permutations
 
 import numpy as np
 
+from icalib.data.measurements import CornerStream, Measurements
 from icalib.errors import EstimationError
-from icalib.estimation.board import SHAPE_LABELS, shape_basis
-from icalib.estimation.nodes import MERGED_WITHIN_S
-from icalib.estimation.state import Entry, Key, Layout
 from icalib.geometry.targets import Target
 from icalib.geometry.targets.base import BOARD
-from icalib.measurements import CornerStream, Measurements
+from icalib.motion.nodes import MERGED_WITHIN_S
+from icalib.optim.state import Entry, Key, Layout
 from icalib.rig import Rig
+from icalib.sensors.camera.board import SHAPE_LABELS, shape_basis
 
 FEWEST_TOGETHER = 3  # images with both of two bodies that tie them to each other
 MOST_NAMED = 8  # bodies in a sentence
@@ -66,7 +66,7 @@ class Bodies:
 
     def size_entries(self) -> list[Entry]:
         """The block of a layout for the size of all bodies together."""
-        return [(*SIZE, "vector", 1, True)] if self.sized and self.used else []
+        return [(*SIZE, "nuisance", 1, True)] if self.sized and self.used else []
 
     def shape_entries(self) -> list[Entry]:
         """Blocks of a layout for how bodies bend."""

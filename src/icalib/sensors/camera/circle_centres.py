@@ -14,9 +14,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from icalib.estimation.corner_factor import CornerFactor
-from icalib.estimation.state import State
 from icalib.geometry.cameras.base import CameraModel
+from icalib.optim.state import State
+from icalib.sensors.camera.corner_factor import CornerFactor
 
 N_CONTOUR = 32  # points of a circle; the sums over a smooth contour converge faster than any power of it
 ROUNDS = 3  # Gauss-Newton steps from the affine image of the circle; the second is of the order of the first squared

@@ -18,12 +18,19 @@ from itertools import pairwise
 
 import numpy as np
 
-from icalib.estimation import pages
-from icalib.estimation.arrowhead import Piece
-from icalib.estimation.board import board_in
-from icalib.estimation.bodies import Bodies
-from icalib.estimation.clocks import mounted_columns, offset_at
-from icalib.estimation.corner_kernels import (
+from icalib.data.measurements import CornerStream
+from icalib.geometry.cameras.base import CameraModel
+from icalib.geometry.targets.base import BOARD
+from icalib.motion.clocks import mounted_columns, offset_at
+from icalib.motion.imu_data import ImuData
+from icalib.motion.poses import Poses, poses_at, poses_of_nodes
+from icalib.optim import pages
+from icalib.optim.arrowhead import Piece
+from icalib.optim.state import Layout, State
+from icalib.rig import Scheme
+from icalib.sensors.camera.board import board_in
+from icalib.sensors.camera.bodies import Bodies
+from icalib.sensors.camera.corner_kernels import (
     Direct,
     Found,
     Images,
@@ -34,13 +41,6 @@ from icalib.estimation.corner_kernels import (
     accumulate_clusters,
     camera_points,
 )
-from icalib.estimation.imu_data import ImuData
-from icalib.estimation.poses import Poses, poses_at, poses_of_nodes
-from icalib.estimation.state import Layout, State
-from icalib.geometry.cameras.base import CameraModel
-from icalib.geometry.targets.base import BOARD
-from icalib.measurements import CornerStream
-from icalib.rig import Scheme
 
 BLOCK = 256  # images at a time, where nothing is summed
 POSES = 1024  # views at a time, whose poses and how these move are made together

@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icalib.compiled import njit
-from icalib.estimation.corner_chain import add_clusters, add_image, pose_chain
-from icalib.estimation.corner_weights import bend, marginalise_shared, robust_weights, weight, whole_error
+from icalib.base.compiled import njit
+from icalib.motion.pose_chain import add_clusters, add_image, pose_chain
+from icalib.optim.robust_weights import bend, marginalise_shared, robust_weights, weight, whole_error
 
 
 class Images(NamedTuple):

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.measurements import CornerStream
+from icalib.data.measurements import CornerStream
 
 CELLS = (
     12,

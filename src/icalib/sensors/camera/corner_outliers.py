@@ -13,9 +13,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from icalib.estimation.corner_factor import CornerFactor, CornerOutput
-from icalib.estimation.medians import grouped_quantiles, largest_normal
+from icalib.optim.medians import grouped_quantiles, largest_normal
 from icalib.rig import Settings
+from icalib.sensors.camera.corner_factor import CornerFactor, CornerOutput
 
 NEIGHBOURS = 12  # with twice as many, small outliers near the border find a similar residual by chance
 # Corners that are not suspect, among which neighbours are looked for: in images of 752 x 480 px one for each 4 px in

@@ -16,9 +16,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from icalib.estimation.corner_factor import CornerFactor
-from icalib.estimation.state import State
 from icalib.geometry.cameras.base import CameraModel
+from icalib.optim.state import State
+from icalib.sensors.camera.corner_factor import CornerFactor
 
 # Image of a unit area of the target at unit depth, over fx^2: 0 where the plane is seen edge-on. Below, the affine map
 # to the image is not inverted, and the corner stays where it is.

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from icalib.estimation.corner_factor import CornerFactor, CornerOutput
-from icalib.estimation.medians import grouped_quantiles
+from icalib.optim.medians import grouped_quantiles
 from icalib.rig import Settings
+from icalib.sensors.camera.corner_factor import CornerFactor, CornerOutput
 
 MEDIAN_RATIO = 8.0  # of an image's median to the median of all images' medians; lenses and blur reach a few times that
 MOST_SHARE = 0.2  # of the shared keyframes: where more do not fit, no single set is to blame, and none is rejected

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from icalib.data.measurements import CornerStream, Measurements, TrackStream
 from icalib.errors import EstimationError
-from icalib.measurements import CornerStream, Measurements, TrackStream
 from icalib.rig import Rig
 
 _NONE = np.zeros(0, dtype=np.int64)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimation.imu_data import ImuData
+from icalib.motion.imu_data import ImuData
 from icalib.rig import Axes, ImuSensor
 
 AS_THEY_ARE: Axes = ("x", "y", "z")

@@ -7,16 +7,16 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from icalib.compiled import njit
-from icalib.estimation import pages
-from icalib.estimation.arrowhead import Piece, in_parallel
-from icalib.estimation.imu_data import ImuData
-from icalib.estimation.integration import Increment, correction, integrate, readings_of
-from icalib.estimation.interval_sums import add_interval
-from icalib.estimation.prior_factor import accumulate_bias_prior
-from icalib.estimation.state import State
+from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.geometry.small import inverse_cholesky, mul3, tmul3
+from icalib.motion.imu_data import ImuData
+from icalib.motion.integration import Increment, correction, integrate, readings_of
+from icalib.optim import pages
+from icalib.optim.arrowhead import Piece, in_parallel
+from icalib.optim.interval_sums import add_interval
+from icalib.optim.prior_factor import accumulate_bias_prior
+from icalib.optim.state import State
 
 ROWS = 15  # rotation, velocity, position, gyro bias, accelerometer bias
 

@@ -19,10 +19,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from icalib.data.measurements import LidarStream
 from icalib.errors import EstimationError
-from icalib.estimation.arrowhead import in_parallel
-from icalib.estimation.clocks import instants
-from icalib.estimation.lidar_moments import (
+from icalib.motion.clocks import instants
+from icalib.motion.nodes import usable
+from icalib.motion.sweep import Motion, sweep
+from icalib.optim.arrowhead import in_parallel
+from icalib.rig import Loss
+from icalib.sensors.lidar.lidar_moments import (
     MOMENTS,
     Cells,
     Scans,
@@ -32,10 +36,6 @@ from icalib.estimation.lidar_moments import (
     step_range,
     to_centres,
 )
-from icalib.estimation.lidar_sweep import Motion, sweep
-from icalib.estimation.nodes import usable
-from icalib.measurements import LidarStream
-from icalib.rig import Loss
 
 BIN_S = 3e-3
 STEP_S = 1e-3  # of a longer bin

@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icalib.compiled import njit
-from icalib.estimation.corner_chain import by_imu_pose
-from icalib.estimation.lidar_walk import PLANE, POSE, add_entry, add_plane, add_pose, border_of, no_walk, taken_off
-from icalib.estimation.state import Key, State
+from icalib.base.compiled import njit
 from icalib.geometry.planes import tangents
+from icalib.motion.pose_chain import by_imu_pose
+from icalib.optim.state import Key, State
+from icalib.sensors.lidar.lidar_walk import PLANE, POSE, add_entry, add_plane, add_pose, border_of, no_walk, taken_off
 
 ROWS = 4  # whitened residuals of a plane in a bin
 RESIDUAL = POSE + PLANE  # the last column of an entry's Jacobian

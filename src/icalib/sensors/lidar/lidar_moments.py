@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icalib.compiled import njit
-from icalib.estimation.corner_weights import weight
+from icalib.base.compiled import njit
+from icalib.optim.robust_weights import weight
 
 MOMENTS = 10  # of (1, x, y, z), lower triangle row by row
 SUMS = MOMENTS + 3  # and the slant

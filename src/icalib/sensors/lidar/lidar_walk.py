@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icalib.compiled import njit
+from icalib.base.compiled import njit
 from icalib.geometry.small import cholesky
 
 POSE, PLANE = 6, 3

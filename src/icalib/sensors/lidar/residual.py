@@ -15,18 +15,18 @@ from itertools import pairwise
 
 import numpy as np
 
-from icalib.estimation import lidar_kernels
-from icalib.estimation.arrowhead import Piece, in_parallel
-from icalib.estimation.clocks import by_clock, instants, mounted_columns, offset_at
-from icalib.estimation.imu_data import ImuData
-from icalib.estimation.lidar_binning import BIN_S, Associated, LidarNoise, Moments, take_moments
-from icalib.estimation.lidar_kernels import ROWS, Bins, Motion, Planes
-from icalib.estimation.lidar_sweep import Motion as ImuMotion
-from icalib.estimation.poses import assign_nodes, poses_at
-from icalib.estimation.sensors import Whitened
-from icalib.estimation.state import Key, Layout, State
-from icalib.measurements import LidarStream
+from icalib.data.measurements import LidarStream
+from icalib.motion.clocks import by_clock, instants, mounted_columns, offset_at
+from icalib.motion.factor import Whitened
+from icalib.motion.imu_data import ImuData
+from icalib.motion.poses import assign_nodes, poses_at
+from icalib.motion.sweep import Motion as ImuMotion
+from icalib.optim.arrowhead import Piece, in_parallel
+from icalib.optim.state import Key, Layout, State
 from icalib.rig import Scheme
+from icalib.sensors.lidar import lidar_kernels
+from icalib.sensors.lidar.lidar_binning import BIN_S, Associated, LidarNoise, Moments, take_moments
+from icalib.sensors.lidar.lidar_kernels import ROWS, Bins, Motion, Planes
 
 CHUNK = 512  # bins at a time: what a chunk needs stays in the cache
 

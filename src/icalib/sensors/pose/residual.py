@@ -16,20 +16,20 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from icalib.estimation.arrowhead import Piece
-from icalib.estimation.board import board_in
-from icalib.estimation.clocks import by_clock, instants, mounted_columns, offset_at
-from icalib.estimation.imu_data import ImuData
-from icalib.estimation.lidar_sweep import Motion
-from icalib.estimation.nodes import MERGED_WITHIN_S, usable
-from icalib.estimation.pose_rows import Frame, Mount, PoseRows, absolute_rows, add_chain_rule, relative_rows
-from icalib.estimation.poses import Poses, assign_nodes, poses_alone, poses_at, poses_of_nodes
-from icalib.estimation.row_sums import Into, Weighing, add_rows, in_chunks
-from icalib.estimation.sensors import Whitened
-from icalib.estimation.state import NODE, Layout, State
-from icalib.estimation.wheel_intervals import WheelIntervals, choose_intervals
-from icalib.estimation.wheel_kernels import Rows
-from icalib.measurements import PoseStream
+from icalib.data.measurements import PoseStream
+from icalib.motion.clocks import by_clock, instants, mounted_columns, offset_at
+from icalib.motion.factor import Whitened
+from icalib.motion.imu_data import ImuData
+from icalib.motion.nodes import MERGED_WITHIN_S, usable
+from icalib.motion.pose_rows import Frame, Mount, PoseRows, absolute_rows, add_chain_rule, relative_rows
+from icalib.motion.poses import Poses, assign_nodes, poses_alone, poses_at, poses_of_nodes
+from icalib.motion.sweep import Motion
+from icalib.optim.arrowhead import Piece
+from icalib.optim.state import NODE, Layout, State
+from icalib.sensors.camera.board import board_in
+from icalib.sensors.wheels.row_sums import Into, Weighing, add_rows, in_chunks
+from icalib.sensors.wheels.wheel_intervals import WheelIntervals, choose_intervals
+from icalib.sensors.wheels.wheel_kernels import Rows
 
 FRAME = ("frame_rotation", "frame_translation")
 NEAR_NODE_S = 0.05  # a pose further from all nodes is left out: the IMU alone would carry it there

@@ -20,14 +20,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.estimation.arrowhead import Piece
-from icalib.estimation.imu_data import ImuData
-from icalib.estimation.row_sums import Into, Weighing, add_rows
-from icalib.estimation.sensors import Whitened
-from icalib.estimation.state import Key, Layout, State
-from icalib.estimation.wheel_kernels import Rows
 from icalib.geometry import planes
+from icalib.motion.factor import Whitened
+from icalib.motion.imu_data import ImuData
+from icalib.optim.arrowhead import Piece
+from icalib.optim.state import Key, Layout, State
 from icalib.rig import Ground
+from icalib.sensors.wheels.row_sums import Into, Weighing, add_rows
+from icalib.sensors.wheels.wheel_kernels import Rows
 
 LEVEL = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])  # normal and point
 NEARLY_LEVEL = np.cos(np.deg2rad(20.0))

@@ -19,33 +19,20 @@ from typing import ClassVar
 
 import numpy as np
 
-from icalib.estimation.arrowhead import Piece
-from icalib.estimation.clocks import by_clock, instants, mounted_columns, offset_at
-from icalib.estimation.imu_data import ImuData
-from icalib.estimation.poses import Poses, Velocities, motion_at, poses_alone, poses_at
-from icalib.estimation.row_sums import Into, Weighing, add_rows, in_chunks
-from icalib.estimation.sensors import Whitened
-from icalib.estimation.state import Layout, State
-from icalib.estimation.wheel_carry import carried_noise
-from icalib.estimation.wheel_drives import KINDS, N_DRIVE, UNITS, Kinds, coefficients
-from icalib.estimation.wheel_intervals import (
-    Instants,
-    WheelIntervals,
-    choose_intervals,
-    pose_intervals,
-    quadrature,
-)
-from icalib.estimation.wheel_kernels import (
-    N_OWN,
-    Rows,
-    Track,
-    Wheels,
-    increment_rows,
-    relative_rows,
-)
-from icalib.estimation.wheel_poses import RelativePoses, preintegrated
-from icalib.measurements import WheelPoses
+from icalib.data.measurements import WheelPoses
+from icalib.motion.clocks import by_clock, instants, mounted_columns, offset_at
+from icalib.motion.factor import Whitened
+from icalib.motion.imu_data import ImuData
+from icalib.motion.poses import Poses, Velocities, motion_at, poses_alone, poses_at
+from icalib.optim.arrowhead import Piece
+from icalib.optim.state import Layout, State
 from icalib.rig import DRIVE_SIZES, WheelKind
+from icalib.sensors.wheels.row_sums import Into, Weighing, add_rows, in_chunks
+from icalib.sensors.wheels.wheel_carry import carried_noise
+from icalib.sensors.wheels.wheel_drives import KINDS, N_DRIVE, UNITS, Kinds, coefficients
+from icalib.sensors.wheels.wheel_intervals import Instants, WheelIntervals, choose_intervals, pose_intervals, quadrature
+from icalib.sensors.wheels.wheel_kernels import N_OWN, Rows, Track, Wheels, increment_rows, relative_rows
+from icalib.sensors.wheels.wheel_poses import RelativePoses, preintegrated
 
 
 @dataclass(frozen=True)

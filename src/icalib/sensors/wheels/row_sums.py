@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icalib.estimation.arrowhead import Piece
-from icalib.estimation.corner_factor import LOSSES
-from icalib.estimation.corner_weights import Loss
-from icalib.estimation.imu_data import ImuData
-from icalib.estimation.sensors import Whitened
-from icalib.estimation.state import Layout
-from icalib.estimation.wheel_kernels import Rows, accumulate_rows
+from icalib.motion.factor import Whitened
+from icalib.motion.imu_data import ImuData
+from icalib.optim.arrowhead import Piece
+from icalib.optim.robust_weights import Loss
+from icalib.optim.state import Layout
+from icalib.sensors.camera.corner_factor import LOSSES
+from icalib.sensors.wheels.wheel_kernels import Rows, accumulate_rows
 
 # Rows of a factor that are made at once: their Jacobians stay in the processor's cache.
 CHUNK = 256

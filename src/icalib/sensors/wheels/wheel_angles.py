@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from icalib.measurements import WheelStream
+from icalib.data.measurements import WheelStream
 
 RateReading = Literal["interval-mean", "instantaneous"]
 STEEPEST_RAD = 1.55  # beyond it a wheel stands across the vehicle

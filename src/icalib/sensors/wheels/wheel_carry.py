@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.estimation.imu_data import ImuData
-from icalib.estimation.poses import Poses
 from icalib.geometry import so3
+from icalib.motion.imu_data import ImuData
+from icalib.motion.poses import Poses
 
 
 def carried_noise(

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icalib.estimation.imu_data import ImuData
+from icalib.motion.imu_data import ImuData
 
 LONGEST_S = 0.5  # intervals longer than this are no longer consistent
 # Two Gauss points a panel miss u'''' h^5 / 4320 of the integral of u: a vibration of 20 Hz and 3 m/s^2 costs 0.01 mm.

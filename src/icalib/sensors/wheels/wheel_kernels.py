@@ -13,11 +13,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icalib.compiled import njit
-from icalib.estimation.corner_weights import weight
-from icalib.estimation.interval_sums import add_interval
+from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.geometry.small import tmul3
+from icalib.optim.interval_sums import add_interval
+from icalib.optim.robust_weights import weight
 
 N_OWN = 10  # border columns of the wheels: rotation 3, translation 3, time offset 1, up to three of the drive
 

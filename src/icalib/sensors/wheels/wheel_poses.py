@@ -13,9 +13,9 @@ from math import cos, sin
 
 import numpy as np
 
-from icalib.compiled import njit
-from icalib.estimation.wheel_intervals import WheelIntervals
+from icalib.base.compiled import njit
 from icalib.geometry.small import inverse_cholesky
+from icalib.sensors.wheels.wheel_intervals import WheelIntervals
 
 
 @dataclass(frozen=True)

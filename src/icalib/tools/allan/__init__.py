@@ -1,9 +1,9 @@
 """The noise of an IMU, from a recording of it at rest."""
 
-from icalib.allan.analysis import ImuNoiseStudy, SensorNoise, study_imu, study_recording
-from icalib.allan.deviation import Deviation, allan_deviation
-from icalib.allan.files import write_study
-from icalib.allan.fit import NoiseFit
+from icalib.tools.allan.analysis import ImuNoiseStudy, SensorNoise, study_imu, study_recording
+from icalib.tools.allan.deviation import Deviation, allan_deviation
+from icalib.tools.allan.files import write_study
+from icalib.tools.allan.fit import NoiseFit
 
 __all__ = [
     "Deviation",

@@ -7,19 +7,19 @@ from pathlib import Path
 
 import numpy as np
 
-from icalib.allan.deviation import Deviation, allan_deviation_of_all
-from icalib.allan.fit import NoiseFit, bands_of_all, fit_noise, pooled
-from icalib.allan.sampling import still_readings
+from icalib.data.checks.imu_checks import read_imu
+from icalib.data.checks.imu_halves import pair_of
+from icalib.data.checks.imu_units import DEGREE
+from icalib.data.images.topics import find_topic, listing
+from icalib.data.measurements import ImuStream
+from icalib.data.recordings import BagRecording, Recording, TopicInfo, open_recording
+from icalib.data.stamps.jumps import ClockJumps
 from icalib.errors import RecordingError
-from icalib.imu_classes import DEFAULT_CLASS, class_noise
-from icalib.measurements import ImuStream
-from icalib.recordings import BagRecording, Recording, TopicInfo, open_recording
-from icalib.recordings.imu_checks import read_imu
-from icalib.recordings.imu_halves import pair_of
-from icalib.recordings.imu_units import DEGREE
-from icalib.recordings.jumps import ClockJumps
-from icalib.recordings.topics import find_topic, listing
 from icalib.rig import AccelUnit, GyroUnit, ImuSensor
+from icalib.rig.imu_classes import DEFAULT_CLASS, class_noise
+from icalib.tools.allan.deviation import Deviation, allan_deviation_of_all
+from icalib.tools.allan.fit import NoiseFit, bands_of_all, fit_noise, pooled
+from icalib.tools.allan.sampling import still_readings
 
 AXES = ("x", "y", "z")
 _WALK_KNOWN = 1.0  # of NoiseFit.lacking

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from icalib.allan.analysis import ImuNoiseStudy
-from icalib.allan.page import allan_html
-from icalib.allan.words import rig_snippet, study_json
-from icalib.own_files import refuse_foreign, sealed_texts
-from icalib.result_files import check_writable
-from icalib.text_files import printable, write_texts
+from icalib.base.own_files import refuse_foreign, sealed_texts
+from icalib.base.result_files import check_writable
+from icalib.base.text_files import printable, write_texts
+from icalib.tools.allan.analysis import ImuNoiseStudy
+from icalib.tools.allan.page import allan_html
+from icalib.tools.allan.words import rig_snippet, study_json
 
 FILES = ("allan.html", "noise.yaml", "allan.json")
 

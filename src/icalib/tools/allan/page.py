@@ -6,12 +6,12 @@ from string import Template
 
 import numpy as np
 
-from icalib.allan.analysis import AXES, ImuNoiseStudy, SensorNoise
-from icalib.allan.deviation import model_variance
-from icalib.allan.words import rig_snippet, rows
 from icalib.report.page import document, resource
 from icalib.report.plot import AXIS_COLORS, Figure, axis, figure, line
 from icalib.report.tables import Html, element, html, sentences
+from icalib.tools.allan.analysis import AXES, ImuNoiseStudy, SensorNoise
+from icalib.tools.allan.deviation import model_variance
+from icalib.tools.allan.words import rig_snippet, rows
 
 _HEADERS = ("", "noise density", "bias walk", "bias instability")
 
@@ -27,7 +27,7 @@ def allan_html(study: ImuNoiseStudy) -> str:
         "notes": sentences(study.notes, "", "None."),
     }
     escaped = {name: html(value) for name, value in words.items()}
-    body = Template(resource("icalib.allan", "page.html")).substitute(escaped | parts)
+    body = Template(resource("icalib.tools.allan", "page.html")).substitute(escaped | parts)
     return document(f"Noise of {study.name}", body, figures)
 
 

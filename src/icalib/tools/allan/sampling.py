@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from icalib.data.measurements import ImuStream
 from icalib.errors import EstimationError
-from icalib.measurements import ImuStream
 
 _GAP_PERIODS = 5.0  # a longer step between stamps is a gap; shorter ones are jitter of whoever stamps
 _MOST_FILLED = 0.05  # share of readings; beyond it stamps come in bursts, and say nothing about gaps

@@ -11,9 +11,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from icalib.allan.analysis import AXES, ImuNoiseStudy, SensorNoise
-from icalib.allan.fit import NoiseFit
-from icalib.text_files import json_text
+from icalib.base.text_files import json_text
+from icalib.tools.allan.analysis import AXES, ImuNoiseStudy, SensorNoise
+from icalib.tools.allan.fit import NoiseFit
 
 _UNITS = {"gyroscope": ("rad/s/sqrt(Hz)", "rad/s^2/sqrt(Hz)"), "accelerometer": ("m/s^2/sqrt(Hz)", "m/s^3/sqrt(Hz)")}
 _FIELDS = {"gyroscope": ("gyro", "gyro_walk"), "accelerometer": ("accel", "accel_walk")}

@@ -1,10 +1,10 @@
 """Much work shared out to processes and machines by Dask, of which nothing finished is lost or done twice."""
 
-from icalib.batch.alone import alone
-from icalib.batch.files import replacing, write_whole
-from icalib.batch.program import program
-from icalib.batch.records import check_worker, plain_record, record_json, sentence_on
-from icalib.batch.workers import Crew, Lost, run_all
+from icalib.tools.batch.alone import alone
+from icalib.tools.batch.files import replacing, write_whole
+from icalib.tools.batch.program import program
+from icalib.tools.batch.records import check_worker, plain_record, record_json, sentence_on
+from icalib.tools.batch.workers import Crew, Lost, run_all
 
 __all__ = [
     "Crew",

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from icalib.base.extras import load_filelock
 from icalib.errors import CalibrationError
-from icalib.extras import load_filelock
 
 LOCK = ".lock"
 

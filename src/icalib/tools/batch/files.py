@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from icalib.base.staging import staged
 from icalib.errors import CalibrationError
-from icalib.staging import staged
 
 
 def write_whole(path: Path, content: bytes) -> None:

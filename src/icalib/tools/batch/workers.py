@@ -8,8 +8,8 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from icalib.base.extras import load_dask, load_distributed
 from icalib.errors import CalibrationError
-from icalib.extras import load_dask, load_distributed
 
 ANSWER_WITHIN_S = 10
 # A task that waits at a worker would share the blame when that worker dies, and be given up in the end with the guilty.

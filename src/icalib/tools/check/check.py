@@ -16,18 +16,18 @@ from typing import Literal
 
 import numpy as np
 
-from icalib.calibration import Calibration, SensorFit, joint_covariance
-from icalib.calibration.verdict import NUISANCE, lens_verdict
-from icalib.comparison.compare import Comparison, Difference, compare_sides
-from icalib.comparison.results import side_of_result
-from icalib.comparison.significance import sigmas
+from icalib.data.measurements import Measurements
+from icalib.data.recordings.several import Source
 from icalib.errors import CalibrationError, EstimationError
 from icalib.geometry import so3
-from icalib.measurements import Measurements
 from icalib.pipeline import Progress, calibrate_measurements, measure
-from icalib.recordings.several import Source
-from icalib.result_rig import rig_of_result
+from icalib.result import Calibration, SensorFit, joint_covariance
+from icalib.result.as_rig import rig_of_result
+from icalib.result.verdict import NUISANCE, lens_verdict
 from icalib.rig import LENS, Rig
+from icalib.tools.comparison.compare import Comparison, Difference, compare_sides
+from icalib.tools.comparison.results import side_of_result
+from icalib.tools.comparison.significance import sigmas
 
 Validity = Literal["valid", "changed", "cannot say"]
 EXIT_CODES: dict[Validity, int] = {"valid": 0, "changed": 1, "cannot say": 3}

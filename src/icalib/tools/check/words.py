@@ -6,12 +6,12 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
-from icalib.calibration import SensorFit
-from icalib.calibration.quantities import chi2_words, rms_words
-from icalib.check.check import Check
-from icalib.comparison.compare import Difference
-from icalib.comparison.words import sentence
-from icalib.text_files import json_text, printable
+from icalib.base.text_files import json_text, printable
+from icalib.result import SensorFit
+from icalib.result.quantities import chi2_words, rms_words
+from icalib.tools.check.check import Check
+from icalib.tools.comparison.compare import Difference
+from icalib.tools.comparison.words import sentence
 
 _EXTRINSICS = ("rotation", "translation")
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.comparison.sides import LensSide, Quantity, Side
-from icalib.comparison.significance import sigmas
-from icalib.comparison.units import DEFAULT_TOLERANCES
 from icalib.errors import CalibrationError
 from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
+from icalib.tools.comparison.sides import LensSide, Quantity, Side
+from icalib.tools.comparison.significance import sigmas
+from icalib.tools.comparison.units import DEFAULT_TOLERANCES
 
 _GRID = (24, 18)  # pixels across and down on which lenses are compared
 

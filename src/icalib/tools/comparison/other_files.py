@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from icalib.comparison.results import DENSITIES, noise_quantities
-from icalib.comparison.sides import LensSide, Quantity, Side, unknown
+from icalib.base.yaml_nodes import YamlValue
 from icalib.errors import CalibrationError
 from icalib.export.urdf_tree import read_urdf
-from icalib.inspection.kalibr import MODELS
-from icalib.yaml_nodes import YamlValue
+from icalib.tools.comparison.results import DENSITIES, noise_quantities
+from icalib.tools.comparison.sides import LensSide, Quantity, Side, unknown
+from icalib.tools.inspection.kalibr import MODELS
 
 _KALIBR_NOISE = {
     "gyro": "gyroscope_noise_density",

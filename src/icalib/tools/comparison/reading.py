@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from icalib.calibration import load_calibration
-from icalib.comparison.compare import Comparison, Tolerances, compare_sides
-from icalib.comparison.other_files import is_kalibr, side_of_kalibr, side_of_urdf, side_of_urdf_alone
-from icalib.comparison.results import side_of_result, side_of_rig
-from icalib.comparison.sides import Side
+from icalib.base.yaml_nodes import read_yaml, suggestion
 from icalib.errors import CalibrationError, RigError
-from icalib.yaml_nodes import read_yaml, suggestion
+from icalib.result import load_calibration
+from icalib.tools.comparison.compare import Comparison, Tolerances, compare_sides
+from icalib.tools.comparison.other_files import is_kalibr, side_of_kalibr, side_of_urdf, side_of_urdf_alone
+from icalib.tools.comparison.results import side_of_result, side_of_rig
+from icalib.tools.comparison.sides import Side
 
 _XML = b"<"
 

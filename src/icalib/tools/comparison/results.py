@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from icalib.calibration import Calibration, joint_covariance, relative_pose
-from icalib.comparison.sides import LensSide, Quantity, Side, unknown
+from icalib.result import Calibration, joint_covariance, relative_pose
 from icalib.rig import Camera, Lidar, Parameter, PoseSensor, Wheels
-from icalib.rig_file import load_rig
+from icalib.rig.file import load_rig
+from icalib.tools.comparison.sides import LensSide, Quantity, Side, unknown
 
 DENSITIES = {
     "gyro": "noise density of the gyroscope",

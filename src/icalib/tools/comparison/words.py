@@ -7,8 +7,8 @@ from math import floor, log10
 
 import numpy as np
 
-from icalib.comparison.compare import Comparison, Difference
-from icalib.text_files import json_text, printable
+from icalib.base.text_files import json_text, printable
+from icalib.tools.comparison.compare import Comparison, Difference
 
 _ALONG = 0.95  # of the whole: then it is about one axis
 _TITLES = {True: "same", False: "DIFFERS"}

@@ -8,8 +8,8 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from icalib.fleet import words
-from icalib.fleet.result import Fleet
+from icalib.tools.fleet import words
+from icalib.tools.fleet.result import Fleet
 
 MOST = 20  # sentences of a kind; all are on the page
 

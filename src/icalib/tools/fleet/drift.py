@@ -6,12 +6,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import erfc, sqrt
 
-from icalib.calibration import Calibration
-from icalib.comparison.compare import Comparison, Difference, compare_sides
-from icalib.comparison.results import side_of_result
-from icalib.comparison.sides import Side
-from icalib.comparison.words import sentence
 from icalib.errors import CalibrationError
+from icalib.result import Calibration
+from icalib.tools.comparison.compare import Comparison, Difference, compare_sides
+from icalib.tools.comparison.results import side_of_result
+from icalib.tools.comparison.sides import Side
+from icalib.tools.comparison.words import sentence
 
 
 @dataclass(frozen=True)

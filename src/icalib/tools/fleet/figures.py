@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from icalib.calibration.units import SHOWN_UNITS
-from icalib.fleet.record import Block
-from icalib.fleet.result import JobResult
 from icalib.geometry import so3
 from icalib.report.plot import AXIS_COLORS, COLORS, Figure, figure, numbers, stacked_axes, y_of
 from icalib.report.tables import WORDS
+from icalib.result.units import SHOWN_UNITS
+from icalib.tools.fleet.record import Block
+from icalib.tools.fleet.result import JobResult
 
 _PANEL_PX, _EDGE_PX, _GAPS = 170, 90, 0.2
 OPEN = "undetermined"

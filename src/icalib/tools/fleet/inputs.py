@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from icalib.batch import program
-from icalib.fleet.jobs import Job
+from icalib.tools.batch import program
+from icalib.tools.fleet.jobs import Job
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from icalib.yaml_nodes import YamlValue, read_yaml
+from icalib.base.yaml_nodes import YamlValue, read_yaml
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}")
 _UNFIT = re.compile(r"[^A-Za-z0-9_.-]+")

@@ -5,12 +5,12 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, replace
 
-from icalib.batch import program, sentence_on
-from icalib.fleet.inputs import Inputs
-from icalib.fleet.jobs import Job
-from icalib.fleet.record import Record
-from icalib.outputs import output_files
+from icalib.export.outputs import output_files
 from icalib.pipeline import calibrate
+from icalib.tools.batch import program, sentence_on
+from icalib.tools.fleet.inputs import Inputs
+from icalib.tools.fleet.jobs import Job
+from icalib.tools.fleet.record import Record
 
 
 @dataclass(frozen=True)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from string import Template
 
-from icalib.fleet import words
-from icalib.fleet.figures import over_time, sensors
-from icalib.fleet.result import Fleet, JobResult, by_robot
-from icalib.fleet.store import JOBS
 from icalib.report.page import document, plot_place, resource
 from icalib.report.plot import Figure
 from icalib.report.tables import Html, element, html, sentences, table
+from icalib.tools.fleet import words
+from icalib.tools.fleet.figures import over_time, sensors
+from icalib.tools.fleet.result import Fleet, JobResult, by_robot
+from icalib.tools.fleet.store import JOBS
 
 _BADGES = {"done": "determined", "failed": "undetermined"}  # green, red
 
@@ -36,7 +36,7 @@ def fleet_html(fleet: Fleet, title: str) -> str:
         "notes": sentences(words.notes(fleet), "", "None."),
     }
     escaped = {name: html(text) for name, text in texts.items()}
-    body = Template(resource("icalib.fleet", "page.html")).substitute(escaped | parts)
+    body = Template(resource("icalib.tools.fleet", "page.html")).substitute(escaped | parts)
     return document(f"Fleet of {title}", body, figures)
 
 

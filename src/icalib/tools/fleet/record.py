@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from icalib.batch import plain_record, record_json
-from icalib.calibration import Calibration, ParameterGroup
-from icalib.calibration.quantities import shown_groups
-from icalib.fleet.inputs import Inputs
-from icalib.own_files import SEAL, sealed
+from icalib.base.own_files import SEAL, sealed
+from icalib.result import Calibration, ParameterGroup
+from icalib.result.quantities import shown_groups
+from icalib.tools.batch import plain_record, record_json
+from icalib.tools.fleet.inputs import Inputs
 
 FORMAT = 1
 WALL_CLOCK_NS = (10**18, 4 * 10**18)  # 2001 to 2096; clocks that start with the computer are far below

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
-from icalib.fleet.drift import Drift, by_chance
-from icalib.fleet.jobs import Job
-from icalib.fleet.record import Record
+from icalib.tools.fleet.drift import Drift, by_chance
+from icalib.tools.fleet.jobs import Job
+from icalib.tools.fleet.record import Record
 
 
 @dataclass(frozen=True)

@@ -7,20 +7,20 @@ from contextlib import closing
 from math import isfinite
 from pathlib import Path
 
-from icalib.batch import Crew, Lost, alone, run_all, write_whole
+from icalib.base.own_files import refuse_foreign, sealed
+from icalib.base.result_files import refuse_foreign_set
+from icalib.base.text_files import printable
 from icalib.errors import CalibrationError
-from icalib.fleet.drift import drift_of
-from icalib.fleet.inputs import Inputs
-from icalib.fleet.jobs import Job, load_jobs
-from icalib.fleet.one_job import Task, run
-from icalib.fleet.page import fleet_html
-from icalib.fleet.record import Record
-from icalib.fleet.result import Fleet, JobResult, by_robot
-from icalib.fleet.store import Store, to_do
-from icalib.fleet.table import write_table
-from icalib.own_files import refuse_foreign, sealed
-from icalib.result_files import refuse_foreign_set
-from icalib.text_files import printable
+from icalib.tools.batch import Crew, Lost, alone, run_all, write_whole
+from icalib.tools.fleet.drift import drift_of
+from icalib.tools.fleet.inputs import Inputs
+from icalib.tools.fleet.jobs import Job, load_jobs
+from icalib.tools.fleet.one_job import Task, run
+from icalib.tools.fleet.page import fleet_html
+from icalib.tools.fleet.record import Record
+from icalib.tools.fleet.result import Fleet, JobResult, by_robot
+from icalib.tools.fleet.store import Store, to_do
+from icalib.tools.fleet.table import write_table
 
 Progress = Callable[[str, float], None]
 TABLE, PAGE = "fleet.sqlite", "fleet.html"

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from icalib.batch import check_worker, program
-from icalib.calibration import Calibration, load_calibration
+from icalib.base.file_names import below
+from icalib.base.result_files import check_writable, finish_writing, read_file, write_files
 from icalib.errors import CalibrationError
-from icalib.file_names import below
-from icalib.fleet.inputs import Inputs
-from icalib.fleet.one_job import Outcome
-from icalib.fleet.record import Record, from_json, to_json
-from icalib.result_files import check_writable, finish_writing, read_file, write_files
+from icalib.result import Calibration, load_calibration
+from icalib.tools.batch import check_worker, program
+from icalib.tools.fleet.inputs import Inputs
+from icalib.tools.fleet.one_job import Outcome
+from icalib.tools.fleet.record import Record, from_json, to_json
 
 JOBS, RECORD = "jobs", "fleet-job.json"
 

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from icalib.batch import replacing
-from icalib.calibration.quantities import rpy_deg
+from icalib.base.own_files import DATABASE_ID
+from icalib.base.text_files import printable
 from icalib.errors import CalibrationError
-from icalib.fleet.record import Block
-from icalib.fleet.result import JobResult
-from icalib.own_files import DATABASE_ID
-from icalib.text_files import printable
+from icalib.result.quantities import rpy_deg
+from icalib.tools.batch import replacing
+from icalib.tools.fleet.record import Block
+from icalib.tools.fleet.result import JobResult
 
 _COLUMNS = (
     "robot TEXT", "time TEXT", "job TEXT", "status TEXT", "sentence TEXT", "sensor TEXT", "block TEXT", "entry TEXT",

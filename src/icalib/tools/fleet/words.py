@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from datetime import datetime
 
-from icalib.comparison.words import digits
-from icalib.fleet.drift import Change, Drift
-from icalib.fleet.result import Fleet, JobResult
+from icalib.tools.comparison.words import digits
+from icalib.tools.fleet.drift import Change, Drift
+from icalib.tools.fleet.result import Fleet, JobResult
 
 
 def answer(fleet: Fleet) -> str:

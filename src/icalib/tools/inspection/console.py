@@ -6,7 +6,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from icalib.inspection.facts import Inspection, StreamFacts, Vector
+from icalib.tools.inspection.facts import Inspection, StreamFacts, Vector
 
 STYLES = {"problem": "bold red", "warning": "yellow", "hint": "dim"}
 _ANSWERS = {

@@ -10,20 +10,20 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from icalib.base.staging import staged
+from icalib.base.text_files import write_text
+from icalib.data.recordings import TopicInfo
 from icalib.errors import CalibrationError, RecordingError
 from icalib.geometry.cameras import CAMERA_MODELS
 from icalib.geometry.targets import Scene
-from icalib.imu_classes import DEFAULT_CLASS, IMU_CLASSES
-from icalib.inspection.facts import CameraSource, Inspection
-from icalib.inspection.frames import frame_lines
-from icalib.inspection.inspect import resolution_of
-from icalib.inspection.kalibr import KalibrImu
-from icalib.inspection.lens import LensStart, lens_start
-from icalib.inspection.lidar import timing_lines
-from icalib.recordings import TopicInfo
 from icalib.rig import TwoSources
-from icalib.staging import staged
-from icalib.text_files import write_text
+from icalib.rig.imu_classes import DEFAULT_CLASS, IMU_CLASSES
+from icalib.tools.inspection.facts import CameraSource, Inspection
+from icalib.tools.inspection.frames import frame_lines
+from icalib.tools.inspection.inspect import resolution_of
+from icalib.tools.inspection.kalibr import KalibrImu
+from icalib.tools.inspection.lens import LensStart, lens_start
+from icalib.tools.inspection.lidar import timing_lines
 
 _PLAIN = re.compile(r"[A-Za-z0-9_./][A-Za-z0-9_./-]*")
 _TEMPLATE = """\

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
+from icalib.data.checks.imu_checks import Saturation
+from icalib.data.messages.streams import CameraInfo
+from icalib.data.recordings import TopicInfo
 from icalib.geometry.targets import Target
-from icalib.inspection.kalibr import KalibrFiles
-from icalib.recordings import TopicInfo
-from icalib.recordings.imu_checks import Saturation
-from icalib.recordings.streams import CameraInfo
 from icalib.rig import TimeUnit, TwoSources
+from icalib.tools.inspection.kalibr import KalibrFiles
 
 Severity = Literal["problem", "warning", "hint"]
 Vector = tuple[float, float, float]

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from icalib.base.text_files import json_text
 from icalib.geometry.targets import Scene
-from icalib.inspection.facts import CameraSource, Inspection, StreamFacts
-from icalib.inspection.timing import overlap_s
-from icalib.inspection.views import GRID
-from icalib.text_files import json_text
+from icalib.tools.inspection.facts import CameraSource, Inspection, StreamFacts
+from icalib.tools.inspection.timing import overlap_s
+from icalib.tools.inspection.views import GRID
 
 
 def figures(found: Inspection) -> dict[str, Any]:

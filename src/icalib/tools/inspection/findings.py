@@ -6,12 +6,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from icalib.inspection.facts import CameraSource, Finding, ImuFacts, Inspection, TargetView, Timing
-from icalib.inspection.lidar import untimed
-from icalib.inspection.sensors import missing_sensors
-from icalib.inspection.timing import overlap_s
-from icalib.inspection.unread import unread
-from icalib.recordings import TopicInfo
+from icalib.data.recordings import TopicInfo
+from icalib.tools.inspection.facts import CameraSource, Finding, ImuFacts, Inspection, TargetView, Timing
+from icalib.tools.inspection.lidar import untimed
+from icalib.tools.inspection.sensors import missing_sensors
+from icalib.tools.inspection.timing import overlap_s
+from icalib.tools.inspection.unread import unread
 
 STILL_RAD_S = 0.03  # RMS: below it, nothing moved
 WEAK_RAD_S = 0.1  # RMS about one axis: below it, this axis is hardly determined

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 
+from icalib.data.recordings import BagRecording, Recording
+from icalib.data.recordings.transforms import TRANSFORMS, read_edges, transform_topics
 from icalib.errors import RecordingError
-from icalib.inspection.facts import FramePair
-from icalib.recordings import BagRecording, Recording
-from icalib.recordings.transforms import TRANSFORMS, read_edges, transform_topics
+from icalib.tools.inspection.facts import FramePair
 
 
 def frame_pairs(recording: Recording) -> tuple[tuple[FramePair, ...], tuple[str, ...]]:

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
+from icalib.data.checks.gravity_turns import gravity_spread
+from icalib.data.checks.imu_checks import checked_imu, saturations
+from icalib.data.checks.imu_halves import one_stream
+from icalib.data.measurements import ImuStream
+from icalib.data.recordings import Recording
+from icalib.data.stamps.jumps import ClockJumps
 from icalib.errors import RecordingError
-from icalib.imu_classes import DEFAULT_CLASS, class_noise
-from icalib.inspection.facts import ImuFacts, Vector
-from icalib.measurements import ImuStream
-from icalib.recordings import Recording
-from icalib.recordings.gravity_turns import gravity_spread
-from icalib.recordings.imu_checks import checked_imu, saturations
-from icalib.recordings.imu_halves import one_stream
-from icalib.recordings.jumps import ClockJumps
 from icalib.rig import ImuSensor, TwoSources
+from icalib.rig.imu_classes import DEFAULT_CLASS, class_noise
+from icalib.tools.inspection.facts import ImuFacts, Vector
 
 _DEGREE = np.pi / 180.0
 

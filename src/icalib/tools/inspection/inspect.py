@@ -10,9 +10,22 @@ from pathlib import Path
 
 import numpy as np
 
-from icalib.detection.image_work import spread_images
+from icalib.data.checks.imu_halves import pair_of
+from icalib.data.messages.streams import CameraInfo, read_camera_info
+from icalib.data.recordings import (
+    BagRecording,
+    DamagedImageError,
+    Payload,
+    Recording,
+    TopicInfo,
+    decode,
+    open_recording,
+)
+from icalib.data.recordings.transforms import TRANSFORMS
+from icalib.detection.images.image_work import spread_images
 from icalib.errors import RecordingError
-from icalib.inspection.facts import (
+from icalib.rig import TwoSources
+from icalib.tools.inspection.facts import (
     CameraSource,
     GivenTarget,
     ImageFacts,
@@ -22,19 +35,14 @@ from icalib.inspection.facts import (
     StreamFacts,
     TargetView,
 )
-from icalib.inspection.findings import findings
-from icalib.inspection.frames import frame_pairs
-from icalib.inspection.imu import imu_facts, read_imu
-from icalib.inspection.kalibr import KalibrFiles, find_kalibr_files
-from icalib.inspection.lidar import lidar_facts
-from icalib.inspection.sources import find_sources
-from icalib.inspection.timing import timing_of
-from icalib.inspection.views import target_in, target_view
-from icalib.recordings import BagRecording, DamagedImageError, Payload, Recording, TopicInfo, decode, open_recording
-from icalib.recordings.imu_halves import pair_of
-from icalib.recordings.streams import CameraInfo, read_camera_info
-from icalib.recordings.transforms import TRANSFORMS
-from icalib.rig import TwoSources
+from icalib.tools.inspection.findings import findings
+from icalib.tools.inspection.frames import frame_pairs
+from icalib.tools.inspection.imu import imu_facts, read_imu
+from icalib.tools.inspection.kalibr import KalibrFiles, find_kalibr_files
+from icalib.tools.inspection.lidar import lidar_facts
+from icalib.tools.inspection.sources import find_sources
+from icalib.tools.inspection.timing import timing_of
+from icalib.tools.inspection.views import target_in, target_view
 
 SAMPLE = 16  # images that are decoded, spread over the recording
 READING_SHARE = 0.3  # of the time, where the target is looked for

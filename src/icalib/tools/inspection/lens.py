@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from icalib.data.messages.streams import CameraInfo
 from icalib.geometry.cameras import camera_model
-from icalib.inspection.facts import CameraSource, Inspection
-from icalib.inspection.kalibr import KalibrCamera
-from icalib.recordings.streams import CameraInfo
+from icalib.tools.inspection.facts import CameraSource, Inspection
+from icalib.tools.inspection.kalibr import KalibrCamera
 
 DEFAULT_MODEL = "pinhole-radtan"
 _BROWN = ("plumb_bob", "rational_polynomial")

@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 
+from icalib.data.messages.clouds import timing_fields
+from icalib.data.messages.streams import point_clouds
+from icalib.data.recordings import BagRecording, Recording, TopicInfo
 from icalib.errors import RecordingError
-from icalib.inspection.facts import Finding, Inspection, LidarFacts
-from icalib.recordings import BagRecording, Recording, TopicInfo
-from icalib.recordings.clouds import timing_fields
-from icalib.recordings.streams import point_clouds
 from icalib.rig import Lidar
+from icalib.tools.inspection.facts import Finding, Inspection, LidarFacts
 
 
 def lidar_facts(recording: Recording, lidars: Mapping[str, TopicInfo]) -> dict[str, LidarFacts]:

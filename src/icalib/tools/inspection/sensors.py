@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from icalib.inspection.facts import Finding, Inspection
-from icalib.recordings.topics import listing
+from icalib.data.images.topics import listing
+from icalib.tools.inspection.facts import Finding, Inspection
 
 
 def missing_sensors(found: Inspection) -> Iterator[Finding]:

@@ -6,9 +6,9 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import PurePosixPath
 
-from icalib.inspection.facts import CameraSource, Sources
-from icalib.recordings import TopicInfo
-from icalib.recordings.unreadable import VIDEO_FILE
+from icalib.data.images.unreadable import VIDEO_FILE
+from icalib.data.recordings import TopicInfo
+from icalib.tools.inspection.facts import CameraSource, Sources
 
 # Parts of a topic's name that say what it carries, not whose it is.
 _WHAT = re.compile(

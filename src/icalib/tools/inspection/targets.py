@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from icalib.base.yaml_nodes import read_yaml
 from icalib.errors import RigError
-from icalib.inspection.facts import GivenTarget
-from icalib.inspection.kalibr import kalibr_target, yaml_mapping
-from icalib.rig_file import load_rig, load_target
-from icalib.yaml_nodes import read_yaml
+from icalib.rig.file import load_rig, load_target
+from icalib.tools.inspection.facts import GivenTarget
+from icalib.tools.inspection.kalibr import kalibr_target, yaml_mapping
 
 
 def read_target(path: Path) -> GivenTarget:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.inspection.facts import Timing
-from icalib.recordings.jumps import longest_part
+from icalib.data.stamps.jumps import longest_part
+from icalib.tools.inspection.facts import Timing
 
 GAP = 1.5  # medians: halfway between an interval and the one that a lost message leaves
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from icalib.inspection.facts import Finding, Inspection
-from icalib.recordings.unreadable import type_not_read
+from icalib.data.images.unreadable import type_not_read
+from icalib.tools.inspection.facts import Finding, Inspection
 
 
 def unread(found: Inspection) -> Iterator[Finding]:

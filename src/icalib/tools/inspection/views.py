@@ -6,15 +6,15 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from icalib.detection.board_diagnosis import checkerboard_in
-from icalib.detection.diagnosis import tags_in
+from icalib.data.measurements import CornerStream
+from icalib.data.recordings import Recording
+from icalib.detection.boards.board_diagnosis import checkerboard_in
+from icalib.detection.boards.diagnosis import tags_in
 from icalib.detection.streams import find_corners
 from icalib.errors import RecordingError
 from icalib.geometry.targets import Target
-from icalib.inspection.facts import CameraSource, TargetView
-from icalib.measurements import CornerStream
-from icalib.recordings import Recording
 from icalib.rig import Camera
+from icalib.tools.inspection.facts import CameraSource, TargetView
 
 GRID = (8, 5)  # columns and rows of cells over the image
 _LEAST_CORNERS = 8  # for the pose of a board in one image; of a free tag, all four

@@ -10,9 +10,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from icalib.montecarlo.study import Study
-from icalib.montecarlo.summary import Consistency
-from icalib.montecarlo.words import (
+from icalib.tools.montecarlo.study import Study
+from icalib.tools.montecarlo.summary import Consistency
+from icalib.tools.montecarlo.words import (
     HEADERS,
     NUMBERS,
     answer,

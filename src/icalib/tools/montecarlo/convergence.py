@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.calibration.units import SHOWN_UNITS
-from icalib.extras import load_matplotlib
-from icalib.montecarlo.record import Block, Record
+from icalib.base.extras import load_matplotlib
 from icalib.report.plot import COLORS, Figure, axis, figure, line
+from icalib.result.units import SHOWN_UNITS
+from icalib.tools.montecarlo.record import Block, Record
 
 MOST_RUNS = 6
 SIGMAS = 3.0

@@ -8,13 +8,13 @@ from typing import Literal
 
 import numpy as np
 
-from icalib.batch import program, sentence_on
-from icalib.calibration import Calibration, Visited
-from icalib.montecarlo.record import Block, Record, Size, Waypoint
-from icalib.montecarlo.truth import error, true_value
-from icalib.montecarlo.whiteness import whiteness
 from icalib.pipeline import calibrate_measurements
-from icalib.simulation import Scenario, Truth, rig_for, simulate, with_drawn_guess
+from icalib.result import Calibration, Visited
+from icalib.tools.batch import program, sentence_on
+from icalib.tools.montecarlo.record import Block, Record, Size, Waypoint
+from icalib.tools.montecarlo.truth import error, true_value
+from icalib.tools.montecarlo.whiteness import whiteness
+from icalib.tools.simulation import Scenario, Truth, rig_for, simulate, with_drawn_guess
 
 GuessKind = Literal["none", "drawn"]
 PlanesKind = Literal["known", "found"]

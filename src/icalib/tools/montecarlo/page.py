@@ -7,11 +7,14 @@ from string import Template
 
 import numpy as np
 
-from icalib.montecarlo.record import Record
-from icalib.montecarlo.statistics import Nees
-from icalib.montecarlo.store import Identity
-from icalib.montecarlo.summary import Consistency
-from icalib.montecarlo.words import (
+from icalib.report.page import document, plot_place, resource
+from icalib.report.plot import COLORS, Figure, axis, figure, numbers
+from icalib.report.tables import Html, element, html, sentences, table
+from icalib.tools.montecarlo.record import Record
+from icalib.tools.montecarlo.statistics import Nees
+from icalib.tools.montecarlo.store import Identity
+from icalib.tools.montecarlo.summary import Consistency
+from icalib.tools.montecarlo.words import (
     HEADERS,
     NUMBERS,
     answer,
@@ -24,9 +27,6 @@ from icalib.montecarlo.words import (
     undetermined_words,
     verdict_words,
 )
-from icalib.report.page import document, plot_place, resource
-from icalib.report.plot import COLORS, Figure, axis, figure, numbers
-from icalib.report.tables import Html, element, html, sentences, table
 
 MEAN = ("sensor", "kind", "mean over runs")
 
@@ -50,7 +50,7 @@ def study_html(found: Consistency, identity: Identity, records: Sequence[Record]
 
 def page(title: str, summary: str, sections: Sequence[Html], figures: dict[str, Figure]) -> str:
     """A document in the style of the reports."""
-    body = Template(resource("icalib.montecarlo", "page.html")).substitute(
+    body = Template(resource("icalib.tools.montecarlo", "page.html")).substitute(
         title=html(title), answer=html(summary), sections="".join(sections)
     )
     return document(title, body, figures)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from icalib.batch import plain_record, record_json
+from icalib.tools.batch import plain_record, record_json
 
 FORMAT = 1
 LEAST_SIGMA = 1e-100  # a number, however little

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from icalib.batch import write_whole
-from icalib.montecarlo.convergence import plotly_figure, png, rows
-from icalib.montecarlo.page import blocks_table, failures, page
-from icalib.montecarlo.study import Plan, Study, run_study, scenario_digest
-from icalib.montecarlo.words import answer, failures_words, largest_words
-from icalib.own_files import refuse_foreign, sealed
+from icalib.base.own_files import refuse_foreign, sealed
 from icalib.report.page import plot_place
 from icalib.report.plot import Figure
 from icalib.report.tables import Html, element
-from icalib.simulation import load_scenario
+from icalib.tools.batch import write_whole
+from icalib.tools.montecarlo.convergence import plotly_figure, png, rows
+from icalib.tools.montecarlo.page import blocks_table, failures, page
+from icalib.tools.montecarlo.study import Plan, Study, run_study, scenario_digest
+from icalib.tools.montecarlo.words import answer, failures_words, largest_words
+from icalib.tools.simulation import load_scenario
 
 MOTIONS = {"3d": "Motion in three dimensions", "planar": "Planar motion"}
 PAGE = "reproduce.html"

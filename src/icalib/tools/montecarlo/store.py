@@ -6,11 +6,11 @@ import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from icalib.batch import check_worker, program, write_whole
 from icalib.errors import CalibrationError
-from icalib.montecarlo.one_run import GuessKind, PlanesKind
-from icalib.montecarlo.record import Record, from_json, to_json
-from icalib.provenance import versions
+from icalib.result.provenance import versions
+from icalib.tools.batch import check_worker, program, write_whole
+from icalib.tools.montecarlo.one_run import GuessKind, PlanesKind
+from icalib.tools.montecarlo.record import Record, from_json, to_json
 
 STUDY, RUNS = "study.json", "runs"
 

@@ -8,17 +8,17 @@ from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from icalib.batch import Crew, alone, write_whole
+from icalib.base.own_files import refuse_foreign, sealed
+from icalib.base.text_files import printable
 from icalib.errors import CalibrationError
-from icalib.montecarlo.one_run import GuessKind, PlanesKind, Task
-from icalib.montecarlo.page import study_html
-from icalib.montecarlo.record import Record
-from icalib.montecarlo.store import Identity, Store
-from icalib.montecarlo.summary import Consistency, consistency_json, summarise
-from icalib.montecarlo.workers import run_all
-from icalib.own_files import refuse_foreign, sealed
-from icalib.simulation import Drive, Scenario, load_scenario
-from icalib.text_files import printable
+from icalib.tools.batch import Crew, alone, write_whole
+from icalib.tools.montecarlo.one_run import GuessKind, PlanesKind, Task
+from icalib.tools.montecarlo.page import study_html
+from icalib.tools.montecarlo.record import Record
+from icalib.tools.montecarlo.store import Identity, Store
+from icalib.tools.montecarlo.summary import Consistency, consistency_json, summarise
+from icalib.tools.montecarlo.workers import run_all
+from icalib.tools.simulation import Drive, Scenario, load_scenario
 
 Progress = Callable[[str, float], None]
 FILES = ("consistency.json", "consistency.html")

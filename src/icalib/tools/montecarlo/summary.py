@@ -9,8 +9,8 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from icalib.montecarlo.record import Block, Record
-from icalib.montecarlo.statistics import Largest, Nees, Sample, Spread, largest, nees, spread
+from icalib.tools.montecarlo.record import Block, Record
+from icalib.tools.montecarlo.statistics import Largest, Nees, Sample, Spread, largest, nees, spread
 
 EVERYTHING = "calibration"  # all blocks together
 

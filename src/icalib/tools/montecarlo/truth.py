@@ -6,7 +6,7 @@ import numpy as np
 
 from icalib.geometry import so3
 from icalib.geometry.targets.base import BOARD
-from icalib.simulation import Truth
+from icalib.tools.simulation import Truth
 
 
 def true_value(truth: Truth, sensor: str, name: str) -> np.ndarray | None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.calibration import Calibration, ImageResiduals, LidarResiduals, WheelResiduals, image_of
-from icalib.montecarlo.record import Whiteness
+from icalib.result import Calibration, ImageResiduals, LidarResiduals, WheelResiduals, image_of
+from icalib.tools.montecarlo.record import Whiteness
 
 SAME_WALL_S = 0.3  # between two points of a plane that are neighbours in time
 IMU_ROWS = ("rotation", "velocity", "position", "gyroscope walk", "accelerometer walk")  # three columns each

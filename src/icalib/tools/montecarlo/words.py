@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from icalib.calibration.quantities import shown
-from icalib.calibration.units import SHOWN_UNITS
-from icalib.montecarlo.statistics import PROBABILITY, Nees, Spread
-from icalib.montecarlo.summary import BlockSummary, Consistency, Mean
+from icalib.result.quantities import shown
+from icalib.result.units import SHOWN_UNITS
+from icalib.tools.montecarlo.statistics import PROBABILITY, Nees, Spread
+from icalib.tools.montecarlo.summary import BlockSummary, Consistency, Mean
 
 HEADERS = ("block", "dim", "runs", "NEES", "95 %", "RMSE", "mean sigma", "unit", "sampled / predicted")
 NUMBERS = HEADERS[1:7] + HEADERS[8:]

@@ -1,24 +1,24 @@
 """Simulated recordings with their truth, made with formulas of their own so that no sign can cancel."""
 
-from icalib.simulation.corners import CornerTruth
-from icalib.simulation.filming import Film, Shot, film, sheets_of
-from icalib.simulation.image_faults import ImageFaults
-from icalib.simulation.motion import Trajectory
-from icalib.simulation.poses import PoseTruth
-from icalib.simulation.rendering import Imaging, Picture, Renderer, Sheet, SheetTruth, exposure_poses
-from icalib.simulation.rigs import GuessError, rig_for, settings_for, with_drawn_guess
-from icalib.simulation.robot import Drive, Features, SimLidar, SimPoses, SimWheels
-from icalib.simulation.room import Block, Hills, Room, hills_of_slope
-from icalib.simulation.scenario import ADIS16448, Motion, Scenario, SimCamera, handheld
-from icalib.simulation.scenario_file import load_scenario
-from icalib.simulation.sensor_bag import write_sensors
-from icalib.simulation.simulate import Simulation, Truth, simulate
-from icalib.simulation.tables import write_tables
-from icalib.simulation.tag_map import tag_map
-from icalib.simulation.texture import Texture
-from icalib.simulation.tracks import TrackTruth
-from icalib.simulation.wheels import WheelTruth
-from icalib.simulation.writing import write_film
+from icalib.tools.simulation.images.filming import Film, Shot, film, sheets_of
+from icalib.tools.simulation.images.rendering import Imaging, Picture, Renderer, Sheet, SheetTruth, exposure_poses
+from icalib.tools.simulation.rigs import GuessError, rig_for, settings_for, with_drawn_guess
+from icalib.tools.simulation.scenario.image_faults import ImageFaults
+from icalib.tools.simulation.scenario.robot import Drive, Features, SimLidar, SimPoses, SimWheels
+from icalib.tools.simulation.scenario.room import Block, Hills, Room, hills_of_slope
+from icalib.tools.simulation.scenario.scenario import ADIS16448, Motion, Scenario, SimCamera, handheld
+from icalib.tools.simulation.scenario.scenario_file import load_scenario
+from icalib.tools.simulation.scenario.tag_map import tag_map
+from icalib.tools.simulation.scenario.texture import Texture
+from icalib.tools.simulation.sensor_bag import write_sensors
+from icalib.tools.simulation.sensors.corners import CornerTruth
+from icalib.tools.simulation.sensors.motion import Trajectory
+from icalib.tools.simulation.sensors.poses import PoseTruth
+from icalib.tools.simulation.sensors.simulate import Simulation, Truth, simulate
+from icalib.tools.simulation.sensors.tracks import TrackTruth
+from icalib.tools.simulation.sensors.wheels import WheelTruth
+from icalib.tools.simulation.tables import write_tables
+from icalib.tools.simulation.writing import write_film
 
 __all__ = [
     "ADIS16448",

@@ -9,8 +9,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from icalib.base.extras import install
 from icalib.errors import CalibrationError
-from icalib.extras import install
 
 BagForm = Literal["ros1", "mcap", "sqlite3"]
 IMU_TOPIC = "/imu0"

@@ -9,10 +9,10 @@ import numpy as np
 
 from icalib.geometry.targets import NoTarget
 from icalib.rig import TRACK_IMAGES, Camera, ImuSensor, Lidar, Parameter, PoseSensor, Rig, Settings, Wheels
-from icalib.simulation.imu import rotation_from_vector
-from icalib.simulation.robot import SimLidar, SimPoses, SimWheels
-from icalib.simulation.scenario import GRAVITY_WORLD, Scenario, SimCamera
-from icalib.simulation.simulate import raw_time_offset
+from icalib.tools.simulation.scenario.robot import SimLidar, SimPoses, SimWheels
+from icalib.tools.simulation.scenario.scenario import GRAVITY_WORLD, Scenario, SimCamera
+from icalib.tools.simulation.sensors.imu import rotation_from_vector
+from icalib.tools.simulation.sensors.simulate import raw_time_offset
 
 Sensor = TypeVar("Sensor", Camera, Lidar, Wheels, PoseSensor)
 Robotic = TypeVar("Robotic", Lidar, Wheels, PoseSensor)

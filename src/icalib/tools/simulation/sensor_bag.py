@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from icalib.data.measurements import ImuStream, LidarStream, PoseStream, WheelPoses, WheelStream
 from icalib.errors import RigError
-from icalib.measurements import ImuStream, LidarStream, PoseStream, WheelPoses, WheelStream
-from icalib.simulation.bag_writer import IMAGE, IMU, IMU_TOPIC, JOINTS, POINTS, POSE, TWIST, BagWriter
-from icalib.simulation.filming import Film
-from icalib.simulation.poses import quaternion
-from icalib.simulation.rendering import Imaging
-from icalib.simulation.simulate import Simulation
-from icalib.simulation.tables import whole, write_truth
+from icalib.tools.simulation.bag_writer import IMAGE, IMU, IMU_TOPIC, JOINTS, POINTS, POSE, TWIST, BagWriter
+from icalib.tools.simulation.images.filming import Film
+from icalib.tools.simulation.images.rendering import Imaging
+from icalib.tools.simulation.sensors.poses import quaternion
+from icalib.tools.simulation.sensors.simulate import Simulation
+from icalib.tools.simulation.tables import whole, write_truth
 
 Event = tuple[int, str, Callable[[BagWriter], Any]]  # when on the IMU's clock [ns], topic, what makes the message
 _EXPOSURE_S = 0.004

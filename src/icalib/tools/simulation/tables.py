@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from icalib.errors import RecordingError
-from icalib.file_names import below
-from icalib.measurements import (
+from icalib.base.file_names import below
+from icalib.base.staging import staged
+from icalib.data.measurements import (
     CornerStream,
     ImuStream,
     LidarStream,
@@ -22,10 +22,10 @@ from icalib.measurements import (
     WheelPoses,
     WheelStream,
 )
-from icalib.simulation.poses import quaternion
-from icalib.simulation.scenario import Scenario
-from icalib.simulation.simulate import Simulation, Truth
-from icalib.staging import staged
+from icalib.errors import RecordingError
+from icalib.tools.simulation.scenario.scenario import Scenario
+from icalib.tools.simulation.sensors.poses import quaternion
+from icalib.tools.simulation.sensors.simulate import Simulation, Truth
 
 _TRUTH_HEADER = """\
 # Truth of a simulated recording, in SI units: p_imu = T_imu_sensor p_sensor, t_imu = t_sensor + time_offset.

@@ -1,5 +1,5 @@
 """A 3D view of a result, and of the recording that it is of, in Rerun."""
 
-from icalib.view.show import view
+from icalib.tools.view.show import view
 
 __all__ = ["view"]

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from icalib.calibration import Calibration
-from icalib.view.scene import place
-from icalib.view.stream import TIMELINE
+from icalib.result import Calibration
+from icalib.tools.view.scene import place
+from icalib.tools.view.stream import TIMELINE
 
 
 def blueprint(rr: Any, c: Calibration, readings: bool) -> Any:

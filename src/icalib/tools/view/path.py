@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.calibration import Calibration
 from icalib.geometry import so3
 from icalib.geometry.cubic import hermite
+from icalib.result import Calibration
 
 LONGEST_STEP_S = 0.5  # between nodes; what lies between two that are further apart is not known
 _AT_NODE_S = 1e-6

@@ -9,18 +9,18 @@ from pathlib import Path as FilePath
 
 import numpy as np
 
-from icalib.calibration import Calibration, RecordingSpan
+from icalib.data.checks.imu_checks import read_imu
+from icalib.data.measurements import LidarStream
+from icalib.data.recordings import DamagedImageError, Recording, decode, image_topics
+from icalib.data.stamps.jumps import ClockJumps
 from icalib.errors import CalibrationError, RecordingError
-from icalib.measurements import LidarStream
-from icalib.recordings import DamagedImageError, Recording, decode, image_topics
-from icalib.recordings.imu_checks import read_imu
-from icalib.recordings.jumps import ClockJumps
+from icalib.result import Calibration, RecordingSpan
 from icalib.rig import Camera, ImuSensor, Lidar, Rig
-from icalib.view.colors import by_value
-from icalib.view.path import Path
-from icalib.view.scene import POINT, place
-from icalib.view.series import log_lines
-from icalib.view.stream import Stream
+from icalib.tools.view.colors import by_value
+from icalib.tools.view.path import Path
+from icalib.tools.view.scene import POINT, place
+from icalib.tools.view.series import log_lines
+from icalib.tools.view.stream import Stream
 
 MOST_READINGS = 100_000
 MOST_IMAGES = 600  # of a camera

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from icalib.calibration import Calibration, RecordingSpan
 from icalib.geometry.targets import target_from_plain
 from icalib.report import rig_shapes
 from icalib.report.ellipsoids import SIGMAS, VERDICT_COLORS, ellipsoids, magnification
 from icalib.report.plot import COLORS
-from icalib.view.colors import by_value, rgb
-from icalib.view.stream import Stream
+from icalib.result import Calibration, RecordingSpan
+from icalib.tools.view.colors import by_value, rgb
+from icalib.tools.view.stream import Stream
 
 POINT = 1.5  # radius of a point of a LiDAR, in points of the screen
 _TARGET, _WAY = "#be185d", "#64748b"

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from icalib.calibration import Calibration, ImageResiduals, LidarResiduals, rms_of_images
 from icalib.report.motion_figures import BLOCKS
 from icalib.report.plot import AXIS_COLORS, COLORS, REJECTED
-from icalib.view.colors import rgb
-from icalib.view.scene import place
-from icalib.view.stream import Stream
+from icalib.result import Calibration, ImageResiduals, LidarResiduals, rms_of_images
+from icalib.tools.view.colors import rgb
+from icalib.tools.view.scene import place
+from icalib.tools.view.stream import Stream
 
 BIN_S = 0.1  # over which points of a LiDAR are taken together
 _DOT = 3.0  # radius, in points of the screen

@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from icalib.calibration import Calibration, load_calibration
-from icalib.calibration.quantities import rows
-from icalib.extras import load_rerun
-from icalib.recordings import open_recording
+from icalib.base.extras import load_rerun
+from icalib.data.recordings import open_recording
 from icalib.report.ellipsoids import SIGMAS, magnification
-from icalib.rig_file import rig_from_dict
-from icalib.view.layout import blueprint
-from icalib.view.recorded import Recorded, span_of
-from icalib.view.scene import log_motion, log_planes, log_rig, log_target, log_uncertainty
-from icalib.view.series import log_residuals, log_states
-from icalib.view.stream import Stream, opened
+from icalib.result import Calibration, load_calibration
+from icalib.result.quantities import rows
+from icalib.rig.file import rig_from_dict
+from icalib.tools.view.layout import blueprint
+from icalib.tools.view.recorded import Recorded, span_of
+from icalib.tools.view.scene import log_motion, log_planes, log_rig, log_target, log_uncertainty
+from icalib.tools.view.series import log_residuals, log_states
+from icalib.tools.view.stream import Stream, opened
 
 
 def view(

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from icalib.base.staging import staged
 from icalib.errors import CalibrationError
-from icalib.staging import staged
 
 TIMELINE = "imu clock"
 _PATIENCE_S = 30.0  # until the viewer has taken what it was sent

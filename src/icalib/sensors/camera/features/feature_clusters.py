@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.compiled import njit
-from icalib.estimation.corner_chain import add_clusters, pose_chain
-from icalib.estimation.feature_kernels import weighted_rows
+from icalib.base.compiled import njit
+from icalib.motion.pose_chain import add_clusters, pose_chain
+from icalib.sensors.camera.features.feature_kernels import weighted_rows
 
 
 @njit(cache=True, nogil=True)

@@ -14,13 +14,18 @@ from functools import cached_property
 
 import numpy as np
 
-from icalib.estimation.arrowhead import Piece, in_parallel, make_pieces
-from icalib.estimation.clocks import clock_of, mounted_columns
-from icalib.estimation.corner_factor import LOSSES, CornerFactor
-from icalib.estimation.corner_kernels import Motion
-from icalib.estimation.corner_weights import Loss
-from icalib.estimation.feature_clusters import accumulate_clusters
-from icalib.estimation.feature_kernels import (
+from icalib.data.measurements import TrackStream
+from icalib.motion.clocks import clock_of, mounted_columns
+from icalib.optim.arrowhead import Piece, in_parallel, make_pieces
+from icalib.optim.front import Features
+from icalib.optim.front_plan import FeatureSums, plan
+from icalib.optim.medians import median_variance
+from icalib.optim.robust_weights import Loss
+from icalib.optim.state import Layout, State
+from icalib.sensors.camera.corner_factor import LOSSES, CornerFactor
+from icalib.sensors.camera.corner_kernels import Motion
+from icalib.sensors.camera.features.feature_clusters import accumulate_clusters
+from icalib.sensors.camera.features.feature_kernels import (
     Points,
     Range,
     Seen,
@@ -30,13 +35,8 @@ from icalib.estimation.feature_kernels import (
     held_back,
     take_trials,
 )
-from icalib.estimation.feature_views import View
-from icalib.estimation.front import Features
-from icalib.estimation.front_plan import FeatureSums, plan
-from icalib.estimation.lidar_kernels import Planes
-from icalib.estimation.medians import median_variance
-from icalib.estimation.state import Layout, State
-from icalib.estimation.surfaces import (
+from icalib.sensors.camera.features.feature_views import View
+from icalib.sensors.camera.features.surfaces import (
     NOWHERE,
     Distances,
     OnPlanes,
@@ -44,8 +44,8 @@ from icalib.estimation.surfaces import (
     add_planes_to_points,
     add_points_on_planes,
 )
-from icalib.estimation.tracks import NO_TRACKS, Sightings, TrackNoise, Tracks
-from icalib.measurements import TrackStream
+from icalib.sensors.camera.features.tracks import NO_TRACKS, Sightings, TrackNoise, Tracks
+from icalib.sensors.lidar.lidar_kernels import Planes
 
 MOST_STEPS = 20  # of a point; most settle in three
 WEAK = 1e-6  # information [1/m^2]: keeps a point defined that no image shows any more; steers nothing else

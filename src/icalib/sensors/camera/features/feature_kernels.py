@@ -10,12 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icalib.compiled import njit
-from icalib.estimation.corner_chain import add_image, pose_chain
-from icalib.estimation.corner_weights import bend, weight
+from icalib.base.compiled import njit
 from icalib.geometry.blas import subtract_gram
 from icalib.geometry.planes import tangents
 from icalib.geometry.small import eigen3, solve_definite
+from icalib.motion.pose_chain import add_image, pose_chain
+from icalib.optim.robust_weights import bend, weight
 
 # Of half the chi^2: a point's step that takes off less is its last. What that leaves is the square of it, but where a
 # robust loss bends a part of it; from 1e-8 on gradients show that.

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from icalib.estimation.corner_factor import CornerFactor
-from icalib.estimation.corner_kernels import Motion
-from icalib.estimation.feature_kernels import (
+from icalib.sensors.camera.corner_factor import CornerFactor
+from icalib.sensors.camera.corner_kernels import Motion
+from icalib.sensors.camera.features.feature_kernels import (
     Points,
     Seeing,
     Seen,

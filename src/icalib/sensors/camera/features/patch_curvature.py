@@ -17,8 +17,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from icalib.data.measurements import TrackStream
 from icalib.geometry.cameras.base import CameraModel
-from icalib.measurements import TrackStream
 
 _AROUND = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 

@@ -15,18 +15,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icalib.compiled import njit
-from icalib.estimation.arrowhead import Piece
-from icalib.estimation.corner_weights import Loss, weight
-from icalib.estimation.feature_kernels import Points
-from icalib.estimation.front_plan import FeatureSums
-from icalib.estimation.lidar_binning import in_world
-from icalib.estimation.lidar_kernels import Planes
-from icalib.estimation.lidar_sweep import Motion
-from icalib.estimation.state import Key
+from icalib.base.compiled import njit
+from icalib.data.measurements import LidarStream
 from icalib.geometry.planes import tangents
 from icalib.geometry.small import solve_definite
-from icalib.measurements import LidarStream
+from icalib.motion.sweep import Motion
+from icalib.optim.arrowhead import Piece
+from icalib.optim.front_plan import FeatureSums
+from icalib.optim.robust_weights import Loss, weight
+from icalib.optim.state import Key
+from icalib.sensors.camera.features.feature_kernels import Points
+from icalib.sensors.lidar.lidar_binning import in_world
+from icalib.sensors.lidar.lidar_kernels import Planes
 
 ON_PLANES = "points on planes"  # the kind of these rows
 CELL_M = 0.25  # a plane ends where no LiDAR saw it, to a cell

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.measurements import TrackStream
+from icalib.data.measurements import TrackStream
 
 FEWEST = 3  # observations of a track; two images of one point are met by almost any pose
 

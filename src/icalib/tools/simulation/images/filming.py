@@ -14,17 +14,17 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from icalib.data.measurements import ImuStream
 from icalib.errors import RigError
 from icalib.geometry.targets import Markers, Scene, Tag, Target
-from icalib.measurements import ImuStream
-from icalib.simulation.corners import image_stamps
-from icalib.simulation.image_faults import faults_of
-from icalib.simulation.imu import inside
-from icalib.simulation.interior import INSTANTS, Interior, RoomRenderer
-from icalib.simulation.people import standing, walking
-from icalib.simulation.rendering import Imaging, Picture, Renderer, Sheet, SheetTruth, exposure_poses
-from icalib.simulation.scenario import Scenario
-from icalib.simulation.simulate import Truth, simulate
+from icalib.tools.simulation.images.interior import INSTANTS, Interior, RoomRenderer
+from icalib.tools.simulation.images.people import standing, walking
+from icalib.tools.simulation.images.rendering import Imaging, Picture, Renderer, Sheet, SheetTruth, exposure_poses
+from icalib.tools.simulation.scenario.image_faults import faults_of
+from icalib.tools.simulation.scenario.scenario import Scenario
+from icalib.tools.simulation.sensors.corners import image_stamps
+from icalib.tools.simulation.sensors.imu import inside
+from icalib.tools.simulation.sensors.simulate import Truth, simulate
 
 _AHEAD = 2  # images being rendered or waiting, for each thread
 

@@ -11,13 +11,13 @@ from functools import cached_property
 
 import numpy as np
 
-from icalib.simulation.image_faults import CameraFaults
-from icalib.simulation.lenses import unproject
-from icalib.simulation.rendering import Imaging, Optics
-from icalib.simulation.room import Block, Room
-from icalib.simulation.roomlight import CELLS, TILE, Lens, Tone, View, light
-from icalib.simulation.scenario import SimCamera
-from icalib.simulation.texture import Atlas, Texture, atlas_of, leaves, texel_size
+from icalib.tools.simulation.images.lenses import unproject
+from icalib.tools.simulation.images.rendering import Imaging, Optics
+from icalib.tools.simulation.images.roomlight import CELLS, TILE, Lens, Tone, View, light
+from icalib.tools.simulation.scenario.image_faults import CameraFaults
+from icalib.tools.simulation.scenario.room import Block, Room
+from icalib.tools.simulation.scenario.scenario import SimCamera
+from icalib.tools.simulation.scenario.texture import Atlas, Texture, atlas_of, leaves, texel_size
 
 INSTANTS = CELLS * CELLS  # of an exposure, as many poses are wanted
 _PERSON_SURFACES = 10_000  # numbers of their textures, so that people leave those of the room as they are

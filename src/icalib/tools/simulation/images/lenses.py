@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from icalib.simulation.projection import in_range
-from icalib.simulation.scenario import MODELS, SimCamera
+from icalib.tools.simulation.scenario.projection import in_range
+from icalib.tools.simulation.scenario.scenario import MODELS, SimCamera
 
 RADTAN, EQUIDISTANT, EUCM, DOUBLE_SPHERE, OMNI, RATIONAL = range(6)
 _CODES: dict[str, int] = dict(zip(MODELS, range(6), strict=True))

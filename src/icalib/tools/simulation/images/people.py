@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.simulation.motion import Trajectory
-from icalib.simulation.room import Block
-from icalib.simulation.scenario import SimCamera
+from icalib.tools.simulation.scenario.room import Block
+from icalib.tools.simulation.scenario.scenario import SimCamera
+from icalib.tools.simulation.sensors.motion import Trajectory
 
 _SIZE_M = (0.5, 0.3, 1.75)
 _AWAY_M, _NEARER_M = 1.8, 0.4  # from the camera, and by how much this changes

@@ -15,11 +15,11 @@ import numpy as np
 from icalib.errors import RigError
 from icalib.geometry.targets import Target
 from icalib.geometry.targets.pattern import Pattern, pattern_of
-from icalib.simulation.lenses import unproject
-from icalib.simulation.motion import Trajectory
-from icalib.simulation.projection import project, visible
-from icalib.simulation.raster import paint, paint_discs, pixel_kernel, shrink
-from icalib.simulation.scenario import SimCamera
+from icalib.tools.simulation.images.lenses import unproject
+from icalib.tools.simulation.images.raster import paint, paint_discs, pixel_kernel, shrink
+from icalib.tools.simulation.scenario.projection import project, visible
+from icalib.tools.simulation.scenario.scenario import SimCamera
+from icalib.tools.simulation.sensors.motion import Trajectory
 
 _CELLS = 4  # a pixel, along each axis
 _REACH = 4.0  # of the blur, in standard deviations

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from icalib.simulation.room import Surfaces, ground
-from icalib.simulation.texture import Atlas
+from icalib.tools.simulation.scenario.room import Surfaces, ground
+from icalib.tools.simulation.scenario.texture import Atlas
 
 CELLS = 2  # a pixel, along each axis
 TILE = 16  # pixels

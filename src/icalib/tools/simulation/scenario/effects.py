@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from icalib.simulation.robot import SimPoses
-from icalib.yaml_nodes import YamlValue
+from icalib.base.yaml_nodes import YamlValue
+from icalib.tools.simulation.scenario.robot import SimPoses
 
 # Field of the IMU -> where its numbers stand in `Scenario.imu_intrinsics`.
 _IMU = {

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.simulation.texture import Texture, leaves
+from icalib.tools.simulation.scenario.texture import Texture, leaves
 
 _PART_TEXEL_M = 0.002  # a pixel of the robot's own part, as if seen from 0.9 m at a focal length of 460 px
 _DIRT_SIZE = (0.02, 0.06)  # standard deviation of a spot, share of the image's width

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.simulation.scenario import SimCamera
+from icalib.tools.simulation.scenario.scenario import SimCamera
 
 PARAMETER_COUNTS = {
     "pinhole-radtan": 4,

@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from icalib.errors import RigError
-from icalib.simulation.texture import Texture
+from icalib.tools.simulation.scenario.texture import Texture
 
 _STEPS = 1000  # of a ray's march over hills; one that grazes them for longer meets nothing
 _CLOSE_M = 1e-9  # to the ground, where the march ends

@@ -10,9 +10,9 @@ import numpy as np
 from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Target
 from icalib.rig import ImuNoise
-from icalib.simulation.image_faults import ImageFaults
-from icalib.simulation.robot import Drive, Features, SimLidar, SimPoses, SimWheels
-from icalib.simulation.room import Room
+from icalib.tools.simulation.scenario.image_faults import ImageFaults
+from icalib.tools.simulation.scenario.robot import Drive, Features, SimLidar, SimPoses, SimWheels
+from icalib.tools.simulation.scenario.room import Room
 
 MotionKind = Literal["handheld", "planar", "single_axis", "motionless"]
 Interval = tuple[float, float]  # (start, end) in seconds on the IMU's clock, since its origin

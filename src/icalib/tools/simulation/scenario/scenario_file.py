@@ -9,19 +9,19 @@ from typing import Any, TypeVar, get_args, get_type_hints
 
 import numpy as np
 
+from icalib.base.file_names import NAME, NAME_WORDS
+from icalib.base.yaml_nodes import MOST_WHOLE, YamlValue, read_yaml
 from icalib.errors import RigError
-from icalib.file_names import NAME, NAME_WORDS
 from icalib.geometry.targets import TARGETS
 from icalib.rig import ImuNoise
-from icalib.simulation.effects import read_effects
-from icalib.simulation.image_faults import ImageFaults
-from icalib.simulation.projection import PARAMETER_COUNTS
-from icalib.simulation.robot import Drive, DriveKind, Features, SimLidar, SimPoses, SimWheels
-from icalib.simulation.room import Block, Room, hills_of_slope
-from icalib.simulation.scenario import MODELS, Scenario, SimCamera, pose_from_rows
-from icalib.simulation.size import refuse_large
-from icalib.simulation.texture import Texture
-from icalib.yaml_nodes import MOST_WHOLE, YamlValue, read_yaml
+from icalib.tools.simulation.scenario.effects import read_effects
+from icalib.tools.simulation.scenario.image_faults import ImageFaults
+from icalib.tools.simulation.scenario.projection import PARAMETER_COUNTS
+from icalib.tools.simulation.scenario.robot import Drive, DriveKind, Features, SimLidar, SimPoses, SimWheels
+from icalib.tools.simulation.scenario.room import Block, Room, hills_of_slope
+from icalib.tools.simulation.scenario.scenario import MODELS, Scenario, SimCamera, pose_from_rows
+from icalib.tools.simulation.scenario.size import refuse_large
+from icalib.tools.simulation.scenario.texture import Texture
 
 _SENSOR_TYPES = ("imu", "camera", "lidar", "wheels", "pose")
 _DENSITIES = ("gyro", "gyro_walk", "accel", "accel_walk")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from math import ceil
 
 from icalib.errors import RigError
-from icalib.simulation.scenario import Scenario
+from icalib.tools.simulation.scenario.scenario import Scenario
 
 # Of all sensors together. Either takes about 1 GB with intermediate arrays; twice the number takes twice the memory.
 MOST_INSTANTS = 5_000_000  # readings, images and scans: an IMU at 200 Hz for 7 h

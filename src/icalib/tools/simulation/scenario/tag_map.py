@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from icalib.geometry.targets import AprilGrid, Markers, Scene, Target
-from icalib.simulation.scenario import Scenario, handheld
+from icalib.tools.simulation.scenario.scenario import Scenario, handheld
 
 _TAGS = Markers("tag36h11", 0.16, tuple(range(40, 76, 3)))
 _GRID = AprilGrid(3, 3, 0.1, 0.3)  # ids 0 to 8

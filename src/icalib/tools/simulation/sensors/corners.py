@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from icalib.data.measurements import CornerStream
 from icalib.geometry.targets import Target
-from icalib.measurements import CornerStream
-from icalib.simulation.imu import inside
-from icalib.simulation.motion import Trajectory
-from icalib.simulation.projection import image_velocity, project, visible
-from icalib.simulation.scenario import Scenario, SimCamera
+from icalib.tools.simulation.scenario.projection import image_velocity, project, visible
+from icalib.tools.simulation.scenario.scenario import Scenario, SimCamera
+from icalib.tools.simulation.sensors.imu import inside
+from icalib.tools.simulation.sensors.motion import Trajectory
 
 _MIN_CORNERS = 6
 _LEAD_S = 0.05  # images start and end this far inside the IMU's readings

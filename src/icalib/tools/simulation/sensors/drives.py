@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from icalib.errors import RecordingError
-from icalib.simulation.ground import ground_motion
-from icalib.simulation.motion import ClosedForm, Reference, Waves, basis_with_z
-from icalib.simulation.recorded import recorded_motion
-from icalib.simulation.robot import Drive
-from icalib.simulation.room import Room
+from icalib.tools.simulation.scenario.robot import Drive
+from icalib.tools.simulation.scenario.room import Room
+from icalib.tools.simulation.sensors.ground import ground_motion
+from icalib.tools.simulation.sensors.motion import ClosedForm, Reference, Waves, basis_with_z
+from icalib.tools.simulation.sensors.recorded import recorded_motion
 
 _HEIGHT = 0.45  # of the room's, where a free motion has its middle
 _SHIFT = np.array([[0.20, 0.20, 0.12], [0.02, 0.02, 0.035]])  # slow, fast; shares of the room's sides

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.simulation.jets import Jet, Rows, cross, matrices, unit, values
-from icalib.simulation.motion import readings_of
-from icalib.simulation.robot import Drive
-from icalib.simulation.room import Hills, Room
+from icalib.tools.simulation.scenario.jets import Jet, Rows, cross, matrices, unit, values
+from icalib.tools.simulation.scenario.robot import Drive
+from icalib.tools.simulation.scenario.room import Hills, Room
+from icalib.tools.simulation.sensors.motion import readings_of
 
 # x, y of the wheel frame's origin, and a horizontal vector of any length along its x axis
 Path = Callable[[Jet], tuple[Jet, Jet, Jet, Jet]]

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.simulation.motion import skew
-from icalib.simulation.scenario import Interval, Scenario
+from icalib.tools.simulation.scenario.scenario import Interval, Scenario
+from icalib.tools.simulation.sensors.motion import skew
 
 _LOWER = ((0, 1, 1, 2, 2, 2), (0, 0, 1, 0, 1, 2))  # rows, columns of xx, yx, yy, zx, zy, zz
 

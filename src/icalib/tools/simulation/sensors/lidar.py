@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from icalib.measurements import LidarStream
-from icalib.simulation.instants import LEAD_S, stamped
-from icalib.simulation.motion import Trajectory
-from icalib.simulation.robot import SimLidar
-from icalib.simulation.room import Room, Surfaces, nearest
-from icalib.simulation.scenario import Scenario
+from icalib.data.measurements import LidarStream
+from icalib.tools.simulation.scenario.instants import LEAD_S, stamped
+from icalib.tools.simulation.scenario.robot import SimLidar
+from icalib.tools.simulation.scenario.room import Room, Surfaces, nearest
+from icalib.tools.simulation.scenario.scenario import Scenario
+from icalib.tools.simulation.sensors.motion import Trajectory
 
 _FIRING_S = 2.304e-6
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.measurements import PoseStream
-from icalib.simulation.imu import rotation_from_vector
-from icalib.simulation.instants import LEAD_S, stamped
-from icalib.simulation.motion import Trajectory
-from icalib.simulation.robot import SimPoses
+from icalib.data.measurements import PoseStream
+from icalib.tools.simulation.scenario.instants import LEAD_S, stamped
+from icalib.tools.simulation.scenario.robot import SimPoses
+from icalib.tools.simulation.sensors.imu import rotation_from_vector
+from icalib.tools.simulation.sensors.motion import Trajectory
 
 
 @dataclass(frozen=True, eq=False)

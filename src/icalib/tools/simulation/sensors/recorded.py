@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from icalib.errors import RecordingError
-from icalib.simulation.jets import Jet, Rows, Vector, matrices, values
-from icalib.simulation.motion import readings_of
+from icalib.tools.simulation.scenario.jets import Jet, Rows, Vector, matrices, values
+from icalib.tools.simulation.sensors.motion import readings_of
 
 _KNOT_S = 0.1  # what is faster than a few Hz is taken for noise, and smoothed away
 _ORDER = 6  # quintic: the fourth derivative of position is continuous

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from icalib.measurements import (
+from icalib.data.measurements import (
     CornerStream,
     ImuStream,
     LidarStream,
@@ -17,16 +17,16 @@ from icalib.measurements import (
     WheelPoses,
     WheelStream,
 )
-from icalib.simulation.corners import CornerTruth, see_corners
-from icalib.simulation.drives import drive_motion
-from icalib.simulation.imu import imu_stamps, inside, read_imu
-from icalib.simulation.lidar import scan_room
-from icalib.simulation.motion import ClosedForm, Trajectory, exact_motion, reference_motion
-from icalib.simulation.poses import PoseTruth, report_poses
-from icalib.simulation.robot import SimLidar, SimPoses, SimWheels
-from icalib.simulation.scenario import GRAVITY_WORLD, Motion, Scenario, SimCamera
-from icalib.simulation.tracks import Followed, TrackTruth, follow
-from icalib.simulation.wheels import WheelTruth, read_wheels
+from icalib.tools.simulation.scenario.robot import SimLidar, SimPoses, SimWheels
+from icalib.tools.simulation.scenario.scenario import GRAVITY_WORLD, Motion, Scenario, SimCamera
+from icalib.tools.simulation.sensors.corners import CornerTruth, see_corners
+from icalib.tools.simulation.sensors.drives import drive_motion
+from icalib.tools.simulation.sensors.imu import imu_stamps, inside, read_imu
+from icalib.tools.simulation.sensors.lidar import scan_room
+from icalib.tools.simulation.sensors.motion import ClosedForm, Trajectory, exact_motion, reference_motion
+from icalib.tools.simulation.sensors.poses import PoseTruth, report_poses
+from icalib.tools.simulation.sensors.tracks import Followed, TrackTruth, follow
+from icalib.tools.simulation.sensors.wheels import WheelTruth, read_wheels
 
 Progress = Callable[[str, float], None]  # what is being done, and the share of all that is done
 _LIDAR_STREAM, _WHEEL_STREAM, _POSE_STREAM = 1000, 2000, 4000  # of random numbers; those of cameras count from 2

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.measurements import TrackStream
-from icalib.simulation.corners import image_stamps
-from icalib.simulation.instants import check_enough
-from icalib.simulation.motion import Trajectory
-from icalib.simulation.projection import project, visible
-from icalib.simulation.robot import Features
-from icalib.simulation.room import Room, distances
-from icalib.simulation.scenario import Scenario, SimCamera
+from icalib.data.measurements import TrackStream
+from icalib.tools.simulation.scenario.instants import check_enough
+from icalib.tools.simulation.scenario.projection import project, visible
+from icalib.tools.simulation.scenario.robot import Features
+from icalib.tools.simulation.scenario.room import Room, distances
+from icalib.tools.simulation.scenario.scenario import Scenario, SimCamera
+from icalib.tools.simulation.sensors.corners import image_stamps
+from icalib.tools.simulation.sensors.motion import Trajectory
 
 _NEAREST_M = 0.3
 _LOST_PERIODS = 1.5

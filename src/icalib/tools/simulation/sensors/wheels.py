@@ -8,11 +8,11 @@ from typing import Literal
 
 import numpy as np
 
+from icalib.data.measurements import WheelPoses, WheelStream
 from icalib.errors import RigError
-from icalib.measurements import WheelPoses, WheelStream
-from icalib.simulation.instants import LEAD_S, check_enough, stamped
-from icalib.simulation.motion import Trajectory
-from icalib.simulation.robot import SimWheels
+from icalib.tools.simulation.scenario.instants import LEAD_S, check_enough, stamped
+from icalib.tools.simulation.scenario.robot import SimWheels
+from icalib.tools.simulation.sensors.motion import Trajectory
 
 _GAUSS = np.polynomial.legendre.leggauss(3)
 _STEEPEST_RAD = 1.3

@@ -1,0 +1,1 @@
+"""What every package may use: files, YAML with line numbers, optional packages, the compiler of kernels."""

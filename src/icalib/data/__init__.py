@@ -1,0 +1,1 @@
+"""What was measured: streams of all sensors, and the recordings that they are read from."""

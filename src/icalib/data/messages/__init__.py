@@ -1,0 +1,1 @@
+"""Messages of bags: point clouds, poses, wheels."""

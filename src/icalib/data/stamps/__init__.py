@@ -1,0 +1,1 @@
+"""Time stamps: clocks, jumps, gaps, copies."""

@@ -1,0 +1,1 @@
+"""Tables of text: columns, and what each sensor has in them."""

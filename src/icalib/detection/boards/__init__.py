@@ -1,0 +1,1 @@
+"""One file for each kind of target: from a grey image to its corners."""

@@ -1,0 +1,1 @@
+"""What targets consist of: edges, saddles, quads, tags, ellipses."""

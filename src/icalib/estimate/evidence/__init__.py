@@ -1,0 +1,1 @@
+"""How well the solution fits: noise, outliers, covariance from residuals."""

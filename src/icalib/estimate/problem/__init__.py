@@ -1,0 +1,1 @@
+"""From rig and data to the problem, and from there to its solution."""

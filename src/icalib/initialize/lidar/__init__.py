@@ -1,0 +1,1 @@
+"""Initial guess from point clouds."""

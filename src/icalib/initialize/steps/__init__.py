@@ -1,0 +1,1 @@
+"""Steps that initial guesses of several kinds of sensors share."""

@@ -1,0 +1,1 @@
+"""Least squares on manifolds: layout and state, normal equations, elimination, acceleration."""

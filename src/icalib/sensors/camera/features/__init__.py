@@ -1,0 +1,1 @@
+"""Factors of cameras: feature tracks, and planes that their points lie on."""

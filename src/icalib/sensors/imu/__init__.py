@@ -1,0 +1,1 @@
+"""The factor of an IMU between two keyframes."""

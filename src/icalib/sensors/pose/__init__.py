@@ -1,0 +1,1 @@
+"""The factor of a sensor that gives its own pose."""

@@ -1,0 +1,1 @@
+"""The factors of wheel odometry, and of the ground that wheels stand on."""

@@ -1,0 +1,1 @@
+"""What works with calibrations: the library never imports it."""

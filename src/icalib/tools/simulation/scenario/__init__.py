@@ -1,0 +1,1 @@
+"""What is simulated: the rig, its motion, room and noise."""

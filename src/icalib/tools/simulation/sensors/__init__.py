@@ -1,0 +1,1 @@
+"""What each sensor measures, by the obvious formula."""
