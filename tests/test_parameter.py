@@ -96,7 +96,7 @@ def test_with_changes_one_thing_and_names_what_there_is():
     )
     with pytest.raises(RigError, match=r"no sensor cam2; the rig has settings, imu0, cam0, cam1, lidar0\."):
         rig.with_("cam2", intrinsics=kept)
-    with pytest.raises(RigError, match=r"cam1 has no field intrinsic; did you mean intrinsics\?"):
+    with pytest.raises(RigError, match=r"cam1 has no field intrinsic, did you mean 'intrinsics'; available are "):
         rig.with_("cam1", intrinsic=kept)
     with pytest.raises(RigError, match=r"cam1: intrinsics must be a parameter; write icalib.guess"):
         rig.with_("cam1", intrinsics=[1.0, 2.0, 3.0, 4.0])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import NoReturn
 import numpy as np
 import yaml
 
+from icalib.base.suggestion import suggestion
 from icalib.errors import RigError
 
 MOST_WHOLE = 2**63 - 1  # what int64, the type of stamps, holds
@@ -198,10 +198,3 @@ def _reason(error: Exception) -> str:
 def _new_values(former: str) -> str:
     """What else changed with the name of a field."""
     return ", and write interval-mean for mean, instantaneous for instant" if former == "meaning" else ""
-
-
-def suggestion(name: str, valid: tuple[str, ...]) -> str:
-    """The words that point to the nearest valid name, if there is one."""
-    near = difflib.get_close_matches(name.lower(), [v.lower() for v in valid], n=1, cutoff=0.6)
-    match = next((v for v in valid if near and v.lower() == near[0]), None)
-    return f", did you mean {match!r}" if match else ""

@@ -7,7 +7,7 @@ import re
 from math import inf
 from typing import Any, NoReturn
 
-from icalib.base.yaml_nodes import suggestion
+from icalib.base.suggestion import suggestion
 
 _CHOICES = re.compile(r"invalid choice: (?P<given>'[^']*'|\S+) \(choose from (?P<choices>.*)\)", re.DOTALL)
 

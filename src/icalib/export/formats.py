@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from icalib.base.yaml_nodes import suggestion
+from icalib.base.suggestion import suggestion
 from icalib.errors import CalibrationError
 from icalib.export.autoware import autoware
 from icalib.export.colmap import colmap
@@ -73,7 +73,7 @@ def _check(
     known = list(dict.fromkeys([c.body, *c.mounted]))
     for sensor in (*frames, *joints):
         if sensor not in known:
-            near = suggestion(sensor, tuple(known))
+            near = suggestion(sensor, known)
             raise CalibrationError(f"there is no sensor {sensor}{near}; this calibration has {', '.join(known)}.")
 
 

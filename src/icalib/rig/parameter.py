@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 
+from icalib.base.suggestion import suggestion
 from icalib.errors import RigError
 
 Mode = Literal["free", "fixed", "prior"]
@@ -92,9 +92,7 @@ def check_fields(where: str, old: Any, fields: dict[str, Any]) -> None:
     kinds = get_type_hints(type(old))
     for name, value in fields.items():
         if name not in kinds:
-            near = difflib.get_close_matches(name, kinds, 1)
-            hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(kinds)}."
-            raise RigError(f"{where} has no field {name}; {hint}")
+            raise RigError(f"{where} has no field {name}{suggestion(name, kinds)}; available are {', '.join(kinds)}.")
         choices = get_args(kinds[name])
         if get_origin(kinds[name]) is Literal and value not in choices:
             raise RigError(f"{where}: {name} is {', '.join(map(str, choices))}, not {value!r}; use one of these.")

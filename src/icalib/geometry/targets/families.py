@@ -5,7 +5,6 @@ AprilTags are called as their authors do (tag36h11), others as OpenCV does, with
 
 from __future__ import annotations
 
-import difflib
 import re
 from dataclasses import dataclass
 from functools import lru_cache
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from icalib.base.extras import load_cv2
+from icalib.base.suggestion import suggestion
 from icalib.errors import RecordingError, RigError
 
 # name -> (bits along a side without the border, number of ids); `original` is that of the ArUco library.
@@ -56,9 +56,8 @@ def family_name(text: str) -> str:
     if april := _APRILTAG.fullmatch(name):
         name = f"tag{april[1]}"
     if name not in FAMILIES:
-        near = difflib.get_close_matches(name, FAMILIES, n=1)
-        hint = f", did you mean {near[0]!r}" if near else ""
-        raise RigError(f"there is no tag family {text!r}{hint}; available are {', '.join(FAMILIES)}.")
+        near = suggestion(name, FAMILIES)
+        raise RigError(f"there is no tag family {text!r}{near}; available are {', '.join(FAMILIES)}.")
     return name
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from icalib.base.yaml_nodes import read_yaml, suggestion
+from icalib.base.suggestion import suggestion
+from icalib.base.yaml_nodes import read_yaml
 from icalib.errors import CalibrationError, RigError
 from icalib.result import load_calibration
 from icalib.tools.comparison.compare import Comparison, Tolerances, compare_sides
@@ -60,7 +61,7 @@ def _renamed(a: Side, b: Side, frames: Mapping[str, str]) -> tuple[Side, Side]:
 
 def _check_known(name: str, side: Side) -> None:
     if name not in side.sensors:
-        near = suggestion(name, tuple(side.sensors))
+        near = suggestion(name, side.sensors)
         raise CalibrationError(f"there is no sensor {name} in {side.path}{near}; it has {', '.join(side.sensors)}.")
 
 
