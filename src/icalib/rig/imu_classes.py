@@ -66,17 +66,19 @@ _FIGURES = {
 }
 IMU_CLASSES = tuple(_FIGURES)
 
-# Tolerances of data sheets are taken for two standard deviations, typical values for one.
-# consumer: InvenSense MPU-6050 (PS-MPU-6000A): scales +-3 %, cross-axis sensitivity +-2 %, 0.1 deg/s/g; gyroscope and
-# accelerometer are turned against each other by what the axes of both are off.
+# Tolerances of data sheets are taken for two standard deviations, typical values for one. Gyroscope and accelerometer
+# are turned against each other by what both are off the case: no sheet says that they are off together.
+# consumer: InvenSense MPU-6050 (PS-MPU-6000A, tables 6.1 and 6.2): scales +-3 %, cross-axis sensitivity +-2 %, 0.1
+# deg/s/g typical. MPU-9250 (PS-MPU-9250A, tables 1 and 2): the same scales and cross-axis sensitivity.
 # industrial: Analog Devices ADIS16448: scales +-1 %, axes 0.2 deg (accelerometer) and 0.05 deg (gyroscope) from
-# perpendicular, 0.015 deg/s/g. Its 0.5 deg to the case is common to both sensors, which the factory aligns together.
-# tactical: Honeywell HG1700: scales 300 ppm and 150 ppm, axes 0.5 mrad, all one sigma. Its ring laser gyroscopes do not
-# feel acceleration; 1 deg/h/g is what MEMS of this class leave over (Safran STIM300, compensated).
+# perpendicular, 0.5 deg to the case, 0.015 deg/s/g. ADIS16460, table 1: 1 %, 0.05 deg, 1 deg to the
+# case, 0.01 deg/s/g.
+# tactical: Safran STIM300 (TS1524): scales 300 ppm (accelerometer) and 500 ppm (gyroscope), axes 1 mrad, 1 deg/h/g
+# after its compensation, all typical.
 _IMPERFECTIONS = {
     "consumer": Imperfections(0.015, 0.01, 0.015, 0.01, 0.014, 1.8e-4),
-    "industrial": Imperfections(0.005, 1.7e-3, 0.005, 4.4e-4, 1.8e-3, 2.7e-5),
-    "tactical": Imperfections(3e-4, 5e-4, 1.5e-4, 5e-4, 5e-4, 4.9e-7),
+    "industrial": Imperfections(0.005, 1.7e-3, 0.005, 4.4e-4, 6.2e-3, 2.7e-5),
+    "tactical": Imperfections(3e-4, 1e-3, 5e-4, 1e-3, 1.4e-3, 4.9e-7),
 }
 # Of IMU intrinsics that are `free`: wider than any class, so that a first calibration is not led by its prior.
 FREE = Imperfections(0.05, 0.05, 0.05, 0.05, 0.05, 0.01)
