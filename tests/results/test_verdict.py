@@ -56,6 +56,19 @@ def console_of(c: Calibration) -> str:
     return " ".join(out.getvalue().split())
 
 
+def test_a_long_output_begins_with_verdict_and_first_reason(cases: dict[str, Calibration], monkeypatch):
+    """And its legend says what the words of the table mean."""
+    c = cases["not usable: wrong and open"]
+    monkeypatch.setenv("LINES", "5")
+    shown = console_of(c)
+    assert shown.startswith(
+        f"Verdict: {c.verdict}. {NEXT[c.verdict]} First of {len(c.reasons)} reasons: {c.reasons[0]}"
+    )
+    assert shown.endswith(f"Verdict: {c.verdict}. {NEXT[c.verdict]}") and "bloom: dark edges" in shown
+    monkeypatch.setenv("LINES", "500")
+    assert console_of(c).startswith("Calibration")
+
+
 def test_the_worst_that_applies_is_the_verdict(cases: dict[str, Calibration]):
     assert {name: c.verdict for name, c in cases.items()} == {name: name.split(":")[0] for name in cases}
     assert {c.verdict for c in cases.values()} == set(EXIT_CODES) == set(NEXT)

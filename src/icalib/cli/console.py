@@ -19,6 +19,7 @@ from icalib.result.quantities import chi2_words, dof_words, rms_words
 from icalib.result.verdict import NEXT, Usability
 
 LINE_EVERY_S = 30.0  # between lines of progress in logs
+NO_REDUNDANCY = "n/a: the recording cannot test this noise, so the value stated in the rig file is used as it is."
 VERDICT_STYLES: dict[Usability, str] = {
     "usable": "bold green",
     "usable with care": "bold yellow",
@@ -65,8 +66,10 @@ def progress_lines(clock: Callable[[], float]) -> Callable[[str, float], None]:
 
 def print_result(calibration: Calibration, folder: Path) -> None:
     """The table of parameters, what they rest on, and where the files are, on standard output."""
-    console = Console()
-    console.print(table(calibration))
+    console, parameters = Console(), table(calibration)
+    if parameters.row_count > console.height:
+        _print_summary(calibration, console)
+    console.print(parameters)
     if placed := bodies_words(calibration):
         console.print(f"  target: {placed}", markup=False)
     for sentence in relative_words(calibration):
@@ -77,6 +80,8 @@ def print_result(calibration: Calibration, folder: Path) -> None:
         console.print(
             f"  {f.sensor} {f.kind}: chi^2 per degree of freedom {chi2_words(f)} ({dof_words(f)}){rms}", markup=False
         )
+    if any(f.chi2_per_dof is None for f in calibration.fits):
+        console.print(f"  {NO_REDUNDANCY}", markup=False)
     for sentence in calibration.notes:
         console.print(f"Note: {sentence}", markup=False)
     console.print(f"Solver: {calibration.status}", markup=False)
@@ -87,13 +92,23 @@ def print_result(calibration: Calibration, folder: Path) -> None:
     print_verdict(calibration, console)
 
 
+def _print_summary(calibration: Calibration, console: Console) -> None:
+    """Verdict and first reason, for a reader who does not see the end of a long output."""
+    console.print(_verdict_line(calibration))
+    for sentence in calibration.reasons[:1]:
+        console.print(f"First of {len(calibration.reasons)} reasons: {sentence}", markup=False, highlight=False)
+
+
 def print_verdict(calibration: Calibration, console: Console) -> None:
     """The reasons, numbered, and as the last line the verdict with what to do next."""
     for k, sentence in enumerate(calibration.reasons, 1):
         console.print(f"Reason {k}: {sentence}", markup=False, highlight=False)
+    console.print(_verdict_line(calibration))
+
+
+def _verdict_line(calibration: Calibration) -> Text:
     verdict = calibration.verdict
-    line = Text.assemble("Verdict: ", (verdict, VERDICT_STYLES[verdict]), f". {NEXT[verdict]}")
-    console.print(line)
+    return Text.assemble("Verdict: ", (verdict, VERDICT_STYLES[verdict]), f". {NEXT[verdict]}")
 
 
 def print_warnings(calibration: Calibration) -> None:

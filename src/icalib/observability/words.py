@@ -15,10 +15,11 @@ SHARE = 0.25  # a parameter that makes up this much of an undetermined direction
 NAMED = 0.2  # parts of a direction smaller than this are not named
 MOST_NAMED = 4  # of the largest
 
-# The motion that would determine a parameter which the data leave open.
+EVERY_AXIS = "every axis"
+# The motion that would determine a parameter which is unobservable. {axes}: those about which the rig hardly turned.
 MISSING_MOTION = {
-    "translation": "turn the rig about two more axes, briskly: a lever arm shows only in rotation",
-    "rotation": "turn the rig about at least two axes",
+    "translation": "turn the rig briskly about {axes}: a lever arm shows only in rotation",
+    "rotation": "turn the rig about {axes}",
     "time_offset": "turn or shake the rig faster, so that a time shift shows",
     "intrinsics": "show the target at different distances, tilted, and in every part of the image",
     "distortion": "show the target in the corners of the image",
@@ -60,12 +61,16 @@ class Observability:
 
 
 def observe(
-    found: Determined, names: tuple[str, ...], wheels: Collection[str] = (), tracking: Collection[str] = ()
+    found: Determined,
+    names: tuple[str, ...],
+    wheels: Collection[str] = (),
+    tracking: Collection[str] = (),
+    axes: str = "",
 ) -> Observability:
     """Verdicts by what the data alone say; undetermined throughout where the solver did not converge.
 
     `names` (B,) as in "cam0.translation.x"; `wheels`: which sensors are wheels, on which the whole rig drives;
-    `tracking`: which are cameras without a target.
+    `tracking`: which are cameras without a target; `axes`: about which the rig hardly turned, in words, or empty.
     """
     directions = sparse_basis(found.held)
     share = (directions**2).sum(axis=1)
@@ -74,6 +79,7 @@ def observe(
         is_open = part > SHARE or not found.estimate.outcome.converged
         verdicts.append("undetermined" if is_open else by_size(spread))
     rig = MISSING_MOTION | (ON_THE_GROUND if wheels else {})
+    rig = {kind: motion.format(axes=axes or EVERY_AXIS) for kind, motion in rig.items()}
     advice = {sensor: rig | WITHOUT_TARGET for sensor in tracking}
     sentences = tuple(_sentence(u, names, rig, advice) for u in directions.T)
     return Observability(found.covariance, tuple(verdicts), sentences, found.spread)

@@ -11,6 +11,13 @@ from icalib.result.quantities import rows, rpy_deg, shown
 from icalib.result.verdict import UNDETERMINED, tolerance
 
 TOLERANCES = ("rotation_tolerance_deg", "translation_tolerance_m", "time_tolerance_s", "pixel_tolerance")
+SCALED = "includes the empirical factor: how much more segments of the recording scatter than the noise predicts"
+FORMAL = "is formal: the recording was not split"
+NUISANCE_WORDS = {
+    "bloom": "dark edges of the target shifted outwards by blur and the camera's response",
+    "tilt": "of the target against the vertical",
+    "shape": "how far the target deviates from its design",
+}
 STYLES = {"determined": "green", "weak": "yellow", "undetermined": "bold red", "fixed": "dim"}
 
 
@@ -63,11 +70,12 @@ def _caption(calibration: Calibration) -> str:
     body = "imu" if calibration.imu else calibration.body
     text = f"T_{body}_sensor; rotation: std about the sensor's axes; t_{body} = t_sensor + time offset."
     scaled = any(g.columns is not None and g.factor is not None for g in calibration.groups)
-    text += " std includes the empirical factor." if scaled else " std is formal: the recording was not split."
+    text += f" std {SCALED if scaled else FORMAL}."
     if {"weak", "undetermined"} & {v for g in calibration.groups for v in g.verdict}:
         turn, move, time, pixels = (tolerance(calibration, name) for name in TOLERANCES)
         text += (
             f" Tolerances: {turn:g} deg, {1e3 * move:g} mm, {1e3 * time:g} ms, {pixels:g} px; std above it is weak, "
             f"above {UNDETERMINED:g} of it undetermined."
         )
-    return text
+    names = {g.name for g in calibration.groups}
+    return " ".join([text, *(f"{name}: {meaning}." for name, meaning in NUISANCE_WORDS.items() if name in names)])

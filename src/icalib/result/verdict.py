@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Literal
 
+from icalib.motion.axes import hardly_turned
 from icalib.result.projection import projection_uncertainty
 from icalib.result.units import SHOWN_UNITS
 from icalib.rig import LENS, Settings
@@ -140,9 +141,10 @@ def _more(c: Calibration) -> str:
     if c.imu is None and c.cameras:
         images = sum(len(r.seconds) for r in c.image_residuals)
         return f"the result rests on {images} images: take more, near and far, tilted, and in every part of the image"
+    axes = hardly_turned(c.trajectory.seconds, c.trajectory.rotation, c.body)
     if c.imu is None:
-        return "record more poses, turned about more axes"
-    return "record longer, and turn and move about every axis"
+        return f"record more poses, turned about {axes or 'every axis'}"
+    return f"record longer, and {f'turn the rig about {axes}' if axes else 'turn about and move along every axis'}"
 
 
 def _components(c: Calibration) -> Iterator[tuple[str, Verdict]]:

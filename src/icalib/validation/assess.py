@@ -19,6 +19,7 @@ from icalib.estimate.problem.gauge import IN_THE_WORLD
 from icalib.estimate.problem.inputs import Inputs, origin_difference
 from icalib.estimate.problem.outcome import Visit
 from icalib.estimate.problem.problem import Problem
+from icalib.motion.axes import hardly_turned
 from icalib.motion.imu_model import LABELS as IMU_LABELS
 from icalib.observability.contradictions import Contradiction
 from icalib.observability.determination import Determined
@@ -71,16 +72,18 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
     problem, outcome = found.problem, found.outcome
     names = _column_names(inputs)
     tracking = [] if inputs.rig.has_target else [c.name for c in inputs.rig.cameras]
-    seen = observe(determined, names, [w.name for w in inputs.rig.wheels], tracking)
+    state = outcome.state
+    axes = hardly_turned(state.seconds, state.rotation, inputs.rig.body)
+    seen = observe(determined, names, [w.name for w in inputs.rig.wheels], tracking, axes)
     parts = Parts.of(problem, outcome, inputs.rig.settings.segments)
     noise = _Noise.of(determined, seen.covariance, parts)
     groups = _groups(inputs, determined, seen, noise)
     judged = [_sensor_fit(f, found) for f in fits(problem, outcome) if not _is_assumed(inputs, f.sensor)]
     held = held_out(parts, [s for s in (inputs.rig.body,) if _is_assumed(inputs, s)])
-    timeline = Timeline.of(inputs.parts, image_times(inputs, outcome.state.values))
+    timeline = Timeline.of(inputs.parts, image_times(inputs, state.values))
     factors = _factors(inputs, groups)
     factor = factors.max(initial=1.0)
-    trajectory, poses = _trajectory(inputs, outcome.state, timeline), pose_residuals(inputs, found, timeline)
+    trajectory, poses = _trajectory(inputs, state, timeline), pose_residuals(inputs, found, timeline)
     causes, size_notes = all_causes(Judged(inputs, found, groups, judged, factor, parts, timeline), against)
     wrong = tuple(c.sentence for c in causes if c.grave)
     warnings = (
@@ -116,7 +119,7 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
         recordings=timeline.spans,
         lidar_residuals=lidar_residuals(inputs, found, timeline),
         wheel_residuals=wheel_residuals(inputs, found, timeline),
-        planes=planes(inputs, outcome.state),
+        planes=planes(inputs, state),
         pose_residuals=poses,
         track_residuals=track_residuals(found, timeline),
         cross_validation=held,

@@ -24,6 +24,7 @@ from icalib.initialize.steps.mean_rates import MeanRates
 from icalib.initialize.steps.rate_shifts import NORM_MEDIAN, noise_beside, unlike
 from icalib.initialize.steps.slow_rates import ChainedRates
 from icalib.initialize.steps.target_poses import TargetPoses
+from icalib.motion.axes import other_axes
 from icalib.motion.imu_data import ImuData
 
 FEWEST_PAIRS = 20  # of neighbouring images
@@ -304,7 +305,7 @@ def check_axes(imu: ImuData, rates: CameraRates, found: Alignment, name: str) ->
     if not turns_about_two_axes(imu, rates, found):
         raise OneAxisError(
             f"{name} turned about one axis only, so its rotation about that axis is unobservable; turn the rig "
-            "about two more axes, or give rotation in the rig file."
+            f"about {other_axes(imu.name, main_axis(imu.gyro))} as well, or give `rotation` in the rig file."
         )
 
 

@@ -290,6 +290,6 @@ def _check(seen: _Seen, result: OptimizeResult, held: np.ndarray) -> None:
     sigma = UNITS[:3] * np.sqrt(np.diag(np.linalg.pinv(result.jac.T @ result.jac)))[:3]
     if np.linalg.norm(sigma) > LARGEST_SIGMA:
         raise EstimationError(
-            f"{name}: the motion does not determine its rotation; move the robot about and along more axes, or "
-            "give rotation in the rig file."
+            f"{name}: the motion does not determine its rotation; turn the robot about two axes or more and move "
+            "along each, or give rotation in the rig file."
         )

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from icalib.data.recordings import TopicInfo
+from icalib.motion.axes import axis_words, other_axes
 from icalib.tools.inspection.facts import CameraSource, Finding, ImuFacts, Inspection, TargetView, Timing
 from icalib.tools.inspection.lidar import untimed
 from icalib.tools.inspection.sensors import missing_sensors
@@ -144,19 +145,20 @@ def _motion(found: Inspection, name: str, facts: ImuFacts) -> Iterator[Finding]:
     elif second < SECOND_AXIS * strongest or second < STILL_RAD_S:
         # Without a guess `calibrate` finds the rotation of cameras from turns alone, that of others from the path, too.
         alone = not (found.sources.lidars or found.sources.poses)
+        rest = other_axes(name, facts.principal[0])
         yield Finding(
             "problem" if alone else "warning",
-            f"{name} turns about {_axis(name, facts.principal[0])} only ({strongest:.2f} rad/s RMS; "
+            f"{name} turns about {axis_words(name, facts.principal[0])} only ({strongest:.2f} rad/s RMS; "
             f"{second:.2f} and {weakest:.2f} about the perpendicular axes), so some parameters are "
             "unobservable; "
-            f"{'drive over ramps' if found.sources.wheels else 'turn the rig about two more axes'}.",
+            f"{'drive over ramps' if found.sources.wheels else f'turn the rig about {rest} as well'}.",
         )
     else:
         for rms, direction in zip(facts.principal_rms, facts.principal, strict=True):
             if rms < WEAK_RAD_S:
                 yield Finding(
                     "warning",
-                    f"Hardly any rotation about {_axis(name, direction)} ({rms:.2f} rad/s RMS); turn the rig "
+                    f"Hardly any rotation about {axis_words(name, direction)} ({rms:.2f} rad/s RMS); turn the rig "
                     "about it as well.",
                 )
     if strongest >= STILL_RAD_S and max(facts.accel_std) < WEAK_M_S2:
@@ -165,13 +167,6 @@ def _motion(found: Inspection, name: str, facts: ImuFacts) -> Iterator[Finding]:
             f"Hardly any acceleration of {name} ({max(facts.accel_std):.2f} m/s^2 RMS about the mean); shake "
             "the rig briskly back and forth, along all three axes.",
         )
-
-
-def _axis(name: str, direction: tuple[float, float, float]) -> str:
-    k = int(np.argmax(np.abs(direction)))
-    if abs(direction[k]) > 0.9:
-        return f"the {'xyz'[k]} axis of {name}"
-    return f"the direction ({', '.join(f'{x:.2f}' for x in direction)}) in the axes of {name}"
 
 
 def _clocks(found: Inspection) -> Iterator[Finding]:
