@@ -9,7 +9,7 @@ import pytest
 from tests.consistency.test_robot import steady
 
 from icalib.pipeline import calibrate_measurements
-from icalib.rig import DRIVE_SIZES
+from icalib.rig import drive_names
 from icalib.tools.montecarlo.truth import error, true_value
 from icalib.tools.simulation import Scenario, rig_for, simulate
 
@@ -28,7 +28,7 @@ def reporting(scenario: Scenario, reports: str) -> Scenario:
 
 def check(consistency, robot, reports: str, seeds: range, probability: float) -> None:
     scenario = reporting(robot("ramp", 30.0, "cw"), reports)
-    blocks = (*MOUNTS, *DRIVE_SIZES[KINDS[reports]])
+    blocks = (*MOUNTS, *drive_names(KINDS[reports]))
     found = consistency(scenario, steady(rig_for(scenario)), seeds, probability, blocks)
     print({block: (round(c.mean, 3), round(c.low, 3), round(c.high, 3)) for block, c in found.items()})
     assert {block: c for block, c in found.items() if not c.consistent} == {}

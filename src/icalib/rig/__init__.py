@@ -1,38 +1,61 @@
 """What is calibrated: sensors and their parameters, target, settings."""
 
-from icalib.rig.imu_classes import ImuNoise
-from icalib.rig.parameter import Parameter
-from icalib.rig.rig import (
-    BY_CLASS,
-    DRIVE_SIZES,
+from icalib.rig.camera import (
     LENS,
-    PLAIN_TABLE,
-    RATE_UNITS,
     TRACK_IMAGES,
-    AccelUnit,
-    Axes,
     Camera,
-    Ground,
-    GroundPlane,
+)
+from icalib.rig.imu import (
+    BY_CLASS,
+    AccelUnit,
     GyroUnit,
     ImuSensor,
+    TwoSources,
+)
+from icalib.rig.imu_classes import (
+    ImuNoise,
+)
+from icalib.rig.lidar import (
     Lidar,
-    Loss,
     PointTime,
+)
+from icalib.rig.parameter import (
+    Parameter,
+)
+from icalib.rig.parameter_spec import (
+    ParameterSpec,
+)
+from icalib.rig.pose import (
     PoseKind,
     PoseSensor,
-    RateUnit,
+)
+from icalib.rig.rig import (
     Rig,
-    Scheme,
-    Settings,
+)
+from icalib.rig.sensor import (
+    PLAIN_TABLE,
+    Axes,
+    Sensor,
     TableLayout,
     TimeUnit,
-    TwoSources,
+)
+from icalib.rig.settings import (
+    Loss,
+    Scheme,
+    Settings,
+)
+from icalib.rig.wheels import (
+    DRIVES,
+    RATE_UNITS,
+    Ground,
+    GroundPlane,
+    RateUnit,
     WheelDrive,
     WheelFactor,
     WheelKind,
     WheelMeasure,
     Wheels,
+    drive_names,
 )
 
 __all__ = [
@@ -40,7 +63,7 @@ __all__ = [
     "Axes",
     "BY_CLASS",
     "Camera",
-    "DRIVE_SIZES",
+    "DRIVES",
     "Ground",
     "GroundPlane",
     "GyroUnit",
@@ -51,6 +74,7 @@ __all__ = [
     "Loss",
     "PLAIN_TABLE",
     "Parameter",
+    "ParameterSpec",
     "PointTime",
     "PoseKind",
     "PoseSensor",
@@ -58,6 +82,7 @@ __all__ = [
     "RateUnit",
     "Rig",
     "Scheme",
+    "Sensor",
     "Settings",
     "TRACK_IMAGES",
     "TableLayout",
@@ -68,4 +93,5 @@ __all__ = [
     "WheelKind",
     "WheelMeasure",
     "Wheels",
+    "drive_names",
 ]

@@ -44,7 +44,7 @@ class Imperfections:
 
     @property
     def sigma(self) -> np.ndarray:
-        """(24,) in the order of `motion.imu_model.LABELS`: diagonal and lower triangle of two matrices, ..."""
+        """(24,) in the order of `INTRINSICS_LABELS`: diagonal and lower triangle of two matrices, ..."""
         lower = (0, 1, 0, 1, 1, 0)  # xx yx yy zx zy zz: 0 on the diagonal
         accel = [(self.accel_scale, self.accel_misalignment)[k] for k in lower]
         gyro = [(self.gyro_scale, self.gyro_misalignment)[k] for k in lower]
@@ -52,7 +52,13 @@ class Imperfections:
 
 
 DEFAULT_CLASS = "consumer"
-N_INTRINSICS = 24
+INTRINSICS_LABELS = (
+    *(f"accel_{n}" for n in ("xx", "yx", "yy", "zx", "zy", "zz")),
+    *(f"gyro_{n}" for n in ("xx", "yx", "yy", "zx", "zy", "zz")),
+    *(f"gyro_rotation_{n}" for n in "xyz"),
+    *(f"g_sensitivity_{a}{b}" for a in "xyz" for b in "xyz"),
+)
+N_INTRINSICS = len(INTRINSICS_LABELS)
 
 # gyro, gyro_walk, accel, accel_walk in the units of ImuNoise. Where they come from:
 # consumer: Bosch BMI160 of the TUM VI data set (Schubert et al., IROS 2018), as OpenVINS sets it for that data set.

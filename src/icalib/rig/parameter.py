@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from icalib.base.suggestion import suggestion
 from icalib.errors import RigError
+from icalib.rig.parameter_spec import ParameterSpec
 
 Mode = Literal["free", "fixed", "prior"]
 ROUNDING = 1e-3  # published rotations have few digits; an error of R R^T beyond it is a mistake
@@ -71,18 +73,18 @@ def prior(value: Any, sigma: Any) -> Parameter:
     return Parameter("prior", _array(value), _array(sigma))
 
 
-def check_sizes(sensor: Any, sizes: dict[str, int]) -> None:
-    """Raises RigError where a group of `sensor` has a value of another size. sizes: by group; rotations are not in it,
-    as they are recognised by their name."""
-    for group, size in (sizes | {"rotation": 9}).items():
-        p = getattr(sensor, group, None)
+def check_sizes(sensor: Any, specs: Iterable[ParameterSpec]) -> None:
+    """Raises RigError where a group of `sensor` has a value of another size than its definition in `specs`."""
+    for spec in specs:
+        p = getattr(sensor, spec.name, None)
         if p is None or p.value is None:
             continue
-        shape = (3, 3) if group == "rotation" else (size,)
-        if p.value.shape != shape:
-            wanted = "a 3x3 rotation matrix" if group == "rotation" else f"{size} number{'s' * (size > 1)}"
+        is_rotation = spec.manifold == "rotation"
+        if p.value.shape != ((3, 3) if is_rotation else (spec.size,)):
+            wanted = "a 3x3 rotation matrix" if is_rotation else f"{spec.size} number{'s' * (spec.size > 1)}"
             raise RigError(
-                f"{sensor.name}: {group} needs {wanted}, but the value has shape {p.value.shape}; correct the value."
+                f"{sensor.name}: {spec.name} needs {wanted}, but the value has shape {p.value.shape}; correct the "
+                "value."
             )
 
 

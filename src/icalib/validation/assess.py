@@ -40,7 +40,7 @@ from icalib.result import (
 from icalib.result.provenance import versions
 from icalib.result.timeline import Timeline
 from icalib.result.verdict import by_size
-from icalib.rig import DRIVE_SIZES
+from icalib.rig import drive_names
 from icalib.rig.file import rig_to_dict
 from icalib.validation.all_causes import Judged, all_causes
 from icalib.validation.cameras import plane_warnings
@@ -233,7 +233,7 @@ def _groups(inputs: Inputs, determined: Determined, seen: Observability, noise: 
 def _unheard_of(inputs: Inputs, block: Block) -> bool:
     """Whether it belongs to wheels that report poses, in which it has no part."""
     wheels = [w.name for w in inputs.rig.wheels if w.measures == "poses"]
-    return block.sensor in wheels and block.name in DRIVE_SIZES["pair"]
+    return block.sensor in wheels and block.name in drive_names("pair")
 
 
 def _final_verdict(formal: Verdict, size: float) -> Verdict:

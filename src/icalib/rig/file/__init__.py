@@ -16,23 +16,21 @@ from icalib.geometry.targets import NoTarget, Scene, Target
 from icalib.rig import Camera, ImuSensor, Lidar, Parameter, PoseSensor, Rig, Settings, Wheels
 from icalib.rig.complete import lack_of
 from icalib.rig.file.fields import (
-    MOUNTING,
     TABLE,
     groups_to_plain,
     layout_to_plain,
-    mounting,
+    parameter_fields,
+    parameters,
     path_or,
     table_layout,
     topic_or_none,
 )
 from icalib.rig.file.imu import imu_to_plain, read_imu
 from icalib.rig.file.lidar import lidar_to_plain, read_lidar
-from icalib.rig.file.parameters import vector_parameter
 from icalib.rig.file.poses import pose_sensor, pose_to_plain
 from icalib.rig.file.targets import target_of, target_or_targets
 from icalib.rig.file.wheels import read_wheels, wheels_to_plain
-
-_SENSOR_TYPES = ("imu", "camera", "lidar", "wheels", "pose")
+from icalib.rig.kinds import SENSOR_TYPES
 
 
 def load_rig(path: str | Path) -> Rig:
@@ -121,8 +119,8 @@ def _sensors(value: YamlValue) -> _Sensors:
             sensor.fail(f"a sensor's name is {NAME_WORDS}, as in cam0; rename it.")
         fields = sensor.entries()
         if "type" not in fields:
-            sensor.fail(f"type is missing; add type: {' or type: '.join(_SENSOR_TYPES)}.")
-        match fields["type"].choice("sensor type", _SENSOR_TYPES):
+            sensor.fail(f"type is missing; add type: {' or type: '.join(SENSOR_TYPES)}.")
+        match fields["type"].choice("sensor type", tuple(SENSOR_TYPES)):
             case "camera":
                 found.cameras.append(_camera(name, sensor))
             case "lidar":
@@ -187,18 +185,11 @@ def _refuse_unseen_ground(value: YamlValue, found: _Sensors, targeted: bool) -> 
 
 
 def _camera(name: str, value: YamlValue) -> Camera:
-    groups = (*MOUNTING, "intrinsics", "distortion", "bloom")
-    found = value.record(
-        ("type", "model", "resolution"), ("path", "topic", "corner_noise", "tracks", "track_noise", *TABLE, *groups)
-    )
+    options = ("path", "topic", "corner_noise", "tracks", "track_noise", *TABLE, *parameter_fields(Camera))
+    found = value.record(("type", "model", "resolution"), options)
     model = found["model"].choice("camera model", tuple(CAMERA_MODELS))
-    sizes = {"intrinsics": 4, "bloom": 1}
-    sizes["distortion"] = len(CAMERA_MODELS[model].parameter_names) - sizes["intrinsics"]
-    parameters: dict[str, Any] = {
-        group: vector_parameter(found[group], n) for group, n in sizes.items() if group in found
-    }
-    _refuse_negative_focal_length(found, parameters)
-    given: dict[str, Any] = mounting(found) | parameters
+    groups = parameters(found, Camera(name, "", model, (0, 0)).specs())
+    _refuse_negative_focal_length(found, groups)
     return Camera(
         name=name,
         path=path_or(found, f"{name}/corners.csv"),
@@ -209,12 +200,12 @@ def _camera(name: str, value: YamlValue) -> Camera:
         tracks=found["tracks"].text() if "tracks" in found else None,
         track_noise_px=found["track_noise"].positive() if "track_noise" in found else None,
         layout=table_layout(found),
-        **given,
+        **groups,
     )
 
 
-def _refuse_negative_focal_length(found: dict[str, YamlValue], parameters: dict[str, Parameter]) -> None:
-    value = parameters["intrinsics"].value if "intrinsics" in parameters else None
+def _refuse_negative_focal_length(found: dict[str, YamlValue], groups: dict[str, Parameter]) -> None:
+    value = groups["intrinsics"].value if "intrinsics" in groups else None
     if value is not None and (value[:2] <= 0).any():
         found["intrinsics"].fail("fx and fy of [fx, fy, cx, cy] must be above 0 px; correct them.")
 

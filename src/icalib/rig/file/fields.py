@@ -3,23 +3,36 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 from typing import Any, get_args
 
 from icalib.base.yaml_nodes import YamlValue
-from icalib.rig import PLAIN_TABLE, Axes, Camera, Lidar, Parameter, PoseSensor, TableLayout, TimeUnit, Wheels
-from icalib.rig.file.parameters import parameter_to_plain, rotation_parameter, vector_parameter
+from icalib.rig import (
+    PLAIN_TABLE,
+    Axes,
+    Camera,
+    Lidar,
+    Parameter,
+    ParameterSpec,
+    PoseSensor,
+    Sensor,
+    TableLayout,
+    TimeUnit,
+    Wheels,
+)
+from icalib.rig.file.parameters import parameter, parameter_to_plain
 
-MOUNTED = ("rotation", "translation", "time_offset")
-MOUNTING = (*MOUNTED, "clock_restarts")
 TABLE = ("columns", "time_unit")
 
 
-def mounting(found: dict[str, YamlValue]) -> dict[str, Any]:
-    """Where a sensor is and how its clock goes, as far as it is said."""
-    sizes = {"translation": 3, "time_offset": 1}
-    groups: dict[str, Any] = {group: vector_parameter(found[group], n) for group, n in sizes.items() if group in found}
-    if "rotation" in found:
-        groups["rotation"] = rotation_parameter(found["rotation"])
+def parameter_fields(sensor: type[Sensor]) -> tuple[str, ...]:
+    """The fields that `parameters` reads."""
+    return (*(spec.name for spec in sensor.stated()), "clock_restarts")
+
+
+def parameters(found: dict[str, YamlValue], specs: Iterable[ParameterSpec]) -> dict[str, Any]:
+    """The parameters `specs` of a sensor and how its clock goes, as far as it is said."""
+    groups: dict[str, Any] = {spec.name: parameter(found[spec.name], spec) for spec in specs if spec.name in found}
     if "clock_restarts" in found:
         groups["clock_restarts"] = found["clock_restarts"].boolean()
         if groups["clock_restarts"] and "time_offset" in groups and groups["time_offset"].mode == "fixed":

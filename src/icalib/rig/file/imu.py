@@ -6,7 +6,7 @@ import dataclasses
 from typing import Any, get_args
 
 from icalib.base.yaml_nodes import YamlValue
-from icalib.rig import BY_CLASS, AccelUnit, GyroUnit, ImuNoise, ImuSensor, TwoSources
+from icalib.rig import AccelUnit, GyroUnit, ImuNoise, ImuSensor, TwoSources
 from icalib.rig.file.fields import TABLE, axes_or_none, layout_to_plain, table_layout
 from icalib.rig.file.parameters import imu_intrinsics_parameter, parameter_to_plain
 from icalib.rig.imu_classes import DEFAULT_CLASS, IMU_CLASSES, class_noise
@@ -17,22 +17,24 @@ _FIELDS = ("accel_unit", "gyro_unit", "accel_axes", "gyro_axes")
 
 def read_imu(name: str, value: YamlValue) -> ImuSensor:
     """Raises RigError, one sentence naming file, line and field."""
-    found = value.record(("type",), ("path", "topic", "noise", "intrinsics", *_FIELDS, *TABLE))
+    names = [spec.name for spec in ImuSensor.stated()]
+    found = value.record(("type",), ("path", "topic", "noise", *names, *_FIELDS, *TABLE))
     units: dict[str, Any] = {
         field: found[field].choice("such unit as", get_args(kind))
         for field, kind in (("accel_unit", AccelUnit), ("gyro_unit", GyroUnit))
         if field in found
     }
+    groups: dict[str, Any] = {name: imu_intrinsics_parameter(found[name]) for name in names if name in found}
     return ImuSensor(
         name=name,
         path=_source(found["path"]) if "path" in found else f"{name}/data.csv",
         noise=_noise(found["noise"]) if "noise" in found else class_noise(DEFAULT_CLASS),
-        intrinsics=imu_intrinsics_parameter(found["intrinsics"]) if "intrinsics" in found else BY_CLASS,
         topic=_source(found["topic"]) if "topic" in found else None,
         accel_axes=axes_or_none(found, "accel_axes"),
         gyro_axes=axes_or_none(found, "gyro_axes"),
         layout=table_layout(found),
         **units,
+        **groups,
     )
 
 
@@ -46,8 +48,9 @@ def imu_to_plain(imu: ImuSensor) -> dict[str, Any]:
         given = getattr(imu, field)
         if given is not None:
             plain[field] = list(given) if isinstance(given, tuple) else given
-    is_ideal = imu.intrinsics.mode == "fixed" and imu.intrinsics.value is None
-    return plain | {"intrinsics": "fixed" if is_ideal else parameter_to_plain(imu.intrinsics)}
+    groups = {spec.name: getattr(imu, spec.name) for spec in ImuSensor.stated()}
+    ideal = [name for name, p in groups.items() if p.mode == "fixed" and p.value is None]
+    return plain | {name: "fixed" if name in ideal else parameter_to_plain(p) for name, p in groups.items()}
 
 
 def _noise(value: YamlValue) -> ImuNoise:

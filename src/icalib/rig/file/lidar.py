@@ -6,11 +6,19 @@ from typing import Any
 
 from icalib.base.yaml_nodes import YamlValue
 from icalib.rig import Lidar, PointTime, TimeUnit
-from icalib.rig.file.fields import MOUNTING, choice_or, groups_to_plain, mounting, path_or, positive_or, topic_or_none
+from icalib.rig.file.fields import (
+    choice_or,
+    groups_to_plain,
+    parameter_fields,
+    parameters,
+    path_or,
+    positive_or,
+    topic_or_none,
+)
 
 _FIELDS = (
     "path", "topic", "range_noise", "min_range", "max_range", "point_time", "point_time_field", "point_time_unit",
-    *MOUNTING,
+    *parameter_fields(Lidar),
 )  # fmt: skip
 
 
@@ -33,7 +41,7 @@ def read_lidar(name: str, value: YamlValue) -> Lidar:
         point_time_field=found["point_time_field"].text() if "point_time_field" in found else None,
         point_time_unit=choice_or(found, "point_time_unit", TimeUnit, None),
         topic=topic_or_none(found),
-        **mounting(found),
+        **parameters(found, Lidar.stated()),
     )
 
 

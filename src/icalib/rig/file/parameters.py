@@ -11,9 +11,15 @@ from icalib.base.yaml_nodes import YamlValue
 from icalib.errors import RigError
 from icalib.rig.imu_classes import IMU_CLASSES, N_INTRINSICS, class_imperfections
 from icalib.rig.parameter import ROUNDING, Parameter, nearest_rotation
+from icalib.rig.parameter_spec import ParameterSpec
 
 _FORMS = "write free, {guess: VALUE}, {fixed: VALUE} or {prior: VALUE, sigma: SIGMA}"
 _ROTATION_FORMS = "a 3x3 matrix, {xyzw: [x, y, z, w]} or {rpy_deg: [roll, pitch, yaw]}"
+
+
+def parameter(value: YamlValue, spec: ParameterSpec) -> Parameter:
+    """The group that `spec` defines. Raises RigError naming line and field."""
+    return rotation_parameter(value) if spec.manifold == "rotation" else vector_parameter(value, spec.size)
 
 
 def vector_parameter(value: YamlValue, size: int) -> Parameter:

@@ -7,13 +7,13 @@ from typing import Any
 from icalib.base.yaml_nodes import YamlValue
 from icalib.rig import PoseKind, PoseSensor
 from icalib.rig.file.fields import (
-    MOUNTING,
     TABLE,
     axes_or_none,
     choice_or,
     groups_to_plain,
     layout_to_plain,
-    mounting,
+    parameter_fields,
+    parameters,
     path_or,
     table_layout,
     topic_or_none,
@@ -25,7 +25,7 @@ _NOISE = ("rotation_noise", "position_noise")
 
 def pose_sensor(name: str, value: YamlValue) -> PoseSensor:
     """Raises RigError naming file, line and field."""
-    found = value.record(("type",), (*_FIELDS, *_NOISE, *TABLE, *MOUNTING))
+    found = value.record(("type",), (*_FIELDS, *_NOISE, *TABLE, *parameter_fields(PoseSensor)))
     return PoseSensor(
         name=name,
         path=path_or(found, f"{name}/poses.csv"),
@@ -39,7 +39,7 @@ def pose_sensor(name: str, value: YamlValue) -> PoseSensor:
         layout=table_layout(found),
         scale_sigma=_scale_sigma(found["scale_sigma"]) if "scale_sigma" in found else PoseSensor.scale_sigma,
         frames=_frames(found["frames"]) if "frames" in found else None,
-        **mounting(found),
+        **parameters(found, PoseSensor.stated()),
     )
 
 

@@ -6,10 +6,9 @@ from typing import Any, Literal
 
 from icalib.base.yaml_nodes import YamlValue
 from icalib.rig import (
-    DRIVE_SIZES,
+    DRIVES,
     Ground,
     GroundPlane,
-    Parameter,
     RateUnit,
     WheelDrive,
     WheelFactor,
@@ -17,18 +16,17 @@ from icalib.rig import (
     Wheels,
 )
 from icalib.rig.file.fields import (
-    MOUNTING,
     TABLE,
     choice_or,
     groups_to_plain,
     layout_to_plain,
-    mounting,
+    parameter_fields,
+    parameters,
     path_or,
     positive_or,
     table_layout,
     topic_or_none,
 )
-from icalib.rig.file.parameters import vector_parameter
 
 _WORDS = (
     "path", "topic", "drive", "measures", "sampling", "counts_per_turn", "counter_size", "angle_range", "rate_unit",
@@ -37,7 +35,6 @@ _WORDS = (
 _NOISES = ("wheel_noise", "speed_noise", "yaw_noise", "steering_noise")
 _GROUND = ("tilt_noise", "height", "height_sigma", "bump_noise")
 _SLIP = ("lateral_slip", "vertical_slip")
-_LENGTHS = ("radii", "baseline", "radius", "wheelbase")
 _TURNED = ("rates", "angles", "ticks")
 # Fields that go with some of `measures` only.
 _ONLY_OF: dict[str, tuple[str, ...]] = {
@@ -46,7 +43,7 @@ _ONLY_OF: dict[str, tuple[str, ...]] = {
 }  # fmt: skip
 # And with some kinds of wheels only.
 _ONLY_OF_KIND: dict[str, tuple[str, ...]] = {
-    **{group: (kind,) for kind, sizes in DRIVE_SIZES.items() for group in sizes},
+    **{spec.name: (kind,) for kind, specs in DRIVES.items() for spec in specs},
     "wheel_noise": ("pair", "steered"), "speed_noise": ("twist",), "yaw_noise": ("twist",),
     "steering_noise": ("steered",),
 }  # fmt: skip
@@ -64,16 +61,16 @@ def read_wheels(name: str, value: YamlValue) -> Wheels:
     """Raises RigError naming line and field."""
     found = value.record(
         ("type",),
-        (*_WORDS, "ground", *_NOISES, *_SLIP, *TABLE, *MOUNTING, *(g for s in DRIVE_SIZES.values() for g in s)),
+        (*_WORDS, "ground", *_NOISES, *_SLIP, *TABLE, *parameter_fields(Wheels)),
     )
     measures: WheelMeasure = choice_or(found, "measures", WheelMeasure, Wheels.measures)
     drive: WheelDrive = choice_or(found, "drive", WheelDrive, Wheels.drive)
     bare = Wheels(name, "", drive, measures=measures)
     _refuse_other_measures(value, found, bare)
-    groups = {group: vector_parameter(found[group], n) for group, n in bare.sizes.items() if group in found}
-    _refuse_negative_lengths(found, groups)
+    groups = parameters(found, bare.specs())
+    _refuse_negative_lengths(found, groups, bare)
     given: dict[str, Any] = {d: positive_or(found, d, getattr(Wheels, d)) for d in (*_NOISES, *_SLIP)}
-    given |= mounting(found) | groups
+    given |= groups
     return Wheels(
         name=name,
         path=path_or(found, f"{name}/{measures}.csv"),
@@ -125,11 +122,12 @@ def _refuse_factor(found: dict[str, YamlValue], bare: Wheels) -> None:
         found["factor"].fail("relative-poses (the paper's factor) needs a left and a right wheel; write increments.")
 
 
-def _refuse_negative_lengths(found: dict[str, YamlValue], groups: dict[str, Parameter]) -> None:
-    for name, group in groups.items():
-        if name != "steering_offset" and group.value is not None and (group.value <= 0).any():
-            unit = "is in metres and" if name in _LENGTHS else "are factors and"
-            found[name].fail(f"{unit} must be above 0; correct it.")
+def _refuse_negative_lengths(found: dict[str, YamlValue], groups: dict[str, Any], bare: Wheels) -> None:
+    for spec in bare.drive_specs:
+        value = groups[spec.name].value if spec.name in groups else None
+        if spec.is_positive and value is not None and (value <= 0).any():
+            unit = "is in metres and" if spec.unit == "m" else "are factors and"
+            found[spec.name].fail(f"{unit} must be above 0; correct it.")
 
 
 def _signs(value: YamlValue, drive: WheelDrive) -> tuple[int, ...]:
@@ -180,5 +178,6 @@ def wheels_to_plain(wheels: Wheels) -> dict[str, Any]:
     given["ground"] = None if wheels.ground is None else _ground_to_plain(wheels.ground)
     lists = {name: getattr(wheels, name) for name in ("joints", "signs")}
     given |= {"topic": wheels.topic, **{name: None if x is None else list(x) for name, x in lists.items()}}
-    groups = {name: p for name, p in groups_to_plain(wheels).items() if name in (*MOUNTING, *wheels.sizes)}
+    foreign = {spec.name for spec in Wheels.parameters} - {spec.name for spec in wheels.specs()}
+    groups = {name: p for name, p in groups_to_plain(wheels).items() if name not in foreign}
     return plain | {name: value for name, value in given.items() if value is not None} | groups

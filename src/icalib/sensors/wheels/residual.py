@@ -26,7 +26,7 @@ from icalib.motion.imu_data import ImuData
 from icalib.motion.poses import Poses, Velocities, motion_at, poses_alone, poses_at
 from icalib.optim.arrowhead import Piece
 from icalib.optim.state import Layout, State
-from icalib.rig import DRIVE_SIZES, WheelKind
+from icalib.rig import WheelKind, drive_names
 from icalib.sensors.wheels.row_sums import Into, Weighing, add_rows, in_chunks
 from icalib.sensors.wheels.wheel_carry import carried_noise
 from icalib.sensors.wheels.wheel_drives import KINDS, N_DRIVE, UNITS, Kinds, coefficients
@@ -274,9 +274,9 @@ def wheel_intervals(
 
 
 def drive_of(name: str, state: State, kind: WheelKind = "pair") -> np.ndarray:
-    """(3,) parameters of the wheels `name` beside pose and clock, in the order of `DRIVE_SIZES`, zeros after the last:
+    """(3,) parameters of the wheels `name` beside pose and clock, in the order of `rig.DRIVES`, zeros after the last:
     of a pair left radius, right radius, baseline [m]."""
-    found = np.concatenate([state.values[name, group] for group in DRIVE_SIZES[kind]])
+    found = np.concatenate([state.values[name, group] for group in drive_names(kind)])
     return np.concatenate([found, np.zeros(N_DRIVE - len(found))])
 
 
@@ -334,7 +334,7 @@ def _add(
 ) -> float:
     """Adds the rows of intervals `own`."""
     cost, node, layout = 0.0, factor.intervals.node[own], factor.layout
-    drive = layout.columns(factor.name, *DRIVE_SIZES[factor.kind])
+    drive = layout.columns(factor.name, *drive_names(factor.kind))
     for clock, part in by_clock(state, factor.name, node):
         columns = np.concatenate([mounted_columns(layout, factor.name, clock), drive])
         columns = np.concatenate([columns, np.full(N_OWN - len(columns), -1)])
