@@ -17,16 +17,17 @@ from icalib.optim.state import Key
 from icalib.result import ParameterGroup, SensorFit
 from icalib.result.timeline import Timeline
 from icalib.result.verdict import NUISANCE
-from icalib.rig import LENS
+from icalib.rig import DRIVE_SIZES, LENS
 from icalib.sensors.camera.features.surfaces import ON_PLANES
 from icalib.validation.cameras import mixed_up, other_lens, plane_warnings
 from icalib.validation.causes import Cause, Misfit, changing, explaining, ranked
 from icalib.validation.lens_models import lens_warnings
 from icalib.validation.misfit import LARGE_FACTOR, misfit_causes
-from icalib.validation.size import felt_size, is_certain, scale_notes, size_words
+from icalib.validation.size import felt_size, is_certain, scale_causes, scale_notes, size_words
 from icalib.validation.stated import absurd_wheels, stated_words
 
 SEEN = ("corners", "features")
+WHEEL_LENGTHS = tuple(next(iter(sizes)) for sizes in DRIVE_SIZES.values())
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ def all_causes(judged: Judged, against: Sequence[Contradiction]) -> tuple[list[C
 
 def _stated(judged: Judged, against: Sequence[Contradiction]) -> tuple[list[Cause], tuple[str, ...]]:
     inputs, factor = judged.inputs, judged.factor
-    size = felt_size(judged.found, factor)
+    size = None if inputs.rig.assumes_motion else felt_size(judged.found, factor)
     wrong_size, notes = ((), ()) if against else size_words(inputs, size)
     # What others complain of may come of a wrong size, or of an accelerometer's scale: then that is the news.
     certain, given = is_certain(size), bool(against)
@@ -81,10 +82,13 @@ def _stated(judged: Judged, against: Sequence[Contradiction]) -> tuple[list[Caus
     if size is not None:
         gain = ((size.ratio - 1.0) / (size.std / factor)) ** 2
         causes += [Cause(sentence, float(gain), certain) for sentence in wrong_size]
+    scales = tuple(scale_causes(inputs, judged.groups, size))
+    causes += scales
     causes += [Cause(sentence, gain, True) for _, sentence, gain in lenses]
     causes += [Cause(sentence, gain) for sentence, gain in lens_warnings(inputs, judged.found)]
     said = {(camera, name) for camera, *_ in lenses for name in LENS}
-    against = tuple(c for c in against if c.key not in said)
+    # Wheel sizes that contradict another length are named with it.
+    against = tuple(c for c in against if c.key not in said and not (scales and c.key[1] in WHEEL_LENGTHS))
     causes += _contradicted(judged, against, scale, certain or given, None if given else stated)
     return causes, (*notes, *scale_notes(inputs, size))
 

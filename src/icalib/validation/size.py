@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -10,6 +10,10 @@ from icalib.errors import EstimationError
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.evidence.target_size import TargetSize, target_size
 from icalib.estimate.problem.inputs import Inputs
+from icalib.result import ParameterGroup
+from icalib.rig import Camera, Wheels
+from icalib.sensors.camera.bodies import SIZE
+from icalib.validation.causes import Cause
 
 WRONG = 0.02  # of the size: more than a ruler or a good accelerometer is off by
 BEYOND = 0.05  # accelerometers are off by 3 % at most
@@ -53,11 +57,53 @@ def size_words(inputs: Inputs, size: TargetSize | None) -> tuple[tuple[str, ...]
 
 def scale_notes(inputs: Inputs, size: TargetSize | None) -> Iterator[str]:
     """What all lengths rest on, where that is one thing only."""
-    rig, source = inputs.rig, None
-    seeing = [c.name for c in rig.cameras]
-    if rig.has_target and seeing and size is None and not (rig.lidars or rig.wheels or rig.poses):
-        source = "the size of the target in the rig file"
-    elif not rig.has_target and rig.assumes_motion and not rig.lidars and (rig.poses or rig.wheels):
-        source = f"the positions of {rig.poses[0].name}" if rig.poses else f"the wheel sizes of {rig.wheels[0].name}"
-    if source is not None:
-        yield f"every length comes from {source} alone: 1 % error there is 1 % in every translation here."
+    sources = scale_sources(inputs, size)
+    if len(sources) == 1:
+        lengths = "translation and wheel size" if inputs.rig.wheels else "translation"
+        yield f"every length comes from {sources[0]} alone: 1 % error there is 1 % in every {lengths} here."
+
+
+def scale_sources(inputs: Inputs, size: TargetSize | None) -> list[str]:
+    """What shows how long a metre is. `size`: of the target by the accelerometer, None where that does not show it."""
+    rig = inputs.asked or inputs.rig
+    target = rig.has_target and bool(rig.cameras)
+    has_imu = rig.imu is not None and not rig.imu.assumed
+    sources = ["the size of the target"] if target else []
+    sources += [f"the positions of {p.name}" for p in rig.poses]
+    sources += [f"the ranges of {lidar.name}" for lidar in rig.lidars]
+    sources += [f"the stated sizes of {w.name}" for w in rig.wheels if _has_scale(w)]
+    sources += [f"the stated translation of {c.name}" for c in rig.cameras if _is_stated(c, rig.body)]
+    if has_imu and (size is not None or not target):
+        sources.append("the accelerometer")
+    return sources
+
+
+def _has_scale(wheels: Wheels) -> bool:
+    """Whether what they report is in metres, or in turns of wheels of a known size."""
+    return wheels.measures == "poses" or getattr(wheels, next(iter(wheels.sizes))).mode != "free"
+
+
+def _is_stated(camera: Camera, body: str) -> bool:
+    p = camera.translation
+    return camera.name != body and p.mode != "free" and p.value is not None and bool(np.any(p.value))
+
+
+def scale_causes(inputs: Inputs, groups: Sequence[ParameterGroup], size: TargetSize | None) -> Iterator[Cause]:
+    """Sizes of the target and scales of pose sensors that the others contradict. Each has a prior about 1, and is
+    pulled from it by less than all disagree, as both ends give way."""
+    sigmas = {SIZE: inputs.rig.target.size_sigma} if size is None else {}
+    sigmas |= {(p.name, "scale"): p.scale_sigma for p in inputs.rig.poses}
+    off = {k: float(g.value[0]) - 1.0 for g in groups if (k := (g.sensor, g.name)) in sigmas and g.columns is not None}
+    away = {key: abs(d) / sigmas[key] for key, d in off.items()}
+    if max(away.values(), default=0.0) <= CLEARLY:
+        return
+    apart = 100.0 * float(np.ptp([0.0, *off.values()]))
+    first, *others = scale_sources(inputs, size)
+    more = " and ".join(others) or "what else shows a length"
+    yield Cause(
+        f"{first} and {more} contradict each other: lengths differ by {apart:.1f} % or more, "
+        f"{max(away.values()):.0f} standard deviations of what the rig file allows; find out which is wrong, and "
+        "correct it in the rig file.",
+        float(sum(a**2 for a in away.values())),
+        True,
+    )
