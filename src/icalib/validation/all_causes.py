@@ -17,7 +17,7 @@ from icalib.optim.state import Key
 from icalib.result import ParameterGroup, SensorFit
 from icalib.result.timeline import Timeline
 from icalib.result.verdict import NUISANCE
-from icalib.rig import DRIVE_SIZES, LENS
+from icalib.rig import DRIVES, LENS
 from icalib.sensors.camera.features.surfaces import ON_PLANES
 from icalib.validation.cameras import mixed_up, other_lens, plane_warnings
 from icalib.validation.causes import Cause, Misfit, changing, explaining, ranked
@@ -27,7 +27,7 @@ from icalib.validation.size import felt_size, is_certain, scale_causes, scale_no
 from icalib.validation.stated import absurd_wheels, stated_words
 
 SEEN = ("corners", "features")
-WHEEL_LENGTHS = tuple(next(iter(sizes)) for sizes in DRIVE_SIZES.values())
+WHEEL_LENGTHS = tuple(drive[0].name for drive in DRIVES.values())
 
 
 @dataclass(frozen=True)

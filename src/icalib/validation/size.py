@@ -80,7 +80,7 @@ def scale_sources(inputs: Inputs, size: TargetSize | None) -> list[str]:
 
 def _has_scale(wheels: Wheels) -> bool:
     """Whether what they report is in metres, or in turns of wheels of a known size."""
-    return wheels.measures == "poses" or getattr(wheels, next(iter(wheels.sizes))).mode != "free"
+    return wheels.measures == "poses" or getattr(wheels, wheels.drive_specs[0].name).mode != "free"
 
 
 def _is_stated(camera: Camera, body: str) -> bool:
