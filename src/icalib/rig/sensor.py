@@ -19,7 +19,7 @@ ROTATION = ParameterSpec(
     labels=AXES,
     tolerance="rotation_tolerance_deg",
     prior_sigma=0.1,
-    motion="turn the rig about at least two axes",
+    motion="turn the rig about {axes}",
     motion_on_wheels="drive over ramps: a flat floor does not show tilts; or give it as a prior",
 )
 TRANSLATION = ParameterSpec(
@@ -30,7 +30,7 @@ TRANSLATION = ParameterSpec(
     labels=AXES,
     tolerance="translation_tolerance_m",
     prior_sigma=0.1,
-    motion="turn the rig about two more axes, briskly: a lever arm shows only in rotation",
+    motion="turn the rig briskly about {axes}: a lever arm shows only in rotation",
     motion_on_wheels="turn, and drive over ramps: a flat floor does not show heights; or give it as a prior",
 )
 TIME_OFFSET = ParameterSpec(

@@ -149,6 +149,11 @@ class Wheels(Sensor):
         return DRIVES[self.kind]
 
     @property
+    def sizes(self) -> dict[str, int]:
+        """Its parameters beside pose, clock and height, with how many numbers they have."""
+        return {spec.name: spec.size for spec in self.drive_specs}
+
+    @property
     def knows_height(self) -> bool:
         """Whether `ground_height` is estimated."""
         return self.ground is not None and self.ground.height_sigma is not None
