@@ -27,9 +27,8 @@ from icalib.motion.sweep import Motion
 from icalib.optim.arrowhead import Piece, make_pieces
 from icalib.optim.prior_factor import FIRST_BIAS_SIGMA, Prior, accumulate_bias_prior
 from icalib.optim.robust_weights import LEAST_CURVATURE
-from icalib.optim.state import NODE, State, make_layout
+from icalib.optim.state import NODE, State, in_recording, make_layout
 from icalib.rig import Ground
-from icalib.sensors.camera.board import board_in
 from icalib.sensors.camera.corner_factor import CornerNoise
 from icalib.sensors.imu.residual import ROWS, ImuFactor
 from icalib.sensors.lidar.lidar_binning import LidarNoise
@@ -98,9 +97,9 @@ def with_two_clocks(setup, node=5):
         for b in setup.layout.blocks
     ]
     values = {k: np.repeat(v, 2) if k[1] == "time_offset" else v for k, v in setup.state.values.items()}
-    if ("board0", "tilt") in values and (board_in("board0", 1), "tilt") not in values:
-        entries.append((board_in("board0", 1), "tilt", "tilt", 2, True))
-        values[board_in("board0", 1), "tilt"] = values["board0", "tilt"]
+    if ("board0", "tilt") in values and (in_recording("board0", 1), "tilt") not in values:
+        entries.append((in_recording("board0", 1), "tilt", "tilt", 2, True))
+        values[in_recording("board0", 1), "tilt"] = values["board0", "tilt"]
     return replace(setup, layout=make_layout(entries), state=replace(setup.state, values=values, starts=(0, node)))
 
 
@@ -481,8 +480,8 @@ def with_poses(setup, starts):
     entries += [("mocap0", k, "rotation" if k == "rotation" else "vector", len(v), True) for k, v in mount.items()]
     values = setup.state.values | {("mocap0", k): v for k, v in mount.items()}
     for k in range(1, len(starts)):
-        entries += [(board_in("board0", k), "tilt", "tilt", 2, True)]
-        values[board_in("board0", k), "tilt"] = so3.exp(rng.normal(size=3))
+        entries += [(in_recording("board0", k), "tilt", "tilt", 2, True)]
+        values[in_recording("board0", k), "tilt"] = so3.exp(rng.normal(size=3))
     for k in range(len(starts)):
         entries += [(frame_of("mocap0", k), "frame_rotation", "rotation", 3, True)]
         entries += [(frame_of("mocap0", k), "frame_translation", "vector", 3, True)]

@@ -9,6 +9,7 @@ import pytest
 
 from icalib.optim.arrowhead import make_pieces
 from icalib.sensors.camera.features.surfaces import CELL_M, PATCH_M, REACH_M, Surfaces, most_alike
+from icalib.sensors.lidar.lidar_binning import points_on_planes
 from icalib.sensors.robot import Clouds
 from icalib.tools.simulation import handheld, simulate
 
@@ -24,7 +25,9 @@ def room(room_of, sparse_room):
 @pytest.fixture(scope="module")
 def surfaces(room) -> Surfaces:
     recording = np.zeros(len(room.planes), dtype=np.int64)
-    return Surfaces.seen(room.planes, recording, [(room.stream, room.plane)], room.motion(room.state), NOISE, False)
+    planes = np.array([room.state.values[key] for key in room.planes])
+    clouds = [points_on_planes(room.motion(room.state), room.stream, room.plane)]
+    return Surfaces.seen(room.planes, recording, planes, clouds, NOISE, False)
 
 
 @pytest.fixture(scope="module")

@@ -40,10 +40,9 @@ from icalib.initialize.wheels.wheel_path import (
 )
 from icalib.initialize.wheels.wheels import SidewaysError
 from icalib.motion.nodes import first_nodes
-from icalib.optim.state import Key, State
+from icalib.optim.state import Key, State, in_recording
 from icalib.rig import ImuNoise, ImuSensor, Rig
 from icalib.rig.parameter import Parameter, fixed
-from icalib.sensors.camera.board import board_in
 from icalib.sensors.pose.residual import FRAME, frame_of
 
 ASSUMPTION = "assumed motion"  # no sensor is called so
@@ -232,7 +231,7 @@ def _identity(inputs: Inputs) -> dict[Key, np.ndarray]:
     sensor = (rig.poses if rig.moves_by_poses else rig.cameras)[0]
     out = given(inputs, sensor, NAMES)
     if not rig.moves_by_poses:
-        return out | {(board_in(BOARD, k), "tilt"): np.eye(3) for k in range(n) if rig.has_target}
+        return out | {(in_recording(BOARD, k), "tilt"): np.eye(3) for k in range(n) if rig.has_target}
     for k in range(n):
         frame = frame_of(sensor.name, k)
         out |= {(frame, FRAME[0]): np.eye(3), (frame, FRAME[1]): np.zeros(3)}

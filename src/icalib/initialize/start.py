@@ -28,9 +28,8 @@ from icalib.initialize.steps.by_recording import each_clock
 from icalib.initialize.steps.clocks import OneAxisError
 from icalib.initialize.tracks.tracks_on_motion import track_camera_values
 from icalib.motion.nodes import first_nodes
-from icalib.optim.state import Key, State
+from icalib.optim.state import Key, State, in_recording
 from icalib.rig import Rig
-from icalib.sensors.camera.board import board_in
 from icalib.sensors.camera.bodies import without_bodies
 
 
@@ -148,7 +147,7 @@ def first_state(inputs: Inputs, *guesses: Guess) -> State:
     """The state that the first pass starts from: the guess of each of `inputs.motions` at all its nodes."""
     values = guesses[0].values()
     for k, guess in enumerate(guesses):
-        values[board_in(BOARD, k), "tilt"] = guess.R_world_board
+        values[in_recording(BOARD, k), "tilt"] = guess.R_world_board
     for camera in inputs.rig.cameras if len(guesses) > 1 else ():
         if camera.clock_restarts:
             own = [g.cameras[camera.name].offset for g in guesses]

@@ -24,10 +24,9 @@ from icalib.initialize.poses.pose_ways import placed
 from icalib.initialize.steps.hand_eye import LARGEST_LEFT, HandEye, PosePairs, hand_eye, left_over, outliers, turns_of
 from icalib.initialize.steps.smooth_path import BodyPoses
 from icalib.motion.pose_rows import Mount
-from icalib.optim.state import Key, State
+from icalib.optim.state import Key, State, in_recording
 from icalib.rig import PoseSensor, Rig
 from icalib.rig.parameter import fixed
-from icalib.sensors.camera.board import board_in
 from icalib.sensors.pose.residual import FRAME, frame_of
 
 FEWEST_PAIRS = 3  # of one recording
@@ -70,7 +69,7 @@ def start_from_pairs(
     for k in range(len(recordings)):
         frame = frame_of(rig.body, k)
         world = {(frame, FRAME[0]): np.eye(3), (frame, FRAME[1]): np.zeros(3)}
-        found |= world if own else {(board_in(BOARD, k), "tilt"): np.eye(3)}
+        found |= world if own else {(in_recording(BOARD, k), "tilt"): np.eye(3)}
     state = _state(inputs, shown, found)
     return inputs, state, state.values
 

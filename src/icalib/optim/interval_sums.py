@@ -1,8 +1,28 @@
-"""What a measurement between neighbouring nodes adds to the normal equations."""
+"""What measurements between neighbouring nodes add to the normal equations: whitened, weighed, scattered."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
+import numpy as np
+
 from icalib.base.compiled import njit
+from icalib.optim.robust_weights import weight
+
+
+class Rows(NamedTuple):
+    """n intervals of m rows: residual (n, m); by_node, by_next (n, m, 15), with respect to both nodes; by_border (n, m,
+    c): to columns of the border. Jacobians of length 0 where not wanted."""
+
+    residual: np.ndarray
+    by_node: np.ndarray
+    by_next: np.ndarray
+    by_border: np.ndarray
+
+    @classmethod
+    def empty(cls, n: int, m: int, n_columns: int, jacobians: bool) -> Rows:
+        k = n if jacobians else 0
+        return cls(np.empty((n, m)), np.zeros((k, m, 15)), np.zeros((k, m, 15)), np.zeros((k, m, n_columns)))
 
 
 @njit(cache=True, nogil=True)
@@ -53,3 +73,57 @@ def _scatter_border(Ac, cols, n_b, border):
                 border[cols[i], cols[j]] += f * Ac[k, j]
             border[cols[i], n_b] += f * Ac[k, len(cols)]
             border[n_b, cols[i]] += f * Ac[k, len(cols)]
+
+
+@njit(cache=True, nogil=True)
+def _weigh(r, loss, scaled, root):
+    """root (m,): square roots of the weights of whitened residuals r (m,); scaled (2, m): what Jacobian and residual
+    are multiplied by, so that J^T J, J^T r are those of the weights or, curved, of the loss. Returns half the robust
+    chi^2."""
+    cost = 0.0
+    for q in range(len(r)):
+        w, c, curvature = weight(loss.kind, loss.scale, r[q] * r[q])
+        bend = np.sqrt(curvature) if loss.curved else 1.0
+        root[q] = np.sqrt(w)
+        scaled[0, q], scaled[1, q] = root[q] * bend, root[q] / bend
+        cost += c
+    return cost
+
+
+@njit(cache=True, nogil=True)
+def _whiten(W, J, columns, scale, out):
+    """out (m, n) = diag(scale) W J[:, columns] for lower triangular W (m, m)."""
+    for q in range(len(W)):
+        for j in range(len(columns)):
+            s = 0.0
+            for k in range(q + 1):
+                s += W[q, k] * J[k, columns[j]]
+            out[q, j] = scale[q] * s
+
+
+@njit(cache=True, nogil=True)
+def accumulate_rows(rows, node, W, loss, free, columns, sums, residual, root):
+    """Whitens rows by W (n, m, m), weighs them, and adds them to the sums where these are wanted.
+
+    free, columns (c,): columns of by_border that are estimated, and theirs in the border. residual, root (n, m):
+    whitened residuals and square roots of their weights, out. Returns half the robust chi^2.
+    """
+    m, n_c = W.shape[1], len(free)
+    A0, A1, Ac = np.empty((m, 15)), np.empty((m, 15)), np.empty((m, n_c + 1))
+    scaled, chain = np.empty((2, m)), np.arange(15)
+    cost = 0.0
+    for i in range(len(W)):
+        for q in range(m):
+            residual[i, q] = 0.0
+            for k in range(q + 1):
+                residual[i, q] += W[i, q, k] * rows.residual[i, k]
+        cost += _weigh(residual[i], loss, scaled, root[i])
+        if len(sums.diagonal) == 0:
+            continue
+        _whiten(W[i], rows.by_node[i], chain, scaled[0], A0)
+        _whiten(W[i], rows.by_next[i], chain, scaled[0], A1)
+        _whiten(W[i], rows.by_border[i], free, scaled[0], Ac)
+        for q in range(m):
+            Ac[q, n_c] = scaled[1, q] * residual[i, q]
+        add_interval(node[i] - sums.first, A0, A1, Ac, columns, sums)
+    return cost

@@ -9,6 +9,7 @@ import numpy as np
 from icalib.base.compiled import njit
 
 LEAST_CURVATURE = 1e-3
+LOSSES = {"none": 0, "huber": 1, "cauchy": 2}  # names of the settings; numbers in kernels
 
 
 class Loss(NamedTuple):

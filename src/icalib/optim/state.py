@@ -19,6 +19,12 @@ Kind = Literal["vector", "nuisance", "rotation", "tilt", "plane"]
 Entry = tuple[str, str, Kind, int, bool]  # sensor, name, kind, size, whether it is estimated
 
 
+def in_recording(name: str, recording: int) -> str:
+    """The first part of the key of what each recording has of its own, such as the attitude of the target, counted
+    from 0."""
+    return name if recording == 0 else f"{name} in recording {recording + 1}"
+
+
 @dataclass(frozen=True)
 class Block:
     """One lasting parameter. kind: how it is perturbed; start: its first border column, None where it is fixed.

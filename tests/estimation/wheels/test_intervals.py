@@ -7,9 +7,10 @@ import pytest
 
 from icalib.data.measurements import ImuStream
 from icalib.motion.imu_data import ImuData
+from icalib.motion.stamp_intervals import LONGEST_S, StampIntervals, choose_intervals
 from icalib.rig import ImuNoise
+from icalib.sensors.wheels.quadrature import PANEL_S, quadrature
 from icalib.sensors.wheels.wheel_angles import angles_from_rates
-from icalib.sensors.wheels.wheel_intervals import LONGEST_S, PANEL_S, WheelIntervals, choose_intervals, quadrature
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +74,7 @@ def test_a_pause_of_the_wheels_is_no_interval(imu):
 
 
 SECONDS = np.array([0.0, 0.03, 0.055, 0.3, 0.8])
-INTERVALS = WheelIntervals(np.array([0, 1, 2]), np.array([1, 3, 4]), np.array([4, 5, 8]))
+INTERVALS = StampIntervals(np.array([0, 1, 2]), np.array([1, 3, 4]), np.array([4, 5, 8]))
 
 
 def test_quadrature_is_exact_for_cubics():

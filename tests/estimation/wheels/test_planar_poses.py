@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from icalib.motion.stamp_intervals import StampIntervals
 from icalib.optim.arrowhead import make_pieces
 from icalib.sensors.wheels.residual import RelativePoseFactor, WheelNoise, drive_of, wheel_intervals
-from icalib.sensors.wheels.wheel_intervals import WheelIntervals
 from icalib.sensors.wheels.wheel_poses import between_given, preintegrated
 
 RNG = np.random.default_rng(3)
 SECONDS = np.cumsum(RNG.uniform(0.01, 0.02, 60))
 DRIVE = np.array([0.1, 0.12, 0.5])
-INTERVALS = WheelIntervals(np.array([0, 10, 20, 30]), np.array([1, 20, 40, 59]), np.array([0, 1, 2, 3]))
+INTERVALS = StampIntervals(np.array([0, 10, 20, 30]), np.array([1, 20, 40, 59]), np.array([0, 1, 2, 3]))
 
 
 def steps(kind):
@@ -64,7 +64,7 @@ def test_covariance_is_that_of_samples():
     """Every step with its own noise of either wheel and of lateral slip; 4000 samples."""
     wheel, slip, n = 0.05, 8e-3, 4000
     angles, dt, rng = steps("turning"), np.diff(SECONDS), np.random.default_rng(8)
-    one = WheelIntervals(np.array([20]), np.array([40]), np.array([0]))
+    one = StampIntervals(np.array([20]), np.array([40]), np.array([0]))
     made = preintegrated(SECONDS, angles, one, DRIVE, wheel, slip)
     first, last, r = 20, 40, DRIVE[:2]
     errors = np.zeros((n, 3))
@@ -95,7 +95,7 @@ def test_given_poses_are_differenced_in_the_frame_of_the_first():
         axis=1,
     )
     poses[:, 0] = np.arctan2(np.sin(poses[:, 0]), np.cos(poses[:, 0]))
-    which = WheelIntervals(np.array([10, 20, 30]), np.array([20, 40, 59]), np.array([0, 1, 2]))
+    which = StampIntervals(np.array([10, 20, 30]), np.array([20, 40, 59]), np.array([0, 1, 2]))
     A = np.random.default_rng(1).normal(size=(3, 3, 3))
     covariance = A @ A.transpose(0, 2, 1) + np.eye(3)
     made = between_given(poses, which, covariance)

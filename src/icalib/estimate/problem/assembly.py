@@ -36,6 +36,7 @@ from icalib.sensors.camera.features.patch_curvature import with_curved_patches
 from icalib.sensors.camera.features.surfaces import Surfaces
 from icalib.sensors.camera.features.tracks import TrackNoise
 from icalib.sensors.imu.residual import ImuFactor
+from icalib.sensors.lidar.lidar_binning import points_on_planes
 from icalib.sensors.robot import NO_ROBOT, RobotNoise, robot_factors, still_factors
 
 BLOOM_SIGMA_PX = 1.0
@@ -252,8 +253,10 @@ def _surfaces(inputs: Inputs, state: State, coarse: bool) -> Surfaces | None:
     clouds, noise = inputs.clouds, inputs.rig.settings.points_on_planes_m
     if not clouds.count or noise == 0.0:
         return None
-    seen = list(zip(inputs.measurements.lidars, clouds.plane, strict=True))
-    return Surfaces.seen(clouds.keys, clouds.recording, seen, motion_of(inputs, state), noise, coarse)
+    motion, planes = motion_of(inputs, state), np.array([state.values[key] for key in clouds.keys])
+    pairs = zip(inputs.measurements.lidars, clouds.plane, strict=True)
+    seen = (points_on_planes(motion, stream, plane) for stream, plane in pairs)
+    return Surfaces.seen(clouds.keys, clouds.recording, planes, seen, noise, coarse)
 
 
 def _nodes_of(scheme: Scheme, state: State, times: np.ndarray, images: list[slice], forwards: bool) -> np.ndarray:

@@ -12,9 +12,8 @@ from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets.base import BOARD
 from icalib.motion.imu_data import ImuData, joined_imu_data
 from icalib.motion.imu_model import N_INTRINSICS
-from icalib.optim.state import Entry, Kind, Layout, State, make_layout
+from icalib.optim.state import Entry, Kind, Layout, State, in_recording, make_layout
 from icalib.rig import Camera, Lidar, PoseSensor, Rig, Wheels
-from icalib.sensors.camera.board import board_in
 from icalib.sensors.camera.bodies import Bodies, choose_bodies, restrict
 from icalib.sensors.camera.images import on_common_images
 from icalib.sensors.robot import NO_CLOUDS, Clouds, frame_entries, own_entries
@@ -104,7 +103,7 @@ def layout_for(rig: Rig, bodies: Bodies, n_recordings: int = 1, clouds: Clouds =
     # Without an IMU the scene's frame is the world's, in all recordings.
     levelled = imu is not None and not rig.assumes_motion
     for k in range(1 if imu is None else n_recordings) if bodies.used else ():
-        entries.append((board_in(BOARD, k), "tilt", "tilt", 2, levelled))
+        entries.append((in_recording(BOARD, k), "tilt", "tilt", 2, levelled))
     entries += bodies.size_entries() + bodies.shape_entries()
     for camera in rig.cameras:
         sizes = SIZES | {"distortion": len(camera_model(camera.model).parameter_names) - 4}

@@ -19,8 +19,8 @@ from icalib.errors import EstimationError
 from icalib.initialize.steps.clock_shifts import LONGEST_STEP_S, how_alike, longest_step
 from icalib.initialize.steps.correlation import best_shift
 from icalib.motion.imu_data import ImuData
+from icalib.motion.stamp_intervals import LONGEST_S
 from icalib.rig import WheelKind
-from icalib.sensors.wheels.wheel_intervals import LONGEST_S
 
 GRID_HZ = 100.0
 SHORTEST_OVERLAP_S = 4.0

@@ -16,15 +16,6 @@ SHAPE_LABELS = BOW_LABELS + IN_PLANE_LABELS
 SHAPE_SIGMA_M = np.array([3e-3] * len(BOW_LABELS) + [1e-3] * len(IN_PLANE_LABELS))
 
 
-_RECORDING = " in recording "
-
-
-def board_in(target: str, recording: int) -> str:
-    """Name of the scene as it stands in one of several recordings, counted from 0: its bodies stand to each other alike
-    in all, its attitude is not the same."""
-    return target if recording == 0 else f"{target}{_RECORDING}{recording + 1}"
-
-
 def shape_basis(target: Target, bent: bool) -> np.ndarray:
     """(n_points, s, 3) displacement in the frame of each point's body by unit of the body's shape parameters [m]; zeros
     for bodies that do not bend, s = 0 where none may."""

@@ -26,9 +26,9 @@ from icalib.motion.imu_data import ImuData
 from icalib.motion.poses import Poses, poses_at, poses_of_nodes
 from icalib.optim import pages
 from icalib.optim.arrowhead import Piece
-from icalib.optim.state import Layout, State
+from icalib.optim.robust_weights import LOSSES
+from icalib.optim.state import Layout, State, in_recording
 from icalib.rig import Scheme
-from icalib.sensors.camera.board import board_in
 from icalib.sensors.camera.bodies import Bodies
 from icalib.sensors.camera.corner_kernels import (
     Direct,
@@ -45,7 +45,6 @@ from icalib.sensors.camera.corner_kernels import (
 BLOCK = 256  # images at a time, where nothing is summed
 POSES = 1024  # views at a time, whose poses and how these move are made together
 CHUNK = 64  # views at a time: what a chunk needs stays in the cache
-LOSSES = {"none": 0, "huber": 1, "cauchy": 2}
 
 
 @dataclass(frozen=True)
@@ -231,7 +230,7 @@ class CornerFactor:
         pose, shape = (columns[body] for columns in self.bodies.columns(self.layout))
         chained = [
             mounted_columns(self.layout, self.name, recording),
-            self.layout.columns(board_in(BOARD, recording), "tilt"),
+            self.layout.columns(in_recording(BOARD, recording), "tilt"),
             imu[imu >= 0],
         ]
         model = self.layout.columns(self.name, "intrinsics", "distortion")
@@ -337,4 +336,4 @@ class CornerFactor:
 
 def _scene(state: State, recording: int) -> np.ndarray:
     """R_world_scene (3, 3)."""
-    return state.values[board_in(BOARD, recording), "tilt"]
+    return state.values[in_recording(BOARD, recording), "tilt"]

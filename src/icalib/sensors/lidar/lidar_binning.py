@@ -25,6 +25,7 @@ from icalib.motion.clocks import instants
 from icalib.motion.nodes import usable
 from icalib.motion.sweep import Motion, sweep
 from icalib.optim.arrowhead import in_parallel
+from icalib.optim.robust_weights import LOSSES
 from icalib.rig import Loss
 from icalib.sensors.lidar.lidar_moments import (
     MOMENTS,
@@ -39,8 +40,8 @@ from icalib.sensors.lidar.lidar_moments import (
 
 BIN_S = 3e-3
 STEP_S = 1e-3  # of a longer bin
+LOOKED_AT = 500_000  # points of a LiDAR show where planes end
 POINTS_AT_A_TIME = 150_000  # by one thread: what a chunk needs beside the cloud stays small
-LOSSES: dict[Loss, int] = {"none": 0, "huber": 1, "cauchy": 2}
 
 
 @dataclass(frozen=True)
@@ -171,3 +172,10 @@ def in_world(drive: Motion, stream: LidarStream) -> tuple[np.ndarray, np.ndarray
 
     in_parallel(move, _groups(stream))
     return points, seen_from
+
+
+def points_on_planes(drive: Motion, stream: LidarStream, plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 3) in the world frame, about LOOKED_AT at most, of those that lie on planes, and on which (n,); plane
+    (N,): -1 where a point of the stream lies on none."""
+    some = (plane >= 0) & (np.arange(len(plane)) % (len(plane) // LOOKED_AT | 1) == 0)
+    return in_world(drive, stream.some(some))[0], plane[some]

@@ -11,9 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icalib.base.compiled import njit
-from icalib.geometry.planes import tangents
 from icalib.motion.pose_chain import by_imu_pose
-from icalib.optim.state import Key, State
 from icalib.sensors.lidar.lidar_walk import PLANE, POSE, add_entry, add_plane, add_pose, border_of, no_walk, taken_off
 
 ROWS = 4  # whitened residuals of a plane in a bin
@@ -34,22 +32,6 @@ class Bins(NamedTuple):
     slant: np.ndarray
     turned: np.ndarray
     slope: np.ndarray
-
-
-class Planes(NamedTuple):
-    """normal (P, 3), tangents (P, 2, 3), point (P, 3) of each plane; columns (P, 3) in the border, -1 where fixed."""
-
-    normal: np.ndarray
-    tangents: np.ndarray
-    point: np.ndarray
-    columns: np.ndarray
-
-    @classmethod
-    def of(cls, keys: tuple[Key, ...], state: State, columns: np.ndarray) -> Planes:
-        """Those of `keys` as `state` has them."""
-        value = np.array([state.values[key] for key in keys])
-        across = np.array([tangents(v[:3]) for v in value])
-        return cls(value[:, :3].copy(), across, value[:, 3:].copy(), columns)
 
 
 class Motion(NamedTuple):

@@ -22,11 +22,12 @@ from icalib.motion.imu_data import ImuData
 from icalib.motion.poses import assign_nodes, poses_at
 from icalib.motion.sweep import Motion as ImuMotion
 from icalib.optim.arrowhead import Piece, in_parallel
+from icalib.optim.planes import Planes
 from icalib.optim.state import Key, Layout, State
 from icalib.rig import Scheme
 from icalib.sensors.lidar import lidar_kernels
 from icalib.sensors.lidar.lidar_binning import BIN_S, Associated, LidarNoise, Moments, take_moments
-from icalib.sensors.lidar.lidar_kernels import ROWS, Bins, Motion, Planes
+from icalib.sensors.lidar.lidar_kernels import ROWS, Bins, Motion
 
 CHUNK = 512  # bins at a time: what a chunk needs stays in the cache
 

@@ -23,13 +23,12 @@ from icalib.motion.imu_data import ImuData
 from icalib.motion.nodes import MERGED_WITHIN_S, usable
 from icalib.motion.pose_rows import Frame, Mount, PoseRows, absolute_rows, add_chain_rule, relative_rows
 from icalib.motion.poses import Poses, assign_nodes, poses_alone, poses_at, poses_of_nodes
+from icalib.motion.row_sums import Into, RobustNoise, add_rows, in_chunks
+from icalib.motion.stamp_intervals import StampIntervals, choose_intervals
 from icalib.motion.sweep import Motion
 from icalib.optim.arrowhead import Piece
-from icalib.optim.state import NODE, Layout, State
-from icalib.sensors.camera.board import board_in
-from icalib.sensors.wheels.row_sums import Into, Weighing, add_rows, in_chunks
-from icalib.sensors.wheels.wheel_intervals import WheelIntervals, choose_intervals
-from icalib.sensors.wheels.wheel_kernels import Rows
+from icalib.optim.interval_sums import Rows
+from icalib.optim.state import NODE, Layout, State, in_recording
 
 FRAME = ("frame_rotation", "frame_translation")
 NEAR_NODE_S = 0.05  # a pose further from all nodes is left out: the IMU alone would carry it there
@@ -50,7 +49,7 @@ class PoseNoise:
 
 def frame_of(sensor: str, recording: int) -> str:
     """Name of the frame in which a sensor's poses are given in one of several recordings, counted from 0."""
-    return board_in(f"frame of {sensor}", recording)
+    return in_recording(f"frame of {sensor}", recording)
 
 
 @dataclass(frozen=True)
@@ -180,7 +179,7 @@ class RelativePosesFactor:
 
     name: str
     seconds: np.ndarray  # (N,) stamps since the first on the sensor's clock
-    intervals: WheelIntervals
+    intervals: StampIntervals
     rotation: np.ndarray  # (n, 3, 3)
     position: np.ndarray  # (n, 3)
     imu: ImuData
@@ -313,5 +312,5 @@ def _chained(rows: PoseRows, scaling: _Scaling, ends: tuple[Poses, ...]) -> Rows
 
 def _add(factor: PoseFactor, own: slice, rows: Rows, columns: np.ndarray, node: np.ndarray, into: Into) -> float:
     """Adds the rows `own`, each to the interval that begins at its `node`."""
-    by = Weighing(np.eye(6) / factor.sigma[own][:, :, None], factor.noise.loss, factor.noise.loss_scale)
+    by = RobustNoise(np.eye(6) / factor.sigma[own][:, :, None], factor.noise.loss, factor.noise.loss_scale)
     return add_rows(rows, own, node, columns, factor.layout, factor.imu, by, into)

@@ -23,11 +23,11 @@ import numpy as np
 from icalib.geometry import planes
 from icalib.motion.factor import Whitened
 from icalib.motion.imu_data import ImuData
+from icalib.motion.row_sums import Into, RobustNoise, add_rows
 from icalib.optim.arrowhead import Piece
+from icalib.optim.interval_sums import Rows
 from icalib.optim.state import Key, Layout, State
 from icalib.rig import Ground
-from icalib.sensors.wheels.row_sums import Into, Weighing, add_rows
-from icalib.sensors.wheels.wheel_kernels import Rows
 
 LEVEL = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])  # normal and point
 NEARLY_LEVEL = np.cos(np.deg2rad(20.0))
@@ -125,7 +125,7 @@ class GroundFactor:
             own = slice(int(low), int(high))
             rows = self._rows(state, self.nodes[own], None if key is None else state.values[key])
             whitening = np.tile(np.diag(1.0 / self.sigma), (high - low, 1, 1))
-            by = Weighing(whitening, "none", 1.0)
+            by = RobustNoise(whitening, "none", 1.0)
             into = Into(piece, out, sums, curved)
             cost += add_rows(rows, own, self.nodes[own], self._columns(key), self.layout, self.imu, by, into)
         return cost

@@ -24,14 +24,16 @@ from icalib.motion.clocks import by_clock, instants, mounted_columns, offset_at
 from icalib.motion.factor import Whitened
 from icalib.motion.imu_data import ImuData
 from icalib.motion.poses import Poses, Velocities, motion_at, poses_alone, poses_at
+from icalib.motion.row_sums import Into, RobustNoise, add_rows, in_chunks
+from icalib.motion.stamp_intervals import StampIntervals, choose_intervals, pose_intervals
 from icalib.optim.arrowhead import Piece
+from icalib.optim.interval_sums import Rows
 from icalib.optim.state import Layout, State
 from icalib.rig import WheelKind, drive_names
-from icalib.sensors.wheels.row_sums import Into, Weighing, add_rows, in_chunks
+from icalib.sensors.wheels.quadrature import Instants, quadrature
 from icalib.sensors.wheels.wheel_carry import carried_noise
 from icalib.sensors.wheels.wheel_drives import KINDS, N_DRIVE, UNITS, Kinds, coefficients
-from icalib.sensors.wheels.wheel_intervals import Instants, WheelIntervals, choose_intervals, pose_intervals, quadrature
-from icalib.sensors.wheels.wheel_kernels import N_OWN, Rows, Track, Wheels, increment_rows, relative_rows
+from icalib.sensors.wheels.wheel_kernels import N_OWN, Track, Wheels, increment_rows, relative_rows
 from icalib.sensors.wheels.wheel_poses import RelativePoses, preintegrated
 
 
@@ -66,7 +68,7 @@ class IncrementFactor:
 
     name: str
     kind: WheelKind
-    intervals: WheelIntervals
+    intervals: StampIntervals
     measured: np.ndarray  # (n, 4): what the wheels turned, rad; slip, which nobody measured: 0 m
     mean: np.ndarray  # (n, m - 1): see `coefficients`
     whitening: np.ndarray  # (n, 4, 4)
@@ -145,7 +147,7 @@ class IncrementFactor:
         node = self.instants.node[seen]
         times = self.instants.times[seen] + offset_at(state, self.name, node)
         poses, moving = _motion(self, times, node, state, into.sums)
-        rows = Rows.empty(len(start) - 1, 4, poses.by_imu.shape[2], into.sums)
+        rows = Rows.empty(len(start) - 1, 4, N_OWN + poses.by_imu.shape[2], into.sums)
         wheels = _wheels(self.name, state, self.kind)
         c = coefficients(self.kind, wheels.drive, self.mean[own])
         increment_rows(
@@ -173,7 +175,7 @@ class RelativePoseFactor:
 
     name: str
     seconds: np.ndarray  # (N,) stamps since the first on the wheels' clock
-    intervals: WheelIntervals
+    intervals: StampIntervals
     poses: RelativePoses
     imu: ImuData
     gravity: float
@@ -257,14 +259,14 @@ class RelativePoseFactor:
             poses = poses_at("inertial", times, node, state, self.imu, self.gravity, free)
         else:
             poses = poses_alone(times, node, state, self.imu, self.gravity)
-        rows = Rows.empty(len(times) // 2, 3, poses.by_imu.shape[2], into.sums)
+        rows = Rows.empty(len(times) // 2, 3, N_OWN + poses.by_imu.shape[2], into.sums)
         relative_rows(_track(node, poses), _wheels(self.name, state, self.kind), z.z[own], z.J[own], z.drive0, rows)
         return _add(self, own, rows, z.W, state, into)
 
 
 def wheel_intervals(
     name: str, seconds: np.ndarray, imu: ImuData, state: State, times: np.ndarray | None = None
-) -> WheelIntervals:
+) -> StampIntervals:
     """The intervals of the wheels `name`, stamped at `seconds` (N,), at the nodes in `state`; `times` as in
     `IncrementFactor.build`."""
     if times is not None:
@@ -318,7 +320,7 @@ def _rms(out: Whitened, whitening: np.ndarray, rows: slice) -> float:
     return float(np.sqrt(np.mean(residual**2)))
 
 
-def _in_piece(intervals: WheelIntervals, piece: Piece) -> slice:
+def _in_piece(intervals: StampIntervals, piece: Piece) -> slice:
     """The intervals of which both nodes lie in `piece`."""
     i0, i1 = np.searchsorted(intervals.node, [piece.first, piece.last])
     return slice(int(i0), int(i1))
@@ -339,6 +341,6 @@ def _add(
         columns = np.concatenate([mounted_columns(layout, factor.name, clock), drive])
         columns = np.concatenate([columns, np.full(N_OWN - len(columns), -1)])
         mine = slice(own.start + part.start, own.start + part.stop)
-        by = Weighing(whitening[mine], factor.noise.loss, factor.noise.loss_scale)
+        by = RobustNoise(whitening[mine], factor.noise.loss, factor.noise.loss_scale)
         cost += add_rows(Rows(*(x[part] for x in rows)), mine, node[part], columns, layout, factor.imu, by, into)
     return cost

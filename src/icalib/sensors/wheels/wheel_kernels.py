@@ -1,4 +1,4 @@
-"""Rows of the wheel factors: residuals and Jacobians between two instants, and their normal equations.
+"""Rows of the wheel factors: residuals and Jacobians between two instants.
 
 Both factors compare (X, T), a displacement and a turn in wheel axes, made of (Y, Theta) in the axes of the IMU:
 
@@ -16,8 +16,6 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.geometry.small import tmul3
-from icalib.optim.interval_sums import add_interval
-from icalib.optim.robust_weights import weight
 
 N_OWN = 10  # border columns of the wheels: rotation 3, translation 3, time offset 1, up to three of the drive
 
@@ -41,21 +39,6 @@ class Track(NamedTuple):
     velocity: np.ndarray
     by_node: np.ndarray
     by_imu: np.ndarray
-
-
-class Rows(NamedTuple):
-    """n intervals of m rows: residual (n, m); by_node, by_next (n, m, 15), with respect to both nodes; by_border (n, m,
-    10 + 24 or 0): to the wheels' own parameters and the IMU intrinsics. Jacobians of length 0 where not wanted."""
-
-    residual: np.ndarray
-    by_node: np.ndarray
-    by_next: np.ndarray
-    by_border: np.ndarray
-
-    @classmethod
-    def empty(cls, n: int, m: int, n_imu: int, jacobians: bool) -> Rows:
-        k = n if jacobians else 0
-        return cls(np.empty((n, m)), np.zeros((k, m, 15)), np.zeros((k, m, 15)), np.zeros((k, m, N_OWN + n_imu)))
 
 
 @njit(cache=True, nogil=True)
@@ -251,57 +234,3 @@ def relative_rows(track, wheels, z, J, drive0, rows):
                     rows.by_border[i, q, 3 + k] = aY[0] * R01[0, k] + aY[1] * R01[1, k] + aY[2] * R01[2, k] - aY[k]
             for k in range(3):
                 rows.by_border[i, q, 7 + k] = -J[i, q, k]
-
-
-@njit(cache=True, nogil=True)
-def _weigh(r, loss, scaled, root):
-    """root (m,): square roots of the weights of whitened residuals r (m,); scaled (2, m): what Jacobian and residual
-    are multiplied by, so that J^T J, J^T r are those of the weights or, curved, of the loss. Returns half the robust
-    chi^2."""
-    cost = 0.0
-    for q in range(len(r)):
-        w, c, curvature = weight(loss.kind, loss.scale, r[q] * r[q])
-        bend = np.sqrt(curvature) if loss.curved else 1.0
-        root[q] = np.sqrt(w)
-        scaled[0, q], scaled[1, q] = root[q] * bend, root[q] / bend
-        cost += c
-    return cost
-
-
-@njit(cache=True, nogil=True)
-def _whiten(W, J, columns, scale, out):
-    """out (m, n) = diag(scale) W J[:, columns] for lower triangular W (m, m)."""
-    for q in range(len(W)):
-        for j in range(len(columns)):
-            s = 0.0
-            for k in range(q + 1):
-                s += W[q, k] * J[k, columns[j]]
-            out[q, j] = scale[q] * s
-
-
-@njit(cache=True, nogil=True)
-def accumulate_rows(rows, node, W, loss, free, columns, sums, residual, root):
-    """Whitens rows by W (n, m, m), weighs them, and adds them to the sums where these are wanted.
-
-    free, columns (c,): columns of by_border that are estimated, and theirs in the border. residual, root (n, m):
-    whitened residuals and square roots of their weights, out. Returns half the robust chi^2.
-    """
-    m, n_c = W.shape[1], len(free)
-    A0, A1, Ac = np.empty((m, 15)), np.empty((m, 15)), np.empty((m, n_c + 1))
-    scaled, chain = np.empty((2, m)), np.arange(15)
-    cost = 0.0
-    for i in range(len(W)):
-        for q in range(m):
-            residual[i, q] = 0.0
-            for k in range(q + 1):
-                residual[i, q] += W[i, q, k] * rows.residual[i, k]
-        cost += _weigh(residual[i], loss, scaled, root[i])
-        if len(sums.diagonal) == 0:
-            continue
-        _whiten(W[i], rows.by_node[i], chain, scaled[0], A0)
-        _whiten(W[i], rows.by_next[i], chain, scaled[0], A1)
-        _whiten(W[i], rows.by_border[i], free, scaled[0], Ac)
-        for q in range(m):
-            Ac[q, n_c] = scaled[1, q] * residual[i, q]
-        add_interval(node[i] - sums.first, A0, A1, Ac, columns, sums)
-    return cost

@@ -15,7 +15,7 @@ import numpy as np
 
 from icalib.base.compiled import njit
 from icalib.geometry.small import inverse_cholesky
-from icalib.sensors.wheels.wheel_intervals import WheelIntervals
+from icalib.motion.stamp_intervals import StampIntervals
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def _integrate_all(first, last, seconds, angles, drive, wheel_noise, slip_noise,
 def preintegrated(
     seconds: np.ndarray,
     angles: np.ndarray,
-    intervals: WheelIntervals,
+    intervals: StampIntervals,
     drive: np.ndarray,
     wheel_noise: float,
     slip_noise: float,
@@ -117,7 +117,7 @@ def preintegrated(
     return RelativePoses(z, J, W, drive0)
 
 
-def between_given(poses: np.ndarray, intervals: WheelIntervals, covariance: np.ndarray) -> RelativePoses:
+def between_given(poses: np.ndarray, intervals: StampIntervals, covariance: np.ndarray) -> RelativePoses:
     """From planar poses (N, 3), yaw, x, y in a frame that stands still, that a driver gives at its stamps.
 
     covariance (n, 3, 3) of each relative pose (yaw, x, y). They say nothing of radii and baseline.

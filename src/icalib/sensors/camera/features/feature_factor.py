@@ -20,9 +20,10 @@ from icalib.optim.arrowhead import Piece, in_parallel, make_pieces
 from icalib.optim.front import Features
 from icalib.optim.front_plan import FeatureSums, plan
 from icalib.optim.medians import median_variance
-from icalib.optim.robust_weights import Loss
+from icalib.optim.planes import Planes
+from icalib.optim.robust_weights import LOSSES, Loss
 from icalib.optim.state import Layout, State
-from icalib.sensors.camera.corner_factor import LOSSES, CornerFactor
+from icalib.sensors.camera.corner_factor import CornerFactor
 from icalib.sensors.camera.corner_kernels import Motion
 from icalib.sensors.camera.features.feature_clusters import accumulate_clusters
 from icalib.sensors.camera.features.feature_kernels import (
@@ -45,7 +46,6 @@ from icalib.sensors.camera.features.surfaces import (
     add_points_on_planes,
 )
 from icalib.sensors.camera.features.tracks import NO_TRACKS, Sightings, TrackNoise, Tracks
-from icalib.sensors.lidar.lidar_kernels import Planes
 
 MOST_STEPS = 20  # of a point; most settle in three
 WEAK = 1e-6  # information [1/m^2]: keeps a point defined that no image shows any more; steers nothing else

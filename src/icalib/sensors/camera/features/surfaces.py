@@ -10,28 +10,25 @@ patch of a plane together have the weight of one.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from icalib.base.compiled import njit
-from icalib.data.measurements import LidarStream
 from icalib.geometry.planes import tangents
 from icalib.geometry.small import solve_definite
-from icalib.motion.sweep import Motion
 from icalib.optim.arrowhead import Piece
 from icalib.optim.front_plan import FeatureSums
+from icalib.optim.planes import Planes
 from icalib.optim.robust_weights import Loss, weight
 from icalib.optim.state import Key
 from icalib.sensors.camera.features.feature_kernels import Points
-from icalib.sensors.lidar.lidar_binning import in_world
-from icalib.sensors.lidar.lidar_kernels import Planes
 
 ON_PLANES = "points on planes"  # the kind of these rows
 CELL_M = 0.25  # a plane ends where no LiDAR saw it, to a cell
 PATCH_M = 1.0  # within which a surface is off its plane by much the same
-LOOKED_AT = 500_000  # points of a LiDAR show where planes end
 GATE = 3.0  # standard deviations that a point may be off
 REACH_M = 0.5  # from a plane to points that may lie on it: cameras and LiDARs may be that far apart before
 VAGUE_M = 0.1  # a point that is less certain across a plane lies on none
@@ -92,20 +89,16 @@ class Surfaces:
         cls,
         keys: tuple[Key, ...],
         recording: np.ndarray,
-        clouds: list[tuple[LidarStream, np.ndarray]],
-        motion: Motion,
+        plane: np.ndarray,
+        clouds: Iterable[tuple[np.ndarray, np.ndarray]],
         noise: float,
         coarse: bool,
     ) -> Surfaces:
-        """`clouds`: of each LiDAR its points, and on which plane (N,) each lies; `coarse`: all is only about where it
-        is."""
-        plane = np.array([motion.state.values[key] for key in keys])
+        """`plane` (P, 6): where the planes are; `clouds`: of each LiDAR points (n, 3) in the world, and on which plane
+        (n,) each lies; `coarse`: all is only about where it is."""
         codes = [np.zeros(0, dtype=np.int64)]
-        for stream, of_points in clouds:
-            some = (of_points >= 0) & (np.arange(len(of_points)) % (len(of_points) // LOOKED_AT | 1) == 0)
-            own = stream.some(some)
-            xyz, _ = in_world(motion, own)
-            codes.append(_with_neighbours(np.unique(_codes(plane, of_points[some].astype(np.int64), xyz))))
+        for xyz, of_points in clouds:
+            codes.append(_with_neighbours(np.unique(_codes(plane, of_points.astype(np.int64), xyz))))
         cells = np.unique(np.concatenate(codes))
         return cls(keys, plane, recording, cells, max(noise, FIRST_NOISE_M) if coarse else noise)
 

@@ -1,4 +1,5 @@
-"""Rows of a sensor between nodes, into the normal equations: what factors of wheels and of poses share."""
+"""Rows of a sensor between nodes, into the normal equations: what factors share whose measurements lie between two
+neighbouring nodes."""
 
 from __future__ import annotations
 
@@ -10,10 +11,9 @@ import numpy as np
 from icalib.motion.factor import Whitened
 from icalib.motion.imu_data import ImuData
 from icalib.optim.arrowhead import Piece
-from icalib.optim.robust_weights import Loss
+from icalib.optim.interval_sums import Rows, accumulate_rows
+from icalib.optim.robust_weights import LOSSES, Loss
 from icalib.optim.state import Layout
-from icalib.sensors.camera.corner_factor import LOSSES
-from icalib.sensors.wheels.wheel_kernels import Rows, accumulate_rows
 
 # Rows of a factor that are made at once: their Jacobians stay in the processor's cache.
 CHUNK = 256
@@ -28,7 +28,7 @@ class Into(NamedTuple):
     curved: bool
 
 
-class Weighing(NamedTuple):
+class RobustNoise(NamedTuple):
     """whitening (n, m, m) of the rows at hand; name and bend of the robust loss of each whitened row."""
 
     whitening: np.ndarray
@@ -49,7 +49,7 @@ def add_rows(
     columns: np.ndarray,
     layout: Layout,
     imu: ImuData | None,
-    by: Weighing,
+    by: RobustNoise,
     into: Into,
 ) -> float:
     """Adds the rows `own` of a factor, each to the interval that begins at its `node`, and fills `into.out`; returns

@@ -1,0 +1,26 @@
+"""Planes of the scene as parameters: what kernels need to know of them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from icalib.geometry.planes import tangents
+from icalib.optim.state import Key, State
+
+
+class Planes(NamedTuple):
+    """normal (P, 3), tangents (P, 2, 3), point (P, 3) of each plane; columns (P, 3) in the border, -1 where fixed."""
+
+    normal: np.ndarray
+    tangents: np.ndarray
+    point: np.ndarray
+    columns: np.ndarray
+
+    @classmethod
+    def of(cls, keys: tuple[Key, ...], state: State, columns: np.ndarray) -> Planes:
+        """Those of `keys` as `state` has them."""
+        value = np.array([state.values[key] for key in keys])
+        across = np.array([tangents(v[:3]) for v in value])
+        return cls(value[:, :3].copy(), across, value[:, 3:].copy(), columns)
