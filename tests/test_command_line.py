@@ -8,7 +8,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from icalib.cli import _parser, main
+from icalib.cli import main
+from icalib.cli.commands import _parser
 from icalib.cli.console import LINE_EVERY_S, progress_bar, progress_lines
 
 

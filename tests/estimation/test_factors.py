@@ -17,7 +17,8 @@ import pytest
 from scipy import sparse
 from scipy.sparse.linalg import LinearOperator
 
-import icalib.estimate
+import icalib.optim
+import icalib.sensors
 from icalib.data.measurements import PoseStream
 from icalib.geometry import so3
 from icalib.geometry.planes import plane_of
@@ -665,13 +666,14 @@ SAMPLES = {
 
 
 def factors_in_the_source():
-    """Whatever adds to the normal equations: classes with `accumulate`, functions named so, of modules *_factor."""
+    """Whatever adds to the normal equations: classes with `accumulate`, functions named so, of the modules `residual`
+    and `*_factor` of sensors and of what they share."""
     found = set()
-    for module in pkgutil.iter_modules(icalib.estimate.__path__):
-        if module.name.endswith("_factor"):
-            name = f"icalib.estimate.{module.name}"
-            for key, thing in vars(importlib.import_module(name)).items():
-                own = getattr(thing, "__module__", None) == name
+    packages = (icalib.sensors, icalib.optim)
+    for module in (m for p in packages for m in pkgutil.walk_packages(p.__path__, f"{p.__name__}.")):
+        if module.name.endswith((".residual", "_factor")):
+            for key, thing in vars(importlib.import_module(module.name)).items():
+                own = getattr(thing, "__module__", None) == module.name
                 if own and (hasattr(thing, "accumulate") or (key.startswith("accumulate") and callable(thing))):
                     found.add(key)
     return found
