@@ -32,6 +32,7 @@ def program(benchmark_program: Callable[[str], ModuleType]) -> ModuleType:
         ("poses + IMU", "gyroscope misalignment"),
         ("poses + IMU", "g-sensitivity"),
         ("poses + IMU", "scale of poses"),
+        ("camera + wheels", "target size"),  # one image, then none for 14 s
     ],
 )
 def test_effects_of_two_sigma_are_within_four_printed_ones(program: ModuleType, kind: str, effect: str):

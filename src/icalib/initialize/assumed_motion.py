@@ -220,8 +220,8 @@ def _bridged(path: SmoothPath, max_gap_s: float) -> np.ndarray:
     seen = path.seconds[path.near]
     if not len(seen):
         return np.zeros(len(path.seconds), dtype=bool)
-    after = np.searchsorted(seen, path.seconds)
-    before, behind = seen[np.maximum(after - 1, 0)], seen[np.minimum(after, len(seen) - 1)]
+    after, ends = np.searchsorted(seen, path.seconds), np.concatenate([[-np.inf], seen, [np.inf]])
+    before, behind = ends[after], ends[after + 1]
     return path.near | (behind - before <= max_gap_s)
 
 

@@ -19,7 +19,6 @@ from icalib.initialize.wheels.wheel_poses import mount_guess, poses_offset
 from icalib.initialize.wheels.wheels import OPPOSITE, SidewaysError, WheelRates, drive_guess, wheel_offset, wheel_rates
 from icalib.motion.clocks import instants
 from icalib.motion.known_motion import imu_poses, is_known
-from icalib.motion.sweep import Motion
 from icalib.optim.state import Key, State
 from icalib.rig import Wheels
 from icalib.sensors.pose.residual import FRAME, frame_of
@@ -184,7 +183,7 @@ def _turning(
         offset = np.array([wheel_offset(inputs.imu, up, name, rates)])
     clock = {(name, "time_offset"): offset}
     start, end = instants(stream, clock, rates.start), instants(stream, clock, rates.end)
-    inside, rate, velocity = _means(motion_of(inputs, state), start, end)
+    inside, rate, velocity = _means(inputs, state, start, end)
     drive = drive_guess(name, rates.rate[inside], rate, velocity, up, rates.kind)
     found = {"rotation": drive.rotation, "translation": drive.position, "time_offset": offset} | drive.values
     return {(name, group): value for group, value in found.items()}
@@ -204,19 +203,25 @@ def _posing(inputs: Inputs, state: State, stream: WheelPoses, offset: np.ndarray
     if offset is None:
         offset = np.array([poses_offset(inputs.imu, stream)])
     times = stream.seconds + offset[0]  # there is but one recording of relative poses
-    inside, rate, velocity = _means(motion_of(inputs, state), times[:-1], times[1:])
+    inside, rate, velocity = _means(inputs, state, times[:-1], times[1:])
     found = mount_guess(stream, inside, rate, velocity)
     values = {"rotation": found.rotation, "translation": found.position, "time_offset": offset}
     return {(stream.name, name): np.ascontiguousarray(value) for name, value in values.items()}
 
 
-def _means(motion: Motion, start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Which spans from start to end (m,), on the IMU's clock, fall within the motion, and over these n the means (n, 3)
-    of the IMU's rate, without bias, and velocity, in its axes.
+def _means(
+    inputs: Inputs, state: State, start: np.ndarray, end: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Which spans from start to end (m,), on the IMU's clock, fall within the motion and no gap of the IMU, and over
+    these n the means (n, 3) of the IMU's rate, without bias, and velocity, in its axes.
 
     Raises EstimationError where the wheels turned while nothing else was recorded.
     """
-    inside = is_known(motion.state.seconds, start) & is_known(motion.state.seconds, end)
+    assert inputs.imu is not None
+    motion = motion_of(inputs, state)
+    inside = is_known(state.seconds, start) & is_known(state.seconds, end)
+    for a, b in inputs.imu.gaps:  # across which the keyframes are extrapolated
+        inside &= (end <= a) | (start >= b)
     if not inside.any():
         raise EstimationError(
             "no reading of the wheels falls within the recording of the other sensors; check the clocks, or "
