@@ -19,6 +19,7 @@ from icalib.result.quantities import chi2_words, dof_words, rms_words
 from icalib.result.verdict import NEXT, Usability
 
 LINE_EVERY_S = 30.0  # between lines of progress in logs
+RESIDUALS = "Residuals: chi^2 per degree of freedom is 1 where noise is as stated; in brackets the degrees of freedom."
 NO_REDUNDANCY = "n/a: the recording cannot test this noise, so the value stated in the rig file is used as it is."
 VERDICT_STYLES: dict[Usability, str] = {
     "usable": "bold green",
@@ -74,6 +75,8 @@ def print_result(calibration: Calibration, folder: Path) -> None:
         console.print(f"  target: {placed}", markup=False)
     for sentence in relative_words(calibration):
         console.print(f"  {sentence}", markup=False)
+    if calibration.fits:
+        console.print(RESIDUALS, markup=False)
     for f in calibration.fits:
         rms = f", {rms_words(f)} RMS" if f.rms is not None else ""
         rms += f", {f.rejected} rejected" if f.unit == "px" else ""

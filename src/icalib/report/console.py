@@ -68,7 +68,10 @@ def relative_words(calibration: Calibration) -> list[str]:
 
 def _caption(calibration: Calibration) -> str:
     body = "imu" if calibration.imu else calibration.body
-    text = f"T_{body}_sensor; rotation: std about the sensor's axes; t_{body} = t_sensor + time offset."
+    text = (
+        f"T_{body}_sensor; rotation: Rz(yaw) Ry(pitch) Rx(roll), std about the sensor's axes; t_{body} = t_sensor + "
+        "time offset."
+    )
     scaled = any(g.columns is not None and g.factor is not None for g in calibration.groups)
     text += f" std {SCALED if scaled else FORMAL}."
     if {"weak", "undetermined"} & {v for g in calibration.groups for v in g.verdict}:

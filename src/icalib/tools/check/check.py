@@ -21,7 +21,7 @@ from icalib.data.recordings.several import Source
 from icalib.errors import CalibrationError, EstimationError
 from icalib.geometry import so3
 from icalib.pipeline import Progress, calibrate_measurements, measure
-from icalib.result import Calibration, SensorFit, joint_covariance
+from icalib.result import Calibration, ParameterGroup, SensorFit, joint_covariance
 from icalib.result.as_rig import rig_of_result
 from icalib.result.verdict import NUISANCE, lens_verdict
 from icalib.rig import LENS, Rig
@@ -31,6 +31,7 @@ from icalib.tools.comparison.significance import sigmas
 
 Validity = Literal["valid", "changed", "cannot say"]
 EXIT_CODES: dict[Validity, int] = {"valid": 0, "changed": 1, "cannot say": 3}
+IN_ITSELF = ("rotation", "translation", "time_offset")
 READING_SHARE, SOLVED_SHARE = 0.5, 0.8  # of the time: the end of reading, and of the first solve
 
 
@@ -57,8 +58,8 @@ class Check:
 
     limit: sigma above which one block counts as changed. tested: the blocks that both results estimate; changed: those
     beyond the limit. unknown: parameters, as "cam0 translation", that the calibration knows and the new recording does
-    not determine. reason: why nothing can be said, else empty. fits: of the calibration's own recording; with its
-    values fixed on the new one; of the new one alone.
+    not determine. untested: those that the rig file fixes. reason: why nothing can be said, else empty. fits: of the
+    calibration's own recording; with its values fixed on the new one; of the new one alone.
     """
 
     validity: Validity
@@ -67,6 +68,7 @@ class Check:
     tested: tuple[Difference, ...]
     changed: tuple[Difference, ...]
     unknown: tuple[str, ...]
+    untested: tuple[str, ...]
     comparison: Comparison | None
     drifts: tuple[Drift, ...]
     fits: tuple[tuple[SensorFit, ...], tuple[SensorFit, ...], tuple[SensorFit, ...]]
@@ -113,7 +115,7 @@ def check_measurements(
     try:
         new = calibrate_measurements(rig, measurements, lambda s, done: progress(s, SOLVED_SHARE * done))
     except EstimationError as error:
-        return Check("cannot say", str(error), sigma, (), (), (), None, (), (old, (), ()), None)
+        return Check("cannot say", str(error), sigma, (), (), (), (), None, (), (old, (), ()), None)
     fixed = _fits_of_fixed(rig_of_result(calibration, "fixed")[0], measurements, progress)
     comparison = compare_sides(
         side_of_result(calibration, "the calibration"), side_of_result(new, "the new recording"), limit=sigma
@@ -126,7 +128,8 @@ def check_measurements(
     validity: Validity = "cannot say" if reason else "changed" if changed else "cannot say" if unknown else "valid"
     drifts = tuple(_drifts(calibration, new))
     blocks = tuple(d for d, _ in tested)
-    return Check(validity, reason, limit, blocks, changed, unknown, comparison, drifts, (old, fixed, new.fits), new)
+    untested, all_fits = tuple(_fixed(calibration)), (old, fixed, new.fits)
+    return Check(validity, reason, limit, blocks, changed, unknown, untested, comparison, drifts, all_fits, new)
 
 
 def joint_limit(sigma: float, tests: int) -> float:
@@ -155,8 +158,20 @@ def _undetermined(c: Calibration) -> list[str]:
             continue
         lens = g.name in LENS and g.sensor in c.cameras
         if (lens_verdict(c, g.sensor) == "undetermined") if lens else ("undetermined" in g.verdict):
-            found.append(f"{g.sensor} {'lens' if lens else g.name.replace('_', ' ')}")
+            found.append(_block(c, g))
     return list(dict.fromkeys(found))
+
+
+def _fixed(c: Calibration) -> list[str]:
+    """Names of groups that the rig file fixes, but for the pose of the body in itself."""
+    own = [g for g in c.groups if g.columns is None and g.sensor in c.rig["sensors"] and g.name not in NUISANCE]
+    fixed = [_block(c, g) for g in own if g.mode == "fixed" and not (g.sensor == c.body and g.name in IN_ITSELF)]
+    return list(dict.fromkeys(fixed))
+
+
+def _block(c: Calibration, g: ParameterGroup) -> str:
+    lens = g.name in LENS and g.sensor in c.cameras
+    return f"{g.sensor} {'lens' if lens else g.name.replace('_', ' ')}"
 
 
 def _drifts(old: Calibration, new: Calibration) -> list[Drift]:

@@ -43,7 +43,8 @@ def verdict(check: Check) -> str:
             f"Cannot say: the new recording does not determine {', '.join(check.unknown)}; all else is unchanged. "
             "Record longer, with more motion."
         )
-    return f"Valid: no parameter changed by more than {check.limit:.1f} sigma."
+    untested = f" Not tested, as the rig file fixes them: {', '.join(check.untested)}." if check.untested else ""
+    return f"Valid: no parameter changed by more than {check.limit:.1f} sigma.{untested}"
 
 
 def named(check: Check) -> list[str]:
@@ -72,6 +73,7 @@ def check_json(check: Check) -> str:
         "limit_sigma": check.limit,
         "changed": [f"{d.sensor} {d.what}" for d in check.changed],
         "not_determined": list(check.unknown),
+        "not_tested": list(check.untested),
         "notes": [] if check.new is None else list(check.new.reasons),
         "drifts": [dataclasses.asdict(d) for d in check.drifts],
         "differences": [dataclasses.asdict(d) for d in check.tested],
