@@ -15,10 +15,12 @@ import numpy as np
 from icalib.data.measurements import CornerStream, ImuStream, Measurements
 from icalib.data.recordings import open_recording, read_measurements
 from icalib.geometry import so3
+from icalib.geometry.targets.base import SIZE_SIGMA
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
-from icalib.rig import Rig
+from icalib.rig import Parameter, Rig
 from icalib.rig.file import load_rig
+from icalib.rig.imu_classes import N_INTRINSICS, class_imperfections, class_of_noise
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "euroc"
 PLAIN = {"bloom": False, "board_shape": False, "blur_noise": False, "common_error": False}
@@ -29,6 +31,7 @@ MODELS = {
     "bloom, shape, blur (default)": PLAIN | {"bloom": True, "board_shape": True, "blur_noise": True},
     "default and common error": {k: True for k in PLAIN},
 }
+IMPERFECT = "default, priors on IMU and target"
 
 
 def part(measurements: Measurements, start: float, stop: float) -> Measurements:
@@ -67,6 +70,14 @@ def with_model(rig: Rig, model: str | None, **settings: bool) -> Rig:
     return dataclasses.replace(rig, cameras=cameras, settings=dataclasses.replace(rig.settings, **settings))
 
 
+def with_priors(rig: Rig) -> Rig:
+    """The rig with the default priors on the IMU's intrinsics and the size of the target."""
+    assert rig.imu is not None
+    prior = Parameter("prior", np.zeros(N_INTRINSICS), class_imperfections(class_of_noise(rig.imu.noise)).sigma)
+    target = dataclasses.replace(rig.target, size_sigma=SIZE_SIGMA)
+    return dataclasses.replace(rig, imu=dataclasses.replace(rig.imu, intrinsics=prior), target=target)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--data", type=Path, default=Path(os.environ.get("ICALIB_DATA", "../shared/data")))
@@ -81,8 +92,9 @@ def main() -> None:
         ("free, pinhole-radtan5", free, "pinhole-radtan5"),
         ("free, pinhole-equidistant", free, "pinhole-equidistant"),
     ):
-        for name, settings in MODELS.items():
-            one, two = (calibrate_measurements(with_model(rig, model, **settings), h) for h in halves)
+        models = {name: with_model(rig, model, **settings) for name, settings in MODELS.items()}
+        for name, own in (models | {IMPERFECT: with_priors(with_model(rig, model))}).items():
+            one, two = (calibrate_measurements(own, h) for h in halves)
             d, formal, printed = differences(one, two)
             print(
                 f"| {title} | {name} | {d['rotation']:.3f} | {d['translation']:.2f} | {d['time_offset']:.1f} "
