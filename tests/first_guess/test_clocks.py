@@ -8,7 +8,7 @@ import pytest
 from icalib.data.measurements import ImuStream
 from icalib.errors import EstimationError
 from icalib.initialize.steps.clock_shifts import CameraRates
-from icalib.initialize.steps.clocks import align
+from icalib.initialize.steps.clocks import Alignment, align, check_axes
 from icalib.motion.imu_data import ImuData
 from icalib.rig import ImuNoise
 from icalib.tools.simulation.sensors.imu import rotation_from_vector
@@ -88,3 +88,18 @@ def _turning_axis(count: int) -> np.ndarray:
     t = np.linspace(0.0, 1.0, count)
     z, angle = 2.0 * t - 1.0, 25.0 * t
     return np.stack([np.sqrt(1.0 - z**2) * np.cos(angle), np.sqrt(1.0 - z**2) * np.sin(angle), z], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("on_wheels", "advice"),
+    [(False, "turn the rig about the x and y axes of imu0 as well"), (True, "drive over ramps")],
+)
+def test_turns_about_one_axis_are_refused_with_what_the_rig_can_do(on_wheels: bool, advice: str):
+    seconds = np.arange(0.0, 10.0, 0.005)
+    gyro = np.zeros((len(seconds), 3))
+    gyro[:, 2] = np.sin(seconds)
+    stream = ImuStream("imu0", (1e9 * seconds).astype(np.int64), gyro, np.zeros_like(gyro))
+    imu = ImuData.build(stream, ImuNoise(1e-3, 1e-2, 1e-5, 1e-4))
+    rates = CameraRates(seconds[100:-101:10], seconds[110:-91:10], gyro[105:-96:10], least_correlation=0.3)
+    with pytest.raises(EstimationError, match=f"cam0 turned about one axis only.*; {advice}, or give `rotation`"):
+        check_axes(imu, rates, Alignment(0.0, np.eye(3), np.zeros(3)), "cam0", on_wheels)

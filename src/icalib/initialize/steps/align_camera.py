@@ -53,14 +53,14 @@ def align_camera(
     try:
         found = align(imu, camera.name, rates, None if held is None else relative_offset(held, stream, measurements))
         if rotation is None:
-            check_axes(imu, rates, found, camera.name)
+            check_axes(imu, rates, found, camera.name, bool(measurements.wheels))
     except EstimationError:
         if given is None:
             raise
         at = relative_offset(given, stream, measurements)
         if rotation is None:
             found = align(imu, camera.name, rates, at)
-            check_axes(imu, rates, found, camera.name)
+            check_axes(imu, rates, found, camera.name, bool(measurements.wheels))
         else:
             found = as_given(imu, camera.name, rates, at, rotation)
             if contradicts(imu, rates, found):

@@ -300,12 +300,15 @@ def main_axis(rate: np.ndarray) -> np.ndarray:
     return _axes(rate)[1][0]
 
 
-def check_axes(imu: ImuData, rates: CameraRates, found: Alignment, name: str) -> None:
-    """Raises OneAxisError where the camera turned about one axis only."""
+def check_axes(imu: ImuData, rates: CameraRates, found: Alignment, name: str, on_wheels: bool) -> None:
+    """Raises OneAxisError where the camera turned about one axis only. on_wheels: a vehicle, which turns about others
+    on slopes only."""
     if not turns_about_two_axes(imu, rates, found):
+        axes = other_axes(imu.name, main_axis(imu.gyro))
+        motion = "drive over ramps" if on_wheels else f"turn the rig about {axes} as well"
         raise OneAxisError(
-            f"{name} turned about one axis only, so its rotation about that axis is unobservable; turn the rig "
-            f"about {other_axes(imu.name, main_axis(imu.gyro))} as well, or give `rotation` in the rig file."
+            f"{name} turned about one axis only, so its rotation about that axis is unobservable; {motion}, or "
+            "give `rotation` in the rig file."
         )
 
 
