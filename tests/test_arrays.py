@@ -49,7 +49,10 @@ def test_seconds_and_nanoseconds():
 def test_every_other_kind():
     scans = [np.ones((2, 3)), np.zeros((0, 3)), 2.0 * np.ones((1, 3))]
     scan = arrays.lidar("lidar0", T, scans, [[0.0, 0.01], [], [0.02]])
-    assert scan.start.tolist() == [0, 2, 2, 3] and scan.offset_s.tolist() == np.float32([0.0, 0.01, 0.02]).tolist()
+    assert (
+        scan.start.tolist() == [0, 2, 2, 3]
+        and scan.offset_s.tolist() == np.array([0.0, 0.01, 0.02], np.float32).tolist()
+    )
     assert scan.xyz.tolist() == [[1.0] * 3, [1.0] * 3, [2.0] * 3] and scan.plane.tolist() == [-1] * 3
     seen = arrays.tracks("cam0", T, [[7, 8], [7], []], [np.ones((2, 2)), np.ones((1, 2)), []])
     assert seen.feature.tolist() == [7, 8, 7] and seen.start.tolist() == [0, 2, 3, 3]

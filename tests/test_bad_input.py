@@ -12,12 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from tests.typed import instance
 
 from icalib import pipeline
 from icalib.base.own_files import sealed
 from icalib.cli import main
 from icalib.errors import CalibrationError
 from icalib.geometry import so3
+from icalib.geometry.targets import AprilGrid
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig import Settings
@@ -104,14 +106,15 @@ settings: {board_shape: false, segments: 0}
 def tables(excerpt) -> Tables:
     """The first seconds of the excerpt."""
     end = stamp(excerpt["imu"][0]) + SECONDS * 10**9
-    return Tables(*([x for x in excerpt[k] if stamp(x) < end] for k in ("imu", "cam0")), RIG)
+    imu, cam0 = ([x for x in excerpt[k] if stamp(x) < end] for k in ("imu", "cam0"))
+    return Tables(imu, cam0, RIG)
 
 
 @pytest.fixture(scope="module")
 def good(excerpt, tmp_path_factory) -> Calibration:
     end = stamp(excerpt["imu"][0]) + SECONDS * 10**9
-    whole = Tables(*([x for x in excerpt[k] if stamp(x) < end] for k in ("imu", "cam0")), RIG)
-    return pipeline.calibrate(*whole.write(tmp_path_factory.mktemp("good")))
+    imu, cam0 = ([x for x in excerpt[k] if stamp(x) < end] for k in ("imu", "cam0"))
+    return pipeline.calibrate(*Tables(imu, cam0, RIG).write(tmp_path_factory.mktemp("good")))
 
 
 def run(tables: Tables, folder: Path, *more: str) -> int:
@@ -420,6 +423,7 @@ def test_the_error_class_of_all_these_is_one(tables, tmp_path):
 def test_a_wrong_tag_spacing_is_warned_about():
     simulation = simulate(handheld(8.0), 1)
     rig = rig_for(simulation.scenario, settings=Settings(segments=0))
-    target = dataclasses.replace(rig.target, tag_spacing=0.25, tag_size=rig.target.tag_size * 1.3 / 1.25)
+    target = instance(rig.target, AprilGrid)
+    target = dataclasses.replace(target, tag_spacing=0.25, tag_size=target.tag_size * 1.3 / 1.25)
     found = calibrate_measurements(dataclasses.replace(rig, target=target), simulation.measurements)
     assert [w for w in found.warnings if "check tag_size and tag_spacing" in w]

@@ -11,7 +11,7 @@ from icalib.base.compiled import njit
 
 
 @pytest.mark.parametrize("enabled", [True, False])
-def test_the_garbage_collector_rests_while_a_kernel_is_compiled(enabled: bool):
+def test_the_garbage_collector_rests_while_a_kernel_is_compiled(enabled: bool, monkeypatch):
     @njit()
     def inner(x):
         return x + 1
@@ -22,7 +22,7 @@ def test_the_garbage_collector_rests_while_a_kernel_is_compiled(enabled: bool):
 
     listener, before = event.RecordingListener(), gc.isenabled()
     during: list[bool] = []
-    listener.on_start = lambda _: during.append(gc.isenabled())
+    monkeypatch.setattr(listener, "on_start", lambda _: during.append(gc.isenabled()))
     try:
         (gc.enable if enabled else gc.disable)()
         with event.install_listener("numba:compile", listener):

@@ -25,6 +25,7 @@ def test_the_four_ways_to_treat_a_parameter():
     assert kept.mode == "fixed" and kept.value is not None and kept.value.dtype == np.float64 and kept.sigma is None
     known = icalib.prior(TURN, 0.01)
     assert known.mode == "prior" and known.sigma is not None and known.sigma.tolist() == [0.01] * 3 and known.size == 3
+    assert known.value is not None
     np.testing.assert_allclose(known.value, TURN.as_matrix(), atol=1e-15)
 
 

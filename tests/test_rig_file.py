@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from tests.typed import instance, not_none
 
 from icalib.errors import CalibrationError, RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard
@@ -66,31 +67,39 @@ def complaint(tmp_path: Path, text: str) -> str:
 def test_everything_is_read(tmp_path):
     rig = load(tmp_path, VALID)
     cam0, cam1 = rig.cameras
-    assert (rig.imu.name, rig.imu.path, rig.imu.noise.gyro_walk, rig.imu.noise.source) == (
+    assert (
+        not_none(rig.imu).name,
+        not_none(rig.imu).path,
+        not_none(rig.imu).noise.gyro_walk,
+        not_none(rig.imu).noise.source,
+    ) == (
         "imu0",
         "imu0/data.csv",
         2e-5,
         "rig file",
     )
-    assert rig.imu.intrinsics.mode == "prior"
+    assert not_none(rig.imu).intrinsics.mode == "prior"
     assert (cam0.path, cam0.model, cam0.resolution, cam0.corner_noise_px) == (
         "cam0/corners.csv",
         "pinhole-radtan",
         (752, 480),
         0.2,
     )
-    assert cam0.rotation.mode == "free" and np.array_equal(cam0.rotation.value, [[0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    assert cam0.translation.mode == "prior" and np.array_equal(cam0.translation.sigma, [0.05, 0.05, 0.05])
+    assert cam0.rotation.mode == "free" and np.array_equal(
+        not_none(cam0.rotation.value), [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    )
+    assert cam0.translation.mode == "prior" and np.array_equal(not_none(cam0.translation.sigma), [0.05, 0.05, 0.05])
     assert cam0.time_offset.mode == "free" and cam0.time_offset.value is None
-    assert cam0.intrinsics.mode == "fixed" and cam0.intrinsics.value[2] == 367.215
-    assert cam0.bloom.value.shape == cam0.bloom.sigma.shape == (1,)
+    assert cam0.intrinsics.mode == "fixed" and not_none(cam0.intrinsics.value)[2] == 367.215
+    assert not_none(cam0.bloom.value).shape == not_none(cam0.bloom.sigma).shape == (1,)
     assert (cam1.path, cam1.model, cam1.distortion.mode, cam1.corner_noise_px) == (
         "right/corners.csv.gz",
         "pinhole-equidistant",
         "free",
         None,
     )
-    assert (rig.target.cols, rig.target.tag_size, rig.gravity) == (7, 0.088, 9.80665)
+    target = instance(rig.target, AprilGrid)
+    assert (target.cols, target.tag_size, rig.gravity) == (7, 0.088, 9.80665)
     s = rig.settings
     assert (s.scheme, s.loss, s.segments, s.bloom, s.outlier_std) == ("pose", "cauchy", 0, False, 4.0)
     assert rig.path == tmp_path / "rig.yaml"
@@ -100,16 +109,16 @@ def test_defaults(tmp_path):
     text = VALID[: VALID.index("gravity")].replace(VALID.splitlines(keepends=True)[3], "")
     rig = load(tmp_path, text)
     assert rig.gravity == 9.81 and rig.settings == Rig.settings
-    assert rig.imu.noise.source == "default for a consumer IMU"
+    assert not_none(rig.imu).noise.source == "default for a consumer IMU"
 
 
 def test_topics_of_a_bag(tmp_path):
     text = edited("    path: right/corners.csv.gz\n", "    topic: /right/image_raw\n")
     rig = load(tmp_path, text.replace("    type: imu\n", "    type: imu\n    topic: /imu/data\n"))
-    assert (rig.imu.topic, [c.topic for c in rig.cameras]) == ("/imu/data", [None, "/right/image_raw"])
+    assert (not_none(rig.imu).topic, [c.topic for c in rig.cameras]) == ("/imu/data", [None, "/right/image_raw"])
     assert rig.cameras[1].path == "cam1/corners.csv"
     again = load(tmp_path, yaml.safe_dump(rig_to_dict(rig)))
-    assert (again.imu.topic, [c.topic for c in again.cameras]) == ("/imu/data", [None, "/right/image_raw"])
+    assert (not_none(again.imu).topic, [c.topic for c in again.cameras]) == ("/imu/data", [None, "/right/image_raw"])
 
 
 def test_units_axes_and_sources_of_an_imu(tmp_path):
@@ -120,11 +129,13 @@ def test_units_axes_and_sources_of_an_imu(tmp_path):
     gyro_axes: [z, x, y]
 """
     rig = load(tmp_path, edited("    type: imu\n", "    type: imu\n" + extra))
-    assert rig.imu.topic == TwoSources("/a", "/b")
-    assert (rig.imu.accel_unit, rig.imu.gyro_unit) == ("g", "deg/s")
-    assert (rig.imu.accel_axes, rig.imu.gyro_axes) == (("x", "-y", "-z"), ("z", "x", "y"))
+    assert not_none(rig.imu).topic == TwoSources("/a", "/b")
+    assert (not_none(rig.imu).accel_unit, not_none(rig.imu).gyro_unit) == ("g", "deg/s")
+    assert (not_none(rig.imu).accel_axes, not_none(rig.imu).gyro_axes) == (("x", "-y", "-z"), ("z", "x", "y"))
     again, ideal = rig_from_dict(rig_to_dict(rig), "again").imu, Parameter("fixed")
-    assert dataclasses.replace(again, intrinsics=ideal) == dataclasses.replace(rig.imu, intrinsics=ideal)
+    assert dataclasses.replace(not_none(again), intrinsics=ideal) == dataclasses.replace(
+        not_none(rig.imu), intrinsics=ideal
+    )
 
 
 @pytest.mark.parametrize(
@@ -142,7 +153,9 @@ def test_wrong_units_axes_and_sources_of_an_imu(tmp_path, line, words):
 
 @pytest.mark.parametrize("name", IMU_CLASSES)
 def test_imu_classes(tmp_path, name):
-    noise = load(tmp_path, edited("{gyro: 1.7e-4, gyro_walk: 2e-5, accel: 2e-3, accel_walk: 3e-3}", name)).imu.noise
+    noise = not_none(
+        load(tmp_path, edited("{gyro: 1.7e-4, gyro_walk: 2e-5, accel: 2e-3, accel_walk: 3e-3}", name)).imu
+    ).noise
     assert name in noise.source and noise.source.startswith("default for a")
     assert noise.gyro > noise.gyro_walk > 0 and noise.accel > 0 and noise.accel_walk > 0
 
@@ -162,21 +175,21 @@ TURN = "{guess: [[0, -1, 0], [1, 0, 0], [0, 0, 1]]}"
 )
 def test_rotations(tmp_path, value, expected):
     rotation = load(tmp_path, edited(TURN, f"{{fixed: {value}}}")).cameras[0].rotation
-    np.testing.assert_allclose(rotation.value, expected, atol=1e-8)
-    np.testing.assert_allclose(rotation.value @ rotation.value.T, np.eye(3), atol=1e-15)
+    np.testing.assert_allclose(not_none(rotation.value), expected, atol=1e-8)
+    np.testing.assert_allclose(not_none(rotation.value) @ not_none(rotation.value).T, np.eye(3), atol=1e-15)
 
 
 def test_rounded_rotation_is_made_orthonormal(tmp_path):
     rows = "[[0.0149, -0.9999, 0.0041], [0.9996, 0.0150, 0.0257], [-0.0258, 0.0038, 0.9997]]"
     value = load(tmp_path, edited(TURN, f"{{fixed: {rows}}}")).cameras[0].rotation.value
-    np.testing.assert_allclose(value @ value.T, np.eye(3), atol=1e-14)
-    np.testing.assert_allclose(value, yaml.safe_load(rows), atol=2e-4)
+    np.testing.assert_allclose(value @ not_none(value).T, np.eye(3), atol=1e-14)
+    np.testing.assert_allclose(not_none(value), yaml.safe_load(rows), atol=2e-4)
 
 
 @pytest.mark.parametrize(("sigma", "expected"), [("sigma_deg: 180", [np.pi] * 3), ("sigma: [1, 2, 3]", [1, 2, 3])])
 def test_rotation_sigma(tmp_path, sigma, expected):
     text = edited(TURN, f"{{prior: {{rpy_deg: [0, 0, 90]}}, {sigma}}}")
-    np.testing.assert_allclose(load(tmp_path, text).cameras[0].rotation.sigma, expected)
+    np.testing.assert_allclose(not_none(load(tmp_path, text).cameras[0].rotation.sigma), expected)
 
 
 NOISE = "{gyro: 1.7e-4, gyro_walk: 2e-5, accel: 2e-3, accel_walk: 3e-3}"
@@ -185,13 +198,13 @@ NOISE = "{gyro: 1.7e-4, gyro_walk: 2e-5, accel: 2e-3, accel_walk: 3e-3}"
 def with_intrinsics(tmp_path, value, noise=None):
     """IMU intrinsics of a rig file that says `value` of them, or nothing."""
     text = edited("    type: imu\n", "    type: imu\n" + (f"    intrinsics: {value}\n" if value else ""))
-    return load(tmp_path, text.replace(NOISE, noise) if noise else text).imu.intrinsics
+    return not_none(load(tmp_path, text.replace(NOISE, noise) if noise else text).imu).intrinsics
 
 
 def test_free_imu_intrinsics_are_broad_priors(tmp_path):
     intrinsics = with_intrinsics(tmp_path, "free")
-    assert intrinsics.mode == "prior" and np.array_equal(intrinsics.value, np.zeros(24))
-    assert intrinsics.sigma.tolist() == [0.05] * 15 + [0.01] * 9
+    assert intrinsics.mode == "prior" and np.array_equal(not_none(intrinsics.value), np.zeros(24))
+    assert not_none(intrinsics.sigma).tolist() == [0.05] * 15 + [0.01] * 9
 
 
 @pytest.mark.parametrize(
@@ -205,7 +218,7 @@ def test_free_imu_intrinsics_are_broad_priors(tmp_path):
 )
 def test_by_default_imu_intrinsics_have_the_prior_of_the_class(tmp_path, noise, name):
     found = with_intrinsics(tmp_path, None, noise)
-    assert found.mode == "prior" and np.array_equal(found.value, np.zeros(24))
+    assert found.mode == "prior" and np.array_equal(not_none(found.value), np.zeros(24))
     np.testing.assert_array_equal(found.sigma, with_intrinsics(tmp_path, name).sigma)
     np.testing.assert_array_equal(found.sigma, class_imperfections(name).sigma)
 
@@ -228,9 +241,9 @@ def test_imu_intrinsics_with_own_values(tmp_path):
     values = [round(0.001 * k, 3) for k in range(24)]
     for form, mode, sigma in (("fixed: {}", "fixed", None), ("prior: {}, sigma: 0.1", "prior", [0.1] * 24)):
         text = edited("    type: imu\n", f"    type: imu\n    intrinsics: {{{form.format(values)}}}\n")
-        intrinsics = load(tmp_path, text).imu.intrinsics
-        assert intrinsics.mode == mode and intrinsics.value.tolist() == values
-        assert (intrinsics.sigma if sigma is None else intrinsics.sigma.tolist()) == sigma
+        intrinsics = not_none(load(tmp_path, text).imu).intrinsics
+        assert intrinsics.mode == mode and not_none(intrinsics.value).tolist() == values
+        assert (intrinsics.sigma if sigma is None else not_none(intrinsics.sigma).tolist()) == sigma
 
 
 @pytest.mark.parametrize("extra", ["", "    intrinsics: free\n", "    intrinsics: fixed\n"])
@@ -243,7 +256,11 @@ def test_plain_data_load_back_as_the_same_rig(tmp_path, extra, noise):
     plain = rig_to_dict(rig)
     again = load(tmp_path, yaml.safe_dump(plain, sort_keys=False))
     assert rig_to_dict(again) == plain
-    assert (again.imu.noise, again.settings, again.target) == (rig.imu.noise, rig.settings, rig.target)
+    assert (not_none(again.imu).noise, again.settings, again.target) == (
+        not_none(rig.imu).noise,
+        rig.settings,
+        rig.target,
+    )
     for a, b in zip(again.cameras, rig.cameras, strict=True):
         for group in ("rotation", "translation", "time_offset", "intrinsics", "distortion", "bloom"):
             p, q = getattr(a, group), getattr(b, group)

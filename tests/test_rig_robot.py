@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from tests.typed import not_none
 
 from icalib.errors import RigError
 from icalib.rig import Ground, Lidar, Parameter, PoseSensor, Rig, Wheels
@@ -91,15 +92,15 @@ def test_lidars_and_wheels_are_read(tmp_path):
         60.0,
     )
     assert (a.point_time, a.topic, a.time_offset.mode) == ("azimuth", "/lidar/points", "fixed")
-    assert a.rotation == Parameter() and np.array_equal(a.translation.value, [0.1, 0, 0.3])
+    assert a.rotation == Parameter() and np.array_equal(not_none(a.translation.value), [0.1, 0, 0.3])
     assert b == Lidar("lidar1", "top/scans.npz") and (rig.cameras, rig.body) == ((), "imu0")
     ticks, rates, poses = rig.wheels
     assert (ticks.measures, ticks.counts_per_turn, ticks.counter_size) == ("ticks", 4096.5, 65536)
     assert (ticks.path, ticks.topic, ticks.joints) == ("wheel0/ticks.csv", "/joints", ("l", "r"))
     assert (ticks.wheel_noise, ticks.lateral_slip, ticks.vertical_slip) == (0.01, 0.002, 0.003)
-    assert ticks.factor == "relative-poses" and np.array_equal(ticks.radii.value, [0.1, 0.11])
-    assert ticks.rotation.mode == "prior" and np.allclose(ticks.rotation.value @ [1, 0, 0], [0, 1, 0])
-    assert ticks.baseline.mode == "free" and np.array_equal(ticks.baseline.value, [0.4])
+    assert ticks.factor == "relative-poses" and np.array_equal(not_none(ticks.radii.value), [0.1, 0.11])
+    assert ticks.rotation.mode == "prior" and np.allclose(not_none(ticks.rotation.value) @ [1, 0, 0], [0, 1, 0])
+    assert ticks.baseline.mode == "free" and np.array_equal(not_none(ticks.baseline.value), [0.4])
     assert rates == Wheels("wheel1", "wheel1/rates.csv", sampling="instantaneous")
     assert poses == Wheels("wheel2", "wheel2/poses.csv", measures="poses", factor="relative-poses")
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from tests.typed import not_none
 
 from icalib.data.measurements import CornerStream, ImuStream, Measurements
 from icalib.data.recordings import open_recording, read_measurements
@@ -67,11 +68,16 @@ def cut() -> Callable[[Measurements, float, float], Measurements]:
 
     def part(measurements: Measurements, low: float, high: float) -> Measurements:
         imu = measurements.imu
-        first, length = imu.stamps_ns[0], imu.stamps_ns[-1] - imu.stamps_ns[0]
+        first, length = not_none(imu).stamps_ns[0], not_none(imu).stamps_ns[-1] - not_none(imu).stamps_ns[0]
         begin, end = first + int(length * low), first + int(length * high)
-        kept = (imu.stamps_ns >= begin) & (imu.stamps_ns <= end)
+        kept = (not_none(imu).stamps_ns >= begin) & (not_none(imu).stamps_ns <= end)
         cameras = tuple(_images(c, (c.stamps_ns >= begin) & (c.stamps_ns <= end)) for c in measurements.cameras)
-        return Measurements(ImuStream(imu.name, imu.stamps_ns[kept], imu.gyro[kept], imu.accel[kept]), cameras)
+        return Measurements(
+            ImuStream(
+                not_none(imu).name, not_none(imu).stamps_ns[kept], not_none(imu).gyro[kept], not_none(imu).accel[kept]
+            ),
+            cameras,
+        )
 
     return part
 

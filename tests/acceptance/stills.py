@@ -122,6 +122,7 @@ class Adjustment:
 
     def solve(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         """x, its standard deviations, and the median-based size of a residual's component [px]."""
+        sigma, H = np.nan, np.zeros((len(x), len(x)))
         for turn in range(ROUNDS):
             r, J = self.residuals(x), self.jacobian(x)
             size = np.linalg.norm(r, axis=1)

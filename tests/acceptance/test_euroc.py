@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from tests.typed import not_none
 
 from icalib.data.measurements import ImuStream, Measurements
 from icalib.geometry import so3
@@ -104,10 +105,12 @@ def baseline_std(calibration: Calibration) -> float:
     """Of |p_imu_cam0 - p_imu_cam1|, to first order, from the formal covariance and the larger factor of the two."""
     first, second = (calibration.group(c, "translation") for c in CAMERAS)
     direction = (first.value - second.value) / np.linalg.norm(first.value - second.value)
-    a, b = list(first.columns), list(second.columns)
+    a, b = list(not_none(first.columns)), list(not_none(second.columns))
     C = calibration.covariance
     relative = C[np.ix_(a, a)] + C[np.ix_(b, b)] - C[np.ix_(a, b)] - C[np.ix_(b, a)]
-    return float(np.sqrt(direction @ relative @ direction) * max(first.factor.max(), second.factor.max()))
+    return float(
+        np.sqrt(direction @ relative @ direction) * max(not_none(first.factor).max(), not_none(second.factor).max())
+    )
 
 
 @pytest.fixture(scope="module", params=["fixed", "free"])

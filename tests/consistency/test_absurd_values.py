@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from tests.consistency.test_assumed_motion import mocap, without_imu
 from tests.consistency.test_wheel_kinds import reporting
+from tests.typed import not_none
 
 from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
@@ -35,7 +36,7 @@ def solved(monkeypatch) -> list[Rig]:
 
 def measured(scenario: Scenario, imu: bool) -> tuple[Rig, Measurements, Rig]:
     """The rig from nothing, what it measured, and the rig at its true values."""
-    truth = rig_for(scenario, **dict.fromkeys(("rotation", "translation", "drive"), "fixed"))
+    truth = rig_for(scenario, rotation="fixed", translation="fixed", drive="fixed")
     if not imu:
         rig, measurements, _ = without_imu(scenario, SEED)
         return rig, measurements, truth
@@ -103,8 +104,8 @@ def test_what_is_merely_wrong_is_estimated_with_it(robot, solved, times, named):
 def test_a_prior_that_is_far_off_gives_way(robot):
     """The radii do not end up on the other side of zero, from where nothing leads back."""
     rig, measurements, truth = measured(*drive(robot, "lw"))
-    true = truth.wheels[0].radii.value
+    true = not_none(truth.wheels[0].radii.value)
     result = calibrate_measurements(with_value(rig, "radii", 10.0 * true, 1e-3), measurements)
     (words,) = [w for w in result.warnings if "the prior of radii" in w]
     shown = float(words.split("alone show ")[1].split(" +- ")[0])
-    assert result.converged and min(abs(shown - 1e3 * r) for r in true) < 2.0
+    assert result.converged and min(abs(shown - 1e3 * r) for r in not_none(true)) < 2.0

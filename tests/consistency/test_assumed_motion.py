@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 from tests.consistency.test_robot import steady
+from tests.typed import not_none
 
 from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
@@ -43,7 +44,11 @@ def true_beside(simulation: Simulation, body: str, sensor: str, name: str) -> np
     """As `true_value`, of a sensor as seen from the body's."""
     values = {s: {n: true_value(simulation.truth, s, n) for n in MOUNT} for s in (body, sensor)}
     (R, p, t), (Q, q, u) = (tuple(values[s][n] for n in MOUNT) for s in (body, sensor))
-    beside = {"rotation": R.T @ Q, "translation": R.T @ (q - p), "time_offset": u - t}
+    beside = {
+        "rotation": not_none(R).T @ Q,
+        "translation": not_none(R).T @ (not_none(q) - p),
+        "time_offset": not_none(u) - t,
+    }
     return beside.get(name, true_value(simulation.truth, sensor, name))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -17,9 +18,10 @@ from icalib.tools.simulation import Scenario, Simulation, handheld, rig_for, sim
 
 ROTATION_RAD, TRANSLATION_M, OFFSET_S = 0.087, 0.05, 0.02  # of a guess
 MOST_SIGMA = 4.0
+ImuQuality = Literal["datasheet", "noisy"]
 
 
-def moving(kind: str, imu: str = "datasheet") -> Scenario:
+def moving(kind: str, imu: ImuQuality = "datasheet") -> Scenario:
     scenario = handheld(20.0, imu=imu, exact=False)
     return dataclasses.replace(scenario, motion=dataclasses.replace(scenario.motion, kind=kind, exact=False))
 
@@ -71,7 +73,7 @@ def axis_in_camera(simulation: Simulation, camera: str) -> np.ndarray:
     return np.linalg.svd(turns, full_matrices=False)[2][0]
 
 
-def check(kind: str, imu: str, seed: int, mode: str = "prior") -> None:
+def check(kind: str, imu: ImuQuality, seed: int, mode: str = "prior") -> None:
     simulation = simulate(moving(kind, imu), seed)
     rig = guessed(simulation, seed, mode)
     result = calibrate_measurements(rig, simulation.measurements)
@@ -110,7 +112,7 @@ def test_a_noisy_imu_does_not_make_it_up(kind: str):
 @pytest.mark.statistical
 @pytest.mark.parametrize("imu", ["datasheet", "noisy"])
 @pytest.mark.parametrize("kind", ["handheld", "planar", "single_axis", "motionless"])
-def test_no_confident_wrong_number_in_a_hundred(kind: str, imu: str):
+def test_no_confident_wrong_number_in_a_hundred(kind: str, imu: ImuQuality):
     wrong = []
     for seed in range(100):
         simulation = simulate(moving(kind, imu), seed)

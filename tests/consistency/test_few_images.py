@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from tests.typed import not_none
 
 from icalib.data.measurements import CornerStream, Measurements
 from icalib.pipeline import calibrate_measurements
@@ -61,7 +62,7 @@ def test_errors_that_an_image_shares_are_covered(count: int):
 @pytest.mark.parametrize("count", [5, 9, 16])
 def test_white_noise_costs_little_more_than_students_t(count: int):
     results = [stills(count, seed, 0.0) for seed in range(6)]
-    factors = [float(r.group("cam0", "intrinsics").factor[0]) for r in results]
+    factors = [float(not_none(r.group("cam0", "intrinsics").factor)[0]) for r in results]
     assert 1.0 <= np.mean(factors) < 1.25 * few_factor(count - 1)
     assert 0.6 < rms([in_deviations(r, formal=False) for r in results]) < 1.4
 

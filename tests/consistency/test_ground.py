@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.typed import not_none
 
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
@@ -102,6 +103,6 @@ def test_hills_are_no_plane(robot):
         standing(scenario, 0, replace(LEVEL, height=height)), simulation.measurements
     )  # fmt: skip
     ratios = {f.kind: f.chi2_per_dof for f in result.fits if f.sensor == "wheel0"}
-    assert ratios["ground tilt"] > 10.0 and ratios["ground height"] > 10.0
+    assert not_none(ratios["ground tilt"]) > 10.0 and not_none(ratios["ground height"]) > 10.0
     assert any("wheel0 tilts against its ground" in words for words in result.warnings)
     assert any("wheel0 moves up and down over its ground" in words for words in result.warnings)

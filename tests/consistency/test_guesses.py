@@ -31,8 +31,7 @@ def guessed(rig: Rig, **values: np.ndarray) -> Rig:
 
 
 def true_camera(simulation: Simulation) -> Camera:
-    names = ("rotation", "translation", "time_offset")
-    return rig_for(simulation.scenario, **dict.fromkeys(names, "fixed")).cameras[0]
+    return rig_for(simulation.scenario, rotation="fixed", translation="fixed", time_offset="fixed").cameras[0]
 
 
 def value(camera: Camera, name: str) -> np.ndarray:
@@ -98,9 +97,7 @@ def test_all_guesses_wrong_at_once(simulation):
 
 
 def test_good_guesses_are_no_news(simulation):
-    rig = rig_for(
-        simulation.scenario, **dict.fromkeys(("rotation", "translation", "time_offset", "intrinsics"), "start")
-    )
+    rig = rig_for(simulation.scenario, rotation="start", translation="start", time_offset="start", intrinsics="start")
     result = calibrate_measurements(rig, simulation.measurements)
     assert result.converged and noted(result) == []
 

@@ -8,6 +8,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from tests.typed import not_none
 
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter
@@ -61,7 +62,7 @@ def test_a_baseline_carries_the_uncertainty_of_the_target():
         found = calibrate_measurements(rig, measured)
         group = found.group("cam1", "translation")
         along = group.value / np.linalg.norm(group.value)
-        covariance = found.covariance[np.ix_(group.columns, group.columns)]
+        covariance = found.covariance[np.ix_(not_none(group.columns), not_none(group.columns))]
         sizes[sigma] = float(np.sqrt(along @ covariance @ along)) / float(np.linalg.norm(group.value))
     assert np.hypot(sizes[0.0], 0.002) == pytest.approx(sizes[0.002], rel=0.02)
 

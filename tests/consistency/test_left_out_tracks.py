@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.typed import not_none
 
 from icalib.estimate.estimate import ENOUGH, estimate
 from icalib.geometry import so3
@@ -46,7 +47,7 @@ def test_tracks_that_a_wrong_pose_left_out_come_back(settled):
     again, begun = passes(inputs, found, 15.0)
     assert begun[0].followed < 0.5 * found.problem.features.followed
     assert len(begun) == 2
-    assert again.problem.features.followed >= 0.99 * found.problem.features.followed
+    assert not_none(again.problem.features).followed >= 0.99 * found.problem.features.followed
     way = so3.log(
         np.ascontiguousarray(
             found.outcome.state.values["cam0", "rotation"].T @ again.outcome.state.values["cam0", "rotation"]
@@ -59,4 +60,6 @@ def test_where_enough_take_part_there_is_one_pass(settled):
     inputs, found = settled
     again, begun = passes(inputs, found, 0.5)
     assert len(begun) == 1
-    assert again.problem.features.followed > ENOUGH * sum(int(k.sum()) for k in again.problem.features.keep)
+    assert not_none(again.problem.features).followed > ENOUGH * sum(
+        int(k.sum()) for k in not_none(again.problem.features).keep
+    )

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import pytest
 
 from icalib.tools.simulation import handheld, rig_for
 
+ImuQuality = Literal["datasheet", "noisy"]
 CONFIGURATIONS = [(a, i) for a in (False, True) for i in ("datasheet", "noisy")]
 
 
-def check(consistency, asynchronous: bool, imu: str, seeds: range, probability: float) -> None:
+def check(consistency, asynchronous: bool, imu: ImuQuality, seeds: range, probability: float) -> None:
     scenario = handheld(12.0, asynchronous=asynchronous, imu=imu)
     rig = rig_for(scenario, intrinsics="start", distortion="start")
     found = consistency(scenario, rig, seeds, probability)
@@ -18,12 +21,12 @@ def check(consistency, asynchronous: bool, imu: str, seeds: range, probability: 
 
 
 @pytest.mark.parametrize(("asynchronous", "imu"), [(False, "datasheet"), (True, "noisy")])
-def test_a_few_recordings(consistency, asynchronous: bool, imu: str):
+def test_a_few_recordings(consistency, asynchronous: bool, imu: ImuQuality):
     # So few seeds that only a gross fault shows; the bounds are wide so that chance has no part in it.
     check(consistency, asynchronous, imu, range(6), 0.9999)
 
 
 @pytest.mark.statistical
 @pytest.mark.parametrize(("asynchronous", "imu"), CONFIGURATIONS)
-def test_fifty_recordings(consistency, asynchronous: bool, imu: str):
+def test_fifty_recordings(consistency, asynchronous: bool, imu: ImuQuality):
     check(consistency, asynchronous, imu, range(50), 0.95)

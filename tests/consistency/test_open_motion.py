@@ -8,11 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.consistency.conftest import PAPER
+from tests.typed import not_none
 
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.tools.montecarlo.one_run import compare
 from icalib.tools.simulation import Scenario, Simulation, load_scenario, rig_for, simulate, with_drawn_guess
+from icalib.tools.simulation.rigs import Treatment
 
 SECONDS = 8.0
 SPIN_SECONDS = 10.0  # after 8 s of noisy spinning the baseline is called known, 19 standard deviations off
@@ -27,12 +29,12 @@ def thin(motion: str, noise: float, seconds: float = SECONDS) -> Scenario:
         duration_s=seconds,
         imu_noise=scenario.imu_noise.scaled(noise),
         lidars=tuple(replace(x, azimuth_steps=300) for x in scenario.lidars),
-        features=replace(scenario.features, per_image=30, count=450, persistent=60),
+        features=replace(not_none(scenario.features), per_image=30, count=450, persistent=60),
     )
 
 
 def calibrated(
-    motion: str, noise: float, seed: int, lens: str = "fixed", seconds: float = SECONDS
+    motion: str, noise: float, seed: int, lens: Treatment = "fixed", seconds: float = SECONDS
 ) -> tuple[Calibration, Simulation]:
     scenario = thin(motion, noise, seconds)
     simulation = simulate(scenario, seed)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from tests.typed import not_none
 
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
@@ -30,7 +31,7 @@ def scenario_of(example: str, seed: int, relief_m: float = RELIEF_M) -> Scenario
         cameras=scenario.cameras[:1],
         lidars=tuple(replace(x, azimuth_steps=300) for x in scenario.lidars),
         wheels=(),
-        features=replace(scenario.features, relief_m=relief_m, seed=seed),
+        features=replace(not_none(scenario.features), relief_m=relief_m, seed=seed),
     )
 
 
@@ -49,7 +50,7 @@ def between(result: Calibration, simulation: Simulation) -> tuple[float, float]:
     camera, lidar = (result.group(name, "translation") for name in ("cam0", "lidar0"))
     truth = simulation.truth
     off = camera.value - lidar.value - truth.T_imu_cam["cam0"][:3, 3] + truth.T_imu_lidar["lidar0"][:3, 3]
-    i, j = camera.columns[2], lidar.columns[2]
+    i, j = not_none(camera.columns)[2], not_none(lidar.columns)[2]
     C = result.covariance
     return float(off[2]), float(np.sqrt(C[i, i] + C[j, j] - 2.0 * C[i, j]))
 
@@ -62,8 +63,8 @@ def test_on_a_flat_floor_they_tie_camera_and_lidar():
     (words,) = result.undetermined
     assert {"cam0 translation z", "lidar0 translation z"} == set(words.split(":")[0].split(" with "))
     (fit,) = (f for f in result.fits if f.kind == "points on planes")
-    assert fit.sensor == "cam0" and fit.count > 100 and fit.unit == "m" and fit.rms < 1.5 * RELIEF_M
-    assert 0.6 < fit.chi2_per_dof < 1.5
+    assert fit.sensor == "cam0" and fit.count > 100 and fit.unit == "m" and not_none(fit.rms) < 1.5 * RELIEF_M
+    assert 0.6 < not_none(fit.chi2_per_dof) < 1.5
     assert any("of the tracks lie on" in note for note in result.notes)
 
     without, simulation = calibrated(scenario_of("planar", 1), 1, 0.0)
@@ -87,7 +88,7 @@ def test_rough_surfaces_are_told(relief_m: float, says: str):
 
 def test_where_too_few_points_lie_on_planes_a_warning_says_so():
     scenario = scenario_of("3d", 0)
-    few = replace(scenario, features=replace(scenario.features, per_image=6))
+    few = replace(scenario, features=replace(not_none(scenario.features), per_image=6))
     result, _ = calibrated(few, 0)
     (warning,) = (w for w in result.warnings if "points_on_planes_m" in w)
     assert warning.startswith("no tracked points lie on planes")
@@ -104,7 +105,7 @@ def test_planes_are_those_of_the_recording():
     off, std = between(result, simulations[0])
     assert std < 2e-3 and abs(off) < 4.0 * std
     (fit,) = (f for f in result.fits if f.kind == "points on planes")
-    assert fit.count > 100 and 0.5 < fit.chi2_per_dof < 1.6
+    assert fit.count > 100 and 0.5 < not_none(fit.chi2_per_dof) < 1.6
 
 
 @pytest.mark.statistical

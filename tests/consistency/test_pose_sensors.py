@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.typed import not_none
 
 from icalib.data.measurements import PoseStream
 from icalib.errors import EstimationError
@@ -14,6 +15,7 @@ from icalib.pipeline import calibrate_measurements
 from icalib.result import relative_poses
 from icalib.tools.montecarlo.truth import error, true_value
 from icalib.tools.simulation import Drive, Room, Scenario, SimPoses, handheld, rig_for, simulate
+from icalib.tools.simulation.scenario.robot import DriveKind
 
 ROOM = Room((8.0, 6.0, 3.0))
 NOISE = {"absolute": (2e-3, 1e-3), "relative": (5e-3, 1e-2)}
@@ -36,7 +38,7 @@ def sensor(kind, name="mocap0", **others):
     )  # fmt: skip
 
 
-def alone(kind, motion="free", exact=True, **others):
+def alone(kind, motion: DriveKind = "free", exact=True, **others):
     drive = Drive(motion, exact=exact)
     return Scenario((), duration_s=12.0, motion=drive, board=False, room=ROOM, poses=(sensor(kind),), **others)
 
@@ -44,7 +46,7 @@ def alone(kind, motion="free", exact=True, **others):
 def errors(result, truth, name):
     """Of rotation [rad], translation [m], time offset [s]."""
     values = (result.group(name, b).value for b in BLOCKS)
-    return [error(b, v, true_value(truth, name, b)) for b, v in zip(BLOCKS, values, strict=True)]
+    return [error(b, v, not_none(true_value(truth, name, b))) for b, v in zip(BLOCKS, values, strict=True)]
 
 
 def without_noise(rig):
@@ -190,7 +192,7 @@ def test_what_cannot_be_calibrated_is_said():
     large = PoseStream("mocap0", stream.stamps_ns, stream.rotation, 3.28 * stream.position)
     with pytest.raises(EstimationError, match=r"its motion to be 0\.3\d \+- 0\.0\d times as large as its positions"):
         calibrate_measurements(rig, cut(sim, large))
-    in_g = replace(sim.measurements.imu, accel=sim.measurements.imu.accel / 9.81)
+    in_g = replace(not_none(sim.measurements.imu), accel=not_none(sim.measurements.imu).accel / 9.81)
     with pytest.raises(EstimationError, match=r"give a gravity of [\d.]* m/s\^2 instead of 9.81; check that the acc"):
         calibrate_measurements(rig, replace(sim.measurements, imu=in_g))
     bad = replace(cut(sim, other), name="second")

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.typed import not_none
 
 from icalib.geometry.targets import Charuco, Checkerboard, Target
 from icalib.pipeline import calibrate_measurements
@@ -136,7 +137,7 @@ def test_imu_intrinsics_of_one_percent_are_recovered():
     simulation = simulate(scenario, 1)
     rig = rig_for(scenario)
     rig = dataclasses.replace(
-        rig, imu=dataclasses.replace(rig.imu, intrinsics=Parameter("prior", np.zeros(24), FREE.sigma))
+        rig, imu=dataclasses.replace(not_none(rig.imu), intrinsics=Parameter("prior", np.zeros(24), FREE.sigma))
     )
     result = calibrate_measurements(rig, simulation.measurements)
     found = result.group("imu0", "intrinsics")

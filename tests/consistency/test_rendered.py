@@ -42,7 +42,7 @@ def filmed(scenario: Scenario) -> Film:
 @pytest.fixture(scope="module")
 def recordings(filmed: Film, tmp_path_factory: pytest.TempPathFactory) -> dict[Form, Path]:
     folder = tmp_path_factory.mktemp("filmed")
-    paths = {form: folder / form for form in FORMS}
+    paths: dict[Form, Path] = {form: folder / form for form in FORMS}
     write_film(filmed, paths)
     return paths
 

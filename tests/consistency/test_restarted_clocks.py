@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 import yaml
 from scipy.stats import chi2
+from tests.typed import instance
 
+from icalib.data.measurements import WheelStream
 from icalib.errors import EstimationError, RecordingError
 from icalib.export.outputs import write_outputs
 from icalib.geometry.targets import NoTarget
@@ -128,7 +130,9 @@ def test_a_stream_that_outlasts_the_others(robot):
     (wheels,) = first.measurements.wheels
     n, step = 4000, int(np.median(np.diff(wheels.stamps_ns)))
     stamps = np.concatenate([wheels.stamps_ns, wheels.stamps_ns[-1] + step * np.arange(1, n + 1)])
-    longer = replace(wheels, stamps_ns=stamps, rate=np.concatenate([wheels.rate, np.zeros((n, 2))]))
+    longer = replace(
+        wheels, stamps_ns=stamps, rate=np.concatenate([instance(wheels, WheelStream).rate, np.zeros((n, 2))])
+    )
     first = replace(first, measurements=replace(first.measurements, wheels=(longer,)))
     result = joint((first, second), open_rig(scenario, ""))
     assert result.converged

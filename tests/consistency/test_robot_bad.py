@@ -9,6 +9,7 @@ from functools import cache, partial
 
 import numpy as np
 import pytest
+from tests.typed import not_none
 
 from icalib.data.measurements import LidarStream, Measurements, WheelStream
 from icalib.errors import CalibrationError, EstimationError
@@ -87,7 +88,7 @@ def test_wheels_that_never_turned_while_the_camera_looked(drive):
     words = refusal(replace(rig, wheels=stated), late)
     assert re.search(r"fixed value of time offset of wheel0.*-999999\.9", words), words
     result = calibrate_measurements(rig, late)
-    offset = true_value(simulation.truth, "wheel0", "time_offset")[0] - 1000.0
+    offset = not_none(true_value(simulation.truth, "wheel0", "time_offset"))[0] - 1000.0
     assert result.group("wheel0", "time_offset").value[0] == pytest.approx(offset, abs=2e-3)
     assert any("guess of time offset of wheel0" in note for note in result.notes)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from icalib.tools.simulation.scenario.robot import SimPoses
 
 OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 ON_TOP = np.array([[1.0, 0.0, 0.0, 0.1], [0.0, 0.0, -1.0, 0.2], [0.0, 1.0, 0.0, 0.3], [0.0, 0.0, 0.0, 1.0]])
-STARTS = dict.fromkeys(("rotation", "translation", "time_offset", "drive"), "start")
+STARTS: dict[str, Any] = dict.fromkeys(("rotation", "translation", "time_offset", "drive"), "start")
 Sensor = Camera | Lidar | Wheels | PoseSensor
 KINDS = ("cameras", "lidars", "wheels", "poses")
 

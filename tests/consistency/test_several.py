@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
+from tests.typed import not_none
 
 from icalib.data.measurements import CornerStream, ImuStream
 from icalib.errors import EstimationError, RecordingError
@@ -67,7 +68,7 @@ def errors(result: Calibration, truth: Truth) -> tuple[np.ndarray, np.ndarray]:
             g = result.group(camera, name)
             turned = name == "rotation"
             found.append(Rotation.from_matrix(T[:3, :3].T @ g.value).as_rotvec() if turned else g.value - true[name])
-            columns.extend(g.columns)
+            columns.extend(not_none(g.columns))
     return np.concatenate(found), np.array(columns)
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.typed import not_none
 
 from icalib.geometry import so3
 from icalib.geometry.targets import AprilGrid
@@ -41,7 +42,7 @@ def stated(rig: Rig, name: str, value: np.ndarray, sigma: float | None = None) -
 
 
 def truth(simulation: Simulation, name: str) -> np.ndarray:
-    rig = rig_for(simulation.scenario, **dict.fromkeys(("rotation", "translation", "time_offset", "drive"), "fixed"))
+    rig = rig_for(simulation.scenario, rotation="fixed", translation="fixed", time_offset="fixed", drive="fixed")
     sensor = rig.wheels[0] if rig.wheels and name in rig.wheels[0].sizes else rig.cameras[0]
     value = getattr(sensor, name).value
     assert value is not None
@@ -54,7 +55,7 @@ def test_true_values_are_no_news(simulation, mode):
     rig = rig_for(simulation.scenario)
     for name, sigma in (("rotation", 1e-3), ("translation", 0.5), ("time_offset", 1e-7), ("distortion", 1e-4)):
         value = rig.cameras[0].distortion.value if name == "distortion" else truth(simulation, name)
-        rig = stated(rig, name, value, sigma if mode == "prior" else None)
+        rig = stated(rig, name, not_none(value), sigma if mode == "prior" else None)
     result = calibrate_measurements(rig, simulation.measurements)
     assert result.converged and said(result) == []
 
@@ -78,7 +79,7 @@ def test_a_wrong_value_is_named_with_what_the_data_show(simulation, name, off, s
     k = int(np.argmax(np.abs(off)))
     scale = {"translation": 1e3, "time_offset": 1e3}.get(name, 1.0)
     shown, spread = said(result)[0].split("alone show ")[1].split(" standard")[0].split(":")[0].split(" +- ")
-    assert abs(float(shown) - scale * value[k]) < 5.0 * float(spread.split(" ")[0])
+    assert abs(float(shown) - scale * not_none(value)[k]) < 5.0 * float(spread.split(" ")[0])
     assert float(spread.split(" ")[0]) < 0.1 * scale * abs(off[k])
 
 
@@ -113,6 +114,6 @@ def test_wheels_that_no_vehicle_has_are_named(driven):
 
 
 def test_a_wrong_size_of_the_target_does_not_blame_true_lever_arms(simulation):
-    rig = rig_for(simulation.scenario, **dict.fromkeys(("rotation", "translation", "time_offset"), "fixed"))
+    rig = rig_for(simulation.scenario, rotation="fixed", translation="fixed", time_offset="fixed")
     result = calibrate_measurements(replace(rig, target=AprilGrid(6, 6, 1.08 * 0.088, 0.3)), simulation.measurements)
     assert said(result) == [] and "times the size that the rig file says" in result.wrong[0]

@@ -7,8 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from tests.typed import instance
 
 from icalib.estimate.evidence.target_size import TargetSize, target_size
+from icalib.geometry.targets import AprilGrid, Markers
 from icalib.initialize.start import start
 from icalib.observability.determination import determine
 from icalib.pipeline import calibrate_measurements
@@ -20,7 +22,7 @@ SECONDS = 10.0
 
 def of_size(rig: Rig, size: float) -> Rig:
     """The rig with a target said to be `size` times as large as it is."""
-    target = rig.target
+    target = instance(rig.target, AprilGrid)
     return replace(rig, target=replace(target, tag_size=size * target.tag_size))
 
 
@@ -41,7 +43,8 @@ def test_without_noise_the_size_is_found(said):
 def test_of_tags_in_a_room_all_sizes_and_distances_grow_together():
     made = replace(tag_map(), duration_s=15.0)
     rig = rig_for(made)
-    smaller = replace(rig, target=replace(rig.target, size=0.95 * rig.target.size))
+    target = instance(rig.target, Markers)
+    smaller = replace(rig, target=replace(target, size=0.95 * target.size))
     inputs, state, guess = start(smaller, [simulate(made, 0).measurements])
     estimate = determine(inputs, state, guess=guess).estimate
     size = target_size(estimate.problem, estimate.outcome.state)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.typed import not_none
 
 from icalib.data.measurements import Measurements, TrackStream
 from icalib.estimate.evidence.corner_noise import first_noise
@@ -59,6 +60,7 @@ def test_noiseless_tracks_are_recovered_from_nothing_but_rough_intrinsics():
     streams = inputs.measurements.cameras
     noise = [first_noise(c).noise(s, c, rig.settings) for c, s in zip(rig.cameras, streams, strict=True)]
     nothing = [np.zeros(0, dtype=bool) for _ in streams]
+    last = None
     for _ in range(3):
         problem = assemble(inputs, state, noise, nothing, following=first_following(inputs))
         outcome = minimise(problem, state, tolerance=1e-10)
@@ -66,7 +68,7 @@ def test_noiseless_tracks_are_recovered_from_nothing_but_rough_intrinsics():
         last = problem, state, outcome
         state = outcome.state
         state = resample(state, nodes_for(inputs, image_times(inputs, state.values)), inputs)
-    _is_the_same_in_its_own_room(*last)
+    _is_the_same_in_its_own_room(*not_none(last))
     for camera, stream in zip(scenario.cameras, streams, strict=True):
         value, T = {name: state.values[camera.name, name] for name in CALIBRATED}, camera.T_imu_cam
         offset = simulation.truth.time_offset[camera.name] + origin_difference(inputs.measurements, stream)

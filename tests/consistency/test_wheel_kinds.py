@@ -9,12 +9,12 @@ import pytest
 from tests.consistency.test_robot import steady
 
 from icalib.pipeline import calibrate_measurements
-from icalib.rig import drive_names
+from icalib.rig import WheelKind, drive_names
 from icalib.tools.montecarlo.truth import error, true_value
 from icalib.tools.simulation import Scenario, rig_for, simulate
 
 MOUNTS = ("rotation", "translation", "time_offset")
-KINDS = {"twist": "twist", "steering": "steered"}
+KINDS: dict[str, WheelKind] = {"twist": "twist", "steering": "steered"}
 
 
 def reporting(scenario: Scenario, reports: str) -> Scenario:
@@ -51,8 +51,8 @@ def test_fifty_recordings(consistency, robot, reports):
 def test_a_straight_line_leaves_what_only_turning_shows(robot, reports, open_, known):
     scenario = reporting(robot("planar", 20.0, "lw"), reports)
     scenario = replace(scenario, motion=replace(scenario.motion, kind="straight-line"))
-    start = dict.fromkeys(("rotation", "translation", "time_offset", "drive"), "start")
-    simulation, rig = simulate(scenario, 0), rig_for(scenario, **start)
+    simulation = simulate(scenario, 0)
+    rig = rig_for(scenario, rotation="start", translation="start", time_offset="start", drive="start")
     result = calibrate_measurements(rig, simulation.measurements)
     assert result.converged, result.status
     verdicts = {

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.signal import lfilter
+from tests.typed import not_none
 
 from icalib.data.measurements import Measurements
 from icalib.pipeline import calibrate_measurements
@@ -23,10 +25,10 @@ def simulation() -> Simulation:
 def with_noise(simulation: Simulation, times: float) -> Calibration:
     """Calibrated with densities that are so many times the true ones."""
     rig = rig_for(simulation.scenario)
-    noise = rig.imu.noise
+    noise = not_none(rig.imu).noise
     names = ("gyro", "gyro_walk", "accel", "accel_walk")
     wrong = replace(noise, **{name: times * getattr(noise, name) for name in names})
-    return calibrate_measurements(replace(rig, imu=replace(rig.imu, noise=wrong)), simulation.measurements)
+    return calibrate_measurements(replace(rig, imu=replace(not_none(rig.imu), noise=wrong)), simulation.measurements)
 
 
 def said(result: Calibration) -> list[str]:
@@ -57,19 +59,20 @@ def test_the_noise_that_is_advised_is_the_true_one(simulation, times):
     """To a third, whether far too small or too large is stated; calibrated with it there is nothing left to say."""
     (words,) = said(with_noise(simulation, times))
     assert f"too {'small' if times < 1.0 else 'large'}" in words
-    noise, found = rig_for(simulation.scenario).imu.noise, advised(words)
+    noise, found = not_none(rig_for(simulation.scenario).imu).noise, advised(words)
     assert set(found) == {"gyro", "gyro_walk", "accel", "accel_walk"}
     for name, value in found.items():
         assert 0.67 < value / getattr(noise, name) < 1.5, (name, value)
     rig = rig_for(simulation.scenario)
-    rig = replace(rig, imu=replace(rig.imu, noise=replace(noise, **found)))
+    rig = replace(rig, imu=replace(not_none(rig.imu), noise=replace(noise, **found)))
     assert said(calibrate_measurements(rig, simulation.measurements)) == []
 
 
 def test_residuals_that_are_no_noise_get_no_advice_on_the_noise(simulation):
     """Vibration, correlated over 20 readings: the cause is unknown, and what was checked is told."""
     m = simulation.measurements
-    shaken = lfilter([1.0], [1.0, -0.95], np.random.default_rng(3).normal(size=m.imu.accel.shape), axis=0)
+    noise = np.random.default_rng(3).normal(size=m.imu.accel.shape)
+    shaken = np.asarray(lfilter([1.0], [1.0, -0.95], noise, axis=0))
     imu = replace(m.imu, accel=m.imu.accel + 0.1 * shaken)
     result = calibrate_measurements(rig_for(simulation.scenario), replace(m, imu=imu))
     (words,) = said(result)
@@ -83,7 +86,7 @@ def swapped(simulation: Simulation) -> Measurements:
     return replace(simulation.measurements, cameras=(replace(b, name=a.name), replace(a, name=b.name)))
 
 
-GUESSES = [
+GUESSES: list[dict[str, Any]] = [
     {"rotation": "start", "translation": "start", "time_offset": "start", "intrinsics": "start"},
     {"rotation": "start", "translation": "start", "time_offset": "free", "intrinsics": "free"},
     {"rotation": "free", "translation": "free", "time_offset": "free", "intrinsics": "start"},
@@ -104,7 +107,7 @@ def test_a_poor_guess_is_not_taken_for_the_other_camera(simulation):
     rig = rig_for(simulation.scenario, **GUESSES[0])
     for moved in ((0.11, 0.0), (0.3, 0.3)):
         cameras = tuple(
-            replace(c, translation=replace(c.translation, value=c.translation.value + [0.0, by, 0.0]))
+            replace(c, translation=replace(c.translation, value=not_none(c.translation.value) + [0.0, by, 0.0]))
             for c, by in zip(rig.cameras, moved, strict=True)
         )
         result = calibrate_measurements(replace(rig, cameras=cameras), simulation.measurements)
@@ -117,7 +120,9 @@ def test_a_lens_of_another_camera_that_is_fixed(simulation, stated):
     rig = rig_for(simulation.scenario, intrinsics="fixed", distortion="fixed")
     first, second = rig.cameras
     off = [1.0, 1.0] if stated else [0.8, 1.0]
-    lens = replace(second.distortion, value=first.distortion.value * [*off, 1.0, 1.0] * (1.05 if stated else 1.0))
+    lens = replace(
+        second.distortion, value=not_none(first.distortion.value) * [*off, 1.0, 1.0] * (1.05 if stated else 1.0)
+    )
     cameras = (replace(first, distortion=lens, corner_noise_px=first.corner_noise_px if stated else None), second)
     result = calibrate_measurements(replace(rig, cameras=cameras), simulation.measurements)
     assert result.reasons[0].startswith("the fixed value of distortion k1 of cam0"), result.reasons

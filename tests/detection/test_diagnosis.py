@@ -40,7 +40,7 @@ def scene(rendering):
         (("aprilgrid", 6, 6), ("tag36h11", 2), "check that rows, cols and spacing are those of the target"),
     ],
 )
-def test_what_is_there_is_named(scene, pattern, target, sentence):
+def test_what_is_there_is_named(scene, pattern, target: tuple[str, int], sentence):
     image = scene(*pattern, y_up=pattern[0] != "charuco")
     assert re.search(sentence, what_is_seen([image], *target, range(36)))
 

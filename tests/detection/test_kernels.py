@@ -220,7 +220,7 @@ def test_corners_of_a_quad_move_to_their_places_where_curvatures_are_known(curva
         sagitta = 0.0 if c == 0.0 else 1.0 / c - np.sign(c) * np.sqrt(1.0 / c**2 - 0.25 * length**2)
         dark *= covered(-bent_distance(FINE_U, FINE_V, middle - sagitta * across, along, c))
     image = photographed(dark, 0.9)
-    rng, before, after = np.random.default_rng(0), [], []
+    rng, before, after, sigma = np.random.default_rng(0), [], [], np.zeros(4)
     for _ in range(40):
         corners, sigma, _, edges = fit_corners(image + 2.0 * rng.standard_normal(image.shape), quad, 3.0, 4.0)
         known = np.array([[of_side[k], of_side[k - 1]] for k in range(4)])

@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.typed import instance
 
-from icalib.detection.boards.detectors import detector_of
+from icalib.detection.boards.detectors import _Detector, _Follower, detector_of
 from icalib.detection.primitives.corners import ImageCorners, no_corners
 from icalib.detection.primitives.decoding import mapped
 from icalib.detection.primitives.prediction import PredictedCorners, predict_corners, predict_nodes
@@ -65,7 +66,7 @@ def test_without_two_images_that_show_the_target_nothing_is_expected(n):
 
 def test_nodes_that_were_not_seen_lie_on_the_board():
     H = np.array([[30.0, 4.0, 100.0], [-3.0, 28.0, 80.0], [0.01, -0.02, 1.0]])
-    every = np.stack(np.indices((5, 7)), axis=-1).reshape(-1, 2)
+    every = np.moveaxis(np.indices((5, 7)), 0, -1).reshape(-1, 2)
     true = np.array([mapped(H, float(row), float(col)) for row, col in every])
     seen = ((every >= 1) & (every < [4, 6])).all(axis=1) & (np.arange(35) % 4 > 0)
     np.testing.assert_allclose(predict_nodes(every[seen], true[seen], 5, 7).reshape(-1, 2), true, atol=1e-6)
@@ -82,8 +83,9 @@ def filmed(target, count):
 def test_what_is_found_near_is_what_a_search_of_the_whole_image_finds(name, monkeypatch):
     detector, images = detector_of(TARGETS[name]), filmed(TARGETS[name], 7)
     whole = [detector.detect(image) for image in images]
-    searched, plain = [], type(detector.finder).find
-    monkeypatch.setattr(type(detector.finder), "find", lambda self, view: searched.append(view) or plain(self, view))
+    kind = type(instance(detector, _Detector).finder)
+    searched, plain = [], kind.find
+    monkeypatch.setattr(kind, "find", lambda self, view: searched.append(view) or plain(self, view))
     found: list[ImageCorners] = []
     for image in images:
         found.append(detector.detect(image, found[-3:]))
@@ -119,4 +121,5 @@ def test_a_board_is_not_taken_for_one_that_is_some_squares_away(name, squares):
         2 + squares[0] : 2 + squares[0] + rows, 2 + squares[1] : 2 + squares[1] + cols
     ]
     expected = PredictedCorners(np.arange(rows * cols), shifted.reshape(-1, 2))
-    assert detector.finder.find_near(View(image), expected) is None
+    finder = instance(instance(detector, _Detector).finder, _Follower)
+    assert finder.find_near(View(image), expected) is None

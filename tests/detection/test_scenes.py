@@ -8,6 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from tests.typed import StandIn
 
 from icalib.data.recordings import Payload, TopicInfo
 from icalib.detection import streams
@@ -26,7 +27,7 @@ CAMERA = Camera("cam0", "cam0/corners.csv", "pinhole-radtan", (752, 480))
 TAGS = Markers("tag36h11", 0.16, tuple(range(40, 76, 3)))
 
 
-class Shown:
+class Shown(StandIn):
     """A recording of these images."""
 
     def __init__(self, images: list[np.ndarray]) -> None:

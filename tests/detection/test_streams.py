@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.typed import StandIn
 
 from icalib.data.recordings import Payload, TopicInfo
 from icalib.detection import streams
@@ -21,7 +22,7 @@ GRID = AprilGrid(6, 6, 0.088, 0.3)
 CAMERA = Camera("cam0", "cam0/corners.csv", "pinhole-radtan", (8, 6))
 
 
-class FakeRecording:
+class FakeRecording(StandIn):
     """Images of 6 x 8 px; the first pixel counts them."""
 
     def __init__(self, n: int = 20, width: int = 8, size: int = 48, damaged: tuple[int, ...] = ()) -> None:

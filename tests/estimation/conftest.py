@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.typed import instance, not_none
 
 from icalib.data.measurements import CornerStream, LidarStream, TrackStream
 from icalib.estimate.problem.problem import Problem
@@ -23,7 +24,8 @@ from icalib.motion.nodes import place_nodes
 from icalib.motion.poses import assign_nodes
 from icalib.motion.sweep import Motion
 from icalib.optim.arrowhead import Piece, make_pieces
-from icalib.optim.state import NODE, Layout, State, make_layout
+from icalib.optim.state import NODE, Entry, Kind, Layout, State, make_layout
+from icalib.rig import Scheme
 from icalib.sensors.camera.board import SHAPE_LABELS
 from icalib.sensors.camera.bodies import SIZE, Bodies, restrict
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerNoise
@@ -143,23 +145,25 @@ def make_setup(
 ) -> Setup:
     """split: the target is taken as three bodies that stand where they would on the target. size: it is estimated."""
     truth, measurements = sim.truth, sim.measurements
-    imu = ImuData.build(measurements.imu, sim.scenario.imu_noise)
-    entries = [("imu0", "intrinsics", "vector", 24, imu_free), ("board0", "tilt", "tilt", 2, True)]
-    target = SplitGrid(**fields_of(sim.scenario.target)) if split else sim.scenario.target
+    imu = ImuData.build(not_none(measurements.imu), sim.scenario.imu_noise)
+    entries: list[Entry] = [("imu0", "intrinsics", "vector", 24, imu_free), ("board0", "tilt", "tilt", 2, True)]
+    target = SplitGrid(**fields_of(instance(sim.scenario.target, AprilGrid))) if split else sim.scenario.target
     bodies = Bodies(target, (1, 0, 2) if split else (0,), (), shape, sized=size)
     entries += bodies.size_entries() + bodies.shape_entries() + bodies.pose_entries()
     values = {(name, "shape"): np.zeros(len(SHAPE_LABELS)) for name in bodies.bending}
     values["imu0", "intrinsics"] = truth.imu_intrinsics.copy()
     values[SIZE] = np.array([truth.target_size])
     R_world_grid, origin = truth.T_world_board[:3, :3], truth.T_world_board[:3, 3]
-    R_grid_scene, p_grid_scene = target.frame(1) if split else (np.eye(3), np.zeros(3))
+    R_grid_scene, p_grid_scene = target.frame(1) if isinstance(target, SplitGrid) else (np.eye(3), np.zeros(3))
     values["board0", "tilt"] = R_world_grid @ R_grid_scene
-    for k in bodies.used if split else ():
-        values[target.bodies[k], "rotation"], values[target.bodies[k], "translation"] = target.place(k, bodies.used[0])
+    if isinstance(target, SplitGrid):
+        for k in bodies.used:
+            body, (R_body, p_body) = target.bodies[k], target.place(k, bodies.used[0])
+            values[body, "rotation"], values[body, "translation"] = R_body, p_body
     times = []
     for c in measurements.cameras:
         T = truth.T_imu_cam[c.name]
-        offset = truth.time_offset[c.name] + (c.origin_ns - measurements.imu.origin_ns) * 1e-9
+        offset = truth.time_offset[c.name] + (c.origin_ns - not_none(measurements.imu).origin_ns) * 1e-9
         parameters = {
             "rotation": T[:3, :3].copy(),
             "translation": T[:3, 3].copy(),
@@ -169,22 +173,24 @@ def make_setup(
             "bloom": np.zeros(1),
         }
         for name, value in parameters.items():
-            kind, size = ("rotation", 3) if name == "rotation" else ("vector", len(value))
-            entries.append((c.name, name, kind, size, bloom or name != "bloom"))
+            kind: Kind = "rotation" if name == "rotation" else "vector"
+            columns = 3 if name == "rotation" else len(value)
+            entries.append((c.name, name, kind, columns, bloom or name != "bloom"))
             values[c.name, name] = value
         times.append(c.seconds + offset)
     seconds = place_nodes(imu, times, spacing, 0.5)
     bias = np.concatenate([truth.gyro_bias[0], truth.accel_bias[0]])
     streams = restrict(bodies, measurements).cameras
+    empty = np.empty(0)
     pending = Setup(
         sim, imu, make_layout(entries), bodies, streams, origin + R_world_grid @ p_grid_scene,
-        State(seconds, *(np.empty(0),) * 4, values),
+        State(seconds, empty, empty, empty, empty, values),
     )  # fmt: skip
     R, p, v = pending.truth_at(seconds)
     return replace(pending, state=State(seconds, R, p, v, np.tile(bias, (len(seconds), 1)), values))
 
 
-def make_factor(setup: Setup, camera: int, scheme: str = "inertial", **changes) -> CornerFactor:
+def make_factor(setup: Setup, camera: int, scheme: Scheme = "inertial", **changes) -> CornerFactor:
     """The factor of one camera, everything kept, sigma 0.2 px, no loss and no common error unless `changes` say so."""
     stream = setup.streams[camera]
     n, state = len(stream.uv), setup.state
@@ -208,7 +214,7 @@ def make_factor(setup: Setup, camera: int, scheme: str = "inertial", **changes) 
 
 
 def make_features(
-    setup: Setup, scheme: str = "inertial", loss: tuple[str, float] = ("none", 2.5), noise_px: float = 0.0
+    setup: Setup, scheme: Scheme = "inertial", loss: tuple[str, float] = ("none", 2.5), noise_px: float = 0.0
 ) -> FeatureFactor:
     """The corners of both cameras as features of unknown position, sigma 0.8 and 1.1 px, that of the second camera
     growing with the number of views; of every third image of the first camera some are not in use."""
@@ -236,7 +242,7 @@ def make_features_on_planes(setup: Setup, *arguments, **options) -> tuple[Setup,
     across, _, normal = np.linalg.svd(points - centre, full_matrices=False)[2]
     both = [plane_of(normal, centre + 0.004 * normal), plane_of(normal + 0.03 * across, centre)]
     keys = tuple((f"plane {k}", "plane") for k in range(2))
-    entries = [(b.sensor, b.name, b.kind, b.size, b.start is not None) for b in setup.layout.blocks]
+    entries: list[Entry] = [(b.sensor, b.name, b.kind, b.size, b.start is not None) for b in setup.layout.blocks]
     layout = make_layout([*entries, *((*key, "plane", 3, True) for key in keys)])
     values = setup.state.values | dict(zip(keys, both, strict=True))
     setup = replace(setup, layout=layout, state=replace(setup.state, values=values))
@@ -247,7 +253,7 @@ def make_features_on_planes(setup: Setup, *arguments, **options) -> tuple[Setup,
     return setup, replace(factor, layout=layout, cameras=cameras, surfaces=surfaces, on=on)
 
 
-def make_problem(setup: Setup, start: State | None = None, scheme: str = "inertial") -> Problem:
+def make_problem(setup: Setup, start: State | None = None, scheme: Scheme = "inertial") -> Problem:
     columns = setup.layout.columns("imu0", "intrinsics")
     imu = ImuFactor.build(setup.imu, start or setup.state, 9.81, columns[columns >= 0])
     cameras = tuple(make_factor(setup, i, scheme) for i in range(len(setup.sim.measurements.cameras)))
@@ -303,20 +309,24 @@ class RoomSetup:
 def make_room(sim: Simulation, *, imu_free: bool = False, spacing: float = 0.025) -> RoomSetup:
     """Of the first LiDAR; the planes' points are the means of the faces that the points were seen on."""
     truth, stream = sim.truth, sim.measurements.lidars[0]
-    imu = ImuData.build(sim.measurements.imu, sim.scenario.imu_noise)
+    imu = ImuData.build(not_none(sim.measurements.imu), sim.scenario.imu_noise)
     count = np.bincount(stream.plane[stream.plane >= 0], minlength=len(truth.planes))
     used = np.flatnonzero(count >= FEWEST_POINTS)
     own = np.full(len(truth.planes) + 1, -1, dtype=np.int32)
     own[used] = np.arange(len(used))
     planes = tuple((f"plane{k}", "plane") for k in used)
-    entries = [("imu0", "intrinsics", "vector", 24, imu_free), (stream.name, "rotation", "rotation", 3, True)]
-    entries += [(stream.name, "translation", "vector", 3, True), (stream.name, "time_offset", "vector", 1, True)]
-    entries += [(*key, "plane", 3, True) for key in planes]
-    T, origin_s = truth.T_imu_lidar[stream.name], (stream.origin_ns - sim.measurements.imu.origin_ns) * 1e-9
+    entries: list[Entry] = [
+        ("imu0", "intrinsics", "vector", 24, imu_free),
+        (stream.name, "rotation", "rotation", 3, True),
+    ]
+    entries.append((stream.name, "translation", "vector", 3, True))
+    entries.append((stream.name, "time_offset", "vector", 1, True))
+    entries.extend((*key, "plane", 3, True) for key in planes)
+    T, origin_s = truth.T_imu_lidar[stream.name], (stream.origin_ns - not_none(sim.measurements.imu).origin_ns) * 1e-9
     offset = truth.time_offset[stream.name] + origin_s
     values = {("imu0", "intrinsics"): truth.imu_intrinsics.copy(), (stream.name, "time_offset"): np.array([offset])}
     values[stream.name, "rotation"], values[stream.name, "translation"] = T[:3, :3].copy(), T[:3, 3].copy()
-    faces = sim.scenario.room.faces
+    faces = not_none(sim.scenario.room).faces
     for key, k in zip(planes, used, strict=True):
         values[key] = plane_of(truth.planes[k, :3], faces[k, 0] + 0.5 * (faces[k, 1] + faces[k, 2]))
     ends = stream.seconds[[0, -1]] + offset + np.array([0.0, stream.offset_s.max()])
@@ -369,7 +379,7 @@ def make_dense(pieces: tuple[Piece, ...], n_nodes: int) -> tuple[np.ndarray, np.
 
 def schur_of_features(piece: Piece, n_nodes: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """What eliminating each feature of a piece takes from the dense normal matrix and its gradient."""
-    sums, o = piece.features.sums, NODE * n_nodes
+    sums, o = not_none(piece.features).sums, NODE * n_nodes
     for f in range(len(sums.own)):
         K = np.zeros((3, o + sums.side.shape[2]))
         K[:, o:] = sums.side[f]

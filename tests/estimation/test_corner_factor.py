@@ -162,7 +162,7 @@ def test_estimating_the_common_error_explicitly_gives_the_same_normal_equations(
     expected_H, expected_g = J.T @ J - J.T @ F @ taken[:, :-1], J.T @ r - J.T @ F @ taken[:, -1]
     size = np.sqrt(np.maximum(np.diag(expected_H), 1e-9 * np.diag(expected_H).max()))
     np.testing.assert_allclose(H / np.outer(size, size), expected_H / np.outer(size, size), rtol=0, atol=1e-6)
-    np.testing.assert_allclose(g / size, expected_g / size, rtol=0, atol=1e-6 * np.linalg.norm(r))
+    np.testing.assert_allclose(g / size, expected_g / size, rtol=0, atol=1e-6 * float(np.linalg.norm(r)))
 
 
 def whitened(factor, setup, state, field):

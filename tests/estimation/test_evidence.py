@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from tests.estimation.test_arrowhead import random_pieces
 from tests.estimation.test_front import build
+from tests.typed import not_none
 
 from icalib.estimate.evidence.debias import spurious_information
 from icalib.estimate.evidence.evidence import fits
@@ -169,7 +170,9 @@ def test_an_early_outcome_has_no_draws_and_they_are_made_where_they_are_asked_fo
     early, late = minimise(followed, start, tolerance=0.5), minimise(followed, start)
     assert early.draws is None and early.information.size == 0
     there = posterior(followed, late.state)
-    for a, b in zip((*there.free, *there.still), (*late.draws.free, *late.draws.still), strict=True):
+    for a, b in zip(
+        (*there.free, *there.still), (*not_none(late.draws).free, *not_none(late.draws).still), strict=True
+    ):
         np.testing.assert_allclose(a.chain, b.chain, atol=1e-6 * np.abs(b.chain).max())
         np.testing.assert_allclose(a.border, b.border, atol=1e-6 * np.abs(b.border).max())
     without = replace(late, draws=None)
@@ -179,5 +182,5 @@ def test_an_early_outcome_has_no_draws_and_they_are_made_where_they_are_asked_fo
     bare = Piece.bare(0, followed.n_nodes - 1)
     out = followed.features.output()
     followed.features.accumulate(early.state, bare, out, sums=False)
-    for a, b in zip(early.residuals.features.residual, out.residual, strict=True):
+    for a, b in zip(not_none(early.residuals.features).residual, out.residual, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)

@@ -11,11 +11,13 @@ import importlib
 import pkgutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy import sparse
 from scipy.sparse.linalg import LinearOperator
+from tests.typed import not_none
 
 import icalib.optim
 import icalib.sensors
@@ -29,7 +31,7 @@ from icalib.optim.arrowhead import Piece, make_pieces
 from icalib.optim.prior_factor import FIRST_BIAS_SIGMA, Prior, accumulate_bias_prior
 from icalib.optim.robust_weights import LEAST_CURVATURE
 from icalib.optim.state import NODE, State, in_recording, make_layout
-from icalib.rig import Ground
+from icalib.rig import Ground, Loss, Scheme
 from icalib.sensors.camera.corner_factor import CornerNoise
 from icalib.sensors.imu.residual import ROWS, ImuFactor
 from icalib.sensors.lidar.lidar_binning import LidarNoise
@@ -48,7 +50,7 @@ class Sample:
     state: State
     accumulate: Callable[[State, Piece, bool], float]
     residual: Callable[[State], np.ndarray]
-    weights: Callable[[State], tuple[np.ndarray, np.ndarray]]
+    weights: Callable[[State], tuple[np.ndarray, Any]]
     tolerance: float = 1e-6  # of the gradient, where weights are found by iteration
     potential: Callable[[State], float] = lambda at: 0.0
 
@@ -233,7 +235,7 @@ def feature_sample(
         blocks = (root**2)[:, None, None] * (np.eye(2) + (bend - 1.0)[:, None, None] * along)
         bent = slope_along(loss if curved else "none", np.abs(d) / factor.on.sigma[on])
         W = sparse.block_diag([*blocks, sparse.diags(at_optimum.off.root[on] ** 2 * bent)], format="csr")
-        F, h = sparse.lil_array((W.shape[0], 3 * factor.tracks.count)), 1e-5
+        F, h = sparse.lil_array((not_none(W.shape)[0], 3 * factor.tracks.count)), 1e-5
         for k in range(3):
             step = h * np.eye(3)[k]
             slope = (errors(at, world + step) - errors(at, world - step)) / (2 * h)
@@ -241,14 +243,15 @@ def feature_sample(
                 F[2 * np.arange(len(e)) + r, 3 * track + k] = slope[:, r]
         for k in range(len(on)):
             F[2 * len(e) + k, 3 * on[k] : 3 * on[k] + 3] = planes(at)[0][k]
-        WF = (W @ F.tocsr()).tocsr()
+        WF = sparse.csr_array(W @ F.tocsr())
         known = (F.T @ WF).toarray()
         y = np.concatenate([(root[:, None] ** 2 * e).ravel(), at_optimum.off.root[on] ** 2 * d])
 
         def times(J):
             return W @ J - WF @ np.linalg.solve(known, WF.T @ J)
 
-        return y, LinearOperator(W.shape, matvec=times, matmat=times, dtype=float)
+        operator: Any = LinearOperator  # its stubs know only that of its __new__
+        return y, operator(W.shape, matvec=times, matmat=times, dtype=float)
 
     def accumulate(at, piece, sums):
         if sums:
@@ -259,7 +262,9 @@ def feature_sample(
     return Sample("FeatureFactor", setup, state, accumulate, residual, weights, 5e-6)
 
 
-def lidar_sample(room, room_of, scheme="inertial", loss="none", beam=0.0, imu_free=False, restarts=False, noisy=1.0):
+def lidar_sample(
+    room, room_of, scheme: Scheme = "inertial", loss: Loss = "none", beam=0.0, imu_free=False, restarts=False, noisy=1.0
+):
     """Its moments taken at another state, as in all but the first linearisation of a pass. noisy: how much more than
     that of the data sheet the gyroscope's noise is."""
     setup = room_of(room, imu_free=imu_free, spacing=0.05)
@@ -589,11 +594,11 @@ SAMPLES = {
     "lidar, noisy gyroscope": ("LidarFactor", lambda u, s, f: lidar_sample(*s, beam=0.02, imu_free=True, noisy=30.0)),
     "lidar, huber, beam, kinematic, intrinsics": (
         "LidarFactor",
-        lambda u, s, f: lidar_sample(*s, "kinematic", "huber", 0.02, imu_free=True),
+        lambda u, s, f: lidar_sample(*s, scheme="kinematic", loss="huber", beam=0.02, imu_free=True),
     ),
     "lidar, cauchy, pose, intrinsics": (
         "LidarFactor",
-        lambda u, s, f: lidar_sample(*s, "pose", "cauchy", imu_free=True),
+        lambda u, s, f: lidar_sample(*s, scheme="pose", loss="cauchy", imu_free=True),
     ),
     "lidar, clock that restarts": ("LidarFactor", lambda u, s, f: lidar_sample(*s, imu_free=True, restarts=True)),
     "prior on a rotation": ("Prior", lambda u, s, f: prior_sample(u, s, "cam1", "rotation")),

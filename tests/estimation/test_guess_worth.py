@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,7 +18,7 @@ from icalib.observability.guess_worth import (
     moved_to_worth,
     owed_to_guess,
 )
-from icalib.optim.state import State, make_layout
+from icalib.optim.state import Entry, State, make_layout
 
 TOLERANCE = {"translation": 5e-3, "time_offset": 1e-3}
 SIGMA = {"translation": np.array([0.1, 0.2, 0.06]), "time_offset": np.array([0.02])}
@@ -28,7 +29,9 @@ DRAWS = 2000
 def given(monkeypatch):
     """Two sensors; the data leave open a shift of both, and a mixture of height and time of one. What is left is
     determined exactly: the answer to a move is the move."""
-    entries = [(s, n, "vector", size, True) for s in "ab" for n, size in (("translation", 3), ("time_offset", 1))]
+    entries: list[Entry] = [
+        (s, n, "vector", size, True) for s in "ab" for n, size in (("translation", 3), ("time_offset", 1))
+    ]
     layout = make_layout(entries)
     values = {b.key: np.zeros(b.size) for b in layout.free}
     zeros = np.zeros((2, 3))
@@ -101,7 +104,7 @@ def test_what_comes_of_two_errors_together_is_owed_too(given, monkeypatch):
     def bent(problem, state, tolerance, room):
         values = {k: v.copy() for k, v in state.values.items()}
         values["a", "translation"][1] += 7.0 * values["a", "translation"][0] * values["a", "translation"][2]
-        return SimpleNamespace(state=State(*(getattr(state, n) for n in list(State.__dataclass_fields__)[:5]), values))
+        return SimpleNamespace(state=replace(state, values=values))
 
     monkeypatch.setattr(guess_worth, "minimise", bent)
     shifts = owed_to_guess(given.inputs, given.outcome, np.zeros((8, 8)))

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
+from tests.typed import not_none
 
 from icalib.errors import EstimationError
 from icalib.geometry.planes import moved
@@ -21,7 +23,7 @@ def moments_of(setup, noise=None, state=None, stream=None, plane=None, bin_s=1e-
     state = state or setup.state
     values = np.array([state.values[p] for p in setup.planes])
     own = setup.plane if plane is None else plane
-    return take_moments(Associated(stream or setup.stream, own, values), setup.motion(state), noise, bin_s)
+    return take_moments(Associated(stream or setup.stream, own, values), setup.motion(state), not_none(noise), bin_s)
 
 
 def point_times(setup):
@@ -238,8 +240,8 @@ def test_stamps_at_the_end_of_scans_and_points_in_any_order_change_nothing(spars
     ended = with_stream(setup, replace(stream, xyz=stream.xyz[order], offset_s=offset[order]), setup.plane[order])
     later = setup.state.values | {("lidar0", "time_offset"): setup.state.values["lidar0", "time_offset"] + 0.125}
     state = replace(setup.state, values=later)
-    found = sums(ended, ended.factor(state), state, dense)
-    expected = sums(setup, setup.factor(), setup.state, dense)
+    found: Any = sums(ended, ended.factor(state), state, dense)
+    expected: Any = sums(setup, setup.factor(), setup.state, dense)
     # Points at the edge of bins of 3 ms change theirs, and perhaps the node; to the border that is all the same.
     H, H_expected = (h[NODE * len(state.seconds) :, NODE * len(state.seconds) :] for h in (found[1], expected[1]))
     size = np.sqrt(np.diag(H_expected))

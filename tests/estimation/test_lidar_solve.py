@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from tests.typed import not_none
 
 from icalib.detection.planes.planes import PlaneSearch, find_planes
 from icalib.estimate.problem.solver import minimise
@@ -53,12 +54,12 @@ def test_noiseless_recovery(robot, room_of):
     scenario = replace(scenario, imu_rate_hz=8000.0, gyro_bias=(0.0,) * 3, accel_bias=(0.0,) * 3)
     setup = room_of(simulate(scenario, seed=1), spacing=5e-3)
     outcome = recover(setup, setup.perturbed(np.random.default_rng(2), 3.0), LidarNoise(0.03), 2, bin_s=1e-4)
-    assert np.abs(errors(setup, outcome.state)).max() < 1e-8
+    assert np.abs(errors(setup, not_none(outcome).state)).max() < 1e-8
     # The world stays where the solver found it, turned about gravity.
     back = so3.exp(
-        so3.log(np.ascontiguousarray(setup.state.rotation[0] @ outcome.state.rotation[0].T)) * [0.0, 0.0, 1.0]
+        so3.log(np.ascontiguousarray(setup.state.rotation[0] @ not_none(outcome).state.rotation[0].T)) * [0.0, 0.0, 1.0]
     )
-    planes = [back @ outcome.state.values[k][:3] - setup.state.values[k][:3] for k in setup.planes]
+    planes = [back @ not_none(outcome).state.values[k][:3] - setup.state.values[k][:3] for k in setup.planes]
     assert np.abs(planes).max() < 5e-8
 
 
@@ -66,14 +67,14 @@ def test_a_start_far_off_leads_to_the_same_place(robot, room_of):
     setup = room_of(simulate(robot(5.0), seed=2))
     near = recover(setup, setup.state, BEAM, 3)
     far = recover(setup, setup.perturbed(np.random.default_rng(0), 30.0), BEAM, 4)
-    apart = np.abs(errors(setup, far.state) - errors(setup, near.state))
+    apart = np.abs(errors(setup, not_none(far).state) - errors(setup, not_none(near).state))
     assert (apart < 0.05 * np.sqrt(np.diag(covariance(setup, near)))).all()
 
 
 def test_longer_bins_change_the_answer_little(robot, room_of):
     """Far less than its standard deviations, which stay."""
     setup = room_of(simulate(robot(5.0), seed=3))
-    start = recover(setup, setup.state, BEAM, 2).state
+    start = not_none(recover(setup, setup.state, BEAM, 2)).state
     short, long = (minimise(setup.problem(start, BEAM, bin_s=b), start) for b in (1e-3, BIN_S))
     std = np.sqrt(np.diag(covariance(setup, short)))
     assert (np.abs(errors(setup, long.state) - errors(setup, short.state)) < 0.1 * std).all()
@@ -108,7 +109,7 @@ def check_nees(robot, room_of, name, seeds, probability):
     for seed in seeds:
         setup = room_of(simulate(robot(10.0, example=name), seed))
         outcome = recover(setup, setup.perturbed(np.random.default_rng(seed), 2.0), BEAM, 2)
-        e.append(errors(setup, outcome.state))
+        e.append(errors(setup, not_none(outcome).state))
         P.append(covariance(setup, outcome))
     for part, own in (PARTS | {"all": slice(0, 7)}).items():
         nees = [x[own] @ np.linalg.solve(C[own, own], x[own]) for x, C in zip(e, P, strict=True)]
@@ -140,8 +141,8 @@ def test_planar_motion_leaves_the_translation_along_its_axis_open(robot, room_of
     assert value[0] < 1e-3 and value[1] > 0.1
     vertical = setup.state.rotation.transpose(0, 2, 1)[:, :, 2].mean(axis=0)  # the axis that it turns about, in the IMU
     assert abs(vector[3:6, 0] @ vertical) > 0.99
-    assert abs(errors(setup, outcome.state)[5] - errors(setup, start)[5]) < 0.05
-    assert np.abs(errors(setup, outcome.state)[3:5]).max() < 0.01
+    assert abs(errors(setup, not_none(outcome).state)[5] - errors(setup, start)[5]) < 0.05
+    assert np.abs(errors(setup, not_none(outcome).state)[3:5]).max() < 0.01
 
 
 def wrong_by_a_centimetre(setup, rng):
@@ -180,4 +181,4 @@ def test_found_planes_do_nearly_as_well_as_known_ones(robot, room_of):
     np.add.at(table, (plane[plane >= 0], face[plane >= 0]), 1)
     assert table.max(axis=1).sum() > 0.998 * table.sum()
     std = np.sqrt(np.diag(covariance(setup, known)))
-    assert (np.abs(errors(setup, state) - errors(setup, known.state)) < 1.0 * std).all()
+    assert (np.abs(errors(setup, state) - errors(setup, not_none(known).state)) < 1.0 * std).all()

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.typed import not_none
 
 from icalib.data.measurements import PoseStream
 from icalib.estimate.problem.assembly import motion_of
@@ -15,7 +16,7 @@ from icalib.motion.pose_rows import Frame, Mount, absolute_rows, relative_rows
 from icalib.optim.arrowhead import make_pieces
 from icalib.optim.state import State
 from icalib.rig import PoseSensor
-from icalib.sensors.pose.residual import FRAME, PoseNoise, frame_of
+from icalib.sensors.pose.residual import FRAME, PoseNoise, RelativePosesFactor, frame_of
 from icalib.sensors.robot import next_posing, pose_factor
 from icalib.tools.simulation import Drive, Room, Scenario, SimPoses, rig_for, simulate
 
@@ -41,7 +42,7 @@ def world(request):
     sim = simulate(scenario, 5)
     inputs = inputs_for(rig_for(scenario), [sim.measurements])
     (stream,), truth = sim.measurements.poses, sim.truth
-    origins_s = (stream.origin_ns - sim.measurements.imu.origin_ns) * 1e-9
+    origins_s = (stream.origin_ns - not_none(sim.measurements.imu).origin_ns) * 1e-9
     values = {
         ("imu0", "intrinsics"): np.zeros(24),
         ("mocap0", "scale"): np.array([mocap.scale]),
@@ -51,7 +52,7 @@ def world(request):
         (frame_of("mocap0", 0), FRAME[0]): mocap.T_world_frame[:3, :3].copy(),
         (frame_of("mocap0", 0), FRAME[1]): mocap.T_world_frame[:3, 3].copy(),
     }
-    nodes = np.arange(0.0, sim.measurements.imu.seconds[-1], 0.02)
+    nodes = np.arange(0.0, not_none(sim.measurements.imu).seconds[-1], 0.02)
     bias = np.concatenate([truth.gyro_bias[0], truth.accel_bias[0]])
     state = State(nodes, *truth.pose_at(nodes + truth.seconds[0]), np.tile(bias, (len(nodes), 1)), values)
     return inputs, state, stream
@@ -70,7 +71,7 @@ def rows(inputs, state, stream, at=None):
 def last_of_a_row(inputs, state, stream):
     """The number of a pose that a row in the middle ends with."""
     factor, _ = rows(inputs, state, stream)
-    return int(factor.intervals.last[100]) if inputs.rig.poses[0].kind == "relative" else 200
+    return int(factor.intervals.last[100]) if isinstance(factor, RelativePosesFactor) else 200
 
 
 def test_truth_leaves_nothing(world):
@@ -86,9 +87,10 @@ def test_a_pose_that_is_moved_lowers_its_residual(world):
     position = stream.position.copy()
     position[k] += by
     factor, residual = rows(inputs, state, replace(stream, position=position))
-    seconds = factor.instants if inputs.rig.poses[0].kind == "absolute" else factor.seconds[factor.intervals.last]
+    relative = isinstance(factor, RelativePosesFactor)
+    seconds = factor.seconds[factor.intervals.last] if relative else factor.instants
     (row,) = np.flatnonzero(np.abs(seconds - stream.seconds[k]) < 1e-9)
-    if inputs.rig.poses[0].kind == "relative":
+    if isinstance(factor, RelativePosesFactor):
         by = stream.rotation[factor.intervals.first[row]].T @ by
     np.testing.assert_allclose(residual[row, 3:], -by, atol=1e-7)
 
@@ -99,7 +101,8 @@ def test_a_rotation_that_is_turned_lowers_its_residual(world):
     rotation = stream.rotation.copy()
     rotation[k] = rotation[k] @ Rotation.from_rotvec(by).as_matrix()
     factor, residual = rows(inputs, state, replace(stream, rotation=rotation))
-    seconds = factor.instants if inputs.rig.poses[0].kind == "absolute" else factor.seconds[factor.intervals.last]
+    relative = isinstance(factor, RelativePosesFactor)
+    seconds = factor.seconds[factor.intervals.last] if relative else factor.instants
     (row,) = np.flatnonzero(np.abs(seconds - stream.seconds[k]) < 1e-9)
     np.testing.assert_allclose(residual[row, :3], -by, atol=1e-7)
 

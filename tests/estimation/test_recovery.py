@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.typed import not_none
 
 from icalib.errors import EstimationError
 from icalib.estimate.problem import solver
@@ -58,12 +59,12 @@ def test_noiseless_recovery(setup_of, problem_of, asynchronous):
     scenario = without_bias(handheld(5.0, asynchronous=asynchronous, noiseless=True))
     setup = setup_of(simulate(scenario, seed=1))
     outcome = recover(setup, problem_of, setup.perturbed(np.random.default_rng(2), 5.0))
-    assert too_large(setup, outcome.state, EXACT) == {}
+    assert too_large(setup, not_none(outcome).state, EXACT) == {}
     for name in ("position", "velocity"):
-        in_board = [getattr(s, name) @ s.values["board0", "tilt"] for s in (outcome.state, setup.state)]
+        in_board = [getattr(s, name) @ s.values["board0", "tilt"] for s in (not_none(outcome).state, setup.state)]
         assert np.abs(in_board[0] - in_board[1]).max() < EXACT, name
-    assert np.abs(outcome.state.bias).max() < EXACT
-    assert outcome.cost < 1e-9
+    assert np.abs(not_none(outcome).state.bias).max() < EXACT
+    assert not_none(outcome).cost < 1e-9
 
 
 @pytest.mark.parametrize("asynchronous", [False, True])
@@ -71,17 +72,17 @@ def test_noiseless_recovery_with_biases(setup_of, problem_of, asynchronous):
     """The prior on the first biases takes a share that shrinks with the recording's length: 20 s are enough."""
     setup = setup_of(simulate(handheld(20.0, asynchronous=asynchronous, noiseless=True), seed=1))
     outcome = recover(setup, problem_of, setup.perturbed(np.random.default_rng(2), 5.0))
-    found = errors(setup, outcome.state)
+    found = errors(setup, not_none(outcome).state)
     tilt = found.pop(("board0", "tilt"))
     assert {k: e for k, e in found.items() if not e < EXACT} == {}
     assert tilt < 3e-8
-    assert np.abs(outcome.state.bias - setup.state.bias).max() < 5e-7
+    assert np.abs(not_none(outcome).state.bias - setup.state.bias).max() < 5e-7
 
 
 def test_noiseless_recovery_of_another_camera_model_and_the_imu_intrinsics(setup_of, problem_of, unlike):
     setup = setup_of(simulate(without_bias(replace(unlike.scenario, duration_s=5.0)), seed=1), imu_free=True)
     outcome = recover(setup, problem_of, setup.perturbed(np.random.default_rng(3)), passes=4)
-    assert too_large(setup, outcome.state, EXACT) == {}
+    assert too_large(setup, not_none(outcome).state, EXACT) == {}
 
 
 @pytest.fixture(scope="module")

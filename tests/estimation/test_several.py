@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from tests.typed import not_none
 
 from icalib.data.joining import PAUSE_NS, join
 from icalib.data.measurements import Measurements
@@ -49,9 +50,9 @@ def test_all_clocks_of_a_recording_are_shifted_alike(rig, recordings):
     for stream, part in zip((joined.imu, *joined.cameras), (None, 0, 1), strict=True):
         own = slice(len(recordings[0].imu.stamps_ns), None) if part is None else second.images[part]
         raw = recordings[1].imu if part is None else recordings[1].cameras[part]
-        np.testing.assert_array_equal(stream.stamps_ns[own] - second.shift_ns, raw.stamps_ns)
-        assert (np.diff(stream.stamps_ns) > 0).all()
-        assert np.diff(stream.stamps_ns).max() > PAUSE_NS + 10 * 10**9
+        np.testing.assert_array_equal(not_none(stream).stamps_ns[own] - second.shift_ns, raw.stamps_ns)
+        assert (np.diff(not_none(stream).stamps_ns) > 0).all()
+        assert np.diff(not_none(stream).stamps_ns).max() > PAUSE_NS + 10 * 10**9
     for corners, a, b in zip(joined.cameras, *(m.cameras for m in recordings), strict=True):
         np.testing.assert_array_equal(corners.uv, np.concatenate([a.uv, b.uv]))
         np.testing.assert_array_equal(corners.image[len(a.uv) :], b.image + len(a.stamps_ns))
@@ -91,11 +92,11 @@ def test_without_an_imu_given_offsets_keep_recordings_apart(rig, recordings):
 def test_nodes_and_images_stay_off_the_seam(rig, recordings):
     inputs = inputs_for(rig, recordings)
     imu = inputs.imu
-    ((end, begin),) = imu.seams
-    assert imu.gaps == ()
+    ((end, begin),) = not_none(imu).seams
+    assert not_none(imu).gaps == ()
     times = np.array([end - 0.5, end - 0.4, end + 1.0, begin - 1.0, begin + 0.4, begin + 0.5])
-    np.testing.assert_array_equal(usable(imu, times, 1e9), [True, True, False, False, True, True])
-    nodes = place_nodes(imu, [times], 0.05, 1e9)
+    np.testing.assert_array_equal(usable(not_none(imu), times, 1e9), [True, True, False, False, True, True])
+    nodes = place_nodes(not_none(imu), [times], 0.05, 1e9)
     k = first_nodes(imu, nodes)[1]
     np.testing.assert_allclose(nodes, [end - 0.5, end - 0.45, end - 0.4, begin + 0.4, begin + 0.45, begin + 0.5])
     assert k == 3
@@ -177,7 +178,8 @@ def test_a_tilt_turns_its_own_recording(problem):
 
 
 def test_a_state_knows_its_recordings():
-    state = State(np.arange(7.0), *(np.zeros((7, 3)),) * 4, {}, (0, 3, 5))
+    zeros = np.zeros((7, 3))
+    state = State(np.arange(7.0), zeros, zeros, zeros, zeros, {}, (0, 3, 5))
     assert state.recordings == [slice(0, 3), slice(3, 5), slice(5, 7)]
 
 

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.optimize import minimize
+from tests.typed import StandIn
 
 from icalib.estimate.problem.solver import minimise
 from icalib.optim.anderson import Accelerator
@@ -19,7 +20,7 @@ KEY = ("sensor", "value")
 FAR, WEAK, STEEP, LARGE = 10.0, 1e-3, 1e3, 100.0
 
 
-class OneNumber:
+class OneNumber(StandIn):
     """A problem in one number y, with one node that is left alone."""
 
     layout = make_layout([(*KEY, "vector", 1, True)])

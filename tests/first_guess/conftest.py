@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.typed import not_none
 
 from icalib.data.measurements import LidarStream
 from icalib.geometry import so3
@@ -28,7 +29,7 @@ class Robot:
 
     @cached_property
     def imu(self) -> ImuData:
-        return ImuData.build(self.sim.measurements.imu, self.sim.scenario.imu_noise)
+        return ImuData.build(not_none(self.sim.measurements.imu), self.sim.scenario.imu_noise)
 
     @property
     def streams(self) -> tuple[LidarStream, ...]:
@@ -37,7 +38,7 @@ class Robot:
     def truth(self, k: int = 0) -> LidarGuess:
         stream, truth = self.streams[k], self.sim.truth
         T = truth.T_imu_lidar[stream.name]
-        origins_s = (stream.origin_ns - self.sim.measurements.imu.origin_ns) * 1e-9
+        origins_s = (stream.origin_ns - not_none(self.sim.measurements.imu).origin_ns) * 1e-9
         return LidarGuess(T[:3, :3].copy(), T[:3, 3].copy(), truth.time_offset[stream.name] + origins_s)
 
     def pose_at(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

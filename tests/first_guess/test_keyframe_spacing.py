@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +33,7 @@ def recorded(seconds: float = 20.0) -> Measurements:
     return Measurements(None, (), wheels=(WheelStream("wheel0", stamps[::2], rate[::2]),), poses=(poses,))
 
 
-def spacing(noise: float | None, densities=DENSITIES, **settings: float) -> float:
+def spacing(noise: float | None, densities=DENSITIES, **settings: Any) -> float:
     m = recorded()
     s = m.poses[0]
     path = smooth_path(s.seconds, s.rotation, s.position, np.arange(0.0, s.seconds[-1], 0.01))

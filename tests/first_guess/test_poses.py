@@ -51,8 +51,8 @@ def errors(sim, values):
 
 def truth_at(sim, nodes):
     bias = np.concatenate([sim.truth.gyro_bias.mean(axis=0), sim.truth.accel_bias.mean(axis=0)])
-    poses = sim.truth.pose_at(nodes + sim.truth.seconds[0])
-    return State(nodes, *poses, np.tile(bias, (len(nodes), 1)), {("imu0", "intrinsics"): np.zeros(24)})
+    R, p, v = sim.truth.pose_at(nodes + sim.truth.seconds[0])
+    return State(nodes, R, p, v, np.tile(bias, (len(nodes), 1)), {("imu0", "intrinsics"): np.zeros(24)})
 
 
 def test_with_the_imu_alone(sim):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.typed import instance, not_none
 from threadpoolctl import threadpool_limits
 
 from icalib.data.measurements import CornerStream, Measurements
@@ -47,7 +48,7 @@ def robot(tags_on_walls):
         wheels=tuple(replace(w, noise=0.005, allowed_slip=1e-4) for w in base.wheels),
         target=Markers("tag36h11", EDGE_M, tuple(range(4 * PER_WALL))),
         board=True,
-        T_world_bodies=tags_on_walls(base.room.size, PER_WALL),
+        T_world_bodies=tags_on_walls(not_none(base.room).size, PER_WALL),
     )
 
 
@@ -106,7 +107,7 @@ def scrambled(stream: CornerStream, target: Markers, body: int) -> CornerStream:
 def test_a_tag_that_nothing_ties_to_the_others_is_left_out():
     scenario = tag_map(6.0)
     simulation = simulate(scenario, 0)
-    cameras = tuple(scrambled(c, scenario.target, 7) for c in simulation.measurements.cameras)
+    cameras = tuple(scrambled(c, instance(scenario.target, Markers), 7) for c in simulation.measurements.cameras)
     result = calibrate_measurements(rig_for(scenario), replace(simulation.measurements, cameras=cameras))
     name = scenario.target.bodies[7]
     assert result.converged

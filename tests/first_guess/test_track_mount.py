@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.typed import not_none
 from threadpoolctl import threadpool_limits
 
 from icalib.errors import EstimationError
@@ -37,7 +38,7 @@ def drive(example="table2-planar", cameras=1, seed=1, noise_px=0.0, duration_s=2
     scenario = replace(scenario, duration_s=duration_s, cameras=own, lidars=(), wheels=(), **changes)
     simulation = simulate(scenario, seed)
     truth = simulation.truth
-    imu = ImuData.build(simulation.measurements.imu, scenario.imu_noise)
+    imu = ImuData.build(not_none(simulation.measurements.imu), scenario.imu_noise)
     nodes = np.arange(0.0, imu.seconds[-1], 0.05)
     bias = np.concatenate([truth.gyro_bias.mean(axis=0), truth.accel_bias.mean(axis=0)])
     poses = truth.pose_at(nodes + truth.seconds[0])

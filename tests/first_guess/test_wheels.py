@@ -102,8 +102,10 @@ def test_wheels_that_slipped_for_a_while_are_left_out():
     wheel = np.diff(p.angles[::step], axis=0) / 0.1
     wheel[100:115] *= [1.5, 1.2]
     n = len(wheel)
-    means = [(0.5 * (x[1:] + x[:-1]))[: n * step].reshape(n, step, 3).mean(axis=1) for x in (p.rate, p.velocity)]
-    turn, lever, radii, baseline = differences(drive_guess("wheel0", wheel, *means, UP))
+    rate, velocity = (
+        (0.5 * (x[1:] + x[:-1]))[: n * step].reshape(n, step, 3).mean(axis=1) for x in (p.rate, p.velocity)
+    )
+    turn, lever, radii, baseline = differences(drive_guess("wheel0", wheel, rate, velocity, UP))
     assert np.abs(turn).max() < 1e-6 and np.abs(lever[:2]).max() < 1e-6
     assert np.abs(radii).max() < 1e-6 and abs(baseline) < 1e-6
 

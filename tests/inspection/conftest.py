@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
+from tests.typed import not_none
 
 from icalib.data.measurements import ImuStream
 from icalib.tools.simulation import handheld, simulate
@@ -115,7 +116,7 @@ def bags() -> Bags:
 def waved() -> ImuStream:
     """25 s of an IMU turned about all axes, 200 Hz."""
     imu = simulate(handheld(25.0), 1).measurements.imu
-    return replace(imu, stamps_ns=imu.stamps_ns - imu.stamps_ns[0] + ORIGIN)
+    return replace(not_none(imu), stamps_ns=not_none(imu).stamps_ns - not_none(imu).stamps_ns[0] + ORIGIN)
 
 
 @pytest.fixture(scope="session")

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.typed import not_none
 
 from icalib.cli import main
 from icalib.errors import CalibrationError, RigError
@@ -96,7 +97,11 @@ def test_a_draft_loads_once_the_target_is_filled_in(draft, bags):
         ("cam1", "/cam1/image_raw", "pinhole-radtan", (40, 30)),
     ]
     assert all(c.intrinsics.value is None for c in rig.cameras)
-    assert (rig.imu.name, rig.imu.topic, rig.imu.noise.source) == ("imu0", "/imu0", "default for a consumer IMU")
+    assert (not_none(rig.imu).name, not_none(rig.imu).topic, not_none(rig.imu).noise.source) == (
+        "imu0",
+        "/imu0",
+        "default for a consumer IMU",
+    )
     assert 'frame "left: eye"' in text and 'frame "imu_link"' in text
     assert "ruler" in text and "The default class" in text
 
@@ -114,7 +119,7 @@ def clouds_and_joints(bags):
 def test_a_draft_of_a_lidar_and_an_imu_needs_no_target(draft, bags):
     text, path = draft(clouds_and_joints(bags))
     rig = load_rig(path)
-    assert [x.name for x in rig.lidars] == ["top"] and rig.imu.name == "imu0" and not rig.cameras
+    assert [x.name for x in rig.lidars] == ["top"] and not_none(rig.imu).name == "imu0" and not rig.cameras
     assert "target" not in text
 
 
@@ -221,7 +226,7 @@ def test_a_draft_with_kalibrs_files_loads_as_it_is(draft, bags, tmp_path):
     assert rig.cameras[0].model == "pinhole-equidistant"
     np.testing.assert_array_equal(rig.cameras[0].intrinsics.value, [30.0, 31.0, 16.0, 12.0])
     np.testing.assert_array_equal(rig.cameras[0].distortion.value, [-0.28, 0.07, 0.0002, 1.8e-05])
-    assert (rig.imu.noise.gyro, rig.imu.noise.source) == (1.87e-4, "imu.yaml (Kalibr)")
+    assert (not_none(rig.imu).noise.gyro, not_none(rig.imu).noise.source) == (1.87e-4, "imu.yaml (Kalibr)")
     assert "from camchain-imucam.yaml (Kalibr, cam0)" in text and "The target is from grid.yaml" in text
 
 
@@ -238,7 +243,7 @@ def test_kalibrs_noise_of_another_imu(draft, bags, tmp_path):
     text, path = draft(bags.noise("/cam0/image_raw", SIZE), ("/imu0", "/imu1"))
     fill(path)
     rig = load_rig(path)
-    assert (rig.imu.name, rig.imu.noise.gyro) == ("imu1", 1.87e-4)
+    assert (not_none(rig.imu).name, not_none(rig.imu).noise.gyro) == ("imu1", 1.87e-4)
     assert "Also recorded: imu0 (/imu0); a rig has one IMU" in text
 
 
@@ -270,7 +275,7 @@ def test_a_folder_of_tables_needs_its_resolution(tmp_path, capsys):
     path.write_text(path.read_text().replace("resolution:", "resolution: [752, 480]"))
     rig = load_rig(path)
     assert [c.path for c in rig.cameras] == ["cam0/corners.csv", "cam1/corners.csv"]
-    assert rig.imu.path == "imu0/data.csv"
+    assert not_none(rig.imu).path == "imu0/data.csv"
 
 
 @pytest.mark.parametrize("made", ["file", "link"])

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.typed import not_none
 
 from icalib.data.measurements import ImuStream
 from icalib.tools.inspection import inspect_recording
@@ -109,14 +110,14 @@ def test_readings_that_are_not_finite(waved):
 def test_gravity_stands_still_in_the_right_unit_only():
     """At rest but for its turning: rates in rad/s keep gravity where it is."""
     imu = simulate(handheld(6.0, noiseless=True), 3).measurements.imu
-    t = imu.seconds
+    t = not_none(imu).seconds
     angle = np.stack([0.5 * np.sin(3 * t), 0 * t, 0 * t], axis=1)
     rate = np.stack([1.5 * np.cos(3 * t), 0 * t, 0 * t], axis=1)
     force = 9.81 * np.stack([0 * t, np.sin(angle[:, 0]), np.cos(angle[:, 0])], axis=1)
-    turned = replace(imu, gyro=rate, accel=force)
-    assert gravity_spread(turned, 1.0) < 0.02
-    assert gravity_spread(turned, DEGREE) > 2.0
-    assert gravity_spread(replace(turned, gyro=rate / DEGREE), DEGREE) < 0.02
+    turned = replace(not_none(imu), gyro=rate, accel=force)
+    assert not_none(gravity_spread(turned, 1.0)) < 0.02
+    assert not_none(gravity_spread(turned, DEGREE)) > 2.0
+    assert not_none(gravity_spread(replace(turned, gyro=rate / DEGREE), DEGREE)) < 0.02
 
 
 def test_gravity_spread_of_a_short_recording(waved):

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from rich.console import Console
+from tests.typed import StandIn
 
 from icalib.cli import main
 from icalib.data.measurements import CornerStream
@@ -162,7 +163,7 @@ def test_tilts_and_distances():
     stamps = np.arange(41, dtype=np.int64) * STEP
     stream = CornerStream("cam0", stamps, n * np.arange(42), np.tile(np.arange(n), 41), np.concatenate(uv))
 
-    class Tables:
+    class Tables(StandIn):
         def corners(self, camera, target):
             return stream
 
@@ -183,7 +184,7 @@ def test_tilts_are_those_of_each_free_tag():
         "cam0", stamps, 8 * np.arange(21), np.tile(np.arange(8), 20), np.tile([*front, *tilted], (20, 1))
     )
 
-    class Tables:
+    class Tables(StandIn):
         def corners(self, camera, target):
             return stream
 

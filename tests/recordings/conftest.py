@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -61,7 +61,7 @@ class Maker:
         w, f = (self.vector(v) for v in (gyro, accel))
         return self.make("sensor_msgs/msg/Imu", self.header(stamp_ns), turn, unknown, w, unknown, f, unknown)
 
-    def vector(self, v: Sequence[float], kind: str = "Vector3") -> Any:
+    def vector(self, v: Iterable[float], kind: str = "Vector3") -> Any:
         return self.make(f"geometry_msgs/msg/{kind}", *(float(x) for x in v))
 
     def serialise(self, type_name: str, message: Any) -> bytes:

@@ -9,9 +9,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from tests.typed import instance
 
 from icalib.data.bags.ros1 import Ros1Storage
 from icalib.data.checks.imu_checks import checked_imu
+from icalib.data.measurements import ImuStream
 from icalib.data.recordings import Recording, open_recording
 from icalib.errors import RecordingError
 from icalib.rig import ImuSensor
@@ -77,8 +79,8 @@ class TestCutOff:
             assert all((f.image == i).all() for f, i in zip(frames, truth.images, strict=False))
         if "imu" in kinds:
             imu = recording.imu(IMU)
-            readings = len(imu.stamps_ns)
-            assert imu.stamps_ns.tolist() == truth.imu_stamps[:readings]
+            readings = len(instance(imu, ImuStream).stamps_ns)
+            assert instance(imu, ImuStream).stamps_ns.tolist() == truth.imu_stamps[:readings]
             np.testing.assert_allclose(imu.gyro, truth.gyro[:readings], rtol=1e-15)
         return images + readings
 
@@ -144,7 +146,7 @@ class TestCutOff:
         (tmp_path / "run_1.mcap").write_bytes(b"")
         recording = open_recording(tmp_path)
         assert recording.notes() == (f"{tmp_path / 'run_1.mcap'} is empty; record or copy it again.",)
-        assert 0 < len(recording.imu(IMU).stamps_ns) < 70
+        assert 0 < len(instance(recording.imu(IMU), ImuStream).stamps_ns) < 70
 
     def test_no_part_can_be_read(self, tmp_path):
         for k in range(2):
@@ -156,7 +158,9 @@ class TestCutOff:
         folder = write.small("ros2 mcap", tmp_path, truth)
         (folder / "metadata.yaml").unlink()
         recording = open_recording(folder)
-        assert len(recording.imu(IMU).stamps_ns) == len(truth.imu_stamps) and recording.notes() == ()
+        assert (
+            len(instance(recording.imu(IMU), ImuStream).stamps_ns) == len(truth.imu_stamps) and recording.notes() == ()
+        )
 
     def test_part_that_metadata_names_is_missing(self, tmp_path, truth, write):
         folder = write.small("ros2 mcap", tmp_path, truth)
@@ -191,7 +195,7 @@ class TestDamaged:
         damaged[len(damaged) // 2] ^= 0xFF
         path.write_bytes(damaged)
         recording = open_recording(path)
-        stamps = recording.imu(IMU).stamps_ns.tolist()
+        stamps = instance(recording.imu(IMU), ImuStream).stamps_ns.tolist()
         assert set(stamps) < set(truth.imu_stamps) and len(stamps) > 90 and stamps[-1] == truth.imu_stamps[-1]
         assert "is damaged; the messages after the damage were ignored" in recording.notes()[0]
 
@@ -217,7 +221,7 @@ class TestDamaged:
         lost = {topic: [m[2] for m in messages if m[0] == topic and "String" in m[1]] for topic in kinds}
         assert len(lost["/imu0"]) > 3
         left = [t for t in truth.imu_stamps if t + write.delay_ns not in lost["/imu0"]]
-        assert recording.imu(IMU).stamps_ns.tolist() == left
+        assert instance(recording.imu(IMU), ImuStream).stamps_ns.tolist() == left
         frames = [f.stamp_ns for f in recording.images("/cam0/image_raw")]
         assert frames == [t for t in truth.image_stamps if t + write.delay_ns not in lost["/cam0/image_raw"]]
         counted = f"/imu0: {len(lost['/imu0'])} of 120 messages are damaged and were left out, the first received at "
@@ -304,7 +308,7 @@ class TestClocks:
 
     def test_no_stamp_in_the_header(self, tmp_path, write):
         bag = self.bag(tmp_path, write, [0] * 20)
-        assert bag.imu(IMU).stamps_ns.tolist() == [9 * S + k * 5_000_000 for k in range(20)]
+        assert instance(bag.imu(IMU), ImuStream).stamps_ns.tolist() == [9 * S + k * 5_000_000 for k in range(20)]
         assert "/imu: 20 messages have no stamp in their header. Their receive times are used instead" in bag.notes()[0]
 
     def test_readings_that_overtook_each_other_are_sorted(self, tmp_path, write):
@@ -312,7 +316,7 @@ class TestClocks:
         stamps[7], stamps[9] = stamps[9], stamps[7]
         bag = self.bag(tmp_path, write, stamps)
         imu = bag.imu(IMU)
-        assert imu.stamps_ns.tolist() == sorted(stamps)
+        assert instance(imu, ImuStream).stamps_ns.tolist() == sorted(stamps)
         rng = np.random.default_rng(0)
         written = np.array([[rng.normal(size=3), rng.normal(size=3)] for _ in stamps])[:, 0]
         np.testing.assert_array_equal(imu.gyro, written[np.argsort(stamps)])
@@ -321,7 +325,7 @@ class TestClocks:
     def test_clock_that_was_set_back_is_refused(self, tmp_path, write):
         stamps = [S + k * 5_000_000 for k in range(10)] + [5 + k * 5_000_000 for k in range(10)]
         bag = self.bag(tmp_path, write, [100 * S + t for t in stamps[:10]] + stamps[10:])
-        sentence = complaint(lambda: checked_imu(bag.imu(IMU), bag.where(IMU)))
+        sentence = complaint(lambda: checked_imu(instance(bag.imu(IMU), ImuStream), bag.where(IMU)))
         assert f"run.mcap /imu (imu0): the reading at 5 ns comes after the one at {101 * S + 45_000_000} ns" in sentence
 
 

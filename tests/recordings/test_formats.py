@@ -6,15 +6,18 @@ import pickle
 import shutil
 import sqlite3
 import tracemalloc
+from collections.abc import Generator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.typed import instance
 
 from icalib.data.bags.opening import bag_files
 from icalib.data.checks.imu_checks import checked_imu
+from icalib.data.measurements import ImuStream
 from icalib.data.recordings import BagRecording, Recording, decode, image_topics, open_recording, read_measurements
 from icalib.errors import RecordingError
 from icalib.geometry.targets import AprilGrid
@@ -65,11 +68,11 @@ def test_streams_are_those_that_were_written(form, tmp_path, truth, write):
             assert frame.image.dtype == np.uint8 and frame.image.flags.writeable
             np.testing.assert_array_equal(frame.image, image[::step])
     imu = recording.imu(IMU)
-    assert imu.stamps_ns.tolist() == truth.imu_stamps
+    assert instance(imu, ImuStream).stamps_ns.tolist() == truth.imu_stamps
     np.testing.assert_allclose(imu.gyro, truth.gyro, rtol=1e-15)
     np.testing.assert_allclose(imu.accel, truth.accel, rtol=1e-15)
     assert recording.notes() == ()
-    assert checked_imu(imu, recording.where(IMU))[1] == ()
+    assert checked_imu(instance(imu, ImuStream), recording.where(IMU))[1] == ()
 
 
 @pytest.mark.parametrize("form", FORMS[:-1])
@@ -77,7 +80,7 @@ def test_what_is_left_half_read_is_closed_by_any_thread(form, tmp_path, truth, w
     """Garbage is collected in the thread that happens to make some."""
     recording = open_recording(write.small(form, tmp_path, truth))
     assert isinstance(recording, BagRecording)
-    messages = recording.messages(recording.image_topic(CAM0), "image")
+    messages = instance(recording.messages(recording.image_topic(CAM0), "image"), Generator)
     next(messages)
     with ThreadPoolExecutor(1) as pool:
         pool.submit(messages.close).result()
@@ -126,7 +129,7 @@ def test_folder_of_split_bags_is_one_recording(tmp_path, truth, write):
     recording = open_recording(tmp_path)
     assert [p.name for p in recording.files()] == ["run_1.mcap", "run_2.mcap", "run_10.mcap"]
     assert [f.stamp_ns for f in recording.images("/cam0/image_raw")] == truth.image_stamps
-    assert recording.imu(IMU).stamps_ns.tolist() == truth.imu_stamps
+    assert instance(recording.imu(IMU), ImuStream).stamps_ns.tolist() == truth.imu_stamps
 
 
 def test_single_database_and_odd_names(tmp_path, truth, write):
@@ -151,7 +154,7 @@ def test_database_whose_recorder_crashed(tmp_path, truth, write):
 def test_mav0_itself_may_be_given(tmp_path, truth, write):
     recording = open_recording(write.euroc(tmp_path, truth) / "mav0")
     assert len(list(recording.images(recording.image_topic(CAM1)))) == len(truth.images)
-    assert recording.imu(IMU).stamps_ns.tolist() == truth.imu_stamps
+    assert instance(recording.imu(IMU), ImuStream).stamps_ns.tolist() == truth.imu_stamps
 
 
 def test_a_folder_of_tables_beside_its_bag_is_tables(tmp_path, truth, write):

@@ -6,11 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.typed import instance
 
 from icalib.data.recordings import FolderRecording, read_measurements
 from icalib.data.stamps.clocks import unit_of_stamps, usual_step
 from icalib.data.tables.columns import IMU, TableKind
 from icalib.data.tables.table import holds, named, read_table
+from icalib.data.tables.wheels import WheelReadings
 from icalib.errors import RecordingError, RigError
 from icalib.rig import Camera, ImuSensor, PoseSensor, Rig, TableLayout, Wheels
 from icalib.rig.file import load_rig, rig_from_dict, rig_to_dict
@@ -208,12 +210,12 @@ def test_wheels_corners_tracks_and_poses_by_name(tmp_path):
     )
     folder = FolderRecording(tmp_path)
     read_wheels = folder.wheels(Wheels("wheel0", "wheel0/rates.csv"))
-    assert read_wheels.value.tolist() == [[1.0, 2.0]] * N
+    assert instance(read_wheels, WheelReadings).value.tolist() == [[1.0, 2.0]] * N
     write_table(
         tmp_path, "odom0/twist.csv", "w,v,t\n" + "".join(f"0.5,1.5,{t / 1e9:.9f}\n" for t in 20_000_000 * np.arange(N))
     )
     twist = folder.wheels(Wheels("odom0", "odom0/twist.csv", measures="twist"))
-    assert twist.value.tolist() == [[1.5, 0.5]] * N and twist.stamps_ns[1] == 20_000_000
+    assert instance(twist, WheelReadings).value.tolist() == [[1.5, 0.5]] * N and twist.stamps_ns[1] == 20_000_000
     write_table(tmp_path, "cam0/tracks.csv", "v,u,id,t\n" + "".join(f"2,1,7,{t}\n" for t in 20 * np.arange(200)))
     camera = Camera("cam0", "cam0/corners.csv", "pinhole-radtan", (64, 48), tracks="cam0/tracks.csv")
     tracks = folder.tracks(camera)
@@ -355,5 +357,6 @@ def test_poses_and_wheels_with_stamps_in_two_columns(tmp_path):
     recording = FolderRecording(tmp_path)
     assert recording.poses(PoseSensor("a", "a/poses.csv")).stamps_ns.tolist() == STAMPS.tolist()
     wheels = recording.wheels(Wheels("a", "a/rates.csv"))
-    assert wheels.stamps_ns.tolist() == STAMPS.tolist() and wheels.value[5].tolist() == [1.5, 2.0]
+    assert wheels.stamps_ns.tolist() == STAMPS.tolist()
+    assert instance(wheels, WheelReadings).value[5].tolist() == [1.5, 2.0]
     assert {t.name: t.first_ns for t in recording.topics()} == {"a/poses.csv": ORIGIN, "a/rates.csv": ORIGIN}

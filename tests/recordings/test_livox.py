@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,7 +40,7 @@ def bag_of(path: Path, package: str, form: str, frame: str, cut: int = 0) -> Bag
             stamp = t["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 10**9))
             header = t["std_msgs/msg/Header"](*([k] if form == "ros1" else []), stamp, frame)
             rows = zip(SINCE.tolist(), XYZ[k].tolist(), strict=True)
-            points = [t[f"{package}/msg/CustomPoint"](since, *xyz, 100 + k, 16, 3) for since, xyz in rows]
+            points: Any = [t[f"{package}/msg/CustomPoint"](since, *xyz, 100 + k, 16, 3) for since, xyz in rows]
             message = t[kind](header, stamp_ns, N, 1, np.array([1, 2, 3], np.uint8), points)
             content = bytes(serialise(message, kind))
             writer.write(connection, stamp_ns + 10, content[: len(content) - cut])

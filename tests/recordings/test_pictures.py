@@ -7,7 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from tests.typed import instance
 
+from icalib.data.measurements import ImuStream
 from icalib.data.recordings import FolderRecording, PictureFolder, open_recording
 from icalib.errors import RecordingError
 from icalib.rig import Camera, ImuNoise, ImuSensor
@@ -164,7 +166,7 @@ def test_kalibrs_folder(tmp_path):
     assert isinstance(recording, FolderRecording)
     assert [f.stamp_ns for f in recording.images("cam0")] == STAMPS
     imu = recording.imu(ImuSensor("imu0", "imu0/data.csv", ImuNoise(1, 1, 1, 1)))
-    assert imu.stamps_ns.tolist() == STAMPS and imu.accel[0].tolist() == [4, 5, 6]
+    assert instance(imu, ImuStream).stamps_ns.tolist() == STAMPS and imu.accel[0].tolist() == [4, 5, 6]
     assert [(t.name, t.kind, t.count) for t in recording.topics()] == [("cam0", "image", 4), ("imu0.csv", "imu", 4)]
     assert recording.stamps("imu0.csv").tolist() == STAMPS
     found = find_sources(recording.topics())

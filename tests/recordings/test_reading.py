@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.typed import not_none
 
 from icalib.data.measurements import CornerStream, Measurements
 from icalib.data.recordings import open_recording, read_measurements
@@ -67,8 +68,10 @@ def complaint(folder: Path, **tables: list[list[float]]) -> str:
 def test_reads_what_was_written(tmp_path):
     m = read(tmp_path)
     assert m.notes == ()
-    assert m.imu.stamps_ns.tolist() == [row[0] for row in imu_rows()]
-    np.testing.assert_allclose(np.hstack([m.imu.gyro, m.imu.accel]), [r[1:] for r in imu_rows()], rtol=1e-15)
+    assert not_none(m.imu).stamps_ns.tolist() == [row[0] for row in imu_rows()]
+    np.testing.assert_allclose(
+        np.hstack([not_none(m.imu).gyro, not_none(m.imu).accel]), [r[1:] for r in imu_rows()], rtol=1e-15
+    )
     cam = m.cameras[0]
     assert cam.stamps_ns[cam.image].tolist() == [row[0] for row in corner_rows()]
     assert cam.point.tolist() == [4 * r[1] + r[2] for r in corner_rows()]
@@ -92,7 +95,7 @@ def test_euroc_folder_and_gzip(tmp_path):
     (tmp_path / "mav0/cam0/corners.csv.gz").write_bytes(gzip.compress(plain.read_bytes()))
     plain.unlink()
     recording = open_recording(tmp_path)
-    assert len(read_measurements(recording, a_rig()).imu.stamps_ns) == 200
+    assert len(not_none(read_measurements(recording, a_rig()).imu).stamps_ns) == 200
     assert [p.name for p in recording.files()] == ["data.csv", "corners.csv.gz"]
 
 
@@ -100,8 +103,8 @@ def test_whole_real_recording_is_read_exactly(euroc):
     m = read_measurements(open_recording(euroc), a_rig(2))
     assert [len(c.uv) for c in m.cameras] == [179524, 178764]
     rows = [r.split(",") for r in gzip.decompress((euroc / "imu0/data.csv.gz").read_bytes()).decode().split()[1:]]
-    assert m.imu.stamps_ns.tolist() == [int(r[0]) for r in rows]
-    assert m.imu.gyro[:, 2].tolist() == [float(r[3]) for r in rows]
+    assert not_none(m.imu).stamps_ns.tolist() == [int(r[0]) for r in rows]
+    assert not_none(m.imu).gyro[:, 2].tolist() == [float(r[3]) for r in rows]
     assert m.notes == ()
 
 
@@ -152,14 +155,14 @@ class TestImu:
     def test_exact_repeats_are_dropped_with_a_note(self, tmp_path):
         rows = imu_rows()
         m = read(tmp_path, imu=rows[:10] + rows[9:20] + rows[19:])
-        assert len(m.imu.stamps_ns) == 200 and (np.diff(m.imu.stamps_ns) > 0).all()
+        assert len(not_none(m.imu).stamps_ns) == 200 and (np.diff(not_none(m.imu).stamps_ns) > 0).all()
         assert "2 repeated readings were dropped" in m.notes[0] and str(ORIGIN + 9 * IMU_STEP) in m.notes[0]
 
     def test_different_readings_at_one_instant(self, tmp_path):
         rows = imu_rows()
         rows[10][0] = rows[9][0]
         m = read(tmp_path, imu=rows)
-        assert m.imu.stamps_ns.tolist() == [row[0] for row in rows if row[0] != rows[9][0]]
+        assert not_none(m.imu).stamps_ns.tolist() == [row[0] for row in rows if row[0] != rows[9][0]]
         assert "2 readings share a stamp with a different reading" in m.notes[0]
         assert f"the first at {ORIGIN + 9 * IMU_STEP} ns" in m.notes[0]
 
@@ -167,7 +170,7 @@ class TestImu:
     def test_other_units_of_time(self, tmp_path, divisor, unit):
         rows = [[r[0] // divisor, *r[1:]] for r in imu_rows()]
         m = read(tmp_path, imu=rows)
-        assert m.imu.stamps_ns.tolist() == [r[0] * divisor for r in rows]
+        assert not_none(m.imu).stamps_ns.tolist() == [r[0] * divisor for r in rows]
         assert f"the stamps are read as {unit}, as their rate shows" in m.notes[0]
 
     def test_whole_seconds(self, tmp_path):

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.typed import random_rotations
 
 from icalib.data.messages.streams import (
     point_clouds,
@@ -20,7 +23,7 @@ from icalib.errors import RecordingError
 RNG = np.random.default_rng(11)
 STAMPS = [1_700_000_000_123_456_789 + k * 10_000_000 for k in range(5)]
 POSITION, LINEAR, ANGULAR = (RNG.normal(size=(5, 3)) for _ in range(3))
-XYZW = Rotation.random(5, random_state=1).as_quat()
+XYZW = random_rotations(5, seed=1).as_quat()
 
 
 @pytest.fixture(params=["ros1", "ros2"])
@@ -124,7 +127,7 @@ POINT = np.dtype(
 )
 
 
-def cloud(make, k: int, header, order: str = "<", cut: int = 0):
+def cloud(make, k: int, header, order: Literal["<", ">"] = "<", cut: int = 0):
     """Two rows of three points, each row followed by four bytes of padding."""
     points = np.zeros((2, 3), POINT.newbyteorder(order))
     points["x"], points["ring"], points["t"] = RNG.normal(size=(2, 3)), np.arange(6).reshape(2, 3) + k, 7

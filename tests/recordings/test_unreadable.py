@@ -7,8 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.writer import Writer as McapWriter
+from tests.typed import instance
 
 from icalib.data.images.unreadable import type_not_read
+from icalib.data.measurements import ImuStream
 from icalib.data.recordings import open_recording
 from icalib.errors import RecordingError
 from icalib.rig import Camera, ImuSensor, Lidar
@@ -151,4 +153,4 @@ def test_numbers_are_no_pointers(tmp_path):
     (tmp_path / "imu0").mkdir()
     rows = np.hstack([1e6 * np.arange(20)[:, None], np.random.default_rng(1).normal(size=(20, 6))])
     np.savetxt(tmp_path / "imu0" / "data.csv", rows, delimiter=",", fmt=["%d"] + ["%.6f"] * 6)
-    assert len(open_recording(tmp_path).imu(IMU).stamps_ns) == 20
+    assert len(instance(open_recording(tmp_path).imu(IMU), ImuStream).stamps_ns) == 20

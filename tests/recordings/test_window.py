@@ -9,9 +9,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from tests.typed import instance
 
 from icalib.cli import main
 from icalib.data.checks.imu_halves import ImuHalves
+from icalib.data.measurements import ImuStream
 from icalib.data.recordings import open_recording
 from icalib.data.recordings.several import open_all
 from icalib.data.stamps.window import Window, start_of
@@ -33,15 +35,15 @@ def test_of_folders_and_bags(form, tmp_path, truth, write):
     recording = open_recording(path, begin, end)
     imu = recording.imu(IMU)
     inside = [t for t in truth.imu_stamps if truth.image_stamps[3] <= t < truth.image_stamps[7]]
-    assert imu.stamps_ns.tolist() == inside and len(imu.gyro) == len(inside)
+    assert instance(imu, ImuStream).stamps_ns.tolist() == inside and len(imu.gyro) == len(inside)
     camera = Camera("cam0", "cam0/corners.csv", "eucm", (8, 6))
     topic = recording.image_topic(camera)
     assert [f.stamp_ns for f in recording.images(topic)] == truth.image_stamps[3:7]
     assert recording.stamps(topic).tolist() == truth.image_stamps[3:7]
     assert f"only the part from {begin:g} s after its start to {end:g} s is used" in recording.notes()[0]
-    assert open_recording(path).imu(IMU).stamps_ns.tolist() == truth.imu_stamps
+    assert instance(open_recording(path).imu(IMU), ImuStream).stamps_ns.tolist() == truth.imu_stamps
     late = open_recording(path, begin).imu(IMU)
-    assert late.stamps_ns.tolist() == [t for t in truth.imu_stamps if t >= truth.image_stamps[3]]
+    assert instance(late, ImuStream).stamps_ns.tolist() == [t for t in truth.imu_stamps if t >= truth.image_stamps[3]]
     with pytest.raises(
         RecordingError, match=r"there is nothing from 900 s to the end, the whole lasts .* correct --from"
     ):

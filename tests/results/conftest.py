@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.typed import instance
 
 from icalib.geometry.targets import AprilGrid
 from icalib.result import (
@@ -21,6 +22,7 @@ from icalib.result import (
     PredictedFit,
     SensorFit,
     Trajectory,
+    Verdict,
     WheelResiduals,
 )
 from icalib.rig import Camera, ImuNoise, ImuSensor, Lidar, Parameter, Rig, Settings, Wheels
@@ -62,7 +64,7 @@ def calibration() -> Calibration:
         covariance_names=names,
         undetermined=("cam1 translation y: turn the rig about a second axis to determine it.",),
         fits=tuple(_fits()),
-        corner_residuals=tuple(_corners(name, trajectory, rig.target, rng) for name in POSES),
+        corner_residuals=tuple(_corners(name, trajectory, instance(rig.target, AprilGrid), rng) for name in POSES),
         imu_residuals=ImuResiduals(trajectory.seconds[:-1], rng.normal(size=(NODES - 1, 15))),
         trajectory=trajectory,
         iterations=tuple(_iterations()),
@@ -132,7 +134,7 @@ def _group(before: list[ParameterGroup], sensor: str, name: str, value: object, 
         zeros = np.zeros(n)
         return ParameterGroup(sensor, name, labels, unit, array, zeros, zeros, ("fixed",) * n, "fixed")
     start = sum(len(g.labels) for g in before if g.columns)
-    verdict = ["determined"] * n
+    verdict: list[Verdict] = ["determined"] * n
     if (sensor, name) == ("cam1", "translation"):
         verdict = ["determined", "undetermined", "weak"]
     formal, factor = np.full(n, std) * (1.0 + 0.1 * np.arange(n)), np.full(n, 2.7)

@@ -205,7 +205,8 @@ def test_arrays_that_do_not_fit_the_others(robot: Calibration, tmp_path: Path, n
         arrays = {key: file[key] for key in file.files}
     spoilt = SPOILT[how](arrays[name])
     same = spoilt.shape == arrays[name].shape and spoilt.dtype == arrays[name].dtype  # what is flat stays so
-    np.savez(tmp_path / "result.npz", **(arrays | {name: spoilt}))
+    written: dict[str, Any] = arrays | {name: spoilt}
+    np.savez(tmp_path / "result.npz", **written)
     change(tmp_path, npz_sha256=hashlib.sha256((tmp_path / "result.npz").read_bytes()).hexdigest())
     if same:
         load_calibration(tmp_path)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.typed import not_none
 
 from icalib.tools.simulation import (
     Block,
@@ -18,6 +19,7 @@ from icalib.tools.simulation import (
     SimWheels,
     hills_of_slope,
 )
+from icalib.tools.simulation.scenario.robot import DriveKind
 
 CAMERA_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # R_imu_cam of one that looks ahead
 
@@ -111,11 +113,11 @@ def robot() -> Scenario:
     )
 
 
-def on_ground(robot: Scenario, kind: str, **motion) -> Scenario:
+def on_ground(robot: Scenario, kind: DriveKind, **motion) -> Scenario:
     """The robot with wheels that report rates, on the floor or, for ramps, on hills."""
     hills = hills_of_slope(12.0) if kind == "ramps" else None
     wheels = tuple(replace(w, reports="rates") for w in robot.wheels)
-    return replace(robot, motion=Drive(kind, **motion), room=replace(robot.room, hills=hills), wheels=wheels)
+    return replace(robot, motion=Drive(kind, **motion), room=replace(not_none(robot.room), hills=hills), wheels=wheels)
 
 
 def alone(robot: Scenario) -> Scenario:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from tests.typed import not_none
 
 from icalib.errors import RecordingError, RigError
 from icalib.tools.simulation import Drive, Room, SimWheels, hills_of_slope, simulate
@@ -50,8 +52,8 @@ def swing_file(tmp_path_factory):
 
 @pytest.mark.parametrize("kind", ["free", "single-axis", *GROUND, "recorded"])
 def test_readings_are_derivatives_of_the_pose(robot, kind, swing_file):
-    motion = {"path": swing_file} if kind == "recorded" else {"sideslip_deg": 1.0} if kind == "arc" else {}
-    sim = simulated(robot, kind, **motion)
+    only_of: dict[str, dict[str, Any]] = {"recorded": {"path": swing_file}, "arc": {"sideslip_deg": 1.0}}
+    sim = simulated(robot, kind, **only_of.get(kind, {}))
     t = sim.truth.seconds[30:-30:37]
     R, _, v = sim.truth.pose_at(t)
     (R0, p0, v0), (R1, p1, v1) = sim.truth.pose_at(t - STEP_S), sim.truth.pose_at(t + STEP_S)
@@ -59,8 +61,8 @@ def test_readings_are_derivatives_of_the_pose(robot, kind, swing_file):
     rate = np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1)
     force = np.einsum("nji,nj->ni", R, (v1 - v0) / (2.0 * STEP_S) - GRAVITY)
     np.testing.assert_allclose((p1 - p0) / (2.0 * STEP_S), v, atol=1e-6)
-    np.testing.assert_allclose(sim.measurements.imu.gyro[30:-30:37], rate, atol=1e-5)
-    np.testing.assert_allclose(sim.measurements.imu.accel[30:-30:37], force, atol=1e-5)
+    np.testing.assert_allclose(not_none(sim.measurements.imu).gyro[30:-30:37], rate, atol=1e-5)
+    np.testing.assert_allclose(not_none(sim.measurements.imu).accel[30:-30:37], force, atol=1e-5)
     np.testing.assert_allclose(sim.truth.trajectory.rate_at(t), rate, atol=1e-5)
     np.testing.assert_allclose(np.swapaxes(R, 1, 2) @ R, np.broadcast_to(np.eye(3), R.shape), atol=1e-12)
 
@@ -69,9 +71,12 @@ def test_exact_readings_integrate_to_the_truth(robot):
     sim = simulated(robot, "ramps", duration_s=1.0, exact=True)
     imu, truth = sim.measurements.imu, sim.truth
     R, p, v = truth.R_world_imu[0], truth.position[0], truth.velocity[0]
-    for i in range(len(imu.stamps_ns) - 1):
-        dt = (imu.stamps_ns[i + 1] - imu.stamps_ns[i]) * 1e-9 / 20
-        w, f = 0.5 * (imu.gyro[i] + imu.gyro[i + 1]), 0.5 * (imu.accel[i] + imu.accel[i + 1])
+    for i in range(len(not_none(imu).stamps_ns) - 1):
+        dt = (not_none(imu).stamps_ns[i + 1] - not_none(imu).stamps_ns[i]) * 1e-9 / 20
+        w, f = (
+            0.5 * (not_none(imu).gyro[i] + not_none(imu).gyro[i + 1]),
+            0.5 * (not_none(imu).accel[i] + not_none(imu).accel[i + 1]),
+        )
         for _ in range(20):
             a = R @ turn(w, 0.5 * dt * np.linalg.norm(w)) @ f + GRAVITY
             p, v, R = p + v * dt + 0.5 * a * dt * dt, v + a * dt, R @ turn(w, dt * np.linalg.norm(w))
@@ -90,7 +95,7 @@ def test_wheels_do_not_slide(robot, kind, exact, bound):
     velocity = (wheel_path(sim.truth, T, t + STEP_S)[1] - wheel_path(sim.truth, T, t - STEP_S)[1]) / (2.0 * STEP_S)
     local = np.einsum("nji,nj->ni", R, velocity)
     np.testing.assert_allclose(local[:, 1:], 0.0, atol=bound + 1e-8)
-    height = sim.scenario.room.hills.height(p[:, :2]) if kind == "ramps" else 0.0
+    height = not_none(not_none(sim.scenario.room).hills).height(p[:, :2]) if kind == "ramps" else 0.0
     np.testing.assert_allclose(p[:, 2], height, atol=1e-12 if not exact else 1e-3)
 
 
@@ -109,7 +114,7 @@ def test_each_motion_is_what_it_is_called(robot):
     found = {kind: simulated(robot, kind, duration_s=30.0, seed=3) for kind in ("free", "single-axis", *GROUND)}
     T = robot.wheels[0].T_imu_wheel
     paths = {kind: wheel_path(sim.truth, T, sim.truth.seconds) for kind, sim in found.items()}
-    rates = {kind: sim.measurements.imu.gyro for kind, sim in found.items()}
+    rates = {kind: not_none(sim.measurements.imu).gyro for kind, sim in found.items()}
     spread = {kind: np.ptp(position, axis=0) for kind, (_, position) in paths.items()}
     up = T[:3, 2]  # the wheel frame's z in imu axes
 

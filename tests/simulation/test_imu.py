@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from tests.typed import not_none
 
 from icalib.rig import ImuNoise
 from icalib.tools.simulation import handheld, simulate
@@ -14,8 +15,8 @@ def test_white_noise_has_the_density_and_the_walk_its_own():
     scenario = replace(handheld(duration_s=60.0), imu_noise=noise)
     noisy, clean = simulate(scenario, seed=5), simulate(replace(scenario, imu_noise_enabled=False), seed=5)
     bias_g, bias_a = noisy.truth.gyro_bias, noisy.truth.accel_bias
-    white_g = noisy.measurements.imu.gyro - clean.measurements.imu.gyro - bias_g + bias_g[0]
-    white_a = noisy.measurements.imu.accel - clean.measurements.imu.accel - bias_a + bias_a[0]
+    white_g = not_none(noisy.measurements.imu).gyro - not_none(clean.measurements.imu).gyro - bias_g + bias_g[0]
+    white_a = not_none(noisy.measurements.imu).accel - not_none(clean.measurements.imu).accel - bias_a + bias_a[0]
     # 36 000 samples: the standard deviation is known to 0.37 %, four of which are allowed.
     for white, density in ((white_g, noise.gyro), (white_a, noise.accel)):
         assert abs(white.std() / (density * math.sqrt(200.0)) - 1.0) < 0.015
@@ -31,7 +32,9 @@ def test_noiseless_readings_are_truth_plus_constant_bias():
     plain = simulate(replace(scenario, gyro_bias=(0.0,) * 3, accel_bias=(0.0,) * 3), seed=6)
     biased = simulate(scenario, seed=6)
     np.testing.assert_allclose(
-        biased.measurements.imu.gyro - plain.measurements.imu.gyro, biased.truth.gyro_bias, atol=1e-14
+        not_none(biased.measurements.imu).gyro - not_none(plain.measurements.imu).gyro,
+        biased.truth.gyro_bias,
+        atol=1e-14,
     )
     np.testing.assert_array_equal(biased.truth.accel_bias, np.tile(scenario.accel_bias, (401, 1)))
 
@@ -50,7 +53,9 @@ def test_intrinsics_follow_the_scale_misalignment_model():
     for n in range(1, 12):
         term = term @ K / n
         C = C + term
-    for w, f, gyro, accel in zip(ideal.gyro, ideal.accel, real.gyro, real.accel, strict=True):
+    for w, f, gyro, accel in zip(
+        not_none(ideal).gyro, not_none(ideal).accel, not_none(real).gyro, not_none(real).accel, strict=True
+    ):
         np.testing.assert_allclose(gyro, M_g @ C @ w + A @ f, atol=1e-13)
         np.testing.assert_allclose(accel, M_a @ f, atol=1e-13)
 
@@ -58,9 +63,9 @@ def test_intrinsics_follow_the_scale_misalignment_model():
 def test_gap_loses_readings_and_keeps_the_motion():
     scenario = handheld(duration_s=3.0)
     whole, gap = simulate(scenario, seed=8), simulate(replace(scenario, imu_gaps=((1.0, 1.5),)), seed=8)
-    stamps = whole.measurements.imu.seconds
+    stamps = not_none(whole.measurements.imu).seconds
     kept = (stamps < 0.999) | (stamps > 1.501)
-    np.testing.assert_array_equal(gap.measurements.imu.gyro, whole.measurements.imu.gyro[kept])
+    np.testing.assert_array_equal(not_none(gap.measurements.imu).gyro, not_none(whole.measurements.imu).gyro[kept])
     np.testing.assert_array_equal(gap.truth.position, whole.truth.position[kept])
     np.testing.assert_array_equal(gap.measurements.cameras[0].uv, whole.measurements.cameras[0].uv)
 
@@ -68,14 +73,14 @@ def test_gap_loses_readings_and_keeps_the_motion():
 def test_stamps_count_from_the_clock_origin_and_increase_under_jitter():
     scenario = replace(handheld(duration_s=1.0), imu_clock_origin_ns=5_000_000_123, imu_jitter_s=2e-3)
     imu = simulate(scenario, seed=9).measurements.imu
-    assert imu.stamps_ns[0] == 5_000_000_123
-    steps = np.diff(imu.stamps_ns)
+    assert not_none(imu).stamps_ns[0] == 5_000_000_123
+    steps = np.diff(not_none(imu).stamps_ns)
     assert steps.min() > 0 and np.ptp(steps) > 1_000_000
 
 
 def test_same_seed_same_numbers():
     scenario = replace(handheld(duration_s=1.0), outlier_fraction=0.1, shift_px=0.1)
     a, b, c = (simulate(scenario, seed=s) for s in (10, 10, 11))
-    np.testing.assert_array_equal(a.measurements.imu.gyro, b.measurements.imu.gyro)
+    np.testing.assert_array_equal(not_none(a.measurements.imu).gyro, not_none(b.measurements.imu).gyro)
     np.testing.assert_array_equal(a.measurements.cameras[1].uv, b.measurements.cameras[1].uv)
-    assert not np.array_equal(a.measurements.imu.gyro, c.measurements.imu.gyro)
+    assert not np.array_equal(not_none(a.measurements.imu).gyro, not_none(c.measurements.imu).gyro)

@@ -12,7 +12,7 @@ from icalib.tools.simulation import SimLidar, hills_of_slope, simulate
 from .conftest import alone, on_ground
 
 
-def in_world(sim, shift_s=0.0):
+def in_world(sim, shift_s: float | np.ndarray = 0.0):
     """(N, 3) the points in the world, by raw stamps, offsets and the truth; shift_s is added to their instants."""
     stream, truth = sim.measurements.lidars[0], sim.truth
     since = (stream.stamps_ns - truth.imu_clock_origin_ns) * 1e-9 + truth.time_offset[stream.name]
@@ -55,7 +55,8 @@ def test_a_scan_turns_once_and_its_rings_fire_one_after_another(robot, quiet):
     np.testing.assert_allclose(np.diff(azimuth, axis=0), 2.0 * np.pi / 180, atol=1e-6)
     level = np.hypot(xyz[..., 0], xyz[..., 1])
     elevation = np.rad2deg(np.arctan2(xyz[..., 2], level))
-    np.testing.assert_allclose(elevation, np.broadcast_to(np.linspace(*lidar.elevation_deg, 8), (180, 8)), atol=1e-4)
+    low, high = lidar.elevation_deg
+    np.testing.assert_allclose(elevation, np.broadcast_to(np.linspace(low, high, 8), (180, 8)), atol=1e-4)
     np.testing.assert_allclose(offset[:, 0], np.arange(180) * 0.125 / 180, atol=1e-8)
     np.testing.assert_allclose(offset - offset[:, :1], np.broadcast_to(2.304e-6 * np.arange(8), (180, 8)), atol=1e-8)
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.typed import not_none
 
 from icalib.tools.simulation import handheld, simulate
 
@@ -50,18 +51,18 @@ def test_readings_are_derivatives_of_the_closed_form_pose(kind):
     rate = np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1)
     force = np.einsum("nji,nj->ni", R, (v1 - v0) / (2.0 * h) - GRAVITY)
     np.testing.assert_allclose((p1 - p0) / (2.0 * h), v, atol=1e-6)
-    np.testing.assert_allclose(sim.measurements.imu.gyro[::50], rate, atol=1e-5)
-    np.testing.assert_allclose(sim.measurements.imu.accel[::50], force, atol=1e-5)
+    np.testing.assert_allclose(not_none(sim.measurements.imu).gyro[::50], rate, atol=1e-5)
+    np.testing.assert_allclose(not_none(sim.measurements.imu).accel[::50], force, atol=1e-5)
 
 
 @pytest.mark.parametrize("jitter_s", [0.0, 1.5e-3])
 def test_exact_trajectory_is_the_integral_of_mean_readings(jitter_s):
     sim = simulate(scenario_of("handheld", exact=True, duration_s=1.5, imu_jitter_s=jitter_s), seed=2)
     truth, imu = sim.truth, sim.measurements.imu
-    readings = np.concatenate([imu.gyro, imu.accel], axis=1)
+    readings = np.concatenate([not_none(imu).gyro, not_none(imu).accel], axis=1)
     state = (truth.R_world_imu[0], truth.position[0], truth.velocity[0])
     for i in range(len(readings) - 1):
-        dt = (imu.stamps_ns[i + 1] - imu.stamps_ns[i]) * 1e-9
+        dt = (not_none(imu).stamps_ns[i + 1] - not_none(imu).stamps_ns[i]) * 1e-9
         mean = 0.5 * (readings[i] + readings[i + 1])
         halfway = truth.pose_at(np.array([truth.seconds[i] + 0.37 * dt]))
         for found, expected in zip(halfway, runge_kutta(state, mean, 0.37 * dt, 2), strict=True):
@@ -76,8 +77,8 @@ def test_exact_motion_stays_by_its_reference_and_is_rich():
     closed = simulate(scenario_of("handheld", exact=False, duration_s=30.0), seed=3)
     assert np.abs(exact.truth.position - closed.truth.position).max() < 1e-3
     assert np.abs(exact.truth.R_world_imu - closed.truth.R_world_imu).max() < 1e-3
-    assert (exact.measurements.imu.gyro.std(axis=0) > 0.4).all()
-    assert (exact.measurements.imu.accel.std(axis=0) > 1.0).all()
+    assert (not_none(exact.measurements.imu).gyro.std(axis=0) > 0.4).all()
+    assert (not_none(exact.measurements.imu).accel.std(axis=0) > 1.0).all()
     for camera in exact.measurements.cameras:
         assert len(camera.stamps_ns) > 590
         assert len(camera.uv) > 80 * len(camera.stamps_ns)
@@ -95,13 +96,15 @@ def test_degenerate_motions_are_degenerate(exact):
 
     single = simulate(scenario_of("single_axis", exact), seed=4)
     axis = np.array(single.scenario.motion.axis_imu)
-    np.testing.assert_allclose(np.cross(single.measurements.imu.gyro, axis), 0.0, atol=1e-4)
+    np.testing.assert_allclose(np.cross(not_none(single.measurements.imu).gyro, axis), 0.0, atol=1e-4)
     assert np.ptp(single.truth.position, axis=0).min() > 0.05
 
     still = simulate(scenario_of("motionless", exact), seed=4)
     np.testing.assert_allclose(still.truth.position, still.truth.position[:1] + np.zeros((601, 1)), atol=1e-9)
-    np.testing.assert_allclose(still.measurements.imu.gyro, 0.0, atol=1e-12)
-    np.testing.assert_allclose(still.truth.R_world_imu[0] @ still.measurements.imu.accel[0], -GRAVITY, atol=1e-12)
+    np.testing.assert_allclose(not_none(still.measurements.imu).gyro, 0.0, atol=1e-12)
+    np.testing.assert_allclose(
+        still.truth.R_world_imu[0] @ not_none(still.measurements.imu).accel[0], -GRAVITY, atol=1e-12
+    )
 
 
 def test_scales_and_motion_seed():
@@ -111,5 +114,5 @@ def test_scales_and_motion_seed():
     a, b = simulate(slow, seed=1), simulate(fast, seed=2)
     ratio = np.ptp(a.truth.position, axis=0) / np.ptp(b.truth.position, axis=0)
     np.testing.assert_allclose(ratio, 0.5, rtol=1e-9)
-    assert a.measurements.imu.gyro.std() < 0.25 * b.measurements.imu.gyro.std()
+    assert not_none(a.measurements.imu).gyro.std() < 0.25 * not_none(b.measurements.imu).gyro.std()
     np.testing.assert_array_equal(simulate(fast, seed=3).truth.position, b.truth.position)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.typed import instance
 
 from icalib.data.measurements import WheelPoses, WheelStream
 from icalib.data.recordings import open_recording, read_measurements
@@ -64,7 +65,7 @@ def test_relative_poses(robot, tmp_path):
     assert isinstance(wheels, WheelPoses)
     for name in ("stamps_ns", "pose", "covariance"):
         np.testing.assert_allclose(getattr(wheels, name), getattr(truth, name), rtol=1e-14, atol=1e-30)
-    assert len(open_recording(tmp_path / "run").stamps("wheel0/poses.csv")) == len(truth.pose)
+    assert len(open_recording(tmp_path / "run").stamps("wheel0/poses.csv")) == len(instance(truth, WheelPoses).pose)
 
 
 @pytest.mark.parametrize("name", ["run", "run.bag"])

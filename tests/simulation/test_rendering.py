@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 import pytest
@@ -27,7 +28,11 @@ SHARP = Imaging(white=1.0, black=0.0, background=0.5, blur_px=0.0)
 class Half(Target):
     """A print that is black left of x = 0."""
 
-    type, blooms, points = "half", False, np.zeros((1, 3))
+    type, blooms = "half", False
+
+    @cached_property
+    def points(self) -> np.ndarray:
+        return np.zeros((1, 3))
 
     def point_index(self, tag_id, corner):
         return corner

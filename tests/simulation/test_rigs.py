@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.typed import not_none
 
 import icalib.tools.simulation
 from icalib.rig import Parameter, Settings, Wheels
@@ -40,7 +41,10 @@ def test_rig_states_truth_and_noise():
     prior = Parameter("prior", np.zeros(3), np.full(3, 0.1))
     rig = rig_for(scenario, translation=prior, time_offset="start", bloom="fixed")
     cam0, truth = rig.cameras[0], scenario.cameras[0]
-    assert rig.imu.noise.gyro == 10.0 * ADIS16448.gyro and rig.imu.noise.accel_walk == 10.0 * ADIS16448.accel_walk
+    assert (
+        not_none(rig.imu).noise.gyro == 10.0 * ADIS16448.gyro
+        and not_none(rig.imu).noise.accel_walk == 10.0 * ADIS16448.accel_walk
+    )
     assert (
         cam0.corner_noise_px == 0.2 and rig.gravity == 9.81 and rig.target == replace(scenario.target, size_sigma=0.0)
     )
@@ -51,7 +55,7 @@ def test_rig_states_truth_and_noise():
     assert cam0.intrinsics.mode == "fixed"
     np.testing.assert_array_equal(cam0.intrinsics.value, truth.intrinsics)
     np.testing.assert_array_equal(cam0.distortion.value, truth.distortion)
-    np.testing.assert_array_equal(rig.imu.intrinsics.value, np.zeros(24))
+    np.testing.assert_array_equal(not_none(rig.imu).intrinsics.value, np.zeros(24))
 
 
 def test_cameras_of_a_room_track_images_where_there_are_no_tables_of_tracks():
@@ -106,10 +110,12 @@ def test_guesses_are_drawn_about_the_truth_with_the_given_spread():
         turn = truth.T_imu_cam[:3, :3].T @ cam0.rotation.value
         found["turn"] += Rotation.from_matrix(turn).as_rotvec().tolist()
         found["move"] += (cam0.translation.value - truth.T_imu_cam[:3, 3]).tolist()
-        found["offset"] += (cam0.time_offset.value - truth.time_offset_s).tolist()
+        found["offset"] += (not_none(cam0.time_offset.value) - truth.time_offset_s).tolist()
         drawn = with_drawn_guess(rig_for(scenario, intrinsics="free"), scenario, seed, error).cameras[0].intrinsics
-        found["focal"].append(drawn.value[0] / truth.intrinsics[0] - 1.0)
-        assert drawn.value[1] / truth.intrinsics[1] == pytest.approx(drawn.value[0] / truth.intrinsics[0])
+        found["focal"].append(not_none(drawn.value)[0] / truth.intrinsics[0] - 1.0)
+        assert not_none(drawn.value)[1] / truth.intrinsics[1] == pytest.approx(
+            not_none(drawn.value)[0] / truth.intrinsics[0]
+        )
     sizes = {name: float(np.std(values)) for name, values in found.items()}
     assert sizes == pytest.approx({"turn": 0.1, "move": 0.2, "offset": 0.3, "focal": 0.04}, rel=0.1)
 
@@ -118,7 +124,10 @@ def test_guesses_are_of_what_is_free_and_the_same_for_a_seed():
     scenario = handheld()
     rig = rig_for(scenario, translation="fixed", distortion="free")
     first, second = (with_drawn_guess(rig, scenario, 3).cameras[1] for _ in range(2))
-    assert first.rotation.mode == "free" and first.rotation.value.tolist() == second.rotation.value.tolist()
+    assert (
+        first.rotation.mode == "free"
+        and not_none(first.rotation.value).tolist() == not_none(second.rotation.value).tolist()
+    )
     assert first.translation is rig.cameras[1].translation and first.intrinsics is rig.cameras[1].intrinsics
     assert first.distortion.value is None
     other = with_drawn_guess(rig, scenario, 4).cameras[1]

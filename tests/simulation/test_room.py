@@ -31,7 +31,7 @@ def rays():
 
 def test_rays_meet_the_nearest_face(robot, rays):
     found = np.empty(400)
-    distances(robot.room.surfaces, *rays, found)
+    distances(robot.room.surfaces, rays[0], rays[1], found)
     np.testing.assert_allclose(found, [met(robot.room, o, d) for o, d in zip(*rays, strict=True)], rtol=1e-10)
     assert np.isfinite(found).all()  # the room is closed
 
@@ -40,7 +40,7 @@ def test_rays_meet_hills_where_they_pass_below_them(robot, rays):
     hills = hills_of_slope(12.0)
     room = replace(robot.room, hills=hills)
     found = np.empty(400)
-    distances(room.surfaces, *rays, found)
+    distances(room.surfaces, rays[0], rays[1], found)
     on_ground = 0
     for i, (o, d) in enumerate(zip(*rays, strict=True)):
         wall = met(room, o, d)

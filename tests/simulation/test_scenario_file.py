@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.typed import not_none
 
 from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid
@@ -121,11 +122,11 @@ def test_every_field_arrives(tmp_path):
     assert (mocap.name, mocap.kind, mocap.rate_hz) == ("mocap", "relative", 30.0)
     assert (mocap.rotation_noise, mocap.position_noise) == (0.003, 0.004)
     np.testing.assert_allclose([mocap.T_imu_sensor, mocap.T_world_frame], [T, T], atol=1e-12)
-    ramp, box = s.room.blocks
-    assert s.room.size == (8.0, 7.0, 3.0) and s.room.hills is None
+    ramp, box = not_none(s.room).blocks
+    assert not_none(s.room).size == (8.0, 7.0, 3.0) and not_none(s.room).hills is None
     assert (ramp.center, ramp.size, ramp.ramp) == ((3.0, 2.0), (1.0, 1.5, 0.5), True)
     assert ramp.yaw_rad == pytest.approx(np.pi / 6) and (box.yaw_rad, box.ramp) == (0.0, False)
-    assert s.room.texture == Texture(2, 0.3, 0.8) and camera.dropouts == ((0.4, 0.5), (2.0, 2.1))
+    assert not_none(s.room).texture == Texture(2, 0.3, 0.8) and camera.dropouts == ((0.4, 0.5), (2.0, 2.1))
     assert s.image_faults == ImageFaults(2, ((1.0, 0.5), (2.0, 1.5)), ((1.2, 1.4),), 0.1, 3)
     assert s.features == Features(300, 20, 2.0, 30, 9.0, 3)
     assert s.board and s.target == AprilGrid(3, 4, 0.1, 0.3, squares=False)
@@ -139,12 +140,12 @@ def test_shipped_scenarios_load_and_run(path):
     measured = simulate(replace(scenario, duration_s=1.5, lidars=lidars), scenario.seed).measurements
     assert [len(group) for group in (measured.tracks, measured.lidars, measured.wheels)] == [3, 1, 1]
     assert measured.cameras == () and all(len(s.uv) > 100 for s in measured.tracks)
-    assert len(measured.imu.stamps_ns) == 451 and len(measured.lidars[0].stamps_ns) == 11
+    assert len(not_none(measured.imu).stamps_ns) == 451 and len(measured.lidars[0].stamps_ns) == 11
 
 
 def test_table_2_is_that_of_the_paper():
     s = load_scenario(PAPER / "table2-3d.yaml")
-    assert s.imu_rate_hz == 300 and s.features.per_image == 100
+    assert s.imu_rate_hz == 300 and not_none(s.features).per_image == 100
     assert [c.rate_hz for c in s.cameras] == [20, 10, 10]
     assert [c.time_offset_s for c in s.cameras] == [0.010, -0.010, 0.0]
     assert [c.corner_noise_px for c in s.cameras] == [1.0, 1.0, 1.0]

@@ -6,11 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.typed import instance
 
+from icalib.data.measurements import WheelStream
 from icalib.data.recordings import open_recording, read_measurements
 from icalib.errors import RigError
 from icalib.rig.file import load_rig
 from icalib.tools.simulation import simulate
+from icalib.tools.simulation.scenario.robot import DriveKind
 from icalib.tools.simulation.sensor_bag import write_sensors
 from icalib.tools.simulation.tables import write_tables
 
@@ -19,7 +22,7 @@ from .conftest import alone, on_ground, wheel_path
 SCALES, OFFSET, BASE, RADIUS = (1.1, 0.9), 0.05, 0.6, 0.12
 
 
-def reporting(robot, reports, sampling="interval-mean", kind="planar", **changes):
+def reporting(robot, reports, sampling="interval-mean", kind: DriveKind = "planar", **changes):
     scenario = alone(on_ground(robot, kind))
     wheels = replace(
         scenario.wheels[0], reports=reports, sampling=sampling, scales=SCALES, radius=RADIUS, wheelbase=BASE,
@@ -48,24 +51,31 @@ def moved(sim, begin, end, parts=400):
 def test_speed_and_yaw_rate_are_those_of_the_path_over_their_scales(robot, kind, sampling):
     sim = simulate(replace(reporting(robot, "twist", sampling, kind), robot_noise_enabled=False), 3)
     stream, t = sim.measurements.wheels[0], instants(sim)
-    assert (stream.kind, stream.sampling) == ("twist", sampling)
+    assert (instance(stream, WheelStream).kind, instance(stream, WheelStream).sampling) == ("twist", sampling)
     for i in (1, 80, 200):
         a, b = (t[i - 1], t[i]) if sampling == "interval-mean" else (t[i] - 1e-4, t[i] + 1e-4)
-        np.testing.assert_allclose(stream.rate[i], moved(sim, a, b) / (b - a) / SCALES, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(
+            instance(stream, WheelStream).rate[i], moved(sim, a, b) / (b - a) / SCALES, rtol=1e-4, atol=1e-5
+        )
 
 
 @pytest.mark.parametrize("sampling", ["interval-mean", "instantaneous"])
 def test_a_point_ahead_moves_where_the_front_wheels_point(robot, sampling):
     sim = simulate(replace(reporting(robot, "steering", sampling), robot_noise_enabled=False), 3)
     stream, t = sim.measurements.wheels[0], instants(sim)
-    assert (stream.kind, stream.sampling) == ("steered", sampling) and np.ptp(stream.rate[:, 1]) > 0.2
+    assert (instance(stream, WheelStream).kind, instance(stream, WheelStream).sampling) == (
+        "steered",
+        sampling,
+    ) and np.ptp(instance(stream, WheelStream).rate[:, 1]) > 0.2
     for i in (1, 80, 200):
         R, p = wheel_path(sim.truth, sim.scenario.wheels[0].T_imu_wheel, t[i] + np.array([-1e-4, 0.0, 1e-4]))
         front = p + BASE * R[:, :, 0]
         ahead, left, _ = R[1].T @ (front[2] - front[0])
-        assert stream.rate[i, 1] + OFFSET == pytest.approx(np.arctan(left / ahead), abs=1e-5)
+        assert instance(stream, WheelStream).rate[i, 1] + OFFSET == pytest.approx(np.arctan(left / ahead), abs=1e-5)
         a, b = (t[i - 1], t[i]) if sampling == "interval-mean" else (t[i] - 1e-4, t[i] + 1e-4)
-        assert stream.rate[i, 0] == pytest.approx(moved(sim, a, b)[0] / (b - a) / RADIUS, rel=1e-4)
+        assert instance(stream, WheelStream).rate[i, 0] == pytest.approx(
+            moved(sim, a, b)[0] / (b - a) / RADIUS, rel=1e-4
+        )
 
 
 @pytest.mark.parametrize(
@@ -78,10 +88,15 @@ def test_a_point_ahead_moves_where_the_front_wheels_point(robot, sampling):
 def test_noise_is_a_density(robot, reports, noise, density):
     scenario = reporting(robot, reports, **noise)
     sim, quiet = simulate(scenario, 3), simulate(replace(scenario, robot_noise_enabled=False), 3)
-    off = sim.measurements.wheels[0].rate - quiet.measurements.wheels[0].rate
+    off = (
+        instance(sim.measurements.wheels[0], WheelStream).rate
+        - instance(quiet.measurements.wheels[0], WheelStream).rate
+    )
     expected = np.array(density) * np.sqrt(scenario.wheels[0].rate_hz)
     np.testing.assert_allclose(off.std(axis=0), expected, rtol=0.15)
-    assert quiet.measurements.wheels[0].rate == pytest.approx(quiet.truth.wheels["wheel0"].value, abs=1e-12)
+    assert instance(quiet.measurements.wheels[0], WheelStream).rate == pytest.approx(
+        quiet.truth.wheels["wheel0"].value, abs=1e-12
+    )
 
 
 def test_front_wheels_that_would_have_to_stand_across_are_refused(robot):
@@ -100,9 +115,12 @@ def test_what_is_written_is_read_again(tmp_path, robot, write, reports, what):
     (tmp_path / "rig.yaml").write_text(RIG.replace("WHAT", what))
     rig = replace(load_rig(tmp_path / "rig.yaml"), poses=())
     (found,), (written,) = read_measurements(open_recording(tmp_path / "run"), rig).wheels, sim.measurements.wheels
-    assert (found.kind, found.sampling) == (written.kind, "interval-mean")
+    assert (instance(found, WheelStream).kind, instance(found, WheelStream).sampling) == (
+        instance(written, WheelStream).kind,
+        "interval-mean",
+    )
     np.testing.assert_array_equal(found.stamps_ns, written.stamps_ns)
-    np.testing.assert_allclose(found.rate, written.rate, rtol=1e-15)
+    np.testing.assert_allclose(instance(found, WheelStream).rate, instance(written, WheelStream).rate, rtol=1e-15)
     topics = {t.name: t.kind for t in open_recording(tmp_path / "run").topics()}
     own = {name: kind for name, kind in topics.items() if "wheel0" in name}
     bagged = "twist" if reports == "twist" else "joints"

@@ -6,7 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.typed import instance
 
+from icalib.data.measurements import WheelPoses, WheelStream
 from icalib.tools.simulation import simulate
 
 from .conftest import alone, on_ground, wheel_path
@@ -39,8 +41,8 @@ def test_mean_rates_are_the_angles_turned_since_the_stamp_before(robot, kind, ex
     np.testing.assert_allclose(sim.truth.wheels["wheel0"].seconds, t, atol=1e-9)
     for i in (1, 50, 200):
         expected = turned(sim, t[i - 1], t[i], 200) / (t[i] - t[i - 1])
-        np.testing.assert_allclose(stream.rate[i], expected, rtol=1e-5, atol=1e-6)
-    angle = (stream.rate[1:] * np.diff(t)[:, None]).sum(axis=0)
+        np.testing.assert_allclose(instance(stream, WheelStream).rate[i], expected, rtol=1e-5, atol=1e-6)
+    angle = (instance(stream, WheelStream).rate[1:] * np.diff(t)[:, None]).sum(axis=0)
     np.testing.assert_allclose(angle, turned(sim, t[0], t[-1]), rtol=1e-6, atol=1e-6)
 
 
@@ -49,11 +51,19 @@ def test_instant_rates_are_those_at_the_stamp(robot):
     instant = replace(scenario, wheels=(replace(scenario.wheels[0], sampling="instantaneous"),))
     sim, mean = simulate(instant, 6), simulate(scenario, 6)
     stream, t = sim.measurements.wheels[0], instants(sim)
-    assert stream.sampling == "instantaneous" and mean.measurements.wheels[0].sampling == "interval-mean"
+    assert (
+        instance(stream, WheelStream).sampling == "instantaneous"
+        and instance(mean.measurements.wheels[0], WheelStream).sampling == "interval-mean"
+    )
     np.testing.assert_array_equal(stream.stamps_ns, mean.measurements.wheels[0].stamps_ns)
     for i in (0, 50, 200):
-        np.testing.assert_allclose(stream.rate[i], turned(sim, t[i] - 1e-4, t[i] + 1e-4, 2) / 2e-4, atol=1e-5)
-    assert np.abs(stream.rate - mean.measurements.wheels[0].rate).max() > 1e-3
+        np.testing.assert_allclose(
+            instance(stream, WheelStream).rate[i], turned(sim, t[i] - 1e-4, t[i] + 1e-4, 2) / 2e-4, atol=1e-5
+        )
+    assert (
+        np.abs(instance(stream, WheelStream).rate - instance(mean.measurements.wheels[0], WheelStream).rate).max()
+        > 1e-3
+    )
 
 
 def test_the_path_is_found_again_from_the_rates(robot):
@@ -63,7 +73,7 @@ def test_the_path_is_found_again_from_the_rates(robot):
     w, stream, t = scenario.wheels[0], sim.measurements.wheels[0], instants(sim)
     R, p = wheel_path(sim.truth, w.T_imu_wheel, t)
     x, y, heading = *p[0, :2], np.arctan2(R[0, 1, 0], R[0, 0, 0])
-    for (left, right), dt in zip(stream.rate[1:], np.diff(t), strict=True):
+    for (left, right), dt in zip(instance(stream, WheelStream).rate[1:], np.diff(t), strict=True):
         ahead = 0.5 * dt * (left * w.radii[0] + right * w.radii[1])
         yaw = dt * (right * w.radii[1] - left * w.radii[0]) / w.baseline
         x, y = x + ahead * np.cos(heading + 0.5 * yaw), y + ahead * np.sin(heading + 0.5 * yaw)
@@ -74,7 +84,7 @@ def test_the_path_is_found_again_from_the_rates(robot):
 
 def test_noise_of_rates_has_the_density_stated(robot):
     scenario = replace(alone(on_ground(robot, "standing")), duration_s=60.0)
-    rate = simulate(scenario, 8).measurements.wheels[0].rate
+    rate = instance(simulate(scenario, 8).measurements.wheels[0], WheelStream).rate
     # 8400 numbers: their standard deviation is known to 0.8 %, four of which are allowed.
     assert rate.std() == pytest.approx(0.03 * np.sqrt(70.0), rel=0.032)
     assert abs((rate[1:] * rate[:-1]).mean()) < 4.0 * rate.var() / np.sqrt(rate.size)
@@ -85,20 +95,24 @@ def test_relative_poses_are_those_of_27(robot, kind):
     scenario = replace(alone(robot), motion=replace(robot.motion, kind=kind), robot_noise_enabled=False)
     sim = simulate(scenario, 9)
     stream, t = sim.measurements.wheels[0], instants(sim)
-    assert len(t) == len(stream.pose) + 1 and np.allclose(np.diff(t), 3.0 / 70.0, atol=2e-9)
+    assert len(t) == len(instance(stream, WheelPoses).pose) + 1 and np.allclose(np.diff(t), 3.0 / 70.0, atol=2e-9)
     T = scenario.wheels[0].T_imu_wheel
     R_W_I, p_W_I = T[:3, :3].T, -T[:3, :3].T @ T[:3, 3]
     p_I_W = T[:3, 3]
     R, p, _ = sim.truth.pose_at(t)
-    for k in range(0, len(stream.pose), 7):
+    for k in range(0, len(instance(stream, WheelPoses).pose), 7):
         turn = R_W_I @ R[k].T @ R[k + 1] @ R_W_I.T
         angle = np.arccos(0.5 * (np.trace(turn) - 1.0))
         yaw = (turn[1, 0] - turn[0, 1]) * angle / (2.0 * np.sin(angle))
         xyz = R_W_I @ R[k].T @ (p[k + 1] + R[k + 1] @ p_I_W - p[k]) + p_W_I
-        np.testing.assert_allclose(stream.pose[k], [yaw, *xyz[:2]], atol=1e-8)
+        np.testing.assert_allclose(instance(stream, WheelPoses).pose[k], [yaw, *xyz[:2]], atol=1e-8)
     if kind == "planar":  # a wheel that goes ahead and to the left
-        assert (stream.pose[:, 1] > 0.0).all()
-        np.testing.assert_allclose(stream.pose[:, 2], 0.5 * stream.pose[:, 0] * stream.pose[:, 1], atol=1e-4)
+        assert (instance(stream, WheelPoses).pose[:, 1] > 0.0).all()
+        np.testing.assert_allclose(
+            instance(stream, WheelPoses).pose[:, 2],
+            0.5 * instance(stream, WheelPoses).pose[:, 0] * instance(stream, WheelPoses).pose[:, 1],
+            atol=1e-4,
+        )
 
 
 def test_covariance_of_relative_poses_is_that_of_integrated_noise(robot):
@@ -123,7 +137,7 @@ def test_covariance_of_relative_poses_is_that_of_integrated_noise(robot):
     x = np.sum(v * np.cos(mid) - side * np.sin(mid), axis=1) * dt
     y = np.sum(v * np.sin(mid) + side * np.cos(mid), axis=1) * dt
     samples = np.stack([angle[:, -1], x, y])
-    stated, found = stream.covariance[k], np.cov(samples)
+    stated, found = instance(stream, WheelPoses).covariance[k], np.cov(samples)
     size = np.sqrt(np.diag(stated))
     # Each entry of a correlation from 10 000 samples is known to 0.014; four of these.
     np.testing.assert_allclose(found / np.outer(size, size), stated / np.outer(size, size), atol=0.06)
@@ -133,8 +147,8 @@ def test_covariance_of_relative_poses_is_that_of_integrated_noise(robot):
 def test_noise_of_relative_poses_has_their_covariance(robot):
     scenario = replace(alone(robot), duration_s=60.0)
     stream = simulate(scenario, 12).measurements.wheels[0]
-    error = stream.pose - simulate(scenario, 12).truth.wheels["wheel0"].value
-    whitened = np.linalg.solve(np.linalg.cholesky(stream.covariance), error[..., None])[..., 0]
+    error = instance(stream, WheelPoses).pose - simulate(scenario, 12).truth.wheels["wheel0"].value
+    whitened = np.linalg.solve(np.linalg.cholesky(instance(stream, WheelPoses).covariance), error[..., None])[..., 0]
     n = len(whitened)
     np.testing.assert_allclose(whitened.T @ whitened / n, np.eye(3), atol=4.0 * np.sqrt(2.0 / n))
 

@@ -13,7 +13,7 @@ SIZE = 96
 def _grey(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """A smooth pattern of four waves with texture in all directions."""
     waves = ((0.35, 0.1, 0.2), (-0.12, 0.4, 1.0), (0.3, 0.33, 2.0), (0.22, -0.28, 0.7))
-    return 120.0 + 25.0 * sum(np.sin(a * x + b * y + c) for a, b, c in waves)
+    return 120.0 + 25.0 * np.sum([np.sin(a * x + b * y + c) for a, b, c in waves], axis=0)
 
 
 def _image(A: np.ndarray, shift: np.ndarray, centre: np.ndarray) -> np.ndarray:

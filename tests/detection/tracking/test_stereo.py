@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from tests.typed import StandIn
 
 from icalib.data.recordings import Payload, TopicInfo
 from icalib.detection.tracking.streams import find_all_tracks
@@ -19,7 +20,7 @@ CAMERAS = [Camera(name, "", "pinhole-radtan", SIZE, tracks="images") for name in
 PERIOD_NS = 100_000_000
 
 
-class TwoCameras:
+class TwoCameras(StandIn):
     """Images of both, those of the second 4 ms later on its clock."""
 
     def __init__(self, first: Turning, second: Turning) -> None:

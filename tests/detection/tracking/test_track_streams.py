@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from tests.typed import StandIn
 
 from icalib.data.recordings import Payload, TopicInfo
 from icalib.detection.images import image_work
@@ -20,7 +21,7 @@ CAMERA = Camera("cam0", "cam0/corners.csv", "pinhole-radtan", SIZE, tracks="imag
 PERIOD_NS = 50_000_000
 
 
-class Images:
+class Images(StandIn):
     """A recording of one camera; `damaged`: numbers of images that cannot be decoded."""
 
     def __init__(self, images: list[np.ndarray], damaged: tuple[int, ...] = (), period_ns: int = PERIOD_NS) -> None:

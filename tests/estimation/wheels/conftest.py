@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -82,7 +83,7 @@ class Drive:
 
     def rate_slope(self, t):
         """(n, 3) rad/s^2, by a complex step."""
-        return self.rate(t + 1e-30j).imag / 1e-30
+        return np.imag(self.rate(t + 1e-30j)) / 1e-30
 
     def integral(self, f, t):
         """Integral of f(t) (n, m) from 0 to each t: Gauss's four points on every stretch of GRID_S, and on the rest."""
@@ -237,7 +238,7 @@ class DriveProblem:
     layout: Layout
     imu: ImuFactor
     poses: PoseFactor
-    wheels: object
+    wheels: Any
     priors: tuple[Prior, ...] = ()
     held: np.ndarray = field(default_factory=lambda: NOTHING)
 

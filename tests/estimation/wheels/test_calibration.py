@@ -1,6 +1,7 @@
 """IMU, wheels and known poses solved together: what comes back, with what spread, and what paper (27) makes of it."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -56,7 +57,7 @@ def away(world, planar):
 class Slipping:
     """Increments of wheels with noise; slip is an error of the zero that it is taken for. The same in each pass."""
 
-    world: object
+    world: Any
     angles: np.ndarray
     slip: np.ndarray
     noise: WheelNoise
@@ -80,8 +81,8 @@ def noisy(world, rng, noise, pose_sigma):
     return angles, slip, world.state.rotation @ turn, world.state.position + pose_sigma[1] * rng.normal(size=(k, 3))
 
 
-def solve(problem_of, world, factor_at, poses, sigma, priors, start, passes=2):
-    outcome = None
+def solve(problem_of, world, factor_at, poses, sigma, priors, start, passes=2) -> Any:
+    outcome: Any = None
     for _ in range(passes):
         outcome = minimise(problem_of(world, factor_at(start), *poses, sigma, start, priors), start)
         assert outcome.converged, outcome.status
@@ -131,7 +132,10 @@ def test_errors_are_as_large_as_the_covariance_says(drive_of_kind, world_of, pro
         outcome = solve(
             problem_of, world, Slipping(world, angles, slip, NOISE), (R, p), POSE_SIGMA, priors, away(world, planar)
         )  # fmt: skip
-        e, P = errors(world, outcome.state)[kept], np.linalg.inv(outcome.information)[np.ix_(kept, kept)]
+        e, P = (
+            errors(world, outcome.state)[kept],
+            np.linalg.inv(outcome.information)[np.ix_(kept, kept)],
+        )
         nees.append(e @ np.linalg.solve(P, e))
         square.append((outcome.residuals[1].residual ** 2).mean(axis=0))
     dof = seeds * len(kept)
@@ -163,7 +167,10 @@ def test_a_vehicle_that_drifts_sideways_is_within_its_slip_density_or_shows_in_i
         factor = Slipping(world, angles, np.zeros((1000, 2)), NOISE)
         priors = pinned(world, [PINNED, FREE, FREE], PINNED)
         outcome = solve(problem_of, world, factor, (R, p), POSE_SIGMA, priors, away(world, True))
-        e, P = errors(world, outcome.state)[kept], np.linalg.inv(outcome.information)[np.ix_(kept, kept)]
+        e, P = (
+            errors(world, outcome.state)[kept],
+            np.linalg.inv(outcome.information)[np.ix_(kept, kept)],
+        )
         nees.append(e @ np.linalg.solve(P, e))
         square.append((outcome.residuals[1].residual[:, 2] ** 2).mean())
     low, high = chi2_of_rows

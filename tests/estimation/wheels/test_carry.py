@@ -1,6 +1,7 @@
 """What the IMU loses from a node to the end of a relative pose, against walks that are drawn."""
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -34,13 +35,13 @@ def test_against_walks_of_orientation_and_speed():
     R[2:] = R[:2] @ Rotation.from_rotvec(0.1 * rng.standard_normal((2, 3))).as_matrix()
     p = rng.standard_normal((4, 3))
     p[2:] = p[:2] + 0.3 * rng.standard_normal((2, 3))
-    first, last = (SimpleNamespace(rotation=R[k], position=p[k]) for k in (slice(0, 2), slice(2, 4)))
-    imu = SimpleNamespace(variance=np.tile([GYRO**2, ACCEL**2, 1e-4 * ACCEL**2], (10, 1)))
-    found = carried_noise(first, last, AWAY, R_iw, lever, imu)
+    poses: list[Any] = [SimpleNamespace(rotation=R[k], position=p[k]) for k in (slice(0, 2), slice(2, 4))]
+    imu: Any = SimpleNamespace(variance=np.tile([GYRO**2, ACCEL**2, 1e-4 * ACCEL**2], (10, 1)))
+    found = carried_noise(poses[0], poses[1], AWAY, R_iw, lever, imu)
     for n in range(2):
         ends = [(R[n], p[n], AWAY[n, 0]), (R[2 + n], p[2 + n], AWAY[n, 1])]
         drawn = np.array([
-            planar(*(x for R_, p_, t in ends for x in walked(R_, p_, t, rng)), R_iw, lever) for _ in range(DRAWS)
+            planar(*walked(*ends[0], rng), *walked(*ends[1], rng), R_iw, lever) for _ in range(DRAWS)
         ])  # fmt: skip
         sampled = np.cov(drawn.T)
         scale = np.sqrt(np.diag(found[n]))
@@ -49,6 +50,6 @@ def test_against_walks_of_orientation_and_speed():
 
 
 def test_at_the_nodes_nothing_is_lost():
-    eye = SimpleNamespace(rotation=np.eye(3)[None], position=np.zeros((1, 3)))
-    imu = SimpleNamespace(variance=np.ones((3, 3)))
+    eye: Any = SimpleNamespace(rotation=np.eye(3)[None], position=np.zeros((1, 3)))
+    imu: Any = SimpleNamespace(variance=np.ones((3, 3)))
     np.testing.assert_array_equal(carried_noise(eye, eye, np.zeros((1, 2)), np.eye(3), np.ones(3), imu), 0.0)

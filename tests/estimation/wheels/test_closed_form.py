@@ -13,6 +13,7 @@ for the multiplier.
 from dataclasses import replace
 
 import numpy as np
+from tests.typed import not_none
 
 from icalib.sensors.wheels.residual import WheelNoise
 
@@ -92,7 +93,7 @@ def by_increments(world, problem_of, angles, slip, R, p):
     """With roll and height, of which a plane says nothing and the closed form knows nothing, where they are."""
     priors = pinned(world, [PINNED, FREE, FREE], PINNED)
     factor = Slipping(world, angles, slip, NOISE)
-    values = solve(problem_of, world, factor, (R, p), POSE_SIGMA, priors, away(world, True)).state.values
+    values = not_none(solve(problem_of, world, factor, (R, p), POSE_SIGMA, priors, away(world, True))).state.values
     drive = np.concatenate([values["wheel0", "radii"], values["wheel0", "baseline"]])
     return np.concatenate([drive, sensor_on_robot(values["wheel0", "rotation"], values["wheel0", "translation"])])
 

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -134,7 +135,7 @@ def test_recordings_that_do_not_see_the_floor_have_no_part(world_of, drive_of_ki
     factor = GroundFactor.build("wheel0", FLOOR, (None, KEY), state, world.imu, world.layout)
     assert factor.nodes.tolist() == list(range(30, len(state.seconds) - 1))
     none = GroundFactor.build("wheel0", FLOOR, (None, None), state, world.imu, world.layout)
-    found = SimpleNamespace(problem=SimpleNamespace(sensors=(factor, none)))
+    found: Any = SimpleNamespace(problem=SimpleNamespace(sensors=(factor, none)))
     (words,) = ground_warnings(found)
     assert (
         "none of the planes that LiDARs see is a floor" in words and "the ground of wheel0 counts for nothing" in words
