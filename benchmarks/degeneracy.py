@@ -28,10 +28,16 @@ from icalib.tools.simulation import Scenario, load_scenario
 ROOT = Path(__file__).resolve().parent.parent
 FOUND = ROOT / "docs" / "studies" / "degeneracy.json"
 MOTIONS = {
-    "table2-3d": "free", "table2-ramp": "ramps", "table2-planar": "planar", "single-axis": "about one axis",
-    "arc": "constant arc", "spin": "spin in place", "straight-line": "straight line, speed varying",
-    "constant-velocity": "constant velocity", "standing": "standing",
-}  # fmt: skip
+    "table2-3d": "free",
+    "table2-ramp": "ramps",
+    "table2-planar": "planar",
+    "single-axis": "about one axis",
+    "arc": "constant arc",
+    "spin": "spin in place",
+    "straight-line": "straight line, speed varying",
+    "constant-velocity": "constant velocity",
+    "standing": "standing",
+}
 IMUS = {"data sheet": 1.0, "ten times noisier": 10.0}
 SECONDS, AZIMUTH_STEPS, PER_IMAGE = 8.0, 300, 30
 FAR = 4.0  # standard deviations

@@ -42,10 +42,12 @@ def _of_rig(weight: float, rig: str, recording: str, *tables: str) -> tuple[_Kin
 
 def _of_result(weight: float, out: str, rig: str, recording: str, *exports: str) -> _Kind:
     commands = (
-        ("compare", out, f"good-{out}", "--json", "made.json", "-q"), ("view", out, "--save", "made.rrd", "-q"),
-        ("view", out, recording, "--save", "made.rrd", "-q"), ("calibrate", rig, recording, "-o", out, *QUIET),
+        ("compare", out, f"good-{out}", "--json", "made.json", "-q"),
+        ("view", out, "--save", "made.rrd", "-q"),
+        ("view", out, recording, "--save", "made.rrd", "-q"),
+        ("calibrate", rig, recording, "-o", out, *QUIET),
         *(("export", out, "--to", to, *_OUT, "-q") for to in exports),
-    )  # fmt: skip
+    )
     return _Kind("result", (f"{out}/*",), weight, commands)
 
 
@@ -63,26 +65,38 @@ _KINDS: tuple[_Kind, ...] = (
     _Kind("bag", ("run.bag", "run/*.mcap", "run/metadata.yaml"), 2.0, (_DRAFT, _calibrate("pose.yaml", "{top}"))),
     _Kind("bag", ("quiet.bag", "quiet/*", "db/*"), 1.0, (_ALLAN, _LOOK)),
     _Kind("picture", ("pictures/*",), 1.0, (("inspect", "pictures", "--target", "cam.yaml", *_INSPECT),)),
-    _Kind("scenario", ("scenario.yaml",), 2.0, (
-        ("simulate", "{file}", *_OUT, "-q"), ("simulate", "{file}", "-o", "made.bag", "--level", "sensor", "-q"),
-    )),
+    _Kind(
+        "scenario",
+        ("scenario.yaml",),
+        2.0,
+        (
+            ("simulate", "{file}", *_OUT, "-q"),
+            ("simulate", "{file}", "-o", "made.bag", "--level", "sensor", "-q"),
+        ),
+    ),
     _of_result(1.3, "out", "pose.yaml", "rec", "urdf", "ros2-static", "mins", "json"),
     _of_result(1.3, "cam-out", "cam.yaml", "board", *_EXPORTS),
     _of_result(1.3, "lidar-out", "lidar.yaml", "rec", "fast-lio", "ros2-static", "json"),
     _Kind("jobs", ("jobs.yaml",), 0.2, (("fleet", "{file}", *_OUT, "--workers", "1", "-q"),)),
-    _Kind("study", ("scenario.yaml",), 0.1, (
-        ("montecarlo", "{file}", "--runs", "1", *_OUT, "--workers", "1", "-q"),
-    )),
-    _Kind("others", ("kalibr/camchain-imucam.yaml", "kalibr/imu.yaml"), 1.0, (
-        ("compare", "{file}", "good-cam-out", "-q"),
-    )),
+    _Kind("study", ("scenario.yaml",), 0.1, (("montecarlo", "{file}", "--runs", "1", *_OUT, "--workers", "1", "-q"),)),
+    _Kind(
+        "others",
+        ("kalibr/camchain-imucam.yaml", "kalibr/imu.yaml"),
+        1.0,
+        (("compare", "{file}", "good-cam-out", "-q"),),
+    ),
     _Kind("others", ("kalibr/april.yaml",), 0.3, (("inspect", "rec", "--target", "{file}", "-q"),)),
     _Kind("others", ("kalibr/*",), 0.5, (("inspect", "kalibr", "--rig", "made.yaml", *_INSPECT),)),
-    _Kind("others", ("robot.urdf",), 0.7, (
-        ("compare", "{file}", "good-out", "-q"),
-        ("export", "good-out", "--to", "urdf", "--urdf", "{file}", "-o", "made.urdf", "-q"),
-    )),
-)  # fmt: skip
+    _Kind(
+        "others",
+        ("robot.urdf",),
+        0.7,
+        (
+            ("compare", "{file}", "good-out", "-q"),
+            ("export", "good-out", "--to", "urdf", "--urdf", "{file}", "-o", "made.urdf", "-q"),
+        ),
+    ),
+)
 
 
 @dataclass(frozen=True)

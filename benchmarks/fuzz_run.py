@@ -54,10 +54,13 @@ def warm(good: Path, place: Path) -> None:
 
     cv2.setNumThreads(0)
     for command in (
-        ("inspect", "rec", "-q"), ("inspect", "run.bag", "-q"), ("allan", "still", "-o", "made", "-q"),
+        ("inspect", "rec", "-q"),
+        ("inspect", "run.bag", "-q"),
+        ("allan", "still", "-o", "made", "-q"),
         ("calibrate", "mocap.yaml", "rec", "-o", "made2", *QUIET),
-        ("calibrate", "hand.yaml", "stops", "-o", "made3", *QUIET), ("compare", "out", "good-out", "-q"),
-    ):  # fmt: skip
+        ("calibrate", "hand.yaml", "stops", "-o", "made3", *QUIET),
+        ("compare", "out", "good-out", "-q"),
+    ):
         shutil.copytree(good, place)
         with inside(place):
             succeed(*command)

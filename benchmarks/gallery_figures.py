@@ -43,9 +43,15 @@ def tracks() -> np.ndarray:
     scenario = load_scenario(ROOT / "examples" / "paper" / "table2-3d.yaml")
     camera = replace(scenario.cameras[0], rate_hz=15.0)
     scenario = replace(
-        scenario, cameras=(camera,), lidars=(), wheels=(), features=None, target=NoTarget(),
-        T_world_bodies=np.zeros((0, 4, 4)), duration_s=1.5,
-    )  # fmt: skip
+        scenario,
+        cameras=(camera,),
+        lidars=(),
+        wheels=(),
+        features=None,
+        target=NoTarget(),
+        T_world_bodies=np.zeros((0, 4, 4)),
+        duration_s=1.5,
+    )
     images, tracker, paths = _images(scenario, 18), Tracker(), {}
     for k, image in enumerate(images):
         seen = tracker.add(image)

@@ -1,14 +1,12 @@
 """The same least-squares problem by icalib and by GTSAM: time, and how far apart the extrinsics come out.
 
-Both: nodes at the images of cam0, preintegrated IMU with bias walks, direction of gravity and both extrinsics
-estimated,
-intrinsics and time offsets fixed (offsets 0: cameras and IMU share a clock), no robust loss, nothing set aside, the
-same
-noise and the same first state. GTSAM's projection factor with the extrinsics as a variable, ProjectionFactorPPP of
-gtsam_unstable, wants each target point to be a variable too; a tight prior holds them. That costs GTSAM time:
-`linearise_once`, the part of an iteration that the points hardly slow, bounds from below what a factor with
-fixed
-points would take.
+Both: keyframes at the images of cam0, preintegrated IMU with bias walks, direction of gravity and both extrinsics
+estimated, intrinsics and time offsets fixed (offsets 0: cameras and IMU share a clock), no robust loss, no corner
+rejected, the same noise and the same first state.
+
+GTSAM's projection factor with the extrinsics as a variable, ProjectionFactorPPP of gtsam_unstable, wants each target
+point to be a variable too; a tight prior fixes them. That costs GTSAM time: `linearise_once`, the part of an iteration
+that the points hardly slow, bounds from below what a factor with fixed points would take.
 """
 
 from __future__ import annotations

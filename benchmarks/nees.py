@@ -74,9 +74,14 @@ def _rig(scenario: Scenario) -> Rig:
     """All is estimated, from the truth on: whether a first guess is found is another question. The noise of IMU and
     encoders is stated, all other is found from residuals. Simulated wheels do not slip."""
     rig = rig_for(
-        scenario, rotation="start", translation="start", time_offset="start", intrinsics="start", distortion="start",
+        scenario,
+        rotation="start",
+        translation="start",
+        time_offset="start",
+        intrinsics="start",
+        distortion="start",
         drive="start",
-    )  # fmt: skip
+    )
     return replace(
         rig,
         cameras=tuple(replace(c, corner_noise_px=None, track_noise_px=None) for c in rig.cameras),
@@ -107,10 +112,14 @@ def _drive() -> Case:
     """A robot on hills with a LiDAR, wheels and motion capture."""
     scenario = load_scenario(PAPER / "table2-ramp.yaml")
     scenario = replace(
-        scenario, duration_s=6.0, cameras=(), features=None, poses=(_mocap(),),
+        scenario,
+        duration_s=6.0,
+        cameras=(),
+        features=None,
+        poses=(_mocap(),),
         lidars=tuple(replace(x, azimuth_steps=200) for x in scenario.lidars),
         wheels=tuple(replace(w, noise=0.005) for w in scenario.wheels),
-    )  # fmt: skip
+    )
     return Case(scenario, _rig(scenario), 20, ("lidar", "wheel", "mocap"))
 
 

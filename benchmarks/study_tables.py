@@ -2,9 +2,9 @@
 
 python benchmarks/study_tables.py [NAME=STUDY ...]
 
-With NAME=STUDY the result of the study in the folder STUDY, made anew from its runs, becomes
-docs/studies/NAME.json. Then the tables between `<!-- study NAME -->` or `<!-- studies NAME ... -->`
-and `<!-- end -->` are written anew. `tests/test_docs_studies.py` holds the page against the results.
+With NAME=STUDY the result of the study in the folder STUDY, made anew from its runs, becomes docs/studies/NAME.json.
+Then the tables between `<!-- study NAME -->` or `<!-- studies NAME ... -->` and `<!-- end -->` are written anew.
+`tests/test_docs_studies.py` compares the page with the results.
 """
 
 from __future__ import annotations
@@ -55,10 +55,14 @@ def overview(names: Sequence[str]) -> str:
         inside = sum(n.consistent for n in counted)
         first, runs, failed = study["first_seed"], found["runs"], len(found["failures"])
         cells = (
-            f"[{name}](studies/{name}.json)", study["guess"], f"{first} to {first + runs - 1}", f"{failed} of {runs}",
-            _nees(Nees(**found["whole"])), f"{inside} of {len(counted)}",
+            f"[{name}](studies/{name}.json)",
+            study["guess"],
+            f"{first} to {first + runs - 1}",
+            f"{failed} of {runs}",
+            _nees(Nees(**found["whole"])),
+            f"{inside} of {len(counted)}",
             f"{largest['sigmas']:.1f} sigma of {largest['numbers']}",
-        )  # fmt: skip
+        )
         rows.append(f"| {' | '.join(cells)} |")
     return "\n".join(rows) + "\n"
 

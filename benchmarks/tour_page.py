@@ -54,9 +54,14 @@ def checkout(folder: Path) -> Path:
 def run(block: Block, folder: Path) -> subprocess.CompletedProcess[str]:
     """The command of `block` in `folder`, with all that it prints in `stdout`."""
     return subprocess.run(
-        ["bash", "-euo", "pipefail", "-c", block.command], cwd=folder, env=os.environ | {"COLUMNS": "120"},
-        encoding="utf-8", stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False,
-    )  # fmt: skip
+        ["bash", "-euo", "pipefail", "-c", block.command],
+        cwd=folder,
+        env=os.environ | {"COLUMNS": "120"},
+        encoding="utf-8",
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        check=False,
+    )
 
 
 def says(output: str, pieces: tuple[str, ...]) -> str:

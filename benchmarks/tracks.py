@@ -44,9 +44,7 @@ def main() -> None:
     with threadpool_limits(limits=1, user_api="blas"):
         inputs = inputs_for(rig, [simulation.measurements])
         guesses, _ = _spent(lambda: initial_guesses(rig, inputs.bodies, [m.measurements for m in inputs.motions]))
-        state = first_state(
-            inputs, *initial_guesses(rig, inputs.bodies, [m.measurements for m in inputs.motions])
-        )  # fmt: skip
+        state = first_state(inputs, *initial_guesses(rig, inputs.bodies, [m.measurements for m in inputs.motions]))
         print(f"first guess               {guesses:>8.2f} s of the processor")
         passes, _ = _spent(lambda: estimate(inputs, state))
         print(f"all passes                {passes:>8.2f} s")

@@ -63,8 +63,12 @@ def test_every_other_kind():
     np.testing.assert_array_equal(placed.rotation, rotations.as_matrix())
     found = arrays.measurements(scan, seen, turned, placed)
     assert (found.imu, found.lidars, found.tracks, found.wheels, found.poses) == (
-        None, (scan,), (seen,), (turned,), (placed,)
-    )  # fmt: skip
+        None,
+        (scan,),
+        (seen,),
+        (turned,),
+        (placed,),
+    )
 
 
 @pytest.mark.parametrize(

@@ -43,12 +43,15 @@ def test_a_value_of_zero_is_compared_with_its_standard_deviation(golden: Any, re
     assert not golden.is_equal(change, 0.05)
 
 
-@pytest.mark.parametrize("other", [
-    {"verdict": {"cam0.translation": ["weak"] * 3, "cam0.rotation": ["determined"] * 3}},
-    {"converged": False},
-    {"values": {"cam0.translation": [0.1, -0.2, 0.0]}},
-    {"std": {"cam0.translation": [1e-3, 2e-3, 0.0], "cam0.rotation": [1e-3] * 3}},
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"verdict": {"cam0.translation": ["weak"] * 3, "cam0.rotation": ["determined"] * 3}},
+        {"converged": False},
+        {"values": {"cam0.translation": [0.1, -0.2, 0.0]}},
+        {"std": {"cam0.translation": [1e-3, 2e-3, 0.0], "cam0.rotation": [1e-3] * 3}},
+    ],
+)
 def test_other_changes_are_named(golden: Any, record: Any, other: dict[str, Any]):
     change = golden.changed(record, replace(record, **other))
     assert change.words and not golden.is_equal(change, 0.05)

@@ -24,9 +24,10 @@ LARGE = bytes(3 * FREE_BYTES)
 def test_blocks_and_files_within_and_beyond_the_limit():
     lz4, zstd = load_lz4(), load_zstd()
     kinds = {
-        bz2.BZ2Decompressor: bz2.compress, lz4.LZ4FrameDecompressor: lz4.compress,
+        bz2.BZ2Decompressor: bz2.compress,
+        lz4.LZ4FrameDecompressor: lz4.compress,
         zstd.ZstdDecompressor: zstd.compress,
-    }  # fmt: skip
+    }
     for kind, pack in kinds.items():
         assert unpacked(kind(), pack(LARGE[: FREE_BYTES // 2])) == LARGE[: FREE_BYTES // 2]
         if len(pack(LARGE)) * 256 < FREE_BYTES:
@@ -82,9 +83,12 @@ def test_headers_of_arrays_that_lie(header: str):
 @pytest.mark.parametrize("plane", [2**31, 2**31 - 1, -2, 5])
 def test_plane_ids_are_below_the_number_of_points(tmp_path: Path, plane: int):
     arrays = {
-        "stamps_ns": np.arange(2) * 100_000_000, "start": np.array([0, 2, 4]), "offset_s": np.zeros(4, np.float32),
-        "xyz": np.ones((4, 3), np.float32), "plane": np.array([0, -1, 1, plane]),
-    }  # fmt: skip
+        "stamps_ns": np.arange(2) * 100_000_000,
+        "start": np.array([0, 2, 4]),
+        "offset_s": np.zeros(4, np.float32),
+        "xyz": np.ones((4, 3), np.float32),
+        "plane": np.array([0, -1, 1, plane]),
+    }
     np.savez(tmp_path / "scans.npz", **arrays)
     with pytest.raises(RecordingError, match="plane must be -1 or a plane's number"):
         read_scans("lidar0", tmp_path / "scans.npz")

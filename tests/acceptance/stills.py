@@ -143,6 +143,9 @@ def calibrate_stills(folder: Path) -> dict:
     x, std, sigma = adjustment.solve(adjustment.start(np.array([460.0, 460.0, 370.0, 250.0, 0.0, 0.0, 0.0, 0.0])))
     rest, spread = x[6 * adjustment.n :], std[6 * adjustment.n :]
     return {
-        "lenses": rest[6:22].reshape(2, 8), "std": spread[6:22].reshape(2, 8), "shape": rest[-SHAPE:],
-        "baseline": float(np.linalg.norm(rest[3:6])), "sigma": sigma,
-    }  # fmt: skip
+        "lenses": rest[6:22].reshape(2, 8),
+        "std": spread[6:22].reshape(2, 8),
+        "shape": rest[-SHAPE:],
+        "baseline": float(np.linalg.norm(rest[3:6])),
+        "sigma": sigma,
+    }

@@ -93,10 +93,14 @@ def recording(tags_on_walls: Callable) -> Callable[[str], Simulation]:
         "board": replace(robot, cameras=robot.cameras[:1], target=BOARD, board=True, T_world_board=ON_WALL),
         "tags": replace(robot, cameras=robot.cameras[:1], target=tags, board=True, T_world_bodies=bodies),
         "tracks": replace(
-            robot, cameras=robot.cameras[:1], target=NoTarget(), board=False, T_world_bodies=np.zeros((0, 4, 4)),
+            robot,
+            cameras=robot.cameras[:1],
+            target=NoTarget(),
+            board=False,
+            T_world_bodies=np.zeros((0, 4, 4)),
             features=Features(per_image=60, count=800),
         ),
-    }  # fmt: skip
+    }
     made: dict[str, Simulation] = {}
 
     def of(sees: str) -> Simulation:

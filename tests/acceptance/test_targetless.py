@@ -23,9 +23,15 @@ def recorded(tmp_path_factory):
     scenario = load_scenario(PAPER / "table2-3d.yaml")
     camera = replace(scenario.cameras[0], rate_hz=10.0, resolution=(320, 240), intrinsics=(195.2, 194.6, 156.3, 124.2))
     scenario = replace(
-        scenario, cameras=(camera,), lidars=(), wheels=(), features=None, target=NoTarget(),
-        T_world_bodies=np.zeros((0, 4, 4)), duration_s=10.0,
-    )  # fmt: skip
+        scenario,
+        cameras=(camera,),
+        lidars=(),
+        wheels=(),
+        features=None,
+        target=NoTarget(),
+        T_world_bodies=np.zeros((0, 4, 4)),
+        duration_s=10.0,
+    )
     filmed, path = film(scenario, 3), tmp_path_factory.mktemp("room") / "room.bag"
     write_film(filmed, {"ros1": path})
     rig = rig_for(scenario, intrinsics="free", distortion="free")

@@ -172,9 +172,13 @@ def test_cameras_that_follow_points_and_wheels_on_a_floor(seed, drive):
     assert set(result.group("wheel0", "radii").verdict) == {"undetermined" if drive == "start" else "fixed"}
 
 
-@pytest.mark.parametrize(("example", "drive", "words"), [
-    ("ramp", "start", "determines the motion on a flat floor only"), ("planar", "free", "give its radii and baseline"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("example", "drive", "words"),
+    [
+        ("ramp", "start", "determines the motion on a flat floor only"),
+        ("planar", "free", "give its radii and baseline"),
+    ],
+)
 def test_what_wheels_do_not_show_to_cameras_that_follow_points(example, drive, words):
     rig, measurements, _ = followed_by_wheels(example, 1, drive)
     with pytest.raises(EstimationError, match=words):

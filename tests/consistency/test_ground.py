@@ -87,9 +87,7 @@ def test_a_level_floor_under_a_target(robot):
     scenario = robot("planar", 20.0, "cw")
     simulation = simulate(scenario, 0)
     height = under_the_target(scenario, simulation)
-    result = calibrate_measurements(
-        standing(scenario, 0, replace(LEVEL, height=height)), simulation.measurements
-    )  # fmt: skip
+    result = calibrate_measurements(standing(scenario, 0, replace(LEVEL, height=height)), simulation.measurements)
     check_upright(result, simulation)
     check_known(result, simulation)
     assert any("cam0 translation z with wheel0 translation z" in words for words in result.undetermined)
@@ -99,9 +97,7 @@ def test_hills_are_no_plane(robot):
     scenario = robot("ramp", 20.0, "cw")
     simulation = simulate(scenario, 0)
     height = under_the_target(scenario, simulation)
-    result = calibrate_measurements(
-        standing(scenario, 0, replace(LEVEL, height=height)), simulation.measurements
-    )  # fmt: skip
+    result = calibrate_measurements(standing(scenario, 0, replace(LEVEL, height=height)), simulation.measurements)
     ratios = {f.kind: f.chi2_per_dof for f in result.fits if f.sensor == "wheel0"}
     assert not_none(ratios["ground tilt"]) > 10.0 and not_none(ratios["ground height"]) > 10.0
     assert any("wheel0 tilts against its ground" in words for words in result.warnings)

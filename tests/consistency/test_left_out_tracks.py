@@ -36,9 +36,7 @@ def passes(inputs, found, turned_deg: float):
         if not any(problem.features is p for p in begun):
             begun.append(problem.features)
 
-    again = estimate(
-        inputs, replace(end, values=end.values | {key: turned}), on_visit=note, judged=found.judged
-    )  # fmt: skip
+    again = estimate(inputs, replace(end, values=end.values | {key: turned}), on_visit=note, judged=found.judged)
     return again, begun
 
 

@@ -65,11 +65,15 @@ def test_free_motion_shows_all_clocks_to_a_noisy_imu(seed: int):
 @pytest.mark.parametrize(
     ("motion", "noise", "seconds"),
     [
-        ("table2-planar", 10.0, SECONDS), ("single-axis", 10.0, SECONDS), ("straight-line", 10.0, SECONDS),
-        ("constant-velocity", 1.0, SECONDS), ("arc", 1.0, SECONDS), ("spin", 10.0, SPIN_SECONDS),
+        ("table2-planar", 10.0, SECONDS),
+        ("single-axis", 10.0, SECONDS),
+        ("straight-line", 10.0, SECONDS),
+        ("constant-velocity", 1.0, SECONDS),
+        ("arc", 1.0, SECONDS),
+        ("spin", 10.0, SPIN_SECONDS),
         ("standing", 1.0, SECONDS),
     ],
-)  # fmt: skip
+)
 def test_what_is_known_is_right_and_nothing_creeps(motion: str, noise: float, seconds: float):
     result, simulation = calibrated(motion, noise, 1, seconds=seconds)
     check(result, simulation)

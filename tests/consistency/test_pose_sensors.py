@@ -32,10 +32,14 @@ def sensor(kind, name="mocap0", **others):
     """With a clock of its own; its frame is tilted against gravity."""
     turn, way = NOISE[kind]
     return SimPoses(
-        name, pose([0.3, -0.5, 1.0], [0.1, -0.2, 0.15]), kind, pose([0.2, 0.1, 2.0], [3.0, -1.0, 0.5]),
+        name,
+        pose([0.3, -0.5, 1.0], [0.1, -0.2, 0.15]),
+        kind,
+        pose([0.2, 0.1, 2.0], [3.0, -1.0, 0.5]),
         **({"time_offset_s": 0.0123, "clock_origin_ns": 777, "phase_s": 0.003} | others),
-        rotation_noise=turn, position_noise=way,
-    )  # fmt: skip
+        rotation_noise=turn,
+        position_noise=way,
+    )
 
 
 def alone(kind, motion: DriveKind = "free", exact=True, **others):

@@ -103,7 +103,7 @@ def test_wheels_that_never_turned_while_the_camera_looked(drive):
         ("arc", "lw", "drove a single arc"),
         ("planar", "w", "wheel0 and imu0 do not determine the motion"),
     ],
-)  # fmt: skip
+)
 def test_drives_that_show_too_little(drive, kind: str, parts: str, words: str):
     simulation = drive("planar", 16.0, parts, kind)
     rig = rig_for(simulation.scenario) if kind == "standing" else guessed(simulation)

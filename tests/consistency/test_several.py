@@ -34,10 +34,8 @@ def second(scenario: Scenario) -> Scenario:
         gyro_bias=(0.05, -0.03, -0.04),
         accel_bias=(0.2, -0.1, 0.05),
         imu_clock_origin_ns=scenario.imu_clock_origin_ns - earlier,
-        cameras=tuple(
-            dataclasses.replace(c, clock_origin_ns=c.clock_origin_ns - earlier) for c in scenario.cameras
-        ),
-    )  # fmt: skip
+        cameras=tuple(dataclasses.replace(c, clock_origin_ns=c.clock_origin_ns - earlier) for c in scenario.cameras),
+    )
 
 
 def pair(seed: int, seconds: tuple[float, float] = (12.0, 9.0), **options) -> tuple[Simulation, Simulation]:
@@ -318,5 +316,7 @@ def test_three_recordings_share_bloom_and_bow():
     assert low < error @ np.linalg.solve(result.covariance[np.ix_(columns, columns)], error) < high
     assert not any("too short" in w for w in result.warnings)
     assert [g.sensor for g in result.groups if g.name == "tilt"] == [
-        "board0", "board0 in recording 2", "board0 in recording 3"
-    ]  # fmt: skip
+        "board0",
+        "board0 in recording 2",
+        "board0 in recording 3",
+    ]

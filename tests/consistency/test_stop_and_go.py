@@ -36,13 +36,25 @@ def stills(count: int, noisy: bool = True, seed: int = 0, **motion) -> Stills:
     scenario = handheld(count - 0.2, noiseless=not noisy)
     camera = replace(scenario.cameras[0], rate_hz=1.0, phase_s=0.5, time_offset_s=0.0, clock_origin_ns=0, jitter_s=0.0)
     flange = SimPoses(
-        "flange", MOUNT, "absolute", FRAME, time_offset_s=0.0, clock_origin_ns=0, phase_s=0.5, rate_hz=1.0,
-        rotation_noise=2e-3, position_noise=1e-3,
-    )  # fmt: skip
+        "flange",
+        MOUNT,
+        "absolute",
+        FRAME,
+        time_offset_s=0.0,
+        clock_origin_ns=0,
+        phase_s=0.5,
+        rate_hz=1.0,
+        rotation_noise=2e-3,
+        position_noise=1e-3,
+    )
     scenario = replace(
-        scenario, cameras=(camera,), poses=(flange,), imu_clock_origin_ns=0, robot_noise_enabled=noisy,
+        scenario,
+        cameras=(camera,),
+        poses=(flange,),
+        imu_clock_origin_ns=0,
+        robot_noise_enabled=noisy,
         motion=replace(scenario.motion, **motion),
-    )  # fmt: skip
+    )
     sim = simulate(scenario, seed)
     rig = replace(rig_for(scenario), imu=None)
     rig = replace(rig, poses=(replace(rig.poses[0], rotation_noise=None, position_noise=None),))

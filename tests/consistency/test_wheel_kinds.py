@@ -20,9 +20,15 @@ KINDS: dict[str, WheelKind] = {"twist": "twist", "steering": "steered"}
 def reporting(scenario: Scenario, reports: str) -> Scenario:
     """Its wheels as good as the encoders of the other tests, with parameters that are not the defaults."""
     changed = replace(
-        scenario.wheels[0], reports=reports, scales=(1.03, 0.97), speed_noise=5e-4, yaw_noise=2e-3, wheelbase=0.25,
-        steering_offset=0.02, steering_noise=5e-4,
-    )  # fmt: skip
+        scenario.wheels[0],
+        reports=reports,
+        scales=(1.03, 0.97),
+        speed_noise=5e-4,
+        yaw_noise=2e-3,
+        wheelbase=0.25,
+        steering_offset=0.02,
+        steering_noise=5e-4,
+    )
     return replace(scenario, wheels=(changed,))
 
 
@@ -57,9 +63,10 @@ def test_a_straight_line_leaves_what_only_turning_shows(robot, reports, open_, k
     assert result.converged, result.status
     verdicts = {
         f"{g.name}.{label}".removesuffix(f".{g.name}").rstrip("."): v
-        for g in result.groups if g.sensor == "wheel0"
+        for g in result.groups
+        if g.sensor == "wheel0"
         for label, v in zip(g.labels, g.verdict, strict=True)
-    }  # fmt: skip
+    }
     assert verdicts[open_] == "undetermined" and verdicts[known] != "undetermined", verdicts
     words = "wheel0 " + open_.replace(".", " ").replace("_", " ")
     assert any(words in sentence for sentence in result.undetermined), result.undetermined

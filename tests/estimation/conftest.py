@@ -183,9 +183,14 @@ def make_setup(
     streams = restrict(bodies, measurements).cameras
     empty = np.empty(0)
     pending = Setup(
-        sim, imu, make_layout(entries), bodies, streams, origin + R_world_grid @ p_grid_scene,
+        sim,
+        imu,
+        make_layout(entries),
+        bodies,
+        streams,
+        origin + R_world_grid @ p_grid_scene,
         State(seconds, empty, empty, empty, empty, values),
-    )  # fmt: skip
+    )
     R, p, v = pending.truth_at(seconds)
     return replace(pending, state=State(seconds, R, p, v, np.tile(bias, (len(seconds), 1)), values))
 

@@ -31,14 +31,25 @@ def pose(vector, position):
 def world(request):
     """Four seconds without noise, nodes every 20 ms at the truth: inputs, state, stream."""
     mocap = SimPoses(
-        "mocap0", pose([0.3, -0.5, 1.0], [0.1, -0.2, 0.15]), request.param, pose([0.2, 0.1, 2.0], [3.0, -1.0, 0.5]),
-        time_offset_s=0.0123, clock_origin_ns=777, scale=1.02,
-    )  # fmt: skip
+        "mocap0",
+        pose([0.3, -0.5, 1.0], [0.1, -0.2, 0.15]),
+        request.param,
+        pose([0.2, 0.1, 2.0], [3.0, -1.0, 0.5]),
+        time_offset_s=0.0123,
+        clock_origin_ns=777,
+        scale=1.02,
+    )
     drive = Drive("free", exact=True)
     scenario = Scenario(
-        (), duration_s=4.0, motion=drive, board=False, room=Room((8.0, 6.0, 3.0)), poses=(mocap,),
-        imu_noise_enabled=False, robot_noise_enabled=False,
-    )  # fmt: skip
+        (),
+        duration_s=4.0,
+        motion=drive,
+        board=False,
+        room=Room((8.0, 6.0, 3.0)),
+        poses=(mocap,),
+        imu_noise_enabled=False,
+        robot_noise_enabled=False,
+    )
     sim = simulate(scenario, 5)
     inputs = inputs_for(rig_for(scenario), [sim.measurements])
     (stream,), truth = sim.measurements.poses, sim.truth

@@ -20,9 +20,13 @@ pytestmark = pytest.mark.slow
 
 def empty(n: int) -> LidarStream:
     return LidarStream(
-        "lidar0", np.zeros(1, np.int64), np.array([0, n]), np.zeros(n, np.float32), np.zeros((n, 3), np.float32),
+        "lidar0",
+        np.zeros(1, np.int64),
+        np.array([0, n]),
+        np.zeros(n, np.float32),
+        np.zeros((n, 3), np.float32),
         np.full(n, -1, np.int32),
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize("step", [1, 3, 5, 13])

@@ -30,9 +30,16 @@ def pose(vector, position):
 def sim(request):
     noise = {"absolute": (2e-3, 1e-3), "relative": (5e-3, 1e-2)}[request.param]
     mocap = SimPoses(
-        "mocap0", pose([2.0, -0.5, 1.0], [0.1, -0.2, 0.15]), request.param, pose([0.4, 0.1, 2.0], [3.0, -1.0, 0.5]),
-        time_offset_s=0.5, rate_hz=50.0, clock_origin_ns=777, rotation_noise=noise[0], position_noise=noise[1],
-    )  # fmt: skip
+        "mocap0",
+        pose([2.0, -0.5, 1.0], [0.1, -0.2, 0.15]),
+        request.param,
+        pose([0.4, 0.1, 2.0], [3.0, -1.0, 0.5]),
+        time_offset_s=0.5,
+        rate_hz=50.0,
+        clock_origin_ns=777,
+        rotation_noise=noise[0],
+        position_noise=noise[1],
+    )
     scenario = Scenario(
         (), duration_s=15.0, motion=Drive("free"), board=False, room=Room((8.0, 6.0, 3.0)), poses=(mocap,)
     )

@@ -30,16 +30,20 @@ LENSES = {
     "eucm": ("eucm", WIDE, (250.0, 251.0, 325.0, 238.0), (0.6, 1.1)),
     "omni": ("omni-radtan", WIDE, (450.0, 451.0, 325.0, 238.0), (1.0, -0.1, 0.02, 0.0, 0.0)),
     "rational": ("pinhole-rational", WIDE, (400.0, 401.0, 325.0, 238.0), (0.3, 0.05, 0.0, 0.0, 0.01, 0.6, 0.1, 0.02)),
-}  # fmt: skip
+}
 
 
 def drive(lens: str = "radtan", example="table2-3d", noise_px=0.5, duration_s=15.0, seed=1, **changes) -> Simulation:
     model, resolution, intrinsics, distortion = LENSES[lens]
     scenario = load_scenario(PAPER / f"{example}.yaml")
     camera = replace(
-        scenario.cameras[0], model=model, resolution=resolution, intrinsics=intrinsics, distortion=distortion,
+        scenario.cameras[0],
+        model=model,
+        resolution=resolution,
+        intrinsics=intrinsics,
+        distortion=distortion,
         corner_noise_px=noise_px,
-    )  # fmt: skip
+    )
     return simulate(replace(scenario, duration_s=duration_s, cameras=(camera,), lidars=(), wheels=(), **changes), seed)
 
 
@@ -79,9 +83,10 @@ def test_every_model_is_found(lens: str):
     assert off_px(simulation, found) < 3e-3 * model.central_scale(found)
 
 
-@pytest.mark.parametrize(("example", "noise_px", "most_px"), [
-    ("table2-3d", 0.0, 0.7), ("table2-planar", 1.0, 3.0), ("table2-ramp", 1.0, 3.0), ("single-axis", 0.3, 3.0),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("example", "noise_px", "most_px"),
+    [("table2-3d", 0.0, 0.7), ("table2-planar", 1.0, 3.0), ("table2-ramp", 1.0, 3.0), ("single-axis", 0.3, 3.0)],
+)
 def test_other_motions(example: str, noise_px: float, most_px: float):
     """3 px at half the image's width are 1 % of the focal length."""
     simulation = drive(example=example, noise_px=noise_px)
@@ -112,9 +117,10 @@ def test_tracks_of_another_drive_do_not_match():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("lens", "seed", "longest_s"), [
-    ("radtan", 1, 5.0), ("radtan", 2, 0.25), ("fisheye", 3, 0.5), ("double sphere", 4, 5.0),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("lens", "seed", "longest_s"),
+    [("radtan", 1, 5.0), ("radtan", 2, 0.25), ("fisheye", 3, 0.5), ("double sphere", 4, 5.0)],
+)
 def test_calibration_from_nothing(lens: str, seed: int, longest_s: float):
     """Also where points are lost after five or ten images."""
     features = load_scenario(PAPER / "table2-3d.yaml").features

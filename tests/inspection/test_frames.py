@@ -49,8 +49,13 @@ def test_frames_are_listed(arm, tmp_path, capsys):
     assert "Frames" in shown and "upper -> flange" in shown
     first = json.loads(path.read_text())["frames"][0]
     assert first == {
-        "topic": "/arm/tf", "parent": "base", "child": "upper", "count": 50, "rate_hz": 50.0, "moves": True
-    }  # fmt: skip
+        "topic": "/arm/tf",
+        "parent": "base",
+        "child": "upper",
+        "count": 50,
+        "rate_hz": 50.0,
+        "moves": True,
+    }
 
 
 def test_a_pose_sensor_is_suggested(arm, tmp_path):

@@ -55,8 +55,14 @@ def test_the_same_images_twice_are_one_camera():
 
 
 def test_lidars_and_wheels():
-    given = {"/imu0": "imu", "/top/points": "points", "/velodyne_points": "points", "lidar0/scans.npz": "points",
-             "/joint_states": "joints", "wheel1/ticks.csv": "wheels"}  # fmt: skip
+    given = {
+        "/imu0": "imu",
+        "/top/points": "points",
+        "/velodyne_points": "points",
+        "lidar0/scans.npz": "points",
+        "/joint_states": "joints",
+        "wheel1/ticks.csv": "wheels",
+    }
     found = find_sources([TopicInfo(name, "", kind, 10, 0, 1) for name, kind in given.items()])
     assert list(found.imus) == ["imu0"] and list(found.lidars) == ["top", "velodyne_points", "lidar0"]
     assert {name: t.name for name, t in found.wheels.items()} == {

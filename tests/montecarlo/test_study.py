@@ -62,8 +62,12 @@ def test_two_workers_find_what_one_finds(alone: Path, tmp_path: Path):
 
 def test_what_is_written(alone: Path):
     assert sorted(f.name for f in alone.iterdir()) == [
-        ".lock", "consistency.html", "consistency.json", "runs", "study.json",
-    ]  # fmt: skip
+        ".lock",
+        "consistency.html",
+        "consistency.json",
+        "runs",
+        "study.json",
+    ]
     assert sorted(written(alone)) == [f"{seed:06d}.json" for seed in range(RUNS)]
     found = json.loads((alone / "consistency.json").read_bytes())
     assert (found["runs"], found["failures"], found["study"]["first_seed"]) == (RUNS, [], 0)

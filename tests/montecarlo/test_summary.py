@@ -97,8 +97,9 @@ def test_failed_runs_are_listed_and_do_not_count(record):
     failed = Record(6, "no camera saw the target.", 1.0, "digest")
     found = summarise([far, *runs, failed])
     assert [(f.seed, f.sentence) for f in found.failures] == [
-        (6, "no camera saw the target."), (7, "the solver did not converge: it stopped."),
-    ]  # fmt: skip
+        (6, "no camera saw the target."),
+        (7, "the solver did not converge: it stopped."),
+    ]
     assert found.runs == 7
     assert found.blocks == summarise(runs).blocks
 

@@ -125,12 +125,20 @@ DRIVERS = {
     "livox, absolute ns": (LIVOX, lambda t, s: {"timestamp": t.astype(np.float64)}, 3_000_000, {}, 140),
     "livox, offset": (LIVOX_OFFSET, lambda t, s: {"offset_time": t - s}, 0, {}, 10),
     "counted from the first, stamped at the last": (
-        VELODYNE, lambda t, s: {"time": (t - t[0]) * 1e-9}, LAST, {"point_time": "end"}, 10
+        VELODYNE,
+        lambda t, s: {"time": (t - t[0]) * 1e-9},
+        LAST,
+        {"point_time": "end"},
+        10,
     ),
     "counted to the last, stamped at the first": (
-        VELODYNE, lambda t, s: {"time": (t - t[-1]) * 1e-9}, 0, {"point_time": "start"}, 10
+        VELODYNE,
+        lambda t, s: {"time": (t - t[-1]) * 1e-9},
+        0,
+        {"point_time": "start"},
+        10,
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("driver", DRIVERS)
@@ -232,22 +240,27 @@ def stamped(times: Any, shuffle: bool = False) -> Any:
 REFUSED = {
     "no times": (stamped((PLAIN, lambda t, s: {})), {}, "no times (their fields are x, y, z, intensity); record a clo"),
     "no unit": (
-        stamped((HESAI, lambda t, s: {"timestamp": t * 3e-8})), {}, "increases by 3 from scan to scan, which is 0.1 s"
+        stamped((HESAI, lambda t, s: {"timestamp": t * 3e-8})),
+        {},
+        "increases by 3 from scan to scan, which is 0.1 s",
     ),
     "times of float32": (
-        stamped((layout(16, timestamp=("f4", 12)), lambda t, s: {"timestamp": t * 1e-9})), {},
+        stamped((layout(16, timestamp=("f4", 12)), lambda t, s: {"timestamp": t * 1e-9})),
+        {},
         "all points of a scan have the same `timestamp`",
     ),
     "zeros": (stamped((VELODYNE, lambda t, s: {})), {}, "all points of a scan have the same `time`; correct"),
     "set back": (
-        stamped((VELODYNE, lambda t, s: {"time": (t - s) * 1e-9}), shuffle=True), {},
+        stamped((VELODYNE, lambda t, s: {"time": (t - s) * 1e-9}), shuffle=True),
+        {},
         f"the scan at {ORIGIN} ns comes after the one at {ORIGIN + 11 * PERIOD} ns",
     ),
     "all too far": (
-        stamped((VELODYNE, lambda t, s: {"time": (t - s) * 1e-9})), {"min_range_m": 50.0},
+        stamped((VELODYNE, lambda t, s: {"time": (t - s) * 1e-9})),
+        {"min_range_m": 50.0},
         "0 of 12 scans have usable points",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", REFUSED)

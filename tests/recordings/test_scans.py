@@ -79,7 +79,7 @@ def test_points_that_cannot_be_used(tmp_path):
         ({"stamps_ns": GOOD["stamps_ns"] // 10**6}, "they look like milliseconds; export them in nanoseconds"),
         ({"xyz": np.array([object()] * 200)}, "cannot be read \\(Object arrays cannot be loaded"),
     ],
-)  # fmt: skip
+)
 def test_what_is_refused(tmp_path, changed, words):
     arrays = {name: array for name, array in (GOOD | changed).items() if array is not None}
     with pytest.raises(RecordingError, match=words) as error:

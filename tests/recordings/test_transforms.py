@@ -105,8 +105,11 @@ def test_between_branches(one_bag):
     """From one branch of the tree to another: up, then down."""
     static = [*STATIC, (0, "base", "camera", *TOOL)]
     found = one_bag(MOVING, static).poses(sensor("camera", "flange"))
-    check(found, [START + k * STEP for k in range(COUNT)], matrix(
-        TOOL[0].inv(), -TOOL[0].inv().apply(TOOL[1])) @ matrix(*SHOULDER) @ matrix(*WRIST))  # fmt: skip
+    check(
+        found,
+        [START + k * STEP for k in range(COUNT)],
+        matrix(TOOL[0].inv(), -TOOL[0].inv().apply(TOOL[1])) @ matrix(*SHOULDER) @ matrix(*WRIST),
+    )
 
 
 def test_a_slower_edge_is_interpolated(one_bag):
@@ -167,10 +170,16 @@ def test_clock_set_back(one_bag):
     stamps = [START + k * STEP - (k > 20) * 5_000_000_000 for k in range(COUNT)]
     make = one_bag.write.maker("ros2")  # pyright: ignore
     messages = [
-        ("/tf", "tf2_msgs/msg/TFMessage", START + k * STEP, make.make(
-            "tf2_msgs/msg/TFMessage", [transform(make, stamps[k], "base", "flange", WRIST[0][k], WRIST[1][k])]))
+        (
+            "/tf",
+            "tf2_msgs/msg/TFMessage",
+            START + k * STEP,
+            make.make(
+                "tf2_msgs/msg/TFMessage", [transform(make, stamps[k], "base", "flange", WRIST[0][k], WRIST[1][k])]
+            ),
+        )
         for k in range(COUNT)
-    ]  # fmt: skip
+    ]
     with pytest.raises(RecordingError, match="the stamps of base -> flange go back by 5.0 s"):
         one_bag((), (), messages).poses(sensor("base", "flange"))
 

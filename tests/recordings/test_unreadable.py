@@ -23,11 +23,19 @@ MP4 = b"\0\0\0\x20ftypisom" + bytes(100)
 LIDAR, IMU = Lidar("lidar0", "lidar0/scans.npz"), ImuSensor("imu0", "imu0/data.csv", class_noise("consumer"))
 CAMERA = Camera("cam0", "cam0/corners.csv", "pinhole-radtan", (64, 48))
 PACKETS = (
-    "velodyne_msgs/VelodyneScan", "velodyne_msgs/msg/VelodynePacket", "ouster_ros/PacketMsg",
-    "ouster_sensor_msgs/msg/PacketMsg", "hesai_ros_driver/msg/UdpFrame", "hesai_lidar/PandarScan",
-    "pandar_msgs/msg/PandarScan", "rslidar_msgs/rslidarScan", "rslidar_msg/msg/RslidarPacket",
-    "nebula_msgs/msg/NebulaPackets", "lslidar_msgs/msg/LslidarScan", "robosense_msgs/msg/RobosenseScan",
-)  # fmt: skip
+    "velodyne_msgs/VelodyneScan",
+    "velodyne_msgs/msg/VelodynePacket",
+    "ouster_ros/PacketMsg",
+    "ouster_sensor_msgs/msg/PacketMsg",
+    "hesai_ros_driver/msg/UdpFrame",
+    "hesai_lidar/PandarScan",
+    "pandar_msgs/msg/PandarScan",
+    "rslidar_msgs/rslidarScan",
+    "rslidar_msg/msg/RslidarPacket",
+    "nebula_msgs/msg/NebulaPackets",
+    "lslidar_msgs/msg/LslidarScan",
+    "robosense_msgs/msg/RobosenseScan",
+)
 VIDEOS = (
     "foxglove_msgs/msg/CompressedVideo",
     "ffmpeg_image_transport_msgs/msg/FFMPEGPacket",

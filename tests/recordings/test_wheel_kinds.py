@@ -63,7 +63,7 @@ REFUSED = {
     "degrees": (np.rad2deg(STEERING) * [0.01, 1.0], {"drive": "ackermann"}, "steered by 2"),
     "wheel": (STEERING * [30.0, 1.0], {"drive": "ackermann"}, "the wheels turn at 449.9 rad/s"),
     "columns": (FOUR, {}, "4 columns|has 5 columns|columns"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", REFUSED)
@@ -117,8 +117,11 @@ def stamped(make, k, t):
 def odometry(make, k, t):
     """Its pose was never filled in, which is no matter here."""
     none = np.zeros(36)
-    pose = make.make("geometry_msgs/msg/Pose", make.make("geometry_msgs/msg/Point", 0.0, 0.0, 0.0), make.make(
-        "geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 0.0))  # fmt: skip
+    pose = make.make(
+        "geometry_msgs/msg/Pose",
+        make.make("geometry_msgs/msg/Point", 0.0, 0.0, 0.0),
+        make.make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 0.0),
+    )
     placed = make.make("geometry_msgs/msg/PoseWithCovariance", pose, none)
     moving = make.make("geometry_msgs/msg/TwistWithCovariance", twist_of(make, k), none)
     return make.make("nav_msgs/msg/Odometry", make.header(t), "base_link", placed, moving)
@@ -163,9 +166,13 @@ def joints(names, position, velocity):
     def make_one(make, k, t):
         make_it = make.make
         return make_it(
-            "sensor_msgs/msg/JointState", make.header(t), names, np.array(position(k)), np.array(velocity(k)),
+            "sensor_msgs/msg/JointState",
+            make.header(t),
+            names,
+            np.array(position(k)),
+            np.array(velocity(k)),
             np.zeros(0),
-        )  # fmt: skip
+        )
 
     return make_one
 
@@ -187,9 +194,10 @@ def test_joints_of_front_wheels_that_steer(bag_of):
     turn = np.tan(STEERING[:, 1]) / 0.6
     left, right = (np.arctan(0.6 * turn / (1.0 - 0.2 * side * turn)) for side in (1.0, -1.0))
     content = joints(
-        names, lambda k: [np.nan, np.nan, left[k], right[k]],
+        names,
+        lambda k: [np.nan, np.nan, left[k], right[k]],
         lambda k: [STEERING[k, 0] - 1.0, STEERING[k, 0] + 1.0, np.nan, np.nan],
-    )  # fmt: skip
+    )
     bag = bag_of("sensor_msgs/msg/JointState", content)
     wheels = Wheels("wheel0", "", drive="ackermann", joints=("rl", "rr", "sl", "sr"))
     stream, _ = checked_wheels(bag.wheels(wheels), wheels, bag.where(wheels))

@@ -72,19 +72,23 @@ TWICE = np.insert(STAMPS, 7, STAMPS[7])
 REFUSED = {
     "back": (RATES, np.where(np.arange(N) == 9, STAMPS - 10**9, STAMPS), {}, f"ing at {STAMPS[9] - 10**9} ns comes"),
     "two": (
-        np.insert(RATES, np.arange(0, N, 15), 1.0, axis=0), np.insert(STAMPS, np.arange(0, N, 15), STAMPS[::15]), {},
+        np.insert(RATES, np.arange(0, N, 15), 1.0, axis=0),
+        np.insert(STAMPS, np.arange(0, N, 15), STAMPS[::15]),
+        {},
         f"readings share a stamp with a different reading, the first {STAMPS[0]} ns",
     ),
     "deg/s": (np.rad2deg(RATES), STAMPS, {}, "(wheel0): the wheels turn at 366.7 rad/s, which is implausible"),
     "degrees": (np.rad2deg(ANGLES), STAMPS, {"measures": "angles"}, "set measures of wheel0 to ticks and counts_pe"),
     "counter": (
-        np.mod(np.round(ANGLES * 5000), 65536), STAMPS, {"measures": "ticks", "counts_per_turn": 31416.0},
+        np.mod(np.round(ANGLES * 5000), 65536),
+        STAMPS,
+        {"measures": "ticks", "counts_per_turn": 31416.0},
         "which looks like an encoder wrap-around; set counter_size of wheel0 in the rig file (65536",
     ),
     "counts": (ANGLES * 1e3, STAMPS, {"measures": "ticks", "counts_per_turn": 1.0}, "; correct counts_per_turn"),
     "seconds": (RATES, STAMPS // 10**9, {}, "as if stamps were truncated to whole seconds"),
     "short": (RATES[:2], STAMPS[:2], {}, "only 2 readings"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", REFUSED)

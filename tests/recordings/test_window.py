@@ -67,9 +67,12 @@ def write_tables(folder: Path, origin: int, apart: int) -> None:
         (folder / name).write_text(text)
     (folder / "lidar0").mkdir()
     np.savez(
-        folder / "lidar0" / "scans.npz", stamps_ns=stamps, start=np.arange(101), offset_s=np.zeros(100, np.float32),
+        folder / "lidar0" / "scans.npz",
+        stamps_ns=stamps,
+        start=np.arange(101),
+        offset_s=np.zeros(100, np.float32),
         xyz=np.ones((100, 3), np.float32),
-    )  # fmt: skip
+    )
 
 
 def test_every_table_and_clocks_of_other_origins(tmp_path):
@@ -117,13 +120,16 @@ def test_pictures(tmp_path):
         open_recording(tmp_path, 1.0, 3.0).stamps("left")
 
 
-@pytest.mark.parametrize(("start_s", "end_s", "words"), [
-    (-1.0, inf, "--from must be seconds after the start of the recording, not -1"),
-    (nan, inf, "--from must be seconds"),
-    (inf, inf, "--from must be seconds"),
-    (5.0, 5.0, r"--to must be seconds after --from \(5\), not 5"),
-    (5.0, nan, "--to must be seconds"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("start_s", "end_s", "words"),
+    [
+        (-1.0, inf, "--from must be seconds after the start of the recording, not -1"),
+        (nan, inf, "--from must be seconds"),
+        (inf, inf, "--from must be seconds"),
+        (5.0, 5.0, r"--to must be seconds after --from \(5\), not 5"),
+        (5.0, nan, "--to must be seconds"),
+    ],
+)
 def test_what_is_no_part(start_s, end_s, words, tmp_path):
     with pytest.raises(RecordingError, match=words):
         Window(start_s, end_s)
@@ -145,8 +151,10 @@ def test_the_command_line(tmp_path, truth, write, capsys):
     assert "run.mcap: there is nothing from 900 s to the end" in capsys.readouterr().err
     found = inspect_recording(path, end_s=0.2)
     counts = [s.timing.count for s in found.streams if s.timing is not None]
-    assert counts == [len([t for t in of if t < truth.imu_stamps[0] + S // 5]) for of in
-                      (truth.image_stamps, truth.image_stamps, truth.imu_stamps)]  # fmt: skip
+    assert counts == [
+        len([t for t in of if t < truth.imu_stamps[0] + S // 5])
+        for of in (truth.image_stamps, truth.image_stamps, truth.imu_stamps)
+    ]
     assert main(["inspect", str(path), "--to", "0.2", "--quiet"]) == 0
     opened = open_all(path, 0.1, 0.2)
     with pytest.raises(RecordingError, match="start_s and end_s do not apply to an opened recording"):

@@ -141,7 +141,7 @@ def _group(before: list[ParameterGroup], sensor: str, name: str, value: object, 
     columns = tuple(range(start, start + n))
     return ParameterGroup(
         sensor, name, labels, unit, array, formal, formal * factor, tuple(verdict), "free", columns, factor
-    )  # fmt: skip
+    )
 
 
 def _covariance(groups: tuple[ParameterGroup, ...], rng: np.random.Generator) -> np.ndarray:

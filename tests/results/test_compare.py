@@ -203,8 +203,9 @@ def test_cameras_alone_are_seen_from_each_other(robot: Calibration, tmp_path: Pa
     assert {d.frame for d in found.differences if d.what == "rotation"} == {"cam0"}
     assert "only one side has an IMU" in " ".join(found.notes)
     # cam2 is back where cam0 is.
-    (tmp_path / "other.yaml").write_text(yaml.safe_dump({"cam0": data["cam0"], "cam2": data["cam0"] | {
-        "T_cn_cnm1": np.eye(4).tolist()}}))  # fmt: skip
+    (tmp_path / "other.yaml").write_text(
+        yaml.safe_dump({"cam0": data["cam0"], "cam2": data["cam0"] | {"T_cn_cnm1": np.eye(4).tolist()}})
+    )
     back = compare_files(tmp_path / "camchain.yaml", tmp_path / "other.yaml")
     assert only(back, "cam2", "translation").size < 1e-9
 
@@ -276,13 +277,17 @@ def test_lenses_of_other_models_are_compared_by_pixels(robot: Calibration):
     fixed_: Verdict = "fixed"
     groups = tuple(
         dataclasses.replace(
-            g, value=np.append(g.value, 0.0), labels=(*g.labels, "k3"), std=np.zeros(5), std_formal=np.zeros(5),
+            g,
+            value=np.append(g.value, 0.0),
+            labels=(*g.labels, "k3"),
+            std=np.zeros(5),
+            std_formal=np.zeros(5),
             verdict=(fixed_, fixed_, fixed_, fixed_, fixed_),
         )
         if (g.sensor, g.name) == ("cam1", "distortion")
         else g
         for g in robot.groups
-    )  # fmt: skip
+    )
     other = dataclasses.replace(robot, rig=robot.rig | {"sensors": sensors}, groups=groups)
     lens = only(compared(robot, other), "cam1", "lens")
     assert lens.size < 1e-6 and lens.sigmas is None and not lens.differs

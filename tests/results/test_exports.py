@@ -232,8 +232,12 @@ def test_mins(robot: Calibration, tmp_path: Path):
     assert by_yaml(files["config_wheel.yaml"])["wheel"]["intrinsics"] == [0.1, 0.102, 0.42]
     imu = by_yaml(files["config_imu.yaml"])["imu"]
     assert imu == {
-        "accel_noise": 2.8e-3, "accel_bias": 8.6e-4, "gyro_noise": 1.6e-4, "gyro_bias": 2.2e-5, "topic": "/imu0"
-    }  # fmt: skip
+        "accel_noise": 2.8e-3,
+        "accel_bias": 8.6e-4,
+        "gyro_noise": 1.6e-4,
+        "gyro_bias": 2.2e-5,
+        "topic": "/imu0",
+    }
 
 
 def test_fast_lio(robot: Calibration):

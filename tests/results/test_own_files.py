@@ -58,9 +58,14 @@ def test_commands_refuse_before_they_start(command: str, tmp_path: Path, capsys,
     """The inputs do not even exist, or are empty: the refusal comes first."""
     monkeypatch.chdir(tmp_path)
     names = {
-        "allan": "noise.yaml", "montecarlo": "consistency.html", "fleet": "fleet.html", "target": "board.pdf",
-        "inspect": "found.json", "calibrate": "imu.yaml", "reproduce": "reproduce.html",
-    }  # fmt: skip
+        "allan": "noise.yaml",
+        "montecarlo": "consistency.html",
+        "fleet": "fleet.html",
+        "target": "board.pdf",
+        "inspect": "found.json",
+        "calibrate": "imu.yaml",
+        "reproduce": "reproduce.html",
+    }
     files = kalibr_folder(tmp_path) | {names[command]: b"mine"}
     (tmp_path / names[command]).write_bytes(b"mine")
     rig = Path(__file__).parents[2] / "examples" / "euroc" / "rig.yaml"

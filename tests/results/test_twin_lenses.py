@@ -50,9 +50,13 @@ def test_models_of_one_set_have_no_other(name: str):
 def test_a_note_names_it_where_the_noise_hides_the_difference(noise_px: float, named: bool):
     base = load_scenario("examples/paper/table2-3d.yaml")
     camera = replace(
-        base.cameras[0], model="double-sphere", resolution=(640, 480), intrinsics=tuple(LENS[:4].tolist()),
-        distortion=tuple(LENS[4:].tolist()), corner_noise_px=noise_px,
-    )  # fmt: skip
+        base.cameras[0],
+        model="double-sphere",
+        resolution=(640, 480),
+        intrinsics=tuple(LENS[:4].tolist()),
+        distortion=tuple(LENS[4:].tolist()),
+        corner_noise_px=noise_px,
+    )
     scenario = replace(base, duration_s=10.0, cameras=(camera,), lidars=(), wheels=())
     rig = replace(rig_for(scenario, intrinsics="free", distortion="free"), target=NoTarget())
     result = calibrate_measurements(rig, simulate(scenario, 1).measurements)

@@ -208,7 +208,7 @@ def test_poses_in_a_file_are_read_as_ros_does(file: Path):
         ('<parent link="mast"/>', '<parent link="right_eye"/>', {}, "is above itself; correct the parents"),
         ('base_link"/><child link="mast"/>', 'x"/><child link="mast"/>', {}, "joined; their roots are base_link and x"),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_be_updated_is_one_sentence(
     robot: Calibration, file: Path, old: str, new: str, frames: dict[str, str], words: str
 ):

@@ -31,13 +31,26 @@ def scenario_of(reports: str) -> Scenario:
     """Twenty seconds on hills before a wall of tags."""
     scenario = load_scenario(PAPER / "table2-ramp.yaml")
     wheels = replace(
-        scenario.wheels[0], reports=reports, scales=(1.03, 0.97), steering_offset=0.02, noise=0.005, speed_noise=5e-4,
-        yaw_noise=2e-3, steering_noise=5e-4,
-    )  # fmt: skip
+        scenario.wheels[0],
+        reports=reports,
+        scales=(1.03, 0.97),
+        steering_offset=0.02,
+        noise=0.005,
+        speed_noise=5e-4,
+        yaw_noise=2e-3,
+        steering_noise=5e-4,
+    )
     return replace(
-        scenario, duration_s=20.0, features=None, cameras=(replace(scenario.cameras[0], corner_noise_px=0.15),),
-        lidars=(), wheels=(wheels,), board=True, T_world_board=ON_WALL, target=AprilGrid(4, 10, 0.6, 0.3),
-    )  # fmt: skip
+        scenario,
+        duration_s=20.0,
+        features=None,
+        cameras=(replace(scenario.cameras[0], corner_noise_px=0.15),),
+        lidars=(),
+        wheels=(wheels,),
+        board=True,
+        T_world_board=ON_WALL,
+        target=AprilGrid(4, 10, 0.6, 0.3),
+    )
 
 
 @pytest.fixture(scope="module", params=PARAMETERS)

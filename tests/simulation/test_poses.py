@@ -27,15 +27,23 @@ sensors:
 @pytest.fixture(scope="module")
 def scenario() -> Scenario:
     mocap = SimPoses(
-        "mocap0", pose(turn([1.0, 2.0, -1.0], 0.8), [0.1, -0.2, 0.3]),
-        T_world_frame=pose(turn([0.1, 0.2, 1.0], 2.0), [3.0, 1.0, -0.5]), time_offset_s=0.02, phase_s=0.004,
+        "mocap0",
+        pose(turn([1.0, 2.0, -1.0], 0.8), [0.1, -0.2, 0.3]),
+        T_world_frame=pose(turn([0.1, 0.2, 1.0], 2.0), [3.0, 1.0, -0.5]),
+        time_offset_s=0.02,
+        phase_s=0.004,
         clock_origin_ns=10**9,
-    )  # fmt: skip
+    )
     odom = replace(mocap, name="odom0", kind="relative", rate_hz=20.0, rotation_noise=0.02, position_noise=0.05)
     return Scenario(
-        (), duration_s=5.0, motion=Drive("free"), board=False, room=Room((8.0, 6.0, 3.0)), poses=(mocap, odom),
+        (),
+        duration_s=5.0,
+        motion=Drive("free"),
+        board=False,
+        room=Room((8.0, 6.0, 3.0)),
+        poses=(mocap, odom),
         imu_clock_origin_ns=2 * 10**9,
-    )  # fmt: skip
+    )
 
 
 def angles(R: np.ndarray) -> np.ndarray:

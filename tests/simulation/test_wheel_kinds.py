@@ -25,9 +25,15 @@ SCALES, OFFSET, BASE, RADIUS = (1.1, 0.9), 0.05, 0.6, 0.12
 def reporting(robot, reports, sampling="interval-mean", kind: DriveKind = "planar", **changes):
     scenario = alone(on_ground(robot, kind))
     wheels = replace(
-        scenario.wheels[0], reports=reports, sampling=sampling, scales=SCALES, radius=RADIUS, wheelbase=BASE,
-        steering_offset=OFFSET, **changes,
-    )  # fmt: skip
+        scenario.wheels[0],
+        reports=reports,
+        sampling=sampling,
+        scales=SCALES,
+        radius=RADIUS,
+        wheelbase=BASE,
+        steering_offset=OFFSET,
+        **changes,
+    )
     return replace(scenario, cameras=(), wheels=(wheels,))
 
 

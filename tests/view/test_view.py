@@ -148,8 +148,9 @@ def test_lines_hold_what_the_result_holds(found, shown):
     )
     np.testing.assert_allclose(
         found["readings/imu0/gyro"].values["Scalars:scalars"],
-        np.rad2deg(shown.simulation.measurements.imu.gyro), atol=1e-5,
-    )  # fmt: skip
+        np.rad2deg(shown.simulation.measurements.imu.gyro),
+        atol=1e-5,
+    )
     total = np.sum(c.lidar_residuals[0].residual.astype(np.float64) ** 2)
     r = c.lidar_residuals[0]
     counts = np.unique(np.floor(r.seconds / 0.1), return_counts=True)[1]

@@ -20,9 +20,15 @@ from icalib.errors import CalibrationError
 COMMIT = ".icalib-commit"
 # Every name that icalib writes: a leftover of an earlier result beside a new one would be a silently wrong number.
 OWN_FILES = (
-    "calibration.yaml", "camchain-imucam.yaml", "camchain.yaml", "fleet-job.json", "imu.yaml", "report.html",
-    "result.json", "result.npz",
-)  # fmt: skip
+    "calibration.yaml",
+    "camchain-imucam.yaml",
+    "camchain.yaml",
+    "fleet-job.json",
+    "imu.yaml",
+    "report.html",
+    "result.json",
+    "result.npz",
+)
 
 
 def write_files(folder: Path, files: Mapping[str, bytes]) -> None:

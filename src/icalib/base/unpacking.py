@@ -20,9 +20,20 @@ from icalib.base.file_hashes import HashedFile
 FREE_BYTES, RATIO = 16 << 20, 256  # sensors' data shrink to a tenth; images of one colour, and zeros, to less
 LIMIT_WORDS = f"{FREE_BYTES >> 20} MiB and {RATIO} times its size"
 _NOT_ARRAYS = (
-    OSError, ValueError, EOFError, KeyError, TypeError, SyntaxError, RuntimeError, OverflowError, MemoryError,
-    struct.error, tokenize.TokenError, zlib.error, zipfile.BadZipFile,
-)  # fmt: skip
+    OSError,
+    ValueError,
+    EOFError,
+    KeyError,
+    TypeError,
+    SyntaxError,
+    RuntimeError,
+    OverflowError,
+    MemoryError,
+    struct.error,
+    tokenize.TokenError,
+    zlib.error,
+    zipfile.BadZipFile,
+)
 
 
 class TooLargeError(ValueError):

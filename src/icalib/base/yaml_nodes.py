@@ -19,10 +19,17 @@ _WHOLE = re.compile(r"[-+]?[0-9]{1,19}")
 
 # Former names of fields, for the error that names the new one.
 RENAMED = {
-    "far": "max_range", "keep_corners": "cache_corners", "lasting": "persistent", "meaning": "sampling",
-    "near": "min_range", "node_spacing_s": "keyframe_spacing_s", "nodes": "keyframes", "sideways_slip": "lateral_slip",
-    "splits": "segments", "upwards_slip": "vertical_slip",
-}  # fmt: skip
+    "far": "max_range",
+    "keep_corners": "cache_corners",
+    "lasting": "persistent",
+    "meaning": "sampling",
+    "near": "min_range",
+    "node_spacing_s": "keyframe_spacing_s",
+    "nodes": "keyframes",
+    "sideways_slip": "lateral_slip",
+    "splits": "segments",
+    "upwards_slip": "vertical_slip",
+}
 
 
 @dataclass(frozen=True)

@@ -18,13 +18,22 @@ _EXAMPLES = {
     "tag": "icalib target tag --family tag36h11 --id 3 --size 0.16 -o tag.pdf",
 }
 _FIELDS = {
-    "rows": "number of rows (of a checkerboard: of inner corners)", "cols": "number of columns (likewise)",
-    "tag_size": "edge of a tag", "tag_spacing": "gap between tags over tag_size", "squares_x": "squares in a row",
-    "squares_y": "squares in a column", "square_size": "edge of a square", "marker_size": "edge of a tag",
-    "dictionary": "family of the tags, as 5x5_100", "spacing": "distance of centres", "diameter": "of a circle",
-    "family": "family of the tags, as tag36h11", "size": "edge of the black border of a tag", "ids": "ids to print",
+    "rows": "number of rows (of a checkerboard: of inner corners)",
+    "cols": "number of columns (likewise)",
+    "tag_size": "edge of a tag",
+    "tag_spacing": "gap between tags over tag_size",
+    "squares_x": "squares in a row",
+    "squares_y": "squares in a column",
+    "square_size": "edge of a square",
+    "marker_size": "edge of a tag",
+    "dictionary": "family of the tags, as 5x5_100",
+    "spacing": "distance of centres",
+    "diameter": "of a circle",
+    "family": "family of the tags, as tag36h11",
+    "size": "edge of the black border of a tag",
+    "ids": "ids to print",
     "id": "id to print",
-}  # fmt: skip
+}
 
 
 def add_target_command(commands: argparse._SubParsersAction[CommandParser]) -> None:
@@ -37,13 +46,17 @@ def add_target_command(commands: argparse._SubParsersAction[CommandParser]) -> N
     fields = {
         "aprilgrid": {"rows": count, "cols": count, "tag_size": _metres, "tag_spacing": _metres},
         "charuco": {
-            "squares_x": count, "squares_y": count, "square_size": _metres, "marker_size": _metres, "dictionary": str
+            "squares_x": count,
+            "squares_y": count,
+            "square_size": _metres,
+            "marker_size": _metres,
+            "dictionary": str,
         },
         "checkerboard": {"rows": count, "cols": count, "square_size": _metres},
         "circles": {"rows": count, "cols": count, "spacing": _metres, "diameter": _metres},
         "markers": {"family": str, "size": _metres, "ids": _ids},
         "tag": {"family": str, "id": whole, "size": _metres},
-    }  # fmt: skip
+    }
     for name, options in fields.items():
         one = types.add_parser(name, help=f"{name}, with the fields of the rig file", epilog=examples(_EXAMPLES[name]))
         for field, kind in options.items():

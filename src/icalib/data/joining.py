@@ -112,9 +112,15 @@ def _joined(recordings: Sequence[Measurements], shifts: Sequence[int]) -> Measur
     wheels = (join_wheels([(m.wheels[k], shift) for m, shift in shifted]) for k in range(len(recordings[0].wheels)))
     poses = (join_poses([(m.poses[k], shift) for m, shift in shifted]) for k in range(len(recordings[0].poses)))
     return Measurements(
-        imu, tuple(cameras), notes, tracks=_joined_tracks(shifted), lidars=tuple(lidars), wheels=tuple(wheels),
-        poses=tuple(poses), warnings=warnings,
-    )  # fmt: skip
+        imu,
+        tuple(cameras),
+        notes,
+        tracks=_joined_tracks(shifted),
+        lidars=tuple(lidars),
+        wheels=tuple(wheels),
+        poses=tuple(poses),
+        warnings=warnings,
+    )
 
 
 def _joined_tracks(recordings: list[tuple[Measurements, int]]) -> tuple[TrackStream, ...]:
@@ -132,10 +138,14 @@ def _joined_tracks(recordings: list[tuple[Measurements, int]]) -> tuple[TrackStr
         stated = {name: np.concatenate([getattr(s, name) for s in streams]) for name in ("views", "spread")}
         joined.append(
             TrackStream(
-                one.name, np.concatenate(stamps), start.astype(np.int64), np.concatenate(numbers), uv,
+                one.name,
+                np.concatenate(stamps),
+                start.astype(np.int64),
+                np.concatenate(numbers),
+                uv,
                 **{name: values for name, values in stated.items() if len(values) == len(uv)},
             )
-        )  # fmt: skip
+        )
     return tuple(joined)
 
 

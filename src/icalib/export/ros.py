@@ -27,7 +27,7 @@ _DISTORTION = {
     "pinhole-rational": "rational_polynomial",
     "pinhole-equidistant": "equidistant",
 }
-_LAUNCH = '''\
+_LAUNCH = """\
 {comments}
 from launch import LaunchDescription
 from launch_ros.actions import Node
@@ -53,7 +53,7 @@ def generate_launch_description():
             for child, (parent, x, y, z, qx, qy, qz, qw) in TRANSFORMS.items()
         ]
     )
-'''  # fmt: skip
+"""
 
 
 def ros2_static(c: Calibration, frames: Mapping[str, str]) -> Export:

@@ -24,9 +24,7 @@ def _external(module: str, name: str, *arguments: types.Type) -> Any:
 
 
 _dsyrk = _external("blas", "dsyrk", _TEXT, _TEXT, _INT, _INT, _REAL, _REAL, _INT, _REAL, _REAL, _INT)
-_dgemm = _external(
-    "blas", "dgemm", _TEXT, _TEXT, _INT, _INT, _INT, _REAL, _REAL, _INT, _REAL, _INT, _REAL, _REAL, _INT
-)  # fmt: skip
+_dgemm = _external("blas", "dgemm", _TEXT, _TEXT, _INT, _INT, _INT, _REAL, _REAL, _INT, _REAL, _INT, _REAL, _REAL, _INT)
 _dtrsm = _external("blas", "dtrsm", _TEXT, _TEXT, _TEXT, _TEXT, _INT, _INT, _REAL, _REAL, _INT, _REAL, _INT)
 _dpotrf = _external("lapack", "dpotrf", _TEXT, _INT, _REAL, _INT, _INT)
 
@@ -51,9 +49,17 @@ def subtract_gram(W, C):
     sizes, factors = np.array([n, k, _stride(W), _stride(C)], dtype=np.int32), np.array([-1.0, 1.0])
     t = _letters("L", "N", " ", " ")
     _dsyrk(
-        t[0:].ctypes, t[1:].ctypes, sizes[0:].ctypes, sizes[1:].ctypes, factors[0:].ctypes, W.ctypes, sizes[2:].ctypes,
-        factors[1:].ctypes, C.ctypes, sizes[3:].ctypes,
-    )  # fmt: skip
+        t[0:].ctypes,
+        t[1:].ctypes,
+        sizes[0:].ctypes,
+        sizes[1:].ctypes,
+        factors[0:].ctypes,
+        W.ctypes,
+        sizes[2:].ctypes,
+        factors[1:].ctypes,
+        C.ctypes,
+        sizes[3:].ctypes,
+    )
 
 
 @njit(cache=True, nogil=True)
@@ -65,9 +71,20 @@ def subtract_product(A, B, C):
     sizes = np.array([n, m, k, _stride(B), _stride(A), _stride(C)], dtype=np.int32)
     factors, t = np.array([-1.0, 1.0]), _letters("N", "T", " ", " ")
     _dgemm(
-        t[0:].ctypes, t[1:].ctypes, sizes[0:].ctypes, sizes[1:].ctypes, sizes[2:].ctypes, factors[0:].ctypes, B.ctypes,
-        sizes[3:].ctypes, A.ctypes, sizes[4:].ctypes, factors[1:].ctypes, C.ctypes, sizes[5:].ctypes,
-    )  # fmt: skip
+        t[0:].ctypes,
+        t[1:].ctypes,
+        sizes[0:].ctypes,
+        sizes[1:].ctypes,
+        sizes[2:].ctypes,
+        factors[0:].ctypes,
+        B.ctypes,
+        sizes[3:].ctypes,
+        A.ctypes,
+        sizes[4:].ctypes,
+        factors[1:].ctypes,
+        C.ctypes,
+        sizes[5:].ctypes,
+    )
 
 
 @njit(cache=True, nogil=True)
@@ -93,9 +110,18 @@ def solve_transposed(U, X):
     sizes, one = np.array([n, p, _stride(U), _stride(X)], dtype=np.int32), np.ones(1)
     t = _letters("R", "L", "T", "N")
     _dtrsm(
-        t[0:].ctypes, t[1:].ctypes, t[2:].ctypes, t[3:].ctypes, sizes[0:].ctypes, sizes[1:].ctypes, one.ctypes,
-        U.ctypes, sizes[2:].ctypes, X.ctypes, sizes[3:].ctypes,
-    )  # fmt: skip
+        t[0:].ctypes,
+        t[1:].ctypes,
+        t[2:].ctypes,
+        t[3:].ctypes,
+        sizes[0:].ctypes,
+        sizes[1:].ctypes,
+        one.ctypes,
+        U.ctypes,
+        sizes[2:].ctypes,
+        X.ctypes,
+        sizes[3:].ctypes,
+    )
 
 
 @njit(cache=True, nogil=True)

@@ -125,9 +125,7 @@ def make_pieces(n_nodes: int, n_border: int | None) -> tuple[Piece, ...]:
     ends = (0, *chain_cuts(n_nodes), n_nodes - 1)
     if n_border is not None:
         pages.give_back()  # there is no moment at which more is needed
-    return tuple(
-        Piece.bare(a, b) if n_border is None else Piece.zeros(a, b, n_border) for a, b in pairwise(ends)
-    )  # fmt: skip
+    return tuple(Piece.bare(a, b) if n_border is None else Piece.zeros(a, b, n_border) for a, b in pairwise(ends))
 
 
 @dataclass(frozen=True)

@@ -76,9 +76,7 @@ def eliminate(
     sizes = _sizes(plan, n_border)
     widest = int(sizes.wide.max())
     turn, room = np.empty_like(diagonal), features.room
-    chain = Chain(
-        diagonal, upper, side, forwards, turn, np.empty_like(sums.pose), np.empty_like(sums.next_pose)
-    )  # fmt: skip
+    chain = Chain(diagonal, upper, side, forwards, turn, np.empty_like(sums.pose), np.empty_like(sums.next_pose))
     turn_nodes(plan, sums, turn, chain.pose, chain.next_pose)
     front, carry = np.zeros((widest, widest)), np.zeros((NODE, NODE + widest))
     if not eliminate_all(plan, sizes, sums, chain, room, front, carry):

@@ -48,9 +48,15 @@ class FeatureSums(NamedTuple):
     ) -> FeatureSums:
         pose = np.zeros((len(node), POSE, NODE))
         return cls(
-            np.zeros((n_tracks, 3, 3)), np.zeros((n_tracks, 3, n_border + 1)), np.zeros((len(track), 3, POSE)), pose,
-            pose.copy() if by_next else pose[:0], track, image, node,
-        )  # fmt: skip
+            np.zeros((n_tracks, 3, 3)),
+            np.zeros((n_tracks, 3, n_border + 1)),
+            np.zeros((len(track), 3, POSE)),
+            pose,
+            pose.copy() if by_next else pose[:0],
+            track,
+            image,
+            node,
+        )
 
     def clear(self) -> None:
         for a in (self.own, self.side, self.block):
@@ -185,10 +191,21 @@ def _steps(sums: FeatureSums, lives: _Lives, coupled: np.ndarray, n_nodes: int, 
     rank[local.values] = np.arange(len(local.values))
     local_pair = Lists.sorted_by(rank[sums.track], np.arange(len(step)), len(local.values))
     return Plan(
-        Lists.of(groups), after, own, slots.alive, Lists.of(slots.leave), Lists.of(slots.enter).values,
-        Lists.of(slots.born), Lists.of(slots.born_at).values, Lists.of(slots.dying), pair,
-        _places(slots, pair, sums.track, n), local, local_pair.start, local_pair.values,
-    )  # fmt: skip
+        Lists.of(groups),
+        after,
+        own,
+        slots.alive,
+        Lists.of(slots.leave),
+        Lists.of(slots.enter).values,
+        Lists.of(slots.born),
+        Lists.of(slots.born_at).values,
+        Lists.of(slots.dying),
+        pair,
+        _places(slots, pair, sums.track, n),
+        local,
+        local_pair.start,
+        local_pair.values,
+    )
 
 
 @dataclass(frozen=True)

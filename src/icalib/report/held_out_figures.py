@@ -64,8 +64,14 @@ def _row(f: PredictedFit) -> tuple[object, ...]:
     inside, outside = (np.sqrt(x / f.count) for x in (f.chi2_inside, f.chi2_outside))
     rms = (_raw(f.rms_inside, f.unit), _raw(f.rms_outside, f.unit))
     return (
-        f.sensor, f.kind, f.count, f"{inside:.4f}", f"{outside:.4f}", *rms, f"{f.chi2_outside - f.chi2_inside:+.1f}"
-    )  # fmt: skip
+        f.sensor,
+        f.kind,
+        f.count,
+        f"{inside:.4f}",
+        f"{outside:.4f}",
+        *rms,
+        f"{f.chi2_outside - f.chi2_inside:+.1f}",
+    )
 
 
 def _raw(rms: float | None, unit: str) -> str:

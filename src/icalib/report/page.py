@@ -87,9 +87,12 @@ def _ellipsoid_words(c: Calibration) -> str:
 def document(title: str, body: str, figures: dict[str, Figure]) -> str:
     """One HTML file, plotly.js included, that draws each of the `figures` in the place with its id."""
     return Template(resource("icalib.report", "frame.html")).substitute(
-        title=tables.html(title), body=body, figures=script_json(figures),
-        css=resource("icalib.report", "page.css"), plotly=resource("plotly", "package_data/plotly.min.js"),
-    )  # fmt: skip
+        title=tables.html(title),
+        body=body,
+        figures=script_json(figures),
+        css=resource("icalib.report", "page.css"),
+        plotly=resource("plotly", "package_data/plotly.min.js"),
+    )
 
 
 def _figures(c: Calibration) -> dict[str, Figure]:

@@ -71,11 +71,15 @@ def panels(r: WheelResiduals | PoseResiduals) -> Figure:
     units = ["mrad" if unit == "rad" else "mm" for unit in r.units]
     traces = [
         line(
-            r.seconds[keep], 1e3 * r.residual[keep, k], label, COLORS[k % len(COLORS)], yaxis=y_of(k),
+            r.seconds[keep],
+            1e3 * r.residual[keep, k],
+            label,
+            COLORS[k % len(COLORS)],
+            yaxis=y_of(k),
             line={"color": COLORS[k % len(COLORS)], "width": 1},
         )
         for k, label in enumerate(r.labels)
-    ]  # fmt: skip
+    ]
     titles = [f"{label} [{unit}]" for label, unit in zip(r.labels, units, strict=True)]
     return figure(traces, 130 * len(titles) + 90, **stacked_axes(titles))
 

@@ -40,8 +40,7 @@ class TrackResiduals:
     each point being where all its images want it. What is not in use has none, NaN: observations that were rejected,
     and tracks that are too short, whose point is uncertain, or that fit far worse than most.
 
-    distance: m, median of the points in use from the
-    camera; None where there are none.
+    distance: m, median of the points in use from the camera; None where there are none.
     """
 
     kind: ClassVar[str] = "observations"

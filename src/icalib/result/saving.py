@@ -111,9 +111,11 @@ def _npz(c: Calibration) -> bytes:
     for r in c.corner_residuals:
         arrays |= {f"corners/{r.sensor}/{name}": getattr(r, name) for name in _array_names(CornerResiduals)}
     residuals = {
-        "lidars": c.lidar_residuals, "wheels": c.wheel_residuals, "poses": c.pose_residuals,
+        "lidars": c.lidar_residuals,
+        "wheels": c.wheel_residuals,
+        "poses": c.pose_residuals,
         "tracks": c.track_residuals,
-    }  # fmt: skip
+    }
     for folder, found in residuals.items():
         for r in found:
             arrays |= {f"{folder}/{r.sensor}/{name}": getattr(r, name) for name in _array_names(type(r))}

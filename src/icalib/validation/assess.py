@@ -221,12 +221,19 @@ def _groups(inputs: Inputs, determined: Determined, seen: Observability, noise: 
         unit = "" if labels == IMU_LABELS else UNITS[block.name]
         groups.append(
             ParameterGroup(
-                block.sensor, block.name, labels, unit, _raw_value(inputs, found.outcome.state, block), std,
+                block.sensor,
+                block.name,
+                labels,
+                unit,
+                _raw_value(inputs, found.outcome.state, block),
+                std,
                 std * np.maximum(factor, 1.0),
-                verdict, _mode(inputs, block),
-                None if block.start is None else tuple(int(i) for i in block.columns), factor,
+                verdict,
+                _mode(inputs, block),
+                None if block.start is None else tuple(int(i) for i in block.columns),
+                factor,
             )
-        )  # fmt: skip
+        )
     return tuple(groups)
 
 

@@ -17,10 +17,16 @@ def corner_residuals(found: Estimate, timeline: Timeline) -> tuple[CornerResidua
         stream = camera.stream
         out.append(
             CornerResiduals(
-                camera.name, _seconds(found, timeline, i), stream.start, stream.point, stream.uv,
-                corners.residual, camera.noise.sigma, corners.root == 0.0,
+                camera.name,
+                _seconds(found, timeline, i),
+                stream.start,
+                stream.point,
+                stream.uv,
+                corners.residual,
+                camera.noise.sigma,
+                corners.root == 0.0,
             )
-        )  # fmt: skip
+        )
     return tuple(out)
 
 
@@ -36,10 +42,17 @@ def track_residuals(found: Estimate, timeline: Timeline) -> tuple[TrackResiduals
         own = np.linalg.norm(left.points[factor.tracks.camera == i], axis=1)
         out.append(
             TrackResiduals(
-                camera.name, float(np.median(own)) if len(own) else None, _seconds(found, timeline, i), stream.start,
-                stream.feature, stream.uv, residual, factor.sigmas[i].astype(np.float32), factor.outliers[i],
+                camera.name,
+                float(np.median(own)) if len(own) else None,
+                _seconds(found, timeline, i),
+                stream.start,
+                stream.feature,
+                stream.uv,
+                residual,
+                factor.sigmas[i].astype(np.float32),
+                factor.outliers[i],
             )
-        )  # fmt: skip
+        )
     return tuple(out)
 
 

@@ -10,14 +10,30 @@ from icalib.rig import Camera
 from icalib.sensors.camera.board import SHAPE_LABELS
 
 UNITS = {
-    "rotation": "rad", "translation": "m", "time_offset": "s", "intrinsics": "px", "distortion": "", "bloom": "px",
-    "shape": "m", "tilt": "rad", "radii": "m", "baseline": "m", "radius": "m", "wheelbase": "m",
-    "steering_offset": "rad", "scales": "", "ground_height": "m", "size": "", "scale": "",
-}  # fmt: skip
+    "rotation": "rad",
+    "translation": "m",
+    "time_offset": "s",
+    "intrinsics": "px",
+    "distortion": "",
+    "bloom": "px",
+    "shape": "m",
+    "tilt": "rad",
+    "radii": "m",
+    "baseline": "m",
+    "radius": "m",
+    "wheelbase": "m",
+    "steering_offset": "rad",
+    "scales": "",
+    "ground_height": "m",
+    "size": "",
+    "scale": "",
+}
 LABELS = {
-    "shape": SHAPE_LABELS, "radii": ("left", "right"), "scales": ("speed", "yaw_rate"),
+    "shape": SHAPE_LABELS,
+    "radii": ("left", "right"),
+    "scales": ("speed", "yaw_rate"),
     "plane": ("turn 1", "turn 2", "distance"),
-}  # fmt: skip
+}
 
 
 def labels_of(inputs: Inputs, block: Block) -> tuple[str, ...]:

@@ -39,9 +39,12 @@ HALF_STEP_S = np.float32(2e-3)  # of a difference of residuals
 CORRELATED, ALTERNATING = 0.5, 0.35
 CLIP = 4.0  # standard deviations
 LABELS = {"wheels": ("left", "right"), "lateral slip": ("lateral",), "vertical slip": ("vertical",)} | {
-    "yaw": ("yaw",), "path": ("forward", "lateral"), "speed": ("speed",), "wheel": ("wheel",),
+    "yaw": ("yaw",),
+    "path": ("forward", "lateral"),
+    "speed": ("speed",),
+    "wheel": ("wheel",),
     "steering": ("steering",),
-}  # fmt: skip
+}
 
 
 def planes(inputs: Inputs, state: State) -> tuple[Plane, ...]:
@@ -74,11 +77,20 @@ def lidar_residuals(inputs: Inputs, found: Estimate, timeline: Timeline) -> tupl
         first_residual, _ = _on_planes(first_world, seen_from, guessed[plane])
         out.append(
             LidarResiduals(
-                stream.name, len(whole.stamps_ns), len(whole.xyz), _used(found, stream.name),
-                timeline.shown(seconds, timeline.recording_of(seconds)), plane, np.linalg.norm(stream.xyz, axis=1),
-                _sigma(noise, cosine), world, residual, first_world, first_residual,
+                stream.name,
+                len(whole.stamps_ns),
+                len(whole.xyz),
+                _used(found, stream.name),
+                timeline.shown(seconds, timeline.recording_of(seconds)),
+                plane,
+                np.linalg.norm(stream.xyz, axis=1),
+                _sigma(noise, cosine),
+                world,
+                residual,
+                first_world,
+                first_residual,
             )
-        )  # fmt: skip
+        )
     return tuple(out)
 
 

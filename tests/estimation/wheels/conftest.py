@@ -137,9 +137,11 @@ class Drive:
 def some_waves(rng, offset, size, slow, fast):
     n = 4
     return Waves(
-        offset, tuple(size * rng.uniform(0.5, 1.0, n) / np.sqrt(n)), tuple(rng.uniform(slow, fast, n)),
+        offset,
+        tuple(size * rng.uniform(0.5, 1.0, n) / np.sqrt(n)),
+        tuple(rng.uniform(slow, fast, n)),
         tuple(rng.uniform(0.0, 2.0 * np.pi, n)),
-    )  # fmt: skip
+    )
 
 
 def make_drive(kind: str, seed: int = 0, **changes) -> Drive:
@@ -181,9 +183,13 @@ BIAS = np.array([0.01, -0.02, 0.005, 0.1, -0.05, 0.08])
 
 
 def make_world(
-    drive: Drive, imu_hz: float = 200.0, wheel_hz: float = 70.0, node_s: float = 0.05, offset: float = 0.0123,
+    drive: Drive,
+    imu_hz: float = 200.0,
+    wheel_hz: float = 70.0,
+    node_s: float = 0.05,
+    offset: float = 0.0123,
     noise_seed: int | None = None,
-) -> World:  # fmt: skip
+) -> World:
     """Noiseless unless there is a seed for the IMU's white noise."""
     t = np.arange(0.0, drive.duration, 1.0 / imu_hz)
     gyro, accel = drive.readings(t)
@@ -203,9 +209,11 @@ def make_world(
         ("wheel0", "baseline"): np.array([drive.baseline]),
     }
     layout = make_layout(
-        [(s, n, "rotation" if n == "rotation" else "vector", v.size if n != "rotation" else 3, s != "imu0")
-         for (s, n), v in values.items()]
-    )  # fmt: skip
+        [
+            (s, n, "rotation" if n == "rotation" else "vector", v.size if n != "rotation" else 3, s != "imu0")
+            for (s, n), v in values.items()
+        ]
+    )
     state = State(nodes, R, p, v, np.tile(BIAS, (len(nodes), 1)), values)
     return World(drive, ImuData.build(stream, NOISE), seconds, drive.angles(seconds + offset), layout, state)
 

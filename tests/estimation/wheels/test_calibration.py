@@ -99,10 +99,15 @@ def test_planar_motion_without_noise_gives_the_truth_back(drive_of_kind, world_o
     """To what readings at 1 kHz leave open between them."""
     world = world_of(level_drive(drive_of_kind, 1, duration=10.0), imu_hz=1000.0)
     outcome = solve(
-        problem_of, world, Slipping(world, world.angles, np.zeros((1000, 2)), NOISE),
-        (world.state.rotation, world.state.position), POSE_SIGMA,
-        pinned(world, [PINNED, FREE, FREE], PINNED), away(world, True), passes=3,
-    )  # fmt: skip
+        problem_of,
+        world,
+        Slipping(world, world.angles, np.zeros((1000, 2)), NOISE),
+        (world.state.rotation, world.state.position),
+        POSE_SIGMA,
+        pinned(world, [PINNED, FREE, FREE], PINNED),
+        away(world, True),
+        passes=3,
+    )
     assert np.abs(errors(world, outcome.state)).max() < 3e-7
 
 
@@ -110,9 +115,15 @@ def test_hills_without_noise_give_everything_back(drive_of_kind, world_of, probl
     """To what the logarithm differs from the integral of the rate: hundredths of a millimetre and of a degree."""
     world = world_of(drive_of_kind("hills", 1, duration=10.0))
     outcome = solve(
-        problem_of, world, Slipping(world, world.angles, np.zeros((1000, 2)), NOISE),
-        (world.state.rotation, world.state.position), POSE_SIGMA, (), away(world, False), passes=3,
-    )  # fmt: skip
+        problem_of,
+        world,
+        Slipping(world, world.angles, np.zeros((1000, 2)), NOISE),
+        (world.state.rotation, world.state.position),
+        POSE_SIGMA,
+        (),
+        away(world, False),
+        passes=3,
+    )
     e = np.abs(errors(world, outcome.state))
     assert e[0] < 3e-4 and e[1:3].max() < 2e-5 and e[3:6].max() < 1e-4
     assert e[6] < 5e-6 and e[7:9].max() < 1e-6 and e[9] < 2e-5
@@ -131,7 +142,7 @@ def test_errors_are_as_large_as_the_covariance_says(drive_of_kind, world_of, pro
         priors = pinned(world, [PINNED, FREE, FREE], PINNED) if planar else ()
         outcome = solve(
             problem_of, world, Slipping(world, angles, slip, NOISE), (R, p), POSE_SIGMA, priors, away(world, planar)
-        )  # fmt: skip
+        )
         e, P = (
             errors(world, outcome.state)[kept],
             np.linalg.inv(outcome.information)[np.ix_(kept, kept)],

@@ -40,9 +40,7 @@ def test_against_walks_of_orientation_and_speed():
     found = carried_noise(poses[0], poses[1], AWAY, R_iw, lever, imu)
     for n in range(2):
         ends = [(R[n], p[n], AWAY[n, 0]), (R[2 + n], p[2 + n], AWAY[n, 1])]
-        drawn = np.array([
-            planar(*walked(*ends[0], rng), *walked(*ends[1], rng), R_iw, lever) for _ in range(DRAWS)
-        ])  # fmt: skip
+        drawn = np.array([planar(*walked(*ends[0], rng), *walked(*ends[1], rng), R_iw, lever) for _ in range(DRAWS)])
         sampled = np.cov(drawn.T)
         scale = np.sqrt(np.diag(found[n]))
         np.testing.assert_allclose(sampled / np.outer(scale, scale), found[n] / np.outer(scale, scale), atol=0.08)

@@ -83,9 +83,10 @@ def slow_world(world_of, drive_of_kind, waves, seed, noise_seed=None):
     """Rates that hardly change within a stretch, with clocks that agree: the closed form knows of no offset."""
     rng = np.random.default_rng(seed)
     drive = replace(
-        level_drive(drive_of_kind, seed, duration=20.0), yaw=waves(0.3, (1.5,), (0.07,), tuple(rng.uniform(0, 6, 1))),
+        level_drive(drive_of_kind, seed, duration=20.0),
+        yaw=waves(0.3, (1.5,), (0.07,), tuple(rng.uniform(0, 6, 1))),
         speed=waves(0.8, (0.5,), (0.05,), tuple(rng.uniform(0, 6, 1))),
-    )  # fmt: skip
+    )
     return world_of(drive, noise_seed=noise_seed)
 
 

@@ -82,10 +82,16 @@ def test_what_was_measured_of_the_height_counts_once(world_of, drive_of_kind):
 def test_what_is_not_asked_for_weighs_nothing(world_of, drive_of_kind, dense, ground, kinds):
     world = standing(world_of, drive_of_kind)
     if ground.height_sigma is None:  # then the height is not in the border
-        world = replace(world, layout=make_layout([
-            (b.sensor, b.name, b.kind, b.size, b.start is not None)
-            for b in world.layout.blocks if b.name != "ground_height"
-        ]))  # fmt: skip
+        world = replace(
+            world,
+            layout=make_layout(
+                [
+                    (b.sensor, b.name, b.kind, b.size, b.start is not None)
+                    for b in world.layout.blocks
+                    if b.name != "ground_height"
+                ]
+            ),
+        )
     factor = factor_on(world, ground)
     moved = world.moved(rotation=[0.1, 0.2, 0.0], translation=np.array([0.0, 0.0, 0.3]))
     out, n = factor.output(), len(world.state.seconds)

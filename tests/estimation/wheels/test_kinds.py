@@ -49,13 +49,13 @@ def forwards(drive_of_kind, waves, path="hills"):
     """A drive that never stands still, so that its front wheels can be steered, by up to 45 degrees."""
     return replace(
         drive_of_kind(path, 1), speed=waves(1.2, (0.5,), (0.3,), (0.2,)), yaw=waves(0.3, (1.3,), (0.2,), (0.1,))
-    )  # fmt: skip
+    )
 
 
 def factor_on(world, stream, noise=UNIT):
     return IncrementFactor.build(
         "wheel0", stream.seconds, integrals_of(stream), world.imu, 9.81, noise, world.layout, world.state, stream.kind
-    )  # fmt: skip
+    )
 
 
 def rows(factor, state):
@@ -80,10 +80,13 @@ def test_residuals_vanish_on_a_path_without_slip(drive_of_kind, world_of, waves,
 @pytest.mark.parametrize(
     ("kind", "name", "step", "row"),
     [
-        ("twist", "scales", [0.01, 0.0], 0), ("twist", "scales", [0.0, 0.01], 1), ("steered", "radius", [0.001], 0),
-        ("steered", "wheelbase", [0.01], 1), ("steered", "steering_offset", [0.01], 1),
+        ("twist", "scales", [0.01, 0.0], 0),
+        ("twist", "scales", [0.0, 0.01], 1),
+        ("steered", "radius", [0.001], 0),
+        ("steered", "wheelbase", [0.01], 1),
+        ("steered", "steering_offset", [0.01], 1),
     ],
-)  # fmt: skip
+)
 def test_a_wrong_parameter_shows_in_its_own_row_alone(drive_of_kind, world_of, waves, kind, name, step, row):
     """By how much: speeds and yaw rates that are s too small are too small by s of what they measure, a front axle that
     is dL too far ahead moves dL sin(turn) to the side, and wheels steered by dd too much take it v dd there."""
@@ -101,7 +104,7 @@ def test_a_wrong_parameter_shows_in_its_own_row_alone(drive_of_kind, world_of, w
         "radius": -0.001 / 0.12**2 * drive.speed(t),
         "wheelbase": 0.01 * np.cos(angle) * drive.rate(t)[:, 2],
         "steering_offset": -0.01 * drive.speed(t) / np.cos(angle),
-    }[name] * dt  # fmt: skip
+    }[name] * dt
     np.testing.assert_allclose(change[:, row], expected, rtol=0.02, atol=2e-6)
 
 

@@ -109,7 +109,7 @@ def test_given_poses_are_differenced_in_the_frame_of_the_first():
 def factor_on(world):
     return RelativePoseFactor.build(
         "wheel0", world.seconds, world.angles, world.imu, 9.81, WheelNoise(0.01), world.layout, world.state
-    )  # fmt: skip
+    )
 
 
 def residuals(factor, state):

@@ -104,9 +104,13 @@ def path_of(seconds: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> 
     ends = np.concatenate([[0], own, [n - 1]])
     missing = np.diff(seconds[ends])[np.diff(ends) > 1]
     return Path(
-        on, np.flatnonzero(jump) + 1, float(way.size[jump].max()), float(turn.size[jump].max()),
-        float(np.linalg.norm(left[lasts].sum(axis=0))), float(missing.max(initial=0.0)),
-    )  # fmt: skip
+        on,
+        np.flatnonzero(jump) + 1,
+        float(way.size[jump].max()),
+        float(turn.size[jump].max()),
+        float(np.linalg.norm(left[lasts].sum(axis=0))),
+        float(missing.max(initial=0.0)),
+    )
 
 
 @dataclass(frozen=True)

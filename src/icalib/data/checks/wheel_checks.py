@@ -245,14 +245,19 @@ def _gap_notes(stream: WheelStream, what: str) -> tuple[str, ...]:
 
 # What the columns of a stream are called, in which unit, and how much of the other one is not standing still.
 _COLUMNS = {
-    "pair": (("the left wheel", "the right one turns; check its encoder", _TURNING_RAD_S),
-             ("the right wheel", "the left one turns; check its encoder", _TURNING_RAD_S)),
-    "steered": (("the driven wheel", "the wheels are steered; check its encoder", _STEERING_RAD),
-                ("the steering", "the vehicle drives; unless it went straight, check its sensor", _TURNING_RAD_S)),
-    "twist": (("the speed", "the vehicle turns; check its publisher", _TURNING_RAD_S),
-              ("the yaw rate", "the speed changes; unless it went straight, check its publisher",
-               _DRIVING_M_S)),
-}  # fmt: skip
+    "pair": (
+        ("the left wheel", "the right one turns; check its encoder", _TURNING_RAD_S),
+        ("the right wheel", "the left one turns; check its encoder", _TURNING_RAD_S),
+    ),
+    "steered": (
+        ("the driven wheel", "the wheels are steered; check its encoder", _STEERING_RAD),
+        ("the steering", "the vehicle drives; unless it went straight, check its sensor", _TURNING_RAD_S),
+    ),
+    "twist": (
+        ("the speed", "the vehicle turns; check its publisher", _TURNING_RAD_S),
+        ("the yaw rate", "the speed changes; unless it went straight, check its publisher", _DRIVING_M_S),
+    ),
+}
 _UNITS = {"pair": ("rad/s", "rad/s"), "steered": ("rad/s", "rad"), "twist": ("m/s", "rad/s")}
 
 

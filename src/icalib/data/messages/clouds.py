@@ -193,6 +193,4 @@ def _joined(lidar: Lidar, stamps_ns: np.ndarray, parts: list[tuple[np.ndarray, n
     parts.clear()
     xyz = np.concatenate(points)
     points.clear()
-    return LidarStream(
-        lidar.name, stamps_ns, start, np.concatenate(offsets), xyz, np.full(len(xyz), -1, np.int32)
-    )  # fmt: skip
+    return LidarStream(lidar.name, stamps_ns, start, np.concatenate(offsets), xyz, np.full(len(xyz), -1, np.int32))

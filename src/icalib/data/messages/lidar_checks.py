@@ -42,9 +42,12 @@ class Sieve:
         if not self._dropped.any():
             return None
         words = (
-            "without numbers", "at zero", f"nearer than {self._near_m:g} m", f"farther than {self._far_m:g} m",
+            "without numbers",
+            "at zero",
+            f"nearer than {self._near_m:g} m",
+            f"farther than {self._far_m:g} m",
             "without a time within their scan",
-        )  # fmt: skip
+        )
         parts = [f"{count} {why}" for count, why in zip(self._dropped, words, strict=True) if count]
         return f"{what}: of {self._total} points {', '.join(parts)} were left out."
 

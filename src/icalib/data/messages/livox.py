@@ -1,5 +1,6 @@
-"""Livox's own message of points (CustomMsg of livox_ros_driver, livox_ros_driver2 and
-livox_ros2_driver), which ROS does not define:
+"""Livox's own message of points: CustomMsg of livox_ros_driver, livox_ros_driver2 and livox_ros2_driver.
+
+ROS does not define it:
 
 Header header; uint64 timebase; uint32 point_num; uint8 lidar_id; uint8[3] rsvd; CustomPoint[] points
 CustomPoint: uint32 offset_time [ns]; float32 x, y, z [m]; uint8 reflectivity, tag, line

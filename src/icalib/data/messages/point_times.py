@@ -28,9 +28,17 @@ from icalib.errors import RecordingError
 from icalib.rig import Lidar, PointTime, TimeUnit
 
 FIELDS = (
-    "offset_time", "time", "t", "timestamp", "time_stamp", "time_offset_ns", "point_time_offset", "time_offset",
-    "ts", "stamps",
-)  # fmt: skip
+    "offset_time",
+    "time",
+    "t",
+    "timestamp",
+    "time_stamp",
+    "time_offset_ns",
+    "point_time_offset",
+    "time_offset",
+    "ts",
+    "stamps",
+)
 UNIT_NS: dict[TimeUnit, int] = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
 LONGEST_PERIODS = 1.7  # how long a scan may take: up to scans that overlap
 _SHORTEST_PERIODS = 0.02  # a narrow sector of a turn; shorter ones are in another unit, or a flash

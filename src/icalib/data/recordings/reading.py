@@ -65,10 +65,14 @@ def read_measurements(
     ]
     notes = sum((found for _, found in (*lidars, *wheels, *poses)), notes + followed + seen)
     return Measurements(
-        imu, cameras, recording.notes() + jumps.notes + notes, tracks=tracks,
-        lidars=tuple(stream for stream, _ in lidars), wheels=tuple(stream for stream, _ in wheels),
+        imu,
+        cameras,
+        recording.notes() + jumps.notes + notes,
+        tracks=tracks,
+        lidars=tuple(stream for stream, _ in lidars),
+        wheels=tuple(stream for stream, _ in wheels),
         poses=tuple(stream for stream, _ in poses),
-    )  # fmt: skip
+    )
 
 
 def _scans(
@@ -99,9 +103,15 @@ def without_jumps(rig: Rig, measurements: Measurements) -> Measurements:
     if not jumps.notes:
         return m
     return replace(
-        m, imu=imu, tracks=tracks, cameras=cameras, lidars=lidars, wheels=wheels, poses=poses,
+        m,
+        imu=imu,
+        tracks=tracks,
+        cameras=cameras,
+        lidars=lidars,
+        wheels=wheels,
+        poses=poses,
         notes=m.notes + jumps.notes,
-    )  # fmt: skip
+    )
 
 
 def _whole(stream: S, what: str) -> S:

@@ -152,8 +152,8 @@ def _in_the_world(twists: Twists) -> bool:
 
 def read_wheel_joints(wheels: Wheels, joints: Joints, what: str) -> WheelReadings:
     """The wheels' joints. Raises RecordingError naming the topic (`what`): relative poses, which joints do not have,
-    joints that are not there or not sent together, and what they do not say. Single messages where
-    some are NaN stay, to be left out with a note."""
+    joints that are not there or not sent together, and what they do not say. Single messages where some are NaN stay,
+    to be left out with a note."""
     if wheels.measures == "poses":
         raise RecordingError(
             f"{what}: a bag holds no relative planar poses; set another `measures` of {wheels.name} in the rig file."

@@ -22,8 +22,8 @@ _MOST_IMAGES = 5  # that are searched; the time grows with it
 _LEAST_IMAGES = 2  # that show a board of another size, of several; the cells of a tag may look like a board in one
 _LEAST_SIDE = 3  # inner corners along a side; the detector takes no smaller board
 _LEAST_TAGS = 6  # in an image; fewer may fit several layouts
-# Misfits, in sides of a tag. In a right layout it comes from lens and noise; in a wrong one
-# tags are a whole row or column off.
+# Misfits, in sides of a tag. In a right layout they come from lens and noise; in a wrong one tags are a whole row or
+# column off.
 _MOST_RIGHT = 0.1  # at most: the stated layout is right, and no other is looked at
 _MOST_BEST = 0.3  # at most: the best layout may be the right one; a lens that bends the board much needs room
 _MOST_RATIO = 0.5  # of the best layout's misfit to the stated one's

@@ -45,8 +45,8 @@ def what_is_seen(
 ) -> str:
     """A sentence on the tags in the first images (h, w) uint8 of a recording, in which no target was found.
 
-    `family`, `border_bits` and `ids` are those of the target, `field` is where a rig file names the
-    family. Raises RecordingError for an image that is not grey.
+    `family`, `border_bits` and `ids` are those of the target, `field` is where a rig file names the family. Raises
+    RecordingError for an image that is not grey.
     """
     candidates = _candidates([View(image).image for image in islice(images, _MOST_IMAGES)])
     own_name = _largest(family)

@@ -75,10 +75,10 @@ def consistent_corners(
     """(N,) bool: which corners lie where the 12 nearest others place them, by a homography.
 
     The bound is 6 times the median distance, at least 0.3 px + 0.01 sides and at most 1 px + 0.05 sides. The worst
-    corner is left out first, as long as there is one. Where a straight lens places some elsewhere, a
-    lens that bends is tried, and counts where the median distance is smaller; the bound is then at least a fifth of the
-    median distance that it explains. uv (N, 2) px, board (N, 2), found (N,) bool, side (N,) px;
-    shape (h, w) of the image, whose middle is taken for the lens's.
+    corner is left out first, as long as there is one. Where a straight lens places some elsewhere, a lens that bends is
+    tried, and counts where the median distance is smaller; the bound is then at least a fifth of the median distance
+    that it explains. uv (N, 2) px, board (N, 2), found (N,) bool, side (N,) px; shape (h, w) of the image, whose middle
+    is taken for the lens's.
     """
     middle, width = 0.5 * np.array(shape[1::-1]), float(shape[1])
     straight = _agreeing(_rays(uv - middle, _STRAIGHT * width, False), board, found, side)

@@ -26,8 +26,8 @@ def square_corners(image: np.ndarray, expected: np.ndarray, dark: np.ndarray, in
     """Inner corners of a board of `rows` x `cols` squares, numbered row by row, each refined and judged.
 
     image (h, w) uint8. expected (rows + 1, cols + 1, 2) px, all corners of the squares, right to some 0.15 squares; its
-    columns and rows turn with the clock in the image. dark (rows, cols) bool. `inset` is how far from
-    the edges of the white squares markers begin, in squares, inf without markers.
+    columns and rows turn with the clock in the image. dark (rows, cols) bool. `inset` is how far from the edges of the
+    white squares markers begin, in squares, inf without markers.
     """
     rows, cols = dark.shape
     uv, sigma, quality = np.zeros((rows + 1, cols + 1, 2)), np.full((rows + 1, cols + 1), np.nan), {}

@@ -4,8 +4,8 @@ A pixel at (x, y) from the image's centre has the ray (x, y, 1 + lam (x^2 + y^2)
 (Simultaneous linear estimation of multiple view geometry and lens distortion, 2001). Rays f, h of a point that stands
 still satisfy h . F f = 0. F comes from eight points drawn at random; of many draws the one counts whose errors have the
 least quantile (least quantile of squares, Rousseeuw 1984). With the median, F has freedom enough to fit a body that
-moves beside less than half of the scene. F absorbs the focal length, so that the distortion
-`lam` is all that must be known of the lens.
+moves beside less than half of the scene. F absorbs the focal length, so the distortion `lam` is all that must be known
+of the lens.
 """
 
 from __future__ import annotations

@@ -149,7 +149,10 @@ def _inserted(
     order = np.argsort(images, kind="stable")
     start = np.concatenate([[0], np.cumsum(np.bincount(images, minlength=len(stream.stamps_ns)))]).astype(np.int64)
     return replace(
-        stream, start=start, feature=np.concatenate([stream.feature, feature])[order],
-        uv=np.concatenate([stream.uv, uv])[order], views=np.concatenate([stream.views, source.views[row]])[order],
+        stream,
+        start=start,
+        feature=np.concatenate([stream.feature, feature])[order],
+        uv=np.concatenate([stream.uv, uv])[order],
+        views=np.concatenate([stream.views, source.views[row]])[order],
         spread=np.concatenate([stream.spread, source.spread[row]])[order],
-    )  # fmt: skip
+    )

@@ -147,13 +147,17 @@ def _track_segment(payloads: Iterable[Payload]) -> _Found:
         seen.append(tracker.add(image))
     count = [len(s.feature) for s in seen]
     whole = _Found(
-        np.array(stamps, np.int64), np.cumsum([0, *count]).astype(np.int64),
+        np.array(stamps, np.int64),
+        np.cumsum([0, *count]).astype(np.int64),
         np.concatenate([np.zeros(0, np.int64), *(s.feature for s in seen)]),
         np.concatenate([np.zeros((0, 2)), *(s.uv for s in seen)]),
         np.concatenate([np.zeros(0, np.int64), *(s.views for s in seen)]),
         np.concatenate([np.zeros(0), *(s.spread for s in seen)]),
-        0, 0, np.array(damaged, np.int64), error,
-    )  # fmt: skip
+        0,
+        0,
+        np.array(damaged, np.int64),
+        error,
+    )
     good = np.bincount(whole.feature) >= FEWEST_VIEWS
     in_place = good & stay_in_place(whole.start, whole.feature, whole.uv)
     moving = good & ~in_place & moving_features(whole.start, whole.feature, whole.uv, size)
@@ -180,9 +184,11 @@ def _joined(parts: Sequence[_Found]) -> _Found:
         np.concatenate([np.zeros((0, 2)), *(p.uv for p in parts)]),
         np.concatenate([none, *(p.views for p in parts)]),
         np.concatenate([np.zeros(0), *(p.spread for p in parts)]),
-        sum(p.moving for p in parts), sum(p.in_place for p in parts),
-        np.concatenate([none, *(p.damaged_ns for p in parts)]), next((p.error for p in reversed(parts) if p.error), ""),
-    )  # fmt: skip
+        sum(p.moving for p in parts),
+        sum(p.in_place for p in parts),
+        np.concatenate([none, *(p.damaged_ns for p in parts)]),
+        next((p.error for p in reversed(parts) if p.error), ""),
+    )
 
 
 def _stream(name: str, found: _Found, where: str) -> TrackStream:

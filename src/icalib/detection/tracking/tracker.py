@@ -113,13 +113,25 @@ class Tracker:
         before = alive.uv.astype(np.float32)
         size, end = (WINDOW_PX, WINDOW_PX), (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, *LK_ENDS)
         after, found, _ = cv2.calcOpticalFlowPyrLK(
-            self._before, even, before, before + self._predicted(), winSize=size, maxLevel=MAX_LEVEL,
-            criteria=end, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        )  # fmt: skip
+            self._before,
+            even,
+            before,
+            before + self._predicted(),
+            winSize=size,
+            maxLevel=MAX_LEVEL,
+            criteria=end,
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        )
         back, returned, _ = cv2.calcOpticalFlowPyrLK(
-            even, self._before, after, before.copy(), winSize=size, maxLevel=0,
-            criteria=end, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        )  # fmt: skip
+            even,
+            self._before,
+            after,
+            before.copy(),
+            winSize=size,
+            maxLevel=0,
+            criteria=end,
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        )
         good = (found.ravel() > 0) & (returned.ravel() > 0) & (np.linalg.norm(back - before, axis=1) < BACK_PX)
         uv, A, ncc = after.astype(np.float64), alive.A.copy(), np.full(len(before), -1.0)
         align(smooth, alive.first, uv, A, ncc)

@@ -113,9 +113,7 @@ def _charuco(board: Charuco, border_bits: int) -> list[_Box]:
 def _squares(nx: int, ny: int, size: float, corner: tuple[float, float], parity: int) -> list[_Box]:
     """Squares from `corner` (left, bottom) on, black where column + row has `parity`."""
     x, y = ((c + size * np.arange(n + 1)).tolist() for c, n in zip(corner, (nx, ny), strict=True))
-    return [
-        (x[i], y[j], x[i + 1], y[j + 1], (i + j) % 2 != parity) for j in range(ny) for i in range(nx)
-    ]  # fmt: skip
+    return [(x[i], y[j], x[i + 1], y[j + 1], (i + j) % 2 != parity) for j in range(ny) for i in range(nx)]
 
 
 def _tag(bits: np.ndarray, size: float, corner: tuple[float, float], border_bits: int) -> list[_Box]:

@@ -85,16 +85,30 @@ def poses_by_bodies(stream: CornerStream, model: CameraModel, params: np.ndarray
     rotation, position, rms = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), np.full(n, 1e9)
     first = np.searchsorted(views.image, np.arange(n + 1))
     _best_poses(
-        stream.start, stream.point, rays, density, good & scene.known[stream.point], scene.points, first,
-        views.body, seen.rotation, seen.position, seen.ok, R_sb, p_sb, rotation, position, rms,
-    )  # fmt: skip
+        stream.start,
+        stream.point,
+        rays,
+        density,
+        good & scene.known[stream.point],
+        scene.points,
+        first,
+        views.body,
+        seen.rotation,
+        seen.position,
+        seen.ok,
+        R_sb,
+        p_sb,
+        rotation,
+        position,
+        rms,
+    )
     return TargetPoses(rotation, position, rms < LARGEST_RMS_PX, rms)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _best_poses(
     start, point, rays, density, good, scene_points, first, body, R_bc, p_bc, ok, R_sb, p_sb, rotation, position, rms
-):  # fmt: skip
+):
     """Of each image: the pose that one of its views suggests and all its corners like best, refined on all of them."""
     points, seen = np.empty((MOST_CORNERS, 3)), np.empty((MOST_CORNERS, 3))
     R, t, trial_R, trial_t = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(3)

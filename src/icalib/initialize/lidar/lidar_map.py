@@ -50,10 +50,18 @@ class VoxelMap(NamedTuple):
         """Room for `capacity` voxels, a power of two; points of further ones are not kept."""
         n = capacity
         return cls(
-            edge_m, np.full(2 * n, -1, np.int64), np.zeros(2 * n, np.int64), np.zeros(1, np.int64), np.zeros((n, 3)),
-            np.zeros(n), np.zeros((n, MOMENTS)), np.zeros(n, np.int64), np.zeros((n, 3)), np.zeros((n, 3)),
+            edge_m,
+            np.full(2 * n, -1, np.int64),
+            np.zeros(2 * n, np.int64),
+            np.zeros(1, np.int64),
+            np.zeros((n, 3)),
+            np.zeros(n),
+            np.zeros((n, MOMENTS)),
+            np.zeros(n, np.int64),
+            np.zeros((n, 3)),
+            np.zeros((n, 3)),
             np.zeros(n, np.bool_),
-        )  # fmt: skip
+        )
 
     def clear(self) -> None:
         """As if nothing had been put in."""

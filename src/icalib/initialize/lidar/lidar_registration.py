@@ -39,9 +39,13 @@ class Expected(NamedTuple):
     def of(cls, before: ScanPose, step: float, turned: np.ndarray | None, way: np.ndarray | None) -> Expected:
         """None: not known."""
         return cls(
-            before, step, turned is not None, np.eye(3) if turned is None else np.ascontiguousarray(turned),
-            way is not None, np.zeros(3) if way is None else np.ascontiguousarray(way),
-        )  # fmt: skip
+            before,
+            step,
+            turned is not None,
+            np.eye(3) if turned is None else np.ascontiguousarray(turned),
+            way is not None,
+            np.zeros(3) if way is None else np.ascontiguousarray(way),
+        )
 
 
 @njit(cache=True, nogil=True)

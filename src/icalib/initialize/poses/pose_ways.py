@@ -50,18 +50,23 @@ def _w_first(x: PoseStream) -> PoseStream:
 
 
 WAYS: tuple[tuple[str, Way], ...] = (
-    ("are inverted: they give the pose of the reference frame in the sensor's frame; write inverted: true for "
-     "it in the rig file", _inverse),
+    (
+        "are inverted: they give the pose of the reference frame in the sensor's frame; write inverted: true for "
+        "it in the rig file",
+        _inverse,
+    ),
     ("have inverted rotations; write R_frame_sensor, or change the signs of x, y, z of the quaternions", _turned_back),
     ("are in left-handed axes; write them in right-handed axes", _other_handed),
     *(
         (f"have the {'xyz'[k]} axis of the position reversed; set its position_axes to {axes}", _with_axis_reversed(k))
         for k, axes in enumerate(("[-x, y, z]", "[x, -y, z]", "[x, y, -z]"))
     ),
-    ("have quaternions with w first; name the columns in the rig file as x, y, z, w, or correct the program "
+    (
+        "have quaternions with w first; name the columns in the rig file as x, y, z, w, or correct the program "
         "that writes them",
-     _w_first),
-)  # fmt: skip
+        _w_first,
+    ),
+)
 
 
 def _with_axes(axes: Axes) -> Way:

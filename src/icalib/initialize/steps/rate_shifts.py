@@ -159,9 +159,10 @@ def _explained(a: np.ndarray, known_a: np.ndarray, b: np.ndarray, known_b: np.nd
     a, b = a * known_a[:, None], b * known_b[:, None]
     ma, mb, fa, fb = (transformed(x) for x in (known_a.astype(float), known_b.astype(float), a, b))
     count = np.maximum(correlated(ma, mb), 1e-9)
-    sa, sb = (np.stack([correlated(*p) for p in pairs], axis=1) for pairs in (
-        [(fa[:, k], mb) for k in range(3)], [(ma, fb[:, k]) for k in range(3)]
-    ))  # fmt: skip
+    sa, sb = (
+        np.stack([correlated(*p) for p in pairs], axis=1)
+        for pairs in ([(fa[:, k], mb) for k in range(3)], [(ma, fb[:, k]) for k in range(3)])
+    )
     across, own = np.empty((n, 3, 3)), np.empty((n, 3, 3))
     for i in range(3):
         for j in range(3):

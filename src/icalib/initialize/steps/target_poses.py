@@ -268,9 +268,18 @@ def flat_poses(
         own = slice(int(start[i.start]), int(start[i.stop]))
         rays, density, good = usable_rays(stream.uv[own], model, params)
         _all_poses(
-            start[i.start : i.stop + 1] - own.start, stream.point[own], rays, density, good, target, fewest[i],
-            ROUNDS, rotation[i], position[i], rms[i],
-        )  # fmt: skip
+            start[i.start : i.stop + 1] - own.start,
+            stream.point[own],
+            rays,
+            density,
+            good,
+            target,
+            fewest[i],
+            ROUNDS,
+            rotation[i],
+            position[i],
+            rms[i],
+        )
     return TargetPoses(rotation, position, rms < LARGEST_RMS_PX, rms)
 
 

@@ -229,10 +229,9 @@ class _Seen:
         # Without bounds a lens of infinite length would fit best whatever moves as nothing else does.
         most = np.append(np.full(len(free) - n, np.inf), np.full(n, MOST_BENT))
         now = np.append(np.zeros(len(free) - n), np.clip(self.at.bent, -0.99 * MOST_BENT, 0.99 * MOST_BENT))
-        result = least_squares(
-            residuals, np.zeros(len(free)), bounds=(-most - now, most - now), loss=loss,
-            f_scale=BENDS / np.sqrt(ALIKE), max_nfev=20, ftol=ENOUGH,
-        )  # fmt: skip
+        bounds, scale = (-most - now, most - now), BENDS / np.sqrt(ALIKE)
+        first = np.zeros(len(free))
+        result = least_squares(residuals, first, bounds=bounds, loss=loss, f_scale=scale, max_nfev=20, ftol=ENOUGH)
         return self.at.moved(step(result.x)), result
 
 

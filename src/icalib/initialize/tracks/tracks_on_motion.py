@@ -65,9 +65,12 @@ def _placed(inputs: Inputs, state: State, number: int, lens: np.ndarray) -> dict
     else:
         offset = np.array([other_clocks(found.offset, camera.name, alone(inputs, best), inputs)])
     values = {
-        "rotation": found.rotation, "translation": found.position, "time_offset": offset,
-        "intrinsics": lens[:4], "distortion": lens[4:],
-    }  # fmt: skip
+        "rotation": found.rotation,
+        "translation": found.position,
+        "time_offset": offset,
+        "intrinsics": lens[:4],
+        "distortion": lens[4:],
+    }
     return {(camera.name, name): np.ascontiguousarray(value) for name, value in values.items()}
 
 

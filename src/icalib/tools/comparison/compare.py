@@ -85,9 +85,16 @@ class _Pair:
     limit: float  # sigmas
 
     def difference(
-        self, names: tuple[str, str, str], unit: str, scale: float, labels: tuple[str, ...], vector: np.ndarray,
-        covariances: tuple[np.ndarray, np.ndarray], open_: tuple[str, ...], lens: tuple[float, float] | None = None,
-    ) -> Difference:  # fmt: skip
+        self,
+        names: tuple[str, str, str],
+        unit: str,
+        scale: float,
+        labels: tuple[str, ...],
+        vector: np.ndarray,
+        covariances: tuple[np.ndarray, np.ndarray],
+        open_: tuple[str, ...],
+        lens: tuple[float, float] | None = None,
+    ) -> Difference:
         """names: sensor, frame, what. vector in SI, which times `scale` is in `unit`."""
         known = [bool(np.isfinite(c).all() and c.any()) for c in covariances]
         total = sum((np.zeros_like(c) if not np.isfinite(c).all() else c for c in covariances), np.zeros((1, 1)))

@@ -19,9 +19,14 @@ DENSITIES = {
     "accel_walk": "bias walk of the accelerometer",
 }
 _WHAT = {
-    "time_offset": "time offset", "radii": "radius", "baseline": "baseline", "radius": "radius",
-    "wheelbase": "wheelbase", "steering_offset": "steering offset", "scales": "scale",
-}  # fmt: skip
+    "time_offset": "time offset",
+    "radii": "radius",
+    "baseline": "baseline",
+    "radius": "radius",
+    "wheelbase": "wheelbase",
+    "steering_offset": "steering offset",
+    "scales": "scale",
+}
 _LABELS = {"radii": ("left", "right"), "scales": ("speed", "yaw_rate")} | {
     name: ("",) for name in _WHAT if name not in ("radii", "scales")
 }

@@ -61,15 +61,20 @@ def _traces(results: list[JobResult], places: dict[str, str], first: Block, pane
     colors = AXIS_COLORS if len(first.labels) == len(AXIS_COLORS) else COLORS
     return [
         {
-            "type": "scatter", "mode": "lines+markers", "x": [places[r.job.name] for r in at],
-            "y": numbers(values[:, k]), "yaxis": y_of(panel),
-            "name": label or first.name, "line": {"width": 1, "color": colors[k % len(colors)]},
-            "text": [r.job.name for r in at], "showlegend": len(first.labels) > 1,
+            "type": "scatter",
+            "mode": "lines+markers",
+            "x": [places[r.job.name] for r in at],
+            "y": numbers(values[:, k]),
+            "yaxis": y_of(panel),
+            "name": label or first.name,
+            "line": {"width": 1, "color": colors[k % len(colors)]},
+            "text": [r.job.name for r in at],
+            "showlegend": len(first.labels) > 1,
             "marker": {"size": 7, "symbol": ["circle-open" if b.verdict[k] == OPEN else "circle" for b in blocks]},
             "error_y": {"array": numbers(scale * np.array([_bar(b, k) for b in blocks])), "thickness": 1.2, "width": 3},
         }
         for k, label in enumerate(first.labels)
-    ]  # fmt: skip
+    ]
 
 
 def _in_legend_once(traces: list[dict[str, Any]]) -> list[dict[str, Any]]:

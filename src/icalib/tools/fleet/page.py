@@ -75,11 +75,16 @@ def _over_time(fleet: Fleet) -> tuple[dict[str, Figure], Html]:
 def _jobs(fleet: Fleet) -> Html:
     body = [
         (
-            _link(r), r.job.robot, words.time_words(r.time), _status(r), words.care_words(r),
-            f"{r.record.seconds:.1f}", r.record.failure or fleet.again.get(r.job.name, ""),
+            _link(r),
+            r.job.robot,
+            words.time_words(r.time),
+            _status(r),
+            words.care_words(r),
+            f"{r.record.seconds:.1f}",
+            r.record.failure or fleet.again.get(r.job.name, ""),
         )
         for r in fleet.results
-    ]  # fmt: skip
+    ]
     return table(("job", "robot", "time", "status", "to know", "took [s]", "why"), body, ("took [s]",))
 
 

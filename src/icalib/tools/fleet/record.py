@@ -57,7 +57,7 @@ class Record:
         known = stamp if low <= stamp < high else None
         return cls(
             name, result.failure, seconds, inputs, result.status, known, result.undetermined, result.warnings, blocks
-        )  # fmt: skip
+        )
 
 
 def _block(g: ParameterGroup) -> Block:

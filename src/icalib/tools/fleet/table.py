@@ -18,9 +18,19 @@ from icalib.tools.fleet.record import Block
 from icalib.tools.fleet.result import JobResult
 
 _COLUMNS = (
-    "robot TEXT", "time TEXT", "job TEXT", "status TEXT", "sentence TEXT", "sensor TEXT", "block TEXT", "entry TEXT",
-    "value REAL", "sigma REAL", "unit TEXT", "verdict TEXT",
-)  # fmt: skip
+    "robot TEXT",
+    "time TEXT",
+    "job TEXT",
+    "status TEXT",
+    "sentence TEXT",
+    "sensor TEXT",
+    "block TEXT",
+    "entry TEXT",
+    "value REAL",
+    "sigma REAL",
+    "unit TEXT",
+    "verdict TEXT",
+)
 _NOTHING = (None,) * 7
 
 

@@ -34,17 +34,26 @@ MEAN = ("sensor", "kind", "mean over runs")
 def study_html(found: Consistency, identity: Identity, records: Sequence[Record]) -> str:
     """The whole page; `records` for the NEES of each run."""
     sections = [
-        element("h2", "Blocks"), blocks_table(found),
-        element("p", "Sampled / predicted: square roots of the smallest and the largest eigenvalue of the sampled "
+        element("h2", "Blocks"),
+        blocks_table(found),
+        element(
+            "p",
+            "Sampled / predicted: square roots of the smallest and the largest eigenvalue of the sampled "
             "covariance relative to the predicted one; by chance: the range of these in 95 of 100 studies of a "
-            "consistent covariance."),
+            "consistent covariance.",
+        ),
         element("p", largest_words(found)),
-        element("h2", "Mean NEES"), plot_place("nees"),
+        element("h2", "Mean NEES"),
+        plot_place("nees"),
         *_undetermined(found),
-        element("h2", "Failed runs"), element("p", failures_words(found)), failures(found),
-        element("h2", "Residuals"), _residuals(found),
-        element("h2", "Made from"), table(("what", "value"), _facts(identity, records)),
-    ]  # fmt: skip
+        element("h2", "Failed runs"),
+        element("p", failures_words(found)),
+        failures(found),
+        element("h2", "Residuals"),
+        _residuals(found),
+        element("h2", "Made from"),
+        table(("what", "value"), _facts(identity, records)),
+    ]
     return page(f"Consistency, {identity.scenario}", answer(found), sections, {"nees": nees_figure(found)})
 
 
@@ -76,13 +85,22 @@ def nees_figure(found: Consistency) -> Figure:
     middle = np.array([0.5 * (n.low + n.high) for _, n in known])
     half = np.array([0.5 * (n.high - n.low) for _, n in known])
     bounds = {
-        "type": "scatter", "mode": "markers", "x": names, "y": numbers(middle), "name": "95 % bounds",
-        "marker": {"opacity": 0}, "error_y": {"array": numbers(half), "color": "#94a3b8", "thickness": 6, "width": 0},
-    }  # fmt: skip
+        "type": "scatter",
+        "mode": "markers",
+        "x": names,
+        "y": numbers(middle),
+        "name": "95 % bounds",
+        "marker": {"opacity": 0},
+        "error_y": {"array": numbers(half), "color": "#94a3b8", "thickness": 6, "width": 0},
+    }
     means = {
-        "type": "scatter", "mode": "markers", "x": names, "y": numbers(np.array([n.mean for _, n in known])),
-        "name": "mean NEES", "marker": {"color": COLORS[0], "size": 8},
-    }  # fmt: skip
+        "type": "scatter",
+        "mode": "markers",
+        "x": names,
+        "y": numbers(np.array([n.mean for _, n in known])),
+        "name": "mean NEES",
+        "marker": {"color": COLORS[0], "size": 8},
+    }
     return figure([bounds, means], xaxis=axis("", automargin=True), yaxis=axis("NEES per degree of freedom"))
 
 

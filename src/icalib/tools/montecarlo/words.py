@@ -16,9 +16,14 @@ def block_row(block: BlockSummary) -> tuple[str, ...]:
     unit, scale = SHOWN_UNITS.get(block.unit, (block.unit, 1.0))
     sizes = ["" if x is None else shown(scale * x, 3) for x in (block.rmse, block.mean_sigma)]
     return (
-        f"{block.sensor} {block.name.replace('_', ' ')}", str(block.dimension), str(block.runs),
-        *nees_cells(block.nees), *sizes, unit, spread_words(block.spread),
-    )  # fmt: skip
+        f"{block.sensor} {block.name.replace('_', ' ')}",
+        str(block.dimension),
+        str(block.runs),
+        *nees_cells(block.nees),
+        *sizes,
+        unit,
+        spread_words(block.spread),
+    )
 
 
 def nees_cells(found: Nees | None) -> tuple[str, str]:

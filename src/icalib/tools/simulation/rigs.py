@@ -124,10 +124,16 @@ class _Treated:
     def wheels(self, sim: SimWheels) -> Wheels:
         kind = "rates" if sim.reports == "steering" else sim.reports
         given = Wheels(
-            sim.name, f"{sim.name}/{kind}.csv", "ackermann" if sim.reports == "steering" else "differential",
-            wheel_noise=sim.noise, speed_noise=sim.speed_noise, yaw_noise=sim.yaw_noise,
-            steering_noise=sim.steering_noise, measures=kind, sampling=sim.sampling,
-        )  # fmt: skip
+            sim.name,
+            f"{sim.name}/{kind}.csv",
+            "ackermann" if sim.reports == "steering" else "differential",
+            wheel_noise=sim.noise,
+            speed_noise=sim.speed_noise,
+            yaw_noise=sim.yaw_noise,
+            steering_noise=sim.steering_noise,
+            measures=kind,
+            sampling=sim.sampling,
+        )
         if sim.allowed_slip is not None:
             given = replace(given, lateral_slip=sim.allowed_slip, vertical_slip=sim.allowed_slip)
         given = replace(given, **{name: _parameter(self.drive, value) for name, value in sim.drive.items()})

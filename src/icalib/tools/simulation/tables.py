@@ -32,9 +32,10 @@ _TRUTH_HEADER = """\
 # Planes: [nx, ny, nz, d] in the world, n . p = d. The trajectory and the points of the tracks are in truth.npz.
 """
 _WHEEL_COLUMNS = {
-    "pair": ("rates", "left [rad/s],right [rad/s]"), "steered": ("rates", "wheel [rad/s],steering [rad]"),
+    "pair": ("rates", "left [rad/s],right [rad/s]"),
+    "steered": ("rates", "wheel [rad/s],steering [rad]"),
     "twist": ("twist", "v [m/s],w [rad/s]"),
-}  # fmt: skip
+}
 _WHEEL_SAMPLING = {"interval-mean": "means since the stamp before", "instantaneous": "values at the stamp"}
 
 

@@ -49,9 +49,11 @@ def _pinhole(s: Stream, c: Calibration, name: str, depth: float):
     """Rerun's pixel (0, 0) is the corner of the image, ours the centre of its first pixel; it knows no distortion."""
     fx, fy, cx, cy = c.group(name, "intrinsics").value
     return s.rr.Pinhole(
-        resolution=c.rig["sensors"][name]["resolution"], focal_length=(fx, fy), principal_point=(cx + 0.5, cy + 0.5),
+        resolution=c.rig["sensors"][name]["resolution"],
+        focal_length=(fx, fy),
+        principal_point=(cx + 0.5, cy + 0.5),
         image_plane_distance=depth,
-    )  # fmt: skip
+    )
 
 
 def log_uncertainty(s: Stream, c: Calibration) -> None:
@@ -59,10 +61,13 @@ def log_uncertainty(s: Stream, c: Calibration) -> None:
     factor = magnification(c)
     for e in ellipsoids(c):
         ellipsoid = s.rr.Ellipsoids3D(
-            half_sizes=[factor * e.half_sizes], centers=[c.group(e.sensor, "translation").value],
-            quaternions=[Rotation.from_matrix(e.axes).as_quat()], colors=rgb(VERDICT_COLORS[e.verdict]),
-            labels=[f"{e.sensor}: {SIGMAS:g} sigma x {factor:g}"], show_labels=False,
-        )  # fmt: skip
+            half_sizes=[factor * e.half_sizes],
+            centers=[c.group(e.sensor, "translation").value],
+            quaternions=[Rotation.from_matrix(e.axes).as_quat()],
+            colors=rgb(VERDICT_COLORS[e.verdict]),
+            labels=[f"{e.sensor}: {SIGMAS:g} sigma x {factor:g}"],
+            show_labels=False,
+        )
         s.still(f"world/{c.body}/uncertainty/{e.sensor}", ellipsoid)
 
 
@@ -71,9 +76,10 @@ def log_motion(s: Stream, c: Calibration) -> None:
     path = c.trajectory
     s.still("world", s.rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     s.over(
-        f"world/{c.body}", path.seconds,
+        f"world/{c.body}",
+        path.seconds,
         s.rr.Transform3D.columns(translation=path.position, mat3x3=path.rotation.reshape(-1, 9)),
-    )  # fmt: skip
+    )
     of = c.recording_of(path.seconds)
     for k, span in enumerate(spans(c)):
         s.at("world/way", span.start, s.rr.LineStrips3D([path.position[of == k]], colors=rgb(_WAY)))

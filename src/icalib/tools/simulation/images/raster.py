@@ -50,9 +50,7 @@ def paint(rays, by_u, by_v, bends, s, R, C, x_edges, y_edges, grey_of, fine):
                 for b in range(s):
                     du, dv = (b + 0.5) / s - 0.5, (a + 0.5) / s - 0.5
                     x, y, z = _ray(rays[row, col], by_u[row, col], by_v[row, col], bends[:, row, col], du, dv)
-                    grey, covered = _average(
-                        x, y, z, R, C, Xu / s, Yu / s, Xv / s, Yv / s, x_edges, y_edges, grey_of
-                    )  # fmt: skip
+                    grey, covered = _average(x, y, z, R, C, Xu / s, Yu / s, Xv / s, Yv / s, x_edges, y_edges, grey_of)
                     old = fine[row * s + a, col * s + b]
                     fine[row * s + a, col * s + b] = old * (1.0 - covered) + grey
 

@@ -166,7 +166,7 @@ _DRIVES = {
     "poses": (("radii", "baseline"), ("noise", "slip", "poses_every")),
     "twist": (("scales",), ("speed_noise", "yaw_noise", "allowed_slip")),
     "steering": (("radius", "wheelbase"), ("steering_offset", "noise", "steering_noise", "allowed_slip")),
-}  # fmt: skip
+}
 
 
 def _wheels(name: str, value: YamlValue, start_ns: int) -> SimWheels:
