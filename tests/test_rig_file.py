@@ -13,10 +13,9 @@ from tests.typed import instance, not_none
 
 from icalib.errors import CalibrationError, RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard
-from icalib.motion.imu_model import LABELS
 from icalib.rig import Camera, ImuNoise, ImuSensor, Lidar, Parameter, PoseSensor, Rig, Settings, TwoSources, Wheels
 from icalib.rig.file import load_rig, rig_from_dict, rig_to_dict
-from icalib.rig.imu_classes import IMU_CLASSES, class_imperfections, class_noise
+from icalib.rig.imu_classes import IMU_CLASSES, INTRINSICS_LABELS, class_imperfections, class_noise
 
 VALID = """\
 sensors:
@@ -225,7 +224,7 @@ def test_by_default_imu_intrinsics_have_the_prior_of_the_class(tmp_path, noise, 
 
 def test_figures_of_a_consumer_imu_as_its_data_sheet_has_them():
     """MPU-6050: scales 3 % and cross-axis 2 % at two sigma, 0.1 deg/s/g at one."""
-    sigma = dict(zip(LABELS, class_imperfections("consumer").sigma, strict=True))
+    sigma = dict(zip(INTRINSICS_LABELS, class_imperfections("consumer").sigma, strict=True))
     for sensor in ("accel", "gyro"):
         assert [sigma[f"{sensor}_{a}"] for a in ("xx", "yy", "zz")] == [0.015] * 3
         assert [sigma[f"{sensor}_{a}"] for a in ("yx", "zx", "zy")] == [0.01] * 3

@@ -12,7 +12,7 @@ from icalib.geometry import so3
 from icalib.geometry.targets import AprilGrid
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
-from icalib.rig import Parameter, Rig
+from icalib.rig import Parameter, Rig, drive_names
 from icalib.tools.simulation import Simulation, handheld, rig_for, simulate
 
 TURN = so3.exp(np.deg2rad([0.0, 1.5, 0.0]))
@@ -43,7 +43,7 @@ def stated(rig: Rig, name: str, value: np.ndarray, sigma: float | None = None) -
 
 def truth(simulation: Simulation, name: str) -> np.ndarray:
     rig = rig_for(simulation.scenario, rotation="fixed", translation="fixed", time_offset="fixed", drive="fixed")
-    sensor = rig.wheels[0] if rig.wheels and name in rig.wheels[0].sizes else rig.cameras[0]
+    sensor = rig.wheels[0] if rig.wheels and name in drive_names(rig.wheels[0].kind) else rig.cameras[0]
     value = getattr(sensor, name).value
     assert value is not None
     return value

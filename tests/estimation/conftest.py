@@ -15,7 +15,7 @@ from tests.typed import instance, not_none
 
 from icalib.data.measurements import CornerStream, LidarStream, TrackStream
 from icalib.estimate.problem.problem import Problem
-from icalib.estimate.problem.tolerances import Tolerances
+from icalib.estimate.problem.tolerances import specs_of, tolerance_of
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.planes import plane_of
 from icalib.geometry.targets import AprilGrid
@@ -25,8 +25,9 @@ from icalib.motion.poses import assign_nodes
 from icalib.motion.sweep import Motion
 from icalib.optim.arrowhead import Piece, make_pieces
 from icalib.optim.state import NODE, Entry, Kind, Layout, State, make_layout
-from icalib.rig import Scheme
-from icalib.sensors.camera.board import SHAPE_LABELS
+from icalib.rig import ImuSensor, Lidar, Scheme, Settings
+from icalib.rig.imu_classes import class_noise
+from icalib.rig.scene import SHAPE_LABELS
 from icalib.sensors.camera.bodies import SIZE, Bodies, restrict
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerNoise
 from icalib.sensors.camera.features.feature_factor import FeatureFactor
@@ -307,7 +308,8 @@ class RoomSetup:
         columns = self.layout.columns("imu0", "intrinsics")
         imu = ImuFactor.build(self.imu, start, 9.81, columns[columns >= 0])
         lidar = self.factor(start, noise, **options)
-        tolerance = Tolerances().of(self.layout, "imu0")
+        sensors = ImuSensor("imu0", "", class_noise("consumer")), Lidar(self.stream.name, "")
+        tolerance = tolerance_of(self.layout, specs_of(self.layout, sensors), Settings())
         return Problem(self.layout, imu, (), (), tolerance, sensors=(lidar,), framed=False)
 
 

@@ -15,11 +15,13 @@ from icalib.estimate.problem.assembly import given_priors
 from icalib.estimate.problem.guess_priors import guess_priors, guess_sigma
 from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.problem.solver import _Descent
-from icalib.estimate.problem.tolerances import FROM_NOTHING_M, GUESS_SIGMA
+from icalib.estimate.problem.tolerances import FROM_NOTHING_M
 from icalib.initialize.start import start
 from icalib.optim.arrowhead import solve
 from icalib.optim.state import State
 from icalib.rig import Parameter
+from icalib.rig.camera import DISTORTION, INTRINSICS
+from icalib.rig.sensor import ROTATION, TIME_OFFSET
 from icalib.tools.simulation import handheld, rig_for, simulate
 
 TURNED = {("cam0", "translation"): np.array([0.05, -0.02, 0.03]), ("cam1", "time_offset"): np.array([2e-3])}
@@ -41,8 +43,8 @@ def test_they_are_as_wide_as_a_guess_is_off_and_never_beside_a_given_one(begun):
     found = {p.block.key: p for p in guess_priors(inputs, state, times=2.0)}
     camera, other = (c.name for c in inputs.rig.cameras)
     assert (camera, "time_offset") not in found
-    np.testing.assert_array_equal(found[other, "time_offset"].sigma, 2.0 * GUESS_SIGMA["time_offset"])
-    np.testing.assert_array_equal(found[other, "rotation"].sigma, 2.0 * GUESS_SIGMA["rotation"])
+    np.testing.assert_array_equal(found[other, "time_offset"].sigma, 2.0 * TIME_OFFSET.prior_sigma)
+    np.testing.assert_array_equal(found[other, "rotation"].sigma, 2.0 * ROTATION.prior_sigma)
     np.testing.assert_array_equal(found[other, "translation"].sigma, 2.0 * FROM_NOTHING_M)
     assert all(inputs.is_sensor(sensor) for sensor, _ in found)
     for key, prior in found.items():
@@ -63,9 +65,9 @@ def test_the_focal_length_of_a_sphere_model_is_as_uncertain_as_its_xi():
     inputs, state, _ = start(rig, [simulate(scenario, 0).measurements])
     fx, xi = state.values["cam0", "intrinsics"][0], state.values["cam0", "distortion"][0]
     sigma = guess_sigma(inputs, state)[inputs.layout.columns("cam0", "intrinsics", "distortion")]
-    expected = np.hypot(GUESS_SIGMA["intrinsics"], fx / (1.0 + xi) * GUESS_SIGMA["distortion"])
+    expected = np.hypot(INTRINSICS.prior_sigma, fx / (1.0 + xi) * DISTORTION.prior_sigma)
     np.testing.assert_allclose(sigma[:2], expected, rtol=1e-3)
-    np.testing.assert_allclose(sigma[2:4], GUESS_SIGMA["intrinsics"])
+    np.testing.assert_allclose(sigma[2:4], INTRINSICS.prior_sigma)
 
 
 def information_of(found: Estimate) -> np.ndarray:

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.motion.imu_model import LABELS, N_INTRINSICS, correction_matrices, intrinsics_jacobians
+from icalib.motion.imu_model import correction_matrices, intrinsics_jacobians
+from icalib.rig.imu_classes import INTRINSICS_LABELS as LABELS
+from icalib.rig.imu_classes import N_INTRINSICS
 
 LOWER = ([0, 1, 1, 2, 2, 2], [0, 0, 1, 0, 1, 2])
 RATE, FORCE = np.array([0.7, -1.1, 0.4]), np.array([2.0, -3.0, 9.0])

@@ -11,13 +11,15 @@ import pytest
 from icalib.errors import EstimationError
 from icalib.estimate.problem.problem import Problem
 from icalib.estimate.problem.solver import minimise
-from icalib.estimate.problem.tolerances import Tolerances
+from icalib.estimate.problem.tolerances import specs_of, tolerance_of
 from icalib.initialize.lidar.lidar import LidarGuess, lidar_and_motion, lidar_on_motion
 from icalib.initialize.lidar.lidar_planes import ROUNDS, associate, round_search
 from icalib.initialize.lidar.lidar_rounds import check_shares
 from icalib.motion.nodes import place_nodes
 from icalib.motion.sweep import Motion
 from icalib.optim.state import State, make_layout
+from icalib.rig import ImuSensor, Lidar, Settings
+from icalib.rig.imu_classes import class_noise
 from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.lidar.lidar_binning import LidarNoise
 from icalib.sensors.lidar.residual import LidarFactor
@@ -55,7 +57,8 @@ def solved(r, state, found):
         for s, plane in zip(r.streams, found.clouds.plane, strict=True)
     )
     imu = ImuFactor.build(r.imu, state, 9.81, np.zeros(0, dtype=np.int64))
-    tolerance = Tolerances().of(layout, "imu0")
+    sensors = ImuSensor("imu0", "", class_noise("consumer")), *(Lidar(s.name, "") for s in r.streams)
+    tolerance = tolerance_of(layout, specs_of(layout, sensors), Settings())
     outcome = minimise(Problem(layout, imu, (), (), tolerance, sensors=lidars, framed=False), state)
     assert outcome.converged, outcome.status
     return outcome.state

@@ -24,8 +24,9 @@ from icalib.export.common import quaternion, rpy
 from icalib.export.formats import export
 from icalib.export.names import FORMATS
 from icalib.geometry.cameras import camera_model
-from icalib.motion.imu_model import LABELS, correction_matrices
+from icalib.motion.imu_model import correction_matrices
 from icalib.result import Calibration, ParameterGroup
+from icalib.rig.imu_classes import INTRINSICS_LABELS
 
 
 def by_opencv(text: str, tmp_path: Path) -> cv2.FileStorage:
@@ -70,7 +71,7 @@ def with_offset(c: Calibration, name: str, offset: float) -> Calibration:
 
 def with_imu_intrinsics(c: Calibration, value: np.ndarray) -> Calibration:
     zeros = np.zeros(24)
-    group = ParameterGroup("imu0", "intrinsics", LABELS, "", value, zeros, zeros, ("fixed",) * 24, "fixed")
+    group = ParameterGroup("imu0", "intrinsics", INTRINSICS_LABELS, "", value, zeros, zeros, ("fixed",) * 24, "fixed")
     return dataclasses.replace(c, groups=(*(g for g in c.groups if g.sensor != "imu0"), group))
 
 

@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 from icalib.errors import CalibrationError
 from icalib.export.kalibr import camchain, imu_yaml
 from icalib.geometry.cameras import camera_model
-from icalib.motion.imu_model import LABELS, correction_matrices
+from icalib.motion.imu_model import correction_matrices
 from icalib.result import Calibration, ParameterGroup
+from icalib.rig.imu_classes import INTRINSICS_LABELS
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +25,7 @@ def chain(calibration: Calibration) -> dict:
 
 def with_intrinsics(calibration: Calibration, value: np.ndarray, mode: str) -> Calibration:
     zeros = np.zeros(24)
-    group = ParameterGroup("imu0", "intrinsics", LABELS, "", value, zeros, zeros, ("fixed",) * 24, mode)
+    group = ParameterGroup("imu0", "intrinsics", INTRINSICS_LABELS, "", value, zeros, zeros, ("fixed",) * 24, mode)
     others = tuple(g for g in calibration.groups if g.sensor != "imu0")
     return dataclasses.replace(calibration, groups=(*others, group))
 

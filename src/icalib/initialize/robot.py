@@ -22,8 +22,6 @@ from icalib.motion.known_motion import imu_poses, is_known
 from icalib.optim.state import Key, State
 from icalib.rig import Wheels
 from icalib.sensors.pose.residual import FRAME, frame_of
-from icalib.sensors.robot import MOUNT
-from icalib.sensors.wheels.ground_factor import HEIGHT_BLOCK
 from icalib.sensors.wheels.wheel_angles import integrals_of
 
 LEVEL = 0.7  # cosine of the axis that a vehicle turns about with z of a frame: 45 degrees off, the frame is not level
@@ -58,10 +56,10 @@ def with_robot(inputs: Inputs, settled: State) -> tuple[Inputs, State, dict[Key,
 
 
 def _wheels(inputs: Inputs, state: State, wheels: Wheels, stream: WheelStream | WheelPoses) -> dict[Key, np.ndarray]:
-    names = [name for name, _, _ in MOUNT] + list(wheels.sizes) + ([HEIGHT_BLOCK] if wheels.knows_height else [])
+    names = [spec.name for spec in wheels.specs()]
     known = given(inputs, wheels, names)
     if isinstance(stream, WheelPoses):
-        known |= {(wheels.name, name): np.ones(n) for name, n in wheels.sizes.items()}
+        known |= {(wheels.name, spec.name): np.ones(spec.size) for spec in wheels.drive_specs}
     complete = len(known) == len(names)
     if complete and isinstance(stream, WheelPoses) and not has_guesses(wheels, given(inputs, wheels, names)):
         return known

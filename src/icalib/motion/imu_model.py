@@ -3,7 +3,8 @@
     gyro  = M_g C w + A_g f + b_g + noise        f: specific force, w: angular rate, both in the imu frame
     accel = M_a f + b_a + noise                  M: lower triangular, C = Exp(r): accelerometer to gyroscope axes
 
-Intrinsics are 24 numbers, zero for an ideal IMU: M_a - I (xx yx yy zx zy zz), M_g - I (same), r (3), A_g (row-major 9).
+Intrinsics are 24 numbers (`rig.imu_classes.INTRINSICS_LABELS`), zero for an ideal IMU:
+M_a - I (xx yx yy zx zy zz), M_g - I (same), r (3), A_g (row-major 9).
 """
 
 from __future__ import annotations
@@ -14,13 +15,6 @@ from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.geometry.small import mul3, tmul3
 
-N_INTRINSICS = 24
-LABELS = (
-    *(f"accel_{n}" for n in ("xx", "yx", "yy", "zx", "zy", "zz")),
-    *(f"gyro_{n}" for n in ("xx", "yx", "yy", "zx", "zy", "zz")),
-    *(f"gyro_rotation_{n}" for n in "xyz"),
-    *(f"g_sensitivity_{a}{b}" for a in "xyz" for b in "xyz"),
-)
 _ROW = np.array([0, 1, 1, 2, 2, 2])
 _COL = np.array([0, 0, 1, 0, 1, 2])
 

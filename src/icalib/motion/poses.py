@@ -18,10 +18,11 @@ from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.motion.from_nodes import Moving, integrate_from_node, nodes_of, nothing_carried, place, ways_from
 from icalib.motion.imu_data import ImuData
-from icalib.motion.imu_model import N_INTRINSICS, correction_matrices, intrinsics_jacobians
+from icalib.motion.imu_model import correction_matrices, intrinsics_jacobians
 from icalib.motion.integration import Increment, correction, readings_of
 from icalib.optim.state import NODE, State
 from icalib.rig import Scheme
+from icalib.rig.imu_classes import N_INTRINSICS
 
 
 @dataclass(frozen=True)

@@ -16,13 +16,13 @@ from icalib.errors import EstimationError
 from icalib.estimate.evidence.evidence import fits
 from icalib.estimate.problem.groups import sensors_of
 from icalib.estimate.problem.inputs import Inputs, origin_difference
-from icalib.estimate.problem.tolerances import GUESS_SIGMA
 from icalib.geometry import so3
 from icalib.observability.determination import Determined, determine, judge, scatter
 from icalib.observability.relaxed import Relaxed, freed_inputs, stated_keys
 from icalib.optim.border import restricted_root
 from icalib.optim.state import Block, Key, State
 from icalib.rig import Parameter
+from icalib.rig.kinds import SPECS
 
 SIGMAS = 4.0
 FAR = 0.5  # times the prior uncertainty: 3 deg, 5 cm, 10 ms; a linear step that long does not end where it says
@@ -77,7 +77,7 @@ def _is_far(shown: Contradiction) -> bool:
 
 def worst_off(name: str, off: np.ndarray) -> float:
     """How far off a group is, in what guesses are worth."""
-    return float(np.abs(off).max()) / GUESS_SIGMA[name]
+    return float(np.abs(off).max()) / SPECS[name].prior_sigma
 
 
 def _linear(

@@ -18,10 +18,11 @@ from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.problem.outcome import Outcome
 from icalib.estimate.problem.problem import Problem
 from icalib.estimate.problem.solver import minimise
-from icalib.estimate.problem.tolerances import GUESS_SIGMA, UNGUESSED
+from icalib.estimate.problem.tolerances import UNGUESSED
 from icalib.geometry import planes, so3
 from icalib.optim.border import HELD_BELOW
 from icalib.optim.state import Block, State
+from icalib.rig.sensor import ROTATION
 
 PULLED = 0.25  # information in tolerance units, noise and all
 FARTHEST = 2.0  # standard deviations of the guess
@@ -163,7 +164,7 @@ def _weights(inputs: Inputs, state: State) -> np.ndarray:
     sigma = guess_sigma(inputs, state)
     for block in _unguessed(inputs):
         if block.kind not in ("vector", "nuisance"):
-            sigma[block.columns[:2] if block.kind == "plane" else block.columns] = GUESS_SIGMA["rotation"]
+            sigma[block.columns[:2] if block.kind == "plane" else block.columns] = ROTATION.prior_sigma
     return sigma
 
 

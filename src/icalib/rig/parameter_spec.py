@@ -53,6 +53,10 @@ class ParameterSpec:
         labels = tuple(f"in recording {k}" for k in range(1, count + 1))
         return self if count == 1 else replace(self, size=count, labels=labels)
 
+    def entry(self, owner: str, estimated: bool = True) -> tuple[str, str, Manifold, int, bool]:
+        """What `optim.state.make_layout` takes, for the group of a sensor or of a part of the scene."""
+        return owner, self.name, self.manifold, self.size, estimated
+
     @property
     def shown_unit(self) -> tuple[str, float]:
         """The unit in which people read it, and what SI values are to be multiplied by."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
+import numpy as np
+
 from icalib.rig.parameter import Parameter
 from icalib.rig.parameter_spec import ParameterSpec
 from icalib.rig.sensor import MOUNTED, PLAIN_TABLE, Axes, Sensor, TableLayout
@@ -40,3 +42,9 @@ class PoseSensor(Sensor):
     inverted: bool = False  # what is recorded is T_sensor_frame
     frames: tuple[str, str] | None = None  # parent and child in a topic of transforms; None: it is not one
     scale_sigma: float = 0.001  # of all its lengths, relative: true over reported ones is about 1; 0: exact
+
+    @property
+    def scale(self) -> Parameter:
+        """True lengths over reported ones."""
+        one = np.ones(1)
+        return Parameter("prior", one, self.scale_sigma * one) if self.scale_sigma > 0.0 else Parameter("fixed", one)

@@ -11,6 +11,8 @@ from icalib.rig.sensor import ROTATION, TRANSLATION
 SIZE = ParameterSpec("size", 1, "nuisance", "", ("size",), 1e-2, 0.1)
 # How a body departs from its drawing: see `sensors.camera.board.shape_basis`.
 BOW_LABELS = ("bow_xx", "bow_xy", "bow_yy")
+# In the plane: what printing and mounting do to second order. A turn, a shift and the scale are left out: the first two
+# belong to the board's pose, and the scale is what tag_size says.
 IN_PLANE_LABELS = ("stretch", "shear", "x_xx", "y_xx", "x_xy", "y_xy", "x_yy", "y_yy")
 SHAPE_LABELS = BOW_LABELS + IN_PLANE_LABELS
 SHAPE = ParameterSpec(

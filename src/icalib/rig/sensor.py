@@ -80,6 +80,10 @@ class Sensor:
         """The one of this name."""
         return next(spec for spec in self.specs() if spec.name == name)
 
+    def is_estimated(self, spec: ParameterSpec) -> bool:
+        """Whether the group is estimated, as far as the sensor alone says."""
+        return getattr(self, spec.name).mode != "fixed"
+
     @classmethod
     def stated(cls) -> tuple[ParameterSpec, ...]:
         """Those of `parameters` that are fields of the rig file."""

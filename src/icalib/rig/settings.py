@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
+
+from icalib.rig.parameter_spec import ToleranceSetting
 
 Scheme = Literal["inertial", "pose", "kinematic"]
 Loss = Literal["none", "huber", "cauchy"]
@@ -35,3 +38,8 @@ class Settings:
     translation_tolerance_m: float = 5e-3
     time_tolerance_s: float = 1e-3
     pixel_tolerance: float = 1.0  # of fx, fy, cx, cy
+
+    def tolerance(self, name: ToleranceSetting) -> float:
+        """One of the tolerances, angles in rad."""
+        value = float(getattr(self, name))
+        return math.radians(value) if name.endswith("_deg") else value

@@ -131,6 +131,10 @@ class Wheels(Sensor):
         """As in `Sensor`: those of its drive, and the height where that is estimated."""
         return (*MOUNTED, *((GROUND_HEIGHT,) if self.knows_height else ()), *self.drive_specs)
 
+    def is_estimated(self, spec: ParameterSpec) -> bool:
+        """As in `Sensor`; relative poses do not depend on the drive."""
+        return super().is_estimated(spec) and (self.measures != "poses" or spec not in self.drive_specs)
+
     @property
     def ground_height(self) -> Parameter:
         """What the height over the ground starts from, where it is estimated."""
@@ -147,11 +151,6 @@ class Wheels(Sensor):
     def drive_specs(self) -> tuple[ParameterSpec, ...]:
         """Its parameters beside pose, clock and height."""
         return DRIVES[self.kind]
-
-    @property
-    def sizes(self) -> dict[str, int]:
-        """Its parameters beside pose, clock and height, with how many numbers they have."""
-        return {spec.name: spec.size for spec in self.drive_specs}
 
     @property
     def knows_height(self) -> bool:

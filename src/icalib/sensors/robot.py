@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,18 +12,17 @@ from icalib.motion.clocks import instants
 from icalib.motion.factor import SensorFactor
 from icalib.motion.point_planes import count_points, thinned
 from icalib.motion.sweep import Motion
-from icalib.optim.state import Entry, Key, Kind, Layout, State
-from icalib.rig import Lidar, PoseSensor, Rig, Settings, Wheels
+from icalib.optim.state import Entry, Key, Layout, State
+from icalib.rig import Lidar, ParameterSpec, PoseSensor, Rig, Sensor, Settings, Wheels
+from icalib.rig.scene import FRAME, PLANE
+from icalib.rig.sensor import TIME_OFFSET
 from icalib.sensors.lidar.lidar_binning import BIN_S, LidarNoise
 from icalib.sensors.lidar.residual import LidarFactor
-from icalib.sensors.pose.residual import FRAME, AbsolutePoseFactor, PoseFactor, PoseNoise, RelativePosesFactor, frame_of
-from icalib.sensors.wheels.ground_factor import HEIGHT_BLOCK, GroundFactor, floors
+from icalib.sensors.pose.residual import AbsolutePoseFactor, PoseFactor, PoseNoise, RelativePosesFactor, frame_of
+from icalib.sensors.wheels.ground_factor import GroundFactor, floors
 from icalib.sensors.wheels.residual import IncrementFactor, RelativePoseFactor, WheelNoise
 from icalib.sensors.wheels.wheel_angles import integrals_of
 
-MOUNT: tuple[tuple[str, Kind, int], ...] = (
-    ("rotation", "rotation", 3), ("translation", "vector", 3), ("time_offset", "vector", 1),
-)  # fmt: skip
 NEAR_PLANE_M = 1e-3  # of a point's distance whatever the direction: what the model lacks where beams graze a plane
 FIRST_RANGE_M = 0.03  # of a LiDAR whose noise is not given
 LEAST_RANGE_M = 1e-3
@@ -49,7 +48,7 @@ class Clouds:
     @property
     def keys(self) -> tuple[Key, ...]:
         """Where the planes' values stand in a state."""
-        return tuple((name, "plane") for name in self.names)
+        return tuple((name, PLANE.name) for name in self.names)
 
     @property
     def recording(self) -> np.ndarray:
@@ -60,7 +59,7 @@ class Clouds:
     @property
     def entries(self) -> list[Entry]:
         """The planes as parameters of a layout."""
-        return [(*key, "plane", 3, True) for key in self.keys]
+        return [PLANE.entry(name) for name in self.names]
 
     @property
     def points(self) -> np.ndarray:
@@ -86,31 +85,20 @@ def joined_clouds(each: Sequence[Clouds]) -> Clouds:
     return Clouds(names, tuple(plane))
 
 
-def own_entries(sensor: Lidar | Wheels | PoseSensor, n_recordings: int) -> list[Entry]:
-    """Of the border."""
-    clocks = {"time_offset": n_recordings if sensor.clock_restarts else 1}
-    mounts: list[Entry] = [
-        (sensor.name, name, kind, clocks.get(name, n), getattr(sensor, name).mode != "fixed") for name, kind, n in MOUNT
-    ]
-    if isinstance(sensor, PoseSensor):
-        return [*mounts, (sensor.name, "scale", "nuisance", 1, sensor.scale_sigma > 0.0)]
-    if isinstance(sensor, Lidar):
-        return mounts
-    heard = sensor.measures != "poses"  # which say nothing of what rolls
-    height: list[Entry] = [(sensor.name, HEIGHT_BLOCK, "vector", 1, True)] if sensor.knows_height else []
-    drive: list[Entry] = [
-        (sensor.name, name, "vector", n, heard and getattr(sensor, name).mode != "fixed")
-        for name, n in sensor.sizes.items()
-    ]
-    return mounts + height + drive
+def own_entries(
+    sensor: Sensor, n_recordings: int = 1, is_estimated: Callable[[ParameterSpec], bool] | None = None
+) -> list[Entry]:
+    """The parameters of a sensor; a clock that restarts has a time offset in each recording."""
+    n_clocks = n_recordings if getattr(sensor, "clock_restarts", False) else 1
+    specs = (spec.in_recordings(n_clocks) if spec == TIME_OFFSET else spec for spec in sensor.specs())
+    free = is_estimated or sensor.is_estimated
+    return [spec.entry(sensor.name, free(spec)) for spec in specs]
 
 
 def frame_entries(sensor: PoseSensor, n_recordings: int, estimated: bool = True) -> list[Entry]:
     """Of the border: where the frame of absolute poses stands in each recording's world."""
     frames = [frame_of(sensor.name, k) for k in range(n_recordings if sensor.kind == "absolute" else 0)]
-    return [
-        (f, name, kind, 3, estimated) for f in frames for name, kind in zip(FRAME, ("rotation", "vector"), strict=True)
-    ]
+    return [spec.entry(frame, estimated) for frame in frames for spec in FRAME]
 
 
 def known_planes(streams: Sequence[LidarStream]) -> Clouds:

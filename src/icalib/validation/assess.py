@@ -20,7 +20,6 @@ from icalib.estimate.problem.inputs import Inputs, origin_difference
 from icalib.estimate.problem.outcome import Visit
 from icalib.estimate.problem.problem import Problem
 from icalib.motion.axes import hardly_turned
-from icalib.motion.imu_model import LABELS as IMU_LABELS
 from icalib.observability.contradictions import Contradiction
 from icalib.observability.determination import Determined
 from icalib.observability.words import Observability, observe
@@ -42,12 +41,12 @@ from icalib.result.timeline import Timeline
 from icalib.result.verdict import by_size
 from icalib.rig import drive_names
 from icalib.rig.file import rig_to_dict
+from icalib.rig.pose import SCALE
 from icalib.validation.all_causes import Judged, all_causes
 from icalib.validation.cameras import plane_warnings
 from icalib.validation.guesses import guess_notes
 from icalib.validation.held_out import held_out
 from icalib.validation.images import corner_residuals, track_residuals
-from icalib.validation.labels import UNITS, labels_of
 from icalib.validation.misfit import scatter_warnings
 from icalib.validation.notes import notes
 from icalib.validation.robot import (
@@ -141,7 +140,7 @@ def _is_assumed(inputs: Inputs, name: str) -> bool:
 
 
 def _column_names(inputs: Inputs) -> tuple[str, ...]:
-    return tuple(f"{b.sensor}.{b.name}.{label}" for b in inputs.layout.free for label in labels_of(inputs, b))
+    return tuple(f"{b.sensor}.{b.name}.{label}" for b in inputs.layout.free for label in inputs.specs[b.key].labels)
 
 
 def _mode(inputs: Inputs, block: Block) -> str:
@@ -204,11 +203,9 @@ def _groups(inputs: Inputs, determined: Determined, seen: Observability, noise: 
     for block in inputs.layout.blocks:
         if block.name in IN_THE_WORLD or _unheard_of(inputs, block) or _is_assumed(inputs, block.sensor):
             continue
-        if block.start is None and block.name in ("shape", "bloom", "tilt", "scale"):
+        spec = inputs.specs[block.key]
+        if block.start is None and (spec.is_auxiliary or spec == SCALE):
             continue
-        labels = labels_of(inputs, block)
-        if block.name == "tilt":
-            labels = ("x", "y")
         zeros = np.zeros(block.size)
         if block.start is None:
             std = factor = zeros
@@ -218,13 +215,12 @@ def _groups(inputs: Inputs, determined: Determined, seen: Observability, noise: 
             std, factor = formal[k], noise.factor(k, overall)
             sizes = factor * np.maximum(seen.spread[k], std / found.problem.tolerance[k])
             verdict = tuple(_final_verdict(seen.verdicts[i], size) for i, size in zip(k, sizes.tolist(), strict=True))
-        unit = "" if labels == IMU_LABELS else UNITS[block.name]
         groups.append(
             ParameterGroup(
                 block.sensor,
                 block.name,
-                labels,
-                unit,
+                spec.labels,
+                spec.unit,
                 _raw_value(inputs, found.outcome.state, block),
                 std,
                 std * np.maximum(factor, 1.0),

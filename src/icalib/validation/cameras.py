@@ -7,12 +7,12 @@ from itertools import combinations
 
 import numpy as np
 
-from icalib.estimate.problem.tolerances import GUESS_SIGMA
 from icalib.geometry import so3
 from icalib.observability.fixed_lens import LensStep
 from icalib.result import ParameterGroup, SensorFit
 from icalib.result.excess import excess, times
 from icalib.rig import Camera, Rig
+from icalib.rig.kinds import SPECS
 from icalib.sensors.camera.features.feature_factor import FeatureFactor
 from icalib.sensors.camera.features.surfaces import ON_PLANES
 
@@ -122,5 +122,5 @@ def _away(camera: Camera, found: dict[tuple[str, str], np.ndarray], name: str) -
         if given is None or value is None:
             continue
         off = so3.value_change(given, value)
-        away = max(away, float(np.linalg.norm(off)) / GUESS_SIGMA[group])
+        away = max(away, float(np.linalg.norm(off)) / SPECS[group].prior_sigma)
     return away

@@ -8,13 +8,13 @@ import numpy as np
 
 from icalib.estimate.problem.groups import groups_of
 from icalib.estimate.problem.inputs import Inputs
-from icalib.estimate.problem.tolerances import GUESS_SIGMA
 from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
 from icalib.initialize.steps.contradicted import is_contradicted
 from icalib.result import ParameterGroup
 from icalib.result.units import SHOWN_UNITS
 from icalib.rig import LENS, Camera
+from icalib.rig.camera import INTRINSICS
 from icalib.validation.looks_like import looks_like
 from icalib.validation.stated import scaled
 
@@ -29,7 +29,7 @@ def guess_notes(inputs: Inputs, groups: Sequence[ParameterGroup]) -> Iterator[st
         if group is None or guess is None or parameter.mode != "free" or "undetermined" in group.verdict:
             continue
         if isinstance(sensor, Camera) and name in LENS:
-            far = lens_off(sensor, name, found) > GUESS_SIGMA["intrinsics"]
+            far = lens_off(sensor, name, found) > INTRINSICS.prior_sigma
         else:
             far = is_contradicted(name, guess, group.value)
         if far:

@@ -11,11 +11,10 @@ from icalib.estimate.evidence.corner_noise import NoiseModel
 from icalib.estimate.problem.inputs import Inputs
 from icalib.motion.clocks import instants
 from icalib.motion.imu_data import ImuData
-from icalib.motion.imu_model import LABELS
 from icalib.motion.nodes import usable
 from icalib.result.timeline import Timeline
 from icalib.rig import ImuSensor
-from icalib.rig.imu_classes import class_of_sigma
+from icalib.rig.imu_classes import INTRINSICS_LABELS, class_of_sigma
 from icalib.sensors.camera.bodies import words_on_left_out
 from icalib.sensors.camera.circle_centres import centre_shifts
 from icalib.sensors.camera.corner_factor import CornerFactor
@@ -110,7 +109,7 @@ def _intrinsics_words(imu: ImuSensor) -> str:
     """What was assumed of the IMU's scale and misalignment, where they are estimated; else empty."""
     if imu.intrinsics.mode != "prior" or imu.intrinsics.sigma is None:
         return ""
-    sigma = dict(zip(LABELS, imu.intrinsics.sigma.tolist(), strict=True))
+    sigma = dict(zip(INTRINSICS_LABELS, imu.intrinsics.sigma.tolist(), strict=True))
     name = class_of_sigma(imu.intrinsics.sigma)
     whose = "from the rig file" if name is None else f"of {'an' if name[0] in 'aeiou' else 'a'} {name} IMU"
     turn = np.rad2deg(sigma["gyro_rotation_x"])

@@ -9,9 +9,7 @@ import numpy as np
 from icalib.estimate.problem.inputs import Inputs
 from icalib.observability.contradictions import Contradiction
 from icalib.result import ParameterGroup
-from icalib.result.units import SHOWN_UNITS
 from icalib.rig import Wheels
-from icalib.validation.labels import UNITS, labels_of
 from icalib.validation.looks_like import looks_like
 
 # Radii over baseline: from 1/15 of a floor robot to 1 of a toy; rates in rpm make 1/3 a 1/30.
@@ -29,8 +27,8 @@ def absurd_wheels(inputs: Inputs, against: Sequence[Contradiction], groups: Sequ
 
 def stated_words(inputs: Inputs, c: Contradiction) -> str:
     """Both values, their standard deviations, how far apart they are, and what would explain it."""
-    labels, unit = labels_of(inputs, inputs.layout.block(*c.key)), UNITS[c.key[1]]
-    unit, scale = SHOWN_UNITS.get(unit, (unit, 1.0))
+    spec = inputs.specs[c.key]
+    labels, (unit, scale) = spec.labels, spec.shown_unit
     stated, unit = c.parameter.sigma, f" {unit}" if unit else ""
     sigma = scale * float(c.sigma[c.worst])
     allowed = "" if stated is None else f" +- {scale * np.broadcast_to(stated, c.off.shape)[c.worst]:.3g}{unit}"

@@ -11,11 +11,9 @@ import numpy as np
 from icalib.errors import EstimationError
 from icalib.estimate.problem.inputs import Inputs, origin_difference
 from icalib.estimate.problem.problem import ChainFactor, Problem
-from icalib.estimate.problem.tolerances import distortion_scales
 from icalib.geometry.cameras import camera_model
 from icalib.motion.clocks import EARLY_S, instants
 from icalib.motion.factor import SensorFactor
-from icalib.motion.imu_model import N_INTRINSICS
 from icalib.motion.nodes import MERGED_WITHIN_S, distinct, first_nodes, place_nodes, usable
 from icalib.motion.poses import assign_nodes, poses_at
 from icalib.motion.sweep import Motion
@@ -26,7 +24,9 @@ from icalib.optim.free_nodes import FreeNodes
 from icalib.optim.prior_factor import Prior
 from icalib.optim.state import Key, Layout, State
 from icalib.rig import Camera, ImuSensor, Parameter, Rig, Scheme
-from icalib.sensors.camera.board import SHAPE_LABELS, SHAPE_SIGMA_M, bloom_direction
+from icalib.rig.imu_classes import N_INTRINSICS
+from icalib.rig.scene import SHAPE_LABELS
+from icalib.sensors.camera.board import SHAPE_SIGMA_M, bloom_direction
 from icalib.sensors.camera.bodies import SIZE
 from icalib.sensors.camera.circle_centres import with_circle_centres
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerNoise
@@ -194,14 +194,13 @@ def assemble(
         )  # fmt: skip
         factor = factor if straight else with_circle_centres(with_bent_edges(factor, state), state)
         factors.append(_with_bloom(factor, camera, state, rig) if rig.blooms else factor)
-    tolerance = inputs.tolerances.of(layout, None if rig.imu is None else rig.imu.name) * distortion_scales(rig, layout)
     # Beside one another, in a thread of its own: points of LiDARs use the solver's.
     with ThreadPoolExecutor(1) as aside:
         found = None if following is None else aside.submit(_features, inputs, state, tuple(factors), following)
         others = _others(inputs, state, robot)
         features = None if found is None else found.result()
     return Problem(
-        layout, _chain(inputs, state), tuple(factors), _priors(inputs), tolerance, held, features, others,
+        layout, _chain(inputs, state), tuple(factors), _priors(inputs), inputs.tolerance, held, features, others,
         rig.has_target or rig.imu is None or (rig.assumes_motion and rig.moves_by_poses), not rig.assumes_motion,
     )  # fmt: skip
 

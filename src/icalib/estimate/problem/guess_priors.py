@@ -6,7 +6,7 @@ import numpy as np
 
 from icalib.estimate.problem.assembly import stated_priors
 from icalib.estimate.problem.inputs import Inputs
-from icalib.estimate.problem.tolerances import FROM_NOTHING_M, GUESS_SIGMA, OTHER_SIGMA, distortion_scales
+from icalib.estimate.problem.tolerances import FROM_NOTHING_M
 from icalib.geometry.cameras import camera_model
 from icalib.optim.prior_factor import Prior
 from icalib.optim.state import State
@@ -19,10 +19,9 @@ def guess_sigma(inputs: Inputs, state: State) -> np.ndarray:
     """(B,) standard deviations of the guess: given ones, or the default ones. `state` has the lenses."""
     sigma, sensors = np.zeros(inputs.layout.size), {s.name: s for s in inputs.sensors}
     for b in inputs.layout.free:
-        sigma[b.columns] = OTHER_SIGMA if b.is_nuisance else GUESS_SIGMA[b.name]
+        sigma[b.columns] = inputs.specs[b.key].prior_sigma
         if b.name == "translation" and b.sensor in sensors and sensors[b.sensor].translation.value is None:
             sigma[b.columns] = FROM_NOTHING_M
-    sigma *= distortion_scales(inputs.rig, inputs.layout)
     for camera in inputs.rig.cameras:
         columns = inputs.layout.columns(camera.name, "intrinsics", "distortion")
         if (columns >= 0).all():

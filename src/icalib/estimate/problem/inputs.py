@@ -4,29 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
+
+import numpy as np
 
 from icalib.data.joining import Part, join
 from icalib.data.measurements import Measurements, Stream
-from icalib.estimate.problem.tolerances import Tolerances
-from icalib.geometry.cameras import camera_model
+from icalib.estimate.problem.tolerances import specs_of, tolerance_of
 from icalib.geometry.targets.base import BOARD
 from icalib.motion.imu_data import ImuData, joined_imu_data
-from icalib.motion.imu_model import N_INTRINSICS
-from icalib.optim.state import Entry, Kind, Layout, State, in_recording, make_layout
-from icalib.rig import Camera, Lidar, PoseSensor, Rig, Wheels
+from icalib.optim.state import Entry, Key, Layout, State, in_recording, make_layout
+from icalib.rig import Camera, Lidar, ParameterSpec, PoseSensor, Rig, Wheels
+from icalib.rig.camera import BLOOM
+from icalib.rig.scene import TILT
+from icalib.rig.sensor import MOUNTED, TIME_OFFSET
 from icalib.sensors.camera.bodies import Bodies, choose_bodies, restrict
 from icalib.sensors.camera.images import on_common_images
 from icalib.sensors.robot import NO_CLOUDS, Clouds, frame_entries, own_entries
-
-CAMERA_PARAMETERS: tuple[tuple[str, Kind], ...] = (
-    ("rotation", "rotation"),
-    ("translation", "vector"),
-    ("time_offset", "vector"),
-    ("intrinsics", "vector"),
-    ("distortion", "vector"),
-    ("bloom", "vector"),
-)
-SIZES = {"rotation": 3, "translation": 3, "intrinsics": 4, "bloom": 1}
 
 
 @dataclass(frozen=True)
@@ -41,7 +35,6 @@ class Inputs:
     bodies: Bodies
     imu: ImuData | None
     layout: Layout
-    tolerances: Tolerances
     parts: tuple[Part, ...]
     clouds: Clouds = NO_CLOUDS
     guess: State | None = None
@@ -52,6 +45,16 @@ class Inputs:
         """All that take part, but for the IMU."""
         lidars = self.rig.lidars if self.clouds.count else ()
         return (*self.rig.cameras, *lidars, *self.rig.wheels, *self.rig.poses)
+
+    @cached_property
+    def specs(self) -> dict[Key, ParameterSpec]:
+        """Definitions of the blocks of the layout."""
+        return specs_of(self.layout, (*(() if self.rig.imu is None else (self.rig.imu,)), *self.sensors))
+
+    @property
+    def tolerance(self) -> np.ndarray:
+        """(B,) of each border column."""
+        return tolerance_of(self.layout, self.specs, self.rig.settings)
 
     def sensor(self, name: str) -> Camera | Lidar | Wheels | PoseSensor:
         return next(s for s in self.sensors if s.name == name)
@@ -84,8 +87,7 @@ def inputs_for(rig: Rig, recordings: Sequence[Measurements], whole: Inputs | Non
     shifts = None if whole is None else [part.shift_ns for part in whole.parts]
     joined, parts = join(rig, [on_common_images(rig, restrict(bodies, r)) for r in recordings], shifts)
     layout = layout_for(rig, bodies, len(parts))
-    tolerances = Tolerances.asked_for(rig.settings)
-    return Inputs(rig, joined, bodies, joined_imu_data(rig, parts, joined), layout, tolerances, parts)
+    return Inputs(rig, joined, bodies, joined_imu_data(rig, parts, joined), layout, parts)
 
 
 def with_clouds(inputs: Inputs, clouds: Clouds) -> Inputs:
@@ -99,17 +101,14 @@ def layout_for(rig: Rig, bodies: Bodies, n_recordings: int = 1, clouds: Clouds =
     imu = rig.imu
     entries: list[Entry] = []
     if imu is not None:
-        entries.append((imu.name, "intrinsics", "nuisance", N_INTRINSICS, imu.intrinsics.mode != "fixed"))
+        entries += own_entries(imu)
     # Without an IMU the scene's frame is the world's, in all recordings.
     levelled = imu is not None and not rig.assumes_motion
     for k in range(1 if imu is None else n_recordings) if bodies.used else ():
-        entries.append((in_recording(BOARD, k), "tilt", "tilt", 2, levelled))
+        entries.append(TILT.entry(in_recording(BOARD, k), levelled))
     entries += bodies.size_entries() + bodies.shape_entries()
     for camera in rig.cameras:
-        sizes = SIZES | {"distortion": len(camera_model(camera.model).parameter_names) - 4}
-        sizes["time_offset"] = n_recordings if camera.clock_restarts else 1
-        for name, kind in CAMERA_PARAMETERS:
-            entries.append((camera.name, name, kind, sizes[name], _is_estimated(rig, camera, name)))
+        entries += own_entries(camera, n_recordings, partial(_is_estimated, rig, camera))
     for sensor in (*(rig.lidars if clouds.count else ()), *rig.wheels, *rig.poses):
         entries += own_entries(sensor, n_recordings)
     for k, sensor in enumerate(rig.poses):
@@ -118,10 +117,10 @@ def layout_for(rig: Rig, bodies: Bodies, n_recordings: int = 1, clouds: Clouds =
     return make_layout(entries + bodies.pose_entries() + clouds.entries)
 
 
-def _is_estimated(rig: Rig, camera: Camera, name: str) -> bool:
-    if rig.imu is None and (name == "time_offset" or (camera.name == rig.body and name in ("rotation", "translation"))):
+def _is_estimated(rig: Rig, camera: Camera, spec: ParameterSpec) -> bool:
+    if rig.imu is None and (spec == TIME_OFFSET or (camera.name == rig.body and spec in MOUNTED)):
         return False
-    return getattr(camera, name).mode != "fixed" and (name != "bloom" or rig.blooms)
+    return camera.is_estimated(spec) and (spec != BLOOM or rig.blooms)
 
 
 def origin_difference(measurements: Measurements, stream: Stream) -> float:

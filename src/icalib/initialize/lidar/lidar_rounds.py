@@ -40,11 +40,12 @@ from icalib.motion.point_planes import are_somewhere, thinned
 from icalib.motion.sweep import Motion, sweep
 from icalib.optim.state import Key, State
 from icalib.rig import Camera, Lidar, PoseSensor, Wheels
+from icalib.rig.sensor import MOUNTED_NAMES
 from icalib.sensors.lidar.lidar_binning import Associated, LidarNoise, Moments, take_moments
-from icalib.sensors.robot import COARSE_BIN_S, FIRST_RANGE_M, MOUNT, Clouds, joined_clouds, known_planes
+from icalib.sensors.robot import COARSE_BIN_S, FIRST_RANGE_M, Clouds, joined_clouds, known_planes
 
 FEW, LOST = 0.2, 0.7  # share of points on planes, and of what there was at first, below which the planes are lost
-NAMES = tuple(name for name, _, _ in MOUNT)
+NAMES = MOUNTED_NAMES
 
 
 def given(inputs: Inputs, sensor: Camera | Lidar | Wheels | PoseSensor, names: Sequence[str]) -> dict[Key, np.ndarray]:

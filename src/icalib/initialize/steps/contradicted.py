@@ -12,15 +12,14 @@ from contextvars import ContextVar
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.estimate.problem.tolerances import GUESS_SIGMA
 from icalib.geometry import so3
 from icalib.optim.state import Key
 from icalib.rig import Camera, Lidar, Parameter, PoseSensor, Wheels
+from icalib.rig.kinds import SPECS
+from icalib.rig.sensor import TRANSLATION
 
 SIGMAS = 4.0  # times what a guess is worth
-LENGTHS = ("radii", "radius", "baseline", "wheelbase", "scales")  # guessed to a share of themselves
-SHARE = 0.1  # that such a guess is off by
-_CHECKED = (*LENGTHS, "translation")
+SHARE = 0.1  # of a length or factor, by which its guess is off
 
 
 def is_contradicted(name: str, guess: np.ndarray, found: np.ndarray) -> bool:
@@ -30,13 +29,14 @@ def is_contradicted(name: str, guess: np.ndarray, found: np.ndarray) -> bool:
 
 def worst_off(name: str, guess: np.ndarray, found: np.ndarray) -> float:
     """How far a guess is off, in what one is worth; infinite for a length of no size."""
-    if name == "rotation":
-        return float(np.linalg.norm(so3.log(np.ascontiguousarray(guess.T @ found)))) / GUESS_SIGMA[name]
-    if name in LENGTHS:
+    spec = SPECS[name]
+    if spec.manifold == "rotation":
+        return float(np.linalg.norm(so3.log(np.ascontiguousarray(guess.T @ found)))) / spec.prior_sigma
+    if spec.is_positive:
         if (guess <= 0.0).any() or (found <= 0.0).any():
             return np.inf
         return float(np.abs(np.log(found / guess)).max()) / SHARE
-    return float(np.abs(found - guess).max()) / GUESS_SIGMA[name]
+    return float(np.abs(found - guess).max()) / spec.prior_sigma
 
 
 def chosen(name: str, parameter: Parameter, given: np.ndarray | None, found: np.ndarray) -> np.ndarray:
@@ -69,7 +69,8 @@ def refuse_far_off(wheels: Wheels, found: dict[Key, np.ndarray]) -> None:
     guesses are off."""
     for (sensor, name), value in found.items() if _REFUSING.get() else ():
         stated = getattr(wheels, name)
-        if name in _CHECKED and stated.mode == "fixed" and is_contradicted(name, stated.value, value):
+        checked = SPECS[name].is_positive or name == TRANSLATION.name
+        if checked and stated.mode == "fixed" and is_contradicted(name, stated.value, value):
             raise FarOffError(f"{sensor}: {name} in the rig file contradicts the data.")
 
 
@@ -89,7 +90,7 @@ def settled(
 def _gives_way(sensor: Camera | Lidar | Wheels | PoseSensor, name: str) -> bool:
     """Whether what the rig file gives of a group may be left for what the data show."""
     mode = getattr(sensor, name).mode
-    return mode == "free" or (mode == "prior" and name in LENGTHS)
+    return mode == "free" or (mode == "prior" and SPECS[name].is_positive)
 
 
 def has_guesses(sensor: Camera | Lidar | Wheels | PoseSensor, known: dict[Key, np.ndarray]) -> bool:
@@ -102,7 +103,7 @@ def chosen_along(given: np.ndarray, found: np.ndarray, covariance: np.ndarray) -
     (3, 3), to better than guesses are worth, and that contradict the guess."""
     variance, axes = np.linalg.eigh(covariance)
     way = axes.T @ (found - given)
-    worth = GUESS_SIGMA["translation"]
+    worth = TRANSLATION.prior_sigma
     return given + axes @ np.where((variance < worth**2) & (np.abs(way) > SIGMAS * worth), way, 0.0)
 
 

@@ -59,7 +59,7 @@ def _size(wheels: Wheels, name: str) -> np.ndarray:
     if value is None:
         raise EstimationError(
             f"without IMU, target and pose sensor only {wheels.name} determines the scale; give its "
-            f"{' and '.join(wheels.sizes)} in the rig file, or add one of these sensors."
+            f"{' and '.join(spec.name for spec in wheels.drive_specs)} in the rig file, or add one of these sensors."
         )
     return np.asarray(value, dtype=np.float64)
 
@@ -97,17 +97,19 @@ def seen_from_first(rig: Rig, values: dict[Key, np.ndarray]) -> dict[Key, np.nda
     mounts |= {c.name: tuple(values[c.name, name] for name in NAMES) for c in others}
     for name, (Q, q, dt) in mounts.items():
         out |= {(name, "rotation"): R.T @ Q, (name, "translation"): R.T @ (q - p), (name, "time_offset"): dt - offset}
-    sizes = {name: getattr(wheels, name).value for name in wheels.sizes}
-    usual = {"scales": np.ones(2), "steering_offset": np.zeros(1), "radii": np.ones(2), "baseline": np.ones(1)}
-    return out | {(wheels.name, name): usual[name] if v is None else np.asarray(v) for name, v in sizes.items()}
+    for spec in wheels.drive_specs:
+        value = getattr(wheels, spec.name).value
+        usual = np.full(spec.size, float(spec.is_positive))
+        out[wheels.name, spec.name] = usual if value is None else np.asarray(value)
+    return out
 
 
 def as_given(inputs: Inputs, found: dict[Key, np.ndarray]) -> dict[Key, np.ndarray]:
     """`found`, but what the rig file gives of cameras and the first wheels where that does not contradict it. Nothing
     shows how high wheels are on a floor: that is as given."""
     wheels, (_, *others) = inputs.rig.wheels[0], inputs.rig.cameras
-    out = dict(found)
-    for sensor, names in (*((c, NAMES) for c in others), (wheels, (*NAMES, *wheels.sizes))):
+    out, drive = dict(found), [spec.name for spec in wheels.drive_specs]
+    for sensor, names in (*((c, NAMES) for c in others), (wheels, (*NAMES, *drive))):
         known, own = given(inputs, sensor, names), {k: v for k, v in found.items() if k[0] == sensor.name}
         arm = wheels.name, "translation"
         if arm in known and arm in own:

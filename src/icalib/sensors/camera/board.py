@@ -6,12 +6,8 @@ import numpy as np
 
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.targets import Target
+from icalib.rig.scene import BOW_LABELS, IN_PLANE_LABELS, SHAPE_LABELS
 
-BOW_LABELS = ("bow_xx", "bow_xy", "bow_yy")
-# In the plane: what printing and mounting do to second order. A turn, a shift and the scale are left out: the first two
-# belong to the board's pose, and the scale is what tag_size says.
-IN_PLANE_LABELS = ("stretch", "shear", "x_xx", "y_xx", "x_xy", "y_xy", "x_yy", "y_yy")
-SHAPE_LABELS = BOW_LABELS + IN_PLANE_LABELS
 # Priors: boards are flat to a few millimetres, and printed true to about one.
 SHAPE_SIGMA_M = np.array([3e-3] * len(BOW_LABELS) + [1e-3] * len(IN_PLANE_LABELS))
 

@@ -18,12 +18,12 @@ from icalib.geometry.targets import Target
 from icalib.geometry.targets.base import BOARD
 from icalib.motion.nodes import MERGED_WITHIN_S
 from icalib.optim.state import Entry, Key, Layout
-from icalib.rig import Rig
-from icalib.sensors.camera.board import SHAPE_LABELS, shape_basis
+from icalib.rig import Rig, scene
+from icalib.sensors.camera.board import shape_basis
 
 FEWEST_TOGETHER = 3  # images with both of two bodies that tie them to each other
 MOST_NAMED = 8  # bodies in a sentence
-SIZE: Key = (BOARD, "size")  # (1,) true lengths over those of the target as stated
+SIZE: Key = (BOARD, scene.SIZE.name)  # (1,) true lengths over those of the target as stated
 
 
 @dataclass(frozen=True)
@@ -66,19 +66,16 @@ class Bodies:
 
     def size_entries(self) -> list[Entry]:
         """The block of a layout for the size of all bodies together."""
-        return [(*SIZE, "nuisance", 1, True)] if self.sized and self.used else []
+        return [scene.SIZE.entry(BOARD)] if self.sized and self.used else []
 
     def shape_entries(self) -> list[Entry]:
         """Blocks of a layout for how bodies bend."""
-        return [(name, "shape", "vector", len(SHAPE_LABELS), True) for name in self.bending]
+        return [scene.SHAPE.entry(name) for name in self.bending]
 
     def pose_entries(self) -> list[Entry]:
         """Blocks of a layout for poses in the scene, the reference's fixed; none where there is one body only."""
-        entries: list[Entry] = []
-        for name in self.names if self.several else ():
-            entries.append((name, "rotation", "rotation", 3, name != self.names[0]))
-            entries.append((name, "translation", "vector", 3, name != self.names[0]))
-        return entries
+        names = self.names if self.several else ()
+        return [spec.entry(name, name != self.names[0]) for name in names for spec in scene.BODY]
 
     def columns(self, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
         """Border columns of each of the target's bodies: pose (n, 6, or 0 where only one is in use), and shape and size

@@ -29,8 +29,9 @@ from icalib.motion.sweep import Motion
 from icalib.optim.arrowhead import Piece
 from icalib.optim.interval_sums import Rows
 from icalib.optim.state import NODE, Layout, State, in_recording
+from icalib.rig import scene
 
-FRAME = ("frame_rotation", "frame_translation")
+FRAME = tuple(spec.name for spec in scene.FRAME)
 NEAR_NODE_S = 0.05  # a pose further from all nodes is left out: the IMU alone would carry it there
 KINDS = {"rotation": slice(0, 3), "position": slice(3, 6)}
 UNITS = {"rotation": "rad", "position": "m"}

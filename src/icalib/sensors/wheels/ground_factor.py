@@ -28,12 +28,12 @@ from icalib.optim.arrowhead import Piece
 from icalib.optim.interval_sums import Rows
 from icalib.optim.state import Key, Layout, State
 from icalib.rig import Ground
+from icalib.rig.wheels import GROUND_HEIGHT
 
 LEVEL = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])  # normal and point
 NEARLY_LEVEL = np.cos(np.deg2rad(20.0))
 LEAST_BELOW_M = 0.02
 TILT, HEIGHT = "ground tilt", "ground height"
-HEIGHT_BLOCK = "ground_height"
 N_COLUMNS = 10  # of the border: rotation 3, translation 3, height 1, plane 3
 
 
@@ -135,7 +135,7 @@ class GroundFactor:
         columns = np.full(N_COLUMNS, -1)
         columns[:6] = self.layout.columns(self.name, "rotation", "translation")
         if self.ground.height_sigma is not None:
-            columns[6:7] = self.layout.columns(self.name, HEIGHT_BLOCK)
+            columns[6:7] = self.layout.columns(self.name, GROUND_HEIGHT.name)
         if key is not None:
             columns[7:] = self.layout.columns(*key)
         return columns
@@ -161,7 +161,7 @@ class GroundFactor:
         own[:, 2, 7:9] = way @ across.T
         own[:, 2, 9] = -sign
         own[:, 2:, 6] = [-1.0, 1.0]
-        h = state.values.get((self.name, HEIGHT_BLOCK), np.zeros(1))[0]
+        h = state.values.get((self.name, GROUND_HEIGHT.name), np.zeros(1))[0]
         height = way @ n - h
         residual = np.column_stack([tilt[:, :2], height, np.full(len(nodes), h - self.ground.height)])
         return Rows(residual, by_node, np.zeros_like(by_node), own)
