@@ -37,9 +37,9 @@ class Figure:
 
 FIGURES_OF_THE_PAGE = (
     Figure("trust", "out", "trust"),
-    Figure("corners", "out", "corners", "#corners > :nth-child(n + 5), #time-0"),
-    Figure("corners-lens", "out-lens", "corners", "#corners > :nth-child(n + 5), #time-0"),
-    Figure("jump", "out-jump", "corners", "#corners > p, #plane-0, #image-0, #plane-1, #image-1"),
+    Figure("corners", "out", "images", "#images > :nth-child(n + 5), #time-0"),
+    Figure("corners-lens", "out-lens", "images", "#images > :nth-child(n + 5), #time-0"),
+    Figure("jump", "out-jump", "images", "#images > p, #plane-0, #image-0, #plane-1, #image-1"),
 )
 
 
