@@ -48,7 +48,7 @@ def test_names_stand_in_the_order_of_the_rig_and_say_nothing_twice():
 @pytest.mark.parametrize(
     ("parameter", "wheels", "tracking", "advice"),
     [
-        ("cam0.distortion.k1", (), (), "show the target in the corners of the image"),
+        ("cam0.distortion.k1", (), (), "by these images; show the target in the corners of the image"),
         ("cam0.distortion.k1", (), ("cam0",), "points of the scene pass through the corners of the image"),
         ("cam0.translation.x", (), ("cam0",), "turn the rig briskly about every axis"),
         ("wheel0.translation.z", ("wheel0",), ("cam0",), "turn, and drive over ramps"),

@@ -69,6 +69,14 @@ def test_a_long_output_begins_with_verdict_and_first_reason(cases: dict[str, Cal
     assert console_of(c).startswith("Calibration")
 
 
+def test_single_coefficients_of_a_lens_come_after_its_projection(calibration: Calibration):
+    """Its verdict is that of the projection."""
+    weak = with_verdicts(calibration, "weak", ("translation",))
+    c = dataclasses.replace(weak, undetermined=("cam0 intrinsics fx: ...",))
+    assert c.verdict == "usable with care"
+    assert "weakly determined" in c.reasons[-2] and c.reasons[-1] == "cam0 intrinsics fx: ..."
+
+
 def test_the_worst_that_applies_is_the_verdict(cases: dict[str, Calibration]):
     assert {name: c.verdict for name, c in cases.items()} == {name: name.split(":")[0] for name in cases}
     assert {c.verdict for c in cases.values()} == set(EXIT_CODES) == set(NEXT)

@@ -40,6 +40,7 @@ ON_THE_GROUND = {
     "time_offset": "speed up, brake and turn more",
     "tilt": "drive over ramps",
 }
+SHOWN_BY_IMAGES = ("intrinsics", "distortion", "bloom", "shape")
 # Of cameras without a target, which track points of the scene.
 WITHOUT_TARGET = {
     "intrinsics": "move so that near and far points of the scene cross the whole image",
@@ -107,7 +108,7 @@ def _sentence(
     words = " with ".join(_words(names[i]) for i in parts)
     sensor, kind, _ = names[order[0]].rsplit(".", 2)
     motion = advice.get(sensor, rig).get(kind, "move the rig more")
-    return f"{words}: not determined by this motion; {motion}."
+    return f"{words}: not determined by {'these images' if kind in SHOWN_BY_IMAGES else 'this motion'}; {motion}."
 
 
 def _words(name: str) -> str:

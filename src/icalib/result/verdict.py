@@ -64,7 +64,9 @@ def reasons(c: Calibration) -> tuple[str, ...]:
     open_ones = [*c.undetermined, *(() if mended_first else _unexplained(c))] if counted else []
     weak = [] if mended_first else list(_weak(c))
     rest = [w for w in c.warnings if w not in c.wrong]
-    return tuple(dict.fromkeys([*c.wrong, *open_ones, *rest, *weak]))
+    # Undetermined coefficients of a lens whose projection is known well enough are no more than a detail.
+    first, last = (open_ones, []) if "undetermined" in counted else ([], open_ones)
+    return tuple(dict.fromkeys([*c.wrong, *first, *rest, *weak, *last]))
 
 
 def by_size(tolerances: float) -> Verdict:
