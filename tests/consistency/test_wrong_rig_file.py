@@ -44,6 +44,17 @@ def test_the_right_noise_is_no_news(simulation):
     assert said(with_noise(simulation, 1.0)) == []
 
 
+@pytest.mark.parametrize("times", [3.0, 10.0])
+def test_corner_noise_that_is_far_too_large_is_no_fault_of_the_imu(simulation, times):
+    """Residuals of the IMU are then small, too, as the motion follows it."""
+    rig = rig_for(simulation.scenario)
+    true = zip(rig.cameras, simulation.scenario.cameras, strict=True)
+    cameras = tuple(replace(c, corner_noise_px=times * s.corner_noise_px) for c, s in true)
+    result = calibrate_measurements(replace(rig, cameras=cameras), simulation.measurements)
+    assert said(result) == []
+    assert [f"cam0 {1.0 / times:.2g}x and cam1 {1.0 / times:.2g}x" in w for w in result.warnings].count(True) == 1
+
+
 @pytest.mark.parametrize("times", [0.2, 0.1, 0.05, 0.01])
 def test_noise_that_is_far_too_small_is_said(simulation, times):
     """The motion then follows the IMU, and hardly any degrees of freedom are left to judge it by."""

@@ -43,9 +43,13 @@ def _of_imu(inputs: Inputs, found: Estimate, judged: Sequence[SensorFit], misfit
     large, small = any(excess(f) > 1.0 for f in own), [f for f in own if _is_small(f)]
     if not (large or small) or inputs.rig.imu is None:
         return
+    corners = _loose_corners(inputs, judged)
+    if corners and not large:
+        yield Cause(_corners_words(corners), 0.0)
+        return
     noise = fitting_noise(inputs, found) if found.outcome.converged else None
-    if large and noise is not None and noise.is_as_stated and noise.explains:
-        return  # another sensor's noise makes the residuals of the IMU large
+    if noise is not None and noise.is_as_stated and noise.explains:
+        return  # another sensor's noise makes the residuals of the IMU large, or small
     if large and noise is not None and noise.explains:
         yield Cause(noise_words(inputs, noise), Misfit.of(own).chi2, Misfit.of(own).is_grave)
     elif large:
@@ -53,12 +57,30 @@ def _of_imu(inputs: Inputs, found: Estimate, judged: Sequence[SensorFit], misfit
     elif noise is not None and noise.explains:
         yield Cause(noise_words(inputs, noise), 0.0)
     else:
-        sizes = " and ".join(f"{f.kind} {np.sqrt(max(f.chi2, 0.0) / f.dof):.2g}x" for f in small)
+        sizes = " and ".join(f"{f.kind} {_times(f):.2g}x" for f in small)
         yield Cause(
             f"residuals of {inputs.rig.imu.name} are smaller than the stated noise predicts ({sizes}); standard "
             "deviations are too large, if anything.",
             0.0,
         )
+
+
+def _loose_corners(inputs: Inputs, judged: Sequence[SensorFit]) -> list[SensorFit]:
+    """Corners whose stated noise is too large. The motion then follows the IMU, whose residuals are small, too."""
+    stated = {c.name for c in inputs.rig.cameras if c.corner_noise_px is not None}
+    return [f for f in judged if f.kind == "corners" and f.sensor in stated and _is_small(f)]
+
+
+def _corners_words(corners: list[SensorFit]) -> str:
+    sizes = " and ".join(f"{f.sensor} {_times(f):.2g}x" for f in corners)
+    return (
+        f"residuals of corners are smaller than corner_noise predicts ({sizes}); standard deviations are too large. "
+        "Leave corner_noise out, and it is estimated."
+    )
+
+
+def _times(f: SensorFit) -> float:
+    return float(np.sqrt(max(f.chi2, 0.0) / f.dof))
 
 
 def _is_noise(found: Estimate, f: SensorFit) -> bool:
