@@ -14,7 +14,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +34,16 @@ PERIOD_S = 20.0
 TARGET_MB = 500.0
 
 
+@dataclass(frozen=True)
+class Ended:
+    """A process that has ended: peak memory [MB], seconds on the clock and of the processor, exit code."""
+
+    peak_mb: float
+    seconds: float
+    cpu_seconds: float
+    code: int
+
+
 def main() -> int:
     options = _options()
     options.folder.mkdir(parents=True, exist_ok=True)
@@ -43,16 +53,15 @@ def main() -> int:
         return _render(scenario, bag)
     if not bag.exists():
         # Not in this process: what a child starts with counts as its own peak.
-        _, seconds, _ = _in_a_process([__file__, *sys.argv[1:], "--render"], {})
-        print(f"rendered in {seconds:.0f} s", flush=True)
+        rendered = in_a_process([__file__, *sys.argv[1:], "--render"], {})
+        print(f"rendered in {rendered.seconds:.0f} s", flush=True)
     written = rig_to_dict(rig_for(scenario, settings=Settings(), intrinsics="free", distortion="free"))
     rig.write_text(yaml.safe_dump(written, sort_keys=False))
-    code = 0
     for kernels in ("perhaps compiling", "compiled"):
-        peak, seconds, code = calibrated(rig, bag)
-        print(f"{kernels:<18} {peak:6.0f} MB, {seconds:6.1f} s, exit code {code}", flush=True)
+        done = calibrated(rig, bag)
+        print(f"{kernels:<18} {done.peak_mb:6.0f} MB, {done.seconds:6.1f} s, exit code {done.code}", flush=True)
     print(f"{'at most':<18} {TARGET_MB:6.0f} MB for 10 minutes")
-    return code
+    return done.code
 
 
 def _options() -> argparse.Namespace:
@@ -115,21 +124,22 @@ def _repeating(waves: Waves) -> Waves:
     return replace(waves, frequency=np.round(waves.frequency * PERIOD_S) / PERIOD_S)
 
 
-def calibrated(rig: Path, bag: Path) -> tuple[float, float, int]:
-    """Peak memory [MB], seconds and exit code of the command line."""
+def calibrated(rig: Path, bag: Path) -> Ended:
+    """What the command line needed."""
     run = "import sys; from icalib.cli import main; sys.exit(main())"
     with tempfile.TemporaryDirectory() as empty:
         options = ["calibrate", str(rig), str(bag), "--output", f"{empty}/out", "--quiet"]
-        return _in_a_process(["-c", run, *options], {"ICALIB_CACHE": f"{empty}/corners"})
+        return in_a_process(["-c", run, *options], {"ICALIB_CACHE": f"{empty}/corners"})
 
 
-def _in_a_process(arguments: list[str], environment: dict[str, str]) -> tuple[float, float, int]:
-    """Peak memory [MB], seconds and exit code of Python with `arguments`."""
+def in_a_process(arguments: list[str], environment: dict[str, str]) -> Ended:
+    """Python with `arguments`, its peak memory that of this process at least."""
     started = time.perf_counter()
     child = os.posix_spawn(sys.executable, [sys.executable, *arguments], os.environ | environment)
     _, status, used = os.wait4(child, 0)
     unit = 1 if sys.platform == "darwin" else 1024
-    return used.ru_maxrss * unit * 1e-6, time.perf_counter() - started, os.waitstatus_to_exitcode(status)
+    seconds, cpu = time.perf_counter() - started, used.ru_utime + used.ru_stime
+    return Ended(used.ru_maxrss * unit * 1e-6, seconds, cpu, os.waitstatus_to_exitcode(status))
 
 
 if __name__ == "__main__":

@@ -2,8 +2,8 @@
 
 Bags are kept in FOLDER (145 MB for each camera of 40 s at 10 Hz), so that only the first run renders. Each is
 calibrated from nothing by `icalib.calibrate`, the lens free and unknown, or with `--lens guess` given 3 % off.
-`--tracks` compares what the tracker finds with where the tracked points of the surfaces truly are. Needs
-icalib[bags,images].
+`--tracks` compares what the tracker finds with where the tracked points of the surfaces truly are; `--command` measures
+time and memory of the whole command, in a process of its own. Needs icalib[bags,images].
 """
 
 from __future__ import annotations
@@ -11,22 +11,26 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import sys
+import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
+import yaml
+from memory import calibrated, in_a_process
 from rendered import errors
 from track_errors import print_track_errors
 
 import icalib
 from icalib.errors import CalibrationError
 from icalib.rig import Parameter, Rig, Settings
+from icalib.rig.file import rig_to_dict
 from icalib.tools.montecarlo.one_run import compare
 from icalib.tools.montecarlo.statistics import Sample, nees
 from icalib.tools.simulation import ImageFaults, Scenario, Simulation, load_scenario, rig_for, simulate, write_sensors
 
 PAPER = Path(__file__).parents[1] / "examples" / "paper"
-KINDS = ("free", "lidar", "wheels", "stereo")
+KINDS = ("free", "lidar", "wheels", "stereo", "robot")
 UNITS = ("deg", "mm", "us", "fx px")
 TARGETS = {"free": (0.025, 1.5, 30.0, 0.15), "lidar": (0.03, 2.0, 50.0), "wheels": (0.03, 2.0, 50.0)}  # RMS
 GUESSED = 1.03  # focal lengths with --lens guess, over the true ones
@@ -39,22 +43,40 @@ def main() -> int:
     scenario = scenario_of(options.kind, options.duration, options.rate)
     if options.faults:
         scenario = dataclasses.replace(scenario, image_faults=FAULTS[options.faults])
+    rig, seeds = rig_of(scenario, options.lens), range(options.first, options.first + options.seeds)
+    if options.command and not options.render:
+        return max(_command(rig, options, seed) for seed in seeds)
     rows: dict[str, list[np.ndarray]] = {camera.name: [] for camera in scenario.cameras}
     whole: list[Sample] = []
     head = "".join(f"{unit:>10}{'/ sigma':>9}" for unit in UNITS)
-    if not options.tracks:
+    if not options.tracks and not options.render:
         print(f"{'seed camera':<14}{head}{'NEES':>8}{'cpu s':>8}{'s':>7}   converged", flush=True)
-    for seed in range(options.first, options.first + options.seeds):
-        simulation = simulate(scenario, seed)
-        path = _rendered(options, simulation, seed)
-        rig = rig_of(scenario, options.lens)
+    for seed in seeds:
+        simulation, path = simulate(scenario, seed), _path(options, seed)
+        if not path.exists():
+            write_sensors(simulation, seed, path)
         if options.tracks:
             print_track_errors(simulation, rig, path)
-        else:
+        elif not options.render:
             _calibrated(rig, simulation, path, seed, rows, whole)
     if whole:
         _summary(options.kind, rows, whole)
     return 0
+
+
+def _command(rig: Rig, options: argparse.Namespace, seed: int) -> int:
+    """`icalib calibrate` on one bag, which another process renders: a process starts with the peak memory of the one
+    that starts it."""
+    path = _path(options, seed)
+    if not path.exists():
+        in_a_process([__file__, *sys.argv[1:], "--render", "--first", str(seed), "--seeds", "1"], {})
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "rig.yaml"
+        file.write_text(yaml.safe_dump(rig_to_dict(rig), sort_keys=False), encoding="utf-8")
+        done = calibrated(file, path)
+    used = f"{done.cpu_seconds:.1f} s of the processor, {done.seconds:.1f} s on the clock, {done.peak_mb:.0f} MB"
+    print(f"{path.name}: {used}, exit code {done.code}", flush=True)
+    return done.code
 
 
 def _calibrated(
@@ -111,13 +133,16 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--duration", type=float, default=40.0, metavar="S", help="length of each recording (40)")
     parser.add_argument("--rate", type=float, default=10.0, metavar="HZ", help="images a second of each camera (10)")
     parser.add_argument("--faults", choices=tuple(FAULTS), help="what goes wrong with the images")
-    parser.add_argument("--tracks", action="store_true", help="errors of the tracks, without calibration")
+    only = parser.add_mutually_exclusive_group()
+    only.add_argument("--tracks", action="store_true", help="errors of the tracks, without calibration")
+    only.add_argument("--command", action="store_true", help="time and memory of the command `icalib calibrate`")
+    parser.add_argument("--render", action="store_true", help=argparse.SUPPRESS)
     return parser.parse_args()
 
 
 def scenario_of(kind: str, duration_s: float, rate_hz: float) -> Scenario:
-    """One camera and the IMU of the paper in free motion; two such cameras, side by side; or one over ramps, with the
-    LiDAR or the wheels of the paper's robot."""
+    """One camera and the IMU of the paper in free motion; two such cameras, side by side; one over ramps, with the
+    LiDAR or the wheels of the paper's robot; or all of that robot, its cameras at their rates (20, 10 and 10 Hz)."""
     name = "table2-3d" if kind in ("free", "stereo") else "table2-ramp"
     base = load_scenario(PAPER / f"{name}.yaml")
     camera = dataclasses.replace(base.cameras[0], rate_hz=rate_hz)
@@ -127,13 +152,15 @@ def scenario_of(kind: str, duration_s: float, rate_hz: float) -> Scenario:
         aside[0, 3] = BASELINE_M
         other = dataclasses.replace(base.cameras[1], T_imu_cam=camera.T_imu_cam @ aside, rate_hz=rate_hz, phase_s=0.0)
         cameras.append(other)
+    if kind == "robot":
+        cameras = list(base.cameras)
     return dataclasses.replace(
         base,
         duration_s=duration_s,
         cameras=tuple(cameras),
         features=None,
-        lidars=base.lidars if kind == "lidar" else (),
-        wheels=base.wheels if kind == "wheels" else (),
+        lidars=base.lidars if kind in ("lidar", "robot") else (),
+        wheels=base.wheels if kind in ("wheels", "robot") else (),
     )
 
 
@@ -150,13 +177,9 @@ def rig_of(scenario: Scenario, lens: str) -> Rig:
     return dataclasses.replace(rig, cameras=tuple(cameras))
 
 
-def _rendered(options: argparse.Namespace, simulation: Simulation, seed: int) -> Path:
-    """The bag of a seed, rendered where it is not yet there."""
+def _path(options: argparse.Namespace, seed: int) -> Path:
     faults = f"-{options.faults}" if options.faults else ""
-    path = options.folder / f"{options.kind}-{options.duration:g}s-{options.rate:g}Hz{faults}-{seed}.bag"
-    if not path.exists():
-        write_sensors(simulation, seed, path)
-    return path
+    return options.folder / f"{options.kind}-{options.duration:g}s-{options.rate:g}Hz{faults}-{seed}.bag"
 
 
 if __name__ == "__main__":
