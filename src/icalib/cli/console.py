@@ -98,8 +98,10 @@ def print_result(calibration: Calibration, folder: Path) -> None:
 def _print_summary(calibration: Calibration, console: Console) -> None:
     """Verdict and first reason, for a reader who does not see the end of a long output."""
     console.print(_verdict_line(calibration))
+    count = len(calibration.reasons)
     for sentence in calibration.reasons[:1]:
-        console.print(f"First of {len(calibration.reasons)} reasons: {sentence}", markup=False, highlight=False)
+        first = "Reason" if count == 1 else f"First of {count} reasons"
+        console.print(f"{first}: {sentence}", markup=False, highlight=False)
 
 
 def print_verdict(calibration: Calibration, console: Console) -> None:
